@@ -1,0 +1,35 @@
+"""Everything that px4fuse raises on purpose.
+
+::
+
+    Px4FuseError
+    ├── LogError           the log cannot be read, or is not one
+    ├── MissingDataError   the log can be read but lacks what was asked for
+    ├── SettingsError      a setting is outside its documented range
+    └── OutputError        a result cannot be written
+
+The text of each is one line for a person: what is wrong, where, and what to do.
+The command line prints it on standard error and ends with exit code 2.
+"""
+
+from __future__ import annotations
+
+
+class Px4FuseError(Exception):
+    """Base of all errors that px4fuse raises on purpose."""
+
+
+class LogError(Px4FuseError):
+    """The log cannot be read, or is not a flight log."""
+
+
+class MissingDataError(Px4FuseError):
+    """The log was read, but what was asked for is not in it."""
+
+
+class SettingsError(Px4FuseError):
+    """A setting is outside its documented range."""
+
+
+class OutputError(Px4FuseError):
+    """A result cannot be written."""

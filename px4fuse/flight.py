@@ -1,0 +1,255 @@
+"""The data model: what every reader makes and everything else takes.
+
+Times are float seconds on the autopilot's boot clock, counted from the first sample of data
+(:attr:`LogInfo.boot_time_s` is that sample's own boot time), and they are times of *measurement*,
+not of publication. Vectors are NED (north, east, down) in m, m/s and m/s², or body FRD (forward,
+right, down) where said. Time series are pandas frames whose index is time in seconds, named
+``time_s``; every column's unit stands in its name or in the field's description.
+
+What was looked for and not found is an :class:`Unavailable`; it travels to the report and is never
+replaced by zero, an empty plot or a "pass".
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+import pandas as pd
+
+AxisName = Literal["north", "east", "down"]
+AXIS_NAMES: tuple[AxisName, AxisName, AxisName] = ("north", "east", "down")
+POSITION_COLUMNS = ["north_m", "east_m", "down_m"]
+VELOCITY_COLUMNS = ["north_m_s", "east_m_s", "down_m_s"]
+POSITION_VARIANCE_COLUMNS = ["north_m2", "east_m2", "down_m2"]
+VELOCITY_VARIANCE_COLUMNS = ["north_m2_s2", "east_m2_s2", "down_m2_s2"]
+SPECIFIC_FORCE_COLUMNS = ["forward_m_s2", "right_m_s2", "down_m_s2"]
+ANGULAR_RATE_COLUMNS = ["forward_rad_s", "right_rad_s", "down_rad_s"]
+QUATERNION_COLUMNS = ["w", "x", "y", "z"]
+
+
+@dataclass(frozen=True)
+class Unavailable:
+    """Something that was looked for and not found.
+
+    Attributes
+    ----------
+    what : str
+        What is missing, as a noun phrase ("EKF2 innovations").
+    reason : str
+        Why, in terms of the log ("no topic vehicle_attitude").
+    remedy : str
+        What would have logged it, or what to do instead.
+    """
+
+    what: str
+    reason: str
+    remedy: str
+
+    def __str__(self) -> str:
+        return f"{self.what}: {self.reason}. {self.remedy}"
+
+
+@dataclass(frozen=True)
+class Dropout:
+    """A stretch that the logger lost: start and length in seconds."""
+
+    start_s: float
+    duration_s: float
+
+
+@dataclass(frozen=True)
+class LogInfo:
+    """What the log is.
+
+    Attributes
+    ----------
+    name : str
+        File name without its folder.
+    sha256 : str
+        Of the file's bytes.
+    size_bytes : int
+    format : str
+        "ULog".
+    firmware : str
+        For example "PX4 v1.16.1"; "unknown" where the log does not say.
+    firmware_hash : str
+        Git hash, or "unknown".
+    hardware : str
+    boot_time_s : float
+        Boot clock (s) of time zero, the first sample of data.
+    duration_s : float
+        Span of the data (of the IMU, or else of the densest topic), not of the file: some logs
+        carry one stale message hours away.
+    dropouts : tuple of Dropout
+        As the logger itself reported them.
+    parameters : mapping
+        Parameters that bear on fusion and logging, by PX4 name, as they were at the log's start.
+    notes : tuple of str
+        What the reader had to do: corruption passed over, samples with impossible time stamps.
+    """
+
+    name: str
+    sha256: str
+    size_bytes: int
+    format: str
+    firmware: str
+    firmware_hash: str
+    hardware: str
+    boot_time_s: float
+    duration_s: float
+    dropouts: tuple[Dropout, ...] = ()
+    parameters: Mapping[str, float] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class PositionTrack:
+    """One external position track found in the log.
+
+    Attributes
+    ----------
+    name : str
+        The name that ``--position-source`` takes; the PX4 topic where there is one.
+    rung : int
+        Place in the ladder of sources (2 is best in a ULog); see the README.
+    description : str
+        What it is, for a person.
+    samples : DataFrame, shape (n, 6)
+        ``north_m, east_m, down_m`` and their reported variances ``north_m2, east_m2, down_m2``
+        (NaN where the sender gave none or the topic has none). NaN positions were dropped.
+    frame : str
+        "NED", "FRD" (x is forward at start, not north) or "unknown".
+    clock : str
+        Which clock the time stamps are on.
+    reconstructed : bool
+        Whether it was derived from EKF2's own output instead of being logged as it arrived.
+    topics : tuple of str
+        The topics that it was read from.
+    """
+
+    name: str
+    rung: int
+    description: str
+    samples: pd.DataFrame
+    frame: str
+    clock: str
+    reconstructed: bool
+    topics: tuple[str, ...]
+
+    @property
+    def rate_hz(self) -> float:
+        """Samples per second, from the median interval (NaN with fewer than two samples)."""
+        return median_rate(self.samples)
+
+
+@dataclass(frozen=True)
+class Reset:
+    """One reset of EKF2's output: the new state is the old one plus ``delta``.
+
+    Attributes
+    ----------
+    time_s : float
+        Time of the first sample after it.
+    quantity : str
+        "position" or "velocity".
+    delta : tuple of float
+        North, east, down in m or m/s; 0 for axes that were not reset.
+    """
+
+    time_s: float
+    quantity: Literal["position", "velocity"]
+    delta: tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Ekf2:
+    """EKF2's output, variances and innovations, of the instance that was primary at each time.
+
+    Attributes
+    ----------
+    state : DataFrame, shape (n, 6)
+        Position and velocity (m, m/s, NED) exactly as published, resets included.
+    variance : DataFrame, shape (n, 6), or Unavailable
+        Position and velocity variances (m², m²/s²).
+    innovations : mapping from axis name to DataFrame, or to Unavailable
+        Per axis: ``innovation_m`` (measurement minus prediction: PX4's own sign is flipped, here
+        and only here), ``innovation_variance_m2``, ``observation_variance_m2`` (NaN where not
+        logged), ``test_ratio``, ``fused``, ``rejected`` (1, 0, or NaN where not logged).
+    innovation_topics : tuple of str
+    fusing : DataFrame or Unavailable
+        Columns ``horizontal``, ``vertical``, ``yaw``: 1 while EKF2 reports that it fuses external
+        vision for them, a step function.
+    resets : tuple of Reset
+    instances : tuple of (float, int)
+        Primary instance from each time on.
+    gate : float
+        EKF2_EVP_GATE in standard deviations.
+    notes : tuple of str
+        Joins and what they dropped, time bases, and the like.
+    """
+
+    state: pd.DataFrame
+    variance: pd.DataFrame | Unavailable
+    innovations: Mapping[AxisName, pd.DataFrame | Unavailable]
+    innovation_topics: tuple[str, ...]
+    fusing: pd.DataFrame | Unavailable
+    resets: tuple[Reset, ...]
+    instances: tuple[tuple[float, int], ...]
+    gate: float
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Truth:
+    """A reference that no estimator used: simulation ground truth or motion capture.
+
+    Attributes
+    ----------
+    name : str
+        The topic.
+    samples : DataFrame, shape (n, 6)
+        Position and velocity (m, m/s, NED); velocity is NaN where not logged.
+    """
+
+    name: str
+    samples: pd.DataFrame
+
+
+@dataclass(frozen=True)
+class Flight:
+    """One recorded flight.
+
+    Attributes
+    ----------
+    log : LogInfo
+    imu : DataFrame or Unavailable
+        Specific force (m/s², body FRD, not bias corrected) and angular rate (rad/s, body FRD).
+    attitude : DataFrame or Unavailable
+        Quaternion w, x, y, z that turns body FRD into NED.
+    positions : tuple of PositionTrack
+        Every external position track found, best rung first.
+    ekf2 : Ekf2 or Unavailable
+    truth : Truth or Unavailable
+    airborne : tuple of (float, float), or Unavailable
+        Stretches (s) in which the land detector says that the vehicle flies; empty if never.
+    missing : tuple of Unavailable
+        What was looked for and not found, with the remedy.
+    """
+
+    log: LogInfo
+    imu: pd.DataFrame | Unavailable
+    attitude: pd.DataFrame | Unavailable
+    positions: tuple[PositionTrack, ...]
+    ekf2: Ekf2 | Unavailable
+    truth: Truth | Unavailable
+    airborne: tuple[tuple[float, float], ...] | Unavailable
+    missing: tuple[Unavailable, ...] = ()
+
+
+def median_rate(samples: pd.DataFrame) -> float:
+    """Rate of a time-indexed frame in Hz from its median interval; NaN below two samples."""
+    if len(samples) < 2:
+        return float("nan")
+    return float(1.0 / samples.index.to_series().diff().median())

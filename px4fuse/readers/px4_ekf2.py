@@ -1,0 +1,344 @@
+"""EKF2's part of a ULog: state, variances, innovations, resets, of the primary instance.
+
+Sources: PX4-Autopilot ``EKF2.cpp`` (PublishStates, PublishInnovations), ``EKF2Selector.cpp``
+(primary instance), ``msg/EstimatorInnovations.msg``, ``msg/EstimatorAidSource2d.msg``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import numpy as np
+import pandas as pd
+
+from px4fuse.flight import (
+    AXIS_NAMES,
+    POSITION_COLUMNS,
+    POSITION_VARIANCE_COLUMNS,
+    VELOCITY_COLUMNS,
+    VELOCITY_VARIANCE_COLUMNS,
+    AxisName,
+    Ekf2,
+    Reset,
+    Unavailable,
+)
+from px4fuse.readers.px4_topics import (
+    AID_SOURCE,
+    CONTROL_MODE_BITS,
+    COVARIANCE_OFFSETS,
+    ESTIMATOR_STATES,
+    FUSING,
+    INNOVATIONS,
+    LOCAL_POSITION,
+    SELECTOR,
+    InnovationLayout,
+    Layout,
+)
+from px4fuse.readers.ulog_topics import Topics
+
+# EKF2_EVP_GATE has had this default in every release read (v1.9 to main)
+DEFAULT_GATE = 5.0
+# innovations, variances and ratios are logged by separate rate limiters, up to some cycles apart
+JOIN_TOLERANCE_S = 0.1
+_RESET_COUNTERS = (
+    ("position", "xy_reset_counter", ("delta_north_m", "delta_east_m", None)),
+    ("position", "z_reset_counter", (None, None, "delta_down_m")),
+    ("velocity", "vxy_reset_counter", ("delta_north_m_s", "delta_east_m_s", None)),
+    ("velocity", "vz_reset_counter", (None, None, "delta_down_m_s")),
+)
+INNOVATION_COLUMNS = [
+    "innovation_m",
+    "innovation_variance_m2",
+    "observation_variance_m2",
+    "test_ratio",
+    "fused",
+    "rejected",
+]
+
+
+def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
+    """EKF2's output, or why there is none."""
+    parameters = topics.log.parameters
+    if parameters.get("EKF2_EN") == 0.0:
+        return Unavailable("EKF2", "EKF2_EN is 0: EKF2 did not run", "Set EKF2_EN to 1.")
+    if parameters.get("SYS_MC_EST_GROUP", 2.0) != 2.0:
+        return Unavailable(
+            "EKF2",
+            f"SYS_MC_EST_GROUP is {parameters['SYS_MC_EST_GROUP']:.0f}: another estimator ran",
+            "Set SYS_MC_EST_GROUP to 2.",
+        )
+    layout = topics.find(LOCAL_POSITION)
+    if layout is None:
+        return Unavailable(
+            "EKF2", "no topic vehicle_local_position", "Record with SDLOG_PROFILE bit 0 (default)."
+        )
+    local = topics.frame(layout)
+    state = local[POSITION_COLUMNS + VELOCITY_COLUMNS].dropna()
+    if state.empty:
+        return Unavailable(
+            "EKF2", "vehicle_local_position holds no finite sample", "Wait until EKF2 has started."
+        )
+    instances = _primary_instances(topics)
+    notes: list[str] = []
+    fusing = _read_fusing(topics, instances)
+    innovations, innovation_topics = _read_innovations(topics, instances, fusing, notes)
+    return Ekf2(
+        state=state,
+        variance=_read_variance(topics, instances),
+        innovations=innovations,
+        innovation_topics=innovation_topics,
+        fusing=fusing,
+        resets=read_resets(local),
+        instances=instances,
+        gate=parameters.get("EKF2_EVP_GATE", DEFAULT_GATE),
+        notes=tuple(notes),
+    )
+
+
+def _primary_instances(topics: Topics) -> tuple[tuple[float, int], ...]:
+    """Primary EKF2 instance from each time on; instance 0 where there is no selector."""
+    layout = topics.find(SELECTOR)
+    if layout is None:
+        return ((-np.inf, 0),)
+    selected = topics.frame(layout, step=True)["instance"]
+    selected = selected[selected < 255]  # 255: none selected yet
+    if selected.empty:
+        return ((-np.inf, 0),)
+    changes = selected[selected.ne(selected.shift())]
+    times = [-np.inf, *changes.index[1:]]
+    return tuple(
+        (float(time), int(number)) for time, number in zip(times, changes, strict=True)
+    )
+
+
+def _of_primary(
+    topics: Topics,
+    topic: str,
+    instances: tuple[tuple[float, int], ...],
+    read: Callable[[int], pd.DataFrame],
+) -> pd.DataFrame:
+    """Rows of each instance of a topic from the times in which that instance was primary."""
+    available = topics.instances(topic)
+    if len(available) == 1:
+        return read(available[0])
+    starts = np.array([start for start, _ in instances])
+    numbers = np.array([number for _, number in instances])
+    parts = []
+    for number in available:
+        frame = read(number)
+        at = np.searchsorted(starts, frame.index.to_numpy(), side="right") - 1
+        parts.append(frame[numbers[at] == number])
+    joined = pd.concat(parts).sort_index()
+    return joined[~joined.index.duplicated()]
+
+
+def _read_variance(
+    topics: Topics, instances: tuple[tuple[float, int], ...]
+) -> pd.DataFrame | Unavailable:
+    """Velocity and position variances, their place decided by the lengths of the arrays."""
+    lengths = {}
+    for candidate in ESTIMATOR_STATES:
+        for (name, _), table in topics.tables.items():
+            if name == candidate.topic and "covariances[0]" in table:
+                lengths[candidate.topic] = (
+                    sum(column.startswith("states[") for column in table),
+                    sum(column.startswith("covariances[") for column in table),
+                )
+    for topic, length in lengths.items():
+        offsets = COVARIANCE_OFFSETS.get(length)
+        if offsets is None:
+            return Unavailable(
+                "EKF2 variances",
+                f"{topic} has {length[0]} states and {length[1]} covariances, a layout unknown here",
+                "Report the PX4 version to the authors of px4fuse.",
+            )
+        velocity, position = offsets
+        columns = {
+            name: f"covariances[{first + i}]"
+            for first, names in (
+                (position, POSITION_VARIANCE_COLUMNS),
+                (velocity, VELOCITY_VARIANCE_COLUMNS),
+            )
+            for i, name in enumerate(names)
+        }
+        layout = Layout(topic, columns, "")
+        frame = _of_primary(topics, topic, instances, lambda n: topics.frame(layout, n))  # noqa: B023
+        frame = frame[(frame > 0.0).all(axis=1)]
+        if len(frame):
+            return frame
+    return Unavailable(
+        "EKF2 variances",
+        "no usable topic estimator_states (estimator_status before v1.12)",
+        "Record with SDLOG_PROFILE bit 0 (default), or EKF2 had not started.",
+    )
+
+
+def _read_fusing(
+    topics: Topics, instances: tuple[tuple[float, int], ...]
+) -> pd.DataFrame | Unavailable:
+    layout = topics.find(FUSING)
+    if layout is None:
+        return Unavailable(
+            "EKF2 fusion flags",
+            "neither estimator_status_flags nor estimator_status is in the log",
+            "Record with SDLOG_PROFILE bit 0 (default).",
+        )
+    frame = _of_primary(
+        topics, layout.topic, instances, lambda n: topics.frame(layout, n, step=True)
+    )
+    if "flags" in frame:
+        bits = frame["flags"].to_numpy().astype(np.int64)
+        frame = pd.DataFrame(
+            {name: (bits >> bit & 1).astype(float) for name, bit in CONTROL_MODE_BITS.items()},
+            index=frame.index,
+        )
+    return frame[["horizontal", "vertical", "yaw"]]
+
+
+def step_at(steps: pd.Series, times: pd.Index) -> pd.Series:
+    """Value of a step function at other times (its first value before its first step)."""
+    at = np.clip(np.searchsorted(steps.index, times, side="right") - 1, 0, None)
+    return pd.Series(steps.to_numpy()[at], index=times)
+
+
+def _read_innovations(
+    topics: Topics,
+    instances: tuple[tuple[float, int], ...],
+    fusing: pd.DataFrame | Unavailable,
+    notes: list[str],
+) -> tuple[Mapping[AxisName, pd.DataFrame | Unavailable], tuple[str, ...]]:
+    """Innovations per axis, from the aid-source topics or else from the older three topics."""
+    found: dict[AxisName, pd.DataFrame | Unavailable] = {}
+    used: dict[str, None] = {}
+    for axis in AXIS_NAMES:
+        if isinstance(fusing, pd.DataFrame) and not fusing[_group(axis)].any():
+            found[axis] = Unavailable(
+                f"EKF2 innovations, {axis}",
+                f"EKF2 never fused external vision for {_position_or_height(axis)} in this log",
+                "See the finding on EKF2 not fusing, or EKF2_EV_CTRL and EKF2_HGT_REF "
+                "(EKF2_AID_MASK and EKF2_HGT_MODE before v1.14).",
+            )
+            continue
+        layout = topics.find(AID_SOURCE[axis])
+        if layout is not None:
+            frame = _read_aid_source(topics, instances, layout, fusing, axis)
+            if len(frame):
+                found[axis] = frame
+                used[layout.topic] = None
+                continue
+        for older in INNOVATIONS:
+            joined = _read_joined(topics, instances, older, fusing, axis, notes)
+            if joined is not None and len(joined):
+                found[axis] = joined
+                used[older.topic] = None
+                break
+        else:
+            found[axis] = Unavailable(
+                f"EKF2 innovations, {axis}",
+                "no usable estimator_aid_src_ev_pos, estimator_aid_src_ev_hgt, "
+                "estimator_innovations or ekf2_innovations sample while external vision was fused",
+                "Record with SDLOG_PROFILE 129 (default and vision).",
+            )
+    return found, tuple(used)
+
+
+def _group(axis: AxisName) -> str:
+    return "vertical" if axis == "down" else "horizontal"
+
+
+def _position_or_height(axis: AxisName) -> str:
+    return "height" if axis == "down" else "horizontal position"
+
+
+def _read_aid_source(
+    topics: Topics,
+    instances: tuple[tuple[float, int], ...],
+    layout: Layout,
+    fusing: pd.DataFrame | Unavailable,
+    axis: AxisName,
+) -> pd.DataFrame:
+    frame = _of_primary(topics, layout.topic, instances, lambda n: topics.frame(layout, n))
+    if "fused" in frame and "rejected" in frame:
+        attempted = (frame["fused"] > 0) | (frame["rejected"] > 0)
+    elif isinstance(fusing, pd.DataFrame):
+        attempted = step_at(fusing[_group(axis)], frame.index) > 0
+    else:
+        attempted = pd.Series(True, index=frame.index)
+    frame = frame[attempted & (frame["innovation_variance_m2"] > 0) & frame["innovation_m"].notna()]
+    return _flipped(frame)
+
+
+def _read_joined(
+    topics: Topics,
+    instances: tuple[tuple[float, int], ...],
+    layout: InnovationLayout,
+    fusing: pd.DataFrame | Unavailable,
+    axis: AxisName,
+    notes: list[str],
+) -> pd.DataFrame | None:
+    """Join the innovation, variance and ratio topics by time, within a stated tolerance."""
+    parts: dict[str, pd.DataFrame] = {}
+    wanted = {
+        "innovation_m": (layout.topic, layout.fields),
+        "innovation_variance_m2": (layout.variance_topic, layout.variance_fields),
+        "test_ratio": (layout.ratio_topic, layout.ratio_fields),
+    }
+    for column, (topic, fields) in wanted.items():
+        if axis not in fields:
+            continue
+        single = topics.find((Layout(topic, {column: fields[axis]}, layout.since),))
+        if single is not None:
+            parts[column] = _of_primary(
+                topics, topic, instances, lambda n: topics.frame(single, n)  # noqa: B023
+            ).dropna()
+    if "innovation_m" not in parts or "innovation_variance_m2" not in parts:
+        return None
+    frame = parts.pop("innovation_m")
+    before = len(frame)
+    for column, part in parts.items():
+        frame = pd.merge_asof(
+            frame, part[[column]], left_index=True, right_index=True,
+            direction="nearest", tolerance=JOIN_TOLERANCE_S,
+        )  # fmt: skip
+    frame = frame.dropna(subset=["innovation_variance_m2"])
+    if len(frame) < before:
+        notes.append(
+            f"{before - len(frame)} of {before} samples of {layout.topic} ({axis}) have no "
+            f"{layout.variance_topic} within {JOIN_TOLERANCE_S:g} s and were left out"
+        )
+    # these topics repeat the last fusion's value until the next one; a repeat is no new evidence
+    repeated = frame["innovation_m"].eq(frame["innovation_m"].shift())
+    frame = frame[~repeated & (frame["innovation_m"] != 0) & (frame["innovation_variance_m2"] > 0)]
+    if isinstance(fusing, pd.DataFrame) and len(frame):
+        frame = frame[step_at(fusing[_group(axis)], frame.index) > 0]
+    return _flipped(frame)
+
+
+def _flipped(frame: pd.DataFrame) -> pd.DataFrame:
+    """EKF2 logs state minus measurement; everyone else says measurement minus state."""
+    flipped = frame.reindex(columns=INNOVATION_COLUMNS)
+    flipped["innovation_m"] = -flipped["innovation_m"]
+    return flipped
+
+
+def read_resets(local: pd.DataFrame) -> tuple[Reset, ...]:
+    """Resets of the published state, from the counters (uint8, they wrap) and their deltas."""
+    resets = []
+    for quantity, counter, deltas in _RESET_COUNTERS:
+        if counter not in local:
+            continue
+        count = local[counter].to_numpy()
+        changed = np.flatnonzero(np.diff(count) != 0) + 1
+        for row in changed:
+            delta = tuple(
+                0.0 if name is None or name not in local else float(local[name].iloc[row])
+                for name in deltas
+            )
+            if all(np.isfinite(delta)):
+                north, east, down = delta
+                time = float(local.index[row])
+                if quantity == "position":
+                    resets.append(Reset(time, "position", (north, east, down)))
+                else:
+                    resets.append(Reset(time, "velocity", (north, east, down)))
+    return tuple(sorted(resets, key=lambda reset: reset.time_s))

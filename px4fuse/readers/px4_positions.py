@@ -1,0 +1,275 @@
+"""External position tracks of a ULog: the ladder of sources, best rung first."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from px4fuse.flight import (
+    POSITION_COLUMNS,
+    POSITION_VARIANCE_COLUMNS,
+    VELOCITY_COLUMNS,
+    Ekf2,
+    PositionTrack,
+    Truth,
+    Unavailable,
+)
+from px4fuse.readers.px4_topics import (
+    AID_OBSERVATION_HORIZONTAL,
+    AID_OBSERVATION_VERTICAL,
+    FRAMES,
+    GPS,
+    LOCAL_POSITION,
+    TRACKS,
+    TRUTH_GLOBAL,
+    TRUTH_LOCAL,
+    TrackSource,
+)
+from px4fuse.readers.ulog_topics import Topics
+
+MIN_TRACK_SAMPLES = 3
+EARTH_RADIUS_M = 6_371_000.0  # PX4's CONSTANTS_RADIUS_OF_EARTH, src/lib/geo/geo.h
+GPS_3D_FIX = 3
+AID_SOURCE = "estimator_aid_src_ev_pos"
+RECONSTRUCTION = "ekf2_state_plus_innovation"
+GPS_SOURCE = "vehicle_gps_position"
+AUTOPILOT_CLOCK = "autopilot boot clock (as PX4 mapped the sender's stamp)"
+
+
+def read_positions(
+    topics: Topics, ekf2: Ekf2 | Unavailable
+) -> tuple[tuple[PositionTrack, ...], tuple[Unavailable, ...]]:
+    """Every external position track found, best rung first, and what was looked for in vain."""
+    candidates = [_read_logged(topics, source) for source in TRACKS]
+    candidates.append(_read_aid_observation(topics))
+    candidates.append(_reconstruct(ekf2))
+    candidates.append(_read_gps(topics))
+    tracks = tuple(track for track in candidates if isinstance(track, PositionTrack))
+    missing = tuple(track for track in candidates if isinstance(track, Unavailable))
+    return tuple(sorted(tracks, key=lambda track: track.rung)), missing
+
+
+def _unavailable(name: str, reason: str) -> Unavailable:
+    remedy = {
+        "vehicle_visual_odometry": (
+            "Set SDLOG_PROFILE to 129 (default and vision) to log it as it arrives."
+        ),
+        "vehicle_mocap_odometry": "Logged when ATT_POS_MOCAP is sent to PX4.",
+        AID_SOURCE: "Logged by default since v1.16 when EKF2 runs on external vision.",
+        RECONSTRUCTION: "Needs EKF2 innovations of external vision.",
+        GPS_SOURCE: "Logged when a GPS receiver is connected.",
+    }.get(name, "Logged by PX4 v1.10 to v1.13 when external vision is fused.")
+    return Unavailable(f"position source {name}", reason, remedy)
+
+
+def _finished(track: PositionTrack, axes: list[str]) -> PositionTrack | Unavailable:
+    """Drop samples without a position; a track that is too short is none."""
+    samples = track.samples.reindex(columns=POSITION_COLUMNS + POSITION_VARIANCE_COLUMNS)
+    samples = samples[np.isfinite(samples[axes]).all(axis=1)]
+    if len(samples) < MIN_TRACK_SAMPLES:
+        return _unavailable(track.name, f"{len(samples)} finite samples are too few")
+    variances = samples[POSITION_VARIANCE_COLUMNS]
+    samples[POSITION_VARIANCE_COLUMNS] = variances.where(variances > 0)  # 0 and NaN: not given
+    return PositionTrack(
+        track.name, track.rung, track.description, samples, track.frame, track.clock,
+        track.reconstructed, track.topics,
+    )  # fmt: skip
+
+
+def _read_logged(topics: Topics, source: TrackSource) -> PositionTrack | Unavailable:
+    layout = topics.find(source.layouts)
+    if layout is None:
+        return _unavailable(source.name, f"no topic {source.name} in the log")
+    samples = topics.frame(layout)
+    frame = "unknown"
+    for field, names in FRAMES.items():
+        if field in samples and len(samples):
+            frame = names.get(int(samples[field].iloc[-1]), "unknown")
+    if source.name == "estimator_visual_odometry_aligned":
+        frame = "NED"  # rotated by EKF2 itself, whatever the field still says
+    return _finished(
+        PositionTrack(
+            source.name, source.rung, source.description, samples, frame, AUTOPILOT_CLOCK,
+            False, (layout.topic,),
+        ),
+        POSITION_COLUMNS,
+    )  # fmt: skip
+
+
+def _read_aid_observation(topics: Topics) -> PositionTrack | Unavailable:
+    layout = topics.find(AID_OBSERVATION_HORIZONTAL)
+    if layout is None:
+        return _unavailable(AID_SOURCE, f"no topic {AID_SOURCE} in the log")
+    samples = topics.frame(layout)
+    used = [layout.topic]
+    vertical = topics.find(AID_OBSERVATION_VERTICAL)
+    if vertical is not None:
+        # both are stamped with the same external vision sample, so the join is exact
+        height = topics.frame(vertical)
+        samples = pd.merge_asof(
+            samples, height, left_index=True, right_index=True, direction="nearest", tolerance=1e-4
+        )
+        used.append(vertical.topic)
+    # EKF2 stamps its buffer entries EKF2_EV_DELAY earlier than the sender did
+    delay_s = topics.log.parameters.get("EKF2_EV_DELAY", 0.0) * 1e-3
+    samples.index = pd.Index(samples.index.to_numpy() + delay_s, name="time_s")
+    return _finished(
+        PositionTrack(
+            AID_SOURCE, 5, "the observations that EKF2 kept of external vision", samples, "NED",
+            AUTOPILOT_CLOCK, True, tuple(used),
+        ),
+        POSITION_COLUMNS[:2],
+    )  # fmt: skip
+
+
+def _reconstruct(ekf2: Ekf2 | Unavailable) -> PositionTrack | Unavailable:
+    """Position = EKF2's state + innovation (measurement - state), at the innovation's time.
+
+    The innovation may be as old as one interval of the source, so the times are late by up to
+    that; without the source's own stamps nothing better is known.
+    """
+    if isinstance(ekf2, Unavailable):
+        return _unavailable(RECONSTRUCTION, "no EKF2 output")
+    tracks = {}
+    for axis, column in zip(("north", "east", "down"), POSITION_COLUMNS, strict=True):
+        innovations = ekf2.innovations[axis]
+        if isinstance(innovations, pd.DataFrame):
+            tracks[column] = innovations["innovation_m"] + np.interp(
+                innovations.index, ekf2.state.index, ekf2.state[column], left=np.nan, right=np.nan
+            )
+    if not {"north_m", "east_m"} <= tracks.keys():
+        return _unavailable(RECONSTRUCTION, "EKF2 fused no horizontal external vision position")
+    samples = pd.DataFrame({"north_m": tracks["north_m"], "east_m": tracks["east_m"]})
+    if "down_m" in tracks:
+        samples["down_m"] = tracks["down_m"].reindex(samples.index, method="nearest", tolerance=0.1)
+    samples.index.name = "time_s"
+    return _finished(
+        PositionTrack(
+            RECONSTRUCTION, 6, "EKF2's position plus its innovation", samples, "NED",
+            "EKF2's own time; late by up to one interval of the source", True,
+            ("vehicle_local_position", *ekf2.innovation_topics),
+        ),
+        POSITION_COLUMNS[:2],
+    )  # fmt: skip
+
+
+def project(
+    latitude_deg: NDArray[np.float64],
+    longitude_deg: NDArray[np.float64],
+    origin: tuple[float, float],
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """North and east (m) of an origin by the azimuthal equidistant projection that PX4 uses.
+
+    Source: PX4 ``MapProjection::project``, src/lib/geo/geo.cpp (Snyder 1987, equation 25-2).
+    """
+    latitude, longitude = np.radians(latitude_deg), np.radians(longitude_deg)
+    latitude_0, longitude_0 = np.radians(origin[0]), np.radians(origin[1])
+    difference = longitude - longitude_0
+    cosine = np.sin(latitude_0) * np.sin(latitude) + np.cos(latitude_0) * np.cos(
+        latitude
+    ) * np.cos(difference)
+    angle = np.arccos(np.clip(cosine, -1.0, 1.0))
+    k = np.where(angle > 0, angle / np.where(angle > 0, np.sin(angle), 1.0), 1.0)
+    north = k * (
+        np.cos(latitude_0) * np.sin(latitude)
+        - np.sin(latitude_0) * np.cos(latitude) * np.cos(difference)
+    )
+    east = k * np.cos(latitude) * np.sin(difference)
+    return north * EARTH_RADIUS_M, east * EARTH_RADIUS_M
+
+
+def _local_origin(topics: Topics) -> tuple[float, float, float] | None:
+    """EKF2's geographic origin (degrees, degrees, m), where it had one."""
+    layout = topics.find(LOCAL_POSITION)
+    if layout is None:
+        return None
+    local = topics.frame(layout)
+    if "ref_lat" not in local:
+        return None
+    origin = local[["ref_lat", "ref_lon", "ref_alt"]]
+    origin = origin[np.isfinite(origin).all(axis=1) & (origin["ref_lat"] != 0)]
+    if origin.empty:
+        return None
+    latitude, longitude, altitude = origin.iloc[-1]
+    return float(latitude), float(longitude), float(altitude)
+
+
+def _read_gps(topics: Topics) -> PositionTrack | Unavailable:
+    layout = topics.find(GPS)
+    if layout is None:
+        return _unavailable(GPS_SOURCE, f"no topic {GPS_SOURCE} in the log")
+    gps = topics.frame(layout)
+    if "latitude_1e7" in gps:
+        gps["latitude_deg"] = gps["latitude_1e7"] * 1e-7
+        gps["longitude_deg"] = gps["longitude_1e7"] * 1e-7
+        gps["altitude_m"] = gps["altitude_mm"] * 1e-3
+    if "fix_type" in gps:
+        gps = gps[gps["fix_type"] >= GPS_3D_FIX]
+    if gps.empty:
+        return _unavailable(GPS_SOURCE, "the receiver never had a 3D fix")
+    origin = _local_origin(topics) or (
+        float(gps["latitude_deg"].iloc[0]),
+        float(gps["longitude_deg"].iloc[0]),
+        float(gps["altitude_m"].iloc[0]),
+    )
+    north, east = project(
+        gps["latitude_deg"].to_numpy(), gps["longitude_deg"].to_numpy(), origin[:2]
+    )
+    samples = pd.DataFrame(
+        {"north_m": north, "east_m": east, "down_m": origin[2] - gps["altitude_m"].to_numpy()},
+        index=gps.index,
+    )
+    if "eph_m" in gps:
+        samples["north_m2"] = samples["east_m2"] = gps["eph_m"].to_numpy() ** 2 / 2.0
+        samples["down_m2"] = gps["epv_m"].to_numpy() ** 2
+    return _finished(
+        PositionTrack(
+            GPS_SOURCE, 7, "GPS position", samples, "NED", AUTOPILOT_CLOCK, False, (layout.topic,)
+        ),
+        POSITION_COLUMNS,
+    )
+
+
+def read_truth(topics: Topics, positions: tuple[PositionTrack, ...]) -> Truth | Unavailable:
+    """Simulation ground truth, or motion capture where another track feeds EKF2.
+
+    Ground truth that has only latitude and longitude (v1.13 and older) is projected about EKF2's
+    origin, or where EKF2 had none about its own first sample, the simulation's home.
+    """
+    layout = topics.find(TRUTH_LOCAL)
+    if layout is not None:
+        samples = topics.frame(layout).dropna()
+        if len(samples):
+            return Truth(layout.topic, samples)
+    layout = topics.find(TRUTH_GLOBAL)
+    if layout is not None:
+        geo = topics.frame(layout)
+        geo = geo[np.isfinite(geo[["latitude_deg", "longitude_deg"]]).all(axis=1)]
+        if len(geo):
+            origin = _local_origin(topics) or (
+                float(geo["latitude_deg"].iloc[0]),
+                float(geo["longitude_deg"].iloc[0]),
+                float(geo["altitude_m"].iloc[0]),
+            )
+            north, east = project(
+                geo["latitude_deg"].to_numpy(), geo["longitude_deg"].to_numpy(), origin[:2]
+            )
+            samples = pd.DataFrame(
+                {
+                    "north_m": north,
+                    "east_m": east,
+                    "down_m": origin[2] - geo["altitude_m"].to_numpy(),
+                },
+                index=geo.index,
+            ).join(geo.reindex(columns=VELOCITY_COLUMNS))
+            return Truth(layout.topic, samples)
+    fed = any(track.rung in (2, 4, 5, 6) for track in positions)
+    for track in positions:
+        if track.name == "vehicle_mocap_odometry" and fed:
+            return Truth(track.name, track.samples.reindex(columns=POSITION_COLUMNS + VELOCITY_COLUMNS))
+    return Unavailable(
+        "ground truth",
+        "neither simulation ground truth nor motion capture is in the log",
+        "Real flights have truth only from motion capture (send ATT_POS_MOCAP).",
+    )

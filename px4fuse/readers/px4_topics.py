@@ -1,0 +1,327 @@
+"""The table of PX4 topic and field names by generation: data, no ifs elsewhere.
+
+Each quantity lists the layouts in which PX4 has logged it, best first. A reader takes the first
+whose topic holds all its ``columns``; ``optional`` columns are read where they exist. Names are
+from PX4-Autopilot's ``msg/*.msg`` at the release tags named in ``since``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+
+@dataclass(frozen=True)
+class Layout:
+    """One way in which PX4 has logged a quantity.
+
+    Attributes
+    ----------
+    topic : str
+    columns : mapping
+        Our column name to PX4's field name; all must be present.
+    since : str
+        The PX4 releases that log it so.
+    optional : mapping
+        Further columns, read where the topic has them.
+    """
+
+    topic: str
+    columns: Mapping[str, str]
+    since: str
+    optional: Mapping[str, str] = field(default_factory=dict)
+
+
+def _vector(names: list[str], px4_field: str, first: int = 0) -> dict[str, str]:
+    return {name: f"{px4_field}[{first + i}]" for i, name in enumerate(names)}
+
+
+_POSITION = ["north_m", "east_m", "down_m"]
+_VARIANCE = ["north_m2", "east_m2", "down_m2"]
+_VELOCITY = ["north_m_s", "east_m_s", "down_m_s"]
+_FORCE = ["forward_m_s2", "right_m_s2", "down_m_s2"]
+_RATE = ["forward_rad_s", "right_rad_s", "down_rad_s"]
+_QUATERNION = ["w", "x", "y", "z"]
+_XYZ = dict(zip(_POSITION, "xyz", strict=True))
+# pose_covariance is the row-major upper triangle of a 6×6 matrix: diagonal at 0, 6, 11
+_POSE_DIAGONAL = {
+    "north_m2": "pose_covariance[0]",
+    "east_m2": "pose_covariance[6]",
+    "down_m2": "pose_covariance[11]",
+}
+
+IMU = (
+    Layout(
+        "sensor_combined",
+        _vector(_FORCE, "accelerometer_m_s2") | _vector(_RATE, "gyro_rad"),
+        "v1.8",
+        {"accelerometer_offset_us": "accelerometer_timestamp_relative"},
+    ),
+)
+
+ATTITUDE = (Layout("vehicle_attitude", _vector(_QUATERNION, "q"), "v1.8"),)
+
+LOCAL_POSITION = (
+    Layout(
+        "vehicle_local_position",
+        _XYZ | dict(zip(_VELOCITY, ["vx", "vy", "vz"], strict=True)),
+        "v1.8",
+        {
+            "xy_reset_counter": "xy_reset_counter",
+            "z_reset_counter": "z_reset_counter",
+            "vxy_reset_counter": "vxy_reset_counter",
+            "vz_reset_counter": "vz_reset_counter",
+            "delta_north_m": "delta_xy[0]",
+            "delta_east_m": "delta_xy[1]",
+            "delta_down_m": "delta_z",
+            "delta_north_m_s": "delta_vxy[0]",
+            "delta_east_m_s": "delta_vxy[1]",
+            "delta_down_m_s": "delta_vz",
+            "ref_lat": "ref_lat",
+            "ref_lon": "ref_lon",
+            "ref_alt": "ref_alt",
+        },
+    ),
+)
+
+# EKF2's state vector with its variances; the offsets of the variances follow from the lengths
+ESTIMATOR_STATES = (
+    Layout("estimator_states", {}, "v1.12"),
+    Layout("estimator_status", {}, "v1.8 to v1.11"),
+)
+
+# (number of states, number of covariances) -> index of the first velocity and position variance.
+# 24/24: quaternion filter; 24/23 and 25/24: error-state filter with three attitude errors
+# (src/modules/ekf2/EKF/python/ekf_derivation/generated/state.h at v1.15.4 and v1.16).
+COVARIANCE_OFFSETS: Mapping[tuple[int, int], tuple[int, int]] = {
+    (24, 24): (4, 7),
+    (24, 23): (3, 6),
+    (25, 24): (3, 6),
+    (32, 28): (4, 7),  # before v1.9: arrays padded beyond the 24 states of EKF2
+}
+
+SELECTOR = (
+    Layout("estimator_selector_status", {"instance": "primary_instance"}, "v1.12"),
+)
+
+FUSING = (
+    Layout(
+        "estimator_status_flags",
+        {"horizontal": "cs_ev_pos", "vertical": "cs_ev_hgt", "yaw": "cs_ev_yaw"},
+        "v1.12",
+    ),
+    Layout("estimator_status", {"flags": "control_mode_flags"}, "v1.8"),
+)
+# estimator_status.control_mode_flags, msg/EstimatorStatus.msg
+CONTROL_MODE_BITS: Mapping[str, int] = {"horizontal": 12, "yaw": 13, "vertical": 14}
+
+_AID_OPTIONAL = {"fused": "fused", "rejected": "innovation_rejected", "enabled": "fusion_enabled"}
+
+
+def _aid(index: str) -> dict[str, str]:
+    return {
+        "innovation_m": f"innovation{index}",
+        "innovation_variance_m2": f"innovation_variance{index}",
+        "observation_variance_m2": f"observation_variance{index}",
+        "test_ratio": f"test_ratio{index}",
+    }
+
+
+# The per-source record of every fusion attempt, with exact times, since v1.14
+AID_SOURCE: Mapping[str, tuple[Layout, ...]] = {
+    "north": (Layout("estimator_aid_src_ev_pos", _aid("[0]"), "v1.14", _AID_OPTIONAL),),
+    "east": (Layout("estimator_aid_src_ev_pos", _aid("[1]"), "v1.14", _AID_OPTIONAL),),
+    "down": (Layout("estimator_aid_src_ev_hgt", _aid(""), "v1.14", _AID_OPTIONAL),),
+}
+
+
+@dataclass(frozen=True)
+class InnovationLayout:
+    """Innovations, their variances and test ratios, which are separate topics before v1.14.
+
+    ``fields`` gives the field per axis, ``ratio_fields`` that of the test ratio: v1.11 to v1.13
+    store the larger of the two horizontal ratios in element 0.
+    """
+
+    topic: str
+    variance_topic: str
+    ratio_topic: str
+    fields: Mapping[str, str]
+    variance_fields: Mapping[str, str]
+    ratio_fields: Mapping[str, str]
+    since: str
+
+
+_EV_FIELDS = {"north": "ev_hpos[0]", "east": "ev_hpos[1]", "down": "ev_vpos"}
+INNOVATIONS = (
+    InnovationLayout(
+        "estimator_innovations",
+        "estimator_innovation_variances",
+        "estimator_innovation_test_ratios",
+        _EV_FIELDS,
+        _EV_FIELDS,
+        _EV_FIELDS,
+        "v1.11",
+    ),
+    InnovationLayout(
+        "ekf2_innovations",
+        "ekf2_innovations",
+        "",
+        {axis: f"vel_pos_innov[{3 + i}]" for i, axis in enumerate(("north", "east", "down"))},
+        {axis: f"vel_pos_innov_var[{3 + i}]" for i, axis in enumerate(("north", "east", "down"))},
+        {},
+        "v1.8 to v1.10",
+    ),
+)
+
+LAND_DETECTED = (Layout("vehicle_land_detected", {"landed": "landed"}, "v1.8"),)
+
+TRUTH_LOCAL = (
+    Layout(
+        "vehicle_local_position_groundtruth",
+        _XYZ | dict(zip(_VELOCITY, ["vx", "vy", "vz"], strict=True)),
+        "simulation",
+    ),
+)
+TRUTH_GLOBAL = (
+    Layout(
+        "vehicle_global_position_groundtruth",
+        {"latitude_deg": "lat", "longitude_deg": "lon", "altitude_m": "alt"},
+        "simulation",
+        {"north_m_s": "vel_n", "east_m_s": "vel_e", "down_m_s": "vel_d"},
+    ),
+)
+
+GPS = (
+    Layout(
+        "vehicle_gps_position",
+        {
+            "latitude_deg": "latitude_deg",
+            "longitude_deg": "longitude_deg",
+            "altitude_m": "altitude_msl_m",
+        },
+        "v1.14",
+        {"eph_m": "eph", "epv_m": "epv", "fix_type": "fix_type"},
+    ),
+    Layout(
+        "vehicle_gps_position",
+        {"latitude_1e7": "lat", "longitude_1e7": "lon", "altitude_mm": "alt"},
+        "v1.8 to v1.13",
+        {"eph_m": "eph", "epv_m": "epv", "fix_type": "fix_type"},
+    ),
+)
+
+
+@dataclass(frozen=True)
+class TrackSource:
+    """A logged position track: its name for ``--position-source``, and its layouts."""
+
+    name: str
+    rung: int
+    description: str
+    layouts: tuple[Layout, ...]
+
+
+_FRAME_NEW = {"pose_frame": "pose_frame"}
+_FRAME_OLD = {"local_frame": "local_frame"}
+# msg/VehicleOdometry.msg: LOCAL_FRAME_* up to v1.13, POSE_FRAME_* since v1.14
+FRAMES: Mapping[str, Mapping[int, str]] = {
+    "pose_frame": {0: "unknown", 1: "NED", 2: "FRD"},
+    "local_frame": {0: "NED", 1: "FRD", 2: "unknown", 3: "FRD"},
+}
+
+
+def _odometry(topic: str) -> tuple[Layout, ...]:
+    return (
+        Layout(
+            topic,
+            _vector(_POSITION, "position"),
+            "v1.14",
+            _vector(_VARIANCE, "position_variance") | _FRAME_NEW,
+        ),
+        Layout(topic, _XYZ, "v1.9 to v1.13", _POSE_DIAGONAL | _FRAME_OLD),
+    )
+
+
+TRACKS = (
+    TrackSource(
+        "vehicle_visual_odometry",
+        2,
+        "external vision position as PX4 received it",
+        (
+            *_odometry("vehicle_visual_odometry"),
+            Layout("vehicle_vision_position", _XYZ, "v1.8"),
+        ),
+    ),
+    TrackSource(
+        "vehicle_mocap_odometry",
+        3,
+        "motion capture, which EKF2 never fuses",
+        (
+            *_odometry("vehicle_mocap_odometry"),
+            Layout("att_pos_mocap", _XYZ, "v1.8"),
+        ),
+    ),
+    TrackSource(
+        "estimator_visual_odometry_aligned",
+        4,
+        "external vision rotated into EKF2's frame",
+        (
+            Layout(
+                "estimator_visual_odometry_aligned",
+                _XYZ,
+                "v1.12 to v1.13",
+                _POSE_DIAGONAL | _FRAME_OLD,
+            ),
+            Layout("vehicle_visual_odometry_aligned", _XYZ, "v1.10 to v1.11", _POSE_DIAGONAL),
+        ),
+    ),
+)
+
+AID_OBSERVATION_HORIZONTAL = (
+    Layout(
+        "estimator_aid_src_ev_pos",
+        {"north_m": "observation[0]", "east_m": "observation[1]"},
+        "v1.14",
+        {"north_m2": "observation_variance[0]", "east_m2": "observation_variance[1]"},
+    ),
+)
+AID_OBSERVATION_VERTICAL = (
+    Layout(
+        "estimator_aid_src_ev_hgt",
+        {"down_m": "observation"},
+        "v1.14",
+        {"down_m2": "observation_variance"},
+    ),
+)
+
+# Parameters that bear on fusion and on what is logged; only these enter the results
+PARAMETERS = (
+    "EKF2_AID_MASK",
+    "EKF2_EN",
+    "EKF2_EVP_GATE",
+    "EKF2_EVP_NOISE",
+    "EKF2_EV_CTRL",
+    "EKF2_EV_DELAY",
+    "EKF2_EV_NOISE_MD",
+    "EKF2_HGT_MODE",
+    "EKF2_HGT_REF",
+    "EKF2_ACC_NOISE",
+    "EKF2_PREDICT_US",
+    "EKF2_GPS_CTRL",
+    "SDLOG_PROFILE",
+    "SYS_MC_EST_GROUP",
+)
+
+
+def topics() -> list[str]:
+    """Every topic named in this table, sorted: all that a reader needs to decode."""
+    groups = (
+        IMU, ATTITUDE, LOCAL_POSITION, ESTIMATOR_STATES, SELECTOR, FUSING, LAND_DETECTED,
+        TRUTH_LOCAL, TRUTH_GLOBAL, GPS, AID_OBSERVATION_HORIZONTAL, AID_OBSERVATION_VERTICAL,
+        *AID_SOURCE.values(), *(track.layouts for track in TRACKS),
+    )  # fmt: skip
+    names = {layout.topic for group in groups for layout in group}
+    for layout in INNOVATIONS:
+        names |= {layout.topic, layout.variance_topic, layout.ratio_topic}
+    return sorted(names - {""})

@@ -1,0 +1,270 @@
+"""ULog file to topic tables on one clean clock: everything that touches pyulog.
+
+pyulog does the parsing; this module decides what of it can be trusted. Time stamps that are zero,
+go back or jump hours away exist in real logs, and so do topics that were subscribed to twice.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import io
+import struct
+from bisect import bisect_left
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+from pyulog import ULog
+from pyulog.exceptions import ULogException
+
+from px4fuse.errors import LogError
+from px4fuse.flight import Dropout, LogInfo
+from px4fuse.readers.px4_topics import IMU, PARAMETERS, Layout, topics
+
+_MICROSECOND = 1e-6
+# A measurement time stamp further than this from its publication is not on the boot clock
+# (GPS topics before v1.16 carry receiver time, ground truth of v1.13 carries 0).
+MAX_PUBLICATION_LAG_S = 10.0
+# Samples outside the data window by more than this are stale leftovers of an earlier boot phase.
+WINDOW_MARGIN_S = 2.0
+ACCELEROMETER_OFFSET_INVALID_US = 0x7FFFFFFF
+# pyulog walks damaged bytes as though they were messages; these are what that can raise
+_PARSE_ERRORS = (
+    ULogException, struct.error, IndexError, KeyError, ValueError, TypeError, AttributeError,
+    OverflowError, UnicodeError, EOFError, MemoryError, AssertionError,
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Topics:
+    """The decoded topics of one log.
+
+    Attributes
+    ----------
+    log : LogInfo
+        Without notes on single topics; see :attr:`dropped`.
+    tables : mapping from (topic, instance) to mapping from PX4 field name to array
+    zero_us : int
+        Boot time of time zero in µs.
+    dropped : dict
+        Samples dropped for an impossible time stamp, by topic; filled by :meth:`frame`.
+    """
+
+    log: LogInfo
+    tables: dict[tuple[str, int], dict[str, NDArray[Any]]]
+    zero_us: int
+    dropped: dict[str, int]
+
+    def instances(self, topic: str) -> list[int]:
+        """Instances of a topic that hold data, in order."""
+        return sorted(instance for name, instance in self.tables if name == topic)
+
+    def find(self, layouts: tuple[Layout, ...], instance: int | None = None) -> Layout | None:
+        """First layout that this log holds, or None."""
+        for layout in layouts:
+            for name, number in self.tables:
+                if name == layout.topic and instance in (None, number):
+                    table = self.tables[name, number]
+                    if all(column in table for column in layout.columns.values()):
+                        return layout
+        return None
+
+    def frame(self, layout: Layout, instance: int = 0, *, step: bool = False) -> pd.DataFrame:
+        """Read one layout as a frame of float64 columns, indexed by measurement time in s.
+
+        Parameters
+        ----------
+        layout : Layout
+            Must be one that :meth:`find` returned.
+        instance : int
+            Topic instance; the lowest that exists is taken where this one does not.
+        step : bool
+            Whether the topic is a step function, whose stale first sample still holds.
+
+        Returns
+        -------
+        DataFrame
+            Strictly increasing in time; may be empty.
+        """
+        available = self.instances(layout.topic)
+        table = self.tables[layout.topic, instance if instance in available else available[0]]
+        columns = layout.columns | {
+            ours: px4 for ours, px4 in layout.optional.items() if px4 in table
+        }
+        time_us = measurement_time_us(table)
+        keep = increasing(time_us)
+        if len(keep) < len(time_us):
+            self.dropped[layout.topic] = len(time_us) - len(keep)
+        frame = pd.DataFrame(
+            {ours: table[px4][keep].astype(np.float64) for ours, px4 in columns.items()},
+            index=pd.Index((time_us[keep] - self.zero_us) * _MICROSECOND, name="time_s"),
+        )
+        if step:
+            return frame
+        return self.window(frame)
+
+    def window(self, frame: pd.DataFrame) -> pd.DataFrame:
+        """Drop what lies outside the span of the data by more than the margin."""
+        end = self.log.duration_s + WINDOW_MARGIN_S
+        inside = (frame.index >= -WINDOW_MARGIN_S) & (frame.index <= end)
+        return frame[inside]
+
+
+def measurement_time_us(table: dict[str, NDArray[Any]]) -> NDArray[np.int64]:
+    """Time of measurement in µs: ``timestamp_sample`` where it is on the boot clock.
+
+    Publication (``timestamp``) is up to 0.2 s later in EKF2's own topics.
+    """
+    published = table["timestamp"].astype(np.int64)
+    sampled = table.get("timestamp_sample")
+    if sampled is None:
+        return published
+    sampled = sampled.astype(np.int64)
+    lag_s = np.abs(published - sampled) * _MICROSECOND
+    # where only the first message predates its measurement stamp, keep publication for that one
+    plausible = (sampled > 0) & (lag_s <= MAX_PUBLICATION_LAG_S)
+    if np.count_nonzero(plausible) * 2 < len(plausible):
+        return published
+    return np.where(plausible, sampled, published)
+
+
+def increasing(time_us: NDArray[np.int64]) -> NDArray[np.intp]:
+    """Indices of the longest strictly increasing run of positive time stamps.
+
+    A stamp hours ahead must cost one sample, not all that follow it, so the longest increasing
+    subsequence is kept (patience sorting, Fredman 1975) instead of a running maximum.
+    """
+    indices = np.flatnonzero(time_us > 0)
+    stamps = time_us[indices]
+    if len(stamps) < 2 or np.all(np.diff(stamps) > 0):
+        return indices
+    tails: list[int] = []  # smallest last stamp of an increasing run of each length
+    tail_at: list[int] = []  # where that stamp stands
+    previous = np.full(len(stamps), -1, dtype=np.intp)
+    for at, stamp in enumerate(stamps.tolist()):
+        length = bisect_left(tails, stamp)
+        if length:
+            previous[at] = tail_at[length - 1]
+        if length == len(tails):
+            tails.append(stamp)
+            tail_at.append(at)
+        else:
+            tails[length] = stamp
+            tail_at[length] = at
+    run = []
+    at = tail_at[-1]
+    while at >= 0:
+        run.append(at)
+        at = int(previous[at])
+    return indices[np.array(run[::-1], dtype=np.intp)]
+
+
+def read_topics(path: Path) -> Topics:
+    """Decode the topics that px4fuse uses.
+
+    Raises
+    ------
+    LogError
+        The file cannot be read, is no ULog, or holds no data with usable time stamps.
+    """
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise LogError(f"{path.name}: cannot be read ({error.strerror}).") from error
+    chatter = io.StringIO()
+    try:
+        with contextlib.redirect_stdout(chatter):  # pyulog prints what it stumbles over
+            ulog = ULog(io.BytesIO(content), message_name_filter_list=topics())
+            tables = _tables(ulog)
+    except _PARSE_ERRORS as error:
+        raise LogError(
+            f"{path.name}: not a readable ULog ({str(error) or type(error).__name__}). "
+            "Copy the .ulg from the vehicle again."
+        ) from error
+    notes = _corruption_notes(ulog, chatter.getvalue())
+    if not tables:
+        raise LogError(
+            f"{path.name}: a ULog without any of the topics that px4fuse uses "
+            "(no IMU, no position, no EKF2). Record with SDLOG_PROFILE 129."
+        )
+    zero_us, end_us = _data_span(tables, path.name)
+    version = ulog.get_version_info()
+    log = LogInfo(
+        name=path.name,
+        sha256=hashlib.sha256(content).hexdigest(),
+        size_bytes=len(content),
+        format="ULog",
+        firmware=_firmware(ulog.msg_info_dict, version),
+        firmware_hash=str(ulog.msg_info_dict.get("ver_sw", "unknown")),
+        hardware=str(ulog.msg_info_dict.get("ver_hw", "unknown")),
+        boot_time_s=zero_us * _MICROSECOND,
+        duration_s=(end_us - zero_us) * _MICROSECOND,
+        dropouts=tuple(
+            Dropout((d.timestamp - zero_us) * _MICROSECOND, d.duration * 1e-3)
+            for d in ulog.dropouts
+        ),
+        parameters=MappingProxyType(
+            {
+                name: float(ulog.initial_parameters[name])
+                for name in PARAMETERS
+                if isinstance(ulog.initial_parameters.get(name), int | float)
+            }
+        ),
+        notes=notes,
+    )
+    return Topics(log, tables, zero_us, {})
+
+
+def _tables(ulog: ULog) -> dict[tuple[str, int], dict[str, NDArray[Any]]]:
+    """Topic tables; a topic that was subscribed to twice is joined on its common fields."""
+    tables: dict[tuple[str, int], dict[str, NDArray[Any]]] = {}
+    for data in ulog.data_list:
+        if "timestamp" not in data.data:
+            continue
+        key = (data.name, data.multi_id)
+        table = {name: np.asarray(values) for name, values in data.data.items()}
+        if key in tables:
+            first = tables[key]
+            table = {
+                name: np.concatenate([first[name], table[name]]) for name in first if name in table
+            }
+            order = np.argsort(table["timestamp"], kind="stable")
+            table = {name: values[order] for name, values in table.items()}
+        tables[key] = table
+    return tables
+
+
+def _data_span(tables: dict[tuple[str, int], dict[str, NDArray[Any]]], name: str) -> tuple[int, int]:
+    """First and last time (µs) of the IMU, or else of the topic with most samples."""
+    candidates = sorted(tables, key=lambda key: (key[0] != IMU[0].topic, -len(tables[key]["timestamp"])))
+    for key in candidates:
+        time_us = tables[key]["timestamp"].astype(np.int64)
+        kept = time_us[increasing(time_us)]
+        if len(kept):
+            return int(kept[0]), int(kept[-1])
+    raise LogError(
+        f"{name}: every time stamp in it is zero, so nothing can be placed in time. "
+        "The logger ran before the clock did; record again."
+    )
+
+
+def _corruption_notes(ulog: ULog, chatter: str) -> tuple[str, ...]:
+    if not ulog.file_corruption:
+        return ()
+    said = "; ".join(dict.fromkeys(line.strip() for line in chatter.splitlines() if line.strip()))
+    return (f"the file is damaged, what could be read was used ({said or 'pyulog gives no detail'})",)
+
+
+def _firmware(info: dict[str, Any], version: tuple[int, int, int, int] | None) -> str:
+    if version is None:
+        return "unknown"
+    major, minor, patch, kind = version
+    # msg_info ver_sw_release: last byte 0 development, 64 alpha, 128 beta, 192 RC, 255 release
+    suffix = {0: "-dev", 1: "-alpha", 2: "-beta", 3: "-rc"}[kind // 64] if kind != 255 else ""
+    system = str(info.get("sys_name", "PX4"))
+    return f"{system} v{major}.{minor}.{patch}{suffix}"
