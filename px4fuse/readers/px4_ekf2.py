@@ -106,9 +106,7 @@ def _primary_instances(topics: Topics) -> tuple[tuple[float, int], ...]:
         return ((-np.inf, 0),)
     changes = selected[selected.ne(selected.shift())]
     times = [-np.inf, *changes.index[1:]]
-    return tuple(
-        (float(time), int(number)) for time, number in zip(times, changes, strict=True)
-    )
+    return tuple((float(time), int(number)) for time, number in zip(times, changes, strict=True))
 
 
 def _of_primary(
@@ -289,7 +287,10 @@ def _read_joined(
         single = topics.find((Layout(topic, {column: fields[axis]}, layout.since),))
         if single is not None:
             parts[column] = _of_primary(
-                topics, topic, instances, lambda n: topics.frame(single, n)  # noqa: B023
+                topics,
+                topic,
+                instances,
+                lambda n: topics.frame(single, n),  # noqa: B023
             ).dropna()
     if "innovation_m" not in parts or "innovation_variance_m2" not in parts:
         return None

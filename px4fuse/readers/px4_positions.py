@@ -166,9 +166,9 @@ def project(
     latitude, longitude = np.radians(latitude_deg), np.radians(longitude_deg)
     latitude_0, longitude_0 = np.radians(origin[0]), np.radians(origin[1])
     difference = longitude - longitude_0
-    cosine = np.sin(latitude_0) * np.sin(latitude) + np.cos(latitude_0) * np.cos(
-        latitude
-    ) * np.cos(difference)
+    cosine = np.sin(latitude_0) * np.sin(latitude) + np.cos(latitude_0) * np.cos(latitude) * np.cos(
+        difference
+    )
     angle = np.arccos(np.clip(cosine, -1.0, 1.0))
     k = np.where(angle > 0, angle / np.where(angle > 0, np.sin(angle), 1.0), 1.0)
     north = k * (
@@ -267,7 +267,9 @@ def read_truth(topics: Topics, positions: tuple[PositionTrack, ...]) -> Truth | 
     fed = any(track.rung in (2, 4, 5, 6) for track in positions)
     for track in positions:
         if track.name == "vehicle_mocap_odometry" and fed:
-            return Truth(track.name, track.samples.reindex(columns=POSITION_COLUMNS + VELOCITY_COLUMNS))
+            return Truth(
+                track.name, track.samples.reindex(columns=POSITION_COLUMNS + VELOCITY_COLUMNS)
+            )
     return Unavailable(
         "ground truth",
         "neither simulation ground truth nor motion capture is in the log",

@@ -100,9 +100,7 @@ COVARIANCE_OFFSETS: Mapping[tuple[int, int], tuple[int, int]] = {
     (32, 28): (4, 7),  # before v1.9: arrays padded beyond the 24 states of EKF2
 }
 
-SELECTOR = (
-    Layout("estimator_selector_status", {"instance": "primary_instance"}, "v1.12"),
-)
+SELECTOR = (Layout("estimator_selector_status", {"instance": "primary_instance"}, "v1.12"),)
 
 FUSING = (
     Layout(

@@ -239,9 +239,13 @@ def _tables(ulog: ULog) -> dict[tuple[str, int], dict[str, NDArray[Any]]]:
     return tables
 
 
-def _data_span(tables: dict[tuple[str, int], dict[str, NDArray[Any]]], name: str) -> tuple[int, int]:
+def _data_span(
+    tables: dict[tuple[str, int], dict[str, NDArray[Any]]], name: str
+) -> tuple[int, int]:
     """First and last time (µs) of the IMU, or else of the topic with most samples."""
-    candidates = sorted(tables, key=lambda key: (key[0] != IMU[0].topic, -len(tables[key]["timestamp"])))
+    candidates = sorted(
+        tables, key=lambda key: (key[0] != IMU[0].topic, -len(tables[key]["timestamp"]))
+    )
     for key in candidates:
         time_us = tables[key]["timestamp"].astype(np.int64)
         kept = time_us[increasing(time_us)]
@@ -257,13 +261,17 @@ def _corruption_notes(ulog: ULog, chatter: str) -> tuple[str, ...]:
     if not ulog.file_corruption:
         return ()
     said = "; ".join(dict.fromkeys(line.strip() for line in chatter.splitlines() if line.strip()))
-    return (f"the file is damaged, what could be read was used ({said or 'pyulog gives no detail'})",)
+    return (
+        f"the file is damaged, what could be read was used ({said or 'pyulog gives no detail'})",
+    )
 
 
 def _firmware(info: dict[str, Any], version: tuple[int, int, int, int] | None) -> str:
     if version is None:
         return "unknown"
     major, minor, patch, kind = version
+    if (major, minor, patch) == (0, 0, 0):
+        return "PX4 development version"
     # msg_info ver_sw_release: last byte 0 development, 64 alpha, 128 beta, 192 RC, 255 release
     suffix = {0: "-dev", 1: "-alpha", 2: "-beta", 3: "-rc"}[kind // 64] if kind != 255 else ""
     system = str(info.get("sys_name", "PX4"))

@@ -1,0 +1,547 @@
+"""Our filter against EKF2 and ground truth: every number of the report."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pandas as pd
+
+from px4fuse.consistency import Consistency, HorizontalNis, assess, assess_horizontal
+from px4fuse.errors import SettingsError
+from px4fuse.flight import (
+    POSITION_COLUMNS,
+    POSITION_VARIANCE_COLUMNS,
+    VELOCITY_COLUMNS,
+    VELOCITY_VARIANCE_COLUMNS,
+    Ekf2,
+    Flight,
+    PositionTrack,
+    Truth,
+    Unavailable,
+)
+from px4fuse.kalman import Replay, Settings, replay, state_at
+from px4fuse.likelihood import NoiseAsked, noise_asked
+from px4fuse.signals import (
+    Array,
+    Axis,
+    Segment,
+    choose_segment,
+    choose_source,
+    continuous_state,
+    make_axes,
+)
+
+# EKF2 never trusts external vision better than this (ev_pos_control.cpp, EKF2.cpp)
+EKF2_MIN_NOISE_M = 0.01
+MIN_COMMON_SAMPLES = 3
+
+
+@dataclass(frozen=True)
+class FilterSummary:
+    """What one filter did along one axis.
+
+    Attributes
+    ----------
+    consistency : Consistency or Unavailable
+    sigma_p_median_m, sigma_v_median_m_s : float or None
+        Median standard deviations over the segment; None where not logged.
+    sigma_p_before_update_m, sigma_p_after_update_m : float or None
+        Medians just before and just after an update. For EKF2 from S and R: P⁻ = S - R,
+        P⁺ = P⁻R/S.
+    """
+
+    consistency: Consistency | Unavailable
+    sigma_p_median_m: float | None
+    sigma_v_median_m_s: float | None
+    sigma_p_before_update_m: float | None
+    sigma_p_after_update_m: float | None
+
+
+@dataclass(frozen=True)
+class Difference:
+    """Ours minus EKF2, at EKF2's own sample times."""
+
+    count: int
+    position_rmse_m: float
+    position_mean_m: float
+    position_maximum_m: float
+    velocity_rmse_m_s: float
+    velocity_mean_m_s: float
+    velocity_maximum_m_s: float
+
+
+@dataclass(frozen=True)
+class AgainstTruth:
+    """One filter against ground truth.
+
+    NEES is per component (1 is consistent); it is strongly autocorrelated within one flight, so
+    no band is stated. None where the variance or the true velocity is not logged.
+    """
+
+    count: int
+    position_rmse_m: float
+    velocity_rmse_m_s: float | None
+    nees_position_mean: float | None
+    nees_velocity_mean: float | None
+
+
+@dataclass(frozen=True)
+class AxisComparison:
+    """Everything about one axis.
+
+    Attributes
+    ----------
+    axis : Axis
+    replay : Replay
+    kf, ekf2 : FilterSummary (ekf2 may be Unavailable)
+    ekf2_state : DataFrame or Unavailable
+        ``position_m, velocity_m_s`` in the segment, resets treated as the comparison says.
+    ekf2_variance : DataFrame or Unavailable
+        ``position_variance_m2, velocity_variance_m2_s2`` in the segment.
+    ekf2_innovations : DataFrame or Unavailable
+        Columns as :attr:`Ekf2.innovations`, in the segment, plus ``prior_variance_m2`` and
+        ``posterior_variance_m2`` (P⁻ = S - R and P⁺ = P⁻R/S, NaN where R is unknown).
+    noise_asked : NoiseAsked or None
+        SIGMA_Z that the data ask for at the chosen SIGMA_A.
+    difference : Difference or Unavailable
+    kf_truth, ekf2_truth : AgainstTruth or Unavailable
+    truth : DataFrame or Unavailable
+        ``position_m, velocity_m_s`` in the segment.
+    """
+
+    axis: Axis
+    replay: Replay
+    kf: FilterSummary
+    ekf2: FilterSummary | Unavailable
+    ekf2_state: pd.DataFrame | Unavailable
+    ekf2_variance: pd.DataFrame | Unavailable
+    ekf2_innovations: pd.DataFrame | Unavailable
+    noise_asked: NoiseAsked | None
+    difference: Difference | Unavailable
+    kf_truth: AgainstTruth | Unavailable
+    ekf2_truth: AgainstTruth | Unavailable
+    truth: pd.DataFrame | Unavailable
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """The result of ``px4fuse compare``.
+
+    Attributes
+    ----------
+    flight : Flight
+    source : PositionTrack
+    source_reason : str
+    segment : Segment
+    settings : Settings
+        As used: ``input`` is "zero" where the log has no acceleration.
+    axes : tuple of AxisComparison
+    horizontal_kf, horizontal_ekf2 : HorizontalNis or None
+        North and east together, None unless both were analysed.
+    notes : tuple of str
+        Choices made on the way.
+    missing : tuple of Unavailable
+    """
+
+    flight: Flight
+    source: PositionTrack
+    source_reason: str
+    segment: Segment
+    settings: Settings
+    axes: tuple[AxisComparison, ...]
+    horizontal_kf: HorizontalNis | None
+    horizontal_ekf2: HorizontalNis | None
+    notes: tuple[str, ...]
+    missing: tuple[Unavailable, ...]
+
+
+def compare(
+    flight: Flight,
+    settings: Settings | None = None,
+    *,
+    axes: tuple[str, ...] | None = None,
+    heading_deg: float | None = None,
+    position_source: str | None = None,
+    start_s: float | None = None,
+    end_s: float | None = None,
+    input_required: bool = False,
+    progress: Callable[[str], None] = lambda _: None,
+) -> Comparison:
+    """Replay a flight and compare it with EKF2 and, where there is one, with the truth.
+
+    Parameters
+    ----------
+    flight : Flight
+    settings : Settings, optional
+    axes : tuple of str, optional
+        From "north", "east", "down", "aisle"; by default all that the source supports.
+    heading_deg : float, optional
+        Of the aisle.
+    position_source : str, optional
+        Name of a track of the flight.
+    start_s, end_s : float, optional
+        Segment, seconds from the first data.
+    input_required : bool
+        Raise instead of falling back to ``input="zero"`` where the log has no acceleration.
+    progress : callable
+        Told the name of each axis as it starts.
+
+    Returns
+    -------
+    Comparison
+
+    Raises
+    ------
+    MissingDataError
+        No position source, or no such axis.
+    SettingsError
+        An empty segment, or no acceleration while ``input_required``.
+    """
+    settings = settings or Settings()
+    track, reason = choose_source(flight, position_source)
+    segment = choose_segment(flight, track, start_s, end_s)
+    lines = make_axes(
+        flight, track, segment,
+        names=axes, heading_deg=heading_deg, clock_offset_s=settings.clock_offset_s,
+    )  # fmt: skip
+    missing = list(flight.missing)
+    notes = list(flight.log.notes)
+    acceleration = lines[0].acceleration
+    if settings.input == "imu" and isinstance(acceleration, Unavailable):
+        if input_required:
+            raise SettingsError(f"{flight.log.name}: --input imu: {acceleration}")
+        settings = replace(settings, input="zero")
+        notes.append(f"no acceleration input ({acceleration.reason}): constant velocity was used")
+        if acceleration not in missing:
+            missing.append(acceleration)
+    state: pd.DataFrame | Unavailable
+    if isinstance(flight.ekf2, Unavailable):
+        state = flight.ekf2
+    else:
+        state, statement = continuous_state(flight.ekf2, track, segment)
+        notes += [f"EKF2 {statement}"] if statement else []
+        notes += flight.ekf2.notes
+    results = []
+    for line in lines:
+        progress(line.name)
+        results.append(_compare_axis(flight, track, segment, line, settings, state))
+    return Comparison(
+        flight=flight,
+        source=track,
+        source_reason=reason,
+        segment=segment,
+        settings=settings,
+        axes=tuple(results),
+        horizontal_kf=_horizontal(results, lambda axis: axis.replay.updates),
+        horizontal_ekf2=_horizontal(results, lambda axis: axis.ekf2_innovations),
+        notes=tuple(notes),
+        missing=tuple(missing),
+    )
+
+
+def _cut(frame: pd.DataFrame, segment: Segment) -> pd.DataFrame:
+    return frame[(frame.index >= segment.start_s) & (frame.index <= segment.end_s)]
+
+
+def _along(frame: pd.DataFrame, columns: list[str], weights: Array) -> Array:
+    """Weighted sum of columns; a zero weight ignores a NaN."""
+    total = np.zeros(len(frame))
+    for column, weight in zip(columns, weights, strict=True):
+        if weight != 0.0:
+            total += weight * frame[column].to_numpy()
+    return total
+
+
+def _compare_axis(
+    flight: Flight,
+    track: PositionTrack,
+    segment: Segment,
+    axis: Axis,
+    settings: Settings,
+    state: pd.DataFrame | Unavailable,
+) -> AxisComparison:
+    run = replay(axis, settings)
+    truth = _project_truth(flight.truth, axis, segment)
+    kf = FilterSummary(
+        consistency=assess(
+            run.updates["innovation_m"].to_numpy(),
+            run.updates["innovation_variance_m2"].to_numpy(),
+        ),
+        sigma_p_median_m=_median_sigma(run.steps["position_variance_m2"]),
+        sigma_v_median_m_s=_median_sigma(run.steps["velocity_variance_m2_s2"]),
+        sigma_p_before_update_m=_median_sigma(run.updates["prior_position_variance_m2"]),
+        sigma_p_after_update_m=_median_sigma(
+            run.steps["position_variance_m2"].reindex(run.updates.index)
+        ),
+    )
+    if isinstance(flight.ekf2, Unavailable) or isinstance(state, Unavailable):
+        none = flight.ekf2 if isinstance(flight.ekf2, Unavailable) else state
+        times = run.steps.index.to_numpy()
+        return AxisComparison(
+            axis=axis, replay=run, kf=kf, ekf2=none, ekf2_state=none, ekf2_variance=none,
+            ekf2_innovations=none, noise_asked=noise_asked(axis, settings), difference=none,
+            kf_truth=_kf_against_truth(run, truth, times), ekf2_truth=none, truth=truth,
+        )  # fmt: skip
+    ekf2_state = _project_state(state, axis, segment)
+    ekf2_variance = _project_variance(flight.ekf2, axis, segment)
+    ekf2_innovations = _project_innovations(flight, track, axis, segment)
+    times = ekf2_state.index.to_numpy()
+    return AxisComparison(
+        axis=axis,
+        replay=run,
+        kf=kf,
+        ekf2=_ekf2_summary(flight.ekf2, ekf2_variance, ekf2_innovations),
+        ekf2_state=ekf2_state,
+        ekf2_variance=ekf2_variance,
+        ekf2_innovations=ekf2_innovations,
+        noise_asked=noise_asked(axis, settings),
+        difference=_difference(run, ekf2_state),
+        kf_truth=_kf_against_truth(run, truth, times),
+        ekf2_truth=_ekf2_against_truth(ekf2_state, ekf2_variance, truth),
+        truth=truth,
+    )
+
+
+def _median_sigma(variance: pd.Series) -> float | None:
+    variance = variance.dropna()
+    return float(np.sqrt(variance.median())) if len(variance) else None
+
+
+def _project_state(state: pd.DataFrame, axis: Axis, segment: Segment) -> pd.DataFrame:
+    cut = _cut(state, segment)
+    return pd.DataFrame(
+        {
+            "position_m": _along(cut, POSITION_COLUMNS, axis.direction),
+            "velocity_m_s": _along(cut, VELOCITY_COLUMNS, axis.direction),
+        },
+        index=cut.index,
+    )
+
+
+def _project_variance(ekf2: Ekf2, axis: Axis, segment: Segment) -> pd.DataFrame | Unavailable:
+    """Variances along the axis; EKF2 logs no covariance between axes, so none is added."""
+    if isinstance(ekf2.variance, Unavailable):
+        return ekf2.variance
+    cut = _cut(ekf2.variance, segment)
+    if cut.empty:
+        return Unavailable("EKF2 variances", "no sample in the segment", "Analyse more of the log.")
+    weights = axis.direction**2
+    position = _along(cut, POSITION_VARIANCE_COLUMNS, weights)
+    return pd.DataFrame(
+        {
+            "position_variance_m2": position,
+            "velocity_variance_m2_s2": _along(cut, VELOCITY_VARIANCE_COLUMNS, weights),
+        },
+        index=cut.index,
+    )
+
+
+def _project_innovations(
+    flight: Flight, track: PositionTrack, axis: Axis, segment: Segment
+) -> pd.DataFrame | Unavailable:
+    """EKF2's innovations along the axis, with its variances just before and after each update."""
+    assert not isinstance(flight.ekf2, Unavailable)
+    innovations = flight.ekf2.innovations
+    if axis.name in ("north", "east", "down"):
+        frame = innovations[axis.name]  # type: ignore[index]
+        if isinstance(frame, Unavailable):
+            return frame
+        cut = _cut(frame, segment).copy()
+    else:
+        north, east = innovations["north"], innovations["east"]
+        if isinstance(north, Unavailable):
+            return north
+        if isinstance(east, Unavailable):
+            return east
+        common = _cut(north, segment).index.intersection(east.index)
+        north, east = north.loc[common], east.loc[common]
+        c, s = float(axis.direction[0]), float(axis.direction[1])
+        cut = c * c * north + s * s * east  # variances; the rest is set below
+        cut["innovation_m"] = c * north["innovation_m"] + s * east["innovation_m"]
+        for column in ("test_ratio", "fused", "rejected"):
+            # the larger: before v1.14 PX4 keeps one ratio for both; a rejection is of the vector
+            cut[column] = np.fmax(north[column], east[column])
+    if cut.empty:
+        return Unavailable(
+            "EKF2 innovations", "no sample in the segment", "Analyse more of the log."
+        )
+    r = cut["observation_variance_m2"].fillna(observation_variance(flight, track, axis, segment))
+    s_total = cut["innovation_variance_m2"]
+    prior = (s_total - r).where(s_total > r)
+    cut["observation_variance_m2"] = r
+    cut["prior_variance_m2"] = prior
+    cut["posterior_variance_m2"] = prior * r / s_total
+    return cut
+
+
+def observation_variance(
+    flight: Flight, track: PositionTrack, axis: Axis, segment: Segment
+) -> float:
+    """R (m²) that EKF2 used for external vision where it does not log it, NaN if unknown.
+
+    R = EKF2_EVP_NOISE², or the sender's variance if larger, unless EKF2_EV_NOISE_MD is 1
+    (EKF2.cpp, ev_pos_control.cpp).
+    """
+    parameters = flight.log.parameters
+    if "EKF2_EVP_NOISE" not in parameters:
+        return float("nan")
+    r = max(parameters["EKF2_EVP_NOISE"], EKF2_MIN_NOISE_M) ** 2
+    if parameters.get("EKF2_EV_NOISE_MD") == 1.0:
+        return r
+    reported = _cut(track.samples, segment)[POSITION_VARIANCE_COLUMNS].median()
+    along = float(np.nansum(reported.to_numpy() * axis.direction**2))
+    return max(r, along)
+
+
+def _ekf2_summary(
+    ekf2: Ekf2, variance: pd.DataFrame | Unavailable, innovations: pd.DataFrame | Unavailable
+) -> FilterSummary:
+    if isinstance(innovations, Unavailable):
+        consistency: Consistency | Unavailable = innovations
+        before = after = None
+    else:
+        consistency = assess(
+            innovations["innovation_m"].to_numpy(),
+            innovations["innovation_variance_m2"].to_numpy(),
+            ekf2.gate,
+        )
+        before = _median_sigma(innovations["prior_variance_m2"])
+        after = _median_sigma(innovations["posterior_variance_m2"])
+    known = isinstance(variance, pd.DataFrame)
+    return FilterSummary(
+        consistency=consistency,
+        sigma_p_median_m=_median_sigma(variance["position_variance_m2"]) if known else None,
+        sigma_v_median_m_s=_median_sigma(variance["velocity_variance_m2_s2"]) if known else None,
+        sigma_p_before_update_m=before,
+        sigma_p_after_update_m=after,
+    )
+
+
+def _difference(run: Replay, ekf2_state: pd.DataFrame) -> Difference | Unavailable:
+    position, velocity = state_at(run, ekf2_state.index.to_numpy())
+    dp = position - ekf2_state["position_m"].to_numpy()
+    dv = velocity - ekf2_state["velocity_m_s"].to_numpy()
+    common = np.isfinite(dp) & np.isfinite(dv)
+    dp, dv = dp[common], dv[common]
+    if len(dp) < MIN_COMMON_SAMPLES:
+        return Unavailable(
+            "difference to EKF2",
+            f"{len(dp)} common samples in the segment",
+            "Choose a segment in which EKF2 runs.",
+        )
+    return Difference(
+        count=len(dp),
+        position_rmse_m=_rmse(dp),
+        position_mean_m=float(np.mean(dp)),
+        position_maximum_m=float(np.max(np.abs(dp))),
+        velocity_rmse_m_s=_rmse(dv),
+        velocity_mean_m_s=float(np.mean(dv)),
+        velocity_maximum_m_s=float(np.max(np.abs(dv))),
+    )
+
+
+def _rmse(error: Array) -> float:
+    return float(np.sqrt(np.mean(error**2)))
+
+
+def _project_truth(
+    truth: Truth | Unavailable, axis: Axis, segment: Segment
+) -> pd.DataFrame | Unavailable:
+    if isinstance(truth, Unavailable):
+        return truth
+    projected = _project_state(truth.samples, axis, segment)
+    if len(projected) < MIN_COMMON_SAMPLES:
+        return Unavailable(
+            "ground truth",
+            f"{truth.name} has no samples in the segment",
+            "Analyse more of the log.",
+        )
+    return projected
+
+
+def _kf_against_truth(
+    run: Replay, truth: pd.DataFrame | Unavailable, times: Array
+) -> AgainstTruth | Unavailable:
+    if isinstance(truth, Unavailable):
+        return truth
+    position, velocity = state_at(run, times)
+    variances = [
+        np.interp(times, run.steps.index, run.steps[column])
+        for column in ("position_variance_m2", "velocity_variance_m2_s2")
+    ]
+    return _against_truth(times, (position, velocity), times, (variances[0], variances[1]), truth)
+
+
+def _ekf2_against_truth(
+    state: pd.DataFrame, variance: pd.DataFrame | Unavailable, truth: pd.DataFrame | Unavailable
+) -> AgainstTruth | Unavailable:
+    if isinstance(truth, Unavailable):
+        return truth
+    columns = state["position_m"].to_numpy(), state["velocity_m_s"].to_numpy()
+    times = state.index.to_numpy()
+    if isinstance(variance, Unavailable):
+        return _against_truth(times, columns, None, None, truth)
+    # EKF2's variances are logged at a tenth of the state's rate: NEES at their own times
+    return _against_truth(
+        times,
+        columns,
+        variance.index.to_numpy(),
+        (
+            variance["position_variance_m2"].to_numpy(),
+            variance["velocity_variance_m2_s2"].to_numpy(),
+        ),
+        truth,
+    )
+
+
+def _against_truth(
+    times: Array,
+    state: tuple[Array, Array],
+    variance_times: Array | None,
+    variances: tuple[Array, Array] | None,
+    truth: pd.DataFrame,
+) -> AgainstTruth | Unavailable:
+    errors = [
+        values - np.interp(times, truth.index, truth[column], left=np.nan, right=np.nan)
+        for values, column in zip(state, ("position_m", "velocity_m_s"), strict=True)
+    ]
+    finite = np.isfinite(errors[0])
+    if np.count_nonzero(finite) < MIN_COMMON_SAMPLES:
+        return Unavailable(
+            "difference to truth", "no common samples", "Choose a segment that the truth covers."
+        )
+    nees: list[float | None] = [None, None]
+    if variances is not None and variance_times is not None:
+        for i, (error, variance) in enumerate(zip(errors, variances, strict=True)):
+            known = np.isfinite(error)
+            if np.any(known):
+                at = np.interp(
+                    variance_times, times[known], error[known], left=np.nan, right=np.nan
+                )
+                nees[i] = float(np.nanmean(at**2 / variance))
+    velocity_known = np.isfinite(errors[1])
+    return AgainstTruth(
+        count=int(np.count_nonzero(finite)),
+        position_rmse_m=_rmse(errors[0][finite]),
+        velocity_rmse_m_s=_rmse(errors[1][velocity_known]) if np.any(velocity_known) else None,
+        nees_position_mean=nees[0],
+        nees_velocity_mean=nees[1],
+    )
+
+
+def _horizontal(
+    results: list[AxisComparison], frame_of: Callable[[AxisComparison], pd.DataFrame | Unavailable]
+) -> HorizontalNis | None:
+    frames = {}
+    for result in results:
+        frame = frame_of(result)
+        if isinstance(frame, pd.DataFrame):
+            frames[result.axis.name] = (
+                frame["innovation_m"].to_numpy(),
+                frame["innovation_variance_m2"].to_numpy(),
+            )
+    if not {"north", "east"} <= frames.keys():
+        return None
+    return assess_horizontal(frames["north"], frames["east"])

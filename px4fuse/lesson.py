@@ -1,0 +1,71 @@
+"""The lesson's worked examples through px4fuse's own engine.
+
+Source: UAT 366, module 2, "SLAM and sensor fusion", Example 1.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from px4fuse.flight import Unavailable
+from px4fuse.kalman import InitialState, Replay, Settings, replay
+from px4fuse.signals import Axis
+
+TRUE_VELOCITY_M_S = 1.0
+STEPS = 30
+STEPS_PER_UPDATE = 5
+# Fixed values standing in for noise, as in the lesson (m).
+UWB_NOISE_M = (0.08, -0.12, 0.05, 0.10, -0.06, -0.09)
+
+
+@dataclass(frozen=True)
+class LessonUpdate:
+    """State after one UWB update of Example 1 (s, m, m/s)."""
+
+    time_s: float
+    true_position_m: float
+    position_m: float
+    velocity_m_s: float
+    sigma_p_m: float
+    sigma_v_m_s: float
+
+    def __str__(self) -> str:
+        return (
+            f"t {self.time_s:.1f} s: p {self.position_m:.2f} (true {self.true_position_m:.2f}), "
+            f"v {self.velocity_m_s:.2f}, sigma_p {self.sigma_p_m:.3f} m, "
+            f"sigma_v {self.sigma_v_m_s:.3f} m/s"
+        )
+
+
+def example_1() -> Replay:
+    """Run Example 1: UWB every 0.5 s on an aisle at 1 m/s, velocity unknown at first."""
+    settings = Settings(sigma_a_m_s2=0.5, sigma_z_m=0.10, dt_s=0.1, input="zero")
+    time = settings.dt_s * np.arange(STEPS_PER_UPDATE, STEPS + 1, STEPS_PER_UPDATE)
+    axis = Axis(
+        name="aisle",
+        direction=np.array([1.0, 0.0, 0.0]),
+        heading_deg=0.0,
+        note="the lesson's aisle",
+        measurement_time_s=time,
+        measurement_m=TRUE_VELOCITY_M_S * time + np.array(UWB_NOISE_M),
+        acceleration=Unavailable("acceleration", "the lesson's IMU measures zero", "none needed"),
+    )
+    return replay(axis, settings, InitialState(time_s=0.0, position_m=0.0))
+
+
+def kalman_lines() -> Iterator[LessonUpdate]:
+    """Yield the six updates of Example 1; ``str`` of each is the lesson's line."""
+    run = example_1()
+    for time, row in run.steps.loc[run.updates.index].iterrows():
+        seconds = float(str(time))
+        yield LessonUpdate(
+            time_s=seconds,
+            true_position_m=TRUE_VELOCITY_M_S * seconds,
+            position_m=row["position_m"],
+            velocity_m_s=row["velocity_m_s"],
+            sigma_p_m=float(np.sqrt(row["position_variance_m2"])),
+            sigma_v_m_s=float(np.sqrt(row["velocity_variance_m2_s2"])),
+        )

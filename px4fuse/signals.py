@@ -1,0 +1,497 @@
+"""Frames, gravity, the aisle axis and resampling: Flight → one-dimensional signals.
+
+NED acceleration = R(q) · specific force + [0, 0, g] (Groves 2013, equation 5.52 without earth rate).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+from numpy.typing import ArrayLike, NDArray
+from scipy.integrate import cumulative_trapezoid
+from scipy.spatial.transform import Rotation, Slerp
+
+from px4fuse.errors import MissingDataError, SettingsError
+from px4fuse.flight import (
+    AXIS_NAMES,
+    POSITION_COLUMNS,
+    QUATERNION_COLUMNS,
+    SPECIFIC_FORCE_COLUMNS,
+    VELOCITY_COLUMNS,
+    Ekf2,
+    Flight,
+    PositionTrack,
+    Unavailable,
+)
+
+Array = NDArray[np.float64]
+
+STANDARD_GRAVITY_M_S2 = 9.80665
+AISLE = "aisle"
+# An IMU interval is a gap when it is longer than this and than five median intervals.
+IMU_GAP_S = 0.1
+IMU_GAP_INTERVALS = 5.0
+MIN_MEASUREMENTS = 3
+# Undoing resets must bring EKF2 this much closer to the measurements (median squared distance);
+# below that the published output, which the vehicle flew on, stands.
+CLEARLY_CLOSER = 0.95
+# The GPS rung is taken only when asked for.
+LAST_AUTOMATIC_RUNG = 6
+
+
+@dataclass(frozen=True)
+class Segment:
+    """The part of the flight that is analysed: start and end (s), and why these."""
+
+    start_s: float
+    end_s: float
+    reason: str
+
+
+@dataclass(frozen=True)
+class Acceleration:
+    """Acceleration along one axis.
+
+    Attributes
+    ----------
+    time_s : ndarray, shape (n,)
+    value_m_s2 : ndarray, shape (n,)
+        Gravity removed.
+    integral_m_s : ndarray, shape (n,)
+        Trapezoidal integral from the first sample, for averages over steps.
+    gap_integral_s : ndarray, shape (n,)
+        Seconds of gap passed since the first sample.
+    rms_m_s2 : float
+        Root mean square of the signal: how wrong the input may be inside a gap.
+    """
+
+    time_s: Array
+    value_m_s2: Array
+    integral_m_s: Array
+    gap_integral_s: Array
+    rms_m_s2: float
+
+
+@dataclass(frozen=True)
+class Axis:
+    """The flight along one direction.
+
+    Attributes
+    ----------
+    name : str
+        "north", "east", "down" or "aisle".
+    direction : ndarray, shape (3,)
+        Unit vector in NED.
+    heading_deg : float or None
+        Of horizontal axes, clockwise from north.
+    note : str
+        How the direction was found, where that is a choice; else empty.
+    measurement_time_s, measurement_m : ndarray, shape (n,)
+        Position measurements along the axis; n ≥ 3.
+    acceleration : Acceleration or Unavailable
+        The filter's input.
+    """
+
+    name: str
+    direction: Array
+    heading_deg: float | None
+    note: str
+    measurement_time_s: Array
+    measurement_m: Array
+    acceleration: Acceleration | Unavailable
+
+
+def choose_source(flight: Flight, name: str | None = None) -> tuple[PositionTrack, str]:
+    """Choose the position source by the ladder, or by name.
+
+    Parameters
+    ----------
+    flight : Flight
+    name : str, optional
+        One of the track names; by default the best rung short of GPS.
+
+    Returns
+    -------
+    track : PositionTrack
+    reason : str
+        One sentence: why this one.
+
+    Raises
+    ------
+    MissingDataError
+        The log holds no (such) track; the text says what was looked for and what would log it.
+    """
+    have = ", ".join(track.name for track in flight.positions) or "none"
+    if name is not None:
+        for track in flight.positions:
+            if track.name == name:
+                return track, "chosen with --position-source"
+        looked = {missing.what.split()[-1]: missing for missing in flight.missing}
+        reason = looked[name].reason if name in looked else "no such source"
+        raise MissingDataError(
+            f"{flight.log.name}: position source {name}: {reason}. This log has: {have}."
+        )
+    for track in flight.positions:
+        if track.rung <= LAST_AUTOMATIC_RUNG:
+            return track, _ladder_reason(flight, track)
+    gps = any(track.rung > LAST_AUTOMATIC_RUNG for track in flight.positions)
+    hint = (
+        "Only GPS is in it: give --position-source vehicle_gps_position to use that, or s"
+        if gps
+        else "S"
+    )
+    raise MissingDataError(
+        f"{flight.log.name}: no external position in this log (no vehicle_visual_odometry, motion "
+        f"capture or EKF2 innovations of external vision). {hint}et SDLOG_PROFILE to 129 and send "
+        "the UWB position to PX4 as VISION_POSITION_ESTIMATE."
+    )
+
+
+def _ladder_reason(flight: Flight, track: PositionTrack) -> str:
+    passed = [
+        missing.what.removeprefix("position source ")
+        for missing in flight.missing
+        if missing.what.startswith("position source ")
+        and missing.what.split()[-1]
+        in (
+            "vehicle_visual_odometry",
+            "vehicle_mocap_odometry",
+            "estimator_visual_odometry_aligned",
+        )
+    ]
+    if track.rung == 2 or not passed:
+        return "the best source: logged as it arrived"
+    return f"the best that this log has; not in it: {', '.join(passed)}"
+
+
+def choose_segment(
+    flight: Flight,
+    track: PositionTrack,
+    start_s: float | None = None,
+    end_s: float | None = None,
+) -> Segment:
+    """Choose the part of the log to analyse: where the source runs and the vehicle flies.
+
+    Parameters
+    ----------
+    flight : Flight
+    track : PositionTrack
+    start_s, end_s : float, optional
+        Override either end (seconds from the first data).
+
+    Raises
+    ------
+    SettingsError
+        The chosen part is empty or holds fewer than three measurements.
+    """
+    source_start, source_end = float(track.samples.index[0]), float(track.samples.index[-1])
+    low, high = max(source_start, 0.0), min(source_end, flight.log.duration_s)
+    if isinstance(flight.airborne, Unavailable):
+        reason = "the whole span of the position source: the log has no land detector"
+    elif not flight.airborne:
+        reason = "the whole span of the position source: the vehicle never took off"
+    else:
+        take_off, touch_down = flight.airborne[0][0], flight.airborne[-1][1]
+        if max(low, take_off) < min(high, touch_down):
+            low, high = max(low, take_off), min(high, touch_down)
+            reason = "where the position source runs and the vehicle flies (land detector)"
+        else:
+            reason = "the whole span of the position source: it does not run in flight"
+    if start_s is not None or end_s is not None:
+        low = low if start_s is None else start_s
+        high = high if end_s is None else end_s
+        given = [
+            text for text, value in (("--start", start_s), ("--end", end_s)) if value is not None
+        ]
+        reason = f"chosen with {' and '.join(given)}"
+    if not low < high:
+        raise SettingsError(
+            f"{flight.log.name}: the segment from {low:.2f} s to {high:.2f} s is empty; the "
+            f"position source runs from {source_start:.2f} s to {source_end:.2f} s."
+        )
+    inside = np.count_nonzero((track.samples.index >= low) & (track.samples.index <= high))
+    if inside < MIN_MEASUREMENTS:
+        raise SettingsError(
+            f"{flight.log.name}: {inside} measurements of {track.name} between {low:.2f} s and "
+            f"{high:.2f} s are too few (at least {MIN_MEASUREMENTS} are needed)."
+        )
+    return Segment(low, high, reason)
+
+
+def ned_acceleration(flight: Flight) -> pd.DataFrame | Unavailable:
+    """Acceleration in NED with gravity removed, at the IMU's own times.
+
+    The attitude is interpolated on the sphere (slerp, Shoemake 1985), since default logs hold it
+    at a tenth of the IMU's rate.
+
+    Returns
+    -------
+    DataFrame, shape (n, 3), m/s², or Unavailable
+    """
+    if isinstance(flight.imu, Unavailable):
+        return flight.imu
+    if isinstance(flight.attitude, Unavailable):
+        return flight.attitude
+    attitude_time = flight.attitude.index.to_numpy()
+    imu = flight.imu[
+        (flight.imu.index >= attitude_time[0]) & (flight.imu.index <= attitude_time[-1])
+    ]
+    if len(imu) < 2:
+        return Unavailable(
+            "acceleration in NED",
+            "IMU and attitude do not overlap in time",
+            "Record both from boot (SDLOG_MODE 0).",
+        )
+    rotations = Rotation.from_quat(
+        flight.attitude[QUATERNION_COLUMNS].to_numpy(), scalar_first=True
+    )
+    body_to_ned = Slerp(attitude_time, rotations)(imu.index.to_numpy())
+    acceleration = body_to_ned.apply(imu[SPECIFIC_FORCE_COLUMNS].to_numpy())
+    acceleration[:, 2] += STANDARD_GRAVITY_M_S2
+    return pd.DataFrame(acceleration, index=imu.index, columns=list(AXIS_NAMES))
+
+
+def aisle_heading(track: PositionTrack, segment: Segment) -> tuple[float, float]:
+    """Heading of the horizontal principal direction of the track.
+
+    Returns
+    -------
+    heading_deg : float
+        In [0, 180): an aisle has no front.
+    elongation : float
+        Ratio of the standard deviations along and across it (1: no direction is distinct).
+    """
+    horizontal = _cut(track.samples, segment)[POSITION_COLUMNS[:2]].to_numpy()
+    centred = horizontal - horizontal.mean(axis=0)
+    _, singular, directions = np.linalg.svd(centred, full_matrices=False)
+    heading = float(np.degrees(np.arctan2(directions[0, 1], directions[0, 0]))) % 180.0
+    elongation = float(singular[0] / singular[1]) if singular[1] > 0 else float("inf")
+    return heading, elongation
+
+
+def make_axes(
+    flight: Flight,
+    track: PositionTrack,
+    segment: Segment,
+    *,
+    names: tuple[str, ...] | None = None,
+    heading_deg: float | None = None,
+    clock_offset_s: float = 0.0,
+) -> tuple[Axis, ...]:
+    """Project a flight on its axes.
+
+    Parameters
+    ----------
+    flight : Flight
+    track : PositionTrack
+    segment : Segment
+    names : tuple of str, optional
+        From "north", "east", "down", "aisle"; by default all that the source supports.
+    heading_deg : float, optional
+        Of the aisle, clockwise from north; by default the horizontal principal direction.
+    clock_offset_s : float
+        Added to the position source's time stamps.
+
+    Raises
+    ------
+    MissingDataError
+        An axis was asked for that the source has no finite samples for.
+    """
+    samples = track.samples.copy()
+    samples.index = pd.Index(samples.index.to_numpy() + clock_offset_s, name="time_s")
+    samples = _cut(samples, segment)
+    acceleration = ned_acceleration(flight)
+    asked = names if names is not None else (*AXIS_NAMES, AISLE)
+    axes = []
+    for name in asked:
+        direction, heading, note = _direction(name, track, segment, heading_deg)
+        projected = samples[POSITION_COLUMNS].to_numpy() @ np.where(direction == 0, 0, direction)
+        if name == "down":
+            projected = samples["down_m"].to_numpy()
+        elif direction[2] == 0:
+            projected = samples[POSITION_COLUMNS[:2]].to_numpy() @ direction[:2]
+        finite = np.isfinite(projected)
+        if np.count_nonzero(finite) < MIN_MEASUREMENTS:
+            if names is None:
+                continue
+            raise MissingDataError(
+                f"{flight.log.name}: {track.name} has no position along {name} in this segment."
+            )
+        axes.append(
+            Axis(
+                name=name,
+                direction=direction,
+                heading_deg=heading,
+                note=note,
+                measurement_time_s=samples.index.to_numpy()[finite],
+                measurement_m=projected[finite],
+                acceleration=acceleration
+                if isinstance(acceleration, Unavailable)
+                else project_acceleration(acceleration, direction, segment),
+            )
+        )
+    return tuple(axes)
+
+
+def _direction(
+    name: str, track: PositionTrack, segment: Segment, heading_deg: float | None
+) -> tuple[Array, float | None, str]:
+    if name != AISLE:
+        at = AXIS_NAMES.index(name)  # type: ignore[arg-type]
+        return np.eye(3)[at], (None if name == "down" else 90.0 * at), ""
+    if heading_deg is None:
+        heading, elongation = aisle_heading(track, segment)
+        note = f"horizontal principal direction, {elongation:.1f} times longer than wide"
+    else:
+        heading, note = heading_deg, "given with --heading"
+    angle = np.radians(heading)
+    return np.array([np.cos(angle), np.sin(angle), 0.0]), heading, note
+
+
+def project_acceleration(
+    acceleration: pd.DataFrame, direction: Array, segment: Segment
+) -> Acceleration | Unavailable:
+    """Acceleration along a direction, with what step averages need.
+
+    Parameters
+    ----------
+    acceleration : DataFrame, shape (n, 3), m/s², NED
+    direction : ndarray, shape (3,)
+    segment : Segment
+        Only for the root mean square.
+    """
+    time = acceleration.index.to_numpy()
+    value = acceleration.to_numpy() @ direction
+    inside = (time >= segment.start_s) & (time <= segment.end_s)
+    if np.count_nonzero(inside) < 2:
+        return Unavailable(
+            "IMU", "no IMU sample in the analysed segment", "Choose --start and --end inside it."
+        )
+    interval = np.diff(time)
+    is_gap = interval > max(IMU_GAP_S, IMU_GAP_INTERVALS * float(np.median(interval)))
+    return Acceleration(
+        time_s=time,
+        value_m_s2=value,
+        integral_m_s=cumulative_trapezoid(value, time, initial=0.0),
+        gap_integral_s=np.concatenate([[0.0], np.cumsum(np.where(is_gap, interval, 0.0))]),
+        rms_m_s2=float(np.sqrt(np.mean(value[inside] ** 2))),
+    )
+
+
+def step_means(acceleration: Acceleration, edges: ArrayLike) -> tuple[Array, Array]:
+    """Mean acceleration over each step, and the fraction of it that lies in an IMU gap.
+
+    Parameters
+    ----------
+    acceleration : Acceleration
+    edges : array_like, shape (n + 1,)
+        Strictly increasing times in s.
+
+    Returns
+    -------
+    mean_m_s2 : ndarray, shape (n,)
+    gap_fraction : ndarray, shape (n,)
+        1 also where the step lies outside the IMU's span, where the mean is 0.
+    """
+    edges = np.asarray(edges, dtype=np.float64)
+    length = np.diff(edges)
+    velocity = np.interp(edges, acceleration.time_s, acceleration.integral_m_s)
+    gap = np.interp(edges, acceleration.time_s, acceleration.gap_integral_s)
+    covered = np.clip(edges, acceleration.time_s[0], acceleration.time_s[-1])
+    outside = 1.0 - np.diff(covered) / length
+    return np.diff(velocity) / length, np.clip(np.diff(gap) / length + outside, 0.0, 1.0)
+
+
+def _cut(frame: pd.DataFrame, segment: Segment) -> pd.DataFrame:
+    return frame[(frame.index >= segment.start_s) & (frame.index <= segment.end_s)]
+
+
+def continuous_state(
+    ekf2: Ekf2, track: PositionTrack, segment: Segment
+) -> tuple[pd.DataFrame, str]:
+    """EKF2's state with its resets undone, where undoing them is right.
+
+    A reset that changes EKF2's frame must be undone before positions are compared. A reset that
+    moves EKF2 back onto the measurements corrects an error, and undoing it would carry that error
+    through the rest of the flight. The measurements decide: the resets are undone where that
+    brings the series clearly closer to them (median distance).
+
+    Parameters
+    ----------
+    ekf2 : Ekf2
+    track : PositionTrack
+    segment : Segment
+
+    Returns
+    -------
+    state : DataFrame
+        Position and velocity as in :attr:`Ekf2.state`.
+    statement : str
+        What was done, empty where there was no reset in the segment.
+    """
+    inside = [r for r in ekf2.resets if segment.start_s < r.time_s <= segment.end_s]
+    if not inside:
+        return ekf2.state, ""
+    state = ekf2.state.copy()
+    kept, undone = [], []
+    groups = (
+        ("horizontal position", "position", POSITION_COLUMNS[:2], [0, 1]),
+        ("height", "position", POSITION_COLUMNS[2:], [2]),
+        ("velocity", "velocity", VELOCITY_COLUMNS, [0, 1, 2]),
+    )
+    for label, quantity, columns, axes in groups:
+        deltas = np.array(
+            [[r.delta[axis] if r.quantity == quantity else 0.0 for axis in axes] for r in inside]
+        )
+        times = np.array([r.time_s for r in inside])
+        real = np.any(deltas != 0, axis=1)
+        count = int(np.count_nonzero(real))
+        if not count:
+            continue
+        if quantity == "velocity":  # a velocity has no frame origin to lose
+            kept.append(f"{count} of {label}")
+            continue
+        published = ekf2.state[columns]
+        candidate = _undo(published, times[real], deltas[real], track, segment, columns)
+        distance = _distance(published, track, segment, columns)
+        if _distance(candidate, track, segment, columns) < CLEARLY_CLOSER * distance:
+            state[columns] = candidate
+            undone.append(f"{count} of {label}")
+        else:
+            kept.append(f"{count} of {label}")
+    said = []
+    if undone:
+        said.append(f"resets undone: {', '.join(undone)} (they change the frame)")
+    if kept:
+        said.append(f"resets kept: {', '.join(kept)} (they correct an error)")
+    return state, "; ".join(said)
+
+
+def _undo(
+    published: pd.DataFrame,
+    times: Array,
+    deltas: Array,
+    track: PositionTrack,
+    segment: Segment,
+    columns: list[str],
+) -> pd.DataFrame:
+    """Continuous position, in the frame of that stretch between resets that fits the track best."""
+    after = published.index.to_numpy()[:, None] >= times[None, :]
+    candidates = []
+    for stretch in range(len(times) + 1):
+        # relative to this stretch: resets before it still to come are added, later ones taken away
+        shift = (~after[:, :stretch]) @ deltas[:stretch] - after[:, stretch:] @ deltas[stretch:]
+        candidates.append(published + shift)
+    return min(candidates, key=lambda frame: _distance(frame, track, segment, columns))
+
+
+def _distance(
+    state: pd.DataFrame, track: PositionTrack, segment: Segment, columns: list[str]
+) -> float:
+    samples = _cut(track.samples, segment)[columns].dropna()
+    squared = np.zeros(len(samples))
+    for column in columns:
+        squared += (np.interp(samples.index, state.index, state[column]) - samples[column]) ** 2
+    return float(np.median(squared)) if len(squared) else float("inf")
