@@ -1,6 +1,6 @@
 """Frames, gravity, the aisle axis and resampling: Flight → one-dimensional signals.
 
-NED acceleration = R(q) · specific force + [0, 0, g] (Groves 2013, equation 5.52 without earth rate).
+NED acceleration = R(q) · specific force + [0, 0, g] (Groves 2013, eq. 5.52 without earth rate).
 """
 
 from __future__ import annotations

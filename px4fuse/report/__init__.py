@@ -1,0 +1,1 @@
+"""The report: PDF pages, terminal summary, results JSON."""
