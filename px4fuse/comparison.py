@@ -10,32 +10,26 @@ import pandas as pd
 
 from px4fuse.consistency import Consistency, HorizontalNis, assess, assess_horizontal
 from px4fuse.errors import SettingsError
-from px4fuse.flight import (
-    POSITION_COLUMNS,
-    POSITION_VARIANCE_COLUMNS,
-    VELOCITY_COLUMNS,
-    VELOCITY_VARIANCE_COLUMNS,
-    Ekf2,
-    Flight,
-    PositionTrack,
-    Truth,
-    Unavailable,
-)
-from px4fuse.kalman import Replay, Settings, replay, state_at
+from px4fuse.flight import Ekf2, Flight, PositionTrack, Unavailable
+from px4fuse.kalman import Replay, Settings, replay, state_at, variance_at
 from px4fuse.likelihood import NoiseAsked, noise_asked
+from px4fuse.projection import (
+    MIN_COMMON_SAMPLES,
+    continuous_state,
+    project_innovations,
+    project_state,
+    project_truth,
+    project_variance,
+)
 from px4fuse.signals import (
     Array,
     Axis,
     Segment,
     choose_segment,
     choose_source,
-    continuous_state,
     make_axes,
+    shift_clock,
 )
-
-# EKF2 never trusts external vision better than this (ev_pos_control.cpp, EKF2.cpp)
-EKF2_MIN_NOISE_M = 0.01
-MIN_COMMON_SAMPLES = 3
 
 
 @dataclass(frozen=True)
@@ -201,11 +195,9 @@ def compare(
     """
     settings = settings or Settings()
     track, reason = choose_source(flight, position_source)
+    track = shift_clock(track, settings.clock_offset_s)
     segment = choose_segment(flight, track, start_s, end_s)
-    lines = make_axes(
-        flight, track, segment,
-        names=axes, heading_deg=heading_deg, clock_offset_s=settings.clock_offset_s,
-    )  # fmt: skip
+    lines = make_axes(flight, track, segment, names=axes, heading_deg=heading_deg)
     missing = list(flight.missing)
     notes = list(flight.log.notes)
     acceleration = lines[0].acceleration
@@ -216,17 +208,16 @@ def compare(
         notes.append(f"no acceleration input ({acceleration.reason}): constant velocity was used")
         if acceleration not in missing:
             missing.append(acceleration)
-    state: pd.DataFrame | Unavailable
-    if isinstance(flight.ekf2, Unavailable):
-        state = flight.ekf2
-    else:
-        state, statement = continuous_state(flight.ekf2, track, segment)
+    ekf2 = flight.ekf2
+    if isinstance(ekf2, Ekf2):
+        state, statement = continuous_state(ekf2, track, segment)
         notes += [f"EKF2 {statement}"] if statement else []
-        notes += flight.ekf2.notes
+        notes += ekf2.notes
+        ekf2 = replace(ekf2, state=state)
     results = []
     for line in lines:
         progress(line.name)
-        results.append(_compare_axis(flight, track, segment, line, settings, state))
+        results.append(_compare_axis(flight, ekf2, track, segment, line, settings))
     return Comparison(
         flight=flight,
         source=track,
@@ -241,29 +232,17 @@ def compare(
     )
 
 
-def _cut(frame: pd.DataFrame, segment: Segment) -> pd.DataFrame:
-    return frame[(frame.index >= segment.start_s) & (frame.index <= segment.end_s)]
-
-
-def _along(frame: pd.DataFrame, columns: list[str], weights: Array) -> Array:
-    """Weighted sum of columns; a zero weight ignores a NaN."""
-    total = np.zeros(len(frame))
-    for column, weight in zip(columns, weights, strict=True):
-        if weight != 0.0:
-            total += weight * frame[column].to_numpy()
-    return total
-
-
 def _compare_axis(
     flight: Flight,
+    ekf2: Ekf2 | Unavailable,
     track: PositionTrack,
     segment: Segment,
     axis: Axis,
     settings: Settings,
-    state: pd.DataFrame | Unavailable,
 ) -> AxisComparison:
+    """Everything about one axis; ``ekf2`` is the flight's, its resets treated."""
     run = replay(axis, settings)
-    truth = _project_truth(flight.truth, axis, segment)
+    truth = project_truth(flight.truth, axis, segment)
     kf = FilterSummary(
         consistency=assess(
             run.updates["innovation_m"].to_numpy(),
@@ -276,23 +255,22 @@ def _compare_axis(
             run.steps["position_variance_m2"].reindex(run.updates.index)
         ),
     )
-    if isinstance(flight.ekf2, Unavailable) or isinstance(state, Unavailable):
-        none = flight.ekf2 if isinstance(flight.ekf2, Unavailable) else state
+    if isinstance(ekf2, Unavailable):
         times = run.steps.index.to_numpy()
         return AxisComparison(
-            axis=axis, replay=run, kf=kf, ekf2=none, ekf2_state=none, ekf2_variance=none,
-            ekf2_innovations=none, noise_asked=noise_asked(axis, settings), difference=none,
-            kf_truth=_kf_against_truth(run, truth, times), ekf2_truth=none, truth=truth,
+            axis=axis, replay=run, kf=kf, ekf2=ekf2, ekf2_state=ekf2, ekf2_variance=ekf2,
+            ekf2_innovations=ekf2, noise_asked=noise_asked(axis, settings), difference=ekf2,
+            kf_truth=_kf_against_truth(run, truth, times), ekf2_truth=ekf2, truth=truth,
         )  # fmt: skip
-    ekf2_state = _project_state(state, axis, segment)
-    ekf2_variance = _project_variance(flight.ekf2, axis, segment)
-    ekf2_innovations = _project_innovations(flight, track, axis, segment)
+    ekf2_state = project_state(ekf2.state, axis, segment)
+    ekf2_variance = project_variance(ekf2, axis, segment)
+    ekf2_innovations = project_innovations(flight, ekf2, track, axis, segment)
     times = ekf2_state.index.to_numpy()
     return AxisComparison(
         axis=axis,
         replay=run,
         kf=kf,
-        ekf2=_ekf2_summary(flight.ekf2, ekf2_variance, ekf2_innovations),
+        ekf2=_ekf2_summary(ekf2, ekf2_variance, ekf2_innovations),
         ekf2_state=ekf2_state,
         ekf2_variance=ekf2_variance,
         ekf2_innovations=ekf2_innovations,
@@ -309,92 +287,6 @@ def _median_sigma(variance: pd.Series) -> float | None:
     return float(np.sqrt(variance.median())) if len(variance) else None
 
 
-def _project_state(state: pd.DataFrame, axis: Axis, segment: Segment) -> pd.DataFrame:
-    cut = _cut(state, segment)
-    return pd.DataFrame(
-        {
-            "position_m": _along(cut, POSITION_COLUMNS, axis.direction),
-            "velocity_m_s": _along(cut, VELOCITY_COLUMNS, axis.direction),
-        },
-        index=cut.index,
-    )
-
-
-def _project_variance(ekf2: Ekf2, axis: Axis, segment: Segment) -> pd.DataFrame | Unavailable:
-    """Variances along the axis; EKF2 logs no covariance between axes, so none is added."""
-    if isinstance(ekf2.variance, Unavailable):
-        return ekf2.variance
-    cut = _cut(ekf2.variance, segment)
-    if cut.empty:
-        return Unavailable("EKF2 variances", "no sample in the segment", "Analyse more of the log.")
-    weights = axis.direction**2
-    position = _along(cut, POSITION_VARIANCE_COLUMNS, weights)
-    return pd.DataFrame(
-        {
-            "position_variance_m2": position,
-            "velocity_variance_m2_s2": _along(cut, VELOCITY_VARIANCE_COLUMNS, weights),
-        },
-        index=cut.index,
-    )
-
-
-def _project_innovations(
-    flight: Flight, track: PositionTrack, axis: Axis, segment: Segment
-) -> pd.DataFrame | Unavailable:
-    """EKF2's innovations along the axis, with its variances just before and after each update."""
-    assert not isinstance(flight.ekf2, Unavailable)
-    innovations = flight.ekf2.innovations
-    if axis.name in ("north", "east", "down"):
-        frame = innovations[axis.name]  # type: ignore[index]
-        if isinstance(frame, Unavailable):
-            return frame
-        cut = _cut(frame, segment).copy()
-    else:
-        north, east = innovations["north"], innovations["east"]
-        if isinstance(north, Unavailable):
-            return north
-        if isinstance(east, Unavailable):
-            return east
-        common = _cut(north, segment).index.intersection(east.index)
-        north, east = north.loc[common], east.loc[common]
-        c, s = float(axis.direction[0]), float(axis.direction[1])
-        cut = c * c * north + s * s * east  # variances; the rest is set below
-        cut["innovation_m"] = c * north["innovation_m"] + s * east["innovation_m"]
-        for column in ("test_ratio", "fused", "rejected"):
-            # the larger: before v1.14 PX4 keeps one ratio for both; a rejection is of the vector
-            cut[column] = np.fmax(north[column], east[column])
-    if cut.empty:
-        return Unavailable(
-            "EKF2 innovations", "no sample in the segment", "Analyse more of the log."
-        )
-    r = cut["observation_variance_m2"].fillna(observation_variance(flight, track, axis, segment))
-    s_total = cut["innovation_variance_m2"]
-    prior = (s_total - r).where(s_total > r)
-    cut["observation_variance_m2"] = r
-    cut["prior_variance_m2"] = prior
-    cut["posterior_variance_m2"] = prior * r / s_total
-    return cut
-
-
-def observation_variance(
-    flight: Flight, track: PositionTrack, axis: Axis, segment: Segment
-) -> float:
-    """R (m²) that EKF2 used for external vision where it does not log it, NaN if unknown.
-
-    R = EKF2_EVP_NOISE², or the sender's variance if larger, unless EKF2_EV_NOISE_MD is 1
-    (EKF2.cpp, ev_pos_control.cpp).
-    """
-    parameters = flight.log.parameters
-    if "EKF2_EVP_NOISE" not in parameters:
-        return float("nan")
-    r = max(parameters["EKF2_EVP_NOISE"], EKF2_MIN_NOISE_M) ** 2
-    if parameters.get("EKF2_EV_NOISE_MD") == 1.0:
-        return r
-    reported = _cut(track.samples, segment)[POSITION_VARIANCE_COLUMNS].median()
-    along = float(np.nansum(reported.to_numpy() * axis.direction**2))
-    return max(r, along)
-
-
 def _ekf2_summary(
     ekf2: Ekf2, variance: pd.DataFrame | Unavailable, innovations: pd.DataFrame | Unavailable
 ) -> FilterSummary:
@@ -409,11 +301,14 @@ def _ekf2_summary(
         )
         before = _median_sigma(innovations["prior_variance_m2"])
         after = _median_sigma(innovations["posterior_variance_m2"])
-    known = isinstance(variance, pd.DataFrame)
+    sigma_p = sigma_v = None
+    if isinstance(variance, pd.DataFrame):
+        sigma_p = _median_sigma(variance["position_variance_m2"])
+        sigma_v = _median_sigma(variance["velocity_variance_m2_s2"])
     return FilterSummary(
         consistency=consistency,
-        sigma_p_median_m=_median_sigma(variance["position_variance_m2"]) if known else None,
-        sigma_v_median_m_s=_median_sigma(variance["velocity_variance_m2_s2"]) if known else None,
+        sigma_p_median_m=sigma_p,
+        sigma_v_median_m_s=sigma_v,
         sigma_p_before_update_m=before,
         sigma_p_after_update_m=after,
     )
@@ -446,32 +341,12 @@ def _rmse(error: Array) -> float:
     return float(np.sqrt(np.mean(error**2)))
 
 
-def _project_truth(
-    truth: Truth | Unavailable, axis: Axis, segment: Segment
-) -> pd.DataFrame | Unavailable:
-    if isinstance(truth, Unavailable):
-        return truth
-    projected = _project_state(truth.samples, axis, segment)
-    if len(projected) < MIN_COMMON_SAMPLES:
-        return Unavailable(
-            "ground truth",
-            f"{truth.name} has no samples in the segment",
-            "Analyse more of the log.",
-        )
-    return projected
-
-
 def _kf_against_truth(
     run: Replay, truth: pd.DataFrame | Unavailable, times: Array
 ) -> AgainstTruth | Unavailable:
     if isinstance(truth, Unavailable):
         return truth
-    position, velocity = state_at(run, times)
-    variances = [
-        np.interp(times, run.steps.index, run.steps[column])
-        for column in ("position_variance_m2", "velocity_variance_m2_s2")
-    ]
-    return _against_truth(times, (position, velocity), times, (variances[0], variances[1]), truth)
+    return _against_truth(times, state_at(run, times), times, variance_at(run, times), truth)
 
 
 def _ekf2_against_truth(
@@ -516,11 +391,12 @@ def _against_truth(
     if variances is not None and variance_times is not None:
         for i, (error, variance) in enumerate(zip(errors, variances, strict=True)):
             known = np.isfinite(error)
-            if np.any(known):
-                at = np.interp(
-                    variance_times, times[known], error[known], left=np.nan, right=np.nan
-                )
-                nees[i] = float(np.nanmean(at**2 / variance))
+            if not np.any(known):
+                continue
+            at = np.interp(variance_times, times[known], error[known], left=np.nan, right=np.nan)
+            normalised = at**2 / variance
+            if np.any(np.isfinite(normalised)):
+                nees[i] = float(np.nanmean(normalised))
     velocity_known = np.isfinite(errors[1])
     return AgainstTruth(
         count=int(np.count_nonzero(finite)),
@@ -538,10 +414,9 @@ def _horizontal(
     for result in results:
         frame = frame_of(result)
         if isinstance(frame, pd.DataFrame):
-            frames[result.axis.name] = (
-                frame["innovation_m"].to_numpy(),
-                frame["innovation_variance_m2"].to_numpy(),
-            )
+            frames[result.axis.name] = frame[["innovation_m", "innovation_variance_m2"]]
     if not {"north", "east"} <= frames.keys():
         return None
-    return assess_horizontal(frames["north"], frames["east"])
+    # only updates that both axes have, at the very same times
+    both = pd.concat([frames["north"], frames["east"]], axis=1, join="inner").to_numpy().T
+    return assess_horizontal((both[0], both[1]), (both[2], both[3]))

@@ -82,8 +82,9 @@ def nis_band(count: int, dimensions: int = 1) -> tuple[float, float]:
     (1.67, 2.36)
     """
     freedom = count * dimensions
-    low, high = stats.chi2.ppf([(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2], freedom) / freedom
-    return float(low), float(high)
+    low = float(stats.chi2.ppf((1 - CONFIDENCE) / 2, freedom)) / freedom
+    high = float(stats.chi2.ppf((1 + CONFIDENCE) / 2, freedom)) / freedom
+    return low, high
 
 
 def verdict_of(nis_mean: float, band: tuple[float, float]) -> Verdict:
@@ -187,10 +188,14 @@ def assess_horizontal(
     -------
     HorizontalNis, or None below ten innovations or where the two differ in length.
     """
-    count = len(north[0])
-    if count != len(east[0]) or count < MIN_INNOVATIONS:
+    if len(north[0]) != len(east[0]):
         return None
-    mean = float(np.mean(north[0] ** 2 / north[1] + east[0] ** 2 / east[1])) / 2.0
+    usable = (north[1] > 0) & (east[1] > 0) & np.isfinite(north[0]) & np.isfinite(east[0])
+    count = int(np.count_nonzero(usable))
+    if count < MIN_INNOVATIONS:
+        return None
+    nis = sum(nu[usable] ** 2 / s[usable] for nu, s in (north, east))
+    mean = float(np.mean(nis)) / 2.0
     if mean == 0.0:
         return None
     band = nis_band(count, 2)

@@ -16,7 +16,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
+import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
 AxisName = Literal["north", "east", "down"]
 AXIS_NAMES: tuple[AxisName, AxisName, AxisName] = ("north", "east", "down")
@@ -246,6 +248,12 @@ class Flight:
     truth: Truth | Unavailable
     airborne: tuple[tuple[float, float], ...] | Unavailable
     missing: tuple[Unavailable, ...] = ()
+
+
+def finite_rows(samples: pd.DataFrame, columns: list[str]) -> pd.DataFrame:
+    """Rows of a frame in which all of some float columns are finite."""
+    finite: NDArray[np.bool_] = np.isfinite(samples[columns].to_numpy()).all(axis=1)
+    return samples[finite]
 
 
 def median_rate(samples: pd.DataFrame) -> float:

@@ -211,7 +211,7 @@ def replay(axis: Axis, settings: Settings, initial: InitialState | None = None) 
     lengths = np.diff(line.time_s)
     states = np.empty((len(line.time_s), 5))
     updates = np.empty((np.count_nonzero(line.measurement >= 0), 8))
-    updated_at = []
+    updated_at: list[float] = []
     states[0] = _state_row(kalman)
     for step, (dt, acceleration, extra) in enumerate(
         zip(lengths, line.acceleration_m_s2, line.input_variance_m2_s4, strict=True), start=1
@@ -277,21 +277,39 @@ def _state_row(kalman: KalmanFilter) -> tuple[float, float, float, float, float]
     return x[0, 0], x[1, 0], p[0, 0], p[0, 1], p[1, 1]
 
 
+def _ahead(run: Replay, times: Array) -> tuple[NDArray[np.intp], Array, NDArray[np.bool_]]:
+    """The step before each time, how long ago it was (s), and whether the time is outside."""
+    edges = run.steps.index.to_numpy()
+    at = np.clip(np.searchsorted(edges, times, side="right") - 1, 0, len(edges) - 1)
+    return at, times - edges[at], (times < edges[0]) | (times > edges[-1])
+
+
 def state_at(run: Replay, times: Array) -> tuple[Array, Array]:
     """Position (m) and velocity (m/s) at other times, predicted from the step before each.
 
     Nothing later than the time itself is used: interpolating between two steps would let a
     measurement act before it arrived. NaN outside the replay.
     """
-    edges = run.steps.index.to_numpy()
-    at = np.clip(np.searchsorted(edges, times, side="right") - 1, 0, len(edges) - 1)
-    ahead = times - edges[at]
+    at, ahead, outside = _ahead(run, times)
     position, velocity, acceleration = (
         run.steps[column].to_numpy()[at]
         for column in ("position_m", "velocity_m_s", "acceleration_m_s2")
     )
-    outside = (times < edges[0]) | (times > edges[-1])
     return (
         np.where(outside, np.nan, position + velocity * ahead + acceleration * ahead**2 / 2.0),
         np.where(outside, np.nan, velocity + acceleration * ahead),
+    )
+
+
+def variance_at(run: Replay, times: Array) -> tuple[Array, Array]:
+    """Variances (m², m²/s²) that belong to :func:`state_at`: P = FPFᵀ + Q from the step before."""
+    at, ahead, outside = _ahead(run, times)
+    p00, p01, p11 = (
+        run.steps[column].to_numpy()[at]
+        for column in ("position_variance_m2", "covariance_m2_s", "velocity_variance_m2_s2")
+    )
+    q = run.settings.sigma_a_m_s2**2 * run.settings.dt_s
+    return (
+        np.where(outside, np.nan, p00 + 2 * ahead * p01 + ahead**2 * p11 + q * ahead**3 / 4.0),
+        np.where(outside, np.nan, p11 + q * ahead),
     )

@@ -43,7 +43,8 @@ class LessonUpdate:
 def example_1() -> Replay:
     """Run Example 1: UWB every 0.5 s on an aisle at 1 m/s, velocity unknown at first."""
     settings = Settings(sigma_a_m_s2=0.5, sigma_z_m=0.10, dt_s=0.1, input="zero")
-    time = settings.dt_s * np.arange(STEPS_PER_UPDATE, STEPS + 1, STEPS_PER_UPDATE)
+    step = np.arange(STEPS_PER_UPDATE, STEPS + 1, STEPS_PER_UPDATE, dtype=np.float64)
+    time = settings.dt_s * step
     axis = Axis(
         name="aisle",
         direction=np.array([1.0, 0.0, 0.0]),

@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy.stats import chi2
 
 from px4fuse.kalman import (
@@ -74,7 +74,7 @@ def preintegrate(axis: Axis, settings: Settings) -> Preintegrated:
     count = len(ends)
 
     def total(values: Array) -> Array:
-        return np.bincount(leg, weights=values, minlength=count)
+        return np.asarray(np.bincount(leg, weights=values, minlength=count), dtype=np.float64)
 
     return Preintegrated(
         length_s=np.diff(time[np.concatenate([[0], ends])]),
@@ -88,7 +88,10 @@ def preintegrate(axis: Axis, settings: Settings) -> Preintegrated:
 
 
 def innovations(
-    legs: Preintegrated, sigma_a_m_s2: ArrayLike, sigma_z_m: ArrayLike
+    legs: Preintegrated,
+    sigma_a_m_s2: ArrayLike,
+    sigma_z_m: ArrayLike,
+    skip: NDArray[np.bool_] | None = None,
 ) -> tuple[Array, Array]:
     """Innovations and their variances for every combination of settings.
 
@@ -97,6 +100,8 @@ def innovations(
     legs : Preintegrated
     sigma_a_m_s2, sigma_z_m : array_like
         Broadcast against each other to a grid of shape (...).
+    skip : ndarray of bool, shape (m,), optional
+        Measurements that are compared but not fused.
 
     Returns
     -------
@@ -124,6 +129,8 @@ def innovations(
         # ν = z - Hx, S = HPHᵀ + R, K = PHᵀS⁻¹
         nu[k] = legs.measurement_m[k] - p
         s[k] = p00 + r
+        if skip is not None and skip[k]:
+            continue
         k0, k1 = p00 / s[k], p01 / s[k]
         p, v = p + k0 * nu[k], v + k1 * nu[k]
         p11 = p11 - k1 * p01
@@ -132,6 +139,10 @@ def innovations(
     return nu, s
 
 
+# Innovations beyond this many √S are outliers, as in EKF2_EVP_GATE's default.
+GATE_SIGMA = 5.0
+MAX_PASSES = 4
+MAX_OUTLIER_SHARE = 0.25
 # The grid on which the measurement noise that the data ask for is sought.
 SIGMA_Z_GRID_M = np.geomspace(1e-3, 30.0, 91)
 # Median of a chi-square variable of one degree of freedom.
@@ -157,7 +168,9 @@ class NoiseAsked:
 def noise_asked(axis: Axis, settings: Settings) -> NoiseAsked | None:
     """SIGMA_Z at which the *median* NIS takes its chi-square value, SIGMA_A as set.
 
-    The median, so that a few gross outliers do not raise the noise of all the others.
+    The median, and without the outliers, whose effect on the state lasts for several updates: a
+    few gross ones must not raise the noise of all the others. Outliers are found at the noise of
+    the pass before, until they stay the same.
 
     Parameters
     ----------
@@ -171,7 +184,23 @@ def noise_asked(axis: Axis, settings: Settings) -> NoiseAsked | None:
     acceleration input is wrong, not the measurement.
     """
     legs = preintegrate(axis, settings)
-    nu, s = innovations(legs, settings.sigma_a_m_s2, SIGMA_Z_GRID_M)
+    skip = np.zeros(len(legs.measurement_m), dtype=bool)
+    asked: NoiseAsked | None = None
+    for _ in range(MAX_PASSES):
+        nu, s = innovations(legs, settings.sigma_a_m_s2, SIGMA_Z_GRID_M, skip)
+        asked = _median_match(nu[~skip], s[~skip])
+        if asked is None or asked.upper_bound:
+            return asked
+        nu, s = innovations(legs, settings.sigma_a_m_s2, asked.sigma_z_m, skip)
+        outlier = nu**2 > GATE_SIGMA**2 * s
+        if np.array_equal(outlier, skip) or np.mean(outlier) > MAX_OUTLIER_SHARE:
+            return asked
+        skip = outlier
+    return asked
+
+
+def _median_match(nu: Array, s: Array) -> NoiseAsked | None:
+    """Point of the grid (second dimension) where the median NIS is that of chi-square."""
     median = np.median(nu**2 / s, axis=0)
     above = np.flatnonzero(median >= CHI2_MEDIAN)
     if not len(above):

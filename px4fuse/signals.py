@@ -5,7 +5,7 @@ NED acceleration = R(q) · specific force + [0, 0, g] (Groves 2013, eq. 5.52 wit
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
@@ -19,8 +19,6 @@ from px4fuse.flight import (
     POSITION_COLUMNS,
     QUATERNION_COLUMNS,
     SPECIFIC_FORCE_COLUMNS,
-    VELOCITY_COLUMNS,
-    Ekf2,
     Flight,
     PositionTrack,
     Unavailable,
@@ -34,9 +32,6 @@ AISLE = "aisle"
 IMU_GAP_S = 0.1
 IMU_GAP_INTERVALS = 5.0
 MIN_MEASUREMENTS = 3
-# Undoing resets must bring EKF2 this much closer to the measurements (median squared distance);
-# below that the published output, which the vehicle flew on, stands.
-CLEARLY_CLOSER = 0.95
 # The GPS rung is taken only when asked for.
 LAST_AUTOMATIC_RUNG = 6
 
@@ -166,6 +161,14 @@ def _ladder_reason(flight: Flight, track: PositionTrack) -> str:
     return f"the best that this log has; not in it: {', '.join(passed)}"
 
 
+def shift_clock(track: PositionTrack, clock_offset_s: float) -> PositionTrack:
+    """The same track with ``clock_offset_s`` added to its time stamps."""
+    if clock_offset_s == 0.0:
+        return track
+    index = pd.Index(track.samples.index.to_numpy() + clock_offset_s, name="time_s")
+    return replace(track, samples=track.samples.set_axis(index))
+
+
 def choose_segment(
     flight: Flight,
     track: PositionTrack,
@@ -189,16 +192,16 @@ def choose_segment(
     source_start, source_end = float(track.samples.index[0]), float(track.samples.index[-1])
     low, high = max(source_start, 0.0), min(source_end, flight.log.duration_s)
     if isinstance(flight.airborne, Unavailable):
-        reason = "the whole span of the position source: the log has no land detector"
+        reason = "the whole span of the source: the log has no land detector"
     elif not flight.airborne:
-        reason = "the whole span of the position source: the vehicle never took off"
+        reason = "the whole span of the source: the vehicle never took off"
     else:
         take_off, touch_down = flight.airborne[0][0], flight.airborne[-1][1]
         if max(low, take_off) < min(high, touch_down):
             low, high = max(low, take_off), min(high, touch_down)
-            reason = "where the position source runs and the vehicle flies (land detector)"
+            reason = "where the source runs and the vehicle flies"
         else:
-            reason = "the whole span of the position source: it does not run in flight"
+            reason = "the whole span of the source: it does not run in flight"
     if start_s is not None or end_s is not None:
         low = low if start_s is None else start_s
         high = high if end_s is None else end_s
@@ -245,10 +248,10 @@ def ned_acceleration(flight: Flight) -> pd.DataFrame | Unavailable:
             "Record both from boot (SDLOG_MODE 0).",
         )
     rotations = Rotation.from_quat(
-        flight.attitude[QUATERNION_COLUMNS].to_numpy(), scalar_first=True
+        flight.attitude[QUATERNION_COLUMNS].to_numpy(copy=True), scalar_first=True
     )
     body_to_ned = Slerp(attitude_time, rotations)(imu.index.to_numpy())
-    acceleration = body_to_ned.apply(imu[SPECIFIC_FORCE_COLUMNS].to_numpy())
+    acceleration = body_to_ned.apply(imu[SPECIFIC_FORCE_COLUMNS].to_numpy(copy=True))
     acceleration[:, 2] += STANDARD_GRAVITY_M_S2
     return pd.DataFrame(acceleration, index=imu.index, columns=list(AXIS_NAMES))
 
@@ -263,7 +266,7 @@ def aisle_heading(track: PositionTrack, segment: Segment) -> tuple[float, float]
     elongation : float
         Ratio of the standard deviations along and across it (1: no direction is distinct).
     """
-    horizontal = _cut(track.samples, segment)[POSITION_COLUMNS[:2]].to_numpy()
+    horizontal = within(track.samples, segment)[POSITION_COLUMNS[:2]].to_numpy()
     centred = horizontal - horizontal.mean(axis=0)
     _, singular, directions = np.linalg.svd(centred, full_matrices=False)
     heading = float(np.degrees(np.arctan2(directions[0, 1], directions[0, 0]))) % 180.0
@@ -278,7 +281,6 @@ def make_axes(
     *,
     names: tuple[str, ...] | None = None,
     heading_deg: float | None = None,
-    clock_offset_s: float = 0.0,
 ) -> tuple[Axis, ...]:
     """Project a flight on its axes.
 
@@ -291,27 +293,19 @@ def make_axes(
         From "north", "east", "down", "aisle"; by default all that the source supports.
     heading_deg : float, optional
         Of the aisle, clockwise from north; by default the horizontal principal direction.
-    clock_offset_s : float
-        Added to the position source's time stamps.
 
     Raises
     ------
     MissingDataError
         An axis was asked for that the source has no finite samples for.
     """
-    samples = track.samples.copy()
-    samples.index = pd.Index(samples.index.to_numpy() + clock_offset_s, name="time_s")
-    samples = _cut(samples, segment)
+    samples = within(track.samples, segment)
     acceleration = ned_acceleration(flight)
     asked = names if names is not None else (*AXIS_NAMES, AISLE)
     axes = []
     for name in asked:
         direction, heading, note = _direction(name, track, segment, heading_deg)
-        projected = samples[POSITION_COLUMNS].to_numpy() @ np.where(direction == 0, 0, direction)
-        if name == "down":
-            projected = samples["down_m"].to_numpy()
-        elif direction[2] == 0:
-            projected = samples[POSITION_COLUMNS[:2]].to_numpy() @ direction[:2]
+        projected = along(samples, POSITION_COLUMNS, direction)
         finite = np.isfinite(projected)
         if np.count_nonzero(finite) < MIN_MEASUREMENTS:
             if names is None:
@@ -332,14 +326,27 @@ def make_axes(
                 else project_acceleration(acceleration, direction, segment),
             )
         )
+    if not axes:
+        raise MissingDataError(
+            f"{flight.log.name}: {track.name} has no finite position in this segment."
+        )
     return tuple(axes)
+
+
+def along(frame: pd.DataFrame, columns: list[str], weights: Array) -> Array:
+    """Weighted sum of columns; a column of weight zero may be NaN."""
+    total = np.zeros(len(frame))
+    for column, weight in zip(columns, weights, strict=True):
+        if weight != 0.0:
+            total += weight * frame[column].to_numpy()
+    return total
 
 
 def _direction(
     name: str, track: PositionTrack, segment: Segment, heading_deg: float | None
 ) -> tuple[Array, float | None, str]:
     if name != AISLE:
-        at = AXIS_NAMES.index(name)  # type: ignore[arg-type]
+        at = AXIS_NAMES.index(name)
         return np.eye(3)[at], (None if name == "down" else 90.0 * at), ""
     if heading_deg is None:
         heading, elongation = aisle_heading(track, segment)
@@ -374,7 +381,7 @@ def project_acceleration(
     return Acceleration(
         time_s=time,
         value_m_s2=value,
-        integral_m_s=cumulative_trapezoid(value, time, initial=0.0),
+        integral_m_s=cumulative_trapezoid(value, time, initial=0),
         gap_integral_s=np.concatenate([[0.0], np.cumsum(np.where(is_gap, interval, 0.0))]),
         rms_m_s2=float(np.sqrt(np.mean(value[inside] ** 2))),
     )
@@ -404,94 +411,6 @@ def step_means(acceleration: Acceleration, edges: ArrayLike) -> tuple[Array, Arr
     return np.diff(velocity) / length, np.clip(np.diff(gap) / length + outside, 0.0, 1.0)
 
 
-def _cut(frame: pd.DataFrame, segment: Segment) -> pd.DataFrame:
+def within(frame: pd.DataFrame, segment: Segment) -> pd.DataFrame:
+    """Rows of a time-indexed frame inside a segment, both ends included."""
     return frame[(frame.index >= segment.start_s) & (frame.index <= segment.end_s)]
-
-
-def continuous_state(
-    ekf2: Ekf2, track: PositionTrack, segment: Segment
-) -> tuple[pd.DataFrame, str]:
-    """EKF2's state with its resets undone, where undoing them is right.
-
-    A reset that changes EKF2's frame must be undone before positions are compared. A reset that
-    moves EKF2 back onto the measurements corrects an error, and undoing it would carry that error
-    through the rest of the flight. The measurements decide: the resets are undone where that
-    brings the series clearly closer to them (median distance).
-
-    Parameters
-    ----------
-    ekf2 : Ekf2
-    track : PositionTrack
-    segment : Segment
-
-    Returns
-    -------
-    state : DataFrame
-        Position and velocity as in :attr:`Ekf2.state`.
-    statement : str
-        What was done, empty where there was no reset in the segment.
-    """
-    inside = [r for r in ekf2.resets if segment.start_s < r.time_s <= segment.end_s]
-    if not inside:
-        return ekf2.state, ""
-    state = ekf2.state.copy()
-    kept, undone = [], []
-    groups = (
-        ("horizontal position", "position", POSITION_COLUMNS[:2], [0, 1]),
-        ("height", "position", POSITION_COLUMNS[2:], [2]),
-        ("velocity", "velocity", VELOCITY_COLUMNS, [0, 1, 2]),
-    )
-    for label, quantity, columns, axes in groups:
-        deltas = np.array(
-            [[r.delta[axis] if r.quantity == quantity else 0.0 for axis in axes] for r in inside]
-        )
-        times = np.array([r.time_s for r in inside])
-        real = np.any(deltas != 0, axis=1)
-        count = int(np.count_nonzero(real))
-        if not count:
-            continue
-        if quantity == "velocity":  # a velocity has no frame origin to lose
-            kept.append(f"{count} of {label}")
-            continue
-        published = ekf2.state[columns]
-        candidate = _undo(published, times[real], deltas[real], track, segment, columns)
-        distance = _distance(published, track, segment, columns)
-        if _distance(candidate, track, segment, columns) < CLEARLY_CLOSER * distance:
-            state[columns] = candidate
-            undone.append(f"{count} of {label}")
-        else:
-            kept.append(f"{count} of {label}")
-    said = []
-    if undone:
-        said.append(f"resets undone: {', '.join(undone)} (they change the frame)")
-    if kept:
-        said.append(f"resets kept: {', '.join(kept)} (they correct an error)")
-    return state, "; ".join(said)
-
-
-def _undo(
-    published: pd.DataFrame,
-    times: Array,
-    deltas: Array,
-    track: PositionTrack,
-    segment: Segment,
-    columns: list[str],
-) -> pd.DataFrame:
-    """Continuous position, in the frame of that stretch between resets that fits the track best."""
-    after = published.index.to_numpy()[:, None] >= times[None, :]
-    candidates = []
-    for stretch in range(len(times) + 1):
-        # relative to this stretch: resets before it still to come are added, later ones taken away
-        shift = (~after[:, :stretch]) @ deltas[:stretch] - after[:, stretch:] @ deltas[stretch:]
-        candidates.append(published + shift)
-    return min(candidates, key=lambda frame: _distance(frame, track, segment, columns))
-
-
-def _distance(
-    state: pd.DataFrame, track: PositionTrack, segment: Segment, columns: list[str]
-) -> float:
-    samples = _cut(track.samples, segment)[columns].dropna()
-    squared = np.zeros(len(samples))
-    for column in columns:
-        squared += (np.interp(samples.index, state.index, state[column]) - samples[column]) ** 2
-    return float(np.median(squared)) if len(squared) else float("inf")

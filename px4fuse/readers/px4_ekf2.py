@@ -7,6 +7,7 @@ Sources: PX4-Autopilot ``EKF2.cpp`` (PublishStates, PublishInnovations), ``EKF2S
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import partial
 
 import numpy as np
 import pandas as pd
@@ -56,6 +57,10 @@ INNOVATION_COLUMNS = [
 ]
 
 
+# One EKF2 instance alone publishes no selector
+NO_SELECTOR = ((-np.inf, 0),)
+
+
 def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
     """EKF2's output, or why there is none."""
     parameters = topics.log.parameters
@@ -99,11 +104,11 @@ def _primary_instances(topics: Topics) -> tuple[tuple[float, int], ...]:
     """Primary EKF2 instance from each time on; instance 0 where there is no selector."""
     layout = topics.find(SELECTOR)
     if layout is None:
-        return ((-np.inf, 0),)
+        return NO_SELECTOR
     selected = topics.frame(layout, step=True)["instance"]
     selected = selected[selected < 255]  # 255: none selected yet
     if selected.empty:
-        return ((-np.inf, 0),)
+        return NO_SELECTOR
     changes = selected[selected.ne(selected.shift())]
     times = [-np.inf, *changes.index[1:]]
     return tuple((float(time), int(number)) for time, number in zip(times, changes, strict=True))
@@ -117,11 +122,11 @@ def _of_primary(
 ) -> pd.DataFrame:
     """Rows of each instance of a topic from the times in which that instance was primary."""
     available = topics.instances(topic)
-    if len(available) == 1:
+    if instances == NO_SELECTOR:
         return read(available[0])
     starts = np.array([start for start, _ in instances])
     numbers = np.array([number for _, number in instances])
-    parts = []
+    parts: list[pd.DataFrame] = []
     for number in available:
         frame = read(number)
         at = np.searchsorted(starts, frame.index.to_numpy(), side="right") - 1
@@ -147,7 +152,8 @@ def _read_variance(
         if offsets is None:
             return Unavailable(
                 "EKF2 variances",
-                f"{topic} has {length[0]} states and {length[1]} covariances, a layout unknown here",
+                f"{topic} has {length[0]} states and {length[1]} covariances, a layout unknown "
+                "here",
                 "Report the PX4 version to the authors of px4fuse.",
             )
         velocity, position = offsets
@@ -159,8 +165,8 @@ def _read_variance(
             )
             for i, name in enumerate(names)
         }
-        layout = Layout(topic, columns, "")
-        frame = _of_primary(topics, topic, instances, lambda n: topics.frame(layout, n))  # noqa: B023
+        read = partial(topics.frame, Layout(topic, columns, ""))
+        frame = _of_primary(topics, topic, instances, read)
         frame = frame[(frame > 0.0).all(axis=1)]
         if len(frame):
             return frame
@@ -181,9 +187,8 @@ def _read_fusing(
             "neither estimator_status_flags nor estimator_status is in the log",
             "Record with SDLOG_PROFILE bit 0 (default).",
         )
-    frame = _of_primary(
-        topics, layout.topic, instances, lambda n: topics.frame(layout, n, step=True)
-    )
+    read = partial(topics.frame, layout, step=True)
+    frame = _of_primary(topics, layout.topic, instances, read)
     if "flags" in frame:
         bits = frame["flags"].to_numpy().astype(np.int64)
         frame = pd.DataFrame(
@@ -255,7 +260,7 @@ def _read_aid_source(
     fusing: pd.DataFrame | Unavailable,
     axis: AxisName,
 ) -> pd.DataFrame:
-    frame = _of_primary(topics, layout.topic, instances, lambda n: topics.frame(layout, n))
+    frame = _of_primary(topics, layout.topic, instances, partial(topics.frame, layout))
     if "fused" in frame and "rejected" in frame:
         attempted = (frame["fused"] > 0) | (frame["rejected"] > 0)
     elif isinstance(fusing, pd.DataFrame):
@@ -286,12 +291,10 @@ def _read_joined(
             continue
         single = topics.find((Layout(topic, {column: fields[axis]}, layout.since),))
         if single is not None:
-            parts[column] = _of_primary(
-                topics,
-                topic,
-                instances,
-                lambda n: topics.frame(single, n),  # noqa: B023
-            ).dropna()
+            read = partial(topics.frame, single)
+            if column == "innovation_m":
+                read = partial(_read_fresh, topics, single)
+            parts[column] = _of_primary(topics, topic, instances, read).dropna()
     if "innovation_m" not in parts or "innovation_variance_m2" not in parts:
         return None
     frame = parts.pop("innovation_m")
@@ -299,7 +302,7 @@ def _read_joined(
     for column, part in parts.items():
         frame = pd.merge_asof(
             frame, part[[column]], left_index=True, right_index=True,
-            direction="nearest", tolerance=JOIN_TOLERANCE_S,
+            direction="nearest", tolerance=JOIN_TOLERANCE_S,  # type: ignore[arg-type]
         )  # fmt: skip
     frame = frame.dropna(subset=["innovation_variance_m2"])
     if len(frame) < before:
@@ -307,12 +310,20 @@ def _read_joined(
             f"{before - len(frame)} of {before} samples of {layout.topic} ({axis}) have no "
             f"{layout.variance_topic} within {JOIN_TOLERANCE_S:g} s and were left out"
         )
-    # these topics repeat the last fusion's value until the next one; a repeat is no new evidence
-    repeated = frame["innovation_m"].eq(frame["innovation_m"].shift())
-    frame = frame[~repeated & (frame["innovation_m"] != 0) & (frame["innovation_variance_m2"] > 0)]
+    frame = frame[frame["innovation_variance_m2"] > 0]
     if isinstance(fusing, pd.DataFrame) and len(frame):
         frame = frame[step_at(fusing[_group(axis)], frame.index) > 0]
     return _flipped(frame)
+
+
+def _read_fresh(topics: Topics, layout: Layout, instance: int) -> pd.DataFrame:
+    """Innovations of one instance without repeats and without zeros, its value before any fusion.
+
+    These topics repeat the last fusion's value until the next one: a repeat is no new evidence.
+    """
+    frame = topics.frame(layout, instance)
+    value = frame["innovation_m"]
+    return frame[value.ne(value.shift()) & (value != 0)]
 
 
 def _flipped(frame: pd.DataFrame) -> pd.DataFrame:
@@ -325,6 +336,7 @@ def _flipped(frame: pd.DataFrame) -> pd.DataFrame:
 def read_resets(local: pd.DataFrame) -> tuple[Reset, ...]:
     """Resets of the published state, from the counters (uint8, they wrap) and their deltas."""
     resets = []
+    times = local.index.to_numpy()
     for quantity, counter, deltas in _RESET_COUNTERS:
         if counter not in local:
             continue
@@ -337,7 +349,7 @@ def read_resets(local: pd.DataFrame) -> tuple[Reset, ...]:
             )
             if all(np.isfinite(delta)):
                 north, east, down = delta
-                time = float(local.index[row])
+                time = float(times[row])
                 if quantity == "position":
                     resets.append(Reset(time, "position", (north, east, down)))
                 else:

@@ -7,6 +7,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from px4fuse.flight import (
+    AXIS_NAMES,
     POSITION_COLUMNS,
     POSITION_VARIANCE_COLUMNS,
     VELOCITY_COLUMNS,
@@ -14,6 +15,7 @@ from px4fuse.flight import (
     PositionTrack,
     Truth,
     Unavailable,
+    finite_rows,
 )
 from px4fuse.readers.px4_topics import (
     AID_OBSERVATION_HORIZONTAL,
@@ -66,7 +68,7 @@ def _unavailable(name: str, reason: str) -> Unavailable:
 def _finished(track: PositionTrack, axes: list[str]) -> PositionTrack | Unavailable:
     """Drop samples without a position; a track that is too short is none."""
     samples = track.samples.reindex(columns=POSITION_COLUMNS + POSITION_VARIANCE_COLUMNS)
-    samples = samples[np.isfinite(samples[axes]).all(axis=1)]
+    samples = finite_rows(samples, axes)
     if len(samples) < MIN_TRACK_SAMPLES:
         return _unavailable(track.name, f"{len(samples)} finite samples are too few")
     variances = samples[POSITION_VARIANCE_COLUMNS]
@@ -108,8 +110,9 @@ def _read_aid_observation(topics: Topics) -> PositionTrack | Unavailable:
         # both are stamped with the same external vision sample, so the join is exact
         height = topics.frame(vertical)
         samples = pd.merge_asof(
-            samples, height, left_index=True, right_index=True, direction="nearest", tolerance=1e-4
-        )
+            samples, height, left_index=True, right_index=True, direction="nearest",
+            tolerance=1e-4,  # type: ignore[arg-type]
+        )  # fmt: skip
         used.append(vertical.topic)
     # EKF2 stamps its buffer entries EKF2_EV_DELAY earlier than the sender did
     delay_s = topics.log.parameters.get("EKF2_EV_DELAY", 0.0) * 1e-3
@@ -132,7 +135,7 @@ def _reconstruct(ekf2: Ekf2 | Unavailable) -> PositionTrack | Unavailable:
     if isinstance(ekf2, Unavailable):
         return _unavailable(RECONSTRUCTION, "no EKF2 output")
     tracks = {}
-    for axis, column in zip(("north", "east", "down"), POSITION_COLUMNS, strict=True):
+    for axis, column in zip(AXIS_NAMES, POSITION_COLUMNS, strict=True):
         innovations = ekf2.innovations[axis]
         if isinstance(innovations, pd.DataFrame):
             tracks[column] = innovations["innovation_m"] + np.interp(
@@ -187,8 +190,9 @@ def _local_origin(topics: Topics) -> tuple[float, float, float] | None:
     local = topics.frame(layout)
     if "ref_lat" not in local:
         return None
-    origin = local[["ref_lat", "ref_lon", "ref_alt"]]
-    origin = origin[np.isfinite(origin).all(axis=1) & (origin["ref_lat"] != 0)]
+    columns = ["ref_lat", "ref_lon", "ref_alt"]
+    origin = finite_rows(local[columns], columns)
+    origin = origin[origin["ref_lat"] != 0]
     if origin.empty:
         return None
     latitude, longitude, altitude = origin.iloc[-1]
@@ -244,8 +248,7 @@ def read_truth(topics: Topics, positions: tuple[PositionTrack, ...]) -> Truth | 
             return Truth(layout.topic, samples)
     layout = topics.find(TRUTH_GLOBAL)
     if layout is not None:
-        geo = topics.frame(layout)
-        geo = geo[np.isfinite(geo[["latitude_deg", "longitude_deg"]]).all(axis=1)]
+        geo = finite_rows(topics.frame(layout), ["latitude_deg", "longitude_deg"])
         if len(geo):
             origin = _local_origin(topics) or (
                 float(geo["latitude_deg"].iloc[0]),

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
 from px4fuse.flight import (
     ANGULAR_RATE_COLUMNS,
@@ -14,11 +15,17 @@ from px4fuse.flight import (
     SPECIFIC_FORCE_COLUMNS,
     Flight,
     Unavailable,
+    finite_rows,
 )
 from px4fuse.readers.px4_ekf2 import read_ekf2
 from px4fuse.readers.px4_positions import read_positions, read_truth
 from px4fuse.readers.px4_topics import ATTITUDE, IMU, LAND_DETECTED
-from px4fuse.readers.ulog_topics import ACCELEROMETER_OFFSET_INVALID_US, Topics, read_topics
+from px4fuse.readers.ulog_topics import (
+    ACCELEROMETER_OFFSET_INVALID_US,
+    Topics,
+    increasing,
+    read_topics,
+)
 
 MAGIC = b"\x55\x4c\x6f\x67\x01\x12\x35"
 
@@ -75,13 +82,12 @@ def _read_imu(topics: Topics) -> pd.DataFrame | Unavailable:
     imu = topics.frame(layout)
     if "accelerometer_offset_us" in imu:
         offset_us = imu.pop("accelerometer_offset_us")
-        valid = offset_us != ACCELEROMETER_OFFSET_INVALID_US
-        imu = imu[valid]
-        time = imu.index.to_numpy() + offset_us[valid].to_numpy() * 1e-6
-        imu.index = pd.Index(time, name="time_s")
-        imu = imu[np.concatenate([[True], np.diff(np.maximum.accumulate(time)) > 0])[: len(imu)]]
-    imu = imu[SPECIFIC_FORCE_COLUMNS + ANGULAR_RATE_COLUMNS]
-    imu = imu[np.isfinite(imu).all(axis=1)]
+        imu = imu[offset_us != ACCELEROMETER_OFFSET_INVALID_US]
+        time_us = np.rint(imu.index.to_numpy() * 1e6 + offset_us[imu.index].to_numpy())
+        keep = increasing(time_us.astype(np.int64) + topics.zero_us)
+        imu = imu.iloc[keep].set_axis(pd.Index(time_us[keep] * 1e-6, name="time_s"))
+    columns = SPECIFIC_FORCE_COLUMNS + ANGULAR_RATE_COLUMNS
+    imu = finite_rows(imu[columns], columns)
     if len(imu) < 2:
         return Unavailable(
             "IMU",
@@ -98,7 +104,7 @@ def _read_attitude(topics: Topics) -> pd.DataFrame | Unavailable:
             "attitude", "no topic vehicle_attitude", "Record with SDLOG_PROFILE bit 0 (default)."
         )
     attitude = topics.frame(layout)[QUATERNION_COLUMNS]
-    norm = np.sqrt((attitude**2).sum(axis=1, skipna=False))
+    norm: NDArray[np.float64] = np.linalg.norm(attitude.to_numpy(), axis=1)
     attitude = attitude[np.isfinite(norm) & (norm > 0.5)]  # a zero quaternion is no attitude
     if len(attitude) < 2:
         return Unavailable(

@@ -32,11 +32,18 @@ _MICROSECOND = 1e-6
 MAX_PUBLICATION_LAG_S = 10.0
 # Samples outside the data window by more than this are stale leftovers of an earlier boot phase.
 WINDOW_MARGIN_S = 2.0
+# ULog file format, docs.px4.io: header, then definitions up to the first of these messages
+HEADER_BYTES = 16
+DATA_MESSAGES = "ALC"
+MAX_READS = 2_000_000
+RELEASE = 255
+# A gap longer than this in the IMU's stamps is no dropout: what lies beyond is another boot.
+MAX_DATA_GAP_S = 600.0
 ACCELEROMETER_OFFSET_INVALID_US = 0x7FFFFFFF
 # pyulog walks damaged bytes as though they were messages; these are what that can raise
 _PARSE_ERRORS = (
     ULogException, struct.error, IndexError, KeyError, ValueError, TypeError, AttributeError,
-    OverflowError, UnicodeError, EOFError, MemoryError, AssertionError,
+    OverflowError, UnicodeError, EOFError, MemoryError, AssertionError, RecursionError,
 )  # fmt: skip
 
 
@@ -93,9 +100,8 @@ class Topics:
         """
         available = self.instances(layout.topic)
         table = self.tables[layout.topic, instance if instance in available else available[0]]
-        columns = layout.columns | {
-            ours: px4 for ours, px4 in layout.optional.items() if px4 in table
-        }
+        optional = {ours: px4 for ours, px4 in layout.optional.items() if px4 in table}
+        columns = {**layout.columns, **optional}
         time_us = measurement_time_us(table)
         keep = increasing(time_us)
         if len(keep) < len(time_us):
@@ -104,6 +110,7 @@ class Topics:
             {ours: table[px4][keep].astype(np.float64) for ours, px4 in columns.items()},
             index=pd.Index((time_us[keep] - self.zero_us) * _MICROSECOND, name="time_s"),
         )
+        frame = frame.where(np.isfinite(frame))  # an infinite value is as unusable as NaN
         if step:
             return frame
         return self.window(frame)
@@ -179,7 +186,7 @@ def read_topics(path: Path) -> Topics:
     chatter = io.StringIO()
     try:
         with contextlib.redirect_stdout(chatter):  # pyulog prints what it stumbles over
-            ulog = ULog(io.BytesIO(content), message_name_filter_list=topics())
+            ulog = ULog(_handle(content), message_name_filter_list=topics())
             tables = _tables(ulog)
     except _PARSE_ERRORS as error:
         raise LogError(
@@ -193,13 +200,12 @@ def read_topics(path: Path) -> Topics:
             "(no IMU, no position, no EKF2). Record with SDLOG_PROFILE 129."
         )
     zero_us, end_us = _data_span(tables, path.name)
-    version = ulog.get_version_info()
     log = LogInfo(
         name=path.name,
         sha256=hashlib.sha256(content).hexdigest(),
         size_bytes=len(content),
         format="ULog",
-        firmware=_firmware(ulog.msg_info_dict, version),
+        firmware=_firmware(ulog.msg_info_dict),
         firmware_hash=str(ulog.msg_info_dict.get("ver_sw", "unknown")),
         hardware=str(ulog.msg_info_dict.get("ver_hw", "unknown")),
         boot_time_s=zero_us * _MICROSECOND,
@@ -212,7 +218,7 @@ def read_topics(path: Path) -> Topics:
             {
                 name: float(ulog.initial_parameters[name])
                 for name in PARAMETERS
-                if isinstance(ulog.initial_parameters.get(name), int | float)
+                if _is_finite(ulog.initial_parameters.get(name))
             }
         ),
         notes=notes,
@@ -250,11 +256,18 @@ def _data_span(
         time_us = tables[key]["timestamp"].astype(np.int64)
         kept = time_us[increasing(time_us)]
         if len(kept):
-            return int(kept[0]), int(kept[-1])
+            # a stamp hours away from the others is a leftover: the longest stretch counts
+            breaks = np.flatnonzero(np.diff(kept) > MAX_DATA_GAP_S / _MICROSECOND) + 1
+            stretch = max(np.split(kept, breaks), key=len)
+            return int(stretch[0]), int(stretch[-1])
     raise LogError(
         f"{name}: every time stamp in it is zero, so nothing can be placed in time. "
         "The logger ran before the clock did; record again."
     )
+
+
+def _is_finite(value: object) -> bool:
+    return isinstance(value, int | float) and bool(np.isfinite(value))
 
 
 def _corruption_notes(ulog: ULog, chatter: str) -> tuple[str, ...]:
@@ -266,13 +279,45 @@ def _corruption_notes(ulog: ULog, chatter: str) -> tuple[str, ...]:
     )
 
 
-def _firmware(info: dict[str, Any], version: tuple[int, int, int, int] | None) -> str:
-    if version is None:
+def _firmware(info: dict[str, Any]) -> str:
+    release = info.get("ver_sw_release")
+    if not isinstance(release, int):
         return "unknown"
-    major, minor, patch, kind = version
+    major, minor, patch, kind = (release & 0xFFFFFFFF).to_bytes(4, "big")
     if (major, minor, patch) == (0, 0, 0):
         return "PX4 development version"
-    # msg_info ver_sw_release: last byte 0 development, 64 alpha, 128 beta, 192 RC, 255 release
-    suffix = {0: "-dev", 1: "-alpha", 2: "-beta", 3: "-rc"}[kind // 64] if kind != 255 else ""
+    # last byte: 0 development, 64 alpha, 128 beta, 192 release candidate, 255 release
+    suffix = "" if kind == RELEASE else ("-dev", "-alpha", "-beta", "-rc")[kind // 64]
     system = str(info.get("sys_name", "PX4"))
     return f"{system} v{major}.{minor}.{patch}{suffix}"
+
+
+class _PatientBytes(io.BytesIO):
+    """A file that ends a reader that no longer gets anywhere.
+
+    pyulog steps back by more than it read when the definitions are cut off, and would do so for
+    ever.
+    """
+
+    def __init__(self, content: bytes) -> None:
+        super().__init__(content)
+        self._left = min(1000 + 4 * len(content), MAX_READS)
+
+    def read(self, size: int | None = -1) -> bytes:
+        self._left -= 1
+        if self._left < 0:
+            raise EOFError("its definitions are damaged")
+        return super().read(size)
+
+
+def _handle(content: bytes) -> io.BytesIO:
+    """The file for pyulog; a patient one, which costs time, only for damaged definitions."""
+    at = HEADER_BYTES
+    while at + 3 <= len(content):
+        size, kind = struct.unpack_from("<HB", content, at)
+        if chr(kind) in DATA_MESSAGES:
+            return io.BytesIO(content)
+        at += 3 + size
+        if kind == 0 or size == 0 or at > len(content):
+            break
+    return _PatientBytes(content)

@@ -1,0 +1,62 @@
+"""The command line: parses and prints; it computes nothing."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+
+import click
+
+from px4fuse.errors import Px4FuseError
+
+# Command name to module and one-line help: --help must not import what the commands need.
+COMMANDS = {
+    "compare": ("px4fuse.cli.compare", "Compare a flight's EKF2 with a two-state Kalman filter."),
+    "lesson": ("px4fuse.cli.lesson", "Run the lesson's worked examples through this engine."),
+}
+
+
+class LazyGroup(click.Group):
+    """A group whose commands are imported when they are called."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """Names of all commands."""
+        del ctx
+        return list(COMMANDS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """Import one command."""
+        del ctx
+        if cmd_name not in COMMANDS:
+            return None
+        module = importlib.import_module(COMMANDS[cmd_name][0])
+        command: click.Command = getattr(module, cmd_name)
+        return command
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """List the commands from the table above, without importing them."""
+        del ctx
+        with formatter.section("Commands"):
+            formatter.write_dl([(name, text) for name, (_, text) in COMMANDS.items()])
+
+
+@click.group(cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(package_name="px4fuse")
+def cli() -> None:
+    r"""Replay a PX4 flight through a two-state Kalman filter and compare it with EKF2.
+
+    \b
+    px4fuse compare log.ulg      writes reports/log.pdf and reports/log.json
+    """
+
+
+def main() -> None:
+    """Run the command line; an error that px4fuse knows is one line and exit code 2."""
+    for stream in (sys.stdout, sys.stderr):
+        if hasattr(stream, "reconfigure"):  # σ and ν on a Windows console with a legacy code page
+            stream.reconfigure(errors="replace")
+    try:
+        cli.main(standalone_mode=True)
+    except Px4FuseError as error:
+        click.echo(f"px4fuse: {error}", err=True)
+        sys.exit(2)

@@ -1,0 +1,19 @@
+"""``px4fuse lesson``: the worked examples of the lesson."""
+
+from __future__ import annotations
+
+import click
+
+
+@click.group()
+def lesson() -> None:
+    """Run the lesson's worked examples through px4fuse's own engine."""
+
+
+@lesson.command()
+def kalman() -> None:
+    """Print Example 1: fusing the IMU with UWB on an aisle at 1 m/s."""
+    from px4fuse.lesson import kalman_lines
+
+    for update in kalman_lines():
+        click.echo(str(update))

@@ -1,0 +1,47 @@
+"""The mistakes that px4fuse names: each a detector with evidence and a remedy that can be typed.
+
+Thresholds are data, with unit and source. A detector looks at a :class:`Comparison` and yields
+findings; it never prints and never guesses: what it cannot see it does not mention.
+"""
+
+from __future__ import annotations
+
+from px4fuse.comparison import Comparison
+from px4fuse.findings.ekf2 import ekf2_not_fusing, ekf2_rejecting, ekf2_unavailable, resets
+from px4fuse.findings.filter import process_noise_forgotten, too_few_innovations, variance_wrong
+from px4fuse.findings.model import SEVERITIES, Detector, Finding, Severity
+from px4fuse.findings.source import (
+    gaps,
+    input_unavailable,
+    log_damaged,
+    logging_rate_low,
+    no_motion,
+    source_frame,
+    source_reconstructed,
+)
+
+__all__ = ["DETECTORS", "SEVERITIES", "Finding", "Severity", "find"]
+
+
+def find(comparison: Comparison) -> tuple[Finding, ...]:
+    """All findings of all detectors, most severe first, each detector's own order kept."""
+    found = [finding for detector in DETECTORS for finding in detector(comparison)]
+    return tuple(sorted(found, key=lambda finding: SEVERITIES.index(finding.severity)))
+
+
+DETECTORS: tuple[Detector, ...] = (
+    ekf2_not_fusing,
+    variance_wrong,
+    process_noise_forgotten,
+    ekf2_rejecting,
+    source_reconstructed,
+    gaps,
+    resets,
+    no_motion,
+    logging_rate_low,
+    source_frame,
+    ekf2_unavailable,
+    input_unavailable,
+    too_few_innovations,
+    log_damaged,
+)

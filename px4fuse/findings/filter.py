@@ -1,0 +1,166 @@
+"""What the innovations say about the noise settings, of our filter and of EKF2 alike."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from px4fuse.comparison import AxisComparison, Comparison
+from px4fuse.consistency import Consistency
+from px4fuse.findings.model import Finding
+from px4fuse.findings.thresholds import (
+    EKF2_NOISE_FLOOR,
+    GROWTH,
+    LESSON_SIGMA_A,
+    NOISE_FITS,
+    OUTLIER_SHARE,
+    VARIANCE_FACTOR,
+    VARIANCE_FACTOR_ERROR,
+)
+from px4fuse.flight import Unavailable
+
+
+def variance_wrong(comparison: Comparison) -> Iterator[Finding]:
+    """S larger or smaller than the innovations deserve, for our filter and for EKF2 alike."""
+    for owner in ("kf", "ekf2"):
+        named: list[tuple[AxisComparison, Consistency]] = []
+        for result in comparison.axes:
+            summary = result.kf if owner == "kf" else result.ekf2
+            if isinstance(summary, Unavailable) or isinstance(summary.consistency, Unavailable):
+                continue
+            statement = summary.consistency
+            factor = max(statement.variance_factor, 1.0 / statement.variance_factor)
+            if statement.verdict != "consistent" and factor >= VARIANCE_FACTOR.value:
+                named.append((result, statement))
+        for group, axes in (("horizontal", ("north", "east", "aisle")), ("vertical", ("down",))):
+            members = [(r, s) for r, s in named if r.axis.name in axes]
+            if members:
+                yield _variance_finding(comparison, owner, group, members)
+
+
+def _variance_finding(
+    comparison: Comparison,
+    owner: str,
+    group: str,
+    members: list[tuple[AxisComparison, Consistency]],
+) -> Finding:
+    """One finding for a group of axes, on the axis whose NIS is furthest from 1."""
+    result, statement = max(members, key=lambda pair: abs(np.log(pair[1].nis_mean)))
+    over = statement.variance_factor > 1.0
+    factor = statement.variance_factor if over else 1.0 / statement.variance_factor
+    name = "Our" if owner == "kf" else "EKF2's"
+    low, high = statement.nis_band
+    evidence: dict[str, float | str] = {
+        "axis": result.axis.name,
+        "variance_factor": statement.variance_factor,
+        "nis_mean": statement.nis_mean,
+        "outside_gate": statement.outside_gate,
+    }
+    if result.noise_asked is not None:
+        evidence["sigma_z_asked_m"] = result.noise_asked.sigma_z_m
+        evidence["sigma_z_asked_is_upper_bound"] = float(result.noise_asked.upper_bound)
+    return Finding(
+        f"{owner}_variance_{'overstated' if over else 'understated'}",
+        "error" if factor >= VARIANCE_FACTOR_ERROR.value else "warning",
+        f"{name} innovation variance is {'overstated' if over else 'understated'} "
+        f"{factor:.3g} times along {result.axis.name} (mean NIS {statement.nis_mean:.3g}, "
+        f"consistent is {low:.2f} to {high:.2f}; {group}).",
+        _noise_remedy(comparison, owner, result, statement),
+        evidence,
+    )
+
+
+def _noise_remedy(
+    comparison: Comparison, owner: str, result: AxisComparison, statement: Consistency
+) -> str:
+    """The measurement noise that the data ask for, as what to type or to set.
+
+    It is a property of the source, so our estimate of it serves EKF2 as well.
+    """
+    asked = result.noise_asked
+    if asked is None:
+        return (
+            "No SIGMA_Z up to 30 m explains it: look at the acceleration input "
+            "(IMU rate, gaps, vibration) and at the clocks."
+        )
+    noise = asked.sigma_z_m
+    if owner == "kf":
+        used = comparison.settings.sigma_z_m
+        if asked.upper_bound:
+            return (
+                f"The source's noise is at most {noise:.2g} m, below what this rate can "
+                f"show: lower SIGMA_Z (--sigma-z {max(noise, 0.005):.2g}) and SIGMA_A."
+            )
+        remedy = f"The data ask for SIGMA_Z {noise:.2g} m at this SIGMA_A: --sigma-z {noise:.2g}."
+    else:
+        used = _ekf2_noise(result)
+        bound = "at most " if asked.upper_bound else ""
+        if asked.upper_bound:  # EKF2's own innovations bound it too, and less tightly
+            noise = float(np.hypot(statement.innovation_std_m, statement.innovation_mean_m))
+        was = "" if np.isnan(used) else f" (√R was {used:.2g} m)"
+        remedy = (
+            f"The source's noise is {bound}{noise:.2g} m: set EKF2_EVP_NOISE to "
+            f"{max(noise, EKF2_NOISE_FLOOR.value):.2g}{was}."
+        )
+    if not 1 / NOISE_FITS.value < noise / used < NOISE_FITS.value:
+        return remedy
+    if statement.variance_factor < 1.0 and statement.outside_gate > OUTLIER_SHARE.value:
+        return (
+            f"{statement.outside_gate:.1%} lie outside the gate while the bulk fits {noise:.2g} m: "
+            "remove the outliers (line of sight, anchor survey) instead of raising the noise."
+        )
+    if owner == "kf":
+        return (
+            f"SIGMA_Z fits the source ({noise:.2g} m): look at SIGMA_A (--sigma-a) and the clock "
+            "(--clock-offset)."
+        )
+    return (
+        f"EKF2_EVP_NOISE fits the source ({noise:.2g} m): look at the clock (EKF2_EV_DELAY) and at "
+        "EKF2's process noise (EKF2_ACC_NOISE)."
+    )
+
+
+def _ekf2_noise(result: AxisComparison) -> float:
+    """Median √R (m) that EKF2 used; NaN where unknown."""
+    frame = result.ekf2_innovations
+    if isinstance(frame, Unavailable):
+        return float("nan")
+    return float(np.sqrt(frame["observation_variance_m2"].median()))
+
+
+def process_noise_forgotten(comparison: Comparison) -> Iterator[Finding]:
+    """SIGMA_A so small that σ no longer grows between updates."""
+    if comparison.settings.sigma_a_m_s2 >= LESSON_SIGMA_A.value:
+        return  # then it is SIGMA_Z that is out of proportion, which is another finding
+    for result in comparison.axes:
+        updates = result.replay.updates
+        after = result.replay.steps["position_variance_m2"].reindex(updates.index)
+        growth = updates["prior_position_variance_m2"].to_numpy()[1:] / after.to_numpy()[:-1] - 1
+        late = growth[len(growth) // 2 :]
+        if len(late) and (relative := float(np.median(late))) < GROWTH.value:
+            gain = float(updates["gain_position"].iloc[-1])
+            yield Finding(
+                "process_noise_forgotten",
+                "error",
+                f"σ_p hardly grows between updates ({relative:.1%} in variance): with SIGMA_A "
+                f"{comparison.settings.sigma_a_m_s2:g} m/s² the filter ends up ignoring new "
+                f"measurements (last gain {gain:.3f}).",
+                f"Raise SIGMA_A: try --sigma-a {LESSON_SIGMA_A.value:g}.",
+                {"relative_growth": relative, "last_gain": gain, "axis": result.axis.name},
+            )
+            return
+
+
+def too_few_innovations(comparison: Comparison) -> Iterator[Finding]:
+    """Our own statistics could not be stated."""
+    for result in comparison.axes:
+        if isinstance(result.kf.consistency, Unavailable):
+            yield Finding(
+                "too_few_innovations",
+                "warning",
+                f"No statement on consistency: {result.kf.consistency.reason}.",
+                result.kf.consistency.remedy,
+                {"count": float(len(result.replay.updates))},
+            )
+            return

@@ -1,0 +1,206 @@
+"""What is wrong with the recording: the position source, the IMU and the logger."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import pandas as pd
+
+from px4fuse.comparison import Comparison
+from px4fuse.findings.model import Finding, step_share, times
+from px4fuse.findings.thresholds import (
+    FUSING_SHARE_ERROR,
+    GAP,
+    GAP_INTERVALS,
+    IMU_GAP_TOTAL,
+    LOGGER_INTERVAL_TOLERANCE,
+    LOGGER_INTERVALS_S,
+    MIN_ATTITUDE_RATE,
+    MIN_IMU_RATE,
+    MIN_INNOVATION_SHARE,
+    MOTION_RANGE,
+    VISION_PROFILE_BIT,
+)
+from px4fuse.flight import POSITION_COLUMNS, Ekf2, Unavailable, median_rate
+
+
+def source_reconstructed(comparison: Comparison) -> Iterator[Finding]:
+    """The position source as it arrived is not in the log."""
+    source = comparison.source
+    if source.rung not in (4, 5, 6):
+        return
+    profile = int(comparison.flight.log.parameters.get("SDLOG_PROFILE", 1))
+    yield Finding(
+        "source_not_logged",
+        "warning",
+        "vehicle_visual_odometry, the position as it arrived, is not in this log; "
+        f"{source.name} ({source.description}) stands in for it at {source.rate_hz:.1f} Hz.",
+        f"Set SDLOG_PROFILE to {profile | VISION_PROFILE_BIT} and fly again.",
+        {"rate_hz": source.rate_hz, "sdlog_profile": float(profile)},
+    )
+    interval = LOGGER_INTERVALS_S[source.name]
+    if abs(1.0 / source.rate_hz - interval) < LOGGER_INTERVAL_TOLERANCE.value * interval:
+        yield Finding(
+            "source_decimated",
+            "warning",
+            f"{source.name} is logged at {source.rate_hz:.1f} Hz, the logger's own limit for it "
+            f"({1 / interval:g} Hz): the source may have run faster, the samples between are lost.",
+            f"Set SDLOG_PROFILE to {profile | VISION_PROFILE_BIT} and fly again.",
+            {"rate_hz": source.rate_hz, "logger_limit_hz": 1.0 / interval},
+        )
+
+
+def source_frame(comparison: Comparison) -> Iterator[Finding]:
+    """The source's x axis is not north."""
+    ekf2 = comparison.flight.ekf2
+    if comparison.source.frame != "FRD":
+        return
+    aligned = False
+    if isinstance(ekf2, Ekf2) and isinstance(ekf2.fusing, pd.DataFrame):
+        segment = comparison.segment
+        share = step_share(ekf2.fusing["yaw"], segment.start_s, segment.end_s)
+        aligned = share > FUSING_SHARE_ERROR.value
+    yield Finding(
+        "source_frame_not_north",
+        "info" if aligned else "warning",
+        "The source's frame is FRD: its x axis is where the vehicle pointed at start, not north"
+        + (
+            "; EKF2 fused its yaw, so that EKF2's frame is the same."
+            if aligned
+            else ", while the IMU is turned into NED: north and east of the two may differ."
+        ),
+        "Read 'north' as the source's x axis."
+        if aligned
+        else "Send the position in NED, or let EKF2 fuse the yaw (EKF2_EV_CTRL bit 3).",
+    )
+
+
+def gaps(comparison: Comparison) -> Iterator[Finding]:
+    """The source, the IMU or the logger stopped for a while."""
+    segment, source = comparison.segment, comparison.source
+    measured_s = comparison.axes[0].axis.measurement_time_s
+    intervals = np.diff(measured_s)
+    limit = max(GAP.value, GAP_INTERVALS.value / source.rate_hz)
+    long = intervals[intervals > limit]
+    if len(long):
+        at = float(measured_s[:-1][intervals > limit][np.argmax(long)])
+        yield Finding(
+            "source_gap",
+            "warning",
+            f"The source was silent {times(len(long))} for more than {limit:.1f} s, the longest "
+            f"time {long.max():.1f} s at {at:.1f} s: only the IMU carries the position there.",
+            "Check line of sight to the anchors and the link; analyse one side with --start, "
+            "--end.",
+            {"count": float(len(long)), "longest_s": float(long.max()), "at_s": at},
+        )
+    lost = [
+        d for d in comparison.flight.log.dropouts
+        if d.start_s <= segment.end_s and d.start_s + d.duration_s >= segment.start_s
+    ]  # fmt: skip
+    if lost:
+        total = sum(d.duration_s for d in lost)
+        yield Finding(
+            "logger_dropouts",
+            "warning",
+            f"The logger lost data {times(len(lost))}, {total:.2f} s in all, the longest "
+            f"{max(d.duration_s for d in lost):.2f} s.",
+            "Use a faster SD card, or log less (SDLOG_PROFILE).",
+            {"count": float(len(lost)), "total_s": total},
+        )
+    gap_s = comparison.axes[0].replay.input_gap_s
+    if gap_s > IMU_GAP_TOTAL.value:
+        yield Finding(
+            "imu_gap",
+            "warning",
+            f"The IMU is missing for {gap_s:.2f} s of the segment; the process noise was raised "
+            "there to the size of the motion.",
+            "Use a faster SD card, or choose a segment without the gap (--start, --end).",
+            {"total_s": gap_s},
+        )
+
+
+def no_motion(comparison: Comparison) -> Iterator[Finding]:
+    """The vehicle hardly moved: nothing about dynamics can be identified."""
+    samples = comparison.source.samples
+    inside = samples[
+        (samples.index >= comparison.segment.start_s) & (samples.index <= comparison.segment.end_s)
+    ]
+    low, high = inside[POSITION_COLUMNS[:2]].quantile([0.05, 0.95]).to_numpy()
+    extent = float(np.max(high - low))
+    if extent < MOTION_RANGE.value:
+        yield Finding(
+            "no_motion",
+            "warning",
+            f"The vehicle moved only {extent:.2f} m horizontally (5 to 95 %): velocity, heading "
+            "and clock offset cannot be judged from this flight.",
+            "Fly several passes of 5 m or more, with clear starts and stops.",
+            {"range_m": extent},
+        )
+
+
+def logging_rate_low(comparison: Comparison) -> Iterator[Finding]:
+    """Topics that were logged too slowly for what is done with them."""
+    flight = comparison.flight
+    for part, topic, threshold in (
+        (flight.imu, "sensor_combined", MIN_IMU_RATE),
+        (flight.attitude, "vehicle_attitude", MIN_ATTITUDE_RATE),
+    ):
+        if isinstance(part, pd.DataFrame) and median_rate(part) < threshold.value:
+            yield Finding(
+                "logging_rate_low",
+                "warning",
+                f"{topic} was logged at {median_rate(part):.1f} Hz, below the "
+                f"{threshold.value:g} Hz that the acceleration needs: motion between samples "
+                "is lost.",
+                "Set SDLOG_PROFILE to 129, which logs it at full rate.",
+                {"rate_hz": median_rate(part), "needed_hz": threshold.value, "topic": topic},
+            )
+    innovations = next(
+        (
+            a.ekf2_innovations
+            for a in comparison.axes
+            if isinstance(a.ekf2_innovations, pd.DataFrame)
+        ),
+        None,
+    )
+    if innovations is not None and not comparison.source.reconstructed:
+        count = len(comparison.axes[0].replay.updates)
+        share = len(innovations) / count
+        if share < MIN_INNOVATION_SHARE.value and isinstance(flight.ekf2, Ekf2):
+            topic = flight.ekf2.innovation_topics[0]
+            yield Finding(
+                "ekf2_innovations_decimated",
+                "info",
+                f"The log holds {len(innovations)} EKF2 innovations for {count} measurements: "
+                f"{1 - share:.0%} of what EKF2 did with the source is not in it.",
+                f'Put the line "{topic} 0" into etc/logging/logger_topics.txt on the SD card.',
+                {"logged": float(len(innovations)), "measurements": float(count)},
+            )
+
+
+def input_unavailable(comparison: Comparison) -> Iterator[Finding]:
+    """No IMU or attitude: the filter ran without its input."""
+    acceleration = comparison.axes[0].axis.acceleration
+    if isinstance(acceleration, Unavailable):
+        yield Finding(
+            "input_unavailable",
+            "warning",
+            f"No acceleration input ({acceleration.what}: {acceleration.reason}); "
+            "our filter assumes constant velocity.",
+            acceleration.remedy,
+        )
+
+
+def log_damaged(comparison: Comparison) -> Iterator[Finding]:
+    """Bytes or samples that the reader had to pass over."""
+    notes = [n for n in comparison.flight.log.notes if "damaged" in n or "dropped" in n]
+    if notes:
+        yield Finding(
+            "log_damaged",
+            "warning",
+            f"{notes[0][0].upper()}{notes[0][1:]}"
+            + (f" (and {len(notes) - 1} more such notes)." if len(notes) > 1 else "."),
+            "Copy the log from the SD card again; if it stays, replace the card.",
+            {"notes": float(len(notes))},
+        )

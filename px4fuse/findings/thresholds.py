@@ -1,0 +1,44 @@
+"""The numbers that detectors compare with, each with its unit and source."""
+
+from __future__ import annotations
+
+from px4fuse.findings.model import Threshold
+
+MIN_IMU_RATE = Threshold(
+    50.0, "Hz", "5 IMU samples per DT of 0.1 s and 10 with margin for aliasing"
+)
+MIN_ATTITUDE_RATE = Threshold(10.0, "Hz", "PX4's default is 20 Hz; slerp bridges 0.1 s of a tilt")
+MIN_INNOVATION_SHARE = Threshold(
+    0.75, "of the source's samples", "a quarter lost biases nothing yet"
+)
+LOGGER_INTERVAL_TOLERANCE = Threshold(
+    0.25, "of the interval", "jitter of PX4's logger seen in flights"
+)
+EV_START_INTERVAL = Threshold(0.2, "s", "EV_MAX_INTERVAL, PX4 v1.14 and later, ev_control.cpp")
+EV_STOP_INTERVAL = Threshold(0.4, "s", "two times EV_MAX_INTERVAL, ev_pos_control.cpp")
+FUSING_SHARE_ERROR = Threshold(
+    0.5, "of the segment", "below, EKF2's track is mostly not the source's"
+)
+FUSING_SHARE_WARNING = Threshold(0.98, "of the segment", "one second in a flight of a minute")
+REJECTED_SHARE_WARNING = Threshold(0.01, "of the innovations", "5 σ rejects 6e-7 when consistent")
+REJECTED_SHARE_ERROR = Threshold(0.20, "of the innovations", "one in five: R or the clock is wrong")
+GAP = Threshold(1.0, "s", "ten prediction steps without a measurement")
+GAP_INTERVALS = Threshold(5.0, "median intervals", "jitter and single losses pass")
+VARIANCE_FACTOR = Threshold(
+    1.5, "times", "22 % in standard deviation; chance moves it less at n > 100"
+)
+VARIANCE_FACTOR_ERROR = Threshold(4.0, "times", "a factor of two in standard deviation")
+IMU_GAP_TOTAL = Threshold(0.2, "s", "two prediction steps")
+EKF2_NOISE_FLOOR = Threshold(0.01, "m", "EKF2 never trusts external vision better, EKF2.cpp")
+NOISE_FITS = Threshold(1.25, "times", "the median's own scatter below n = 100 (1.17/√n, two σ)")
+LESSON_SIGMA_A = Threshold(0.5, "m/s²", "the lesson's Example 1")
+OUTLIER_SHARE = Threshold(0.005, "outside 5√S", "6e-7 is expected")
+GROWTH = Threshold(0.02, "relative growth of σ_p² between updates", "each update then brings < 2 %")
+MOTION_RANGE = Threshold(0.5, "m", "5 to 95 % range; a hovering drone with 0.1 m UWB stays below")
+VISION_PROFILE_BIT = 128  # SDLOG_PROFILE bit 7, logged_topics.cpp
+# Intervals (s) at which PX4's default profile thins these topics, logged_topics.cpp
+LOGGER_INTERVALS_S = {
+    "estimator_visual_odometry_aligned": 0.2,
+    "estimator_aid_src_ev_pos": 0.5,
+    "ekf2_state_plus_innovation": 0.5,
+}

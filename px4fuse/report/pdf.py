@@ -1,0 +1,81 @@
+"""The PDF report: pages in order, page numbers, and the results attached inside."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator
+from importlib import metadata
+
+from matplotlib.backends.backend_pdf import PdfPages
+from matplotlib.figure import Figure
+from pypdf import PdfWriter
+
+from px4fuse.report import consistency, cover, innovations, notes, provenance, tracks, variances
+from px4fuse.report.document import Document
+from px4fuse.report.style import LEFT, MUTED, RIGHT, printable, report_style, shorten
+
+RESULTS_NAME = "results.json"
+PAGES = (
+    cover.draw,
+    tracks.draw,
+    innovations.draw,
+    variances.draw,
+    consistency.draw,
+    notes.draw,
+    provenance.draw,
+)
+
+
+def render(document: Document, results_json: str) -> bytes:
+    """Draw the report.
+
+    Parameters
+    ----------
+    document : Document
+    results_json : str
+        Attached inside the PDF as ``results.json``, so that the PDF alone can be checked.
+
+    Returns
+    -------
+    bytes
+        The same for the same input and the same versions: no dates, no random identifiers.
+    """
+    drawn = io.BytesIO()
+    with report_style():
+        figures = list(_pages(document))
+        with PdfPages(
+            drawn, metadata={"CreationDate": None, "Creator": None, "Producer": None}
+        ) as pdf:
+            for number, figure in enumerate(figures, start=1):
+                _running_lines(figure, document, number, len(figures))
+                pdf.savefig(figure)
+    return _attach(drawn.getvalue(), document, results_json)
+
+
+def _pages(document: Document) -> Iterator[Figure]:
+    for draw in PAGES:
+        yield from draw(document)
+
+
+def _running_lines(figure: Figure, document: Document, number: int, count: int) -> None:
+    """Head and foot of a page: which log, whose, which version, which page."""
+    log = document.comparison.flight.log
+    style = {"size": 6.5, "color": MUTED}
+    head = shorten(printable(f"px4fuse · {log.name} · SHA-256 {log.sha256[:12]}"), 6.5, 330)
+    who = " · ".join(part for part in (document.student.name, document.student.id) if part)
+    figure.text(LEFT, 0.972, head, **style)  # type: ignore[arg-type]
+    if who:
+        figure.text(RIGHT, 0.972, shorten(printable(who), 6.5, 170), ha="right", **style)  # type: ignore[arg-type]
+    version = metadata.version("px4fuse")
+    figure.text(LEFT, 0.022, f"px4fuse {version}", **style)  # type: ignore[arg-type]
+    figure.text(RIGHT, 0.022, f"{number} / {count}", ha="right", **style)  # type: ignore[arg-type]
+
+
+def _attach(drawn: bytes, document: Document, results_json: str) -> bytes:
+    writer = PdfWriter(clone_from=io.BytesIO(drawn))
+    writer.add_attachment(RESULTS_NAME, results_json.encode())
+    title = f"px4fuse compare {document.comparison.flight.log.name}"
+    writer.metadata = {"/Title": title, "/Creator": f"px4fuse {metadata.version('px4fuse')}"}
+    out = io.BytesIO()
+    writer.write(out)
+    return out.getvalue()

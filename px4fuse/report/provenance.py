@@ -1,0 +1,118 @@
+"""Provenance: where every number comes from, so that somebody else can make it again."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from matplotlib.figure import Figure
+
+from px4fuse.report.document import Document
+from px4fuse.report.results import provenance
+from px4fuse.report.style import BOTTOM, LEFT, MUTED, NO_GLYPH, lacks_glyphs, page
+
+INDENT = LEFT + 0.235
+METHOD = (
+    "State x = [position, velocity] per axis, F = [[1, dt], [0, 1]], B = [dt²/2, dt], H = [1, 0], "
+    "R = SIGMA_Z², Q(dt) = SIGMA_A² · DT · [[dt³/4, dt²/2], [dt²/2, dt]]; predict on the DT grid "
+    "and to each measurement's own time, update with filterpy. Input: specific force turned into "
+    "NED by the slerped attitude, gravity removed, averaged over each step. Initial state: the "
+    "first measurement at rest, σ_p 0.5 m, σ_v 1 m/s.",
+    "NIS = ν²/S with a two-sided 95 % chi-square band (Bar-Shalom, Li and Kirubarajan 2001, "
+    "section 5.4), assuming white innovations. EKF2's innovations have their sign turned, resets "
+    "are treated as stated, and times are of measurement. EKF2 logs no covariance between north "
+    "and east, so along the aisle none is added. Along one axis EKF2's σ just before an update is "
+    "√(S - R), just after it √((S - R) R / S).",
+)
+
+
+def draw(document: Document) -> Iterator[Figure]:
+    """Draw one page or more."""
+    comparison = document.comparison
+    log, source = comparison.flight.log, comparison.source
+    made = provenance(document.command)
+    sections: list[tuple[str, list[tuple[str, str]]]] = [
+        (
+            "Made with",
+            [
+                ("command", made["command"]),
+                ("px4fuse", f"{made['px4fuse']} on Python {made['python']}"),
+                ("libraries", ", ".join(f"{k} {v}" for k, v in made["libraries"].items())),
+                ("results", "attached inside this PDF as results.json"),
+                *_fonts(document),
+            ],
+        ),
+        (
+            "The log",
+            [
+                ("file", f"{log.name}, {log.size_bytes} bytes, {log.format}"),
+                ("SHA-256", log.sha256),
+                ("firmware", f"{log.firmware}, git {log.firmware_hash}"),
+                ("time zero", f"{log.boot_time_s:.6f} s after boot, the first sample of data"),
+                (
+                    "position source",
+                    f"{source.name} (rung {source.rung} of 7) from {', '.join(source.topics)}; "
+                    f"clock: {source.clock}",
+                ),
+                (
+                    "also in the log",
+                    ", ".join(
+                        f"{t.name} ({t.rate_hz:.1f} Hz)"
+                        for t in comparison.flight.positions
+                        if t is not source
+                    )
+                    or "no other position",
+                ),
+                (
+                    "parameters",
+                    ", ".join(f"{k} {v:g}" for k, v in log.parameters.items()) or "none",
+                ),
+            ],
+        ),
+        ("Choices made on the way", [("", note) for note in comparison.notes] or [("", "none")]),
+        (
+            "Looked for and not found",
+            [
+                (part.what.removeprefix("position source "), f"{part.reason}. {part.remedy}")
+                for part in comparison.missing
+            ]
+            or [("", "nothing is missing")],
+        ),
+        ("How the numbers are made", [("", text) for text in METHOD]),
+    ]
+    figure, cursor = page("Provenance")
+    for title, entries in sections:
+        cursor.skip(4)
+        needed = 0.03
+        for position, (label, text) in enumerate(entries):
+            x = INDENT if label else LEFT
+            height = max(
+                cursor.height(text, size=7.5, x=x),
+                cursor.height(label, size=7.5, right=INDENT - 0.01),
+            )
+            if cursor.y - height - (needed if position == 0 else 0.0) < BOTTOM:
+                yield figure
+                figure, cursor = page("Provenance, continued")
+            if position == 0:
+                cursor.write(title, size=9.5, weight="bold")
+                cursor.skip(1)
+            top = cursor.y
+            if label:
+                cursor.write(label, size=7.5, colour=MUTED, right=INDENT - 0.01)
+                label_end, cursor.y = cursor.y, top
+            else:
+                label_end = top
+            cursor.write(text, size=7.5, x=x)
+            cursor.y = min(cursor.y, label_end)
+            cursor.skip(1)
+    yield figure
+
+
+def _fonts(document: Document) -> list[tuple[str, str]]:
+    student = document.student
+    if not lacks_glyphs(student.name + student.id + student.notes):
+        return []
+    text = (
+        f"{NO_GLYPH} stands for characters that no font on this machine has; results.json holds "
+        "the text as given"
+    )
+    return [("fonts", text)]

@@ -1,0 +1,207 @@
+"""The results contract: one JSON object per report, documented by its JSON Schema.
+
+The schema is ``results.schema.json`` beside this file. Names carry units. What could not be
+computed is absent, or an object ``{"unavailable": {"what", "reason", "remedy"}}``, never zero.
+"""
+
+from __future__ import annotations
+
+import json
+import platform
+from dataclasses import asdict
+from importlib import metadata
+from importlib.resources import files
+from typing import Any
+
+from px4fuse.comparison import AgainstTruth, AxisComparison, Comparison, FilterSummary
+from px4fuse.consistency import Consistency
+from px4fuse.flight import Unavailable, median_rate
+from px4fuse.report.document import Document
+
+SCHEMA_NAME = "px4fuse-results"
+SCHEMA_VERSION = "1.0"
+# The libraries on whose arithmetic the numbers rest
+LIBRARIES = ("numpy", "scipy", "pandas", "pyulog", "filterpy", "matplotlib", "pypdf")
+NOT_YET = "this version does not compute it"
+
+
+def schema() -> dict[str, Any]:
+    """JSON Schema of the results object."""
+    text = files("px4fuse.report").joinpath("results.schema.json").read_text(encoding="utf-8")
+    loaded: dict[str, Any] = json.loads(text)
+    return loaded
+
+
+def to_json(results: dict[str, Any]) -> str:
+    """Text of a results object: stable order, no NaN, one trailing newline."""
+    return json.dumps(results, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+
+
+def results(document: Document) -> dict[str, Any]:
+    """Everything that the report says, as plain data.
+
+    Returns
+    -------
+    dict
+        Valid under :func:`schema`.
+    """
+    comparison = document.comparison
+    return {
+        "schema": {"name": SCHEMA_NAME, "version": SCHEMA_VERSION},
+        "log": _log(comparison),
+        "position_source": _source(comparison),
+        "settings": _settings(comparison),
+        "axes": {axis.axis.name: _axis(axis) for axis in comparison.axes},
+        "horizontal": {
+            name: asdict(joint)
+            for name, joint in (
+                ("kf", comparison.horizontal_kf),
+                ("ekf2", comparison.horizontal_ekf2),
+            )
+            if joint is not None
+        },
+        "tuning": _unavailable(Unavailable("tuning", NOT_YET, "See updates.noise_asked per axis.")),
+        "clock": _unavailable(Unavailable("clock offset", NOT_YET, "Set it with --clock-offset.")),
+        "loop": _unavailable(Unavailable("loop closure", NOT_YET, "None needed on an aisle.")),
+        "findings": [
+            {
+                "id": finding.id,
+                "severity": finding.severity,
+                "message": finding.message,
+                "evidence": finding.evidence,
+                "remedy": finding.remedy,
+            }
+            for finding in document.findings
+        ],
+        "notes": list(comparison.notes),
+        "missing": [asdict(part) for part in comparison.missing],
+        "student": asdict(document.student),
+        "provenance": provenance(document.command),
+    }
+
+
+def provenance(command: str) -> dict[str, Any]:
+    """Versions and the command line; nothing else of the machine is recorded."""
+    return {
+        "px4fuse": metadata.version("px4fuse"),
+        "python": platform.python_version(),
+        "libraries": {name: metadata.version(name) for name in LIBRARIES},
+        "command": command,
+    }
+
+
+def _unavailable(part: Unavailable) -> dict[str, Any]:
+    return {"unavailable": asdict(part)}
+
+
+def _present(values: dict[str, Any]) -> dict[str, Any]:
+    """Without the entries that could not be computed."""
+    return {name: value for name, value in values.items() if value is not None}
+
+
+def _log(comparison: Comparison) -> dict[str, Any]:
+    log = comparison.flight.log
+    return {
+        "name": log.name,
+        "sha256": log.sha256,
+        "size_bytes": log.size_bytes,
+        "format": log.format,
+        "firmware": log.firmware,
+        "firmware_hash": log.firmware_hash,
+        "hardware": log.hardware,
+        "boot_time_s": log.boot_time_s,
+        "duration_s": log.duration_s,
+        "dropouts": [asdict(dropout) for dropout in log.dropouts],
+        "parameters": dict(log.parameters),
+        "notes": list(log.notes),
+    }
+
+
+def _source(comparison: Comparison) -> dict[str, Any]:
+    source = comparison.source
+    looked_for = [m for m in comparison.missing if m.what.startswith("position source ")]
+    return {
+        "name": source.name,
+        "rung": source.rung,
+        "description": source.description,
+        "reason": comparison.source_reason,
+        "rate_hz": source.rate_hz,
+        "frame": source.frame,
+        "clock": source.clock,
+        "reconstructed": source.reconstructed,
+        "topics": list(source.topics),
+        "available": [
+            _present(
+                {
+                    "name": track.name,
+                    "rung": track.rung,
+                    "samples": len(track.samples),
+                    "rate_hz": track.rate_hz,
+                }
+            )
+            for track in comparison.flight.positions
+        ],
+        "not_in_log": [asdict(part) for part in looked_for],
+    }
+
+
+def _settings(comparison: Comparison) -> dict[str, Any]:
+    settings = comparison.settings
+    return {
+        "sigma_a_m_s2": settings.sigma_a_m_s2,
+        "sigma_z_m": settings.sigma_z_m,
+        "dt_s": settings.dt_s,
+        "input": settings.input,
+        "start_s": comparison.segment.start_s,
+        "end_s": comparison.segment.end_s,
+        "segment_reason": comparison.segment.reason,
+        "clock_offset_s": settings.clock_offset_s,
+    }
+
+
+def _axis(result: AxisComparison) -> dict[str, Any]:
+    updates = result.replay.updates
+    asked = result.noise_asked
+    return _present(
+        {
+            "heading_deg": result.axis.heading_deg,
+            "direction": [float(part) for part in result.axis.direction],
+            "note": result.axis.note,
+            "updates": _present(
+                {
+                    "count": len(updates),
+                    "first_s": float(updates.index[0]),
+                    "last_s": float(updates.index[-1]),
+                    "rate_hz": median_rate(updates) if len(updates) > 1 else None,
+                    "input_gap_s": result.replay.input_gap_s,
+                    "noise_asked": asdict(asked) if asked is not None else None,
+                }
+            ),
+            "kf": _filter(result.kf),
+            "ekf2": _filter(result.ekf2),
+            "difference": _unavailable(result.difference)
+            if isinstance(result.difference, Unavailable)
+            else asdict(result.difference),
+            "truth": _truth(result),
+        }
+    )
+
+
+def _filter(summary: FilterSummary | Unavailable) -> dict[str, Any]:
+    if isinstance(summary, Unavailable):
+        return _unavailable(summary)
+    sigmas = asdict(summary)
+    del sigmas["consistency"]
+    statement = summary.consistency
+    stated = asdict(statement) if isinstance(statement, Consistency) else _unavailable(statement)
+    return stated | _present(sigmas)
+
+
+def _truth(result: AxisComparison) -> dict[str, Any]:
+    if isinstance(result.truth, Unavailable):
+        return _unavailable(result.truth)
+    values: dict[str, Any] = {}
+    for name, part in (("kf", result.kf_truth), ("ekf2", result.ekf2_truth)):
+        if isinstance(part, AgainstTruth):
+            values |= {f"{name}_{key}": value for key, value in asdict(part).items()}
+    return _present(values)

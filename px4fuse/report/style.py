@@ -1,0 +1,312 @@
+"""Page geometry, colours, fonts and text for the report's pages.
+
+Our filter is dark, solid and round; EKF2 is lighter, dashed and square; so that the two stay apart
+in grey. Text from outside (names, notes) is drawn as it is: no mathematics, no markup.
+"""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib import font_manager
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ft2font import LoadFlags
+from matplotlib.ticker import MaxNLocator
+
+from px4fuse.signals import Array
+
+A4_INCHES = (8.27, 11.69)
+LEFT, RIGHT, TOP, BOTTOM = 0.085, 0.945, 0.95, 0.05
+POINTS_PER_WIDTH = A4_INCHES[0] * 72.0
+POINTS_PER_HEIGHT = A4_INCHES[1] * 72.0
+
+OURS = "#123f7a"
+OURS_BAND = "#b9cbe4"
+EKF2 = "#e0741a"
+EKF2_BAND = "#f6c99f"
+TRUTH = "#111111"
+MEASUREMENT = "#9a9a9a"
+MUTED = "#555555"
+RULE = "#bbbbbb"
+SEVERITY_COLOURS = {"error": "#a61b1b", "warning": "#8a5a00", "info": "#33556b"}
+
+OURS_LINE: dict[str, Any] = {"color": OURS, "lw": 1.0, "ls": "-"}
+EKF2_LINE: dict[str, Any] = {"color": EKF2, "lw": 1.1, "ls": (0, (4, 1.6))}
+TRUTH_LINE: dict[str, Any] = {"color": TRUTH, "lw": 0.7, "ls": (0, (1, 1.5))}
+OURS_DOTS: dict[str, Any] = {"color": OURS, "marker": "o", "ms": 2.0, "mew": 0, "ls": "none"}
+EKF2_DOTS: dict[str, Any] = {
+    "color": EKF2, "marker": "s", "ms": 2.8, "mew": 0.6, "mfc": "none", "ls": "none",
+}  # fmt: skip
+
+# The first is matplotlib's own and always there; the others serve scripts that it lacks.
+FONTS = (
+    "DejaVu Sans", "Noto Sans", "Noto Sans Thai", "Leelawadee UI", "Thonburi", "Noto Sans CJK SC",
+    "Noto Sans CJK JP", "WenQuanYi Zen Hei", "Microsoft YaHei", "PingFang SC", "Hiragino Sans GB",
+    "Malgun Gothic", "Noto Sans Arabic", "Noto Sans Devanagari", "Segoe UI", "Arial Unicode MS",
+)  # fmt: skip
+NO_GLYPH = "\N{WHITE SQUARE}"
+# What the eye can see across a page, and across a third of it: longer series are thinned to their
+# extremes per bucket.
+MAX_POINTS = 1500
+MAX_POINTS_NARROW = 500
+
+
+@contextmanager
+def report_style() -> Iterator[None]:
+    """Matplotlib settings of the report, for the duration of a block."""
+    with mpl.rc_context(
+        {
+            "font.family": list(_available_fonts()),
+            "font.size": 7.5,
+            "axes.titlesize": 8.5,
+            "axes.titlelocation": "left",
+            "axes.titlepad": 4,
+            "axes.titley": 1.0,  # fixed: placing titles automatically lays every axis out twice
+            "axes.labelsize": 7.5,
+            "axes.labelpad": 2,
+            "axes.linewidth": 0.6,
+            "axes.spines.top": False,
+            "axes.spines.right": False,
+            "axes.unicode_minus": True,
+            "axes.grid": True,
+            "grid.color": "#e3e3e3",
+            "grid.linewidth": 0.5,
+            "axes.axisbelow": True,
+            "xtick.labelsize": 7,
+            "ytick.labelsize": 7,
+            "xtick.major.width": 0.6,
+            "ytick.major.width": 0.6,
+            "xtick.major.size": 2.5,
+            "ytick.major.size": 2.5,
+            "legend.fontsize": 7,
+            "legend.frameon": False,
+            "legend.handlelength": 2.4,
+            "text.parse_math": False,
+            "pdf.fonttype": 42,
+            "pdf.compression": 6,
+            "path.simplify": True,
+            "path.simplify_threshold": 0.5,
+        }
+    ):
+        yield
+
+
+@cache
+def _available_fonts() -> tuple[str, ...]:
+    installed = {entry.name for entry in font_manager.fontManager.ttflist}
+    return tuple(name for name in FONTS if name in installed)
+
+
+@cache
+def _font(name: str, weight: str) -> Any:
+    properties = font_manager.FontProperties(family=name, weight=weight)
+    return font_manager.get_font(font_manager.findfont(properties))
+
+
+def printable(text: str) -> str:
+    """Text with what no font here can draw replaced by a white square, and tabs by spaces."""
+    drawn = []
+    for character in text.expandtabs(4):
+        if character in "\n" or (character.isprintable() and _has_glyph(character)):
+            drawn.append(character)
+        elif character.isprintable():
+            drawn.append(NO_GLYPH)
+    return "".join(drawn)
+
+
+def lacks_glyphs(text: str) -> bool:
+    """Whether a part of a text can only be drawn as white squares here."""
+    return NO_GLYPH in printable(text.replace(NO_GLYPH, ""))
+
+
+@cache
+def _has_glyph(character: str) -> bool:
+    code = ord(character)
+    return any(_font(name, "normal").get_char_index(code) for name in _available_fonts())
+
+
+@cache
+def text_width(text: str, size: float, weight: str = "normal") -> float:
+    """Width of a line of text in points, kerning and all fonts but the first left out."""
+    font = _font(FONTS[0], weight)
+    font.set_size(size, 72.0)
+    width = 0.0
+    for character in text:
+        if font.get_char_index(ord(character)):
+            width += _advance(character, weight) * size
+        else:
+            width += 1.05 * size  # wide scripts: an em and a little
+    return width
+
+
+@cache
+def _advance(character: str, weight: str) -> float:
+    """Advance of one character in em."""
+    font = _font(FONTS[0], weight)
+    font.set_size(100.0, 72.0)
+    return (
+        float(font.load_char(ord(character), flags=LoadFlags.NO_HINTING).linearHoriAdvance)
+        / 65536.0
+        / 100.0
+    )
+
+
+def wrap(text: str, size: float, width_points: float, weight: str = "normal") -> list[str]:
+    """Break text into lines that fit; a word longer than a line is broken too."""
+    lines: list[str] = []
+    for paragraph in text.split("\n"):
+        line = ""
+        for word in paragraph.split(" "):
+            candidate = f"{line} {word}" if line else word
+            if text_width(candidate, size, weight) <= width_points:
+                line = candidate
+                continue
+            if line:
+                lines.append(line)
+            line = word
+            while text_width(line, size, weight) > width_points:
+                fitting = next(
+                    n
+                    for n in range(len(line) - 1, 0, -1)
+                    if n == 1 or text_width(line[:n], size, weight) <= width_points
+                )
+                lines.append(line[:fitting])
+                line = line[fitting:]
+        lines.append(line)
+    return lines
+
+
+def shorten(text: str, size: float, width_points: float, weight: str = "normal") -> str:
+    """One line that fits, with an ellipsis where it was cut."""
+    text = " ".join(text.split())
+    if text_width(text, size, weight) <= width_points:
+        return text
+    while text and text_width(text + "…", size, weight) > width_points:
+        text = text[:-1]
+    return text + "…"
+
+
+@dataclass
+class Cursor:
+    """A place on a page for text that runs down it; moves as text is written."""
+
+    figure: Figure
+    y: float = TOP
+
+    def write(
+        self,
+        text: str,
+        *,
+        size: float = 8.0,
+        weight: str = "normal",
+        colour: str = "black",
+        x: float = LEFT,
+        right: float = RIGHT,
+        spacing: float = 1.32,
+    ) -> None:
+        """Write wrapped text and move below it."""
+        for line in wrap(printable(text), size, (right - x) * POINTS_PER_WIDTH, weight):
+            self.y -= size * spacing / POINTS_PER_HEIGHT
+            self.figure.text(x, self.y, line, size=size, weight=weight, color=colour, va="baseline")
+
+    def height(
+        self, text: str, *, size: float = 8.0, weight: str = "normal", x: float = LEFT,
+        right: float = RIGHT, spacing: float = 1.32,
+    ) -> float:  # fmt: skip
+        """Height that :meth:`write` would take, as a fraction of the page."""
+        lines = wrap(printable(text), size, (right - x) * POINTS_PER_WIDTH, weight)
+        return len(lines) * size * spacing / POINTS_PER_HEIGHT
+
+    def skip(self, points: float) -> None:
+        """Leave a gap."""
+        self.y -= points / POINTS_PER_HEIGHT
+
+    def rule(self, colour: str = RULE) -> None:
+        """Draw a thin line across the page."""
+        self.figure.add_artist(
+            mpl.lines.Line2D([LEFT, RIGHT], [self.y, self.y], color=colour, lw=0.6)
+        )
+
+
+def page(title: str, lead: str = "") -> tuple[Figure, Cursor]:
+    """Start a page with a heading and a sentence that says what to see."""
+    figure = Figure(figsize=A4_INCHES)
+    cursor = Cursor(figure)
+    cursor.write(title, size=13, weight="bold")
+    if lead:
+        cursor.skip(2)
+        cursor.write(lead, size=8.0, colour=MUTED)
+    cursor.skip(6)
+    return figure, cursor
+
+
+def panels(
+    figure: Figure,
+    top: float,
+    bottom: float,
+    rows: int,
+    columns: int,
+    *,
+    widths: Sequence[float] | None = None,
+    hspace: float = 0.45,
+    wspace: float = 0.2,
+    left: float = LEFT,
+) -> list[list[Axes]]:
+    """Lay out a grid of axes between two heights of a page (fractions).
+
+    Rows share what their x axes mean, so only the last one has numbers on it.
+    """
+    grid = figure.add_gridspec(
+        rows, columns, left=left, right=RIGHT, top=top, bottom=bottom, hspace=hspace,
+        wspace=wspace, width_ratios=widths,
+    )  # fmt: skip
+    axes = [[figure.add_subplot(grid[r, c]) for c in range(columns)] for r in range(rows)]
+    for row in axes:
+        for single in row:
+            single.xaxis.set_major_locator(MaxNLocator(7))
+            single.yaxis.set_major_locator(MaxNLocator(5))
+            if row is not axes[-1]:
+                single.tick_params(axis="x", labelbottom=False)
+    return axes
+
+
+def caption(axes: Axes, text: str, *, size: float = 7.0) -> None:
+    """Numbers below an axes (below its x label, if it has one yet), wrapped to its width."""
+    box = axes.get_position()
+    offset_points = 24.0 if axes.get_xlabel() else 5.0
+    lines = wrap(printable(text), size, box.width * POINTS_PER_WIDTH)
+    figure = axes.get_figure()
+    if figure is not None:
+        figure.text(
+            box.x0, box.y0 - offset_points / POINTS_PER_HEIGHT, "\n".join(lines), size=size,
+            color=MUTED, va="top", linespacing=1.25,
+        )  # fmt: skip
+
+
+def empty(axes: Axes, reason: str) -> None:
+    """Say in an axes why there is nothing to draw."""
+    axes.set_axis_off()
+    width = max(20, int(axes.get_position().width * 95))
+    axes.text(
+        0.5, 0.5, textwrap.fill(reason, width), ha="center", va="center", size=7.5, color=MUTED,
+        transform=axes.transAxes,
+    )  # fmt: skip
+
+
+def thin(time: Array, value: Array, limit: int = MAX_POINTS) -> tuple[Array, Array]:
+    """Thin a series to at most ``limit`` points, keeping the extremes of every bucket."""
+    if len(time) <= limit:
+        return time, value
+    buckets = np.array_split(np.arange(len(time)), limit // 2)
+    keep = np.unique(
+        [b[i] for b in buckets for i in (int(np.argmin(value[b])), int(np.argmax(value[b])))]
+    )
+    return time[keep], value[keep]

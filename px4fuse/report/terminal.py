@@ -1,0 +1,106 @@
+"""The summary on the terminal: what was compared with what, verdicts, findings, on one screen."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from px4fuse.comparison import AgainstTruth, AxisComparison, Difference, FilterSummary
+from px4fuse.consistency import Consistency
+from px4fuse.findings import Severity
+from px4fuse.flight import Unavailable
+from px4fuse.report.document import Document
+from px4fuse.report.words import settings_words, verdict_words
+
+MOST_FINDINGS = 5
+# the screen shows the beginning of a long line; the report has it whole
+ONE_LINE: dict[str, Any] = {"no_wrap": True, "overflow": "ellipsis", "crop": True}
+STYLES: dict[Severity, str] = {"error": "bold red", "warning": "yellow", "info": "cyan"}
+
+
+def print_summary(console: Console, document: Document) -> None:
+    """Print the summary of one comparison.
+
+    Parameters
+    ----------
+    console : Console
+        Standard output.
+    document : Document
+    """
+    comparison = document.comparison
+    log = comparison.flight.log
+    opponent = "" if isinstance(comparison.flight.ekf2, Unavailable) else ", against EKF2"
+    _line(console, "Log", f"{log.name}, {log.firmware}, {log.duration_s:.1f} s")
+    _line(console, "Filter", settings_words(comparison.settings) + opponent)
+    source = comparison.source
+    _line(
+        console, "Position", f"{source.name}, {source.rate_hz:.1f} Hz ({comparison.source_reason})"
+    )
+    segment = comparison.segment
+    _line(console, "Segment", f"{segment.start_s:.1f} s to {segment.end_s:.1f} s, {segment.reason}")
+    console.print(_table(document))
+    if not document.findings:
+        console.print(Text("No findings."))
+    for finding in document.findings[:MOST_FINDINGS]:
+        line = Text(f"{finding.severity:9}", style=STYLES[finding.severity])
+        console.print(line.append(finding.message, style="none"), **ONE_LINE)
+        console.print(Text(" " * 9 + finding.remedy, style="dim"), **ONE_LINE)
+    if (more := len(document.findings) - MOST_FINDINGS) > 0:
+        console.print(Text(f"and {more} more in the report"))
+
+
+def _table(document: Document) -> Table:
+    truth = not isinstance(document.comparison.flight.truth, Unavailable)
+    table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="bold")
+    columns = ["axis", "filter", "mean NIS", "95 % band", "innovation S", "vs EKF2"]
+    columns += ["vs truth"] if truth else []
+    for name in columns:
+        left = name in ("axis", "filter", "innovation S")
+        table.add_column(name, justify="left" if left else "right", no_wrap=True)
+    for result in document.comparison.axes:
+        table.add_row(
+            result.axis.name, "ours", *_statement(result.kf), _difference(result),
+            *([_errors(result.kf_truth)] if truth else []),
+        )  # fmt: skip
+        if not isinstance(result.ekf2, Unavailable):
+            table.add_row(
+                "", "EKF2", *_statement(result.ekf2), "",
+                *([_errors(result.ekf2_truth)] if truth else []),
+            )  # fmt: skip
+    table.caption = "vs: RMSE of position (m), velocity (m/s). NIS 1 is consistent."
+    table.caption_justify = "left"
+    return table
+
+
+def _line(console: Console, label: str, text: str) -> None:
+    console.print(Text(f"{label:9}", style="bold").append(text, style="none"))
+
+
+def _statement(summary: FilterSummary) -> tuple[str, str, Text]:
+    statement = summary.consistency
+    if not isinstance(statement, Consistency):
+        return "", "", Text(verdict_words(statement), style="dim")
+    low, high = statement.nis_band
+    style = "green" if statement.verdict == "consistent" else "yellow"
+    return (
+        f"{statement.nis_mean:.3g}",
+        f"{low:.2f}-{high:.2f}",
+        Text(verdict_words(statement), style=style),
+    )
+
+
+def _errors(truth: AgainstTruth | Unavailable) -> str:
+    if isinstance(truth, Unavailable):
+        return ""
+    if truth.velocity_rmse_m_s is None:
+        return f"{truth.position_rmse_m:.3f}"
+    return f"{truth.position_rmse_m:.3f} {truth.velocity_rmse_m_s:.3f}"
+
+
+def _difference(result: AxisComparison) -> str:
+    if not isinstance(result.difference, Difference):
+        return ""
+    return f"{result.difference.position_rmse_m:.3f} {result.difference.velocity_rmse_m_s:.3f}"

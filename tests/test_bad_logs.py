@@ -1,0 +1,581 @@
+"""Damaged, foreign and empty files: a flight or one line of explanation, and nothing else.
+
+Whatever the bytes are, :func:`read_log` returns a flight or raises one of px4fuse's own errors. It
+does not hang, it does not print and it does not leak an exception of the parser.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import signal
+import struct
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import Phase, given, settings
+from hypothesis import strategies as st
+from ulog_tools import (
+    MAGIC,
+    Log,
+    load,
+    make_log,
+    position,
+    seconds_of,
+    selector,
+    stamps,
+    take,
+    topic,
+)
+
+from px4fuse.errors import LogError, Px4FuseError
+from px4fuse.flight import Flight, Unavailable
+from px4fuse.readers import read_log
+from px4fuse.signals import choose_segment, choose_source, make_axes
+
+PATIENCE_S = 3.0  # these files are some kilobytes; reading one takes hundredths of a second
+
+
+# the same examples every time, and no shrinking: a hang would be waited for again and again
+damaged = settings(
+    deadline=None,
+    derandomize=True,
+    database=None,
+    phases=[Phase.explicit, Phase.generate],
+    max_examples=150,
+)
+
+
+class TookTooLongError(Exception):
+    """Reading did not end."""
+
+
+@contextlib.contextmanager
+def patience() -> Iterator[None]:
+    """Interrupt what does not end, where the system can."""
+
+    def give_up(*_):
+        raise TookTooLongError(f"not read within {PATIENCE_S:g} s")
+
+    if not hasattr(signal, "setitimer"):
+        yield
+        return
+    before = signal.signal(signal.SIGALRM, give_up)
+    signal.setitimer(signal.ITIMER_REAL, PATIENCE_S)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, before)
+
+
+def outcome(path: Path) -> Flight | Px4FuseError:
+    """Read a log as a person's script would; anything but the two outcomes fails the test."""
+    printed = io.StringIO()
+    result: Flight | Px4FuseError
+    with contextlib.redirect_stdout(printed), patience():
+        try:
+            result = read_log(path)
+        except Px4FuseError as error:
+            result = error
+    assert printed.getvalue() == ""
+    if isinstance(result, Px4FuseError):
+        assert "\n" not in str(result)
+        assert str(result).startswith(f"{path.name}: ")
+    return result
+
+
+def refusal(path: Path) -> str:
+    result = outcome(path)
+    assert isinstance(result, LogError), "this file must be refused"
+    return str(result)
+
+
+def analysed(path: Path) -> Flight | None:
+    """Read a log and, where it can be read, take it as far as its axes."""
+    flight = outcome(path)
+    if isinstance(flight, Px4FuseError):
+        return None
+    with contextlib.suppress(Px4FuseError):
+        track, _ = choose_source(flight)
+        axes = make_axes(flight, track, choose_segment(flight, track))
+        for axis in axes:
+            assert np.isfinite(axis.measurement_m).all()
+            assert (np.diff(axis.measurement_time_s) > 0).all()
+    return flight
+
+
+@pytest.fixture(scope="module")
+def workspace(tmp_path_factory) -> Path:
+    """A file to overwrite."""
+    return tmp_path_factory.mktemp("damaged") / "damaged.ulg"
+
+
+# ---- not a log --------------------------------------------------------------------------------
+
+
+def test_a_missing_file(tmp_path):
+    assert "cannot be read" in refusal(tmp_path / "missing.ulg")
+
+
+def test_a_directory(tmp_path):
+    (tmp_path / "folder.ulg").mkdir()
+    assert "cannot be read" in refusal(tmp_path / "folder.ulg")
+
+
+def test_an_empty_file(tmp_path):
+    (tmp_path / "empty.ulg").touch()
+    assert "empty" in refusal(tmp_path / "empty.ulg")
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"\0",
+        b"ULog",
+        MAGIC[:-1],
+        b"%PDF-1.4 and so on",
+        b"\xa3\x95\x80DataFlash",
+        "a text file, naïve\n".encode(),
+        bytes(4096),
+    ],
+)
+def test_files_of_other_kinds(tmp_path, content):
+    path = tmp_path / "other.ulg"
+    path.write_bytes(content)
+    assert "not a" in refusal(path)
+
+
+@pytest.mark.parametrize("content", [
+    b"", b"\x01", b"\x01" + bytes(7), b"\x01" + bytes(8), b"\x01" + bytes(200),
+    b"\x01" + b"\xff" * 200, b"\x01" + b"\xff" * 40_000, b"\x01" + bytes(range(256)) * 8,
+])  # fmt: skip
+def test_nothing_of_use_behind_a_good_first_line(tmp_path, content):
+    path = tmp_path / "header_only.ulg"
+    path.write_bytes(MAGIC + content)
+    refusal(path)
+
+
+@given(content=st.binary(max_size=400))
+@damaged
+def test_random_bytes_behind_a_good_first_line(workspace, content):
+    workspace.write_bytes(MAGIC + b"\x01" + content)
+    refusal(workspace)
+
+
+def test_a_log_of_topics_that_are_none_of_ours(tmp_path):
+    at = stamps(2.0, 10.0)
+    log = Log([topic("battery_status", at, {"voltage_v": np.full(len(at), 16.0)})])
+    assert "SDLOG_PROFILE" in refusal(log.write(tmp_path / "battery.ulg"))
+
+
+def test_definitions_without_data(tmp_path):
+    log = make_log("v1.16", 2.0)
+    log.topics = [take(made, []) for made in log.topics]
+    assert "without any" in refusal(log.write(tmp_path / "no_data.ulg"))
+
+
+def test_a_format_that_contains_itself(tmp_path):
+    """A nested format that never ends must not end the program."""
+    path = tmp_path / "nested.ulg"
+    content = make_log("v1.16", 1.0).encode()
+    name = b"vehicle_attitude:"
+    at = content.index(name)
+    length = struct.unpack("<H", content[at - 3 : at - 1])[0]
+    text = b"vehicle_attitude:uint64_t timestamp;vehicle_attitude a;"
+    message = struct.pack("<HB", len(text), ord("F")) + text
+    path.write_bytes(content[: at - 3] + message + content[at + length :])
+    outcome(path)
+
+
+@pytest.mark.parametrize("key", ["char[4] ver_sw_release", "uint32_t[1] ver_sw_release",
+                                 "float ver_sw_release"])  # fmt: skip
+def test_a_release_number_of_another_type(tmp_path, key):
+    """One flipped bit in the name of a type, and the release is no number any more."""
+    content = make_log("v1.16", 1.0).encode()
+    old = b"uint32_t ver_sw_release"
+    at = content.index(old) - 1
+    assert content[at] == len(old)
+    size = struct.unpack("<H", content[at - 3 : at - 1])[0] + len(key) - len(old)
+    new = struct.pack("<H", size) + b"I" + bytes([len(key)]) + key.encode()
+    path = tmp_path / "release.ulg"
+    path.write_bytes(content[: at - 3] + new + content[at + 1 + len(old) :])
+    flight = outcome(path)
+    assert isinstance(flight, Flight)
+    assert len(flight.imu) == 100
+
+
+# ---- cut and damaged files --------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def small() -> bytes:
+    """A log of one second and every topic, a few kilobytes."""
+    return make_log("v1.16", 1.0, imu_hz=20.0).encode()
+
+
+def first_data(content: bytes) -> int:
+    """Offset of the first message of data, walking the messages as the format says."""
+    at = 16
+    while content[at + 2] != ord("D"):
+        at += 3 + struct.unpack("<H", content[at : at + 2])[0]
+    return at
+
+
+def test_the_small_log_is_whole(small, workspace):
+    """The tests below are about damage only if this is a flight without any."""
+    workspace.write_bytes(small)
+    flight = outcome(workspace)
+    assert isinstance(flight, Flight)
+    assert flight.log.notes == ()
+    assert len(flight.positions) == 3
+    assert len(small) < 16_000
+
+
+@pytest.mark.parametrize("at", range(7, 60))
+def test_cut_within_the_header(small, workspace, at):
+    workspace.write_bytes(small[:at])
+    refusal(workspace)
+
+
+@given(share=st.floats(0.0, 1.0))
+@damaged
+def test_cut_anywhere(small, workspace, share):
+    workspace.write_bytes(small[: 7 + int(share * (len(small) - 7))])
+    analysed(workspace)
+
+
+def test_cut_within_the_data_keeps_what_was_written(small, workspace):
+    """A flight that ended in a crash is cut; what came before is still good."""
+    start = first_data(small)
+    workspace.write_bytes(small[: start + (len(small) - start) // 2])
+    flight = outcome(workspace)
+    assert isinstance(flight, Flight)
+    assert flight.log.duration_s == pytest.approx(0.5, abs=0.1)
+    state = flight.ekf2.state
+    np.testing.assert_allclose(
+        state[["north_m", "east_m", "down_m"]], position(state.index), rtol=1e-6, atol=1e-6
+    )
+
+
+@pytest.mark.parametrize("share", [0.001, 0.01, 0.05, 0.2, 0.5, 0.8, 0.99, 0.999])
+def test_the_sample_log_cut(sample_log, sample_flight, workspace, share):
+    content = sample_log.read_bytes()
+    workspace.write_bytes(content[: int(share * len(content))])
+    flight = analysed(workspace)
+    if share >= 0.2:
+        assert flight.log.duration_s == pytest.approx(
+            share * sample_flight.log.duration_s, abs=0.1 * sample_flight.log.duration_s
+        )
+        np.testing.assert_array_equal(
+            flight.imu["down_m_s2"], sample_flight.imu["down_m_s2"].iloc[: len(flight.imu)]
+        )
+
+
+damage = st.lists(
+    st.tuples(st.floats(0.0, 1.0, exclude_max=True), st.integers(0, 255)), min_size=1, max_size=12
+)
+
+
+@given(damage=damage)
+@damaged
+def test_bytes_overwritten_anywhere(small, workspace, damage):
+    content = bytearray(small)
+    for share, value in damage:
+        content[7 + int(share * (len(content) - 7))] = value
+    workspace.write_bytes(content)
+    analysed(workspace)
+
+
+@given(damage=damage)
+@damaged
+def test_bytes_overwritten_in_the_definitions(small, workspace, damage):
+    """Formats, parameters and subscriptions: where a byte changes the meaning of all the rest."""
+    content = bytearray(small)
+    end = first_data(small)
+    for share, value in damage:
+        content[7 + int(share * (end - 7))] = value
+    workspace.write_bytes(content)
+    analysed(workspace)
+
+
+@given(share=st.floats(0.0, 1.0, exclude_max=True), bit=st.integers(0, 7))
+@damaged
+def test_one_bit_flipped_in_the_definitions(small, workspace, share, bit):
+    content = bytearray(small)
+    at = 7 + int(share * (first_data(small) - 7))
+    content[at] ^= 1 << bit
+    workspace.write_bytes(content)
+    analysed(workspace)
+
+
+@given(first=st.floats(0.0, 1.0), length=st.integers(1, 3000), value=st.sampled_from([0, 255]))
+@damaged
+def test_a_block_that_was_never_written(small, workspace, first, length, value):
+    """A card that lost a sector gives zeros or ones."""
+    at = 7 + int(first * (len(small) - 7))
+    lost = min(length, len(small) - at)
+    workspace.write_bytes(small[:at] + bytes([value]) * lost + small[at + lost :])
+    analysed(workspace)
+
+
+@pytest.mark.parametrize("at", [500_000, 1_500_000, 3_000_000])
+@pytest.mark.parametrize("value", [0, 255])
+def test_the_sample_log_with_a_lost_sector(sample_log, workspace, at, value):
+    content = bytearray(sample_log.read_bytes())
+    content[at : at + 4096] = bytes([value]) * 4096
+    workspace.write_bytes(content)
+    begun = time.perf_counter()
+    flight = analysed(workspace)
+    assert isinstance(flight, Flight)
+    assert len(flight.imu) > 1000
+    assert time.perf_counter() - begun < PATIENCE_S
+
+
+def test_damage_is_said_in_the_notes(small, workspace):
+    start = first_data(small)
+    content = bytearray(small)
+    content[start + 3 : start + 5] = b"\xee\xee"  # a message of a topic that was never subscribed
+    workspace.write_bytes(content)
+    flight = outcome(workspace)
+    assert any("damaged" in note and "61166" in note for note in flight.log.notes)
+
+
+# ---- logs without a part ----------------------------------------------------------------------
+
+
+def read_of(log: Log, tmp_path: Path) -> Flight:
+    flight = outcome(log.write(tmp_path / "made.ulg"))
+    assert isinstance(flight, Flight)
+    return flight
+
+
+def test_no_imu(tmp_path):
+    flight = read_of(make_log("v1.16", 2.0).drop("sensor_combined"), tmp_path)
+    assert isinstance(flight.imu, Unavailable)
+    assert flight.imu in flight.missing
+    assert len(flight.ekf2.state) == 20
+
+
+def test_no_attitude(tmp_path):
+    flight = read_of(make_log("v1.16", 2.0).drop("vehicle_attitude"), tmp_path)
+    assert isinstance(flight.attitude, Unavailable)
+    assert flight.attitude in flight.missing
+    track, _ = choose_source(flight)
+    axis = make_axes(flight, track, choose_segment(flight, track))[0]
+    assert axis.acceleration is flight.attitude
+
+
+def test_no_position(tmp_path):
+    log = make_log("v1.16", 2.0)
+    log.drop(*(n for n in log.names() if "_ev_" in n or n == "vehicle_visual_odometry"))
+    flight = read_of(log, tmp_path)
+    assert flight.positions == ()
+    with pytest.raises(Px4FuseError, match="no external position"):
+        choose_source(flight)
+
+
+def test_no_ekf2(tmp_path):
+    flight = read_of(make_log("v1.16", 2.0).drop("vehicle_local_position"), tmp_path)
+    assert isinstance(flight.ekf2, Unavailable)
+    assert flight.ekf2 in flight.missing
+    assert flight.positions[0].name == "vehicle_visual_odometry"
+
+
+def test_no_land_detector(tmp_path):
+    flight = read_of(make_log("v1.16", 2.0).drop("vehicle_land_detected"), tmp_path)
+    assert isinstance(flight.airborne, Unavailable)
+
+
+@pytest.mark.parametrize("alone", sorted(make_log("v1.16", 2.0).names()))
+def test_one_topic_alone(tmp_path, alone):
+    log = make_log("v1.16", 2.0)
+    flight = read_of(log.drop(*(log.names() - {alone})), tmp_path)
+    assert len(flight.missing) >= 5
+    assert analysed(tmp_path / "made.ulg") is not None
+
+
+def rich_log() -> Log:
+    """Every topic that is read in v1.16, with the fields that are optional."""
+    log = make_log("v1.16", 2.0)
+    at = stamps(2.0, 5.0)
+    count = len(at)
+    fix = {"fix_type": np.full(count, 3, np.uint8), "eph": np.ones(count), "epv": np.ones(count)}
+    receiver = topic("vehicle_gps_position", at, fix)
+    receiver.fields |= {"latitude_deg": np.full(count, 47.0), "longitude_deg": np.full(count, 8.0)}
+    receiver.fields["altitude_msl_m"] = np.full(count, 500.0)
+    truth = topic("vehicle_global_position_groundtruth", at, {
+        "alt": np.full(count, 500.0), "vel_n": np.zeros(count), "vel_e": np.zeros(count),
+        "vel_d": np.zeros(count),
+    })  # fmt: skip
+    truth.fields |= {"lat": np.full(count, 47.0), "lon": np.full(count, 8.0)}
+    local = log["vehicle_local_position"]
+    for name, value in (("ref_lat", 47.0), ("ref_lon", 8.0), ("ref_alt", 500.0)):
+        local[name] = np.full(len(local["timestamp"]), value)
+    return log.add(receiver, truth, selector([(0.0, 0)]))
+
+
+@pytest.mark.parametrize("name", sorted(rich_log().names()))
+def test_each_field_left_out_in_turn(tmp_path, name):
+    """PX4 adds and removes fields between releases, and a damaged format loses one."""
+    for field in rich_log()[name]:
+        log = rich_log()
+        del log[name][field]
+        assert analysed(log.write(tmp_path / "made.ulg")) is not None, field
+
+
+def test_every_missing_part_says_what_to_do(tmp_path):
+    flight = read_of(Log([make_log("v1.16", 2.0).topics[1]]), tmp_path)
+    for part in flight.missing:
+        assert all((part.what, part.reason, part.remedy))
+        assert "\n" not in str(part)
+
+
+# ---- impossible values ------------------------------------------------------------------------
+
+
+def test_all_time_stamps_zero(tmp_path):
+    log = make_log("v1.16", 2.0)
+    for made in log.topics:
+        made.fields["timestamp"][:] = 0
+        made.fields.get("timestamp_sample", np.zeros(1))[:] = 0
+    assert "time stamp" in refusal(log.write(tmp_path / "zero.ulg"))
+
+
+def test_one_topic_with_all_time_stamps_zero(tmp_path):
+    """As ekf2_innovations in a real log of 2016."""
+    log = make_log("v1.9", 2.0)
+    log["ekf2_innovations"]["timestamp"][:] = 0
+    flight = read_of(log, tmp_path)
+    assert isinstance(flight.ekf2.innovations["north"], Unavailable)
+    assert any("ekf2_innovations" in note for note in flight.log.notes)
+
+
+@pytest.mark.parametrize(
+    "name", ["sensor_combined", "vehicle_attitude", "vehicle_visual_odometry",
+             "vehicle_local_position", "estimator_aid_src_ev_pos"],
+)  # fmt: skip
+def test_time_stamps_that_go_back(tmp_path, name):
+    """Samples out of order are dropped and counted; those that stay are at their own place."""
+    log = make_log("v1.16", 4.0)
+    index = next(i for i, made in enumerate(log.topics) if made.name == name)
+    count = len(log[name]["timestamp"])
+    order = np.arange(count)
+    order[[5, 12]] = order[[12, 5]]
+    log.topics[index] = take(log.topics[index], order)
+    flight = read_of(log, tmp_path)
+    frames = [flight.imu, flight.attitude, flight.ekf2.state, flight.ekf2.innovations["north"]]
+    frames += [track.samples for track in flight.positions]
+    assert all((np.diff(frame.index) > 0).all() for frame in frames)
+    assert any(f"2 samples of {name} were dropped" in note for note in flight.log.notes)
+    state = flight.ekf2.state
+    np.testing.assert_allclose(state["north_m"], position(state.index)[:, 0], rtol=1e-6)
+
+
+def test_a_clock_that_starts_again(tmp_path):
+    """A reboot in mid-log: the longer half is kept, in order."""
+    log = make_log("v1.16", 4.0)
+    for made in log.topics:
+        for name in ("timestamp", "timestamp_sample"):
+            if name in made.fields:
+                late = seconds_of(made.fields["timestamp"]) >= 3.0
+                made.fields[name][late] -= np.uint64(3_000_000)
+    flight = read_of(log, tmp_path)
+    assert flight.log.duration_s == pytest.approx(2.99, abs=0.2)
+    assert (np.diff(flight.imu.index) > 0).all()
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize(
+    ("name", "field"),
+    [
+        ("sensor_combined", "accelerometer_m_s2"),
+        ("vehicle_attitude", "q"),
+        ("vehicle_visual_odometry", "position"),
+        ("estimator_aid_src_ev_pos", "observation"),
+        ("estimator_aid_src_ev_pos", "innovation"),
+        ("estimator_aid_src_ev_pos", "innovation_variance"),
+        ("estimator_states", "covariances"),
+        ("vehicle_local_position", "x"),
+        ("vehicle_local_position", "vz"),
+    ],
+)
+def test_not_a_number_everywhere(tmp_path, name, field, value):
+    """What holds no finite number is missing, not zero, and the rest of the flight stays."""
+    log = make_log("v1.16", 2.0)
+    log[name][field][:] = value
+    flight = analysed(log.write(tmp_path / "made.ulg"))
+    assert flight is not None
+    if name == "sensor_combined":
+        assert isinstance(flight.imu, Unavailable)
+    elif name == "vehicle_attitude":
+        assert isinstance(flight.attitude, Unavailable)
+    elif name == "vehicle_visual_odometry":
+        assert name not in [track.name for track in flight.positions]
+    elif name == "vehicle_local_position":
+        assert isinstance(flight.ekf2, Unavailable)
+    elif field == "observation":
+        assert name not in [track.name for track in flight.positions]
+    elif name == "estimator_states":
+        assert isinstance(flight.ekf2.variance, Unavailable)
+    else:
+        assert isinstance(flight.ekf2.innovations["north"], Unavailable)
+
+
+def test_not_a_number_here_and_there(tmp_path):
+    log = make_log("v1.16", 2.0)
+    log["sensor_combined"]["accelerometer_m_s2"][[10, 20], 1] = np.nan
+    log["vehicle_attitude"]["q"][7, 3] = np.nan
+    log["vehicle_local_position"]["vx"][4] = np.nan
+    flight = read_of(log, tmp_path)
+    assert (len(flight.imu), len(flight.attitude), len(flight.ekf2.state)) == (198, 39, 19)
+
+
+def test_quaternions_of_zeros_are_no_attitude(tmp_path):
+    log = make_log("v1.16", 2.0)
+    log["vehicle_attitude"]["q"][:] = 0.0
+    assert isinstance(read_of(log, tmp_path).attitude, Unavailable)
+    log["vehicle_attitude"]["q"][5:] = [1.0, 0.0, 0.0, 0.0]
+    assert len(read_of(log, tmp_path).attitude) == 35
+
+
+@pytest.mark.parametrize("parameter", ["EKF2_EV_DELAY", "EKF2_EVP_GATE"])
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_parameters_that_are_no_numbers(tmp_path, parameter, value):
+    log = make_log("v1.16", 2.0)
+    log.parameters[parameter] = value
+    flight = analysed(log.write(tmp_path / "made.ulg"))
+    for track in flight.positions:
+        assert np.isfinite(track.samples.index).all()
+
+
+def test_a_log_of_four_tenths_of_a_second(tmp_path):
+    flight = read_of(make_log("v1.16", 0.4, imu_hz=5.0), tmp_path)
+    assert flight.log.duration_s == pytest.approx(0.2)
+    assert len(flight.imu) == 2
+    with pytest.raises(Px4FuseError):
+        choose_segment(flight, choose_source(flight)[0])
+
+
+@pytest.mark.parametrize("count", [0, 1, 2])
+def test_too_few_samples_of_everything(tmp_path, count):
+    log = make_log("v1.16", 2.0)
+    log.topics = [take(made, range(count)) for made in log.topics]
+    result = outcome(log.write(tmp_path / "made.ulg"))
+    if count == 0:
+        assert isinstance(result, LogError)
+    else:
+        assert result.positions == ()
+        assert isinstance(result.imu, Unavailable) == (count == 1)
+
+
+def test_the_sample_log_without_each_topic_in_turn(sample_log, tmp_path):
+    """Leaving out any one topic costs what was in it, never the whole flight."""
+    whole = load(sample_log)
+    short = Log([take(t, range(0, len(t.fields["timestamp"]), 8)) for t in whole.topics])
+    for name in sorted(short.names()):
+        less = Log([t for t in short.topics if t.name != name], whole.parameters, whole.info)
+        assert analysed(less.write(tmp_path / "less.ulg")) is not None, name

@@ -1,0 +1,195 @@
+"""The command line as a student types it: outputs, one clear line for bad input, exit codes."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import jsonschema
+import pypdf
+import pytest
+from click.testing import CliRunner, Result
+
+from px4fuse.cli import cli, main
+from px4fuse.report.results import schema
+
+
+def run(*arguments: str | Path) -> Result:
+    return CliRunner().invoke(cli, [str(argument) for argument in arguments])
+
+
+def run_main(monkeypatch, capsys, *arguments: str | Path) -> tuple[int, str, str]:
+    """The real entry point: exit code, standard output, standard error."""
+    monkeypatch.setattr(sys, "argv", ["px4fuse", *map(str, arguments)])
+    with pytest.raises(SystemExit) as stopped:
+        main()
+    out, err = capsys.readouterr()
+    return int(stopped.value.code or 0), out, err
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory, sample_log) -> tuple[Path, Result]:
+    """One report of the sample log, with awkward text in every place that takes text."""
+    folder = tmp_path_factory.mktemp("made")
+    notes = folder / "notes.md"
+    notes.write_text(
+        "# What I saw\n\nCosts $5 and $x^2$ or \\frac{1}{2}; **bold**, _under_, <b>tag</b>.\n"
+        "- a bullet\n1. numbered\n" + "word" * 300 + "\n\nสวัสดี 你好 \N{GRINNING FACE}\n"
+        "line " * 4000,
+        encoding="utf-8",
+    )
+    result = run(
+        "compare", sample_log, "-o", folder / "report.pdf", "--student", "Ana $x$ Müller 李 " * 9,
+        "--id", "$^2_", "--notes", notes, "--sigma-z", "0.12",
+    )  # fmt: skip
+    return folder, result
+
+
+def test_compare_writes_report_and_results(made):
+    folder, result = made
+    assert result.exit_code == 0, result.output
+    assert sorted(p.name for p in folder.iterdir()) == ["notes.md", "report.json", "report.pdf"]
+    assert "vehicle_visual_odometry" in result.output
+    assert len(result.output.splitlines()) <= 24, "the summary must fit one screen"
+
+
+def test_results_validate_and_are_attached_in_the_pdf(made):
+    folder, _ = made
+    text = (folder / "report.json").read_bytes()
+    attached = pypdf.PdfReader(folder / "report.pdf").attachments["results.json"]
+    assert attached == [text]
+    jsonschema.validate(json.loads(text), schema())
+
+
+def test_awkward_text_reaches_the_pages_as_it_is(made):
+    folder, _ = made
+    pages = [page.extract_text() for page in pypdf.PdfReader(folder / "report.pdf").pages]
+    assert "Ana $x$ Müller" in pages[0]
+    whole = "\n".join(pages)
+    assert "Costs $5 and $x^2$ or \\frac{1}{2}" in whole
+    assert "continued" in whole, "long notes must run over several pages"
+
+
+def test_command_line_in_the_report_names_no_folder_and_no_person(made):
+    folder, _ = made
+    results = json.loads((folder / "report.json").read_text(encoding="utf-8"))
+    assert results["provenance"]["command"] == "px4fuse compare aisle_uwb.ulg --sigma-z 0.12"
+    assert results["settings"]["sigma_z_m"] == 0.12
+
+
+def test_same_input_gives_the_same_bytes(tmp_path, sample_log):
+    for name in ("a", "b"):
+        assert run("compare", sample_log, "--axis", "north", "-o", tmp_path / f"{name}.pdf").exit_code == 0
+    for suffix in ("pdf", "json"):
+        first, second = ((tmp_path / f"{name}.{suffix}").read_bytes() for name in ("a", "b"))
+        assert first == second
+
+
+def test_json_to_standard_output_is_alone_there(tmp_path, sample_log):
+    result = run("compare", sample_log, "--axis", "aisle", "--heading", "30",
+                 "-o", tmp_path / "r.pdf", "--json", "-")  # fmt: skip
+    assert json.loads(result.stdout)["axes"]["aisle"]["heading_deg"] == 30.0
+
+
+def test_fail_on_sets_exit_code_1(tmp_path, sample_log):
+    out = tmp_path / "r.pdf"
+    assert run("compare", sample_log, "--axis", "north", "-o", out, "--fail-on", "info").exit_code == 1
+    assert run("compare", sample_log, "--axis", "north", "-o", out, "--fail-on", "error").exit_code == 0
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        ["--sigma-a", "0"],
+        ["--sigma-a", "-1"],
+        ["--sigma-z", "0"],
+        ["--sigma-z", "1e9"],
+        ["--sigma-z", "nan"],
+        ["--dt", "0"],
+        ["--dt", "100"],
+        ["--clock-offset", "inf"],
+        ["--heading", "nan"],
+        ["--start", "500"],
+        ["--start", "50", "--end", "40"],
+        ["--start", "50", "--end", "50.1"],
+        ["--position-source", "vehicle_mocap_odometry"],
+        ["--position-source", "nonsense"],
+        ["--notes", "absent.md"],
+        ["-o", "report.txt"],
+    ],
+)
+def test_bad_settings_give_one_line_and_leave_nothing(
+    tmp_path, monkeypatch, capsys, sample_log, options
+):
+    monkeypatch.chdir(tmp_path)
+    code, out, err = run_main(monkeypatch, capsys, "compare", sample_log.resolve(), *options)
+    assert code == 2
+    assert out == ""
+    assert err.startswith("px4fuse: ")
+    assert len(err.strip().splitlines()) == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("content", [b"", b"not a log at all, only text", b"ULog\x01\x12\x35" * 2])
+def test_bad_logs_give_one_line_and_overwrite_nothing(tmp_path, monkeypatch, capsys, content):
+    monkeypatch.chdir(tmp_path)
+    log = tmp_path / "bad.ulg"
+    log.write_bytes(content)
+    old = tmp_path / "reports" / "bad.pdf"
+    old.parent.mkdir()
+    old.write_text("an older report")
+    code, _, err = run_main(monkeypatch, capsys, "compare", log)
+    assert code == 2
+    assert len(err.strip().splitlines()) == 1
+    assert "bad.ulg" in err
+    assert old.read_text() == "an older report"
+    assert [p.name for p in old.parent.iterdir()] == ["bad.pdf"]
+
+
+def test_missing_log_gives_one_line(monkeypatch, capsys):
+    code, _, err = run_main(monkeypatch, capsys, "compare", "absent.ulg")
+    assert code == 2
+    assert err == "px4fuse: absent.ulg: cannot be read (No such file or directory).\n"
+
+
+def test_output_that_cannot_be_written_gives_one_line(tmp_path, monkeypatch, capsys, sample_log):
+    blocker = tmp_path / "file"
+    blocker.write_text("in the way")
+    code, _, err = run_main(
+        monkeypatch, capsys, "compare", sample_log, "--axis", "north", "-o", blocker / "r.pdf"
+    )
+    assert code == 2
+    assert len(err.strip().splitlines()) == 1
+    assert blocker.read_text() == "in the way"
+
+
+def test_help_imports_nothing_heavy():
+    """--help answers at once: it may import neither pandas nor matplotlib nor scipy."""
+    code = (
+        "import sys\n"
+        "from px4fuse.cli import cli\n"
+        "cli.main(['--help'], standalone_mode=False)\n"
+        "heavy = {'pandas', 'matplotlib', 'scipy', 'numpy', 'pyulog', 'filterpy', 'rich'}\n"
+        "assert not heavy & set(sys.modules), heavy & set(sys.modules)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "compare" in done.stdout
+
+
+def test_every_command_has_help():
+    for command in ("compare", "lesson"):
+        result = run(command, "--help")
+        assert result.exit_code == 0
+        assert "Usage:" in result.output
+
+
+def test_lesson_kalman_prints_the_lesson_digit_for_digit():
+    assert run("lesson", "kalman").output == (
+        "t 0.5 s: p 0.57 (true 0.50), v 0.57, sigma_p 0.099 m, sigma_v 0.719 m/s\n"
+        "t 1.0 s: p 0.88 (true 1.00), v 0.61, sigma_p 0.097 m, sigma_v 0.262 m/s\n"
+        "t 1.5 s: p 1.48 (true 1.50), v 0.98, sigma_p 0.090 m, sigma_v 0.164 m/s\n"
+        "t 2.0 s: p 2.06 (true 2.00), v 1.07, sigma_p 0.085 m, sigma_v 0.141 m/s\n"
+        "t 2.5 s: p 2.49 (true 2.50), v 0.97, sigma_p 0.082 m, sigma_v 0.137 m/s\n"
+        "t 3.0 s: p 2.93 (true 3.00), v 0.92, sigma_p 0.081 m, sigma_v 0.136 m/s\n"
+    )

@@ -1,0 +1,472 @@
+"""Every number of a comparison against direct computation and against what was injected."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from flights import Estimator, Imu, Uwb, aisle_flight, unavailable
+from numpy.typing import NDArray
+
+from px4fuse.comparison import AxisComparison, Comparison, Difference, FilterSummary, compare
+from px4fuse.consistency import Consistency
+from px4fuse.errors import MissingDataError, SettingsError
+from px4fuse.flight import Ekf2, Flight, Reset, Truth, Unavailable
+from px4fuse.kalman import Settings
+from px4fuse.readers import read_log
+
+Array = NDArray[np.float64]
+
+# How many times EKF2 overstates its horizontal innovation variance in real motion-capture flights
+OVERSTATED = {
+    "vladimireganov_ROS_PX4_MOCAP_log_3_2022-6-9-13-01-36": 92.0,
+    "vladimireganov_ROS_PX4_MOCAP_min_snap_01": 22.0,
+    "vladimireganov_ROS_PX4_MOCAP_square2": 16.0,
+    "PX4_flight-review-rs_battery_brownout": 109.0,
+}
+
+
+@pytest.fixture(scope="module")
+def sample(sample_flight: Flight) -> Comparison:
+    return compare(sample_flight)
+
+
+@pytest.fixture(scope="module")
+def made() -> Comparison:
+    return compare(aisle_flight())
+
+
+def along(comparison: Comparison, name: str) -> AxisComparison:
+    return next(result for result in comparison.axes if result.axis.name == name)
+
+
+def consistency(summary: FilterSummary | Unavailable) -> Consistency:
+    assert isinstance(summary, FilterSummary)
+    assert isinstance(summary.consistency, Consistency)
+    return summary.consistency
+
+
+def rms(values: Array) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def predicted(result: AxisComparison, times: Array) -> Array:
+    """Our position, velocity and their variances at other times, one time after the other.
+
+    Each is predicted from the last step before it: x = Fx + Ba, P = FPFᵀ + Q.
+    """
+    run, chosen = result.replay, result.replay.settings
+    edges, rows = run.steps.index.to_numpy(), run.steps.to_numpy()
+    q = chosen.sigma_a_m_s2**2 * chosen.dt_s
+    out = []
+    for time in times:
+        p, v, pp, pv, vv, a = rows[np.flatnonzero(edges <= time)[-1]]
+        d = time - edges[edges <= time][-1]
+        out.append(
+            (
+                p + v * d + a * d * d / 2,
+                v + a * d,
+                pp + 2 * d * pv + d * d * vv + q * d**3 / 4,
+                vv + q * d,
+            )
+        )
+    return np.array(out).T
+
+
+def ekf2_times_within(result: AxisComparison) -> Array:
+    """EKF2's sample times that our replay covers."""
+    first, last = result.replay.steps.index[[0, -1]]
+    times = result.ekf2_state.index.to_numpy()
+    return times[(times >= first) & (times <= last)]
+
+
+def true_errors(flight: Flight, frame: pd.DataFrame, column: str) -> Array:
+    """Difference of a series and the truth interpolated to its times, where there is truth."""
+    truth = flight.truth.samples[column]
+    error = frame[column] - np.interp(frame.index, truth.index, truth, left=np.nan, right=np.nan)
+    return error.dropna()
+
+
+class TestSample:
+    def test_both_filters_are_near_consistent_horizontally(self, sample: Comparison) -> None:
+        for name in ("north", "east"):
+            result = along(sample, name)
+            assert 0.75 < consistency(result.kf).nis_mean < 1.15
+            assert 0.75 < consistency(result.ekf2).nis_mean < 1.15
+
+    def test_both_filters_are_close_to_the_truth(self, sample: Comparison) -> None:
+        for name in ("north", "east"):
+            result = along(sample, name)
+            assert result.kf_truth.position_rmse_m < 0.08
+            assert result.ekf2_truth.position_rmse_m < 0.08
+            assert result.kf_truth.velocity_rmse_m_s < 0.12
+
+    def test_nis_equals_the_mean_of_squared_normalised_innovations(
+        self, sample: Comparison, sample_flight: Flight
+    ) -> None:
+        segment = sample.segment
+        for name in ("north", "east"):
+            result = along(sample, name)
+            ours = result.replay.updates
+            logged = sample_flight.ekf2.innovations[name].loc[segment.start_s : segment.end_s]
+            for summary, frame in ((result.kf, ours), (result.ekf2, logged)):
+                nis = frame["innovation_m"] ** 2 / frame["innovation_variance_m2"]
+                assert consistency(summary).count == len(frame)
+                assert consistency(summary).nis_mean == pytest.approx(nis.mean(), rel=1e-12)
+                std = frame["innovation_m"].std()
+                assert consistency(summary).innovation_std_m == pytest.approx(std, rel=1e-12)
+
+    def test_nis_of_ekf2_is_its_own_test_ratio_times_the_squared_gate(
+        self, sample: Comparison
+    ) -> None:
+        """PX4 publishes innov² / (gate² S): the sign is flipped, the size must not change."""
+        for name in ("north", "east"):
+            result = along(sample, name)
+            nis = result.ekf2_innovations["test_ratio"].mean() * 5.0**2
+            assert consistency(result.ekf2).nis_mean == pytest.approx(nis, rel=1e-4)
+
+    def test_horizontal_nis_is_the_mean_of_north_and_east(self, sample: Comparison) -> None:
+        for who, joint in (("kf", sample.horizontal_kf), ("ekf2", sample.horizontal_ekf2)):
+            both = [consistency(getattr(along(sample, name), who)) for name in ("north", "east")]
+            assert joint.nis_mean == pytest.approx(np.mean([each.nis_mean for each in both]))
+            assert joint.count == both[0].count == both[1].count
+
+    def test_ekf2_errors_are_those_of_its_own_topics(
+        self, sample: Comparison, sample_flight: Flight
+    ) -> None:
+        start, end = sample.segment.start_s, sample.segment.end_s
+        state = sample_flight.ekf2.state.loc[start:end]
+        for name in ("north", "east"):
+            truth = along(sample, name).ekf2_truth
+            position = true_errors(sample_flight, state, f"{name}_m")
+            velocity = true_errors(sample_flight, state, f"{name}_m_s")
+            assert truth.count == len(position)
+            assert truth.position_rmse_m == pytest.approx(rms(position))
+            assert truth.velocity_rmse_m_s == pytest.approx(rms(velocity))
+            variance = sample_flight.ekf2.variance.loc[start:end]
+            error = np.interp(variance.index, position.index, position, np.nan, np.nan)
+            nees = np.nanmean(error**2 / variance[f"{name}_m2"])
+            assert truth.nees_position_mean == pytest.approx(nees)
+
+    def test_our_errors_are_those_of_the_prediction_at_ekf2s_times(
+        self, sample: Comparison, sample_flight: Flight
+    ) -> None:
+        for name in ("north", "east"):
+            result = along(sample, name)
+            times = ekf2_times_within(result)
+            p, v, pp, vv = predicted(result, times)
+            truth = sample_flight.truth.samples
+            ep = p - np.interp(times, truth.index, truth[f"{name}_m"])
+            ev = v - np.interp(times, truth.index, truth[f"{name}_m_s"])
+            assert result.kf_truth.position_rmse_m == pytest.approx(rms(ep))
+            assert result.kf_truth.velocity_rmse_m_s == pytest.approx(rms(ev))
+            nees = np.mean(ep**2 / pp), np.mean(ev**2 / vv)
+            stated = result.kf_truth.nees_position_mean, result.kf_truth.nees_velocity_mean
+            assert stated == pytest.approx(nees, rel=0.003)
+
+
+@pytest.mark.reallogs
+@pytest.mark.parametrize(("name", "factor"), OVERSTATED.items())
+def test_ekf2_overstates_its_variance_in_real_flights(
+    shared_logs: Path, name: str, factor: float
+) -> None:
+    flight = read_log(shared_logs / "real" / f"{name}.ulg")
+    whole = compare(flight, start_s=0.0, end_s=flight.log.duration_s)
+    assert whole.horizontal_ekf2.variance_factor == pytest.approx(factor, rel=0.10)
+    assert compare(flight).horizontal_ekf2.verdict == "variance overstated"
+
+
+class TestMadeFlight:
+    def test_our_filter_is_consistent_where_its_noise_is_the_flights(
+        self, made: Comparison
+    ) -> None:
+        assert made.horizontal_kf.verdict == "consistent"
+        for result in made.axes:
+            assert result.kf_truth.nees_position_mean == pytest.approx(1.0, abs=0.3)
+            assert result.kf_truth.nees_velocity_mean == pytest.approx(1.0, abs=0.3)
+
+    @pytest.mark.parametrize("nis", [0.01, 1.0, 20.0])
+    def test_ekf2s_variance_factor_is_the_one_injected(self, nis: float) -> None:
+        comparison = compare(aisle_flight(ekf2=Estimator(nis=nis)))
+        assert comparison.horizontal_ekf2.variance_factor == pytest.approx(1 / nis, rel=0.1)
+
+    def test_ekf2s_errors_and_variances_are_those_injected(self, made: Comparison) -> None:
+        for result in made.axes:
+            truth = result.ekf2_truth
+            assert truth.position_rmse_m == pytest.approx(0.05, rel=0.06)
+            assert truth.velocity_rmse_m_s == pytest.approx(0.04, rel=0.06)
+            assert truth.nees_position_mean == pytest.approx(1.0, abs=0.35)
+            assert truth.nees_velocity_mean == pytest.approx(1.0, abs=0.35)
+            assert result.ekf2.sigma_p_median_m == pytest.approx(0.05)
+            assert result.ekf2.sigma_v_median_m_s == pytest.approx(0.04)
+
+    def test_ekf2s_sigma_around_an_update_follows_from_s_and_r(self, made: Comparison) -> None:
+        """P⁻ = S - R and P⁺ = P⁻R/S, with P⁻ = (0.06 m)² and R = (0.10 m)²."""
+        for result in made.axes:
+            assert result.ekf2.sigma_p_before_update_m == pytest.approx(0.06)
+            after = 0.06 * 0.10 / np.hypot(0.06, 0.10)
+            assert result.ekf2.sigma_p_after_update_m == pytest.approx(after)
+
+    def test_our_sigma_shrinks_with_each_update(self, made: Comparison) -> None:
+        for result in made.axes:
+            kf = result.kf
+            prior = result.replay.updates["prior_position_variance_m2"]
+            assert kf.sigma_p_before_update_m == pytest.approx(np.sqrt(prior.median()))
+            assert kf.sigma_p_after_update_m < kf.sigma_p_median_m < kf.sigma_p_before_update_m
+
+    def test_difference_is_ours_minus_ekf2_at_ekf2s_times(self, made: Comparison) -> None:
+        for result in made.axes:
+            times = ekf2_times_within(result)
+            p, v, *_ = predicted(result, times)
+            theirs = result.ekf2_state.loc[times]
+            dp, dv = p - theirs["position_m"], v - theirs["velocity_m_s"]
+            expected = Difference(
+                count=len(times),
+                position_rmse_m=rms(dp),
+                position_mean_m=np.mean(dp),
+                position_maximum_m=np.max(np.abs(dp)),
+                velocity_rmse_m_s=rms(dv),
+                velocity_mean_m_s=np.mean(dv),
+                velocity_maximum_m_s=np.max(np.abs(dv)),
+            )
+            assert vars(result.difference) == pytest.approx(vars(expected))
+
+    def test_a_constant_offset_of_ekf2_is_the_mean_difference(self, made: Comparison) -> None:
+        flight = made.flight
+        shifted = flight.ekf2.state.assign(north_m=lambda state: state["north_m"] + 0.7)
+        moved = compare(replace(flight, ekf2=replace(flight.ekf2, state=shifted)), axes=("north",))
+        before = along(made, "north").difference.position_mean_m
+        assert moved.axes[0].difference.position_mean_m == pytest.approx(before - 0.7)
+
+    def test_nees_does_not_depend_on_the_prediction_grid(self) -> None:
+        """The variance belongs to the same moment as the error, also between two steps."""
+        flight = aisle_flight(uwb=Uwb(rate_hz=1.0))
+        fine, coarse = (
+            compare(flight, Settings(dt_s=dt, sigma_a_m_s2=0.5 * (0.1 / dt) ** 0.5), axes=("east",))
+            for dt in (0.1, 1.0)
+        )
+        expected = fine.axes[0].kf_truth.nees_position_mean
+        assert coarse.axes[0].kf_truth.nees_position_mean == pytest.approx(expected, rel=0.1)
+
+    def test_aisle_is_where_the_flight_went(self, made: Comparison) -> None:
+        assert along(made, "aisle").axis.heading_deg == pytest.approx(30.0, abs=0.5)
+
+    @pytest.mark.parametrize(("heading", "name"), [(0.0, "north"), (90.0, "east")])
+    def test_aisle_along_a_cardinal_direction_is_that_axis(
+        self, made: Comparison, heading: float, name: str
+    ) -> None:
+        aisle = compare(made.flight, axes=("aisle",), heading_deg=heading).axes[0]
+        same = along(made, name)
+        assert vars(aisle.difference) == pytest.approx(vars(same.difference))
+        assert vars(aisle.kf_truth) == pytest.approx(vars(same.kf_truth))
+        assert vars(aisle.ekf2_truth) == pytest.approx(vars(same.ekf2_truth))
+        for ours, theirs in ((aisle.kf, same.kf), (aisle.ekf2, same.ekf2)):
+            assert consistency(ours).nis_mean == pytest.approx(consistency(theirs).nis_mean)
+            assert ours.sigma_p_after_update_m == pytest.approx(theirs.sigma_p_after_update_m)
+
+    def test_a_single_axis_has_the_same_numbers_alone(self, made: Comparison) -> None:
+        told: list[str] = []
+        alone = compare(made.flight, axes=("east",), progress=told.append)
+        assert told == ["east"]
+        assert [result.axis.name for result in alone.axes] == ["east"]
+        assert alone.horizontal_kf is None
+        assert alone.horizontal_ekf2 is None
+        for part in ("kf", "ekf2", "difference", "kf_truth", "ekf2_truth", "noise_asked"):
+            assert getattr(alone.axes[0], part) == getattr(along(made, "east"), part)
+
+    def test_settings_and_segment_reach_the_replay(self, made: Comparison) -> None:
+        chosen = Settings(sigma_z_m=0.3, clock_offset_s=0.05)
+        run = compare(made.flight, chosen, start_s=20.0, end_s=50.0).axes[0].replay
+        assert run.settings == chosen
+        assert run.steps.index[0] == pytest.approx(20.05)
+        assert run.steps.index[-1] <= 50.0
+        s = run.updates["innovation_variance_m2"] - run.updates["prior_position_variance_m2"]
+        np.testing.assert_allclose(s, 0.3**2)
+
+
+class TestMissingParts:
+    def test_without_ekf2_our_part_stands_and_the_rest_says_why(self) -> None:
+        comparison = compare(aisle_flight(ekf2=None))
+        assert comparison.horizontal_kf.verdict == "consistent"
+        assert comparison.horizontal_ekf2 is None
+        for result in comparison.axes:
+            assert consistency(result.kf).count == 600
+            assert result.kf_truth.position_rmse_m < 0.09
+            for part in ("ekf2", "ekf2_state", "ekf2_variance", "ekf2_innovations"):
+                assert getattr(result, part) == comparison.flight.ekf2
+            assert result.difference == result.ekf2_truth == comparison.flight.ekf2
+
+    @pytest.mark.parametrize("left_out", ["imu", "attitude_hz"])
+    def test_without_acceleration_constant_velocity_stands_in_and_is_noted(
+        self, left_out: str
+    ) -> None:
+        flight = aisle_flight(**{left_out: None})
+        comparison = compare(flight)
+        assert comparison.settings.input == "zero"
+        assert any("constant velocity was used" in note for note in comparison.notes)
+        assert isinstance(comparison.axes[0].axis.acceleration, Unavailable)
+        assert comparison.axes[0].axis.acceleration in comparison.missing
+        assert consistency(comparison.axes[0].kf).count == 600
+        with pytest.raises(SettingsError, match="--input imu"):
+            compare(flight, input_required=True)
+
+    def test_zero_input_asked_for_is_not_noted_as_missing(self, made: Comparison) -> None:
+        comparison = compare(made.flight, Settings(input="zero"), axes=("north",))
+        assert comparison.notes == ()
+        assert comparison.missing == ()
+        assert np.all(comparison.axes[0].replay.steps["acceleration_m_s2"] == 0.0)
+
+    def test_without_truth_nothing_is_said_about_it(self) -> None:
+        for result in compare(aisle_flight(truth=False)).axes:
+            assert isinstance(result.kf_truth, Unavailable)
+            assert isinstance(result.ekf2_truth, Unavailable)
+            assert isinstance(result.difference, Difference)
+
+    def test_without_variances_there_is_no_nees_but_an_rmse(self) -> None:
+        for result in compare(aisle_flight(ekf2=Estimator(variance_logged=False))).axes:
+            assert isinstance(result.ekf2_variance, Unavailable)
+            assert result.ekf2.sigma_p_median_m is None
+            assert result.ekf2_truth.nees_position_mean is None
+            assert result.ekf2_truth.position_rmse_m == pytest.approx(0.05, rel=0.06)
+
+    def test_without_true_velocity_there_is_no_velocity_error(self, made: Comparison) -> None:
+        samples = made.flight.truth.samples.assign(north_m_s=np.nan, east_m_s=np.nan)
+        flight = replace(made.flight, truth=Truth("positions only", samples))
+        result = compare(flight, axes=("north",)).axes[0]
+        assert result.kf_truth.velocity_rmse_m_s is None
+        assert result.kf_truth.nees_velocity_mean is None
+        assert result.kf_truth.position_rmse_m == along(made, "north").kf_truth.position_rmse_m
+
+    def test_without_innovations_there_is_no_verdict_on_ekf2(self) -> None:
+        comparison = compare(aisle_flight(ekf2=Estimator(innovations_logged=False)))
+        assert comparison.horizontal_ekf2 is None
+        for result in comparison.axes:
+            assert isinstance(result.ekf2.consistency, Unavailable)
+            assert result.ekf2.sigma_p_before_update_m is None
+            assert isinstance(result.difference, Difference)
+
+    @pytest.mark.parametrize(
+        ("parameters", "sender_m", "noise_m"),
+        [
+            ({"EKF2_EVP_NOISE": 0.10}, 0.02, 0.10),
+            ({"EKF2_EVP_NOISE": 0.001}, 0.002, 0.01),
+            ({"EKF2_EVP_NOISE": 0.02}, 0.10, 0.10),
+            ({"EKF2_EVP_NOISE": 0.10, "EKF2_EV_NOISE_MD": 1.0}, 0.11, 0.10),
+        ],
+    )
+    def test_measurement_noise_that_is_not_logged_follows_px4s_rule(
+        self, parameters: dict[str, float], sender_m: float, noise_m: float
+    ) -> None:
+        flight = aisle_flight(parameters=parameters, ekf2=Estimator(noise_logged=False))
+        samples = flight.positions[0].samples.assign(north_m2=sender_m**2)
+        flight = replace(flight, positions=(replace(flight.positions[0], samples=samples),))
+        result = compare(flight, axes=("north",)).axes[0]
+        r = result.ekf2_innovations["observation_variance_m2"]
+        np.testing.assert_allclose(r, noise_m**2)
+
+    def test_unknown_measurement_noise_leaves_only_its_sigmas_open(self) -> None:
+        flight = aisle_flight(parameters={}, ekf2=Estimator(noise_logged=False))
+        result = compare(flight, axes=("north",)).axes[0]
+        assert result.ekf2.sigma_p_before_update_m is None
+        assert result.ekf2.sigma_p_after_update_m is None
+        assert consistency(result.ekf2).nis_mean == pytest.approx(1.0, abs=0.2)
+
+    def test_a_flight_too_short_for_statistics_says_so(self) -> None:
+        comparison = compare(aisle_flight(duration_s=1.0))
+        for result in comparison.axes:
+            assert isinstance(result.kf.consistency, Unavailable)
+            assert isinstance(result.ekf2.consistency, Unavailable)
+        assert comparison.horizontal_kf is None
+
+    def test_truth_for_part_of_the_flight_counts_that_part(self, made: Comparison) -> None:
+        samples = made.flight.truth.samples.loc[40:50]
+        flight = replace(made.flight, truth=Truth("ten seconds", samples))
+        result = compare(flight, axes=("north",)).axes[0]
+        assert result.kf_truth.count == result.ekf2_truth.count == 101
+
+    def test_truth_between_two_variances_has_an_rmse_but_no_nees(self, made: Comparison) -> None:
+        """EKF2's variances come once a second: none may fall where the truth is."""
+        samples = made.flight.truth.samples.loc[40.1:40.9]
+        flight = replace(made.flight, truth=Truth("0.8 s", samples))
+        truth = compare(flight, axes=("north",)).axes[0].ekf2_truth
+        assert truth.count == 9
+        assert truth.nees_position_mean is None
+        assert truth.nees_velocity_mean is None
+
+    def test_ekf2s_innovations_are_not_put_beside_a_source_that_it_did_not_fuse(self) -> None:
+        comparison = compare(aisle_flight(uwb=Uwb(name="vehicle_mocap_odometry", rung=3)))
+        assert comparison.horizontal_ekf2 is None
+        for result in comparison.axes:
+            assert isinstance(result.ekf2.consistency, Unavailable)
+            assert isinstance(result.difference, Difference)
+
+    def test_horizontal_nis_uses_only_the_updates_that_both_axes_have(self) -> None:
+        flight = aisle_flight(ekf2=Estimator(nis=0.5))
+        innovations = flight.ekf2.innovations
+        north, east = innovations["north"], innovations["east"].iloc[100:]
+        ekf2 = replace(flight.ekf2, innovations={**innovations, "east": east})
+        joint = compare(replace(flight, ekf2=ekf2)).horizontal_ekf2
+        nis = [
+            frame["innovation_m"].iloc[-500:] ** 2 / frame["innovation_variance_m2"].iloc[-500:]
+            for frame in (north, east)
+        ]
+        assert joint.count == 500
+        assert joint.nis_mean == pytest.approx(np.mean(nis))
+
+
+class TestRobustness:
+    def test_a_reset_of_frame_is_undone_and_noted(self, made: Comparison) -> None:
+        reset = Reset(60.0, "position", (5.0, -3.0, 0.0))
+        comparison = compare(aisle_flight(ekf2=Estimator(resets=(reset,))))
+        assert any("resets undone: 1 of horizontal position" in note for note in comparison.notes)
+        for result, same in zip(comparison.axes, made.axes, strict=True):
+            assert vars(result.difference) == pytest.approx(vars(same.difference))
+
+    def test_compare_does_not_change_the_flight(self) -> None:
+        flight = aisle_flight(ekf2=Estimator(resets=(Reset(60.0, "position", (5.0, 0.0, 0.0)),)))
+
+        def frames() -> list[pd.DataFrame]:
+            ekf2 = flight.ekf2
+            assert isinstance(ekf2, Ekf2)
+            return [
+                flight.imu, flight.attitude, flight.positions[0].samples, flight.truth.samples,
+                ekf2.state, ekf2.variance, ekf2.fusing, *ekf2.innovations.values(),
+            ]  # fmt: skip
+
+        before = [frame.copy() for frame in frames()]
+        compare(flight, Settings(clock_offset_s=0.3))
+        for frame, copy in zip(frames(), before, strict=True):
+            pd.testing.assert_frame_equal(frame, copy)
+
+    def test_an_imu_gap_is_counted(self) -> None:
+        comparison = compare(aisle_flight(imu=Imu(gap_s=(40.0, 42.0))))
+        for result in comparison.axes:
+            assert result.replay.input_gap_s == pytest.approx(2.0, abs=1e-6)
+
+    def test_frames_of_one_block_serve_as_well_as_frames_of_columns(self, made: Comparison) -> None:
+        """How pandas holds a frame inside, which a copy changes, must not matter."""
+        flight = replace(
+            made.flight, imu=made.flight.imu.copy(), attitude=made.flight.attitude.copy()
+        )
+        result = compare(flight, axes=("north",)).axes[0]
+        assert result.difference == along(made, "north").difference
+
+    def test_a_clock_offset_that_leaves_no_measurement_is_refused(self) -> None:
+        flight = aisle_flight(duration_s=8.0)
+        with pytest.raises((SettingsError, MissingDataError)):
+            compare(flight, Settings(clock_offset_s=9.0))
+
+    def test_an_unknown_axis_is_refused(self, made: Comparison) -> None:
+        with pytest.raises((SettingsError, MissingDataError), match="up"):
+            compare(made.flight, axes=("up",))
+
+    def test_an_unknown_source_is_refused_with_those_there_are(self, made: Comparison) -> None:
+        with pytest.raises(MissingDataError, match="This log has: vehicle_visual_odometry"):
+            compare(made.flight, position_source="vehicle_mocap_odometry")
+
+    def test_a_flight_without_a_source_is_refused(self, made: Comparison) -> None:
+        with pytest.raises(MissingDataError, match="no external position"):
+            compare(replace(made.flight, positions=(), missing=(unavailable("UWB"),)))

@@ -1,0 +1,207 @@
+"""NIS, bias and whiteness against closed forms and against what was injected."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy import stats
+
+from px4fuse.consistency import (
+    Consistency,
+    assess,
+    assess_horizontal,
+    autocorrelation,
+    nis_band,
+    verdict_of,
+)
+from px4fuse.flight import Unavailable
+
+# n and the 95 % band of the mean NIS of two degrees of freedom of eleven real flights
+BANDS_OF_TWO = [
+    (128, 1.67, 2.36), (145, 1.69, 2.34), (72, 1.56, 2.49), (90, 1.61, 2.43), (108, 1.64, 2.39),
+    (179, 1.72, 2.30), (81, 1.59, 2.46), (103, 1.63, 2.40), (121, 1.66, 2.37), (152, 1.69, 2.33),
+    (124, 1.66, 2.37),
+]  # fmt: skip
+
+
+def white(seed: int, count: int = 200) -> NDArray[np.float64]:
+    return np.random.default_rng(seed).normal(size=count)
+
+
+def ar1(phi: float, count: int, seed: int = 4) -> NDArray[np.float64]:
+    """First-order autoregression of unit variance: r(l) = φ^l."""
+    noise = white(seed, count)
+    values = [noise[0]]
+    for each in noise[1:]:
+        values.append(phi * values[-1] + math.sqrt(1 - phi**2) * each)
+    return np.array(values)
+
+
+def assessed(nu: NDArray[np.float64], s: float | NDArray[np.float64] = 1.0) -> Consistency:
+    result = assess(nu, np.broadcast_to(s, nu.shape).astype(float))
+    assert isinstance(result, Consistency)
+    return result
+
+
+@pytest.mark.parametrize(("count", "low", "high"), BANDS_OF_TWO)
+def test_band_of_two_degrees_of_freedom_is_the_published_table(
+    count: int, low: float, high: float
+) -> None:
+    band = nis_band(count, 2)
+    assert (round(2 * band[0], 2), round(2 * band[1], 2)) == (low, high)
+
+
+def test_band_holds_95_percent_of_chi_square() -> None:
+    for count in (10, 100, 1000):
+        low, high = nis_band(count)
+        assert low < 1.0 < high
+        tails = stats.chi2.cdf(low * count, count), stats.chi2.sf(high * count, count)
+        assert tails == pytest.approx((0.025, 0.025))
+
+
+def test_verdict_is_two_sided() -> None:
+    band = (0.8, 1.2)
+    verdicts = [verdict_of(nis, band) for nis in (0.79, 0.8, 1.0, 1.2, 1.21)]
+    assert verdicts == [
+        "variance overstated", "consistent", "consistent", "consistent", "variance understated",
+    ]  # fmt: skip
+
+
+def test_95_percent_of_white_flights_are_consistent() -> None:
+    consistent = [assessed(white(seed)).verdict == "consistent" for seed in range(1000)]
+    assert np.mean(consistent) == pytest.approx(0.95, abs=0.02)
+
+
+@pytest.mark.parametrize("factor", [0.05, 0.5, 2.0, 90.0])
+def test_a_wrong_variance_is_recovered_as_its_factor(factor: float) -> None:
+    variance = np.random.default_rng(2).uniform(0.5, 2.0, 2000)
+    result = assessed(white(1, 2000) * np.sqrt(variance), factor * variance)
+    assert result.variance_factor == pytest.approx(factor, rel=0.08)
+    assert result.variance_factor * result.nis_mean == pytest.approx(1.0)
+    assert result.verdict == f"variance {'overstated' if factor > 1 else 'understated'}"
+
+
+def test_every_number_against_its_formula() -> None:
+    nu, s = white(9, 60) + 0.2, np.linspace(0.5, 2.0, 60)
+    result = assessed(nu, s)
+    normalised = [n / math.sqrt(v) for n, v in zip(nu, s, strict=True)]
+    assert result.count == 60
+    assert result.innovation_mean_m == pytest.approx(sum(nu) / 60)
+    assert result.innovation_std_m == pytest.approx(np.std(nu, ddof=1))
+    assert result.sqrt_s_median_m == pytest.approx(np.median([math.sqrt(v) for v in s]))
+    assert result.nis_mean == pytest.approx(sum(e * e for e in normalised) / 60)
+    assert result.nis_band == nis_band(60)
+    assert result.outside_two_sigma == sum(abs(e) > 2 for e in normalised) / 60
+    power = sum(e * e for e in normalised)
+    r = [
+        sum(a * b for a, b in zip(normalised, normalised[lag:], strict=False)) / power
+        for lag in range(1, 11)
+    ]
+    q = 60 * 62 * sum(each**2 / (60 - lag) for lag, each in enumerate(r, start=1))
+    assert result.lag1_autocorrelation == pytest.approx(r[0])
+    assert result.ljung_box_lags == 10
+    assert result.ljung_box_p == pytest.approx(stats.chi2.sf(q, 10))
+
+
+def test_bias_is_students_t_test() -> None:
+    nu = 0.1 * white(3, 80) + 0.03
+    expected = stats.ttest_1samp(nu, 0.0)
+    result = assessed(nu)
+    assert result.bias_t == pytest.approx(expected.statistic)
+    assert result.bias_p == pytest.approx(expected.pvalue)
+
+
+def test_a_constant_bias_is_found_and_its_sign_kept() -> None:
+    for bias in (-0.5, 0.5):
+        result = assessed(white(6) + bias)
+        assert result.bias_p < 1e-6
+        assert math.copysign(1.0, result.bias_t) == math.copysign(1.0, bias)
+    assert assessed(white(6)).bias_p > 0.05
+
+
+@pytest.mark.parametrize("phi", [-0.6, 0.3, 0.9])
+def test_autocorrelation_of_an_autoregression_is_its_power(phi: float) -> None:
+    r = autocorrelation(ar1(phi, 40_000), 4)
+    np.testing.assert_allclose(r, phi ** np.arange(1, 5), atol=0.03)
+    assert assessed(ar1(phi, 40_000)).lag1_autocorrelation == pytest.approx(r[0])
+
+
+def test_ljung_box_rejects_colour_and_passes_five_percent_of_white_noise() -> None:
+    assert assessed(ar1(0.5, 200)).ljung_box_p < 1e-6
+    rejected = [assessed(white(seed)).ljung_box_p < 0.05 for seed in range(1000)]
+    assert np.mean(rejected) == pytest.approx(0.05, abs=0.02)
+
+
+def test_share_outside_the_gate_follows_the_gate() -> None:
+    nu = np.repeat([0.5, 2.5, 4.0, 6.0], 5)
+    result = assess(nu, np.ones(20), gate=3.0)
+    assert (result.outside_two_sigma, result.outside_gate) == (0.75, 0.5)
+    assert assessed(nu).outside_gate == 0.25
+
+
+def test_samples_without_a_number_or_a_variance_are_left_out() -> None:
+    nu, s = white(1, 50), np.ones(50)
+    nu[3], s[7], s[9] = np.nan, 0.0, np.nan
+    kept = np.delete(np.arange(50), [3, 7, 9])
+    assert assess(nu, s) == assessed(nu[kept])
+
+
+@pytest.mark.parametrize("count", [0, 1, 9])
+def test_fewer_than_ten_innovations_say_nothing(count: int) -> None:
+    result = assess(white(1, count), np.ones(count))
+    assert isinstance(result, Unavailable)
+    assert f"{count} innovations are too few" in result.reason
+    assert result.remedy
+
+
+def test_ten_innovations_make_a_statement() -> None:
+    assert assessed(white(1, 10)).ljung_box_lags == 2
+
+
+def test_innovations_that_are_all_zero_say_nothing() -> None:
+    result = assess(np.zeros(50), np.ones(50))
+    assert isinstance(result, Unavailable)
+    assert result.reason == "every innovation is exactly zero"
+
+
+def test_horizontal_nis_is_the_mean_of_both_axes_with_the_narrower_band() -> None:
+    north, east = white(1), 0.5 * white(2)
+    result = assess_horizontal((north, np.ones(200)), (east, np.ones(200)))
+    both = (assessed(north).nis_mean + assessed(east).nis_mean) / 2
+    assert result.count == 200
+    assert result.nis_mean == pytest.approx(both)
+    assert result.variance_factor == pytest.approx(1 / both)
+    assert result.nis_band == nis_band(200, 2)
+    assert result.verdict == "variance overstated"
+
+
+def test_95_percent_of_white_flights_are_consistent_horizontally() -> None:
+    one = np.ones(200)
+    verdicts = [
+        assess_horizontal((white(seed), one), (white(seed + 5000), one)).verdict
+        for seed in range(1000)
+    ]
+    assert np.mean([verdict == "consistent" for verdict in verdicts]) == pytest.approx(
+        0.95, abs=0.02
+    )
+
+
+def test_horizontal_nis_needs_ten_shared_samples() -> None:
+    def axis(count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        return white(1, count), np.ones(count)
+
+    assert assess_horizontal(axis(9), axis(9)) is None
+    assert assess_horizontal(axis(20), axis(19)) is None
+    assert assess_horizontal((np.zeros(20), np.ones(20)), (np.zeros(20), np.ones(20))) is None
+
+
+@pytest.mark.parametrize(("column", "value"), [(0, np.nan), (1, np.nan), (1, 0.0)])
+def test_horizontal_nis_never_passes_on_what_is_not_a_number(column: int, value: float) -> None:
+    north, east = (white(1), np.ones(200)), (white(2), np.ones(200))
+    north[column][5] = value
+    kept = np.delete(np.arange(200), 5)
+    expected = assess_horizontal((north[0][kept], north[1][kept]), (east[0][kept], east[1][kept]))
+    assert assess_horizontal(north, east) in (None, expected)

@@ -1,0 +1,507 @@
+"""Each detector on a clean flight, a faulty one, one without the field, a short and a real one."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import pytest
+from flights import Estimator, Imu, Uwb, aisle_flight
+
+from px4fuse import findings as package
+from px4fuse.comparison import Comparison, compare
+from px4fuse.findings import DETECTORS, SEVERITIES, Finding, find
+from px4fuse.flight import Dropout, Flight, Reset
+from px4fuse.kalman import Settings
+from px4fuse.readers import read_log
+
+ALIGNED = "estimator_visual_odometry_aligned"
+NO_VISION = {"EKF2_EVP_NOISE": 0.1, "SDLOG_PROFILE": 1.0}
+SIDESTEP = Reset(60.0, "position", (3.0, 0.0, 0.0))
+STEP_UP = Reset(60.0, "position", (0.0, 0.0, -0.4))
+NOT_A_NUMBER = re.compile(r"\b(nan|inf|none)\b", re.IGNORECASE)
+
+
+def never(**parameters: float) -> dict[str, Any]:
+    """EKF2 that never fuses, with these parameters set."""
+    return {"ekf2": Estimator(fusing=((0.0, 0.0),)), "parameters": {**NO_VISION, **parameters}}
+
+
+@dataclass(frozen=True)
+class Fault:
+    """A mistake, the finding that names it, and the evidence that must be in it."""
+
+    id: str
+    severity: str
+    flight: Mapping[str, Any] = field(default_factory=dict)
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    evidence: Mapping[str, Any] = field(default_factory=dict)
+    says: str = ""
+    remedy: str = ""
+
+
+def about(value: float, rel: float = 0.1) -> Any:
+    return pytest.approx(value, rel=rel)
+
+
+FAULTS = [
+    # the filter's own settings
+    Fault(
+        "kf_variance_understated",
+        "error",
+        settings={"sigma_z_m": 0.01},
+        evidence={"sigma_z_asked_m": about(0.10, 0.2)},
+        says="Our innovation variance is understated",
+        remedy="--sigma-z",
+    ),
+    Fault(
+        "kf_variance_overstated",
+        "error",
+        settings={"sigma_z_m": 1.0},
+        evidence={"sigma_z_asked_m": about(0.10, 0.2)},
+        says="Our innovation variance is overstated",
+        remedy="--sigma-z",
+    ),
+    Fault(
+        "process_noise_forgotten",
+        "error",
+        settings={"sigma_a_m_s2": 1e-4},
+        evidence={"relative_growth": pytest.approx(0.01, abs=0.01)},
+        says="hardly grows between updates",
+        remedy="--sigma-a 0.5",
+    ),
+    # EKF2's
+    Fault(
+        "ekf2_variance_overstated",
+        "error",
+        {"ekf2": Estimator(nis=0.02, noise_m=0.7)},
+        evidence={"variance_factor": about(50, 0.3), "sigma_z_asked_m": about(0.10, 0.2)},
+        says="EKF2's innovation variance is overstated",
+        remedy="EKF2_EVP_NOISE",
+    ),
+    Fault(
+        "ekf2_variance_overstated",
+        "warning",
+        {"ekf2": Estimator(nis=0.4, noise_m=0.15)},
+        evidence={"variance_factor": about(2.5, 0.3)},
+    ),
+    Fault(
+        "ekf2_variance_understated",
+        "error",
+        {"ekf2": Estimator(nis=22.0, noise_m=0.02)},
+        evidence={"nis_mean": about(22, 0.2), "sigma_z_asked_m": about(0.10, 0.2)},
+        says="EKF2's innovation variance is understated",
+        remedy="EKF2_EVP_NOISE",
+    ),
+    Fault(
+        "ekf2_not_fusing",
+        "error",
+        {**never(EKF2_EV_CTRL=15), "uwb": Uwb(rate_hz=2.0)},
+        evidence={"fusing_share": 0.0, "source_interval_s": about(0.5)},
+        says="less than 0.2 s apart",
+        remedy="10 Hz",
+    ),
+    Fault(
+        "ekf2_not_fusing", "error", never(EKF2_EV_CTRL=14), {}, {"fusing_share": 0.0},
+        "EKF2_EV_CTRL is 14", "Set EKF2_EV_CTRL to 15",
+    ),
+    Fault(
+        "ekf2_not_fusing", "error", never(EKF2_AID_MASK=1), {}, {"fusing_share": 0.0},
+        "EKF2_AID_MASK is 1", "Set EKF2_AID_MASK to 9",
+    ),
+    Fault(
+        "ekf2_not_fusing",
+        "error",
+        {"ekf2": Estimator(fusing=((0.0, 0.0), (90.0, 1.0)))},
+        evidence={"fusing_share": about(0.25, 0.01)},
+    ),
+    Fault(
+        "ekf2_fusion_interrupted",
+        "warning",
+        {"ekf2": Estimator(fusing=((0.0, 1.0), (60.0, 0.0), (72.0, 1.0)))},
+        evidence={"fusing_share": about(0.90, 0.01)},
+    ),
+    Fault(
+        "ekf2_rejecting",
+        "error",
+        {"ekf2": Estimator(rejected_share=0.5)},
+        evidence={"rejected_share": about(0.5, 0.2), "axis": "north"},
+        remedy="EKF2_EVP_NOISE",
+    ),
+    Fault(
+        "ekf2_rejecting",
+        "warning",
+        {"ekf2": Estimator(rejected_share=0.05)},
+        evidence={"rejected_share": about(0.05, 0.4), "axis": "north"},
+    ),
+    Fault(
+        "ekf2_resets",
+        "warning",
+        {"ekf2": Estimator(resets=(SIDESTEP,))},
+        evidence={"count": 1.0, "largest_m": 3.0, "at_s": 60.0},
+        says="resets undone",
+    ),
+    Fault(
+        "ekf2_resets",
+        "info",
+        {"ekf2": Estimator(resets=(STEP_UP,))},
+        evidence={"count": 1.0, "largest_m": about(0.4, 1e-9), "at_s": 60.0},
+        says="height",
+    ),
+    Fault(
+        "ekf2_instance_switch",
+        "warning",
+        {"ekf2": Estimator(instances=((-math.inf, 0), (30.0, 1), (80.0, 0)))},
+        evidence={"count": 2.0, "at_s": 30.0},
+    ),
+    Fault(
+        "ekf2_innovations_decimated",
+        "info",
+        {"ekf2": Estimator(every=3)},
+        evidence={"logged": 200.0, "measurements": 600.0},
+        remedy="estimator_aid_src_ev_pos 0",
+    ),
+    Fault("ekf2_unavailable", "warning", {"ekf2": None}, remedy="Log EKF2"),
+    # the position source
+    Fault(
+        "source_not_logged",
+        "warning",
+        {"uwb": Uwb(name=ALIGNED, rung=4, rate_hz=4.0), "parameters": NO_VISION},
+        evidence={"rate_hz": about(4.0), "sdlog_profile": 1.0},
+        says="vehicle_visual_odometry, the position as it arrived, is not in this log",
+        remedy="SDLOG_PROFILE to 129",
+    ),
+    Fault(
+        "source_decimated",
+        "warning",
+        {"uwb": Uwb(name="estimator_aid_src_ev_pos", rung=5, rate_hz=2.0)},
+        evidence={"rate_hz": about(2.0), "logger_limit_hz": 2.0},
+    ),
+    Fault(
+        "source_frame_not_north",
+        "warning",
+        {"uwb": Uwb(frame="FRD"), "ekf2": Estimator(fusing_yaw=0.0)},
+        remedy="NED",
+    ),
+    Fault("source_frame_not_north", "info", {"uwb": Uwb(frame="FRD")}, says="EKF2 fused its yaw"),
+    Fault(
+        "source_gap",
+        "warning",
+        {"uwb": Uwb(gap_s=(40.0, 48.0))},
+        evidence={"count": 1.0, "longest_s": about(8.0, 1e-9), "at_s": about(40.0, 1e-9)},
+    ),
+    Fault("no_motion", "warning", {"length_m": 0.0}, evidence={"range_m": about(0.33, 0.15)}),
+    # the log
+    Fault(
+        "imu_gap",
+        "warning",
+        {"imu": Imu(gap_s=(40.0, 42.0))},
+        evidence={"total_s": about(2.0, 1e-6)},
+    ),
+    Fault(
+        "logger_dropouts",
+        "warning",
+        {"dropouts": (Dropout(20.0, 0.3), Dropout(50.0, 0.2), Dropout(500.0, 9.0))},
+        evidence={"count": 2.0, "total_s": about(0.5, 1e-9)},
+    ),
+    Fault(
+        "logging_rate_low",
+        "warning",
+        {"imu": Imu(rate_hz=20.0)},
+        evidence={"rate_hz": about(20.0), "needed_hz": 50.0, "topic": "sensor_combined"},
+    ),
+    Fault(
+        "logging_rate_low",
+        "warning",
+        {"attitude_hz": 5.0},
+        evidence={"rate_hz": about(5.0), "needed_hz": 10.0, "topic": "vehicle_attitude"},
+    ),
+    Fault("input_unavailable", "warning", {"imu": None}, says="constant velocity"),
+    Fault("input_unavailable", "warning", {"attitude_hz": None}, says="constant velocity"),
+    Fault(
+        "log_damaged",
+        "warning",
+        {"notes": ("the file is damaged, what could be read was used",)},
+        evidence={"notes": 1.0},
+    ),
+    Fault("too_few_innovations", "warning", {"duration_s": 1.5}, evidence={"count": 7.0}),
+]  # fmt: skip
+
+# An error that another fault brings with it
+FOLLOWS = {
+    "process_noise_forgotten": "kf_variance_understated",
+    "ekf2_rejecting": "ekf2_variance_understated",
+}
+
+# What a flight without the field must (not) say: the detector's id and what stands instead
+MISSING_FIELD: list[tuple[str, dict[str, Any], str | None]] = [
+    ("ekf2_not_fusing", {"ekf2": Estimator(fusing=None)}, None),
+    ("ekf2_not_fusing", {"ekf2": None}, "ekf2_unavailable"),
+    ("ekf2_fusion_interrupted", {"ekf2": Estimator(fusing=None)}, None),
+    ("ekf2_rejecting", {"ekf2": Estimator(innovations_logged=False)}, None),
+    ("ekf2_variance_overstated", {"ekf2": Estimator(innovations_logged=False)}, None),
+    ("ekf2_variance_understated", {"ekf2": Estimator(innovations_logged=False)}, None),
+    ("ekf2_innovations_decimated", {"ekf2": Estimator(innovations_logged=False)}, None),
+    ("ekf2_resets", {"ekf2": None}, "ekf2_unavailable"),
+    ("ekf2_instance_switch", {"ekf2": None}, "ekf2_unavailable"),
+    ("imu_gap", {"imu": None}, "input_unavailable"),
+    ("logging_rate_low", {"imu": None}, "input_unavailable"),
+    ("logging_rate_low", {"attitude_hz": None}, "input_unavailable"),
+    ("source_not_logged", {"parameters": {}}, None),
+    ("ekf2_variance_overstated", {"parameters": {}, "ekf2": Estimator(noise_logged=False)}, None),
+]
+
+
+@cache
+def clean() -> Comparison:
+    return compare(aisle_flight())
+
+
+def found(comparison: Comparison) -> tuple[Finding, ...]:
+    """All findings, each checked for form."""
+    findings = find(comparison)
+    order = [SEVERITIES.index(finding.severity) for finding in findings]
+    assert order == sorted(order)
+    for finding in findings:
+        assert re.fullmatch(r"[a-z0-9_]+", finding.id)
+        for text in (finding.message, finding.remedy):
+            assert text.strip()
+            assert "\n" not in text
+            assert text.endswith(".")
+            assert not NOT_A_NUMBER.search(text), text
+        for value in finding.evidence.values():
+            assert isinstance(value, str) or math.isfinite(value)
+    return findings
+
+
+def ids(findings: tuple[Finding, ...]) -> set[str]:
+    return {finding.id for finding in findings}
+
+
+@pytest.mark.parametrize("seed", range(2, 8))
+def test_a_clean_flight_has_no_findings(seed: int) -> None:
+    assert found(compare(aisle_flight(seed=seed))) == ()
+
+
+def test_the_faults_below_cover_every_finding() -> None:
+    source = "".join(
+        path.read_text(encoding="utf-8") for path in Path(package.__file__).parent.glob("*.py")
+    )
+    named = set(re.findall(r'Finding\(\s*"([a-z0-9_]+)"', source))
+    named |= {f"{who}_variance_{how}stated" for who in ("kf", "ekf2") for how in ("over", "under")}
+    assert named <= {fault.id for fault in FAULTS}
+
+
+@pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: f"{fault.id}-{fault.severity}")
+def test_a_fault_is_named_with_its_evidence_and_no_unrelated_error(fault: Fault) -> None:
+    findings = found(compare(aisle_flight(**fault.flight), Settings(**fault.settings)))
+    named = [each for each in findings if each.id == fault.id]
+    assert named, f"{fault.id} is not among {sorted(ids(findings))}"
+    assert named[0].severity == fault.severity
+    evidence = named[0].evidence
+    assert {name: evidence.get(name) for name in fault.evidence} == fault.evidence
+    assert fault.says in named[0].message
+    assert fault.remedy in named[0].remedy
+    errors = {each.id for each in findings if each.severity == "error"}
+    assert errors <= {fault.id, FOLLOWS.get(fault.id)}
+
+
+@pytest.mark.parametrize(
+    ("silent", "flight", "instead"), MISSING_FIELD, ids=lambda value: str(value)[:40]
+)
+def test_a_missing_field_is_not_guessed(
+    silent: str, flight: dict[str, Any], instead: str | None
+) -> None:
+    named = ids(found(compare(aisle_flight(**flight))))
+    assert silent not in named
+    assert instead is None or instead in named
+
+
+@pytest.mark.parametrize("duration_s", [0.4, 2.0])
+@pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: f"{fault.id}-{fault.severity}")
+def test_a_flight_of_a_moment_does_not_break_a_detector(fault: Fault, duration_s: float) -> None:
+    uwb = replace(fault.flight.get("uwb", Uwb()), rate_hz=5.0, gap_s=None)
+    short = {**fault.flight, "duration_s": duration_s, "uwb": uwb}
+    if isinstance(short.get("imu"), Imu):
+        short["imu"] = replace(short["imu"], gap_s=None)
+    findings = found(compare(aisle_flight(**short), Settings(**fault.settings)))
+    assert ("too_few_innovations" in ids(findings)) == (duration_s < 2.0)
+
+
+@pytest.mark.parametrize("detector", DETECTORS, ids=lambda detector: detector.__name__)
+def test_each_detector_alone_is_silent_on_a_clean_flight(detector: Any) -> None:
+    assert list(detector(clean())) == []
+
+
+def test_rejections_that_are_not_logged_are_read_off_the_test_ratio() -> None:
+    ekf2 = Estimator(rejected_share=0.5, rejected_logged=False)
+    assert "ekf2_rejecting" in ids(found(compare(aisle_flight(ekf2=ekf2))))
+
+
+@pytest.mark.parametrize("axis", ["north", "east", "aisle"])
+def test_rejections_are_named_whichever_axis_is_analysed(axis: str) -> None:
+    """A rejection is of the whole horizontal vector."""
+    flight = aisle_flight(ekf2=Estimator(rejected_share=0.5))
+    assert "ekf2_rejecting" in ids(found(compare(flight, axes=(axis,))))
+
+
+def test_resets_and_switches_outside_the_segment_do_not_count() -> None:
+    ekf2 = Estimator(resets=(SIDESTEP,), instances=((-math.inf, 0), (30.0, 1)))
+    flight = aisle_flight(ekf2=ekf2, dropouts=(Dropout(20.0, 0.5),))
+    assert found(compare(flight, start_s=70.0)) == ()
+
+
+def test_a_source_that_ekf2_never_takes_is_not_called_not_fused() -> None:
+    flight = aisle_flight(
+        ekf2=Estimator(fusing=((0.0, 0.0),)), uwb=Uwb(name="vehicle_mocap_odometry", rung=3)
+    )
+    assert "ekf2_not_fusing" not in ids(found(compare(flight)))
+
+
+@pytest.mark.parametrize("share", [0.02, 0.05])
+def test_outliers_are_not_answered_by_raising_the_noise(share: float) -> None:
+    flight = aisle_flight(uwb=Uwb(outlier_share=share))
+    finding = next(each for each in found(compare(flight)) if each.id == "kf_variance_understated")
+    assert finding.evidence["outside_gate"] > 0.005
+    assert "remove the outliers" in finding.remedy
+
+
+@pytest.mark.parametrize(
+    ("nis", "noise_m", "direction"),
+    [
+        (3.0, 0.10, "understated"),
+        (3.0, 0.20, "understated"),
+        (0.3, 0.10, "overstated"),
+        (0.3, 0.05, "overstated"),
+    ],
+)
+def test_a_wrong_ekf2_variance_is_not_answered_by_a_noise_that_would_make_it_worse(
+    nis: float, noise_m: float, direction: str
+) -> None:
+    """The source's noise is 0.10 m: where that is not the other side of R, R is not the cause."""
+    findings = found(compare(aisle_flight(ekf2=Estimator(nis=nis, noise_m=noise_m))))
+    assert ids(findings) == {f"ekf2_variance_{direction}"}
+    for finding in findings:
+        told = re.search(r"set EKF2_EVP_NOISE to ([0-9.]+\d)", finding.remedy)
+        change = float(told[1]) / noise_m if told else None
+        assert change is None or (change > 1.2 if nis > 1 else change < 0.8), finding.remedy
+
+
+def test_an_unknown_ekf2_noise_is_not_printed_as_a_number() -> None:
+    flight = aisle_flight(parameters={}, ekf2=Estimator(nis=0.02, noise_logged=False))
+    assert "ekf2_variance_overstated" in ids(found(compare(flight)))
+
+
+def test_process_noise_is_not_called_forgotten_where_it_is_the_lessons() -> None:
+    flight = aisle_flight(uwb=Uwb(rate_hz=100.0), duration_s=30.0)
+    findings = found(compare(flight, Settings(sigma_a_m_s2=0.5, sigma_z_m=1.0)))
+    for finding in findings:
+        if finding.id == "process_noise_forgotten":
+            assert "--sigma-a 0.5" not in finding.remedy
+    assert "kf_variance_overstated" in ids(findings)
+
+
+class TestSampleLog:
+    def test_default_settings_have_no_error_and_no_warning(self, sample_flight: Flight) -> None:
+        assert {each.severity for each in found(compare(sample_flight))} <= {"info"}
+
+    def test_process_noise_forgotten(self, sample_flight: Flight) -> None:
+        comparison = compare(sample_flight, Settings(sigma_a_m_s2=1e-4))
+        finding = next(e for e in found(comparison) if e.id == "process_noise_forgotten")
+        assert finding.severity == "error"
+        assert finding.evidence["relative_growth"] < 0.02
+        assert finding.evidence["last_gain"] < 0.05
+
+    @pytest.mark.parametrize(("sigma_z", "direction"), [(0.01, "understated"), (1.0, "overstated")])
+    def test_wrong_measurement_noise_is_named_and_the_right_one_told(
+        self, sample_flight: Flight, sigma_z: float, direction: str
+    ) -> None:
+        findings = found(compare(sample_flight, Settings(sigma_z_m=sigma_z)))
+        named = [each for each in findings if each.id == f"kf_variance_{direction}"]
+        assert len(named) == 2  # horizontal, vertical
+        for each in named:
+            assert each.severity == "error"
+            assert each.evidence["sigma_z_asked_m"] == pytest.approx(0.10, rel=0.2)
+            typed = re.search(r"--sigma-z ([0-9.]+\d)", each.remedy)
+            assert float(typed[1]) == pytest.approx(0.10, rel=0.2)
+
+    def test_typing_the_remedy_removes_the_finding(self, sample_flight: Flight) -> None:
+        findings = found(compare(sample_flight, Settings(sigma_z_m=0.01)))
+        asked = next(e for e in findings if e.id == "kf_variance_understated").evidence
+        cured = compare(sample_flight, Settings(sigma_z_m=asked["sigma_z_asked_m"]))
+        assert not ids(found(cured)) & {"kf_variance_understated", "kf_variance_overstated"}
+
+
+@pytest.mark.reallogs
+class TestRealLogs:
+    @staticmethod
+    def findings(shared_logs: Path, pattern: str) -> dict[str, Finding]:
+        (path,) = shared_logs.glob(pattern)
+        return {finding.id: finding for finding in found(compare(read_log(path)))}
+
+    def test_overconfident_ekf2_is_told_the_true_noise(self, shared_logs: Path) -> None:
+        findings = self.findings(shared_logs, "simulated/*_aisle_overconfident.ulg")
+        understated = findings["ekf2_variance_understated"]
+        assert understated.severity == "error"
+        assert understated.evidence["nis_mean"] == pytest.approx(22.0, rel=0.2)
+        assert understated.evidence["sigma_z_asked_m"] == pytest.approx(0.10, rel=0.2)
+        rejecting = findings["ekf2_rejecting"]
+        assert rejecting.severity == "error"
+        assert rejecting.evidence["rejected_share"] == pytest.approx(0.5, abs=0.1)
+
+    def test_a_2_hz_source_is_never_fused_and_the_rule_is_told(self, shared_logs: Path) -> None:
+        finding = self.findings(shared_logs, "simulated/*_aisle_2hz_stock.ulg")["ekf2_not_fusing"]
+        assert finding.severity == "error"
+        assert finding.evidence["fusing_share"] == 0.0
+        assert finding.evidence["source_interval_s"] == pytest.approx(0.5, rel=0.05)
+        assert "less than 0.2 s apart" in finding.message
+        assert "10 Hz" in finding.remedy
+
+    def test_a_gap_and_its_reset_are_named(self, shared_logs: Path) -> None:
+        findings = self.findings(shared_logs, "simulated/*_aisle_nlos.ulg")
+        assert findings["source_gap"].evidence["longest_s"] == pytest.approx(8.0, abs=0.3)
+        assert findings["ekf2_resets"].severity == "warning"
+        gap = findings["source_gap"].evidence
+        end_of_gap = gap["at_s"] + gap["longest_s"]
+        assert findings["ekf2_resets"].evidence["at_s"] == pytest.approx(end_of_gap, abs=2.0)
+        assert "remove the outliers" in findings["kf_variance_understated"].remedy
+
+    def test_the_default_logging_profile_is_named(self, shared_logs: Path) -> None:
+        findings = self.findings(shared_logs, "simulated/*_aisle_hwlog.ulg")
+        assert "SDLOG_PROFILE to 129" in findings["source_not_logged"].remedy
+        assert findings["source_decimated"].evidence["logger_limit_hz"] == 2.0
+
+    @pytest.mark.parametrize("version", ["v1.14.4", "v1.16.1"])
+    def test_a_nominal_flight_has_no_error_and_no_warning(
+        self, shared_logs: Path, version: str
+    ) -> None:
+        findings = self.findings(shared_logs, f"simulated/{version}_aisle_nominal.ulg")
+        assert {finding.severity for finding in findings.values()} <= {"info"}
+
+    @pytest.mark.parametrize("name", ["log_3", "min_snap_01", "square2", "battery_brownout"])
+    def test_motion_capture_flights_overstate_the_variance(
+        self, shared_logs: Path, name: str
+    ) -> None:
+        findings = self.findings(shared_logs, f"real/*{name}*.ulg")
+        assert findings["ekf2_variance_overstated"].severity == "error"
+        assert findings["ekf2_variance_overstated"].evidence["variance_factor"] > 4.0
+        assert "ekf2_variance_understated" not in findings
+
+    def test_dropouts_of_a_real_logger_are_named(self, shared_logs: Path) -> None:
+        findings = self.findings(shared_logs, "real/mengchaoheng*test3.ulg")
+        assert findings["logger_dropouts"].evidence["total_s"] == pytest.approx(0.82, abs=0.05)
+        assert findings["imu_gap"].evidence["total_s"] == pytest.approx(0.82, abs=0.1)
+
+
+def test_findings_are_ordered_by_severity() -> None:
+    flight = aisle_flight(
+        ekf2=Estimator(nis=0.02, noise_m=0.7, every=3), uwb=Uwb(gap_s=(40.0, 48.0))
+    )
+    severities = [finding.severity for finding in found(compare(flight))]
+    assert severities == sorted(severities, key=SEVERITIES.index)
+    assert set(severities) == set(SEVERITIES)

@@ -1,0 +1,341 @@
+"""The filterpy replay against a recursion written out in plain Python, as the lesson writes it."""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_right
+from collections.abc import Sequence
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from flights import line
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from px4fuse.errors import SettingsError
+from px4fuse.flight import Flight
+from px4fuse.kalman import (
+    InitialState,
+    Replay,
+    Settings,
+    process_noise,
+    replay,
+    state_at,
+)
+from px4fuse.signals import Axis, choose_segment, choose_source, make_axes
+
+SAME_TIME_S = 5e-7
+STATE = [
+    "position_m",
+    "velocity_m_s",
+    "position_variance_m2",
+    "covariance_m2_s",
+    "velocity_variance_m2_s2",
+]
+UPDATE = ["innovation_m", "innovation_variance_m2"]
+
+
+def steps_of(measured: Sequence[float], dt: float) -> list[float]:
+    """The DT grid from the first measurement on, and each measurement's own time."""
+    kept = list(measured)
+    for k in range(math.floor((measured[-1] - measured[0]) / dt + 1e-6) + 1):
+        time = measured[0] + k * dt
+        at = bisect_right(measured, time)
+        near = measured[max(at - 1, 0) : at + 1]
+        if min(abs(time - other) for other in near) > SAME_TIME_S:
+            kept.append(time)
+    return sorted(kept)
+
+
+def mean_acceleration(
+    times: Sequence[float], values: Sequence[float], start: float, end: float
+) -> float:
+    """Mean over a step of a signal that has in each interval the mean of its two samples."""
+    total = 0.0
+    at = max(bisect_right(times, start) - 1, 0)
+    while at + 1 < len(times) and times[at] < end:
+        overlap = min(end, times[at + 1]) - max(start, times[at])
+        if overlap > 0:
+            total += overlap * (values[at] + values[at + 1]) / 2
+        at += 1
+    return total / (end - start)
+
+
+def plain_replay(axis: Axis, chosen: Settings) -> tuple[list[list[float]], list[list[float]]]:
+    """The lesson's loop with an input and with Q(dt) = SIGMA_A² DT [[dt³/4, dt²/2], [dt²/2, dt]].
+
+    Returns the state after each step (p, v, P00, P01, P11) and, per update, ν and S.
+    """
+    measured = axis.measurement_time_s.tolist()
+    z_at = dict(zip(measured, axis.measurement_m.tolist(), strict=True))
+    steps = steps_of(measured, chosen.dt_s)
+    if chosen.input == "imu":
+        imu = axis.acceleration.time_s.tolist(), axis.acceleration.value_m_s2.tolist()
+    q, r = chosen.sigma_a_m_s2**2 * chosen.dt_s, chosen.sigma_z_m**2
+    x = [z_at[measured[0]], 0.0]
+    P = [[0.5**2, 0.0], [0.0, 1.0**2]]
+    states, updates = [[*x, P[0][0], P[0][1], P[1][1]]], []
+    for before, now in pairwise(steps):
+        dt = now - before
+        a = mean_acceleration(*imu, before, now) if chosen.input == "imu" else 0.0
+        x = [x[0] + dt * x[1] + dt * dt / 2 * a, x[1] + dt * a]
+        P = [
+            [
+                P[0][0] + dt * (P[1][0] + P[0][1]) + dt * dt * P[1][1] + q * dt**3 / 4,
+                P[0][1] + dt * P[1][1] + q * dt**2 / 2,
+            ],
+            [P[1][0] + dt * P[1][1] + q * dt**2 / 2, P[1][1] + q * dt],
+        ]
+        if now in z_at:
+            s = P[0][0] + r
+            k = [P[0][0] / s, P[1][0] / s]
+            nu = z_at[now] - x[0]
+            x = [x[0] + k[0] * nu, x[1] + k[1] * nu]
+            P = [
+                [r * P[0][0] / s, r * P[0][1] / s],
+                [r * P[1][0] / s, P[1][1] - k[1] * P[0][1]],
+            ]
+            updates.append([nu, s])
+        states.append([*x, P[0][0], P[0][1], P[1][1]])
+    return states, updates
+
+
+def assert_equals_plain_recursion(axis: Axis, chosen: Settings) -> None:
+    run = replay(axis, chosen)
+    states, updates = plain_replay(axis, chosen)
+    np.testing.assert_allclose(run.steps[STATE], states, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(run.updates[UPDATE], updates, rtol=1e-9, atol=1e-9)
+
+
+def sample_axes(flight: Flight) -> tuple[Axis, ...]:
+    track, _ = choose_source(flight)
+    return make_axes(flight, track, choose_segment(flight, track))
+
+
+log_uniform = st.floats(-2.0, 1.0).map(lambda exponent: 10.0**exponent)
+any_settings = st.builds(
+    Settings,
+    sigma_a_m_s2=log_uniform,
+    sigma_z_m=log_uniform,
+    dt_s=st.floats(0.02, 1.0),
+    input=st.sampled_from(["imu", "zero"]),
+)
+
+
+@st.composite
+def any_axis(draw: st.DrawFn) -> Axis:
+    """Measurements at irregular times, under an acceleration sampled at 50 Hz."""
+    intervals = draw(st.lists(st.floats(0.005, 0.7), min_size=3, max_size=20))
+    rng = np.random.default_rng(draw(st.integers(0, 2**32)))
+    measured = draw(st.floats(0.0, 500.0)) + np.cumsum(intervals)
+    imu = np.arange(measured[0] - 0.05, measured[-1] + 0.05, 0.02)
+    return line(measured, rng.normal(0.0, 5.0, len(measured)), (imu, rng.normal(0, 3, len(imu))))
+
+
+@pytest.fixture
+def axis() -> Axis:
+    """Twenty measurements at 4 Hz on a constant acceleration of 0.3 m/s²."""
+    time = 2.0 + 0.25 * np.arange(20)
+    imu = np.arange(1.5, 7.5, 0.02)
+    return line(time, 0.15 * (time - 2.0) ** 2, (imu, np.full(len(imu), 0.3)))
+
+
+def test_replay_of_the_sample_log_equals_the_plain_recursion(sample_flight: Flight) -> None:
+    axes = sample_axes(sample_flight)
+    assert [axis.name for axis in axes] == ["north", "east", "down", "aisle"]
+    for axis in axes:
+        assert_equals_plain_recursion(axis, Settings())
+
+
+@settings(max_examples=60, deadline=None)
+@given(axis=any_axis(), chosen=any_settings)
+def test_replay_of_any_axis_equals_the_plain_recursion(axis: Axis, chosen: Settings) -> None:
+    assert_equals_plain_recursion(axis, chosen)
+
+
+@settings(max_examples=40, deadline=None)
+@given(axis=any_axis(), chosen=any_settings)
+def test_variance_is_positive_grows_on_predict_and_shrinks_on_update(
+    axis: Axis, chosen: Settings
+) -> None:
+    run = replay(axis, chosen)
+    p, c, v = (run.steps[name].to_numpy() for name in STATE[2:])
+    assert np.all(p > 0)
+    assert np.all(v > 0)
+    assert np.all(p * v > c * c)
+    s = run.updates["innovation_variance_m2"].to_numpy()
+    assert np.all(s > chosen.sigma_z_m**2)
+    updated = run.steps.index.isin(run.updates.index)[1:]
+    assert np.all(np.diff(p)[~updated] > 0)
+    assert np.all(np.diff(v)[~updated] > 0)
+    prior_p = run.updates["prior_position_variance_m2"].to_numpy()
+    prior_v = run.updates["prior_velocity_variance_m2_s2"].to_numpy()
+    assert np.all(prior_p > p[:-1][updated])
+    assert np.all(prior_p > p[1:][updated])
+    assert np.all(prior_v > v[:-1][updated])
+    assert np.all(prior_v > v[1:][updated])
+
+
+def test_updates_report_the_textbook_gain_and_prior(axis: Axis) -> None:
+    run = replay(axis, Settings())
+    updates = run.updates
+    gain = updates["prior_position_variance_m2"] / updates["innovation_variance_m2"]
+    np.testing.assert_allclose(updates["gain_position"], gain, rtol=1e-12)
+    np.testing.assert_allclose(
+        updates["innovation_m"], updates["measurement_m"] - updates["prior_position_m"], atol=1e-12
+    )
+    posterior = run.steps.loc[updates.index, "position_m"]
+    np.testing.assert_allclose(
+        posterior, updates["prior_position_m"] + gain * updates["innovation_m"], rtol=1e-12
+    )
+
+
+@pytest.mark.parametrize(("dt", "sigma_a"), [(0.1, 0.5), (0.02, 2.0), (1.0, 0.05)])
+def test_process_noise_at_dt_is_the_lessons(dt: float, sigma_a: float) -> None:
+    q = sigma_a**2
+    lessons = [[q * dt**4 / 4, q * dt**3 / 2], [q * dt**3 / 2, q * dt**2]]
+    ours = process_noise(dt, Settings(sigma_a_m_s2=sigma_a, dt_s=dt))
+    np.testing.assert_allclose(ours, lessons, rtol=1e-14)
+
+
+def test_velocity_noise_per_second_does_not_depend_on_the_step() -> None:
+    chosen = Settings(sigma_a_m_s2=0.7)
+    per_second = [process_noise(dt, chosen)[1, 1] / dt for dt in (0.001, 0.004, 0.1, 0.37)]
+    np.testing.assert_allclose(per_second, 0.7**2 * 0.1, rtol=1e-12)
+
+
+NOT_FINITE = (math.nan, math.inf, -math.inf)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        (name, value)
+        for name in ("sigma_a_m_s2", "sigma_z_m", "dt_s")
+        for value in (0.0, -0.1, 1e-300, 1e300, *NOT_FINITE)
+    ]
+    + [("clock_offset_s", value) for value in (-1e300, -11.0, 11.0, *NOT_FINITE)],
+)
+def test_settings_out_of_range_are_refused_in_one_line(name: str, value: float) -> None:
+    with pytest.raises(
+        SettingsError, match=r"^--[a-z-]+ \S+ is out of range: give .+\.$"
+    ) as raised:
+        Settings(**{name: value})
+    assert "\n" not in str(raised.value)
+
+
+def test_imu_input_without_an_imu_is_refused() -> None:
+    with pytest.raises(SettingsError, match="--input imu needs an acceleration"):
+        replay(line([0.0, 0.2, 0.4], [0.0, 0.0, 0.0]), Settings(input="imu"))
+
+
+def test_first_measurement_is_the_start_and_is_not_fused_again(axis: Axis) -> None:
+    run = replay(axis, Settings())
+    assert run.steps.index[0] == axis.measurement_time_s[0]
+    assert run.steps[STATE].iloc[0].tolist() == [axis.measurement_m[0], 0.0, 0.25, 0.0, 1.0]
+    assert run.updates.index.tolist() == axis.measurement_time_s[1:].tolist()
+
+
+def test_given_start_fuses_every_measurement_after_it(axis: Axis) -> None:
+    run = replay(axis, Settings(), InitialState(1.9, -1.0, 0.5))
+    assert run.steps[STATE].iloc[0].tolist() == [-1.0, 0.5, 0.25, 0.0, 1.0]
+    assert run.steps.index[0] == 1.9
+    assert run.updates.index.tolist() == axis.measurement_time_s.tolist()
+
+
+def test_exact_input_keeps_the_state_exact() -> None:
+    """Constant velocity start, constant acceleration: p = t + 0.15 t² leaves no innovation."""
+    time = 0.25 * np.arange(20)
+    imu = np.arange(-0.5, 6.0, 0.02)
+    moving = line(time, time + 0.15 * time**2, (imu, np.full(len(imu), 0.3)))
+    run = replay(moving, Settings(), InitialState(-0.1, -0.1 + 0.0015, 1.0 - 0.03))
+    np.testing.assert_allclose(run.updates["innovation_m"], 0.0, atol=1e-12)
+
+
+def test_state_at_step_times_is_the_step(axis: Axis) -> None:
+    run = replay(axis, Settings())
+    position, velocity = state_at(run, run.steps.index.to_numpy())
+    np.testing.assert_array_equal(position, run.steps["position_m"])
+    np.testing.assert_array_equal(velocity, run.steps["velocity_m_s"])
+
+
+def test_state_between_steps_is_predicted_from_the_step_before(axis: Axis) -> None:
+    run = replay(axis, Settings())
+    step = run.steps.iloc[30]
+    position, velocity = state_at(run, np.array([run.steps.index[30] + 0.01]))
+    expected = step["position_m"] + 0.01 * step["velocity_m_s"] + 0.5 * 0.01**2 * 0.3
+    assert position[0] == pytest.approx(expected, abs=1e-12)
+    assert velocity[0] == pytest.approx(step["velocity_m_s"] + 0.01 * 0.3, abs=1e-12)
+
+
+def test_state_outside_the_replay_is_not_a_number(axis: Axis) -> None:
+    run = replay(axis, Settings())
+    first, last = run.steps.index[[0, -1]]
+    position, velocity = state_at(run, np.array([first - 0.01, first, last, last + 0.01]))
+    assert np.isnan(position).tolist() == [True, False, False, True]
+    assert np.isnan(velocity).tolist() == [True, False, False, True]
+
+
+@settings(max_examples=30, deadline=None)
+@given(axis=any_axis(), chosen=any_settings, data=st.data())
+def test_a_later_measurement_does_not_change_earlier_output(
+    axis: Axis, chosen: Settings, data: st.DataObject
+) -> None:
+    changed = data.draw(st.integers(1, len(axis.measurement_m) - 1))
+    arrival = axis.measurement_time_s[changed]
+    measured = axis.measurement_m.copy()
+    measured[changed] += 100.0
+    imu = axis.acceleration.time_s, axis.acceleration.value_m_s2
+    other = line(axis.measurement_time_s, measured, imu)
+    times = np.append(np.linspace(axis.measurement_time_s[0], arrival - 1e-9, 50), arrival)
+
+    def output(run: Replay) -> np.ndarray:
+        return np.array(state_at(run, times))
+
+    before, after = output(replay(axis, chosen)), output(replay(other, chosen))
+    np.testing.assert_array_equal(before[:, :-1], after[:, :-1])
+    assert abs(after[0, -1] - before[0, -1]) > 0.0
+
+
+def test_replay_does_not_change_its_input(axis: Axis) -> None:
+    arrays = (
+        axis.measurement_time_s,
+        axis.measurement_m,
+        axis.direction,
+        axis.acceleration.time_s,
+        axis.acceleration.value_m_s2,
+        axis.acceleration.integral_m_s,
+    )
+    copies = [array.copy() for array in arrays]
+    for array in arrays:
+        array.setflags(write=False)
+    first = replay(axis, Settings())
+    second = replay(axis, Settings())
+    np.testing.assert_array_equal(first.steps, second.steps)
+    for array, copy in zip(arrays, copies, strict=True):
+        np.testing.assert_array_equal(array, copy)
+
+
+def test_imu_gap_raises_the_process_noise_by_the_inputs_mean_square() -> None:
+    time = 0.5 * np.arange(21)
+    imu = np.arange(0.0, 10.001, 0.02)
+    value = 2.0 * np.sin(imu)
+    outside_gap = (imu <= 4.0) | (imu >= 5.0)
+    chosen = Settings()
+    whole = replay(line(time, 0.0 * time, (imu, value)), chosen)
+    broken_axis = line(time, 0.0 * time, (imu[outside_gap], value[outside_gap]))
+    broken = replay(broken_axis, chosen)
+    assert whole.input_gap_s == 0.0
+    assert broken.input_gap_s == pytest.approx(1.0, abs=1e-6)
+    mean_square = np.mean(value[outside_gap] ** 2)
+    before, after = (
+        broken.steps["velocity_variance_m2_s2"].iloc[
+            int(broken.steps.index.searchsorted(moment - 0.01))
+        ]
+        for moment in (4.1, 4.2)
+    )
+    assert after - before == pytest.approx((0.5**2 + mean_square) * 0.1 * 0.1, rel=1e-6)
+    at = whole.steps.index[(whole.steps.index > 4.05) & (whole.steps.index < 4.95)]
+    raised = broken.steps.loc[at, "position_variance_m2"]
+    assert np.all(raised > whole.steps.loc[at, "position_variance_m2"])

@@ -1,0 +1,112 @@
+"""The vectorised filter against the filterpy replay, and the noise that the data ask for."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from flights import line, random_walk
+from hypothesis import given, settings
+from numpy.typing import NDArray
+from test_kalman import any_axis, any_settings, sample_axes
+
+from px4fuse.flight import Flight
+from px4fuse.kalman import Settings, replay
+from px4fuse.likelihood import innovations, noise_asked, preintegrate
+from px4fuse.signals import Axis
+
+SIGMA_A = [0.05, 0.5, 5.0]
+SIGMA_Z = [0.02, 0.1, 1.0]
+ZERO = Settings(sigma_a_m_s2=0.5, input="zero")
+
+
+def replayed(axis: Axis, chosen: Settings) -> NDArray[np.float64]:
+    """ν and S of the filterpy replay, shape (2, m)."""
+    return replay(axis, chosen).updates[["innovation_m", "innovation_variance_m2"]].to_numpy().T
+
+
+def walk(seed: int = 3, *, sigma_z: float = 0.1, count: int = 4000) -> Axis:
+    """Make a flight whose process noise is that of ``ZERO``."""
+    rng = np.random.default_rng(seed)
+    return random_walk(rng, count=count, interval_s=0.2, sigma_a=0.5, sigma_z=sigma_z)
+
+
+def test_grid_on_the_sample_log_equals_the_replay_at_every_setting(sample_flight: Flight) -> None:
+    for axis in sample_axes(sample_flight):
+        nu, s = innovations(
+            preintegrate(axis, Settings()), np.array(SIGMA_A)[:, None], np.array(SIGMA_Z)
+        )
+        for i, sigma_a in enumerate(SIGMA_A):
+            for j in range(3) if axis.name == "north" else [i]:
+                chosen = Settings(sigma_a_m_s2=sigma_a, sigma_z_m=SIGMA_Z[j])
+                ours = np.array([nu[:, i, j], s[:, i, j]])
+                np.testing.assert_allclose(ours, replayed(axis, chosen), rtol=1e-9, atol=1e-9)
+
+
+@settings(max_examples=60, deadline=None)
+@given(axis=any_axis(), chosen=any_settings)
+def test_any_axis_and_setting_equals_the_replay(axis: Axis, chosen: Settings) -> None:
+    ours = innovations(preintegrate(axis, chosen), chosen.sigma_a_m_s2, chosen.sigma_z_m)
+    np.testing.assert_allclose(ours, replayed(axis, chosen), rtol=1e-9, atol=1e-9)
+
+
+def test_an_imu_gap_costs_the_same_in_both_filters() -> None:
+    imu = np.arange(0.0, 12.0, 0.02)
+    imu = imu[(imu < 4.0) | (imu > 5.3)]
+    time = 0.37 * np.arange(30)
+    axis = line(time, np.sin(time), (imu, -np.sin(imu)))
+    assert replay(axis, Settings()).input_gap_s > 1.0
+    ours = innovations(preintegrate(axis, Settings()), 0.5, 0.1)
+    np.testing.assert_allclose(ours, replayed(axis, Settings()), rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("a", "z", "shape"),
+    [((), (), ()), ((3,), (), (3,)), ((), (4,), (4,)), ((3, 1), (4,), (3, 4)), ((3,), (3,), (3,))],
+)
+def test_settings_broadcast_to_a_grid(
+    a: tuple[int, ...], z: tuple[int, ...], shape: tuple[int, ...]
+) -> None:
+    legs = preintegrate(walk(count=12), ZERO)
+    nu, s = innovations(legs, np.full(a, 0.5), np.full(z, 0.1))
+    assert nu.shape == s.shape == (11, *shape)
+    single = np.array(innovations(legs, 0.5, 0.1)).reshape(2, 11, *[1] * len(shape))
+    np.testing.assert_array_equal([nu, s], np.broadcast_to(single, (2, 11, *shape)))
+
+
+@pytest.mark.parametrize("sigma_z", [0.05, 0.1, 0.5])
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_noise_asked_is_the_noise_injected(seed: int, sigma_z: float) -> None:
+    asked = noise_asked(walk(seed, sigma_z=sigma_z), ZERO)
+    assert not asked.upper_bound
+    assert asked.sigma_z_m == pytest.approx(sigma_z, rel=0.10)
+
+
+def test_noise_asked_does_not_depend_on_the_chosen_sigma_z() -> None:
+    axis = walk()
+    chosen = [Settings(sigma_a_m_s2=0.5, sigma_z_m=z, input="zero") for z in (0.001, 0.1, 10.0)]
+    assert len({noise_asked(axis, each) for each in chosen}) == 1
+
+
+@pytest.mark.parametrize("sigma_z", [0.0, 0.0005, 0.002])
+def test_noise_below_what_the_rate_can_show_is_bounded_from_above(sigma_z: float) -> None:
+    """Half the process noise that the filter is told: it alone explains the innovations."""
+    rng = np.random.default_rng(7)
+    axis = random_walk(rng, count=500, interval_s=0.2, sigma_a=0.25, sigma_z=sigma_z)
+    asked = noise_asked(axis, ZERO)
+    assert asked.upper_bound
+    assert sigma_z <= asked.sigma_z_m < 0.02
+
+
+def test_no_noise_up_to_30_m_explains_absurd_measurements() -> None:
+    rng = np.random.default_rng(5)
+    assert noise_asked(line(0.2 * np.arange(100), rng.normal(0.0, 1000.0, 100)), ZERO) is None
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_five_percent_gross_outliers_hardly_move_the_noise_asked(seed: int) -> None:
+    clean = walk(seed, count=1000)
+    rng = np.random.default_rng(seed)
+    outlier = rng.random(1000) < 0.05
+    measured = clean.measurement_m + np.where(outlier, rng.choice([-3.0, 3.0], 1000), 0.0)
+    asked = noise_asked(line(clean.measurement_time_s, measured), ZERO)
+    assert asked.sigma_z_m == pytest.approx(noise_asked(clean, ZERO).sigma_z_m, rel=0.20)

@@ -1,0 +1,862 @@
+"""The reader against made logs of every PX4 generation, and against flights with known truth."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from ulog_tools import (
+    AXES,
+    EV_VARIANCE,
+    GENERATIONS,
+    GRAVITY,
+    INNOVATION_VARIANCE,
+    VELOCITY,
+    covariances,
+    ev_error,
+    ev_stamps,
+    innovations,
+    load,
+    make_log,
+    odometry,
+    position,
+    seconds_of,
+    selector,
+    stamps,
+    states,
+    topic,
+)
+
+from px4fuse.errors import MissingDataError
+from px4fuse.flight import (
+    POSITION_COLUMNS,
+    POSITION_VARIANCE_COLUMNS,
+    VELOCITY_COLUMNS,
+    VELOCITY_VARIANCE_COLUMNS,
+    Reset,
+    Unavailable,
+)
+from px4fuse.readers import read_log
+from px4fuse.signals import choose_source
+
+HOUR_US = 3_600_000_000
+FLOAT32 = {"rtol": 1e-6, "atol": 1e-6}
+
+
+@pytest.fixture
+def read(tmp_path):
+    """Write a made log and read it as a flight."""
+
+    def write_and_read(log):
+        return read_log(log.write(tmp_path / "made.ulg"))
+
+    return write_and_read
+
+
+def missing_reason(flight, what):
+    return next(str(part) for part in flight.missing if part.what == what)
+
+
+def times(frame):
+    return frame.index.to_numpy()
+
+
+def shift(stamps_us, at, by_us):
+    stamps_us[at] = int(stamps_us[at]) + by_us
+
+
+def later(log, by_us):
+    """The same log from a vehicle that was switched on earlier."""
+    for made in log.topics:
+        for name in ("timestamp", "timestamp_sample"):
+            if name in made.fields:
+                made.fields[name] = made.fields[name] + np.uint64(by_us)
+    return log
+
+
+# ---- every generation ----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("generation", GENERATIONS)
+def test_external_vision_is_read(read, generation):
+    (track, *_) = read(make_log(generation)).positions
+    assert (track.name, track.rung, track.reconstructed) == ("vehicle_visual_odometry", 2, False)
+    expected = seconds_of(ev_stamps(10.0))
+    np.testing.assert_allclose(times(track.samples), expected, atol=1e-9)
+    np.testing.assert_allclose(
+        track.samples[POSITION_COLUMNS], position(expected) + ev_error(expected), **FLOAT32
+    )
+    np.testing.assert_allclose(
+        track.samples[POSITION_VARIANCE_COLUMNS],
+        np.tile(EV_VARIANCE, (len(expected), 1)),
+        **FLOAT32,
+    )
+    assert track.frame == ("unknown" if generation == "v1.9" else "NED")
+    assert track.rate_hz == pytest.approx(5.0)
+
+
+@pytest.mark.parametrize("generation", GENERATIONS)
+@pytest.mark.parametrize("axis", range(3))
+def test_innovations_are_measurement_minus_state(read, generation, axis):
+    """PX4 logs state minus measurement; the file holds that sign, the flight the other one."""
+    log = make_log(generation)
+    logged = {
+        "v1.9": lambda: log["ekf2_innovations"]["vel_pos_innov"][:, 3 + axis],
+        "v1.11": lambda: log["estimator_innovations"]["ev_hpos" if axis < 2 else "ev_vpos"],
+    }
+    if generation in logged:  # the test's own premise
+        first = np.ravel(logged[generation]())[axis if generation == "v1.11" and axis < 2 else 0]
+        assert np.sign(first) == -np.sign(ev_error([0.1])[0, axis])
+    frame = read(log).ekf2.innovations[AXES[axis]]
+    expected = seconds_of(ev_stamps(10.0))
+    np.testing.assert_allclose(times(frame), expected, atol=1e-9)
+    np.testing.assert_allclose(frame["innovation_m"], ev_error(expected)[:, axis], **FLOAT32)
+    np.testing.assert_allclose(
+        frame["innovation_variance_m2"], INNOVATION_VARIANCE[axis], rtol=1e-6
+    )
+
+
+@pytest.mark.parametrize("generation", ["v1.14", "v1.15", "v1.16"])
+def test_aid_source_gives_noise_ratio_and_flags(read, generation):
+    ekf2 = read(make_log(generation)).ekf2
+    assert ekf2.innovation_topics == ("estimator_aid_src_ev_pos", "estimator_aid_src_ev_hgt")
+    for at, axis in enumerate(AXES):
+        frame = ekf2.innovations[axis]
+        np.testing.assert_allclose(frame["observation_variance_m2"], EV_VARIANCE[at], rtol=1e-6)
+        ratio = ev_error(times(frame))[:, at] ** 2 / (25.0 * INNOVATION_VARIANCE[at])
+        np.testing.assert_allclose(frame["test_ratio"], ratio, rtol=1e-5, atol=1e-9)
+        assert (frame["fused"] == 1).all()
+        assert (frame["rejected"] == 0).all()
+
+
+@pytest.mark.parametrize("generation", ["v1.9", "v1.11", "v1.12"])
+def test_what_older_generations_do_not_log_is_nan(read, generation):
+    frame = read(make_log(generation)).ekf2.innovations["north"]
+    assert frame[["observation_variance_m2", "fused", "rejected"]].isna().all(axis=None)
+
+
+@pytest.mark.parametrize("generation", GENERATIONS)
+def test_state_and_imu_are_read(read, generation):
+    flight = read(make_log(generation))
+    state = flight.ekf2.state
+    np.testing.assert_allclose(times(state), seconds_of(stamps(10.0, 10.0)), atol=1e-9)
+    np.testing.assert_allclose(state[POSITION_COLUMNS], position(times(state)), **FLOAT32)
+    np.testing.assert_allclose(state[VELOCITY_COLUMNS], np.tile(VELOCITY, (100, 1)), **FLOAT32)
+    assert len(flight.imu) == 1000
+    np.testing.assert_allclose(flight.imu["down_m_s2"], -GRAVITY, rtol=1e-6)
+    assert (flight.attitude == [1.0, 0.0, 0.0, 0.0]).all(axis=None)
+    assert flight.airborne == ((1.0, 9.0),)
+    assert (flight.ekf2.fusing[["horizontal", "vertical"]] == 1).all(axis=None)
+    assert (flight.ekf2.fusing["yaw"] == 0).all()
+
+
+@pytest.mark.parametrize(
+    ("generation", "first_velocity", "first_position"),
+    [("v1.9", 4, 7), ("v1.11", 4, 7), ("v1.12", 4, 7), ("v1.14", 4, 7), ("v1.15", 3, 6),
+     ("v1.16", 3, 6)],
+)  # fmt: skip
+def test_variances_are_picked_by_the_lengths_of_the_arrays(
+    read, generation, first_velocity, first_position
+):
+    """(24, 24), (24, 23) and (25, 24): the arrays hold (i + 1) / 100, so an offset shows."""
+    variance = read(make_log(generation)).ekf2.variance
+    expected = covariances(24)
+    for columns, first in (
+        (VELOCITY_VARIANCE_COLUMNS, first_velocity),
+        (POSITION_VARIANCE_COLUMNS, first_position),
+    ):
+        np.testing.assert_allclose(
+            variance[columns], np.tile(expected[first : first + 3], (len(variance), 1)), rtol=1e-6
+        )
+
+
+def test_the_release_number_does_not_decide_the_layout(read):
+    """A development version between two releases may carry either layout."""
+    log = make_log("v1.15")
+    log.info["ver_sw_release"] = 1 << 24 | 14 << 16
+    assert read(log).ekf2.variance["north_m2"].iloc[0] == pytest.approx(0.07, rel=1e-6)
+
+
+def test_an_unknown_layout_of_variances_is_not_guessed(read):
+    log = make_log("v1.16")
+    fields = log["estimator_states"]
+    fields["covariances"] = fields["covariances"][:, :22]
+    variance = read(log).ekf2.variance
+    assert isinstance(variance, Unavailable)
+    assert "25 states and 22 covariances" in variance.reason
+
+
+def test_v1_8_vision_position_is_read(read):
+    log = make_log("v1.9").rename("vehicle_visual_odometry", "vehicle_vision_position")
+    del log["vehicle_vision_position"]["pose_covariance"]
+    (track, *_) = read(log).positions
+    assert (track.name, track.topics) == ("vehicle_visual_odometry", ("vehicle_vision_position",))
+    assert track.samples[POSITION_VARIANCE_COLUMNS].isna().all(axis=None)
+
+
+@pytest.mark.parametrize(("generation", "code", "frame"), [
+    ("v1.11", 0, "NED"), ("v1.11", 1, "FRD"), ("v1.11", 2, "unknown"), ("v1.11", 3, "FRD"),
+    ("v1.16", 0, "unknown"), ("v1.16", 1, "NED"), ("v1.16", 2, "FRD"), ("v1.16", 9, "unknown"),
+])  # fmt: skip
+def test_frames_of_external_vision(read, generation, code, frame):
+    log = make_log(generation)
+    fields = log["vehicle_visual_odometry"]
+    name = "pose_frame" if "pose_frame" in fields else "local_frame"
+    fields[name][:] = code
+    assert read(log).positions[0].frame == frame
+
+
+@pytest.mark.parametrize("value", [0.0, np.nan])
+def test_a_variance_that_was_not_given_is_nan(read, value):
+    log = make_log("v1.16")
+    log["vehicle_visual_odometry"]["position_variance"][:] = value
+    assert read(log).positions[0].samples[POSITION_VARIANCE_COLUMNS].isna().all(axis=None)
+
+
+# ---- time -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["vehicle_visual_odometry", "estimator_aid_src_ev_pos"])
+def test_time_is_that_of_measurement(read, name):
+    """Both topics are published 60 ms after the measurement that they describe."""
+    log = make_log("v1.16")
+    assert (log[name]["timestamp"] - log[name]["timestamp_sample"] == 60_000).all()
+    track = next(track for track in read(log).positions if track.name == name)
+    np.testing.assert_allclose(times(track.samples), seconds_of(ev_stamps(10.0)), atol=1e-9)
+
+
+def test_accelerometer_times_follow_their_offset(read):
+    log = make_log("v1.16")
+    offset = log["sensor_combined"]["accelerometer_timestamp_relative"]
+    offset[:] = -2_000
+    offset[7] = 0x7FFFFFFF  # PX4's mark of an invalid accelerometer sample
+    imu = read(log).imu
+    expected = np.delete(seconds_of(stamps(10.0, 100.0)), 7) - 0.002
+    np.testing.assert_allclose(times(imu), expected, atol=1e-9)
+
+
+def test_one_wild_accelerometer_offset_costs_one_sample(read):
+    log = make_log("v1.16")
+    log["sensor_combined"]["accelerometer_timestamp_relative"][500] = 60_000_000
+    assert len(read(log).imu) >= 998
+
+
+@pytest.mark.parametrize(("at", "jump_us"), [(-1, 3 * HOUR_US), (0, -3 * HOUR_US)])
+def test_a_stale_message_of_another_topic_does_not_change_the_duration(read, at, jump_us):
+    log = later(make_log("v1.16"), 4 * HOUR_US)
+    shift(log["vehicle_land_detected"]["timestamp"], at, jump_us)
+    info = read(log).log
+    assert info.duration_s == pytest.approx(9.99)
+    assert info.boot_time_s == pytest.approx(4 * 3600 + 5.0)
+
+
+@pytest.mark.parametrize("at", [0, 1, 500, -2, -1])
+@pytest.mark.parametrize("jump_us", [3 * HOUR_US, -3 * HOUR_US])
+def test_a_stray_imu_stamp_does_not_change_the_duration(read, at, jump_us):
+    log = later(make_log("v1.16"), 4 * HOUR_US)
+    shift(log["sensor_combined"]["timestamp"], at, jump_us)
+    info = read(log).log
+    assert info.duration_s == pytest.approx(9.99, abs=0.03)
+    assert info.boot_time_s == pytest.approx(4 * 3600 + 5.0, abs=0.03)
+
+
+def test_without_an_imu_the_densest_topic_gives_the_span(read):
+    log = make_log("v1.16").drop("sensor_combined")
+    shift(log["vehicle_land_detected"]["timestamp"], -1, 3 * HOUR_US)
+    flight = read(log)
+    assert flight.log.duration_s == pytest.approx(9.95)
+    assert isinstance(flight.imu, Unavailable)
+
+
+def test_samples_with_impossible_stamps_are_counted(read):
+    log = make_log("v1.16")
+    log["vehicle_attitude"]["timestamp"][[3, 4]] = 0
+    flight = read(log)
+    assert len(flight.attitude) == 198
+    assert any("2 samples of vehicle_attitude were dropped" in note for note in flight.log.notes)
+
+
+# ---- two instances of EKF2 --------------------------------------------------------------------
+
+
+def with_two_instances(generation, switches):
+    """A second EKF2 whose variances and innovations are three times those of the first."""
+    log = make_log(generation)
+    number = int(generation.removeprefix("v1."))
+    log.add(*states(10.0, generation, instance=1, scale=3.0))
+    log.add(*innovations(10.0, number, instance=1, scale=3.0))
+    return log.add(selector(switches))
+
+
+@pytest.mark.parametrize("generation", ["v1.12", "v1.15", "v1.16"])
+@pytest.mark.parametrize("switches", [
+    [(0.0, 0), (4.95, 1)],
+    [(0.0, 1), (4.95, 0)],
+    [(0.0, 0), (2.05, 1), (3.05, 1), (6.95, 0)],
+])  # fmt: skip
+def test_rows_come_from_the_instance_that_was_primary(read, generation, switches):
+    ekf2 = read(with_two_instances(generation, switches)).ekf2
+    starts = np.array([start for start, _ in switches])
+    numbers = np.array([number for _, number in switches])
+
+    def scale(time):
+        return np.where(numbers[np.searchsorted(starts, time, side="right") - 1] == 1, 3.0, 1.0)
+
+    variance = ekf2.variance
+    np.testing.assert_allclose(times(variance), seconds_of(stamps(10.0, 2.0)), atol=1e-9)
+    first = 6 if generation in ("v1.15", "v1.16") else 7
+    np.testing.assert_allclose(
+        variance["north_m2"], covariances(24)[first] * scale(times(variance)), rtol=1e-6
+    )
+    frame = ekf2.innovations["east"]
+    np.testing.assert_allclose(times(frame), seconds_of(ev_stamps(10.0)), atol=1e-9)
+    np.testing.assert_allclose(
+        frame["innovation_m"], ev_error(times(frame))[:, 1] * scale(times(frame)), **FLOAT32
+    )
+    assert [number for _, number in ekf2.instances] == [
+        number for at, number in enumerate(numbers) if at == 0 or number != numbers[at - 1]
+    ]
+
+
+def test_a_selector_that_has_not_chosen_yet_is_passed_over(read):
+    ekf2 = read(with_two_instances("v1.16", [(0.0, 255), (3.05, 1)])).ekf2
+    assert ekf2.instances == ((-np.inf, 1),)
+    assert ekf2.variance["north_m2"].iloc[-1] == pytest.approx(3.0 * 0.07, rel=1e-6)
+
+
+# ---- resets -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("before", [0, 254, 255])
+def test_resets_are_read_through_the_wrap_of_the_counter(read, before):
+    """The counters are uint8: the reset after number 255 is number 0."""
+    log = make_log("v1.16")
+    fields = log["vehicle_local_position"]
+    after = (before + 1) % 256
+    fields["xy_reset_counter"][:40], fields["xy_reset_counter"][40:] = before, after
+    fields["delta_xy"][40:] = [1.5, -0.5]
+    fields["z_reset_counter"][:60], fields["z_reset_counter"][60:] = before, after
+    fields["delta_z"][60:] = 0.25
+    fields["vxy_reset_counter"][:70], fields["vxy_reset_counter"][70:] = before, after
+    fields["delta_vxy"][70:] = [0.125, 2.0]
+    fields["vz_reset_counter"][:80], fields["vz_reset_counter"][80:] = before, after
+    fields["delta_vz"][80:] = -4.0
+    resets = read(log).ekf2.resets
+    assert [dataclasses.replace(r, time_s=round(r.time_s, 6)) for r in resets] == [
+        Reset(4.0, "position", (1.5, -0.5, 0.0)),
+        Reset(6.0, "position", (0.0, 0.0, 0.25)),
+        Reset(7.0, "velocity", (0.125, 2.0, 0.0)),
+        Reset(8.0, "velocity", (0.0, 0.0, -4.0)),
+    ]
+
+
+def test_a_flight_without_resets_has_none(read):
+    log = make_log("v1.16")
+    log["vehicle_local_position"]["delta_xy"][:] = 7.0  # a delta counts only with its counter
+    assert read(log).ekf2.resets == ()
+
+
+# ---- innovations ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("generation", ["v1.11", "v1.12"])
+def test_repeated_innovations_are_one_innovation(read, generation):
+    """The topic is written twice per fusion here; the second copy is no new evidence."""
+    log = make_log(generation)
+    assert len(log["estimator_innovations"]["timestamp"]) == 2 * len(ev_stamps(10.0))
+    assert len(read(log).ekf2.innovations["north"]) == len(ev_stamps(10.0))
+
+
+def test_innovations_without_a_variance_near_in_time_are_left_out(read):
+    log = make_log("v1.12")
+    late = log["estimator_innovation_variances"]
+    kept = seconds_of(late["timestamp_sample"]) < 5.0
+    for name in late:
+        late[name] = late[name][kept]
+    ekf2 = read(log).ekf2
+    assert times(ekf2.innovations["north"]).max() < 5.1
+    assert any("left out" in note for note in ekf2.notes)
+
+
+def test_innovations_count_only_while_external_vision_is_fused(read):
+    log = make_log("v1.12")
+    flags = log["estimator_status_flags"]
+    fused = (seconds_of(flags["timestamp_sample"]) >= 3.0) & (
+        seconds_of(flags["timestamp_sample"]) < 6.0
+    )
+    flags["cs_ev_pos"][:] = fused
+    frame = read(log).ekf2.innovations["north"]
+    expected = seconds_of(ev_stamps(10.0))
+    expected = expected[(expected >= 3.0) & (expected < 6.0)]
+    np.testing.assert_allclose(times(frame), expected, atol=1e-9)
+
+
+def test_aid_source_samples_that_were_not_tried_are_no_innovations(read):
+    log = make_log("v1.16")
+    fields = log["estimator_aid_src_ev_pos"]
+    fields["fused"][:10] = False
+    fields["fused"][10:13], fields["innovation_rejected"][10:13] = False, True
+    frame = read(log).ekf2.innovations["north"]
+    np.testing.assert_allclose(times(frame), seconds_of(ev_stamps(10.0))[10:], atol=1e-9)
+    assert frame["rejected"].sum() == 3
+    assert frame["fused"].sum() == len(frame) - 3
+
+
+def test_never_fused_is_said_instead_of_an_empty_series(read):
+    log = make_log("v1.16")
+    log["estimator_status_flags"]["cs_ev_hgt"][:] = False
+    flight = read(log)
+    assert isinstance(flight.ekf2.innovations["down"], Unavailable)
+    assert len(flight.ekf2.innovations["north"]) == len(ev_stamps(10.0))
+    assert "never fused" in missing_reason(flight, "EKF2 innovations, down")
+
+
+# ---- EKF2 that did not run --------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("parameters", "reason"),
+    [({"EKF2_EN": 0}, "EKF2_EN is 0"), ({"SYS_MC_EST_GROUP": 1}, "SYS_MC_EST_GROUP is 1")],
+)
+def test_another_estimator_is_not_taken_for_ekf2(read, parameters, reason):
+    """The position topics are in the log all the same, published by whatever ran."""
+    log = make_log("v1.11")
+    log.parameters |= parameters
+    flight = read(log)
+    assert isinstance(flight.ekf2, Unavailable)
+    assert reason in flight.ekf2.reason
+    assert flight.ekf2 in flight.missing
+    assert flight.positions[0].name == "vehicle_visual_odometry"
+
+
+def test_sys_mc_est_group_2_is_ekf2(read):
+    log = make_log("v1.11")
+    log.parameters["SYS_MC_EST_GROUP"] = 2
+    assert len(read(log).ekf2.state) == 100
+
+
+def test_the_gate_is_the_parameters(read):
+    log = make_log("v1.16")
+    log.parameters["EKF2_EVP_GATE"] = 3.0
+    assert read(log).ekf2.gate == 3.0
+    del log.parameters["EKF2_EVP_GATE"]
+    assert read(log).ekf2.gate == 5.0  # PX4's default
+
+
+# ---- the ladder of position sources -----------------------------------------------------------
+
+
+def gps(generation="v1.16"):
+    """A receiver that moves 0.001° of latitude per second from the origin (111.19 m)."""
+    at = stamps(10.0, 5.0)
+    time = seconds_of(at)
+    latitude, longitude = 47.0 + 0.001 * time, np.full(len(time), 8.0)
+    fix = {"fix_type": np.full(len(time), 3, np.uint8), "eph": np.full(len(time), 2.0)}
+    fix["epv"] = np.full(len(time), 3.0)
+    if generation == "v1.16":
+        made = topic("vehicle_gps_position", at, fix)
+        made.fields |= {"latitude_deg": latitude, "longitude_deg": longitude}
+        made.fields["altitude_msl_m"] = 500.0 + time
+        return made
+    whole = {
+        "lat": np.round(latitude * 1e7).astype(np.int32),
+        "lon": np.round(longitude * 1e7).astype(np.int32),
+        "alt": np.round((500.0 + time) * 1e3).astype(np.int32),
+    }
+    return topic("vehicle_gps_position", at, fix | whole)
+
+
+def everything():
+    log = make_log("v1.16")
+    log.add(odometry("vehicle_mocap_odometry", 10.0, 16), gps())
+    return log.add(odometry("estimator_visual_odometry_aligned", 10.0, 12))
+
+
+LADDER = [
+    ("vehicle_visual_odometry", 2),
+    ("vehicle_mocap_odometry", 3),
+    ("estimator_visual_odometry_aligned", 4),
+    ("estimator_aid_src_ev_pos", 5),
+    ("ekf2_state_plus_innovation", 6),
+    ("vehicle_gps_position", 7),
+]
+
+
+def test_sources_stand_in_the_order_of_the_ladder(read):
+    tracks = read(everything()).positions
+    assert [(track.name, track.rung) for track in tracks] == LADDER
+    assert [track.reconstructed for track in tracks] == [False, False, False, True, True, False]
+
+
+@pytest.mark.parametrize("taken", range(1, 4))
+def test_the_best_source_left_is_chosen_and_the_reason_names_the_others(read, taken):
+    log = everything().drop(*(name for name, _ in LADDER[:taken]))
+    flight = read(log)
+    track, reason = choose_source(flight)
+    assert track.name == LADDER[taken][0]
+    assert all(name in reason for name, _ in LADDER[:taken])
+
+
+def test_the_best_source_of_all_needs_no_excuse(read):
+    track, reason = choose_source(read(everything()))
+    assert (track.name, reason) == (LADDER[0][0], "the best source: logged as it arrived")
+
+
+@pytest.mark.parametrize("name", [name for name, _ in LADDER])
+def test_any_source_can_be_asked_for(read, name):
+    track, reason = choose_source(read(everything()), name)
+    assert track.name == name
+    assert "--position-source" in reason
+
+
+def test_asking_for_a_source_that_is_absent_says_what_there_is(read):
+    flight = read(make_log("v1.16"))
+    with pytest.raises(MissingDataError, match="vehicle_mocap_odometry") as error:
+        choose_source(flight, "vehicle_mocap_odometry")
+    assert "vehicle_visual_odometry, estimator_aid_src_ev_pos" in str(error.value)
+    with pytest.raises(MissingDataError, match="no such source"):
+        choose_source(flight, "sonar")
+
+
+def test_gps_is_used_only_when_asked_for(read):
+    log = make_log("v1.16")
+    names = [n for n in log.names() if "_ev_" in n or n == "vehicle_visual_odometry"]
+    flight = read(log.drop(*names).add(gps()))
+    with pytest.raises(MissingDataError, match="--position-source vehicle_gps_position"):
+        choose_source(flight)
+    assert choose_source(flight, "vehicle_gps_position")[0].rung == 7
+
+
+def test_no_source_at_all_says_what_would_log_one(read):
+    log = make_log("v1.16")
+    names = [n for n in log.names() if "_ev_" in n or n == "vehicle_visual_odometry"]
+    with pytest.raises(MissingDataError, match="SDLOG_PROFILE to 129"):
+        choose_source(read(log.drop(*names)))
+
+
+@pytest.mark.parametrize("generation", ["v1.12", "v1.16"])
+def test_gps_is_projected_to_metres(read, generation):
+    """On PX4's sphere of 6371 km, 0.001° of latitude is 111.195 m."""
+    track = choose_source(read(make_log("v1.16").add(gps(generation))), "vehicle_gps_position")[0]
+    time = times(track.samples)
+    per_degree = 6_371_000.0 * np.pi / 180.0
+    np.testing.assert_allclose(track.samples["north_m"], 0.001 * per_degree * time, atol=0.02)
+    np.testing.assert_allclose(track.samples["east_m"], 0.0, atol=0.02)
+    np.testing.assert_allclose(track.samples["down_m"], -time, atol=1e-3)
+    np.testing.assert_allclose(track.samples["down_m2"], 9.0)
+    np.testing.assert_allclose(track.samples[["north_m2", "east_m2"]].sum(axis=1), 4.0)
+
+
+def test_gps_without_a_fix_is_no_position(read):
+    made = gps()
+    made.fields["fix_type"][:] = 2
+    flight = read(make_log("v1.16").add(made))
+    assert "never had a 3D fix" in missing_reason(flight, "position source vehicle_gps_position")
+
+
+def test_nan_positions_are_dropped(read):
+    log = make_log("v1.16")
+    log["vehicle_visual_odometry"]["position"][5:9, 1] = np.nan
+    samples = read(log).positions[0].samples
+    np.testing.assert_allclose(times(samples), np.delete(seconds_of(ev_stamps(10.0)), slice(5, 9)))
+
+
+@pytest.mark.parametrize("delay_ms", [0.0, 175.0])
+def test_ekf2s_own_delay_is_added_back_to_its_observations(read, delay_ms):
+    """EKF2 files a sample under its stamp less EKF2_EV_DELAY; the sender's stamp is wanted."""
+    log = make_log("v1.16").drop("vehicle_visual_odometry")
+    log.parameters["EKF2_EV_DELAY"] = delay_ms
+    for name in ("estimator_aid_src_ev_pos", "estimator_aid_src_ev_hgt"):
+        log[name]["timestamp_sample"] -= np.uint64(delay_ms * 1000)
+    track, _ = choose_source(read(log))
+    assert (track.name, track.rung) == ("estimator_aid_src_ev_pos", 5)
+    expected = seconds_of(ev_stamps(10.0))
+    np.testing.assert_allclose(times(track.samples), expected, atol=1e-9)
+    np.testing.assert_allclose(
+        track.samples[POSITION_COLUMNS], position(expected) + ev_error(expected), **FLOAT32
+    )
+    np.testing.assert_allclose(
+        track.samples[POSITION_VARIANCE_COLUMNS],
+        np.tile(EV_VARIANCE, (len(expected), 1)),
+        **FLOAT32,
+    )
+
+
+def test_observations_without_height_leave_height_open(read):
+    log = make_log("v1.16").drop("vehicle_visual_odometry", "estimator_aid_src_ev_hgt")
+    track, _ = choose_source(read(log))
+    assert track.name == "estimator_aid_src_ev_pos"
+    assert track.samples["down_m"].isna().all()
+    assert track.samples["north_m"].notna().all()
+
+
+@pytest.mark.parametrize("generation", ["v1.9", "v1.11", "v1.12"])
+def test_state_plus_innovation_is_the_measurement(read, generation):
+    log = make_log(generation).drop("vehicle_visual_odometry")
+    if generation == "v1.12":
+        log.drop("estimator_visual_odometry_aligned")
+    track, _ = choose_source(read(log))
+    assert (track.name, track.rung, track.reconstructed) == ("ekf2_state_plus_innovation", 6, True)
+    expected = position(times(track.samples)) + ev_error(times(track.samples))
+    np.testing.assert_allclose(track.samples[POSITION_COLUMNS], expected, atol=1e-5)
+    assert len(track.samples) >= len(ev_stamps(10.0)) - 1
+
+
+def test_reconstruction_of_the_sample_flight_is_near_the_truth(read, sample_log):
+    """Without either logged source, what is rebuilt must be as good as the UWB itself was.
+
+    The flight's UWB has white noise of 0.10 m; state plus innovation adds the prediction's own
+    error and its age, for which 0.05 m is allowed (√(0.10² + 0.05²) < 0.12 m).
+    """
+    log = load(sample_log).drop("vehicle_visual_odometry")
+    flight = read(log)
+    track = next(t for t in flight.positions if t.name == "ekf2_state_plus_innovation")
+    truth = flight.truth.samples
+    airborne = track.samples.loc[flight.airborne[0][0] : flight.airborne[-1][1]]
+    assert len(airborne) > 200
+    for column in ("north_m", "east_m"):
+        error = airborne[column] - np.interp(times(airborne), truth.index, truth[column])
+        assert error.std() < 0.12
+        assert abs(error.mean()) < 0.03
+
+
+def test_reconstruction_from_the_older_topics_of_the_sample_flight(read, sample_log):
+    """As above without the per-source topic: fewer innovations, each up to 0.2 s old.
+
+    At 1 m/s along an aisle the age adds up to 0.06 m (one standard deviation of 0 to 0.2 s).
+    """
+    log = load(sample_log).drop("vehicle_visual_odometry", "estimator_aid_src_ev_pos")
+    flight = read(log)
+    track, _ = choose_source(flight)
+    assert (track.name, track.topics[1:]) == (
+        "ekf2_state_plus_innovation", ("estimator_innovations",),
+    )  # fmt: skip
+    truth = flight.truth.samples
+    airborne = track.samples.loc[flight.airborne[0][0] : flight.airborne[-1][1]]
+    assert len(airborne) > 40
+    for column in ("north_m", "east_m"):
+        error = airborne[column] - np.interp(times(airborne), truth.index, truth[column])
+        assert error.std() < 0.14
+        assert abs(error.mean()) < 0.05
+
+
+# ---- truth ------------------------------------------------------------------------------------
+
+
+def test_simulation_truth_is_read(read):
+    at = stamps(10.0, 20.0)
+    here = position(seconds_of(at)) + 0.5
+    fields = dict(zip("xyz", here.T, strict=True))
+    fields |= {name: np.full(len(at), 0.25) for name in ("vx", "vy", "vz")}
+    flight = read(make_log("v1.16").add(topic("vehicle_local_position_groundtruth", at, fields)))
+    assert flight.truth.name == "vehicle_local_position_groundtruth"
+    np.testing.assert_allclose(flight.truth.samples[POSITION_COLUMNS], here, **FLOAT32)
+    assert (flight.truth.samples[VELOCITY_COLUMNS] == 0.25).all(axis=None)
+
+
+def test_motion_capture_is_truth_where_something_else_feeds_ekf2(read):
+    log = make_log("v1.16").add(odometry("vehicle_mocap_odometry", 10.0, 16))
+    assert read(log).truth.name == "vehicle_mocap_odometry"
+
+
+def test_motion_capture_is_no_truth_where_it_is_all_there_is(read):
+    log = make_log("v1.16")
+    log.drop(*(n for n in log.names() if "_ev_" in n or n == "vehicle_visual_odometry"))
+    flight = read(log.add(odometry("vehicle_mocap_odometry", 10.0, 16)))
+    assert isinstance(flight.truth, Unavailable)
+    assert choose_source(flight)[0].name == "vehicle_mocap_odometry"
+
+
+# ---- the shipped sample -----------------------------------------------------------------------
+
+
+def test_the_sample_flight_is_complete(sample_flight):
+    assert sample_flight.log.firmware == "PX4 v1.16.1"
+    assert sample_flight.log.duration_s == pytest.approx(129.74, abs=0.01)
+    assert [track.rung for track in sample_flight.positions] == [2, 5, 6]
+    assert sample_flight.positions[0].rate_hz == pytest.approx(5.0, abs=0.01)
+    assert not isinstance(sample_flight.truth, Unavailable)
+    assert len(sample_flight.airborne) == 1
+
+
+def test_the_sample_flights_innovations_have_the_right_sign(sample_flight):
+    """measurement − state, both taken from the log itself, goes with the innovation."""
+    frame = sample_flight.ekf2.innovations["north"]
+    uwb, state = sample_flight.positions[0].samples, sample_flight.ekf2.state
+    nearest = uwb.index.get_indexer(frame.index, method="nearest")
+    measured = uwb["north_m"].to_numpy()[nearest]
+    expected = measured - np.interp(times(frame), state.index, state["north_m"])
+    assert np.corrcoef(frame["innovation_m"], expected)[0, 1] > 0.9
+
+
+# ---- flights with known truth -----------------------------------------------------------------
+
+SIMULATED = {
+    "main202603_aisle_hwlogvision": "vehicle_visual_odometry",
+    "v1.13.3_aisle_evdelay175": "vehicle_visual_odometry",
+    "v1.13.3_aisle_hwlogvision": "vehicle_visual_odometry",
+    "v1.14.4_aisle_nominal": "vehicle_visual_odometry",
+    "v1.16.1_aisle_10hz": "vehicle_visual_odometry",
+    "v1.16.1_aisle_2hz_stock": "vehicle_visual_odometry",
+    "v1.16.1_aisle_clock_late": "vehicle_visual_odometry",
+    "v1.16.1_aisle_clock_nosync": "vehicle_visual_odometry",
+    "v1.16.1_aisle_hwlog": "estimator_aid_src_ev_pos",
+    "v1.16.1_aisle_hwlogvision": "vehicle_visual_odometry",
+    "v1.16.1_aisle_nlos": "vehicle_visual_odometry",
+    "v1.16.1_aisle_nominal": "vehicle_visual_odometry",
+    "v1.16.1_aisle_overconfident": "vehicle_visual_odometry",
+}
+
+
+@pytest.mark.reallogs
+@pytest.mark.parametrize("name", SIMULATED)
+def test_simulated_uwb_is_read_as_it_was_sent(shared_logs, name):
+    """Every sample of the chosen source is one that the simulated UWB sent, at its own time."""
+    flight = read_log(shared_logs / "simulated" / f"{name}.ulg")
+    sent = json.loads((shared_logs / "simulated" / f"{name}.json").read_text())
+    track, _ = choose_source(flight)
+    assert track.name == SIMULATED[name]
+
+    axes = slice(0, 2) if track.rung == 5 else slice(0, 3)  # EKF2 kept no height in these
+    sent_z = np.array([sample["z"] for sample in sent["uwb"]])[:, axes]
+    sent_s = np.array([sample["t_px4_us"] for sample in sent["uwb"]]) * 1e-6
+    read_z = track.samples[POSITION_COLUMNS[axes]].to_numpy()
+    read_s = times(track.samples) + flight.log.boot_time_s
+
+    distance = np.abs(read_z[:, None, :] - sent_z[None, :, :]).max(axis=2)
+    match = distance.argmin(axis=1)
+    assert distance.min(axis=1).max() < 1e-4  # the truth file is rounded to 0.1 mm
+    assert (np.diff(match) > 0).all()
+
+    late = read_s - sent_s[match]
+    config = sent["config"]
+    if config["timesync"]:
+        synced = np.abs(late - config["stamp_offset_s"]) < 0.01
+        first = int(synced.argmax())
+        # before, stamps are arrival times: PX4 maps the clocks after 500 TIMESYNC replies at 10 Hz
+        assert sent_s[match[first]] - sent_s[0] < 55.0
+        assert synced[first:].all()
+    else:
+        assert np.median(late) == pytest.approx(config["latency_ms"] * 1e-3, abs=0.02)
+    inside = (sent_s > sent_s[match[0]]) & (sent_s < sent_s[match[-1]])
+    if track.rung == 2 and not config["dropouts"]:
+        assert len(read_s) >= 0.98 * np.count_nonzero(inside)
+
+
+@pytest.mark.reallogs
+def test_a_gps_flight_has_no_external_position(shared_logs):
+    flight = read_log(shared_logs / "simulated" / "v1.16.1_no_uwb.ulg")
+    assert [track.name for track in flight.positions] == ["vehicle_gps_position"]
+    with pytest.raises(MissingDataError, match="Only GPS"):
+        choose_source(flight)
+
+
+@pytest.mark.reallogs
+def test_a_2_hz_uwb_is_never_fused(shared_logs):
+    flight = read_log(shared_logs / "simulated" / "v1.16.1_aisle_2hz_stock.ulg")
+    assert "never fused" in missing_reason(flight, "EKF2 innovations, north")
+
+
+@pytest.mark.reallogs
+@pytest.mark.parametrize("name", [name for name in SIMULATED if "1.13" in name])
+def test_truth_is_derived_where_only_the_global_one_is_logged(shared_logs, name):
+    """The UWB's error against the derived truth has the noise that was put in (0.10 m)."""
+    flight = read_log(shared_logs / "simulated" / f"{name}.ulg")
+    assert flight.truth.name == "vehicle_global_position_groundtruth"
+    samples, truth = flight.positions[0].samples, flight.truth.samples
+    for column in ("north_m", "east_m"):
+        error = samples[column] - np.interp(times(samples), truth.index, truth[column])
+        assert error.std() == pytest.approx(0.10, abs=0.015)
+        assert abs(error.mean()) < 0.02
+
+
+REAL = "real/{}.ulg"
+MOCAP = [
+    "vladimireganov_ROS_PX4_MOCAP_log_3_2022-6-9-13-01-36",
+    "vladimireganov_ROS_PX4_MOCAP_min_snap_01",
+    "vladimireganov_ROS_PX4_MOCAP_square2",
+]
+
+
+@pytest.mark.reallogs
+@pytest.mark.parametrize("name", MOCAP)
+def test_v1_12_logs_without_raw_vision_use_the_aligned_topic(shared_logs, name):
+    flight = read_log(shared_logs / REAL.format(name))
+    track, reason = choose_source(flight)
+    assert (track.name, track.frame) == ("estimator_visual_odometry_aligned", "NED")
+    assert track.rate_hz == pytest.approx(5.0, abs=0.5)
+    assert "vehicle_visual_odometry" in reason
+    assert flight.log.firmware == "PX4 v1.12.3"
+
+
+@pytest.mark.reallogs
+@pytest.mark.parametrize(("name", "duration_s"), [
+    ("PX4_pyulog_sample_log_small", 6.5),  # one message stands at 1194 s
+    ("PX4_pyulog_sample", 68.9),
+    ("PX4_pyulog_hist_fa8acbdc_sample_unordered", 68.9),
+    ("PX4_pyulog_sample_appended_multiple", 9.6),
+    ("mengchaoheng_PX4_ulog_plottools_hist_6a8cf408_test3", 37.7),
+    ("Auterion_px4-ulog-rs_hist_2f3b79f6_corrupt_unregistered_msg_id", 95.1),
+    ("PX4_flight-review-rs_battery_brownout", 76.0),
+])  # fmt: skip
+def test_durations_are_those_of_the_data(shared_logs, name, duration_s):
+    flight = read_log(shared_logs / REAL.format(name))
+    assert flight.log.duration_s == pytest.approx(duration_s, abs=0.06)
+
+
+@pytest.mark.reallogs
+@pytest.mark.parametrize(("name", "reason"), [
+    ("PX4_pyulog_sample", "SYS_MC_EST_GROUP is 1"),
+    ("erdemarslan380_px4-system-identification_last_trajectory_issue_2026-04-02_14-13-00",
+     "EKF2_EN is 0"),
+])  # fmt: skip
+def test_logs_of_other_estimators(shared_logs, name, reason):
+    assert reason in read_log(shared_logs / REAL.format(name)).ekf2.reason
+
+
+@pytest.mark.reallogs
+def test_vision_that_shows_only_in_innovations_is_rebuilt(shared_logs):
+    flight = read_log(shared_logs / REAL.format("PX4_flight-review-rs_battery_brownout"))
+    track, _ = choose_source(flight)
+    assert (track.rung, flight.ekf2.innovation_topics) == (6, ("estimator_innovations",))
+    assert (flight.ekf2.fusing[["horizontal", "vertical", "yaw"]].mean() > 0.9).all()
+
+
+@pytest.mark.reallogs
+def test_raw_vision_of_v1_13_is_read(shared_logs):
+    name = "mengchaoheng_PX4_ulog_plottools_hist_6a8cf408_test3"
+    flight = read_log(shared_logs / REAL.format(name))
+    assert choose_source(flight)[0].name == "vehicle_visual_odometry"
+    assert len(flight.log.dropouts) == 8
+    assert sum(dropout.duration_s for dropout in flight.log.dropouts) == pytest.approx(
+        0.82, abs=0.01
+    )
+
+
+@pytest.mark.reallogs
+@pytest.mark.parametrize("name", [
+    "PX4_pyulog_sample_px4_events",  # EKF2_EV_CTRL is 15, yet no vision was sent
+    "Auterion_px4-ulog-rs_hist_571df892_quadrotor_local",
+])  # fmt: skip
+def test_no_fusion_is_claimed_where_none_was(shared_logs, name):
+    flight = read_log(shared_logs / REAL.format(name))
+    assert all(isinstance(part, Unavailable) for part in flight.ekf2.innovations.values())
+    with pytest.raises(MissingDataError):
+        choose_source(flight)
+
+
+@pytest.mark.reallogs
+def test_every_log_reads_or_is_refused_and_times_increase(shared_logs):
+    paths = sorted((shared_logs / "real").glob("*.ulg"))
+    assert paths
+    for path in paths:
+        if path.name == "annoybot_yule_log_trig_stats.ulg":  # no PX4 topic in it
+            continue
+        flight = read_log(path)
+        frames = [flight.imu, flight.attitude, *(track.samples for track in flight.positions)]
+        for frame in frames:
+            if not isinstance(frame, Unavailable):
+                assert all(a < b for a, b in pairwise(frame.index)), path.name

@@ -1,0 +1,515 @@
+"""Frames, gravity, axes, averages, segments and resets, against closed forms."""
+
+from __future__ import annotations
+
+import dataclasses
+from itertools import pairwise
+
+import numpy as np
+import pandas as pd
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from px4fuse.errors import MissingDataError, SettingsError
+from px4fuse.flight import (
+    ANGULAR_RATE_COLUMNS,
+    AXIS_NAMES,
+    POSITION_COLUMNS,
+    POSITION_VARIANCE_COLUMNS,
+    QUATERNION_COLUMNS,
+    SPECIFIC_FORCE_COLUMNS,
+    VELOCITY_COLUMNS,
+    Ekf2,
+    Flight,
+    LogInfo,
+    PositionTrack,
+    Reset,
+    Unavailable,
+)
+from px4fuse.projection import continuous_state
+from px4fuse.signals import (
+    Segment,
+    aisle_heading,
+    choose_segment,
+    choose_source,
+    make_axes,
+    ned_acceleration,
+    project_acceleration,
+    shift_clock,
+    step_means,
+)
+
+GRAVITY = 9.80665
+NORTH = np.array([1.0, 0.0, 0.0])
+ALL = Segment(-np.inf, np.inf, "all")
+ABSENT = Unavailable("thing", "not in this log", "Log it.")
+
+
+def frame(time, values, columns):
+    values = np.broadcast_to(values, (len(time), len(columns))).astype(float)
+    return pd.DataFrame(values.copy(), index=pd.Index(time, name="time_s"), columns=columns)
+
+
+def still_imu(time, force=(0.0, 0.0, -GRAVITY)):
+    values = np.hstack([np.broadcast_to(force, (len(time), 3)), np.zeros((len(time), 3))])
+    return frame(time, values, SPECIFIC_FORCE_COLUMNS + ANGULAR_RATE_COLUMNS)
+
+
+def attitude_of(time, rotations):
+    return frame(time, rotations.as_quat(scalar_first=True), QUATERNION_COLUMNS)
+
+
+def track_of(time, positions, name="vehicle_visual_odometry", rung=2):
+    values = np.hstack([positions, np.full((len(time), 3), np.nan)])
+    samples = frame(time, values, POSITION_COLUMNS + POSITION_VARIANCE_COLUMNS)
+    return PositionTrack(name, rung, "", samples, "NED", "", False, (name,))
+
+
+def flight_of(*, imu=ABSENT, attitude=ABSENT, track=None, duration_s=10.0, airborne=ABSENT):
+    log = LogInfo("made.ulg", "", 0, "ULog", "", "", "", 0.0, duration_s)
+    tracks = () if track is None else (track,)
+    return Flight(log, imu, attitude, tracks, ABSENT, ABSENT, airborne)
+
+
+# ---- acceleration in NED ----------------------------------------------------------------------
+
+
+def test_a_level_still_vehicle_does_not_accelerate():
+    time = np.arange(0.0, 5.0, 0.01)
+    level = attitude_of(time[::5], Rotation.identity(len(time[::5])))
+    acceleration = ned_acceleration(flight_of(imu=still_imu(time), attitude=level))
+    assert list(acceleration.columns) == list(AXIS_NAMES)
+    np.testing.assert_array_equal(acceleration, 0.0)
+    np.testing.assert_array_equal(acceleration.index, time[time <= time[::5][-1]])
+
+
+@pytest.mark.parametrize("angles_deg", [(40.0, 0.0, 0.0), (0.0, 25.0, 0.0), (120.0, -10.0, 170.0)])
+def test_a_tilted_still_vehicle_does_not_accelerate(angles_deg):
+    """Gravity is what the accelerometer feels at rest, whichever way it is turned."""
+    time = np.arange(0.0, 5.0, 0.01)
+    tilt = Rotation.from_euler("ZYX", angles_deg, degrees=True)
+    imu = still_imu(time, tilt.inv().apply([0.0, 0.0, -GRAVITY]))
+    attitude = attitude_of(time[::5], Rotation.concatenate([tilt] * len(time[::5])))
+    np.testing.assert_allclose(
+        ned_acceleration(flight_of(imu=imu, attitude=attitude)), 0, atol=1e-12
+    )
+
+
+def test_forward_is_where_the_nose_points():
+    """1 m/s² forward while heading east is 1 m/s² east."""
+    time = np.arange(0.0, 2.0, 0.01)
+    east = Rotation.from_euler("Z", np.full((len(time), 1), 90.0), degrees=True)
+    imu = still_imu(time, (1.0, 0.0, -GRAVITY))
+    acceleration = ned_acceleration(flight_of(imu=imu, attitude=attitude_of(time, east)))
+    np.testing.assert_allclose(acceleration, np.tile([0.0, 1.0, 0.0], (len(time), 1)), atol=1e-12)
+
+
+@pytest.mark.parametrize("axis", [(0, 0, 1), (0, 1, 0), (0.6, 0.0, 0.8)])
+@pytest.mark.parametrize("rate_rad_s", [0.5, -3.0])
+def test_constant_acceleration_of_a_turning_body(axis, rate_rad_s):
+    """Turning at a constant rate, felt force is R(t)ᵀ(a − g); a must come back.
+
+    The attitude is logged ten times slower than the IMU; interpolation on the sphere is exact for
+    a constant rate.
+    """
+    truth = np.array([1.0, -2.0, 0.5])
+    start = Rotation.from_euler("ZYX", [30.0, 5.0, -8.0], degrees=True)
+
+    def body_to_ned(time):
+        return start * Rotation.from_rotvec(np.outer(time * rate_rad_s, axis))
+
+    time = np.arange(0.0, 5.0, 0.005)
+    force = body_to_ned(time).inv().apply(truth - [0.0, 0.0, GRAVITY])
+    attitude = attitude_of(time[::10], body_to_ned(time[::10]))
+    acceleration = ned_acceleration(flight_of(imu=still_imu(time, force), attitude=attitude))
+    assert len(acceleration) > 980
+    np.testing.assert_allclose(acceleration, np.tile(truth, (len(acceleration), 1)), atol=1e-9)
+
+
+def test_the_sign_and_length_of_a_quaternion_do_not_matter():
+    """q and −q are one attitude, and a logged float32 quaternion is not quite of length 1."""
+    time = np.arange(0.0, 4.0, 0.01)
+    turning = Rotation.from_euler("Z", 0.3 * time[::5, None])
+    attitude = attitude_of(time[::5], turning)
+    imu = still_imu(time, (0.5, 0.0, -GRAVITY))
+    expected = ned_acceleration(flight_of(imu=imu, attitude=attitude))
+    flips = np.where(np.arange(len(attitude)) % 2, -1.001, 0.999)
+    flipped = attitude.mul(flips, axis=0)
+    result = ned_acceleration(flight_of(imu=imu, attitude=flipped))
+    np.testing.assert_allclose(result, expected, atol=1e-12)
+
+
+def test_no_acceleration_without_imu_or_attitude():
+    time = np.arange(0.0, 1.0, 0.01)
+    level = attitude_of(time, Rotation.identity(len(time)))
+    assert ned_acceleration(flight_of(attitude=level)) is ABSENT
+    assert ned_acceleration(flight_of(imu=still_imu(time))) is ABSENT
+
+
+def test_imu_and_attitude_at_different_times_give_no_acceleration():
+    time = np.arange(0.0, 1.0, 0.01)
+    later = attitude_of(time + 100.0, Rotation.identity(len(time)))
+    result = ned_acceleration(flight_of(imu=still_imu(time), attitude=later))
+    assert isinstance(result, Unavailable)
+    assert "overlap" in result.reason
+
+
+# ---- averages over steps ----------------------------------------------------------------------
+
+
+def acceleration_of(time, values):
+    table = frame(time, np.outer(values, NORTH), list(AXIS_NAMES))
+    return project_acceleration(table, NORTH, ALL)
+
+
+intervals = st.lists(st.integers(1, 50), min_size=3, max_size=40)
+
+
+@given(intervals, st.data())
+def test_step_means_of_piecewise_linear_signals_are_exact(gaps_ms, data):
+    """Between samples the signal is a straight line; steps that end on samples average exactly."""
+    time = np.concatenate([[0.0], np.cumsum(gaps_ms) * 1e-3])
+    values = np.array(
+        data.draw(st.lists(st.floats(-20, 20), min_size=len(time), max_size=len(time)))
+    )
+    ends = data.draw(st.sets(st.integers(0, len(time) - 1), min_size=2))
+    at = sorted(ends)
+    mean, _ = step_means(acceleration_of(time, values), time[at])
+    for step, (first, last) in enumerate(pairwise(at)):
+        area = sum(
+            (values[i] + values[i + 1]) / 2 * (time[i + 1] - time[i]) for i in range(first, last)
+        )
+        assert mean[step] == pytest.approx(area / (time[last] - time[first]), abs=1e-9)
+
+
+@given(st.floats(-30, 30), st.floats(-10, 10), st.floats(0.011, 0.5), st.floats(0.0, 0.009))
+def test_step_means_between_samples_err_by_less_than_half_a_sample(slope, level, step, shift):
+    """Of a ramp, whose mean is its middle value: off by at most slope · h² / (4 · step)."""
+    h = 0.01
+    time = np.arange(0.0, 6.0 + h / 2, h)
+    edges = 1.0 + shift + step * np.arange(9)
+    mean, gap = step_means(acceleration_of(time, level + slope * time), edges)
+    middle = level + slope * (edges[:-1] + edges[1:]) / 2
+    assert np.abs(mean - middle).max() <= abs(slope) * h**2 / (4 * step) + 1e-9
+    np.testing.assert_allclose(gap, 0.0, atol=1e-9)
+
+
+def test_means_over_all_steps_add_up_to_the_change_of_velocity():
+    time = np.arange(0.0, 10.0, 0.004)
+    edges = np.arange(0.0, 9.95, 0.1)
+    mean, _ = step_means(acceleration_of(time, np.cos(time)), edges)
+    assert np.sum(mean * np.diff(edges)) == pytest.approx(np.sin(edges[-1]), abs=1e-5)
+
+
+def test_gap_fraction_is_the_share_of_the_step_without_imu():
+    time = np.arange(0.0, 10.0, 0.01)
+    time = time[(time < 2.005) | (time > 2.995)]  # nothing strictly between 2 s and 3 s
+    acceleration = acceleration_of(time, np.ones(len(time)))
+    mean, gap = step_means(acceleration, [0.0, 1.0, 1.5, 2.5, 2.7, 2.9, 4.0, 5.0])
+    np.testing.assert_allclose(gap, [0.0, 0.0, 0.5, 1.0, 1.0, 0.1 / 1.1, 0.0], atol=1e-9)
+    np.testing.assert_allclose(mean, 1.0)  # a gap between equal values says the same value
+
+
+def test_outside_the_imu_all_is_gap_and_the_mean_is_zero():
+    time = np.arange(1.0, 2.001, 0.01)
+    mean, gap = step_means(acceleration_of(time, np.ones(len(time))), [0.0, 0.5, 1.5, 2.5, 3.0])
+    np.testing.assert_allclose(gap, [1.0, 0.5, 0.5, 1.0], atol=1e-9)
+    np.testing.assert_allclose(mean[[0, 3]], 0.0)
+
+
+def test_a_slow_imu_is_slow_and_has_no_gaps():
+    """8.6 Hz as in a real log: every interval is long, none is longer than the rest."""
+    time = np.arange(0.0, 20.0, 1 / 8.6)
+    _, gap = step_means(acceleration_of(time, np.ones(len(time))), np.arange(0.0, 19.0, 0.1))
+    np.testing.assert_allclose(gap, 0.0, atol=1e-12)
+
+
+def test_rms_counts_only_the_segment():
+    time = np.arange(0.0, 10.0, 0.01)
+    table = frame(time, np.outer(np.where(time < 5.0, 100.0, 2.0), NORTH), list(AXIS_NAMES))
+    inside = project_acceleration(table, NORTH, Segment(5.0, 9.0, ""))
+    assert inside.rms_m_s2 == pytest.approx(2.0)
+
+
+def test_no_imu_sample_in_the_segment_is_said():
+    time = np.arange(0.0, 1.0, 0.01)
+    table = frame(time, 0.0, list(AXIS_NAMES))
+    assert isinstance(project_acceleration(table, NORTH, Segment(5.0, 9.0, "")), Unavailable)
+
+
+# ---- axes -------------------------------------------------------------------------------------
+
+
+def line_track(heading_deg, count=200, noise=0.0):
+    """Back and forth along a direction, 6 m either way, at a height of 1.5 m."""
+    time = np.arange(count) / 5.0
+    along = 6.0 * np.sin(0.4 * time)
+    heading = np.radians(heading_deg)
+    middle = np.array([3.0, -4.0, -1.5])
+    positions = middle + np.outer(along, [np.cos(heading), np.sin(heading), 0.0])
+    positions += np.random.default_rng(1).normal(0.0, noise, positions.shape) if noise else 0.0
+    return track_of(time, positions), along
+
+
+@pytest.mark.parametrize("heading_deg", [0.0, 30.0, 90.0, 135.0, 179.0])
+def test_heading_of_a_straight_line(heading_deg):
+    heading, elongation = aisle_heading(line_track(heading_deg)[0], ALL)
+    assert (heading - heading_deg + 90.0) % 180.0 - 90.0 == pytest.approx(0.0, abs=1e-6)
+    assert 0.0 <= heading < 180.0
+    assert elongation > 1e6
+
+
+def test_flying_the_other_way_is_the_same_aisle():
+    heading, _ = aisle_heading(line_track(210.0, noise=0.1)[0], ALL)
+    assert heading == pytest.approx(30.0, abs=0.5)
+
+
+def test_the_sample_flights_aisle_points_30_degrees_east_of_north(sample_flight):
+    track, _ = choose_source(sample_flight)
+    segment = choose_segment(sample_flight, track)
+    heading, elongation = aisle_heading(track, segment)
+    assert heading == pytest.approx(30.0, abs=1.0)
+    assert elongation > 10.0
+
+
+def test_axes_project_the_positions():
+    track, along = line_track(30.0)
+    axes = {axis.name: axis for axis in make_axes(flight_of(track=track), track, ALL)}
+    assert list(axes) == ["north", "east", "down", "aisle"]
+    for at, name in enumerate(AXIS_NAMES):
+        np.testing.assert_array_equal(axes[name].measurement_m, track.samples[POSITION_COLUMNS[at]])
+    assert (axes["north"].heading_deg, axes["east"].heading_deg) == (0.0, 90.0)
+    assert axes["down"].heading_deg is None
+    offset = np.dot([3.0, -4.0], [np.cos(np.radians(30)), np.sin(np.radians(30))])
+    np.testing.assert_allclose(axes["aisle"].measurement_m, along + offset, atol=1e-9)
+
+
+def test_a_given_heading_is_used():
+    track, _ = line_track(30.0)
+    (axis,) = make_axes(flight_of(track=track), track, ALL, names=("aisle",), heading_deg=45.0)
+    expected = (track.samples["north_m"] + track.samples["east_m"]) / np.sqrt(2.0)
+    np.testing.assert_allclose(axis.measurement_m, expected, atol=1e-12)
+    assert axis.heading_deg == 45.0
+    assert "--heading" in axis.note
+
+
+def test_acceleration_is_projected_on_the_same_axis_as_the_positions():
+    time = np.arange(0.0, 10.0, 0.01)
+    level = attitude_of(time, Rotation.identity(len(time)))
+    imu = still_imu(time, (3.0, 4.0, -GRAVITY))
+    track, _ = line_track(30.0, count=50)
+    flight = flight_of(imu=imu, attitude=level, track=track)
+    (axis,) = make_axes(
+        flight, track, ALL, names=("aisle",), heading_deg=np.degrees(np.arctan2(4, 3))
+    )
+    np.testing.assert_allclose(axis.acceleration.value_m_s2, 5.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("offset_s", [0.25, -0.1, 0.0])
+def test_a_clock_offset_moves_the_times_and_nothing_else(offset_s):
+    track, _ = line_track(30.0)
+    before = track.samples.copy(deep=True)
+    moved = shift_clock(track, offset_s)
+    np.testing.assert_allclose(moved.samples.index, before.index + offset_s, atol=1e-12)
+    np.testing.assert_array_equal(moved.samples, before)
+    assert dataclasses.replace(moved, samples=track.samples) == track
+    pd.testing.assert_frame_equal(track.samples, before)
+
+
+def test_a_source_without_height_has_no_down_axis():
+    track, _ = line_track(30.0)
+    track.samples["down_m"] = np.nan
+    axes = make_axes(flight_of(track=track), track, ALL)
+    assert [axis.name for axis in axes] == ["north", "east", "aisle"]
+    assert all(np.isfinite(axis.measurement_m).all() for axis in axes)
+    with pytest.raises(MissingDataError, match="down"):
+        make_axes(flight_of(track=track), track, ALL, names=("down",))
+
+
+def test_axes_hold_only_the_segment():
+    track, _ = line_track(30.0)
+    (axis,) = make_axes(flight_of(track=track), track, Segment(4.0, 8.0, ""), names=("east",))
+    assert (axis.measurement_time_s[0], axis.measurement_time_s[-1]) == (4.0, 8.0)
+
+
+# ---- the segment ------------------------------------------------------------------------------
+
+
+def straight(first_s, last_s):
+    time = np.arange(first_s, last_s + 0.1, 0.2)
+    return track_of(time, np.zeros((len(time), 3)))
+
+
+@pytest.mark.parametrize(("airborne", "expected"), [
+    (((4.0, 12.0),), (4.0, 12.0)),
+    (((4.0, 6.0), (8.0, 12.0)), (4.0, 12.0)),  # first take-off to last touch-down
+    (((0.0, 30.0),), (2.0, 18.0)),
+    (((10.0, 30.0),), (10.0, 18.0)),
+    ((), (2.0, 18.0)),  # never took off
+    (((19.0, 20.0),), (2.0, 18.0)),  # the source does not run in flight
+    (ABSENT, (2.0, 18.0)),  # no land detector
+])  # fmt: skip
+def test_the_segment_is_where_the_source_runs_and_the_vehicle_flies(airborne, expected):
+    track = straight(2.0, 18.0)
+    flight = flight_of(track=track, duration_s=20.0, airborne=airborne)
+    segment = choose_segment(flight, track)
+    assert (segment.start_s, segment.end_s) == pytest.approx(expected)
+    assert segment.reason
+
+
+def test_each_rule_of_the_segment_has_its_own_reason():
+    track = straight(2.0, 18.0)
+    spans = [((4.0, 12.0),), (), ((19.0, 20.0),), ABSENT]
+    flights = [flight_of(track=track, duration_s=20.0, airborne=airborne) for airborne in spans]
+    assert len({choose_segment(flight, track).reason for flight in flights}) == len(spans)
+
+
+def test_the_segment_stays_inside_the_data():
+    track = straight(-1.0, 25.0)
+    segment = choose_segment(flight_of(track=track, duration_s=20.0), track)
+    assert (segment.start_s, segment.end_s) == (0.0, 20.0)
+
+
+@pytest.mark.parametrize(("start_s", "end_s", "expected"), [
+    (5.0, None, (5.0, 12.0)), (None, 9.0, (4.0, 9.0)), (3.0, 15.0, (3.0, 15.0)),
+])  # fmt: skip
+def test_either_end_can_be_given(start_s, end_s, expected):
+    track = straight(2.0, 18.0)
+    flight = flight_of(track=track, duration_s=20.0, airborne=((4.0, 12.0),))
+    segment = choose_segment(flight, track, start_s, end_s)
+    assert (segment.start_s, segment.end_s) == expected
+    assert ("--start" in segment.reason) == (start_s is not None)
+    assert ("--end" in segment.reason) == (end_s is not None)
+
+
+@pytest.mark.parametrize(("start_s", "end_s", "said"), [
+    (9.0, 9.0, "empty"), (9.0, 5.0, "empty"), (50.0, None, "empty"),
+    (5.0, 5.3, "too few"), (18.5, 19.5, "too few"),
+])  # fmt: skip
+def test_a_segment_without_measurements_is_refused(start_s, end_s, said):
+    track = straight(2.0, 18.0)
+    with pytest.raises(SettingsError, match=said) as error:
+        choose_segment(flight_of(track=track, duration_s=20.0), track, start_s, end_s)
+    assert "\n" not in str(error.value)
+
+
+# ---- resets of EKF2 ---------------------------------------------------------------------------
+
+STATE_TIME = np.arange(0.0, 20.0, 0.1)
+EV_TIME = np.arange(0.05, 19.8, 0.2)
+
+
+def truth_at(time):
+    """A slow curve, so that a shift in time or place shows."""
+    return np.stack([0.5 * time, 2.0 * np.sin(0.3 * time), -1.5 + 0.0 * time], axis=1)
+
+
+def ekf2_of(offset, resets, velocity=0.0):
+    """EKF2 that publishes the truth plus an offset, shape (n, 3), of its own making."""
+    state = np.hstack([truth_at(STATE_TIME) + offset, np.full((len(STATE_TIME), 3), velocity)])
+    table = frame(STATE_TIME, state, POSITION_COLUMNS + VELOCITY_COLUMNS)
+    unavailable = dict.fromkeys(AXIS_NAMES, ABSENT)
+    return Ekf2(table, ABSENT, unavailable, (), ABSENT, tuple(resets), ((-np.inf, 0),), 5.0)
+
+
+def noisy_track():
+    noise = np.random.default_rng(3).normal(0.0, 0.1, (len(EV_TIME), 3))
+    return track_of(EV_TIME, truth_at(EV_TIME) + noise)
+
+
+WHOLE = Segment(0.0, 19.9, "")
+
+
+@pytest.mark.parametrize("reset_s", [2.0, 6.0, 10.0, 14.0, 17.0])
+def test_a_reset_that_changes_the_frame_is_undone_exactly(reset_s):
+    delta = np.array([2.0, -1.0, 0.0])
+    offset = np.where(STATE_TIME[:, None] >= reset_s, delta, 0.0)
+    ekf2 = ekf2_of(offset, [Reset(reset_s, "position", tuple(delta))])
+    state, statement = continuous_state(ekf2, noisy_track(), WHOLE)
+    np.testing.assert_allclose(state[POSITION_COLUMNS], truth_at(STATE_TIME), atol=1e-12)
+    assert "undone" in statement
+    assert "kept" not in statement
+
+
+@pytest.mark.parametrize("good", [0, 1, 2])
+def test_the_stretch_that_fits_the_source_gives_the_frame(good):
+    """Two changes of frame; the source is in the frame of the first, middle or last stretch."""
+    deltas = np.array([[1.0, 0.5, 0.0], [-3.0, 2.0, 0.0]])
+    at = [5.0, 15.0]
+    offset = sum(
+        np.where(STATE_TIME[:, None] >= t, delta, 0.0) for t, delta in zip(at, deltas, strict=True)
+    )
+    offset = offset - deltas[:good].sum(axis=0)
+    resets = [Reset(t, "position", tuple(d)) for t, d in zip(at, deltas, strict=True)]
+    state, statement = continuous_state(ekf2_of(offset, resets), noisy_track(), WHOLE)
+    np.testing.assert_allclose(state[POSITION_COLUMNS], truth_at(STATE_TIME), atol=1e-12)
+    assert "2 of horizontal position" in statement
+
+
+@pytest.mark.parametrize("reset_s", [4.0, 10.0, 15.0])
+def test_a_reset_that_corrects_an_error_is_kept(reset_s):
+    """EKF2 drifts off by 2 m and is then moved back onto the source."""
+    drift = np.where(reset_s > STATE_TIME, 2.0 * STATE_TIME / reset_s, 0.0)
+    ekf2 = ekf2_of(np.outer(drift, NORTH), [Reset(reset_s, "position", (-2.0, 0.0, 0.0))])
+    state, statement = continuous_state(ekf2, noisy_track(), WHOLE)
+    pd.testing.assert_frame_equal(state, ekf2.state)
+    assert "kept" in statement
+    assert "undone" not in statement
+
+
+def test_height_and_horizontal_position_are_decided_apart():
+    frame_change = np.where(STATE_TIME >= 8.0, 3.0, 0.0)
+    drift = np.where(STATE_TIME < 12.0, 0.1 * STATE_TIME, 0.0)
+    offset = np.stack([frame_change, 0.0 * drift, drift], axis=1)
+    resets = [Reset(8.0, "position", (3.0, 0.0, 0.0)), Reset(12.0, "position", (0.0, 0.0, -1.2))]
+    ekf2 = ekf2_of(offset, resets)
+    state, statement = continuous_state(ekf2, noisy_track(), WHOLE)
+    np.testing.assert_allclose(state["north_m"], truth_at(STATE_TIME)[:, 0], atol=1e-12)
+    np.testing.assert_array_equal(state["down_m"], ekf2.state["down_m"])
+    assert "horizontal" in statement.split("kept")[0]
+    assert "height" in statement.split("kept")[1]
+
+
+def test_a_reset_of_velocity_is_kept():
+    ekf2 = ekf2_of(np.zeros(3), [Reset(8.0, "velocity", (1.0, 0.0, 0.0))])
+    state, statement = continuous_state(ekf2, noisy_track(), WHOLE)
+    pd.testing.assert_frame_equal(state, ekf2.state)
+    assert "1 of velocity" in statement
+
+
+@pytest.mark.parametrize("reset_s", [0.5, 18.5])
+def test_resets_outside_the_segment_change_nothing(reset_s):
+    ekf2 = ekf2_of(np.zeros(3), [Reset(reset_s, "position", (5.0, 5.0, 0.0))])
+    state, statement = continuous_state(ekf2, noisy_track(), Segment(1.0, 18.0, ""))
+    pd.testing.assert_frame_equal(state, ekf2.state)
+    assert statement == ""
+
+
+# ---- inputs stay as they are ------------------------------------------------------------------
+
+
+def test_nothing_changes_its_input(sample_flight):
+    """Flight is shared by everything; a change in place would spoil what comes after."""
+    track, _ = choose_source(sample_flight)
+    parts = [sample_flight.imu, sample_flight.attitude, track.samples, sample_flight.ekf2.state]
+    before = [part.copy(deep=True) for part in parts]
+    segment = choose_segment(sample_flight, track)
+    axes = make_axes(sample_flight, shift_clock(track, 0.1), segment)
+    step_means(axes[0].acceleration, np.arange(10.0, 20.0, 0.1))
+    shifted = dataclasses.replace(
+        sample_flight.ekf2, resets=(Reset(60.0, "position", (1.0, 0.0, 0.0)),)
+    )
+    continuous_state(shifted, track, segment)
+    for part, copy in zip(parts, before, strict=True):
+        pd.testing.assert_frame_equal(part, copy)
+
+
+def test_undoing_a_reset_leaves_what_was_published():
+    offset = np.where(STATE_TIME[:, None] >= 6.0, [2.0, -1.0, 0.0], 0.0)
+    ekf2 = ekf2_of(offset, [Reset(6.0, "position", (2.0, -1.0, 0.0))])
+    before = ekf2.state.copy(deep=True)
+    state, _ = continuous_state(ekf2, noisy_track(), WHOLE)
+    assert not state.equals(before)
+    pd.testing.assert_frame_equal(ekf2.state, before)

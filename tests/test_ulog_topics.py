@@ -1,0 +1,215 @@
+"""Which time stamps of a log are trusted, and the helper that the other tests write logs with."""
+
+from __future__ import annotations
+
+from itertools import combinations, pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pyulog import ULog
+from ulog_tools import GENERATIONS, load, make_log, position, seconds_of
+
+from px4fuse.errors import LogError
+from px4fuse.readers.ulog_topics import increasing, measurement_time_us, read_topics
+
+HOUR_US = 3_600_000_000
+small_stamps = st.lists(st.integers(-2, 12), max_size=9)
+any_stamps = st.lists(st.integers(-(2**63), 2**63 - 1), max_size=60)
+
+
+def kept(stamps: list[int]) -> list[int]:
+    return increasing(np.array(stamps, dtype=np.int64)).tolist()
+
+
+def longest_run(stamps: list[int]) -> int:
+    """Length of the longest strictly increasing run of positive stamps, by trying them all."""
+    positive = [stamp for stamp in stamps if stamp > 0]
+    for length in range(len(positive), 0, -1):
+        for run in combinations(positive, length):
+            if all(a < b for a, b in pairwise(run)):
+                return length
+    return 0
+
+
+@given(any_stamps)
+def test_kept_stamps_are_positive_and_increase(stamps):
+    indices = kept(stamps)
+    chosen = [stamps[at] for at in indices]
+    assert indices == sorted(set(indices))
+    assert all(stamp > 0 for stamp in chosen)
+    assert all(a < b for a, b in pairwise(chosen))
+
+
+@given(small_stamps)
+def test_no_longer_run_exists(stamps):
+    assert len(kept(stamps)) == longest_run(stamps)
+
+
+@given(st.sets(st.integers(1, 2**62)).map(sorted))
+def test_clean_stamps_all_stay(stamps):
+    assert kept(stamps) == list(range(len(stamps)))
+
+
+@pytest.mark.parametrize("at", [2, 50, 97])
+@pytest.mark.parametrize("jump_us", [3 * HOUR_US, -3 * HOUR_US])
+def test_one_stray_stamp_costs_one_sample(at, jump_us):
+    stamps = (4 * HOUR_US + 5_000 * np.arange(100)).tolist()
+    stamps[at] += jump_us
+    assert kept(stamps) == [i for i in range(100) if i != at]
+
+
+def test_a_running_maximum_would_lose_what_follows():
+    assert kept([1, 2, 9_000, 3, 4, 5]) == [0, 1, 3, 4, 5]
+
+
+@pytest.mark.parametrize("stamps", [[], [0], [0, 0, 0], [-5, 0, -1]])
+def test_no_positive_stamp_keeps_nothing(stamps):
+    assert kept(stamps) == []
+
+
+def test_repeated_stamps_keep_one_sample():
+    assert len(kept([7, 7, 7])) == 1
+
+
+def table(published, sampled=None):
+    arrays = {"timestamp": np.array(published, dtype=np.uint64)}
+    if sampled is not None:
+        arrays["timestamp_sample"] = np.array(sampled, dtype=np.uint64)
+    return arrays
+
+
+PUBLISHED = [10_000_000, 11_000_000, 12_000_000, 13_000_000]
+
+
+def test_publication_is_used_where_nothing_else_is_logged():
+    assert measurement_time_us(table(PUBLISHED)).tolist() == PUBLISHED
+
+
+def test_measurement_time_is_preferred():
+    sampled = [stamp - 214_000 for stamp in PUBLISHED]
+    assert measurement_time_us(table(PUBLISHED, sampled)).tolist() == sampled
+
+
+@pytest.mark.parametrize(
+    "sampled",
+    [
+        pytest.param([0, 0, 0, 0], id="zero, as the ground truth of v1.13 has it"),
+        pytest.param([1_700_000_000_000_000 + i for i in range(4)], id="UNIX time of a receiver"),
+        pytest.param([0, 0, 0, 12_900_000], id="mostly unusable"),
+    ],
+)
+def test_publication_is_used_where_measurement_time_is_on_another_clock(sampled):
+    assert measurement_time_us(table(PUBLISHED, sampled)).tolist() == PUBLISHED
+
+
+def test_one_unusable_measurement_time_falls_back_alone():
+    sampled = [0, 10_900_000, 11_900_000, 12_900_000]
+    expected = [10_000_000, 10_900_000, 11_900_000, 12_900_000]
+    assert measurement_time_us(table(PUBLISHED, sampled)).tolist() == expected
+
+
+def test_measurement_time_may_be_ahead_of_publication():
+    """A sender whose clock runs ahead is a finding, not a reason to hide its stamps."""
+    sampled = [stamp + 250_000 for stamp in PUBLISHED]
+    assert measurement_time_us(table(PUBLISHED, sampled)).tolist() == sampled
+
+
+@pytest.mark.parametrize("generation", GENERATIONS)
+def test_written_logs_read_back_as_written(tmp_path, generation):
+    """pyulog, which knows nothing of the writer, must see every number that went in."""
+    log = make_log(generation, 2.0)
+    ulog = ULog(str(log.write(tmp_path / "made.ulg")))
+    assert not ulog.file_corruption
+    assert {data.name for data in ulog.data_list} == log.names()
+    assert ulog.get_version_info_str() == f"{generation}.0"
+    assert ulog.initial_parameters == log.parameters
+    for topic in log.topics:
+        read = ulog.get_dataset(topic.name).data
+        for name, values in topic.fields.items():
+            columns = values.T if values.ndim == 2 else [values]
+            keys = [f"{name}[{i}]" for i in range(len(columns))] if values.ndim == 2 else [name]
+            for key, column in zip(keys, columns, strict=True):
+                np.testing.assert_array_equal(read[key], column, err_msg=f"{topic.name}.{key}")
+
+
+def test_loaded_and_written_again_a_log_is_the_same(tmp_path, sample_log):
+    before = ULog(str(sample_log))
+    after = ULog(str(load(sample_log).write(tmp_path / "again.ulg")))
+    assert len(after.data_list) == len(before.data_list)
+    for old, new in zip(before.data_list, after.data_list, strict=True):
+        assert (old.name, old.multi_id) == (new.name, new.multi_id)
+        for name in ("timestamp", *list(old.data)[-3:]):
+            np.testing.assert_array_equal(new.data[name], old.data[name])
+
+
+def test_time_zero_is_the_first_imu_sample(tmp_path):
+    path = make_log("v1.16", 10.0).write(tmp_path / "made.ulg")
+    topics = read_topics(path)
+    assert topics.log.boot_time_s == pytest.approx(5.0)
+    assert topics.log.duration_s == pytest.approx(9.99)
+    assert topics.log.size_bytes == path.stat().st_size
+    assert topics.log.firmware == "PX4 v1.16.0"
+    assert topics.log.firmware_hash == "0123456789abcdef"
+    assert topics.log.parameters == {
+        "EKF2_EN": 1.0, "EKF2_EVP_GATE": 5.0, "EKF2_EV_DELAY": 0.0, "SDLOG_PROFILE": 129.0,
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("kind", "text"),
+    [(255, "PX4 v1.16.2"), (192, "PX4 v1.16.2-rc"), (128, "PX4 v1.16.2-beta"),
+     (64, "PX4 v1.16.2-alpha"), (0, "PX4 v1.16.2-dev")],
+)  # fmt: skip
+def test_firmware_kinds(tmp_path, kind, text):
+    log = make_log("v1.16", 2.0)
+    log.info["ver_sw_release"] = 1 << 24 | 16 << 16 | 2 << 8 | kind
+    assert read_topics(log.write(tmp_path / "made.ulg")).log.firmware == text
+
+
+def test_a_log_that_does_not_say_its_firmware(tmp_path):
+    log = make_log("v1.16", 2.0)
+    log.info.clear()
+    info = read_topics(log.write(tmp_path / "made.ulg")).log
+    assert (info.firmware, info.firmware_hash, info.hardware) == ("unknown",) * 3
+
+
+def test_dropouts_carry_their_length_and_place(tmp_path):
+    log = make_log("v1.16", 2.0)
+    log.dropouts_ms = (250,)
+    last = max(int(topic.fields["timestamp"].max()) for topic in log.topics)
+    (dropout,) = read_topics(log.write(tmp_path / "made.ulg")).log.dropouts
+    assert dropout.duration_s == pytest.approx(0.25)
+    assert dropout.start_s == pytest.approx((last - 5_000_000) * 1e-6)
+
+
+def test_a_topic_subscribed_to_twice_is_one_topic(tmp_path):
+    """A logger that restarts subscribes again; both halves belong to the same topic."""
+    log = make_log("v1.9", 4.0)
+    whole = next(t for t in log.topics if t.name == "vehicle_local_position")
+    count = len(whole.fields["timestamp"])
+    halves = [
+        type(whole)(whole.name, {name: values[rows] for name, values in whole.fields.items()})
+        for rows in (slice(count // 2, None), slice(0, count // 2))
+    ]
+    log.drop("vehicle_local_position").add(*halves)
+    topics = read_topics(log.write(tmp_path / "made.ulg"))
+    read = topics.tables["vehicle_local_position", 0]
+    np.testing.assert_array_equal(read["timestamp"], whole.fields["timestamp"])
+    expected = position(seconds_of(whole.fields["timestamp"]))[:, 0]
+    np.testing.assert_allclose(read["x"], expected, rtol=1e-6)
+
+
+def test_logs_without_any_known_topic_are_refused(tmp_path):
+    log = make_log("v1.16", 2.0)
+    for name in sorted(log.names()):
+        log.rename(name, f"other_{name}")
+    with pytest.raises(LogError, match="without any of the topics"):
+        read_topics(log.write(tmp_path / "made.ulg"))
+
+
+def test_a_missing_file_is_named_without_its_folder(tmp_path):
+    with pytest.raises(LogError, match=r"^missing\.ulg: cannot be read"):
+        read_topics(Path(tmp_path / "missing.ulg"))

@@ -1,0 +1,387 @@
+"""Write small ULog files with chosen topics, in the layouts of several PX4 generations.
+
+The made flight moves on a straight line, level and at constant speed, so everything in it has a
+closed form: :func:`position` is EKF2's state and :func:`ev_error` what external vision adds to it.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pyulog import ULog
+
+MAGIC = b"ULog\x01\x12\x35"
+START_US = 5_000_000
+PUBLICATION_LAG_US = 60_000
+GRAVITY = 9.80665
+GENERATIONS = ("v1.9", "v1.11", "v1.12", "v1.14", "v1.15", "v1.16")
+# states and covariances in each generation's array of EKF2 states
+LENGTHS = {"v1.15": (24, 23), "v1.16": (25, 24)}
+INNOVATION_VARIANCE = np.array([0.05, 0.06, 0.07])
+EV_VARIANCE = np.array([0.01, 0.02, 0.03])
+VELOCITY = np.array([0.5, -0.25, 0.0])
+AXES = ("north", "east", "down")
+_TYPES = {
+    "<u8": "uint64_t", "<u4": "uint32_t", "<u2": "uint16_t", "|u1": "uint8_t",
+    "<i8": "int64_t", "<i4": "int32_t", "<i2": "int16_t", "|i1": "int8_t",
+    "<f8": "double", "<f4": "float", "|b1": "bool",
+}  # fmt: skip
+
+Array = NDArray[np.float64]
+
+
+@dataclass
+class Topic:
+    """One topic instance: arrays of shape (n,) or (n, k) by PX4 field name."""
+
+    name: str
+    fields: dict[str, NDArray]
+    instance: int = 0
+
+    def rows(self) -> tuple[str, list[bytes]]:
+        """ULog format text and one packed record per sample."""
+        dtype = np.dtype(
+            [(name, values.dtype, values.shape[1:]) for name, values in self.fields.items()]
+        )
+        records = np.zeros(len(self.fields["timestamp"]), dtype)
+        parts = []
+        for name, values in self.fields.items():
+            records[name] = values
+            size = f"[{values.shape[1]}]" if values.ndim == 2 else ""
+            parts.append(f"{_TYPES[values.dtype.str]}{size} {name};")
+        content, width = records.tobytes(), dtype.itemsize
+        text = f"{self.name}:{''.join(parts)}"
+        return text, [content[at : at + width] for at in range(0, len(content), width)]
+
+
+@dataclass
+class Log:
+    """What goes into a ULog file."""
+
+    topics: list[Topic]
+    parameters: dict[str, int | float] = field(default_factory=dict)
+    info: dict[str, int | str] = field(default_factory=dict)
+    dropouts_ms: tuple[int, ...] = ()
+
+    def __getitem__(self, name: str) -> dict[str, NDArray]:
+        """Fields of the first topic of that name."""
+        return next(topic.fields for topic in self.topics if topic.name == name)
+
+    def names(self) -> set[str]:
+        return {topic.name for topic in self.topics}
+
+    def drop(self, *names: str) -> Log:
+        """Take topics out; the names must exist."""
+        assert set(names) <= self.names()
+        self.topics = [topic for topic in self.topics if topic.name not in names]
+        return self
+
+    def add(self, *topics: Topic) -> Log:
+        self.topics.extend(topics)
+        return self
+
+    def rename(self, old: str, new: str) -> Log:
+        self.topics = [replace(t, name=new) if t.name == old else t for t in self.topics]
+        return self
+
+    def write(self, path: Path) -> Path:
+        path.write_bytes(self.encode())
+        return path
+
+    def encode(self) -> bytes:
+        """The file: header, flag bits, formats, info, parameters, subscriptions, data.
+
+        Topics advance together, so that a cut file ends early in each of them. A topic that
+        stands twice in the list is subscribed to twice.
+        """
+        out = [MAGIC, struct.pack("<BQ", 1, START_US), _message("B", bytes(40))]
+        formats: dict[str, str] = {}
+        data = []
+        for number, topic in enumerate(self.topics):
+            text, rows = topic.rows()
+            assert formats.setdefault(topic.name, text) == text, "one layout per topic name"
+            prefix = struct.pack("<H", number)
+            data += [((at + 0.5) / len(rows), prefix + row) for at, row in enumerate(rows)]
+        out += [_message("F", text.encode()) for text in formats.values()]
+        for name, value in self.info.items():
+            text = value.encode() if isinstance(value, str) else struct.pack("<I", value)
+            kind = f"char[{len(text)}]" if isinstance(value, str) else "uint32_t"
+            out.append(_keyed("I", f"{kind} {name}", text))
+        for name, value in self.parameters.items():
+            kind, code = ("int32_t", "<i") if isinstance(value, int) else ("float", "<f")
+            out.append(_keyed("P", f"{kind} {name}", struct.pack(code, value)))
+        for number, topic in enumerate(self.topics):
+            head = struct.pack("<BH", topic.instance, number)
+            out.append(_message("A", head + topic.name.encode()))
+        out += [_message("D", row) for _, row in sorted(data, key=lambda item: item[0])]
+        out += [_message("O", struct.pack("<H", length)) for length in self.dropouts_ms]
+        return b"".join(out)
+
+
+def _message(kind: str, content: bytes) -> bytes:
+    return struct.pack("<HB", len(content), ord(kind)) + content
+
+
+def _keyed(kind: str, key: str, value: bytes) -> bytes:
+    return _message(kind, bytes([len(key)]) + key.encode() + value)
+
+
+def load(path: Path) -> Log:
+    """A ULog file as topics that can be edited (nested and padding fields are left out)."""
+    ulog = ULog(str(path))
+    topics = []
+    for data in ulog.data_list:
+        fields: dict[str, list[NDArray] | NDArray] = {}
+        for name, values in data.data.items():
+            match = re.fullmatch(r"(\w+)\[(\d+)\]", name)
+            if match:
+                fields.setdefault(match[1], []).append(values)
+            elif re.fullmatch(r"\w+", name):
+                fields[name] = values
+        arrays = {
+            name: np.stack(values, axis=1) if isinstance(values, list) else values
+            for name, values in fields.items()
+        }
+        topics.append(Topic(data.name, arrays, data.multi_id))
+    parameters = dict(ulog.initial_parameters)
+    info = {
+        name: value
+        for name, value in ulog.msg_info_dict.items()
+        if name in ("sys_name", "ver_hw", "ver_sw", "ver_sw_release")
+    }
+    return Log(topics, parameters, info)
+
+
+def position(time_s: ArrayLike) -> Array:
+    """EKF2's position (north, east, down) in the made flight; ``time_s`` from the first data."""
+    return np.array([1.0, 2.0, -1.5]) + np.outer(time_s, VELOCITY)
+
+
+def ev_error(time_s: ArrayLike) -> Array:
+    """What external vision measures beyond EKF2's position: the innovation, by its definition."""
+    t = np.asarray(time_s, dtype=np.float64)
+    return np.stack([0.1 * np.sin(1.3 * t), 0.08 * np.cos(0.7 * t), 0.05 * np.sin(2 * t)], axis=1)
+
+
+def stamps(seconds: float, rate_hz: float, first_s: float = 0.0) -> NDArray[np.uint64]:
+    """Boot times in µs, at a fixed rate."""
+    count = round((seconds - first_s) * rate_hz)
+    return (START_US + np.round((first_s + np.arange(count) / rate_hz) * 1e6)).astype(np.uint64)
+
+
+def seconds_of(stamps_us: NDArray[np.uint64]) -> Array:
+    return (stamps_us.astype(np.float64) - START_US) * 1e-6
+
+
+def topic(
+    name: str,
+    measured_us: NDArray[np.uint64],
+    fields: Mapping[str, ArrayLike],
+    *,
+    sampled: bool = False,
+    instance: int = 0,
+) -> Topic:
+    """A topic of float32 fields, unless an array says otherwise.
+
+    ``sampled`` topics carry the time of measurement in ``timestamp_sample`` and are published
+    :data:`PUBLICATION_LAG_US` later.
+    """
+    lag = np.uint64(PUBLICATION_LAG_US if sampled else 0)
+    arrays: dict[str, NDArray] = {"timestamp": measured_us + lag}
+    if sampled:
+        arrays["timestamp_sample"] = measured_us.copy()
+    for key, values in fields.items():  # copies: a test may change one topic alone
+        array = np.array(values)
+        arrays[key] = array.astype(np.float32) if array.dtype == np.float64 else array
+    return Topic(name, arrays, instance)
+
+
+def make_log(generation: str = "v1.16", seconds: float = 10.0, imu_hz: float = 100.0) -> Log:
+    """The made flight as PX4 of that generation logs it, with external vision fused at 5 Hz."""
+    assert generation in GENERATIONS
+    number = int(generation.removeprefix("v1."))
+    imu = stamps(seconds, imu_hz)
+    attitude = stamps(seconds, 20.0)
+    log = Log(
+        [
+            topic("sensor_combined", imu, {
+                "gyro_rad": np.zeros((len(imu), 3)),
+                "accelerometer_timestamp_relative": np.zeros(len(imu), np.int32),
+                "accelerometer_m_s2": np.tile([0.0, 0.0, -GRAVITY], (len(imu), 1)),
+            }),
+            topic("vehicle_attitude", attitude, {
+                "q": np.tile([1.0, 0.0, 0.0, 0.0], (len(attitude), 1)),
+            }),
+            local_position(seconds, sampled=number >= 12),
+            topic("vehicle_land_detected", stamps(seconds, 1.0), {
+                "landed": np.isin(
+                    np.arange(round(seconds)), (0, round(seconds) - 1)
+                ).astype(np.uint8),
+            }),
+            odometry("vehicle_visual_odometry", seconds, number),
+            *states(seconds, generation),
+            *innovations(seconds, number),
+        ],
+        {"EKF2_EN": 1, "EKF2_EVP_GATE": 5.0, "EKF2_EV_DELAY": 0.0, "SDLOG_PROFILE": 129},
+        {
+            "sys_name": "PX4",
+            "ver_hw": "TEST",
+            "ver_sw": "0123456789abcdef",
+            "ver_sw_release": 1 << 24 | number << 16 | 255,
+        },
+    )  # fmt: skip
+    if number == 12:
+        log.add(odometry("estimator_visual_odometry_aligned", seconds, number))
+    return log
+
+
+def local_position(seconds: float, *, sampled: bool) -> Topic:
+    measured = stamps(seconds, 10.0)
+    here = position(seconds_of(measured))
+    count = len(measured)
+    fields: dict[str, ArrayLike] = dict(zip("xyz", here.T, strict=True))
+    fields |= {
+        name: np.full(count, v) for name, v in zip(("vx", "vy", "vz"), VELOCITY, strict=True)
+    }
+    for counter in ("xy_reset_counter", "z_reset_counter", "vxy_reset_counter", "vz_reset_counter"):
+        fields[counter] = np.zeros(count, np.uint8)
+    fields |= {"delta_xy": np.zeros((count, 2)), "delta_vxy": np.zeros((count, 2))}
+    fields |= {"delta_z": np.zeros(count), "delta_vz": np.zeros(count)}
+    return topic("vehicle_local_position", measured, fields, sampled=sampled)
+
+
+def ev_stamps(seconds: float) -> NDArray[np.uint64]:
+    """Times of external vision: 5 Hz from 0.1 s."""
+    return stamps(seconds, 5.0, 0.1)
+
+
+def odometry(name: str, seconds: float, number: int) -> Topic:
+    """External vision as v1.9 (x, y, z and a covariance triangle) or v1.14 (arrays) logs it."""
+    measured = ev_stamps(seconds)
+    time = seconds_of(measured)
+    measurement = position(time) + ev_error(time)
+    if number >= 14:
+        fields = {
+            "position": measurement,
+            "position_variance": np.tile(EV_VARIANCE, (len(time), 1)),
+            "pose_frame": np.ones(len(time), np.uint8),
+        }
+    else:
+        covariance = np.full((len(time), 21), 99.0)  # what is not on the diagonal must not be read
+        covariance[:, [0, 6, 11]] = EV_VARIANCE
+        fields = dict(zip("xyz", measurement.T, strict=True)) | {"pose_covariance": covariance}
+        if number >= 11:
+            fields["local_frame"] = np.zeros(len(time), np.uint8)
+    return topic(name, measured, fields, sampled=number >= 11)
+
+
+def covariances(count: int) -> Array:
+    """Distinguishable variances: element i is (i + 1) / 100."""
+    return 0.01 * (1 + np.arange(count))
+
+
+def states(seconds: float, generation: str, instance: int = 0, scale: float = 1.0) -> list[Topic]:
+    """EKF2's state vector and its fusion flags."""
+    number = int(generation.removeprefix("v1."))
+    measured = stamps(seconds, 2.0)
+    count = len(measured)
+    state_count, covariance_count = LENGTHS.get(generation, (24, 24))
+    fields: dict[str, ArrayLike] = {
+        "states": np.zeros((count, state_count)),
+        "covariances": np.tile(covariances(covariance_count) * scale, (count, 1)),
+    }
+    if number < 12:
+        fields["control_mode_flags"] = np.full(count, 1 << 12 | 1 << 14, np.uint32)
+        return [topic("estimator_status", measured, fields, instance=instance)]
+    one, zero = np.ones(count, np.bool_), np.zeros(count, np.bool_)
+    flags = {"cs_ev_pos": one, "cs_ev_yaw": zero, "cs_ev_hgt": one}
+    return [
+        topic("estimator_states", measured, fields, sampled=True, instance=instance),
+        topic("estimator_status_flags", measured, flags, sampled=True, instance=instance),
+    ]
+
+
+def innovations(seconds: float, number: int, instance: int = 0, scale: float = 1.0) -> list[Topic]:
+    """EKF2's innovations of external vision, with PX4's sign: state minus measurement."""
+    measured = ev_stamps(seconds)
+    time = seconds_of(measured)
+    logged = -ev_error(time) * scale
+    variance = np.tile(INNOVATION_VARIANCE, (len(time), 1))
+    ratio = logged**2 / (25.0 * variance)
+    if number >= 14:
+        return _aid_sources(measured, logged, variance, ratio, number, instance)
+    if number <= 10:
+        empty = np.zeros((len(time), 3))
+        fields = {
+            "vel_pos_innov": np.hstack([empty, logged]),
+            "vel_pos_innov_var": np.hstack([empty, variance]),
+        }
+        return [topic("ekf2_innovations", measured, fields, instance=instance)]
+    # logged twice as often as fused: each value stands twice
+    twice = np.repeat(np.arange(len(time)), 2)
+    measured = np.repeat(measured, 2) + np.tile(np.array([0, 100_000], np.uint64), len(time))
+    largest = np.stack([ratio[:, :2].max(axis=1), np.zeros(len(time)), ratio[:, 2]], axis=1)
+    return [
+        topic(
+            name,
+            measured + np.uint64(late_us),
+            {"ev_hpos": values[twice, :2], "ev_vpos": values[twice, 2]},
+            sampled=number >= 12,
+            instance=instance,
+        )
+        for name, values, late_us in (
+            ("estimator_innovations", logged, 0),
+            ("estimator_innovation_variances", variance, 2_000),
+            ("estimator_innovation_test_ratios", largest, 4_000),
+        )
+    ]
+
+
+def _aid_sources(
+    measured: NDArray[np.uint64],
+    logged: Array,
+    variance: Array,
+    ratio: Array,
+    number: int,
+    instance: int,
+) -> list[Topic]:
+    time = seconds_of(measured)
+    observation = position(time) + ev_error(time)
+    wide = np.dtype(np.float64) if number >= 16 else np.dtype(np.float32)
+    topics = []
+    for name, axes in (
+        ("estimator_aid_src_ev_pos", slice(0, 2)),
+        ("estimator_aid_src_ev_hgt", 2),
+    ):
+        made = topic(name, measured, {
+            "observation_variance": np.tile(EV_VARIANCE, (len(time), 1))[:, axes],
+            "innovation": logged[:, axes],
+            "innovation_variance": variance[:, axes],
+            "test_ratio": ratio[:, axes],
+            "innovation_rejected": np.zeros(len(time), np.bool_),
+            "fused": np.ones(len(time), np.bool_),
+        }, sampled=True, instance=instance)  # fmt: skip
+        made.fields["observation"] = observation[:, axes].astype(wide)
+        if number == 14:
+            made.fields["fusion_enabled"] = np.ones(len(time), np.bool_)
+        topics.append(made)
+    return topics
+
+
+def selector(switches: Sequence[tuple[float, int]]) -> Topic:
+    """estimator_selector_status: the primary instance from each time (s) on."""
+    at = np.array([START_US + round(time * 1e6) for time, _ in switches], np.uint64)
+    numbers = np.array([number for _, number in switches], np.uint8)
+    return topic("estimator_selector_status", at, {"primary_instance": numbers})
+
+
+def take(topic: Topic, rows: Iterable[int]) -> Topic:
+    """The same topic with only these rows, in this order."""
+    rows = np.asarray(list(rows), dtype=np.intp)
+    return replace(topic, fields={name: values[rows] for name, values in topic.fields.items()})
