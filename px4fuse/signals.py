@@ -297,11 +297,18 @@ def make_axes(
     Raises
     ------
     MissingDataError
-        An axis was asked for that the source has no finite samples for.
+        An axis was asked for that the source has no finite samples for, or none has any.
+    SettingsError
+        An axis has an unknown name.
     """
     samples = within(track.samples, segment)
     acceleration = ned_acceleration(flight)
     asked = names if names is not None else (*AXIS_NAMES, AISLE)
+    if unknown := [name for name in asked if name not in (*AXIS_NAMES, AISLE)]:
+        raise SettingsError(
+            f"axis {unknown[0]}: there is no such axis. Choose from "
+            f"{', '.join((*AXIS_NAMES, AISLE))}."
+        )
     axes = []
     for name in asked:
         direction, heading, note = _direction(name, track, segment, heading_deg)

@@ -421,7 +421,7 @@ def rich_log() -> Log:
 @pytest.mark.parametrize("name", sorted(rich_log().names()))
 def test_each_field_left_out_in_turn(tmp_path, name):
     """PX4 adds and removes fields between releases, and a damaged format loses one."""
-    for field in rich_log()[name]:
+    for field in rich_log()[name].keys() - {"timestamp"}:
         log = rich_log()
         del log[name][field]
         assert analysed(log.write(tmp_path / "made.ulg")) is not None, field

@@ -79,7 +79,8 @@ def test_command_line_in_the_report_names_no_folder_and_no_person(made):
 
 def test_same_input_gives_the_same_bytes(tmp_path, sample_log):
     for name in ("a", "b"):
-        assert run("compare", sample_log, "--axis", "north", "-o", tmp_path / f"{name}.pdf").exit_code == 0
+        out = tmp_path / f"{name}.pdf"
+        assert run("compare", sample_log, "--axis", "north", "-o", out).exit_code == 0
     for suffix in ("pdf", "json"):
         first, second = ((tmp_path / f"{name}.{suffix}").read_bytes() for name in ("a", "b"))
         assert first == second
@@ -92,9 +93,9 @@ def test_json_to_standard_output_is_alone_there(tmp_path, sample_log):
 
 
 def test_fail_on_sets_exit_code_1(tmp_path, sample_log):
-    out = tmp_path / "r.pdf"
-    assert run("compare", sample_log, "--axis", "north", "-o", out, "--fail-on", "info").exit_code == 1
-    assert run("compare", sample_log, "--axis", "north", "-o", out, "--fail-on", "error").exit_code == 0
+    command = ["compare", sample_log, "--axis", "north", "-o", tmp_path / "r.pdf", "--fail-on"]
+    assert run(*command, "info").exit_code == 1
+    assert run(*command, "error").exit_code == 0
 
 
 @pytest.mark.parametrize(

@@ -103,21 +103,25 @@ def _noise_remedy(
             f"The source's noise is {bound}{noise:.2g} m: set EKF2_EVP_NOISE to "
             f"{max(noise, EKF2_NOISE_FLOOR.value):.2g}{was}."
         )
-    if not 1 / NOISE_FITS.value < noise / used < NOISE_FITS.value:
+    fits = 1 / NOISE_FITS.value < noise / used < NOISE_FITS.value
+    understated = statement.variance_factor < 1.0
+    # more noise mends a variance that is understated, less one that is overstated; the other way
+    # round the cause is not the measurement noise
+    if not fits and not (noise < used if understated else noise > used):
         return remedy
-    if statement.variance_factor < 1.0 and statement.outside_gate > OUTLIER_SHARE.value:
+    if understated and statement.outside_gate > OUTLIER_SHARE.value:
         return (
             f"{statement.outside_gate:.1%} lie outside the gate while the bulk fits {noise:.2g} m: "
             "remove the outliers (line of sight, anchor survey) instead of raising the noise."
         )
     if owner == "kf":
         return (
-            f"SIGMA_Z fits the source ({noise:.2g} m): look at SIGMA_A (--sigma-a) and the clock "
-            "(--clock-offset)."
+            f"It is not SIGMA_Z (the source's noise is {noise:.2g} m): look at SIGMA_A (--sigma-a) "
+            "and the clock (--clock-offset)."
         )
     return (
-        f"EKF2_EVP_NOISE fits the source ({noise:.2g} m): look at the clock (EKF2_EV_DELAY) and at "
-        "EKF2's process noise (EKF2_ACC_NOISE)."
+        f"It is not EKF2_EVP_NOISE (the source's noise is {noise:.2g} m): look at the clock "
+        "(EKF2_EV_DELAY) and at EKF2's process noise (EKF2_ACC_NOISE)."
     )
 
 
