@@ -153,7 +153,7 @@ def project_innovations(
     """EKF2's innovations along the axis, with its variances just before and after each update.
 
     Columns as :attr:`Ekf2.innovations` plus ``prior_variance_m2`` (P⁻ = S - R) and
-    ``posterior_variance_m2`` (P⁺ = P⁻R/S), NaN where R is unknown.
+    ``posterior_variance_m2`` (P⁺ = P⁻R/S, or P⁻ where rejected), NaN where R is unknown.
     """
     if track.rung not in EXTERNAL_VISION_RUNGS:
         return Unavailable(
@@ -182,7 +182,8 @@ def project_innovations(
     prior = (s_total - r).where(s_total > r)
     cut["observation_variance_m2"] = r
     cut["prior_variance_m2"] = prior
-    cut["posterior_variance_m2"] = prior * r / s_total
+    # a rejected sample updates nothing
+    cut["posterior_variance_m2"] = (prior * r / s_total).where(~(cut["rejected"] > 0), prior)
     return cut
 
 

@@ -29,5 +29,5 @@ def sample_flight(sample_log: Path) -> Flight:
 def shared_logs() -> Path:
     """The folder of further flight logs, which are not part of the project."""
     if not SHARED_LOGS.is_dir():
-        pytest.skip(f"no flight logs beside the repository ({SHARED_LOGS.name}/ is absent)")
+        pytest.skip("the further flight logs (../shared/logs) are not beside the repository")
     return SHARED_LOGS

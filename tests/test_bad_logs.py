@@ -45,7 +45,7 @@ damaged = settings(
     derandomize=True,
     database=None,
     phases=[Phase.explicit, Phase.generate],
-    max_examples=150,
+    max_examples=80,
 )
 
 

@@ -406,6 +406,27 @@ def test_process_noise_is_not_called_forgotten_where_it_is_the_lessons() -> None
     assert "kf_variance_overstated" in ids(findings)
 
 
+def test_a_small_process_noise_that_still_lets_the_variance_grow_is_not_called_forgotten() -> None:
+    comparison = compare(aisle_flight(), Settings(sigma_a_m_s2=0.02))
+    assert comparison.axes[0].replay.updates["gain_position"].iloc[-1] > 0.05
+    assert "process_noise_forgotten" not in ids(found(comparison))
+
+
+def test_a_variance_is_named_on_the_axis_where_it_is_worst() -> None:
+    flight = aisle_flight(ekf2=Estimator(nis=0.2))
+    innovations = flight.ekf2.innovations
+    worst = innovations["north"].assign(innovation_m=innovations["north"]["innovation_m"] / 5.0)
+    ekf2 = replace(flight.ekf2, innovations={**innovations, "north": worst})
+    named = found(compare(replace(flight, ekf2=ekf2)))
+    assert [each.evidence["axis"] for each in named] == ["north", "down"]
+
+
+def test_innovations_are_not_called_decimated_where_the_source_is_made_of_them() -> None:
+    uwb = Uwb(name="estimator_aid_src_ev_pos", rung=5)
+    flight = aisle_flight(uwb=uwb, ekf2=Estimator(every=3))
+    assert "ekf2_innovations_decimated" not in ids(found(compare(flight)))
+
+
 class TestSampleLog:
     def test_default_settings_have_no_error_and_no_warning(self, sample_flight: Flight) -> None:
         assert {each.severity for each in found(compare(sample_flight))} <= {"info"}

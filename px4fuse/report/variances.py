@@ -150,6 +150,8 @@ def _zoom_words(result: AxisComparison) -> str:
     words = [_before_after("ours", result.kf)]
     if isinstance(result.ekf2, Unavailable):
         words.append(result.ekf2.reason)
+    elif isinstance(result.ekf2_innovations, Unavailable):
+        words.append(result.ekf2_innovations.reason)
     elif result.ekf2.sigma_p_before_update_m is None:
         words.append("EKF2: S or R not logged, so no before and after")
     else:
