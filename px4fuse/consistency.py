@@ -126,19 +126,19 @@ def assess(
     finite = np.isfinite(innovation_m) & (innovation_variance_m2 > 0)
     nu, s = innovation_m[finite], innovation_variance_m2[finite]
     count = len(nu)
-    if count < MIN_INNOVATIONS or not np.any(nu):
+    if count < MIN_INNOVATIONS or np.ptp(nu) == 0.0:
         return Unavailable(
             "consistency",
             f"{count} innovations are too few for a statement (at least {MIN_INNOVATIONS})"
             if count < MIN_INNOVATIONS
-            else "every innovation is exactly zero",
+            else "every innovation is the same",
             "Analyse a longer segment, or log the source at a higher rate.",
         )
     normalised = nu / np.sqrt(s)
     nis_mean = float(np.mean(normalised**2))
     band = nis_band(count)
     std = float(np.std(nu, ddof=1))
-    bias_t = float(np.sqrt(count) * np.mean(nu) / std) if std > 0 else float("inf")
+    bias_t = float(np.sqrt(count) * np.mean(nu) / std)
     lags = min(LJUNG_BOX_LAGS, count // 5)
     r = autocorrelation(normalised, lags)
     q = count * (count + 2) * float(np.sum(r**2 / (count - np.arange(1, lags + 1))))

@@ -24,6 +24,7 @@ from px4fuse.flight import Unavailable
 from px4fuse.signals import Array, Axis, step_means
 
 InputName = Literal["imu", "zero"]
+INPUT_NAMES: tuple[InputName, InputName] = ("imu", "zero")
 
 # The lesson's initial standard deviations: position 0.5 m, velocity 1.0 m/s.
 INITIAL_SIGMA_P_M = 0.5
@@ -78,6 +79,8 @@ class Settings:
                 raise SettingsError(
                     f"{name} {value:g} is out of range: give {low:g} to {high:g} {unit}."
                 )
+        if self.input not in INPUT_NAMES:
+            raise SettingsError(f"--input {self.input}: give {' or '.join(INPUT_NAMES)}.")
 
 
 @dataclass(frozen=True)
@@ -97,10 +100,11 @@ class Replay:
     ----------
     axis : Axis
     settings : Settings
-    steps : DataFrame, shape (n, 6)
+    steps : DataFrame, shape (n, 7)
         After each predict, and its update where there was one: ``position_m, velocity_m_s,
-        position_variance_m2, covariance_m2_s, velocity_variance_m2_s2`` and
-        ``acceleration_m_s2``, the input of the step that *starts* there (0 at the last).
+        position_variance_m2, covariance_m2_s, velocity_variance_m2_s2``, and of the step that
+        *starts* there (0 at the last) its input ``acceleration_m_s2`` and
+        ``input_variance_m2_s4``, added to SIGMA_A² where the IMU has a gap.
     updates : DataFrame, shape (m, 8)
         At each measurement after the first: ``measurement_m, innovation_m`` (z - Hx, prior),
         ``innovation_variance_m2`` (HPHᵀ + R), ``gain_position`` (1), ``gain_velocity`` (1/s), and
@@ -151,11 +155,14 @@ def timeline(axis: Axis, settings: Settings, initial: InitialState | None = None
     Raises
     ------
     SettingsError
-        ``settings.input`` is "imu" and the axis has no acceleration.
+        ``settings.input`` is "imu" and the axis has no acceleration, or no measurement follows
+        the start.
     """
     first = axis.measurement_time_s[0] if initial is None else initial.time_s
     usable = axis.measurement_time_s > first + SAME_TIME_S
     measured = axis.measurement_time_s[usable]
+    if not len(measured):
+        raise SettingsError(f"axis {axis.name}: no measurement after the start at {first:.2f} s.")
     count = int(np.floor((measured[-1] - first) / settings.dt_s + 1e-9)) + 1
     grid = first + settings.dt_s * np.arange(count)
     # a grid time that coincides with a measurement gives way to the measurement's own stamp
@@ -250,6 +257,7 @@ def replay(axis: Axis, settings: Settings, initial: InitialState | None = None) 
         ],
     )
     steps["acceleration_m_s2"] = np.append(line.acceleration_m_s2, 0.0)
+    steps["input_variance_m2_s4"] = np.append(line.input_variance_m2_s4, 0.0)
     return Replay(
         axis,
         settings,
@@ -308,7 +316,8 @@ def variance_at(run: Replay, times: Array) -> tuple[Array, Array]:
         run.steps[column].to_numpy()[at]
         for column in ("position_variance_m2", "covariance_m2_s", "velocity_variance_m2_s2")
     )
-    q = run.settings.sigma_a_m_s2**2 * run.settings.dt_s
+    extra = run.steps["input_variance_m2_s4"].to_numpy()[at]
+    q = (run.settings.sigma_a_m_s2**2 + extra) * run.settings.dt_s
     return (
         np.where(outside, np.nan, p00 + 2 * ahead * p01 + ahead**2 * p11 + q * ahead**3 / 4.0),
         np.where(outside, np.nan, p11 + q * ahead),

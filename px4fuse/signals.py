@@ -266,7 +266,7 @@ def aisle_heading(track: PositionTrack, segment: Segment) -> tuple[float, float]
     elongation : float
         Ratio of the standard deviations along and across it (1: no direction is distinct).
     """
-    horizontal = within(track.samples, segment)[POSITION_COLUMNS[:2]].to_numpy()
+    horizontal = within(track.samples, segment)[POSITION_COLUMNS[:2]].dropna().to_numpy()
     centred = horizontal - horizontal.mean(axis=0)
     _, singular, directions = np.linalg.svd(centred, full_matrices=False)
     heading = float(np.degrees(np.arctan2(directions[0, 1], directions[0, 0]))) % 180.0
@@ -299,11 +299,15 @@ def make_axes(
     MissingDataError
         An axis was asked for that the source has no finite samples for, or none has any.
     SettingsError
-        An axis has an unknown name.
+        An axis has an unknown name, or the heading is not finite.
     """
     samples = within(track.samples, segment)
     acceleration = ned_acceleration(flight)
-    asked = names if names is not None else (*AXIS_NAMES, AISLE)
+    asked = tuple(dict.fromkeys((*AXIS_NAMES, AISLE) if names is None else names))
+    if not asked:
+        raise SettingsError("no axis was asked for.")
+    if heading_deg is not None and not np.isfinite(heading_deg):
+        raise SettingsError(f"--heading {heading_deg:g} is not a finite number.")
     if unknown := [name for name in asked if name not in (*AXIS_NAMES, AISLE)]:
         raise SettingsError(
             f"axis {unknown[0]}: there is no such axis. Choose from "

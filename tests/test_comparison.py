@@ -15,7 +15,7 @@ from px4fuse.comparison import AxisComparison, Comparison, Difference, FilterSum
 from px4fuse.consistency import Consistency
 from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.flight import Ekf2, Flight, Reset, Truth, Unavailable
-from px4fuse.kalman import Settings
+from px4fuse.kalman import Settings, variance_at
 from px4fuse.readers import read_log
 
 Array = NDArray[np.float64]
@@ -59,7 +59,10 @@ def predicted(result: AxisComparison, times: Array) -> Array:
     Each is predicted from the last step before it: x = Fx + Ba, P = FPFᵀ + Q.
     """
     run, chosen = result.replay, result.replay.settings
-    edges, rows = run.steps.index.to_numpy(), run.steps.to_numpy()
+    edges, rows = (
+        run.steps.index.to_numpy(),
+        run.steps.drop(columns="input_variance_m2_s4").to_numpy(),
+    )
     q = chosen.sigma_a_m_s2**2 * chosen.dt_s
     out = []
     for time in times:
@@ -470,3 +473,14 @@ class TestRobustness:
     def test_a_flight_without_a_source_is_refused(self, made: Comparison) -> None:
         with pytest.raises(MissingDataError, match="no external position"):
             compare(replace(made.flight, positions=(), missing=(unavailable("UWB"),)))
+
+
+def test_variance_in_an_imu_gap_is_that_of_the_next_step() -> None:
+    """What the replay adds to Q in a gap is in the variance between two steps as well."""
+    result = compare(aisle_flight(imu=Imu(gap_s=(40.0, 42.0))), axes=("north",)).axes[0]
+    steps, updates = result.replay.steps, result.replay.updates
+    inside = steps.index[(steps.index > 40.5) & (steps.index < 41.5)]
+    predicted = inside[~inside.isin(updates.index)]
+    assert len(predicted) > 3
+    _, before = variance_at(result.replay, predicted.to_numpy() - 1e-9)
+    np.testing.assert_allclose(before, steps.loc[predicted, "velocity_variance_m2_s2"], rtol=1e-6)

@@ -161,10 +161,11 @@ def test_ten_innovations_make_a_statement() -> None:
     assert assessed(white(1, 10)).ljung_box_lags == 2
 
 
-def test_innovations_that_are_all_zero_say_nothing() -> None:
-    result = assess(np.zeros(50), np.ones(50))
+@pytest.mark.parametrize("value", [0.0, -0.5])
+def test_innovations_that_are_all_the_same_say_nothing(value: float) -> None:
+    result = assess(np.full(50, value), np.ones(50))
     assert isinstance(result, Unavailable)
-    assert result.reason == "every innovation is exactly zero"
+    assert result.reason == "every innovation is the same"
 
 
 def test_horizontal_nis_is_the_mean_of_both_axes_with_the_narrower_band() -> None:

@@ -526,3 +526,12 @@ def test_findings_are_ordered_by_severity() -> None:
     severities = [finding.severity for finding in found(compare(flight))]
     assert severities == sorted(severities, key=SEVERITIES.index)
     assert set(severities) == set(SEVERITIES)
+
+
+@pytest.mark.parametrize("sigma_a", [0.02, 0.05, 0.1])
+def test_process_noise_too_small_is_answered_by_more_of_it(sigma_a: float) -> None:
+    """Q too small looks like R too small to the NIS; the correlation tells them apart."""
+    found = find(compare(aisle_flight(imu=Imu(sigma_a_m_s2=2.0)), Settings(sigma_a_m_s2=sigma_a)))
+    (finding,) = [f for f in found if f.id == "kf_variance_understated" and "horiz" in f.message]
+    assert "raise SIGMA_A" in finding.remedy
+    assert "--sigma-z" not in finding.remedy

@@ -40,6 +40,7 @@ from px4fuse.flight import (
     Unavailable,
 )
 from px4fuse.readers import read_log
+from px4fuse.readers.px4_ekf2 import JOIN_TOLERANCE_S
 from px4fuse.signals import choose_source
 
 HOUR_US = 3_600_000_000
@@ -398,7 +399,7 @@ def test_innovations_without_a_variance_near_in_time_are_left_out(read):
     for name in late:
         late[name] = late[name][kept]
     ekf2 = read(log).ekf2
-    assert times(ekf2.innovations["north"]).max() < 5.1
+    assert times(ekf2.innovations["north"]).max() < 5.0 + JOIN_TOLERANCE_S
     assert any("left out" in note for note in ekf2.notes)
 
 

@@ -161,7 +161,7 @@ def compare(
         input=cast(InputName, input_name or "imu"),
         clock_offset_s=clock_offset,
     )
-    for name, value in (("--heading", heading), ("--start", start), ("--end", end)):
+    for name, value in (("--start", start), ("--end", end)):
         if value is not None and not abs(value) < float("inf"):
             raise SettingsError(f"{name} {value:g} is not a finite number.")
     person = Student(student, student_id, _read_notes(notes))
@@ -174,7 +174,7 @@ def compare(
         compared = comparison.compare(
             flight,
             settings,
-            axes=tuple(dict.fromkeys(axes)) or None,
+            axes=axes or None,
             heading_deg=heading,
             position_source=position_source,
             start_s=start,

@@ -12,13 +12,21 @@ from px4fuse.findings.model import Finding
 from px4fuse.findings.thresholds import (
     EKF2_NOISE_FLOOR,
     GROWTH,
+    LAG1_SLOW,
     LESSON_SIGMA_A,
+    NOISE_ABSURD,
     NOISE_FITS,
     OUTLIER_SHARE,
+    SMALLEST_NOISE,
     VARIANCE_FACTOR,
     VARIANCE_FACTOR_ERROR,
 )
 from px4fuse.flight import Unavailable
+from px4fuse.kalman import Settings
+from px4fuse.likelihood import NoiseAsked
+
+# A step in SIGMA_A that is seen in the plots and does not overshoot
+SIGMA_A_FACTOR = 4.0
 
 
 def variance_wrong(comparison: Comparison) -> Iterator[Finding]:
@@ -78,50 +86,75 @@ def _noise_remedy(
 
     It is a property of the source, so our estimate of it serves EKF2 as well.
     """
-    asked = result.noise_asked
+    asked, settings = result.noise_asked, comparison.settings
+    lag1 = statement.lag1_autocorrelation
+    noise_absurd = asked is None or asked.sigma_z_m > NOISE_ABSURD.value * settings.sigma_z_m
+    if owner == "kf" and noise_absurd and lag1 > LAG1_SLOW.value:
+        return (
+            f"The filter follows too slowly (lag-1 correlation {lag1:+.2f}): raise SIGMA_A first, "
+            f"try --sigma-a {SIGMA_A_FACTOR * settings.sigma_a_m_s2:.2g}."
+        )
     if asked is None:
         return (
             "No SIGMA_Z up to 30 m explains it: look at the acceleration input "
             "(IMU rate, gaps, vibration) and at the clocks."
         )
-    noise = asked.sigma_z_m
     if owner == "kf":
-        used = comparison.settings.sigma_z_m
-        if asked.upper_bound:
-            return (
-                f"The source's noise is at most {noise:.2g} m, below what this rate can "
-                f"show: lower SIGMA_Z (--sigma-z {max(noise, 0.005):.2g}) and SIGMA_A."
-            )
-        remedy = f"The data ask for SIGMA_Z {noise:.2g} m at this SIGMA_A: --sigma-z {noise:.2g}."
-    else:
-        used = _ekf2_noise(result)
-        bound = "at most " if asked.upper_bound else ""
-        if asked.upper_bound:  # EKF2's own innovations bound it too, and less tightly
-            noise = float(np.hypot(statement.innovation_std_m, statement.innovation_mean_m))
-        was = "" if np.isnan(used) else f" (√R was {used:.2g} m)"
-        remedy = (
-            f"The source's noise is {bound}{noise:.2g} m: set EKF2_EVP_NOISE to "
-            f"{max(noise, EKF2_NOISE_FLOOR.value):.2g}{was}."
-        )
-    fits = 1 / NOISE_FITS.value < noise / used < NOISE_FITS.value
-    understated = statement.variance_factor < 1.0
-    # more noise mends a variance that is understated, less one that is overstated; the other way
-    # round the cause is not the measurement noise
-    if not fits and not (noise < used if understated else noise > used):
-        return remedy
-    if understated and statement.outside_gate > OUTLIER_SHARE.value:
+        return _kf_remedy(settings, asked, statement)
+    return _ekf2_remedy(_ekf2_noise(result), asked, statement)
+
+
+def _kf_remedy(settings: Settings, asked: NoiseAsked, statement: Consistency) -> str:
+    noise = max(asked.sigma_z_m, SMALLEST_NOISE.value)
+    if asked.upper_bound:
         return (
-            f"{statement.outside_gate:.1%} lie outside the gate while the bulk fits {noise:.2g} m: "
-            "remove the outliers (line of sight, anchor survey) instead of raising the noise."
+            f"The source's noise is at most {noise:.2g} m, below what this rate can show: lower "
+            f"SIGMA_Z (--sigma-z {max(noise, 0.005):.2g}) and SIGMA_A."
         )
-    if owner == "kf":
-        return (
+    if not _noise_helps(noise, settings.sigma_z_m, statement):
+        return _outliers(noise, statement) or (
             f"It is not SIGMA_Z (the source's noise is {noise:.2g} m): look at SIGMA_A (--sigma-a) "
             "and the clock (--clock-offset)."
         )
+    return f"The data ask for SIGMA_Z {noise:.2g} m at this SIGMA_A: --sigma-z {noise:.2g}."
+
+
+def _ekf2_remedy(used: float, asked: NoiseAsked, statement: Consistency) -> str:
+    noise = asked.sigma_z_m
+    if asked.upper_bound:  # EKF2's own innovations bound it too, and less tightly
+        noise = float(np.hypot(statement.innovation_std_m, statement.innovation_mean_m))
+    noise = max(noise, SMALLEST_NOISE.value)
+    if not _noise_helps(noise, used, statement):
+        return _outliers(noise, statement) or (
+            f"It is not EKF2_EVP_NOISE (the source's noise is {noise:.2g} m): look at the clock "
+            "(EKF2_EV_DELAY) and at EKF2's process noise (EKF2_ACC_NOISE)."
+        )
+    bound = "at most " if asked.upper_bound else ""
+    was = "" if np.isnan(used) else f" (√R was {used:.2g} m)"
     return (
-        f"It is not EKF2_EVP_NOISE (the source's noise is {noise:.2g} m): look at the clock "
-        "(EKF2_EV_DELAY) and at EKF2's process noise (EKF2_ACC_NOISE)."
+        f"The source's noise is {bound}{noise:.2g} m: set EKF2_EVP_NOISE to "
+        f"{max(noise, EKF2_NOISE_FLOOR.value):.2g}{was}."
+    )
+
+
+def _noise_helps(noise: float, used: float, statement: Consistency) -> bool:
+    """Whether another measurement noise mends the variance.
+
+    More noise mends one that is understated, less one that is overstated; if the noise already
+    fits, or the other way round, the cause lies elsewhere.
+    """
+    if 1 / NOISE_FITS.value < noise / used < NOISE_FITS.value:
+        return False
+    return not (noise < used if statement.variance_factor < 1.0 else noise > used)
+
+
+def _outliers(noise: float, statement: Consistency) -> str:
+    """What to do about gross outliers, empty where there are none."""
+    if statement.variance_factor > 1.0 or statement.outside_gate <= OUTLIER_SHARE.value:
+        return ""
+    return (
+        f"{statement.outside_gate:.1%} lie outside the gate while the bulk fits {noise:.2g} m: "
+        "remove the outliers (line of sight, anchor survey) instead of raising the noise."
     )
 
 

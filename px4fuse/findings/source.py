@@ -22,7 +22,7 @@ from px4fuse.findings.thresholds import (
     MOTION_RANGE,
     VISION_PROFILE_BIT,
 )
-from px4fuse.flight import POSITION_COLUMNS, Ekf2, Unavailable, median_rate
+from px4fuse.flight import POSITION_COLUMNS, Ekf2, Unavailable, sample_rate
 
 
 def source_reconstructed(comparison: Comparison) -> Iterator[Finding]:
@@ -39,8 +39,11 @@ def source_reconstructed(comparison: Comparison) -> Iterator[Finding]:
         f"Set SDLOG_PROFILE to {profile | VISION_PROFILE_BIT} and fly again.",
         {"rate_hz": source.rate_hz, "sdlog_profile": float(profile)},
     )
-    interval = LOGGER_INTERVALS_S[source.name]
-    if abs(1.0 / source.rate_hz - interval) < LOGGER_INTERVAL_TOLERANCE.value * interval:
+    interval = LOGGER_INTERVALS_S.get(source.name)
+    if (
+        interval is not None
+        and abs(1.0 / source.rate_hz - interval) < LOGGER_INTERVAL_TOLERANCE.value * interval
+    ):
         yield Finding(
             "source_decimated",
             "warning",
@@ -146,15 +149,15 @@ def logging_rate_low(comparison: Comparison) -> Iterator[Finding]:
         (flight.imu, "sensor_combined", MIN_IMU_RATE),
         (flight.attitude, "vehicle_attitude", MIN_ATTITUDE_RATE),
     ):
-        if isinstance(part, pd.DataFrame) and median_rate(part) < threshold.value:
+        if isinstance(part, pd.DataFrame) and sample_rate(part) < threshold.value:
             yield Finding(
                 "logging_rate_low",
                 "warning",
-                f"{topic} was logged at {median_rate(part):.1f} Hz, below the "
+                f"{topic} was logged at {sample_rate(part):.1f} Hz, below the "
                 f"{threshold.value:g} Hz that the acceleration needs: motion between samples "
                 "is lost.",
                 "Set SDLOG_PROFILE to 129, which logs it at full rate.",
-                {"rate_hz": median_rate(part), "needed_hz": threshold.value, "topic": topic},
+                {"rate_hz": sample_rate(part), "needed_hz": threshold.value, "topic": topic},
             )
     innovations = next(
         (

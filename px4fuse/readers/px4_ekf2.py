@@ -37,10 +37,15 @@ from px4fuse.readers.px4_topics import (
 )
 from px4fuse.readers.ulog_topics import Topics
 
+# Primary EKF2 instance from each time on
+Instances = tuple[tuple[float, int], ...]
+# One EKF2 instance alone publishes no selector
+NO_SELECTOR: Instances = ((-np.inf, 0),)
 # EKF2_EVP_GATE has had this default in every release read (v1.9 to main)
 DEFAULT_GATE = 5.0
-# innovations, variances and ratios are logged by separate rate limiters, up to some cycles apart
-JOIN_TOLERANCE_S = 0.1
+# innovations, variances and ratios are logged by separate rate limiters, up to one interval of
+# the default profile (0.5 s) apart; S changes little in that time
+JOIN_TOLERANCE_S = 0.6
 _RESET_COUNTERS = (
     ("position", "xy_reset_counter", ("delta_north_m", "delta_east_m", None)),
     ("position", "z_reset_counter", (None, None, "delta_down_m")),
@@ -55,10 +60,6 @@ INNOVATION_COLUMNS = [
     "fused",
     "rejected",
 ]
-
-
-# One EKF2 instance alone publishes no selector
-NO_SELECTOR = ((-np.inf, 0),)
 
 
 def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
@@ -100,7 +101,7 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
     )
 
 
-def _primary_instances(topics: Topics) -> tuple[tuple[float, int], ...]:
+def _primary_instances(topics: Topics) -> Instances:
     """Primary EKF2 instance from each time on; instance 0 where there is no selector."""
     layout = topics.find(SELECTOR)
     if layout is None:
@@ -114,10 +115,10 @@ def _primary_instances(topics: Topics) -> tuple[tuple[float, int], ...]:
     return tuple((float(time), int(number)) for time, number in zip(times, changes, strict=True))
 
 
-def _of_primary(
+def of_primary(
     topics: Topics,
     topic: str,
-    instances: tuple[tuple[float, int], ...],
+    instances: Instances,
     read: Callable[[int], pd.DataFrame],
 ) -> pd.DataFrame:
     """Rows of each instance of a topic from the times in which that instance was primary."""
@@ -135,9 +136,7 @@ def _of_primary(
     return joined[~joined.index.duplicated()]
 
 
-def _read_variance(
-    topics: Topics, instances: tuple[tuple[float, int], ...]
-) -> pd.DataFrame | Unavailable:
+def _read_variance(topics: Topics, instances: Instances) -> pd.DataFrame | Unavailable:
     """Velocity and position variances, their place decided by the lengths of the arrays."""
     lengths = {}
     for candidate in ESTIMATOR_STATES:
@@ -166,7 +165,7 @@ def _read_variance(
             for i, name in enumerate(names)
         }
         read = partial(topics.frame, Layout(topic, columns, ""))
-        frame = _of_primary(topics, topic, instances, read)
+        frame = of_primary(topics, topic, instances, read)
         frame = frame[(frame > 0.0).all(axis=1)]
         if len(frame):
             return frame
@@ -177,9 +176,7 @@ def _read_variance(
     )
 
 
-def _read_fusing(
-    topics: Topics, instances: tuple[tuple[float, int], ...]
-) -> pd.DataFrame | Unavailable:
+def _read_fusing(topics: Topics, instances: Instances) -> pd.DataFrame | Unavailable:
     layout = topics.find(FUSING)
     if layout is None:
         return Unavailable(
@@ -188,7 +185,7 @@ def _read_fusing(
             "Record with SDLOG_PROFILE bit 0 (default).",
         )
     read = partial(topics.frame, layout, step=True)
-    frame = _of_primary(topics, layout.topic, instances, read)
+    frame = of_primary(topics, layout.topic, instances, read)
     if "flags" in frame:
         bits = frame["flags"].to_numpy().astype(np.int64)
         frame = pd.DataFrame(
@@ -206,7 +203,7 @@ def step_at(steps: pd.Series, times: pd.Index) -> pd.Series:
 
 def _read_innovations(
     topics: Topics,
-    instances: tuple[tuple[float, int], ...],
+    instances: Instances,
     fusing: pd.DataFrame | Unavailable,
     notes: list[str],
 ) -> tuple[Mapping[AxisName, pd.DataFrame | Unavailable], tuple[str, ...]]:
@@ -255,12 +252,12 @@ def _position_or_height(axis: AxisName) -> str:
 
 def _read_aid_source(
     topics: Topics,
-    instances: tuple[tuple[float, int], ...],
+    instances: Instances,
     layout: Layout,
     fusing: pd.DataFrame | Unavailable,
     axis: AxisName,
 ) -> pd.DataFrame:
-    frame = _of_primary(topics, layout.topic, instances, partial(topics.frame, layout))
+    frame = of_primary(topics, layout.topic, instances, partial(topics.frame, layout))
     if "fused" in frame and "rejected" in frame:
         attempted = (frame["fused"] > 0) | (frame["rejected"] > 0)
     elif isinstance(fusing, pd.DataFrame):
@@ -273,7 +270,7 @@ def _read_aid_source(
 
 def _read_joined(
     topics: Topics,
-    instances: tuple[tuple[float, int], ...],
+    instances: Instances,
     layout: InnovationLayout,
     fusing: pd.DataFrame | Unavailable,
     axis: AxisName,
@@ -294,7 +291,7 @@ def _read_joined(
             read = partial(topics.frame, single)
             if column == "innovation_m":
                 read = partial(_read_fresh, topics, single)
-            parts[column] = _of_primary(topics, topic, instances, read).dropna()
+            parts[column] = of_primary(topics, topic, instances, read).dropna()
     if "innovation_m" not in parts or "innovation_variance_m2" not in parts:
         return None
     frame = parts.pop("innovation_m")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
@@ -17,6 +19,7 @@ from px4fuse.flight import (
     Unavailable,
     finite_rows,
 )
+from px4fuse.readers.px4_ekf2 import NO_SELECTOR, Instances, of_primary
 from px4fuse.readers.px4_topics import (
     AID_OBSERVATION_HORIZONTAL,
     AID_OBSERVATION_VERTICAL,
@@ -43,8 +46,9 @@ def read_positions(
     topics: Topics, ekf2: Ekf2 | Unavailable
 ) -> tuple[tuple[PositionTrack, ...], tuple[Unavailable, ...]]:
     """Every external position track found, best rung first, and what was looked for in vain."""
-    candidates = [_read_logged(topics, source) for source in TRACKS]
-    candidates.append(_read_aid_observation(topics))
+    instances = NO_SELECTOR if isinstance(ekf2, Unavailable) else ekf2.instances
+    candidates = [_read_logged(topics, source, instances) for source in TRACKS]
+    candidates.append(_read_aid_observation(topics, instances))
     candidates.append(_reconstruct(ekf2))
     candidates.append(_read_gps(topics))
     tracks = tuple(track for track in candidates if isinstance(track, PositionTrack))
@@ -79,11 +83,15 @@ def _finished(track: PositionTrack, axes: list[str]) -> PositionTrack | Unavaila
     )  # fmt: skip
 
 
-def _read_logged(topics: Topics, source: TrackSource) -> PositionTrack | Unavailable:
+def _read_logged(
+    topics: Topics, source: TrackSource, instances: Instances
+) -> PositionTrack | Unavailable:
     layout = topics.find(source.layouts)
     if layout is None:
         return _unavailable(source.name, f"no topic {source.name} in the log")
-    samples = topics.frame(layout)
+    if not layout.topic.startswith("estimator_"):  # only EKF2's own topics have its instances
+        instances = NO_SELECTOR
+    samples = of_primary(topics, layout.topic, instances, partial(topics.frame, layout))
     frame = "unknown"
     for field, names in FRAMES.items():
         if field in samples and len(samples):
@@ -99,16 +107,16 @@ def _read_logged(topics: Topics, source: TrackSource) -> PositionTrack | Unavail
     )  # fmt: skip
 
 
-def _read_aid_observation(topics: Topics) -> PositionTrack | Unavailable:
+def _read_aid_observation(topics: Topics, instances: Instances) -> PositionTrack | Unavailable:
     layout = topics.find(AID_OBSERVATION_HORIZONTAL)
     if layout is None:
         return _unavailable(AID_SOURCE, f"no topic {AID_SOURCE} in the log")
-    samples = topics.frame(layout)
+    samples = of_primary(topics, layout.topic, instances, partial(topics.frame, layout))
     used = [layout.topic]
     vertical = topics.find(AID_OBSERVATION_VERTICAL)
     if vertical is not None:
         # both are stamped with the same external vision sample, so the join is exact
-        height = topics.frame(vertical)
+        height = of_primary(topics, vertical.topic, instances, partial(topics.frame, vertical))
         samples = pd.merge_asof(
             samples, height, left_index=True, right_index=True, direction="nearest",
             tolerance=1e-4,  # type: ignore[arg-type]
@@ -188,9 +196,9 @@ def _local_origin(topics: Topics) -> tuple[float, float, float] | None:
     if layout is None:
         return None
     local = topics.frame(layout)
-    if "ref_lat" not in local:
-        return None
     columns = ["ref_lat", "ref_lon", "ref_alt"]
+    if not set(columns) <= set(local.columns):
+        return None
     origin = finite_rows(local[columns], columns)
     origin = origin[origin["ref_lat"] != 0]
     if origin.empty:
@@ -224,7 +232,7 @@ def _read_gps(topics: Topics) -> PositionTrack | Unavailable:
         {"north_m": north, "east_m": east, "down_m": origin[2] - gps["altitude_m"].to_numpy()},
         index=gps.index,
     )
-    if "eph_m" in gps:
+    if {"eph_m", "epv_m"} <= set(gps.columns):
         samples["north_m2"] = samples["east_m2"] = gps["eph_m"].to_numpy() ** 2 / 2.0
         samples["down_m2"] = gps["epv_m"].to_numpy() ** 2
     return _finished(

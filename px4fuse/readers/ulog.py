@@ -59,7 +59,7 @@ def read_ulog(path: Path) -> Flight:
         missing += [part for part in parts if isinstance(part, Unavailable)]
     dropped = tuple(
         f"{count} samples of {topic} were dropped: their time stamps are zero or go back"
-        for topic, count in sorted(topics.dropped.items())
+        for (topic, _), count in sorted(topics.dropped.items())
     )
     return Flight(
         log=dataclasses.replace(topics.log, notes=topics.log.notes + dropped),

@@ -59,13 +59,14 @@ class Topics:
     zero_us : int
         Boot time of time zero in µs.
     dropped : dict
-        Samples dropped for an impossible time stamp, by topic; filled by :meth:`frame`.
+        Samples dropped for an impossible time stamp, by topic and instance; :meth:`frame` fills
+        it.
     """
 
     log: LogInfo
     tables: dict[tuple[str, int], dict[str, NDArray[Any]]]
     zero_us: int
-    dropped: dict[str, int]
+    dropped: dict[tuple[str, int], int]
 
     def instances(self, topic: str) -> list[int]:
         """Instances of a topic that hold data, in order."""
@@ -105,11 +106,12 @@ class Topics:
         time_us = measurement_time_us(table)
         keep = increasing(time_us)
         if len(keep) < len(time_us):
-            self.dropped[layout.topic] = len(time_us) - len(keep)
-        frame = pd.DataFrame(
-            {ours: table[px4][keep].astype(np.float64) for ours, px4 in columns.items()},
-            index=pd.Index((time_us[keep] - self.zero_us) * _MICROSECOND, name="time_s"),
-        )
+            self.dropped[layout.topic, instance] = len(time_us) - len(keep)
+        with np.errstate(invalid="ignore"):  # damaged bytes can be signalling NaNs
+            frame = pd.DataFrame(
+                {ours: table[px4][keep].astype(np.float64) for ours, px4 in columns.items()},
+                index=pd.Index((time_us[keep] - self.zero_us) * _MICROSECOND, name="time_s"),
+            )
         frame = frame.where(np.isfinite(frame))  # an infinite value is as unusable as NaN
         if step:
             return frame

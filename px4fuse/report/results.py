@@ -15,7 +15,7 @@ from typing import Any
 
 from px4fuse.comparison import AgainstTruth, AxisComparison, Comparison, FilterSummary
 from px4fuse.consistency import Consistency
-from px4fuse.flight import Unavailable, median_rate
+from px4fuse.flight import Unavailable, sample_rate
 from px4fuse.report.document import Document
 
 SCHEMA_NAME = "px4fuse-results"
@@ -172,7 +172,7 @@ def _axis(result: AxisComparison) -> dict[str, Any]:
                     "count": len(updates),
                     "first_s": float(updates.index[0]),
                     "last_s": float(updates.index[-1]),
-                    "rate_hz": median_rate(updates) if len(updates) > 1 else None,
+                    "rate_hz": sample_rate(updates) if len(updates) > 1 else None,
                     "input_gap_s": result.replay.input_gap_s,
                     "noise_asked": asdict(asked) if asked is not None else None,
                 }
