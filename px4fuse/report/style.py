@@ -77,6 +77,7 @@ def report_style() -> Iterator[None]:
             "axes.spines.right": False,
             "axes.unicode_minus": True,
             "axes.grid": True,
+            "axes.grid.axis": "y",
             "grid.color": "#e3e3e3",
             "grid.linewidth": 0.5,
             "axes.axisbelow": True,
@@ -271,10 +272,10 @@ def panels(
     axes = [[figure.add_subplot(grid[r, c]) for c in range(columns)] for r in range(rows)]
     for row in axes:
         for single in row:
-            single.xaxis.set_major_locator(MaxNLocator(7))
-            single.yaxis.set_major_locator(MaxNLocator(5))
+            single.xaxis.set_major_locator(MaxNLocator(6))
+            single.yaxis.set_major_locator(MaxNLocator(4))
             if row is not axes[-1]:
-                single.tick_params(axis="x", labelbottom=False)
+                single.tick_params(axis="x", labelbottom=False, bottom=False)
     return axes
 
 
