@@ -117,6 +117,10 @@ def test_fail_on_sets_exit_code_1(tmp_path, sample_log):
         ["--position-source", "nonsense"],
         ["--notes", "absent.md"],
         ["-o", "report.txt"],
+        ["-o", "same.pdf", "--json", "same.pdf"],
+        ["--sigma-a", "abc"],
+        ["--axis", "up"],
+        ["--no-such-option"],
     ],
 )
 def test_bad_settings_give_one_line_and_leave_nothing(
@@ -145,6 +149,23 @@ def test_bad_logs_give_one_line_and_overwrite_nothing(tmp_path, monkeypatch, cap
     assert "bad.ulg" in err
     assert old.read_text() == "an older report"
     assert [p.name for p in old.parent.iterdir()] == ["bad.pdf"]
+
+
+def test_no_command_shows_help(monkeypatch, capsys):
+    code, out, err = run_main(monkeypatch, capsys)
+    assert code == 2
+    assert "Usage:" in out + err
+
+
+def test_a_pipe_that_closes_early_is_no_traceback(tmp_path, sample_log):
+    """As in px4fuse compare ... | head: the reader is gone before the summary is printed."""
+    command = [sys.executable, "-m", "px4fuse", "compare", str(sample_log), "--axis", "north",
+               "-o", str(tmp_path / "r.pdf")]  # fmt: skip
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    process.stdout.close()
+    assert process.stderr.read() == b""
+    process.stderr.close()
+    assert process.wait() in (0, 1)
 
 
 def test_missing_log_gives_one_line(monkeypatch, capsys):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import importlib
+import os
 import sys
 
 import click
@@ -44,22 +45,35 @@ class LazyGroup(click.Group):
 @click.group(cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(package_name="px4fuse")
 def cli() -> None:
-    r"""Replay a PX4 flight through a two-state Kalman filter and compare it with EKF2.
+    """Replay a PX4 flight through a two-state Kalman filter and compare it with EKF2.
 
-    \b
-    px4fuse compare log.ulg      writes reports/log.pdf and reports/log.json
+    For example, px4fuse compare log.ulg writes reports/log.pdf and reports/log.json.
     """
 
 
 def main() -> None:
-    """Run the command line; an error that px4fuse knows is one line and exit code 2."""
+    """Run the command line; bad input is one line on standard error and exit code 2."""
     # one short job per process: looking for garbage while importing and drawing costs a tenth
     gc.disable()
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):  # σ and ν on a Windows console with a legacy code page
             stream.reconfigure(errors="replace")
     try:
-        cli.main(standalone_mode=True)
+        code = cli.main(standalone_mode=False)
+    except click.exceptions.NoArgsIsHelpError as error:
+        error.show()
+        code = 2
+    except click.UsageError as error:
+        where = error.ctx.command_path if error.ctx else "px4fuse"
+        click.echo(f"px4fuse: {error.format_message()} See {where} --help.", err=True)
+        code = 2
     except Px4FuseError as error:
         click.echo(f"px4fuse: {error}", err=True)
-        sys.exit(2)
+        code = 2
+    except (click.Abort, KeyboardInterrupt):
+        click.echo("px4fuse: interrupted, nothing was written.", err=True)
+        code = 130
+    except BrokenPipeError:  # the reader of a pipe has gone, as with | head
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        code = 1
+    sys.exit(code if isinstance(code, int) else 0)

@@ -263,5 +263,7 @@ def _write(
     contents = {target: render(document, text)}
     beside = target.with_suffix(".json") if json_path in (None, Path("-")) else json_path
     if beside is not None:
+        if beside.resolve() == target.resolve():
+            raise OutputError(f"{beside}: --json and -o name the same file. Give two names.")
         contents[beside] = text.encode()
     write_all(contents)
