@@ -10,7 +10,7 @@ import pandas as pd
 
 from px4fuse.consistency import Consistency, HorizontalNis, assess, assess_horizontal
 from px4fuse.errors import SettingsError
-from px4fuse.flight import Ekf2, Flight, PositionTrack, Unavailable
+from px4fuse.flight import Ekf2, Flight, PositionTrack, Truth, Unavailable
 from px4fuse.kalman import Replay, Settings, replay, state_at, variance_at
 from px4fuse.likelihood import NoiseAsked, noise_asked
 from px4fuse.projection import (
@@ -29,6 +29,12 @@ from px4fuse.signals import (
     choose_source,
     make_axes,
     shift_clock,
+)
+
+NOT_ITS_OWN_TRUTH = Unavailable(
+    "ground truth",
+    "the position source is the only reference in the log, and it is what our filter was given",
+    "Choose another --position-source to have it as the truth.",
 )
 
 
@@ -198,6 +204,8 @@ def compare(
     track = shift_clock(track, settings.clock_offset_s)
     segment = choose_segment(flight, track, start_s, end_s)
     lines = make_axes(flight, track, segment, names=axes, heading_deg=heading_deg)
+    if isinstance(flight.truth, Truth) and flight.truth.name == track.name:
+        flight = replace(flight, truth=NOT_ITS_OWN_TRUTH)
     missing = list(flight.missing)
     notes = list(flight.log.notes)
     acceleration = lines[0].acceleration

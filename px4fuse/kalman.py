@@ -180,12 +180,18 @@ def timeline(axis: Axis, settings: Settings, initial: InitialState | None = None
     if isinstance(axis.acceleration, Unavailable):
         raise SettingsError(f"--input imu needs an acceleration. {axis.acceleration}")
     mean, gap = step_means(axis.acceleration, time)
+    gap_s = gap * np.diff(time)
+    # Unknown acceleration persists through a gap: after T seconds it has moved the velocity by
+    # rms·T, not by the rms·√(DT·T) of white noise, so its variance is scaled by T/DT.
+    leg = np.searchsorted(np.flatnonzero(measurement >= 0), np.arange(1, len(time)))
+    gap_of_leg = np.bincount(leg, weights=gap_s)[leg]
+    persistence = np.maximum(gap_of_leg / settings.dt_s, 1.0)
     return Timeline(
         time,
         measurement,
         mean,
-        gap * axis.acceleration.rms_m_s2**2,
-        float(np.sum(gap * np.diff(time))),
+        gap * persistence * axis.acceleration.rms_m_s2**2,
+        float(np.sum(gap_s)),
     )
 
 

@@ -213,3 +213,15 @@ def _median_match(nu: Array, s: Array) -> NoiseAsked | None:
     y = np.log(median[[low, low + 1]])
     at = x[0] + (np.log(CHI2_MEDIAN) - y[0]) * (x[1] - x[0]) / (y[1] - y[0])
     return NoiseAsked(float(np.exp(at)), False)
+
+
+SIGMA_A_GRID_M_S2 = np.geomspace(1e-3, 30.0, 61)
+
+
+def sigma_a_asked(axis: Axis, settings: Settings) -> float:
+    """SIGMA_A (m/s²) of greatest likelihood at the SIGMA_Z that is set, on a coarse grid.
+
+    Minimises ½ Σ (ln S + ν²/S), the negative log-likelihood of the innovations.
+    """
+    nu, s = innovations(preintegrate(axis, settings), SIGMA_A_GRID_M_S2, settings.sigma_z_m)
+    return float(SIGMA_A_GRID_M_S2[np.argmin(np.sum(np.log(s) + nu**2 / s, axis=0))])

@@ -34,6 +34,14 @@ IMU_GAP_INTERVALS = 5.0
 MIN_MEASUREMENTS = 3
 # The GPS rung is taken only when asked for.
 LAST_AUTOMATIC_RUNG = 6
+# The ladder's names short of GPS, best first
+LADDER = (
+    "vehicle_visual_odometry",
+    "vehicle_mocap_odometry",
+    "estimator_visual_odometry_aligned",
+    "estimator_aid_src_ev_pos",
+    "ekf2_state_plus_innovation",
+)
 
 
 @dataclass(frozen=True)
@@ -145,20 +153,11 @@ def choose_source(flight: Flight, name: str | None = None) -> tuple[PositionTrac
 
 
 def _ladder_reason(flight: Flight, track: PositionTrack) -> str:
-    passed = [
-        missing.what.removeprefix("position source ")
-        for missing in flight.missing
-        if missing.what.startswith("position source ")
-        and missing.what.split()[-1]
-        in (
-            "vehicle_visual_odometry",
-            "vehicle_mocap_odometry",
-            "estimator_visual_odometry_aligned",
-        )
-    ]
-    if track.rung == 2 or not passed:
+    missing = {part.what.removeprefix("position source ") for part in flight.missing}
+    lacking = [name for name in LADDER[: LADDER.index(track.name)] if name in missing]
+    if not lacking:
         return "the best source: logged as it arrived"
-    return f"the best that this log has; not in it: {', '.join(passed)}"
+    return f"the best that this log has; no usable {', '.join(lacking)}"
 
 
 def shift_clock(track: PositionTrack, clock_offset_s: float) -> PositionTrack:
@@ -245,7 +244,7 @@ def ned_acceleration(flight: Flight) -> pd.DataFrame | Unavailable:
         return Unavailable(
             "acceleration in NED",
             "IMU and attitude do not overlap in time",
-            "Record both from boot (SDLOG_MODE 0).",
+            "Record both from boot (SDLOG_MODE 1).",
         )
     rotations = Rotation.from_quat(
         flight.attitude[QUATERNION_COLUMNS].to_numpy(copy=True), scalar_first=True

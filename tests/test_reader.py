@@ -43,6 +43,7 @@ from px4fuse.readers import read_log
 from px4fuse.readers.px4_ekf2 import JOIN_TOLERANCE_S
 from px4fuse.signals import choose_source
 
+HALF_PERIOD_S = 0.005  # of EKF2's update, EKF2_PREDICT_US 10,000
 HOUR_US = 3_600_000_000
 FLOAT32 = {"rtol": 1e-6, "atol": 1e-6}
 
@@ -136,7 +137,22 @@ def test_aid_source_gives_noise_ratio_and_flags(read, generation):
 @pytest.mark.parametrize("generation", ["v1.9", "v1.11", "v1.12"])
 def test_what_older_generations_do_not_log_is_nan(read, generation):
     frame = read(make_log(generation)).ekf2.innovations["north"]
-    assert frame[["observation_variance_m2", "fused", "rejected"]].isna().all(axis=None)
+    assert frame[["observation_variance_m2", "fused"]].isna().all(axis=None)
+
+
+@pytest.mark.parametrize("generation", ["v1.9", "v1.11", "v1.12"])
+def test_a_rejection_that_is_not_logged_follows_from_the_gate(read, generation):
+    """Beyond five √S along east alone, the whole horizontal vector is rejected."""
+    log = make_log(generation)
+    topic = "ekf2_innovations" if generation == "v1.9" else "estimator_innovations"
+    field = "vel_pos_innov" if generation == "v1.9" else "ev_hpos"
+    at = 4 if generation == "v1.9" else 1
+    copies = 1 if generation == "v1.9" else 2  # the newer topic is written twice per fusion here
+    log[topic][field][20 : 20 + 4 * copies, at] = np.repeat(40.0 + np.arange(4), copies)
+    innovations = read(log).ekf2.innovations
+    for axis in ("north", "east"):
+        assert innovations[axis]["rejected"].sum() == 4
+    assert innovations["down"]["rejected"].sum() == 0
 
 
 @pytest.mark.parametrize("generation", GENERATIONS)
@@ -226,7 +242,8 @@ def test_time_is_that_of_measurement(read, name):
     log = make_log("v1.16")
     assert (log[name]["timestamp"] - log[name]["timestamp_sample"] == 60_000).all()
     track = next(track for track in read(log).positions if track.name == name)
-    np.testing.assert_allclose(times(track.samples), seconds_of(ev_stamps(10.0)), atol=1e-9)
+    lead = HALF_PERIOD_S if name == "estimator_aid_src_ev_pos" else 0.0
+    np.testing.assert_allclose(times(track.samples), seconds_of(ev_stamps(10.0)) + lead, atol=1e-9)
 
 
 def test_accelerometer_times_follow_their_offset(read):
@@ -339,7 +356,8 @@ def test_positions_that_ekf2_kept_are_those_of_the_primary(read, name, generatio
     track, _ = choose_source(read(log), name)
     time = seconds_of(ev_stamps(10.0))
     expected = position(time)[:, 0] + ev_error(time)[:, 0] + (time >= 4.95)
-    np.testing.assert_allclose(times(track.samples), time, atol=1e-9)
+    lead = HALF_PERIOD_S if name == "estimator_aid_src_ev_pos" else 0.0
+    np.testing.assert_allclose(times(track.samples), time + lead, atol=1e-9)
     np.testing.assert_allclose(track.samples["north_m"], expected, **FLOAT32)
 
 
@@ -588,11 +606,11 @@ def test_nan_positions_are_dropped(read):
 
 @pytest.mark.parametrize("delay_ms", [0.0, 175.0])
 def test_ekf2s_own_delay_is_added_back_to_its_observations(read, delay_ms):
-    """EKF2 files a sample under its stamp less EKF2_EV_DELAY; the sender's stamp is wanted."""
+    """EKF2 files a sample under its stamp less EKF2_EV_DELAY and half its update period."""
     log = make_log("v1.16").drop("vehicle_visual_odometry")
     log.parameters["EKF2_EV_DELAY"] = delay_ms
     for name in ("estimator_aid_src_ev_pos", "estimator_aid_src_ev_hgt"):
-        log[name]["timestamp_sample"] -= np.uint64(delay_ms * 1000)
+        log[name]["timestamp_sample"] -= np.uint64((delay_ms * 1e-3 + HALF_PERIOD_S) * 1e6)
     track, _ = choose_source(read(log))
     assert (track.name, track.rung) == ("estimator_aid_src_ev_pos", 5)
     expected = seconds_of(ev_stamps(10.0))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -235,7 +236,7 @@ def _read_notes(path: Path | None) -> str:
 def _command_line(log: Path) -> str:
     """The command that makes this report again: what was given, without folders and names."""
     context = click.get_current_context()
-    words = ["px4fuse compare", log.name]
+    words = ["px4fuse", "compare", log.name]
     for parameter in context.command.params:
         name = parameter.name or ""
         given = context.get_parameter_source(name) == ParameterSource.COMMANDLINE
@@ -243,8 +244,8 @@ def _command_line(log: Path) -> str:
             continue
         value: Any = context.params[name]
         for single in value if isinstance(value, tuple) else (value,):
-            words += [parameter.opts[-1], f"{single:g}" if isinstance(single, float) else single]
-    return " ".join(words)
+            words += [parameter.opts[-1], str(single)]
+    return shlex.join(words)
 
 
 def _write(

@@ -31,8 +31,8 @@ def find(comparison: Comparison) -> tuple[Finding, ...]:
 
 DETECTORS: tuple[Detector, ...] = (
     ekf2_not_fusing,
-    variance_wrong,
     process_noise_forgotten,
+    variance_wrong,
     ekf2_rejecting,
     source_reconstructed,
     gaps,

@@ -17,6 +17,7 @@ from px4fuse.findings.thresholds import (
     REJECTED_SHARE_WARNING,
 )
 from px4fuse.flight import Ekf2, Unavailable
+from px4fuse.projection import EXTERNAL_VISION_RUNGS
 
 
 def ekf2_unavailable(comparison: Comparison) -> Iterator[Finding]:
@@ -36,7 +37,17 @@ def ekf2_not_fusing(comparison: Comparison) -> Iterator[Finding]:
     ekf2, segment = comparison.flight.ekf2, comparison.segment
     if isinstance(ekf2, Unavailable) or isinstance(ekf2.fusing, Unavailable):
         return
-    if comparison.source.rung not in (2, 4, 5, 6):
+    if comparison.source.rung not in EXTERNAL_VISION_RUNGS:
+        fused = step_share(ekf2.fusing["horizontal"], segment.start_s, segment.end_s)
+        if comparison.source.name == "vehicle_mocap_odometry" and fused == 0.0:
+            yield Finding(
+                "ekf2_not_fusing",
+                "warning",
+                "EKF2 never fuses motion capture (ATT_POS_MOCAP), and nothing else of external "
+                "vision reached it: its track does not come from this source.",
+                "Send the position as VISION_POSITION_ESTIMATE if EKF2 is to fuse it.",
+                {"fusing_share": fused},
+            )
         return
     share = step_share(ekf2.fusing["horizontal"], segment.start_s, segment.end_s)
     interval = 1.0 / comparison.source.rate_hz
@@ -48,8 +59,8 @@ def ekf2_not_fusing(comparison: Comparison) -> Iterator[Finding]:
         yield Finding(
             "ekf2_fusion_interrupted",
             "warning",
-            f"EKF2 fused the source in {share:.0%} of the segment only; in between its track is "
-            "dead reckoning.",
+            f"EKF2 fused the source in {share:.0%} of the segment only; in between its track "
+            "rests on its other sensors.",
             "Look at the gaps and rejections below; EKF2 stops after 0.4 s without a sample.",
             evidence,
         )
@@ -63,7 +74,11 @@ def ekf2_not_fusing(comparison: Comparison) -> Iterator[Finding]:
     elif control is None and mask is not None and not int(mask) & 8:
         why = f"EKF2_AID_MASK is {mask:.0f}, bit 3 (vision position) is not set"
         remedy = f"Set EKF2_AID_MASK to {int(mask) | 8}."
-    elif control is not None and interval > EV_START_INTERVAL.value:
+    elif (
+        control is not None
+        and not comparison.source.reconstructed  # else its rate is the logger's, not its own
+        and interval > EV_START_INTERVAL.value
+    ):
         why = (
             f"its samples come every {interval:.2f} s, and EKF2 (v1.14 and later) starts only when "
             f"they are less than {EV_START_INTERVAL.value:g} s apart and stops after "
@@ -92,11 +107,10 @@ def ekf2_rejecting(comparison: Comparison) -> Iterator[Finding]:
         frame = result.ekf2_innovations
         if isinstance(frame, Unavailable):
             continue
-        beyond = (frame["test_ratio"] > 1.0).astype(float).where(frame["test_ratio"].notna())
-        rejected = frame["rejected"].fillna(beyond).dropna()
-        if rejected.empty:
+        known = frame["rejected"].dropna()
+        if known.empty:
             continue
-        share = float(rejected.mean())
+        share = float(known.mean())
         if share < REJECTED_SHARE_WARNING.value:
             continue
         what = "height" if result.axis.name == "down" else "horizontal position"
@@ -105,8 +119,8 @@ def ekf2_rejecting(comparison: Comparison) -> Iterator[Finding]:
             "error" if share >= REJECTED_SHARE_ERROR.value else "warning",
             f"EKF2 rejected {share:.1%} of the source's samples for {what} (outside "
             f"{_gate(comparison):g} √S): outliers, a noise set too small, or a late clock.",
-            "Raise EKF2_EVP_NOISE to the measured noise first; widen EKF2_EVP_GATE only after "
-            "that.",
+            "First make EKF2_EVP_NOISE the source's own noise, then remove outliers (line of "
+            "sight) and check the clock; widen EKF2_EVP_GATE last.",
             {"rejected_share": share, "count": float(len(frame)), "axis": result.axis.name},
         )
 

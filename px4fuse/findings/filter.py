@@ -11,22 +11,18 @@ from px4fuse.consistency import Consistency
 from px4fuse.findings.model import Finding
 from px4fuse.findings.thresholds import (
     EKF2_NOISE_FLOOR,
-    GROWTH,
     LAG1_SLOW,
-    LESSON_SIGMA_A,
     NOISE_ABSURD,
     NOISE_FITS,
     OUTLIER_SHARE,
+    RESPONSE_TIME,
     SMALLEST_NOISE,
     VARIANCE_FACTOR,
     VARIANCE_FACTOR_ERROR,
 )
-from px4fuse.flight import Unavailable
+from px4fuse.flight import Unavailable, sample_rate
 from px4fuse.kalman import Settings
-from px4fuse.likelihood import NoiseAsked
-
-# A step in SIGMA_A that is seen in the plots and does not overshoot
-SIGMA_A_FACTOR = 4.0
+from px4fuse.likelihood import NoiseAsked, sigma_a_asked
 
 
 def variance_wrong(comparison: Comparison) -> Iterator[Finding]:
@@ -92,7 +88,7 @@ def _noise_remedy(
     if owner == "kf" and noise_absurd and lag1 > LAG1_SLOW.value:
         return (
             f"The filter follows too slowly (lag-1 correlation {lag1:+.2f}): raise SIGMA_A first, "
-            f"try --sigma-a {SIGMA_A_FACTOR * settings.sigma_a_m_s2:.2g}."
+            f"--sigma-a {sigma_a_asked(result.axis, settings):.2g} fits these data best."
         )
     if asked is None:
         return (
@@ -101,7 +97,16 @@ def _noise_remedy(
         )
     if owner == "kf":
         return _kf_remedy(settings, asked, statement)
-    return _ekf2_remedy(_ekf2_noise(result), asked, statement)
+    parameters = comparison.flight.log.parameters
+    used, set_noise = _ekf2_noise(result), parameters.get("EKF2_EVP_NOISE", np.nan)
+    reported = used > NOISE_FITS.value * set_noise and parameters.get("EKF2_EV_NOISE_MD") != 1.0
+    if reported and statement.variance_factor > 1.0:
+        return (
+            f"R is what the sender reports ({used:.2g} m), since that is more than EKF2_EVP_NOISE: "
+            f"correct it there, or set EKF2_EV_NOISE_MD to 1 and EKF2_EVP_NOISE to "
+            f"{max(asked.sigma_z_m, EKF2_NOISE_FLOOR.value):.2g}."
+        )
+    return _ekf2_remedy(used, asked, statement)
 
 
 def _kf_remedy(settings: Settings, asked: NoiseAsked, statement: Consistency) -> str:
@@ -167,26 +172,40 @@ def _ekf2_noise(result: AxisComparison) -> float:
 
 
 def process_noise_forgotten(comparison: Comparison) -> Iterator[Finding]:
-    """SIGMA_A so small that σ no longer grows between updates."""
-    if comparison.settings.sigma_a_m_s2 >= LESSON_SIGMA_A.value:
-        return  # then it is SIGMA_Z that is out of proportion, which is another finding
+    """SIGMA_A so small that σ hardly grows between updates and new measurements are ignored.
+
+    A slow filter is no mistake where nothing happens: its innovations must say that it lags.
+    """
     for result in comparison.axes:
-        updates = result.replay.updates
-        after = result.replay.steps["position_variance_m2"].reindex(updates.index)
-        growth = updates["prior_position_variance_m2"].to_numpy()[1:] / after.to_numpy()[:-1] - 1
-        late = growth[len(growth) // 2 :]
-        if len(late) and (relative := float(np.median(late))) < GROWTH.value:
-            gain = float(updates["gain_position"].iloc[-1])
-            yield Finding(
-                "process_noise_forgotten",
-                "error",
-                f"σ_p hardly grows between updates ({relative:.1%} in variance): with SIGMA_A "
-                f"{comparison.settings.sigma_a_m_s2:g} m/s² the filter ends up ignoring new "
-                f"measurements (last gain {gain:.3f}).",
-                f"Raise SIGMA_A: try --sigma-a {LESSON_SIGMA_A.value:g}.",
-                {"relative_growth": relative, "last_gain": gain, "axis": result.axis.name},
-            )
-            return
+        updates, statement = result.replay.updates, result.kf.consistency
+        if isinstance(statement, Unavailable) or statement.verdict != "variance understated":
+            continue
+        if statement.lag1_autocorrelation < LAG1_SLOW.value:
+            continue
+        gain = float(updates["gain_position"].iloc[len(updates) // 2 :].median())
+        response_s = 1.0 / (sample_rate(updates) * gain)
+        if response_s < RESPONSE_TIME.value:
+            continue
+        after = result.replay.steps["position_variance_m2"].reindex(updates.index).to_numpy()
+        before = updates["prior_position_variance_m2"].to_numpy()
+        growth = float(np.median((before[1:] / after[:-1] - 1.0)[len(after) // 2 :]))
+        asked = sigma_a_asked(result.axis, comparison.settings)
+        yield Finding(
+            "process_noise_forgotten",
+            "error",
+            f"Q forgotten: with SIGMA_A {comparison.settings.sigma_a_m_s2:g} m/s² σ_p hardly grows "
+            f"between updates ({growth:.1%} in variance), the gain is {gain:.3f}, and the filter "
+            f"needs {response_s:.0f} s to follow (along {result.axis.name}).",
+            f"Raise SIGMA_A: --sigma-a {asked:.2g} fits these data best.",
+            {
+                "relative_growth": growth,
+                "gain": gain,
+                "response_s": response_s,
+                "sigma_a_asked_m_s2": asked,
+                "axis": result.axis.name,
+            },
+        )
+        return
 
 
 def too_few_innovations(comparison: Comparison) -> Iterator[Finding]:

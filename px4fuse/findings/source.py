@@ -28,7 +28,8 @@ from px4fuse.flight import POSITION_COLUMNS, Ekf2, Unavailable, sample_rate
 def source_reconstructed(comparison: Comparison) -> Iterator[Finding]:
     """The position source as it arrived is not in the log."""
     source = comparison.source
-    if source.rung not in (4, 5, 6):
+    logged = any(track.rung == 2 for track in comparison.flight.positions)
+    if source.rung not in (4, 5, 6) or logged:
         return
     profile = int(comparison.flight.log.parameters.get("SDLOG_PROFILE", 1))
     yield Finding(
@@ -39,11 +40,13 @@ def source_reconstructed(comparison: Comparison) -> Iterator[Finding]:
         f"Set SDLOG_PROFILE to {profile | VISION_PROFILE_BIT} and fly again.",
         {"rate_hz": source.rate_hz, "sdlog_profile": float(profile)},
     )
-    interval = LOGGER_INTERVALS_S.get(source.name)
-    if (
-        interval is not None
-        and abs(1.0 / source.rate_hz - interval) < LOGGER_INTERVAL_TOLERANCE.value * interval
-    ):
+    intervals = LOGGER_INTERVALS_S.get(source.name, ())
+    limits = [
+        interval
+        for interval in intervals
+        if abs(1.0 / source.rate_hz / interval - 1.0) < LOGGER_INTERVAL_TOLERANCE.value
+    ]
+    for interval in limits:
         yield Finding(
             "source_decimated",
             "warning",
@@ -156,7 +159,7 @@ def logging_rate_low(comparison: Comparison) -> Iterator[Finding]:
                 f"{topic} was logged at {sample_rate(part):.1f} Hz, below the "
                 f"{threshold.value:g} Hz that the acceleration needs: motion between samples "
                 "is lost.",
-                "Set SDLOG_PROFILE to 129, which logs it at full rate.",
+                f'Put the line "{topic} 0" into etc/logging/logger_topics.txt on the SD card.',
                 {"rate_hz": sample_rate(part), "needed_hz": threshold.value, "topic": topic},
             )
     innovations = next(

@@ -192,7 +192,12 @@ def _read_fusing(topics: Topics, instances: Instances) -> pd.DataFrame | Unavail
             {name: (bits >> bit & 1).astype(float) for name, bit in CONTROL_MODE_BITS.items()},
             index=frame.index,
         )
-    return frame[["horizontal", "vertical", "yaw"]]
+    frame = frame[["horizontal", "vertical", "yaw"]].dropna()
+    if frame.empty:
+        return Unavailable(
+            "EKF2 fusion flags", f"{layout.topic} holds no usable sample", "Record again."
+        )
+    return frame
 
 
 def step_at(steps: pd.Series, times: pd.Index) -> pd.Series:
@@ -239,7 +244,33 @@ def _read_innovations(
                 "estimator_innovations or ekf2_innovations sample while external vision was fused",
                 "Record with SDLOG_PROFILE 129 (default and vision).",
             )
-    return found, tuple(used)
+    gate = topics.log.parameters.get("EKF2_EVP_GATE", DEFAULT_GATE)
+    for topic in used:
+        if not any("timestamp_sample" in topics.tables[topic, n] for n in topics.instances(topic)):
+            notes.append(
+                f"{topic} has no time of measurement in this release: EKF2's innovations carry the "
+                "time of their publication, up to 0.2 s later"
+            )
+    return _with_rejections(found, gate), tuple(used)
+
+
+def _with_rejections(
+    found: dict[AxisName, pd.DataFrame | Unavailable], gate: float
+) -> dict[AxisName, pd.DataFrame | Unavailable]:
+    """Fill ``rejected`` where it is not logged: ν² > gate²·S, for the horizontal vector as one."""
+    judged = {}
+    for axis, frame in found.items():
+        if isinstance(frame, pd.DataFrame):
+            beyond = frame["innovation_m"] ** 2 > gate**2 * frame["innovation_variance_m2"]
+            judged[axis] = frame["rejected"].fillna(beyond.astype(float))
+    if "north" in judged and "east" in judged:
+        either = pd.concat([judged["north"], judged["east"]], axis=1).max(axis=1)
+        judged["north"] = either.reindex(judged["north"].index)
+        judged["east"] = either.reindex(judged["east"].index)
+    return {
+        axis: frame.assign(rejected=judged[axis]) if isinstance(frame, pd.DataFrame) else frame
+        for axis, frame in found.items()
+    }
 
 
 def _group(axis: AxisName) -> str:

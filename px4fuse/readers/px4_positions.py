@@ -34,6 +34,7 @@ from px4fuse.readers.px4_topics import (
 from px4fuse.readers.ulog_topics import Topics
 
 MIN_TRACK_SAMPLES = 3
+DEFAULT_PREDICT_US = 10_000.0  # EKF2_PREDICT_US, ekf2_params.c
 EARTH_RADIUS_M = 6_371_000.0  # PX4's CONSTANTS_RADIUS_OF_EARTH, src/lib/geo/geo.h
 GPS_3D_FIX = 3
 AID_SOURCE = "estimator_aid_src_ev_pos"
@@ -49,7 +50,7 @@ def read_positions(
     instances = NO_SELECTOR if isinstance(ekf2, Unavailable) else ekf2.instances
     candidates = [_read_logged(topics, source, instances) for source in TRACKS]
     candidates.append(_read_aid_observation(topics, instances))
-    candidates.append(_reconstruct(ekf2))
+    candidates.append(_reconstruct(topics, ekf2))
     candidates.append(_read_gps(topics))
     tracks = tuple(track for track in candidates if isinstance(track, PositionTrack))
     missing = tuple(track for track in candidates if isinstance(track, Unavailable))
@@ -122,9 +123,11 @@ def _read_aid_observation(topics: Topics, instances: Instances) -> PositionTrack
             tolerance=1e-4,  # type: ignore[arg-type]
         )  # fmt: skip
         used.append(vertical.topic)
-    # EKF2 stamps its buffer entries EKF2_EV_DELAY earlier than the sender did
-    delay_s = topics.log.parameters.get("EKF2_EV_DELAY", 0.0) * 1e-3
-    samples.index = pd.Index(samples.index.to_numpy() + delay_s, name="time_s")
+    # EKF2 stamps its buffer entries earlier than the sender did: by EKF2_EV_DELAY and by half its
+    # update period (estimator_interface.cpp)
+    half_period_s = topics.log.parameters.get("EKF2_PREDICT_US", DEFAULT_PREDICT_US) * 0.5e-6
+    lead_s = _delay_s(topics) + half_period_s
+    samples.index = pd.Index(samples.index.to_numpy() + lead_s, name="time_s")
     return _finished(
         PositionTrack(
             AID_SOURCE, 5, "the observations that EKF2 kept of external vision", samples, "NED",
@@ -134,7 +137,12 @@ def _read_aid_observation(topics: Topics, instances: Instances) -> PositionTrack
     )  # fmt: skip
 
 
-def _reconstruct(ekf2: Ekf2 | Unavailable) -> PositionTrack | Unavailable:
+def _delay_s(topics: Topics) -> float:
+    """EKF2_EV_DELAY, by which EKF2 takes a sample to be older than its stamp."""
+    return topics.log.parameters.get("EKF2_EV_DELAY", 0.0) * 1e-3
+
+
+def _reconstruct(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack | Unavailable:
     """Position = EKF2's state + innovation (measurement - state), at the innovation's time.
 
     The innovation may be as old as one interval of the source, so the times are late by up to
@@ -154,11 +162,11 @@ def _reconstruct(ekf2: Ekf2 | Unavailable) -> PositionTrack | Unavailable:
     samples = pd.DataFrame({"north_m": tracks["north_m"], "east_m": tracks["east_m"]})
     if "down_m" in tracks:
         samples["down_m"] = tracks["down_m"].reindex(samples.index, method="nearest", tolerance=0.1)
-    samples.index.name = "time_s"
+    samples.index = pd.Index(samples.index.to_numpy() + _delay_s(topics), name="time_s")
     return _finished(
         PositionTrack(
             RECONSTRUCTION, 6, "EKF2's position plus its innovation", samples, "NED",
-            "EKF2's own time; late by up to one interval of the source", True,
+            "EKF2's time plus EKF2_EV_DELAY; late by up to one interval of the source", True,
             ("vehicle_local_position", *ekf2.innovation_topics),
         ),
         POSITION_COLUMNS[:2],

@@ -21,7 +21,7 @@ def write_all(contents: Mapping[Path, bytes]) -> None:
     Raises
     ------
     OutputError
-        A target cannot be written; then none was replaced.
+        A target cannot be written; none was replaced, unless renaming itself failed half-way.
     """
     temporary: dict[Path, Path] = {}
     try:
