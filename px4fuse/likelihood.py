@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.stats import chi2
 
+from px4fuse.consistency import GATE_SIGMA
 from px4fuse.kalman import (
     INITIAL_SIGMA_P_M,
     INITIAL_SIGMA_V_M_S,
@@ -139,8 +140,6 @@ def innovations(
     return nu, s
 
 
-# Innovations beyond this many √S are outliers, as in EKF2_EVP_GATE's default.
-GATE_SIGMA = 5.0
 MAX_PASSES = 4
 MAX_OUTLIER_SHARE = 0.25
 # The grid on which the measurement noise that the data ask for is sought.

@@ -113,7 +113,7 @@ FUSING = (
 # estimator_status.control_mode_flags, msg/EstimatorStatus.msg
 CONTROL_MODE_BITS: Mapping[str, int] = {"horizontal": 12, "yaw": 13, "vertical": 14}
 
-_AID_OPTIONAL = {"fused": "fused", "rejected": "innovation_rejected", "enabled": "fusion_enabled"}
+_AID_OPTIONAL = {"fused": "fused", "rejected": "innovation_rejected"}
 
 
 def _aid(index: str) -> dict[str, str]:
