@@ -145,9 +145,11 @@ def choose_source(flight: Flight, name: str | None = None) -> tuple[PositionTrac
         if gps
         else "S"
     )
+    damaged = "the file is damaged, and " if any("damaged" in n for n in flight.log.notes) else ""
     raise MissingDataError(
-        f"{flight.log.name}: no external position in this log (no vehicle_visual_odometry, motion "
-        f"capture or EKF2 innovations of external vision). {hint}et SDLOG_PROFILE to 129 and send "
+        f"{flight.log.name}: {damaged}no external position in this log (no "
+        "vehicle_visual_odometry, motion capture or EKF2 innovations of external vision). "
+        f"{hint}et SDLOG_PROFILE to 129 and send "
         "the UWB position to PX4 as VISION_POSITION_ESTIMATE."
     )
 
@@ -208,15 +210,19 @@ def choose_segment(
             text for text, value in (("--start", start_s), ("--end", end_s)) if value is not None
         ]
         reason = f"chosen with {' and '.join(given)}"
+        inside = max(low, 0.0), min(high, flight.log.duration_s)
+        if inside != (low, high) and inside[0] < inside[1]:
+            low, high = inside
+            reason += ", cut at the ends of the data"
     if not low < high:
         raise SettingsError(
-            f"{flight.log.name}: the segment from {low:.2f} s to {high:.2f} s is empty; the "
+            f"{flight.log.name}: the segment from {low:.6g} s to {high:.6g} s is empty; the "
             f"position source runs from {source_start:.2f} s to {source_end:.2f} s."
         )
-    inside = np.count_nonzero((track.samples.index >= low) & (track.samples.index <= high))
-    if inside < MIN_MEASUREMENTS:
+    count = np.count_nonzero((track.samples.index >= low) & (track.samples.index <= high))
+    if count < MIN_MEASUREMENTS:
         raise SettingsError(
-            f"{flight.log.name}: {inside} measurements of {track.name} between {low:.2f} s and "
+            f"{flight.log.name}: {count} measurements of {track.name} between {low:.2f} s and "
             f"{high:.2f} s are too few (at least {MIN_MEASUREMENTS} are needed)."
         )
     return Segment(low, high, reason)

@@ -215,3 +215,22 @@ def test_lesson_kalman_prints_the_lesson_digit_for_digit():
         "t 2.5 s: p 2.49 (true 2.50), v 0.97, sigma_p 0.082 m, sigma_v 0.137 m/s\n"
         "t 3.0 s: p 2.93 (true 3.00), v 0.92, sigma_p 0.081 m, sigma_v 0.136 m/s\n"
     )
+
+
+def test_a_name_with_stray_bytes_or_ten_thousand_characters_is_drawn(tmp_path, sample_log):
+    result = run(
+        "compare", sample_log, "--axis", "north", "--start", "20", "--end", "40",
+        "-o", tmp_path / "r.pdf", "--student", "bad\udcff", "--id", "9" * 10_000,
+    )  # fmt: skip
+    assert result.exit_code == 0, result.output
+    student = json.loads((tmp_path / "r.json").read_text(encoding="utf-8"))["student"]
+    assert student == {"name": "bad?", "id": "9" * 10_000, "notes": ""}
+
+
+def test_a_segment_beyond_the_data_is_cut_and_said_to_be(tmp_path, sample_log):
+    out = tmp_path / "r.pdf"
+    run("compare", sample_log, "--axis", "north", "--start", "-50", "--end", "500", "-o", out)
+    settings = json.loads(out.with_suffix(".json").read_text(encoding="utf-8"))["settings"]
+    assert settings["start_s"] == 0.0
+    assert 129.0 < settings["end_s"] < 130.0
+    assert "cut at the ends of the data" in settings["segment_reason"]

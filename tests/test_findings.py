@@ -173,7 +173,7 @@ FAULTS = [
         "warning",
         {"uwb": Uwb(name=ALIGNED, rung=4, rate_hz=4.0), "parameters": NO_VISION},
         evidence={"rate_hz": about(4.0), "sdlog_profile": 1.0},
-        says="vehicle_visual_odometry, the position as it arrived, is not in this log",
+        says="No vehicle_visual_odometry, the position as it arrived",
         remedy="SDLOG_PROFILE to 129",
     ),
     Fault(

@@ -73,7 +73,16 @@ def main() -> None:
     except (click.Abort, KeyboardInterrupt):
         click.echo("px4fuse: interrupted, nothing was written.", err=True)
         code = 130
-    except BrokenPipeError:  # the reader of a pipe has gone, as with | head
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        code = 1
+    except BrokenPipeError:  # the reader of a pipe has gone, as with | head; the files are written
+        _abandon_output()
+        code = 0
+    except OSError as error:
+        click.echo(f"px4fuse: the output cannot be written ({error.strerror}).", err=True)
+        _abandon_output()
+        code = 2
     sys.exit(code if isinstance(code, int) else 0)
+
+
+def _abandon_output() -> None:
+    """Send what is still buffered nowhere, so that Python does not complain at its end."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

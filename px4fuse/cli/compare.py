@@ -48,7 +48,7 @@ NOT_RECORDED = ("log", "output", "json_path", "student", "student_id", "notes", 
     default=0.1,
     show_default=True,
     metavar="S",
-    help="Prediction step DT, 0.001 to 1.",
+    help="Prediction step DT, 0.001 to 1; Q is proportional to it.",
 )
 @click.option(
     "--input",
@@ -165,7 +165,7 @@ def compare(
     for name, value in (("--start", start), ("--end", end)):
         if value is not None and not abs(value) < float("inf"):
             raise SettingsError(f"{name} {value:g} is not a finite number.")
-    person = Student(student, student_id, _read_notes(notes))
+    person = Student(_encodable(student), _encodable(student_id), _read_notes(notes))
     target = output or Path("reports") / f"{log.stem}.pdf"
     if target.suffix.lower() != ".pdf":
         raise OutputError(f"{target}: the report is a PDF. Give a name that ends in .pdf with -o.")
@@ -193,7 +193,7 @@ def compare(
 
         console = Console(highlight=False)
         print_summary(console, document)
-        console.print(f"Report   {target} (results beside it)", markup=False, style="bold")
+        console.print(f"Report   {target}", markup=False, style="bold", soft_wrap=True)
     if fail_on is not None:
         worst = SEVERITIES[: SEVERITIES.index(fail_on) + 1]
         if any(finding.severity in worst for finding in document.findings):
@@ -211,6 +211,11 @@ def _progress(json_path: Path | None) -> Iterator[Callable[[str], None]]:
         return
     with console.status("starting") as status:
         yield status.update
+
+
+def _encodable(text: str) -> str:
+    """Text without the stray bytes that a terminal may hand over."""
+    return text.encode(errors="replace").decode()
 
 
 def _read_notes(path: Path | None) -> str:
@@ -236,7 +241,7 @@ def _read_notes(path: Path | None) -> str:
 def _command_line(log: Path) -> str:
     """The command that makes this report again: what was given, without folders and names."""
     context = click.get_current_context()
-    words = ["px4fuse", "compare", log.name]
+    words = ["px4fuse", "compare", _encodable(log.name)]
     for parameter in context.command.params:
         name = parameter.name or ""
         given = context.get_parameter_source(name) == ParameterSource.COMMANDLINE

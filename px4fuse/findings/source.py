@@ -32,10 +32,18 @@ def source_reconstructed(comparison: Comparison) -> Iterator[Finding]:
     if source.rung not in (4, 5, 6) or logged:
         return
     profile = int(comparison.flight.log.parameters.get("SDLOG_PROFILE", 1))
+    why = next(
+        (
+            part.reason
+            for part in comparison.missing
+            if part.what == "position source vehicle_visual_odometry"
+        ),
+        "it is not in this log",
+    )
     yield Finding(
         "source_not_logged",
         "warning",
-        "vehicle_visual_odometry, the position as it arrived, is not in this log; "
+        f"No vehicle_visual_odometry, the position as it arrived ({why}); "
         f"{source.name} ({source.description}) stands in for it at {source.rate_hz:.1f} Hz.",
         f"Set SDLOG_PROFILE to {profile | VISION_PROFILE_BIT} and fly again.",
         {"rate_hz": source.rate_hz, "sdlog_profile": float(profile)},

@@ -199,11 +199,12 @@ def read_topics(path: Path) -> Topics:
     if not tables:
         raise LogError(
             f"{path.name}: a ULog without any of the topics that px4fuse uses "
-            "(no IMU, no position, no EKF2). Record with SDLOG_PROFILE 129."
+            "(no IMU, no position, no EKF2). If it is cut short, copy it again; else record with "
+            "SDLOG_PROFILE 129."
         )
     zero_us, end_us = _data_span(tables, path.name)
     log = LogInfo(
-        name=path.name,
+        name=path.name.encode(errors="replace").decode(),
         sha256=hashlib.sha256(content).hexdigest(),
         size_bytes=len(content),
         format="ULog",

@@ -50,8 +50,8 @@ def draw(document: Document) -> Iterator[Figure]:
     for row, result in zip(grid, comparison.axes, strict=True):
         series = _normalised(result)
         if not series:
-            for axes in row:
-                empty(axes, _reason(result))
+            for axes, reason in zip(row, (_reason(result), "", ""), strict=True):
+                empty(axes, f"{result.axis.name}: {reason}" if reason else "")
             continue
         _running_nis(row[0], result, series)
         _histogram(row[1], series)

@@ -173,12 +173,7 @@ def wrap(text: str, size: float, width_points: float, weight: str = "normal") ->
             if line:
                 lines.append(line)
             line = word
-            while text_width(line, size, weight) > width_points:
-                fitting = next(
-                    n
-                    for n in range(len(line) - 1, 0, -1)
-                    if n == 1 or text_width(line[:n], size, weight) <= width_points
-                )
+            while (fitting := _fitting(line, size, width_points, weight)) < len(line):
                 lines.append(line[:fitting])
                 line = line[fitting:]
         lines.append(line)
@@ -188,11 +183,19 @@ def wrap(text: str, size: float, width_points: float, weight: str = "normal") ->
 def shorten(text: str, size: float, width_points: float, weight: str = "normal") -> str:
     """One line that fits, with an ellipsis where it was cut."""
     text = " ".join(text.split())
-    if text_width(text, size, weight) <= width_points:
+    if _fitting(text, size, width_points, weight) == len(text):
         return text
-    while text and text_width(text + "…", size, weight) > width_points:
-        text = text[:-1]
-    return text + "…"
+    return text[: _fitting(text, size, width_points - size, weight)] + "…"
+
+
+def _fitting(text: str, size: float, width_points: float, weight: str) -> int:
+    """How many characters of a text fit, at least one."""
+    width = 0.0
+    for count, character in enumerate(text):
+        width += text_width(character, size, weight)
+        if width > width_points:
+            return max(count, 1)
+    return len(text)
 
 
 @dataclass

@@ -15,7 +15,7 @@ from px4fuse.flight import Unavailable
 from px4fuse.report.document import Document
 from px4fuse.report.words import settings_words, verdict_words
 
-MOST_FINDINGS = 5
+MOST_FINDINGS = 4
 # the screen shows the beginning of a long line; the report has it whole
 ONE_LINE: dict[str, Any] = {"no_wrap": True, "overflow": "ellipsis", "crop": True}
 STYLES: dict[Severity, str] = {"error": "bold red", "warning": "yellow", "info": "cyan"}
@@ -42,6 +42,7 @@ def print_summary(console: Console, document: Document) -> None:
     segment = comparison.segment
     _line(console, "Segment", f"{segment.start_s:.1f} s to {segment.end_s:.1f} s, {segment.reason}")
     console.print(_table(document))
+    console.print(Text("vs: RMSE of position (m), velocity (m/s). NIS 1 is consistent.", "dim"))
     if not document.findings:
         console.print(Text("No findings."))
     for finding in document.findings[:MOST_FINDINGS]:
@@ -70,13 +71,11 @@ def _table(document: Document) -> Table:
                 "", "EKF2", *_statement(result.ekf2), "",
                 *([_errors(result.ekf2_truth)] if truth else []),
             )  # fmt: skip
-    table.caption = "vs: RMSE of position (m), velocity (m/s). NIS 1 is consistent."
-    table.caption_justify = "left"
     return table
 
 
 def _line(console: Console, label: str, text: str) -> None:
-    console.print(Text(f"{label:9}", style="bold").append(text, style="none"))
+    console.print(Text(f"{label:9}", style="bold").append(text, style="none"), **ONE_LINE)
 
 
 def _statement(summary: FilterSummary) -> tuple[str, str, Text]:

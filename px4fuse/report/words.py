@@ -23,5 +23,4 @@ def verdict_words(statement: Consistency | Unavailable) -> str:
     if statement.verdict == "consistent":
         return "consistent"
     factor = max(statement.variance_factor, 1.0 / statement.variance_factor)
-    size = f"{factor:.3g}" if factor < 1000.0 else f"{factor:.0f}"
-    return f"{statement.verdict.removeprefix('variance ')} {size}×"
+    return f"{statement.verdict.removeprefix('variance ')} {factor:.3g}×"
