@@ -22,6 +22,8 @@ from numpy.typing import NDArray
 
 AxisName = Literal["north", "east", "down"]
 AXIS_NAMES: tuple[AxisName, AxisName, AxisName] = ("north", "east", "down")
+# Rungs of the ladder of position sources that are external vision, which EKF2 can fuse
+EXTERNAL_VISION_RUNGS = (2, 4, 5, 6)
 POSITION_COLUMNS = ["north_m", "east_m", "down_m"]
 VELOCITY_COLUMNS = ["north_m_s", "east_m_s", "down_m_s"]
 POSITION_VARIANCE_COLUMNS = ["north_m2", "east_m2", "down_m2"]

@@ -6,6 +6,7 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.flight import (
+    EXTERNAL_VISION_RUNGS,
     POSITION_COLUMNS,
     POSITION_VARIANCE_COLUMNS,
     VELOCITY_COLUMNS,
@@ -21,8 +22,6 @@ from px4fuse.signals import AISLE, Array, Axis, Segment, along, within
 # EKF2 never trusts external vision better than this (ev_pos_control.cpp, EKF2.cpp)
 EKF2_MIN_NOISE_M = 0.01
 MIN_COMMON_SAMPLES = 3
-# Rungs of the ladder that are external vision, the only source whose innovations are read
-EXTERNAL_VISION_RUNGS = (2, 4, 5, 6)
 # Undoing resets must bring EKF2 this much closer to the measurements (median squared distance);
 # below that the published output, which the vehicle flew on, stands.
 CLEARLY_CLOSER = 0.95

@@ -16,8 +16,7 @@ from px4fuse.findings.thresholds import (
     REJECTED_SHARE_ERROR,
     REJECTED_SHARE_WARNING,
 )
-from px4fuse.flight import Ekf2, Unavailable
-from px4fuse.projection import EXTERNAL_VISION_RUNGS
+from px4fuse.flight import EXTERNAL_VISION_RUNGS, Ekf2, Unavailable
 
 
 def ekf2_unavailable(comparison: Comparison) -> Iterator[Finding]:

@@ -23,6 +23,7 @@ from px4fuse.findings.thresholds import (
     VISION_PROFILE_BIT,
 )
 from px4fuse.flight import POSITION_COLUMNS, Ekf2, Unavailable, sample_rate
+from px4fuse.signals import within
 
 
 def source_reconstructed(comparison: Comparison) -> Iterator[Finding]:
@@ -136,10 +137,7 @@ def gaps(comparison: Comparison) -> Iterator[Finding]:
 
 def no_motion(comparison: Comparison) -> Iterator[Finding]:
     """The vehicle hardly moved: nothing about dynamics can be identified."""
-    samples = comparison.source.samples
-    inside = samples[
-        (samples.index >= comparison.segment.start_s) & (samples.index <= comparison.segment.end_s)
-    ]
+    inside = within(comparison.source.samples, comparison.segment)
     low, high = inside[POSITION_COLUMNS[:2]].quantile([0.05, 0.95]).to_numpy()
     extent = float(np.max(high - low))
     if extent < MOTION_RANGE.value:

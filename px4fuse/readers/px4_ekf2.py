@@ -96,7 +96,7 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
         fusing=fusing,
         resets=read_resets(local),
         instances=instances,
-        gate=parameters.get("EKF2_EVP_GATE", DEFAULT_GATE),
+        gate=_gate(topics),
         notes=tuple(notes),
     )
 
@@ -244,14 +244,17 @@ def _read_innovations(
                 "estimator_innovations or ekf2_innovations sample while external vision was fused",
                 "Record with SDLOG_PROFILE 129 (default and vision).",
             )
-    gate = topics.log.parameters.get("EKF2_EVP_GATE", DEFAULT_GATE)
     for topic in used:
         if not any("timestamp_sample" in topics.tables[topic, n] for n in topics.instances(topic)):
             notes.append(
                 f"{topic} has no time of measurement in this release: EKF2's innovations carry the "
                 "time of their publication, up to 0.2 s later"
             )
-    return _with_rejections(found, gate), tuple(used)
+    return _with_rejections(found, _gate(topics)), tuple(used)
+
+
+def _gate(topics: Topics) -> float:
+    return topics.log.parameters.get("EKF2_EVP_GATE", DEFAULT_GATE)
 
 
 def _with_rejections(

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from px4fuse.flight import (
     AXIS_NAMES,
+    EXTERNAL_VISION_RUNGS,
     POSITION_COLUMNS,
     POSITION_VARIANCE_COLUMNS,
     VELOCITY_COLUMNS,
@@ -283,7 +284,7 @@ def read_truth(topics: Topics, positions: tuple[PositionTrack, ...]) -> Truth | 
                 index=geo.index,
             ).join(geo.reindex(columns=VELOCITY_COLUMNS))
             return Truth(layout.topic, samples)
-    fed = any(track.rung in (2, 4, 5, 6) for track in positions)
+    fed = any(track.rung in EXTERNAL_VISION_RUNGS for track in positions)
     for track in positions:
         if track.name == "vehicle_mocap_odometry" and fed:
             return Truth(
