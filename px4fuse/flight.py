@@ -64,6 +64,150 @@ class Dropout:
 
 
 @dataclass(frozen=True)
+class Sender:
+    """One MAVLink sender that a recording heard.
+
+    Attributes
+    ----------
+    system, component : int
+        MAVLink ids.
+    description : str
+        What it says it is ("PX4 quadrotor", "companion computer").
+    messages : int
+        Messages with a good checksum.
+    lost_share : float
+        Share of its messages that the recording lacks, from the sequence numbers.
+    chosen : bool
+        Whether it is the autopilot that the flight was read from.
+    """
+
+    system: int
+    component: int
+    description: str
+    messages: int
+    lost_share: float
+    chosen: bool
+
+
+@dataclass(frozen=True)
+class ClockMap:
+    """How one clock was mapped to the autopilot's boot clock.
+
+    boot = stamp + offset + drift · (stamp - middle of the stamps)
+
+    Attributes
+    ----------
+    clock : str
+        Which clock ("UNIX time of system 1, component 197").
+    method : str
+        "TIMESYNC", "SYSTEM_TIME", "receive time" or "position in the stream".
+    pairs : int
+        Pairs of readings that it rests on.
+    offset_s : float
+        Boot clock minus this clock, at the middle of the pairs.
+    drift_ppm : float
+        How much faster the boot clock runs (parts per million).
+    jitter_s : float
+        Standard deviation of the pairs about the fitted line (1.4826 · median absolute deviation).
+    note : str
+        What to keep in mind; may be empty.
+    """
+
+    clock: str
+    method: str
+    pairs: int
+    offset_s: float
+    drift_ppm: float
+    jitter_s: float
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class Stream:
+    """Where one part of a flight was read from.
+
+    Attributes
+    ----------
+    topics : tuple of str
+        PX4 topics or MAVLink messages.
+    clock : str
+        Which clock its time stamps were given on.
+    log : str
+        Name of the file.
+    """
+
+    topics: tuple[str, ...]
+    clock: str
+    log: str
+
+
+@dataclass(frozen=True)
+class Unused:
+    """Something in the log that bears on position but that px4fuse does not use, and why."""
+
+    name: str
+    count: int
+    reason: str
+
+
+@dataclass(frozen=True)
+class InputFile:
+    """A file that was read beside the log: name without its folder, hash, size, and its part."""
+
+    name: str
+    sha256: str
+    size_bytes: int
+    role: str
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """How an external position file was placed into the flight.
+
+    A position p of the file becomes origin + Rz(yaw) · C · p, where C turns its frame into NED.
+
+    Attributes
+    ----------
+    frame, frame_reason : str
+        "ned", "enu" or "nwu", and why.
+    yaw_deg : float
+        Rotation about down, clockwise seen from above, applied after the frame.
+    yaw_sigma_deg : float or None
+        Its standard deviation where it was estimated.
+    yaw_reason : str
+    origin_m : tuple of float
+        Added after the rotation, NED.
+    clock_offset_s : float
+        Added to the file's time stamps to give the autopilot's boot clock.
+    clock_offset_sigma_s : float or None
+        Its standard deviation where it was estimated.
+    clock_reason : str
+    reference : str
+        What it was matched with: "EKF2 position", "IMU", or "" where nothing was.
+    correlation : float or None
+        Of the file's track with the reference after alignment (1 is perfect).
+    residual_rms_m : float or None
+        Horizontal, root mean square per axis; None where the reference has no position.
+    warnings : tuple of str
+        What is poorly determined, each a sentence.
+    """
+
+    frame: str
+    frame_reason: str
+    yaw_deg: float
+    yaw_sigma_deg: float | None
+    yaw_reason: str
+    origin_m: tuple[float, float, float]
+    clock_offset_s: float
+    clock_offset_sigma_s: float | None
+    clock_reason: str
+    reference: str
+    correlation: float | None
+    residual_rms_m: float | None
+    warnings: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
 class LogInfo:
     """What the log is.
 
@@ -75,7 +219,7 @@ class LogInfo:
         Of the file's bytes.
     size_bytes : int
     format : str
-        "ULog".
+        "ULog", "MAVLink tlog" (with time of receipt) or "MAVLink stream" (without).
     firmware : str
         For example "PX4 v1.16.1"; "unknown" where the log does not say.
     firmware_hash : str
@@ -92,6 +236,12 @@ class LogInfo:
         Parameters that bear on fusion and logging, by PX4 name, as they were at the log's start.
     notes : tuple of str
         What the reader had to do: corruption passed over, samples with impossible time stamps.
+    autopilot : str
+        "PX4", "ArduPilot", or what the log says.
+    start_unix_s : float or None
+        UNIX time of time zero, by whichever clock the log has it from; None where it has none.
+    senders : tuple of Sender
+        Of a MAVLink recording, most messages first.
     """
 
     name: str
@@ -106,6 +256,9 @@ class LogInfo:
     dropouts: tuple[Dropout, ...] = ()
     parameters: Mapping[str, float] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    autopilot: str = "PX4"
+    start_unix_s: float | None = None
+    senders: tuple[Sender, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -117,7 +270,8 @@ class PositionTrack:
     name : str
         The name that ``--position-source`` takes; the PX4 topic where there is one.
     rung : int
-        Place in the ladder of sources (2 is best in a ULog); see the README.
+        Place in the ladder of sources (1 is a file given with ``--position``, 2 the best that a
+        log holds); see the README.
     description : str
         What it is, for a person.
     samples : DataFrame, shape (n, 6)
@@ -130,7 +284,11 @@ class PositionTrack:
     reconstructed : bool
         Whether it was derived from EKF2's own output instead of being logged as it arrived.
     topics : tuple of str
-        The topics that it was read from.
+        The topics or messages that it was read from.
+    log : str
+        Name of the file that it was read from.
+    alignment : Alignment or None
+        Of a track from a file of its own.
     """
 
     name: str
@@ -141,6 +299,8 @@ class PositionTrack:
     clock: str
     reconstructed: bool
     topics: tuple[str, ...]
+    log: str = ""
+    alignment: Alignment | None = None
 
     @property
     def rate_hz(self) -> float:
@@ -240,6 +400,15 @@ class Flight:
         Stretches (s) in which the land detector says that the vehicle flies; empty if never.
     missing : tuple of Unavailable
         What was looked for and not found, with the remedy.
+    streams : mapping from part to Stream
+        Where each part was read from: "imu", "attitude", "ekf2_state", "ekf2_variance",
+        "ekf2_innovations", "ekf2_fusing", "truth", "airborne", as far as there is one.
+    clocks : tuple of ClockMap
+        Clocks other than the autopilot's that were mapped to it.
+    unused : tuple of Unused
+        What the log holds besides, and why it is not used.
+    inputs : tuple of InputFile
+        Files read beside the log.
     """
 
     log: LogInfo
@@ -250,6 +419,10 @@ class Flight:
     truth: Truth | Unavailable
     airborne: tuple[tuple[float, float], ...] | Unavailable
     missing: tuple[Unavailable, ...] = ()
+    streams: Mapping[str, Stream] = field(default_factory=dict)
+    clocks: tuple[ClockMap, ...] = ()
+    unused: tuple[Unused, ...] = ()
+    inputs: tuple[InputFile, ...] = ()
 
 
 def finite_rows(samples: pd.DataFrame, columns: list[str]) -> pd.DataFrame:
