@@ -21,9 +21,12 @@ import pandas as pd
 from numpy.typing import NDArray
 
 AxisName = Literal["north", "east", "down"]
+# Below this share of intervals near the median, samples come in bursts
+BURST_SHARE = 0.8
 AXIS_NAMES: tuple[AxisName, AxisName, AxisName] = ("north", "east", "down")
-# Rungs of the ladder of position sources that are external vision, which EKF2 can fuse
-EXTERNAL_VISION_RUNGS = (2, 4, 5, 6)
+# Rungs of the ladder of position sources that are external vision, which EKF2 can fuse; a file
+# given by hand is taken to be of the system that was sent to it
+EXTERNAL_VISION_RUNGS = (1, 2, 4, 5, 6)
 POSITION_COLUMNS = ["north_m", "east_m", "down_m"]
 VELOCITY_COLUMNS = ["north_m_s", "east_m_s", "down_m_s"]
 POSITION_VARIANCE_COLUMNS = ["north_m2", "east_m2", "down_m2"]
@@ -75,8 +78,9 @@ class Sender:
         What it says it is ("PX4 quadrotor", "companion computer").
     messages : int
         Messages with a good checksum.
-    lost_share : float
-        Share of its messages that the recording lacks, from the sequence numbers.
+    lost_share : float or None
+        Share of its messages that the recording lacks, by the sequence numbers; None where it
+        does not count them.
     chosen : bool
         Whether it is the autopilot that the flight was read from.
     """
@@ -85,7 +89,7 @@ class Sender:
     component: int
     description: str
     messages: int
-    lost_share: float
+    lost_share: float | None
     chosen: bool
 
 
@@ -111,6 +115,8 @@ class ClockMap:
         Standard deviation of the pairs about the fitted line (1.4826 · median absolute deviation).
     note : str
         What to keep in mind; may be empty.
+    distinct_stamps : int or None
+        How many values the stamps take where those do not tell the time.
     """
 
     clock: str
@@ -120,6 +126,7 @@ class ClockMap:
     drift_ppm: float
     jitter_s: float
     note: str = ""
+    distinct_stamps: int | None = None
 
 
 @dataclass(frozen=True)
@@ -228,8 +235,8 @@ class LogInfo:
     boot_time_s : float
         Boot clock (s) of time zero, the first sample of data.
     duration_s : float
-        Span of the data (of the IMU, or else of the densest topic), not of the file: some logs
-        carry one stale message hours away.
+        Span of the data, not of the file: some logs carry one stale message hours away. In a ULog
+        of the IMU (or else of the densest topic), in MAVLink of what carries the boot clock.
     dropouts : tuple of Dropout
         As the logger itself reported them.
     parameters : mapping
@@ -287,6 +294,8 @@ class PositionTrack:
         The topics or messages that it was read from.
     log : str
         Name of the file that it was read from.
+    clock_map : ClockMap or None
+        How the sender's clock was mapped to the autopilot's, where that was done here.
     alignment : Alignment or None
         Of a track from a file of its own.
     """
@@ -300,6 +309,7 @@ class PositionTrack:
     reconstructed: bool
     topics: tuple[str, ...]
     log: str = ""
+    clock_map: ClockMap | None = None
     alignment: Alignment | None = None
 
     @property
@@ -435,9 +445,13 @@ def sample_rate(samples: pd.DataFrame) -> float:
     """Rate of a time-indexed frame in Hz, gaps left out; NaN below two samples.
 
     From the mean of all intervals up to three times the median one: a thinned topic alternates
-    between two intervals, of which the median knows only one.
+    between two intervals, of which the median knows only one. Samples that come in bursts have no
+    regular interval, so that all of them count.
     """
     if len(samples) < 2:
         return float("nan")
     intervals = samples.index.to_series().diff().dropna()
-    return float(1.0 / intervals[intervals <= 3.0 * intervals.median()].mean())
+    regular = intervals[intervals <= 3.0 * intervals.median()]
+    if len(regular) < BURST_SHARE * len(intervals):
+        regular = intervals
+    return float(1.0 / regular.mean())

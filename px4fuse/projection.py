@@ -211,7 +211,8 @@ def observation_variance(
     if "EKF2_EVP_NOISE" not in parameters:
         return float("nan")
     r = max(parameters["EKF2_EVP_NOISE"], EKF2_MIN_NOISE_M) ** 2
-    if parameters.get("EKF2_EV_NOISE_MD") == 1.0:
+    # what a file of its own reports is not what EKF2 was sent
+    if parameters.get("EKF2_EV_NOISE_MD") == 1.0 or track.alignment is not None:
         return r
     reported = within(track.samples, segment)[POSITION_VARIANCE_COLUMNS].median()
     reported_along = float(np.nansum(reported.to_numpy() * axis.direction**2))

@@ -34,14 +34,17 @@ IMU_GAP_INTERVALS = 5.0
 MIN_MEASUREMENTS = 3
 # The GPS rung is taken only when asked for.
 LAST_AUTOMATIC_RUNG = 6
-# The ladder's names short of GPS, best first
-LADDER = (
-    "vehicle_visual_odometry",
-    "vehicle_mocap_odometry",
-    "estimator_visual_odometry_aligned",
-    "estimator_aid_src_ev_pos",
-    "ekf2_state_plus_innovation",
-)
+# Rung of each name of the ladder short of GPS: PX4's topics, then MAVLink's messages
+LADDER = {
+    "vehicle_visual_odometry": 2,
+    "vehicle_mocap_odometry": 3,
+    "estimator_visual_odometry_aligned": 4,
+    "estimator_aid_src_ev_pos": 5,
+    "ekf2_state_plus_innovation": 6,
+    "VISION_POSITION_ESTIMATE": 2,
+    "ODOMETRY": 2,
+    "ATT_POS_MOCAP": 3,
+}
 
 
 @dataclass(frozen=True)
@@ -139,27 +142,41 @@ def choose_source(flight: Flight, name: str | None = None) -> tuple[PositionTrac
     for track in flight.positions:
         if track.rung <= LAST_AUTOMATIC_RUNG:
             return track, _ladder_reason(flight, track)
+    raise MissingDataError(_no_source(flight))
+
+
+def _no_source(flight: Flight) -> str:
+    damaged = "the file is damaged, and " if any("damaged" in n for n in flight.log.notes) else ""
+    if flight.log.format.startswith("MAVLink"):
+        return (
+            f"{flight.log.name}: {damaged}no external position was sent to the autopilot in this "
+            "recording (no VISION_POSITION_ESTIMATE, ODOMETRY or ATT_POS_MOCAP). Give the "
+            "positioning system's own file with --position, or the ULog; px4fuse info says what "
+            "is in it."
+        )
     gps = any(track.rung > LAST_AUTOMATIC_RUNG for track in flight.positions)
     hint = (
         "Only GPS is in it: give --position-source vehicle_gps_position to use that, or s"
         if gps
         else "S"
     )
-    damaged = "the file is damaged, and " if any("damaged" in n for n in flight.log.notes) else ""
-    raise MissingDataError(
+    return (
         f"{flight.log.name}: {damaged}no external position in this log (no "
         "vehicle_visual_odometry, motion capture or EKF2 innovations of external vision). "
-        f"{hint}et SDLOG_PROFILE to 129 and send "
-        "the UWB position to PX4 as VISION_POSITION_ESTIMATE."
+        f"{hint}et SDLOG_PROFILE to 129 and send the UWB position to PX4 as "
+        "VISION_POSITION_ESTIMATE, or give the UWB's own file with --position."
     )
 
 
 def _ladder_reason(flight: Flight, track: PositionTrack) -> str:
-    missing = {part.what.removeprefix("position source ") for part in flight.missing}
-    lacking = [name for name in LADDER[: LADDER.index(track.name)] if name in missing]
+    if track.rung == 1:
+        return "given with --position"
+    whence = f" (from {track.log})" if track.log and track.log != flight.log.name else ""
+    missing = [part.what.removeprefix("position source ") for part in flight.missing]
+    lacking = [name for name in missing if LADDER.get(name, LAST_AUTOMATIC_RUNG) < track.rung]
     if not lacking:
-        return "the best source: logged as it arrived"
-    return f"the best that this log has; no usable {', '.join(lacking)}"
+        return f"the best source: logged as it arrived{whence}"
+    return f"the best that this log has{whence}; no usable {', '.join(lacking)}"
 
 
 def shift_clock(track: PositionTrack, clock_offset_s: float) -> PositionTrack:

@@ -4,19 +4,24 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from px4fuse.errors import LogError
+from px4fuse.errors import LogError, SettingsError
 from px4fuse.flight import Flight
 
 _SNIFF_BYTES = 16
+ULOG_MAGIC = b"\x55\x4c\x6f\x67\x01\x12\x35"
+DATAFLASH_MAGIC = b"\xa3\x95"  # libraries/AP_Logger/LogStructure.h
 
 
-def read_log(path: str | Path) -> Flight:
+def read_log(path: str | Path, *, system: int | None = None) -> Flight:
     """Read a flight log of any supported format.
 
     Parameters
     ----------
     path : str or Path
-        A PX4 ULog (``.ulg``); the format is recognised by content.
+        A PX4 ULog (``.ulg``) or a MAVLink recording (``.tlog`` or a raw stream); the format is
+        recognised by content.
+    system : int, optional
+        MAVLink system id of the vehicle; by default the autopilot with the most messages.
 
     Returns
     -------
@@ -26,6 +31,8 @@ def read_log(path: str | Path) -> Flight:
     ------
     LogError
         The file is missing, empty, of an unknown format, or holds no usable data.
+    SettingsError
+        ``system`` is not in the recording, or the log is a ULog, which has no systems.
     """
     path = Path(path)
     try:
@@ -35,12 +42,18 @@ def read_log(path: str | Path) -> Flight:
         raise LogError(f"{path.name}: cannot be read ({error.strerror}).") from error
     if not head:
         raise LogError(f"{path.name}: the file is empty. Copy it from the vehicle again.")
-    # each reader is imported when its format is met: pyulog costs time
-    from px4fuse.readers import ulog  # noqa: PLC0415
+    # each reader is imported when its format is met: pyulog and pymavlink cost time
+    if head.startswith(ULOG_MAGIC):
+        if system is not None:
+            raise SettingsError(f"{path.name}: --system is for MAVLink recordings; this is a ULog.")
+        from px4fuse.readers.ulog import read_ulog  # noqa: PLC0415
 
-    if head.startswith(ulog.MAGIC):
-        return ulog.read_ulog(path)
-    raise LogError(
-        f"{path.name}: not a PX4 ULog (its first bytes are not ULog's). "
-        "Give the .ulg file that PX4 wrote on its SD card."
-    )
+        return read_ulog(path)
+    if head.startswith(DATAFLASH_MAGIC):
+        raise LogError(
+            f"{path.name}: an ArduPilot DataFlash log, which px4fuse does not read. Give a PX4 "
+            "ULog, or the .tlog that the ground station wrote."
+        )
+    from px4fuse.readers.mavlink import read_mavlink  # noqa: PLC0415
+
+    return read_mavlink(path, system)

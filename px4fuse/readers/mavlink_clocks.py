@@ -1,0 +1,247 @@
+"""Clocks of a MAVLink recording: boot time, the senders' own clocks, and the time of receipt.
+
+A message is received later than it was stamped, by a delay that is never negative and often
+large, so that two clocks are mapped by the lower envelope of their difference: the messages that
+were hardly delayed. TIMESYNC pairs (MAVLink "Time Synchronization Protocol v2") are mapped the
+same way.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import theilslopes
+
+from px4fuse.flight import ClockMap
+
+Array = NDArray[np.float64]
+
+# Stamps within this of the boot clock at their receipt are taken to be on the boot clock
+SAME_CLOCK_S = 10.0
+# 2001-09-09: below this, microseconds count from boot, above from 1970
+UNIX_FROM_S = 1e9
+# The envelope takes the least delayed message of each stretch of this length
+ENVELOPE_S = 2.0
+MAX_STRETCHES = 200
+# A drift is stated from this span on; below, both clocks are taken to run alike
+MIN_DRIFT_SPAN_S = 30.0
+# but a recording replayed at another speed shows at once
+OTHER_SPEED = 0.01
+MIN_PAIRS = 3
+# A clock whose stamps take fewer values than this share of its messages does not tell the time
+MIN_DISTINCT_SHARE = 0.1
+# Positions further apart than this are a gap
+MAX_INTERVAL_S = 1.0
+
+
+@dataclass(frozen=True)
+class Line:
+    """A straight line between two clocks: y = y0 + slope · (x - x0).
+
+    ``jitter`` is the standard deviation of the pairs about it, 1.4826 · median absolute
+    deviation, in the unit of y; ``pairs`` their number.
+    """
+
+    x0: float
+    y0: float
+    slope: float
+    jitter: float
+    pairs: int
+
+    def at(self, x: Array) -> Array:
+        """The other clock's reading y at readings x."""
+        return np.asarray(self.y0 + self.slope * (x - self.x0), dtype=np.float64)
+
+    def inverse(self) -> Line:
+        """The same line from y to x."""
+        return Line(self.y0, self.x0, 1.0 / self.slope, self.jitter / self.slope, self.pairs)
+
+
+def least_delay(x: Array, y: Array) -> Line:
+    """Line below which no pair lies by much: y is a reading taken a varying delay after x.
+
+    Parameters
+    ----------
+    x, y : ndarray, shape (n,), s
+        Readings of the earlier and of the later clock; n ≥ 1.
+
+    Returns
+    -------
+    Line
+        Slope 1 where the span is too short to tell a drift.
+    """
+    order = np.argsort(x, kind="stable")
+    x, y = x[order], y[order]
+    x0 = float(x[len(x) // 2])
+    span = float(x[-1] - x[0])
+    stretches = int(np.clip(span / ENVELOPE_S, 1, MAX_STRETCHES))
+    edges = np.searchsorted(x, np.linspace(x[0], x[-1], stretches + 1)[1:-1])
+    parts = [part for part in np.split(np.arange(len(x)), edges) if len(part)]
+    slope = 1.0
+    middles = [part[len(part) // 2] for part in parts]
+    if len(middles) > 1 and x[middles[-1]] > x[middles[0]]:
+        rough = float(theilslopes(y[middles], x[middles])[0])
+        slope = rough if abs(rough - 1.0) > OTHER_SPEED and rough > 0.0 else 1.0
+    residual = y - slope * (x - x0)
+    lowest = [part[np.argmin(residual[part])] for part in parts]
+    if span >= MIN_DRIFT_SPAN_S and len(lowest) > 1:
+        slope += float(theilslopes(residual[lowest], x[lowest])[0])
+        residual = y - slope * (x - x0)
+    y0 = float(np.median(residual[lowest]))
+    return Line(x0, y0, slope, spread(residual), len(x))
+
+
+def spread(values: Array) -> float:
+    """Standard deviation by 1.4826 · median absolute deviation."""
+    return float(1.4826 * np.median(np.abs(values - np.median(values))))
+
+
+@dataclass(frozen=True)
+class Exchanges:
+    """TIMESYNC readings of one sender, in s.
+
+    Attributes
+    ----------
+    replied_s, autopilot_s : ndarray, shape (n,)
+        The sender's clock when it replied, and the autopilot's when it had asked.
+    asked_s, answered_s : ndarray, shape (m,)
+        The sender's clock when it asked, and the autopilot's when it answered.
+    """
+
+    replied_s: Array
+    autopilot_s: Array
+    asked_s: Array
+    answered_s: Array
+
+
+@dataclass(frozen=True)
+class Mapped:
+    """A sender's stamps on the boot clock.
+
+    ``to_boot`` is None where the stamps do not tell the time; the time of receipt stands in then.
+    """
+
+    to_boot: Line | None
+    statement: ClockMap
+
+
+def map_clock(
+    name: str,
+    stamp_s: Array,
+    received_s: Array,
+    boot_of_receipt: Line,
+    exchanges: Exchanges,
+    unix_of_boot: Line | None,
+    *,
+    has_receipt: bool,
+) -> Mapped:
+    """Map a sender's own clock to the autopilot's boot clock by the best means there is.
+
+    Parameters
+    ----------
+    name : str
+        The sender, for a person.
+    stamp_s, received_s : ndarray, shape (n,)
+        All that the sender stamped with this clock, and when it was received.
+    boot_of_receipt : Line
+        From time of receipt to boot clock.
+    exchanges : Exchanges
+        TIMESYNC; may be empty.
+    unix_of_boot : Line or None
+        From boot clock to UNIX time by the autopilot's SYSTEM_TIME.
+    has_receipt : bool
+        Whether the recording has times of receipt, or only an order.
+
+    Returns
+    -------
+    Mapped
+    """
+    receipt = "receive time" if has_receipt else "position in the stream"
+    boot_at_receipt = boot_of_receipt.at(received_s)
+    distinct = len(np.unique(stamp_s))
+    if distinct < max(MIN_DISTINCT_SHARE * len(stamp_s), 2):
+        note = (
+            f"its {len(stamp_s)} time stamps take only {distinct} values, so the {receipt} stands "
+            "in for them"
+        )
+        # what the receipt adds to evenly sent samples; gaps are no jitter
+        intervals = np.diff(received_s)
+        regular = intervals[intervals < MAX_INTERVAL_S]
+        jitter = float(np.std(regular) / np.sqrt(2.0)) if len(regular) > 1 else 0.0
+        return Mapped(None, ClockMap(name, receipt, len(stamp_s), 0.0, 0.0, jitter, note, distinct))
+    if abs(float(np.median(boot_at_receipt - stamp_s))) <= SAME_CLOCK_S:
+        line = Line(float(stamp_s[0]), float(stamp_s[0]), 1.0, 0.0, len(stamp_s))
+        note = "its stamps are on the boot clock already"
+        return Mapped(line, ClockMap(name, "boot clock", len(stamp_s), 0.0, 0.0, 0.0, note))
+    kind = "UNIX time" if float(np.median(stamp_s)) > UNIX_FROM_S else "own clock"
+    clock = f"{kind} of {name}"
+    candidates: list[tuple[str, Line, str]] = []
+    synchronised = _by_exchange(exchanges)
+    if synchronised is not None:
+        candidates.append(("TIMESYNC", synchronised, ""))
+    if kind == "UNIX time" and unix_of_boot is not None:
+        candidates.append(
+            (
+                "SYSTEM_TIME",
+                unix_of_boot.inverse(),
+                "assumes that sender and autopilot agree on UNIX time",
+            )
+        )
+    late = least_delay(stamp_s, received_s)
+    by_receipt = Line(
+        late.x0,
+        float(boot_of_receipt.at(np.array([late.y0]))[0]),
+        late.slope * boot_of_receipt.slope,
+        late.jitter,
+        late.pairs,
+    )
+    candidates.append(
+        (
+            receipt,
+            by_receipt,
+            "no usable TIMESYNC or SYSTEM_TIME; late by the least delay of the link",
+        )
+    )
+    for method, line, note in candidates:
+        distance = float(np.median(line.at(stamp_s) - boot_at_receipt))
+        # a map that puts messages long before or after their receipt is of another clock
+        if method == receipt or abs(distance) <= SAME_CLOCK_S:
+            return Mapped(line, _statement(clock, method, line, stamp_s, note))
+    raise AssertionError("the last candidate is always taken")
+
+
+def _by_exchange(exchanges: Exchanges) -> Line | None:
+    """From the sender's clock to the boot clock, between the two envelopes where both exist."""
+    lines = []
+    if len(exchanges.replied_s) >= MIN_PAIRS:
+        # asked before replied: the reply is the later reading
+        lines.append(least_delay(exchanges.autopilot_s, exchanges.replied_s).inverse())
+    if len(exchanges.asked_s) >= MIN_PAIRS:
+        lines.append(least_delay(exchanges.asked_s, exchanges.answered_s))
+    if not lines:
+        return None
+    if len(lines) == 1:
+        return lines[0]
+    x0 = lines[0].x0
+    return Line(
+        x0,
+        float(np.mean([line.at(np.array([x0]))[0] for line in lines])),
+        float(np.mean([line.slope for line in lines])),
+        float(np.mean([line.jitter for line in lines])),
+        sum(line.pairs for line in lines),
+    )
+
+
+def _statement(clock: str, method: str, line: Line, stamp_s: Array, note: str) -> ClockMap:
+    middle = float(0.5 * (stamp_s.min() + stamp_s.max()))
+    return ClockMap(
+        clock=clock,
+        method=method,
+        pairs=line.pairs,
+        offset_s=float(line.at(np.array([middle]))[0] - middle),
+        drift_ppm=(line.slope - 1.0) * 1e6,
+        jitter_s=line.jitter,
+        note=note,
+    )

@@ -1,0 +1,394 @@
+"""MAVLink bytes to frames, and frames to columns: everything that knows the wire format.
+
+A recording is scanned for frames instead of being parsed byte by byte: every position that could
+begin a frame of a known message is checked by its checksum, so that junk, cut frames and bad
+checksums cost themselves and nothing else. A message type is then decoded for all its frames at
+once with the field tables of pymavlink's dialect.
+
+Sources: MAVLink developer guide, "Packet Serialization"; pymavlink's generated dialects.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from fastcrc.crc16 import mcrf4xx  # CRC-16/MCRF4XX is MAVLink's X.25 checksum
+from numpy.typing import NDArray
+from pymavlink.dialects.v20 import all as dialect
+
+from px4fuse.errors import LogError
+
+Integers = NDArray[np.int64]
+
+MAGIC_1, MAGIC_2 = 0xFE, 0xFD
+HEADER_1, HEADER_2 = 6, 10
+CHECKSUM = 2
+SIGNATURE = 13
+SIGNED = 0x01
+# QGroundControl and MAVProxy put the time of receipt before each frame: µs, big-endian
+STAMP = 8
+# Bytes that are scanned at a time, which bounds the memory that hostile bytes can claim
+BLOCK = 1 << 18
+# Below this share of bytes in good frames a file is no MAVLink recording: chance makes one frame
+# in about eight million random bytes.
+MIN_GOOD_SHARE = 0.01
+# A stamp further than this from the median one is damaged (pymavlink's own limit)
+MAX_STAMP_DISTANCE_US = 3 * 24 * 3600 * 1_000_000
+_WIRE_TYPES = {
+    "char": "S1", "double": "<f8", "float": "<f4",
+    "int8_t": "i1", "int16_t": "<i2", "int32_t": "<i4", "int64_t": "<i8",
+    "uint8_t": "u1", "uint16_t": "<u2", "uint32_t": "<u4", "uint64_t": "<u8",
+    "uint8_t_mavlink_version": "u1",
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Frames:
+    """The good frames of one recording, in file order.
+
+    Attributes
+    ----------
+    name : str
+        File name.
+    content : bytes
+    sha256 : str
+    start : ndarray of int64, shape (n,)
+        Offset of each frame's first byte.
+    message_id : ndarray of int32, shape (n,)
+    system, component, sequence, link : ndarray of uint8, shape (n,)
+        ``link`` is the number that MAVProxy keeps in the lowest two bits of the stamp.
+    payload_start : ndarray of int64, shape (n,)
+    payload_length : ndarray of uint8, shape (n,)
+    received_us : ndarray of int64, shape (n,), or None
+        Time of receipt, µs UNIX, of a recording with stamps (damaged ones interpolated).
+    unknown : mapping from message id to count
+        Whole frames of messages that the dialect does not know; their checksum cannot be checked.
+    bad_bytes : int
+        Bytes that belong to no frame.
+    bad_stamps : int
+    """
+
+    name: str
+    content: bytes
+    sha256: str
+    start: Integers
+    message_id: NDArray[np.int32]
+    system: NDArray[np.uint8]
+    component: NDArray[np.uint8]
+    sequence: NDArray[np.uint8]
+    link: NDArray[np.uint8]
+    payload_start: Integers
+    payload_length: NDArray[np.uint8]
+    received_us: Integers | None
+    unknown: Mapping[int, int]
+    bad_bytes: int
+    bad_stamps: int
+
+    def __len__(self) -> int:
+        return len(self.start)
+
+    def rows(self, message: str) -> NDArray[np.intp]:
+        """Indices of the frames of one message, by its MAVLink name."""
+        return np.flatnonzero(self.message_id == message_ids()[message])
+
+    def table(self, message: str, rows: NDArray[np.intp]) -> NDArray[Any]:
+        """Decode frames of one message.
+
+        Parameters
+        ----------
+        message : str
+            MAVLink name, for example "ATTITUDE".
+        rows : ndarray, shape (n,)
+            Of :meth:`rows`.
+
+        Returns
+        -------
+        structured ndarray, shape (n,)
+            One field per MAVLink field, in MAVLink's units; trailing zeros that MAVLink 2 cuts
+            off the payload are put back.
+        """
+        layout = wire_layout(message_ids()[message])
+        payload = np.zeros((len(rows), layout.itemsize), dtype=np.uint8)
+        source = np.frombuffer(self.content, dtype=np.uint8)
+        starts, lengths = self.payload_start[rows], self.payload_length[rows]
+        for length in np.unique(lengths).tolist():
+            size = min(length, layout.itemsize)
+            if size:
+                of_length = np.flatnonzero(lengths == length)
+                windows = np.lib.stride_tricks.sliding_window_view(source, size)
+                payload[of_length, :size] = windows[starts[of_length]]
+        return payload.view(layout)[:, 0]
+
+
+@cache
+def message_ids() -> Mapping[str, int]:
+    """MAVLink message ids by name."""
+    return {message.msgname: number for number, message in dialect.mavlink_map.items()}
+
+
+def message_name(number: int) -> str:
+    """MAVLink's name of a message id."""
+    message = dialect.mavlink_map.get(number)
+    return f"message {number}" if message is None else str(message.msgname)
+
+
+@cache
+def wire_layout(number: int) -> np.dtype[Any]:
+    """Payload of a message as a packed structured dtype, from pymavlink's field tables."""
+    message = dialect.mavlink_map[number]
+    kinds = dict(zip(message.fieldnames, message.fieldtypes, strict=True))
+    fields: list[Any] = []
+    for name, length in zip(message.ordered_fieldnames, message.array_lengths, strict=True):
+        kind = _WIRE_TYPES[kinds[name]]
+        if length and kind == "S1":
+            fields.append((name, f"S{length}"))
+        else:
+            fields.append((name, kind, (length,)) if length else (name, kind))
+    return np.dtype(fields)
+
+
+@cache
+def _crc_extra() -> NDArray[np.int16]:
+    """Checksum seed by message id; -1 where the dialect does not know the message."""
+    seeds = np.full(1 << 16, -1, dtype=np.int16)
+    for number, message in dialect.mavlink_map.items():
+        if number < len(seeds):
+            seeds[number] = message.crc_extra
+    return seeds
+
+
+@cache
+def _crc_table() -> NDArray[np.uint16]:
+    """Checksum of each single byte, for the last step over the seed."""
+    return np.array([mcrf4xx(bytes([byte]), 0) for byte in range(256)], dtype=np.uint16)
+
+
+def read_frames(path: Path) -> Frames:
+    """Find all good frames of a recording.
+
+    Parameters
+    ----------
+    path : Path
+        A ``.tlog`` with time stamps, or a raw stream of MAVLink 1 and 2.
+
+    Returns
+    -------
+    Frames
+
+    Raises
+    ------
+    LogError
+        The file cannot be read or holds no MAVLink.
+    """
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise LogError(f"{path.name}: cannot be read ({error.strerror}).") from error
+    start, end = _scan(content)
+    stamped = bool(len(start)) and _is_stamped(start, end)
+    start, end = _without_overlap(start, end, STAMP if stamped else 0)
+    start, end = _without_chance(content, start, end, STAMP if stamped else 0)
+    good = int(np.sum(end - start))
+    if good < MIN_GOOD_SHARE * len(content) or not len(start):
+        raise LogError(
+            f"{path.name}: neither a PX4 ULog nor MAVLink: {len(start)} frames with a good "
+            f"checksum in {len(content)} bytes. Give the .ulg from the vehicle, or a .tlog or raw "
+            "MAVLink recording."
+        )
+    source = np.frombuffer(content, dtype=np.uint8)
+    second = source[start] == MAGIC_2
+    # where each header field stands: MAVLink 2 and 1
+    header = start[:, None] + np.where(second[:, None], [[4, 5, 6, 7]], [[2, 3, 4, 5]])
+    number = source[header[:, 3]].astype(np.int32)
+    at = start[second]
+    number[second] |= (source[at + 8].astype(np.int32) << 8) | (
+        source[at + 9].astype(np.int32) << 16
+    )
+    unknown, bad_bytes = _gaps(content, start, end, STAMP if stamped else 0)
+    received, link, bad_stamps = None, np.zeros(len(start), dtype=np.uint8), 0
+    if stamped:
+        received, link, bad_stamps = _stamps(source, start, end)
+    return Frames(
+        name=path.name,
+        content=content,
+        sha256=hashlib.sha256(content).hexdigest(),
+        start=start,
+        message_id=number,
+        system=source[header[:, 1]],
+        component=source[header[:, 2]],
+        sequence=source[header[:, 0]],
+        link=link,
+        payload_start=start + np.where(second, HEADER_2, HEADER_1),
+        payload_length=source[start + 1],
+        received_us=received,
+        unknown=unknown,
+        bad_bytes=bad_bytes,
+        bad_stamps=bad_stamps,
+    )
+
+
+def _scan(content: bytes) -> tuple[Integers, Integers]:
+    """Offsets of all frames with a good checksum, and of the byte after each; may overlap."""
+    source = np.frombuffer(content, dtype=np.uint8)
+    view = memoryview(content)
+    starts, ends = [], []
+    for low in range(0, len(source), BLOCK):
+        start, end, crc_end, seed = _candidates(source, low)
+        bodies = zip((start + 1).tolist(), crc_end.tolist(), strict=True)
+        crc = np.array([mcrf4xx(view[a:b]) for a, b in bodies], dtype=np.uint16)
+        crc = (crc >> 8) ^ _crc_table()[(crc ^ seed) & 0xFF]
+        stored = source[crc_end] | source[crc_end + 1].astype(np.uint16) << 8
+        starts.append(start[crc == stored])
+        ends.append(end[crc == stored])
+    nothing = np.zeros(0, dtype=np.int64)
+    return np.concatenate([nothing, *starts]), np.concatenate([nothing, *ends])
+
+
+def _without_overlap(start: Integers, end: Integers, stamp: int) -> tuple[Integers, Integers]:
+    """Frames that do not overlap; those that touch a neighbour go before those that do not.
+
+    One frame may lie in another one's payload (a tunnel), and chance makes a few of bytes that
+    are none, which must not hide the true ones below them.
+    """
+    if not np.any(start[1:] < end[:-1]):
+        return start, end
+    touches = np.isin(start - stamp, end) | np.isin(end + stamp, start)
+    keep = _greedy(start, end, np.flatnonzero(touches))
+    kept_start, kept_end = start[keep], end[keep]
+    rest = np.flatnonzero(~touches)
+    after = np.searchsorted(kept_start, start[rest])
+    if len(keep):
+        next_start = np.append(kept_start, np.iinfo(np.int64).max)[after]
+        last_end = np.append(0, kept_end)[after]
+        rest = rest[(end[rest] <= next_start) & (start[rest] >= last_end)]
+    keep = np.sort(np.concatenate([keep, _greedy(start, end, rest)]))
+    return start[keep], end[keep]
+
+
+def _greedy(start: Integers, end: Integers, rows: Integers) -> Integers:
+    """Rows in order, without those that begin before the last one kept ends."""
+    keep, reached = [], 0
+    for row, first, last in zip(
+        rows.tolist(), start[rows].tolist(), end[rows].tolist(), strict=True
+    ):
+        if first >= reached:
+            keep.append(row)
+            reached = last
+    return np.array(keep, dtype=np.int64)
+
+
+def _candidates(
+    source: NDArray[np.uint8], low: int
+) -> tuple[Integers, Integers, Integers, NDArray[np.uint16]]:
+    """Where a frame of a known message could begin in one block, its end, checksum and seed."""
+    block = source[low : low + BLOCK]
+    start = np.flatnonzero((block == MAGIC_1) | (block == MAGIC_2)).astype(np.int64) + low
+    start = start[start + HEADER_1 + CHECKSUM <= len(source)]
+    second = source[start] == MAGIC_2
+    whole = ~second | (start + HEADER_2 + CHECKSUM <= len(source))
+    start, second = start[whole], second[whole]
+    crc_end = start + source[start + 1] + np.where(second, HEADER_2, HEADER_1)
+    number = source[start + 5].astype(np.int64)
+    at = start[second]
+    number[second] = source[at + 7] | source[at + 8].astype(np.int64) << 8
+    known = _crc_extra()[number] >= 0
+    known[second] &= (source[at + 9] == 0) & (source[at + 2] <= SIGNED)
+    end = crc_end + CHECKSUM
+    end[second] += SIGNATURE * (source[at + 2] & SIGNED).astype(np.int64)
+    known &= end <= len(source)
+    return (
+        start[known],
+        end[known],
+        crc_end[known],
+        _crc_extra()[number[known]].astype(np.uint16),
+    )
+
+
+def _is_stamped(start: Integers, end: Integers) -> bool:
+    """Whether a stamp stands before each frame: eight bytes between neighbours instead of none."""
+    stamped = np.count_nonzero(np.isin(end + STAMP, start))
+    bare = np.count_nonzero(np.isin(end, start))
+    return bool(stamped > bare) if stamped + bare else bool(start[0] == STAMP)
+
+
+def _without_chance(
+    content: bytes, start: Integers, end: Integers, stamp: int
+) -> tuple[Integers, Integers]:
+    """Drop frames that chance made inside a message that the dialect does not know.
+
+    Such a frame touches no neighbour, and without it the bytes between the neighbours are whole
+    frames of unknown messages.
+    """
+    highs = np.concatenate([start[1:] - stamp, [len(content)]])
+    lows = np.concatenate([[0], end[:-1]])
+    alone = np.flatnonzero((lows != start - stamp) & (highs != end))
+    chance = [
+        at
+        for at in alone.tolist()
+        if (reached := _unknown_frames(content, int(lows[at]), int(highs[at]), stamp))[0]
+        and reached[1] == highs[at]
+    ]
+    return np.delete(start, chance), np.delete(end, chance)
+
+
+def _unknown_frames(content: bytes, at: int, high: int, stamp: int) -> tuple[list[int], int]:
+    """Ids of the whole frames of unknown messages from one offset on, and where they end."""
+    found: list[int] = []
+    while at + stamp + HEADER_1 + CHECKSUM <= high:
+        head = content[at + stamp : at + stamp + HEADER_2]
+        size = head[1] + HEADER_1 + CHECKSUM
+        number = head[5]
+        if head[0] == MAGIC_2 and len(head) == HEADER_2:
+            size = head[1] + HEADER_2 + CHECKSUM + SIGNATURE * (head[2] & SIGNED)
+            number = int.from_bytes(head[7:10], "little")
+        elif head[0] != MAGIC_1:
+            break
+        if number in dialect.mavlink_map or at + stamp + size > high:
+            break
+        found.append(number)
+        at += stamp + size
+    return found, at
+
+
+def _gaps(content: bytes, start: Integers, end: Integers, stamp: int) -> tuple[dict[int, int], int]:
+    """Unknown but whole frames between the good ones, and the bytes that belong to no frame."""
+    unknown: Counter[int] = Counter()
+    bad = 0
+    lows = np.concatenate([[0], end])
+    highs = np.concatenate([start - stamp, [len(content)]])
+    for gap in np.flatnonzero(highs > lows).tolist():
+        found, at = _unknown_frames(content, int(lows[gap]), int(highs[gap]), stamp)
+        unknown.update(found)
+        bad += int(highs[gap]) - at
+    return dict(unknown), bad
+
+
+def _stamps(
+    source: NDArray[np.uint8], start: Integers, end: Integers
+) -> tuple[Integers, NDArray[np.uint8], int]:
+    """Time of receipt (µs), link number, and how many stamps were damaged."""
+    room = start - np.concatenate([[0], end[:-1]]) >= STAMP
+    first = np.flatnonzero(room)
+    windows = np.lib.stride_tricks.sliding_window_view(source, STAMP)
+    stamp = windows[start[first] - STAMP].copy().view(">u8")[:, 0].astype(np.uint64)
+    plausible = stamp < np.uint64(1 << 62)
+    time_us = stamp[plausible].astype(np.int64)
+    middle = int(np.median(time_us)) if len(time_us) else 0
+    near = np.abs(time_us - middle) <= MAX_STAMP_DISTANCE_US
+    rows = first[plausible][near]
+    received = np.zeros(len(start), dtype=np.int64)
+    link = np.zeros(len(start), dtype=np.uint8)
+    if len(rows):
+        # interpolated from the first one on, so that float64 keeps every microsecond
+        zero = time_us[near][0]
+        steps = np.interp(np.arange(len(start)), rows, time_us[near] - zero)
+        received = zero + np.rint(steps).astype(np.int64)
+        link[rows] = (time_us[near] & 0x3).astype(np.uint8)
+    return received, link, len(start) - len(rows)

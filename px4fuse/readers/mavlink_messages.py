@@ -1,0 +1,139 @@
+"""The table of MAVLink messages: names, units, frames and directions as data.
+
+Sources: MAVLink ``common.xml``; PX4 ``src/modules/mavlink/mavlink_receiver.cpp`` and
+``streams/*.hpp`` (v1.13 to v1.16).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+AUTOPILOT_COMPONENT = 1  # MAV_COMP_ID_AUTOPILOT1
+NO_AUTOPILOT = 8  # MAV_AUTOPILOT_INVALID: a ground station, a camera, a companion computer
+GROUND_STATION = 6  # MAV_TYPE_GCS
+LANDED = 1  # MAV_LANDED_STATE_ON_GROUND
+AUTOPILOTS: Mapping[int, str] = {0: "generic autopilot", 3: "ArduPilot", 12: "PX4"}
+VEHICLE_TYPES: Mapping[int, str] = {
+    0: "generic vehicle", 1: "fixed wing", 2: "quadrotor", 3: "coaxial helicopter",
+    4: "helicopter", 5: "antenna tracker", 6: "ground station", 10: "ground rover",
+    11: "surface boat", 12: "submarine", 13: "hexarotor", 14: "octorotor", 15: "tricopter",
+    18: "companion computer", 19: "VTOL", 20: "VTOL", 21: "VTOL", 22: "VTOL", 26: "gimbal",
+    27: "ADS-B receiver", 30: "camera",
+}  # fmt: skip
+
+STANDARD_GRAVITY_M_S2 = 9.80665
+# Row-major upper triangle of a 6×6 matrix: x, y, z
+POSE_DIAGONAL = np.array([0, 6, 11])
+# Row-major upper triangle of a 9×9 matrix: x, y, z, vx, vy, vz
+EXTENDED_COVARIANCE_DIAGONAL = np.array([0, 9, 17, 24, 30, 35])
+
+
+@dataclass(frozen=True)
+class ImuSource:
+    """An IMU message and what its units are in m/s² and rad/s; axes are body FRD."""
+
+    message: str
+    acceleration_unit: float
+    angular_rate_unit: float
+
+
+IMU = (
+    ImuSource("HIGHRES_IMU", 1.0, 1.0),
+    # milli-g and mrad/s
+    ImuSource("SCALED_IMU", STANDARD_GRAVITY_M_S2 * 1e-3, 1e-3),
+    ImuSource("SCALED_IMU2", STANDARD_GRAVITY_M_S2 * 1e-3, 1e-3),
+    ImuSource("SCALED_IMU3", STANDARD_GRAVITY_M_S2 * 1e-3, 1e-3),
+)
+# Messages whose time_usec is the autopilot's boot clock; GPS_RAW_INT's, say, is the receiver's
+STAMPED_BY_BOOT_CLOCK = ("HIGHRES_IMU", "ODOMETRY", "ESTIMATOR_STATUS")
+# Equally dense ones are taken in this order
+ATTITUDE = ("ATTITUDE_QUATERNION", "ATTITUDE", "ODOMETRY")
+
+
+@dataclass(frozen=True)
+class PositionInput:
+    """An external position on its way to the autopilot.
+
+    ``name`` is the track's name for ``--position-source``, ``stamp`` the field with the sender's
+    time in µs. PX4 drops the covariance of a naive estimator (``mavlink_receiver.cpp``).
+    """
+
+    name: str
+    message: str
+    stamp: str
+    rung: int
+    description: str
+    drops_covariance: bool = False
+
+
+def _odometry(name: str, rung: int, description: str, drops: bool = False) -> PositionInput:
+    return PositionInput(name, "ODOMETRY", "time_usec", rung, description, drops)
+
+
+_MOCAP = "motion capture, which EKF2 never fuses"
+POSITION_INPUTS = (
+    PositionInput(
+        "VISION_POSITION_ESTIMATE", "VISION_POSITION_ESTIMATE", "usec", 2,
+        "external vision position as it was sent to PX4",
+    ),
+    _odometry("ODOMETRY", 2, "external odometry as it was sent to PX4"),
+    PositionInput("ATT_POS_MOCAP", "ATT_POS_MOCAP", "time_usec", 3, _MOCAP),
+)  # fmt: skip
+# ODOMETRY from outside the autopilot by MAV_ESTIMATOR_TYPE. The others are no measurement: PX4
+# refuses GPS, GPS_INS, LIDAR and AUTOPILOT as input; from the autopilot itself it is EKF2's output.
+ODOMETRY_INPUTS: Mapping[int, PositionInput] = {
+    0: _odometry("ODOMETRY", 2, "external odometry as it was sent to PX4"),
+    1: _odometry("ODOMETRY_NAIVE", 2, "external odometry, without covariance", True),
+    2: _odometry("ODOMETRY_VISION", 2, "visual odometry as it was sent to PX4"),
+    3: _odometry("ODOMETRY_VIO", 2, "visual-inertial odometry as it was sent to PX4"),
+    6: _odometry("ODOMETRY_MOCAP", 3, _MOCAP),
+}
+
+
+@dataclass(frozen=True)
+class FrameOfReference:
+    """A MAV_FRAME: which component is north (or forward), east (right) and down, and its sign.
+
+    ``body`` says whether it turns with the vehicle.
+    """
+
+    name: str
+    order: tuple[int, int, int]
+    signs: tuple[float, float, float]
+    body: bool = False
+
+    def turn(self, vectors: Array) -> Array:
+        """Vectors of this frame in NED (or FRD), shape (n, 3)."""
+        return vectors[:, self.order] * self.signs
+
+    def permute(self, variances: Array) -> Array:
+        """Variances of this frame's components in NED (or FRD) order, shape (n, 3)."""
+        return variances[:, self.order]
+
+
+_AS_IS, _NOTHING = (0, 1, 2), (1.0, 1.0, 1.0)
+FRAMES_OF_REFERENCE: Mapping[int, FrameOfReference] = {
+    1: FrameOfReference("NED", _AS_IS, _NOTHING),
+    4: FrameOfReference("NED", (1, 0, 2), (1.0, 1.0, -1.0)),  # ENU: x_N = y, y_E = x, z_D = -z
+    8: FrameOfReference("FRD", _AS_IS, _NOTHING, body=True),  # MAV_FRAME_BODY_NED, in fact FRD
+    12: FrameOfReference("FRD", _AS_IS, _NOTHING, body=True),
+    20: FrameOfReference("FRD", _AS_IS, _NOTHING),
+    21: FrameOfReference("FRD", _AS_IS, (1.0, -1.0, -1.0)),
+}
+
+UNUSED: Mapping[str, str] = {
+    "RAW_IMU": "raw counts without a unit",
+    "VISION_SPEED_ESTIMATE": "a velocity, not a position; for information",
+    "VICON_POSITION_ESTIMATE": "PX4 does not read it",
+    "GLOBAL_VISION_POSITION_ESTIMATE": "PX4 does not read it",
+    "GPS_INPUT": "a substitute GPS receiver",
+    "GPS_RAW_INT": "GPS is not an indoor position",
+    "DISTANCE_SENSOR": "a range, not a position",
+    "OPTICAL_FLOW_RAD": "an angular rate, not a position",
+}

@@ -1,0 +1,199 @@
+"""External positions that were sent to the autopilot over MAVLink, and the truth."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from px4fuse.flight import (
+    EXTERNAL_VISION_RUNGS,
+    POSITION_COLUMNS,
+    POSITION_VARIANCE_COLUMNS,
+    VELOCITY_COLUMNS,
+    PositionTrack,
+    Truth,
+    Unavailable,
+    finite_rows,
+)
+from px4fuse.readers.mavlink_clocks import Mapped
+from px4fuse.readers.mavlink_ekf2 import STATE_COLUMNS, odometry
+from px4fuse.readers.mavlink_messages import (
+    FRAMES_OF_REFERENCE,
+    ODOMETRY_INPUTS,
+    POSE_DIAGONAL,
+    POSITION_INPUTS,
+    PositionInput,
+)
+from px4fuse.readers.mavlink_recording import (
+    RECEIPT_CLOCK,
+    Address,
+    Array,
+    Recording,
+    Rows,
+    senders_of,
+    vector,
+)
+from px4fuse.readers.px4_positions import MIN_TRACK_SAMPLES, project
+
+TRACK_COLUMNS = POSITION_COLUMNS + POSITION_VARIANCE_COLUMNS
+ROUTER_REMEDY = (
+    "Record where the companion's link passes (a MAVLink router), or join the ULog of the flight, "
+    "or give the positioning system's own file with --position."
+)
+
+
+def read_positions(
+    recording: Recording, mapped: dict[Address, Mapped]
+) -> tuple[tuple[PositionTrack, ...], tuple[Unavailable, ...]]:
+    """Every external position that was sent to the autopilot, best rung first.
+
+    Parameters
+    ----------
+    recording : Recording
+    mapped : mapping from address to Mapped
+        Clock of every sender.
+    """
+    found: list[PositionTrack | Unavailable] = []
+    for source in POSITION_INPUTS:
+        senders = senders_of(recording, source.message)
+        before = len(found)
+        for sender in senders:
+            suffix = f"_{sender[0]}_{sender[1]}" if len(senders) > 1 else ""
+            rows = recording.rows(source.message, sender)
+            for kind, part in _kinds(source, recording.frames.table(source.message, rows)):
+                found.append(_read_track(recording, kind, suffix, rows[part], mapped[sender]))
+        if len(found) == before:
+            found.append(
+                Unavailable(
+                    f"position source {source.message}",
+                    f"no {source.message} to the autopilot in the recording",
+                    ROUTER_REMEDY,
+                )
+            )
+    tracks = [part for part in found if isinstance(part, PositionTrack)]
+    missing = tuple(part for part in found if isinstance(part, Unavailable))
+    return tuple(sorted(tracks, key=lambda track: track.rung)), missing
+
+
+def _kinds(source: PositionInput, table: NDArray[Any]) -> list[tuple[PositionInput, Rows]]:
+    """Tracks in one message: one, or for ODOMETRY one per kind of estimator."""
+    if source.message != "ODOMETRY":
+        return [(source, np.arange(len(table)))]
+    parts = [
+        (kind, np.flatnonzero(table["estimator_type"] == number))
+        for number, kind in ODOMETRY_INPUTS.items()
+    ]
+    return [(kind, part) for kind, part in parts if len(part)]
+
+
+def _read_track(
+    recording: Recording, source: PositionInput, suffix: str, rows: Rows, clock: Mapped
+) -> PositionTrack | Unavailable:
+    table = recording.frames.table(source.message, rows)
+    frame = "NED"
+    if source.message == "ODOMETRY":
+        state, variances = odometry(table)
+        position, variance = state[:, :3], variances[:, :3]
+        # one frame per track: that of the last sample, as PX4 would have used it
+        reference = FRAMES_OF_REFERENCE.get(int(table["frame_id"][-1]))
+        frame = "unknown" if reference is None else reference.name
+    else:
+        position = vector(table, "x", "y", "z")
+        variance = table["covariance"][:, POSE_DIAGONAL].astype(np.float64)
+    if source.drops_covariance:
+        variance = np.full_like(variance, np.nan)
+    stamp_s = table[source.stamp] * 1e-6
+    boot_s = (
+        recording.receipt_boot_s(rows)
+        if clock.to_boot is None
+        else np.where(stamp_s > 0.0, clock.to_boot.at(stamp_s), np.nan)
+    )
+    name = source.name + suffix
+    values = np.column_stack([position, variance])
+    samples = finite_rows(recording.frame(name, boot_s, TRACK_COLUMNS, values), POSITION_COLUMNS)
+    if len(samples) < MIN_TRACK_SAMPLES:
+        return Unavailable(
+            f"position source {name}", f"{len(samples)} finite samples are too few", ROUTER_REMEDY
+        )
+    given = samples[POSITION_VARIANCE_COLUMNS]
+    samples[POSITION_VARIANCE_COLUMNS] = given.where(given > 0)  # 0 and NaN: not given
+    statement = clock.statement
+    mapping = (
+        "" if statement.method == "boot clock" else f", mapped to boot time by {statement.method}"
+    )
+    return PositionTrack(
+        name=name,
+        rung=source.rung,
+        description=source.description,
+        samples=samples,
+        frame=frame,
+        clock=f"{statement.clock}{mapping}",
+        reconstructed=False,
+        topics=(source.message,),
+        log=recording.frames.name,
+        clock_map=statement,
+    )
+
+
+def read_truth(recording: Recording, positions: tuple[PositionTrack, ...]) -> Truth | Unavailable:
+    """Simulation truth, or motion capture where another track feeds EKF2.
+
+    Simulation truth carries no usable clock (``HIL_STATE_QUATERNION.time_usec`` is 0 in PX4), so
+    the time of receipt is taken, and no local position, so it is projected about its own first
+    sample, where the simulated vehicle was put.
+    """
+    for message, read in (
+        ("HIL_STATE_QUATERNION", _hil_state),
+        ("SIM_STATE", _sim_state),
+        ("SIMSTATE", _simstate),
+    ):
+        rows = recording.rows(message)
+        if len(rows) < MIN_TRACK_SAMPLES:
+            continue
+        latitude, longitude, height, velocity = read(recording.frames.table(message, rows))
+        north, east = project(latitude, longitude, (float(latitude[0]), float(longitude[0])))
+        values = np.column_stack([north, east, height[0] - height, velocity])
+        samples = recording.frame(
+            message, recording.receipt_boot_s(rows), STATE_COLUMNS, values
+        ).dropna(subset=POSITION_COLUMNS[:2])
+        if len(samples):
+            recording.came_from("truth", RECEIPT_CLOCK, message)
+            return Truth(message, samples)
+    fed = any(track.rung in EXTERNAL_VISION_RUNGS for track in positions)
+    for track in positions:
+        if track.topics == ("ATT_POS_MOCAP",) and fed:
+            recording.came_from("truth", track.clock, *track.topics)
+            return Truth(
+                track.name, track.samples.reindex(columns=POSITION_COLUMNS + VELOCITY_COLUMNS)
+            )
+    return Unavailable(
+        "ground truth",
+        "neither simulation truth nor motion capture is in the recording",
+        "Real flights have truth only from motion capture (send ATT_POS_MOCAP).",
+    )
+
+
+def _hil_state(table: NDArray[Any]) -> tuple[Array, Array, Array, Array]:
+    """Latitude and longitude (degrees), height (m) and NED velocity (m/s), shape (n, 3)."""
+    return (
+        table["lat"] * 1e-7,
+        table["lon"] * 1e-7,
+        table["alt"] * 1e-3,
+        vector(table, "vx", "vy", "vz", scale=1e-2),
+    )
+
+
+def _sim_state(table: NDArray[Any]) -> tuple[Array, Array, Array, Array]:
+    """As :func:`_hil_state`; latitude as integer where the sender has that extension."""
+    fine = bool(np.any(table["lat_int"]))
+    latitude = table["lat_int"] * 1e-7 if fine else table["lat"].astype(np.float64)
+    longitude = table["lon_int"] * 1e-7 if fine else table["lon"].astype(np.float64)
+    return latitude, longitude, table["alt"].astype(np.float64), vector(table, "vn", "ve", "vd")
+
+
+def _simstate(table: NDArray[Any]) -> tuple[Array, Array, Array, Array]:
+    """As :func:`_hil_state`; ArduPilot's has no height and no velocity."""
+    nothing = np.full(len(table), np.nan)
+    return table["lat"] * 1e-7, table["lng"] * 1e-7, nothing, np.full((len(table), 3), np.nan)

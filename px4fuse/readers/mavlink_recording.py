@@ -1,0 +1,391 @@
+"""One MAVLink recording with its vehicle chosen and its clocks settled."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from px4fuse.errors import SettingsError
+from px4fuse.flight import ClockMap, Sender, Stream
+from px4fuse.readers.mavlink_clocks import (
+    UNIX_FROM_S,
+    Exchanges,
+    Line,
+    Mapped,
+    least_delay,
+    map_clock,
+)
+from px4fuse.readers.mavlink_frames import Frames, message_name, wire_layout
+from px4fuse.readers.mavlink_messages import (
+    AUTOPILOT_COMPONENT,
+    AUTOPILOTS,
+    GROUND_STATION,
+    NO_AUTOPILOT,
+    POSITION_INPUTS,
+    STAMPED_BY_BOOT_CLOCK,
+    VEHICLE_TYPES,
+)
+from px4fuse.readers.ulog_topics import increasing
+
+Array = NDArray[np.float64]
+Rows = NDArray[np.intp]
+# MAVLink system and component
+Address = tuple[int, int]
+
+BOOT_CLOCK = "autopilot boot clock"
+RECEIPT_CLOCK = "time of receipt, less the link's least delay"
+# The boot clock going back by more than this is a restart, not a late packet
+RESTART_S = 5.0
+# Messages after a restart that must be early too
+RESTART_MESSAGES = 20
+# Senders beyond the busiest ones are not described
+MAX_SENDERS = 32
+# A sender that seems to lose more than this does not count its messages
+SEQUENCE_MEANS_NOTHING = 0.9
+# More bytes than this outside of frames are damage; a stream begins and ends in mid-frame
+DAMAGED_SHARE = 0.02
+# Stamps of one sender further apart than this are of two clocks
+OTHER_CLOCK_S = 1e5
+
+
+@dataclass(frozen=True)
+class Recording:
+    """One recording with its clocks settled.
+
+    Attributes
+    ----------
+    frames : Frames
+    system, component : int
+        Of the autopilot whose flight this is.
+    session : slice
+        The frames between two restarts of the autopilot.
+    received_s : ndarray, shape (n,)
+        Time of receipt (s) of every frame, from the first one; in a stream without stamps the
+        boot time of the autopilot's last stamped message before it.
+    boot_of_receipt : Line
+        From time of receipt to the boot clock, both s.
+    zero_s, duration_s : float
+        Boot time of the flight's time zero, and the span of the session.
+    notes : list of str
+    dropped : dict
+        Samples dropped for an impossible time stamp, by message; :meth:`frame` fills it.
+    streams : dict
+        Where each part of the flight came from; :meth:`came_from` fills it.
+    """
+
+    frames: Frames
+    system: int
+    component: int
+    session: slice
+    received_s: Array
+    boot_of_receipt: Line
+    zero_s: float
+    duration_s: float
+    notes: list[str]
+    dropped: dict[str, int] = field(default_factory=dict)
+    streams: dict[str, Stream] = field(default_factory=dict)
+
+    def rows(self, message: str, address: Address | None = None) -> Rows:
+        """Frames of one message within the session, from the autopilot unless said otherwise."""
+        system, component = address or (self.system, self.component)
+        rows = self.frames.rows(message)
+        rows = rows[(rows >= self.session.start) & (rows < self.session.stop)]
+        rows = rows[self.frames.system[rows] == system]
+        chosen: Rows = rows[self.frames.component[rows] == component]
+        return chosen
+
+    def frame(self, name: str, boot_s: Array, columns: list[str], values: Array) -> pd.DataFrame:
+        """Samples indexed by seconds of the flight, strictly increasing.
+
+        Parameters
+        ----------
+        name : str
+            Under which dropped samples are counted.
+        boot_s : ndarray, shape (n,)
+            Boot clock; NaN drops the sample.
+        columns : list of str, length m
+        values : ndarray, shape (n, m)
+        """
+        time_us = np.rint(np.nan_to_num(boot_s, nan=-1.0) * 1e6).astype(np.int64)
+        # one message that came over two links is one sample
+        first = np.sort(np.unique(time_us, return_index=True)[1])
+        keep = first[increasing(time_us[first])]
+        if len(keep) < len(first):
+            self.dropped[name] = len(first) - len(keep)
+        kept = values[keep]
+        return pd.DataFrame(
+            np.where(np.isfinite(kept), kept, np.nan),
+            index=pd.Index(boot_s[keep] - self.zero_s, name="time_s"),
+            columns=columns,
+        )
+
+    def receipt_boot_s(self, rows: Rows) -> Array:
+        """Boot clock (s) at which frames were received, less the link's least delay."""
+        return self.boot_of_receipt.at(self.received_s[rows])
+
+    def boot_s(self, table: NDArray[Any], rows: Rows) -> Array:
+        """Boot clock (s) of the autopilot's own messages; by receipt where they are not on it."""
+        if "time_boot_ms" in (table.dtype.names or ()):
+            return np.asarray(table["time_boot_ms"] * 1e-3, dtype=np.float64)
+        stamp = table["time_usec"] * 1e-6
+        on_boot = (stamp > 0.0) & (stamp < UNIX_FROM_S)
+        return np.asarray(np.where(on_boot, stamp, self.receipt_boot_s(rows)), dtype=np.float64)
+
+    def came_from(self, part: str, clock: str, *messages: str) -> None:
+        """Note where a part of the flight came from."""
+        self.streams[part] = Stream(messages, clock, self.frames.name)
+
+
+def vector(table: NDArray[Any], *fields: str, scale: float = 1.0) -> Array:
+    """Fields of a table as columns of float64, shape (n, number of fields)."""
+    return np.column_stack([table[name].astype(np.float64) * scale for name in fields])
+
+
+def _vehicles(frames: Frames) -> dict[Address, tuple[int, int]]:
+    """Type and autopilot that each sender gave in its first heartbeat."""
+    rows = frames.rows("HEARTBEAT")
+    beats = frames.table("HEARTBEAT", rows)
+    address = frames.system[rows].astype(np.int64) << 8 | frames.component[rows]
+    first = np.unique(address, return_index=True)[1]
+    return {
+        (int(number) >> 8, int(number) & 0xFF): (int(kind), int(autopilot))
+        for number, kind, autopilot in zip(
+            address[first], beats["type"][first], beats["autopilot"][first], strict=True
+        )
+    }
+
+
+def _counts(frames: Frames, rows: Rows | slice = slice(None)) -> list[tuple[Address, int]]:
+    """Senders of frames and how many each sent, most first, at most :data:`MAX_SENDERS`."""
+    address = frames.system[rows].astype(np.int64) << 8 | frames.component[rows]
+    numbers, counts = np.unique(address, return_counts=True)
+    most = np.argsort(-counts, kind="stable")[:MAX_SENDERS]
+    return [((int(numbers[i]) >> 8, int(numbers[i]) & 0xFF), int(counts[i])) for i in most]
+
+
+def _flies(kind: int, autopilot: int) -> bool:
+    return autopilot != NO_AUTOPILOT and kind != GROUND_STATION
+
+
+def choose_autopilot(frames: Frames, system: int | None) -> tuple[Address, str]:
+    """Address and name of the autopilot whose flight this is.
+
+    Raises
+    ------
+    SettingsError
+        No autopilot has the system id that was asked for.
+    """
+    counts = dict(_counts(frames))
+    vehicles = _vehicles(frames)
+    flying = [s for s in counts if s in vehicles and _flies(*vehicles[s])]
+    # without a heartbeat the autopilot is still known by its component
+    candidates = flying or [s for s in counts if s[1] == AUTOPILOT_COMPONENT] or list(counts)
+    if system is not None:
+        candidates = [address for address in candidates if address[0] == system]
+        if not candidates:
+            have = ", ".join(str(number) for number in sorted({s[0] for s in flying})) or "none"
+            raise SettingsError(
+                f"{frames.name}: --system {system}: no autopilot has this system id; autopilots "
+                f"in the file: {have}."
+            )
+    best = max(candidates, key=lambda address: counts[address])
+    name = AUTOPILOTS.get(vehicles[best][1]) if best in vehicles else None
+    return best, name or "unknown autopilot"
+
+
+def _boot_stamps(frames: Frames, address: Address) -> tuple[Rows, Array]:
+    """Frames of the autopilot that carry its boot clock, in file order, and that clock (s)."""
+    own = (frames.system == address[0]) & (frames.component == address[1])
+    all_rows, all_stamps = [], []
+    for number in np.unique(frames.message_id[own]).tolist():
+        name = message_name(number)
+        if "time_boot_ms" in (wire_layout(number).names or ()):
+            stamp, unit = "time_boot_ms", 1e-3
+        elif name in STAMPED_BY_BOOT_CLOCK:
+            stamp, unit = "time_usec", 1e-6
+        else:
+            continue
+        rows = frames.rows(name)
+        rows = rows[own[rows]]
+        stamps = frames.table(name, rows)[stamp] * unit
+        good = (stamps > 0.0) & (stamps < UNIX_FROM_S)
+        all_rows.append(rows[good])
+        all_stamps.append(stamps[good])
+    if not all_rows:
+        return np.zeros(0, dtype=np.intp), np.zeros(0)
+    rows, stamps = np.concatenate(all_rows), np.concatenate(all_stamps)
+    order = np.argsort(rows, kind="stable")
+    return rows[order], stamps[order]
+
+
+def settle_clocks(frames: Frames, address: Address) -> Recording:
+    """Choose the session and map the time of receipt to the boot clock."""
+    notes: list[str] = []
+    rows, stamps = _boot_stamps(frames, address)
+    session = slice(0, len(frames))
+    restarts = np.flatnonzero(np.diff(stamps) < -RESTART_S) + 1
+    # one late packet is no restart: those after it must be early too
+    later = stamps[np.minimum(restarts + RESTART_MESSAGES, len(stamps) - 1)]
+    restarts = restarts[later < stamps[restarts - 1] - RESTART_S]
+    if len(restarts):
+        parts = np.split(np.arange(len(rows)), restarts)
+        longest = max(range(len(parts)), key=lambda part: len(parts[part]))
+        part = parts[longest]
+        low = int(rows[part[0]]) if longest else 0
+        high = len(frames) if longest == len(parts) - 1 else int(rows[part[-1]]) + 1
+        session = slice(low, high)
+        notes.append(
+            f"the autopilot's boot clock went back {len(restarts)} "
+            f"{'times' if len(restarts) > 1 else 'time'} (restart): only part {longest + 1} of "
+            f"{len(parts)} was read, from {stamps[part[0]]:.1f} s to {stamps[part[-1]]:.1f} s of "
+            f"its boot clock, {len(part) / len(rows):.0%} of the data"
+        )
+        rows, stamps = rows[part], stamps[part]
+    line = Line(0.0, 0.0, 1.0, 0.0, len(rows))
+    received = np.zeros(len(frames))
+    if frames.received_us is not None:
+        received = (frames.received_us - frames.received_us[0]) * 1e-6
+        if len(rows):
+            line = least_delay(stamps, received[rows]).inverse()
+    elif len(rows):
+        # no time of receipt: the boot clock of the last stamped message stands in for it
+        at = np.clip(np.searchsorted(rows, np.arange(len(frames)), side="right") - 1, 0, None)
+        received = np.maximum.accumulate(stamps)[at]
+    notes += _frame_notes(frames, received)
+    kept = stamps[increasing(np.rint(stamps * 1e6).astype(np.int64))]
+    zero_s, end_s = (float(kept[0]), float(kept[-1])) if len(kept) else (0.0, 0.0)
+    return Recording(frames, *address, session, received, line, zero_s, end_s - zero_s, notes)
+
+
+def _frame_notes(frames: Frames, received: Array) -> list[str]:
+    notes = []
+    if frames.bad_bytes:
+        share = frames.bad_bytes / len(frames.content)
+        notes.append(
+            f"{'damaged: ' if share > DAMAGED_SHARE else ''}{frames.bad_bytes} bytes ({share:.2%}) "
+            "belong to no whole MAVLink frame and were passed over"
+        )
+    if frames.bad_stamps:
+        notes.append(f"{frames.bad_stamps} times of receipt are damaged and were interpolated")
+    back = int(np.count_nonzero(np.diff(received) < 0.0))
+    if back and frames.received_us is not None:
+        notes.append(f"the time of receipt went back {back} {'times' if back > 1 else 'time'}")
+    if frames.unknown:
+        listed = ", ".join(f"{count} of {name}" for name, count in sorted(frames.unknown.items()))
+        notes.append(f"messages with ids that this version does not know: {listed}")
+    return notes
+
+
+def senders_of(recording: Recording, message: str) -> list[Address]:
+    """Senders of one message that may speak to this vehicle: not it, nor another vehicle's."""
+    frames = recording.frames
+    rows = frames.rows(message)
+    rows = rows[(rows >= recording.session.start) & (rows < recording.session.stop)]
+    own = (recording.system, recording.component)
+    others = {s[0] for s, seen in _vehicles(frames).items() if _flies(*seen)} - {recording.system}
+    return [s for s, _ in _counts(frames, rows) if s != own and s[0] not in others]
+
+
+def map_senders(recording: Recording) -> dict[Address, Mapped]:
+    """Clock of every sender of an external position."""
+    found = {s for source in POSITION_INPUTS for s in senders_of(recording, source.message)}
+    unix = unix_of_boot(recording)
+    return {sender: _map_sender(recording, sender, unix) for sender in sorted(found)}
+
+
+def _map_sender(recording: Recording, sender: Address, unix: Line | None) -> Mapped:
+    frames = recording.frames
+    stamps, received = [], []
+    for source in POSITION_INPUTS:
+        rows = recording.rows(source.message, sender)
+        stamps.append(frames.table(source.message, rows)[source.stamp] * 1e-6)
+        received.append(recording.received_s[rows])
+    about = float(np.median(np.concatenate(stamps)))
+    rows = recording.rows("TIMESYNC", sender)
+    sync = frames.table("TIMESYNC", rows)
+    replied, asked = sync["tc1"] * 1e-9, sync["ts1"] * 1e-9
+    # the reply to somebody else's question carries another clock
+    replies = (replied != 0.0) & (np.abs(asked - recording.receipt_boot_s(rows)) <= RESTART_S)
+    # a question is stamped as it is sent: hardly delayed
+    questions = (replied == 0.0) & (np.abs(asked - about) < OTHER_CLOCK_S)
+    stamps.append(asked[questions])
+    received.append(recording.received_s[rows][questions])
+    own = frames.table("TIMESYNC", recording.rows("TIMESYNC"))
+    answered, question = own["tc1"] * 1e-9, own["ts1"] * 1e-9
+    answers = (answered != 0.0) & (np.abs(question - about) < OTHER_CLOCK_S)
+    return map_clock(
+        f"system {sender[0]}, component {sender[1]}",
+        np.concatenate(stamps),
+        np.concatenate(received),
+        recording.boot_of_receipt,
+        Exchanges(replied[replies], asked[replies], question[answers], answered[answers]),
+        unix,
+        has_receipt=frames.received_us is not None,
+    )
+
+
+def unix_of_boot(recording: Recording) -> Line | None:
+    """Boot clock to UNIX time by the autopilot's SYSTEM_TIME, where a receiver has set it."""
+    table = recording.frames.table("SYSTEM_TIME", recording.rows("SYSTEM_TIME"))
+    boot, unix = table["time_boot_ms"] * 1e-3, table["time_unix_usec"] * 1e-6
+    known = unix > UNIX_FROM_S
+    if not np.any(known):
+        return None
+    return least_delay(boot[known], unix[known])
+
+
+def clock_maps(recording: Recording, mapped: dict[Address, Mapped]) -> tuple[ClockMap, ...]:
+    """How the senders' clocks and the time of receipt were mapped to the boot clock."""
+    clocks = [sender.statement for sender in mapped.values()]
+    received_us, line = recording.frames.received_us, recording.boot_of_receipt
+    if received_us is not None and line.pairs:
+        clocks.append(
+            ClockMap(
+                "time of receipt (the recording computer's UNIX time)",
+                "receive time",
+                line.pairs,
+                line.y0 - line.x0 - float(received_us[0]) * 1e-6,
+                (line.slope - 1.0) * 1e6,
+                line.jitter,
+                "by the least delayed messages; used only to order messages and to map clocks",
+            )
+        )
+    return tuple(clocks)
+
+
+def describe_senders(recording: Recording) -> tuple[Sender, ...]:
+    """Senders that the recording heard, most messages first."""
+    frames, vehicles = recording.frames, _vehicles(recording.frames)
+    described = []
+    for address, count in _counts(frames):
+        word = "no heartbeat"
+        if address in vehicles:
+            kind, autopilot = vehicles[address]
+            word = VEHICLE_TYPES.get(kind, f"type {kind}")
+            if autopilot != NO_AUTOPILOT:
+                word = f"{AUTOPILOTS.get(autopilot, 'autopilot')} {word}"
+        chosen = address == (recording.system, recording.component)
+        described.append(Sender(*address, word, count, _lost_share(frames, address), chosen))
+    return tuple(described)
+
+
+def _lost_share(frames: Frames, address: Address) -> float | None:
+    """Share of a sender's messages that its sequence numbers say are not here.
+
+    MAVProxy keeps the link's number in the stamp, and every link has its own sequence; others
+    leave the clock's own bits there. The reading that misses fewer is the right one.
+    """
+    own = (frames.system == address[0]) & (frames.component == address[1])
+    sequence, link = frames.sequence[own].astype(np.int64), frames.link[own]
+    by_link = [sequence[link == number] for number in np.unique(link).tolist()]
+    lost = min(_missing(sequence), sum(_missing(part) for part in by_link))
+    share = lost / (lost + len(sequence))
+    return share if share < SEQUENCE_MEANS_NOTHING else None
+
+
+def _missing(sequence: NDArray[np.int64]) -> int:
+    return int(np.sum((np.diff(sequence) - 1) % 256))
