@@ -90,9 +90,8 @@ def join(flight: Flight, other: Flight) -> Flight:
         ),
         positions=tuple(sorted((*flight.positions, *moved.positions), key=lambda t: t.rung)),
         missing=tuple(
-            part
-            for part in flight.missing
-            if part.what.startswith("position source ") or part in lacking
+            *lacking,
+            *(part for part in flight.missing if part.what.startswith("position source ")),
         ),
         streams=streams,
         clocks=(*flight.clocks, *other.clocks),

@@ -31,6 +31,7 @@ from ulog_tools import (
     topic,
 )
 
+from px4fuse.cli import main
 from px4fuse.errors import LogError, Px4FuseError
 from px4fuse.flight import Flight, Unavailable
 from px4fuse.readers import read_log
@@ -169,13 +170,47 @@ def test_random_bytes_behind_a_good_first_line(workspace, content):
 def test_a_log_of_topics_that_are_none_of_ours(tmp_path):
     at = stamps(2.0, 10.0)
     log = Log([topic("battery_status", at, {"voltage_v": np.full(len(at), 16.0)})])
-    assert "SDLOG_PROFILE" in refusal(log.write(tmp_path / "battery.ulg"))
+    flight = outcome(log.write(tmp_path / "battery.ulg"))
+    assert isinstance(flight, Flight)
+    parts = (flight.imu, flight.attitude, flight.ekf2, flight.truth, flight.airborne)
+    assert all(isinstance(part, Unavailable) for part in parts)
+    assert set(parts[:4]) <= set(flight.missing)
+    assert flight.positions == ()
+    assert flight.streams == {}
+    assert flight.log.duration_s == pytest.approx(1.9)
+    assert any("battery_status" in note for note in flight.log.notes)
+    with pytest.raises(Px4FuseError, match=r"no external position .* SDLOG_PROFILE to 129"):
+        choose_source(flight)
+
+
+def test_a_log_of_other_topics_without_time_is_refused(tmp_path):
+    log = Log([topic("battery_status", np.zeros(20, np.uint64), {"voltage_v": np.ones(20)})])
+    assert "time stamp" in refusal(log.write(tmp_path / "battery.ulg"))
+
+
+@pytest.mark.reallogs
+@pytest.mark.parametrize("name", [
+    "annoybot_yule_log_trig_stats", "erdemarslan380_px4-system-identification_log100",
+])  # fmt: skip
+def test_compare_on_a_log_without_anything_of_ours_is_one_line(
+    shared_logs, tmp_path, monkeypatch, capsys, name
+):
+    monkeypatch.chdir(tmp_path)
+    log = shared_logs / "real" / f"{name}.ulg"
+    monkeypatch.setattr("sys.argv", ["px4fuse", "compare", str(log)])
+    with pytest.raises(SystemExit) as stopped:
+        main()
+    out, err = capsys.readouterr()
+    assert (stopped.value.code, out, len(err.splitlines())) == (2, "", 1)
+    assert err.startswith(f"px4fuse: {name}.ulg: no external position in this log")
+    assert "SDLOG_PROFILE" in err
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_definitions_without_data(tmp_path):
     log = make_log("v1.16", 2.0)
     log.topics = [take(made, []) for made in log.topics]
-    assert "without any" in refusal(log.write(tmp_path / "no_data.ulg"))
+    assert "without any data" in refusal(log.write(tmp_path / "no_data.ulg"))
 
 
 def test_a_format_that_contains_itself(tmp_path):

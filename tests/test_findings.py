@@ -4,19 +4,30 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from flights import Estimator, Imu, Uwb, aisle_flight
 
 from px4fuse import findings as package
 from px4fuse.comparison import Comparison, compare
+from px4fuse.consistency import MIN_INNOVATIONS
 from px4fuse.findings import DETECTORS, SEVERITIES, Finding, find
-from px4fuse.flight import Dropout, Flight, Reset
+from px4fuse.flight import (
+    AXIS_NAMES,
+    Alignment,
+    ClockMap,
+    Dropout,
+    Ekf2,
+    Flight,
+    Reset,
+    Unavailable,
+)
 from px4fuse.kalman import Settings
 from px4fuse.readers import read_log
 
@@ -43,6 +54,57 @@ class Fault:
     evidence: Mapping[str, Any] = field(default_factory=dict)
     says: str = ""
     remedy: str = ""
+    change: Callable[[Flight], Flight] = lambda flight: flight
+
+    def fly(self, **other: Any) -> Flight:
+        """The flight with the mistake in it."""
+        return self.change(aisle_flight(**{**self.flight, **other}))
+
+
+def with_source(**changes: Any) -> Callable[[Flight], Flight]:
+    """Change the position track."""
+
+    def change(flight: Flight) -> Flight:
+        (track,) = flight.positions
+        return replace(flight, positions=(replace(track, **changes),))
+
+    return change
+
+
+def with_log(**changes: Any) -> Callable[[Flight], Flight]:
+    """Change what is said of the log."""
+    return lambda flight: replace(flight, log=replace(flight.log, **changes))
+
+
+def without_every(nth: int) -> Callable[[Flight], Flight]:
+    """A recording of a link that lost every nth position."""
+
+    def change(flight: Flight) -> Flight:
+        (track,) = flight.positions
+        keep = np.arange(len(track.samples)) % nth > 0
+        lossy = replace(track, samples=track.samples[keep], clock_map=mapped("TIMESYNC"))
+        return replace(flight, positions=(lossy,))
+
+    return change
+
+
+def mapped(method: str, distinct: int | None = None, jitter_s: float = 0.02) -> ClockMap:
+    return ClockMap("UNIX time of system 1", method, 600, -1e9, 0.1, jitter_s, "", distinct)
+
+
+def as_recording(flight: Flight) -> Flight:
+    """Without innovations, as MAVLink carries it."""
+    assert isinstance(flight.ekf2, Ekf2)
+    none = Unavailable("EKF2 innovations", "MAVLink does not carry them", "")
+    ekf2 = replace(flight.ekf2, innovations=dict.fromkeys(AXIS_NAMES, none))
+    return with_log(format="MAVLink tlog")(replace(flight, ekf2=ekf2))
+
+
+def placed(*warnings: str) -> Alignment:
+    return Alignment(
+        "enu", "given", 0.0, None, "given", (0.0, 0.0, 0.0), 0.0, None, "given", "", None, None,
+        warnings,
+    )  # fmt: skip
 
 
 def about(value: float, rel: float = 0.1) -> Any:
@@ -50,6 +112,64 @@ def about(value: float, rel: float = 0.1) -> Any:
 
 
 FAULTS = [
+    # a recording of its own
+    Fault(
+        "source_stamps_constant",
+        "error",
+        evidence={"stamps": 600.0, "distinct": 2.0},
+        says="take only 2 values",
+        remedy="time of measurement",
+        change=with_source(clock_map=mapped("receive time", distinct=2)),
+    ),
+    Fault(
+        "source_receipt_jitter",
+        "warning",
+        evidence={"jitter_s": 0.02},
+        says="jitters by 20 ms",
+        change=with_source(clock_map=mapped("receive time", distinct=2)),
+    ),
+    Fault(
+        "companion_not_synchronised",
+        "warning",
+        evidence={"jitter_s": 0.02},
+        says="never synchronised",
+        remedy="TIMESYNC",
+        change=with_source(clock_map=mapped("receive time")),
+    ),
+    Fault(
+        "source_samples_lost",
+        "info",
+        evidence={"lost_share": about(0.1, 0.05)},
+        says="About 10%",
+        change=without_every(10),
+    ),
+    Fault(
+        "innovations_need_ulog",
+        "info",
+        says="states and variances but not its innovations",
+        remedy="--mavlink aisle.ulg",
+        change=as_recording,
+    ),
+    Fault("not_px4", "info", says="ArduPilot", change=with_log(autopilot="ArduPilot")),
+    Fault(
+        "autopilot_restarted",
+        "warning",
+        says="boot clock went back 1 time",
+        change=with_log(notes=("the autopilot's boot clock went back 1 time (restart): x",)),
+    ),
+    Fault(
+        "receipt_out_of_order",
+        "info",
+        says="went back 3 times",
+        change=with_log(notes=("the time of receipt went back 3 times",)),
+    ),
+    Fault(
+        "position_file_placement",
+        "warning",
+        says="Yaw is known to 5° only.",
+        remedy="--position-yaw",
+        change=with_source(alignment=placed("yaw is known to 5° only")),
+    ),
     # the filter's own settings
     Fault(
         "kf_variance_understated",
@@ -234,6 +354,7 @@ FAULTS = [
 
 # An error that another fault brings with it
 FOLLOWS = {
+    "source_receipt_jitter": "source_stamps_constant",
     "process_noise_forgotten": "kf_variance_understated",
     "ekf2_rejecting": "ekf2_variance_understated",
 }
@@ -299,7 +420,7 @@ def test_the_faults_below_cover_every_finding() -> None:
 
 @pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: f"{fault.id}-{fault.severity}")
 def test_a_fault_is_named_with_its_evidence_and_no_unrelated_error(fault: Fault) -> None:
-    findings = found(compare(aisle_flight(**fault.flight), Settings(**fault.settings)))
+    findings = found(compare(fault.fly(), Settings(**fault.settings)))
     named = [each for each in findings if each.id == fault.id]
     assert named, f"{fault.id} is not among {sorted(ids(findings))}"
     assert named[0].severity == fault.severity
@@ -326,11 +447,15 @@ def test_a_missing_field_is_not_guessed(
 @pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: f"{fault.id}-{fault.severity}")
 def test_a_flight_of_a_moment_does_not_break_a_detector(fault: Fault, duration_s: float) -> None:
     uwb = replace(fault.flight.get("uwb", Uwb()), rate_hz=5.0, gap_s=None)
-    short = {**fault.flight, "duration_s": duration_s, "uwb": uwb}
-    if isinstance(short.get("imu"), Imu):
-        short["imu"] = replace(short["imu"], gap_s=None)
-    findings = found(compare(aisle_flight(**short), Settings(**fault.settings)))
-    assert ("too_few_innovations" in ids(findings)) == (duration_s < 2.0)
+    short: dict[str, Any] = {"duration_s": duration_s, "uwb": uwb}
+    if isinstance(imu := fault.flight.get("imu"), Imu):
+        short["imu"] = replace(imu, gap_s=None)
+    if fault.id == "source_samples_lost":
+        uwb = replace(uwb, rate_hz=10.0)  # of which one in ten is lost
+        short["uwb"] = uwb
+    comparison = compare(fault.fly(**short), Settings(**fault.settings))
+    few = len(comparison.axes[0].replay.updates) < MIN_INNOVATIONS
+    assert ("too_few_innovations" in ids(found(comparison))) == few
 
 
 @pytest.mark.parametrize("detector", DETECTORS, ids=lambda detector: detector.__name__)

@@ -710,6 +710,95 @@ def test_motion_capture_is_no_truth_where_it_is_all_there_is(read):
     assert choose_source(flight)[0].name == "vehicle_mocap_odometry"
 
 
+# ---- where each part came from ----------------------------------------------------------------
+
+STREAMS = {
+    "v1.9": {
+        "ekf2_variance": ("estimator_status",),
+        "ekf2_innovations": ("ekf2_innovations",),
+        "ekf2_fusing": ("estimator_status",),
+    },
+    "v1.12": {
+        "ekf2_variance": ("estimator_states",),
+        "ekf2_innovations": (
+            "estimator_innovations",
+            "estimator_innovation_variances",
+            "estimator_innovation_test_ratios",
+        ),
+        "ekf2_fusing": ("estimator_status_flags",),
+    },
+    "v1.16": {
+        "ekf2_variance": ("estimator_states",),
+        "ekf2_innovations": ("estimator_aid_src_ev_pos", "estimator_aid_src_ev_hgt"),
+        "ekf2_fusing": ("estimator_status_flags",),
+    },
+}
+
+
+@pytest.mark.parametrize("generation", STREAMS)
+def test_each_part_names_its_topics_clock_and_file(read, generation):
+    flight = read(make_log(generation))
+    named = {part: stream.topics for part, stream in flight.streams.items()}
+    assert named == STREAMS[generation] | {
+        "imu": ("sensor_combined",),
+        "attitude": ("vehicle_attitude",),
+        "ekf2_state": ("vehicle_local_position",),
+        "airborne": ("vehicle_land_detected",),
+    }
+    assert {stream.log for stream in flight.streams.values()} == {"made.ulg"}
+    assert {track.log for track in flight.positions} == {"made.ulg"}
+    measured = {part for part, s in flight.streams.items() if s.clock.endswith("at measurement")}
+    sampled = {"ekf2_state", *STREAMS[generation]}
+    assert measured == {"imu"} | (set() if generation == "v1.9" else sampled)
+    assert flight.log.autopilot == "PX4"
+
+
+def test_parts_that_are_missing_have_no_stream(read):
+    flight = read(make_log().drop("sensor_combined", "vehicle_local_position"))
+    assert set(flight.streams) == {"attitude", "airborne"}
+
+
+def test_truth_has_a_stream(sample_flight):
+    assert sample_flight.streams["truth"].topics == ("vehicle_local_position_groundtruth",)
+
+
+def test_ranges_of_uwb_are_reported_as_unused(read):
+    at = stamps(10.0, 4.0)
+    ranges = topic("sensor_uwb", at, {"distance": np.ones(len(at))})
+    grid = topic("uwb_grid", at[:3], {"num_anchors": np.ones(3, np.uint8)})
+    flight = read(make_log().add(ranges, grid))
+    assert [(part.name, part.count) for part in flight.unused] == [
+        ("sensor_uwb", 40), ("uwb_grid", 3),
+    ]  # fmt: skip
+    assert "one range and two angles" in flight.unused[0].reason
+    assert flight.positions[0].name == "vehicle_visual_odometry"
+
+
+@pytest.mark.parametrize("generation", ["v1.12", "v1.16"])
+def test_the_start_in_utc_is_that_of_the_receivers_fixes(read, generation):
+    made = gps(generation)
+    utc_us = 1_700_000_000_000_000 + np.round(seconds_of(made.fields["timestamp"]) * 1e6)
+    utc_us[:2] = 0  # not known yet
+    made.fields["time_utc_usec"] = utc_us.astype(np.uint64)
+    start = read(make_log().add(made)).log.start_unix_s
+    assert start == pytest.approx(1_700_000_000.0, abs=1e-5)
+
+
+@pytest.mark.parametrize("utc_us", [0, 5_000_000, 2**64 - 1])
+def test_a_receiver_without_utc_gives_no_start(read, utc_us):
+    made = gps()
+    made.fields["time_utc_usec"] = np.full(len(made.fields["timestamp"]), utc_us, np.uint64)
+    assert read(make_log().add(made)).log.start_unix_s is None
+
+
+def test_a_receiver_without_a_fix_gives_no_start(read):
+    made = gps()
+    count = len(made.fields["timestamp"])
+    made.fields["time_utc_usec"] = np.full(count, 1_700_000_000_000_000, np.uint64)
+    made.fields["fix_type"][:] = 2
+    assert read(make_log().add(made)).log.start_unix_s is None
+
+
 # ---- the shipped sample -----------------------------------------------------------------------
 
 
@@ -893,8 +982,6 @@ def test_every_log_reads_or_is_refused_and_times_increase(shared_logs):
     paths = sorted((shared_logs / "real").glob("*.ulg"))
     assert paths
     for path in paths:
-        if path.name == "annoybot_yule_log_trig_stats.ulg":  # no PX4 topic in it
-            continue
         flight = read_log(path)
         frames = [flight.imu, flight.attitude, *(track.samples for track in flight.positions)]
         for frame in frames:

@@ -199,11 +199,20 @@ def test_a_topic_subscribed_to_twice_is_one_topic(tmp_path, order):
     np.testing.assert_allclose(read["x"], expected, rtol=1e-6)
 
 
-def test_logs_without_any_known_topic_are_refused(tmp_path):
+def test_logs_without_any_known_topic_are_placed_in_time_all_the_same(tmp_path):
     log = make_log("v1.16", 2.0)
     for name in sorted(log.names()):
         log.rename(name, f"other_{name}")
-    with pytest.raises(LogError, match="without any of the topics"):
+    topics = read_topics(log.write(tmp_path / "made.ulg"))
+    assert topics.tables == {}
+    assert topics.log.duration_s == pytest.approx(1.99)
+    assert any("none of its topics" in note for note in topics.log.notes)
+
+
+def test_logs_without_any_data_are_refused(tmp_path):
+    log = make_log("v1.16", 2.0)
+    log.topics = [take(made, []) for made in log.topics]
+    with pytest.raises(LogError, match="without any data"):
         read_topics(log.write(tmp_path / "made.ulg"))
 
 

@@ -14,6 +14,8 @@ from px4fuse.errors import Px4FuseError
 # Command name to module and one-line help: --help must not import what the commands need.
 COMMANDS = {
     "compare": ("px4fuse.cli.compare", "Compare a flight's EKF2 with a two-state Kalman filter."),
+    "info": ("px4fuse.cli.info", "Say what is in a log and what can be done with it."),
+    "extract": ("px4fuse.cli.extract", "Write a log's data as tidy tables, CSV or Parquet."),
     "lesson": ("px4fuse.cli.lesson", "Run the lesson's worked examples through this engine."),
 }
 

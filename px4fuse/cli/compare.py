@@ -12,6 +12,13 @@ from typing import TYPE_CHECKING, Any, cast
 import click
 from click.core import ParameterSource
 
+from px4fuse.cli.inputs import (
+    clock_offset_option,
+    position_options,
+    read_recordings,
+    recording_options,
+    with_position,
+)
 from px4fuse.errors import OutputError, SettingsError
 
 if TYPE_CHECKING:
@@ -85,14 +92,9 @@ NOT_RECORDED = ("log", "output", "json_path", "student", "student_id", "notes", 
     metavar="NAME",
     help="Position source, for example vehicle_gps_position.  [default: the best logged]",
 )
-@click.option(
-    "--clock-offset",
-    type=float,
-    default=0.0,
-    show_default=True,
-    metavar="S",
-    help="Added to the position source's time stamps.",
-)
+@recording_options
+@position_options
+@clock_offset_option
 @click.option("--student", default="", metavar="NAME", help="Name on the report.")
 @click.option("--id", "student_id", default="", metavar="ID", help="Student number on the report.")
 @click.option(
@@ -135,21 +137,26 @@ def compare(
     start: float | None,
     end: float | None,
     position_source: str | None,
-    clock_offset: float,
+    mavlink: Path | None,
+    system: int | None,
+    position: Path | None,
+    clock_offset: float | str | None,
     student: str,
     student_id: str,
     notes: Path | None,
     output: Path | None,
     json_path: Path | None,
     fail_on: str | None,
+    **position_format: Any,
 ) -> None:
     """Compare a flight's EKF2 with a two-state Kalman filter over IMU and position.
 
-    LOG is a PX4 ULog. Writes a PDF report and its results as JSON.
+    LOG is a PX4 ULog or a MAVLink recording (.tlog or raw stream). Writes a PDF report and its
+    results as JSON.
     """
     from rich.console import Console
 
-    from px4fuse import comparison, readers
+    from px4fuse import comparison
     from px4fuse.findings import find
     from px4fuse.kalman import InputName, Settings
     from px4fuse.report.document import Document, Student
@@ -160,10 +167,11 @@ def compare(
         sigma_z_m=sigma_z,
         dt_s=dt,
         input=cast(InputName, input_name or "imu"),
-        clock_offset_s=clock_offset,
+        # that of a position file is spent on placing it
+        clock_offset_s=clock_offset if isinstance(clock_offset, float) and not position else 0.0,
     )
-    for name, value in (("--start", start), ("--end", end)):
-        if value is not None and not abs(value) < float("inf"):
+    for name, value in (("--start", start), ("--end", end), ("--clock-offset", clock_offset)):
+        if isinstance(value, float) and not abs(value) < float("inf"):
             raise SettingsError(f"{name} {value:g} is not a finite number.")
     person = Student(_encodable(student), _encodable(student_id), _read_notes(notes))
     target = output or Path("reports") / f"{log.stem}.pdf"
@@ -171,7 +179,8 @@ def compare(
         raise OutputError(f"{target}: the report is a PDF. Give a name that ends in .pdf with -o.")
     with _progress(json_path) as step:
         step(f"reading {log.name}")
-        flight = readers.read_log(log)
+        flight = read_recordings(log, mavlink, system)
+        flight = with_position(flight, position, clock_offset, **position_format)
         compared = comparison.compare(
             flight,
             settings,
@@ -249,7 +258,8 @@ def _command_line(log: Path) -> str:
             continue
         value: Any = context.params[name]
         for single in value if isinstance(value, tuple) else (value,):
-            words += [parameter.opts[-1], str(single)]
+            text = single.name if isinstance(single, Path) else str(single)
+            words += [parameter.opts[-1], _encodable(text)]
     return shlex.join(words)
 
 

@@ -10,6 +10,16 @@ from px4fuse.comparison import Comparison
 from px4fuse.findings.ekf2 import ekf2_not_fusing, ekf2_rejecting, ekf2_unavailable, resets
 from px4fuse.findings.filter import process_noise_forgotten, too_few_innovations, variance_wrong
 from px4fuse.findings.model import SEVERITIES, Detector, Finding, Severity
+from px4fuse.findings.recording import (
+    autopilot_restarted,
+    companion_not_synchronised,
+    innovations_need_ulog,
+    other_autopilot,
+    position_file_placement,
+    receipt_out_of_order,
+    samples_lost,
+    stamps_meaningless,
+)
 from px4fuse.findings.source import (
     gaps,
     input_unavailable,
@@ -30,12 +40,16 @@ def find(comparison: Comparison) -> tuple[Finding, ...]:
 
 
 DETECTORS: tuple[Detector, ...] = (
+    stamps_meaningless,
     ekf2_not_fusing,
     process_noise_forgotten,
     variance_wrong,
     ekf2_rejecting,
+    companion_not_synchronised,
+    position_file_placement,
     source_reconstructed,
     gaps,
+    autopilot_restarted,
     resets,
     no_motion,
     logging_rate_low,
@@ -44,4 +58,8 @@ DETECTORS: tuple[Detector, ...] = (
     input_unavailable,
     too_few_innovations,
     log_damaged,
+    samples_lost,
+    other_autopilot,
+    receipt_out_of_order,
+    innovations_need_ulog,
 )

@@ -154,10 +154,12 @@ def no_motion(comparison: Comparison) -> Iterator[Finding]:
 def logging_rate_low(comparison: Comparison) -> Iterator[Finding]:
     """Topics that were logged too slowly for what is done with them."""
     flight = comparison.flight
-    for part, topic, threshold in (
-        (flight.imu, "sensor_combined", MIN_IMU_RATE),
-        (flight.attitude, "vehicle_attitude", MIN_ATTITUDE_RATE),
+    mavlink = flight.log.format.startswith("MAVLink")
+    for part, name, default, threshold in (
+        (flight.imu, "imu", "sensor_combined", MIN_IMU_RATE),
+        (flight.attitude, "attitude", "vehicle_attitude", MIN_ATTITUDE_RATE),
     ):
+        topic = flight.streams[name].topics[0] if name in flight.streams else default
         if isinstance(part, pd.DataFrame) and sample_rate(part) < threshold.value:
             yield Finding(
                 "logging_rate_low",
@@ -165,7 +167,10 @@ def logging_rate_low(comparison: Comparison) -> Iterator[Finding]:
                 f"{topic} was logged at {sample_rate(part):.1f} Hz, below the "
                 f"{threshold.value:g} Hz that the acceleration needs: motion between samples "
                 "is lost.",
-                f'Put the line "{topic} 0" into etc/logging/logger_topics.txt on the SD card.',
+                f"Raise its stream rate (mavlink stream -d DEVICE -s {topic} -r "
+                f"{2 * threshold.value:g} in PX4's console), or join the ULog (--mavlink)."
+                if mavlink
+                else f'Put the line "{topic} 0" into etc/logging/logger_topics.txt on the SD card.',
                 {"rate_hz": sample_rate(part), "needed_hz": threshold.value, "topic": topic},
             )
     innovations = next(
@@ -213,6 +218,6 @@ def log_damaged(comparison: Comparison) -> Iterator[Finding]:
             "warning",
             f"{notes[0][0].upper()}{notes[0][1:]}"
             + (f" (and {len(notes) - 1} more such notes)." if len(notes) > 1 else "."),
-            "Copy the log from the SD card again; if it stays, replace the card.",
+            "Copy the log again; if it stays, replace the SD card or mend the MAVLink link.",
             {"notes": float(len(notes))},
         )

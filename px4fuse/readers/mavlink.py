@@ -46,6 +46,8 @@ from px4fuse.readers.px4_topics import PARAMETERS
 PARAMETER_REAL = 9
 
 
+# hostile values become NaN or infinite without a word, and are dropped where samples are made
+@np.errstate(invalid="ignore", over="ignore", divide="ignore")
 def read_mavlink(path: Path, system: int | None = None) -> Flight:
     """Read a MAVLink recording.
 
@@ -219,7 +221,8 @@ def _describe(
     beats = frames.table("HEARTBEAT", recording.rows("HEARTBEAT"))
     kind = VEHICLE_TYPES.get(int(beats["type"][0]), "vehicle") if len(beats) else "vehicle"
     dropped = [
-        f"{count} samples of {message} were dropped: their time stamps are zero or go back"
+        f"{count} samples of {message} were dropped: their time stamps are zero, go back, or lie "
+        "outside the recording"
         for message, count in sorted(recording.dropped.items())
     ]
     return LogInfo(

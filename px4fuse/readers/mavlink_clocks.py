@@ -20,6 +20,8 @@ Array = NDArray[np.float64]
 
 # Stamps within this of the boot clock at their receipt are taken to be on the boot clock
 SAME_CLOCK_S = 10.0
+# unless TIMESYNC brings them closer to their receipt by this much
+MIN_GAIN_S = 0.1
 # 2001-09-09: below this, microseconds count from boot, above from 1970
 UNIX_FROM_S = 1e9
 # The envelope takes the least delayed message of each stretch of this length
@@ -89,8 +91,16 @@ def least_delay(x: Array, y: Array) -> Line:
     if span >= MIN_DRIFT_SPAN_S and len(lowest) > 1:
         slope += float(theilslopes(residual[lowest], x[lowest])[0])
         residual = y - slope * (x - x0)
+    if not 0.0 < slope < np.inf:  # no clock runs backwards
+        slope = 1.0
+        residual = y - x + x0
     y0 = float(np.median(residual[lowest]))
     return Line(x0, y0, slope, spread(residual), len(x))
+
+
+def tells_time(stamp_s: Array) -> bool:
+    """Whether stamps take enough values to be a clock's."""
+    return len(np.unique(stamp_s)) >= max(MIN_DISTINCT_SHARE * len(stamp_s), 2)
 
 
 def spread(values: Array) -> float:
@@ -160,8 +170,8 @@ def map_clock(
     """
     receipt = "receive time" if has_receipt else "position in the stream"
     boot_at_receipt = boot_of_receipt.at(received_s)
-    distinct = len(np.unique(stamp_s))
-    if distinct < max(MIN_DISTINCT_SHARE * len(stamp_s), 2):
+    if not tells_time(stamp_s):
+        distinct = len(np.unique(stamp_s))
         note = (
             f"its {len(stamp_s)} time stamps take only {distinct} values, so the {receipt} stands "
             "in for them"
@@ -171,14 +181,19 @@ def map_clock(
         regular = intervals[intervals < MAX_INTERVAL_S]
         jitter = float(np.std(regular) / np.sqrt(2.0)) if len(regular) > 1 else 0.0
         return Mapped(None, ClockMap(name, receipt, len(stamp_s), 0.0, 0.0, jitter, note, distinct))
-    if abs(float(np.median(boot_at_receipt - stamp_s))) <= SAME_CLOCK_S:
+    synchronised = _by_exchange(exchanges)
+    as_it_is = abs(float(np.median(boot_at_receipt - stamp_s)))
+    # a clock of its own may have started seconds after the autopilot's
+    gained = 0.0
+    if synchronised is not None:
+        gained = as_it_is - abs(float(np.median(boot_at_receipt - synchronised.at(stamp_s))))
+    if as_it_is <= SAME_CLOCK_S and gained < MIN_GAIN_S:
         line = Line(float(stamp_s[0]), float(stamp_s[0]), 1.0, 0.0, len(stamp_s))
         note = "its stamps are on the boot clock already"
         return Mapped(line, ClockMap(name, "boot clock", len(stamp_s), 0.0, 0.0, 0.0, note))
     kind = "UNIX time" if float(np.median(stamp_s)) > UNIX_FROM_S else "own clock"
     clock = f"{kind} of {name}"
     candidates: list[tuple[str, Line, str]] = []
-    synchronised = _by_exchange(exchanges)
     if synchronised is not None:
         candidates.append(("TIMESYNC", synchronised, ""))
     if kind == "UNIX time" and unix_of_boot is not None:

@@ -82,12 +82,16 @@ def read_ekf2(
         variance=variance,
         innovations={
             axis: Unavailable(
-                f"EKF2 innovations, {axis}", "MAVLink does not carry them", INNOVATIONS_REMEDY
+                f"EKF2 innovations, {axis}",
+                "MAVLink does not carry EKF2's innovations",
+                INNOVATIONS_REMEDY,
             )
             for axis in AXIS_NAMES
         },
         innovation_topics=(),
-        fusing=Unavailable("EKF2 fusion flags", "MAVLink does not carry them", INNOVATIONS_REMEDY),
+        fusing=Unavailable(
+            "EKF2 fusion flags", "MAVLink does not carry EKF2's fusion flags", INNOVATIONS_REMEDY
+        ),
         resets=(),
         instances=NO_SELECTOR,
         gate=parameters.get("EKF2_EVP_GATE", DEFAULT_GATE),

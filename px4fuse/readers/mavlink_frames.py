@@ -35,7 +35,7 @@ SIGNED = 0x01
 # QGroundControl and MAVProxy put the time of receipt before each frame: µs, big-endian
 STAMP = 8
 # Bytes that are scanned at a time, which bounds the memory that hostile bytes can claim
-BLOCK = 1 << 18
+BLOCK = 1 << 16
 # Below this share of bytes in good frames a file is no MAVLink recording: chance makes one frame
 # in about eight million random bytes.
 MIN_GOOD_SHARE = 0.01
@@ -198,15 +198,15 @@ def read_frames(path: Path) -> Frames:
     good = int(np.sum(end - start))
     if good < MIN_GOOD_SHARE * len(content) or not len(start):
         raise LogError(
-            f"{path.name}: neither a PX4 ULog nor MAVLink: {len(start)} frames with a good "
-            f"checksum in {len(content)} bytes. Give the .ulg from the vehicle, or a .tlog or raw "
-            "MAVLink recording."
+            f"{path.name}: not a PX4 ULog, and not a MAVLink recording ({len(start)} frames with a "
+            f"good checksum in {len(content)} bytes). Give the .ulg from the vehicle, or a .tlog "
+            "or raw MAVLink stream."
         )
     source = np.frombuffer(content, dtype=np.uint8)
     second = source[start] == MAGIC_2
-    # where each header field stands: MAVLink 2 and 1
-    header = start[:, None] + np.where(second[:, None], [[4, 5, 6, 7]], [[2, 3, 4, 5]])
-    number = source[header[:, 3]].astype(np.int32)
+    # sequence, system, component and the lowest byte of the message id follow one another
+    sequence = start + np.where(second, 4, 2)
+    number = source[sequence + 3].astype(np.int32)
     at = start[second]
     number[second] |= (source[at + 8].astype(np.int32) << 8) | (
         source[at + 9].astype(np.int32) << 16
@@ -221,9 +221,9 @@ def read_frames(path: Path) -> Frames:
         sha256=hashlib.sha256(content).hexdigest(),
         start=start,
         message_id=number,
-        system=source[header[:, 1]],
-        component=source[header[:, 2]],
-        sequence=source[header[:, 0]],
+        system=source[sequence + 1],
+        component=source[sequence + 2],
+        sequence=source[sequence],
         link=link,
         payload_start=start + np.where(second, HEADER_2, HEADER_1),
         payload_length=source[start + 1],
@@ -259,7 +259,7 @@ def _without_overlap(start: Integers, end: Integers, stamp: int) -> tuple[Intege
     """
     if not np.any(start[1:] < end[:-1]):
         return start, end
-    touches = np.isin(start - stamp, end) | np.isin(end + stamp, start)
+    touches = _among(start - stamp, np.sort(end)) | _among(end + stamp, start)
     keep = _greedy(start, end, np.flatnonzero(touches))
     kept_start, kept_end = start[keep], end[keep]
     rest = np.flatnonzero(~touches)
@@ -274,14 +274,15 @@ def _without_overlap(start: Integers, end: Integers, stamp: int) -> tuple[Intege
 
 def _greedy(start: Integers, end: Integers, rows: Integers) -> Integers:
     """Rows in order, without those that begin before the last one kept ends."""
+    free = np.ones(len(rows), dtype=np.bool_)
+    free[1:] = start[rows[1:]] >= np.maximum.accumulate(end[rows])[:-1]
+    alone = free & np.append(free[1:], True)
     keep, reached = [], 0
-    for row, first, last in zip(
-        rows.tolist(), start[rows].tolist(), end[rows].tolist(), strict=True
-    ):
-        if first >= reached:
+    for row in rows[~alone].tolist():
+        if start[row] >= reached:
             keep.append(row)
-            reached = last
-    return np.array(keep, dtype=np.int64)
+            reached = end[row]
+    return np.sort(np.concatenate([rows[alone], np.array(keep, dtype=np.int64)]))
 
 
 def _candidates(
@@ -311,10 +312,16 @@ def _candidates(
     )
 
 
+def _among(values: Integers, increasing: Integers) -> NDArray[np.bool_]:
+    """Whether each value is among increasing ones; np.isin takes many times the memory."""
+    at = np.searchsorted(increasing[:-1], values)
+    return np.asarray(increasing[at] == values)
+
+
 def _is_stamped(start: Integers, end: Integers) -> bool:
     """Whether a stamp stands before each frame: eight bytes between neighbours instead of none."""
-    stamped = np.count_nonzero(np.isin(end + STAMP, start))
-    bare = np.count_nonzero(np.isin(end, start))
+    stamped = np.count_nonzero(_among(end + STAMP, start))
+    bare = np.count_nonzero(_among(end, start))
     return bool(stamped > bare) if stamped + bare else bool(start[0] == STAMP)
 
 
@@ -374,21 +381,22 @@ def _stamps(
     source: NDArray[np.uint8], start: Integers, end: Integers
 ) -> tuple[Integers, NDArray[np.uint8], int]:
     """Time of receipt (µs), link number, and how many stamps were damaged."""
-    room = start - np.concatenate([[0], end[:-1]]) >= STAMP
-    first = np.flatnonzero(room)
+    usable = start >= STAMP
+    usable[1:] &= start[1:] - end[:-1] >= STAMP
     windows = np.lib.stride_tricks.sliding_window_view(source, STAMP)
-    stamp = windows[start[first] - STAMP].copy().view(">u8")[:, 0].astype(np.uint64)
-    plausible = stamp < np.uint64(1 << 62)
-    time_us = stamp[plausible].astype(np.int64)
-    middle = int(np.median(time_us)) if len(time_us) else 0
-    near = np.abs(time_us - middle) <= MAX_STAMP_DISTANCE_US
-    rows = first[plausible][near]
-    received = np.zeros(len(start), dtype=np.int64)
-    link = np.zeros(len(start), dtype=np.uint8)
-    if len(rows):
-        # interpolated from the first one on, so that float64 keeps every microsecond
-        zero = time_us[near][0]
-        steps = np.interp(np.arange(len(start)), rows, time_us[near] - zero)
-        received = zero + np.rint(steps).astype(np.int64)
-        link[rows] = (time_us[near] & 0x3).astype(np.uint8)
-    return received, link, len(start) - len(rows)
+    # the first frame may stand at the very beginning
+    stamp = np.ascontiguousarray(windows[np.maximum(start - STAMP, 0)]).view(">u8")[:, 0]
+    received = stamp.astype(np.int64)  # beyond 1 << 63: negative
+    usable &= (received >= 0) & (received < 1 << 62)
+    middle = int(np.median(received[usable])) if np.any(usable) else 0
+    usable &= np.abs(received - middle) <= MAX_STAMP_DISTANCE_US
+    link = (received & 0x3).astype(np.uint8)
+    if not np.all(usable):
+        rows = np.flatnonzero(usable)
+        link[~usable] = 0
+        received, good = np.zeros_like(received), received[rows]
+        if len(rows):
+            # interpolated from the first one on, so that float64 keeps every microsecond
+            steps = np.interp(np.arange(len(start)), rows, good - good[0])
+            received = good[0] + np.rint(steps).astype(np.int64)
+    return received, link, int(np.count_nonzero(~usable))

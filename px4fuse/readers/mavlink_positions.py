@@ -153,6 +153,8 @@ def read_truth(recording: Recording, positions: tuple[PositionTrack, ...]) -> Tr
         if len(rows) < MIN_TRACK_SAMPLES:
             continue
         latitude, longitude, height, velocity = read(recording.frames.table(message, rows))
+        if not np.any(velocity):  # not sent: a vehicle that never moves has no use for truth
+            velocity = np.full_like(velocity, np.nan)
         north, east = project(latitude, longitude, (float(latitude[0]), float(longitude[0])))
         values = np.column_stack([north, east, height[0] - height, velocity])
         samples = recording.frame(

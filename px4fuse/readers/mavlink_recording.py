@@ -18,6 +18,7 @@ from px4fuse.readers.mavlink_clocks import (
     Mapped,
     least_delay,
     map_clock,
+    tells_time,
 )
 from px4fuse.readers.mavlink_frames import Frames, message_name, wire_layout
 from px4fuse.readers.mavlink_messages import (
@@ -42,7 +43,9 @@ RECEIPT_CLOCK = "time of receipt, less the link's least delay"
 RESTART_S = 5.0
 # Messages after a restart that must be early too
 RESTART_MESSAGES = 20
-# Senders beyond the busiest ones are not described
+# Samples further than this before or after the session have an impossible stamp
+OUTSIDE_S = 60.0
+# Senders beyond the busiest ones are not described, and their positions are not read
 MAX_SENDERS = 32
 # A sender that seems to lose more than this does not count its messages
 SEQUENCE_MEANS_NOTHING = 0.9
@@ -110,12 +113,17 @@ class Recording:
         columns : list of str, length m
         values : ndarray, shape (n, m)
         """
-        time_us = np.rint(np.nan_to_num(boot_s, nan=-1.0) * 1e6).astype(np.int64)
+        # false for NaN too
+        late_s = boot_s - self.zero_s
+        inside = (late_s >= -OUTSIDE_S) & (late_s <= self.duration_s + OUTSIDE_S)
+        rows = np.flatnonzero(inside & (boot_s > 0.0))
+        time_us = np.rint(boot_s[rows] * 1e6).astype(np.int64)
         # one message that came over two links is one sample
         first = np.sort(np.unique(time_us, return_index=True)[1])
-        keep = first[increasing(time_us[first])]
-        if len(keep) < len(first):
-            self.dropped[name] = len(first) - len(keep)
+        keep = rows[first[increasing(time_us[first])]]
+        dropped = len(boot_s) - len(rows) + len(first) - len(keep)
+        if dropped:
+            self.dropped[name] = dropped
         kept = values[keep]
         return pd.DataFrame(
             np.where(np.isfinite(kept), kept, np.nan),
@@ -160,10 +168,10 @@ def _vehicles(frames: Frames) -> dict[Address, tuple[int, int]]:
 
 
 def _counts(frames: Frames, rows: Rows | slice = slice(None)) -> list[tuple[Address, int]]:
-    """Senders of frames and how many each sent, most first, at most :data:`MAX_SENDERS`."""
+    """Senders of frames and how many each sent, most first."""
     address = frames.system[rows].astype(np.int64) << 8 | frames.component[rows]
     numbers, counts = np.unique(address, return_counts=True)
-    most = np.argsort(-counts, kind="stable")[:MAX_SENDERS]
+    most = np.argsort(-counts, kind="stable")
     return [((int(numbers[i]) >> 8, int(numbers[i]) & 0xFF), int(counts[i])) for i in most]
 
 
@@ -257,7 +265,9 @@ def settle_clocks(frames: Frames, address: Address) -> Recording:
         received = np.maximum.accumulate(stamps)[at]
     notes += _frame_notes(frames, received)
     kept = stamps[increasing(np.rint(stamps * 1e6).astype(np.int64))]
-    zero_s, end_s = (float(kept[0]), float(kept[-1])) if len(kept) else (0.0, 0.0)
+    # without a boot clock the receipt must do
+    span = kept if len(kept) else np.array([0.0, received.max()])
+    zero_s, end_s = float(span[0]), float(span[-1])
     return Recording(frames, *address, session, received, line, zero_s, end_s - zero_s, notes)
 
 
@@ -287,7 +297,8 @@ def senders_of(recording: Recording, message: str) -> list[Address]:
     rows = rows[(rows >= recording.session.start) & (rows < recording.session.stop)]
     own = (recording.system, recording.component)
     others = {s[0] for s, seen in _vehicles(frames).items() if _flies(*seen)} - {recording.system}
-    return [s for s, _ in _counts(frames, rows) if s != own and s[0] not in others]
+    heard = [s for s, _ in _counts(frames, rows) if s != own and s[0] not in others]
+    return heard[:MAX_SENDERS]
 
 
 def map_senders(recording: Recording) -> dict[Address, Mapped]:
@@ -305,18 +316,20 @@ def _map_sender(recording: Recording, sender: Address, unix: Line | None) -> Map
         stamps.append(frames.table(source.message, rows)[source.stamp] * 1e-6)
         received.append(recording.received_s[rows])
     about = float(np.median(np.concatenate(stamps)))
+    clock_runs = tells_time(np.concatenate(stamps))
     rows = recording.rows("TIMESYNC", sender)
     sync = frames.table("TIMESYNC", rows)
     replied, asked = sync["tc1"] * 1e-9, sync["ts1"] * 1e-9
     # the reply to somebody else's question carries another clock
     replies = (replied != 0.0) & (np.abs(asked - recording.receipt_boot_s(rows)) <= RESTART_S)
     # a question is stamped as it is sent: hardly delayed
-    questions = (replied == 0.0) & (np.abs(asked - about) < OTHER_CLOCK_S)
+    questions = clock_runs & (replied == 0.0) & (np.abs(asked - about) < OTHER_CLOCK_S)
     stamps.append(asked[questions])
     received.append(recording.received_s[rows][questions])
     own = frames.table("TIMESYNC", recording.rows("TIMESYNC"))
     answered, question = own["tc1"] * 1e-9, own["ts1"] * 1e-9
     answers = (answered != 0.0) & (np.abs(question - about) < OTHER_CLOCK_S)
+    answers &= ~np.isin(own["ts1"], _questions_of_others(recording, sender))
     return map_clock(
         f"system {sender[0]}, component {sender[1]}",
         np.concatenate(stamps),
@@ -326,6 +339,16 @@ def _map_sender(recording: Recording, sender: Address, unix: Line | None) -> Map
         unix,
         has_receipt=frames.received_us is not None,
     )
+
+
+def _questions_of_others(recording: Recording, sender: Address) -> NDArray[np.int64]:
+    """``ts1`` of the TIMESYNC questions of everybody but one sender."""
+    frames = recording.frames
+    rows = frames.rows("TIMESYNC")
+    rows = rows[(frames.system[rows] != sender[0]) | (frames.component[rows] != sender[1])]
+    sync = frames.table("TIMESYNC", rows)
+    asked: NDArray[np.int64] = sync["ts1"][sync["tc1"] == 0]
+    return asked
 
 
 def unix_of_boot(recording: Recording) -> Line | None:
@@ -361,7 +384,7 @@ def describe_senders(recording: Recording) -> tuple[Sender, ...]:
     """Senders that the recording heard, most messages first."""
     frames, vehicles = recording.frames, _vehicles(recording.frames)
     described = []
-    for address, count in _counts(frames):
+    for address, count in _counts(frames)[:MAX_SENDERS]:
         word = "no heartbeat"
         if address in vehicles:
             kind, autopilot = vehicles[address]

@@ -43,6 +43,13 @@ Instances = tuple[tuple[float, int], ...]
 NO_SELECTOR: Instances = ((-np.inf, 0),)
 # EKF2_EVP_GATE has had this default in every release read (v1.9 to main)
 DEFAULT_GATE = 5.0
+# EKF2_EV_CTRL and EKF2_AID_MASK, ekf2_params.c; EV_MAX_INTERVAL, ev_control.cpp
+_HOW_TO_FUSE = {
+    "horizontal": "Send the position at 10 Hz (EKF2 starts on samples less than 0.2 s apart) and "
+    "set bit 0 of EKF2_EV_CTRL (bit 3 of EKF2_AID_MASK before v1.14).",
+    "vertical": "Set bit 1 of EKF2_EV_CTRL (EKF2_HGT_MODE 3 before v1.14) if EKF2 is to fuse the "
+    "source's height.",
+}
 # innovations, variances and ratios are logged by separate rate limiters, up to one interval of
 # the default profile (0.5 s) apart; S changes little in that time
 JOIN_TOLERANCE_S = 0.6
@@ -101,6 +108,27 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
     )
 
 
+def ekf2_topics(topics: Topics, ekf2: Ekf2 | Unavailable) -> Mapping[str, tuple[str, ...]]:
+    """Topics behind each part that is there, by the part's name in ``Flight.streams``."""
+    if isinstance(ekf2, Unavailable):
+        return {}
+    used = {"ekf2_state": tuple(layout.topic for layout in LOCAL_POSITION)}
+    if isinstance(ekf2.variance, pd.DataFrame):
+        used["ekf2_variance"] = tuple(_lengths(topics))[:1]
+    if ekf2.innovation_topics:
+        joined = [
+            (layout.variance_topic, layout.ratio_topic)
+            for layout in INNOVATIONS
+            if layout.topic in ekf2.innovation_topics
+        ]
+        names = [*ekf2.innovation_topics, *(name for pair in joined for name in pair)]
+        used["ekf2_innovations"] = tuple(n for n in dict.fromkeys(names) if topics.instances(n))
+    layout = topics.find(FUSING)
+    if isinstance(ekf2.fusing, pd.DataFrame) and layout is not None:
+        used["ekf2_fusing"] = (layout.topic,)
+    return used
+
+
 def _primary_instances(topics: Topics) -> Instances:
     """Primary EKF2 instance from each time on; instance 0 where there is no selector."""
     layout = topics.find(SELECTOR)
@@ -136,8 +164,8 @@ def of_primary(
     return joined[~joined.index.duplicated()]
 
 
-def _read_variance(topics: Topics, instances: Instances) -> pd.DataFrame | Unavailable:
-    """Velocity and position variances, their place decided by the lengths of the arrays."""
+def _lengths(topics: Topics) -> Mapping[str, tuple[int, int]]:
+    """Numbers of states and of covariances of each topic that has both, best first."""
     lengths = {}
     for candidate in ESTIMATOR_STATES:
         for (name, _), table in topics.tables.items():
@@ -146,7 +174,12 @@ def _read_variance(topics: Topics, instances: Instances) -> pd.DataFrame | Unava
                     sum(column.startswith("states[") for column in table),
                     sum(column.startswith("covariances[") for column in table),
                 )
-    for topic, length in lengths.items():
+    return lengths
+
+
+def _read_variance(topics: Topics, instances: Instances) -> pd.DataFrame | Unavailable:
+    """Velocity and position variances, their place decided by the lengths of the arrays."""
+    for topic, length in _lengths(topics).items():
         offsets = COVARIANCE_OFFSETS.get(length)
         if offsets is None:
             return Unavailable(
@@ -220,8 +253,7 @@ def _read_innovations(
             found[axis] = Unavailable(
                 f"EKF2 innovations, {axis}",
                 f"EKF2 never fused external vision for {_position_or_height(axis)} in this log",
-                "See the finding on EKF2 not fusing, or EKF2_EV_CTRL and EKF2_HGT_REF "
-                "(EKF2_AID_MASK and EKF2_HGT_MODE before v1.14).",
+                _HOW_TO_FUSE[_group(axis)],
             )
             continue
         layout = topics.find(AID_SOURCE[axis])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -53,7 +54,11 @@ def read_positions(
     candidates.append(_read_aid_observation(topics, instances))
     candidates.append(_reconstruct(topics, ekf2))
     candidates.append(_read_gps(topics))
-    tracks = tuple(track for track in candidates if isinstance(track, PositionTrack))
+    tracks = tuple(
+        replace(track, log=topics.log.name)
+        for track in candidates
+        if isinstance(track, PositionTrack)
+    )
     missing = tuple(track for track in candidates if isinstance(track, Unavailable))
     return tuple(sorted(tracks, key=lambda track: track.rung)), missing
 
@@ -79,10 +84,7 @@ def _finished(track: PositionTrack, axes: list[str]) -> PositionTrack | Unavaila
         return _unavailable(track.name, f"{len(samples)} finite samples are too few")
     variances = samples[POSITION_VARIANCE_COLUMNS]
     samples[POSITION_VARIANCE_COLUMNS] = variances.where(variances > 0)  # 0 and NaN: not given
-    return PositionTrack(
-        track.name, track.rung, track.description, samples, track.frame, track.clock,
-        track.reconstructed, track.topics,
-    )  # fmt: skip
+    return replace(track, samples=samples)
 
 
 def _read_logged(

@@ -190,6 +190,9 @@ TRUTH_GLOBAL = (
     ),
 )
 
+_GPS_OPTIONAL = {
+    "eph_m": "eph", "epv_m": "epv", "fix_type": "fix_type", "utc_us": "time_utc_usec",
+}  # fmt: skip
 GPS = (
     Layout(
         "vehicle_gps_position",
@@ -199,13 +202,13 @@ GPS = (
             "altitude_m": "altitude_msl_m",
         },
         "v1.14",
-        {"eph_m": "eph", "epv_m": "epv", "fix_type": "fix_type"},
+        _GPS_OPTIONAL,
     ),
     Layout(
         "vehicle_gps_position",
         {"latitude_1e7": "lat", "longitude_1e7": "lon", "altitude_mm": "alt"},
         "v1.8 to v1.13",
-        {"eph_m": "eph", "epv_m": "epv", "fix_type": "fix_type"},
+        _GPS_OPTIONAL,
     ),
 )
 
@@ -293,6 +296,14 @@ AID_OBSERVATION_VERTICAL = (
     ),
 )
 
+# What bears on position and is not used, and why
+UNUSED: Mapping[str, str] = {
+    "sensor_uwb": "one range and two angles per message, not a position: send the position that "
+    "the UWB system computes as VISION_POSITION_ESTIMATE",
+    "uwb_distance": "ranges to the anchors, and the landing target seen from the vehicle",
+    "uwb_grid": "positions of the UWB anchors and of the landing target, not the vehicle's",
+}
+
 # Parameters that bear on fusion and on what is logged; only these enter the results
 PARAMETERS = (
     "EKF2_AID_MASK",
@@ -319,7 +330,7 @@ def topics() -> list[str]:
         TRUTH_LOCAL, TRUTH_GLOBAL, GPS, AID_OBSERVATION_HORIZONTAL, AID_OBSERVATION_VERTICAL,
         *AID_SOURCE.values(), *(track.layouts for track in TRACKS),
     )  # fmt: skip
-    names = {layout.topic for group in groups for layout in group}
+    names = {layout.topic for group in groups for layout in group} | UNUSED.keys()
     for layout in INNOVATIONS:
         names |= {layout.topic, layout.variance_topic, layout.ratio_topic}
     return sorted(names - {""})

@@ -14,20 +14,26 @@ from px4fuse.flight import (
     QUATERNION_COLUMNS,
     SPECIFIC_FORCE_COLUMNS,
     Flight,
+    Stream,
+    Truth,
     Unavailable,
+    Unused,
     finite_rows,
 )
-from px4fuse.readers.px4_ekf2 import read_ekf2
-from px4fuse.readers.px4_positions import read_positions, read_truth
-from px4fuse.readers.px4_topics import ATTITUDE, IMU, LAND_DETECTED
+from px4fuse.readers.px4_ekf2 import ekf2_topics, read_ekf2
+from px4fuse.readers.px4_positions import GPS_3D_FIX, read_positions, read_truth
+from px4fuse.readers.px4_topics import ATTITUDE, GPS, IMU, LAND_DETECTED, UNUSED
 from px4fuse.readers.ulog_topics import (
     ACCELEROMETER_OFFSET_INVALID_US,
+    AT_MEASUREMENT,
     Topics,
     increasing,
     read_topics,
 )
 
 MAGIC = b"\x55\x4c\x6f\x67\x01\x12\x35"
+# A receiver's UTC outside these is none: PX4's own GPS_EPOCH_SECS (gps_helper.h), and 2100
+UTC_RANGE_S = (1_234_567_890.0, 4_102_444_800.0)
 
 
 def read_ulog(path: Path) -> Flight:
@@ -61,8 +67,17 @@ def read_ulog(path: Path) -> Flight:
         f"{count} samples of {topic} were dropped: their time stamps are zero or go back"
         for (topic, _), count in sorted(topics.dropped.items())
     )
+    used = {
+        "imu": () if isinstance(imu, Unavailable) else (IMU[0].topic,),
+        "attitude": () if isinstance(attitude, Unavailable) else (ATTITUDE[0].topic,),
+        **ekf2_topics(topics, ekf2),
+        "truth": (truth.name,) if isinstance(truth, Truth) else (),
+        "airborne": () if isinstance(airborne, Unavailable) else (LAND_DETECTED[0].topic,),
+    }
     return Flight(
-        log=dataclasses.replace(topics.log, notes=topics.log.notes + dropped),
+        log=dataclasses.replace(
+            topics.log, notes=topics.log.notes + dropped, start_unix_s=_start_unix(topics)
+        ),
         imu=imu,
         attitude=attitude,
         positions=positions,
@@ -70,7 +85,35 @@ def read_ulog(path: Path) -> Flight:
         truth=truth,
         airborne=airborne,
         missing=(*missing, *missing_positions),
+        streams={part: _stream(topics, part, names) for part, names in used.items() if names},
+        unused=tuple(
+            Unused(name, len(topics.tables[name, number]["timestamp"]), reason)
+            for name, reason in UNUSED.items()
+            for number in topics.instances(name)[:1]
+        ),
     )
+
+
+def _stream(topics: Topics, part: str, names: tuple[str, ...]) -> Stream:
+    # sensor_combined has no timestamp_sample: its timestamp is the gyro's, to which _read_imu adds
+    # the accelerometer's offset
+    clock = AT_MEASUREMENT if part == "imu" else topics.clock(names[0])
+    return Stream(names, clock, topics.log.name)
+
+
+def _start_unix(topics: Topics) -> float | None:
+    """UNIX time (s) of time zero by the GPS receiver, the median over its fixes."""
+    layout = topics.find(GPS)
+    if layout is None:
+        return None
+    gps = topics.frame(layout)
+    if "utc_us" not in gps:
+        return None
+    utc_s = gps["utc_us"] * 1e-6
+    known = utc_s.between(*UTC_RANGE_S)
+    if "fix_type" in gps:
+        known &= gps["fix_type"] >= GPS_3D_FIX
+    return float((utc_s - gps.index)[known].median()) if known.any() else None
 
 
 def _read_imu(topics: Topics) -> pd.DataFrame | Unavailable:

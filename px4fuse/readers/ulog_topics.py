@@ -35,6 +35,9 @@ WINDOW_MARGIN_S = 2.0
 # ULog file format, docs.px4.io: header, then definitions up to the first of these messages
 HEADER_BYTES = 16
 DATA_MESSAGES = "ALC"
+# What a time stamp of a topic says, see measurement_time_us
+AT_MEASUREMENT = "autopilot boot clock, at measurement"
+AT_PUBLICATION = "autopilot boot clock, at publication"
 MAX_READS = 2_000_000
 RELEASE = 255
 # A gap longer than this in the IMU's stamps is no dropout: what lies beyond is another boot.
@@ -117,6 +120,15 @@ class Topics:
             return frame
         return self.window(frame)
 
+    def clock(self, topic: str) -> str:
+        """Which moment the times of a topic's samples are."""
+        measured = any(
+            np.any(measurement_time_us(table) != table["timestamp"].astype(np.int64))
+            for (name, _), table in self.tables.items()
+            if name == topic
+        )
+        return AT_MEASUREMENT if measured else AT_PUBLICATION
+
     def window(self, frame: pd.DataFrame) -> pd.DataFrame:
         """Drop what lies outside the span of the data by more than the margin."""
         end = self.log.duration_s + WINDOW_MARGIN_S
@@ -190,27 +202,31 @@ def read_topics(path: Path) -> Topics:
         with contextlib.redirect_stdout(chatter):  # pyulog prints what it stumbles over
             ulog = ULog(_handle(content), message_name_filter_list=topics())
             tables = _tables(ulog)
+            # a log of other topics can still be placed in time, by all that it holds
+            placed = tables or _tables(ULog(_handle(content)))
     except _PARSE_ERRORS as error:
         raise LogError(
             f"{path.name}: not a readable ULog ({str(error) or type(error).__name__}). "
             "Copy the .ulg from the vehicle again."
         ) from error
     notes = _corruption_notes(ulog, chatter.getvalue())
-    if not tables:
+    if not placed:
         raise LogError(
-            f"{path.name}: a ULog without any of the topics that px4fuse uses "
-            "(no IMU, no position, no EKF2). If it is cut short, copy it again; else record with "
-            "SDLOG_PROFILE 129."
+            f"{path.name}: a ULog without any data (no IMU, no position, no EKF2). If it is cut "
+            "short, copy it again; else record with SDLOG_PROFILE 129."
         )
-    zero_us, end_us = _data_span(tables, path.name)
+    if not tables:
+        names = sorted({topic for topic, _ in placed})
+        notes += (f"none of its topics is one that px4fuse uses (it holds {_listed(names)})",)
+    zero_us, end_us = _data_span(placed, path.name)
     log = LogInfo(
         name=path.name.encode(errors="replace").decode(),
         sha256=hashlib.sha256(content).hexdigest(),
         size_bytes=len(content),
         format="ULog",
         firmware=_firmware(ulog.msg_info_dict),
-        firmware_hash=str(ulog.msg_info_dict.get("ver_sw", "unknown")),
-        hardware=str(ulog.msg_info_dict.get("ver_hw", "unknown")),
+        firmware_hash=_text(ulog.msg_info_dict, "ver_sw", "unknown"),
+        hardware=_text(ulog.msg_info_dict, "ver_hw", "unknown"),
         boot_time_s=zero_us * _MICROSECOND,
         duration_s=(end_us - zero_us) * _MICROSECOND,
         dropouts=tuple(
@@ -225,6 +241,7 @@ def read_topics(path: Path) -> Topics:
             }
         ),
         notes=notes,
+        autopilot=_text(ulog.msg_info_dict, "sys_name", "PX4"),
     )
     return Topics(log, tables, zero_us, {})
 
@@ -269,6 +286,17 @@ def _data_span(
     )
 
 
+def _listed(names: list[str]) -> str:
+    most = 5
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if names[most:] else "")
+
+
+def _text(info: dict[str, Any], key: str, otherwise: str) -> str:
+    """One of the log's own words about itself, without what a terminal would obey."""
+    text = str(info.get(key, otherwise))
+    return "".join(c for c in text if c.isprintable()) or otherwise
+
+
 def _is_finite(value: object) -> bool:
     return isinstance(value, int | float) and bool(np.isfinite(value))
 
@@ -291,8 +319,7 @@ def _firmware(info: dict[str, Any]) -> str:
         return "PX4 development version"
     # last byte: 0 development, 64 alpha, 128 beta, 192 release candidate, 255 release
     suffix = "" if kind == RELEASE else ("-dev", "-alpha", "-beta", "-rc")[kind // 64]
-    system = str(info.get("sys_name", "PX4"))
-    return f"{system} v{major}.{minor}.{patch}{suffix}"
+    return f"{_text(info, 'sys_name', 'PX4')} v{major}.{minor}.{patch}{suffix}"
 
 
 class _PatientBytes(io.BytesIO):

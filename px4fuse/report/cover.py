@@ -27,7 +27,7 @@ from px4fuse.report.style import (
     Cursor,
     page,
 )
-from px4fuse.report.words import settings_words, verdict_words
+from px4fuse.report.words import clock_words, settings_words, verdict_words
 
 LABEL_WIDTH = 0.115
 PLAN_MIN_HEIGHT = 0.27
@@ -114,6 +114,7 @@ def _plan(figure: Figure, cursor: Cursor, document: Document) -> None:
 def _facts(cursor: Cursor, document: Document) -> None:
     comparison = document.comparison
     log, source, segment = comparison.flight.log, comparison.source, comparison.segment
+    files = comparison.flight.inputs
     who = ", ".join(part for part in (document.student.name, document.student.id) if part)
     looked = [
         part.what.removeprefix("position source ")
@@ -130,8 +131,10 @@ def _facts(cursor: Cursor, document: Document) -> None:
         ("Student", who),
         ("Log", f"{log.name}, {log.size_bytes / 1e6:.2f} MB, {log.duration_s:.1f} s of data"),
         ("SHA-256", log.sha256),
+        ("With", ", ".join(f"{f.name}, SHA-256 {f.sha256[:12]}…" for f in files)),
         ("Vehicle", f"{log.firmware}, {log.hardware}"),
         ("Position", source_text),
+        ("Clock", _clock(document)),
         ("Segment", f"{segment.start_s:.2f} s to {segment.end_s:.2f} s, {segment.reason}"),
         ("Our filter", settings_words(comparison.settings)),
     ]
@@ -145,6 +148,14 @@ def _facts(cursor: Cursor, document: Document) -> None:
         cursor.write(label, weight="bold", right=LEFT + LABEL_WIDTH)
         cursor.y = top
         cursor.write(text, x=LEFT + LABEL_WIDTH)
+
+
+def _clock(document: Document) -> str:
+    """Clock of the source, where it was mapped or matched here."""
+    source = document.comparison.source
+    if source.clock_map is not None:
+        return clock_words(source.clock_map)
+    return "" if source.alignment is None else source.clock
 
 
 def _verdicts(figure: Figure, cursor: Cursor, document: Document) -> None:

@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 from px4fuse.report.document import Document
 from px4fuse.report.results import provenance
 from px4fuse.report.style import BOTTOM, LEFT, MUTED, NO_GLYPH, lacks_glyphs, page
+from px4fuse.report.words import alignment_words, clock_words
 
 INDENT = LEFT + 0.235
 METHOD = (
@@ -28,7 +29,8 @@ METHOD = (
 def draw(document: Document) -> Iterator[Figure]:
     """Draw one page or more."""
     comparison = document.comparison
-    log, source = comparison.flight.log, comparison.source
+    flight, source = comparison.flight, comparison.source
+    log = flight.log
     made = provenance(document.command)
     sections: list[tuple[str, list[tuple[str, str]]]] = [
         (
@@ -46,6 +48,10 @@ def draw(document: Document) -> Iterator[Figure]:
             [
                 ("file", f"{log.name}, {log.size_bytes} bytes, {log.format}"),
                 ("SHA-256", log.sha256),
+                *(
+                    (f.role, f"{f.name}, {f.size_bytes} bytes, SHA-256 {f.sha256}")
+                    for f in flight.inputs
+                ),
                 ("firmware", f"{log.firmware}, git {log.firmware_hash}"),
                 ("time zero", f"{log.boot_time_s:.6f} s after boot, the first sample of data"),
                 (
@@ -57,7 +63,7 @@ def draw(document: Document) -> Iterator[Figure]:
                     "also in the log",
                     ", ".join(
                         f"{t.name} ({t.rate_hz:.1f} Hz)"
-                        for t in comparison.flight.positions
+                        for t in flight.positions
                         if t is not source
                     )
                     or "no other position",
@@ -67,6 +73,11 @@ def draw(document: Document) -> Iterator[Figure]:
                     ", ".join(f"{k} {v:g}" for k, v in log.parameters.items()) or "none",
                 ),
             ],
+        ),
+        ("Clocks, to the autopilot's boot clock", [("", clock_words(c)) for c in flight.clocks]),
+        (
+            f"Placement of {source.name}",
+            [] if source.alignment is None else alignment_words(source.alignment),
         ),
         ("Choices made on the way", [("", note) for note in comparison.notes] or [("", "none")]),
         (
@@ -81,6 +92,8 @@ def draw(document: Document) -> Iterator[Figure]:
     ]
     figure, cursor = page("Provenance")
     for title, entries in sections:
+        if not entries:
+            continue
         cursor.skip(4)
         needed = 0.03
         for position, (label, text) in enumerate(entries):

@@ -19,9 +19,9 @@ from px4fuse.flight import Unavailable, sample_rate
 from px4fuse.report.document import Document
 
 SCHEMA_NAME = "px4fuse-results"
-SCHEMA_VERSION = "1.0"
+SCHEMA_VERSION = "1.1"
 # The libraries on whose arithmetic the numbers rest
-LIBRARIES = ("numpy", "scipy", "pandas", "pyulog", "filterpy", "matplotlib", "pypdf")
+LIBRARIES = ("numpy", "scipy", "pandas", "pyulog", "pymavlink", "filterpy", "matplotlib", "pypdf")
 NOT_YET = "this version does not compute it"
 
 
@@ -114,6 +114,10 @@ def _log(comparison: Comparison) -> dict[str, Any]:
         "dropouts": [asdict(dropout) for dropout in log.dropouts],
         "parameters": dict(log.parameters),
         "notes": list(log.notes),
+        "autopilot": log.autopilot,
+        **_present({"start_unix_s": log.start_unix_s}),
+        "joined": [asdict(file) for file in comparison.flight.inputs],
+        "clocks": [_present(asdict(clock)) for clock in comparison.flight.clocks],
     }
 
 
@@ -142,11 +146,19 @@ def _source(comparison: Comparison) -> dict[str, Any]:
             for track in comparison.flight.positions
         ],
         "not_in_log": [asdict(part) for part in looked_for],
+        **_present(
+            {
+                "log": source.log,
+                "alignment": _present(asdict(source.alignment)) if source.alignment else None,
+            }
+        ),
     }
 
 
 def _settings(comparison: Comparison) -> dict[str, Any]:
     settings = comparison.settings
+    alignment = comparison.source.alignment
+    placed_s = 0.0 if alignment is None else alignment.clock_offset_s
     return {
         "sigma_a_m_s2": settings.sigma_a_m_s2,
         "sigma_z_m": settings.sigma_z_m,
@@ -155,7 +167,7 @@ def _settings(comparison: Comparison) -> dict[str, Any]:
         "start_s": comparison.segment.start_s,
         "end_s": comparison.segment.end_s,
         "segment_reason": comparison.segment.reason,
-        "clock_offset_s": settings.clock_offset_s,
+        "clock_offset_s": settings.clock_offset_s + placed_s,
     }
 
 

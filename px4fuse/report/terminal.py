@@ -33,7 +33,8 @@ def print_summary(console: Console, document: Document) -> None:
     comparison = document.comparison
     log = comparison.flight.log
     opponent = "" if isinstance(comparison.flight.ekf2, Unavailable) else ", against EKF2"
-    _line(console, "Log", f"{log.name}, {log.firmware}, {log.duration_s:.1f} s")
+    names = " + ".join([log.name, *(file.name for file in comparison.flight.inputs)])
+    _line(console, "Log", f"{names}, {log.firmware}, {log.duration_s:.1f} s")
     _line(console, "Filter", settings_words(comparison.settings) + opponent)
     source = comparison.source
     _line(

@@ -1,0 +1,99 @@
+"""``px4fuse extract``: a log as tidy tables for one's own code."""
+
+from __future__ import annotations
+
+import importlib.util
+import io
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from px4fuse.cli.inputs import (
+    clock_offset_option,
+    position_options,
+    read_recordings,
+    recording_options,
+    with_position,
+)
+from px4fuse.errors import OutputError
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+FORMATS = ("csv", "parquet")
+
+
+@click.command()
+@click.argument("log", type=click.Path(path_type=Path))
+@click.option(
+    "-o",
+    "--output",
+    "folder",
+    type=click.Path(path_type=Path),
+    required=True,
+    metavar="DIR",
+    help="Folder for the tables; made where it is missing.",
+)
+@click.option(
+    "--format",
+    "kind",
+    type=click.Choice(FORMATS),
+    default="csv",
+    show_default=True,
+    help='Of the tables; Parquet needs pip install "px4fuse[parquet]".',
+)
+@recording_options
+@position_options
+@clock_offset_option
+def extract(
+    log: Path,
+    folder: Path,
+    kind: str,
+    mavlink: Path | None,
+    system: int | None,
+    **position: Any,
+) -> None:
+    """Write everything that a log holds as tidy tables, one file each.
+
+    With data_dictionary.csv, which says the unit, frame, meaning, source topic and clock of every
+    column, and flight.json, which says what the log is and what is missing from it.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise OutputError(f"{folder}: is a file. Give a folder with -o.")
+    if kind == "parquet" and importlib.util.find_spec("pyarrow") is None:
+        raise OutputError(
+            '--format parquet needs pyarrow: pip install "px4fuse[parquet]", or take --format csv.'
+        )
+    from px4fuse import extraction
+    from px4fuse.report.results import to_json
+    from px4fuse.report.writing import write_all
+
+    flight = with_position(read_recordings(log, mavlink, system), **position)
+    tables = extraction.tables(flight)
+    encode = _parquet if kind == "parquet" else _csv
+    contents = {folder / f"{name}.{kind}": encode(table) for name, table in tables.items()}
+    contents[folder / "data_dictionary.csv"] = _csv(extraction.data_dictionary(flight))
+    contents[folder / "flight.json"] = to_json(extraction.description(flight)).encode()
+    write_all(contents)
+    click.echo(f"Wrote to {folder}:")
+    for name, table in tables.items():
+        click.echo(f"  {f'{name}.{kind}':44} {len(table):8} rows")
+    click.echo("  data_dictionary.csv, flight.json")
+    for part in extraction.absent(flight):
+        click.echo(f"Not in this log: {part.what} ({part.reason})")
+    others = {path for path in folder.glob(f"*.{kind}") if path not in contents}
+    if others:
+        names = ", ".join(sorted(path.name for path in others))
+        click.echo(f"Already there and not of this run: {names}")
+
+
+def _csv(table: pd.DataFrame) -> bytes:
+    # without a format, pandas writes the shortest text that reads back as the same float64
+    return table.to_csv(index=False, lineterminator="\n").encode()
+
+
+def _parquet(table: pd.DataFrame) -> bytes:
+    buffer = io.BytesIO()
+    table.to_parquet(buffer, engine="pyarrow", index=False)
+    return buffer.getvalue()

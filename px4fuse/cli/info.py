@@ -1,0 +1,250 @@
+"""``px4fuse info``: what is in a log, and what can be done with it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from px4fuse.cli.inputs import (
+    clock_offset_option,
+    position_options,
+    read_recordings,
+    recording_options,
+    with_position,
+)
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.table import Table
+
+    from px4fuse.inventory import Inventory, Source
+
+
+@click.command()
+@click.argument("log", type=click.Path(path_type=Path))
+@click.option(
+    "--json",
+    "json_path",
+    type=click.Path(path_type=Path),
+    default=None,
+    metavar="FILE",
+    help="Write it as JSON; - prints that alone on standard output.",
+)
+@recording_options
+@position_options
+@clock_offset_option
+def info(
+    log: Path,
+    json_path: Path | None,
+    mavlink: Path | None,
+    system: int | None,
+    **position: Any,
+) -> None:
+    """Say what is in a log, what px4fuse can do with it, and what to log next time."""
+    from rich.console import Console
+
+    from px4fuse.inventory import take_inventory, to_plain
+    from px4fuse.report.results import to_json
+    from px4fuse.report.writing import write_all
+
+    inventory = take_inventory(with_position(read_recordings(log, mavlink, system), **position))
+    text = to_json(to_plain(inventory))
+    if json_path == Path("-"):
+        click.echo(text, nl=False)
+        return
+    if json_path is not None:
+        write_all({json_path: text.encode()})
+    _print(Console(highlight=False), inventory)
+
+
+def _print(console: Console, inventory: Inventory) -> None:
+    log = inventory.log
+    console.print(log.name, style="bold", markup=False)
+    _list(console, "", _facts(inventory))
+    if log.senders:
+        console.print()
+        console.print(_senders(inventory))
+    console.print()
+    console.print(_sources(inventory))
+    _list(console, "Clocks", _clocks(inventory))
+    console.print()
+    console.print("What px4fuse can do with it", style="bold")
+    _rows(
+        console,
+        (
+            ("yes" if a.possible else "no", a.name, a.reason, "green" if a.possible else "yellow")
+            for a in inventory.abilities
+        ),
+    )
+    _list(
+        console,
+        "Next time",
+        [
+            (f"{number}.", f"{advice.remedy} ({', '.join(advice.improves)})")
+            for number, advice in enumerate(inventory.advice, start=1)
+        ],
+    )
+    unused = [(part.name, f"{part.count} messages: {part.reason}") for part in inventory.unused]
+    _list(console, "Not used", unused)
+    _list(console, "Notes", [("-", note) for note in log.notes])
+
+
+def _facts(inventory: Inventory) -> list[tuple[str, str]]:
+    log = inventory.log
+    size = f"{log.size_bytes / 1e6:.1f} MB" if log.size_bytes >= 1e5 else f"{log.size_bytes} bytes"
+    version = log.firmware if log.firmware != "unknown" else f"{log.autopilot}, version unknown"
+    git = "" if log.firmware_hash == "unknown" else f" (git {log.firmware_hash[:8]})"
+    hardware = "hardware unknown" if log.hardware == "unknown" else log.hardware
+    facts = [
+        ("Log", f"{log.format}, {size}, SHA-256 {log.sha256[:12]}"),
+        ("Vehicle", f"{version}{git}, {hardware}"),
+        ("Data", f"{log.duration_s:.{1 if log.duration_s >= 1 else 3}f} s, {_start(inventory)}"),
+        ("In flight", _flying(inventory)),
+    ]
+    if log.dropouts:
+        lost_s = sum(dropout.duration_s for dropout in log.dropouts)
+        longest_s = max(dropout.duration_s for dropout in log.dropouts)
+        count = len(log.dropouts)
+        words = f"{count} of the logger, {lost_s:.2f} s in all, the longest {longest_s:.2f} s"
+        facts.append(("Dropouts", words))
+    facts += [(file.role, f"{file.name}, SHA-256 {file.sha256[:12]}") for file in inventory.inputs]
+    return facts
+
+
+def _start(inventory: Inventory) -> str:
+    if inventory.start_utc is None:
+        return f"from {inventory.log.boot_time_s:.1f} s after boot (no UTC in the log)"
+    return f"from {inventory.start_utc[:19].replace('T', ' ')} UTC"
+
+
+def _flying(inventory: Inventory) -> str:
+    if inventory.airborne is None:
+        return "unknown, no land detector"
+    if not inventory.airborne:
+        return "never, by the land detector"
+    spans = [f"{start:.1f} s to {end:.1f} s" for start, end in inventory.airborne]
+    most = 3
+    more = f" and {len(spans) - most} more" if len(spans) > most else ""
+    return ", ".join(spans[:most]) + more
+
+
+def _senders(inventory: Inventory) -> Table:
+    table = _table("sender", "what it is", "messages", "lost", left=2)
+    for sender in inventory.log.senders:
+        table.add_row(
+            f"{sender.system}/{sender.component}",
+            sender.description + (" (this flight)" if sender.chosen else ""),
+            f"{sender.messages}",
+            "unknown" if sender.lost_share is None else f"{sender.lost_share:.1%}",
+        )
+    return table
+
+
+def _sources(inventory: Inventory) -> Table:
+    from rich.text import Text
+
+    table = _table("", "source", "samples", "Hz", "gaps", "span (s)", left=2)
+    previous = ""
+    for source in inventory.sources:
+        part = source.part if source.part != previous else ""
+        previous = source.part
+        if source.unavailable:
+            table.add_row(part, Text("none", "dim"))  # why not stands below
+            continue
+        table.add_row(
+            f"{part:9}->" if source.chosen else part,
+            Text(source.name, "bold" if source.chosen else ""),
+            "" if source.samples is None else f"{source.samples}",
+            "" if source.rate_hz is None else _short(source.rate_hz),
+            _gaps(source),
+            _span(source),
+        )
+    return table
+
+
+def _gaps(source: Source) -> str:
+    if source.gaps is None:
+        return ""
+    if not source.gaps.count:
+        return "0"
+    return f"{source.gaps.count} ({_short(source.gaps.longest_s)} s)"
+
+
+def _short(value: float) -> str:
+    """Two digits or more, four characters as a rule."""
+    return f"{value:.{2 if value < 1 else 1 if value < 10 else 0}f}"
+
+
+def _span(source: Source) -> str:
+    if source.start_s is None or source.end_s is None:
+        return ""
+    digits = 1 if source.end_s < 10 else 0
+    # adding zero makes of -0 a 0
+    start, end = (round(time, digits) + 0.0 for time in (source.start_s, source.end_s))
+    return f"{start:.{digits}f}..{end:.{digits}f}"
+
+
+def _clocks(inventory: Inventory) -> list[tuple[str, str]]:
+    on: dict[str, dict[str, None]] = {}
+    for source in inventory.sources:
+        if source.clock:
+            name = source.name if source.part == "position" else source.part
+            on.setdefault(source.clock, {})[name] = None
+    lines = [("-", f"{clock}: {', '.join(parts)}") for clock, parts in on.items()]
+    for clock in inventory.clocks:
+        note = f"; {clock.note}" if clock.note else ""
+        words = (
+            f"{clock.clock}, mapped by {clock.method} ({clock.pairs} pairs): offset "
+            f"{clock.offset_s:.4f} s, drift {clock.drift_ppm:+.1f} ppm, jitter "
+            f"{clock.jitter_s * 1e3:.1f} ms{note}"
+        )
+        lines.append(("-", words))
+    return lines
+
+
+def _table(*headers: str, left: int) -> Table:
+    """A table whose first columns are left-aligned, and whose rows are one line each."""
+    from rich.table import Table
+
+    table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="bold")
+    for at, header in enumerate(headers):
+        table.add_column(
+            header,
+            justify="left" if at < left else "right",
+            no_wrap=True,
+            overflow="ellipsis",
+        )
+    return table
+
+
+def _list(console: Console, title: str, lines: list[tuple[str, str]]) -> None:
+    """A titled list with hanging indents; nothing where there is nothing to say."""
+    from rich.table import Table
+    from rich.text import Text
+
+    if not lines:
+        return
+    if title:
+        console.print()
+        console.print(title, style="bold")
+    grid = Table.grid(padding=(0, 1))
+    grid.add_column(no_wrap=True)
+    grid.add_column(overflow="fold")
+    for label, text in lines:
+        grid.add_row(Text(label), Text(text))
+    console.print(grid)
+
+
+def _rows(console: Console, lines: Iterable[tuple[str, str, str, str]]) -> None:
+    from rich.table import Table
+    from rich.text import Text
+
+    grid = Table.grid(padding=(0, 1))
+    for name in ("", "", ""):
+        grid.add_column(name)
+    for answer, name, reason, style in lines:
+        grid.add_row(Text(answer, style), Text(name, no_wrap=True), Text(reason))
+    console.print(grid)

@@ -1,0 +1,164 @@
+"""What a MAVLink recording or a position file of its own brings with it: clocks, losses, frames."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import pandas as pd
+
+from px4fuse.comparison import Comparison
+from px4fuse.findings.model import Finding
+from px4fuse.findings.thresholds import (
+    GAP,
+    GAP_INTERVALS,
+    LOST_SHARE,
+    MAPPED_BY_RECEIPT,
+    RECEIPT_JITTER,
+)
+from px4fuse.flight import Ekf2
+from px4fuse.signals import within
+
+SYNCHRONISE = (
+    "Let the companion answer TIMESYNC (MAVROS does by default; with pymavlink answer every "
+    "request), and send the positions after 500 answers, 50 s at 10 Hz."
+)
+
+
+def stamps_meaningless(comparison: Comparison) -> Iterator[Finding]:
+    """The sender's time stamps take so few values that they tell no time."""
+    clock = comparison.source.clock_map
+    if clock is None or clock.distinct_stamps is None:
+        return
+    yield Finding(
+        "source_stamps_constant",
+        "error",
+        f"The {clock.pairs} time stamps of {comparison.source.name} take only "
+        f"{clock.distinct_stamps} {'values' if clock.distinct_stamps > 1 else 'value'}: when each "
+        "position was measured is not known, the time of receipt stands in.",
+        "Send the time of measurement in the message (usec, time_usec), in microseconds as an "
+        "integer: a 32-bit float cannot hold it.",
+        {"stamps": float(clock.pairs), "distinct": float(clock.distinct_stamps)},
+    )
+    if clock.jitter_s > RECEIPT_JITTER.value:
+        yield Finding(
+            "source_receipt_jitter",
+            "warning",
+            f"The receipt of {comparison.source.name}, which stands in for its time stamps, "
+            f"jitters by {clock.jitter_s * 1e3:.0f} ms: at 1 m/s that is an error of "
+            f"{clock.jitter_s:.3f} m.",
+            "Send the time of measurement in the message, and record close to the sender.",
+            {"jitter_s": clock.jitter_s},
+        )
+
+
+def companion_not_synchronised(comparison: Comparison) -> Iterator[Finding]:
+    """No TIMESYNC between sender and autopilot: PX4 takes the time of arrival instead."""
+    clock = comparison.source.clock_map
+    if clock is None or clock.distinct_stamps is not None:
+        return
+    if clock.method not in MAPPED_BY_RECEIPT:
+        return
+    yield Finding(
+        "companion_not_synchronised",
+        "warning",
+        f"The clock of the sender of {comparison.source.name} was never synchronised with the "
+        "autopilot's (no answered TIMESYNC in the recording): EKF2 took the positions to be as old "
+        "as their arrival. Our filter has the sender's own stamps, mapped by the "
+        f"{clock.method}.",
+        SYNCHRONISE,
+        {"offset_s": clock.offset_s, "jitter_s": clock.jitter_s},
+    )
+
+
+def innovations_need_ulog(comparison: Comparison) -> Iterator[Finding]:
+    """MAVLink carries EKF2's states and variances, but no innovations."""
+    flight = comparison.flight
+    if not flight.log.format.startswith("MAVLink") or not isinstance(flight.ekf2, Ekf2):
+        return
+    variances = isinstance(flight.ekf2.variance, pd.DataFrame)
+    yield Finding(
+        "innovations_need_ulog",
+        "info",
+        f"A MAVLink recording holds EKF2's states{' and variances' if variances else ''} but not "
+        "its innovations: whether EKF2 is consistent cannot be said from it.",
+        f"Compare the ULog of the same flight: px4fuse compare LOG.ulg --mavlink {flight.log.name}.",
+    )
+
+
+def other_autopilot(comparison: Comparison) -> Iterator[Finding]:
+    """The estimator that is called EKF2 here is not PX4's."""
+    autopilot = comparison.flight.log.autopilot
+    if autopilot == "PX4" or not isinstance(comparison.flight.ekf2, Ekf2):
+        return
+    yield Finding(
+        "not_px4",
+        "info",
+        f"This is {autopilot}: where the report says EKF2 it means this autopilot's own estimator, "
+        "and the PX4 parameters named do not exist there.",
+        "Read EKF2 as the autopilot's own estimator.",
+        {"autopilot": autopilot},
+    )
+
+
+def autopilot_restarted(comparison: Comparison) -> Iterator[Finding]:
+    """The boot clock began again in mid-recording, and only one part was read."""
+    for note in comparison.flight.log.notes:
+        if "boot clock went back" in note:
+            yield Finding(
+                "autopilot_restarted",
+                "warning",
+                f"{note[0].upper()}{note[1:]}.",
+                "Record each flight into a file of its own.",
+            )
+
+
+def samples_lost(comparison: Comparison) -> Iterator[Finding]:
+    """The recording lacks single samples of a regular source."""
+    source = comparison.source
+    if source.clock_map is None:
+        return
+    intervals = np.diff(within(source.samples, comparison.segment).index.to_numpy())
+    if len(intervals) < 2 or source.clock_map.distinct_stamps is not None:
+        return
+    typical = float(np.median(intervals))
+    short = intervals[intervals <= max(GAP.value, GAP_INTERVALS.value * typical)]
+    lost = int(np.sum(np.rint(short / typical) - 1.0))
+    share = lost / (lost + len(short))
+    if share > LOST_SHARE.value:
+        yield Finding(
+            "source_samples_lost",
+            "info",
+            f"About {share:.0%} of {source.name} is not in the recording ({lost} samples of "
+            f"{lost + len(short)} at one per {typical:.2f} s); EKF2 may have had them.",
+            "Record on the companion, or on a link that does not lose messages; the ULog has what "
+            "arrived (SDLOG_PROFILE 129).",
+            {"lost": float(lost), "lost_share": share},
+        )
+
+
+def position_file_placement(comparison: Comparison) -> Iterator[Finding]:
+    """What is poorly determined about where an external position file lies in the flight."""
+    alignment = comparison.source.alignment
+    if alignment is None:
+        return
+    for warning in alignment.warnings:
+        yield Finding(
+            "position_file_placement",
+            "warning",
+            f"{comparison.source.name}: {warning[0].upper()}{warning[1:].rstrip('.')}.",
+            "Give --clock-offset, --position-frame and --position-yaw where you know them.",
+        )
+
+
+def receipt_out_of_order(comparison: Comparison) -> Iterator[Finding]:
+    """The recording computer's clock was set back while it recorded."""
+    for note in comparison.flight.log.notes:
+        if "time of receipt went back" in note:
+            yield Finding(
+                "receipt_out_of_order",
+                "info",
+                f"{note[0].upper()}{note[1:]}: the recording computer's clock was set, or "
+                "recordings were put together; what is stamped by the sender is not affected.",
+                "Switch the recording computer's time service off while recording.",
+            )

@@ -1,0 +1,361 @@
+"""Write small MAVLink recordings with pymavlink: stamps, links, senders and clocks on demand.
+
+The made flight swings along the aisle of :func:`flights.motion`, so that every message has a closed
+form. Clocks are lines of the autopilot's boot clock; a message is received ``delay`` after it was
+sent, never before.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from flights import GRAVITY_M_S2, motion
+from numpy.typing import NDArray
+from pymavlink.dialects.v20 import all as dialect
+from scipy.spatial.transform import Rotation
+
+Array = NDArray[np.float64]
+Address = tuple[int, int]
+
+AUTOPILOT: Address = (1, 1)
+COMPANION: Address = (1, 197)
+GROUND: Address = (255, 190)
+BOOT_S = 50.0  # boot clock at the flight's start
+UNIX_S = 1_700_000_000.0  # UNIX time at boot
+HEADING_DEG, LENGTH_M = 30.0, 10.0
+LEAST_DELAY_S = 0.002
+MESSAGES = {message.msgname: message for message in dialect.mavlink_map.values()}
+POSE_VARIANCE = (0.01, 0.02, 0.03)
+VELOCITY_VARIANCE = (0.04, 0.05, 0.06)
+
+
+def message(name: str, /, **fields: Any) -> Any:
+    """A pymavlink message; fields that are not given are zero."""
+    kind = MESSAGES[name]
+    values = []
+    lengths = dict(zip(kind.ordered_fieldnames, kind.array_lengths, strict=True))
+    for key, wire in zip(kind.fieldnames, kind.fieldtypes, strict=True):
+        zero: Any = b"" if wire == "char" else 0
+        if lengths[key] and wire != "char":
+            zero = [0] * lengths[key]
+        values.append(fields.pop(key, zero))
+    assert not fields, f"{name} has no {sorted(fields)}"
+    return kind(*values)
+
+
+def frame(
+    made: Any,
+    sender: Address = AUTOPILOT,
+    sequence: int = 0,
+    *,
+    v1: bool = False,
+    key: bytes | None = None,
+) -> bytes:
+    """One frame; ``key`` signs it."""
+    link = dialect.MAVLink(None, srcSystem=sender[0], srcComponent=sender[1])
+    link.seq = sequence % 256
+    if key is not None:
+        link.signing.secret_key = key
+        link.signing.sign_outgoing = True
+    return bytes(made.pack(link, force_mavlink1=v1))
+
+
+def raw_frame(
+    number: int,
+    payload: bytes,
+    *,
+    seed: int,
+    sender: Address = AUTOPILOT,
+    sequence: int = 0,
+    flags: int = 0,
+    v1: bool = False,
+) -> bytes:
+    """One frame with any payload; ``seed`` is the checksum's last byte (CRC_EXTRA)."""
+    if v1:
+        head = bytes([len(payload), sequence, *sender, number])
+    else:
+        head = bytes([len(payload), flags, 0, sequence, *sender]) + number.to_bytes(3, "little")
+    checksum = dialect.x25crc(head + payload + bytes([seed])).crc
+    signature = bytes(13) if flags & 1 else b""
+    start = b"\xfe" if v1 else b"\xfd"
+    return start + head + payload + checksum.to_bytes(2, "little") + signature
+
+
+def stamp(received_us: int, link: int | None = None) -> bytes:
+    """A tlog's stamp; MAVProxy puts the link's number into the lowest bits."""
+    us = received_us if link is None else received_us & ~3 | link
+    return int(us).to_bytes(8, "big")
+
+
+@dataclass
+class Recorder:
+    """What a ground station hears, in any order; written in order of receipt.
+
+    ``sent`` holds time of receipt (s, UNIX), sender, message and link.
+    """
+
+    sent: list[tuple[float, Address, Any, int | None]] = field(default_factory=list)
+    v1: bool = False
+
+    def hear(
+        self, received_s: float, sender: Address, made: Any, link: int | None = None
+    ) -> Recorder:
+        self.sent.append((received_s, sender, made, link))
+        return self
+
+    def frames(self) -> list[tuple[int, int | None, bytes]]:
+        """Time of receipt (µs), link and frame, with each sender's sequence by link."""
+        sequence: defaultdict[tuple[Address, int | None], int] = defaultdict(int)
+        out = []
+        for received, sender, made, link in sorted(self.sent, key=lambda item: item[0]):
+            number = sequence[sender, link]
+            sequence[sender, link] += 1
+            out.append((round(received * 1e6), link, frame(made, sender, number, v1=self.v1)))
+        return out
+
+    def tlog(self) -> bytes:
+        return b"".join(stamp(us, link) + content for us, link, content in self.frames())
+
+    def raw(self) -> bytes:
+        return b"".join(content for _, _, content in self.frames())
+
+
+def same(boot_s: float) -> float:
+    """The autopilot's own boot clock."""
+    return boot_s
+
+
+def unix(boot_s: float) -> float:
+    """A UNIX clock without drift."""
+    return UNIX_S + boot_s
+
+
+@dataclass
+class Aisle:
+    """A flight along the aisle, as MAVLink carries it.
+
+    Attributes
+    ----------
+    seconds : float
+    start_s : float
+        Boot clock at its first message.
+    system : int
+    clock : callable
+        Boot time to the companion's own clock, s.
+    receiver : callable
+        Boot time to the clock that stamps the recording, s.
+    delay : callable
+        Of a generator: one link delay, s; never below :data:`LEAST_DELAY_S`.
+    asks, replies : bool
+        Whether the companion asks for TIMESYNC, and whether it replies to the autopilot.
+    system_time : bool
+        Whether the autopilot knows UNIX time.
+    uwb : str or None
+        The message that carries the position to the autopilot, at 5 Hz.
+    estimator : int
+        MAV_ESTIMATOR_TYPE of ``uwb`` where that is ODOMETRY.
+    noise_m : float
+    """
+
+    seconds: float = 40.0
+    start_s: float = BOOT_S
+    system: int = 1
+    clock: Callable[[float], float] = unix
+    receiver: Callable[[float], float] = unix
+    delay: Callable[[np.random.Generator], float] = lambda rng: (
+        LEAST_DELAY_S + rng.exponential(0.002)
+    )
+    asks: bool = False
+    replies: bool = True
+    system_time: bool = False
+    uwb: str | None = "VISION_POSITION_ESTIMATE"
+    estimator: int = 2
+    noise_m: float = 0.0
+    state: str | None = "ODOMETRY"
+    seed: int = 1
+
+    def record(self, into: Recorder | None = None) -> Recorder:
+        """Let a ground station listen."""
+        rng = np.random.default_rng(self.seed)
+        recorder = into or Recorder()
+        autopilot, companion = (self.system, AUTOPILOT[1]), (self.system, COMPANION[1])
+
+        def hear(boot_s: float, sender: Address, made: Any) -> None:
+            recorder.hear(self.receiver(boot_s + self.delay(rng)), sender, made)
+
+        for boot in self.times(1.0):
+            hear(boot, autopilot, heartbeat())
+            hear(boot, autopilot, message("EXTENDED_SYS_STATE", landed_state=self.landed(boot)))
+            if self.system_time:
+                hear(boot, autopilot, message(
+                    "SYSTEM_TIME", time_boot_ms=ms(boot), time_unix_usec=us(unix(boot)),
+                ))  # fmt: skip
+            hear(boot, companion, heartbeat(kind=18, autopilot=8))
+        for boot in self.times(50.0):
+            force = self.path(boot)[2] - [0.0, 0.0, GRAVITY_M_S2]
+            hear(boot, autopilot, message("HIGHRES_IMU", time_usec=us(boot), **xyz(force, "acc")))
+        for boot in self.times(20.0):
+            hear(boot, autopilot, message("ATTITUDE_QUATERNION", time_boot_ms=ms(boot), q1=1.0))
+            if self.state is not None:
+                hear(boot, autopilot, self.own_state(boot))
+        for boot in self.times(10.0):
+            if self.replies:
+                # asked at boot, replied a delay later, received after another
+                at = boot + self.delay(rng)
+                hear(boot, autopilot, message("TIMESYNC", ts1=ns(boot)))
+                hear(at, companion, message("TIMESYNC", tc1=ns(self.clock(at)), ts1=ns(boot)))
+            if self.asks:
+                asked = self.clock(boot)
+                at = boot + self.delay(rng)
+                hear(boot, companion, message("TIMESYNC", ts1=ns(asked)))
+                hear(at, autopilot, message("TIMESYNC", tc1=ns(at), ts1=ns(asked)))
+        if self.uwb is not None:
+            for boot in self.times(5.0):
+                hear(boot, companion, self.position(boot, rng))
+        return recorder
+
+    def times(self, rate_hz: float) -> list[float]:
+        """Boot times at which something is sent."""
+        return (self.start_s + np.arange(round(self.seconds * rate_hz)) / rate_hz).tolist()
+
+    def path(self, boot_s: float) -> tuple[Array, Array, Array]:
+        """Position, velocity and acceleration, NED."""
+        p, v, a = motion(np.array([boot_s - self.start_s]), HEADING_DEG, LENGTH_M)
+        return p[0], v[0], a[0]
+
+    def landed(self, boot_s: float) -> int:
+        """On the ground in the first and the last quarter."""
+        share = (boot_s - self.start_s) / self.seconds
+        return 2 if 0.25 <= share < 0.75 else 1
+
+    def own_state(self, boot_s: float) -> Any:
+        p, v, _ = self.path(boot_s)
+        if self.state == "ODOMETRY":
+            return odometry(us(boot_s), p, v, estimator=8)
+        if self.state == "LOCAL_POSITION_NED":
+            return message(self.state, time_boot_ms=ms(boot_s), **xyz(p), **xyz(v, prefix="v"))
+        covariance = np.full(45, 99.0)
+        covariance[[0, 9, 17]] = POSE_VARIANCE
+        covariance[[24, 30, 35]] = VELOCITY_VARIANCE
+        return message(
+            "LOCAL_POSITION_NED_COV", time_usec=us(boot_s), covariance=covariance.tolist(),
+            **xyz(p), **xyz(v, prefix="v"),
+        )  # fmt: skip
+
+    def position(self, boot_s: float, rng: np.random.Generator) -> Any:
+        here = self.path(boot_s)[0] + rng.normal(0.0, self.noise_m, 3)
+        at = us(self.clock(boot_s))
+        if self.uwb == "ODOMETRY":
+            return odometry(at, here, np.zeros(3), estimator=self.estimator)
+        name = "usec" if self.uwb == "VISION_POSITION_ESTIMATE" else "time_usec"
+        assert self.uwb is not None
+        return message(self.uwb, covariance=triangle(POSE_VARIANCE), **{name: at}, **xyz(here))
+
+
+def ms(seconds: float) -> int:
+    return round(seconds * 1e3)
+
+
+def us(seconds: float) -> int:
+    return round(seconds * 1e6)
+
+
+def ns(seconds: float) -> int:
+    return round(seconds * 1e9)
+
+
+def xyz(values: Any, suffix: str = "", *, prefix: str = "") -> dict[str, float]:
+    return {f"{prefix}{axis}{suffix}": float(v) for axis, v in zip("xyz", values, strict=True)}
+
+
+def triangle(diagonal: tuple[float, ...]) -> list[float]:
+    """Upper triangle of a 6×6 covariance; what is not on the diagonal must not be read."""
+    made = np.full(21, 99.0)
+    made[[0, 6, 11]] = diagonal
+    return made.tolist()
+
+
+def heartbeat(kind: int = 2, autopilot: int = 12) -> Any:
+    return message("HEARTBEAT", type=kind, autopilot=autopilot, mavlink_version=3)
+
+
+def odometry(
+    time_us: int,
+    position: Any,
+    velocity: Any,
+    *,
+    estimator: int,
+    frame_id: int = 1,
+    child: int = 1,
+    attitude: Rotation | None = None,
+    resets: int = 0,
+) -> Any:
+    quaternion = (attitude or Rotation.identity()).as_quat(scalar_first=True)
+    return message(
+        "ODOMETRY", time_usec=time_us, frame_id=frame_id, child_frame_id=child,
+        q=quaternion.tolist(), pose_covariance=triangle(POSE_VARIANCE),
+        velocity_covariance=triangle(VELOCITY_VARIANCE), estimator_type=estimator,
+        reset_counter=resets, quality=100, **xyz(position), **xyz(velocity, prefix="v"),
+    )  # fmt: skip
+
+
+@dataclass
+class Heard:
+    """One message as pymavlink's own reader gives it."""
+
+    start: int
+    received_us: int
+    sender: Address
+    sequence: int
+    fields: dict[str, Any]
+
+
+@contextlib.contextmanager
+def pymavlink_as_v2() -> Iterator[Any]:
+    """pymavlink's file reader with the dialect "all", its globals put back afterwards."""
+    before = {name: os.environ.get(name) for name in ("MAVLINK20", "MAVLINK_DIALECT")}
+    os.environ["MAVLINK20"] = "1"
+    from pymavlink import mavutil
+
+    dialect_before, module_before = mavutil.current_dialect, mavutil.mavlink
+    try:
+        yield mavutil
+    finally:
+        mavutil.current_dialect, mavutil.mavlink = dialect_before, module_before
+        for name, value in before.items():
+            os.environ.pop(name, None)
+            if value is not None:
+                os.environ[name] = value
+
+
+def heard_by_pymavlink(path: Path, *, stamped: bool) -> tuple[dict[str, list[Heard]], int]:
+    """Everything that recv_match gives, by message name, and how many are of unknown ids."""
+    found: defaultdict[str, list[Heard]] = defaultdict(list)
+    unknown = 0
+    with pymavlink_as_v2() as mavutil:
+        link = mavutil.mavlink_connection(str(path), dialect="all", notimestamps=not stamped)
+        while (made := link.recv_match()) is not None:
+            name = made.get_type()
+            if name == "BAD_DATA":
+                continue
+            if name.startswith("UNKNOWN"):
+                unknown += 1
+                continue
+            found[name].append(
+                Heard(
+                    link.f.tell() - link.mav.buf_len() - len(made.get_msgbuf()),
+                    round(made._timestamp * 1e6) if stamped else 0,
+                    (made.get_srcSystem(), made.get_srcComponent()),
+                    made.get_seq(),
+                    {key: getattr(made, key) for key in made.get_fieldnames()},
+                )
+            )
+        link.close()
+    return dict(found), unknown

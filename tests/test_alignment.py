@@ -1,0 +1,684 @@
+"""External position files placed into flights, against injected clocks, frames and yaws."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import flights
+import numpy as np
+import pandas as pd
+import pytest
+from flights import Estimator, Imu, Span, Uwb, aisle_flight, table, unavailable
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from px4fuse.alignment import EKF2_POSITION, IMU, place
+from px4fuse.errors import MissingDataError, SettingsError
+from px4fuse.flight import (
+    POSITION_COLUMNS,
+    POSITION_VARIANCE_COLUMNS,
+    Alignment,
+    Ekf2,
+    Flight,
+    PositionTrack,
+    Reset,
+)
+from px4fuse.readers import read_log
+from px4fuse.readers.position_csv import SAMPLE_COLUMNS, PositionFile, read_position_csv
+
+Array = NDArray[np.float64]
+
+BOOT_S = 2416.25
+OFFSET_S = -1795251250.2  # boot clock minus a UNIX clock
+# x, y, z of the file from north, east, down: written out, not taken from the code
+FROM_NED: dict[str, Any] = {
+    "ned": lambda n, e, d: (n, e, d),
+    "enu": lambda n, e, d: (e, n, -d),
+    "nwu": lambda n, e, d: (n, -e, -d),
+}
+
+
+# A pass along the aisle begins at each of these times and ends at this share of its length
+PASSES = {
+    6: 1.0,
+    18: 0.25,
+    27: 0.8,
+    41: 0.0,
+    52: 0.9,
+    66: 0.1,
+    75: 0.7,
+    90: 0.3,
+    104: 1.0,
+    112: 0.5,
+}
+PASS_S = 6.0
+
+
+def smooth_step(time_s: Array) -> Array:
+    """Go from 0 to 1 with least jerk."""
+    u = np.clip(time_s / PASS_S, 0.0, 1.0)
+    return u**3 * (10.0 - 15.0 * u + 6.0 * u**2)
+
+
+def passes(time_s: Array, heading_deg: float, length_m: float, across_m: float = 0.2) -> Array:
+    """Passes along the aisle of which no two are alike; shape (n, 3), NED."""
+    along, place_m = 0.0 * time_s, 0.0
+    for start_s, share in PASSES.items():
+        along += (share * length_m - place_m) * smooth_step(time_s - start_s)
+        place_m = share * length_m
+    across = across_m * np.sin(time_s / 2.3)
+    c, s = np.cos(np.radians(heading_deg)), np.sin(np.radians(heading_deg))
+    down = -1.5 * smooth_step(time_s)
+    return np.stack([c * along - s * across, s * along + c * across, down], axis=1)
+
+
+def flight_along(path: Any = passes, *, boot_s: float = BOOT_S, **parts: Any) -> Flight:
+    """Fly another path than the aisle's, which repeats itself."""
+
+    def motion(time_s: Array, heading_deg: float, length_m: float) -> tuple[Array, Array, Array]:
+        h = 1e-3
+        before, now, after = (
+            path(time_s + step, heading_deg, length_m) for step in (-h, 0.0, h)
+        )  # fmt: skip
+        return now, (after - before) / (2.0 * h), (after - 2.0 * now + before) / h**2
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(flights, "motion", motion)
+        flight = aisle_flight(**parts)
+    return replace(flight, log=replace(flight.log, boot_time_s=boot_s))
+
+
+def position_file(
+    time_s: Array, xyz_m: Array, *, sigma_m: Any = np.nan, frame: str | None = None
+) -> PositionFile:
+    values = np.full((len(time_s), len(SAMPLE_COLUMNS)), np.nan)
+    values[:, :3], values[:, 3:6] = xyz_m, sigma_m
+    return PositionFile(
+        name="uwb.csv",
+        sha256="f" * 64,
+        size_bytes=1234,
+        samples=table(time_s, values, SAMPLE_COLUMNS),
+        clock="UNIX",
+        frame=frame,
+        detected=("time: column 1",),
+        notes=("two rows dropped",),
+    )
+
+
+def recorded(
+    flight: Flight,
+    *,
+    offset_s: float = OFFSET_S,
+    frame: str = "enu",
+    yaw_deg: float = 0.0,
+    origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    span_s: Span = (-np.inf, np.inf),
+    **made: Any,
+) -> PositionFile:
+    """Record the flight's UWB on another clock and in another frame."""
+    samples = flight.positions[0].samples.loc[span_s[0] : span_s[1]]
+    n, e, d = (samples[POSITION_COLUMNS].to_numpy() - origin_m).T
+    c, s = np.cos(np.radians(yaw_deg)), np.sin(np.radians(yaw_deg))
+    xyz = np.stack(FROM_NED[frame](c * n + s * e, c * e - s * n, d), axis=1)
+    return position_file(samples.index.to_numpy() + flight.log.boot_time_s - offset_s, xyz, **made)
+
+
+def placed(flight: Flight, file: PositionFile, **options: Any) -> tuple[Alignment, PositionTrack]:
+    track = place(flight, file, **options).positions[0]
+    assert track.alignment is not None
+    return track.alignment, track
+
+
+def turn(one_deg: float, other_deg: float) -> float:
+    """Angle between two yaws."""
+    return abs((one_deg - other_deg + 180.0) % 360.0 - 180.0)
+
+
+def assert_same_track(track: PositionTrack, expected: PositionTrack, tolerance_m: float) -> None:
+    difference = track.samples[POSITION_COLUMNS].to_numpy() - expected.samples[POSITION_COLUMNS]
+    assert np.abs(difference.to_numpy()).max() < tolerance_m
+
+
+@pytest.fixture(scope="module")
+def flight() -> Flight:
+    return flight_along()
+
+
+@pytest.fixture(scope="module")
+def external(sample_log: Path) -> PositionFile:
+    return read_position_csv(sample_log.with_name("aisle_uwb_external.csv"))
+
+
+@pytest.fixture(scope="module")
+def true_offset_s(sample_flight: Flight, external: PositionFile) -> float:
+    """Boot clock minus the file's, from the positions that both hold."""
+    logged = sample_flight.positions[0].samples
+    time_of = {
+        (round(east, 3), round(north, 3)): time
+        for time, north, east in zip(logged.index, logged.north_m, logged.east_m, strict=True)
+    }
+    offsets = [
+        time_of[x, y] + sample_flight.log.boot_time_s - stamp
+        for stamp, x, y in zip(
+            external.samples.index, external.samples.x_m, external.samples.y_m, strict=True
+        )
+        if (x, y) in time_of
+    ]
+    assert len(offsets) > 500
+    assert np.ptp(offsets) < 2e-3
+    return float(np.median(offsets))
+
+
+# -- the sample flight -----------------------------------------------------------------------------
+
+
+def test_sample_file_is_placed_without_any_option(
+    sample_flight: Flight, external: PositionFile, true_offset_s: float
+) -> None:
+    alignment, track = placed(sample_flight, external)
+    assert alignment.frame == "enu"
+    assert "fits EKF2 position best" in alignment.frame_reason
+    assert alignment.reference == EKF2_POSITION
+    assert alignment.yaw_deg == 0.0
+    assert alignment.yaw_sigma_deg is None
+    assert alignment.origin_m == (0.0, 0.0, 0.0)
+    error = alignment.clock_offset_s - true_offset_s
+    assert abs(error) < 0.03
+    assert alignment.clock_offset_sigma_s is not None
+    assert 0.003 < alignment.clock_offset_sigma_s < 0.03
+    assert abs(error) < 3.0 * alignment.clock_offset_sigma_s
+    assert alignment.correlation == pytest.approx(0.9994, abs=3e-4)
+    assert alignment.residual_rms_m == pytest.approx(0.115, abs=0.01)
+    assert alignment.warnings == ()
+    assert len(track.samples) == len(external.samples)
+    assert track.samples[POSITION_VARIANCE_COLUMNS].isna().to_numpy().all()
+
+
+def test_sample_file_with_the_true_offset_is_the_logged_track(
+    sample_flight: Flight, external: PositionFile, true_offset_s: float
+) -> None:
+    alignment, track = placed(
+        sample_flight, external, frame="enu", clock_offset_s=true_offset_s
+    )  # fmt: skip
+    assert alignment.clock_offset_s == true_offset_s
+    assert alignment.clock_offset_sigma_s is None
+    assert alignment.clock_reason == "given with --clock-offset"
+    assert alignment.frame_reason == "given with --position-frame"
+    assert alignment.residual_rms_m == pytest.approx(0.115, abs=0.01)
+    logged = sample_flight.positions[0].samples
+    for column in POSITION_COLUMNS[:2]:
+        ours = np.interp(logged.index, track.samples.index, track.samples[column])
+        assert np.median(np.abs(ours - logged[column])) < 2e-3
+
+
+@pytest.mark.parametrize("yaw_deg", [-170.0, -90.0, 10.0, 75.0, 180.0])
+def test_turned_mirrored_and_shifted_sample_is_recovered(
+    sample_flight: Flight, external: PositionFile, true_offset_s: float, yaw_deg: float
+) -> None:
+    origin = (3.0, -2.0, 0.5)
+    position = external.samples[["y_m", "x_m", "z_m"]].to_numpy() * [1.0, 1.0, -1.0]
+    source = replace(
+        sample_flight,
+        positions=(
+            replace(
+                sample_flight.positions[0],
+                samples=table(
+                    external.samples.index.to_numpy() + true_offset_s - BOOT_S,
+                    np.hstack([position, np.full(position.shape, np.nan)]),
+                    POSITION_COLUMNS + POSITION_VARIANCE_COLUMNS,
+                ),
+            ),
+        ),
+        log=replace(sample_flight.log, boot_time_s=BOOT_S),
+    )
+    for frame in FROM_NED:
+        file = recorded(
+            source, offset_s=true_offset_s, frame=frame, yaw_deg=yaw_deg, origin_m=origin
+        )
+        alignment, _ = placed(sample_flight, file, frame=frame, yaw_deg="auto")
+        assert turn(alignment.yaw_deg, yaw_deg) < 0.5
+        assert alignment.yaw_sigma_deg is not None
+        assert 0.02 < alignment.yaw_sigma_deg < 0.3
+        np.testing.assert_allclose(alignment.origin_m[:2], origin[:2], atol=0.05)
+        # EKF2's height as published, of which one reset on the ground is not undone
+        assert alignment.origin_m[2] == pytest.approx(origin[2], abs=0.05)
+        assert abs(alignment.clock_offset_s - true_offset_s) < 0.03
+        assert alignment.warnings == ()
+
+
+# -- synthetic flights -----------------------------------------------------------------------------
+
+
+@settings(max_examples=20, deadline=None)
+@given(
+    seed=st.integers(0, 3),
+    frame=st.sampled_from(sorted(FROM_NED)),
+    told=st.booleans(),
+    offset_s=st.floats(-2e9, 2e9),
+    yaw_deg=st.floats(-179.0, 179.0),
+    origin_m=st.tuples(*[st.floats(-8.0, 8.0)] * 3),
+)
+def test_any_clock_frame_yaw_and_origin_is_recovered(
+    seed: int,
+    frame: str,
+    told: bool,
+    offset_s: float,
+    yaw_deg: float,
+    origin_m: tuple[float, float, float],
+) -> None:
+    flight = flight_along(seed=seed)
+    file = recorded(flight, offset_s=offset_s, frame=frame, yaw_deg=yaw_deg, origin_m=origin_m)
+    alignment, track = placed(flight, file, frame=frame if told else None, yaw_deg="auto")
+    if told:
+        assert turn(alignment.yaw_deg, yaw_deg) < 0.5
+        np.testing.assert_allclose(alignment.origin_m, origin_m, atol=0.05)
+    else:
+        assert alignment.frame == {"ned": "ned"}.get(frame, "enu")
+    assert_same_track(track, flight.positions[0], 0.1)
+    assert abs(alignment.clock_offset_s - offset_s) < 0.03
+    assert alignment.clock_offset_sigma_s is not None
+    assert 5e-4 < alignment.clock_offset_sigma_s < 0.02
+    assert alignment.warnings == ()
+
+
+def test_sigmas_of_clock_and_yaw_are_the_scatter_over_many_flights() -> None:
+    clock, yaw = [], []
+    for seed in range(24):
+        flight = flight_along(seed=seed, duration_s=60.0)
+        alignment, _ = placed(flight, recorded(flight), frame="enu", yaw_deg="auto")
+        clock.append((alignment.clock_offset_s - OFFSET_S) / (alignment.clock_offset_sigma_s or 0))
+        yaw.append(alignment.yaw_deg / (alignment.yaw_sigma_deg or 0))
+    # 95 % of the root mean squares of 24 normal variables lie between 0.72 and 1.28
+    assert 0.65 < np.sqrt(np.mean(np.square(clock))) < 1.4
+    assert 0.65 < np.sqrt(np.mean(np.square(yaw))) < 1.4
+
+
+@pytest.mark.parametrize("frame", sorted(FROM_NED))
+def test_frame_is_told_by_the_fit_unless_the_columns_name_it(flight: Flight, frame: str) -> None:
+    file = recorded(flight, frame=frame)
+    alignment, track = placed(flight, file)
+    assert alignment.frame == frame
+    assert alignment.frame_reason.startswith(f"fits EKF2 position best; residuals: {frame} 0.1")
+    assert_same_track(track, flight.positions[0], 1e-9)
+    alignment, _ = placed(flight, replace(file, frame=frame))
+    assert alignment.frame == frame
+    assert alignment.frame_reason == "from the names of the file's columns"
+
+
+def test_an_aisle_at_45_degrees_without_height_does_not_tell_the_frame() -> None:
+    flight = flight_along(partial(passes, across_m=0.0), heading_deg=45.0)
+    file = recorded(flight, frame="enu")
+    file.samples["z_m"] = np.nan
+    with pytest.raises(MissingDataError, match=r"no frame fits .*Give --position-frame ned\|enu"):
+        place(flight, file)
+    alignment, track = placed(flight, file, frame="enu")
+    assert abs(alignment.clock_offset_s - OFFSET_S) < 0.03
+    assert track.samples["down_m"].isna().all()
+    assert track.samples["north_m"].notna().all()
+
+
+def test_variances_turn_with_the_track(flight: Flight) -> None:
+    file = recorded(flight, frame="enu", yaw_deg=90.0, sigma_m=[0.1, 0.2, 0.3])
+    options: dict[str, Any] = {"frame": "enu", "clock_offset_s": OFFSET_S}
+    variances = [
+        placed(flight, file, yaw_deg=yaw, **options)[1].samples[POSITION_VARIANCE_COLUMNS].iloc[7]
+        for yaw in (0.0, 90.0, 30.0)
+    ]
+    np.testing.assert_allclose(variances[0], [0.04, 0.01, 0.09])
+    np.testing.assert_allclose(variances[1], [0.01, 0.04, 0.09])
+    # cos² 30° = 3/4
+    np.testing.assert_allclose(variances[2], [0.0325, 0.0175, 0.09])
+    alignment, track = placed(flight, file, yaw_deg=90.0, **options)
+    assert (alignment.yaw_deg, alignment.yaw_reason) == (90.0, "given with --position-yaw")
+    assert_same_track(track, flight.positions[0], 1e-9)
+
+
+def test_the_flight_gets_the_track_the_file_and_what_its_reader_said(flight: Flight) -> None:
+    file = recorded(flight)
+    result = place(flight, file)
+    track, *others = result.positions
+    assert (track.name, track.rung, track.log, track.topics) == (
+        "uwb.csv",
+        1,
+        "uwb.csv",
+        ("uwb.csv",),
+    )
+    assert (track.frame, track.reconstructed) == ("NED", False)
+    assert track.description == "external position file, 601 samples, enu"
+    assert track.clock.startswith("the file's own UNIX clock, -1795251250.")
+    assert track.clock.endswith(" s to the boot clock, matched with EKF2 position")
+    assert tuple(others) == flight.positions
+    assert [vars(given) for given in result.inputs] == [
+        {"name": "uwb.csv", "sha256": "f" * 64, "size_bytes": 1234, "role": "position"}
+    ]
+    assert result.log.notes == ("uwb.csv: time: column 1", "uwb.csv: two rows dropped")
+    assert result.ekf2 is flight.ekf2
+    assert flight.inputs == ()
+
+
+# -- frames that are not EKF2's --------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("yaw_deg", "origin_m"),
+    [(90.0, (0.0, 0.0, 0.0)), (-12.0, (1.0, 2.0, 0.0)), (180.0, (5.0, 0.0, 0.0))],
+)
+def test_a_turned_frame_is_warned_of_and_does_not_spoil_the_clock(
+    flight: Flight, yaw_deg: float, origin_m: tuple[float, float, float]
+) -> None:
+    file = recorded(flight, yaw_deg=yaw_deg, origin_m=origin_m)
+    alignment, _ = placed(flight, file, frame="enu")
+    assert alignment.yaw_deg == 0.0
+    assert abs(alignment.clock_offset_s - OFFSET_S) < 0.03
+    (warning,) = alignment.warnings
+    seen = re.search(r"turned by ([-0-9.]+)° and shifted by ([0-9.]+) m against", warning)
+    assert seen
+    turned, shifted = map(float, seen.groups())
+    assert turn(turned, yaw_deg) < 0.5
+    assert shifted == pytest.approx(np.hypot(*origin_m[:2]), abs=0.1)
+    assert warning.endswith("give --position-yaw auto.")
+    alignment, _ = placed(flight, file, frame="enu", yaw_deg="auto")
+    assert alignment.warnings == ()
+
+
+def test_a_frame_shifted_by_two_metres_is_warned_of(flight: Flight) -> None:
+    alignment, _ = placed(flight, recorded(flight, origin_m=(2.0, 0.0, 0.0)), frame="enu")
+    (warning,) = alignment.warnings
+    assert "shifted by 2.0 m" in warning
+    assert alignment.residual_rms_m == pytest.approx(np.sqrt(2.0), abs=0.05)
+
+
+def test_a_given_offset_that_is_wrong_is_warned_of(flight: Flight) -> None:
+    alignment, _ = placed(flight, recorded(flight), frame="enu", clock_offset_s=OFFSET_S + 11.0)
+    (warning,) = alignment.warnings
+    assert warning.startswith("The file hardly follows the EKF2 position (correlation ")
+    assert alignment.correlation is not None
+    assert alignment.correlation < 0.7
+
+
+def test_yaw_is_found_at_a_given_offset(flight: Flight) -> None:
+    file = recorded(flight, yaw_deg=40.0)
+    alignment, track = placed(flight, file, yaw_deg="auto", clock_offset_s=OFFSET_S)
+    assert alignment.yaw_deg == pytest.approx(40.0, abs=0.5)
+    assert alignment.clock_offset_sigma_s is None
+    assert_same_track(track, flight.positions[0], 0.1)
+
+
+def test_a_flight_that_is_nearly_a_point_leaves_the_yaw_open() -> None:
+    flight = flight_along(length_m=0.6, duration_s=25.0)
+    alignment, _ = placed(
+        flight, recorded(flight), frame="enu", yaw_deg="auto", clock_offset_s=OFFSET_S
+    )  # fmt: skip
+    assert alignment.yaw_sigma_deg is not None
+    assert alignment.yaw_sigma_deg > 2.0
+    assert any("yaw is poorly determined" in warning for warning in alignment.warnings)
+
+
+# -- what real files are like ----------------------------------------------------------------------
+
+
+def test_outliers_and_gaps_move_the_clock_little() -> None:
+    flight = flight_along(uwb=Uwb(outlier_share=0.08, gap_s=(30.0, 48.0)))
+    alignment, _ = placed(flight, recorded(flight), frame="enu", yaw_deg="auto")
+    assert abs(alignment.clock_offset_s - OFFSET_S) < 0.03
+    assert abs(alignment.yaw_deg) < 0.5
+    np.testing.assert_allclose(alignment.origin_m[:2], 0.0, atol=0.05)
+
+
+@pytest.mark.parametrize("span_s", [(0.0, 35.0), (50.0, 80.0), (100.0, 120.0)])
+def test_a_file_of_a_part_of_the_flight(flight: Flight, span_s: Span) -> None:
+    alignment, track = placed(flight, recorded(flight, span_s=span_s), frame="enu")
+    assert abs(alignment.clock_offset_s - OFFSET_S) < 0.05
+    assert track.samples.index[0] == pytest.approx(span_s[0], abs=0.05)
+
+
+def test_a_file_from_minutes_before_until_minutes_after_the_flight(flight: Flight) -> None:
+    rng = np.random.default_rng(5)
+    own = recorded(flight).samples
+    before = np.arange(own.index[0] - 400.0, own.index[0] - 0.1, 0.2)
+    after = np.arange(own.index[-1] + 0.2, own.index[-1] + 300.0, 0.2)
+    xyz = own[["x_m", "y_m", "z_m"]].to_numpy()
+    rows = [
+        rng.normal(0.0, 0.1, (len(before), 3)) + xyz[:3].mean(axis=0),
+        xyz,
+        rng.normal(0.0, 0.1, (len(after), 3)) + xyz[-3:].mean(axis=0),
+    ]
+    file = position_file(np.concatenate([before, own.index, after]), np.vstack(rows))
+    alignment, track = placed(flight, file)
+    assert abs(alignment.clock_offset_s - OFFSET_S) < 0.03
+    assert len(track.samples) == len(file.samples)
+    assert alignment.warnings == ()
+
+
+@pytest.mark.parametrize("delta", [(3.0, -2.0, 0.5), (100.0, 40.0, 0.0)])
+def test_a_reset_of_ekf2_does_no_harm(delta: tuple[float, float, float]) -> None:
+    flight = flight_along(ekf2=Estimator(resets=(Reset(70.0, "position", delta),)))
+    for yaw in (None, "auto"):
+        alignment, track = placed(flight, recorded(flight), frame="enu", yaw_deg=yaw)
+        assert abs(alignment.clock_offset_s - OFFSET_S) < 0.03
+        assert alignment.residual_rms_m == pytest.approx(0.11, abs=0.02)
+        assert_same_track(track, flight.positions[0], 0.1)
+        assert alignment.warnings == ()
+
+
+# -- the IMU as the reference ----------------------------------------------------------------------
+
+QUIET = Imu(sigma_a_m_s2=0.1)
+
+
+@pytest.mark.parametrize("noise", [0.1, 0.5])
+def test_without_ekf2_the_imu_gives_clock_and_yaw(noise: float) -> None:
+    flight = flight_along(imu=Imu(sigma_a_m_s2=noise), ekf2=None)
+    file = recorded(flight, yaw_deg=25.0, origin_m=(4.0, 5.0, 0.0))
+    alignment, _ = placed(flight, file, frame="enu", yaw_deg="auto")
+    assert alignment.reference == IMU
+    assert abs(alignment.clock_offset_s - OFFSET_S) < 0.05
+    assert alignment.clock_offset_sigma_s is not None
+    assert 2e-3 < alignment.clock_offset_sigma_s < 0.05
+    assert alignment.yaw_deg == pytest.approx(25.0, abs=3.0)
+    assert alignment.origin_m == (0.0, 0.0, 0.0)
+    assert alignment.residual_rms_m is None
+    assert alignment.correlation is not None
+    assert alignment.correlation > 0.7
+    assert any("which was left at 0" in warning for warning in alignment.warnings)
+
+
+def test_the_imu_tells_the_frame_and_that_it_is_turned() -> None:
+    flight = flight_along(imu=QUIET, ekf2=None)
+    assert placed(flight, recorded(flight, frame="nwu"))[0].frame == "nwu"
+    alignment, _ = placed(flight, recorded(flight, yaw_deg=120.0), frame="enu")
+    assert abs(alignment.clock_offset_s - OFFSET_S) < 0.05
+    assert "seems turned by 1" in alignment.warnings[-1]
+    assert "shifted" not in alignment.warnings[-1]
+
+
+def test_an_ekf2_that_stands_still_leaves_it_to_the_imu() -> None:
+    flight = flight_along(imu=QUIET)
+    assert isinstance(flight.ekf2, Ekf2)
+    still = flight.ekf2.state * 0.0
+    alignment, _ = placed(
+        replace(flight, ekf2=replace(flight.ekf2, state=still)), recorded(flight), frame="enu"
+    )
+    assert alignment.reference == IMU
+    assert abs(alignment.clock_offset_s - OFFSET_S) < 0.05
+
+
+def test_the_sample_flight_without_ekf2(
+    sample_flight: Flight, external: PositionFile, true_offset_s: float
+) -> None:
+    flight = replace(sample_flight, ekf2=unavailable("EKF2"))
+    alignment, _ = placed(flight, external)
+    assert (alignment.frame, alignment.reference) == ("enu", IMU)
+    assert alignment.clock_offset_sigma_s is not None
+    assert abs(alignment.clock_offset_s - true_offset_s) < 0.05
+    assert 0.01 < alignment.clock_offset_sigma_s < 0.08
+
+
+# -- what cannot be placed -------------------------------------------------------------------------
+
+BOTH_SPANS = r"the log covers 2416\.25 s to 2536\.25 s of the boot clock, the file 1795253666\.45 s"
+
+
+def test_no_motion_is_one_line_with_both_spans() -> None:
+    flight = flight_along(partial(passes, across_m=0.0), length_m=0.0)
+    for parts in ({}, {"ekf2": unavailable("EKF2")}):
+        with pytest.raises(MissingDataError) as caught:
+            place(replace(flight, **parts), recorded(flight), frame="enu")
+        assert caught.match(r"^uwb\.csv: .*hardly moves; " + BOTH_SPANS)
+        assert caught.match(r"Give --clock-offset SECONDS\.$")
+        assert "\n" not in str(caught.value)
+
+
+def test_what_stands_still_is_placed_by_a_given_offset() -> None:
+    flight = flight_along(partial(passes, across_m=0.0), length_m=0.0)
+    alignment, track = placed(flight, recorded(flight), frame="enu", clock_offset_s=OFFSET_S)
+    assert alignment.warnings == ()
+    assert alignment.correlation is None
+    assert alignment.residual_rms_m == pytest.approx(0.11, abs=0.02)
+    assert_same_track(track, flight.positions[0], 1e-9)
+
+
+def test_no_reference_at_all() -> None:
+    flight = flight_along(imu=None, ekf2=None)
+    file = recorded(flight)
+    with pytest.raises(
+        MissingDataError, match="no EKF2 position; the log has no acceleration"
+    ) as e:
+        place(flight, file)
+    assert e.match(BOTH_SPANS)
+    assert e.match(r"Give --clock-offset SECONDS and --position-frame ned\|enu\|nwu\.$")
+    with pytest.raises(MissingDataError, match=r"Give --position-yaw DEGREES\.$"):
+        place(flight, file, frame="enu", yaw_deg="auto", clock_offset_s=OFFSET_S)
+    alignment, track = placed(flight, file, frame="enu", clock_offset_s=OFFSET_S)
+    assert (alignment.reference, alignment.correlation, alignment.residual_rms_m) == (
+        "",
+        None,
+        None,
+    )
+    assert_same_track(track, flight.positions[0], 1e-9)
+
+
+def test_a_given_offset_without_overlap(flight: Flight) -> None:
+    file = recorded(flight)
+    for offset in (0.0, OFFSET_S + 121.0, OFFSET_S - 121.0):
+        with pytest.raises(MissingDataError, match="does not overlap the log; " + BOTH_SPANS):
+            place(flight, file, frame="enu", clock_offset_s=offset)
+
+
+def test_a_file_of_another_flight_is_refused(flight: Flight) -> None:
+    def other(time_s: Array, heading_deg: float, length_m: float) -> Array:
+        angle = 2.0 * np.pi * time_s / 55.0
+        radius = 3.0 + np.sin(7.0 * angle)
+        return np.stack([radius * np.cos(angle), radius * np.sin(angle), 0.0 * angle], axis=1)
+
+    with pytest.raises(MissingDataError, match="does not follow the EKF2 position"):
+        place(flight, recorded(flight_along(other)), frame="enu")
+
+
+@pytest.mark.parametrize("yaw", [None, "auto"])
+def test_a_flight_that_repeats_itself_needs_the_offset(yaw: Any) -> None:
+    flight = replace(aisle_flight(), log=replace(aisle_flight().log, boot_time_s=BOOT_S))
+    file = recorded(flight)
+    with pytest.raises(MissingDataError) as caught:
+        place(flight, file, frame="enu", yaw_deg=yaw)
+    assert caught.match(r"path leaves the clock open: offsets [1-6]0\.\d s apart fit")
+    assert caught.match(BOTH_SPANS + r".*Give --clock-offset SECONDS\.$")
+    alignment, _ = placed(flight, file, frame="enu", yaw_deg=yaw, clock_offset_s=OFFSET_S)
+    assert alignment.residual_rms_m == pytest.approx(0.11, abs=0.02)
+
+
+def test_a_flight_that_nearly_repeats_itself_is_warned_of() -> None:
+    def ever_faster(time_s: Array, heading_deg: float, length_m: float) -> Array:
+        along = 5.0 * (1.0 - np.cos(2.0 * np.pi * (time_s / 20.0 + time_s**2 / 2e5)))
+        return np.stack([along, 0.0 * along, 0.0 * along], axis=1)
+
+    flight = flight_along(ever_faster)
+    alignment, _ = placed(flight, recorded(flight), frame="enu")
+    assert abs(alignment.clock_offset_s - OFFSET_S) < 0.03
+    (warning,) = alignment.warnings
+    assert re.match(r"A clock offset [-+]19\.\d s from this one fits nearly as well, ", warning)
+
+
+def test_on_a_circle_any_offset_fits_with_some_yaw() -> None:
+    def circle(time_s: Array, heading_deg: float, length_m: float) -> Array:
+        angle = 2.0 * np.pi * time_s / 50.0
+        return np.stack([5.0 * np.cos(angle), 5.0 * np.sin(angle), 0.0 * angle], axis=1)
+
+    flight = flight_along(circle, duration_s=45.0)
+    file = recorded(flight)
+    with pytest.raises(
+        MissingDataError, match=r"leaves the clock open.*Give --clock-offset SECONDS\.$"
+    ):
+        place(flight, file, frame="enu", yaw_deg="auto")
+    alignment, _ = placed(flight, file, frame="enu")
+    assert abs(alignment.clock_offset_s - OFFSET_S) < 0.05
+
+
+def test_a_file_of_days_is_refused(flight: Flight) -> None:
+    file = recorded(flight)
+    stamps = file.samples.index.to_numpy().copy()
+    stamps[-1] += 2e5
+    with pytest.raises(MissingDataError, match="spans more than a day"):
+        place(flight, replace(file, samples=file.samples.set_axis(pd.Index(stamps))), frame="enu")
+
+
+def test_too_few_positions(flight: Flight) -> None:
+    file = recorded(flight)
+    few = replace(file, samples=file.samples.iloc[:9])
+    with pytest.raises(MissingDataError, match="9 positions are too few"):
+        place(flight, few)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (
+            {"frame": "utm"},
+            "--position-frame utm: there is no such frame. Choose from ned, enu, nwu.",
+        ),
+        ({"yaw_deg": float("nan")}, "--position-yaw nan is not a finite number."),
+        ({"yaw_deg": "north"}, "--position-yaw north: give degrees, or auto."),
+        ({"clock_offset_s": float("inf")}, "--clock-offset inf is not a finite number."),
+    ],
+)
+def test_invalid_options(flight: Flight, options: dict[str, Any], message: str) -> None:
+    with pytest.raises(SettingsError) as caught:
+        place(flight, recorded(flight), **options)
+    assert str(caught.value) == message
+
+
+# -- simulated flights -----------------------------------------------------------------------------
+
+
+@pytest.mark.reallogs
+@pytest.mark.parametrize("name", ["v1.14.4_aisle_nominal", "v1.16.1_aisle_nlos"])
+def test_simulated_flights(shared_logs: Path, name: str) -> None:
+    log = shared_logs / "simulated" / f"{name}.ulg"
+    if not log.is_file():
+        pytest.skip(f"{log.name} is not there")
+    record = json.loads(log.with_suffix(".json").read_text())
+    stamps = np.array([sample["t_unix"] for sample in record["uwb"]])
+    file = position_file(stamps, np.array([sample["z"] for sample in record["uwb"]]))
+    flight = read_log(log)
+    true_s = record["clock"]["px4_boot_minus_companion_unix_ns"] * 1e-9
+    for options in ({"frame": "ned"}, {"yaw_deg": "auto"}):
+        alignment, track = placed(flight, file, **options)
+        assert alignment.frame == "ned"
+        assert alignment.clock_offset_sigma_s is not None
+        # EKF2 itself lags by about 15 ms
+        error = alignment.clock_offset_s - true_s
+        assert abs(error) < min(0.05, 3.0 * alignment.clock_offset_sigma_s)
+        assert abs(alignment.yaw_deg) < 0.5
+        np.testing.assert_allclose(alignment.origin_m[:2], 0.0, atol=0.05)
+        truth = np.array([sample["truth"] for sample in record["uwb"]])
+        error_m = track.samples[POSITION_COLUMNS[:2]].to_numpy() - truth[:, :2]
+        assert np.median(np.abs(error_m)) < 0.08
+    alignment, _ = placed(replace(flight, ekf2=unavailable("EKF2")), file, frame="ned")
+    assert alignment.clock_offset_sigma_s is not None
+    assert abs(alignment.clock_offset_s - true_s) < 2.0 * alignment.clock_offset_sigma_s

@@ -1,0 +1,370 @@
+"""``px4fuse extract``: what is written is what was read, described, and enough for the lesson."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from click.testing import CliRunner, Result
+from flights import Estimator, aisle_flight
+from test_cli import run_main
+from ulog_tools import Log, make_log, stamps, topic
+
+from px4fuse import extraction
+from px4fuse.cli import cli
+from px4fuse.comparison import compare
+from px4fuse.flight import (
+    QUATERNION_COLUMNS,
+    ClockMap,
+    Dropout,
+    Flight,
+    InputFile,
+    Reset,
+    Unavailable,
+)
+from px4fuse.kalman import Settings, state_at
+from px4fuse.readers import read_log
+from px4fuse.signals import ned_acceleration
+
+# As it stands in the README: the lesson's Example 1 on one's own flight
+README = (Path(__file__).parent.parent / "README.md").read_text(encoding="utf-8")
+(LESSON,) = re.findall(r"```python\n(import numpy.*?)```", README, re.DOTALL)
+
+
+def extract(*arguments: str | Path) -> Result:
+    return CliRunner().invoke(cli, ["extract", *map(str, arguments)])
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory, sample_log) -> tuple[Path, str]:
+    folder = tmp_path_factory.mktemp("extracted") / "new" / "tables"
+    result = extract(sample_log, "-o", folder)
+    assert result.exit_code == 0, result.output
+    return folder, result.output
+
+
+def read(path: Path) -> pd.DataFrame:
+    # pandas' fast reader may miss the last bit; this one uses Python's own float()
+    return pd.read_csv(path, engine="python")
+
+
+def rich_flight() -> Flight:
+    """A flight with every part that a table can be made of."""
+    flight = aisle_flight(
+        duration_s=20.0,
+        ekf2=Estimator(
+            resets=(Reset(5.0, "position", (0.5, 0.0, -1.0)), Reset(6.0, "velocity", (0, 1, 0))),
+            instances=((-np.inf, 0), (9.0, 1)),
+        ),
+        dropouts=(Dropout(3.0, 0.2),),
+    )
+    clock = ClockMap('UNIX time, "quoted"', "TIMESYNC", 512, -1.7e9 / 3, 2.5, 0.001, "a, note")
+    return dataclasses.replace(
+        flight, clocks=(clock,), inputs=(InputFile("uwb.csv", "00" * 32, 10, "position"),)
+    )  # fmt: skip
+
+
+def assert_same_clock(table: pd.DataFrame, clock: ClockMap) -> None:
+    row = {name: value for name, value in table.iloc[0].to_dict().items() if not pd.isna(value)}
+    assert row == {name: value for name, value in vars(clock).items() if value is not None}
+
+
+# ---- what was read is what is written ---------------------------------------------------------
+
+
+def test_csv_reads_back_as_exactly_the_same_floats(written, sample_flight):
+    folder, _ = written
+    ekf2 = sample_flight.ekf2
+    expected = {
+        "imu": sample_flight.imu,
+        "attitude": sample_flight.attitude,
+        "acceleration_ned": ned_acceleration(sample_flight),
+        "ekf2_state": ekf2.state,
+        "ekf2_variance": ekf2.variance,
+        "ekf2_fusing": ekf2.fusing,
+        "truth": sample_flight.truth.samples,
+    } | {f"position_{track.name}": track.samples for track in sample_flight.positions}
+    for name, frame in expected.items():
+        table = read(folder / f"{name}.csv")
+        assert table.columns[0] == "time_s"
+        np.testing.assert_array_equal(table["time_s"], frame.index, strict=False)
+        np.testing.assert_array_equal(table.iloc[:, 1:], frame, err_msg=name)
+
+
+def test_innovations_are_one_tidy_table(written, sample_flight):
+    table = read(written[0] / "ekf2_innovations.csv")
+    assert table["time_s"].is_monotonic_increasing
+    assert set(table["axis"]) == {"north", "east"}
+    for axis, rows in table.groupby("axis"):
+        frame = sample_flight.ekf2.innovations[axis]
+        np.testing.assert_array_equal(rows["time_s"], frame.index)
+        np.testing.assert_array_equal(rows[frame.columns], frame)
+
+
+def test_the_lists_of_a_flight_are_tables():
+    flight = rich_flight()
+    tables = extraction.tables(flight)
+    resets = tables["resets"]
+    assert resets.to_numpy().tolist() == [
+        [5.0, "position", 0.5, 0.0, -1.0], [6.0, "velocity", 0.0, 1.0, 0.0],
+    ]  # fmt: skip
+    instances = tables["instances"]
+    assert instances["instance"].tolist() == [0, 1]
+    assert np.isfinite(instances["time_s"]).all()
+    assert instances["time_s"].iloc[1] == 9.0
+    assert tables["airborne"].to_numpy().tolist() == [list(span) for span in flight.airborne]
+    assert tables["dropouts"].to_numpy().tolist() == [[3.0, 0.2]]
+    assert dict(tables["parameters"].to_numpy().tolist()) == dict(flight.log.parameters)
+    assert_same_clock(tables["clocks"], flight.clocks[0])
+
+
+def test_text_with_commas_and_quotes_survives_csv():
+    flight = rich_flight()
+    text = extraction.tables(flight)["clocks"].to_csv(index=False)
+    back = pd.read_csv(io.StringIO(text), engine="python")
+    assert_same_clock(back, flight.clocks[0])
+
+
+def test_files_are_what_a_spreadsheet_reads(written):
+    """Comma, ASCII (so UTF-8 whatever the spreadsheet guesses), line feed, a header, no NaN."""
+    for path in written[0].glob("*.csv"):
+        content = path.read_bytes()
+        assert content.isascii(), path.name
+        assert b"\r" not in content
+        assert content.endswith(b"\n")
+        assert b"nan" not in content.lower().replace(b"resonan", b"")
+        assert b"inf," not in content
+
+
+def test_nothing_else_is_written(written):
+    names = {path.name for path in written[0].iterdir()}
+    listed = set(re.findall(r"^  (\S+\.csv)\s+\d+ rows$", written[1], re.MULTILINE))
+    assert names == listed | {"data_dictionary.csv", "flight.json"}
+
+
+# ---- the dictionary ---------------------------------------------------------------------------
+
+
+def test_the_dictionary_and_the_files_agree_both_ways(written):
+    folder, _ = written
+    dictionary = pd.read_csv(folder / "data_dictionary.csv", keep_default_na=False)
+    described = list(zip(dictionary["table"], dictionary["column"], strict=True))
+    assert len(set(described)) == len(described)
+    present = [
+        (path.stem, column)
+        for path in folder.glob("*.csv")
+        if path.stem != "data_dictionary"
+        for column in pd.read_csv(path, nrows=0).columns
+    ]
+    assert set(described) == set(present)
+    assert list(dictionary.columns) == [
+        "table", "column", "unit", "frame", "meaning", "source_topic", "clock",
+    ]  # fmt: skip
+    assert dictionary["meaning"].ne("").all()
+
+
+@pytest.mark.parametrize("flight", [rich_flight(), aisle_flight(duration_s=5.0, imu=None)])
+def test_every_column_of_every_flight_is_described(flight):
+    dictionary = extraction.data_dictionary(flight)
+    tables = extraction.tables(flight)
+    assert list(dict.fromkeys(dictionary["table"])) == list(tables)
+    for name, table in tables.items():
+        columns = dictionary[dictionary["table"] == name]["column"]
+        assert columns.tolist() == table.columns.tolist()
+
+
+UNITS = {"_m": "m", "_m2": "m^2", "_s": "s", "_m_s": "m/s", "_m_s2": "m/s^2",
+         "_m2_s2": "m^2/s^2", "_rad_s": "rad/s"}  # fmt: skip
+
+
+def test_units_are_those_in_the_names():
+    for row in extraction.data_dictionary(rich_flight()).itertuples():
+        suffix = re.search(r"(_(rad|m2?))?(_s2?)?$", row.column)[0]
+        if suffix:
+            assert row.unit == UNITS[suffix], row
+
+
+def test_the_dictionary_names_topics_and_clocks(written, sample_flight):
+    dictionary = pd.read_csv(written[0] / "data_dictionary.csv", keep_default_na=False)
+    for part, stream in sample_flight.streams.items():
+        rows = dictionary[dictionary["table"] == part]
+        assert set(rows["source_topic"]) == {" ".join(stream.topics)}, part
+        assert set(rows["clock"]) == {stream.clock}
+    acceleration = dictionary[dictionary["table"] == "acceleration_ned"]
+    assert set(acceleration["source_topic"]) == {"sensor_combined vehicle_attitude"}
+
+
+def test_flight_json_says_what_the_log_is_and_lacks(written, sample_flight):
+    text = (written[0] / "flight.json").read_text(encoding="utf-8")
+    about = json.loads(text, parse_constant=pytest.fail)
+    assert about["schema"] == {"name": "px4fuse-flight", "version": "1.0"}
+    assert about["log"]["sha256"] == sample_flight.log.sha256
+    assert about["streams"]["imu"]["topics"] == ["sensor_combined"]
+    assert {part["what"] for part in about["missing"]} >= {
+        part.what for part in sample_flight.missing
+    }
+    for position in about["positions"]:
+        assert (written[0] / f"{position['table']}.csv").exists()
+
+
+# ---- what is not there ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("dropped", "lost"),
+    [
+        ("sensor_combined", {"imu", "acceleration_ned"}),
+        ("vehicle_attitude", {"attitude", "acceleration_ned"}),
+        ("estimator_states", {"ekf2_variance"}),
+        ("vehicle_land_detected", {"airborne"}),
+        ("vehicle_visual_odometry", {"position_vehicle_visual_odometry"}),
+    ],
+)
+def test_what_is_unavailable_has_no_table_and_is_said(tmp_path, dropped, lost):
+    whole = set(extraction.tables(read_log(make_log().write(tmp_path / "whole.ulg"))))
+    path = make_log().drop(dropped).write(tmp_path / "less.ulg")
+    result = extract(path, "-o", tmp_path / "out")
+    assert result.exit_code == 0
+    assert {file.stem for file in (tmp_path / "out").glob("*.csv")} == (
+        whole - lost | {"data_dictionary"}
+    )
+    if dropped != "vehicle_visual_odometry":  # others stand in for that one
+        assert "Not in this log: " in result.output
+
+
+def test_a_log_of_other_topics_has_no_tables(tmp_path):
+    at = stamps(2.0, 10.0)
+    log = Log([topic("battery_status", at, {"voltage_v": np.full(len(at), 16.0)})])
+    flight = read_log(log.write(tmp_path / "battery.ulg"))
+    assert extraction.tables(flight) == {}
+    assert extraction.data_dictionary(flight).empty
+    assert "IMU" in [part.what for part in extraction.absent(flight)]
+
+
+# ---- names and folders ------------------------------------------------------------------------
+
+
+def test_table_names_are_file_names_on_every_system(sample_flight):
+    track = sample_flight.positions[0]
+    names = ["uwb log.csv", "UWB_LOG.csv", 'a/b\\c:d*?"<>|', "CON", "ünï", "x" * 300, "end. "]
+    flight = dataclasses.replace(
+        sample_flight,
+        positions=tuple(dataclasses.replace(track, name=name) for name in names),
+    )
+    tables = [name for name in extraction.tables(flight) if name.startswith("position_")]
+    assert len(tables) == len(names)
+    assert len({name.lower() for name in tables}) == len(names)
+    assert all(re.fullmatch(r"[A-Za-z0-9_-]{1,90}", name) for name in tables)
+
+
+def test_a_file_in_the_folders_place_is_refused(tmp_path, monkeypatch, capsys, sample_log):
+    target = tmp_path / "tables"
+    target.write_text("mine")
+    code, out, err = run_main(monkeypatch, capsys, "extract", sample_log, "-o", target)
+    assert (code, out, len(err.splitlines())) == (2, "", 1)
+    assert "is a file" in err
+    assert target.read_text() == "mine"
+
+
+def test_a_failed_run_overwrites_nothing(tmp_path, monkeypatch, capsys, sample_log):
+    folder = tmp_path / "tables"
+    (folder / "truth.csv").mkdir(parents=True)  # a table cannot be written there
+    (folder / "imu.csv").write_text("mine")
+    code, _, err = run_main(monkeypatch, capsys, "extract", sample_log, "-o", folder)
+    assert (code, len(err.splitlines())) == (2, 1)
+    assert sorted(path.name for path in folder.iterdir()) == ["imu.csv", "truth.csv"]
+    assert (folder / "imu.csv").read_text() == "mine"
+
+
+def test_a_bad_log_makes_no_folder(tmp_path, monkeypatch, capsys):
+    (tmp_path / "bad.ulg").write_bytes(b"no log")
+    folder = tmp_path / "tables"
+    code, _, err = run_main(monkeypatch, capsys, "extract", tmp_path / "bad.ulg", "-o", folder)
+    assert (code, len(err.splitlines())) == (2, 1)
+    assert not folder.exists()
+
+
+def test_tables_of_an_earlier_run_are_pointed_out(tmp_path, sample_log):
+    (tmp_path / "position_old.csv").write_text("time_s\n")
+    assert "position_old.csv" in extract(sample_log, "-o", tmp_path).output.splitlines()[-1]
+    path = make_log().write(tmp_path / "made.ulg")
+    assert "truth.csv" in extract(path, "-o", tmp_path).output.splitlines()[-1]
+
+
+# ---- Parquet ----------------------------------------------------------------------------------
+
+
+def test_parquet_holds_the_same_tables(tmp_path, sample_log, sample_flight):
+    pytest.importorskip("pyarrow", reason="Parquet needs the extra px4fuse[parquet]")
+    assert extract(sample_log, "-o", tmp_path, "--format", "parquet").exit_code == 0
+    for name, table in extraction.tables(sample_flight).items():
+        back = pd.read_parquet(tmp_path / f"{name}.parquet")
+        pd.testing.assert_frame_equal(back, table, check_exact=True)
+    assert (tmp_path / "data_dictionary.csv").exists()
+
+
+def test_parquet_without_pyarrow_is_one_line(tmp_path, monkeypatch, capsys, sample_log):
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    folder = tmp_path / "tables"
+    code, out, err = run_main(
+        monkeypatch, capsys, "extract", sample_log, "-o", folder, "--format", "parquet"
+    )
+    assert (code, out, len(err.splitlines())) == (2, "", 1)
+    assert 'pip install "px4fuse[parquet]"' in err
+    assert not folder.exists()
+
+
+# ---- the lesson by hand -----------------------------------------------------------------------
+
+
+def test_the_lesson_by_hand_is_what_compare_does(
+    tmp_path, monkeypatch, capsys, sample_log, sample_flight
+):
+    """The README's ten lines round every measurement to the DT grid; else they are our filter."""
+    monkeypatch.chdir(tmp_path)
+    assert extract(sample_log, "-o", "reports/tables").exit_code == 0
+    exec(compile(LESSON, "README.md", "exec"), {})
+    printed = np.array(
+        [
+            [float(number) for number in re.findall(r"-?\d+\.\d+", line)]
+            for line in capsys.readouterr().out.splitlines()
+        ]
+    )
+    time, position, velocity, gain = printed.T
+    (north,) = compare(sample_flight, Settings(), axes=("north",), start_s=0.0).axes
+    # both settled, and off the ground
+    inside = (time > 5.0) & (time < 125.0)
+    ours = state_at(north.replay, time[inside])
+    moved = np.abs(ours[1]).max() * 0.1  # how far the vehicle gets in the 0.1 s of rounding
+    assert np.abs(position[inside] - ours[0]).max() < 2.0 * moved
+    assert np.sqrt(np.mean((velocity[inside] - ours[1]) ** 2)) < 0.1
+    settled = north.replay.updates["gain_position"].loc[20.0:120.0].median()
+    assert np.median(gain[inside]) == pytest.approx(settled, rel=0.1)
+
+
+def test_acceleration_of_a_level_vehicle_at_rest_is_zero(tmp_path):
+    table = extraction.tables(read_log(make_log().write(tmp_path / "made.ulg")))["acceleration_ned"]
+    np.testing.assert_allclose(table.iloc[:, 1:], 0.0, atol=1e-6)
+    attitude = extraction.tables(read_log(tmp_path / "made.ulg"))["attitude"]
+    assert attitude.columns.tolist() == ["time_s", *QUATERNION_COLUMNS]
+
+
+@pytest.mark.reallogs
+def test_every_log_is_extracted(shared_logs):
+    for path in sorted(shared_logs.glob("real/*.ulg")):
+        flight = read_log(path)
+        tables = extraction.tables(flight)
+        dictionary = extraction.data_dictionary(flight)
+        assert len(dictionary) == sum(len(table.columns) for table in tables.values()), path.name
+        for name, table in tables.items():
+            if "time_s" in table:
+                assert table.columns[0] == "time_s"
+                assert np.isfinite(table["time_s"]).all(), (path.name, name)
+        for part in extraction.absent(flight):
+            assert isinstance(part, Unavailable)

@@ -1,0 +1,403 @@
+"""What ``px4fuse info`` says of logs that are whole, poor, damaged or not flights at all."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from flights import Estimator, Uwb, aisle_flight
+from test_cli import run_main
+from ulog_tools import Log, load, make_log, odometry, stamps, take, topic
+
+from px4fuse.cli import cli
+from px4fuse.comparison import compare
+from px4fuse.errors import Px4FuseError
+from px4fuse.flight import ClockMap, Dropout, Flight, Sender, Unavailable
+from px4fuse.inventory import Ability, Inventory, Source, take_inventory, to_plain
+from px4fuse.readers import read_log
+from px4fuse.signals import choose_source
+
+WIDTH = 80
+
+
+def info(*arguments: str | Path) -> str:
+    result = CliRunner().invoke(cli, ["info", *map(str, arguments)])
+    assert result.exit_code == 0, result.output
+    return result.stdout
+
+
+def inventory_of(log: Log, tmp_path: Path) -> Inventory:
+    return take_inventory(read_log(log.write(tmp_path / "made.ulg")))
+
+
+def source(inventory: Inventory, part: str) -> Source:
+    return next(source for source in inventory.sources if source.part == part)
+
+
+def ability(inventory: Inventory, name: str) -> Ability:
+    return next(ability for ability in inventory.abilities if ability.name == name)
+
+
+def remedies(inventory: Inventory) -> list[str]:
+    return [advice.remedy for advice in inventory.advice]
+
+
+def without_position(log: Log) -> Log:
+    return log.drop(*(n for n in log.names() if "_ev_" in n or n == "vehicle_visual_odometry"))
+
+
+# ---- the sample log ---------------------------------------------------------------------------
+
+
+def test_it_fits_the_screen_and_is_plain_in_a_pipe(sample_log):
+    text = info(sample_log)
+    assert max(map(len, text.splitlines())) <= WIDTH
+    assert len(text.splitlines()) <= 50
+    assert "\x1b" not in text
+    assert "…" not in text
+    assert "position ->   vehicle_visual_odometry" in text
+
+
+def test_it_says_what_the_log_is(sample_log, sample_flight):
+    text = info(sample_log)
+    for words in ("PX4 v1.16.1", "3.3 MB", sample_flight.log.sha256[:12], "129.7 s", "no UTC"):
+        assert words in text
+
+
+def test_every_row_says_what_the_flight_holds(sample_flight):
+    inventory = take_inventory(sample_flight)
+    ekf2 = sample_flight.ekf2
+    frames = {
+        "IMU": sample_flight.imu,
+        "attitude": sample_flight.attitude,
+        "EKF2 state": ekf2.state,
+        "EKF2 variance": ekf2.variance,
+        "innovations": ekf2.innovations["north"],
+        "fusion flags": ekf2.fusing,
+        "truth": sample_flight.truth.samples,
+    }
+    for part, frame in frames.items():
+        row = source(inventory, part)
+        assert (row.samples, row.start_s, row.end_s) == (
+            len(frame), frame.index[0], frame.index[-1],
+        )  # fmt: skip
+        assert row.log == "aisle_uwb.ulg"
+        assert row.topics[0] == row.name
+        assert row.clock.startswith("autopilot boot clock")
+    positions = [row for row in inventory.sources if row.part == "position"]
+    assert [row.name for row in positions] == [track.name for track in sample_flight.positions]
+    assert [row.chosen for row in positions] == [True, False, False]
+    assert positions[0].rate_hz == pytest.approx(5.0, abs=0.01)
+    assert source(inventory, "land detector").start_s == sample_flight.airborne[0][0]
+
+
+def test_everything_is_possible_with_the_sample(sample_flight):
+    assert all(ability.possible for ability in take_inventory(sample_flight).abilities)
+
+
+def test_abilities_are_what_compare_then_does(sample_flight):
+    """The counts are of the very samples that compare uses."""
+    inventory = take_inventory(sample_flight)
+    comparison = compare(sample_flight)
+    assert inventory.segment == comparison.segment
+    said = ability(inventory, "EKF2 innovations").reason
+    for axis in comparison.axes:
+        if not isinstance(axis.ekf2_innovations, Unavailable):
+            assert f"{axis.axis.name} {len(axis.ekf2_innovations)}" in said
+    assert f"{len(comparison.axes[0].ekf2_state)} samples" in ability(
+        inventory, "EKF2 states"
+    ).reason  # fmt: skip
+
+
+def test_both_new_commands_have_help():
+    for command in ("info", "extract"):
+        result = CliRunner().invoke(cli, [command, "--help"])
+        assert result.exit_code == 0
+        assert "Usage:" in result.output
+
+
+# ---- JSON -------------------------------------------------------------------------------------
+
+
+def strict(text: str) -> dict:
+    def refuse(constant):
+        raise AssertionError(f"{constant} in JSON")
+
+    return json.loads(text, parse_constant=refuse)
+
+
+def test_json_is_alone_on_standard_output(sample_log, sample_flight):
+    found = strict(info(sample_log, "--json", "-"))
+    assert found["schema"] == {"name": "px4fuse-info", "version": "1.0"}
+    assert found["log"]["sha256"] == sample_flight.log.sha256
+    assert found["log"]["parameters"]["SDLOG_PROFILE"] == 129
+    (chosen,) = [row["name"] for row in found["sources"] if row.get("chosen")]
+    assert chosen == choose_source(sample_flight)[0].name
+    assert "start_utc" not in found, "what is not known is absent"
+
+
+def test_json_file_is_the_same_object(sample_log, tmp_path):
+    target = tmp_path / "new" / "info.json"
+    text = info(sample_log, "--json", target)
+    assert "What px4fuse can do" in text
+    assert target.read_text(encoding="utf-8") == info(sample_log, "--json", "-")
+
+
+def test_json_that_cannot_be_written_is_one_line(tmp_path, monkeypatch, capsys, sample_log):
+    code, out, err = run_main(monkeypatch, capsys, "info", sample_log, "--json", tmp_path)
+    assert (code, out, len(err.splitlines())) == (2, "", 1)
+
+
+@pytest.mark.parametrize("content", [b"", b"no log", b"ULog\x01\x12\x35" + bytes(40)])
+def test_what_is_no_log_is_one_line(tmp_path, monkeypatch, capsys, content):
+    path = tmp_path / "bad.ulg"
+    path.write_bytes(content)
+    code, out, err = run_main(monkeypatch, capsys, "info", path)
+    assert (code, out, len(err.splitlines())) == (2, "", 1)
+
+
+# ---- logs that lack something -----------------------------------------------------------------
+
+
+def test_a_log_of_other_topics_is_described_all_the_same(tmp_path):
+    at = stamps(2.0, 10.0)
+    log = Log([topic("battery_status", at, {"voltage_v": np.full(len(at), 16.0)})])
+    path = log.write(tmp_path / "battery.ulg")
+    inventory = take_inventory(read_log(path))
+    assert all(row.unavailable for row in inventory.sources)
+    assert not any(ability.possible for ability in inventory.abilities)
+    assert inventory.log.duration_s == pytest.approx(1.9)
+    assert "battery_status" in info(path)
+    assert "SDLOG_PROFILE to 129" in remedies(inventory)[0]
+
+
+def test_no_imu(tmp_path):
+    inventory = inventory_of(make_log().drop("sensor_combined"), tmp_path)
+    assert "sensor_combined" in source(inventory, "IMU").unavailable
+    assert not ability(inventory, "acceleration").possible
+    assert ability(inventory, "compare").possible
+    assert ability(inventory, "EKF2 innovations").possible
+    assert "Record with SDLOG_PROFILE bit 0 (default)." in remedies(inventory)
+
+
+def test_no_ekf2(tmp_path):
+    inventory = inventory_of(make_log().drop("vehicle_local_position"), tmp_path)
+    for name in ("EKF2 states", "EKF2 variances", "EKF2 innovations"):
+        assert ability(inventory, name) == Ability(name, False, "no topic vehicle_local_position")
+    assert ability(inventory, "compare").possible
+
+
+def test_no_position(tmp_path):
+    inventory = inventory_of(without_position(make_log()), tmp_path)
+    assert not ability(inventory, "compare").possible
+    assert ability(inventory, "acceleration").possible
+    assert "VISION_POSITION_ESTIMATE" in remedies(inventory)[0]
+    assert source(inventory, "position").unavailable.startswith("no external position")
+
+
+def test_one_remedy_for_many_parts_is_said_once(tmp_path):
+    log = make_log()
+    names = ("sensor_combined", "vehicle_attitude", "vehicle_local_position")
+    inventory = inventory_of(log.drop(*names), tmp_path)
+    (shared,) = [a for a in inventory.advice if a.remedy.endswith("bit 0 (default).")]
+    assert shared.improves == ("IMU", "attitude", "EKF2")
+    assert len(set(remedies(inventory))) == len(remedies(inventory))
+
+
+@pytest.mark.parametrize(("profile", "wanted"), [(1, 129), (3, 131)])
+def test_a_source_that_was_not_logged_names_the_profile_that_logs_it(tmp_path, profile, wanted):
+    log = make_log().drop("vehicle_visual_odometry")
+    log.parameters["SDLOG_PROFILE"] = profile
+    inventory = inventory_of(log, tmp_path)
+    assert remedies(inventory)[0].startswith(f"Set SDLOG_PROFILE to {wanted} (it is {profile})")
+    assert source(inventory, "position").name == "estimator_aid_src_ev_pos"
+
+
+def test_slow_topics_name_the_line_that_logs_them(tmp_path):
+    log = make_log(imu_hz=20.0)
+    said = remedies(inventory_of(log, tmp_path))
+    assert any('"sensor_combined 0"' in remedy and "20.0 Hz" in remedy for remedy in said)
+    assert not any("vehicle_attitude" in remedy for remedy in said)
+
+
+def test_a_slow_source_is_told_to_be_faster(tmp_path):
+    assert any("10 Hz" in remedy for remedy in remedies(inventory_of(make_log(), tmp_path)))
+
+
+def test_few_of_ekf2s_innovations_name_the_line_that_logs_them(tmp_path):
+    log = make_log(seconds=40.0)
+    at = next(i for i, t in enumerate(log.topics) if t.name == "estimator_aid_src_ev_pos")
+    log.topics[at] = take(log.topics[at], range(0, 200, 3))
+    said = remedies(inventory_of(log, tmp_path))
+    assert any('"estimator_aid_src_ev_pos 0"' in remedy for remedy in said)
+
+
+def test_a_log_that_stands_still_is_described(tmp_path):
+    log = make_log()
+    for name in ("x", "y", "z"):
+        log["vehicle_local_position"][name][:] = 0
+    log["vehicle_visual_odometry"]["position"][:] = 0
+    log["vehicle_land_detected"]["landed"][:] = 1
+    inventory = inventory_of(log, tmp_path)
+    assert inventory.airborne == ()
+    assert ability(inventory, "compare").possible
+    assert "never, by the land detector" in info(tmp_path / "made.ulg")
+
+
+def test_damage_comes_first(sample_log, tmp_path):
+    content = bytearray(sample_log.read_bytes())
+    content[1_500_000:1_504_096] = bytes(4096)
+    path = tmp_path / "damaged.ulg"
+    path.write_bytes(content)
+    inventory = take_inventory(read_log(path))
+    assert "Copy the log" in remedies(inventory)[0]
+    assert "damaged" in info(path)
+
+
+def test_a_segment_that_is_too_short_is_no_comparison(tmp_path):
+    inventory = inventory_of(make_log(seconds=0.6, imu_hz=50.0), tmp_path)
+    possible = ability(inventory, "compare").possible
+    try:
+        compare(read_log(tmp_path / "made.ulg"))
+    except Px4FuseError:
+        assert not possible
+    else:
+        assert possible
+
+
+def test_the_only_reference_is_not_its_own_truth(tmp_path):
+    log = make_log().add(odometry("vehicle_mocap_odometry", 10.0, 16))
+    assert ability(inventory_of(log, tmp_path), "truth").possible
+    flight = read_log(log.drop("vehicle_visual_odometry").write(tmp_path / "made.ulg"))
+    inventory = take_inventory(flight)
+    assert source(inventory, "position").name == "vehicle_mocap_odometry"
+    assert not ability(inventory, "truth").possible
+
+
+# ---- gaps -------------------------------------------------------------------------------------
+
+
+def test_gaps_are_counted_and_the_longest_is_given(tmp_path):
+    log = make_log(seconds=40.0)
+    for name, rate_hz, first_s in (("sensor_combined", 100, 0.0),
+                                   ("vehicle_visual_odometry", 5, 0.1)):  # fmt: skip
+        at = next(i for i, t in enumerate(log.topics) if t.name == name)
+        seconds = first_s + np.arange(len(log.topics[at].fields["timestamp"])) / rate_hz
+        lost = ((seconds > 10.0) & (seconds < 12.0)) | ((seconds > 20.0) & (seconds < 20.5))
+        log.topics[at] = take(log.topics[at], np.flatnonzero(~lost))
+    inventory = inventory_of(log, tmp_path)
+    imu, position = source(inventory, "IMU").gaps, source(inventory, "position").gaps
+    assert (imu.count, imu.limit_s) == (2, pytest.approx(0.1))
+    assert imu.longest_s == pytest.approx(2.0)
+    assert imu.total_s == pytest.approx(2.5)
+    assert (position.count, position.limit_s) == (1, pytest.approx(1.0))
+    assert position.longest_s == pytest.approx(2.0, abs=0.21)
+    assert source(inventory, "attitude").gaps.count == 0
+
+
+# ---- flights of any reader --------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "flight",
+    [
+        aisle_flight(duration_s=20.0),
+        aisle_flight(duration_s=20.0, imu=None),
+        aisle_flight(duration_s=20.0, attitude_hz=None),
+        aisle_flight(duration_s=20.0, ekf2=None),
+        aisle_flight(duration_s=20.0, ekf2=Estimator(variance_logged=False)),
+        aisle_flight(duration_s=20.0, ekf2=Estimator(innovations_logged=False)),
+        aisle_flight(duration_s=20.0, ekf2=Estimator(fusing=None)),
+        aisle_flight(duration_s=20.0, truth=False),
+        aisle_flight(duration_s=20.0, uwb=Uwb(name="vehicle_gps_position", rung=7)),
+        dataclasses.replace(aisle_flight(duration_s=20.0), positions=()),
+    ],
+)
+def test_abilities_follow_the_flight(flight: Flight):
+    """Without streams, as a reader may give it; every no is one of compare's own."""
+    inventory = take_inventory(flight)
+    strict(json.dumps(to_plain(inventory)))
+    try:
+        comparison = compare(flight)
+    except Px4FuseError:
+        assert not ability(inventory, "compare").possible
+        return
+    north = comparison.axes[0]
+    assert ability(inventory, "compare").possible
+    for name, part in (
+        ("acceleration", north.axis.acceleration),
+        ("EKF2 states", north.ekf2_state),
+        ("EKF2 variances", north.ekf2_variance),
+        ("EKF2 innovations", north.ekf2_innovations),
+        ("truth", north.truth),
+    ):
+        assert ability(inventory, name).possible != isinstance(part, Unavailable), name
+
+
+def test_a_recording_names_its_senders_clocks_and_dropouts(monkeypatch, tmp_path, sample_flight):
+    log = dataclasses.replace(
+        sample_flight.log,
+        format="MAVLink tlog",
+        senders=(Sender(1, 1, "PX4 quadrotor", 4321, 0.125, True),
+                 Sender(1, 197, "visual odometry", 99, None, False)),
+        dropouts=(Dropout(3.0, 0.25), Dropout(7.0, 0.5)),
+        start_unix_s=1_700_000_000.0,
+    )  # fmt: skip
+    clock = ClockMap("UNIX time of system 1, component 197", "TIMESYNC", 512, -1.7e9, 2.5, 0.001)
+    flight = dataclasses.replace(sample_flight, log=log, clocks=(clock,))
+    monkeypatch.setattr("px4fuse.readers.read_log", lambda _, **__: flight)
+    text = info(tmp_path / "any.tlog")
+    assert max(map(len, text.splitlines())) <= WIDTH
+    for words in ("1/1", "PX4 quadrotor (this flight)", "12.5%", "unknown", "TIMESYNC",
+                  "2 of the logger", "2023-11-14 22:13:20 UTC", "faster SD card"):  # fmt: skip
+        assert words in text
+
+
+def test_a_clock_beyond_the_calendar_is_no_date(sample_flight):
+    log = dataclasses.replace(sample_flight.log, start_unix_s=1e18)
+    assert take_inventory(dataclasses.replace(sample_flight, log=log)).start_utc is None
+
+
+# ---- every log --------------------------------------------------------------------------------
+
+
+@pytest.mark.reallogs
+def test_every_recording_is_described_or_refused_in_one_line(shared_logs, monkeypatch, capsys):
+    for path in sorted(shared_logs.glob("mavlink/*")):
+        code, out, err = run_main(monkeypatch, capsys, "info", path, "--json", "-")
+        assert code in (0, 2), path.name
+        assert len(err.splitlines()) == code // 2, path.name
+        if code == 0:
+            assert len(strict(out)["abilities"]) == 6, path.name
+
+
+@pytest.mark.reallogs
+def test_every_log_is_described_or_refused_in_one_line(shared_logs, monkeypatch, capsys):
+    paths = sorted([*shared_logs.glob("real/*.ulg"), *shared_logs.glob("simulated/*.ulg")])
+    assert len(paths) > 30
+    for path in paths:
+        code, out, err = run_main(monkeypatch, capsys, "info", path)
+        assert (code, err) == (0, ""), path.name  # all of these are ULogs that hold data
+        assert max(map(len, out.splitlines())) <= WIDTH, path.name
+        inventory = take_inventory(read_log(path))
+        strict(json.dumps(to_plain(inventory)))
+        assert len(inventory.abilities) == 6, path.name
+        assert all(a.reason for a in inventory.abilities), path.name
+        try:
+            choose_source(read_log(path))
+        except Px4FuseError:
+            assert not ability(inventory, "compare").possible, path.name
+            assert any("VISION_POSITION" in a.remedy for a in inventory.advice), path.name
+
+
+def test_leaving_out_any_topic_leaves_an_inventory(sample_log, tmp_path):
+    whole = load(sample_log)
+    short = Log([take(t, range(0, len(t.fields["timestamp"]), 8)) for t in whole.topics])
+    for name in sorted(short.names()):
+        less = Log([t for t in short.topics if t.name != name], whole.parameters, whole.info)
+        text = json.dumps(to_plain(inventory_of(less, tmp_path)))
+        strict(text)

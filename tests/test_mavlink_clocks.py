@@ -1,0 +1,498 @@
+"""Clocks of a recording against closed forms: every made clock is a line of the boot clock."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mavlink_tools import (
+    AUTOPILOT,
+    BOOT_S,
+    COMPANION,
+    GROUND,
+    LEAST_DELAY_S,
+    UNIX_S,
+    Aisle,
+    Recorder,
+    heartbeat,
+    message,
+    ms,
+    ns,
+    same,
+    unix,
+    us,
+)
+
+from px4fuse.errors import SettingsError
+from px4fuse.flight import Flight
+from px4fuse.readers import read_log
+from px4fuse.readers.mavlink_clocks import Exchanges, Line, least_delay, map_clock
+
+NOTHING = np.zeros(0)
+NO_EXCHANGES = Exchanges(NOTHING, NOTHING, NOTHING, NOTHING)
+
+
+@pytest.fixture
+def read(tmp_path):
+    """Write a recording and read it as a flight."""
+
+    def write_and_read(recording, *, stamped: bool = True, system: int | None = None) -> Flight:
+        recorder = recording.record() if isinstance(recording, Aisle) else recording
+        path = tmp_path / "made.tlog"
+        path.write_bytes(recorder.tlog() if stamped else recorder.raw())
+        return read_log(path, system=system)
+
+    return write_and_read
+
+
+def clock_error(flight: Flight, aisle: Aisle, track: int = 0) -> np.ndarray:
+    """Boot time that the reader gives each position, minus the true one (s)."""
+    times = flight.positions[track].samples.index.to_numpy() + flight.log.boot_time_s
+    true = np.array(aisle.times(5.0))
+    assert len(times) == len(true)
+    return times - true
+
+
+def position_is_true(flight: Flight, aisle: Aisle, track: int = 0) -> None:
+    here = np.array([aisle.path(boot)[0] for boot in aisle.times(5.0)])
+    samples = flight.positions[track].samples.to_numpy()
+    np.testing.assert_allclose(samples[:, :3], here, atol=1e-5)
+
+
+# ---- least delay ------------------------------------------------------------------------------
+
+
+@given(
+    offset=st.floats(-1e9, 1e9),
+    drift_ppm=st.floats(-200.0, 200.0),
+    least=st.floats(0.0, 0.5),
+    scale=st.floats(0.0, 0.3),
+    seed=st.integers(0, 2**32 - 1),
+)
+@settings(max_examples=60, deadline=None)
+def test_offset_and_drift_come_back_under_one_sided_delays(offset, drift_ppm, least, scale, seed):
+    """1200 messages in 120 s: the least delayed of each 2 s is late by scale/20 on average."""
+    rng = np.random.default_rng(seed)
+    x = np.arange(1200) * 0.1
+    exact = offset + (1.0 + drift_ppm * 1e-6) * x
+    line = least_delay(x, exact + least + rng.exponential(scale, len(x)))
+    error = line.at(x) - exact - least
+    rounding = 4.0 * np.spacing(abs(offset) + 200.0)
+    assert np.all(error > -0.2 * scale - rounding)
+    assert np.all(error < 0.3 * scale + rounding)
+    assert abs(line.slope - 1.0 - drift_ppm * 1e-6) < scale * 5e-3 + 2e-8 + rounding / 10.0
+
+
+def test_without_delay_the_line_is_exact():
+    x = np.linspace(0.0, 100.0, 500)
+    line = least_delay(x, 7.0 + 1.00005 * x)
+    np.testing.assert_allclose(line.at(x), 7.0 + 1.00005 * x, atol=1e-9)
+    assert line.jitter < 1e-9
+    assert line.pairs == 500
+    np.testing.assert_allclose(line.inverse().at(line.at(x)), x, atol=1e-9)
+
+
+def test_a_short_span_tells_no_drift():
+    x = np.linspace(0.0, 20.0, 200)
+    line = least_delay(x, 3.0 + 1.0002 * x)
+    assert line.slope == 1.0
+    assert abs(line.at(np.array([10.0]))[0] - 3.0 - 10.002) < 0.003
+
+
+@pytest.mark.parametrize("speed", [0.04, 0.5, 10.0])
+@pytest.mark.parametrize("span", [10.0, 100.0])
+def test_a_recording_replayed_at_another_speed_is_mapped(speed, span):
+    x = np.linspace(0.0, span, 600)
+    delay = np.random.default_rng(1).exponential(0.01, len(x))
+    line = least_delay(x, 5.0 + speed * x + delay)
+    assert line.slope == pytest.approx(speed, rel=0.01)
+    assert np.abs(line.at(x) - 5.0 - speed * x).max() < 0.05
+
+
+def test_an_outage_of_the_link_does_not_bend_the_line():
+    """For 10 s messages are queued and arrive together."""
+    x = np.arange(0.0, 100.0, 0.05)
+    received = x + 0.01
+    received[(x > 40.0) & (x < 50.0)] = 50.01
+    line = least_delay(x, received)
+    np.testing.assert_allclose(line.at(x), x + 0.01, atol=1e-6)
+
+
+@given(
+    st.lists(
+        st.tuples(st.floats(-1e13, 1e13), st.floats(-1e13, 1e13)), min_size=1, max_size=60
+    )
+)
+@settings(max_examples=100, deadline=None)
+def test_any_pairs_give_a_line_that_can_be_turned_round(pairs):
+    x, y = np.array(pairs).T
+    line = least_delay(x, y)
+    assert 0.0 < line.slope < np.inf
+    assert np.isfinite([line.x0, line.y0, line.inverse().slope]).all()
+
+
+# ---- which means a clock is mapped by -----------------------------------------------------------
+
+
+def test_replies_alone_are_late_by_the_way_there(read):
+    """The companion replies after the autopilot's question has reached it."""
+    aisle = Aisle(seconds=60.0)
+    flight = read(aisle)
+    [clock] = [c for c in flight.clocks if "component 197" in c.clock]
+    assert clock.method == "TIMESYNC"
+    assert clock.clock.startswith("UNIX time")
+    assert clock.offset_s == pytest.approx(-UNIX_S, abs=2 * LEAST_DELAY_S)
+    assert -1.5 * LEAST_DELAY_S < clock_error(flight, aisle).mean() < 0.0
+    assert np.abs(clock_error(flight, aisle)).max() < 1.5 * LEAST_DELAY_S
+    position_is_true(flight, aisle)
+
+
+def test_questions_alone_are_late_the_other_way(read):
+    aisle = Aisle(seconds=60.0, replies=False, asks=True)
+    flight = read(aisle)
+    assert flight.positions[0].clock_map.method == "TIMESYNC"
+    assert 0.0 < clock_error(flight, aisle).mean() < 1.5 * LEAST_DELAY_S
+
+
+def test_both_directions_cancel_the_way(read):
+    aisle = Aisle(seconds=60.0, replies=True, asks=True)
+    flight = read(aisle)
+    assert flight.positions[0].clock_map.pairs == 1200
+    assert np.abs(clock_error(flight, aisle)).max() < 0.25 * LEAST_DELAY_S
+
+
+@given(
+    offset=st.floats(-1e6, 1e6),
+    drift_ppm=st.floats(-100.0, 100.0),
+    seed=st.integers(0, 1000),
+)
+@settings(max_examples=8, deadline=None)
+def test_offset_and_drift_of_a_companion_come_back(tmp_path_factory, offset, drift_ppm, seed):
+    """A UNIX clock that is wrong by days, and drifts."""
+    aisle = Aisle(
+        seconds=60.0, asks=True, seed=seed, state=None,
+        clock=lambda boot: UNIX_S + offset + boot * (1.0 + drift_ppm * 1e-6),
+    )  # fmt: skip
+    path = tmp_path_factory.mktemp("clock") / "made.tlog"
+    path.write_bytes(aisle.record().tlog())
+    flight = read_log(path)
+    clock = flight.positions[0].clock_map
+    assert np.abs(clock_error(flight, aisle)).max() < LEAST_DELAY_S
+    assert clock.drift_ppm == pytest.approx(-drift_ppm, abs=15.0)
+
+
+def test_timesync_wins_although_the_recorder_and_the_companion_disagree(read):
+    """The ground station's UNIX clock is an hour wrong."""
+    aisle = Aisle(receiver=lambda boot: UNIX_S + 3600.0 + boot)
+    flight = read(aisle)
+    assert flight.positions[0].clock_map.method == "TIMESYNC"
+    assert np.abs(clock_error(flight, aisle)).max() < 1.5 * LEAST_DELAY_S
+
+
+def test_system_time_is_second(read):
+    aisle = Aisle(replies=False, system_time=True)
+    flight = read(aisle)
+    clock = flight.positions[0].clock_map
+    assert clock.method == "SYSTEM_TIME"
+    assert "agree on UNIX time" in clock.note
+    assert np.abs(clock_error(flight, aisle)).max() < 1e-3
+    assert flight.log.start_unix_s == pytest.approx(UNIX_S + BOOT_S, abs=1e-3)
+
+
+def test_system_time_of_a_companion_with_a_wrong_date_is_not_used(read):
+    aisle = Aisle(replies=False, system_time=True, clock=lambda boot: UNIX_S - 86_400.0 + boot)
+    flight = read(aisle)
+    assert flight.positions[0].clock_map.method == "receive time"
+    assert np.abs(clock_error(flight, aisle)).max() < 1.5 * LEAST_DELAY_S
+
+
+def test_the_time_of_receipt_is_last(read):
+    """Both ways have the same least delay, which cancels."""
+    aisle = Aisle(replies=False, seconds=60.0)
+    flight = read(aisle)
+    clock = flight.positions[0].clock_map
+    assert clock.method == "receive time"
+    assert "least delay" in clock.note
+    assert np.abs(clock_error(flight, aisle)).max() < 1.5e-3
+
+
+def test_a_boot_clock_needs_no_mapping(read):
+    aisle = Aisle(clock=same, replies=False)
+    flight = read(aisle)
+    track = flight.positions[0]
+    assert track.clock_map.method == "boot clock"
+    assert track.clock_map.offset_s == 0.0
+    assert np.abs(clock_error(flight, aisle)).max() < 1e-6
+
+
+def test_boot_clock_stamps_stay_although_the_companion_syncs_its_unix_clock(read):
+    """The companion converts its stamps to the autopilot's clock by itself."""
+    aisle = Aisle(clock=unix, asks=True)
+    recorder = aisle.record()
+    converted = replace(aisle, clock=same, replies=False, asks=False).record()
+    names = ("VISION_POSITION_ESTIMATE",)
+    recorder.sent = [s for s in recorder.sent if s[2].get_type() not in names]
+    recorder.sent += [s for s in converted.sent if s[2].get_type() in names]
+    flight = read(recorder)
+    assert flight.positions[0].clock_map.method == "boot clock"
+    assert np.abs(clock_error(flight, aisle)).max() < 1e-6
+
+
+def test_a_clock_that_started_seconds_after_the_autopilots_is_another_clock(read):
+    """A companion's monotonic clock reads 3 s less; TIMESYNC knows."""
+    aisle = Aisle(clock=lambda boot: boot - 3.0, asks=True)
+    flight = read(aisle)
+    clock = flight.positions[0].clock_map
+    assert clock.method == "TIMESYNC"
+    assert clock.clock.startswith("own clock")
+    assert clock.offset_s == pytest.approx(3.0, abs=LEAST_DELAY_S)
+    assert np.abs(clock_error(flight, aisle)).max() < LEAST_DELAY_S
+
+
+def test_an_own_clock_hours_away_is_mapped_by_receipt(read):
+    aisle = Aisle(clock=lambda boot: boot + 7200.0, replies=False)
+    flight = read(aisle)
+    clock = flight.positions[0].clock_map
+    assert (clock.method, clock.clock[:9]) == ("receive time", "own clock")
+    assert np.abs(clock_error(flight, aisle)).max() < 1.5 * LEAST_DELAY_S
+
+
+@pytest.mark.parametrize("asks", [False, True])
+def test_stamps_of_two_values_do_not_tell_the_time(read, asks):
+    """A running TIMESYNC does not make them better."""
+    aisle = Aisle()
+    recorder = replace(aisle, uwb=None, asks=asks).record()
+    rng = np.random.default_rng(1)
+    for i, boot in enumerate(aisle.times(5.0)):
+        made = message(
+            "VISION_POSITION_ESTIMATE", usec=us(UNIX_S) + (i >= 100), x=float(i), covariance=[0] * 21
+        )
+        recorder.hear(unix(boot + aisle.delay(rng)), COMPANION, made)
+    flight = read(recorder)
+    track = flight.positions[0]
+    assert track.clock_map.distinct_stamps == 2
+    assert track.clock_map.method == "receive time"
+    assert "2 values" in track.clock_map.note
+    assert np.abs(clock_error(flight, aisle)).max() < 0.02
+    # of an exponential delay of 2 ms
+    assert 0.5e-3 < track.clock_map.jitter_s < 4e-3
+
+
+def test_two_companions_do_not_answer_for_each_other(read):
+    """Both ask; the autopilot's answers are told apart by what was asked."""
+    first = Aisle(asks=True, replies=False)
+    second = replace(first, clock=lambda boot: unix(boot) + 2.0, seed=2, state=None)
+    recorder = first.record()
+    other = second.record()
+    recorder.sent += [
+        (received, (1, 198) if sender == COMPANION else sender, made, link)
+        for received, sender, made, link in other.sent
+        if sender == COMPANION or made.get_type() == "TIMESYNC"
+    ]
+    flight = read(recorder)
+    assert [t.name for t in flight.positions] == [
+        "VISION_POSITION_ESTIMATE_1_197", "VISION_POSITION_ESTIMATE_1_198",
+    ]  # fmt: skip
+    for number, aisle in enumerate((first, second)):
+        assert flight.positions[number].clock_map.method == "TIMESYNC"
+        assert np.abs(clock_error(flight, aisle, number)).max() < 1.5 * LEAST_DELAY_S
+
+
+def test_a_ground_stations_exchanges_do_not_disturb(read):
+    """QGroundControl asks too, with its own clock, and replies to the autopilot."""
+    aisle = Aisle(asks=True)
+    recorder = aisle.record()
+    for boot in aisle.times(10.0):
+        wrong = unix(boot) - 5.0
+        recorder.hear(unix(boot), GROUND, message("TIMESYNC", tc1=ns(wrong), ts1=ns(boot)))
+        recorder.hear(unix(boot), GROUND, message("TIMESYNC", ts1=ns(wrong)))
+        reply = message("TIMESYNC", tc1=ns(boot + 0.004), ts1=ns(wrong))
+        recorder.hear(unix(boot), AUTOPILOT, reply)
+    flight = read(recorder)
+    assert np.abs(clock_error(flight, aisle)).max() < LEAST_DELAY_S
+
+
+def test_a_raw_stream_is_mapped_by_timesync_and_by_order(read):
+    for replies, method, allowed in (
+        (True, "TIMESYNC", 1.5 * LEAST_DELAY_S),
+        (False, "position in the stream", 0.1),
+    ):
+        aisle = Aisle(replies=replies)
+        flight = read(aisle, stamped=False)
+        assert flight.log.format == "MAVLink stream"
+        assert flight.positions[0].clock_map.method == method
+        assert np.abs(clock_error(flight, aisle)).max() < allowed
+        assert [c.clock for c in flight.clocks] == ["UNIX time of system 1, component 197"]
+
+
+def test_two_valued_stamps_in_a_raw_stream_go_by_their_place(read):
+    aisle = Aisle(clock=lambda boot: UNIX_S, replies=False)
+    flight = read(aisle, stamped=False)
+    track = flight.positions[0]
+    assert track.clock_map.method == "position in the stream"
+    times = track.samples.index.to_numpy() + flight.log.boot_time_s
+    for boot in times:
+        assert np.abs(np.array(aisle.times(5.0)) - boot).min() < 0.1
+
+
+def test_a_recording_without_a_boot_clock_counts_from_its_first_receipt(read):
+    """Only the companion's way to the autopilot was recorded."""
+    aisle = Aisle(replies=False)
+    recorder = aisle.record()
+    recorder.sent = [s for s in recorder.sent if s[1] == COMPANION]
+    flight = read(recorder)
+    assert flight.log.boot_time_s == 0.0
+    assert flight.log.duration_s == pytest.approx(aisle.seconds, abs=0.5)
+    times = flight.positions[0].samples.index.to_numpy()
+    assert len(times) >= 199
+    np.testing.assert_allclose(np.diff(times), 0.2, atol=1e-3)
+
+
+# ---- restarts, late packets, several vehicles ---------------------------------------------------
+
+
+def test_after_a_restart_only_the_longer_part_is_read(read):
+    first = Aisle(seconds=20.0, start_s=500.0)
+    second = Aisle(seconds=60.0, start_s=3.0, receiver=lambda boot: UNIX_S + 520.0 + boot,
+                   clock=lambda boot: UNIX_S + 520.0 + boot, seed=2)  # fmt: skip
+    recorder = second.record(first.record())
+    flight = read(recorder)
+    assert flight.log.boot_time_s == pytest.approx(3.0, abs=0.1)
+    assert flight.log.duration_s == pytest.approx(60.0, abs=0.1)
+    [note] = [note for note in flight.log.notes if "restart" in note]
+    assert "went back 1 time" in note
+    assert "part 2 of 2" in note
+    assert np.abs(clock_error(flight, second)).max() < 1.5 * LEAST_DELAY_S
+    position_is_true(flight, second)
+    assert flight.airborne[0] == pytest.approx((15.0, 45.0), abs=0.1)
+
+
+def test_a_late_packet_is_no_restart(read):
+    """Ten seconds late, for example out of a router's queue."""
+    aisle = Aisle(seconds=40.0)
+    recorder = aisle.record()
+    for boot in (60.0, 70.0):
+        late = message("ATTITUDE_QUATERNION", time_boot_ms=ms(boot), q1=1.0)
+        recorder.hear(unix(boot + 10.0), AUTOPILOT, late)
+    flight = read(recorder)
+    assert not [note for note in flight.log.notes if "restart" in note]
+    assert flight.log.duration_s == pytest.approx(40.0, abs=0.1)
+    assert len(flight.attitude) == 800
+
+
+def test_one_stamp_far_ahead_costs_one_sample(read):
+    aisle = Aisle()
+    recorder = aisle.record()
+    ahead = message("ATTITUDE_QUATERNION", time_boot_ms=900_000_000, q1=1.0)
+    recorder.hear(unix(70.0), AUTOPILOT, ahead)
+    flight = read(recorder)
+    assert flight.log.duration_s == pytest.approx(40.0, abs=0.1)
+    assert len(flight.attitude) == 800
+    assert not [note for note in flight.log.notes if "restart" in note]
+
+
+def test_a_position_stamped_years_ahead_is_dropped(read):
+    aisle = Aisle()
+    recorder = aisle.record()
+    end = BOOT_S + aisle.seconds
+    for year in (1, 2, 3):
+        at = us(unix(end)) + year * 31_557_600_000_000
+        made = message("VISION_POSITION_ESTIMATE", usec=at, covariance=[0] * 21)
+        recorder.hear(unix(end + 0.1 * year), COMPANION, made)
+    flight = read(recorder)
+    assert np.abs(clock_error(flight, aisle)).max() < 1.5 * LEAST_DELAY_S
+    [note] = [note for note in flight.log.notes if "VISION_POSITION_ESTIMATE" in note]
+    assert note.startswith("3 samples")
+
+
+def test_several_vehicles_are_told_apart(read):
+    busy = Aisle(seconds=30.0, system=3)
+    other = Aisle(seconds=20.0, system=7, start_s=900.0, clock=lambda boot: unix(boot) - 850.0,
+                  receiver=lambda boot: unix(boot) - 850.0, seed=2)  # fmt: skip
+    recorder = other.record(busy.record())
+    for system, aisle in ((None, busy), (3, busy), (7, other)):
+        flight = read(recorder, system=system)
+        [track] = flight.positions
+        assert track.name == "VISION_POSITION_ESTIMATE"
+        assert f"system {aisle.system})" in flight.log.hardware
+        assert flight.log.boot_time_s == pytest.approx(aisle.start_s, abs=0.1)
+        assert np.abs(clock_error(flight, aisle)).max() < 1.5 * LEAST_DELAY_S
+        [chosen] = [s for s in flight.log.senders if s.chosen]
+        assert (chosen.system, chosen.component) == (aisle.system, 1)
+    for system in (5, 255):
+        with pytest.raises(SettingsError, match=r"autopilots in the file: 3, 7\."):
+            read(recorder, system=system)
+
+
+def test_the_fortieth_vehicle_of_a_swarm_can_be_asked_for(read):
+    recorder = Recorder()
+    for system in range(1, 41):
+        Aisle(seconds=2.0 + (system < 40), system=system, state=None).record(recorder)
+    flight = read(recorder, system=40)
+    assert "system 40)" in flight.log.hardware
+    assert flight.log.duration_s == pytest.approx(2.0, abs=0.1)
+    assert len(flight.log.senders) == 32
+
+
+def test_senders_and_what_they_lost_are_described(read):
+    """Every tenth heartbeat of the companion is not in the file."""
+    aisle = Aisle(seconds=60.0)
+    recorder = aisle.record()
+    for boot in aisle.times(1.0):
+        recorder.hear(unix(boot), GROUND, heartbeat(kind=6, autopilot=8))
+    frames = recorder.frames()
+    companion = 0
+    content = []
+    for received, _, made in frames:
+        is_companion = made[5:7] == bytes(COMPANION)
+        companion += is_companion
+        if is_companion and companion % 10 == 5:
+            continue
+        content.append(received.to_bytes(8, "big") + made)
+    path = read.__closure__[0].cell_contents / "lossy.tlog"
+    path.write_bytes(b"".join(content))
+    flight = read_log(path)
+    described = {(s.system, s.component): s for s in flight.log.senders}
+    assert described[AUTOPILOT].description == "PX4 quadrotor"
+    assert described[COMPANION].description == "companion computer"
+    assert described[GROUND].description == "ground station"
+    assert described[COMPANION].lost_share == pytest.approx(0.1, abs=0.005)
+    assert described[AUTOPILOT].lost_share == 0.0
+
+
+# ---- the map itself -----------------------------------------------------------------------------
+
+
+def test_a_timesync_of_another_clock_is_passed_over():
+    """It would put messages an hour before their receipt."""
+    stamps = UNIX_S + np.arange(0.0, 60.0, 0.2)
+    received = np.arange(0.0, 60.0, 0.2) + 0.01
+    asked = np.arange(0.0, 60.0, 0.1)
+    wrong = Exchanges(UNIX_S + 3600.0 + asked, asked, NOTHING, NOTHING)
+    mapped = map_clock(
+        "x", stamps, received, Line(0.0, 0.0, 1.0, 0.0, 9), wrong, None, has_receipt=True
+    )
+    assert mapped.statement.method == "receive time"
+    assert mapped.to_boot is not None
+    np.testing.assert_allclose(mapped.to_boot.at(stamps), received, atol=1e-6)
+
+
+def test_the_statement_says_what_the_map_does():
+    """boot = stamp + offset + drift · (stamp - middle of the stamps)."""
+    stamps = UNIX_S + np.arange(0.0, 100.0, 0.1)
+    received = 20.0 + 1.0001 * np.arange(0.0, 100.0, 0.1)
+    mapped = map_clock(
+        "x", stamps, received, Line(0.0, 0.0, 1.0, 0.0, 9), NO_EXCHANGES, None, has_receipt=True
+    )
+    statement, line = mapped.statement, mapped.to_boot
+    assert line is not None
+    assert statement.drift_ppm == pytest.approx(100.0, abs=0.1)
+    middle = 0.5 * (stamps[0] + stamps[-1])
+    by_statement = (
+        stamps + statement.offset_s + statement.drift_ppm * 1e-6 * (stamps - middle)
+    )
+    np.testing.assert_allclose(by_statement, line.at(stamps), atol=2e-6)
+    np.testing.assert_allclose(by_statement, received, atol=2e-6)

@@ -1,0 +1,513 @@
+"""Frames and columns against pymavlink's own reader, and frames among every kind of damage."""
+
+from __future__ import annotations
+
+import tracemalloc
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import SHARED_LOGS
+from fastcrc.crc16 import mcrf4xx
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mavlink_tools import (
+    AUTOPILOT,
+    COMPANION,
+    MESSAGES,
+    Heard,
+    Recorder,
+    frame,
+    heard_by_pymavlink,
+    heartbeat,
+    message,
+    odometry,
+    raw_frame,
+    stamp,
+)
+
+from px4fuse.errors import LogError
+from px4fuse.readers import mavlink_frames, read_log
+from px4fuse.readers.mavlink_frames import Frames, message_name, read_frames
+
+START_US = 1_700_000_000_000_000
+# good frames that pymavlink steps over after bad bytes, because it trusts a false length there
+BEYOND_PYMAVLINK = {
+    "ArduPilot_UAVLogViewer_hist_7092460c_flight_logs.tlog": 5,
+    "mbiuki_Phoenix_mission1.rlog": 17,
+}
+# "unknown" messages that pymavlink makes of such bytes
+FALSE_UNKNOWN = {
+    "ArduPilot_UAVLogViewer_hist_7092460c_flight_logs.tlog": 3,
+    "mbiuki_Phoenix_mission1.rlog": 1,
+}
+PARSABLE = [
+    path
+    for path in sorted((SHARED_LOGS / "mavlink").glob("*"))
+    if path.suffix in (".tlog", ".rlog", ".raw")
+]
+ATTITUDE = message("ATTITUDE", time_boot_ms=1000, roll=0.1, pitch=-0.2, yaw=1.5)
+MANY_BYTES = 5_000_000
+# What one frame may cost beside its bytes: offsets, header fields, time of receipt, and what is
+# made of them on the way
+FRAME_BYTES = 150
+TINY_BYTES = 1_000_000
+# What a block of the scan may cost, if every byte of it could begin a frame
+BLOCK_BYTES = 15_000_000
+# What 65,536 senders may cost
+SENDER_BYTES = 10_000_000
+
+
+@pytest.fixture
+def read(tmp_path):
+    """Write bytes and read their frames."""
+
+    def write_and_read(content: bytes) -> Frames:
+        path = tmp_path / "made.tlog"
+        path.write_bytes(content)
+        return read_frames(path)
+
+    return write_and_read
+
+
+def names(frames: Frames) -> list[str]:
+    return [message_name(number) for number in frames.message_id.tolist()]
+
+
+def stamped(*contents: bytes) -> bytes:
+    """A tlog with one frame in each millisecond."""
+    return b"".join(stamp(START_US + 1000 * i) + part for i, part in enumerate(contents))
+
+
+def beats(count: int, sender: tuple[int, int] = AUTOPILOT) -> list[bytes]:
+    return [frame(heartbeat(), sender, number) for number in range(count)]
+
+
+def decoded(frames: Frames, name: str) -> np.ndarray:
+    return frames.table(name, frames.rows(name))
+
+
+# ---- against pymavlink ------------------------------------------------------------------------
+
+
+def same_values(kind, name: str, table: np.ndarray, heard: list[Heard]) -> None:
+    """Every field of one message type, as pymavlink decoded it."""
+    types = dict(zip(kind.fieldnames, kind.fieldtypes, strict=True))
+    for field in kind.fieldnames:
+        theirs = [one.fields[field] for one in heard]
+        mine = table[field]
+        if types[field] == "char":
+            # pymavlink cuts a text at its first zero, numpy only at the end
+            texts = [value.split(b"\0")[0].decode(errors="replace") for value in mine.tolist()]
+            assert [value.split("\0")[0] for value in theirs] == texts, (name, field)
+            continue
+        assert mine.shape == np.shape(theirs), (name, field)
+        expected = np.array(theirs, dtype=mine.dtype)
+        np.testing.assert_array_equal(mine, expected, err_msg=f"{name}.{field}")
+
+
+def agrees(path: Path) -> None:
+    with_stamps = path.suffix == ".tlog"
+    heard, unknown = heard_by_pymavlink(path, stamped=with_stamps)
+    frames = read_frames(path)
+    at = {start: row for row, start in enumerate(frames.start.tolist())}
+    count = 0
+    for name, all_heard in heard.items():
+        rows = np.array([at[one.start] for one in all_heard], dtype=np.intp)
+        assert set(names(frames)[row] for row in rows[:1]) == {name}
+        assert (frames.message_id[rows] == MESSAGES[name].id).all()
+        same_values(MESSAGES[name], name, frames.table(name, rows), all_heard)
+        senders = np.column_stack([frames.system[rows], frames.component[rows]])
+        np.testing.assert_array_equal(senders, [one.sender for one in all_heard])
+        np.testing.assert_array_equal(frames.sequence[rows], [one.sequence for one in all_heard])
+        if with_stamps:
+            assert frames.received_us is not None
+            received = [one.received_us for one in all_heard]
+            np.testing.assert_array_equal(frames.received_us[rows], received)
+        count += len(rows)
+    assert (frames.received_us is not None) == with_stamps
+    assert len(frames) - count == BEYOND_PYMAVLINK.get(path.name, 0)
+    assert sum(frames.unknown.values()) == unknown - FALSE_UNKNOWN.get(path.name, 0)
+    if path.name not in BEYOND_PYMAVLINK:
+        assert sum(map(len, heard.values())) == len(frames)
+
+
+def test_the_sample_tlog_is_read_as_pymavlink_reads_it(sample_log):
+    agrees(sample_log.with_suffix(".tlog"))
+
+
+@pytest.mark.reallogs
+@pytest.mark.parametrize("path", PARSABLE, ids=lambda path: path.name)
+def test_real_recordings_are_read_as_pymavlink_reads_them(path):
+    agrees(path)
+
+
+@pytest.mark.reallogs
+@pytest.mark.parametrize("name", sorted(BEYOND_PYMAVLINK))
+def test_what_pymavlink_lost_follows_bad_bytes_and_is_good(shared_logs, name):
+    """Checksums are recomputed here; chance would make less than one in such a file."""
+    path = shared_logs / "mavlink" / name
+    heard, _ = heard_by_pymavlink(path, stamped=path.suffix == ".tlog")
+    theirs = {one.start for ones in heard.values() for one in ones}
+    frames = read_frames(path)
+    gap = 8 if path.suffix == ".tlog" else 0
+    ends = frames.payload_start + frames.payload_length + 2
+    previous = np.concatenate([[0], ends[:-1]])
+    lost = [row for row, start in enumerate(frames.start.tolist()) if start not in theirs]
+    assert len(lost) == BEYOND_PYMAVLINK[name]
+    # each is after bad bytes, or after one that was lost too
+    damaged = set(np.flatnonzero(frames.start - gap != previous).tolist())
+    for row in lost:
+        assert row in damaged or row - 1 in lost or row + 1 in damaged
+        begin, end = int(frames.start[row]), int(ends[row])
+        seed = MESSAGES[message_name(int(frames.message_id[row]))].crc_extra
+        body = frames.content[begin + 1 : end - 2] + bytes([seed])
+        assert mcrf4xx(body) == int.from_bytes(frames.content[end - 2 : end], "little")
+
+
+def test_reading_with_pymavlink_leaves_its_globals_alone(sample_log, tmp_path):
+    """Or every later test would depend on this one."""
+    import os
+
+    from pymavlink import mavutil
+
+    before = (mavutil.mavlink, mavutil.current_dialect, os.environ.get("MAVLINK20"))
+    path = tmp_path / "one.tlog"
+    path.write_bytes(stamped(frame(ATTITUDE)))
+    heard, _ = heard_by_pymavlink(path, stamped=True)
+    assert list(heard) == ["ATTITUDE"]
+    assert (mavutil.mavlink, mavutil.current_dialect, os.environ.get("MAVLINK20")) == before
+
+
+def example(kind) -> object:
+    """A message with another value in every field and array element."""
+    fields = {}
+    lengths = dict(zip(kind.ordered_fieldnames, kind.array_lengths, strict=True))
+    for number, (key, wire) in enumerate(zip(kind.fieldnames, kind.fieldtypes, strict=True)):
+        length = lengths[key]
+        if wire == "char":
+            fields[key] = b"text%d"[: length or 1] % number if length > 5 else b"t"
+        elif length:
+            fields[key] = [(number + 3 * i) % 100 + 1 for i in range(length)]
+        else:
+            fields[key] = number + 1
+    return message(kind.msgname, **fields)
+
+
+def test_every_message_of_the_dialect_survives_the_way_there_and_back(read):
+    """Layouts are from pymavlink's tables; the bytes are from its packers."""
+    kinds = [kind for _, kind in sorted(MESSAGES.items())]
+    made = [example(kind) for kind in kinds]
+    frames = read(stamped(*(frame(one, sequence=i % 256) for i, one in enumerate(made))))
+    assert names(frames) == [kind.msgname for kind in kinds]
+    for kind, one in zip(kinds, made, strict=True):
+        fields = {
+            key: value.decode() if isinstance(value, bytes) else value
+            for key, value in ((key, getattr(one, key)) for key in kind.fieldnames)
+        }
+        heard = [Heard(0, 0, AUTOPILOT, 0, fields)]
+        same_values(kind, kind.msgname, decoded(frames, kind.msgname), heard)
+
+
+# ---- the wire format --------------------------------------------------------------------------
+
+
+def test_zeros_that_mavlink_2_cuts_off_are_put_back(read):
+    whole = message("PARAM_VALUE", param_id=b"EKF2_EV_DELAY", param_value=3.5, param_type=9)
+    short = message("ATTITUDE", time_boot_ms=7)
+    frames = read(stamped(frame(short), frame(whole, sequence=1), frame(ATTITUDE, sequence=2)))
+    assert frames.payload_length.tolist()[0] == 1  # of 28
+    table = decoded(frames, "ATTITUDE")
+    assert table["time_boot_ms"].tolist() == [7, 1000]
+    np.testing.assert_array_equal(table["yaw"], np.float32([0.0, 1.5]))
+    assert decoded(frames, "PARAM_VALUE")["param_id"].tolist() == [b"EKF2_EV_DELAY"]
+
+
+def test_signed_frames_are_read_and_their_signature_is_no_bad_byte(read):
+    key = bytes(range(32))
+    contents = [frame(heartbeat(), sequence=i, key=key if i % 2 else None) for i in range(10)]
+    assert len(contents[1]) == len(contents[0]) + 13
+    frames = read(stamped(*contents))
+    assert len(frames) == 10
+    assert frames.bad_bytes == 0
+    assert frames.sequence.tolist() == list(range(10))
+
+
+def test_a_payload_longer_than_the_dialect_knows_is_cut(read):
+    """A later dialect adds extension fields at the end."""
+    payload = bytes(ATTITUDE.unpacker.pack(1000, 0.1, -0.2, 1.5, 0.0, 0.0, 0.0)) + b"\x07" * 20
+    longer = raw_frame(30, payload, seed=ATTITUDE.crc_extra)
+    frames = read(stamped(frame(ATTITUDE), longer))
+    assert frames.payload_length.tolist() == [16, 48]
+    table = decoded(frames, "ATTITUDE")
+    assert table[0] == table[1]
+
+
+def test_unknown_ids_are_counted_and_cost_nothing_else(read):
+    unknown = [raw_frame(40_000, bytes([i] * 40), seed=1, sequence=i) for i in range(3)]
+    signed = raw_frame(70_000, b"\x01", seed=1, flags=1)
+    old = raw_frame(207, b"\x01\x02", seed=1, v1=True)
+    parts = [*beats(3), *unknown, *beats(3), signed, *beats(2), old, *beats(2)]
+    for content in (stamped(*parts), b"".join(parts)):
+        frames = read(content)
+        assert len(frames) == 10
+        assert dict(frames.unknown) == {40_000: 3, 70_000: 1, 207: 1}
+        assert frames.bad_bytes == 0
+
+
+def test_a_bad_checksum_costs_its_own_frame(read):
+    parts = beats(10)
+    parts[4] = parts[4][:-1] + bytes([parts[4][-1] ^ 1])
+    frames = read(stamped(*parts))
+    assert frames.sequence.tolist() == [0, 1, 2, 3, 5, 6, 7, 8, 9]
+    assert frames.bad_bytes == len(parts[4]) + 8
+
+
+@pytest.mark.parametrize("junk", [b"\x00" * 50, b"\xfd" * 50, b"\xfe" * 300, bytes(range(256))])
+def test_junk_between_frames_costs_itself(read, junk):
+    parts = beats(6)
+    frames = read(b"".join(parts[:3]) + junk + b"".join(parts[3:]))
+    assert frames.sequence.tolist() == list(range(6))
+    assert frames.bad_bytes == len(junk)
+
+
+def test_junk_in_a_tlog_costs_itself(read):
+    parts = [stamp(START_US + i) + part for i, part in enumerate(beats(6))]
+    frames = read(b"".join(parts[:3]) + b"\xfd junk \xfe" + b"".join(parts[3:]))
+    assert frames.sequence.tolist() == list(range(6))
+    assert frames.received_us is not None
+    assert frames.received_us.tolist() == [START_US + i for i in range(6)]
+
+
+@pytest.mark.parametrize("with_stamps", [True, False])
+def test_a_frame_inside_a_payload_is_payload(read, with_stamps):
+    """A tunnel carries whole frames, even ones that end where the outer one's checksum begins."""
+    inner = frame(message("VISION_POSITION_ESTIMATE", usec=1, x=1.0), COMPANION)
+    payload = list(inner.ljust(128, b"\x01"))
+    outer = message("TUNNEL", payload_length=len(inner), payload=payload)
+    filled = message("TUNNEL", payload_length=128, payload=list((b"\x01" * 128 + inner)[-128:]))
+    parts = [*beats(2), frame(outer), *beats(2), frame(filled), *beats(2)]
+    frames = read(stamped(*parts) if with_stamps else b"".join(parts))
+    assert Counter(names(frames)) == {"HEARTBEAT": 6, "TUNNEL": 2}
+    assert frames.bad_bytes == 0
+    carried = decoded(frames, "TUNNEL")["payload"][0]
+    assert bytes(carried[: len(inner)]) == inner
+
+
+def test_a_frame_inside_an_unknown_message_is_payload(read):
+    inner = frame(ATTITUDE)
+    unknown = raw_frame(40_000, b"ab" + inner + b"cd", seed=1)
+    frames = read(stamped(*beats(2), unknown, *beats(2)))
+    assert names(frames) == ["HEARTBEAT"] * 4
+    assert dict(frames.unknown) == {40_000: 1}
+
+
+def test_the_first_and_the_last_frame_may_be_cut(read):
+    parts = beats(5)
+    whole = b"".join(parts)
+    for cut in (1, 5, len(parts[0]) - 1):
+        frames = read(whole[cut : len(whole) - cut])
+        assert frames.sequence.tolist() == [1, 2, 3]
+        assert frames.bad_bytes == 2 * (len(parts[0]) - cut)
+    tlog = stamped(*parts)
+    for cut in (3, 8, 12):
+        frames = read(tlog[cut : len(tlog) - cut])
+        expected = [0, 1, 2, 3] if cut <= 8 else [1, 2, 3]
+        assert frames.sequence.tolist() == expected
+        assert frames.received_us is not None
+        assert (np.diff(frames.received_us[1:]) == 1000).all()
+
+
+def test_mavlink_1_and_2_may_be_mixed(read):
+    parts = [frame(ATTITUDE, sequence=i, v1=bool(i % 3)) for i in range(30)]
+    for content in (stamped(*parts), b"".join(parts)):
+        frames = read(content)
+        assert frames.sequence.tolist() == list(range(30))
+        assert len(np.unique(decoded(frames, "ATTITUDE"))) == 1
+        assert set(frames.payload_length.tolist()) == {28, 16}
+
+
+def test_damaged_stamps_are_interpolated(read):
+    parts = beats(9)
+    times = [START_US + 1000 * i for i in range(9)]
+    for at, wrong in ((2, 0), (3, 2**64 - 1), (6, START_US + 10**12)):
+        times[at] = wrong
+    content = b"".join(stamp(us) + part for us, part in zip(times, parts, strict=True))
+    frames = read(content)
+    assert frames.bad_stamps == 3
+    assert frames.received_us is not None
+    assert frames.received_us.tolist() == [START_US + 1000 * i for i in range(9)]
+
+
+def test_stamps_that_are_all_damaged_are_all_counted(read):
+    frames = read(b"".join(b"\xff" * 8 + part for part in beats(5)))
+    assert frames.bad_stamps == 5
+    assert frames.received_us is not None
+    assert frames.received_us.shape == (5,)
+
+
+def test_link_numbers_are_in_the_stamps_lowest_bits(read):
+    recorder = Recorder()
+    for i in range(8):
+        recorder.hear(START_US * 1e-6 + i, AUTOPILOT, heartbeat(), link=i % 3)
+    frames = read(recorder.tlog())
+    assert frames.link.tolist() == [i % 3 for i in range(8)]
+
+
+@pytest.mark.parametrize("with_stamps", [True, False])
+def test_one_message_is_a_recording(read, with_stamps):
+    content = frame(odometry(5_000_000, [1, 2, 3], [0, 0, 0], estimator=8))
+    frames = read(stamped(content) if with_stamps else content)
+    assert len(frames) == 1
+    assert (frames.received_us is not None) == with_stamps
+    assert frames.bad_bytes == 0
+
+
+@pytest.mark.reallogs
+def test_the_recording_of_one_message_is_read(shared_logs):
+    path = shared_logs / "mavlink" / "ArduPilot_pymavlink_capture.mav2.battery_status.tlog"
+    assert names(read_frames(path)) == ["BATTERY_STATUS"]
+    assert read_log(path).positions == ()
+
+
+@given(st.lists(st.sampled_from(["v1", "v2", "signed", "unknown", "bad", "junk"]), min_size=1))
+@settings(max_examples=60, deadline=None)
+def test_any_mixture_gives_back_its_good_frames(tmp_path_factory, kinds):
+    """The number of good frames is known; junk here holds no byte that could begin a frame."""
+    good = 3
+    parts = [*beats(3)]
+    for i, kind in enumerate(kinds):
+        made = frame(ATTITUDE, sequence=i % 256, v1=kind == "v1", key=bytes(32) if kind == "signed"
+                     else None)  # fmt: skip
+        if kind == "unknown":
+            made = raw_frame(40_001, bytes(i % 200), seed=3)
+        elif kind == "bad":
+            made = made[:-1] + bytes([made[-1] ^ 0xFF])
+        elif kind == "junk":
+            made = bytes(i % 40)
+        good += kind in ("v1", "v2", "signed")
+        parts += [made, *beats(1)]
+        good += 1
+    path = tmp_path_factory.mktemp("mixture") / "made.raw"
+    path.write_bytes(b"".join(parts))
+    frames = read_frames(path)
+    assert len(frames) == good
+    assert sum(frames.unknown.values()) <= kinds.count("unknown")
+
+
+# ---- what is no MAVLink, and what it costs ------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("zeros", bytes(MANY_BYTES)),
+        ("MAVLink 2 starts", b"\xfd" * MANY_BYTES),
+        ("MAVLink 1 starts", b"\xfe" * (MANY_BYTES // 5)),
+        ("headers of long frames", (b"\xfd\xff\x00" + b"\xfd" * 7) * (MANY_BYTES // 10)),
+        ("chance", np.random.default_rng(1).bytes(MANY_BYTES)),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_what_is_no_mavlink_is_refused_in_bounded_memory(tmp_path, name, content):
+    path = tmp_path / "hostile.tlog"
+    path.write_bytes(content)
+    tracemalloc.start()
+    with pytest.raises(LogError, match="MAVLink"):
+        read_log(path)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 4 * len(content) + BLOCK_BYTES, name
+
+
+def test_an_empty_file_is_refused(tmp_path):
+    path = tmp_path / "empty.tlog"
+    path.write_bytes(b"")
+    with pytest.raises(LogError, match="empty"):
+        read_log(path)
+
+
+@pytest.mark.reallogs
+@pytest.mark.parametrize(
+    ("name", "reason"),
+    [
+        ("ArduPilot_pymavlink_capture.mavlink", "0 frames with a good checksum"),
+        ("ArduPilot_pymavlink_test.BIN", "DataFlash"),
+    ],
+)
+def test_foreign_files_are_refused(shared_logs, name, reason):
+    with pytest.raises(LogError, match=reason):
+        read_log(shared_logs / "mavlink" / name)
+
+
+def test_the_scan_reads_no_byte_more_than_a_frames_length_for_each_start(tmp_path, monkeypatch):
+    """Bytes summed are at most 267 for each byte of the file: a bound without a clock."""
+    summed = 0
+
+    def counting(part, *start):
+        nonlocal summed
+        summed += len(part)
+        return mcrf4xx(part, *start)
+
+    content = b"\xfe" * 200_000
+    path = tmp_path / "hostile.tlog"
+    path.write_bytes(content)
+    monkeypatch.setattr(mavlink_frames, "mcrf4xx", counting)
+    with pytest.raises(LogError):
+        read_frames(path)
+    assert 200 * len(content) < summed < 280 * len(content)
+
+
+def short_frames(rng: np.random.Generator, total: int, ids: list[int], *, v1: bool) -> bytes:
+    """Frames with the least payload there is, from random senders."""
+    seeds = {kind.id: kind.crc_extra for kind in MESSAGES.values()}
+    out, size = [], 0
+    while size < total:
+        sender = tuple(rng.integers(0, 256, 2).tolist())
+        number = ids[len(out) % len(ids)]
+        made = raw_frame(number, b"", seed=seeds[number], sender=sender,
+                         sequence=len(out) % 256, v1=v1)  # fmt: skip
+        out.append(made)
+        size += len(made)
+    return b"".join(out)
+
+
+@pytest.mark.parametrize(
+    ("ids", "v1"),
+    [([0], True), ([0], False), ([0, 102, 331, 111], False), (sorted(
+        kind.id for kind in MESSAGES.values() if kind.id < 60_000), False)],
+    ids=["shortest", "heartbeats", "positions", "all"],
+)  # fmt: skip
+def test_shortest_frames_of_random_senders_cost_a_bounded_amount_each(tmp_path, ids, v1):
+    content = short_frames(np.random.default_rng(1), 600_000, ids, v1=v1)
+    path = tmp_path / "hostile.raw"
+    path.write_bytes(content)
+    read_log(path)  # tables that are made once
+    tracemalloc.start()
+    flight = read_log(path)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert len(flight.log.senders) == 32
+    frames = read_frames(path)
+    assert peak < len(content) + FRAME_BYTES * len(frames) + SENDER_BYTES
+
+
+@pytest.mark.reallogs
+@pytest.mark.parametrize("path", PARSABLE, ids=lambda path: path.name)
+def test_real_recordings_take_less_than_four_times_their_size(path):
+    memory_is_bounded(path)
+
+
+def test_the_sample_takes_less_than_four_times_its_size(sample_log):
+    memory_is_bounded(sample_log.with_suffix(".tlog"))
+
+
+def memory_is_bounded(path: Path) -> None:
+    read_log(path)  # tables that are made once
+    tracemalloc.start()
+    read_log(path)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    size = path.stat().st_size
+    assert peak < 4 * size + (TINY_BYTES if size < 500_000 else 0)

@@ -1,0 +1,955 @@
+"""An external position log in whatever dialect: the same samples, or one line of explanation."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import io
+from collections.abc import Callable
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from conftest import REPOSITORY
+from hypothesis import HealthCheck, Phase, example, given, settings
+from hypothesis import strategies as st
+
+from px4fuse.errors import LogError, Px4FuseError, SettingsError
+from px4fuse.readers import position_csv
+from px4fuse.readers.position_csv import (
+    LENGTH_UNITS,
+    SAMPLE_COLUMNS,
+    TIME_UNITS,
+    PositionFile,
+    read_position_csv,
+)
+
+EXTERNAL = REPOSITORY / "sample_logs" / "aisle_uwb_external.csv"
+SHARED_UWB = REPOSITORY.parent / "shared" / "uwb"
+AXES = ["x_m", "y_m", "z_m"]
+
+# The one track that every dialect below is written from: 5 Hz with jitter, 0.1 mm, 1 µs
+ROWS = 60
+RANDOM = np.random.default_rng(20261121)
+TIME_US = 200_000 * np.arange(ROWS) + RANDOM.integers(-40_000, 40_000, ROWS)
+TIME_US += 50_000 - TIME_US[0]
+UNIX_US = 1_795_253_650_000_000
+TRACK_M = np.column_stack(
+    [
+        np.linspace(-3.2, 9.1, ROWS) + RANDOM.normal(0, 0.1, ROWS),
+        4.0 * np.sin(np.arange(ROWS) / 9.0) + RANDOM.normal(0, 0.1, ROWS),
+        1.5 + RANDOM.normal(0, 0.1, ROWS),
+    ]
+).round(4)
+SIGMA_M = RANDOM.uniform(0.05, 0.3, ROWS).round(3)
+QUALITY = RANDOM.integers(40, 100, ROWS)
+
+
+def fixed(values: np.ndarray, decimals: int) -> list[str]:
+    return [f"{value:.{decimals}f}" for value in values]
+
+
+def exact(ticks: np.ndarray, decimals: int) -> list[str]:
+    """Integers divided by a power of ten, in full."""
+    if not decimals:
+        return [str(tick) for tick in ticks]
+    return [f"{tick // 10**decimals}.{tick % 10**decimals:0{decimals}d}" for tick in ticks.tolist()]
+
+
+UNIX_S = exact(UNIX_US + TIME_US, 6)
+X, Y, Z = (fixed(axis, 4) for axis in TRACK_M.T)
+PLAIN = {"time": UNIX_S, "x": X, "y": Y, "z": Z}
+
+
+def table(
+    columns: dict[str, list[str]],
+    *,
+    separator: str = ",",
+    decimal: str = ".",
+    header: bool = True,
+    end: str = "\n",
+    trailing: str = "",
+    quote: str = "",
+) -> str:
+    """Write columns as a vendor would."""
+    lines = [list(columns)] if header else []
+    lines += [
+        [field.replace(".", decimal) for field in row]
+        for row in zip(*columns.values(), strict=True)
+    ]
+    return "".join(
+        separator.join(f"{quote}{field}{quote}" for field in line) + trailing + end
+        for line in lines
+    )
+
+
+@pytest.fixture
+def read(tmp_path: Path) -> Callable[..., PositionFile]:
+    """Write text or bytes to a file and read it."""
+
+    def read_(content: str | bytes, **options) -> PositionFile:
+        path = tmp_path / "uwb.csv"
+        path.write_bytes(content if isinstance(content, bytes) else content.encode())
+        return read_position_csv(path, **options)
+
+    return read_
+
+
+def refused(read: Callable[..., PositionFile], content: str | bytes, **options) -> str:
+    """The one line with which a file is refused."""
+    with pytest.raises(Px4FuseError) as caught:
+        read(content, **options)
+    assert isinstance(caught.value, LogError)
+    assert_one_line(caught.value)
+    return str(caught.value)
+
+
+def assert_one_line(error: Px4FuseError) -> None:
+    assert len(str(error).splitlines()) == 1, str(error)
+    assert str(error).endswith(".")
+
+
+def assert_track(file: PositionFile, *, start_us: int = UNIX_US, axes=(0, 1, 2), rows=slice(None)):
+    """The samples are the track that was written."""
+    assert list(file.samples.columns) == SAMPLE_COLUMNS
+    assert file.samples.index.name == "time_s"
+    assert (file.samples.dtypes == np.float64).all()
+    truth_us = (start_us + TIME_US)[rows]
+    read_us = file.samples.index.to_numpy() * 1e6
+    np.testing.assert_allclose(read_us - start_us, truth_us - start_us, rtol=0, atol=0.5)
+    track = TRACK_M[rows][:, axes]
+    np.testing.assert_allclose(file.samples[AXES].to_numpy(), track, rtol=0, atol=1e-9)
+
+
+def said(file: PositionFile, *words: str) -> None:
+    """One of the sentences has all of these words."""
+    sentences = (*file.detected, *file.notes)
+    assert any(all(word in sentence for word in words) for sentence in sentences), sentences
+
+
+# -- the text --------------------------------------------------------------------------------------
+
+PREAMBLE = "UWB Studio 4.2 export\nSite: Hall 3; Operator: A, B\n\nAnchors: 8\n"
+DIALECTS: dict[str, str | bytes] = {
+    "comma": table(PLAIN),
+    "comma and blank": table(PLAIN, separator=", "),
+    "semicolon": table(PLAIN, separator=";"),
+    "semicolon, decimal comma": table(PLAIN, separator=";", decimal=","),
+    "tab": table(PLAIN, separator="\t"),
+    "tab, decimal comma": table(PLAIN, separator="\t", decimal=","),
+    "space": table(PLAIN, separator=" "),
+    "several spaces": table(PLAIN, separator="   "),
+    "leading spaces": "".join(
+        "  " + line for line in table(PLAIN, separator="  ").splitlines(True)
+    ),
+    "space, decimal comma": table(PLAIN, separator=" ", decimal=","),
+    "quotes": table(PLAIN, quote='"'),
+    "quotes, decimal comma": table(PLAIN, quote='"', decimal=","),
+    "single quotes": table(PLAIN, quote="'"),
+    "byte order mark": b"\xef\xbb\xbf" + table(PLAIN).encode(),
+    "UTF-16": table(PLAIN, separator="\t").encode("utf-16"),
+    "Latin-1": table({"t [µs]": exact(UNIX_US + TIME_US, 0), "x": X, "y": Y, "z": Z}).encode(
+        "latin-1"
+    ),
+    "CRLF": table(PLAIN, end="\r\n"),
+    "CR": table(PLAIN, end="\r"),
+    "trailing separators": table(PLAIN, trailing=",,"),
+    "trailing semicolon": table(PLAIN, separator=";", decimal=",", trailing=";"),
+    "blank lines": "\n\n" + table(PLAIN, end="\n\n") + "\n  \n",
+    "lines of separators": table(PLAIN) + ",,,\n,,,\n",
+    "comments": "# made by uwbd\n% v2\n" + table(PLAIN).replace("\n", "\n# note, 1, 2, 3\n", 5),
+    "preamble": PREAMBLE + table(PLAIN),
+    "anchors before the header": "A0,0.0,0.0,2.5\nA1,9.0,0.0,2.5\n" + table(PLAIN),
+    "no header": table(PLAIN, header=False),
+    "no header, decimal comma": table(PLAIN, header=False, separator=";", decimal=","),
+    "preamble, no header": PREAMBLE + table(PLAIN, header=False),
+    "comment header": "# " + table(PLAIN),
+    "numpy.savetxt": "# time, x, y, z\n" + table(PLAIN, header=False, separator=" "),
+    "units in a line of their own": table(PLAIN).replace("\n", "\ns,m,m,m\n", 1),
+    "header again": table(PLAIN).replace(UNIX_S[30], f"time,x,y,z\n{UNIX_S[30]}"),
+    "no line feed at the end": table(PLAIN).rstrip("\n"),
+    "NULs after a power cut": table(PLAIN).encode() + bytes(300),
+    "DOS end of file": table(PLAIN).encode() + b"\x1a",
+    "header only names what is used": table({"id": ["7"] * ROWS, **PLAIN, "note": ["ok"] * ROWS}),
+    "columns without a name": table({"": [str(i) for i in range(ROWS)], **PLAIN}),
+}
+
+
+@pytest.mark.parametrize("dialect", DIALECTS)
+def test_every_dialect_gives_the_same_samples(read, dialect):
+    file = read(DIALECTS[dialect])
+    assert_track(file)
+    assert file.clock == "UNIX"
+    assert file.frame is None
+    assert file.samples[SAMPLE_COLUMNS[3:]].isna().all(axis=None)
+
+
+@pytest.mark.parametrize(
+    ("dialect", "words"),
+    [
+        ("tab, decimal comma", ("tab", "decimal comma", "header in line 1")),
+        ("preamble", ("comma between", "decimal point", "header in line 5")),
+        ("preamble", ("3 lines before the table",)),
+        ("no header", ("no header",)),
+        ("no header", ("position: column 2, column 3, column 4 as x, y, z",)),
+        ("header again", ("the header stands 1 more times",)),
+        ("UTF-16", ("utf-16",)),
+    ],
+)
+def test_says_what_the_text_is(read, dialect, words):
+    said(read(DIALECTS[dialect]), *words)
+
+
+def test_plain_format_needs_no_note(read):
+    file = read(DIALECTS["comma"])
+    assert file.notes == ()
+    assert len(file.detected) == 5
+    content = str(DIALECTS["comma"]).encode()
+    assert (file.name, file.size_bytes) == ("uwb.csv", len(content))
+    assert file.sha256 == hashlib.sha256(content).hexdigest()
+
+
+# -- time ------------------------------------------------------------------------------------------
+
+LOCAL_US = 5_000_000  # five seconds after the UWB computer started
+TIMES: dict[str, tuple[str, list[str], int, str]] = {
+    # name, texts, start in µs, clock
+    "UNIX s": ("time", UNIX_S, UNIX_US, "UNIX"),
+    "UNIX ms": ("time", exact(UNIX_US + TIME_US, 3), UNIX_US, "UNIX"),
+    "UNIX us": ("time", exact(UNIX_US + TIME_US, 0), UNIX_US, "UNIX"),
+    "UNIX ns": ("time", exact(1000 * (UNIX_US + TIME_US), 0), UNIX_US, "UNIX"),
+    "UNIX s, exponent": ("t", [f"{float(t):.15e}" for t in UNIX_S], UNIX_US, "UNIX"),
+    "timestamp_s": ("timestamp_s", UNIX_S, UNIX_US, "UNIX"),
+    "time_ms": ("time_ms", exact(UNIX_US + TIME_US, 3), UNIX_US, "UNIX"),
+    "t [us]": ("t [us]", exact(UNIX_US + TIME_US, 0), UNIX_US, "UNIX"),
+    "t (µs)": ("t (µs)", exact(UNIX_US + TIME_US, 0), UNIX_US, "UNIX"),
+    "Timestamp(ns)": ("Timestamp(ns)", exact(1000 * (UNIX_US + TIME_US), 0), UNIX_US, "UNIX"),
+    "unix_time": ("unix_time", UNIX_S, UNIX_US, "UNIX"),
+    "header_stamp": ("header_stamp", UNIX_S, UNIX_US, "UNIX"),
+    "bag_time": ("bag_time", UNIX_S, UNIX_US, "UNIX"),
+    "field.header.stamp": (
+        "field.header.stamp", exact(1000 * (UNIX_US + TIME_US), 0), UNIX_US, "UNIX",
+    ),
+    "TimeStamp": ("TimeStamp", UNIX_S, UNIX_US, "UNIX"),
+    "timeMs": ("timeMs", exact(LOCAL_US + TIME_US, 3), LOCAL_US, "local"),
+    "local s": ("time", exact(TIME_US, 6), 0, "local"),
+    "local ms": ("time", exact(LOCAL_US + TIME_US, 3), LOCAL_US, "local"),
+    "local us": ("time", exact(TIME_US, 0), 0, "local"),
+    "local ns": ("time", exact(1000 * TIME_US, 0), 0, "local"),
+    "local us, magnitude of UNIX s": (
+        "time", exact(1_795_253_650 + TIME_US, 0), 1_795_253_650, "local",
+    ),
+    "local ns, magnitude of UNIX ms": (
+        "time", exact(1000 * (1_795_253_650 + TIME_US), 0), 1_795_253_650, "local",
+    ),
+    "local us by name": ("time_us", exact(1_795_253_650 + TIME_US, 0), 1_795_253_650, "local"),
+    "before zero": ("time", fixed((TIME_US - 5_000_000) / 1e6, 6), -5_000_000, "local"),
+    "wrong unit in the name": ("time_s", exact(UNIX_US + TIME_US, 3), UNIX_US, "UNIX"),
+    "millis": ("millis", exact(LOCAL_US + TIME_US, 3), LOCAL_US, "local"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", TIMES)
+def test_units_and_clocks_of_time(read, case):
+    name, texts, start_us, clock = TIMES[case]
+    file = read(table({name: texts, "x": X, "y": Y, "z": Z}))
+    assert_track(file, start_us=start_us)
+    assert file.clock == clock
+
+
+@pytest.mark.parametrize(
+    ("case", "words"),
+    [
+        ("timestamp_s", ("'timestamp_s'", "UNIX clock", "s from its name")),
+        ("UNIX ms", ("ms from its magnitude",)),
+        ("local us", ("local clock", "us from its interval of 0.")),
+        ("wrong unit in the name", ("ms from its magnitude", "its name says s, which cannot be")),
+    ],
+)
+def test_says_why_the_unit_of_time(read, case, words):
+    name, texts, _, _ = TIMES[case]
+    said(read(table({name: texts, "x": X, "y": Y, "z": Z})), "time: ", *words)
+
+
+def iso(zone: str = "Z", separator: str = "T", date: str = "-", shift_h: int = 0) -> list[str]:
+    start = datetime(1970, 1, 1, tzinfo=UTC) + timedelta(hours=shift_h)
+    moments = [start + timedelta(microseconds=UNIX_US + int(us)) for us in TIME_US]
+    return [
+        moment.strftime(f"%Y{date}%m{date}%d{separator}%H:%M:%S.%f{zone}") for moment in moments
+    ]
+
+
+@pytest.mark.parametrize(
+    ("texts", "words"),
+    [
+        (iso(), "ISO 8601 text"),
+        (iso(zone="+01:00", shift_h=1), "ISO 8601 text"),
+        (iso(zone=""), "no zone, taken as UTC"),
+        (iso(zone="", separator=" "), "no zone, taken as UTC"),
+        (iso(zone="", separator=" ", date="/"), "no zone, taken as UTC"),
+    ],
+)
+@pytest.mark.parametrize("header", [True, False])
+def test_iso_time(read, texts, words, header):
+    file = read(table({"Timestamp": texts, "x": X, "y": Y, "z": Z}, header=header))
+    assert_track(file)
+    assert file.clock == "UNIX"
+    said(file, words)
+
+
+def test_nineteen_digits_keep_their_microseconds(read):
+    stamps = [1_795_253_650_123_456_789 + 1000 * i for i in range(5)]
+    rows = "".join(f"{stamp},{i},0.5,1.5\n" for i, stamp in enumerate(stamps))
+    file = read("t_ns,x,y,z\n" + rows)
+    assert file.samples.index.tolist() == [stamp / 10**9 for stamp in stamps]
+    assert np.diff(file.samples.index) == pytest.approx(1e-6, abs=5e-7)
+
+
+def test_an_ambiguous_interval_is_taken_as_seconds(read):
+    file = read(table({"t": [str(5 * i) for i in range(ROWS)], "x": X, "y": Y, "z": Z}))
+    assert file.samples.index[1] == 5.0
+    said(file, "ms would do as well", "--position-time-unit")
+
+
+@pytest.mark.parametrize("rate", [0.2, 200])
+def test_the_bounds_of_the_rate_are_within_them(read, rate):
+    stamps = [str(round(1e9 * (0.98 * i / rate + 1795253650))) for i in range(ROWS)]
+    file = read(table({"t": stamps, "x": X, "y": Y, "z": Z}))
+    assert np.diff(file.samples.index) == pytest.approx(0.98 / rate, abs=1e-6)
+    assert file.notes == ()
+
+
+@pytest.mark.parametrize("step", ["0.0001", "1e7"])
+def test_a_rate_that_no_unit_explains_is_doubted(read, step):
+    texts = [f"{float(step) * i:.6f}" for i in range(ROWS)]
+    file = read(table({"time_s": texts, "x": X, "y": Y, "z": Z}))
+    said(file, "is no rate of a UWB", "--position-time-unit")
+    assert file.samples.index[-1] == pytest.approx(float(texts[-1]))
+
+
+@pytest.mark.parametrize("unit", TIME_UNITS)
+def test_time_unit_option_wins(read, unit):
+    texts = [str(10 * i) for i in range(ROWS)]
+    file = read(table({"time_us": texts, "x": X, "y": Y, "z": Z}), time_unit=unit)
+    assert file.samples.index[1] == pytest.approx(10 * TIME_UNITS[unit])
+    said(file, f"{unit} as --position-time-unit says")
+
+
+LATER_S = exact(UNIX_US + TIME_US + 30_000, 6)
+SPLIT = {
+    "secs": [text[:10] for text in UNIX_S],
+    "nsecs": [str(int(text[11:]) * 1000) for text in UNIX_S],
+}
+
+
+@pytest.mark.parametrize(
+    ("columns", "words"),
+    [
+        ({"bag_time": LATER_S, "header_stamp": UNIX_S}, ("(not used: 'bag_time')",)),
+        ({"header_stamp": UNIX_S, "bag_time": LATER_S}, ("'header_stamp'", "of measurement")),
+        ({"bag_time": UNIX_S, "header_stamp": [""] * ROWS}, ("('header_stamp' is empty)",)),
+        ({"bag_time": UNIX_S, "header_stamp": ["0.0"] * ROWS}, ("('header_stamp' is empty)",)),
+        ({"recv_time": LATER_S, "time": UNIX_S}, ("(not used: 'recv_time')",)),
+        (
+            {"%time": exact(1000 * (UNIX_US + TIME_US) + 9, 0),
+             "field.header.seq": ["1"] * ROWS,
+             "field.header.stamp": exact(1000 * (UNIX_US + TIME_US), 0),
+             "field.header.frame_id": ["map"] * ROWS},
+            ("'field.header.stamp', the time of measurement",),
+        ),
+        (
+            {"Time": LATER_S, "header.stamp.secs": SPLIT["secs"],
+             "header.stamp.nsecs": SPLIT["nsecs"]},
+            ("'header.stamp.secs', 'header.stamp.nsecs' together",),
+        ),
+    ],
+)  # fmt: skip
+def test_measurement_time_wins_over_recording_time(read, columns, words):
+    file = read(table({**columns, "x": X, "y": Y, "z": Z}))
+    assert_track(file)
+    said(file, "time: ", *words)
+
+
+# -- position --------------------------------------------------------------------------------------
+
+MM, CM = (
+    [fixed(axis * scale, 1 if scale == 1000 else 2) for axis in TRACK_M.T] for scale in (1e3, 1e2)
+)
+JUNK = ["0.1"] * ROWS
+POSITIONS: dict[str, tuple[dict[str, list[str]], str | None]] = {
+    "x_m": ({"x_m": X, "y_m": Y, "z_m": Z}, None),
+    "X": ({"X": X, "Y": Y, "Z": Z}, None),
+    "pos_x": ({"pos_x": X, "pos_y": Y, "pos_z": Z}, None),
+    "posX": ({"posX": X, "posY": Y, "posZ": Z}, None),
+    "position.x": ({"position.x": X, "position.y": Y, "position.z": Z}, None),
+    "x_pos": ({"x_pos": X, "y_pos": Y, "z_pos": Z}, None),
+    "tum": ({"tx": X, "ty": Y, "tz": Z, "qx": JUNK, "qy": JUNK, "qz": JUNK, "qw": JUNK}, None),
+    "rosbag": ({"v0": X, "v1": Y, "v2": Z, "v3": JUNK}, None),
+    "rostopic echo": (
+        {f"field.pose.orientation.{axis}": JUNK for axis in "xyzw"}
+        | {"field.pose.position.x": X, "field.pose.position.y": Y, "field.pose.position.z": Z},
+        None,
+    ),
+    "velocity first": ({"vx": JUNK, "vel_y": JUNK, "x": X, "y": Y, "z": Z, "acc_x": JUNK}, None),
+    "other order": ({"z": Z, "y": Y, "x": X}, None),
+    "anchors": ({"anchor1_x": JUNK, "anchor1_y": JUNK, "x": X, "y": Y, "z": Z}, None),
+    "two tracks": (
+        {"raw_x": X, "filtered_x": JUNK, "filtered_y": JUNK, "raw_y": Y, "raw_z": Z}, None,
+    ),
+    "height": ({"x": X, "y": Y, "height": Z}, None),
+    "X [mm]": ({"X [mm]": MM[0], "Y [mm]": MM[1], "Z [mm]": MM[2]}, None),
+    "x(cm)": ({"x(cm)": CM[0], "y(cm)": CM[1], "z(cm)": CM[2]}, None),
+    "x_mm": ({"x_mm": MM[0], "y_mm": MM[1], "z_mm": MM[2]}, None),
+    "mixed units": ({"x_m": X, "y_m": Y, "z_cm": CM[2]}, None),
+    "mm unsaid": ({"x": MM[0], "y": MM[1], "z": MM[2]}, None),
+    "north_m": ({"north_m": X, "east_m": Y, "down_m": Z}, "ned"),
+    "N,E,D": ({"N": X, "E": Y, "D": Z}, "ned"),
+    "D,E,N": ({"D": Z, "E": Y, "N": X}, "ned"),
+    "E,N,U": ({"E": X, "N": Y, "U": Z}, "enu"),
+    "up, north, east": ({"up [mm]": MM[2], "north [mm]": MM[1], "east [mm]": MM[0]}, "enu"),
+    "pos_north": ({"pos_east": X, "pos_north": Y, "altitude_m": JUNK, "pos_up": Z}, "enu"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("separator", [",", " "])
+@pytest.mark.parametrize("case", POSITIONS)
+def test_names_units_and_frames_of_position(read, case, separator):
+    columns, frame = POSITIONS[case]
+    file = read(table({"time": UNIX_S, **columns}, separator=separator))
+    assert_track(file)
+    assert file.frame == frame
+
+
+@pytest.mark.parametrize(
+    ("case", "words"),
+    [
+        ("E,N,U", ("'E', 'N', 'U' as ENU",)),
+        ("up, north, east", ("'east [mm]', 'north [mm]', 'up [mm]' as ENU, in mm (from the n",)),
+        ("mm unsaid", ("mm", "m is no indoor flight", "--position-unit")),
+        ("x_m", ("in m (from the names), nine tenths of it within 11.",)),
+        ("two tracks", ("'raw_x', 'raw_y', 'raw_z'", "not used: 'filtered_x', 'filtered_y'")),
+    ],
+)  # fmt: skip
+def test_says_which_position(read, case, words):
+    said(read(table({"time": UNIX_S, **POSITIONS[case][0]})), "position: ", *words)
+
+
+@pytest.mark.parametrize("unit", LENGTH_UNITS)
+def test_length_unit_option_wins(read, unit):
+    columns = {"time": UNIX_S, "x_cm": X, "y_cm": Y, "z": Z, "sigma_cm": fixed(SIGMA_M, 3)}
+    samples = read(table(columns), length_unit=unit).samples
+    assert samples["x_m"].to_numpy() == pytest.approx(TRACK_M[:, 0] * LENGTH_UNITS[unit])
+    assert samples["z_m"].to_numpy() == pytest.approx(TRACK_M[:, 2] * LENGTH_UNITS[unit])
+    assert samples["sigma_z_m"].to_numpy() == pytest.approx(SIGMA_M * LENGTH_UNITS[unit])
+
+
+def test_an_outlier_does_not_decide_the_unit(read):
+    x = [*X]
+    x[7] = "4000.0"
+    file = read(table({**PLAIN, "x": x}))
+    assert file.samples["x_m"].iloc[7] == 4000.0
+    assert file.samples["y_m"].to_numpy() == pytest.approx(TRACK_M[:, 1])
+
+
+def test_a_spread_that_no_unit_explains_is_doubted(read):
+    x = fixed(np.linspace(0.0, 5e6, ROWS), 1)
+    file = read(table({**PLAIN, "x": x}))
+    assert file.samples["x_m"].iloc[-1] == 5e6
+    said(file, "position: ", "assumed, as no unit gives an indoor flight")
+
+
+def test_whole_metres_are_doubted(read):
+    whole = {axis: fixed(TRACK_M[:, i], 0) for i, axis in enumerate("xyz")}
+    file = read(table({"time": UNIX_S, **whole}))
+    said(file, "all positions are whole metres", "--position-unit")
+
+
+@pytest.mark.parametrize("extra", [{}, {"z": [""] * ROWS}, {"z": ["nan"] * ROWS}])
+def test_no_height(read, extra):
+    file = read(table({"time": UNIX_S, "x": X, "y": Y, **extra, "quality": ["80"] * ROWS}))
+    assert file.samples["z_m"].isna().all()
+    assert file.samples["y_m"].to_numpy() == pytest.approx(TRACK_M[:, 1])
+    said(file, "position: ", "without height")
+
+
+# -- sigma and quality -----------------------------------------------------------------------------
+
+SIGMA = fixed(SIGMA_M, 3)
+
+
+@pytest.mark.parametrize(
+    ("columns", "factors"),
+    [
+        ({"sigma": SIGMA}, (1, 1, 1)),
+        ({"std": SIGMA}, (1, 1, 1)),
+        ({"accuracy_mm": fixed(1000 * SIGMA_M, 0)}, (1, 1, 1)),
+        ({"Accuracy [cm]": fixed(100 * SIGMA_M, 1)}, (1, 1, 1)),
+        ({"sx": SIGMA, "sy": fixed(2 * SIGMA_M, 3), "sz": fixed(3 * SIGMA_M, 3)}, (1, 2, 3)),
+        (
+            {"sigma_z": fixed(3 * SIGMA_M, 3), "sigma_y": fixed(2 * SIGMA_M, 3), "sigma_x": SIGMA},
+            (1, 2, 3),
+        ),
+        ({"std_x_m": SIGMA, "y_std": fixed(2 * SIGMA_M, 3)}, (1, 2, np.nan)),
+    ],
+)
+def test_sigma(read, columns, factors):
+    file = read(table({**PLAIN, **columns}))
+    assert_track(file)
+    sigmas = file.samples[["sigma_x_m", "sigma_y_m", "sigma_z_m"]].to_numpy()
+    np.testing.assert_allclose(sigmas, np.outer(SIGMA_M, factors), rtol=0, atol=1e-9)
+    said(file, "sigma: ", repr(next(iter(columns))) if "sigma_z" not in columns else "'sigma_x'")
+
+
+def test_sigma_has_the_unit_of_position(read):
+    file = read(table({"t": UNIX_S, "x": MM[0], "y": MM[1], "sigma": fixed(1000 * SIGMA_M, 0)}))
+    assert file.samples["sigma_y_m"].to_numpy() == pytest.approx(SIGMA_M)
+
+
+def test_sigma_of_a_named_frame(read):
+    columns = {"n": X, "e": Y, "d": Z, "sd": SIGMA, "sigma_e": fixed(2 * SIGMA_M, 3)}
+    samples = read(table({"t": UNIX_S, **columns})).samples
+    assert samples["sigma_x_m"].to_numpy() == pytest.approx(SIGMA_M)
+    assert samples["sigma_y_m"].to_numpy() == pytest.approx(2 * SIGMA_M)
+
+
+@pytest.mark.parametrize("name", ["quality", "Q", "qf", "Quality (0-100)", "quality [%]"])
+def test_quality_is_kept_as_given(read, name):
+    file = read(table({**PLAIN, name: [str(value) for value in QUALITY]}))
+    assert_track(file)
+    assert file.samples["quality"].tolist() == QUALITY.tolist()
+    assert file.samples[SAMPLE_COLUMNS[3:6]].isna().all(axis=None)
+    said(file, "quality: ", name, "as given")
+
+
+def test_quality_in_words_is_left_out(read):
+    file = read(table({**PLAIN, "quality": ["good"] * ROWS}))
+    assert_track(file)
+    assert file.samples["quality"].isna().all()
+    said(file, "'quality' holds no numbers")
+
+
+def test_sigma_must_be_above_zero(read):
+    sigma = [*SIGMA]
+    sigma[3], sigma[4] = "0", "-1"
+    file = read(table({**PLAIN, "sigma": sigma}))
+    assert_track(file)
+    assert np.flatnonzero(file.samples["sigma_x_m"].isna()).tolist() == [3, 4]
+    said(file, "sigma is not above zero in 2 rows")
+
+
+@pytest.mark.parametrize(("more", "is_sigma"), [([SIGMA], True), ([JUNK] * 4, False)])
+def test_without_header_a_fifth_and_last_column_is_sigma(read, more, is_sigma):
+    columns = {**PLAIN, **{f"c{i}": values for i, values in enumerate(more)}}
+    file = read(table(columns, header=False))
+    assert_track(file)
+    assert file.samples["sigma_z_m"].notna().all() == is_sigma
+
+
+# -- rows ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "missing", ["nan", "NaN", "", "null", "None", "-", "inf", "-nan(ind)", "NULL", "1e999"]
+)
+def test_rows_without_position_are_dropped(read, missing):
+    x, z = [*X], [*Z]
+    x[0] = x[20] = z[21] = missing
+    file = read(table({**PLAIN, "x": x, "z": z}))
+    assert_track(file, rows=np.setdiff1d(np.arange(ROWS), [0, 20, 21]))
+    said(file, "3 rows were dropped", "without a usable time or position")
+
+
+def test_without_header_first_rows_may_lack_a_position(read):
+    text = table(PLAIN, header=False)
+    file = read(f"{UNIX_S[0][:9]}0.5,nan,nan,nan\n" + text)
+    assert_track(file)
+    said(file, "1 row was dropped")
+
+
+def test_cut_rows_between_others_are_dropped(read):
+    lines = table(PLAIN).splitlines(keepends=True)
+    lines[30] = UNIX_S[29] + ",1.0\n"
+    file = read("".join(lines))
+    assert_track(file, rows=np.setdiff1d(np.arange(ROWS), [29]))
+    said(file, "1 row was dropped")
+
+
+@pytest.mark.parametrize("keep", range(1, len(table(PLAIN).splitlines()[-1])))
+def test_a_cut_last_line_is_dropped(read, keep):
+    lines = table(PLAIN).splitlines(keepends=True)
+    file = read("".join(lines[:-1]) + lines[-1][:keep])
+    assert_track(file, rows=slice(-1))
+    assert file.notes == (f"line {ROWS + 1}, the last one, was dropped: it is cut",)
+
+
+@pytest.mark.parametrize(
+    ("columns", "last", "is_cut"),
+    [
+        (PLAIN, "1795253690.0,1.0,2.0,nu", True),
+        ({**PLAIN, "state": ["valid"] * ROWS}, "1795253690.0,1.0,2.0,3.0,valid", False),
+        ({**PLAIN, "qf": [str(q) for q in QUALITY]}, "1795253690.0,1.0,2.0,3.0,8", True),
+        ({**PLAIN, "qf": [str(q) for q in QUALITY]}, "1795253690.0,1.0,2.0,3.0,80", False),
+    ],
+)
+def test_which_last_line_is_cut(read, columns, last, is_cut):
+    file = read(table(columns) + last)
+    assert len(file.samples) == ROWS + (not is_cut)
+    assert (f"line {ROWS + 2}, the last one, was dropped: it is cut" in file.notes) == is_cut
+
+
+@pytest.mark.parametrize(
+    ("shifts_us", "dropped"),
+    [
+        ({10: -3_600_000_000}, [10]),
+        ({10: 3_600_000_000}, [10]),
+        ({10: 3_600_000_000, 40: -60_000_000}, [10, 40]),
+        ({10: -TIME_US[10] + TIME_US[9]}, [10]),
+        ({0: 10**15}, [0]),
+    ],
+)
+def test_stamps_that_repeat_or_go_back_are_dropped(read, shifts_us, dropped):
+    stamps = UNIX_US + TIME_US
+    for at, shift in shifts_us.items():
+        stamps[at] += shift
+    file = read(table({**PLAIN, "time": exact(stamps, 6)}))
+    kept = len(file.samples)
+    assert kept == ROWS - len(dropped)
+    assert np.all(np.diff(file.samples.index) > 0)
+    # of two equal stamps either may stay
+    expected = np.delete(TRACK_M, dropped, axis=0)
+    differs = np.any(np.abs(file.samples[AXES].to_numpy() - expected) > 1e-9, axis=1)
+    assert np.count_nonzero(differs) <= (1 if shifts_us.get(10, 0) > -(10**6) else 0)
+    said(file, f"{len(dropped)} row", "dropped: their time stamps repeat, go back")
+
+
+@pytest.mark.parametrize(
+    ("column", "text"),
+    [("x", "12.3m"), ("z", "1.2.3"), ("time", "soon"), ("y", "1_000"), ("x", "0x1f")],
+)
+def test_text_in_a_column_of_numbers_is_named(read, column, text):
+    columns = {name: [*values] for name, values in PLAIN.items()}
+    columns[column][29] = text
+    line = refused(read, PREAMBLE + table(columns))
+    assert f"uwb.csv: line 35, '{column}': '{text}' is no" in line
+
+
+@pytest.mark.parametrize("text", ["2026-11-21T25:00:00Z", "1795253650.9", "later"])
+def test_text_among_iso_times_is_named(read, text):
+    line = refused(read, table({**PLAIN, "time": [*iso()[:29], text, *iso()[30:]]}))
+    assert f"line 31, 'time': '{text}' is no time" in line
+
+
+def test_text_in_split_times_is_named(read):
+    nsecs = [*SPLIT["nsecs"][:-1], "oops"]
+    columns = {"secs": SPLIT["secs"], "nsecs": nsecs, "x": X, "y": Y}
+    assert f"line {ROWS + 1}, 'nsecs': 'oops' is no number" in refused(read, table(columns))
+
+
+def test_text_in_a_file_without_header_is_named(read):
+    y = [*Y]
+    y[29] = "oops"
+    line = refused(read, table({**PLAIN, "y": y}, header=False))
+    assert "line 30, column 3: 'oops' is no number" in line
+
+
+def test_several_tags_are_pointed_out(read):
+    file = read(table({"tag_id": ["A1", "B2"] * (ROWS // 2), **PLAIN}))
+    said(file, "'tag_id' has several values ('A1', 'B2')")
+
+
+# -- the options -----------------------------------------------------------------------------------
+
+ODD = {"clock": UNIX_S, "a": Y, "b": X, "c": Z, "d_": SIGMA}
+
+
+@pytest.mark.parametrize(
+    ("columns", "header", "has_sigma"),
+    [
+        (("clock", "b", "a", "c"), True, False),
+        (("CLOCK", "B ", "a", "c", "d_"), True, True),
+        (("1", "3", "2", "4"), True, False),
+        (("1", "3", "2", "4", "5"), False, True),
+        (("clock", "3", "a", "4"), True, False),
+    ],
+)
+def test_columns_option(read, columns, header, has_sigma):
+    file = read(PREAMBLE + table(ODD, header=header), columns=columns)
+    assert_track(file)
+    assert file.samples["sigma_x_m"].notna().all() == has_sigma
+    if has_sigma:
+        assert file.samples["sigma_y_m"].to_numpy() == pytest.approx(SIGMA_M)
+
+
+def test_columns_option_overrides_names(read):
+    file = read(table({**PLAIN, "x2": JUNK}), columns=("time", "y", "x", "x2"))
+    assert file.samples["x_m"].to_numpy() == pytest.approx(TRACK_M[:, 1])
+    assert file.samples["z_m"].tolist() == [0.1] * ROWS
+
+
+def test_columns_option_keeps_the_frame_of_the_names(read):
+    columns = {"time_ms": UNIX_S, "t": UNIX_S, "up_mm": MM[2], "east_mm": MM[0], "north_mm": MM[1]}
+    file = read(table(columns), columns=("t", "north_mm", "east_mm", "up_mm"))
+    assert_track(file)
+    assert file.frame == "enu"
+
+
+def test_columns_option_without_height(read):
+    file = read(table(ODD), columns=("clock", "b", "a"))
+    assert file.samples["z_m"].isna().all()
+    assert file.samples["x_m"].to_numpy() == pytest.approx(TRACK_M[:, 0])
+
+
+def test_columns_option_by_number_where_the_header_is_short(read):
+    text = "time,x,y,z\n" + table({"row": JUNK, **PLAIN}, header=False)
+    assert_track(read(text, columns=("2", "3", "4", "5")))
+
+
+def test_header_with_unnamed_columns_at_its_end(read):
+    rows = table({**PLAIN, "more": JUNK}, header=False)
+    assert_track(read("time,x,y,z,\n" + rows))
+
+
+def test_columns_option_takes_any_column(read):
+    # names whose own meaning is another: a length as time, a time as a length
+    file = read(table({"x_m": UNIX_S, "time_ms": X, "b": Y, "c": Z}), columns=("1", "2", "3", "4"))
+    assert_track(file)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"time_unit": "min"}, "--position-time-unit: 'min' is none of s, ms, us, ns."),
+        ({"length_unit": "ft"}, "--position-unit: 'ft' is none of m, cm, mm."),
+        ({"columns": ("time", "x")}, "does not name four or five different columns"),
+        ({"columns": ("time", "x", "x", "z")}, "does not name four or five different columns"),
+        ({"columns": ("time", "x", "y", "")}, "does not name four or five different columns"),
+        ({"columns": ("1", "2", "y", "z", "5", "6")}, "does not name four or five"),
+        ({"columns": ("time", "x", "y", "w")}, "no column 'w' (it has 4, named 'time', 'x', 'y'"),
+        ({"columns": ("1", "2", "3", "9")}, "no column '9'"),
+        ({"columns": ("0", "2", "3", "4")}, "no column '0'"),
+        ({"columns": ("1", "2", "3", "9" * 5000)}, "no column '9999"),
+        ({"columns": ("time", "2", "x", "y")}, "names one column twice"),
+    ],
+)
+def test_bad_options(read, options, words):
+    with pytest.raises(SettingsError) as caught:
+        read(table(PLAIN), **options)
+    assert words in str(caught.value)
+    assert_one_line(caught.value)
+
+
+# -- what cannot be read ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"", "empty"),
+        (b"\n\n \n", "no row of numbers"),
+        (b"\x00\x01time,x,y,z\n1,2,3,4\n", "binary"),
+        ((REPOSITORY / "sample_logs" / "aisle_uwb.ulg").read_bytes(), "binary"),
+        (b"Dear all,\nplease find attached\nthe log.\n", "no row of numbers"),
+        (b"time,x,y,z\n", "no row of numbers"),
+        (table({"when": UNIX_S, "x": X, "y": Y}), "no time column found (the columns are 'when'"),
+        (table({"time": UNIX_S, "a": X, "b": Y}), "no position columns found (the columns are 't"),
+        (table({"time": UNIX_S, "x": X, "b": Y}), "no position columns found"),
+        (table({"time": UNIX_S, "x [ft]": X, "y [ft]": Y}), "no position columns found"),
+        (table({"t": UNIX_S, "lat": X, "lon": Y}), "'lat', 'lon'). Name them with --position-col"),
+        (table(PLAIN, decimal=","), "names 4 columns, but rows have 8, as with a decimal comma"),
+        ("time,x,y,z\n" + table({"n": JUNK, **PLAIN}, header=False), "4 columns, but rows have 5"),
+        (table({"t": UNIX_S, "x": X}, header=False), "no time and position columns found"),
+        (table(PLAIN, header=False)[:60], "usable rows: 1, at least 3"),
+        (table({**PLAIN, "x": ["nan"] * ROWS}), "usable rows: 0, at least 3 are needed; 60 rows"),
+        (table({**PLAIN, "time": [""] * ROWS}), "usable rows: 0"),
+        (table({**PLAIN, "time": ["12.5"] * ROWS}), "usable rows: 1"),
+        ("time,x,y,z\n1,2,3,4\n" + "5" * 200_000, "line 3 has 100000 characters or more"),
+    ],
+)
+def test_what_cannot_be_read_is_explained(read, content, words):
+    line = refused(read, content)
+    assert words in line
+    assert line.startswith("uwb.csv: ")
+
+
+def test_not_a_file(tmp_path):
+    for path, words in (
+        (tmp_path / "none.csv", "cannot be read (No such file"),
+        (tmp_path, "a folder"),
+        (tmp_path / "a\0b.csv", "cannot be read"),
+    ):
+        with pytest.raises(LogError) as caught:
+            read_position_csv(path)
+        assert words in str(caught.value)
+        assert_one_line(caught.value)
+
+
+def test_too_large(read, monkeypatch):
+    monkeypatch.setattr(position_csv, "MAX_FILE_BYTES", 1000)
+    assert "more than the limit" in refused(read, table(PLAIN))
+
+
+# -- any bytes -------------------------------------------------------------------------------------
+
+fuzzed = settings(
+    deadline=2000,
+    derandomize=True,
+    database=None,
+    phases=[Phase.explicit, Phase.generate],
+    max_examples=300,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
+)
+SEEDS = [
+    content if isinstance(content, bytes) else content.encode() for content in DIALECTS.values()
+]
+WORDS = (
+    "time t_ms x y z north e up sigma q header.stamp.secs nsecs [m] 0 -1.5 1,5 1e400 -1e18 nan - "
+    "9999999999999999999 1795253650.25 1.8e18 2026-11-21T13:00:01Z 0001-01-01T00:00:00+23:59"
+)
+MARKS = [",", ";", "\t", " ", "\n", "\r\n", '"', "#", "%", "\0", "\x85", "é", "\ufeff", ""]
+words_of_tables = st.sampled_from(WORDS.split(" ")) | st.sampled_from([*MARKS, ",", "\n", "\n"])
+options = st.fixed_dictionaries(
+    {},
+    optional={
+        "time_unit": st.sampled_from([*TIME_UNITS, "h"]),
+        "length_unit": st.sampled_from([*LENGTH_UNITS, "ft"]),
+        "columns": st.lists(
+            st.sampled_from(["1", "2", "3", "4", "5", "time", "x", "y", "٣", "²"]), max_size=5
+        ).map(tuple),
+    },
+)
+
+
+def check_any(read, content: bytes, given_options: dict) -> None:
+    """Reading gives sound samples or one line, whatever the bytes are."""
+    try:
+        file = read(content, **given_options)
+    except (LogError, SettingsError) as error:
+        assert_one_line(error)
+        return
+    samples = file.samples
+    assert len(samples) >= 3
+    assert np.all(np.diff(samples.index) > 0)
+    assert np.isfinite(samples.index).all()
+    assert np.isfinite(samples[["x_m", "y_m"]].to_numpy()).all()
+    assert not np.isinf(samples.to_numpy()).any()
+    assert all(len(line.splitlines()) == 1 for line in (*file.detected, *file.notes))
+
+
+@fuzzed
+@given(st.binary(max_size=400), options)
+@example(b"\xff\xfe" + bytes(range(255)), {})
+def test_any_bytes(read, content, given_options):
+    check_any(read, content, given_options)
+
+
+@fuzzed
+@given(st.text(max_size=300), options)
+def test_any_text(read, content, given_options):
+    check_any(read, content.encode(errors="replace"), given_options)
+
+
+@fuzzed
+@given(st.lists(words_of_tables, max_size=80).map("".join), options)
+def test_any_table(read, content, given_options):
+    check_any(read, content.encode(), given_options)
+
+
+@st.composite
+def rows_of_values(draw: st.DrawFn) -> bytes:
+    values = st.one_of(
+        st.integers(-(2**70), 2**70).map(str),
+        st.floats(width=64).map(str),
+        st.sampled_from(["nan", "", "1e308", "-1e308", "4102444799.9", "4611686018427387904"]),
+    )
+    header = draw(
+        st.sampled_from(["time,x,y,z,sigma,q", "t_ns,e,n,u", "secs,nsecs,x_mm,y", "a,b,c"])
+    )
+    rows = draw(st.lists(st.lists(values, min_size=2, max_size=6), max_size=12))
+    return "\n".join([header, *map(",".join, rows), ""]).encode()
+
+
+@fuzzed
+@given(rows_of_values(), options)
+def test_any_values(read, content, given_options):
+    check_any(read, content, given_options)
+
+
+@fuzzed
+@given(st.sampled_from(SEEDS), st.data(), options)
+def test_damaged_files(read, seed, data, given_options):
+    content = bytearray(seed)
+    for _ in range(data.draw(st.integers(1, 4))):
+        at = data.draw(st.integers(0, len(content)))
+        end = min(len(content), at + data.draw(st.integers(0, 60)))
+        content[at:end] = data.draw(st.binary(max_size=20))
+    check_any(read, bytes(content), given_options)
+
+
+@pytest.mark.parametrize(
+    "line",
+    [line * 9_000 for line in (b'"', b" ", b"1 ", b"1,", b"(", b"x,", b"a1B", b"_", b"1", b"[ ")],
+)
+def test_work_is_bounded(read, line):
+    text = table(PLAIN).encode()
+    line += b"1\n"
+    for content in (line + text, text + line, line * 30 + text, line * 300):
+        seconds = datetime.now(tz=UTC)
+        check_any(read, content, {})
+        assert (datetime.now(tz=UTC) - seconds).total_seconds() < 5.0
+
+
+# -- real files ------------------------------------------------------------------------------------
+
+
+def test_sample_of_the_project():
+    file = read_position_csv(EXTERNAL)
+    rows = list(csv.reader(io.StringIO(EXTERNAL.read_text())))
+    assert rows[0] == ["timestamp_s", "x_m", "y_m", "z_m"]
+    truth = np.array(rows[1:], dtype=np.float64)
+    np.testing.assert_array_equal(file.samples.index, truth[:, 0])
+    np.testing.assert_array_equal(file.samples[AXES], truth[:, 1:])
+    assert (file.clock, file.frame, file.notes) == ("UNIX", None, ())
+
+
+@pytest.fixture(scope="session")
+def shared_uwb() -> Path:
+    """The folder of UWB recordings, which are not part of the project."""
+    if not SHARED_UWB.is_dir():
+        pytest.skip("the UWB recordings (../shared/uwb) are not beside the repository")
+    return SHARED_UWB
+
+
+@pytest.mark.reallogs
+@pytest.mark.parametrize(
+    ("pattern", "time", "count"),
+    [("dwm1001__tag__*position.csv", "bag_time", 3), ("vrpn*.csv", "header_stamp", 2)],
+)
+def test_recordings_of_uwb(shared_uwb, pattern, time, count):
+    paths = sorted(shared_uwb.glob(f"*/{pattern}"))
+    assert len(paths) == count
+    for path in paths:
+        file = read_position_csv(path)
+        # as text first: pandas' own conversion may be off by the last bit
+        truth = pd.read_csv(path, dtype=str).astype(np.float64)
+        truth = truth[truth[["v0", "v1", "v2"]].notna().all(axis=1)]
+        np.testing.assert_array_equal(file.samples.index, truth[time])
+        np.testing.assert_array_equal(file.samples[AXES], truth[["v0", "v1", "v2"]])
+        assert file.clock == "UNIX"
+        said(file, f"'{time}'", "of recording" if time == "bag_time" else "of measurement")
+        dropped = len(pd.read_csv(path)) - len(truth)
+        if dropped:
+            said(file, f"{dropped} rows were dropped")
+
+
+@pytest.mark.reallogs
+def test_damaged_recordings(shared_uwb, read):
+    random = np.random.default_rng(1)
+    for path in sorted(shared_uwb.glob("*/dwm1001__tag__*position.csv")):
+        content = path.read_bytes()[:20_000]
+        for _ in range(40):
+            damaged = bytearray(content[: random.integers(1, len(content))])
+            for at in random.integers(0, len(damaged), 3):
+                damaged[at] = random.integers(0, 256)
+            check_any(read, bytes(damaged), {})
