@@ -435,6 +435,30 @@ class Flight:
     inputs: tuple[InputFile, ...] = ()
 
 
+def missing_parts(
+    imu: pd.DataFrame | Unavailable,
+    attitude: pd.DataFrame | Unavailable,
+    ekf2: Ekf2 | Unavailable,
+    truth: Truth | Unavailable,
+) -> tuple[Unavailable, ...]:
+    """Parts of a flight that its log lacks, those of EKF2 included."""
+    parts: list[object] = [imu, attitude, ekf2, truth]
+    if isinstance(ekf2, Ekf2):
+        parts += [ekf2.variance, *ekf2.innovations.values(), ekf2.fusing]
+    return tuple(part for part in parts if isinstance(part, Unavailable))
+
+
+def stretches_of_flight(landed: pd.Series, duration_s: float) -> tuple[tuple[float, float], ...]:
+    """Stretches (s) in which a step function of time says "not landed" (0 or False)."""
+    changes = landed[landed.ne(landed.shift())]
+    ends = [*changes.index[1:], duration_s]
+    return tuple(
+        (max(float(start), 0.0), float(end))
+        for start, end, value in zip(changes.index, ends, changes, strict=True)
+        if not value and end > max(start, 0.0)
+    )
+
+
 def finite_rows(samples: pd.DataFrame, columns: list[str]) -> pd.DataFrame:
     """Rows of a frame in which all of some float columns are finite."""
     finite: NDArray[np.bool_] = np.isfinite(samples[columns].to_numpy()).all(axis=1)

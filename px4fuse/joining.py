@@ -19,6 +19,7 @@ from px4fuse.flight import (
     Reset,
     Truth,
     Unavailable,
+    missing_parts,
 )
 
 # Both recordings must hold this much of the same time
@@ -27,6 +28,7 @@ MIN_OVERLAP_S = 2.0
 MAX_POSITION_DIFFERENCE_M = 0.5
 MAX_ATTITUDE_DIFFERENCE_DEG = 10.0
 MIN_COMMON_SAMPLES = 5
+SOURCE = "position source "
 
 
 def join(flight: Flight, other: Flight) -> Flight:
@@ -74,7 +76,7 @@ def join(flight: Flight, other: Flight) -> Flight:
         taken["ekf2"] = replace(ekf2, variance=moved.ekf2.variance)
         streams["ekf2_variance"] = moved.streams["ekf2_variance"]
     joined = replace(flight, **taken)  # type: ignore[arg-type]
-    lacking = _lacking(joined)
+    lacking = missing_parts(joined.imu, joined.attitude, joined.ekf2, joined.truth)
     return replace(
         joined,
         log=replace(
@@ -101,14 +103,6 @@ def join(flight: Flight, other: Flight) -> Flight:
             InputFile(other.log.name, other.log.sha256, other.log.size_bytes, "mavlink"),
         ),
     )
-
-
-def _lacking(flight: Flight) -> list[Unavailable]:
-    """Everything that a flight still has not."""
-    parts: list[object] = [flight.imu, flight.attitude, flight.ekf2, flight.truth, flight.airborne]
-    if isinstance(flight.ekf2, Ekf2):
-        parts += [flight.ekf2.variance, *flight.ekf2.innovations.values(), flight.ekf2.fusing]
-    return [part for part in parts if isinstance(part, Unavailable)]
 
 
 def _span(flight: Flight) -> str:

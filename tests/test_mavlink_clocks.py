@@ -83,7 +83,7 @@ def test_offset_and_drift_come_back_under_one_sided_delays(offset, drift_ppm, le
     rounding = 4.0 * np.spacing(abs(offset) + 200.0)
     assert np.all(error > -0.2 * scale - rounding)
     assert np.all(error < 0.3 * scale + rounding)
-    assert abs(line.slope - 1.0 - drift_ppm * 1e-6) < scale * 5e-3 + 2e-8 + rounding / 10.0
+    assert abs(line.slope - 1.0 - drift_ppm * 1e-6) < scale * 5e-3 + rounding / 10.0
 
 
 def test_without_delay_the_line_is_exact():
@@ -365,8 +365,10 @@ def test_after_a_restart_only_the_longer_part_is_read(read):
     [note] = [note for note in flight.log.notes if "restart" in note]
     assert "went back 1 time" in note
     assert "part 2 of 2" in note
-    assert np.abs(clock_error(flight, second)).max() < 1.5 * LEAST_DELAY_S
-    position_is_true(flight, second)
+    # what was sent before the first message with the new boot clock is of no known boot
+    times = flight.positions[0].samples.index.to_numpy() + flight.log.boot_time_s
+    assert len(times) >= 299
+    assert np.abs(times - second.times(5.0)[-len(times) :]).max() < 1.5 * LEAST_DELAY_S
     assert flight.airborne[0] == pytest.approx((15.0, 45.0), abs=0.1)
 
 

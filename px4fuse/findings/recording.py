@@ -82,7 +82,7 @@ def innovations_need_ulog(comparison: Comparison) -> Iterator[Finding]:
         "info",
         f"A MAVLink recording holds EKF2's states{' and variances' if variances else ''} but not "
         "its innovations: whether EKF2 is consistent cannot be said from it.",
-        f"Compare the ULog of the same flight: px4fuse compare LOG.ulg --mavlink {flight.log.name}.",
+        f"Give the ULog of the same flight: px4fuse compare LOG.ulg --mavlink {flight.log.name}.",
     )
 
 

@@ -17,12 +17,13 @@ from px4fuse.flight import (
     ANGULAR_RATE_COLUMNS,
     QUATERNION_COLUMNS,
     SPECIFIC_FORCE_COLUMNS,
-    Ekf2,
     Flight,
     LogInfo,
     Unavailable,
     Unused,
     finite_rows,
+    missing_parts,
+    stretches_of_flight,
 )
 from px4fuse.readers.mavlink_ekf2 import MIN_NORM, read_ekf2
 from px4fuse.readers.mavlink_frames import Frames, message_ids, read_frames
@@ -81,10 +82,6 @@ def read_mavlink(path: Path, system: int | None = None) -> Flight:
     positions, missing_positions = read_positions(recording, mapped)
     truth = read_truth(recording, positions)
     airborne = _read_airborne(recording)
-    missing = [part for part in (imu, attitude, ekf2, truth) if isinstance(part, Unavailable)]
-    if isinstance(ekf2, Ekf2):
-        parts = (ekf2.variance, *ekf2.innovations.values(), ekf2.fusing)
-        missing += [part for part in parts if isinstance(part, Unavailable)]
     return Flight(
         log=_describe(recording, parameters, autopilot),
         imu=imu,
@@ -93,7 +90,7 @@ def read_mavlink(path: Path, system: int | None = None) -> Flight:
         ekf2=ekf2,
         truth=truth,
         airborne=airborne,
-        missing=(*missing, *missing_positions),
+        missing=(*missing_parts(imu, attitude, ekf2, truth), *missing_positions),
         streams=MappingProxyType(recording.streams),
         clocks=clock_maps(recording, mapped),
         unused=_unused(frames),
@@ -178,17 +175,6 @@ def _read_airborne(recording: Recording) -> tuple[tuple[float, float], ...] | Un
     time_s = recording.receipt_boot_s(rows[known]) - recording.zero_s
     landed = pd.Series(table["landed_state"][known] == LANDED, index=time_s)
     return stretches_of_flight(landed, recording.duration_s)
-
-
-def stretches_of_flight(landed: pd.Series, duration_s: float) -> tuple[tuple[float, float], ...]:
-    """Stretches (s) in which a step function of time says "not landed"."""
-    changes = landed[landed.ne(landed.shift())]
-    ends = [*changes.index[1:], duration_s]
-    return tuple(
-        (max(float(start), 0.0), float(end))
-        for start, end, down in zip(changes.index, ends, changes, strict=True)
-        if not down and end > max(start, 0.0)
-    )
 
 
 def _read_parameters(recording: Recording, autopilot: str) -> MappingProxyType[str, float]:

@@ -89,8 +89,11 @@ def least_delay(x: Array, y: Array) -> Line:
     residual = y - slope * (x - x0)
     lowest = [part[np.argmin(residual[part])] for part in parts]
     if span >= MIN_DRIFT_SPAN_S and len(lowest) > 1:
-        slope += float(theilslopes(residual[lowest], x[lowest])[0])
-        residual = y - slope * (x - x0)
+        # with the drift known, others are the least delayed
+        for _ in range(2):
+            slope += float(theilslopes(residual[lowest], x[lowest])[0])
+            residual = y - slope * (x - x0)
+            lowest = [part[np.argmin(residual[part])] for part in parts]
     if not 0.0 < slope < np.inf:  # no clock runs backwards
         slope = 1.0
         residual = y - x + x0

@@ -15,7 +15,6 @@ from px4fuse.flight import (
     PositionTrack,
     Truth,
     Unavailable,
-    finite_rows,
 )
 from px4fuse.readers.mavlink_clocks import Mapped
 from px4fuse.readers.mavlink_ekf2 import STATE_COLUMNS, odometry
@@ -35,7 +34,7 @@ from px4fuse.readers.mavlink_recording import (
     senders_of,
     vector,
 )
-from px4fuse.readers.px4_positions import MIN_TRACK_SAMPLES, project
+from px4fuse.readers.px4_positions import MIN_TRACK_SAMPLES, clean_positions, project
 
 TRACK_COLUMNS = POSITION_COLUMNS + POSITION_VARIANCE_COLUMNS
 ROUTER_REMEDY = (
@@ -112,13 +111,12 @@ def _read_track(
     )
     name = source.name + suffix
     values = np.column_stack([position, variance])
-    samples = finite_rows(recording.frame(name, boot_s, TRACK_COLUMNS, values), POSITION_COLUMNS)
+    samples = recording.frame(name, boot_s, TRACK_COLUMNS, values)
+    samples = clean_positions(samples, POSITION_COLUMNS)
     if len(samples) < MIN_TRACK_SAMPLES:
         return Unavailable(
             f"position source {name}", f"{len(samples)} finite samples are too few", ROUTER_REMEDY
         )
-    given = samples[POSITION_VARIANCE_COLUMNS]
-    samples[POSITION_VARIANCE_COLUMNS] = given.where(given > 0)  # 0 and NaN: not given
     statement = clock.statement
     mapping = (
         "" if statement.method == "boot clock" else f", mapped to boot time by {statement.method}"

@@ -41,8 +41,10 @@ BOOT_CLOCK = "autopilot boot clock"
 RECEIPT_CLOCK = "time of receipt, less the link's least delay"
 # The boot clock going back by more than this is a restart, not a late packet
 RESTART_S = 5.0
-# Messages after a restart that must be early too
+# Messages so far before and after a restart must say so too
 RESTART_MESSAGES = 20
+# Stamps apart from the rest by OUTSIDE_S and fewer than this share of it are impossible
+STRAY_SHARE = 0.01
 # Samples further than this before or after the session have an impossible stamp
 OUTSIDE_S = 60.0
 # Senders beyond the busiest ones are not described, and their positions are not read
@@ -191,7 +193,9 @@ def choose_autopilot(frames: Frames, system: int | None) -> tuple[Address, str]:
     vehicles = _vehicles(frames)
     flying = [s for s in counts if s in vehicles and _flies(*vehicles[s])]
     # without a heartbeat the autopilot is still known by its component
-    candidates = flying or [s for s in counts if s[1] == AUTOPILOT_COMPONENT] or list(counts)
+    candidates = flying or [s for s in counts if s[1] == AUTOPILOT_COMPONENT]
+    # nor need it have been heard itself
+    candidates = candidates or [(s[0], AUTOPILOT_COMPONENT) for s in counts]
     if system is not None:
         candidates = [address for address in candidates if address[0] == system]
         if not candidates:
@@ -200,7 +204,7 @@ def choose_autopilot(frames: Frames, system: int | None) -> tuple[Address, str]:
                 f"{frames.name}: --system {system}: no autopilot has this system id; autopilots "
                 f"in the file: {have}."
             )
-    best = max(candidates, key=lambda address: counts[address])
+    best = max(candidates, key=lambda address: counts.get(address, 0))
     name = AUTOPILOTS.get(vehicles[best][1]) if best in vehicles else None
     return best, name or "unknown autopilot"
 
@@ -236,9 +240,10 @@ def settle_clocks(frames: Frames, address: Address) -> Recording:
     rows, stamps = _boot_stamps(frames, address)
     session = slice(0, len(frames))
     restarts = np.flatnonzero(np.diff(stamps) < -RESTART_S) + 1
-    # one late packet is no restart: those after it must be early too
+    # one late or early packet is no restart: its neighbours must say so too
+    before = stamps[np.maximum(restarts - 1 - RESTART_MESSAGES, 0)]
     later = stamps[np.minimum(restarts + RESTART_MESSAGES, len(stamps) - 1)]
-    restarts = restarts[later < stamps[restarts - 1] - RESTART_S]
+    restarts = restarts[later < np.minimum(before, stamps[restarts - 1]) - RESTART_S]
     if len(restarts):
         parts = np.split(np.arange(len(rows)), restarts)
         longest = max(range(len(parts)), key=lambda part: len(parts[part]))
@@ -253,6 +258,8 @@ def settle_clocks(frames: Frames, address: Address) -> Recording:
             f"its boot clock, {len(part) / len(rows):.0%} of the data"
         )
         rows, stamps = rows[part], stamps[part]
+    kept = _without_strays(stamps, increasing(np.rint(stamps * 1e6).astype(np.int64)))
+    rows, stamps = rows[kept], stamps[kept]
     line = Line(0.0, 0.0, 1.0, 0.0, len(rows))
     received = np.zeros(len(frames))
     if frames.received_us is not None:
@@ -262,13 +269,20 @@ def settle_clocks(frames: Frames, address: Address) -> Recording:
     elif len(rows):
         # no time of receipt: the boot clock of the last stamped message stands in for it
         at = np.clip(np.searchsorted(rows, np.arange(len(frames)), side="right") - 1, 0, None)
-        received = np.maximum.accumulate(stamps)[at]
+        received = stamps[at]
     notes += _frame_notes(frames, received)
-    kept = stamps[increasing(np.rint(stamps * 1e6).astype(np.int64))]
     # without a boot clock the receipt must do
-    span = kept if len(kept) else np.array([0.0, received.max()])
+    span = stamps if len(stamps) else np.array([0.0, received.max()])
     zero_s, end_s = float(span[0]), float(span[-1])
     return Recording(frames, *address, session, received, line, zero_s, end_s - zero_s, notes)
+
+
+def _without_strays(stamps: Array, rows: Rows) -> Rows:
+    """Rows of increasing stamps without a few at either end that are far from all others."""
+    parts = np.split(rows, np.flatnonzero(np.diff(stamps[rows]) > OUTSIDE_S) + 1)
+    enough = STRAY_SHARE * max(len(part) for part in parts)
+    many = [number for number, part in enumerate(parts) if len(part) >= enough]
+    return np.concatenate(parts[many[0] : many[-1] + 1])
 
 
 def _frame_notes(frames: Frames, received: Array) -> list[str]:

@@ -76,14 +76,21 @@ def _unavailable(name: str, reason: str) -> Unavailable:
     return Unavailable(f"position source {name}", reason, remedy)
 
 
+def clean_positions(samples: pd.DataFrame, axes: list[str]) -> pd.DataFrame:
+    """Positions and variances, without the rows that lack one of ``axes``.
+
+    A variance of 0 is none, as PX4 reads it (``EKF2.cpp``); it becomes NaN.
+    """
+    found = finite_rows(samples.reindex(columns=POSITION_COLUMNS + POSITION_VARIANCE_COLUMNS), axes)
+    given = found[POSITION_VARIANCE_COLUMNS]
+    return found.assign(**given.where(given > 0))
+
+
 def _finished(track: PositionTrack, axes: list[str]) -> PositionTrack | Unavailable:
     """Drop samples without a position; a track that is too short is none."""
-    samples = track.samples.reindex(columns=POSITION_COLUMNS + POSITION_VARIANCE_COLUMNS)
-    samples = finite_rows(samples, axes)
+    samples = clean_positions(track.samples, axes)
     if len(samples) < MIN_TRACK_SAMPLES:
         return _unavailable(track.name, f"{len(samples)} finite samples are too few")
-    variances = samples[POSITION_VARIANCE_COLUMNS]
-    samples[POSITION_VARIANCE_COLUMNS] = variances.where(variances > 0)  # 0 and NaN: not given
     return replace(track, samples=samples)
 
 

@@ -19,6 +19,8 @@ from px4fuse.flight import (
     Unavailable,
     Unused,
     finite_rows,
+    missing_parts,
+    stretches_of_flight,
 )
 from px4fuse.readers.px4_ekf2 import ekf2_topics, read_ekf2
 from px4fuse.readers.px4_positions import GPS_3D_FIX, read_positions, read_truth
@@ -59,10 +61,6 @@ def read_ulog(path: Path) -> Flight:
     positions, missing_positions = read_positions(topics, ekf2)
     truth = read_truth(topics, positions)
     airborne = _read_airborne(topics)
-    missing = [part for part in (imu, attitude, ekf2, truth) if isinstance(part, Unavailable)]
-    if not isinstance(ekf2, Unavailable):
-        parts = (ekf2.variance, *ekf2.innovations.values(), ekf2.fusing)
-        missing += [part for part in parts if isinstance(part, Unavailable)]
     dropped = tuple(
         f"{count} samples of {topic} were dropped: their time stamps are zero or go back"
         for (topic, _), count in sorted(topics.dropped.items())
@@ -84,7 +82,7 @@ def read_ulog(path: Path) -> Flight:
         ekf2=ekf2,
         truth=truth,
         airborne=airborne,
-        missing=(*missing, *missing_positions),
+        missing=(*missing_parts(imu, attitude, ekf2, truth), *missing_positions),
         streams={part: _stream(topics, part, names) for part, names in used.items() if names},
         unused=tuple(
             Unused(name, len(topics.tables[name, number]["timestamp"]), reason)
@@ -168,10 +166,4 @@ def _read_airborne(topics: Topics) -> tuple[tuple[float, float], ...] | Unavaila
             "no usable topic vehicle_land_detected",
             "Record with SDLOG_PROFILE bit 0 (default), or give --start and --end.",
         )
-    changes = landed[landed.ne(landed.shift())]
-    ends = [*changes.index[1:], topics.log.duration_s]
-    return tuple(
-        (max(float(start), 0.0), float(end))
-        for start, end, value in zip(changes.index, ends, changes, strict=True)
-        if value == 0 and end > max(start, 0.0)
-    )
+    return stretches_of_flight(landed, topics.log.duration_s)
