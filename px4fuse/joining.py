@@ -58,6 +58,9 @@ def join(flight: Flight, other: Flight) -> Flight:
             f"{_span(other)} on the autopilot's boot clock. Give the recordings of one flight."
         )
     moved = _shifted(other, shift_s)
+    unix_s = flight.log.start_unix_s
+    if unix_s is None and other.log.start_unix_s is not None:
+        unix_s = other.log.start_unix_s - shift_s
     agreement = _agreement(flight, moved)
     taken: dict[str, object] = {}
     streams = dict(flight.streams)
@@ -87,14 +90,11 @@ def join(flight: Flight, other: Flight) -> Flight:
                 f"joined with {other.log.name} on the boot clock, {high - low:.1f} s in common; "
                 f"{agreement}",
             ),
-            start_unix_s=flight.log.start_unix_s or other.log.start_unix_s,
+            start_unix_s=unix_s,
             senders=flight.log.senders or other.log.senders,
         ),
         positions=tuple(sorted((*flight.positions, *moved.positions), key=lambda t: t.rung)),
-        missing=tuple(
-            *lacking,
-            *(part for part in flight.missing if part.what.startswith("position source ")),
-        ),
+        missing=(*lacking, *(m for m in flight.missing if m.what.startswith(SOURCE))),
         streams=streams,
         clocks=(*flight.clocks, *other.clocks),
         unused=(*flight.unused, *other.unused),
