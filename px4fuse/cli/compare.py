@@ -2,99 +2,26 @@
 
 from __future__ import annotations
 
-import shlex
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import click
-from click.core import ParameterSource
 
-from px4fuse.cli.inputs import (
-    clock_offset_option,
-    position_options,
-    read_recordings,
-    recording_options,
-    with_position,
-)
+from px4fuse.cli.inputs import analysis_options, command_line, encodable, progress, run_comparison
 from px4fuse.errors import OutputError, SettingsError
 
 if TYPE_CHECKING:
     from px4fuse.report.document import Document
 
-AXES = ("north", "east", "down", "aisle")
 SEVERITIES = ("error", "warning", "info")
 MAX_NOTES_BYTES = 200_000
-# Options that name places or people; the command line in the report leaves them out
-NOT_RECORDED = ("log", "output", "json_path", "student", "student_id", "notes", "fail_on")
 
 
 @click.command()
 @click.argument("log", type=click.Path(path_type=Path))
-@click.option(
-    "--sigma-a",
-    type=float,
-    default=0.5,
-    show_default=True,
-    metavar="M/S²",
-    help="Process noise SIGMA_A, 0.0001 to 100.",
-)
-@click.option(
-    "--sigma-z",
-    type=float,
-    default=0.10,
-    show_default=True,
-    metavar="M",
-    help="Measurement noise SIGMA_Z, 0.0001 to 100.",
-)
-@click.option(
-    "--dt",
-    type=float,
-    default=0.1,
-    show_default=True,
-    metavar="S",
-    help="Prediction step DT, 0.001 to 1; Q is proportional to it.",
-)
-@click.option(
-    "--input",
-    "input_name",
-    type=click.Choice(["imu", "zero"]),
-    default=None,
-    help="Acceleration from the IMU, or constant velocity.  [default: imu where logged]",
-)
-@click.option(
-    "--axis",
-    "axes",
-    type=click.Choice(AXES),
-    multiple=True,
-    help="Axis to analyse; may be repeated.  [default: all that the source supports]",
-)
-@click.option(
-    "--heading",
-    type=float,
-    default=None,
-    metavar="DEG",
-    help="Heading of the aisle, clockwise from north.  [default: from the track]",
-)
-@click.option(
-    "--start",
-    type=float,
-    default=None,
-    metavar="S",
-    help="Start, seconds from the first data.  [default: take-off]",
-)
-@click.option("--end", type=float, default=None, metavar="S", help="End.  [default: touch-down]")
-@click.option(
-    "--position-source",
-    default=None,
-    metavar="NAME",
-    help="Position source, for example vehicle_gps_position.  [default: the best logged]",
-)
-@recording_options
-@position_options
-@clock_offset_option
+@analysis_options
 @click.option("--student", default="", metavar="NAME", help="Name on the report.")
 @click.option("--id", "student_id", default="", metavar="ID", help="Student number on the report.")
 @click.option(
@@ -128,26 +55,13 @@ NOT_RECORDED = ("log", "output", "json_path", "student", "student_id", "notes", 
 )
 def compare(
     log: Path,
-    sigma_a: float,
-    sigma_z: float,
-    dt: float,
-    input_name: str | None,
-    axes: tuple[str, ...],
-    heading: float | None,
-    start: float | None,
-    end: float | None,
-    position_source: str | None,
-    mavlink: Path | None,
-    system: int | None,
-    position: Path | None,
-    clock_offset: float | str | None,
     student: str,
     student_id: str,
     notes: Path | None,
     output: Path | None,
     json_path: Path | None,
     fail_on: str | None,
-    **position_format: Any,
+    **analysis: Any,
 ) -> None:
     """Compare a flight's EKF2 with a two-state Kalman filter over IMU and position.
 
@@ -156,43 +70,17 @@ def compare(
     """
     from rich.console import Console
 
-    from px4fuse import comparison
     from px4fuse.findings import find
-    from px4fuse.kalman import InputName, Settings
     from px4fuse.report.document import Document, Student
     from px4fuse.report.results import results, to_json
 
-    settings = Settings(
-        sigma_a_m_s2=sigma_a,
-        sigma_z_m=sigma_z,
-        dt_s=dt,
-        input=cast(InputName, input_name or "imu"),
-        # that of a position file is spent on placing it
-        clock_offset_s=clock_offset if isinstance(clock_offset, float) and not position else 0.0,
-    )
-    for name, value in (("--start", start), ("--end", end), ("--clock-offset", clock_offset)):
-        if isinstance(value, float) and not abs(value) < float("inf"):
-            raise SettingsError(f"{name} {value:g} is not a finite number.")
-    person = Student(_encodable(student), _encodable(student_id), _read_notes(notes))
+    person = Student(encodable(student), encodable(student_id), _read_notes(notes))
     target = output or Path("reports") / f"{log.stem}.pdf"
     if target.suffix.lower() != ".pdf":
         raise OutputError(f"{target}: the report is a PDF. Give a name that ends in .pdf with -o.")
-    with _progress(json_path) as step:
-        step(f"reading {log.name}")
-        flight = read_recordings(log, mavlink, system)
-        flight = with_position(flight, position, clock_offset, **position_format)
-        compared = comparison.compare(
-            flight,
-            settings,
-            axes=axes or None,
-            heading_deg=heading,
-            position_source=position_source,
-            start_s=start,
-            end_s=end,
-            input_required=input_name == "imu",
-            progress=lambda name: step(f"filtering {name}"),
-        )
-        document = Document(compared, find(compared), person, _command_line(log))
+    with progress(json_path == Path("-")) as step:
+        compared = run_comparison(log, step, **analysis)
+        document = Document(compared, find(compared), person, command_line("compare", log))
         found = results(document)
         _write(document, found, target, json_path, step)
     if json_path == Path("-"):
@@ -207,24 +95,6 @@ def compare(
         worst = SEVERITIES[: SEVERITIES.index(fail_on) + 1]
         if any(finding.severity in worst for finding in document.findings):
             sys.exit(1)
-
-
-@contextmanager
-def _progress(json_path: Path | None) -> Iterator[Callable[[str], None]]:
-    """Say what is being done on a terminal; be quiet in a pipe."""
-    from rich.console import Console
-
-    console = Console(stderr=True)
-    if not console.is_terminal or json_path == Path("-"):
-        yield lambda _: None
-        return
-    with console.status("starting") as status:
-        yield status.update
-
-
-def _encodable(text: str) -> str:
-    """Text without the stray bytes that a terminal may hand over."""
-    return text.encode(errors="replace").decode()
 
 
 def _read_notes(path: Path | None) -> str:
@@ -245,22 +115,6 @@ def _read_notes(path: Path | None) -> str:
         raise SettingsError(
             f"--notes {path}: not UTF-8 text (byte {error.start}). Save it as UTF-8."
         ) from error
-
-
-def _command_line(log: Path) -> str:
-    """The command that makes this report again: what was given, without folders and names."""
-    context = click.get_current_context()
-    words = ["px4fuse", "compare", _encodable(log.name)]
-    for parameter in context.command.params:
-        name = parameter.name or ""
-        given = context.get_parameter_source(name) == ParameterSource.COMMANDLINE
-        if not given or name in NOT_RECORDED:
-            continue
-        value: Any = context.params[name]
-        for single in value if isinstance(value, tuple) else (value,):
-            text = single.name if isinstance(single, Path) else str(single)
-            words += [parameter.opts[-1], _encodable(text)]
-    return shlex.join(words)
 
 
 def _write(

@@ -9,13 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from px4fuse.cli.inputs import (
-    clock_offset_option,
-    position_options,
-    read_recordings,
-    recording_options,
-    with_position,
-)
+from px4fuse.cli.inputs import read_recordings, recording_options, with_position
 from px4fuse.errors import OutputError
 
 if TYPE_CHECKING:
@@ -44,8 +38,6 @@ FORMATS = ("csv", "parquet")
     help='Of the tables; Parquet needs pip install "px4fuse[parquet]".',
 )
 @recording_options
-@position_options
-@clock_offset_option
 def extract(
     log: Path,
     folder: Path,

@@ -8,13 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from px4fuse.cli.inputs import (
-    clock_offset_option,
-    position_options,
-    read_recordings,
-    recording_options,
-    with_position,
-)
+from px4fuse.cli.inputs import read_recordings, recording_options, with_position
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -34,8 +28,6 @@ if TYPE_CHECKING:
     help="Write it as JSON; - prints that alone on standard output.",
 )
 @recording_options
-@position_options
-@clock_offset_option
 def info(
     log: Path,
     json_path: Path | None,

@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import shlex
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, cast
 
 import click
+from click.core import ParameterSource
 
 from px4fuse.errors import LogError, SettingsError
 
 if TYPE_CHECKING:
+    from px4fuse.comparison import Comparison
     from px4fuse.flight import Flight
 
+AXES = ("north", "east", "down", "aisle")
+# Options that name places or people; the command line in the report leaves them out
+NOT_RECORDED = ("log", "output", "json_path", "student", "student_id", "notes", "fail_on")
 AUTO: Literal["auto"] = "auto"
 
 
@@ -33,6 +40,69 @@ class NumberOrAuto(click.ParamType[float | str]):
             self.fail(f"{value!r} is neither a number nor 'auto'.", param, ctx)
 
 
+_ANALYSIS = (
+    click.option(
+        "--sigma-a",
+        type=float,
+        default=0.5,
+        show_default=True,
+        metavar="M/S²",
+        help="Process noise SIGMA_A, 0.0001 to 100.",
+    ),
+    click.option(
+        "--sigma-z",
+        type=float,
+        default=0.10,
+        show_default=True,
+        metavar="M",
+        help="Measurement noise SIGMA_Z, 0.0001 to 100.",
+    ),
+    click.option(
+        "--dt",
+        type=float,
+        default=0.1,
+        show_default=True,
+        metavar="S",
+        help="Prediction step DT, 0.001 to 1; Q is proportional to it.",
+    ),
+    click.option(
+        "--input",
+        "input_name",
+        type=click.Choice(["imu", "zero"]),
+        default=None,
+        help="Acceleration from the IMU, or constant velocity.  [default: imu where logged]",
+    ),
+    click.option(
+        "--axis",
+        "axes",
+        type=click.Choice(AXES),
+        multiple=True,
+        help="Axis to analyse; may be repeated.  [default: all that the source supports]",
+    ),
+    click.option(
+        "--heading",
+        type=float,
+        default=None,
+        metavar="DEG",
+        help="Heading of the aisle, clockwise from north.  [default: from the track]",
+    ),
+    click.option(
+        "--start",
+        type=float,
+        default=None,
+        metavar="S",
+        help="Start, seconds from the first data.  [default: take-off]",
+    ),
+    click.option(
+        "--end", type=float, default=None, metavar="S", help="End.  [default: touch-down]"
+    ),
+    click.option(
+        "--position-source",
+        default=None,
+        metavar="NAME",
+        help="Position source, for example vehicle_gps_position.  [default: the best logged]",
+    ),
+)
 _RECORDINGS = (
     click.option(
         "--mavlink",
@@ -91,16 +161,26 @@ _POSITION = (
 )
 
 
+clock_offset_option = click.option(
+    "--clock-offset",
+    type=NumberOrAuto(),
+    default=None,
+    metavar="S|auto",
+    help="Added to the position source's time stamps.  [default: 0; auto with --position]",
+)
+
+
 def recording_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Add the options that name further recordings by the autopilot."""
-    for option in reversed(_RECORDINGS):
+    """Add the options that say which recordings of the flight are read, and how."""
+    for option in reversed((*_RECORDINGS, *_POSITION, clock_offset_option)):
         command = option(command)
     return command
 
 
-def position_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Add the options that bring in an external position file."""
-    for option in reversed(_POSITION):
+def analysis_options(command: Callable[..., None]) -> Callable[..., None]:
+    """Add the options of every command that runs the filter: settings, segment and recordings."""
+    command = recording_options(command)
+    for option in reversed(_ANALYSIS):
         command = option(command)
     return command
 
@@ -118,15 +198,6 @@ def read_recordings(log: Path, mavlink: Path | None, system: int | None) -> Flig
     if not other.log.format.startswith("MAVLink"):
         raise LogError(f"--mavlink {mavlink.name}: a {other.log.format}, no MAVLink recording.")
     return join(flight, other)
-
-
-clock_offset_option = click.option(
-    "--clock-offset",
-    type=NumberOrAuto(),
-    default=None,
-    metavar="S|auto",
-    help="Added to the position source's time stamps.  [default: 0; auto with --position]",
-)
 
 
 def with_position(
@@ -172,3 +243,87 @@ def with_position(
         yaw_deg=options["position_yaw"],
         clock_offset_s=clock_offset if isinstance(clock_offset, float) else None,
     )
+
+
+def run_comparison(
+    log: Path,
+    step: Callable[[str], None],
+    *,
+    sigma_a: float,
+    sigma_z: float,
+    dt: float,
+    input_name: str | None,
+    axes: tuple[str, ...],
+    heading: float | None,
+    start: float | None,
+    end: float | None,
+    position_source: str | None,
+    mavlink: Path | None,
+    system: int | None,
+    position: Path | None,
+    clock_offset: float | str | None,
+    **position_format: Any,
+) -> Comparison:
+    """Read what :func:`analysis_options` name and run the filter over it."""
+    from px4fuse import comparison
+    from px4fuse.kalman import InputName, Settings
+
+    settings = Settings(
+        sigma_a_m_s2=sigma_a,
+        sigma_z_m=sigma_z,
+        dt_s=dt,
+        input=cast(InputName, input_name or "imu"),
+        # that of a position file is spent on placing it
+        clock_offset_s=clock_offset if isinstance(clock_offset, float) and not position else 0.0,
+    )
+    for name, value in (("--start", start), ("--end", end), ("--clock-offset", clock_offset)):
+        if isinstance(value, float) and not abs(value) < float("inf"):
+            raise SettingsError(f"{name} {value:g} is not a finite number.")
+    step(f"reading {log.name}")
+    flight = read_recordings(log, mavlink, system)
+    flight = with_position(flight, position, clock_offset, **position_format)
+    return comparison.compare(
+        flight,
+        settings,
+        axes=axes or None,
+        heading_deg=heading,
+        position_source=position_source,
+        start_s=start,
+        end_s=end,
+        input_required=input_name == "imu",
+        progress=lambda name: step(f"filtering {name}"),
+    )
+
+
+@contextmanager
+def progress(quiet: bool) -> Iterator[Callable[[str], None]]:
+    """Say what is being done on a terminal; be quiet in a pipe."""
+    from rich.console import Console
+
+    console = Console(stderr=True)
+    if not console.is_terminal or quiet:
+        yield lambda _: None
+        return
+    with console.status("starting") as status:
+        yield status.update
+
+
+def encodable(text: str) -> str:
+    """Text without the stray bytes that a terminal may hand over."""
+    return text.encode(errors="replace").decode()
+
+
+def command_line(command: str, log: Path) -> str:
+    """The command that makes this again: what was given, without folders and names."""
+    context = click.get_current_context()
+    words = ["px4fuse", command, encodable(log.name)]
+    for parameter in context.command.params:
+        name = parameter.name or ""
+        given = context.get_parameter_source(name) == ParameterSource.COMMANDLINE
+        if not given or name in NOT_RECORDED:
+            continue
+        value: Any = context.params[name]
+        for single in value if isinstance(value, tuple) else (value,):
+            text = single.name if isinstance(single, Path) else str(single)
+            words += [parameter.opts[-1], encodable(text)]
+    return shlex.join(words)
