@@ -50,6 +50,10 @@ def join(flight: Flight, other: Flight) -> Flight:
     MissingDataError
         The two do not overlap in time, or are not of the same flight.
     """
+    if other.log.sha256 == flight.log.sha256:
+        raise MissingDataError(
+            f"{other.log.name}: the same recording twice. Give the other recording of the flight."
+        )
     shift_s = other.log.boot_time_s - flight.log.boot_time_s
     low, high = max(0.0, shift_s), min(flight.log.duration_s, shift_s + other.log.duration_s)
     if high - low < MIN_OVERLAP_S:

@@ -162,6 +162,9 @@ class Aisle:
     estimator : int
         MAV_ESTIMATOR_TYPE of ``uwb`` where that is ODOMETRY.
     noise_m : float
+    imu_hz : float
+    state : str or None
+        The message that carries EKF2's state, at 20 Hz.
     """
 
     seconds: float = 40.0
@@ -178,6 +181,7 @@ class Aisle:
     uwb: str | None = "VISION_POSITION_ESTIMATE"
     estimator: int = 2
     noise_m: float = 0.0
+    imu_hz: float = 50.0
     state: str | None = "ODOMETRY"
     seed: int = 1
 
@@ -198,7 +202,7 @@ class Aisle:
                     "SYSTEM_TIME", time_boot_ms=ms(boot), time_unix_usec=us(unix(boot)),
                 ))  # fmt: skip
             hear(boot, companion, heartbeat(kind=18, autopilot=8))
-        for boot in self.times(50.0):
+        for boot in self.times(self.imu_hz):
             force = self.path(boot)[2] - [0.0, 0.0, GRAVITY_M_S2]
             hear(boot, autopilot, message("HIGHRES_IMU", time_usec=us(boot), **xyz(force, "acc")))
         for boot in self.times(20.0):

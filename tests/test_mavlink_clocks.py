@@ -121,11 +121,7 @@ def test_an_outage_of_the_link_does_not_bend_the_line():
     np.testing.assert_allclose(line.at(x), x + 0.01, atol=1e-6)
 
 
-@given(
-    st.lists(
-        st.tuples(st.floats(-1e13, 1e13), st.floats(-1e13, 1e13)), min_size=1, max_size=60
-    )
-)
+@given(st.lists(st.tuples(st.floats(-1e13, 1e13), st.floats(-1e13, 1e13)), min_size=1, max_size=60))
 @settings(max_examples=100, deadline=None)
 def test_any_pairs_give_a_line_that_can_be_turned_round(pairs):
     x, y = np.array(pairs).T
@@ -268,8 +264,9 @@ def test_stamps_of_two_values_do_not_tell_the_time(read, asks):
     rng = np.random.default_rng(1)
     for i, boot in enumerate(aisle.times(5.0)):
         made = message(
-            "VISION_POSITION_ESTIMATE", usec=us(UNIX_S) + (i >= 100), x=float(i), covariance=[0] * 21
-        )
+            "VISION_POSITION_ESTIMATE", usec=us(UNIX_S) + (i >= 100), x=float(i),
+            covariance=[0] * 21,
+        )  # fmt: skip
         recorder.hear(unix(boot + aisle.delay(rng)), COMPANION, made)
     flight = read(recorder)
     track = flight.positions[0]
@@ -493,8 +490,6 @@ def test_the_statement_says_what_the_map_does():
     assert line is not None
     assert statement.drift_ppm == pytest.approx(100.0, abs=0.1)
     middle = 0.5 * (stamps[0] + stamps[-1])
-    by_statement = (
-        stamps + statement.offset_s + statement.drift_ppm * 1e-6 * (stamps - middle)
-    )
+    by_statement = stamps + statement.offset_s + statement.drift_ppm * 1e-6 * (stamps - middle)
     np.testing.assert_allclose(by_statement, line.at(stamps), atol=2e-6)
     np.testing.assert_allclose(by_statement, received, atol=2e-6)

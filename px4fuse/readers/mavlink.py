@@ -21,7 +21,6 @@ from px4fuse.flight import (
     LogInfo,
     Unavailable,
     Unused,
-    finite_rows,
     missing_parts,
     stretches_of_flight,
 )
@@ -113,16 +112,19 @@ def _read_imu(recording: Recording) -> pd.DataFrame | Unavailable:
     table = recording.frames.table(source.message, rows)
     if "id" in (table.dtype.names or ()):
         busiest = table["id"] == np.bincount(table["id"]).argmax()
-        rows, table = rows[busiest], table[busiest]
-    values = np.column_stack(
-        [
-            vector(table, "xacc", "yacc", "zacc", scale=source.acceleration_unit),
-            vector(table, "xgyro", "ygyro", "zgyro", scale=source.angular_rate_unit),
-        ]
-    )
+        if not np.all(busiest):
+            rows, table = rows[busiest], table[busiest]
+    boot_s = recording.boot_s(table, rows)
+    # an hour of it is hundreds of megabytes, so that nothing is kept twice
+    values = np.empty((len(rows), 6))
+    values[:, :3] = vector(table, "xacc", "yacc", "zacc", scale=source.acceleration_unit)
+    values[:, 3:] = vector(table, "xgyro", "ygyro", "zgyro", scale=source.angular_rate_unit)
+    del table
     columns = SPECIFIC_FORCE_COLUMNS + ANGULAR_RATE_COLUMNS
-    imu = recording.frame(source.message, recording.boot_s(table, rows), columns, values)
-    imu = finite_rows(imu, columns)
+    usable = np.isfinite(values).all(axis=1)
+    if not np.all(usable):
+        boot_s, values = boot_s[usable], values[usable]
+    imu = recording.frame(source.message, boot_s, columns, values)
     if len(imu) < 2:
         return Unavailable(
             "IMU",
@@ -169,7 +171,7 @@ def _read_airborne(recording: Recording) -> tuple[tuple[float, float], ...] | Un
         return Unavailable(
             "land detector",
             "no usable EXTENDED_SYS_STATE",
-            "Set its stream rate to 1 Hz or more, or give --start and --end.",
+            "Set the stream rate of EXTENDED_SYS_STATE to 1 Hz, or give --start and --end.",
         )
     recording.came_from("airborne", RECEIPT_CLOCK, "EXTENDED_SYS_STATE")
     time_s = recording.receipt_boot_s(rows[known]) - recording.zero_s

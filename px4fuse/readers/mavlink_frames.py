@@ -36,6 +36,8 @@ SIGNED = 0x01
 STAMP = 8
 # Bytes that are scanned at a time, which bounds the memory that hostile bytes can claim
 BLOCK = 1 << 16
+# Frames that are gathered at a time
+PIECE = 1 << 12
 # Below this share of bytes in good frames a file is no MAVLink recording: chance makes one frame
 # in about eight million random bytes.
 MIN_GOOD_SHARE = 0.01
@@ -123,7 +125,10 @@ class Frames:
             if size:
                 of_length = np.flatnonzero(lengths == length)
                 windows = np.lib.stride_tricks.sliding_window_view(source, size)
-                payload[of_length, :size] = windows[starts[of_length]]
+                # a piece at a time: what is gathered is a copy
+                for at in range(0, len(of_length), PIECE):
+                    part = of_length[at : at + PIECE]
+                    payload[part, :size] = windows[starts[part]]
         return payload.view(layout)[:, 0]
 
 

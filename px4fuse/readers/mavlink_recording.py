@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from px4fuse.errors import SettingsError
 from px4fuse.flight import ClockMap, Sender, Stream
 from px4fuse.readers.mavlink_clocks import (
+    OTHER_SPEED,
     UNIX_FROM_S,
     Exchanges,
     Line,
@@ -115,6 +116,18 @@ class Recording:
         columns : list of str, length m
         values : ndarray, shape (n, m)
         """
+        keep = self._keep(name, boot_s)
+        kept = values[keep]
+        kept[~np.isfinite(kept)] = np.nan
+        return pd.DataFrame(
+            kept,
+            index=pd.Index(boot_s[keep] - self.zero_s, name="time_s"),
+            columns=columns,
+            copy=False,  # it is a copy already
+        )
+
+    def _keep(self, name: str, boot_s: Array) -> Rows:
+        """Samples with a possible time stamp, strictly increasing; the others are counted."""
         # false for NaN too
         late_s = boot_s - self.zero_s
         inside = (late_s >= -OUTSIDE_S) & (late_s <= self.duration_s + OUTSIDE_S)
@@ -122,16 +135,11 @@ class Recording:
         time_us = np.rint(boot_s[rows] * 1e6).astype(np.int64)
         # one message that came over two links is one sample
         first = np.sort(np.unique(time_us, return_index=True)[1])
-        keep = rows[first[increasing(time_us[first])]]
+        keep: Rows = rows[first[increasing(time_us[first])]]
         dropped = len(boot_s) - len(rows) + len(first) - len(keep)
         if dropped:
             self.dropped[name] = dropped
-        kept = values[keep]
-        return pd.DataFrame(
-            np.where(np.isfinite(kept), kept, np.nan),
-            index=pd.Index(boot_s[keep] - self.zero_s, name="time_s"),
-            columns=columns,
-        )
+        return keep
 
     def receipt_boot_s(self, rows: Rows) -> Array:
         """Boot clock (s) at which frames were received, less the link's least delay."""
@@ -388,7 +396,9 @@ def clock_maps(recording: Recording, mapped: dict[Address, Mapped]) -> tuple[Clo
                 line.y0 - line.x0 - float(received_us[0]) * 1e-6,
                 (line.slope - 1.0) * 1e6,
                 line.jitter,
-                "by the least delayed messages; used only to order messages and to map clocks",
+                "by the least delayed messages; used only to order messages and to map clocks"
+                if abs(line.slope - 1.0) < OTHER_SPEED
+                else "the recording did not run at the flight's own speed (a replay?)",
             )
         )
     return tuple(clocks)

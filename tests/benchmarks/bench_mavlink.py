@@ -1,0 +1,106 @@
+"""Speed and memory of the MAVLink reader, against pymavlink's own reader of the same file.
+
+Both decode every message: ours into columns, pymavlink's ``recv_match`` into one object each. They
+run in turn, so that the ratio holds on a machine whose speed drifts. Nothing here can fail: run it,
+read it.
+
+    python tests/benchmarks/bench_mavlink.py [RUNS] [FILE ...]
+"""
+
+from __future__ import annotations
+
+import os
+import statistics
+import sys
+import tempfile
+import time
+import tracemalloc
+from collections.abc import Callable
+from pathlib import Path
+
+os.environ["MAVLINK20"] = "1"
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+LOG = Path(__file__).parents[2] / "sample_logs" / "aisle_uwb.tlog"
+MINUTES = 10
+RATE_HZ = 200
+
+
+def ours(path: Path) -> int:
+    """Frames, and every message type into columns."""
+    import numpy as np
+
+    from px4fuse.readers.mavlink_frames import message_name, read_frames
+
+    frames = read_frames(path)
+    for number in np.unique(frames.message_id).tolist():
+        name = message_name(number)
+        frames.table(name, frames.rows(name))
+    return len(frames)
+
+
+def pymavlinks(path: Path) -> int:
+    from pymavlink import mavutil
+
+    link = mavutil.mavlink_connection(str(path), dialect="all", notimestamps=path.suffix != ".tlog")
+    count = 0
+    while (made := link.recv_match()) is not None:
+        kind = made.get_type()
+        count += kind != "BAD_DATA" and not kind.startswith("UNKNOWN")
+    link.close()
+    return count
+
+
+def synthetic(path: Path) -> Path:
+    """Ten minutes at 200 messages per second, of the made aisle flight."""
+    from mavlink_tools import Aisle
+
+    # 68 messages per second beside the IMU, over a link that keeps their order
+    aisle = Aisle(
+        seconds=60.0 * MINUTES,
+        imu_hz=RATE_HZ - 68.0,
+        delay=lambda rng: 0.002 + rng.exponential(0.0003),
+    )
+    path.write_bytes(aisle.record().tlog())
+    return path
+
+
+def seconds(work: Callable[[Path], object], path: Path) -> float:
+    start = time.perf_counter()
+    work(path)
+    return time.perf_counter() - start
+
+
+def memory(work: Callable[[Path], object], path: Path) -> float:
+    """Peak over the size of the file."""
+    tracemalloc.start()
+    work(path)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    return peak / path.stat().st_size
+
+
+def main() -> None:
+    from px4fuse.readers import read_log
+
+    runs = int(sys.argv[1]) if len(sys.argv) > 1 else 5
+    with tempfile.TemporaryDirectory() as folder:
+        files = [Path(name) for name in sys.argv[2:]] or [LOG]
+        files.append(synthetic(Path(folder) / f"{MINUTES}_minutes.tlog"))
+        for path in files:
+            count, theirs = ours(path), pymavlinks(path)
+            read_log(path)  # tables that are made once
+            pairs = [(seconds(pymavlinks, path), seconds(ours, path)) for _ in range(runs)]
+            whole = statistics.median(seconds(read_log, path) for _ in range(runs))
+            ratio = statistics.median(a / b for a, b in pairs)
+            a = statistics.median(a for a, _ in pairs)
+            b = statistics.median(b for _, b in pairs)
+            print(
+                f"{path.name}: recv_match / ours: {ratio:.1f} ({a:.2f} s / {b:.3f} s, {runs} pairs,"
+                f" {theirs} and {count} messages); read_log {whole:.3f} s, peak memory "
+                f"{memory(read_log, path):.2f} times the file's {path.stat().st_size / 1e6:.1f} MB"
+            )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,244 @@
+"""Two recordings of one flight become one; recordings of two flights do not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+from flights import aisle_flight
+from mavlink_tools import BOOT_S, Aisle, unix
+from ulog_tools import load
+
+from px4fuse.errors import MissingDataError
+from px4fuse.flight import AXIS_NAMES, POSITION_COLUMNS, Ekf2, Flight, Unavailable
+from px4fuse.joining import join
+from px4fuse.readers import read_log
+
+POSITION_TOPICS = ("vehicle_visual_odometry", "estimator_aid_src_ev_pos")
+
+
+@pytest.fixture(scope="module")
+def tlog_flight(sample_log) -> Flight:
+    return read_log(sample_log.with_suffix(".tlog"))
+
+
+@pytest.fixture(scope="module")
+def stripped(sample_log, tmp_path_factory) -> Flight:
+    """The sample ULog as SDLOG_PROFILE 1 on v1.15 would have left it: no position topics."""
+    log = load(sample_log)
+    log.drop(*(name for name in log.names() if name.startswith(POSITION_TOPICS)))
+    path = tmp_path_factory.mktemp("stripped") / "stripped.ulg"
+    return read_log(log.write(path))
+
+
+@pytest.fixture
+def record(tmp_path):
+    def write_and_read(aisle: Aisle, name: str = "made.tlog", *leave_out: str) -> Flight:
+        recorder = aisle.record()
+        recorder.sent = [s for s in recorder.sent if s[2].get_type() not in leave_out]
+        path = tmp_path / name
+        path.write_bytes(recorder.tlog())
+        return read_log(path)
+
+    return write_and_read
+
+
+def boot(flight: Flight, samples: pd.DataFrame) -> np.ndarray:
+    return samples.index.to_numpy() + flight.log.boot_time_s
+
+
+def track(flight: Flight, name: str):
+    return next(track for track in flight.positions if track.name == name)
+
+
+# ---- the sample -------------------------------------------------------------------------------
+
+
+def test_a_ulog_without_positions_gets_them_back_from_the_tlog(
+    stripped, tlog_flight, sample_flight
+):
+    assert "vehicle_visual_odometry" not in [t.name for t in stripped.positions]
+    joined = join(stripped, tlog_flight)
+    assert joined.positions[0].name == "VISION_POSITION_ESTIMATE"
+    mine = joined.positions[0].samples
+    truth = track(sample_flight, "vehicle_visual_odometry").samples
+    nearest = pd.merge_asof(
+        pd.DataFrame(index=pd.Index(boot(sample_flight, truth), name="t")).assign(
+            **truth[POSITION_COLUMNS].reset_index(drop=True).set_axis(boot(sample_flight, truth))
+        ),
+        mine[POSITION_COLUMNS].set_axis(pd.Index(boot(joined, mine), name="t")),
+        left_index=True, right_index=True, direction="nearest", tolerance=1e-3,
+    )  # fmt: skip
+    assert len(nearest) == len(truth)
+    left = nearest[[f"{c}_x" for c in POSITION_COLUMNS]].to_numpy()
+    right = nearest[[f"{c}_y" for c in POSITION_COLUMNS]].to_numpy()
+    np.testing.assert_allclose(left, right, atol=1e-6)
+
+
+def test_the_first_recording_keeps_what_it_has(stripped, tlog_flight):
+    joined = join(stripped, tlog_flight)
+    assert joined.log.boot_time_s == stripped.log.boot_time_s
+    assert joined.imu is stripped.imu
+    assert joined.attitude is stripped.attitude
+    assert joined.truth is stripped.truth
+    assert joined.airborne == stripped.airborne
+    assert isinstance(stripped.ekf2, Ekf2)
+    assert joined.ekf2.state is stripped.ekf2.state
+    assert joined.streams["imu"].log == "stripped.ulg"
+    assert joined.log.senders == tlog_flight.log.senders
+    [given] = joined.inputs
+    assert given.name == "aisle_uwb.tlog"
+    assert given.sha256 == tlog_flight.log.sha256
+    assert given.role == "mavlink"
+
+
+def test_the_join_is_noted_with_how_well_both_agree(sample_flight, tlog_flight):
+    note = join(sample_flight, tlog_flight).log.notes[-1]
+    assert "joined with aisle_uwb.tlog" in note
+    assert "129.7 s in common" in note
+    assert "EKF2 positions differ by 0.001 m (median)" in note
+
+
+def test_tracks_stand_in_the_order_of_the_ladder(sample_flight, tlog_flight):
+    for joined in (join(sample_flight, tlog_flight), join(tlog_flight, sample_flight)):
+        rungs = [t.rung for t in joined.positions]
+        assert rungs == sorted(rungs)
+        names = {t.name for t in joined.positions}
+        assert {"vehicle_visual_odometry", "VISION_POSITION_ESTIMATE"} <= names
+
+
+def test_either_way_round_says_the_same_on_the_boot_clock(sample_flight, tlog_flight):
+    one, other = join(sample_flight, tlog_flight), join(tlog_flight, sample_flight)
+    for name in ("vehicle_visual_odometry", "VISION_POSITION_ESTIMATE"):
+        first, second = track(one, name).samples, track(other, name).samples
+        np.testing.assert_allclose(boot(one, first), boot(other, second), atol=1e-6)
+    assert isinstance(other.ekf2, Ekf2)
+    # MAVLink does not carry innovations, and only a lacking estimator is replaced
+    assert isinstance(other.ekf2.innovations["north"], Unavailable)
+
+
+# ---- made recordings ----------------------------------------------------------------------------
+
+
+def test_every_part_that_lacks_is_taken_and_moved(record):
+    """The other recording began five seconds later."""
+    bare = record(
+        Aisle(uwb=None), "bare.tlog",
+        "HIGHRES_IMU", "ATTITUDE_QUATERNION", "EXTENDED_SYS_STATE", "ODOMETRY",
+    )  # fmt: skip
+    assert bare.log.duration_s == 0.0 or isinstance(bare.imu, Unavailable)
+    bare = replace(bare, log=replace(bare.log, boot_time_s=BOOT_S, duration_s=40.0))
+    full = record(Aisle(seconds=40.0, start_s=BOOT_S + 5.0), "full.tlog")
+    joined = join(bare, full)
+    for part in ("imu", "attitude", "airborne", "ekf2"):
+        assert isinstance(getattr(bare, part), Unavailable)
+        assert not isinstance(getattr(joined, part), Unavailable)
+    np.testing.assert_allclose(boot(joined, joined.imu), boot(full, full.imu), atol=1e-9)
+    np.testing.assert_allclose(
+        boot(joined, joined.ekf2.state), boot(full, full.ekf2.state), atol=1e-9
+    )
+    np.testing.assert_allclose(
+        boot(joined, joined.ekf2.variance), boot(full, full.ekf2.variance), atol=1e-9
+    )
+    np.testing.assert_allclose(joined.airborne, np.array(full.airborne) + 5.0, atol=1e-9)
+    assert joined.streams["imu"] == full.streams["imu"]
+    assert joined.streams["ekf2_variance"] == full.streams["ekf2_variance"]
+    assert "could not be checked" in joined.log.notes[-1]
+
+
+def test_missing_names_what_still_lacks_and_nothing_else(record):
+    """An estimator that was taken brings what it lacks with it."""
+    bare = record(Aisle(uwb=None), "bare.tlog", "ODOMETRY", "HIGHRES_IMU")
+    full = record(Aisle(), "full.tlog")
+    assert {"EKF2", "IMU"} <= {part.what for part in bare.missing}
+    joined = join(bare, full)
+    whats = [part.what for part in joined.missing]
+    assert "EKF2" not in whats
+    assert "IMU" not in whats
+    assert whats.count("ground truth") == 1
+    for axis in AXIS_NAMES:
+        assert f"EKF2 innovations, {axis}" in whats
+    assert len(whats) == len(set(whats))
+
+
+def test_variances_alone_are_taken_too(record):
+    poor = record(Aisle(state="LOCAL_POSITION_NED"), "poor.tlog")
+    rich = record(Aisle(seed=5), "rich.tlog")
+    assert isinstance(poor.ekf2.variance, Unavailable)
+    joined = join(poor, rich)
+    assert joined.ekf2.state is poor.ekf2.state
+    assert isinstance(joined.ekf2.variance, pd.DataFrame)
+    assert joined.streams["ekf2_variance"].log == "rich.tlog"
+    assert joined.streams["ekf2_state"].log == "poor.tlog"
+    assert "EKF2 variances" not in [part.what for part in joined.missing]
+
+
+def test_senders_and_unix_time_are_taken(record):
+    ulog = aisle_flight(duration_s=40.0, ekf2=None, attitude_hz=None)
+    ulog = replace(ulog, log=replace(ulog.log, boot_time_s=BOOT_S))
+    flight = record(Aisle(system_time=True))
+    joined = join(ulog, flight)
+    assert joined.log.start_unix_s == pytest.approx(unix(BOOT_S), abs=1e-2)
+    assert joined.log.senders == flight.log.senders
+    assert flight.clocks[0] in joined.clocks
+
+
+def test_unix_time_is_moved_to_the_first_recordings_zero(record):
+    """Time zero of the joined flight is the first one's."""
+    ulog = aisle_flight(duration_s=60.0, ekf2=None, attitude_hz=None)
+    ulog = replace(ulog, log=replace(ulog.log, boot_time_s=BOOT_S - 10.0))
+    joined = join(ulog, record(Aisle(system_time=True)))
+    assert joined.log.start_unix_s == pytest.approx(unix(BOOT_S - 10.0), abs=1e-2)
+
+
+# ---- refusals -----------------------------------------------------------------------------------
+
+
+def test_recordings_that_do_not_overlap_are_refused_with_both_spans(record):
+    first = record(Aisle(seconds=20.0), "first.tlog")
+    second = record(Aisle(seconds=20.0, start_s=BOOT_S + 30.0), "second.tlog")
+    with pytest.raises(MissingDataError) as caught:
+        join(first, second)
+    text = str(caught.value)
+    assert "first.tlog and second.tlog do not overlap" in text
+    assert "50.0 s to 70.0 s" in text
+    assert "80.0 s to 100.0 s" in text
+
+
+def test_another_flight_is_refused_by_its_positions(sample_flight, tlog_flight):
+    elsewhere = replace(
+        tlog_flight,
+        ekf2=replace(tlog_flight.ekf2, state=tlog_flight.ekf2.state + 3.0),
+    )
+    with pytest.raises(MissingDataError, match="not of the same flight: EKF2's positions differ"):
+        join(sample_flight, elsewhere)
+
+
+def test_another_flight_is_refused_by_its_attitude(record):
+    ulog = aisle_flight(duration_s=40.0, ekf2=None)
+    ulog = replace(ulog, log=replace(ulog.log, boot_time_s=BOOT_S))
+    with pytest.raises(MissingDataError, match=r"attitudes differ by 4[0-9]°"):
+        join(ulog, record(Aisle()))
+
+
+@pytest.mark.reallogs
+def test_two_flights_whose_boot_clocks_overlap_are_told_apart(shared_logs, sample_flight):
+    other = read_log(shared_logs / "mavlink" / "v1.16.1_aisle_clock_nosync.tlog")
+    other = replace(other, log=replace(other.log, boot_time_s=sample_flight.log.boot_time_s))
+    with pytest.raises(MissingDataError, match="not of the same flight"):
+        join(sample_flight, other)
+
+
+@pytest.mark.reallogs
+@pytest.mark.parametrize(
+    "name", ["v1.13.3_aisle_hwlogvision", "v1.16.1_aisle_clock_late", "v1.16.1_aisle_clock_nosync"]
+)
+def test_real_pairs_join(shared_logs, name):
+    ulog = read_log(shared_logs / "simulated" / f"{name}.ulg")
+    joined = join(ulog, read_log(shared_logs / "mavlink" / f"{name}.tlog"))
+    assert "EKF2 positions differ by 0.001 m" in joined.log.notes[-1]
+    assert {"VISION_POSITION_ESTIMATE", "vehicle_visual_odometry"} <= {
+        t.name for t in joined.positions
+    }

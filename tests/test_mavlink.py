@@ -1,0 +1,961 @@
+"""What a MAVLink recording means: units, frames, directions, and the ULog of the same flight.
+
+The fuzz tests make PX4FUSE_FUZZ_CASES cases (1600 unless that environment variable says
+otherwise), the same ones every time::
+
+    PX4FUSE_FUZZ_CASES=20000 python -m pytest tests/test_mavlink.py -k fuzz
+"""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import json
+import os
+import struct
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mavlink_tools import (
+    AUTOPILOT,
+    BOOT_S,
+    COMPANION,
+    GRAVITY_M_S2,
+    LEAST_DELAY_S,
+    MESSAGES,
+    POSE_VARIANCE,
+    VELOCITY_VARIANCE,
+    Aisle,
+    Recorder,
+    heartbeat,
+    message,
+    ms,
+    odometry,
+    raw_frame,
+    same,
+    stamp,
+    unix,
+    us,
+    xyz,
+)
+from scipy.spatial.transform import Rotation
+from test_bad_logs import patience
+
+from px4fuse.comparison import compare
+from px4fuse.errors import LogError, Px4FuseError, SettingsError
+from px4fuse.flight import (
+    ANGULAR_RATE_COLUMNS,
+    POSITION_COLUMNS,
+    POSITION_VARIANCE_COLUMNS,
+    QUATERNION_COLUMNS,
+    SPECIFIC_FORCE_COLUMNS,
+    VELOCITY_COLUMNS,
+    VELOCITY_VARIANCE_COLUMNS,
+    Ekf2,
+    Flight,
+    PositionTrack,
+    Truth,
+    Unavailable,
+)
+from px4fuse.kalman import Settings, state_at
+from px4fuse.readers import read_log
+from px4fuse.readers.mavlink_frames import read_frames
+
+FUZZ_CASES = int(os.environ.get("PX4FUSE_FUZZ_CASES", "1600"))
+STATE_COLUMNS = POSITION_COLUMNS + VELOCITY_COLUMNS
+VARIANCE_COLUMNS = POSITION_VARIANCE_COLUMNS + VELOCITY_VARIANCE_COLUMNS
+PAIRS = ("v1.13.3_aisle_hwlogvision", "v1.16.1_aisle_clock_late", "v1.16.1_aisle_clock_nosync")
+
+
+@pytest.fixture
+def read(tmp_path):
+    """Write a recording and read it as a flight."""
+
+    def write_and_read(recording: Aisle | Recorder, *, stamped: bool = True) -> Flight:
+        recorder = recording.record() if isinstance(recording, Aisle) else recording
+        path = tmp_path / "made.tlog"
+        path.write_bytes(recorder.tlog() if stamped else recorder.raw())
+        return read_log(path)
+
+    return write_and_read
+
+
+def boot(flight: Flight, samples: pd.DataFrame) -> np.ndarray:
+    return samples.index.to_numpy() + flight.log.boot_time_s
+
+
+def without(aisle: Aisle, *names: str) -> Recorder:
+    recorder = aisle.record()
+    recorder.sent = [s for s in recorder.sent if s[2].get_type() not in names]
+    return recorder
+
+
+def add(recorder: Recorder, rate_hz: float, make, sender=AUTOPILOT, seconds=40.0) -> Recorder:
+    """Add a message at a fixed rate, received at once."""
+    for boot_s in Aisle(seconds=seconds).times(rate_hz):
+        recorder.hear(unix(boot_s + LEAST_DELAY_S), sender, make(boot_s))
+    return recorder
+
+
+def reason(flight: Flight, what: str) -> str:
+    return next(str(part) for part in flight.missing if part.what == what)
+
+
+# ---- the made flight as a whole -----------------------------------------------------------------
+
+
+def test_the_made_flight_comes_back(read):
+    """Everything against its closed form."""
+    aisle = Aisle(asks=True)
+    flight = read(aisle)
+    assert flight.log.format == "MAVLink tlog"
+    assert flight.log.autopilot == "PX4"
+    assert flight.log.boot_time_s == BOOT_S
+    assert flight.log.duration_s == pytest.approx(39.98, abs=1e-6)
+    force = np.array([aisle.path(t)[2] - [0, 0, GRAVITY_M_S2] for t in boot(flight, flight.imu)])
+    np.testing.assert_allclose(flight.imu[SPECIFIC_FORCE_COLUMNS], force, atol=1e-5)
+    assert len(flight.imu) == 2000
+    np.testing.assert_array_equal(
+        flight.attitude[QUATERNION_COLUMNS], np.tile([1.0, 0, 0, 0], (800, 1))
+    )
+    state = flight.ekf2.state
+    expected = np.array([np.hstack(aisle.path(t)[:2]) for t in boot(flight, state)])
+    np.testing.assert_allclose(state[STATE_COLUMNS], expected, atol=1e-5)
+    np.testing.assert_allclose(boot(flight, state), aisle.times(20.0), atol=1e-6)
+    variances = np.tile([*POSE_VARIANCE, *VELOCITY_VARIANCE], (800, 1))
+    np.testing.assert_allclose(flight.ekf2.variance[VARIANCE_COLUMNS], variances, rtol=1e-6)
+    np.testing.assert_allclose(flight.airborne, [(10.0, 30.0)], atol=0.1)
+    assert flight.streams["imu"].topics == ("HIGHRES_IMU",)
+    assert flight.streams["ekf2_state"].topics == ("ODOMETRY",)
+    [track] = flight.positions
+    assert (track.name, track.rung, track.frame) == ("VISION_POSITION_ESTIMATE", 2, "NED")
+    np.testing.assert_allclose(
+        track.samples[POSITION_VARIANCE_COLUMNS], np.tile(POSE_VARIANCE, (200, 1)), rtol=1e-6
+    )
+
+
+def test_mavlink_1_and_a_raw_stream_say_the_same(read):
+    """MAVLink 1 has no ids above 255, so the state is LOCAL_POSITION_NED."""
+    aisle = Aisle(state="LOCAL_POSITION_NED")
+    recorder = without(aisle, "ODOMETRY")
+    as_2 = read(recorder)
+    recorder.v1 = True
+    as_1 = read(recorder)
+    raw = read(recorder, stamped=False)
+    for other in (as_1, raw):
+        pd.testing.assert_frame_equal(as_2.imu, other.imu)
+        pd.testing.assert_frame_equal(as_2.attitude, other.attitude)
+        pd.testing.assert_frame_equal(as_2.ekf2.state, other.ekf2.state)
+    pd.testing.assert_frame_equal(as_2.positions[0].samples, as_1.positions[0].samples)
+
+
+def test_duplicates_over_two_links_are_one(read):
+    """MAVProxy with two radios: every message twice, the second time later."""
+    aisle = Aisle(asks=True)
+    once = aisle.record()
+    twice = Recorder()
+    for received, sender, made, _ in once.sent:
+        twice.hear(received, sender, made, link=0)
+        twice.hear(received + 0.03, sender, made, link=1)
+    one, two = read(once), read(twice)
+    pd.testing.assert_frame_equal(one.imu, two.imu)
+    pd.testing.assert_frame_equal(one.ekf2.state, two.ekf2.state)
+    assert len(two.positions[0].samples) == 200
+    np.testing.assert_allclose(
+        one.positions[0].samples.index, two.positions[0].samples.index, atol=1e-3
+    )
+    assert {s.lost_share for s in two.log.senders} == {0.0}
+
+
+# ---- IMU ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["SCALED_IMU", "SCALED_IMU2", "SCALED_IMU3"])
+def test_scaled_imu_is_in_milli_g_and_milliradians(read, name):
+    recorder = add(without(Aisle(), "HIGHRES_IMU"), 50.0, lambda t: message(
+        name, time_boot_ms=ms(t), xacc=1000, yacc=-500, zacc=-1000, xgyro=1000, ygyro=-20, zgyro=3,
+    ))  # fmt: skip
+    imu = read(recorder).imu
+    assert len(imu) == 2000
+    np.testing.assert_allclose(
+        imu[SPECIFIC_FORCE_COLUMNS].iloc[0], [9.80665, -4.903325, -9.80665], rtol=1e-12
+    )
+    np.testing.assert_allclose(imu[ANGULAR_RATE_COLUMNS].iloc[0], [1.0, -0.02, 0.003], rtol=1e-12)
+
+
+def test_highres_imu_goes_before_a_denser_scaled_one(read):
+    recorder = add(Aisle().record(), 100.0, lambda t: message("SCALED_IMU", time_boot_ms=ms(t)))
+    flight = read(recorder)
+    assert flight.streams["imu"].topics == ("HIGHRES_IMU",)
+
+
+def test_raw_imu_is_refused_with_the_reason(read):
+    recorder = add(without(Aisle(), "HIGHRES_IMU"), 50.0, lambda t: message(
+        "RAW_IMU", time_usec=us(t), xacc=17, zacc=-998,
+    ))  # fmt: skip
+    flight = read(recorder)
+    assert isinstance(flight.imu, Unavailable)
+    assert "2000 RAW_IMU were refused, since raw counts have no unit" in reason(flight, "IMU")
+    assert [(u.name, u.count) for u in flight.unused] == [("RAW_IMU", 2000)]
+
+
+def test_of_several_imus_in_one_message_the_busiest_is_taken(read):
+    recorder = without(Aisle(), "HIGHRES_IMU")
+    add(recorder, 50.0, lambda t: message("HIGHRES_IMU", time_usec=us(t), xacc=2.0, id=1))
+    add(recorder, 10.0, lambda t: message("HIGHRES_IMU", time_usec=us(t) + 7, xacc=9.0, id=0))
+    imu = read(recorder).imu
+    assert len(imu) == 2000
+    assert set(imu["forward_m_s2"]) == {2.0}
+
+
+# ---- attitude -----------------------------------------------------------------------------------
+
+
+def test_euler_angles_become_the_quaternion_that_turns_frd_into_ned(read):
+    roll, pitch, yaw = 0.1, -0.3, 2.0
+    recorder = add(without(Aisle(), "ATTITUDE_QUATERNION"), 30.0, lambda t: message(
+        "ATTITUDE", time_boot_ms=ms(t), roll=roll, pitch=pitch, yaw=yaw,
+    ))  # fmt: skip
+    flight = read(recorder)
+    assert flight.streams["attitude"].topics == ("ATTITUDE",)
+    got = Rotation.from_quat(flight.attitude[QUATERNION_COLUMNS].to_numpy()[0], scalar_first=True)
+
+    def about(axis: int, angle: float) -> np.ndarray:
+        """Elementary rotation, written out."""
+        c, s = np.cos(angle), np.sin(angle)
+        turn = np.eye(3)
+        i, j = [(1, 2), (2, 0), (0, 1)][axis]
+        turn[i, i] = turn[j, j] = c
+        turn[i, j], turn[j, i] = -s, s
+        return turn
+
+    expected = about(2, yaw) @ about(1, pitch) @ about(0, roll)
+    np.testing.assert_allclose(got.as_matrix(), expected, atol=1e-6)
+    # nose up is negative down: pitch < 0 here, so the nose points down
+    assert got.as_matrix()[2, 0] == pytest.approx(-np.sin(pitch), abs=1e-6)
+
+
+def test_zero_and_nan_quaternions_are_no_attitude(read):
+    recorder = without(Aisle(), "ATTITUDE_QUATERNION")
+    values = itertools.cycle([0.0, float("nan"), 1.0])
+    add(recorder, 60.0, lambda t: message(
+        "ATTITUDE_QUATERNION", time_boot_ms=ms(t), q1=next(values)))  # fmt: skip
+    assert len(read(recorder).attitude) == 800
+
+
+# ---- frames of reference and senders ------------------------------------------------------------
+
+
+def frame_truth(frame_id: int) -> tuple[list[float], list[float]]:
+    """NED position and variances of (1, 2, 3) with variances (.01, .02, .03), by hand."""
+    return {
+        1: ([1.0, 2.0, 3.0], [0.01, 0.02, 0.03]),
+        4: ([2.0, 1.0, -3.0], [0.02, 0.01, 0.03]),  # ENU
+        20: ([1.0, 2.0, 3.0], [0.01, 0.02, 0.03]),  # FRD
+        21: ([1.0, -2.0, -3.0], [0.01, 0.02, 0.03]),  # FLU
+    }[frame_id]
+
+
+@pytest.mark.parametrize(("frame_id", "name"), [(1, "NED"), (4, "NED"), (20, "FRD"), (21, "FRD")])
+def test_external_odometry_is_turned_into_ned(read, frame_id, name):
+    recorder = add(Aisle(uwb=None, asks=True).record(), 30.0, lambda t: odometry(
+        us(unix(t)), [1.0, 2.0, 3.0], [0, 0, 0], estimator=3, frame_id=frame_id,
+    ), COMPANION)  # fmt: skip
+    [track] = read(recorder).positions
+    assert (track.name, track.frame) == ("ODOMETRY_VIO", name)
+    position, variance = frame_truth(frame_id)
+    np.testing.assert_array_equal(track.samples[POSITION_COLUMNS].iloc[5], position)
+    np.testing.assert_allclose(track.samples[POSITION_VARIANCE_COLUMNS].iloc[5], variance)
+
+
+@pytest.mark.parametrize("frame_id", [8, 12, 0, 255])
+def test_a_position_in_a_body_frame_is_none(read, frame_id):
+    recorder = add(Aisle(uwb=None).record(), 30.0, lambda t: odometry(
+        us(unix(t)), [1.0, 2.0, 3.0], [0, 0, 0], estimator=3, frame_id=frame_id,
+    ), COMPANION)  # fmt: skip
+    flight = read(recorder)
+    assert flight.positions == ()
+    assert "0 finite samples" in reason(flight, "position source ODOMETRY_VIO")
+
+
+@pytest.mark.parametrize("child", [8, 12])
+def test_velocity_in_the_body_is_turned_with_its_variances(read, child):
+    """PX4 v1.13: v_NED = R v_body and var_i = Σ_j R_ij² var_j."""
+    attitude = Rotation.from_euler("ZYX", [120.0, 10.0, -20.0], degrees=True)
+    velocity = np.array([1.0, -0.5, 0.25])
+    recorder = add(without(Aisle(), "ODOMETRY"), 30.0, lambda t: odometry(
+        us(t), [1, 2, 3], velocity, estimator=8, child=child, attitude=attitude,
+    ))  # fmt: skip
+    ekf2 = read(recorder).ekf2
+    matrix = attitude.as_matrix()
+    np.testing.assert_allclose(ekf2.state[VELOCITY_COLUMNS].iloc[3], matrix @ velocity, atol=1e-6)
+    np.testing.assert_allclose(
+        ekf2.variance[VELOCITY_VARIANCE_COLUMNS].iloc[3],
+        np.diag(matrix @ np.diag(VELOCITY_VARIANCE) @ matrix.T), rtol=1e-5,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("child", "expected"),
+    [(1, [1.0, -0.5, 0.25]), (4, [-0.5, 1.0, -0.25]), (21, [1.0, 0.5, -0.25])],
+)
+def test_velocity_in_a_fixed_frame_is_turned(read, child, expected):
+    recorder = add(without(Aisle(), "ODOMETRY"), 30.0, lambda t: odometry(
+        us(t), [1, 2, 3], [1.0, -0.5, 0.25], estimator=8, child=child,
+    ))  # fmt: skip
+    state = read(recorder).ekf2.state
+    np.testing.assert_array_equal(state[VELOCITY_COLUMNS].iloc[0], expected)
+
+
+@pytest.mark.parametrize(
+    ("estimator", "name", "rung"),
+    [(0, "ODOMETRY", 2), (1, "ODOMETRY_NAIVE", 2), (2, "ODOMETRY_VISION", 2),
+     (3, "ODOMETRY_VIO", 2), (6, "ODOMETRY_MOCAP", 3)],
+)  # fmt: skip
+def test_odometry_to_the_autopilot_is_a_position_by_its_estimator(read, estimator, name, rung):
+    """And EKF2's own ODOMETRY beside it stays EKF2's."""
+    flight = read(Aisle(uwb="ODOMETRY", estimator=estimator, asks=True))
+    [track] = flight.positions
+    assert (track.name, track.rung, track.topics) == (name, rung, ("ODOMETRY",))
+    assert len(track.samples) == 200
+    assert len(flight.ekf2.state) == 800
+    given = track.samples[POSITION_VARIANCE_COLUMNS]
+    if estimator == 1:
+        assert given.isna().all(axis=None)
+    else:
+        np.testing.assert_allclose(given.iloc[0], POSE_VARIANCE, rtol=1e-6)
+
+
+@pytest.mark.parametrize("estimator", [4, 5, 7, 8])
+def test_what_px4_refuses_as_input_is_no_position(read, estimator):
+    """GPS, GPS_INS, LIDAR and AUTOPILOT."""
+    flight = read(Aisle(uwb="ODOMETRY", estimator=estimator, asks=True))
+    assert flight.positions == ()
+    assert "no ODOMETRY to the autopilot" in reason(flight, "position source ODOMETRY")
+
+
+def test_odometry_of_the_autopilot_is_never_a_position(read):
+    """Whatever estimator it claims."""
+    recorder = add(without(Aisle(uwb=None), "ODOMETRY"), 30.0, lambda t: odometry(
+        us(t), [1, 2, 3], [0, 0, 0], estimator=2))  # fmt: skip
+    flight = read(recorder)
+    assert flight.positions == ()
+    assert isinstance(flight.ekf2, Ekf2)
+
+
+def test_motion_capture_is_truth_where_another_source_feeds_ekf2(read):
+    aisle = Aisle(asks=True)
+    recorder = aisle.record()
+    add(recorder, 50.0, lambda t: message(
+        "ATT_POS_MOCAP", time_usec=us(unix(t)), q=[1, 0, 0, 0], **xyz(aisle.path(t)[0]),
+    ), COMPANION)  # fmt: skip
+    flight = read(recorder)
+    assert isinstance(flight.truth, Truth)
+    assert flight.truth.name == "ATT_POS_MOCAP"
+    expected = np.array([aisle.path(t)[0] for t in aisle.times(50.0)])
+    np.testing.assert_allclose(flight.truth.samples[POSITION_COLUMNS], expected, atol=1e-5)
+    assert flight.truth.samples[VELOCITY_COLUMNS].isna().all(axis=None)
+    assert [t.name for t in flight.positions] == ["VISION_POSITION_ESTIMATE", "ATT_POS_MOCAP"]
+
+
+def test_motion_capture_alone_is_a_position_and_no_truth(read):
+    flight = read(Aisle(uwb="ATT_POS_MOCAP", asks=True))
+    [track] = flight.positions
+    assert (track.name, track.rung) == ("ATT_POS_MOCAP", 3)
+    assert isinstance(flight.truth, Unavailable)
+
+
+def test_positions_without_a_number_and_variances_of_zero(read):
+    """NaN positions are dropped; a variance of 0 or NaN is none."""
+    recorder = Aisle(uwb=None, asks=True).record()
+    kinds = itertools.cycle(range(4))
+
+    def make(t):
+        kind = next(kinds)
+        covariance = [[0.5] * 21, [0.0] * 21, [float("nan")] * 21, [0.5] * 21][kind]
+        x = float("nan") if kind == 3 else 1.0
+        return message(
+            "VISION_POSITION_ESTIMATE", usec=us(unix(t)), x=x, covariance=covariance
+        )  # fmt: skip
+
+    [track] = read(add(recorder, 10.0, make, COMPANION)).positions
+    assert len(track.samples) == 300
+    given = track.samples["north_m2"].to_numpy()
+    np.testing.assert_array_equal(given[:6], [0.5, np.nan, np.nan] * 2)
+
+
+# ---- EKF2's state and variances -----------------------------------------------------------------
+
+
+def test_local_position_with_covariance_gives_state_and_variances(read):
+    aisle = Aisle(state="LOCAL_POSITION_NED_COV")
+    flight = read(aisle)
+    expected = np.array([np.hstack(aisle.path(t)[:2]) for t in aisle.times(20.0)])
+    np.testing.assert_allclose(flight.ekf2.state[STATE_COLUMNS], expected, atol=1e-5)
+    variances = np.tile([*POSE_VARIANCE, *VELOCITY_VARIANCE], (800, 1))
+    np.testing.assert_allclose(flight.ekf2.variance[VARIANCE_COLUMNS], variances, rtol=1e-6)
+
+
+def test_estimator_status_stands_in_for_variances(read):
+    """Its horizontal accuracy is the root of the sum over both axes."""
+    aisle = Aisle(state="LOCAL_POSITION_NED")
+    recorder = add(aisle.record(), 5.0, lambda t: message(
+        "ESTIMATOR_STATUS", time_usec=us(t), pos_horiz_accuracy=0.5, pos_vert_accuracy=0.3,
+    ))  # fmt: skip
+    flight = read(recorder)
+    variance = flight.ekf2.variance
+    np.testing.assert_allclose(
+        variance[POSITION_VARIANCE_COLUMNS].iloc[0], [0.125, 0.125, 0.09], rtol=1e-6
+    )
+    assert variance[VELOCITY_VARIANCE_COLUMNS].isna().all(axis=None)
+    assert flight.streams["ekf2_variance"].topics == ("ESTIMATOR_STATUS",)
+    assert any("ESTIMATOR_STATUS" in note for note in flight.ekf2.notes)
+
+
+def test_odometry_without_covariance_takes_the_accuracies_too(read):
+    recorder = without(Aisle(), "ODOMETRY")
+    add(recorder, 30.0, lambda t: message(
+        "ODOMETRY", time_usec=us(t), frame_id=1, child_frame_id=1, q=[1, 0, 0, 0],
+        pose_covariance=[float("nan")] * 21, velocity_covariance=[float("nan")] * 21,
+        estimator_type=8,
+    ))  # fmt: skip
+    add(
+        recorder,
+        5.0,
+        lambda t: message(
+            "ESTIMATOR_STATUS", time_usec=us(t), pos_horiz_accuracy=0.2, pos_vert_accuracy=0.1
+        ),
+    )
+    flight = read(recorder)
+    assert len(flight.ekf2.state) == 1200
+    np.testing.assert_allclose(flight.ekf2.variance["down_m2"], 0.01, rtol=1e-6)
+
+
+def test_without_any_accuracy_variances_are_lacking(read):
+    flight = read(Aisle(state="LOCAL_POSITION_NED"))
+    assert isinstance(flight.ekf2.variance, Unavailable)
+    assert "no ODOMETRY with covariance" in reason(flight, "EKF2 variances")
+
+
+def test_resets_are_counted(read):
+    recorder = add(without(Aisle(), "ODOMETRY"), 30.0, lambda t: odometry(
+        us(t), [1, 2, 3], [0, 0, 0], estimator=8, resets=(t > 60.0) + (t > 70.0),
+    ))  # fmt: skip
+    assert any("reset its state 2 times" in note for note in read(recorder).ekf2.notes)
+
+
+# ---- truth --------------------------------------------------------------------------------------
+
+EARTH_RADIUS_M = 6_371_000.0
+LATITUDE, LONGITUDE, HEIGHT_M = 47.0, 8.0, 500.0
+
+
+def degrees(aisle: Aisle, boot_s: float) -> tuple[float, float, float, np.ndarray]:
+    """Latitude, longitude, height and velocity of the made flight, about its first sample."""
+    position, velocity, _ = aisle.path(boot_s)
+    d = position - aisle.path(BOOT_S)[0]
+    latitude = LATITUDE + np.degrees(d[0] / EARTH_RADIUS_M)
+    longitude = LONGITUDE + np.degrees(d[1] / (EARTH_RADIUS_M * np.cos(np.radians(LATITUDE))))
+    return latitude, longitude, HEIGHT_M - d[2], velocity
+
+
+def simulated(name: str, aisle: Aisle, boot_s: float):
+    latitude, longitude, height, v = degrees(aisle, boot_s)
+    as_integer = {"lat": round(latitude * 1e7), "lon": round(longitude * 1e7)}
+    if name == "HIL_STATE_QUATERNION":
+        speed = dict(zip(("vx", "vy", "vz"), (round(x * 100) for x in v), strict=True))
+        return message(name, alt=round(height * 1e3), **as_integer, **speed)
+    if name == "SIMSTATE":
+        return message(name, lat=as_integer["lat"], lng=as_integer["lon"])
+    return message(
+        "SIM_STATE", lat=latitude, lon=longitude, lat_int=as_integer["lat"],
+        lon_int=as_integer["lon"], alt=height, vn=v[0], ve=v[1], vd=v[2],
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ["HIL_STATE_QUATERNION", "SIM_STATE", "SIMSTATE"])
+def test_simulation_truth_is_projected_about_its_first_sample(read, name):
+    """At the time of receipt, since its own stamp is 0 in PX4."""
+    aisle = Aisle(asks=True)
+    flight = read(add(aisle.record(), 25.0, lambda t: simulated(name, aisle, t)))
+    assert flight.truth.name == name
+    times = boot(flight, flight.truth.samples)
+    np.testing.assert_allclose(times, aisle.times(25.0), atol=1e-3)
+    start = aisle.path(BOOT_S)[0]
+    expected = np.array([aisle.path(t)[0] - start for t in aisle.times(25.0)])
+    got = flight.truth.samples
+    np.testing.assert_allclose(got[POSITION_COLUMNS[:2]], expected[:, :2], atol=0.012)
+    velocity = np.array([aisle.path(t)[1] for t in aisle.times(25.0)])
+    if name == "SIMSTATE":
+        assert got[["down_m", *VELOCITY_COLUMNS]].isna().all(axis=None)
+    else:
+        np.testing.assert_allclose(got["down_m"], expected[:, 2], atol=1e-3)
+        np.testing.assert_allclose(got[VELOCITY_COLUMNS], velocity, atol=5.1e-3)
+
+
+# ---- the log itself -----------------------------------------------------------------------------
+
+
+def parameter(name: bytes, value: int | float, *, by_bytes: bool):
+    kind = 6 if isinstance(value, int) else 9
+    if isinstance(value, int) and by_bytes:
+        value = struct.unpack("<f", struct.pack("<i", value))[0]
+    return message("PARAM_VALUE", param_id=name, param_value=float(value), param_type=kind)
+
+
+@pytest.mark.parametrize(("autopilot", "by_bytes"), [(12, True), (3, False)])
+def test_integer_parameters_are_bytes_in_px4_and_casts_in_ardupilot(read, autopilot, by_bytes):
+    recorder = without(Aisle(), "HEARTBEAT")
+    add(recorder, 1.0, lambda t: heartbeat(2, autopilot))
+    for i, (name, value) in enumerate(
+        {b"EKF2_EV_CTRL": 15, b"SDLOG_PROFILE": 129, b"EKF2_EVP_GATE": 3.5, b"X": 7}.items()
+    ):
+        recorder.hear(unix(60.0 + i), AUTOPILOT, parameter(name, value, by_bytes=by_bytes))
+    # changed in flight: the log's start counts
+    later = parameter(b"EKF2_EVP_GATE", 9.0, by_bytes=by_bytes)
+    recorder.hear(unix(80.0), AUTOPILOT, later)
+    flight = read(recorder)
+    assert flight.log.autopilot == ("PX4" if by_bytes else "ArduPilot")
+    expected = {"EKF2_EV_CTRL": 15.0, "SDLOG_PROFILE": 129.0, "EKF2_EVP_GATE": 3.5}
+    assert dict(flight.log.parameters) == expected
+    assert flight.ekf2.gate == 3.5
+
+
+def test_the_version_is_read(read):
+    recorder = Aisle().record()
+    recorder.hear(unix(60.0), AUTOPILOT, message(
+        "AUTOPILOT_VERSION", flight_sw_version=0x011001FF,
+        flight_custom_version=list(bytes.fromhex("0123456789abcdef"))[::-1],
+    ))  # fmt: skip
+    flight = read(recorder)
+    assert flight.log.firmware == "PX4 v1.16.1"
+    assert flight.log.firmware_hash == "0123456789abcdef"
+    assert "version not in the recording" in read(Aisle()).log.firmware
+
+
+def test_what_is_not_used_is_listed_with_the_reason(read):
+    recorder = add(Aisle().record(), 1.0, lambda t: message("GPS_RAW_INT", time_usec=us(t)))
+    add(recorder, 2.0, lambda t: message("VICON_POSITION_ESTIMATE", usec=us(t)), COMPANION)
+    found = {u.name: (u.count, u.reason) for u in read(recorder).unused}
+    assert found == {
+        "VICON_POSITION_ESTIMATE": (80, "PX4 does not read it"),
+        "GPS_RAW_INT": (40, "GPS is not an indoor position"),
+    }
+
+
+def test_an_empty_recording_of_heartbeats_lacks_everything_by_name(read):
+    flight = read(add(Recorder(), 1.0, lambda t: heartbeat()))
+    for part in ("imu", "attitude", "ekf2", "truth", "airborne"):
+        assert isinstance(getattr(flight, part), Unavailable)
+    whats = {part.what for part in flight.missing}
+    assert {"IMU", "attitude", "EKF2", "ground truth", "position source ODOMETRY"} <= whats
+
+
+def test_system_is_for_mavlink_only(sample_log):
+    with pytest.raises(SettingsError, match="MAVLink"):
+        read_log(sample_log, system=1)
+
+
+# ---- two recordings of one flight ---------------------------------------------------------------
+
+
+def track_of(flight: Flight, name: str) -> PositionTrack:
+    return next(track for track in flight.positions if track.name == name)
+
+
+def stamp_differences(tlog: Flight, ulog: Flight) -> tuple[np.ndarray, np.ndarray]:
+    """Boot time by the tlog minus by the ULog, of positions equal to the bit, and their rows."""
+    ours = track_of(tlog, "VISION_POSITION_ESTIMATE").samples
+    theirs = track_of(ulog, "vehicle_visual_odometry").samples
+
+    def keys(samples: pd.DataFrame) -> list[tuple[float, ...]]:
+        single = samples[POSITION_COLUMNS].to_numpy().astype(np.float32)
+        return [tuple(row) for row in single.tolist()]
+
+    at = {key: row for row, key in enumerate(keys(theirs))}
+    pairs = [(row, at[key]) for row, key in enumerate(keys(ours)) if key in at]
+    mine, other = np.array(pairs).T
+    return boot(tlog, ours)[mine] - boot(ulog, theirs)[other], other
+
+
+def kalman_rmse(tlog: Flight, ulog: Flight, ulog_settings: Settings) -> list[float]:
+    """Of our filter's position from either, on common boot times, per axis."""
+    low = max(tlog.log.boot_time_s, ulog.log.boot_time_s) + 5.0
+    high = min(f.log.boot_time_s + f.log.duration_s for f in (tlog, ulog)) - 1.0
+    runs = [
+        compare(
+            flight, chosen, position_source=name, axes=("north", "east", "down"),
+            start_s=low - flight.log.boot_time_s, end_s=high - flight.log.boot_time_s,
+        )
+        for flight, chosen, name in (
+            (tlog, Settings(), "VISION_POSITION_ESTIMATE"),
+            (ulog, ulog_settings, "vehicle_visual_odometry"),
+        )
+    ]  # fmt: skip
+    times = np.arange(low + 1.0, high - 1.0, 0.05)
+    found = []
+    for one, other in zip(runs[0].axes, runs[1].axes, strict=True):
+        first, _ = state_at(one.replay, times - tlog.log.boot_time_s)
+        second, _ = state_at(other.replay, times - ulog.log.boot_time_s)
+        assert np.isfinite(first - second).mean() > 0.99
+        found.append(float(np.sqrt(np.nanmean((first - second) ** 2))))
+    return found
+
+
+def differences(
+    tlog: Flight, ulog: Flight, mine: pd.DataFrame, theirs: pd.DataFrame, columns: list[str]
+) -> np.ndarray:
+    """The tlog's samples minus the ULog's, interpolated, at common boot times."""
+    a, b = boot(tlog, mine), boot(ulog, theirs)
+    within = (a > b[0]) & (a < b[-1])
+    return np.column_stack(
+        [mine[c].to_numpy()[within] - np.interp(a[within], b, theirs[c]) for c in columns]
+    )
+
+
+def same_flight(tlog: Flight, ulog: Flight) -> None:
+    """EKF2's state, the attitude and the truth, which do not depend on the companion's clock."""
+    states = differences(tlog, ulog, tlog.ekf2.state, ulog.ekf2.state, POSITION_COLUMNS)
+    assert len(states) > 1000
+    assert np.abs(np.median(states, axis=0)).max() < 1e-3
+    assert np.percentile(np.abs(states), 99) < 0.02
+    speeds = differences(tlog, ulog, tlog.ekf2.state, ulog.ekf2.state, VELOCITY_COLUMNS)
+    assert np.abs(np.median(speeds, axis=0)).max() < 2e-3
+    assert np.percentile(np.abs(speeds), 99) < 0.06
+    nearest = pd.merge_asof(
+        tlog.attitude.set_axis(pd.Index(boot(tlog, tlog.attitude), name="t")),
+        ulog.attitude.set_axis(pd.Index(boot(ulog, ulog.attitude), name="t")),
+        left_index=True, right_index=True, direction="nearest", tolerance=0.011,
+    ).dropna()  # fmt: skip
+    assert len(nearest) > 1000
+    one, other = (
+        Rotation.from_quat(nearest[[c + s for c in QUATERNION_COLUMNS]].to_numpy(copy=True),
+                           scalar_first=True)
+        for s in ("_x", "_y")
+    )  # fmt: skip
+    assert np.degrees(np.median((one.inv() * other).magnitude())) < 0.5
+    truth = differences(tlog, ulog, tlog.truth.samples, ulog.truth.samples, POSITION_COLUMNS)
+    assert len(truth) > 1000
+    # projected about the first sample of either recording, some millimetres apart
+    assert np.abs(np.median(truth, axis=0)).max() < 0.015
+    assert truth.std(axis=0).max() < 0.01
+
+
+def test_the_sample_tlog_and_ulog_are_one_flight(sample_log, sample_flight):
+    tlog = read_log(sample_log.with_suffix(".tlog"))
+    late, rows = stamp_differences(tlog, sample_flight)
+    assert len(rows) == len(track_of(sample_flight, "vehicle_visual_odometry").samples)
+    assert np.abs(late).max() < 1e-3
+    assert max(kalman_rmse(tlog, sample_flight, Settings())) < 0.03
+    same_flight(tlog, sample_flight)
+    assert tlog.log.firmware_hash in ("unknown", sample_flight.log.firmware_hash[:16])
+
+
+@pytest.fixture(scope="module", params=PAIRS)
+def pair(request, shared_logs) -> tuple[str, Flight, Flight, dict]:
+    name = request.param
+    return (
+        name,
+        read_log(shared_logs / "mavlink" / f"{name}.tlog"),
+        read_log(shared_logs / "simulated" / f"{name}.ulg"),
+        json.loads((shared_logs / "simulated" / f"{name}.json").read_text()),
+    )
+
+
+@pytest.mark.reallogs
+def test_stamps_of_real_pairs_agree_with_px4_and_with_the_truth(pair):
+    """The companion's own stamps on the boot clock, whatever PX4 took them for.
+
+    Without TIMESYNC PX4 took the time of arrival, 250 ms after the measurement.
+    """
+    name, tlog, ulog, recorded = pair
+    late, rows = stamp_differences(tlog, ulog)
+    assert len(rows) > 590
+    expected = -0.250 if "nosync" in name else 0.0
+    spread = 0.015 if "nosync" in name else 1e-3
+    assert np.median(late) == pytest.approx(expected, abs=2e-3)
+    assert np.abs(late - expected).max() < spread
+    offset = recorded["clock"]["px4_boot_minus_companion_unix_ns"] * 1e-9
+    [clock] = [c for c in tlog.clocks if "component 197" in c.clock]
+    assert clock.offset_s == pytest.approx(offset, abs=1e-3)
+    # every stamp that is in the file, where the simulation says that it was sent
+    stamps = [sample["usec_sent"] for sample in recorded["uwb"] if "usec_sent" in sample]
+    sent = np.array(stamps) * 1e-6 + offset
+    ours = boot(tlog, track_of(tlog, "VISION_POSITION_ESTIMATE").samples)
+    nearest = np.abs(sent[None, :] - ours[:, None]).min(axis=1)
+    assert nearest.max() < 1e-3
+
+
+@pytest.mark.reallogs
+def test_the_filter_says_the_same_from_either_recording(pair):
+    name, tlog, ulog, _ = pair
+    _, rows = stamp_differences(tlog, ulog)
+    # the v1.13 tlog lacks 7 % of the positions; compared is what both have
+    both = tuple(
+        replace(t, samples=t.samples.iloc[np.unique(rows)])
+        if t.name == "vehicle_visual_odometry" else t
+        for t in ulog.positions
+    )  # fmt: skip
+    ulog = replace(ulog, positions=both)
+    offset = -0.2509 if "nosync" in name else 0.0
+    assert max(kalman_rmse(tlog, ulog, Settings(clock_offset_s=offset))) < 0.03
+    if "nosync" in name:
+        # at 1 m/s, 250 ms are decimetres
+        assert max(kalman_rmse(tlog, ulog, Settings())) > 0.15
+
+
+@pytest.mark.reallogs
+def test_state_attitude_and_truth_of_real_pairs_agree(pair):
+    _, tlog, ulog, _ = pair
+    same_flight(tlog, ulog)
+
+
+@pytest.mark.reallogs
+def test_the_loop_flight_is_the_ulogs(shared_logs, sample_log):
+    """Two senders of ODOMETRY in one recording."""
+    tlog = read_log(shared_logs / "mavlink" / "v1.16.1_loop_vio.tlog")
+    ulog = read_log(sample_log.with_name("loop_vio.ulg"))
+    [track] = tlog.positions
+    assert (track.name, track.frame) == ("ODOMETRY_VIO", "FRD")
+    same_flight(tlog, ulog)
+    theirs = track_of(ulog, "vehicle_visual_odometry").samples
+    found = differences(tlog, ulog, track.samples, theirs, POSITION_COLUMNS)
+    assert len(found) > 2000
+    assert np.percentile(np.abs(found), 99) < 0.01
+
+
+@pytest.mark.reallogs
+def test_real_recordings_of_others(shared_logs):
+    folder = shared_logs / "mavlink"
+    flight = read_log(folder / "Ian-McConachie-CU_drone_position_hold_hist_40e21c1c_mav.tlog")
+    [track] = flight.positions
+    assert (flight.log.autopilot, track.clock_map.distinct_stamps) == ("ArduPilot", 2)
+    assert track.rate_hz == pytest.approx(47.0, abs=2.0)
+    assert flight.streams["imu"].topics == ("SCALED_IMU2",)
+    assert ("RAW_IMU", 188) in [(unused.name, unused.count) for unused in flight.unused]
+    vtol = read_log(folder / "ArduPilot_UAVLogViewer_vtol.tlog")
+    assert (vtol.truth.name, vtol.log.autopilot) == ("SIMSTATE", "ArduPilot")
+    sub = read_log(folder / "clydemcqueen_ardusub_log_tools_small.tlog")
+    assert sub.log.hardware.startswith("submarine")
+    assert len(sub.log.senders) == 5
+    one, other = (read_log(folder / f"mbiuki_Phoenix_mission1.{s}") for s in ("tlog", "rlog"))
+    assert one.log.boot_time_s == other.log.boot_time_s
+    assert one.log.duration_s == other.log.duration_s
+
+
+# ---- fuzz ---------------------------------------------------------------------------------------
+
+INTERESTING = [0, 1, 2**31 - 1, 2**31, 2**32 - 1, 2**63 - 1, 2**63, 2**64 - 1]
+WIRE = {
+    "char": "c", "double": "d", "float": "f", "int8_t": "b", "int16_t": "h", "int32_t": "i",
+    "int64_t": "q", "uint8_t": "B", "uint16_t": "H", "uint32_t": "I", "uint64_t": "Q",
+    "uint8_t_mavlink_version": "B",
+}  # fmt: skip
+READ = [
+    "HEARTBEAT", "HIGHRES_IMU", "SCALED_IMU", "SCALED_IMU2", "ATTITUDE", "ATTITUDE_QUATERNION",
+    "ODOMETRY", "LOCAL_POSITION_NED", "LOCAL_POSITION_NED_COV", "ESTIMATOR_STATUS", "TIMESYNC",
+    "SYSTEM_TIME", "VISION_POSITION_ESTIMATE", "ATT_POS_MOCAP", "EXTENDED_SYS_STATE",
+    "PARAM_VALUE", "AUTOPILOT_VERSION", "HIL_STATE_QUATERNION", "SIM_STATE", "SIMSTATE", "RAW_IMU",
+]  # fmt: skip
+SENDERS = [(1, 1), (1, 1), (1, 1), (1, 197), (2, 1), (255, 190)]
+
+
+class Chunks:
+    """Cases are made of a few hundred frames of real and made recordings."""
+
+    def __init__(self, sample_log: Path, folder: Path):
+        self.path = folder / "fuzz.tlog"
+        frames = read_frames(sample_log.with_suffix(".tlog"))
+        starts = (frames.start - 8).tolist()
+        # parts of the flight with every kind of message
+        self.real = [
+            frames.content[starts[at] : starts[at + 300]] for at in range(0, 38_000, 3_800)
+        ]
+        made = Aisle(seconds=4.0, asks=True, system_time=True).record()
+        for name in ("LOCAL_POSITION_NED", "ATTITUDE", "SCALED_IMU2"):
+            add(made, 5.0, lambda t, name=name: message(name, time_boot_ms=ms(t)), seconds=4.0)
+        add(made, 5.0, lambda t: simulated("HIL_STATE_QUATERNION", Aisle(), t), seconds=4.0)
+        add(made, 5.0, lambda t: message("ATT_POS_MOCAP", time_usec=us(unix(t))), COMPANION, 4.0)
+        self.frames = [stamp(us_) + content for us_, _, content in made.frames()]
+        self.real += [b"".join(self.frames), made.raw()]
+
+    def read(self, content: bytes) -> Flight | Px4FuseError:
+        """A flight whose parts keep their promises, or a refusal; nothing else."""
+        self.path.write_bytes(content)
+        read: Flight | Px4FuseError
+        try:
+            with patience():
+                read = read_log(self.path)
+        except Px4FuseError as error:
+            read = error
+        if isinstance(read, Flight):
+            self.check(read)
+        else:
+            assert isinstance(read, LogError)
+            assert "\n" not in str(read)
+        return read
+
+    def check(self, flight: Flight) -> None:
+        tables = [part for part in (flight.imu, flight.attitude) if isinstance(part, pd.DataFrame)]
+        tables += [track.samples for track in flight.positions]
+        if isinstance(flight.truth, Truth):
+            tables.append(flight.truth.samples)
+        if isinstance(flight.ekf2, Ekf2):
+            tables.append(flight.ekf2.state)
+            assert np.isfinite(flight.ekf2.state.to_numpy()).all()
+            if isinstance(flight.ekf2.variance, pd.DataFrame):
+                tables.append(flight.ekf2.variance)
+        for table in tables:
+            times = table.index.to_numpy()
+            assert np.isfinite(times).all()
+            assert (np.diff(times) > 0.0).all()
+            assert not np.isinf(table.to_numpy()).any()
+        for track in flight.positions:
+            assert np.isfinite(track.samples[POSITION_COLUMNS].to_numpy()).all()
+            assert not (track.samples[POSITION_VARIANCE_COLUMNS].to_numpy() <= 0.0).any()
+        for clock in flight.clocks:
+            assert np.isfinite([clock.offset_s, clock.drift_ppm, clock.jitter_s]).all()
+        assert np.isfinite([flight.log.boot_time_s, flight.log.duration_s]).all()
+        assert flight.log.duration_s >= 0.0
+
+
+@pytest.fixture(scope="module")
+def chunks(sample_log, tmp_path_factory) -> Chunks:
+    return Chunks(sample_log, tmp_path_factory.mktemp("fuzz"))
+
+
+def hostile_value(rng: np.random.Generator, code: str) -> bytes:
+    """Bytes of one field: a plain value, an extreme one, or anything."""
+    size = struct.calcsize(f"<{code}")
+    choice = rng.integers(0, 4)
+    if choice == 0:
+        return rng.bytes(size)
+    if code in "df":
+        values = [0.0, 1.0, -1.0, 1e3, float("nan"), float("inf"), float("-inf"), 3e38, 1e-38]
+        value = values[rng.integers(0, len(values))]
+        if code == "d" and choice == 1:
+            value = float(rng.choice([1e308, -1e308, 5e-324]))
+        return struct.pack(f"<{code}", value)
+    if choice == 1:
+        number = INTERESTING[rng.integers(0, len(INTERESTING))]
+    elif choice == 2:
+        # times near those of the made flight, in every unit
+        unit = (1e3, 1e6, 1e9)[rng.integers(0, 3)]
+        zero = (0.0, unix(0.0))[rng.integers(0, 2)]
+        number = int((zero + BOOT_S + rng.uniform(0.0, 4.0)) * unit)
+    else:
+        number = int(rng.integers(0, 13))
+    return (number % 256**size).to_bytes(size, "little")
+
+
+def hostile_frame(rng: np.random.Generator) -> bytes:
+    """A frame with a good checksum and bad content."""
+    kind = MESSAGES[READ[rng.integers(0, len(READ))]]
+    types = dict(zip(kind.fieldnames, kind.fieldtypes, strict=True))
+    payload = b"".join(
+        hostile_value(rng, WIRE[types[name]])
+        for name, length in zip(kind.ordered_fieldnames, kind.array_lengths, strict=True)
+        for _ in range(length or 1)
+    )
+    if rng.integers(0, 8) == 0:
+        payload = payload[: rng.integers(0, len(payload) + 1)]
+    return raw_frame(
+        kind.id, payload, seed=kind.crc_extra, sender=SENDERS[rng.integers(0, len(SENDERS))],
+        sequence=int(rng.integers(0, 256)), v1=bool(kind.id < 256 and rng.integers(0, 8) == 0),
+    )  # fmt: skip
+
+
+def mutated(rng: np.random.Generator, content: bytes) -> bytes:
+    """Flip, cut, insert, duplicate and reorder."""
+    for _ in range(rng.integers(1, 6)):
+        size = max(len(content), 1)
+        a, b = sorted(rng.integers(0, size + 1, 2).tolist())
+        b = min(b, a + int(rng.integers(1, 2000)))
+        action = rng.integers(0, 6)
+        if action == 0:
+            changed = bytearray(content)
+            for at in rng.integers(0, size, rng.integers(1, 60)).tolist():
+                if at < len(changed):
+                    changed[at] ^= 1 << rng.integers(0, 8)
+            content = bytes(changed)
+        elif action == 1:
+            content = content[:a] + content[b:]
+        elif action == 2:
+            content = content[:a] + rng.bytes(int(rng.integers(1, 300))) + content[a:]
+        elif action == 3:
+            content = content[:b] + content[a:b] * int(rng.integers(1, 4)) + content[b:]
+        elif action == 4:
+            content = content[b:] + content[a:b] + content[:a]
+        else:
+            content = content[:a]
+    return content
+
+
+def hostile_recording(rng: np.random.Generator, chunks: Chunks, pool: list[bytes]) -> bytes:
+    """A made recording of which some frames were replaced, with or without stamps."""
+    stamped = rng.integers(0, 3) > 0
+    parts = list(chunks.frames) if rng.integers(0, 4) else []
+    if parts and rng.integers(0, 2):
+        first = int(rng.integers(0, len(parts)))
+        parts = parts[first : first + int(rng.integers(1, 300))]
+    # of one kind there may be many, so that a part consists of nothing else
+    for _ in range(rng.integers(1, 40)):
+        repeats = int(rng.integers(1, 12))
+        at = int(rng.integers(0, len(parts) + 1))
+        time_us = us(unix(BOOT_S + 4.0 * at / (len(parts) + 1)))
+        if rng.integers(0, 10) == 0:
+            time_us = INTERESTING[rng.integers(0, len(INTERESTING))]
+        made = [pool[i] for i in rng.integers(0, len(pool), repeats).tolist()]
+        parts[at:at] = [stamp(min(time_us + i, 2**64 - 1)) + one for i, one in enumerate(made)]
+    return b"".join(parts if stamped else [part[8:] for part in parts])
+
+
+def test_fuzz_hostile_values_in_good_frames(chunks):
+    rng = np.random.default_rng(1)
+    read = 0
+    for case in range(FUZZ_CASES // 3):
+        if case % 250 == 0:
+            pool = [hostile_frame(rng) for _ in range(2000)]
+        content = hostile_recording(rng, chunks, pool)
+        with told(case):
+            read += isinstance(chunks.read(content), Flight)
+    assert read > 0.95 * (FUZZ_CASES // 3)
+
+
+def test_fuzz_mutations_of_real_recordings(chunks):
+    rng = np.random.default_rng(2)
+    read = 0
+    cases = FUZZ_CASES - FUZZ_CASES // 3
+    for case in range(cases):
+        content = mutated(rng, chunks.real[rng.integers(0, len(chunks.real))])
+        with told(case):
+            read += isinstance(chunks.read(content), Flight)
+    assert read > 0.5 * cases
+
+
+@contextlib.contextmanager
+def told(case: int):
+    """Say which case failed."""
+    try:
+        yield
+    except Exception as error:
+        error.add_note(f"case {case}")
+        raise
+
+
+@given(st.binary(max_size=600), st.booleans())
+@settings(max_examples=200, deadline=None)
+def test_fuzz_random_bytes_around_frames(chunks, content, framed):
+    chunks.read(content + (chunks.frames[0] + content if framed else b""))
+
+
+def test_clocks_that_agree_by_chance_do_no_harm(read):
+    """The companion's UNIX clock at 0: below the first second there is no stamp to trust."""
+    flight = read(Aisle(seconds=20.0, clock=same, start_s=0.5, replies=False))
+    assert np.isfinite(flight.positions[0].samples.index.to_numpy()).all()
+    assert flight.log.boot_time_s == pytest.approx(0.5, abs=0.05)
