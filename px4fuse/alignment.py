@@ -79,6 +79,8 @@ FAR_S = 3.0  # at this distance a lag is another one, even on a plateau
 RESIDUAL_FLOOR_M = 0.05  # what the grid's steps leave of a perfect match
 MAX_CLOCK_SIGMA_S, LARGE_CLOCK_SIGMA_S = 0.5, 0.1
 LARGE_YAW_SIGMA_DEG = 2.0
+MIN_MIRRORED = 0.8  # correlation of the heights below minus which they run against each other
+MAX_UNIX_DIFFERENCE_S = 60.0  # computers in a lab keep time better than this
 FRAME_RATIO = 1.3  # by which one frame must fit better than the next
 # A free yaw and origin that reduce the residual so much say that the file's frame is not EKF2's
 TURNED_RATIO, TURNED_RMS_M = 2.0, 0.3
@@ -190,6 +192,8 @@ class _Match:
         With the yaw found in any case.
     turned : bool
         Whether the file's frame is clearly not EKF2's, so that the clock is taken from ``free``.
+    better_frame : str
+        Frame in which the file fits without a turn, where that is not the one asked for.
     """
 
     reference: _Track
@@ -198,6 +202,7 @@ class _Match:
     fit: _Fit
     free: _Fit
     turned: bool
+    better_frame: str = ""
 
     @property
     def clock(self) -> _Fit:
@@ -483,7 +488,18 @@ def _match(
         )
         turned &= _is_sound(free, reference.name)
         misfits = {name: tried.rms_m for name, tried in fits.items()}
-        matches.append(_Match(reference, best, misfits, fit, free, turned))
+        better = ""
+        if turned and frame and yaw_rad is not None:
+            others = {
+                name: _best_fit(samples, name, reference, yaw_rad, lag_s)
+                for name in FRAMES
+                if name != frame
+            }
+            name, other = min(others.items(), key=lambda item: item[1].rms_m)
+            fits_well = other.peak.concordance >= GOOD_CONCORDANCE[reference.name]
+            if fits_well and TURNED_RATIO * other.rms_m < fit.rms_m:
+                better = name
+        matches.append(_Match(reference, best, misfits, fit, free, turned, better))
     return min(matches, key=lambda match: match.clock.rms_m)
 
 
@@ -884,6 +900,8 @@ def _describe(
         warnings=(
             *_match_warnings(match, samples, yaw_sigma_deg),
             *_frame_warnings(match, compared, yaw_rad, yaw_deg == "auto"),
+            *([] if match and match.better_frame else _height_warnings(flight, placed)),
+            *_unix_warnings(flight, file, clock_offset_s),
         ),
     )
     return alignment, placed
@@ -944,6 +962,42 @@ def _match_warnings(
     return warnings
 
 
+def _height_warnings(flight: Flight, placed: pd.DataFrame) -> list[str]:
+    """Whether the file's height runs against EKF2's: then its frame is another one."""
+    if isinstance(flight.ekf2, Unavailable):
+        return []
+    down = flight.ekf2.state["down_m"]
+    inside = placed[(placed.index >= down.index[0]) & (placed.index <= down.index[-1])]
+    file_down = inside["down_m"].to_numpy()
+    known = np.isfinite(file_down)
+    if np.count_nonzero(known) < MIN_SAMPLES:
+        return []
+    ours = file_down[known]
+    theirs = np.interp(inside.index[known], down.index, down)
+    if min(np.ptp(np.percentile(ours, [2, 98])), np.ptp(theirs)) < MIN_MOTION_M:
+        return []
+    if np.corrcoef(ours, theirs)[0, 1] > -MIN_MIRRORED:
+        return []
+    return [
+        "The file's height runs against EKF2's (one rises where the other sinks): its z points the "
+        f"other way. Give another {FRAME_OPTION}."
+    ]
+
+
+def _unix_warnings(flight: Flight, file: PositionFile, clock_offset_s: float | None) -> list[str]:
+    """Whether the file's UNIX clock is far from the log's: then it may be of another flight."""
+    start_s = flight.log.start_unix_s
+    if file.clock != "UNIX" or start_s is None or clock_offset_s is None:
+        return []
+    apart_s = flight.log.boot_time_s - clock_offset_s - start_s
+    if abs(apart_s) < MAX_UNIX_DIFFERENCE_S:
+        return []
+    return [
+        f"By their UNIX times file and log are {abs(apart_s):.0f} s apart: is it the same flight? "
+        "Flights along one path match each other well."
+    ]
+
+
 def _frame_warnings(
     match: _Match | None, compared: _Comparison | None, yaw_rad: float, auto: bool
 ) -> list[str]:
@@ -962,6 +1016,11 @@ def _frame_warnings(
     if match and turned:
         yaw = np.degrees(np.angle(np.exp(1j * (match.free.yaw_rad - yaw_rad))))
         shift = np.hypot(*match.free.origin_m[:2])
+        if match.better_frame:
+            return [
+                f"The file does not fit the {match.reference.name} as {match.frame}, but it does "
+                f"as {match.better_frame}: give --position-frame {match.better_frame}."
+            ]
         how = f" and shifted by {shift:.1f} m" if compared else ""
         return [
             f"The file's frame seems turned by {yaw:.1f}°{how} against the {match.reference.name}: "

@@ -182,6 +182,8 @@ class Inventory:
         What was looked for and not found.
     unused : tuple of Unused
     inputs : tuple of InputFile
+    notes : tuple of str
+        What the reader had to do, and what EKF2 means here.
     """
 
     log: LogInfo
@@ -196,6 +198,7 @@ class Inventory:
     missing: tuple[Unavailable, ...]
     unused: tuple[Unused, ...]
     inputs: tuple[InputFile, ...]
+    notes: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -235,6 +238,7 @@ def take_inventory(flight: Flight) -> Inventory:
         missing=flight.missing,
         unused=flight.unused,
         inputs=flight.inputs,
+        notes=(*flight.log.notes, *(flight.ekf2.notes if isinstance(flight.ekf2, Ekf2) else ())),
     )
 
 

@@ -151,8 +151,7 @@ def _no_source(flight: Flight) -> str:
         return (
             f"{flight.log.name}: {damaged}no external position was sent to the autopilot in this "
             "recording (no VISION_POSITION_ESTIMATE, ODOMETRY or ATT_POS_MOCAP). Give the "
-            "positioning system's own file with --position, or the ULog; px4fuse info says what "
-            "is in it."
+            "positioning system's own file with --position, or the ULog."
         )
     gps = any(track.rung > LAST_AUTOMATIC_RUNG for track in flight.positions)
     hint = (

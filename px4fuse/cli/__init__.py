@@ -16,6 +16,9 @@ COMMANDS = {
     "compare": ("px4fuse.cli.compare", "Compare a flight's EKF2 with a two-state Kalman filter."),
     "info": ("px4fuse.cli.info", "Say what is in a log and what can be done with it."),
     "extract": ("px4fuse.cli.extract", "Write a log's data as tidy tables, CSV or Parquet."),
+    "tune": ("px4fuse.cli.tune", "Find the noises that the data ask for, with intervals."),
+    "sync": ("px4fuse.cli.sync", "Estimate the position source's clock offset."),
+    "simulate": ("px4fuse.cli.simulate", "Simulate a flight with chosen mistakes, as ULog."),
     "lesson": ("px4fuse.cli.lesson", "Run the lesson's worked examples through this engine."),
 }
 

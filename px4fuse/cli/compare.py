@@ -9,7 +9,15 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from px4fuse.cli.inputs import analysis_options, command_line, encodable, progress, run_comparison
+from px4fuse.cli.inputs import (
+    analysis_options,
+    command_line,
+    encodable,
+    progress,
+    run_comparison,
+    terminal,
+    write_outputs,
+)
 from px4fuse.errors import OutputError, SettingsError
 
 if TYPE_CHECKING:
@@ -68,8 +76,7 @@ def compare(
     LOG is a PX4 ULog or a MAVLink recording (.tlog or raw stream). Writes a PDF report and its
     results as JSON.
     """
-    from rich.console import Console
-
+    from px4fuse.explanation import explain
     from px4fuse.findings import find
     from px4fuse.report.document import Document, Student
     from px4fuse.report.results import results, to_json
@@ -79,7 +86,7 @@ def compare(
     if target.suffix.lower() != ".pdf":
         raise OutputError(f"{target}: the report is a PDF. Give a name that ends in .pdf with -o.")
     with progress(json_path == Path("-")) as step:
-        compared = run_comparison(log, step, **analysis)
+        compared = explain(run_comparison(log, step, **analysis), step)
         document = Document(compared, find(compared), person, command_line("compare", log))
         found = results(document)
         _write(document, found, target, json_path, step)
@@ -88,7 +95,7 @@ def compare(
     else:
         from px4fuse.report.terminal import print_summary
 
-        console = Console(highlight=False)
+        console = terminal()
         print_summary(console, document)
         console.print(f"Report   {target}", markup=False, style="bold", soft_wrap=True)
     if fail_on is not None:
@@ -126,7 +133,6 @@ def _write(
 ) -> None:
     from px4fuse.report.pdf import render
     from px4fuse.report.results import to_json
-    from px4fuse.report.writing import write_all
 
     step("drawing the report")
     text = to_json(found)
@@ -136,4 +142,4 @@ def _write(
         if beside.resolve() == target.resolve():
             raise OutputError(f"{beside}: --json and -o name the same file. Give two names.")
         contents[beside] = text.encode()
-    write_all(contents)
+    write_outputs(contents)

@@ -4,12 +4,18 @@ from __future__ import annotations
 
 import importlib.util
 import io
+import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from px4fuse.cli.inputs import read_recordings, recording_options, with_position
+from px4fuse.cli.inputs import (
+    read_recordings,
+    recording_options,
+    with_position,
+    write_outputs,
+)
 from px4fuse.errors import OutputError
 
 if TYPE_CHECKING:
@@ -59,15 +65,15 @@ def extract(
         )
     from px4fuse import extraction
     from px4fuse.report.results import to_json
-    from px4fuse.report.writing import write_all
 
     flight = with_position(read_recordings(log, mavlink, system), **position)
+    _refuse_mixture(folder, flight.log.sha256)
     tables = extraction.tables(flight)
     encode = _parquet if kind == "parquet" else _csv
     contents = {folder / f"{name}.{kind}": encode(table) for name, table in tables.items()}
     contents[folder / "data_dictionary.csv"] = _csv(extraction.data_dictionary(flight))
     contents[folder / "flight.json"] = to_json(extraction.description(flight)).encode()
-    write_all(contents)
+    write_outputs(contents)
     click.echo(f"Wrote to {folder}:")
     for name, table in tables.items():
         click.echo(f"  {f'{name}.{kind}':44} {len(table):8} rows")
@@ -78,6 +84,20 @@ def extract(
     if others:
         names = ", ".join(sorted(path.name for path in others))
         click.echo(f"Already there and not of this run: {names}")
+
+
+def _refuse_mixture(folder: Path, sha256: str) -> None:
+    """Tables of two flights in one folder would pass for one."""
+    try:
+        before = json.loads((folder / "flight.json").read_text(encoding="utf-8"))["log"]
+        other = before["sha256"] != sha256
+        name = str(before["name"])
+    except (OSError, ValueError, KeyError, TypeError):  # not one of ours
+        return
+    if other:
+        raise OutputError(
+            f"{folder}: holds the tables of another log, {name}. Give another folder with -o."
+        )
 
 
 def _csv(table: pd.DataFrame) -> bytes:

@@ -8,7 +8,13 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from px4fuse.cli.inputs import read_recordings, recording_options, with_position
+from px4fuse.cli.inputs import (
+    read_recordings,
+    recording_options,
+    terminal,
+    with_position,
+    write_outputs,
+)
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -36,11 +42,8 @@ def info(
     **position: Any,
 ) -> None:
     """Say what is in a log, what px4fuse can do with it, and what to log next time."""
-    from rich.console import Console
-
     from px4fuse.inventory import take_inventory, to_plain
     from px4fuse.report.results import to_json
-    from px4fuse.report.writing import write_all
 
     inventory = take_inventory(with_position(read_recordings(log, mavlink, system), **position))
     text = to_json(to_plain(inventory))
@@ -48,8 +51,8 @@ def info(
         click.echo(text, nl=False)
         return
     if json_path is not None:
-        write_all({json_path: text.encode()})
-    _print(Console(highlight=False), inventory)
+        write_outputs({json_path: text.encode()})
+    _print(terminal(), inventory)
 
 
 def _print(console: Console, inventory: Inventory) -> None:
@@ -81,7 +84,7 @@ def _print(console: Console, inventory: Inventory) -> None:
     )
     unused = [(part.name, f"{part.count} messages: {part.reason}") for part in inventory.unused]
     _list(console, "Not used", unused)
-    _list(console, "Notes", [("-", note) for note in log.notes])
+    _list(console, "Notes", [("-", note) for note in inventory.notes])
 
 
 def _facts(inventory: Inventory) -> list[tuple[str, str]]:
@@ -124,7 +127,7 @@ def _flying(inventory: Inventory) -> str:
 
 
 def _senders(inventory: Inventory) -> Table:
-    table = _table("sender", "what it is", "messages", "lost", left=2)
+    table = _table("sender", "what it is", "messages", "not here", left=2)
     for sender in inventory.log.senders:
         table.add_row(
             f"{sender.system}/{sender.component}",

@@ -3,23 +3,28 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, cast
 
 import click
 from click.core import ParameterSource
 
-from px4fuse.errors import LogError, SettingsError
+from px4fuse.errors import LogError, OutputError, SettingsError
 
 if TYPE_CHECKING:
+    from rich.console import Console
+
     from px4fuse.comparison import Comparison
     from px4fuse.flight import Flight
 
 AXES = ("north", "east", "down", "aisle")
 # Options that name places or people; the command line in the report leaves them out
 NOT_RECORDED = ("log", "output", "json_path", "student", "student_id", "notes", "fail_on")
+# Options that name files to read
+INPUTS = ("log", "mavlink", "position", "notes")
 AUTO: Literal["auto"] = "auto"
 
 
@@ -166,7 +171,8 @@ clock_offset_option = click.option(
     type=NumberOrAuto(),
     default=None,
     metavar="S|auto",
-    help="Added to the position source's time stamps.  [default: 0; auto with --position]",
+    help="Added to the position source's time stamps; auto estimates it.  [default: 0; auto with "
+    "--position]",
 )
 
 
@@ -196,7 +202,10 @@ def read_recordings(log: Path, mavlink: Path | None, system: int | None) -> Flig
     flight = read_log(log)
     other = read_log(mavlink, system=system)
     if not other.log.format.startswith("MAVLink"):
-        raise LogError(f"--mavlink {mavlink.name}: a {other.log.format}, no MAVLink recording.")
+        raise LogError(
+            f"--mavlink {mavlink.name}: a {other.log.format}, no MAVLink recording. Give the ULog "
+            "first: px4fuse compare LOG.ulg --mavlink LOG.tlog."
+        )
     return join(flight, other)
 
 
@@ -221,10 +230,6 @@ def with_position(
     if position is None:
         if given:
             raise SettingsError(f"--{given[0].replace('_', '-')} is of use with --position only.")
-        if clock_offset == AUTO:
-            raise SettingsError(
-                "--clock-offset auto is of use with --position only; give the seconds to add."
-            )
         return flight
     from px4fuse.alignment import place
     from px4fuse.readers.position_csv import read_position_csv
@@ -282,17 +287,27 @@ def run_comparison(
     step(f"reading {log.name}")
     flight = read_recordings(log, mavlink, system)
     flight = with_position(flight, position, clock_offset, **position_format)
-    return comparison.compare(
-        flight,
-        settings,
-        axes=axes or None,
-        heading_deg=heading,
-        position_source=position_source,
-        start_s=start,
-        end_s=end,
-        input_required=input_name == "imu",
-        progress=lambda name: step(f"filtering {name}"),
-    )
+
+    def run(settings: Settings) -> Comparison:
+        return comparison.compare(
+            flight,
+            settings,
+            axes=axes or None,
+            heading_deg=heading,
+            position_source=position_source,
+            start_s=start,
+            end_s=end,
+            input_required=input_name == "imu",
+            progress=lambda name: step(f"filtering {name}"),
+        )
+
+    compared = run(settings)
+    if clock_offset == AUTO and position is None:
+        from px4fuse.explanation import clock_offset_found
+
+        found = clock_offset_found(compared, step)
+        compared = run(replace(settings, clock_offset_s=found))
+    return compared
 
 
 @contextmanager
@@ -306,6 +321,39 @@ def progress(quiet: bool) -> Iterator[Callable[[str], None]]:
         return
     with console.status("starting") as status:
         yield status.update
+
+
+def write_outputs(contents: Mapping[Path, bytes]) -> None:
+    """Write results, all or none, and never over a file that this run has read.
+
+    Raises
+    ------
+    OutputError
+        A target is one of the inputs, or cannot be written.
+    """
+    from px4fuse.report.writing import write_all
+
+    params = click.get_current_context().params
+    read = [params[name] for name in INPUTS if params.get(name) is not None]
+    for target in contents:
+        for source in read:
+            if target.exists() and source.exists() and target.samefile(source):
+                raise OutputError(
+                    f"{target}: is what this command reads; it was not overwritten. Give another "
+                    "name for the output."
+                )
+    write_all(contents)
+
+
+def terminal() -> Console:
+    """Standard output for tables; a reader that has gone, as with ``| head``, is no error."""
+    from rich.console import Console
+
+    class PipeConsole(Console):
+        def on_broken_pipe(self) -> None:
+            raise BrokenPipeError
+
+    return PipeConsole(highlight=False)
 
 
 def encodable(text: str) -> str:

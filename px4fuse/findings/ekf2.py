@@ -149,7 +149,10 @@ def resets(comparison: Comparison) -> Iterator[Finding]:
             "warning" if horizontal else "info",
             f"EKF2 reset its position {times(len(inside))} ({horizontal} horizontal), by up to "
             f"{max(sizes):.2f} m at {largest.time_s:.1f} s. In the comparison: {said[5:]}.",
-            "Look for the gap, rejection or change of height source at that time.",
+            "Look for the gap or rejection at that time."
+            if horizontal
+            else "A height reset at take-off is usual; in mid-flight look for a change of the "
+            "height source.",
             {"count": float(len(inside)), "largest_m": max(sizes), "at_s": largest.time_s},
         )
     switches = [time for time, _ in ekf2.instances if segment.start_s < time <= segment.end_s]

@@ -58,6 +58,12 @@ def times(count: int) -> str:
     return "once" if count == 1 else f"{count} times"
 
 
+def sentence(note: str) -> str:
+    """A note with a capital letter, unless it begins with a file's name."""
+    first = note.split(" ", 1)[0]
+    return note if "." in first else note[:1].upper() + note[1:]
+
+
 def step_share(steps: pd.Series, start_s: float, end_s: float) -> float:
     """Share of a span in which a 0/1 step function is 1."""
     edges = np.clip(np.append(steps.index.to_numpy(), np.inf), start_s, end_s)

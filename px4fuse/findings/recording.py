@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.comparison import Comparison
-from px4fuse.findings.model import Finding
+from px4fuse.findings.model import Finding, sentence
 from px4fuse.findings.thresholds import (
     GAP,
     GAP_INTERVALS,
@@ -59,15 +59,19 @@ def companion_not_synchronised(comparison: Comparison) -> Iterator[Finding]:
         return
     if clock.method not in MAPPED_BY_RECEIPT:
         return
+    ours = (
+        "Ours has to do the same; however old they were, by that much its track is late"
+        if clock.method == "arrival time"
+        else f"Ours has the sender's own stamps, mapped by the {clock.method}"
+    )
     yield Finding(
         "companion_not_synchronised",
         "warning",
         f"The clock of the sender of {comparison.source.name} was never synchronised with the "
-        "autopilot's (no answered TIMESYNC in the recording): EKF2 took the positions to be as old "
-        "as their arrival. Our filter has the sender's own stamps, mapped by the "
-        f"{clock.method}.",
+        "autopilot's (TIMESYNC): EKF2 took the positions to be measured when they arrived. "
+        f"{ours}.",
         SYNCHRONISE,
-        {"offset_s": clock.offset_s, "jitter_s": clock.jitter_s},
+        {"jitter_s": clock.jitter_s},
     )
 
 
@@ -108,7 +112,7 @@ def autopilot_restarted(comparison: Comparison) -> Iterator[Finding]:
             yield Finding(
                 "autopilot_restarted",
                 "warning",
-                f"{note[0].upper()}{note[1:]}.",
+                f"{sentence(note)}.",
                 "Record each flight into a file of its own.",
             )
 
@@ -116,7 +120,7 @@ def autopilot_restarted(comparison: Comparison) -> Iterator[Finding]:
 def samples_lost(comparison: Comparison) -> Iterator[Finding]:
     """The recording lacks single samples of a regular source."""
     source = comparison.source
-    if source.clock_map is None:
+    if source.clock_map is None or source.clock_map.method == "arrival time":
         return
     intervals = np.diff(within(source.samples, comparison.segment).index.to_numpy())
     if len(intervals) < 2 or source.clock_map.distinct_stamps is not None:
@@ -143,11 +147,15 @@ def position_file_placement(comparison: Comparison) -> Iterator[Finding]:
     if alignment is None:
         return
     for warning in alignment.warnings:
+        said, option, value = warning.rstrip(".").partition("ive --position-")
+        message = sentence(f"{said[:-1].rstrip(' :')}" if option else said)
         yield Finding(
             "position_file_placement",
-            "warning",
-            f"{comparison.source.name}: {warning[0].upper()}{warning[1:].rstrip('.')}.",
-            "Give --clock-offset, --position-frame and --position-yaw where you know them.",
+            "error" if option else "warning",
+            f"{comparison.source.name}: {message.rstrip('.')}.",
+            f"Give --position-{value}."
+            if option
+            else "Give --clock-offset, --position-frame and --position-yaw where you know them.",
         )
 
 
@@ -158,7 +166,7 @@ def receipt_out_of_order(comparison: Comparison) -> Iterator[Finding]:
             yield Finding(
                 "receipt_out_of_order",
                 "info",
-                f"{note[0].upper()}{note[1:]}: the recording computer's clock was set, or "
+                f"{sentence(note)}: the recording computer's clock was set, or "
                 "recordings were put together; what is stamped by the sender is not affected.",
                 "Switch the recording computer's time service off while recording.",
             )

@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.comparison import Comparison
-from px4fuse.findings.model import Finding, step_share, times
+from px4fuse.findings.model import Finding, sentence, step_share, times
 from px4fuse.findings.thresholds import (
     FUSING_SHARE_ERROR,
     GAP,
@@ -20,6 +20,7 @@ from px4fuse.findings.thresholds import (
     MIN_IMU_RATE,
     MIN_INNOVATION_SHARE,
     MOTION_RANGE,
+    RATE_MARGIN,
     VISION_PROFILE_BIT,
 )
 from px4fuse.flight import POSITION_COLUMNS, Ekf2, Unavailable, sample_rate
@@ -72,6 +73,16 @@ def source_frame(comparison: Comparison) -> Iterator[Finding]:
     if comparison.source.frame != "FRD":
         return
     aligned = False
+    if isinstance(ekf2, Ekf2) and isinstance(ekf2.fusing, Unavailable):
+        yield Finding(
+            "source_frame_not_north",
+            "info",
+            "The source's frame is FRD: its x axis is where the vehicle pointed at start, not "
+            "north. Whether EKF2 fused its yaw, so that the frames are the same, is not in this "
+            "recording.",
+            "Read 'north' as the source's x axis; the ULog says whether EKF2's is the same.",
+        )
+        return
     if isinstance(ekf2, Ekf2) and isinstance(ekf2.fusing, pd.DataFrame):
         segment = comparison.segment
         share = step_share(ekf2.fusing["yaw"], segment.start_s, segment.end_s)
@@ -124,7 +135,9 @@ def gaps(comparison: Comparison) -> Iterator[Finding]:
             {"count": float(len(lost)), "total_s": total},
         )
     gap_s = comparison.axes[0].replay.input_gap_s
-    if gap_s > IMU_GAP_TOTAL.value:
+    imu = comparison.flight.imu
+    interval_s = 1.0 / sample_rate(imu) if isinstance(imu, pd.DataFrame) else 0.0
+    if gap_s > max(IMU_GAP_TOTAL.value, 2.0 * interval_s):
         yield Finding(
             "imu_gap",
             "warning",
@@ -160,7 +173,7 @@ def logging_rate_low(comparison: Comparison) -> Iterator[Finding]:
         (flight.attitude, "attitude", "vehicle_attitude", MIN_ATTITUDE_RATE),
     ):
         topic = flight.streams[name].topics[0] if name in flight.streams else default
-        if isinstance(part, pd.DataFrame) and sample_rate(part) < threshold.value:
+        if isinstance(part, pd.DataFrame) and sample_rate(part) < RATE_MARGIN * threshold.value:
             yield Finding(
                 "logging_rate_low",
                 "warning",
@@ -216,7 +229,7 @@ def log_damaged(comparison: Comparison) -> Iterator[Finding]:
         yield Finding(
             "log_damaged",
             "warning",
-            f"{notes[0][0].upper()}{notes[0][1:]}"
+            sentence(notes[0])
             + (f" (and {len(notes) - 1} more such notes)." if len(notes) > 1 else "."),
             "Copy the log again; if it stays, replace the SD card or mend the MAVLink link.",
             {"notes": float(len(notes))},

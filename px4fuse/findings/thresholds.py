@@ -8,6 +8,7 @@ MIN_IMU_RATE = Threshold(
     50.0, "Hz", "5 IMU samples per DT of 0.1 s and 10 with margin for aliasing"
 )
 MIN_ATTITUDE_RATE = Threshold(10.0, "Hz", "PX4's default is 20 Hz; slerp bridges 0.1 s of a tilt")
+RATE_MARGIN = 0.98  # a stream set to a rate runs a little below it
 MIN_INNOVATION_SHARE = Threshold(
     0.75, "of the source's samples", "a quarter lost biases nothing yet"
 )
@@ -40,7 +41,7 @@ MOTION_RANGE = Threshold(0.5, "m", "5 to 95 % range; a hovering drone with 0.1 m
 RECEIPT_JITTER = Threshold(0.010, "s", "1 cm at 1 m/s, a tenth of a good UWB's noise")
 LOST_SHARE = Threshold(0.02, "of the source's samples", "seen: 0 to 0.3 %, and 8 to 9 % in v1.13")
 # ClockMap.method where no exchange of stamps tied the two clocks together
-MAPPED_BY_RECEIPT = ("receive time", "position in the stream")
+MAPPED_BY_RECEIPT = ("receive time", "position in the stream", "arrival time")
 VISION_PROFILE_BIT = 128  # SDLOG_PROFILE bit 7, logged_topics.cpp
 # Intervals (s) at which PX4's default profile thins these topics, logged_topics.cpp
 LOGGER_INTERVALS_S = {

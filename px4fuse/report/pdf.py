@@ -10,7 +10,17 @@ from matplotlib.backends.backend_pdf import PdfPages
 from matplotlib.figure import Figure
 from pypdf import PdfWriter
 
-from px4fuse.report import consistency, cover, innovations, notes, provenance, tracks, variances
+from px4fuse.report import (
+    clock,
+    consistency,
+    cover,
+    innovations,
+    notes,
+    provenance,
+    sensitivity,
+    tracks,
+    variances,
+)
 from px4fuse.report.document import Document
 from px4fuse.report.style import LEFT, MUTED, RIGHT, printable, report_style, shorten
 
@@ -21,6 +31,8 @@ PAGES = (
     innovations.draw,
     variances.draw,
     consistency.draw,
+    sensitivity.draw,
+    clock.draw,
     notes.draw,
     provenance.draw,
 )

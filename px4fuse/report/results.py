@@ -8,15 +8,18 @@ from __future__ import annotations
 
 import json
 import platform
-from dataclasses import asdict
+from collections.abc import Mapping
+from dataclasses import asdict, replace
 from importlib import metadata
 from importlib.resources import files
 from typing import Any
 
+from px4fuse.clock import ClockOffset
 from px4fuse.comparison import AgainstTruth, AxisComparison, Comparison, FilterSummary
 from px4fuse.consistency import Consistency
 from px4fuse.flight import Unavailable, sample_rate
 from px4fuse.report.document import Document
+from px4fuse.tuning import AxisTuning, Noise
 
 SCHEMA_NAME = "px4fuse-results"
 SCHEMA_VERSION = "1.1"
@@ -60,8 +63,11 @@ def results(document: Document) -> dict[str, Any]:
             )
             if joint is not None
         },
-        "tuning": _unavailable(Unavailable("tuning", NOT_YET, "See updates.noise_asked per axis.")),
-        "clock": _unavailable(Unavailable("clock offset", NOT_YET, "Set it with --clock-offset.")),
+        "tuning": {name: _tuned(found) for name, found in comparison.tuning.items()},
+        "clock": _clock(
+            comparison.clock or Unavailable("clock offset", "it was not asked for", "See sync."),
+            comparison.settings.clock_offset_s,
+        ),
         "loop": _unavailable(Unavailable("loop closure", NOT_YET, "None needed on an aisle.")),
         "findings": [
             {
@@ -78,6 +84,93 @@ def results(document: Document) -> dict[str, Any]:
         "student": asdict(document.student),
         "provenance": provenance(document.command),
     }
+
+
+def tuning_results(
+    comparison: Comparison, tuned: Mapping[str, AxisTuning | Unavailable], command: str
+) -> dict[str, Any]:
+    """What ``px4fuse tune`` found, as plain data."""
+    return {
+        "schema": {"name": "px4fuse-tuning", "version": "1.0"},
+        "log": _log(comparison),
+        "position_source": _source(comparison),
+        "settings": _settings(comparison),
+        "tuning": {name: _tuned(found) for name, found in tuned.items()},
+        "provenance": provenance(command),
+    }
+
+
+def sync_results(
+    comparison: Comparison, clock: ClockOffset | Unavailable, command: str
+) -> dict[str, Any]:
+    """What ``px4fuse sync`` found, as plain data."""
+    return {
+        "schema": {"name": "px4fuse-sync", "version": "1.0"},
+        "log": _log(comparison),
+        "position_source": _source(comparison),
+        "settings": _settings(comparison),
+        "clock": _clock(clock, comparison.settings.clock_offset_s),
+        "provenance": provenance(command),
+    }
+
+
+def _clock(clock: ClockOffset | Unavailable, applied_s: float) -> dict[str, Any]:
+    """Offsets count from the source's own stamps, what was applied already included."""
+    if isinstance(clock, Unavailable):
+        return _unavailable(clock)
+    low, high = clock.interval_s
+    return _present(
+        {
+            "offset_s": applied_s + clock.offset_s,
+            "interval_s": [applied_s + low, applied_s + high],
+            "sigma_s": clock.sigma_s,
+            "determinable": clock.determinable,
+            "reason": clock.reason or None,
+            "applied_s": applied_s,
+            "drift_ppm": clock.drift_ppm,
+            "drift_sigma_ppm": clock.drift_sigma_ppm,
+            "change_p": clock.change_p,
+            "parts": [
+                asdict(replace(part, offset_s=applied_s + part.offset_s)) for part in clock.parts
+            ],
+            "sigma_a_m_s2": clock.sigma_a_m_s2,
+            "sigma_z_m": clock.sigma_z_m,
+            "count": clock.count,
+        }
+    )
+
+
+def _tuned(found: AxisTuning | Unavailable) -> dict[str, Any]:
+    if isinstance(found, Unavailable):
+        return _unavailable(found)
+    held = found.held_out
+    return _present(
+        {
+            **_noise("sigma_a_m_s2", found.sigma_a),
+            **_noise("sigma_z_m", found.sigma_z),
+            "count": found.count,
+            "outliers": len(found.outlier_time_s),
+            "gain_nats": found.gain_nats,
+            "before": _statement(found.before),
+            "after": _statement(found.after),
+            "held_out": _unavailable(held) if isinstance(held, Unavailable) else asdict(held),
+            "als_sigma_a_m_s2": found.als_sigma_a_m_s2,
+            "als_sigma_z_m": found.als_sigma_z_m,
+        }
+    )
+
+
+def _noise(name: str, noise: Noise) -> dict[str, Any]:
+    """Value and interval, or a bound where there is only that; an open lower end is 0."""
+    if noise.value is None:
+        return _present({f"{name}_upper_bound": noise.high, f"{name}_lower_bound": noise.low})
+    if noise.high is None:
+        return {name: noise.value}
+    return {name: noise.value, f"{name}_interval": [noise.low or 0.0, noise.high]}
+
+
+def _statement(statement: Consistency | Unavailable) -> dict[str, Any]:
+    return asdict(statement) if isinstance(statement, Consistency) else _unavailable(statement)
 
 
 def provenance(command: str) -> dict[str, Any]:
@@ -204,9 +297,7 @@ def _filter(summary: FilterSummary | Unavailable) -> dict[str, Any]:
         return _unavailable(summary)
     sigmas = asdict(summary)
     del sigmas["consistency"]
-    statement = summary.consistency
-    stated = asdict(statement) if isinstance(statement, Consistency) else _unavailable(statement)
-    return stated | _present(sigmas)
+    return _statement(summary.consistency) | _present(sigmas)
 
 
 def _truth(result: AxisComparison) -> dict[str, Any]:

@@ -40,6 +40,14 @@ def print_summary(console: Console, document: Document) -> None:
     _line(
         console, "Position", f"{source.name}, {source.rate_hz:.1f} Hz ({comparison.source_reason})"
     )
+    if source.alignment is not None:
+        placed = source.alignment
+        sigma = placed.clock_offset_sigma_s
+        placing = (
+            f"{placed.frame}, yaw {placed.yaw_deg:.1f}°, clock {placed.clock_offset_s:+.3f}"
+            + (f" ± {sigma:.3f} s" if sigma is not None else " s")
+        )
+        _line(console, "Placed", placing)
     segment = comparison.segment
     _line(console, "Segment", f"{segment.start_s:.1f} s to {segment.end_s:.1f} s, {segment.reason}")
     console.print(_table(document))

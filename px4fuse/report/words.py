@@ -2,9 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
+from px4fuse.clock import CHANGE_P, ClockOffset
+from px4fuse.comparison import Comparison
 from px4fuse.consistency import Consistency
 from px4fuse.flight import Alignment, ClockMap, Unavailable
 from px4fuse.kalman import Settings
+from px4fuse.tuning import HORIZONTAL, AxisTuning
+
+# One update of EKF2 (EKF2_PREDICT_US)
+NEGLIGIBLE_OFFSET_S = 0.010
 
 
 def settings_words(settings: Settings) -> str:
@@ -28,7 +36,8 @@ def verdict_words(statement: Consistency | Unavailable) -> str:
 
 def clock_words(clock: ClockMap) -> str:
     """How one clock was mapped to the autopilot's, with its figures."""
-    if clock.method == "boot clock" or clock.distinct_stamps is not None:
+    told = clock.method in ("boot clock", "arrival time") or "own speed" in clock.note
+    if told or clock.distinct_stamps is not None:
         return f"{clock.clock}: {clock.note}"
     return (
         f"{clock.clock} by {clock.method}: offset {clock.offset_s:+.4f} s, drift "
@@ -66,4 +75,108 @@ def alignment_words(alignment: Alignment) -> list[tuple[str, str]]:
                 + (f", {residual:.3f} m RMS per axis" if residual is not None else ""),
             )
         )
+    return lines
+
+
+def tuning_advice(
+    comparison: Comparison, tuned: Mapping[str, AxisTuning | Unavailable]
+) -> list[str]:
+    """What follows from tuning: the command to run again, PX4's parameter, and cautions."""
+    name = next(
+        (n for n in (HORIZONTAL, "aisle", *tuned) if isinstance(tuned.get(n), AxisTuning)), None
+    )
+    if name is None:
+        return []
+    found = tuned[name]
+    assert isinstance(found, AxisTuning)
+    lines = []
+    options = [
+        f"{option} {noise.value:.3g}"
+        for option, noise in (("--sigma-a", found.sigma_a), ("--sigma-z", found.sigma_z))
+        if noise.value is not None
+    ]
+    if options:
+        lines.append(
+            f"Re-run   px4fuse compare {comparison.flight.log.name} {' '.join(options)}   ({name})"
+        )
+    now = comparison.flight.log.parameters.get("EKF2_EVP_NOISE")
+    if found.sigma_z.value is None:
+        bound = found.sigma_z.high
+        lines.append(
+            "SIGMA_Z  is below what this logging rate can show"
+            + (f" (at most {bound:.2g} m)" if bound is not None else "")
+            + ": between samples the process noise hides it. Log the source at a higher rate."
+        )
+    elif comparison.flight.log.autopilot == "PX4":
+        lines.append(
+            f"PX4      EKF2_EVP_NOISE {found.sigma_z.value:.3g}"
+            + (f" (now {now:g})" if now is not None else "")
+        )
+    if found.sigma_a.value is None:
+        lines.append("SIGMA_A  is not determined by this flight: too little motion, or too short.")
+    als = [
+        f"{label} {value:.3g} {unit}"
+        for label, value, unit in (
+            ("SIGMA_A", found.als_sigma_a_m_s2, "m/s²"),
+            ("SIGMA_Z", found.als_sigma_z_m, "m"),
+        )
+        if value is not None
+    ]
+    if als:
+        lines.append(f"Check    autocovariance least squares has {', '.join(als)} ({name})")
+    if len(found.outlier_time_s):
+        lines.append(
+            f"Outliers {len(found.outlier_time_s)} of {found.count} measurements ({name}), the "
+            f"first at {found.outlier_time_s[0]:.1f} s; they do not enter the noises"
+        )
+    held = found.held_out
+    if not isinstance(held, Unavailable) and held.gain_nats <= 0.0:
+        lines.append(
+            "Held out the settings found on the first half do no better on the second than the "
+            "chosen ones: these are as good as any"
+        )
+    return lines
+
+
+def clock_advice(comparison: Comparison, clock: ClockOffset | Unavailable) -> list[str]:
+    """What the clock estimate says, and what follows from it."""
+    if isinstance(clock, Unavailable):
+        return [f"Not determinable: {clock.reason}. {clock.remedy}"]
+    applied = comparison.settings.clock_offset_s
+    offset, (low, high) = applied + clock.offset_s, clock.interval_s
+    log = comparison.flight.log
+    lines = []
+    if not clock.determinable:
+        lines.append(f"Not determinable: {clock.reason}.")
+        lines.append("Fly passes of 5 m or more with clear starts and stops.")
+        return lines
+    lines.append(
+        f"Offset   {offset:+.3f} s, 95 % {applied + low:+.3f} s to {applied + high:+.3f} s, to be "
+        "added to the stamps of the source"
+    )
+    side = "late" if offset < 0.0 else "early"
+    if low <= -applied <= high or abs(offset) < NEGLIGIBLE_OFFSET_S:
+        lines.append("Reading  the stamps are right as far as this flight can tell")
+    else:
+        lines.append(f"Reading  the stamps are {side} by {abs(offset):.3f} s")
+        lines.append(f"Re-run   px4fuse compare {log.name} --clock-offset {offset:.3f}")
+    delay = log.parameters.get("EKF2_EV_DELAY")
+    if delay is not None:
+        asked = -offset * 1e3
+        margin = NEGLIGIBLE_OFFSET_S
+        inside = -(applied + high + margin) <= delay * 1e-3 <= -(applied + low - margin)
+        lines.append(
+            f"PX4      EKF2_EV_DELAY is {delay:g} ms, the data ask for {asked:.0f} ms ("
+            f"{-(applied + high) * 1e3:.0f} to {-(applied + low) * 1e3:.0f})"
+            + ("" if inside else "; set it, or mend the clock")
+        )
+    if clock.change_p is not None and clock.change_p < CHANGE_P:
+        parts = ", ".join(
+            f"{applied + p.offset_s:+.2f} s from {p.start_s:.0f} s" for p in clock.parts
+        )
+        lines.append(
+            f"Changes  the offset is not the same throughout (p {clock.change_p:.1g}): {parts}"
+        )
+    if clock.drift_ppm is not None and clock.drift_sigma_ppm is not None:
+        lines.append(f"Drift    {clock.drift_ppm:+.0f} ± {1.96 * clock.drift_sigma_ppm:.0f} ppm")
     return lines

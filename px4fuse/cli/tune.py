@@ -1,0 +1,111 @@
+"""``px4fuse tune``: the noises that the data ask for."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from px4fuse.cli.inputs import (
+    analysis_options,
+    command_line,
+    progress,
+    run_comparison,
+    terminal,
+    write_outputs,
+)
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from px4fuse.comparison import Comparison
+    from px4fuse.flight import Unavailable
+    from px4fuse.tuning import AxisTuning, Noise
+
+
+@click.command()
+@click.argument("log", type=click.Path(path_type=Path))
+@analysis_options
+@click.option(
+    "--json",
+    "json_path",
+    type=click.Path(path_type=Path),
+    default=None,
+    metavar="FILE",
+    help="Write it as JSON; - prints that alone on standard output.",
+)
+def tune(log: Path, json_path: Path | None, **analysis: Any) -> None:
+    """Find the SIGMA_A and SIGMA_Z of greatest likelihood, with their 95 % intervals.
+
+    --sigma-a and --sigma-z are what they are compared with. LOG is a PX4 ULog or a MAVLink
+    recording.
+    """
+    from px4fuse.report.results import to_json, tuning_results
+    from px4fuse.tuning import tune as tune_axes
+
+    with progress(json_path == Path("-")) as step:
+        compared = run_comparison(log, step, **analysis)
+        axes = tuple(result.axis for result in compared.axes)
+        tuned = tune_axes(axes, compared.settings, progress=lambda name: step(f"tuning {name}"))
+    text = to_json(tuning_results(compared, tuned, command_line("tune", log)))
+    if json_path == Path("-"):
+        click.echo(text, nl=False)
+        return
+    if json_path is not None:
+        write_outputs({json_path: text.encode()})
+    _print(terminal(), compared, tuned)
+
+
+def _print(
+    console: Console, compared: Comparison, tuned: dict[str, AxisTuning | Unavailable]
+) -> None:
+    from rich.table import Table
+    from rich.text import Text
+
+    from px4fuse.flight import Unavailable
+    from px4fuse.report.words import settings_words, tuning_advice
+
+    console.print(f"Chosen   {settings_words(compared.settings)}", markup=False, soft_wrap=True)
+    table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="bold")
+    for name in ("axis", "SIGMA_A, 95 %", "SIGMA_Z, 95 %", "gain", "held out", "lag 1"):
+        table.add_column(name, justify="left" if name == "axis" else "right", no_wrap=True)
+    for name, found in tuned.items():
+        if isinstance(found, Unavailable):
+            table.add_row(name, Text(found.reason, "dim"))
+            continue
+        held = found.held_out
+        table.add_row(
+            name,
+            _noise(found.sigma_a),
+            _noise(found.sigma_z),
+            f"{found.gain_nats:.3f}",
+            "" if isinstance(held, Unavailable) else f"{held.gain_nats:+.3f}",
+            _whiteness(found),
+        )
+    console.print(table)
+    console.print(
+        Text(
+            "gain: log-likelihood per measurement above the chosen settings; held out: the same on "
+            "the second half, tuned on the first; lag 1: autocorrelation before and after.",
+            "dim",
+        )
+    )
+    for line in tuning_advice(compared, tuned):
+        console.print(line, markup=False, soft_wrap=True)
+
+
+def _noise(noise: Noise) -> str:
+    if noise.value is None:
+        return "not determinable" if noise.high is None else f"at most {noise.high:.2g}"
+    low = "0" if noise.low is None else f"{noise.low:.2g}"
+    high = "?" if noise.high is None else f"{noise.high:.2g}"
+    return f"{noise.value:.3g} ({low}-{high})"
+
+
+def _whiteness(found: AxisTuning) -> str:
+    from px4fuse.flight import Unavailable
+
+    if isinstance(found.before, Unavailable) or isinstance(found.after, Unavailable):
+        return ""
+    return f"{found.before.lag1_autocorrelation:+.2f} {found.after.lag1_autocorrelation:+.2f}"
