@@ -16,10 +16,12 @@ if TYPE_CHECKING:
     from px4fuse.comparison import Comparison, compare
     from px4fuse.consistency import Consistency, assess
     from px4fuse.errors import Px4FuseError
+    from px4fuse.explanation import explain
     from px4fuse.findings import Finding, find
     from px4fuse.flight import Flight, Unavailable
     from px4fuse.kalman import Settings, replay
     from px4fuse.readers import read_log
+    from px4fuse.tuning import tune
 
 __all__ = [
     "Comparison",
@@ -31,9 +33,11 @@ __all__ = [
     "Unavailable",
     "assess",
     "compare",
+    "explain",
     "find",
     "read_log",
     "replay",
+    "tune",
 ]
 
 _HOMES = {
@@ -46,9 +50,11 @@ _HOMES = {
     "Unavailable": "flight",
     "assess": "consistency",
     "compare": "comparison",
+    "explain": "explanation",
     "find": "findings",
     "read_log": "readers",
     "replay": "kalman",
+    "tune": "tuning",
 }
 
 

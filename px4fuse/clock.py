@@ -58,7 +58,7 @@ MAX_HALF_INTERVAL_S = 0.15
 # Gyros are averaged to this interval before they are integrated
 GYRO_STEP_S = 0.02
 # Parts further apart than chance would put them (two-sided)
-CHANGE_P = 0.001
+CHANGE_P = 0.005
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ from px4fuse.comparison import Comparison
 from px4fuse.findings.ekf2 import ekf2_not_fusing, ekf2_rejecting, ekf2_unavailable, resets
 from px4fuse.findings.filter import process_noise_forgotten, too_few_innovations, variance_wrong
 from px4fuse.findings.model import SEVERITIES, Detector, Finding, Severity
+from px4fuse.findings.noise import clock_off, ekf2_delay_off, noises_off, outliers
 from px4fuse.findings.recording import (
     autopilot_restarted,
     companion_not_synchronised,
@@ -41,10 +42,14 @@ def find(comparison: Comparison) -> tuple[Finding, ...]:
 
 DETECTORS: tuple[Detector, ...] = (
     stamps_meaningless,
+    clock_off,
+    outliers,
+    noises_off,
     ekf2_not_fusing,
     process_noise_forgotten,
     variance_wrong,
     ekf2_rejecting,
+    ekf2_delay_off,
     companion_not_synchronised,
     position_file_placement,
     source_reconstructed,

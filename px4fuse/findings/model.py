@@ -10,6 +10,8 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.comparison import Comparison
+from px4fuse.flight import POSITION_COLUMNS
+from px4fuse.signals import within
 
 Severity = Literal["error", "warning", "info"]
 SEVERITIES: tuple[Severity, Severity, Severity] = ("error", "warning", "info")
@@ -62,6 +64,13 @@ def sentence(note: str) -> str:
     """A note with a capital letter, unless it begins with a file's name."""
     first = note.split(" ", 1)[0]
     return note if "." in first else note[:1].upper() + note[1:]
+
+
+def motion_range_m(comparison: Comparison) -> float:
+    """Larger horizontal extent of the source in the segment, 5 to 95 %."""
+    inside = within(comparison.source.samples, comparison.segment)
+    low, high = inside[POSITION_COLUMNS[:2]].quantile([0.05, 0.95]).to_numpy()
+    return float(np.max(high - low))
 
 
 def step_share(steps: pd.Series, start_s: float, end_s: float) -> float:

@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.comparison import Comparison
-from px4fuse.findings.model import Finding, sentence, step_share, times
+from px4fuse.findings.model import Finding, motion_range_m, sentence, step_share, times
 from px4fuse.findings.thresholds import (
     FUSING_SHARE_ERROR,
     GAP,
@@ -23,8 +23,7 @@ from px4fuse.findings.thresholds import (
     RATE_MARGIN,
     VISION_PROFILE_BIT,
 )
-from px4fuse.flight import POSITION_COLUMNS, Ekf2, Unavailable, sample_rate
-from px4fuse.signals import within
+from px4fuse.flight import Ekf2, Unavailable, sample_rate
 
 
 def source_reconstructed(comparison: Comparison) -> Iterator[Finding]:
@@ -150,9 +149,7 @@ def gaps(comparison: Comparison) -> Iterator[Finding]:
 
 def no_motion(comparison: Comparison) -> Iterator[Finding]:
     """The vehicle hardly moved: nothing about dynamics can be identified."""
-    inside = within(comparison.source.samples, comparison.segment)
-    low, high = inside[POSITION_COLUMNS[:2]].quantile([0.05, 0.95]).to_numpy()
-    extent = float(np.max(high - low))
+    extent = motion_range_m(comparison)
     if extent < MOTION_RANGE.value:
         yield Finding(
             "no_motion",

@@ -38,6 +38,14 @@ SMALLEST_NOISE = Threshold(0.001, "m", "below what any positioning system resolv
 RESPONSE_TIME = Threshold(2.5, "s", "five times the lesson's; a vehicle turns around in less")
 OUTLIER_SHARE = Threshold(0.005, "outside 5√S", "6e-7 is expected")
 MOTION_RANGE = Threshold(0.5, "m", "5 to 95 % range; a hovering drone with 0.1 m UWB stays below")
+CLOCK_OFFSET = Threshold(0.03, "s", "at 1 m/s a third of a good UWB's noise")
+CLOCK_OFFSET_ERROR = Threshold(0.10, "s", "at 1 m/s a good UWB's noise")
+EKF2_UPDATE = Threshold(0.010, "s", "EKF2_PREDICT_US, EKF2's own step")
+NOISE_OFF = Threshold(1.5, "times", "in standard deviation; below, hardly a line moves")
+NOISE_OFF_ERROR = Threshold(4.0, "times", "the gain is another one")
+OUTLIERS = Threshold(0.005, "of the measurements", "a normal source has 0.02 % beyond 3.7 σ")
+OUTLIERS_ERROR = Threshold(0.02, "of the measurements", "every tenth second at 5 Hz")
+MIN_OUTLIERS = 3
 RECEIPT_JITTER = Threshold(0.010, "s", "1 cm at 1 m/s, a tenth of a good UWB's noise")
 LOST_SHARE = Threshold(0.02, "of the source's samples", "seen: 0 to 0.3 %, and 8 to 9 % in v1.13")
 # ClockMap.method where no exchange of stamps tied the two clocks together

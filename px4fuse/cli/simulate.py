@@ -1,0 +1,227 @@
+"""``px4fuse simulate``: flights with known truth and chosen mistakes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from px4fuse.errors import OutputError
+from px4fuse.simulation.mistakes import MISTAKES, as_typed, made, parse
+from px4fuse.simulation.scenario import KINDS, YAWS, Scenario
+
+if TYPE_CHECKING:
+    from px4fuse.simulation.flights import Simulation
+
+_DEFAULT = Scenario()
+PASSES = {"aisle": _DEFAULT.passes, "loop": 1}
+
+
+class WithMistakes(click.Command):
+    """A command whose help ends with the table of mistakes."""
+
+    def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """List the mistakes."""
+        del ctx
+        with formatter.section("Mistakes (without =VALUE: a clear case)"):
+            formatter.write_dl(
+                [
+                    (
+                        f"{name}{mistake.usage}",
+                        mistake.help + (f" [{mistake.default:g}]" if mistake.arguments else ""),
+                    )
+                    for name, mistake in MISTAKES.items()
+                ]
+            )
+
+
+@click.command(cls=WithMistakes)
+@click.option(
+    "-o",
+    "--output",
+    type=click.Path(path_type=Path),
+    required=True,
+    metavar="FLIGHT.ulg",
+    help="The log to write.",
+)
+@click.option(
+    "--kind",
+    type=click.Choice(KINDS),
+    default=_DEFAULT.kind,
+    show_default=True,
+    help="Passes along an aisle with UWB, or laps around a square with drifting VIO.",
+)
+@click.option(
+    "--seed",
+    type=int,
+    default=_DEFAULT.seed,
+    show_default=True,
+    metavar="N",
+    help="A number per student gives everyone a flight of their own; the same number the same.",
+)
+@click.option(
+    "--mistake",
+    "mistakes",
+    multiple=True,
+    metavar="NAME[=VALUE]",
+    help="What goes wrong, from the table below; may be repeated.",
+)
+@click.option(
+    "--answer",
+    "answer_path",
+    type=click.Path(path_type=Path),
+    default=None,
+    metavar="FILE.json",
+    help="Write the answer: mistakes, biases, outliers, clock offset. Keep it to yourself.",
+)
+@click.option("--no-truth", is_flag=True, help="Leave the ground truth out of the log.")
+@click.option(
+    "--passes",
+    type=int,
+    default=None,
+    metavar="N",
+    help="Passes of the aisle [6], or laps of the loop [1].",
+)
+@click.option(
+    "--length",
+    "length_m",
+    type=float,
+    default=_DEFAULT.length_m,
+    show_default=True,
+    metavar="M",
+    help="Of the aisle, or of a side of the square.",
+)
+@click.option(
+    "--speed",
+    "speed_m_s",
+    type=float,
+    default=_DEFAULT.speed_m_s,
+    show_default=True,
+    metavar="M/S",
+)
+@click.option(
+    "--heading",
+    "heading_deg",
+    type=float,
+    default=_DEFAULT.heading_deg,
+    show_default=True,
+    metavar="DEG",
+    help="Of the aisle or of the first side, clockwise from north.",
+)
+@click.option(
+    "--yaw",
+    type=click.Choice(YAWS),
+    default=None,
+    help="Whether the nose stays or follows the flight.  [default: fixed; follow in a loop]",
+)
+@click.option(
+    "--sigma-uwb",
+    "sigma_uwb_m",
+    type=float,
+    default=_DEFAULT.sigma_uwb_m,
+    show_default=True,
+    metavar="M",
+    help="White noise of the UWB, per axis: the true SIGMA_Z.",
+)
+@click.option(
+    "--uwb-rate",
+    "uwb_rate_hz",
+    type=float,
+    default=_DEFAULT.uwb_rate_hz,
+    show_default=True,
+    metavar="HZ",
+)
+@click.option(
+    "--sigma-a",
+    "sigma_a_m_s2",
+    type=float,
+    default=_DEFAULT.sigma_a_m_s2,
+    show_default=True,
+    metavar="M/S²",
+    help="White noise of the accelerometer's mean over 0.1 s: the true SIGMA_A.",
+)
+@click.option(
+    "--accel-bias-sigma",
+    "accel_bias_sigma_m_s2",
+    type=float,
+    default=_DEFAULT.accel_bias_sigma_m_s2,
+    show_default=True,
+    metavar="M/S²",
+    help="Width from which the accelerometer's constant bias is drawn.",
+)
+@click.option(
+    "--vio-drift",
+    type=float,
+    default=_DEFAULT.vio_drift,
+    show_default=True,
+    metavar="SHARE",
+    help="Drift of the VIO, as a share of the distance.",
+)
+def simulate(
+    output: Path,
+    mistakes: tuple[str, ...],
+    answer_path: Path | None,
+    no_truth: bool,
+    passes: int | None,
+    **scenario: Any,
+) -> None:
+    """Simulate a flight with known truth and chosen mistakes, for exercises and exams.
+
+    Writes a PX4 ULog that every px4fuse command reads. It says that it was simulated but not which
+    mistakes were made, so that it can be handed out; with ground truth, unless --no-truth. It
+    holds no EKF2, since none was run: for that use the sample logs.
+
+    For example, px4fuse simulate -o s07.ulg --seed 7 --mistake nlos=5% --answer s07.json
+    """
+    if output.suffix.lower() != ".ulg":
+        raise OutputError(f"{output}: the log is a ULog. Give a name that ends in .ulg with -o.")
+    if answer_path is not None and answer_path.resolve() == output.resolve():
+        raise OutputError(f"{output}: --answer and -o name the same file. Give two names.")
+    parsed = parse(mistakes)
+    chosen = Scenario(
+        passes=passes if passes is not None else PASSES[scenario["kind"]],
+        truth=not no_truth,
+        **scenario,
+    )
+    from px4fuse.report.results import to_json
+    from px4fuse.report.writing import write_all
+    from px4fuse.simulation import flights
+
+    simulation = flights.simulate(chosen, parsed)
+    contents = {output: flights.to_ulog(simulation)}
+    if answer_path is not None:
+        contents[answer_path] = to_json(flights.answer(simulation)).encode()
+    write_all(contents)
+    for line in _summary(simulation):
+        click.echo(line)
+    click.echo(f"Log       {output}")
+    if answer_path is not None:
+        click.echo(f"Answer    {answer_path} (not for students)")
+
+
+def _summary(simulation: Simulation) -> list[str]:
+    """What was simulated, one line each."""
+    scenario, motion = simulation.scenario, simulation.motion
+    names = made(simulation.mistakes)
+    loop = scenario.kind == "loop"
+    path = (
+        f"{scenario.passes} lap{'s' * (scenario.passes > 1)} of a square of {scenario.length_m:g} m"
+        if loop
+        else f"{scenario.passes} pass{'es' * (scenario.passes > 1)} of {scenario.length_m:g} m"
+    )
+    return [
+        f"Flight    {scenario.kind}, {path} at {scenario.speed_m_s:g} m/s, "
+        f"{motion.duration_s:g} s, seed {scenario.seed}",
+        f"Position  {'VIO' if loop else 'UWB'}, {scenario.source_sigma_m:g} m at "
+        f"{scenario.source_rate_hz:g} Hz"
+        + (f", drift {scenario.vio_drift:.1%} of the path" if loop else ""),
+        f"IMU       {scenario.imu_rate_hz:g} Hz, SIGMA_A {scenario.sigma_a_m_s2:g} m/s²",
+        *(
+            f"Mistake   {as_typed(name, simulation.mistakes)}: {MISTAKES[name].help}"
+            for name in names
+        ),
+        *([] if names else ["Mistakes  none"]),
+        f"Truth     {'in the log' if scenario.truth else 'not in the log'}",
+        "EKF2      none: it was not run, so that there is nothing of it in the log",
+    ]

@@ -1,0 +1,247 @@
+"""Scenario and mistakes to a flight: in memory, as ULog, and the answer for the instructor."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from px4fuse.errors import SettingsError
+from px4fuse.flight import (
+    ANGULAR_RATE_COLUMNS,
+    QUATERNION_COLUMNS,
+    SPECIFIC_FORCE_COLUMNS,
+    Flight,
+    LogInfo,
+    Stream,
+    Truth,
+    missing_parts,
+    stretches_of_flight,
+)
+from px4fuse.plain import plain
+from px4fuse.readers.px4_ekf2 import read_ekf2
+from px4fuse.readers.px4_positions import read_positions, read_truth
+from px4fuse.readers.px4_topics import ATTITUDE, IMU, LAND_DETECTED, PARAMETERS, TRUTH_LOCAL
+from px4fuse.readers.ulog_topics import AT_MEASUREMENT, Topics
+from px4fuse.simulation import sensors
+from px4fuse.simulation.mistakes import MISTAKES, Mistakes, as_typed, made
+from px4fuse.simulation.motion import Motion, plan
+from px4fuse.simulation.scenario import Scenario
+from px4fuse.simulation.ulog_writer import Topic, encode
+
+NO_MISTAKES = Mistakes()
+PROFILE_WITH_VISION, PROFILE_DEFAULT = 129, 1
+RELEASE = 1 << 24 | 16 << 16 | 255  # v1.16.0, whose topics and fields these are
+HARDWARE = "px4fuse simulation"
+ANSWER_SCHEMA = {"name": "px4fuse-answer", "version": 1}
+
+
+@dataclass(frozen=True)
+class Simulation:
+    """A simulated flight: what is logged, and what only the instructor knows.
+
+    Attributes
+    ----------
+    scenario : Scenario
+    mistakes : Mistakes
+    motion : Motion
+        The truth at any time.
+    positions : Positions
+        The position source with its outliers and errors.
+    topics : tuple of Topic
+        All that a reader looks at.
+    parameters : mapping
+    """
+
+    scenario: Scenario
+    mistakes: Mistakes
+    motion: Motion
+    positions: sensors.Positions
+    topics: tuple[Topic, ...]
+    parameters: Mapping[str, int | float]
+
+
+def simulate(scenario: Scenario, mistakes: Mistakes = NO_MISTAKES) -> Simulation:
+    """Fly a scenario.
+
+    Raises
+    ------
+    SettingsError
+        A mistake does not fit the scenario.
+    """
+    for name in made(mistakes):
+        if MISTAKES[name].kind not in ("", scenario.kind):
+            raise SettingsError(
+                f"--mistake {name} is of use with --kind {MISTAKES[name].kind} only."
+            )
+    motion = plan(scenario, mistakes, sensors.stream(scenario, sensors.Stream.WANDER))
+    positions = sensors.positions(scenario, mistakes, motion)
+    topics = [
+        sensors.imu(scenario, mistakes, motion),
+        sensors.logged_attitude(scenario, motion),
+        sensors.land_detector(motion),
+    ]
+    if not mistakes.no_vvo:
+        topics.append(positions.topic)
+    if scenario.truth:
+        topics.append(sensors.ground_truth(scenario, motion))
+    for topic in topics:
+        if len(topic.fields["timestamp"]) < 2:
+            raise SettingsError(f"with these mistakes nothing is left of {topic.name}.")
+    return Simulation(
+        scenario, mistakes, motion, positions, tuple(topics), _parameters(scenario, mistakes)
+    )
+
+
+def simulate_flight(scenario: Scenario, mistakes: Mistakes = NO_MISTAKES) -> Flight:
+    """Fly a scenario and give what :func:`px4fuse.read_log` would read from its ULog.
+
+    Its ``log.sha256`` is of scenario and mistakes, since there is no file, and ``size_bytes`` 0.
+    """
+    return to_flight(simulate(scenario, mistakes))
+
+
+def to_ulog(simulation: Simulation) -> bytes:
+    """The flight as a ULog file; nothing in it says which mistakes were made."""
+    info: dict[str, int | str] = {
+        "sys_name": "PX4",
+        "ver_hw": HARDWARE,
+        "ver_sw_release": RELEASE,
+    }
+    topics = simulation.topics
+    if simulation.scenario.truth:
+        # left out of the fast path: no reader looks at it
+        topics += (sensors.true_attitude(simulation.scenario, simulation.motion),)
+    return encode(topics, simulation.parameters, info, sensors.START_US)
+
+
+def to_flight(simulation: Simulation, name: str = "simulation.ulg") -> Flight:
+    """The flight as the reader gives it, by the reader's own functions, without the file."""
+    tables = {(topic.name, 0): topic.columns() for topic in simulation.topics}
+    stamps = tables[IMU[0].topic, 0]["timestamp"].astype(np.int64)
+    identity = repr((simulation.scenario, simulation.mistakes)).encode()
+    topics = Topics(
+        log=LogInfo(
+            name=name,
+            sha256=hashlib.sha256(identity).hexdigest(),
+            size_bytes=0,
+            format="ULog",
+            firmware="PX4 v1.16.0",
+            firmware_hash="unknown",
+            hardware=HARDWARE,
+            boot_time_s=int(stamps[0]) * 1e-6,
+            duration_s=int(stamps[-1] - stamps[0]) * 1e-6,
+            parameters={
+                key: float(np.float32(simulation.parameters[key]))
+                for key in PARAMETERS
+                if key in simulation.parameters
+            },
+        ),
+        tables=tables,
+        zero_us=int(stamps[0]),
+        dropped={},
+    )
+    imu = topics.frame(IMU[0])[SPECIFIC_FORCE_COLUMNS + ANGULAR_RATE_COLUMNS]
+    attitude = topics.frame(ATTITUDE[0])[QUATERNION_COLUMNS]
+    landed = topics.frame(LAND_DETECTED[0], step=True)["landed"]
+    ekf2 = read_ekf2(topics)
+    tracks, missing_tracks = read_positions(topics, ekf2)
+    truth = read_truth(topics, tracks)
+    used = {"imu": IMU, "attitude": ATTITUDE}
+    if isinstance(truth, Truth):
+        used["truth"] = TRUTH_LOCAL
+    used["airborne"] = LAND_DETECTED
+    return Flight(
+        log=replace(
+            topics.log,
+            notes=tuple(
+                f"{count} samples of {topic} were dropped: their time stamps are zero or go back"
+                for (topic, _), count in sorted(topics.dropped.items())
+            ),
+        ),
+        imu=imu,
+        attitude=attitude,
+        positions=tracks,
+        ekf2=ekf2,
+        truth=truth,
+        airborne=stretches_of_flight(landed, topics.log.duration_s),
+        missing=(*missing_parts(imu, attitude, ekf2, truth), *missing_tracks),
+        streams={
+            part: Stream(
+                (layouts[0].topic,),
+                AT_MEASUREMENT if part == "imu" else topics.clock(layouts[0].topic),
+                name,
+            )
+            for part, layouts in used.items()
+        },
+    )
+
+
+def _parameters(scenario: Scenario, mistakes: Mistakes) -> dict[str, int | float]:
+    return {
+        "EKF2_EN": 0,  # there is no EKF2 in this simulation
+        "EKF2_EVP_GATE": 5.0,
+        "EKF2_EVP_NOISE": sensors.reported_sigma_m(scenario, mistakes),
+        "EKF2_EV_CTRL": 1,
+        "EKF2_EV_DELAY": 0.0,
+        "EKF2_EV_NOISE_MD": 0,
+        "EKF2_GPS_CTRL": 0,
+        "EKF2_HGT_REF": 3,
+        "SDLOG_PROFILE": PROFILE_DEFAULT if mistakes.no_vvo else PROFILE_WITH_VISION,
+    }
+
+
+def answer(simulation: Simulation) -> dict[str, Any]:
+    """What the instructor knows and the log does not say, as plain data.
+
+    Keys
+    ----
+    mistakes
+        Name to help and to the finding that a student should make.
+    truth
+        Biases, noises, the clock offset that must be *added* to the source's stamps, outliers by
+        index and time in the logged topic, and how far the path is from closing.
+    """
+    scenario, mistakes = simulation.scenario, simulation.mistakes
+    motion, source = simulation.motion, simulation.positions
+    accelerometer, gyro = sensors.biases(scenario, mistakes)
+    first, last = motion.at(np.array([0.0, motion.duration_s])).position_m
+    stamps = source.topic.fields["timestamp_sample"].astype(np.int64) - sensors.START_US
+    outlier = np.flatnonzero(source.outlier)
+    found: dict[str, Any] = plain(
+        {
+            "schema": ANSWER_SCHEMA,
+            "scenario": asdict(scenario),
+            "mistakes": {
+                name: {
+                    "typed": as_typed(name, mistakes),
+                    "help": MISTAKES[name].help,
+                    "finding": MISTAKES[name].finding,
+                    **{
+                        argument.field: getattr(mistakes, argument.field)
+                        for argument in MISTAKES[name].arguments
+                    },
+                }
+                for name in made(mistakes)
+            },
+            "truth": {
+                "duration_s": motion.duration_s,
+                "airborne_s": [motion.take_off_s, motion.touch_down_s],
+                "sigma_z_m": scenario.source_sigma_m,
+                "sigma_a_m_s2": float(np.hypot(scenario.sigma_a_m_s2, mistakes.vibration_m_s2)),
+                "reported_sigma_m": sensors.reported_sigma_m(scenario, mistakes),
+                "accelerometer_bias_m_s2": accelerometer.tolist(),
+                "gyro_bias_rad_s": gyro.tolist(),
+                "clock_offset_to_add_s": 0.0 - mistakes.clock_offset_s,
+                "outlier_index": outlier.tolist(),
+                "outlier_time_s": (stamps[outlier] * 1e-6).tolist(),
+                "path_length_m": source.distance_m,
+                "closure_error_m": float(np.linalg.norm((last - first)[:2])),
+                "source_drift_m": list(source.drift_m),
+            },
+        }
+    )
+    return found

@@ -1,0 +1,166 @@
+"""What is flown, and with which sensors."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+from px4fuse.errors import SettingsError
+
+Kind = Literal["aisle", "loop"]
+Yaw = Literal["fixed", "follow"]
+KINDS: tuple[Kind, Kind] = ("aisle", "loop")
+YAWS: tuple[Yaw, Yaw] = ("fixed", "follow")
+
+# DT to which SIGMA_A refers, the lesson's (px4fuse.kalman)
+DT_S = 0.1
+# How long it takes to start or stop along the aisle, and to turn a corner of the loop
+START_STOP_S = 1.5
+CORNER_S = 2.0
+# Range of each number beyond which it is a slip of the keyboard, with its option and unit
+_RANGES: dict[str, tuple[str, float, float, str]] = {
+    "passes": ("--passes", 1, 100, ""),
+    "length_m": ("--length", 2.0, 1000.0, "m"),
+    "speed_m_s": ("--speed", 0.1, 10.0, "m/s"),
+    "heading_deg": ("--heading", -360.0, 360.0, "degrees"),
+    "altitude_m": ("--altitude", 0.5, 50.0, "m"),
+    "uwb_rate_hz": ("--uwb-rate", 0.5, 100.0, "Hz"),
+    "sigma_uwb_m": ("--sigma-uwb", 0.0, 10.0, "m"),
+    "vio_rate_hz": ("vio_rate_hz", 1.0, 200.0, "Hz"),
+    "sigma_vio_m": ("sigma_vio_m", 0.0, 10.0, "m"),
+    "vio_drift": ("--vio-drift", 0.0, 0.5, "of the path"),
+    "vio_walk_m": ("vio_walk_m", 0.0, 1.0, "m/√m"),
+    "sigma_a_m_s2": ("--sigma-a", 0.0, 20.0, "m/s²"),
+    "accel_bias_sigma_m_s2": ("--accel-bias-sigma", 0.0, 2.0, "m/s²"),
+    "gyro_bias_sigma_rad_s": ("gyro_bias_sigma_rad_s", 0.0, 0.5, "rad/s"),
+    "gyro_noise_rad_s": ("gyro_noise_rad_s", 0.0, 1.0, "rad/s"),
+    "tilt_error_deg": ("tilt_error_deg", 0.0, 10.0, "degrees"),
+    "yaw_error_deg": ("yaw_error_deg", 0.0, 45.0, "degrees"),
+    "pause_s": ("pause_s", 0.0, 600.0, "s"),
+    "wander_m": ("wander_m", 0.0, 1.0, "m"),
+    "imu_rate_hz": ("imu_rate_hz", 50.0, 1000.0, "Hz"),
+    "attitude_rate_hz": ("attitude_rate_hz", 5.0, 250.0, "Hz"),
+    "truth_rate_hz": ("truth_rate_hz", 1.0, 250.0, "Hz"),
+    "seed": ("--seed", 0, 2**32 - 1, ""),
+}
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """A flight without mistakes.
+
+    Attributes
+    ----------
+    kind : {"aisle", "loop"}
+        Passes to and fro along a straight line with UWB, or laps around a square with VIO.
+    passes : int
+        Passes of the aisle, or laps of the loop.
+    length_m : float
+        Of the aisle, or of a side of the square.
+    speed_m_s : float
+    heading_deg : float
+        Of the aisle or of the square's first side, clockwise from north.
+    altitude_m : float
+    yaw : {"fixed", "follow"} or None
+        Whether the nose keeps its heading or turns into the direction of flight; None is fixed
+        in the aisle and following around the loop.
+    pause_s : float
+        Hover at either end of the aisle.
+    wander_m : float
+        Root mean square of the slow wander about the path, on each axis.
+    uwb_rate_hz, sigma_uwb_m : float
+        Of the UWB, whose noise is white and equal on all axes.
+    vio_rate_hz, sigma_vio_m : float
+        Likewise of the VIO.
+    vio_drift : float
+        Drift of the VIO in one horizontal direction, as a share of the distance flown.
+    vio_walk_m : float
+        And its random part, m per square root of the distance in m, on each axis.
+    sigma_a_m_s2 : float
+        White noise of the accelerometer, as the standard deviation of its mean over 0.1 s: the
+        SIGMA_A of the filter. A single sample has √(0.1 s · ``imu_rate_hz``) times that.
+    accel_bias_sigma_m_s2, gyro_bias_sigma_rad_s : float
+        The constant biases are drawn from normal distributions of these widths, per body axis.
+    gyro_noise_rad_s : float
+        Of a single sample.
+    tilt_error_deg, yaw_error_deg : float
+        Root mean square of the slow error (periods of 20 to 60 s) of the logged attitude.
+    imu_rate_hz, attitude_rate_hz, truth_rate_hz : float
+    truth : bool
+        Whether the log holds the ground truth.
+    seed : int
+        Decides everything random; each sensor draws from a stream of its own, so that a mistake
+        in one leaves the noise of the others as it was.
+
+    Raises
+    ------
+    SettingsError
+        A value is outside its range, or the speed is not reached within the length.
+    """
+
+    kind: Kind = "aisle"
+    passes: int = 6
+    length_m: float = 12.0
+    speed_m_s: float = 1.0
+    heading_deg: float = 30.0
+    altitude_m: float = 1.5
+    yaw: Yaw | None = None
+    pause_s: float = 3.0
+    wander_m: float = 0.03
+    uwb_rate_hz: float = 5.0
+    sigma_uwb_m: float = 0.10
+    vio_rate_hz: float = 30.0
+    sigma_vio_m: float = 0.01
+    vio_drift: float = 0.015
+    vio_walk_m: float = 0.01
+    sigma_a_m_s2: float = 0.2
+    accel_bias_sigma_m_s2: float = 0.03
+    gyro_bias_sigma_rad_s: float = 0.002
+    gyro_noise_rad_s: float = 0.01
+    tilt_error_deg: float = 0.1
+    yaw_error_deg: float = 1.0
+    imu_rate_hz: float = 250.0
+    attitude_rate_hz: float = 50.0
+    truth_rate_hz: float = 50.0
+    truth: bool = True
+    seed: int = 1
+
+    def __post_init__(self) -> None:
+        if self.kind not in KINDS:
+            raise SettingsError(f"--kind {self.kind}: give {' or '.join(KINDS)}.")
+        if self.yaw is not None and self.yaw not in YAWS:
+            raise SettingsError(f"--yaw {self.yaw}: give {' or '.join(YAWS)}.")
+        for name, (option, low, high, unit) in _RANGES.items():
+            value = getattr(self, name)
+            if not low <= value <= high:  # false for NaN too
+                raise SettingsError(
+                    f"{option} {value:g} is out of range: give {low:g} to {high:g} {unit}".rstrip()
+                    + "."
+                )
+        needed = self.speed_m_s * (CORNER_S if self.kind == "loop" else START_STOP_S)
+        if self.length_m < needed:
+            raise SettingsError(
+                f"--length {self.length_m:g} is too short for --speed {self.speed_m_s:g}: starts, "
+                f"stops and corners need {needed:g} m."
+            )
+
+    @property
+    def follows(self) -> bool:
+        """Whether the nose turns into the direction of flight."""
+        return self.yaw == "follow" or (self.yaw is None and self.kind == "loop")
+
+    @property
+    def source_rate_hz(self) -> float:
+        """Rate of the position source."""
+        return self.vio_rate_hz if self.kind == "loop" else self.uwb_rate_hz
+
+    @property
+    def source_sigma_m(self) -> float:
+        """White noise of the position source."""
+        return self.sigma_vio_m if self.kind == "loop" else self.sigma_uwb_m
+
+    @property
+    def accelerometer_noise_m_s2(self) -> float:
+        """White noise of a single sample."""
+        return self.sigma_a_m_s2 * math.sqrt(DT_S * self.imu_rate_hz)

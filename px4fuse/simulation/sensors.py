@@ -1,0 +1,372 @@
+"""What the sensors make of the truth, as PX4 v1.16 logs it, mistakes included."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.integrate import cumulative_trapezoid
+from scipy.signal import lfilter
+from scipy.spatial.transform import Rotation
+
+from px4fuse.simulation.mistakes import Mistakes
+from px4fuse.simulation.motion import Array, Motion, Sines, attitude, direction
+from px4fuse.simulation.scenario import DT_S, Scenario
+from px4fuse.simulation.ulog_writer import Topic
+
+# Boot time of the first data: an autopilot takes a while to start
+START_US = 12_000_000
+# From a measurement of the position source to its arrival in PX4
+LATENCY_S, LATENCY_SIGMA_S, LEAST_LATENCY_S = 0.030, 0.003, 0.005
+# Scatter of the source's intervals, as a share of them
+INTERVAL_SCATTER = 0.02
+FIRST_POSITION_S = 0.1
+# PX4 stamps with the time of arrival until 500 replies at 10 Hz (Timesync.cpp)
+TIMESYNC_CONVERGED_S = 50.0
+NLOS_BURST = 3  # samples, mean
+ATTITUDE_PERIODS_S = (20.0, 60.0)
+ATTITUDE_SINES = 4
+ATTITUDE_LATENCY_US = 200
+LANDED_INTERVAL_US = 1_000_000
+POSE_FRAME_NED = 1  # msg/VehicleOdometry.msg
+
+
+class Stream(IntEnum):
+    """Streams of random numbers: a mistake in one sensor leaves the others' noise as it was."""
+
+    WANDER = 0
+    BIAS = 1
+    IMU = 2
+    ATTITUDE = 3
+    TIMING = 4
+    SOURCE = 5
+    DRIFT = 6
+    NLOS = 7
+    VIBRATION = 8
+
+
+def stream(scenario: Scenario, name: Stream) -> np.random.Generator:
+    """The random numbers of one stream."""
+    return np.random.default_rng([scenario.seed, name])
+
+
+@dataclass(frozen=True)
+class Positions:
+    """The position source.
+
+    Attributes
+    ----------
+    topic : Topic
+    outlier : ndarray of bool, shape (n,)
+        Of each logged sample, whether it is one of the outliers that were put in.
+    error_m : ndarray, shape (n, 3)
+        What it measured beyond the truth, NED, mistakes of frame and scale included.
+    measured_s : ndarray, shape (n,)
+        When it truly measured, seconds from the first data.
+    distance_m, drift_m : float, tuple of float
+        Horizontal distance flown, and the VIO's drift at the end (NED).
+    """
+
+    topic: Topic
+    outlier: NDArray[np.bool_]
+    error_m: Array
+    measured_s: Array
+    distance_m: float
+    drift_m: tuple[float, float, float]
+
+
+def biases(scenario: Scenario, mistakes: Mistakes) -> tuple[Array, Array]:
+    """Accelerometer (m/s²) and gyro (rad/s) biases, body FRD, each of shape (3,)."""
+    rng = stream(scenario, Stream.BIAS)
+    accelerometer = rng.normal(0.0, scenario.accel_bias_sigma_m_s2, 3)
+    accelerometer[0] += mistakes.accel_bias_m_s2
+    return accelerometer, rng.normal(0.0, scenario.gyro_bias_sigma_rad_s, 3)
+
+
+def imu(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> Topic:
+    """sensor_combined: the accelerometer's and the gyro's own samples."""
+    time_us = _grid_us(motion.duration_s, scenario.imu_rate_hz)
+    truth = attitude(motion.at(_seconds(time_us)))
+    bias_a, bias_g = biases(scenario, mistakes)
+    rng = stream(scenario, Stream.IMU)
+    shape = (len(time_us), 3)
+    force = truth.specific_force_m_s2 + bias_a
+    force += scenario.accelerometer_noise_m_s2 * rng.standard_normal(shape)
+    rate = truth.angular_rate_rad_s + bias_g
+    rate += scenario.gyro_noise_rad_s * rng.standard_normal(shape)
+    if mistakes.vibration_m_s2:
+        sigma = mistakes.vibration_m_s2 * np.sqrt(DT_S * scenario.imu_rate_hz)
+        force += sigma * stream(scenario, Stream.VIBRATION).standard_normal(shape)
+    keep = _outside_gap(
+        _seconds(time_us), mistakes.imu_dropout_s, mistakes.imu_dropout_at_s, motion.duration_s
+    )
+    keep &= thinned(_seconds(time_us), mistakes.imu_rate_hz)
+    count = int(np.count_nonzero(keep))
+    interval_us = round(1e6 / scenario.imu_rate_hz)
+    return Topic(
+        "sensor_combined",
+        {
+            "timestamp": _boot(time_us[keep]),
+            "gyro_rad": rate[keep].astype(np.float32),
+            "gyro_integral_dt": np.full(count, interval_us, np.uint32),
+            "accelerometer_timestamp_relative": np.zeros(count, np.int32),
+            "accelerometer_m_s2": force[keep].astype(np.float32),
+            "accelerometer_integral_dt": np.full(count, interval_us, np.uint32),
+            "accelerometer_clipping": np.zeros(count, np.uint8),
+            "gyro_clipping": np.zeros(count, np.uint8),
+        },
+    )
+
+
+def logged_attitude(scenario: Scenario, motion: Motion) -> Topic:
+    """vehicle_attitude: the truth with a small slow error, as of a good estimator without EKF2."""
+    time_us = _grid_us(motion.duration_s, scenario.attitude_rate_hz)
+    truth = attitude(motion.at(_seconds(time_us))).body_to_ned
+    error = attitude_error(scenario, _seconds(time_us)).as_matrix()
+    return _attitude_topic("vehicle_attitude", time_us, ATTITUDE_LATENCY_US, error @ truth)
+
+
+def true_attitude(scenario: Scenario, motion: Motion) -> Topic:
+    """vehicle_attitude_groundtruth."""
+    time_us = _grid_us(motion.duration_s, scenario.truth_rate_hz)
+    truth = attitude(motion.at(_seconds(time_us))).body_to_ned
+    return _attitude_topic("vehicle_attitude_groundtruth", time_us, 0, truth)
+
+
+def _attitude_topic(
+    name: str, time_us: NDArray[np.int64], late_us: int, body_to_ned: Array
+) -> Topic:
+    quaternion = Rotation.from_matrix(body_to_ned).as_quat(scalar_first=True)
+    return Topic(
+        name,
+        {
+            "timestamp": _boot(time_us + late_us),
+            "timestamp_sample": _boot(time_us),
+            "q": quaternion.astype(np.float32),
+        },
+    )
+
+
+def attitude_error(scenario: Scenario, time_s: Array) -> Rotation:
+    """Error of the logged attitude, a small rotation about north, east and down."""
+    tilt, yaw = np.radians([scenario.tilt_error_deg, scenario.yaw_error_deg])
+    rng = stream(scenario, Stream.ATTITUDE)
+    rms = np.array([tilt, tilt, yaw])
+    sines = Sines.draw(rng, rms, ATTITUDE_PERIODS_S, ATTITUDE_SINES)
+    return Rotation.from_rotvec(sines.at(time_s)[0])
+
+
+def land_detector(motion: Motion) -> Topic:
+    """vehicle_land_detected: once a second, and when it changes."""
+    changes_us = np.rint(np.array([motion.take_off_s, motion.touch_down_s]) * 1e6).astype(np.int64)
+    time_us = np.union1d(np.arange(0, int(motion.duration_s * 1e6), LANDED_INTERVAL_US), changes_us)
+    landed = (time_us < changes_us[0]) | (time_us >= changes_us[1])
+    return Topic(
+        "vehicle_land_detected",
+        {
+            "timestamp": _boot(time_us),
+            "freefall": np.zeros(len(time_us), np.bool_),
+            "ground_contact": landed,
+            "maybe_landed": landed,
+            "landed": landed,
+        },
+    )
+
+
+def ground_truth(scenario: Scenario, motion: Motion) -> Topic:
+    """vehicle_local_position_groundtruth."""
+    time_us = _grid_us(motion.duration_s, scenario.truth_rate_hz)
+    state = motion.at(_seconds(time_us))
+    fields: dict[str, NDArray[Any]] = {
+        "timestamp": _boot(time_us),
+        "timestamp_sample": _boot(time_us),
+    }
+    for names, values in (
+        (("x", "y", "z"), state.position_m),
+        (("vx", "vy", "vz"), state.velocity_m_s),
+        (("ax", "ay", "az"), state.acceleration_m_s2),
+    ):
+        fields |= {name: values[:, i].astype(np.float32) for i, name in enumerate(names)}
+    heading = np.angle(np.exp(1j * state.yaw_rad))
+    fields["heading"] = heading.astype(np.float32)
+    for name in ("xy_valid", "z_valid", "v_xy_valid", "v_z_valid"):
+        fields[name] = np.ones(len(time_us), np.bool_)
+    return Topic("vehicle_local_position_groundtruth", fields)
+
+
+def positions(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> Positions:
+    """vehicle_visual_odometry: UWB in the aisle, VIO around the loop."""
+    timing = stream(scenario, Stream.TIMING)
+    interval_s = 1.0 / scenario.source_rate_hz
+    count = int((motion.duration_s - FIRST_POSITION_S) / interval_s)
+    nominal_s = FIRST_POSITION_S + interval_s * np.arange(count)
+    # half an interval at most, so that the order stays
+    scatter = np.clip(timing.normal(0.0, INTERVAL_SCATTER, count), -0.4, 0.4)
+    time_s = np.maximum(nominal_s + scatter * interval_s, 0.0)
+    state = motion.at(time_s)
+    position = state.position_m.copy()
+    speed = np.hypot(state.velocity_m_s[:, 0], state.velocity_m_s[:, 1])
+    distance = cumulative_trapezoid(speed, time_s, initial=0)
+    drift = np.zeros_like(position)
+    if scenario.kind == "loop":
+        drift = vio_drift(scenario, distance)
+    position += drift
+    sigma = scenario.source_sigma_m
+    position += sigma * stream(scenario, Stream.SOURCE).standard_normal(position.shape)
+    airborne = (time_s > motion.take_off_s) & (time_s < motion.touch_down_s)
+    shift, outlier = outliers(scenario, mistakes, airborne)
+    position += shift
+    if mistakes.smoothed_s:
+        position = _low_pass(position, interval_s, mistakes.smoothed_s)
+    position *= 1.0 + mistakes.scale_percent / 100.0
+    if mistakes.yaw_deg:
+        position = Rotation.from_euler("z", mistakes.yaw_deg, degrees=True).apply(position)
+    if mistakes.jump_m:
+        at_s = motion.duration_s / 1.5 if mistakes.jump_at_s is None else mistakes.jump_at_s
+        position[time_s >= at_s] += mistakes.jump_m * direction(scenario.heading_deg)
+    keep = _outside_gap(
+        time_s, mistakes.dropout_s, mistakes.dropout_at_s, motion.duration_s
+    ) & thinned(time_s, mistakes.decimate_hz)
+    arrival_us, stamp_us = _stamps(mistakes, time_s, timing)
+    rotation = None
+    if scenario.kind == "loop":
+        rotation = attitude(state).body_to_ned[keep]
+    return Positions(
+        topic=_odometry(
+            arrival_us[keep], stamp_us[keep], position[keep], reported_sigma_m(scenario, mistakes),
+            rotation,
+        ),
+        outlier=outlier[keep],
+        error_m=(position - state.position_m)[keep],
+        measured_s=time_s[keep],
+        distance_m=float(distance[-1]),
+        drift_m=(float(drift[-1, 0]), float(drift[-1, 1]), float(drift[-1, 2])),
+    )  # fmt: skip
+
+
+def reported_sigma_m(scenario: Scenario, mistakes: Mistakes) -> float:
+    """Standard deviation that the source reports; EKF2 takes none below 0.01 m (EKF2.cpp)."""
+    return max(scenario.source_sigma_m, 0.01) * float(np.sqrt(mistakes.r_scale))
+
+
+def vio_drift(scenario: Scenario, distance_m: Array) -> Array:
+    """Drift of the VIO, NED, shape (n, 3): a share of the distance, and a random walk on it."""
+    rng = stream(scenario, Stream.DRIFT)
+    straight = scenario.vio_drift * direction(rng.uniform(0.0, 360.0))
+    steps = np.sqrt(np.diff(distance_m, prepend=0.0))[:, None]
+    walk = np.cumsum(steps * rng.standard_normal((len(distance_m), 3)), axis=0)
+    return np.asarray(distance_m[:, None] * straight + scenario.vio_walk_m * walk)
+
+
+def outliers(
+    scenario: Scenario, mistakes: Mistakes, airborne: NDArray[np.bool_]
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Shift of each sample, shape (n, 3), and which are outliers, in bursts while airborne.
+
+    A burst has one horizontal direction, away from the anchor that is hidden, and sizes from half
+    to one and a half of the mean one.
+    """
+    shift = np.zeros((len(airborne), 3))
+    chosen = np.zeros(len(airborne), np.bool_)
+    flying = np.flatnonzero(airborne)
+    count = round(len(flying) * mistakes.nlos_percent / 100.0)
+    if count == 0:
+        return shift, chosen
+    rng = stream(scenario, Stream.NLOS)
+    bursts = -(-count // NLOS_BURST)
+    lengths = 1 + rng.multinomial(count - bursts, np.full(bursts, 1.0 / bursts))
+    gaps = rng.multinomial(len(flying) - count, np.full(bursts + 1, 1.0 / (bursts + 1)))
+    starts = np.cumsum(gaps[:-1]) + np.cumsum(lengths) - lengths
+    burst = np.repeat(np.arange(bursts), lengths)
+    within = np.arange(count) - np.repeat(np.cumsum(lengths) - lengths, lengths)
+    at = flying[starts[burst] + within]
+    angle = rng.uniform(0.0, 2.0 * np.pi, bursts)[burst]
+    size = mistakes.nlos_size_m * rng.uniform(0.5, 1.5, count)
+    shift[at, 0], shift[at, 1] = size * np.cos(angle), size * np.sin(angle)
+    chosen[at] = True
+    return shift, chosen
+
+
+def thinned(time_s: Array, rate_hz: float) -> NDArray[np.bool_]:
+    """Samples that a logger keeps which passes on at most this rate; 0 keeps all."""
+    if rate_hz <= 0.0:
+        return np.ones(len(time_s), np.bool_)
+    # a sample on the edge of an interval must not fall to either side by rounding
+    return np.asarray(np.diff(np.floor(time_s * rate_hz + 1e-6), prepend=-1.0) > 0.0)
+
+
+def _stamps(
+    mistakes: Mistakes, time_s: Array, rng: np.random.Generator
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Times of arrival and stamps of measurement, µs from the first data."""
+    latency = mistakes.clock_jump_s or LATENCY_S
+    latency_s = np.maximum(rng.normal(latency, LATENCY_SIGMA_S, len(time_s)), LEAST_LATENCY_S)
+    arrival_us = np.maximum.accumulate(np.rint((time_s + latency_s) * 1e6).astype(np.int64))
+    shift_s = mistakes.clock_offset_s + mistakes.clock_drift_ppm * 1e-6 * time_s
+    stamp_us = np.rint((time_s + shift_s) * 1e6).astype(np.int64)
+    if mistakes.clock_jump_s:
+        stamp_us = np.where(time_s < TIMESYNC_CONVERGED_S, arrival_us, stamp_us)
+    return arrival_us, stamp_us
+
+
+def _odometry(
+    arrival_us: NDArray[np.int64],
+    stamp_us: NDArray[np.int64],
+    position_m: Array,
+    sigma_m: float,
+    body_to_ned: Array | None,
+) -> Topic:
+    count = len(arrival_us)
+    unknown = np.full((count, 3), np.nan, np.float32)
+    quaternion = np.full((count, 4), np.nan)
+    if body_to_ned is not None:
+        quaternion = Rotation.from_matrix(body_to_ned).as_quat(scalar_first=True)
+    return Topic(
+        "vehicle_visual_odometry",
+        {
+            "timestamp": _boot(arrival_us),
+            "timestamp_sample": _boot(stamp_us),
+            "position": position_m.astype(np.float32),
+            "q": quaternion.astype(np.float32),
+            "velocity": unknown,
+            "angular_velocity": unknown,
+            "position_variance": np.full((count, 3), sigma_m**2, np.float32),
+            "orientation_variance": unknown,
+            "velocity_variance": unknown,
+            "pose_frame": np.full(count, POSE_FRAME_NED, np.uint8),
+            "velocity_frame": np.zeros(count, np.uint8),
+            "reset_counter": np.zeros(count, np.uint8),
+            "quality": np.zeros(count, np.int8),
+        },
+    )
+
+
+def _low_pass(position_m: Array, interval_s: float, constant_s: float) -> Array:
+    """First-order low pass, started at rest on the first sample."""
+    keep = np.exp(-interval_s / constant_s)
+    smooth, _ = lfilter([1.0 - keep], [1.0, -keep], position_m, axis=0, zi=keep * position_m[:1])
+    return np.asarray(smooth)
+
+
+def _outside_gap(
+    time_s: Array, length_s: float, at_s: float | None, duration_s: float
+) -> NDArray[np.bool_]:
+    """Samples outside a gap, which lies in the middle unless said otherwise."""
+    start_s = (duration_s - length_s) / 2.0 if at_s is None else at_s
+    return np.asarray((time_s <= start_s) | (time_s >= start_s + length_s))
+
+
+def _grid_us(duration_s: float, rate_hz: float) -> NDArray[np.int64]:
+    time_us = np.rint(np.arange(int(duration_s * rate_hz) + 1) * (1e6 / rate_hz))
+    return np.asarray(time_us, dtype=np.int64)
+
+
+def _seconds(time_us: NDArray[np.int64]) -> Array:
+    return np.asarray(time_us * 1e-6, dtype=np.float64)
+
+
+def _boot(time_us: NDArray[np.int64]) -> NDArray[np.uint64]:
+    return (START_US + time_us).astype(np.uint64)

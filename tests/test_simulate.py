@@ -1,0 +1,721 @@
+"""Simulated flights against their own truth: motion, sensors, mistakes, ULog and command."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pandas as pd
+import pytest
+from click.testing import CliRunner
+from pyulog import ULog
+from scipy.integrate import cumulative_simpson
+from scipy.spatial.transform import Rotation
+
+import px4fuse
+from px4fuse.cli import cli, main
+from px4fuse.consistency import nis_band
+from px4fuse.errors import SettingsError
+from px4fuse.findings import find
+from px4fuse.flight import POSITION_COLUMNS, Truth, Unavailable
+from px4fuse.kalman import Settings
+from px4fuse.likelihood import innovations, preintegrate
+from px4fuse.signals import Segment, make_axes, project_acceleration, step_means
+from px4fuse.simulation import sensors
+from px4fuse.simulation.flights import answer, simulate, simulate_flight, to_flight, to_ulog
+from px4fuse.simulation.mistakes import MISTAKES, Mistakes, as_typed, made, parse
+from px4fuse.simulation.motion import attitude, direction, plan
+from px4fuse.simulation.scenario import DT_S, Scenario
+
+NO_MISTAKES = Mistakes()
+AISLE = Scenario(passes=2, seed=4)
+LOOP = Scenario(kind="loop", passes=1, length_m=8.0, seed=4)
+FOLLOWING = Scenario(passes=2, yaw="follow", seed=4)
+# Errors of the sensors other than white noise switched off
+IDEAL = {
+    "accel_bias_sigma_m_s2": 0.0,
+    "gyro_bias_sigma_rad_s": 0.0,
+    "tilt_error_deg": 0.0,
+    "yaw_error_deg": 0.0,
+}
+
+
+def motion_of(scenario, mistakes=NO_MISTAKES):
+    return plan(scenario, mistakes, sensors.stream(scenario, sensors.Stream.WANDER))
+
+
+def position_error(scenario, *texts):
+    """What the source measured beyond the truth at its own true times, and those times."""
+    source = simulate(scenario, parse(texts)).positions
+    return source.error_m, source.measured_s
+
+
+def stamps_s(simulation):
+    source = simulation.positions.topic.fields
+    return (source["timestamp_sample"].astype(np.int64) - sensors.START_US) * 1e-6
+
+
+# --- motion
+
+
+@pytest.mark.parametrize("scenario", [AISLE, LOOP, FOLLOWING], ids=["aisle", "loop", "follow"])
+class TestMotion:
+    def test_derivatives_agree(self, scenario):
+        motion = motion_of(scenario)
+        time = np.linspace(0.0, motion.duration_s, 40_001)
+        state = motion.at(time)
+        for value, derivative, tolerance in (
+            (state.position_m, state.velocity_m_s, 1e-6),
+            (state.velocity_m_s, state.acceleration_m_s2, 1e-6),
+            # the jerk steps where the wander's fade begins and ends
+            (state.acceleration_m_s2, state.jerk_m_s3, 1e-3),
+        ):
+            integral = value[0] + cumulative_simpson(derivative, x=time, axis=0, initial=0)
+            assert np.max(np.abs(integral - value)) < tolerance
+        turned = cumulative_simpson(state.yaw_rate_rad_s, x=time, initial=0)
+        assert np.allclose(state.yaw_rad, state.yaw_rad[0] + turned, atol=1e-6)
+
+    def test_velocity_is_the_derivative_of_position_to_1e_6(self, scenario):
+        motion = motion_of(scenario)
+        time = np.random.default_rng(0).uniform(1.0, motion.duration_s - 1.0, 500)
+        step = 2e-3
+        ahead, behind = motion.at(time + step), motion.at(time - step)
+        further, before = motion.at(time + 2 * step), motion.at(time - 2 * step)
+        here = motion.at(time)
+        for name, derivative in (
+            ("position_m", here.velocity_m_s),
+            ("velocity_m_s", here.acceleration_m_s2),
+        ):
+            # five-point formula; the knots of the ramps have a continuous third derivative only
+            slope = 8 * (getattr(ahead, name) - getattr(behind, name))
+            slope -= getattr(further, name) - getattr(before, name)
+            error = np.abs(slope / (12 * step) - derivative)
+            assert np.quantile(error, 0.95) < 1e-6
+            assert error.max() < 1e-5
+
+    def test_acceleration_is_continuous(self, scenario):
+        time = np.linspace(0.0, motion_of(scenario).duration_s, 200_001)
+        state = motion_of(scenario).at(time)
+        steps = np.abs(np.diff(state.acceleration_m_s2, axis=0)) / (time[1] - time[0])
+        assert steps.max() < 1.05 * np.abs(state.jerk_m_s3).max()
+        assert np.abs(state.jerk_m_s3).max() < 10.0
+
+    def test_stands_on_the_ground_before_and_after(self, scenario):
+        motion = motion_of(scenario)
+        time = np.array([0.0, motion.take_off_s, motion.touch_down_s + 1e-6, motion.duration_s])
+        state = motion.at(time)
+        assert np.allclose(state.velocity_m_s, 0.0, atol=1e-9)
+        assert np.allclose(state.acceleration_m_s2, 0.0, atol=1e-9)
+        assert np.allclose(state.position_m[:, 2], 0.0, atol=1e-9)
+
+    def test_attitude_explains_acceleration_and_rates(self, scenario):
+        motion = motion_of(scenario)
+        # not at the ends of the wander's fade, where the jerk has a small step
+        time = np.linspace(0.0, motion.duration_s, 20_001)
+        step = 1e-4
+        before, here, after = (attitude(motion.at(time + s)) for s in (-step, 0.0, step))
+        force = np.einsum("nij,nj->ni", here.body_to_ned, here.specific_force_m_s2)
+        force[:, 2] += 9.80665
+        assert np.allclose(force, motion.at(time).acceleration_m_s2, atol=1e-9)
+        turn = Rotation.from_matrix(before.body_to_ned).inv() * Rotation.from_matrix(
+            after.body_to_ned
+        )
+        error = np.abs(turn.as_rotvec() / (2 * step) - here.angular_rate_rad_s)
+        assert np.quantile(error, 0.999) < 1e-5
+        assert error.max() < 0.01
+
+    def test_is_gentle(self, scenario):
+        motion = motion_of(scenario)
+        state = motion.at(np.linspace(0.0, motion.duration_s, 20_001))
+        tilt = np.degrees(np.arccos(attitude(state).body_to_ned[:, 2, 2]))
+        assert 2.0 < tilt.max() < 15.0
+        assert np.hypot(*state.velocity_m_s[:, :2].T).max() < 1.3 * scenario.speed_m_s
+
+
+def test_aisle_is_as_long_as_asked_and_ends_where_it_began():
+    motion = motion_of(dataclasses.replace(AISLE, wander_m=0.0))
+    position = motion.at(np.linspace(0.0, motion.duration_s, 5001)).position_m
+    along = position @ direction(30.0)
+    assert along.max() == pytest.approx(12.0, abs=1e-9)
+    assert np.abs(position @ direction(120.0)).max() < 1e-9
+    assert position[:, 2].min() == pytest.approx(-1.5, abs=1e-9)
+    assert np.allclose(position[-1], 0.0, atol=1e-9)
+
+
+@pytest.mark.parametrize(("left_out", "texts"), [(0.0, []), (2.5, ["open-end=2.5m"])])
+def test_loop_closes_but_for_what_is_left_out(left_out, texts):
+    scenario = dataclasses.replace(LOOP, passes=2)
+    motion = motion_of(scenario, parse(texts))
+    first, last = motion.at(np.array([0.0, motion.duration_s])).position_m
+    # its last side points back along heading + 270 degrees
+    assert np.allclose(last - first, -left_out * direction(30.0 + 270.0), atol=1e-9)
+    assert answer(simulate(scenario, parse(texts)))["truth"]["closure_error_m"] == pytest.approx(
+        left_out, abs=1e-9
+    )
+
+
+def test_nose_follows_the_flight_or_stays():
+    fixed, following = motion_of(AISLE), motion_of(FOLLOWING)
+    time = np.linspace(0.0, fixed.duration_s, 5001)
+    assert np.allclose(fixed.at(time).yaw_rad, np.radians(30.0))
+    state = following.at(np.linspace(0.0, following.duration_s, 5001))
+    moving = np.hypot(*state.velocity_m_s[:, :2].T) > 0.8
+    course = np.arctan2(state.velocity_m_s[:, 1], state.velocity_m_s[:, 0])
+    off = np.angle(np.exp(1j * (course - state.yaw_rad)))[moving]
+    assert np.abs(off).max() < 0.2  # the wander's part
+
+
+# --- sensors
+
+
+def test_position_noise_is_white_and_as_stated():
+    error, _ = position_error(Scenario(seed=2, sigma_uwb_m=0.07, uwb_rate_hz=20.0))
+    assert np.std(error, axis=0) == pytest.approx(np.full(3, 0.07), rel=0.05)
+    for axis in error.T:
+        assert abs(np.corrcoef(axis[1:], axis[:-1])[0, 1]) < 0.06
+
+
+@pytest.mark.parametrize("texts", [[], ["vibration=0.5"]])
+def test_acceleration_noise_per_step_is_sigma_a(texts):
+    scenario = Scenario(seed=3, passes=4, wander_m=0.0, **IDEAL)
+    simulation = simulate(scenario, parse(texts))
+    imu = to_flight(simulation).imu
+    time = imu.index.to_numpy()
+    truth = attitude(simulation.motion.at(time))
+    error = np.einsum("nij,nj->ni", truth.body_to_ned, imu.to_numpy()[:, :3])
+    error[:, 2] += 9.80665
+    error -= simulation.motion.at(time).acceleration_m_s2
+    frame = pd.DataFrame(error, index=imu.index)
+    for axis in np.eye(3):
+        signal = project_acceleration(frame, axis, Segment(0.0, time[-1], ""))
+        mean, _ = step_means(signal, np.arange(0.0, time[-1], DT_S))
+        expected = np.hypot(0.2, 0.5 if texts else 0.0)
+        assert np.std(mean) == pytest.approx(expected, rel=0.07)
+
+
+def test_biases_are_constant_and_drawn_as_stated():
+    simulation = simulate(Scenario(seed=9))
+    imu = to_flight(simulation).imu
+    truth = attitude(simulation.motion.at(imu.index.to_numpy()))
+    told = answer(simulation)["truth"]
+    bias = imu.to_numpy()[:, :3].astype(float) - truth.specific_force_m_s2
+    assert bias.mean(axis=0) == pytest.approx(told["accelerometer_bias_m_s2"], abs=0.025)
+    bias = imu.to_numpy()[:, 3:].astype(float) - truth.angular_rate_rad_s
+    assert bias.mean(axis=0) == pytest.approx(told["gyro_bias_rad_s"], abs=3e-4)
+    drawn = [sensors.biases(Scenario(seed=seed), NO_MISTAKES) for seed in range(400)]
+    assert np.std([b[0] for b in drawn]) == pytest.approx(0.03, rel=0.1)
+    assert np.std([b[1] for b in drawn]) == pytest.approx(0.002, rel=0.1)
+
+
+def test_logged_attitude_has_a_small_slow_error():
+    scenario = Scenario(seed=5)
+    simulation = simulate(scenario)
+    logged = to_flight(simulation).attitude
+    time = logged.index.to_numpy()
+    truth = Rotation.from_matrix(attitude(simulation.motion.at(time)).body_to_ned)
+    error = Rotation.from_quat(logged.to_numpy(copy=True), scalar_first=True) * truth.inv()
+    expected = sensors.attitude_error(scenario, time).as_rotvec()
+    assert np.allclose(error.as_rotvec(), expected, atol=2e-6)
+    spread = [
+        sensors.attitude_error(Scenario(seed=s), np.linspace(0, 240, 200)).as_rotvec()
+        for s in range(60)
+    ]
+    rms = np.degrees(np.sqrt(np.mean(np.concatenate(spread) ** 2, axis=0)))
+    assert rms == pytest.approx([0.1, 0.1, 1.0], rel=0.15)
+
+
+def test_vio_drifts_as_stated():
+    ends = []
+    for seed in range(40):
+        scenario = Scenario(kind="loop", passes=1, length_m=8.0, seed=seed, sigma_vio_m=0.0)
+        motion = motion_of(scenario)
+        source = sensors.positions(scenario, NO_MISTAKES, motion)
+        assert np.allclose(source.error_m[-1], source.drift_m, atol=1e-9)
+        ends.append(source.drift_m)
+    # 1.5 % of 32 m (and of the wander) with a random walk of 0.01 m/√m
+    length = np.hypot(*np.array(ends)[:, :2].T)
+    assert np.mean(length) == pytest.approx(0.015 * source.distance_m, rel=0.06)
+    assert np.std(np.array(ends)[:, 2]) == pytest.approx(0.01 * np.sqrt(source.distance_m), rel=0.3)
+    assert source.distance_m == pytest.approx(32.0, rel=0.1)
+
+
+def test_arrival_is_30_ms_after_measurement():
+    fields = simulate(Scenario(seed=3)).positions.topic.fields
+    lag = (fields["timestamp"].astype(float) - fields["timestamp_sample"].astype(float)) * 1e-6
+    assert np.mean(lag) == pytest.approx(0.030, abs=5e-4)
+    assert np.std(lag) == pytest.approx(0.003, rel=0.15)
+    assert np.all(np.diff(fields["timestamp"].astype(np.int64)) >= 0)
+
+
+# --- mistakes
+
+
+class TestMistakes:
+    CLEAN = simulate(AISLE)
+
+    def test_clock_offset_shifts_the_stamps(self):
+        late = simulate(AISLE, parse(["clock-offset=80ms"]))
+        assert np.allclose(stamps_s(late) - late.positions.measured_s, 0.08, atol=1e-6)
+        assert np.allclose(stamps_s(late) - stamps_s(self.CLEAN), 0.08, atol=1.1e-6)
+        arrivals = (s.positions.topic.fields["timestamp"] for s in (late, self.CLEAN))
+        assert np.array_equal(*arrivals)
+        assert answer(late)["truth"]["clock_offset_to_add_s"] == -0.08
+
+    def test_clock_drift_grows(self):
+        drifting = simulate(AISLE, parse(["clock-drift=500ppm"]))
+        time = drifting.positions.measured_s
+        assert np.allclose(stamps_s(drifting) - time, 500e-6 * time, atol=1e-6)
+
+    def test_clock_jump_ends_when_timesync_converges(self):
+        scenario = Scenario(seed=4)
+        jumping = simulate(scenario, parse(["clock-jump=0.25"]))
+        fields = jumping.positions.topic.fields
+        time = jumping.positions.measured_s
+        before = time < 50.0
+        assert np.any(before)
+        assert np.any(~before)
+        same = fields["timestamp"] == fields["timestamp_sample"]
+        assert np.array_equal(same, before)
+        late = stamps_s(jumping) - time
+        assert np.mean(late[before]) == pytest.approx(0.25, abs=1e-3)
+        assert np.allclose(late[~before], 0.0, atol=1e-6)
+
+    def test_nlos_is_an_exact_share_in_bursts(self):
+        scenario = Scenario(seed=6, sigma_uwb_m=0.0)
+        simulation = simulate(scenario, parse(["nlos=5%,3m"]))
+        outlier = simulation.positions.outlier
+        motion = simulation.motion
+        time = simulation.positions.measured_s
+        flying = (time > motion.take_off_s) & (time < motion.touch_down_s)
+        assert np.count_nonzero(outlier) == round(0.05 * np.count_nonzero(flying))
+        assert not np.any(outlier & ~flying)
+        size = np.hypot(*simulation.positions.error_m[:, :2].T)
+        assert np.all(size[~outlier] < 1e-9)
+        assert np.all((size[outlier] >= 1.5) & (size[outlier] <= 4.5))
+        assert np.mean(size[outlier]) == pytest.approx(3.0, rel=0.2)
+        starts = np.count_nonzero(np.diff(outlier.astype(int)) == 1)
+        assert np.count_nonzero(outlier) / starts > 1.5
+        told = answer(simulation)["truth"]
+        assert told["outlier_index"] == np.flatnonzero(outlier).tolist()
+        assert np.allclose(told["outlier_time_s"], stamps_s(simulation)[outlier])
+
+    @pytest.mark.parametrize(
+        ("text", "start", "end"),
+        [("dropout=6s,12s", 12.0, 18.0), ("dropout=6", None, None)],
+    )
+    def test_dropout_silences_the_source(self, text, start, end):
+        gone = simulate(AISLE, parse([text]))
+        middle = gone.motion.duration_s / 2.0
+        start, end = start or middle - 3.0, end or middle + 3.0
+        time = gone.positions.measured_s
+        assert not np.any((time > start) & (time < end))
+        clean = self.CLEAN.positions.measured_s
+        assert len(time) == np.count_nonzero((clean <= start) | (clean >= end))
+
+    def test_imu_dropout_takes_the_imu_alone(self):
+        gone = to_flight(simulate(AISLE, parse(["imu-dropout=2s,10s"])))
+        time = gone.imu.index.to_numpy()
+        assert np.diff(time).max() == pytest.approx(2.0, abs=1e-6)
+        assert len(time) == len(to_flight(self.CLEAN).imu) - 499
+        assert len(gone.attitude) == len(to_flight(self.CLEAN).attitude)
+
+    @pytest.mark.parametrize("rate", [1.0, 2.0, 4.0])
+    def test_decimate_thins_the_source(self, rate):
+        thin = to_flight(simulate(AISLE, parse([f"decimate={rate}Hz"])))
+        samples = thin.positions[0].samples
+        assert len(samples) / thin.log.duration_s == pytest.approx(rate, rel=0.1)
+        assert samples.index.isin(to_flight(self.CLEAN).positions[0].samples.index).all()
+
+    @pytest.mark.parametrize("factor", [0.1, 9.0])
+    def test_r_scale_changes_what_is_reported_alone(self, factor):
+        scaled = to_flight(simulate(AISLE, parse([f"r-scale={factor}"])))
+        clean = to_flight(self.CLEAN)
+        reported = scaled.positions[0].samples["north_m2"]
+        assert np.allclose(reported, 0.01 * factor)
+        assert scaled.log.parameters["EKF2_EVP_NOISE"] == pytest.approx(0.1 * np.sqrt(factor))
+        pd.testing.assert_frame_equal(
+            scaled.positions[0].samples[POSITION_COLUMNS],
+            clean.positions[0].samples[POSITION_COLUMNS],
+        )
+
+    def test_yaw_turns_the_frame_clockwise(self):
+        turned, clean = (
+            s.positions.topic.fields["position"].astype(float)
+            for s in (simulate(AISLE, parse(["yaw=90deg"])), self.CLEAN)
+        )
+        # north becomes east
+        assert np.allclose(turned[:, 1], clean[:, 0], atol=1e-5)
+        assert np.allclose(turned[:, 0], -clean[:, 1], atol=1e-5)
+
+    def test_scale_stretches(self):
+        long, clean = (
+            s.positions.topic.fields["position"].astype(float)
+            for s in (simulate(AISLE, parse(["scale=5%"])), self.CLEAN)
+        )
+        assert np.allclose(long, 1.05 * clean, atol=1e-5)
+
+    def test_jump_stays(self):
+        jumped = simulate(AISLE, parse(["jump=2m,20s"])).positions
+        shift = jumped.error_m - self.CLEAN.positions.error_m
+        after = jumped.measured_s >= 20.0
+        assert np.allclose(shift[after], 2.0 * direction(30.0), atol=1e-9)
+        assert np.allclose(shift[~after], 0.0, atol=1e-9)
+
+    def test_smoothed_lags_and_correlates(self):
+        scenario = Scenario(seed=4, sigma_uwb_m=0.0, uwb_rate_hz=50.0, wander_m=0.0)
+        simulation = simulate(scenario, parse(["smoothed=0.5s"]))
+        truth = simulation.motion.at(simulation.positions.measured_s)
+        along = truth.velocity_m_s @ direction(30.0)
+        lag = -(simulation.positions.error_m @ direction(30.0))
+        fast = np.abs(np.abs(along) - 1.0) < 1e-9
+        settled = fast & np.roll(fast, 150)  # 3 s, six time constants
+        assert np.any(settled)
+        assert np.allclose(lag[settled] / along[settled], 0.5, atol=0.02)
+        noisy, _ = position_error(AISLE, "smoothed=1s")
+        assert np.std(noisy[:25]) < 0.07  # on the ground: 0.10 without
+
+    def test_accel_bias_is_along_the_nose(self):
+        biased, clean = (
+            to_flight(s).imu for s in (simulate(AISLE, parse(["accel-bias=0.3m/s2"])), self.CLEAN)
+        )
+        difference = (biased - clean).to_numpy()
+        assert np.allclose(difference[:, 0], 0.3, atol=1e-5)
+        assert np.allclose(difference[:, 1:], 0.0, atol=1e-5)
+
+    @pytest.mark.parametrize("rate", [20.0, 125.0])
+    def test_imu_rate_thins_the_imu(self, rate):
+        thin = to_flight(simulate(AISLE, parse([f"imu-rate={rate}"]))).imu
+        clean = to_flight(self.CLEAN).imu
+        assert np.mean(np.diff(thin.index)) == pytest.approx(1 / rate, rel=1e-2)
+        pd.testing.assert_frame_equal(thin, clean.loc[thin.index])
+
+    @pytest.mark.parametrize("scenario", [AISLE, LOOP])
+    def test_no_motion_hovers_for_as_long(self, scenario):
+        hovering = simulate(scenario, parse(["no-motion"]))
+        assert hovering.motion.duration_s == motion_of(scenario).duration_s
+        time = np.linspace(0.0, hovering.motion.duration_s, 1001)
+        assert np.abs(hovering.motion.at(time).position_m[:, :2]).max() < 0.2
+
+    def test_no_vvo_leaves_no_source(self):
+        flight = to_flight(simulate(AISLE, parse(["no-vvo"])))
+        assert flight.positions == ()
+        assert flight.log.parameters["SDLOG_PROFILE"] == 1.0
+        with pytest.raises(px4fuse.Px4FuseError, match="SDLOG_PROFILE"):
+            px4fuse.compare(flight)
+
+    def test_leave_the_noise_of_other_sensors_as_it_was(self):
+        kept = {
+            "sensor_combined": {"imu-dropout", "imu-rate", "accel-bias", "vibration", "no-motion"},
+            "vehicle_attitude": {"no-motion"},
+        }
+        for name, mistake in MISTAKES.items():
+            if mistake.kind:
+                continue
+            topics = {t.name: t for t in simulate(AISLE, parse([name])).topics}
+            for topic, changed_by in kept.items():
+                clean = next(t for t in self.CLEAN.topics if t.name == topic)
+                same = all(
+                    np.array_equal(values, topics[topic].fields[field])
+                    for field, values in clean.fields.items()
+                )
+                assert same == (name not in changed_by), (name, topic)
+
+    def test_combine(self):
+        both = simulate(AISLE, parse(["clock-offset=0.1", "yaw=10", "nlos=4%", "decimate=2.5Hz"]))
+        assert made(both.mistakes) == ("clock-offset", "nlos", "decimate", "yaw")
+        late = stamps_s(both) - both.positions.measured_s
+        assert np.allclose(late, 0.1, atol=1e-6)
+        assert len(both.positions.outlier) == len(late)
+
+
+class TestParsing:
+    @pytest.mark.parametrize(
+        ("text", "field", "value"),
+        [
+            ("clock-offset=0.08", "clock_offset_s", 0.08),
+            ("clock-offset=-80ms", "clock_offset_s", -0.08),
+            ("nlos=5%", "nlos_percent", 5.0),
+            ("nlos=5%,50cm", "nlos_size_m", 0.5),
+            ("dropout=8s", "dropout_s", 8.0),
+            ("dropout = 8 s, 40s", "dropout_at_s", None),
+            ("r-scale=1e-1", "r_scale", 0.1),
+            ("accel-bias=.5m/s²", "accel_bias_m_s2", 0.5),
+            ("no-motion", "no_motion", True),
+        ],
+    )
+    def test_values_have_units(self, text, field, value):
+        if value is None:
+            with pytest.raises(SettingsError, match="there is no such mistake"):
+                parse([text])
+        else:
+            assert getattr(parse([text]), field) == pytest.approx(value)
+
+    @pytest.mark.parametrize("name", MISTAKES)
+    def test_every_default_is_a_mistake_and_can_be_typed_again(self, name):
+        parsed = parse([name])
+        assert made(parsed) == (name,)
+        assert parse([as_typed(name, parsed)]) == parsed
+
+    @pytest.mark.parametrize(
+        ("text", "said"),
+        [
+            ("fog", "Choose from clock-offset, clock-drift"),
+            ("nlos=much", "not a number in %"),
+            ("nlos=5s", "not a number in %"),
+            ("nlos=80%", "give 0 to 50 %"),
+            ("nlos=5%,1m,2", r"give nlos=PERCENT\[,SIZE\]"),
+            ("clock-offset=nan", "not a number"),
+            ("clock-offset=1e999", "out of range"),
+            ("clock-offset=", "not a number"),
+            ("no-motion=1", "give no-motion"),
+        ],
+    )
+    def test_bad_ones_are_one_line(self, text, said):
+        with pytest.raises(SettingsError, match=said) as error:
+            parse([text])
+        assert "\n" not in str(error.value)
+
+    def test_zero_is_no_mistake(self):
+        assert made(parse(["clock-offset=0", "nlos=0"])) == ()
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"kind": "spiral"},
+        {"yaw": "spin"},
+        {"passes": 0},
+        {"speed_m_s": float("nan")},
+        {"length_m": 2.0, "speed_m_s": 4.0},
+        {"seed": -1},
+    ],
+)
+def test_impossible_scenarios_are_refused(changes):
+    with pytest.raises(SettingsError):
+        Scenario(**changes)
+
+
+def test_what_does_not_fit_is_refused():
+    with pytest.raises(SettingsError, match="--kind loop only"):
+        simulate(AISLE, parse(["open-end"]))
+    with pytest.raises(SettingsError, match="at most 6 m"):
+        simulate(LOOP, parse(["open-end=7"]))
+    with pytest.raises(SettingsError, match="at most 3600 s"):
+        simulate(Scenario(passes=100, length_m=100.0))
+    with pytest.raises(SettingsError, match="nothing is left of vehicle_visual_odometry"):
+        simulate(AISLE, parse(["dropout=600s,0s"]))
+
+
+# --- as ULog and in memory
+
+
+@pytest.mark.parametrize(
+    ("scenario", "texts"),
+    [
+        (AISLE, []),
+        (LOOP, ["jump=1m"]),
+        (dataclasses.replace(AISLE, truth=False, passes=4), ["clock-jump=0.3", "nlos=5%"]),
+        (AISLE, ["no-vvo", "imu-dropout=1s,0s"]),
+    ],
+    ids=["aisle", "loop", "clock-jump", "no-vvo"],
+)
+def test_reader_gives_the_flight_that_is_made_in_memory(scenario, texts, tmp_path):
+    simulation = simulate(scenario, parse(texts))
+    path = tmp_path / "simulation.ulg"
+    path.write_bytes(to_ulog(simulation))
+    read, made_here = px4fuse.read_log(path), to_flight(simulation)
+    for part in dataclasses.fields(read):
+        a, b = getattr(read, part.name), getattr(made_here, part.name)
+        if part.name == "log":
+            same = {"sha256": "", "size_bytes": 0}
+            a, b = (
+                dataclasses.replace(log, parameters=dict(log.parameters), **same) for log in (a, b)
+            )
+            assert a == b
+        elif isinstance(a, pd.DataFrame):
+            pd.testing.assert_frame_equal(a, b, check_exact=True)
+        elif isinstance(a, Truth):
+            assert a.name == b.name
+            pd.testing.assert_frame_equal(a.samples, b.samples, check_exact=True)
+        elif part.name == "positions":
+            for one, other in zip(a, b, strict=True):
+                pd.testing.assert_frame_equal(one.samples, other.samples, check_exact=True)
+                empty = pd.DataFrame()
+                assert repr(dataclasses.replace(one, samples=empty)) == repr(
+                    dataclasses.replace(other, samples=empty)
+                )
+        else:
+            assert a == b, part.name
+
+
+def test_same_seed_same_bytes_and_another_seed_others():
+    first, again, other = (to_ulog(simulate(Scenario(passes=1, seed=seed))) for seed in (1, 1, 2))
+    assert first == again
+    assert first != other
+
+
+def test_pyulog_reads_it(tmp_path):
+    path = tmp_path / "flight.ulg"
+    path.write_bytes(to_ulog(simulate(LOOP)))
+    ulog = ULog(str(path))
+    assert not ulog.file_corruption
+    assert {data.name for data in ulog.data_list} == {
+        "sensor_combined",
+        "vehicle_attitude",
+        "vehicle_attitude_groundtruth",
+        "vehicle_land_detected",
+        "vehicle_local_position_groundtruth",
+        "vehicle_visual_odometry",
+    }
+    assert ulog.msg_info_dict["ver_hw"] == "px4fuse simulation"
+    assert ulog.msg_info_dict["sys_name"] == "PX4"
+    assert ulog.initial_parameters["EKF2_EN"] == 0
+    odometry = ulog.get_dataset("vehicle_visual_odometry").data
+    norm = np.linalg.norm([odometry[f"q[{i}]"] for i in range(4)], axis=0)
+    assert np.allclose(norm, 1.0, atol=1e-6)
+    stamps = np.concatenate([data.data["timestamp"] for data in ulog.data_list])
+    assert stamps.min() >= ulog.start_timestamp
+
+
+def test_log_does_not_give_the_mistakes_away():
+    texts = [name for name, mistake in MISTAKES.items() if not mistake.kind and name != "no-vvo"]
+    content = to_ulog(simulate(AISLE, parse(texts)))
+    for name in (*MISTAKES, *(a.field for m in MISTAKES.values() for a in m.arguments)):
+        if name not in ("yaw", "scale", "jump"):  # too short to mean anything
+            assert name.encode() not in content
+    assert b"mistake" not in content.lower()
+
+
+def test_log_without_truth_has_none(tmp_path):
+    path = tmp_path / "flight.ulg"
+    path.write_bytes(to_ulog(simulate(dataclasses.replace(AISLE, truth=False))))
+    assert isinstance(px4fuse.read_log(path).truth, Unavailable)
+    assert b"groundtruth" not in path.read_bytes()
+
+
+# --- through our filter
+
+
+def nis(scenario, names=("north", "east", "down")):
+    """Mean NIS per axis at the true noises, by the fast filter, and its 95 % band."""
+    flight = simulate_flight(scenario)
+    (start, end) = flight.airborne[0]
+    settings = Settings(sigma_a_m_s2=scenario.sigma_a_m_s2, sigma_z_m=scenario.sigma_uwb_m)
+    found = []
+    for axis in make_axes(flight, flight.positions[0], Segment(start, end, ""), names=names):
+        nu, s = innovations(preintegrate(axis, settings), settings.sigma_a_m_s2, settings.sigma_z_m)
+        found.append(float(np.mean(nu**2 / s)))
+    return found, nis_band(len(nu))
+
+
+def test_clean_flights_are_consistent_at_their_true_noises():
+    inside = []
+    for seed in range(20):
+        values, (low, high) = nis(Scenario(seed=seed, passes=4))
+        inside += [low < value < high for value in values]
+    assert np.mean(inside) > 0.75
+
+
+def test_ideal_flights_are_consistent_as_often_as_chance_has_it():
+    values = []
+    inside = []
+    for seed in range(20):
+        found, (low, high) = nis(Scenario(seed=seed, passes=4, **IDEAL))
+        values += found
+        inside += [low < value < high for value in found]
+    assert np.mean(values) == pytest.approx(1.0, abs=0.03)
+    assert np.mean(inside) >= 0.88
+
+
+@pytest.mark.parametrize("scenario", [Scenario(seed=7, passes=4), LOOP], ids=["aisle", "loop"])
+def test_clean_flight_has_one_finding_that_there_is_no_ekf2(scenario):
+    settings = Settings(sigma_a_m_s2=0.2, sigma_z_m=scenario.source_sigma_m)
+    compared = px4fuse.compare(simulate_flight(scenario), settings)
+    findings = find(compared)
+    assert [finding.id for finding in findings] == ["ekf2_unavailable"]
+    assert "EKF2 did not run" in findings[0].message
+    for axis in compared.axes:
+        assert axis.kf_truth.position_rmse_m < (0.12 if scenario.kind == "aisle" else 0.7)
+
+
+@pytest.mark.parametrize(
+    ("text", "finding"),
+    [
+        ("nlos=8%", "kf_variance_understated"),
+        ("dropout=8s", "source_gap"),
+        ("imu-dropout=2s", "imu_gap"),
+        ("imu-rate=20", "logging_rate_low"),
+        ("no-motion", "no_motion"),
+        ("accel-bias=0.5", "kf_variance_understated"),
+        ("vibration=1.5", "kf_variance_understated"),
+        ("smoothed=1s", "kf_variance_overstated"),
+    ],
+)
+def test_mistake_is_found(text, finding):
+    flight = simulate_flight(Scenario(seed=7, passes=2), parse([text]))
+    compared = px4fuse.compare(flight, Settings(sigma_a_m_s2=0.2), axes=("aisle", "north"))
+    assert finding in [found.id for found in find(compared)]
+
+
+# --- the command
+
+
+def run(*arguments):
+    return CliRunner().invoke(cli, ["simulate", *map(str, arguments)])
+
+
+def test_command_writes_log_and_answer(tmp_path):
+    log, told = tmp_path / "s07.ulg", tmp_path / "s07.json"
+    options = ("--seed", 7, "--passes", 1, "--mistake", "nlos=5%", "--mistake", "clock-offset=80ms")
+    result = run("-o", log, *options, "--answer", told)
+    assert result.exit_code == 0, result.output
+    assert "nlos=5%,2m" in result.output
+    assert "EKF2      none" in result.output
+    first = log.read_bytes()
+    content = json.loads(told.read_text(encoding="utf-8"))
+    assert set(content["mistakes"]) == {"nlos", "clock-offset"}
+    assert content["truth"]["clock_offset_to_add_s"] == -0.08
+    assert content["scenario"]["seed"] == 7
+    assert content["truth"]["outlier_index"]
+    again = tmp_path / "again.ulg"
+    assert run("-o", again, *options).exit_code == 0
+    assert again.read_bytes() == first
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["again.ulg", "s07.json", "s07.ulg"]
+
+
+def test_command_flies_loops(tmp_path):
+    result = run("-o", tmp_path / "loop.ulg", "--kind", "loop", "--no-truth", "--vio-drift", 0.02)
+    assert result.exit_code == 0, result.output
+    assert "1 lap of a square of 12 m" in result.output
+    assert "drift 2.0% of the path" in result.output
+    flight = px4fuse.read_log(tmp_path / "loop.ulg")
+    assert flight.positions[0].rate_hz == pytest.approx(30.0, rel=0.01)
+    assert isinstance(flight.truth, Unavailable)
+
+
+def test_help_lists_every_mistake():
+    result = run("--help")
+    assert result.exit_code == 0
+    for name, mistake in MISTAKES.items():
+        assert name + mistake.usage in result.output
+        assert mistake.finding.endswith(".")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["-o", "flight.ulg", "--mistake", "fog"], "there is no such mistake"),
+        (["-o", "flight.ulg", "--sigma-uwb", "-1"], "--sigma-uwb -1 is out of range"),
+        (["-o", "flight.pdf"], "ends in .ulg"),
+        (["-o", "flight.ulg", "--answer", "flight.ulg"], "name the same file"),
+    ],
+)
+def test_bad_options_are_one_line_and_write_nothing(arguments, said, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sys.argv", ["px4fuse", "simulate", *arguments])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 2
+    error = capsys.readouterr().err
+    assert said in error
+    assert error.count("\n") == 1
+    assert not list(tmp_path.iterdir())
