@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pandas as pd
 
+from px4fuse.budget import Budget
+from px4fuse.clock import ClockOffset
 from px4fuse.consistency import Consistency, HorizontalNis, assess, assess_horizontal
 from px4fuse.errors import SettingsError
 from px4fuse.flight import Ekf2, Flight, PositionTrack, Truth, Unavailable
@@ -30,6 +32,7 @@ from px4fuse.signals import (
     make_axes,
     shift_clock,
 )
+from px4fuse.tuning import AxisTuning
 
 NOT_ITS_OWN_TRUTH = Unavailable(
     "ground truth",
@@ -143,6 +146,12 @@ class Comparison:
     notes : tuple of str
         Choices made on the way.
     missing : tuple of Unavailable
+    tuning : mapping from axis name, or "horizontal", to AxisTuning or Unavailable
+        Empty until :func:`px4fuse.explanation.explain` fills it.
+    clock : ClockOffset, Unavailable or None
+        What must still be added to the source's stamps; None until ``explain`` fills it.
+    budget : mapping from axis name to Budget or Unavailable
+        What the difference to EKF2 comes from; empty until ``explain`` fills it.
     """
 
     flight: Flight
@@ -155,6 +164,9 @@ class Comparison:
     horizontal_ekf2: HorizontalNis | None
     notes: tuple[str, ...]
     missing: tuple[Unavailable, ...]
+    tuning: Mapping[str, AxisTuning | Unavailable] = field(default_factory=dict)
+    clock: ClockOffset | Unavailable | None = None
+    budget: Mapping[str, Budget | Unavailable] = field(default_factory=dict)
 
 
 def compare(

@@ -1,10 +1,11 @@
-"""What explains a comparison: the noises that the data ask for, and the clock offset."""
+"""What explains a comparison: noises that the data ask for, clock offset, difference budget."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
 
+from px4fuse.budget import budget
 from px4fuse.clock import ClockOffset, estimate_clock_offset
 from px4fuse.comparison import Comparison
 from px4fuse.errors import MissingDataError
@@ -16,7 +17,7 @@ REPORTED = (HORIZONTAL, "down", "aisle")
 
 
 def explain(comparison: Comparison, progress: Callable[[str], None] = lambda _: None) -> Comparison:
-    """Add tuning and clock offset to a comparison.
+    """Add tuning, clock offset and difference budget to a comparison.
 
     Parameters
     ----------
@@ -28,7 +29,8 @@ def explain(comparison: Comparison, progress: Callable[[str], None] = lambda _: 
     names = REPORTED if {"north", "east"} <= {axis.name for axis in axes} else None
     tuning = tune(axes, comparison.settings, names, lambda name: progress(f"tuning {name}"))
     tuned = replace(comparison, tuning=tuning)
-    return replace(tuned, clock=clock_offset(tuned, progress))
+    timed = replace(tuned, clock=clock_offset(tuned, progress))
+    return replace(timed, budget=budget(timed, progress))
 
 
 def tuned_horizontally(comparison: Comparison) -> Comparison:

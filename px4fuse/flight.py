@@ -337,6 +337,20 @@ class Reset:
     delta: tuple[float, float, float]
 
 
+# EKF2_PREDICT_US, ekf2_params.c
+EKF2_STEP_S = 0.010
+BIAS_NOT_LOGGED = Unavailable(
+    "EKF2 accelerometer bias",
+    "no estimator_sensor_bias and no estimator_states",
+    "Record a ULog with SDLOG_PROFILE bit 0 (default).",
+)
+HORIZON_NOT_LOGGED = Unavailable(
+    "EKF2 fusion horizon",
+    "the log does not tell times of fusion from times of publication",
+    "Record a ULog with PX4 v1.13 or newer.",
+)
+
+
 @dataclass(frozen=True)
 class Ekf2:
     """EKF2's output, variances and innovations, of the instance that was primary at each time.
@@ -362,6 +376,13 @@ class Ekf2:
         EKF2_EVP_GATE in standard deviations.
     notes : tuple of str
         Joins and what they dropped, time bases, and the like.
+    accelerometer_bias : DataFrame, shape (n, 3), or Unavailable
+        Estimated bias (m/s², body FRD) that EKF2 subtracts from the specific force.
+    step_s : float
+        Time between two of its predictions.
+    horizon_s : float or Unavailable
+        How far its fusion runs behind its output: the state at t knows measurements up to
+        t - horizon, carried to t by the IMU.
     """
 
     state: pd.DataFrame
@@ -373,6 +394,9 @@ class Ekf2:
     instances: tuple[tuple[float, int], ...]
     gate: float
     notes: tuple[str, ...] = ()
+    accelerometer_bias: pd.DataFrame | Unavailable = BIAS_NOT_LOGGED
+    step_s: float = EKF2_STEP_S
+    horizon_s: float | Unavailable = HORIZON_NOT_LOGGED
 
 
 @dataclass(frozen=True)

@@ -181,6 +181,55 @@ def _recursion(
         yield nu, s, k0, v, p00, p11
 
 
+def filtered(
+    legs: Preintegrated, settings: Settings, skip: NDArray[np.bool_] | None = None
+) -> tuple[Array, Array]:
+    """Position and velocity at the start and after each measurement, for one pair of settings.
+
+    In plain floats: fifty times as fast as arrays of a single element.
+
+    Parameters
+    ----------
+    legs : Preintegrated
+    settings : Settings
+        ``sigma_a_m_s2`` and ``sigma_z_m`` are used.
+    skip : ndarray of bool, shape (m,), optional
+        Measurements that are not fused.
+
+    Returns
+    -------
+    position_m, velocity_m_s : ndarray, shape (m + 1,)
+    """
+    q, r = settings.sigma_a_m_s2**2, settings.sigma_z_m**2
+    p, v = legs.initial.position_m, legs.initial.velocity_m_s
+    p00, p01, p11 = INITIAL_SIGMA_P_M**2, 0.0, INITIAL_SIGMA_V_M_S**2
+    after = [(p, v)]
+    for dt, dp, dv, unit, fixed, z, skipped in zip(
+        legs.length_s.tolist(),
+        legs.delta_position_m.tolist(),
+        legs.delta_velocity_m_s.tolist(),
+        legs.noise_unit.tolist(),
+        legs.noise_fixed.tolist(),
+        legs.measurement_m.tolist(),
+        [False] * len(legs.measurement_m) if skip is None else skip.tolist(),
+        strict=True,
+    ):
+        # x = Fx + Ba, P = FPFᵀ + Q
+        p, v = p + dt * v + dp, v + dv
+        p00 += 2.0 * dt * p01 + dt * dt * p11 + q * unit[0] + fixed[0]
+        p01 += dt * p11 + q * unit[1] + fixed[1]
+        p11 += q * unit[2] + fixed[2]
+        if not skipped:
+            # ν = z - Hx, K = PHᵀS⁻¹, x = x + Kν, P = (I - KH)P
+            s = p00 + r
+            k0, k1, nu = p00 / s, p01 / s, z - p
+            p, v = p + k0 * nu, v + k1 * nu
+            p00, p01, p11 = r * k0, r * k1, p11 - k1 * p01
+        after.append((p, v))
+    position, velocity = np.array(after).T
+    return position, velocity
+
+
 # An innovation is of a wide normal distribution with this probability, WIDTH times as wide: far
 # more tail than a normal one has, and hardly any bias where there are no outliers.
 OUTLIER_SHARE, OUTLIER_WIDTH = 0.005, 10.0

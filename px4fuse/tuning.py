@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import islice
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +22,7 @@ from px4fuse.flight import Unavailable
 from px4fuse.kalman import Settings
 from px4fuse.likelihood import (
     Preintegrated,
+    _recursion,
     innovations,
     negative_log_likelihood,
     outlier_probability,
@@ -46,6 +48,9 @@ MAX_OUTLIER_SHARE = 0.3
 # Legs longer than this many median ones break the constant interval that ALS needs
 ALS_LONGEST_LEG = 1.5
 ALS_LAGS = 15
+# Innovations that are scored at once: a whole flight's over a grid would take gigabytes, and five
+# times as long outside the processor's cache
+BLOCK = 2**14
 
 
 @dataclass(frozen=True)
@@ -235,9 +240,20 @@ def _total(
     start: int = 0,
 ) -> Array:
     """Negative log-likelihood of all axes from one measurement on, shape of the grid."""
-    pairs = [innovations(leg, sigma_a, sigma_z, skip) for leg in legs]
-    scores = [negative_log_likelihood(nu[start:], s[start:]) for nu, s in pairs]
-    return np.asarray(np.sum(scores, axis=0), dtype=np.float64)
+    shape = np.broadcast(sigma_a, sigma_z).shape
+    rows = max(1, BLOCK // max(1, int(np.prod(shape))))
+    nu, s = np.empty((rows, *shape)), np.empty((rows, *shape))
+    total = np.zeros(shape)
+    for leg in legs:
+        row = 0
+        for step in islice(_recursion(leg, sigma_a, sigma_z, skip), start, None):
+            nu[row], s[row] = step[:2]
+            row += 1
+            if row == rows:
+                total += negative_log_likelihood(nu, s)
+                row = 0
+        total += negative_log_likelihood(nu[:row], s[:row])
+    return total
 
 
 def _fit_without_outliers(legs: list[Preintegrated]) -> tuple[_Best, NDArray[np.bool_]]:
@@ -406,6 +422,8 @@ def _autocovariance_least_squares(
     if np.count_nonzero(skip | ~regular) * 2 * ALS_LAGS > len(skip):
         return None, None
     measured = np.mean([_autocovariance(leg, F, L, skip | ~regular) for leg in legs], axis=0)
+    if not np.all(np.isfinite(measured)):
+        return None, None
     (q_found, r_found), _ = nnls(np.column_stack([c_q, c_r]), measured)
     return (
         float(np.sqrt(q_found)) if q_found > 0.0 else None,
@@ -414,7 +432,10 @@ def _autocovariance_least_squares(
 
 
 def _autocovariance(legs: Preintegrated, F: Array, L: Array, skip: NDArray[np.bool_]) -> Array:
-    """Autocovariance of the innovations of a filter of fixed gain, without what is skipped."""
+    """Autocovariance of the innovations of a filter of fixed gain, without what is skipped.
+
+    NaN where hardly any stretch between what is skipped is longer than the lags.
+    """
     x = np.array([legs.initial.position_m, legs.initial.velocity_m_s])
     nu = np.full(len(skip), np.nan)
     known = 0  # measurements since the filter last lost its state
@@ -427,4 +448,7 @@ def _autocovariance(legs: Preintegrated, F: Array, L: Array, skip: NDArray[np.bo
             x += L[:, 0] * error
         if known > ALS_LAGS:
             nu[k] = error
-    return np.array([np.nanmean(nu[: len(nu) - lag] * nu[lag:]) for lag in range(ALS_LAGS)])
+    products = [nu[: len(nu) - lag] * nu[lag:] for lag in range(ALS_LAGS)]
+    if np.count_nonzero(np.isfinite(products[-1])) < ALS_LAGS:
+        return np.full(ALS_LAGS, np.nan)
+    return np.array([np.nanmean(product) for product in products])

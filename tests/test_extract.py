@@ -293,8 +293,6 @@ def test_a_bad_log_makes_no_folder(tmp_path, monkeypatch, capsys):
 def test_tables_of_an_earlier_run_are_pointed_out(tmp_path, sample_log):
     (tmp_path / "position_old.csv").write_text("time_s\n")
     assert "position_old.csv" in extract(sample_log, "-o", tmp_path).output.splitlines()[-1]
-    path = make_log().write(tmp_path / "made.ulg")
-    assert "truth.csv" in extract(path, "-o", tmp_path).output.splitlines()[-1]
 
 
 # ---- Parquet ----------------------------------------------------------------------------------

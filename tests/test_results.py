@@ -17,7 +17,7 @@ ROOT = Path(__file__).parent.parent
 
 
 def document(flight: px4fuse.Flight, **options: object) -> Document:
-    comparison = px4fuse.compare(flight, **options)
+    comparison = px4fuse.explain(px4fuse.compare(flight, **options))
     return Document(comparison, px4fuse.find(comparison), Student(), "px4fuse compare")
 
 

@@ -12,6 +12,7 @@ from px4fuse.findings.model import Finding, Severity, motion_range_m
 from px4fuse.findings.thresholds import (
     CLOCK_OFFSET,
     CLOCK_OFFSET_ERROR,
+    CLOCK_SIGMAS,
     EKF2_UPDATE,
     MIN_OUTLIERS,
     MOTION_RANGE,
@@ -154,7 +155,8 @@ def clock_off(comparison: Comparison) -> Iterator[Finding]:
             "change with --start, --end.",
             {**evidence, "change_p": clock.change_p or 0.0},
         )
-    if not low <= 0.0 <= high and abs(clock.offset_s) > CLOCK_OFFSET.value and not changes:
+    sure = abs(clock.offset_s) > CLOCK_SIGMAS.value * clock.sigma_s
+    if sure and abs(clock.offset_s) > CLOCK_OFFSET.value and not changes:
         yield Finding(
             "source_clock_offset",
             "error" if abs(clock.offset_s) > CLOCK_OFFSET_ERROR.value else "warning",
@@ -176,10 +178,10 @@ def ekf2_delay_off(comparison: Comparison) -> Iterator[Finding]:
     if not clock.determinable or delay is None:
         return
     applied = comparison.settings.clock_offset_s
-    asked = np.array([-(applied + high) for high in (clock.interval_s[1], clock.interval_s[0])])
-    asked += np.array([-EKF2_UPDATE.value, EKF2_UPDATE.value])
+    asked = -applied - np.array([clock.interval_s[1], clock.interval_s[0]])
     best = -(applied + clock.offset_s)
-    if asked[0] <= delay * 1e-3 <= asked[1] or abs(delay * 1e-3 - best) < CLOCK_OFFSET.value:
+    apart = abs(delay * 1e-3 - best)
+    if apart < max(CLOCK_SIGMAS.value * clock.sigma_s + EKF2_UPDATE.value, CLOCK_OFFSET.value):
         return
     yield Finding(
         "ekf2_ev_delay_wrong",

@@ -14,8 +14,12 @@ import pandas as pd
 
 from px4fuse.flight import (
     AXIS_NAMES,
+    BIAS_NOT_LOGGED,
+    EKF2_STEP_S,
+    HORIZON_NOT_LOGGED,
     POSITION_COLUMNS,
     POSITION_VARIANCE_COLUMNS,
+    SPECIFIC_FORCE_COLUMNS,
     VELOCITY_COLUMNS,
     VELOCITY_VARIANCE_COLUMNS,
     AxisName,
@@ -24,18 +28,22 @@ from px4fuse.flight import (
     Unavailable,
 )
 from px4fuse.readers.px4_topics import (
+    ACCELEROMETER_BIAS_STATE,
     AID_SOURCE,
+    BIAS_PER_STEP,
     CONTROL_MODE_BITS,
     COVARIANCE_OFFSETS,
     ESTIMATOR_STATES,
     FUSING,
+    IMU,
     INNOVATIONS,
     LOCAL_POSITION,
     SELECTOR,
+    SENSOR_BIAS,
     InnovationLayout,
     Layout,
 )
-from px4fuse.readers.ulog_topics import Topics
+from px4fuse.readers.ulog_topics import Topics, measurement_time_us
 
 # Primary EKF2 instance from each time on
 Instances = tuple[tuple[float, int], ...]
@@ -105,6 +113,9 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
         instances=instances,
         gate=_gate(topics),
         notes=tuple(notes),
+        accelerometer_bias=_read_accelerometer_bias(topics, instances),
+        step_s=_step_s(topics),
+        horizon_s=_horizon_s(topics),
     )
 
 
@@ -207,6 +218,59 @@ def _read_variance(topics: Topics, instances: Instances) -> pd.DataFrame | Unava
         "no usable topic estimator_states (estimator_status before v1.12)",
         "Record with SDLOG_PROFILE bit 0 (default), or EKF2 had not started.",
     )
+
+
+def _step_s(topics: Topics) -> float:
+    """Time between two predictions: EKF2 gathers whole IMU samples (ImuDownSampler.cpp)."""
+    target = topics.log.parameters.get("EKF2_PREDICT_US", EKF2_STEP_S * 1e6) * 1e-6
+    layout = topics.find(IMU)
+    if layout is None:
+        return target
+    intervals = np.diff(topics.frame(layout).index.to_numpy())
+    if not len(intervals):
+        return target
+    interval = float(np.median(intervals))
+    return round(target / interval) * interval if interval < target else target
+
+
+def _read_accelerometer_bias(topics: Topics, instances: Instances) -> pd.DataFrame | Unavailable:
+    """Accelerometer bias from its own topic, or else from the state vector.
+
+    A state vector of 24 with 24 covariances holds it per prediction step: divided by that step.
+    """
+    layout = topics.find(SENSOR_BIAS)
+    if layout is not None:
+        own = of_primary(topics, layout.topic, instances, partial(topics.frame, layout)).dropna()
+        if len(own):
+            return own
+    for topic, length in _lengths(topics).items():
+        if length not in COVARIANCE_OFFSETS:
+            continue
+        columns = {
+            name: f"states[{ACCELEROMETER_BIAS_STATE + i}]"
+            for i, name in enumerate(SPECIFIC_FORCE_COLUMNS)
+        }
+        read = partial(topics.frame, Layout(topic, columns, ""))
+        frame = of_primary(topics, topic, instances, read).dropna()
+        if len(frame):
+            return frame / (_step_s(topics) if length in BIAS_PER_STEP else 1.0)
+    return BIAS_NOT_LOGGED
+
+
+def _horizon_s(topics: Topics) -> float | Unavailable:
+    """How long after the time that it is of the delayed state is published (median).
+
+    Releases before v1.13 stamp it with the newest IMU sample instead, so that what is left is less
+    than a prediction step.
+    """
+    for topic in _lengths(topics):
+        table = topics.tables[topic, topics.instances(topic)[0]]
+        if "timestamp_sample" in table:
+            measured = measurement_time_us(table).astype(np.float64)
+            lag = float(np.median(table["timestamp"] - measured)) * 1e-6
+            if lag > _step_s(topics):
+                return lag
+    return HORIZON_NOT_LOGGED
 
 
 def _read_fusing(topics: Topics, instances: Instances) -> pd.DataFrame | Unavailable:

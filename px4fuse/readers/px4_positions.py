@@ -15,6 +15,7 @@ from px4fuse.flight import (
     POSITION_COLUMNS,
     POSITION_VARIANCE_COLUMNS,
     VELOCITY_COLUMNS,
+    ClockMap,
     Ekf2,
     PositionTrack,
     Truth,
@@ -39,6 +40,9 @@ MIN_TRACK_SAMPLES = 3
 DEFAULT_PREDICT_US = 10_000.0  # EKF2_PREDICT_US, ekf2_params.c
 EARTH_RADIUS_M = 6_371_000.0  # PX4's CONSTANTS_RADIUS_OF_EARTH, src/lib/geo/geo.h
 GPS_3D_FIX = 3
+# Samples that are published within this of their measurement have no measured time of their own
+SAME_TIME_US = 100
+ARRIVAL_SHARE = 0.9
 AID_SOURCE = "estimator_aid_src_ev_pos"
 RECONSTRUCTION = "ekf2_state_plus_innovation"
 GPS_SOURCE = "vehicle_gps_position"
@@ -112,9 +116,26 @@ def _read_logged(
     return _finished(
         PositionTrack(
             source.name, source.rung, source.description, samples, frame, AUTOPILOT_CLOCK,
-            False, (layout.topic,),
+            False, (layout.topic,), clock_map=_arrival(topics, layout.topic),
         ),
         POSITION_COLUMNS,
+    )  # fmt: skip
+
+
+def _arrival(topics: Topics, topic: str) -> ClockMap | None:
+    """Whether a topic's times of measurement are in truth the times of arrival.
+
+    PX4 takes the time of arrival until 500 answers to TIMESYNC have come (``Timesync.cpp``).
+    """
+    table = topics.tables[topic, topics.instances(topic)[0]]
+    if "timestamp_sample" not in table:
+        return None
+    age_us = table["timestamp"].astype(np.int64) - table["timestamp_sample"].astype(np.int64)
+    if len(age_us) < MIN_TRACK_SAMPLES or np.mean(np.abs(age_us) <= SAME_TIME_US) < ARRIVAL_SHARE:
+        return None
+    return ClockMap(
+        "the sender's stamps", "arrival time", len(age_us), 0.0, 0.0, 0.0,
+        "PX4 replaced them by the time of arrival, since the clocks were not synchronised",
     )  # fmt: skip
 
 

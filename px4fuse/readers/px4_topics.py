@@ -100,6 +100,12 @@ COVARIANCE_OFFSETS: Mapping[tuple[int, int], tuple[int, int]] = {
     (32, 28): (4, 7),  # before v1.9: arrays padded beyond the 24 states of EKF2
 }
 
+# EKF2's accelerometer bias in m/s², whatever the generation of the state vector
+SENSOR_BIAS = (Layout("estimator_sensor_bias", _vector(_FORCE, "accel_bias"), "v1.11"),)
+ACCELEROMETER_BIAS_STATE = 13
+# States of the quaternion filter (24 covariances or 28) are velocity increments per prediction
+BIAS_PER_STEP: frozenset[tuple[int, int]] = frozenset({(24, 24), (32, 28)})
+
 SELECTOR = (Layout("estimator_selector_status", {"instance": "primary_instance"}, "v1.12"),)
 
 FUSING = (
@@ -326,9 +332,9 @@ PARAMETERS = (
 def topics() -> list[str]:
     """Every topic named in this table, sorted: all that a reader needs to decode."""
     groups = (
-        IMU, ATTITUDE, LOCAL_POSITION, ESTIMATOR_STATES, SELECTOR, FUSING, LAND_DETECTED,
-        TRUTH_LOCAL, TRUTH_GLOBAL, GPS, AID_OBSERVATION_HORIZONTAL, AID_OBSERVATION_VERTICAL,
-        *AID_SOURCE.values(), *(track.layouts for track in TRACKS),
+        IMU, ATTITUDE, LOCAL_POSITION, ESTIMATOR_STATES, SENSOR_BIAS, SELECTOR, FUSING,
+        LAND_DETECTED, TRUTH_LOCAL, TRUTH_GLOBAL, GPS, AID_OBSERVATION_HORIZONTAL,
+        AID_OBSERVATION_VERTICAL, *AID_SOURCE.values(), *(track.layouts for track in TRACKS),
     )  # fmt: skip
     names = {layout.topic for group in groups for layout in group} | UNUSED.keys()
     for layout in INNOVATIONS:

@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from pypdf import PdfWriter
 
 from px4fuse.report import (
+    budget,
     clock,
     consistency,
     cover,
@@ -33,6 +34,7 @@ PAGES = (
     consistency.draw,
     sensitivity.draw,
     clock.draw,
+    budget.draw,
     notes.draw,
     provenance.draw,
 )

@@ -14,6 +14,7 @@ from importlib import metadata
 from importlib.resources import files
 from typing import Any
 
+from px4fuse.budget import Budget, Effect
 from px4fuse.clock import ClockOffset
 from px4fuse.comparison import AgainstTruth, AxisComparison, Comparison, FilterSummary
 from px4fuse.consistency import Consistency
@@ -68,6 +69,7 @@ def results(document: Document) -> dict[str, Any]:
             comparison.clock or Unavailable("clock offset", "it was not asked for", "See sync."),
             comparison.settings.clock_offset_s,
         ),
+        "budget": {name: _budget(found) for name, found in comparison.budget.items()},
         "loop": _unavailable(Unavailable("loop closure", NOT_YET, "None needed on an aisle.")),
         "findings": [
             {
@@ -158,6 +160,41 @@ def _tuned(found: AxisTuning | Unavailable) -> dict[str, Any]:
             "als_sigma_z_m": found.als_sigma_z_m,
         }
     )
+
+
+def _budget(found: Budget | Unavailable) -> dict[str, Any]:
+    if isinstance(found, Unavailable):
+        return _unavailable(found)
+    truth = found.truth
+    return {
+        "count": found.count,
+        **_present(asdict(found.baseline)),
+        "causes": {
+            name.replace(" ", "_"): _effect(effect) for name, effect in found.causes.items()
+        },
+        "together": _effect(found.together),
+        "clock": _effect(found.clock),
+        "truth": _unavailable(truth)
+        if isinstance(truth, Unavailable)
+        else _present(asdict(truth) | {"reasons": list(truth.reasons)}),
+    }
+
+
+def _effect(effect: Effect | Unavailable) -> dict[str, Any]:
+    if isinstance(effect, Unavailable):
+        return _unavailable(effect)
+    without = effect.without
+    return {
+        "made": effect.made,
+        **_present(asdict(effect.alone)),
+        "position_share": effect.position_share,
+        "velocity_share": effect.velocity_share,
+        **(
+            {}
+            if without is None
+            else {f"without_{name}": value for name, value in _present(asdict(without)).items()}
+        ),
+    }
 
 
 def _noise(name: str, noise: Noise) -> dict[str, Any]:

@@ -160,9 +160,9 @@ def _curves(figure: Figure, top: float, by_a: States, by_z: States) -> None:
         axes.set_ylim(bottom=0.0)
         axes.set_title(title)
         if at == 0:
-            axes.legend(loc="upper center", ncols=1)
             axes.tick_params(axis="x", labelbottom=False)
         else:
+            axes.legend(loc="upper left")
             gain, sigma = _settled(by_a.gain), _settled(by_a.sigma_p_m)
             axes.set_xlabel("factor on the chosen value")
             caption(axes, f"at the chosen values: gain {gain[2]:.2f}, σ_p {sigma[2]:.3f} m")

@@ -1,0 +1,116 @@
+"""Detectors on what the likelihood says: clean, faulty, unexplained, short and real flights."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+from px4fuse.comparison import Comparison, compare
+from px4fuse.explanation import explain
+from px4fuse.findings import Finding
+from px4fuse.findings.noise import clock_off, ekf2_delay_off, noises_off, outliers
+from px4fuse.kalman import Settings
+from px4fuse.readers import read_log
+from px4fuse.simulation.flights import simulate_flight
+from px4fuse.simulation.mistakes import parse
+from px4fuse.simulation.scenario import Scenario
+
+DETECTORS = (clock_off, outliers, noises_off, ekf2_delay_off)
+RIGHT = Settings(sigma_a_m_s2=0.27, sigma_z_m=0.10)
+SEED = 3
+NAMED_HERE = {
+    "source_clock_offset",
+    "source_clock_changes",
+    "source_outliers",
+    "sigma_z_small",
+    "sigma_z_large",
+    "sigma_a_small",
+    "sigma_a_large",
+    "ekf2_ev_delay_wrong",
+}
+
+
+@cache
+def flown(settings: Settings = RIGHT, *mistakes: str) -> Comparison:
+    flight = simulate_flight(Scenario(seed=SEED), parse(mistakes))
+    return explain(compare(flight, settings, axes=("north", "east")))
+
+
+def found(comparison: Comparison) -> dict[str, Finding]:
+    return {finding.id: finding for detector in DETECTORS for finding in detector(comparison)}
+
+
+def test_a_clean_flight_has_none() -> None:
+    assert found(flown()) == {}
+
+
+@pytest.mark.parametrize(
+    ("name", "mistakes", "settings", "severity", "remedy"),
+    [
+        ("source_clock_offset", ("clock-offset=120ms",), {}, "error", "--clock-offset -0."),
+        ("source_clock_changes", ("clock-jump=400ms",), {}, "error", "--start"),
+        ("source_outliers", ("nlos=5%",), {}, "error", "line of sight"),
+        ("sigma_z_small", (), {"sigma_z_m": 0.02}, "error", "--sigma-z 0.09|--sigma-z 0.1"),
+        ("sigma_z_large", (), {"sigma_z_m": 0.3}, "warning", "--sigma-z 0.09|--sigma-z 0.1"),
+        ("sigma_a_small", (), {"sigma_a_m_s2": 0.02}, "error", "--sigma-a 0.2|--sigma-a 0.3"),
+        ("sigma_a_large", (), {"sigma_a_m_s2": 2.0}, "error", "--sigma-a 0.2|--sigma-a 0.3"),
+    ],
+)
+def test_a_mistake_is_named_with_what_to_type(name, mistakes, settings, severity, remedy) -> None:
+    named = found(flown(replace(RIGHT, **settings), *mistakes))
+    assert named[name].severity == severity
+    assert any(part in named[name].remedy for part in remedy.split("|"))
+
+
+def test_r_and_q_are_told_apart() -> None:
+    """Both make S too large, and the mean NIS too small; only the likelihood knows which."""
+    by_r = found(flown(replace(RIGHT, sigma_z_m=0.3)))
+    by_q = found(flown(replace(RIGHT, sigma_a_m_s2=2.0)))
+    assert "sigma_z_large" in by_r
+    assert "sigma_a_large" not in by_r
+    assert "sigma_a_large" in by_q
+    assert "sigma_z_large" not in by_q
+
+
+def test_the_offset_that_is_stated_is_the_one_that_was_made() -> None:
+    evidence = found(flown(RIGHT, "clock-offset=120ms"))["source_clock_offset"].evidence
+    low, high = evidence["interval_low_s"], evidence["interval_high_s"]
+    assert isinstance(low, float)
+    assert isinstance(high, float)
+    assert low <= -0.12 <= high
+
+
+@pytest.mark.parametrize("mistake", ["clock-offset=120ms", "nlos=5%"])
+def test_what_was_not_explained_is_not_guessed(mistake) -> None:
+    assert found(replace(flown(RIGHT, mistake), tuning={}, clock=None)) == {}
+
+
+def test_a_flight_of_a_moment_says_nothing() -> None:
+    flight = simulate_flight(Scenario(seed=SEED), parse(["clock-offset=120ms"]))
+    short = compare(flight, RIGHT, axes=("north", "east"), start_s=20.0, end_s=22.0)
+    assert found(explain(short)) == {}
+
+
+def test_the_process_noise_of_a_hovering_vehicle_is_not_judged() -> None:
+    flight = simulate_flight(Scenario(seed=SEED), parse(["no-motion"]))
+    named = found(explain(compare(flight, Settings(sigma_a_m_s2=5.0), axes=("north", "east"))))
+    assert named == {}
+
+
+@pytest.mark.reallogs
+@pytest.mark.parametrize(
+    ("log", "name"),
+    [
+        ("v1.16.1_aisle_clock_late", "source_clock_offset"),
+        ("v1.16.1_aisle_nlos", "source_outliers"),
+        ("v1.13.3_aisle_evdelay175", "ekf2_ev_delay_wrong"),
+        ("v1.16.1_aisle_nominal", None),
+    ],
+)
+def test_simulated_px4_flights(shared_logs: Path, log, name) -> None:
+    flight = read_log(shared_logs / "simulated" / f"{log}.ulg")
+    named = list(found(explain(compare(flight, Settings(0.35, 0.10), axes=("north", "east")))))
+    assert named[:1] == ([] if name is None else [name])
