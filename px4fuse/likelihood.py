@@ -110,7 +110,7 @@ def innovations(
     -------
     innovation_m, innovation_variance_m2 : ndarray, shape (m, ...)
     """
-    steps = _recursion(legs, sigma_a_m_s2, sigma_z_m, skip)
+    steps = recursion(legs, sigma_a_m_s2, sigma_z_m, skip)
     shape = (len(legs.measurement_m), *np.broadcast(sigma_a_m_s2, sigma_z_m).shape)
     nu, s = np.empty(shape), np.empty(shape)
     for k, step in enumerate(steps):
@@ -140,18 +140,33 @@ def states(legs: Preintegrated, sigma_a_m_s2: ArrayLike, sigma_z_m: ArrayLike) -
     """
     rows = [
         (k0, v, np.sqrt(p00), np.sqrt(p11), nu**2 / s)
-        for nu, s, k0, v, p00, p11 in _recursion(legs, sigma_a_m_s2, sigma_z_m, None)
+        for nu, s, k0, v, p00, p11 in recursion(legs, sigma_a_m_s2, sigma_z_m, None)
     ]
     return States(*(np.array(column) for column in zip(*rows, strict=True)))
 
 
-def _recursion(
+def recursion(
     legs: Preintegrated,
     sigma_a_m_s2: ArrayLike,
     sigma_z_m: ArrayLike,
     skip: NDArray[np.bool_] | None,
 ) -> Iterator[tuple[Array, Array, Array, Array, Array, Array]]:
-    """ν, S, gain, and after the update velocity and both variances, measurement by measurement."""
+    """Run the filter over a grid of settings, measurement by measurement.
+
+    Parameters
+    ----------
+    legs : Preintegrated
+    sigma_a_m_s2, sigma_z_m : array_like
+        Broadcast against each other to a grid of shape (...).
+    skip : ndarray of bool, shape (m,), or None
+        Measurements that are compared but not fused.
+
+    Yields
+    ------
+    tuple of ndarray, each of shape (...)
+        ν (m), S (m²), gain, and after the update the velocity (m/s) and the variances of position
+        and velocity.
+    """
     q, r = np.broadcast_arrays(
         np.square(np.asarray(sigma_a_m_s2, float)), np.square(np.asarray(sigma_z_m, float))
     )

@@ -22,11 +22,11 @@ from px4fuse.flight import Unavailable
 from px4fuse.kalman import Settings
 from px4fuse.likelihood import (
     Preintegrated,
-    _recursion,
     innovations,
     negative_log_likelihood,
     outlier_probability,
     preintegrate,
+    recursion,
 )
 from px4fuse.signals import Array, Axis
 
@@ -45,6 +45,8 @@ PROFILE_DROP = float(chi2.ppf(0.95, 1)) / 2.0
 MIN_MEASUREMENTS = 30
 MAX_PASSES = 5
 MAX_OUTLIER_SHARE = 0.3
+# Median NIS, against that of chi-square, below which outliers are hidden in the fitted noise
+MASKED = 0.6
 # Legs longer than this many median ones break the constant interval that ALS needs
 ALS_LONGEST_LEG = 1.5
 ALS_LAGS = 15
@@ -246,7 +248,7 @@ def _total(
     total = np.zeros(shape)
     for leg in legs:
         row = 0
-        for step in islice(_recursion(leg, sigma_a, sigma_z, skip), start, None):
+        for step in islice(recursion(leg, sigma_a, sigma_z, skip), start, None):
             nu[row], s[row] = step[:2]
             row += 1
             if row == rows:
@@ -262,7 +264,14 @@ def _fit_without_outliers(legs: list[Preintegrated]) -> tuple[_Best, NDArray[np.
     best = _search(legs, skip)
     for _ in range(MAX_PASSES):
         pairs = [innovations(leg, best.sigma_a, best.sigma_z, skip) for leg in legs]
-        outlier = outlier_probability([nu for nu, _ in pairs], [s for _, s in pairs]) > 0.5
+        nu, s = [nu for nu, _ in pairs], [s for _, s in pairs]
+        # many outliers at once raise the fitted SIGMA_Z until they pass: the median tells, where
+        # SIGMA_Z makes up most of S
+        square = np.sum([n**2 / v for n, v in zip(nu, s, strict=True)], axis=0)
+        scale = float(np.median(square[~skip]) / chi2.median(len(legs)))
+        if scale < MASKED and best.sigma_z**2 > 0.5 * np.median(s):
+            s = [v * scale for v in s]
+        outlier = outlier_probability(nu, s) > 0.5
         if np.array_equal(outlier, skip):
             break
         skip = outlier

@@ -21,6 +21,7 @@ from px4fuse.consistency import MIN_INNOVATIONS
 from px4fuse.findings import DETECTORS, SEVERITIES, Finding, find
 from px4fuse.flight import (
     AXIS_NAMES,
+    SPECIFIC_FORCE_COLUMNS,
     Alignment,
     ClockMap,
     Dropout,
@@ -99,6 +100,15 @@ def as_recording(flight: Flight) -> Flight:
     none = Unavailable("EKF2 innovations", "MAVLink does not carry them", "")
     ekf2 = replace(flight.ekf2, innovations=dict.fromkeys(AXIS_NAMES, none))
     return with_log(format="MAVLink tlog")(replace(flight, ekf2=ekf2))
+
+
+def biased(flight: Flight) -> Flight:
+    """EKF2 that found a bias along the body's axes."""
+    assert isinstance(flight.ekf2, Ekf2)
+    bias = flight.ekf2.state.iloc[:, :3].set_axis(SPECIFIC_FORCE_COLUMNS, axis=1) * 0.0
+    return replace(
+        flight, ekf2=replace(flight.ekf2, accelerometer_bias=bias + np.array([0.2, -0.1, 0.2]))
+    )
 
 
 def placed(*warnings: str) -> Alignment:
@@ -197,6 +207,14 @@ FAULTS = [
         remedy="--sigma-a 0.",
     ),
     # EKF2's
+    Fault(
+        "accelerometer_bias",
+        "warning",
+        evidence={"bias_m_s2": about(0.3, 0.01)},
+        says="+0.20 forward, -0.10 right, +0.20 down",
+        remedy="Calibrate",
+        change=biased,
+    ),
     Fault(
         "ekf2_variance_overstated",
         "error",

@@ -7,11 +7,21 @@ import pytest
 from flights import line, random_walk
 from hypothesis import given, settings
 from numpy.typing import NDArray
+from scipy.stats import norm
 from test_kalman import any_axis, any_settings, sample_axes
 
 from px4fuse.flight import Flight
 from px4fuse.kalman import Settings, replay
-from px4fuse.likelihood import innovations, noise_asked, preintegrate
+from px4fuse.likelihood import (
+    OUTLIER_SHARE,
+    OUTLIER_WIDTH,
+    innovations,
+    negative_log_likelihood,
+    noise_asked,
+    outlier_probability,
+    preintegrate,
+    states,
+)
 from px4fuse.signals import Axis
 
 SIGMA_A = [0.05, 0.5, 5.0]
@@ -110,3 +120,86 @@ def test_five_percent_gross_outliers_hardly_move_the_noise_asked(seed: int) -> N
     measured = clean.measurement_m + np.where(outlier, rng.choice([-3.0, 3.0], 1000), 0.0)
     asked = noise_asked(line(clean.measurement_time_s, measured), ZERO)
     assert asked.sigma_z_m == pytest.approx(noise_asked(clean, ZERO).sigma_z_m, rel=0.20)
+
+
+def test_states_on_a_grid_equal_the_replay_at_the_measurements(sample_flight: Flight) -> None:
+    axis = sample_axes(sample_flight)[0]
+    grid = states(preintegrate(axis, Settings()), np.array(SIGMA_A)[:, None], np.array(SIGMA_Z))
+    for i, j in ((0, 0), (1, 1), (2, 0), (0, 2)):
+        run = replay(axis, Settings(sigma_a_m_s2=SIGMA_A[i], sigma_z_m=SIGMA_Z[j]))
+        after = run.steps.loc[run.updates.index]
+        for ours, theirs in (
+            (grid.gain, run.updates["gain_position"]),
+            (grid.velocity_m_s, after["velocity_m_s"]),
+            (grid.sigma_p_m**2, after["position_variance_m2"]),
+            (grid.sigma_v_m_s**2, after["velocity_variance_m2_s2"]),
+            (
+                grid.nis,
+                run.updates["innovation_m"] ** 2 / run.updates["innovation_variance_m2"],
+            ),
+        ):
+            np.testing.assert_allclose(ours[:, i, j], theirs, rtol=1e-9, atol=1e-9)
+
+
+@settings(max_examples=30, deadline=None)
+@given(axis=any_axis(), chosen=any_settings)
+def test_states_of_any_axis_equal_the_replay(axis: Axis, chosen: Settings) -> None:
+    ours = states(preintegrate(axis, chosen), chosen.sigma_a_m_s2, chosen.sigma_z_m)
+    run = replay(axis, chosen)
+    np.testing.assert_allclose(ours.gain, run.updates["gain_position"], rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(
+        ours.velocity_m_s, run.steps.loc[run.updates.index, "velocity_m_s"], rtol=1e-9, atol=1e-9
+    )
+
+
+def test_a_skipped_measurement_is_compared_but_not_fused() -> None:
+    """As if it were not there, for all that come after it."""
+    axis = walk(count=60)
+    skip = np.zeros(59, dtype=bool)
+    skip[[20, 21, 40]] = True
+    nu, s = innovations(preintegrate(axis, ZERO), 0.5, 0.1, skip)
+    kept = np.concatenate([[True], ~skip])
+    without = line(axis.measurement_time_s[kept], axis.measurement_m[kept])
+    expected = innovations(preintegrate(without, ZERO), 0.5, 0.1)
+    np.testing.assert_allclose([nu[~skip], s[~skip]], expected, rtol=1e-9, atol=1e-9)
+    assert np.all(s[skip] > 0.0)
+    assert np.all(nu[skip] != 0.0)
+
+
+def test_likelihood_is_that_of_the_contaminated_normal() -> None:
+    rng = np.random.default_rng(1)
+    s = rng.uniform(0.01, 4.0, (50, 2, 3))
+    nu = rng.normal(0.0, 2.0, s.shape)
+    density = (1.0 - OUTLIER_SHARE) * norm.pdf(nu, scale=np.sqrt(s)) + OUTLIER_SHARE * norm.pdf(
+        nu, scale=OUTLIER_WIDTH * np.sqrt(s)
+    )
+    np.testing.assert_allclose(
+        negative_log_likelihood(nu, s), -np.log(density).sum(axis=0), rtol=1e-12
+    )
+
+
+@pytest.mark.parametrize("far", [40.0, 1e4, 1e150])
+def test_likelihood_stays_finite_where_the_density_underflows(far: float) -> None:
+    got = negative_log_likelihood(np.array([far]), np.array([1.0]))
+    wide = -np.log(OUTLIER_SHARE) - norm.logpdf(far, scale=OUTLIER_WIDTH)
+    assert got == pytest.approx(wide, rel=1e-12)
+
+
+def test_outlier_probability_goes_from_the_prior_to_certainty() -> None:
+    """Bayes: ε N(ν; 0, w²S) against (1 - ε) N(ν; 0, S), over all axes."""
+    nu, s = np.linspace(0.0, 6.0, 25), np.full(25, 0.04)
+    for axes in (1, 2):
+        narrow = (1.0 - OUTLIER_SHARE) * norm.pdf(nu, scale=0.2) ** axes
+        wide = OUTLIER_SHARE * norm.pdf(nu, scale=0.2 * OUTLIER_WIDTH) ** axes
+        got = outlier_probability([nu] * axes, [s] * axes)
+        known = narrow > 0.0
+        np.testing.assert_allclose(got[known], (wide / (wide + narrow))[known], rtol=1e-9)
+        assert np.all(np.diff(got) >= 0.0)
+        assert got[0] < OUTLIER_SHARE  # no evidence at all speaks against an outlier
+        assert got[-1] == 1.0
+    # beyond every floating-point density
+    assert outlier_probability([np.array([1e100])], [np.array([1.0])]) == 1.0
+    # both axes together see what neither sees alone
+    both = [np.array([3.2]), np.array([3.2])]
+    unit = [np.ones(1), np.ones(1)]
+    assert outlier_probability(both[:1], unit[:1]) < 0.5 < outlier_probability(both, unit)

@@ -40,6 +40,14 @@ class LazyGroup(click.Group):
         command: click.Command = getattr(module, cmd_name)
         return command
 
+    def invoke(self, ctx: click.Context) -> object:
+        """Invoke a command; a closed pipe is told apart from other errors of writing by main."""
+        try:
+            return super().invoke(ctx)
+        except BrokenPipeError as error:
+            # click itself ends with exit code 1 where it sees errno EPIPE
+            raise BrokenPipeError from error
+
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """List the commands from the table above, without importing them."""
         del ctx

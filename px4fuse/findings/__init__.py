@@ -7,7 +7,13 @@ findings; it never prints and never guesses: what it cannot see it does not ment
 from __future__ import annotations
 
 from px4fuse.comparison import Comparison
-from px4fuse.findings.ekf2 import ekf2_not_fusing, ekf2_rejecting, ekf2_unavailable, resets
+from px4fuse.findings.ekf2 import (
+    accelerometer_bias,
+    ekf2_not_fusing,
+    ekf2_rejecting,
+    ekf2_unavailable,
+    resets,
+)
 from px4fuse.findings.filter import process_noise_forgotten, too_few_innovations, variance_wrong
 from px4fuse.findings.model import SEVERITIES, Detector, Finding, Severity
 from px4fuse.findings.noise import clock_off, ekf2_delay_off, noises_off, outliers
@@ -50,6 +56,7 @@ DETECTORS: tuple[Detector, ...] = (
     variance_wrong,
     ekf2_rejecting,
     ekf2_delay_off,
+    accelerometer_bias,
     companion_not_synchronised,
     position_file_placement,
     source_reconstructed,

@@ -9,6 +9,7 @@ import numpy as np
 from px4fuse.comparison import Comparison
 from px4fuse.findings.model import Finding, step_share, times
 from px4fuse.findings.thresholds import (
+    ACCELEROMETER_BIAS,
     EV_START_INTERVAL,
     EV_STOP_INTERVAL,
     FUSING_SHARE_ERROR,
@@ -16,7 +17,8 @@ from px4fuse.findings.thresholds import (
     REJECTED_SHARE_ERROR,
     REJECTED_SHARE_WARNING,
 )
-from px4fuse.flight import EXTERNAL_VISION_RUNGS, Ekf2, Unavailable
+from px4fuse.flight import EXTERNAL_VISION_RUNGS, SPECIFIC_FORCE_COLUMNS, Ekf2, Unavailable
+from px4fuse.signals import within
 
 
 def ekf2_unavailable(comparison: Comparison) -> Iterator[Finding]:
@@ -165,3 +167,26 @@ def resets(comparison: Comparison) -> Iterator[Finding]:
             "Compare the IMUs (vehicle_imu_status); set EKF2_MULTI_IMU to 1 for a lab flight.",
             {"count": float(len(switches)), "at_s": switches[0]},
         )
+
+
+def accelerometer_bias(comparison: Comparison) -> Iterator[Finding]:
+    """EKF2 found a large accelerometer bias, which our filter takes for acceleration."""
+    ekf2, segment = comparison.flight.ekf2, comparison.segment
+    if isinstance(ekf2, Unavailable) or isinstance(ekf2.accelerometer_bias, Unavailable):
+        return
+    inside = within(ekf2.accelerometer_bias, segment)
+    if inside.empty:
+        return
+    bias = inside[SPECIFIC_FORCE_COLUMNS].median().to_numpy()
+    size = float(np.linalg.norm(bias))
+    if size < ACCELEROMETER_BIAS.value:
+        return
+    yield Finding(
+        "accelerometer_bias",
+        "warning",
+        f"EKF2 takes an accelerometer bias of {size:.2f} m/s² off ({bias[0]:+.2f} forward, "
+        f"{bias[1]:+.2f} right, {bias[2]:+.2f} down), which our filter integrates: it needs a "
+        "larger SIGMA_A for that.",
+        "Calibrate the accelerometers, at the temperature of the flight.",
+        {"bias_m_s2": size},
+    )

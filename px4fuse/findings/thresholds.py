@@ -25,6 +25,7 @@ REJECTED_SHARE_WARNING = Threshold(0.01, "of the innovations", "5 σ rejects 6e-
 REJECTED_SHARE_ERROR = Threshold(0.20, "of the innovations", "one in five: R or the clock is wrong")
 GAP = Threshold(1.0, "s", "ten prediction steps without a measurement")
 GAP_INTERVALS = Threshold(5.0, "median intervals", "jitter and single losses pass")
+ACCELEROMETER_BIAS = Threshold(0.2, "m/s²", "half of EKF2's own limit, EKF2_ABL_LIM")
 VARIANCE_FACTOR = Threshold(
     1.5, "times", "22 % in standard deviation; chance moves it less at n > 100"
 )

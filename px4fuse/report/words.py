@@ -100,7 +100,11 @@ def tuning_advice(
             f"Re-run   px4fuse compare {comparison.flight.log.name} {' '.join(options)}   ({name})"
         )
     now = comparison.flight.log.parameters.get("EKF2_EVP_NOISE")
-    if found.sigma_z.value is None:
+    if found.sigma_z.value is None and found.sigma_z.low is not None:
+        lines.append(
+            f"SIGMA_Z  is at least {found.sigma_z.low:.2g} m: is this a position source at all?"
+        )
+    elif found.sigma_z.value is None:
         bound = found.sigma_z.high
         lines.append(
             "SIGMA_Z  is below what this logging rate can show"
@@ -113,7 +117,11 @@ def tuning_advice(
             + (f" (now {now:g})" if now is not None else "")
         )
     if found.sigma_a.value is None:
-        lines.append("SIGMA_A  is not determined by this flight: too little motion, or too short.")
+        lines.append(
+            "SIGMA_A  is not determined by this flight: too little motion, or too short."
+            if found.sigma_a.low is None
+            else f"SIGMA_A  is at least {found.sigma_a.low:.2g} m/s²: the acceleration is wrong."
+        )
     als = [
         f"{label} {value:.3g} {unit}"
         for label, value, unit in (

@@ -1,0 +1,66 @@
+"""Speed of tuning and of the clock estimate; nothing here can fail: run it, read it.
+
+A grid of 64 × 64 settings against filterpy replays of single settings, on the sample log; then
+``tune`` and the clock estimate on a ten-minute flight, 5 Hz positions and 250 Hz IMU, in memory
+(reading a log of that size comes on top).
+
+    python tests/benchmarks/bench_tuning.py
+"""
+
+from __future__ import annotations
+
+import statistics
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+LOG = Path(__file__).parents[2] / "sample_logs" / "aisle_uwb.ulg"
+RUNS = 3
+
+
+def seconds(work: Callable[[], object], runs: int = RUNS) -> float:
+    """Median over some runs."""
+    took = []
+    for _ in range(runs):
+        start = time.perf_counter()
+        work()
+        took.append(time.perf_counter() - start)
+    return statistics.median(took)
+
+
+def main() -> None:
+    import test_clock
+
+    from px4fuse.comparison import compare
+    from px4fuse.kalman import Settings, replay
+    from px4fuse.likelihood import preintegrate
+    from px4fuse.readers import read_log
+    from px4fuse.tuning import HORIZONTAL, _total, tune
+
+    axis = compare(read_log(LOG), axes=("north",)).axes[0].axis
+    single = seconds(lambda: replay(axis, Settings()))
+    legs = preintegrate(axis, Settings())
+    skip = np.zeros(len(legs.measurement_m), dtype=bool)
+    a, z = np.geomspace(0.05, 5.0, 64)[:, None], np.geomspace(0.01, 1.0, 64)
+    grid = seconds(lambda: _total([preintegrate(axis, Settings())], a, z, skip))
+    print(
+        f"64 x 64 settings, {len(skip)} measurements: {grid:.2f} s, {4096 / grid:.0f} settings/s; "
+        f"filterpy {single:.2f} s for one; {4096 * single / grid:.0f} times as fast"
+    )
+    test_clock.IMU_HZ = 250.0
+    flight, _ = test_clock.made_flight(1, duration_s=600.0, offset_s=-0.1)
+    axes = tuple(each.axis for each in compare(flight, test_clock.SETTINGS).axes)
+    for names in (None, (HORIZONTAL,)):
+        took = seconds(lambda names=names: tune(axes, test_clock.SETTINGS, names), 1)
+        print(f"tune, {names[0] if names else 'all axes'}, 600 s: {took:.1f} s (aim 5 s)")
+    took = seconds(lambda: test_clock.estimate(flight), 1)
+    print(f"clock offset, 600 s: {took:.1f} s (aim 10 s)")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,276 @@
+"""What the commands write, and what they never write over; what they say about what they read."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_cli import run_main
+from ulog_tools import ev_error, ev_stamps, make_log, position
+
+import px4fuse.report.pdf
+from px4fuse.comparison import compare
+from px4fuse.errors import MissingDataError
+from px4fuse.explanation import clock_offset_found
+from px4fuse.readers import read_log
+
+SECONDS = 20.0
+
+
+@pytest.fixture
+def no_drawing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pages take most of the time, and none of them is looked at here."""
+    monkeypatch.setattr(px4fuse.report.pdf, "render", lambda document, text: b"%PDF-")
+
+
+@pytest.fixture
+def desk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with a short log, its positions as CSV and notes; the commands run there."""
+    make_log("v1.16", SECONDS).write(tmp_path / "l.ulg")
+    time = ev_stamps(SECONDS) * 1e-6
+    measured = position(time - 5.0) + ev_error(time - 5.0)
+    rows = [f"{t:.6f},{n:.4f},{e:.4f},{d:.4f}" for t, (n, e, d) in zip(time, measured, strict=True)]
+    (tmp_path / "c.csv").write_text("\n".join(["time_s,north,east,down", *rows, ""]))
+    (tmp_path / "n.md").write_text("my own words")
+    (tmp_path / "hard.json").hardlink_to(tmp_path / "l.ulg")
+    (tmp_path / "soft.json").symlink_to(tmp_path / "l.ulg")
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+REFUSED = {
+    "info": "info l.ulg --json l.ulg",
+    "info by another spelling": "info l.ulg --json ./l.ulg",
+    "info by hard link": "info l.ulg --json hard.json",
+    "info by soft link": "info l.ulg --json soft.json",
+    "tune": "tune l.ulg --axis north --json l.ulg",
+    "tune by hard link": "tune l.ulg --axis north --json hard.json",
+    "sync": "sync l.ulg --json ./l.ulg",
+    "sync over positions": "sync l.ulg --position c.csv --clock-offset 0 --json c.csv",
+    "compare": "compare l.ulg -o r.pdf --json l.ulg",
+    "compare by hard link": "compare l.ulg -o r.pdf --json hard.json",
+    "compare over positions": "compare l.ulg --position c.csv --clock-offset 0 -o r.pdf "
+    "--json ../{folder}/c.csv",
+    "compare over notes": "compare l.ulg --notes n.md -o r.pdf --json n.md",
+}
+
+
+@pytest.mark.usefixtures("no_drawing")
+@pytest.mark.parametrize("command", REFUSED.values(), ids=REFUSED)
+def test_no_command_writes_over_what_it_reads(desk, monkeypatch, capsys, command) -> None:
+    before = contents(desk)
+    code, out, err = run_main(monkeypatch, capsys, *command.format(folder=desk.name).split())
+    assert code == 2
+    assert out == ""
+    assert err.startswith("px4fuse: ")
+    assert len(err.splitlines()) == 1
+    assert "not overwritten" in err
+    assert contents(desk) == before  # nor was anything else written
+
+
+@pytest.mark.usefixtures("no_drawing")
+def test_a_log_called_like_a_report_survives_its_own_report(desk, monkeypatch, capsys) -> None:
+    log = (desk / "l.ulg").rename(desk / "l.pdf")
+    before = log.read_bytes()
+    code, _, err = run_main(monkeypatch, capsys, "compare", "l.pdf", "--axis", "north",
+                            "-o", "l.pdf")  # fmt: skip
+    assert code == 2
+    assert len(err.splitlines()) == 1
+    assert log.read_bytes() == before
+
+
+@pytest.mark.usefixtures("no_drawing")
+@pytest.mark.parametrize("option", ["--json", "-o"])
+def test_the_mavlink_recording_is_not_written_over(
+    tmp_path, monkeypatch, capsys, sample_log, option
+) -> None:
+    tlog = tmp_path / "t.pdf"
+    tlog.write_bytes(sample_log.with_suffix(".tlog").read_bytes())
+    before = tlog.read_bytes()
+    command = ["compare", sample_log, "--mavlink", tlog, "--axis", "north", "--start", "30",
+               "--end", "50", option, tlog]  # fmt: skip
+    if option == "--json":
+        command += ["-o", tmp_path / "r.pdf"]
+    code, _, err = run_main(monkeypatch, capsys, *command)
+    assert code == 2
+    assert "not overwritten" in err
+    assert len(err.splitlines()) == 1
+    assert tlog.read_bytes() == before
+    assert [path.name for path in tmp_path.iterdir()] == ["t.pdf"]
+
+
+def test_results_may_be_written_again(desk, monkeypatch, capsys) -> None:
+    for _ in range(2):
+        code, _, err = run_main(monkeypatch, capsys, "tune", "l.ulg", "--axis", "north",
+                                "--json", "t.json")  # fmt: skip
+        assert (code, err) == (0, "")
+    assert "north" in json.loads((desk / "t.json").read_text())["tuning"]
+
+
+def test_extract_keeps_the_tables_of_two_logs_apart(desk, monkeypatch, capsys) -> None:
+    make_log("v1.14", SECONDS).write(desk / "other.ulg")
+    for _ in range(2):  # the same log again
+        assert run_main(monkeypatch, capsys, "extract", "l.ulg", "-o", "tables")[0] == 0
+    before = contents(desk / "tables")
+    code, out, err = run_main(monkeypatch, capsys, "extract", "other.ulg", "-o", "tables")
+    assert code == 2
+    assert out == ""
+    assert len(err.splitlines()) == 1
+    assert "l.ulg" in err
+    assert contents(desk / "tables") == before
+    # the same log under another name is the same log
+    (desk / "l.ulg").rename(desk / "renamed.ulg")
+    assert run_main(monkeypatch, capsys, "extract", "renamed.ulg", "-o", "tables")[0] == 0
+
+
+@pytest.mark.parametrize(
+    "command",
+    ["info", "tune", "sync", "extract"],
+)
+def test_a_reader_that_leaves_is_no_error(desk, command) -> None:
+    """As in px4fuse info LOG | head -1, when head has gone before anything is printed."""
+    arguments = [sys.executable, "-m", "px4fuse", command, "l.ulg"]
+    arguments += ["-o", "tables"] if command == "extract" else []
+    process = subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    process.stdout.close()
+    complaint = process.stderr.read()
+    process.stderr.close()
+    assert (process.wait(), complaint) == (0, b"")
+
+
+def test_a_recording_is_not_joined_with_itself(monkeypatch, capsys, sample_log) -> None:
+    tlog = sample_log.with_suffix(".tlog")
+    code, out, err = run_main(monkeypatch, capsys, "compare", tlog, "--mavlink", tlog)
+    assert code == 2
+    assert out == ""
+    assert "the same recording twice" in err
+    assert len(err.splitlines()) == 1
+
+
+# --- --clock-offset auto ---
+
+
+def test_auto_on_a_flight_without_motion_is_refused_with_the_reason(
+    desk, monkeypatch, capsys
+) -> None:
+    """The made flight goes straight ahead at constant speed: no acceleration, no clock offset."""
+    before = contents(desk)
+    code, out, err = run_main(monkeypatch, capsys, "compare", "l.ulg", "--clock-offset", "auto")
+    assert code == 2
+    assert out == ""
+    assert len(err.splitlines()) == 1
+    assert err.startswith("px4fuse: l.ulg: --clock-offset auto: not determinable: ")
+    assert "Give the seconds to add" in err
+    assert contents(desk) == before
+
+
+def test_auto_without_imu_is_refused_with_the_reason(tmp_path) -> None:
+    log = make_log("v1.16", SECONDS).drop("sensor_combined").write(tmp_path / "l.ulg")
+    with pytest.raises(MissingDataError, match="not determinable") as refused:
+        clock_offset_found(compare(read_log(log)))
+    assert "IMU" in str(refused.value) or "sensor_combined" in str(refused.value)
+
+
+@pytest.mark.usefixtures("no_drawing")
+@pytest.mark.reallogs
+def test_auto_brings_late_stamps_to_the_truth(shared_logs, tmp_path, monkeypatch, capsys) -> None:
+    log = shared_logs / "simulated" / "v1.16.1_aisle_clock_late.ulg"
+    rmse = {}
+    for offset in ("0", "auto"):
+        out = tmp_path / f"{offset}.pdf"
+        code, _, err = run_main(monkeypatch, capsys, "compare", log, "--axis", "aisle",
+                                "--clock-offset", offset, "-o", out)  # fmt: skip
+        assert (code, err) == (0, "")
+        found = json.loads(out.with_suffix(".json").read_text(encoding="utf-8"))
+        rmse[offset] = found["axes"]["aisle"]["truth"]["kf_position_rmse_m"]
+        if offset == "auto":
+            assert found["settings"]["clock_offset_s"] == pytest.approx(-0.25, abs=0.05)
+    assert rmse["auto"] < 0.1 < rmse["0"]
+
+
+# --- what is said about position files and stamps ---
+
+
+def findings_of(monkeypatch, capsys, out: Path, *arguments: object) -> list[dict[str, str]]:
+    code, _, err = run_main(
+        monkeypatch, capsys, "compare", *arguments, "--axis", "north", "-o", out
+    )
+    assert (code, err) == (0, "")
+    return json.loads(out.with_suffix(".json").read_text(encoding="utf-8"))["findings"]
+
+
+def external(sample_log: Path) -> tuple[str, np.ndarray]:
+    file = sample_log.with_name("aisle_uwb_external.csv")
+    header = file.read_text(encoding="utf-8").splitlines()[0]
+    return header, np.loadtxt(file, delimiter=",", skiprows=1)
+
+
+def write_csv(path: Path, header: str, rows: np.ndarray) -> Path:
+    np.savetxt(path, rows, delimiter=",", header=header, comments="", fmt="%.6f")
+    return path
+
+
+def placement(findings: list[dict[str, str]]) -> list[dict[str, str]]:
+    return [each for each in findings if each["id"] == "position_file_placement"]
+
+
+@pytest.mark.usefixtures("no_drawing")
+def test_position_files_that_do_not_fit_are_said_not_to(
+    tmp_path, monkeypatch, capsys, sample_log, subtests
+) -> None:
+    header, rows = external(sample_log)
+    out = tmp_path / "r.pdf"
+    file = sample_log.with_name("aisle_uwb_external.csv")
+
+    with subtests.test("the file as it is"):
+        found = findings_of(monkeypatch, capsys, out, sample_log, "--position", file)
+        fitted = json.loads(out.with_suffix(".json").read_text(encoding="utf-8"))
+        assert not placement(found)
+    frame = fitted["position_source"]["alignment"]["frame"]
+
+    for given in {"ned", "enu", "nwu"} - {frame}:
+        with subtests.test("another frame", given=given):
+            found = findings_of(monkeypatch, capsys, out, sample_log, "--position", file,
+                                "--position-frame", given)  # fmt: skip
+            named = [each for each in placement(found) if each["severity"] == "error"]
+            assert len(named) == 1
+            assert f"as {frame}" in named[0]["message"]
+            assert f"--position-frame {frame}" in named[0]["remedy"]
+
+    with subtests.test("upside down"):
+        flipped = rows.copy()
+        flipped[:, 3] *= -1.0
+        found = findings_of(monkeypatch, capsys, out, sample_log, "--position",
+                            write_csv(tmp_path / "f.csv", header, flipped),
+                            "--position-frame", frame)  # fmt: skip
+        assert any("height runs against" in each["message"] for each in placement(found))
+
+    with subtests.test("another day"):
+        late = rows.copy()
+        late[:, 0] += 86400.0
+        tlog = sample_log.with_suffix(".tlog")
+        found = findings_of(monkeypatch, capsys, out, tlog, "--position",
+                            write_csv(tmp_path / "d.csv", header, late))  # fmt: skip
+        apart = [each for each in placement(found) if "By their UNIX times" in each["message"]]
+        assert len(apart) == 1
+        assert apart[0]["severity"] == "warning"
+        assert "86" in apart[0]["message"]
+
+
+@pytest.mark.usefixtures("no_drawing")
+@pytest.mark.parametrize("arrived", [True, False])
+def test_stamps_of_arrival_are_said_to_be(tmp_path, monkeypatch, capsys, arrived: bool) -> None:
+    log = make_log("v1.16", SECONDS)
+    if arrived:
+        odometry: dict[str, np.ndarray] = log["vehicle_visual_odometry"]
+        odometry["timestamp_sample"] = odometry["timestamp"].copy()
+    found = findings_of(monkeypatch, capsys, tmp_path / "r.pdf", log.write(tmp_path / "l.ulg"))
+    assert ("companion_not_synchronised" in {each["id"] for each in found}) == arrived

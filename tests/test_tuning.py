@@ -1,0 +1,346 @@
+"""Tuning against data that the filter's own model made, with noises that are known."""
+
+from __future__ import annotations
+
+import json
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from flights import Array, line
+from numpy.typing import NDArray
+from scipy.stats import binom
+
+from px4fuse.comparison import compare
+from px4fuse.consistency import Consistency
+from px4fuse.flight import Unavailable
+from px4fuse.kalman import Settings
+from px4fuse.likelihood import innovations, negative_log_likelihood, preintegrate
+from px4fuse.readers import read_log
+from px4fuse.signals import Axis
+from px4fuse.tuning import (
+    HORIZONTAL,
+    MIN_MEASUREMENTS,
+    PROFILE_DROP,
+    SIGMA_Z_SEARCH_M,
+    AxisTuning,
+    _total,
+    tune,
+    tune_axes,
+)
+
+SIGMA_A, SIGMA_Z = 0.5, 0.10
+DT, INTERVAL_S = 0.1, 0.2
+TRUE = Settings(sigma_a_m_s2=SIGMA_A, sigma_z_m=SIGMA_Z, dt_s=DT, input="zero")
+SEEDS, COUNT = 60, 300
+
+
+def modelled(
+    seed: int, count: int = COUNT, *, sigma_a: float = SIGMA_A, sigma_z: float = SIGMA_Z
+) -> Axis:
+    """Make an axis exactly as the filter assumes it: even the start is of its initial P."""
+    rng = np.random.default_rng(seed)
+    per_leg = round(INTERVAL_S / DT)
+    pushed = rng.normal(0.0, sigma_a, count * per_leg)
+    velocity = rng.normal(0.0, 1.0) + DT * np.concatenate([[0.0], np.cumsum(pushed)])
+    way = velocity[:-1] * DT + pushed * DT**2 / 2.0
+    position = rng.normal(0.0, 0.5) + np.concatenate([[0.0], np.cumsum(way)])
+    measured = position[::per_leg] + rng.normal(0.0, sigma_z, count + 1)
+    measured[0] = 0.0  # the filter starts there, wrong by 0.5 m
+    return line(INTERVAL_S * np.arange(count + 1), measured)
+
+
+def spoiled(axis: Axis, seed: int, share: float = 0.05) -> tuple[Axis, NDArray[np.bool_]]:
+    """The axis with outliers of ±1 m, and which measurements after the first they are."""
+    rng = np.random.default_rng(seed)
+    outlier = rng.random(len(axis.measurement_m)) < share
+    outlier[0] = False
+    wrong = axis.measurement_m + np.where(outlier, rng.choice([-1.0, 1.0], len(outlier)), 0.0)
+    return line(axis.measurement_time_s, wrong), outlier
+
+
+def tuned(*axes: Axis, chosen: Settings = TRUE) -> AxisTuning:
+    found = tune_axes("north", axes, chosen)
+    assert isinstance(found, AxisTuning)
+    return found
+
+
+@cache
+def many() -> tuple[AxisTuning, ...]:
+    """The same flight with many seeds."""
+    return tuple(tuned(modelled(seed)) for seed in range(SEEDS))
+
+
+# --- the estimates ---
+
+
+@pytest.mark.parametrize(("name", "true"), [("sigma_z", SIGMA_Z), ("sigma_a", SIGMA_A)])
+def test_intervals_cover_the_truth_as_often_as_they_say(name: str, true: float) -> None:
+    """By hand over 1000 seeds of 400 measurements: SIGMA_Z 95.2 %, SIGMA_A 95.5 %."""
+    noises = [getattr(found, name) for found in many()]
+    inside = sum(noise.low <= true <= noise.high for noise in noises)
+    # half a percent in either tail of a binomial distribution
+    low, high = binom.ppf([0.005, 0.995], SEEDS, 0.95)
+    assert low <= inside <= high
+    # and the ends err to both sides
+    assert any(noise.low > true for noise in noises) or any(noise.high < true for noise in noises)
+
+
+@pytest.mark.parametrize(("name", "true"), [("sigma_z", SIGMA_Z), ("sigma_a", SIGMA_A)])
+def test_estimates_are_unbiased(name: str, true: float) -> None:
+    """By hand over 1000 seeds: SIGMA_Z -0.5 %, SIGMA_A -0.3 %."""
+    values = np.array([getattr(found, name).value for found in many()])
+    error = np.std(values) / np.sqrt(SEEDS)
+    assert np.mean(values) == pytest.approx(true, abs=0.01 * true + 2.6 * error)
+    assert error < 0.02 * true  # enough seeds to say so
+
+
+def test_nothing_is_called_an_outlier_where_there_is_none() -> None:
+    assert sum(len(found.outlier_time_s) for found in many()) <= 0.001 * SEEDS * COUNT
+
+
+def test_true_settings_have_nothing_to_gain_on_unseen_data() -> None:
+    gains = np.array([found.held_out.gain_nats for found in many()])
+    assert np.mean(gains) < 0.0
+    assert np.median(gains) <= 0.0
+    assert np.max(gains) < 0.05
+    # on the data they were found on they always gain; twice that is χ² of two parameters: mean 1
+    # per flight
+    seen = np.array([found.gain_nats * found.count for found in many()])
+    assert np.all(seen >= -1e-3)
+    assert np.mean(seen) == pytest.approx(1.0, abs=2.6 / np.sqrt(SEEDS))
+
+
+def test_bad_settings_lose_on_unseen_data() -> None:
+    bad = Settings(sigma_a_m_s2=5.0, sigma_z_m=0.02, dt_s=DT, input="zero")
+    found = tuned(modelled(1), chosen=bad)
+    assert found.held_out.gain_nats > 0.1
+    assert found.held_out.count == COUNT // 2
+    assert found.gain_nats > 0.1
+    assert isinstance(found.before, Consistency)
+    assert isinstance(found.after, Consistency)
+    assert found.before.verdict != "consistent"
+    assert found.after.verdict == "consistent"
+    assert abs(found.after.lag1_autocorrelation) < abs(found.before.lag1_autocorrelation)
+
+
+def test_autocovariance_least_squares_agrees_on_regular_data() -> None:
+    found = [tuned(modelled(seed, 3000)) for seed in range(2)]
+    for each in found:
+        assert each.als_sigma_z_m == pytest.approx(SIGMA_Z, rel=0.15)
+        assert each.als_sigma_a_m_s2 == pytest.approx(SIGMA_A, rel=0.15)
+    values = [each.als_sigma_z_m for each in many()]
+    assert np.median(values) == pytest.approx(SIGMA_Z, rel=0.05)
+
+
+def test_autocovariance_least_squares_declines_irregular_intervals() -> None:
+    rng = np.random.default_rng(2)
+    time = np.cumsum(rng.choice([0.1, 0.4], 300))
+    found = tuned(line(time, rng.normal(0.0, SIGMA_Z, 300)))
+    assert found.als_sigma_a_m_s2 is None
+    assert found.als_sigma_z_m is None
+    assert found.sigma_z.value == pytest.approx(SIGMA_Z, rel=0.15)
+
+
+@pytest.mark.parametrize("at", [8, 14, 20])
+def test_a_short_flight_with_a_gap_is_too_short_for_autocovariances(at: int) -> None:
+    """No stretch between gaps is longer than the lags: there is no autocovariance at all."""
+    axis = modelled(1, MIN_MEASUREMENTS)
+    time = axis.measurement_time_s + np.where(np.arange(MIN_MEASUREMENTS + 1) >= at, 1.0, 0.0)
+    found = tuned(line(time, axis.measurement_m))
+    assert found.als_sigma_z_m is None
+    assert found.sigma_z.low < SIGMA_Z < found.sigma_z.high
+
+
+def test_horizontal_axes_together_know_more_than_each_alone() -> None:
+    for seed in range(2):
+        north, east = modelled(seed), modelled(seed + 100)
+        both = tuned(north, east)
+        for single in (tuned(north), tuned(east)):
+            for name in ("sigma_a", "sigma_z"):
+                one, pooled = getattr(single, name), getattr(both, name)
+                width = np.log(one.high / one.low), np.log(pooled.high / pooled.low)
+                # twice the data: 1/√2 of the width
+                assert width[1] / width[0] == pytest.approx(np.sqrt(0.5), rel=0.25)
+                assert pooled.value is not None
+
+
+def test_sigma_z_does_not_depend_on_what_was_chosen() -> None:
+    axis = modelled(3)
+    settings = [Settings(sigma_a_m_s2=a, sigma_z_m=z, input="zero")
+                for a, z in ((0.01, 5.0), (20.0, 0.01))]  # fmt: skip
+    first, second = (tuned(axis, chosen=each) for each in settings)
+    assert first.sigma_z == second.sigma_z
+    assert first.sigma_a == second.sigma_a
+
+
+# --- the map ---
+
+
+def test_the_map_is_the_likelihood_on_its_grid_and_the_interval_its_profile() -> None:
+    axis = modelled(5)
+    found = tuned(axis)
+    legs = preintegrate(axis, TRUE)
+    grid_a, grid_z = found.map.sigma_a_m_s2, found.map.sigma_z_m
+    for i, j in ((0, 0), (10, 40), (63, 5)):
+        here, best = (
+            negative_log_likelihood(*innovations(legs, a, z))
+            for a, z in ((grid_a[i], grid_z[j]), (found.sigma_a.value, found.sigma_z.value))
+        )
+        assert here - best == pytest.approx(found.map.drop[i, j], abs=0.02)
+    assert found.map.drop.min() == 0.0
+    profile = found.map.drop.min(axis=0)
+    for end in (found.sigma_z.low, found.sigma_z.high):
+        assert np.interp(np.log(end), np.log(grid_z), profile) == pytest.approx(PROFILE_DROP)
+    # the map shows all that is likely
+    assert min(profile[0], profile[-1]) > PROFILE_DROP
+    assert found.sigma_z.low < found.sigma_z.value < found.sigma_z.high
+
+
+def test_scoring_in_blocks_is_scoring_at_once() -> None:
+    """Several legs, a skip, a late start, and more innovations than one block holds."""
+    axes = modelled(1), modelled(2)
+    legs = [preintegrate(axis, TRUE) for axis in axes]
+    skip = np.arange(COUNT) % 17 == 3
+    a, z = np.geomspace(0.1, 2.0, 20)[:, None], np.geomspace(0.02, 0.5, 30)
+    for start in (0, 37):
+        pairs = [innovations(leg, a, z, skip) for leg in legs]
+        whole = sum(negative_log_likelihood(nu[start:], s[start:]) for nu, s in pairs)
+        np.testing.assert_allclose(_total(legs, a, z, skip, start), whole, rtol=1e-10)
+    assert _total(legs, SIGMA_A, SIGMA_Z, skip).shape == ()
+
+
+# --- the edges ---
+
+
+@pytest.mark.parametrize("sigma_a", [0.05, 0.5])
+def test_noise_free_positions_bound_the_noise_and_give_no_value(sigma_a: float) -> None:
+    found = tuned(modelled(3, 500, sigma_a=sigma_a, sigma_z=0.0))
+    assert found.sigma_z.value is None
+    assert found.sigma_z.low is None
+    assert SIGMA_Z_SEARCH_M[0] <= found.sigma_z.high < 0.003
+    assert found.sigma_a.low <= sigma_a <= found.sigma_a.high or sigma_a < 0.1
+
+
+def test_a_flight_without_process_noise_bounds_sigma_a() -> None:
+    found = tuned(line(0.2 * np.arange(300), np.random.default_rng(0).normal(0.0, 0.1, 300)))
+    assert found.sigma_a.value is None
+    assert found.sigma_a.low is None
+    assert 0.001 < found.sigma_a.high < 0.02
+    assert found.sigma_z.low < 0.1 < found.sigma_z.high
+
+
+def test_noise_beyond_the_search_has_a_lower_end_only() -> None:
+    rng = np.random.default_rng(0)
+    found = tuned(line(0.2 * np.arange(300), rng.normal(0.0, 30.0, 300)))
+    assert found.sigma_z.value is None
+    assert found.sigma_z.high is None
+    assert found.sigma_z.low > 9.0
+
+
+def test_too_few_measurements_are_said_to_be() -> None:
+    short = tune_axes("down", (modelled(1, MIN_MEASUREMENTS - 1),), TRUE)
+    assert isinstance(short, Unavailable)
+    assert short.what == "tuning, down"
+    assert f"{MIN_MEASUREMENTS - 1} measurements are too few" in short.reason
+    enough = tuned(modelled(1, MIN_MEASUREMENTS))
+    assert isinstance(enough.held_out, Unavailable)
+    assert f"{MIN_MEASUREMENTS // 2} measurements" in enough.held_out.reason
+    assert enough.sigma_z.low < SIGMA_Z < enough.sigma_z.high
+
+
+def test_axes_are_named_and_pooled_only_where_they_share_their_times() -> None:
+    from dataclasses import replace
+
+    north, east = modelled(1, 60), replace(modelled(2, 60), name="east")
+    told: list[str] = []
+    found = tune((north, east), TRUE, progress=told.append)
+    assert list(found) == told == ["north", "east", HORIZONTAL]
+    assert list(tune((north, east), TRUE, (HORIZONTAL, "down"))) == [HORIZONTAL]
+    late = replace(east, measurement_time_s=east.measurement_time_s + 0.01)
+    assert list(tune((north, late), TRUE)) == ["north", "east"]
+
+
+# --- outliers ---
+
+
+@pytest.mark.parametrize("share", [0.05, 0.10])
+def test_outliers_are_found_and_do_not_move_the_noise(share: float) -> None:
+    """At 10 % a fit that takes them for noise hides them; above 15 % it still may."""
+    hits = wrong = missed = 0
+    for seed in range(5):
+        axis, outlier = spoiled(modelled(seed, 400), seed, share)
+        found, clean = tuned(axis), tuned(modelled(seed, 400))
+        assert found.sigma_z.value == pytest.approx(clean.sigma_z.value, rel=0.10)
+        truly = axis.measurement_time_s[outlier]
+        right = np.count_nonzero(np.isin(found.outlier_time_s, truly))
+        hits += right
+        wrong += len(found.outlier_time_s) - right
+        missed += len(truly) - right
+    assert hits / (hits + wrong) > 0.9
+    assert hits / (hits + missed) > 0.9
+
+
+# --- real and simulated logs ---
+
+WITH_VISION = (
+    "main202603_aisle_hwlogvision",
+    "v1.13.3_aisle_hwlogvision",
+    "v1.16.1_aisle_hwlogvision",
+    "v1.14.4_aisle_nominal",
+    "v1.16.1_aisle_nominal",
+    "v1.16.1_aisle_10hz",
+    "v1.16.1_aisle_clock_nosync",
+    "v1.16.1_aisle_nlos",
+    "v1.16.1_aisle_overconfident",
+    "v1.13.3_aisle_evdelay175",
+)
+
+
+def truth_of(log: Path) -> tuple[Array, NDArray[np.bool_]]:
+    """Boot times (s from the first data) of the positions sent, and which are outliers."""
+    made = json.loads(log.with_suffix(".json").read_text(encoding="utf-8"))
+    sent = [each for each in made["uwb"] if not each.get("dropped")]
+    start = read_log(log).log.boot_time_s
+    time = np.array([each["t_px4_us"] for each in sent]) * 1e-6 - start
+    return time, np.array([bool(each.get("outlier")) for each in sent])
+
+
+@pytest.mark.reallogs
+@pytest.mark.parametrize("name", WITH_VISION)
+def test_the_noise_injected_is_found_in_simulated_flights(shared_logs, name: str) -> None:
+    compared = compare(read_log(shared_logs / "simulated" / f"{name}.ulg"))
+    axes = tuple(result.axis for result in compared.axes)
+    found = tune(axes, compared.settings, (HORIZONTAL,))[HORIZONTAL]
+    assert found.sigma_z.value == pytest.approx(0.10, rel=0.10)
+    assert found.sigma_z.low <= 0.10 <= found.sigma_z.high
+
+
+@pytest.mark.reallogs
+def test_nlos_is_found(shared_logs) -> None:
+    log = shared_logs / "simulated" / "v1.16.1_aisle_nlos.ulg"
+    compared = compare(read_log(log))
+    axes = tuple(result.axis for result in compared.axes)
+    found = tune(axes, compared.settings, (HORIZONTAL,))[HORIZONTAL]
+    time, outlier = truth_of(log)
+    segment = compared.segment
+    truly = time[outlier & (time > segment.start_s) & (time < segment.end_s)]
+    assert len(truly) > 15
+    distance = np.abs(found.outlier_time_s[:, None] - truly).min(axis=1)
+    right = np.count_nonzero(distance < 0.02)
+    assert right / len(found.outlier_time_s) > 0.9
+    assert right / len(truly) > 0.9
+
+
+@pytest.mark.reallogs
+def test_motion_capture_bounds_the_noise(shared_logs) -> None:
+    """Millimetres at 5 Hz: nothing but a bound can be told."""
+    logs = sorted((shared_logs / "real").glob("vladimireganov*.ulg"))
+    assert len(logs) >= 3
+    for log in logs:
+        compared = compare(read_log(log))
+        axes = tuple(result.axis for result in compared.axes)
+        found = tune(axes, compared.settings, (HORIZONTAL,))[HORIZONTAL]
+        assert found.sigma_z.value is None, log.name
+        assert found.sigma_z.high < 0.03, log.name
