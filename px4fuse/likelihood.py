@@ -110,6 +110,9 @@ def innovations(
     -------
     innovation_m, innovation_variance_m2 : ndarray, shape (m, ...)
     """
+    if np.ndim(sigma_a_m_s2) == np.ndim(sigma_z_m) == 0:
+        run = _single(legs, float(np.asarray(sigma_a_m_s2)), float(np.asarray(sigma_z_m)), skip)
+        return run[:, 0], run[:, 1]
     steps = recursion(legs, sigma_a_m_s2, sigma_z_m, skip)
     shape = (len(legs.measurement_m), *np.broadcast(sigma_a_m_s2, sigma_z_m).shape)
     nu, s = np.empty(shape), np.empty(shape)
@@ -201,8 +204,6 @@ def filtered(
 ) -> tuple[Array, Array]:
     """Position and velocity at the start and after each measurement, for one pair of settings.
 
-    In plain floats: fifty times as fast as arrays of a single element.
-
     Parameters
     ----------
     legs : Preintegrated
@@ -215,10 +216,25 @@ def filtered(
     -------
     position_m, velocity_m_s : ndarray, shape (m + 1,)
     """
-    q, r = settings.sigma_a_m_s2**2, settings.sigma_z_m**2
+    run = _single(legs, settings.sigma_a_m_s2, settings.sigma_z_m, skip)
+    start = legs.initial
+    return (
+        np.append(start.position_m, run[:, 2]),
+        np.append(start.velocity_m_s, run[:, 3]),
+    )
+
+
+def _single(
+    legs: Preintegrated, sigma_a_m_s2: float, sigma_z_m: float, skip: NDArray[np.bool_] | None
+) -> Array:
+    """:func:`recursion` for one pair of settings: ν, S, position and velocity, shape (m, 4).
+
+    In plain floats: fifty times as fast as arrays of a single element.
+    """
+    q, r = sigma_a_m_s2**2, sigma_z_m**2
     p, v = legs.initial.position_m, legs.initial.velocity_m_s
     p00, p01, p11 = INITIAL_SIGMA_P_M**2, 0.0, INITIAL_SIGMA_V_M_S**2
-    after = [(p, v)]
+    rows = []
     for dt, dp, dv, unit, fixed, z, skipped in zip(
         legs.length_s.tolist(),
         legs.delta_position_m.tolist(),
@@ -234,15 +250,15 @@ def filtered(
         p00 += 2.0 * dt * p01 + dt * dt * p11 + q * unit[0] + fixed[0]
         p01 += dt * p11 + q * unit[1] + fixed[1]
         p11 += q * unit[2] + fixed[2]
+        # ν = z - Hx, S = HPHᵀ + R
+        nu, s = z - p, p00 + r
         if not skipped:
-            # ν = z - Hx, K = PHᵀS⁻¹, x = x + Kν, P = (I - KH)P
-            s = p00 + r
-            k0, k1, nu = p00 / s, p01 / s, z - p
+            # K = PHᵀS⁻¹, x = x + Kν, P = (I - KH)P
+            k0, k1 = p00 / s, p01 / s
             p, v = p + k0 * nu, v + k1 * nu
             p00, p01, p11 = r * k0, r * k1, p11 - k1 * p01
-        after.append((p, v))
-    position, velocity = np.array(after).T
-    return position, velocity
+        rows.append((nu, s, p, v))
+    return np.array(rows).reshape(-1, 4)
 
 
 # An innovation is of a wide normal distribution with this probability, WIDTH times as wide: far

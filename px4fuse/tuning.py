@@ -243,6 +243,10 @@ def _total(
 ) -> Array:
     """Negative log-likelihood of all axes from one measurement on, shape of the grid."""
     shape = np.broadcast(sigma_a, sigma_z).shape
+    if not shape:
+        pairs = [innovations(leg, sigma_a, sigma_z, skip) for leg in legs]
+        scores = [negative_log_likelihood(nu[start:], s[start:]) for nu, s in pairs]
+        return np.asarray(np.sum(scores), dtype=np.float64)
     rows = max(1, BLOCK // max(1, int(np.prod(shape))))
     nu, s = np.empty((rows, *shape)), np.empty((rows, *shape))
     total = np.zeros(shape)

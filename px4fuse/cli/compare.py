@@ -15,6 +15,7 @@ from px4fuse.cli.inputs import (
     encodable,
     progress,
     run_comparison,
+    spare_inputs,
     terminal,
     write_outputs,
 )
@@ -85,6 +86,7 @@ def compare(
     target = output or Path("reports") / f"{log.stem}.pdf"
     if target.suffix.lower() != ".pdf":
         raise OutputError(f"{target}: the report is a PDF. Give a name that ends in .pdf with -o.")
+    spare_inputs([target, *([json_path] if json_path is not None else [])])
     with progress(json_path == Path("-")) as step:
         compared = explain(run_comparison(log, step, **analysis), step)
         document = Document(compared, find(compared), person, command_line("compare", log))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -333,16 +333,27 @@ def write_outputs(contents: Mapping[Path, bytes]) -> None:
     """
     from px4fuse.report.writing import write_all
 
+    spare_inputs(contents)
+    write_all(contents)
+
+
+def spare_inputs(targets: Iterable[Path]) -> None:
+    """Refuse to write over a file that this command reads.
+
+    Raises
+    ------
+    OutputError
+        A target is one of the inputs.
+    """
     params = click.get_current_context().params
     read = [params[name] for name in INPUTS if params.get(name) is not None]
-    for target in contents:
+    for target in targets:
         for source in read:
             if target.exists() and source.exists() and target.samefile(source):
                 raise OutputError(
                     f"{target}: is what this command reads; it was not overwritten. Give another "
                     "name for the output."
                 )
-    write_all(contents)
 
 
 def terminal() -> Console:
