@@ -43,6 +43,7 @@ from px4fuse.signals import STANDARD_GRAVITY_M_S2, Array, Segment, within
 # (rad/s) and accelerometer (m/s²)
 CONSTANT_SIGMA = np.repeat([0.05, 0.004, 0.3], 3)
 CONSTANTS = len(CONSTANT_SIGMA)
+HEADING = 2  # which of them is a turn about down
 STATES = 6 + CONSTANTS
 # To first order only while the angles stay small: longer flights are cut into stretches. A gyro
 # bias of 0.004 rad/s turns by 0.12 rad in one, whose square costs 0.07 m/s².
@@ -100,6 +101,9 @@ class ClockOffset:
         Noises at the maximum.
     count : int
         Measurements.
+    heading_error_deg, heading_sigma_deg : float
+        By how much the source's frame is turned, clockwise seen from above, against the logged
+        attitude; and its standard deviation.
     """
 
     offset_s: float
@@ -116,6 +120,8 @@ class ClockOffset:
     sigma_a_m_s2: float
     sigma_z_m: float
     count: int
+    heading_error_deg: float
+    heading_sigma_deg: float
 
 
 @dataclass(frozen=True)
@@ -246,6 +252,7 @@ def estimate_clock_offset(
         noises = sigma_a, sigma_z, settings.dt_s
         parts = _parts(flight.imu, flight.attitude, samples, offset, *noises)
     drift, drift_sigma, change_p = _changes(parts)
+    heading, heading_sigma = _heading_error(stretches, offset, sigma_a, sigma_z, settings.dt_s)
     return ClockOffset(
         offset_s=offset,
         interval_s=interval,
@@ -261,6 +268,8 @@ def estimate_clock_offset(
         sigma_a_m_s2=sigma_a,
         sigma_z_m=sigma_z,
         count=len(samples),
+        heading_error_deg=float(np.degrees(heading)),
+        heading_sigma_deg=float(np.degrees(heading_sigma)),
     )
 
 
@@ -334,7 +343,7 @@ def _score(
     total = np.zeros((len(offsets), len(sigma_a)))
     square, count = np.zeros_like(total), 0
     for stretch in stretches:
-        chi_square, log_s, used = _filter(stretch, offsets, sigma_a, sigma_z, dt_s)
+        chi_square, log_s, used, _ = _filter(stretch, offsets, sigma_a, sigma_z, dt_s)
         total += 0.5 * (chi_square + log_s)
         square += chi_square
         count += used
@@ -343,8 +352,11 @@ def _score(
 
 def _filter(
     stretch: _Stretch, offsets: Array, sigma_a: Array, sigma_z: float, dt_s: float
-) -> tuple[Array, Array, int]:
-    """Run the filter for every offset and SIGMA_A; Σν²/S, Σ ln S and the number of innovations."""
+) -> tuple[Array, Array, int, tuple[Array, Array]]:
+    """Run the filter for every offset and SIGMA_A.
+
+    Returns Σν²/S, Σ ln S, the number of innovations, and the last state with its covariance.
+    """
     time, measured = stretch.time_s, stretch.position_m
     speed, way = stretch.signals.between(time[None, :] + offsets[:, None])
     shape = len(offsets), len(sigma_a)
@@ -385,7 +397,27 @@ def _filter(
             used += 1
             x = x + gain * nu[..., None]
             P -= gain[..., :, None] * P[..., None, axis, :]
-    return chi_square, log_s, used
+    return chi_square, log_s, used, (x, P)
+
+
+def _heading_error(
+    stretches: list[_Stretch], offset: float, sigma_a: float, sigma_z: float, dt_s: float
+) -> tuple[float, float]:
+    """Heading of the logged attitude that the positions ask for, minus it (rad), and its σ.
+
+    Each stretch has its own; what the prior added is taken out of each before they are joined.
+    """
+    weight = total = 0.0
+    prior = CONSTANT_SIGMA[HEADING] ** -2.0
+    for stretch in stretches:
+        at = np.array([offset]), np.array([sigma_a])
+        x, P = _filter(stretch, *at, sigma_z, dt_s)[3]
+        found, variance = x[0, 0, 6 + HEADING], P[0, 0, 6 + HEADING, 6 + HEADING]
+        weight += max(1.0 / variance - prior, 0.0)
+        total += found / variance
+    if weight <= 0.0:
+        return 0.0, float("inf")
+    return float(total / weight), float(weight**-0.5)
 
 
 def _vertex(grid: Array, profile: Array) -> tuple[float, float]:

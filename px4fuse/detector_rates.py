@@ -56,6 +56,7 @@ class Condition:
 CONDITIONS = (
     *(Condition("source_clock_offset", (f"clock-offset={ms}ms",)) for ms in (40, 80, 120, 250)),
     *(Condition("source_clock_changes", (f"clock-jump={ms}ms",)) for ms in (150, 250, 400)),
+    *(Condition("source_frame_turned", (f"yaw={degrees}",)) for degrees in (10, 20, 30)),
     *(Condition("source_outliers", (f"nlos={share}%",)) for share in (1, 2, 5)),
     *(Condition("source_gap", (f"dropout={seconds}s",)) for seconds in (2, 8)),
     *(Condition("sigma_z_small", (), {"sigma_z_m": value}) for value in (0.07, 0.05, 0.03)),

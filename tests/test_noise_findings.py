@@ -11,20 +11,27 @@ import pytest
 from px4fuse.comparison import Comparison, compare
 from px4fuse.explanation import explain
 from px4fuse.findings import Finding
-from px4fuse.findings.noise import clock_off, ekf2_delay_off, noises_off, outliers
+from px4fuse.findings.noise import (
+    clock_off,
+    ekf2_delay_off,
+    frame_turned,
+    noises_off,
+    outliers,
+)
 from px4fuse.kalman import Settings
 from px4fuse.readers import read_log
 from px4fuse.simulation.flights import simulate_flight
 from px4fuse.simulation.mistakes import parse
 from px4fuse.simulation.scenario import Scenario
 
-DETECTORS = (clock_off, outliers, noises_off, ekf2_delay_off)
+DETECTORS = (clock_off, frame_turned, outliers, noises_off, ekf2_delay_off)
 RIGHT = Settings(sigma_a_m_s2=0.27, sigma_z_m=0.10)
 SEED = 3
 NAMED_HERE = {
     "source_clock_offset",
     "source_clock_changes",
     "source_outliers",
+    "source_frame_turned",
     "sigma_z_small",
     "sigma_z_large",
     "sigma_a_small",
@@ -52,6 +59,7 @@ def test_a_clean_flight_has_none() -> None:
     [
         ("source_clock_offset", ("clock-offset=120ms",), {}, "error", "--clock-offset -0."),
         ("source_clock_changes", ("clock-jump=400ms",), {}, "error", "--start"),
+        ("source_frame_turned", ("yaw=30",), {}, "error", "Turn the positions by -2|by -3"),
         ("source_outliers", ("nlos=5%",), {}, "error", "line of sight"),
         ("sigma_z_small", (), {"sigma_z_m": 0.02}, "error", "--sigma-z 0.09|--sigma-z 0.1"),
         ("sigma_z_large", (), {"sigma_z_m": 0.3}, "warning", "--sigma-z 0.09|--sigma-z 0.1"),

@@ -16,7 +16,13 @@ from px4fuse.findings.ekf2 import (
 )
 from px4fuse.findings.filter import process_noise_forgotten, too_few_innovations, variance_wrong
 from px4fuse.findings.model import SEVERITIES, Detector, Finding, Severity
-from px4fuse.findings.noise import clock_off, ekf2_delay_off, noises_off, outliers
+from px4fuse.findings.noise import (
+    clock_off,
+    ekf2_delay_off,
+    frame_turned,
+    noises_off,
+    outliers,
+)
 from px4fuse.findings.recording import (
     autopilot_restarted,
     companion_not_synchronised,
@@ -49,6 +55,7 @@ def find(comparison: Comparison) -> tuple[Finding, ...]:
 DETECTORS: tuple[Detector, ...] = (
     stamps_meaningless,
     clock_off,
+    frame_turned,
     outliers,
     noises_off,
     ekf2_not_fusing,

@@ -14,6 +14,9 @@ from px4fuse.findings.thresholds import (
     CLOCK_OFFSET_ERROR,
     CLOCK_SIGMAS,
     EKF2_UPDATE,
+    HEADING_ERROR,
+    HEADING_ERROR_LARGE,
+    HEADING_SIGMAS,
     MIN_OUTLIERS,
     MOTION_RANGE,
     NOISE_OFF,
@@ -167,6 +170,27 @@ def clock_off(comparison: Comparison) -> Iterator[Finding]:
             f"--clock-offset {applied + clock.offset_s:.3f}",
             evidence,
         )
+
+
+def frame_turned(comparison: Comparison) -> Iterator[Finding]:
+    """The source's frame is turned against the vehicle's heading."""
+    clock = comparison.clock
+    if not isinstance(clock, ClockOffset) or comparison.source.reconstructed:
+        return
+    turn, sigma = clock.heading_error_deg, clock.heading_sigma_deg
+    if abs(turn) < max(HEADING_SIGMAS.value * sigma, HEADING_ERROR.value):
+        return
+    yield Finding(
+        "source_frame_turned",
+        "error" if abs(turn) >= HEADING_ERROR_LARGE.value else "warning",
+        f"The frame of {comparison.source.name} is turned by {turn:+.0f}° ± {1.96 * sigma:.0f}° "
+        "(clockwise seen from above) against the vehicle's heading: what the IMU feels as north "
+        "the positions show elsewhere. Either the positioning frame is not aligned with north, or "
+        "the heading is wrong (magnetometer).",
+        f"Turn the positions by {-turn:+.0f}° before they are sent (a file: --position-yaw), or "
+        "calibrate the magnetometer.",
+        {"turn_deg": turn, "sigma_deg": sigma},
+    )
 
 
 def ekf2_delay_off(comparison: Comparison) -> Iterator[Finding]:

@@ -7,6 +7,7 @@ computed is absent, or an object ``{"unavailable": {"what", "reason", "remedy"}}
 from __future__ import annotations
 
 import json
+import math
 import platform
 from collections.abc import Mapping
 from dataclasses import asdict, replace
@@ -138,6 +139,10 @@ def _clock(clock: ClockOffset | Unavailable, applied_s: float) -> dict[str, Any]
             "sigma_a_m_s2": clock.sigma_a_m_s2,
             "sigma_z_m": clock.sigma_z_m,
             "count": clock.count,
+            "heading_error_deg": clock.heading_error_deg,
+            "heading_sigma_deg": clock.heading_sigma_deg
+            if math.isfinite(clock.heading_sigma_deg)
+            else None,
         }
     )
 
