@@ -312,7 +312,7 @@ class TestClock:
         made = replace(ekf2_is(flight, flight), positions=(late,))
         offset = ClockOffset(
             -0.25, (-0.3, -0.2), 0.02, True, "", np.zeros(1), np.zeros(1), (), None, None, None,
-            0.5, 0.1, 100,
+            0.5, 0.1, 100, 0.0, 2.0,
         )  # fmt: skip
         found = budget(replace(compare(made, axes=("aisle",)), clock=offset))["aisle"]
         assert found.clock.position_share > 0.95
@@ -326,7 +326,7 @@ class TestClock:
     def test_an_uncertain_offset_is_not_replayed(self, changes: dict[str, object], reason: str):
         offset = ClockOffset(
             -0.1, (-0.2, -0.05), 0.02, True, "", np.zeros(1), np.zeros(1), (), None, None, None,
-            0.5, 0.1, 100,
+            0.5, 0.1, 100, 0.0, 2.0,
         )  # fmt: skip
         made = compare(base_flight(duration_s=30.0), axes=("aisle",))
         found = budget(replace(made, clock=replace(offset, **changes)))
