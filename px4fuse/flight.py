@@ -29,11 +29,13 @@ AXIS_NAMES: tuple[AxisName, AxisName, AxisName] = ("north", "east", "down")
 EXTERNAL_VISION_RUNGS = (1, 2, 4, 5, 6)
 POSITION_COLUMNS = ["north_m", "east_m", "down_m"]
 VELOCITY_COLUMNS = ["north_m_s", "east_m_s", "down_m_s"]
+STATE_COLUMNS = POSITION_COLUMNS + VELOCITY_COLUMNS
 POSITION_VARIANCE_COLUMNS = ["north_m2", "east_m2", "down_m2"]
 VELOCITY_VARIANCE_COLUMNS = ["north_m2_s2", "east_m2_s2", "down_m2_s2"]
 SPECIFIC_FORCE_COLUMNS = ["forward_m_s2", "right_m_s2", "down_m_s2"]
 ANGULAR_RATE_COLUMNS = ["forward_rad_s", "right_rad_s", "down_rad_s"]
 QUATERNION_COLUMNS = ["w", "x", "y", "z"]
+ROTATION_VARIANCE_COLUMNS = ["forward_rad2", "right_rad2", "down_rad2"]
 
 
 @dataclass(frozen=True)
@@ -298,6 +300,11 @@ class PositionTrack:
         How the sender's clock was mapped to the autopilot's, where that was done here.
     alignment : Alignment or None
         Of a track from a file of its own.
+    orientation : DataFrame, shape (m, 7), or None
+        Quaternion ``w, x, y, z`` that turns body FRD into ``frame``, and its reported variances
+        about the body's axes ``forward_rad2, right_rad2, down_rad2`` (NaN where none was given).
+        None where the sender gave no orientation, or only ever the same one: a positioning
+        system, no odometry.
     """
 
     name: str
@@ -311,6 +318,7 @@ class PositionTrack:
     log: str = ""
     clock_map: ClockMap | None = None
     alignment: Alignment | None = None
+    orientation: pd.DataFrame | None = None
 
     @property
     def rate_hz(self) -> float:
@@ -409,10 +417,13 @@ class Truth:
         The topic.
     samples : DataFrame, shape (n, 6)
         Position and velocity (m, m/s, NED); velocity is NaN where not logged.
+    attitude : DataFrame, shape (m, 4), or None
+        Quaternion ``w, x, y, z`` that turns body FRD into NED; None where not logged.
     """
 
     name: str
     samples: pd.DataFrame
+    attitude: pd.DataFrame | None = None
 
 
 @dataclass(frozen=True)
@@ -487,6 +498,31 @@ def finite_rows(samples: pd.DataFrame, columns: list[str]) -> pd.DataFrame:
     """Rows of a frame in which all of some float columns are finite."""
     finite: NDArray[np.bool_] = np.isfinite(samples[columns].to_numpy()).all(axis=1)
     return samples[finite]
+
+
+def orientation_of(samples: pd.DataFrame) -> pd.DataFrame | None:
+    """Orientations in a frame of samples; None where there are none, or only one and the same.
+
+    Parameters
+    ----------
+    samples : DataFrame
+        With the columns ``w, x, y, z`` where the sender gave quaternions, and perhaps
+        ``forward_rad2, right_rad2, down_rad2``. A quaternion of norm 0 is none, and so is a
+        variance of 0 (``EKF2.cpp``).
+    """
+    if not set(QUATERNION_COLUMNS) <= set(samples.columns):
+        return None
+    found = finite_rows(
+        samples.reindex(columns=QUATERNION_COLUMNS + ROTATION_VARIANCE_COLUMNS), QUATERNION_COLUMNS
+    )
+    norm = np.linalg.norm(found[QUATERNION_COLUMNS].to_numpy(), axis=1)
+    found = found[norm > 0.5]
+    quaternions = found[QUATERNION_COLUMNS]
+    if len(found) < 2 or (quaternions == quaternions.iloc[0]).to_numpy().all():
+        return None
+    variances = found[ROTATION_VARIANCE_COLUMNS]
+    oriented: pd.DataFrame = found.assign(**variances.where(variances > 0))
+    return oriented
 
 
 def sample_rate(samples: pd.DataFrame) -> float:

@@ -132,15 +132,25 @@ def _shifted(flight: Flight, shift_s: float) -> Flight:
             variance=moved(ekf2.variance),
             innovations={axis: moved(part) for axis, part in ekf2.innovations.items()},
             fusing=moved(ekf2.fusing),
+            accelerometer_bias=moved(ekf2.accelerometer_bias),
             resets=tuple(Reset(r.time_s + shift_s, r.quantity, r.delta) for r in ekf2.resets),
             instances=tuple((time + shift_s, number) for time, number in ekf2.instances),
         )
     if isinstance(truth, Truth):
-        truth = replace(truth, samples=_later(truth.samples, shift_s))
+        truth = replace(
+            truth,
+            samples=_later(truth.samples, shift_s),
+            attitude=None if truth.attitude is None else _later(truth.attitude, shift_s),
+        )
     if not isinstance(airborne, Unavailable):
         airborne = tuple((start + shift_s, end + shift_s) for start, end in airborne)
     tracks: list[PositionTrack] = [
-        replace(track, samples=_later(track.samples, shift_s)) for track in flight.positions
+        replace(
+            track,
+            samples=_later(track.samples, shift_s),
+            orientation=None if track.orientation is None else _later(track.orientation, shift_s),
+        )
+        for track in flight.positions
     ]
     return replace(
         flight,

@@ -182,8 +182,15 @@ def shift_clock(track: PositionTrack, clock_offset_s: float) -> PositionTrack:
     """The same track with ``clock_offset_s`` added to its time stamps."""
     if clock_offset_s == 0.0:
         return track
-    index = pd.Index(track.samples.index.to_numpy() + clock_offset_s, name="time_s")
-    return replace(track, samples=track.samples.set_axis(index))
+
+    def later(frame: pd.DataFrame) -> pd.DataFrame:
+        return frame.set_axis(pd.Index(frame.index.to_numpy() + clock_offset_s, name="time_s"))
+
+    return replace(
+        track,
+        samples=later(track.samples),
+        orientation=None if track.orientation is None else later(track.orientation),
+    )
 
 
 def choose_segment(

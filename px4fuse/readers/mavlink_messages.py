@@ -30,6 +30,8 @@ VEHICLE_TYPES: Mapping[int, str] = {
 STANDARD_GRAVITY_M_S2 = 9.80665
 # Row-major upper triangle of a 6×6 matrix: x, y, z
 POSE_DIAGONAL = np.array([0, 6, 11])
+# The same triangle's rotations about x, y, z
+ROTATION_DIAGONAL = np.array([15, 18, 20])
 # Row-major upper triangle of a 9×9 matrix: x, y, z, vx, vy, vz
 EXTENDED_COVARIANCE_DIAGONAL = np.array([0, 9, 17, 24, 30, 35])
 
@@ -107,6 +109,11 @@ class FrameOfReference:
     order: tuple[int, int, int]
     signs: tuple[float, float, float]
     body: bool = False
+
+    @property
+    def as_is(self) -> bool:
+        """Whether it is NED (or FRD) already, and does not turn with the vehicle."""
+        return not self.body and self.order == _AS_IS and self.signs == _NOTHING
 
     def turn(self, vectors: Array) -> Array:
         """Vectors of this frame in NED (or FRD), shape (n, 3)."""

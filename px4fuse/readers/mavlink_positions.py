@@ -6,23 +6,27 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from px4fuse.flight import (
-    EXTERNAL_VISION_RUNGS,
     POSITION_COLUMNS,
     POSITION_VARIANCE_COLUMNS,
-    VELOCITY_COLUMNS,
+    QUATERNION_COLUMNS,
+    ROTATION_VARIANCE_COLUMNS,
+    STATE_COLUMNS,
     PositionTrack,
     Truth,
     Unavailable,
+    orientation_of,
 )
 from px4fuse.readers.mavlink_clocks import Mapped
-from px4fuse.readers.mavlink_ekf2 import STATE_COLUMNS, odometry
+from px4fuse.readers.mavlink_ekf2 import odometry
 from px4fuse.readers.mavlink_messages import (
     FRAMES_OF_REFERENCE,
     ODOMETRY_INPUTS,
     POSE_DIAGONAL,
     POSITION_INPUTS,
+    ROTATION_DIAGONAL,
     PositionInput,
 )
 from px4fuse.readers.mavlink_recording import (
@@ -34,9 +38,17 @@ from px4fuse.readers.mavlink_recording import (
     senders_of,
     vector,
 )
-from px4fuse.readers.px4_positions import MIN_TRACK_SAMPLES, clean_positions, project
+from px4fuse.readers.px4_positions import (
+    MIN_TRACK_SAMPLES,
+    captured_truth,
+    clean_positions,
+    motion_capture,
+    project,
+)
 
-TRACK_COLUMNS = POSITION_COLUMNS + POSITION_VARIANCE_COLUMNS
+TRACK_COLUMNS = [
+    *POSITION_COLUMNS, *POSITION_VARIANCE_COLUMNS, *QUATERNION_COLUMNS, *ROTATION_VARIANCE_COLUMNS,
+]  # fmt: skip
 ROUTER_REMEDY = (
     "Record where the companion's link passes (a MAVLink router), or join the ULog of the flight, "
     "or give the positioning system's own file with --position."
@@ -101,8 +113,9 @@ def _read_track(
     else:
         position = vector(table, "x", "y", "z")
         variance = table["covariance"][:, POSE_DIAGONAL].astype(np.float64)
+    quaternion, turn_variance = _orientation(source, table, frame)
     if source.drops_covariance:
-        variance = np.full_like(variance, np.nan)
+        variance, turn_variance = np.full_like(variance, np.nan), np.full_like(variance, np.nan)
     stamp_s = table[source.stamp] * 1e-6
     boot_s = (
         recording.receipt_boot_s(rows)
@@ -110,8 +123,9 @@ def _read_track(
         else np.where(stamp_s > 0.0, clock.to_boot.at(stamp_s), np.nan)
     )
     name = source.name + suffix
-    values = np.column_stack([position, variance])
+    values = np.column_stack([position, variance, quaternion, turn_variance])
     samples = recording.frame(name, boot_s, TRACK_COLUMNS, values)
+    orientation = orientation_of(samples)
     samples = clean_positions(samples, POSITION_COLUMNS)
     if len(samples) < MIN_TRACK_SAMPLES:
         return Unavailable(
@@ -132,7 +146,33 @@ def _read_track(
         topics=(source.message,),
         log=recording.frames.name,
         clock_map=statement,
+        orientation=orientation,
     )
+
+
+def _orientation(source: PositionInput, table: NDArray[Any], frame: str) -> tuple[Array, Array]:
+    """Quaternions w, x, y, z from body FRD, shape (n, 4), and rotation variances, shape (n, 3).
+
+    NaN where the frame is not one of NED and FRD: what such a sender calls its body is not known.
+    """
+    nothing = np.full((len(table), 4), np.nan), np.full((len(table), 3), np.nan)
+    if source.message == "ODOMETRY":
+        reference = FRAMES_OF_REFERENCE.get(int(table["frame_id"][-1]))
+        if reference is None or not reference.as_is or np.ptp(table["frame_id"]):
+            return nothing
+        covariance = table["pose_covariance"]
+    else:
+        covariance = table["covariance"]
+    variance = covariance[:, ROTATION_DIAGONAL].astype(np.float64)
+    if source.message != "VISION_POSITION_ESTIMATE":
+        return table["q"].astype(np.float64), variance
+    angles = vector(table, "yaw", "pitch", "roll")
+    known = np.isfinite(angles).all(axis=1)
+    quaternion = nothing[0]
+    if known.any():
+        turned = Rotation.from_euler("ZYX", angles[known])
+        quaternion[known] = turned.as_quat(scalar_first=True)
+    return quaternion, variance
 
 
 def read_truth(recording: Recording, positions: tuple[PositionTrack, ...]) -> Truth | Unavailable:
@@ -154,25 +194,39 @@ def read_truth(recording: Recording, positions: tuple[PositionTrack, ...]) -> Tr
         if not np.any(velocity):  # not sent: a vehicle that never moves has no use for truth
             velocity = np.full_like(velocity, np.nan)
         north, east = project(latitude, longitude, (float(latitude[0]), float(longitude[0])))
-        values = np.column_stack([north, east, height[0] - height, velocity])
+        values = np.column_stack(
+            [north, east, height[0] - height, velocity, _true_attitude(message, rows, recording)]
+        )
         samples = recording.frame(
-            message, recording.receipt_boot_s(rows), STATE_COLUMNS, values
+            message, recording.receipt_boot_s(rows), STATE_COLUMNS + QUATERNION_COLUMNS, values
         ).dropna(subset=POSITION_COLUMNS[:2])
         if len(samples):
             recording.came_from("truth", RECEIPT_CLOCK, message)
-            return Truth(message, samples)
-    fed = any(track.rung in EXTERNAL_VISION_RUNGS for track in positions)
-    for track in positions:
-        if track.topics == ("ATT_POS_MOCAP",) and fed:
-            recording.came_from("truth", track.clock, *track.topics)
+            attitude = orientation_of(samples)
             return Truth(
-                track.name, track.samples.reindex(columns=POSITION_COLUMNS + VELOCITY_COLUMNS)
+                message,
+                samples[STATE_COLUMNS],
+                None if attitude is None else attitude[QUATERNION_COLUMNS],
             )
-    return Unavailable(
-        "ground truth",
-        "neither simulation truth nor motion capture is in the recording",
-        "Real flights have truth only from motion capture (send ATT_POS_MOCAP).",
-    )
+    captured = motion_capture(positions, "ATT_POS_MOCAP")
+    if captured is None:
+        return Unavailable(
+            "ground truth",
+            "neither simulation truth nor motion capture is in the recording",
+            "Real flights have truth only from motion capture (send ATT_POS_MOCAP).",
+        )
+    recording.came_from("truth", captured.clock, *captured.topics)
+    return captured_truth(captured)
+
+
+def _true_attitude(message: str, rows: Rows, recording: Recording) -> Array:
+    """Quaternion w, x, y, z of the simulated vehicle, shape (n, 4); NaN where there is none."""
+    table = recording.frames.table(message, rows)
+    if message == "HIL_STATE_QUATERNION":
+        return table["attitude_quaternion"].astype(np.float64)
+    if message == "SIM_STATE":
+        return vector(table, "q1", "q2", "q3", "q4")
+    return np.full((len(table), 4), np.nan)
 
 
 def _hil_state(table: NDArray[Any]) -> tuple[Array, Array, Array, Array]:

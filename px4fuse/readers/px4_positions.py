@@ -14,6 +14,8 @@ from px4fuse.flight import (
     EXTERNAL_VISION_RUNGS,
     POSITION_COLUMNS,
     POSITION_VARIANCE_COLUMNS,
+    QUATERNION_COLUMNS,
+    STATE_COLUMNS,
     VELOCITY_COLUMNS,
     ClockMap,
     Ekf2,
@@ -21,6 +23,7 @@ from px4fuse.flight import (
     Truth,
     Unavailable,
     finite_rows,
+    orientation_of,
 )
 from px4fuse.readers.px4_ekf2 import NO_SELECTOR, Instances, of_primary
 from px4fuse.readers.px4_topics import (
@@ -30,6 +33,7 @@ from px4fuse.readers.px4_topics import (
     GPS,
     LOCAL_POSITION,
     TRACKS,
+    TRUTH_ATTITUDE,
     TRUTH_GLOBAL,
     TRUTH_LOCAL,
     TrackSource,
@@ -117,6 +121,7 @@ def _read_logged(
         PositionTrack(
             source.name, source.rung, source.description, samples, frame, AUTOPILOT_CLOCK,
             False, (layout.topic,), clock_map=_arrival(topics, layout.topic),
+            orientation=orientation_of(samples),
         ),
         POSITION_COLUMNS,
     )  # fmt: skip
@@ -292,7 +297,7 @@ def read_truth(topics: Topics, positions: tuple[PositionTrack, ...]) -> Truth | 
     if layout is not None:
         samples = topics.frame(layout).dropna()
         if len(samples):
-            return Truth(layout.topic, samples)
+            return Truth(layout.topic, samples, _true_attitude(topics))
     layout = topics.find(TRUTH_GLOBAL)
     if layout is not None:
         geo = finite_rows(topics.frame(layout), ["latitude_deg", "longitude_deg"])
@@ -313,15 +318,32 @@ def read_truth(topics: Topics, positions: tuple[PositionTrack, ...]) -> Truth | 
                 },
                 index=geo.index,
             ).join(geo.reindex(columns=VELOCITY_COLUMNS))
-            return Truth(layout.topic, samples)
+            return Truth(layout.topic, samples, _true_attitude(topics))
+    captured = motion_capture(positions, "vehicle_mocap_odometry", "att_pos_mocap")
+    if captured is None:
+        return Unavailable(
+            "ground truth",
+            "neither simulation ground truth nor motion capture is in the log",
+            "Real flights have truth only from motion capture (send ATT_POS_MOCAP).",
+        )
+    return captured_truth(captured)
+
+
+def _true_attitude(topics: Topics) -> pd.DataFrame | None:
+    layout = topics.find(TRUTH_ATTITUDE)
+    if layout is None:
+        return None
+    attitude = orientation_of(topics.frame(layout))
+    return None if attitude is None else attitude[QUATERNION_COLUMNS]
+
+
+def captured_truth(track: PositionTrack) -> Truth:
+    """Motion capture as the truth."""
+    attitude = None if track.orientation is None else track.orientation[QUATERNION_COLUMNS]
+    return Truth(track.name, track.samples.reindex(columns=STATE_COLUMNS), attitude)
+
+
+def motion_capture(positions: tuple[PositionTrack, ...], *topics: str) -> PositionTrack | None:
+    """Motion capture by its topics, where another track feeds EKF2: then it is the truth."""
     fed = any(track.rung in EXTERNAL_VISION_RUNGS for track in positions)
-    for track in positions:
-        if track.name == "vehicle_mocap_odometry" and fed:
-            return Truth(
-                track.name, track.samples.reindex(columns=POSITION_COLUMNS + VELOCITY_COLUMNS)
-            )
-    return Unavailable(
-        "ground truth",
-        "neither simulation ground truth nor motion capture is in the log",
-        "Real flights have truth only from motion capture (send ATT_POS_MOCAP).",
-    )
+    return next((track for track in positions if fed and track.topics[0] in topics), None)

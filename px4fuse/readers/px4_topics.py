@@ -49,6 +49,13 @@ _POSE_DIAGONAL = {
     "east_m2": "pose_covariance[6]",
     "down_m2": "pose_covariance[11]",
 }
+_ROTATION_VARIANCE = ["forward_rad2", "right_rad2", "down_rad2"]
+# the same triangle's rotations, at 15, 18, 20
+_ROTATION_DIAGONAL = {
+    "forward_rad2": "pose_covariance[15]",
+    "right_rad2": "pose_covariance[18]",
+    "down_rad2": "pose_covariance[20]",
+}
 
 IMU = (
     Layout(
@@ -195,6 +202,7 @@ TRUTH_GLOBAL = (
         {"north_m_s": "vel_n", "east_m_s": "vel_e", "down_m_s": "vel_d"},
     ),
 )
+TRUTH_ATTITUDE = (Layout("vehicle_attitude_groundtruth", _vector(_QUATERNION, "q"), "simulation"),)
 
 _GPS_OPTIONAL = {
     "eph_m": "eph", "epv_m": "epv", "fix_type": "fix_type", "utc_us": "time_utc_usec",
@@ -244,9 +252,17 @@ def _odometry(topic: str) -> tuple[Layout, ...]:
             topic,
             _vector(_POSITION, "position"),
             "v1.14",
-            _vector(_VARIANCE, "position_variance") | _FRAME_NEW,
+            _vector(_VARIANCE, "position_variance")
+            | _FRAME_NEW
+            | _vector(_QUATERNION, "q")
+            | _vector(_ROTATION_VARIANCE, "orientation_variance"),
         ),
-        Layout(topic, _XYZ, "v1.9 to v1.13", _POSE_DIAGONAL | _FRAME_OLD),
+        Layout(
+            topic,
+            _XYZ,
+            "v1.9 to v1.13",
+            _POSE_DIAGONAL | _FRAME_OLD | _vector(_QUATERNION, "q") | _ROTATION_DIAGONAL,
+        ),
     )
 
 
@@ -278,7 +294,7 @@ TRACKS = (
                 "estimator_visual_odometry_aligned",
                 _XYZ,
                 "v1.12 to v1.13",
-                _POSE_DIAGONAL | _FRAME_OLD,
+                _POSE_DIAGONAL | _FRAME_OLD | _vector(_QUATERNION, "q") | _ROTATION_DIAGONAL,
             ),
             Layout("vehicle_visual_odometry_aligned", _XYZ, "v1.10 to v1.11", _POSE_DIAGONAL),
         ),
@@ -333,7 +349,7 @@ def topics() -> list[str]:
     """Every topic named in this table, sorted: all that a reader needs to decode."""
     groups = (
         IMU, ATTITUDE, LOCAL_POSITION, ESTIMATOR_STATES, SENSOR_BIAS, SELECTOR, FUSING,
-        LAND_DETECTED, TRUTH_LOCAL, TRUTH_GLOBAL, GPS, AID_OBSERVATION_HORIZONTAL,
+        LAND_DETECTED, TRUTH_LOCAL, TRUTH_GLOBAL, TRUTH_ATTITUDE, GPS, AID_OBSERVATION_HORIZONTAL,
         AID_OBSERVATION_VERTICAL, *AID_SOURCE.values(), *(track.layouts for track in TRACKS),
     )  # fmt: skip
     names = {layout.topic for group in groups for layout in group} | UNUSED.keys()
