@@ -37,6 +37,7 @@ from px4fuse.flight import (
     Unavailable,
 )
 from px4fuse.kalman import INITIAL_SIGMA_P_M, INITIAL_SIGMA_V_M_S, Settings
+from px4fuse.likelihood import PROFILE_DROP, parabola_vertex
 from px4fuse.signals import STANDARD_GRAVITY_M_S2, Array, Segment, within
 
 # Standard deviations of the constants, wide for consumer sensors: tilt and heading (rad), gyro
@@ -53,7 +54,6 @@ PART_S = STRETCH_S
 SEARCH_S = 0.6
 COARSE_POINTS, FINE_POINTS = 25, 31
 SIGMA_A_FACTORS = np.geomspace(0.25, 2.0, 5)
-PROFILE_DROP = float(chi2.ppf(0.95, 1)) / 2.0
 MIN_MEASUREMENTS = 30
 # A wider interval says nothing that a student could use
 MAX_HALF_INTERVAL_S = 0.15
@@ -424,12 +424,10 @@ def _vertex(grid: Array, profile: Array) -> tuple[float, float]:
     """Minimum of a profile by a parabola, and the standard deviation that its bend gives."""
     at = int(np.clip(np.argmin(profile), 1, len(grid) - 2))
     step = grid[1] - grid[0]
-    left, middle, right = profile[at - 1 : at + 2]
-    bend = left - 2.0 * middle + right
+    shift, bend = parabola_vertex(profile, at)
     if bend <= 0.0:
         return float(grid[int(np.argmin(profile))]), float(grid[-1] - grid[0])
-    shift = float(np.clip(0.5 * (left - right) / bend, -1.0, 1.0))
-    return float(grid[at] + shift * step), float(step / np.sqrt(bend))
+    return float(grid[at] + np.clip(shift, -1.0, 1.0) * step), float(step / np.sqrt(bend))
 
 
 def _interval(grid: Array, drop: Array) -> tuple[tuple[float, float], bool]:

@@ -226,14 +226,9 @@ def _tables(flight: Flight) -> Iterator[_Table]:
     yield from _series(flight, "attitude", flight.attitude, _ATTITUDE)
     acceleration = ned_acceleration(flight)
     if isinstance(acceleration, pd.DataFrame):
-        topics = [t for key in ("imu", "attitude") for t in _topics(flight, key)]
-        yield _Table(
-            "acceleration_ned",
-            (_TIME, *_ACCELERATION),
-            acceleration.set_axis(ACCELERATION_COLUMNS, axis=1).rename_axis("time_s").reset_index(),
-            tuple(topics),
-            _clock(flight, "imu"),
-        )
+        data = acceleration.set_axis(ACCELERATION_COLUMNS, axis=1)
+        topics = (*_topics(flight, "imu"), *_topics(flight, "attitude"))
+        yield _timed("acceleration_ned", _ACCELERATION, data, topics, _clock(flight, "imu"))
     for name, track in _named_tracks(flight):
         yield _position(name, track)
     if isinstance(flight.ekf2, Ekf2):
@@ -292,14 +287,16 @@ def _series(
 ) -> Iterator[_Table]:
     """A time series that is named as its stream; nothing where it is unavailable."""
     if isinstance(data, pd.DataFrame):
-        wanted = data.reindex(columns=[column.name for column in columns])
-        yield _Table(
-            name,
-            (_TIME, *columns),
-            wanted.rename_axis("time_s").reset_index(),
-            _topics(flight, name),
-            _clock(flight, name),
-        )
+        yield _timed(name, columns, data, _topics(flight, name), _clock(flight, name))
+
+
+def _timed(
+    name: str, columns: tuple[_Column, ...], data: pd.DataFrame, topics: tuple[str, ...], clock: str
+) -> _Table:
+    """Table of a frame that is indexed by time."""
+    wanted = data.reindex(columns=[column.name for column in columns])
+    series = wanted.rename_axis("time_s").reset_index()
+    return _Table(name, (_TIME, *columns), series, topics, clock)
 
 
 def _named_tracks(flight: Flight) -> Iterator[tuple[str, PositionTrack]]:
@@ -323,14 +320,7 @@ def _position(name: str, track: PositionTrack) -> _Table:
             POSITION_VARIANCE_COLUMNS, "m^2", track.frame, "its variance as reported, empty if none"
         ),
     )
-    wanted = track.samples.reindex(columns=[column.name for column in columns])
-    return _Table(
-        name,
-        (_TIME, *columns),
-        wanted.rename_axis("time_s").reset_index(),
-        track.topics,
-        track.clock,
-    )
+    return _timed(name, columns, track.samples, track.topics, track.clock)
 
 
 def _topics(flight: Flight, part: str) -> tuple[str, ...]:

@@ -25,6 +25,9 @@ from px4fuse.kalman import (
 )
 from px4fuse.signals import Array, Axis
 
+# Half of the 95 % point of chi-square: the drop of log-likelihood that bounds an interval
+PROFILE_DROP = float(chi2.ppf(0.95, 1)) / 2.0
+
 
 @dataclass(frozen=True)
 class Preintegrated:
@@ -295,6 +298,28 @@ MAX_OUTLIER_SHARE = 0.25
 SIGMA_Z_GRID_M = np.geomspace(1e-3, 30.0, 91)
 # Median of a chi-square variable of one degree of freedom.
 CHI2_MEDIAN = float(chi2.median(1))
+
+
+def parabola_vertex(profile: Array, at: int) -> tuple[float, float]:
+    """Vertex of the parabola through three points of a profile.
+
+    Parameters
+    ----------
+    profile : ndarray, shape (n,)
+        At equal steps.
+    at : int
+        Index of the middle one, 1 to n - 2.
+
+    Returns
+    -------
+    shift : float
+        From the middle point to the minimum, in steps; 0 where there is none.
+    bend : float
+        Second difference, per square step.
+    """
+    left, middle, right = profile[at - 1 : at + 2]
+    bend = left - 2.0 * middle + right
+    return (0.5 * (left - right) / bend if bend > 0.0 else 0.0), bend
 
 
 @dataclass(frozen=True)

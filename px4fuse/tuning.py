@@ -21,10 +21,12 @@ from px4fuse.consistency import Consistency, assess
 from px4fuse.flight import Unavailable
 from px4fuse.kalman import Settings
 from px4fuse.likelihood import (
+    PROFILE_DROP,
     Preintegrated,
     innovations,
     negative_log_likelihood,
     outlier_probability,
+    parabola_vertex,
     preintegrate,
     recursion,
 )
@@ -40,8 +42,6 @@ SIGMA_Z_SEARCH_M = (1e-3, 10.0)
 FIRST_POINTS, NEXT_POINTS, ZOOMS, ZOOM_STEPS = 25, 17, 3, 1.6
 # The map shows what lies less than this below the greatest log-likelihood: three σ and more
 MAP_DROP = 9.0
-# Half of the 95 % point of chi-square: the drop of log-likelihood that bounds the interval
-PROFILE_DROP = float(chi2.ppf(0.95, 1)) / 2.0
 MIN_MEASUREMENTS = 30
 MAX_PASSES = 5
 MAX_OUTLIER_SHARE = 0.3
@@ -336,10 +336,8 @@ def _vertex(grid: Array, profile: Array) -> float:
     at = int(np.argmin(profile))
     if at in (0, len(grid) - 1):
         return float(grid[at])
-    left, middle, right = profile[at - 1 : at + 2]
+    shift, _ = parabola_vertex(profile, at)
     step = np.log(grid[at + 1] / grid[at])
-    bend = left - 2.0 * middle + right
-    shift = 0.5 * (left - right) / bend if bend > 0.0 else 0.0
     return float(np.exp(np.log(grid[at]) + shift * step))
 
 

@@ -16,13 +16,12 @@ from px4fuse.comparison import compare
 from px4fuse.consistency import Consistency
 from px4fuse.flight import Unavailable
 from px4fuse.kalman import Settings
-from px4fuse.likelihood import innovations, negative_log_likelihood, preintegrate
+from px4fuse.likelihood import PROFILE_DROP, innovations, negative_log_likelihood, preintegrate
 from px4fuse.readers import read_log
 from px4fuse.signals import Axis
 from px4fuse.tuning import (
     HORIZONTAL,
     MIN_MEASUREMENTS,
-    PROFILE_DROP,
     SIGMA_Z_SEARCH_M,
     AxisTuning,
     _total,

@@ -3,26 +3,25 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
 from px4fuse.cli.inputs import (
+    STANDARD_OUTPUT,
     analysis_options,
     command_line,
     encodable,
+    path_option,
     progress,
+    report_options,
+    report_paths,
     run_comparison,
-    spare_inputs,
     terminal,
     write_outputs,
 )
-from px4fuse.errors import OutputError, SettingsError
-
-if TYPE_CHECKING:
-    from px4fuse.report.document import Document
+from px4fuse.errors import SettingsError
 
 SEVERITIES = ("error", "warning", "info")
 MAX_NOTES_BYTES = 200_000
@@ -33,29 +32,8 @@ MAX_NOTES_BYTES = 200_000
 @analysis_options
 @click.option("--student", default="", metavar="NAME", help="Name on the report.")
 @click.option("--id", "student_id", default="", metavar="ID", help="Student number on the report.")
-@click.option(
-    "--notes",
-    type=click.Path(path_type=Path),
-    default=None,
-    metavar="FILE.md",
-    help="Your own words, printed in the report.",
-)
-@click.option(
-    "-o",
-    "--output",
-    type=click.Path(path_type=Path),
-    default=None,
-    metavar="FILE.pdf",
-    help="The report.  [default: reports/LOG.pdf]",
-)
-@click.option(
-    "--json",
-    "json_path",
-    type=click.Path(path_type=Path),
-    default=None,
-    metavar="FILE",
-    help="The results; - prints them alone on standard output.  [default: beside the PDF]",
-)
+@path_option("--notes", metavar="FILE.md", help="Your own words, printed in the report.")
+@report_options
 @click.option(
     "--fail-on",
     type=click.Choice(SEVERITIES),
@@ -80,20 +58,19 @@ def compare(
     from px4fuse.explanation import explain
     from px4fuse.findings import find
     from px4fuse.report.document import Document, Student
+    from px4fuse.report.pdf import render
     from px4fuse.report.results import results, to_json
 
     person = Student(encodable(student), encodable(student_id), _read_notes(notes))
-    target = output or Path("reports") / f"{log.stem}.pdf"
-    if target.suffix.lower() != ".pdf":
-        raise OutputError(f"{target}: the report is a PDF. Give a name that ends in .pdf with -o.")
-    spare_inputs([target, *([json_path] if json_path is not None else [])])
-    with progress(json_path == Path("-")) as step:
+    target, beside = report_paths(output or Path("reports") / f"{log.stem}.pdf", json_path)
+    with progress(json_path == STANDARD_OUTPUT) as step:
         compared = explain(run_comparison(log, step, **analysis), step)
         document = Document(compared, find(compared), person, command_line("compare", log))
-        found = results(document)
-        _write(document, found, target, json_path, step)
-    if json_path == Path("-"):
-        click.echo(to_json(found), nl=False)
+        text = to_json(results(document))
+        step("drawing the report")
+        write_outputs({target: render(document, text), beside: text.encode()})
+    if json_path == STANDARD_OUTPUT:
+        click.echo(text, nl=False)
     else:
         from px4fuse.report.terminal import print_summary
 
@@ -124,24 +101,3 @@ def _read_notes(path: Path | None) -> str:
         raise SettingsError(
             f"--notes {path}: not UTF-8 text (byte {error.start}). Save it as UTF-8."
         ) from error
-
-
-def _write(
-    document: Document,
-    found: dict[str, Any],
-    target: Path,
-    json_path: Path | None,
-    step: Callable[[str], None],
-) -> None:
-    from px4fuse.report.pdf import render
-    from px4fuse.report.results import to_json
-
-    step("drawing the report")
-    text = to_json(found)
-    contents = {target: render(document, text)}
-    beside = target.with_suffix(".json") if json_path in (None, Path("-")) else json_path
-    if beside is not None:
-        if beside.resolve() == target.resolve():
-            raise OutputError(f"{beside}: --json and -o name the same file. Give two names.")
-        contents[beside] = text.encode()
-    write_outputs(contents)

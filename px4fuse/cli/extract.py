@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from px4fuse.cli.inputs import (
+    path_option,
     read_recordings,
     recording_options,
     with_position,
@@ -26,11 +27,10 @@ FORMATS = ("csv", "parquet")
 
 @click.command()
 @click.argument("log", type=click.Path(path_type=Path))
-@click.option(
+@path_option(
     "-o",
     "--output",
     "folder",
-    type=click.Path(path_type=Path),
     required=True,
     metavar="DIR",
     help="Folder for the tables; made where it is missing.",

@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from px4fuse.cli.inputs import (
+    json_option,
     read_recordings,
     recording_options,
     terminal,
     with_position,
-    write_outputs,
+    write_json,
 )
 
 if TYPE_CHECKING:
@@ -25,14 +26,7 @@ if TYPE_CHECKING:
 
 @click.command()
 @click.argument("log", type=click.Path(path_type=Path))
-@click.option(
-    "--json",
-    "json_path",
-    type=click.Path(path_type=Path),
-    default=None,
-    metavar="FILE",
-    help="Write it as JSON; - prints that alone on standard output.",
-)
+@json_option
 @recording_options
 def info(
     log: Path,
@@ -43,15 +37,10 @@ def info(
 ) -> None:
     """Say what is in a log, what px4fuse can do with it, and what to log next time."""
     from px4fuse.inventory import take_inventory, to_plain
-    from px4fuse.report.results import to_json
 
     inventory = take_inventory(with_position(read_recordings(log, mavlink, system), **position))
-    text = to_json(to_plain(inventory))
-    if json_path == Path("-"):
-        click.echo(text, nl=False)
+    if write_json(to_plain(inventory), json_path):
         return
-    if json_path is not None:
-        write_outputs({json_path: text.encode()})
     _print(terminal(), inventory)
 
 

@@ -6,6 +6,7 @@ import shlex
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, cast
 
@@ -26,6 +27,7 @@ NOT_RECORDED = ("log", "output", "json_path", "student", "student_id", "notes", 
 # Options that name files to read
 INPUTS = ("log", "mavlink", "position", "notes")
 AUTO: Literal["auto"] = "auto"
+STANDARD_OUTPUT = Path("-")
 
 
 class NumberOrAuto(click.ParamType[float | str]):
@@ -45,6 +47,8 @@ class NumberOrAuto(click.ParamType[float | str]):
             self.fail(f"{value!r} is neither a number nor 'auto'.", param, ctx)
 
 
+# An option that names a file or folder
+path_option = partial(click.option, type=click.Path(path_type=Path))
 _ANALYSIS = (
     click.option(
         "--sigma-a",
@@ -109,10 +113,8 @@ _ANALYSIS = (
     ),
 )
 _RECORDINGS = (
-    click.option(
+    path_option(
         "--mavlink",
-        type=click.Path(path_type=Path),
-        default=None,
         metavar="FILE.tlog",
         help="MAVLink recording of the same flight: gives what LOG lacks.",
     ),
@@ -125,10 +127,8 @@ _RECORDINGS = (
     ),
 )
 _POSITION = (
-    click.option(
+    path_option(
         "--position",
-        type=click.Path(path_type=Path),
-        default=None,
         metavar="FILE.csv",
         help="The positioning system's own recording: time, x, y, z.",
     ),
@@ -174,6 +174,23 @@ clock_offset_option = click.option(
     help="Added to the position source's time stamps; auto estimates it.  [default: 0; auto with "
     "--position]",
 )
+json_option = path_option(
+    "--json",
+    "json_path",
+    metavar="FILE",
+    help="Write it as JSON; - prints that alone on standard output.",
+)
+_REPORT = (
+    path_option(
+        "-o", "--output", metavar="FILE.pdf", help="The report.  [default: reports/LOG.pdf]"
+    ),
+    path_option(
+        "--json",
+        "json_path",
+        metavar="FILE",
+        help="The results; - prints them alone on standard output.  [default: beside the PDF]",
+    ),
+)
 
 
 def recording_options(command: Callable[..., None]) -> Callable[..., None]:
@@ -187,6 +204,13 @@ def analysis_options(command: Callable[..., None]) -> Callable[..., None]:
     """Add the options of every command that runs the filter: settings, segment and recordings."""
     command = recording_options(command)
     for option in reversed(_ANALYSIS):
+        command = option(command)
+    return command
+
+
+def report_options(command: Callable[..., None]) -> Callable[..., None]:
+    """Add the options of every command that makes a report: the PDF and its results."""
+    for option in reversed(_REPORT):
         command = option(command)
     return command
 
@@ -321,6 +345,36 @@ def progress(quiet: bool) -> Iterator[Callable[[str], None]]:
         return
     with console.status("starting") as status:
         yield status.update
+
+
+def report_paths(output: Path, json_path: Path | None) -> tuple[Path, Path]:
+    """Where a report and its results go: the results beside it, unless --json names a file.
+
+    Raises
+    ------
+    OutputError
+        The report is no PDF, both are the same file, or one of them is read by this command.
+    """
+    if output.suffix.lower() != ".pdf":
+        raise OutputError(f"{output}: the report is a PDF. Give a name that ends in .pdf with -o.")
+    beside = output.with_suffix(".json") if json_path in (None, STANDARD_OUTPUT) else json_path
+    if beside.resolve() == output.resolve():
+        raise OutputError(f"{beside}: --json and -o name the same file. Give two names.")
+    spare_inputs([output, beside])
+    return output, beside
+
+
+def write_json(results: dict[str, Any], json_path: Path | None) -> bool:
+    """Write results where --json says; true where they have standard output to themselves."""
+    from px4fuse.report.results import to_json
+
+    text = to_json(results)
+    if json_path == STANDARD_OUTPUT:
+        click.echo(text, nl=False)
+        return True
+    if json_path is not None:
+        write_outputs({json_path: text.encode()})
+    return False
 
 
 def write_outputs(contents: Mapping[Path, bytes]) -> None:

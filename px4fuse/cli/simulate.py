@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
+from px4fuse.cli.inputs import path_option, write_outputs
 from px4fuse.errors import OutputError
 from px4fuse.simulation.mistakes import MISTAKES, as_typed, made, parse
 from px4fuse.simulation.scenario import KINDS, YAWS, Scenario
@@ -16,6 +18,13 @@ if TYPE_CHECKING:
 
 _DEFAULT = Scenario()
 PASSES = {"aisle": _DEFAULT.passes, "loop": 1}
+Command = TypeVar("Command", bound=Callable[..., None])
+
+
+def _scenario_option(name: str, field: str, **details: Any) -> Callable[[Command], Command]:
+    """Option that sets one real number of the scenario, whose own value is the default."""
+    default = getattr(_DEFAULT, field)
+    return click.option(name, field, type=float, default=default, show_default=True, **details)
 
 
 class WithMistakes(click.Command):
@@ -37,14 +46,7 @@ class WithMistakes(click.Command):
 
 
 @click.command(cls=WithMistakes)
-@click.option(
-    "-o",
-    "--output",
-    type=click.Path(path_type=Path),
-    required=True,
-    metavar="FLIGHT.ulg",
-    help="The log to write.",
-)
+@path_option("-o", "--output", required=True, metavar="FLIGHT.ulg", help="The log to write.")
 @click.option(
     "--kind",
     type=click.Choice(KINDS),
@@ -67,11 +69,9 @@ class WithMistakes(click.Command):
     metavar="NAME[=VALUE]",
     help="What goes wrong, from the table below; may be repeated.",
 )
-@click.option(
+@path_option(
     "--answer",
     "answer_path",
-    type=click.Path(path_type=Path),
-    default=None,
     metavar="FILE.json",
     help="Write the answer: mistakes, biases, outliers, clock offset. Keep it to yourself.",
 )
@@ -83,29 +83,16 @@ class WithMistakes(click.Command):
     metavar="N",
     help="Passes of the aisle [6], or laps of the loop [1].",
 )
-@click.option(
+@_scenario_option(
     "--length",
     "length_m",
-    type=float,
-    default=_DEFAULT.length_m,
-    show_default=True,
     metavar="M",
     help="Of the aisle, or of a side of the square.",
 )
-@click.option(
-    "--speed",
-    "speed_m_s",
-    type=float,
-    default=_DEFAULT.speed_m_s,
-    show_default=True,
-    metavar="M/S",
-)
-@click.option(
+@_scenario_option("--speed", "speed_m_s", metavar="M/S")
+@_scenario_option(
     "--heading",
     "heading_deg",
-    type=float,
-    default=_DEFAULT.heading_deg,
-    show_default=True,
     metavar="DEG",
     help="Of the aisle or of the first side, clockwise from north.",
 )
@@ -115,46 +102,28 @@ class WithMistakes(click.Command):
     default=None,
     help="Whether the nose stays or follows the flight.  [default: fixed; follow in a loop]",
 )
-@click.option(
+@_scenario_option(
     "--sigma-uwb",
     "sigma_uwb_m",
-    type=float,
-    default=_DEFAULT.sigma_uwb_m,
-    show_default=True,
     metavar="M",
     help="White noise of the UWB, per axis: the true SIGMA_Z.",
 )
-@click.option(
-    "--uwb-rate",
-    "uwb_rate_hz",
-    type=float,
-    default=_DEFAULT.uwb_rate_hz,
-    show_default=True,
-    metavar="HZ",
-)
-@click.option(
+@_scenario_option("--uwb-rate", "uwb_rate_hz", metavar="HZ")
+@_scenario_option(
     "--sigma-a",
     "sigma_a_m_s2",
-    type=float,
-    default=_DEFAULT.sigma_a_m_s2,
-    show_default=True,
     metavar="M/S²",
     help="White noise of the accelerometer's mean over 0.1 s: the true SIGMA_A.",
 )
-@click.option(
+@_scenario_option(
     "--accel-bias-sigma",
     "accel_bias_sigma_m_s2",
-    type=float,
-    default=_DEFAULT.accel_bias_sigma_m_s2,
-    show_default=True,
     metavar="M/S²",
     help="Width from which the accelerometer's constant bias is drawn.",
 )
-@click.option(
+@_scenario_option(
     "--vio-drift",
-    type=float,
-    default=_DEFAULT.vio_drift,
-    show_default=True,
+    "vio_drift",
     metavar="SHARE",
     help="Drift of the VIO, as a share of the distance.",
 )
@@ -185,14 +154,13 @@ def simulate(
         **scenario,
     )
     from px4fuse.report.results import to_json
-    from px4fuse.report.writing import write_all
     from px4fuse.simulation import flights
 
     simulation = flights.simulate(chosen, parsed)
     contents = {output: flights.to_ulog(simulation)}
     if answer_path is not None:
         contents[answer_path] = to_json(flights.answer(simulation)).encode()
-    write_all(contents)
+    write_outputs(contents)
     for line in _summary(simulation):
         click.echo(line)
     click.echo(f"Log       {output}")

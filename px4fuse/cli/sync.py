@@ -8,25 +8,20 @@ from typing import Any
 import click
 
 from px4fuse.cli.inputs import (
+    STANDARD_OUTPUT,
     analysis_options,
     command_line,
+    json_option,
     progress,
     run_comparison,
-    write_outputs,
+    write_json,
 )
 
 
 @click.command()
 @click.argument("log", type=click.Path(path_type=Path))
 @analysis_options
-@click.option(
-    "--json",
-    "json_path",
-    type=click.Path(path_type=Path),
-    default=None,
-    metavar="FILE",
-    help="Write it as JSON; - prints that alone on standard output.",
-)
+@json_option
 def sync(log: Path, json_path: Path | None, **analysis: Any) -> None:
     """Estimate what must be added to the position source's time stamps, with its interval.
 
@@ -34,17 +29,13 @@ def sync(log: Path, json_path: Path | None, **analysis: Any) -> None:
     or a MAVLink recording.
     """
     from px4fuse.explanation import clock_offset, tuned_horizontally
-    from px4fuse.report.results import sync_results, to_json
+    from px4fuse.report.results import sync_results
     from px4fuse.report.words import clock_advice
 
-    with progress(json_path == Path("-")) as step:
+    with progress(json_path == STANDARD_OUTPUT) as step:
         compared = tuned_horizontally(run_comparison(log, step, **analysis))
         found = clock_offset(compared, step)
-    text = to_json(sync_results(compared, found, command_line("sync", log)))
-    if json_path == Path("-"):
-        click.echo(text, nl=False)
+    if write_json(sync_results(compared, found, command_line("sync", log)), json_path):
         return
-    if json_path is not None:
-        write_outputs({json_path: text.encode()})
     for line in clock_advice(compared, found):
         click.echo(line)

@@ -8,12 +8,14 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from px4fuse.cli.inputs import (
+    STANDARD_OUTPUT,
     analysis_options,
     command_line,
+    json_option,
     progress,
     run_comparison,
     terminal,
-    write_outputs,
+    write_json,
 )
 
 if TYPE_CHECKING:
@@ -27,33 +29,22 @@ if TYPE_CHECKING:
 @click.command()
 @click.argument("log", type=click.Path(path_type=Path))
 @analysis_options
-@click.option(
-    "--json",
-    "json_path",
-    type=click.Path(path_type=Path),
-    default=None,
-    metavar="FILE",
-    help="Write it as JSON; - prints that alone on standard output.",
-)
+@json_option
 def tune(log: Path, json_path: Path | None, **analysis: Any) -> None:
     """Find the SIGMA_A and SIGMA_Z of greatest likelihood, with their 95 % intervals.
 
     --sigma-a and --sigma-z are what they are compared with. LOG is a PX4 ULog or a MAVLink
     recording.
     """
-    from px4fuse.report.results import to_json, tuning_results
+    from px4fuse.report.results import tuning_results
     from px4fuse.tuning import tune as tune_axes
 
-    with progress(json_path == Path("-")) as step:
+    with progress(json_path == STANDARD_OUTPUT) as step:
         compared = run_comparison(log, step, **analysis)
         axes = tuple(result.axis for result in compared.axes)
         tuned = tune_axes(axes, compared.settings, progress=lambda name: step(f"tuning {name}"))
-    text = to_json(tuning_results(compared, tuned, command_line("tune", log)))
-    if json_path == Path("-"):
-        click.echo(text, nl=False)
+    if write_json(tuning_results(compared, tuned, command_line("tune", log)), json_path):
         return
-    if json_path is not None:
-        write_outputs({json_path: text.encode()})
     _print(terminal(), compared, tuned)
 
 

@@ -12,9 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from px4fuse.flight import (
     AXIS_NAMES,
-    POSITION_COLUMNS,
     POSITION_VARIANCE_COLUMNS,
-    VELOCITY_COLUMNS,
+    STATE_COLUMNS,
     VELOCITY_VARIANCE_COLUMNS,
     Ekf2,
     Unavailable,
@@ -27,7 +26,6 @@ from px4fuse.readers.mavlink_messages import (
 from px4fuse.readers.mavlink_recording import BOOT_CLOCK, Array, Recording, vector
 from px4fuse.readers.px4_ekf2 import DEFAULT_GATE, NO_SELECTOR
 
-STATE_COLUMNS = POSITION_COLUMNS + VELOCITY_COLUMNS
 VARIANCE_COLUMNS = POSITION_VARIANCE_COLUMNS + VELOCITY_VARIANCE_COLUMNS
 COVARIANT_POSITION = "LOCAL_POSITION_NED_COV"
 INNOVATIONS_REMEDY = "Give the ULog of the same flight: px4fuse compare LOG.ulg --mavlink LOG.tlog."

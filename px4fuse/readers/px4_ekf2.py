@@ -17,10 +17,9 @@ from px4fuse.flight import (
     BIAS_NOT_LOGGED,
     EKF2_STEP_S,
     HORIZON_NOT_LOGGED,
-    POSITION_COLUMNS,
     POSITION_VARIANCE_COLUMNS,
     SPECIFIC_FORCE_COLUMNS,
-    VELOCITY_COLUMNS,
+    STATE_COLUMNS,
     VELOCITY_VARIANCE_COLUMNS,
     AxisName,
     Ekf2,
@@ -94,7 +93,7 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
             "EKF2", "no topic vehicle_local_position", "Record with SDLOG_PROFILE bit 0 (default)."
         )
     local = topics.frame(layout)
-    state = local[POSITION_COLUMNS + VELOCITY_COLUMNS].dropna()
+    state = local[STATE_COLUMNS].dropna()
     if state.empty:
         return Unavailable(
             "EKF2", "vehicle_local_position holds no finite sample", "Wait until EKF2 has started."

@@ -54,7 +54,16 @@ def read_ulog(path: Path) -> Flight:
     LogError
         The file cannot be read, is no ULog, or holds no usable data.
     """
-    topics = read_topics(path)
+    return to_flight(read_topics(path))
+
+
+def to_flight(topics: Topics) -> Flight:
+    """Make a flight of the topics of a log.
+
+    Parameters
+    ----------
+    topics : Topics
+    """
     imu = _read_imu(topics)
     attitude = _read_attitude(topics)
     ekf2 = read_ekf2(topics)

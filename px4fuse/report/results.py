@@ -93,26 +93,28 @@ def tuning_results(
     comparison: Comparison, tuned: Mapping[str, AxisTuning | Unavailable], command: str
 ) -> dict[str, Any]:
     """What ``px4fuse tune`` found, as plain data."""
-    return {
-        "schema": {"name": "px4fuse-tuning", "version": "1.0"},
-        "log": _log(comparison),
-        "position_source": _source(comparison),
-        "settings": _settings(comparison),
-        "tuning": {name: _tuned(found) for name, found in tuned.items()},
-        "provenance": provenance(command),
-    }
+    found = {name: _tuned(axis) for name, axis in tuned.items()}
+    return _of_command("px4fuse-tuning", comparison, command, {"tuning": found})
 
 
 def sync_results(
     comparison: Comparison, clock: ClockOffset | Unavailable, command: str
 ) -> dict[str, Any]:
     """What ``px4fuse sync`` found, as plain data."""
+    found = _clock(clock, comparison.settings.clock_offset_s)
+    return _of_command("px4fuse-sync", comparison, command, {"clock": found})
+
+
+def _of_command(
+    schema_name: str, comparison: Comparison, command: str, found: dict[str, Any]
+) -> dict[str, Any]:
+    """What a command found, with what it was found from."""
     return {
-        "schema": {"name": "px4fuse-sync", "version": "1.0"},
+        "schema": {"name": schema_name, "version": "1.0"},
         "log": _log(comparison),
         "position_source": _source(comparison),
         "settings": _settings(comparison),
-        "clock": _clock(clock, comparison.settings.clock_offset_s),
+        **found,
         "provenance": provenance(command),
     }
 

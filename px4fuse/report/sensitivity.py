@@ -11,7 +11,7 @@ from matplotlib.ticker import FixedLocator, NullFormatter, ScalarFormatter
 
 from px4fuse.comparison import AxisComparison
 from px4fuse.flight import Unavailable
-from px4fuse.likelihood import States, preintegrate, states
+from px4fuse.likelihood import PROFILE_DROP, States, preintegrate, states
 from px4fuse.report.document import Document
 from px4fuse.report.style import (
     BOTTOM,
@@ -28,7 +28,7 @@ from px4fuse.report.style import (
     panels,
 )
 from px4fuse.signals import AISLE, Array
-from px4fuse.tuning import HORIZONTAL, PROFILE_DROP, Noise
+from px4fuse.tuning import HORIZONTAL, Noise
 
 FACTORS = (0.25, 0.5, 1.0, 2.0, 4.0)
 # Drops of log-likelihood: the 95 % intervals of one parameter, then further down

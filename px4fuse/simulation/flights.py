@@ -4,28 +4,17 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 
 from px4fuse.errors import SettingsError
-from px4fuse.flight import (
-    ANGULAR_RATE_COLUMNS,
-    QUATERNION_COLUMNS,
-    SPECIFIC_FORCE_COLUMNS,
-    Flight,
-    LogInfo,
-    Stream,
-    Truth,
-    missing_parts,
-    stretches_of_flight,
-)
+from px4fuse.flight import Flight, LogInfo
 from px4fuse.plain import plain
-from px4fuse.readers.px4_ekf2 import read_ekf2
-from px4fuse.readers.px4_positions import read_positions, read_truth
-from px4fuse.readers.px4_topics import ATTITUDE, IMU, LAND_DETECTED, PARAMETERS, TRUTH_LOCAL
-from px4fuse.readers.ulog_topics import AT_MEASUREMENT, Topics
+from px4fuse.readers import ulog
+from px4fuse.readers.px4_topics import IMU, PARAMETERS
+from px4fuse.readers.ulog_topics import Topics
 from px4fuse.simulation import sensors
 from px4fuse.simulation.mistakes import MISTAKES, Mistakes, as_typed, made
 from px4fuse.simulation.motion import Motion, plan
@@ -144,40 +133,7 @@ def to_flight(simulation: Simulation, name: str = "simulation.ulg") -> Flight:
         zero_us=int(stamps[0]),
         dropped={},
     )
-    imu = topics.frame(IMU[0])[SPECIFIC_FORCE_COLUMNS + ANGULAR_RATE_COLUMNS]
-    attitude = topics.frame(ATTITUDE[0])[QUATERNION_COLUMNS]
-    landed = topics.frame(LAND_DETECTED[0], step=True)["landed"]
-    ekf2 = read_ekf2(topics)
-    tracks, missing_tracks = read_positions(topics, ekf2)
-    truth = read_truth(topics, tracks)
-    used = {"imu": IMU, "attitude": ATTITUDE}
-    if isinstance(truth, Truth):
-        used["truth"] = TRUTH_LOCAL
-    used["airborne"] = LAND_DETECTED
-    return Flight(
-        log=replace(
-            topics.log,
-            notes=tuple(
-                f"{count} samples of {topic} were dropped: their time stamps are zero or go back"
-                for (topic, _), count in sorted(topics.dropped.items())
-            ),
-        ),
-        imu=imu,
-        attitude=attitude,
-        positions=tracks,
-        ekf2=ekf2,
-        truth=truth,
-        airborne=stretches_of_flight(landed, topics.log.duration_s),
-        missing=(*missing_parts(imu, attitude, ekf2, truth), *missing_tracks),
-        streams={
-            part: Stream(
-                (layouts[0].topic,),
-                AT_MEASUREMENT if part == "imu" else topics.clock(layouts[0].topic),
-                name,
-            )
-            for part, layouts in used.items()
-        },
-    )
+    return ulog.to_flight(topics)
 
 
 def _parameters(scenario: Scenario, mistakes: Mistakes) -> dict[str, int | float]:
