@@ -5,6 +5,7 @@
     Px4FuseError
     ├── LogError           the log cannot be read, or is not one
     ├── MissingDataError   the log can be read but lacks what was asked for
+    ├── TrajectoryError    a trajectory or pose graph cannot be read or used
     ├── SettingsError      a setting is outside its documented range
     └── OutputError        a result cannot be written
 
@@ -25,6 +26,10 @@ class LogError(Px4FuseError):
 
 class MissingDataError(Px4FuseError):
     """The log was read, but what was asked for is not in it."""
+
+
+class TrajectoryError(Px4FuseError):
+    """A trajectory or pose graph cannot be read, or lacks what was asked for."""
 
 
 class SettingsError(Px4FuseError):

@@ -1,6 +1,6 @@
 """The lesson's worked examples through px4fuse's own engine.
 
-Source: UAT 366, module 2, "SLAM and sensor fusion", Example 1.
+Source: UAT 366, module 2, "SLAM and sensor fusion", Examples 1 and 2.
 """
 
 from __future__ import annotations
@@ -13,12 +13,15 @@ import numpy as np
 from px4fuse.flight import Unavailable
 from px4fuse.kalman import InitialState, Replay, Settings, replay
 from px4fuse.signals import Axis
+from px4fuse.trajectory.closure import cumulative_distance, distribute_by_distance
 
 TRUE_VELOCITY_M_S = 1.0
 STEPS = 30
 STEPS_PER_UPDATE = 5
 # Fixed values standing in for noise, as in the lesson (m).
 UWB_NOISE_M = (0.08, -0.12, 0.05, 0.10, -0.06, -0.09)
+# Corners of Example 2's path by odometry, m; it truly returns to the start.
+ODOMETRY_M = ((0.0, 0.0), (20.3, 0.2), (20.6, 20.4), (0.8, 20.9), (1.2, 0.8))
 
 
 @dataclass(frozen=True)
@@ -70,3 +73,17 @@ def kalman_lines() -> Iterator[LessonUpdate]:
             sigma_p_m=float(np.sqrt(row["position_variance_m2"])),
             sigma_v_m_s=float(np.sqrt(row["velocity_variance_m2_s2"])),
         )
+
+
+def loop_lines() -> Iterator[str]:
+    """Yield the six lines of Example 2: the loop-closure error, distributed by distance."""
+    odometry = np.array(ODOMETRY_M)
+    misclosure = odometry[-1] - odometry[0]
+    total = cumulative_distance(odometry)[-1]
+    yield (
+        f"loop closure error ({misclosure[0]:.1f}, {misclosure[1]:.1f}) m over {total:.1f} m = "
+        f"{np.hypot(*misclosure) / total:.1%}"
+    )
+    corrected = distribute_by_distance(odometry, misclosure)
+    for (x, y), (x_corrected, y_corrected) in zip(odometry, corrected, strict=True):
+        yield f"({x:5.1f}, {y:5.1f}) -> ({x_corrected:5.2f}, {y_corrected:5.2f})"

@@ -1,10 +1,10 @@
-"""Example 1 of the lesson, digit for digit."""
+"""Examples 1 and 2 of the lesson, digit for digit."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from px4fuse.lesson import example_1, kalman_lines
+from px4fuse.lesson import example_1, kalman_lines, loop_lines
 
 # as the lesson prints them
 EXAMPLE_1 = """\
@@ -51,3 +51,18 @@ def test_example_1_equals_the_lessons_own_loop_at_every_step() -> None:
         expected.append([*x, P[0][0], P[0][1], P[1][1]])
     steps = example_1().steps.drop(columns=["acceleration_m_s2", "input_variance_m2_s4"])
     np.testing.assert_allclose(steps, expected, rtol=1e-12, atol=1e-12)
+
+
+# as the lesson prints them
+EXAMPLE_2 = """\
+loop closure error (1.2, 0.8) m over 80.4 m = 1.8%
+(  0.0,   0.0) -> ( 0.00,  0.00)
+( 20.3,   0.2) -> (20.00, -0.00)
+( 20.6,  20.4) -> (20.00, 20.00)
+(  0.8,  20.9) -> (-0.10, 20.30)
+(  1.2,   0.8) -> ( 0.00,  0.00)
+"""
+
+
+def test_example_2_prints_the_lessons_six_lines() -> None:
+    assert list(loop_lines()) == EXAMPLE_2.splitlines()

@@ -17,3 +17,12 @@ def kalman() -> None:
 
     for update in kalman_lines():
         click.echo(str(update))
+
+
+@lesson.command()
+def loop() -> None:
+    """Print Example 2: the loop-closure error, distributed by distance."""
+    from px4fuse.lesson import loop_lines
+
+    for line in loop_lines():
+        click.echo(line)

@@ -1,0 +1,181 @@
+"""Loop closure by hand: path length, misclosure, and its distribution by distance.
+
+Positions have z down here (NED, or forward-right-down at the start); see :func:`upright`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from px4fuse.trajectory.model import Array, Frame, Trajectory
+
+IntArray = NDArray[np.intp]
+DOWN = np.array([0.0, 0.0, 1.0])
+# Rows turn a frame into one with z down: x forward or north, y right or east
+_TO_Z_DOWN: dict[Frame, tuple[tuple[tuple[float, ...], ...], Frame, str]] = {
+    "ENU": (
+        ((0.0, 1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, -1.0)),
+        "NED",
+        "east, north, up turned into north, east, down",
+    ),
+    "camera": (
+        ((0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)),
+        "FRD",
+        "the camera's right, down, forward turned into forward, right, down",
+    ),
+    "unknown": (
+        ((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0)),
+        "FRD",
+        "the frame is not stated: z is taken to be up",
+    ),
+}
+# Key frames are this share of the extent apart, between these bounds: the path of a hand-held
+# camera over a desk and of a flight through a hall both bend on the scale of their own size
+SPACING_SHARE = 0.02
+MIN_SPACING_M, MAX_SPACING_M = 0.02, 0.5
+
+
+def upright(trajectory: Trajectory) -> Trajectory:
+    """The same trajectory in a frame with z down.
+
+    A camera's orientation becomes that of a vehicle whose nose is where the camera looks.
+    """
+    if trajectory.frame in ("NED", "FRD"):
+        return trajectory
+    rows, frame, note = _TO_Z_DOWN[trajectory.frame]
+    turn = np.array(rows)
+    rotation = trajectory.rotation
+    if rotation is not None:
+        rotation = Rotation.from_matrix(turn @ rotation.as_matrix() @ turn.T)
+    variance = trajectory.position_variance_m2
+    return replace(
+        trajectory,
+        position_m=trajectory.position_m @ turn.T,
+        rotation=rotation,
+        frame=frame,
+        position_variance_m2=None if variance is None else variance @ np.abs(turn).T,
+        notes=(*trajectory.notes, note),
+    )
+
+
+def key_frame_spacing_m(position_m: Array) -> float:
+    """Distance between key frames that suits a path, shape (n, d), in m."""
+    extent = float(np.linalg.norm(np.ptp(position_m, axis=0)))
+    return float(np.clip(SPACING_SHARE * extent, MIN_SPACING_M, MAX_SPACING_M))
+
+
+def key_frames(position_m: Array, spacing_m: float) -> IntArray:
+    """Indices of poses that are at least ``spacing_m`` from the one before, both ends included.
+
+    Length along every sample of a noisy track is too long: each step of 30 Hz adds the noise of
+    two positions. Steps that are long against the noise do not.
+    """
+    kept = [0]
+    last = position_m[0]
+    for index, position in enumerate(position_m[1:-1], start=1):
+        step = position - last
+        if step @ step >= spacing_m * spacing_m:
+            kept.append(index)
+            last = position
+    if len(kept) > 1 and np.linalg.norm(position_m[-1] - last) < spacing_m / 2.0:
+        kept.pop()  # so that the last step is not one of noise alone
+    return np.array([*kept, len(position_m) - 1])
+
+
+def cumulative_distance(position_m: Array) -> Array:
+    """Length of the path from its start to each position, shape (n, d) to (n,), in m."""
+    steps = np.linalg.norm(np.diff(position_m, axis=0), axis=1)
+    return np.concatenate([[0.0], np.cumsum(steps)])
+
+
+def distribute_by_distance(
+    position_m: Array, misclosure_m: Array, cumulative_m: Array | None = None
+) -> Array:
+    """Correct a path in proportion to cumulative distance: the surveyors' compass rule.
+
+    p_k' = p_k - (s_k / s_n) · e
+
+    It is what a pose graph gives when the variance of a step's translation is proportional to its
+    length and orientation is perfect.
+
+    Parameters
+    ----------
+    position_m : ndarray, shape (n, d)
+    misclosure_m : ndarray, shape (d,)
+        e, where the path ends minus where it should end.
+    cumulative_m : ndarray, shape (n,), optional
+        s, by default of the positions themselves.
+
+    Returns
+    -------
+    ndarray, shape (n, d)
+
+    Notes
+    -----
+    Bowditch (1808); UAT 366 module 2, Example 2.
+    """
+    cumulative = cumulative_distance(position_m) if cumulative_m is None else cumulative_m
+    share = cumulative / cumulative[-1]
+    corrected: Array = position_m - share[:, np.newaxis] * misclosure_m
+    return corrected
+
+
+def heading_change_rad(rotation: Rotation) -> float:
+    """Turn about the vertical that is part of a rotation within a frame with z down.
+
+    The twist of the swing-twist decomposition about z; positive is clockwise seen from above.
+    """
+    _, _, z, w = rotation.as_quat()
+    return wrapped(float(2.0 * np.arctan2(z, w)))
+
+
+def wrapped(angle_rad: float) -> float:
+    """An angle within -π to π."""
+    return float(np.remainder(angle_rad + np.pi, 2.0 * np.pi) - np.pi)
+
+
+def correct_by_distance(
+    trajectory: Trajectory,
+    cumulative_m: Array,
+    misclosure_m: Array,
+    misclosure_heading_rad: float,
+) -> Trajectory:
+    """Distribute a misclosure of position and heading by distance.
+
+    Orientations are turned back by the share of the heading misclosure that their distance gives
+    (slerp about the vertical), the steps between poses are turned with them, and what is left of
+    the misclosure of position is distributed by the compass rule. Without turning the steps the
+    shape would shear.
+
+    Parameters
+    ----------
+    trajectory : Trajectory
+        In a frame with z down.
+    cumulative_m : ndarray, shape (n,)
+        Distance along the path at each pose.
+    misclosure_m : ndarray, shape (3,)
+        Where the path ends minus where it should end.
+    misclosure_heading_rad : float
+        Heading at the end minus what it should be; 0 where that is not known.
+    """
+    position = trajectory.position_m
+    share = cumulative_m / cumulative_m[-1]
+    turn = Rotation.from_rotvec(np.outer(-share * misclosure_heading_rad, DOWN))
+    between = Rotation.from_rotvec(
+        np.outer(-(share[1:] + share[:-1]) / 2.0 * misclosure_heading_rad, DOWN)
+    )
+    steps = between.apply(np.diff(position, axis=0))
+    turned = position[0] + np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+    left = turned[-1] - (position[-1] - misclosure_m)
+    rotation = trajectory.rotation
+    return replace(
+        trajectory,
+        position_m=distribute_by_distance(turned, left, cumulative_m),
+        rotation=None if rotation is None else turn * rotation,
+        position_variance_m2=None,
+        rotation_variance_rad2=None,
+    )

@@ -1,0 +1,85 @@
+"""What a trajectory is: poses over time, from a file or out of a flight."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+Array = NDArray[np.float64]
+# What made it; "slam" is a system whose world is its first key frame (ORB-SLAM3 and the like)
+Kind = Literal["vio", "ekf2", "kf", "truth", "slam", "unknown"]
+# Axes of its world: "NED" and "FRD" have z down, "ENU" z up, "camera" y down and z forward
+Frame = Literal["NED", "FRD", "ENU", "camera", "unknown"]
+MIN_POSES = 3
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Poses over time.
+
+    Attributes
+    ----------
+    name : str
+        File name without its folder, with the part for a log ("log.ulg:vio").
+    kind : Kind
+    time_s : ndarray, shape (n,)
+        Strictly increasing seconds: the file's own stamps, or seconds from a log's first data.
+    position_m : ndarray, shape (n, 3)
+        In ``frame``.
+    rotation : Rotation of n, or None
+        Turns vectors of the body (or camera) into ``frame``; None where only positions are known.
+    frame : Frame
+    unix_offset_s : float or None
+        What must be added to ``time_s`` to give UNIX time; None where that is not known.
+    position_variance_m2, rotation_variance_rad2 : ndarray, shape (n, 3), or None
+        As the estimator itself reported them, rotation about the body's axes; None where it gave
+        none.
+    sha256 : str
+        Of the file that it was read from.
+    size_bytes : int
+        Of that file.
+    notes : tuple of str
+        What the reader recognised and did, each a sentence.
+    """
+
+    name: str
+    kind: Kind
+    time_s: Array
+    position_m: Array
+    rotation: Rotation | None
+    frame: Frame = "unknown"
+    unix_offset_s: float | None = None
+    position_variance_m2: Array | None = None
+    rotation_variance_rad2: Array | None = None
+    sha256: str = ""
+    size_bytes: int = 0
+    notes: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.time_s)
+
+    def __getitem__(self, chosen: slice | NDArray[np.bool_] | NDArray[np.intp]) -> Trajectory:
+        """Some of its poses, in order.
+
+        Parameters
+        ----------
+        chosen : slice, boolean array of shape (n,), or integer array
+        """
+        return replace(
+            self,
+            time_s=self.time_s[chosen],
+            position_m=self.position_m[chosen],
+            rotation=None if self.rotation is None else self.rotation[chosen],
+            position_variance_m2=_some(self.position_variance_m2, chosen),
+            rotation_variance_rad2=_some(self.rotation_variance_rad2, chosen),
+        )
+
+
+def _some(
+    values: Array | None, chosen: slice | NDArray[np.bool_] | NDArray[np.intp]
+) -> Array | None:
+    return None if values is None else values[chosen]

@@ -1,0 +1,123 @@
+"""Loop closure by distance against closed forms and the lesson's own code."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from px4fuse.trajectory.closure import (
+    correct_by_distance,
+    cumulative_distance,
+    distribute_by_distance,
+    heading_change_rad,
+    key_frame_spacing_m,
+    key_frames,
+    upright,
+)
+from px4fuse.trajectory.model import Trajectory
+
+COORDINATE = st.floats(-50.0, 50.0)
+
+
+@given(st.lists(st.tuples(COORDINATE, COORDINATE), min_size=3, max_size=30, unique=True))
+def test_distribution_equals_the_lessons_own_code(odom: list[tuple[float, float]]) -> None:
+    err = (odom[-1][0] - odom[0][0], odom[-1][1] - odom[0][1])
+    seg = [math.dist(a, b) for a, b in zip(odom, odom[1:], strict=False)]
+    cum = [0.0]
+    for s in seg:
+        cum.append(cum[-1] + s)
+    expected = [
+        (x - s / cum[-1] * err[0], y - s / cum[-1] * err[1])
+        for (x, y), s in zip(odom, cum, strict=True)
+    ]
+    found = distribute_by_distance(np.array(odom), np.array(err))
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9)
+
+
+def square(count: int = 401, side_m: float = 20.0) -> tuple[np.ndarray, Rotation]:
+    """A square flown nose first, corners turned on the spot."""
+    share = np.linspace(0.0, 4.0, count)
+    leg = np.minimum(share.astype(int), 3)
+    corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1], [0, 0]]) * side_m
+    along = (share - leg)[:, None]
+    flat = (1 - along) * corners[leg] + along * corners[leg + 1]
+    position = np.column_stack([flat, np.full(count, -1.5)])
+    return position, Rotation.from_rotvec(np.outer(leg * np.pi / 2, [0.0, 0.0, 1.0]))
+
+
+def trajectory(position: np.ndarray, rotation: Rotation | None) -> Trajectory:
+    time = np.arange(len(position)) * 0.1
+    return Trajectory("flight", "vio", time, position, rotation, "FRD")
+
+
+def test_heading_drift_that_grows_with_distance_is_undone() -> None:
+    position, rotation = square()
+    distance = cumulative_distance(position)
+    share = distance / distance[-1]
+    drift = math.radians(8.0)
+    between = (share[1:] + share[:-1]) / 2.0
+    steps = Rotation.from_rotvec(np.outer(between * drift, [0, 0, 1])).apply(
+        np.diff(position, axis=0)
+    )
+    drifted = position[0] + np.vstack([np.zeros(3), np.cumsum(steps, axis=0)])
+    turned = Rotation.from_rotvec(np.outer(share * drift, [0, 0, 1])) * rotation
+    misclosure = drifted[-1] - position[-1]
+    assert np.linalg.norm(misclosure) > 1.0
+    found = correct_by_distance(trajectory(drifted, turned), distance, misclosure, drift)
+    np.testing.assert_allclose(found.position_m, position, atol=1e-9)
+    assert found.rotation is not None
+    assert np.max((found.rotation * rotation.inv()).magnitude()) < 1e-9
+    # distributing only the position leaves the shape sheared
+    sheared = distribute_by_distance(drifted, misclosure)
+    assert np.max(np.linalg.norm(sheared - position, axis=1)) > 0.3
+
+
+def test_translation_drift_in_proportion_to_distance_is_undone() -> None:
+    position, rotation = square()
+    distance = cumulative_distance(position)
+    misclosure = np.array([1.2, -0.8, 0.1])
+    drifted = position + (distance / distance[-1])[:, None] * misclosure
+    found = correct_by_distance(trajectory(drifted, rotation), distance, misclosure, 0.0)
+    np.testing.assert_allclose(found.position_m, position, atol=1e-12)
+
+
+def test_length_on_key_frames_is_not_lengthened_by_noise() -> None:
+    position, _ = square(count=2400)  # 80 m, 3.3 cm a step
+    noisy = position + np.random.default_rng(1).normal(0.0, 0.02, position.shape)
+    frames = key_frames(noisy, key_frame_spacing_m(noisy))
+    assert cumulative_distance(noisy)[-1] > 95.0
+    assert abs(cumulative_distance(noisy[frames])[-1] - 80.0) < 0.8
+    assert frames[0] == 0
+    assert frames[-1] == len(noisy) - 1
+
+
+@given(st.floats(-3.1, 3.1), st.floats(-0.3, 0.3), st.floats(-0.3, 0.3))
+def test_heading_change_is_the_twist_about_the_vertical(yaw: float, x: float, y: float) -> None:
+    tilt = Rotation.from_rotvec([x, y, 0.0])
+    turn = Rotation.from_rotvec([0.0, 0.0, yaw])
+    assert abs(heading_change_rad(turn * tilt) - yaw) < 1e-9
+
+
+def test_a_cameras_world_becomes_forward_right_down() -> None:
+    # one metre ahead, two to the right, three up of the first camera, looking right
+    position = np.array([[0.0, 0.0, 0.0], [2.0, -3.0, 1.0], [2.0, -3.0, 1.5]])
+    looking_right = Rotation.from_rotvec([0.0, np.pi / 2, 0.0])  # about the camera's y, down
+    rotation = Rotation.concatenate([Rotation.identity(), looking_right, looking_right])
+    camera = Trajectory("c", "slam", np.arange(3.0), position, rotation, "camera")
+    found = upright(camera)
+    assert found.frame == "FRD"
+    np.testing.assert_allclose(found.position_m[1], [1.0, 2.0, -3.0])
+    assert found.rotation is not None
+    nose = found.rotation[1].apply([1.0, 0.0, 0.0])
+    np.testing.assert_allclose(nose, [0.0, 1.0, 0.0], atol=1e-12)
+
+
+def test_east_north_up_becomes_north_east_down() -> None:
+    position = np.array([[0.0, 0.0, 0.0], [1.0, 2.0, 3.0], [1.0, 2.0, 4.0]])
+    found = upright(Trajectory("m", "truth", np.arange(3.0), position, None, "ENU"))
+    np.testing.assert_allclose(found.position_m[1], [2.0, 1.0, -3.0])
+    assert found.frame == "NED"
