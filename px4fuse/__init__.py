@@ -21,6 +21,9 @@ if TYPE_CHECKING:
     from px4fuse.flight import Flight, Unavailable
     from px4fuse.kalman import Settings, replay
     from px4fuse.readers import read_log
+    from px4fuse.readers.trajectory import read_trajectory
+    from px4fuse.trajectory.evaluation import evaluate
+    from px4fuse.trajectory.loop import close_loop
     from px4fuse.tuning import tune
 
 __all__ = [
@@ -32,10 +35,13 @@ __all__ = [
     "Settings",
     "Unavailable",
     "assess",
+    "close_loop",
     "compare",
+    "evaluate",
     "explain",
     "find",
     "read_log",
+    "read_trajectory",
     "replay",
     "tune",
 ]
@@ -49,10 +55,13 @@ _HOMES = {
     "Settings": "kalman",
     "Unavailable": "flight",
     "assess": "consistency",
+    "close_loop": "trajectory.loop",
     "compare": "comparison",
+    "evaluate": "trajectory.evaluation",
     "explain": "explanation",
     "find": "findings",
     "read_log": "readers",
+    "read_trajectory": "readers.trajectory",
     "replay": "kalman",
     "tune": "tuning",
 }

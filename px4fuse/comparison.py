@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
@@ -33,6 +34,9 @@ from px4fuse.signals import (
     shift_clock,
 )
 from px4fuse.tuning import AxisTuning
+
+if TYPE_CHECKING:
+    from px4fuse.trajectory.loop import Loop  # it is made from tracks, ours among them
 
 NOT_ITS_OWN_TRUTH = Unavailable(
     "ground truth",
@@ -152,6 +156,8 @@ class Comparison:
         What must still be added to the source's stamps; None until ``explain`` fills it.
     budget : mapping from axis name to Budget or Unavailable
         What the difference to EKF2 comes from; empty until ``explain`` fills it.
+    loop : Loop, Unavailable or None
+        Loop closure of the flight's odometry; None until ``explain`` fills it.
     """
 
     flight: Flight
@@ -167,6 +173,7 @@ class Comparison:
     tuning: Mapping[str, AxisTuning | Unavailable] = field(default_factory=dict)
     clock: ClockOffset | Unavailable | None = None
     budget: Mapping[str, Budget | Unavailable] = field(default_factory=dict)
+    loop: Loop | Unavailable | None = None
 
 
 def compare(

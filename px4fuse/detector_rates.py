@@ -18,11 +18,14 @@ from scipy.stats import binomtest
 
 from px4fuse.comparison import compare
 from px4fuse.explanation import explain
-from px4fuse.findings import find
+from px4fuse.findings import find, find_loop
 from px4fuse.kalman import Settings
 from px4fuse.simulation.flights import simulate_flight
 from px4fuse.simulation.mistakes import parse
-from px4fuse.simulation.scenario import Scenario
+from px4fuse.simulation.scenario import Kind, Scenario
+from px4fuse.trajectory.analysis import analyse
+from px4fuse.trajectory.sources import Source
+from px4fuse.trajectory.tracks import trajectory_of
 
 TABLE = "rates.csv"
 CLEAN = "none"
@@ -30,7 +33,7 @@ CLEAN_FLIGHTS, FAULTY_FLIGHTS = 200, 30
 # What simulated flights ask for: the IMU's white noise with what bias and attitude errors add
 RIGHT_NOISES = {"sigma_a_m_s2": 0.27, "sigma_z_m": 0.10}
 # A simulated flight holds no EKF2, and says so
-ALWAYS = ("ekf2_unavailable",)
+ALWAYS = ("ekf2_unavailable", "loop_end_assumed")
 
 
 @dataclass(frozen=True)
@@ -38,17 +41,19 @@ class Condition:
     """A mistake of a stated size, and the finding that must name it.
 
     ``mistakes`` are as ``px4fuse simulate --mistake`` takes them, ``settings`` replace the right
-    ones.
+    ones, ``kind`` is that of the flight.
     """
 
     finding: str
     mistakes: tuple[str, ...] = ()
     settings: dict[str, float] = field(default_factory=dict)
+    kind: Kind = "aisle"
 
     @property
     def name(self) -> str:
         """As it is typed."""
-        options = [f"--mistake {mistake}" for mistake in self.mistakes]
+        options = [] if self.kind == "aisle" else [f"--kind {self.kind}"]
+        options += [f"--mistake {mistake}" for mistake in self.mistakes]
         options += [f"{name}={value:g}" for name, value in self.settings.items()]
         return " ".join(options)
 
@@ -69,7 +74,13 @@ CONDITIONS = (
     Condition("imu_gap", ("imu-dropout=1s",)),
     Condition("no_motion", ("no-motion",)),
     Condition("logging_rate_low", ("imu-rate=20",)),
+    *(
+        Condition("false_loop_closure", (f"open-end={metres}m",), kind="loop")
+        for metres in (3, 5, 8)
+    ),
 )
+# Clean flights: without a mistake
+AISLE, LOOP = Condition(""), Condition("", kind="loop")
 
 
 def found(seed: int, condition: Condition | None = None) -> tuple[str, ...]:
@@ -81,15 +92,21 @@ def found(seed: int, condition: Condition | None = None) -> tuple[str, ...]:
     condition : Condition, optional
         None for a clean flight.
     """
-    condition = condition or Condition("")
-    flight = simulate_flight(Scenario(seed=seed), parse(condition.mistakes))
+    condition = condition or AISLE
+    mistakes = parse(condition.mistakes)
+    if condition.kind == "loop":
+        # without the truth, which would tell where it landed
+        flight = simulate_flight(Scenario(kind="loop", passes=1, truth=False, seed=seed), mistakes)
+        loop = analyse(Source(trajectory_of(flight, "vio"), flight))
+        return tuple(f.id for f in find_loop(loop) if f.id not in ALWAYS)
+    flight = simulate_flight(Scenario(seed=seed), mistakes)
     noises = {**RIGHT_NOISES, **condition.settings}
     settings = Settings(sigma_a_m_s2=noises["sigma_a_m_s2"], sigma_z_m=noises["sigma_z_m"])
     comparison = explain(compare(flight, settings, axes=("north", "east")))
     return tuple(f.id for f in find(comparison) if f.id not in ALWAYS)
 
 
-def _job(job: tuple[int, Condition | None]) -> tuple[str, ...]:
+def _job(job: tuple[int, Condition]) -> tuple[str, ...]:
     return found(*job)
 
 
@@ -105,7 +122,7 @@ def measure(
         ``flights``, ``rate``, its 95 % interval ``low``, ``high`` (Clopper and Pearson 1934), and
         ``first``, the share in which that finding came first.
     """
-    jobs: list[tuple[int, Condition | None]] = [(seed, None) for seed in range(clean_flights)]
+    jobs = [(seed, clean) for clean in (AISLE, LOOP) for seed in range(clean_flights)]
     # other seeds than the clean flights have
     jobs += [(10_000 + seed, c) for c in CONDITIONS for seed in range(faulty_flights)]
     with ProcessPoolExecutor(os.cpu_count()) as pool:
@@ -114,12 +131,17 @@ def measure(
 
 
 def _rows(
-    jobs: list[tuple[int, Condition | None]], results: list[tuple[str, ...]]
+    jobs: list[tuple[int, Condition]], results: list[tuple[str, ...]]
 ) -> Iterator[dict[str, object]]:
-    clean = [result for (_, c), result in zip(jobs, results, strict=True) if c is None]
-    named = sorted({c.finding for c in CONDITIONS} | {name for result in clean for name in result})
-    for name in named:
-        yield _row(name, CLEAN, [name in r for r in clean], [r[:1] == (name,) for r in clean])
+    clean = {
+        kind.kind: [result for (_, c), result in zip(jobs, results, strict=True) if c == kind]
+        for kind in (AISLE, LOOP)
+    }
+    kinds = {name: kind for kind, flights in clean.items() for result in flights for name in result}
+    kinds |= {condition.finding: condition.kind for condition in CONDITIONS}
+    for name, kind in sorted(kinds.items()):
+        own = clean[kind]
+        yield _row(name, CLEAN, [name in r for r in own], [r[:1] == (name,) for r in own])
     for condition in CONDITIONS:
         own = [r for (_, c), r in zip(jobs, results, strict=True) if c == condition]
         name = condition.finding

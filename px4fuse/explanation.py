@@ -1,4 +1,4 @@
-"""What explains a comparison: noises that the data ask for, clock offset, difference budget."""
+"""What explains a comparison: noises asked for, clock offset, difference budget, loop."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from px4fuse.clock import ClockOffset, estimate_clock_offset
 from px4fuse.comparison import Comparison
 from px4fuse.errors import MissingDataError
 from px4fuse.flight import Unavailable
+from px4fuse.trajectory.analysis import loop_in
 from px4fuse.tuning import HORIZONTAL, AxisTuning, tune
 
 # What the report shows; each axis by itself is for `px4fuse tune`
@@ -17,7 +18,7 @@ REPORTED = (HORIZONTAL, "down", "aisle")
 
 
 def explain(comparison: Comparison, progress: Callable[[str], None] = lambda _: None) -> Comparison:
-    """Add tuning, clock offset and difference budget to a comparison.
+    """Add tuning, clock offset, difference budget and loop closure to a comparison.
 
     Parameters
     ----------
@@ -30,7 +31,9 @@ def explain(comparison: Comparison, progress: Callable[[str], None] = lambda _: 
     tuning = tune(axes, comparison.settings, names, lambda name: progress(f"tuning {name}"))
     tuned = replace(comparison, tuning=tuning)
     timed = replace(tuned, clock=clock_offset(tuned, progress))
-    return replace(timed, budget=budget(timed, progress))
+    budgeted = replace(timed, budget=budget(timed, progress))
+    progress("looking for a loop")
+    return replace(budgeted, loop=loop_in(comparison.flight, progress))
 
 
 def tuned_horizontally(comparison: Comparison) -> Comparison:

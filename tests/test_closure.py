@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
@@ -26,7 +27,7 @@ COORDINATE = st.floats(-50.0, 50.0)
 @given(st.lists(st.tuples(COORDINATE, COORDINATE), min_size=3, max_size=30, unique=True))
 def test_distribution_equals_the_lessons_own_code(odom: list[tuple[float, float]]) -> None:
     err = (odom[-1][0] - odom[0][0], odom[-1][1] - odom[0][1])
-    seg = [math.dist(a, b) for a, b in zip(odom, odom[1:], strict=False)]
+    seg = [math.dist(a, b) for a, b in itertools.pairwise(odom)]
     cum = [0.0]
     for s in seg:
         cum.append(cum[-1] + s)

@@ -26,7 +26,8 @@ LINES = [
 def at_root(tmp_path, monkeypatch):
     """A folder that looks like a fresh clone, so that outputs do not land in this one."""
     (tmp_path / "sample_logs").mkdir()
-    for name in ("aisle_uwb.ulg", "aisle_uwb.tlog", "aisle_uwb_external.csv"):
+    for name in ("aisle_uwb.ulg", "aisle_uwb.tlog", "aisle_uwb_external.csv",
+                 "loop_vio.ulg", "loop_slam.tum"):  # fmt: skip
         shutil.copy(ROOT / "sample_logs" / name, tmp_path / "sample_logs")
     monkeypatch.chdir(tmp_path)
 

@@ -12,27 +12,23 @@ from px4fuse.cli.inputs import (
     STANDARD_OUTPUT,
     analysis_options,
     command_line,
-    encodable,
-    path_option,
+    person_options,
     progress,
+    read_person,
     report_options,
     report_paths,
     run_comparison,
     terminal,
     write_outputs,
 )
-from px4fuse.errors import SettingsError
 
 SEVERITIES = ("error", "warning", "info")
-MAX_NOTES_BYTES = 200_000
 
 
 @click.command()
 @click.argument("log", type=click.Path(path_type=Path))
 @analysis_options
-@click.option("--student", default="", metavar="NAME", help="Name on the report.")
-@click.option("--id", "student_id", default="", metavar="ID", help="Student number on the report.")
-@path_option("--notes", metavar="FILE.md", help="Your own words, printed in the report.")
+@person_options
 @report_options
 @click.option(
     "--fail-on",
@@ -42,9 +38,6 @@ MAX_NOTES_BYTES = 200_000
 )
 def compare(
     log: Path,
-    student: str,
-    student_id: str,
-    notes: Path | None,
     output: Path | None,
     json_path: Path | None,
     fail_on: str | None,
@@ -57,11 +50,11 @@ def compare(
     """
     from px4fuse.explanation import explain
     from px4fuse.findings import find
-    from px4fuse.report.document import Document, Student
+    from px4fuse.report.document import Document
     from px4fuse.report.pdf import render
     from px4fuse.report.results import results, to_json
 
-    person = Student(encodable(student), encodable(student_id), _read_notes(notes))
+    person = read_person(analysis)
     target, beside = report_paths(output or Path("reports") / f"{log.stem}.pdf", json_path)
     with progress(json_path == STANDARD_OUTPUT) as step:
         compared = explain(run_comparison(log, step, **analysis), step)
@@ -81,23 +74,3 @@ def compare(
         worst = SEVERITIES[: SEVERITIES.index(fail_on) + 1]
         if any(finding.severity in worst for finding in document.findings):
             sys.exit(1)
-
-
-def _read_notes(path: Path | None) -> str:
-    if path is None:
-        return ""
-    try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise SettingsError(f"--notes {path}: cannot be read ({error.strerror}).") from error
-    if len(content) > MAX_NOTES_BYTES:
-        raise SettingsError(
-            f"--notes {path}: {len(content)} bytes are too many for notes "
-            f"(at most {MAX_NOTES_BYTES})."
-        )
-    try:
-        return content.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise SettingsError(
-            f"--notes {path}: not UTF-8 text (byte {error.start}). Save it as UTF-8."
-        ) from error

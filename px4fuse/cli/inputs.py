@@ -20,14 +20,20 @@ if TYPE_CHECKING:
 
     from px4fuse.comparison import Comparison
     from px4fuse.flight import Flight
+    from px4fuse.report.document import Student
 
 AXES = ("north", "east", "down", "aisle")
 # Options that name places or people; the command line in the report leaves them out
-NOT_RECORDED = ("log", "output", "json_path", "student", "student_id", "notes", "fail_on")
-# Options that name files to read
-INPUTS = ("log", "mavlink", "position", "notes")
+NOT_RECORDED = (
+    "output", "json_path", "tum", "g2o", "student", "student_id", "notes", "fail_on",
+)  # fmt: skip
+# Parameters that name files to read; some name a part of a log after a colon
+INPUTS = (
+    "log", "mavlink", "position", "notes", "source", "estimate", "reference", "closures",
+)  # fmt: skip
 AUTO: Literal["auto"] = "auto"
 STANDARD_OUTPUT = Path("-")
+MAX_NOTES_BYTES = 200_000
 
 
 class NumberOrAuto(click.ParamType[float | str]):
@@ -112,19 +118,20 @@ _ANALYSIS = (
         help="Position source, for example vehicle_gps_position.  [default: the best logged]",
     ),
 )
+system_option = click.option(
+    "--system",
+    type=click.IntRange(0, 255),
+    default=None,
+    metavar="ID",
+    help="MAVLink system id of the vehicle.  [default: the one with the most data]",
+)
 _RECORDINGS = (
     path_option(
         "--mavlink",
         metavar="FILE.tlog",
         help="MAVLink recording of the same flight: gives what LOG lacks.",
     ),
-    click.option(
-        "--system",
-        type=click.IntRange(0, 255),
-        default=None,
-        metavar="ID",
-        help="MAVLink system id of the vehicle.  [default: the one with the most data]",
-    ),
+    system_option,
 )
 _POSITION = (
     path_option(
@@ -180,6 +187,13 @@ json_option = path_option(
     metavar="FILE",
     help="Write it as JSON; - prints that alone on standard output.",
 )
+_PERSON = (
+    click.option("--student", default="", metavar="NAME", help="Name on the report."),
+    click.option(
+        "--id", "student_id", default="", metavar="ID", help="Student number on the report."
+    ),
+    path_option("--notes", metavar="FILE.md", help="Your own words, printed in the report."),
+)
 _REPORT = (
     path_option(
         "-o", "--output", metavar="FILE.pdf", help="The report.  [default: reports/LOG.pdf]"
@@ -204,6 +218,13 @@ def analysis_options(command: Callable[..., None]) -> Callable[..., None]:
     """Add the options of every command that runs the filter: settings, segment and recordings."""
     command = recording_options(command)
     for option in reversed(_ANALYSIS):
+        command = option(command)
+    return command
+
+
+def person_options(command: Callable[..., None]) -> Callable[..., None]:
+    """Add the options that say whose report it is."""
+    for option in reversed(_PERSON):
         command = option(command)
     return command
 
@@ -391,6 +412,40 @@ def write_outputs(contents: Mapping[Path, bytes]) -> None:
     write_all(contents)
 
 
+def read_person(given: dict[str, Any]) -> Student:
+    """Whose report it is, taken out of what :func:`person_options` gave.
+
+    Raises
+    ------
+    SettingsError
+        The notes cannot be read.
+    """
+    from px4fuse.report.document import Student
+
+    name, number = given.pop("student"), given.pop("student_id")
+    return Student(encodable(name), encodable(number), _read_notes(given.pop("notes")))
+
+
+def _read_notes(path: Path | None) -> str:
+    if path is None:
+        return ""
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise SettingsError(f"--notes {path}: cannot be read ({error.strerror}).") from error
+    if len(content) > MAX_NOTES_BYTES:
+        raise SettingsError(
+            f"--notes {path}: {len(content)} bytes are too many for notes "
+            f"(at most {MAX_NOTES_BYTES})."
+        )
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise SettingsError(
+            f"--notes {path}: not UTF-8 text (byte {error.start}). Save it as UTF-8."
+        ) from error
+
+
 def spare_inputs(targets: Iterable[Path]) -> None:
     """Refuse to write over a file that this command reads.
 
@@ -400,7 +455,8 @@ def spare_inputs(targets: Iterable[Path]) -> None:
         A target is one of the inputs.
     """
     params = click.get_current_context().params
-    read = [params[name] for name in INPUTS if params.get(name) is not None]
+    given = [params[name] for name in INPUTS if params.get(name) is not None]
+    read = [path if path.exists() else Path(str(path).rpartition(":")[0]) for path in given]
     for target in targets:
         for source in read:
             if target.exists() and source.exists() and target.samefile(source):
@@ -426,14 +482,14 @@ def encodable(text: str) -> str:
     return text.encode(errors="replace").decode()
 
 
-def command_line(command: str, log: Path) -> str:
+def command_line(command: str, *files: Path) -> str:
     """The command that makes this again: what was given, without folders and names."""
     context = click.get_current_context()
-    words = ["px4fuse", command, encodable(log.name)]
+    words = ["px4fuse", command, *(encodable(file.name) for file in files)]
     for parameter in context.command.params:
         name = parameter.name or ""
         given = context.get_parameter_source(name) == ParameterSource.COMMANDLINE
-        if not given or name in NOT_RECORDED:
+        if not given or name in NOT_RECORDED or isinstance(parameter, click.Argument):
             continue
         value: Any = context.params[name]
         for single in value if isinstance(value, tuple) else (value,):

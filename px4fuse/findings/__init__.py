@@ -6,6 +6,8 @@ findings; it never prints and never guesses: what it cannot see it does not ment
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 from px4fuse.comparison import Comparison
 from px4fuse.findings.ekf2 import (
     accelerometer_bias,
@@ -15,6 +17,7 @@ from px4fuse.findings.ekf2 import (
     resets,
 )
 from px4fuse.findings.filter import process_noise_forgotten, too_few_innovations, variance_wrong
+from px4fuse.findings.loop import find_in_loop, loop_closures
 from px4fuse.findings.model import SEVERITIES, Detector, Finding, Severity
 from px4fuse.findings.noise import (
     clock_off,
@@ -42,13 +45,22 @@ from px4fuse.findings.source import (
     source_frame,
     source_reconstructed,
 )
+from px4fuse.trajectory.loop import Loop
 
-__all__ = ["DETECTORS", "SEVERITIES", "Finding", "Severity", "find"]
+__all__ = ["DETECTORS", "SEVERITIES", "Finding", "Severity", "find", "find_loop"]
 
 
 def find(comparison: Comparison) -> tuple[Finding, ...]:
     """All findings of all detectors, most severe first, each detector's own order kept."""
-    found = [finding for detector in DETECTORS for finding in detector(comparison)]
+    return _sorted(finding for detector in DETECTORS for finding in detector(comparison))
+
+
+def find_loop(loop: Loop) -> tuple[Finding, ...]:
+    """All findings about a loop, most severe first."""
+    return _sorted(find_in_loop(loop))
+
+
+def _sorted(found: Iterable[Finding]) -> tuple[Finding, ...]:
     return tuple(sorted(found, key=lambda finding: SEVERITIES.index(finding.severity)))
 
 
@@ -58,6 +70,7 @@ DETECTORS: tuple[Detector, ...] = (
     frame_turned,
     outliers,
     noises_off,
+    loop_closures,
     ekf2_not_fusing,
     process_noise_forgotten,
     variance_wrong,

@@ -80,7 +80,7 @@ def draw(document: Document) -> Iterator[Figure]:
         if cursor.y - _finding_height(cursor, finding) < BOTTOM:
             yield figure
             figure, cursor = page("Findings, continued")
-        _finding(cursor, finding)
+        write_finding(cursor, finding)
     _plan(figure, cursor, document)
     yield figure
 
@@ -227,7 +227,8 @@ def _finding_height(cursor: Cursor, finding: Finding) -> float:
     return text + 12.0 / POINTS_PER_HEIGHT
 
 
-def _finding(cursor: Cursor, finding: Finding) -> None:
+def write_finding(cursor: Cursor, finding: Finding) -> None:
+    """Write severity, sentence and remedy."""
     cursor.skip(3)
     top = cursor.y
     cursor.write(

@@ -1,4 +1,4 @@
-"""What a report is made of: the comparison, its findings, and who it is for."""
+"""What a report is made of: the comparison or the loop, its findings, and who it is for."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from px4fuse.comparison import Comparison
 from px4fuse.findings import Finding
+from px4fuse.trajectory.loop import Loop
 
 
 @dataclass(frozen=True)
@@ -42,3 +43,49 @@ class Document:
     findings: tuple[Finding, ...]
     student: Student
     command: str
+
+    @property
+    def log(self) -> tuple[str, str]:
+        """Name and SHA-256 of the log."""
+        return self.comparison.flight.log.name, self.comparison.flight.log.sha256
+
+    @property
+    def title(self) -> str:
+        """Of the PDF."""
+        return f"px4fuse compare {self.log[0]}"
+
+
+@dataclass(frozen=True)
+class LoopDocument:
+    """A report on a loop alone.
+
+    Attributes
+    ----------
+    loop : Loop
+    findings : tuple of Finding
+        Most severe first.
+    student : Student
+    command : str
+    """
+
+    loop: Loop
+    findings: tuple[Finding, ...]
+    student: Student
+    command: str
+
+    @property
+    def log(self) -> tuple[str, str]:
+        """Name and SHA-256 of what the trajectory was read from."""
+        track = self.loop.odometry.trajectory
+        return track.name, track.sha256
+
+    @property
+    def title(self) -> str:
+        """Of the PDF."""
+        return f"px4fuse loop {self.log[0]}"
+
+    @property
+    def facts(self) -> tuple[tuple[str, str], ...]:
+        """Whose report it is, and which file it is about."""
+        who = ", ".join(part for part in (self.student.name, self.student.id) if part)
+        return (*((("Student", who),) if who else ()), ("SHA-256", self.log[1]))

@@ -8,7 +8,7 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from px4fuse.report.document import Document
+from px4fuse.report.document import Document, LoopDocument
 from px4fuse.report.style import BOTTOM, LEFT, POINTS_PER_WIDTH, RIGHT, page, printable, wrap
 
 HEADING = re.compile(r"^(#{1,6})\s+(.*?)\s*#*$")
@@ -17,7 +17,7 @@ EMPHASIS = re.compile(r"(\*\*|__)(?=\S)(.+?)(?<=\S)\1")
 BODY_SIZE = 8.5
 
 
-def draw(document: Document) -> Iterator[Figure]:
+def draw(document: Document | LoopDocument) -> Iterator[Figure]:
     """Draw as many pages as the notes need; none without notes."""
     text = document.student.notes
     if not text.strip():

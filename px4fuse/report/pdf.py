@@ -16,13 +16,14 @@ from px4fuse.report import (
     consistency,
     cover,
     innovations,
+    loop,
     notes,
     provenance,
     sensitivity,
     tracks,
     variances,
 )
-from px4fuse.report.document import Document
+from px4fuse.report.document import Document, LoopDocument
 from px4fuse.report.style import LEFT, MUTED, RIGHT, printable, report_style, shorten
 
 RESULTS_NAME = "results.json"
@@ -35,17 +36,19 @@ PAGES = (
     sensitivity.draw,
     clock.draw,
     budget.draw,
+    loop.draw,
     notes.draw,
     provenance.draw,
 )
+LOOP_PAGES = (loop.draw_report, notes.draw, provenance.draw_loop)
 
 
-def render(document: Document, results_json: str) -> bytes:
+def render(document: Document | LoopDocument, results_json: str) -> bytes:
     """Draw the report.
 
     Parameters
     ----------
-    document : Document
+    document : Document or LoopDocument
     results_json : str
         Attached inside the PDF as ``results.json``, so that the PDF alone can be checked.
 
@@ -66,16 +69,22 @@ def render(document: Document, results_json: str) -> bytes:
     return _attach(drawn.getvalue(), document, results_json)
 
 
-def _pages(document: Document) -> Iterator[Figure]:
-    for draw in PAGES:
-        yield from draw(document)
+def _pages(document: Document | LoopDocument) -> Iterator[Figure]:
+    if isinstance(document, LoopDocument):
+        for draw_loop in LOOP_PAGES:
+            yield from draw_loop(document)
+    else:
+        for draw in PAGES:
+            yield from draw(document)
 
 
-def _running_lines(figure: Figure, document: Document, number: int, count: int) -> None:
+def _running_lines(
+    figure: Figure, document: Document | LoopDocument, number: int, count: int
+) -> None:
     """Head and foot of a page: which log, whose, which version, which page."""
-    log = document.comparison.flight.log
+    name, sha256 = document.log
     style = {"size": 6.5, "color": MUTED}
-    head = shorten(printable(f"px4fuse · {log.name} · SHA-256 {log.sha256[:12]}"), 6.5, 330)
+    head = shorten(printable(f"px4fuse · {name} · SHA-256 {sha256[:12]}"), 6.5, 330)
     who = " · ".join(part for part in (document.student.name, document.student.id) if part)
     figure.text(LEFT, 0.972, head, **style)  # type: ignore[arg-type]
     if who:
@@ -85,11 +94,13 @@ def _running_lines(figure: Figure, document: Document, number: int, count: int) 
     figure.text(RIGHT, 0.022, f"{number} / {count}", ha="right", **style)  # type: ignore[arg-type]
 
 
-def _attach(drawn: bytes, document: Document, results_json: str) -> bytes:
+def _attach(drawn: bytes, document: Document | LoopDocument, results_json: str) -> bytes:
     writer = PdfWriter(clone_from=io.BytesIO(drawn))
     writer.add_attachment(RESULTS_NAME, results_json.encode())
-    title = f"px4fuse compare {document.comparison.flight.log.name}"
-    writer.metadata = {"/Title": title, "/Creator": f"px4fuse {metadata.version('px4fuse')}"}
+    writer.metadata = {
+        "/Title": document.title,
+        "/Creator": f"px4fuse {metadata.version('px4fuse')}",
+    }
     out = io.BytesIO()
     writer.write(out)
     return out.getvalue()

@@ -19,15 +19,25 @@ from px4fuse.budget import Budget, Effect
 from px4fuse.clock import ClockOffset
 from px4fuse.comparison import AgainstTruth, AxisComparison, Comparison, FilterSummary
 from px4fuse.consistency import Consistency
+from px4fuse.findings import Finding
 from px4fuse.flight import Unavailable, sample_rate
+from px4fuse.plain import present, unavailable
 from px4fuse.report.document import Document
+from px4fuse.report.trajectory_results import (
+    evaluation_part,
+    graph_part,
+    loop_part,
+    trajectory_part,
+)
+from px4fuse.trajectory.evaluation import Evaluation
+from px4fuse.trajectory.graph_analysis import SolvedGraph
+from px4fuse.trajectory.loop import Loop
 from px4fuse.tuning import AxisTuning, Noise
 
 SCHEMA_NAME = "px4fuse-results"
-SCHEMA_VERSION = "1.1"
+SCHEMA_VERSION = "1.2"
 # The libraries on whose arithmetic the numbers rest
 LIBRARIES = ("numpy", "scipy", "pandas", "pyulog", "pymavlink", "filterpy", "matplotlib", "pypdf")
-NOT_YET = "this version does not compute it"
 
 
 def schema() -> dict[str, Any]:
@@ -71,17 +81,10 @@ def results(document: Document) -> dict[str, Any]:
             comparison.settings.clock_offset_s,
         ),
         "budget": {name: _budget(found) for name, found in comparison.budget.items()},
-        "loop": _unavailable(Unavailable("loop closure", NOT_YET, "None needed on an aisle.")),
-        "findings": [
-            {
-                "id": finding.id,
-                "severity": finding.severity,
-                "message": finding.message,
-                "evidence": finding.evidence,
-                "remedy": finding.remedy,
-            }
-            for finding in document.findings
-        ],
+        "loop": loop_part(
+            comparison.loop or Unavailable("loop closure", "it was not asked for", "See loop.")
+        ),
+        "findings": [_finding(finding) for finding in document.findings],
         "notes": list(comparison.notes),
         "missing": [asdict(part) for part in comparison.missing],
         "student": asdict(document.student),
@@ -105,6 +108,48 @@ def sync_results(
     return _of_command("px4fuse-sync", comparison, command, {"clock": found})
 
 
+def loop_results(loop: Loop, findings: tuple[Finding, ...], command: str) -> dict[str, Any]:
+    """What ``px4fuse loop`` found, as plain data."""
+    return {
+        "schema": {"name": "px4fuse-loop", "version": "1.0"},
+        "track": trajectory_part(loop.odometry.trajectory),
+        "references": [trajectory_part(reference) for reference in loop.references],
+        "loop": loop_part(loop),
+        "findings": [_finding(finding) for finding in findings],
+        "provenance": provenance(command),
+    }
+
+
+def graph_results(name: str, solved: SolvedGraph, command: str) -> dict[str, Any]:
+    """What ``px4fuse loop`` found about a pose graph from a file, as plain data."""
+    return {
+        "schema": {"name": "px4fuse-graph", "version": "1.0"},
+        "graph": graph_part(name, solved),
+        "provenance": provenance(command),
+    }
+
+
+def evaluation_results(score: Evaluation, command: str) -> dict[str, Any]:
+    """What ``px4fuse evaluate`` found, as plain data."""
+    return {
+        "schema": {"name": "px4fuse-evaluation", "version": "1.0"},
+        "estimate": trajectory_part(score.estimate),
+        "reference": trajectory_part(score.reference),
+        **evaluation_part(score),
+        "provenance": provenance(command),
+    }
+
+
+def _finding(finding: Finding) -> dict[str, Any]:
+    return {
+        "id": finding.id,
+        "severity": finding.severity,
+        "message": finding.message,
+        "evidence": finding.evidence,
+        "remedy": finding.remedy,
+    }
+
+
 def _of_command(
     schema_name: str, comparison: Comparison, command: str, found: dict[str, Any]
 ) -> dict[str, Any]:
@@ -122,9 +167,9 @@ def _of_command(
 def _clock(clock: ClockOffset | Unavailable, applied_s: float) -> dict[str, Any]:
     """Offsets count from the source's own stamps, what was applied already included."""
     if isinstance(clock, Unavailable):
-        return _unavailable(clock)
+        return unavailable(clock)
     low, high = clock.interval_s
-    return _present(
+    return present(
         {
             "offset_s": applied_s + clock.offset_s,
             "interval_s": [applied_s + low, applied_s + high],
@@ -151,9 +196,9 @@ def _clock(clock: ClockOffset | Unavailable, applied_s: float) -> dict[str, Any]
 
 def _tuned(found: AxisTuning | Unavailable) -> dict[str, Any]:
     if isinstance(found, Unavailable):
-        return _unavailable(found)
+        return unavailable(found)
     held = found.held_out
-    return _present(
+    return present(
         {
             **_noise("sigma_a_m_s2", found.sigma_a),
             **_noise("sigma_z_m", found.sigma_z),
@@ -162,7 +207,7 @@ def _tuned(found: AxisTuning | Unavailable) -> dict[str, Any]:
             "gain_nats": found.gain_nats,
             "before": _statement(found.before),
             "after": _statement(found.after),
-            "held_out": _unavailable(held) if isinstance(held, Unavailable) else asdict(held),
+            "held_out": unavailable(held) if isinstance(held, Unavailable) else asdict(held),
             "als_sigma_a_m_s2": found.als_sigma_a_m_s2,
             "als_sigma_z_m": found.als_sigma_z_m,
         }
@@ -171,35 +216,35 @@ def _tuned(found: AxisTuning | Unavailable) -> dict[str, Any]:
 
 def _budget(found: Budget | Unavailable) -> dict[str, Any]:
     if isinstance(found, Unavailable):
-        return _unavailable(found)
+        return unavailable(found)
     truth = found.truth
     return {
         "count": found.count,
-        **_present(asdict(found.baseline)),
+        **present(asdict(found.baseline)),
         "causes": {
             name.replace(" ", "_"): _effect(effect) for name, effect in found.causes.items()
         },
         "together": _effect(found.together),
         "clock": _effect(found.clock),
-        "truth": _unavailable(truth)
+        "truth": unavailable(truth)
         if isinstance(truth, Unavailable)
-        else _present(asdict(truth) | {"reasons": list(truth.reasons)}),
+        else present(asdict(truth) | {"reasons": list(truth.reasons)}),
     }
 
 
 def _effect(effect: Effect | Unavailable) -> dict[str, Any]:
     if isinstance(effect, Unavailable):
-        return _unavailable(effect)
+        return unavailable(effect)
     without = effect.without
     return {
         "made": effect.made,
-        **_present(asdict(effect.alone)),
+        **present(asdict(effect.alone)),
         "position_share": effect.position_share,
         "velocity_share": effect.velocity_share,
         **(
             {}
             if without is None
-            else {f"without_{name}": value for name, value in _present(asdict(without)).items()}
+            else {f"without_{name}": value for name, value in present(asdict(without)).items()}
         ),
     }
 
@@ -207,14 +252,14 @@ def _effect(effect: Effect | Unavailable) -> dict[str, Any]:
 def _noise(name: str, noise: Noise) -> dict[str, Any]:
     """Value and interval, or a bound where there is only that; an open lower end is 0."""
     if noise.value is None:
-        return _present({f"{name}_upper_bound": noise.high, f"{name}_lower_bound": noise.low})
+        return present({f"{name}_upper_bound": noise.high, f"{name}_lower_bound": noise.low})
     if noise.high is None:
         return {name: noise.value}
     return {name: noise.value, f"{name}_interval": [noise.low or 0.0, noise.high]}
 
 
 def _statement(statement: Consistency | Unavailable) -> dict[str, Any]:
-    return asdict(statement) if isinstance(statement, Consistency) else _unavailable(statement)
+    return asdict(statement) if isinstance(statement, Consistency) else unavailable(statement)
 
 
 def provenance(command: str) -> dict[str, Any]:
@@ -225,15 +270,6 @@ def provenance(command: str) -> dict[str, Any]:
         "libraries": {name: metadata.version(name) for name in LIBRARIES},
         "command": command,
     }
-
-
-def _unavailable(part: Unavailable) -> dict[str, Any]:
-    return {"unavailable": asdict(part)}
-
-
-def _present(values: dict[str, Any]) -> dict[str, Any]:
-    """Without the entries that could not be computed."""
-    return {name: value for name, value in values.items() if value is not None}
 
 
 def _log(comparison: Comparison) -> dict[str, Any]:
@@ -252,9 +288,9 @@ def _log(comparison: Comparison) -> dict[str, Any]:
         "parameters": dict(log.parameters),
         "notes": list(log.notes),
         "autopilot": log.autopilot,
-        **_present({"start_unix_s": log.start_unix_s}),
+        **present({"start_unix_s": log.start_unix_s}),
         "joined": [asdict(file) for file in comparison.flight.inputs],
-        "clocks": [_present(asdict(clock)) for clock in comparison.flight.clocks],
+        "clocks": [present(asdict(clock)) for clock in comparison.flight.clocks],
     }
 
 
@@ -272,7 +308,7 @@ def _source(comparison: Comparison) -> dict[str, Any]:
         "reconstructed": source.reconstructed,
         "topics": list(source.topics),
         "available": [
-            _present(
+            present(
                 {
                     "name": track.name,
                     "rung": track.rung,
@@ -283,10 +319,10 @@ def _source(comparison: Comparison) -> dict[str, Any]:
             for track in comparison.flight.positions
         ],
         "not_in_log": [asdict(part) for part in looked_for],
-        **_present(
+        **present(
             {
                 "log": source.log,
-                "alignment": _present(asdict(source.alignment)) if source.alignment else None,
+                "alignment": present(asdict(source.alignment)) if source.alignment else None,
             }
         ),
     }
@@ -311,12 +347,12 @@ def _settings(comparison: Comparison) -> dict[str, Any]:
 def _axis(result: AxisComparison) -> dict[str, Any]:
     updates = result.replay.updates
     asked = result.noise_asked
-    return _present(
+    return present(
         {
             "heading_deg": result.axis.heading_deg,
             "direction": [float(part) for part in result.axis.direction],
             "note": result.axis.note,
-            "updates": _present(
+            "updates": present(
                 {
                     "count": len(updates),
                     "first_s": float(updates.index[0]),
@@ -328,7 +364,7 @@ def _axis(result: AxisComparison) -> dict[str, Any]:
             ),
             "kf": _filter(result.kf),
             "ekf2": _filter(result.ekf2),
-            "difference": _unavailable(result.difference)
+            "difference": unavailable(result.difference)
             if isinstance(result.difference, Unavailable)
             else asdict(result.difference),
             "truth": _truth(result),
@@ -338,17 +374,17 @@ def _axis(result: AxisComparison) -> dict[str, Any]:
 
 def _filter(summary: FilterSummary | Unavailable) -> dict[str, Any]:
     if isinstance(summary, Unavailable):
-        return _unavailable(summary)
+        return unavailable(summary)
     sigmas = asdict(summary)
     del sigmas["consistency"]
-    return _statement(summary.consistency) | _present(sigmas)
+    return _statement(summary.consistency) | present(sigmas)
 
 
 def _truth(result: AxisComparison) -> dict[str, Any]:
     if isinstance(result.truth, Unavailable):
-        return _unavailable(result.truth)
+        return unavailable(result.truth)
     values: dict[str, Any] = {}
     for name, part in (("kf", result.kf_truth), ("ekf2", result.ekf2_truth)):
         if isinstance(part, AgainstTruth):
             values |= {f"{name}_{key}": value for key, value in asdict(part).items()}
-    return _present(values)
+    return present(values)

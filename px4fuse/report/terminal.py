@@ -10,7 +10,7 @@ from rich.text import Text
 
 from px4fuse.comparison import AgainstTruth, AxisComparison, Difference, FilterSummary
 from px4fuse.consistency import Consistency
-from px4fuse.findings import Severity
+from px4fuse.findings import Finding, Severity
 from px4fuse.flight import Unavailable
 from px4fuse.report.document import Document
 from px4fuse.report.words import settings_words, verdict_words
@@ -34,10 +34,10 @@ def print_summary(console: Console, document: Document) -> None:
     log = comparison.flight.log
     opponent = "" if isinstance(comparison.flight.ekf2, Unavailable) else ", against EKF2"
     names = " + ".join([log.name, *(file.name for file in comparison.flight.inputs)])
-    _line(console, "Log", f"{names}, {log.firmware}, {log.duration_s:.1f} s")
-    _line(console, "Filter", settings_words(comparison.settings) + opponent)
+    print_line(console, "Log", f"{names}, {log.firmware}, {log.duration_s:.1f} s")
+    print_line(console, "Filter", settings_words(comparison.settings) + opponent)
     source = comparison.source
-    _line(
+    print_line(
         console, "Position", f"{source.name}, {source.rate_hz:.1f} Hz ({comparison.source_reason})"
     )
     if source.alignment is not None:
@@ -47,19 +47,26 @@ def print_summary(console: Console, document: Document) -> None:
             f"{placed.frame}, yaw {placed.yaw_deg:.1f}°, clock {placed.clock_offset_s:+.3f}"
             + (f" ± {sigma:.3f} s" if sigma is not None else " s")
         )
-        _line(console, "Placed", placing)
+        print_line(console, "Placed", placing)
     segment = comparison.segment
-    _line(console, "Segment", f"{segment.start_s:.1f} s to {segment.end_s:.1f} s, {segment.reason}")
+    print_line(
+        console, "Segment", f"{segment.start_s:.1f} s to {segment.end_s:.1f} s, {segment.reason}"
+    )
     console.print(_table(document))
     console.print(Text("vs: RMSE of position (m), velocity (m/s). NIS 1 is consistent.", "dim"))
     if not document.findings:
         console.print(Text("No findings."))
     for finding in document.findings[:MOST_FINDINGS]:
-        line = Text(f"{finding.severity:9}", style=STYLES[finding.severity])
-        console.print(line.append(finding.message, style="none"), **ONE_LINE)
-        console.print(Text(" " * 9 + finding.remedy, style="dim"), **ONE_LINE)
+        print_finding(console, finding)
     if (more := len(document.findings) - MOST_FINDINGS) > 0:
         console.print(Text(f"and {more} more in the report"))
+
+
+def print_finding(console: Console, finding: Finding) -> None:
+    """Print severity, sentence and remedy, a line each."""
+    line = Text(f"{finding.severity:9}", style=STYLES[finding.severity])
+    console.print(line.append(finding.message, style="none"), **ONE_LINE)
+    console.print(Text(" " * 9 + finding.remedy, style="dim"), **ONE_LINE)
 
 
 def _table(document: Document) -> Table:
@@ -83,8 +90,10 @@ def _table(document: Document) -> Table:
     return table
 
 
-def _line(console: Console, label: str, text: str) -> None:
-    console.print(Text(f"{label:9}", style="bold").append(text, style="none"), **ONE_LINE)
+def print_line(console: Console, label: str, text: str, *, whole: bool = False) -> None:
+    """Print a label and a text, cut at the screen's edge unless all of it is wanted."""
+    line = Text(f"{label:9}", style="bold").append(text, style="none")
+    console.print(line, **({"soft_wrap": True} if whole else ONE_LINE))
 
 
 def _statement(summary: FilterSummary) -> tuple[str, str, Text]:

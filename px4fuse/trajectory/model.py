@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -15,6 +16,13 @@ Kind = Literal["vio", "ekf2", "kf", "truth", "slam", "unknown"]
 # Axes of its world: "NED" and "FRD" have z down, "ENU" z up, "camera" y down and z forward
 Frame = Literal["NED", "FRD", "ENU", "camera", "unknown"]
 MIN_POSES = 3
+AXES_OF_FRAME: Mapping[Frame, tuple[str, str, str]] = {
+    "NED": ("north", "east", "down"),
+    "FRD": ("forward", "right", "down"),
+    "ENU": ("east", "north", "up"),
+    "camera": ("right", "down", "forward"),
+    "unknown": ("x", "y", "z"),
+}
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,295 @@
+"""``px4fuse loop``: the loop-closure error of a flight or a trajectory, and its correction."""
+
+from __future__ import annotations
+
+from dataclasses import astuple, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+from click.core import ParameterSource
+
+from px4fuse.cli.inputs import (
+    STANDARD_OUTPUT,
+    command_line,
+    path_option,
+    person_options,
+    progress,
+    read_person,
+    report_paths,
+    spare_inputs,
+    system_option,
+    terminal,
+    write_json,
+    write_outputs,
+)
+from px4fuse.errors import SettingsError
+
+if TYPE_CHECKING:
+    from px4fuse.trajectory.loop import Loop
+
+FRAMES = {"ned": "NED", "frd": "FRD", "enu": "ENU", "camera": "camera"}
+# Nobody's tape is longer
+MAX_LANDED_AT = 10_000.0
+# What may be given with a pose graph
+FOR_GRAPHS = ("source", "json_path", "g2o")
+
+
+@dataclass(frozen=True)
+class Landing:
+    """Where it landed from where it took off, and how far it was turned there."""
+
+    forward_m: float
+    right_m: float
+    turned_deg: float | None = None
+
+    def __str__(self) -> str:
+        """As it is typed."""
+        return ",".join(f"{number:.12g}" for number in astuple(self) if number is not None)
+
+
+class LandingType(click.ParamType[Landing]):
+    """``FORWARD,RIGHT`` or ``FORWARD,RIGHT,DEG``."""
+
+    name = "landing"
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> Landing:
+        """Convert what was typed."""
+        if isinstance(value, Landing):
+            return value
+        try:
+            numbers = [float(part) for part in value.split(",")]
+        except ValueError:
+            numbers = []
+        if len(numbers) not in (2, 3) or not all(abs(n) <= MAX_LANDED_AT for n in numbers):
+            self.fail(f"{value!r} is not FORWARD,RIGHT in m, or FORWARD,RIGHT,DEG.", param, ctx)
+        return Landing(*numbers)
+
+
+@click.command()
+@click.argument("source", type=click.Path(path_type=Path))
+@click.option(
+    "--from",
+    "start",
+    type=float,
+    default=None,
+    metavar="S",
+    help="Start of the loop: seconds from the first data, or a trajectory's own stamps.  "
+    "[default: take-off]",
+)
+@click.option("--to", "end", type=float, default=None, metavar="S", help="End.  [default: landing]")
+@click.option(
+    "--landed-at",
+    type=LandingType(),
+    default=None,
+    metavar="FORWARD,RIGHT[,DEG]",
+    help="Where it really landed, by tape from the place of take-off: m along its nose there, m to "
+    "the right, and degrees it was turned clockwise.  [default: the log's ground truth, else 0,0]",
+)
+@click.option("--open", "opened", is_flag=True, help="It did not come back: use no landing.")
+@click.option(
+    "--closure",
+    multiple=True,
+    metavar="T1,T2[,SIGMA]",
+    help="It was at the same place at two times, within SIGMA m (0.10); may be repeated.",
+)
+@path_option("--closures", metavar="FILE", help="Such closures, one a line.")
+@path_option(
+    "--reference",
+    metavar="FILE|LOG:PART",
+    help="What the paths are scored against, besides the log's ground truth: a SLAM trajectory.",
+)
+@click.option(
+    "--drift",
+    type=float,
+    default=1.0,
+    show_default=True,
+    metavar="M",
+    help="Standard deviation of the odometry's position after 100 m.",
+)
+@click.option(
+    "--heading-drift",
+    type=float,
+    default=3.0,
+    show_default=True,
+    metavar="DEG",
+    help="Standard deviation of its heading after 100 m.",
+)
+@click.option(
+    "--key-frames",
+    type=float,
+    default=None,
+    metavar="M",
+    help="Distance between key frames.  [default: a fiftieth of the extent, 0.02 to 0.5]",
+)
+@click.option(
+    "--frame",
+    type=click.Choice(list(FRAMES)),
+    default=None,
+    help="Axes of a trajectory file.  [default: recognised]",
+)
+@system_option
+@person_options
+@path_option("-o", "--output", metavar="FILE.pdf", help="A report, and its results beside it.")
+@path_option("--json", "json_path", metavar="FILE", help="The results; - prints them alone.")
+@path_option("--tum", metavar="FILE", help="Write the corrected path as a TUM file.")
+@path_option("--g2o", metavar="FILE", help="Write the pose graph, solved, as a g2o file.")
+def loop(
+    source: Path,
+    frame: str | None,
+    system: int | None,
+    reference: Path | None,
+    output: Path | None,
+    json_path: Path | None,
+    tum: Path | None,
+    g2o: Path | None,
+    **given: Any,
+) -> None:
+    """Measure how far a loop fails to close, and correct its path.
+
+    SOURCE is a flight log (its visual-inertial odometry, or EKF2's track; LOG:vio, LOG:ekf2 and
+    LOG:kf choose), a trajectory (TUM, EuRoC, ORB-SLAM3), or a pose graph (g2o), which is solved.
+    """
+    from px4fuse.findings import find_loop
+    from px4fuse.report.document import LoopDocument
+    from px4fuse.report.loop_terminal import print_loop
+    from px4fuse.report.results import loop_results, to_json
+    from px4fuse.trajectory.sources import is_g2o, read_source, split_part
+
+    person = read_person(given)
+    for option, path in (("--tum", tum), ("--g2o", g2o)):
+        if path == STANDARD_OUTPUT:
+            raise SettingsError(f"{option} -: only --json can print. Give a file name.")
+    if is_g2o(split_part(str(source))[0]):
+        _solve(source, json_path, g2o)
+        return
+    for option in ("start", "end"):
+        if given[option] is not None and not abs(given[option]) < float("inf"):
+            name = {"start": "--from", "end": "--to"}[option]
+            raise SettingsError(f"{name} {given[option]:g} is not a finite number.")
+    _spare(tum, g2o, *((json_path,) if output is None else report_paths(output, json_path)))
+    with progress(json_path == STANDARD_OUTPUT) as step:
+        step(f"reading {source.name}")
+        read = read_source(str(source), frame=FRAMES.get(frame or ""), system=system)  # type: ignore[arg-type]
+        if frame is not None and read.flight is not None:
+            raise SettingsError(
+                f"--frame {frame} is for trajectory files; {read.flight.log.name} is a flight log, "
+                "which states its frame. Leave --frame out."
+            )
+        other = None
+        if reference is not None:
+            other = read_source(str(reference), default="truth", system=system)
+        found = _analyse(read, None if other is None else other.trajectory, step, **given)
+        findings = find_loop(found)
+        files = (source,)
+        command = command_line("loop", *files)
+        results = loop_results(found, findings, command)
+        contents = _files(found, tum, g2o)
+        if output is not None:
+            from px4fuse.report.pdf import render
+
+            step("drawing the report")
+            pdf, beside = report_paths(output, json_path)
+            text = to_json(results)
+            document = LoopDocument(found, findings, person, command)
+            contents |= {pdf: render(document, text), beside: text.encode()}
+        elif json_path not in (None, STANDARD_OUTPUT):
+            contents[json_path] = to_json(results).encode()
+        if contents:
+            write_outputs(contents)
+    if json_path == STANDARD_OUTPUT:
+        write_json(results, json_path)
+        return
+    console = terminal()
+    print_loop(console, found, findings)
+    for path in contents:
+        console.print(f"Wrote    {path}", markup=False, style="bold", soft_wrap=True)
+
+
+def _spare(*targets: Path | None) -> None:
+    """Refuse outputs that name the same file, or one that this command reads."""
+    files = [path for path in targets if path not in (None, STANDARD_OUTPUT)]
+    if len({path.resolve() for path in files}) < len(files):
+        raise SettingsError("two outputs name the same file. Give each a name of its own.")
+    spare_inputs(files)
+
+
+def _analyse(read: Any, other: Any, step: Any, **given: Any) -> Loop:
+    from px4fuse.readers.closures import parse_closure, read_closures
+    from px4fuse.trajectory.analysis import analyse
+    from px4fuse.trajectory.odometry import OdometryNoise
+
+    closures = tuple(parse_closure(text) for text in given["closure"])
+    if given["closures"] is not None:
+        closures += read_closures(given["closures"])
+    return analyse(
+        read,
+        start_s=given["start"],
+        end_s=given["end"],
+        landed_at=None if given["landed_at"] is None else astuple(given["landed_at"]),
+        came_back=not given["opened"],
+        closures=closures,
+        noise=OdometryNoise(given["drift"], given["heading_drift"]),
+        reference=other,
+        spacing_m=given["key_frames"],
+        progress=step,
+    )
+
+
+def _files(found: Loop, tum: Path | None, g2o: Path | None) -> dict[Path, bytes]:
+    """The corrected path and the solved graph, as files for other tools."""
+    from px4fuse.errors import MissingDataError
+    from px4fuse.readers.g2o import g2o_text
+    from px4fuse.readers.trajectory import tum_text
+
+    contents = {}
+    if tum is not None:
+        best = found.best
+        if best is found.odometry:
+            raise MissingDataError(
+                f"--tum {tum.name}: there is no corrected path: no closure could be used."
+            )
+        contents[tum] = tum_text(best.trajectory).encode()
+    if g2o is not None:
+        contents[g2o] = g2o_text(found.solved_graph()).encode()
+    return contents
+
+
+def _solve(source: Path, json_path: Path | None, g2o: Path | None) -> None:
+    """Solve a pose graph from a file."""
+    from px4fuse.readers.g2o import g2o_text, read_g2o
+    from px4fuse.report.loop_terminal import print_graph
+    from px4fuse.report.results import graph_results, to_json
+    from px4fuse.trajectory.graph_analysis import analyse_graph
+    from px4fuse.trajectory.sources import split_part
+
+    path, part = split_part(str(source))
+    if part is not None:
+        raise SettingsError(f"{source.name}: a pose graph has no part {part!r}. Leave it out.")
+    context = click.get_current_context()
+    for parameter in context.command.params:
+        chosen = context.get_parameter_source(parameter.name or "") == ParameterSource.COMMANDLINE
+        if chosen and parameter.name not in FOR_GRAPHS:
+            raise SettingsError(
+                f"{source.name}: {parameter.opts[-1]} is for flights and trajectories, not for a "
+                "pose graph. With one, give only --g2o FILE and --json FILE."
+            )
+    _spare(json_path, g2o)
+    with progress(json_path == STANDARD_OUTPUT) as step:
+        step(f"reading {source.name}")
+        solved = analyse_graph(read_g2o(path), step)
+    results = graph_results(source.name, solved, command_line("loop", source))
+    contents = {} if g2o is None else {g2o: g2o_text(solved.graph).encode()}
+    if json_path not in (None, STANDARD_OUTPUT):
+        contents[json_path] = to_json(results).encode()
+    if contents:
+        write_outputs(contents)
+    if json_path == STANDARD_OUTPUT:
+        write_json(results, json_path)
+        return
+    console = terminal()
+    print_graph(console, source.name, solved)
+    for file in contents:
+        console.print(f"Wrote    {file}", markup=False, style="bold", soft_wrap=True)

@@ -1,0 +1,77 @@
+"""Loop closures that a person gives: pairs of times at which the vehicle was at the same place."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from px4fuse.errors import TrajectoryError
+
+DEFAULT_SIGMA_M = 0.10
+MAX_CLOSURES = 10_000
+_FIELDS = (2, 3)
+
+
+@dataclass(frozen=True)
+class GivenClosure:
+    """Two times (s) at which the vehicle was at the same place, within ``sigma_m`` each axis."""
+
+    time_1_s: float
+    time_2_s: float
+    sigma_m: float = DEFAULT_SIGMA_M
+
+
+def parse_closure(text: str) -> GivenClosure:
+    """Read ``T1,T2`` or ``T1,T2,SIGMA``.
+
+    Raises
+    ------
+    TrajectoryError
+        It is not two or three finite numbers.
+    """
+    parts = [part.strip() for part in text.split(",")]
+    try:
+        numbers = [float(part) for part in parts]
+    except ValueError:
+        numbers = []
+    if len(numbers) not in _FIELDS or not all(abs(number) < float("inf") for number in numbers):
+        raise TrajectoryError(
+            f"closure {text.strip()[:60]!r} is not T1,T2 or T1,T2,SIGMA: two times in s and a "
+            "standard deviation in m."
+        )
+    return GivenClosure(*numbers)
+
+
+def read_closures(path: Path) -> tuple[GivenClosure, ...]:
+    """Read a file of closures, one ``T1,T2[,SIGMA]`` a line; ``#`` begins a comment.
+
+    Raises
+    ------
+    TrajectoryError
+        The file cannot be read, holds no closure, or a line is none.
+    """
+    try:
+        data = path.read_bytes()
+        is_utf16 = data.startswith(b"\xff\xfe")  # a Windows shell's redirection
+        text = data.decode("utf-16" if is_utf16 else "utf-8-sig")
+    except OSError as error:
+        raise TrajectoryError(f"{path.name}: cannot be read ({error.strerror}).") from error
+    except UnicodeDecodeError as error:
+        raise TrajectoryError(
+            f"{path.name}: not a text file. Give one T1,T2[,SIGMA] a line."
+        ) from error
+    found: list[GivenClosure] = []
+    for number, line in enumerate(text.splitlines(), start=1):
+        content = line.split("#", 1)[0].strip()
+        if not content or (not found and content[0].isalpha()):  # a header
+            continue
+        try:
+            found.append(parse_closure(content))
+        except TrajectoryError as error:
+            raise TrajectoryError(f"{path.name}, line {number}: {error}") from error
+    if not 0 < len(found) <= MAX_CLOSURES:
+        raise TrajectoryError(
+            f"{path.name}: {len(found)} closures; give 1 to {MAX_CLOSURES}, one T1,T2[,SIGMA] a "
+            "line."
+        )
+    return tuple(found)

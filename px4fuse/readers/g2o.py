@@ -1,0 +1,345 @@
+"""Pose graphs in g2o's text format, in the plane and in space."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from px4fuse.errors import TrajectoryError
+from px4fuse.trajectory.model import Array
+from px4fuse.trajectory.pose_graph import FROM_FILE, PoseGraph, initialise
+from px4fuse.trajectory.pose_graph_model import IntArray
+
+# Tag: dimension, vertices that it names, numbers that follow them
+_TAGS = {
+    "VERTEX_SE2": (2, 1, 3),
+    "VERTEX_SE3:QUAT": (3, 1, 7),
+    "EDGE_SE2": (2, 2, 3 + 6),
+    "EDGE_SE3:QUAT": (3, 2, 7 + 21),
+}
+# Lines of g2o's own tools that add nothing to poses and edges between them
+_IGNORED = ("PARAMS", "ROBOTLASER", "RAWLASER", "FLASER", "RLASER")
+_TORO = ("VERTEX2", "VERTEX3", "EDGE2", "EDGE3")
+# Files are printed with few digits: a matrix this far from semidefinite is meant as one
+_ROUNDING = 1e-9
+# Of a squared norm: what normalising again would not improve
+_UNIT = 1e-15
+_BIGGEST_ID = 2**63
+
+
+@dataclass
+class _Lines:
+    """Lines of one tag: which ones, the vertices that they name, their numbers."""
+
+    line: list[int] = field(default_factory=list)
+    ids: list[list[int]] = field(default_factory=list)
+    numbers: list[list[float]] = field(default_factory=list)
+
+
+def read_g2o(path: str | Path) -> PoseGraph:
+    """Read a pose graph.
+
+    VERTEX_SE2, EDGE_SE2, VERTEX_SE3:QUAT, EDGE_SE3:QUAT and FIX are read; blank lines, comments
+    (``#``), repeated blanks and Windows line ends are no matter. Vertices are put in the order of
+    their numbers. One FIX is accepted and changes nothing but the frame: the first pose is what is
+    held here. Where the file has no vertices, poses are made from the edges.
+
+    Parameters
+    ----------
+    path : str or Path
+
+    Raises
+    ------
+    TrajectoryError
+        One line with the file, the line and what to do, for what is not such a file, has a number
+        that is not finite, an edge to a vertex that is not there, a vertex twice, a matrix that is
+        no information matrix, or both kinds of pose.
+    """
+    file = Path(path)
+    return parse_g2o(_text(file), file.name)
+
+
+def parse_g2o(text: str, name: str) -> PoseGraph:
+    """Read a pose graph from its text.
+
+    Parameters
+    ----------
+    text : str
+    name : str
+        Of the file, for messages.
+
+    Raises
+    ------
+    TrajectoryError
+        As :func:`read_g2o`.
+    """
+    found, fixed = _split(text, name)
+    tags = [tag for tag in _TAGS if found[tag].line]
+    dimensions = {_TAGS[tag][0] for tag in tags}
+    if len(dimensions) > 1:
+        line = min(found[tag].line[0] for tag in tags if _TAGS[tag][0] == 3)
+        raise TrajectoryError(
+            f"{name}: line {line}: poses in space (SE3) beside poses in the plane (SE2). Give one "
+            "kind per file."
+        )
+    kind = "SE2" if dimensions == {2} else "SE3:QUAT"
+    vertices, edges = found[f"VERTEX_{kind}"], found[f"EDGE_{kind}"]
+    if not edges.line:
+        raise TrajectoryError(
+            f"{name}: no edges. Give a g2o file with EDGE_SE2 or EDGE_SE3:QUAT lines."
+        )
+    return _graph(name, 2 if kind == "SE2" else 3, vertices, edges, fixed)
+
+
+def g2o_text(graph: PoseGraph) -> str:
+    """A pose graph in g2o's format, which :func:`read_g2o` turns into the same numbers.
+
+    Parameters
+    ----------
+    graph : PoseGraph
+
+    Returns
+    -------
+    str
+        Vertices, a FIX of the first one, edges; every number with all its digits.
+    """
+    kind = "SE2" if graph.dimension == 2 else "SE3:QUAT"
+    ids = graph.ids.tolist()
+    upper = np.triu_indices(graph.freedom)
+    lines = [
+        f"VERTEX_{kind} {number} {' '.join(map(repr, pose))}"
+        for number, pose in zip(ids, graph.poses.tolist(), strict=True)
+    ]
+    lines.append(f"FIX {ids[0]}")
+    numbers = np.hstack([graph.measurements, graph.information[:, upper[0], upper[1]]]).tolist()
+    lines += [
+        f"EDGE_{kind} {ids[i]} {ids[j]} {' '.join(map(repr, row))}"
+        for i, j, row in zip(graph.first.tolist(), graph.second.tolist(), numbers, strict=True)
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _text(file: Path) -> str:
+    try:
+        content = file.read_bytes()
+    except OSError as error:
+        raise TrajectoryError(f"{file.name}: cannot be read: {error.strerror}.") from error
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        raise TrajectoryError(
+            f"{file.name}: not a text file. Give a g2o file: VERTEX and EDGE lines."
+        ) from None
+
+
+def _split(text: str, name: str) -> tuple[dict[str, _Lines], list[tuple[int, int]]]:
+    """Lines by tag, and the vertices of FIX lines with their line."""
+    found = {tag: _Lines() for tag in _TAGS}
+    fixed: list[tuple[int, int]] = []
+    for number, raw in enumerate(text.split("\n"), start=1):
+        line = raw.partition("#")[0] if "#" in raw else raw
+        parts = line.split()
+        if not parts:
+            continue
+        tag = parts[0]
+        expected = _TAGS.get(tag)
+        if expected is None:
+            if tag == "FIX":
+                fixed += [(number, _id(each, name, number)) for each in parts[1:]]
+            elif not tag.startswith(_IGNORED):
+                raise TrajectoryError(f"{name}: line {number}: {_unknown(tag)}")
+            continue
+        _, named, numbers = expected
+        if len(parts) != 1 + named + numbers:
+            raise TrajectoryError(
+                f"{name}: line {number}: {tag} has {len(parts) - 1} numbers, not "
+                f"{named + numbers}. Write the file again; it may be cut off."
+            )
+        into = found[tag]
+        try:
+            values = list(map(float, parts[1 + named :]))
+        except ValueError:
+            bad = next(each for each in parts[1 + named :] if not _is_number(each))
+            raise TrajectoryError(
+                f"{name}: line {number}: {_quote(bad)} is not a number. Correct it."
+            ) from None
+        into.line.append(number)
+        into.ids.append([_id(each, name, number) for each in parts[1 : 1 + named]])
+        into.numbers.append(values)
+    return found, fixed
+
+
+def _graph(
+    name: str,
+    dimension: int,
+    vertices: _Lines,
+    edges: _Lines,
+    fixed: list[tuple[int, int]],
+) -> PoseGraph:
+    width = 3 if dimension == 2 else 7
+    numbers = np.array(edges.numbers)
+    _require_finite(name, edges, numbers)
+    ends = np.array(edges.ids, dtype=np.intp)
+    if vertices.line:
+        given = np.array(vertices.numbers)
+        _require_finite(name, vertices, given)
+        poses = _poses(name, vertices, given, dimension)
+        numbered = np.array(vertices.ids, dtype=np.intp)[:, 0]
+        order = np.argsort(numbered, kind="stable")
+        ids, poses = numbered[order], poses[order]
+        _require_once(name, vertices, ids, order)
+    else:
+        ids = np.unique(ends)
+        poses = np.zeros((len(ids), width))
+        poses[:, -1] = 0.0 if dimension == 2 else 1.0
+    index = _indices(name, edges, ids, ends)
+    _require_fixed(name, fixed, ids)
+    graph = PoseGraph(
+        dimension=dimension,
+        ids=ids,
+        poses=poses,
+        first=index[:, 0],
+        second=index[:, 1],
+        measurements=_poses(name, edges, numbers[:, :width], dimension),
+        information=_information(name, edges, numbers[:, width:], 3 if dimension == 2 else 6),
+        initialised=FROM_FILE,
+    )
+    if vertices.line:
+        return graph
+    try:
+        return initialise(graph)
+    except TrajectoryError as error:
+        raise TrajectoryError(f"{name}: {error}") from None
+
+
+def _poses(name: str, lines: _Lines, numbers: Array, dimension: int) -> Array:
+    """Poses with unit quaternions."""
+    if dimension == 2:
+        return numbers
+    poses = numbers.copy()
+    norm = np.linalg.norm(poses[:, 3:], axis=1)
+    bad = _first(norm < 1e-6)
+    if bad is not None:
+        raise TrajectoryError(
+            f"{name}: line {lines.line[bad]}: a quaternion of length 0 is no rotation. Give "
+            "qx qy qz qw behind the position."
+        )
+    # What is a unit quaternion already stays as it is, so that writing and reading changes nothing
+    off = np.abs(norm - 1.0) > _UNIT
+    poses[off, 3:] /= norm[off, None]
+    return poses
+
+
+def _information(name: str, lines: _Lines, numbers: Array, size: int) -> Array:
+    """Symmetric matrices from their upper triangles, row by row."""
+    row, column = np.triu_indices(size)
+    made = np.empty((len(numbers), size, size))
+    made[:, row, column] = made[:, column, row] = numbers
+    try:
+        np.linalg.cholesky(made)
+    except np.linalg.LinAlgError:
+        values = np.linalg.eigvalsh(made)
+        bad = _first(values[:, 0] < -_ROUNDING * np.maximum(values[:, -1], 0.0))
+        if bad is not None:
+            raise TrajectoryError(
+                f"{name}: line {lines.line[bad]}: the information matrix has a negative "
+                f"eigenvalue ({values[bad, 0]:.3g}). Give the upper triangle of an inverse "
+                "covariance, row by row."
+            ) from None
+    return made
+
+
+def _indices(name: str, edges: _Lines, ids: IntArray, ends: IntArray) -> IntArray:
+    """Places of the edges' vertices."""
+    index = np.minimum(np.searchsorted(ids, ends), len(ids) - 1)
+    missing = _first(np.any(ids[index] != ends, axis=1))
+    if missing is not None:
+        vertex = next(each for each in ends[missing].tolist() if each not in set(ids.tolist()))
+        raise TrajectoryError(
+            f"{name}: line {edges.line[missing]}: an edge to vertex {vertex}, which the file does "
+            "not have. Add its VERTEX line, or take all of them out."
+        )
+    same = _first(ends[:, 0] == ends[:, 1])
+    if same is not None:
+        raise TrajectoryError(
+            f"{name}: line {edges.line[same]}: an edge from vertex {ends[same, 0]} to itself. "
+            "Take it out."
+        )
+    return index
+
+
+def _require_finite(name: str, lines: _Lines, numbers: Array) -> None:
+    bad = _first(~np.all(np.isfinite(numbers), axis=1))
+    if bad is not None:
+        raise TrajectoryError(
+            f"{name}: line {lines.line[bad]}: a number that is not finite. Correct it, or take the "
+            "line out."
+        )
+
+
+def _require_once(name: str, vertices: _Lines, ids: IntArray, order: IntArray) -> None:
+    twice = np.flatnonzero(ids[1:] == ids[:-1])
+    if len(twice):
+        before, again = vertices.line[order[twice[0]]], vertices.line[order[twice[0] + 1]]
+        raise TrajectoryError(
+            f"{name}: line {again}: vertex {ids[twice[0]]} for the second time (first on line "
+            f"{before}). Take one of them out."
+        )
+
+
+def _require_fixed(name: str, fixed: list[tuple[int, int]], ids: IntArray) -> None:
+    known = set(ids.tolist())
+    for line, vertex in fixed:
+        if vertex not in known:
+            raise TrajectoryError(
+                f"{name}: line {line}: FIX of vertex {vertex}, which the file does not have. Take "
+                "the line out."
+            )
+        if vertex != fixed[0][1]:
+            raise TrajectoryError(
+                f"{name}: line {line}: FIX of a second vertex ({vertex} beside {fixed[0][1]}). "
+                "One pose is held here: take the line out, or join the two by an edge."
+            )
+
+
+def _first(bad: np.ndarray[tuple[int], np.dtype[np.bool_]]) -> int | None:
+    """Where the first one is."""
+    return int(np.argmax(bad)) if np.any(bad) else None
+
+
+def _id(text: str, name: str, line: int) -> int:
+    try:
+        number = int(text)
+    except ValueError:
+        number = _BIGGEST_ID
+    if not -_BIGGEST_ID <= number < _BIGGEST_ID or "_" in text:
+        raise TrajectoryError(
+            f"{name}: line {line}: {_quote(text)} is not the number of a vertex. Give an integer."
+        )
+    return number
+
+
+def _unknown(tag: str) -> str:
+    if tag in _TORO:
+        return (
+            f"{tag} is TORO's format. Convert it to g2o: the rotation is written otherwise, and the"
+            " information matrix in another order."
+        )
+    return (
+        f"{_quote(tag)} is not read here. Poses (VERTEX_SE2 or VERTEX_SE3:QUAT) and edges between "
+        "them (EDGE_SE2 or EDGE_SE3:QUAT) are; take other lines out."
+    )
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _quote(text: str) -> str:
+    return repr(text if len(text) <= 40 else text[:37] + "...")

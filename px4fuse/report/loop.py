@@ -1,0 +1,356 @@
+"""Loop: the path before and after, the closure error, and scores of every correction."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from px4fuse.findings import Finding
+from px4fuse.flight import Unavailable
+from px4fuse.report.cover import write_finding
+from px4fuse.report.document import Document, LoopDocument
+from px4fuse.report.loop_words import (
+    ate_words,
+    closure_name,
+    loop_lines,
+    moved_words,
+    redundancy_words,
+    refusals,
+    score_words,
+    statistics_words,
+)
+from px4fuse.report.style import (
+    BOTTOM,
+    EKF2,
+    LEFT,
+    MUTED,
+    OURS,
+    POINTS_PER_HEIGHT,
+    POINTS_PER_WIDTH,
+    RIGHT,
+    TRUTH_LINE,
+    Cursor,
+    caption,
+    page,
+    panels,
+    printable,
+    shorten,
+    thin,
+)
+from px4fuse.signals import Array
+from px4fuse.trajectory.evaluation import Evaluation, Interval, Statistics
+from px4fuse.trajectory.loop import BY_DISTANCE, SOLUTIONS, UNCORRECTED, Correction, Loop
+from px4fuse.trajectory.model import AXES_OF_FRAME
+
+Value = Statistics | Unavailable
+GREEN = "#3a7d5c"
+STYLES: Mapping[str, dict[str, Any]] = {
+    UNCORRECTED: {"color": EKF2, "lw": 1.1, "ls": (0, (4, 1.6))},
+    BY_DISTANCE: {"color": GREEN, "lw": 1.0, "ls": (0, (6, 1.2, 1, 1.2))},
+    SOLUTIONS["gated"]: {"color": OURS, "lw": 1.2, "ls": "-"},
+    SOLUTIONS["all"]: {"color": "#8d6a9f", "lw": 0.9, "ls": (0, (2, 1))},
+}
+MAP_MIN_HEIGHT = 0.30
+MAP_POINTS = 2000
+GAP_STEPS = 10.0
+TABLE_SIZE = 7.4
+LABEL_WIDTH = 0.085
+
+
+def draw(document: Document) -> Iterator[Figure]:
+    """Draw the loop's pages; none where the flight holds no loop."""
+    loop = document.comparison.loop
+    if isinstance(loop, Loop):
+        yield from draw_loop(loop)
+
+
+def draw_report(document: LoopDocument) -> Iterator[Figure]:
+    """Draw the pages of a report on a loop alone, its findings on the first."""
+    yield from draw_loop(document.loop, document.findings, document.facts)
+
+
+def draw_loop(
+    loop: Loop,
+    findings: tuple[Finding, ...] = (),
+    facts: tuple[tuple[str, str], ...] = (),
+) -> Iterator[Figure]:
+    """Draw the pages about one loop."""
+    figure, cursor = page(
+        "Loop closure",
+        "A path that truly returns must close; the gap is what the odometry drifted. Each "
+        "correction spreads it over the path, by distance or as a pose graph weighs it. A closure "
+        "that is not true would warp the whole path, so that each one is tested before its use.",
+    )
+    for label, text in (*facts, *loop_lines(loop)):
+        _line(cursor, label, text)
+    for text in (redundancy_words(loop), *refusals(loop)):
+        if text:
+            cursor.skip(2)
+            cursor.write(text, colour=MUTED)
+    for finding in findings:
+        write_finding(cursor, finding)
+    cursor.skip(8)
+    _table(figure, cursor, loop)
+    if cursor.y - BOTTOM < MAP_MIN_HEIGHT:
+        yield figure
+        figure, cursor = page("Loop closure: the map")
+    cursor.skip(10)
+    _map(figure, cursor, loop)
+    yield figure
+    figure, cursor = page(
+        "Along the path",
+        "How far each correction moved each pose, and how far the path is from the reference after "
+        "alignment. A correction that helps brings the error down along most of the path, not only "
+        "at its end.",
+    )
+    _along(figure, cursor, loop)
+    yield figure
+    yield from _scores(loop)
+
+
+def _line(cursor: Cursor, label: str, text: str) -> None:
+    top = cursor.y
+    cursor.write(label, weight="bold", right=LEFT + LABEL_WIDTH)
+    cursor.y = top
+    cursor.write(text, x=LEFT + LABEL_WIDTH)
+
+
+def _row(figure: Figure, cursor: Cursor, cells: list[tuple[float, str]], **style: Any) -> None:
+    """One row of a table: left edges and texts, each cut at the next edge."""
+    cursor.y -= TABLE_SIZE * 1.45 / POINTS_PER_HEIGHT
+    edges = [x for x, _ in cells] + [RIGHT]
+    for (x, text), following in zip(cells, edges[1:], strict=True):
+        width = (following - x) * POINTS_PER_WIDTH - 4.0
+        figure.text(
+            x, cursor.y, shorten(printable(text), TABLE_SIZE, width), size=TABLE_SIZE, **style
+        )
+
+
+def _table(figure: Figure, cursor: Cursor, loop: Loop) -> None:
+    """Every path with how far it moved and its ATE against each reference."""
+    references = [reference.name for reference in loop.references]
+    edges = [LEFT, 0.30]
+    edges += list(np.linspace(0.50, RIGHT, len(references) + 1)[:-1]) if references else []
+    heads = ["path", "moved RMS / max (m)", *(f"ATE to {name} (m)" for name in references)]
+    _row(figure, cursor, list(zip(edges, heads, strict=True)), color=MUTED)
+    cursor.skip(2.5)
+    cursor.rule()
+    for part in loop.reported:
+        scores = [ate_words(part.scores[name]) for name in references]
+        cells = [part.name, moved_words(part), *scores]
+        _row(figure, cursor, list(zip(edges, cells, strict=True)))
+    cursor.skip(4)
+    if references:
+        cursor.write(
+            "ATE is the RMSE of position after alignment, in brackets its 95 % interval by block "
+            "bootstrap where the flight is long enough for one.",
+            size=7,
+            colour=MUTED,
+        )
+    else:
+        cursor.write(
+            "Neither ground truth nor a SLAM trajectory is given, so that no error of the path can "
+            "be stated; --reference FILE scores it.",
+            size=7,
+            colour=MUTED,
+        )
+
+
+def shown(loop: Loop) -> list[Correction]:
+    """The paths that are drawn: each kind of correction once."""
+    return [part for part in loop.reported if part.name in STYLES]
+
+
+def _map(figure: Figure, cursor: Cursor, loop: Loop) -> None:
+    bottom = BOTTOM + 0.075
+    axes = figure.add_axes((LEFT + 0.03, bottom, RIGHT - LEFT - 0.03, cursor.y - 0.012 - bottom))
+    path = loop.odometry.trajectory
+    names = AXES_OF_FRAME[path.frame]
+    axes.set_title("from above, in the odometry's frame")
+    _reference(axes, loop)
+    for part in shown(loop):
+        position = _thinned(part.trajectory.position_m)
+        axes.plot(position[:, 1], position[:, 0], label=part.name, **STYLES[part.name])
+    start, end = path.position_m[0], path.position_m[-1]
+    axes.plot(start[1], start[0], "o", color="black", ms=5, label="start", zorder=5)
+    axes.plot(end[1], end[0], "s", color=EKF2, mec="black", mew=0.6, ms=5,
+              label="end by odometry", zorder=5)  # fmt: skip
+    if not isinstance(loop.misclosure_m, Unavailable):
+        true = end - loop.misclosure_m
+        axes.annotate(
+            "", xy=(true[1], true[0]), xytext=(end[1], end[0]), zorder=6,
+            arrowprops={"arrowstyle": "->", "color": "#a61b1b", "lw": 1.2, "shrinkA": 3,
+                        "shrinkB": 0},
+        )  # fmt: skip
+        axes.plot([], [], color="#a61b1b", lw=1.2, label=f"gap {loop.closure_error_m:.2f} m")
+        axes.plot(true[1], true[0], "x", color="#a61b1b", ms=5, mew=1.2, zorder=6,
+                  label="where it really ended")  # fmt: skip
+    axes.set_aspect("equal", adjustable="datalim", anchor="W")
+    axes.grid(True, axis="both")
+    axes.set_xlabel(f"{names[1]} (m)")
+    axes.set_ylabel(f"{names[0]} (m)")
+    handles, labels = axes.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="lower left", ncols=4, bbox_to_anchor=(LEFT, BOTTOM - 0.012),
+                  borderaxespad=0.0)  # fmt: skip
+
+
+def _reference(axes: Axes, loop: Loop) -> None:
+    """The reference in the odometry's frame, placed by the best correction there is."""
+    for name in (reference.name for reference in loop.references):
+        for part in reversed(shown(loop)):
+            score = part.scores.get(name)
+            if not isinstance(score, Evaluation):
+                continue
+            transform = score.transform
+            back = transform.rotation.inv().apply(score.reference_m - transform.translation_m)
+            position = _thinned(_broken(back / transform.scale, score.time_s))
+            axes.plot(position[:, 1], position[:, 0], label=name, **TRUTH_LINE, zorder=4)
+            return
+
+
+def _broken(position: Array, time_s: Array) -> Array:
+    """A path with breaks where its poses have a gap in time, so that no line crosses it."""
+    steps = np.diff(time_s)
+    gaps = np.flatnonzero(steps > GAP_STEPS * np.median(steps)) + 1
+    return np.insert(position, gaps, np.nan, axis=0)
+
+
+def _thinned(position: Array) -> Array:
+    step = max(1, len(position) // MAP_POINTS)
+    return position[::step]
+
+
+def _along(figure: Figure, cursor: Cursor, loop: Loop) -> None:
+    references = [reference.name for reference in loop.references]
+    rows = 2 + len(references)
+    grid = panels(figure, cursor.y - 0.03, BOTTOM + 0.05, rows, 1, hspace=0.38)
+    moved, height, *errors = [row[0] for row in grid]
+    moved.set_title("how far each pose moved (m)")
+    height.set_title(f"{AXES_OF_FRAME[loop.odometry.trajectory.frame][2]} (m)")
+    for part in shown(loop):
+        style = STYLES[part.name]
+        if part is not loop.odometry:
+            moved.plot(*thin(loop.distance_m, part.moved_m), label=part.name, **style)
+        height.plot(*thin(loop.distance_m, part.trajectory.position_m[:, 2]), label=part.name,
+                    **style)  # fmt: skip
+    height.legend(loc="best", ncols=3)
+    for axes, name in zip(errors, references, strict=True):
+        axes.set_title(f"distance to {name} after alignment (m)")
+        said = []
+        for part in shown(loop):
+            score = part.scores[name]
+            if not isinstance(score, Evaluation):
+                said.append(f"{part.name}: {score.reason}")
+                continue
+            along = np.interp(score.time_s, part.trajectory.time_s, loop.distance_m)
+            axes.plot(*thin(along, score.position_error_m), label=part.name, **STYLES[part.name])
+            said.append(f"{part.name}: RMSE {score.ate.translation.rmse:.3f} m, max "
+                        f"{score.ate.translation.max:.3f} m")  # fmt: skip
+        _fit(axes)
+        if axes is errors[-1]:
+            axes.set_xlabel("distance along the path (m)")
+        caption(axes, "; ".join(said))
+    if not errors:
+        height.set_xlabel("distance along the path (m)")
+    _fit(moved)
+    for axes in (moved, height, *errors):
+        axes.set_xlim(0.0, loop.path_length_m)
+    if len(shown(loop)) > 1:
+        most = [f"{part.name}: at most {part.moved_m.max():.2f} m"
+                for part in shown(loop) if part is not loop.odometry]  # fmt: skip
+        caption(moved, "; ".join(most))
+
+
+def _fit(axes: Axes) -> None:
+    """Scale to the paths that might be used: one that a false closure warps runs out of sight."""
+    highest = [
+        float(np.nanmax(line.get_ydata()))
+        for line in axes.get_lines()
+        if line.get_label() != SOLUTIONS["all"]
+    ]
+    if highest:
+        axes.set_ylim(0.0, 1.15 * max(*highest, 1e-3))
+
+
+def _scores(loop: Loop) -> Iterator[Figure]:
+    """Tables: every closure with its gate and weights, RPE, and how scores were made."""
+    figure, cursor = page(
+        "Closures and scores",
+        "d² is the squared misclosure against what drift and closure explain together; p is the "
+        "chance of a larger one if the closure is true. Robust solving (dynamic covariance "
+        "scaling, DCS; graduated non-convexity, GNC) weighs each closure by how well the others "
+        "agree with it: 1 keeps it, 0 drops it.",
+    )
+    cursor.write("Closures", size=10.5, weight="bold")
+    cursor.skip(2)
+    edges = [LEFT, 0.27, 0.38, 0.45, 0.49, 0.58, 0.72, 0.82]
+    heads = ["same place at", "missed by (m)", "d²", "dof", "p", "gate", "DCS weight", "GNC weight"]
+    _row(figure, cursor, list(zip(edges, heads, strict=True)), color=MUTED)
+    cursor.skip(2.5)
+    cursor.rule()
+    for judged in loop.closures:
+        if cursor.y < BOTTOM + 0.03:
+            yield figure
+            figure, cursor = page("Closures and scores, continued")
+        gate = judged.gate
+        weights = [
+            f"{judged.weights[name]:.2f}" if name in judged.weights else "–"
+            for name in ("dcs", "gnc")
+        ]
+        cells = [
+            closure_name(judged), f"{judged.distance_m:.2f}", f"{gate.d2:.1f}",
+            f"{gate.degrees_of_freedom}", f"{gate.p:.2g}",
+            "accepted" if gate.accepted else "REJECTED", *weights,
+        ]  # fmt: skip
+        _row(figure, cursor, list(zip(edges, cells, strict=True)),
+             color="black" if gate.accepted else "#a61b1b")  # fmt: skip
+    if not loop.closures:
+        cursor.write("None.")
+    for reference in loop.references:
+        rows = sum(1 + len(s.rpe) for p in loop.reported
+                   if isinstance(s := p.scores[reference.name], Evaluation))  # fmt: skip
+        if cursor.y - 0.14 - rows * TABLE_SIZE * 1.45 / POINTS_PER_HEIGHT < BOTTOM:
+            yield figure
+            figure, cursor = page("Closures and scores, continued")
+        cursor.skip(12)
+        _relative(figure, cursor, loop, reference.name)
+    yield figure
+
+
+def _relative(figure: Figure, cursor: Cursor, loop: Loop, name: str) -> None:
+    cursor.write(f"Against {name}", size=10.5, weight="bold")
+    cursor.skip(2)
+    scores = [(part, part.scores[name]) for part in loop.reported]
+    good = [(part, s) for part, s in scores if isinstance(s, Evaluation)]
+    for part, score in scores:
+        if isinstance(score, Unavailable):
+            cursor.write(f"{part.name}: {score.reason}", size=7.5)
+    if not good:
+        return
+    first = good[0][1]
+    edges = [LEFT, 0.27, 0.38, 0.50, 0.66, 0.80]
+    heads = ["path", "error over", "RMSE (m)", "95 % interval (m)", "rotation RMSE (°)", "n"]
+    _row(figure, cursor, list(zip(edges, heads, strict=True)), color=MUTED)
+    cursor.skip(2.5)
+    cursor.rule()
+    for part, score in good:
+        ate = score.ate
+        rows: list[tuple[str, Value, Interval | Unavailable, Value]] = [
+            ("ATE", ate.translation, ate.interval, ate.rotation)
+        ]
+        rows += [(f"RPE {e.delta}", e.translation, e.interval, e.rotation) for e in score.rpe]
+        for index, (label, moved, interval, turned) in enumerate(rows):
+            cells = [
+                part.name if index == 0 else "", label, *statistics_words(moved, interval, turned)
+            ]  # fmt: skip
+            _row(figure, cursor, list(zip(edges, cells, strict=True)))
+        cursor.skip(2.5)
+        cursor.rule("#dddddd")
+    cursor.skip(4)
+    told = [score_words(first), *first.notes, *first.warnings]
+    for text in told:
+        cursor.write(text[:1].upper() + text[1:], size=7, colour=MUTED)

@@ -1,0 +1,140 @@
+"""Loops, scores and pose graphs on the terminal."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from px4fuse.findings import Finding
+from px4fuse.flight import Unavailable
+from px4fuse.report.loop_words import (
+    ate_words,
+    closure_name,
+    interval_words,
+    loop_lines,
+    moved_words,
+    redundancy_words,
+    refusals,
+    score_words,
+)
+from px4fuse.report.terminal import print_finding, print_line
+from px4fuse.trajectory.evaluation import Evaluation, Statistics
+from px4fuse.trajectory.graph_analysis import SolvedGraph
+from px4fuse.trajectory.loop import SOLUTIONS, Loop
+
+MOST_ROWS = 10
+
+
+def print_loop(console: Console, loop: Loop, findings: tuple[Finding, ...]) -> None:
+    """Print what was found about a loop."""
+    for label, text in loop_lines(loop):
+        print_line(console, label, text, whole=True)
+    references = [reference.name for reference in loop.references]
+    table = _table("path", "moved RMS / max (m)", *(f"ATE to {name} (m)" for name in references))
+    for part in loop.reported:
+        table.add_row(
+            part.name, moved_words(part), *(ate_words(part.scores[name]) for name in references)
+        )
+    console.print(table)
+    if len(loop.closures) > 1:
+        closures = _table("closure", "missed by (m)", "d²", "p", "gate", "DCS", "GNC")
+        for judged in loop.closures:
+            gate = judged.gate
+            closures.add_row(
+                closure_name(judged),
+                f"{judged.distance_m:.2f}",
+                f"{gate.d2:.1f}",
+                f"{gate.p:.2g}",
+                Text("accepted", "green") if gate.accepted else Text("REJECTED", "bold red"),
+                *(f"{judged.weights.get(name, float('nan')):.2f}" for name in ("dcs", "gnc")),
+            )
+        console.print(closures)
+    for text in (redundancy_words(loop), *refusals(loop)):
+        if text:
+            console.print(Text(text, "dim"), soft_wrap=True)
+    for finding in findings:
+        print_finding(console, finding)
+
+
+def print_evaluation(console: Console, score: Evaluation) -> None:
+    """Print the scores of one trajectory against another."""
+    print_line(console, "Estimate", _described(score.estimate), whole=True)
+    print_line(console, "Against", _described(score.reference), whole=True)
+    print_line(console, "How", score_words(score), whole=True)
+    ate = score.ate
+    table = _table("error", "RMSE", "95 %", "mean", "median", "max", "n")
+    _statistics(table, "ATE (m)", ate.translation, interval_words(ate.interval).strip(" ()"))
+    if isinstance(ate.rotation, Statistics):
+        _statistics(table, "rotation (°)", ate.rotation)
+    for error in score.rpe:
+        if isinstance(error.translation, Statistics):
+            interval = interval_words(error.interval).strip(" ()")
+            _statistics(table, f"RPE {error.delta} (m)", error.translation, interval)
+        if isinstance(error.rotation, Statistics):
+            _statistics(table, f"RPE {error.delta} (°)", error.rotation)
+    console.print(table)
+    missing = [part for part in (ate.interval, ate.rotation) if isinstance(part, Unavailable)]
+    missing += [e.translation for e in score.rpe if isinstance(e.translation, Unavailable)]
+    for reason in dict.fromkeys(f"No {part.what}: {part.reason}." for part in missing):
+        console.print(Text(reason, "dim"), soft_wrap=True)
+    for text in score.notes:
+        console.print(Text(text, "dim"), soft_wrap=True)
+    for text in score.warnings:
+        console.print(Text(text, "yellow"), soft_wrap=True)
+
+
+def print_graph(console: Console, name: str, solved: SolvedGraph) -> None:
+    """Print how a pose graph was solved, and the closures that the gate rejects."""
+    graph = solved.graph
+    print_line(
+        console,
+        "Graph",
+        f"{name}: {graph.dimension}-D, {len(graph)} poses, {len(graph.first)} edges; poses from "
+        f"{graph.initialised}",
+    )
+    gates = solved.gates
+    if isinstance(gates, Unavailable):
+        print_line(console, "Gate", f"none: {gates.reason}", whole=True)
+    else:
+        rejected = [gate for gate in gates if not gate.accepted]
+        print_line(console, "Gate", f"rejects {len(rejected)} of {len(gates)} closures")
+        for gate in rejected[:MOST_ROWS]:
+            ends = f"{graph.ids[graph.first[gate.edge]]} – {graph.ids[graph.second[gate.edge]]}"
+            console.print(f"         {ends}: d² {gate.d2:.1f}, p {gate.p:.2g}", markup=False)
+        if len(rejected) > MOST_ROWS:
+            console.print(f"         and {len(rejected) - MOST_ROWS} more", markup=False)
+    table = _table("path", "cost before", "cost", "iterations", "closures dropped")
+    for key, solution in solved.solutions.items():
+        table.add_row(
+            SOLUTIONS[key],
+            f"{solution.initial_cost:.6g}",
+            f"{solution.cost:.6g}",
+            f"{solution.iterations}" + ("" if solution.converged else " (not converged)"),
+            "" if key == "all" else f"{(solution.weights < 0.5).sum()}",
+        )
+    console.print(table)
+
+
+def _described(trajectory: Any) -> str:
+    return (
+        f"{trajectory.name}: {trajectory.kind}, {len(trajectory)} poses over "
+        f"{trajectory.time_s[-1] - trajectory.time_s[0]:.1f} s, frame {trajectory.frame}"
+    )
+
+
+def _statistics(table: Table, label: str, values: Statistics, interval: str = "") -> None:
+    numbers = (values.mean, values.median, values.max)
+    table.add_row(
+        label, f"{values.rmse:.4f}", interval, *(f"{n:.4f}" for n in numbers), f"{values.count}"
+    )
+
+
+def _table(*names: str) -> Table:
+    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="bold")
+    for name in names:
+        left = name in ("path", "closure", "error", "gate", "edge")
+        table.add_column(name, justify="left" if left else "right")
+    return table

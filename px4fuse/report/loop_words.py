@@ -1,0 +1,136 @@
+"""What there is to say about a loop, for the terminal and the PDF."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from px4fuse.flight import Unavailable
+from px4fuse.trajectory.evaluation import Evaluation, Interval, Statistics
+from px4fuse.trajectory.loop import GATE_ALPHA, SINGLE_LOOP, Correction, Judged, Loop
+from px4fuse.trajectory.model import AXES_OF_FRAME, Array, Trajectory
+
+KINDS = {
+    "vio": "visual-inertial odometry",
+    "ekf2": "EKF2's track",
+    "kf": "our filter's track",
+    "truth": "ground truth",
+    "slam": "a SLAM system's trajectory",
+    "unknown": "a trajectory",
+}
+
+
+def loop_lines(loop: Loop) -> list[tuple[str, str]]:
+    """Label and sentence, in the order of interest."""
+    path = loop.odometry.trajectory
+    part = loop.segment
+    lines = [
+        (
+            "Track",
+            f"{path.name}: {KINDS[path.kind]}, {len(path)} poses, {len(loop.nodes)} key frames "
+            f"{loop.spacing_m:.2g} m apart",
+        ),
+        ("Part", f"{part.start_s:.1f} s to {part.end_s:.1f} s, {part.reason}"),
+        ("Closure", closure_words(loop)),
+        ("End", "not used" if isinstance(loop.known_end, Unavailable) else loop.known_end.source),
+    ]
+    lines += [("Gate", gate_words(judged)) for judged in loop.closures[:1]]
+    return lines
+
+
+def closure_words(loop: Loop) -> str:
+    """The closure error in m, in percent, per axis and in heading."""
+    error, misclosure = loop.closure_error_m, loop.misclosure_m
+    if error is None or isinstance(misclosure, Unavailable):
+        return f"path {loop.path_length_m:.1f} m; no closure error is stated: it did not come back"
+    text = (
+        f"{error:.2f} m after {loop.path_length_m:.1f} m = {error / loop.path_length_m:.2%} "
+        f"({axes_words(loop.odometry.trajectory, misclosure)})"
+    )
+    turned = loop.misclosure_heading_deg
+    if isinstance(turned, Unavailable):
+        return f"{text}; heading: not known, {turned.reason}"
+    return f"{text}; heading {turned:+.1f}°"
+
+
+def axes_words(path: Trajectory, vector: Array) -> str:
+    """A vector with the names of its axes."""
+    names = AXES_OF_FRAME[path.frame]
+    return ", ".join(f"{name} {v:+.2f} m" for name, v in zip(names, vector, strict=True))
+
+
+def gate_words(judged: Judged) -> str:
+    """What the gate says about one closure."""
+    gate = judged.gate
+    verdict = (
+        "as the stated drift allows" if gate.accepted else "REJECTED: the drift cannot explain it"
+    )
+    return (
+        f"d² {gate.d2:.1f} with {gate.degrees_of_freedom} degrees of freedom, p {gate.p:.2g} "
+        f"(rejected below {GATE_ALPHA:g}): {verdict}"
+    )
+
+
+def closure_name(judged: Judged) -> str:
+    """Which closure."""
+    closure = judged.closure
+    if closure.source == "landing":
+        return "take-off and landing"
+    return f"{closure.time_1_s:.2f} s and {closure.time_2_s:.2f} s"
+
+
+def redundancy_words(loop: Loop) -> str:
+    """That one loop has no redundancy, or nothing."""
+    return SINGLE_LOOP if len(loop.closures) == 1 else ""
+
+
+def refusals(loop: Loop) -> list[str]:
+    """Why a correction is missing, each reason once."""
+    parts = (loop.by_distance, *loop.solved.values())
+    reasons = [f"{p.what}: {p.reason}" for p in parts if isinstance(p, Unavailable)]
+    return [r for r in dict.fromkeys(reasons) if SINGLE_LOOP not in r]
+
+
+def ate_words(score: Evaluation | Unavailable) -> str:
+    """RMSE of the ATE in m, with its interval where there is one."""
+    if isinstance(score, Unavailable):
+        return "–"
+    return f"{score.ate.translation.rmse:.3f}{interval_words(score.ate.interval)}"
+
+
+def interval_words(interval: Interval | Unavailable) -> str:
+    """An interval in brackets; nothing where there is none."""
+    return f" ({interval.low:.3f}–{interval.high:.3f})" if isinstance(interval, Interval) else ""
+
+
+def statistics_words(
+    moved: Statistics | Unavailable,
+    interval: Interval | Unavailable,
+    turned: Statistics | Unavailable,
+) -> list[str]:
+    """RMSE, its interval, RMSE of rotation, and how many errors: cells of a table."""
+    return [
+        f"{moved.rmse:.3f}" if isinstance(moved, Statistics) else "–",
+        f"{interval.low:.3f} – {interval.high:.3f}" if isinstance(interval, Interval) else "–",
+        f"{turned.rmse:.2f}" if isinstance(turned, Statistics) else "–",
+        f"{moved.count}" if isinstance(moved, Statistics) else "",
+    ]
+
+
+def moved_words(correction: Correction) -> str:
+    """How far the poses moved."""
+    if not correction.moved_m.any():
+        return "–"
+    return f"{np.sqrt(np.mean(correction.moved_m**2)):.2f} / {correction.moved_m.max():.2f}"
+
+
+def score_words(score: Evaluation) -> str:
+    """How a score was made, in one sentence."""
+    matched = score.association
+    offset = score.time_offset.offset_s
+    clock = "" if not offset else f"; clocks matched by {offset:+.3f} s"
+    return (
+        f"alignment {score.alignment} ({score.alignment_reason.rstrip('.')}); "
+        f"{len(matched)} poses, "
+        f"{matched.coverage_estimate:.0%} of the estimate, {matched.coverage_reference:.0%} of the "
+        f"reference's time{clock}"
+    )

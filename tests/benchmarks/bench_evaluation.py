@@ -1,0 +1,65 @@
+"""Speed of trajectory files and scores; nothing here can fail: run it, read it.
+
+A file of 20,000 poses, then reading, association, scores with intervals, and the time offset, on a
+ten-minute flight: 30 Hz of an estimate against 200 Hz of a reference.
+
+    python tests/benchmarks/bench_evaluation.py
+"""
+
+from __future__ import annotations
+
+import statistics
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+RUNS = 3
+
+
+def seconds(work: Callable[[], object]) -> float:
+    """Median over some runs."""
+    took = []
+    for _ in range(RUNS):
+        start = time.perf_counter()
+        work()
+        took.append(time.perf_counter() - start)
+    return statistics.median(took)
+
+
+def main() -> None:
+    import numpy as np
+    import test_evaluation
+
+    from px4fuse.readers.trajectory import read_trajectory, tum_text
+    from px4fuse.trajectory.association import associate, estimate_time_offset
+    from px4fuse.trajectory.evaluation import evaluate, rmse_interval
+
+    reference = test_evaluation.flight(600.0, 200.0)
+    estimate = test_evaluation.flight(600.0, 30.0, "vio")
+    noise = np.random.default_rng(1).normal(0.0, 0.05, estimate.position_m.shape)
+    estimate = replace(estimate, position_m=estimate.position_m + noise)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "track.tum"
+        path.write_text(tum_text(reference[:20_000]))
+        size = path.stat().st_size / 1e6
+        took = seconds(lambda: read_trajectory(path))
+        print(f"read 20,000 poses, {size:.1f} MB       {took:7.3f} s")
+    matched = associate(estimate, reference)
+    error = np.linalg.norm(matched.estimate.position_m - matched.reference.position_m, axis=1)
+    for words, work in (
+        ("write 120,000 poses", lambda: tum_text(reference)),
+        ("associate 18,000 with 120,000", lambda: associate(estimate, reference)),
+        ("interval of 18,000 errors", lambda: rmse_interval(error, "ATE")),
+        ("all scores", lambda: evaluate(estimate, reference)),
+        ("the time offset", lambda: estimate_time_offset(estimate, reference)),
+    ):
+        print(f"{words:35} {seconds(work):7.3f} s")
+
+
+if __name__ == "__main__":
+    main()

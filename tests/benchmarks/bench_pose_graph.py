@@ -1,0 +1,87 @@
+"""Speed of pose graph optimisation against GTSAM, from the same start to the same tolerances.
+
+Both run in turn, so that the ratio holds on a machine whose speed drifts; ours includes finding the
+pattern and its order, GTSAM's its ordering. Then how time grows with the poses of laps of a loop.
+Nothing here can fail: run it, read it. Needs GTSAM and ../shared/pose_graphs.
+
+    OMP_NUM_THREADS=1 python tests/benchmarks/bench_pose_graph.py [RUNS] [FILE ...]
+"""
+
+from __future__ import annotations
+
+import statistics
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+FOLDER = Path(__file__).parents[3] / "shared" / "pose_graphs"
+NAMED = ("SE-Sync_manhattan", "SE-Sync_sphere2500", "SE-Sync_parking-garage")
+SIZES = (100, 300, 1000, 3000, 10_000)
+
+
+def seconds(work: Callable[[], object]) -> float:
+    start = time.perf_counter()
+    work()
+    return time.perf_counter() - start
+
+
+def chain(poses: int):
+    """Laps of 50 poses in space, a closure to the lap before every tenth pose."""
+    from px4fuse.trajectory import lie
+    from px4fuse.trajectory.pose_graph import PoseGraph, composed
+
+    rng = np.random.default_rng(0)
+    step = np.array([1.0, 0.0, 0.02, 0.0, 0.01, 2.0 * np.pi / 50])
+    truth = lie.chain(lie.exp(np.tile(step, (poses - 1, 1))))
+    first, last = np.arange(poses - 1), np.arange(0, poses - 50, 10)
+    i, j = np.concatenate([first, last]), np.concatenate([first + 1, last + 50])
+    spread = np.repeat([0.02, 0.002], 3)
+    noise = lie.exp(rng.normal(size=(len(i), 6)) * spread)
+    measured = lie.compose(lie.between(truth[i], truth[j]), noise)
+    information = np.tile(np.diag(spread**-2.0), (len(i), 1, 1))
+    return composed(PoseGraph(3, np.arange(poses), truth, i, j, measured, information))
+
+
+def main() -> None:
+    import gtsam
+    from test_pose_graph import gtsam_optimiser
+
+    from px4fuse.readers.g2o import read_g2o
+    from px4fuse.trajectory.pose_graph import cost, solve
+
+    runs = int(sys.argv[1]) if len(sys.argv) > 1 else 5
+    for name in sys.argv[2:] or NAMED:
+        file = FOLDER / f"{name}.g2o"
+        reading = seconds(lambda file=file: read_g2o(file))
+        graph = read_g2o(file)
+        ours, theirs, ratios = [], [], []
+        for _ in range(runs):
+            ours.append(seconds(lambda graph=graph: solve(graph)))
+            factors, optimiser = gtsam_optimiser(gtsam, graph)
+            theirs.append(seconds(optimiser.optimize))
+            ratios.append(ours[-1] / theirs[-1])
+        found, other = solve(graph), factors.error(optimiser.values())
+        print(
+            f"{name}: {len(graph)} poses, {len(graph.first)} edges, {graph.initialised}, read in "
+            f"{reading:.2f} s; {statistics.median(ratios):.2f} x GTSAM "
+            f"({statistics.median(ours):.3f} s / {statistics.median(theirs):.3f} s, {runs} pairs); "
+            f"steps {found.iterations} / {optimiser.iterations()}; cost {cost(graph):.6g} -> "
+            f"{found.cost:.9g}, {found.cost / other - 1.0:+.0e} of GTSAM's"
+        )
+    took = []
+    for poses in SIZES:
+        graph = chain(poses)
+        took.append(min(seconds(lambda graph=graph: solve(graph)) for _ in range(3)))
+        print(f"laps of {poses} poses: {took[-1]:.3f} s, {solve(graph).iterations} steps")
+    whole = np.log(took[-1] / took[0]) / np.log(SIZES[-1] / SIZES[0])
+    end = np.log(took[-1] / took[-3]) / np.log(SIZES[-1] / SIZES[-3])
+    print(f"time grows as n^{whole:.2f} from 100 to 10,000, as n^{end:.2f} from 1,000 (aim 1.3)")
+
+
+if __name__ == "__main__":
+    main()

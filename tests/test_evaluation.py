@@ -1,0 +1,679 @@
+"""ATE, RPE, alignment and clocks: against evo, closed forms and what was put in."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from conftest import REPOSITORY
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.optimize import minimize
+from scipy.signal import lfilter
+from scipy.spatial.transform import Rotation
+
+from px4fuse.errors import SettingsError, TrajectoryError
+from px4fuse.flight import Unavailable
+from px4fuse.readers.trajectory import read_trajectory
+from px4fuse.trajectory.alignment import DEGREES_OF_FREEDOM, AlignmentKind, fit
+from px4fuse.trajectory.association import associate, clock_difference, estimate_time_offset
+from px4fuse.trajectory.evaluation import (
+    MIN_BLOCKS,
+    Delta,
+    Interval,
+    Statistics,
+    autocorrelation_time,
+    choose_alignment,
+    evaluate,
+    pairs,
+    rmse_interval,
+)
+from px4fuse.trajectory.model import Frame, Kind, Trajectory
+
+SAMPLE = REPOSITORY / "sample_logs" / "loop_slam.tum"
+SHARED = REPOSITORY.parent / "shared" / "trajectories"
+PUBLISHED = [
+    ("evo_fr2_desk_ORB.txt", "evo_fr2_desk_groundtruth.txt"),
+    ("evo_freiburg1_xyz-ORB_kf_mono.txt", "evo_freiburg1_xyz-groundtruth.txt"),
+    ("evo_freiburg1_xyz-rgbdslam.txt", "evo_freiburg1_xyz-groundtruth.txt"),
+    ("rpg_vislam_ba_MH_04_estimate0.txt", "rpg_vislam_MH_04_groundtruth.txt"),
+    ("rpg_vislam_rp_MH_04_estimate0.txt", "rpg_vislam_MH_04_groundtruth.txt"),
+    ("rpg_vislam_rp_MH_04_estimate1.txt", "rpg_vislam_MH_04_groundtruth.txt"),
+]
+NAMES = [estimate.removesuffix(".txt") for estimate, _ in PUBLISHED]
+
+
+def flight(
+    seconds: float = 60.0, rate_hz: float = 20.0, kind: Kind = "truth", frame: Frame = "NED"
+) -> Trajectory:
+    """A smooth flight in three dimensions whose speed varies."""
+    time = np.arange(0.0, seconds, 1.0 / rate_hz)
+    position = np.column_stack(
+        [
+            4.0 * np.sin(0.5 * time) + 1.5 * np.sin(1.3 * time),
+            3.0 * np.cos(0.31 * time) + np.sin(0.9 * time + 1.0),
+            -2.0 + 0.6 * np.sin(0.7 * time),
+        ]
+    )
+    angles = np.column_stack(
+        [0.4 * time + np.sin(0.4 * time), 0.2 * np.sin(1.1 * time), 0.2 * np.cos(0.8 * time)]
+    )
+    rotation = Rotation.from_euler("ZYX", angles)
+    return Trajectory("flight.tum", kind, time, position, rotation, frame)
+
+
+def moved(
+    one: Trajectory, turn: Rotation, shift: np.ndarray, scale: float = 1.0, **changes: Any
+) -> Trajectory:
+    """The same motion in another world."""
+    assert one.rotation is not None
+    position = scale * turn.apply(one.position_m) + shift
+    return replace(one, position_m=position, rotation=turn * one.rotation, **changes)
+
+
+SHIFT = np.array([100.0, -20.0, 3.0])
+TURN = Rotation.from_euler("ZYX", [2.0, 0.4, -0.7])
+
+
+@cache
+def published(name: str) -> Trajectory:
+    if not SHARED.is_dir():
+        pytest.skip("the published trajectories (../shared/trajectories) are not here")
+    return read_trajectory(SHARED / name)
+
+
+# -- evo -------------------------------------------------------------------------------------------
+
+
+@cache
+def evo_matched(estimate: str, reference: str) -> tuple[Any, Any]:
+    pytest.importorskip("evo")
+    from evo.core import sync
+    from evo.tools import file_interface
+
+    published(estimate)
+    both = (file_interface.read_tum_trajectory_file(SHARED / n) for n in (reference, estimate))
+    matched: tuple[Any, Any] = sync.associate_trajectories(*both)
+    return matched
+
+
+def evo_aligned(estimate: str, reference: str, kind: AlignmentKind) -> tuple[Any, Any]:
+    true, made = evo_matched(estimate, reference)
+    made = copy.deepcopy(made)
+    if kind != "none":
+        made.align(true, correct_scale=kind == "sim3")
+    return true, made
+
+
+@pytest.mark.reallogs
+@pytest.mark.parametrize("pair", PUBLISHED, ids=NAMES)
+@pytest.mark.parametrize("offset_s", [0.0, 0.013, -0.5])
+def test_association_by_the_nearest_is_that_of_evo(pair: tuple[str, str], offset_s: float) -> None:
+    pytest.importorskip("evo")
+    from evo.core import sync
+
+    for first, second in (pair, pair[::-1]):
+        x, y = published(first), published(second)
+        expected = sync.matching_time_indices
+        if len(x) > len(y):
+            theirs = expected(y.time_s, x.time_s, 0.01, offset_s)[::-1]
+        else:
+            theirs = expected(x.time_s, y.time_s, 0.01, -offset_s)
+        got = associate(x, y, method="nearest", time_offset_s=offset_s)
+        np.testing.assert_array_equal(got.estimate.time_s, x.time_s[theirs[0]])
+        np.testing.assert_array_equal(got.reference.time_s, y.time_s[theirs[1]])
+
+
+@pytest.mark.reallogs
+@pytest.mark.parametrize("pair", PUBLISHED, ids=NAMES)
+@pytest.mark.parametrize("kind", ["none", "se3", "sim3"])
+def test_ate_is_that_of_evo(pair: tuple[str, str], kind: AlignmentKind) -> None:
+    pytest.importorskip("evo")
+    from evo.core.metrics import APE, PoseRelation
+
+    true, made = evo_aligned(*pair, kind)
+    got = evaluate(*map(published, pair), alignment=kind, association="nearest", rpe_deltas=())
+    np.testing.assert_array_equal(got.reference_m, true.positions_xyz)
+    np.testing.assert_allclose(got.estimate_m, made.positions_xyz, rtol=0, atol=1e-9)
+    assert isinstance(got.ate.rotation, Statistics)
+    for relation, errors, ours in (
+        (PoseRelation.translation_part, got.position_error_m, got.ate.translation),
+        (PoseRelation.rotation_angle_deg, got.rotation_error_deg, got.ate.rotation),
+    ):
+        metric = APE(relation)
+        metric.process_data((true, made))
+        np.testing.assert_allclose(errors, metric.error, rtol=0, atol=1e-9)
+        theirs = metric.get_all_statistics()
+        for name in ("rmse", "mean", "median", "std", "min", "max"):
+            assert getattr(ours, name) == pytest.approx(theirs[name], rel=0, abs=1e-9)
+
+
+DELTAS = (
+    Delta(1, "frames"),
+    Delta(10, "frames"),
+    Delta(0.5, "m"),
+    Delta(1.0, "m"),
+    Delta(5.0, "m"),
+)
+
+
+@pytest.mark.reallogs
+@pytest.mark.parametrize("pair", PUBLISHED, ids=NAMES)
+@pytest.mark.parametrize("kind", ["none", "se3", "sim3"])
+def test_rpe_is_that_of_evo(pair: tuple[str, str], kind: AlignmentKind) -> None:
+    pytest.importorskip("evo")
+    from evo.core.filters import FilterException
+    from evo.core.metrics import RPE, PoseRelation
+    from evo.core.units import Unit
+
+    true, made = evo_aligned(*pair, kind)
+    for all_pairs, pairs_from in ((True, "estimate"), (False, "estimate"), (True, "reference")):
+        got = evaluate(
+            *map(published, pair),
+            alignment=kind,
+            association="nearest",
+            rpe_deltas=DELTAS,
+            all_pairs=all_pairs,
+            pairs_from=pairs_from,  # type: ignore[arg-type]
+        )
+        for ours in got.rpe:
+            if kind != "se3" and ours.delta.unit == "frames":
+                continue  # scale and turn do not change these pairs; evo takes its time
+            unit = Unit.frames if ours.delta.unit == "frames" else Unit.meters
+            is_reference = pairs_from == "reference"
+            metric = RPE(
+                PoseRelation.translation_part,
+                ours.delta.value,
+                unit,
+                all_pairs=all_pairs,
+                pairs_from_reference=is_reference,
+            )
+            try:
+                metric.process_data((true, made))
+            except FilterException:
+                assert isinstance(ours.translation, Unavailable)
+                continue
+            np.testing.assert_array_equal(ours.end, metric.delta_ids)
+            np.testing.assert_allclose(ours.translation_error_m, metric.error, rtol=0, atol=1e-9)
+            turns = Rotation.from_matrix(np.array(metric.E)[:, :3, :3]).magnitude()
+            np.testing.assert_allclose(
+                ours.rotation_error_deg, np.degrees(turns), rtol=0, atol=1e-9
+            )
+
+
+# -- alignment -------------------------------------------------------------------------------------
+
+ANGLE = st.floats(-3.1, 3.1)
+
+
+@settings(deadline=None)
+@given(
+    angles=st.tuples(ANGLE, ANGLE, ANGLE),
+    shift=st.tuples(*[st.floats(-1e3, 1e3)] * 3),
+    scale=st.floats(0.05, 20.0),
+    seed=st.integers(0, 1000),
+)
+def test_a_random_similarity_is_recovered(
+    angles: tuple[float, ...], shift: tuple[float, ...], scale: float, seed: int
+) -> None:
+    points = np.random.default_rng(seed).normal(0.0, 5.0, (30, 3))
+    turn = Rotation.from_euler("ZYX", angles)
+    for kind in ("yaw", "se3", "sim3"):
+        used = Rotation.from_euler("Z", angles[0]) if kind == "yaw" else turn
+        factor = scale if kind == "sim3" else 1.0
+        got = fit(points, factor * used.apply(points) + shift, kind)  # type: ignore[arg-type]
+        assert got.degrees_of_freedom == DEGREES_OF_FREEDOM[kind]  # type: ignore[index]
+        assert (got.rotation.inv() * used).magnitude() < 1e-9
+        assert got.scale == pytest.approx(factor, rel=1e-9)
+        np.testing.assert_allclose(got.translation_m, shift, atol=1e-7)
+
+
+@pytest.mark.parametrize(("kind", "unknowns"), [("yaw", 4), ("se3", 6), ("sim3", 7)])
+def test_closed_forms_are_the_minimum(kind: AlignmentKind, unknowns: int) -> None:
+    random = np.random.default_rng(5)
+    x = random.normal(0.0, 2.0, (40, 3))
+    y = 1.2 * TURN.apply(x) + SHIFT + random.normal(0.0, 0.5, (40, 3))
+
+    def cost(p: np.ndarray) -> float:
+        turn = Rotation.from_euler("z", p[3]) if unknowns == 4 else Rotation.from_rotvec(p[3:6])
+        scale = np.exp(p[6]) if unknowns == 7 else 1.0
+        return float(((y - scale * turn.apply(x) - p[:3]) ** 2).sum())
+
+    got = fit(x, y, kind)
+    ours = float(((y - got.apply(x)) ** 2).sum())
+    starts = [
+        np.concatenate((y.mean(axis=0), random.uniform(-3, 3, unknowns - 3))) for _ in range(8)
+    ]
+    best = min(minimize(cost, start).fun for start in starts)
+    assert ours == pytest.approx(best, rel=1e-7)
+    np.testing.assert_allclose(got.apply(x[0]), got.apply(x)[0])
+
+
+def line(noise_m: float) -> tuple[np.ndarray, np.ndarray]:
+    random = np.random.default_rng(2)
+    along = np.linspace(0.0, 12.0, 200)[:, None] * np.array([0.8, 0.6, 0.0])
+    return tuple(along + random.normal(0.0, noise_m, along.shape) for _ in range(2))  # type: ignore[return-value]
+
+
+@pytest.mark.parametrize("noise_m", [0.0, 1e-9, 1e-3, 0.1])
+def test_a_turn_about_the_line_of_motion_is_refused(noise_m: float) -> None:
+    x, y = line(noise_m)
+    for kind in ("se3", "sim3"):
+        with pytest.raises(TrajectoryError, match=r"along a line.*--alignment yaw"):
+            fit(x, y, kind)  # type: ignore[arg-type]
+    assert fit(x, y, "yaw").rotation.magnitude() < 0.02
+
+
+def test_alignments_without_motion_are_refused() -> None:
+    random = np.random.default_rng(3)
+    still = random.normal(0.0, 0.01, (200, 3))
+    up = np.linspace(0.0, 3.0, 200)[:, None] * [0.0, 0.0, 1.0]
+    for x, y in ((up, up), (up + 0.01 * random.normal(size=up.shape), up + still)):
+        with pytest.raises(TrajectoryError, match=r"yaw cannot be found.*--alignment none"):
+            fit(x, y, "yaw")
+    for kind in ("se3", "sim3"):
+        with pytest.raises(TrajectoryError, match="does not move"):
+            fit(np.ones((9, 3)), up[:9], kind)  # type: ignore[arg-type]
+        with pytest.raises(TrajectoryError, match=kind):
+            fit(still, still[::-1].copy() + up, kind)  # type: ignore[arg-type]
+    with pytest.raises(TrajectoryError, match="Only 2 poses"):
+        fit(up[:2], up[:2], "none")
+
+
+# -- association -----------------------------------------------------------------------------------
+
+
+def test_interpolation_is_exact_where_the_motion_is_uniform() -> None:
+    time = np.arange(0.0, 10.0, 0.1)
+    turns = Rotation.from_rotvec(time[:, None] * [0.1, 0.5, 0.2])
+    reference = Trajectory("r", "truth", time, time[:, None] * [1.0, 2.0, 3.0], turns)
+    at = np.sort(np.random.default_rng(1).uniform(-1.0, 11.0, 300))
+    estimate = Trajectory("e", "vio", at - 5.0, np.zeros((300, 3)), None)
+    got = associate(estimate, reference, time_offset_s=5.0)
+    inside = (at >= 0.0) & (at <= time[-1])
+    assert (len(got), got.outside, got.in_gaps) == (inside.sum(), (~inside).sum(), 0)
+    np.testing.assert_allclose(got.reference.position_m, at[inside, None] * [1, 2, 3], atol=1e-12)
+    assert got.reference.rotation is not None
+    expected = Rotation.from_rotvec(at[inside, None] * [0.1, 0.5, 0.2])
+    assert (got.reference.rotation.inv() * expected).magnitude().max() < 1e-12
+    assert got.coverage_estimate == pytest.approx(inside.mean())
+    assert got.coverage_reference == pytest.approx(np.ptp(at[inside]) / time[-1])
+
+
+def test_nothing_is_interpolated_across_a_gap() -> None:
+    whole = flight(20.0)
+    reference = whole[(whole.time_s < 5.0) | (whole.time_s >= 10.0)]
+    got = associate(whole, reference)
+    assert got.max_gap_s == pytest.approx(0.15)
+    assert (len(got), got.in_gaps, got.outside) == (300, 100, 0)
+    assert len(associate(whole, reference, max_gap_s=6.0)) == 400
+    lost = associate(reference, whole)  # the other way round: the reference's time is not covered
+    assert lost.coverage_estimate == 1.0
+    assert lost.coverage_reference == pytest.approx(0.75, abs=0.01)
+
+
+def test_no_overlap_names_both_spans_and_the_remedy() -> None:
+    reference = flight()
+    estimate = replace(reference, name="boot.tum", time_s=reference.time_s + 500.0)
+    for method in ("interpolate", "nearest"):
+        with pytest.raises(
+            TrajectoryError, match=r"boot.tum: no poses match.*500.000 to 559.950 s"
+        ):
+            associate(estimate, reference, method=method)  # type: ignore[arg-type]
+    with pytest.raises(TrajectoryError, match=r"0.000 to 59.950 s.*--time-offset auto"):
+        evaluate(estimate, reference, time_offset_s=0.0)
+    assert evaluate(estimate, reference, time_offset_s=-500.0).ate.translation.rmse < 1e-9
+
+
+# -- scores ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", ["yaw", "se3", "sim3"])
+def test_a_transformed_copy_has_no_error(kind: AlignmentKind) -> None:
+    reference = flight()
+    turn = Rotation.from_euler("z", 2.0) if kind == "yaw" else TURN
+    copied = moved(reference, turn, SHIFT, 0.3 if kind == "sim3" else 1.0, kind="vio")
+    got = evaluate(copied, reference, alignment=kind)
+    assert got.ate.translation.max < 1e-9
+    assert isinstance(got.ate.rotation, Statistics)
+    assert got.ate.rotation.max < 1e-9
+    assert [str(one.delta) for one in got.rpe] == ["1 m", "5 m", "10 m", "1 s", "10 s"]
+    for one in got.rpe:
+        assert isinstance(one.translation, Statistics)
+        assert isinstance(one.rotation, Statistics)
+        assert one.translation.max < 1e-9
+        assert one.rotation.max < 1e-9
+    assert not got.warnings
+
+
+def test_a_tilt_shows_after_yaw_and_hides_after_se3() -> None:
+    reference = flight()
+    tilted = moved(reference, Rotation.from_euler("x", 5.0, degrees=True), SHIFT, kind="vio")
+    got = evaluate(tilted, reference)
+    assert got.alignment == "yaw"
+    assert isinstance(got.ate.rotation, Statistics)
+    assert got.ate.rotation.rmse == pytest.approx(5.0, abs=0.1)
+    assert got.ate.translation.rmse > 0.1
+    assert evaluate(tilted, reference, alignment="se3").ate.translation.rmse < 1e-9
+
+
+def test_a_drift_in_scale_is_the_rpe_over_distance() -> None:
+    reference = flight(200.0, 50.0)
+    got = evaluate(moved(reference, TURN, SHIFT, 1.02, kind="vio"), reference, alignment="se3")
+    for one in got.rpe:
+        chord = np.linalg.norm(got.reference_m[one.end] - got.reference_m[one.start], axis=1)
+        np.testing.assert_allclose(one.translation_error_m, 0.02 * chord, atol=1e-9)
+
+
+@settings(deadline=None, max_examples=60)
+@given(
+    steps=st.lists(st.sampled_from([0.0, 0.1, 0.25, 1.0, 3.0]), min_size=3, max_size=40),
+    value=st.sampled_from([0.1, 0.3, 0.5, 1.0, 2.0]),
+    tolerance=st.sampled_from([0.0, 0.1, 0.5]),
+)
+def test_pairs_are_those_of_the_definition(
+    steps: list[float], value: float, tolerance: float
+) -> None:
+    along = np.concatenate(([0.0], np.cumsum(steps)))
+    position, time = along[:, None] * [1.0, 0.0, 0.0], np.arange(len(along), dtype=float)
+    expected = []
+    for i in range(len(along) - 1):
+        miss = np.abs(along[i + 1 :] - along[i] - value)
+        j = int(np.argmin(miss))
+        if miss[j] <= tolerance * value:
+            expected.append((i, i + 1 + j))
+    start, end = pairs(position, time, Delta(value, "m"), relative_tolerance=tolerance)
+    assert list(zip(start.tolist(), end.tolist(), strict=True)) == expected
+    start, end = pairs(position, time, Delta(2.0, "s"), all_pairs=False)
+    np.testing.assert_array_equal(start, np.arange(0, len(along) - 2, 2))
+    np.testing.assert_array_equal(end, start + 2)
+
+
+@pytest.mark.parametrize("delta", [Delta(0.0, "m"), Delta(-1.0, "s"), Delta(1.5, "frames")])
+def test_deltas_that_mean_nothing_are_refused(delta: Delta) -> None:
+    one = flight(5.0)
+    with pytest.raises(SettingsError, match="RPE delta"):
+        evaluate(one, one, rpe_deltas=[delta])
+
+
+def test_what_cannot_be_had_is_absent_with_the_reason() -> None:
+    reference = flight()
+    got = evaluate(replace(reference, rotation=None, kind="vio"), reference)
+    assert isinstance(got.ate.rotation, Unavailable)
+    assert got.rotation_error_deg is None
+    for one in got.rpe:
+        assert isinstance(one.translation, Unavailable)
+        assert "the estimate has no orientation" in str(one.translation)
+    far = evaluate(reference, reference, rpe_deltas=[Delta(1e4, "m")]).rpe[0]
+    assert isinstance(far.translation, Unavailable)
+    assert "no two poses are 10000 m apart" in str(far.translation)
+
+
+# -- which alignment, and doubts -------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("estimate", "reference", "name", "scale", "expected", "why"),
+    [
+        (("vio", "FRD"), ("truth", "NED"), "a", 1.0, "yaw", "z is vertical"),
+        (("kf", "NED"), ("truth", "NED"), "a", 1.3, "yaw", "z is vertical"),
+        (("ekf2", "NED"), ("truth", "ENU"), "a", 1.0, "se3", "do not share a vertical"),
+        (("vio", "NED"), ("slam", "camera"), "a", 1.0, "se3", "first key frame"),
+        (("slam", "camera"), ("vio", "NED"), "a", 1.05, "se3", "first key frame"),
+        (("slam", "camera"), ("truth", "NED"), "a", 2.0, "sim3", "the scale is 0.5"),
+        (
+            ("slam", "unknown"),
+            ("truth", "NED"),
+            "kf_mono",
+            1.0,
+            "sim3",
+            "says that it is monocular",
+        ),
+        (("slam", "unknown"), ("truth", "NED"), "harmony", 1.0, "se3", "first key frame"),
+        (("unknown", "unknown"), ("truth", "unknown"), "a", 1.0, "se3", "does not say what made"),
+        (("vio", "NED"), ("truth", "unknown"), "a", 1.0, "se3", "do not share a vertical"),
+        (("truth", "NED"), ("truth", "NED"), "a", 1.0, "none", "ground truth"),
+        (("truth", "unknown"), ("slam", "unknown"), "a", 1.0, "se3", "first key frame"),
+    ],
+)
+def test_the_alignment_follows_from_what_the_two_are(
+    estimate: tuple[Kind, Frame],
+    reference: tuple[Kind, Frame],
+    name: str,
+    scale: float,
+    expected: str,
+    why: str,
+) -> None:
+    y = replace(flight(), kind=reference[0], frame=reference[1])
+    x = moved(y, TURN, SHIFT, scale, kind=estimate[0], frame=estimate[1], name=name)
+    kind, reason = choose_alignment(x, y)
+    assert kind == expected
+    assert why in reason
+
+
+def test_an_aisle_is_aligned_by_yaw_where_z_is_vertical() -> None:
+    x, y = line(0.02)
+    time = np.arange(len(x)) * 0.1
+    aisle = Trajectory("aisle", "truth", time, y, None, "NED")
+    got = evaluate(replace(aisle, kind="unknown", position_m=x), aisle)
+    assert got.alignment == "yaw"
+    assert "along a line" in got.alignment_reason
+    with pytest.raises(TrajectoryError, match="--alignment yaw"):
+        evaluate(replace(aisle, kind="slam", frame="camera", position_m=x), aisle)
+
+
+def test_a_camera_is_compared_around_its_constant_rotation_in_the_vehicle() -> None:
+    reference = flight()
+    assert reference.rotation is not None
+    mounted = Rotation.from_euler("ZYX", [90.0, 0.0, 90.0], degrees=True)
+    camera = moved(reference, TURN, SHIFT, kind="slam", frame="camera")
+    assert camera.rotation is not None
+    noise = Rotation.from_rotvec(np.random.default_rng(1).normal(0.0, 0.01, (len(camera), 3)))
+    camera = replace(camera, rotation=camera.rotation * mounted * noise)
+    got = evaluate(camera, reference)
+    assert isinstance(got.ate.rotation, Statistics)
+    assert got.ate.rotation.rmse == pytest.approx(np.degrees(0.01 * np.sqrt(3)), rel=0.05)
+    assert got.body_rotation is not None
+    assert (got.body_rotation * mounted).magnitude() < 0.01
+    assert "constant rotation of 120" in got.notes[0]
+    assert isinstance(got.rpe[0].translation, Statistics)
+    assert got.rpe[0].translation.rmse < 0.03
+    for same in (replace(camera, frame="unknown", kind="unknown"), replace(camera, frame="NED")):
+        assert evaluate(same, reference, alignment="se3").body_rotation is None
+
+
+def test_interchanged_and_doubtful_arguments_are_warned_about() -> None:
+    truth = flight()
+    vio = moved(truth, Rotation.from_euler("z", 1.0), SHIFT, kind="vio", name="log:vio")
+    assert not evaluate(vio, truth).warnings
+    assert "is ground truth and log:vio is not" in evaluate(truth, vio).warnings[0]
+    slam = replace(vio, kind="slam", name="slam")
+    every = np.arange(0, len(truth), 8)
+    assert "one pose in 0.4 s" in evaluate(vio, slam[every], max_gap_s=1.0).warnings[0]
+    assert "lasts 20.0 s" in evaluate(vio, slam[:400]).warnings[0]
+    assert "Only 33%" in evaluate(vio, truth[:400]).warnings[0]
+    assert "covers only 33%" in evaluate(vio[:400], truth).warnings[0]
+    large = evaluate(moved(truth, TURN, SHIFT, 1.5, kind="vio"), truth, alignment="se3")
+    assert "0.667 times it would fit best" in large.warnings[0]
+
+
+# -- clocks ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("offset_s", [0.0, 0.0371, -2.5, 17.0, 1_795_253_724.3])
+@pytest.mark.parametrize("rate_hz", [7.0, 50.0])
+def test_an_offset_between_clocks_is_recovered(offset_s: float, rate_hz: float) -> None:
+    reference = flight()
+    random = np.random.default_rng(4)
+    estimate = moved(flight(40.0, rate_hz), TURN, SHIFT, 1.7, kind="slam", frame="camera")
+    noise = random.normal(0.0, 0.02, (len(estimate), 3))
+    estimate = replace(
+        estimate, time_s=estimate.time_s - offset_s, position_m=estimate.position_m + noise
+    )
+    got = estimate_time_offset(estimate, reference)
+    assert got.determinable
+    assert got.offset_s == pytest.approx(offset_s, abs=2e-3)
+    assert got.interval_s is not None
+    assert got.interval_s[0] - 1e-3 < offset_s < got.interval_s[1] + 1e-3
+    back = estimate_time_offset(reference, estimate)
+    assert back.offset_s == pytest.approx(-offset_s, abs=2e-3)
+
+
+def test_the_interval_of_an_offset_holds_it() -> None:
+    reference, held = flight(40.0, 100.0), 0
+    random = np.random.default_rng(8)
+    for _ in range(40):
+        estimate = flight(40.0, 10.0)
+        noise = lfilter([0.05], [1.0, -0.9], random.normal(size=(len(estimate), 3)), axis=0)
+        estimate = replace(estimate, position_m=estimate.position_m + noise)
+        got = estimate_time_offset(estimate, reference)
+        assert got.interval_s is not None
+        held += got.interval_s[0] <= 0.0 <= got.interval_s[1]
+    assert held >= 35
+
+
+def test_clocks_that_are_set_are_the_start() -> None:
+    reference = replace(flight(), unix_offset_s=1.5e9)
+    estimate = replace(flight(), unix_offset_s=0.0, time_s=flight().time_s + 1.5e9 - 0.2)
+    assert clock_difference(estimate, reference) == -1.5e9
+    got = evaluate(estimate, reference, time_offset_s="auto")
+    assert got.time_offset.offset_s == pytest.approx(0.2 - 1.5e9, abs=1e-3)
+    again = evaluate(estimate, reference, time_offset_s=got.time_offset.offset_s)
+    assert again.time_offset.offset_s == got.time_offset.offset_s
+    assert again.ate == got.ate
+    assert evaluate(estimate, reference).time_offset.offset_s == -1.5e9
+    alone = replace(reference, unix_offset_s=None)
+    found = evaluate(estimate, alone).time_offset
+    assert found.offset_s == pytest.approx(0.2 - 1.5e9, abs=1e-3)
+
+
+@pytest.mark.parametrize("kind", ["still", "line", "circle"])
+@pytest.mark.parametrize("noise_m", [0.0, 0.01, 0.05])
+def test_an_offset_without_excitation_is_not_determinable(kind: str, noise_m: float) -> None:
+    time = np.arange(0.0, 60.0, 0.05)
+    position = {
+        "still": np.zeros((len(time), 3)),
+        "line": time[:, None] * [1.0, 0.5, 0.0],
+        "circle": np.column_stack((np.cos(time / 3), np.sin(time / 3), 0.0 * time)) * 5.0,
+    }[kind]
+    noise = np.random.default_rng(6).normal(0.0, noise_m, (2, *position.shape))
+    estimate, reference = (
+        Trajectory(kind, "kf", time, position + one, None, "NED") for one in noise
+    )
+    got = estimate_time_offset(estimate, reference)
+    assert not got.determinable
+    assert got.offset_s is None
+    assert got.interval_s is None
+    assert "not determinable" in got.reason
+    used = evaluate(estimate, reference, alignment="none", time_offset_s="auto")
+    assert used.time_offset.offset_s == 0.0
+    assert "Used the stamps as they are instead." in used.warnings[0]
+
+
+def test_a_motion_that_repeats_is_ambiguous() -> None:
+    one = flight(20.0)
+    lap = np.tile(np.arange(len(one)), 4)
+    time = np.arange(len(lap)) * 0.05
+    # laps that close: the same 20 s four times, out and back
+    closed = one.position_m * np.sin(np.pi * one.time_s / 20.0)[:, None] ** 2
+    laps = Trajectory("laps", "vio", time, closed[lap], None)
+    got = estimate_time_offset(replace(laps[:800], unix_offset_s=None), laps)
+    assert not got.determinable
+    assert "repeats itself" in got.reason
+
+
+@pytest.mark.reallogs
+@pytest.mark.parametrize("pair", PUBLISHED, ids=NAMES)
+def test_published_trajectories_that_were_shifted_are_shifted_back(pair: tuple[str, str]) -> None:
+    estimate, reference = map(published, pair)
+    base = estimate_time_offset(estimate, reference)
+    assert base.offset_s is not None
+    assert abs(base.offset_s) < 0.06  # their own clocks are not perfect
+    for shift_s in (0.137, -2.5, 30.0):
+        shifted = replace(estimate, time_s=estimate.time_s + shift_s)
+        got = estimate_time_offset(shifted, reference)
+        assert got.offset_s == pytest.approx(base.offset_s - shift_s, abs=1e-3)
+    boot = replace(estimate, time_s=estimate.time_s - estimate.time_s[0] + 12.5, unix_offset_s=None)
+    got = estimate_time_offset(boot, reference)
+    assert got.offset_s == pytest.approx(base.offset_s + estimate.time_s[0] - 12.5, abs=1e-3)
+
+
+# -- intervals -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("phi", [0.0, 0.9, 0.97])
+def test_intervals_hold_the_true_rmse(phi: float) -> None:
+    random = np.random.default_rng(9)
+    flights, n = 200, 2000
+    white = random.normal(size=(n + 500, flights, 3)) * np.sqrt(1.0 - phi**2)
+    errors = np.linalg.norm(lfilter([1.0], [1.0, -phi], white, axis=0)[500:], axis=2)
+    got = [rmse_interval(errors[:, i], "ATE", resamples=1000) for i in range(flights)]
+    known = [one for one in got if isinstance(one, Interval)]
+    assert len(known) == flights
+    assert np.median([one.blocks for one in known]) > 20.0
+    held = np.mean([one.low <= np.sqrt(3.0) <= one.high for one in known])
+    assert 0.85 < held <= 1.0
+
+
+def test_the_autocorrelation_time_is_that_of_the_process() -> None:
+    white = np.random.default_rng(10).normal(size=200_000)
+    for phi in (0.0, 0.5, 0.9):
+        values = lfilter([1.0], [1.0, -phi], white)
+        assert autocorrelation_time(values) == pytest.approx((1 + phi) / (1 - phi), rel=0.1)
+    assert autocorrelation_time(np.ones(50)) == 1.0
+
+
+def test_too_few_blocks_give_no_interval() -> None:
+    drift = np.linspace(0.0, 1.0, 500)
+    got = rmse_interval(drift, "ATE")
+    assert isinstance(got, Unavailable)
+    assert f"fewer than the {MIN_BLOCKS:.0f} independent blocks" in str(got)
+    assert isinstance(rmse_interval(np.ones(100), "ATE", min_block=30), Unavailable)
+    same = rmse_interval(np.full(100, 0.5), "ATE")
+    assert isinstance(same, Interval)
+    assert (same.low, same.high) == (pytest.approx(0.5), pytest.approx(0.5))
+    assert rmse_interval(np.sin(drift * 99), "ATE") == rmse_interval(np.sin(drift * 99), "ATE")
+
+
+# -- the sample ------------------------------------------------------------------------------------
+
+
+def test_the_sample_slam_against_itself_drifting() -> None:
+    slam = read_trajectory(SAMPLE)
+    drift = slam.position_m * (1.0 + 0.01 * np.linspace(0.0, 1.0, len(slam)))[:, None]
+    got = evaluate(replace(slam, position_m=drift, name="drifting.tum"), slam)
+    assert got.alignment == "se3"
+    assert got.body_rotation is None
+    assert 0.005 < got.ate.translation.rmse < 0.1
+    assert len(got.time_s) == len(got.distance_m) == len(got.position_error_m) == len(slam)
+    assert got.association.coverage_reference == pytest.approx(1 - 3.1 / 86.0, abs=0.002)
+
+
+def test_the_sample_slam_against_the_log_that_it_was_made_from() -> None:
+    from px4fuse.readers import read_log
+    from px4fuse.trajectory.tracks import trajectory_of
+
+    log: Path = REPOSITORY / "sample_logs" / "loop_vio.ulg"
+    flown = read_log(log)
+    truth, vio = (trajectory_of(flown, part) for part in ("truth", "vio"))  # type: ignore[arg-type]
+    slam = read_trajectory(SAMPLE)
+    odometry = evaluate(vio, truth)
+    assert odometry.alignment == "yaw"
+    assert 0.3 < odometry.ate.translation.rmse < 0.6
+    # the log has no UNIX time: the offset is found from the motion
+    got = evaluate(slam, truth)
+    assert got.alignment == "se3"
+    assert got.time_offset.determinable
+    assert got.ate.translation.rmse < 0.08
+    assert isinstance(got.ate.rotation, Statistics)
+    assert got.ate.rotation.rmse < 0.6
+    assert got.body_rotation is not None
+    assert np.degrees(got.body_rotation.magnitude()) == pytest.approx(120.0, abs=1.0)
+    other = evaluate(vio, slam)
+    assert other.alignment == "se3"
+    assert other.time_offset.offset_s == pytest.approx(-(got.time_offset.offset_s or 0.0), abs=0.1)

@@ -1,0 +1,438 @@
+"""Loops: the sample flight against its truth, and laps with known drift and false closures."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import REPOSITORY
+from pyulog import ULog
+from scipy.spatial.transform import Rotation, Slerp
+
+from px4fuse.errors import SettingsError, TrajectoryError
+from px4fuse.findings import find_loop
+from px4fuse.flight import Unavailable
+from px4fuse.readers.closures import GivenClosure, parse_closure, read_closures
+from px4fuse.trajectory.analysis import analyse, loop_in
+from px4fuse.trajectory.evaluation import Evaluation
+from px4fuse.trajectory.loop import SINGLE_LOOP, Correction, Loop, close_loop
+from px4fuse.trajectory.model import Trajectory
+from px4fuse.trajectory.odometry import Closure, OdometryNoise, odometry_variances
+from px4fuse.trajectory.sources import Source, read_source, split_part
+
+SAMPLE = REPOSITORY / "sample_logs" / "loop_vio.ulg"
+SLAM = REPOSITORY / "sample_logs" / "loop_slam.tum"
+# Findings that this file makes, see test_findings
+NAMED_HERE = {
+    "false_loop_closure",
+    "loop_closure_doubtful",
+    "loop_drift_understated",
+    "loop_end_assumed",
+    "loop_of_absolute_track",
+}
+RATE_HZ = 10.0
+SPEED_M_S = 1.0
+SIDE_M = 10.0
+
+
+@pytest.fixture(scope="module")
+def sample() -> Source:
+    return read_source(str(SAMPLE))
+
+
+@pytest.fixture(scope="module")
+def sample_loop(sample: Source) -> Loop:
+    return analyse(sample, reference=read_source(str(SLAM)).trajectory)
+
+
+def score(correction: Correction | Unavailable, index: int = 0) -> Evaluation:
+    assert isinstance(correction, Correction)
+    found = list(correction.scores.values())[index]
+    assert isinstance(found, Evaluation)
+    return found
+
+
+def rmse(correction: Correction | Unavailable, index: int = 0) -> float:
+    return score(correction, index).ate.translation.rmse
+
+
+# ------------------------------------------------------------------ the sample flight
+
+
+def true_closure_error_m() -> float:
+    """How far the odometry is from the vehicle at its landing, straight from the log's topics."""
+    log = ULog(str(SAMPLE))
+    topics = {topic.name: topic.data for topic in log.data_list}
+    odometry, truth = (
+        topics["vehicle_visual_odometry"],
+        topics["vehicle_local_position_groundtruth"],
+    )
+    landed = topics["vehicle_land_detected"]
+    time = odometry["timestamp_sample"].astype(float)
+    true_time = truth["timestamp_sample"].astype(float)
+    up = landed["timestamp"][np.flatnonzero(np.diff(landed["landed"].astype(int)) == -1)[0] + 1]
+    down = landed["timestamp"][np.flatnonzero(np.diff(landed["landed"].astype(int)) == 1)[-1] + 1]
+
+    def rest(times: np.ndarray, data: dict, names: tuple[str, ...], low: float) -> np.ndarray:
+        inside = (times >= low) & (times <= low + 1e6)
+        return np.array([data[name][inside].mean() for name in names])
+
+    moved = [
+        rest(times, data, names, float(down)) - rest(times, data, names, float(up) - 1e6)
+        for times, data, names in (
+            (time, odometry, ("position[0]", "position[1]", "position[2]")),
+            (true_time, truth, ("x", "y", "z")),
+        )
+    ]
+    return float(np.linalg.norm(moved[0] - moved[1]))
+
+
+def test_the_samples_closure_error_is_the_true_one(sample_loop: Loop) -> None:
+    assert sample_loop.closure_error_m == pytest.approx(true_closure_error_m(), abs=0.02)
+    assert sample_loop.closure_error_m == pytest.approx(1.42, abs=0.05)  # sample_logs/README.md
+    assert sample_loop.path_length_m == pytest.approx(87.7, abs=1.5)
+    assert sample_loop.misclosure_heading_deg == pytest.approx(5.09, abs=0.3)
+    assert sample_loop.segment.reason == "from take-off to landing, by the land detector"
+
+
+@pytest.mark.parametrize("reference", [0, 1], ids=["truth", "SLAM"])
+def test_both_corrections_bring_the_sample_closer(sample_loop: Loop, reference: int) -> None:
+    before = rmse(sample_loop.odometry, reference)
+    assert rmse(sample_loop.by_distance, reference) < 0.8 * before
+    assert rmse(sample_loop.solved["gated"], reference) < 0.8 * before
+
+
+def test_a_corrected_path_ends_where_the_vehicle_did(sample_loop: Loop) -> None:
+    assert not isinstance(sample_loop.known_end, Unavailable)
+    end = np.array(sample_loop.known_end.displacement_m)
+    for part, within in ((sample_loop.by_distance, 1e-9), (sample_loop.solved["gated"], 0.02)):
+        assert isinstance(part, Correction)
+        moved = part.trajectory.position_m[-1] - part.trajectory.position_m[0]
+        assert np.linalg.norm(moved - end) < within
+
+
+def test_a_single_loop_says_that_it_has_no_redundancy(sample_loop: Loop) -> None:
+    for name in ("dcs", "gnc"):
+        robust = sample_loop.solved[name]
+        assert isinstance(robust, Unavailable)
+        assert robust.reason == SINGLE_LOOP
+
+
+def test_a_tape_gives_what_the_truth_gives(sample: Source, sample_loop: Loop) -> None:
+    assert not isinstance(sample_loop.known_end, Unavailable)
+    forward, right, _ = sample_loop.known_end.displacement_m  # its nose points along x
+    heading = sample_loop.known_end.heading_change_deg
+    taped = analyse(sample, landed_at=(forward, right, heading))
+    # a tape does not see the height, which the truth has 0.16 m lower
+    assert taped.closure_error_m == pytest.approx(sample_loop.closure_error_m, abs=0.03)
+    assert taped.misclosure_heading_deg == pytest.approx(
+        sample_loop.misclosure_heading_deg, abs=1e-6
+    )
+
+
+def test_the_tlog_of_the_flight_gives_the_same_loop(shared_logs: Path) -> None:
+    found = analyse(read_source(str(shared_logs / "mavlink" / "v1.16.1_loop_vio.tlog")))
+    assert found.closure_error_m == pytest.approx(true_closure_error_m(), abs=0.05)
+
+
+test_the_tlog_of_the_flight_gives_the_same_loop = pytest.mark.reallogs(
+    test_the_tlog_of_the_flight_gives_the_same_loop
+)
+
+
+def test_an_absolute_track_is_not_taken_for_odometry() -> None:
+    source = read_source(str(REPOSITORY / "sample_logs" / "aisle_uwb.ulg"))
+    assert source.trajectory.kind == "ekf2"
+    found = analyse(source)
+    assert found.absolute
+    assert "loop_of_absolute_track" in {finding.id for finding in find_loop(found)}
+    assert source.flight is not None
+    assert isinstance(loop_in(source.flight), Unavailable)
+
+
+# ------------------------------------------------------------------ laps with known drift
+
+
+def laps(count: int, seed: int, noise: OdometryNoise) -> tuple[Trajectory, Trajectory]:
+    """Truth and odometry of laps around a square, nose first, with drift as the noise says."""
+    rng = np.random.default_rng(seed)
+    corners = SIDE_M * np.array([[0, 0], [1, 0], [1, 1], [0, 1]], dtype=float)
+    per_leg = int(SIDE_M / SPEED_M_S * RATE_HZ)
+    legs = [
+        corners[leg % 4] + share * (corners[(leg + 1) % 4] - corners[leg % 4])
+        for leg in range(4 * count)
+        for share in np.arange(per_leg)[:, None] / per_leg
+    ]
+    flat = np.array([*legs, corners[0]]).reshape(-1, 2)
+    position = np.column_stack([flat, np.full(len(flat), -1.5)])
+    turn = np.minimum(np.arange(len(flat)) / per_leg, 4 * count - 1e-9).astype(int) * np.pi / 2
+    rotation = Rotation.from_rotvec(np.outer(turn, [0, 0, 1]))
+    time = np.arange(len(flat)) / RATE_HZ
+    length = np.linalg.norm(np.diff(position, axis=0), axis=1)
+    duration = np.diff(time)
+    sigma = np.sqrt(noise.position_m**2 / 100 * length + noise.position_m_per_root_s**2 * duration)
+    heading = np.radians(
+        np.sqrt(noise.heading_deg**2 / 100 * length + noise.heading_deg_per_root_s**2 * duration)
+    )
+    turns = rng.normal(size=(len(heading), 3)) * np.outer(
+        heading, [noise.tilt_share, noise.tilt_share, 1.0]
+    )
+    moved = rotation[:-1].inv().apply(np.diff(position, axis=0))
+    moved += rng.normal(size=moved.shape) * sigma[:, None]
+    steps = rotation[:-1].inv() * rotation[1:] * Rotation.from_rotvec(turns)
+    measured, oriented = [position[0]], [rotation[0]]
+    for step, turned in zip(moved, steps, strict=True):
+        measured.append(measured[-1] + oriented[-1].apply(step))
+        oriented.append(oriented[-1] * turned)
+    truth = Trajectory("truth", "truth", time, position, rotation, "NED")
+    odometry = Trajectory(
+        "laps", "vio", time, np.array(measured), Rotation.concatenate(oriented), "NED"
+    )
+    return truth, odometry
+
+
+LAP_S = 4 * SIDE_M / SPEED_M_S
+# on the second and third laps the vehicle passes where it was on the first
+TRUE = tuple(Closure(t, t + lap * LAP_S, 0.05) for lap in (1, 2) for t in (5.0, 14.0, 23.0, 32.0))
+# opposite sides of the square
+FALSE = Closure(12.0, 2 * LAP_S + 35.0, 0.05)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_one_false_closure_among_true_ones(seed: int) -> None:
+    noise = OdometryNoise()
+    truth, odometry = laps(3, seed, noise)
+    clean = close_loop(odometry, closures=TRUE, noise=noise, references=(truth,))
+    fooled = close_loop(odometry, closures=(*TRUE, FALSE), noise=noise, references=(truth,))
+    assert all(judged.gate.accepted for judged in clean.closures)
+    *true, false = fooled.closures
+    assert false.gate.p < 0.001
+    assert not false.gate.accepted
+    assert all(judged.gate.accepted for judged in true)
+    without = rmse(clean.solved["all"])
+    assert without < 0.6 * rmse(clean.odometry)
+    # trusting it warps the path; the gate and both ways of robust solving do not
+    assert rmse(fooled.solved["all"]) > 3.0 * without
+    for name in ("gated", "dcs", "gnc"):
+        assert rmse(fooled.solved[name]) == pytest.approx(without, rel=0.05), name
+    for name in ("dcs", "gnc"):
+        assert false.weights[name] < 0.05
+        assert min(judged.weights[name] for judged in true) > 0.5
+    named = [finding.id for finding in find_loop(fooled)]
+    assert named[0] == "false_loop_closure"
+    assert "loop_closure_doubtful" not in named
+
+
+def test_the_gate_accepts_true_landings_as_often_as_stated() -> None:
+    """With the noise that the laps have, p is uniform: a third below a third, and so on."""
+    noise = OdometryNoise()
+    p = []
+    for seed in range(60):
+        _, odometry = laps(1, 100 + seed, noise)
+        p.append(close_loop(odometry, noise=noise).closures[0].gate.p)
+    assert min(p) > 0.001
+    for share in (0.25, 0.5, 0.75):
+        assert np.mean(np.array(p) < share) == pytest.approx(share, abs=0.2)
+
+
+def test_a_landing_elsewhere_is_rejected_and_nothing_is_corrected() -> None:
+    _, odometry = laps(1, 3, OdometryNoise())
+    half = odometry[: len(odometry) // 2]
+    found = close_loop(half)
+    judged = found.closures[0]
+    assert not judged.gate.accepted
+    assert judged.distance_m == pytest.approx(SIDE_M * np.sqrt(2.0), rel=0.2)
+    for part in (found.by_distance, found.solved["gated"]):
+        assert isinstance(part, Unavailable)
+        assert "warp" in part.reason
+    finding = find_loop(found)[0]
+    assert (finding.id, finding.severity) == ("false_loop_closure", "error")
+    assert finding.evidence["p"] < 0.001
+    opened = close_loop(half, came_back=False)
+    assert opened.closure_error_m is None
+    assert isinstance(opened.misclosure_m, Unavailable)
+    assert opened.closures == ()
+    assert find_loop(opened) == ()
+
+
+def test_the_heading_at_landing_counts_only_where_it_may_be_the_same() -> None:
+    noise = OdometryNoise()
+    _, odometry = laps(1, 4, noise)
+    turned = close_loop(odometry, noise=noise)  # it ends facing west
+    assert isinstance(turned.misclosure_heading_deg, Unavailable)
+    assert turned.closures[0].gate.degrees_of_freedom == 3
+    assert odometry.rotation is not None
+    quaternions = odometry.rotation.as_quat()
+    quaternions[-1] = odometry.rotation[0].as_quat()
+    same = replace(odometry, rotation=Rotation.from_quat(quaternions))
+    found = close_loop(same, noise=noise)
+    assert found.misclosure_heading_deg == pytest.approx(0.0, abs=1e-9)
+    assert found.closures[0].gate.degrees_of_freedom == 4
+
+
+def test_a_doubtful_closure_is_named() -> None:
+    """Off by less than the drift could explain, but the others know better."""
+    noise = OdometryNoise()
+    _, odometry = laps(3, 5, noise)
+    wrong = Closure(20.0, 21.5 + LAP_S, 0.05)  # 1.5 m further along the side
+    found = close_loop(odometry, closures=(*TRUE, wrong), noise=noise)
+    assert found.closures[-1].gate.accepted
+    doubtful = [f for f in find_loop(found) if f.id == "loop_closure_doubtful"]
+    assert len(doubtful) == 1
+    assert doubtful[0].evidence["time_1_s"] == 20.0
+
+
+def test_dropping_most_closures_points_to_the_drift() -> None:
+    """An odometry with a turn in every step, which is said to be almost perfect."""
+    _, odometry = laps(3, 7, OdometryNoise())
+    assert odometry.rotation is not None
+    turn = Rotation.from_rotvec(np.outer(np.linspace(0.0, 0.7, len(odometry)), [0, 0, 1]))
+    steps = turn[:-1].apply(np.diff(odometry.position_m, axis=0))
+    biased = replace(
+        odometry,
+        position_m=np.vstack([np.zeros(3), np.cumsum(steps, axis=0)]),
+        rotation=turn * odometry.rotation,
+    )
+    found = close_loop(biased, closures=TRUE, noise=OdometryNoise(1.0, 1.0))
+    assert "loop_drift_understated" in {finding.id for finding in find_loop(found)}
+
+
+def test_an_assumed_landing_is_said_to_be_assumed(sample: Source, sample_loop: Loop) -> None:
+    assert find_loop(sample_loop) == ()  # the log has the truth
+    assert sample.flight is not None
+    blind = Unavailable("ground truth", "left out", "")
+    found = analyse(Source(sample.trajectory, replace(sample.flight, truth=blind)))
+    (finding,) = find_loop(found)
+    assert (finding.id, finding.severity) == ("loop_end_assumed", "info")
+    assert "--landed-at" in finding.remedy
+    assert find_loop(analyse(sample, landed_at=(0.0, 0.0, None))) == ()
+
+
+def test_reported_variances_count_where_they_grow() -> None:
+    _, odometry = laps(1, 6, OdometryNoise())
+    nodes = np.arange(0, len(odometry), 10)
+    constant = replace(odometry, position_variance_m2=np.full((len(odometry), 3), 0.0025))
+    default, _, _ = odometry_variances(odometry, nodes, OdometryNoise())
+    same, _, words = odometry_variances(constant, nodes, OdometryNoise())
+    np.testing.assert_array_equal(same, default)
+    assert "do not grow" in words
+    growing = np.linspace(0.001, 0.4, len(odometry))[:, None].repeat(3, axis=1)
+    grown, _, words = odometry_variances(
+        replace(odometry, position_variance_m2=growing), nodes, OdometryNoise()
+    )
+    np.testing.assert_allclose(grown.sum(), 0.4 - 0.001, rtol=0.05)
+    assert "as the log's own position variances grow" in words
+
+
+def test_poses_between_key_frames_move_with_them(sample_loop: Loop) -> None:
+    solved = sample_loop.solved["gated"]
+    assert isinstance(solved, Correction)
+    assert solved.solution is not None
+    at_nodes = solved.trajectory.position_m[sample_loop.nodes]
+    np.testing.assert_allclose(at_nodes, solved.solution.poses[:, :3], atol=1e-9)
+    # and no jump between them that the odometry does not have
+    jump = np.linalg.norm(np.diff(solved.trajectory.position_m, axis=0), axis=1)
+    before = np.linalg.norm(np.diff(sample_loop.odometry.trajectory.position_m, axis=0), axis=1)
+    assert np.max(np.abs(jump - before)) < 0.02
+
+
+# ------------------------------------------------------------------ what is given
+
+
+def test_times_of_a_file_in_unix_time_may_count_from_its_first_pose() -> None:
+    source = read_source(str(SLAM))
+    relative = analyse(source, closures=(GivenClosure(3.0, 80.0, 0.3),))
+    start = float(source.trajectory.time_s[0])
+    stamped = analyse(source, closures=(GivenClosure(start + 3.0, start + 80.0, 0.3),))
+    assert relative.closures[1].gate == stamped.closures[1].gate
+
+
+def test_the_slam_file_is_levelled_and_closes_better_than_the_odometry() -> None:
+    source = read_source(str(SLAM))
+    found = analyse(source, landed_at=(0.0, 0.0, None))
+    assert found.odometry.trajectory.frame == "FRD"
+    assert found.closure_error_m is not None
+    assert found.closure_error_m < 0.7  # it truly ended 0.4 m away
+    height = found.odometry.trajectory.position_m[:, 2]
+    assert np.ptp(height) < 2.5
+    assert found.path_length_m == pytest.approx(86.0, abs=5.0)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [("1,2", (1.0, 2.0, 0.10)), (" 1.5 , 20,0.3", (1.5, 20.0, 0.3))],
+)
+def test_a_closure_is_read(text: str, expected: tuple[float, float, float]) -> None:
+    found = parse_closure(text)
+    assert (found.time_1_s, found.time_2_s, found.sigma_m) == expected
+
+
+@pytest.mark.parametrize("text", ["", "1", "1,2,3,4", "a,b", "1,nan", "1;2", "inf,2"])
+def test_what_is_no_closure_is_refused(text: str) -> None:
+    with pytest.raises(TrajectoryError, match="T1,T2"):
+        parse_closure(text)
+
+
+def test_a_file_of_closures(tmp_path: Path) -> None:
+    path = tmp_path / "closures.csv"
+    path.write_text("t1,t2,sigma\n# same corner\n1,2\n\n3, 4, 0.5  # guess\n")
+    assert [c.sigma_m for c in read_closures(path)] == [0.10, 0.5]
+    path.write_text("1,2\n3,x\n")
+    with pytest.raises(TrajectoryError, match=r"closures\.csv, line 2: closure '3,x'"):
+        read_closures(path)
+    path.write_text("# none\n")
+    with pytest.raises(TrajectoryError, match="0 closures"):
+        read_closures(path)
+    with pytest.raises(TrajectoryError, match="cannot be read"):
+        read_closures(tmp_path / "missing.csv")
+
+
+@pytest.mark.parametrize(
+    ("closure", "says"),
+    [
+        (GivenClosure(5.0, 500.0), "500 s is outside the path, which runs from"),
+        (GivenClosure(-5.0, 50.0), "-5 s is outside the path"),
+        (GivenClosure(50.0, 20.0), "the first time must be before the second"),
+        (GivenClosure(20.0, 50.0, 0.0), "SIGMA 0 is outside"),
+    ],
+)
+def test_impossible_closures_are_refused(sample: Source, closure: GivenClosure, says: str) -> None:
+    with pytest.raises(TrajectoryError, match=says):
+        analyse(sample, closures=(closure,))
+
+
+def test_impossible_parts_are_refused(sample: Source) -> None:
+    with pytest.raises(SettingsError, match="--from or --to"):
+        analyse(sample, start_s=50.0, end_s=20.0)
+    with pytest.raises(TrajectoryError, match="too few"):
+        analyse(sample, start_s=500.0, end_s=600.0)
+    with pytest.raises(TrajectoryError, match="too short for a loop"):
+        analyse(sample, start_s=96.0, end_s=98.0)
+    with pytest.raises(SettingsError, match="exclude each other"):
+        analyse(sample, landed_at=(0.0, 0.0, None), came_back=False)
+
+
+def test_a_part_of_a_log_is_named_after_a_colon(tmp_path: Path) -> None:
+    assert split_part(f"{SAMPLE}:ekf2") == (SAMPLE, "ekf2")
+    assert split_part(str(SAMPLE)) == (SAMPLE, None)
+    odd = tmp_path / "a:vio"
+    odd.write_bytes(b"")
+    assert split_part(str(odd)) == (odd, None)
+    with pytest.raises(TrajectoryError, match="'slam' is no part of a flight"):
+        split_part(f"{SAMPLE}:slam")
+
+
+def test_slerp_is_what_the_turn_between_nodes_is(sample_loop: Loop) -> None:
+    """Orientation corrections between nodes are on the geodesic of their neighbours'."""
+    solved = sample_loop.solved["gated"]
+    assert isinstance(solved, Correction)
+    after, before = solved.trajectory, sample_loop.odometry.trajectory
+    assert after.rotation is not None
+    assert before.rotation is not None
+    turn = after.rotation * before.rotation.inv()
+    a, b = sample_loop.nodes[40], sample_loop.nodes[41]
+    ends = Rotation.concatenate([turn[a], turn[b]])
+    expected = Slerp(before.time_s[[a, b]], ends)(before.time_s[a:b])
+    assert np.max((turn[a:b] * expected.inv()).magnitude()) < 1e-9

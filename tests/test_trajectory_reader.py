@@ -1,0 +1,353 @@
+"""Trajectory files in every dialect: the same poses, or one line of explanation."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import replace
+from decimal import Decimal
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import REPOSITORY
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from scipy.spatial.transform import Rotation
+
+from px4fuse.errors import TrajectoryError
+from px4fuse.readers import trajectory as reader
+from px4fuse.readers.trajectory import looks_like_trajectory, read_trajectory, tum_text
+from px4fuse.trajectory.model import Trajectory
+
+SAMPLE = REPOSITORY / "sample_logs" / "loop_slam.tum"
+SHARED = REPOSITORY.parent / "shared" / "trajectories"
+
+# The one track that every dialect below is written from
+RANDOM = np.random.default_rng(20261121)
+POSES = 50
+NANOSECONDS = 1_403_636_579_763_555_584 + 50_000_000 * np.arange(POSES)
+POSITION_M = RANDOM.normal(0.0, 3.0, (POSES, 3)).round(6)
+ROTATION = Rotation.random(POSES, random_state=1)
+QUATERNION = ROTATION.as_quat().round(9)  # x y z w
+EUROC_HEADER = (
+    "#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], "
+    "q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z []"
+)
+EUROC_MORE = (
+    ", v_RS_R_x [m s^-1], v_RS_R_y [m s^-1], v_RS_R_z [m s^-1], b_w_RS_S_x [rad s^-1], "
+    "b_w_RS_S_y [rad s^-1], b_w_RS_S_z [rad s^-1], b_a_RS_S_x [m s^-2], b_a_RS_S_y [m s^-2], "
+    "b_a_RS_S_z [m s^-2]"
+)
+
+
+def rows(
+    separator: str = " ", stamps: str = "s", order: str = "xyzw", number: str = ".9f"
+) -> list[str]:
+    times = {
+        "s": [f"{t // 10**9}.{t % 10**9:09d}" for t in NANOSECONDS.tolist()],
+        "ns": [str(t) for t in NANOSECONDS.tolist()],
+        "orb": [f"{t}.000000" for t in NANOSECONDS.tolist()],
+        "exponent": [f"{Decimal(t) / 10**9:.18e}" for t in NANOSECONDS.tolist()],
+    }[stamps]
+    quaternion = QUATERNION[:, ["xyzw".index(axis) for axis in order]]
+    values = np.column_stack((POSITION_M, quaternion)).tolist()
+    return [
+        separator.join((time, *(format(value, number) for value in row)))
+        for time, row in zip(times, values, strict=True)
+    ]
+
+
+def text(lines: list[str], end: str = "\n") -> str:
+    return end.join(lines) + end
+
+
+HEAD = ["# estimated trajectory", "# timestamp tx ty tz qx qy qz qw"]
+COMMAS = rows(",", "ns", "wxyz")
+DIALECTS: dict[str, str | bytes] = {
+    "TUM": text(rows()),
+    "comments": text([*HEAD, *rows()[:9], "# a remark", "", *rows()[9:]]),
+    "tabs": text(rows("\t")),
+    "double spaces and a last one": text([f"  {row} " for row in rows("  ")]),
+    "CRLF": text(rows(), "\r\n"),
+    "BOM": b"\xef\xbb\xbf" + text([*HEAD, *rows()]).encode(),
+    "UTF-16": text(rows()).encode("utf-16"),
+    "latin-1 comment": b"# K\xf6ln\n" + text(rows()).encode(),
+    "exponents": text(rows(stamps="exponent", number=".18e")),
+    "header without #": text(["timestamp tx ty tz qx qy qz qw", *rows()]),
+    "w first by its header": text(["# time x y z qw qx qy qz", *rows(order="wxyz")]),
+    "remarks behind": text([f"{row} # keyframe" for row in rows()]),
+    "EuRoC, 8": text([EUROC_HEADER, *COMMAS], "\r\n"),
+    "EuRoC, 17": text([EUROC_HEADER + EUROC_MORE, *(row + ",0.1" * 9 for row in COMMAS)]),
+    "EuRoC without header": text(COMMAS),
+    "EuRoC, header without #": text([EUROC_HEADER[1:], *rows(", ", "ns", "wxyz")]),
+    "TUM between commas": text(["#t,tx,ty,tz,qx,qy,qz,qw", *rows(",")]),
+    "ORB-SLAM3's SaveTrajectoryEuRoC": text(rows(stamps="orb")),
+    "no line feed at the end": text(rows())[:-1],
+}
+
+
+def write(folder: Path, content: str | bytes, name: str = "track.txt") -> Path:
+    path = folder / name
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    return path
+
+
+@pytest.mark.parametrize("dialect", DIALECTS)
+def test_every_dialect_gives_the_same_poses(dialect: str, tmp_path: Path) -> None:
+    path = write(tmp_path, DIALECTS[dialect])
+    got = read_trajectory(path)
+    expected = np.array([float(Decimal(t) / 10**9) for t in NANOSECONDS.tolist()])
+    # one unit in the last place of UNIX time
+    np.testing.assert_allclose(got.time_s, expected, rtol=0, atol=2.4e-7)
+    np.testing.assert_array_equal(got.position_m, POSITION_M)
+    assert got.rotation is not None
+    assert (got.rotation.inv() * ROTATION).magnitude().max() < 1e-8
+    assert got.kind == ("truth" if dialect == "EuRoC, 17" else "unknown")
+    assert (got.name, got.frame, got.unix_offset_s) == ("track.txt", "unknown", 0.0)
+    assert got.sha256 == hashlib.sha256(path.read_bytes()).hexdigest()
+    assert got.size_bytes == path.stat().st_size
+    assert looks_like_trajectory(path.read_bytes()[:1500])
+    assert all(note.endswith(".") for note in got.notes)
+    is_ns = dialect.startswith(("EuRoC", "ORB"))
+    assert is_ns == any("nanoseconds and were divided" in note for note in got.notes)
+
+
+def test_the_sample_is_slam_in_a_camera_frame_that_lost_track() -> None:
+    got = read_trajectory(SAMPLE)
+    assert (len(got), got.kind, got.frame, got.unix_offset_s) == (831, "slam", "camera", 0.0)
+    notes = " ".join(got.notes)
+    assert "UNIX time" in notes
+    assert "Camera frame" in notes
+    assert "Tracking lost for 3.0 s at 41.0 s after its start, 30 frames missing." in notes
+
+
+def test_a_clock_of_its_own_and_nanoseconds_since_boot(tmp_path: Path) -> None:
+    values = text(rows()[:4]).replace("14036365", "")
+    assert read_trajectory(write(tmp_path, values)).unix_offset_s is None
+    lines = [f"{12_000_000_000 + 33_000_000 * i}.000000 {i} 0 0 0 0 0 1" for i in range(9)]
+    got = read_trajectory(write(tmp_path, text(lines)))
+    np.testing.assert_allclose(got.time_s, 12.0 + 0.033 * np.arange(9), rtol=1e-15)
+    assert got.unix_offset_s is None
+
+
+@pytest.mark.parametrize(
+    ("name", "folder", "first"),
+    [
+        ("MH_04_groundtruth.txt", "a", ""),
+        ("data.csv", "state_groundtruth_estimate0", ""),
+        ("room_gt.txt", "a", ""),
+        ("track.txt", "a", "# Ground truth trajectory\n"),
+    ],
+)
+def test_ground_truth_says_so(name: str, folder: str, first: str, tmp_path: Path) -> None:
+    (tmp_path / folder).mkdir()
+    path = write(tmp_path / folder, first + text(rows()), name)
+    assert read_trajectory(path).kind == "truth"
+
+
+@pytest.mark.parametrize(
+    ("axes", "tilt_deg", "frame"),
+    [
+        ("xzy", 0.0, "camera"),
+        ("xzy", 15.0, "camera"),
+        ("xzy", 30.0, "unknown"),
+        ("xyz", 0.0, "unknown"),
+    ],
+)
+def test_the_camera_frame_shows_in_a_level_motion(
+    axes: str, tilt_deg: float, frame: str, tmp_path: Path
+) -> None:
+    angle = np.linspace(0.0, 6.0, 200)
+    level = np.column_stack((9 * np.sin(angle), 6 - 6 * np.cos(angle), 0.1 * np.sin(7 * angle)))
+    position = level[:, ["xyz".index(axis) for axis in axes]]
+    position = Rotation.from_euler("x", tilt_deg, degrees=True).apply(position)
+    made = Trajectory("t", "slam", angle, position, Rotation.identity(200))
+    got = read_trajectory(write(tmp_path, tum_text(made)))
+    assert (got.kind, got.frame) == ("slam", frame)
+
+
+def test_gaps_key_frames_and_repeated_stamps_are_told(tmp_path: Path) -> None:
+    time = np.arange(1000) * 0.05
+    keep = ((time < 10) | (time > 14)) & ((time < 30) | (time > 31))
+    made = Trajectory("t", "unknown", time, np.tile(POSITION_M, (20, 1)), Rotation.identity(1000))
+    notes = " ".join(read_trajectory(write(tmp_path, tum_text(made[keep]))).notes)
+    assert "No poses 2 times, for 5.1 s in all and at most for 4.0 s, at 10.0 s after" in notes
+    assert "102 frames missing" in notes
+    irregular = made[np.flatnonzero(RANDOM.random(1000) < 0.2)]
+    assert "key frames" in " ".join(read_trajectory(write(tmp_path, tum_text(irregular))).notes)
+    lines = tum_text(made).split("\n")
+    lines.insert(500, lines[500])
+    again = read_trajectory(write(tmp_path, "\n".join(lines)))
+    assert len(again) == 1000
+    assert "Dropped 1 pose with the stamp of the one before" in " ".join(again.notes)
+
+
+def test_a_cut_last_line_is_dropped(tmp_path: Path) -> None:
+    got = read_trajectory(write(tmp_path, text(rows())[:-50]))
+    assert len(got) == POSES - 1
+    assert got.notes[-1] == f"Line {POSES}, the last one, was dropped: it is cut."
+
+
+TUM_ROWS = rows()
+
+
+def changed(line: int, new: str) -> str:
+    return text([*HEAD, *TUM_ROWS[: line - 3], new, *TUM_ROWS[line - 2 :]])
+
+
+def with_field(line: int, column: int, field: str) -> str:
+    fields = TUM_ROWS[line - 3].split()
+    fields[column] = field
+    return changed(line, " ".join(fields))
+
+
+REFUSED: dict[str, tuple[str | bytes, str]] = {
+    "empty": ("", "the file is empty"),
+    "blank": ("\n\n  \n", "nothing but blank lines"),
+    "comments": ("# a\n# b\n", "nothing but comments"),
+    "text": ("Dear reader,\nthis is a letter.\n", "its first line is 'Dear reader"),
+    "binary": (bytes(range(256)) * 9, "a binary file"),
+    "ULog": (b"ULog\x01\x12\x35\x01" + bytes(99), "Name a part of the log: track.txt:vio"),
+    "g2o": ("VERTEX_SE3:QUAT 0 0 0 0 0 0 0 1\n" * 5, "a pose graph (g2o)"),
+    "KITTI": ("1 0 0 0 0 1 0 0 0 0 1 0\n" * 5, "a KITTI file, which has no times"),
+    "other columns": ("t,x,y,z\n" + "1,2,3,4\n" * 5, "4 columns; TUM has 8"),
+    "other 8 columns": ("time,x,y,z,vx,vy,vz,sigma\n" + "1,2,3,4,5,6,7,8\n" * 5, "its columns are"),
+    "commas, no header": (text(rows(",")), "the place of the quaternion's w is not known"),
+    "two poses": (text(TUM_ROWS[:2]), "poses: 2, at least 3 are needed"),
+    "text within": (with_field(7, 2, "abc"), "line 7: column 3: 'abc' is no number"),
+    "time that is text": (with_field(7, 0, "abc"), "line 7: column 1: 'abc' is no"),
+    "NaN": (with_field(8, 3, "nan"), "line 8: a value that is not finite"),
+    "infinite": (with_field(8, 5, "-inf"), "line 8: a value that is not finite"),
+    "NaN time": (with_field(9, 0, "nan"), "line 9: column 1: 'nan' is no time"),
+    "too few columns": (changed(10, "1 2 3"), "line 10: 3 columns, where the first line has 8"),
+    "too many columns": (changed(11, TUM_ROWS[0] + " 1"), "line 11: 9 columns"),
+    "zero quaternion": (changed(12, TUM_ROWS[9].split()[0] + " 1 2 3 0 0 0 0"), "line 12: columns"),
+    "no quaternion": (text([f"{i} 1 2 3 4 5 6 7" for i in range(9)]), "norm is 11.22, not 1"),
+    "back in time": (changed(13, TUM_ROWS[2]), "line 13: its time 1403636579.8635557 s is before"),
+    "equal stamps": (
+        text([f"{i // 2} 1 2 3 0 0 0 1" for i in range(99)]),
+        "line 2: its time 0.0 s",
+    ),
+    "odd unit": (text([f"{i * 33_000} 1 2 3 0 0 0 1" for i in range(9)]), "no interval of frames"),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_what_is_no_trajectory_is_refused_in_one_line(case: str, tmp_path: Path) -> None:
+    content, words = REFUSED[case]
+    with pytest.raises(TrajectoryError) as caught:
+        read_trajectory(write(tmp_path, content))
+    message = str(caught.value)
+    assert message.startswith("track.txt")
+    assert words in message
+    assert "\n" not in message
+    assert message.endswith(".")
+
+
+def test_paths_that_cannot_be_read_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(TrajectoryError, match="cannot be read"):
+        read_trajectory(tmp_path / "none.tum")
+    with pytest.raises(TrajectoryError, match="a folder"):
+        read_trajectory(tmp_path)
+    monkeypatch.setattr(reader, "MAX_FILE_BYTES", 10)
+    with pytest.raises(TrajectoryError, match="more than the limit"):
+        read_trajectory(SAMPLE)
+
+
+@pytest.mark.parametrize(
+    "name", ["loop_vio.ulg", "aisle_uwb.tlog", "aisle_uwb_external.csv", "README.md"]
+)
+def test_other_files_do_not_look_like_trajectories(name: str) -> None:
+    assert not looks_like_trajectory((REPOSITORY / "sample_logs" / name).read_bytes()[:4096])
+
+
+def test_no_bytes_do_not_look_like_a_trajectory() -> None:
+    assert not looks_like_trajectory(b"")
+    assert not looks_like_trajectory(REFUSED["g2o"][0].encode())  # type: ignore[union-attr]
+    assert looks_like_trajectory(b"0.5 1 2 3 0 0 0 1")
+
+
+NUMBER = st.floats(-1e6, 1e6)
+
+
+@settings(deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    steps=hnp.arrays(float, 8, elements=st.floats(1e-3, 10.0)),
+    start=st.sampled_from([0.0, 17.25, 1_795_253_728.219561]),
+    position=hnp.arrays(float, (8, 3), elements=NUMBER),
+    quaternion=hnp.arrays(float, (8, 4), elements=st.floats(0.1, 1.0)),
+)
+def test_what_is_written_is_read_back_exactly(
+    steps: np.ndarray, start: float, position: np.ndarray, quaternion: np.ndarray, tmp_path: Path
+) -> None:
+    made = Trajectory(
+        "t", "unknown", start + np.cumsum(steps), position, Rotation.from_quat(quaternion)
+    )
+    once = read_trajectory(write(tmp_path, tum_text(made)))
+    np.testing.assert_array_equal(once.time_s, made.time_s)
+    np.testing.assert_array_equal(once.position_m, made.position_m)
+    assert once.rotation is not None
+    assert made.rotation is not None
+    np.testing.assert_array_equal(once.rotation.as_quat(), made.rotation.as_quat())
+    assert tum_text(once) == tum_text(made)
+
+
+def test_a_log_is_written_with_unix_time_and_positions_alone_are_not(tmp_path: Path) -> None:
+    made = Trajectory("t", "vio", np.arange(5.0), POSITION_M[:5], ROTATION[:5], unix_offset_s=1.5e9)
+    assert read_trajectory(write(tmp_path, tum_text(made))).time_s[0] == 1.5e9
+    with pytest.raises(TrajectoryError, match="needs orientations"):
+        tum_text(replace(made, rotation=None))
+
+
+@settings(
+    deadline=None, max_examples=200, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(
+    pieces=st.lists(
+        st.one_of(
+            st.sampled_from(
+                [" ", "\n", ",", "#", "\t", "\r", "nan", "1e300", "1e999", "-", "\x00"]
+            ),
+            st.floats().map(str),
+            st.integers().map(str),
+            st.just("1 2 3 0 0 0 1\n"),
+        ),
+        max_size=60,
+    )
+)
+def test_any_text_is_read_or_refused(pieces: list[str], tmp_path: Path) -> None:
+    content = "".join(pieces).encode()
+    looks_like_trajectory(content)
+    try:
+        got = read_trajectory(write(tmp_path, content))
+    except TrajectoryError as error:
+        message = str(error)
+    else:
+        message = ""
+        assert (np.diff(got.time_s) > 0).all()
+    assert "\n" not in message
+
+
+@pytest.mark.reallogs
+@pytest.mark.parametrize(
+    ("name", "poses", "kind"),
+    [
+        ("evo_fr2_desk_ORB.txt", 2893, "slam"),
+        ("evo_fr2_desk_groundtruth.txt", 20956, "truth"),
+        ("evo_freiburg1_xyz-ORB_kf_mono.txt", 32, "slam"),
+        ("rpg_vislam_MH_04_groundtruth.txt", 19753, "truth"),
+        ("rpg_vislam_rp_MH_04_estimate0.txt", 1347, "unknown"),
+    ],
+)
+def test_published_trajectories(name: str, poses: int, kind: str) -> None:
+    if not SHARED.is_dir():
+        pytest.skip("the published trajectories (../shared/trajectories) are not here")
+    got = read_trajectory(SHARED / name)
+    assert (len(got), got.kind, got.unix_offset_s) == (poses, kind, 0.0)
+    table = np.loadtxt(SHARED / name)
+    table = table[np.diff(table[:, 0], prepend=0.0) > 0.0]
+    np.testing.assert_array_equal(got.time_s, table[:, 0])
+    np.testing.assert_array_equal(got.position_m, table[:, 1:4])
