@@ -24,6 +24,7 @@ from px4fuse.report import (
     variances,
 )
 from px4fuse.report.document import Document, LoopDocument
+from px4fuse.report.seal import sealed
 from px4fuse.report.style import LEFT, MUTED, RIGHT, printable, report_style, shorten
 
 RESULTS_NAME = "results.json"
@@ -103,4 +104,4 @@ def _attach(drawn: bytes, document: Document | LoopDocument, results_json: str) 
     }
     out = io.BytesIO()
     writer.write(out)
-    return out.getvalue()
+    return sealed(out.getvalue())
