@@ -491,6 +491,9 @@ def command_line(command: str, *files: Path) -> str:
         given = context.get_parameter_source(name) == ParameterSource.COMMANDLINE
         if not given or name in NOT_RECORDED or isinstance(parameter, click.Argument):
             continue
+        if getattr(parameter, "is_flag", False):
+            words.append(parameter.opts[-1])
+            continue
         value: Any = context.params[name]
         for single in value if isinstance(value, tuple) else (value,):
             text = single.name if isinstance(single, Path) else str(single)

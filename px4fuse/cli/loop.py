@@ -32,7 +32,7 @@ FRAMES = {"ned": "NED", "frd": "FRD", "enu": "ENU", "camera": "camera"}
 # Nobody's tape is longer
 MAX_LANDED_AT = 10_000.0
 # What may be given with a pose graph
-FOR_GRAPHS = ("source", "json_path", "g2o")
+FOR_GRAPHS = ("source", "json_path", "g2o", "robust")
 
 
 @dataclass(frozen=True)
@@ -130,11 +130,16 @@ class LandingType(click.ParamType[Landing]):
     default=None,
     help="Axes of a trajectory file.  [default: recognised]",
 )
+@click.option(
+    "--robust", is_flag=True, help="Solve a pose graph of over 1000 closures robustly too: minutes."
+)
 @system_option
 @person_options
 @path_option("-o", "--output", metavar="FILE.pdf", help="A report, and its results beside it.")
 @path_option("--json", "json_path", metavar="FILE", help="The results; - prints them alone.")
-@path_option("--tum", metavar="FILE", help="Write the corrected path as a TUM file.")
+@path_option(
+    "--tum", metavar="FILE", help="Write the corrected path as a TUM file, in the axes of SOURCE."
+)
 @path_option("--g2o", metavar="FILE", help="Write the pose graph, solved, as a g2o file.")
 def loop(
     source: Path,
@@ -163,7 +168,7 @@ def loop(
         if path == STANDARD_OUTPUT:
             raise SettingsError(f"{option} -: only --json can print. Give a file name.")
     if is_g2o(split_part(str(source))[0]):
-        _solve(source, json_path, g2o)
+        _solve(source, json_path, g2o, True if given["robust"] else None)
         return
     for option in ("start", "end"):
         if given[option] is not None and not abs(given[option]) < float("inf"):
@@ -243,6 +248,7 @@ def _files(found: Loop, tum: Path | None, g2o: Path | None) -> dict[Path, bytes]
     from px4fuse.errors import MissingDataError
     from px4fuse.readers.g2o import g2o_text
     from px4fuse.readers.trajectory import tum_text
+    from px4fuse.trajectory.closure import in_frame
 
     contents = {}
     if tum is not None:
@@ -251,13 +257,13 @@ def _files(found: Loop, tum: Path | None, g2o: Path | None) -> dict[Path, bytes]
             raise MissingDataError(
                 f"--tum {tum.name}: there is no corrected path: no closure could be used."
             )
-        contents[tum] = tum_text(best.trajectory).encode()
+        contents[tum] = tum_text(in_frame(best.trajectory, found.frame)).encode()
     if g2o is not None:
         contents[g2o] = g2o_text(found.solved_graph()).encode()
     return contents
 
 
-def _solve(source: Path, json_path: Path | None, g2o: Path | None) -> None:
+def _solve(source: Path, json_path: Path | None, g2o: Path | None, robust: bool | None) -> None:
     """Solve a pose graph from a file."""
     from px4fuse.readers.g2o import g2o_text, read_g2o
     from px4fuse.report.loop_terminal import print_graph
@@ -279,7 +285,7 @@ def _solve(source: Path, json_path: Path | None, g2o: Path | None) -> None:
     _spare(json_path, g2o)
     with progress(json_path == STANDARD_OUTPUT) as step:
         step(f"reading {source.name}")
-        solved = analyse_graph(read_g2o(path), step)
+        solved = analyse_graph(read_g2o(path), step, robust=robust)
     results = graph_results(source.name, solved, command_line("loop", source))
     contents = {} if g2o is None else {g2o: g2o_text(solved.graph).encode()}
     if json_path not in (None, STANDARD_OUTPUT):

@@ -33,13 +33,13 @@ def find_in_loop(loop: Loop) -> Iterator[Finding]:
         )
     for judged in loop.closures:
         if not judged.gate.accepted:
-            yield _false(judged)
+            yield _false(judged, loop.end_assumed)
         elif judged in dropped and not most:
             yield Finding(
                 "loop_closure_doubtful",
                 "warning",
-                f"The other closures contradict {_name(judged)}: robust solving drops it, although "
-                "the drift alone could explain it.",
+                f"The other closures contradict {judged.closure}: robust solving drops it, "
+                "although the drift alone could explain it.",
                 "Leave it out, or take the robust solution (GNC).",
                 _evidence(judged) | {"gnc_weight": judged.weights["gnc"]},
             )
@@ -64,26 +64,28 @@ def find_in_loop(loop: Loop) -> Iterator[Finding]:
         )
 
 
-def _false(judged: Judged) -> Finding:
+def _false(judged: Judged, assumed: bool) -> Finding:
     gate = judged.gate
+    landing = judged.closure.source == "landing"
+    remedy = "Leave it out; it is not used."
+    if landing:
+        remedy = (
+            "If it landed elsewhere, measure where (--landed-at FORWARD,RIGHT) or leave the "
+            "landing out (--open)."
+        )
+    what = f"{judged.closure} cannot be true"
+    if landing and assumed:
+        what = "the vehicle cannot have landed where it took off, as was assumed"
     return Finding(
         "false_loop_closure",
         "error",
-        f"False loop closure: {_name(judged)} cannot be true. The odometry "
-        f"misses it by {judged.distance_m:.2f} m, and drift explains that with a chance of "
-        f"{gate.p:.1g} (d² {gate.d2:.0f}, {gate.degrees_of_freedom} degrees of freedom). Trusting "
-        "it would warp the entire path.",
-        "Leave it out; it is not used. If the odometry really drifts that much, say so with "
-        "--drift and --heading-drift.",
+        f"False loop closure: {what}. The odometry misses it by {judged.distance_m:.2f} m, and "
+        f"drift explains that with a chance of {gate.p:.1g} (d² {gate.d2:.0f}, "
+        f"{gate.degrees_of_freedom} degrees of freedom). Trusting it would warp the entire path.",
+        f"{remedy} If the odometry really drifts that much, say so with --drift and "
+        "--heading-drift.",
         _evidence(judged),
     )
-
-
-def _name(judged: Judged) -> str:
-    closure = judged.closure
-    if closure.source == "landing":
-        return "that it landed where stated"
-    return f"the closure of {closure.time_1_s:.2f} s and {closure.time_2_s:.2f} s"
 
 
 def _evidence(judged: Judged) -> dict[str, float | str]:

@@ -25,6 +25,7 @@ from px4fuse.trajectory.model import MIN_POSES, Array, Frame, Kind, Trajectory
 
 MAX_FILE_BYTES = 500_000_000
 COLUMNS = 8
+MAX_USUAL_STEP_S = 10.0
 EUROC_COLUMNS = (8, 17)  # alone, or with velocity and the biases of gyro and accelerometer
 HEAD_LINES = 1000  # in which the format must show
 UNIX_START_S, UNIX_END_S = 946_684_800.0, 4_102_444_800.0  # 2000 to 2100
@@ -138,7 +139,10 @@ def read_trajectory(path: str | Path) -> Trajectory:
     is_unix = UNIX_START_S <= time[0] < UNIX_END_S
     clock = "its stamps are UNIX time" if is_unix else "its clock is its own, not UNIX time"
     recognised = f"Recognised as {layout.words}; {clock}."
-    said = (recognised, time_words, kind_words, frame_words, dropped, _gaps(time, kind), *notes)
+    said = (
+        recognised, time_words, _far_apart(time), kind_words, frame_words, dropped,
+        _gaps(time, kind), *notes,
+    )  # fmt: skip
     return Trajectory(
         name=name,
         kind=kind,
@@ -456,6 +460,13 @@ def _frame(kind: Kind, position: Array) -> tuple[Frame, str]:
         f"{thin:.2g} m against {width:.2g} and {length:.2g} m (RMS), and what is vertical is "
         f"{math.degrees(tilt):.0f}° from y."
     )
+
+
+def _far_apart(time_s: Array) -> str:
+    step = float(np.median(np.diff(time_s)))
+    if step < MAX_USUAL_STEP_S:
+        return ""
+    return f"Poses are {step:.0f} s apart, read as seconds: are the stamps in milliseconds?"
 
 
 def _gaps(time: Array, kind: Kind) -> str:

@@ -225,20 +225,22 @@ def _thinned(position: Array) -> Array:
 
 
 def _along(figure: Figure, cursor: Cursor, loop: Loop) -> None:
-    references = [reference.name for reference in loop.references]
-    rows = 2 + len(references)
-    grid = panels(figure, cursor.y - 0.03, BOTTOM + 0.05, rows, 1, hspace=0.38)
-    moved, height, *errors = [row[0] for row in grid]
-    moved.set_title("how far each pose moved (m)")
+    scored = [name for name in (reference.name for reference in loop.references)
+              if isinstance(loop.odometry.scores[name], Evaluation)]  # fmt: skip
+    corrected = [part for part in shown(loop) if part is not loop.odometry]
+    rows = 1 + bool(corrected) + len(scored)
+    grid = panels(figure, cursor.y - 0.03, max(BOTTOM + 0.05, 0.72 - 0.22 * rows), rows, 1,
+                  hspace=0.38)  # fmt: skip
+    height, *others = [row[0] for row in grid]
+    errors = others[bool(corrected) :]
+    if corrected:
+        _moved(others[0], loop, corrected)
     height.set_title(f"{AXES_OF_FRAME[loop.odometry.trajectory.frame][2]} (m)")
     for part in shown(loop):
-        style = STYLES[part.name]
-        if part is not loop.odometry:
-            moved.plot(*thin(loop.distance_m, part.moved_m), label=part.name, **style)
         height.plot(*thin(loop.distance_m, part.trajectory.position_m[:, 2]), label=part.name,
-                    **style)  # fmt: skip
+                    **STYLES[part.name])  # fmt: skip
     height.legend(loc="best", ncols=3)
-    for axes, name in zip(errors, references, strict=True):
+    for axes, name in zip(errors, scored, strict=True):
         axes.set_title(f"distance to {name} after alignment (m)")
         said = []
         for part in shown(loop):
@@ -254,15 +256,17 @@ def _along(figure: Figure, cursor: Cursor, loop: Loop) -> None:
         if axes is errors[-1]:
             axes.set_xlabel("distance along the path (m)")
         caption(axes, "; ".join(said))
-    if not errors:
-        height.set_xlabel("distance along the path (m)")
-    _fit(moved)
-    for axes in (moved, height, *errors):
+    (height, *others)[-1].set_xlabel("distance along the path (m)")
+    for axes in (height, *others):
         axes.set_xlim(0.0, loop.path_length_m)
-    if len(shown(loop)) > 1:
-        most = [f"{part.name}: at most {part.moved_m.max():.2f} m"
-                for part in shown(loop) if part is not loop.odometry]  # fmt: skip
-        caption(moved, "; ".join(most))
+
+
+def _moved(axes: Axes, loop: Loop, corrected: list[Correction]) -> None:
+    axes.set_title("how far each pose moved (m)")
+    for part in corrected:
+        axes.plot(*thin(loop.distance_m, part.moved_m), label=part.name, **STYLES[part.name])
+    _fit(axes)
+    caption(axes, "; ".join(f"{p.name}: at most {p.moved_m.max():.2f} m" for p in corrected))
 
 
 def _fit(axes: Axes) -> None:
@@ -302,7 +306,7 @@ def _scores(loop: Loop) -> Iterator[Figure]:
             for name in ("dcs", "gnc")
         ]
         cells = [
-            closure_name(judged), f"{judged.distance_m:.2f}", f"{gate.d2:.1f}",
+            closure_name(judged, loop), f"{judged.distance_m:.2f}", f"{gate.d2:.1f}",
             f"{gate.degrees_of_freedom}", f"{gate.p:.2g}",
             "accepted" if gate.accepted else "REJECTED", *weights,
         ]  # fmt: skip
@@ -326,9 +330,8 @@ def _relative(figure: Figure, cursor: Cursor, loop: Loop, name: str) -> None:
     cursor.skip(2)
     scores = [(part, part.scores[name]) for part in loop.reported]
     good = [(part, s) for part, s in scores if isinstance(s, Evaluation)]
-    for part, score in scores:
-        if isinstance(score, Unavailable):
-            cursor.write(f"{part.name}: {score.reason}", size=7.5)
+    for reason in dict.fromkeys(s.reason for _, s in scores if isinstance(s, Unavailable)):
+        cursor.write(reason, size=7.5)
     if not good:
         return
     first = good[0][1]

@@ -19,10 +19,11 @@ from px4fuse.report.loop_words import (
     redundancy_words,
     refusals,
     score_words,
+    unscored,
 )
 from px4fuse.report.terminal import print_finding, print_line
 from px4fuse.trajectory.evaluation import Evaluation, Statistics
-from px4fuse.trajectory.graph_analysis import SolvedGraph
+from px4fuse.trajectory.graph_analysis import MANY_CLOSURES, SolvedGraph
 from px4fuse.trajectory.loop import SOLUTIONS, Loop
 
 MOST_ROWS = 10
@@ -44,7 +45,7 @@ def print_loop(console: Console, loop: Loop, findings: tuple[Finding, ...]) -> N
         for judged in loop.closures:
             gate = judged.gate
             closures.add_row(
-                closure_name(judged),
+                closure_name(judged, loop),
                 f"{judged.distance_m:.2f}",
                 f"{gate.d2:.1f}",
                 f"{gate.p:.2g}",
@@ -52,11 +53,11 @@ def print_loop(console: Console, loop: Loop, findings: tuple[Finding, ...]) -> N
                 *(f"{judged.weights.get(name, float('nan')):.2f}" for name in ("dcs", "gnc")),
             )
         console.print(closures)
-    for text in (redundancy_words(loop), *refusals(loop)):
+    for text in (redundancy_words(loop), *refusals(loop), *unscored(loop)):
         if text:
             console.print(Text(text, "dim"), soft_wrap=True)
     for finding in findings:
-        print_finding(console, finding)
+        print_finding(console, finding, whole=True)
 
 
 def print_evaluation(console: Console, score: Evaluation) -> None:
@@ -94,10 +95,13 @@ def print_graph(console: Console, name: str, solved: SolvedGraph) -> None:
         "Graph",
         f"{name}: {graph.dimension}-D, {len(graph)} poses, {len(graph.first)} edges; poses from "
         f"{graph.initialised}",
+        whole=True,
     )
     gates = solved.gates
     if isinstance(gates, Unavailable):
         print_line(console, "Gate", f"none: {gates.reason}", whole=True)
+    elif not gates:
+        print_line(console, "Gate", "no closures to judge: every edge is odometry")
     else:
         rejected = [gate for gate in gates if not gate.accepted]
         print_line(console, "Gate", f"rejects {len(rejected)} of {len(gates)} closures")
@@ -106,6 +110,8 @@ def print_graph(console: Console, name: str, solved: SolvedGraph) -> None:
             console.print(f"         {ends}: d² {gate.d2:.1f}, p {gate.p:.2g}", markup=False)
         if len(rejected) > MOST_ROWS:
             console.print(f"         and {len(rejected) - MOST_ROWS} more", markup=False)
+    if len(solved.solutions) == 1 and (~graph.successive).sum() > MANY_CLOSURES:
+        print_line(console, "Robust", "left out for so many closures: --robust takes minutes")
     table = _table("path", "cost before", "cost", "iterations", "closures dropped")
     for key, solution in solved.solutions.items():
         table.add_row(

@@ -5,12 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 from px4fuse.flight import Unavailable
+from px4fuse.signals import Segment
+from px4fuse.trajectory.analysis import SMALLEST_STAMP_S
 from px4fuse.trajectory.evaluation import Evaluation, Interval, Statistics
 from px4fuse.trajectory.loop import GATE_ALPHA, SINGLE_LOOP, Correction, Judged, Loop
 from px4fuse.trajectory.model import AXES_OF_FRAME, Array, Trajectory
 
 KINDS = {
-    "vio": "visual-inertial odometry",
+    "vio": "odometry (external vision)",
     "ekf2": "EKF2's track",
     "kf": "our filter's track",
     "truth": "ground truth",
@@ -29,12 +31,18 @@ def loop_lines(loop: Loop) -> list[tuple[str, str]]:
             f"{path.name}: {KINDS[path.kind]}, {len(path)} poses, {len(loop.nodes)} key frames "
             f"{loop.spacing_m:.2g} m apart",
         ),
-        ("Part", f"{part.start_s:.1f} s to {part.end_s:.1f} s, {part.reason}"),
+        ("Part", f"{_span(part)}, {part.reason}"),
         ("Closure", closure_words(loop)),
         ("End", "not used" if isinstance(loop.known_end, Unavailable) else loop.known_end.source),
     ]
     lines += [("Gate", gate_words(judged)) for judged in loop.closures[:1]]
     return lines
+
+
+def _span(part: Segment) -> str:
+    if part.start_s > SMALLEST_STAMP_S:
+        return f"{part.end_s - part.start_s:.1f} s from stamp {part.start_s:.2f} s"
+    return f"{part.start_s:.1f} s to {part.end_s:.1f} s"
 
 
 def closure_words(loop: Loop) -> str:
@@ -70,12 +78,14 @@ def gate_words(judged: Judged) -> str:
     )
 
 
-def closure_name(judged: Judged) -> str:
-    """Which closure."""
+def closure_name(judged: Judged, loop: Loop) -> str:
+    """Which closure; long stamps count from the first pose."""
     closure = judged.closure
     if closure.source == "landing":
         return "take-off and landing"
-    return f"{closure.time_1_s:.2f} s and {closure.time_2_s:.2f} s"
+    start = loop.segment.start_s
+    zero = start if start > SMALLEST_STAMP_S else 0.0
+    return f"{closure.time_1_s - zero:.2f} s and {closure.time_2_s - zero:.2f} s"
 
 
 def redundancy_words(loop: Loop) -> str:
@@ -88,6 +98,17 @@ def refusals(loop: Loop) -> list[str]:
     parts = (loop.by_distance, *loop.solved.values())
     reasons = [f"{p.what}: {p.reason}" for p in parts if isinstance(p, Unavailable)]
     return [r for r in dict.fromkeys(reasons) if SINGLE_LOOP not in r]
+
+
+def unscored(loop: Loop) -> list[str]:
+    """Why a reference scores nothing, each reason once."""
+    reasons = [
+        f"{name}: {score.reason}"
+        for part in loop.reported
+        for name, score in part.scores.items()
+        if isinstance(score, Unavailable)
+    ]
+    return list(dict.fromkeys(reasons))
 
 
 def ate_words(score: Evaluation | Unavailable) -> str:

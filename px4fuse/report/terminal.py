@@ -62,11 +62,12 @@ def print_summary(console: Console, document: Document) -> None:
         console.print(Text(f"and {more} more in the report"))
 
 
-def print_finding(console: Console, finding: Finding) -> None:
-    """Print severity, sentence and remedy, a line each."""
+def print_finding(console: Console, finding: Finding, *, whole: bool = False) -> None:
+    """Print severity, sentence and remedy, cut at the screen's edge unless all of it is wanted."""
+    how = {"soft_wrap": True} if whole else ONE_LINE
     line = Text(f"{finding.severity:9}", style=STYLES[finding.severity])
-    console.print(line.append(finding.message, style="none"), **ONE_LINE)
-    console.print(Text(" " * 9 + finding.remedy, style="dim"), **ONE_LINE)
+    console.print(line.append(finding.message, style="none"), **how)
+    console.print(Text(" " * 9 + finding.remedy, style="dim"), **how)
 
 
 def _table(document: Document) -> Table:

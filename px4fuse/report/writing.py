@@ -24,10 +24,11 @@ def write_all(contents: Mapping[Path, bytes]) -> None:
         A target cannot be written; none was replaced, unless renaming itself failed half-way.
     """
     temporary: dict[Path, Path] = {}
+    target = next(iter(contents), Path())
     try:
         for target, content in contents.items():
             if target.is_dir():
-                raise OutputError(f"{target}: is a folder. Give a file name with -o.")
+                raise OutputError(f"{target}: is a folder. Give a file name.")
             target.parent.mkdir(parents=True, exist_ok=True)
             handle, name = tempfile.mkstemp(prefix=f".{target.name}.", dir=target.parent)
             temporary[target] = Path(name)
@@ -38,9 +39,8 @@ def write_all(contents: Mapping[Path, bytes]) -> None:
         for target, path in temporary.items():
             path.replace(target)
     except OSError as error:
-        name = str(error.filename or next(iter(contents)))
         raise OutputError(
-            f"{name}: cannot be written ({error.strerror}). Choose another place with -o."
+            f"{target}: cannot be written ({error.strerror}). Choose another place for it."
         ) from error
     finally:
         for path in temporary.values():

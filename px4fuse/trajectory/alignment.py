@@ -165,5 +165,5 @@ def _check_turn(
         raise TrajectoryError(
             f"The motion is along a line: {length:.2g} m (RMS) by {width:.2g} m across it, where "
             f"an alignment leaves {rms:.2g} m, so the turn about that line and with it {kind} "
-            f"cannot be found. Use {_OPTION} yaw if z is vertical in both."
+            f"cannot be found. Use {_OPTION} yaw if z is vertical in both, or {_OPTION} none."
         )

@@ -80,10 +80,9 @@ def analyse(
     start = None if start_s is None else stamp(start_s)
     end = None if end_s is None else stamp(end_s)
     if flight is None:
-        whole = Segment(
-            float(trajectory.time_s[0]), float(trajectory.time_s[-1]), "the whole trajectory"
-        )
-        segment, at_rest = chosen_part(whole, start, end), False
+        span = float(trajectory.time_s[0]), float(trajectory.time_s[-1])
+        whole = Segment(*span, "the whole trajectory")
+        segment, at_rest = chosen_part(whole, start, end, span), False
     else:
         segment, at_rest = part_of_flight(flight, trajectory, start, end)
     truth = None if flight is None or trajectory.kind == "truth" else truth_of(flight)

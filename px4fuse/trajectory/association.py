@@ -238,7 +238,7 @@ def _no_overlap(
     estimate: Trajectory, reference: Trajectory, time_s: Array, count: int, offset_s: float
 ) -> str:
     what = "no poses match" if not count else f"only {count} of its poses match"
-    added = f" (with the offset of {offset_s:g} s)" if offset_s else ""
+    added = f" (with the offset of {offset_s:.12g} s)" if offset_s else ""
     return (
         f"{estimate.name}: {what} in time: it spans {time_s[0]:.3f} to {time_s[-1]:.3f} s{added}, "
         f"the reference {reference.name} {reference.time_s[0]:.3f} to {reference.time_s[-1]:.3f} "

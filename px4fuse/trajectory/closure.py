@@ -50,7 +50,9 @@ def upright(trajectory: Trajectory) -> Trajectory:
     turn = np.array(rows)
     rotation = trajectory.rotation
     if rotation is not None:
-        rotation = Rotation.from_matrix(turn @ rotation.as_matrix() @ turn.T)
+        rotation = Rotation.from_matrix(turn) * rotation
+        if trajectory.frame == "camera":
+            rotation = rotation * Rotation.from_matrix(turn).inv()
     variance = trajectory.position_variance_m2
     return replace(
         trajectory,
@@ -59,6 +61,25 @@ def upright(trajectory: Trajectory) -> Trajectory:
         frame=frame,
         position_variance_m2=None if variance is None else variance @ np.abs(turn).T,
         notes=(*trajectory.notes, note),
+    )
+
+
+def in_frame(trajectory: Trajectory, frame: Frame) -> Trajectory:
+    """What :func:`upright` made of a trajectory in ``frame``, turned back into that frame."""
+    if frame not in _TO_Z_DOWN or trajectory.frame not in ("NED", "FRD"):
+        return trajectory
+    back = Rotation.from_matrix(np.array(_TO_Z_DOWN[frame][0])).inv()
+    rotation = trajectory.rotation
+    if rotation is not None:
+        rotation = back * rotation
+        if frame == "camera":
+            rotation = rotation * back.inv()
+    return replace(
+        trajectory,
+        position_m=back.apply(trajectory.position_m),
+        rotation=rotation,
+        frame=frame,
+        position_variance_m2=None,
     )
 
 

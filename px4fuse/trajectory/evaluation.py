@@ -44,6 +44,7 @@ MAX_DISTANCES, MAX_TIMES = 3, 2
 MIN_DELTA_SHARE, MAX_DELTA_SHARE = 1 / 200, 1 / 5
 MAX_SCALE_ERROR = 0.1
 MIN_COVERAGE = 0.5
+MIN_CLOCK_DOUBT_S = 0.1  # less than this may be the filter's own lag
 MAX_SPARSER = 5.0  # a reference with so much longer intervals is hardly one
 
 RESAMPLES, SEED, LEVEL = 2000, 20120101, 0.95
@@ -368,6 +369,8 @@ def _time_offset(
     by_clock = "the stamps as they are" if clocks in (None, 0.0) else "UNIX time of both clocks"
     start, end = estimate.time_s[[0, -1]] + (clocks or 0.0)
     apart = start > reference.time_s[-1] or end < reference.time_s[0]
+    # a flight's boot clock and the clock of a file have nothing to do with each other
+    unrelated = clocks is None and estimate.of_log != reference.of_log
     if given_s == "auto" or (given_s is None and apart):
         found = estimate_time_offset(estimate, reference)
         if found.determinable:
@@ -375,8 +378,23 @@ def _time_offset(
         used = TimeOffset(clocks or 0.0, None, False, found.reason)
         return used, [f"{found.reason} Used {by_clock} instead."]
     if given_s is None:
-        return TimeOffset(clocks or 0.0, None, True, f"By {by_clock}."), []
+        used = TimeOffset(clocks or 0.0, None, True, f"By {by_clock}.")
+        return used, _clock_doubts(estimate, reference) if unrelated else []
     return TimeOffset(given_s, None, True, "As asked for."), []
+
+
+def _clock_doubts(estimate: Trajectory, reference: Trajectory) -> list[str]:
+    """A warning where two clocks that may be unrelated agree with other stamps than given."""
+    found = estimate_time_offset(estimate, reference)
+    if found.interval_s is None or found.offset_s is None:
+        return []
+    low, high = found.interval_s
+    if low <= 0.0 <= high or abs(found.offset_s) < MIN_CLOCK_DOUBT_S:
+        return []
+    return [
+        f"The stamps are used as they are, but the motions fit best with {found.offset_s:+.3f} s "
+        "added to the estimate's: are the two clocks unrelated? Then give --time-offset auto."
+    ]
 
 
 def _swapped(estimate: Trajectory, reference: Trajectory) -> list[str]:

@@ -12,6 +12,8 @@ from px4fuse.flight import Unavailable
 from px4fuse.trajectory.loop import GATE_ALPHA, SOLUTIONS
 from px4fuse.trajectory.pose_graph import GateResult, PoseGraph, Solution, gate, solve
 
+MANY_CLOSURES = 1000
+
 
 @dataclass(frozen=True)
 class SolvedGraph:
@@ -32,7 +34,10 @@ class SolvedGraph:
 
 
 def analyse_graph(
-    graph: PoseGraph, progress: Callable[[str], None] = lambda _: None
+    graph: PoseGraph,
+    progress: Callable[[str], None] = lambda _: None,
+    *,
+    robust: bool | None = None,
 ) -> SolvedGraph:
     """Judge the closures of a graph and solve it, plainly and robustly.
 
@@ -42,6 +47,9 @@ def analyse_graph(
     ----------
     graph : PoseGraph
     progress : callable
+    robust : bool, optional
+        Whether to solve it robustly too; by default up to 1000 closures, since it takes minutes
+        for more.
 
     Raises
     ------
@@ -56,9 +64,11 @@ def analyse_graph(
         gates = tuple(gate(graph, np.flatnonzero(closures), alpha=GATE_ALPHA))
     except TrajectoryError as error:
         gates = Unavailable("gate", str(error), "It needs an odometry edge between all successors.")
-    if np.count_nonzero(closures) > 1:
+    count = np.count_nonzero(closures)
+    if robust is None:
+        robust = count <= MANY_CLOSURES
+    if robust and count > 1:
         for name in ("dcs", "gnc"):
             progress(f"solving: {SOLUTIONS[name]}")
-            robust = "dcs" if name == "dcs" else "gnc"
-            solutions[name] = solve(graph, robust=robust, loops=closures)  # type: ignore[arg-type]
+            solutions[name] = solve(graph, robust="dcs" if name == "dcs" else "gnc", loops=closures)
     return SolvedGraph(replace(graph, poses=solutions["all"].poses), gates, solutions)

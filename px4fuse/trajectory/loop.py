@@ -23,7 +23,7 @@ from px4fuse.trajectory.closure import (
     wrapped,
 )
 from px4fuse.trajectory.evaluation import Evaluation, evaluate
-from px4fuse.trajectory.model import Array, Trajectory
+from px4fuse.trajectory.model import Array, Frame, Trajectory
 from px4fuse.trajectory.odometry import Closure, OdometryNoise, pose_graph
 from px4fuse.trajectory.part import KnownEnd, assumed_end, part_of
 from px4fuse.trajectory.pose_graph import GateResult, PoseGraph, Solution, gate, solve
@@ -127,6 +127,8 @@ class Loop:
     notes : tuple of str
     absolute : bool
         Whether the track follows an absolute position, so that it does not drift.
+    frame : Frame
+        That of the trajectory as it was given.
     """
 
     odometry: Correction
@@ -147,6 +149,7 @@ class Loop:
     references: tuple[Trajectory, ...]
     notes: tuple[str, ...]
     absolute: bool = False
+    frame: Frame = "NED"
 
     @property
     def path_length_m(self) -> float:
@@ -260,8 +263,8 @@ def close_loop(
     along = cumulative_distance(path.position_m[frames])
     if not along[-1] >= max(MIN_PATH_M * min(1.0, spacing / 0.5), 1e-6):
         raise TrajectoryError(
-            f"{trajectory.name}: the path is {along[-1]:.2f} m long, too short for a loop. Give "
-            "the part with --from and --to."
+            f"{trajectory.name}: the path is {along[-1]:.2f} m long on key frames {spacing:g} m "
+            "apart, too short for a loop. Give the part with --from and --to, or --key-frames."
         )
     distance = np.interp(path.time_s, path.time_s[frames], along)
     end_m = path.position_m[-1] - path.position_m[0]
@@ -310,6 +313,7 @@ def close_loop(
         solved=solved,
         references=references,
         notes=tuple(note for note in notes if note),
+        frame=trajectory.frame,
     )
 
 
@@ -328,12 +332,12 @@ def _landing(end: KnownEnd, segment: Segment) -> Closure:
 def _check(closure: Closure, path: Trajectory) -> None:
     low, high = float(path.time_s[0]), float(path.time_s[-1])
     times = (closure.time_1_s, closure.time_2_s)
-    label = f"closure {closure.time_1_s:g},{closure.time_2_s:g}"
+    label = f"closure {closure.time_1_s:.12g},{closure.time_2_s:.12g}"
     if closure.source != LANDING:
         for time in times:
             if not low <= time <= high:
                 raise TrajectoryError(
-                    f"{path.name}: {label}: {time:g} s is outside the path, which runs from "
+                    f"{path.name}: {label}: {time:.12g} s is outside the path, which runs from "
                     f"{low:.2f} s to {high:.2f} s."
                 )
         if not times[0] < times[1]:
@@ -386,10 +390,10 @@ def _by_distance(
 def _refused(what: str, judged: Judged) -> Unavailable:
     return Unavailable(
         what,
-        f"the gate rejects the closure of the {judged.closure.source} (d² {judged.gate.d2:.1f}, p "
-        f"{judged.gate.p:.1g}): forcing it would warp the whole path",
-        "Measure where the vehicle landed (--landed-at), or say with --drift that this odometry "
-        "drifts more.",
+        f"the gate rejects {judged.closure} (d² {judged.gate.d2:.1f}, p {judged.gate.p:.1g}): "
+        "forcing it would warp the whole path",
+        "Measure where the vehicle landed (--landed-at), leave the landing out (--open), or say "
+        "with --drift that this odometry drifts more.",
     )
 
 
@@ -500,14 +504,15 @@ def _scored(
     """Score a path against every reference; the clocks are matched once, on the odometry."""
     scores: dict[str, Evaluation | Unavailable] = {}
     for reference in references:
-        known = 0.0 if reference.kind == "truth" else None
+        same_clock = reference.sha256 == correction.trajectory.sha256
+        known = 0.0 if same_clock else None
         if offsets is not None:
             known = offsets.get(reference.name, known)
         try:
             scores[reference.name] = evaluate(
                 correction.trajectory,
                 reference,
-                time_offset_s="auto" if known is None else known,
+                time_offset_s=known,
             )
         except Px4FuseError as error:
             scores[reference.name] = Unavailable(

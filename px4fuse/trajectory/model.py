@@ -67,6 +67,11 @@ class Trajectory:
     size_bytes: int = 0
     notes: tuple[str, ...] = ()
 
+    @property
+    def of_log(self) -> bool:
+        """Whether it is part of a flight log, on the autopilot's boot clock."""
+        return self.name.endswith(f":{self.kind}")
+
     def __len__(self) -> int:
         return len(self.time_s)
 

@@ -145,6 +145,11 @@ class Closure:
     sigma_heading_deg: float = 2.0
     source: str = "given"
 
+    def __str__(self) -> str:
+        if self.source != "given":
+            return f"the closure of take-off and {self.source}"
+        return f"the closure of {self.time_1_s:.12g} s and {self.time_2_s:.12g} s"
+
 
 def pose_graph(
     path: Trajectory,

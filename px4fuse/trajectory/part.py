@@ -108,7 +108,7 @@ def part_of_flight(
     start_s, end_s : float or None
         Override either end.
     """
-    low, high = float(trajectory.time_s[0]), float(trajectory.time_s[-1])
+    low, high = span = float(trajectory.time_s[0]), float(trajectory.time_s[-1])
     at_rest = False
     if isinstance(flight.airborne, Unavailable):
         reason = "the whole track: the log has no land detector"
@@ -122,13 +122,15 @@ def part_of_flight(
         if count > 1:
             reason = f"from the first take-off to the last of {count} landings"
         at_rest = True
-    return chosen_part(Segment(low, high, reason), start_s, end_s), (
+    return chosen_part(Segment(low, high, reason), start_s, end_s, span), (
         at_rest and start_s is None and end_s is None
     )
 
 
-def chosen_part(segment: Segment, start_s: float | None, end_s: float | None) -> Segment:
-    """A part with either end overridden.
+def chosen_part(
+    segment: Segment, start_s: float | None, end_s: float | None, span: tuple[float, float]
+) -> Segment:
+    """A part with either end overridden, cut at the ends of the data, ``span`` (s).
 
     Raises
     ------
@@ -140,10 +142,14 @@ def chosen_part(segment: Segment, start_s: float | None, end_s: float | None) ->
     high = segment.end_s if end_s is None else end_s
     if not low < high:
         raise SettingsError(
-            f"the part from {low:.6g} s to {high:.6g} s is empty; the track runs from "
-            f"{segment.start_s:.2f} s to {segment.end_s:.2f} s. Change --from or --to."
+            f"the part from {low:.12g} s to {high:.12g} s is empty; the track runs from "
+            f"{span[0]:.2f} s to {span[1]:.2f} s. Change --from or --to."
         )
-    return Segment(low, high, f"chosen with {' and '.join(given)}" if given else segment.reason)
+    reason = f"chosen with {' and '.join(given)}" if given else segment.reason
+    inside = max(low, span[0]), min(high, span[1])
+    if inside != (low, high) and inside[0] < inside[1]:
+        return Segment(*inside, f"{reason}, cut at the ends of the data")
+    return Segment(low, high, reason)
 
 
 def assumed_end(heading_change_deg: float | None) -> KnownEnd:

@@ -1,0 +1,541 @@
+"""``px4fuse loop`` and ``px4fuse evaluate`` as a student types them."""
+
+from __future__ import annotations
+
+import json
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+import numpy as np
+import pypdf
+import pytest
+from click.testing import CliRunner, Result
+from conftest import REPOSITORY
+from test_cli import run, run_main
+from test_lesson import EXAMPLE_2
+from test_outputs import contents
+
+from px4fuse.cli import cli
+from px4fuse.report.results import schema
+
+LOG = REPOSITORY / "sample_logs" / "loop_vio.ulg"
+SLAM = REPOSITORY / "sample_logs" / "loop_slam.tum"
+TRUTH = "loop_vio.ulg:truth"
+ROWS = [line for line in SLAM.read_text().splitlines() if not line.startswith("#")]
+
+
+def results(*arguments: str | Path) -> dict[str, Any]:
+    """What a command prints with ``--json -``."""
+    result: Result = CliRunner().invoke(cli, [*map(str, arguments), "--json", "-"])
+    assert result.exit_code == 0, result.output
+    assert result.stderr == ""
+    found: dict[str, Any] = json.loads(result.stdout)
+    return found
+
+
+def write(path: Path, rows: list[str], newline: str = "\n", encoding: str = "utf-8") -> None:
+    path.write_bytes("".join(row + newline for row in rows).encode(encoding))
+
+
+def with_field(row: int, field: int, text: str) -> list[str]:
+    """The trajectory with another text in one field, or in this one and all after it."""
+    fields = ROWS[row].split()
+    fields[field:] = [text] * (len(fields) - field) if field > 3 else [text, *fields[field + 1 :]]
+    return [*ROWS[:row], " ".join(fields), *ROWS[row + 1 :]]
+
+
+def with_times(change: Any) -> list[str]:
+    return [" ".join([change(row.split()[0]), *row.split()[1:]]) for row in ROWS]
+
+
+def straight(step_m: float) -> list[str]:
+    return [f"{0.1 * i:.1f} {step_m * i} 0 0 0 0 0 1" for i in range(100)]
+
+
+@pytest.fixture(scope="module")
+def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a flight, a trajectory, a pose graph, and everything that is none of these."""
+    folder = tmp_path_factory.mktemp("desk")
+    log = LOG.read_bytes()
+    binary = np.random.default_rng(0).bytes(5000)
+    for name, content in {
+        "l.ulg": log,
+        "cut.ulg": log[:200],
+        "empty.tum": b"",
+        "empty.ulg": b"",
+        "junk.bin": binary,
+        "f.pdf": b"%PDF-1.7\n\x00\x01\x02" + binary,
+        "df.BIN": b"\xa3\x95\x80\x80\x59FMT\x00BBnNZ\x00Type,Length,Name\x00" + binary,
+        "closures.bin": binary,
+    }.items():
+        (folder / name).write_bytes(content)
+    (folder / "folder").mkdir()
+    for name, rows in {
+        "s.tum": ROWS,
+        "junk.txt": ["hello world", "this is no data"],
+        "uwb.csv": ["time,x,y,z", "1,2,3,4", "2,3,4,5"],
+        "two.tum": ROWS[:2],
+        "nonmono.tum": [*ROWS[:100], ROWS[101], ROWS[100], *ROWS[102:]],
+        "nan.tum": with_field(50, 2, "nan"),
+        "zero.tum": with_field(50, 4, "0"),
+        "comma.tum": [row.replace(" ", ",") for row in ROWS],
+        "still.tum": straight(0.0),
+        "line.tum": straight(0.1),
+        "g.g2o": [
+            *(f"VERTEX_SE2 {i} {i} 0 0" for i in range(3)),
+            *(f"EDGE_SE2 {i} {i + 1} 1 0 0 1 0 0 1 0 1" for i in range(2)),
+        ],
+        "bad.g2o": ["VERTEX_SE2 0 0 0 0", "EDGE_SE2 0 7 1 0 0 1 0 0 1 0 1"],
+        "text.g2o": ["VERTEX_SE2 0 hello"],
+        "closures.txt": ["t1,t2", "10,50", "20,60,0.2 # the door"],
+        "junk_closures.txt": ["10,50", "hello"],
+        "no_closures.txt": ["# nothing"],
+        "n.md": ["my own words"],
+    }.items():
+        write(folder / name, rows)
+    (folder / "hard.json").hardlink_to(folder / "s.tum")
+    (folder / "soft.json").symlink_to(folder / "l.ulg")
+    (folder / "s.pdf").write_bytes((folder / "s.tum").read_bytes())
+    return folder
+
+
+# ------------------------------------------------------------------ what the commands write
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Result]:
+    """Everything that ``px4fuse loop`` writes of the sample flight."""
+    folder = tmp_path_factory.mktemp("made")
+    return folder, make(folder)
+
+
+def make(folder: Path) -> Result:
+    return run(
+        "loop", LOG, "--reference", SLAM, "--closure", "10,60", "-o", folder / "r.pdf",
+        "--tum", folder / "r.tum", "--g2o", folder / "r.g2o",
+        "--student", "Ana $x$ Müller", "--id", "$^2_",
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def found(made: tuple[Path, Result]) -> dict[str, Any]:
+    read: dict[str, Any] = json.loads((made[0] / "r.json").read_text(encoding="utf-8"))
+    return read
+
+
+def test_loop_writes_report_results_path_and_graph(made) -> None:
+    folder, result = made
+    assert result.exit_code == 0, result.output
+    assert sorted(path.name for path in folder.iterdir()) == ["r.g2o", "r.json", "r.pdf", "r.tum"]
+    assert "1.42 m" in result.output
+    assert "REJECTED" in result.output  # 10,60 is no closure
+    for name in ("r.g2o", "r.json", "r.pdf", "r.tum"):
+        assert f"Wrote    {folder / name}" in result.output
+
+
+def test_loop_results_are_in_the_report_and_validate(made, found) -> None:
+    folder, _ = made
+    attached = pypdf.PdfReader(folder / "r.pdf").attachments["results.json"]
+    assert attached == [(folder / "r.json").read_bytes()]
+    whole = schema()
+    jsonschema.validate(found["loop"], {"$ref": "#/$defs/loop", "$defs": whole["$defs"]})
+    assert found["loop"]["closure_error_m"] == pytest.approx(1.42, abs=0.05)
+    assert [each["accepted"] for each in found["loop"]["closures"]] == [True, False]
+
+
+def test_loop_report_names_whom_was_asked_and_no_folder(made) -> None:
+    folder, _ = made
+    pages = "".join(page.extract_text() for page in pypdf.PdfReader(folder / "r.pdf").pages)
+    assert "Ana $x$ Müller" in pages
+    for path in folder.iterdir():
+        content = path.read_bytes()
+        assert str(folder).encode() not in content
+        assert str(REPOSITORY).encode() not in content
+
+
+def test_loop_gives_the_same_bytes_again(made, tmp_path) -> None:
+    assert make(tmp_path).exit_code == 0
+    assert contents(tmp_path) == contents(made[0])
+
+
+@pytest.mark.parametrize("reference", [f"{LOG}:truth", str(LOG)])
+def test_the_written_path_scores_as_the_loop_said(made, found, reference) -> None:
+    gated = found["loop"]["corrections"]["pose_graph_gated"]["scores"][TRUTH]
+    again = results("evaluate", made[0] / "r.tum", reference, "--alignment", gated["alignment"])
+    assert again["ate"]["translation_m"]["rmse"] == pytest.approx(
+        gated["ate"]["translation_m"]["rmse"], rel=1e-4
+    )
+    assert again["association"]["poses"] == gated["association"]["poses"]
+
+
+def test_the_written_graph_is_solved_already(tmp_path) -> None:
+    """A graph whose closures are all accepted; with a rejected one it would move."""
+    graph = tmp_path / "g.g2o"
+    loop = results("loop", LOG, "--g2o", graph)["loop"]
+    again = results("loop", graph)
+    before, after = loop["corrections"]["pose_graph_gated"], again["graph"]["solutions"]["all"]
+    assert after["cost"] == pytest.approx(before["cost"], rel=1e-6)
+    assert after["cost_initial"] == pytest.approx(after["cost"], rel=1e-6)
+    assert [gate["accepted"] for gate in again["graph"]["gates"]] == [True]
+
+
+def test_the_graph_with_a_rejected_closure_still_holds_it(made, found) -> None:
+    again = results("loop", made[0] / "r.g2o")
+    assert [gate["accepted"] for gate in again["graph"]["gates"]] == [True, False]
+    judged = found["loop"]["closures"][1]
+    all_closures = found["loop"]["corrections"]["pose_graph_all"]
+    assert again["graph"]["gates"][1]["degrees_of_freedom"] == judged["degrees_of_freedom"]
+    assert again["graph"]["solutions"]["all"]["cost"] == pytest.approx(
+        all_closures["cost"], rel=1e-3
+    )
+
+
+def test_loop_of_a_graph_writes_both_files(desk, tmp_path) -> None:
+    result = run("loop", desk / "g.g2o", "--g2o", tmp_path / "s.g2o", "--json", tmp_path / "s.json")
+    assert result.exit_code == 0, result.output
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["s.g2o", "s.json"]
+    found = json.loads((tmp_path / "s.json").read_text(encoding="utf-8"))
+    assert found["graph"]["poses"] == 3
+    assert run("loop", tmp_path / "s.g2o").exit_code == 0
+
+
+def test_results_alone_on_standard_output_beside_written_files(desk, tmp_path) -> None:
+    found = results("loop", desk / "s.tum", "--tum", tmp_path / "o.tum")
+    assert found["schema"]["name"] == "px4fuse-loop"
+    assert found["provenance"]["command"] == "px4fuse loop s.tum"
+    assert [path.name for path in tmp_path.iterdir()] == ["o.tum"]
+
+
+def test_the_results_keep_the_command_that_makes_them_again(desk) -> None:
+    given = ["--landed-at", "0.1,-0.2,5", "--closures", desk / "closures.txt", "--drift", "2"]
+    found = results("loop", desk / "s.tum", *given)
+    assert found["provenance"]["command"] == (
+        "px4fuse loop s.tum --landed-at 0.1,-0.2,5 --closures closures.txt --drift 2.0"
+    )
+    assert len(found["loop"]["closures"]) == 3
+
+
+def test_evaluate_writes_what_it_prints(desk, tmp_path) -> None:
+    out = tmp_path / "e.json"
+    command = ["evaluate", desk / "s.tum", desk / "l.ulg:truth", "--rpe", "5m", "--rpe", "10s",
+               "--rpe", "1f"]  # fmt: skip
+    printed = run(*command, "--json", out)
+    assert printed.exit_code == 0
+    assert "ATE (m)" in printed.output
+    found = json.loads(out.read_text(encoding="utf-8"))
+    assert found == results(*command)
+    assert found["schema"]["name"] == "px4fuse-evaluation"
+    assert found["alignment"] == "se3"
+    assert found["ate"]["translation_m"]["rmse"] == pytest.approx(0.060, abs=0.01)
+    assert found["time_offset"]["determinable"]
+    assert [(one["delta"], one["unit"]) for one in found["rpe"]] == [
+        (5.0, "m"), (10.0, "s"), (1.0, "frames"),
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ["s.tum", "l.ulg:vio", "l.ulg:truth"])
+def test_a_trajectory_has_no_error_against_itself(desk, name) -> None:
+    found = results("evaluate", desk / name, desk / name)
+    assert found["ate"]["translation_m"]["max"] == pytest.approx(0.0, abs=1e-6)
+
+
+def test_the_clocks_of_another_day_are_matched(desk, tmp_path) -> None:
+    later = tmp_path / "later.tum"
+    write(later, with_times(lambda time: f"{float(time) + 86_400.0:.6f}"))
+    found = results("evaluate", desk / "s.tum", later)
+    assert found["time_offset"]["offset_s"] == pytest.approx(86_400.0, abs=0.01)
+    assert found["ate"]["translation_m"]["rmse"] < 0.01
+
+
+def test_a_reference_without_overlap_is_stated_and_fails_nothing(desk) -> None:
+    scores = results("loop", desk / "s.tum", "--reference", desk / "line.tum")["loop"][
+        "corrections"
+    ]["uncorrected"]["scores"]
+    assert "no poses match in time" in json.dumps(scores["line.tum"])
+
+
+def test_a_loop_against_itself_is_zero_before_it_is_corrected(desk) -> None:
+    found = results("loop", desk / "s.tum", "--reference", desk / "s.tum")["loop"]["corrections"]
+    assert found["uncorrected"]["scores"]["s.tum"]["ate"]["translation_m"]["rmse"] < 1e-5
+    assert found["pose_graph_gated"]["scores"]["s.tum"]["ate"]["translation_m"]["rmse"] > 0.05
+
+
+# ------------------------------------------------------------------ odd files that are right
+
+
+@pytest.mark.parametrize(
+    ("rows", "newline", "encoding"),
+    [
+        (["# timestamp tx ty tz qx qy qz qw", *ROWS], "\r\n", "utf-8-sig"),
+        (ROWS, "\r\n", "utf-16"),
+        (with_times(lambda time: time.replace(".", "") + "000"), "\n", "utf-8"),
+    ],
+    ids=["BOM and CRLF", "UTF-16 of a Windows shell", "nanoseconds"],
+)
+def test_other_ways_to_write_the_same_trajectory(desk, tmp_path, rows, newline, encoding) -> None:
+    file = tmp_path / "s.tum"
+    write(file, rows, newline, encoding)
+    same, other = results("loop", desk / "s.tum"), results("loop", file)
+    for each in (same, other):
+        del each["loop"]["notes"]
+    # nanoseconds are rounded elsewhere
+    assert other["loop"]["closure_error_m"] == same["loop"]["closure_error_m"]
+    assert other["loop"]["start_s"] == pytest.approx(same["loop"]["start_s"], abs=1e-6)
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
+def test_closures_as_windows_writes_them(desk, tmp_path, encoding) -> None:
+    write(tmp_path / "c.txt", ["10,50", "20,60"], "\r\n", encoding)
+    found = results("loop", desk / "s.tum", "--closures", tmp_path / "c.txt")
+    assert len(found["loop"]["closures"]) == 3
+
+
+def test_a_file_with_a_colon_in_its_name_is_a_file(desk, tmp_path) -> None:
+    (tmp_path / "a:vio").write_bytes((desk / "s.tum").read_bytes())
+    assert results("loop", tmp_path / "a:vio")["track"]["name"] == "a:vio"
+
+
+# ------------------------------------------------------------------ what is refused
+
+# Command and a part of what it must say
+REFUSED = {
+    "missing": ("loop absent.ulg", "absent.ulg: cannot be read (No such file or directory)"),
+    "missing part": ("loop absent.ulg:vio", "absent.ulg: cannot be read"),
+    "no name": ("loop ''", "is a folder"),
+    "no name but a part": ("loop :vio", "is a folder"),
+    "folder": ("loop folder", "folder: is a folder"),
+    "folder with a part": ("loop folder:vio", "folder: is a folder"),
+    "empty log": ("loop empty.ulg", "empty.ulg: the file is empty"),
+    "empty trajectory": ("loop empty.tum", "empty.tum: the file is empty"),
+    "binary junk": ("loop junk.bin", "junk.bin: not a PX4 ULog"),
+    "text junk": ("loop junk.txt", "junk.txt: not a trajectory file"),
+    "another table": ("loop uwb.csv", "uwb.csv: 4 columns"),
+    "PDF": ("loop f.pdf", "f.pdf: not a PX4 ULog"),
+    "DataFlash": ("loop df.BIN", "df.BIN: not a PX4 ULog but an ArduPilot DataFlash"),
+    "cut log": ("loop cut.ulg", "cut.ulg: a ULog without any data"),
+    "two poses": ("loop two.tum", "two.tum: poses: 2"),
+    "times that go back": ("loop nonmono.tum", "nonmono.tum, line 102"),
+    "not a number": ("loop nan.tum", "nan.tum, line 51"),
+    "zero quaternion": ("loop zero.tum", "zero.tum, line 51: columns 5 to 8 are no quaternion"),
+    "commas": ("loop comma.tum", "comma.tum: 8 columns between commas"),
+    "no motion": ("loop still.tum", "still.tum: the path is 0.00 m long"),
+    "closure outside": ("loop s.tum --closure 10,5000", "outside the path"),
+    "closure of one time": ("loop s.tum --closure 10", "closure '10' is not T1,T2"),
+    "closure of words": ("loop s.tum --closure abc", "closure 'abc' is not T1,T2"),
+    "closure of NaN": ("loop s.tum --closure 10,nan", "is not T1,T2"),
+    "closure of nothing": ("loop s.tum --closure ''", "is not T1,T2"),
+    "closure of four": ("loop s.tum --closure 1,2,3,4", "is not T1,T2"),
+    "closure backwards": ("loop s.tum --closure 50,10", "first time must be before the second"),
+    "closure at once": ("loop s.tum --closure 10,10", "first time must be before the second"),
+    "closure of no width": ("loop s.tum --closure 10,50,0", "SIGMA 0 is outside"),
+    "closures of junk": ("loop s.tum --closures junk_closures.txt", "junk_closures.txt, line 2"),
+    "closures of bytes": ("loop s.tum --closures closures.bin", "closures.bin: not a text file"),
+    "closures of none": ("loop s.tum --closures no_closures.txt", "no_closures.txt: 0 closures"),
+    "closures missing": ("loop s.tum --closures absent.txt", "absent.txt: cannot be read"),
+    "closures a folder": ("loop s.tum --closures folder", "folder: cannot be read"),
+    "landing of words": ("loop s.tum --landed-at junk", "'junk' is not FORWARD,RIGHT"),
+    "landing of one": ("loop s.tum --landed-at 1", "'1' is not FORWARD,RIGHT"),
+    "landing of four": ("loop s.tum --landed-at 1,2,3,4", "is not FORWARD,RIGHT"),
+    "landing of NaN": ("loop s.tum --landed-at nan,1", "is not FORWARD,RIGHT"),
+    "landing on the moon": ("loop s.tum --landed-at 1e300,1", "is not FORWARD,RIGHT"),
+    "landing, and open": ("loop s.tum --landed-at 1,2 --open", "exclude each other"),
+    "open, and nothing to correct": ("loop s.tum --open --tum o.tum", "no corrected path"),
+    "no drift": ("loop s.tum --drift 0", "--drift 0 is outside"),
+    "drift of NaN": ("loop s.tum --drift nan", "--drift nan is outside"),
+    "negative drift": ("loop s.tum --drift -1", "--drift -1 is outside"),
+    "no heading drift": ("loop s.tum --heading-drift 0", "--heading-drift 0 is outside"),
+    "from after to": ("loop s.tum --from 50 --to 40", "Change --from or --to"),
+    "from NaN": ("loop s.tum --from nan", "--from nan is not a finite number"),
+    "to infinity": ("loop s.tum --to -inf", "--to -inf is not a finite number"),
+    "from after the end": ("loop s.tum --from 5000", "Change --from or --to"),
+    "no key frames": ("loop s.tum --key-frames 0", "--key-frames 0 is outside"),
+    "key frames of NaN": ("loop s.tum --key-frames nan", "--key-frames nan is outside"),
+    "no such part": ("loop l.ulg:slam", "'slam' is no part of a flight"),
+    "part of a trajectory": ("loop s.tum:vio", "s.tum: a trajectory file has no part 'vio'"),
+    "frame of a flight": ("loop l.ulg --frame enu", "--frame enu is for trajectory files"),
+    "no such frame": ("loop s.tum --frame up", "'up' is not one of"),
+    "notes missing": ("loop s.tum --notes absent.md", "absent.md: cannot be read"),
+    "no PDF": ("loop s.tum -o r.txt", "r.txt: the report is a PDF"),
+    "report and results": ("loop s.tum -o r.pdf --json r.pdf", "same file"),
+    "results and path": ("loop s.tum --json x --tum ./x", "two outputs name the same file"),
+    "report's results and path": ("loop s.tum -o r.pdf --tum r.json", "two outputs"),
+    "path and graph": ("loop s.tum --tum x --g2o x", "two outputs name the same file"),
+    "path to standard output": ("loop s.tum --tum -", "only --json can print"),
+    "graph to standard output": ("loop s.tum --g2o -", "only --json can print"),
+    "path into a file": ("loop s.tum --tum n.md/r.tum", "cannot be written"),
+    "path over a folder": ("loop s.tum --json j.json --tum folder", "folder: is a folder"),
+    "reference missing": ("loop s.tum --reference absent.tum", "absent.tum: cannot be read"),
+    "reference of junk": ("loop s.tum --reference junk.txt", "junk.txt: not a trajectory file"),
+    "reference a graph": ("loop s.tum --reference g.g2o", "g.g2o: a pose graph, not a trajectory"),
+    "graph with a bad edge": ("loop bad.g2o", "bad.g2o: line 2"),
+    "graph of words": ("loop text.g2o", "text.g2o: line 1"),
+    "part of a graph": ("loop g.g2o:vio", "a pose graph has no part 'vio'"),
+    "report of a graph": ("loop g.g2o -o r.pdf", "not for a pose graph"),
+    "path of a graph": ("loop g.g2o --tum r.tum", "not for a pose graph"),
+    "closure of a graph": ("loop g.g2o --closure 1,2", "not for a pose graph"),
+    "reference of a graph": ("loop g.g2o --reference s.tum", "not for a pose graph"),
+    "graph's outputs the same": ("loop g.g2o --json x --g2o ./x", "two outputs name the same file"),
+    "graph's outputs half good": ("loop g.g2o --g2o x --json folder", "folder: is a folder"),
+    "nothing": ("loop", "Missing argument 'SOURCE'"),
+    "evaluate nothing": ("evaluate s.tum", "Missing argument 'REFERENCE'"),
+    "evaluate missing": ("evaluate s.tum absent.tum", "absent.tum: cannot be read"),
+    "evaluate empty": ("evaluate empty.tum s.tum", "empty.tum: the file is empty"),
+    "evaluate a folder": ("evaluate folder s.tum", "folder: is a folder"),
+    "evaluate junk": ("evaluate s.tum junk.bin", "junk.bin: not a PX4 ULog"),
+    "evaluate a table": ("evaluate uwb.csv s.tum", "uwb.csv: 4 columns"),
+    "evaluate a graph": ("evaluate s.tum g.g2o", "g.g2o: a pose graph, not a trajectory"),
+    "evaluate another flight": ("evaluate s.tum still.tum", "no poses match in time"),
+    "evaluate apart": ("evaluate s.tum l.ulg --time-offset 0", "no poses match in time"),
+    "evaluate a line": ("evaluate line.tum line.tum", "--alignment yaw"),
+    "evaluate no such part": ("evaluate s.tum l.ulg:slam", "'slam' is no part of a flight"),
+    "gap of nothing": ("evaluate s.tum s.tum --max-gap 0", "--max-gap"),
+    "gap of NaN": ("evaluate s.tum s.tum --max-gap nan", "--max-gap nan is not a finite"),
+    "endless gap": ("evaluate s.tum s.tum --max-gap inf", "--max-gap inf is not a finite"),
+    "offset of NaN": ("evaluate s.tum s.tum --time-offset nan", "--time-offset nan is not"),
+    "endless offset": ("evaluate s.tum s.tum --time-offset inf", "--time-offset inf is not"),
+    "offset of words": ("evaluate s.tum s.tum --time-offset abc", "neither a number nor 'auto'"),
+    "RPE over km": ("evaluate s.tum s.tum --rpe 5km", "'5km' is no distance"),
+    "RPE over nothing": ("evaluate s.tum s.tum --rpe 0m", "'0m' is no distance"),
+    "RPE backwards": ("evaluate s.tum s.tum --rpe -1m", "'-1m' is no distance"),
+    "RPE over half a frame": ("evaluate s.tum s.tum --rpe 1.5f", "frames come whole"),
+    "RPE over too many": (f"evaluate s.tum s.tum --rpe {'9' * 26}f", "is no distance"),
+    "results into a file": ("evaluate s.tum s.tum --json n.md/e.json", "cannot be written"),
+}
+
+
+@pytest.mark.parametrize(("command", "said"), REFUSED.values(), ids=REFUSED)
+def test_bad_input_gives_one_line_and_writes_nothing(
+    desk, monkeypatch, capsys, command, said
+) -> None:
+    refused(desk, monkeypatch, capsys, command, said)
+
+
+SPARED = {
+    "report": "loop s.pdf -o s.pdf",
+    "path": "loop s.tum --tum s.tum",
+    "path by another spelling": "loop s.tum --tum ./s.tum",
+    "path of a part": "loop l.ulg:vio --tum l.ulg",
+    "graph": "loop s.tum --g2o s.tum",
+    "results": "loop s.tum --json s.tum",
+    "results by hard link": "loop s.tum --json hard.json",
+    "results by soft link of a part": "loop l.ulg:vio --json soft.json",
+    "results of the report": "loop l.ulg -o r.pdf --json l.ulg",
+    "reference": "loop l.ulg --reference s.tum --tum s.tum",
+    "part of a reference": "loop s.tum --reference l.ulg:truth --json l.ulg",
+    "closures": "loop s.tum --closures closures.txt --json closures.txt",
+    "notes": "loop s.tum --notes n.md --json n.md",
+    "pose graph": "loop g.g2o --g2o g.g2o",
+    "pose graph by its results": "loop g.g2o --json ./g.g2o",
+    "estimate": "evaluate s.tum s.tum --json s.tum",
+    "reference of evaluate": "evaluate s.tum l.ulg:truth --json l.ulg",
+}
+
+
+@pytest.mark.parametrize("command", SPARED.values(), ids=SPARED)
+def test_no_command_writes_over_what_it_reads(desk, monkeypatch, capsys, command) -> None:
+    refused(desk, monkeypatch, capsys, command, "not overwritten")
+
+
+def refused(desk, monkeypatch, capsys, command: str, said: str) -> None:
+    monkeypatch.chdir(desk)
+    before = contents(desk)
+    code, out, err = run_main(monkeypatch, capsys, *shlex.split(command))
+    assert (code, out) == (2, ""), err
+    assert err.startswith("px4fuse: ")
+    assert len(err.splitlines()) == 1
+    assert said in err
+    assert contents(desk) == before
+
+
+def test_an_older_report_survives_a_failed_run(desk, tmp_path, monkeypatch, capsys) -> None:
+    old = tmp_path / "r.pdf"
+    old.write_text("an older report")
+    code, _, _ = run_main(monkeypatch, capsys, "loop", desk / "nan.tum", "-o", old)
+    assert code == 2
+    assert contents(tmp_path) == {"r.pdf": b"an older report"}
+
+
+@pytest.mark.parametrize("command", ["loop s.tum", "evaluate s.tum s.tum", "loop g.g2o"])
+def test_a_reader_that_leaves_is_no_error(desk, command) -> None:
+    """As in px4fuse loop s.tum | head -1, when head has gone before anything is printed."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", "px4fuse", *command.split()],
+        cwd=desk, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+    )  # fmt: skip
+    assert process.stdout is not None
+    assert process.stderr is not None
+    process.stdout.close()
+    complaint = process.stderr.read()
+    process.stderr.close()
+    assert (process.wait(), complaint) == (0, b"")
+
+
+# ------------------------------------------------------------------ the other commands
+
+
+def test_lesson_loop_prints_the_lesson() -> None:
+    result = run("lesson", "loop")
+    assert (result.exit_code, result.output) == (0, EXAMPLE_2)
+
+
+def test_help_of_both_commands() -> None:
+    for command in ("loop", "evaluate"):
+        result = run(command, "--help")
+        assert result.exit_code == 0
+        assert "Usage:" in result.output
+
+
+def test_compare_reports_the_loop_of_the_sample_flight(tmp_path) -> None:
+    result = run("compare", LOG, "-o", tmp_path / "r.pdf")
+    assert result.exit_code == 0, result.output
+    found = json.loads((tmp_path / "r.json").read_text(encoding="utf-8"))
+    jsonschema.validate(found, schema())
+    assert found["loop"]["closure_error_m"] == pytest.approx(1.42, abs=0.05)
+
+
+# ------------------------------------------------------------------ not right yet
+
+
+def turned_up(rows: list[str]) -> list[str]:
+    """A trajectory of a camera as one of a body in a world with z up, as ROS writes it."""
+    turned = []
+    for row in rows:
+        time, x, y, z, qx, qy, qz, qw = row.split()
+        minus = [str(-float(text)) for text in (x, y, qx, qy)]
+        turned.append(" ".join([time, z, *minus[:2], qz, *minus[2:], qw]))
+    return turned
+
+
+def test_a_track_with_z_up_scores_in_the_loop_as_evaluate_does(desk, tmp_path) -> None:
+    for name in ("a.tum", "truth.tum"):
+        write(tmp_path / name, turned_up(ROWS))
+    found = results("loop", tmp_path / "a.tum", "--reference", tmp_path / "truth.tum")["loop"]
+    score = found["corrections"]["uncorrected"]["scores"]["truth.tum"]
+    assert score["ate"]["rotation_deg"]["max"] < 0.01
+    assert score["rpe"][0]["translation_m"]["max"] < 0.01
+
+
+def test_a_flight_is_a_reference_for_slam_with_unix_stamps(desk) -> None:
+    found = results("loop", desk / "s.tum", "--reference", desk / "l.ulg:truth")["loop"]
+    score = found["corrections"]["uncorrected"]["scores"]["l.ulg:truth"]
+    assert score["ate"]["translation_m"]["rmse"] == pytest.approx(0.060, abs=0.01)
+
+
+def test_a_flag_is_kept_as_it_is_typed(desk) -> None:
+    found = results("loop", desk / "s.tum", "--open")
+    assert found["provenance"]["command"] == "px4fuse loop s.tum --open"
+
+
+@pytest.mark.parametrize("options", [["--closure", "10,5000"], ["--from", "50", "--to", "40"]])
+def test_times_in_messages_can_be_told_apart(desk, monkeypatch, capsys, options) -> None:
+    _, _, err = run_main(monkeypatch, capsys, "loop", desk / "s.tum", *options)
+    assert "1.79525e+09" not in err
+
+
+def test_a_part_beyond_the_data_is_cut(desk) -> None:
+    found = results("loop", desk / "s.tum", "--from", "5", "--to", "5000")["loop"]
+    assert found["end_s"] - found["start_s"] < 90.0
