@@ -66,7 +66,7 @@ def analyse_graph(
         gates = Unavailable("gate", str(error), "It needs an odometry edge between all successors.")
     count = np.count_nonzero(closures)
     if robust is None:
-        robust = count <= MANY_CLOSURES
+        robust = bool(count <= MANY_CLOSURES)
     if robust and count > 1:
         for name in ("dcs", "gnc"):
             progress(f"solving: {SOLUTIONS[name]}")
