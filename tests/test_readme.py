@@ -13,11 +13,14 @@ from px4fuse.cli import COMMANDS, cli
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 BLOCKS = re.findall(r"```(\w+)\n(.*?)```", README, re.DOTALL)
+SHELL = [block.splitlines() for kind, block in BLOCKS if kind == "sh"]
+# The instructor's four commands need each other
+(JOURNEY,) = (lines for lines in SHELL if any("--assignment" in line for line in lines))
 LINES = [
     line
-    for kind, block in BLOCKS
-    if kind == "sh"
-    for line in block.splitlines()
+    for lines in SHELL
+    if lines is not JOURNEY
+    for line in lines
     if line.startswith("px4fuse ") and "|" not in line
 ]
 
@@ -36,6 +39,19 @@ def at_root(tmp_path, monkeypatch):
 def test_command_runs(at_root, line):
     result = CliRunner().invoke(cli, shlex.split(line)[1:])
     assert result.exit_code == 0, result.output
+
+
+def test_the_instructors_four_commands_run_in_order(at_root):
+    Path("roster.csv").write_text("id,name\n1001,Ada Lovelace\n1002,Grace Hopper\n")
+    Path("notes.md").write_text("# What I found\n\nThe stamps are late.\n")
+    assert len(JOURNEY) == 4
+    for line in JOURNEY:
+        result = CliRunner().invoke(cli, shlex.split(line)[1:])
+        assert result.exit_code == 0, (line, result.output)
+    assert {path.name for path in Path("flights").iterdir()} == {"1001.ulg", "1002.ulg"}
+    assert "verified" in result.output
+    table = Path("class/class.csv").read_text(encoding="utf-8-sig")
+    assert "Ada Lovelace,1001,verified" in table
 
 
 def test_python_examples_run(at_root, capsys):

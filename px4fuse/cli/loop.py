@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import astuple, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -161,7 +162,7 @@ def loop(
     from px4fuse.report.document import LoopDocument
     from px4fuse.report.loop_terminal import print_loop
     from px4fuse.report.results import loop_results, to_json
-    from px4fuse.trajectory.sources import is_g2o, read_source, split_part
+    from px4fuse.trajectory.sources import is_g2o, split_part
 
     person = read_person(given)
     for option, path in (("--tum", tum), ("--g2o", g2o)):
@@ -170,27 +171,13 @@ def loop(
     if is_g2o(split_part(str(source))[0]):
         _solve(source, json_path, g2o, True if given["robust"] else None)
         return
-    for option in ("start", "end"):
-        if given[option] is not None and not abs(given[option]) < float("inf"):
-            name = {"start": "--from", "end": "--to"}[option]
-            raise SettingsError(f"{name} {given[option]:g} is not a finite number.")
+    _check_span(given)
     _spare(tum, g2o, *((json_path,) if output is None else report_paths(output, json_path)))
     with progress(json_path == STANDARD_OUTPUT) as step:
-        step(f"reading {source.name}")
-        read = read_source(str(source), frame=FRAMES.get(frame or ""), system=system)  # type: ignore[arg-type]
-        if frame is not None and read.flight is not None:
-            raise SettingsError(
-                f"--frame {frame} is for trajectory files; {read.flight.log.name} is a flight log, "
-                "which states its frame. Leave --frame out."
-            )
-        other = None
-        if reference is not None:
-            other = read_source(str(reference), default="truth", system=system)
-        found = _analyse(read, None if other is None else other.trajectory, step, **given)
+        found = run_loop(source, step, frame=frame, system=system, reference=reference, **given)
         findings = find_loop(found)
-        files = (source,)
-        command = command_line("loop", *files)
-        results = loop_results(found, findings, command)
+        command = command_line("loop", source)
+        results = loop_results(found, findings, person, command)
         contents = _files(found, tum, g2o)
         if output is not None:
             from px4fuse.report.pdf import render
@@ -211,6 +198,38 @@ def loop(
     print_loop(console, found, findings)
     for path in contents:
         console.print(f"Wrote    {path}", markup=False, style="bold", soft_wrap=True)
+
+
+def _check_span(given: Mapping[str, Any]) -> None:
+    for option, name in (("start", "--from"), ("end", "--to")):
+        if given[option] is not None and not abs(given[option]) < float("inf"):
+            raise SettingsError(f"{name} {given[option]:g} is not a finite number.")
+
+
+def run_loop(
+    source: Path,
+    step: Callable[[str], None],
+    *,
+    frame: str | None,
+    system: int | None,
+    reference: Path | None,
+    **given: Any,
+) -> Loop:
+    """Read what the command's options name and measure the loop."""
+    from px4fuse.trajectory.sources import read_source
+
+    _check_span(given)
+    step(f"reading {source.name}")
+    read = read_source(str(source), frame=FRAMES.get(frame or ""), system=system)  # type: ignore[arg-type]
+    if frame is not None and read.flight is not None:
+        raise SettingsError(
+            f"--frame {frame} is for trajectory files; {read.flight.log.name} is a flight log, "
+            "which states its frame. Leave --frame out."
+        )
+    other = None
+    if reference is not None:
+        other = read_source(str(reference), default="truth", system=system)
+    return _analyse(read, None if other is None else other.trajectory, step, **given)
 
 
 def _spare(*targets: Path | None) -> None:

@@ -2,22 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
+from click.core import ParameterSource
 
 from px4fuse.cli.inputs import path_option, write_outputs
-from px4fuse.errors import OutputError
+from px4fuse.errors import OutputError, SettingsError
 from px4fuse.simulation.mistakes import MISTAKES, as_typed, made, parse
 from px4fuse.simulation.scenario import KINDS, YAWS, Scenario
 
 if TYPE_CHECKING:
+    from px4fuse.grading.answers import AnswerKey
     from px4fuse.simulation.flights import Simulation
+    from px4fuse.simulation.scenario import Kind
 
 _DEFAULT = Scenario()
 PASSES = {"aisle": _DEFAULT.passes, "loop": 1}
+# What goes with --assignment, and what goes with nothing else
+OF_ASSIGNMENTS = ("output", "assignment", "secret", "secret_file", "count", "kind", "answer_path",
+                  "no_truth")  # fmt: skip
+ONLY_ASSIGNMENTS = ("secret", "secret_file", "count")
+MAX_SECRET_BYTES = 10_000
 Command = TypeVar("Command", bound=Callable[..., None])
 
 
@@ -46,7 +55,39 @@ class WithMistakes(click.Command):
 
 
 @click.command(cls=WithMistakes)
-@path_option("-o", "--output", required=True, metavar="FLIGHT.ulg", help="The log to write.")
+@path_option(
+    "-o",
+    "--output",
+    required=True,
+    metavar="FLIGHT.ulg|DIR",
+    help="The log to write; with --assignment the folder for everyone's.",
+)
+@path_option(
+    "--assignment",
+    metavar="ROSTER.csv",
+    help="A flight for every student of a class list (student id, name), with noises and mistakes "
+    "of their own, and the answer key beside the folder.",
+)
+@path_option(
+    "--secret-file",
+    metavar="FILE",
+    help="Holds the secret from which assignments are drawn: the same secret and id give the same "
+    "flight.  [default: made up, and kept in the answer key]",
+)
+@click.option(
+    "--secret",
+    default=None,
+    metavar="TEXT",
+    help="The secret itself; others on this computer may see what you type.",
+)
+@click.option(
+    "--mistakes",
+    "count",
+    type=int,
+    default=None,
+    metavar="N",
+    help="How many mistakes each assigned flight has.  [default: drawn: none, one or two]",
+)
 @click.option(
     "--kind",
     type=click.Choice(KINDS),
@@ -73,7 +114,8 @@ class WithMistakes(click.Command):
     "--answer",
     "answer_path",
     metavar="FILE.json",
-    help="Write the answer: mistakes, biases, outliers, clock offset. Keep it to yourself.",
+    help="Write the answer: mistakes, biases, outliers, clock offset. Keep it to yourself.  "
+    "[default with --assignment: DIR_answers.json]",
 )
 @click.option("--no-truth", is_flag=True, help="Leave the ground truth out of the log.")
 @click.option(
@@ -129,6 +171,10 @@ class WithMistakes(click.Command):
 )
 def simulate(
     output: Path,
+    assignment: Path | None,
+    secret_file: Path | None,
+    secret: str | None,
+    count: int | None,
     mistakes: tuple[str, ...],
     answer_path: Path | None,
     no_truth: bool,
@@ -142,7 +188,17 @@ def simulate(
     holds no EKF2, since none was run: for that use the sample logs.
 
     For example, px4fuse simulate -o s07.ulg --seed 7 --mistake nlos=5% --answer s07.json
+
+    With --assignment every student of a class gets a flight:
+    px4fuse simulate --assignment roster.csv -o flights
     """
+    _check_options(assignment)
+    if assignment is not None:
+        chosen_secret = _read_secret(secret, secret_file)
+        _assign(
+            assignment, output, answer_path, chosen_secret, scenario["kind"], count, not no_truth
+        )
+        return
     if output.suffix.lower() != ".ulg":
         raise OutputError(f"{output}: the log is a ULog. Give a name that ends in .ulg with -o.")
     if answer_path is not None and answer_path.resolve() == output.resolve():
@@ -166,6 +222,106 @@ def simulate(
     click.echo(f"Log       {output}")
     if answer_path is not None:
         click.echo(f"Answer    {answer_path} (not for students)")
+
+
+def _check_options(assignment: Path | None) -> None:
+    """Refuse options that do not go together."""
+    context = click.get_current_context()
+    for parameter in context.command.params:
+        name = parameter.name or ""
+        if context.get_parameter_source(name) != ParameterSource.COMMANDLINE:
+            continue
+        if assignment is not None and name not in OF_ASSIGNMENTS:
+            raise SettingsError(
+                f"{parameter.opts[0]} is for a single flight: --assignment draws it for every "
+                "student. Leave it out."
+            )
+        if assignment is None and name in ONLY_ASSIGNMENTS:
+            raise SettingsError(f"{parameter.opts[0]} is of use with --assignment ROSTER.csv only.")
+
+
+def _read_secret(secret: str | None, file: Path | None) -> bytes | None:
+    from px4fuse.simulation.assignment import secret_of
+
+    if secret is not None and file is not None:
+        raise SettingsError("--secret and --secret-file: give one of them.")
+    if secret is not None:
+        return secret_of(secret, "--secret")
+    if file is None:
+        return None
+    try:
+        with file.open("rb") as stream:
+            content = stream.read(MAX_SECRET_BYTES + 1)
+    except OSError as error:
+        raise SettingsError(f"--secret-file {file}: cannot be read ({error.strerror}).") from error
+    try:
+        text = content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise SettingsError(
+            f"--secret-file {file}: not UTF-8 text. Give a line of text."
+        ) from error
+    if len(content) > MAX_SECRET_BYTES:
+        raise SettingsError(f"--secret-file {file}: too long. Give a line of text.")
+    return secret_of(text, f"--secret-file {file}")
+
+
+def _assign(
+    roster: Path,
+    folder: Path,
+    answer_path: Path | None,
+    secret: bytes | None,
+    kind: Kind,
+    count: int | None,
+    truth: bool,
+) -> None:
+    """Write a flight for everyone, and the answer key."""
+    from px4fuse.simulation.assignment import assign, key_path, read_roster
+
+    students = read_roster(roster)
+    key_file = key_path(folder, answer_path)
+    if key_file.exists() and key_file.samefile(roster):
+        raise OutputError(f"{key_file}: is the roster. Give another name with --answer.")
+    with _counting(len(students)) as step:
+        made = assign(students, folder, key_file, secret, kind, count, truth, step)
+    for line in _class_summary(made.key):
+        click.echo(line)
+    click.echo(f"Flights   {folder} ({made.written} written, {made.kept} were there already)")
+    click.echo(f"Answers   {key_file} (not for students: it says what is wrong in every flight)")
+    if made.key.secret:
+        click.echo(
+            "Secret    made up, and kept in the answers: the same flights can be made again, and "
+            "later students added, while that file is there"
+        )
+
+
+def _class_summary(key: AnswerKey) -> list[str]:
+    """What the class was given, one line each."""
+    counts: dict[str, int] = {}
+    for answer in key.answers:
+        for mistake in answer.mistakes or ("none",):
+            name = mistake.partition("=")[0]
+            counts[name] = counts.get(name, 0) + 1
+    students = len(key.answers)
+    return [
+        f"Class     {students} student{'s' * (students != 1)}, {key.kind}",
+        f"Mistakes  {', '.join(f'{name} {number}' for name, number in sorted(counts.items()))}",
+    ]
+
+
+@contextmanager
+def _counting(total: int) -> Iterator[Callable[[], None]]:
+    """A progress bar on a terminal; nothing in a pipe."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+
+    console = Console(stderr=True)
+    if not console.is_terminal:
+        yield lambda: None
+        return
+    columns = (TextColumn("simulating"), BarColumn(), MofNCompleteColumn())
+    with Progress(*columns, console=console, transient=True) as bar:
+        task = bar.add_task("", total=total)
+        yield lambda: bar.advance(task)
 
 
 def _summary(simulation: Simulation) -> list[str]:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 from px4fuse.comparison import Comparison
 from px4fuse.findings import Finding
@@ -37,12 +39,16 @@ class Document:
     student : Student
     command : str
         The command line that makes it again, without folders.
+    made : mapping or None
+        Versions to print, as :func:`px4fuse.report.results.provenance` gives them; None for those
+        that run.
     """
 
     comparison: Comparison
     findings: tuple[Finding, ...]
     student: Student
     command: str
+    made: Mapping[str, Any] | None = None
 
     @property
     def log(self) -> tuple[str, str]:
@@ -66,12 +72,15 @@ class LoopDocument:
         Most severe first.
     student : Student
     command : str
+    made : mapping or None
+        As in :class:`Document`.
     """
 
     loop: Loop
     findings: tuple[Finding, ...]
     student: Student
     command: str
+    made: Mapping[str, Any] | None = None
 
     @property
     def log(self) -> tuple[str, str]:

@@ -126,7 +126,7 @@ def draw_loop(document: LoopDocument) -> Iterator[Figure]:
 
 
 def _made_with(document: Document | LoopDocument) -> Section:
-    made = provenance(document.command)
+    made = provenance(document.command) if document.made is None else document.made
     return (
         "Made with",
         [

@@ -22,7 +22,7 @@ from px4fuse.consistency import Consistency
 from px4fuse.findings import Finding
 from px4fuse.flight import Unavailable, sample_rate
 from px4fuse.plain import present, unavailable
-from px4fuse.report.document import Document
+from px4fuse.report.document import Document, Student
 from px4fuse.report.trajectory_results import (
     evaluation_part,
     graph_part,
@@ -108,7 +108,9 @@ def sync_results(
     return _of_command("px4fuse-sync", comparison, command, {"clock": found})
 
 
-def loop_results(loop: Loop, findings: tuple[Finding, ...], command: str) -> dict[str, Any]:
+def loop_results(
+    loop: Loop, findings: tuple[Finding, ...], student: Student, command: str
+) -> dict[str, Any]:
     """What ``px4fuse loop`` found, as plain data."""
     return {
         "schema": {"name": "px4fuse-loop", "version": "1.0"},
@@ -116,6 +118,7 @@ def loop_results(loop: Loop, findings: tuple[Finding, ...], command: str) -> dic
         "references": [trajectory_part(reference) for reference in loop.references],
         "loop": loop_part(loop),
         "findings": [_finding(finding) for finding in findings],
+        "student": asdict(student),
         "provenance": provenance(command),
     }
 

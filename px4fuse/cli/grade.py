@@ -1,0 +1,149 @@
+"""``px4fuse grade``: a folder of reports becomes a class table."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from px4fuse.cli.inputs import path_option, terminal, write_outputs
+from px4fuse.errors import OutputError, SettingsError
+
+if TYPE_CHECKING:
+    from px4fuse.grading.grade import Outcome
+
+
+@click.command()
+@click.argument("submissions", nargs=-1, type=click.Path(path_type=Path))
+@path_option(
+    "--logs",
+    multiple=True,
+    metavar="DIR",
+    help="Folder of the flight logs (or one log); may be repeated. Without a report's log its "
+    "numbers cannot be verified.",
+)
+@path_option(
+    "--rubric", metavar="FILE.toml", help="What is worth how many points.  [default: of this lab]"
+)
+@path_option("--key", metavar="FILE.json", help="Answer key of px4fuse simulate --assignment.")
+@path_option("-o", "--output", metavar="DIR", help="Folder for the class table and the feedback.")
+@click.option("--title", default="Class", show_default=True, help="Of the class page.")
+@click.option(
+    "--jobs",
+    type=click.IntRange(1, 256),
+    default=None,
+    metavar="N",
+    help="How many reports at once.  [default: one per core]",
+)
+@path_option(
+    "--write-rubric", metavar="FILE.toml", help="Write the default rubric, to edit it, and stop."
+)
+def grade(
+    submissions: tuple[Path, ...],
+    logs: tuple[Path, ...],
+    rubric: Path | None,
+    key: Path | None,
+    output: Path | None,
+    title: str,
+    jobs: int | None,
+    write_rubric: Path | None,
+) -> None:
+    """Verify and score reports: PDFs, folders of them, and zip files of learning platforms.
+
+    Writes class.csv, class.html, one feedback text per student and Gradescope's results.json into
+    DIR. A second run does again only what has changed. What students hand in is read within bounds
+    of time and memory, and nothing in it is executed.
+    """
+    from px4fuse.grading.grade import grade as grade_all
+    from px4fuse.grading.rubric import read_rubric, rubric_text
+
+    if write_rubric is not None:
+        if write_rubric.exists():
+            raise OutputError(f"{write_rubric}: exists already; it was not overwritten.")
+        write_outputs({write_rubric: rubric_text().encode()})
+        click.echo(f"Wrote    {write_rubric}")
+        return
+    if not submissions:
+        raise SettingsError("nothing to grade: give PDFs, folders or zip files.")
+    if output is None:
+        raise SettingsError("say with -o where the class table goes.")
+    for path in (*submissions, *logs):
+        if not path.exists():
+            raise SettingsError(f"{path}: there is no such file or folder.")
+        if path.is_dir() and output.resolve().is_relative_to(path.resolve()):
+            raise OutputError(
+                f"-o {output}: lies inside {path}, which is read; its own output would be graded. "
+                "Choose another folder."
+            )
+    answers = None
+    if key is not None:
+        from px4fuse.grading.answers import read_key
+
+        answers = read_key(key)
+    chosen = read_rubric(rubric)
+    with _progress() as advance:
+        outcome = grade_all(
+            submissions,
+            logs,
+            chosen,
+            output,
+            key=answers,
+            title=title,
+            processes=jobs,
+            progress=advance,
+        )
+    _print(outcome)
+
+
+@contextmanager
+def _progress() -> Iterator[Callable[[int, int], None]]:
+    """A bar on a terminal; nothing in a pipe."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
+
+    console = Console(stderr=True)
+    if not console.is_terminal:
+        yield lambda done, of: None
+        return
+    columns = ("grading", BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console) as bar:
+        task = bar.add_task("grading")
+        yield lambda done, of: bar.update(task, completed=done, total=of)
+
+
+def _print(outcome: Outcome) -> None:
+    from collections import Counter
+
+    from rich.table import Table
+    from rich.text import Text
+
+    console = terminal()
+    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="bold")
+    for name in ("submission", "student", "status", "points", "flags"):
+        wraps = name in ("submission", "student")
+        table.add_column(
+            name,
+            justify="right" if name == "points" else "left",
+            no_wrap=not wraps,
+            overflow="fold",
+        )
+    for one in outcome.graded:
+        style = "green" if one.verdict.status == "verified" else "yellow"
+        table.add_row(
+            Text(one.submission),
+            Text(one.student or one.student_id),
+            Text(one.verdict.status, style),
+            f"{one.points:g} / {one.of:g}" if one.items else "–",
+            f"{len(one.flags)}" if one.flags else "",
+        )
+    console.print(table)
+    counts = Counter(one.verdict.status for one in outcome.graded)
+    said = ", ".join(f"{count} {status}" for status, count in counts.most_common())
+    console.print(f"{len(outcome.graded)} submissions: {said}; {outcome.reused} as before")
+    for note in outcome.notes:
+        console.print(Text(note, "dim"))
+    for path in outcome.written:
+        console.print(f"Wrote    {path}", markup=False, style="bold", soft_wrap=True)

@@ -1,0 +1,115 @@
+"""``px4fuse verify``: whether a report is what its log gives."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from px4fuse.cli.inputs import STANDARD_OUTPUT, json_option, progress, terminal, write_json
+from px4fuse.errors import LogError, OutputError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from px4fuse.grading.model import Report, Verdict
+
+SCHEMA = {"name": "px4fuse-verification", "version": "1.0"}
+STYLES = {"verified": "bold green", "cannot verify": "bold yellow"}
+
+
+@click.command()
+@click.argument("report", type=click.Path(path_type=Path), metavar="REPORT.pdf")
+@click.argument("logs", type=click.Path(path_type=Path), nargs=-1, metavar="[LOG ...]")
+@json_option
+def verify(report: Path, logs: tuple[Path, ...], json_path: Path | None) -> None:
+    """Check that REPORT.pdf is what its log gives: every number, and every page.
+
+    LOG is the flight log and whatever was read besides it, or folders of such; they are found by
+    their SHA-256. The analysis is run again with the recorded settings. Without LOG only the pages
+    are compared with the attached results, and nothing is verified.
+
+    This proves that the numbers belong to the log, not who wrote them.
+
+    Exit code 0: verified; 1: numbers differ, page altered, other log, or cannot verify; 2: bad
+    input.
+    """
+    from px4fuse.grading.intake import MAX_BYTES, read_report
+    from px4fuse.grading.model import Refused
+    from px4fuse.grading.rerun import hashed
+    from px4fuse.grading.verification import verify as verify_report
+
+    read = read_report(_content(report, MAX_BYTES), report.name)
+    if isinstance(read, Refused):
+        raise LogError(read.reason)
+    _spare(json_path, report, *logs)
+    with progress(json_path == STANDARD_OUTPUT) as step:
+        step("hashing the logs")
+        try:
+            files = hashed(logs)
+        except OSError as error:
+            name = Path(error.filename or "the log").name
+            raise LogError(f"{name}: cannot be read ({error.strerror}).") from error
+        if logs and not files:
+            raise LogError("there is no file in what was given as LOG.")
+        step("running the analysis again" if files else "comparing pages and results")
+        verdict = verify_report(read, files)
+    if not write_json(_plain(read, verdict), json_path):
+        _print(terminal(), report.name, verdict)
+    sys.exit(0 if verdict.status == "verified" else 1)
+
+
+def _content(report: Path, limit: int) -> bytes:
+    """Bytes of the report, one more than its reader takes at the most."""
+    try:
+        with report.open("rb") as file:
+            return file.read(limit + 1)
+    except (OSError, ValueError) as error:  # ValueError: a path with a NUL in it
+        reason = getattr(error, "strerror", None) or error
+        raise LogError(f"{report.name}: cannot be read ({reason}).") from error
+
+
+def _spare(json_path: Path | None, *inputs: Path) -> None:
+    if json_path in (None, STANDARD_OUTPUT) or not json_path.exists():
+        return
+    for path in inputs:
+        if path.exists() and path.samefile(json_path):
+            raise OutputError(
+                f"{json_path}: is what this command reads; it was not overwritten. Give another "
+                "name for the output."
+            )
+
+
+def _plain(report: Report, verdict: Verdict) -> dict[str, object]:
+    from px4fuse.grading.verification import LIMIT
+
+    return {
+        "schema": SCHEMA,
+        "report_sha256": report.sha256,
+        "seal": report.seal,
+        **asdict(verdict),
+        "limit": LIMIT,
+    }
+
+
+def _print(console: Console, name: str, verdict: Verdict) -> None:
+    from rich.text import Text
+
+    from px4fuse.grading.intake import one_line
+    from px4fuse.grading.verification import LIMIT
+
+    style = STYLES.get(verdict.status, "bold red")
+    console.print(Text.assemble(f"{one_line(name, 200)}: ", (verdict.status, style)))
+    for reason in verdict.reasons:
+        if reason != LIMIT:
+            console.print(Text(f"  {one_line(reason, 400)}"), soft_wrap=True)
+    for one in verdict.differences:
+        console.print(
+            Text(f"  {one.path}: {one.recorded}, recomputed {one.recomputed}"), soft_wrap=True
+        )
+    if verdict.pages:
+        console.print(Text(f"  Pages: {', '.join(map(str, verdict.pages))}"))
+    console.print(Text(LIMIT), style="dim", soft_wrap=True)

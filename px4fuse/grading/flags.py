@@ -1,0 +1,425 @@
+"""What an instructor should look at: sentences, never points.
+
+A flag is no proof. Two students may fly one flight together, and advice that px4fuse prints leads
+everyone to the same number.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import unicodedata
+from collections import Counter, defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import combinations
+from pathlib import PurePosixPath
+from typing import Any
+
+from px4fuse.grading.answers import AnswerKey, folded
+from px4fuse.grading.model import Graded
+from px4fuse.kalman import Settings
+from px4fuse.tuning import HORIZONTAL
+
+# Words in a row by which two texts are compared. Five are hardly ever the same by chance, and a
+# changed word costs five shingles of hundreds.
+SHINGLE_WORDS = 5
+# Share of the shingles of two notes that are in both. Notes written apart on one lab share a few
+# per cent; at a quarter, two in five sentences are the same.
+COPIED = 0.25
+# Shorter notes are the same by chance
+MIN_SHINGLES = 40
+# What more than half of the class has is the instructor's template, from a class of this size on;
+# in a smaller one the copy itself would be taken for it
+TEMPLATE_SHARE = 0.5
+TEMPLATE_CLASS = 5
+# Of notes longer than this only the beginning is compared, so that a class takes seconds
+MAX_WORDS = 5000
+# Chosen noises have so many digits together before they are the same by chance only once in a
+# thousand pairs: 0.3 and 0.1 are what many would type
+MIN_DIGITS = 4
+# Digits to which px4fuse prints the settings that it advises
+PRINTED_DIGITS = 3
+# A hand-picked part of the flight below this share leaves most of it out
+HAND_PICKED = 0.5
+# Beyond this factor px4fuse itself names a wrong noise (findings/thresholds.py, NOISE_OFF is 1.5);
+# with a margin for what lies between interval and value
+SIGMA_FAR_OFF = 2.0
+# What a student chooses; the rest of the settings follows from the log
+CHOSEN = ("sigma_a_m_s2", "sigma_z_m", "dt_s", "input", "clock_offset_s")
+SHOWN = 4
+
+
+# ------------------------------------------------------------------ one report
+
+
+def own_flags(results: Mapping[str, Any]) -> tuple[str, ...]:
+    """What stands out in one report by itself.
+
+    Parameters
+    ----------
+    results : mapping
+        As attached to the report; nothing about them is taken for granted.
+    """
+    return tuple(
+        flag
+        for look in (_tuned_here, _hand_picked, _nothing_found, _left_out)
+        for flag in look(results)
+    )
+
+
+def _tuned_here(results: Mapping[str, Any]) -> Iterator[str]:
+    """The settings are the optimum of the very flight that they are graded on."""
+    tuned = _mapping(_mapping(results, "tuning"), HORIZONTAL)
+    settings = _mapping(results, "settings")
+    pairs = [
+        (_number(settings, name), _number(tuned, name)) for name in ("sigma_a_m_s2", "sigma_z_m")
+    ]
+    if not all(
+        chosen is not None and best is not None and _as_printed(chosen, best)
+        for chosen, best in pairs
+    ):
+        return
+    gain = _number(_mapping(tuned, "held_out"), "gain_nats")
+    held = (
+        "no half of the flight was held out"
+        if gain is None
+        else "settings found on its first half alone would be "
+        f"{abs(gain):.2g} nats per measurement {'better' if gain > 0 else 'worse'} on the second"
+    )
+    yield (
+        f"SIGMA_A {pairs[0][0]:g} and SIGMA_Z {pairs[1][0]:g} are the most likely ones of this "
+        "very flight: they were tuned on the segment that is graded, so that consistency and "
+        f"intervals are met by construction and say nothing about another flight ({held})."
+    )
+
+
+def _as_printed(chosen: float, best: float) -> bool:
+    """Whether a chosen number is the best one, rounded to two or more digits as when copied."""
+    digits = _digits(chosen)
+    if digits < 2 or best <= 0.0:
+        return False
+    return math.isclose(float(f"{best:.{min(digits, PRINTED_DIGITS)}g}"), chosen, rel_tol=1e-9) or (
+        math.isclose(best, chosen, rel_tol=1e-6)
+    )
+
+
+def _hand_picked(results: Mapping[str, Any]) -> Iterator[str]:
+    """Start or end were chosen by hand, and most of the flight is left out."""
+    settings, log = _mapping(results, "settings"), _mapping(results, "log")
+    start, end = _number(settings, "start_s"), _number(settings, "end_s")
+    whole = _number(log, "duration_s")
+    reason = settings.get("segment_reason")
+    if start is None or end is None or not whole or not isinstance(reason, str):
+        return
+    share = (end - start) / whole
+    if reason.startswith("chosen with") and share < HAND_PICKED:
+        yield (
+            f"The analysed part was chosen by hand and is {share:.0%} of the log ({start:.1f} to "
+            f"{end:.1f} s of {whole:.1f} s): ask why the rest was left out."
+        )
+
+
+def _nothing_found(results: Mapping[str, Any]) -> Iterator[str]:
+    """A noise is far off and no finding says so: px4fuse would have."""
+    findings = results.get("findings")
+    if not isinstance(findings, list):
+        return
+    ids = {str(one.get("id")) for one in findings if isinstance(one, dict)}
+    if "no_motion" in ids:
+        return
+    tuned = _mapping(_mapping(results, "tuning"), HORIZONTAL)
+    for name, label in (("sigma_z_m", "sigma_z"), ("sigma_a_m_s2", "sigma_a")):
+        chosen = _number(_mapping(results, "settings"), name)
+        best = _number(tuned, name)
+        if not chosen or not best or chosen < 0.0 or best < 0.0:
+            continue
+        factor = max(chosen / best, best / chosen)
+        inside = _inside(chosen, tuned.get(f"{name}_interval"))
+        named = {f"{label}_small", f"{label}_large", "process_noise_forgotten"} & ids
+        if factor > SIGMA_FAR_OFF and not inside and not named:
+            yield (
+                f"{label.upper()} is {factor:.2g} times off what the data ask for, and no finding "
+                "says so: findings may have been taken out."
+            )
+
+
+def _left_out(results: Mapping[str, Any]) -> Iterator[str]:
+    """The harder part of the lab was switched off."""
+    axes = results.get("axes")
+    if isinstance(axes, dict) and axes and not {"north", "east", "aisle"} & set(axes):
+        yield "Only the vertical axis was analysed (--axis)."
+    missing = results.get("findings")
+    without_imu = any(
+        isinstance(one, dict) and one.get("id") == "input_unavailable"
+        for one in (missing if isinstance(missing, list) else [])
+    )
+    if _mapping(results, "settings").get("input") == "zero" and not without_imu:
+        yield "The IMU was not used (--input zero)."
+
+
+# ------------------------------------------------------------------ a class
+
+
+def class_flags(
+    graded: Sequence[Graded], key: AnswerKey | None = None
+) -> Mapping[int, tuple[str, ...]]:
+    """What stands out between the reports of a class.
+
+    Parameters
+    ----------
+    graded : sequence of Graded
+    key : AnswerKey, optional
+        Tells whose log is whose.
+
+    Returns
+    -------
+    mapping
+        Index into ``graded`` to sentences; those without any are left out.
+    """
+    found: dict[int, list[str]] = defaultdict(list)
+    looks = (
+        _same_report(graded),
+        _same_id(graded),
+        _same_log(graded),
+        _other_assignment(graded, key),
+        _same_settings(graded),
+        _other_version(graded),
+        _copied_notes(graded),
+        _other_name(graded, key),
+    )
+    for look in looks:
+        for index, flag in look:
+            found[index].append(flag)
+    return {index: tuple(flags) for index, flags in sorted(found.items())}
+
+
+Flags = Iterator[tuple[int, str]]
+
+
+def _same_report(graded: Sequence[Graded]) -> Flags:
+    for members in _groups([one.sha256 for one in graded]):
+        for index in members:
+            yield index, f"The same file as {_others(graded, members, index)}."
+
+
+def _same_id(graded: Sequence[Graded]) -> Flags:
+    for members in _groups([folded(one.student_id) for one in graded]):
+        for index in members:
+            yield index, f"The same student id as in {_others(graded, members, index)}."
+
+
+def _same_log(graded: Sequence[Graded]) -> Flags:
+    """Identical logs of different students; one student may hand in two reports on one log."""
+    for members in _groups([one.log_sha256 for one in graded]):
+        if len({_who(graded[index]) for index in members}) > 1:
+            for index in members:
+                yield index, f"The same log as {_others(graded, members, index)}."
+
+
+def _other_assignment(graded: Sequence[Graded], key: AnswerKey | None) -> Flags:
+    if key is None:
+        return
+    for index, one in enumerate(graded):
+        own, given = key.of_student(one.student_id), key.of_log(one.log_sha256)
+        if not one.log_sha256:
+            continue
+        if given is None:
+            yield index, "The log is none of those that were handed out with the assignment."
+        elif own is None:
+            said = f"the id {_short(one.student_id)} is" if one.student_id else "no id is"
+            yield index, f"The log was given to {given.student_id}; {said} in the answer key."
+        elif own.sha256 != one.log_sha256:
+            yield index, f"The log was given to another student, {given.student_id}."
+
+
+def _same_settings(graded: Sequence[Graded]) -> Flags:
+    chosen = [_chosen(one.settings) for one in graded]
+    for members in _groups(chosen):
+        if len({_who(graded[index]) for index in members}) > 1:
+            for index in members:
+                others = _others(graded, members, index)
+                yield index, f"The same settings to the last digit as {others}: {chosen[index]}."
+
+
+def _chosen(settings: str) -> str:
+    """What was chosen, in words; empty for defaults and for what many would type."""
+    try:
+        given = json.loads(settings)
+    except (ValueError, RecursionError):
+        return ""
+    if not isinstance(given, dict):
+        return ""
+    default = Settings()
+    own = {
+        name: given[name]
+        for name in CHOSEN
+        if isinstance(given.get(name), str | int | float) and given[name] != getattr(default, name)
+    }
+    digits = sum(
+        _digits(float(value))
+        for value in own.values()
+        if isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e12
+    )
+    if digits < MIN_DIGITS:
+        return ""
+    return ", ".join(f"{name} {_short(str(value))}" for name, value in own.items())
+
+
+def _other_version(graded: Sequence[Graded]) -> Flags:
+    counted = Counter(one.version for one in graded if one.version)
+    if len(counted) < 2:
+        return
+    usual = counted.most_common(1)[0][0]
+    for index, one in enumerate(graded):
+        if one.version and one.version != usual:
+            others = f"most of the class with {_short(usual)}"
+            yield index, f"Made with px4fuse {_short(one.version)}, {others}."
+
+
+# ------------------------------------------------------------------ notes
+
+
+def _copied_notes(graded: Sequence[Graded]) -> Flags:
+    shingles = [_shingles(one.notes) for one in graded]
+    counted = Counter(part for parts in shingles for part in parts)
+    # one that hands in twice does not make a template
+    if len(graded) >= TEMPLATE_CLASS:
+        common = {p for p, count in counted.items() if count > TEMPLATE_SHARE * len(graded)}
+        shingles = [parts - common for parts in shingles]
+    long = [index for index, parts in enumerate(shingles) if len(parts) >= MIN_SHINGLES]
+    # most of what anyone writes nobody else does: what is compared pair by pair is short
+    shared = {i: {part for part in shingles[i] if counted[part] > 1} for i in long}
+    alike: dict[int, list[tuple[float, int]]] = defaultdict(list)
+    for first, second in combinations(long, 2):
+        # no smaller than this share, whatever the rest
+        most = min(len(shared[first]), len(shared[second]))
+        least = COPIED * max(len(shingles[first]), len(shingles[second]))
+        if most < least or _who(graded[first]) == _who(graded[second]):
+            continue
+        both = len(shared[first] & shared[second])
+        share = both / (len(shingles[first]) + len(shingles[second]) - both)
+        if share >= COPIED:
+            alike[first].append((share, second))
+            alike[second].append((share, first))
+    for index, others in sorted(alike.items()):
+        others.sort(reverse=True)
+        named = ", ".join(
+            f"{_name(graded[other])} ({share:.0%} of both)" for share, other in others[:SHOWN]
+        )
+        more = f" and {len(others) - SHOWN} more" if len(others) > SHOWN else ""
+        yield index, f"The notes share whole passages with those of {named}{more}."
+
+
+def _shingles(text: str) -> frozenset[int]:
+    """Hashes of all runs of words, spelling and punctuation aside."""
+    normal = unicodedata.normalize("NFKC", text).casefold()
+    words = re.findall(r"\w+", normal)[:MAX_WORDS]
+    return frozenset(
+        hash(tuple(words[at : at + SHINGLE_WORDS])) for at in range(len(words) - SHINGLE_WORDS + 1)
+    )
+
+
+# ------------------------------------------------------------------ names
+
+
+def _other_name(graded: Sequence[Graded], key: AnswerKey | None) -> Flags:
+    """The file's name is that of another student of the class."""
+    people = {folded(one.student_id): one.student for one in graded if one.student_id.strip()}
+    people |= {folded(a.student_id): a.name for a in (key.answers if key else ())}
+    names = {
+        parts: folded(student_id)
+        for student_id, name in people.items()
+        # one word is too short to be told from other words of a file name
+        if len(parts := frozenset(_words(name))) > 1
+    }
+    for index, one in enumerate(graded):
+        own_id, own_words = folded(one.student_id), frozenset(_words(one.student))
+        stem = PurePosixPath(one.submission.replace("\\", "/")).stem
+        words = frozenset(_words(one.submission.removesuffix(".pdf"))) | {folded(stem)}
+        says_own = own_id in words or (own_words and own_words <= words)
+        if says_own or not (own_id or own_words):
+            continue
+        ids = sorted({student_id for student_id in people if student_id in words} - {own_id})
+        others = sorted({of for parts, of in names.items() if parts <= words} - {own_id})
+        if ids or others:
+            other = _short((ids or others)[0])
+            yield index, f"The file's name is that of {other}, the report says {_name(one)}."
+        elif own_id.isdecimal() and _looks_like(stem, own_id):
+            said = f"the report gives the id {_short(one.student_id)}"
+            yield index, f"The file is named {_short(stem)}, {said}."
+
+
+def _looks_like(stem: str, student_id: str) -> bool:
+    return stem.isdecimal() and len(stem) == len(student_id) and stem != student_id
+
+
+def _words(text: str) -> list[str]:
+    """Words of a name or a file's name; ids with signs in them stay whole as well."""
+    plain = folded(text)
+    parts = (*re.findall(r"[^\W_]+", plain), *re.split(r"[\s_/(),]+", plain))
+    return [part for part in parts if part]
+
+
+# ------------------------------------------------------------------ helpers
+
+
+def _groups(values: Sequence[str]) -> list[list[int]]:
+    """Indices of those that have the same value, where it is not empty."""
+    where: dict[str, list[int]] = defaultdict(list)
+    for index, value in enumerate(values):
+        if value:
+            where[value].append(index)
+    return [members for members in where.values() if len(members) > 1]
+
+
+def _who(one: Graded) -> str:
+    return folded(one.student_id) or folded(one.student) or one.submission
+
+
+def _name(one: Graded) -> str:
+    """A student in a sentence."""
+    parts = [part for part in (one.student.strip(), one.student_id.strip()) if part]
+    return _short(", ".join(parts) or one.submission)
+
+
+def _others(graded: Sequence[Graded], members: Sequence[int], index: int) -> str:
+    others = [other for other in members if other != index]
+    named = "; ".join(
+        f"{_name(graded[other])} ({_short(graded[other].submission)})" for other in others[:SHOWN]
+    )
+    return f"{named} and {len(others) - SHOWN} more" if len(others) > SHOWN else named
+
+
+def _short(text: str) -> str:
+    kept = "".join(c if unicodedata.category(c)[0] != "C" else " " for c in text[:200])
+    line = " ".join(kept.split())
+    return line if len(line) <= 80 else line[:79] + "…"
+
+
+def _mapping(given: Mapping[str, Any], name: str) -> Mapping[str, Any]:
+    value = given.get(name)
+    return value if isinstance(value, dict) else {}
+
+
+def _number(given: Mapping[str, Any], name: str) -> float | None:
+    value = given.get(name)
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e12:
+        return None
+    return float(value)
+
+
+def _inside(number: float, interval: object) -> bool:
+    if not isinstance(interval, list) or len(interval) != 2:
+        return False
+    bounds = {"low": interval[0], "high": interval[1]}
+    low, high = _number(bounds, "low"), _number(bounds, "high")
+    return low is not None and high is not None and low <= number <= high
+
+
+def _digits(number: float) -> int:
+    """Significant digits of a number as typed."""
+    mantissa = repr(abs(number)).partition("e")[0]
+    whole, _, part = mantissa.partition(".")
+    digits = (whole + ("" if part == "0" else part)).lstrip("0")
+    return len(digits.rstrip("0") if part in ("", "0") else digits)

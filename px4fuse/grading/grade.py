@@ -1,0 +1,334 @@
+"""A folder of submissions becomes a class table: in parallel, within bounds, and resumable."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from px4fuse.flight import Unavailable
+from px4fuse.grading import submissions
+from px4fuse.grading.answers import AnswerKey
+from px4fuse.grading.class_page import html_text
+from px4fuse.grading.class_table import csv_text
+from px4fuse.grading.flags import class_flags, own_flags
+from px4fuse.grading.intake import read_report
+from px4fuse.grading.model import Difference, Graded, Item, Refused, Report, Submission, Verdict
+from px4fuse.grading.pictures import key_page, picture
+from px4fuse.grading.rubric import Rubric
+from px4fuse.grading.scoring import feedback, gradescope, score, score_refused
+from px4fuse.grading.verification import verify
+from px4fuse.grading.workers import Failed, run_bounded
+from px4fuse.report.writing import write_all
+
+RECORDS = "records"
+# Of one report: a flight of ten minutes takes about one; what takes longer is no report
+TIMEOUT_S = 300.0
+MEMORY_BYTES = 4_000_000_000
+# File names that Windows keeps for devices
+RESERVED = {"CON", "PRN", "AUX", "NUL", *(f"{p}{n}" for p in ("COM", "LPT") for n in range(10))}
+# For the class table: column title, and where in the results
+NUMBERS = (
+    ("SIGMA_A (m/s²)", "settings.sigma_a_m_s2"),
+    ("SIGMA_Z (m)", "settings.sigma_z_m"),
+    ("mean NIS north", "axes.north.kf.nis_mean"),
+    ("mean NIS east", "axes.east.kf.nis_mean"),
+    ("position RMSE to truth, aisle (m)", "axes.aisle.truth.kf_position_rmse_m"),
+    ("closure error (m)", "loop.closure_error_m"),
+)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What grading a class gave.
+
+    Attributes
+    ----------
+    graded : tuple of Graded
+        In the order of the submissions, without their pictures.
+    notes : tuple of str
+        What was passed over.
+    reused : int
+        How many were not done again, since nothing of theirs has changed.
+    written : tuple of Path
+    """
+
+    graded: tuple[Graded, ...]
+    notes: tuple[str, ...]
+    reused: int
+    written: tuple[Path, ...]
+
+
+def grade(
+    paths: Sequence[Path],
+    logs: Sequence[Path],
+    rubric: Rubric,
+    output: Path,
+    *,
+    key: AnswerKey | None = None,
+    title: str = "Class",
+    processes: int | None = None,
+    progress: Callable[[int, int], None] = lambda done, of: None,
+) -> Outcome:
+    """Grade everything that was handed in.
+
+    Parameters
+    ----------
+    paths : sequence of Path
+        PDFs, folders and zip files.
+    logs : sequence of Path
+        Flight logs and folders of them; a report names its log by SHA-256.
+    rubric : Rubric
+    output : Path
+        Folder for the class table (``class.csv``, ``class.html``), ``feedback/``, ``gradescope/``
+        and the records that make a second run quick.
+    key : AnswerKey, optional
+        Which mistakes each student's flight has.
+    title : str
+        Of the class page.
+    processes : int, optional
+        By default as many as there are cores.
+    progress : callable
+        Told how many submissions are done, and of how many.
+
+    Raises
+    ------
+    SettingsError
+        Nothing was handed in.
+    OutputError
+        The folder cannot be written.
+    """
+    found, notes = submissions.collect(paths)
+    known = logs_by_hash(logs)
+    records = output / RECORDS
+    context = _context(rubric, key)
+    graded: list[Graded | None] = [None] * len(found)
+    todo: list[int] = []
+    for index, submission in enumerate(found):
+        graded[index] = _recalled(records, submission, context, known)
+        if graded[index] is None:
+            todo.append(index)
+    reused = len(found) - len(todo)
+    progress(reused, len(found))
+    done = reused
+
+    def on_done(position: int, result: Graded | Failed) -> None:
+        nonlocal done
+        index = todo[position]
+        if isinstance(result, Failed):
+            why = Refused(f"Grading it failed: {result.reason}")
+            made = _refused(found[index], why, "", rubric, key)
+        else:
+            made = result
+        _remember(records, found[index], context, made)
+        graded[index] = replace(made, picture=b"")
+        done += 1
+        progress(done, len(found))
+
+    run_bounded(
+        partial(grade_one, logs=known, rubric=rubric, key=key),
+        [found[index] for index in todo],
+        processes=processes or os.cpu_count() or 1,
+        timeout_s=TIMEOUT_S,
+        memory_bytes=MEMORY_BYTES,
+        on_done=on_done,
+        keep=False,
+    )
+    complete = [one for one in graded if one is not None]
+    flags = class_flags(complete, key)
+    complete = [
+        replace(one, flags=(*one.flags, *flags.get(index, ())))
+        for index, one in enumerate(complete)
+    ]
+    written = _write(output, complete, found, title)
+    return Outcome(tuple(complete), notes, reused, written)
+
+
+def logs_by_hash(paths: Sequence[Path]) -> dict[str, Path]:
+    """Files by their SHA-256; folders are searched."""
+    files = [
+        file
+        for path in paths
+        for file in (sorted(path.rglob("*")) if path.is_dir() else [path])
+        if file.is_file()
+    ]
+    found = {}
+    for file in files:
+        with file.open("rb") as stream:
+            found[hashlib.file_digest(stream, "sha256").hexdigest()] = file
+    return found
+
+
+def grade_one(
+    submission: Submission, logs: Mapping[str, Path], rubric: Rubric, key: AnswerKey | None
+) -> Graded:
+    """Read, verify and score one submission; runs in a process of its own, within bounds."""
+    content = submissions.read(submission)
+    if isinstance(content, Refused):
+        return _refused(submission, content, "", rubric, key)
+    sha256 = hashlib.sha256(content).hexdigest()
+    report = read_report(content, submission.name)
+    if isinstance(report, Refused):
+        return _refused(submission, report, sha256, rubric, key)
+    verdict = verify(report, logs)
+    results = report.results
+    drawn = picture(report.pdf, key_page(report.pages))
+    student = results.get("student", {})
+    return Graded(
+        submission=submission.name,
+        student=str(student.get("name", "")),
+        student_id=str(student.get("id", "")),
+        verdict=verdict,
+        items=score(report, verdict, rubric, key),
+        flags=own_flags(results),
+        numbers=_numbers(results),
+        sha256=sha256,
+        log_sha256=_log_of(report),
+        version=str(results.get("provenance", {}).get("px4fuse", "")),
+        settings=json.dumps(results.get("settings", {}), sort_keys=True, ensure_ascii=False),
+        notes=str(student.get("notes", "")),
+        picture=b"" if isinstance(drawn, Unavailable) else drawn,
+    )
+
+
+def _log_of(report: Report) -> str:
+    log = report.results.get("log") or report.results.get("track") or {}
+    return str(log.get("sha256", ""))
+
+
+def _numbers(results: Mapping[str, Any]) -> dict[str, float]:
+    found = {}
+    for title, path in NUMBERS:
+        value: Any = results
+        for name in path.split("."):
+            value = value.get(name) if isinstance(value, dict) else None
+        if isinstance(value, int | float) and not isinstance(value, bool):
+            found[title] = float(value)
+    return found
+
+
+def _refused(
+    submission: Submission, why: Refused, sha256: str, rubric: Rubric, key: AnswerKey | None
+) -> Graded:
+    student, student_id = submissions.guess_student(submission.name)
+    verdict = Verdict("cannot verify", (why.reason,), with_log=False)
+    items = score_refused(rubric, key, why.reason)
+    return Graded(submission.name, student, student_id, verdict, items, sha256=sha256)
+
+
+# ------------------------------------------------------------------ records of earlier runs
+
+
+def _context(rubric: Rubric, key: AnswerKey | None) -> str:
+    """Hash of what all results depend on besides the submission and its log."""
+    made_with = [metadata.version(name) for name in ("px4fuse", "numpy", "scipy", "matplotlib")]
+    text = json.dumps([made_with, repr(rubric), repr(key)])
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _record(records: Path, submission: Submission) -> Path:
+    name = hashlib.sha256(f"{submission.file.name}\0{submission.entry}".encode()).hexdigest()
+    return records / f"{name}.json"
+
+
+def _recalled(
+    records: Path, submission: Submission, context: str, logs: Mapping[str, Path]
+) -> Graded | None:
+    """What an earlier run found, if nothing that it rests on has changed."""
+    path = _record(records, submission)
+    try:
+        record = json.loads(path.read_text(encoding="utf-8"))
+        made = graded_from(record["graded"])
+    except (OSError, ValueError, KeyError, TypeError):  # none, or not one of ours: done again
+        return None
+    content = submissions.read(submission)
+    sha256 = "" if isinstance(content, Refused) else hashlib.sha256(content).hexdigest()
+    same = record.get("context") == context and made.sha256 == sha256 != ""
+    if not same or made.submission != submission.name:
+        return None
+    return made if made.verdict.with_log == (made.log_sha256 in logs) else None
+
+
+def _remember(records: Path, submission: Submission, context: str, made: Graded) -> None:
+    path = _record(records, submission)
+    values = asdict(made)
+    del values["picture"]
+    text = json.dumps({"context": context, "graded": values}, ensure_ascii=False, indent=1)
+    write_all({path: text.encode(), path.with_suffix(".png"): made.picture})
+
+
+def graded_from(values: dict[str, Any]) -> Graded:
+    """A record's part back as what it was."""
+    verdict = values["verdict"]
+    return Graded(
+        **{
+            **values,
+            "verdict": Verdict(
+                **{
+                    **verdict,
+                    "reasons": tuple(verdict["reasons"]),
+                    "differences": tuple(Difference(**d) for d in verdict["differences"]),
+                    "pages": tuple(verdict["pages"]),
+                }
+            ),
+            "items": tuple(Item(**item) for item in values["items"]),
+            "flags": tuple(values["flags"]),
+        }
+    )
+
+
+# ------------------------------------------------------------------ outputs
+
+
+def _write(
+    output: Path, graded: Sequence[Graded], found: Sequence[Submission], title: str
+) -> tuple[Path, ...]:
+    made_with = f"px4fuse {metadata.version('px4fuse')}"
+    pictured = [
+        replace(one, picture=_picture(output / RECORDS, submission))
+        for one, submission in zip(graded, found, strict=True)
+    ]
+    table, page = output / "class.csv", output / "class.html"
+    write_all(
+        {
+            table: csv_text(graded).encode(),
+            page: html_text(pictured, title, made_with).encode(),
+        }
+    )
+    for one, name in zip(graded, file_names(graded), strict=True):
+        results = json.dumps(gradescope(one), ensure_ascii=False, indent=2)
+        write_all(
+            {
+                output / "feedback" / f"{name}.txt": feedback(one, title).encode(),
+                output / "gradescope" / name / "results.json": results.encode(),
+            }
+        )
+    return table, page, output / "feedback", output / "gradescope"
+
+
+def _picture(records: Path, submission: Submission) -> bytes:
+    path = _record(records, submission).with_suffix(".png")
+    return path.read_bytes() if path.is_file() else b""
+
+
+def file_names(graded: Sequence[Graded]) -> list[str]:
+    """A name for each submission's files, unique ignoring case: letters, digits, - and _ only."""
+    taken: set[str] = set()
+    names = []
+    for one in graded:
+        stem = one.student_id or Path(one.submission).stem
+        safe = "".join(c if c.isascii() and (c.isalnum() or c in "-_") else "_" for c in stem)[:60]
+        if not safe or safe.upper() in RESERVED:
+            safe = f"report_{safe}"
+        name, number = safe, 2
+        while name.lower() in taken:
+            name, number = f"{safe}-{number}", number + 1
+        taken.add(name.lower())
+        names.append(name)
+    return names

@@ -1,0 +1,329 @@
+"""The rubric: what a report is worth, as an instructor writes it down.
+
+A TOML file of items, each with a title, points, the name of a check and its parameters. Which
+parameters a check has, and between which limits, is data here; what it does is in
+:mod:`px4fuse.grading.scoring`.
+"""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from importlib.resources import files
+from pathlib import Path
+from typing import Any, Literal, NoReturn, cast
+
+from px4fuse.errors import SettingsError
+
+DEFAULT = "rubric.toml"
+MAX_RUBRIC_BYTES = 1_000_000
+MAX_ITEMS = 100
+MAX_POINTS = 1000.0
+MAX_TEXT = 200
+MAX_LIST = 50
+HELP = "px4fuse grade --write-rubric FILE.toml writes one that explains itself"
+
+Kind = Literal["number", "whole", "flag", "text", "texts"]
+Applies = Literal["any", "compare", "loop"]
+Unverified = Literal["zero", "score"]
+APPLIES: tuple[Applies, ...] = ("any", "compare", "loop")
+UNVERIFIED: tuple[Unverified, ...] = ("zero", "score")
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """What a check can be told.
+
+    Attributes
+    ----------
+    kind : {"number", "whole", "flag", "text", "texts"}
+    default : object
+        Where it is left out; None says that there is none, which leaves that part out.
+    low, high : float
+        Limits of a number, or of each.
+    choices : tuple of str
+        What a text may be; empty for anything.
+    required : bool
+    """
+
+    kind: Kind
+    default: Any = None
+    low: float = -1e12
+    high: float = 1e12
+    choices: tuple[str, ...] = ()
+    required: bool = False
+
+
+def _share(default: float) -> Parameter:
+    return Parameter("number", default, 0.0, 1.0)
+
+
+CHECKS: Mapping[str, Mapping[str, Parameter]] = {
+    "verified": {"without_log": _share(0.5)},
+    "student": {"name": Parameter("flag", True), "id": Parameter("flag", True)},
+    "sections": {"results": Parameter("texts", ()), "pages": Parameter("texts", ())},
+    "notes": {
+        "min_words": Parameter("whole", 150, 1, 100_000),
+        "min_different": Parameter("whole", 60, 1, 100_000),
+    },
+    "findings": {
+        "severities": Parameter(
+            "texts", ("error", "warning"), choices=("error", "warning", "info")
+        ),
+        "ignore": Parameter("texts", ("ekf2_unavailable",)),
+    },
+    "tuning": {
+        "axis": Parameter("text", "horizontal"),
+        "settings": Parameter(
+            "texts", ("sigma_z_m", "sigma_a_m_s2"), choices=("sigma_z_m", "sigma_a_m_s2")
+        ),
+        "factor": Parameter("number", 2.0, 1.0, 1000.0),
+    },
+    "number": {
+        "path": Parameter("texts", required=True),
+        "name": Parameter("text", ""),
+        "unit": Parameter("text", ""),
+        "at_least": Parameter("number"),
+        "at_most": Parameter("number"),
+        "zero_at": Parameter("number"),
+    },
+    "consistent": {
+        "filter": Parameter("text", "kf", choices=("kf", "ekf2")),
+        "axes": Parameter("texts", ("horizontal",)),
+        "factor": Parameter("number", 1.5, 1.0, 1000.0),
+    },
+    "clock": {"margin_s": Parameter("number", 0.03, 0.0, 10.0), "undeterminable": _share(0.5)},
+    "loop": {"without_reference": _share(0.5)},
+    "flight": {
+        "min_duration_s": Parameter("number", 60.0, 0.0, 1e5),
+        "min_measurements": Parameter("whole", 100, 0, 10_000_000),
+        "min_path_m": Parameter("number", 20.0, 0.0, 1e6),
+    },
+    "mistakes": {"in_report": _share(0.25), "most_named": Parameter("whole", 4, 1, 100)},
+}
+ITEM_KEYS = ("title", "points", "check", "report")
+RUBRIC_KEYS = ("title", "unverified", "item", "words")
+
+
+@dataclass(frozen=True)
+class RubricItem:
+    """One part of the grade.
+
+    Attributes
+    ----------
+    title : str
+    points : float
+        The most that it gives.
+    check : str
+        One of :data:`CHECKS`.
+    report : {"any", "compare", "loop"}
+        The reports that it is for; in others it is left out.
+    parameters : dict
+        Of the check, all of them.
+    """
+
+    title: str
+    points: float
+    check: str
+    report: Applies = "any"
+    parameters: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Rubric:
+    """What a report is worth.
+
+    Attributes
+    ----------
+    title : str
+    unverified : {"zero", "score"}
+        Whether a report whose numbers, pages or log are not what they should be gets nothing, or
+        its points as a proposal.
+    items : tuple of RubricItem
+    words : dict
+        Finding id to words by which notes may name it; "none" to those that say that nothing is
+        wrong.
+    """
+
+    title: str
+    unverified: Unverified
+    items: tuple[RubricItem, ...]
+    words: dict[str, tuple[str, ...]] = field(default_factory=dict)
+
+
+def rubric_text() -> str:
+    """The default rubric, comments and all, for an instructor to copy and edit."""
+    return files("px4fuse.grading").joinpath(DEFAULT).read_text(encoding="utf-8")
+
+
+def read_rubric(path: Path | None) -> Rubric:
+    """Read and check a rubric.
+
+    Parameters
+    ----------
+    path : Path or None
+        None is the default one.
+
+    Raises
+    ------
+    SettingsError
+        It cannot be read, or something in it is not what it should be: the text says which item.
+    """
+    if path is None:
+        return parse_rubric(rubric_text(), DEFAULT)
+    default = read_rubric(None)
+    try:
+        with path.open("rb") as file:
+            content = file.read(MAX_RUBRIC_BYTES + 1)
+    except OSError as error:
+        raise SettingsError(f"{path}: cannot be read ({error.strerror}).") from error
+    if len(content) > MAX_RUBRIC_BYTES:
+        raise SettingsError(
+            f"{path}: more than {MAX_RUBRIC_BYTES} bytes are too many for a rubric; {HELP}."
+        )
+    try:
+        rubric = parse_rubric(content.decode("utf-8-sig"), str(path))
+    except UnicodeDecodeError as error:
+        raise SettingsError(
+            f"{path}: not UTF-8 text (byte {error.start}). Save it as UTF-8."
+        ) from error
+    return replace(rubric, words={**default.words, **rubric.words})
+
+
+def parse_rubric(text: str, where: str) -> Rubric:
+    """Check the text of a rubric; ``where`` names it in errors."""
+    try:
+        given = tomllib.loads(text.replace("\r\n", "\n"))
+    # integers of a million digits are no TOMLDecodeError
+    except (ValueError, RecursionError) as error:
+        why = str(error).splitlines()[0] if isinstance(error, tomllib.TOMLDecodeError) else ""
+        raise SettingsError(
+            f"{where}: not TOML{f' ({why[:MAX_TEXT]})' if why else ''}; {HELP}."
+        ) from error
+    for name in given:
+        if name not in RUBRIC_KEYS:
+            _refuse(where, f"unknown key {name!r}; it may have {', '.join(RUBRIC_KEYS)}")
+    items = given.get("item")
+    if not isinstance(items, list) or not items:
+        _refuse(where, f"no items; give at least one [[item]], {HELP}")
+    if len(items) > MAX_ITEMS:
+        _refuse(where, f"{len(items)} items; give at most {MAX_ITEMS}")
+    read = tuple(_item(where, number, item) for number, item in enumerate(items, start=1))
+    titles: dict[tuple[str, str], int] = {}
+    for number, item in enumerate(read, start=1):
+        other = titles.setdefault((item.title, item.report), number)
+        if other != number:
+            _refuse(where, f"items {other} and {number} have the same title; give each its own")
+    unverified = _value(where, "unverified", given, Parameter("text", "zero", choices=UNVERIFIED))
+    return Rubric(
+        title=_value(where, "title", given, Parameter("text", "")),
+        unverified=cast(Unverified, unverified),
+        items=read,
+        words=_words(where, given.get("words", {})),
+    )
+
+
+def _item(where: str, number: int, given: object) -> RubricItem:
+    if not isinstance(given, dict):
+        _refuse(where, f"item {number} is no table; begin it with [[item]]")
+    title = _value(f"{where}: item {number}", "title", given, Parameter("text", required=True))
+    here = f"{where}: item {number} ({title!r})"
+    if not title.strip():
+        _refuse(f"{where}: item {number}", "the title is empty; give it one")
+    points = _value(
+        here, "points", given, Parameter("number", None, 0.0, MAX_POINTS, required=True)
+    )
+    check = _value(here, "check", given, Parameter("text", choices=tuple(CHECKS), required=True))
+    known = CHECKS[check]
+    for name in given:
+        if name not in ITEM_KEYS and name not in known:
+            _refuse(
+                here,
+                f"unknown key {name!r}; the check {check!r} may have {', '.join(known)}",
+            )
+    parameters = {name: _value(here, name, given, one) for name, one in known.items()}
+    if check == "number":
+        _check_bounds(here, parameters)
+    if check == "sections" and not parameters["results"] and not parameters["pages"]:
+        _refuse(here, "nothing is required; give results = [...] or pages = [...]")
+    applies = _value(here, "report", given, Parameter("text", "any", choices=APPLIES))
+    return RubricItem(title, points, check, cast(Applies, applies), parameters)
+
+
+def _check_bounds(here: str, given: Mapping[str, Any]) -> None:
+    low, high, zero = given["at_least"], given["at_most"], given["zero_at"]
+    if low is None and high is None:
+        _refuse(here, "no bound; give at_least, at_most or both")
+    if low is not None and high is not None and low > high:
+        _refuse(here, "at_least is above at_most; exchange them")
+    if zero is None:
+        return
+    if low is not None and high is not None:
+        _refuse(here, "zero_at goes with one bound; give at_least or at_most alone")
+    if (high is not None and zero <= high) or (low is not None and zero >= low):
+        _refuse(here, "zero_at is on the good side of the bound; put it beyond")
+
+
+def _words(where: str, given: object) -> dict[str, tuple[str, ...]]:
+    if not isinstance(given, dict) or len(given) > MAX_ITEMS:
+        _refuse(where, '[words] is no table of finding ids; give ID = ["word", ...]')
+    here = f"{where}: [words]"
+    return {name: _value(here, name, given, Parameter("texts")) for name in given}
+
+
+def _value(here: str, name: str, given: Mapping[str, Any], parameter: Parameter) -> Any:
+    """One value, checked; a whole number counts as a number and one text as a list of it."""
+    if name not in given:
+        if parameter.required:
+            _refuse(here, f"no {name!r}; give {_wanted(parameter)}")
+        return parameter.default
+    value, kind = given[name], parameter.kind
+    good = False
+    if kind in ("number", "whole"):
+        types = int if kind == "whole" else int | float
+        good = isinstance(value, types) and not isinstance(value, bool)
+        # false for NaN too, and exact for integers that no float can hold
+        good = good and parameter.low <= value <= parameter.high
+        value = float(value) if good and kind == "number" else value
+        good = good and math.isfinite(value)
+    elif kind == "flag":
+        good = isinstance(value, bool)
+    elif kind == "text":
+        good = _is_text(value, parameter)
+    else:
+        value = (value,) if isinstance(value, str) else value
+        good = isinstance(value, list | tuple) and len(value) <= MAX_LIST
+        good = good and all(_is_text(one, parameter) and one.strip() for one in value)
+        good = good and (bool(value) or not parameter.required)
+        value = tuple(value) if good else value
+    if not good:
+        simple = isinstance(value, str | float) or (isinstance(value, int) and abs(value) < 1e15)
+        shown = repr(value) if simple else "what it is"
+        shown = shown if len(shown) <= 40 else shown[:39] + "…"
+        _refuse(here, f"{name} cannot be {shown}; give {_wanted(parameter)}")
+    return value
+
+
+def _is_text(value: object, parameter: Parameter) -> bool:
+    if not isinstance(value, str) or len(value) > MAX_TEXT or not value.isprintable():
+        return False
+    return not parameter.choices or value in parameter.choices
+
+
+def _wanted(parameter: Parameter) -> str:
+    """What may be given, in words."""
+    limits = f" from {parameter.low:g} to {parameter.high:g}" if parameter.high < 1e12 else ""
+    choices = ", ".join(parameter.choices)
+    return {
+        "number": f"a number{limits}",
+        "whole": f"a whole number{limits}",
+        "flag": "true or false",
+        "text": f"one of {choices}" if choices else f"a text of at most {MAX_TEXT} characters",
+        "texts": f"a list of {choices}" if choices else 'a list of texts, ["...", "..."]',
+    }[parameter.kind]
+
+
+def _refuse(here: str, why: str) -> NoReturn:
+    raise SettingsError(f"{here}: {why}.")

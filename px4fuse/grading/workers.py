@@ -1,0 +1,247 @@
+"""Work on what strangers wrote, in processes that may hang, crash or eat memory.
+
+Neither pool of the standard library can do this. ``concurrent.futures`` cannot end one running
+job: a worker that is killed breaks the whole pool (BrokenProcessPool). ``multiprocessing.Pool``
+waits for ever for the result of a worker that died. So: one pipe per process, and a clock.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import pickle
+import signal
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from multiprocessing.connection import Connection, wait
+from typing import Any, TypeVar
+
+from px4fuse.errors import Px4FuseError
+
+Job = TypeVar("Job")
+Result = TypeVar("Result")
+
+# A worker is replaced after so many jobs: what libraries cache does not grow with the class
+JOBS_PER_WORKER = 40
+# Until a new process has imported what the function needs, on a slow and busy machine
+START_S = 180.0
+# Read by an interpreter and by libraries as they start, before any code of ours runs
+_ENVIRONMENT = {
+    # a spawned interpreter looks for modules in the current folder first; who grades there would
+    # run a functools.py that was handed in
+    "PYTHONSAFEPATH": "1",
+    # the processes are the parallel part
+    "OMP_NUM_THREADS": "1",
+    "OPENBLAS_NUM_THREADS": "1",
+    "MKL_NUM_THREADS": "1",
+    "NUMEXPR_NUM_THREADS": "1",
+    "VECLIB_MAXIMUM_THREADS": "1",
+}
+
+
+@dataclass(frozen=True)
+class Failed:
+    """What stands for the result of a job that gave none, and why: one line for a person."""
+
+    reason: str
+
+
+class _Worker:
+    """A process, our end of its pipe, and the job it has."""
+
+    def __init__(self, function: Callable[[Any], Any], memory_bytes: int | None) -> None:
+        # spawn: the same on Windows and macOS, and no copy of the parent's memory
+        context = multiprocessing.get_context("spawn")
+        self.pipe, theirs = context.Pipe()
+        self.process = context.Process(
+            target=_serve, args=(theirs, function, memory_bytes), daemon=True
+        )
+        with _environment():
+            self.process.start()
+        theirs.close()  # so that the pipe ends when the process does
+        self.ready = False
+        self.job: int | None = None
+        self.jobs_done = 0
+        self.deadline = time.monotonic() + START_S
+
+    def end(self) -> None:
+        self.process.kill()
+        self.process.join()
+        self.process.close()
+        self.pipe.close()
+
+
+def run_bounded(
+    function: Callable[[Job], Result],
+    jobs: Sequence[Job],
+    *,
+    processes: int,
+    timeout_s: float,
+    memory_bytes: int | None,
+    on_done: Callable[[int, Result | Failed], object],
+    keep: bool = True,
+) -> list[Result | Failed]:
+    """Call a function on every job, in processes of their own, each within bounds.
+
+    A job whose process hangs, dies or takes too much memory is lost alone: its process is ended
+    and replaced. Whatever ends this function (an error, Ctrl-C) ends all processes.
+
+    Parameters
+    ----------
+    function : callable
+        At the top level of a module; pickled, as are jobs and results.
+    jobs : sequence
+    processes : int
+        At once.
+    timeout_s : float
+        For one job, once its process is ready.
+    memory_bytes : int or None
+        Address space of one process (RLIMIT_AS), libraries included, which take about 0.6 GB of it;
+        None for no limit. Without effect on Windows, which has no such limit, and on macOS, which
+        does not enforce it.
+    on_done : callable
+        Called here with the index of a job and its result, in the order in which they finish.
+    keep : bool
+        False: results go to ``on_done`` only, and the memory taken here does not grow with them.
+
+    Returns
+    -------
+    list
+        Results in the order of the jobs, :class:`Failed` where there is none; empty without
+        ``keep``.
+    """
+    results: dict[int, Result | Failed] = {}
+    waiting = list(range(len(jobs)))[::-1]
+    workers: list[_Worker] = []
+
+    def done(worker: _Worker, result: Any) -> None:
+        index, worker.job = worker.job, None
+        worker.jobs_done += 1
+        if index is not None:
+            if keep:
+                results[index] = result
+            on_done(index, result)
+
+    def drop(worker: _Worker) -> None:
+        workers.remove(worker)
+        worker.end()
+
+    try:
+        while waiting or workers:
+            while waiting and len(workers) < max(1, processes):
+                workers.append(_Worker(function, memory_bytes))
+                # given now, sent when the process is ready: a start that fails costs one job
+                workers[-1].job = waiting.pop()
+            answered = _wait_for_any(workers)
+            for worker in list(workers):
+                if worker.pipe in answered:
+                    sound, result = _received(worker)
+                    if sound and not worker.ready:
+                        worker.ready = True
+                    else:
+                        done(worker, result)
+                        if not sound or worker.jobs_done >= JOBS_PER_WORKER or not waiting:
+                            drop(worker)
+                            continue
+                        worker.job = waiting.pop()
+                    worker.deadline = time.monotonic() + timeout_s
+                    _send(worker, jobs)
+                elif time.monotonic() >= worker.deadline:
+                    limit = timeout_s if worker.ready else START_S
+                    done(worker, Failed(f"it took longer than {limit:g} s and was ended."))
+                    drop(worker)
+    finally:
+        for worker in workers:
+            worker.end()
+    return [results[index] for index in range(len(jobs))] if keep else []
+
+
+def _wait_for_any(workers: list[_Worker]) -> list[Any]:
+    """Pipes that have something to read, at the latest when somebody's time is up."""
+    soonest = min(worker.deadline for worker in workers)
+    return wait([worker.pipe for worker in workers], max(0.0, soonest - time.monotonic()))
+
+
+def _send(worker: _Worker, jobs: Sequence[Any]) -> None:
+    assert worker.job is not None
+    # a process that died in between shows at the next look at its pipe
+    with suppress(BrokenPipeError, ConnectionResetError):
+        worker.pipe.send(jobs[worker.job])
+
+
+def _received(worker: _Worker) -> tuple[bool, Any]:
+    """Whether the process can go on, and what it said."""
+    try:
+        answer: tuple[bool, Any] = worker.pipe.recv()
+    except (EOFError, OSError):
+        worker.process.join(5)
+        how = f"exit code {worker.process.exitcode}"
+        when = "" if worker.ready else " before it began"
+        return False, Failed(f"the process that read it ended{when} ({how}).")
+    # unpickling runs what the classes of a result define: anything can go wrong
+    except Exception as error:  # noqa: BLE001
+        return False, Failed(f"its result could not be read ({type(error).__name__}).")
+    return answer
+
+
+@contextmanager
+def _environment() -> Iterator[None]:
+    before = {name: os.environ.get(name) for name in _ENVIRONMENT}
+    os.environ.update(_ENVIRONMENT)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
+def _serve(pipe: Connection, function: Callable[[Any], Any], memory_bytes: int | None) -> None:
+    """Life of a worker: ready, then job by job until the pipe ends."""
+    # Ctrl-C is for the parent, which ends us
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    _limit_memory(memory_bytes)
+    pipe.send((True, None))
+    while True:
+        try:
+            job = pipe.recv()
+        except (EOFError, OSError):
+            return
+        answer: tuple[bool, Any]
+        try:
+            answer = (True, function(job))
+            message = pickle.dumps(answer, pickle.HIGHEST_PROTOCOL)
+        except MemoryError:
+            # what is left of the heap is no place for the next job
+            answer = (False, Failed("it needed more memory than one file may take."))
+            message = pickle.dumps(answer)
+        except Px4FuseError as error:
+            message = pickle.dumps((True, _failed(str(error))))
+        except Exception as error:  # noqa: BLE001 - a job's failure is its result
+            message = pickle.dumps((True, _failed(f"{type(error).__name__}: {error}")))
+        del job
+        pipe.send_bytes(message)
+
+
+def _failed(text: str) -> Failed:
+    # two seconds to import, in every process, for what mostly does not happen
+    from px4fuse.grading.intake import one_line  # noqa: PLC0415
+
+    return Failed(one_line(text, 300))
+
+
+def _limit_memory(memory_bytes: int | None) -> None:
+    try:
+        import resource  # noqa: PLC0415 - not on Windows
+    except ImportError:
+        return
+    # a crash leaves no memory image of a student's file behind
+    with suppress(ValueError, OSError):
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    if memory_bytes is not None:
+        with suppress(ValueError, OSError):  # macOS refuses some values
+            resource.setrlimit(resource.RLIMIT_AS, (memory_bytes, memory_bytes))

@@ -1,0 +1,415 @@
+"""Assignments: a flight for everyone, the roster they come from, and the answer key."""
+
+import hashlib
+import json
+import os
+import stat
+
+import pytest
+from click.testing import CliRunner
+
+import px4fuse
+from px4fuse.cli import cli, main
+from px4fuse.comparison import compare
+from px4fuse.detector_rates import rates
+from px4fuse.errors import OutputError, SettingsError
+from px4fuse.explanation import explain
+from px4fuse.findings import find, find_loop
+from px4fuse.grading.answers import AnswerKey, key_text, read_key
+from px4fuse.simulation import assignment
+from px4fuse.simulation.assignment import (
+    CHOICES,
+    COUNTS,
+    Student,
+    assign,
+    draw,
+    file_stem,
+    fly,
+    key_path,
+    read_roster,
+)
+from px4fuse.simulation.mistakes import parse
+from px4fuse.trajectory.analysis import analyse
+from px4fuse.trajectory.sources import Source
+from px4fuse.trajectory.tracks import trajectory_of
+
+SECRET = b"a secret for tests"
+# What the secret gives student s1: seed, noise and heading, and the mistakes
+PINNED = ((4014383831, 0.095, -146.2), ("dropout=4.5s,48s", "nlos=3.9%"))
+CLASS = tuple(Student(f"s{n:02d}", f"Name {n}", f"s{n:02d}.ulg") for n in range(3))
+
+
+def student(name):
+    return Student(name, "", f"{name}.ulg")
+
+
+def roster(tmp_path, content):
+    path = tmp_path / "roster.csv"
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    return path
+
+
+def files(folder):
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+# ------------------------------------------------------------------ drawing
+
+
+class TestDraw:
+    def test_same_secret_and_id_same_bytes(self):
+        assert fly(SECRET, student("s1"), "aisle") == fly(SECRET, student("s1"), "aisle")
+        # as a platform may spell it in another export
+        assert draw(SECRET, "S1 ", "aisle") == draw(SECRET, "s1", "aisle")
+
+    def test_pinned_so_that_next_term_gives_the_same(self):
+        scenario, _, typed = draw(SECRET, "s1", "aisle", 2)
+        assert (scenario.seed, scenario.sigma_uwb_m, scenario.heading_deg) == PINNED[0]
+        assert typed == PINNED[1]
+
+    @pytest.mark.parametrize("kind", ["aisle", "loop"])
+    def test_students_secrets_and_kinds_differ(self, kind):
+        drawn = [draw(SECRET, f"s{n}", kind)[0] for n in range(200)]
+        drawn += [draw(b"another secret", f"s{n}", kind)[0] for n in range(200)]
+        assert len({one.seed for one in drawn}) == 400
+        assert len({(one.sigma_a_m_s2, one.heading_deg, one.speed_m_s) for one in drawn}) > 390
+
+    @pytest.mark.parametrize("kind", ["aisle", "loop"])
+    def test_shares_of_counts_and_mistakes(self, kind):
+        flights = [draw(SECRET, f"s{n}", kind) for n in range(1000)]
+        for count, share in enumerate(COUNTS[kind]):
+            found = sum(len(chosen) == count for _, chosen, _ in flights) / 1000
+            assert found == pytest.approx(share, abs=0.05)
+        names = {choice.mistake for _, chosen, _ in flights for choice in chosen}
+        assert names == {choice.mistake for choice in CHOICES[kind]}
+
+    def test_two_go_together_and_lie_within_their_sizes(self):
+        for n in range(300):
+            _, chosen, typed = draw(SECRET, f"s{n}", "aisle", 2)
+            assert len(chosen) == len(typed) == 2
+            assert chosen[0].goes_with(chosen[1])
+            parse(typed)
+            for choice, text in zip(chosen, typed, strict=True):
+                size = float(text.partition("=")[2].split(",")[0].removesuffix(choice.unit))
+                assert choice.low <= abs(size) <= choice.high
+                assert size > 0 or choice.either_sign
+
+    def test_sizes_are_those_that_are_found(self):
+        """findings/rates.csv: in nine flights of ten or more, at what is no plainer."""
+        table = rates()
+        for choice in (choice for kind in CHOICES.values() for choice in kind):
+            rows = table[table.condition.str.contains(f"--mistake {choice.mistake}=", regex=False)]
+            rows = rows[(rows.finding == choice.finding) & (rows.rate >= 0.9)]
+            sizes = [float(text.rpartition("=")[2].rstrip("%ms")) for text in rows.condition]
+            assert sizes
+            if choice.mistake == "imu-rate":  # slower is plainer, and 50 Hz is what is asked for
+                assert choice.high <= 1.3 * max(sizes)
+            else:
+                assert choice.low >= min(sizes)
+
+    def test_a_loop_does_not_tell_where_it_landed(self):
+        assert not draw(SECRET, "s1", "loop")[0].truth
+        assert draw(SECRET, "s1", "aisle")[0].truth
+        assert not draw(SECRET, "s1", "aisle", truth=False)[0].truth
+
+
+@pytest.mark.parametrize(
+    ("kind", "number", "count"), [("aisle", 0, 2), ("aisle", 1, 2), ("aisle", 2, 1), ("loop", 0, 1)]
+)
+def test_what_the_key_expects_is_found_in_the_log(tmp_path, kind, number, count):
+    log, answer = fly(SECRET, CLASS[number], kind, count)
+    path = tmp_path / answer.file
+    path.write_bytes(log)
+    flight = px4fuse.read_log(path)
+    assert flight.log.sha256 == answer.sha256
+    if kind == "loop":
+        found = find_loop(analyse(Source(trajectory_of(flight, "vio"), flight)))
+    else:
+        found = find(explain(compare(flight, axes=("north", "east"))))
+    assert len(answer.findings) == count
+    assert set(answer.findings) <= {finding.id for finding in found}
+
+
+# ------------------------------------------------------------------ roster
+
+
+ROSTERS = {
+    "plain": "id,name\n1001,Ann Lee\n1002,Bob Ray\n",
+    "gradescope": "First Name,Last Name,SID,Email\nAnn,Lee,1001,a@x\nBob,Ray,1002,b@x\n",
+    "moodle": '\ufeff"First name","Surname","ID number"\n"Ann","Lee","1001"\n"Bob","Ray","1002"\n',
+    "id number empty": "Name,ID number,User name\nAnn Lee,,1001\nBob Ray,,1002\n",
+    "semicolons": 'Student ID;Name\r\n1001;"Ann Lee"\r\n1002;Bob Ray\r\n',
+    "comma in a quoted title": '"Student ID","Name, whole"\n1001,x\n1002,y\n',
+    "tabs": "Student-ID\tFull name\n1001\tAnn Lee\n1002\tBob Ray\n",
+    "old mac": "id,name\r1001,Ann Lee\r1002,Bob Ray\r",
+    "empty rows": "\n\nid,name\n\n1001,Ann Lee\n,\n 1002 , Bob Ray \n\n",
+    "short rows": "name,x,id\nAnn Lee,,1001\nBob Ray,,1002,more,cells\n",
+}
+
+
+BAD_ROSTERS = {
+    "no id column": ("a,b\n1,2\n", "no column of ids"),
+    "empty": ("", "no column of ids"),
+    "no header": ("1001,Ann\n", "no column of ids"),
+    "header alone": ("id,name\n", "no students"),
+    "empty id": ("id,name\n1,A\n,B\n", "row 3 has no id in the column 'id'"),
+    "same id": ("id\n1\n2\n1\n", "rows 2 and 4 have the same id '1'"),
+    "same but for case": ("id\nab\nAB\n", "rows 2 and 3"),
+    "same file": ("id\na/b\na:b\n", "rows 2 and 3"),
+    "nothing left": ("id\n///\n", "neither letters nor digits"),
+    "binary": (b"\x00\x01\x02id", "not text"),
+    "spreadsheet": (b"PK\x03\x04....", "Save it as CSV"),
+    "too many": ("id\n" + "\n".join(map(str, range(1001))), "1001 students are too many"),
+    "too long": (b"id\n" + b"1" * 5_000_001, "too many for a roster"),
+    "huge cell": ('id,name\n1,"' + "x" * 200_000 + '"\n', "not a CSV file"),
+}
+
+
+class TestRoster:
+    @pytest.mark.parametrize("content", ROSTERS.values(), ids=ROSTERS.keys())
+    def test_spellings(self, tmp_path, content):
+        students = read_roster(roster(tmp_path, content))
+        assert [one.id for one in students] == ["1001", "1002"]
+        assert [one.file for one in students] == ["1001.ulg", "1002.ulg"]
+        if "whole" not in content:
+            assert [one.name for one in students] == ["Ann Lee", "Bob Ray"]
+
+    @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "cp1252"])
+    def test_encodings(self, tmp_path, encoding):
+        (one,) = read_roster(roster(tmp_path, "id,name\nä1,Jürgen\n".encode(encoding)))
+        assert (one.id, one.name) == ("ä1", "Jürgen")
+
+    def test_formulas_and_markup_stay_data(self, tmp_path):
+        text = 'id,name\n=1+1|cmd,"<b onclick=\'x\'>&"\n@x,"=HYPERLINK(""http://x"")"\n'
+        first, second = read_roster(roster(tmp_path, text))
+        assert first == Student("=1+1|cmd", "<b onclick='x'>&", "_1+1_cmd.ulg")
+        assert second.name == '=HYPERLINK("http://x")'
+
+    @pytest.mark.parametrize(("content", "said"), BAD_ROSTERS.values(), ids=BAD_ROSTERS.keys())
+    def test_bad_ones(self, tmp_path, content, said):
+        with pytest.raises(SettingsError) as error:
+            read_roster(roster(tmp_path, content))
+        assert said in str(error.value)
+        assert "\n" not in str(error.value)
+
+    @pytest.mark.parametrize(
+        ("student_id", "stem"),
+        [
+            ("a@b.de", "a@b.de"),
+            ("../../etc/passwd", "_.._etc_passwd"),
+            ("C:\\x", "C__x"),
+            ("NUL", "_NUL"),
+            ("com1.txt", "_com1.txt"),
+            ("-rf", "rf"),
+            ("a.", "a"),
+            ("ก12", "ก12"),
+            ("x" * 300, "x" * 48),
+            ("\u202e1", "_1"),
+            ("...", None),
+        ],
+    )
+    def test_file_names(self, student_id, stem):
+        assert file_stem(student_id) == stem
+
+
+# ------------------------------------------------------------------ files
+
+
+class TestAssign:
+    def test_logs_and_key(self, tmp_path):
+        folder, key_file = tmp_path / "a" / "flights", tmp_path / "key.json"
+        made = assign(CLASS, folder, key_file, SECRET, "aisle", 1)
+        assert (made.written, made.kept) == (3, 0)
+        key = read_key(key_file)
+        assert key == made.key
+        assert not key.secret
+        assert SECRET.decode() not in key_file.read_text(encoding="utf-8")
+        logs = files(folder)
+        assert set(logs) == {"s00.ulg", "s01.ulg", "s02.ulg"}
+        for answer in key.answers:
+            assert hashlib.sha256(logs[answer.file]).hexdigest() == answer.sha256
+            assert len(answer.mistakes) == len(answer.findings) == 1
+            assert answer.truth["sigma_z_m"] == answer.scenario["sigma_uwb_m"]
+        assert len(set(logs.values())) == 3
+        if os.name == "posix":
+            assert stat.S_IMODE(key_file.stat().st_mode) == 0o600
+
+    def test_second_run_changes_nothing_and_may_add_students(self, tmp_path):
+        folder, key_file = tmp_path / "flights", tmp_path / "key.json"
+        first = assign(CLASS[:2], folder, key_file, None, "aisle")
+        assert first.key.secret
+        before = files(folder) | {"key": key_file.read_bytes()}
+        again = assign(CLASS[:2], folder, key_file, None, "aisle")
+        assert (again.written, again.kept) == (0, 2)
+        assert files(folder) | {"key": key_file.read_bytes()} == before
+        more = assign(CLASS, folder, key_file, None, "aisle")
+        assert (more.written, more.kept) == (1, 2)
+        assert files(folder).items() >= {k: v for k, v in before.items() if k != "key"}.items()
+        # the secret that was made up serves as one that is given
+        assign(CLASS, folder, key_file, more.key.secret.encode(), "aisle")
+        assert read_key(key_file).secret == more.key.secret
+
+    def test_other_flights_and_keys_are_not_replaced(self, tmp_path):
+        folder, key_file = tmp_path / "flights", tmp_path / "key.json"
+        assign(CLASS[:2], folder, key_file, SECRET, "aisle")
+        before = files(folder) | {"key": key_file.read_bytes()}
+        for students, secret in ((CLASS, b"another secret"), (CLASS[1:], SECRET)):
+            with pytest.raises(OutputError, match="was not overwritten"):
+                assign(students, folder, key_file, secret, "aisle")
+        with pytest.raises(OutputError, match="other flights"):
+            assign(CLASS[:2], tmp_path / "new", key_file, b"another secret", "aisle")
+        assert not (tmp_path / "new").exists()
+        key_file.write_text("{}", encoding="utf-8")
+        with pytest.raises(SettingsError, match="not an answer key"):
+            assign(CLASS[:2], folder, key_file, SECRET, "aisle")
+        assert files(folder) == {k: v for k, v in before.items() if k != "key"}
+
+    def test_failed_runs_leave_nothing(self, tmp_path, monkeypatch):
+        folder, key_file = tmp_path / "flights", tmp_path / "key.json"
+
+        def stop_at_last(*given):
+            if given[1] == CLASS[-1]:
+                raise KeyboardInterrupt
+            return fly(*given)
+
+        monkeypatch.setattr(assignment, "fly", stop_at_last)
+        with pytest.raises(KeyboardInterrupt):
+            assign(CLASS, folder, key_file, SECRET, "aisle")
+        monkeypatch.undo()
+        assert list(tmp_path.iterdir()) == []
+        key_file.mkdir()
+        with pytest.raises(SettingsError):
+            assign(CLASS[:1], folder, key_file, SECRET, "aisle")
+        blocked = tmp_path / "file"
+        blocked.write_bytes(b"")
+        for where, key in ((folder, blocked / "key.json"), (blocked, tmp_path / "k.json")):
+            with pytest.raises(OutputError, match="cannot be written"):
+                assign(CLASS[:1], where, key, SECRET, "aisle")
+        assert {path.name for path in tmp_path.iterdir()} == {"key.json", "file"}
+
+    def test_number_of_mistakes(self, tmp_path):
+        for kind, count in (("aisle", 3), ("aisle", -1), ("loop", 2)):
+            with pytest.raises(SettingsError, match="--mistakes"):
+                assign(CLASS, tmp_path / "f", tmp_path / "k.json", SECRET, kind, count)
+
+    def test_place_of_the_key(self, tmp_path, monkeypatch):
+        monkeypatch.chdir(tmp_path)
+        flights = tmp_path / "flights"
+        assert key_path(flights, None) == tmp_path / "flights_answers.json"
+        flights.mkdir()
+        monkeypatch.chdir(flights)
+        for here in (".", "../flights", "../flights/."):
+            path = key_path(type(flights)(here), None)
+            assert path.resolve() == tmp_path / "flights_answers.json"
+        for inside in (flights / "key.json", flights / "a" / "key.json", flights):
+            with pytest.raises(OutputError, match="students' folder"):
+                key_path(flights, inside)
+
+
+class TestKey:
+    def key(self):
+        return AnswerKey("aisle", tuple(fly(SECRET, one, "aisle", 2)[1] for one in CLASS[:2]), "s")
+
+    def test_round_trip(self, tmp_path):
+        path = tmp_path / "key.json"
+        path.write_text(key_text(self.key()), encoding="utf-8")
+        assert read_key(path) == self.key()
+        assert "Do not hand it out" in path.read_text(encoding="utf-8")
+
+    def test_edited_and_hostile_keys(self, tmp_path):
+        good = json.loads(key_text(self.key()))
+
+        def spoilt(**values):
+            return json.dumps({**good, **values})
+
+        def with_student(**values):
+            return spoilt(students=[{**good["students"][0], **values}])
+
+        texts = [
+            "", "[]", "3", "null", "{", '"x"', "[" * 1_000_000, "9" * 10_000, '{"a": NaN}',
+            spoilt(schema=None), spoilt(schema={"name": "px4fuse-results"}),
+            spoilt(schema={**good["schema"], "version": 99}), spoilt(kind=3), spoilt(secret=[]),
+            spoilt(students={}), spoilt(students=[]), spoilt(students=[1]),
+            spoilt(students=[good["students"][0]] * 2), spoilt(students=good["students"] * 600),
+            with_student(id=None), with_student(id=" "), with_student(sha256="x" * 64),
+            with_student(file=7), with_student(name="x" * 2000), with_student(mistakes="nlos"),
+            with_student(findings=[3]), with_student(findings=["x"] * 100),
+            with_student(truth={"sigma_z_m": "0.1"}), with_student(truth={"sigma_z_m": True}),
+            with_student(truth=[]), with_student(scenario={"a": []}), with_student(scenario=1),
+        ]  # fmt: skip
+        path = tmp_path / "key.json"
+        for text in texts:
+            path.write_text(text, encoding="utf-8")
+            with pytest.raises(SettingsError) as error:
+                read_key(path)
+            assert "\n" not in str(error.value)
+        for content in (b"\xff\xff", b" " * 20_000_001):
+            path.write_bytes(content)
+            with pytest.raises(SettingsError):
+                read_key(path)
+        with pytest.raises(SettingsError, match="cannot be read"):
+            read_key(tmp_path)
+
+
+# ------------------------------------------------------------------ command
+
+
+BAD_COMMANDS = {
+    "short secret": ("--assignment roster.csv -o f --secret abc", "can be guessed"),
+    "two secrets": (
+        "--assignment roster.csv -o f --secret abcdefgh1 --secret-file x",
+        "one of",
+    ),
+    "no secret file": ("--assignment roster.csv -o f --secret-file none", "cannot be read"),
+    "seed": ("--assignment roster.csv -o f --seed 3", "--seed is for a single flight"),
+    "mistake": ("--assignment roster.csv -o f --mistake nlos", "--mistake is for a single"),
+    "too many": ("--assignment roster.csv -o f --mistakes 9", "0 to 2"),
+    "mistakes alone": ("-o f.ulg --mistakes 1", "with --assignment"),
+    "secret alone": ("-o f.ulg --secret abcdefghij", "with --assignment"),
+    "no roster": ("--assignment none.csv -o f", "cannot be read"),
+    "key inside": ("--assignment roster.csv -o f --answer f/k.json", "students' folder"),
+    "key is the roster": ("--assignment roster.csv -o f --answer roster.csv", "is the roster"),
+}
+
+
+class TestCommand:
+    @pytest.fixture
+    def at(self, tmp_path, monkeypatch):
+        monkeypatch.chdir(tmp_path)
+        roster(tmp_path, "id,name\ns01,=cmd|x\ns02,<b>\n")
+        return tmp_path
+
+    def run(self, *words):
+        return CliRunner().invoke(cli, ["simulate", *words])
+
+    def test_journey(self, at):
+        result = self.run("--assignment", "roster.csv", "-o", "flights")
+        assert result.exit_code == 0, result.output
+        assert {path.name for path in (at / "flights").iterdir()} == {"s01.ulg", "s02.ulg"}
+        key = read_key(at / "flights_answers.json")
+        assert [one.name for one in key.answers] == ["=cmd|x", "<b>"]
+        assert key.secret
+        assert key.secret not in result.output
+        assert "kept in the answers" in result.output
+
+    def test_secret_by_file_or_option_is_the_same(self, at):
+        (at / "secret.txt").write_text("\ufeffour secret 2026\r\n", encoding="utf-8")
+        for folder, secret in (("a", ("--secret-file", "secret.txt")),
+                               ("b", ("--secret", "our secret 2026"))):  # fmt: skip
+            given = ("--assignment", "roster.csv", "-o", folder, "--kind", "loop", *secret)
+            assert self.run(*given, "--answer", f"{folder}.json").exit_code == 0
+        assert files(at / "a") == files(at / "b")
+        assert (at / "a.json").read_bytes() == (at / "b.json").read_bytes()
+        assert "our secret" not in (at / "a.json").read_text(encoding="utf-8")
+
+    @pytest.mark.parametrize(("words", "said"), BAD_COMMANDS.values(), ids=BAD_COMMANDS.keys())
+    def test_bad_ones_write_nothing(self, at, words, said, capsys, monkeypatch):
+        before = files(at)
+        monkeypatch.setattr("sys.argv", ["px4fuse", "simulate", *words.split()])
+        with pytest.raises(SystemExit) as end:
+            main()
+        assert end.value.code == 2
+        message = capsys.readouterr().err
+        assert said in message
+        assert message.count("\n") == 1
+        assert files(at) == before

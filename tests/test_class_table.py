@@ -1,0 +1,131 @@
+"""The class as CSV, opened by programs that execute what looks like a formula."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+import unicodedata
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from px4fuse.grading.class_table import MAX_CHARACTERS, csv_text, neutral
+from px4fuse.grading.model import Graded, Item, Verdict
+
+DANGEROUS = (
+    "=cmd|' /C calc'!A0", "+1+1", "-2+3", "@SUM(A1)", "\t=1", "\r=1", "\n=1", "  =1", "\u00a0=1",
+    "\u200b=1", "\ufeff=1", "\uff1d1", "\uff0b1", "\uff0d1", "\uff201", "\ufe661", '"=1', '""=1"',
+    "'=1", "a;=1+1", 'a;"=1+1', "a; \t=1;b", "a\t=1", "a\r\n=1", "\x00=1", "\ud800=1", "\u2028=1",
+    "-", "=", "\t", "\r",
+)  # fmt: skip
+texts = (
+    st.text(max_size=40) | st.sampled_from(DANGEROUS) | st.text("=+-@;,\t\r\n\"' a1", max_size=8)
+)
+finite = st.floats(allow_nan=False, allow_infinity=False, width=32)
+
+
+def graded(text: str, numbers: dict[str, float] | None = None, points: float = 1.0) -> Graded:
+    return Graded(
+        submission=text, student=text, student_id=text,
+        verdict=Verdict("cannot verify", (text, text), with_log=False),
+        items=(Item(text, points, 2.0, text),), flags=(text, text), numbers=numbers or {},
+        log_sha256="ab" * 32,
+    )  # fmt: skip
+
+
+def cells(text: str, delimiter: str = ",") -> list[list[str]]:
+    return list(
+        csv.reader(io.StringIO(text.removeprefix("\ufeff"), newline=""), delimiter=delimiter)
+    )
+
+
+def is_number(cell: str) -> bool:
+    try:
+        return math.isfinite(float(cell)) and cell.isascii()
+    except ValueError:
+        return False
+
+
+def may_be_formula(cell: str) -> bool:
+    visible = [c for c in cell if c != '"' and unicodedata.category(c)[0] not in "ZC"]
+    return bool(visible) and unicodedata.normalize("NFKC", visible[0])[0] in "=+-@"
+
+
+@given(texts)
+def test_no_cell_is_live_whatever_the_program_splits_at(text: str) -> None:
+    made = csv_text([graded(text, {text: -3.25})])
+    made.encode()
+    for delimiter in (",", ";", "\t"):
+        for row in cells(made, delimiter):
+            for cell in row:
+                assert is_number(cell) or not may_be_formula(cell), (delimiter, cell)
+                assert not cell.startswith(("\t", "\r", "\n"))
+
+
+@given(st.lists(st.tuples(texts, st.dictionaries(texts, finite, max_size=3)), max_size=4))
+def test_read_back_it_is_what_was_made_safe(rows: list[tuple[str, dict[str, float]]]) -> None:
+    head, *rest = cells(csv_text([graded(text, numbers) for text, numbers in rows]))
+    assert head[:6] == ["file", "student", "id", "status", "points", "of"]
+    assert head[-3:] == ["flags", "reasons", "log SHA-256"]
+    assert len(rest) == len(rows)
+    for (text, numbers), row in zip(rows, rest, strict=True):
+        assert len(row) == len(head)
+        assert row[:6] == [neutral(text)] * 3 + ["cannot verify", "1", "2"]
+        assert row[-3:] == [neutral(f"{text} | {text}")] * 2 + ["ab" * 32]
+        found = sorted(float(cell) for cell in row[6:-3] if cell)
+        assert found == pytest.approx(sorted([*numbers.values(), 1.0]), rel=1e-9, abs=1e-300)
+
+
+@given(texts)
+def test_what_is_safe_stays_so(text: str) -> None:
+    once = neutral(text)
+    assert neutral(once).replace("'", "") == once.replace("'", "")
+    assert not may_be_formula(once)
+
+
+@pytest.mark.parametrize("text", DANGEROUS)
+def test_every_known_trick_is_stopped(text: str) -> None:
+    assert neutral(text) != text
+    assert not may_be_formula(neutral(text))
+
+
+@pytest.mark.parametrize(
+    "text", ["Ada Lovelace", "Zoë", "李雷", "3 - 2", "a@b.nl", "x=1", "O'Neill", "0012", "", "a; b"]
+)
+def test_what_is_harmless_is_left_alone(text: str) -> None:
+    assert neutral(text) == text
+
+
+def test_excel_knows_the_encoding_and_the_line_ends() -> None:
+    made = csv_text([graded("Zoë 李雷")])
+    assert made.encode().startswith(b"\xef\xbb\xbffile,student,")
+    assert made.count("\r\n") == made.count("\n") == 2
+    assert made.encode().decode("utf-8-sig").splitlines()[1].startswith("Zoë 李雷,")
+
+
+def test_numbers_stay_numbers_and_what_is_none_is_empty() -> None:
+    made = csv_text(
+        [
+            graded("a", {"NIS": -0.125, "gap": float("nan")}, points=0.1 + 0.2),
+            graded("b", {"gap": 1e-7}),
+        ]
+    )
+    head, first, second = cells(made)
+    assert head[6:-3] == ["a", "b", "NIS", "gap"]
+    assert first[4:-3] == ["0.3", "2", "0.3", "", "-0.125", ""]
+    assert second[4:-3] == ["1", "2", "", "1", "", "1e-07"]
+
+
+def test_items_of_one_title_keep_a_column_each() -> None:
+    items = (Item("notes", 1.0, 2.0, ""), Item("notes", 2.0, 2.0, ""), Item("=x", 0.0, 1.0, ""))
+    one = Graded("a.pdf", "A", "1", Verdict("verified", (), True), items)
+    head, row = cells(csv_text([one]))
+    assert head[6:-3] == ["notes", "notes (2)", "'=x"]
+    assert row[4:-3] == ["3", "5", "1", "2", "0"]
+
+
+def test_a_cell_holds_no_more_than_excel_takes() -> None:
+    assert len(neutral("=" * 10**6)) <= MAX_CHARACTERS + 1
+    assert len(cells(csv_text([]))) == 1

@@ -1,0 +1,185 @@
+"""A class graded: outputs, resuming, and hostile files among the others."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import shutil
+import zipfile
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+from conftest import REPOSITORY
+from pypdf import PdfReader, PdfWriter
+
+from px4fuse.cli import cli
+from px4fuse.grading.grade import file_names, grade, graded_from, logs_by_hash
+from px4fuse.grading.model import Graded, Verdict
+from px4fuse.grading.rubric import parse_rubric, read_rubric, rubric_text
+
+REPORT = REPOSITORY / "reports" / "aisle_uwb.pdf"
+LOG = REPOSITORY / "sample_logs" / "aisle_uwb.ulg"
+UNKNOWN = Verdict("cannot verify", (), with_log=False)
+
+
+def rows(output: Path) -> list[dict[str, str]]:
+    text = (output / "class.csv").read_text(encoding="utf-8-sig")
+    return list(csv.DictReader(io.StringIO(text)))
+
+
+@pytest.fixture
+def handed_in(tmp_path: Path) -> Path:
+    """A folder as a learning platform exports it: one report, and what goes wrong."""
+    folder = tmp_path / "handed in"
+    for name in ("Lovelace Ada_1_assignsubmission_file_", "Hopper Grace_2_assignsubmission_file_"):
+        (folder / name).mkdir(parents=True)
+        shutil.copy(REPORT, folder / name / "report.pdf")
+    (folder / "essay.pdf").write_bytes(b"%PDF-1.7\nnot one")
+    (folder / "=cmd|'calc'!A0.pdf").write_bytes(b"MZ this is no PDF")
+    locked = PdfWriter(clone_from=io.BytesIO(REPORT.read_bytes()))
+    locked.encrypt("secret")
+    with (folder / "locked.pdf").open("wb") as file:
+        locked.write(file)
+    with zipfile.ZipFile(folder / "more.zip", "w") as archive:
+        archive.write(REPORT, "../../escaped/<img src=x onerror=alert(1)>.pdf")
+    return folder
+
+
+def test_everything_that_was_handed_in_stands_in_the_table(handed_in, tmp_path) -> None:
+    output = tmp_path / "class"
+    before = {path for path in tmp_path.rglob("*") if not path.is_relative_to(output)}
+    outcome = grade([handed_in], [], read_rubric(None), output, processes=2)
+    assert {path for path in tmp_path.rglob("*") if not path.is_relative_to(output)} == before
+    assert len(outcome.graded) == 6
+    table = rows(output)
+    assert len(table) == 6
+    assert {row["status"] for row in table} == {"cannot verify"}  # no log was given
+    scored = [row for row in table if float(row["points"]) > 0]
+    assert len(scored) == 3
+    assert all("the same" in row["flags"].lower() for row in scored)
+    refused = {row["file"]: row["reasons"] for row in table if float(row["points"]) == 0}
+    assert len(refused) == 3
+    assert any("encrypted" in reason for reason in refused.values())
+    assert not any(row["file"].startswith(("=", "+", "-", "@")) for row in table)
+    page = (output / "class.html").read_text(encoding="utf-8")
+    assert "<img src=x" not in page
+    assert len(list((output / "feedback").glob("*.txt"))) == 6
+    for results in (output / "gradescope").rglob("results.json"):
+        found = json.loads(results.read_text(encoding="utf-8"))
+        assert found["score"] >= 0.0
+
+
+def test_a_report_with_its_log_is_verified_and_a_changed_one_is_not(tmp_path) -> None:
+    folder = tmp_path / "in"
+    folder.mkdir()
+    shutil.copy(REPORT, folder / "a.pdf")
+    changed = PdfWriter(clone_from=io.BytesIO(REPORT.read_bytes()))
+    (name,) = PdfReader(io.BytesIO(REPORT.read_bytes())).attachments
+    results = json.loads(PdfReader(io.BytesIO(REPORT.read_bytes())).attachments[name][0])
+    results["axes"]["north"]["kf"]["nis_mean"] = 1.0
+    changed._root_object.pop("/Names", None)
+    changed.add_attachment(name, json.dumps(results).encode())
+    with (folder / "b.pdf").open("wb") as file:
+        changed.write(file)
+    output = tmp_path / "class"
+    outcome = grade([folder], [LOG.parent], read_rubric(None), output, processes=2)
+    first, second = outcome.graded
+    assert first.verdict.status == "verified"
+    assert first.verdict.with_log
+    assert first.numbers["SIGMA_Z (m)"] == 0.1
+    assert second.verdict.status == "numbers differ"
+    assert second.points == 0.0
+    assert any("nis_mean" in difference.path for difference in second.verdict.differences)
+    # a second run does nothing again, and says the same
+    again = grade([folder], [LOG.parent], read_rubric(None), output, processes=2)
+    assert again.reused == 2
+    assert again.graded == outcome.graded
+
+
+def test_only_what_changed_is_done_again(handed_in, tmp_path) -> None:
+    output = tmp_path / "class"
+    rubric = read_rubric(None)
+    grade([handed_in], [], rubric, output, processes=2)
+    same = grade([handed_in], [], rubric, output, processes=2)
+    assert same.reused == 5  # all but what was no PDF at all, and so was not read
+    html = (output / "class.html").read_bytes()
+    (handed_in / "essay.pdf").write_bytes(REPORT.read_bytes())
+    assert grade([handed_in], [], rubric, output, processes=2).reused == 4
+    assert (output / "class.html").read_bytes() != html
+    other = parse_rubric(rubric_text().replace("points = 15", "points = 14"), "other.toml")
+    assert other != rubric
+    assert grade([handed_in], [], other, output, processes=2).reused == 0
+
+
+def test_a_damaged_record_is_made_again(handed_in, tmp_path) -> None:
+    output = tmp_path / "class"
+    rubric = read_rubric(None)
+    first = grade([handed_in], [], rubric, output, processes=2)
+    for record in (output / "records").glob("*.json"):
+        record.write_text('{"graded": {"verdict": 3}}')
+    again = grade([handed_in], [], rubric, output, processes=2)
+    assert again.reused == 0
+    assert again.graded == first.graded
+
+
+def test_a_record_holds_all_of_a_grade() -> None:
+    from dataclasses import asdict
+
+    from px4fuse.grading.model import Difference, Item
+
+    whole = Graded(
+        "a.pdf", "Ada", "1",
+        Verdict("numbers differ", ("why",), True, (Difference("a.b", "1", "2"),), (2, 3)),
+        (Item("t", 1.0, 2.0, "c"),), ("flag",), {"n": 0.5}, "a", "b", "0.1", "{}", "notes",
+    )  # fmt: skip
+    values = json.loads(json.dumps({k: v for k, v in asdict(whole).items() if k != "picture"}))
+    assert graded_from(values) == whole
+
+
+def test_names_of_files_are_safe_and_unique() -> None:
+    names = ["12345", "12345", "../../etc/passwd", "CON", "", "a" * 300, "日本"]
+    graded = [Graded(f"{name}.pdf", "", name, UNKNOWN) for name in names]
+    found = file_names(graded)
+    assert found[:4] == ["12345", "12345-2", "______etc_passwd", "report_CON"]
+    assert len({name.lower() for name in found}) == len(found)
+    assert all(name.replace("-", "").replace("_", "").isalnum() or set(name) <= {"_"}
+               for name in found)  # fmt: skip
+    assert max(map(len, found)) < 80
+
+
+def test_logs_are_found_by_their_hash_not_their_name(tmp_path) -> None:
+    shutil.copy(LOG, tmp_path / "anything.bin")
+    (path,) = logs_by_hash([tmp_path]).values()
+    assert path == tmp_path / "anything.bin"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["grade"], "nothing to grade"),
+        (["grade", "in"], "say with -o"),
+        (["grade", "missing", "-o", "out"], "there is no such file or folder"),
+        (["grade", "in", "-o", "in/out"], "lies inside"),
+        (["grade", "in", "-o", "out", "--rubric", "missing.toml"], "missing.toml"),
+        (["grade", "in", "-o", "out", "--key", "missing.json"], "missing.json"),
+        (["grade", "in", "-o", "out", "--logs", "missing"], "there is no such file or folder"),
+    ],
+)
+def test_bad_input_is_one_line(tmp_path, monkeypatch, arguments, says) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("in").mkdir()
+    shutil.copy(REPORT, "in/a.pdf")
+    result = CliRunner().invoke(cli, arguments)
+    assert result.exit_code != 0
+    assert says in str(result.exception)
+    assert not Path("out").exists()
+
+
+def test_the_default_rubric_is_written_to_be_edited(tmp_path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert CliRunner().invoke(cli, ["grade", "--write-rubric", "lab.toml"]).exit_code == 0
+    assert read_rubric(Path("lab.toml")) == read_rubric(None)
+    again = CliRunner().invoke(cli, ["grade", "--write-rubric", "lab.toml"])
+    assert "not overwritten" in str(again.exception)

@@ -1,0 +1,651 @@
+"""Hostile input: whatever is handed in is a Report or one sentence, in bounded memory."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import random
+import subprocess
+import sys
+import tracemalloc
+import zlib
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pypdf import PdfReader, PdfWriter
+from pypdf.generic import (
+    ArrayObject,
+    DecodedStreamObject,
+    DictionaryObject,
+    EncodedStreamObject,
+    NameObject,
+    NumberObject,
+    TextStringObject,
+)
+
+from px4fuse.grading import intake
+from px4fuse.grading.intake import cleaned, one_line, read_report
+from px4fuse.grading.model import Refused, Report
+
+ROOT = Path(__file__).parent.parent
+REAL = (ROOT / "reports" / "aisle_uwb.pdf").read_bytes()
+JSON = (ROOT / "reports" / "aisle_uwb.json").read_bytes()
+FUZZ = int(os.environ.get("PX4FUSE_FUZZ", "300"))
+DAMAGED = "damaged: it cannot be read as a PDF"
+
+
+def written(writer: PdfWriter) -> bytes:
+    out = io.BytesIO()
+    writer.write(out)
+    return out.getvalue()
+
+
+def small(attached: bytes | None = JSON, edit=lambda writer: None, name="results.json") -> bytes:
+    """A PDF of one page with results attached, changed by ``edit``."""
+    writer = PdfWriter()
+    writer.add_blank_page(100, 100)
+    if attached is not None:
+        writer.add_attachment(name, attached)
+    edit(writer)
+    return written(writer)
+
+
+def raw(*objects: bytes, trailer: bytes = b"/Root 1 0 R") -> bytes:
+    """A PDF of objects as they stand, numbered from 1."""
+    out, places = bytearray(b"%PDF-1.4\n"), []
+    for number, content in enumerate(objects, start=1):
+        places.append(len(out))
+        out += b"%d 0 obj\n%b\nendobj\n" % (number, content)
+    start = len(out)
+    out += b"xref\n0 %d\n0000000000 65535 f \n" % (len(objects) + 1)
+    out += b"".join(b"%010d 00000 n \n" % place for place in places)
+    out += b"trailer\n<< /Size %d %b >>\n" % (len(objects) + 1, trailer)
+    return bytes(out + b"startxref\n%d\n%%%%EOF\n" % start)
+
+
+def stream(data: bytes, entries: bytes = b"") -> bytes:
+    return b"<< /Length %d %b >>\nstream\n%b\nendstream" % (len(data), entries, data)
+
+
+CATALOG = b"<< /Type /Catalog /Pages 2 0 R >>"
+PAGES = b"<< /Type /Pages /Kids [3 0 R] /Count 1 >>"
+PAGE = b"<< /Type /Page /Parent 2 0 R /MediaBox [0 0 9 9] /Contents 4 0 R /Resources << >> >>"
+FLATE = b"/Filter /FlateDecode"
+
+
+def with_attachment(
+    embedded: bytes, file: bytes = b"/F (results.json) /EF << /F 5 0 R >>"
+) -> bytes:
+    catalog = (
+        b"<< /Type /Catalog /Pages 2 0 R /Names << /EmbeddedFiles << /Names [(x) 6 0 R] >> >> >>"
+    )
+    filespec = b"<< /Type /Filespec %b >>" % file
+    return raw(catalog, PAGES, PAGE, stream(b""), embedded, filespec)
+
+
+def reason(pdf: bytes) -> str:
+    report = read_report(pdf, "r.pdf")
+    assert isinstance(report, Refused)
+    assert report.reason.startswith("r.pdf: ")
+    assert report.reason.isprintable()
+    assert len(report.reason) < 400
+    return report.reason
+
+
+def dictionary(**entries: object) -> DictionaryObject:
+    return DictionaryObject({NameObject(f"/{name}"): value for name, value in entries.items()})
+
+
+# ------------------------------------------------------------------ reports
+
+
+def test_the_real_report():
+    report = read_report(REAL, "aisle_uwb.pdf")
+    assert isinstance(report, Report)
+    assert report.seal == "intact"
+    assert report.results == json.loads(JSON)
+    assert len(report.pages) == 9
+    assert "Two-state Kalman filter against EKF2" in report.pages[0]
+    assert report.size_bytes == len(REAL)
+    assert report.pdf is REAL
+
+
+def test_a_report_that_was_saved_again():
+    writer = PdfWriter(clone_from=io.BytesIO(REAL))
+    saved = read_report(written(writer), "r.pdf")
+    assert isinstance(saved, Report)
+    assert saved.seal == "missing"
+    assert saved.pages == read_report(REAL, "r.pdf").pages
+    changed = read_report(REAL.replace(b"/Title", b"/Titlf"), "r.pdf")
+    assert isinstance(changed, Report)
+    assert changed.seal == "broken"
+
+
+def test_one_packed_attachment_is_read():
+    packed = stream(zlib.compress(JSON), b"/Type /EmbeddedFile " + FLATE)
+    report = read_report(with_attachment(packed), "r.pdf")
+    assert isinstance(report, Report)
+    assert report.seal == "missing"
+
+
+def test_results_of_a_loop():
+    loop = {
+        "schema": {"name": "px4fuse-loop", "version": "1.0"},
+        "track": {"name": "x"},
+        "references": [],
+        **{key: json.loads(JSON)[key] for key in ("loop", "findings", "provenance")},
+    }
+    assert isinstance(read_report(small(json.dumps(loop).encode()), "r.pdf"), Report)
+    loop["findings"] = [1]
+    assert "does not follow the schema at findings.0" in reason(small(json.dumps(loop).encode()))
+
+
+def test_results_of_another_version_are_kept():
+    other = json.loads(JSON) | {"schema": {"name": "px4fuse-results", "version": "9.0"}, "new": 1}
+    report = read_report(small(json.dumps(other).encode()), "r.pdf")
+    assert isinstance(report, Report)
+    assert report.results["schema"]["version"] == "9.0"
+
+
+# ------------------------------------------------------------------ no report
+
+
+@pytest.mark.parametrize(
+    ("pdf", "said"),
+    [
+        (b"", "an empty file."),
+        (b"hello", "not a PDF."),
+        (b"\x89PNG" + bytes(100), "not a PDF."),
+        (b"%PDF-1.4 and no more", "cut off"),
+        (REAL[: len(REAL) // 2], "cut off"),
+        (REAL[:300_000] + b"\n%%EOF\n", DAMAGED),
+        (b"%PDF-1.4\nstartxref\n5\n%%EOF", DAMAGED),
+        (b"%PDF-1.4\n" + bytes(intake.MAX_BYTES), "larger than 25 MB"),
+        (small(None), "no results.json is attached: not a px4fuse report, or printed to PDF again"),
+        (small(name="../../results.json"), "called '../../results.json', not 'results.json'"),
+        (small(name="C:\\results.json"), "the attached file is called"),
+        (small(name="\u202ex\x1b[2J" * 50), "the attached file is called"),
+        (
+            small(edit=lambda writer: writer.add_attachment("results.json", b"{}")),
+            "more than one file is attached",
+        ),
+        (
+            small(edit=lambda writer: writer.add_attachment("x.exe", b"MZ")),
+            "more than one file is attached",
+        ),
+        (raw(CATALOG, b"<< /Type /Pages /Kids [] /Count 0 >>"), "a PDF without pages"),
+    ],
+    ids=range(15),
+)
+def test_what_is_no_report(pdf, said):
+    assert said in reason(pdf)
+
+
+def test_two_streams_under_one_name():
+    embedded = stream(JSON, b"/Type /EmbeddedFile")
+    two = with_attachment(embedded, b"/F (results.json) /EF << /F 5 0 R /UF 4 0 R >>")
+    assert "more than one file is attached" in reason(two)
+    names = with_attachment(embedded, b"/F (results.json) /UF (x.exe) /EF << /F 5 0 R >>")
+    assert "results.json / x.exe" in reason(names)
+
+
+@pytest.mark.parametrize("algorithm", ["RC4-128", "RC4-40"])
+def test_encrypted(algorithm):
+    for password in ("", "secret"):
+        encrypted = small(edit=lambda writer, p=password: writer.encrypt(p, algorithm=algorithm))
+        assert "encrypted" in reason(encrypted)
+    for key in (b"/Encrypt", b"/#45ncrypt"):  # the second is damaged: nobody would write it so
+        trailer = b"/Root 1 0 R %b << /Filter /X >>" % key
+        said = reason(raw(CATALOG, PAGES, PAGE, stream(b""), trailer=trailer))
+        assert "encrypted" in said or DAMAGED in said
+
+
+@pytest.mark.parametrize("count", [101, 3000])
+def test_too_many_pages(count):
+    writer = PdfWriter()
+    for _ in range(count):
+        writer.add_blank_page(9, 9)
+    assert reason(written(writer)) == "r.pdf: more than 100 pages."
+
+
+def test_one_page_shown_a_million_times():
+    kids = b"<< /Type /Pages /Kids [%b] /Count 1 >>"
+    assert "more than 100 pages" in reason(raw(CATALOG, kids % (b"3 0 R " * 90_000), PAGE))
+    # more than pypdf takes in one array
+    assert reason(raw(CATALOG, kids % (b"3 0 R " * 1_000_000), PAGE))
+
+
+# ------------------------------------------------------------------ what acts
+
+
+def on_root(key: str, value: object):
+    return lambda writer: writer.root_object.update({NameObject(key): value})
+
+
+def annotation(**entries: object):
+    made = ArrayObject([dictionary(Type=NameObject("/Annot"), **entries)])
+    return lambda writer: writer.pages[0].update({NameObject("/Annots"): made})
+
+
+def action(kind: str, **entries: object) -> DictionaryObject:
+    return dictionary(S=NameObject(f"/{kind}"), **entries)
+
+
+TEXT = TextStringObject("x")
+
+
+@pytest.mark.parametrize(
+    ("edit", "said"),
+    [
+        (on_root("/Names", dictionary(JavaScript=dictionary(Names=ArrayObject()))), "JavaScript"),
+        (on_root("/Outlines", dictionary(A=action("JavaScript", JS=TEXT))), "JavaScript"),
+        (on_root("/OpenAction", action("Launch", F=TEXT)), "an action that starts a program"),
+        (on_root("/OpenAction", ArrayObject([NumberObject(0)])), "an action on opening"),
+        (on_root("/AA", dictionary(WC=action("JavaScript", JS=TEXT))), "an automatic action"),
+        (on_root("/AcroForm", dictionary(Fields=ArrayObject())), "a form"),
+        (on_root("/AcroForm", dictionary(XFA=TEXT)), "an XFA form"),
+        (on_root("/Collection", dictionary()), "a portfolio"),
+        (on_root("/Outlines", dictionary(First=dictionary(A=action("URI", URI=TEXT)))), "the web"),
+        (on_root("/Outlines", dictionary(A=action("SubmitForm"))), "sends a form"),
+        (on_root("/Outlines", dictionary(A=action("GoToR", F=TEXT))), "a link to another file"),
+        (on_root("/Outlines", dictionary(A=action("GoToE"))), "a link into an attached file"),
+        (on_root("/X", dictionary(Type=NameObject("/Filespec"), F=TEXT)), "a reference to another"),
+        (
+            annotation(Subtype=NameObject("/Link"), A=action("URI", URI=TEXT)),
+            "a link to the web, an annotation (/Link)",
+        ),
+        (annotation(Subtype=NameObject("/FileAttachment")), "a file attached to a page"),
+        (annotation(Subtype=NameObject("/RichMedia")), "an annotation (/RichMedia)"),
+        (annotation(Subtype=NameObject("/FreeText")), "an annotation (/FreeText)"),
+        (annotation(), "an annotation (of no type)"),
+    ],
+    ids=range(18),
+)
+def test_what_acts_is_named(edit, said):
+    assert said in reason(small(edit=edit))
+    assert "it contains" in reason(small(edit=edit))
+
+
+def test_nothing_hides_behind_escaped_names_or_object_streams():
+    script = b"<< /Type /Catalog /Pages 2 0 R /Open#41ction << /S /#4aavaScript /JS (x) >> >>"
+    assert "JavaScript" in reason(raw(script, PAGES, PAGE, stream(b"")))
+
+
+# ------------------------------------------------------------------ bombs
+
+
+def bomb(size: int, entries: bytes = b"/Type /EmbeddedFile ") -> bytes:
+    squeeze = zlib.compressobj(9)
+    packed = b"".join(squeeze.compress(bytes(1_000_000)) for _ in range(size // 1_000_000))
+    return stream(packed + squeeze.flush(), entries + FLATE)
+
+
+def content_bomb(size: int) -> bytes:
+    return raw(CATALOG, PAGES, PAGE, bomb(size, b""))
+
+
+def stream_bomb(kind: bytes) -> bytes:
+    """A bomb in a stream that pypdf inflates before anybody asks."""
+    body = b"%PDF-1.5\n1 0 obj\n" + bomb(
+        1_000_000_000, b"/Type /%b /Size 9 /W [1 2 1] /N 9 /First 9 /Root 2 0 R " % kind
+    )
+    return body + b"\nendobj\nstartxref\n9\n%%EOF\n"
+
+
+@pytest.mark.parametrize(
+    ("pdf", "said"),
+    [
+        (with_attachment(bomb(1_000_000_000)), "expands to more"),
+        (with_attachment(bomb(8_000_000)), "larger than 5 MB"),
+        (with_attachment(stream(bytes(6_000_000), b"/Type /EmbeddedFile")), "larger than 5 MB"),
+        (content_bomb(1_000_000_000), "expands to more"),
+        (content_bomb(30_000_000), "expands to more"),
+        (raw(CATALOG, *[bomb(15_000_000, b"")] * 8), "expands to more"),
+        (stream_bomb(b"XRef"), "expands to more"),
+        (stream_bomb(b"ObjStm"), "expands to more"),
+    ],
+    ids=range(8),
+)
+def test_bombs_take_little_memory(pdf, said):
+    tracemalloc.start()
+    try:
+        assert said in reason(pdf)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert peak < 120_000_000
+
+
+def test_bombs_in_a_process_of_their_own():
+    """What C libraries allocate is not traced: the process as a whole stays small."""
+    if sys.platform == "win32":
+        pytest.skip("no ru_maxrss")
+    script = (
+        "import resource, sys; from px4fuse.grading.intake import read_report;"
+        "base = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss;"
+        "print(read_report(sys.stdin.buffer.read(), 'r.pdf').reason);"
+        "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - base)"
+    )
+    ran = subprocess.run(
+        [sys.executable, "-c", script],
+        input=content_bomb(400_000_000),
+        capture_output=True,
+        check=True,
+        timeout=120,
+    )
+    said, grown = ran.stdout.decode().splitlines()
+    assert "expands to more" in said
+    assert int(grown) * (1 if sys.platform == "darwin" else 1024) < 100_000_000
+
+
+def test_one_content_on_a_hundred_pages():
+    pages = b"<< /Type /Pages /Kids [%b] /Count 90 >>" % (b"3 0 R " * 90)
+    embedded = [
+        stream(JSON, b"/Type /EmbeddedFile"),
+        b"<< /Type /Filespec /F (results.json) /EF << /F 5 0 R >> >>",
+    ]
+    content = stream(zlib.compress(b"0 0 m " * 100_000), FLATE)
+    catalog = b"<< /Type /Catalog /Pages 2 0 R /Names 6 0 R >>"
+    assert "its pages expand" in reason(raw(catalog, pages, PAGE, content, *embedded))
+
+
+@pytest.mark.parametrize(
+    "filters",
+    [
+        b"/Filter [" + b"/FlateDecode " * 20 + b"]",
+        b"/Filter [/FlateDecode /FlateDecode]",
+        b"/Filter /LZWDecode",
+        b"/Filter /RunLengthDecode",
+        b"/Filter /JBIG2Decode",
+        b"/Filter /DCTDecode",
+        b"/Filter /Invented",
+        b"/Filter 7",
+        b"/Filter []",
+    ],
+)
+def test_other_filters(filters):
+    attached = with_attachment(stream(zlib.compress(JSON), b"/Type /EmbeddedFile " + filters))
+    assert "a stream packed by other means" in reason(attached)
+    content = raw(CATALOG, PAGES, PAGE, stream(b"x", filters))
+    assert "a stream packed by other means" in reason(content)
+
+
+def test_stream_words_that_make_us_try_again_and_again():
+    # each try inflates what follows; all of them pay from one purse
+    stored = b"".join(b"stream\x78\x01\x00" + b"\x00\x00\xff\xff\x00" * 3 for _ in range(200_000))
+    assert reason(b"%PDF-1.4\n" + stored + b"%%EOF")
+
+
+def test_a_letter_that_prints_a_book():
+    mapping = b"1 beginbfchar <41> <" + b"0041" * 5000 + b"> endbfchar"
+    fonts = b"/Resources << /Font << /F << /Type /Font /Subtype /Type1 /BaseFont /Helvetica "
+    page = PAGE.replace(b"/Resources << >>", fonts + b"/ToUnicode 7 0 R >> >> >>")
+    pdf = raw(
+        b"<< /Type /Catalog /Pages 2 0 R /Names 6 0 R >>",
+        PAGES,
+        page,
+        stream(b"BT /F 9 Tf (" + b"A" * 100_000 + b") Tj ET"),
+        stream(JSON, b"/Type /EmbeddedFile"),
+        b"<< /Type /Filespec /F (results.json) /EF << /F 5 0 R >> >>",
+        stream(mapping),
+    )
+    assert "more memory or work" in reason(pdf)
+
+
+# ------------------------------------------------------------------ structure
+
+
+@pytest.mark.parametrize(
+    "pdf",
+    [
+        raw(CATALOG, b"<< /Type /Pages /Kids [2 0 R] /Count 1 >>"),
+        raw(CATALOG, b"<< /Type /Pages /Kids [3 0 R] >>", b"<< /Type /Pages /Kids [2 0 R] >>"),
+        raw(CATALOG, b"2 0 R"),
+        raw(CATALOG, b"3 0 R", b"2 0 R"),
+        raw(b"<< /Type /Pages >>"),
+        raw(b"[]"),
+        raw(CATALOG),
+        raw(CATALOG, PAGES, PAGE, trailer=b""),
+        raw(CATALOG, PAGES, PAGE, trailer=b"/Root 9 0 R"),
+        raw(CATALOG, PAGES, PAGE, trailer=b"/Root 1 0 R /Prev 9"),
+        raw(CATALOG, PAGES, PAGE, trailer=b"/Root 1 0 R /Prev -5"),
+        raw(CATALOG, PAGES, PAGE, trailer=b"/Root 1 0 R /Prev " + b"9" * 6000),
+        raw(CATALOG, PAGES, PAGE, trailer=b"/Root 1 0 R /XRefStm 9"),
+        raw(CATALOG, b"[" * 100_000),
+        raw(CATALOG, b"<</A" * 100_000),
+        raw(CATALOG, b"(" * 100_000),
+        raw(CATALOG, PAGES, PAGE, stream(b"", b"/Length 99999999")),
+        raw(CATALOG, PAGES, PAGE, b"<< /Length 4 0 R >>\nstream\nx\nendstream"),
+        raw(
+            CATALOG, PAGES, b"<< /Type /Page /Contents [" + b"4 0 R " * 9000 + b"] >>", stream(b"q")
+        ),
+        raw(CATALOG, PAGES, PAGE, stream(b"(" * 5000 + b"[" * 5000 + b"<<" * 5000)),
+        b"%PDF-1.4\nxref\n0 99999999\ntrailer\n<< >>\nstartxref\n9\n%%EOF",
+        b"%PDF-1.4\n" + b"startxref\n9\n%%EOF\n" * 20_000,
+    ],
+    ids=range(22),
+)
+def test_broken_structure(pdf):
+    assert reason(pdf)
+
+
+def test_an_xref_table_that_points_at_itself():
+    pdf = raw(CATALOG, PAGES, PAGE, stream(b""))
+    start = pdf.rindex(b"xref\n0")
+    looped = pdf.replace(b"/Root", b"/Prev %d /Root" % start)
+    assert "no results.json" in reason(looped)
+
+
+def test_object_streams():
+    """An object stream that holds itself, or what it does not say."""
+    for offsets in (b"1 0 2 9 ", b"5 0 5 3 ", b"1 99 ", b"x y "):
+        packed = stream(offsets + CATALOG + PAGES, b"/Type /ObjStm /N 2 /First 8")
+        body = b"%PDF-1.5\n5 0 obj\n" + packed + b"\nendobj\n"
+        entries = b"".join(
+            bytes(each)
+            for each in ((0, 0, 0), (2, 5, 0), (2, 5, 1), (2, 6, 0), (0, 0, 0), (2, 5, 0))
+        )
+        table = stream(entries, b"/Type /XRef /Size 6 /W [1 1 1] /Root 1 0 R")
+        pdf = body + b"6 0 obj\n" + table + b"\nendobj\nstartxref\n%d\n%%%%EOF" % len(body)
+        assert reason(pdf)
+
+
+def test_references_to_nothing_are_not_searched_for():
+    refer = b"".join(b"%d 0 R " % number for number in range(100, 20_000))
+    pdf = raw(b"<< /Type /Catalog /Pages 2 0 R /X [%b] >>" % refer, PAGES, PAGE, stream(b""))
+    assert "more memory or work" in reason(pdf)
+
+
+def test_too_many_objects():
+    many = raw(
+        b"<< /Type /Catalog /Pages 2 0 R /X 5 0 R >>",
+        PAGES,
+        PAGE,
+        stream(b""),
+        b"[" + b"".join(b"%d 0 R " % number for number in range(6, 25_000)) + b"]",
+        *[b"null"] * 24_995,
+    )
+    assert "more memory or work" in reason(many)
+
+
+# ------------------------------------------------------------------ results
+
+
+def changed(**entries: object) -> bytes:
+    return json.dumps(json.loads(JSON) | entries).encode()
+
+
+@pytest.mark.parametrize(
+    ("attached", "said"),
+    [
+        (b"", "is not JSON"),
+        (b"{", "is not JSON"),
+        (b'{"a": 1} x', "is not JSON"),
+        (b"\xff\xfe{}", "is not UTF-8"),
+        (JSON.decode().encode("utf-16"), "is not UTF-8"),
+        (b"[" * 1_000_000, "nested too deeply"),
+        (b'{"a":' * 1_000_000, "nested too deeply"),
+        (b"[" * 100 + b"]" * 100, "nested too deeply"),
+        (b"[" + b"0," * 2_200_000 + b"0]", "more values"),
+        (b"[" + b"[]," * 300_000 + b"[]]", "a list that is too long"),
+        (b'["' + b"x" * 300_000 + b'"]', "a text that is too long"),
+        (b"[NaN]", "the number NaN, which is not JSON"),
+        (b"[-Infinity]", "the number -Infinity, which is not JSON"),
+        (b"[1e999]", "a number that is too large"),
+        (b"[" + b"9" * 1_000_000 + b"]", "too many digits"),
+        (b'{"a": 1, "a": 2}', "a key twice"),
+        (b'{"schema": {"name": "px4fuse-tuning", "version": "1.0"}}', "no results of px4fuse"),
+        (b'{"schema": {"name": ["px4fuse-results"], "version": 1}}', "no results of px4fuse"),
+        (b'{"schema": {"name": "px4fuse-results"}}', "no results of px4fuse"),
+        (b'{"schema": "px4fuse-results"}', "no results of px4fuse"),
+        (b"[]", "no results of px4fuse"),
+        (b"null", "no results of px4fuse"),
+        (b"1", "no results of px4fuse"),
+        (
+            b'{"schema": {"name": "px4fuse-results", "version": "1.2"}}',
+            "does not follow the schema at its top",
+        ),
+        (changed(student={"name": 7, "id": "", "notes": ""}), "the schema at student.name"),
+        (changed(extra=1), "does not follow the schema"),
+        (changed(**{"a\u202eb": 1}), "a key with control characters"),
+    ],
+    ids=range(27),
+)
+def test_results_that_are_none(attached, said):
+    assert said in reason(small(attached))
+
+
+def test_texts_are_cleaned():
+    student = {"name": "Zoë \u202eevil\u2066 \ud800李\x1b[31m", "id": "=1+1", "notes": "a\n\tb\x07"}
+    report = read_report(small(changed(student=student)), "r.pdf")
+    assert isinstance(report, Report)
+    assert report.results["student"] == {
+        "name": "Zoë evil 李[31m",
+        "id": "=1+1",
+        "notes": "a\n\tb",
+    }
+
+
+def test_without_jsonschema(monkeypatch):
+    monkeypatch.setitem(sys.modules, "jsonschema", None)
+    assert 'pip install "px4fuse[grade]"' in reason(REAL)
+
+
+def test_the_name_is_cleaned_and_short():
+    report = read_report(b"", "a\nb\u202e\x1b" * 10_000)
+    assert isinstance(report, Refused)
+    assert report.reason.isprintable()
+    assert len(report.reason) < 300
+
+
+@given(st.text())
+def test_cleaned_text(text):
+    made = cleaned(text)
+    assert cleaned(made) == made
+    made.encode()
+    assert not set(made) & {
+        *map(chr, range(9)),
+        "\x1b",
+        "\x7f",
+        "\x9b",
+        *"\u202a\u202e\u2066\u2069",
+    }
+    assert [each for each in text if each.isalpha()] == [each for each in made if each.isalpha()]
+    assert len(one_line(text, 10)) <= 10
+    assert "\n" not in one_line(text, 10)
+
+
+# ------------------------------------------------------------------ anything at all
+
+
+@given(st.binary(max_size=2000))
+def test_any_bytes(content):
+    for pdf in (content, b"%PDF-1.7\n" + content + b"\n%%EOF\n"):
+        assert isinstance(read_report(pdf, "r.pdf"), Refused)
+
+
+@given(st.binary(max_size=2000))
+def test_any_attachment(content):
+    assert isinstance(read_report(small(content), "r.pdf"), Refused)
+
+
+def test_mutated_reports(monkeypatch):
+    """The real report with bytes, words and parts changed; its pages' text costs too much here."""
+    monkeypatch.setattr(intake, "_page_texts", lambda reader: iter(()))
+    rng = random.Random(6)
+    words = [b"obj", b"endobj", b"stream", b"<<", b">>", b"/Kids", b"/Type", b"/Length", b" 0 R"]
+    bare = small()
+    for _ in range(FUZZ):
+        whole = rng.choice([REAL, bare])
+        content = bytearray(whole)
+        for _ in range(rng.randint(1, 8)):
+            # where structure is: the first and the last objects, the table and the trailer
+            place = rng.choice([rng.randrange(min(6000, len(whole))), -rng.randint(1, 4000)])
+            place %= len(content)
+            match rng.randrange(4):
+                case 0:
+                    content[place] = rng.randrange(256)
+                case 1:
+                    del content[place : place + rng.randint(1, 50)]
+                case 2:
+                    content[place:place] = rng.choice(words)
+                case 3:
+                    other = rng.randrange(len(whole))
+                    content[place : place + 40] = whole[other : other + 40]
+        assert isinstance(read_report(bytes(content), "r.pdf"), Report | Refused)
+
+
+def test_mutated_reports_with_their_text():
+    rng = random.Random(7)
+    shown = small(edit=lambda writer: writer.pages[0].update({}))
+    reader = PdfReader(io.BytesIO(REAL))
+    writer = PdfWriter()
+    writer.add_page(reader.pages[8])
+    writer.add_attachment("results.json", JSON)
+    page = written(writer)
+    assert isinstance(read_report(page, "r.pdf"), Report)
+    for _ in range(FUZZ // 3):
+        content = bytearray(rng.choice([page, page, shown]))
+        for _ in range(rng.randint(1, 4)):
+            content[rng.randrange(len(content))] = rng.randrange(256)
+        assert isinstance(read_report(bytes(content), "r.pdf"), Report | Refused)
+
+
+@pytest.mark.parametrize("operators", [b"0 0 m ", b"1 ", b"[", b"(a) Tj ", b"[(a)]TJ ", b"/X Do "])
+def test_pages_within_every_size_that_are_slow(operators):
+    content = b"BT " + operators * (19_000_000 // len(operators))
+    pdf = raw(
+        b"<< /Type /Catalog /Pages 2 0 R /Names 6 0 R >>",
+        PAGES,
+        PAGE.replace(b"<< >>", b"<< /Font << >> >>"),
+        stream(zlib.compress(content), FLATE),
+        stream(JSON, b"/Type /EmbeddedFile"),
+        b"<< /Type /Filespec /F (results.json) /EF << /F 5 0 R >> >>",
+    )
+    assert isinstance(read_report(pdf, "r.pdf"), Report | Refused)
+
+
+def test_other_objects_that_pypdf_may_meet():
+    """Values of a kind that no reader expects, at every key that intake looks at."""
+    odd = [
+        NumberObject(7),
+        TextStringObject("x"),
+        ArrayObject(),
+        dictionary(),
+        DecodedStreamObject(),
+    ]
+    for key in ("/Names", "/Pages", "/Outlines", "/Metadata", "/S", "/Filter", "/EF", "/Annots"):
+        for value in odd:
+            report = read_report(small(edit=on_root(key, value)), "r.pdf")
+            assert isinstance(report, Report | Refused)
+    broken = EncodedStreamObject()
+    broken._data = b"no zlib" * 100
+    broken[NameObject("/Filter")] = NameObject("/FlateDecode")
+
+    def put(writer):
+        writer.pages[0][NameObject("/Contents")] = writer._add_object(broken)
+
+    assert isinstance(read_report(small(edit=put), "r.pdf"), Refused)

@@ -1,0 +1,130 @@
+"""Pictures of pages: small, true to the page, and never an exception."""
+
+from __future__ import annotations
+
+import io
+import random
+import sys
+from pathlib import Path
+
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+from matplotlib.figure import Figure
+from PIL import Image
+from pypdf import PdfReader, PdfWriter
+
+from px4fuse.flight import Unavailable
+from px4fuse.grading.pictures import MAX_BYTES, MAX_PIXELS, key_page, picture
+
+REPORT = Path(__file__).resolve().parents[1] / "reports" / "aisle_uwb.pdf"
+
+
+@pytest.fixture(autouse=True)
+def _pdfium() -> None:
+    pytest.importorskip("pypdfium2", reason='pypdfium2 is absent: pip install "px4fuse[grade]"')
+
+
+def opened(made: bytes | Unavailable) -> Image.Image:
+    assert isinstance(made, bytes), made
+    assert len(made) <= MAX_BYTES
+    image = Image.open(io.BytesIO(made))
+    image.load()
+    assert image.format == "PNG"
+    return image
+
+
+def blank(width: float, height: float) -> bytes:
+    writer = PdfWriter()
+    writer.add_blank_page(width, height)
+    out = io.BytesIO()
+    writer.write(out)
+    return out.getvalue()
+
+
+def test_a_report_s_cover_is_small_and_readable() -> None:
+    made = picture(REPORT.read_bytes(), 0)
+    image = opened(made)
+    assert image.size == (700, 990)
+    colours = image.convert("RGB").getcolors(256)
+    assert colours is not None
+    assert max(colours)[1] == (255, 255, 255)
+    assert min(sum(colour) for _, colour in colours) < 60  # letters are black, not grey
+    # Our blue and EKF2's orange survive the palette
+    assert any(b > r + 60 for _, (r, _, b) in colours)
+    assert any(r > b + 100 for _, (r, _, b) in colours)
+
+
+def test_the_same_page_gives_the_same_bytes() -> None:
+    assert picture(REPORT.read_bytes(), 1) == picture(REPORT.read_bytes(), 1)
+
+
+def test_the_key_page_is_the_cover() -> None:
+    pages = [page.extract_text() for page in PdfReader(REPORT).pages]
+    assert key_page(pages) == 0
+    assert key_page(["my own title page", *pages]) == 1
+    assert key_page([]) == key_page(["", "no verdict here"]) == 0
+
+
+@pytest.mark.parametrize("page", [-1, 9, 10**9, 2**70])
+def test_a_page_that_is_not_there(page: int) -> None:
+    made = picture(REPORT.read_bytes(), page)
+    assert isinstance(made, Unavailable)
+    assert "there is no page" in made.reason
+
+
+def test_a_photograph_is_made_to_fit() -> None:
+    figure = Figure(figsize=(8.27, 11.69))
+    noise = random.Random(1).randbytes(600 * 800 * 3)
+    figure.figimage(Image.frombytes("RGB", (600, 800), noise))
+    out = io.BytesIO()
+    figure.savefig(out, format="pdf")
+    assert opened(picture(out.getvalue(), 0)).size[0] < 700
+
+
+@pytest.mark.parametrize(
+    "size", [(14_400, 14_400), (1, 14_400), (14_400, 1), (0.001, 0.001), (3, 3)]
+)
+def test_odd_pages_are_bounded(size: tuple[float, float]) -> None:
+    made = picture(blank(*size), 0)
+    if not isinstance(made, Unavailable):
+        width, height = opened(made).size
+        assert width * height <= 1.1 * MAX_PIXELS
+
+
+@pytest.mark.parametrize("size", [(1e9, 1e9), (1e38, 1.0), (1e300, 1e300)])
+def test_pages_without_a_sane_size_are_refused(size: tuple[float, float]) -> None:
+    made = picture(blank(*size), 0)
+    # PDFium takes what it cannot believe for a letter
+    if not isinstance(made, Unavailable):
+        assert opened(made).size[0] <= 700
+
+
+def test_locked_and_broken_files_are_unavailable() -> None:
+    writer = PdfWriter(clone_from=REPORT)
+    writer.encrypt("secret", algorithm="RC4-128")
+    out = io.BytesIO()
+    writer.write(out)
+    for content in (out.getvalue(), b"", b"%PDF-1.7", b"\0" * 1000, REPORT.read_bytes()[:3000]):
+        made = picture(content, 0)
+        assert isinstance(made, Unavailable)
+        assert made.remedy == "Open the PDF itself."
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 2**32), st.integers(1, 60))
+@example(0, 1)
+def test_damaged_reports_never_raise(seed: int, count: int) -> None:
+    content = bytearray(REPORT.read_bytes())
+    dice = random.Random(seed)
+    for _ in range(count):
+        content[dice.randrange(len(content))] = dice.randrange(256)
+    made = picture(bytes(content), dice.randrange(9), 200)
+    assert isinstance(made, bytes | Unavailable)
+
+
+def test_without_pypdfium2_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pypdfium2", None)
+    made = picture(REPORT.read_bytes(), 0)
+    assert isinstance(made, Unavailable)
+    assert 'pip install "px4fuse[grade]"' in str(made)

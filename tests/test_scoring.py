@@ -1,0 +1,654 @@
+"""Points, comments, feedback and flags, on the example report with parts of it changed."""
+
+import copy
+import dataclasses
+import json
+import pickle
+import random
+import re
+from pathlib import Path
+
+import pytest
+
+from px4fuse.grading.answers import Answer, AnswerKey
+from px4fuse.grading.flags import class_flags, own_flags
+from px4fuse.grading.model import Graded, Report, Verdict
+from px4fuse.grading.rubric import parse_rubric, read_rubric
+from px4fuse.grading.scoring import (
+    Notes,
+    feedback,
+    gradescope,
+    score,
+    score_refused,
+    values_at,
+)
+
+ROOT = Path(__file__).parent.parent
+RESULTS = json.loads((ROOT / "reports" / "aisle_uwb.json").read_text(encoding="utf-8"))
+PAGES = ("Two-state Kalman filter against EKF2", "Innovations\nof both", "Provenance\nMade with")
+VERIFIED = Verdict("verified", ("all 900 numbers agree",), with_log=True)
+SHA = RESULTS["log"]["sha256"]
+WORDS = read_rubric(None).words
+GAP = {"id": "source_gap", "severity": "warning", "message": "It was silent.", "remedy": "See."}
+LOOP = {
+    "schema": {"name": "px4fuse-loop", "version": "1.0"},
+    "track": {"name": "loop.ulg:vio", "sha256": SHA},
+    "loop": {
+        "start_s": 1.0,
+        "end_s": 95.0,
+        "path_length_m": 87.7,
+        "closure_error_m": 1.42,
+        "closure_percent": 1.62,
+        "absolute": False,
+        "closures": [{"accepted": True}],
+        "corrections": {
+            "uncorrected": {"scores": {"slam.tum": {"ate": {"translation_m": {"rmse": 0.41}}}}},
+            "by_distance": {
+                "moved_max_m": 1.4,
+                "scores": {"slam.tum": {"ate": {"translation_m": {"rmse": 0.26}}}},
+            },
+        },
+    },
+    "findings": [],
+}
+
+
+def changed(results=RESULTS, **values):
+    """The example with the values at some paths, "__" for dots, replaced; ``...`` removes."""
+    made = copy.deepcopy(results)
+    for path, value in values.items():
+        *parents, last = path.split("__")
+        place = made
+        for parent in parents:
+            place = place.setdefault(parent, {})
+        if value is ...:
+            place.pop(last, None)
+        else:
+            place[last] = value
+    return made
+
+
+def report(results=RESULTS, pages=PAGES):
+    return Report("0" * 64, 1000, "intact", results, tuple(pages), b"%PDF")
+
+
+def checked(check, results=RESULTS, pages=PAGES, /, verdict=VERIFIED, key=None, **parameters):
+    """Share of the points and comment of one check."""
+    given = "\n".join(f"{name} = {json.dumps(value)}" for name, value in parameters.items())
+    rubric = parse_rubric(f'[[item]]\ntitle = "T"\npoints = 1\ncheck = "{check}"\n{given}', "x")
+    rubric = dataclasses.replace(rubric, unverified="score", words=WORDS)
+    (item,) = score(report(results, pages), verdict, rubric, key)
+    assert item.comment.endswith(".")
+    assert "\n" not in item.comment
+    return item.points, item.comment
+
+
+def noted(text, **values):
+    return changed(student__notes=text, **values)
+
+
+# ------------------------------------------------------------------ checks
+
+
+class TestVerified:
+    def test_with_and_without_log(self):
+        assert checked("verified")[0] == 1.0
+        assert checked("verified", verdict=Verdict("verified", (), with_log=False))[0] == 0.5
+
+    def test_other_verdicts_say_why(self):
+        verdict = Verdict("cannot verify", ("the log is not here",), with_log=False)
+        points, comment = checked("verified", verdict=verdict)
+        assert points == 0.0
+        assert "the log is not here" in comment
+
+
+class TestStudent:
+    def test_both_one_none(self):
+        both = changed(student={"name": "Ann", "id": "7", "notes": ""})
+        assert checked("student", both)[0] == 1.0
+        points, comment = checked("student", changed(student__name="Ann"))
+        assert points == 0.5
+        assert "--id" in comment
+        assert checked("student", changed(student=...))[0] == 0.0
+        assert checked("student", changed(student__name="Ann"), id=False)[0] == 1.0
+
+    def test_report_of_a_loop_says_it_on_its_page(self):
+        page = "A loop\nStudent Ann Lee, 77\nSHA-256 00"
+        assert checked("student", LOOP, [page]) == (1.0, "Your report names Ann Lee, 77.")
+
+
+class TestSections:
+    def test_pages_and_results(self):
+        parts = {"pages": ["innovations OF both"], "results": ["axes.*.kf", "clock"]}
+        assert checked("sections", **parts)[0] == 1.0
+
+    def test_missing_ones_are_named_with_their_reason(self):
+        points, comment = checked("sections", pages=["Appendix"], results=["loop", "axes.north"])
+        assert points == pytest.approx(1 / 3, abs=0.01)
+        assert "'Appendix'" in comment
+        assert "no external vision with orientation" in comment
+
+
+class TestNotes:
+    def test_length(self):
+        long = " ".join(f"word{number}" for number in range(150))
+        assert checked("notes", noted(long))[0] == 1.0
+        points, comment = checked("notes", noted("five words of my own"))
+        assert points == pytest.approx(5 / 150, abs=0.01)
+        assert "5 words; 150" in comment
+
+    def test_one_word_again_and_again_is_not_enough(self):
+        points, comment = checked("notes", noted("word " * 500))
+        assert points < 0.1
+        assert "only 1 different" in comment
+
+    @pytest.mark.parametrize("notes", ["", "  \n", None, 7, ["a"], {}])
+    def test_none(self, notes):
+        assert checked("notes", noted(notes))[0] == 0.0
+
+    def test_languages_without_spaces_count(self):
+        assert Notes("การวัดตำแหน่งมีสัญญาณรบกวนสูงกว่าที่ตั้งไว้").words >= 8
+        assert Notes("測定値のノイズが大きい").words >= 5
+
+    def test_notes_of_a_loop_stand_on_its_page(self):
+        page = "Notes by the student\nFive words of my own\npx4fuse · x\npx4fuse 0.1.0 4 / 5"
+        assert "5 words" in checked("notes", LOOP, ["Loop", page])[1]
+
+    def test_words_belong_together_within_a_sentence(self):
+        notes = Notes("The clock is fine. Positions come late.\n- Stamps are 0.2 s later")
+        assert not notes.mention(["clock late"])
+        assert notes.mention(["stamp late"])
+        assert notes.mention(["outlier", "fine"])
+
+    def test_no_before_a_word_denies_it(self):
+        notes = Notes("There are no outliers, and the gap is not long")
+        assert notes.mention(["outlier"])
+        assert not notes.mention(["outlier"], affirmed=True)
+        assert notes.mention(["gap"], affirmed=True)
+
+
+class TestFindings:
+    def test_none_left(self):
+        assert checked("findings")[0] == 1.0
+
+    def test_named_by_id_by_words_or_not(self):
+        late = {"id": "source_clock_offset", "severity": "error", "message": "Late."}
+        both = {"findings": [GAP, late]}
+        points, comment = checked("findings", noted("source_gap: see below.", **both))
+        assert points == 0.5
+        assert "source_clock_offset" in comment
+        text = "UWB was silent for 5 s. The stamps come late by 0.2 s."
+        assert checked("findings", noted(text, **both))[0] == 1.0
+
+    def test_what_is_ignored_or_mild_is_not_asked_for(self):
+        ignored = {"id": "ekf2_unavailable", "severity": "warning", "message": ""}
+        assert checked("findings", changed(findings=[ignored]))[0] == 1.0
+        assert checked("findings", severities=["info"])[0] == 0.0
+
+    def test_no_list(self):
+        assert checked("findings", changed(findings=...))[0] == 0.0
+
+
+class TestTuning:
+    def test_within(self):
+        assert checked("tuning", settings=["sigma_z_m"])[0] == 1.0
+
+    def test_outside_falls_to_zero_at_the_factor(self):
+        points, comment = checked("tuning", settings=["sigma_a_m_s2"])
+        assert 0.5 < points < 0.9
+        assert "0.5 m/s²" in comment
+        assert "above" in comment
+        small = changed(settings__sigma_a_m_s2=0.1)
+        points, comment = checked("tuning", small, settings=["sigma_a_m_s2"])
+        assert points == 0.0
+        assert "below" in comment
+        assert checked("tuning")[0] > 0.5
+
+    def test_a_bound_and_nothing(self):
+        bound = {"sigma_z_m_upper_bound": 0.2}
+        results = changed(tuning__horizontal=bound)
+        assert checked("tuning", results, settings=["sigma_z_m"])[0] == 1.0
+        none = {"unavailable": {"what": "tuning", "reason": "too few of them", "remedy": ""}}
+        points, comment = checked("tuning", changed(tuning__horizontal=none))
+        assert points == 0.0
+        assert "too few of them" in comment
+
+
+class TestNumber:
+    PATH = "axes.north.truth.kf_position_rmse_m"
+
+    def test_below_and_above(self):
+        assert checked("number", path=self.PATH, at_most=0.15)[0] == 1.0
+        points, comment = checked("number", path=self.PATH, at_most=0.05, name="the error")
+        assert (points, comment) == (0.0, "The error is 0.06499; at most 0.05 was asked for.")
+
+    def test_part_of_the_points(self):
+        assert checked("number", path=self.PATH, at_most=0.06, zero_at=0.07)[0] == 0.5
+        assert checked("number", path=self.PATH, at_least=0.07, zero_at=0.06)[0] == 0.5
+
+    def test_the_worst_of_several_counts(self):
+        points, comment = checked("number", path="axes.*.kf.nis_mean", at_least=0.82)
+        assert points == 0.0
+        assert "axes.north" in comment
+
+    def test_first_path_that_is_there(self):
+        paths = ["nothing.here", "log.duration_s"]
+        assert checked("number", path=paths, at_least=100)[0] == 1.0
+
+    def test_lists_and_names_with_dots(self):
+        path = 'loop.corrections.by_distance.scores."slam.tum".ate.translation_m.rmse'
+        assert checked("number", LOOP, path=path, at_most=0.3)[0] == 1.0
+        assert checked("number", path="clock.interval_s.1", at_most=0.1)[0] == 1.0
+
+    @pytest.mark.parametrize("value", ["0.01", True, None, [], {}, float("nan"), 10**400, ...])
+    def test_what_is_no_number_gives_nothing(self, value):
+        results = changed(axes__north__truth__kf_position_rmse_m=value)
+        points, comment = checked("number", results, path=self.PATH, at_most=1.0)
+        assert points == 0.0
+        assert "does not have" in comment
+
+
+class TestConsistent:
+    def test_verdicts(self):
+        good = changed(horizontal__kf__verdict="consistent")
+        assert checked("consistent", good)[0] == 1.0
+        points, comment = checked("consistent")
+        assert 0.5 < points < 1.0
+        assert "overstated 1.13 times" in comment
+        assert checked("consistent", changed(horizontal__kf__variance_factor=0.5))[0] == 0.0
+        assert checked("consistent", filter="ekf2", axes=["horizontal", "east"])[0] == 1.0
+
+    def test_absent(self):
+        points, comment = checked("consistent", axes=["down"], filter="ekf2")
+        assert points == 0.0
+        assert "never fused" in comment
+
+
+class TestClock:
+    def test_applied_or_not(self):
+        assert checked("clock")[0] == 1.0
+        points, comment = checked("clock", changed(clock__applied_s=0.25))
+        assert points == 0.0
+        assert "0.250 s" in comment
+        assert "--clock-offset" in comment
+
+    def test_undetermined_and_absent(self):
+        results = changed(clock__determinable=False, clock__reason="no acceleration.")
+        points, comment = checked("clock", results)
+        assert points == 0.5
+        assert "no acceleration" in comment
+        assert checked("clock", changed(clock=...))[0] == 0.0
+
+
+class TestLoop:
+    def test_corrected(self):
+        points, comment = checked("loop", LOOP)
+        assert points == 1.0
+        assert "from 0.41 m to 0.26 m" in comment
+
+    def test_worse_without_reference_uncorrected_and_none(self):
+        after = "loop__corrections__by_distance"
+        worse = {f"{after}__scores": {"slam.tum": {"ate": {"translation_m": {"rmse": 0.5}}}}}
+        assert checked("loop", changed(LOOP, **worse))[0] == 0.67
+        assert checked("loop", changed(LOOP, **{f"{after}__scores": {}}))[0] == 0.83
+        assert checked("loop", changed(LOOP, **{after: ...}))[0] == 0.33
+        points, comment = checked("loop")
+        assert points == 0.0
+        assert "no external vision with orientation" in comment
+        assert checked("loop", changed(LOOP, loop__absolute=True))[0] == 0.0
+
+    def test_false_closure_is_rejected_for_a_reason(self):
+        rejected = changed(LOOP, loop__closures=[{"accepted": False}])
+        assert checked("loop", rejected)[0] == 0.67
+        why = "Notes by the student\nIt is a false closure: we landed 6 m away.\nfoot\nfoot"
+        assert checked("loop", rejected, [why])[0] == 1.0
+
+
+class TestFlight:
+    def test_enough_and_too_little(self):
+        assert checked("flight")[0] == 1.0
+        assert checked("flight", LOOP)[0] == 1.0
+        points, comment = checked("flight", changed(settings__end_s=31.848858))
+        assert points == 0.5
+        assert "30 s" in comment
+        assert checked("flight", LOOP, min_path_m=175.4)[0] == 0.5
+
+    def test_no_motion_and_absent(self):
+        still = changed(findings=[{"id": "no_motion", "severity": "warning", "message": ""}])
+        assert checked("flight", still)[0] == 0.0
+        assert checked("flight", changed(settings=...))[0] == 0.0
+
+
+# ------------------------------------------------------------------ mistakes
+
+
+def key(*findings, sha256=SHA, **values):
+    answer = Answer("s01", "Ann", "s01.ulg", sha256, {}, findings, findings, **values)
+    other = Answer("s02", "Bob", "s02.ulg", "b" * 64)
+    return AnswerKey("aisle", (answer, other))
+
+
+class TestMistakes:
+    def test_without_a_key_it_is_left_out(self):
+        items = score(report(), VERIFIED, read_rubric(None), None)
+        assert "The mistake in your log" not in [item.title for item in items]
+        items = score(report(), VERIFIED, read_rubric(None), key())
+        assert items[-1].title == "The mistake in your log"
+
+    def test_named_shown_missed(self):
+        two = key("source_gap", "source_outliers")
+        notes = noted("Outliers at 20 s.", student__id="S01 ")
+        points, comment = checked("mistakes", notes, key=two)
+        assert points == 0.5
+        assert "source_gap" in comment
+        shown = noted("Outliers at 20 s.", student__id="s01", findings=[GAP])
+        assert checked("mistakes", shown, key=two)[0] == 0.62
+        both = noted("Outliers at 20 s and a gap at 40 s.", student__id="s01")
+        assert checked("mistakes", both, key=two)[0] == 1.0
+
+    def test_a_list_of_everything_finds_half(self):
+        text = "Outliers. Gap. Clock offset. Clock jump. Yaw error. Logging rate."
+        points, comment = checked("mistakes", noted(text, student__id="s01"), key=key("source_gap"))
+        assert points == 0.5
+        assert "kinds of mistakes" in comment
+
+    def test_clock_that_was_mended_counts_as_shown(self):
+        own = key("source_clock_offset", truth={"clock_offset_to_add_s": -0.25})
+        mended = noted("", student__id="s01", settings__clock_offset_s=-0.24)
+        assert checked("mistakes", mended, key=own)[0] == 0.25
+        assert checked("mistakes", noted("", student__id="s01"), key=own)[0] == 0.0
+
+    def test_nothing_wrong(self):
+        def points(text):
+            return checked("mistakes", noted(text, student__id="s01"), key=key())[0]
+
+        assert points("I looked and found no mistakes, and no outliers.") == 1.0
+        assert points("") == 0.25
+        assert points("There are outliers.") == 0.0
+
+    def test_another_log_an_unknown_id_and_no_id(self):
+        other = key("source_gap", sha256="c" * 64)
+        points, comment = checked("mistakes", noted("A gap.", student__id="s01"), key=other)
+        assert points == 0.0
+        assert "s01.ulg" in comment
+        assert checked("mistakes", noted("A gap.", student__id="zz"), key=other)[0] == 0.0
+        # the log says which flight it is
+        assert checked("mistakes", noted("A gap."), key=key("source_gap"))[0] == 1.0
+
+    def test_ids_without_their_leading_zeros(self):
+        answers = AnswerKey("aisle", (Answer("0042", "", "", SHA), Answer("7", "", "", "b" * 64)))
+        assert answers.of_student("42").student_id == "0042"
+        assert answers.of_student("") is None
+        assert answers.of_log("") is None
+
+
+# ------------------------------------------------------------------ the whole
+
+
+class TestScore:
+    def test_example(self):
+        items = score(report(), VERIFIED, read_rubric(None), None)
+        assert sum(item.of for item in items) == 100
+        assert 50 < sum(item.points for item in items) < 80
+
+    def test_refuted_reports_get_nothing_unless_the_rubric_says_so(self):
+        rubric = read_rubric(None)
+        for status in ("numbers differ", "page altered", "other log"):
+            verdict = Verdict(status, ("SIGMA_A is 0.5",), with_log=True)
+            items = score(report(), verdict, rubric, None)
+            assert {item.points for item in items} == {0.0}
+            assert all("SIGMA_A is 0.5" in item.comment for item in items)
+            kept = score(report(), verdict, dataclasses.replace(rubric, unverified="score"), None)
+            assert kept[0].points == 0.0
+            assert sum(item.points for item in kept) > 40
+
+    def test_unverified_report_keeps_its_points_as_a_proposal(self):
+        verdict = Verdict("cannot verify", ("no log",), with_log=False)
+        items = score(report(), verdict, read_rubric(None), None)
+        assert items[0].points == 0.0
+        assert sum(item.points for item in items) > 40
+
+    def test_refused_file_has_every_item_with_nothing(self):
+        items = score_refused(read_rubric(None), None, "not a PDF")
+        assert sum(item.of for item in items) == 100
+        assert {item.points for item in items} == {0.0}
+
+    def test_rubric_and_key_go_to_other_processes(self):
+        for one in (read_rubric(None), key("source_gap")):
+            assert pickle.loads(pickle.dumps(one)) == one
+
+    @pytest.mark.parametrize("results", [RESULTS, LOOP], ids=["compare", "loop"])
+    def test_whatever_stands_in_the_results_is_no_exception(self, results):
+        rng = random.Random(0)
+        strange = [None, True, "x" * 2000, -1.0, 0, 10**400, float("nan"), [], {}, [[1, 2]], "\0"]
+        strange += [{"unavailable": 3}, {"unavailable": {"reason": ["x"]}}, [{"id": 3}], -1e308]
+        rubric = read_rubric(None)
+        for _ in range(400):
+            spoilt = copy.deepcopy(results)
+            for _ in range(rng.randint(1, 6)):
+                place = spoilt
+                while isinstance(place, dict) and place:
+                    name = rng.choice(list(place))
+                    if rng.random() < 0.35 or not isinstance(place[name], dict):
+                        place[name] = rng.choice(strange)
+                        break
+                    place = place[name]
+            for item in score(report(spoilt), VERIFIED, rubric, key("source_gap")):
+                assert 0.0 <= item.points <= item.of
+                assert len(item.comment) < 1500
+                assert item.comment.isprintable()
+            own_flags(spoilt)
+
+    def test_paths_that_lead_nowhere(self):
+        for path in (
+            "",
+            ".",
+            "*",
+            "*.*.*",
+            "axes..north",
+            "a.0.b",
+            '"',
+            '""',
+            "clock.interval_s.9",
+        ):
+            list(values_at(RESULTS, path))
+
+
+def graded(items=(), **values):
+    given = {"submission": "a.pdf", "student": "Ann Lee", "student_id": "1001"}
+    return Graded(**{**given, "verdict": VERIFIED, "items": tuple(items), **values})
+
+
+class TestWhatStudentsRead:
+    def test_feedback(self):
+        items = score(report(), VERIFIED, read_rubric(None), None)
+        text = feedback(graded(items, flags=("copied",)), "Lab 2")
+        assert text.startswith("Lab 2\n")
+        assert "Ann Lee, 1001" in text
+        assert "Most points are still to be had here" in text
+        assert "copied" not in text
+        assert all(len(line) <= 100 for line in text.splitlines())
+
+    def test_feedback_on_what_is_no_report(self):
+        verdict = Verdict("cannot verify", ("Not a PDF.",), with_log=False)
+        text = feedback(graded(verdict=verdict))
+        assert "Not a PDF." in text
+        assert "hand in the PDF" in " ".join(text.split())
+
+    def test_names_stay_text(self):
+        text = feedback(graded(student="=cmd|' /C calc'!A0\n<script>", student_id="\x1b[31m"))
+        assert "\x1b" not in text
+        assert "=cmd|' /C calc'!A0 <script>" in text
+
+    def test_gradescope(self):
+        items = score(report(), VERIFIED, read_rubric(None), None)
+        made = json.loads(json.dumps(gradescope(graded(items, flags=("copied",)))))
+        assert made["score"] == pytest.approx(sum(test["score"] for test in made["tests"]))
+        assert made["output_format"] == "text"
+        assert made["visibility"] == "after_published"
+        *shown, hidden = made["tests"]
+        assert len(shown) == len(items)
+        for test in shown:
+            assert {"name", "score", "max_score", "output"} <= set(test)
+            assert test["visibility"] == "after_published"
+        assert hidden["visibility"] == "hidden"
+        assert "copied" not in made["output"]
+
+    def test_gradescope_of_a_refused_file(self):
+        verdict = Verdict("cannot verify", ("Not a PDF.",), with_log=False)
+        made = gradescope(graded(verdict=verdict))
+        assert made["score"] == 0.0
+        assert made["tests"] == []
+        assert "Not a PDF." in made["output"]
+
+
+# ------------------------------------------------------------------ flags
+
+
+TUNED = {"settings__sigma_a_m_s2": 0.363, "settings__sigma_z_m": 0.0966}
+REASON = "chosen with --start and --end"
+
+
+class TestOwnFlags:
+    def test_none_on_the_example(self):
+        assert own_flags(RESULTS) == ()
+        assert own_flags({}) == ()
+        assert own_flags(LOOP) == ()
+
+    def test_tuned_on_what_is_graded(self):
+        (flag,) = own_flags(changed(**TUNED))
+        assert "tuned on the segment that is graded" in flag
+        assert "0.016 nats" in flag
+        assert own_flags(changed(settings__sigma_z_m=0.0966)) == ()
+        assert own_flags(changed(settings__sigma_a_m_s2=0.36, settings__sigma_z_m=0.097))
+
+    def test_part_chosen_by_hand(self):
+        (flag,) = own_flags(changed(settings__segment_reason=REASON, settings__end_s=50.0))
+        assert "37%" in flag
+        assert own_flags(changed(settings__segment_reason=REASON)) == ()
+        assert own_flags(changed(settings__end_s=50.0)) == ()
+
+    def test_findings_that_should_be_there(self):
+        (flag,) = own_flags(changed(settings__sigma_z_m=0.3))
+        assert "SIGMA_Z is 3.1 times off" in flag
+        named = [{"id": "sigma_z_large", "severity": "warning", "message": ""}]
+        assert own_flags(changed(settings__sigma_z_m=0.3, findings=named)) == ()
+
+    def test_parts_left_out(self):
+        (flag,) = own_flags(changed(settings__input="zero"))
+        assert "IMU" in flag
+        (flag,) = own_flags(changed(axes={"down": RESULTS["axes"]["down"]}))
+        assert "vertical" in flag
+
+
+def text_of(seed, count=120):
+    rng = random.Random(seed)
+    return " ".join(f"word{rng.randrange(50)}" for _ in range(count))
+
+
+def of(number, **values):
+    given = {
+        "submission": f"{number}.pdf",
+        "student": f"Student{number} Name{number}",
+        "student_id": f"10{number:02d}",
+        "sha256": f"{number:064d}",
+        "log_sha256": f"{number + 500:064d}",
+        "version": "0.1.0",
+    }
+    return graded(**{**given, **values})
+
+
+class TestClassFlags:
+    def test_an_honest_class(self):
+        settings = json.dumps({"sigma_a_m_s2": 0.5, "sigma_z_m": 0.1, "start_s": 1.0})
+        assert class_flags([of(n, notes=text_of(n), settings=settings) for n in range(12)]) == {}
+        assert class_flags([]) == {}
+
+    def test_logs_ids_files_and_versions(self):
+        made = class_flags(
+            [of(1, log_sha256="x"), of(2, log_sha256="x"), of(3, version="0.0.9"), of(4), of(5),
+             of(6, student_id="1005"), of(7, sha256="y"), of(8, sha256="y")]
+        )  # fmt: skip
+        assert set(made) == {0, 1, 2, 4, 5, 6, 7}
+        assert "same log as Student2" in made[0][0]
+        assert "0.0.9" in made[2][0]
+        assert "same student id" in made[4][0]
+        assert "same file" in made[7][0]
+
+    def test_two_reports_of_one_student_on_one_log(self):
+        assert class_flags([of(1, log_sha256="x"), of(1, log_sha256="x", sha256="z")]) == {
+            0: ("The same student id as in Student1 Name1, 1001 (1.pdf).",),
+            1: ("The same student id as in Student1 Name1, 1001 (1.pdf).",),
+        }
+
+    def test_settings_to_the_last_digit(self):
+        def settings(sigma_a, sigma_z, **more):
+            return json.dumps({"sigma_a_m_s2": sigma_a, "sigma_z_m": sigma_z, **more})
+
+        same = class_flags(
+            [of(1, settings=settings(0.362, 0.097, start_s=1.0)),
+             of(2, settings=settings(0.362, 0.097, start_s=2.0)),
+             of(3, settings=settings(0.3, 0.2)), of(4, settings=settings(0.3, 0.2)),
+             of(5, settings="["), of(6, settings="[1]")]
+        )  # fmt: skip
+        assert set(same) == {0, 1}
+        assert "sigma_a_m_s2 0.362" in same[0][0]
+
+    def test_notes_copied(self):
+        own = text_of(1)
+        words = own.split()
+        words[10] = words[60] = "CHANGED"
+        changed_ = " ".join(words).upper() + "!"
+        made = class_flags([of(1, notes=own), of(2, notes=changed_), of(3, notes=text_of(3))])
+        assert set(made) == {0, 1}
+        assert "whole passages" in made[0][0]
+
+    def test_short_notes_and_a_template_are_not(self):
+        assert class_flags([of(1, notes="All is well."), of(2, notes="All is well.")]) == {}
+        template = text_of(99, 300)
+        made = class_flags([of(n, notes=f"{template} {text_of(n)}") for n in range(8)])
+        assert made == {}
+        copies = [of(n, notes=f"{template} {text_of(min(n, 6))}") for n in range(8)]
+        assert set(class_flags(copies)) == {6, 7}
+
+    def test_logs_of_an_assignment(self):
+        answers = key(sha256="a" * 64)
+        made = class_flags(
+            [of(1, student_id="s01", log_sha256="a" * 64),
+             of(2, student_id="s01x", log_sha256="a" * 64, student="B"),
+             of(3, student_id="s02", log_sha256="c" * 64)],
+            answers,
+        )  # fmt: skip
+        assert any("in the answer key" in flag for flag in made[1])
+        assert any("none of those" in flag for flag in made[2])
+        taken = class_flags([of(1, student_id="s02", log_sha256="a" * 64)], answers)
+        assert "given to another student, s01" in taken[0][0]
+
+    @pytest.mark.parametrize(
+        ("file", "flagged"),
+        [
+            ("1002_lab.pdf", True),
+            ("Student2 Name2_88_assignsubmission_file_report.pdf", True),
+            ("Student1_Name1/1002.pdf", False),
+            ("1001.pdf", False),
+            ("lab report.pdf", False),
+            ("2222.pdf", True),
+            ("report-1002-1001.pdf", False),
+            ("", False),
+            ("/", False),
+        ],
+    )
+    def test_file_of_another_name(self, file, flagged):
+        made = class_flags([of(1, submission=file), of(2)])
+        assert (0 in made) == flagged
+
+    def test_three_hundred_take_seconds(self):
+        many = [of(n, notes=text_of(n % 290, 1500), log_sha256=f"{n}") for n in range(300)]
+        made = class_flags(many)
+        assert set(made) >= {0, 290}
+        assert 20 not in made
+
+
+def test_flags_are_sentences():
+    for flags in class_flags([of(1, log_sha256="x\n<b>"), of(2, log_sha256="x\n<b>")]).values():
+        assert all(re.fullmatch(r"[A-Z].*\.", flag) and flag.isprintable() for flag in flags)

@@ -1,0 +1,317 @@
+"""Submissions in folders and zip files: found, named, read within bounds, never unpacked."""
+
+from __future__ import annotations
+
+import io
+import os
+import random
+import struct
+import sys
+import tracemalloc
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+
+import pytest
+
+from px4fuse.errors import SettingsError
+from px4fuse.grading import submissions
+from px4fuse.grading.intake import MAX_BYTES
+from px4fuse.grading.model import Refused, Submission
+from px4fuse.grading.submissions import collect, guess_student, read
+
+PDF = b"%PDF-1.4 a small one\n%%EOF\n"
+
+
+def zipped(entries: Mapping[str, bytes], method: int = zipfile.ZIP_DEFLATED) -> bytes:
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w", method) as archive:
+        for name, content in entries.items():
+            archive.writestr(name, content)
+    return out.getvalue()
+
+
+def write(path: Path, content: bytes) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(content)
+    return path
+
+
+def names(paths: list[Path]) -> list[str]:
+    return [submission.name for submission in collect(paths)[0]]
+
+
+def reason(submission: Submission) -> str:
+    content = read(submission)
+    assert isinstance(content, Refused)
+    assert "\n" not in content.reason
+    return content.reason
+
+
+def only(path: Path) -> Submission:
+    (submission,), _ = collect([path])
+    return submission
+
+
+# ------------------------------------------------------------------ what is found
+
+
+def test_folders_are_searched_and_sorted(tmp_path):
+    for name in ("b/report.pdf", "A/Report.PDF", "c.pdf", "notes.docx", "b/log.ulg", "x.docx"):
+        write(tmp_path / name, PDF)
+    for name in (".hidden.pdf", "__MACOSX/x.pdf", ".git/x.pdf"):
+        write(tmp_path / name, PDF)
+    found, notes = collect([tmp_path])
+    assert [each.name for each in found] == ["A/Report.PDF", "b/report.pdf", "c.pdf"]
+    assert notes == ("Passed over, since they are no PDFs: 2 .docx, 1 .ulg.",)
+    assert [read(each) for each in found] == [PDF] * 3
+    assert all(each.entry == "" for each in found)
+
+
+def test_what_is_given_twice_is_found_once(tmp_path):
+    path = write(tmp_path / "a.pdf", PDF)
+    assert len(names([tmp_path, path, tmp_path])) == 1
+
+
+def test_platforms_exports(tmp_path):
+    moodle = zipped(
+        {
+            "Doe Jane_4711_assignsubmission_file_/report.pdf": PDF,
+            "Müller Zoë_12_assignsubmission_file_/Bericht.pdf": PDF,
+            "Old Style_99_assignsubmission_file_report.pdf": PDF,
+        }
+    )
+    canvas = zipped({"doejane_12345_67890_report-1.pdf": PDF, "roejo_LATE_5_6_r.pdf": PDF})
+    gradescope = zipped({"assignment_7_export/submission_31/report.pdf": PDF})
+    found = [
+        guess_student(submission.name)
+        for content in (moodle, canvas, gradescope)
+        for submission in collect([write(tmp_path / "export.zip", content)])[0]
+    ]
+    assert found == [
+        ("Doe Jane", "4711"),
+        ("Müller Zoë", "12"),
+        ("Old Style", "99"),
+        ("doejane", "12345"),
+        ("roejo", "5"),
+        ("", "31"),
+    ]
+    assert guess_student("flight 3/report_2024_1_final.pdf")[0] in {"report", ""}
+
+
+def test_a_zip_in_a_zip_is_read_and_no_deeper(tmp_path):
+    deepest = zipped({"deep.pdf": PDF})
+    inner = zipped({"report.pdf": PDF, "more.zip": deepest, "log.ulg": b""})
+    path = write(tmp_path / "all.zip", zipped({"Roe_1_assignsubmission_file_/work.zip": inner}))
+    found, notes = collect([path])
+    assert [each.name for each in found] == ["Roe_1_assignsubmission_file_/work.zip/report.pdf"]
+    assert guess_student(found[0].name) == ("Roe", "1")
+    assert read(found[0]) == PDF
+    assert any("too deep" in note for note in notes)
+    assert notes[-1] == "Passed over, since they are no PDFs: 1 .ulg."
+
+
+def test_a_zip_in_a_folder_keeps_its_own_name(tmp_path):
+    write(tmp_path / "doejane_5_6_work.zip", zipped({"report.pdf": PDF}))
+    assert names([tmp_path]) == ["doejane_5_6_work.zip/report.pdf"]
+    assert guess_student(names([tmp_path])[0]) == ("doejane", "5")
+
+
+def test_nothing_there(tmp_path):
+    with pytest.raises(SettingsError, match="no such file or folder"):
+        collect([tmp_path / "absent"])
+    write(tmp_path / "a.txt", b"")
+    with pytest.raises(SettingsError, match=r"No PDF was found.*1 \.txt") as caught:
+        collect([tmp_path])
+    assert "\n" not in str(caught.value)
+    write(tmp_path / "a.zip", b"PK\x03\x04 no")
+    with pytest.raises(SettingsError, match="not a zip file, or damaged"):
+        collect([tmp_path / "a.zip"])
+
+
+def test_a_damaged_zip_leaves_the_others(tmp_path):
+    write(tmp_path / "bad.zip", b"PK" + bytes(100))
+    write(tmp_path / "good.zip", zipped({"a.pdf": PDF, "inner.zip": b"PK\x05\x06 no"}))
+    found, notes = collect([tmp_path])
+    assert [each.name for each in found] == ["good.zip/a.pdf"]
+    assert len(notes) == 2
+    assert notes[0] == "bad.zip: passed over: not a zip file, or damaged."
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="links need rights that tests do not have")
+def test_links_do_not_lead_out_of_the_folder(tmp_path):
+    outside = write(tmp_path / "outside" / "secret.pdf", PDF)
+    inside = write(tmp_path / "in" / "a.pdf", PDF)
+    (tmp_path / "in" / "link.pdf").symlink_to(outside)
+    (tmp_path / "in" / "folder").symlink_to(outside.parent)
+    (tmp_path / "in" / "loop").symlink_to(tmp_path / "in")
+    (tmp_path / "in" / "gone.pdf").symlink_to(tmp_path / "nowhere")
+    (tmp_path / "in" / "same.pdf").symlink_to(inside)
+    os.mkfifo(tmp_path / "in" / "pipe.pdf")
+    found, notes = collect([tmp_path / "in"])
+    assert [each.name for each in found] == ["a.pdf"]
+    assert notes == ("in: 5 links out of the folder or special files were not followed.",)
+
+
+# ------------------------------------------------------------------ names
+
+
+def test_hostile_names_are_shown_and_never_used(tmp_path):
+    entries = {
+        "../../../etc/x.pdf": PDF,
+        "/etc/passwd.pdf": PDF,
+        "C:\\Windows\\system32\\y.pdf": PDF,
+        "=cmd|' /C calc'!A0.pdf": PDF,
+        "+1.pdf": PDF,
+        "<img src=x onerror=alert(1)>.pdf": PDF,
+        "a\x1b[2J\u202egnp.pdf": PDF,
+        "new\nline.pdf": PDF,
+        "n" * 5000 + ".pdf": PDF,
+    }
+    folder = tmp_path / "work"
+    path = write(folder / "x.zip", zipped(entries))
+    before = sorted(tmp_path.rglob("*"))
+    found, _ = collect([path])
+    shown = {each.name for each in found}
+    assert len(shown) == len(entries)
+    assert {"etc/x.pdf", "etc/passwd.pdf", "Windows/system32/y.pdf", "_1.pdf"} <= shown
+    assert "_cmd_' /C calc'!A0.pdf" in shown
+    assert "_img src=x onerror=alert(1)_.pdf" in shown
+    assert "a[2Jgnp.pdf" in shown
+    assert "new line.pdf" in shown
+    assert max(map(len, shown)) == 200
+    assert all(read(each) == PDF for each in found)
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_equal_names_are_told_apart(tmp_path):
+    for folder in "abc":
+        write(tmp_path / folder / "Report.pdf", folder.encode())
+    found, _ = collect([tmp_path / folder for folder in "abc"])
+    assert [each.name for each in found] == ["Report.pdf", "Report.pdf (2)", "Report.pdf (3)"]
+    assert [read(each) for each in found] == [b"a", b"b", b"c"]
+
+
+def test_two_entries_of_one_name(tmp_path):
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w") as archive:
+        archive.writestr("a.pdf", b"first")
+        with pytest.warns(UserWarning, match="Duplicate"):
+            archive.writestr("a.pdf", b"last")
+    found, notes = collect([write(tmp_path / "x.zip", out.getvalue())])
+    assert [read(each) for each in found] == [b"last"]
+    assert notes[0].startswith("x.zip: 1 entries have the name of another one")
+
+
+def test_names_without_a_mark_of_their_code_page(tmp_path):
+    content = zipped({"M_ller.pdf": PDF, "Zo__.pdf": PDF})
+    content = content.replace(b"M_ller", b"M\x81ller").replace(b"Zo__", "Zoë".encode())
+    assert names([write(tmp_path / "x.zip", content)]) == ["Müller.pdf", "Zoë.pdf"]
+
+
+# ------------------------------------------------------------------ bounds
+
+
+def test_files_that_are_too_large(tmp_path):
+    path = tmp_path / "large.pdf"
+    with path.open("wb") as file:
+        file.truncate(500_000_000)  # sparse: it takes no space
+    tracemalloc.start()
+    said = reason(only(path))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert said == "large.pdf: larger than 25 MB; reports are below 2 MB."
+    assert peak < 3 * MAX_BYTES
+
+
+def test_a_file_that_is_gone(tmp_path):
+    submission = only(write(tmp_path / "a.pdf", PDF))
+    submission.file.unlink()
+    assert reason(submission) == "a.pdf: no file any more."
+
+
+def test_bombs_and_lies(tmp_path):
+    packed = zipped({"bomb.pdf": bytes(20_000_000)})
+    path = write(tmp_path / "x.zip", packed)
+    assert "shrinks more than 100 times" in reason(only(path))
+    path.write_bytes(zipped({"large.pdf": bytes(MAX_BYTES + 1)}))
+    assert "larger than 25 MB" in reason(only(path))
+    # a declared size that is smaller than what there is: zipfile stops there, and the sum is off
+    path.write_bytes(packed.replace(struct.pack("<I", 20_000_000), struct.pack("<I", 1000)))
+    assert "cannot be read" in reason(only(path))
+
+
+def test_a_zip_that_unpacks_to_too_much(tmp_path, monkeypatch):
+    monkeypatch.setattr(submissions, "MAX_TOTAL_BYTES", 50)
+    with pytest.raises(SettingsError, match="unpacks to more than"):
+        collect([write(tmp_path / "x.zip", zipped({"a.pdf": PDF, "b.pdf": PDF}))])
+
+
+def test_too_many_zip_files_in_a_zip(tmp_path, monkeypatch):
+    monkeypatch.setattr(submissions, "MAX_INNER_BYTES", 200)
+    inner = zipped({"r.pdf": PDF})
+    path = write(tmp_path / "x.zip", zipped({"a.zip": inner, "b.zip": inner}))
+    found, notes = collect([path])
+    assert [each.name for each in found] == ["a.zip/r.pdf"]
+    assert notes == ("x.zip: it holds too many zip files; the rest of it was passed over.",)
+
+
+def test_too_many_entries(tmp_path, monkeypatch):
+    monkeypatch.setattr(submissions, "MAX_ENTRIES", 3)
+    with pytest.raises(SettingsError, match="more than 3 entries"):
+        collect([write(tmp_path / "x.zip", zipped({f"{n}.pdf": PDF for n in range(4)}))])
+
+
+def test_a_table_of_contents_that_is_too_large(tmp_path):
+    entries = {f"{'n' * 60_000}{n}.pdf": b"" for n in range(80)}
+    path = write(tmp_path / "x.zip", zipped(entries))
+    with pytest.raises(SettingsError, match="not a zip file, or damaged"):
+        collect([path])
+
+
+def test_ten_thousand_equal_names(tmp_path):
+    found, _ = collect(
+        [write(tmp_path / "x.zip", zipped({f"{n}/a.pdf": b"" for n in range(9999)}))]
+    )
+    assert len({each.name for each in found}) == 9999
+    entries = {f"{' ' * n}a.pdf": b"" for n in range(500)}
+    found, _ = collect([write(tmp_path / "x.zip", zipped(entries))])
+    assert found[-1].name == "a.pdf (500)"
+
+
+def test_entries_that_are_not_plain_files(tmp_path):
+    link = zipfile.ZipInfo("link.pdf")
+    link.external_attr = 0o120777 << 16
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w") as archive:
+        archive.writestr(link, "/etc/passwd")
+        archive.writestr("packed.pdf", PDF, zipfile.ZIP_LZMA)
+    by_name = {each.name: each for each in collect([write(tmp_path / "x.zip", out.getvalue())])[0]}
+    assert "symbolic link" in reason(by_name["link.pdf"])
+    assert "a method that is not read" in reason(by_name["packed.pdf"])
+
+
+def test_encrypted_entries(tmp_path):
+    content = bytearray(zipped({"a.pdf": PDF}))
+    for mark, place in ((b"PK\x03\x04", 6), (b"PK\x01\x02", 8)):
+        content[content.index(mark) + place] |= 1
+    assert reason(only(write(tmp_path / "x.zip", bytes(content)))) == (
+        "a.pdf: encrypted in its zip file."
+    )
+
+
+def test_mutated_zip_files_never_raise_anything_else(tmp_path):
+    rng = random.Random(6)
+    whole = zipped({"a/report.pdf": PDF * 20, "b.zip": zipped({"c.pdf": PDF}), "d.txt": b""})
+    path = tmp_path / "x.zip"
+    for _ in range(int(os.environ.get("PX4FUSE_FUZZ", "300"))):
+        content = bytearray(whole)
+        for _ in range(rng.randint(1, 6)):
+            content[rng.randrange(len(content))] = rng.randrange(256)
+        path.write_bytes(content[: rng.choice([len(content), rng.randrange(len(content))])])
+        try:
+            found, notes = collect([path])
+        except SettingsError:
+            continue
+        assert all(isinstance(read(each), bytes | Refused) for each in found)
+        assert all("\n" not in note for note in notes)

@@ -1,0 +1,912 @@
+"""Reports that prove themselves: whatever is changed in one, it is no longer verified."""
+
+from __future__ import annotations
+
+import copy
+import hashlib
+import io
+import json
+import re
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from click.testing import CliRunner
+from forgery import Anatomy, Numbers, numbers_of, taken_apart
+from pypdf import PdfReader, PdfWriter
+from pypdf.generic import NameObject, TextStringObject
+
+from px4fuse.cli import cli
+from px4fuse.cli.verify import verify as verify_command
+from px4fuse.grading import rerun
+from px4fuse.grading.intake import read_report
+from px4fuse.grading.model import Refused, Report, Verdict
+from px4fuse.grading.page_comparison import plain_layout
+from px4fuse.grading.rerun import Recomputed
+from px4fuse.grading.verification import (
+    ESTIMATE_RELATIVE,
+    LIMIT,
+    RELATIVE,
+    compare_results,
+    verify,
+)
+from px4fuse.report.results import to_json
+from px4fuse.report.seal import seal_of, sealed
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+LOG = REPOSITORY / "sample_logs" / "aisle_uwb.ulg"
+LOOP_LOG = REPOSITORY / "sample_logs" / "loop_vio.ulg"
+SHIPPED = REPOSITORY / "reports" / "aisle_uwb.pdf"
+
+
+def report_of(pdf: bytes, *, with_text: bool = False) -> Report:
+    """A report, read without care: tests of reading are elsewhere."""
+    reader = PdfReader(io.BytesIO(pdf))
+    results = json.loads(reader.attachments["results.json"][0])
+    pages = tuple(page.extract_text() if with_text else "" for page in reader.pages)
+    return Report(hashlib.sha256(pdf).hexdigest(), len(pdf), seal_of(pdf), results, pages, pdf)
+
+
+@dataclass(frozen=True)
+class Base:
+    """A report that is verified, and its analysis, computed once."""
+
+    pdf: bytes
+    results: dict[str, Any]
+    again: Recomputed
+    files: Mapping[str, Path]
+    anatomy: Anatomy
+    numbers: Numbers
+
+    def recompute(
+        self, results: Mapping[str, Any], logs: Mapping[str, Path]
+    ) -> Recomputed | Refused:
+        """The analysis from memory, where it is this one; else as it really is."""
+        if any(
+            results.get(part) != self.results[part] for part in ("student", "provenance")
+        ) or rerun.log_sha256(results) != rerun.log_sha256(self.results):
+            return rerun.recompute(results, logs)
+        return self.again
+
+    def verified(self, pdf: bytes) -> Verdict:
+        """The verdict on a forged report, with the log."""
+        return verify(report_of(pdf), self.files, recompute=self.recompute)
+
+    def with_results(self, results: Mapping[str, Any]) -> Anatomy:
+        """The report with other results attached."""
+        text = to_json(dict(results)).encode()
+        return self.anatomy.streamed(self.numbers.results, lambda _: text)
+
+
+def base(pdf: bytes, log: Path) -> Base:
+    files = rerun.hashed([log])
+    results = report_of(pdf).results
+    again = rerun.recompute(results, files)
+    assert isinstance(again, Recomputed), again
+    drawn = again.draw()
+    kept = Recomputed(again.results, lambda: drawn)
+    return Base(drawn, report_of(drawn).results, kept, files, taken_apart(drawn),
+                numbers_of(drawn))  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def aisle() -> Base:
+    return base(SHIPPED.read_bytes(), LOG)
+
+
+@pytest.fixture(scope="module")
+def loop(tmp_path_factory: pytest.TempPathFactory) -> Base:
+    folder = tmp_path_factory.mktemp("loop")
+    (folder / "notes.md").write_text("# Drift\n\nThe *heading* drifts most.\n", encoding="utf-8")
+    target = folder / "loop.pdf"
+    words = ["loop", str(LOOP_LOG), "-o", str(target), "--student", "Ada", "--id", "7",
+             "--notes", str(folder / "notes.md")]  # fmt: skip
+    outcome = CliRunner().invoke(cli, words, standalone_mode=False)
+    assert outcome.exception is None, outcome.output
+    return base(target.read_bytes(), LOOP_LOG)
+
+
+# -- what is untouched -----------------------------------------------------------------------------
+
+
+def test_the_shipped_report_is_verified(aisle: Base) -> None:
+    report = report_of(SHIPPED.read_bytes())
+    verdict = verify(report, aisle.files, recompute=aisle.recompute)
+    assert verdict.status == "verified", verdict
+    assert verdict.with_log
+    assert LIMIT in verdict.reasons
+    assert aisle.pdf == report.pdf
+
+
+def test_a_report_on_a_loop_is_verified(loop: Base) -> None:
+    verdict = loop.verified(loop.pdf)
+    assert verdict.status == "verified", verdict
+    text = "".join(page.extract_text() for page in PdfReader(io.BytesIO(loop.pdf)).pages)
+    assert "Ada" in text
+    assert "heading drifts most" in text.replace("*", "")
+
+
+def test_nothing_is_verified_without_the_log(aisle: Base, loop: Base) -> None:
+    for one in (aisle, loop):
+        verdict = verify(report_of(one.pdf, with_text=True))
+        assert verdict.status == "cannot verify"
+        assert verdict.reasons == ("no log was given; the pages agree with the results",)
+        assert not verdict.with_log
+
+
+def test_the_real_reader_gives_the_same(aisle: Base) -> None:
+    read = read_report(aisle.pdf, "aisle.pdf")
+    assert isinstance(read, Report)
+    assert verify(read, aisle.files, recompute=aisle.recompute).status == "verified"
+    assert verify(read).reasons == ("no log was given; the pages agree with the results",)
+
+
+def nudged(value: Any, share: float) -> Any:
+    if isinstance(value, float):
+        return value * (1.0 + share)
+    if isinstance(value, dict):
+        return {name: nudged(part, share) for name, part in value.items()}
+    return [nudged(part, share) for part in value] if isinstance(value, list | tuple) else value
+
+
+def shifted(pdf: bytes, numbers: Numbers, by: float) -> bytes:
+    """All lines and marks a little aside."""
+
+    def moved(match: re.Match[bytes]) -> bytes:
+        x, y = float(match[1]) + by, float(match[2]) + by
+        return b"%.6f %.6f %s" % (x, y, match[3])
+
+    anatomy = taken_apart(pdf)
+    for number in numbers.contents:
+        anatomy = anatomy.streamed(
+            number,
+            lambda content: re.sub(rb"(?m)^(\d[\d.]*) (\d[\d.]*) ([ml])$", moved, content),
+        )
+    return anatomy.sealed()
+
+
+@pytest.mark.parametrize("which", ["aisle", "loop"])
+def test_another_platform_is_still_verified(which: str, request: pytest.FixtureRequest) -> None:
+    one: Base = request.getfixturevalue(which)
+    drawn = shifted(one.pdf, one.numbers, 0.01)
+    elsewhere = Recomputed(nudged(json.loads(to_json(one.again.results)), 1e-9), lambda: drawn)
+    verdict = verify(report_of(one.pdf), one.files, recompute=lambda *_: elsewhere)
+    assert verdict.status == "verified", verdict
+    assert f"within {RELATIVE:g}" in verdict.reasons[0]
+    aside = shifted(one.pdf, one.numbers, 0.6)
+    elsewhere = Recomputed(one.again.results, lambda: aside)
+    verdict = verify(report_of(one.pdf), one.files, recompute=lambda *_: elsewhere)
+    assert verdict.status == "page altered"
+    assert len(verdict.pages) >= len(one.numbers.pages) - 1
+
+
+def test_tolerances(aisle: Base) -> None:
+    ours = json.loads(to_json(aisle.again.results))
+    for share, path, alike in (
+        (0.5 * RELATIVE, ("axes", "north", "kf", "nis_mean"), True),
+        (2.0 * RELATIVE, ("axes", "north", "kf", "nis_mean"), False),
+        (0.5 * ESTIMATE_RELATIVE, ("tuning", "horizontal", "sigma_a_m_s2"), True),
+        (2.0 * ESTIMATE_RELATIVE, ("tuning", "horizontal", "sigma_a_m_s2"), False),
+    ):
+        theirs = copy.deepcopy(ours)
+        part = theirs
+        for name in path[:-1]:
+            part = part[name]
+        part[path[-1]] *= 1.0 + share
+        assert (not compare_results(theirs, ours).differences) == alike, path
+
+
+# -- what is changed in the results ----------------------------------------------------------------
+
+Change = Callable[[dict[str, Any]], Any]
+
+
+def leaves(value: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+    if isinstance(value, dict):
+        for name, part in value.items():
+            yield from leaves(part, (*path, name))
+    elif isinstance(value, list) and value:
+        yield from leaves(value[0], (*path, 0))
+    else:
+        yield path
+
+
+def one_of_each_kind() -> list[tuple[Any, ...]]:
+    """A leaf of every name in the results."""
+    results = report_of(SHIPPED.read_bytes()).results
+    # what another test is for: the log, the version, and what is printed anew
+    apart = ("schema", "student", "provenance")
+    kinds = {
+        path[-1]: path
+        for path in leaves(results)
+        if path[0] not in apart and path != ("log", "sha256")
+    }
+    return list(kinds.values())
+
+
+KINDS = one_of_each_kind()
+
+
+def changed(results: dict[str, Any], path: tuple[Any, ...]) -> dict[str, Any]:
+    forged = copy.deepcopy(results)
+    part: Any = forged
+    for name in path[:-1]:
+        part = part[name]
+    value = part[path[-1]]
+    if isinstance(value, bool):
+        part[path[-1]] = not value
+    elif isinstance(value, int):
+        part[path[-1]] = value + 3
+    elif isinstance(value, float):
+        part[path[-1]] = value * 1.01 + 2e-5
+    elif isinstance(value, str):
+        part[path[-1]] = value[:-1] + ("x" if value[-1:] != "x" else "y")
+    else:
+        part[path[-1]] = [1.0]
+    return forged
+
+
+def test_a_hundred_kinds_of_numbers_and_words() -> None:
+    assert len(KINDS) >= 100
+
+
+@pytest.mark.parametrize("path", KINDS, ids=lambda path: ".".join(map(str, path)))
+def test_a_changed_leaf_of_the_results(aisle: Base, path: tuple[Any, ...]) -> None:
+    forged = aisle.with_results(changed(aisle.results, path))
+    for pdf in (forged.sealed(), forged.unsealed()):
+        verdict = aisle.verified(pdf)
+        assert verdict.status == "numbers differ", verdict
+        (difference,) = verdict.differences
+        assert difference.path.replace("[0]", ".0").startswith(".".join(map(str, path)))
+
+
+def without(*path: Any) -> Change:
+    def change(results: dict[str, Any]) -> None:
+        part: Any = results
+        for name in path[:-1]:
+            part = part[name]
+        del part[path[-1]]
+
+    return change
+
+
+def put(value: Any, *path: Any) -> Change:
+    def change(results: dict[str, Any]) -> None:
+        part: Any = results
+        for name in path[:-1]:
+            part = part[name]
+        if isinstance(part, list) and path[-1] == len(part):
+            part.append(value)
+        else:
+            part[path[-1]] = value
+
+    return change
+
+
+STRUCTURE: dict[str, tuple[Change, str]] = {
+    "a finding less": (without("findings", 0), "numbers differ"),
+    "no finding": (put([], "findings"), "numbers differ"),
+    "a finding more": (
+        lambda r: r["findings"].append(copy.deepcopy(r["findings"][0])), "numbers differ",
+    ),
+    "findings in another order": (lambda r: r["findings"].reverse(), "numbers differ"),
+    "another severity": (put("error", "findings", 0, "severity"), "numbers differ"),
+    "an axis less": (without("axes", "down"), "numbers differ"),
+    "an axis more": (
+        lambda r: r["axes"].update(up=copy.deepcopy(r["axes"]["down"])), "numbers differ",
+    ),
+    "two axes exchanged": (
+        lambda r: r["axes"].update(north=r["axes"]["east"], east=r["axes"]["north"]),
+        "numbers differ",
+    ),
+    "a filter's part as if it were not available": (
+        put({"unavailable": {"what": "a", "reason": "b", "remedy": "c"}}, "axes", "north", "ekf2"),
+        "numbers differ",
+    ),
+    "a parameter more": (put(1.0, "log", "parameters", "EKF2_HACK"), "numbers differ"),
+    "a dropout": (put([{"time_s": 1.0, "duration_s": 1.0}], "log", "dropouts"), "numbers differ"),
+    "a note more": (put("all is well", "notes", 1), "numbers differ"),
+    "a number as a text": (put("0.5", "settings", "sigma_a_m_s2"), "numbers differ"),
+    "a number as true": (put(True, "axes", "north", "kf", "nis_mean"), "numbers differ"),
+    "a number as a list": (put([0.8], "axes", "north", "kf", "nis_mean"), "numbers differ"),
+    "a part deep down": (put({"a": {"b": [[[[]]]]}}, "settings", "more"), "numbers differ"),
+    "an interval narrower": (
+        lambda r: r["tuning"]["horizontal"].update(
+            sigma_z_m_interval=[r["tuning"]["horizontal"]["sigma_z_m"]] * 2
+        ),
+        "numbers differ",
+    ),
+    "the results of nothing": (
+        lambda r: [r.pop(k) for k in [*r] if k not in ("schema", "log", "student", "provenance")],
+        "numbers differ",
+    ),
+    "another log": (put("0" * 64, "log", "sha256"), "other log"),
+    "no log": (without("log"), "other log"),
+    "the log as a number": (put(7, "log", "sha256"), "other log"),
+    "another version": (put("0.0.9", "provenance", "px4fuse"), "cannot verify"),
+    "no version": (without("provenance", "px4fuse"), "cannot verify"),
+    "no provenance": (without("provenance"), "cannot verify"),
+    "another schema": (put("px4fuse-graph", "schema", "name"), "cannot verify"),
+    "another version of the schema": (put("0.9", "schema", "version"), "cannot verify"),
+    "no schema": (without("schema"), "cannot verify"),
+    "no student": (without("student"), "cannot verify"),
+    "the student as a number": (put(7, "student", "name"), "cannot verify"),
+    "notes without an end": (put("x\n" * 200_000, "student", "notes"), "cannot verify"),
+    "no libraries": (put({}, "provenance", "libraries"), "cannot verify"),
+    "a library of no version": (
+        put("1\n2", "provenance", "libraries", "numpy"), "cannot verify",
+    ),
+}  # fmt: skip
+COMMANDS = {
+    "no command": "",
+    "another program": "rm -rf aisle_uwb.ulg",
+    "another command": "px4fuse tune aisle_uwb.ulg",
+    "help": "px4fuse compare aisle_uwb.ulg --help",
+    "an unknown option": "px4fuse compare aisle_uwb.ulg --please",
+    "an output": "px4fuse compare aisle_uwb.ulg -o evil.pdf",
+    "results": "px4fuse compare aisle_uwb.ulg --json evil.json",
+    "notes of this machine": "px4fuse compare aisle_uwb.ulg --notes /etc/passwd",
+    "a student in the command": "px4fuse compare aisle_uwb.ulg --student Eve",
+    "an open quote": "px4fuse compare 'aisle_uwb.ulg",
+    "a path": "px4fuse compare ../../etc/passwd",
+    "an absolute path": "px4fuse compare /etc/passwd",
+    "a path of Windows": "px4fuse compare '..\\aisle_uwb.ulg'",
+    "two logs": "px4fuse compare aisle_uwb.ulg aisle_uwb.ulg",
+    "no log": "px4fuse compare",
+    "a recording that was not joined": "px4fuse compare aisle_uwb.ulg --mavlink /etc/passwd",
+    "a position file that was not joined": "px4fuse compare aisle_uwb.ulg --position x.csv",
+    "a value out of range": "px4fuse compare aisle_uwb.ulg --sigma-a 1e9",
+    "a value that is none": "px4fuse compare aisle_uwb.ulg --sigma-a much",
+    "a value without an end": "px4fuse compare aisle_uwb.ulg --start nan",
+    "a million words": "px4fuse compare " + "a " * 1_000_000,
+    "axes of a file": "px4fuse loop aisle_uwb.ulg --frame ned",
+}
+STRUCTURE |= {
+    f"command: {name}": (put(command, "provenance", "command"), "cannot verify")
+    for name, command in COMMANDS.items()
+}
+
+
+@pytest.mark.parametrize("name", STRUCTURE)
+def test_changed_results(aisle: Base, name: str) -> None:
+    change, expected = STRUCTURE[name]
+    results = copy.deepcopy(aisle.results)
+    change(results)
+    forged = aisle.with_results(results)
+    for pdf in (forged.sealed(), forged.unsealed()):
+        verdict = aisle.verified(pdf)
+        assert verdict.status == expected, verdict
+
+
+def test_another_command_gives_other_numbers(aisle: Base) -> None:
+    results = copy.deepcopy(aisle.results)
+    results["provenance"]["command"] = "px4fuse compare other.ulg --axis down"
+    verdict = aisle.verified(aisle.with_results(results).sealed())
+    assert verdict.status == "numbers differ", verdict
+
+
+@pytest.mark.parametrize(
+    "path",
+    [("student", "name"), ("student", "notes"), ("provenance", "libraries", "numpy")],
+)
+def test_what_is_printed_from_the_record(loop: Base, path: tuple[str, ...]) -> None:
+    results = copy.deepcopy(loop.results)
+    put({"name": "Eve", "notes": "I flew it."}.get(path[-1], "9.9.9"), *path)(results)
+    forged = loop.with_results(results)
+    again = rerun.recompute(results, loop.files)
+    for pdf in (forged.sealed(), forged.unsealed()):
+        verdict = verify(report_of(pdf), loop.files, recompute=lambda *_: again)
+        assert verdict.status == "page altered", verdict
+
+
+def test_another_matplotlib_is_no_accusation(loop: Base) -> None:
+    results = copy.deepcopy(loop.results)
+    results["provenance"]["libraries"]["matplotlib"] = "3.10.0"
+    verdict = loop.verified(loop.with_results(results).sealed())
+    assert verdict.status == "cannot verify"
+    assert "matplotlib" in verdict.reasons[0]
+
+
+# -- what is changed on the pages ------------------------------------------------------------------
+
+Forge = Callable[[Base], Anatomy]
+
+
+def on_page(number: int, change: Callable[[bytes], bytes]) -> Forge:
+    return lambda one: one.anatomy.streamed(one.numbers.contents[number - 1], change)
+
+
+def once(pattern: bytes, replacement: Any, *, last: bool = True) -> Callable[[bytes], bytes]:
+    """Replace one match: by default the last."""
+
+    def change(content: bytes) -> bytes:
+        found = list(re.finditer(pattern, content))
+        match = found[-1 if last else 0]
+        new = replacement(match) if callable(replacement) else match.expand(replacement)
+        return content[: match.start()] + new + content[match.end() :]
+
+    return change
+
+
+def other_digit(match: re.Match[bytes]) -> bytes:
+    return b"(\x00%d)" % ((int(match[1]) + 1) % 10)
+
+
+def aside(match: re.Match[bytes]) -> bytes:
+    return b"%.6f %s l" % (float(match[1]) + 2.0, match[2])
+
+
+DRAWING: dict[str, Callable[[bytes], bytes]] = {
+    "another digit": once(rb"\(\x00(\d)\)", other_digit),
+    "a digit less": once(rb"\(\x00(\d)\)", b"()"),
+    "a point of a line moved": once(rb"([\d.]+) ([\d.]+) l", aside),
+    "another point of a line moved": once(rb"([\d.]+) ([\d.]+) l", aside, last=False),
+    "a line more": lambda c: c + b"\n0 0 m\n500 500 l\nS\n",
+    "a white rectangle": lambda c: c + b"\n1 g\n100 100 80 12 re\nf\n",
+    "a text more": lambda c: c + b"\nBT\n/F2 12 Tf\n100 100 Td\n(\x00A) Tj\nET\n",
+    "a text moved": once(rb"1 0 -?0 1 ([\d.]+) ([\d.]+) cm\nBT", rb"1 0 -0 1 9\1 \2 cm\nBT"),
+    "a text invisible": once(rb"BT\n", b"BT\n3 Tr\n"),
+    "a text white": once(rb"BT\n", b"1 g\nBT\n"),
+    "a text larger": once(rb"(/F\d+) [\d.]+ Tf", rb"\1 14 Tf"),
+    "another font": once(rb"/F2 ", b"/F3 "),
+    "a colour": once(rb"[\d.]+ g\n", b"0.123 g\n"),
+    "the end cut off": lambda c: c[: c.rindex(b"\nQ")],
+    "a comment": lambda c: c + b"\n% nothing\n",
+    "an inline image": lambda c: c + b"\nBI /W 1 /H 1 /BPC 8 /CS /G ID \xff EI\n",
+    "clipped": lambda c: b"0 0 300 300 re W n\n" + c,
+    "turned over": lambda c: b"-1 0 0 1 595 0 cm\n" + c,
+    "nothing at all": lambda c: b"\n",
+}
+PAGES = 9
+
+
+# Every page in two ways, and each of the others on three pages
+DRAWN = [
+    (page, name)
+    for place, name in enumerate(DRAWING)
+    for page in range(1, PAGES + 1)
+    if name in ("another digit", "a white rectangle") or (page + place) % 3 == 0
+]
+
+
+@pytest.mark.parametrize(("page", "name"), DRAWN)
+def test_a_changed_page(aisle: Base, page: int, name: str) -> None:
+    forged = on_page(page, DRAWING[name])(aisle)
+    for pdf in (forged.sealed(), forged.unsealed()):
+        verdict = aisle.verified(pdf)
+        assert verdict.status == "page altered", verdict
+        assert verdict.pages == (page,)
+
+
+def of_object(which: Callable[[Numbers], int], change: Callable[[bytes], bytes]) -> Forge:
+    return lambda one: one.anatomy.edited(which(one.numbers), change)
+
+
+def entry(text: bytes) -> Callable[[bytes], bytes]:
+    """Put an entry into a dictionary."""
+    return lambda content: content.replace(b"<<\n", b"<<\n" + text + b"\n", 1)
+
+
+def kids(change: Callable[[list[bytes]], list[bytes]]) -> Forge:
+    def forge(one: Base) -> Anatomy:
+        def rewritten(content: bytes) -> bytes:
+            found = re.search(rb"/Kids \[ (.*?) \]", content)
+            assert found is not None
+            pages = change(re.findall(rb"\d+ 0 R", found[1]))
+            content = content.replace(found[1], b" ".join(pages))
+            return re.sub(rb"/Count \d+", b"/Count %d" % len(pages), content)
+
+        return one.anatomy.edited(one.numbers.tree, rewritten)
+
+    return forge
+
+
+def font_part(name: str, path: list[str]) -> Callable[[Base], int]:
+    def find(one: Base) -> int:
+        found: Any = PdfReader(io.BytesIO(one.pdf)).pages[0]["/Resources"]["/Font"][name]  # type: ignore[index]
+        for key in path[:-1]:
+            found = found[int(key)] if key.isdigit() else found[key]
+            found = found.get_object()
+        return int(found.raw_get(path[-1]).idnum)
+
+    return find
+
+
+def exchanged_glyphs(one: Base) -> Anatomy:
+    """A font that draws a 9 where the text has a 1: all texts stay, the page reads otherwise."""
+    number = font_part("/F2", ["/DescendantFonts", "0", "/CIDToGIDMap"])(one)
+
+    def change(content: bytes) -> bytes:
+        glyphs = bytearray(content)
+        for a, b in (("1", "9"), ("9", "1")):
+            glyphs[2 * ord(a) : 2 * ord(a) + 2] = content[2 * ord(b) : 2 * ord(b) + 2]
+        return bytes(glyphs)
+
+    return one.anatomy.streamed(number, change)
+
+
+def redrawn_glyph(one: Base) -> Anatomy:
+    """A font whose outlines were edited."""
+    from fontTools.ttLib import TTFont  # type: ignore[import-untyped]
+
+    number = font_part("/F2", ["/DescendantFonts", "0", "/FontDescriptor", "/FontFile2"])(one)
+    glyphs = font_part("/F2", ["/DescendantFonts", "0", "/CIDToGIDMap"])(one)
+    stream: Any = PdfReader(io.BytesIO(one.pdf)).get_object(glyphs)
+    data = stream.get_data()
+
+    def change(content: bytes) -> bytes:
+        font = TTFont(io.BytesIO(content))
+        names = [font.getGlyphName(int.from_bytes(data[2 * ord(d) : 2 * ord(d) + 2], "big"))
+                 for d in "38"]  # fmt: skip
+        font["glyf"][names[0]] = font["glyf"][names[1]]
+        out = io.BytesIO()
+        font.save(out)
+        return out.getvalue()
+
+    return one.anatomy.streamed(number, change)
+
+
+def narrower_letters(one: Base) -> Anatomy:
+    number = font_part("/F2", ["/DescendantFonts", "0", "/W"])(one)
+    return one.anatomy.edited(number, lambda c: c.replace(b"636", b"036"))
+
+
+def rewritten_texts(one: Base) -> Anatomy:
+    number = font_part("/F2", ["/ToUnicode"])(one)
+    return one.anatomy.streamed(number, lambda c: c.replace(b"<0031>]", b"<0039>]").replace(
+        b"<0031> <0032>", b"<0039> <0032>"))  # fmt: skip
+
+
+def another_state(one: Base) -> Anatomy:
+    return one.anatomy.edited(one.numbers.states, lambda c: c.replace(b"/ca 1\n", b"/ca 0\n", 1)
+                              if b"/ca 1\n" in c else c.replace(b"/CA 1", b"/CA 0", 1))  # fmt: skip
+
+
+def another_marker(one: Base) -> Anatomy:
+    found: Any = PdfReader(io.BytesIO(one.pdf)).pages[0]["/Resources"]["/XObject"]  # type: ignore[index]
+    return one.anatomy.streamed(found.raw_get("/M0").idnum, lambda c: c.replace(b"0.45", b"4.5"))
+
+
+JAVASCRIPT = b"/OpenAction << /S /JavaScript /JS (app.alert\\(1\\)) >>"
+NOTE = (b"/Annots [ << /Type /Annot /Subtype /FreeText /Rect [ 100 100 200 120 ] /Contents (0.01) "
+        b"/DA (/Helv 8 Tf) >> ]")  # fmt: skip
+DOCUMENT: dict[str, tuple[Forge, str]] = {
+    "the first page away": (kids(lambda k: k[1:]), "page altered"),
+    "a page away": (kids(lambda k: k[:3] + k[4:]), "page altered"),
+    "the last page away": (kids(lambda k: k[:-1]), "page altered"),
+    "a page twice": (kids(lambda k: [*k[:2], *k[1:]]), "page altered"),
+    "a page again at the end": (kids(lambda k: [*k, k[2]]), "page altered"),
+    "two pages exchanged": (kids(lambda k: [k[1], k[0], *k[2:]]), "page altered"),
+    "pages in reverse": (kids(lambda k: k[::-1]), "page altered"),
+    "one page for all": (kids(lambda k: k[:1] * len(k)), "page altered"),
+    "an annotation": (
+        of_object(lambda n: n.pages[1], lambda c: re.sub(rb"/Annots \d+ 0 R", NOTE, c)),
+        "page altered",
+    ),
+    "a page turned": (of_object(lambda n: n.pages[2], entry(b"/Rotate 180")), "page altered"),
+    "a page cut": (
+        of_object(lambda n: n.pages[2], entry(b"/CropBox [ 0 0 300 300 ]")), "page altered",
+    ),
+    "a page smaller": (
+        of_object(lambda n: n.pages[2], lambda c: c.replace(b"841.68", b"641.68")), "page altered",
+    ),
+    "a page in other units": (of_object(lambda n: n.pages[2], entry(b"/UserUnit 2")),
+                              "page altered"),
+    "an action of a page": (
+        of_object(lambda n: n.pages[2], entry(b"/AA << /O << /S /JavaScript /JS (1) >> >>")),
+        "page altered",
+    ),
+    "all pages turned": (of_object(lambda n: n.tree, entry(b"/Rotate 180")), "page altered"),
+    "all pages cut": (
+        of_object(lambda n: n.tree, entry(b"/CropBox [ 0 0 300 300 ]")), "page altered",
+    ),
+    "glyphs exchanged": (exchanged_glyphs, "page altered"),
+    "a glyph redrawn": (redrawn_glyph, "page altered"),
+    "letters narrower": (narrower_letters, "page altered"),
+    "texts of glyphs exchanged": (rewritten_texts, "page altered"),
+    "marks larger": (another_marker, "page altered"),
+    "a script": (of_object(lambda n: n.root, entry(JAVASCRIPT)), "cannot verify"),
+    "a form": (of_object(lambda n: n.root, entry(b"/AcroForm << /Fields [ ] >>")),
+               "cannot verify"),
+    "layers": (of_object(lambda n: n.root, entry(b"/OCProperties << /OCGs [ ] /D << >> >>")),
+               "cannot verify"),
+    "named scripts": (of_object(lambda n: n.names, entry(b"/JavaScript << /Names [ ] >>")),
+                      "cannot verify"),
+    "another title": (
+        of_object(lambda n: n.info, lambda c: c.replace(b"/Title (px4", b"/Title (my ")),
+        "cannot verify",
+    ),
+    "another creator": (
+        of_object(lambda n: n.info, lambda c: c.replace(b"/Creator (px4", b"/Creator (abc")),
+        "cannot verify",
+    ),
+    "an author": (of_object(lambda n: n.info, entry(b"/Author (Eve)")), "cannot verify"),
+    "a date": (of_object(lambda n: n.info, entry(b"/CreationDate (D:20260101)")), "cannot verify"),
+    "a part that nothing refers to": (
+        lambda one: one.anatomy.added(b"<< /Eve 1 >>")[0], "cannot verify",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", DOCUMENT)
+def test_a_changed_document(aisle: Base, name: str) -> None:
+    forge, expected = DOCUMENT[name]
+    forged = forge(aisle)
+    for pdf in (forged.sealed(), forged.unsealed()):
+        verdict = aisle.verified(pdf)
+        assert verdict.status == expected, verdict
+
+
+def saved_again(pdf: bytes) -> bytes:
+    out = io.BytesIO()
+    PdfWriter(clone_from=io.BytesIO(pdf)).write(out)
+    return out.getvalue()
+
+
+def appended_version(pdf: bytes) -> bytes:
+    """A second version of the first page, appended as an incremental update."""
+    number = numbers_of(pdf).contents[0]
+    place = len(pdf)
+    content = b"%d 0 obj\n<<\n/Length 1\n>>\nstream\n \nendstream\nendobj\n" % number
+    start = place + len(content)
+    before = re.findall(rb"startxref\n(\d+)\n", pdf)[-1]
+    return (
+        pdf
+        + content
+        + b"xref\n%d 1\n%010d 00000 n \ntrailer\n<<\n/Size %d\n/Root 1 0 R\n/Prev %s\n>>\n"
+        % (number, place, 200, before)
+        + b"startxref\n%d\n%%%%EOF\n" % start
+    )
+
+
+def pages_of_another(one: Base, other: Base) -> bytes:
+    """A report with the last page of another."""
+    writer = PdfWriter(clone_from=io.BytesIO(one.pdf))
+    writer.remove_page(len(one.numbers.pages) - 1)
+    writer.add_page(PdfReader(io.BytesIO(other.pdf)).pages[-1])
+    out = io.BytesIO()
+    writer.write(out)
+    return out.getvalue()
+
+
+def with_link(pdf: bytes) -> bytes:
+    writer = PdfWriter(clone_from=io.BytesIO(pdf))
+    writer.root_object[NameObject("/URI")] = TextStringObject("http://example.org")
+    out = io.BytesIO()
+    writer.write(out)
+    return out.getvalue()
+
+
+FILES: dict[str, tuple[Callable[[Base, Base], bytes], set[str]]] = {
+    "saved again": (lambda a, _: saved_again(a.pdf), {"cannot verify"}),
+    "saved again twice": (lambda a, _: saved_again(saved_again(a.pdf)), {"cannot verify"}),
+    "the seal removed": (lambda a, _: a.anatomy.assembled(), {"cannot verify"}),
+    "the seal of another": (
+        lambda a, b: a.anatomy.assembled() + b.anatomy.seal, {"cannot verify"},
+    ),
+    "bytes appended": (lambda a, _: a.pdf + b"\n% Eve\n", {"cannot verify"}),
+    "a version appended": (
+        lambda a, _: appended_version(a.anatomy.assembled()), {"page altered", "cannot verify"},
+    ),
+    "a page of another report": (pages_of_another, {"page altered"}),
+    "a link": (lambda a, _: with_link(a.pdf), {"cannot verify"}),
+    "results of another report": (
+        lambda a, b: a.with_results(b.results).assembled(), {"other log"},
+    ),
+    "bytes before the first object": (
+        lambda a, _: replace(a.anatomy, head=a.anatomy.head + b"% Eve\n").assembled(),
+        {"cannot verify"},
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", FILES)
+@pytest.mark.parametrize("resealed", [False, True])
+def test_a_changed_file(aisle: Base, loop: Base, name: str, resealed: bool) -> None:
+    forge, expected = FILES[name]
+    if resealed and name.startswith("the seal"):
+        return  # a seal put back where it was
+    pdf = forge(aisle, loop)
+    verdict = aisle.verified(sealed(pdf) if resealed else pdf)
+    assert verdict.status in expected, verdict
+
+
+def test_another_log(aisle: Base) -> None:
+    for files in ([LOOP_LOG], [Path(__file__)], [LOOP_LOG, Path(__file__)]):
+        verdict = verify(report_of(aisle.pdf), files)
+        assert verdict.status == "other log"
+        assert not verdict.with_log
+
+
+def test_the_name_of_the_log_does_not_matter(aisle: Base, tmp_path: Path) -> None:
+    """Nor is a file taken for the log since it is called so."""
+    wrong = tmp_path / "aisle_uwb.ulg"
+    wrong.write_bytes(LOOP_LOG.read_bytes())
+    assert verify(report_of(aisle.pdf), [wrong]).status == "other log"
+
+
+def test_a_joined_recording_is_found_by_its_content(tmp_path: Path) -> None:
+    """And what it is called here does not show."""
+    source = REPOSITORY / "sample_logs"
+    target = tmp_path / "joined.pdf"
+    words = [
+        "compare",
+        str(source / "aisle_uwb.ulg"),
+        "--position",
+        str(source / "aisle_uwb_external.csv"),
+        "--axis",
+        "down",
+        "-o",
+        str(target),
+    ]
+    outcome = CliRunner().invoke(cli, words, standalone_mode=False)
+    assert outcome.exception is None, outcome.output
+    report = report_of(target.read_bytes())
+    (tmp_path / "a").write_bytes(LOG.read_bytes())
+    (tmp_path / "b").write_bytes((source / "aisle_uwb_external.csv").read_bytes())
+    verdict = verify(report, [tmp_path / "a"])
+    assert verdict.status == "cannot verify"
+    assert "--position" in verdict.reasons[0]
+    assert verify(report, [tmp_path / "a", tmp_path / "b"]).status == "verified"
+
+
+# -- without the log -------------------------------------------------------------------------------
+
+PRINTED = [
+    ("log", "name"), ("log", "size_bytes"), ("log", "duration_s"), ("log", "firmware"),
+    ("log", "hardware"), ("log", "boot_time_s"), ("log", "format"), ("log", "sha256"),
+    ("log", "parameters", "EKF2_EV_DELAY"), ("settings", "sigma_a_m_s2"),
+    ("settings", "sigma_z_m"), ("settings", "dt_s"), ("settings", "start_s"),
+    ("settings", "segment_reason"), ("settings", "clock_offset_s"), ("position_source", "name"),
+    ("position_source", "rate_hz"), ("position_source", "reason"),
+    ("axes", "north", "kf", "nis_mean"), ("axes", "east", "kf", "count"),
+    ("axes", "down", "kf", "sqrt_s_median_m"), ("axes", "aisle", "ekf2", "nis_mean"),
+    ("axes", "north", "kf", "variance_factor"), ("axes", "north", "kf", "verdict"),
+    ("axes", "east", "truth", "kf_position_rmse_m"), ("axes", "east", "difference",
+    "velocity_rmse_m_s"), ("findings", 0, "message"), ("findings", 1, "remedy"),
+    ("findings", 0, "severity"), ("notes", 0), ("missing", 0, "reason"),
+    ("provenance", "command"), ("provenance", "python"), ("provenance", "libraries", "numpy"),
+    ("student", "name"),
+]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def loop_texts(loop: Base) -> Report:
+    return report_of(loop.pdf, with_text=True)
+
+
+@pytest.fixture(scope="module")
+def aisle_texts(aisle: Base) -> Report:
+    return report_of(aisle.pdf, with_text=True)
+
+
+@pytest.mark.parametrize("path", PRINTED, ids=lambda path: ".".join(map(str, path)))
+def test_without_the_log_pages_and_results_must_agree(
+    aisle: Base, aisle_texts: Report, path: tuple[Any, ...]
+) -> None:
+    results = changed(aisle.results, path)
+    if path[-1] in ("verdict", "severity"):
+        part: Any = results
+        for name in path[:-1]:
+            part = part[name]
+        part[path[-1]] = "consistent" if path[-1] == "verdict" else "error"
+    elif path[-1] in ("duration_s", "size_bytes", "clock_offset_s", "kf_position_rmse_m"):
+        part = results
+        for name in path[:-1]:
+            part = part[name]
+        part[path[-1]] = part[path[-1]] * 1.1 + 0.5
+    verdict = verify(replace(aisle_texts, results=results))
+    assert verdict.status == "page altered", verdict
+    assert verdict.pages
+
+
+def test_without_the_log_findings_are_neither_hidden_nor_invented(aisle_texts: Report) -> None:
+    for change in (
+        lambda findings: findings[:-1],
+        lambda findings: findings[::-1],
+        lambda findings: [*findings, findings[0]],
+        lambda findings: [],
+    ):
+        results = copy.deepcopy(aisle_texts.results)
+        results["findings"] = change(results["findings"])
+        assert verify(replace(aisle_texts, results=results)).status == "page altered"
+
+
+@pytest.mark.parametrize("name", ["two pages exchanged", "a page away", "a page twice"])
+def test_without_the_log_pages_are_where_they_belong(aisle: Base, name: str) -> None:
+    pdf = DOCUMENT[name][0](aisle).sealed()
+    assert verify(report_of(pdf, with_text=True)).status == "page altered"
+
+
+def test_without_the_log_a_broken_seal_is_told(aisle: Base) -> None:
+    verdict = verify(report_of(saved_again(aisle.pdf), with_text=True))
+    assert verdict.status == "cannot verify"
+    assert any("saved again" in reason for reason in verdict.reasons)
+
+
+@pytest.mark.parametrize(
+    "path",
+    [("closure_error_m",), ("path_length_m",), ("heading_error_deg",), ("key_frames",),
+     ("closures", 0, "d2"), ("closures", 0, "p"), ("closures", 0, "accepted"), ("start_s",),
+     ("closure_error_axes_m", "right"), ("known_end", "source"), ("track",)],
+)  # fmt: skip
+def test_without_the_log_the_figures_of_a_loop(loop_texts: Report, path: tuple[Any, ...]) -> None:
+    report = loop_texts
+    results = changed(report.results, ("loop", *path))
+    part: Any = results["loop"]
+    for name in path[:-1]:
+        part = part[name]
+    if isinstance(part[path[-1]], float):
+        part[path[-1]] = part[path[-1]] * 1.2 + 0.2
+    assert verify(replace(report, results=results)).status == "page altered"
+
+
+@pytest.mark.parametrize(
+    "results",
+    [{}, {"log": None}, {"log": {"name": 3}}, {"axes": [], "findings": {}}, {"settings": 1e308}],
+)
+def test_without_the_log_results_of_no_form(aisle_texts: Report, results: dict[str, Any]) -> None:
+    kept = {"schema": aisle_texts.results["schema"],
+            "provenance": aisle_texts.results["provenance"]}  # fmt: skip
+    verdict = verify(replace(aisle_texts, results=kept | results))
+    assert verdict.status == "cannot verify"
+
+
+# -- the command -----------------------------------------------------------------------------------
+
+
+def run(*words: str) -> tuple[int, str]:
+    outcome = CliRunner().invoke(verify_command, list(words))
+    return outcome.exit_code, outcome.output
+
+
+def test_the_command_says_what_it_found(tmp_path: Path, aisle: Base) -> None:
+    target = tmp_path / "verdict.json"
+    code, output = run(str(SHIPPED), str(LOOP_LOG), "--json", str(target))
+    assert code == 1
+    assert "other log" in output
+    assert LIMIT in output
+    told = json.loads(target.read_text(encoding="utf-8"))
+    assert told["status"] == "other log"
+    assert told["seal"] == "intact"
+    assert told["limit"] == LIMIT
+    code, output = run(str(SHIPPED))
+    assert (code, "cannot verify" in output) == (1, True)
+    code, output = run(str(SHIPPED), "--json", "-")
+    assert json.loads(output)["status"] == "cannot verify"
+
+
+def test_the_command_verifies(tmp_path: Path) -> None:
+    target = tmp_path / "loop.pdf"
+    made = CliRunner().invoke(
+        cli, ["loop", f"{LOOP_LOG}:ekf2", "-o", str(target)], standalone_mode=False
+    )
+    assert made.exception is None
+    folder = tmp_path / "logs"
+    folder.mkdir()
+    (folder / "renamed.bin").write_bytes(LOOP_LOG.read_bytes())
+    code, output = run(str(target), str(folder))
+    assert (code, "verified" in output) == (0, True), output
+
+
+@pytest.mark.parametrize("words", [["none.pdf"], [str(LOG)], [str(SHIPPED), "none.ulg"]])
+def test_bad_input_is_one_line(words: list[str]) -> None:
+    outcome = CliRunner().invoke(cli, ["verify", *words], standalone_mode=False)
+    assert outcome.exception is not None
+    assert "\n" not in str(outcome.exception)
+
+
+def test_help_states_the_limit() -> None:
+    code, output = run("--help")
+    assert code == 0
+    assert "not who wrote them" in " ".join(output.split())
+
+
+def test_a_layout_of_one_piece(aisle: Base) -> None:
+    assert plain_layout(aisle.pdf)
+    assert plain_layout(saved_again(aisle.pdf))
+    assert not plain_layout(appended_version(aisle.anatomy.assembled()))
+    assert not plain_layout(b"%PDF-1.4\n")
+    assert not plain_layout(b"")

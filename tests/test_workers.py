@@ -1,0 +1,206 @@
+"""Bounded work: what hangs, crashes or eats memory is lost alone."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from px4fuse.errors import LogError
+from px4fuse.grading import workers
+from px4fuse.grading.workers import Failed, run_bounded
+
+MEMORY = 1_500_000_000
+
+
+class Unreadable:
+    """Pickles, and cannot be read back."""
+
+    def __reduce__(self):
+        return int, ("no number",)
+
+
+def act(job):  # noqa: PLR0912
+    """What a job says."""
+    what, value = job
+    match what:
+        case "square":
+            return value * value
+        case "exit":
+            os._exit(value)
+        case "hang":
+            time.sleep(600)
+        case "spin":
+            while True:
+                pass
+        case "hog":
+            return len(bytearray(value))
+        case "raise":
+            raise ValueError(value)
+        case "own error":
+            raise LogError(value)
+        case "big":
+            return bytes(value)
+        case "local":
+            return lambda: value
+        case "unreadable":
+            return Unreadable()
+        case "process":
+            return os.getpid()
+        case "variable":
+            return os.environ.get(value)
+    return None
+
+
+def run(jobs, processes=2, timeout_s=60.0, memory_bytes=None, **options):
+    heard = []
+    results = run_bounded(
+        act,
+        jobs,
+        processes=processes,
+        timeout_s=timeout_s,
+        memory_bytes=memory_bytes,
+        on_done=lambda index, result: heard.append((index, result)),
+        **options,
+    )
+    assert not multiprocessing.active_children()
+    return results, heard
+
+
+def test_fifty_jobs_in_their_order():
+    jobs = [("square", n) for n in range(50)]
+    results, heard = run(jobs)
+    assert results == [n * n for n in range(50)]
+    assert sorted(heard) == list(enumerate(results))
+
+
+def test_results_need_not_be_kept():
+    results, heard = run([("square", 3)], keep=False)
+    assert results == []
+    assert heard == [(0, 9)]
+    assert run([])[0] == []
+
+
+def test_one_bad_job_is_lost_alone():
+    before = os.environ.get("OMP_NUM_THREADS")
+    jobs = [
+        ("square", 1),
+        ("exit", 3),
+        ("raise", "a\nb\x1b[2J"),
+        ("square", 2),
+        ("own error", "x.ulg: empty."),
+        ("local", 1),
+        ("unreadable", 0),
+        ("big", 30_000_000),
+        ("variable", "OMP_NUM_THREADS"),
+        ("exit", 0),
+        ("square", 3),
+    ]
+    results, _ = run(jobs)
+    assert [results[n] for n in (0, 3, 10)] == [1, 4, 9]
+    assert results[1] == Failed("the process that read it ended (exit code 3).")
+    assert results[2] == Failed("ValueError: a b[2J")
+    assert results[4] == Failed("x.ulg: empty.")
+    assert isinstance(results[5], Failed)
+    assert results[6] == Failed("its result could not be read (ValueError).")
+    assert results[7] == bytes(30_000_000)
+    assert results[8] == "1"
+    assert results[9] == Failed("the process that read it ended (exit code 0).")
+    assert os.environ.get("OMP_NUM_THREADS") == before
+
+
+def test_what_hangs_is_ended():
+    start = time.monotonic()
+    results, _ = run([("hang", 0), ("square", 2), ("spin", 0), ("square", 3)], timeout_s=2.0)
+    assert results[1::2] == [4, 9]
+    late = Failed("it took longer than 2 s and was ended.")
+    assert results[0::2] == [late, late]
+    assert time.monotonic() - start < 120
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems do not enforce the limit")
+def test_what_eats_memory_is_ended():
+    jobs = [("square", 2), ("hog", 10 * MEMORY), ("square", 3)]
+    results, _ = run(jobs, processes=1, memory_bytes=MEMORY)
+    assert results == [4, Failed("it needed more memory than one file may take."), 9]
+
+
+def test_processes_are_replaced_after_some_jobs(monkeypatch):
+    monkeypatch.setattr(workers, "JOBS_PER_WORKER", 2)
+    results, _ = run([("process", 0)] * 5, processes=1)
+    assert len(set(results)) == 3
+    assert results[0] == results[1] != results[2]
+
+
+def test_a_function_that_cannot_be_loaded_fails_and_ends(monkeypatch):
+    monkeypatch.setattr(act, "__module__", "test_workers_is_not_here")
+    monkeypatch.setitem(sys.modules, "test_workers_is_not_here", sys.modules[__name__])
+    results, _ = run([("square", 1), ("square", 2)])
+    assert all(isinstance(each, Failed) and "before it began" in each.reason for each in results)
+
+
+def test_an_error_of_the_listener_ends_all():
+    def listen(index, result):
+        raise KeyError(index)
+
+    with pytest.raises(KeyError):
+        run_bounded(
+            act,
+            [("square", 1), ("hang", 0)],
+            processes=2,
+            timeout_s=60,
+            memory_bytes=None,
+            on_done=listen,
+        )
+    assert not multiprocessing.active_children()
+
+
+INTERRUPTED = """
+import os, sys, time
+sys.path.insert(0, {tests!r})
+from px4fuse.grading.workers import run_bounded
+from test_workers import act
+
+def heard(index, result):
+    print(result, flush=True)
+
+if __name__ == "__main__":
+    run_bounded(act, [("process", 0), ("hang", 0)], processes=1, timeout_s=500,
+                memory_bytes=None, on_done=heard)
+"""
+
+
+def test_modules_in_the_current_folder_are_not_imported(tmp_path):
+    """An instructor grades inside the folder of submissions; one of them is called types.py."""
+    script = tmp_path / "program" / "script.py"
+    script.parent.mkdir()
+    script.write_text(INTERRUPTED.format(tests=os.path.dirname(__file__)).replace("hang", "square"))  # noqa: PTH120
+    work = tmp_path / "work"
+    work.mkdir()
+    for name in ("types", "functools", "multiprocessing", "numpy", "threading", "sitecustomize"):
+        (work / f"{name}.py").write_text("open('executed', 'w').close()")
+    ran = subprocess.run(
+        [sys.executable, script], cwd=work, capture_output=True, text=True, check=True, timeout=60
+    )
+    assert ran.stdout.splitlines()[-1] == "0"
+    assert not (work / "executed").exists()
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no SIGINT for one process")
+def test_ctrl_c_ends_all(tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text(INTERRUPTED.format(tests=os.path.dirname(__file__)))  # noqa: PTH120
+    with subprocess.Popen(
+        [sys.executable, script], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as parent:
+        worker = int(parent.stdout.readline())
+        parent.send_signal(signal.SIGINT)
+        _, said = parent.communicate(timeout=60)
+    assert "KeyboardInterrupt" in said
+    with pytest.raises(ProcessLookupError):
+        os.kill(worker, 0)
