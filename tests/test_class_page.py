@@ -113,6 +113,11 @@ def test_every_inline_block_is_what_the_policy_allows() -> None:
         assert f"{tag}-src 'sha256-{digest}'" in policy
 
 
+def test_a_file_s_name_is_not_cut_at_its_first_space() -> None:
+    page = html_text([graded("Ada", 1.0)], "Class", "px4fuse")
+    assert re.search(r"\.file \{[^}]*word-break: break-all", page)
+
+
 def test_nothing_is_loaded_and_nothing_hangs_on_an_attribute() -> None:
     for tag, attributes in Elements(html_text(CLASS, "Class", "px4fuse 1")).found:
         assert tag not in ("img", "iframe", "object", "embed", "a", "base")

@@ -15,6 +15,7 @@ from conftest import REPOSITORY
 from pypdf import PdfReader, PdfWriter
 
 from px4fuse.cli import cli
+from px4fuse.grading.answers import Answer, AnswerKey
 from px4fuse.grading.grade import file_names, grade, graded_from, logs_by_hash
 from px4fuse.grading.model import Graded, Verdict
 from px4fuse.grading.rubric import parse_rubric, read_rubric, rubric_text
@@ -103,14 +104,102 @@ def test_only_what_changed_is_done_again(handed_in, tmp_path) -> None:
     rubric = read_rubric(None)
     grade([handed_in], [], rubric, output, processes=2)
     same = grade([handed_in], [], rubric, output, processes=2)
-    assert same.reused == 5  # all but what was no PDF at all, and so was not read
+    assert same.reused == 6
     html = (output / "class.html").read_bytes()
     (handed_in / "essay.pdf").write_bytes(REPORT.read_bytes())
-    assert grade([handed_in], [], rubric, output, processes=2).reused == 4
+    assert grade([handed_in], [], rubric, output, processes=2).reused == 5
     assert (output / "class.html").read_bytes() != html
     other = parse_rubric(rubric_text().replace("points = 15", "points = 14"), "other.toml")
     assert other != rubric
     assert grade([handed_in], [], other, output, processes=2).reused == 0
+
+
+def test_a_log_that_was_handed_out_and_is_not_at_hand_costs_nobody_everything(tmp_path) -> None:
+    (tmp_path / "in").mkdir()
+    shutil.copy(REPORT, tmp_path / "in")
+    (tmp_path / "logs").mkdir()
+    (tmp_path / "logs" / "another.ulg").write_bytes(b"x")
+    (sha256,) = logs_by_hash([LOG])
+    rubric, logs = read_rubric(None), [tmp_path / "logs"]
+    for given, status in ((sha256, "cannot verify"), ("0" * 64, "other log")):
+        key = AnswerKey("aisle", (Answer("1", "Ada", "1.ulg", given),))
+        outcome = grade([tmp_path / "in"], logs, rubric, tmp_path / "out", key=key, processes=1)
+        (one,) = outcome.graded
+        assert one.verdict.status == status
+        assert (one.points > 0) == (status == "cannot verify")
+
+
+def test_reports_of_one_name_in_two_folders_are_kept_apart(tmp_path) -> None:
+    turned = PdfWriter(clone_from=io.BytesIO(REPORT.read_bytes()))
+    turned.pages[0].rotate(90)
+    for name in ("Ada_1", "Bob_2"):
+        folder = tmp_path / "in" / f"{name}_assignsubmission_file_"
+        folder.mkdir(parents=True)
+        shutil.copy(REPORT, folder / "report.pdf")
+    turned.write(folder / "report.pdf")
+    output = tmp_path / "class"
+    grade([tmp_path / "in"], [], read_rubric(None), output, processes=2)
+    assert len({path.read_bytes() for path in (output / "records").glob("*.png")}) == 2
+    assert grade([tmp_path / "in"], [], read_rubric(None), output, processes=2).reused == 2
+
+
+def test_results_of_another_version_may_hold_anything(tmp_path) -> None:
+    pdf = REPORT.read_bytes()
+    schema = {"name": "px4fuse-results", "version": "9.9"}
+    results = {"schema": schema, "student": "x", "provenance": [1], "log": "s", "settings": [[]],
+               "axes": 3, "findings": {"a": 1}}  # fmt: skip
+    (tmp_path / "in").mkdir()
+    for name, more in (("a", {}), ("b", {"student": {"name": {"x": 1}, "id": ["y"], "notes": 7}})):
+        made = PdfWriter(clone_from=io.BytesIO(pdf))
+        made._root_object.pop("/Names", None)
+        made.add_attachment("results.json", json.dumps(results | more).encode())
+        with (tmp_path / "in" / f"{name}.pdf").open("wb") as file:
+            made.write(file)
+    outcome = grade([tmp_path / "in"], [], read_rubric(None), tmp_path / "out", processes=1)
+    for one in outcome.graded:
+        assert (one.student, one.student_id, one.notes, one.version) == ("", "", "", "")
+        assert one.sha256
+        assert "Error" not in " ".join(one.verdict.reasons)
+
+
+def test_what_an_earlier_run_left_is_told(tmp_path) -> None:
+    (tmp_path / "in").mkdir()
+    for name in ("old.pdf", "new.pdf"):
+        (tmp_path / "in" / name).write_bytes(b"none")
+    output = tmp_path / "out"
+    assert not grade([tmp_path / "in"], [], read_rubric(None), output, processes=1).notes
+    (tmp_path / "in" / "old.pdf").unlink()
+    (note,) = grade([tmp_path / "in"], [], read_rubric(None), output, processes=1).notes
+    assert "1 of an earlier run" in note
+    assert "old" in note
+    assert (output / "feedback" / "old.txt").is_file()
+
+
+def test_names_are_one_line_in_the_terminal(tmp_path, monkeypatch) -> None:
+    import px4fuse.grading.grade as module
+
+    one = Graded("a.pdf", "Ada\nPoints 120\n" + "A" * 100_000, "1", UNKNOWN)
+    monkeypatch.setattr(module, "grade", lambda *_, **__: module.Outcome((one,), (), 0, ()))
+    monkeypatch.chdir(tmp_path)
+    shutil.copy(REPORT, "a.pdf")
+    result = CliRunner().invoke(cli, ["grade", "a.pdf", "-o", "out"])
+    assert result.exit_code == 0
+    assert len(result.output) < 3000
+    assert not any(line.lstrip().startswith("Points 120") for line in result.output.splitlines())
+
+
+def test_an_interrupted_run_says_that_it_can_go_on(tmp_path, monkeypatch) -> None:
+    import px4fuse.grading.grade as module
+
+    def interrupted(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(module, "grade", interrupted)
+    monkeypatch.chdir(tmp_path)
+    shutil.copy(REPORT, "a.pdf")
+    result = CliRunner().invoke(cli, ["grade", "a.pdf", "-o", "out"])
+    assert result.exit_code == 130
+    assert "goes on from there" in result.output
 
 
 def test_a_damaged_record_is_made_again(handed_in, tmp_path) -> None:
@@ -162,6 +251,7 @@ def test_logs_are_found_by_their_hash_not_their_name(tmp_path) -> None:
         (["grade", "in"], "say with -o"),
         (["grade", "missing", "-o", "out"], "there is no such file or folder"),
         (["grade", "in", "-o", "in/out"], "lies inside"),
+        (["grade", "in", "-o", "in/a.pdf"], "is no folder"),
         (["grade", "in", "-o", "out", "--rubric", "missing.toml"], "missing.toml"),
         (["grade", "in", "-o", "out", "--key", "missing.json"], "missing.json"),
         (["grade", "in", "-o", "out", "--logs", "missing"], "there is no such file or folder"),

@@ -12,6 +12,7 @@ import pytest
 
 from px4fuse.grading.answers import Answer, AnswerKey
 from px4fuse.grading.flags import class_flags, own_flags
+from px4fuse.grading.intake import read_report
 from px4fuse.grading.model import Graded, Report, Verdict
 from px4fuse.grading.rubric import parse_rubric, read_rubric
 from px4fuse.grading.scoring import (
@@ -22,6 +23,7 @@ from px4fuse.grading.scoring import (
     score_refused,
     values_at,
 )
+from px4fuse.grading.verification import verify
 
 ROOT = Path(__file__).parent.parent
 RESULTS = json.loads((ROOT / "reports" / "aisle_uwb.json").read_text(encoding="utf-8"))
@@ -95,11 +97,30 @@ class TestVerified:
         assert checked("verified")[0] == 1.0
         assert checked("verified", verdict=Verdict("verified", (), with_log=False))[0] == 0.5
 
+    def test_log_not_at_hand(self):
+        read = read_report((ROOT / "reports" / "aisle_uwb.pdf").read_bytes(), "aisle_uwb.pdf")
+        verdict = verify(read)
+        points, comment = checked("verified", verdict=verdict)
+        assert points == 0.5
+        assert "was not at hand" in comment
+        text = " ".join(feedback(graded(verdict=verdict)).split())
+        assert "log was not at hand" in text
+        assert "Make it again" not in text
+        more = (*verdict.reasons, "the file was saved again")
+        forged = dataclasses.replace(verdict, reasons=more)
+        assert checked("verified", verdict=forged)[0] == 0.0
+
     def test_other_verdicts_say_why(self):
         verdict = Verdict("cannot verify", ("the log is not here",), with_log=False)
         points, comment = checked("verified", verdict=verdict)
         assert points == 0.0
-        assert "the log is not here" in comment
+        assert comment == "Your report could not be verified (the log is not here)."
+        two = ("every number and page is what the log gives, but", "the file was saved again")
+        verdict = Verdict("cannot verify", two, with_log=True)
+        assert checked("verified", verdict=verdict)[1] == (
+            "Your report could not be verified (every number and page is what the log gives, but "
+            "the file was saved again)."
+        )
 
 
 class TestStudent:
@@ -245,7 +266,7 @@ class TestNumber:
         results = changed(axes__north__truth__kf_position_rmse_m=value)
         points, comment = checked("number", results, path=self.PATH, at_most=1.0)
         assert points == 0.0
-        assert "does not have" in comment
+        assert "has no number for" in comment
 
 
 class TestConsistent:
@@ -254,7 +275,7 @@ class TestConsistent:
         assert checked("consistent", good)[0] == 1.0
         points, comment = checked("consistent")
         assert 0.5 < points < 1.0
-        assert "overstated 1.13 times" in comment
+        assert "overstated by a factor of 1.13" in comment
         assert checked("consistent", changed(horizontal__kf__variance_factor=0.5))[0] == 0.0
         assert checked("consistent", filter="ekf2", axes=["horizontal", "east"])[0] == 1.0
 
@@ -262,6 +283,19 @@ class TestConsistent:
         points, comment = checked("consistent", axes=["down"], filter="ekf2")
         assert points == 0.0
         assert "never fused" in comment
+
+    def test_outliers_that_no_setting_mends(self):
+        outliers = {"id": "source_outliers", "severity": "error", "message": ""}
+        understated = {
+            "horizontal__kf": {"verdict": "variance understated", "variance_factor": 5.0},
+            "findings": [outliers],
+        }
+        points, comment = checked("consistent", changed(**understated))
+        assert points == 0.0
+        assert "your notes should say" in comment
+        named = noted("There are outliers at 20 s.", **understated)
+        assert checked("consistent", named)[0] == 1.0
+        assert checked("consistent", noted("Outliers.", **understated | {"findings": []}))[0] == 0.0
 
 
 class TestClock:
@@ -278,6 +312,12 @@ class TestClock:
         assert points == 0.5
         assert "no acceleration" in comment
         assert checked("clock", changed(clock=...))[0] == 0.0
+
+    def test_flight_that_was_handed_out_is_not_the_student_s_choice(self):
+        results = changed(clock__determinable=False, clock__reason="no acceleration.")
+        points, comment = checked("clock", results, key=key())
+        assert points == 1.0
+        assert "fly" not in comment.replace("flight", "")
 
 
 class TestLoop:
@@ -302,6 +342,19 @@ class TestLoop:
         assert checked("loop", rejected)[0] == 0.67
         why = "Notes by the student\nIt is a false closure: we landed 6 m away.\nfoot\nfoot"
         assert checked("loop", rejected, [why])[0] == 1.0
+
+
+class TestOneAxisOnly:
+    def test_why_there_is_nothing_horizontal(self):
+        north = {"axes": {"north": RESULTS["axes"]["north"]}, "tuning": {}, "horizontal": {}}
+        for check, more in (
+            ("tuning", {"settings": ["sigma_z_m"]}),
+            ("consistent", {}),
+            ("number", {"path": "tuning.horizontal.held_out.gain_nats", "at_most": 1.0}),
+        ):
+            points, comment = checked(check, changed(**north), **more)
+            assert points == 0.0
+            assert "leave --axis out" in comment
 
 
 class TestFlight:
@@ -398,6 +451,7 @@ class TestScore:
             items = score(report(), verdict, rubric, None)
             assert {item.points for item in items} == {0.0}
             assert all("SIGMA_A is 0.5" in item.comment for item in items)
+            assert all("px4fuse wrote" not in item.comment for item in items)
             kept = score(report(), verdict, dataclasses.replace(rubric, unverified="score"), None)
             assert kept[0].points == 0.0
             assert sum(item.points for item in kept) > 40
@@ -474,6 +528,16 @@ class TestWhatStudentsRead:
         text = feedback(graded(verdict=verdict))
         assert "Not a PDF." in text
         assert "hand in the PDF" in " ".join(text.split())
+
+    def test_reasons_are_sentences(self):
+        reasons = ("the file was saved again", "page 3: a word is missing")
+        text = feedback(graded(verdict=Verdict("cannot verify", reasons, with_log=True)))
+        said = "verified: the file was saved again; page 3: a word is missing. Make it again"
+        assert said in " ".join(text.split())
+        missing = Verdict("other log", ("none of the 7 files given is the log",), with_log=False)
+        text = " ".join(feedback(graded(verdict=missing)).split())
+        assert "that your instructor has: none of the 7 files given is the log." in text
+        assert "that it names" not in text
 
     def test_names_stay_text(self):
         text = feedback(graded(student="=cmd|' /C calc'!A0\n<script>", student_id="\x1b[31m"))
@@ -619,7 +683,7 @@ class TestClassFlags:
              of(3, student_id="s02", log_sha256="c" * 64)],
             answers,
         )  # fmt: skip
-        assert any("in the answer key" in flag for flag in made[1])
+        assert "The log was given to s01; the id s01x is not in the answer key." in made[1]
         assert any("none of those" in flag for flag in made[2])
         taken = class_flags([of(1, student_id="s02", log_sha256="a" * 64)], answers)
         assert "given to another student, s01" in taken[0][0]
@@ -641,6 +705,11 @@ class TestClassFlags:
     def test_file_of_another_name(self, file, flagged):
         made = class_flags([of(1, submission=file), of(2)])
         assert (0 in made) == flagged
+
+    def test_leading_zeros_are_no_other_name(self):
+        answers = AnswerKey("aisle", (Answer("0106", "Bob Bold", "0106.ulg", "a" * 64),))
+        bob = {"student": "Bob <b>Bold</b>", "student_id": "106", "log_sha256": "a" * 64}
+        assert class_flags([of(1, submission="late_0106.pdf", **bob)], answers) == {}
 
     def test_three_hundred_take_seconds(self):
         many = [of(n, notes=text_of(n % 290, 1500), log_sha256=f"{n}") for n in range(300)]

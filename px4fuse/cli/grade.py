@@ -70,6 +70,8 @@ def grade(
         raise SettingsError("nothing to grade: give PDFs, folders or zip files.")
     if output is None:
         raise SettingsError("say with -o where the class table goes.")
+    if output.exists() and not output.is_dir():
+        raise OutputError(f"-o {output}: is no folder. Give another place.")
     for path in (*submissions, *logs):
         if not path.exists():
             raise SettingsError(f"{path}: there is no such file or folder.")
@@ -84,17 +86,24 @@ def grade(
 
         answers = read_key(key)
     chosen = read_rubric(rubric)
-    with _progress() as advance:
-        outcome = grade_all(
-            submissions,
-            logs,
-            chosen,
-            output,
-            key=answers,
-            title=title,
-            processes=jobs,
-            progress=advance,
+    try:
+        with _progress() as advance:
+            outcome = grade_all(
+                submissions,
+                logs,
+                chosen,
+                output,
+                key=answers,
+                title=title,
+                processes=jobs,
+                progress=advance,
+            )
+    except KeyboardInterrupt:
+        click.echo(
+            "px4fuse: interrupted; what is graded is kept. The same command goes on from there.",
+            err=True,
         )
+        raise click.exceptions.Exit(130) from None
     _print(outcome)
 
 
@@ -120,6 +129,8 @@ def _print(outcome: Outcome) -> None:
     from rich.table import Table
     from rich.text import Text
 
+    from px4fuse.grading.intake import one_line
+
     console = terminal()
     table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="bold")
     for name in ("submission", "student", "status", "points", "flags"):
@@ -134,7 +145,7 @@ def _print(outcome: Outcome) -> None:
         style = "green" if one.verdict.status == "verified" else "yellow"
         table.add_row(
             Text(one.submission),
-            Text(one.student or one.student_id),
+            Text(one_line(one.student or one.student_id, 60)),
             Text(one.verdict.status, style),
             f"{one.points:g} / {one.of:g}" if one.items else "–",
             f"{len(one.flags)}" if one.flags else "",

@@ -227,8 +227,12 @@ def _other_assignment(graded: Sequence[Graded], key: AnswerKey | None) -> Flags:
         if given is None:
             yield index, "The log is none of those that were handed out with the assignment."
         elif own is None:
-            said = f"the id {_short(one.student_id)} is" if one.student_id else "no id is"
-            yield index, f"The log was given to {given.student_id}; {said} in the answer key."
+            said = (
+                f"the id {_short(one.student_id)} is not in the answer key"
+                if one.student_id
+                else "the report gives no id"
+            )
+            yield index, f"The log was given to {given.student_id}; {said}."
         elif own.sha256 != one.log_sha256:
             yield index, f"The log was given to another student, {given.student_id}."
 
@@ -335,13 +339,16 @@ def _other_name(graded: Sequence[Graded], key: AnswerKey | None) -> Flags:
     }
     for index, one in enumerate(graded):
         own_id, own_words = folded(one.student_id), frozenset(_words(one.student))
+        # the key's spelling, where a spreadsheet took away leading zeros
+        given = key.of_student(one.student_id) if key else None
+        own_ids = {own_id} | ({folded(given.student_id)} if given else set())
         stem = PurePosixPath(one.submission.replace("\\", "/")).stem
         words = frozenset(_words(one.submission.removesuffix(".pdf"))) | {folded(stem)}
-        says_own = own_id in words or (own_words and own_words <= words)
+        says_own = bool(own_ids & words) or (own_words and own_words <= words)
         if says_own or not (own_id or own_words):
             continue
-        ids = sorted({student_id for student_id in people if student_id in words} - {own_id})
-        others = sorted({of for parts, of in names.items() if parts <= words} - {own_id})
+        ids = sorted({student_id for student_id in people if student_id in words} - own_ids)
+        others = sorted({of for parts, of in names.items() if parts <= words} - own_ids)
         if ids or others:
             other = _short((ids or others)[0])
             yield index, f"The file's name is that of {other}, the report says {_name(one)}."

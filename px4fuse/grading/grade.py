@@ -147,7 +147,7 @@ def grade(
         for index, one in enumerate(complete)
     ]
     written = _write(output, complete, found, title)
-    return Outcome(tuple(complete), notes, reused, written)
+    return Outcome(tuple(complete), (*notes, *_left_over(output, complete)), reused, written)
 
 
 def logs_by_hash(paths: Sequence[Path]) -> dict[str, Path]:
@@ -176,30 +176,38 @@ def grade_one(
     report = read_report(content, submission.name)
     if isinstance(report, Refused):
         return _refused(submission, report, sha256, rubric, key)
-    verdict = verify(report, logs)
+    log = _log_of(report)
+    # handed out and not among the logs: the instructor's gap, not another log
+    missing = key is not None and key.of_log(log) is not None and log not in logs
+    verdict = verify(report, {} if missing else logs)
     results = report.results
     drawn = picture(report.pdf, key_page(report.pages))
-    student = results.get("student", {})
     return Graded(
         submission=submission.name,
-        student=str(student.get("name", "")),
-        student_id=str(student.get("id", "")),
+        student=_text(results, "student", "name"),
+        student_id=_text(results, "student", "id"),
         verdict=verdict,
         items=score(report, verdict, rubric, key),
         flags=own_flags(results),
         numbers=_numbers(results),
         sha256=sha256,
-        log_sha256=_log_of(report),
-        version=str(results.get("provenance", {}).get("px4fuse", "")),
+        log_sha256=log,
+        version=_text(results, "provenance", "px4fuse"),
         settings=json.dumps(results.get("settings", {}), sort_keys=True, ensure_ascii=False),
-        notes=str(student.get("notes", "")),
+        notes=_text(results, "student", "notes"),
         picture=b"" if isinstance(drawn, Unavailable) else drawn,
     )
 
 
 def _log_of(report: Report) -> str:
-    log = report.results.get("log") or report.results.get("track") or {}
-    return str(log.get("sha256", ""))
+    return _text(report.results, "log", "sha256") or _text(report.results, "track", "sha256")
+
+
+def _text(results: Mapping[str, Any], part: str, name: str) -> str:
+    """A text in the results; those of another version may hold anything in its place."""
+    parts = results.get(part)
+    value = parts.get(name) if isinstance(parts, dict) else None
+    return value if isinstance(value, str) else ""
 
 
 def _numbers(results: Mapping[str, Any]) -> dict[str, float]:
@@ -233,7 +241,8 @@ def _context(rubric: Rubric, key: AnswerKey | None) -> str:
 
 
 def _record(records: Path, submission: Submission) -> Path:
-    name = hashlib.sha256(f"{submission.file.name}\0{submission.entry}".encode()).hexdigest()
+    # not by the name of the file: platforms put everyone's report.pdf into a folder of its own
+    name = hashlib.sha256(f"{submission.name}\0{submission.entry}".encode()).hexdigest()
     return records / f"{name}.json"
 
 
@@ -310,6 +319,19 @@ def _write(
             }
         )
     return table, page, output / "feedback", output / "gradescope"
+
+
+def _left_over(output: Path, graded: Sequence[Graded]) -> tuple[str, ...]:
+    """What an earlier run wrote for others: never taken away, but told."""
+    names = set(file_names(graded))
+    others = sorted(p.stem for p in (output / "feedback").glob("*.txt") if p.stem not in names)
+    if not others:
+        return ()
+    shown = ", ".join(others[:4]) + (", ..." if len(others) > 4 else "")
+    return (
+        f"feedback and gradescope also hold {len(others)} of an earlier run, which are not among "
+        f"these submissions: {shown}. Delete them if they are out of date.",
+    )
 
 
 def _picture(records: Path, submission: Submission) -> bytes:

@@ -19,9 +19,16 @@ from px4fuse.grading.answers import Answer, AnswerKey
 from px4fuse.grading.model import Graded, Item, Report, Verdict
 from px4fuse.grading.rubric import Rubric, RubricItem
 from px4fuse.simulation.assignment import POSSIBLE_FINDINGS
+from px4fuse.tuning import HORIZONTAL
 
 # What verification has refuted, rather than what it could not look at
-CONTRADICTED = ("numbers differ", "page altered", "other log")
+REFUTED: Mapping[str, str] = {
+    "numbers differ": "your report's numbers are not those that its log gives",
+    "page altered": "a page of your report is not what px4fuse draws",
+    "other log": "the log of your report is none of those that your instructor has",
+}
+# What verification says of a report that is sound as far as can be told without its log
+NO_LOG = "no log was given; the pages agree with the results"
 # As many as px4fuse compare takes
 MAX_NOTES = 200_000
 MAX_QUOTE = 160
@@ -226,6 +233,9 @@ def _why_absent(results: Mapping[str, Any], path: str) -> str:
             reason = _text(_at(value, "unavailable.reason")) if isinstance(value, dict) else ""
             if reason:
                 return f" ({reason.rstrip('.')})"
+    axes = results.get("axes")
+    if HORIZONTAL in path and isinstance(axes, dict) and not {"north", "east"} <= set(axes):
+        return " (it needs the axes north and east, which were not both analysed: leave --axis out)"
     return ""
 
 
@@ -239,20 +249,35 @@ def _listed(names: Sequence[str]) -> str:
 
 def _verified(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float, str]:
     verdict = evidence.verdict
-    reason = _reason(verdict)
-    if verdict.status != "verified":
-        return 0.0, f"Your report could not be verified: {verdict.status}{reason}."
-    if verdict.with_log:
+    if _without_log(verdict):
+        return given["without_log"], (
+            "Pages and numbers of your report agree with each other, but its log was not at hand "
+            "to compute them again."
+        )
+    if verdict.status == "verified":
         return 1.0, "Your report's numbers were computed again from its log and agree."
-    return given["without_log"], (
-        "Pages and numbers of your report agree with each other, but its log was not at hand to "
-        "compute them again."
-    )
+    status = "" if verdict.status == "cannot verify" else f": {verdict.status}"
+    return 0.0, f"Your report could not be verified{status}{_reason(verdict)}."
+
+
+def _without_log(verdict: Verdict) -> bool:
+    """Whether nothing is wrong with a report, but its log is missing."""
+    if verdict.status == "verified":
+        return not verdict.with_log
+    return verdict.status == "cannot verify" and verdict.reasons == (NO_LOG,)
 
 
 def _reason(verdict: Verdict) -> str:
-    first = _text(verdict.reasons[0]).rstrip(".") if verdict.reasons else ""
-    return f" ({first})" if first else ""
+    # the first says "..., but" where the second says what
+    first = verdict.reasons[: 2 if verdict.reasons[:1] and verdict.reasons[0][-3:] == "but" else 1]
+    said = _joined(first)
+    return f" ({said})" if said else ""
+
+
+def _joined(reasons: Sequence[str]) -> str:
+    """Reasons as the end of a sentence."""
+    said = "; ".join(text for reason in reasons if (text := _text(reason).rstrip(".")))
+    return said.replace(", but; ", ", but ")
 
 
 def _student(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float, str]:
@@ -359,7 +384,7 @@ def _tuned(evidence: Evidence, path: str, name: str, factor: float) -> tuple[flo
         return 1.0, f"{said} within {asked}"
     share = 1.0 - math.log(off) / math.log(factor) if factor > max(off, 1.0) else 0.0
     side = "above" if chosen > high else "below"
-    return share, f"{said} {off:.3g} times {side} {asked}"
+    return share, f"{said} {side} {asked}, by a factor of {off:.3g}"
 
 
 def _number_between(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float, str]:
@@ -377,7 +402,7 @@ def _number_between(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float
         why = next(
             (why for path in given["path"] if (why := _why_absent(evidence.results, path))), ""
         )
-        return 0.0, f"Your report does not have {label or given['path'][0]}{why}."
+        return 0.0, f"Your report has no number for {label or given['path'][0]}{why}."
     # of several the one that is worst counts
     name, number = min(found, key=lambda pair: _within(pair[1], given))
     share = _within(number, given)
@@ -421,13 +446,29 @@ def _consistent(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float, st
         off = max(factor, 1.0 / factor)
         good = verdict == "consistent"
         gone = given["factor"] <= off or given["factor"] <= 1.0
+        # no noise explains outliers, and none should be made to
+        outliers = "understated" in verdict and any(
+            name == "source_outliers" for name, *_ in evidence.findings
+        )
+        explained = outliers and evidence.names("source_outliers")
         shares.append(
-            1.0 if good else 0.0 if gone else 1.0 - math.log(off) / math.log(given["factor"])
+            1.0
+            if good or explained
+            else 0.0
+            if gone
+            else 1.0 - math.log(off) / math.log(given["factor"])
+        )
+        because = (
+            ", because of outliers that no setting mends, as your notes say"
+            if explained
+            else ", because of outliers that no setting mends; your notes should say so"
+            if outliers
+            else ""
         )
         said.append(
             f"{owner} is consistent ({axis})"
             if good
-            else f"{owner} has its {verdict} {off:.3g} times ({axis})"
+            else f"{verdict} by a factor of {off:.3g} ({owner}, {axis}){because}"
         )
     comment = "; ".join(said) or "the rubric names no axis"
     return sum(shares) / max(len(shares), 1), f"{comment[:1].upper() + comment[1:]}."
@@ -441,10 +482,11 @@ def _clock(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float, str]:
         return 0.0, f"Your report says nothing about the clock offset{why}."
     if _at(evidence.results, "clock.determinable") is not True:
         reason = _text(_at(evidence.results, "clock.reason"))
-        return given["undeterminable"], (
-            "Your flight does not determine the clock offset"
-            f"{f' ({reason.rstrip(chr(46))})' if reason else ''}; fly clear starts and stops."
-        )
+        said = "Your flight does not determine the clock offset"
+        said += f" ({reason.rstrip('.')})" if reason else ""
+        if evidence.key is not None and evidence.key.of_log(evidence.log_sha256) is not None:
+            return 1.0, f"{said}, which is not your choice."
+        return given["undeterminable"], f"{said}; fly clear starts and stops."
     low, high = interval
     said = f"You applied a clock offset of {applied:.3f} s"
     if low - given["margin_s"] <= applied <= high + given["margin_s"]:
@@ -643,14 +685,14 @@ def score(
     Items for another kind of report are left out, and without an answer key those on mistakes.
     """
     evidence = Evidence(report, verdict, rubric.words, key)
-    refuted = verdict.status in CONTRADICTED and rubric.unverified == "zero"
+    refuted = verdict.status in REFUTED and rubric.unverified == "zero"
     made = []
     for item in rubric.items:
         if not _applies(item, key, evidence.kind):
             continue
         if refuted:
-            comment = f"No points, since your report is not what px4fuse wrote: {verdict.status}"
-            made.append(Item(item.title, 0.0, item.points, f"{comment}{_reason(verdict)}."))
+            comment = f"No points, since {REFUTED[verdict.status]}{_reason(verdict)}."
+            made.append(Item(item.title, 0.0, item.points, comment))
             continue
         share, comment = DOES[item.check](evidence, item.parameters)
         made.append(
@@ -715,13 +757,21 @@ def _verdict_text(verdict: Verdict) -> str:
         "numbers differ": "Numbers in your report are not those that px4fuse computes from the "
         "log with your settings.",
         "page altered": "A page of your report is not what px4fuse draws from its numbers.",
-        "other log": "Your report is not about the log that it names.",
+        "other log": "The log of your report is none of those that your instructor has.",
         "cannot verify": "Your report could not be verified.",
     }[verdict.status]
     if verdict.status == "verified":
         return said
-    reasons = " ".join(_text(reason) for reason in verdict.reasons[:NAMED])
-    return f"{said} {reasons} Make it again with px4fuse and hand in the PDF as it was written."
+    if _without_log(verdict):
+        return (
+            "The pages of your report agree with its numbers; its log was not at hand to compute "
+            "them again."
+        )
+    reasons = _joined(verdict.reasons[:NAMED])
+    said = f"{said.rstrip('.')}: {reasons}." if reasons else said
+    if verdict.status == "other log":
+        return f"{said} Make the report of the log that you were given, or hand in your log too."
+    return f"{said} Make it again with px4fuse and hand in the PDF as it was written."
 
 
 def _wrapped(text: str, width: int = 88) -> list[str]:
