@@ -18,7 +18,7 @@ import numpy as np
 from pypdf import PdfReader
 from pypdf.generic import DictionaryObject, StreamObject
 
-from px4fuse.grading.content_stream import PATH, Operation, operations
+from px4fuse.grading.content_stream import PATH, Operation, UnreadableError, operations
 from px4fuse.grading.glyphs import Font, code_texts, read_font, same_glyph
 
 # Of anything drawn, on the page: half the width of a thick line, no reading of a plot
@@ -98,7 +98,7 @@ def compare_pdf(submitted: bytes, drawn: bytes, numbers_alike: NumbersAlike = _e
         try:
             _compare_page(page, expected[number - 1], numbers_alike, fonts)
         except Exception as error:  # noqa: BLE001 - as above
-            reason = str(error) if isinstance(error, _DiffersError | ValueError) else ""
+            reason = str(error) if isinstance(error, _DiffersError | UnreadableError) else ""
             altered[number] = reason or f"it cannot be read ({type(error).__name__})"
             other = _stands_for(page, expected, number)
             if other:

@@ -23,7 +23,7 @@ import click
 from click.core import ParameterSource
 
 from px4fuse.cli.inputs import MAX_NOTES_BYTES, NOT_RECORDED, command_line, run_comparison
-from px4fuse.errors import Px4FuseError
+from px4fuse.errors import Px4FuseError, SettingsError
 from px4fuse.grading.model import Refused
 from px4fuse.report.document import Document, LoopDocument, Student
 
@@ -106,6 +106,8 @@ def recompute(results: Mapping[str, Any], logs: Mapping[str, Path]) -> Recompute
             files = _Files(results, logs, Path(folder))
             again = _compared if name == "compare" else _looped
             return again(context, files, person, versions)
+    except SettingsError as error:  # no run with these settings can have made a report
+        return Refused(f"{NOT_OURS}: {error}")
     except (_RefusedError, Px4FuseError) as error:
         return Refused(str(error))
     except Exception as error:  # noqa: BLE001 - settings made to fail may fail anywhere
@@ -206,7 +208,7 @@ class _Files:
         name = str(recorded)
         plain = name == recorded.name and "\\" not in name and name.isprintable()
         if not plain or len(name.encode(errors="replace")) > MAX_NAME_BYTES:
-            raise _RefusedError("a recorded file name is none")
+            raise _RefusedError(f"{NOT_OURS}: a file name in it is none")
         if os.name == "nt" and _WINDOWS.search(name):
             raise _RefusedError("a recorded file name is none on Windows: verify it elsewhere")
         # each in a folder of its own: two may have one name

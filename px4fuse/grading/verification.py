@@ -116,12 +116,15 @@ def verify(
     files = logs if isinstance(logs, Mapping) else rerun.hashed(logs)
     sha256 = rerun.log_sha256(report.results)
     if sha256 not in files:
-        asked = one_line(sha256, 16) or "none"
-        reason = f"none of the {len(files)} files given is the log, whose SHA-256 is {asked}…"
+        asked = one_line(sha256, 64) or "none"
+        reason = f"none of the {len(files)} files given is the log, whose SHA-256 is {asked}"
         return Verdict("other log", (reason,), with_log=False)
     again = recompute(report.results, files)
     if isinstance(again, Refused):
-        return Verdict("cannot verify", (one_line(again.reason, 400),), with_log=False)
+        # what px4fuse cannot have recorded contradicts the report; what it could, does not
+        forged = again.reason.startswith(rerun.NOT_OURS)
+        status: Status = "numbers differ" if forged else "cannot verify"
+        return Verdict(status, (one_line(again.reason, 400),), with_log=False)
     return _with_log(report, again)
 
 
