@@ -27,7 +27,7 @@ from pypdf.generic import (
 )
 
 from px4fuse.grading import intake
-from px4fuse.grading.intake import cleaned, one_line, read_report
+from px4fuse.grading.intake import SHARED, cleaned, one_line, read_report
 from px4fuse.grading.model import Refused, Report
 
 ROOT = Path(__file__).parent.parent
@@ -136,7 +136,7 @@ def test_results_of_a_loop():
         "schema": {"name": "px4fuse-loop", "version": "1.0"},
         "track": {"name": "x"},
         "references": [],
-        **{key: json.loads(JSON)[key] for key in ("loop", "findings", "provenance")},
+        **{key: json.loads(JSON)[key] for key in SHARED},
     }
     assert isinstance(read_report(small(json.dumps(loop).encode()), "r.pdf"), Report)
     loop["findings"] = [1]
