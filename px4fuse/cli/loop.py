@@ -27,6 +27,8 @@ from px4fuse.cli.inputs import (
 from px4fuse.errors import SettingsError
 
 if TYPE_CHECKING:
+    from rich.console import Console
+
     from px4fuse.trajectory.loop import Loop
 
 FRAMES = {"ned": "NED", "frd": "FRD", "enu": "ENU", "camera": "camera"}
@@ -187,17 +189,8 @@ def loop(
             text = to_json(results)
             document = LoopDocument(found, findings, person, command)
             contents |= {pdf: render(document, text), beside: text.encode()}
-        elif json_path not in (None, STANDARD_OUTPUT):
-            contents[json_path] = to_json(results).encode()
-        if contents:
-            write_outputs(contents)
-    if json_path == STANDARD_OUTPUT:
-        write_json(results, json_path)
-        return
-    console = terminal()
-    print_loop(console, found, findings)
-    for path in contents:
-        console.print(f"Wrote    {path}", markup=False, style="bold", soft_wrap=True)
+            json_path = json_path if json_path == STANDARD_OUTPUT else None
+    _finish(results, json_path, contents, lambda console: print_loop(console, found, findings))
 
 
 def _check_span(given: Mapping[str, Any]) -> None:
@@ -286,7 +279,7 @@ def _solve(source: Path, json_path: Path | None, g2o: Path | None, robust: bool 
     """Solve a pose graph from a file."""
     from px4fuse.readers.g2o import g2o_text, read_g2o
     from px4fuse.report.loop_terminal import print_graph
-    from px4fuse.report.results import graph_results, to_json
+    from px4fuse.report.results import graph_results
     from px4fuse.trajectory.graph_analysis import analyse_graph
     from px4fuse.trajectory.sources import split_part
 
@@ -307,14 +300,26 @@ def _solve(source: Path, json_path: Path | None, g2o: Path | None, robust: bool 
         solved = analyse_graph(read_g2o(path), step, robust=robust)
     results = graph_results(source.name, solved, command_line("loop", source))
     contents = {} if g2o is None else {g2o: g2o_text(solved.graph).encode()}
+    _finish(results, json_path, contents, lambda to: print_graph(to, source.name, solved))
+
+
+def _finish(
+    results: dict[str, Any],
+    json_path: Path | None,
+    contents: dict[Path, bytes],
+    show: Callable[[Console], None],
+) -> None:
+    """Write all outputs or none; print the results alone, or what was found and written."""
+    from px4fuse.report.results import to_json
+
     if json_path not in (None, STANDARD_OUTPUT):
-        contents[json_path] = to_json(results).encode()
+        contents = {**contents, json_path: to_json(results).encode()}
     if contents:
         write_outputs(contents)
     if json_path == STANDARD_OUTPUT:
         write_json(results, json_path)
         return
     console = terminal()
-    print_graph(console, source.name, solved)
-    for file in contents:
-        console.print(f"Wrote    {file}", markup=False, style="bold", soft_wrap=True)
+    show(console)
+    for path in contents:
+        console.print(f"Wrote    {path}", markup=False, style="bold", soft_wrap=True)

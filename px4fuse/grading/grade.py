@@ -26,13 +26,12 @@ from px4fuse.grading.scoring import feedback, gradescope, score, score_refused
 from px4fuse.grading.verification import verify
 from px4fuse.grading.workers import Failed, run_bounded
 from px4fuse.report.writing import write_all
+from px4fuse.simulation.assignment import RESERVED
 
 RECORDS = "records"
 # Of one report: a flight of ten minutes takes about one; what takes longer is no report
 TIMEOUT_S = 300.0
 MEMORY_BYTES = 4_000_000_000
-# File names that Windows keeps for devices
-RESERVED = {"CON", "PRN", "AUX", "NUL", *(f"{p}{n}" for p in ("COM", "LPT") for n in range(10))}
 # For the class table: column title, and where in the results
 NUMBERS = (
     ("SIGMA_A (m/s²)", "settings.sigma_a_m_s2"),
@@ -346,7 +345,7 @@ def file_names(graded: Sequence[Graded]) -> list[str]:
     for one in graded:
         stem = one.student_id or Path(one.submission).stem
         safe = "".join(c if c.isascii() and (c.isalnum() or c in "-_") else "_" for c in stem)[:60]
-        if not safe or safe.upper() in RESERVED:
+        if not safe or safe.casefold() in RESERVED:
             safe = f"report_{safe}"
         name, number = safe, 2
         while name.lower() in taken:

@@ -21,6 +21,7 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.errors import LogError, SettingsError
+from px4fuse.readers.files import read_whole
 from px4fuse.readers.position_names import (
     LENGTH_UNITS,
     TIME_KINDS,
@@ -145,7 +146,14 @@ def read_position_csv(
     _check_options(columns, time_unit, length_unit)
     path = Path(path)
     name = path.name.encode(errors="replace").decode()
-    content = _read_bytes(path, name)
+    content = read_whole(
+        path,
+        name,
+        MAX_FILE_BYTES,
+        LogError,
+        give="Give the UWB system's CSV file",
+        again="Copy it again",
+    )
     table = find_table(name, plain_text(name, content), columns)
     choice = _choose(table, columns)
     ticks, numbers, notes = _read_rows(table, choice)
@@ -221,23 +229,6 @@ def _count(rows: int) -> str:
 
 
 # -- the file --------------------------------------------------------------------------------------
-
-
-def _read_bytes(path: Path, name: str) -> bytes:
-    """All bytes of a regular file that is neither empty nor too large."""
-    try:
-        size = path.stat().st_size
-        if not path.is_file():
-            raise LogError(f"{name}: a folder or no regular file. Give the UWB system's CSV file.")
-        content = b"" if size > MAX_FILE_BYTES else path.read_bytes()
-    except (OSError, ValueError) as error:  # ValueError: a path with a NUL in it
-        reason = getattr(error, "strerror", None) or error
-        raise LogError(f"{name}: cannot be read ({reason}). Check its path.") from error
-    if not content:
-        limit = f"more than the limit of {MAX_FILE_BYTES / 1e6:.0f} MB. Cut it to the flight"
-        what = limit if size else "the file is empty. Copy it again"
-        raise LogError(f"{name}: {what}.")
-    return content
 
 
 # -- which columns ---------------------------------------------------------------------------------

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from px4fuse.errors import TrajectoryError
+from px4fuse.readers.files import read_whole
 from px4fuse.readers.position_table import quote
 from px4fuse.trajectory.model import MIN_POSES, Array, Frame, Kind, Trajectory
 
@@ -114,7 +115,14 @@ def read_trajectory(path: str | Path) -> Trajectory:
     """
     path = Path(path)
     name = path.name.encode(errors="replace").decode()
-    content = _read_bytes(path, name)
+    content = read_whole(
+        path,
+        name,
+        MAX_FILE_BYTES,
+        TrajectoryError,
+        give="Give a trajectory file",
+        again="Export it again",
+    )
     lines = _text(name, content).split("\n")
     comments = "\n".join(line for line in lines if line.lstrip().startswith("#"))
     file = _File(name, lines, comments)
@@ -182,23 +190,6 @@ def tum_text(trajectory: Trajectory) -> str:
 
 
 # -- the file --------------------------------------------------------------------------------------
-
-
-def _read_bytes(path: Path, name: str) -> bytes:
-    """All bytes of a regular file that is neither empty nor too large."""
-    try:
-        size = path.stat().st_size
-        if not path.is_file():
-            raise TrajectoryError(f"{name}: a folder or no regular file. Give a trajectory file.")
-        content = b"" if size > MAX_FILE_BYTES else path.read_bytes()
-    except (OSError, ValueError) as error:  # ValueError: a path with a NUL in it
-        reason = getattr(error, "strerror", None) or error
-        raise TrajectoryError(f"{name}: cannot be read ({reason}). Check its path.") from error
-    if not content:
-        limit = f"more than the limit of {MAX_FILE_BYTES / 1e6:.0f} MB. Cut it to the flight"
-        what = limit if size else "the file is empty. Export it again"
-        raise TrajectoryError(f"{name}: {what}.")
-    return content
 
 
 def _text(name: str, content: bytes) -> str:
