@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
 
 import jsonschema
 import numpy as np
@@ -30,8 +31,10 @@ from px4fuse.flight import (
 )
 from px4fuse.kalman import Replay, Settings, replay, state_at
 from px4fuse.readers import read_log
+from px4fuse.report.budget import draw
 from px4fuse.report.document import Document, Student
 from px4fuse.report.results import results, schema
+from px4fuse.report.style import BOTTOM, report_style
 from px4fuse.signals import choose_segment, choose_source, make_axes, ned_acceleration, shift_clock
 
 Array = NDArray[np.float64]
@@ -468,3 +471,13 @@ class TestFlownFlights:
         assert effects["rejected samples"].without.position_rms_m > 1.5 * (
             found.together.alone.position_rms_m
         )
+
+
+def test_what_does_not_fit_on_a_page_begins_the_next() -> None:
+    """Two axes with much to say ran over the foot of the page."""
+    long = Unavailable("budget", "a sentence of some length, again " * 160, "None")
+    document = SimpleNamespace(comparison=SimpleNamespace(budget={"aisle": long, "down": long}))
+    with report_style():
+        pages = list(draw(document))  # type: ignore[arg-type]
+    assert len(pages) == 2
+    assert min(text.get_position()[1] for figure in pages for text in figure.texts) >= BOTTOM

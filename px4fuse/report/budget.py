@@ -13,6 +13,7 @@ from px4fuse.budget import Budget, Effect, Fit
 from px4fuse.flight import Unavailable
 from px4fuse.report.document import Document
 from px4fuse.report.style import (
+    BOTTOM,
     LEFT,
     MUTED,
     OURS,
@@ -33,25 +34,50 @@ SMALLEST_SHARE = 0.005
 
 
 def draw(document: Document) -> Iterator[Figure]:
-    """Draw a page for every two axes; none where the budget was not made."""
-    found = list(document.comparison.budget.items())
-    for first in range(0, len(found), AXES_PER_PAGE):
-        figure, cursor = page(
-            "Difference budget" + (" (continued)" if first else ""),
-            "Our filter is replayed with one thing made like EKF2's. Where the bar is shorter than "
-            "the dashed line, that thing explains part of the difference (its share of the mean "
-            "square); where it is longer, it hides another cause. A square is everything made like "
-            "EKF2's but that one: the further right of the lowest bar, the more it matters. Shares "
-            "overlap and do not add up.",
-        )
-        for name, budget in found[first : first + AXES_PER_PAGE]:
-            cursor.skip(6)
-            if isinstance(budget, Unavailable):
-                cursor.write(f"{name}: no budget", size=9.5, weight="bold")
-                cursor.write(f"{budget.reason}. {budget.remedy}", colour=MUTED)
-            else:
-                _axis(figure, cursor, name, budget)
-        yield figure
+    """Draw as many axes on a page as fit, at most two; none where the budget was not made."""
+    started = None
+    on_page = 0
+    for name, budget in document.comparison.budget.items():
+        if started is not None and (
+            on_page == AXES_PER_PAGE or started[1].y - _height(started[1], budget) < BOTTOM
+        ):
+            yield started[0]
+            started = _started(" (continued)")
+            on_page = 0
+        started = started or _started("")
+        figure, cursor = started
+        on_page += 1
+        cursor.skip(6)
+        if isinstance(budget, Unavailable):
+            cursor.write(f"{name}: no budget", size=9.5, weight="bold")
+            cursor.write(f"{budget.reason}. {budget.remedy}", colour=MUTED)
+        else:
+            _axis(figure, cursor, name, budget)
+    if started is not None:
+        yield started[0]
+
+
+def _started(continued: str) -> tuple[Figure, Cursor]:
+    return page(
+        f"Difference budget{continued}",
+        "Our filter is replayed with one thing made like EKF2's. Where the bar is shorter than "
+        "the dashed line, that thing explains part of the difference (its share of the mean "
+        "square); where it is longer, it hides another cause. A square is everything made like "
+        "EKF2's but that one: the further right of the lowest bar, the more it matters. Shares "
+        "overlap and do not add up.",
+    )
+
+
+def _height(cursor: Cursor, budget: Budget | Unavailable) -> float:
+    """Height that an axis takes, as a fraction of the page."""
+    heading = cursor.height("heading", size=9.5) + 6.0 / POINTS_PER_HEIGHT
+    if isinstance(budget, Unavailable):
+        return heading + cursor.height(f"{budget.reason}. {budget.remedy}")
+    reading = _reading(budget)
+    words = sum(cursor.height(sentence, size=8.0) for sentence in reading)
+    words += sum(cursor.height(line, size=7.0) for line in _made(budget))
+    gaps = 16.0 + 20.0 + len(reading) + 2.0
+    return heading + words + (gaps + ROW_POINTS * (len(_rows(budget)) + 1)) / POINTS_PER_HEIGHT
 
 
 @dataclass(frozen=True)
@@ -64,8 +90,7 @@ class _Bar:
     hatch: str = ""
 
 
-def _axis(figure: Figure, cursor: Cursor, name: str, budget: Budget) -> None:
-    cursor.write(f"{name}: RMS difference to EKF2, {budget.count} samples", size=9.5, weight="bold")
+def _rows(budget: Budget) -> list[_Bar]:
     bars = [_Bar("ours as set", None, OURS)]
     bars += [
         _Bar(cause, effect, OURS_BAND)
@@ -75,6 +100,12 @@ def _axis(figure: Figure, cursor: Cursor, name: str, budget: Budget) -> None:
     bars.append(_Bar("all of these together", budget.together, OURS))
     if isinstance(budget.clock, Effect):
         bars.append(_Bar("clock offset removed", budget.clock, "white", "////"))
+    return bars
+
+
+def _axis(figure: Figure, cursor: Cursor, name: str, budget: Budget) -> None:
+    cursor.write(f"{name}: RMS difference to EKF2, {budget.count} samples", size=9.5, weight="bold")
+    bars = _rows(budget)
     height = ROW_POINTS * (len(bars) + 1) / POINTS_PER_HEIGHT
     cursor.skip(16)
     width = (RIGHT - LEFT - LABELS - GAP) / 2.0
