@@ -13,18 +13,18 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from px4fuse.comparison import Comparison, compare
-    from px4fuse.consistency import Consistency, assess
+    from px4fuse.analysis import explain
+    from px4fuse.comparison.comparison import Comparison, compare
     from px4fuse.errors import Px4FuseError
-    from px4fuse.explanation import explain
+    from px4fuse.filter.consistency import Consistency, assess
+    from px4fuse.filter.kalman import Settings, replay
+    from px4fuse.filter.tuning import tune
     from px4fuse.findings import Finding, find
     from px4fuse.flight import Flight, Unavailable
-    from px4fuse.kalman import Settings, replay
+    from px4fuse.loop.loop import close_loop
     from px4fuse.readers import read_log
     from px4fuse.readers.trajectory import read_trajectory
     from px4fuse.trajectory.evaluation import evaluate
-    from px4fuse.trajectory.loop import close_loop
-    from px4fuse.tuning import tune
 
 __all__ = [
     "Comparison",
@@ -47,23 +47,23 @@ __all__ = [
 ]
 
 _HOMES = {
-    "Comparison": "comparison",
-    "Consistency": "consistency",
+    "Comparison": "comparison.comparison",
+    "Consistency": "filter.consistency",
     "Finding": "findings",
     "Flight": "flight",
     "Px4FuseError": "errors",
-    "Settings": "kalman",
+    "Settings": "filter.kalman",
     "Unavailable": "flight",
-    "assess": "consistency",
-    "close_loop": "trajectory.loop",
-    "compare": "comparison",
+    "assess": "filter.consistency",
+    "close_loop": "loop.loop",
+    "compare": "comparison.comparison",
     "evaluate": "trajectory.evaluation",
-    "explain": "explanation",
+    "explain": "analysis",
     "find": "findings",
     "read_log": "readers",
     "read_trajectory": "readers.trajectory",
-    "replay": "kalman",
-    "tune": "tuning",
+    "replay": "filter.kalman",
+    "tune": "filter.tuning",
 }
 
 

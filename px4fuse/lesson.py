@@ -10,10 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from px4fuse.filter.kalman import InitialState, Replay, Settings, replay
+from px4fuse.filter.signals import Axis
 from px4fuse.flight import Unavailable
-from px4fuse.kalman import InitialState, Replay, Settings, replay
-from px4fuse.signals import Axis
-from px4fuse.trajectory.closure import cumulative_distance, distribute_by_distance
+from px4fuse.loop.closure import cumulative_distance, distribute_by_distance
 
 TRUE_VELOCITY_M_S = 1.0
 STEPS = 30

@@ -16,6 +16,7 @@ import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
+from px4fuse.filter.signals import Axis, Segment, project_acceleration
 from px4fuse.flight import (
     ANGULAR_RATE_COLUMNS,
     AXIS_NAMES,
@@ -34,7 +35,6 @@ from px4fuse.flight import (
     Truth,
     Unavailable,
 )
-from px4fuse.signals import Axis, Segment, project_acceleration
 
 Array = NDArray[np.float64]
 Span = tuple[float, float]

@@ -18,7 +18,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from px4fuse.alignment import EKF2_POSITION, IMU, place
 from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.flight import (
     POSITION_COLUMNS,
@@ -29,6 +28,7 @@ from px4fuse.flight import (
     PositionTrack,
     Reset,
 )
+from px4fuse.placing.placement import EKF2_POSITION, IMU, place
 from px4fuse.readers import read_log
 from px4fuse.readers.position_csv import SAMPLE_COLUMNS, PositionFile, read_position_csv
 

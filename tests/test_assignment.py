@@ -9,15 +9,9 @@ import pytest
 from click.testing import CliRunner
 
 import px4fuse
-from px4fuse.cli import cli, main
-from px4fuse.comparison import compare
-from px4fuse.detector_rates import rates
-from px4fuse.errors import OutputError, SettingsError
-from px4fuse.explanation import explain
-from px4fuse.findings import find, find_loop
-from px4fuse.grading.answers import AnswerKey, key_text, read_key
-from px4fuse.simulation import assignment
-from px4fuse.simulation.assignment import (
+from px4fuse.analysis import explain
+from px4fuse.assignment import assignment
+from px4fuse.assignment.assignment import (
     CHOICES,
     COUNTS,
     Student,
@@ -28,10 +22,16 @@ from px4fuse.simulation.assignment import (
     key_path,
     read_roster,
 )
+from px4fuse.assignment.key import AnswerKey, key_text, read_key
+from px4fuse.cli import cli, main
+from px4fuse.comparison.comparison import compare
+from px4fuse.errors import OutputError, SettingsError
+from px4fuse.findings import find, find_loop
+from px4fuse.loop.analysis import analyse
+from px4fuse.loop.sources import Source
+from px4fuse.loop.tracks import trajectory_of
+from px4fuse.simulation.detector_rates import rates
 from px4fuse.simulation.mistakes import parse
-from px4fuse.trajectory.analysis import analyse
-from px4fuse.trajectory.sources import Source
-from px4fuse.trajectory.tracks import trajectory_of
 
 SECRET = b"a secret for tests"
 # What the secret gives student s1: seed, noise and heading, and the mistakes

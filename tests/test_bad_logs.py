@@ -33,9 +33,9 @@ from ulog_tools import (
 
 from px4fuse.cli import main
 from px4fuse.errors import LogError, Px4FuseError
+from px4fuse.filter.signals import choose_segment, choose_source, make_axes
 from px4fuse.flight import Flight, Unavailable
 from px4fuse.readers import read_log
-from px4fuse.signals import choose_segment, choose_source, make_axes
 
 PATIENCE_S = 3.0  # these files are some kilobytes; reading one takes hundredths of a second
 

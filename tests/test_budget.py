@@ -16,9 +16,17 @@ from numpy.typing import NDArray
 from scipy.integrate import cumulative_trapezoid
 from ulog_tools import GENERATIONS, make_log, stamps, topic
 
-from px4fuse.budget import CAUSES, Budget, Effect, Run, budget, states_at
-from px4fuse.clock import ClockOffset
-from px4fuse.comparison import Comparison, compare
+from px4fuse.comparison.budget import CAUSES, Budget, Effect, Run, budget, states_at
+from px4fuse.comparison.comparison import Comparison, compare
+from px4fuse.filter.clock import ClockOffset
+from px4fuse.filter.kalman import Replay, Settings, replay, state_at
+from px4fuse.filter.signals import (
+    choose_segment,
+    choose_source,
+    make_axes,
+    ned_acceleration,
+    shift_clock,
+)
 from px4fuse.flight import (
     AXIS_NAMES,
     POSITION_COLUMNS,
@@ -29,13 +37,11 @@ from px4fuse.flight import (
     Truth,
     Unavailable,
 )
-from px4fuse.kalman import Replay, Settings, replay, state_at
 from px4fuse.readers import read_log
 from px4fuse.report.budget import draw
 from px4fuse.report.document import Document, Student
-from px4fuse.report.results import results, schema
 from px4fuse.report.style import BOTTOM, report_style
-from px4fuse.signals import choose_segment, choose_source, make_axes, ned_acceleration, shift_clock
+from px4fuse.results.build import results, schema
 
 Array = NDArray[np.float64]
 DEFAULT = Settings()

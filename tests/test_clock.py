@@ -12,7 +12,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.stats import binom
 
-from px4fuse.clock import (
+from px4fuse.analysis import clock_offset, tuned_horizontally
+from px4fuse.comparison.comparison import compare
+from px4fuse.filter.clock import (
     CHANGE_P,
     CONSTANTS,
     MIN_MEASUREMENTS,
@@ -24,8 +26,8 @@ from px4fuse.clock import (
     _vertex,
     estimate_clock_offset,
 )
-from px4fuse.comparison import compare
-from px4fuse.explanation import clock_offset, tuned_horizontally
+from px4fuse.filter.kalman import Settings
+from px4fuse.filter.signals import Segment
 from px4fuse.flight import (
     ANGULAR_RATE_COLUMNS,
     POSITION_COLUMNS,
@@ -35,10 +37,8 @@ from px4fuse.flight import (
     Flight,
     Unavailable,
 )
-from px4fuse.kalman import Settings
 from px4fuse.readers import read_log
 from px4fuse.report.words import clock_advice
-from px4fuse.signals import Segment
 
 GRAVITY = np.array([0.0, 0.0, 9.80665])
 AMPLITUDE = np.array([4.0, 1.0, 0.3])

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from px4fuse.trajectory.closure import (
+from px4fuse.loop.closure import (
     correct_by_distance,
     cumulative_distance,
     distribute_by_distance,

@@ -11,11 +11,17 @@ import pytest
 from flights import Estimator, Imu, Uwb, aisle_flight, unavailable
 from numpy.typing import NDArray
 
-from px4fuse.comparison import AxisComparison, Comparison, Difference, FilterSummary, compare
-from px4fuse.consistency import Consistency
+from px4fuse.comparison.comparison import (
+    AxisComparison,
+    Comparison,
+    Difference,
+    FilterSummary,
+    compare,
+)
 from px4fuse.errors import MissingDataError, SettingsError
+from px4fuse.filter.consistency import Consistency
+from px4fuse.filter.kalman import Settings, variance_at
 from px4fuse.flight import Ekf2, Flight, Reset, Truth, Unavailable
-from px4fuse.kalman import Settings, variance_at
 from px4fuse.readers import read_log
 
 Array = NDArray[np.float64]

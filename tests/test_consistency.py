@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy import stats
 
-from px4fuse.consistency import (
+from px4fuse.filter.consistency import (
     Consistency,
     assess,
     assess_horizontal,

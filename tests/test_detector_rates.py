@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from px4fuse.detector_rates import CLEAN, CONDITIONS, found, rates
+from px4fuse.simulation.detector_rates import CLEAN, CONDITIONS, found, rates
 
 TABLE = rates()
 

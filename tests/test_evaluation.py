@@ -655,8 +655,8 @@ def test_the_sample_slam_against_itself_drifting() -> None:
 
 
 def test_the_sample_slam_against_the_log_that_it_was_made_from() -> None:
+    from px4fuse.loop.tracks import trajectory_of
     from px4fuse.readers import read_log
-    from px4fuse.trajectory.tracks import trajectory_of
 
     log: Path = REPOSITORY / "sample_logs" / "loop_vio.ulg"
     flown = read_log(log)

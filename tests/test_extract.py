@@ -16,9 +16,11 @@ from flights import Estimator, aisle_flight
 from test_cli import run_main
 from ulog_tools import Log, make_log, stamps, topic
 
-from px4fuse import extraction
 from px4fuse.cli import cli
-from px4fuse.comparison import compare
+from px4fuse.comparison.comparison import compare
+from px4fuse.contents import extraction
+from px4fuse.filter.kalman import Settings, state_at
+from px4fuse.filter.signals import ned_acceleration
 from px4fuse.flight import (
     QUATERNION_COLUMNS,
     ClockMap,
@@ -28,9 +30,7 @@ from px4fuse.flight import (
     Reset,
     Unavailable,
 )
-from px4fuse.kalman import Settings, state_at
 from px4fuse.readers import read_log
-from px4fuse.signals import ned_acceleration
 
 # As it stands in the README: the lesson's Example 1 on one's own flight
 README = (Path(__file__).parent.parent / "README.md").read_text(encoding="utf-8")

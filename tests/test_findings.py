@@ -17,8 +17,9 @@ from test_loop import NAMED_HERE as NAMED_IN_LOOPS
 from test_noise_findings import NAMED_HERE
 
 from px4fuse import findings as package
-from px4fuse.comparison import Comparison, compare
-from px4fuse.consistency import MIN_INNOVATIONS
+from px4fuse.comparison.comparison import Comparison, compare
+from px4fuse.filter.consistency import MIN_INNOVATIONS
+from px4fuse.filter.kalman import Settings
 from px4fuse.findings import DETECTORS, SEVERITIES, Finding, find
 from px4fuse.flight import (
     AXIS_NAMES,
@@ -31,7 +32,6 @@ from px4fuse.flight import (
     Reset,
     Unavailable,
 )
-from px4fuse.kalman import Settings
 from px4fuse.readers import read_log
 
 ALIGNED = "estimator_visual_odometry_aligned"

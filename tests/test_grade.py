@@ -14,8 +14,8 @@ from click.testing import CliRunner
 from conftest import REPOSITORY
 from pypdf import PdfReader, PdfWriter
 
+from px4fuse.assignment.key import Answer, AnswerKey
 from px4fuse.cli import cli
-from px4fuse.grading.answers import Answer, AnswerKey
 from px4fuse.grading.grade import file_names, grade, graded_from, logs_by_hash
 from px4fuse.grading.model import Graded, Verdict
 from px4fuse.grading.rubric import parse_rubric, read_rubric, rubric_text

@@ -14,12 +14,12 @@ from test_cli import run_main
 from ulog_tools import Log, load, make_log, odometry, stamps, take, topic
 
 from px4fuse.cli import cli
-from px4fuse.comparison import compare
+from px4fuse.comparison.comparison import compare
+from px4fuse.contents.inventory import Ability, Inventory, Source, take_inventory, to_plain
 from px4fuse.errors import Px4FuseError
+from px4fuse.filter.signals import choose_source
 from px4fuse.flight import ClockMap, Dropout, Flight, Sender, Unavailable
-from px4fuse.inventory import Ability, Inventory, Source, take_inventory, to_plain
 from px4fuse.readers import read_log
-from px4fuse.signals import choose_source
 
 WIDTH = 80
 

@@ -26,9 +26,9 @@ from pypdf.generic import (
     TextStringObject,
 )
 
-from px4fuse.grading import intake
-from px4fuse.grading.intake import SHARED, cleaned, one_line, read_report
 from px4fuse.grading.model import Refused, Report
+from px4fuse.verification import intake
+from px4fuse.verification.intake import SHARED, cleaned, one_line, read_report
 
 ROOT = Path(__file__).parent.parent
 REAL = (ROOT / "reports" / "aisle_uwb.pdf").read_bytes()
@@ -324,7 +324,7 @@ def test_bombs_in_a_process_of_their_own():
     if sys.platform == "win32":
         pytest.skip("no ru_maxrss")
     script = (
-        "import resource, sys; from px4fuse.grading.intake import read_report;"
+        "import resource, sys; from px4fuse.verification.intake import read_report;"
         "base = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss;"
         "print(read_report(sys.stdin.buffer.read(), 'r.pdf').reason);"
         "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - base)"

@@ -14,8 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from px4fuse.errors import SettingsError
-from px4fuse.flight import Flight
-from px4fuse.kalman import (
+from px4fuse.filter.kalman import (
     InitialState,
     Replay,
     Settings,
@@ -23,7 +22,8 @@ from px4fuse.kalman import (
     replay,
     state_at,
 )
-from px4fuse.signals import Axis, choose_segment, choose_source, make_axes
+from px4fuse.filter.signals import Axis, choose_segment, choose_source, make_axes
+from px4fuse.flight import Flight
 
 SAME_TIME_S = 5e-7
 STATE = [

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from px4fuse.trajectory import lie
+from px4fuse.trajectory.graph import lie
 
 ANGLES = (0.0, 1e-12, 1e-6, 0.01, 0.2999, 0.3001, 1.0, 2.5, np.pi - 1e-6, np.pi - 1e-12)
 SIZES = {2: (3, 3), 3: (6, 7)}  # tangent, pose

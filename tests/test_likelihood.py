@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 from scipy.stats import norm
 from test_kalman import any_axis, any_settings, sample_axes
 
-from px4fuse.flight import Flight
-from px4fuse.kalman import Settings, replay
-from px4fuse.likelihood import (
+from px4fuse.filter.kalman import Settings, replay
+from px4fuse.filter.likelihood import (
     OUTLIER_SHARE,
     OUTLIER_WIDTH,
     innovations,
@@ -22,7 +21,8 @@ from px4fuse.likelihood import (
     preintegrate,
     states,
 )
-from px4fuse.signals import Axis
+from px4fuse.filter.signals import Axis
+from px4fuse.flight import Flight
 
 SIGMA_A = [0.05, 0.5, 5.0]
 SIGMA_Z = [0.02, 0.1, 1.0]

@@ -14,13 +14,13 @@ from scipy.spatial.transform import Rotation, Slerp
 from px4fuse.errors import SettingsError, TrajectoryError
 from px4fuse.findings import find_loop
 from px4fuse.flight import Unavailable
+from px4fuse.loop.analysis import analyse, loop_in
+from px4fuse.loop.loop import SINGLE_LOOP, Correction, Loop, close_loop
+from px4fuse.loop.odometry import Closure, OdometryNoise, odometry_variances
+from px4fuse.loop.sources import Source, read_source, split_part
 from px4fuse.readers.closures import GivenClosure, parse_closure, read_closures
-from px4fuse.trajectory.analysis import analyse, loop_in
 from px4fuse.trajectory.evaluation import Evaluation
-from px4fuse.trajectory.loop import SINGLE_LOOP, Correction, Loop, close_loop
 from px4fuse.trajectory.model import Trajectory
-from px4fuse.trajectory.odometry import Closure, OdometryNoise, odometry_variances
-from px4fuse.trajectory.sources import Source, read_source, split_part
 
 SAMPLE = REPOSITORY / "sample_logs" / "loop_vio.ulg"
 SLAM = REPOSITORY / "sample_logs" / "loop_slam.tum"

@@ -46,8 +46,9 @@ from mavlink_tools import (
 from scipy.spatial.transform import Rotation
 from test_bad_logs import patience
 
-from px4fuse.comparison import compare
+from px4fuse.comparison.comparison import compare
 from px4fuse.errors import LogError, Px4FuseError, SettingsError
+from px4fuse.filter.kalman import Settings, state_at
 from px4fuse.flight import (
     ANGULAR_RATE_COLUMNS,
     POSITION_COLUMNS,
@@ -62,7 +63,6 @@ from px4fuse.flight import (
     Truth,
     Unavailable,
 )
-from px4fuse.kalman import Settings, state_at
 from px4fuse.readers import read_log
 from px4fuse.readers.mavlink_frames import read_frames
 

@@ -8,8 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from px4fuse.comparison import Comparison, compare
-from px4fuse.explanation import explain
+from px4fuse.analysis import explain
+from px4fuse.comparison.comparison import Comparison, compare
+from px4fuse.filter.kalman import Settings
 from px4fuse.findings import Finding
 from px4fuse.findings.noise import (
     clock_off,
@@ -18,7 +19,6 @@ from px4fuse.findings.noise import (
     noises_off,
     outliers,
 )
-from px4fuse.kalman import Settings
 from px4fuse.readers import read_log
 from px4fuse.simulation.flights import simulate_flight
 from px4fuse.simulation.mistakes import parse

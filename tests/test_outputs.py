@@ -13,9 +13,9 @@ from test_cli import run_main
 from ulog_tools import ev_error, ev_stamps, make_log, position
 
 import px4fuse.report.pdf
-from px4fuse.comparison import compare
+from px4fuse.analysis import clock_offset_found
+from px4fuse.comparison.comparison import compare
 from px4fuse.errors import MissingDataError
-from px4fuse.explanation import clock_offset_found
 from px4fuse.readers import read_log
 
 SECONDS = 20.0

@@ -14,11 +14,11 @@ from matplotlib.backends.backend_pdf import PdfPages
 from matplotlib.figure import Figure
 from pypdf import PdfWriter
 
-from px4fuse.grading.content_stream import UnreadableError, operations
-from px4fuse.grading.glyphs import code_texts
-from px4fuse.grading.page_comparison import Compared, compare_pdf, plain_layout, same_words
 from px4fuse.report.seal import sealed
 from px4fuse.report.style import report_style
+from px4fuse.verification.content_stream import UnreadableError, operations
+from px4fuse.verification.glyphs import code_texts
+from px4fuse.verification.page_comparison import Compared, compare_pdf, plain_layout, same_words
 
 
 def drawn(*texts: str, thinned: float = 0.5, by: float = 0.0, size: float = 12.0) -> bytes:

@@ -15,7 +15,7 @@ from PIL import Image
 from pypdf import PdfReader, PdfWriter
 
 from px4fuse.flight import Unavailable
-from px4fuse.grading.pictures import MAX_BYTES, MAX_PIXELS, key_page, picture
+from px4fuse.verification.pictures import MAX_BYTES, MAX_PIXELS, key_page, picture
 
 REPORT = Path(__file__).resolve().parents[1] / "reports" / "aisle_uwb.pdf"
 

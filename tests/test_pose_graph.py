@@ -15,8 +15,9 @@ from scipy.stats import chi2, kstest
 
 from px4fuse.errors import TrajectoryError
 from px4fuse.readers.g2o import parse_g2o, read_g2o
-from px4fuse.trajectory import lie
-from px4fuse.trajectory.pose_graph import (
+from px4fuse.trajectory.graph import lie
+from px4fuse.trajectory.graph.initialisation import _chordal
+from px4fuse.trajectory.graph.pose_graph import (
     FROM_CHORDAL,
     FROM_ODOMETRY,
     PoseGraph,
@@ -29,8 +30,7 @@ from px4fuse.trajectory.pose_graph import (
     residuals,
     solve,
 )
-from px4fuse.trajectory.pose_graph_initialisation import _chordal
-from px4fuse.trajectory.pose_graph_solver import jacobians
+from px4fuse.trajectory.graph.solver import jacobians
 
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "pose_graphs"
 TANGENT = {2: 3, 3: 6}

@@ -31,6 +31,7 @@ from ulog_tools import (
 )
 
 from px4fuse.errors import MissingDataError
+from px4fuse.filter.signals import choose_source
 from px4fuse.flight import (
     POSITION_COLUMNS,
     POSITION_VARIANCE_COLUMNS,
@@ -41,7 +42,6 @@ from px4fuse.flight import (
 )
 from px4fuse.readers import read_log
 from px4fuse.readers.px4_ekf2 import JOIN_TOLERANCE_S
-from px4fuse.signals import choose_source
 
 HALF_PERIOD_S = 0.005  # of EKF2's update, EKF2_PREDICT_US 10,000
 HOUR_US = 3_600_000_000

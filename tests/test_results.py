@@ -11,7 +11,7 @@ import px4fuse
 from px4fuse.errors import Px4FuseError
 from px4fuse.report.document import Document, Student
 from px4fuse.report.pdf import render
-from px4fuse.report.results import results, schema, to_json
+from px4fuse.results.build import results, schema, to_json
 
 ROOT = Path(__file__).parent.parent
 

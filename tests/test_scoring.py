@@ -10,9 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from px4fuse.grading.answers import Answer, AnswerKey
+from px4fuse.assignment.key import Answer, AnswerKey
 from px4fuse.grading.flags import class_flags, own_flags
-from px4fuse.grading.intake import read_report
 from px4fuse.grading.model import Graded, Report, Verdict
 from px4fuse.grading.rubric import parse_rubric, read_rubric
 from px4fuse.grading.scoring import (
@@ -23,7 +22,8 @@ from px4fuse.grading.scoring import (
     score_refused,
     values_at,
 )
-from px4fuse.grading.verification import verify
+from px4fuse.verification.intake import read_report
+from px4fuse.verification.verification import verify
 
 ROOT = Path(__file__).parent.parent
 RESULTS = json.loads((ROOT / "reports" / "aisle_uwb.json").read_text(encoding="utf-8"))

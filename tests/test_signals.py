@@ -12,7 +12,19 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from px4fuse.comparison.projection import continuous_state
 from px4fuse.errors import MissingDataError, SettingsError
+from px4fuse.filter.signals import (
+    Segment,
+    aisle_heading,
+    choose_segment,
+    choose_source,
+    make_axes,
+    ned_acceleration,
+    project_acceleration,
+    shift_clock,
+    step_means,
+)
 from px4fuse.flight import (
     ANGULAR_RATE_COLUMNS,
     AXIS_NAMES,
@@ -27,18 +39,6 @@ from px4fuse.flight import (
     PositionTrack,
     Reset,
     Unavailable,
-)
-from px4fuse.projection import continuous_state
-from px4fuse.signals import (
-    Segment,
-    aisle_heading,
-    choose_segment,
-    choose_source,
-    make_axes,
-    ned_acceleration,
-    project_acceleration,
-    shift_clock,
-    step_means,
 )
 
 GRAVITY = 9.80665

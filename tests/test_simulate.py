@@ -13,13 +13,13 @@ from scipy.spatial.transform import Rotation
 
 import px4fuse
 from px4fuse.cli import cli, main
-from px4fuse.consistency import nis_band
 from px4fuse.errors import SettingsError
+from px4fuse.filter.consistency import nis_band
+from px4fuse.filter.kalman import Settings
+from px4fuse.filter.likelihood import innovations, preintegrate
+from px4fuse.filter.signals import Segment, make_axes, project_acceleration, step_means
 from px4fuse.findings import find
 from px4fuse.flight import POSITION_COLUMNS, Truth, Unavailable
-from px4fuse.kalman import Settings
-from px4fuse.likelihood import innovations, preintegrate
-from px4fuse.signals import Segment, make_axes, project_acceleration, step_means
 from px4fuse.simulation import sensors
 from px4fuse.simulation.flights import answer, simulate, simulate_flight, to_flight, to_ulog
 from px4fuse.simulation.mistakes import MISTAKES, Mistakes, as_typed, made, parse

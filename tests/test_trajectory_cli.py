@@ -20,7 +20,7 @@ from test_lesson import EXAMPLE_2
 from test_outputs import contents
 
 from px4fuse.cli import cli
-from px4fuse.report.results import schema
+from px4fuse.results.build import schema
 
 LOG = REPOSITORY / "sample_logs" / "loop_vio.ulg"
 SLAM = REPOSITORY / "sample_logs" / "loop_slam.tum"

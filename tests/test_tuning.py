@@ -12,14 +12,17 @@ from flights import Array, line
 from numpy.typing import NDArray
 from scipy.stats import binom
 
-from px4fuse.comparison import compare
-from px4fuse.consistency import Consistency
-from px4fuse.flight import Unavailable
-from px4fuse.kalman import Settings
-from px4fuse.likelihood import PROFILE_DROP, innovations, negative_log_likelihood, preintegrate
-from px4fuse.readers import read_log
-from px4fuse.signals import Axis
-from px4fuse.tuning import (
+from px4fuse.comparison.comparison import compare
+from px4fuse.filter.consistency import Consistency
+from px4fuse.filter.kalman import Settings
+from px4fuse.filter.likelihood import (
+    PROFILE_DROP,
+    innovations,
+    negative_log_likelihood,
+    preintegrate,
+)
+from px4fuse.filter.signals import Axis
+from px4fuse.filter.tuning import (
     HORIZONTAL,
     MIN_MEASUREMENTS,
     SIGMA_Z_SEARCH_M,
@@ -28,6 +31,8 @@ from px4fuse.tuning import (
     tune,
     tune_axes,
 )
+from px4fuse.flight import Unavailable
+from px4fuse.readers import read_log
 
 SIGMA_A, SIGMA_Z = 0.5, 0.10
 DT, INTERVAL_S = 0.1, 0.2

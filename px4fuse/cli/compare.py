@@ -48,11 +48,11 @@ def compare(
     LOG is a PX4 ULog or a MAVLink recording (.tlog or raw stream). Writes a PDF report and its
     results as JSON.
     """
-    from px4fuse.explanation import explain
+    from px4fuse.analysis import explain
     from px4fuse.findings import find
     from px4fuse.report.document import Document
     from px4fuse.report.pdf import render
-    from px4fuse.report.results import results, to_json
+    from px4fuse.results.build import results, to_json
 
     person = read_person(analysis)
     target, beside = report_paths(output or Path("reports") / f"{log.stem}.pdf", json_path)

@@ -111,10 +111,10 @@ def evaluate(
     Either is a trajectory file (TUM, EuRoC, ORB-SLAM3) or a part of a flight log: LOG:vio,
     LOG:ekf2, LOG:kf (our filter) or LOG:truth.
     """
+    from px4fuse.loop.sources import read_source
     from px4fuse.report.loop_terminal import print_evaluation
-    from px4fuse.report.results import evaluation_results
+    from px4fuse.results.build import evaluation_results
     from px4fuse.trajectory.evaluation import evaluate as score
-    from px4fuse.trajectory.sources import read_source
 
     for option, value in (("--max-gap", max_gap), ("--time-offset", time_offset)):
         if isinstance(value, float) and not abs(value) < float("inf"):

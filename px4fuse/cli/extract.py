@@ -63,8 +63,8 @@ def extract(
         raise OutputError(
             '--format parquet needs pyarrow: pip install "px4fuse[parquet]", or take --format csv.'
         )
-    from px4fuse import extraction
-    from px4fuse.report.results import to_json
+    from px4fuse.contents import extraction
+    from px4fuse.results.build import to_json
 
     flight = with_position(read_recordings(log, mavlink, system), **position)
     _refuse_mixture(folder, flight.log.sha256)

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
-    from px4fuse.inventory import Inventory, Source
+    from px4fuse.contents.inventory import Inventory, Source
 
 
 @click.command()
@@ -36,7 +36,7 @@ def info(
     **position: Any,
 ) -> None:
     """Say what is in a log, what px4fuse can do with it, and what to log next time."""
-    from px4fuse.inventory import take_inventory, to_plain
+    from px4fuse.contents.inventory import take_inventory, to_plain
 
     inventory = take_inventory(with_position(read_recordings(log, mavlink, system), **position))
     if write_json(to_plain(inventory), json_path):

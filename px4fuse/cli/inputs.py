@@ -18,7 +18,7 @@ from px4fuse.errors import LogError, OutputError, SettingsError
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from px4fuse.comparison import Comparison
+    from px4fuse.comparison.comparison import Comparison
     from px4fuse.flight import Flight
     from px4fuse.report.document import Student
 
@@ -242,7 +242,7 @@ def read_recordings(log: Path, mavlink: Path | None, system: int | None) -> Flig
 
     if mavlink is None:
         return read_log(log, system=system)
-    from px4fuse.joining import join
+    from px4fuse.placing.joining import join
 
     flight = read_log(log)
     other = read_log(mavlink, system=system)
@@ -276,7 +276,7 @@ def with_position(
         if given:
             raise SettingsError(f"--{given[0].replace('_', '-')} is of use with --position only.")
         return flight
-    from px4fuse.alignment import place
+    from px4fuse.placing.placement import place
     from px4fuse.readers.position_csv import read_position_csv
 
     columns = options["position_columns"]
@@ -315,8 +315,8 @@ def run_comparison(
     **position_format: Any,
 ) -> Comparison:
     """Read what :func:`analysis_options` name and run the filter over it."""
-    from px4fuse import comparison
-    from px4fuse.kalman import InputName, Settings
+    from px4fuse.comparison import comparison
+    from px4fuse.filter.kalman import InputName, Settings
 
     settings = Settings(
         sigma_a_m_s2=sigma_a,
@@ -348,7 +348,7 @@ def run_comparison(
 
     compared = run(settings)
     if clock_offset == AUTO and position is None:
-        from px4fuse.explanation import clock_offset_found
+        from px4fuse.analysis import clock_offset_found
 
         found = clock_offset_found(compared, step)
         compared = run(replace(settings, clock_offset_s=found))
@@ -387,7 +387,7 @@ def report_paths(output: Path, json_path: Path | None) -> tuple[Path, Path]:
 
 def write_json(results: dict[str, Any], json_path: Path | None) -> bool:
     """Write results where --json says; true where they have standard output to themselves."""
-    from px4fuse.report.results import to_json
+    from px4fuse.results.build import to_json
 
     text = to_json(results)
     if json_path == STANDARD_OUTPUT:
@@ -406,7 +406,7 @@ def write_outputs(contents: Mapping[Path, bytes]) -> None:
     OutputError
         A target is one of the inputs, or cannot be written.
     """
-    from px4fuse.report.writing import write_all
+    from px4fuse.writing import write_all
 
     spare_inputs(contents)
     write_all(contents)

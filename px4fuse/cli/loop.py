@@ -29,7 +29,7 @@ from px4fuse.errors import SettingsError
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from px4fuse.trajectory.loop import Loop
+    from px4fuse.loop.loop import Loop
 
 FRAMES = {"ned": "NED", "frd": "FRD", "enu": "ENU", "camera": "camera"}
 # Nobody's tape is longer
@@ -161,10 +161,10 @@ def loop(
     LOG:kf choose), a trajectory (TUM, EuRoC, ORB-SLAM3), or a pose graph (g2o), which is solved.
     """
     from px4fuse.findings import find_loop
+    from px4fuse.loop.sources import is_g2o, split_part
     from px4fuse.report.document import LoopDocument
     from px4fuse.report.loop_terminal import print_loop
-    from px4fuse.report.results import loop_results, to_json
-    from px4fuse.trajectory.sources import is_g2o, split_part
+    from px4fuse.results.build import loop_results, to_json
 
     person = read_person(given)
     for option, path in (("--tum", tum), ("--g2o", g2o)):
@@ -209,7 +209,7 @@ def run_loop(
     **given: Any,
 ) -> Loop:
     """Read what the command's options name and measure the loop."""
-    from px4fuse.trajectory.sources import read_source
+    from px4fuse.loop.sources import read_source
 
     _check_span(given)
     step(f"reading {source.name}")
@@ -234,9 +234,9 @@ def _spare(*targets: Path | None) -> None:
 
 
 def _analyse(read: Any, other: Any, step: Any, **given: Any) -> Loop:
+    from px4fuse.loop.analysis import analyse
+    from px4fuse.loop.odometry import OdometryNoise
     from px4fuse.readers.closures import parse_closure, read_closures
-    from px4fuse.trajectory.analysis import analyse
-    from px4fuse.trajectory.odometry import OdometryNoise
 
     closures = tuple(parse_closure(text) for text in given["closure"])
     if given["closures"] is not None:
@@ -258,9 +258,9 @@ def _analyse(read: Any, other: Any, step: Any, **given: Any) -> Loop:
 def _files(found: Loop, tum: Path | None, g2o: Path | None) -> dict[Path, bytes]:
     """The corrected path and the solved graph, as files for other tools."""
     from px4fuse.errors import MissingDataError
+    from px4fuse.loop.closure import in_frame
     from px4fuse.readers.g2o import g2o_text
     from px4fuse.readers.trajectory import tum_text
-    from px4fuse.trajectory.closure import in_frame
 
     contents = {}
     if tum is not None:
@@ -277,11 +277,11 @@ def _files(found: Loop, tum: Path | None, g2o: Path | None) -> dict[Path, bytes]
 
 def _solve(source: Path, json_path: Path | None, g2o: Path | None, robust: bool | None) -> None:
     """Solve a pose graph from a file."""
+    from px4fuse.loop.sources import split_part
     from px4fuse.readers.g2o import g2o_text, read_g2o
     from px4fuse.report.loop_terminal import print_graph
-    from px4fuse.report.results import graph_results
-    from px4fuse.trajectory.graph_analysis import analyse_graph
-    from px4fuse.trajectory.sources import split_part
+    from px4fuse.results.build import graph_results
+    from px4fuse.trajectory.graph.analysis import analyse_graph
 
     path, part = split_part(str(source))
     if part is not None:
@@ -310,7 +310,7 @@ def _finish(
     show: Callable[[Console], None],
 ) -> None:
     """Write all outputs or none; print the results alone, or what was found and written."""
-    from px4fuse.report.results import to_json
+    from px4fuse.results.build import to_json
 
     if json_path not in (None, STANDARD_OUTPUT):
         contents = {**contents, json_path: to_json(results).encode()}

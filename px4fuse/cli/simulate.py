@@ -16,7 +16,7 @@ from px4fuse.simulation.mistakes import MISTAKES, as_typed, made, parse
 from px4fuse.simulation.scenario import KINDS, YAWS, Scenario
 
 if TYPE_CHECKING:
-    from px4fuse.grading.answers import AnswerKey
+    from px4fuse.assignment.key import AnswerKey
     from px4fuse.simulation.flights import Simulation
     from px4fuse.simulation.scenario import Kind
 
@@ -209,7 +209,7 @@ def simulate(
         truth=not no_truth,
         **scenario,
     )
-    from px4fuse.report.results import to_json
+    from px4fuse.results.build import to_json
     from px4fuse.simulation import flights
 
     simulation = flights.simulate(chosen, parsed)
@@ -241,7 +241,7 @@ def _check_options(assignment: Path | None) -> None:
 
 
 def _read_secret(secret: str | None, file: Path | None) -> bytes | None:
-    from px4fuse.simulation.assignment import secret_of
+    from px4fuse.assignment.assignment import secret_of
 
     if secret is not None and file is not None:
         raise SettingsError("--secret and --secret-file: give one of them.")
@@ -275,7 +275,7 @@ def _assign(
     truth: bool,
 ) -> None:
     """Write a flight for everyone, and the answer key."""
-    from px4fuse.simulation.assignment import assign, key_path, read_roster
+    from px4fuse.assignment.assignment import assign, key_path, read_roster
 
     students = read_roster(roster)
     key_file = key_path(folder, answer_path)

@@ -28,9 +28,9 @@ def sync(log: Path, json_path: Path | None, **analysis: Any) -> None:
     From the acceleration that the IMU felt; EKF2 and its attitude are not asked. LOG is a PX4 ULog
     or a MAVLink recording.
     """
-    from px4fuse.explanation import clock_offset, tuned_horizontally
-    from px4fuse.report.results import sync_results
+    from px4fuse.analysis import clock_offset, tuned_horizontally
     from px4fuse.report.words import clock_advice
+    from px4fuse.results.build import sync_results
 
     with progress(json_path == STANDARD_OUTPUT) as step:
         compared = tuned_horizontally(run_comparison(log, step, **analysis))

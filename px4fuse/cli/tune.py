@@ -21,9 +21,9 @@ from px4fuse.cli.inputs import (
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from px4fuse.comparison import Comparison
+    from px4fuse.comparison.comparison import Comparison
+    from px4fuse.filter.tuning import AxisTuning, Noise
     from px4fuse.flight import Unavailable
-    from px4fuse.tuning import AxisTuning, Noise
 
 
 @click.command()
@@ -36,8 +36,8 @@ def tune(log: Path, json_path: Path | None, **analysis: Any) -> None:
     --sigma-a and --sigma-z are what they are compared with. LOG is a PX4 ULog or a MAVLink
     recording.
     """
-    from px4fuse.report.results import tuning_results
-    from px4fuse.tuning import tune as tune_axes
+    from px4fuse.filter.tuning import tune as tune_axes
+    from px4fuse.results.build import tuning_results
 
     with progress(json_path == STANDARD_OUTPUT) as step:
         compared = run_comparison(log, step, **analysis)

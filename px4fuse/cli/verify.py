@@ -37,10 +37,10 @@ def verify(report: Path, logs: tuple[Path, ...], json_path: Path | None) -> None
     Exit code 0: verified; 1: numbers differ, page altered, other log, or cannot verify; 2: bad
     input.
     """
-    from px4fuse.grading.intake import MAX_BYTES, read_report
     from px4fuse.grading.model import Refused
-    from px4fuse.grading.rerun import hashed
-    from px4fuse.grading.verification import verify as verify_report
+    from px4fuse.verification.intake import MAX_BYTES, read_report
+    from px4fuse.verification.rerun import hashed
+    from px4fuse.verification.verification import verify as verify_report
 
     read = read_report(_content(report, MAX_BYTES), report.name)
     if isinstance(read, Refused):
@@ -84,7 +84,7 @@ def _spare(json_path: Path | None, *inputs: Path) -> None:
 
 
 def _plain(report: Report, verdict: Verdict) -> dict[str, object]:
-    from px4fuse.grading.verification import LIMIT
+    from px4fuse.verification.verification import LIMIT
 
     return {
         "schema": SCHEMA,
@@ -98,8 +98,8 @@ def _plain(report: Report, verdict: Verdict) -> dict[str, object]:
 def _print(console: Console, name: str, verdict: Verdict) -> None:
     from rich.text import Text
 
-    from px4fuse.grading.intake import one_line
-    from px4fuse.grading.verification import LIMIT
+    from px4fuse.verification.intake import one_line
+    from px4fuse.verification.verification import LIMIT
 
     style = STYLES.get(verdict.status, "bold red")
     console.print(Text.assemble(f"{one_line(name, 200)}: ", (verdict.status, style)))

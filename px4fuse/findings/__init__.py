@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from px4fuse.comparison import Comparison
+from px4fuse.comparison.comparison import Comparison
 from px4fuse.findings.ekf2 import (
     accelerometer_bias,
     ekf2_not_fusing,
@@ -45,7 +45,7 @@ from px4fuse.findings.source import (
     source_frame,
     source_reconstructed,
 )
-from px4fuse.trajectory.loop import Loop
+from px4fuse.loop.loop import Loop
 
 __all__ = ["DETECTORS", "SEVERITIES", "Finding", "Severity", "find", "find_loop"]
 

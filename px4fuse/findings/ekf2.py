@@ -6,7 +6,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from px4fuse.comparison import Comparison
+from px4fuse.comparison.comparison import Comparison
+from px4fuse.filter.signals import within
 from px4fuse.findings.model import Finding, step_share, times
 from px4fuse.findings.thresholds import (
     ACCELEROMETER_BIAS,
@@ -18,7 +19,6 @@ from px4fuse.findings.thresholds import (
     REJECTED_SHARE_WARNING,
 )
 from px4fuse.flight import EXTERNAL_VISION_RUNGS, SPECIFIC_FORCE_COLUMNS, Ekf2, Unavailable
-from px4fuse.signals import within
 
 
 def ekf2_unavailable(comparison: Comparison) -> Iterator[Finding]:

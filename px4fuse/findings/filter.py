@@ -6,8 +6,10 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from px4fuse.comparison import AxisComparison, Comparison
-from px4fuse.consistency import Consistency
+from px4fuse.comparison.comparison import AxisComparison, Comparison
+from px4fuse.filter.consistency import Consistency
+from px4fuse.filter.kalman import Settings
+from px4fuse.filter.likelihood import NoiseAsked, sigma_a_asked
 from px4fuse.findings.model import Finding
 from px4fuse.findings.thresholds import (
     EKF2_NOISE_FLOOR,
@@ -21,8 +23,6 @@ from px4fuse.findings.thresholds import (
     VARIANCE_FACTOR_ERROR,
 )
 from px4fuse.flight import Unavailable, sample_rate
-from px4fuse.kalman import Settings
-from px4fuse.likelihood import NoiseAsked, sigma_a_asked
 
 
 def variance_wrong(comparison: Comparison) -> Iterator[Finding]:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from px4fuse.comparison import Comparison
+from px4fuse.comparison.comparison import Comparison
 from px4fuse.findings.model import Finding, Threshold
-from px4fuse.trajectory.loop import GATE_ALPHA, Judged, Loop
+from px4fuse.loop.loop import GATE_ALPHA, Judged, Loop
 
 MOST = Threshold(0.5, "share", "of several closures, more are true than false")
 DOUBTFUL_WEIGHT = Threshold(0.5, "weight", "GNC ends at 0 or 1 (Yang et al. 2020)")

@@ -9,9 +9,9 @@ from typing import Literal
 import numpy as np
 import pandas as pd
 
-from px4fuse.comparison import Comparison
+from px4fuse.comparison.comparison import Comparison
+from px4fuse.filter.signals import within
 from px4fuse.flight import POSITION_COLUMNS
-from px4fuse.signals import within
 
 Severity = Literal["error", "warning", "info"]
 SEVERITIES: tuple[Severity, Severity, Severity] = ("error", "warning", "info")

@@ -6,8 +6,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from px4fuse.clock import CHANGE_P, ClockOffset
-from px4fuse.comparison import Comparison
+from px4fuse.comparison.comparison import Comparison
+from px4fuse.filter.clock import CHANGE_P, ClockOffset
+from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise
 from px4fuse.findings.model import Finding, Severity, motion_range_m
 from px4fuse.findings.thresholds import (
     CLOCK_OFFSET,
@@ -24,7 +25,6 @@ from px4fuse.findings.thresholds import (
     OUTLIERS,
     OUTLIERS_ERROR,
 )
-from px4fuse.tuning import HORIZONTAL, AxisTuning, Noise
 
 
 def noises_off(comparison: Comparison) -> Iterator[Finding]:

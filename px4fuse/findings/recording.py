@@ -7,7 +7,8 @@ from collections.abc import Iterator
 import numpy as np
 import pandas as pd
 
-from px4fuse.comparison import Comparison
+from px4fuse.comparison.comparison import Comparison
+from px4fuse.filter.signals import within
 from px4fuse.findings.model import Finding, sentence
 from px4fuse.findings.thresholds import (
     GAP,
@@ -17,7 +18,6 @@ from px4fuse.findings.thresholds import (
     RECEIPT_JITTER,
 )
 from px4fuse.flight import Ekf2
-from px4fuse.signals import within
 
 SYNCHRONISE = (
     "Let the companion answer TIMESYNC (MAVROS does by default; with pymavlink answer every "

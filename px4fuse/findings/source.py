@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 import pandas as pd
 
-from px4fuse.comparison import Comparison
+from px4fuse.comparison.comparison import Comparison
 from px4fuse.findings.model import Finding, motion_range_m, sentence, step_share, times
 from px4fuse.findings.thresholds import (
     FUSING_SHARE_ERROR,

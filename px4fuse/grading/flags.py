@@ -16,10 +16,10 @@ from itertools import combinations
 from pathlib import PurePosixPath
 from typing import Any
 
-from px4fuse.grading.answers import AnswerKey, folded
+from px4fuse.assignment.key import AnswerKey, folded
+from px4fuse.filter.kalman import Settings
+from px4fuse.filter.tuning import HORIZONTAL
 from px4fuse.grading.model import Graded
-from px4fuse.kalman import Settings
-from px4fuse.tuning import HORIZONTAL
 
 # Words in a row by which two texts are compared. Five are hardly ever the same by chance, and a
 # changed word costs five shingles of hundreds.

@@ -12,21 +12,21 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+from px4fuse.assignment.assignment import RESERVED
+from px4fuse.assignment.key import AnswerKey
 from px4fuse.flight import Unavailable
 from px4fuse.grading import submissions
-from px4fuse.grading.answers import AnswerKey
 from px4fuse.grading.class_page import html_text
 from px4fuse.grading.class_table import csv_text
 from px4fuse.grading.flags import class_flags, own_flags
-from px4fuse.grading.intake import read_report
 from px4fuse.grading.model import Difference, Graded, Item, Refused, Report, Submission, Verdict
-from px4fuse.grading.pictures import key_page, picture
 from px4fuse.grading.rubric import Rubric
 from px4fuse.grading.scoring import feedback, gradescope, score, score_refused
-from px4fuse.grading.verification import verify
 from px4fuse.grading.workers import Failed, run_bounded
-from px4fuse.report.writing import write_all
-from px4fuse.simulation.assignment import RESERVED
+from px4fuse.verification.intake import read_report
+from px4fuse.verification.pictures import key_page, picture
+from px4fuse.verification.verification import verify
+from px4fuse.writing import write_all
 
 RECORDS = "records"
 # Of one report: a flight of ten minutes takes about one; what takes longer is no report

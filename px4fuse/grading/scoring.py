@@ -15,11 +15,11 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Literal
 
-from px4fuse.grading.answers import Answer, AnswerKey
+from px4fuse.assignment.assignment import POSSIBLE_FINDINGS
+from px4fuse.assignment.key import Answer, AnswerKey
+from px4fuse.filter.tuning import HORIZONTAL
 from px4fuse.grading.model import Graded, Item, Report, Verdict
 from px4fuse.grading.rubric import Rubric, RubricItem
-from px4fuse.simulation.assignment import POSSIBLE_FINDINGS
-from px4fuse.tuning import HORIZONTAL
 
 # What verification has refuted, rather than what it could not look at
 REFUTED: Mapping[str, str] = {

@@ -19,8 +19,8 @@ from pathlib import Path
 from typing import IO
 
 from px4fuse.errors import SettingsError
-from px4fuse.grading.intake import MAX_BYTES, cleaned, one_line
 from px4fuse.grading.model import Refused, Submission
+from px4fuse.verification.intake import MAX_BYTES, cleaned, one_line
 
 MAX_ENTRIES = 10_000
 # Of the table of contents, which zipfile reads in one piece before it can be counted
@@ -104,7 +104,7 @@ def collect(paths: Sequence[Path]) -> tuple[tuple[Submission, ...], tuple[str, .
 
 
 def read(submission: Submission) -> bytes | Refused:
-    """Bytes of a submission, at most :data:`~px4fuse.grading.intake.MAX_BYTES` of them."""
+    """Bytes of a submission, at most :data:`~px4fuse.verification.intake.MAX_BYTES` of them."""
     try:
         if not submission.file.is_file():
             return _refused(submission, "no file any more.")

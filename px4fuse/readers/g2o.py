@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from px4fuse.errors import TrajectoryError
+from px4fuse.trajectory.graph.model import IntArray
+from px4fuse.trajectory.graph.pose_graph import FROM_FILE, PoseGraph, initialise
 from px4fuse.trajectory.model import Array
-from px4fuse.trajectory.pose_graph import FROM_FILE, PoseGraph, initialise
-from px4fuse.trajectory.pose_graph_model import IntArray
 
 # Tag: dimension, vertices that it names, numbers that follow them
 _TAGS = {

@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from px4fuse.budget import Budget, Effect, Fit
+from px4fuse.comparison.budget import Budget, Effect, Fit
 from px4fuse.flight import Unavailable
 from px4fuse.report.document import Document
 from px4fuse.report.style import (

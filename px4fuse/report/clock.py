@@ -6,8 +6,8 @@ from collections.abc import Iterator
 
 from matplotlib.figure import Figure
 
+from px4fuse.filter.likelihood import PROFILE_DROP
 from px4fuse.flight import Unavailable
-from px4fuse.likelihood import PROFILE_DROP
 from px4fuse.report.document import Document
 from px4fuse.report.style import LEFT, OURS, OURS_BAND, OURS_LINE, RIGHT, caption, page
 from px4fuse.report.words import clock_advice

@@ -10,8 +10,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from scipy.stats import norm
 
-from px4fuse.comparison import AxisComparison, FilterSummary
-from px4fuse.consistency import MIN_INNOVATIONS, Consistency, autocorrelation, nis_band
+from px4fuse.comparison.comparison import AxisComparison, FilterSummary
+from px4fuse.filter.consistency import MIN_INNOVATIONS, Consistency, autocorrelation, nis_band
+from px4fuse.filter.signals import Array
 from px4fuse.flight import Unavailable
 from px4fuse.report.document import Document
 from px4fuse.report.style import (
@@ -28,7 +29,6 @@ from px4fuse.report.style import (
     thin,
 )
 from px4fuse.report.words import verdict_words
-from px4fuse.signals import Array
 
 LAGS = 20
 BINS = np.linspace(-4.0, 4.0, 33)

@@ -7,8 +7,8 @@ from collections.abc import Iterator
 import pandas as pd
 from matplotlib.figure import Figure
 
-from px4fuse.comparison import AgainstTruth, AxisComparison, Difference, FilterSummary
-from px4fuse.consistency import Consistency
+from px4fuse.comparison.comparison import AgainstTruth, AxisComparison, Difference, FilterSummary
+from px4fuse.filter.consistency import Consistency
 from px4fuse.findings import Finding
 from px4fuse.flight import Unavailable
 from px4fuse.report.document import Document

@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from px4fuse.comparison import Comparison
+from px4fuse.comparison.comparison import Comparison
 from px4fuse.findings import Finding
-from px4fuse.trajectory.loop import Loop
+from px4fuse.loop.loop import Loop
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Document:
     command : str
         The command line that makes it again, without folders.
     made : mapping or None
-        Versions to print, as :func:`px4fuse.report.results.provenance` gives them; None for those
+        Versions to print, as :func:`px4fuse.results.build.provenance` gives them; None for those
         that run.
     """
 

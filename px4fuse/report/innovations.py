@@ -10,8 +10,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from scipy.stats import norm
 
-from px4fuse.comparison import AxisComparison, FilterSummary
-from px4fuse.consistency import Consistency
+from px4fuse.comparison.comparison import AxisComparison, FilterSummary
+from px4fuse.filter.consistency import Consistency
+from px4fuse.filter.signals import Array
 from px4fuse.flight import Unavailable
 from px4fuse.report.document import Document
 from px4fuse.report.style import (
@@ -28,7 +29,6 @@ from px4fuse.report.style import (
     panels,
     thin,
 )
-from px4fuse.signals import Array
 
 # The axes reach this much beyond 2√S, or beyond 99 % of the innovations if that is further, but
 # not beyond so many √S; what lies outside is drawn at the edge and counted.

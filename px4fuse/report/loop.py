@@ -9,8 +9,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from px4fuse.filter.signals import Array
 from px4fuse.findings import Finding
 from px4fuse.flight import Unavailable
+from px4fuse.loop.loop import BY_DISTANCE, SOLUTIONS, UNCORRECTED, Correction, Loop
 from px4fuse.report.cover import write_finding
 from px4fuse.report.document import Document, LoopDocument
 from px4fuse.report.loop_words import (
@@ -41,9 +43,7 @@ from px4fuse.report.style import (
     shorten,
     thin,
 )
-from px4fuse.signals import Array
 from px4fuse.trajectory.evaluation import Evaluation, Interval, Statistics
-from px4fuse.trajectory.loop import BY_DISTANCE, SOLUTIONS, UNCORRECTED, Correction, Loop
 from px4fuse.trajectory.model import AXES_OF_FRAME
 
 Value = Statistics | Unavailable

@@ -7,9 +7,9 @@ from collections.abc import Iterator
 from matplotlib.figure import Figure
 
 from px4fuse.report.document import Document, LoopDocument
-from px4fuse.report.results import provenance
 from px4fuse.report.style import BOTTOM, LEFT, MUTED, NO_GLYPH, lacks_glyphs, page
 from px4fuse.report.words import alignment_words, clock_words
+from px4fuse.results.build import provenance
 
 INDENT = LEFT + 0.235
 METHOD = (

@@ -9,9 +9,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, NullFormatter, ScalarFormatter
 
-from px4fuse.comparison import AxisComparison
+from px4fuse.comparison.comparison import AxisComparison
+from px4fuse.filter.likelihood import PROFILE_DROP, States, preintegrate, states
+from px4fuse.filter.signals import AISLE, Array
+from px4fuse.filter.tuning import HORIZONTAL, Noise
 from px4fuse.flight import Unavailable
-from px4fuse.likelihood import PROFILE_DROP, States, preintegrate, states
 from px4fuse.report.document import Document
 from px4fuse.report.style import (
     BOTTOM,
@@ -27,8 +29,6 @@ from px4fuse.report.style import (
     page,
     panels,
 )
-from px4fuse.signals import AISLE, Array
-from px4fuse.tuning import HORIZONTAL, Noise
 
 FACTORS = (0.25, 0.5, 1.0, 2.0, 4.0)
 # Drops of log-likelihood: the 95 % intervals of one parameter, then further down

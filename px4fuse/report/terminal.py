@@ -8,8 +8,8 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from px4fuse.comparison import AgainstTruth, AxisComparison, Difference, FilterSummary
-from px4fuse.consistency import Consistency
+from px4fuse.comparison.comparison import AgainstTruth, AxisComparison, Difference, FilterSummary
+from px4fuse.filter.consistency import Consistency
 from px4fuse.findings import Finding, Severity
 from px4fuse.flight import Unavailable
 from px4fuse.report.document import Document

@@ -10,7 +10,8 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from px4fuse.comparison import AgainstTruth, AxisComparison, Difference
+from px4fuse.comparison.comparison import AgainstTruth, AxisComparison, Difference
+from px4fuse.filter.signals import Array
 from px4fuse.flight import Unavailable
 from px4fuse.report.document import Document
 from px4fuse.report.style import (
@@ -27,7 +28,6 @@ from px4fuse.report.style import (
     panels,
     thin,
 )
-from px4fuse.signals import Array
 
 thin_narrow = partial(thin, limit=MAX_POINTS_NARROW)
 

@@ -9,7 +9,8 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from px4fuse.comparison import AxisComparison, FilterSummary
+from px4fuse.comparison.comparison import AxisComparison, FilterSummary
+from px4fuse.filter.signals import Array, Segment
 from px4fuse.flight import Unavailable
 from px4fuse.report.document import Document
 from px4fuse.report.style import (
@@ -24,7 +25,6 @@ from px4fuse.report.style import (
     panels,
     thin,
 )
-from px4fuse.signals import Array, Segment
 
 ZOOM_UPDATES = 15
 ZOOM_RANGE_S = (1.0, 12.0)

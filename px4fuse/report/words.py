@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from px4fuse.clock import CHANGE_P, ClockOffset
-from px4fuse.comparison import Comparison
-from px4fuse.consistency import Consistency
+from px4fuse.comparison.comparison import Comparison
+from px4fuse.filter.clock import CHANGE_P, ClockOffset
+from px4fuse.filter.consistency import Consistency
+from px4fuse.filter.kalman import Settings
+from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.flight import Alignment, ClockMap, Unavailable
-from px4fuse.kalman import Settings
-from px4fuse.tuning import HORIZONTAL, AxisTuning
 
 # One update of EKF2 (EKF2_PREDICT_US)
 NEGLIGIBLE_OFFSET_S = 0.010

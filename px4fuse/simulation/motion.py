@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from px4fuse.errors import SettingsError
-from px4fuse.signals import STANDARD_GRAVITY_M_S2
+from px4fuse.filter.signals import STANDARD_GRAVITY_M_S2
 from px4fuse.simulation.mistakes import Mistakes
 from px4fuse.simulation.scenario import CORNER_S, START_STOP_S, Scenario
 

@@ -13,7 +13,7 @@ Yaw = Literal["fixed", "follow"]
 KINDS: tuple[Kind, Kind] = ("aisle", "loop")
 YAWS: tuple[Yaw, Yaw] = ("fixed", "follow")
 
-# DT to which SIGMA_A refers, the lesson's (px4fuse.kalman)
+# DT to which SIGMA_A refers, the lesson's (px4fuse.filter.kalman)
 DT_S = 0.1
 # How long it takes to start or stop along the aisle, and to turn a corner of the loop
 START_STOP_S = 1.5

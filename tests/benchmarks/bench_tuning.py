@@ -36,11 +36,11 @@ def seconds(work: Callable[[], object], runs: int = RUNS) -> float:
 def main() -> None:
     import test_clock
 
-    from px4fuse.comparison import compare
-    from px4fuse.kalman import Settings, replay
-    from px4fuse.likelihood import preintegrate
+    from px4fuse.comparison.comparison import compare
+    from px4fuse.filter.kalman import Settings, replay
+    from px4fuse.filter.likelihood import preintegrate
+    from px4fuse.filter.tuning import HORIZONTAL, _total, tune
     from px4fuse.readers import read_log
-    from px4fuse.tuning import HORIZONTAL, _total, tune
 
     axis = compare(read_log(LOG), axes=("north",)).axes[0].axis
     single = seconds(lambda: replay(axis, Settings()))

@@ -1,0 +1,1 @@
+"""A flight per student, and its answer key."""

@@ -1,0 +1,1 @@
+"""Our filter against EKF2 and ground truth."""

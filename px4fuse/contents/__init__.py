@@ -1,0 +1,1 @@
+"""What is in a log, and the log as tables."""

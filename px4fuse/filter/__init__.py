@@ -1,0 +1,1 @@
+"""One axis: the filter's model, signals, replay, likelihood, consistency, noises and clock."""

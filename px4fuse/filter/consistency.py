@@ -1,0 +1,202 @@
+"""NIS, NEES, bias, whiteness and verdicts: the same functions for our filter and for EKF2.
+
+Definitions: Bar-Shalom, Li and Kirubarajan (2001), Estimation with Applications to Tracking and
+Navigation, section 5.4; Ljung and Box (1978), Biometrika 65(2).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from scipy import stats
+
+from px4fuse.filter.signals import Array
+from px4fuse.flight import Unavailable
+
+Verdict = Literal["consistent", "variance overstated", "variance understated"]
+
+# Fewer innovations than this say nothing: the 95 % band of the mean NIS is then wider than 0.3–2.1.
+MIN_INNOVATIONS = 10
+CONFIDENCE = 0.95
+LJUNG_BOX_LAGS = 10
+GATE_SIGMA = 5.0  # EKF2_EVP_GATE's default, used where no gate is in force
+
+
+@dataclass(frozen=True)
+class Consistency:
+    """Whether a filter's innovations are what its own variances say.
+
+    Attributes
+    ----------
+    count : int
+        Innovations used.
+    innovation_mean_m, innovation_std_m : float
+    sqrt_s_median_m : float
+        Median of √S, what the filter expected of the standard deviation.
+    nis_mean : float
+        Mean of ν²/S; 1 is consistent.
+    nis_band : (float, float)
+        Two-sided 95 % chi-square band of that mean, for white innovations.
+    variance_factor : float
+        By how much S is overstated (above 1) or understated (below 1): 1/nis_mean.
+    verdict : str
+    outside_two_sigma : float
+        Fraction outside ±2√S; 0.046 is expected.
+    outside_gate : float
+        Fraction outside the gate.
+    bias_t, bias_p : float
+        Student's t of the mean against zero, and its two-sided p-value.
+    lag1_autocorrelation : float
+        Of the normalised innovations; positive says that the filter follows too slowly.
+    ljung_box_p : float
+        p-value of "white" over ``ljung_box_lags`` lags.
+    ljung_box_lags : int
+    """
+
+    count: int
+    innovation_mean_m: float
+    innovation_std_m: float
+    sqrt_s_median_m: float
+    nis_mean: float
+    nis_band: tuple[float, float]
+    variance_factor: float
+    verdict: Verdict
+    outside_two_sigma: float
+    outside_gate: float
+    bias_t: float
+    bias_p: float
+    lag1_autocorrelation: float
+    ljung_box_p: float
+    ljung_box_lags: int
+
+
+def nis_band(count: int, dimensions: int = 1) -> tuple[float, float]:
+    """Two-sided 95 % band of the mean of ``count`` NIS values of ``dimensions`` degrees of freedom.
+
+    Divided by the dimensions, so that 1 is consistent whatever they are.
+
+    >>> low, high = nis_band(128, 2)
+    >>> round(2 * low, 2), round(2 * high, 2)
+    (1.67, 2.36)
+    """
+    freedom = count * dimensions
+    low = float(stats.chi2.ppf((1 - CONFIDENCE) / 2, freedom)) / freedom
+    high = float(stats.chi2.ppf((1 + CONFIDENCE) / 2, freedom)) / freedom
+    return low, high
+
+
+def verdict_of(nis_mean: float, band: tuple[float, float]) -> Verdict:
+    """Two-sided verdict on a mean NIS."""
+    if nis_mean < band[0]:
+        return "variance overstated"
+    if nis_mean > band[1]:
+        return "variance understated"
+    return "consistent"
+
+
+def autocorrelation(values: Array, lags: int) -> Array:
+    """Autocorrelation of a series at lags 1 to ``lags``, about zero, not about its mean.
+
+    r(l) = Σ ν(k) ν(k+l) / Σ ν(k)²; bias is tested apart.
+    """
+    power = float(np.dot(values, values))
+    return np.array([np.dot(values[:-lag], values[lag:]) / power for lag in range(1, lags + 1)])
+
+
+def assess(
+    innovation_m: Array, innovation_variance_m2: Array, gate: float = GATE_SIGMA
+) -> Consistency | Unavailable:
+    """Assess innovations against the variances that their filter gave them.
+
+    Parameters
+    ----------
+    innovation_m : ndarray, shape (n,)
+        Measurement minus prediction, prior, in time order.
+    innovation_variance_m2 : ndarray, shape (n,)
+        S, positive.
+    gate : float
+        In standard deviations.
+
+    Returns
+    -------
+    Consistency, or Unavailable with fewer than ten finite innovations.
+    """
+    finite = np.isfinite(innovation_m) & (innovation_variance_m2 > 0)
+    nu, s = innovation_m[finite], innovation_variance_m2[finite]
+    count = len(nu)
+    if count < MIN_INNOVATIONS or np.ptp(nu) == 0.0:
+        return Unavailable(
+            "consistency",
+            f"{count} innovations are too few for a statement (at least {MIN_INNOVATIONS})"
+            if count < MIN_INNOVATIONS
+            else "every innovation is the same",
+            "Analyse a longer segment, or log the source at a higher rate.",
+        )
+    normalised = nu / np.sqrt(s)
+    nis_mean = float(np.mean(normalised**2))
+    band = nis_band(count)
+    std = float(np.std(nu, ddof=1))
+    bias_t = float(np.sqrt(count) * np.mean(nu) / std)
+    lags = min(LJUNG_BOX_LAGS, count // 5)
+    r = autocorrelation(normalised, lags)
+    q = count * (count + 2) * float(np.sum(r**2 / (count - np.arange(1, lags + 1))))
+    return Consistency(
+        count=count,
+        innovation_mean_m=float(np.mean(nu)),
+        innovation_std_m=std,
+        sqrt_s_median_m=float(np.median(np.sqrt(s))),
+        nis_mean=nis_mean,
+        nis_band=band,
+        variance_factor=1.0 / nis_mean,
+        verdict=verdict_of(nis_mean, band),
+        outside_two_sigma=float(np.mean(np.abs(normalised) > 2.0)),
+        outside_gate=float(np.mean(np.abs(normalised) > gate)),
+        bias_t=bias_t,
+        bias_p=float(2.0 * stats.t.sf(abs(bias_t), count - 1)),
+        lag1_autocorrelation=float(r[0]),
+        ljung_box_p=float(stats.chi2.sf(q, lags)),
+        ljung_box_lags=lags,
+    )
+
+
+@dataclass(frozen=True)
+class HorizontalNis:
+    """NIS of north and east together, two degrees of freedom, divided by two.
+
+    EKF2 logs no covariance between the two, so their correlation is left out for both filters.
+    """
+
+    count: int
+    nis_mean: float
+    nis_band: tuple[float, float]
+    variance_factor: float
+    verdict: Verdict
+
+
+def assess_horizontal(
+    north: tuple[Array, Array], east: tuple[Array, Array]
+) -> HorizontalNis | None:
+    """Joint statement on two axes whose innovations share their times.
+
+    Parameters
+    ----------
+    north, east : (innovation_m, innovation_variance_m2), each of shape (n,)
+
+    Returns
+    -------
+    HorizontalNis, or None below ten innovations or where the two differ in length.
+    """
+    if len(north[0]) != len(east[0]):
+        return None
+    usable = (north[1] > 0) & (east[1] > 0) & np.isfinite(north[0]) & np.isfinite(east[0])
+    count = int(np.count_nonzero(usable))
+    if count < MIN_INNOVATIONS:
+        return None
+    nis = sum(nu[usable] ** 2 / s[usable] for nu, s in (north, east))
+    mean = float(np.mean(nis)) / 2.0
+    if mean == 0.0:
+        return None
+    band = nis_band(count, 2)
+    return HorizontalNis(count, mean, band, 1.0 / mean, verdict_of(mean, band))

@@ -1,0 +1,330 @@
+"""The two-state Kalman filter of the lesson, on filterpy: Axis + Settings → Replay.
+
+State x = [position, velocity] along one axis; input a, the acceleration averaged over the step::
+
+    F = [[1, dt], [0, 1]]    B = [dt²/2, dt]    H = [1, 0]    R = SIGMA_Z²
+    Q(dt) = SIGMA_A² · DT · [[dt³/4, dt²/2], [dt²/2, dt]]
+
+With dt = DT, Q is the lesson's SIGMA_A² · [[dt⁴/4, dt³/2], [dt³/2, dt²]] digit for digit. For other
+steps it keeps the velocity noise per second, so that SIGMA_A means the same at every rate.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+import pandas as pd
+from filterpy.kalman import KalmanFilter
+from numpy.typing import NDArray
+
+from px4fuse.errors import SettingsError
+from px4fuse.filter.signals import Array, Axis, step_means
+from px4fuse.flight import Unavailable
+
+InputName = Literal["imu", "zero"]
+INPUT_NAMES: tuple[InputName, InputName] = ("imu", "zero")
+
+# The lesson's initial standard deviations: position 0.5 m, velocity 1.0 m/s.
+INITIAL_SIGMA_P_M = 0.5
+INITIAL_SIGMA_V_M_S = 1.0
+# Ranges outside which a setting is a slip of the keyboard, not a choice.
+SIGMA_A_RANGE_M_S2 = (1e-4, 100.0)
+SIGMA_Z_RANGE_M = (1e-4, 100.0)
+DT_RANGE_S = (1e-3, 1.0)
+CLOCK_OFFSET_RANGE_S = (-10.0, 10.0)
+# Two times closer than this are one step: stamps have a resolution of one microsecond.
+SAME_TIME_S = 5e-7
+H = np.array([[1.0, 0.0]])
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What the user may turn.
+
+    Attributes
+    ----------
+    sigma_a_m_s2 : float
+        Process noise SIGMA_A, standard deviation of the acceleration input over one DT.
+    sigma_z_m : float
+        Measurement noise SIGMA_Z.
+    dt_s : float
+        Prediction grid DT.
+    input : {"imu", "zero"}
+        Acceleration measured by the IMU, or the lesson's constant-velocity case.
+    clock_offset_s : float
+        Added to the position source's time stamps.
+
+    Raises
+    ------
+    SettingsError
+        A value is outside its documented range, or not a number.
+    """
+
+    sigma_a_m_s2: float = 0.5
+    sigma_z_m: float = 0.10
+    dt_s: float = 0.1
+    input: InputName = "imu"
+    clock_offset_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name, value, (low, high), unit in (
+            ("--sigma-a", self.sigma_a_m_s2, SIGMA_A_RANGE_M_S2, "m/s²"),
+            ("--sigma-z", self.sigma_z_m, SIGMA_Z_RANGE_M, "m"),
+            ("--dt", self.dt_s, DT_RANGE_S, "s"),
+            ("--clock-offset", self.clock_offset_s, CLOCK_OFFSET_RANGE_S, "s"),
+        ):
+            if not low <= value <= high:  # false for NaN too
+                raise SettingsError(
+                    f"{name} {value:g} is out of range: give {low:g} to {high:g} {unit}."
+                )
+        if self.input not in INPUT_NAMES:
+            raise SettingsError(f"--input {self.input}: give {' or '.join(INPUT_NAMES)}.")
+
+
+@dataclass(frozen=True)
+class InitialState:
+    """Where the filter starts: time (s), position (m) and velocity (m/s), with the lesson's P₀."""
+
+    time_s: float
+    position_m: float
+    velocity_m_s: float = 0.0
+
+
+@dataclass(frozen=True)
+class Replay:
+    """The filter's run over one axis.
+
+    Attributes
+    ----------
+    axis : Axis
+    settings : Settings
+    steps : DataFrame, shape (n, 7)
+        After each predict, and its update where there was one: ``position_m, velocity_m_s,
+        position_variance_m2, covariance_m2_s, velocity_variance_m2_s2``, and of the step that
+        *starts* there (0 at the last) its input ``acceleration_m_s2`` and
+        ``input_variance_m2_s4``, added to SIGMA_A² where the IMU has a gap.
+    updates : DataFrame, shape (m, 8)
+        At each measurement after the first: ``measurement_m, innovation_m`` (z - Hx, prior),
+        ``innovation_variance_m2`` (HPHᵀ + R), ``gain_position`` (1), ``gain_velocity`` (1/s), and
+        ``prior_position_m``, ``prior_position_variance_m2``, ``prior_velocity_variance_m2_s2``.
+    input_gap_s : float
+        Seconds without IMU inside the replay, where Q was raised by the input's mean square.
+    """
+
+    axis: Axis
+    settings: Settings
+    steps: pd.DataFrame
+    updates: pd.DataFrame
+    input_gap_s: float = field(default=0.0)
+
+
+@dataclass(frozen=True)
+class Timeline:
+    """The filter's steps: the DT grid and every measurement's own time.
+
+    Attributes
+    ----------
+    time_s : ndarray, shape (n,)
+        Strictly increasing; the first is the initial state's.
+    measurement : ndarray of int, shape (n,)
+        Index of the measurement at that time, -1 where there is none.
+    acceleration_m_s2 : ndarray, shape (n - 1,)
+        Input of each step.
+    input_variance_m2_s4 : ndarray, shape (n - 1,)
+        Added to SIGMA_A² where the IMU has a gap.
+    """
+
+    time_s: Array
+    measurement: NDArray[np.intp]
+    acceleration_m_s2: Array
+    input_variance_m2_s4: Array
+    input_gap_s: float
+
+
+def process_noise(dt_s: float, settings: Settings, input_variance_m2_s4: float = 0.0) -> Array:
+    """Q(dt) for one step, shape (2, 2); see the module's docstring."""
+    q = (settings.sigma_a_m_s2**2 + input_variance_m2_s4) * settings.dt_s
+    return q * np.array([[dt_s**3 / 4.0, dt_s**2 / 2.0], [dt_s**2 / 2.0, dt_s]])
+
+
+def timeline(axis: Axis, settings: Settings, initial: InitialState | None = None) -> Timeline:
+    """Lay out the filter's steps.
+
+    Raises
+    ------
+    SettingsError
+        ``settings.input`` is "imu" and the axis has no acceleration, or no measurement follows
+        the start.
+    """
+    first = axis.measurement_time_s[0] if initial is None else initial.time_s
+    usable = axis.measurement_time_s > first + SAME_TIME_S
+    measured = axis.measurement_time_s[usable]
+    if not len(measured):
+        raise SettingsError(f"axis {axis.name}: no measurement after the start at {first:.2f} s.")
+    count = int(np.floor((measured[-1] - first) / settings.dt_s + 1e-9)) + 1
+    grid = first + settings.dt_s * np.arange(count)
+    # a grid time that coincides with a measurement gives way to the measurement's own stamp
+    nearest = measured[np.clip(np.searchsorted(measured, grid), 0, len(measured) - 1)]
+    before = measured[np.clip(np.searchsorted(measured, grid) - 1, 0, len(measured) - 1)]
+    distance = np.minimum(np.abs(nearest - grid), np.abs(before - grid))
+    time = np.union1d(grid[distance > SAME_TIME_S], measured)
+    if time[0] > first + SAME_TIME_S:
+        time = np.concatenate([[first], time])
+    measurement = np.full(len(time), -1, dtype=np.intp)
+    measurement[np.searchsorted(time, measured)] = np.flatnonzero(usable)
+    steps = len(time) - 1
+    if settings.input == "zero":
+        return Timeline(time, measurement, np.zeros(steps), np.zeros(steps), 0.0)
+    if isinstance(axis.acceleration, Unavailable):
+        raise SettingsError(f"--input imu needs an acceleration. {axis.acceleration}")
+    mean, gap = step_means(axis.acceleration, time)
+    gap_s = gap * np.diff(time)
+    # Unknown acceleration persists through a gap: after T seconds it has moved the velocity by
+    # rms·T, not by the rms·√(DT·T) of white noise, so its variance is scaled by T/DT.
+    leg = np.searchsorted(np.flatnonzero(measurement >= 0), np.arange(1, len(time)))
+    gap_of_leg = np.bincount(leg, weights=gap_s)[leg]
+    persistence = np.maximum(gap_of_leg / settings.dt_s, 1.0)
+    return Timeline(
+        time,
+        measurement,
+        mean,
+        gap * persistence * axis.acceleration.rms_m_s2**2,
+        float(np.sum(gap_s)),
+    )
+
+
+def replay(axis: Axis, settings: Settings, initial: InitialState | None = None) -> Replay:
+    """Run the filter over one axis.
+
+    Parameters
+    ----------
+    axis : Axis
+    settings : Settings
+    initial : InitialState, optional
+        By default the first measurement, at rest; that measurement is then not fused again.
+
+    Returns
+    -------
+    Replay
+
+    Raises
+    ------
+    SettingsError
+        ``settings.input`` is "imu" and the axis has no acceleration.
+    """
+    line = timeline(axis, settings, initial)
+    start = initial or InitialState(line.time_s[0], axis.measurement_m[0])
+    kalman = KalmanFilter(dim_x=2, dim_z=1, dim_u=1)
+    kalman.x = np.array([[start.position_m], [start.velocity_m_s]])
+    kalman.P = np.diag([INITIAL_SIGMA_P_M**2, INITIAL_SIGMA_V_M_S**2])
+    kalman.H = H
+    kalman.R = np.array([[settings.sigma_z_m**2]])
+    lengths = np.diff(line.time_s)
+    states = np.empty((len(line.time_s), 5))
+    updates = np.empty((np.count_nonzero(line.measurement >= 0), 8))
+    updated_at: list[float] = []
+    states[0] = _state_row(kalman)
+    for step, (dt, acceleration, extra) in enumerate(
+        zip(lengths, line.acceleration_m_s2, line.input_variance_m2_s4, strict=True), start=1
+    ):
+        kalman.predict(
+            u=np.array([[acceleration]]),
+            B=np.array([[dt * dt / 2.0], [dt]]),
+            F=np.array([[1.0, dt], [0.0, 1.0]]),
+            Q=process_noise(dt, settings, extra),
+        )
+        at = line.measurement[step]
+        if at >= 0:
+            prior_position = kalman.x[0, 0]
+            prior_variance = kalman.P[0, 0], kalman.P[1, 1]
+            kalman.update(axis.measurement_m[at])
+            updates[len(updated_at)] = (
+                axis.measurement_m[at],
+                kalman.y[0, 0],
+                kalman.S[0, 0],
+                kalman.K[0, 0],
+                kalman.K[1, 0],
+                prior_position,
+                *prior_variance,
+            )
+            updated_at.append(line.time_s[step])
+        states[step] = _state_row(kalman)
+    steps = pd.DataFrame(
+        states,
+        index=pd.Index(line.time_s, name="time_s"),
+        columns=[
+            "position_m",
+            "velocity_m_s",
+            "position_variance_m2",
+            "covariance_m2_s",
+            "velocity_variance_m2_s2",
+        ],
+    )
+    steps["acceleration_m_s2"] = np.append(line.acceleration_m_s2, 0.0)
+    steps["input_variance_m2_s4"] = np.append(line.input_variance_m2_s4, 0.0)
+    return Replay(
+        axis,
+        settings,
+        steps,
+        pd.DataFrame(
+            updates,
+            index=pd.Index(updated_at, name="time_s"),
+            columns=[
+                "measurement_m",
+                "innovation_m",
+                "innovation_variance_m2",
+                "gain_position",
+                "gain_velocity",
+                "prior_position_m",
+                "prior_position_variance_m2",
+                "prior_velocity_variance_m2_s2",
+            ],
+        ),
+        line.input_gap_s,
+    )
+
+
+def _state_row(kalman: KalmanFilter) -> tuple[float, float, float, float, float]:
+    x, p = kalman.x, kalman.P
+    return x[0, 0], x[1, 0], p[0, 0], p[0, 1], p[1, 1]
+
+
+def _ahead(run: Replay, times: Array) -> tuple[NDArray[np.intp], Array, NDArray[np.bool_]]:
+    """The step before each time, how long ago it was (s), and whether the time is outside."""
+    edges = run.steps.index.to_numpy()
+    at = np.clip(np.searchsorted(edges, times, side="right") - 1, 0, len(edges) - 1)
+    return at, times - edges[at], (times < edges[0]) | (times > edges[-1])
+
+
+def state_at(run: Replay, times: Array) -> tuple[Array, Array]:
+    """Position (m) and velocity (m/s) at other times, predicted from the step before each.
+
+    Nothing later than the time itself is used: interpolating between two steps would let a
+    measurement act before it arrived. NaN outside the replay.
+    """
+    at, ahead, outside = _ahead(run, times)
+    position, velocity, acceleration = (
+        run.steps[column].to_numpy()[at]
+        for column in ("position_m", "velocity_m_s", "acceleration_m_s2")
+    )
+    return (
+        np.where(outside, np.nan, position + velocity * ahead + acceleration * ahead**2 / 2.0),
+        np.where(outside, np.nan, velocity + acceleration * ahead),
+    )
+
+
+def variance_at(run: Replay, times: Array) -> tuple[Array, Array]:
+    """Variances (m², m²/s²) that belong to :func:`state_at`: P = FPFᵀ + Q from the step before."""
+    at, ahead, outside = _ahead(run, times)
+    p00, p01, p11 = (
+        run.steps[column].to_numpy()[at]
+        for column in ("position_variance_m2", "covariance_m2_s", "velocity_variance_m2_s2")
+    )
+    extra = run.steps["input_variance_m2_s4"].to_numpy()[at]
+    q = (run.settings.sigma_a_m_s2**2 + extra) * run.settings.dt_s
+    return (
+        np.where(outside, np.nan, p00 + 2 * ahead * p01 + ahead**2 * p11 + q * ahead**3 / 4.0),
+        np.where(outside, np.nan, p11 + q * ahead),
+    )

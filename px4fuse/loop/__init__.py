@@ -1,0 +1,1 @@
+"""A flight's odometry as a loop: part, closure, correction."""

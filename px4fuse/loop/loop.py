@@ -1,0 +1,533 @@
+"""A loop: how far it fails to close, and the path corrected for that in several ways."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation, Slerp
+
+from px4fuse.errors import MissingDataError, Px4FuseError, SettingsError, TrajectoryError
+from px4fuse.filter.signals import Segment
+from px4fuse.flight import Unavailable
+from px4fuse.loop.closure import (
+    IntArray,
+    correct_by_distance,
+    cumulative_distance,
+    heading_change_rad,
+    key_frame_spacing_m,
+    key_frames,
+    upright,
+    wrapped,
+)
+from px4fuse.loop.odometry import Closure, OdometryNoise, pose_graph
+from px4fuse.loop.part import KnownEnd, assumed_end, part_of
+from px4fuse.trajectory.evaluation import Evaluation, evaluate
+from px4fuse.trajectory.graph.pose_graph import GateResult, PoseGraph, Solution, gate, solve
+from px4fuse.trajectory.model import Array, Frame, Trajectory
+
+# Chance that the gate rejects a closure that is true
+GATE_ALPHA = 0.001
+LANDING = "landing"
+UNCORRECTED = "uncorrected"
+BY_DISTANCE = "by distance"
+# What the solutions of the pose graph are called
+SOLUTIONS: Mapping[str, str] = {
+    "all": "pose graph, all closures",
+    "gated": "pose graph, gated",
+    "dcs": "pose graph, DCS",
+    "gnc": "pose graph, GNC",
+}
+# A path that is shorter is no loop, whatever its ends
+MIN_PATH_M = 2.0
+SINGLE_LOOP = (
+    "A single loop has no redundancy: nothing else in the graph can contradict it, so that robust "
+    "solving can reject nothing and only the gate can."
+)
+
+
+@dataclass(frozen=True)
+class Judged:
+    """One closure and what was found about it.
+
+    Attributes
+    ----------
+    closure : Closure
+    distance_m : float
+        By which the odometry misses it.
+    gate : GateResult
+    weights : mapping from "dcs" and "gnc" to float
+        What robust solving gives it, 0 to 1; empty where there is no redundancy.
+    """
+
+    closure: Closure
+    distance_m: float
+    gate: GateResult
+    weights: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Correction:
+    """A corrected path, or the odometry itself.
+
+    Attributes
+    ----------
+    name : str
+    trajectory : Trajectory
+        All poses of the part, corrected.
+    moved_m : ndarray, shape (n,)
+        How far each pose moved.
+    scores : mapping from the reference's name to Evaluation or Unavailable
+    solution : Solution or None
+        Of a pose graph.
+    """
+
+    name: str
+    trajectory: Trajectory
+    moved_m: Array
+    scores: Mapping[str, Evaluation | Unavailable] = field(default_factory=dict)
+    solution: Solution | None = None
+
+
+@dataclass(frozen=True)
+class Loop:
+    """The result of ``px4fuse loop``.
+
+    Attributes
+    ----------
+    odometry : Correction
+        The part between take-off and landing as it was measured, in a frame with z down.
+    segment : Segment
+        In the trajectory's own time, and why.
+    nodes : ndarray of int, shape (k,)
+        Key frames, as indices of poses.
+    spacing_m : float
+        Between key frames.
+    distance_m : ndarray, shape (n,)
+        Along the path at each pose, by key frames.
+    known_end : KnownEnd or Unavailable
+        Unavailable where it is not assumed that the vehicle came back.
+    end_m : ndarray, shape (3,)
+        Last position minus first, by the odometry.
+    heading_change_deg : float or None
+        Last heading minus first, by the odometry; None without orientations.
+    misclosure_m : ndarray, shape (3,), or Unavailable
+        Last position by the odometry minus where the vehicle really was.
+    misclosure_heading_deg : float or Unavailable
+    closures : tuple of Judged
+        That of the landing first, then those given.
+    noise : OdometryNoise
+    graph : PoseGraph or Unavailable
+        With all closures, before it is solved.
+    by_distance : Correction or Unavailable
+    solved : mapping from "all", "gated", "dcs" and "gnc" to Correction or Unavailable
+    references : tuple of Trajectory
+    notes : tuple of str
+    absolute : bool
+        Whether the track follows an absolute position, so that it does not drift.
+    frame : Frame
+        That of the trajectory as it was given.
+    """
+
+    odometry: Correction
+    segment: Segment
+    nodes: IntArray
+    spacing_m: float
+    distance_m: Array
+    known_end: KnownEnd | Unavailable
+    end_m: Array
+    heading_change_deg: float | None
+    misclosure_m: Array | Unavailable
+    misclosure_heading_deg: float | Unavailable
+    closures: tuple[Judged, ...]
+    noise: OdometryNoise
+    graph: PoseGraph | Unavailable
+    by_distance: Correction | Unavailable
+    solved: Mapping[str, Correction | Unavailable]
+    references: tuple[Trajectory, ...]
+    notes: tuple[str, ...]
+    absolute: bool = False
+    frame: Frame = "NED"
+
+    @property
+    def path_length_m(self) -> float:
+        """Length of the path, by key frames."""
+        return float(self.distance_m[-1])
+
+    @property
+    def closure_error_m(self) -> float | None:
+        """Length of the misclosure; None where it is not known where the vehicle ended."""
+        if isinstance(self.misclosure_m, Unavailable):
+            return None
+        return float(np.linalg.norm(self.misclosure_m))
+
+    @property
+    def end_assumed(self) -> bool:
+        """Whether the misclosure rests on the assumption that it landed where it took off."""
+        return isinstance(self.known_end, KnownEnd) and self.known_end.assumed
+
+    @property
+    def reported(self) -> tuple[Correction, ...]:
+        """The paths worth a row: each solution of the pose graph once."""
+        accepted = all(judged.gate.accepted for judged in self.closures)
+        return tuple(c for c in self.corrections if not (accepted and c.name == SOLUTIONS["all"]))
+
+    @property
+    def best(self) -> Correction:
+        """The gated solution of the pose graph, else by distance, else the odometry."""
+        for part in (self.solved.get("gated"), self.by_distance):
+            if isinstance(part, Correction):
+                return part
+        return self.odometry
+
+    def solved_graph(self) -> PoseGraph:
+        """The pose graph with all its closures, its poses those of the best solution there is.
+
+        Raises
+        ------
+        MissingDataError
+            There is no graph.
+        """
+        if isinstance(self.graph, Unavailable):
+            raise MissingDataError(f"{self.graph.what}: {self.graph.reason}.")
+        for name in ("gated", "all"):
+            part = self.solved.get(name)
+            if isinstance(part, Correction) and part.solution is not None:
+                return replace(self.graph, poses=part.solution.poses)
+        return self.graph
+
+    @property
+    def corrections(self) -> tuple[Correction, ...]:
+        """Every path that there is, the odometry first."""
+        every = (self.odometry, self.by_distance, *self.solved.values())
+        return tuple(part for part in every if isinstance(part, Correction))
+
+
+def close_loop(
+    trajectory: Trajectory,
+    segment: Segment | None = None,
+    *,
+    known_end: KnownEnd | None = None,
+    came_back: bool = True,
+    closures: tuple[Closure, ...] = (),
+    noise: OdometryNoise | None = None,
+    references: tuple[Trajectory, ...] = (),
+    spacing_m: float | None = None,
+    at_rest: bool = False,
+    progress: Callable[[str], None] = lambda _: None,
+) -> Loop:
+    """Measure how far a loop fails to close, and correct its path.
+
+    Parameters
+    ----------
+    trajectory : Trajectory
+    segment : Segment, optional
+        Part to take, in the trajectory's own time; by default all of it.
+    known_end : KnownEnd, optional
+        By default the vehicle ends where it began, and with the heading that it began with if
+        the odometry has it within 15° of that.
+    came_back : bool
+        False where only the closures given are to be used.
+    closures : tuple of Closure
+        Further ones.
+    noise : OdometryNoise, optional
+    references : tuple of Trajectory
+        What the paths are scored against: the truth, or a SLAM system's trajectory.
+    spacing_m : float, optional
+        Between key frames; by default a fiftieth of the extent, 0.02 to 0.5 m.
+    at_rest : bool
+        Whether the vehicle stands before the part and after it, so that its poses there may be
+        averaged.
+    progress : callable
+        Told what is being done.
+
+    Raises
+    ------
+    TrajectoryError
+        The part is too short, or a closure lies outside it.
+    SettingsError
+        A number is out of range.
+    """
+    noise = noise or OdometryNoise()
+    whole = upright(trajectory)
+    segment = segment or Segment(
+        float(whole.time_s[0]), float(whole.time_s[-1]), "the whole trajectory"
+    )
+    path = part_of(whole, segment, at_rest)
+    spacing = key_frame_spacing_m(path.position_m) if spacing_m is None else spacing_m
+    if not 1e-3 <= spacing <= 100.0:
+        raise SettingsError(f"--key-frames {spacing:g} is outside 0.001 to 100 m.")
+    frames = key_frames(path.position_m, spacing)
+    along = cumulative_distance(path.position_m[frames])
+    if not along[-1] >= max(MIN_PATH_M * min(1.0, spacing / 0.5), 1e-6):
+        raise TrajectoryError(
+            f"{trajectory.name}: the path is {along[-1]:.2f} m long on key frames {spacing:g} m "
+            "apart, too short for a loop. Give the part with --from and --to, or --key-frames."
+        )
+    distance = np.interp(path.time_s, path.time_s[frames], along)
+    end_m = path.position_m[-1] - path.position_m[0]
+    heading = None
+    if path.rotation is not None:
+        heading = float(np.degrees(heading_change_rad(path.rotation[-1] * path.rotation[0].inv())))
+    notes = list(whole.notes)
+    end: KnownEnd | Unavailable
+    if came_back:
+        end = known_end or assumed_end(heading)
+        every = (_landing(end, segment), *closures)
+    else:
+        end = Unavailable(
+            "misclosure", "the vehicle is not said to have come back", "Leave out --open."
+        )
+        every = closures
+    for closure in every:
+        _check(closure, path)
+    misclosure_m, misclosure_heading = _misclosure(end, end_m, heading)
+    raw = _scored(Correction(UNCORRECTED, path, np.zeros(len(path))), references)
+    offset = _offsets(raw)
+    judged, graph, solved, statement = _solve_all(
+        path, frames, every, noise, references, offset, progress
+    )
+    notes.append(statement)
+    by_distance = _by_distance(
+        path, distance, misclosure_m, misclosure_heading, judged if came_back else ()
+    )
+    if isinstance(by_distance, Correction):
+        by_distance = _scored(by_distance, references, offset)
+    return Loop(
+        odometry=raw,
+        segment=segment,
+        nodes=frames,
+        spacing_m=spacing,
+        distance_m=distance,
+        known_end=end,
+        end_m=end_m,
+        heading_change_deg=heading,
+        misclosure_m=misclosure_m,
+        misclosure_heading_deg=misclosure_heading,
+        closures=judged,
+        noise=noise,
+        graph=graph,
+        by_distance=by_distance,
+        solved=solved,
+        references=references,
+        notes=tuple(note for note in notes if note),
+        frame=trajectory.frame,
+    )
+
+
+def _landing(end: KnownEnd, segment: Segment) -> Closure:
+    return Closure(
+        segment.start_s,
+        segment.end_s,
+        end.sigma_m,
+        end.displacement_m,
+        end.heading_change_deg,
+        end.sigma_heading_deg,
+        LANDING,
+    )
+
+
+def _check(closure: Closure, path: Trajectory) -> None:
+    low, high = float(path.time_s[0]), float(path.time_s[-1])
+    times = (closure.time_1_s, closure.time_2_s)
+    label = f"closure {closure.time_1_s:.12g},{closure.time_2_s:.12g}"
+    if closure.source != LANDING:
+        for time in times:
+            if not low <= time <= high:
+                raise TrajectoryError(
+                    f"{path.name}: {label}: {time:.12g} s is outside the path, which runs from "
+                    f"{low:.2f} s to {high:.2f} s."
+                )
+        if not times[0] < times[1]:
+            raise TrajectoryError(
+                f"{path.name}: {label}: the first time must be before the second."
+            )
+    if not 1e-4 <= closure.sigma_m <= 100.0:
+        raise TrajectoryError(
+            f"{path.name}: {label}: SIGMA {closure.sigma_m:g} is outside 0.0001 to 100 m."
+        )
+
+
+def _misclosure(
+    end: KnownEnd | Unavailable, end_m: Array, heading_deg: float | None
+) -> tuple[Array | Unavailable, float | Unavailable]:
+    if isinstance(end, Unavailable):
+        return end, end
+    if heading_deg is None:
+        turned: float | Unavailable = Unavailable(
+            "heading misclosure", "the trajectory has no orientations", "None needed."
+        )
+    elif end.heading_change_deg is None:
+        turned = Unavailable(
+            "heading misclosure",
+            f"the vehicle ends turned by {heading_deg:+.0f}°, and how far it was really turned is "
+            "not known",
+            "Give it as the third number of --landed-at FORWARD,RIGHT,DEG.",
+        )
+    else:
+        turned = float(np.degrees(wrapped(np.radians(heading_deg - end.heading_change_deg))))
+    return end_m - np.array(end.displacement_m), turned
+
+
+def _by_distance(
+    path: Trajectory,
+    distance: Array,
+    misclosure_m: Array | Unavailable,
+    heading: float | Unavailable,
+    judged: tuple[Judged, ...],
+) -> Correction | Unavailable:
+    if isinstance(misclosure_m, Unavailable):
+        return misclosure_m
+    if judged and not judged[0].gate.accepted:
+        return _refused("correction by distance", judged[0])
+    turned = 0.0 if isinstance(heading, Unavailable) else float(np.radians(heading))
+    corrected = correct_by_distance(path, distance, misclosure_m, turned)
+    return _correction(BY_DISTANCE, path, corrected)
+
+
+def _refused(what: str, judged: Judged) -> Unavailable:
+    return Unavailable(
+        what,
+        f"the gate rejects {judged.closure} (d² {judged.gate.d2:.1f}, p {judged.gate.p:.1g}): "
+        "forcing it would warp the whole path",
+        "Measure where the vehicle landed (--landed-at), leave the landing out (--open), or say "
+        "with --drift that this odometry drifts more.",
+    )
+
+
+def _correction(
+    name: str, path: Trajectory, corrected: Trajectory, solution: Solution | None = None
+) -> Correction:
+    moved: Array = np.linalg.norm(corrected.position_m - path.position_m, axis=1)
+    return Correction(name, corrected, moved, solution=solution)
+
+
+def _solve_all(
+    path: Trajectory,
+    frames: IntArray,
+    closures: tuple[Closure, ...],
+    noise: OdometryNoise,
+    references: tuple[Trajectory, ...],
+    offsets: Mapping[str, float],
+    progress: Callable[[str], None],
+) -> tuple[tuple[Judged, ...], PoseGraph | Unavailable, dict[str, Correction | Unavailable], str]:
+    """Judge the closures and solve the graph with all, with the good ones, and robustly."""
+    if path.rotation is None:
+        lacking = Unavailable(
+            "pose graph", "the trajectory has no orientations", "Give one that has."
+        )
+        return (), lacking, dict.fromkeys(SOLUTIONS, lacking), ""
+    at = [time for closure in closures for time in (closure.time_1_s, closure.time_2_s)]
+    nearest = [int(np.argmin(np.abs(path.time_s - time))) for time in at]
+    nodes = np.unique([*frames, *nearest]).astype(np.intp)
+    graph, statement = pose_graph(path, nodes, closures, noise)
+    if not closures:
+        nothing = Unavailable("pose graph", "there is no closure", "Give one with --closure.")
+        return (), graph, dict.fromkeys(SOLUTIONS, nothing), statement
+    edges = np.arange(len(graph.first) - len(closures), len(graph.first))
+    gates = gate(graph, edges, alpha=GATE_ALPHA)
+    judged = []
+    for closure, result in zip(closures, gates, strict=True):
+        i, j = graph.first[result.edge], graph.second[result.edge]
+        missed = graph.poses[j, :3] - graph.poses[i, :3] - np.array(closure.displacement_m)
+        judged.append(Judged(closure, float(np.linalg.norm(missed)), result))
+    loops = np.zeros(len(graph.first), dtype=np.bool_)
+    loops[edges] = True
+    accepted = np.ones(len(graph.first), dtype=np.bool_)
+    accepted[edges] = [result.accepted for result in gates]
+    solved: dict[str, Correction | Unavailable] = {}
+    for name, label in SOLUTIONS.items():
+        progress(f"solving: {label}")
+        if name in ("dcs", "gnc") and len(closures) < 2:
+            solved[name] = Unavailable(label, SINGLE_LOOP, "Give further closures with --closure.")
+            continue
+        if name == "gated" and not accepted[edges].any():
+            solved[name] = _refused("pose graph", judged[0])
+            continue
+        if name == "gated" and accepted.all():  # the same graph as with all of them
+            same = solved["all"]
+            solved[name] = replace(same, name=label) if isinstance(same, Correction) else same
+            continue
+        if name == "gated":
+            solution = solve(without(graph, ~accepted))
+        elif name == "all":
+            solution = solve(graph)
+        else:
+            solution = solve(graph, robust="dcs" if name == "dcs" else "gnc", loops=loops)
+            judged = [
+                replace(one, weights={**one.weights, name: float(solution.weights[edge])})
+                for one, edge in zip(judged, edges, strict=True)
+            ]
+        corrected = _carried(path, nodes, graph.poses, solution.poses)
+        solved[name] = _scored(_correction(label, path, corrected, solution), references, offsets)
+    return tuple(judged), graph, solved, statement
+
+
+def without(graph: PoseGraph, dropped: NDArray[np.bool_]) -> PoseGraph:
+    """A graph without some of its edges."""
+    return replace(
+        graph,
+        first=graph.first[~dropped],
+        second=graph.second[~dropped],
+        measurements=graph.measurements[~dropped],
+        information=graph.information[~dropped],
+    )
+
+
+def _carried(path: Trajectory, nodes: IntArray, before: Array, after: Array) -> Trajectory:
+    """All poses of a path, each moved as the nodes before and after it were."""
+    if path.rotation is None:
+        raise ValueError("a pose graph needs orientations")
+    old, new = Rotation.from_quat(before[:, 3:]), Rotation.from_quat(after[:, 3:])
+    turn = new * old.inv()
+    left = np.clip(np.searchsorted(nodes, np.arange(len(path)), side="right") - 1, 0, None)
+    left = np.minimum(left, len(nodes) - 2)
+    time = path.time_s
+    share = (time - time[nodes[left]]) / (time[nodes[left + 1]] - time[nodes[left]])
+    moved = [
+        after[node, :3] + turn[node].apply(path.position_m - before[node, :3])
+        for node in (left, left + 1)
+    ]
+    weight = np.clip(share, 0.0, 1.0)[:, np.newaxis]
+    return replace(
+        path,
+        position_m=(1.0 - weight) * moved[0] + weight * moved[1],
+        rotation=Slerp(time[nodes], turn)(time) * path.rotation,
+        position_variance_m2=None,
+        rotation_variance_rad2=None,
+    )
+
+
+def _scored(
+    correction: Correction,
+    references: tuple[Trajectory, ...],
+    offsets: Mapping[str, float] | None = None,
+) -> Correction:
+    """Score a path against every reference; the clocks are matched once, on the odometry."""
+    scores: dict[str, Evaluation | Unavailable] = {}
+    for reference in references:
+        same_clock = reference.sha256 == correction.trajectory.sha256
+        known = 0.0 if same_clock else None
+        if offsets is not None:
+            known = offsets.get(reference.name, known)
+        try:
+            scores[reference.name] = evaluate(
+                correction.trajectory,
+                reference,
+                time_offset_s=known,
+            )
+        except Px4FuseError as error:
+            scores[reference.name] = Unavailable(
+                f"score against {reference.name}", str(error), "Give another --reference."
+            )
+    return replace(correction, scores=scores)
+
+
+def _offsets(odometry: Correction) -> dict[str, float]:
+    return {
+        name: score.time_offset.offset_s
+        for name, score in odometry.scores.items()
+        if isinstance(score, Evaluation) and score.time_offset.offset_s is not None
+    }

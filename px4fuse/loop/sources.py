@@ -1,0 +1,135 @@
+"""Where a trajectory comes from: a file of its own, or a part of a flight log."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from px4fuse.errors import MissingDataError, TrajectoryError
+from px4fuse.flight import Flight, Unavailable
+from px4fuse.loop.tracks import PARTS, Part, odometry_of, trajectory_of
+from px4fuse.readers import read_log
+from px4fuse.readers.trajectory import read_trajectory
+from px4fuse.trajectory.model import Frame, Trajectory
+
+_HEAD_BYTES = 4096
+_UTF16 = b"\xff\xfe"  # what a Windows shell's redirection writes
+_G2O = (b"VERTEX_", b"EDGE_", b"FIX")
+
+
+@dataclass(frozen=True)
+class Source:
+    """A trajectory and, where it is part of one, the flight."""
+
+    trajectory: Trajectory
+    flight: Flight | None
+
+
+def split_part(argument: str) -> tuple[Path, Part | None]:
+    """File and part of ``FILE`` or ``LOG:vio``, ``LOG:ekf2``, ``LOG:kf``, ``LOG:truth``.
+
+    Raises
+    ------
+    TrajectoryError
+        What follows the colon is no part.
+    """
+    whole = Path(argument)
+    if whole.exists():
+        return whole, None
+    path, colon, tail = argument.rpartition(":")
+    for part in PARTS:
+        if colon and tail == part:
+            return Path(path), part
+    if colon and Path(path).is_file():
+        raise TrajectoryError(
+            f"{Path(path).name}:{tail}: {tail!r} is no part of a flight; take one of "
+            f"{', '.join(PARTS)}."
+        )
+    return whole, None
+
+
+def head_of(path: Path) -> bytes:
+    """First bytes of a file.
+
+    Raises
+    ------
+    TrajectoryError
+        It cannot be read.
+    """
+    name = path.name or str(path)
+    if path.is_dir():  # Windows would say "Permission denied"
+        raise TrajectoryError(f"{name}: is a folder. Give a file.")
+    try:
+        with path.open("rb") as file:
+            return file.read(_HEAD_BYTES)
+    except (OSError, ValueError) as error:  # ValueError: a path with a NUL in it
+        reason = getattr(error, "strerror", None) or error
+        raise TrajectoryError(f"{name}: cannot be read ({reason}).") from error
+
+
+def is_text(path: Path) -> bool:
+    """Whether a file is text, and so no flight log."""
+    head = head_of(path)
+    if head.startswith(_UTF16):
+        return True
+    return bool(head) and not any(byte < 9 or 13 < byte < 32 for byte in head)
+
+
+def is_g2o(path: Path) -> bool:
+    """Whether a file is a pose graph in g2o's format."""
+    lines = (line.strip() for line in head_of(path).splitlines())
+    return is_text(path) and any(line.startswith(_G2O) for line in lines)
+
+
+def read_source(
+    argument: str,
+    *,
+    default: Part | None = None,
+    frame: Frame | None = None,
+    system: int | None = None,
+) -> Source:
+    """Read a trajectory from a file, or a part of a flight log.
+
+    Parameters
+    ----------
+    argument : str
+        As :func:`split_part` takes it.
+    default : Part, optional
+        Part of a log that is taken where none is named; by default its odometry, or EKF2's track
+        where it has none.
+    frame : Frame, optional
+        What a file's axes are, where that is known better than its reader can tell.
+    system : int, optional
+        MAVLink system id.
+
+    Raises
+    ------
+    TrajectoryError, LogError, MissingDataError
+        It cannot be read, or lacks the part.
+    """
+    path, part = split_part(argument)
+    if not head_of(path):
+        raise TrajectoryError(f"{path.name}: the file is empty. Copy or export it again.")
+    if is_g2o(path):
+        raise TrajectoryError(
+            f"{path.name}: a pose graph, not a trajectory. Solve it with px4fuse loop {path.name}."
+        )
+    if is_text(path):
+        if part is not None:
+            raise TrajectoryError(
+                f"{path.name}: a trajectory file has no part {part!r}. Leave it out."
+            )
+        trajectory = read_trajectory(path)
+        return Source(trajectory if frame is None else replace(trajectory, frame=frame), None)
+    flight = read_log(path, system=system)
+    chosen = part or default or _odometry_or_ekf2(flight)
+    return Source(trajectory_of(flight, chosen), flight)
+
+
+def _odometry_or_ekf2(flight: Flight) -> Part:
+    odometry = odometry_of(flight)
+    if not isinstance(odometry, Unavailable):
+        return "vio"
+    if isinstance(flight.ekf2, Unavailable):
+        raise MissingDataError(f"{flight.log.name}: {odometry.reason}. {odometry.remedy}")
+    return "ekf2"

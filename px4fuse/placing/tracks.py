@@ -1,0 +1,211 @@
+"""Tracks of a position file and of its references, on one time grid and in north, east, down."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+from scipy.integrate import cumulative_trapezoid
+from scipy.ndimage import binary_erosion, gaussian_filter1d, median_filter
+from scipy.signal import butter, sosfiltfilt
+
+from px4fuse.comparison.projection import continuous_state
+from px4fuse.filter.signals import Array, Segment, ned_acceleration
+from px4fuse.flight import (
+    POSITION_COLUMNS,
+    POSITION_VARIANCE_COLUMNS,
+    Ekf2,
+    Flight,
+    PositionTrack,
+    Unavailable,
+    finite_rows,
+)
+
+Complex = NDArray[np.complex128]
+
+# Which of x, y, z is north, east, down, and with which sign
+FRAMES = {
+    "ned": ([0, 1, 2], [1.0, 1.0, 1.0]),
+    "enu": ([1, 0, 2], [1.0, 1.0, -1.0]),
+    "nwu": ([0, 1, 2], [1.0, -1.0, -1.0]),
+}
+EKF2_POSITION, IMU = "EKF2 position", "IMU"
+
+STEP_S = 0.05  # of the common grid
+# Nothing is interpolated in an interval longer than this and than three median ones
+GAP_S, GAP_INTERVALS = 0.5, 3.0
+MIN_MOTION_M = 0.5
+MIN_SAMPLES = 10
+MIN_OVERLAP_S = 10.0  # or half of the shorter track
+# EKF2's output moves in steps at its updates; the low-pass over them has no delay
+SMOOTHING_S = 0.2
+# Where acceleration integrated twice resembles a position: below this band it drifts
+BAND_HZ = (0.1, 1.0)
+BAND_EDGE_S, BAND_PADDING_S = 2.0, 10.0  # what the filter's transients spoil, and its padding
+
+
+class NoMatchError(Exception):
+    """A reference does not match; with a remedy where no other reference could do better."""
+
+    def __init__(self, reason: str, remedy: str = "") -> None:
+        super().__init__(reason)
+        self.remedy = remedy
+
+
+@dataclass(frozen=True)
+class Track:
+    """Positions over time, of the file or of its reference.
+
+    Attributes
+    ----------
+    time_s : ndarray, shape (n,)
+        Of the flight; for the file from its first sample on.
+    position_m : ndarray, shape (n, 3)
+        North, east, down; down may be NaN.
+    valid : ndarray of bool, shape (n,)
+        False inside gaps.
+    name : str
+        Of a reference.
+    """
+
+    time_s: Array
+    position_m: Array
+    valid: NDArray[np.bool_]
+    name: str = ""
+
+    @property
+    def horizontal_m(self) -> Complex:
+        """North + i·east, shape (n,)."""
+        return self.position_m[:, 0] + 1j * self.position_m[:, 1]
+
+    def at(self, time_s: Array) -> tuple[Array, NDArray[np.bool_]]:
+        """Position at given times, and whether there is one (outside and in gaps there is none)."""
+        position = [np.interp(time_s, self.time_s, column) for column in self.position_m.T]
+        valid = np.interp(time_s, self.time_s, self.valid.astype(float), 0.0, 0.0) > 0.999
+        return np.stack(position, axis=1), valid
+
+
+def file_track(samples: pd.DataFrame, frame: str) -> Track:
+    """Read the file's axes as north, east, down; time from its first sample on."""
+    order, sign = FRAMES[frame]
+    time = samples.index.to_numpy()
+    return Track(
+        time - time[0],
+        samples[["x_m", "y_m", "z_m"]].to_numpy()[:, order] * sign,
+        np.ones(len(time), dtype=bool),
+    )
+
+
+def on_grid(track: Track) -> Track:
+    """Resample to the grid that begins with the track, gaps marked."""
+    interval = np.diff(track.time_s)
+    grid = np.arange(track.time_s[0], track.time_s[-1], STEP_S)
+    before = np.searchsorted(track.time_s, grid, side="right") - 1
+    longest = max(GAP_S, GAP_INTERVALS * float(np.median(interval)))
+    within = interval[np.clip(before, 0, len(interval) - 1)] <= longest
+    return Track(grid, track.at(grid)[0], within)
+
+
+def despiked(track: Track, window: int = 3) -> Track:
+    """Without single outliers, or more with a longer median."""
+    return replace(track, position_m=median_filter(track.position_m, size=(window, 1)))
+
+
+def band_passed(position_m: Array) -> Array:
+    """Band-pass without delay."""
+    sos = butter(2, BAND_HZ, "bandpass", fs=1.0 / STEP_S, output="sos")
+    padding = min(round(BAND_PADDING_S / STEP_S), len(position_m) - 1)
+    filtered: Array = sosfiltfilt(sos, position_m, axis=0, padlen=padding)
+    return filtered
+
+
+def without_edges(track: Track) -> Track:
+    """Without what the filter's transients spoil, next to gaps too."""
+    edge = round(BAND_EDGE_S / STEP_S)
+    return replace(track, valid=binary_erosion(track.valid, np.ones(2 * edge + 1, dtype=bool)))
+
+
+def horizontal_range_m(track: Track) -> float:
+    """Larger horizontal range (m), noise and outliers left out."""
+    return float(np.max(np.ptp(despiked(track, 5).position_m[:, :2], axis=0)))
+
+
+def _ekf2_track(state: pd.DataFrame) -> Track:
+    """EKF2's position on the grid, smoothed."""
+    known = finite_rows(state, POSITION_COLUMNS[:2])
+    if len(known) < MIN_SAMPLES:
+        raise NoMatchError("EKF2 has no horizontal position in this log")
+    raw = Track(
+        known.index.to_numpy(), known[POSITION_COLUMNS].to_numpy(), np.ones(len(known), dtype=bool)
+    )
+    grid = on_grid(raw)
+    smooth = gaussian_filter1d(grid.position_m, SMOOTHING_S / STEP_S, axis=0, mode="nearest")
+    return replace(grid, position_m=smooth, name=EKF2_POSITION)
+
+
+def ekf2_references(flight: Flight) -> list[Track]:
+    """EKF2's position as published and, where it was reset horizontally, without those resets.
+
+    Height is always as published: most of its resets correct an error of before take-off.
+    """
+    if isinstance(flight.ekf2, Unavailable):
+        raise NoMatchError("the log has no EKF2 position")
+    state = flight.ekf2.state
+    states = [state]
+    resets = [
+        reset
+        for reset in flight.ekf2.resets
+        if reset.quantity == "position" and any(reset.delta[:2])
+    ]
+    if resets:
+        after = state.index.to_numpy()[:, None] >= np.array([reset.time_s for reset in resets])
+        moved = after @ np.array([(*reset.delta[:2], 0.0) for reset in resets])
+        states.append(state.assign(**(state[POSITION_COLUMNS] - moved)))
+    references = [_ekf2_track(state) for state in states]
+    if max(map(horizontal_range_m, references)) < MIN_MOTION_M:
+        raise NoMatchError("EKF2's position hardly moves")
+    return references
+
+
+def imu_references(flight: Flight) -> list[Track]:
+    """Acceleration integrated twice, band-passed after each integration."""
+    acceleration = ned_acceleration(flight)
+    if isinstance(acceleration, Unavailable):
+        raise NoMatchError("the log has no acceleration in NED")
+    time = acceleration.index.to_numpy()
+    velocity = cumulative_trapezoid(acceleration.to_numpy(), time, axis=0, initial=0)
+    grid = on_grid(Track(time, velocity, np.ones(len(time), dtype=bool)))
+    if len(grid.time_s) * STEP_S < MIN_OVERLAP_S:
+        raise NoMatchError("the IMU's record is too short")
+    position = cumulative_trapezoid(band_passed(grid.position_m), dx=STEP_S, axis=0, initial=0)
+    return [without_edges(replace(grid, position_m=band_passed(position), name=IMU))]
+
+
+def placed_samples(
+    samples: pd.DataFrame, frame: str, yaw_rad: float, origin_m: Array, lag_s: float
+) -> pd.DataFrame:
+    """NED positions and variances: R·C·p + origin, and the diagonal of R·C·diag(σ²)·Cᵀ·Rᵀ."""
+    track = file_track(samples, frame)
+    position = track.position_m.copy()
+    order, _ = FRAMES[frame]
+    variance = samples[["sigma_x_m", "sigma_y_m", "sigma_z_m"]].to_numpy()[:, order] ** 2
+    if yaw_rad:  # at 0 a missing sigma of one axis is none of the other's
+        c, s = np.cos(yaw_rad), np.sin(yaw_rad)
+        turn = np.array([[c, -s], [s, c]])
+        position[:, :2] = position[:, :2] @ turn.T
+        variance[:, :2] = variance[:, :2] @ (turn**2).T
+    columns = POSITION_COLUMNS + POSITION_VARIANCE_COLUMNS
+    values = np.hstack([position + origin_m, variance])
+    return pd.DataFrame(
+        dict(zip(columns, values.T, strict=True)),
+        index=pd.Index(track.time_s + lag_s, name="time_s"),
+    )
+
+
+def continuous_track(ekf2: Ekf2, placed: pd.DataFrame) -> Track:
+    """EKF2's track with its resets treated as the placed file has it."""
+    track = PositionTrack("", 1, "", placed, "NED", "", False, ())
+    whole = Segment(float(placed.index[0]), float(placed.index[-1]), "")
+    return _ekf2_track(continuous_state(ekf2, track, whole)[0])

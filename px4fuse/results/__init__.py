@@ -1,0 +1,1 @@
+"""The contract: what is written as JSON, its schema, and how it is read back."""

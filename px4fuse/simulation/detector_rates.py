@@ -1,0 +1,172 @@
+"""False-alarm rates and power of the detectors, measured on simulated flights.
+
+``python -m px4fuse.simulation.detector_rates`` measures them again and rewrites
+``findings/rates.csv``, which ships with the package: about a quarter of an hour on two cores.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, field
+from importlib.resources import files
+from pathlib import Path
+
+import pandas as pd
+from scipy.stats import binomtest
+
+from px4fuse.analysis import explain
+from px4fuse.comparison.comparison import compare
+from px4fuse.filter.kalman import Settings
+from px4fuse.findings import find, find_loop
+from px4fuse.loop.analysis import analyse
+from px4fuse.loop.sources import Source
+from px4fuse.loop.tracks import trajectory_of
+from px4fuse.simulation.flights import simulate_flight
+from px4fuse.simulation.mistakes import parse
+from px4fuse.simulation.scenario import Kind, Scenario
+
+TABLE = "rates.csv"
+CLEAN = "none"
+CLEAN_FLIGHTS, FAULTY_FLIGHTS = 200, 30
+# What simulated flights ask for: the IMU's white noise with what bias and attitude errors add
+RIGHT_NOISES = {"sigma_a_m_s2": 0.27, "sigma_z_m": 0.10}
+# A simulated flight holds no EKF2, and says so
+ALWAYS = ("ekf2_unavailable", "loop_end_assumed")
+
+
+@dataclass(frozen=True)
+class Condition:
+    """A mistake of a stated size, and the finding that must name it.
+
+    ``mistakes`` are as ``px4fuse simulate --mistake`` takes them, ``settings`` replace the right
+    ones, ``kind`` is that of the flight.
+    """
+
+    finding: str
+    mistakes: tuple[str, ...] = ()
+    settings: dict[str, float] = field(default_factory=dict)
+    kind: Kind = "aisle"
+
+    @property
+    def name(self) -> str:
+        """As it is typed."""
+        options = [] if self.kind == "aisle" else [f"--kind {self.kind}"]
+        options += [f"--mistake {mistake}" for mistake in self.mistakes]
+        options += [f"{name}={value:g}" for name, value in self.settings.items()]
+        return " ".join(options)
+
+
+CONDITIONS = (
+    *(Condition("source_clock_offset", (f"clock-offset={ms}ms",)) for ms in (40, 80, 120, 250)),
+    *(Condition("source_clock_changes", (f"clock-jump={ms}ms",)) for ms in (150, 250, 400)),
+    *(Condition("source_frame_turned", (f"yaw={degrees}",)) for degrees in (10, 20, 30)),
+    *(Condition("source_outliers", (f"nlos={share}%",)) for share in (1, 2, 5)),
+    *(Condition("source_gap", (f"dropout={seconds}s",)) for seconds in (2, 8)),
+    *(Condition("sigma_z_small", (), {"sigma_z_m": value}) for value in (0.07, 0.05, 0.03)),
+    *(Condition("sigma_z_large", (), {"sigma_z_m": value}) for value in (0.15, 0.2, 0.3)),
+    *(Condition("sigma_a_small", (), {"sigma_a_m_s2": value}) for value in (0.18, 0.1, 0.02)),
+    *(Condition("sigma_a_large", (), {"sigma_a_m_s2": value}) for value in (0.4, 0.8, 2.0)),
+    Condition("kf_variance_understated", (), {"sigma_z_m": 0.03}),
+    Condition("kf_variance_overstated", (), {"sigma_z_m": 0.3}),
+    Condition("process_noise_forgotten", (), {"sigma_a_m_s2": 0.001}),
+    Condition("imu_gap", ("imu-dropout=1s",)),
+    Condition("no_motion", ("no-motion",)),
+    Condition("logging_rate_low", ("imu-rate=20",)),
+    *(
+        Condition("false_loop_closure", (f"open-end={metres}m",), kind="loop")
+        for metres in (3, 5, 8)
+    ),
+)
+# Clean flights: without a mistake
+AISLE, LOOP = Condition(""), Condition("", kind="loop")
+
+
+def found(seed: int, condition: Condition | None = None) -> tuple[str, ...]:
+    """Findings on one simulated flight, most severe first, without those that always are.
+
+    Parameters
+    ----------
+    seed : int
+    condition : Condition, optional
+        None for a clean flight.
+    """
+    condition = condition or AISLE
+    mistakes = parse(condition.mistakes)
+    if condition.kind == "loop":
+        # without the truth, which would tell where it landed
+        flight = simulate_flight(Scenario(kind="loop", passes=1, truth=False, seed=seed), mistakes)
+        loop = analyse(Source(trajectory_of(flight, "vio"), flight))
+        return tuple(f.id for f in find_loop(loop) if f.id not in ALWAYS)
+    flight = simulate_flight(Scenario(seed=seed), mistakes)
+    noises = {**RIGHT_NOISES, **condition.settings}
+    settings = Settings(sigma_a_m_s2=noises["sigma_a_m_s2"], sigma_z_m=noises["sigma_z_m"])
+    comparison = explain(compare(flight, settings, axes=("north", "east")))
+    return tuple(f.id for f in find(comparison) if f.id not in ALWAYS)
+
+
+def _job(job: tuple[int, Condition]) -> tuple[str, ...]:
+    return found(*job)
+
+
+def measure(
+    clean_flights: int = CLEAN_FLIGHTS, faulty_flights: int = FAULTY_FLIGHTS
+) -> pd.DataFrame:
+    """Run every condition, on all cores.
+
+    Returns
+    -------
+    DataFrame
+        ``finding``, ``condition`` ("none" for a clean flight: the rate is that of false alarms),
+        ``flights``, ``rate``, its 95 % interval ``low``, ``high`` (Clopper and Pearson 1934), and
+        ``first``, the share in which that finding came first.
+    """
+    jobs = [(seed, clean) for clean in (AISLE, LOOP) for seed in range(clean_flights)]
+    # other seeds than the clean flights have
+    jobs += [(10_000 + seed, c) for c in CONDITIONS for seed in range(faulty_flights)]
+    with ProcessPoolExecutor(os.cpu_count()) as pool:
+        results = list(pool.map(_job, jobs, chunksize=2))
+    return pd.DataFrame(_rows(jobs, results))
+
+
+def _rows(
+    jobs: list[tuple[int, Condition]], results: list[tuple[str, ...]]
+) -> Iterator[dict[str, object]]:
+    clean = {
+        kind.kind: [result for (_, c), result in zip(jobs, results, strict=True) if c == kind]
+        for kind in (AISLE, LOOP)
+    }
+    kinds = {name: kind for kind, flights in clean.items() for result in flights for name in result}
+    kinds |= {condition.finding: condition.kind for condition in CONDITIONS}
+    for name, kind in sorted(kinds.items()):
+        own = clean[kind]
+        yield _row(name, CLEAN, [name in r for r in own], [r[:1] == (name,) for r in own])
+    for condition in CONDITIONS:
+        own = [r for (_, c), r in zip(jobs, results, strict=True) if c == condition]
+        name = condition.finding
+        yield _row(name, condition.name, [name in r for r in own], [r[:1] == (name,) for r in own])
+
+
+def _row(name: str, condition: str, hits: list[bool], first: list[bool]) -> dict[str, object]:
+    interval = binomtest(sum(hits), len(hits)).proportion_ci()
+    return {
+        "finding": name,
+        "condition": condition,
+        "flights": len(hits),
+        "rate": round(sum(hits) / len(hits), 4),
+        "low": round(float(interval.low), 4),
+        "high": round(float(interval.high), 4),
+        "first": round(sum(first) / len(first), 4),
+    }
+
+
+def rates() -> pd.DataFrame:
+    """The table that ships with the package."""
+    with files("px4fuse.findings").joinpath(TABLE).open(encoding="utf-8") as file:
+        return pd.read_csv(file, keep_default_na=False)
+
+
+if __name__ == "__main__":
+    target = Path(str(files("px4fuse.findings").joinpath(TABLE)))
+    measure().to_csv(target, index=False, lineterminator="\n")

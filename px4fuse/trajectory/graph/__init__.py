@@ -1,0 +1,1 @@
+"""SE(2), SE(3) and pose graphs."""

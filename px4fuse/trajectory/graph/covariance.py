@@ -1,0 +1,189 @@
+"""How well odometry alone knows one pose from another, and whether a closure agrees with it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import chi2
+
+from px4fuse.errors import TrajectoryError
+from px4fuse.trajectory.graph import lie
+from px4fuse.trajectory.graph.model import (
+    IntArray,
+    PoseGraph,
+    observed_directions,
+    odometry_chain,
+    odometry_steps,
+)
+from px4fuse.trajectory.model import Array
+
+
+@dataclass(frozen=True)
+class GateResult:
+    """What odometry alone says to a closure.
+
+    Attributes
+    ----------
+    edge : int
+        Its place in the graph.
+    d2 : float
+        Squared Mahalanobis distance of the closure from the relative pose by odometry.
+    degrees_of_freedom : int
+        Directions that the closure observes.
+    p : float
+        Probability of such a distance, or a larger one, if the closure is true.
+    accepted : bool
+        Whether p is at least alpha.
+    """
+
+    edge: int
+    d2: float
+    degrees_of_freedom: int
+    p: float
+    accepted: bool
+
+
+def relative_covariance(
+    graph: PoseGraph, start: int, end: int, edges: IntArray | None = None
+) -> Array:
+    """Covariance of ``X_start^-1 X_end`` by odometry alone, to first order.
+
+    Each step's error is carried to the end by the adjoint (Barfoot 2017, 8.96 and the first order
+    of 8.108, with right perturbations).
+
+    Parameters
+    ----------
+    graph : PoseGraph
+        Only its measurements are used, not its poses.
+    start, end : int
+        Indices of poses, in either order.
+    edges : ndarray of int, optional
+        Edges that are odometry; by default all that join successive poses. The first one between
+        two poses is taken.
+
+    Returns
+    -------
+    ndarray, shape (3, 3) or (6, 6)
+        In the axes of the pose at the end, m² and rad².
+
+    Raises
+    ------
+    TrajectoryError
+        If odometry does not lead from one to the other, or has a direction without information.
+    """
+    low, high = min(start, end), max(start, end)
+    _, worlds, poses = _dead_reckoning(graph, low, high, odometry_chain(graph, edges))
+    to_end = lie.adjoint(lie.inverse(poses[end - low]))
+    made: Array = to_end @ np.sum(worlds, axis=0) @ to_end.T
+    return 0.5 * (made + made.T)
+
+
+def gate(
+    graph: PoseGraph, edge_indices: Sequence[int] | IntArray, alpha: float = 0.001
+) -> list[GateResult]:
+    """Test closures against odometry alone, before they have pulled at anything.
+
+    ``d2 = r' (J Sigma J' + Omega^-1)^-1 r`` with r the log of the closure's inverse times the
+    relative pose by odometry, Sigma its covariance from :func:`relative_covariance` and J the
+    inverse right Jacobian at r. Only directions that the closure's information observes take part.
+
+    Parameters
+    ----------
+    graph : PoseGraph
+        Its edges between successive poses are the odometry, except those under test.
+    edge_indices : sequence of int
+        Edges to test.
+    alpha : float
+        Probability with which a true closure is refused.
+
+    Returns
+    -------
+    list of GateResult
+        In the order of ``edge_indices``.
+
+    Raises
+    ------
+    TrajectoryError
+        As :func:`relative_covariance`, or if a closure tells nothing.
+    """
+    tested = np.asarray(edge_indices, dtype=np.intp)
+    if not len(tested):
+        return []
+    chain = odometry_chain(graph, np.setdiff1d(np.arange(len(graph.first)), tested))
+    a, b = graph.first[tested], graph.second[tested]
+    low, high = int(min(a.min(), b.min())), int(max(a.max(), b.max()))
+    _, worlds, poses = _dead_reckoning(graph, low, high, chain)
+    total = np.concatenate([np.zeros((1, *worlds.shape[1:])), np.cumsum(worlds, axis=0)])
+    span = total[np.maximum(a, b) - low] - total[np.minimum(a, b) - low]
+    to_end = lie.adjoint(lie.inverse(poses[b - low]))
+    covariance = to_end @ span @ to_end.transpose(0, 2, 1)
+    relative = lie.between(poses[a - low], poses[b - low])
+    residual = lie.log(lie.between(graph.measurements[tested], relative))
+    jacobian = lie.right_jacobian_inverse(residual)
+    covariance = jacobian @ covariance @ jacobian.transpose(0, 2, 1)
+    return [
+        _tested(graph, edge, r, sigma, alpha)
+        for edge, r, sigma in zip(tested.tolist(), residual, covariance, strict=True)
+    ]
+
+
+def _tested(
+    graph: PoseGraph, edge: int, residual: Array, covariance: Array, alpha: float
+) -> GateResult:
+    directions, variance = observed_directions(graph.information[edge])
+    freedom = len(variance)
+    if not freedom:
+        raise TrajectoryError(
+            f"The closure from vertex {graph.ids[graph.first[edge]]} to "
+            f"{graph.ids[graph.second[edge]]} has no information. Give its inverse covariance."
+        )
+    seen = directions.T @ residual
+    spread = directions.T @ covariance @ directions + np.diag(variance)
+    d2 = float(seen @ np.linalg.solve(spread, seen))
+    p = float(chi2.sf(d2, freedom))
+    return GateResult(edge, d2, freedom, p, p >= alpha)
+
+
+def _dead_reckoning(
+    graph: PoseGraph, low: int, high: int, chain: IntArray
+) -> tuple[Array, Array, Array]:
+    """Steps, their covariances carried to the axes of pose ``low``, and poses as seen from it."""
+    used = chain[low:high]
+    gap = np.flatnonzero(used < 0)
+    if len(gap):
+        at = low + int(gap[0])
+        raise TrajectoryError(
+            f"No odometry edge joins vertices {graph.ids[at]} and {graph.ids[at + 1]}, so odometry "
+            "alone does not tell how well the closure fits. Add the edge, or test shorter closures."
+        )
+    steps = odometry_steps(graph, used)
+    covariance = _covariances(graph, used)
+    poses = lie.chain(steps)
+    carry = lie.adjoint(poses[1:])
+    return steps, carry @ covariance @ carry.transpose(0, 2, 1), poses
+
+
+def _covariances(graph: PoseGraph, used: IntArray) -> Array:
+    """Covariances of odometry edges in the axes of the later pose."""
+    information = graph.information[used]
+    scale = np.sqrt(np.diagonal(information, axis1=1, axis2=2))
+    whole = np.all(scale > 0.0, axis=1)
+    unit = np.where(whole[:, None], scale, 1.0)
+    scaled = information / (unit[:, :, None] * unit[:, None, :])
+    whole &= np.linalg.eigvalsh(scaled)[:, 0] > 1e-12
+    if not np.all(whole):
+        edge = used[int(np.argmin(whole))]
+        raise TrajectoryError(
+            f"The odometry edge from vertex {graph.ids[graph.first[edge]]} to "
+            f"{graph.ids[graph.second[edge]]} has a direction without information, so its error "
+            "has no bound. Give the information of all directions."
+        )
+    covariance = np.linalg.inv(scaled) / (unit[:, :, None] * unit[:, None, :])
+    back = graph.first[used] > graph.second[used]
+    # (Z exp(r))^-1 = Z^-1 exp(-Ad(Z) r)
+    turn = lie.adjoint(graph.measurements[used[back]])
+    covariance[back] = turn @ covariance[back] @ turn.transpose(0, 2, 1)
+    made: Array = covariance
+    return made

@@ -1,0 +1,115 @@
+"""Where to start a pose graph that comes without poses."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from px4fuse.errors import TrajectoryError
+from px4fuse.trajectory.graph import lie
+from px4fuse.trajectory.graph.model import (
+    FROM_CHORDAL,
+    PoseGraph,
+    composed,
+    cost,
+    require_connected,
+)
+from px4fuse.trajectory.graph.system import BlockSystem
+from px4fuse.trajectory.model import Array
+
+
+def initialise(graph: PoseGraph) -> PoseGraph:
+    """Poses from the edges alone, except the first, which stays.
+
+    Two starts are made, and the one of lower cost is taken: the edges composed one after the
+    other, and chordal initialisation (Carlone et al. 2015, Initialization techniques for 3D SLAM,
+    section IV-C): rotations by linear least squares without the constraint that they are rotations,
+    projected on rotations, then translations by linear least squares.
+
+    Parameters
+    ----------
+    graph : PoseGraph
+        Its poses but the first one are not looked at.
+
+    Returns
+    -------
+    PoseGraph
+        ``initialised`` tells which.
+
+    Raises
+    ------
+    TrajectoryError
+        If the graph falls into parts.
+    """
+    started = composed(graph)
+    try:
+        chordal = _chordal(graph)
+    except TrajectoryError:  # rotations that only odometry or nothing tells
+        return started
+    return min(started, chordal, key=cost) if chordal is not None else started
+
+
+def _chordal(graph: PoseGraph) -> PoseGraph | None:
+    """Chordal initialisation; None where the linear systems are singular.
+
+    Raises
+    ------
+    TrajectoryError
+        If the edges that tell a rotation do not join all poses.
+    """
+    d = graph.dimension
+    spin = np.trace(graph.information[:, d:, d:], axis1=1, axis2=2)
+    require_connected(graph, spin > 0.0, "edges that tell a rotation")
+    held = graph.first == 0, graph.second == 0
+    system = BlockSystem(graph.first, graph.second, len(graph), d)
+    measured = lie.rotation_matrix(graph.measurements)
+    transposed = measured.transpose(0, 2, 1)
+    first = lie.rotation_matrix(graph.poses[:1])[0]
+    # Unknown are the transposed rotations Y: sum of spin |Z' Y_i - Y_j|^2
+    own = spin[:, None, None] * np.eye(d)
+    weighted = spin[:, None, None] * transposed
+    right = system.vector(
+        np.where(held[1][:, None, None], weighted.transpose(0, 2, 1) @ first.T, 0.0),
+        np.where(held[0][:, None, None], weighted @ first.T, 0.0),
+    )
+    relaxed = system.solve(system.matrix(own, own, -weighted.transpose(0, 2, 1)), right)
+    if relaxed is None:
+        return None
+    relaxed[0] = first.T
+    rotation = _nearest_rotations(relaxed.transpose(0, 2, 1))
+    # Residual of an edge in the axes of the measured pose: (R_i Z)' (t_j - t_i - R_i z)
+    from_i = rotation[graph.first]
+    axes = from_i @ measured
+    information = axes @ graph.information[:, :d, :d] @ axes.transpose(0, 2, 1)
+    pull = information @ (from_i @ graph.measurements[:, :d, None])
+    start = information @ graph.poses[0, :d, None]
+    system_right = system.vector(
+        (np.where(held[1][:, None, None], start, 0.0) - pull)[..., 0],
+        (np.where(held[0][:, None, None], start, 0.0) + pull)[..., 0],
+    )
+    position = system.solve(system.matrix(information, information, -information), system_right)
+    if position is None:
+        return None
+    position[0] = graph.poses[0, :d]
+    if d == 2:
+        heading = np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0])
+        poses = np.column_stack([position, heading])
+    else:
+        poses = np.column_stack([position, Rotation.from_matrix(rotation).as_quat()])
+    poses[0] = graph.poses[0]
+    return replace(graph, poses=poses, initialised=FROM_CHORDAL)
+
+
+def _nearest_rotations(matrices: Array) -> Array:
+    """Project on rotations in the Frobenius norm.
+
+    Parameters
+    ----------
+    matrices : ndarray, shape (n, d, d)
+    """
+    left, _, right = np.linalg.svd(matrices)
+    left[:, :, -1] *= np.sign(np.linalg.det(left @ right))[:, None]
+    made: Array = left @ right
+    return made

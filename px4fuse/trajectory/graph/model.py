@@ -1,0 +1,305 @@
+"""What a pose graph is, what it costs, and what holds it together."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse.csgraph import breadth_first_order, connected_components
+
+from px4fuse.errors import TrajectoryError
+from px4fuse.trajectory.graph import lie
+from px4fuse.trajectory.model import Array
+
+IntArray = NDArray[np.intp]
+BoolArray = NDArray[np.bool_]
+
+# An information matrix, scaled to a unit diagonal, sees the directions whose eigenvalue is above
+OBSERVED = 1e-9
+FROM_FILE = "the file's vertices"
+FROM_ODOMETRY = "odometry edges composed"
+FROM_CHORDAL = "chordal initialisation"
+
+
+@dataclass(frozen=True)
+class PoseGraph:
+    """Poses, and measurements of one pose as seen from another.
+
+    Attributes
+    ----------
+    dimension : int
+        2 or 3.
+    ids : ndarray of int, shape (n,)
+        Vertex numbers as in the file, in ascending order where a file gave them.
+    poses : ndarray, shape (n, 3) or (n, 7)
+        x, y, heading in the plane; x, y, z, qx, qy, qz, qw in space; m and rad, in the world's
+        frame. Quaternions are normalised.
+    first, second : ndarray of int, shape (m,)
+        Indices into ``poses``, not vertex numbers: the measurement is of ``second`` as seen from
+        ``first``.
+    measurements : ndarray, shape (m, 3) or (m, 7)
+        As ``poses``, in the axes of ``first``.
+    information : ndarray, shape (m, 3, 3) or (m, 6, 6)
+        Inverse covariance of the measurement's error in the axes of the measured pose, translation
+        before rotation, in 1/m² and 1/rad². Positive semidefinite: zero along what the measurement
+        does not tell.
+    initialised : str
+        Where the poses come from.
+    """
+
+    dimension: int
+    ids: IntArray
+    poses: Array
+    first: IntArray
+    second: IntArray
+    measurements: Array
+    information: Array
+    initialised: str = FROM_FILE
+
+    def __post_init__(self) -> None:
+        if self.dimension not in {2, 3}:
+            raise ValueError(f"dimension is {self.dimension}, not 2 or 3")
+        n, m, wide, free = len(self.ids), len(self.first), self.width, self.freedom
+        for name, shape in (
+            ("ids", (n,)),
+            ("poses", (n, wide)),
+            ("first", (m,)),
+            ("second", (m,)),
+            ("measurements", (m, wide)),
+            ("information", (m, free, free)),
+        ):
+            if getattr(self, name).shape != shape:
+                raise ValueError(f"{name} has shape {getattr(self, name).shape}, not {shape}")
+        ends = np.concatenate([self.first, self.second])
+        if m and (ends.min() < 0 or ends.max() >= n):
+            raise ValueError(f"edges must lead from 0 to {n - 1}: indices, not vertex numbers")
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    @property
+    def width(self) -> int:
+        """Numbers of a pose: 3 in the plane, 7 in space."""
+        return 3 if self.dimension == 2 else 7
+
+    @property
+    def freedom(self) -> int:
+        """Numbers of a tangent: 3 in the plane, 6 in space."""
+        return 3 if self.dimension == 2 else 6
+
+    @property
+    def successive(self) -> BoolArray:
+        """Which edges join two successive poses: odometry, unless the caller knows better."""
+        made: BoolArray = np.abs(self.first - self.second) == 1
+        return made
+
+
+def residuals(graph: PoseGraph, poses: Array | None = None) -> Array:
+    """Residual of every edge, ``log(Z^-1 X_i^-1 X_j)``, as GTSAM's BetweenFactor has it.
+
+    Parameters
+    ----------
+    graph : PoseGraph
+    poses : ndarray, shape (n, 3) or (n, 7), optional
+        Instead of the graph's own.
+
+    Returns
+    -------
+    ndarray, shape (m, 3) or (m, 6)
+        Translation (m), then rotation (rad), in the axes of the measured pose.
+    """
+    x = graph.poses if poses is None else poses
+    return lie.log(lie.between(graph.measurements, lie.between(x[graph.first], x[graph.second])))
+
+
+def chi_square(graph: PoseGraph, residual: Array) -> Array:
+    """Squared residuals in units of the measurements' own covariance, ``r' Omega r``.
+
+    Parameters
+    ----------
+    graph : PoseGraph
+    residual : ndarray, shape (m, 3) or (m, 6)
+        From :func:`residuals`.
+
+    Returns
+    -------
+    ndarray, shape (m,)
+    """
+    made: Array = np.sum(residual * (graph.information @ residual[..., None])[..., 0], axis=-1)
+    return made
+
+
+def cost(graph: PoseGraph, poses: Array | None = None) -> float:
+    """Half the sum of the squared residuals, as GTSAM's ``graph.error`` has it.
+
+    Parameters
+    ----------
+    graph : PoseGraph
+    poses : ndarray, shape (n, 3) or (n, 7), optional
+        Instead of the graph's own.
+    """
+    return 0.5 * float(np.sum(chi_square(graph, residuals(graph, poses))))
+
+
+def observed_directions(information: Array) -> tuple[Array, Array]:
+    """Functionals of the residual that an information matrix tells about, and their variances.
+
+    Translation and rotation have different units, so the matrix is scaled to a unit diagonal
+    before eigenvalues are called zero.
+
+    Parameters
+    ----------
+    information : ndarray, shape (d, d)
+
+    Returns
+    -------
+    directions : ndarray, shape (d, k)
+        ``directions' r`` is observed; k is the rank.
+    variance : ndarray, shape (k,)
+        ``information == directions @ diag(1 / variance) @ directions.T``.
+    """
+    scale = np.sqrt(np.clip(np.diag(information), 0.0, None))
+    inverse_scale = np.divide(1.0, scale, out=np.zeros_like(scale), where=scale > 0.0)
+    values, vectors = np.linalg.eigh(information * np.outer(inverse_scale, inverse_scale))
+    seen = values > OBSERVED
+    return scale[:, None] * vectors[:, seen], 1.0 / values[seen]
+
+
+def ranks(information: Array) -> IntArray:
+    """Degrees of freedom of measurements: ranks of their information.
+
+    Parameters
+    ----------
+    information : ndarray, shape (m, d, d)
+
+    Returns
+    -------
+    ndarray of int, shape (m,)
+    """
+    scale = np.sqrt(np.clip(np.diagonal(information, axis1=1, axis2=2), 0.0, None))
+    inverse_scale = np.divide(1.0, scale, out=np.zeros_like(scale), where=scale > 0.0)
+    scaled = information * inverse_scale[:, :, None] * inverse_scale[:, None, :]
+    made: IntArray = np.sum(np.linalg.eigvalsh(scaled) > OBSERVED, axis=1)
+    return made
+
+
+def require_connected(graph: PoseGraph, used: BoolArray, what: str) -> None:
+    """Refuse a graph that falls into parts.
+
+    Parameters
+    ----------
+    graph : PoseGraph
+    used : ndarray of bool, shape (m,)
+        The edges that may hold it together.
+    what : str
+        Their name, for the message: "the edges".
+
+    Raises
+    ------
+    TrajectoryError
+        Says how many parts there are and which vertex is apart.
+    """
+    if not len(graph.first):
+        raise TrajectoryError("The pose graph has no edges. Give a file with EDGE lines.")
+    parts, part = connected_components(_links(graph, used), directed=False)
+    if parts > 1:
+        apart = graph.ids[np.flatnonzero(part != part[0])[0]]
+        raise TrajectoryError(
+            f"The pose graph falls into {parts} parts: vertex {apart} is not joined to vertex "
+            f"{graph.ids[0]} by {what}. Add an edge between the parts, or solve them one by one."
+        )
+
+
+def composed(graph: PoseGraph) -> PoseGraph:
+    """The same graph with poses along its edges, from the first pose on.
+
+    Takes the edges between successive poses where they lead from the first pose to the last, and
+    the shortest ways through all edges otherwise.
+
+    Parameters
+    ----------
+    graph : PoseGraph
+
+    Raises
+    ------
+    TrajectoryError
+        If the graph falls into parts.
+    """
+    n = len(graph)
+    chain = odometry_chain(graph)
+    if np.all(chain >= 0):
+        steps = odometry_steps(graph, chain)
+        poses = lie.compose(graph.poses[:1], lie.chain(steps))
+        return replace(graph, poses=poses, initialised=FROM_ODOMETRY)
+    require_connected(graph, np.ones(len(graph.first), dtype=bool), "the edges")
+    links = _links(graph, np.ones(len(graph.first), dtype=bool))
+    _, parent = breadth_first_order(links, 0, directed=False)
+    parent[0] = 0
+    steps = np.empty((n, graph.width))
+    steps[0] = graph.poses[0]
+    # Of several edges between the same two poses the last one stays: any will do for a start
+    for a, b, measured in (
+        (graph.first, graph.second, graph.measurements),
+        (graph.second, graph.first, lie.inverse(graph.measurements)),
+    ):
+        down = parent[b] == a
+        steps[b[down]] = measured[down]
+    # Every pass doubles how far each pose sees towards the first one
+    while np.any(parent):
+        far = parent != 0
+        steps[far] = lie.compose(steps[parent[far]], steps[far])
+        parent = np.where(far, parent[parent], 0)
+    steps[1:] = lie.compose(steps[:1], steps[1:])
+    return replace(graph, poses=steps, initialised="edges composed along the shortest ways")
+
+
+def odometry_chain(graph: PoseGraph, edges: IntArray | None = None) -> IntArray:
+    """The edge that leads from each pose to the next, -1 where there is none.
+
+    Parameters
+    ----------
+    graph : PoseGraph
+    edges : ndarray of int, optional
+        Those that may be used; all by default. The first one between two poses is taken.
+
+    Returns
+    -------
+    ndarray of int, shape (n - 1,)
+    """
+    among = np.flatnonzero(graph.successive)
+    if edges is not None:
+        among = among[np.isin(among, edges)]
+    made = np.full(len(graph) - 1, -1, dtype=np.intp)
+    # Backwards, so that of several edges the first one is what stays
+    among = among[::-1]
+    made[np.minimum(graph.first[among], graph.second[among])] = among
+    return made
+
+
+def odometry_steps(graph: PoseGraph, chain: IntArray) -> Array:
+    """Each next pose as seen from the one before, along a chain of edges.
+
+    Parameters
+    ----------
+    graph : PoseGraph
+    chain : ndarray of int, shape (k,)
+        Edges between successive poses, in order.
+
+    Returns
+    -------
+    ndarray, shape (k, 3) or (k, 7)
+    """
+    steps = graph.measurements[chain].copy()
+    back = graph.first[chain] > graph.second[chain]
+    steps[back] = lie.inverse(steps[back])
+    return steps
+
+
+def _links(graph: PoseGraph, used: BoolArray) -> sparse.csr_array[np.float64]:
+    """Adjacency of poses by edges that tell anything at all."""
+    tells = used & (np.trace(graph.information, axis1=1, axis2=2) > 0.0)
+    i, j = graph.first[tells], graph.second[tells]
+    n = len(graph)
+    return sparse.coo_array((np.ones(len(i)), (i, j)), shape=(n, n)).tocsr()

@@ -1,0 +1,351 @@
+"""Poses that fit a pose graph best, with or without closures that may be false."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from scipy import sparse
+from scipy.stats import chi2
+
+from px4fuse.errors import TrajectoryError
+from px4fuse.trajectory.graph import lie
+from px4fuse.trajectory.graph.model import (
+    BoolArray,
+    PoseGraph,
+    ranks,
+    require_connected,
+)
+from px4fuse.trajectory.graph.system import BlockSystem
+from px4fuse.trajectory.model import Array
+
+Robust = Literal["none", "dcs", "gnc"]
+# From the squared residuals: the factors on the information, and the cost of each edge
+Kernel = Callable[[Array], tuple[Array, Array]]
+
+MAX_ITERATIONS = 100
+# GTSAM's LevenbergMarquardtParams
+_FIRST_DAMPING, _DAMPING_FACTOR, _MOST_DAMPING = 1e-5, 10.0, 1e5
+_LEAST_FIDELITY = 1e-3
+_TOLERANCE = 1e-10
+_EPSILON = float(np.finfo(float).eps)
+# Stages of graduated non-convexity only lead to the last one
+_STAGE_TOLERANCE, _STAGE_ITERATIONS = 1e-6, 20
+
+DCS_PHI = 1.0  # Agarwal 2013, section IV
+GNC_PROBABILITY = 0.99  # a true closure is within the truncation with this probability
+DROP_PROBABILITY = 0.999  # the gate's
+_GNC_FACTOR = 1.4  # Yang 2020, section V
+_GNC_STAGES = 100
+_SECOND_LOOKS = 20  # dropped closures, those that fit best first; each costs one minimisation
+_TLS_ROUNDS = 20
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Result of an optimisation.
+
+    Attributes
+    ----------
+    poses : ndarray, shape (n, 3) or (n, 7)
+        As in the graph; the first one as it was.
+    cost : float
+        Half the sum of the squared residuals times the weights.
+    unweighted_cost : float
+        The same with all weights 1.
+    initial_cost : float
+        At the graph's own poses, with all weights 1.
+    iterations : int
+        Accepted steps, over all starts and stages.
+    converged : bool
+        False where the iterations ran out, or no step could lower the cost before it was flat.
+    weights : ndarray, shape (m,)
+        Factors on each edge's information, from 0 (set aside) to 1.
+    """
+
+    poses: Array
+    cost: float
+    unweighted_cost: float
+    initial_cost: float
+    iterations: int
+    converged: bool
+    weights: Array
+
+
+@dataclass(frozen=True)
+class _State:
+    """Poses, and everything about them that a linearisation needs."""
+
+    poses: Array
+    relative: Array
+    residual: Array
+    weighted_residual: Array
+    chi2: Array
+
+
+@dataclass(frozen=True)
+class _Run:
+    state: _State
+    cost: float
+    iterations: int
+    converged: bool
+
+
+def solve(
+    graph: PoseGraph,
+    *,
+    robust: Robust = "none",
+    loops: BoolArray | None = None,
+    max_iterations: int = MAX_ITERATIONS,
+) -> Solution:
+    """Poses of least cost, by Levenberg and Marquardt's method with GTSAM's schedule.
+
+    The first pose is held. Steps, damping (of the identity, from 1e-5, by factors of 10) and the
+    test of a step follow GTSAM's LevenbergMarquardtOptimizer, so that both go from the same start
+    into the same minimum; the tolerances are 1e-10, relative and absolute.
+
+    ``dcs`` multiplies the information of closures by s², s = min(1, 2 Phi / (Phi + chi²)), Phi = 1
+    (Agarwal et al. 2013, Robust map optimization using dynamic covariance scaling, eq. 15): an
+    M-estimator (MacTavish and Barfoot 2015, At all costs) with many minima. It starts from the
+    solution of ``gnc``: where odometry drifts, true closures too begin with a large chi² and are
+    lost from the given poses or from the least-squares solution. The lowest of its minima is no
+    better a choice: with Phi = 1 a closure that is dropped costs 1.5 at most, and a true one of 3
+    degrees of freedom costs 1.5 on average.
+
+    ``gnc`` minimises least squares truncated at the 99 % point of chi-square, with as many degrees
+    of freedom as the closure's information has rank, by graduated non-convexity (Yang et al. 2020,
+    eq. 13 and 14; control parameter from barc² / (2 max r² - barc²), times 1.4 per stage), from the
+    least-squares solution and from the given poses. Of the two results that of lower cost is taken,
+    with every dropped closure counted at its 99.9 % point: one is given up for no less than what
+    the gate refuses. Up to 20 dropped ones are then put back one by one, and stay where that lowers
+    this cost. Final weights are 0 or 1.
+
+    Parameters
+    ----------
+    graph : PoseGraph
+    robust : {"none", "dcs", "gnc"}
+    loops : ndarray of bool, shape (m,), optional
+        Edges that may be false; all others keep the weight 1. By default those that do not join
+        successive poses.
+    max_iterations : int
+        Accepted steps of each minimisation.
+
+    Raises
+    ------
+    TrajectoryError
+        If the graph has no edges, falls into parts, has a number that is not finite, or if ``gnc``
+        sets aside every edge to some of its poses.
+    """
+    require_connected(graph, np.ones(len(graph.first), dtype=bool), "the edges")
+    doubtful = ~graph.successive if loops is None else loops
+    if doubtful.shape != graph.first.shape:
+        raise ValueError(f"loops has shape {doubtful.shape}, not {graph.first.shape}")
+    problem = _Problem(graph)
+    start = problem.state(graph.poses)
+    initial_cost = 0.5 * float(np.sum(start.chi2))
+    if not np.isfinite(initial_cost):
+        raise TrajectoryError(
+            "The pose graph has a pose or measurement that is not a finite number, or one too "
+            "large to square. Correct it, or take the edge out."
+        )
+    plain = problem.minimise(start, _least_squares(np.ones(len(doubtful))), max_iterations)
+    weights = np.ones(len(doubtful))
+    run = plain
+    if robust != "none" and np.any(doubtful):
+        run, weights = _gnc(problem, start, plain, doubtful, max_iterations)
+        if robust == "dcs":
+            kernel = _dcs(doubtful)
+            last = problem.minimise(run.state, kernel, max_iterations)
+            run = _Run(last.state, last.cost, run.iterations + last.iterations, last.converged)
+            weights = kernel(run.state.chi2)[0]
+    return Solution(
+        poses=run.state.poses,
+        cost=0.5 * float(np.sum(weights * run.state.chi2)),
+        unweighted_cost=0.5 * float(np.sum(run.state.chi2)),
+        initial_cost=initial_cost,
+        iterations=run.iterations,
+        converged=run.converged,
+        weights=weights,
+    )
+
+
+class _Problem:
+    """A graph with the pattern of its normal equations."""
+
+    def __init__(self, graph: PoseGraph) -> None:
+        self.graph = graph
+        self._system = BlockSystem(graph.first, graph.second, len(graph), graph.freedom)
+
+    def state(self, poses: Array) -> _State:
+        graph = self.graph
+        relative = lie.between(poses[graph.first], poses[graph.second])
+        residual = lie.log(lie.between(graph.measurements, relative))
+        weighted = (graph.information @ residual[..., None])[..., 0]
+        return _State(poses, relative, residual, weighted, np.sum(residual * weighted, axis=-1))
+
+    def minimise(
+        self,
+        start: _State,
+        kernel: Kernel,
+        max_iterations: int,
+        tolerance: float = _TOLERANCE,
+    ) -> _Run:
+        """Walk down from some poses, as GTSAM's LevenbergMarquardtOptimizer does."""
+        state, damping, iterations = start, _FIRST_DAMPING, 0
+        weights, costs = kernel(state.chi2)
+        cost = float(np.sum(costs))
+        while iterations < max_iterations and cost > _TOLERANCE:
+            matrix, gradient = self._linearise(state, weights)
+            linear_cost = 0.5 * float(np.sum(weights * state.chi2))
+            while True:
+                tried, promised = self._step(state, matrix, gradient, damping)
+                drop, accepted, flat = 0.0, False, False
+                if tried is not None:
+                    tried_weights, costs = kernel(tried.chi2)
+                    drop = cost - float(np.sum(costs))
+                    worthwhile = promised > _EPSILON * linear_cost
+                    accepted = worthwhile and drop > _LEAST_FIDELITY * promised
+                    flat = abs(drop) < tolerance * cost
+                if accepted or flat or damping >= _MOST_DAMPING:
+                    break
+                damping *= _DAMPING_FACTOR
+            if tried is None or not accepted:
+                return _Run(state, cost, iterations, flat)
+            state, weights, before, cost = tried, tried_weights, cost, cost - drop
+            iterations += 1
+            damping /= _DAMPING_FACTOR
+            if drop <= max(tolerance * before, _TOLERANCE):
+                return _Run(state, cost, iterations, True)
+        return _Run(state, cost, iterations, cost <= _TOLERANCE)
+
+    def _step(
+        self,
+        state: _State,
+        matrix: sparse.csc_array[np.float64],
+        gradient: Array,
+        damping: float,
+    ) -> tuple[_State | None, float]:
+        """Where a damped step leads, and how much it lowers the linearised cost."""
+        step = self._system.solve(matrix, -gradient, damping)
+        if step is None:
+            return None, 0.0
+        promised = 0.5 * float(np.sum(step * (damping * step - gradient)))
+        if promised < 0.0:
+            return None, 0.0
+        return self.state(lie.compose(state.poses, lie.exp(step))), promised
+
+    def _linearise(
+        self, state: _State, weights: Array
+    ) -> tuple[sparse.csc_array[np.float64], Array]:
+        """Hessian in Gauss and Newton's approximation, and gradient of the cost."""
+        # d r / d x_j = J, d r / d x_i = -J A with A the adjoint of x_j's view of x_i
+        jacobian = lie.right_jacobian_inverse(state.residual)
+        transposed = jacobian.transpose(0, 2, 1)
+        back = lie.adjoint(lie.inverse(state.relative))
+        jj = transposed @ (weights[:, None, None] * self.graph.information) @ jacobian
+        ij = -back.transpose(0, 2, 1) @ jj
+        j = (transposed @ (weights[:, None] * state.weighted_residual)[..., None])[..., 0]
+        i = -(back.transpose(0, 2, 1) @ j[..., None])[..., 0]
+        return self._system.matrix(-ij @ back, jj, ij), self._system.vector(i, j)
+
+
+def jacobians(graph: PoseGraph, poses: Array | None = None) -> tuple[Array, Array]:
+    """Derivatives of the residuals as poses are moved in their own axes.
+
+    Parameters
+    ----------
+    graph : PoseGraph
+    poses : ndarray, shape (n, 3) or (n, 7), optional
+        Instead of the graph's own.
+
+    Returns
+    -------
+    first, second : ndarray, shape (m, d, d)
+        By the first pose of each edge and by the second.
+    """
+    x = graph.poses if poses is None else poses
+    relative = lie.between(x[graph.first], x[graph.second])
+    by_second = lie.right_jacobian_inverse(lie.log(lie.between(graph.measurements, relative)))
+    return -by_second @ lie.adjoint(lie.inverse(relative)), by_second
+
+
+def _least_squares(weights: Array) -> Kernel:
+    return lambda chi2_: (weights, 0.5 * weights * chi2_)
+
+
+def _dcs(doubtful: BoolArray) -> Kernel:
+    """Dynamic covariance scaling of the doubtful edges."""
+
+    def kernel(chi2_: Array) -> tuple[Array, Array]:
+        beyond = doubtful & (chi2_ > DCS_PHI)
+        scale = np.where(beyond, 2.0 * DCS_PHI / (DCS_PHI + chi2_), 1.0)
+        return scale**2, np.where(beyond, scale * chi2_ - 0.5 * DCS_PHI, 0.5 * chi2_)
+
+    return kernel
+
+
+def _gnc(
+    problem: _Problem, start: _State, plain: _Run, doubtful: BoolArray, max_iterations: int
+) -> tuple[_Run, Array]:
+    """Truncated least squares over the doubtful edges, from two starts."""
+    freedom = ranks(problem.graph.information)
+    bound = np.full(len(doubtful), np.inf)
+    price = np.zeros(len(doubtful))
+    told = doubtful & (freedom > 0)
+    bound[told] = chi2.ppf(GNC_PROBABILITY, freedom[told])
+    price[told] = chi2.ppf(DROP_PROBABILITY, freedom[told])
+
+    def priced(state: _State, kept: Array) -> float:
+        return 0.5 * float(np.sum(np.where(kept > 0.0, state.chi2, price)))
+
+    spent, found = plain.iterations, []
+    for first in (plain.state, start):
+        run, weights = _graduated(problem, first, bound, max_iterations)
+        spent += run.iterations
+        found.append((priced(run.state, weights), run, weights))
+    lowest, run, weights = min(found, key=lambda each: each[0])
+    dropped = np.flatnonzero(weights == 0.0)
+    for edge in dropped[np.argsort(run.state.chi2[dropped])][:_SECOND_LOOKS]:
+        again = weights.copy()
+        again[edge] = 1.0
+        trial = problem.minimise(run.state, _least_squares(again), max_iterations)
+        spent += trial.iterations
+        if (cost := priced(trial.state, again)) < lowest:
+            lowest, run, weights = cost, trial, again
+    require_connected(problem.graph, weights > 0.0, "the edges that gnc did not set aside")
+    return _Run(run.state, run.cost, spent, run.converged), weights
+
+
+def _graduated(
+    problem: _Problem, start: _State, bound: Array, max_iterations: int
+) -> tuple[_Run, Array]:
+    """One descent of graduated non-convexity (Yang 2020, algorithm 1, eq. 13 and 14)."""
+    state, spent = start, 0
+    # Infinite bounds are edges that are not doubted
+    excess = 2.0 * state.chi2 / bound - 1.0
+    if np.max(excess) > 0.0:
+        control = 1.0 / float(np.max(excess))
+        for _ in range(_GNC_STAGES):
+            ratio = state.chi2 / bound
+            with np.errstate(divide="ignore"):
+                weights = np.sqrt(control * (control + 1.0) / ratio) - control
+            weights = np.clip(weights, 0.0, 1.0)
+            stage = problem.minimise(
+                state, _least_squares(weights), _STAGE_ITERATIONS, _STAGE_TOLERANCE
+            )
+            state, spent = stage.state, spent + stage.iterations
+            if np.all((weights < 1e-6) | (weights > 1.0 - 1e-6)):
+                break
+            control *= _GNC_FACTOR
+    weights = (state.chi2 <= bound).astype(float)
+    for _ in range(_TLS_ROUNDS):
+        run = problem.minimise(state, _least_squares(weights), max_iterations)
+        state, spent = run.state, spent + run.iterations
+        # Lowers the truncated cost every time, so it ends
+        again = (state.chi2 <= bound).astype(float)
+        if np.array_equal(again, weights):
+            break
+        weights = again
+    return _Run(state, run.cost, spent, run.converged), weights

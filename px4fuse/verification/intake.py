@@ -1,0 +1,576 @@
+"""A handed-in PDF, read without trusting it: a report, or one sentence that says why not.
+
+Nothing in the file is executed, followed or written anywhere. Sizes are bounded here before pypdf
+sees the file, and by pypdf's own limits while it reads; what is left (a file made to be slow
+within every limit) is for the time and memory limits of :mod:`px4fuse.grading.workers`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import logging
+import math
+import re
+import unicodedata
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, fields
+from functools import cache
+from typing import Any
+
+import pypdf
+from pypdf.errors import LimitReachedError
+from pypdf.generic import (
+    ArrayObject,
+    DictionaryObject,
+    IndirectObject,
+    StreamObject,
+)
+
+from px4fuse.grading.model import Refused, Report
+from px4fuse.report.pdf import RESULTS_NAME
+from px4fuse.report.seal import seal_of
+from px4fuse.results.build import SCHEMA_NAME, SCHEMA_VERSION, schema
+
+MAX_BYTES = 25_000_000
+MAX_PAGES = 100
+MAX_ATTACHMENT_BYTES = 5_000_000
+# Of all pages together, a page counted as often as it is shown; the same for one stream
+MAX_CONTENT_BYTES = 20_000_000
+MAX_DOCUMENT_BYTES = 100_000_000
+MAX_OBJECTS = 20_000
+MAX_VALUES = 1_000_000
+# Objects that are referred to and not there: pypdf searches the whole file for each of them
+MAX_MISSING = 100
+MAX_PAGE_TEXT = 1_000_000
+
+MAX_JSON_DEPTH = 64
+MAX_JSON_VALUES = 2_000_000
+MAX_JSON_ITEMS = 200_000
+MAX_JSON_STRING = 200_000
+MAX_JSON_DIGITS = 20
+
+LOOP_NAME = "px4fuse-loop"
+LOOP_VERSION = "1.0"
+
+_INSTALL = 'reading reports needs more packages: pip install "px4fuse[grade]".'
+_DAMAGED = "damaged: it cannot be read as a PDF. Hand in the file that px4fuse wrote."
+_COSTLY = "it takes more memory or work to open than a report can need."
+
+# What a report of px4fuse has none of, by key of a dictionary ...
+_KEYS = {
+    "/JS": "JavaScript",
+    "/JavaScript": "JavaScript",
+    "/OpenAction": "an action on opening",
+    "/AA": "an automatic action",
+    "/AcroForm": "a form",
+    "/XFA": "an XFA form",
+    "/RichMediaContent": "rich media",
+    "/RichMediaSettings": "rich media",
+    "/Collection": "a portfolio",
+    "/RF": "related files",
+}
+# ... and by type of an action
+_ACTIONS = {
+    "/JavaScript": "JavaScript",
+    "/Launch": "an action that starts a program",
+    "/URI": "a link to the web",
+    "/SubmitForm": "an action that sends a form",
+    "/ImportData": "an action that imports data",
+    "/GoToR": "a link to another file",
+    "/GoToE": "a link into an attached file",
+    "/Rendition": "rich media",
+    "/RichMediaExecute": "rich media",
+    "/Movie": "rich media",
+    "/Sound": "rich media",
+    "/Named": "a named action",
+    "/Hide": "an action that hides parts",
+    "/ResetForm": "an action on a form",
+}
+
+# pypdf's defaults are for any PDF. A recovery of broken streams, filters other than Flate, chains
+# of filters and the external JBIG2 decoder are not for ours.
+_PYPDF_LIMITS: dict[str, Any] = {
+    "maximum_declared_stream_length": MAX_BYTES,
+    "array_based_stream_maximum_output_length": MAX_CONTENT_BYTES,
+    "zlib_maximum_output_length": MAX_CONTENT_BYTES,
+    "zlib_maximum_recovery_input_length": 0,
+    "lzw_maximum_output_length": 1,
+    "run_length_maximum_output_length": 1,
+    "brotli_maximum_output_length": 1,
+    "jbig2_maximum_output_length": 1,
+    "jbig2dec_binary": None,
+    "stream_filters_maximum_length": 1,
+    "stream_parsing_work_maximum_count": 1_000_000,
+    "page_tree_maximum_entries": 2 * MAX_PAGES,
+    "page_tree_maximum_page_entries": 100 * MAX_PAGES,
+}
+
+_STREAM = re.compile(rb"(?<!end)stream *\r?\n?")
+_LONG_MAPPING = re.compile(rb"<[^<>]{65,}>")
+
+
+class _RefusedError(Exception):
+    """The reason why a file is no report, on its way to :func:`read_report`."""
+
+
+@dataclass
+class _Contents:
+    """What the walk over a document met."""
+
+    files: list[DictionaryObject] = field(default_factory=list)
+    embedded: list[StreamObject] = field(default_factory=list)
+    found: set[str] = field(default_factory=set)
+
+
+def read_report(pdf: bytes, name: str) -> Report | Refused:
+    """Read a report that was handed in.
+
+    Parameters
+    ----------
+    pdf : bytes
+        Anything.
+    name : str
+        What to call the file in a refusal.
+
+    Returns
+    -------
+    Report or Refused
+        The strings of ``results`` and ``pages`` are :func:`cleaned`. Results of the schema's
+        current version are valid under it; those of another version are only bounded in size and
+        depth, and it is for the caller to say so before using them.
+    """
+    try:
+        with _quiet_pypdf():
+            return _read(pdf)
+    except _RefusedError as refusal:
+        reason = str(refusal)
+    except (LimitReachedError, RecursionError, MemoryError):
+        reason = _COSTLY
+    # pypdf names no closed set of exceptions for what is broken in a file
+    except Exception:  # noqa: BLE001
+        reason = _DAMAGED
+    return Refused(f"{one_line(name, 200)}: {reason}")
+
+
+def cleaned(text: str) -> str:
+    r"""Text without characters that act on a terminal, a page or the order of its neighbours.
+
+    Control characters other than newline and tab, bidirectional embeddings, overrides and
+    isolates, line and paragraph separators, invisible tags, noncharacters and lone surrogates are
+    dropped. Letters and signs of all languages stay.
+
+    >>> cleaned("Zo\u00eb\x1b[2J \u202egnp.exe\ud800")
+    'Zoë[2J gnp.exe'
+    """
+    return text if text.isascii() and text.isprintable() else "".join(filter(_harmless, text))
+
+
+def one_line(text: str, length: int) -> str:
+    r"""A cleaned text on one line, at most ``length`` characters long.
+
+    >>> one_line("a\nb\t c", 4)
+    'a b…'
+    """
+    # whoever sends a million characters shall not have them all looked at
+    line = " ".join(cleaned(text[: 10 * length]).split())
+    return line if len(line) <= length else line[: length - 1].rstrip() + "…"
+
+
+@cache
+def _harmless(character: str) -> bool:
+    code = ord(character)
+    if character in "\n\t":
+        return True
+    return not (
+        unicodedata.category(character) in {"Cc", "Cs", "Zl", "Zp"}
+        or 0x202A <= code <= 0x202E
+        or 0x2066 <= code <= 0x2069
+        or 0xE0000 <= code <= 0xE007F
+        or 0xFDD0 <= code <= 0xFDEF
+        or code & 0xFFFE == 0xFFFE
+    )
+
+
+@contextmanager
+def _quiet_pypdf() -> Iterator[None]:
+    """What pypdf thinks of a broken file is not for the instructor's terminal."""
+    logger = logging.getLogger("pypdf")
+    before = logger.level
+    logger.setLevel(logging.CRITICAL + 1)
+    try:
+        yield
+    finally:
+        logger.setLevel(before)
+
+
+def _read(pdf: bytes) -> Report:
+    if not hasattr(pypdf, "apply_configuration"):
+        raise _RefusedError(_INSTALL)
+    _check_file(pdf)
+    _check_streams(pdf)
+    known = {setting.name for setting in fields(pypdf.Configuration)}
+    limits = {name: value for name, value in _PYPDF_LIMITS.items() if name in known}
+    with pypdf.apply_configuration(**limits):
+        reader = _open(pdf)
+        _check_page_count(reader)
+        contents = _walk(reader)
+        if contents.found:
+            raise _RefusedError(f"it contains {', '.join(sorted(contents.found))}; no report does.")
+        results = _results(_attachment(contents))
+        pages = tuple(_page_texts(reader))
+    return Report(
+        sha256=hashlib.sha256(pdf).hexdigest(),
+        size_bytes=len(pdf),
+        seal=seal_of(pdf),
+        results=results,
+        pages=pages,
+        pdf=pdf,
+    )
+
+
+def _check_file(pdf: bytes) -> None:
+    if len(pdf) > MAX_BYTES:
+        raise _RefusedError(f"larger than {MAX_BYTES // 1_000_000} MB; reports are below 2 MB.")
+    if not pdf:
+        raise _RefusedError("an empty file.")
+    if not pdf.startswith(b"%PDF-"):
+        raise _RefusedError("not a PDF.")
+    if b"%%EOF" not in pdf[-2048:]:
+        raise _RefusedError("cut off: the end of the PDF is missing. Hand it in again.")
+
+
+def _check_streams(pdf: bytes) -> None:
+    """Inflate every stream into nothing, so that no bomb reaches pypdf."""
+    left = MAX_DOCUMENT_BYTES
+    for match in _STREAM.finditer(pdf):
+        # `stream` may stand anywhere, also inside a stream; each try costs from the same purse
+        spent = _inflated_bytes(pdf, match.end(), min(left, MAX_CONTENT_BYTES))
+        left -= spent
+        if spent > MAX_CONTENT_BYTES or left < 0:
+            raise _RefusedError("a compressed part of it expands to more than a report can hold.")
+
+
+def _inflated_bytes(pdf: bytes, start: int, limit: int) -> int:
+    """Bytes that zlib data at ``start`` takes or gives, whichever is more, up to limit + 1."""
+    head = pdf[start : start + 2]
+    if len(head) < 2 or head[0] & 15 != zlib.DEFLATED or int.from_bytes(head) % 31:
+        return 0  # RFC 1950, section 2.2: not zlib data
+    inflate = zlib.decompressobj()
+    taken = given = 0
+    feed = b""
+    while not inflate.eof and max(taken, given) <= limit:
+        if not feed:
+            feed = pdf[start + taken : start + taken + 16_384]
+            taken += len(feed)
+        if not feed:
+            break
+        try:
+            given += len(inflate.decompress(feed, 1_000_000))
+        except zlib.error:  # pypdf, told not to repair, has no more use for it
+            break
+        feed = inflate.unconsumed_tail
+    taken -= len(inflate.unused_data)
+    # the least is what a try costs, however little is there
+    return min(max(taken, given, 1000), limit + 1)
+
+
+def _open(pdf: bytes) -> pypdf.PdfReader:
+    try:
+        # strict: a file that needs repair is read differently by every program
+        reader = pypdf.PdfReader(
+            io.BytesIO(pdf), strict=True, xref_stream_maximum_entries=10 * MAX_OBJECTS
+        )
+        encrypted = reader.is_encrypted
+    except (LimitReachedError, RecursionError, MemoryError):
+        raise
+    except Exception as error:
+        if b"/Encrypt" in pdf:
+            raise _RefusedError("encrypted, or damaged. Hand in the file px4fuse wrote.") from error
+        raise
+    if encrypted:
+        raise _RefusedError("encrypted. Hand in the file that px4fuse wrote.")
+    return reader
+
+
+def _check_page_count(reader: pypdf.PdfReader) -> None:
+    try:
+        count = len(reader.pages)
+    except LimitReachedError as error:
+        raise _RefusedError(f"more than {MAX_PAGES} pages.") from error
+    if count > MAX_PAGES:
+        raise _RefusedError(f"more than {MAX_PAGES} pages.")
+    if count == 0:
+        raise _RefusedError("a PDF without pages.")
+
+
+def _walk(reader: pypdf.PdfReader) -> _Contents:
+    """Look at everything that a viewer can reach, each object once, without decoding it."""
+    contents = _Contents()
+    seen: set[tuple[int, int]] = set()
+    missing = values = 0
+    left: list[Any] = [reader.trailer]
+    while left:
+        value = left.pop()
+        values += 1
+        if isinstance(value, IndirectObject):
+            key = (value.idnum, value.generation)
+            if key in seen:
+                continue
+            seen.add(key)
+            listed = _is_listed(reader, *key)
+            missing += not listed
+            if len(seen) > MAX_OBJECTS or missing > MAX_MISSING:
+                raise _RefusedError(_COSTLY)
+            # ISO 32000-1, 7.3.10: a reference to an object that is not there is null
+            value = value.get_object() if listed else None
+        if values > MAX_VALUES:
+            raise _RefusedError(_COSTLY)
+        if isinstance(value, DictionaryObject):
+            _look_at(value, contents)
+            left.extend(value.raw_get(key) for key in value)
+        elif isinstance(value, ArrayObject):
+            left.extend(list.__iter__(value))
+    return contents
+
+
+def _is_listed(reader: pypdf.PdfReader, number: int, generation: int) -> bool:
+    """Whether the cross-reference table has an object, so that no search is needed for it."""
+    return number in reader.xref.get(generation, {}) or (
+        generation == 0 and number in reader.xref_objStm
+    )
+
+
+def _look_at(value: DictionaryObject, contents: _Contents) -> None:
+    """Note what a dictionary has that a report has not."""
+    contents.found.update(text for key, text in _KEYS.items() if key in value)
+    action = _name(value.get("/S"))
+    if action in _ACTIONS:
+        contents.found.add(_ACTIONS[action])
+    annotations = _resolved(value.get("/Annots"))
+    if isinstance(annotations, ArrayObject):
+        contents.found.update(_annotation(_resolved(each)) for each in annotations)
+    if "/EF" in value:
+        contents.files.append(value)
+    elif _name(value.get("/Type")) in {"/Filespec", "/F"}:
+        contents.found.add("a reference to another file")
+    if isinstance(value, StreamObject):
+        if _name(value.get("/Type")) == "/EmbeddedFile":
+            contents.embedded.append(value)
+        if "/F" in value:
+            contents.found.add("a reference to another file")
+        filters = _resolved(value.get("/Filter"))
+        names = list(filters) if isinstance(filters, ArrayObject) else [filters]
+        if filters is not None and [_name(each) for each in names] != ["/FlateDecode"]:
+            listed = " ".join(_name(each) or "?" for each in names[:3])
+            contents.found.add(f"a stream packed by other means ({one_line(listed, 60)})")
+
+
+def _annotation(value: object) -> str:
+    kind = _name(value.get("/Subtype")) if isinstance(value, DictionaryObject) else None
+    if kind == "/FileAttachment":
+        return "a file attached to a page"
+    return f"an annotation ({one_line(kind or 'of no type', 40)})"
+
+
+def _resolved(value: object) -> object:
+    return value.get_object() if isinstance(value, IndirectObject) else value
+
+
+def _name(value: object) -> str | None:
+    value = _resolved(value)
+    return str(value) if isinstance(value, str) else None
+
+
+def _attachment(contents: _Contents) -> bytes:
+    """Bytes of the one attached file; its name is compared and used for nothing else."""
+    if not contents.files and not contents.embedded:
+        raise _RefusedError(
+            f"no {RESULTS_NAME} is attached: not a px4fuse report, or printed to PDF again."
+        )
+    streams = {id(stream): stream for found in contents.files for stream in _streams_of(found)} | {
+        id(stream): stream for stream in contents.embedded
+    }
+    if len(contents.files) != 1 or len(streams) != 1:
+        raise _RefusedError("more than one file is attached, or none that can be read.")
+    names = {
+        str(_resolved(contents.files[0].get(key)))
+        for key in ("/UF", "/F", "/DOS", "/Mac", "/Unix")
+        if key in contents.files[0]
+    }
+    if names != {RESULTS_NAME}:
+        shown = one_line(" / ".join(sorted(names)), 80)
+        raise _RefusedError(f"the attached file is called {shown!r}, not {RESULTS_NAME!r}.")
+    (stream,) = streams.values()
+    too_large = f"{RESULTS_NAME} in it is larger than {MAX_ATTACHMENT_BYTES // 1_000_000} MB."
+    try:
+        with pypdf.apply_configuration(zlib_maximum_output_length=MAX_ATTACHMENT_BYTES):
+            data = bytes(stream.get_data())
+    except LimitReachedError as error:
+        raise _RefusedError(too_large) from error
+    if len(data) > MAX_ATTACHMENT_BYTES:
+        raise _RefusedError(too_large)
+    return data
+
+
+def _streams_of(file: DictionaryObject) -> list[StreamObject]:
+    versions = _resolved(file.get("/EF"))
+    parts = versions.values() if isinstance(versions, DictionaryObject) else ()
+    return [part for each in parts if isinstance(part := _resolved(each), StreamObject)]
+
+
+def _results(data: bytes) -> dict[str, Any]:
+    loaded = _loaded(data)
+    named = loaded.get("schema") if isinstance(loaded, dict) else None
+    name, version = (
+        (named.get("name"), named.get("version")) if isinstance(named, dict) else (None, None)
+    )
+    if name not in (SCHEMA_NAME, LOOP_NAME) or not isinstance(version, str):
+        raise _RefusedError(f"{RESULTS_NAME} in it holds no results of px4fuse.")
+    results: dict[str, Any] = _cleaned_tree(loaded)
+    if (name, version) in ((SCHEMA_NAME, SCHEMA_VERSION), (LOOP_NAME, LOOP_VERSION)):
+        _validate(results, name)
+    return results
+
+
+def _loaded(data: bytes) -> object:
+    """JSON, more strictly than Python reads it."""
+    where = f"{RESULTS_NAME} in it"
+    try:
+        text = data.decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise _RefusedError(f"{where} is not UTF-8 text.") from error
+    # an upper bound that costs nothing: each further value has a comma or bracket before it
+    if sum(map(text.count, ",[{")) >= MAX_JSON_VALUES:
+        raise _RefusedError(f"{where} holds more values than results can have.")
+    try:
+        loaded = json.loads(
+            text,
+            object_pairs_hook=_without_twins,
+            parse_constant=_no_constant,
+            parse_int=_integer,
+            parse_float=_finite,
+        )
+    except RecursionError as error:
+        raise _RefusedError(f"{where} is nested too deeply.") from error
+    except json.JSONDecodeError as error:
+        raise _RefusedError(f"{where} is not JSON.") from error
+    _check_sizes(loaded)
+    return loaded
+
+
+def _without_twins(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    made = dict(pairs)
+    if len(made) != len(pairs):
+        raise _RefusedError(f"{RESULTS_NAME} in it has a key twice.")
+    return made
+
+
+def _no_constant(name: str) -> float:
+    raise _RefusedError(f"{RESULTS_NAME} in it has the number {name}, which is not JSON.")
+
+
+def _integer(digits: str) -> int:
+    if len(digits) > MAX_JSON_DIGITS:
+        raise _RefusedError(f"{RESULTS_NAME} in it has a number with too many digits.")
+    return int(digits)
+
+
+def _finite(digits: str) -> float:
+    number = float(digits)
+    if not math.isfinite(number):
+        raise _RefusedError(f"{RESULTS_NAME} in it has a number that is too large.")
+    return number
+
+
+def _check_sizes(loaded: object) -> None:
+    left = [(loaded, 1)]
+    while left:
+        value, depth = left.pop()
+        if depth > MAX_JSON_DEPTH:
+            raise _RefusedError(f"{RESULTS_NAME} in it is nested too deeply.")
+        if isinstance(value, str) and len(value) > MAX_JSON_STRING:
+            raise _RefusedError(f"{RESULTS_NAME} in it has a text that is too long.")
+        if isinstance(value, dict | list):
+            if len(value) > MAX_JSON_ITEMS:
+                raise _RefusedError(f"{RESULTS_NAME} in it has a list that is too long.")
+            parts = value.values() if isinstance(value, dict) else value
+            left.extend((part, depth + 1) for part in parts)
+            if isinstance(value, dict):
+                left.extend((key, depth) for key in value)
+
+
+def _cleaned_tree(value: Any) -> Any:
+    if isinstance(value, str):
+        return cleaned(value)
+    if isinstance(value, list):
+        return [_cleaned_tree(part) for part in value]
+    if isinstance(value, dict):
+        if any(cleaned(key) != key for key in value):
+            raise _RefusedError(f"{RESULTS_NAME} in it has a key with control characters.")
+        return {key: _cleaned_tree(part) for key, part in value.items()}
+    return value
+
+
+def _validate(results: dict[str, Any], name: str) -> None:
+    try:
+        from jsonschema import (  # type: ignore[import-untyped]  # noqa: PLC0415
+            Draft202012Validator,
+        )
+    except ImportError as error:
+        raise _RefusedError(_INSTALL) from error
+    rules = schema() if name == SCHEMA_NAME else _loop_schema()
+    # the first error only: all of them could be millions
+    wrong = next(Draft202012Validator(rules).iter_errors(results), None)
+    if wrong is not None:
+        place = one_line(".".join(map(str, wrong.absolute_path)), 100) or "its top"
+        raise _RefusedError(f"{RESULTS_NAME} in it does not follow the schema at {place}.")
+
+
+SHARED = ("loop", "findings", "student", "provenance")
+
+
+def _loop_schema() -> dict[str, Any]:
+    """What the results of ``px4fuse loop`` share with those of ``compare``, and their own keys."""
+    whole = schema()
+    shared = {key: whole["properties"][key] for key in SHARED}
+    own: dict[str, Any] = {
+        "schema": {"type": "object"},
+        "track": {"type": "object"},
+        "references": {"type": "array", "items": {"type": "object"}},
+    }
+    return {
+        "$schema": whole["$schema"],
+        "$defs": whole["$defs"],
+        "type": "object",
+        "properties": own | shared,
+        "required": [*own, *shared],
+        "additionalProperties": False,
+    }
+
+
+def _page_texts(reader: pypdf.PdfReader) -> Iterator[str]:
+    _check_mappings(reader)
+    left = MAX_CONTENT_BYTES
+    for page in reader.pages:
+        content = page.get_contents()
+        left -= 0 if content is None else len(content.get_data())
+        if left < 0:
+            raise _RefusedError("its pages expand to more than a report can hold.")
+    for page in reader.pages:
+        text = page.extract_text()
+        if len(text) > MAX_PAGE_TEXT:
+            raise _RefusedError("a page has more text than a report can hold.")
+        yield cleaned(text)
+
+
+def _check_mappings(reader: pypdf.PdfReader) -> None:
+    """No font may print a book for a letter."""
+    for stored in list(reader.resolved_objects.values()):
+        mapping = stored.get("/ToUnicode") if isinstance(stored, DictionaryObject) else None
+        mapping = _resolved(mapping)
+        if isinstance(mapping, StreamObject) and _LONG_MAPPING.search(mapping.get_data()):
+            raise _RefusedError(_COSTLY)

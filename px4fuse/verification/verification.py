@@ -1,0 +1,397 @@
+"""Whether a report is what its log gives: every number, and every page.
+
+The attached results are taken for what they claim: the recorded command is run again on the log,
+found by its SHA-256, and what comes out is compared with what was handed in. This proves that the
+numbers belong to the log. It does not prove who wrote them: whoever has the log can make the same
+report with another name on it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from px4fuse.errors import Px4FuseError
+from px4fuse.grading.model import Difference, Refused, Report, Status, Verdict
+from px4fuse.results.build import SCHEMA_NAME, SCHEMA_VERSION
+from px4fuse.verification import rerun
+from px4fuse.verification.agreement import disagreements
+from px4fuse.verification.intake import cleaned, one_line
+from px4fuse.verification.page_comparison import (
+    TOLERANCE_POINTS,
+    Compared,
+    compare_pdf,
+    font_names,
+    plain_layout,
+    same_words,
+)
+from px4fuse.verification.rerun import Recomputed
+
+LIMIT = "A verified report proves that its numbers belong to the log, not who wrote them."
+SCHEMAS = {SCHEMA_NAME: SCHEMA_VERSION, "px4fuse-loop": "1.0"}
+# Sums over a flight differ between machines in the last few of 16 digits; what is left of a
+# difference of two such sums, after a filter has run over it, in the last 8
+RELATIVE, ABSOLUTE = 1e-6, 1e-9
+# Minima are flat: where the likelihood or a cost differs in its 12th digit, the place of its
+# minimum does in its 6th, and the ends of an interval found from it in the 4th. No page prints
+# more than three digits of these.
+ESTIMATE_RELATIVE, ESTIMATE_ABSOLUTE = 1e-3, 1e-5
+ESTIMATES = (
+    "tuning", "clock", "budget", "findings", "loop.closures", "loop.corrections",
+    "position_source.alignment", "settings.clock_offset_s",
+)  # fmt: skip
+ESTIMATED_WITHIN = "noise_asked"
+# How often a solver went round
+ITERATIONS, MORE_ITERATIONS = "iterations", 2
+# What tells the machine that a report was made on, and no number of it
+MACHINE = ("provenance.python", "provenance.libraries")
+SHOWN = 20
+SHOWN_TEXT = 120
+# Sizes by which a report multiplies numbers to print them: 1, per cent, thousandths
+PRINTED_SCALES = (1.0, 100.0, 1000.0)
+# Lines of notes on a page, at least
+NOTES_LINES = 80
+
+Recompute = Callable[[Mapping[str, Any], Mapping[str, Path]], Recomputed | Refused]
+
+
+@dataclass(frozen=True)
+class Numbers:
+    """What comparing two results found.
+
+    Attributes
+    ----------
+    differences : tuple of Difference
+        The first of those beyond the tolerances.
+    differing : int
+        How many there are.
+    pairs : tuple of (float, float)
+        Recorded and recomputed numbers that agree within the tolerances and are not the same.
+    compared : int
+        How many values.
+    """
+
+    differences: tuple[Difference, ...]
+    differing: int
+    pairs: tuple[tuple[float, float], ...]
+    compared: int
+
+
+def verify(
+    report: Report,
+    logs: Sequence[Path] | Mapping[str, Path] = (),
+    *,
+    recompute: Recompute = rerun.recompute,
+) -> Verdict:
+    """Say whether a report is what its log gives.
+
+    Parameters
+    ----------
+    report : Report
+    logs : sequence of Path, or mapping of str to Path
+        Logs and other recordings, or folders of such; or files by their SHA-256, where many
+        reports share them.
+    recompute : callable
+        Repeats the analysis.
+
+    Returns
+    -------
+    Verdict
+        "verified" where the log gives every number and every page; without a log never. It proves
+        that the numbers belong to the log, not who wrote them.
+
+    Raises
+    ------
+    OSError
+        A log cannot be read.
+    """
+    other_version = _other_version(report.results)
+    if other_version:
+        return Verdict("cannot verify", (other_version,), with_log=False)
+    if not logs:
+        return _without_log(report)
+    files = logs if isinstance(logs, Mapping) else rerun.hashed(logs)
+    sha256 = rerun.log_sha256(report.results)
+    if sha256 not in files:
+        asked = one_line(sha256, 64) or "none"
+        reason = f"none of the {len(files)} files given is the log, whose SHA-256 is {asked}"
+        return Verdict("other log", (reason,), with_log=False)
+    again = recompute(report.results, files)
+    if isinstance(again, Refused):
+        # what px4fuse cannot have recorded contradicts the report; what it could, does not
+        forged = again.reason.startswith(rerun.NOT_OURS)
+        status: Status = "numbers differ" if forged else "cannot verify"
+        return Verdict(status, (one_line(again.reason, 400),), with_log=False)
+    return _with_log(report, again)
+
+
+def _other_version(results: Mapping[str, Any]) -> str:
+    """Why this version cannot say anything about the results; "" where it can."""
+    made = results.get("provenance")
+    theirs = made.get("px4fuse") if isinstance(made, Mapping) else None
+    ours = metadata.version("px4fuse")
+    if theirs != ours:
+        named = one_line(str(theirs), 40)
+        return f"made with px4fuse {named}, this is {ours}: run that version"
+    schema = results.get("schema")
+    name, version = (
+        (schema.get("name"), schema.get("version")) if isinstance(schema, Mapping) else ("", "")
+    )
+    if not isinstance(name, str) or SCHEMAS.get(name) != version:
+        return "its results follow a schema that this version does not know"
+    return ""
+
+
+# -- without the log -------------------------------------------------------------------------------
+
+
+def _without_log(report: Report) -> Verdict:
+    try:
+        missing = disagreements(report.results, report.pages)
+    except (Px4FuseError, LookupError, TypeError, ValueError, AttributeError, ArithmeticError):
+        reason = "no log was given; the results are not of the form that px4fuse writes"
+        return Verdict("cannot verify", (reason,), with_log=False)
+    if missing:
+        pages = tuple(sorted({one.page for one in missing}))
+        reasons = [
+            f"page {one.page} does not say what the results do: {one_line(one.words, SHOWN_TEXT)}"
+            for one in missing[:SHOWN]
+        ]
+        return Verdict("page altered", (*reasons, *_file_reasons(report)), False, (), pages)
+    reasons = ["no log was given; the pages agree with the results", *_file_reasons(report)]
+    return Verdict("cannot verify", tuple(reasons), with_log=False)
+
+
+def _file_reasons(report: Report) -> list[str]:
+    """What the file itself says about having been changed."""
+    saved_again = "the file was saved again or changed after px4fuse wrote it"
+    if report.seal != "intact":
+        return [saved_again]
+    return [] if plain_layout(report.pdf) else [f"{saved_again}: it is laid out in another way"]
+
+
+# -- with the log ----------------------------------------------------------------------------------
+
+
+def _with_log(report: Report, again: Recomputed) -> Verdict:
+    notes = _notes_of(report.results)
+    if sum(1 for line in notes.splitlines() if line.strip()) > NOTES_LINES * len(report.pages):
+        reason = "the recorded notes are longer than the pages"
+        return Verdict("page altered", (reason,), True, (), (len(report.pages),))
+    drawn = again.draw()
+    if drawn == report.pdf:
+        reason = "the log gives the same file again, byte for byte"
+        return Verdict("verified", (reason, LIMIT), with_log=True)
+    numbers = compare_results(report.results, again.results)
+    pages = compare_pdf(report.pdf, drawn, _rounding(numbers.pairs))
+    about_pages = [
+        f"page {page}: {one_line(why, 200)}" for page, why in sorted(pages.pages.items())
+    ]
+    machine = _other_machine(report.results, again.results)
+    about_file = _all_file_reasons(report, pages, machine)
+    excuse = _excuse(report, drawn, machine) if pages.pages else ""
+    status, reasons = _judged(report, numbers, pages, about_file, excuse)
+    kept = (*reasons, *about_pages, *about_file, *machine)
+    return Verdict(
+        status,
+        (*kept, LIMIT) if status == "verified" else kept,
+        True,
+        numbers.differences,
+        tuple(sorted(pages.pages)),
+    )
+
+
+def _judged(
+    report: Report, numbers: Numbers, pages: Compared, about_file: Sequence[str], excuse: str
+) -> tuple[Status, tuple[str, ...]]:
+    """The status, and what there is to say besides what differs."""
+    if numbers.differences:
+        return "numbers differ", (_number_reason(numbers),)
+    if pages.pages:
+        return ("cannot verify", (excuse,)) if excuse else ("page altered", ())
+    if about_file:
+        return "cannot verify", ("every number and page is what the log gives, but",)
+    return "verified", (
+        f"the log gives all {numbers.compared} values again (within {RELATIVE:g}, estimates within "
+        f"{ESTIMATE_RELATIVE:g}) and all {len(report.pages)} pages (within {TOLERANCE_POINTS:g} "
+        "pt)",
+    )
+
+
+def _notes_of(results: Mapping[str, Any]) -> str:
+    student = results.get("student")
+    notes = student.get("notes") if isinstance(student, Mapping) else ""
+    return notes if isinstance(notes, str) else ""
+
+
+def _number_reason(numbers: Numbers) -> str:
+    first = ", ".join(one.path for one in numbers.differences[:3])
+    return (
+        f"{numbers.differing} of {numbers.compared} values are not what the log gives: {first}"
+        + ("" if numbers.differing <= 3 else ", …")
+    )
+
+
+def _all_file_reasons(report: Report, pages: Compared, machine: Sequence[str]) -> list[str]:
+    found = [*_file_reasons(report), *pages.document]
+    # another version of pypdf may number the parts in another order
+    if not pages.ordered and not machine and not found:
+        found.append("the file was saved again or changed after px4fuse wrote it: its parts are "
+                     "in another order")  # fmt: skip
+    return found
+
+
+def _other_machine(recorded: Mapping[str, Any], recomputed: Mapping[str, Any]) -> tuple[str, ...]:
+    """With which other versions the report was made; Python's alone changes no number."""
+    theirs, ours = recorded["provenance"], recomputed["provenance"]
+    others = [
+        f"{name} {theirs['libraries'].get(name)} (here {version})"
+        for name, version in ours["libraries"].items()
+        if theirs["libraries"].get(name) != version
+    ]
+    return (one_line(f"made with {', '.join(others)}", 400),) if others else ()
+
+
+def _excuse(report: Report, drawn: bytes, machine: Sequence[str]) -> str:
+    """Why pages may differ without having been altered; "" where they may not."""
+    if any("matplotlib" in text for text in machine):
+        return (
+            "another version of matplotlib drew the pages: they cannot be compared. Every number "
+            "is what the log gives"
+        )
+    if font_names(report.pdf) != font_names(drawn):
+        return (
+            "the pages are drawn with fonts that this machine has not, or lacks: they cannot be "
+            "compared. Every number is what the log gives"
+        )
+    return ""
+
+
+# -- numbers ---------------------------------------------------------------------------------------
+
+
+def compare_results(recorded: Mapping[str, Any], recomputed: Mapping[str, Any]) -> Numbers:
+    """Compare every value of two results.
+
+    Parameters
+    ----------
+    recorded : mapping
+        A stranger's; followed only as far as the other one goes.
+    recomputed : mapping
+    """
+    command = str(recomputed["provenance"]["command"])
+    # everything rests on an offset or placement that was estimated
+    everywhere = "auto" in command.split() or "--position" in command.split()
+    leaves = [
+        (path, theirs, ours)
+        for path, theirs, ours in _leaves("", recorded, recomputed)
+        if not path.startswith(MACHINE)
+    ]
+    wrong: dict[str, tuple[Any, Any]] = {}
+    pairs: list[tuple[float, float]] = []
+    for path, theirs, ours in leaves:
+        if _is_number(theirs) and _is_number(ours):
+            wide = everywhere or path.startswith(ESTIMATES) or ESTIMATED_WITHIN in path
+            if not _near(path, theirs, ours, wide):
+                wrong[path] = theirs, ours
+            elif theirs != ours:
+                pairs.append((float(theirs), float(ours)))
+    rounded = _rounding(pairs)
+    for path, theirs, ours in leaves:
+        if not (_is_number(theirs) and _is_number(ours)) and not _same(theirs, ours, rounded):
+            wrong[path] = theirs, ours
+    found = tuple(
+        Difference(one_line(path, SHOWN_TEXT), _shown(theirs), _shown(ours))
+        for path, (theirs, ours) in list(wrong.items())[:SHOWN]
+    )
+    return Numbers(found, len(wrong), tuple(pairs), len(leaves))
+
+
+class _Absent:
+    """Stands where there is nothing."""
+
+
+_ABSENT = _Absent()
+
+
+def _leaves(path: str, theirs: Any, ours: Any) -> Iterator[tuple[str, Any, Any]]:
+    """Values side by side; a branch that one of them lacks, or that is a value there, is one."""
+    if isinstance(ours, Mapping) and isinstance(theirs, Mapping):
+        for name in (*ours, *(name for name in theirs if name not in ours)):
+            below = f"{path}.{name}" if path else str(name)
+            yield from _leaves(below, theirs.get(name, _ABSENT), ours.get(name, _ABSENT))
+    elif isinstance(ours, list | tuple) and isinstance(theirs, list | tuple):
+        for i in range(max(len(ours), len(theirs))):
+            yield from _leaves(
+                f"{path}[{i}]",
+                theirs[i] if i < len(theirs) else _ABSENT,
+                ours[i] if i < len(ours) else _ABSENT,
+            )
+    else:
+        yield path, theirs, ours
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _near(path: str, theirs: float, ours: float, wide: bool) -> bool:
+    if isinstance(ours, int):
+        return abs(theirs - ours) <= (MORE_ITERATIONS if path.endswith(ITERATIONS) else 0)
+    relative, absolute = (ESTIMATE_RELATIVE, ESTIMATE_ABSOLUTE) if wide else (RELATIVE, ABSOLUTE)
+    return abs(theirs - ours) <= relative * abs(ours) + absolute
+
+
+def _same(theirs: Any, ours: Any, rounded: Callable[[str, str], bool]) -> bool:
+    """Whether two values that are not both numbers are the same."""
+    if isinstance(theirs, str) and isinstance(ours, str):
+        return same_words(theirs, cleaned(ours), rounded)
+    return type(theirs) is type(ours) and bool(theirs == ours)
+
+
+def _rounding(pairs: Sequence[tuple[float, float]]) -> Callable[[str, str], bool]:
+    """Whether two printed numbers may be one number rounded on two machines.
+
+    They may where they are neighbours in their last digit, and a recorded number and its
+    recomputed twin lie on the two sides of the edge between them.
+    """
+
+    def alike(one: str, other: str) -> bool:
+        if _decimals(one) != _decimals(other):
+            return False
+        step = 10.0 ** -_decimals(one)
+        low, high = sorted((float(one), float(other)))
+        if abs(high - low - step) > 1e-6 * step:
+            return False
+        edge = (low + high) / 2.0
+        return any(
+            min(values) <= edge * (1.0 + 1e-12) and max(values) >= edge * (1.0 - 1e-12)
+            for scale in PRINTED_SCALES
+            for values in ([abs(a) * scale, abs(b) * scale] for a, b in pairs)
+        )
+
+    return alike
+
+
+def _decimals(number: str) -> int:
+    """Decimals of a printed number.
+
+    >>> _decimals("0.15"), _decimals("3"), _decimals("1.2e-3")
+    (2, 0, 4)
+    """
+    mantissa, _, exponent = number.partition("e")
+    return len(mantissa.partition(".")[2]) - int(exponent or 0)
+
+
+def _shown(value: Any) -> str:
+    """A value on one line."""
+    if isinstance(value, _Absent):
+        return "absent"
+    if isinstance(value, Mapping):
+        return f"an object with {len(value)} entries"
+    if isinstance(value, list | tuple):
+        return f"a list of {len(value)}"
+    return one_line(str(value), SHOWN_TEXT)
