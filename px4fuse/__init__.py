@@ -13,44 +13,37 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from px4fuse.analysis import explain
-    from px4fuse.comparison.comparison import Comparison, compare
-    from px4fuse.errors import Px4FuseError
-    from px4fuse.filter.consistency import Consistency, assess
-    from px4fuse.filter.kalman import Settings, replay
-    from px4fuse.filter.tuning import tune
-    from px4fuse.findings import Finding, find
-    from px4fuse.flight import Flight, Unavailable
-    from px4fuse.loop.loop import close_loop
-    from px4fuse.readers import read_log
-    from px4fuse.readers.trajectory import read_trajectory
-    from px4fuse.trajectory.evaluation import evaluate
+    from px4fuse.analysis import Analysis as Analysis
+    from px4fuse.analysis import explain as explain
+    from px4fuse.analysis import run as run
+    from px4fuse.comparison.comparison import Comparison as Comparison
+    from px4fuse.comparison.comparison import compare as compare
+    from px4fuse.errors import Px4FuseError as Px4FuseError
+    from px4fuse.filter.consistency import Consistency as Consistency
+    from px4fuse.filter.consistency import assess as assess
+    from px4fuse.filter.kalman import Settings as Settings
+    from px4fuse.filter.kalman import replay as replay
+    from px4fuse.filter.tuning import tune as tune
+    from px4fuse.findings import Finding as Finding
+    from px4fuse.findings import find as find
+    from px4fuse.flight import Flight as Flight
+    from px4fuse.flight import Unavailable as Unavailable
+    from px4fuse.loop.loop import close_loop as close_loop
+    from px4fuse.readers import read_log as read_log
+    from px4fuse.readers.trajectory import read_trajectory as read_trajectory
+    from px4fuse.request import ComparisonRequest as ComparisonRequest
+    from px4fuse.request import LoopRequest as LoopRequest
+    from px4fuse.trajectory.evaluation import evaluate as evaluate
 
-__all__ = [
-    "Comparison",
-    "Consistency",
-    "Finding",
-    "Flight",
-    "Px4FuseError",
-    "Settings",
-    "Unavailable",
-    "assess",
-    "close_loop",
-    "compare",
-    "evaluate",
-    "explain",
-    "find",
-    "read_log",
-    "read_trajectory",
-    "replay",
-    "tune",
-]
-
+# Where each public name lives
 _HOMES = {
+    "Analysis": "analysis",
     "Comparison": "comparison.comparison",
+    "ComparisonRequest": "request",
     "Consistency": "filter.consistency",
     "Finding": "findings",
     "Flight": "flight",
+    "LoopRequest": "request",
     "Px4FuseError": "errors",
     "Settings": "filter.kalman",
     "Unavailable": "flight",
@@ -63,8 +56,15 @@ _HOMES = {
     "read_log": "readers",
     "read_trajectory": "readers.trajectory",
     "replay": "filter.kalman",
+    "run": "analysis",
     "tune": "filter.tuning",
 }
+__all__ = list(_HOMES)
+
+
+def __dir__() -> list[str]:
+    """Complete the public names, which are imported when they are first used."""
+    return sorted({*globals(), *_HOMES})
 
 
 def __getattr__(name: str) -> Any:

@@ -1,23 +1,215 @@
-"""What explains a comparison: noises asked for, clock offset, difference budget, loop."""
+"""Request → Analysis: the one way to run a comparison or a loop.
+
+Readers, placing, filter, comparison and what explains it are called from here, in that order.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
 
-from px4fuse.comparison.budget import budget
-from px4fuse.comparison.comparison import Comparison
-from px4fuse.errors import MissingDataError
+from px4fuse import placing
+from px4fuse.comparison.budget import Budget, budget
+from px4fuse.comparison.comparison import Comparison, compare
+from px4fuse.errors import LogError, MissingDataError, SettingsError
 from px4fuse.filter.clock import ClockOffset, estimate_clock_offset
+from px4fuse.filter.kalman import Settings
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, tune
-from px4fuse.flight import Unavailable
-from px4fuse.loop.analysis import loop_in
+from px4fuse.flight import Flight, Unavailable
+from px4fuse.loop.analysis import analyse, loop_in
+from px4fuse.loop.loop import Loop
+from px4fuse.loop.odometry import OdometryNoise
+from px4fuse.loop.sources import read_source
+from px4fuse.readers import read_log
+from px4fuse.readers.position_csv import read_position_csv
+from px4fuse.request import AUTO, ComparisonRequest, LoopRequest, PositionFile
 
 # What the report shows; each axis by itself is for `px4fuse tune`
 REPORTED = (HORIZONTAL, "down", "aisle")
 
+Progress = Callable[[str], None]
+Tuning = Mapping[str, AxisTuning | Unavailable]
 
-def explain(comparison: Comparison, progress: Callable[[str], None] = lambda _: None) -> Comparison:
+
+def _silent(_: str) -> None:
+    """Progress that nobody watches."""
+
+
+@dataclass(frozen=True)
+class Analysis:
+    """A comparison and what explains it.
+
+    Attributes
+    ----------
+    comparison : Comparison
+    tuning : mapping from axis name, or "horizontal", to AxisTuning or Unavailable
+        The noises that the data ask for.
+    clock : ClockOffset or Unavailable
+        What must still be added to the source's stamps.
+    budget : mapping from axis name to Budget or Unavailable
+        What the difference to EKF2 comes from.
+    loop : Loop or Unavailable
+        Loop closure of the flight's odometry.
+    """
+
+    comparison: Comparison
+    tuning: Tuning
+    clock: ClockOffset | Unavailable
+    budget: Mapping[str, Budget | Unavailable]
+    loop: Loop | Unavailable
+
+
+def run(request: ComparisonRequest, progress: Progress = _silent) -> Analysis:
+    """Read a flight, compare it with EKF2 and explain the comparison.
+
+    Parameters
+    ----------
+    request : ComparisonRequest
+    progress : callable
+        Told what is being done.
+
+    Raises
+    ------
+    LogError, MissingDataError, SettingsError
+        A file cannot be read, the flight lacks what was asked for, or a setting is out of range.
+    """
+    return explain(run_comparison(request, progress), progress)
+
+
+def read_flight(request: ComparisonRequest, progress: Progress = _silent) -> Flight:
+    """Read the recordings that a request names, and make them one flight.
+
+    Raises
+    ------
+    LogError, MissingDataError, SettingsError
+        A file cannot be read, or does not belong to the flight.
+    """
+    log = Path(request.log)
+    progress(f"reading {log.name}")
+    if request.mavlink is None:
+        flight = read_log(log, system=request.system)
+    else:
+        flight = read_log(log)
+        other = read_log(Path(request.mavlink), system=request.system)
+        if not other.log.format.startswith("MAVLink"):
+            raise LogError(
+                f"--mavlink {other.log.name}: this is a {other.log.format}, not a MAVLink "
+                "recording. Give the ULog first: px4fuse compare LOG.ulg --mavlink LOG.tlog."
+            )
+        flight = placing.join(flight, other)
+    if request.position is None:
+        return flight
+    return _placed(flight, request.position, request.clock_offset_s)
+
+
+def _placed(flight: Flight, position: PositionFile, clock_offset: float | str | None) -> Flight:
+    """The flight with a position file, whose clock offset is found unless it is given."""
+    file = read_position_csv(
+        Path(position.path),
+        columns=position.columns,
+        time_unit=position.time_unit,
+        length_unit=position.length_unit,
+    )
+    return placing.place(
+        flight,
+        file,
+        frame=position.frame,
+        yaw_deg=position.yaw_deg,
+        clock_offset_s=None if isinstance(clock_offset, str) else clock_offset,
+    )
+
+
+def run_comparison(request: ComparisonRequest, progress: Progress = _silent) -> Comparison:
+    """Read a flight and compare it with EKF2, without what explains the comparison.
+
+    Raises
+    ------
+    LogError, MissingDataError, SettingsError
+        As :func:`run`.
+    """
+    asked = request.clock_offset_s
+    settings = Settings(
+        sigma_a_m_s2=request.sigma_a_m_s2,
+        sigma_z_m=request.sigma_z_m,
+        dt_s=request.dt_s,
+        input=request.input or "imu",
+        # that of a position file is spent on placing it
+        clock_offset_s=asked if isinstance(asked, float) and request.position is None else 0.0,
+    )
+    for name, value in (
+        ("--start", request.start_s),
+        ("--end", request.end_s),
+        ("--clock-offset", asked),
+    ):
+        if isinstance(value, float) and not abs(value) < float("inf"):
+            raise SettingsError(f"{name} {value:g} is not a finite number.")
+    flight = read_flight(request, progress)
+
+    def compared(settings: Settings) -> Comparison:
+        return compare(
+            flight,
+            settings,
+            axes=request.axes or None,
+            heading_deg=request.heading_deg,
+            position_source=request.position_source,
+            start_s=request.start_s,
+            end_s=request.end_s,
+            input_required=request.input == "imu",
+            progress=lambda name: progress(f"filtering {name}"),
+        )
+
+    comparison = compared(settings)
+    if asked != AUTO or request.position is not None:
+        return comparison
+    found = clock_offset(comparison, tuned_horizontally(comparison), progress)
+    if isinstance(found, Unavailable) or not found.determinable:
+        raise MissingDataError(
+            f"{flight.log.name}: --clock-offset auto: not determinable: {found.reason}. "
+            "Give the seconds to add, or leave the option out."
+        )
+    return compared(replace(settings, clock_offset_s=found.offset_s))
+
+
+def run_loop(request: LoopRequest, progress: Progress = _silent) -> Loop:
+    """Read a flight or a trajectory, and measure and correct its loop.
+
+    Raises
+    ------
+    TrajectoryError, LogError, MissingDataError, SettingsError
+        A file cannot be read or lacks what was asked for, or a setting is out of range.
+    """
+    for name, value in (("--from", request.start_s), ("--to", request.end_s)):
+        if value is not None and not abs(value) < float("inf"):
+            raise SettingsError(f"{name} {value:g} is not a finite number.")
+    progress(f"reading {Path(request.source).name}")
+    source = read_source(request.source, frame=request.frame, system=request.system)
+    if request.frame is not None and source.flight is not None:
+        raise SettingsError(
+            f"--frame {request.frame.lower()} is for trajectory files; {source.flight.log.name} is "
+            "a flight log, which states its frame. Leave --frame out."
+        )
+    reference = None
+    if request.reference is not None:
+        reference = read_source(
+            request.reference, default="truth", system=request.system
+        ).trajectory
+    landed = request.landed_at
+    return analyse(
+        source,
+        start_s=request.start_s,
+        end_s=request.end_s,
+        landed_at=None if landed is None else (landed.forward_m, landed.right_m, landed.turned_deg),
+        came_back=request.came_back,
+        closures=request.closures,
+        noise=OdometryNoise(request.position_drift_m, request.heading_drift_deg),
+        reference=reference,
+        spacing_m=request.key_frames_m,
+        progress=progress,
+    )
+
+
+def explain(comparison: Comparison, progress: Progress = _silent) -> Analysis:
     """Add tuning, clock offset, difference budget and loop closure to a comparison.
 
     Parameters
@@ -29,49 +221,35 @@ def explain(comparison: Comparison, progress: Callable[[str], None] = lambda _: 
     axes = tuple(result.axis for result in comparison.axes)
     names = REPORTED if {"north", "east"} <= {axis.name for axis in axes} else None
     tuning = tune(axes, comparison.settings, names, lambda name: progress(f"tuning {name}"))
-    tuned = replace(comparison, tuning=tuning)
-    timed = replace(tuned, clock=clock_offset(tuned, progress))
-    budgeted = replace(timed, budget=budget(timed, progress))
+    clock = clock_offset(comparison, tuning, progress)
+    why = budget(comparison, clock, progress)
     progress("looking for a loop")
-    return replace(budgeted, loop=loop_in(comparison.flight, progress))
+    return Analysis(comparison, tuning, clock, why, loop_in(comparison.flight, progress))
 
 
-def tuned_horizontally(comparison: Comparison) -> Comparison:
-    """Add the horizontal noises, which is what the clock estimate needs."""
+def tuned_horizontally(comparison: Comparison) -> Tuning:
+    """The horizontal noises alone, which is what the clock estimate needs."""
     axes = tuple(result.axis for result in comparison.axes)
-    return replace(comparison, tuning=tune(axes, comparison.settings, (HORIZONTAL,)))
-
-
-def clock_offset_found(
-    comparison: Comparison, progress: Callable[[str], None] = lambda _: None
-) -> float:
-    """Clock offset (s) to set, for ``--clock-offset auto``.
-
-    Raises
-    ------
-    MissingDataError
-        The flight does not determine it; the text says why.
-    """
-    found = clock_offset(tuned_horizontally(comparison), progress)
-    if isinstance(found, Unavailable) or not found.determinable:
-        raise MissingDataError(
-            f"{comparison.flight.log.name}: --clock-offset auto: not determinable: {found.reason}. "
-            "Give the seconds to add, or leave the option out."
-        )
-    return comparison.settings.clock_offset_s + found.offset_s
+    return tune(axes, comparison.settings, (HORIZONTAL,))
 
 
 def clock_offset(
-    comparison: Comparison, progress: Callable[[str], None] = lambda _: None
+    comparison: Comparison, tuning: Tuning, progress: Progress = _silent
 ) -> ClockOffset | Unavailable:
     """What must still be added to the stamps of the source, beyond the offset that was set.
 
-    Takes measurement noise and outliers from the comparison's tuning where it has that.
+    Parameters
+    ----------
+    comparison : Comparison
+    tuning : mapping
+        Its measurement noise and outliers are used where it has them.
+    progress : callable
+        Told what is being done.
     """
     tuned = next(
         (
             found
-            for found in (comparison.tuning.get(HORIZONTAL), *comparison.tuning.values())
+            for found in (tuning.get(HORIZONTAL), *tuning.values())
             if isinstance(found, AxisTuning)
         ),
         None,

@@ -16,6 +16,8 @@ import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
+from px4fuse.analysis import Analysis
+from px4fuse.comparison.comparison import Comparison
 from px4fuse.filter.signals import Axis, Segment, project_acceleration
 from px4fuse.flight import (
     ANGULAR_RATE_COLUMNS,
@@ -321,3 +323,8 @@ def random_walk(
         a = rng.normal(0.0, sigma_a)
         p, v = p + v * DT + a * DT**2 / 2.0, v + a * DT
     return line(DT * per_update * np.arange(count), measured)
+
+
+def unexplained(comparison: Comparison) -> Analysis:
+    """Make an analysis that knows nothing but the comparison."""
+    return Analysis(comparison, {}, unavailable("clock offset"), {}, unavailable("loop closure"))

@@ -11,13 +11,14 @@ import jsonschema
 import numpy as np
 import pandas as pd
 import pytest
-from flights import PARAMETERS, Estimator, Uwb, aisle_flight, table
+from flights import PARAMETERS, Estimator, Uwb, aisle_flight, table, unexplained
 from numpy.typing import NDArray
 from scipy.integrate import cumulative_trapezoid
 from ulog_tools import GENERATIONS, make_log, stamps, topic
 
+from px4fuse.analysis import Analysis
 from px4fuse.comparison.budget import CAUSES, Budget, Effect, Run, budget, states_at
-from px4fuse.comparison.comparison import Comparison, compare
+from px4fuse.comparison.comparison import compare
 from px4fuse.filter.clock import ClockOffset
 from px4fuse.filter.kalman import Replay, Settings, replay, state_at
 from px4fuse.filter.signals import (
@@ -39,9 +40,10 @@ from px4fuse.flight import (
 )
 from px4fuse.readers import read_log
 from px4fuse.report.budget import draw
-from px4fuse.report.document import Document, Student
 from px4fuse.report.style import BOTTOM, report_style
+from px4fuse.request import ComparisonRequest
 from px4fuse.results.build import results, schema
+from px4fuse.results.model import Student
 
 Array = NDArray[np.float64]
 DEFAULT = Settings()
@@ -177,6 +179,7 @@ def other_horizon() -> Flight:
     return ekf2_is(flight, flight, state_of=lambda run, time: behind(run, time, 0.2))
 
 
+NO_CLOCK = Unavailable("clock offset", "it was not asked for", "Ask for it.")
 MADE = {
     "measurement variance": other_variance,
     "process noise": other_process_noise,
@@ -194,7 +197,7 @@ def made_flight(cause: str) -> Flight:
 
 
 def of_axis(flight: Flight, name: str = "aisle", settings: Settings = DEFAULT) -> Budget:
-    found = budget(compare(flight, settings, axes=(name,)))[name]
+    found = budget(compare(flight, settings, axes=(name,)), NO_CLOCK)[name]
     assert isinstance(found, Budget)
     return found
 
@@ -223,15 +226,15 @@ def test_every_cause_is_tested_or_never_replayed():
 
 
 @pytest.fixture(scope="module")
-def sample(sample_flight: Flight) -> Comparison:
+def sample(sample_flight: Flight) -> Analysis:
     made = compare(sample_flight)
-    return replace(made, budget=budget(made))
+    return replace(unexplained(made), budget=budget(made, NO_CLOCK))
 
 
-def test_baseline_is_the_difference_of_the_comparison(sample: Comparison):
-    made = sample
-    for name, found in made.budget.items():
-        difference = next(part.difference for part in made.axes if part.axis.name == name)
+def test_baseline_is_the_difference_of_the_comparison(sample: Analysis):
+    for name, found in sample.budget.items():
+        axes = sample.comparison.axes
+        difference = next(part.difference for part in axes if part.axis.name == name)
         assert found.count == difference.count
         assert found.baseline.position_rms_m == pytest.approx(difference.position_rmse_m, abs=1e-9)
         assert found.baseline.velocity_rms_m_s == pytest.approx(
@@ -291,10 +294,10 @@ def test_source_that_ekf2_never_fused_and_unlogged_settings_are_named():
 
 def test_no_ekf2_and_no_known_choice_have_no_budget():
     without = aisle_flight(ekf2=None, duration_s=30.0)
-    assert isinstance(budget(compare(without, axes=("north",)))["north"], Unavailable)
+    assert isinstance(budget(compare(without, axes=("north",)), NO_CLOCK)["north"], Unavailable)
     flight = aisle_flight(ekf2=Estimator(fusing=((0.0, 0.0),)), duration_s=30.0)
     unknown = replace(flight, log=replace(flight.log, autopilot="ArduPilot"))
-    found = budget(compare(unknown, axes=("north",)))["north"]
+    found = budget(compare(unknown, axes=("north",)), NO_CLOCK)["north"]
     assert isinstance(found, Unavailable)
     assert "none of EKF2's choices" in found.reason
 
@@ -308,8 +311,8 @@ def test_constant_velocity_has_no_accelerometer_causes():
 
 def test_axes_are_the_aisle_and_down_or_else_all():
     flight = base_flight(duration_s=30.0)
-    assert list(budget(compare(flight))) == ["aisle", "down"]
-    assert list(budget(compare(flight, axes=("north", "east")))) == ["north", "east"]
+    assert list(budget(compare(flight), NO_CLOCK)) == ["aisle", "down"]
+    assert list(budget(compare(flight, axes=("north", "east")), NO_CLOCK)) == ["north", "east"]
 
 
 class TestClock:
@@ -323,7 +326,7 @@ class TestClock:
             -0.25, (-0.3, -0.2), 0.02, True, "", np.zeros(1), np.zeros(1), (), None, None, None,
             0.5, 0.1, 100, 0.0, 2.0,
         )  # fmt: skip
-        found = budget(replace(compare(made, axes=("aisle",)), clock=offset))["aisle"]
+        found = budget(compare(made, axes=("aisle",)), offset)["aisle"]
         assert found.clock.position_share > 0.95
         assert "clock" not in found.together.made
         assert found.together.position_share < 0.05
@@ -338,7 +341,7 @@ class TestClock:
             0.5, 0.1, 100, 0.0, 2.0,
         )  # fmt: skip
         made = compare(base_flight(duration_s=30.0), axes=("aisle",))
-        found = budget(replace(made, clock=replace(offset, **changes)))
+        found = budget(made, replace(offset, **changes))
         assert reason in found["aisle"].clock.reason
 
 
@@ -346,7 +349,7 @@ class TestTruth:
     def test_which_is_closer_and_what_moves_ours(self):
         """EKF2 takes the measurements to be older than they are: that alone takes it away."""
         made = compare(made_flight("delay"), axes=("aisle",))
-        found = budget(made)["aisle"]
+        found = budget(made, NO_CLOCK)["aisle"]
         aisle = next(part for part in made.axes if part.axis.name == "aisle")
         assert found.truth.kf_position_rmse_m == pytest.approx(aisle.kf_truth.position_rmse_m)
         assert found.truth.ekf2_position_rmse_m == pytest.approx(
@@ -435,8 +438,8 @@ class TestReader:
         assert self.read(tmp_path, lone).step_s == 0.010
 
 
-def test_results_with_a_budget_validate_and_say_which_filter(sample: Comparison):
-    said = results(Document(sample, (), Student(), "px4fuse compare"))
+def test_results_with_a_budget_validate_and_say_which_filter(sample: Analysis):
+    said = results(ComparisonRequest(log="aisle_uwb.ulg"), sample, (), Student(), "")
     jsonschema.validate(said["budget"], {"$ref": "#/$defs/b", "$defs": {
         **schema()["$defs"],
         "b": {"type": "object", "additionalProperties": {"$ref": "#/$defs/budget"}},
@@ -482,7 +485,7 @@ class TestFlownFlights:
 def test_what_does_not_fit_on_a_page_begins_the_next() -> None:
     """Two axes with much to say ran over the foot of the page."""
     long = Unavailable("budget", "a sentence of some length, again " * 160, "None")
-    document = SimpleNamespace(comparison=SimpleNamespace(budget={"aisle": long, "down": long}))
+    document = SimpleNamespace(analysis=SimpleNamespace(budget={"aisle": long, "down": long}))
     with report_style():
         pages = list(draw(document))  # type: ignore[arg-type]
     assert len(pages) == 2

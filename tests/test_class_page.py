@@ -28,7 +28,8 @@ from hypothesis import strategies as st
 from pypdf import PdfReader
 
 from px4fuse.grading.class_page import MAX_CHARACTERS, STATUSES, html_text
-from px4fuse.grading.model import Difference, Graded, Item, Verdict
+from px4fuse.grading.model import Graded, Item
+from px4fuse.verification.model import Difference, Verdict
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
 # Where a browser may be that is not on the path

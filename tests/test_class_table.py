@@ -12,7 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from px4fuse.grading.class_table import MAX_CHARACTERS, csv_text, neutral
-from px4fuse.grading.model import Graded, Item, Verdict
+from px4fuse.grading.model import Graded, Item
+from px4fuse.verification.model import Verdict
 
 DANGEROUS = (
     "=cmd|' /C calc'!A0", "+1+1", "-2+3", "@SUM(A1)", "\t=1", "\r=1", "\n=1", "  =1", "\u00a0=1",

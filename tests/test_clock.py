@@ -334,9 +334,10 @@ def test_outliers_that_were_found_are_left_out() -> None:
 
 def test_outliers_are_those_that_tuning_found() -> None:
     flight, outlier = made_flight(8, offset_s=-0.2, outliers=12)
-    compared = tuned_horizontally(compare(flight, SETTINGS))
-    found = clock_offset(compared)
-    tuned = compared.tuning["horizontal"]
+    compared = compare(flight, SETTINGS)
+    tuning = tuned_horizontally(compared)
+    found = clock_offset(compared, tuning)
+    tuned = tuning["horizontal"]
     at = flight.positions[0].samples.index.to_numpy()
     inside = at[outlier]
     hits = np.isin(tuned.outlier_time_s, inside)
@@ -348,9 +349,9 @@ def test_outliers_are_those_that_tuning_found() -> None:
 def test_an_offset_that_was_set_is_not_found_again() -> None:
     flight, _ = made_flight(9, offset_s=-0.2)
     compared = compare(flight, replace(SETTINGS, clock_offset_s=-0.2))
-    found = clock_offset(tuned_horizontally(compared))
+    found = clock_offset(compared, tuned_horizontally(compared))
     assert covers(found, 0.0)
-    words = clock_advice(replace(compared, clock=found), found)
+    words = clock_advice(compared, found)
     assert words[0].startswith("Offset   -0.")
 
 
@@ -401,8 +402,8 @@ def test_an_offset_beyond_the_search_is_not_called_determined() -> None:
     ],
 )
 def test_the_offset_of_simulated_flights(shared_logs, name: str, true_s: float) -> None:
-    compared = tuned_horizontally(compare(read_log(shared_logs / "simulated" / f"{name}.ulg")))
-    found = clock_offset(compared)
+    compared = compare(read_log(shared_logs / "simulated" / f"{name}.ulg"))
+    found = clock_offset(compared, tuned_horizontally(compared))
     assert found.determinable
     assert found.offset_s == pytest.approx(true_s, abs=0.05)
     assert covers(found, true_s)

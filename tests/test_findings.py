@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from flights import Estimator, Imu, Uwb, aisle_flight
+from flights import Estimator, Imu, Uwb, aisle_flight, unexplained
 from test_loop import NAMED_HERE as NAMED_IN_LOOPS
 from test_noise_findings import NAMED_HERE
 
@@ -404,8 +404,8 @@ def clean() -> Comparison:
 
 
 def found(comparison: Comparison) -> tuple[Finding, ...]:
-    """All findings, each checked for form."""
-    findings = find(comparison)
+    """All findings on a comparison that is not explained, each checked for form."""
+    findings = find(unexplained(comparison))
     order = [SEVERITIES.index(finding.severity) for finding in findings]
     assert order == sorted(order)
     for finding in findings:
@@ -480,7 +480,7 @@ def test_a_flight_of_a_moment_does_not_break_a_detector(fault: Fault, duration_s
 
 @pytest.mark.parametrize("detector", DETECTORS, ids=lambda detector: detector.__name__)
 def test_each_detector_alone_is_silent_on_a_clean_flight(detector: Any) -> None:
-    assert list(detector(clean())) == []
+    assert list(detector(unexplained(clean()))) == []
 
 
 def test_rejections_that_nobody_knows_are_not_named() -> None:
@@ -680,7 +680,8 @@ def test_findings_are_ordered_by_severity() -> None:
 @pytest.mark.parametrize("sigma_a", [0.02, 0.05, 0.1])
 def test_process_noise_too_small_is_answered_by_more_of_it(sigma_a: float) -> None:
     """Q too small looks like R too small to the NIS; the correlation tells them apart."""
-    found = find(compare(aisle_flight(imu=Imu(sigma_a_m_s2=2.0)), Settings(sigma_a_m_s2=sigma_a)))
+    compared = compare(aisle_flight(imu=Imu(sigma_a_m_s2=2.0)), Settings(sigma_a_m_s2=sigma_a))
+    found = find(unexplained(compared))
     (finding,) = [f for f in found if f.id == "kf_variance_understated" and "horiz" in f.message]
     assert "raise SIGMA_A" in finding.remedy
     assert "--sigma-z" not in finding.remedy

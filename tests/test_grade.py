@@ -17,8 +17,9 @@ from pypdf import PdfReader, PdfWriter
 from px4fuse.assignment.key import Answer, AnswerKey
 from px4fuse.cli import cli
 from px4fuse.grading.grade import file_names, grade, graded_from, logs_by_hash
-from px4fuse.grading.model import Graded, Verdict
+from px4fuse.grading.model import Graded
 from px4fuse.grading.rubric import parse_rubric, read_rubric, rubric_text
+from px4fuse.verification.model import Verdict
 
 REPORT = REPOSITORY / "reports" / "aisle_uwb.pdf"
 LOG = REPOSITORY / "sample_logs" / "aisle_uwb.ulg"
@@ -216,7 +217,8 @@ def test_a_damaged_record_is_made_again(handed_in, tmp_path) -> None:
 def test_a_record_holds_all_of_a_grade() -> None:
     from dataclasses import asdict
 
-    from px4fuse.grading.model import Difference, Item
+    from px4fuse.grading.model import Item
+    from px4fuse.verification.model import Difference
 
     whole = Graded(
         "a.pdf", "Ada", "1",

@@ -26,9 +26,9 @@ from pypdf.generic import (
     TextStringObject,
 )
 
-from px4fuse.grading.model import Refused, Report
 from px4fuse.verification import intake
 from px4fuse.verification.intake import SHARED, cleaned, one_line, read_report
+from px4fuse.verification.model import Refused, Report
 
 ROOT = Path(__file__).parent.parent
 REAL = (ROOT / "reports" / "aisle_uwb.pdf").read_bytes()

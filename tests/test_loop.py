@@ -18,7 +18,8 @@ from px4fuse.loop.analysis import analyse, loop_in
 from px4fuse.loop.loop import SINGLE_LOOP, Correction, Loop, close_loop
 from px4fuse.loop.odometry import Closure, OdometryNoise, odometry_variances
 from px4fuse.loop.sources import Source, read_source, split_part
-from px4fuse.readers.closures import GivenClosure, parse_closure, read_closures
+from px4fuse.readers.closures import parse_closure, read_closures
+from px4fuse.request import GivenClosure
 from px4fuse.trajectory.evaluation import Evaluation
 from px4fuse.trajectory.model import Trajectory
 

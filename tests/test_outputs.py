@@ -13,10 +13,9 @@ from test_cli import run_main
 from ulog_tools import ev_error, ev_stamps, make_log, position
 
 import px4fuse.report.pdf
-from px4fuse.analysis import clock_offset_found
-from px4fuse.comparison.comparison import compare
+from px4fuse.analysis import run_comparison
 from px4fuse.errors import MissingDataError
-from px4fuse.readers import read_log
+from px4fuse.request import ComparisonRequest
 
 SECONDS = 20.0
 
@@ -175,7 +174,7 @@ def test_auto_on_a_flight_without_motion_is_refused_with_the_reason(
 def test_auto_without_imu_is_refused_with_the_reason(tmp_path) -> None:
     log = make_log("v1.16", SECONDS).drop("sensor_combined").write(tmp_path / "l.ulg")
     with pytest.raises(MissingDataError, match="not determinable") as refused:
-        clock_offset_found(compare(read_log(log)))
+        run_comparison(ComparisonRequest(log=str(log), clock_offset_s="auto"))
     assert "IMU" in str(refused.value) or "sensor_combined" in str(refused.value)
 
 

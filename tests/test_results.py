@@ -3,24 +3,33 @@
 import json
 import math
 from pathlib import Path
+from typing import Any
 
 import jsonschema
 import pytest
+from flights import unexplained
 
 import px4fuse
 from px4fuse.errors import Px4FuseError
-from px4fuse.report.document import Document, Student
+from px4fuse.report.document import Document
 from px4fuse.report.pdf import render
-from px4fuse.results.build import results, schema, to_json
+from px4fuse.request import ComparisonRequest
+from px4fuse.results import build
+from px4fuse.results.build import schema, to_json
+from px4fuse.results.model import Student
 
 ROOT = Path(__file__).parent.parent
 
 
 def document(flight: px4fuse.Flight, explained: bool = True, **options: object) -> Document:
     comparison = px4fuse.compare(flight, **options)
-    if explained:
-        comparison = px4fuse.explain(comparison)
-    return Document(comparison, px4fuse.find(comparison), Student(), "px4fuse compare")
+    analysis = px4fuse.explain(comparison) if explained else unexplained(comparison)
+    return Document(analysis, px4fuse.find(analysis), Student(), "px4fuse compare")
+
+
+def results(made: Document) -> dict[str, Any]:
+    request = ComparisonRequest(log=made.log[0])
+    return build.results(request, made.analysis, made.findings, made.student, made.command)
 
 
 def assert_close(new: object, old: object, where: str) -> None:

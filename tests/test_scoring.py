@@ -12,7 +12,7 @@ import pytest
 
 from px4fuse.assignment.key import Answer, AnswerKey
 from px4fuse.grading.flags import class_flags, own_flags
-from px4fuse.grading.model import Graded, Report, Verdict
+from px4fuse.grading.model import Graded
 from px4fuse.grading.rubric import parse_rubric, read_rubric
 from px4fuse.grading.scoring import (
     Notes,
@@ -23,6 +23,7 @@ from px4fuse.grading.scoring import (
     values_at,
 )
 from px4fuse.verification.intake import read_report
+from px4fuse.verification.model import Report, Verdict
 from px4fuse.verification.verification import verify
 
 ROOT = Path(__file__).parent.parent

@@ -7,6 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from click.testing import CliRunner
+from flights import unexplained
 from pyulog import ULog
 from scipy.integrate import cumulative_simpson
 from scipy.spatial.transform import Rotation
@@ -630,7 +631,7 @@ def test_ideal_flights_are_consistent_as_often_as_chance_has_it():
 def test_clean_flight_has_one_finding_that_there_is_no_ekf2(scenario):
     settings = Settings(sigma_a_m_s2=0.2, sigma_z_m=scenario.source_sigma_m)
     compared = px4fuse.compare(simulate_flight(scenario), settings)
-    findings = find(compared)
+    findings = find(unexplained(compared))
     assert [finding.id for finding in findings] == ["ekf2_unavailable"]
     assert "EKF2 did not run" in findings[0].message
     for axis in compared.axes:
@@ -653,7 +654,7 @@ def test_clean_flight_has_one_finding_that_there_is_no_ekf2(scenario):
 def test_mistake_is_found(text, finding):
     flight = simulate_flight(Scenario(seed=7, passes=2), parse([text]))
     compared = px4fuse.compare(flight, Settings(sigma_a_m_s2=0.2), axes=("aisle", "north"))
-    assert finding in [found.id for found in find(compared)]
+    assert finding in [found.id for found in find(unexplained(compared))]
 
 
 # --- the command

@@ -16,9 +16,10 @@ import pytest
 
 from px4fuse.errors import SettingsError
 from px4fuse.grading import submissions
-from px4fuse.grading.model import Refused, Submission
+from px4fuse.grading.model import Submission
 from px4fuse.grading.submissions import collect, guess_student, read
 from px4fuse.verification.intake import MAX_BYTES
+from px4fuse.verification.model import Refused
 
 PDF = b"%PDF-1.4 a small one\n%%EOF\n"
 

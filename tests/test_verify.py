@@ -20,11 +20,11 @@ from pypdf.generic import NameObject, TextStringObject
 
 from px4fuse.cli import cli
 from px4fuse.cli.verify import verify as verify_command
-from px4fuse.grading.model import Refused, Report, Verdict
 from px4fuse.report.seal import seal_of, sealed
 from px4fuse.results.build import to_json
 from px4fuse.verification import rerun
 from px4fuse.verification.intake import read_report
+from px4fuse.verification.model import Refused, Report, Verdict
 from px4fuse.verification.page_comparison import plain_layout
 from px4fuse.verification.rerun import Recomputed
 from px4fuse.verification.verification import (

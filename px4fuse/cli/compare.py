@@ -11,13 +11,12 @@ import click
 from px4fuse.cli.inputs import (
     STANDARD_OUTPUT,
     analysis_options,
-    command_line,
+    comparison_request,
     person_options,
     progress,
     read_person,
     report_options,
     report_paths,
-    run_comparison,
     terminal,
     write_outputs,
 )
@@ -41,25 +40,27 @@ def compare(
     output: Path | None,
     json_path: Path | None,
     fail_on: str | None,
-    **analysis: Any,
+    **given: Any,
 ) -> None:
     """Compare a flight's EKF2 with a two-state Kalman filter over IMU and position.
 
     LOG is a PX4 ULog or a MAVLink recording (.tlog or raw stream). Writes a PDF report and its
     results as JSON.
     """
-    from px4fuse.analysis import explain
+    from px4fuse.analysis import run
     from px4fuse.findings import find
     from px4fuse.report.document import Document
     from px4fuse.report.pdf import render
+    from px4fuse.request import command_line
     from px4fuse.results.build import results, to_json
 
-    person = read_person(analysis)
+    person = read_person(given)
+    request = comparison_request(log, given)
     target, beside = report_paths(output or Path("reports") / f"{log.stem}.pdf", json_path)
     with progress(json_path == STANDARD_OUTPUT) as step:
-        compared = explain(run_comparison(log, step, **analysis), step)
-        document = Document(compared, find(compared), person, command_line("compare", log))
-        text = to_json(results(document))
+        analysis = run(request, step)
+        document = Document(analysis, find(analysis), person, command_line(request))
+        text = to_json(results(request, analysis, document.findings, person, document.command))
         step("drawing the report")
         write_outputs({target: render(document, text), beside: text.encode()})
     if json_path == STANDARD_OUTPUT:

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from px4fuse.cli.inputs import (
-    AUTO,
     STANDARD_OUTPUT,
     NumberOrAuto,
     command_line,
@@ -20,6 +19,7 @@ from px4fuse.cli.inputs import (
     write_json,
 )
 from px4fuse.errors import SettingsError
+from px4fuse.request import AUTO
 
 if TYPE_CHECKING:
     from px4fuse.trajectory.evaluation import Delta

@@ -11,10 +11,9 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from px4fuse.cli.inputs import (
+    comparison_request,
     path_option,
-    read_recordings,
     recording_options,
-    with_position,
     write_outputs,
 )
 from px4fuse.errors import OutputError
@@ -48,9 +47,7 @@ def extract(
     log: Path,
     folder: Path,
     kind: str,
-    mavlink: Path | None,
-    system: int | None,
-    **position: Any,
+    **given: Any,
 ) -> None:
     """Write everything that a log holds as tidy tables, one file each.
 
@@ -63,10 +60,11 @@ def extract(
         raise OutputError(
             '--format parquet needs pyarrow: pip install "px4fuse[parquet]", or take --format csv.'
         )
+    from px4fuse.analysis import read_flight
     from px4fuse.contents import extraction
     from px4fuse.results.build import to_json
 
-    flight = with_position(read_recordings(log, mavlink, system), **position)
+    flight = read_flight(comparison_request(log, given))
     _refuse_mixture(folder, flight.log.sha256)
     tables = extraction.tables(flight)
     encode = _parquet if kind == "parquet" else _csv

@@ -9,11 +9,10 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from px4fuse.cli.inputs import (
+    comparison_request,
     json_option,
-    read_recordings,
     recording_options,
     terminal,
-    with_position,
     write_json,
 )
 
@@ -21,6 +20,7 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
+    from px4fuse.analysis import read_flight
     from px4fuse.contents.inventory import Inventory, Source
 
 
@@ -31,14 +31,12 @@ if TYPE_CHECKING:
 def info(
     log: Path,
     json_path: Path | None,
-    mavlink: Path | None,
-    system: int | None,
-    **position: Any,
+    **given: Any,
 ) -> None:
     """Say what is in a log, what px4fuse can do with it, and what to log next time."""
     from px4fuse.contents.inventory import take_inventory, to_plain
 
-    inventory = take_inventory(with_position(read_recordings(log, mavlink, system), **position))
+    inventory = take_inventory(read_flight(comparison_request(log, given)))
     if write_json(to_plain(inventory), json_path):
         return
     _print(terminal(), inventory)

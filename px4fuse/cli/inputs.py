@@ -5,22 +5,21 @@ from __future__ import annotations
 import shlex
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, cast
+from typing import TYPE_CHECKING, Any
 
 import click
 from click.core import ParameterSource
 
-from px4fuse.errors import LogError, OutputError, SettingsError
+from px4fuse.errors import OutputError, SettingsError
+from px4fuse.request import AUTO
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from px4fuse.comparison.comparison import Comparison
-    from px4fuse.flight import Flight
-    from px4fuse.report.document import Student
+    from px4fuse.request import ComparisonRequest, PositionFile
+    from px4fuse.results.model import Student
 
 AXES = ("north", "east", "down", "aisle")
 # Options that name places or people; the command line in the report leaves them out
@@ -31,9 +30,7 @@ NOT_RECORDED = (
 INPUTS = (
     "log", "mavlink", "position", "notes", "source", "estimate", "reference", "closures",
 )  # fmt: skip
-AUTO: Literal["auto"] = "auto"
 STANDARD_OUTPUT = Path("-")
-MAX_NOTES_BYTES = 200_000
 
 
 class NumberOrAuto(click.ParamType[float | str]):
@@ -53,11 +50,24 @@ class NumberOrAuto(click.ParamType[float | str]):
             self.fail(f"{value!r} is neither a number nor 'auto'.", param, ctx)
 
 
+class ColumnNames(click.ParamType["tuple[str, ...]"]):
+    """Names or numbers of columns, with commas between them."""
+
+    name = "columns"
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[str, ...]:
+        """Convert what was typed."""
+        return tuple(value.split(",")) if isinstance(value, str) else value
+
+
 # An option that names a file or folder
 path_option = partial(click.option, type=click.Path(path_type=Path))
 _ANALYSIS = (
     click.option(
         "--sigma-a",
+        "sigma_a_m_s2",
         type=float,
         default=0.5,
         show_default=True,
@@ -66,6 +76,7 @@ _ANALYSIS = (
     ),
     click.option(
         "--sigma-z",
+        "sigma_z_m",
         type=float,
         default=0.10,
         show_default=True,
@@ -74,6 +85,7 @@ _ANALYSIS = (
     ),
     click.option(
         "--dt",
+        "dt_s",
         type=float,
         default=0.1,
         show_default=True,
@@ -82,7 +94,6 @@ _ANALYSIS = (
     ),
     click.option(
         "--input",
-        "input_name",
         type=click.Choice(["imu", "zero"]),
         default=None,
         help="Acceleration from the IMU, or constant velocity.  [default: imu where logged]",
@@ -96,6 +107,7 @@ _ANALYSIS = (
     ),
     click.option(
         "--heading",
+        "heading_deg",
         type=float,
         default=None,
         metavar="DEG",
@@ -103,13 +115,19 @@ _ANALYSIS = (
     ),
     click.option(
         "--start",
+        "start_s",
         type=float,
         default=None,
         metavar="S",
         help="Start, seconds from the first data.  [default: take-off]",
     ),
     click.option(
-        "--end", type=float, default=None, metavar="S", help="End.  [default: touch-down]"
+        "--end",
+        "end_s",
+        type=float,
+        default=None,
+        metavar="S",
+        help="End.  [default: touch-down]",
     ),
     click.option(
         "--position-source",
@@ -154,6 +172,7 @@ _POSITION = (
     ),
     click.option(
         "--position-columns",
+        type=ColumnNames(),
         default=None,
         metavar="TIME,X,Y,Z[,SIGMA]",
         help="Names or numbers of its columns.  [default: by their names]",
@@ -171,10 +190,17 @@ _POSITION = (
         help="Unit of its x, y, z.  [default: detected]",
     ),
 )
-
-
+# Fields of a request's PositionFile by the option that gives them
+_POSITION_FIELDS = {
+    "position_frame": "frame",
+    "position_yaw": "yaw_deg",
+    "position_columns": "columns",
+    "position_time_unit": "time_unit",
+    "position_unit": "length_unit",
+}
 clock_offset_option = click.option(
     "--clock-offset",
+    "clock_offset_s",
     type=NumberOrAuto(),
     default=None,
     metavar="S|auto",
@@ -236,123 +262,37 @@ def report_options(command: Callable[..., None]) -> Callable[..., None]:
     return command
 
 
-def read_recordings(log: Path, mavlink: Path | None, system: int | None) -> Flight:
-    """Read a log, joined with the MAVLink recording of the same flight where one is given."""
-    from px4fuse.readers import read_log
+def comparison_request(log: Path, given: dict[str, Any]) -> ComparisonRequest:
+    """What :func:`recording_options`, or :func:`analysis_options` with them, gave as a request.
 
-    if mavlink is None:
-        return read_log(log, system=system)
-    from px4fuse.placing.joining import join
-
-    flight = read_log(log)
-    other = read_log(mavlink, system=system)
-    if not other.log.format.startswith("MAVLink"):
-        raise LogError(
-            f"--mavlink {mavlink.name}: a {other.log.format}, no MAVLink recording. Give the ULog "
-            "first: px4fuse compare LOG.ulg --mavlink LOG.tlog."
-        )
-    return join(flight, other)
-
-
-def with_position(
-    flight: Flight,
-    position: Path | None,
-    clock_offset: float | str | None,
-    **options: Any,
-) -> Flight:
-    """Bring in the external position file, where one is given.
-
-    Parameters
-    ----------
-    flight : Flight
-    position : Path or None
-    clock_offset : float, "auto" or None
-        What must be added to the file's stamps; None and "auto" find it.
-    **options
-        ``position_frame, position_yaw, position_columns, position_time_unit, position_unit``.
+    Raises
+    ------
+    SettingsError
+        An option is about a position file, and none is given.
     """
-    given = [name for name, value in options.items() if value is not None]
-    if position is None:
-        if given:
-            raise SettingsError(f"--{given[0].replace('_', '-')} is of use with --position only.")
-        return flight
-    from px4fuse.placing.placement import place
-    from px4fuse.readers.position_csv import read_position_csv
+    from px4fuse.request import ComparisonRequest
 
-    columns = options["position_columns"]
-    file = read_position_csv(
-        position,
-        columns=None if columns is None else tuple(columns.split(",")),
-        time_unit=options["position_time_unit"],
-        length_unit=options["position_unit"],
-    )
-    return place(
-        flight,
-        file,
-        frame=options["position_frame"],
-        yaw_deg=options["position_yaw"],
-        clock_offset_s=clock_offset if isinstance(clock_offset, float) else None,
+    position = _position_file(given)
+    mavlink = given.pop("mavlink")
+    return ComparisonRequest(
+        log=str(log),
+        mavlink=None if mavlink is None else str(mavlink),
+        position=position,
+        **given,
     )
 
 
-def run_comparison(
-    log: Path,
-    step: Callable[[str], None],
-    *,
-    sigma_a: float,
-    sigma_z: float,
-    dt: float,
-    input_name: str | None,
-    axes: tuple[str, ...],
-    heading: float | None,
-    start: float | None,
-    end: float | None,
-    position_source: str | None,
-    mavlink: Path | None,
-    system: int | None,
-    position: Path | None,
-    clock_offset: float | str | None,
-    **position_format: Any,
-) -> Comparison:
-    """Read what :func:`analysis_options` name and run the filter over it."""
-    from px4fuse.comparison import comparison
-    from px4fuse.filter.kalman import InputName, Settings
+def _position_file(given: dict[str, Any]) -> PositionFile | None:
+    from px4fuse.request import PositionFile
 
-    settings = Settings(
-        sigma_a_m_s2=sigma_a,
-        sigma_z_m=sigma_z,
-        dt_s=dt,
-        input=cast(InputName, input_name or "imu"),
-        # that of a position file is spent on placing it
-        clock_offset_s=clock_offset if isinstance(clock_offset, float) and not position else 0.0,
-    )
-    for name, value in (("--start", start), ("--end", end), ("--clock-offset", clock_offset)):
-        if isinstance(value, float) and not abs(value) < float("inf"):
-            raise SettingsError(f"{name} {value:g} is not a finite number.")
-    step(f"reading {log.name}")
-    flight = read_recordings(log, mavlink, system)
-    flight = with_position(flight, position, clock_offset, **position_format)
-
-    def run(settings: Settings) -> Comparison:
-        return comparison.compare(
-            flight,
-            settings,
-            axes=axes or None,
-            heading_deg=heading,
-            position_source=position_source,
-            start_s=start,
-            end_s=end,
-            input_required=input_name == "imu",
-            progress=lambda name: step(f"filtering {name}"),
-        )
-
-    compared = run(settings)
-    if clock_offset == AUTO and position is None:
-        from px4fuse.analysis import clock_offset_found
-
-        found = clock_offset_found(compared, step)
-        compared = run(replace(settings, clock_offset_s=found))
-    return compared
+    path = given.pop("position")
+    how = {field: given.pop(option) for option, field in _POSITION_FIELDS.items()}
+    if path is not None:
+        return PositionFile(path=str(path), **how)
+    for option, field in _POSITION_FIELDS.items():
+        if how[field] is not None:
+            raise SettingsError(f"--{option.replace('_', '-')} requires --position.")
+    return None
 
 
 @contextmanager
@@ -420,13 +360,15 @@ def read_person(given: dict[str, Any]) -> Student:
     SettingsError
         The notes cannot be read.
     """
-    from px4fuse.report.document import Student
+    from px4fuse.results.model import Student
 
     name, number = given.pop("student"), given.pop("student_id")
     return Student(encodable(name), encodable(number), _read_notes(given.pop("notes")))
 
 
 def _read_notes(path: Path | None) -> str:
+    from px4fuse.results.model import MAX_NOTES_BYTES
+
     if path is None:
         return ""
     try:

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import astuple, dataclass
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 import click
 from click.core import ParameterSource
@@ -25,30 +24,18 @@ from px4fuse.cli.inputs import (
     write_outputs,
 )
 from px4fuse.errors import SettingsError
+from px4fuse.request import FrameName, Landing
 
 if TYPE_CHECKING:
     from rich.console import Console
 
     from px4fuse.loop.loop import Loop
+    from px4fuse.request import LoopRequest
 
-FRAMES = {"ned": "NED", "frd": "FRD", "enu": "ENU", "camera": "camera"}
 # Nobody's tape is longer
 MAX_LANDED_AT = 10_000.0
 # What may be given with a pose graph
 FOR_GRAPHS = ("source", "json_path", "g2o", "robust")
-
-
-@dataclass(frozen=True)
-class Landing:
-    """Where it landed from where it took off, and how far it was turned there."""
-
-    forward_m: float
-    right_m: float
-    turned_deg: float | None = None
-
-    def __str__(self) -> str:
-        """As it is typed."""
-        return ",".join(f"{number:.12g}" for number in astuple(self) if number is not None)
 
 
 class LandingType(click.ParamType[Landing]):
@@ -71,18 +58,28 @@ class LandingType(click.ParamType[Landing]):
         return Landing(*numbers)
 
 
+class FrameType(click.Choice[str]):
+    """Axes by their names in small letters, given as the field writes them."""
+
+    def normalize_choice(self, choice: Any, ctx: click.Context | None) -> str:
+        """Compare in small letters."""
+        return str(choice).lower()
+
+
 @click.command()
 @click.argument("source", type=click.Path(path_type=Path))
 @click.option(
     "--from",
-    "start",
+    "start_s",
     type=float,
     default=None,
     metavar="S",
     help="Start of the loop: seconds from the first data, or a trajectory's own stamps.  "
     "[default: take-off]",
 )
-@click.option("--to", "end", type=float, default=None, metavar="S", help="End.  [default: landing]")
+@click.option(
+    "--to", "end_s", type=float, default=None, metavar="S", help="End.  [default: landing]"
+)
 @click.option(
     "--landed-at",
     type=LandingType(),
@@ -106,6 +103,7 @@ class LandingType(click.ParamType[Landing]):
 )
 @click.option(
     "--drift",
+    "position_drift_m",
     type=float,
     default=1.0,
     show_default=True,
@@ -114,6 +112,7 @@ class LandingType(click.ParamType[Landing]):
 )
 @click.option(
     "--heading-drift",
+    "heading_drift_deg",
     type=float,
     default=3.0,
     show_default=True,
@@ -122,6 +121,7 @@ class LandingType(click.ParamType[Landing]):
 )
 @click.option(
     "--key-frames",
+    "key_frames_m",
     type=float,
     default=None,
     metavar="M",
@@ -129,7 +129,7 @@ class LandingType(click.ParamType[Landing]):
 )
 @click.option(
     "--frame",
-    type=click.Choice(list(FRAMES)),
+    type=FrameType(get_args(FrameName)),
     default=None,
     help="Axes of a trajectory file.  [default: recognised]",
 )
@@ -146,9 +146,6 @@ class LandingType(click.ParamType[Landing]):
 @path_option("--g2o", metavar="FILE", help="Write the pose graph, solved, as a g2o file.")
 def loop(
     source: Path,
-    frame: str | None,
-    system: int | None,
-    reference: Path | None,
     output: Path | None,
     json_path: Path | None,
     tum: Path | None,
@@ -160,10 +157,12 @@ def loop(
     SOURCE is a flight log (its visual-inertial odometry, or EKF2's track; LOG:vio, LOG:ekf2 and
     LOG:kf choose), a trajectory (TUM, EuRoC, ORB-SLAM3), or a pose graph (g2o), which is solved.
     """
+    from px4fuse.analysis import run_loop
     from px4fuse.findings import find_loop
     from px4fuse.loop.sources import is_g2o, split_part
     from px4fuse.report.document import LoopDocument
     from px4fuse.report.loop_terminal import print_loop
+    from px4fuse.request import command_line as request_line
     from px4fuse.results.build import loop_results, to_json
 
     person = read_person(given)
@@ -173,13 +172,13 @@ def loop(
     if is_g2o(split_part(str(source))[0]):
         _solve(source, json_path, g2o, True if given["robust"] else None)
         return
-    _check_span(given)
+    request = _request(source, given)
     _spare(tum, g2o, *((json_path,) if output is None else report_paths(output, json_path)))
     with progress(json_path == STANDARD_OUTPUT) as step:
-        found = run_loop(source, step, frame=frame, system=system, reference=reference, **given)
+        found = run_loop(request, step)
         findings = find_loop(found)
-        command = command_line("loop", source)
-        results = loop_results(found, findings, person, command)
+        command = request_line(request)
+        results = loop_results(request, found, findings, person, command)
         contents = _files(found, tum, g2o)
         if output is not None:
             from px4fuse.report.pdf import render
@@ -193,36 +192,21 @@ def loop(
     _finish(results, json_path, contents, lambda console: print_loop(console, found, findings))
 
 
-def _check_span(given: Mapping[str, Any]) -> None:
-    for option, name in (("start", "--from"), ("end", "--to")):
-        if given[option] is not None and not abs(given[option]) < float("inf"):
-            raise SettingsError(f"{name} {given[option]:g} is not a finite number.")
+def _request(source: Path, given: dict[str, Any]) -> LoopRequest:
+    """What the command's options gave, as a request."""
+    from px4fuse.readers.closures import parse_closure, read_closures
+    from px4fuse.request import LoopRequest
 
-
-def run_loop(
-    source: Path,
-    step: Callable[[str], None],
-    *,
-    frame: str | None,
-    system: int | None,
-    reference: Path | None,
-    **given: Any,
-) -> Loop:
-    """Read what the command's options name and measure the loop."""
-    from px4fuse.loop.sources import read_source
-
-    _check_span(given)
-    step(f"reading {source.name}")
-    read = read_source(str(source), frame=FRAMES.get(frame or ""), system=system)  # type: ignore[arg-type]
-    if frame is not None and read.flight is not None:
-        raise SettingsError(
-            f"--frame {frame} is for trajectory files; {read.flight.log.name} is a flight log, "
-            "which states its frame. Leave --frame out."
-        )
-    other = None
-    if reference is not None:
-        other = read_source(str(reference), default="truth", system=system)
-    return _analyse(read, None if other is None else other.trajectory, step, **given)
+    closures = tuple(parse_closure(text) for text in given.pop("closure"))
+    file, reference = given.pop("closures"), given.pop("reference")
+    del given["robust"]
+    return LoopRequest(
+        source=str(source),
+        reference=None if reference is None else str(reference),
+        closures=closures if file is None else closures + read_closures(file),
+        came_back=not given.pop("opened"),
+        **given,
+    )
 
 
 def _spare(*targets: Path | None) -> None:
@@ -231,28 +215,6 @@ def _spare(*targets: Path | None) -> None:
     if len({path.resolve() for path in files}) < len(files):
         raise SettingsError("two outputs name the same file. Give each a name of its own.")
     spare_inputs(files)
-
-
-def _analyse(read: Any, other: Any, step: Any, **given: Any) -> Loop:
-    from px4fuse.loop.analysis import analyse
-    from px4fuse.loop.odometry import OdometryNoise
-    from px4fuse.readers.closures import parse_closure, read_closures
-
-    closures = tuple(parse_closure(text) for text in given["closure"])
-    if given["closures"] is not None:
-        closures += read_closures(given["closures"])
-    return analyse(
-        read,
-        start_s=given["start"],
-        end_s=given["end"],
-        landed_at=None if given["landed_at"] is None else astuple(given["landed_at"]),
-        came_back=not given["opened"],
-        closures=closures,
-        noise=OdometryNoise(given["drift"], given["heading_drift"]),
-        reference=other,
-        spacing_m=given["key_frames"],
-        progress=step,
-    )
 
 
 def _files(found: Loop, tum: Path | None, g2o: Path | None) -> dict[Path, bytes]:

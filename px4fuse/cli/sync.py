@@ -10,10 +10,9 @@ import click
 from px4fuse.cli.inputs import (
     STANDARD_OUTPUT,
     analysis_options,
-    command_line,
+    comparison_request,
     json_option,
     progress,
-    run_comparison,
     write_json,
 )
 
@@ -22,20 +21,22 @@ from px4fuse.cli.inputs import (
 @click.argument("log", type=click.Path(path_type=Path))
 @analysis_options
 @json_option
-def sync(log: Path, json_path: Path | None, **analysis: Any) -> None:
+def sync(log: Path, json_path: Path | None, **given: Any) -> None:
     """Estimate what must be added to the position source's time stamps, with its interval.
 
     From the acceleration that the IMU felt; EKF2 and its attitude are not asked. LOG is a PX4 ULog
     or a MAVLink recording.
     """
-    from px4fuse.analysis import clock_offset, tuned_horizontally
+    from px4fuse.analysis import clock_offset, run_comparison, tuned_horizontally
     from px4fuse.report.words import clock_advice
+    from px4fuse.request import command_line
     from px4fuse.results.build import sync_results
 
+    request = comparison_request(log, given)
     with progress(json_path == STANDARD_OUTPUT) as step:
-        compared = tuned_horizontally(run_comparison(log, step, **analysis))
-        found = clock_offset(compared, step)
-    if write_json(sync_results(compared, found, command_line("sync", log)), json_path):
+        compared = run_comparison(request, step)
+        found = clock_offset(compared, tuned_horizontally(compared), step)
+    if write_json(sync_results(request, compared, found, command_line(request, "sync")), json_path):
         return
     for line in clock_advice(compared, found):
         click.echo(line)

@@ -10,10 +10,9 @@ import click
 from px4fuse.cli.inputs import (
     STANDARD_OUTPUT,
     analysis_options,
-    command_line,
+    comparison_request,
     json_option,
     progress,
-    run_comparison,
     terminal,
     write_json,
 )
@@ -30,20 +29,25 @@ if TYPE_CHECKING:
 @click.argument("log", type=click.Path(path_type=Path))
 @analysis_options
 @json_option
-def tune(log: Path, json_path: Path | None, **analysis: Any) -> None:
+def tune(log: Path, json_path: Path | None, **given: Any) -> None:
     """Find the SIGMA_A and SIGMA_Z of greatest likelihood, with their 95 % intervals.
 
     --sigma-a and --sigma-z are what they are compared with. LOG is a PX4 ULog or a MAVLink
     recording.
     """
+    from px4fuse.analysis import run_comparison
     from px4fuse.filter.tuning import tune as tune_axes
+    from px4fuse.request import command_line
     from px4fuse.results.build import tuning_results
 
+    request = comparison_request(log, given)
     with progress(json_path == STANDARD_OUTPUT) as step:
-        compared = run_comparison(log, step, **analysis)
+        compared = run_comparison(request, step)
         axes = tuple(result.axis for result in compared.axes)
         tuned = tune_axes(axes, compared.settings, progress=lambda name: step(f"tuning {name}"))
-    if write_json(tuning_results(compared, tuned, command_line("tune", log)), json_path):
+    if write_json(
+        tuning_results(request, compared, tuned, command_line(request, "tune")), json_path
+    ):
         return
     _print(terminal(), compared, tuned)
 

@@ -15,7 +15,7 @@ from px4fuse.errors import LogError, OutputError
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from px4fuse.grading.model import Report, Verdict
+    from px4fuse.verification.model import Report, Verdict
 
 SCHEMA = {"name": "px4fuse-verification", "version": "1.0"}
 STYLES = {"verified": "bold green", "cannot verify": "bold yellow"}
@@ -37,8 +37,8 @@ def verify(report: Path, logs: tuple[Path, ...], json_path: Path | None) -> None
     Exit code 0: verified; 1: numbers differ, page altered, other log, or cannot verify; 2: bad
     input.
     """
-    from px4fuse.grading.model import Refused
     from px4fuse.verification.intake import MAX_BYTES, read_report
+    from px4fuse.verification.model import Refused
     from px4fuse.verification.rerun import hashed
     from px4fuse.verification.verification import verify as verify_report
 

@@ -9,13 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from px4fuse.comparison.comparison import AxisComparison, Comparison
 from px4fuse.comparison.projection import MIN_COMMON_SAMPLES, observation_variance
+from px4fuse.filter.clock import ClockOffset
 from px4fuse.filter.kalman import Settings, timeline
 from px4fuse.filter.likelihood import filtered, preintegrate
 from px4fuse.filter.signals import (
@@ -35,9 +36,6 @@ from px4fuse.flight import (
     Unavailable,
     sample_rate,
 )
-
-if TYPE_CHECKING:  # comparison.py carries the budget
-    from px4fuse.comparison.comparison import AxisComparison, Comparison
 
 # Of the axes, those that the report shows where there is an aisle
 REPORTED = (AISLE, "down")
@@ -188,14 +186,16 @@ Made = tuple[Change, str]
 
 
 def budget(
-    comparison: Comparison, progress: Callable[[str], None] = lambda _: None
+    comparison: Comparison,
+    clock: ClockOffset | Unavailable,
+    progress: Callable[[str], None] = lambda _: None,
 ) -> dict[str, Budget | Unavailable]:
     """Difference budget of the aisle and down, or of all axes where there is no aisle.
 
     Parameters
     ----------
     comparison : Comparison
-        Its ``clock`` is used where it is filled.
+    clock : ClockOffset or Unavailable
     progress : callable
         Told what is being done.
 
@@ -209,12 +209,15 @@ def budget(
     found = {}
     for name in names:
         progress(f"difference budget, {name}")
-        found[name] = _axis_budget(comparison, results[name], corrected)
+        found[name] = _axis_budget(comparison, clock, results[name], corrected)
     return found
 
 
 def _axis_budget(
-    comparison: Comparison, result: AxisComparison, corrected: pd.DataFrame | Unavailable
+    comparison: Comparison,
+    clock: ClockOffset | Unavailable,
+    result: AxisComparison,
+    corrected: pd.DataFrame | Unavailable,
 ) -> Budget | Unavailable:
     ekf2 = comparison.flight.ekf2
     if isinstance(ekf2, Unavailable):
@@ -258,7 +261,7 @@ def _axis_budget(
         return _effect(part[1], baseline, alone, without)
 
     causes = {name: effect(name) for name in CAUSES}
-    moved = _clock(comparison)
+    moved = _clock(clock)
     return Budget(
         count=len(inside),
         baseline=baseline,
@@ -544,10 +547,7 @@ def _shifted(run: Run, seconds: float) -> Run:
     )
 
 
-def _clock(comparison: Comparison) -> Made | Unavailable:
-    clock = comparison.clock
-    if clock is None:
-        return Unavailable("clock offset", "it was not asked for", "See px4fuse sync.")
+def _clock(clock: ClockOffset | Unavailable) -> Made | Unavailable:
     if isinstance(clock, Unavailable):
         return clock
     if not clock.determinable:

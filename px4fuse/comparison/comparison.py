@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
 
-from px4fuse.comparison.budget import Budget
 from px4fuse.comparison.projection import (
     MIN_COMMON_SAMPLES,
     continuous_state,
@@ -19,7 +17,6 @@ from px4fuse.comparison.projection import (
     project_variance,
 )
 from px4fuse.errors import SettingsError
-from px4fuse.filter.clock import ClockOffset
 from px4fuse.filter.consistency import Consistency, HorizontalNis, assess, assess_horizontal
 from px4fuse.filter.kalman import Replay, Settings, replay, state_at, variance_at
 from px4fuse.filter.likelihood import NoiseAsked, noise_asked
@@ -32,11 +29,7 @@ from px4fuse.filter.signals import (
     make_axes,
     shift_clock,
 )
-from px4fuse.filter.tuning import AxisTuning
 from px4fuse.flight import Ekf2, Flight, PositionTrack, Truth, Unavailable
-
-if TYPE_CHECKING:
-    from px4fuse.loop.loop import Loop  # it is made from tracks, ours among them
 
 NOT_ITS_OWN_TRUTH = Unavailable(
     "ground truth",
@@ -150,14 +143,6 @@ class Comparison:
     notes : tuple of str
         Choices made on the way.
     missing : tuple of Unavailable
-    tuning : mapping from axis name, or "horizontal", to AxisTuning or Unavailable
-        Empty until :func:`px4fuse.analysis.explain` fills it.
-    clock : ClockOffset, Unavailable or None
-        What must still be added to the source's stamps; None until ``explain`` fills it.
-    budget : mapping from axis name to Budget or Unavailable
-        What the difference to EKF2 comes from; empty until ``explain`` fills it.
-    loop : Loop, Unavailable or None
-        Loop closure of the flight's odometry; None until ``explain`` fills it.
     """
 
     flight: Flight
@@ -170,10 +155,6 @@ class Comparison:
     horizontal_ekf2: HorizontalNis | None
     notes: tuple[str, ...]
     missing: tuple[Unavailable, ...]
-    tuning: Mapping[str, AxisTuning | Unavailable] = field(default_factory=dict)
-    clock: ClockOffset | Unavailable | None = None
-    budget: Mapping[str, Budget | Unavailable] = field(default_factory=dict)
-    loop: Loop | Unavailable | None = None
 
 
 def compare(

@@ -1,6 +1,6 @@
 """The mistakes that px4fuse names: each a detector with evidence and a remedy that can be typed.
 
-Thresholds are data, with unit and source. A detector looks at a :class:`Comparison` and yields
+Thresholds are data, with unit and source. A detector looks at an :class:`Analysis` and yields
 findings; it never prints and never guesses: what it cannot see it does not mention.
 """
 
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from px4fuse.comparison.comparison import Comparison
+from px4fuse.analysis import Analysis
 from px4fuse.findings.ekf2 import (
     accelerometer_bias,
     ekf2_not_fusing,
@@ -50,9 +50,9 @@ from px4fuse.loop.loop import Loop
 __all__ = ["DETECTORS", "SEVERITIES", "Finding", "Severity", "find", "find_loop"]
 
 
-def find(comparison: Comparison) -> tuple[Finding, ...]:
+def find(analysis: Analysis) -> tuple[Finding, ...]:
     """All findings of all detectors, most severe first, each detector's own order kept."""
-    return _sorted(finding for detector in DETECTORS for finding in detector(comparison))
+    return _sorted(finding for detector in DETECTORS for finding in detector(analysis))
 
 
 def find_loop(loop: Loop) -> tuple[Finding, ...]:

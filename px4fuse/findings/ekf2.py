@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from px4fuse.analysis import Analysis
 from px4fuse.comparison.comparison import Comparison
 from px4fuse.filter.signals import within
 from px4fuse.findings.model import Finding, step_share, times
@@ -21,8 +22,9 @@ from px4fuse.findings.thresholds import (
 from px4fuse.flight import EXTERNAL_VISION_RUNGS, SPECIFIC_FORCE_COLUMNS, Ekf2, Unavailable
 
 
-def ekf2_unavailable(comparison: Comparison) -> Iterator[Finding]:
+def ekf2_unavailable(analysis: Analysis) -> Iterator[Finding]:
     """There is no EKF2 to compare with."""
+    comparison = analysis.comparison
     ekf2 = comparison.flight.ekf2
     if isinstance(ekf2, Unavailable):
         yield Finding(
@@ -33,8 +35,9 @@ def ekf2_unavailable(comparison: Comparison) -> Iterator[Finding]:
         )
 
 
-def ekf2_not_fusing(comparison: Comparison) -> Iterator[Finding]:
+def ekf2_not_fusing(analysis: Analysis) -> Iterator[Finding]:
     """EKF2 did not use the source for horizontal position, or not all the time."""
+    comparison = analysis.comparison
     ekf2, segment = comparison.flight.ekf2, comparison.segment
     if isinstance(ekf2, Unavailable) or isinstance(ekf2.fusing, Unavailable):
         return
@@ -100,8 +103,9 @@ def ekf2_not_fusing(comparison: Comparison) -> Iterator[Finding]:
     )
 
 
-def ekf2_rejecting(comparison: Comparison) -> Iterator[Finding]:
+def ekf2_rejecting(analysis: Analysis) -> Iterator[Finding]:
     """EKF2's gate threw measurements away."""
+    comparison = analysis.comparison
     # a rejection is of the horizontal vector, so one horizontal axis speaks for all
     horizontal = [r for r in comparison.axes if r.axis.name != "down"][:1]
     for result in (*horizontal, *(r for r in comparison.axes if r.axis.name == "down")):
@@ -131,8 +135,9 @@ def _gate(comparison: Comparison) -> float:
     return ekf2.gate if isinstance(ekf2, Ekf2) else float("nan")
 
 
-def resets(comparison: Comparison) -> Iterator[Finding]:
+def resets(analysis: Analysis) -> Iterator[Finding]:
     """EKF2's output jumped, or another instance took over."""
+    comparison = analysis.comparison
     ekf2, segment = comparison.flight.ekf2, comparison.segment
     if isinstance(ekf2, Unavailable):
         return
@@ -169,8 +174,9 @@ def resets(comparison: Comparison) -> Iterator[Finding]:
         )
 
 
-def accelerometer_bias(comparison: Comparison) -> Iterator[Finding]:
+def accelerometer_bias(analysis: Analysis) -> Iterator[Finding]:
     """EKF2 found a large accelerometer bias, which our filter takes for acceleration."""
+    comparison = analysis.comparison
     ekf2, segment = comparison.flight.ekf2, comparison.segment
     if isinstance(ekf2, Unavailable) or isinstance(ekf2.accelerometer_bias, Unavailable):
         return

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from px4fuse.analysis import Analysis
 from px4fuse.comparison.comparison import AxisComparison, Comparison
 from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.kalman import Settings
@@ -25,8 +26,9 @@ from px4fuse.findings.thresholds import (
 from px4fuse.flight import Unavailable, sample_rate
 
 
-def variance_wrong(comparison: Comparison) -> Iterator[Finding]:
+def variance_wrong(analysis: Analysis) -> Iterator[Finding]:
     """S larger or smaller than the innovations deserve, for our filter and for EKF2 alike."""
+    comparison = analysis.comparison
     for owner in ("kf", "ekf2"):
         named: list[tuple[AxisComparison, Consistency]] = []
         for result in comparison.axes:
@@ -171,11 +173,12 @@ def _ekf2_noise(result: AxisComparison) -> float:
     return float(np.sqrt(frame["observation_variance_m2"].median()))
 
 
-def process_noise_forgotten(comparison: Comparison) -> Iterator[Finding]:
+def process_noise_forgotten(analysis: Analysis) -> Iterator[Finding]:
     """SIGMA_A so small that σ hardly grows between updates and new measurements are ignored.
 
     A slow filter is no mistake where nothing happens: its innovations must say that it lags.
     """
+    comparison = analysis.comparison
     for result in comparison.axes:
         updates, statement = result.replay.updates, result.kf.consistency
         if isinstance(statement, Unavailable) or statement.verdict != "variance understated":
@@ -208,8 +211,9 @@ def process_noise_forgotten(comparison: Comparison) -> Iterator[Finding]:
         return
 
 
-def too_few_innovations(comparison: Comparison) -> Iterator[Finding]:
+def too_few_innovations(analysis: Analysis) -> Iterator[Finding]:
     """Our own statistics could not be stated."""
+    comparison = analysis.comparison
     for result in comparison.axes:
         if isinstance(result.kf.consistency, Unavailable):
             yield Finding(

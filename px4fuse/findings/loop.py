@@ -4,18 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from px4fuse.comparison.comparison import Comparison
+from px4fuse.analysis import Analysis
 from px4fuse.findings.model import Finding, Threshold
-from px4fuse.loop.loop import GATE_ALPHA, Judged, Loop
+from px4fuse.loop.loop import Judged, Loop
+from px4fuse.trajectory.graph.analysis import GATE_ALPHA
 
 MOST = Threshold(0.5, "share", "of several closures, more are true than false")
 DOUBTFUL_WEIGHT = Threshold(0.5, "weight", "GNC ends at 0 or 1 (Yang et al. 2020)")
 
 
-def loop_closures(comparison: Comparison) -> Iterator[Finding]:
+def loop_closures(analysis: Analysis) -> Iterator[Finding]:
     """Findings about the loop of a flight that holds one."""
-    if isinstance(comparison.loop, Loop):
-        yield from find_in_loop(comparison.loop)
+    if isinstance(analysis.loop, Loop):
+        yield from find_in_loop(analysis.loop)
 
 
 def find_in_loop(loop: Loop) -> Iterator[Finding]:

@@ -9,6 +9,7 @@ from typing import Literal
 import numpy as np
 import pandas as pd
 
+from px4fuse.analysis import Analysis
 from px4fuse.comparison.comparison import Comparison
 from px4fuse.filter.signals import within
 from px4fuse.flight import POSITION_COLUMNS
@@ -52,7 +53,7 @@ class Threshold:
     source: str
 
 
-Detector = Callable[[Comparison], Iterator[Finding]]
+Detector = Callable[[Analysis], Iterator[Finding]]
 
 
 def times(count: int) -> str:

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from px4fuse.comparison.comparison import Comparison
+from px4fuse.analysis import Analysis
 from px4fuse.filter.clock import CHANGE_P, ClockOffset
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise
 from px4fuse.findings.model import Finding, Severity, motion_range_m
@@ -27,23 +27,24 @@ from px4fuse.findings.thresholds import (
 )
 
 
-def noises_off(comparison: Comparison) -> Iterator[Finding]:
+def noises_off(analysis: Analysis) -> Iterator[Finding]:
     """SIGMA_Z or SIGMA_A is not what the innovations ask for, each told from the other.
 
     The mean NIS alone cannot tell them apart: both make S larger. The likelihood can, since
     SIGMA_A makes the innovations of a stretch agree with each other and SIGMA_Z does not.
     """
+    comparison = analysis.comparison
     name = next(
         (
             n
             for n in (HORIZONTAL, "aisle", "down")
-            if isinstance(comparison.tuning.get(n), AxisTuning)
+            if isinstance(analysis.tuning.get(n), AxisTuning)
         ),
         None,
     )
     if name is None:
         return
-    tuned = comparison.tuning[name]
+    tuned = analysis.tuning[name]
     assert isinstance(tuned, AxisTuning)
     settings = comparison.settings
     # without motion the acceleration's noise is hardly seen
@@ -76,9 +77,9 @@ def noises_off(comparison: Comparison) -> Iterator[Finding]:
         )
 
 
-def outliers(comparison: Comparison) -> Iterator[Finding]:
+def outliers(analysis: Analysis) -> Iterator[Finding]:
     """Measurements that no noise explains: reflections, no line of sight."""
-    tuned = comparison.tuning.get(HORIZONTAL) or next(iter(comparison.tuning.values()), None)
+    tuned = analysis.tuning.get(HORIZONTAL) or next(iter(analysis.tuning.values()), None)
     if not isinstance(tuned, AxisTuning):
         return
     count = len(tuned.outlier_time_s)
@@ -129,9 +130,10 @@ def _reading(label: str, small: bool) -> str:
     )
 
 
-def clock_off(comparison: Comparison) -> Iterator[Finding]:
+def clock_off(analysis: Analysis) -> Iterator[Finding]:
     """The source's stamps are late or early against the IMU, or their error changed in flight."""
-    clock = comparison.clock
+    comparison = analysis.comparison
+    clock = analysis.clock
     # what was derived from EKF2's own output has EKF2's stamps, not the source's
     if not isinstance(clock, ClockOffset) or comparison.source.reconstructed:
         return
@@ -172,9 +174,10 @@ def clock_off(comparison: Comparison) -> Iterator[Finding]:
         )
 
 
-def frame_turned(comparison: Comparison) -> Iterator[Finding]:
+def frame_turned(analysis: Analysis) -> Iterator[Finding]:
     """The source's frame is turned against the vehicle's heading."""
-    clock = comparison.clock
+    comparison = analysis.comparison
+    clock = analysis.clock
     if not isinstance(clock, ClockOffset) or comparison.source.reconstructed:
         return
     turn, sigma = clock.heading_error_deg, clock.heading_sigma_deg
@@ -193,9 +196,10 @@ def frame_turned(comparison: Comparison) -> Iterator[Finding]:
     )
 
 
-def ekf2_delay_off(comparison: Comparison) -> Iterator[Finding]:
+def ekf2_delay_off(analysis: Analysis) -> Iterator[Finding]:
     """EKF2_EV_DELAY is not the delay that the data have."""
-    clock = comparison.clock
+    comparison = analysis.comparison
+    clock = analysis.clock
     delay = comparison.flight.log.parameters.get("EKF2_EV_DELAY")
     if not isinstance(clock, ClockOffset) or comparison.source.reconstructed:
         return

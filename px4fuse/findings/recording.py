@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 import pandas as pd
 
-from px4fuse.comparison.comparison import Comparison
+from px4fuse.analysis import Analysis
 from px4fuse.filter.signals import within
 from px4fuse.findings.model import Finding, sentence
 from px4fuse.findings.thresholds import (
@@ -25,8 +25,9 @@ SYNCHRONISE = (
 )
 
 
-def stamps_meaningless(comparison: Comparison) -> Iterator[Finding]:
+def stamps_meaningless(analysis: Analysis) -> Iterator[Finding]:
     """The sender's time stamps take so few values that they tell no time."""
+    comparison = analysis.comparison
     clock = comparison.source.clock_map
     if clock is None or clock.distinct_stamps is None:
         return
@@ -52,8 +53,9 @@ def stamps_meaningless(comparison: Comparison) -> Iterator[Finding]:
         )
 
 
-def companion_not_synchronised(comparison: Comparison) -> Iterator[Finding]:
+def companion_not_synchronised(analysis: Analysis) -> Iterator[Finding]:
     """No TIMESYNC between sender and autopilot: PX4 takes the time of arrival instead."""
+    comparison = analysis.comparison
     clock = comparison.source.clock_map
     if clock is None or clock.distinct_stamps is not None:
         return
@@ -75,8 +77,9 @@ def companion_not_synchronised(comparison: Comparison) -> Iterator[Finding]:
     )
 
 
-def innovations_need_ulog(comparison: Comparison) -> Iterator[Finding]:
+def innovations_need_ulog(analysis: Analysis) -> Iterator[Finding]:
     """MAVLink carries EKF2's states and variances, but no innovations."""
+    comparison = analysis.comparison
     flight = comparison.flight
     if not flight.log.format.startswith("MAVLink") or not isinstance(flight.ekf2, Ekf2):
         return
@@ -90,8 +93,9 @@ def innovations_need_ulog(comparison: Comparison) -> Iterator[Finding]:
     )
 
 
-def other_autopilot(comparison: Comparison) -> Iterator[Finding]:
+def other_autopilot(analysis: Analysis) -> Iterator[Finding]:
     """The estimator that is called EKF2 here is not PX4's."""
+    comparison = analysis.comparison
     autopilot = comparison.flight.log.autopilot
     if autopilot == "PX4" or not isinstance(comparison.flight.ekf2, Ekf2):
         return
@@ -105,8 +109,9 @@ def other_autopilot(comparison: Comparison) -> Iterator[Finding]:
     )
 
 
-def autopilot_restarted(comparison: Comparison) -> Iterator[Finding]:
+def autopilot_restarted(analysis: Analysis) -> Iterator[Finding]:
     """The boot clock began again in mid-recording, and only one part was read."""
+    comparison = analysis.comparison
     for note in comparison.flight.log.notes:
         if "boot clock went back" in note:
             yield Finding(
@@ -117,8 +122,9 @@ def autopilot_restarted(comparison: Comparison) -> Iterator[Finding]:
             )
 
 
-def samples_lost(comparison: Comparison) -> Iterator[Finding]:
+def samples_lost(analysis: Analysis) -> Iterator[Finding]:
     """The recording lacks single samples of a regular source."""
+    comparison = analysis.comparison
     source = comparison.source
     if source.clock_map is None or source.clock_map.method == "arrival time":
         return
@@ -141,8 +147,9 @@ def samples_lost(comparison: Comparison) -> Iterator[Finding]:
         )
 
 
-def position_file_placement(comparison: Comparison) -> Iterator[Finding]:
+def position_file_placement(analysis: Analysis) -> Iterator[Finding]:
     """What is poorly determined about where an external position file lies in the flight."""
+    comparison = analysis.comparison
     alignment = comparison.source.alignment
     if alignment is None:
         return
@@ -159,8 +166,9 @@ def position_file_placement(comparison: Comparison) -> Iterator[Finding]:
         )
 
 
-def receipt_out_of_order(comparison: Comparison) -> Iterator[Finding]:
+def receipt_out_of_order(analysis: Analysis) -> Iterator[Finding]:
     """The recording computer's clock was set back while it recorded."""
+    comparison = analysis.comparison
     for note in comparison.flight.log.notes:
         if "time of receipt went back" in note:
             yield Finding(

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 import pandas as pd
 
-from px4fuse.comparison.comparison import Comparison
+from px4fuse.analysis import Analysis
 from px4fuse.findings.model import Finding, motion_range_m, sentence, step_share, times
 from px4fuse.findings.thresholds import (
     FUSING_SHARE_ERROR,
@@ -26,8 +26,9 @@ from px4fuse.findings.thresholds import (
 from px4fuse.flight import Ekf2, Unavailable, sample_rate
 
 
-def source_reconstructed(comparison: Comparison) -> Iterator[Finding]:
+def source_reconstructed(analysis: Analysis) -> Iterator[Finding]:
     """The position source as it arrived is not in the log."""
+    comparison = analysis.comparison
     source = comparison.source
     logged = any(track.rung == 2 for track in comparison.flight.positions)
     if source.rung not in (4, 5, 6) or logged:
@@ -66,8 +67,9 @@ def source_reconstructed(comparison: Comparison) -> Iterator[Finding]:
         )
 
 
-def source_frame(comparison: Comparison) -> Iterator[Finding]:
+def source_frame(analysis: Analysis) -> Iterator[Finding]:
     """The source's x axis is not north."""
+    comparison = analysis.comparison
     ekf2 = comparison.flight.ekf2
     if comparison.source.frame != "FRD":
         return
@@ -101,8 +103,9 @@ def source_frame(comparison: Comparison) -> Iterator[Finding]:
     )
 
 
-def gaps(comparison: Comparison) -> Iterator[Finding]:
+def gaps(analysis: Analysis) -> Iterator[Finding]:
     """The source, the IMU or the logger stopped for a while."""
+    comparison = analysis.comparison
     segment, source = comparison.segment, comparison.source
     measured_s = comparison.axes[0].axis.measurement_time_s
     intervals = np.diff(measured_s)
@@ -147,8 +150,9 @@ def gaps(comparison: Comparison) -> Iterator[Finding]:
         )
 
 
-def no_motion(comparison: Comparison) -> Iterator[Finding]:
+def no_motion(analysis: Analysis) -> Iterator[Finding]:
     """The vehicle hardly moved: nothing about dynamics can be identified."""
+    comparison = analysis.comparison
     extent = motion_range_m(comparison)
     if extent < MOTION_RANGE.value:
         yield Finding(
@@ -161,8 +165,9 @@ def no_motion(comparison: Comparison) -> Iterator[Finding]:
         )
 
 
-def logging_rate_low(comparison: Comparison) -> Iterator[Finding]:
+def logging_rate_low(analysis: Analysis) -> Iterator[Finding]:
     """Topics that were logged too slowly for what is done with them."""
+    comparison = analysis.comparison
     flight = comparison.flight
     mavlink = flight.log.format.startswith("MAVLink")
     for part, name, default, threshold in (
@@ -206,8 +211,9 @@ def logging_rate_low(comparison: Comparison) -> Iterator[Finding]:
             )
 
 
-def input_unavailable(comparison: Comparison) -> Iterator[Finding]:
+def input_unavailable(analysis: Analysis) -> Iterator[Finding]:
     """No IMU or attitude: the filter ran without its input."""
+    comparison = analysis.comparison
     acceleration = comparison.axes[0].axis.acceleration
     if isinstance(acceleration, Unavailable):
         yield Finding(
@@ -219,8 +225,9 @@ def input_unavailable(comparison: Comparison) -> Iterator[Finding]:
         )
 
 
-def log_damaged(comparison: Comparison) -> Iterator[Finding]:
+def log_damaged(analysis: Analysis) -> Iterator[Finding]:
     """Bytes or samples that the reader had to pass over."""
+    comparison = analysis.comparison
     notes = [n for n in comparison.flight.log.notes if "damaged" in n or "dropped" in n]
     if notes:
         yield Finding(

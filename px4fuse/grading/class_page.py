@@ -22,7 +22,8 @@ from string import Template
 from typing import Any, get_args
 
 from px4fuse.grading.class_table import distinct, item_points, number
-from px4fuse.grading.model import Graded, Status
+from px4fuse.grading.model import Graded
+from px4fuse.verification.model import Status
 
 STATUSES: tuple[Status, ...] = get_args(Status)
 SIGNS = {

@@ -19,11 +19,12 @@ from px4fuse.grading import submissions
 from px4fuse.grading.class_page import html_text
 from px4fuse.grading.class_table import csv_text
 from px4fuse.grading.flags import class_flags, own_flags
-from px4fuse.grading.model import Difference, Graded, Item, Refused, Report, Submission, Verdict
+from px4fuse.grading.model import Graded, Item, Submission
 from px4fuse.grading.rubric import Rubric
 from px4fuse.grading.scoring import feedback, gradescope, score, score_refused
 from px4fuse.grading.workers import Failed, run_bounded
 from px4fuse.verification.intake import read_report
+from px4fuse.verification.model import Difference, Refused, Report, Verdict
 from px4fuse.verification.pictures import key_page, picture
 from px4fuse.verification.verification import verify
 from px4fuse.writing import write_all

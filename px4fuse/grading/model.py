@@ -1,15 +1,12 @@
-"""What is read from a submission, what verification says of it, and what it is worth."""
+"""What is handed in, and what it is worth."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
 
-# Whether the file is, to the byte, as px4fuse wrote it
-Seal = Literal["intact", "broken", "missing"]
-Status = Literal["verified", "numbers differ", "page altered", "other log", "cannot verify"]
+from px4fuse.verification.model import Verdict
 
 
 @dataclass(frozen=True)
@@ -30,79 +27,6 @@ class Submission:
     file: Path
     entry: str
     name: str
-
-
-@dataclass(frozen=True)
-class Report:
-    """A report as it was handed in.
-
-    Attributes
-    ----------
-    sha256 : str
-        Of the PDF.
-    size_bytes : int
-    seal : {"intact", "broken", "missing"}
-    results : dict
-        The attached results; a JSON object with a ``schema`` of px4fuse's.
-    pages : tuple of str
-        Text of each page.
-    pdf : bytes
-        The file itself.
-    """
-
-    sha256: str
-    size_bytes: int
-    seal: Seal
-    results: dict[str, Any]
-    pages: tuple[str, ...]
-    pdf: bytes = field(repr=False)
-
-
-@dataclass(frozen=True)
-class Refused:
-    """A submission that cannot be read as a report, and why: one sentence for a person."""
-
-    reason: str
-
-
-@dataclass(frozen=True)
-class Difference:
-    """One number or text that a new run of the analysis does not confirm.
-
-    Attributes
-    ----------
-    path : str
-        Where it stands in the results: ``axes.north.kf.nis_mean``.
-    recorded, recomputed : str
-        "absent" where there is none.
-    """
-
-    path: str
-    recorded: str
-    recomputed: str
-
-
-@dataclass(frozen=True)
-class Verdict:
-    """What verification found.
-
-    Attributes
-    ----------
-    status : Status
-    reasons : tuple of str
-        Sentences: what differs, or why nothing can be said; for "verified" what was checked.
-    with_log : bool
-        Whether the analysis was run again on the log.
-    differences : tuple of Difference
-    pages : tuple of int
-        Pages, counted from 1, that are not what the results print.
-    """
-
-    status: Status
-    reasons: tuple[str, ...]
-    with_log: bool
-    differences: tuple[Difference, ...] = ()
-    pages: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -18,8 +18,9 @@ from typing import Any, Literal
 from px4fuse.assignment.assignment import POSSIBLE_FINDINGS
 from px4fuse.assignment.key import Answer, AnswerKey
 from px4fuse.filter.tuning import HORIZONTAL
-from px4fuse.grading.model import Graded, Item, Report, Verdict
+from px4fuse.grading.model import Graded, Item
 from px4fuse.grading.rubric import Rubric, RubricItem
+from px4fuse.verification.model import Report, Verdict
 
 # What verification has refuted, rather than what it could not look at
 REFUTED: Mapping[str, str] = {

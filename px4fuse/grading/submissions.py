@@ -19,8 +19,9 @@ from pathlib import Path
 from typing import IO
 
 from px4fuse.errors import SettingsError
-from px4fuse.grading.model import Refused, Submission
+from px4fuse.grading.model import Submission
 from px4fuse.verification.intake import MAX_BYTES, cleaned, one_line
+from px4fuse.verification.model import Refused
 
 MAX_ENTRIES = 10_000
 # Of the table of contents, which zipfile reads in one piece before it can be counted

@@ -21,7 +21,7 @@ from px4fuse.loop.part import (
 )
 from px4fuse.loop.sources import Source
 from px4fuse.loop.tracks import odometry_of, trajectory_of
-from px4fuse.readers.closures import GivenClosure
+from px4fuse.request import GivenClosure
 from px4fuse.trajectory.model import Trajectory
 
 # Where stamps are UNIX time, a smaller time counts from the first pose

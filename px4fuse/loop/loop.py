@@ -25,21 +25,13 @@ from px4fuse.loop.closure import (
 from px4fuse.loop.odometry import Closure, OdometryNoise, pose_graph
 from px4fuse.loop.part import KnownEnd, assumed_end, part_of
 from px4fuse.trajectory.evaluation import Evaluation, evaluate
+from px4fuse.trajectory.graph.analysis import GATE_ALPHA, SOLUTIONS
 from px4fuse.trajectory.graph.pose_graph import GateResult, PoseGraph, Solution, gate, solve
 from px4fuse.trajectory.model import Array, Frame, Trajectory
 
-# Chance that the gate rejects a closure that is true
-GATE_ALPHA = 0.001
 LANDING = "landing"
 UNCORRECTED = "uncorrected"
 BY_DISTANCE = "by distance"
-# What the solutions of the pose graph are called
-SOLUTIONS: Mapping[str, str] = {
-    "all": "pose graph, all closures",
-    "gated": "pose graph, gated",
-    "dcs": "pose graph, DCS",
-    "gnc": "pose graph, GNC",
-}
 # A path that is shorter is no loop, whatever its ends
 MIN_PATH_M = 2.0
 SINGLE_LOOP = (

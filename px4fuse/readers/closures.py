@@ -2,23 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 from px4fuse.errors import TrajectoryError
+from px4fuse.request import GivenClosure
 
-DEFAULT_SIGMA_M = 0.10
 MAX_CLOSURES = 10_000
 _FIELDS = (2, 3)
-
-
-@dataclass(frozen=True)
-class GivenClosure:
-    """Two times (s) at which the vehicle was at the same place, within ``sigma_m`` each axis."""
-
-    time_1_s: float
-    time_2_s: float
-    sigma_m: float = DEFAULT_SIGMA_M
 
 
 def parse_closure(text: str) -> GivenClosure:

@@ -37,7 +37,7 @@ def draw(document: Document) -> Iterator[Figure]:
     """Draw as many axes on a page as fit, at most two; none where the budget was not made."""
     started = None
     on_page = 0
-    for name, budget in document.comparison.budget.items():
+    for name, budget in document.analysis.budget.items():
         if started is not None and (
             on_page == AXES_PER_PAGE or started[1].y - _height(started[1], budget) < BOTTOM
         ):

@@ -18,11 +18,9 @@ MAX_DROP = 12.0
 
 
 def draw(document: Document) -> Iterator[Figure]:
-    """Draw one page; none where the clock was not looked at."""
+    """Draw one page."""
     comparison = document.comparison
-    clock = comparison.clock
-    if clock is None:
-        return
+    clock = document.analysis.clock
     figure, cursor = page(
         "Clock",
         "Late or early stamps hardly show in the innovations, since the filter follows. They show "

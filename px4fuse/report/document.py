@@ -6,25 +6,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from px4fuse.analysis import Analysis
 from px4fuse.comparison.comparison import Comparison
 from px4fuse.findings import Finding
 from px4fuse.loop.loop import Loop
-
-
-@dataclass(frozen=True)
-class Student:
-    """Whose report it is; every part may be empty.
-
-    Attributes
-    ----------
-    name, id : str
-    notes : str
-        The student's own words, Markdown.
-    """
-
-    name: str = ""
-    id: str = ""
-    notes: str = ""
+from px4fuse.results.model import Student
 
 
 @dataclass(frozen=True)
@@ -33,7 +19,7 @@ class Document:
 
     Attributes
     ----------
-    comparison : Comparison
+    analysis : Analysis
     findings : tuple of Finding
         Most severe first.
     student : Student
@@ -44,11 +30,16 @@ class Document:
         that run.
     """
 
-    comparison: Comparison
+    analysis: Analysis
     findings: tuple[Finding, ...]
     student: Student
     command: str
     made: Mapping[str, Any] | None = None
+
+    @property
+    def comparison(self) -> Comparison:
+        """The comparison itself, without what explains it."""
+        return self.analysis.comparison
 
     @property
     def log(self) -> tuple[str, str]:

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from px4fuse.filter.signals import Array
 from px4fuse.findings import Finding
 from px4fuse.flight import Unavailable
-from px4fuse.loop.loop import BY_DISTANCE, SOLUTIONS, UNCORRECTED, Correction, Loop
+from px4fuse.loop.loop import BY_DISTANCE, UNCORRECTED, Correction, Loop
 from px4fuse.report.cover import write_finding
 from px4fuse.report.document import Document, LoopDocument
 from px4fuse.report.loop_words import (
@@ -44,6 +44,7 @@ from px4fuse.report.style import (
     thin,
 )
 from px4fuse.trajectory.evaluation import Evaluation, Interval, Statistics
+from px4fuse.trajectory.graph.analysis import SOLUTIONS
 from px4fuse.trajectory.model import AXES_OF_FRAME
 
 Value = Statistics | Unavailable
@@ -63,7 +64,7 @@ LABEL_WIDTH = 0.085
 
 def draw(document: Document) -> Iterator[Figure]:
     """Draw the loop's pages; none where the flight holds no loop."""
-    loop = document.comparison.loop
+    loop = document.analysis.loop
     if isinstance(loop, Loop):
         yield from draw_loop(loop)
 

@@ -10,7 +10,7 @@ from rich.text import Text
 
 from px4fuse.findings import Finding
 from px4fuse.flight import Unavailable
-from px4fuse.loop.loop import SOLUTIONS, Loop
+from px4fuse.loop.loop import Loop
 from px4fuse.report.loop_words import (
     ate_words,
     closure_name,
@@ -24,7 +24,7 @@ from px4fuse.report.loop_words import (
 )
 from px4fuse.report.terminal import print_finding, print_line
 from px4fuse.trajectory.evaluation import Evaluation, Statistics
-from px4fuse.trajectory.graph.analysis import MANY_CLOSURES, SolvedGraph
+from px4fuse.trajectory.graph.analysis import MANY_CLOSURES, SOLUTIONS, SolvedGraph
 
 MOST_ROWS = 10
 

@@ -40,10 +40,10 @@ MAP_HEIGHT = 0.235
 
 def draw(document: Document) -> Iterator[Figure]:
     """Draw one page; none where nothing was tuned."""
-    comparison = document.comparison
-    name = next((n for n in (HORIZONTAL, AISLE) if n in comparison.tuning), None)
+    comparison, tuning = document.comparison, document.analysis.tuning
+    name = next((n for n in (HORIZONTAL, AISLE) if n in tuning), None)
     if name is None:
-        name = next(iter(comparison.tuning), None)
+        name = next(iter(tuning), None)
     if name is None:
         return
     results = {result.axis.name: result for result in comparison.axes}
@@ -74,7 +74,7 @@ def _map(figure: Figure, top: float, document: Document, name: str) -> None:
     """Likelihood map with the optimum, its intervals and the chosen point."""
     width = (RIGHT - LEFT) * 0.45
     axes = figure.add_axes((LEFT + 0.015, top - MAP_HEIGHT, width, MAP_HEIGHT))
-    found = document.comparison.tuning[name]
+    found = document.analysis.tuning[name]
     if isinstance(found, Unavailable):
         empty(axes, f"No likelihood map: {found.reason}.")
         return

@@ -15,6 +15,9 @@ from importlib import metadata
 from importlib.resources import files
 from typing import Any
 
+import msgspec
+
+from px4fuse.analysis import Analysis
 from px4fuse.comparison.budget import Budget, Effect
 from px4fuse.comparison.comparison import AgainstTruth, AxisComparison, Comparison, FilterSummary
 from px4fuse.filter.clock import ClockOffset
@@ -24,7 +27,8 @@ from px4fuse.findings import Finding
 from px4fuse.flight import Unavailable, sample_rate
 from px4fuse.loop.loop import Loop
 from px4fuse.plain import present, unavailable
-from px4fuse.report.document import Document, Student
+from px4fuse.request import ComparisonRequest, LoopRequest
+from px4fuse.results.model import Student
 from px4fuse.results.trajectories import (
     evaluation_part,
     graph_part,
@@ -52,7 +56,13 @@ def to_json(results: dict[str, Any]) -> str:
     return json.dumps(results, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
 
 
-def results(document: Document) -> dict[str, Any]:
+def results(
+    request: ComparisonRequest,
+    analysis: Analysis,
+    findings: tuple[Finding, ...],
+    student: Student,
+    command: str,
+) -> dict[str, Any]:
     """Everything that the report says, as plain data.
 
     Returns
@@ -60,9 +70,10 @@ def results(document: Document) -> dict[str, Any]:
     dict
         Valid under :func:`schema`.
     """
-    comparison = document.comparison
+    comparison = analysis.comparison
     return {
         "schema": {"name": SCHEMA_NAME, "version": SCHEMA_VERSION},
+        "request": msgspec.to_builtins(request.recorded()),
         "log": _log(comparison),
         "position_source": _source(comparison),
         "settings": _settings(comparison),
@@ -75,50 +86,52 @@ def results(document: Document) -> dict[str, Any]:
             )
             if joint is not None
         },
-        "tuning": {name: _tuned(found) for name, found in comparison.tuning.items()},
-        "clock": _clock(
-            comparison.clock or Unavailable("clock offset", "it was not asked for", "See sync."),
-            comparison.settings.clock_offset_s,
-        ),
-        "budget": {name: _budget(found) for name, found in comparison.budget.items()},
-        "loop": loop_part(
-            comparison.loop or Unavailable("loop closure", "it was not asked for", "See loop.")
-        ),
-        "findings": [_finding(finding) for finding in document.findings],
+        "tuning": {name: _tuned(found) for name, found in analysis.tuning.items()},
+        "clock": _clock(analysis.clock, comparison.settings.clock_offset_s),
+        "budget": {name: _budget(found) for name, found in analysis.budget.items()},
+        "loop": loop_part(analysis.loop),
+        "findings": [_finding(finding) for finding in findings],
         "notes": list(comparison.notes),
         "missing": [asdict(part) for part in comparison.missing],
-        "student": asdict(document.student),
-        "provenance": provenance(document.command),
+        "student": msgspec.structs.asdict(student),
+        "provenance": provenance(command),
     }
 
 
 def tuning_results(
-    comparison: Comparison, tuned: Mapping[str, AxisTuning | Unavailable], command: str
+    request: ComparisonRequest,
+    comparison: Comparison,
+    tuned: Mapping[str, AxisTuning | Unavailable],
+    command: str,
 ) -> dict[str, Any]:
     """What ``px4fuse tune`` found, as plain data."""
     found = {name: _tuned(axis) for name, axis in tuned.items()}
-    return _of_command("px4fuse-tuning", comparison, command, {"tuning": found})
+    return _of_command("px4fuse-tuning", request, comparison, command, {"tuning": found})
 
 
 def sync_results(
-    comparison: Comparison, clock: ClockOffset | Unavailable, command: str
+    request: ComparisonRequest,
+    comparison: Comparison,
+    clock: ClockOffset | Unavailable,
+    command: str,
 ) -> dict[str, Any]:
     """What ``px4fuse sync`` found, as plain data."""
     found = _clock(clock, comparison.settings.clock_offset_s)
-    return _of_command("px4fuse-sync", comparison, command, {"clock": found})
+    return _of_command("px4fuse-sync", request, comparison, command, {"clock": found})
 
 
 def loop_results(
-    loop: Loop, findings: tuple[Finding, ...], student: Student, command: str
+    request: LoopRequest, loop: Loop, findings: tuple[Finding, ...], student: Student, command: str
 ) -> dict[str, Any]:
     """What ``px4fuse loop`` found, as plain data."""
     return {
         "schema": {"name": "px4fuse-loop", "version": "1.0"},
+        "request": msgspec.to_builtins(request.recorded()),
         "track": trajectory_part(loop.odometry.trajectory),
         "references": [trajectory_part(reference) for reference in loop.references],
         "loop": loop_part(loop),
         "findings": [_finding(finding) for finding in findings],
-        "student": asdict(student),
+        "student": msgspec.structs.asdict(student),
         "provenance": provenance(command),
     }
 
@@ -154,11 +167,16 @@ def _finding(finding: Finding) -> dict[str, Any]:
 
 
 def _of_command(
-    schema_name: str, comparison: Comparison, command: str, found: dict[str, Any]
+    schema_name: str,
+    request: ComparisonRequest,
+    comparison: Comparison,
+    command: str,
+    found: dict[str, Any],
 ) -> dict[str, Any]:
     """What a command found, with what it was found from."""
     return {
         "schema": {"name": schema_name, "version": "1.0"},
+        "request": msgspec.to_builtins(request.recorded()),
         "log": _log(comparison),
         "position_source": _source(comparison),
         "settings": _settings(comparison),

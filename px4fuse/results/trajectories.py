@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from px4fuse.flight import Unavailable
-from px4fuse.loop.loop import SOLUTIONS, Correction, Judged, Loop
+from px4fuse.loop.loop import Correction, Judged, Loop
 from px4fuse.loop.part import KnownEnd
 from px4fuse.plain import present, unavailable
 from px4fuse.trajectory.evaluation import (
@@ -17,7 +17,7 @@ from px4fuse.trajectory.evaluation import (
     RelativeError,
     Statistics,
 )
-from px4fuse.trajectory.graph.analysis import SolvedGraph
+from px4fuse.trajectory.graph.analysis import SOLUTIONS, SolvedGraph
 from px4fuse.trajectory.model import AXES_OF_FRAME, Array, Trajectory
 
 

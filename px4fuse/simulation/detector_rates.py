@@ -102,8 +102,8 @@ def found(seed: int, condition: Condition | None = None) -> tuple[str, ...]:
     flight = simulate_flight(Scenario(seed=seed), mistakes)
     noises = {**RIGHT_NOISES, **condition.settings}
     settings = Settings(sigma_a_m_s2=noises["sigma_a_m_s2"], sigma_z_m=noises["sigma_z_m"])
-    comparison = explain(compare(flight, settings, axes=("north", "east")))
-    return tuple(f.id for f in find(comparison) if f.id not in ALWAYS)
+    analysis = explain(compare(flight, settings, axes=("north", "east")))
+    return tuple(f.id for f in find(analysis) if f.id not in ALWAYS)
 
 
 def _job(job: tuple[int, Condition]) -> tuple[str, ...]:

@@ -30,10 +30,10 @@ from pypdf.generic import (
     StreamObject,
 )
 
-from px4fuse.grading.model import Refused, Report
 from px4fuse.report.pdf import RESULTS_NAME
 from px4fuse.report.seal import seal_of
 from px4fuse.results.build import SCHEMA_NAME, SCHEMA_VERSION, schema
+from px4fuse.verification.model import Refused, Report
 
 MAX_BYTES = 25_000_000
 MAX_PAGES = 100
@@ -539,6 +539,7 @@ def _loop_schema() -> dict[str, Any]:
     shared = {key: whole["properties"][key] for key in SHARED}
     own: dict[str, Any] = {
         "schema": {"type": "object"},
+        "request": {"type": "object"},
         "track": {"type": "object"},
         "references": {"type": "array", "items": {"type": "object"}},
     }

@@ -1,8 +1,8 @@
 """The analysis of a report once more: what was recorded, on the files that it was recorded from.
 
-The recorded command is a stranger's text. It goes through the command's own parser, which knows
-the range of every value; files are found by their SHA-256 among those that were given, never by
-name; and nothing that names an output is accepted.
+The recorded request is a stranger's. It is decoded strictly, and the analysis knows the range of
+every value; files are found by their SHA-256 among those that were given, never by name; and
+nothing in it names an output.
 """
 
 from __future__ import annotations
@@ -10,29 +10,27 @@ from __future__ import annotations
 import hashlib
 import os
 import re
-import shlex
 import shutil
 import tempfile
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from dataclasses import replace as replaced
 from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
-import click
-from click.core import ParameterSource
+import msgspec
+from msgspec.structs import replace
 
-from px4fuse.cli.inputs import MAX_NOTES_BYTES, NOT_RECORDED, command_line, run_comparison
 from px4fuse.errors import Px4FuseError, SettingsError
-from px4fuse.grading.model import Refused
-from px4fuse.report.document import Document, LoopDocument, Student
+from px4fuse.report.document import Document, LoopDocument
+from px4fuse.request import ComparisonRequest, LoopRequest, Request, command_line
+from px4fuse.results.model import MAX_NOTES_BYTES, Student
+from px4fuse.verification.model import Refused
 
-MAX_COMMAND = 20_000
 MAX_NAME_BYTES = 240
 MAX_PERSON = 10_000
-MAX_CLOSURES_BYTES = 1_000_000
-NOT_OURS = "the recorded command is not one of px4fuse's"
-COMMANDS = ("compare", "loop")
+NOT_OURS = "the recorded request is not one that px4fuse can have made"
 # What Windows does not take in a name, or takes for something else than a file
 _WINDOWS = re.compile(r'[<>:"|?*]|^(?:con|prn|aux|nul|com\d|lpt\d)(?:\.|$)|[. ]$', re.IGNORECASE)
 _VERSION = re.compile(r"[0-9A-Za-z.+!_-]{1,60}")
@@ -101,11 +99,12 @@ def recompute(results: Mapping[str, Any], logs: Mapping[str, Path]) -> Recompute
     try:
         person = _person(results)
         versions = _versions(results)
-        name, context = _parsed(results)
-        with tempfile.TemporaryDirectory(prefix="px4fuse-") as folder, context:
+        request = _request(results)
+        with tempfile.TemporaryDirectory(prefix="px4fuse-") as folder:
             files = _Files(results, logs, Path(folder))
-            again = _compared if name == "compare" else _looped
-            return again(context, files, person, versions)
+            if isinstance(request, LoopRequest):
+                return _looped(request, files, person, versions)
+            return _compared(request, files, person, versions)
     except SettingsError as error:  # no run with these settings can have made a report
         return Refused(f"{NOT_OURS}: {error}")
     except (_RefusedError, Px4FuseError) as error:
@@ -117,37 +116,13 @@ def recompute(results: Mapping[str, Any], logs: Mapping[str, Path]) -> Recompute
 # -- what was recorded -----------------------------------------------------------------------------
 
 
-def _parsed(results: Mapping[str, Any]) -> tuple[str, click.Context]:
-    """The recorded command, through its own parser."""
-    made = results.get("provenance")
-    recorded = made.get("command") if isinstance(made, Mapping) else None
-    if not isinstance(recorded, str) or len(recorded) > MAX_COMMAND:
-        raise _RefusedError(NOT_OURS)
+def _request(results: Mapping[str, Any]) -> Request:
+    """What was analysed and how, as the results record it."""
     try:
-        words = shlex.split(recorded)
-    except ValueError as error:
-        raise _RefusedError(NOT_OURS) from error
-    # help would be printed at once
-    if len(words) < 3 or words[0] != "px4fuse" or {"--help", "-h"} & set(words):
-        raise _RefusedError(NOT_OURS)
-    name, file, options = words[1], words[2], words[3:]
-    if name not in COMMANDS:
-        raise _RefusedError(NOT_OURS)
-    try:
-        context = _command(name).make_context(name, [*options, "--", file])
-    except (click.ClickException, click.exceptions.Exit, click.Abort, ValueError) as error:
-        raise _RefusedError(NOT_OURS) from error
-    for parameter in NOT_RECORDED:
-        if context.get_parameter_source(parameter) == ParameterSource.COMMANDLINE:
-            raise _RefusedError(NOT_OURS)
-    return name, context
-
-
-def _command(name: str) -> click.Command:
-    from px4fuse.cli.compare import compare  # noqa: PLC0415 - they import this package
-    from px4fuse.cli.loop import loop  # noqa: PLC0415
-
-    return compare if name == "compare" else loop
+        request: Request = msgspec.convert(results.get("request"), Request)
+    except msgspec.ValidationError as error:
+        raise _RefusedError(f"{NOT_OURS}: {error}") from error
+    return request
 
 
 def _person(results: Mapping[str, Any]) -> Student:
@@ -196,17 +171,13 @@ class _Files:
         self.logs = logs
         self._folder = folder
 
-    def place(self, recorded: Path, sha256: object, what: str) -> Path:
+    def place(self, recorded: str, sha256: object, what: str) -> Path:
         """A file with this content and the recorded name."""
         path = self.logs.get(sha256) if isinstance(sha256, str) else None
         if path is None:
             raise _RefusedError(f"none of the files given has the SHA-256 of {what}")
-        return self.link(recorded, path)
-
-    def link(self, recorded: Path, path: Path) -> Path:
-        """A given file under the recorded name."""
-        name = str(recorded)
-        plain = name == recorded.name and "\\" not in name and name.isprintable()
+        name = recorded
+        plain = name == Path(name).name and "\\" not in name and name.isprintable()
         if not plain or len(name.encode(errors="replace")) > MAX_NAME_BYTES:
             raise _RefusedError(f"{NOT_OURS}: a file name in it is none")
         if os.name == "nt" and _WINDOWS.search(name):
@@ -231,91 +202,63 @@ def _joined(results: Mapping[str, Any], role: str) -> object:
     return None
 
 
-def _part(argument: Path) -> tuple[Path, str]:
+def _part(source: str) -> tuple[str, str]:
     """File and part of ``LOG:vio``, without a look at any file."""
     from px4fuse.loop.tracks import PARTS  # noqa: PLC0415
 
-    name, colon, tail = str(argument).rpartition(":")
-    return (Path(name), f":{tail}") if colon and tail in PARTS else (argument, "")
+    name, colon, tail = source.rpartition(":")
+    return (name, f":{tail}") if colon and tail in PARTS else (source, "")
 
 
-# -- the two commands ------------------------------------------------------------------------------
+# -- the two kinds of report -----------------------------------------------------------------------
 
 
 def _compared(
-    context: click.Context, files: _Files, person: Student, versions: dict[str, Any]
+    request: ComparisonRequest, files: _Files, person: Student, versions: dict[str, Any]
 ) -> Recomputed:
-    from px4fuse.analysis import explain  # noqa: PLC0415
+    from px4fuse.analysis import run  # noqa: PLC0415
     from px4fuse.findings import find  # noqa: PLC0415
     from px4fuse.results.build import results, to_json  # noqa: PLC0415
 
-    given = {name: value for name, value in context.params.items() if name not in NOT_RECORDED}
-    recorded = given.pop("log")
-    log = files.place(recorded, log_sha256(files.results), "the log")
-    for option in ("mavlink", "position"):
-        if given[option] is not None:
-            sha256 = _joined(files.results, option)
-            given[option] = files.place(given[option], sha256, f"--{option}")
-    compared = explain(run_comparison(log, lambda _: None, **given))
-    document = Document(compared, find(compared), person, command_line("compare", recorded))
-    found = results(document)
+    recorded = request
+    log = files.place(request.log, log_sha256(files.results), "the log")
+    request = replace(request, log=str(log))
+    if request.mavlink is not None:
+        sha256 = _joined(files.results, "mavlink")
+        placed = files.place(request.mavlink, sha256, "--mavlink")
+        request = replace(request, mavlink=str(placed))
+    if request.position is not None:
+        sha256 = _joined(files.results, "position")
+        placed = files.place(request.position.path, sha256, "--position")
+        request = replace(request, position=replace(request.position, path=str(placed)))
+    analysis = run(request)
+    document = Document(analysis, find(analysis), person, command_line(recorded))
+    found = results(recorded, analysis, document.findings, person, document.command)
     return Recomputed(found, partial(_drawn, document, to_json(found), versions))
 
 
 def _looped(
-    context: click.Context, files: _Files, person: Student, versions: dict[str, Any]
+    request: LoopRequest, files: _Files, person: Student, versions: dict[str, Any]
 ) -> Recomputed:
-    from px4fuse.cli.loop import run_loop  # noqa: PLC0415
+    from px4fuse.analysis import run_loop  # noqa: PLC0415
     from px4fuse.findings import find_loop  # noqa: PLC0415
     from px4fuse.results.build import loop_results, to_json  # noqa: PLC0415
 
-    given = {name: value for name, value in context.params.items() if name not in NOT_RECORDED}
-    recorded = given.pop("source")
-    path, part = _part(recorded)
+    recorded = request
+    path, part = _part(request.source)
     source = files.place(path, log_sha256(files.results), "the log")
-    if given["reference"] is not None:
-        path, its_part = _part(given["reference"])
+    request = replace(request, source=f"{source}{part}")
+    if request.reference is not None:
+        path, part = _part(request.reference)
         references = files.results.get("references")
         last = references[-1] if isinstance(references, list) and references else None
         sha256 = last.get("sha256") if isinstance(last, Mapping) else None
         placed = files.place(path, sha256, "--reference")
-        given["reference"] = Path(f"{placed}{its_part}")
-    if given["closures"] is not None:
-        given["closures"] = _closures(given["closures"], files)
-    found = run_loop(Path(f"{source}{part}"), lambda _: None, **given)
-    findings = find_loop(found)
-    command = command_line("loop", recorded)
-    made = loop_results(found, findings, person, command)
-    document = LoopDocument(found, findings, person, command)
+        request = replace(request, reference=f"{placed}{part}")
+    found = run_loop(request)
+    document = LoopDocument(found, find_loop(found), person, command_line(recorded))
+    made = loop_results(recorded, found, document.findings, person, document.command)
     return Recomputed(made, partial(_drawn, document, to_json(made), versions))
-
-
-def _closures(recorded: Path, files: _Files) -> Path:
-    """The file of closures, whose SHA-256 is not recorded: one whose closures were all used.
-
-    Whether it was this one the results show, which list every closure.
-    """
-    from px4fuse.readers.closures import read_closures  # noqa: PLC0415
-
-    loop = files.results.get("loop")
-    used = loop.get("closures") if isinstance(loop, Mapping) else None
-    # apart, as the times themselves may count from the first pose
-    apart = [
-        one["time_2_s"] - one["time_1_s"]
-        for one in (used if isinstance(used, list) else ())
-        if isinstance(one, Mapping)
-    ]
-    for path in files.logs.values():
-        if path.stat().st_size > MAX_CLOSURES_BYTES:
-            continue
-        try:
-            found = read_closures(path)
-        except Px4FuseError:
-            continue
-        times = [one.time_2_s - one.time_1_s for one in found]
-        if all(any(abs(time - used_s) < 1e-3 for used_s in apart) for time in times):
-            return files.link(recorded, path)
-    raise _RefusedError("none of the files given holds the closures of --closures")
 
 
 def _drawn(document: Document | LoopDocument, text: str, versions: dict[str, Any]) -> bytes:
@@ -324,6 +267,6 @@ def _drawn(document: Document | LoopDocument, text: str, versions: dict[str, Any
     from px4fuse.report.style import text_width  # noqa: PLC0415
 
     made = versions | {"command": document.command}
-    drawn = render(replace(document, made=made), text)
+    drawn = render(replaced(document, made=made), text)
     text_width.cache_clear()  # it holds every text of every report otherwise
     return drawn

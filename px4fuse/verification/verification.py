@@ -15,11 +15,11 @@ from pathlib import Path
 from typing import Any
 
 from px4fuse.errors import Px4FuseError
-from px4fuse.grading.model import Difference, Refused, Report, Status, Verdict
 from px4fuse.results.build import SCHEMA_NAME, SCHEMA_VERSION
 from px4fuse.verification import rerun
 from px4fuse.verification.agreement import disagreements
 from px4fuse.verification.intake import cleaned, one_line
+from px4fuse.verification.model import Difference, Refused, Report, Status, Verdict
 from px4fuse.verification.page_comparison import (
     TOLERANCE_POINTS,
     Compared,

@@ -9,10 +9,18 @@ import numpy as np
 
 from px4fuse.errors import TrajectoryError
 from px4fuse.flight import Unavailable
-from px4fuse.loop.loop import GATE_ALPHA, SOLUTIONS
 from px4fuse.trajectory.graph.pose_graph import GateResult, PoseGraph, Solution, gate, solve
 
 MANY_CLOSURES = 1000
+# Chance that the gate rejects a closure that is true
+GATE_ALPHA = 0.001
+# What the solutions of the pose graph are called
+SOLUTIONS: Mapping[str, str] = {
+    "all": "pose graph, all closures",
+    "gated": "pose graph, gated",
+    "dcs": "pose graph, DCS",
+    "gnc": "pose graph, GNC",
+}
 
 
 @dataclass(frozen=True)
@@ -25,7 +33,7 @@ class SolvedGraph:
         With the poses of the plain solution.
     gates : tuple of GateResult, or Unavailable
         Of every edge that is no odometry.
-    solutions : mapping from name, as in :data:`px4fuse.loop.loop.SOLUTIONS`, to Solution
+    solutions : mapping from name, as in :data:`SOLUTIONS`, to Solution
     """
 
     graph: PoseGraph

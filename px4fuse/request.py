@@ -1,0 +1,274 @@
+"""What is analysed and how: the one thing that a command line is parsed into.
+
+A request is what :func:`px4fuse.analysis.run` takes and what the results record, so that a report
+can be made again without its command line.
+"""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Iterator
+from pathlib import PurePath
+from typing import Annotated, Any, Literal
+
+import msgspec
+
+AUTO: Literal["auto"] = "auto"
+AxisName = Literal["north", "east", "down", "aisle"]
+InputName = Literal["imu", "zero"]
+# What a trajectory file's axes may be said to be
+FrameName = Literal["NED", "FRD", "ENU", "camera"]
+System = Annotated[int, msgspec.Meta(ge=0, le=255)]
+
+
+class PositionFile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The positioning system's own recording, and how it is read.
+
+    Attributes
+    ----------
+    path : str
+    frame : {"ned", "enu", "nwu"} or None
+        None: from its column names, or what fits EKF2.
+    yaw_deg : float, "auto" or None
+        Turn it clockwise, seen from above; "auto" finds yaw and origin.
+    columns : tuple of str or None
+        Names or numbers of its columns: time, x, y, z and sigma.
+    time_unit : {"s", "ms", "us", "ns"} or None
+    length_unit : {"m", "cm", "mm"} or None
+    """
+
+    path: str
+    frame: Literal["ned", "enu", "nwu"] | None = None
+    yaw_deg: float | Literal["auto"] | None = None
+    columns: tuple[str, ...] | None = None
+    time_unit: Literal["s", "ms", "us", "ns"] | None = None
+    length_unit: Literal["m", "cm", "mm"] | None = None
+
+
+class ComparisonRequest(
+    msgspec.Struct,
+    frozen=True,
+    kw_only=True,
+    forbid_unknown_fields=True,
+    tag_field="command",
+    tag="compare",
+):
+    """A flight to compare with EKF2, as ``compare``, ``tune`` and ``sync`` take it.
+
+    Attributes
+    ----------
+    log : str
+        Path of the ULog or MAVLink recording; in results its name.
+    mavlink : str or None
+        Path of the MAVLink recording of the same flight.
+    system : int or None
+        MAVLink system id of the vehicle; None for the one with the most data.
+    position : PositionFile or None
+    position_source : str or None
+        Name of a track of the flight; None for the best.
+    sigma_a_m_s2, sigma_z_m, dt_s : float
+        As :class:`px4fuse.filter.kalman.Settings`.
+    input : {"imu", "zero"} or None
+        None: the IMU where it is logged.
+    axes : tuple of str
+        Empty for all that the source supports.
+    heading_deg : float or None
+        Of the aisle; None for that of the track.
+    start_s, end_s : float or None
+        Segment, seconds from the first data; None for the flight.
+    clock_offset_s : float, "auto" or None
+        Added to the source's stamps; None is 0, or "auto" with ``position``.
+    """
+
+    log: str
+    mavlink: str | None = None
+    system: System | None = None
+    position: PositionFile | None = None
+    position_source: str | None = None
+    sigma_a_m_s2: float = 0.5
+    sigma_z_m: float = 0.10
+    dt_s: float = 0.1
+    input: InputName | None = None
+    axes: tuple[AxisName, ...] = ()
+    heading_deg: float | None = None
+    start_s: float | None = None
+    end_s: float | None = None
+    clock_offset_s: float | Literal["auto"] | None = None
+
+    def recorded(self) -> ComparisonRequest:
+        """The same with the names of files alone, as results record it."""
+        position = self.position
+        return msgspec.structs.replace(
+            self,
+            log=_name(self.log),
+            mavlink=None if self.mavlink is None else _name(self.mavlink),
+            position=None
+            if position is None
+            else msgspec.structs.replace(position, path=_name(position.path)),
+        )
+
+
+class Landing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Where it landed from where it took off, and how far it was turned there.
+
+    Attributes
+    ----------
+    forward_m, right_m : float
+        Along the vehicle's nose at take-off, and to the right of it.
+    turned_deg : float or None
+        Clockwise; None where it is not known.
+    """
+
+    forward_m: float
+    right_m: float
+    turned_deg: float | None = None
+
+
+class GivenClosure(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Two times (s) at which the vehicle was at the same place, and how precisely (m, 1 σ)."""
+
+    time_1_s: float
+    time_2_s: float
+    sigma_m: float = 0.10
+
+
+class LoopRequest(
+    msgspec.Struct,
+    frozen=True,
+    kw_only=True,
+    forbid_unknown_fields=True,
+    tag_field="command",
+    tag="loop",
+):
+    """A loop to measure and correct, as ``loop`` takes it.
+
+    Attributes
+    ----------
+    source : str
+        Path of a trajectory or a flight log, as ``FILE`` or ``LOG:PART``; in results its name.
+    frame : str or None
+        What a trajectory's axes are; None as its reader tells.
+    system : int or None
+        MAVLink system id of the vehicle.
+    reference : str or None
+        Path of what the paths are scored against, besides the log's ground truth.
+    start_s, end_s : float or None
+        Override take-off and landing.
+    landed_at : Landing or None
+    came_back : bool
+        False where the landing closes no loop.
+    closures : tuple of GivenClosure
+    position_drift_m, heading_drift_deg : float
+        What the odometry drifts in 100 m (1 σ).
+    key_frames_m : float or None
+        Distance between key frames; None for one that suits the path.
+    """
+
+    source: str
+    frame: FrameName | None = None
+    system: System | None = None
+    reference: str | None = None
+    start_s: float | None = None
+    end_s: float | None = None
+    landed_at: Landing | None = None
+    came_back: bool = True
+    closures: tuple[GivenClosure, ...] = ()
+    position_drift_m: float = 1.0
+    heading_drift_deg: float = 3.0
+    key_frames_m: float | None = None
+
+    def recorded(self) -> LoopRequest:
+        """The same with the names of files alone, as results record it."""
+        return msgspec.structs.replace(
+            self,
+            source=_name(self.source),
+            reference=None if self.reference is None else _name(self.reference),
+        )
+
+
+Request = ComparisonRequest | LoopRequest
+
+# The option that gives each field, in the order in which a command line is written
+OPTIONS = {
+    "mavlink": "--mavlink",
+    "system": "--system",
+    "path": "--position",
+    "frame": "--position-frame",
+    "yaw_deg": "--position-yaw",
+    "columns": "--position-columns",
+    "time_unit": "--position-time-unit",
+    "length_unit": "--position-unit",
+    "position_source": "--position-source",
+    "sigma_a_m_s2": "--sigma-a",
+    "sigma_z_m": "--sigma-z",
+    "dt_s": "--dt",
+    "input": "--input",
+    "axes": "--axis",
+    "heading_deg": "--heading",
+    "start_s": "--start",
+    "end_s": "--end",
+    "clock_offset_s": "--clock-offset",
+}
+LOOP_OPTIONS = {
+    "frame": "--frame",
+    "system": "--system",
+    "reference": "--reference",
+    "start_s": "--from",
+    "end_s": "--to",
+    "landed_at": "--landed-at",
+    "closures": "--closure",
+    "position_drift_m": "--drift",
+    "heading_drift_deg": "--heading-drift",
+    "key_frames_m": "--key-frames",
+}
+
+
+def command_line(request: Request, command: str | None = None) -> str:
+    """The command that makes this again, for people to read: without folders and defaults.
+
+    Parameters
+    ----------
+    request : Request
+    command : str, optional
+        Of those that take this request; by default ``compare`` or ``loop``.
+
+    Returns
+    -------
+    str
+        As a POSIX shell reads it.
+    """
+    recorded = request.recorded()
+    if isinstance(recorded, LoopRequest):
+        words = ["px4fuse", command or "loop", recorded.source]
+        words += _options(recorded, LOOP_OPTIONS)
+        return shlex.join(words if recorded.came_back else [*words, "--open"])
+    words = ["px4fuse", command or "compare", recorded.log, *_options(recorded, OPTIONS)]
+    if recorded.position is not None:
+        words += _options(recorded.position, OPTIONS)
+    return shlex.join(words)
+
+
+def _options(struct: msgspec.Struct, options: dict[str, str]) -> Iterator[str]:
+    """Options with their values, for the fields that are not at their defaults."""
+    for field in msgspec.structs.fields(struct):
+        value = getattr(struct, field.name)
+        if field.name not in options or value == field.default:
+            continue
+        several = value if field.name in ("axes", "closures") else (value,)
+        for single in several:
+            yield options[field.name]
+            yield _typed(single)
+
+
+def _typed(value: Any) -> str:
+    """A value as it is typed."""
+    if isinstance(value, msgspec.Struct):
+        value = msgspec.structs.astuple(value)
+    if isinstance(value, tuple):
+        return ",".join(_typed(part) for part in value if part is not None)
+    return f"{value:.12g}" if isinstance(value, float) else str(value)
+
+
+def _name(path: str) -> str:
+    """Name of a file without its folders and without stray bytes that a terminal hands over."""
+    return PurePath(path).name.encode(errors="replace").decode()
