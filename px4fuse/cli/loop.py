@@ -172,7 +172,7 @@ def loop(
     if is_g2o(split_part(str(source))[0]):
         _solve(source, json_path, g2o, True if given["robust"] else None)
         return
-    request = _request(source, given)
+    request = loop_request(source, given)
     _spare(tum, g2o, *((json_path,) if output is None else report_paths(output, json_path)))
     with progress(json_path == STANDARD_OUTPUT) as step:
         found = run_loop(request, step)
@@ -192,7 +192,7 @@ def loop(
     _finish(results, json_path, contents, lambda console: print_loop(console, found, findings))
 
 
-def _request(source: Path, given: dict[str, Any]) -> LoopRequest:
+def loop_request(source: Path, given: dict[str, Any]) -> LoopRequest:
     """What the command's options gave, as a request."""
     from px4fuse.readers.closures import parse_closure, read_closures
     from px4fuse.request import LoopRequest

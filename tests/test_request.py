@@ -1,0 +1,154 @@
+"""What a command line is parsed into, and the command line that is written from it."""
+
+from __future__ import annotations
+
+import shlex
+
+import click
+import msgspec
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from px4fuse.cli.compare import compare
+from px4fuse.cli.inputs import comparison_request
+from px4fuse.cli.loop import loop, loop_request
+from px4fuse.request import (
+    ComparisonRequest,
+    GivenClosure,
+    Landing,
+    LoopRequest,
+    PositionFile,
+    Request,
+    command_line,
+)
+
+NAMES = st.text("abc ü'\"$-_.", min_size=1, max_size=12).map(lambda text: f"f{text}x")
+NUMBERS = st.integers(-10_000, 10_000).map(lambda number: number / 1000.0)
+POSITIVE = st.integers(1, 10_000).map(lambda number: number / 1000.0)
+
+
+def maybe(strategy: st.SearchStrategy) -> st.SearchStrategy:
+    return st.none() | strategy
+
+
+COMPARISONS = st.builds(
+    ComparisonRequest,
+    log=NAMES,
+    mavlink=maybe(NAMES),
+    system=maybe(st.integers(0, 255)),
+    position=maybe(
+        st.builds(
+            PositionFile,
+            path=NAMES,
+            frame=maybe(st.sampled_from(["ned", "enu", "nwu"])),
+            yaw_deg=maybe(NUMBERS | st.just("auto")),
+            columns=maybe(st.lists(st.sampled_from("tabcd"), min_size=1).map(tuple)),
+            time_unit=maybe(st.sampled_from(["s", "ms", "us", "ns"])),
+            length_unit=maybe(st.sampled_from(["m", "cm", "mm"])),
+        )
+    ),
+    position_source=maybe(NAMES),
+    sigma_a_m_s2=POSITIVE,
+    sigma_z_m=POSITIVE,
+    dt_s=POSITIVE,
+    input=maybe(st.sampled_from(["imu", "zero"])),
+    axes=st.lists(st.sampled_from(["north", "east", "down", "aisle"])).map(tuple),
+    heading_deg=maybe(NUMBERS),
+    start_s=maybe(NUMBERS),
+    end_s=maybe(NUMBERS),
+    clock_offset_s=maybe(NUMBERS | st.just("auto")),
+)
+LOOPS = st.builds(
+    LoopRequest,
+    source=NAMES,
+    frame=maybe(st.sampled_from(["NED", "FRD", "ENU", "camera"])),
+    system=maybe(st.integers(0, 255)),
+    reference=maybe(NAMES),
+    start_s=maybe(NUMBERS),
+    end_s=maybe(NUMBERS),
+    landed_at=maybe(st.builds(Landing, NUMBERS, NUMBERS, maybe(NUMBERS))),
+    came_back=st.booleans(),
+    closures=st.lists(st.builds(GivenClosure, NUMBERS, NUMBERS, POSITIVE), max_size=3).map(tuple),
+    position_drift_m=POSITIVE,
+    heading_drift_deg=POSITIVE,
+    key_frames_m=maybe(POSITIVE),
+)
+
+
+def parsed(command: str) -> Request:
+    """The request that a shell, click and the command make of a command line."""
+    program, name, file, *options = shlex.split(command)
+    assert program == "px4fuse"
+    made = compare if name == "compare" else loop
+    context = made.make_context(name, [*options, "--", file])
+    own = ("output", "json_path", "fail_on", "student", "student_id", "notes", "tum", "g2o")
+    given_ = {key: value for key, value in context.params.items() if key not in own}
+    if name == "compare":
+        return comparison_request(given_.pop("log"), given_)
+    return loop_request(given_.pop("source"), given_)
+
+
+@settings(deadline=None)
+@given(COMPARISONS | LOOPS)
+def test_the_command_line_of_a_request_gives_the_request(request: Request) -> None:
+    assert parsed(command_line(request)) == request
+
+
+@given(COMPARISONS | LOOPS)
+def test_a_request_survives_being_recorded(request: Request) -> None:
+    assert msgspec.json.decode(msgspec.json.encode(request), type=Request) == request
+
+
+def test_what_is_recorded_names_no_folder() -> None:
+    request = ComparisonRequest(
+        log="/home/eve/a.ulg", mavlink="b/c.tlog", position=PositionFile(path="../d.csv")
+    )
+    assert command_line(request) == "px4fuse compare a.ulg --mavlink c.tlog --position d.csv"
+    assert "eve" not in msgspec.json.encode(request.recorded()).decode()
+    assert LoopRequest(source="x/l.ulg:vio", reference="y/s.tum").recorded() == LoopRequest(
+        source="l.ulg:vio", reference="s.tum"
+    )
+
+
+def test_other_commands_that_take_the_same_request_are_named() -> None:
+    assert command_line(ComparisonRequest(log="a.ulg", sigma_z_m=0.2), "tune") == (
+        "px4fuse tune a.ulg --sigma-z 0.2"
+    )
+
+
+@pytest.mark.parametrize(
+    ("recorded", "says"),
+    [
+        ({"command": "tune", "log": "a.ulg"}, "Invalid value 'tune'"),
+        ({"command": "compare"}, "missing required field `log`"),
+        ({"command": "compare", "log": "a", "output": "b"}, "unknown field `output`"),
+        ({"command": "compare", "log": "a", "sigma_z_m": "0.1"}, r"\$.sigma_z_m"),
+        ({"command": "compare", "log": "a", "axes": ["up"]}, "Invalid enum value 'up'"),
+        ({"command": "compare", "log": "a", "system": 256}, "<= 255"),
+    ],
+)
+def test_what_px4fuse_cannot_have_recorded_is_refused(recorded: object, says: str) -> None:
+    with pytest.raises(msgspec.ValidationError, match=says):
+        msgspec.convert(recorded, Request)
+
+
+@pytest.mark.parametrize("command", [compare, loop])
+def test_every_option_of_an_analysis_is_in_the_request(command: click.Command) -> None:
+    """An option that the request forgets would be missing from every record."""
+    about_outputs = {"-o", "--json", "--student", "--id", "--notes", "--fail-on", "--tum", "--g2o",
+                     "--closures", "--robust"}  # fmt: skip
+    request = ComparisonRequest(
+        log="a", mavlink="b", system=1, sigma_a_m_s2=1.0, sigma_z_m=1.0, dt_s=0.2, input="zero",
+        axes=("down",), heading_deg=1.0, start_s=1.0, end_s=2.0, clock_offset_s=0.1,
+        position_source="g",
+        position=PositionFile(path="c", frame="enu", yaw_deg=1.0, columns=("t",), time_unit="s",
+                              length_unit="m"),
+    ) if command is compare else LoopRequest(
+        source="a", frame="NED", system=1, reference="b", start_s=1.0, end_s=2.0,
+        landed_at=Landing(1.0, 2.0), came_back=False, closures=(GivenClosure(1.0, 2.0, 0.1),),
+        position_drift_m=2.0, heading_drift_deg=2.0, key_frames_m=0.1,
+    )  # fmt: skip
+    words = set(shlex.split(command_line(request)))
+    options = {parameter.opts[0] for parameter in command.params if parameter.opts[0][0] == "-"}
+    assert options - about_outputs <= words
