@@ -16,6 +16,7 @@ import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
+from px4fuse.arrays import Array
 from px4fuse.filter.signals import Axis, Segment, project_acceleration
 from px4fuse.flight import (
     ANGULAR_RATE_COLUMNS,
@@ -36,7 +37,6 @@ from px4fuse.flight import (
     Unavailable,
 )
 
-Array = NDArray[np.float64]
 Span = tuple[float, float]
 
 DT = 0.1  # s, the lesson's

@@ -12,10 +12,10 @@ import numpy as np
 import pandas as pd
 import pytest
 from flights import PARAMETERS, Estimator, Uwb, aisle_flight, table
-from numpy.typing import NDArray
 from scipy.integrate import cumulative_trapezoid
 from ulog_tools import GENERATIONS, make_log, stamps, topic
 
+from px4fuse.arrays import Array
 from px4fuse.comparison.budget import CAUSES, Budget, Effect, Run, budget, states_at
 from px4fuse.comparison.comparison import Comparison, compare
 from px4fuse.filter.clock import ClockOffset
@@ -43,7 +43,6 @@ from px4fuse.report.document import Document, Student
 from px4fuse.report.style import BOTTOM, report_style
 from px4fuse.results.build import results, schema
 
-Array = NDArray[np.float64]
 DEFAULT = Settings()
 
 STEP_S = 0.01

@@ -13,19 +13,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
+from px4fuse.arrays import Array, BoolArray
 from px4fuse.comparison.projection import MIN_COMMON_SAMPLES, observation_variance
 from px4fuse.filter.kalman import Settings, timeline
 from px4fuse.filter.likelihood import filtered, preintegrate
-from px4fuse.filter.signals import (
-    AISLE,
-    Array,
-    Axis,
-    Segment,
-    ned_acceleration,
-    project_acceleration,
-)
+from px4fuse.filter.signals import AISLE, Axis, Segment, ned_acceleration, project_acceleration
 from px4fuse.flight import (
     EXTERNAL_VISION_RUNGS,
     SPECIFIC_FORCE_COLUMNS,
@@ -149,7 +142,7 @@ class Run:
 
     axis: Axis
     settings: Settings
-    left_out: NDArray[np.bool_]
+    left_out: BoolArray
     horizon_s: float = 0.0
 
 
@@ -527,7 +520,7 @@ def _ekf2_shift_s(given: Given) -> float | Unavailable:
     return -delay_ms * 1e-3 - given.settings.clock_offset_s
 
 
-def _too_few(left_out: NDArray[np.bool_]) -> Unavailable | None:
+def _too_few(left_out: BoolArray) -> Unavailable | None:
     fused = int(np.count_nonzero(~left_out))
     if fused >= MIN_COMMON_SAMPLES:
         return None
@@ -633,7 +626,7 @@ def states_at(run: Run, times: Array) -> tuple[Array, Array]:
     )
 
 
-def _padded(run: Run, start_s: float, end_s: float) -> tuple[Axis, NDArray[np.bool_]]:
+def _padded(run: Run, start_s: float, end_s: float) -> tuple[Axis, BoolArray]:
     """The axis with measurements that are not fused at both ends where it does not reach them."""
     time, value, left_out = run.axis.measurement_time_s, run.axis.measurement_m, run.left_out
     if time[0] > start_s:

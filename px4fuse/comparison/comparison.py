@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pandas as pd
 
+from px4fuse.arrays import Array
 from px4fuse.comparison.budget import Budget
 from px4fuse.comparison.projection import (
     MIN_COMMON_SAMPLES,
@@ -24,7 +25,6 @@ from px4fuse.filter.consistency import Consistency, HorizontalNis, assess, asses
 from px4fuse.filter.kalman import Replay, Settings, replay, state_at, variance_at
 from px4fuse.filter.likelihood import NoiseAsked, noise_asked
 from px4fuse.filter.signals import (
-    Array,
     Axis,
     Segment,
     choose_segment,

@@ -22,14 +22,14 @@ from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 from scipy.integrate import cumulative_trapezoid
 from scipy.spatial.transform import Rotation, Slerp
 from scipy.stats import chi2
 
+from px4fuse.arrays import Array, IntArray
 from px4fuse.filter.kalman import INITIAL_SIGMA_P_M, INITIAL_SIGMA_V_M_S, Settings
 from px4fuse.filter.likelihood import PROFILE_DROP, parabola_vertex
-from px4fuse.filter.signals import STANDARD_GRAVITY_M_S2, Array, Segment, within
+from px4fuse.filter.signals import STANDARD_GRAVITY_M_S2, Segment, within
 from px4fuse.flight import (
     ANGULAR_RATE_COLUMNS,
     POSITION_COLUMNS,
@@ -432,7 +432,7 @@ def _vertex(grid: Array, profile: Array) -> tuple[float, float]:
 
 def _interval(grid: Array, drop: Array) -> tuple[tuple[float, float], bool]:
     """95 % interval of a profile, and whether both its ends lie inside the grid."""
-    inside: NDArray[np.intp] = np.flatnonzero(drop <= PROFILE_DROP)
+    inside: IntArray = np.flatnonzero(drop <= PROFILE_DROP)
     ends = []
     for edge, step in ((int(inside[0]), -1), (int(inside[-1]), 1)):
         beyond = edge + step

@@ -17,10 +17,10 @@ from typing import Literal
 import numpy as np
 import pandas as pd
 from filterpy.kalman import KalmanFilter
-from numpy.typing import NDArray
 
+from px4fuse.arrays import Array, BoolArray, IntArray
 from px4fuse.errors import SettingsError
-from px4fuse.filter.signals import Array, Axis, step_means
+from px4fuse.filter.signals import Axis, step_means
 from px4fuse.flight import Unavailable
 
 InputName = Literal["imu", "zero"]
@@ -137,7 +137,7 @@ class Timeline:
     """
 
     time_s: Array
-    measurement: NDArray[np.intp]
+    measurement: IntArray
     acceleration_m_s2: Array
     input_variance_m2_s4: Array
     input_gap_s: float
@@ -291,7 +291,7 @@ def _state_row(kalman: KalmanFilter) -> tuple[float, float, float, float, float]
     return x[0, 0], x[1, 0], p[0, 0], p[0, 1], p[1, 1]
 
 
-def _ahead(run: Replay, times: Array) -> tuple[NDArray[np.intp], Array, NDArray[np.bool_]]:
+def _ahead(run: Replay, times: Array) -> tuple[IntArray, Array, BoolArray]:
     """The step before each time, how long ago it was (s), and whether the time is outside."""
     edges = run.steps.index.to_numpy()
     at = np.clip(np.searchsorted(edges, times, side="right") - 1, 0, len(edges) - 1)

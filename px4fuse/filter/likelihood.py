@@ -11,10 +11,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.special import expit
 from scipy.stats import chi2
 
+from px4fuse.arrays import Array, BoolArray
 from px4fuse.filter.consistency import GATE_SIGMA
 from px4fuse.filter.kalman import (
     INITIAL_SIGMA_P_M,
@@ -23,7 +24,7 @@ from px4fuse.filter.kalman import (
     Settings,
     timeline,
 )
-from px4fuse.filter.signals import Array, Axis
+from px4fuse.filter.signals import Axis
 
 # Half of the 95 % point of chi-square: the drop of log-likelihood that bounds an interval
 PROFILE_DROP = float(chi2.ppf(0.95, 1)) / 2.0
@@ -97,7 +98,7 @@ def innovations(
     legs: Preintegrated,
     sigma_a_m_s2: ArrayLike,
     sigma_z_m: ArrayLike,
-    skip: NDArray[np.bool_] | None = None,
+    skip: BoolArray | None = None,
 ) -> tuple[Array, Array]:
     """Innovations and their variances for every combination of settings.
 
@@ -155,7 +156,7 @@ def recursion(
     legs: Preintegrated,
     sigma_a_m_s2: ArrayLike,
     sigma_z_m: ArrayLike,
-    skip: NDArray[np.bool_] | None,
+    skip: BoolArray | None,
 ) -> Iterator[tuple[Array, Array, Array, Array, Array, Array]]:
     """Run the filter over a grid of settings, measurement by measurement.
 
@@ -203,7 +204,7 @@ def recursion(
 
 
 def filtered(
-    legs: Preintegrated, settings: Settings, skip: NDArray[np.bool_] | None = None
+    legs: Preintegrated, settings: Settings, skip: BoolArray | None = None
 ) -> tuple[Array, Array]:
     """Position and velocity at the start and after each measurement, for one pair of settings.
 
@@ -228,7 +229,7 @@ def filtered(
 
 
 def _single(
-    legs: Preintegrated, sigma_a_m_s2: float, sigma_z_m: float, skip: NDArray[np.bool_] | None
+    legs: Preintegrated, sigma_a_m_s2: float, sigma_z_m: float, skip: BoolArray | None
 ) -> Array:
     """:func:`recursion` for one pair of settings: ν, S, position and velocity, shape (m, 4).
 

@@ -8,14 +8,13 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.signal import correlate
 
-from px4fuse.filter.signals import Array
+from px4fuse.arrays import Array, Complex
 from px4fuse.placing.tracks import (
     EKF2_POSITION,
     IMU,
     MIN_OVERLAP_S,
     MIN_SAMPLES,
     STEP_S,
-    Complex,
     NoMatchError,
     Track,
 )

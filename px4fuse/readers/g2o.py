@@ -7,10 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
+from px4fuse.arrays import Array, IntArray
 from px4fuse.errors import TrajectoryError
-from px4fuse.trajectory.graph.model import IntArray
 from px4fuse.trajectory.graph.pose_graph import FROM_FILE, PoseGraph, initialise
-from px4fuse.trajectory.model import Array
 
 # Tag: dimension, vertices that it names, numbers that follow them
 _TAGS = {

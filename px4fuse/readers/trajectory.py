@@ -16,13 +16,13 @@ from decimal import Decimal, InvalidOperation
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from px4fuse.arrays import Array, BoolArray
 from px4fuse.errors import TrajectoryError
 from px4fuse.readers.files import read_whole
 from px4fuse.readers.position_table import quote
-from px4fuse.trajectory.model import MIN_POSES, Array, Frame, Kind, Trajectory
+from px4fuse.trajectory.model import MIN_POSES, Frame, Kind, Trajectory
 
 MAX_FILE_BYTES = 500_000_000
 COLUMNS = 8
@@ -464,7 +464,7 @@ def _gaps(time: Array, kind: Kind) -> str:
     """Words on missing frames, or on poses that are key frames."""
     steps = np.diff(time)
     median = float(np.median(steps))
-    near: NDArray[np.bool_] = np.abs(steps - median) <= REGULAR_WITHIN * median
+    near: BoolArray = np.abs(steps - median) <= REGULAR_WITHIN * median
     if near.mean() < REGULAR_SHARE:
         return (
             f"Poses come at no rate (every {median:.3g} s in the median, {steps.max():.3g} s apart "

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
+from px4fuse.arrays import Array
 from px4fuse.filter.signals import Segment
 from px4fuse.flight import Unavailable
 from px4fuse.loop.analysis import SMALLEST_STAMP_S
 from px4fuse.loop.loop import GATE_ALPHA, SINGLE_LOOP, Correction, Judged, Loop
 from px4fuse.trajectory.evaluation import Evaluation, Interval, Statistics
-from px4fuse.trajectory.model import AXES_OF_FRAME, Array, Trajectory
+from px4fuse.trajectory.model import AXES_OF_FRAME, Trajectory
 
 KINDS = {
     "vio": "odometry (external vision)",

@@ -14,8 +14,9 @@ from typing import Literal
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from px4fuse.arrays import Array
 from px4fuse.errors import TrajectoryError
-from px4fuse.trajectory.model import MIN_POSES, Array
+from px4fuse.trajectory.model import MIN_POSES
 
 AlignmentKind = Literal["none", "yaw", "se3", "sim3"]
 DEGREES_OF_FREEDOM: dict[AlignmentKind, int] = {"none": 0, "yaw": 4, "se3": 6, "sim3": 7}

@@ -6,20 +6,18 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d, maximum_filter1d
 from scipy.optimize import minimize_scalar
 from scipy.signal import correlate
 from scipy.spatial.transform import Slerp
 from scipy.stats import t as student_t
 
+from px4fuse.arrays import Array, BoolArray, IntArray
 from px4fuse.errors import TrajectoryError
 from px4fuse.trajectory.alignment import Transform, umeyama
-from px4fuse.trajectory.model import MIN_POSES, Array, Trajectory
+from px4fuse.trajectory.model import MIN_POSES, Trajectory
 
 Method = Literal["interpolate", "nearest"]
-BoolArray = NDArray[np.bool_]
-IntArray = NDArray[np.intp]
 
 # Positions are not interpolated across longer intervals than so many median ones, or this
 GAP_INTERVALS, GAP_S = 3.0, 0.1

@@ -8,16 +8,15 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import chi2
 
+from px4fuse.arrays import Array, IntArray
 from px4fuse.errors import TrajectoryError
 from px4fuse.trajectory.graph import lie
 from px4fuse.trajectory.graph.model import (
-    IntArray,
     PoseGraph,
     observed_directions,
     odometry_chain,
     odometry_steps,
 )
-from px4fuse.trajectory.model import Array
 
 
 @dataclass(frozen=True)

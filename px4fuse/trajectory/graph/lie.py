@@ -13,10 +13,9 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.polynomial.polynomial import polyval
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-Array = NDArray[np.float64]
+from px4fuse.arrays import Array, BoolArray
 
 # Below this angle (rad) series replace quotients that cancel; five terms then reach 1e-14
 SMALL = 0.3
@@ -484,6 +483,6 @@ def _c_slope(theta: Array) -> Array:
     return made
 
 
-def _split(theta: Array) -> tuple[NDArray[np.bool_], Array]:
+def _split(theta: Array) -> tuple[BoolArray, Array]:
     small = theta < SMALL
     return small, np.where(small, 1.0, theta)

@@ -10,16 +10,11 @@ import numpy as np
 from scipy import sparse
 from scipy.stats import chi2
 
+from px4fuse.arrays import Array, BoolArray
 from px4fuse.errors import TrajectoryError
 from px4fuse.trajectory.graph import lie
-from px4fuse.trajectory.graph.model import (
-    BoolArray,
-    PoseGraph,
-    ranks,
-    require_connected,
-)
+from px4fuse.trajectory.graph.model import PoseGraph, ranks, require_connected
 from px4fuse.trajectory.graph.system import BlockSystem
-from px4fuse.trajectory.model import Array
 
 Robust = Literal["none", "dcs", "gnc"]
 # From the squared residuals: the factors on the information, and the cost of each edge
