@@ -75,22 +75,6 @@ class _File:
         return TrajectoryError(f"{self.name}, line {number}: {what}. {remedy}")
 
 
-def looks_like_trajectory(head: bytes) -> bool:
-    """Whether the first bytes of a file are those of a trajectory, not of a flight log.
-
-    Parameters
-    ----------
-    head : bytes
-        Some kilobytes, so that the comments before the first pose fit in.
-    """
-    try:
-        lines = _text("", head).split("\n")
-        _recognise(_File("", lines[:-1] if sum(map(_is_row, lines)) > 1 else lines, ""))
-    except TrajectoryError:
-        return False
-    return True
-
-
 def read_trajectory(path: str | Path) -> Trajectory:
     """Read a trajectory file.
 
