@@ -18,6 +18,7 @@ from px4fuse.arrays import Array, BoolArray
 from px4fuse.comparison.projection import MIN_COMMON_SAMPLES, observation_variance
 from px4fuse.filter.kalman import Settings, timeline
 from px4fuse.filter.likelihood import filtered, preintegrate
+from px4fuse.filter.model import move
 from px4fuse.filter.signals import AISLE, Axis, Segment, ned_acceleration, project_acceleration
 from px4fuse.flight import (
     EXTERNAL_VISION_RUNGS,
@@ -618,8 +619,7 @@ def states_at(run: Run, times: Array) -> tuple[Array, Array]:
     known = np.clip(known, 0, None)
     node = nodes[known]
     since = times - line.time_s[node]
-    input_v = dv[at] + a[at] * ahead
-    input_p = dp[at] + dv[at] * ahead + a[at] * ahead**2 / 2.0
+    input_p, input_v = move(dp[at], dv[at], a[at], ahead)
     return (
         position[known] + velocity[known] * since + input_p - dp[node] - dv[node] * since,
         velocity[known] + input_v - dv[node],

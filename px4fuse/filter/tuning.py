@@ -29,6 +29,7 @@ from px4fuse.filter.likelihood import (
     preintegrate,
     recursion,
 )
+from px4fuse.filter.model import H, matrix, transition
 from px4fuse.filter.signals import Axis
 from px4fuse.flight import Unavailable
 
@@ -416,10 +417,8 @@ def _autocovariance_least_squares(
     regular = (length < ALS_LONGEST_LEG * interval) & (length > interval / ALS_LONGEST_LEG)
     if np.mean(regular) < 0.8:
         return None, None
-    F = np.array([[1.0, interval], [0.0, 1.0]])
-    H = np.array([[1.0, 0.0]])
-    q = legs[0].noise_unit[regular].mean(axis=0)
-    Q = np.array([[q[0], q[1]], [q[1], q[2]]])
+    F = transition(interval)
+    Q = matrix(legs[0].noise_unit[regular].mean(axis=0))
     P = solve_discrete_are(F.T, H.T, best.sigma_a**2 * Q, np.array([[best.sigma_z**2]]))
     L = P @ H.T / (H @ P @ H.T + best.sigma_z**2)
     A = F - F @ L @ H
