@@ -21,7 +21,7 @@ from px4fuse.errors import SettingsError, TrajectoryError
 from px4fuse.flight import Unavailable
 from px4fuse.readers.trajectory import read_trajectory
 from px4fuse.trajectory.alignment import AlignmentKind, fit
-from px4fuse.trajectory.association import associate, clock_difference, estimate_time_offset
+from px4fuse.trajectory.association import associate
 from px4fuse.trajectory.evaluation import (
     MIN_BLOCKS,
     Delta,
@@ -34,6 +34,7 @@ from px4fuse.trajectory.evaluation import (
     rmse_interval,
 )
 from px4fuse.trajectory.model import Frame, Kind, Trajectory
+from px4fuse.trajectory.offset import clock_difference, estimate_time_offset
 
 SAMPLE = REPOSITORY / "sample_logs" / "loop_slam.tum"
 SHARED = REPOSITORY.parent / "shared" / "trajectories"

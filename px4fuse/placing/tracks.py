@@ -22,6 +22,7 @@ from px4fuse.flight import (
     Unavailable,
     finite_rows,
 )
+from px4fuse.trajectory.offset import STEP_S
 
 # Which of x, y, z is north, east, down, and with which sign
 FRAMES = {
@@ -31,7 +32,6 @@ FRAMES = {
 }
 EKF2_POSITION, IMU = "EKF2 position", "IMU"
 
-STEP_S = 0.05  # of the common grid
 # Nothing is interpolated in an interval longer than this and than three median ones
 GAP_S, GAP_INTERVALS = 0.5, 3.0
 MIN_MOTION_M = 0.5
