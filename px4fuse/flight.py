@@ -18,7 +18,8 @@ from typing import Literal
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
+
+from px4fuse.arrays import BoolArray
 
 AxisName = Literal["north", "east", "down"]
 # Below this share of intervals near the median, samples come in bursts
@@ -496,7 +497,7 @@ def stretches_of_flight(landed: pd.Series, duration_s: float) -> tuple[tuple[flo
 
 def finite_rows(samples: pd.DataFrame, columns: list[str]) -> pd.DataFrame:
     """Rows of a frame in which all of some float columns are finite."""
-    finite: NDArray[np.bool_] = np.isfinite(samples[columns].to_numpy()).all(axis=1)
+    finite: BoolArray = np.isfinite(samples[columns].to_numpy()).all(axis=1)
     return samples[finite]
 
 

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from px4fuse.analysis import Analysis
+from px4fuse.arrays import Array
 from px4fuse.comparison.comparison import Comparison
 from px4fuse.filter.signals import Axis, Segment, project_acceleration
 from px4fuse.flight import (
@@ -38,7 +39,6 @@ from px4fuse.flight import (
     Unavailable,
 )
 
-Array = NDArray[np.float64]
 Span = tuple[float, float]
 
 DT = 0.1  # s, the lesson's

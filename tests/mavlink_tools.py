@@ -17,11 +17,11 @@ from typing import Any
 
 import numpy as np
 from flights import GRAVITY_M_S2, motion
-from numpy.typing import NDArray
 from pymavlink.dialects.v20 import all as dialect
 from scipy.spatial.transform import Rotation
 
-Array = NDArray[np.float64]
+from px4fuse.arrays import Array
+
 Address = tuple[int, int]
 
 AUTOPILOT: Address = (1, 1)

@@ -16,8 +16,8 @@ import pytest
 from flights import Estimator, Imu, Span, Uwb, aisle_flight, table, unavailable
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
+from px4fuse.arrays import Array
 from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.flight import (
     POSITION_COLUMNS,
@@ -31,8 +31,6 @@ from px4fuse.flight import (
 from px4fuse.placing.placement import EKF2_POSITION, IMU, place
 from px4fuse.readers import read_log
 from px4fuse.readers.position_csv import SAMPLE_COLUMNS, PositionFile, read_position_csv
-
-Array = NDArray[np.float64]
 
 BOOT_S = 2416.25
 OFFSET_S = -1795251250.2  # boot clock minus a UNIX clock

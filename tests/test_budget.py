@@ -12,11 +12,11 @@ import numpy as np
 import pandas as pd
 import pytest
 from flights import PARAMETERS, Estimator, Uwb, aisle_flight, table, unexplained
-from numpy.typing import NDArray
 from scipy.integrate import cumulative_trapezoid
 from ulog_tools import GENERATIONS, make_log, stamps, topic
 
 from px4fuse.analysis import Analysis
+from px4fuse.arrays import Array
 from px4fuse.comparison.budget import CAUSES, Budget, Effect, Run, budget, states_at
 from px4fuse.comparison.comparison import compare
 from px4fuse.filter.clock import ClockOffset
@@ -45,7 +45,6 @@ from px4fuse.request import ComparisonRequest
 from px4fuse.results.build import results, schema
 from px4fuse.results.model import Student
 
-Array = NDArray[np.float64]
 DEFAULT = Settings()
 
 STEP_S = 0.01

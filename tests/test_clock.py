@@ -7,12 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 import pytest
-from flights import Array, aisle_flight, table, unavailable
+from flights import aisle_flight, table, unavailable
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.stats import binom
 
 from px4fuse.analysis import clock_offset, tuned_horizontally
+from px4fuse.arrays import Array
 from px4fuse.comparison.comparison import compare
 from px4fuse.filter.clock import (
     CHANGE_P,

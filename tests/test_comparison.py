@@ -9,8 +9,8 @@ import numpy as np
 import pandas as pd
 import pytest
 from flights import Estimator, Imu, Uwb, aisle_flight, unavailable
-from numpy.typing import NDArray
 
+from px4fuse.arrays import Array
 from px4fuse.comparison.comparison import (
     AxisComparison,
     Comparison,
@@ -23,8 +23,6 @@ from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.kalman import Settings, variance_at
 from px4fuse.flight import Ekf2, Flight, Reset, Truth, Unavailable
 from px4fuse.readers import read_log
-
-Array = NDArray[np.float64]
 
 # How many times EKF2 overstates its horizontal innovation variance in real motion-capture flights
 OVERSTATED = {

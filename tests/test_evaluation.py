@@ -20,8 +20,8 @@ from scipy.spatial.transform import Rotation
 from px4fuse.errors import SettingsError, TrajectoryError
 from px4fuse.flight import Unavailable
 from px4fuse.readers.trajectory import read_trajectory
-from px4fuse.trajectory.alignment import DEGREES_OF_FREEDOM, AlignmentKind, fit
-from px4fuse.trajectory.association import associate, clock_difference, estimate_time_offset
+from px4fuse.trajectory.alignment import AlignmentKind, fit
+from px4fuse.trajectory.association import associate
 from px4fuse.trajectory.evaluation import (
     MIN_BLOCKS,
     Delta,
@@ -34,6 +34,7 @@ from px4fuse.trajectory.evaluation import (
     rmse_interval,
 )
 from px4fuse.trajectory.model import Frame, Kind, Trajectory
+from px4fuse.trajectory.offset import clock_difference, estimate_time_offset
 
 SAMPLE = REPOSITORY / "sample_logs" / "loop_slam.tum"
 SHARED = REPOSITORY.parent / "shared" / "trajectories"
@@ -223,11 +224,11 @@ def test_a_random_similarity_is_recovered(
 ) -> None:
     points = np.random.default_rng(seed).normal(0.0, 5.0, (30, 3))
     turn = Rotation.from_euler("ZYX", angles)
-    for kind in ("yaw", "se3", "sim3"):
+    for kind, freedom in (("yaw", 4), ("se3", 6), ("sim3", 7)):
         used = Rotation.from_euler("Z", angles[0]) if kind == "yaw" else turn
         factor = scale if kind == "sim3" else 1.0
         got = fit(points, factor * used.apply(points) + shift, kind)  # type: ignore[arg-type]
-        assert got.degrees_of_freedom == DEGREES_OF_FREEDOM[kind]  # type: ignore[index]
+        assert got.degrees_of_freedom == freedom
         assert (got.rotation.inv() * used).magnitude() < 1e-9
         assert got.scale == pytest.approx(factor, rel=1e-9)
         np.testing.assert_allclose(got.translation_m, shift, atol=1e-7)

@@ -51,41 +51,21 @@ class TestTangents:
         xi = tangents(dimension, angle)
         np.testing.assert_allclose(lie.log(lie.exp(xi)), xi, atol=3e-11, rtol=0)
 
-    def test_right_jacobian_is_the_difference_quotient(self, dimension: int, angle: float) -> None:
-        xi, step = tangents(dimension, angle), 1e-5
-        jacobian = lie.right_jacobian(xi)
+    def test_right_jacobian_inverse_is_the_difference_quotient(
+        self, dimension: int, angle: float
+    ) -> None:
+        xi, step = tangents(dimension, min(angle, 3.0)), 1e-5  # log jumps at a half turn
+        jacobian, pose = lie.right_jacobian_inverse(xi), lie.exp(xi)
         for k, axis in enumerate(np.eye(SIZES[dimension][0])):
-            up, down = lie.exp(xi + step * axis), lie.exp(xi - step * axis)
-            quotient = lie.log(lie.between(down, up)) / (2.0 * step)
-            np.testing.assert_allclose(jacobian[:, :, k], quotient, atol=1e-8, rtol=0)
-
-    def test_right_jacobian_inverse(self, dimension: int, angle: float) -> None:
-        xi = tangents(dimension, angle)
-        product = lie.right_jacobian(xi) @ lie.right_jacobian_inverse(xi)
-        np.testing.assert_allclose(
-            product, np.broadcast_to(np.eye(product.shape[-1]), product.shape), atol=2e-13
-        )
+            up, down = (lie.log(lie.compose(pose, lie.exp(s * step * axis))) for s in (1.0, -1.0))
+            quotient = (up - down) / (2.0 * step)
+            np.testing.assert_allclose(jacobian[:, :, k], quotient, atol=1e-7, rtol=0)
 
     def test_adjoint(self, dimension: int, angle: float) -> None:
         x, xi = lie.exp(tangents(dimension, angle)), tangents(dimension, 0.7)
         moved = (lie.adjoint(x) @ xi[..., None])[..., 0]
         left, right = lie.compose(x, lie.exp(xi)), lie.compose(lie.exp(moved), x)
         np.testing.assert_allclose(lie.log(lie.between(left, right)), 0.0, atol=1e-12)
-
-
-@pytest.mark.parametrize("angle", ANGLES)
-def test_so3(angle: float) -> None:
-    phi = tangents(3, angle)[:, 3:]
-    np.testing.assert_allclose(lie.so3_log(lie.so3_exp(phi)), phi, atol=1e-14)
-    np.testing.assert_allclose(
-        lie.so3_right_jacobian(phi) @ lie.so3_right_jacobian_inverse(phi),
-        np.broadcast_to(np.eye(3), (len(phi), 3, 3)),
-        atol=1e-14,
-    )
-    full = np.hstack([np.zeros_like(phi), phi])
-    np.testing.assert_allclose(
-        lie.so3_right_jacobian(phi), lie.right_jacobian(full)[:, 3:, 3:], atol=1e-15
-    )
 
 
 def test_half_turns() -> None:

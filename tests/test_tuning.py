@@ -8,10 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from flights import Array, line
+from flights import line
 from numpy.typing import NDArray
 from scipy.stats import binom
 
+from px4fuse.arrays import Array
 from px4fuse.comparison.comparison import compare
 from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.kalman import Settings

@@ -16,6 +16,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pyulog import ULog
 
+from px4fuse.arrays import Array
+
 MAGIC = b"ULog\x01\x12\x35"
 START_US = 5_000_000
 PUBLICATION_LAG_US = 60_000
@@ -32,8 +34,6 @@ _TYPES = {
     "<i8": "int64_t", "<i4": "int32_t", "<i2": "int16_t", "|i1": "int8_t",
     "<f8": "double", "<f4": "float", "|b1": "bool",
 }  # fmt: skip
-
-Array = NDArray[np.float64]
 
 
 @dataclass

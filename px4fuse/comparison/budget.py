@@ -12,21 +12,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
+from px4fuse.arrays import Array, BoolArray
 from px4fuse.comparison.comparison import AxisComparison, Comparison
 from px4fuse.comparison.projection import MIN_COMMON_SAMPLES, observation_variance
 from px4fuse.filter.clock import ClockOffset
 from px4fuse.filter.kalman import Settings, timeline
 from px4fuse.filter.likelihood import filtered, preintegrate
-from px4fuse.filter.signals import (
-    AISLE,
-    Array,
-    Axis,
-    Segment,
-    ned_acceleration,
-    project_acceleration,
-)
+from px4fuse.filter.model import move
+from px4fuse.filter.signals import AISLE, Axis, Segment, ned_acceleration, project_acceleration
 from px4fuse.flight import (
     EXTERNAL_VISION_RUNGS,
     SPECIFIC_FORCE_COLUMNS,
@@ -147,7 +141,7 @@ class Run:
 
     axis: Axis
     settings: Settings
-    left_out: NDArray[np.bool_]
+    left_out: BoolArray
     horizon_s: float = 0.0
 
 
@@ -530,7 +524,7 @@ def _ekf2_shift_s(given: Given) -> float | Unavailable:
     return -delay_ms * 1e-3 - given.settings.clock_offset_s
 
 
-def _too_few(left_out: NDArray[np.bool_]) -> Unavailable | None:
+def _too_few(left_out: BoolArray) -> Unavailable | None:
     fused = int(np.count_nonzero(~left_out))
     if fused >= MIN_COMMON_SAMPLES:
         return None
@@ -625,15 +619,14 @@ def states_at(run: Run, times: Array) -> tuple[Array, Array]:
     known = np.clip(known, 0, None)
     node = nodes[known]
     since = times - line.time_s[node]
-    input_v = dv[at] + a[at] * ahead
-    input_p = dp[at] + dv[at] * ahead + a[at] * ahead**2 / 2.0
+    input_p, input_v = move(dp[at], dv[at], a[at], ahead)
     return (
         position[known] + velocity[known] * since + input_p - dp[node] - dv[node] * since,
         velocity[known] + input_v - dv[node],
     )
 
 
-def _padded(run: Run, start_s: float, end_s: float) -> tuple[Axis, NDArray[np.bool_]]:
+def _padded(run: Run, start_s: float, end_s: float) -> tuple[Axis, BoolArray]:
     """The axis with measurements that are not fused at both ends where it does not reach them."""
     time, value, left_out = run.axis.measurement_time_s, run.axis.measurement_m, run.left_out
     if time[0] > start_s:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pandas as pd
 
+from px4fuse.arrays import Array
 from px4fuse.comparison.projection import (
     MIN_COMMON_SAMPLES,
     continuous_state,
@@ -21,7 +22,6 @@ from px4fuse.filter.consistency import Consistency, HorizontalNis, assess, asses
 from px4fuse.filter.kalman import Replay, Settings, replay, state_at, variance_at
 from px4fuse.filter.likelihood import NoiseAsked, noise_asked
 from px4fuse.filter.signals import (
-    Array,
     Axis,
     Segment,
     choose_segment,

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 
-from px4fuse.filter.signals import AISLE, Array, Axis, Segment, along, within
+from px4fuse.arrays import Array
+from px4fuse.filter.signals import AISLE, Axis, Segment, along, within
 from px4fuse.flight import (
     EXTERNAL_VISION_RUNGS,
     POSITION_COLUMNS,

@@ -22,14 +22,15 @@ from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 from scipy.integrate import cumulative_trapezoid
 from scipy.spatial.transform import Rotation, Slerp
 from scipy.stats import chi2
 
-from px4fuse.filter.kalman import INITIAL_SIGMA_P_M, INITIAL_SIGMA_V_M_S, Settings
+from px4fuse.arrays import Array, IntArray
+from px4fuse.filter.kalman import Settings
 from px4fuse.filter.likelihood import PROFILE_DROP, parabola_vertex
-from px4fuse.filter.signals import STANDARD_GRAVITY_M_S2, Array, Segment, within
+from px4fuse.filter.model import INITIAL_SIGMA_P_M, INITIAL_SIGMA_V_M_S, move, noise_of_many_steps
+from px4fuse.filter.signals import STANDARD_GRAVITY_M_S2, Segment, within
 from px4fuse.flight import (
     ANGULAR_RATE_COLUMNS,
     POSITION_COLUMNS,
@@ -150,8 +151,7 @@ class _Signals:
         """
         at = np.clip(np.searchsorted(self.time_s, time_s, side="right") - 1, 0, None)
         ahead = (time_s - self.time_s[at])[..., None, None]
-        velocity = self.velocity[at] + self.value[at] * ahead
-        position = self.position[at] + self.velocity[at] * ahead + self.value[at] * ahead**2 / 2.0
+        position, velocity = move(self.position[at], self.velocity[at], self.value[at], ahead)
         step = np.diff(time_s, axis=-1)[..., None, None]
         before, after = velocity[..., :-1, :, :], velocity[..., 1:, :, :]
         return after - before, np.diff(position, axis=-3) - before * step
@@ -383,7 +383,7 @@ def _filter(
         P[..., :6, :] += moved @ P[..., 6:, :]
         P[..., :, :3] += dt * P[..., :, 3:6]
         P[..., :, :6] += P[..., :, 6:] @ np.swapaxes(moved, -1, -2)
-        for row, column, size in ((0, 0, dt**3 / 3.0), (0, 3, dt**2 / 2.0), (3, 3, dt)):
+        for row, column, size in zip((0, 0, 3), (0, 3, 3), noise_of_many_steps(dt), strict=True):
             P[..., axes + row, axes + column] += (noise * size)[:, None]
             if row != column:
                 P[..., axes + column, axes + row] += (noise * size)[:, None]
@@ -432,7 +432,7 @@ def _vertex(grid: Array, profile: Array) -> tuple[float, float]:
 
 def _interval(grid: Array, drop: Array) -> tuple[tuple[float, float], bool]:
     """95 % interval of a profile, and whether both its ends lie inside the grid."""
-    inside: NDArray[np.intp] = np.flatnonzero(drop <= PROFILE_DROP)
+    inside: IntArray = np.flatnonzero(drop <= PROFILE_DROP)
     ends = []
     for edge, step in ((int(inside[0]), -1), (int(inside[-1]), 1)):
         beyond = edge + step

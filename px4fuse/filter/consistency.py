@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 from scipy import stats
 
-from px4fuse.filter.signals import Array
+from px4fuse.arrays import Array
 from px4fuse.flight import Unavailable
 
 Verdict = Literal["consistent", "variance overstated", "variance understated"]

@@ -1,12 +1,6 @@
 """The two-state Kalman filter of the lesson, on filterpy: Axis + Settings → Replay.
 
-State x = [position, velocity] along one axis; input a, the acceleration averaged over the step::
-
-    F = [[1, dt], [0, 1]]    B = [dt²/2, dt]    H = [1, 0]    R = SIGMA_Z²
-    Q(dt) = SIGMA_A² · DT · [[dt³/4, dt²/2], [dt²/2, dt]]
-
-With dt = DT, Q is the lesson's SIGMA_A² · [[dt⁴/4, dt³/2], [dt³/2, dt²]] digit for digit. For other
-steps it keeps the velocity noise per second, so that SIGMA_A means the same at every rate.
+Its model, F, B, Q, H and R, stands in :mod:`px4fuse.filter.model`.
 """
 
 from __future__ import annotations
@@ -17,18 +11,27 @@ from typing import Literal
 import numpy as np
 import pandas as pd
 from filterpy.kalman import KalmanFilter
-from numpy.typing import NDArray
 
+from px4fuse.arrays import Array, BoolArray, IntArray
 from px4fuse.errors import SettingsError
-from px4fuse.filter.signals import Array, Axis, step_means
+from px4fuse.filter.model import (
+    COVARIANCES,
+    INITIAL_COVARIANCE,
+    STATES,
+    H,
+    input_matrix,
+    matrix,
+    move,
+    noise,
+    spread,
+    transition,
+)
+from px4fuse.filter.signals import Axis, step_means
 from px4fuse.flight import Unavailable
 
 InputName = Literal["imu", "zero"]
 INPUT_NAMES: tuple[InputName, InputName] = ("imu", "zero")
 
-# The lesson's initial standard deviations: position 0.5 m, velocity 1.0 m/s.
-INITIAL_SIGMA_P_M = 0.5
-INITIAL_SIGMA_V_M_S = 1.0
 # Ranges outside which a setting is a slip of the keyboard, not a choice.
 SIGMA_A_RANGE_M_S2 = (1e-4, 100.0)
 SIGMA_Z_RANGE_M = (1e-4, 100.0)
@@ -36,7 +39,6 @@ DT_RANGE_S = (1e-3, 1.0)
 CLOCK_OFFSET_RANGE_S = (-10.0, 10.0)
 # Two times closer than this are one step: stamps have a resolution of one microsecond.
 SAME_TIME_S = 5e-7
-H = np.array([[1.0, 0.0]])
 
 
 @dataclass(frozen=True)
@@ -137,16 +139,16 @@ class Timeline:
     """
 
     time_s: Array
-    measurement: NDArray[np.intp]
+    measurement: IntArray
     acceleration_m_s2: Array
     input_variance_m2_s4: Array
     input_gap_s: float
 
 
 def process_noise(dt_s: float, settings: Settings, input_variance_m2_s4: float = 0.0) -> Array:
-    """Q(dt) for one step, shape (2, 2); see the module's docstring."""
+    """Q(dt) for one step, shape (2, 2)."""
     q = (settings.sigma_a_m_s2**2 + input_variance_m2_s4) * settings.dt_s
-    return q * np.array([[dt_s**3 / 4.0, dt_s**2 / 2.0], [dt_s**2 / 2.0, dt_s]])
+    return q * matrix(noise(dt_s))
 
 
 def timeline(axis: Axis, settings: Settings, initial: InitialState | None = None) -> Timeline:
@@ -218,7 +220,7 @@ def replay(axis: Axis, settings: Settings, initial: InitialState | None = None) 
     start = initial or InitialState(line.time_s[0], axis.measurement_m[0])
     kalman = KalmanFilter(dim_x=2, dim_z=1, dim_u=1)
     kalman.x = np.array([[start.position_m], [start.velocity_m_s]])
-    kalman.P = np.diag([INITIAL_SIGMA_P_M**2, INITIAL_SIGMA_V_M_S**2])
+    kalman.P = matrix(INITIAL_COVARIANCE)
     kalman.H = H
     kalman.R = np.array([[settings.sigma_z_m**2]])
     lengths = np.diff(line.time_s)
@@ -231,8 +233,8 @@ def replay(axis: Axis, settings: Settings, initial: InitialState | None = None) 
     ):
         kalman.predict(
             u=np.array([[acceleration]]),
-            B=np.array([[dt * dt / 2.0], [dt]]),
-            F=np.array([[1.0, dt], [0.0, 1.0]]),
+            B=input_matrix(dt),
+            F=transition(dt),
             Q=process_noise(dt, settings, extra),
         )
         at = line.measurement[step]
@@ -254,13 +256,7 @@ def replay(axis: Axis, settings: Settings, initial: InitialState | None = None) 
     steps = pd.DataFrame(
         states,
         index=pd.Index(line.time_s, name="time_s"),
-        columns=[
-            "position_m",
-            "velocity_m_s",
-            "position_variance_m2",
-            "covariance_m2_s",
-            "velocity_variance_m2_s2",
-        ],
+        columns=STATES + COVARIANCES,
     )
     steps["acceleration_m_s2"] = np.append(line.acceleration_m_s2, 0.0)
     steps["input_variance_m2_s4"] = np.append(line.input_variance_m2_s4, 0.0)
@@ -291,7 +287,7 @@ def _state_row(kalman: KalmanFilter) -> tuple[float, float, float, float, float]
     return x[0, 0], x[1, 0], p[0, 0], p[0, 1], p[1, 1]
 
 
-def _ahead(run: Replay, times: Array) -> tuple[NDArray[np.intp], Array, NDArray[np.bool_]]:
+def _ahead(run: Replay, times: Array) -> tuple[IntArray, Array, BoolArray]:
     """The step before each time, how long ago it was (s), and whether the time is outside."""
     edges = run.steps.index.to_numpy()
     at = np.clip(np.searchsorted(edges, times, side="right") - 1, 0, len(edges) - 1)
@@ -306,25 +302,17 @@ def state_at(run: Replay, times: Array) -> tuple[Array, Array]:
     """
     at, ahead, outside = _ahead(run, times)
     position, velocity, acceleration = (
-        run.steps[column].to_numpy()[at]
-        for column in ("position_m", "velocity_m_s", "acceleration_m_s2")
+        run.steps[column].to_numpy()[at] for column in (*STATES, "acceleration_m_s2")
     )
-    return (
-        np.where(outside, np.nan, position + velocity * ahead + acceleration * ahead**2 / 2.0),
-        np.where(outside, np.nan, velocity + acceleration * ahead),
-    )
+    position, velocity = move(position, velocity, acceleration, ahead)
+    return np.where(outside, np.nan, position), np.where(outside, np.nan, velocity)
 
 
 def variance_at(run: Replay, times: Array) -> tuple[Array, Array]:
     """Variances (m², m²/s²) that belong to :func:`state_at`: P = FPFᵀ + Q from the step before."""
     at, ahead, outside = _ahead(run, times)
-    p00, p01, p11 = (
-        run.steps[column].to_numpy()[at]
-        for column in ("position_variance_m2", "covariance_m2_s", "velocity_variance_m2_s2")
-    )
+    p00, p01, p11 = run.steps[COVARIANCES].to_numpy()[at].T
     extra = run.steps["input_variance_m2_s4"].to_numpy()[at]
     q = (run.settings.sigma_a_m_s2**2 + extra) * run.settings.dt_s
-    return (
-        np.where(outside, np.nan, p00 + 2 * ahead * p01 + ahead**2 * p11 + q * ahead**3 / 4.0),
-        np.where(outside, np.nan, p11 + q * ahead),
-    )
+    (p00, _, p11), (q00, _, q11) = spread((p00, p01, p11), ahead), noise(ahead)
+    return np.where(outside, np.nan, p00 + q * q00), np.where(outside, np.nan, p11 + q * q11)

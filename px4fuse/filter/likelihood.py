@@ -9,21 +9,18 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.special import expit
 from scipy.stats import chi2
 
+from px4fuse.arrays import Array, BoolArray
 from px4fuse.filter.consistency import GATE_SIGMA
-from px4fuse.filter.kalman import (
-    INITIAL_SIGMA_P_M,
-    INITIAL_SIGMA_V_M_S,
-    InitialState,
-    Settings,
-    timeline,
-)
-from px4fuse.filter.signals import Array, Axis
+from px4fuse.filter.kalman import InitialState, Settings, timeline
+from px4fuse.filter.model import INITIAL_COVARIANCE, Symmetric, move, noise, spread
+from px4fuse.filter.signals import Axis
 
 # Half of the 95 % point of chi-square: the drop of log-likelihood that bounds an interval
 PROFILE_DROP = float(chi2.ppf(0.95, 1)) / 2.0
@@ -70,13 +67,9 @@ def preintegrate(axis: Axis, settings: Settings) -> Preintegrated:
     end_of_step = ends[np.searchsorted(ends, np.arange(1, len(time)))]  # where each step's leg ends
     leg = np.searchsorted(ends, np.arange(1, len(time)))
     rest = time[end_of_step] - time[1:]  # from the end of a step to the end of its leg
-    dv = line.acceleration_m_s2 * dt
-    dp = line.acceleration_m_s2 * dt**2 / 2.0 + dv * rest
-    # F(rest) Q(dt) F(rest)ᵀ, Q as in process_noise
-    q00, q01, q11 = dt**3 / 4.0, dt**2 / 2.0, dt
-    unit = settings.dt_s * np.stack(
-        [q00 + 2 * rest * q01 + rest**2 * q11, q01 + rest * q11, q11], 1
-    )
+    still = np.zeros(len(dt))
+    dp, dv = move(*move(still, still, line.acceleration_m_s2, dt), still, rest)
+    unit = settings.dt_s * np.stack(spread(noise(dt), rest), 1)
     count = len(ends)
 
     def total(values: Array) -> Array:
@@ -97,7 +90,7 @@ def innovations(
     legs: Preintegrated,
     sigma_a_m_s2: ArrayLike,
     sigma_z_m: ArrayLike,
-    skip: NDArray[np.bool_] | None = None,
+    skip: BoolArray | None = None,
 ) -> tuple[Array, Array]:
     """Innovations and their variances for every combination of settings.
 
@@ -113,15 +106,9 @@ def innovations(
     -------
     innovation_m, innovation_variance_m2 : ndarray, shape (m, ...)
     """
-    if np.ndim(sigma_a_m_s2) == np.ndim(sigma_z_m) == 0:
-        run = _single(legs, float(np.asarray(sigma_a_m_s2)), float(np.asarray(sigma_z_m)), skip)
-        return run[:, 0], run[:, 1]
-    steps = recursion(legs, sigma_a_m_s2, sigma_z_m, skip)
-    shape = (len(legs.measurement_m), *np.broadcast(sigma_a_m_s2, sigma_z_m).shape)
-    nu, s = np.empty(shape), np.empty(shape)
-    for k, step in enumerate(steps):
-        nu[k], s[k] = step[:2]
-    return nu, s
+    made = np.array([step[:2] for step in recursion(legs, sigma_a_m_s2, sigma_z_m, skip)])
+    made = made.reshape(-1, 2, *np.broadcast(sigma_a_m_s2, sigma_z_m).shape)
+    return made[:, 0], made[:, 1]
 
 
 @dataclass(frozen=True)
@@ -146,7 +133,7 @@ def states(legs: Preintegrated, sigma_a_m_s2: ArrayLike, sigma_z_m: ArrayLike) -
     """
     rows = [
         (k0, v, np.sqrt(p00), np.sqrt(p11), nu**2 / s)
-        for nu, s, k0, v, p00, p11 in recursion(legs, sigma_a_m_s2, sigma_z_m, None)
+        for nu, s, k0, _, v, (p00, _, p11) in recursion(legs, sigma_a_m_s2, sigma_z_m, None)
     ]
     return States(*(np.array(column) for column in zip(*rows, strict=True)))
 
@@ -155,8 +142,8 @@ def recursion(
     legs: Preintegrated,
     sigma_a_m_s2: ArrayLike,
     sigma_z_m: ArrayLike,
-    skip: NDArray[np.bool_] | None,
-) -> Iterator[tuple[Array, Array, Array, Array, Array, Array]]:
+    skip: BoolArray | None,
+) -> Iterator[tuple[Array, Array, Array, Array, Array, Symmetric[Array]]]:
     """Run the filter over a grid of settings, measurement by measurement.
 
     Parameters
@@ -169,41 +156,46 @@ def recursion(
 
     Yields
     ------
-    tuple of ndarray, each of shape (...)
-        ν (m), S (m²), gain, and after the update the velocity (m/s) and the variances of position
-        and velocity.
+    tuple
+        ν (m), S (m²), gain, and after the update position (m), velocity (m/s) and covariance by
+        its elements 00, 01, 11: each of shape (...), and a plain float where that is ().
     """
     q, r = np.broadcast_arrays(
         np.square(np.asarray(sigma_a_m_s2, float)), np.square(np.asarray(sigma_z_m, float))
     )
-    p = np.full(q.shape, legs.initial.position_m)
-    v = np.full(q.shape, legs.initial.velocity_m_s)
-    p00 = np.full(q.shape, INITIAL_SIGMA_P_M**2)
-    p01 = np.zeros(q.shape)
-    p11 = np.full(q.shape, INITIAL_SIGMA_V_M_S**2)
-    for k in range(len(legs.measurement_m)):
-        dt = legs.length_s[k]
-        unit, fixed = legs.noise_unit[k], legs.noise_fixed[k]
+    if not q.ndim:  # in plain floats: fifty times as fast as arrays of a single element
+        q, r = q.item(), r.item()
+    p, v = legs.initial.position_m + 0.0 * q, legs.initial.velocity_m_s + 0.0 * q
+    covariance: Symmetric[Any] = INITIAL_COVARIANCE
+    for dt, dp, dv, unit, fixed, z, skipped in zip(
+        legs.length_s.tolist(),
+        legs.delta_position_m.tolist(),
+        legs.delta_velocity_m_s.tolist(),
+        legs.noise_unit.tolist(),
+        legs.noise_fixed.tolist(),
+        legs.measurement_m.tolist(),
+        [False] * len(legs.measurement_m) if skip is None else skip.tolist(),
+        strict=True,
+    ):
         # x = Fx + Ba, P = FPFᵀ + Q
-        p = p + dt * v + legs.delta_position_m[k]
-        v = v + legs.delta_velocity_m_s[k]
-        p00 = p00 + 2.0 * dt * p01 + dt * dt * p11 + q * unit[0] + fixed[0]
-        p01 = p01 + dt * p11 + q * unit[1] + fixed[1]
+        p, v = p + dt * v + dp, v + dv
+        p00, p01, p11 = spread(covariance, dt)
+        p00 = p00 + q * unit[0] + fixed[0]
+        p01 = p01 + q * unit[1] + fixed[1]
         p11 = p11 + q * unit[2] + fixed[2]
         # ν = z - Hx, S = HPHᵀ + R, K = PHᵀS⁻¹
-        nu = legs.measurement_m[k] - p
-        s = p00 + r
+        nu, s = z - p, p00 + r
         k0, k1 = p00 / s, p01 / s
-        if skip is None or not skip[k]:
+        if not skipped:
+            # x = x + Kν, P = (I - KH)P
             p, v = p + k0 * nu, v + k1 * nu
-            p11 = p11 - k1 * p01
-            p01 = r * p01 / s
-            p00 = r * p00 / s
-        yield nu, s, k0, v, p00, p11
+            p00, p01, p11 = r * k0, r * k1, p11 - k1 * p01
+        covariance = p00, p01, p11
+        yield nu, s, k0, p, v, covariance
 
 
 def filtered(
-    legs: Preintegrated, settings: Settings, skip: NDArray[np.bool_] | None = None
+    legs: Preintegrated, settings: Settings, skip: BoolArray | None = None
 ) -> tuple[Array, Array]:
     """Position and velocity at the start and after each measurement, for one pair of settings.
 
@@ -219,49 +211,12 @@ def filtered(
     -------
     position_m, velocity_m_s : ndarray, shape (m + 1,)
     """
-    run = _single(legs, settings.sigma_a_m_s2, settings.sigma_z_m, skip)
     start = legs.initial
-    return (
-        np.append(start.position_m, run[:, 2]),
-        np.append(start.velocity_m_s, run[:, 3]),
-    )
-
-
-def _single(
-    legs: Preintegrated, sigma_a_m_s2: float, sigma_z_m: float, skip: NDArray[np.bool_] | None
-) -> Array:
-    """:func:`recursion` for one pair of settings: ν, S, position and velocity, shape (m, 4).
-
-    In plain floats: fifty times as fast as arrays of a single element.
-    """
-    q, r = sigma_a_m_s2**2, sigma_z_m**2
-    p, v = legs.initial.position_m, legs.initial.velocity_m_s
-    p00, p01, p11 = INITIAL_SIGMA_P_M**2, 0.0, INITIAL_SIGMA_V_M_S**2
-    rows = []
-    for dt, dp, dv, unit, fixed, z, skipped in zip(
-        legs.length_s.tolist(),
-        legs.delta_position_m.tolist(),
-        legs.delta_velocity_m_s.tolist(),
-        legs.noise_unit.tolist(),
-        legs.noise_fixed.tolist(),
-        legs.measurement_m.tolist(),
-        [False] * len(legs.measurement_m) if skip is None else skip.tolist(),
-        strict=True,
-    ):
-        # x = Fx + Ba, P = FPFᵀ + Q
-        p, v = p + dt * v + dp, v + dv
-        p00 += 2.0 * dt * p01 + dt * dt * p11 + q * unit[0] + fixed[0]
-        p01 += dt * p11 + q * unit[1] + fixed[1]
-        p11 += q * unit[2] + fixed[2]
-        # ν = z - Hx, S = HPHᵀ + R
-        nu, s = z - p, p00 + r
-        if not skipped:
-            # K = PHᵀS⁻¹, x = x + Kν, P = (I - KH)P
-            k0, k1 = p00 / s, p01 / s
-            p, v = p + k0 * nu, v + k1 * nu
-            p00, p01, p11 = r * k0, r * k1, p11 - k1 * p01
-        rows.append((nu, s, p, v))
-    return np.array(rows).reshape(-1, 4)
+    run: list[tuple[Any, Any]] = [(start.position_m, start.velocity_m_s)]
+    steps = recursion(legs, settings.sigma_a_m_s2, settings.sigma_z_m, skip)
+    run += [(position, velocity) for _, _, _, position, velocity, _ in steps]
+    position_m, velocity_m_s = np.array(run).T
+    return position_m, velocity_m_s
 
 
 # An innovation is of a wide normal distribution with this probability, WIDTH times as wide: far

@@ -9,10 +9,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.integrate import cumulative_trapezoid
 from scipy.spatial.transform import Rotation, Slerp
 
+from px4fuse.arrays import Array
 from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.flight import (
     AXIS_NAMES,
@@ -23,8 +24,6 @@ from px4fuse.flight import (
     PositionTrack,
     Unavailable,
 )
-
-Array = NDArray[np.float64]
 
 STANDARD_GRAVITY_M_S2 = 9.80665
 AISLE = "aisle"

@@ -12,11 +12,11 @@ from dataclasses import dataclass, replace
 from itertools import islice
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import solve_discrete_are, solve_discrete_lyapunov
 from scipy.optimize import nnls
 from scipy.stats import chi2
 
+from px4fuse.arrays import Array, BoolArray
 from px4fuse.filter.consistency import Consistency, assess
 from px4fuse.filter.kalman import Settings
 from px4fuse.filter.likelihood import (
@@ -29,7 +29,8 @@ from px4fuse.filter.likelihood import (
     preintegrate,
     recursion,
 )
-from px4fuse.filter.signals import Array, Axis
+from px4fuse.filter.model import H, matrix, transition
+from px4fuse.filter.signals import Axis
 from px4fuse.flight import Unavailable
 
 HORIZONTAL = "horizontal"
@@ -238,7 +239,7 @@ def _total(
     legs: list[Preintegrated],
     sigma_a: Array | float,
     sigma_z: Array | float,
-    skip: NDArray[np.bool_],
+    skip: BoolArray,
     start: int = 0,
 ) -> Array:
     """Negative log-likelihood of all axes from one measurement on, shape of the grid."""
@@ -262,7 +263,7 @@ def _total(
     return total
 
 
-def _fit_without_outliers(legs: list[Preintegrated]) -> tuple[_Best, NDArray[np.bool_]]:
+def _fit_without_outliers(legs: list[Preintegrated]) -> tuple[_Best, BoolArray]:
     """Fit, find the outliers at the optimum, do not fuse them, and again until they stay."""
     skip = np.zeros(len(legs[0].measurement_m), dtype=bool)
     best = _search(legs, skip)
@@ -283,7 +284,7 @@ def _fit_without_outliers(legs: list[Preintegrated]) -> tuple[_Best, NDArray[np.
     return best, skip
 
 
-def _search(legs: list[Preintegrated], skip: NDArray[np.bool_]) -> _Best:
+def _search(legs: list[Preintegrated], skip: BoolArray) -> _Best:
     """Find the optimum on grids that zoom in, from the whole search range."""
     ranges = [np.log(SIGMA_A_SEARCH_M_S2), np.log(SIGMA_Z_SEARCH_M)]
     extents = [np.array(limits) for limits in ranges]
@@ -324,7 +325,7 @@ def _likely(log_grid: Array, profile: Array, search: Array) -> tuple[Array, bool
     return log_grid[[first, last]], bool(ends)
 
 
-def _map(legs: list[Preintegrated], skip: NDArray[np.bool_], best: _Best) -> LikelihoodMap:
+def _map(legs: list[Preintegrated], skip: BoolArray, best: _Best) -> LikelihoodMap:
     """Likelihood all around the optimum."""
     a, z = (np.exp(np.linspace(extent[0], extent[1], GRID)) for extent in best.likely)
     total = _total(legs, a[:, None], z[None, :], skip)
@@ -361,14 +362,14 @@ def _crossing(grid: Array, profile: Array, left: int) -> float:
 
 
 def _assess(
-    legs: Preintegrated, sigma_a: float, sigma_z: float, skip: NDArray[np.bool_]
+    legs: Preintegrated, sigma_a: float, sigma_z: float, skip: BoolArray
 ) -> Consistency | Unavailable:
     nu, s = innovations(legs, sigma_a, sigma_z, skip)
     return assess(nu[~skip], s[~skip])
 
 
 def _hold_out(
-    name: str, legs: list[Preintegrated], settings: Settings, skip: NDArray[np.bool_]
+    name: str, legs: list[Preintegrated], settings: Settings, skip: BoolArray
 ) -> HeldOut | Unavailable:
     """Tune on the first half, score on the second."""
     half = len(skip) // 2
@@ -404,7 +405,7 @@ def _cut(legs: Preintegrated, count: int) -> Preintegrated:
 
 
 def _autocovariance_least_squares(
-    legs: list[Preintegrated], best: _Best, skip: NDArray[np.bool_]
+    legs: list[Preintegrated], best: _Best, skip: BoolArray
 ) -> tuple[float | None, float | None]:
     """SIGMA_A and SIGMA_Z from the autocovariance of a fixed-gain filter's innovations.
 
@@ -416,10 +417,8 @@ def _autocovariance_least_squares(
     regular = (length < ALS_LONGEST_LEG * interval) & (length > interval / ALS_LONGEST_LEG)
     if np.mean(regular) < 0.8:
         return None, None
-    F = np.array([[1.0, interval], [0.0, 1.0]])
-    H = np.array([[1.0, 0.0]])
-    q = legs[0].noise_unit[regular].mean(axis=0)
-    Q = np.array([[q[0], q[1]], [q[1], q[2]]])
+    F = transition(interval)
+    Q = matrix(legs[0].noise_unit[regular].mean(axis=0))
     P = solve_discrete_are(F.T, H.T, best.sigma_a**2 * Q, np.array([[best.sigma_z**2]]))
     L = P @ H.T / (H @ P @ H.T + best.sigma_z**2)
     A = F - F @ L @ H
@@ -442,7 +441,7 @@ def _autocovariance_least_squares(
     )
 
 
-def _autocovariance(legs: Preintegrated, F: Array, L: Array, skip: NDArray[np.bool_]) -> Array:
+def _autocovariance(legs: Preintegrated, F: Array, L: Array, skip: BoolArray) -> Array:
     """Autocovariance of the innovations of a filter of fixed gain, without what is skipped.
 
     NaN where hardly any stretch between what is skipped is longer than the lags.

@@ -8,12 +8,11 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from px4fuse.trajectory.model import Array, Frame, Trajectory
+from px4fuse.arrays import Array, IntArray
+from px4fuse.trajectory.model import Frame, Trajectory
 
-IntArray = NDArray[np.intp]
 DOWN = np.array([0.0, 0.0, 1.0])
 # Rows turn a frame into one with z down: x forward or north, y right or east
 _TO_Z_DOWN: dict[Frame, tuple[tuple[tuple[float, ...], ...], Frame, str]] = {

@@ -6,14 +6,13 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
+from px4fuse.arrays import Array, BoolArray, IntArray
 from px4fuse.errors import MissingDataError, Px4FuseError, SettingsError, TrajectoryError
 from px4fuse.filter.signals import Segment
 from px4fuse.flight import Unavailable
 from px4fuse.loop.closure import (
-    IntArray,
     correct_by_distance,
     cumulative_distance,
     heading_change_rad,
@@ -27,7 +26,7 @@ from px4fuse.loop.part import KnownEnd, assumed_end, part_of
 from px4fuse.trajectory.evaluation import Evaluation, evaluate
 from px4fuse.trajectory.graph.analysis import GATE_ALPHA, SOLUTIONS
 from px4fuse.trajectory.graph.pose_graph import GateResult, PoseGraph, Solution, gate, solve
-from px4fuse.trajectory.model import Array, Frame, Trajectory
+from px4fuse.trajectory.model import Frame, Trajectory
 
 LANDING = "landing"
 UNCORRECTED = "uncorrected"
@@ -457,7 +456,7 @@ def _solve_all(
     return tuple(judged), graph, solved, statement
 
 
-def without(graph: PoseGraph, dropped: NDArray[np.bool_]) -> PoseGraph:
+def without(graph: PoseGraph, dropped: BoolArray) -> PoseGraph:
     """A graph without some of its edges."""
     return replace(
         graph,

@@ -7,16 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from px4fuse.arrays import Array, IntArray
 from px4fuse.errors import SettingsError
-from px4fuse.loop.closure import (
-    DOWN,
-    IntArray,
-    cumulative_distance,
-    heading_change_rad,
-    wrapped,
-)
+from px4fuse.loop.closure import DOWN, cumulative_distance, heading_change_rad, wrapped
 from px4fuse.trajectory.graph.pose_graph import PoseGraph
-from px4fuse.trajectory.model import Array, Trajectory
+from px4fuse.trajectory.model import Trajectory
 
 # The reported variances of an odometry tell its drift only where they grow along the path
 GROWTH = 2.0

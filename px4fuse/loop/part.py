@@ -7,11 +7,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from px4fuse.arrays import Array
 from px4fuse.errors import SettingsError, TrajectoryError
 from px4fuse.filter.signals import Segment
 from px4fuse.flight import Flight, Unavailable
 from px4fuse.loop.closure import DOWN, heading_change_rad, upright
-from px4fuse.trajectory.model import MIN_POSES, Array, Trajectory
+from px4fuse.trajectory.model import MIN_POSES, Trajectory
 
 # Poses on the ground are averaged over this long, if they stay within this far of each other
 REST_S = 1.0

@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 from scipy.spatial.transform import Rotation, Slerp
 
+from px4fuse.arrays import Array
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.projection import continuous_state
 from px4fuse.errors import MissingDataError
@@ -27,7 +28,7 @@ from px4fuse.flight import (
     Unavailable,
     finite_rows,
 )
-from px4fuse.trajectory.model import MIN_POSES, Array, Frame, Kind, Trajectory
+from px4fuse.trajectory.model import MIN_POSES, Frame, Kind, Trajectory
 
 Part = Literal["vio", "ekf2", "kf", "truth"]
 PARTS: tuple[Part, ...] = get_args(Part)

@@ -6,19 +6,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import least_squares
-from scipy.signal import correlate
 
-from px4fuse.filter.signals import Array
+from px4fuse.arrays import Array, Complex
 from px4fuse.placing.tracks import (
     EKF2_POSITION,
     IMU,
     MIN_OVERLAP_S,
     MIN_SAMPLES,
-    STEP_S,
-    Complex,
     NoMatchError,
     Track,
 )
+from px4fuse.trajectory.correlation import autocovariance, moments
+from px4fuse.trajectory.offset import STEP_S
 
 WINDOW_S = 1.0  # by which the least squares may leave the correlation's peak
 # Concordance below which nothing was matched
@@ -98,34 +97,14 @@ def correlation_peak(file: Track, reference: Track, yaw_rad: float | None) -> Pe
     NoMatchError
         No lag has enough overlap.
     """
-    f_mask, g_mask = file.valid.astype(float), reference.valid.astype(float)
-
-    def masked(track: Track) -> Complex:
-        z = track.horizontal_m
-        return np.where(track.valid, z - np.mean(z[track.valid]), 0.0)
-
-    def total(of_file: Array | Complex, of_reference: Array | Complex) -> Complex:
-        """Σ conj(file)·reference over the overlap, for each lag."""
-        sums: Complex = correlate(of_reference, of_file, method="fft").astype(np.complex128)
-        return sums
-
     if not file.valid.any() or not reference.valid.any():
         raise NoMatchError("too little is left between gaps to be matched")
-    f, g = masked(file), masked(reference)
-    count = np.rint(total(f_mask, g_mask).real)
+    found = moments(file.horizontal_m, reference.horizontal_m, file.valid, reference.valid)
+    count, covariance, power = found.count, found.covariance, found.power_a + found.power_b
     shorter = min(np.count_nonzero(file.valid), np.count_nonzero(reference.valid))
     enough = count >= max(MIN_SAMPLES, min(MIN_OVERLAP_S / STEP_S, shorter / 2.0))
     if not enough.any():
         raise NoMatchError("too little is left between gaps to be matched")
-    n = np.maximum(count, 1.0)
-    sum_f, sum_g = total(f, g_mask).conj(), total(f_mask, g)
-    covariance = total(f, g) - sum_f.conj() * sum_g / n
-    power = (
-        total(np.abs(f) ** 2, g_mask).real
-        - np.abs(sum_f) ** 2 / n
-        + total(f_mask, np.abs(g) ** 2).real
-        - np.abs(sum_g) ** 2 / n
-    )
     enough &= power > 1e-9 * np.max(power)  # else rounding errors correlate
     agreed = np.abs(covariance) if yaw_rad is None else (np.exp(-1j * yaw_rad) * covariance).real
     concordance = np.zeros_like(power)
@@ -134,12 +113,12 @@ def correlation_peak(file: Track, reference: Track, yaw_rad: float | None) -> Pe
     best = int(np.argmax(np.where(enough, gain, -np.inf)))
 
     def lag(index: int) -> float:
-        return float(reference.time_s[0]) + (index - len(f) + 1) * STEP_S
+        return float(reference.time_s[0]) + (index - len(file.valid) + 1) * STEP_S
 
     # a rival lies where the concordance has fallen to half in between, or far away
     outside = np.flatnonzero(concordance < 0.5 * concordance[best])
     low = np.max(outside[outside < best], initial=-1)
-    high = np.min(outside[outside > best], initial=len(n))
+    high = np.min(outside[outside > best], initial=len(count))
     rivals = (count >= 0.5 * count[best]) & (power >= 0.25 * power[best]) & enough
     rivals &= concordance >= MIN_CONCORDANCE[reference.name]
     far = round(FAR_S / STEP_S)
@@ -148,7 +127,8 @@ def correlation_peak(file: Track, reference: Track, yaw_rad: float | None) -> Pe
     if not rivals.any():
         return peak
     # per axis; the floor keeps two perfect matches equal
-    residual = np.sqrt(np.maximum(power - 2.0 * agreed, 0.0) / (2.0 * n) + RESIDUAL_FLOOR_M**2)
+    square = np.maximum(power - 2.0 * agreed, 0.0) / (2.0 * np.maximum(count, 1.0))
+    residual = np.sqrt(square + RESIDUAL_FLOOR_M**2)
     rival = int(np.argmin(np.where(rivals, residual, np.inf)))
     return replace(
         peak, rival_s=lag(rival) - lag(best), rival_ratio=float(residual[rival] / residual[best])
@@ -251,7 +231,7 @@ def _inflation(residual: Complex) -> float:
     """1 + 2Σρ: how many autocorrelated residuals say as much as one independent one."""
     limit = 3.0 * _scale(np.abs(residual))
     clipped = residual * np.minimum(1.0, limit / np.maximum(np.abs(residual), 1e-12))
-    rho = correlate(clipped, clipped, method="fft")[len(clipped) - 1 :].real
+    rho = autocovariance(clipped)
     if rho[0] <= 0.0:
         return 1.0
     crossed = np.flatnonzero(rho <= 0.0)

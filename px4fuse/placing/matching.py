@@ -22,7 +22,6 @@ from px4fuse.placing.tracks import (
     IMU,
     MIN_MOTION_M,
     MIN_OVERLAP_S,
-    STEP_S,
     NoMatchError,
     Track,
     band_passed,
@@ -36,6 +35,7 @@ from px4fuse.placing.tracks import (
     placed_samples,
     without_edges,
 )
+from px4fuse.trajectory.offset import RIVAL_RATIO, STEP_S
 
 # nwu is enu turned by 90°
 TURNABLE_FRAMES = ("ned", "enu")
@@ -43,8 +43,6 @@ FRAME_OPTION = f"--position-frame {'|'.join(FRAMES)}"
 MAX_SPAN_S = 86400.0  # a day takes five seconds on the tracks' grid
 # Concordance below which a match is rough: a warning says so, and it overrules nothing
 GOOD_CONCORDANCE = {EKF2_POSITION: 0.9, IMU: 0.7}
-# Another lag whose residual is not larger by this factor cannot be told apart
-SAME_RESIDUAL = 1.2
 MAX_CLOCK_SIGMA_S = 0.5
 FRAME_RATIO = 1.3  # by which one frame must fit better than the next
 # A free yaw and origin that reduce the residual so much say that the file's frame is not EKF2's
@@ -175,7 +173,7 @@ def is_turned(horizontal_rms_m: float, free: Fit, reference: str) -> bool:
 def is_sound(fit: Fit, reference: str) -> bool:
     """Whether a fit is good enough to overrule what was asked for."""
     good = fit.peak.concordance >= GOOD_CONCORDANCE[reference]
-    return good and fit.peak.rival_ratio >= SAME_RESIDUAL
+    return good and fit.peak.rival_ratio >= RIVAL_RATIO
 
 
 def _check_match(match: Match) -> None:
@@ -192,7 +190,7 @@ def _check_match(match: Match) -> None:
             f"the file does not follow the {name} (concordance {peak.concordance:.2f}, at least "
             f"{MIN_CONCORDANCE[name]:g} is needed)"
         )
-    if peak.rival_ratio < SAME_RESIDUAL:
+    if peak.rival_ratio < RIVAL_RATIO:
         raise NoMatchError(
             f"the flight's path leaves the clock open: offsets {abs(peak.rival_s):.1f} s apart fit "
             f"the {name} equally well",

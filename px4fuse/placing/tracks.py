@@ -6,13 +6,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 from scipy.integrate import cumulative_trapezoid
 from scipy.ndimage import binary_erosion, gaussian_filter1d, median_filter
 from scipy.signal import butter, sosfiltfilt
 
+from px4fuse.arrays import Array, BoolArray, Complex
 from px4fuse.comparison.projection import continuous_state
-from px4fuse.filter.signals import Array, Segment, ned_acceleration
+from px4fuse.filter.signals import Segment, ned_acceleration
 from px4fuse.flight import (
     POSITION_COLUMNS,
     POSITION_VARIANCE_COLUMNS,
@@ -22,8 +22,7 @@ from px4fuse.flight import (
     Unavailable,
     finite_rows,
 )
-
-Complex = NDArray[np.complex128]
+from px4fuse.trajectory.offset import STEP_S
 
 # Which of x, y, z is north, east, down, and with which sign
 FRAMES = {
@@ -33,7 +32,6 @@ FRAMES = {
 }
 EKF2_POSITION, IMU = "EKF2 position", "IMU"
 
-STEP_S = 0.05  # of the common grid
 # Nothing is interpolated in an interval longer than this and than three median ones
 GAP_S, GAP_INTERVALS = 0.5, 3.0
 MIN_MOTION_M = 0.5
@@ -72,7 +70,7 @@ class Track:
 
     time_s: Array
     position_m: Array
-    valid: NDArray[np.bool_]
+    valid: BoolArray
     name: str = ""
 
     @property
@@ -80,7 +78,7 @@ class Track:
         """North + i·east, shape (n,)."""
         return self.position_m[:, 0] + 1j * self.position_m[:, 1]
 
-    def at(self, time_s: Array) -> tuple[Array, NDArray[np.bool_]]:
+    def at(self, time_s: Array) -> tuple[Array, BoolArray]:
         """Position at given times, and whether there is one (outside and in gaps there is none)."""
         position = [np.interp(time_s, self.time_s, column) for column in self.position_m.T]
         valid = np.interp(time_s, self.time_s, self.valid.astype(float), 0.0, 0.0) > 0.999

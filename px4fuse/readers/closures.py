@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from px4fuse.errors import TrajectoryError
+from px4fuse.readers.text_table import text_of
 from px4fuse.request import GivenClosure
 
 MAX_CLOSURES = 10_000
@@ -41,17 +42,13 @@ def read_closures(path: Path) -> tuple[GivenClosure, ...]:
         The file cannot be read, holds no closure, or a line is none.
     """
     try:
-        data = path.read_bytes()
-        is_utf16 = data.startswith(b"\xff\xfe")  # a Windows shell's redirection
-        text = data.decode("utf-16" if is_utf16 else "utf-8-sig")
+        text = text_of(path.read_bytes())
     except OSError as error:
         raise TrajectoryError(f"{path.name}: cannot be read ({error.strerror}).") from error
-    except UnicodeDecodeError as error:
-        raise TrajectoryError(
-            f"{path.name}: not a text file. Give one T1,T2[,SIGMA] a line."
-        ) from error
+    if text is None:
+        raise TrajectoryError(f"{path.name}: not a text file. Give one T1,T2[,SIGMA] a line.")
     found: list[GivenClosure] = []
-    for number, line in enumerate(text.splitlines(), start=1):
+    for number, line in enumerate(text.split("\n"), start=1):
         content = line.split("#", 1)[0].strip()
         if not content or (not found and content[0].isalpha()):  # a header
             continue

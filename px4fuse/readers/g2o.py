@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
+from px4fuse.arrays import Array, IntArray
 from px4fuse.errors import TrajectoryError
-from px4fuse.trajectory.graph.model import IntArray
+from px4fuse.readers.text_table import is_number, quote, text_of
 from px4fuse.trajectory.graph.pose_graph import FROM_FILE, PoseGraph, initialise
-from px4fuse.trajectory.model import Array
 
 # Tag: dimension, vertices that it names, numbers that follow them
 _TAGS = {
@@ -81,7 +81,7 @@ def parse_g2o(text: str, name: str) -> PoseGraph:
     if len(dimensions) > 1:
         line = min(found[tag].line[0] for tag in tags if _TAGS[tag][0] == 3)
         raise TrajectoryError(
-            f"{name}: line {line}: poses in space (SE3) beside poses in the plane (SE2). Give one "
+            f"{name}, line {line}: poses in space (SE3) beside poses in the plane (SE2). Give one "
             "kind per file."
         )
     kind = "SE2" if dimensions == {2} else "SE3:QUAT"
@@ -126,12 +126,12 @@ def _text(file: Path) -> str:
         content = file.read_bytes()
     except OSError as error:
         raise TrajectoryError(f"{file.name}: cannot be read: {error.strerror}.") from error
-    try:
-        return content.decode("utf-8-sig")
-    except UnicodeDecodeError:
+    text = text_of(content)
+    if text is None:
         raise TrajectoryError(
             f"{file.name}: not a text file. Give a g2o file: VERTEX and EDGE lines."
-        ) from None
+        )
+    return text
 
 
 def _split(text: str, name: str) -> tuple[dict[str, _Lines], list[tuple[int, int]]]:
@@ -149,21 +149,21 @@ def _split(text: str, name: str) -> tuple[dict[str, _Lines], list[tuple[int, int
             if tag == "FIX":
                 fixed += [(number, _id(each, name, number)) for each in parts[1:]]
             elif not tag.startswith(_IGNORED):
-                raise TrajectoryError(f"{name}: line {number}: {_unknown(tag)}")
+                raise TrajectoryError(f"{name}, line {number}: {_unknown(tag)}")
             continue
         _, named, numbers = expected
         if len(parts) != 1 + named + numbers:
             raise TrajectoryError(
-                f"{name}: line {number}: {tag} has {len(parts) - 1} numbers, not "
+                f"{name}, line {number}: {tag} has {len(parts) - 1} numbers, not "
                 f"{named + numbers}. Write the file again; it may be cut off."
             )
         into = found[tag]
         try:
             values = list(map(float, parts[1 + named :]))
         except ValueError:
-            bad = next(each for each in parts[1 + named :] if not _is_number(each))
+            bad = next(each for each in parts[1 + named :] if not is_number(each))
             raise TrajectoryError(
-                f"{name}: line {number}: {_quote(bad)} is not a number. Correct it."
+                f"{name}, line {number}: {quote(bad)} is not a number. Correct it."
             ) from None
         into.line.append(number)
         into.ids.append([_id(each, name, number) for each in parts[1 : 1 + named]])
@@ -223,7 +223,7 @@ def _poses(name: str, lines: _Lines, numbers: Array, dimension: int) -> Array:
     bad = _first(norm < 1e-6)
     if bad is not None:
         raise TrajectoryError(
-            f"{name}: line {lines.line[bad]}: a quaternion of length 0 is no rotation. Give "
+            f"{name}, line {lines.line[bad]}: a quaternion of length 0 is no rotation. Give "
             "qx qy qz qw behind the position."
         )
     # What is a unit quaternion already stays as it is, so that writing and reading changes nothing
@@ -244,7 +244,7 @@ def _information(name: str, lines: _Lines, numbers: Array, size: int) -> Array:
         bad = _first(values[:, 0] < -_ROUNDING * np.maximum(values[:, -1], 0.0))
         if bad is not None:
             raise TrajectoryError(
-                f"{name}: line {lines.line[bad]}: the information matrix has a negative "
+                f"{name}, line {lines.line[bad]}: the information matrix has a negative "
                 f"eigenvalue ({values[bad, 0]:.3g}). Give the upper triangle of an inverse "
                 "covariance, row by row."
             ) from None
@@ -258,13 +258,13 @@ def _indices(name: str, edges: _Lines, ids: IntArray, ends: IntArray) -> IntArra
     if missing is not None:
         vertex = next(each for each in ends[missing].tolist() if each not in set(ids.tolist()))
         raise TrajectoryError(
-            f"{name}: line {edges.line[missing]}: an edge to vertex {vertex}, which the file does "
+            f"{name}, line {edges.line[missing]}: an edge to vertex {vertex}, which the file does "
             "not have. Add its VERTEX line, or take all of them out."
         )
     same = _first(ends[:, 0] == ends[:, 1])
     if same is not None:
         raise TrajectoryError(
-            f"{name}: line {edges.line[same]}: an edge from vertex {ends[same, 0]} to itself. "
+            f"{name}, line {edges.line[same]}: an edge from vertex {ends[same, 0]} to itself. "
             "Take it out."
         )
     return index
@@ -274,7 +274,7 @@ def _require_finite(name: str, lines: _Lines, numbers: Array) -> None:
     bad = _first(~np.all(np.isfinite(numbers), axis=1))
     if bad is not None:
         raise TrajectoryError(
-            f"{name}: line {lines.line[bad]}: a number that is not finite. Correct it, or take the "
+            f"{name}, line {lines.line[bad]}: a number that is not finite. Correct it, or take the "
             "line out."
         )
 
@@ -284,7 +284,7 @@ def _require_once(name: str, vertices: _Lines, ids: IntArray, order: IntArray) -
     if len(twice):
         before, again = vertices.line[order[twice[0]]], vertices.line[order[twice[0] + 1]]
         raise TrajectoryError(
-            f"{name}: line {again}: vertex {ids[twice[0]]} for the second time (first on line "
+            f"{name}, line {again}: vertex {ids[twice[0]]} for the second time (first on line "
             f"{before}). Take one of them out."
         )
 
@@ -294,12 +294,12 @@ def _require_fixed(name: str, fixed: list[tuple[int, int]], ids: IntArray) -> No
     for line, vertex in fixed:
         if vertex not in known:
             raise TrajectoryError(
-                f"{name}: line {line}: FIX of vertex {vertex}, which the file does not have. Take "
+                f"{name}, line {line}: FIX of vertex {vertex}, which the file does not have. Take "
                 "the line out."
             )
         if vertex != fixed[0][1]:
             raise TrajectoryError(
-                f"{name}: line {line}: FIX of a second vertex ({vertex} beside {fixed[0][1]}). "
+                f"{name}, line {line}: FIX of a second vertex ({vertex} beside {fixed[0][1]}). "
                 "One pose is held here: take the line out, or join the two by an edge."
             )
 
@@ -316,7 +316,7 @@ def _id(text: str, name: str, line: int) -> int:
         number = _BIGGEST_ID
     if not -_BIGGEST_ID <= number < _BIGGEST_ID or "_" in text:
         raise TrajectoryError(
-            f"{name}: line {line}: {_quote(text)} is not the number of a vertex. Give an integer."
+            f"{name}, line {line}: {quote(text)} is not the number of a vertex. Give an integer."
         )
     return number
 
@@ -328,18 +328,6 @@ def _unknown(tag: str) -> str:
             " information matrix in another order."
         )
     return (
-        f"{_quote(tag)} is not read here. Poses (VERTEX_SE2 or VERTEX_SE3:QUAT) and edges between "
+        f"{quote(tag)} is not read here. Poses (VERTEX_SE2 or VERTEX_SE3:QUAT) and edges between "
         "them (EDGE_SE2 or EDGE_SE3:QUAT) are; take other lines out."
     )
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
-
-
-def _quote(text: str) -> str:
-    return repr(text if len(text) <= 40 else text[:37] + "...")

@@ -11,12 +11,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import theilslopes
 
+from px4fuse.arrays import Array
 from px4fuse.flight import ClockMap
-
-Array = NDArray[np.float64]
 
 # Stamps within this of the boot clock at their receipt are taken to be on the boot clock
 SAME_CLOCK_S = 10.0

@@ -10,6 +10,7 @@ import pandas as pd
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from px4fuse.arrays import Array
 from px4fuse.flight import (
     AXIS_NAMES,
     POSITION_VARIANCE_COLUMNS,
@@ -23,7 +24,7 @@ from px4fuse.readers.mavlink_messages import (
     FRAMES_OF_REFERENCE,
     POSE_DIAGONAL,
 )
-from px4fuse.readers.mavlink_recording import BOOT_CLOCK, Array, Recording, vector
+from px4fuse.readers.mavlink_recording import BOOT_CLOCK, Recording, vector
 from px4fuse.readers.px4_ekf2 import DEFAULT_GATE, NO_SELECTOR
 
 VARIANCE_COLUMNS = POSITION_VARIANCE_COLUMNS + VELOCITY_VARIANCE_COLUMNS

@@ -23,6 +23,7 @@ from fastcrc.crc16 import mcrf4xx  # CRC-16/MCRF4XX is MAVLink's X.25 checksum
 from numpy.typing import NDArray
 from pymavlink.dialects.v20 import all as dialect
 
+from px4fuse.arrays import BoolArray, IntArray
 from px4fuse.errors import LogError
 
 Integers = NDArray[np.int64]
@@ -96,11 +97,11 @@ class Frames:
     def __len__(self) -> int:
         return len(self.start)
 
-    def rows(self, message: str) -> NDArray[np.intp]:
+    def rows(self, message: str) -> IntArray:
         """Indices of the frames of one message, by its MAVLink name."""
         return np.flatnonzero(self.message_id == message_ids()[message])
 
-    def table(self, message: str, rows: NDArray[np.intp]) -> NDArray[Any]:
+    def table(self, message: str, rows: IntArray) -> NDArray[Any]:
         """Decode frames of one message.
 
         Parameters
@@ -317,7 +318,7 @@ def _candidates(
     )
 
 
-def _among(values: Integers, increasing: Integers) -> NDArray[np.bool_]:
+def _among(values: Integers, increasing: Integers) -> BoolArray:
     """Whether each value is among increasing ones; np.isin takes many times the memory."""
     at = np.searchsorted(increasing[:-1], values)
     return np.asarray(increasing[at] == values)

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from px4fuse.arrays import Array, IntArray
 from px4fuse.flight import (
     POSITION_COLUMNS,
     POSITION_VARIANCE_COLUMNS,
@@ -29,15 +30,7 @@ from px4fuse.readers.mavlink_messages import (
     ROTATION_DIAGONAL,
     PositionInput,
 )
-from px4fuse.readers.mavlink_recording import (
-    RECEIPT_CLOCK,
-    Address,
-    Array,
-    Recording,
-    Rows,
-    senders_of,
-    vector,
-)
+from px4fuse.readers.mavlink_recording import RECEIPT_CLOCK, Address, Recording, senders_of, vector
 from px4fuse.readers.px4_positions import (
     MIN_TRACK_SAMPLES,
     captured_truth,
@@ -88,7 +81,7 @@ def read_positions(
     return tuple(sorted(tracks, key=lambda track: track.rung)), missing
 
 
-def _kinds(source: PositionInput, table: NDArray[Any]) -> list[tuple[PositionInput, Rows]]:
+def _kinds(source: PositionInput, table: NDArray[Any]) -> list[tuple[PositionInput, IntArray]]:
     """Tracks in one message: one, or for ODOMETRY one per kind of estimator."""
     if source.message != "ODOMETRY":
         return [(source, np.arange(len(table)))]
@@ -100,7 +93,7 @@ def _kinds(source: PositionInput, table: NDArray[Any]) -> list[tuple[PositionInp
 
 
 def _read_track(
-    recording: Recording, source: PositionInput, suffix: str, rows: Rows, clock: Mapped
+    recording: Recording, source: PositionInput, suffix: str, rows: IntArray, clock: Mapped
 ) -> PositionTrack | Unavailable:
     table = recording.frames.table(source.message, rows)
     frame = "NED"
@@ -219,7 +212,7 @@ def read_truth(recording: Recording, positions: tuple[PositionTrack, ...]) -> Tr
     return captured_truth(captured)
 
 
-def _true_attitude(message: str, rows: Rows, recording: Recording) -> Array:
+def _true_attitude(message: str, rows: IntArray, recording: Recording) -> Array:
     """Quaternion w, x, y, z of the simulated vehicle, shape (n, 4); NaN where there is none."""
     table = recording.frames.table(message, rows)
     if message == "HIL_STATE_QUATERNION":

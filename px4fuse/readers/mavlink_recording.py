@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from px4fuse.arrays import Array, IntArray
 from px4fuse.errors import SettingsError
 from px4fuse.flight import ClockMap, Sender, Stream
 from px4fuse.readers.mavlink_clocks import (
@@ -33,8 +34,6 @@ from px4fuse.readers.mavlink_messages import (
 )
 from px4fuse.readers.ulog_topics import increasing
 
-Array = NDArray[np.float64]
-Rows = NDArray[np.intp]
 # MAVLink system and component
 Address = tuple[int, int]
 
@@ -95,13 +94,13 @@ class Recording:
     dropped: dict[str, int] = field(default_factory=dict)
     streams: dict[str, Stream] = field(default_factory=dict)
 
-    def rows(self, message: str, address: Address | None = None) -> Rows:
+    def rows(self, message: str, address: Address | None = None) -> IntArray:
         """Frames of one message within the session, from the autopilot unless said otherwise."""
         system, component = address or (self.system, self.component)
         rows = self.frames.rows(message)
         rows = rows[(rows >= self.session.start) & (rows < self.session.stop)]
         rows = rows[self.frames.system[rows] == system]
-        chosen: Rows = rows[self.frames.component[rows] == component]
+        chosen: IntArray = rows[self.frames.component[rows] == component]
         return chosen
 
     def frame(self, name: str, boot_s: Array, columns: list[str], values: Array) -> pd.DataFrame:
@@ -126,7 +125,7 @@ class Recording:
             copy=False,  # it is a copy already
         )
 
-    def _keep(self, name: str, boot_s: Array) -> Rows:
+    def _keep(self, name: str, boot_s: Array) -> IntArray:
         """Samples with a possible time stamp, strictly increasing; the others are counted."""
         # false for NaN too
         late_s = boot_s - self.zero_s
@@ -135,17 +134,17 @@ class Recording:
         time_us = np.rint(boot_s[rows] * 1e6).astype(np.int64)
         # one message that came over two links is one sample
         first = np.sort(np.unique(time_us, return_index=True)[1])
-        keep: Rows = rows[first[increasing(time_us[first])]]
+        keep: IntArray = rows[first[increasing(time_us[first])]]
         dropped = len(boot_s) - len(rows) + len(first) - len(keep)
         if dropped:
             self.dropped[name] = dropped
         return keep
 
-    def receipt_boot_s(self, rows: Rows) -> Array:
+    def receipt_boot_s(self, rows: IntArray) -> Array:
         """Boot clock (s) at which frames were received, less the link's least delay."""
         return self.boot_of_receipt.at(self.received_s[rows])
 
-    def boot_s(self, table: NDArray[Any], rows: Rows) -> Array:
+    def boot_s(self, table: NDArray[Any], rows: IntArray) -> Array:
         """Boot clock (s) of the autopilot's own messages; by receipt where they are not on it."""
         if "time_boot_ms" in (table.dtype.names or ()):
             return np.asarray(table["time_boot_ms"] * 1e-3, dtype=np.float64)
@@ -177,7 +176,7 @@ def _vehicles(frames: Frames) -> dict[Address, tuple[int, int]]:
     }
 
 
-def _counts(frames: Frames, rows: Rows | slice = slice(None)) -> list[tuple[Address, int]]:
+def _counts(frames: Frames, rows: IntArray | slice = slice(None)) -> list[tuple[Address, int]]:
     """Senders of frames and how many each sent, most first."""
     address = frames.system[rows].astype(np.int64) << 8 | frames.component[rows]
     numbers, counts = np.unique(address, return_counts=True)
@@ -217,7 +216,7 @@ def choose_autopilot(frames: Frames, system: int | None) -> tuple[Address, str]:
     return best, name or "unknown autopilot"
 
 
-def _boot_stamps(frames: Frames, address: Address) -> tuple[Rows, Array]:
+def _boot_stamps(frames: Frames, address: Address) -> tuple[IntArray, Array]:
     """Frames of the autopilot that carry its boot clock, in file order, and that clock (s)."""
     own = (frames.system == address[0]) & (frames.component == address[1])
     all_rows, all_stamps = [], []
@@ -285,8 +284,8 @@ def settle_clocks(frames: Frames, address: Address) -> Recording:
     return Recording(frames, *address, session, received, line, zero_s, end_s - zero_s, notes)
 
 
-def _without_strays(stamps: Array, rows: Rows) -> Rows:
-    """Rows of increasing stamps without a few at either end that are far from all others."""
+def _without_strays(stamps: Array, rows: IntArray) -> IntArray:
+    """IntArray of increasing stamps without a few at either end that are far from all others."""
     parts = np.split(rows, np.flatnonzero(np.diff(stamps[rows]) > OUTSIDE_S) + 1)
     enough = STRAY_SHARE * max(len(part) for part in parts)
     many = [number for number, part in enumerate(parts) if len(part) >= enough]

@@ -40,9 +40,9 @@ from px4fuse.readers.position_table import (
     Table,
     find_table,
     plain_text,
-    quote,
     split,
 )
+from px4fuse.readers.text_table import at_line, quote
 from px4fuse.readers.ulog_topics import increasing
 
 SAMPLE_COLUMNS = ["x_m", "y_m", "z_m", "sigma_x_m", "sigma_y_m", "sigma_z_m", "quality"]
@@ -410,11 +410,12 @@ def _name_text(table: Table, choice: _Choice, texts: pd.DataFrame) -> str:
     if not bad:
         return f"{table.file}: no table of numbers. Export it as CSV again."
     row, column = min(bad)
-    return (
-        f"{table.file}: line {table.first_line + row}, {table.label(column)}: "
-        f"{quote(str(texts[column].iloc[row]))} is no "
-        f"{'time' if column == choice.time else 'number'}. Correct or remove that line, or say "
-        f"where time and position are with {COLUMNS_OPTION}."
+    kind = "time" if column == choice.time else "number"
+    return at_line(
+        table.file,
+        table.first_line + row,
+        f"{table.label(column)}: {quote(str(texts[column].iloc[row]))} is no {kind}",
+        f"Correct or remove that line, or say where time and position are with {COLUMNS_OPTION}.",
     )
 
 

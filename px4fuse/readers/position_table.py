@@ -10,6 +10,7 @@ import numpy as np
 
 from px4fuse.errors import LogError
 from px4fuse.readers.position_names import find_position, meaning
+from px4fuse.readers.text_table import NUMBER, quote, text_of
 
 COLUMNS_OPTION = "--position-columns TIME,X,Y,Z"
 
@@ -22,31 +23,20 @@ MAX_NAMES = 12  # of columns in one sentence
 # In the order in which one is taken where several fit
 _SEPARATORS = {";": "semicolon", "\t": "tab", ",": "comma", " ": "space"}
 _COMMENTS = ("#", "%")
-NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?|[0-9]*[.,][0-9]+)(?:[eE][+-]?[0-9]+)?")
 ISO_TIME = re.compile(r"[0-9]{4}[-/][0-9]{2}[-/][0-9]{2}[T ][0-9]{2}:[0-9]{2}.*")
 MISSING = ["", "-", "--", "inf", "+inf", "-inf", "Inf", "-Inf", "INF", "infinity", "-infinity"]
 MISSING += ["nan", "NaN", "NAN", "+nan", "-nan", "-NaN", "nan(ind)", "-nan(ind)", "NA", "N/A"]
 MISSING += ["n/a", "null", "Null", "NULL", "none", "None", "nil"]
 
 
-def quote(text: str) -> str:
-    """Quote a text of the file, shortened."""
-    return repr(text if len(text) <= 40 else text[:37] + "...")
-
-
 def plain_text(name: str, content: bytes) -> str:
     """Text with line feeds between lines, without quotes and blanks around fields."""
-    content = content.rstrip(b"\0")  # a power cut leaves NULs behind the last line
-    if b"\0" in content:
+    text = text_of(content)
+    if text is None:
         raise LogError(
-            f"{name}: a binary file (or UTF-16), not a text table. Give the CSV file of the UWB "
-            "system, saved as UTF-8; a flight log is read without --position."
+            f"{name}: a binary file, not a text table. Give the CSV file of the UWB system; a "
+            "flight log is read without --position."
         )
-    try:
-        text = content.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        text = content.decode("latin-1")
-    text = text.replace("\r\n", "\n").replace("\r", "\n")
     if '"' in text:  # what looks like a separator is none within a quoted field: "1,5"
         quoted = re.compile(r'(?<![^,;\t\n ])"([^"\n]*)"(?![^,;\t\n ])')
         text = quoted.sub(lambda field: re.sub("[,;\t]", ".", field[1]), text)

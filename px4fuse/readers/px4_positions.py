@@ -7,8 +7,8 @@ from functools import partial
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
+from px4fuse.arrays import Array
 from px4fuse.flight import (
     AXIS_NAMES,
     EXTERNAL_VISION_RUNGS,
@@ -210,10 +210,10 @@ def _reconstruct(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack | Un
 
 
 def project(
-    latitude_deg: NDArray[np.float64],
-    longitude_deg: NDArray[np.float64],
+    latitude_deg: Array,
+    longitude_deg: Array,
     origin: tuple[float, float],
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[Array, Array]:
     """North and east (m) of an origin by the azimuthal equidistant projection that PX4 uses.
 
     Source: PX4 ``MapProjection::project``, src/lib/geo/geo.cpp (Snyder 1987, equation 25-2).

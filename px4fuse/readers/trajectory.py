@@ -16,13 +16,13 @@ from decimal import Decimal, InvalidOperation
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from px4fuse.arrays import Array, BoolArray
 from px4fuse.errors import TrajectoryError
 from px4fuse.readers.files import read_whole
-from px4fuse.readers.position_table import quote
-from px4fuse.trajectory.model import MIN_POSES, Array, Frame, Kind, Trajectory
+from px4fuse.readers.text_table import at_line, is_number, quote, text_of
+from px4fuse.trajectory.model import MIN_POSES, Frame, Kind, Trajectory
 
 MAX_FILE_BYTES = 500_000_000
 COLUMNS = 8
@@ -46,7 +46,6 @@ GAP_INTERVALS, GAP_S = 2.5, 0.3
 
 _TUM = "TUM (time x y z qx qy qz qw)"
 _TRUTH = re.compile(r"truth|vicon|leica|mocap|(?<![a-z])gt(?![a-z])", re.IGNORECASE)
-_NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?|[+-]?(?:nan|inf)", re.IGNORECASE)
 _REMEDY = f"Export the trajectory as {_TUM}, in seconds."
 
 
@@ -72,23 +71,7 @@ class _File:
         """Error that names the line of a row of data."""
         numbers = (at for at, line in enumerate(self.lines, 1) if _is_row(line))
         number = next(at for index, at in enumerate(numbers) if index == row)
-        return TrajectoryError(f"{self.name}, line {number}: {what}. {remedy}")
-
-
-def looks_like_trajectory(head: bytes) -> bool:
-    """Whether the first bytes of a file are those of a trajectory, not of a flight log.
-
-    Parameters
-    ----------
-    head : bytes
-        Some kilobytes, so that the comments before the first pose fit in.
-    """
-    try:
-        lines = _text("", head).split("\n")
-        _recognise(_File("", lines[:-1] if sum(map(_is_row, lines)) > 1 else lines, ""))
-    except TrajectoryError:
-        return False
-    return True
+        return TrajectoryError(at_line(self.name, number, what, remedy))
 
 
 def read_trajectory(path: str | Path) -> Trajectory:
@@ -194,18 +177,13 @@ def tum_text(trajectory: Trajectory) -> str:
 
 def _text(name: str, content: bytes) -> str:
     """Text with line feeds between lines."""
-    is_utf16 = content.startswith((b"\xff\xfe", b"\xfe\xff"))  # a Windows shell's redirection
-    even = content[: len(content) // 2 * 2]
-    try:
-        text = even.decode("utf-16") if is_utf16 else content.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        text = content.decode("latin-1")  # a comment in an old encoding
-    if re.search("[\x00-\x08\x0e-\x1b]", text[:100_000]) or "\0" in text:
+    text = text_of(content)
+    if text is None:
         is_ulog = content.startswith(b"ULog")
         what = "a PX4 log" if is_ulog else "a binary file"
         remedy = f"Name a part of the log: {name}:vio or {name}:ekf2." if is_ulog else _REMEDY
         raise TrajectoryError(f"{name}: {what}, not a trajectory file. {remedy}")
-    return text.replace("\r\n", "\n").replace("\r", "\n")
+    return text
 
 
 def _is_row(line: str) -> bool:
@@ -222,7 +200,7 @@ def _fields(line: str, layout: _Layout | None = None) -> list[str]:
 
 
 def _numeric(fields: list[str]) -> bool:
-    return all(map(_NUMBER.fullmatch, fields))
+    return all(map(is_number, fields))
 
 
 # -- which format ----------------------------------------------------------------------------------
@@ -335,7 +313,7 @@ def _bad_row(file: _File, layout: _Layout, rows: list[str]) -> TrajectoryError:
             what = f"{len(fields)} columns, where the first line has {layout.columns}"
             return file.refuse(row, what, "Correct or remove that line.")
         for column, field in enumerate(fields, 1):
-            if not _NUMBER.fullmatch(field):
+            if not is_number(field):
                 what = f"column {column}: {quote(field)} is no number"
                 return file.refuse(row, what, "Correct or remove that line.")
     return TrajectoryError(f"{file.name}: no table of numbers. {_REMEDY}")
@@ -346,7 +324,7 @@ def _seconds(file: _File, stamps: list[str]) -> tuple[Array, str]:
     try:
         values = np.array(stamps, dtype=np.float64)
     except ValueError as error:
-        row = next(i for i, stamp in enumerate(stamps) if not _NUMBER.fullmatch(stamp.strip()))
+        row = next(i for i, stamp in enumerate(stamps) if not is_number(stamp.strip()))
         what = f"column 1: {quote(stamps[row])} is no time"
         raise file.refuse(row, what, "Correct or remove that line.") from error
     finite = np.isfinite(values)
@@ -464,7 +442,7 @@ def _gaps(time: Array, kind: Kind) -> str:
     """Words on missing frames, or on poses that are key frames."""
     steps = np.diff(time)
     median = float(np.median(steps))
-    near: NDArray[np.bool_] = np.abs(steps - median) <= REGULAR_WITHIN * median
+    near: BoolArray = np.abs(steps - median) <= REGULAR_WITHIN * median
     if near.mean() < REGULAR_SHARE:
         return (
             f"Poses come at no rate (every {median:.3g} s in the median, {steps.max():.3g} s apart "

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
+from px4fuse.arrays import Array
 from px4fuse.flight import (
     ANGULAR_RATE_COLUMNS,
     QUATERNION_COLUMNS,
@@ -154,7 +154,7 @@ def _read_attitude(topics: Topics) -> pd.DataFrame | Unavailable:
             "attitude", "no topic vehicle_attitude", "Record with SDLOG_PROFILE bit 0 (default)."
         )
     attitude = topics.frame(layout)[QUATERNION_COLUMNS]
-    norm: NDArray[np.float64] = np.linalg.norm(attitude.to_numpy(), axis=1)
+    norm: Array = np.linalg.norm(attitude.to_numpy(), axis=1)
     attitude = attitude[np.isfinite(norm) & (norm > 0.5)]  # a zero quaternion is no attitude
     if len(attitude) < 2:
         return Unavailable(

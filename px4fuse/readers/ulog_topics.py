@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from pyulog import ULog
 from pyulog.exceptions import ULogException
 
+from px4fuse.arrays import IntArray
 from px4fuse.errors import LogError
 from px4fuse.flight import Dropout, LogInfo
 from px4fuse.readers.px4_topics import IMU, PARAMETERS, Layout, topics
@@ -154,7 +155,7 @@ def measurement_time_us(table: dict[str, NDArray[Any]]) -> NDArray[np.int64]:
     return np.where(plausible, sampled, published)
 
 
-def increasing(time_us: NDArray[np.int64]) -> NDArray[np.intp]:
+def increasing(time_us: NDArray[np.int64]) -> IntArray:
     """Indices of the longest strictly increasing run of positive time stamps.
 
     A stamp hours ahead must cost one sample, not all that follow it, so the longest increasing

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from px4fuse.filter.signals import Array
+from px4fuse.arrays import Array
 from px4fuse.findings import Finding
 from px4fuse.flight import Unavailable
 from px4fuse.loop.loop import BY_DISTANCE, UNCORRECTED, Correction, Loop

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
+from px4fuse.arrays import Array
 from px4fuse.filter.signals import Segment
 from px4fuse.flight import Unavailable
 from px4fuse.loop.analysis import SMALLEST_STAMP_S
 from px4fuse.loop.loop import SINGLE_LOOP, Correction, Judged, Loop
 from px4fuse.trajectory.evaluation import Evaluation, Interval, Statistics
 from px4fuse.trajectory.graph.analysis import GATE_ALPHA
-from px4fuse.trajectory.model import AXES_OF_FRAME, Array, Trajectory
+from px4fuse.trajectory.model import AXES_OF_FRAME, Trajectory
 
 KINDS = {
     "vio": "odometry (external vision)",

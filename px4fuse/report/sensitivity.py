@@ -9,9 +9,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, NullFormatter, ScalarFormatter
 
+from px4fuse.arrays import Array
 from px4fuse.comparison.comparison import AxisComparison
 from px4fuse.filter.likelihood import PROFILE_DROP, States, preintegrate, states
-from px4fuse.filter.signals import AISLE, Array
+from px4fuse.filter.signals import AISLE
 from px4fuse.filter.tuning import HORIZONTAL, Noise
 from px4fuse.flight import Unavailable
 from px4fuse.report.document import Document

@@ -21,7 +21,7 @@ from matplotlib.figure import Figure
 from matplotlib.ft2font import LoadFlags
 from matplotlib.ticker import MaxNLocator
 
-from px4fuse.filter.signals import Array
+from px4fuse.arrays import Array
 
 A4_INCHES = (8.27, 11.69)
 LEFT, RIGHT, TOP, BOTTOM = 0.085, 0.945, 0.95, 0.05

@@ -10,8 +10,8 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from px4fuse.arrays import Array
 from px4fuse.comparison.comparison import AgainstTruth, AxisComparison, Difference
-from px4fuse.filter.signals import Array
 from px4fuse.flight import Unavailable
 from px4fuse.report.document import Document
 from px4fuse.report.style import (

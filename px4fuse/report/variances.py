@@ -9,8 +9,9 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from px4fuse.arrays import Array
 from px4fuse.comparison.comparison import AxisComparison, FilterSummary
-from px4fuse.filter.signals import Array, Segment
+from px4fuse.filter.signals import Segment
 from px4fuse.flight import Unavailable
 from px4fuse.report.document import Document
 from px4fuse.report.style import (

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from px4fuse.arrays import Array
 from px4fuse.flight import Unavailable
 from px4fuse.loop.loop import Correction, Judged, Loop
 from px4fuse.loop.part import KnownEnd
@@ -18,7 +19,7 @@ from px4fuse.trajectory.evaluation import (
     Statistics,
 )
 from px4fuse.trajectory.graph.analysis import SOLUTIONS, SolvedGraph
-from px4fuse.trajectory.model import AXES_OF_FRAME, Array, Trajectory
+from px4fuse.trajectory.model import AXES_OF_FRAME, Trajectory
 
 
 def loop_part(loop: Loop | Unavailable) -> dict[str, Any]:

@@ -11,14 +11,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from px4fuse.arrays import Array, IntArray
 from px4fuse.errors import SettingsError
 from px4fuse.filter.signals import STANDARD_GRAVITY_M_S2
 from px4fuse.simulation.mistakes import Mistakes
 from px4fuse.simulation.scenario import CORNER_S, START_STOP_S, Scenario
-
-Array = NDArray[np.float64]
 
 # On the ground before take-off and after landing
 GROUND_S = 6.0
@@ -177,7 +175,7 @@ class Motion:
             yaw_rate_rad_s=yaw_rate[:, 0],
         )
 
-    def _fade(self, time_s: Array) -> tuple[tuple[Array, Array, Array, Array], NDArray[np.intp]]:
+    def _fade(self, time_s: Array) -> tuple[tuple[Array, Array, Array, Array], IntArray]:
         """Size of the wander, shape (n, 1), its derivatives at m indices, (m, 1), and those."""
         rise = np.clip((time_s - self.take_off_s) / FADE_S, 0.0, 1.0)
         fall = np.clip((time_s - self.touch_down_s) / FADE_S + 1.0, 0.0, 1.0)

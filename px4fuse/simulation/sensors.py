@@ -12,8 +12,9 @@ from scipy.integrate import cumulative_trapezoid
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
+from px4fuse.arrays import Array, BoolArray
 from px4fuse.simulation.mistakes import Mistakes
-from px4fuse.simulation.motion import Array, Motion, Sines, attitude, direction
+from px4fuse.simulation.motion import Motion, Sines, attitude, direction
 from px4fuse.simulation.scenario import DT_S, Scenario
 from px4fuse.simulation.ulog_writer import Topic
 
@@ -71,7 +72,7 @@ class Positions:
     """
 
     topic: Topic
-    outlier: NDArray[np.bool_]
+    outlier: BoolArray
     error_m: Array
     measured_s: Array
     distance_m: float
@@ -262,8 +263,8 @@ def vio_drift(scenario: Scenario, distance_m: Array) -> Array:
 
 
 def outliers(
-    scenario: Scenario, mistakes: Mistakes, airborne: NDArray[np.bool_]
-) -> tuple[Array, NDArray[np.bool_]]:
+    scenario: Scenario, mistakes: Mistakes, airborne: BoolArray
+) -> tuple[Array, BoolArray]:
     """Shift of each sample, shape (n, 3), and which are outliers, in bursts while airborne.
 
     A burst has one horizontal direction, away from the anchor that is hidden, and sizes from half
@@ -290,7 +291,7 @@ def outliers(
     return shift, chosen
 
 
-def thinned(time_s: Array, rate_hz: float) -> NDArray[np.bool_]:
+def thinned(time_s: Array, rate_hz: float) -> BoolArray:
     """Samples that a logger keeps which passes on at most this rate; 0 keeps all."""
     if rate_hz <= 0.0:
         return np.ones(len(time_s), np.bool_)
@@ -353,7 +354,7 @@ def _low_pass(position_m: Array, interval_s: float, constant_s: float) -> Array:
 
 def _outside_gap(
     time_s: Array, length_s: float, at_s: float | None, duration_s: float
-) -> NDArray[np.bool_]:
+) -> BoolArray:
     """Samples outside a gap, which lies in the middle unless said otherwise."""
     start_s = (duration_s - length_s) / 2.0 if at_s is None else at_s
     return np.asarray((time_s <= start_s) | (time_s >= start_s + length_s))

@@ -14,11 +14,11 @@ from typing import Literal
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from px4fuse.arrays import Array
 from px4fuse.errors import TrajectoryError
-from px4fuse.trajectory.model import MIN_POSES, Array
+from px4fuse.trajectory.model import MIN_POSES
 
 AlignmentKind = Literal["none", "yaw", "se3", "sim3"]
-DEGREES_OF_FREEDOM: dict[AlignmentKind, int] = {"none": 0, "yaw": 4, "se3": 6, "sim3": 7}
 
 # Below this share of the motion's extent, or this RMS, there is nothing to turn by
 MIN_SHARE, MIN_SPREAD_M = 1e-6, 1e-6

@@ -13,25 +13,18 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.signal import correlate
 from scipy.spatial.transform import Rotation
 from scipy.stats import norm
 from scipy.stats import t as student_t
 
+from px4fuse.arrays import Array, IntArray
 from px4fuse.errors import SettingsError, TrajectoryError
 from px4fuse.flight import Unavailable
 from px4fuse.trajectory.alignment import AlignmentKind, Transform, fit, umeyama
-from px4fuse.trajectory.association import (
-    Association,
-    IntArray,
-    Method,
-    TimeOffset,
-    associate,
-    clock_difference,
-    estimate_time_offset,
-)
-from px4fuse.trajectory.model import Array, Trajectory
+from px4fuse.trajectory.association import Association, Method, associate
+from px4fuse.trajectory.correlation import autocovariance
+from px4fuse.trajectory.model import Trajectory
+from px4fuse.trajectory.offset import TimeOffset, clock_difference, estimate_time_offset
 
 Unit = Literal["frames", "m", "s"]
 Side = Literal["estimate", "reference"]
@@ -713,9 +706,7 @@ def autocorrelation_time(values: Array) -> float:
     if not centred.any():
         return 1.0
     n = len(centred)
-    covariance: NDArray[np.float64] = correlate(centred, centred, mode="full", method="fft")[
-        n - 1 :
-    ]
+    covariance = autocovariance(centred)
     times = 2.0 * np.cumsum(covariance / covariance[0]) - 1.0
     enough = np.flatnonzero(np.arange(n) >= WINDOW_TIMES * times)
     return max(1.0, float(times[enough[0]] if len(enough) else n))

@@ -6,11 +6,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Literal
 
-import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-Array = NDArray[np.float64]
+from px4fuse.arrays import Array, BoolArray, IntArray
+
 # What made it; "slam" is a system whose world is its first key frame (ORB-SLAM3 and the like)
 Kind = Literal["vio", "ekf2", "kf", "truth", "slam", "unknown"]
 # Axes of its world: "NED" and "FRD" have z down, "ENU" z up, "camera" y down and z forward
@@ -75,7 +74,7 @@ class Trajectory:
     def __len__(self) -> int:
         return len(self.time_s)
 
-    def __getitem__(self, chosen: slice | NDArray[np.bool_] | NDArray[np.intp]) -> Trajectory:
+    def __getitem__(self, chosen: slice | BoolArray | IntArray) -> Trajectory:
         """Some of its poses, in order.
 
         Parameters
@@ -92,7 +91,5 @@ class Trajectory:
         )
 
 
-def _some(
-    values: Array | None, chosen: slice | NDArray[np.bool_] | NDArray[np.intp]
-) -> Array | None:
+def _some(values: Array | None, chosen: slice | BoolArray | IntArray) -> Array | None:
     return None if values is None else values[chosen]

@@ -8,16 +8,15 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import chi2
 
+from px4fuse.arrays import Array, IntArray
 from px4fuse.errors import TrajectoryError
 from px4fuse.trajectory.graph import lie
 from px4fuse.trajectory.graph.model import (
-    IntArray,
     PoseGraph,
     observed_directions,
     odometry_chain,
     odometry_steps,
 )
-from px4fuse.trajectory.model import Array
 
 
 @dataclass(frozen=True)
@@ -45,49 +44,16 @@ class GateResult:
     accepted: bool
 
 
-def relative_covariance(
-    graph: PoseGraph, start: int, end: int, edges: IntArray | None = None
-) -> Array:
-    """Covariance of ``X_start^-1 X_end`` by odometry alone, to first order.
-
-    Each step's error is carried to the end by the adjoint (Barfoot 2017, 8.96 and the first order
-    of 8.108, with right perturbations).
-
-    Parameters
-    ----------
-    graph : PoseGraph
-        Only its measurements are used, not its poses.
-    start, end : int
-        Indices of poses, in either order.
-    edges : ndarray of int, optional
-        Edges that are odometry; by default all that join successive poses. The first one between
-        two poses is taken.
-
-    Returns
-    -------
-    ndarray, shape (3, 3) or (6, 6)
-        In the axes of the pose at the end, m² and rad².
-
-    Raises
-    ------
-    TrajectoryError
-        If odometry does not lead from one to the other, or has a direction without information.
-    """
-    low, high = min(start, end), max(start, end)
-    _, worlds, poses = _dead_reckoning(graph, low, high, odometry_chain(graph, edges))
-    to_end = lie.adjoint(lie.inverse(poses[end - low]))
-    made: Array = to_end @ np.sum(worlds, axis=0) @ to_end.T
-    return 0.5 * (made + made.T)
-
-
 def gate(
     graph: PoseGraph, edge_indices: Sequence[int] | IntArray, alpha: float = 0.001
 ) -> list[GateResult]:
     """Test closures against odometry alone, before they have pulled at anything.
 
     ``d2 = r' (J Sigma J' + Omega^-1)^-1 r`` with r the log of the closure's inverse times the
-    relative pose by odometry, Sigma its covariance from :func:`relative_covariance` and J the
-    inverse right Jacobian at r. Only directions that the closure's information observes take part.
+    relative pose by odometry, J the inverse right Jacobian at r and Sigma the covariance of that
+    pose: each step's error is carried to the end by the adjoint (Barfoot 2017, 8.96 and the first
+    order of 8.108, with right perturbations). Only directions that the closure's information
+    observes take part.
 
     Parameters
     ----------
@@ -106,7 +72,8 @@ def gate(
     Raises
     ------
     TrajectoryError
-        As :func:`relative_covariance`, or if a closure tells nothing.
+        If odometry does not lead from one end of a closure to the other, or has a direction without
+        information, or a closure tells nothing.
     """
     tested = np.asarray(edge_indices, dtype=np.intp)
     if not len(tested):
@@ -114,7 +81,7 @@ def gate(
     chain = odometry_chain(graph, np.setdiff1d(np.arange(len(graph.first)), tested))
     a, b = graph.first[tested], graph.second[tested]
     low, high = int(min(a.min(), b.min())), int(max(a.max(), b.max()))
-    _, worlds, poses = _dead_reckoning(graph, low, high, chain)
+    worlds, poses = _dead_reckoning(graph, low, high, chain)
     total = np.concatenate([np.zeros((1, *worlds.shape[1:])), np.cumsum(worlds, axis=0)])
     span = total[np.maximum(a, b) - low] - total[np.minimum(a, b) - low]
     to_end = lie.adjoint(lie.inverse(poses[b - low]))
@@ -146,10 +113,8 @@ def _tested(
     return GateResult(edge, d2, freedom, p, p >= alpha)
 
 
-def _dead_reckoning(
-    graph: PoseGraph, low: int, high: int, chain: IntArray
-) -> tuple[Array, Array, Array]:
-    """Steps, their covariances carried to the axes of pose ``low``, and poses as seen from it."""
+def _dead_reckoning(graph: PoseGraph, low: int, high: int, chain: IntArray) -> tuple[Array, Array]:
+    """Covariances of the steps in the axes of pose ``low``, and poses as seen from it."""
     used = chain[low:high]
     gap = np.flatnonzero(used < 0)
     if len(gap):
@@ -158,11 +123,10 @@ def _dead_reckoning(
             f"No odometry edge joins vertices {graph.ids[at]} and {graph.ids[at + 1]}, so odometry "
             "alone does not tell how well the closure fits. Add the edge, or test shorter closures."
         )
-    steps = odometry_steps(graph, used)
     covariance = _covariances(graph, used)
-    poses = lie.chain(steps)
+    poses = lie.chain(odometry_steps(graph, used))
     carry = lie.adjoint(poses[1:])
-    return steps, carry @ covariance @ carry.transpose(0, 2, 1), poses
+    return carry @ covariance @ carry.transpose(0, 2, 1), poses
 
 
 def _covariances(graph: PoseGraph, used: IntArray) -> Array:

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from px4fuse.arrays import Array
 from px4fuse.errors import TrajectoryError
 from px4fuse.trajectory.graph import lie
 from px4fuse.trajectory.graph.model import (
@@ -17,7 +18,6 @@ from px4fuse.trajectory.graph.model import (
     require_connected,
 )
 from px4fuse.trajectory.graph.system import BlockSystem
-from px4fuse.trajectory.model import Array
 
 
 def initialise(graph: PoseGraph) -> PoseGraph:

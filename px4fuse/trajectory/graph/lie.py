@@ -13,16 +13,13 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.polynomial.polynomial import polyval
-from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
-Array = NDArray[np.float64]
+from px4fuse.arrays import Array, BoolArray
 
 # Below this angle (rad) series replace quotients that cancel; five terms then reach 1e-14
 SMALL = 0.3
 _B = (1 / 6, -1 / 120, 1 / 5040, -1 / 362880, 1 / 39916800)
-_A_SLOPE = (-2 / 24, 4 / 720, -6 / 40320, 8 / 3628800, -10 / 479001600)
-_B_SLOPE = (-2 / 120, 4 / 5040, -6 / 362880, 8 / 39916800, -10 / 6227020800)
+
 _C = (1 / 12, 1 / 720, 1 / 30240, 1 / 1209600, 1 / 47900160)
 _C_SLOPE = (1 / 360, 1 / 7560, 1 / 201600, 1 / 5987520, 691 / 130767436800)
 
@@ -65,77 +62,6 @@ def cross(a: Array, b: Array) -> Array:
     return made
 
 
-def so3_exp(phi: Array) -> Array:
-    """Rotation matrices of rotation vectors.
-
-    Parameters
-    ----------
-    phi : ndarray, shape (..., 3)
-        rad.
-
-    Returns
-    -------
-    ndarray, shape (..., 3, 3)
-    """
-    made: Array = Rotation.from_rotvec(phi.reshape(-1, 3)).as_matrix()
-    return made.reshape(*phi.shape, 3)
-
-
-def so3_log(rotation: Array) -> Array:
-    """Rotation vectors of rotation matrices, of length pi at most; right near pi too.
-
-    Parameters
-    ----------
-    rotation : ndarray, shape (..., 3, 3)
-
-    Returns
-    -------
-    ndarray, shape (..., 3)
-        rad.
-    """
-    made: Array = Rotation.from_matrix(rotation.reshape(-1, 3, 3)).as_rotvec()
-    return made.reshape(rotation.shape[:-1])
-
-
-def so3_right_jacobian(phi: Array) -> Array:
-    """How exp(phi) turns, in its own axes, with phi (Barfoot 2017, 7.77 for the left one).
-
-    Parameters
-    ----------
-    phi : ndarray, shape (..., 3)
-        rad.
-
-    Returns
-    -------
-    ndarray, shape (..., 3, 3)
-    """
-    theta = np.linalg.norm(phi, axis=-1)
-    hat = skew(phi)
-    made: Array = (
-        np.eye(3) - _a(theta)[..., None, None] * hat + _b(theta)[..., None, None] * (hat @ hat)
-    )
-    return made
-
-
-def so3_right_jacobian_inverse(phi: Array) -> Array:
-    """Inverse of :func:`so3_right_jacobian` (Barfoot 2017, 7.76 for the left one).
-
-    Parameters
-    ----------
-    phi : ndarray, shape (..., 3)
-        rad, shorter than 2 pi.
-
-    Returns
-    -------
-    ndarray, shape (..., 3, 3)
-    """
-    hat = skew(phi)
-    made: Array = (
-        np.eye(3) + 0.5 * hat + _c(np.linalg.norm(phi, axis=-1))[..., None, None] * (hat @ hat)
-    )
-    return made
-
-
 def rotation_matrix(pose: Array) -> Array:
     """Rotation of poses as a matrix.
 
@@ -156,6 +82,19 @@ def rotation_matrix(pose: Array) -> Array:
         (2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)),
         (2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)),
     )
+
+
+def identity(width: int) -> Array:
+    """Pose that moves nothing.
+
+    Parameters
+    ----------
+    width : int
+        3 in the plane, 7 in space.
+    """
+    made = np.zeros(width)
+    made[6:] = 1.0  # w of the quaternion
+    return made
 
 
 def compose(a: Array, b: Array) -> Array:
@@ -186,14 +125,7 @@ def inverse(pose: Array) -> Array:
     ----------
     pose : ndarray, shape (..., 3) or (..., 7)
     """
-    if pose.shape[-1] == 3:
-        c, s = np.cos(pose[..., 2]), np.sin(pose[..., 2])
-        x, y = pose[..., 0], pose[..., 1]
-        return np.stack([-c * x - s * y, s * x - c * y, -pose[..., 2]], axis=-1)
-    made = np.empty(pose.shape)
-    made[..., 3:] = _conjugate(pose[..., 3:])
-    made[..., :3] = -_rotate(made[..., 3:], pose[..., :3])
-    return made
+    return between(pose, identity(pose.shape[-1]))
 
 
 def between(a: Array, b: Array) -> Array:
@@ -298,41 +230,6 @@ def adjoint(pose: Array) -> Array:
     return made
 
 
-def right_jacobian(tangent: Array) -> Array:
-    """How exp(xi) moves, in its own axes, with xi (Barfoot 2017, 7.95; Sola 2018, 163).
-
-    Barfoot's Q (7.86b) is written as what it is, the derivative of SO(3)'s Jacobian in the
-    direction of the translation: the same numbers from fewer products.
-
-    Parameters
-    ----------
-    tangent : ndarray, shape (..., 3) or (..., 6)
-
-    Returns
-    -------
-    ndarray, shape (..., 3, 3) or (..., 6, 6)
-    """
-    if tangent.shape[-1] == 3:
-        theta = tangent[..., 2]
-        c, column = _versine(theta), _plane_column(tangent)
-        s = np.sinc(theta / np.pi)
-        return _matrix((s, c, column[..., 0]), (-c, s, column[..., 1]), (0.0, 0.0, 1.0))
-    rho, phi = tangent[..., :3], tangent[..., 3:]
-    theta = np.linalg.norm(phi, axis=-1)[..., None, None]
-    dot = np.sum(rho * phi, axis=-1)[..., None, None]
-    hat = skew(phi)
-    square = hat @ hat
-    made = np.zeros((*tangent.shape, 6))
-    diagonal = np.eye(3) - _a(theta) * hat + _b(theta) * square
-    made[..., :3, :3] = made[..., 3:, 3:] = diagonal
-    made[..., :3, 3:] = (
-        -_a(theta) * skew(rho)
-        + _b(theta) * _both(rho, phi, dot)
-        + dot * (_b_slope(theta) * square - _a_slope(theta) * hat)
-    )
-    return made
-
-
 def right_jacobian_inverse(tangent: Array) -> Array:
     """Inverse of :func:`right_jacobian`: how log(X) changes as X is moved in its own axes.
 
@@ -378,10 +275,7 @@ def chain(steps: Array) -> Array:
     -------
     ndarray, shape (n + 1, 3) or (n + 1, 7)
     """
-    start = np.zeros((1, steps.shape[-1]))
-    if steps.shape[-1] == 7:
-        start[0, 6] = 1.0
-    made = np.concatenate([start, steps])
+    made = np.vstack([identity(steps.shape[-1]), steps])
     reach = 1
     while reach < len(made):
         made[reach:] = compose(made[:-reach], made[reach:])
@@ -461,20 +355,6 @@ def _c(theta: Array) -> Array:
     return np.where(small, polyval(theta * theta, _C), (1.0 - 0.5 * t / np.tan(0.5 * t)) / t**2)
 
 
-def _a_slope(theta: Array) -> Array:
-    """Derivative of a by theta, over theta."""
-    small, t = _split(theta)
-    exact = (t * np.sin(t) - 4.0 * np.sin(0.5 * t) ** 2) / t**4
-    return np.where(small, polyval(theta * theta, _A_SLOPE), exact)
-
-
-def _b_slope(theta: Array) -> Array:
-    """Derivative of b by theta, over theta."""
-    small, t = _split(theta)
-    exact = (2.0 * np.sin(0.5 * t) ** 2 * t - 3.0 * (t - np.sin(t))) / t**5
-    return np.where(small, polyval(theta * theta, _B_SLOPE), exact)
-
-
 def _c_slope(theta: Array) -> Array:
     """Derivative of c by theta, over theta."""
     small, t = _split(theta)
@@ -484,6 +364,6 @@ def _c_slope(theta: Array) -> Array:
     return made
 
 
-def _split(theta: Array) -> tuple[NDArray[np.bool_], Array]:
+def _split(theta: Array) -> tuple[BoolArray, Array]:
     small = theta < SMALL
     return small, np.where(small, 1.0, theta)

@@ -5,16 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.csgraph import breadth_first_order, connected_components
 
+from px4fuse.arrays import Array, BoolArray, IntArray
 from px4fuse.errors import TrajectoryError
 from px4fuse.trajectory.graph import lie
-from px4fuse.trajectory.model import Array
-
-IntArray = NDArray[np.intp]
-BoolArray = NDArray[np.bool_]
 
 # An information matrix, scaled to a unit diagonal, sees the directions whose eigenvalue is above
 OBSERVED = 1e-9

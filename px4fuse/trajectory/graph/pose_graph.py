@@ -3,7 +3,7 @@
 What is written here is enough for callers; the modules beside it hold the parts.
 """
 
-from px4fuse.trajectory.graph.covariance import GateResult, gate, relative_covariance
+from px4fuse.trajectory.graph.covariance import GateResult, gate
 from px4fuse.trajectory.graph.initialisation import initialise
 from px4fuse.trajectory.graph.model import (
     FROM_CHORDAL,
@@ -30,7 +30,6 @@ __all__ = [
     "cost",
     "gate",
     "initialise",
-    "relative_covariance",
     "residuals",
     "solve",
 ]

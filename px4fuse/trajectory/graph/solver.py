@@ -10,16 +10,11 @@ import numpy as np
 from scipy import sparse
 from scipy.stats import chi2
 
+from px4fuse.arrays import Array, BoolArray
 from px4fuse.errors import TrajectoryError
 from px4fuse.trajectory.graph import lie
-from px4fuse.trajectory.graph.model import (
-    BoolArray,
-    PoseGraph,
-    ranks,
-    require_connected,
-)
+from px4fuse.trajectory.graph.model import PoseGraph, ranks, require_connected
 from px4fuse.trajectory.graph.system import BlockSystem
-from px4fuse.trajectory.model import Array
 
 Robust = Literal["none", "dcs", "gnc"]
 # From the squared residuals: the factors on the information, and the cost of each edge
@@ -53,8 +48,6 @@ class Solution:
         As in the graph; the first one as it was.
     cost : float
         Half the sum of the squared residuals times the weights.
-    unweighted_cost : float
-        The same with all weights 1.
     initial_cost : float
         At the graph's own poses, with all weights 1.
     iterations : int
@@ -67,7 +60,6 @@ class Solution:
 
     poses: Array
     cost: float
-    unweighted_cost: float
     initial_cost: float
     iterations: int
     converged: bool
@@ -163,7 +155,6 @@ def solve(
     return Solution(
         poses=run.state.poses,
         cost=0.5 * float(np.sum(weights * run.state.chi2)),
-        unweighted_cost=0.5 * float(np.sum(run.state.chi2)),
         initial_cost=initial_cost,
         iterations=run.iterations,
         converged=run.converged,
@@ -249,26 +240,6 @@ class _Problem:
         j = (transposed @ (weights[:, None] * state.weighted_residual)[..., None])[..., 0]
         i = -(back.transpose(0, 2, 1) @ j[..., None])[..., 0]
         return self._system.matrix(-ij @ back, jj, ij), self._system.vector(i, j)
-
-
-def jacobians(graph: PoseGraph, poses: Array | None = None) -> tuple[Array, Array]:
-    """Derivatives of the residuals as poses are moved in their own axes.
-
-    Parameters
-    ----------
-    graph : PoseGraph
-    poses : ndarray, shape (n, 3) or (n, 7), optional
-        Instead of the graph's own.
-
-    Returns
-    -------
-    first, second : ndarray, shape (m, d, d)
-        By the first pose of each edge and by the second.
-    """
-    x = graph.poses if poses is None else poses
-    relative = lie.between(x[graph.first], x[graph.second])
-    by_second = lie.right_jacobian_inverse(lie.log(lie.between(graph.measurements, relative)))
-    return -by_second @ lie.adjoint(lie.inverse(relative)), by_second
 
 
 def _least_squares(weights: Array) -> Kernel:

@@ -8,8 +8,7 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import SuperLU, splu
 
-from px4fuse.trajectory.graph.model import IntArray
-from px4fuse.trajectory.model import Array
+from px4fuse.arrays import Array, IntArray
 
 # scipy's SuperLU writes past its work space where these exceed its own defaults (10 and 20, found
 # with valgrind on scipy 1.17); single columns as relaxed supernodes also fill in least

@@ -1,0 +1,54 @@
+"""What the readers of text tables share: text of bytes, numbers, and errors that name the line.
+
+Position files, trajectories, pose graphs (g2o) and closures are such tables.
+"""
+
+from __future__ import annotations
+
+import re
+
+# A control character within these says that the file is binary; a NUL does anywhere
+_SNIFFED_CHARS = 100_000
+_UTF_16 = (b"\xff\xfe", b"\xfe\xff")  # a Windows shell's redirection
+_CONTROL = re.compile("[\x00-\x08\x0e-\x1b]")
+# With a decimal point or comma
+NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?|[0-9]*[.,][0-9]+)(?:[eE][+-]?[0-9]+)?")
+_NOT_FINITE = re.compile(r"[+-]?(?:nan|inf)", re.IGNORECASE)
+
+
+def text_of(content: bytes) -> str | None:
+    """Text with line feeds between lines; None where the bytes are no text.
+
+    UTF-8, UTF-16 with its mark, or else Latin-1, as in comments of old programs.
+    """
+    if content.startswith(_UTF_16):
+        even = content[: len(content) // 2 * 2]
+        text = even.decode("utf-16", errors="replace")
+    else:
+        content = content.rstrip(b"\0\x1a")  # what a power cut, or DOS, leaves at the end
+        try:
+            text = content.decode("utf-8-sig")
+        except UnicodeDecodeError:
+            text = content.decode("latin-1")
+    if "\0" in text or _CONTROL.search(text, 0, _SNIFFED_CHARS):
+        return None
+    return text.replace("\r\n", "\n").replace("\r", "\n")
+
+
+def is_number(text: str) -> bool:
+    """Whether this is a number with a decimal point, NaN or infinite."""
+    return bool(NUMBER.fullmatch(text) or _NOT_FINITE.fullmatch(text)) and "," not in text
+
+
+def quote(text: str) -> str:
+    """Quote a text of the file, shortened."""
+    return repr(text if len(text) <= 40 else text[:37] + "...")
+
+
+def at_line(name: str, number: int, what: str, remedy: str) -> str:
+    """Message on one line of a file.
+
+    >>> at_line("uwb.csv", 7, "'x' is no number", "Correct or remove that line.")
+    "uwb.csv, line 7: 'x' is no number. Correct or remove that line."
+    """
+    return f"{name}, line {number}: {what}. {remedy}"

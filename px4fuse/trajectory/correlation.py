@@ -1,0 +1,80 @@
+"""Two series correlated over all lags at once, with gaps in both; and a series with itself."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+from scipy.signal import correlate
+
+from px4fuse.arrays import Array, BoolArray, Complex
+
+Series = TypeVar("Series", Array, Complex)
+
+
+@dataclass(frozen=True)
+class Moments:
+    """Second moments of two series over the samples that both know, for every lag.
+
+    Of shape (n + m - 1,); at index k the first series' sample 0 meets the second's k - (n - 1).
+
+    Attributes
+    ----------
+    count : ndarray
+        Samples.
+    covariance : ndarray, complex where the series are
+        Σ conj(a - ā)(b - b̄).
+    power_a, power_b : ndarray
+        Σ |a - ā|² and Σ |b - b̄|².
+    """
+
+    count: Array
+    covariance: Complex
+    power_a: Array
+    power_b: Array
+
+
+def moments(a: Series, b: Series, a_known: BoolArray, b_known: BoolArray) -> Moments:
+    """Moments of two series on one grid over all lags (Padfield 2012, eqs. 3 to 9).
+
+    Parameters
+    ----------
+    a, b : ndarray, shapes (n,) and (m,)
+        Real or complex.
+    a_known, b_known : ndarray of bool, shapes (n,) and (m,)
+        At least one sample of each.
+    """
+
+    def over(x: Array | Complex, y: Array | Complex) -> Complex:
+        """Σ conj(x) y over the overlap."""
+        sums: Complex = correlate(y, x, mode="full", method="fft")
+        return sums
+
+    # about their means, else roundings matter
+    a, b = (
+        np.where(known, values - np.mean(values[known]), 0.0)
+        for values, known in ((a, a_known), (b, b_known))
+    )
+    m, n = a_known.astype(float), b_known.astype(float)
+    count = np.rint(over(m, n).real)
+    weight = 1.0 / np.maximum(count, 1.0)
+    sum_a, sum_b = over(a, n), over(m, b)  # the first conjugate
+    return Moments(
+        count,
+        over(a, b) - sum_a * sum_b * weight,
+        over(np.abs(a) ** 2, n).real - np.abs(sum_a) ** 2 * weight,
+        over(m, np.abs(b) ** 2).real - np.abs(sum_b) ** 2 * weight,
+    )
+
+
+def autocovariance(values: Array | Complex) -> Array:
+    """Real part of Σ conj(v) v later, at lags 0 to n - 1; the mean is not taken out.
+
+    Parameters
+    ----------
+    values : ndarray, shape (n,)
+        Real or complex.
+    """
+    sums: Array = correlate(values, values, mode="full", method="fft")[len(values) - 1 :].real
+    return sums

@@ -1,0 +1,41 @@
+"""Moments over all lags, against sums written out."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.stats import f
+
+from px4fuse.trajectory.correlation import autocovariance, moments
+from px4fuse.trajectory.offset import RIVAL_RATIO
+
+
+@pytest.mark.parametrize("is_complex", [False, True])
+def test_moments_are_those_of_every_overlap(is_complex: bool) -> None:
+    rng = np.random.default_rng(3)
+    a, b = rng.normal(5.0, 1.0, 7), rng.normal(-3.0, 2.0, 11)
+    if is_complex:
+        a, b = a + 1j * rng.normal(size=7), b + 1j * rng.normal(size=11)
+    a_known, b_known = rng.random(7) < 0.7, rng.random(11) < 0.7
+    a[~a_known] = np.nan
+    found = moments(a, b, a_known, b_known)
+    assert len(found.count) == 7 + 11 - 1
+    for k, count in enumerate(found.count):
+        lag = k - 6  # a's sample 0 meets b's sample lag
+        both = [i for i in range(7) if 0 <= i + lag < 11 and a_known[i] and b_known[i + lag]]
+        assert count == len(both)
+        x, y = a[both], b[[i + lag for i in both]]
+        x, y = (v - v.mean() if len(v) else v for v in (x, y))
+        np.testing.assert_allclose(found.covariance[k], np.sum(x.conj() * y), atol=1e-10)
+        np.testing.assert_allclose(found.power_a[k], np.sum(np.abs(x) ** 2), atol=1e-10)
+        np.testing.assert_allclose(found.power_b[k], np.sum(np.abs(y) ** 2), atol=1e-10)
+
+
+def test_autocovariance_is_the_sum_of_products() -> None:
+    v = np.array([1.0 + 2.0j, -3.0, 0.5j, 2.0])
+    expected = [sum((v[i].conj() * v[i + k]).real for i in range(4 - k)) for k in range(4)]
+    np.testing.assert_allclose(autocovariance(v), expected, atol=1e-12)
+
+
+def test_a_rival_is_what_chance_allows_in_one_of_twenty() -> None:
+    assert pytest.approx(0.05, abs=0.005) == f.sf(RIVAL_RATIO**2, 80, 80)
