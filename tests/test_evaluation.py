@@ -211,7 +211,6 @@ def test_rpe_is_that_of_evo(pair: tuple[str, str], kind: AlignmentKind) -> None:
 ANGLE = st.floats(-3.1, 3.1)
 
 
-@settings(deadline=None)
 @given(
     angles=st.tuples(ANGLE, ANGLE, ANGLE),
     shift=st.tuples(*[st.floats(-1e3, 1e3)] * 3),
@@ -370,7 +369,7 @@ def test_a_drift_in_scale_is_the_rpe_over_distance() -> None:
         np.testing.assert_allclose(one.translation_error_m, 0.02 * chord, atol=1e-9)
 
 
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(
     steps=st.lists(st.sampled_from([0.0, 0.1, 0.25, 1.0, 3.0]), min_size=3, max_size=40),
     value=st.sampled_from([0.1, 0.3, 0.5, 1.0, 2.0]),

@@ -148,13 +148,13 @@ def test_replay_of_the_sample_log_equals_the_plain_recursion(sample_flight: Flig
         assert_equals_plain_recursion(axis, Settings())
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(axis=any_axis(), chosen=any_settings)
 def test_replay_of_any_axis_equals_the_plain_recursion(axis: Axis, chosen: Settings) -> None:
     assert_equals_plain_recursion(axis, chosen)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(axis=any_axis(), chosen=any_settings)
 def test_variance_is_positive_grows_on_predict_and_shrinks_on_update(
     axis: Axis, chosen: Settings
@@ -277,7 +277,7 @@ def test_state_outside_the_replay_is_not_a_number(axis: Axis) -> None:
     assert np.isnan(velocity).tolist() == [True, False, False, True]
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(axis=any_axis(), chosen=any_settings, data=st.data())
 def test_a_later_measurement_does_not_change_earlier_output(
     axis: Axis, chosen: Settings, data: st.DataObject

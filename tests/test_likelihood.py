@@ -52,7 +52,7 @@ def test_grid_on_the_sample_log_equals_the_replay_at_every_setting(sample_flight
                 np.testing.assert_allclose(ours, replayed(axis, chosen), rtol=1e-9, atol=1e-9)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(axis=any_axis(), chosen=any_settings)
 def test_any_axis_and_setting_equals_the_replay(axis: Axis, chosen: Settings) -> None:
     ours = innovations(preintegrate(axis, chosen), chosen.sigma_a_m_s2, chosen.sigma_z_m)
@@ -144,7 +144,7 @@ def test_states_on_a_grid_equal_the_replay_at_the_measurements(sample_flight: Fl
             np.testing.assert_allclose(ours[:, i, j], theirs, rtol=1e-9, atol=1e-9)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(axis=any_axis(), chosen=any_settings)
 def test_states_of_any_axis_equal_the_replay(axis: Axis, chosen: Settings) -> None:
     ours = states(preintegrate(axis, chosen), chosen.sigma_a_m_s2, chosen.sigma_z_m)
