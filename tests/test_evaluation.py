@@ -316,6 +316,38 @@ def test_nothing_is_interpolated_across_a_gap() -> None:
     assert lost.coverage_reference == pytest.approx(0.75, abs=0.01)
 
 
+@pytest.mark.parametrize("denser", [False, True], ids=["estimate sparser", "estimate denser"])
+def test_nearest_pairs_and_what_is_left_out_are_those_of_the_definition(denser: bool) -> None:
+    """Every pair by trying all, with poses before, after and in a gap of the reference."""
+    reference = flight(20.0, 10.0)
+    reference = reference[(reference.time_s < 8.0) | (reference.time_s > 12.0)]
+    rate_hz = 33.0 if denser else 4.0
+    limit, offset_s = 0.04, 3.0
+    time = np.arange(-1.0, 21.0, 1.0 / rate_hz) + 0.002
+    # at both ends one pose just within the limit and one just outside
+    edges = reference.time_s[[0, 0, -1, -1]] + np.array([-1.1, -0.9, 0.9, 1.1]) * limit
+    time = np.union1d(time, edges)
+    estimate = Trajectory("e", "vio", time - offset_s, np.zeros((len(time), 3)), None)
+    got = associate(
+        estimate, reference, method="nearest", max_gap_s=limit, time_offset_s=offset_s
+    )
+    apart = np.abs(time[:, None] - reference.time_s)
+    if denser:
+        kept = np.flatnonzero(apart.min(axis=0) <= limit)
+        used, matched = apart.argmin(axis=0)[kept], kept
+    else:
+        used = np.flatnonzero(apart.min(axis=1) <= limit)
+        matched = apart.argmin(axis=1)[used]
+    np.testing.assert_array_equal(got.estimate.time_s, estimate.time_s[used])
+    np.testing.assert_array_equal(got.reference.time_s, reference.time_s[matched])
+    first, last = reference.time_s[[0, -1]]
+    outside = np.count_nonzero((time < first - limit) | (time > last + limit))
+    poses = len(np.unique(used))
+    assert (got.outside, got.in_gaps) == (outside, len(time) - outside - poses)
+    assert got.coverage_estimate == pytest.approx(poses / len(time))
+    assert (got.max_gap_s, got.time_offset_s, len(got)) == (limit, offset_s, len(used))
+
+
 def test_no_overlap_names_both_spans_and_the_remedy() -> None:
     reference = flight()
     estimate = replace(reference, name="boot.tum", time_s=reference.time_s + 500.0)
