@@ -31,6 +31,7 @@ from px4fuse.trajectory.evaluation import (
     choose_alignment,
     evaluate,
     pairs,
+    relative_error,
     rmse_interval,
 )
 from px4fuse.trajectory.model import Frame, Kind, Trajectory
@@ -328,9 +329,7 @@ def test_nearest_pairs_and_what_is_left_out_are_those_of_the_definition(denser: 
     edges = reference.time_s[[0, 0, -1, -1]] + np.array([-1.1, -0.9, 0.9, 1.1]) * limit
     time = np.union1d(time, edges)
     estimate = Trajectory("e", "vio", time - offset_s, np.zeros((len(time), 3)), None)
-    got = associate(
-        estimate, reference, method="nearest", max_gap_s=limit, time_offset_s=offset_s
-    )
+    got = associate(estimate, reference, method="nearest", max_gap_s=limit, time_offset_s=offset_s)
     apart = np.abs(time[:, None] - reference.time_s)
     if denser:
         kept = np.flatnonzero(apart.min(axis=0) <= limit)
@@ -423,6 +422,22 @@ def test_pairs_are_those_of_the_definition(
     start, end = pairs(position, time, Delta(2.0, "s"), all_pairs=False)
     np.testing.assert_array_equal(start, np.arange(0, len(along) - 2, 2))
     np.testing.assert_array_equal(end, start + 2)
+
+
+def test_pairs_are_measured_along_the_side_that_is_asked() -> None:
+    """An estimate of twice the length: 2 m of its path are 1 m of the reference's."""
+    reference = flight(30.0)
+    double = moved(reference, TURN, SHIFT, 2.0, kind="vio")
+    by_reference = relative_error(double, reference, Delta(1.0, "m"))
+    assert by_reference.pairs_from == "reference"
+    for side, metres in (("reference", 1.0), ("estimate", 2.0)):
+        got = relative_error(double, reference, Delta(metres, "m"), pairs_from=side)
+        np.testing.assert_array_equal(got.start, by_reference.start)
+        np.testing.assert_array_equal(got.end, by_reference.end)
+    other = relative_error(double, reference, Delta(1.0, "m"), pairs_from="estimate")
+    assert np.median(other.end - other.start) < 0.6 * np.median(
+        by_reference.end - by_reference.start
+    )
 
 
 @pytest.mark.parametrize("delta", [Delta(0.0, "m"), Delta(-1.0, "s"), Delta(1.5, "frames")])

@@ -472,8 +472,9 @@ def test_height_and_horizontal_position_are_decided_apart():
     assert "height" in statement.split("kept")[1]
 
 
-def test_a_reset_of_velocity_is_kept():
-    ekf2 = ekf2_of(np.zeros(3), [Reset(8.0, "velocity", (1.0, 0.0, 0.0))])
+@pytest.mark.parametrize("delta", [(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, -1.0)])
+def test_a_reset_of_velocity_is_kept(delta):
+    ekf2 = ekf2_of(np.zeros(3), [Reset(8.0, "velocity", delta)])
     state, statement = continuous_state(ekf2, noisy_track(), WHOLE)
     pd.testing.assert_frame_equal(state, ekf2.state)
     assert "1 of velocity" in statement
