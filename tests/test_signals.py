@@ -480,6 +480,18 @@ def test_a_reset_of_velocity_is_kept(delta):
     assert "1 of velocity" in statement
 
 
+def test_a_reset_of_what_the_source_does_not_measure_is_kept():
+    """A source without height cannot say that the frame changed."""
+    track = noisy_track()
+    blind = dataclasses.replace(track, samples=track.samples.assign(down_m=np.nan))
+    offset = np.where(STATE_TIME[:, None] >= 8.0, [0.0, 0.0, 3.0], 0.0)
+    ekf2 = ekf2_of(offset, [Reset(8.0, "position", (0.0, 0.0, 3.0))])
+    assert "undone" in continuous_state(ekf2, track, WHOLE)[1]
+    state, statement = continuous_state(ekf2, blind, WHOLE)
+    pd.testing.assert_frame_equal(state, ekf2.state)
+    assert statement == "resets kept: 1 of height (they correct an error)"
+
+
 @pytest.mark.parametrize(("reset_s", "said"), [
     (0.5, ""), (1.0, ""), (1.1, "kept"), (17.9, "kept"), (18.0, "kept"), (18.5, ""),
 ])  # fmt: skip
