@@ -1,16 +1,38 @@
-"""Fixtures that every test file shares."""
+"""Fixtures that every test file shares, and how Hypothesis chooses its examples.
+
+The suite tries the same examples every time. A search with new random examples, as before each
+release::
+
+    python -m pytest --hypothesis-profile=random
+
+Keep what it finds as an ``@example`` of the test.
+"""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 import pytest
+from hypothesis import HealthCheck, settings
 
 from px4fuse.flight import Flight
 from px4fuse.readers import read_log
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 SHARED_LOGS = REPOSITORY.parent / "shared" / "logs"
+
+# No limit on time: a slow machine must not fail
+settings.register_profile(
+    "steady",
+    deadline=None,
+    suppress_health_check=[HealthCheck.too_slow],
+    derandomize=True,
+    database=None,
+)
+settings.register_profile(
+    "random", deadline=None, suppress_health_check=[HealthCheck.too_slow], print_blob=True
+)
+settings.load_profile("steady")
 
 
 @pytest.fixture(scope="session")

@@ -253,7 +253,7 @@ def test_turned_mirrored_and_shifted_sample_is_recovered(
 # -- synthetic flights -----------------------------------------------------------------------------
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(
     seed=st.integers(0, 3),
     frame=st.sampled_from(sorted(FROM_NED)),

@@ -284,6 +284,14 @@ class TestMadeFlight:
         for part in ("kf", "ekf2", "difference", "kf_truth", "ekf2_truth", "noise_asked"):
             assert getattr(alone.axes[0], part) == getattr(along(made, "east"), part)
 
+    def test_north_and_east_alone_have_the_same_horizontal_numbers(self, made: Comparison) -> None:
+        alone = compare(made.flight, axes=("north", "east"))
+        assert [result.axis.name for result in alone.axes] == ["north", "east"]
+        assert alone.horizontal_kf is not None
+        assert alone.horizontal_ekf2 is not None
+        assert alone.horizontal_kf == made.horizontal_kf
+        assert alone.horizontal_ekf2 == made.horizontal_ekf2
+
     def test_settings_and_segment_reach_the_replay(self, made: Comparison) -> None:
         chosen = Settings(sigma_z_m=0.3, clock_offset_s=0.05)
         run = compare(made.flight, chosen, start_s=20.0, end_s=50.0).axes[0].replay

@@ -31,6 +31,7 @@ from px4fuse.trajectory.evaluation import (
     choose_alignment,
     evaluate,
     pairs,
+    relative_error,
     rmse_interval,
 )
 from px4fuse.trajectory.model import Frame, Kind, Trajectory
@@ -212,7 +213,6 @@ def test_rpe_is_that_of_evo(pair: tuple[str, str], kind: AlignmentKind) -> None:
 ANGLE = st.floats(-3.1, 3.1)
 
 
-@settings(deadline=None)
 @given(
     angles=st.tuples(ANGLE, ANGLE, ANGLE),
     shift=st.tuples(*[st.floats(-1e3, 1e3)] * 3),
@@ -318,6 +318,36 @@ def test_nothing_is_interpolated_across_a_gap() -> None:
     assert lost.coverage_reference == pytest.approx(0.75, abs=0.01)
 
 
+@pytest.mark.parametrize("denser", [False, True], ids=["estimate sparser", "estimate denser"])
+def test_nearest_pairs_and_what_is_left_out_are_those_of_the_definition(denser: bool) -> None:
+    """Every pair by trying all, with poses before, after and in a gap of the reference."""
+    reference = flight(20.0, 10.0)
+    reference = reference[(reference.time_s < 8.0) | (reference.time_s > 12.0)]
+    rate_hz = 33.0 if denser else 4.0
+    limit, offset_s = 0.04, 3.0
+    time = np.arange(-1.0, 21.0, 1.0 / rate_hz) + 0.002
+    # at both ends one pose just within the limit and one just outside
+    edges = reference.time_s[[0, 0, -1, -1]] + np.array([-1.1, -0.9, 0.9, 1.1]) * limit
+    time = np.union1d(time, edges)
+    estimate = Trajectory("e", "vio", time - offset_s, np.zeros((len(time), 3)), None)
+    got = associate(estimate, reference, method="nearest", max_gap_s=limit, time_offset_s=offset_s)
+    apart = np.abs(time[:, None] - reference.time_s)
+    if denser:
+        kept = np.flatnonzero(apart.min(axis=0) <= limit)
+        used, matched = apart.argmin(axis=0)[kept], kept
+    else:
+        used = np.flatnonzero(apart.min(axis=1) <= limit)
+        matched = apart.argmin(axis=1)[used]
+    np.testing.assert_array_equal(got.estimate.time_s, estimate.time_s[used])
+    np.testing.assert_array_equal(got.reference.time_s, reference.time_s[matched])
+    first, last = reference.time_s[[0, -1]]
+    outside = np.count_nonzero((time < first - limit) | (time > last + limit))
+    poses = len(np.unique(used))
+    assert (got.outside, got.in_gaps) == (outside, len(time) - outside - poses)
+    assert got.coverage_estimate == pytest.approx(poses / len(time))
+    assert (got.max_gap_s, got.time_offset_s, len(got)) == (limit, offset_s, len(used))
+
+
 def test_no_overlap_names_both_spans_and_the_remedy() -> None:
     reference = flight()
     estimate = replace(reference, name="boot.tum", time_s=reference.time_s + 500.0)
@@ -371,7 +401,7 @@ def test_a_drift_in_scale_is_the_rpe_over_distance() -> None:
         np.testing.assert_allclose(one.translation_error_m, 0.02 * chord, atol=1e-9)
 
 
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(
     steps=st.lists(st.sampled_from([0.0, 0.1, 0.25, 1.0, 3.0]), min_size=3, max_size=40),
     value=st.sampled_from([0.1, 0.3, 0.5, 1.0, 2.0]),
@@ -393,6 +423,22 @@ def test_pairs_are_those_of_the_definition(
     start, end = pairs(position, time, Delta(2.0, "s"), all_pairs=False)
     np.testing.assert_array_equal(start, np.arange(0, len(along) - 2, 2))
     np.testing.assert_array_equal(end, start + 2)
+
+
+def test_pairs_are_measured_along_the_side_that_is_asked() -> None:
+    """An estimate of twice the length: 2 m of its path are 1 m of the reference's."""
+    reference = flight(30.0)
+    double = moved(reference, TURN, SHIFT, 2.0, kind="vio")
+    by_reference = relative_error(double, reference, Delta(1.0, "m"))
+    assert by_reference.pairs_from == "reference"
+    for side, metres in (("reference", 1.0), ("estimate", 2.0)):
+        got = relative_error(double, reference, Delta(metres, "m"), pairs_from=side)
+        np.testing.assert_array_equal(got.start, by_reference.start)
+        np.testing.assert_array_equal(got.end, by_reference.end)
+    other = relative_error(double, reference, Delta(1.0, "m"), pairs_from="estimate")
+    assert np.median(other.end - other.start) < 0.6 * np.median(
+        by_reference.end - by_reference.start
+    )
 
 
 @pytest.mark.parametrize("delta", [Delta(0.0, "m"), Delta(-1.0, "s"), Delta(1.5, "frames")])

@@ -21,6 +21,7 @@ from px4fuse.filter.kalman import (
     process_noise,
     replay,
     state_at,
+    variance_at,
 )
 from px4fuse.filter.signals import Axis, choose_segment, choose_source, make_axes
 from px4fuse.flight import Flight
@@ -148,13 +149,13 @@ def test_replay_of_the_sample_log_equals_the_plain_recursion(sample_flight: Flig
         assert_equals_plain_recursion(axis, Settings())
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(axis=any_axis(), chosen=any_settings)
 def test_replay_of_any_axis_equals_the_plain_recursion(axis: Axis, chosen: Settings) -> None:
     assert_equals_plain_recursion(axis, chosen)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(axis=any_axis(), chosen=any_settings)
 def test_variance_is_positive_grows_on_predict_and_shrinks_on_update(
     axis: Axis, chosen: Settings
@@ -269,6 +270,52 @@ def test_state_between_steps_is_predicted_from_the_step_before(axis: Axis) -> No
     assert velocity[0] == pytest.approx(step["velocity_m_s"] + 0.01 * 0.3, abs=1e-12)
 
 
+@pytest.mark.parametrize("dt", [0.02, 0.1, 0.4])
+@pytest.mark.parametrize("gap", [False, True])
+def test_variance_between_steps_is_predicted_from_the_step_before(dt: float, gap: bool) -> None:
+    """P = FPFᵀ + Q written as matrices, at every point of every step, with an IMU gap or not."""
+    time = 0.37 * np.arange(12)
+    imu = np.arange(0.0, 5.0, 0.02)
+    imu = imu[(imu < 1.0) | (imu > 2.5)] if gap else imu
+    chosen = Settings(sigma_a_m_s2=0.7, sigma_z_m=0.2, dt_s=dt)
+    run = replay(line(time, np.sin(time), (imu, 2.0 * np.cos(imu))), chosen)
+    edges = run.steps.index.to_numpy()
+    for share in (0.0, 0.3, 0.9):
+        times = edges[:-1] + share * np.diff(edges)
+        position, velocity = variance_at(run, times)
+        for k, at in enumerate(times):
+            step = run.steps.iloc[k]
+            ahead = at - edges[k]
+            P = np.array(
+                [
+                    [step["position_variance_m2"], step["covariance_m2_s"]],
+                    [step["covariance_m2_s"], step["velocity_variance_m2_s2"]],
+                ]
+            )
+            F = np.array([[1.0, ahead], [0.0, 1.0]])
+            q = (0.7**2 + step["input_variance_m2_s4"]) * dt
+            Q = q * np.array([[ahead**3 / 4.0, ahead**2 / 2.0], [ahead**2 / 2.0, ahead]])
+            np.testing.assert_allclose(
+                [position[k], velocity[k]], np.diag(F @ P @ F.T + Q), rtol=1e-12
+            )
+    assert bool((run.steps["input_variance_m2_s4"] > 0.0).any()) == gap
+
+
+def test_variance_just_before_a_measurement_is_that_of_its_prior(axis: Axis) -> None:
+    run = replay(axis, Settings())
+    before = np.nextafter(run.updates.index.to_numpy(), 0.0)
+    position, velocity = variance_at(run, before)
+    np.testing.assert_allclose(position, run.updates["prior_position_variance_m2"], rtol=1e-9)
+    np.testing.assert_allclose(velocity, run.updates["prior_velocity_variance_m2_s2"], rtol=1e-9)
+
+
+def test_variance_outside_the_replay_is_not_a_number(axis: Axis) -> None:
+    run = replay(axis, Settings())
+    first, last = run.steps.index[[0, -1]]
+    for variance in variance_at(run, np.array([first - 0.01, first, last, last + 0.01])):
+        assert np.isnan(variance).tolist() == [True, False, False, True]
+
+
 def test_state_outside_the_replay_is_not_a_number(axis: Axis) -> None:
     run = replay(axis, Settings())
     first, last = run.steps.index[[0, -1]]
@@ -277,7 +324,7 @@ def test_state_outside_the_replay_is_not_a_number(axis: Axis) -> None:
     assert np.isnan(velocity).tolist() == [True, False, False, True]
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(axis=any_axis(), chosen=any_settings, data=st.data())
 def test_a_later_measurement_does_not_change_earlier_output(
     axis: Axis, chosen: Settings, data: st.DataObject

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from flights import line, random_walk
@@ -14,11 +16,13 @@ from px4fuse.filter.kalman import Settings, replay
 from px4fuse.filter.likelihood import (
     OUTLIER_SHARE,
     OUTLIER_WIDTH,
+    SIGMA_A_GRID_M_S2,
     innovations,
     negative_log_likelihood,
     noise_asked,
     outlier_probability,
     preintegrate,
+    sigma_a_asked,
     states,
 )
 from px4fuse.filter.signals import Axis
@@ -52,7 +56,7 @@ def test_grid_on_the_sample_log_equals_the_replay_at_every_setting(sample_flight
                 np.testing.assert_allclose(ours, replayed(axis, chosen), rtol=1e-9, atol=1e-9)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(axis=any_axis(), chosen=any_settings)
 def test_any_axis_and_setting_equals_the_replay(axis: Axis, chosen: Settings) -> None:
     ours = innovations(preintegrate(axis, chosen), chosen.sigma_a_m_s2, chosen.sigma_z_m)
@@ -125,6 +129,32 @@ def test_five_percent_gross_outliers_hardly_move_the_noise_asked(seed: int) -> N
     assert asked.sigma_z_m == pytest.approx(noise_asked(clean, ZERO).sigma_z_m, rel=0.20)
 
 
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_sigma_a_asked_is_the_one_that_moved_the_flight(seed: int) -> None:
+    """At the noise injected; the grid's points are 19 % apart."""
+    for injected in (0.5, 2.0):
+        rng = np.random.default_rng(seed)
+        axis = random_walk(rng, count=2000, interval_s=0.2, sigma_a=injected, sigma_z=0.1)
+        for start in (0.01, 10.0):
+            chosen = Settings(sigma_a_m_s2=start, sigma_z_m=0.1, input="zero")
+            assert sigma_a_asked(axis, chosen) == pytest.approx(injected, rel=0.2)
+
+
+def test_sigma_a_asked_is_of_the_greatest_likelihood() -> None:
+    """Against the density of the replay's innovations, with scipy's normal distribution."""
+    axis = walk(seed=4, count=60)
+    for sigma_z in (0.03, 0.1, 0.4):
+        chosen = replace(ZERO, sigma_z_m=sigma_z)
+        log_likelihood = []
+        for sigma_a in SIGMA_A_GRID_M_S2:
+            nu, s = replayed(axis, replace(chosen, sigma_a_m_s2=float(sigma_a)))
+            log_likelihood.append(np.sum(norm.logpdf(nu, scale=np.sqrt(s))))
+        best = SIGMA_A_GRID_M_S2[np.argmax(log_likelihood)]
+        assert sigma_a_asked(axis, chosen) == pytest.approx(best, rel=1e-12)
+    assert len(SIGMA_A_GRID_M_S2) == 61
+    assert SIGMA_A_GRID_M_S2[[0, -1]] == pytest.approx([1e-3, 30.0])
+
+
 def test_states_on_a_grid_equal_the_replay_at_the_measurements(sample_flight: Flight) -> None:
     axis = sample_axes(sample_flight)[0]
     grid = states(preintegrate(axis, Settings()), np.array(SIGMA_A)[:, None], np.array(SIGMA_Z))
@@ -144,7 +174,7 @@ def test_states_on_a_grid_equal_the_replay_at_the_measurements(sample_flight: Fl
             np.testing.assert_allclose(ours[:, i, j], theirs, rtol=1e-9, atol=1e-9)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(axis=any_axis(), chosen=any_settings)
 def test_states_of_any_axis_equal_the_replay(axis: Axis, chosen: Settings) -> None:
     ours = states(preintegrate(axis, chosen), chosen.sigma_a_m_s2, chosen.sigma_z_m)

@@ -949,7 +949,7 @@ def told(case: int):
 
 
 @given(st.binary(max_size=600), st.booleans())
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 def test_fuzz_random_bytes_around_frames(chunks, content, framed):
     chunks.read(content + (chunks.frames[0] + content if framed else b""))
 

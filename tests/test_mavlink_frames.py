@@ -373,7 +373,7 @@ def test_the_recording_of_one_message_is_read(shared_logs):
 
 
 @given(st.lists(st.sampled_from(["v1", "v2", "signed", "unknown", "bad", "junk"]), min_size=1))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_any_mixture_gives_back_its_good_frames(tmp_path_factory, kinds):
     """The number of good frames is known; junk here holds no byte that could begin a frame."""
     good = 3

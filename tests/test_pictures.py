@@ -111,7 +111,7 @@ def test_locked_and_broken_files_are_unavailable() -> None:
         assert made.remedy == "Open the PDF itself."
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.integers(0, 2**32), st.integers(1, 60))
 @example(0, 1)
 def test_damaged_reports_never_raise(seed: int, count: int) -> None:

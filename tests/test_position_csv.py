@@ -15,6 +15,7 @@ import pytest
 from conftest import REPOSITORY
 from hypothesis import HealthCheck, Phase, example, given, settings
 from hypothesis import strategies as st
+from patience import patience
 
 from px4fuse.errors import LogError, Px4FuseError, SettingsError
 from px4fuse.readers import position_csv
@@ -789,9 +790,6 @@ def test_too_large(read, monkeypatch):
 # -- any bytes -------------------------------------------------------------------------------------
 
 fuzzed = settings(
-    deadline=2000,
-    derandomize=True,
-    database=None,
     phases=[Phase.explicit, Phase.generate],
     max_examples=300,
     suppress_health_check=[HealthCheck.function_scoped_fixture],
@@ -891,9 +889,8 @@ def test_work_is_bounded(read, line):
     text = table(PLAIN).encode()
     line += b"1\n"
     for content in (line + text, text + line, line * 30 + text, line * 300):
-        seconds = datetime.now(tz=UTC)
-        check_any(read, content, {})
-        assert (datetime.now(tz=UTC) - seconds).total_seconds() < 5.0
+        with patience():
+            check_any(read, content, {})
 
 
 # -- real files ------------------------------------------------------------------------------------

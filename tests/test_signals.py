@@ -472,19 +472,36 @@ def test_height_and_horizontal_position_are_decided_apart():
     assert "height" in statement.split("kept")[1]
 
 
-def test_a_reset_of_velocity_is_kept():
-    ekf2 = ekf2_of(np.zeros(3), [Reset(8.0, "velocity", (1.0, 0.0, 0.0))])
+@pytest.mark.parametrize("delta", [(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, -1.0)])
+def test_a_reset_of_velocity_is_kept(delta):
+    ekf2 = ekf2_of(np.zeros(3), [Reset(8.0, "velocity", delta)])
     state, statement = continuous_state(ekf2, noisy_track(), WHOLE)
     pd.testing.assert_frame_equal(state, ekf2.state)
     assert "1 of velocity" in statement
 
 
-@pytest.mark.parametrize("reset_s", [0.5, 18.5])
-def test_resets_outside_the_segment_change_nothing(reset_s):
+def test_a_reset_of_what_the_source_does_not_measure_is_kept():
+    """A source without height cannot say that the frame changed."""
+    track = noisy_track()
+    blind = dataclasses.replace(track, samples=track.samples.assign(down_m=np.nan))
+    offset = np.where(STATE_TIME[:, None] >= 8.0, [0.0, 0.0, 3.0], 0.0)
+    ekf2 = ekf2_of(offset, [Reset(8.0, "position", (0.0, 0.0, 3.0))])
+    assert "undone" in continuous_state(ekf2, track, WHOLE)[1]
+    state, statement = continuous_state(ekf2, blind, WHOLE)
+    pd.testing.assert_frame_equal(state, ekf2.state)
+    assert statement == "resets kept: 1 of height (they correct an error)"
+
+
+@pytest.mark.parametrize(("reset_s", "said"), [
+    (0.5, ""), (1.0, ""), (1.1, "kept"), (17.9, "kept"), (18.0, "kept"), (18.5, ""),
+])  # fmt: skip
+def test_resets_outside_the_segment_change_nothing(reset_s, said):
+    """One at the start gave all that is seen its frame; one at the end moved the last sample."""
     ekf2 = ekf2_of(np.zeros(3), [Reset(reset_s, "position", (5.0, 5.0, 0.0))])
     state, statement = continuous_state(ekf2, noisy_track(), Segment(1.0, 18.0, ""))
     pd.testing.assert_frame_equal(state, ekf2.state)
-    assert statement == ""
+    assert said in statement
+    assert bool(said) == bool(statement)
 
 
 # ---- inputs stay as they are ------------------------------------------------------------------

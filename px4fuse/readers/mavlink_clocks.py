@@ -29,6 +29,8 @@ MAX_STRETCHES = 200
 MIN_DRIFT_SPAN_S = 30.0
 # but a recording replayed at another speed shows at once
 OTHER_SPEED = 0.01
+# Beyond this factor neither a replay nor a wrong unit of time (s for ns: 1e9) explains a speed
+MAX_SPEED = 1e12
 MIN_PAIRS = 3
 # A clock whose stamps take fewer values than this share of its messages does not tell the time
 MIN_DISTINCT_SHARE = 0.1
@@ -82,21 +84,30 @@ def least_delay(x: Array, y: Array) -> Line:
     slope = 1.0
     middles = [part[len(part) // 2] for part in parts]
     if len(middles) > 1 and x[middles[-1]] > x[middles[0]]:
-        rough = float(theilslopes(y[middles], x[middles])[0])
-        slope = rough if abs(rough - 1.0) > OTHER_SPEED and rough > 0.0 else 1.0
+        rough = _median_slope(x[middles], y[middles])
+        slope = rough if abs(rough - 1.0) > OTHER_SPEED and _is_speed(rough) else 1.0
     residual = y - slope * (x - x0)
     lowest = [part[np.argmin(residual[part])] for part in parts]
     if span >= MIN_DRIFT_SPAN_S and len(lowest) > 1:
         # with the drift known, others are the least delayed
         for _ in range(2):
-            slope += float(theilslopes(residual[lowest], x[lowest])[0])
+            corrected = slope + _median_slope(x[lowest], residual[lowest])
+            slope = corrected if _is_speed(corrected) else 1.0
             residual = y - slope * (x - x0)
             lowest = [part[np.argmin(residual[part])] for part in parts]
-    if not 0.0 < slope < np.inf:  # no clock runs backwards
-        slope = 1.0
-        residual = y - x + x0
     y0 = float(np.median(residual[lowest]))
     return Line(x0, y0, slope, spread(residual), len(x))
+
+
+def _median_slope(x: Array, y: Array) -> float:
+    """Theil-Sen slope of y over x; not finite where x differ by next to nothing."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        return float(theilslopes(y, x)[0])
+
+
+def _is_speed(slope: float) -> bool:
+    """Whether one clock can run at this rate of another; none runs backwards."""
+    return 1.0 / MAX_SPEED < slope < MAX_SPEED
 
 
 def tells_time(stamp_s: Array) -> bool:

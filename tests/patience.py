@@ -1,0 +1,34 @@
+"""A guard against what does not end; not a measure of speed."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+from collections.abc import Iterator
+from typing import Any
+
+# What is guarded takes a second at most; no machine is a hundred times slower
+PATIENCE_S = 120.0
+
+
+class TookTooLongError(Exception):
+    """The work did not end."""
+
+
+@contextlib.contextmanager
+def patience() -> Iterator[None]:
+    """Interrupt what does not end, where the system can."""
+
+    def give_up(*_: Any) -> None:
+        raise TookTooLongError(f"not done within {PATIENCE_S:g} s")
+
+    if not hasattr(signal, "setitimer"):
+        yield
+        return
+    before = signal.signal(signal.SIGALRM, give_up)
+    signal.setitimer(signal.ITIMER_REAL, PATIENCE_S)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, before)
