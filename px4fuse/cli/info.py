@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
-    from px4fuse.analysis import read_flight
     from px4fuse.contents.inventory import Inventory, Source
 
 
@@ -34,6 +33,7 @@ def info(
     **given: Any,
 ) -> None:
     """Say what is in a log, what px4fuse can do with it, and what to log next time."""
+    from px4fuse.analysis import read_flight
     from px4fuse.contents.inventory import take_inventory, to_plain
 
     inventory = take_inventory(read_flight(comparison_request(log, given)))
