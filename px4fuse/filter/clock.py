@@ -22,6 +22,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
+from scipy import constants
 from scipy.integrate import cumulative_trapezoid
 from scipy.spatial.transform import Rotation, Slerp
 from scipy.stats import chi2
@@ -30,7 +31,7 @@ from px4fuse.arrays import Array, IntArray
 from px4fuse.filter.kalman import Settings
 from px4fuse.filter.likelihood import PROFILE_DROP, parabola_vertex
 from px4fuse.filter.model import INITIAL_SIGMA_P_M, INITIAL_SIGMA_V_M_S, move, noise_of_many_steps
-from px4fuse.filter.signals import STANDARD_GRAVITY_M_S2, Segment, within
+from px4fuse.filter.signals import Segment, within
 from px4fuse.flight import (
     ANGULAR_RATE_COLUMNS,
     POSITION_COLUMNS,
@@ -303,7 +304,7 @@ def _signals(imu: pd.DataFrame, attitude: pd.DataFrame, span: tuple[float, float
     angles += [
         -cumulative_trapezoid(body_to_ned[:, :, axis], time, axis=0, initial=0) for axis in range(3)
     ]
-    columns = [specific + np.array([0.0, 0.0, STANDARD_GRAVITY_M_S2])]
+    columns = [specific + np.array([0.0, 0.0, constants.g])]
     columns += [np.cross(angle, specific) for angle in angles]
     columns += [-body_to_ned[:, :, axis] for axis in range(3)]
     value = np.stack(columns, axis=2)
