@@ -13,7 +13,8 @@ import numpy as np
 from px4fuse.filter.kalman import InitialState, Replay, Settings, replay
 from px4fuse.filter.signals import Axis
 from px4fuse.flight import Unavailable
-from px4fuse.loop.closure import cumulative_distance, distribute_by_distance
+from px4fuse.loop.closure import distribute_by_distance
+from px4fuse.trajectory.model import cumulative_distance
 
 TRUE_VELOCITY_M_S = 1.0
 STEPS = 30

@@ -17,7 +17,6 @@ from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 from patience import patience
 from ulog_tools import (
-    MAGIC,
     Log,
     load,
     make_log,
@@ -33,7 +32,7 @@ from px4fuse.cli import main
 from px4fuse.errors import LogError, Px4FuseError
 from px4fuse.filter.signals import choose_segment, choose_source, make_axes
 from px4fuse.flight import Flight, Unavailable
-from px4fuse.readers import read_log
+from px4fuse.readers import ULOG_MAGIC, read_log
 
 # no shrinking: a hang would be waited for again and again
 damaged = settings(phases=[Phase.explicit, Phase.generate], max_examples=80)
@@ -103,7 +102,7 @@ def test_an_empty_file(tmp_path):
     [
         b"\0",
         b"ULog",
-        MAGIC[:-1],
+        ULOG_MAGIC[:-1],
         b"%PDF-1.4 and so on",
         b"\xa3\x95\x80DataFlash",
         "a text file, naïve\n".encode(),
@@ -122,14 +121,14 @@ def test_files_of_other_kinds(tmp_path, content):
 ])  # fmt: skip
 def test_nothing_of_use_behind_a_good_first_line(tmp_path, content):
     path = tmp_path / "header_only.ulg"
-    path.write_bytes(MAGIC + content)
+    path.write_bytes(ULOG_MAGIC + content)
     refusal(path)
 
 
 @given(content=st.binary(max_size=400))
 @damaged
 def test_random_bytes_behind_a_good_first_line(workspace, content):
-    workspace.write_bytes(MAGIC + b"\x01" + content)
+    workspace.write_bytes(ULOG_MAGIC + b"\x01" + content)
     refusal(workspace)
 
 
@@ -404,13 +403,15 @@ def rich_log() -> Log:
     count = len(at)
     fix = {"fix_type": np.full(count, 3, np.uint8), "eph": np.ones(count), "epv": np.ones(count)}
     receiver = topic("vehicle_gps_position", at, fix)
-    receiver.fields |= {"latitude_deg": np.full(count, 47.0), "longitude_deg": np.full(count, 8.0)}
+    receiver.fields.update(
+        {"latitude_deg": np.full(count, 47.0), "longitude_deg": np.full(count, 8.0)}
+    )
     receiver.fields["altitude_msl_m"] = np.full(count, 500.0)
     truth = topic("vehicle_global_position_groundtruth", at, {
         "alt": np.full(count, 500.0), "vel_n": np.zeros(count), "vel_e": np.zeros(count),
         "vel_d": np.zeros(count),
     })  # fmt: skip
-    truth.fields |= {"lat": np.full(count, 47.0), "lon": np.full(count, 8.0)}
+    truth.fields.update({"lat": np.full(count, 47.0), "lon": np.full(count, 8.0)})
     local = log["vehicle_local_position"]
     for name, value in (("ref_lat", 47.0), ("ref_lon", 8.0), ("ref_alt", 500.0)):
         local[name] = np.full(len(local["timestamp"]), value)

@@ -22,12 +22,12 @@ from px4fuse.filter.clock import (
     ClockOffset,
     PartOffset,
     _changes,
-    _interval,
     _signals,
     _vertex,
     estimate_clock_offset,
 )
 from px4fuse.filter.kalman import Settings
+from px4fuse.filter.likelihood import profile_interval
 from px4fuse.filter.signals import Segment
 from px4fuse.flight import (
     ANGULAR_RATE_COLUMNS,
@@ -231,11 +231,12 @@ def test_a_parabola_gives_its_vertex_sigma_and_interval() -> None:
     vertex, sigma = _vertex(grid, drop)
     assert vertex == pytest.approx(0.123)
     assert sigma == pytest.approx(0.03)
-    (low, high), closed = _interval(grid, drop - drop.min())
-    assert closed
+    low, high = profile_interval(grid, drop)
     assert [low, high] == pytest.approx([0.123 - 1.96 * 0.03, 0.123 + 1.96 * 0.03], abs=1e-3)
-    _, closed = _interval(grid[18:], drop[18:] - drop.min())
-    assert not closed  # what lies below its lower end was not looked at
+    low, high = profile_interval(grid[18:], drop[18:])
+    assert low is None  # what lies below its lower end was not looked at
+    assert high == pytest.approx(0.123 + 1.96 * 0.03, abs=1e-3)
+    assert profile_interval(grid[:25], drop[:25])[1] is None
 
 
 def test_drift_and_change_are_weighted_least_squares_of_the_parts() -> None:

@@ -12,14 +12,13 @@ from scipy.spatial.transform import Rotation
 
 from px4fuse.loop.closure import (
     correct_by_distance,
-    cumulative_distance,
     distribute_by_distance,
     heading_change_rad,
     key_frame_spacing_m,
     key_frames,
     upright,
 )
-from px4fuse.trajectory.model import Trajectory
+from px4fuse.trajectory.model import Trajectory, cumulative_distance
 
 COORDINATE = st.floats(-50.0, 50.0)
 

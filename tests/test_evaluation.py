@@ -22,20 +22,19 @@ from px4fuse.flight import Unavailable
 from px4fuse.readers.trajectory import read_trajectory
 from px4fuse.trajectory.alignment import AlignmentKind, fit
 from px4fuse.trajectory.association import associate
-from px4fuse.trajectory.evaluation import (
+from px4fuse.trajectory.evaluation import choose_alignment, evaluate
+from px4fuse.trajectory.model import Frame, Kind, Trajectory
+from px4fuse.trajectory.offset import clock_difference, estimate_time_offset
+from px4fuse.trajectory.scores import (
     MIN_BLOCKS,
     Delta,
     Interval,
     Statistics,
     autocorrelation_time,
-    choose_alignment,
-    evaluate,
     pairs,
     relative_error,
     rmse_interval,
 )
-from px4fuse.trajectory.model import Frame, Kind, Trajectory
-from px4fuse.trajectory.offset import clock_difference, estimate_time_offset
 
 SAMPLE = REPOSITORY / "sample_logs" / "loop_slam.tum"
 SHARED = REPOSITORY.parent / "shared" / "trajectories"

@@ -498,7 +498,7 @@ def gps(generation="v1.16"):
     fix["epv"] = np.full(len(time), 3.0)
     if generation == "v1.16":
         made = topic("vehicle_gps_position", at, fix)
-        made.fields |= {"latitude_deg": latitude, "longitude_deg": longitude}
+        made.fields.update({"latitude_deg": latitude, "longitude_deg": longitude})
         made.fields["altitude_msl_m"] = 500.0 + time
         return made
     whole = {

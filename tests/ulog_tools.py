@@ -7,7 +7,6 @@ closed form: :func:`position` is EKF2's state and :func:`ev_error` what external
 from __future__ import annotations
 
 import re
-import struct
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -17,8 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 from pyulog import ULog
 
 from px4fuse.arrays import Array
+from px4fuse.simulation.ulog_writer import Topic, encode
 
-MAGIC = b"ULog\x01\x12\x35"
 START_US = 5_000_000
 PUBLICATION_LAG_US = 60_000
 GRAVITY = 9.80665
@@ -29,35 +28,6 @@ INNOVATION_VARIANCE = np.array([0.05, 0.06, 0.07])
 EV_VARIANCE = np.array([0.01, 0.02, 0.03])
 VELOCITY = np.array([0.5, -0.25, 0.0])
 AXES = ("north", "east", "down")
-_TYPES = {
-    "<u8": "uint64_t", "<u4": "uint32_t", "<u2": "uint16_t", "|u1": "uint8_t",
-    "<i8": "int64_t", "<i4": "int32_t", "<i2": "int16_t", "|i1": "int8_t",
-    "<f8": "double", "<f4": "float", "|b1": "bool",
-}  # fmt: skip
-
-
-@dataclass
-class Topic:
-    """One topic instance: arrays of shape (n,) or (n, k) by PX4 field name."""
-
-    name: str
-    fields: dict[str, NDArray]
-    instance: int = 0
-
-    def rows(self) -> tuple[str, list[bytes]]:
-        """ULog format text and one packed record per sample."""
-        dtype = np.dtype(
-            [(name, values.dtype, values.shape[1:]) for name, values in self.fields.items()]
-        )
-        records = np.zeros(len(self.fields["timestamp"]), dtype)
-        parts = []
-        for name, values in self.fields.items():
-            records[name] = values
-            size = f"[{values.shape[1]}]" if values.ndim == 2 else ""
-            parts.append(f"{_TYPES[values.dtype.str]}{size} {name};")
-        content, width = records.tobytes(), dtype.itemsize
-        text = f"{self.name}:{''.join(parts)}"
-        return text, [content[at : at + width] for at in range(0, len(content), width)]
 
 
 @dataclass
@@ -95,41 +65,8 @@ class Log:
         return path
 
     def encode(self) -> bytes:
-        """The file: header, flag bits, formats, info, parameters, subscriptions, data.
-
-        Topics advance together, so that a cut file ends early in each of them. A topic that
-        stands twice in the list is subscribed to twice.
-        """
-        out = [MAGIC, struct.pack("<BQ", 1, START_US), _message("B", bytes(40))]
-        formats: dict[str, str] = {}
-        data = []
-        for number, topic in enumerate(self.topics):
-            text, rows = topic.rows()
-            assert formats.setdefault(topic.name, text) == text, "one layout per topic name"
-            prefix = struct.pack("<H", number)
-            data += [((at + 0.5) / len(rows), prefix + row) for at, row in enumerate(rows)]
-        out += [_message("F", text.encode()) for text in formats.values()]
-        for name, value in self.info.items():
-            text = value.encode() if isinstance(value, str) else struct.pack("<I", value)
-            kind = f"char[{len(text)}]" if isinstance(value, str) else "uint32_t"
-            out.append(_keyed("I", f"{kind} {name}", text))
-        for name, value in self.parameters.items():
-            kind, code = ("int32_t", "<i") if isinstance(value, int) else ("float", "<f")
-            out.append(_keyed("P", f"{kind} {name}", struct.pack(code, value)))
-        for number, topic in enumerate(self.topics):
-            head = struct.pack("<BH", topic.instance, number)
-            out.append(_message("A", head + topic.name.encode()))
-        out += [_message("D", row) for _, row in sorted(data, key=lambda item: item[0])]
-        out += [_message("O", struct.pack("<H", length)) for length in self.dropouts_ms]
-        return b"".join(out)
-
-
-def _message(kind: str, content: bytes) -> bytes:
-    return struct.pack("<HB", len(content), ord(kind)) + content
-
-
-def _keyed(kind: str, key: str, value: bytes) -> bytes:
-    return _message(kind, bytes([len(key)]) + key.encode() + value)
+        """The file; a topic that stands twice in the list is subscribed to twice."""
+        return encode(self.topics, self.parameters, self.info, START_US, self.dropouts_ms)
 
 
 def load(path: Path) -> Log:

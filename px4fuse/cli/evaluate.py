@@ -22,7 +22,7 @@ from px4fuse.errors import SettingsError
 from px4fuse.request import AUTO
 
 if TYPE_CHECKING:
-    from px4fuse.trajectory.evaluation import Delta
+    from px4fuse.trajectory.scores import Delta
 
 MAX_DELTA = 1e6
 _DELTA = re.compile(r"(\d+\.?\d*|\.\d+) ?(m|s|frames|f)")
@@ -37,7 +37,7 @@ class DeltaType(click.ParamType["Delta"]):
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
     ) -> Delta:
         """Convert what was typed."""
-        from px4fuse.trajectory.evaluation import Delta
+        from px4fuse.trajectory.scores import Delta
 
         if isinstance(value, Delta):
             return value

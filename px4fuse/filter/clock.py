@@ -22,15 +22,16 @@ from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
+from scipy import constants
 from scipy.integrate import cumulative_trapezoid
 from scipy.spatial.transform import Rotation, Slerp
 from scipy.stats import chi2
 
-from px4fuse.arrays import Array, IntArray
+from px4fuse.arrays import Array
 from px4fuse.filter.kalman import Settings
-from px4fuse.filter.likelihood import PROFILE_DROP, parabola_vertex
+from px4fuse.filter.likelihood import parabola_vertex, profile_interval
 from px4fuse.filter.model import INITIAL_SIGMA_P_M, INITIAL_SIGMA_V_M_S, move, noise_of_many_steps
-from px4fuse.filter.signals import STANDARD_GRAVITY_M_S2, Segment, within
+from px4fuse.filter.signals import Segment, within
 from px4fuse.flight import (
     ANGULAR_RATE_COLUMNS,
     POSITION_COLUMNS,
@@ -40,13 +41,14 @@ from px4fuse.flight import (
     PositionTrack,
     Unavailable,
 )
+from px4fuse.trajectory.graph import lie
 
 # Standard deviations of the constants, wide for consumer sensors: tilt and heading (rad), gyro
 # (rad/s) and accelerometer (m/s²)
 CONSTANT_SIGMA = np.repeat([0.05, 0.004, 0.3], 3)
 CONSTANTS = len(CONSTANT_SIGMA)
 HEADING = 2  # which of them is a turn about down
-STATES = 6 + CONSTANTS
+STATE_COUNT = 6 + CONSTANTS
 # To first order only while the angles stay small: longer flights are cut into stretches. A gyro
 # bias of 0.004 rad/s turns by 0.12 rad in one, whose square costs 0.07 m/s².
 STRETCH_S = 30.0
@@ -233,8 +235,9 @@ def estimate_clock_offset(
         profile = score.min(axis=1)
         offset, sigma = _vertex(fine, profile)
         width = float(np.clip(3.5 * sigma, 0.01, 2.0 * SEARCH_S))
-    drop = profile - profile.min()
-    interval, closed = _interval(fine, drop)
+    low, high = profile_interval(fine, profile)
+    closed = low is not None and high is not None
+    interval = fine[0] if low is None else low, fine[-1] if high is None else high
     # an IMU sample is the mean over its interval, stamped somewhere in it
     resolution = 0.5 * float(np.median(np.diff(flight.imu.index.to_numpy())))
     widened = np.hypot(np.array(interval) - offset, 1.96 * resolution)
@@ -260,7 +263,7 @@ def estimate_clock_offset(
         determinable=not reason,
         reason=reason,
         curve_s=fine,
-        curve_drop=drop,
+        curve_drop=profile - profile.min(),
         parts=parts,
         drift_ppm=drift,
         drift_sigma_ppm=drift_sigma,
@@ -303,7 +306,7 @@ def _signals(imu: pd.DataFrame, attitude: pd.DataFrame, span: tuple[float, float
     angles += [
         -cumulative_trapezoid(body_to_ned[:, :, axis], time, axis=0, initial=0) for axis in range(3)
     ]
-    columns = [specific + np.array([0.0, 0.0, STANDARD_GRAVITY_M_S2])]
+    columns = [specific + np.array([0.0, 0.0, constants.g])]
     columns += [np.cross(angle, specific) for angle in angles]
     columns += [-body_to_ned[:, :, axis] for axis in range(3)]
     value = np.stack(columns, axis=2)
@@ -317,22 +320,12 @@ def _integrate_gyros(time: Array, rate: Array, attitude: pd.DataFrame) -> Rotati
     edges = np.arange(time[0], time[-1] + GYRO_STEP_S, GYRO_STEP_S)
     turned = cumulative_trapezoid(rate, time, axis=0, initial=0)
     angle = np.column_stack([np.interp(edges, time, turned[:, axis]) for axis in range(3)])
-    steps = Rotation.from_rotvec(np.diff(angle, axis=0)).as_quat(scalar_first=True)
+    steps = np.zeros((len(edges) - 1, 7))  # poses that only turn
+    steps[:, 3:] = Rotation.from_rotvec(np.diff(angle, axis=0)).as_quat()
     logged = Rotation.from_quat(attitude[QUATERNION_COLUMNS].to_numpy(copy=True), scalar_first=True)
     known = attitude.index.to_numpy()
     start = Slerp(known, logged)(np.clip(time[0], known[0], known[-1]))
-    a, b, c, d = start.as_quat(scalar_first=True).tolist()
-    chain = [(a, b, c, d)]
-    # a running product of quaternions, in plain floats: an array operation each would take longer
-    for w, x, y, z in steps.tolist():
-        a, b, c, d = (
-            a * w - b * x - c * y - d * z,
-            a * x + b * w + c * z - d * y,
-            a * y - b * z + c * w + d * x,
-            a * z + b * y - c * x + d * w,
-        )
-        chain.append((a, b, c, d))
-    integrated = Rotation.from_quat(np.array(chain), scalar_first=True)
+    integrated = start * Rotation.from_quat(lie.chain(steps)[:, 3:])
     return Slerp(edges, integrated)(np.clip(time, edges[0], edges[-1]))
 
 
@@ -360,10 +353,10 @@ def _filter(
     time, measured = stretch.time_s, stretch.position_m
     speed, way = stretch.signals.between(time[None, :] + offsets[:, None])
     shape = len(offsets), len(sigma_a)
-    x = np.zeros((*shape, STATES))
+    x = np.zeros((*shape, STATE_COUNT))
     x[..., :3] = np.nan_to_num(measured[0])
-    P = np.zeros((*shape, STATES, STATES))
-    diagonal = np.arange(STATES)
+    P = np.zeros((*shape, STATE_COUNT, STATE_COUNT))
+    diagonal = np.arange(STATE_COUNT)
     P[..., diagonal, diagonal] = np.concatenate(
         [np.repeat([INITIAL_SIGMA_P_M**2, INITIAL_SIGMA_V_M_S**2], 3), CONSTANT_SIGMA**2]
     )
@@ -428,20 +421,6 @@ def _vertex(grid: Array, profile: Array) -> tuple[float, float]:
     if bend <= 0.0:
         return float(grid[int(np.argmin(profile))]), float(grid[-1] - grid[0])
     return float(grid[at] + np.clip(shift, -1.0, 1.0) * step), float(step / np.sqrt(bend))
-
-
-def _interval(grid: Array, drop: Array) -> tuple[tuple[float, float], bool]:
-    """95 % interval of a profile, and whether both its ends lie inside the grid."""
-    inside: IntArray = np.flatnonzero(drop <= PROFILE_DROP)
-    ends = []
-    for edge, step in ((int(inside[0]), -1), (int(inside[-1]), 1)):
-        beyond = edge + step
-        if not 0 <= beyond < len(grid):
-            ends.append((float(grid[edge]), False))
-            continue
-        share = (PROFILE_DROP - drop[edge]) / (drop[beyond] - drop[edge])
-        ends.append((float(grid[edge] + share * (grid[beyond] - grid[edge])), True))
-    return (ends[0][0], ends[1][0]), ends[0][1] and ends[1][1]
 
 
 def _parts(

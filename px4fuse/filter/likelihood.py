@@ -277,6 +277,26 @@ def parabola_vertex(profile: Array, at: int) -> tuple[float, float]:
     return (0.5 * (left - right) / bend if bend > 0.0 else 0.0), bend
 
 
+def profile_interval(grid: Array, profile: Array) -> tuple[float | None, float | None]:
+    """Ends of the 95 % interval of a profile likelihood, None where it does not end on the grid.
+
+    Parameters
+    ----------
+    grid, profile : ndarray, shape (n,)
+        Values, and the negative log-likelihood at each; between two of them it is a line.
+    """
+    drop = profile - profile.min()
+    inside = np.flatnonzero(drop <= PROFILE_DROP)
+    ends: list[float | None] = []
+    for edge, beyond in ((inside[0], inside[0] - 1), (inside[-1], inside[-1] + 1)):
+        if 0 <= beyond < len(grid):
+            share = (PROFILE_DROP - drop[edge]) / (drop[beyond] - drop[edge])
+            ends.append(float(grid[edge] + share * (grid[beyond] - grid[edge])))
+        else:
+            ends.append(None)
+    return ends[0], ends[1]
+
+
 @dataclass(frozen=True)
 class NoiseAsked:
     """Measurement noise at which the innovations would match their variances.

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike
+from scipy import constants
 from scipy.integrate import cumulative_trapezoid
 from scipy.spatial.transform import Rotation, Slerp
 
@@ -25,7 +26,6 @@ from px4fuse.flight import (
     Unavailable,
 )
 
-STANDARD_GRAVITY_M_S2 = 9.80665
 AISLE = "aisle"
 # An IMU interval is a gap when it is longer than this and than five median intervals.
 IMU_GAP_S = 0.1
@@ -279,7 +279,7 @@ def ned_acceleration(flight: Flight) -> pd.DataFrame | Unavailable:
     )
     body_to_ned = Slerp(attitude_time, rotations)(imu.index.to_numpy())
     acceleration = body_to_ned.apply(imu[SPECIFIC_FORCE_COLUMNS].to_numpy(copy=True))
-    acceleration[:, 2] += STANDARD_GRAVITY_M_S2
+    acceleration[:, 2] += constants.g
     return pd.DataFrame(acceleration, index=imu.index, columns=list(AXIS_NAMES))
 
 

@@ -20,13 +20,13 @@ from px4fuse.arrays import Array, BoolArray
 from px4fuse.filter.consistency import Consistency, assess
 from px4fuse.filter.kalman import Settings
 from px4fuse.filter.likelihood import (
-    PROFILE_DROP,
     Preintegrated,
     innovations,
     negative_log_likelihood,
     outlier_probability,
     parabola_vertex,
     preintegrate,
+    profile_interval,
     recursion,
 )
 from px4fuse.filter.model import H, matrix, transition
@@ -344,21 +344,14 @@ def _vertex(grid: Array, profile: Array) -> float:
 
 def _profile(grid: Array, profile: Array, search: tuple[float, float]) -> Noise:
     """Value and 95 % interval from a profile likelihood."""
-    profile = profile - profile.min()
-    inside = np.flatnonzero(profile <= PROFILE_DROP)
-    first, last = int(inside[0]), int(inside[-1])
-    low = None if first == 0 else _crossing(grid, profile, first - 1)
-    high = None if last == len(grid) - 1 else _crossing(grid, profile, last)
+    low, high = (
+        None if end is None else float(np.exp(end))
+        for end in profile_interval(np.log(grid), profile)
+    )
     at_zero = low is None and grid[0] <= search[0] * (1.0 + 1e-9)
     unbounded = high is None and grid[-1] >= search[1] * (1.0 - 1e-9)
     value = None if at_zero or unbounded else _vertex(grid, profile)
     return Noise(value, low, high)
-
-
-def _crossing(grid: Array, profile: Array, left: int) -> float:
-    """Where the profile crosses the drop between two neighbours, on the log scale."""
-    x, y = np.log(grid[left : left + 2]), profile[left : left + 2]
-    return float(np.exp(x[0] + (PROFILE_DROP - y[0]) * (x[1] - x[0]) / (y[1] - y[0])))
 
 
 def _assess(

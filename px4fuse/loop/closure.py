@@ -11,7 +11,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from px4fuse.arrays import Array, IntArray
-from px4fuse.trajectory.model import Frame, Trajectory
+from px4fuse.trajectory.graph import lie
+from px4fuse.trajectory.model import Frame, Trajectory, cumulative_distance
 
 DOWN = np.array([0.0, 0.0, 1.0])
 # Rows turn a frame into one with z down: x forward or north, y right or east
@@ -106,12 +107,6 @@ def key_frames(position_m: Array, spacing_m: float) -> IntArray:
     return np.array([*kept, len(position_m) - 1])
 
 
-def cumulative_distance(position_m: Array) -> Array:
-    """Length of the path from its start to each position, shape (n, d) to (n,), in m."""
-    steps = np.linalg.norm(np.diff(position_m, axis=0), axis=1)
-    return np.concatenate([[0.0], np.cumsum(steps)])
-
-
 def distribute_by_distance(
     position_m: Array, misclosure_m: Array, cumulative_m: Array | None = None
 ) -> Array:
@@ -150,12 +145,7 @@ def heading_change_rad(rotation: Rotation) -> float:
     The twist of the swing-twist decomposition about z; positive is clockwise seen from above.
     """
     _, _, z, w = rotation.as_quat()
-    return wrapped(float(2.0 * np.arctan2(z, w)))
-
-
-def wrapped(angle_rad: float) -> float:
-    """An angle within -π to π."""
-    return float(np.remainder(angle_rad + np.pi, 2.0 * np.pi) - np.pi)
+    return float(lie.wrap(2.0 * np.arctan2(z, w)))
 
 
 def correct_by_distance(

@@ -14,19 +14,18 @@ from px4fuse.filter.signals import Segment
 from px4fuse.flight import Unavailable
 from px4fuse.loop.closure import (
     correct_by_distance,
-    cumulative_distance,
     heading_change_rad,
     key_frame_spacing_m,
     key_frames,
     upright,
-    wrapped,
 )
 from px4fuse.loop.odometry import Closure, OdometryNoise, pose_graph
 from px4fuse.loop.part import KnownEnd, assumed_end, part_of
 from px4fuse.trajectory.evaluation import Evaluation, evaluate
+from px4fuse.trajectory.graph import lie
 from px4fuse.trajectory.graph.analysis import GATE_ALPHA, SOLUTIONS
 from px4fuse.trajectory.graph.pose_graph import GateResult, PoseGraph, Solution, gate, solve
-from px4fuse.trajectory.model import Frame, Trajectory
+from px4fuse.trajectory.model import Frame, Trajectory, cumulative_distance
 
 LANDING = "landing"
 UNCORRECTED = "uncorrected"
@@ -358,7 +357,7 @@ def _misclosure(
             "Give it as the third number of --landed-at FORWARD,RIGHT,DEG.",
         )
     else:
-        turned = float(np.degrees(wrapped(np.radians(heading_deg - end.heading_change_deg))))
+        turned = float(np.degrees(lie.wrap(np.radians(heading_deg - end.heading_change_deg))))
     return end_m - np.array(end.displacement_m), turned
 
 

@@ -9,9 +9,10 @@ from scipy.spatial.transform import Rotation
 
 from px4fuse.arrays import Array, IntArray
 from px4fuse.errors import SettingsError
-from px4fuse.loop.closure import DOWN, cumulative_distance, heading_change_rad, wrapped
+from px4fuse.loop.closure import DOWN, heading_change_rad
+from px4fuse.trajectory.graph import lie
 from px4fuse.trajectory.graph.pose_graph import PoseGraph
-from px4fuse.trajectory.model import Trajectory
+from px4fuse.trajectory.model import Trajectory, cumulative_distance
 
 # The reported variances of an odometry tell its drift only where they grow along the path
 GROWTH = 2.0
@@ -191,7 +192,7 @@ def pose_graph(
         information[row, range(3), range(3)] = closure.sigma_m**-2
         if closure.heading_change_deg is not None:
             by_odometry = heading_change_rad(rotation[j] * rotation[i].inv())
-            error = wrapped(np.radians(closure.heading_change_deg) - by_odometry)
+            error = float(lie.wrap(np.radians(closure.heading_change_deg) - by_odometry))
             there = Rotation.from_rotvec(error * DOWN) * there
             vertical = there.inv().apply(DOWN)
             information[row, 3:, 3:] = (

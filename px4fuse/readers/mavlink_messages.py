@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import constants
 
 from px4fuse.arrays import Array
 
@@ -26,7 +27,6 @@ VEHICLE_TYPES: Mapping[int, str] = {
     27: "ADS-B receiver", 30: "camera",
 }  # fmt: skip
 
-STANDARD_GRAVITY_M_S2 = 9.80665
 # Row-major upper triangle of a 6×6 matrix: x, y, z
 POSE_DIAGONAL = np.array([0, 6, 11])
 # The same triangle's rotations about x, y, z
@@ -47,9 +47,9 @@ class ImuSource:
 IMU = (
     ImuSource("HIGHRES_IMU", 1.0, 1.0),
     # milli-g and mrad/s
-    ImuSource("SCALED_IMU", STANDARD_GRAVITY_M_S2 * 1e-3, 1e-3),
-    ImuSource("SCALED_IMU2", STANDARD_GRAVITY_M_S2 * 1e-3, 1e-3),
-    ImuSource("SCALED_IMU3", STANDARD_GRAVITY_M_S2 * 1e-3, 1e-3),
+    ImuSource("SCALED_IMU", constants.g * 1e-3, 1e-3),
+    ImuSource("SCALED_IMU2", constants.g * 1e-3, 1e-3),
+    ImuSource("SCALED_IMU3", constants.g * 1e-3, 1e-3),
 )
 # Messages whose time_usec is the autopilot's boot clock; GPS_RAW_INT's, say, is the receiver's
 STAMPED_BY_BOOT_CLOCK = ("HIGHRES_IMU", "ODOMETRY", "ESTIMATOR_STATUS")

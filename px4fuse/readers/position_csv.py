@@ -42,7 +42,7 @@ from px4fuse.readers.position_table import (
     plain_text,
     split,
 )
-from px4fuse.readers.text_table import at_line, quote
+from px4fuse.readers.text_table import UNIX_END_S, UNIX_START_S, at_line, quote, seconds_of
 from px4fuse.readers.ulog_topics import increasing
 
 SAMPLE_COLUMNS = ["x_m", "y_m", "z_m", "sigma_x_m", "sigma_y_m", "sigma_z_m", "quality"]
@@ -50,8 +50,6 @@ SIGMA_COLUMNS = SAMPLE_COLUMNS[3:6]
 
 MAX_FILE_BYTES = 500_000_000  # days of any UWB system
 MIN_ROWS = 3
-# A UNIX clock that is set lies between 2000 and 2100
-UNIX_START_S, UNIX_END_S = 946_684_800, 4_102_444_800
 # UWB systems run between 0.2 Hz and 200 Hz; their intervals vary by a tenth
 MIN_INTERVAL_S, MAX_INTERVAL_S = 0.9 / 200, 1.1 / 0.2
 # A boot clock in µs after half an hour has the magnitude of UNIX time in s; its intervals have not
@@ -158,9 +156,7 @@ def read_position_csv(
     choice = _choose(table, columns)
     ticks, numbers, notes = _read_rows(table, choice)
     unit, unit_words = _time_unit(ticks, choice, time_unit)
-    per_second = round(1.0 / TIME_UNITS[unit])
-    # in two parts: float64 does not hold the 19 digits of UNIX time in ns
-    seconds = ticks // per_second + ticks % per_second / per_second
+    seconds = seconds_of(ticks, round(1.0 / TIME_UNITS[unit]))
     usable = np.flatnonzero(np.abs(seconds) < UNIX_END_S)
     # by rank: stamps that are apart as integers can be one float
     ranks = np.unique(seconds[usable], return_inverse=True)[1].astype(np.int64)

@@ -6,7 +6,12 @@ Position files, trajectories, pose graphs (g2o) and closures are such tables.
 from __future__ import annotations
 
 import re
+from typing import Any
 
+from px4fuse.arrays import Array
+
+# A UNIX clock that is set lies between 2000 and 2100
+UNIX_START_S, UNIX_END_S = 946_684_800.0, 4_102_444_800.0
 # A control character within these says that the file is binary; a NUL does anywhere
 _SNIFFED_CHARS = 100_000
 _UTF_16 = (b"\xff\xfe", b"\xfe\xff")  # a Windows shell's redirection
@@ -38,6 +43,15 @@ def text_of(content: bytes) -> str | None:
 def is_number(text: str) -> bool:
     """Whether this is a number with a decimal point, NaN or infinite."""
     return bool(NUMBER.fullmatch(text) or _NOT_FINITE.fullmatch(text)) and "," not in text
+
+
+def seconds_of(ticks: Any, per_second: int) -> Array:
+    """Seconds of time stamps in their own unit; exact where they are integers of 19 digits.
+
+    In two parts, as float64 does not hold the digits of UNIX time in ns.
+    """
+    seconds: Array = ticks // per_second + ticks % per_second / per_second
+    return seconds
 
 
 def quote(text: str) -> str:

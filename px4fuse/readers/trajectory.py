@@ -21,7 +21,15 @@ from scipy.spatial.transform import Rotation
 from px4fuse.arrays import Array, BoolArray
 from px4fuse.errors import TrajectoryError
 from px4fuse.readers.files import read_whole
-from px4fuse.readers.text_table import at_line, is_number, quote, text_of
+from px4fuse.readers.text_table import (
+    UNIX_END_S,
+    UNIX_START_S,
+    at_line,
+    is_number,
+    quote,
+    seconds_of,
+    text_of,
+)
 from px4fuse.trajectory.model import MIN_POSES, Frame, Kind, Trajectory
 
 MAX_FILE_BYTES = 500_000_000
@@ -29,7 +37,6 @@ COLUMNS = 8
 MAX_USUAL_STEP_S = 10.0
 EUROC_COLUMNS = (8, 17)  # alone, or with velocity and the biases of gyro and accelerometer
 HEAD_LINES = 1000  # in which the format must show
-UNIX_START_S, UNIX_END_S = 946_684_800.0, 4_102_444_800.0  # 2000 to 2100
 # A key frame may be a minute from the next, but no frames come at a kHz
 MAX_INTERVAL_S, MIN_INTERVAL_S = 1000.0, 1e-3
 PER_SECOND = {"nanoseconds": 10**9, "microseconds": 10**6, "milliseconds": 10**3}
@@ -339,10 +346,10 @@ def _seconds(file: _File, stamps: list[str]) -> tuple[Array, str]:
         # on a clock of its own only ORB-SLAM3's nanoseconds are known to occur
         is_known = first >= UNIX_START_S or unit == "nanoseconds"
         if is_known and last < UNIX_END_S and MIN_INTERVAL_S <= step / per_second <= MAX_INTERVAL_S:
-            # as integers: float64 does not hold the 19 digits of UNIX time in ns
             ticks = np.array([_integer(stamp) for stamp in stamps], dtype=np.int64)
-            seconds = ticks // per_second + ticks % per_second / per_second
-            return seconds, f"Its stamps are {unit} and were divided by {per_second:.0e}."
+            return seconds_of(
+                ticks, per_second
+            ), f"Its stamps are {unit} and were divided by {per_second:.0e}."
     raise TrajectoryError(
         f"{file.name}: its stamps are {step:.3g} apart (median), which is no interval of frames in "
         "seconds or nanoseconds. Give stamps in seconds."

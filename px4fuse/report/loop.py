@@ -43,9 +43,10 @@ from px4fuse.report.style import (
     shorten,
     thin,
 )
-from px4fuse.trajectory.evaluation import Evaluation, Interval, Statistics
+from px4fuse.trajectory.evaluation import Evaluation
 from px4fuse.trajectory.graph.analysis import SOLUTIONS
 from px4fuse.trajectory.model import AXES_OF_FRAME
+from px4fuse.trajectory.scores import Interval, Statistics
 
 Value = Statistics | Unavailable
 GREEN = "#3a7d5c"

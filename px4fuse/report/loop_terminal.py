@@ -23,8 +23,9 @@ from px4fuse.report.loop_words import (
     unscored,
 )
 from px4fuse.report.terminal import print_finding, print_line
-from px4fuse.trajectory.evaluation import Evaluation, Statistics
+from px4fuse.trajectory.evaluation import Evaluation
 from px4fuse.trajectory.graph.analysis import MANY_CLOSURES, SOLUTIONS, SolvedGraph
+from px4fuse.trajectory.scores import Statistics
 
 MOST_ROWS = 10
 

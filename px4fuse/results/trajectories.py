@@ -12,14 +12,10 @@ from px4fuse.flight import Unavailable
 from px4fuse.loop.loop import Correction, Judged, Loop
 from px4fuse.loop.part import KnownEnd
 from px4fuse.plain import present, unavailable
-from px4fuse.trajectory.evaluation import (
-    Evaluation,
-    Interval,
-    RelativeError,
-    Statistics,
-)
+from px4fuse.trajectory.evaluation import Evaluation
 from px4fuse.trajectory.graph.analysis import SOLUTIONS, SolvedGraph
 from px4fuse.trajectory.model import AXES_OF_FRAME, Trajectory
+from px4fuse.trajectory.scores import Interval, RelativeError, Statistics
 
 
 def loop_part(loop: Loop | Unavailable) -> dict[str, Any]:

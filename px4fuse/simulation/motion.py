@@ -11,10 +11,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import constants
 
 from px4fuse.arrays import Array, IntArray
 from px4fuse.errors import SettingsError
-from px4fuse.filter.signals import STANDARD_GRAVITY_M_S2
 from px4fuse.simulation.mistakes import Mistakes
 from px4fuse.simulation.scenario import CORNER_S, START_STOP_S, Scenario
 
@@ -216,7 +216,7 @@ class Attitude:
 
 def attitude(state: State) -> Attitude:
     """The attitude that turns thrust into a state's acceleration, and its rates in closed form."""
-    gravity = np.array([0.0, 0.0, STANDARD_GRAVITY_M_S2])
+    gravity = np.array([0.0, 0.0, constants.g])
     down = gravity - state.acceleration_m_s2  # opposite to thrust
     size = np.sqrt(np.einsum("ij,ij->i", down, down))[:, None]
     z = down / size

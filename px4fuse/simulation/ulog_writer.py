@@ -13,7 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-MAGIC = b"ULog\x01\x12\x35\x01"  # the last byte is the version
+from px4fuse.readers import ULOG_MAGIC
+
+_VERSION = b"\x01"
 _TYPES = {
     "<u8": "uint64_t", "<u4": "uint32_t", "<u2": "uint16_t", "|u1": "uint8_t",
     "<i8": "int64_t", "<i4": "int32_t", "<i2": "int16_t", "|i1": "int8_t",
@@ -24,7 +26,7 @@ _FLAG_BITS = bytes(40)
 
 @dataclass(frozen=True)
 class Topic:
-    """One topic: PX4's name and its fields.
+    """One instance of a topic: PX4's name and its fields.
 
     Attributes
     ----------
@@ -32,10 +34,12 @@ class Topic:
     fields : mapping from PX4 field name to ndarray
         Of shape (n,) or (n, k), in the types in which they are logged; the first is
         ``timestamp``, µs since boot, not decreasing.
+    instance : int
     """
 
     name: str
     fields: Mapping[str, NDArray[Any]]
+    instance: int = 0
 
     def columns(self) -> dict[str, NDArray[Any]]:
         """Fields as pyulog names them, one of each element: ``q[0]``, ``q[1]``."""
@@ -53,22 +57,26 @@ def encode(
     parameters: Mapping[str, int | float],
     info: Mapping[str, int | str],
     start_us: int,
+    dropouts_ms: Sequence[int] = (),
 ) -> bytes:
     """Encode a ULog file: the same input gives the same bytes.
 
     Parameters
     ----------
     topics : sequence of Topic
-        With different names; messages are written in the order of their time stamps.
+        Messages are written in the order of their time stamps, those of one topic as they stand.
     parameters : mapping
         int becomes int32, float becomes float32.
     info : mapping
         int becomes uint32.
     start_us : int
         Boot time at which logging starts.
+    dropouts_ms : sequence of int
+        Written after the data.
     """
-    out = [MAGIC, struct.pack("<Q", start_us), _message("B", _FLAG_BITS)]
-    out += [_message("F", _format(topic).encode()) for topic in topics]
+    out = [ULOG_MAGIC + _VERSION, struct.pack("<Q", start_us), _message("B", _FLAG_BITS)]
+    formats = dict.fromkeys(_format(topic) for topic in topics)
+    out += [_message("F", each.encode()) for each in formats]
     for name, word in info.items():
         if isinstance(word, str):
             text = word.encode()
@@ -79,12 +87,13 @@ def encode(
         kind, code = ("int32_t", "<i") if isinstance(value, int) else ("float", "<f")
         out.append(_keyed("P", f"{kind} {name}", struct.pack(code, value)))
     for number, topic in enumerate(topics):
-        out.append(_message("A", struct.pack("<BH", 0, number) + topic.name.encode()))
+        out.append(_message("A", struct.pack("<BH", topic.instance, number) + topic.name.encode()))
     messages: list[bytes] = []
     for number, topic in enumerate(topics):
         messages += _data(topic, number)
-    stamps = np.concatenate([topic.fields["timestamp"] for topic in topics])
-    out += [messages[at] for at in np.argsort(stamps, kind="stable").tolist()]
+    stamps = [np.maximum.accumulate(topic.fields["timestamp"]) for topic in topics]
+    out += [messages[at] for at in np.argsort(np.concatenate(stamps), kind="stable").tolist()]
+    out += [_message("O", struct.pack("<H", length)) for length in dropouts_ms]
     return b"".join(out)
 
 

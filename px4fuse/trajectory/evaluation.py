@@ -1,8 +1,7 @@
 """Scores of a trajectory against a reference: ATE and RPE (Sturm 2012), with intervals.
 
 The absolute trajectory error is the distance of each pose to the reference after alignment; the
-relative pose error compares motions over a fixed distance or time, and so does not add up. Both
-are correlated from pose to pose, hence intervals by a bootstrap over blocks.
+relative pose error compares motions over a fixed distance or time, and so does not add up.
 """
 
 from __future__ import annotations
@@ -14,82 +13,35 @@ from typing import Literal
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from scipy.stats import norm
-from scipy.stats import t as student_t
 
-from px4fuse.arrays import Array, IntArray
-from px4fuse.errors import SettingsError, TrajectoryError
+from px4fuse.arrays import Array
+from px4fuse.errors import TrajectoryError
 from px4fuse.flight import Unavailable
 from px4fuse.trajectory.alignment import AlignmentKind, Transform, fit, umeyama
 from px4fuse.trajectory.association import Association, Method, associate
-from px4fuse.trajectory.correlation import autocovariance
-from px4fuse.trajectory.model import Trajectory
+from px4fuse.trajectory.model import Trajectory, cumulative_distance
 from px4fuse.trajectory.offset import TimeOffset, clock_difference, estimate_time_offset
+from px4fuse.trajectory.scores import (
+    RELATIVE_TOLERANCE,
+    Delta,
+    Interval,
+    RelativeError,
+    Side,
+    Statistics,
+    default_deltas,
+    relative_error,
+    rmse_interval,
+    rotations_of,
+    statistics,
+)
 
-Unit = Literal["frames", "m", "s"]
-Side = Literal["estimate", "reference"]
-
-RELATIVE_TOLERANCE = 0.1  # of a delta where all pairs are used; evo's default too
-# RPE over these, where they are between these shares of the path or of the time
-DISTANCES_M = (0.1, 0.5, 1.0, 5.0, 10.0, 50.0, 100.0, 500.0, 1000.0)
-TIMES_S = (1.0, 10.0, 60.0)
-MAX_DISTANCES, MAX_TIMES = 3, 2
-MIN_DELTA_SHARE, MAX_DELTA_SHARE = 1 / 200, 1 / 5
 MAX_SCALE_ERROR = 0.1
 MIN_COVERAGE = 0.5
 MIN_CLOCK_DOUBT_S = 0.1  # less than this may be the filter's own lag
 MAX_SPARSER = 5.0  # a reference with so much longer intervals is hardly one
 
-RESAMPLES, SEED, LEVEL = 2000, 20120101, 0.95
-BLOCK_TIMES = 3.0  # autocorrelation times in a block
-WINDOW_TIMES = 5.0  # and in the window that they are summed over (Sokal 1997)
-MIN_BLOCKS = 5.0
-
 _DOWN, _UP = ("NED", "FRD"), ("ENU",)
 _MONO = re.compile(r"(?<![a-z])mono(?![a-z])|monocular", re.IGNORECASE)
-
-
-@dataclass(frozen=True)
-class Delta:
-    """Distance between the poses of a pair of the RPE: a value and its unit."""
-
-    value: float
-    unit: Unit
-
-    def __str__(self) -> str:
-        return f"{self.value:g} {self.unit}"
-
-
-@dataclass(frozen=True)
-class Statistics:
-    """Of ``count`` errors, all in their unit; ``std`` without Bessel's correction, as evo's."""
-
-    count: int
-    rmse: float
-    mean: float
-    median: float
-    std: float
-    min: float
-    max: float
-
-
-@dataclass(frozen=True)
-class Interval:
-    """95 % interval of an RMSE, by block bootstrap.
-
-    Attributes
-    ----------
-    low, high : float
-    block_length : int
-        In errors.
-    blocks : float
-        Errors over block length: how many independent errors there are, roughly.
-    """
-
-    low: float
-    high: float
-    block_length: int
-    blocks: float
 
 
 @dataclass(frozen=True)
@@ -99,41 +51,6 @@ class AbsoluteError:
     translation: Statistics
     interval: Interval | Unavailable
     rotation: Statistics | Unavailable
-
-
-@dataclass(frozen=True)
-class RelativeError:
-    """RPE over one delta.
-
-    Attributes
-    ----------
-    delta : Delta
-    all_pairs : bool
-        Pairs start at every pose, else each where the one before ends.
-    pairs_from : {"estimate", "reference"}
-        Whose path a distance is measured along.
-    translation : Statistics or Unavailable
-        m.
-    interval : Interval or Unavailable
-        Of the translation's RMSE.
-    rotation : Statistics or Unavailable
-        Degrees.
-    start, end : ndarray of int, shape (k,)
-        Poses of each pair, as indices into the evaluation's arrays.
-    translation_error_m, rotation_error_deg : ndarray, shape (k,)
-        Empty where unavailable.
-    """
-
-    delta: Delta
-    all_pairs: bool
-    pairs_from: Side
-    translation: Statistics | Unavailable
-    interval: Interval | Unavailable
-    rotation: Statistics | Unavailable
-    start: IntArray
-    end: IntArray
-    translation_error_m: Array
-    rotation_error_deg: Array
 
 
 @dataclass(frozen=True)
@@ -257,9 +174,9 @@ def evaluate(
     body, notes = _body_rotation(aligned, y)
     if body is not None and aligned.rotation is not None:
         aligned = replace(aligned, rotation=aligned.rotation * body)
-    distance = path_m(y.position_m)
+    distance = cumulative_distance(y.position_m)
     error = np.linalg.norm(aligned.position_m - y.position_m, axis=1)
-    both = _rotations(aligned, y, "ATE of the rotation")
+    both = rotations_of(aligned, y, "ATE of the rotation")
     rotation_error: Array | None = None
     rotation_statistics: Statistics | Unavailable
     if isinstance(both, Unavailable):
@@ -459,254 +376,3 @@ def _body_rotation(
         f"a constant rotation of {np.degrees(turn.magnitude()):.1f}° between them, which was "
         "estimated; the distance between camera and vehicle is part of the position errors.",
     )
-
-
-# -- scores ----------------------------------------------------------------------------------------
-
-
-def statistics(errors: Array) -> Statistics:
-    """Statistics of at least one error.
-
-    Parameters
-    ----------
-    errors : ndarray, shape (n,)
-    """
-    return Statistics(
-        count=len(errors),
-        rmse=float(np.sqrt(np.mean(errors**2))),
-        mean=float(np.mean(errors)),
-        median=float(np.median(errors)),
-        std=float(np.std(errors)),
-        min=float(np.min(errors)),
-        max=float(np.max(errors)),
-    )
-
-
-def path_m(position_m: Array) -> Array:
-    """Distance travelled up to each position, shape (n,)."""
-    steps = np.linalg.norm(np.diff(position_m, axis=0), axis=1)
-    return np.concatenate(([0.0], np.cumsum(steps)))
-
-
-def default_deltas(distance_m: Array, time_s: Array) -> tuple[Delta, ...]:
-    """Distances and times of the RPE that suit a flight.
-
-    Parameters
-    ----------
-    distance_m, time_s : ndarray, shape (n,)
-    """
-    length, span = float(distance_m[-1]), float(time_s[-1] - time_s[0])
-    # a delta takes more than one pose
-    step, interval = float(np.median(np.diff(distance_m))), float(np.median(np.diff(time_s)))
-    low, high = max(MIN_DELTA_SHARE * length, 2.0 * step), MAX_DELTA_SHARE * length
-    distances = [value for value in DISTANCES_M if low <= value <= high][-MAX_DISTANCES:]
-    times = [t for t in TIMES_S if 2.0 * interval <= t <= MAX_DELTA_SHARE * span][-MAX_TIMES:]
-    return (*(Delta(value, "m") for value in distances), *(Delta(value, "s") for value in times))
-
-
-def pairs(
-    position_m: Array,
-    time_s: Array,
-    delta: Delta,
-    *,
-    all_pairs: bool = True,
-    relative_tolerance: float = RELATIVE_TOLERANCE,
-) -> tuple[IntArray, IntArray]:
-    """Pairs of poses that are a delta apart.
-
-    Parameters
-    ----------
-    position_m : ndarray, shape (n, 3)
-    time_s : ndarray, shape (n,)
-    delta : Delta
-        A distance is one along the path.
-    all_pairs : bool
-        From every pose to the one whose distance from it is nearest to the delta, if within the
-        tolerance; else from the end of each pair to the first pose that is at least a delta on.
-    relative_tolerance : float
-        Of the delta.
-
-    Returns
-    -------
-    start, end : ndarray of int, shape (k,)
-
-    Raises
-    ------
-    SettingsError
-        The delta is not above zero, or not whole for frames.
-    """
-    if not (np.isfinite(delta.value) and delta.value > 0.0):
-        raise SettingsError(f"RPE delta {delta}: it must be above zero.")
-    n = len(time_s)
-    if delta.unit == "frames":
-        step = int(delta.value)
-        if step != delta.value:
-            raise SettingsError(f"RPE delta {delta}: frames come whole.")
-        start = np.arange(0, max(n - step, 0), 1 if all_pairs else step)
-        return start, start + step
-    along = path_m(position_m) if delta.unit == "m" else time_s - time_s[0]
-    if not all_pairs:
-        return _consecutive(np.diff(along), delta.value)
-    start = np.arange(n - 1)
-    # roundings may put the sum on the other side of one sample
-    guess = np.searchsorted(along, along + delta.value)[:-1]
-    near = np.clip(guess[:, None] + np.arange(-2, 2), start[:, None] + 1, n - 1)
-    miss = np.abs(along[near] - along[start, None] - delta.value)
-    best = np.argmin(miss, axis=1)
-    # of poses at rest, all equally far, the first
-    first = np.searchsorted(along, along[near[start, best]])
-    kept = miss[start, best] <= relative_tolerance * delta.value
-    return start[kept], np.maximum(first, start + 1)[kept]
-
-
-def _consecutive(steps: Array, delta: float) -> tuple[IntArray, IntArray]:
-    """Pairs end to end, each the shortest of at least a delta."""
-    # each pair's sum starts at zero: differences of one running sum would round otherwise
-    ends, travelled = [0], 0.0
-    for index, step in enumerate(steps.tolist(), 1):
-        travelled += step
-        if travelled >= delta:
-            ends.append(index)
-            travelled = 0.0
-    every = np.array(ends, dtype=np.intp)
-    return every[:-1], every[1:]
-
-
-def relative_error(
-    aligned: Trajectory,
-    reference: Trajectory,
-    delta: Delta,
-    *,
-    all_pairs: bool = True,
-    pairs_from: Side = "reference",
-    relative_tolerance: float = RELATIVE_TOLERANCE,
-) -> RelativeError:
-    """RPE over one delta: E = (Q_i⁻¹ Q_j)⁻¹ (P_i⁻¹ P_j), Sturm (2012), eq. 1.
-
-    Parameters
-    ----------
-    aligned, reference : Trajectory
-        P and Q, as many poses at the same times. A similarity other than its scale leaves the
-        error as it is.
-    delta, all_pairs, relative_tolerance
-        See :func:`pairs`.
-    pairs_from : {"estimate", "reference"}
-        Whose path and times the delta is measured in.
-    """
-    source = reference if pairs_from == "reference" else aligned
-    start, end = pairs(
-        source.position_m,
-        source.time_s,
-        delta,
-        all_pairs=all_pairs,
-        relative_tolerance=relative_tolerance,
-    )
-    what = f"RPE over {delta}"
-    both = _rotations(aligned, reference, what)
-    if not isinstance(both, Unavailable) and not len(start):
-        reason = f"no two poses are {delta} apart"
-        both = Unavailable(what, reason, "Ask for another delta.")
-    if isinstance(both, Unavailable):
-        none, empty = np.empty(0, dtype=np.intp), np.empty(0)
-        return RelativeError(
-            delta, all_pairs, pairs_from, both, both, both, none, none, empty, empty
-        )
-    p, q = (rotation[start].inv() for rotation in both)
-    p_move = p.apply(aligned.position_m[end] - aligned.position_m[start])
-    q_move = q.apply(reference.position_m[end] - reference.position_m[start])
-    # the outer rotation of E turns its translation but does not change its length
-    translation = np.linalg.norm(p_move - q_move, axis=1)
-    p_turn, q_turn = p * both[0][end], q * both[1][end]
-    rotation = np.degrees((q_turn.inv() * p_turn).magnitude())
-    overlap = int(np.median(end - start)) if all_pairs else 1
-    return RelativeError(
-        delta=delta,
-        all_pairs=all_pairs,
-        pairs_from=pairs_from,
-        translation=statistics(translation),
-        interval=rmse_interval(translation, what, min_block=overlap),
-        rotation=statistics(rotation),
-        start=start,
-        end=end,
-        translation_error_m=translation,
-        rotation_error_deg=rotation,
-    )
-
-
-def _rotations(
-    aligned: Trajectory, reference: Trajectory, what: str
-) -> tuple[Rotation, Rotation] | Unavailable:
-    """Rotations of both, or the reason why what was asked for cannot be had."""
-    if aligned.rotation is not None and reference.rotation is not None:
-        return aligned.rotation, reference.rotation
-    side = "estimate" if aligned.rotation is None else "reference"
-    return Unavailable(
-        what, f"the {side} has no orientation", "Give a trajectory with orientation."
-    )
-
-
-# -- intervals -------------------------------------------------------------------------------------
-
-
-def rmse_interval(
-    errors: Array, what: str, *, min_block: int = 1, seed: int = SEED, resamples: int = RESAMPLES
-) -> Interval | Unavailable:
-    """95 % interval of the RMSE of correlated errors: circular block bootstrap.
-
-    Politis & Romano (1992), blocks of three integrated autocorrelation times of the squared errors.
-    Percentiles are moved outwards as Student's t would with so many blocks (Hesterberg 2015,
-    section 5.3).
-
-    Parameters
-    ----------
-    errors : ndarray, shape (n,)
-        In order of time.
-    what : str
-        Of which score, for the reason where there is none.
-    min_block : int
-        Errors of pairs that overlap are correlated over so many.
-    seed, resamples : int
-
-    Returns
-    -------
-    Interval or Unavailable
-        Unavailable with fewer than five blocks.
-    """
-    squares = errors**2
-    n = len(squares)
-    length = max(int(np.ceil(BLOCK_TIMES * autocorrelation_time(squares))), min_block, 1)
-    if n < MIN_BLOCKS * length:
-        return Unavailable(
-            f"interval of the {what} RMSE",
-            f"errors are correlated over {length} of {n}, which leaves fewer than the "
-            f"{MIN_BLOCKS:.0f} independent blocks that it takes",
-            "A longer flight would give one.",
-        )
-    sums = np.concatenate(([0.0], np.cumsum(np.concatenate((squares, squares[: length - 1])))))
-    block_means = (sums[length:] - sums[:-length]) / length  # one for each start, round the end
-    blocks = n / length
-    drawn = np.random.default_rng(seed).integers(0, n, (resamples, round(blocks)))
-    means = block_means[drawn].mean(axis=1)
-    quantile = float(student_t.ppf(0.5 + LEVEL / 2.0, blocks - 1.0))
-    tail = float(norm.cdf(-quantile * np.sqrt(blocks / (blocks - 1.0))))
-    low, high = np.sqrt(np.maximum(np.quantile(means, [tail, 1.0 - tail]), 0.0))
-    return Interval(float(low), float(high), length, blocks)
-
-
-def autocorrelation_time(values: Array) -> float:
-    """Integrated autocorrelation time in samples: 1 + 2 Σ ρ, at least 1.
-
-    The sum ends at five times itself (Sokal 1997, section 3).
-
-    Parameters
-    ----------
-    values : ndarray, shape (n,)
-    """
-    centred = values - values.mean()
-    if not centred.any():
-        return 1.0
-    n = len(centred)
-    covariance = autocovariance(centred)
-    times = 2.0 * np.cumsum(covariance / covariance[0]) - 1.0
-    enough = np.flatnonzero(np.arange(n) >= WINDOW_TIMES * times)
-    return max(1.0, float(times[enough[0]] if len(enough) else n))

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Literal
 
+import numpy as np
 from scipy.spatial.transform import Rotation
 
 from px4fuse.arrays import Array, BoolArray, IntArray
@@ -93,3 +94,9 @@ class Trajectory:
 
 def _some(values: Array | None, chosen: slice | BoolArray | IntArray) -> Array | None:
     return None if values is None else values[chosen]
+
+
+def cumulative_distance(position_m: Array) -> Array:
+    """Length of the path from its start to each position, shape (n, d) to (n,), in m."""
+    steps = np.linalg.norm(np.diff(position_m, axis=0), axis=1)
+    return np.concatenate([[0.0], np.cumsum(steps)])

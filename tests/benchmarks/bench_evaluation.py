@@ -37,8 +37,9 @@ def main() -> None:
 
     from px4fuse.readers.trajectory import read_trajectory, tum_text
     from px4fuse.trajectory.association import associate
-    from px4fuse.trajectory.evaluation import evaluate, rmse_interval
+    from px4fuse.trajectory.evaluation import evaluate
     from px4fuse.trajectory.offset import estimate_time_offset
+    from px4fuse.trajectory.scores import rmse_interval
 
     reference = test_evaluation.flight(600.0, 200.0)
     estimate = test_evaluation.flight(600.0, 30.0, "vio")
