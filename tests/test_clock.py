@@ -9,6 +9,8 @@ import pandas as pd
 import pytest
 from flights import aisle_flight, table, unavailable
 from numpy.typing import NDArray
+from scipy.integrate import cumulative_trapezoid
+from scipy.linalg import cho_factor, cho_solve
 from scipy.spatial.transform import Rotation
 from scipy.stats import binom
 
@@ -220,6 +222,120 @@ def test_between_two_times_the_signals_give_the_way_of_constant_acceleration() -
     step = np.diff(at, axis=1)[..., None]
     np.testing.assert_allclose(speed[..., 0], step * [1.5, 0.0, -0.5], atol=1e-10)
     np.testing.assert_allclose(way[..., 0], step**2 / 2.0 * [1.5, 0.0, -0.5], atol=1e-10)
+
+
+# --- the likelihood of an offset ---
+
+
+def joint_normal(
+    stamps: Array, measured: Array, offset: float, sigma_a: float, sigma_z: float
+) -> tuple[float, float, float]:
+    """-ln p of a stretch's positions, all at once, and the heading error with its variance (rad).
+
+    The filter's own model without a filter: given the first position, the others are normal with
+    the mean that the true acceleration gives them. Their covariance has the initial position and
+    velocity, white noise of acceleration, the measurements' own noise, and constants of known
+    variance: tilt, and biases of gyros and accelerometers.
+    """
+    time = stamps + offset
+    fine = np.arange(stamps[0] - 0.62, time[-1] + 0.002, 0.001)
+    turn = attitude(fine).as_matrix()
+    force = acceleration(fine) - GRAVITY
+    unit = np.eye(3)
+    angles = [np.broadcast_to(axis, force.shape) for axis in unit]
+    angles += [-cumulative_trapezoid(turn @ axis, fine, axis=0, initial=0.0) for axis in unit]
+    columns = [np.cross(angle, force) for angle in angles] + [-turn @ axis for axis in unit]
+    begin = int(np.searchsorted(fine, time[0]))
+    ways = []
+    for column in (acceleration(fine), *columns):
+        speed = cumulative_trapezoid(column[begin:], fine[begin:], axis=0, initial=0.0)
+        way = cumulative_trapezoid(speed, fine[begin:], axis=0, initial=0.0)
+        ways.append([np.interp(time[1:], fine[begin:], each) for each in way.T])
+    by_constants = np.array(ways[1:]).transpose(2, 1, 0).reshape(-1, 9)  # (time, axis), constant
+    left = (measured[1:] - measured[0] - np.array(ways[0]).T).ravel()
+    since = time[1:] - time[0]
+    short, long = np.minimum.outer(since, since), np.maximum.outer(since, since)
+    both = (
+        0.5**2
+        + 1.0**2 * np.multiply.outer(since, since)
+        + sigma_a**2 * DT * short**2 * (3.0 * long - short) / 6.0
+        + sigma_z**2 * np.eye(len(since))
+    )
+    prior = np.diag(np.repeat([0.05, 0.004, 0.3], 3) ** 2)
+    covariance = np.kron(both, unit) + by_constants @ prior @ by_constants.T
+    factor = cho_factor(covariance, lower=True)
+    gain = cho_solve(factor, by_constants @ prior).T
+    cost = 0.5 * left @ cho_solve(factor, left) + np.log(np.diag(factor[0])).sum()
+    return float(cost), float((gain @ left)[2]), float((prior - gain @ by_constants @ prior)[2, 2])
+
+
+@pytest.fixture(scope="module")
+def exact_imu() -> tuple[Flight, ClockOffset, list[tuple[Array, Array]]]:
+    """50 s with an IMU without error, in wind that it does not feel; the stretches taken of it."""
+    flight, _ = made_flight(duration_s=50.0, offset_s=0.07)
+    time = np.arange(0.0, 50.005, 1.0 / IMU_HZ)
+    h = 0.0005
+    rate = (attitude(time - h).inv() * attitude(time + h)).as_rotvec() / (2.0 * h)
+    force = attitude(time).inv().apply(acceleration(time) - GRAVITY)
+    track = flight.positions[0]
+    samples = track.samples.copy()
+    rng = np.random.default_rng(12)
+    wind = rng.normal(0.0, SIGMA_A * np.sqrt(DT * UWB_HZ), (len(samples), 3))
+    way = np.cumsum(np.cumsum(wind, axis=0), axis=0) / UWB_HZ**2
+    samples[POSITION_COLUMNS] += way
+    logged = np.arange(0.0, 50.005, 0.02)
+    flight = replace(
+        flight,
+        imu=imu_table(time, force, rate),
+        attitude=attitude_table(logged, attitude(logged)),
+        positions=(replace(track, samples=samples),),
+    )
+    found = estimate(flight)
+    assert isinstance(found, ClockOffset)
+    # what the search can shift is used, in stretches of equal length of at most 30 s
+    used = samples[(samples.index >= 0.6) & (samples.index <= 49.4)]
+    first = used.index < (used.index[0] + used.index[-1]) / 2.0
+    stretches = [
+        (part.index.to_numpy(), part[POSITION_COLUMNS].to_numpy())
+        for part in (used[first], used[~first])
+    ]
+    assert found.count == len(used)
+    return flight, found, stretches
+
+
+def test_the_profile_of_an_offset_is_that_of_the_joint_normal_distribution(exact_imu) -> None:
+    _, found, stretches = exact_imu
+    levels = found.sigma_a_m_s2 * np.geomspace(0.25, 2.0, 5)[1:-1] ** 0.5
+    profile = np.array(
+        [
+            min(
+                sum(
+                    joint_normal(*stretch, offset, float(level), found.sigma_z_m)[0]
+                    for stretch in stretches
+                )
+                for level in levels
+            )
+            for offset in found.curve_s[::5]
+        ]
+    )
+    expected = profile - profile.min()
+    ours = found.curve_drop[::5] - found.curve_drop[::5].min()
+    assert expected.max() > 2.0
+    np.testing.assert_allclose(ours, expected, rtol=0.01, atol=0.01)
+
+
+def test_the_heading_error_is_that_of_the_joint_normal_distribution(exact_imu) -> None:
+    """Each stretch's own, joined by what each knows beyond the prior of 0.05 rad."""
+    _, found, stretches = exact_imu
+    weight = total = 0.0
+    for stretch in stretches:
+        _, heading_rad, variance = joint_normal(
+            *stretch, found.offset_s, found.sigma_a_m_s2, found.sigma_z_m
+        )
+        weight += 1.0 / variance - 0.05**-2
+        total += heading_rad / variance
+    assert found.heading_error_deg == pytest.approx(np.degrees(total / weight), abs=0.01)
+    assert found.heading_sigma_deg == pytest.approx(np.degrees(weight**-0.5), rel=0.01)
 
 
 # --- the arithmetic of profiles and parts ---

@@ -79,6 +79,51 @@ def noisy_graph(dimension: int, seed: int, poses: int = 30, sigma: float = 0.05)
     )
 
 
+# --- where to start ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("seed", range(3))
+def test_chordal_initialisation_is_two_dense_least_squares(dimension: int, seed: int) -> None:
+    """Carlone et al. (2015), IV-C, with every edge's equations written in rows; pose 0 is held."""
+    d, graph = dimension, random_graph(dimension, seed)
+    assert (graph.second == 0).any()
+    n, measured = len(graph), lie.rotation_matrix(graph.measurements)
+    held = lie.rotation_matrix(graph.poses[:1])[0]
+    # sqrt(trace of the rotation's information) · (Z' Y_i - Y_j) = 0, Y the transposed rotations
+    rows, right = [], []
+    for i, j, z, omega in zip(graph.first, graph.second, measured, graph.information, strict=True):
+        row = np.zeros((d, n * d))
+        row[:, i * d : i * d + d] += z.T
+        row[:, j * d : j * d + d] -= np.eye(d)
+        row *= np.sqrt(np.trace(omega[d:, d:]))
+        rows.append(row[:, d:])
+        right.append(-row[:, :d] @ held.T)
+    relaxed = np.linalg.lstsq(np.vstack(rows), np.vstack(right))[0].reshape(n - 1, d, d)
+    rotation = [held]
+    for transposed in relaxed:
+        u, _, vt = np.linalg.svd(transposed.T)
+        rotation.append(u @ np.diag([1.0] * (d - 1) + [np.linalg.det(u @ vt)]) @ vt)
+    # L' (R_i Z)' (t_j - t_i - R_i z) = 0, L the Cholesky factor of the position's information
+    rows, right = [], []
+    for i, j, pose, z, omega in zip(
+        graph.first, graph.second, graph.measurements, measured, graph.information, strict=True
+    ):
+        weight = np.linalg.cholesky(omega[:d, :d]).T @ (rotation[i] @ z).T
+        row = np.zeros((d, n * d))
+        row[:, i * d : i * d + d] -= weight
+        row[:, j * d : j * d + d] += weight
+        rows.append(row[:, d:])
+        right.append(weight @ rotation[i] @ pose[:d] - row[:, :d] @ graph.poses[0, :d])
+    position = np.linalg.lstsq(np.vstack(rows), np.concatenate(right))[0].reshape(n - 1, d)
+    made = _chordal(graph)
+    assert made is not None
+    assert made.initialised == FROM_CHORDAL
+    np.testing.assert_array_equal(made.poses[0], graph.poses[0])
+    np.testing.assert_allclose(lie.rotation_matrix(made.poses), rotation, atol=1e-7)
+    np.testing.assert_allclose(made.poses[1:, :d], position, rtol=1e-6, atol=1e-6)
+
+
 # --- GTSAM ---------------------------------------------------------------------------------------
 
 

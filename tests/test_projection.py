@@ -1,0 +1,222 @@
+"""EKF2 along an axis: every column against its formula, sample by sample."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+from flights import Estimator, Uwb, aisle_flight, table
+
+from px4fuse.comparison.projection import (
+    observation_variance,
+    project_innovations,
+    project_state,
+    project_truth,
+    project_variance,
+)
+from px4fuse.filter.signals import Axis, Segment, make_axes
+from px4fuse.flight import (
+    POSITION_COLUMNS,
+    POSITION_VARIANCE_COLUMNS,
+    VELOCITY_COLUMNS,
+    VELOCITY_VARIANCE_COLUMNS,
+    Alignment,
+    Flight,
+    Unavailable,
+)
+
+WHOLE = Segment(0.0, 40.0, "")
+HEADING_DEG = 30.0
+COSINE, SINE = math.cos(math.radians(HEADING_DEG)), math.sin(math.radians(HEADING_DEG))
+COLUMNS = [
+    "innovation_m", "innovation_variance_m2", "observation_variance_m2", "test_ratio", "fused",
+    "rejected",
+]  # fmt: skip
+
+
+def flight(**changes: object) -> Flight:
+    return aisle_flight(duration_s=40.0, **changes)
+
+
+def axes_of(made: Flight) -> dict[str, Axis]:
+    (track,) = made.positions
+    return {axis.name: axis for axis in make_axes(made, track, WHOLE, heading_deg=HEADING_DEG)}
+
+
+def with_innovations(made: Flight, **frames: pd.DataFrame) -> Flight:
+    return replace(made, ekf2=replace(made.ekf2, innovations={**made.ekf2.innovations, **frames}))
+
+
+def rows(*values: tuple[float, ...], start_s: float = 1.0) -> pd.DataFrame:
+    """Innovations at 5 Hz; each row as ``COLUMNS``."""
+    return table(start_s + 0.2 * np.arange(len(values)), np.array(values), COLUMNS)
+
+
+NORTH = rows(
+    (0.30, 0.05, 0.01, 0.40, 1.0, 0.0),
+    (-0.20, 0.06, 0.02, 0.10, 1.0, 0.0),
+    (0.10, 0.07, 0.01, 0.30, 0.0, 1.0),
+    (0.50, 0.08, 0.03, 0.20, 1.0, 0.0),
+)
+# the first of NORTH is missing, and one follows that NORTH lacks
+EAST = rows(
+    (0.40, 0.09, 0.04, 0.20, 1.0, 0.0),
+    (0.25, 0.05, 0.02, 0.70, 0.0, 1.0),
+    (-0.35, 0.06, 0.01, 0.10, 1.0, 0.0),
+    (0.15, 0.07, 0.02, 0.10, 1.0, 0.0),
+    start_s=1.2,
+)
+
+
+def innovations(made: Flight, axis: str, segment: Segment = WHOLE) -> pd.DataFrame:
+    got = project_innovations(made, made.ekf2, made.positions[0], axes_of(made)[axis], segment)
+    assert isinstance(got, pd.DataFrame)
+    return got
+
+
+def test_along_the_aisle_innovations_are_projected_and_variances_by_the_squares() -> None:
+    got = innovations(with_innovations(flight(), north=NORTH, east=EAST), "aisle")
+    assert got.index.tolist() == pytest.approx([1.2, 1.4, 1.6])
+    for k, time in enumerate(got.index):
+        n, e = NORTH.iloc[k + 1], EAST.iloc[k]
+        row = got.loc[time]
+        assert row["innovation_m"] == pytest.approx(
+            COSINE * n["innovation_m"] + SINE * e["innovation_m"]
+        )
+        for column in ("innovation_variance_m2", "observation_variance_m2"):
+            assert row[column] == pytest.approx(COSINE**2 * n[column] + SINE**2 * e[column])
+        for column in ("test_ratio", "fused", "rejected"):
+            assert row[column] == max(n[column], e[column])
+
+
+@pytest.mark.parametrize("axis", ["north", "east", "aisle"])
+def test_variances_before_and_after_an_update_are_those_of_the_scalar_filter(axis: str) -> None:
+    """P⁻ = S - R and 1/P⁺ = 1/P⁻ + 1/R; what was rejected updates nothing."""
+    got = innovations(with_innovations(flight(), north=NORTH, east=EAST), axis)
+    s, r = got["innovation_variance_m2"], got["observation_variance_m2"]
+    np.testing.assert_allclose(got["prior_variance_m2"], s - r)
+    rejected = got["rejected"] > 0
+    assert rejected.any()
+    assert not rejected.all()
+    expected = np.where(rejected, s - r, 1.0 / (1.0 / (s - r) + 1.0 / r))
+    np.testing.assert_allclose(got["posterior_variance_m2"], expected)
+
+
+def test_a_variance_without_room_for_the_prior_leaves_it_unknown() -> None:
+    """S below R, or R itself: not a prior of zero or less."""
+    north = NORTH.assign(innovation_variance_m2=[0.05, 0.02, 0.005, 0.08])
+    got = innovations(with_innovations(flight(), north=north), "north")
+    assert got["prior_variance_m2"].isna().tolist() == [False, True, True, False]
+    assert got["posterior_variance_m2"].isna().tolist() == [False, True, True, False]
+
+
+def test_only_the_segment_is_taken() -> None:
+    made = with_innovations(flight(), north=NORTH, east=EAST)
+    part = Segment(1.3, 1.7, "")
+    for axis in ("north", "aisle"):
+        assert innovations(made, axis, part).index.tolist() == pytest.approx([1.4, 1.6])
+    nothing = project_innovations(
+        made, made.ekf2, made.positions[0], axes_of(made)["north"], Segment(20.0, 30.0, "")
+    )
+    assert isinstance(nothing, Unavailable)
+    assert "no sample in the segment" in str(nothing)
+
+
+@pytest.mark.parametrize("lacking", ["north", "east"])
+def test_the_aisle_needs_both_horizontal_axes(lacking: str) -> None:
+    gone = Unavailable("innovations", f"no {lacking}", "Log them.")
+    made = with_innovations(flight(), **{lacking: gone})
+    got = project_innovations(made, made.ekf2, made.positions[0], axes_of(made)["aisle"], WHOLE)
+    assert got is gone
+
+
+def test_innovations_are_of_external_vision_alone() -> None:
+    made = flight(uwb=Uwb(name="vehicle_mocap_odometry", rung=3))
+    got = project_innovations(made, made.ekf2, made.positions[0], axes_of(made)["north"], WHOLE)
+    assert isinstance(got, Unavailable)
+    assert "not to vehicle_mocap_odometry" in str(got)
+
+
+def test_where_no_observation_noise_is_logged_the_parameters_stand_in() -> None:
+    made = flight(ekf2=Estimator(noise_logged=False), parameters={"EKF2_EVP_NOISE": 0.05})
+    got = innovations(made, "north")
+    np.testing.assert_allclose(got["observation_variance_m2"], 0.05**2)
+    unknown = innovations(flight(ekf2=Estimator(noise_logged=False), parameters={}), "north")
+    assert unknown["observation_variance_m2"].isna().all()
+    assert unknown["prior_variance_m2"].isna().all()
+
+
+@pytest.mark.parametrize(
+    ("parameters", "reported_m", "expected_m2"),
+    [
+        ({"EKF2_EVP_NOISE": 0.2}, None, 0.2**2),
+        ({"EKF2_EVP_NOISE": 0.001}, None, 0.01**2),  # EKF2 takes no less than a centimetre
+        # the sender's variance where it is the larger, along the axis by the squares
+        ({"EKF2_EVP_NOISE": 0.2}, (0.3, 0.5, 1.0), COSINE**2 * 0.3**2 + SINE**2 * 0.5**2),
+        ({"EKF2_EVP_NOISE": 0.2}, (0.1, 0.1, 1.0), 0.2**2),
+        ({"EKF2_EVP_NOISE": 0.2, "EKF2_EV_NOISE_MD": 0.0}, (0.3, 0.3, 1.0), 0.3**2),
+        ({"EKF2_EVP_NOISE": 0.2, "EKF2_EV_NOISE_MD": 1.0}, (0.3, 0.3, 1.0), 0.2**2),
+    ],
+)
+def test_the_observation_noise_is_ekf2s_own_rule(
+    parameters: dict[str, float],
+    reported_m: tuple[float, float, float] | None,
+    expected_m2: float,
+) -> None:
+    made = flight(parameters=parameters)
+    (track,) = made.positions
+    if reported_m is not None:
+        variances = dict(zip(POSITION_VARIANCE_COLUMNS, np.square(reported_m), strict=True))
+        # one sample that says otherwise does not change the median
+        samples = track.samples.assign(**variances)
+        samples.iloc[10, samples.columns.get_indexer(POSITION_VARIANCE_COLUMNS)] = 100.0
+        track = replace(track, samples=samples)
+    aisle = axes_of(made)["aisle"]
+    assert observation_variance(made, track, aisle, WHOLE) == pytest.approx(expected_m2)
+    placed = Alignment(
+        "enu", "given", 0.0, None, "given", (0.0, 0.0, 0.0), 0.0, None, "given", "", None, None, ()
+    )
+    own_file = replace(track, alignment=placed)
+    least = max(parameters["EKF2_EVP_NOISE"], 0.01) ** 2
+    assert observation_variance(made, own_file, aisle, WHOLE) == pytest.approx(least)
+
+
+def test_state_truth_and_variance_are_projected() -> None:
+    made = flight()
+    rng = np.random.default_rng(2)
+    variances = POSITION_VARIANCE_COLUMNS + VELOCITY_VARIANCE_COLUMNS
+    second = np.arange(0.0, 40.5, 1.0)
+    variance = table(second, rng.uniform(0.1, 2.0, (len(second), 6)), variances)
+    ekf2 = replace(made.ekf2, variance=variance)
+    part = Segment(10.0, 20.0, "")
+    aisle = axes_of(made)["aisle"]
+    for got, samples in (
+        (project_state(ekf2.state, aisle, part), ekf2.state),
+        (project_truth(made.truth, aisle, part), made.truth.samples),
+    ):
+        assert isinstance(got, pd.DataFrame)
+        cut = samples[(samples.index >= 10.0) & (samples.index <= 20.0)]
+        assert got.index.tolist() == cut.index.tolist()
+        for column, (north, east, _) in (
+            ("position_m", POSITION_COLUMNS), ("velocity_m_s", VELOCITY_COLUMNS),
+        ):  # fmt: skip
+            np.testing.assert_allclose(
+                got[column], COSINE * cut[north] + SINE * cut[east], rtol=1e-12
+            )
+    projected = project_variance(ekf2, aisle, part)
+    assert isinstance(projected, pd.DataFrame)
+    cut = variance[10:21]
+    assert projected.index.tolist() == cut.index.tolist()
+    for column, (north, east, _) in (
+        ("position_variance_m2", POSITION_VARIANCE_COLUMNS),
+        ("velocity_variance_m2_s2", VELOCITY_VARIANCE_COLUMNS),
+    ):
+        np.testing.assert_allclose(
+            projected[column], COSINE**2 * cut[north] + SINE**2 * cut[east], rtol=1e-12
+        )
+    late = Segment(100.0, 110.0, "")
+    assert isinstance(project_variance(ekf2, aisle, late), Unavailable)
+    assert isinstance(project_truth(made.truth, aisle, late), Unavailable)
