@@ -55,17 +55,17 @@ class TookTooLongError(Exception):
 
 
 @contextlib.contextmanager
-def patience() -> Iterator[None]:
+def patience(seconds: float = PATIENCE_S) -> Iterator[None]:
     """Interrupt what does not end, where the system can."""
 
     def give_up(*_):
-        raise TookTooLongError(f"not read within {PATIENCE_S:g} s")
+        raise TookTooLongError(f"not read within {seconds:g} s")
 
     if not hasattr(signal, "setitimer"):
         yield
         return
     before = signal.signal(signal.SIGALRM, give_up)
-    signal.setitimer(signal.ITIMER_REAL, PATIENCE_S)
+    signal.setitimer(signal.ITIMER_REAL, seconds)
     try:
         yield
     finally:

@@ -92,7 +92,7 @@ BAD = {
     "zero with two bounds": (NUMBER + "at_least = 0\nat_most = 2\nzero_at = 9", "one bound"),
     "nothing required": (ITEM + 'check = "sections"', "nothing is required"),
     "two alike": (NOTES + NOTES, "items 1 and 2 have the same title"),
-    "too many": (NOTES * 101, "at most 100"),
+    "more than the limit": (NOTES * 101, "at most 100"),
     "words are text": ('words = "x"\n' + NOTES, "[words]"),
     "words hold numbers": (NOTES + "[words]\nsource_gap = [1]", "[words]: source_gap"),
     "unverified": ('unverified = "maybe"\n' + NOTES, "unverified cannot be 'maybe'"),
@@ -113,7 +113,10 @@ def test_spoilt_rubric_is_one_line_that_says_where(tmp_path, text, said):
 
 
 def test_files_that_are_no_rubric(tmp_path):
-    for content, said in ((b"#" * 1_000_001, "too many"), (b"\xff\xfe\x00", "not UTF-8")):
+    for content, said in (
+        (b"#" * 1_000_001, "more than the limit"),
+        (b"\xff\xfe\x00", "not UTF-8"),
+    ):
         path = tmp_path / "x.toml"
         path.write_bytes(content)
         with pytest.raises(SettingsError, match=said):

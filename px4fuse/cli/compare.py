@@ -9,18 +9,20 @@ from typing import Any
 import click
 
 from px4fuse.cli.inputs import (
-    STANDARD_OUTPUT,
     analysis_options,
     command_line,
     person_options,
-    progress,
     read_person,
     report_options,
-    report_paths,
     run_comparison,
+)
+from px4fuse.cli.outputs import (
+    progress,
+    report_paths,
     terminal,
     write_outputs,
 )
+from px4fuse.writing import STANDARD_OUTPUT
 
 SEVERITIES = ("error", "warning", "info")
 
@@ -61,10 +63,11 @@ def compare(
         document = Document(compared, find(compared), person, command_line("compare", log))
         text = to_json(results(document))
         step("drawing the report")
-        write_outputs({target: render(document, text), beside: text.encode()})
+        contents = {target: render(document, text), beside: text.encode()}
     if json_path == STANDARD_OUTPUT:
-        click.echo(text, nl=False)
-    else:
+        contents[STANDARD_OUTPUT] = text.encode()
+    write_outputs(contents)
+    if json_path != STANDARD_OUTPUT:
         from px4fuse.report.terminal import print_summary
 
         console = terminal()

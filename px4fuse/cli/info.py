@@ -12,8 +12,10 @@ from px4fuse.cli.inputs import (
     json_option,
     read_recordings,
     recording_options,
-    terminal,
     with_position,
+)
+from px4fuse.cli.outputs import (
+    terminal,
     write_json,
 )
 

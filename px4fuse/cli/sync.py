@@ -8,14 +8,16 @@ from typing import Any
 import click
 
 from px4fuse.cli.inputs import (
-    STANDARD_OUTPUT,
     analysis_options,
     command_line,
     json_option,
-    progress,
     run_comparison,
+)
+from px4fuse.cli.outputs import (
+    progress,
     write_json,
 )
+from px4fuse.writing import STANDARD_OUTPUT
 
 
 @click.command()

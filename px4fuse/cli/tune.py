@@ -8,15 +8,17 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from px4fuse.cli.inputs import (
-    STANDARD_OUTPUT,
     analysis_options,
     command_line,
     json_option,
-    progress,
     run_comparison,
+)
+from px4fuse.cli.outputs import (
+    progress,
     terminal,
     write_json,
 )
+from px4fuse.writing import STANDARD_OUTPUT
 
 if TYPE_CHECKING:
     from rich.console import Console

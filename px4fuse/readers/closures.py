@@ -6,9 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from px4fuse.errors import TrajectoryError
+from px4fuse.reading import read_text, shown
 
 DEFAULT_SIGMA_M = 0.10
 MAX_CLOSURES = 10_000
+MAX_FILE_BYTES = 1_000_000
 _FIELDS = (2, 3)
 
 
@@ -50,16 +52,8 @@ def read_closures(path: Path) -> tuple[GivenClosure, ...]:
     TrajectoryError
         The file cannot be read, holds no closure, or a line is none.
     """
-    try:
-        data = path.read_bytes()
-        is_utf16 = data.startswith(b"\xff\xfe")  # a Windows shell's redirection
-        text = data.decode("utf-16" if is_utf16 else "utf-8-sig")
-    except OSError as error:
-        raise TrajectoryError(f"{path.name}: cannot be read ({error.strerror}).") from error
-    except UnicodeDecodeError as error:
-        raise TrajectoryError(
-            f"{path.name}: not a text file. Give one T1,T2[,SIGMA] a line."
-        ) from error
+    name = shown(path)
+    text = read_text(path, TrajectoryError, MAX_FILE_BYTES)
     found: list[GivenClosure] = []
     for number, line in enumerate(text.splitlines(), start=1):
         content = line.split("#", 1)[0].strip()
@@ -68,10 +62,9 @@ def read_closures(path: Path) -> tuple[GivenClosure, ...]:
         try:
             found.append(parse_closure(content))
         except TrajectoryError as error:
-            raise TrajectoryError(f"{path.name}, line {number}: {error}") from error
+            raise TrajectoryError(f"{name}, line {number}: {error}") from error
     if not 0 < len(found) <= MAX_CLOSURES:
         raise TrajectoryError(
-            f"{path.name}: {len(found)} closures; give 1 to {MAX_CLOSURES}, one T1,T2[,SIGMA] a "
-            "line."
+            f"{name}: {len(found)} closures; give 1 to {MAX_CLOSURES}, one T1,T2[,SIGMA] a line."
         )
     return tuple(found)

@@ -8,10 +8,12 @@ from pathlib import Path
 import numpy as np
 
 from px4fuse.errors import TrajectoryError
+from px4fuse.reading import read_text, shown
 from px4fuse.trajectory.graph.model import IntArray
 from px4fuse.trajectory.graph.pose_graph import FROM_FILE, PoseGraph, initialise
 from px4fuse.trajectory.model import Array
 
+MAX_FILE_BYTES = 500_000_000
 # Tag: dimension, vertices that it names, numbers that follow them
 _TAGS = {
     "VERTEX_SE2": (2, 1, 3),
@@ -58,7 +60,7 @@ def read_g2o(path: str | Path) -> PoseGraph:
         no information matrix, or both kinds of pose.
     """
     file = Path(path)
-    return parse_g2o(_text(file), file.name)
+    return parse_g2o(read_text(file, TrajectoryError, MAX_FILE_BYTES), shown(file))
 
 
 def parse_g2o(text: str, name: str) -> PoseGraph:
@@ -119,19 +121,6 @@ def g2o_text(graph: PoseGraph) -> str:
         for i, j, row in zip(graph.first.tolist(), graph.second.tolist(), numbers, strict=True)
     ]
     return "\n".join(lines) + "\n"
-
-
-def _text(file: Path) -> str:
-    try:
-        content = file.read_bytes()
-    except OSError as error:
-        raise TrajectoryError(f"{file.name}: cannot be read: {error.strerror}.") from error
-    try:
-        return content.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        raise TrajectoryError(
-            f"{file.name}: not a text file. Give a g2o file: VERTEX and EDGE lines."
-        ) from None
 
 
 def _split(text: str, name: str) -> tuple[dict[str, _Lines], list[tuple[int, int]]]:

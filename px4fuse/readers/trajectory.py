@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from px4fuse.errors import TrajectoryError
-from px4fuse.readers.files import read_whole
 from px4fuse.readers.position_table import quote
+from px4fuse.reading import read_whole, shown
 from px4fuse.trajectory.model import MIN_POSES, Array, Frame, Kind, Trajectory
 
 MAX_FILE_BYTES = 500_000_000
@@ -114,15 +114,8 @@ def read_trajectory(path: str | Path) -> Trajectory:
         back, numbers that are not finite, or quaternions that are far from unit length.
     """
     path = Path(path)
-    name = path.name.encode(errors="replace").decode()
-    content = read_whole(
-        path,
-        name,
-        MAX_FILE_BYTES,
-        TrajectoryError,
-        give="Give a trajectory file",
-        again="Export it again",
-    )
+    name = shown(path)
+    content = read_whole(path, TrajectoryError, MAX_FILE_BYTES, again="Export it again")
     lines = _text(name, content).split("\n")
     comments = "\n".join(line for line in lines if line.lstrip().startswith("#"))
     file = _File(name, lines, comments)

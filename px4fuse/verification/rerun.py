@@ -7,13 +7,12 @@ name; and nothing that names an output is accepted.
 
 from __future__ import annotations
 
-import hashlib
 import os
 import re
 import shlex
 import shutil
 import tempfile
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -56,24 +55,6 @@ class Recomputed:
 
 class _RefusedError(Exception):
     """The analysis cannot be repeated; the text says why."""
-
-
-def hashed(logs: Iterable[Path]) -> dict[str, Path]:
-    """Files by their SHA-256; of a folder all files in it.
-
-    Raises
-    ------
-    OSError
-        A file cannot be read.
-    """
-    found: dict[str, Path] = {}
-    for given in logs:
-        files = sorted(given.rglob("*")) if given.is_dir() else [given]
-        for file in files:
-            if file.is_file() or file is given:
-                with file.open("rb") as content:
-                    found.setdefault(hashlib.file_digest(content, "sha256").hexdigest(), file)
-    return found
 
 
 def log_sha256(results: Mapping[str, Any]) -> str:
