@@ -92,7 +92,7 @@ BAD = {
     "zero with two bounds": (NUMBER + "at_least = 0\nat_most = 2\nzero_at = 9", "one bound"),
     "nothing required": (ITEM + 'check = "sections"', "nothing is required"),
     "two alike": (NOTES + NOTES, "items 1 and 2 have the same title"),
-    "more than the limit": (NOTES * 101, "at most 100"),
+    "too many": (NOTES * 101, "at most 100"),
     "words are text": ('words = "x"\n' + NOTES, "[words]"),
     "words hold numbers": (NOTES + "[words]\nsource_gap = [1]", "[words]: source_gap"),
     "unverified": ('unverified = "maybe"\n' + NOTES, "unverified cannot be 'maybe'"),
@@ -115,12 +115,12 @@ def test_spoilt_rubric_is_one_line_that_says_where(tmp_path, text, said):
 def test_files_that_are_no_rubric(tmp_path):
     for content, said in (
         (b"#" * 1_000_001, "more than the limit"),
-        (b"\xff\xfe\x00", "not UTF-8"),
+        (b"\xff\xfe\x00", "not a text file"),
     ):
         path = tmp_path / "x.toml"
         path.write_bytes(content)
         with pytest.raises(SettingsError, match=said):
             read_rubric(path)
-    for path in (tmp_path, tmp_path / "none.toml"):
-        with pytest.raises(SettingsError, match="cannot be read"):
+    for path, said in ((tmp_path, "is a folder"), (tmp_path / "none.toml", "cannot be read")):
+        with pytest.raises(SettingsError, match=said):
             read_rubric(path)

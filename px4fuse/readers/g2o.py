@@ -29,6 +29,8 @@ _ROUNDING = 1e-9
 # Of a squared norm: what normalising again would not improve
 _UNIT = 1e-15
 _BIGGEST_ID = 2**63
+# In 1/m² or 1/rad². Far beyond any measurement, and far from where squares and inverses overflow
+_LEAST_INFORMATION, _MOST_INFORMATION = 1e-50, 1e50
 
 
 @dataclass
@@ -226,6 +228,17 @@ def _information(name: str, lines: _Lines, numbers: Array, size: int) -> Array:
     row, column = np.triu_indices(size)
     made = np.empty((len(numbers), size, size))
     made[:, row, column] = made[:, column, row] = numbers
+    size_of_entry = np.abs(numbers)
+    beyond = (size_of_entry > _MOST_INFORMATION) | (
+        (row == column) & (size_of_entry > 0.0) & (size_of_entry < _LEAST_INFORMATION)
+    )
+    bad = _first(np.any(beyond, axis=1))
+    if bad is not None:
+        raise TrajectoryError(
+            f"{name}: line {lines.line[bad]}: the information matrix has the entry "
+            f"{numbers[bad][beyond[bad]][0]:.3g}, which cannot be computed with. Give 0 for what "
+            f"the edge does not tell, else {_LEAST_INFORMATION:g} to {_MOST_INFORMATION:g}."
+        )
     try:
         np.linalg.cholesky(made)
     except np.linalg.LinAlgError:
