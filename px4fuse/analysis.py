@@ -23,6 +23,7 @@ from px4fuse.loop.odometry import OdometryNoise
 from px4fuse.loop.sources import read_source
 from px4fuse.readers import read_log
 from px4fuse.readers.position_csv import read_position_csv
+from px4fuse.reading import shown
 from px4fuse.request import AUTO, ComparisonRequest, LoopRequest, PositionFile
 
 # What the report shows; each axis by itself is for `px4fuse tune`
@@ -86,7 +87,7 @@ def read_flight(request: ComparisonRequest, progress: Progress = _silent) -> Fli
         A file cannot be read, or does not belong to the flight.
     """
     log = Path(request.log)
-    progress(f"reading {log.name}")
+    progress(f"reading {shown(log)}")
     if request.mavlink is None:
         flight = read_log(log, system=request.system)
     else:
@@ -182,7 +183,7 @@ def run_loop(request: LoopRequest, progress: Progress = _silent) -> Loop:
     for name, value in (("--from", request.start_s), ("--to", request.end_s)):
         if value is not None and not abs(value) < float("inf"):
             raise SettingsError(f"{name} {value:g} is not a finite number.")
-    progress(f"reading {Path(request.source).name}")
+    progress(f"reading {shown(Path(request.source))}")
     source = read_source(request.source, frame=request.frame, system=request.system)
     if request.frame is not None and source.flight is not None:
         raise SettingsError(

@@ -16,8 +16,28 @@ The command line prints it on standard error and ends with exit code 2.
 from __future__ import annotations
 
 
+def on_one_line(text: str) -> str:
+    r"""A text without what would break or rewrite the line on which it is printed.
+
+    File names may hold line feeds and a terminal's escape sequences.
+
+    >>> on_one_line("a\nb\x1b[2J")
+    'a b?[2J'
+    """
+    return "".join(c if c.isprintable() else " " if c.isspace() else "?" for c in text)
+
+
 class Px4FuseError(Exception):
-    """Base of all errors that px4fuse raises on purpose."""
+    """Base of all errors that px4fuse raises on purpose.
+
+    Parameters
+    ----------
+    text : str
+        Put on one line.
+    """
+
+    def __init__(self, text: str) -> None:
+        super().__init__(on_one_line(text))
 
 
 class LogError(Px4FuseError):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import sys
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from test_cli import run_main
 
 from px4fuse.errors import TrajectoryError
 from px4fuse.readers.g2o import g2o_text, parse_g2o, read_g2o
@@ -122,7 +124,7 @@ def test_files_that_are_none(tmp_path: Path) -> None:
     binary.write_bytes(b"ULog\x01\x12\x35\xff\xfe\x00")
     with pytest.raises(TrajectoryError, match=r"^log\.g2o: not a text file"):
         read_g2o(binary)
-    with pytest.raises(TrajectoryError, match=r"^none\.g2o: cannot be read: No such file"):
+    with pytest.raises(TrajectoryError, match=r"^none\.g2o: cannot be read \(No such file"):
         read_g2o(tmp_path / "none.g2o")
 
 
@@ -196,3 +198,46 @@ def pose_graphs() -> list[Path]:
     if not folder.is_dir():
         pytest.skip("the public pose graphs (../shared/pose_graphs) are not beside the repository")
     return sorted(folder.glob("*.g2o"))
+
+
+# --- numbers that cannot be computed with ---
+
+SQUARE = "".join(f"EDGE_SE2 {i} {i + 1} 1 0 1.57 {{}}\n" for i in range(4))
+UNIT = "1 0 0 1 0 1"
+
+
+def square(information: str, edge: int) -> str:
+    """A path around a square that closes twice, with another information in one edge."""
+    text = SQUARE + "EDGE_SE2 0 4 0.1 0.1 6.2 {}\nEDGE_SE2 0 3 0.1 1.1 4.7 {}\n"
+    return text.format(*[information if edge == one else UNIT for one in range(6)])
+
+
+@pytest.mark.parametrize("edge", [1, 4])
+@pytest.mark.parametrize("entry", ["1e-320", "5e-324", "1e-300", "1e-51", "1e51", "1e300"])
+def test_information_that_overflows_is_refused_with_its_line(
+    tmp_path, monkeypatch, capsys, entry, edge
+) -> None:
+    path = tmp_path / "g.g2o"
+    path.write_text(square(f"{entry} 0 0 1 0 1", edge))
+    code, out, err = run_main(monkeypatch, capsys, "loop", path)
+    assert (code, out) == (2, "")
+    assert f"g.g2o: line {edge + 1}: the information matrix has the entry {entry}" in err.replace(
+        "e+", "e"
+    ).replace("4.94e-324", "5e-324").replace("9.99989e-321", "1e-320")
+    assert len(err.splitlines()) == 1
+
+
+@pytest.mark.parametrize("edge", [1, 4])
+@pytest.mark.parametrize("row", [0, 5])
+@pytest.mark.parametrize("entry", ["1e-50", "1e-30", "1e-12", "1e12", "1e30", "1e50", "0"])
+def test_information_of_any_size_that_is_read_gives_numbers(
+    tmp_path, monkeypatch, capsys, entry, row, edge
+) -> None:
+    """Warnings are errors in these tests, and JSON holds neither NaN nor infinity."""
+    numbers = UNIT.split()
+    numbers[row] = entry
+    path = tmp_path / "g.g2o"
+    path.write_text(square(" ".join(numbers), edge))
+    code, out, err = run_main(monkeypatch, capsys, "loop", path, "--json", "-", "--robust")
+    assert (code, err) == (0, "")
+    assert json.loads(out, parse_constant=pytest.fail)["graph"]["solutions"]

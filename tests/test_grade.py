@@ -16,9 +16,10 @@ from pypdf import PdfReader, PdfWriter
 
 from px4fuse.assignment.key import Answer, AnswerKey
 from px4fuse.cli import cli
-from px4fuse.grading.grade import file_names, grade, graded_from, logs_by_hash
+from px4fuse.grading.grade import file_names, grade, graded_from
 from px4fuse.grading.model import Graded
 from px4fuse.grading.rubric import parse_rubric, read_rubric, rubric_text
+from px4fuse.reading import files_by_sha256
 from px4fuse.verification.model import Verdict
 
 REPORT = REPOSITORY / "reports" / "aisle_uwb.pdf"
@@ -120,7 +121,7 @@ def test_a_log_that_was_handed_out_and_is_not_at_hand_costs_nobody_everything(tm
     shutil.copy(REPORT, tmp_path / "in")
     (tmp_path / "logs").mkdir()
     (tmp_path / "logs" / "another.ulg").write_bytes(b"x")
-    (sha256,) = logs_by_hash([LOG])
+    (sha256,) = files_by_sha256([LOG])
     rubric, logs = read_rubric(None), [tmp_path / "logs"]
     for given, status in ((sha256, "cannot verify"), ("0" * 64, "other log")):
         key = AnswerKey("aisle", (Answer("1", "Ada", "1.ulg", given),))
@@ -242,7 +243,7 @@ def test_names_of_files_are_safe_and_unique() -> None:
 
 def test_logs_are_found_by_their_hash_not_their_name(tmp_path) -> None:
     shutil.copy(LOG, tmp_path / "anything.bin")
-    (path,) = logs_by_hash([tmp_path]).values()
+    (path,) = files_by_sha256([tmp_path]).values()
     assert path == tmp_path / "anything.bin"
 
 

@@ -137,7 +137,7 @@ def test_what_px4fuse_cannot_have_recorded_is_refused(recorded: object, says: st
 def test_every_option_of_an_analysis_is_in_the_request(command: click.Command) -> None:
     """An option that the request forgets would be missing from every record."""
     about_outputs = {"-o", "--json", "--student", "--id", "--notes", "--fail-on", "--tum", "--g2o",
-                     "--closures", "--robust"}  # fmt: skip
+                     "--closures", "--robust", "--max-size"}  # fmt: skip
     request = ComparisonRequest(
         log="a", mavlink="b", system=1, sigma_a_m_s2=1.0, sigma_z_m=1.0, dt_s=0.2, input="zero",
         axes=("down",), heading_deg=1.0, start_s=1.0, end_s=2.0, clock_offset_s=0.1,

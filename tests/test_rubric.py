@@ -113,11 +113,14 @@ def test_spoilt_rubric_is_one_line_that_says_where(tmp_path, text, said):
 
 
 def test_files_that_are_no_rubric(tmp_path):
-    for content, said in ((b"#" * 1_000_001, "too many"), (b"\xff\xfe\x00", "not UTF-8")):
+    for content, said in (
+        (b"#" * 1_000_001, "more than the limit"),
+        (b"\xff\xfe\x00", "not a text file"),
+    ):
         path = tmp_path / "x.toml"
         path.write_bytes(content)
         with pytest.raises(SettingsError, match=said):
             read_rubric(path)
-    for path in (tmp_path, tmp_path / "none.toml"):
-        with pytest.raises(SettingsError, match="cannot be read"):
+    for path, said in ((tmp_path, "is a folder"), (tmp_path / "none.toml", "cannot be read")):
+        with pytest.raises(SettingsError, match=said):
             read_rubric(path)

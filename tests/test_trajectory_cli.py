@@ -336,7 +336,7 @@ REFUSED = {
     "closures of bytes": ("loop s.tum --closures closures.bin", "closures.bin: not a text file"),
     "closures of none": ("loop s.tum --closures no_closures.txt", "no_closures.txt: 0 closures"),
     "closures missing": ("loop s.tum --closures absent.txt", "absent.txt: cannot be read"),
-    "closures a folder": ("loop s.tum --closures folder", "folder: cannot be read"),
+    "closures a folder": ("loop s.tum --closures folder", "folder: is a folder"),
     "landing of words": ("loop s.tum --landed-at junk", "'junk' is not FORWARD,RIGHT"),
     "landing of one": ("loop s.tum --landed-at 1", "'1' is not FORWARD,RIGHT"),
     "landing of four": ("loop s.tum --landed-at 1,2,3,4", "is not FORWARD,RIGHT"),

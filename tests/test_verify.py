@@ -20,6 +20,7 @@ from pypdf.generic import NameObject, TextStringObject
 
 from px4fuse.cli import cli
 from px4fuse.cli.verify import verify as verify_command
+from px4fuse.reading import files_by_sha256
 from px4fuse.report.seal import seal_of, sealed
 from px4fuse.results.build import to_json
 from px4fuse.verification import rerun
@@ -81,7 +82,7 @@ class Base:
 
 
 def base(pdf: bytes, log: Path) -> Base:
-    files = rerun.hashed([log])
+    files = files_by_sha256([log])
     results = report_of(pdf).results
     again = rerun.recompute(results, files)
     assert isinstance(again, Recomputed), again

@@ -31,6 +31,7 @@ from px4fuse.assignment.key import (
 )
 from px4fuse.errors import OutputError, SettingsError
 from px4fuse.plain import plain
+from px4fuse.reading import read_whole
 from px4fuse.simulation import flights
 from px4fuse.simulation.mistakes import parse
 from px4fuse.simulation.scenario import Kind, Scenario
@@ -289,7 +290,7 @@ def assign(
     kind: Kind,
     count: int | None = None,
     truth: bool = True,
-    step: Callable[[], None] = lambda: None,
+    step: Callable[[int, int], None] = lambda done, of: None,
 ) -> Assigned:
     """Write everyone's log into a folder, and the answer key.
 
@@ -309,7 +310,7 @@ def assign(
     truth : bool
         Whether logs of an aisle hold the truth.
     step : callable
-        Told after every flight.
+        Told after every flight how many are made, and of how many.
 
     Raises
     ------
@@ -336,14 +337,14 @@ def assign(
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=".px4fuse-", dir=folder) as staging:
             answers = []
-            for student in students:
+            for done, student in enumerate(students, start=1):
                 log, answer = fly(secret, student, kind, count, truth)
                 answers.append(answer)
                 target = folder / student.file
                 if not _there(target, log):
                     staged[target] = Path(staging) / student.file
                     staged[target].write_bytes(log)
-                step()
+                step(done, len(students))
             key = AnswerKey(kind, tuple(answers), made_up)
             _check_extends(key_file, before, key)
             _place(staged, key_file, key_text(key).encode())
@@ -489,16 +490,13 @@ def file_stem(student_id: str) -> str | None:
 
 def _rows(path: Path) -> list[tuple[int, list[str]]]:
     """Rows that are not empty, with their numbers; the first is the header."""
-    try:
-        with path.open("rb") as file:
-            content = file.read(MAX_ROSTER_BYTES + 1)
-    except OSError as error:
-        raise SettingsError(f"{path}: cannot be read ({error.strerror}).") from error
-    if len(content) > MAX_ROSTER_BYTES:
-        raise SettingsError(
-            f"{path}: more than {MAX_ROSTER_BYTES} bytes are too many for a roster. Give a CSV "
-            "file with one row per student."
-        )
+    content = read_whole(
+        path,
+        SettingsError,
+        MAX_ROSTER_BYTES,
+        name=str(path),
+        smaller="Give a CSV file with one row per student",
+    )
     if content.startswith((b"PK\x03\x04", b"\xd0\xcf\x11\xe0")):
         raise SettingsError(f"{path}: a spreadsheet. Save it as CSV.")
     text = _decoded(content)

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from px4fuse.errors import SettingsError
+from px4fuse.reading import read_text
 
 SCHEMA_NAME = "px4fuse-assignment"
 SCHEMA_VERSION = 1
@@ -127,16 +128,10 @@ def read_key(path: Path) -> AnswerKey:
     SettingsError
         It cannot be read, or is not what ``px4fuse simulate --assignment`` wrote.
     """
+    text = read_text(path, SettingsError, MAX_KEY_BYTES, name=str(path))
     try:
-        with path.open("rb") as file:
-            content = file.read(MAX_KEY_BYTES + 1)
-    except OSError as error:
-        raise SettingsError(f"{path}: cannot be read ({error.strerror}).") from error
-    if len(content) > MAX_KEY_BYTES:
-        _refuse(path, f"more than {MAX_KEY_BYTES} bytes are too many for an answer key")
-    try:
-        given = json.loads(content.decode("utf-8-sig"), parse_constant=_no_constant)
-    # a JSON that is nested too deep, or has an integer of a million digits, or is not UTF-8
+        given = json.loads(text, parse_constant=_no_constant)
+    # a JSON that is nested too deep, or has an integer of a million digits
     except (ValueError, RecursionError):
         _refuse(path, "not JSON")
     schema = given.get("schema") if isinstance(given, dict) else None

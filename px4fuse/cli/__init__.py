@@ -5,11 +5,14 @@ from __future__ import annotations
 import gc
 import importlib
 import os
+import signal
 import sys
 
 import click
 
-from px4fuse.errors import Px4FuseError
+from px4fuse.cli.outputs import Interrupted, written_so_far
+from px4fuse.errors import OutputError, Px4FuseError, on_one_line
+from px4fuse.writing import STOPPING
 
 # Command name to module and one-line help: --help must not import what the commands need.
 COMMANDS = {
@@ -45,12 +48,18 @@ class LazyGroup(click.Group):
         return command
 
     def invoke(self, ctx: click.Context) -> object:
-        """Invoke a command; a closed pipe is told apart from other errors of writing by main."""
+        """Invoke a command; what ends it early is told apart before click sees it."""
         try:
             return super().invoke(ctx)
         except BrokenPipeError as error:
             # click itself ends with exit code 1 where it sees errno EPIPE
             raise BrokenPipeError from error
+        except KeyboardInterrupt as stopped:  # click itself would print an empty line
+            raise Interrupted(stopped, written_so_far(ctx)) from None
+        except OSError as error:
+            raise OutputError(
+                f"standard output: cannot be written ({error.strerror}), {written_so_far(ctx)}"
+            ) from error
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """List the commands from the table above, without importing them."""
@@ -75,6 +84,9 @@ def main() -> None:
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):  # σ and ν on a Windows console with a legacy code page
             stream.reconfigure(errors="replace")
+    for number in STOPPING:
+        if signal.getsignal(number) is signal.SIG_DFL:  # not where nohup ignores it
+            signal.signal(number, _stop)
     try:
         code = cli.main(standalone_mode=False)
     except click.exceptions.NoArgsIsHelpError as error:
@@ -82,22 +94,31 @@ def main() -> None:
         code = 2
     except click.UsageError as error:
         where = error.ctx.command_path if error.ctx else "px4fuse"
-        click.echo(f"px4fuse: {error.format_message()} See {where} --help.", err=True)
+        _say(f"{error.format_message()} See {where} --help.")
         code = 2
     except Px4FuseError as error:
-        click.echo(f"px4fuse: {error}", err=True)
+        _say(str(error))
         code = 2
-    except (click.Abort, KeyboardInterrupt):
-        click.echo("px4fuse: interrupted, nothing was written.", err=True)
-        code = 130
+    except Interrupted as stopped:
+        _say(str(stopped))
+        code = stopped.exit_code
     except BrokenPipeError:  # the reader of a pipe has gone, as with | head; the files are written
         _abandon_output()
         code = 0
-    except OSError as error:
-        click.echo(f"px4fuse: the output cannot be written ({error.strerror}).", err=True)
+    try:
+        sys.stdout.flush()
+    except OSError:  # said before
         _abandon_output()
-        code = 2
     sys.exit(code if isinstance(code, int) else 0)
+
+
+def _say(text: str) -> None:
+    click.echo(f"px4fuse: {on_one_line(text)}", err=True)
+
+
+def _stop(number: int, _: object) -> None:
+    """End the run by termination as by Ctrl-C, so that it clears up."""
+    raise KeyboardInterrupt(number)
 
 
 def _abandon_output() -> None:

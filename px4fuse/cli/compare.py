@@ -9,17 +9,19 @@ from typing import Any
 import click
 
 from px4fuse.cli.inputs import (
-    STANDARD_OUTPUT,
     analysis_options,
     comparison_request,
     person_options,
-    progress,
     read_person,
     report_options,
+)
+from px4fuse.cli.outputs import (
+    progress,
     report_paths,
     terminal,
     write_outputs,
 )
+from px4fuse.writing import STANDARD_OUTPUT
 
 SEVERITIES = ("error", "warning", "info")
 
@@ -62,10 +64,11 @@ def compare(
         document = Document(analysis, find(analysis), person, command_line(request))
         text = to_json(results(request, analysis, document.findings, person, document.command))
         step("drawing the report")
-        write_outputs({target: render(document, text), beside: text.encode()})
+        contents = {target: render(document, text), beside: text.encode()}
     if json_path == STANDARD_OUTPUT:
-        click.echo(text, nl=False)
-    else:
+        contents[STANDARD_OUTPUT] = text.encode()
+    write_outputs(contents)
+    if json_path != STANDARD_OUTPUT:
         from px4fuse.report.terminal import print_summary
 
         console = terminal()

@@ -9,17 +9,20 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from px4fuse.cli.inputs import (
-    STANDARD_OUTPUT,
     NumberOrAuto,
     command_line,
     json_option,
-    progress,
+    max_size_option,
     system_option,
+)
+from px4fuse.cli.outputs import (
+    progress,
     terminal,
     write_json,
 )
 from px4fuse.errors import SettingsError
 from px4fuse.request import AUTO
+from px4fuse.writing import STANDARD_OUTPUT
 
 if TYPE_CHECKING:
     from px4fuse.trajectory.scores import Delta
@@ -93,6 +96,7 @@ class DeltaType(click.ParamType["Delta"]):
     "--consecutive", is_flag=True, help="RPE over pairs end to end, instead of from every pose."
 )
 @system_option
+@max_size_option
 @json_option
 def evaluate(
     estimate: Path,

@@ -14,14 +14,19 @@ from px4fuse.cli.inputs import (
     comparison_request,
     path_option,
     recording_options,
+)
+from px4fuse.cli.outputs import (
     write_outputs,
 )
 from px4fuse.errors import OutputError
+from px4fuse.reading import read_text
 
 if TYPE_CHECKING:
     import pandas as pd
 
 FORMATS = ("csv", "parquet")
+# Of flight.json
+MAX_DESCRIPTION_BYTES = 50_000_000
 
 
 @click.command()
@@ -87,10 +92,11 @@ def extract(
 def _refuse_mixture(folder: Path, sha256: str) -> None:
     """Tables of two flights in one folder would pass for one."""
     try:
-        before = json.loads((folder / "flight.json").read_text(encoding="utf-8"))["log"]
+        text = read_text(folder / "flight.json", OutputError, MAX_DESCRIPTION_BYTES)
+        before = json.loads(text)["log"]
         other = before["sha256"] != sha256
         name = str(before["name"])
-    except (OSError, ValueError, KeyError, TypeError):  # not one of ours
+    except (OutputError, ValueError, KeyError, TypeError):  # not one of ours
         return
     if other:
         raise OutputError(

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from px4fuse.cli.inputs import path_option, terminal, write_outputs
+from px4fuse.cli.inputs import max_size_option, path_option
+from px4fuse.cli.outputs import Interrupted, progress, terminal, write_outputs
 from px4fuse.errors import OutputError, SettingsError
 
 if TYPE_CHECKING:
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 @path_option(
     "--rubric", metavar="FILE.toml", help="What is worth how many points.  [default: of this lab]"
 )
+@max_size_option
 @path_option("--key", metavar="FILE.json", help="Answer key of px4fuse simulate --assignment.")
 @path_option("-o", "--output", metavar="DIR", help="Folder for the class table and the feedback.")
 @click.option("--title", default="Class", show_default=True, help="Of the class page.")
@@ -87,7 +88,7 @@ def grade(
         answers = read_key(key)
     chosen = read_rubric(rubric)
     try:
-        with _progress() as advance:
+        with progress() as step:
             outcome = grade_all(
                 submissions,
                 logs,
@@ -96,31 +97,12 @@ def grade(
                 key=answers,
                 title=title,
                 processes=jobs,
-                progress=advance,
+                progress=partial(step, "grading"),
             )
-    except KeyboardInterrupt:
-        click.echo(
-            "px4fuse: interrupted; what is graded is kept. The same command goes on from there.",
-            err=True,
-        )
-        raise click.exceptions.Exit(130) from None
+    except KeyboardInterrupt as stopped:
+        left = "but what is graded is kept. The same command goes on from there."
+        raise Interrupted(stopped, left) from None
     _print(outcome)
-
-
-@contextmanager
-def _progress() -> Iterator[Callable[[int, int], None]]:
-    """A bar on a terminal; nothing in a pipe."""
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
-
-    console = Console(stderr=True)
-    if not console.is_terminal:
-        yield lambda done, of: None
-        return
-    columns = ("grading", BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console) as bar:
-        task = bar.add_task("grading")
-        yield lambda done, of: bar.update(task, completed=done, total=of)
 
 
 def _print(outcome: Outcome) -> None:

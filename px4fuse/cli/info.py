@@ -12,6 +12,8 @@ from px4fuse.cli.inputs import (
     comparison_request,
     json_option,
     recording_options,
+)
+from px4fuse.cli.outputs import (
     terminal,
     write_json,
 )

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,25 +11,19 @@ from typing import TYPE_CHECKING, Any
 import click
 from click.core import ParameterSource
 
-from px4fuse.errors import OutputError, SettingsError
+from px4fuse.errors import SettingsError
+from px4fuse.reading import max_log_bytes, read_text
 from px4fuse.request import AUTO
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from px4fuse.request import ComparisonRequest, PositionFile
     from px4fuse.results.model import Student
 
 AXES = ("north", "east", "down", "aisle")
 # Options that name places or people; the command line in the report leaves them out
 NOT_RECORDED = (
-    "output", "json_path", "tum", "g2o", "student", "student_id", "notes", "fail_on",
+    "output", "json_path", "tum", "g2o", "student", "student_id", "notes", "fail_on", "max_size",
 )  # fmt: skip
-# Parameters that name files to read; some name a part of a log after a colon
-INPUTS = (
-    "log", "mavlink", "position", "notes", "source", "estimate", "reference", "closures",
-)  # fmt: skip
-STANDARD_OUTPUT = Path("-")
 
 
 class NumberOrAuto(click.ParamType[float | str]):
@@ -143,6 +136,24 @@ system_option = click.option(
     metavar="ID",
     help="MAVLink system id of the vehicle.  [default: the one with the most data]",
 )
+
+
+def _allow_size(ctx: click.Context, _: click.Parameter, megabytes: int | None) -> None:
+    if megabytes is not None:
+        before = max_log_bytes.set(megabytes * 1_000_000)
+        ctx.call_on_close(lambda: max_log_bytes.reset(before))
+
+
+# It says what this machine can take, not what is analysed, so it is no setting of the analysis
+max_size_option = click.option(
+    "--max-size",
+    type=click.IntRange(min=1),
+    default=None,
+    expose_value=False,
+    callback=_allow_size,
+    metavar="MB",
+    help=f"Largest log that is read.  [default: {max_log_bytes.get() // 1_000_000}]",
+)
 _RECORDINGS = (
     path_option(
         "--mavlink",
@@ -235,7 +246,7 @@ _REPORT = (
 
 def recording_options(command: Callable[..., None]) -> Callable[..., None]:
     """Add the options that say which recordings of the flight are read, and how."""
-    for option in reversed((*_RECORDINGS, *_POSITION, clock_offset_option)):
+    for option in reversed((*_RECORDINGS, *_POSITION, clock_offset_option, max_size_option)):
         command = option(command)
     return command
 
@@ -295,63 +306,6 @@ def _position_file(given: dict[str, Any]) -> PositionFile | None:
     return None
 
 
-@contextmanager
-def progress(quiet: bool) -> Iterator[Callable[[str], None]]:
-    """Say what is being done on a terminal; be quiet in a pipe."""
-    from rich.console import Console
-
-    console = Console(stderr=True)
-    if not console.is_terminal or quiet:
-        yield lambda _: None
-        return
-    with console.status("starting") as status:
-        yield status.update
-
-
-def report_paths(output: Path, json_path: Path | None) -> tuple[Path, Path]:
-    """Where a report and its results go: the results beside it, unless --json names a file.
-
-    Raises
-    ------
-    OutputError
-        The report is no PDF, both are the same file, or one of them is read by this command.
-    """
-    if output.suffix.lower() != ".pdf":
-        raise OutputError(f"{output}: the report is a PDF. Give a name that ends in .pdf with -o.")
-    beside = output.with_suffix(".json") if json_path in (None, STANDARD_OUTPUT) else json_path
-    if beside.resolve() == output.resolve():
-        raise OutputError(f"{beside}: --json and -o name the same file. Give two names.")
-    spare_inputs([output, beside])
-    return output, beside
-
-
-def write_json(results: dict[str, Any], json_path: Path | None) -> bool:
-    """Write results where --json says; true where they have standard output to themselves."""
-    from px4fuse.results.build import to_json
-
-    text = to_json(results)
-    if json_path == STANDARD_OUTPUT:
-        click.echo(text, nl=False)
-        return True
-    if json_path is not None:
-        write_outputs({json_path: text.encode()})
-    return False
-
-
-def write_outputs(contents: Mapping[Path, bytes]) -> None:
-    """Write results, all or none, and never over a file that this run has read.
-
-    Raises
-    ------
-    OutputError
-        A target is one of the inputs, or cannot be written.
-    """
-    from px4fuse.writing import write_all
-
-    spare_inputs(contents)
-    write_all(contents)
-
-
 def read_person(given: dict[str, Any]) -> Student:
     """Whose report it is, taken out of what :func:`person_options` gave.
 
@@ -371,52 +325,7 @@ def _read_notes(path: Path | None) -> str:
 
     if path is None:
         return ""
-    try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise SettingsError(f"--notes {path}: cannot be read ({error.strerror}).") from error
-    if len(content) > MAX_NOTES_BYTES:
-        raise SettingsError(
-            f"--notes {path}: {len(content)} bytes are too many for notes "
-            f"(at most {MAX_NOTES_BYTES})."
-        )
-    try:
-        return content.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise SettingsError(
-            f"--notes {path}: not UTF-8 text (byte {error.start}). Save it as UTF-8."
-        ) from error
-
-
-def spare_inputs(targets: Iterable[Path]) -> None:
-    """Refuse to write over a file that this command reads.
-
-    Raises
-    ------
-    OutputError
-        A target is one of the inputs.
-    """
-    params = click.get_current_context().params
-    given = [params[name] for name in INPUTS if params.get(name) is not None]
-    read = [path if path.exists() else Path(str(path).rpartition(":")[0]) for path in given]
-    for target in targets:
-        for source in read:
-            if target.exists() and source.exists() and target.samefile(source):
-                raise OutputError(
-                    f"{target}: is what this command reads; it was not overwritten. Give another "
-                    "name for the output."
-                )
-
-
-def terminal() -> Console:
-    """Standard output for tables; a reader that has gone, as with ``| head``, is no error."""
-    from rich.console import Console
-
-    class PipeConsole(Console):
-        def on_broken_pipe(self) -> None:
-            raise BrokenPipeError
-
-    return PipeConsole(highlight=False)
+    return read_text(path, SettingsError, MAX_NOTES_BYTES, name=f"--notes {path}")
 
 
 def encodable(text: str) -> str:

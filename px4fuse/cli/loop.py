@@ -10,21 +10,24 @@ import click
 from click.core import ParameterSource
 
 from px4fuse.cli.inputs import (
-    STANDARD_OUTPUT,
     command_line,
+    max_size_option,
     path_option,
     person_options,
-    progress,
     read_person,
+    system_option,
+)
+from px4fuse.cli.outputs import (
+    progress,
     report_paths,
     spare_inputs,
-    system_option,
     terminal,
-    write_json,
     write_outputs,
 )
 from px4fuse.errors import SettingsError
+from px4fuse.reading import shown
 from px4fuse.request import FrameName, Landing
+from px4fuse.writing import STANDARD_OUTPUT
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -137,6 +140,7 @@ class FrameType(click.Choice[str]):
     "--robust", is_flag=True, help="Solve a pose graph of over 1000 closures robustly too: minutes."
 )
 @system_option
+@max_size_option
 @person_options
 @path_option("-o", "--output", metavar="FILE.pdf", help="A report, and its results beside it.")
 @path_option("--json", "json_path", metavar="FILE", help="The results; - prints them alone.")
@@ -229,7 +233,7 @@ def _files(found: Loop, tum: Path | None, g2o: Path | None) -> dict[Path, bytes]
         best = found.best
         if best is found.odometry:
             raise MissingDataError(
-                f"--tum {tum.name}: there is no corrected path: no closure could be used."
+                f"--tum {shown(tum)}: there is no corrected path: no closure could be used."
             )
         contents[tum] = tum_text(in_frame(best.trajectory, found.frame)).encode()
     if g2o is not None:
@@ -247,22 +251,22 @@ def _solve(source: Path, json_path: Path | None, g2o: Path | None, robust: bool 
 
     path, part = split_part(str(source))
     if part is not None:
-        raise SettingsError(f"{source.name}: a pose graph has no part {part!r}. Leave it out.")
+        raise SettingsError(f"{shown(source)}: a pose graph has no part {part!r}. Leave it out.")
     context = click.get_current_context()
     for parameter in context.command.params:
         chosen = context.get_parameter_source(parameter.name or "") == ParameterSource.COMMANDLINE
         if chosen and parameter.name not in FOR_GRAPHS:
             raise SettingsError(
-                f"{source.name}: {parameter.opts[-1]} is for flights and trajectories, not for a "
+                f"{shown(source)}: {parameter.opts[-1]} is for flights and trajectories, not for a "
                 "pose graph. With one, give only --g2o FILE and --json FILE."
             )
     _spare(json_path, g2o)
     with progress(json_path == STANDARD_OUTPUT) as step:
-        step(f"reading {source.name}")
+        step(f"reading {shown(source)}")
         solved = analyse_graph(read_g2o(path), step, robust=robust)
-    results = graph_results(source.name, solved, command_line("loop", source))
+    results = graph_results(shown(source), solved, command_line("loop", source))
     contents = {} if g2o is None else {g2o: g2o_text(solved.graph).encode()}
-    _finish(results, json_path, contents, lambda to: print_graph(to, source.name, solved))
+    _finish(results, json_path, contents, lambda to: print_graph(to, shown(source), solved))
 
 
 def _finish(
@@ -274,12 +278,11 @@ def _finish(
     """Write all outputs or none; print the results alone, or what was found and written."""
     from px4fuse.results.build import to_json
 
-    if json_path not in (None, STANDARD_OUTPUT):
+    if json_path is not None:
         contents = {**contents, json_path: to_json(results).encode()}
     if contents:
         write_outputs(contents)
     if json_path == STANDARD_OUTPUT:
-        write_json(results, json_path)
         return
     console = terminal()
     show(console)

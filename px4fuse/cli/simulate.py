@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 from click.core import ParameterSource
 
-from px4fuse.cli.inputs import path_option, write_outputs
+from px4fuse.cli.inputs import (
+    path_option,
+)
+from px4fuse.cli.outputs import progress, write_outputs
 from px4fuse.errors import OutputError, SettingsError
+from px4fuse.reading import read_text
 from px4fuse.simulation.mistakes import MISTAKES, as_typed, made, parse
 from px4fuse.simulation.scenario import KINDS, YAWS, Scenario
 
@@ -249,20 +253,11 @@ def _read_secret(secret: str | None, file: Path | None) -> bytes | None:
         return secret_of(secret, "--secret")
     if file is None:
         return None
-    try:
-        with file.open("rb") as stream:
-            content = stream.read(MAX_SECRET_BYTES + 1)
-    except OSError as error:
-        raise SettingsError(f"--secret-file {file}: cannot be read ({error.strerror}).") from error
-    try:
-        text = content.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise SettingsError(
-            f"--secret-file {file}: not UTF-8 text. Give a line of text."
-        ) from error
-    if len(content) > MAX_SECRET_BYTES:
-        raise SettingsError(f"--secret-file {file}: too long. Give a line of text.")
-    return secret_of(text, f"--secret-file {file}")
+    name = f"--secret-file {file}"
+    text = read_text(
+        file, SettingsError, MAX_SECRET_BYTES, name=name, smaller="Give a line of text"
+    )
+    return secret_of(text, name)
 
 
 def _assign(
@@ -281,8 +276,10 @@ def _assign(
     key_file = key_path(folder, answer_path)
     if key_file.exists() and key_file.samefile(roster):
         raise OutputError(f"{key_file}: is the roster. Give another name with --answer.")
-    with _counting(len(students)) as step:
-        made = assign(students, folder, key_file, secret, kind, count, truth, step)
+    with progress() as step:
+        made = assign(
+            students, folder, key_file, secret, kind, count, truth, partial(step, "simulating")
+        )
     for line in _class_summary(made.key):
         click.echo(line)
     click.echo(f"Flights   {folder} ({made.written} written, {made.kept} were there already)")
@@ -306,22 +303,6 @@ def _class_summary(key: AnswerKey) -> list[str]:
         f"Class     {students} student{'s' * (students != 1)}, {key.kind}",
         f"Mistakes  {', '.join(f'{name} {number}' for name, number in sorted(counts.items()))}",
     ]
-
-
-@contextmanager
-def _counting(total: int) -> Iterator[Callable[[], None]]:
-    """A progress bar on a terminal; nothing in a pipe."""
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
-
-    console = Console(stderr=True)
-    if not console.is_terminal:
-        yield lambda: None
-        return
-    columns = (TextColumn("simulating"), BarColumn(), MofNCompleteColumn())
-    with Progress(*columns, console=console, transient=True) as bar:
-        task = bar.add_task("", total=total)
-        yield lambda: bar.advance(task)
 
 
 def _summary(simulation: Simulation) -> list[str]:

@@ -8,13 +8,15 @@ from typing import Any
 import click
 
 from px4fuse.cli.inputs import (
-    STANDARD_OUTPUT,
     analysis_options,
     comparison_request,
     json_option,
+)
+from px4fuse.cli.outputs import (
     progress,
     write_json,
 )
+from px4fuse.writing import STANDARD_OUTPUT
 
 
 @click.command()

@@ -9,8 +9,16 @@ from typing import TYPE_CHECKING
 
 import click
 
-from px4fuse.cli.inputs import STANDARD_OUTPUT, json_option, progress, terminal, write_json
-from px4fuse.errors import LogError, OutputError
+from px4fuse.cli.inputs import json_option, max_size_option
+from px4fuse.cli.outputs import (
+    progress,
+    spare_inputs,
+    terminal,
+    write_json,
+)
+from px4fuse.errors import LogError
+from px4fuse.reading import files_by_sha256, read_whole, shown
+from px4fuse.writing import STANDARD_OUTPUT
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -24,6 +32,7 @@ STYLES = {"verified": "bold green", "cannot verify": "bold yellow"}
 @click.command()
 @click.argument("report", type=click.Path(path_type=Path), metavar="REPORT.pdf")
 @click.argument("logs", type=click.Path(path_type=Path), nargs=-1, metavar="[LOG ...]")
+@max_size_option
 @json_option
 def verify(report: Path, logs: tuple[Path, ...], json_path: Path | None) -> None:
     """Check that REPORT.pdf is what its log gives: every number, and every page.
@@ -39,48 +48,24 @@ def verify(report: Path, logs: tuple[Path, ...], json_path: Path | None) -> None
     """
     from px4fuse.verification.intake import MAX_BYTES, read_report
     from px4fuse.verification.model import Refused
-    from px4fuse.verification.rerun import hashed
     from px4fuse.verification.verification import verify as verify_report
 
-    read = read_report(_content(report, MAX_BYTES), report.name)
+    content = read_whole(report, LogError, MAX_BYTES, smaller="Reports are below 2 MB")
+    read = read_report(content, shown(report))
     if isinstance(read, Refused):
         raise LogError(read.reason)
-    _spare(json_path, report, *logs)
+    if json_path not in (None, STANDARD_OUTPUT):
+        spare_inputs([json_path])
     with progress(json_path == STANDARD_OUTPUT) as step:
         step("hashing the logs")
-        try:
-            files = hashed(logs)
-        except OSError as error:
-            name = Path(error.filename or "the log").name
-            raise LogError(f"{name}: cannot be read ({error.strerror}).") from error
+        files = files_by_sha256(logs)
         if logs and not files:
             raise LogError("there is no file in what was given as LOG.")
         step("running the analysis again" if files else "comparing pages and results")
         verdict = verify_report(read, files)
     if not write_json(_plain(read, verdict), json_path):
-        _print(terminal(), report.name, verdict)
+        _print(terminal(), shown(report), verdict)
     sys.exit(0 if verdict.status == "verified" else 1)
-
-
-def _content(report: Path, limit: int) -> bytes:
-    """Bytes of the report, one more than its reader takes at the most."""
-    try:
-        with report.open("rb") as file:
-            return file.read(limit + 1)
-    except (OSError, ValueError) as error:  # ValueError: a path with a NUL in it
-        reason = getattr(error, "strerror", None) or error
-        raise LogError(f"{report.name}: cannot be read ({reason}).") from error
-
-
-def _spare(json_path: Path | None, *inputs: Path) -> None:
-    if json_path in (None, STANDARD_OUTPUT) or not json_path.exists():
-        return
-    for path in inputs:
-        if path.exists() and path.samefile(json_path):
-            raise OutputError(
-                f"{json_path}: is what this command reads; it was not overwritten. Give another "
-                "name for the output."
-            )
 
 
 def _plain(report: Report, verdict: Verdict) -> dict[str, object]:

@@ -23,6 +23,7 @@ from px4fuse.grading.model import Graded, Item, Submission
 from px4fuse.grading.rubric import Rubric
 from px4fuse.grading.scoring import feedback, gradescope, score, score_refused
 from px4fuse.grading.workers import Failed, run_bounded
+from px4fuse.reading import files_by_sha256, max_log_bytes
 from px4fuse.verification.intake import read_report
 from px4fuse.verification.model import Difference, Refused, Report, Verdict
 from px4fuse.verification.pictures import key_page, picture
@@ -105,7 +106,7 @@ def grade(
         The folder cannot be written.
     """
     found, notes = submissions.collect(paths)
-    known = logs_by_hash(logs)
+    known = files_by_sha256(logs)
     records = output / RECORDS
     context = _context(rubric, key)
     graded: list[Graded | None] = [None] * len(found)
@@ -132,7 +133,9 @@ def grade(
         progress(done, len(found))
 
     run_bounded(
-        partial(grade_one, logs=known, rubric=rubric, key=key),
+        partial(
+            grade_one, logs=known, rubric=rubric, key=key, largest_log_bytes=max_log_bytes.get()
+        ),
         [found[index] for index in todo],
         processes=processes or os.cpu_count() or 1,
         timeout_s=TIMEOUT_S,
@@ -150,25 +153,15 @@ def grade(
     return Outcome(tuple(complete), (*notes, *_left_over(output, complete)), reused, written)
 
 
-def logs_by_hash(paths: Sequence[Path]) -> dict[str, Path]:
-    """Files by their SHA-256; folders are searched."""
-    files = [
-        file
-        for path in paths
-        for file in (sorted(path.rglob("*")) if path.is_dir() else [path])
-        if file.is_file()
-    ]
-    found = {}
-    for file in files:
-        with file.open("rb") as stream:
-            found[hashlib.file_digest(stream, "sha256").hexdigest()] = file
-    return found
-
-
 def grade_one(
-    submission: Submission, logs: Mapping[str, Path], rubric: Rubric, key: AnswerKey | None
+    submission: Submission,
+    logs: Mapping[str, Path],
+    rubric: Rubric,
+    key: AnswerKey | None,
+    largest_log_bytes: int,
 ) -> Graded:
     """Read, verify and score one submission; runs in a process of its own, within bounds."""
+    max_log_bytes.set(largest_log_bytes)
     content = submissions.read(submission)
     if isinstance(content, Refused):
         return _refused(submission, content, "", rubric, key)

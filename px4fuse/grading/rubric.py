@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, Literal, NoReturn, cast
 
 from px4fuse.errors import SettingsError
+from px4fuse.reading import read_text
 
 DEFAULT = "rubric.toml"
 MAX_RUBRIC_BYTES = 1_000_000
@@ -174,21 +175,8 @@ def read_rubric(path: Path | None) -> Rubric:
     if path is None:
         return parse_rubric(rubric_text(), DEFAULT)
     default = read_rubric(None)
-    try:
-        with path.open("rb") as file:
-            content = file.read(MAX_RUBRIC_BYTES + 1)
-    except OSError as error:
-        raise SettingsError(f"{path}: cannot be read ({error.strerror}).") from error
-    if len(content) > MAX_RUBRIC_BYTES:
-        raise SettingsError(
-            f"{path}: more than {MAX_RUBRIC_BYTES} bytes are too many for a rubric; {HELP}."
-        )
-    try:
-        rubric = parse_rubric(content.decode("utf-8-sig"), str(path))
-    except UnicodeDecodeError as error:
-        raise SettingsError(
-            f"{path}: not UTF-8 text (byte {error.start}). Save it as UTF-8."
-        ) from error
+    text = read_text(path, SettingsError, MAX_RUBRIC_BYTES, name=str(path))
+    rubric = parse_rubric(text, str(path))
     return replace(rubric, words={**default.words, **rubric.words})
 
 

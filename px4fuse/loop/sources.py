@@ -10,6 +10,7 @@ from px4fuse.flight import Flight, Unavailable
 from px4fuse.loop.tracks import PARTS, Part, odometry_of, trajectory_of
 from px4fuse.readers import read_log
 from px4fuse.readers.trajectory import read_trajectory
+from px4fuse.reading import read_head, shown
 from px4fuse.trajectory.model import Frame, Trajectory
 
 _HEAD_BYTES = 4096
@@ -42,7 +43,7 @@ def split_part(argument: str) -> tuple[Path, Part | None]:
             return Path(path), part
     if colon and Path(path).is_file():
         raise TrajectoryError(
-            f"{Path(path).name}:{tail}: {tail!r} is no part of a flight; take one of "
+            f"{shown(Path(path))}:{tail}: {tail!r} is no part of a flight; take one of "
             f"{', '.join(PARTS)}."
         )
     return whole, None
@@ -56,15 +57,7 @@ def head_of(path: Path) -> bytes:
     TrajectoryError
         It cannot be read.
     """
-    name = path.name or str(path)
-    if path.is_dir():  # Windows would say "Permission denied"
-        raise TrajectoryError(f"{name}: is a folder. Give a file.")
-    try:
-        with path.open("rb") as file:
-            return file.read(_HEAD_BYTES)
-    except (OSError, ValueError) as error:  # ValueError: a path with a NUL in it
-        reason = getattr(error, "strerror", None) or error
-        raise TrajectoryError(f"{name}: cannot be read ({reason}).") from error
+    return read_head(path, _HEAD_BYTES, TrajectoryError)
 
 
 def is_text(path: Path) -> bool:
@@ -109,15 +102,16 @@ def read_source(
     """
     path, part = split_part(argument)
     if not head_of(path):
-        raise TrajectoryError(f"{path.name}: the file is empty. Copy or export it again.")
+        raise TrajectoryError(f"{shown(path)}: the file is empty. Copy or export it again.")
     if is_g2o(path):
         raise TrajectoryError(
-            f"{path.name}: a pose graph, not a trajectory. Solve it with px4fuse loop {path.name}."
+            f"{shown(path)}: a pose graph, not a trajectory. Solve it with px4fuse loop "
+            f"{shown(path)}."
         )
     if is_text(path):
         if part is not None:
             raise TrajectoryError(
-                f"{path.name}: a trajectory file has no part {part!r}. Leave it out."
+                f"{shown(path)}: a trajectory file has no part {part!r}. Leave it out."
             )
         trajectory = read_trajectory(path)
         return Source(trajectory if frame is None else replace(trajectory, frame=frame), None)

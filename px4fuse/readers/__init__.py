@@ -6,6 +6,7 @@ from pathlib import Path
 
 from px4fuse.errors import LogError, SettingsError
 from px4fuse.flight import Flight
+from px4fuse.reading import read_head, shown
 
 _SNIFF_BYTES = 16
 ULOG_MAGIC = b"\x55\x4c\x6f\x67\x01\x12\x35"
@@ -30,28 +31,24 @@ def read_log(path: str | Path, *, system: int | None = None) -> Flight:
     Raises
     ------
     LogError
-        The file is missing, empty, of an unknown format, or holds no usable data.
+        The file is missing, empty, not a regular file, larger than
+        :data:`px4fuse.reading.max_log_bytes`, of an unknown format, or holds no usable data.
     SettingsError
         ``system`` is not in the recording, or the log is a ULog, which has no systems.
     """
     path = Path(path)
-    try:
-        with path.open("rb") as file:
-            head = file.read(_SNIFF_BYTES)
-    except OSError as error:
-        raise LogError(f"{path.name}: cannot be read ({error.strerror}).") from error
-    if not head:
-        raise LogError(f"{path.name}: the file is empty. Copy it from the vehicle again.")
+    name = shown(path)
+    head = read_head(path, _SNIFF_BYTES, LogError)
     # each reader is imported when its format is met: pyulog and pymavlink cost time
     if head.startswith(ULOG_MAGIC):
         if system is not None:
-            raise SettingsError(f"{path.name}: --system is for MAVLink recordings; this is a ULog.")
+            raise SettingsError(f"{name}: --system is for MAVLink recordings; this is a ULog.")
         from px4fuse.readers.ulog import read_ulog  # noqa: PLC0415
 
         return read_ulog(path)
     if head.startswith(DATAFLASH_MAGIC):
         raise LogError(
-            f"{path.name}: not a PX4 ULog but an ArduPilot DataFlash log, which px4fuse does not "
+            f"{name}: not a PX4 ULog but an ArduPilot DataFlash log, which px4fuse does not "
             "read. Give the .tlog that the ground station wrote."
         )
     from px4fuse.readers.mavlink import read_mavlink  # noqa: PLC0415

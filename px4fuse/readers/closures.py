@@ -6,9 +6,11 @@ from pathlib import Path
 
 from px4fuse.errors import TrajectoryError
 from px4fuse.readers.text_table import text_of
+from px4fuse.reading import read_whole, shown
 from px4fuse.request import GivenClosure
 
 MAX_CLOSURES = 10_000
+MAX_FILE_BYTES = 1_000_000
 _FIELDS = (2, 3)
 
 
@@ -41,12 +43,10 @@ def read_closures(path: Path) -> tuple[GivenClosure, ...]:
     TrajectoryError
         The file cannot be read, holds no closure, or a line is none.
     """
-    try:
-        text = text_of(path.read_bytes())
-    except OSError as error:
-        raise TrajectoryError(f"{path.name}: cannot be read ({error.strerror}).") from error
+    name = shown(path)
+    text = text_of(read_whole(path, TrajectoryError, MAX_FILE_BYTES))
     if text is None:
-        raise TrajectoryError(f"{path.name}: not a text file. Give one T1,T2[,SIGMA] a line.")
+        raise TrajectoryError(f"{name}: not a text file. Give one T1,T2[,SIGMA] a line.")
     found: list[GivenClosure] = []
     for number, line in enumerate(text.split("\n"), start=1):
         content = line.split("#", 1)[0].strip()
@@ -55,10 +55,9 @@ def read_closures(path: Path) -> tuple[GivenClosure, ...]:
         try:
             found.append(parse_closure(content))
         except TrajectoryError as error:
-            raise TrajectoryError(f"{path.name}, line {number}: {error}") from error
+            raise TrajectoryError(f"{name}, line {number}: {error}") from error
     if not 0 < len(found) <= MAX_CLOSURES:
         raise TrajectoryError(
-            f"{path.name}: {len(found)} closures; give 1 to {MAX_CLOSURES}, one T1,T2[,SIGMA] a "
-            "line."
+            f"{name}: {len(found)} closures; give 1 to {MAX_CLOSURES}, one T1,T2[,SIGMA] a line."
         )
     return tuple(found)

@@ -10,8 +10,10 @@ import numpy as np
 from px4fuse.arrays import Array, IntArray
 from px4fuse.errors import TrajectoryError
 from px4fuse.readers.text_table import is_number, quote, text_of
+from px4fuse.reading import read_whole, shown
 from px4fuse.trajectory.graph.pose_graph import FROM_FILE, PoseGraph, initialise
 
+MAX_FILE_BYTES = 500_000_000
 # Tag: dimension, vertices that it names, numbers that follow them
 _TAGS = {
     "VERTEX_SE2": (2, 1, 3),
@@ -27,6 +29,8 @@ _ROUNDING = 1e-9
 # Of a squared norm: what normalising again would not improve
 _UNIT = 1e-15
 _BIGGEST_ID = 2**63
+# In 1/m² or 1/rad². Far beyond any measurement, and far from where squares and inverses overflow
+_LEAST_INFORMATION, _MOST_INFORMATION = 1e-50, 1e50
 
 
 @dataclass
@@ -58,7 +62,12 @@ def read_g2o(path: str | Path) -> PoseGraph:
         no information matrix, or both kinds of pose.
     """
     file = Path(path)
-    return parse_g2o(_text(file), file.name)
+    text = text_of(read_whole(file, TrajectoryError, MAX_FILE_BYTES))
+    if text is None:
+        raise TrajectoryError(
+            f"{shown(file)}: not a text file. Give a g2o file: VERTEX and EDGE lines."
+        )
+    return parse_g2o(text, shown(file))
 
 
 def parse_g2o(text: str, name: str) -> PoseGraph:
@@ -119,19 +128,6 @@ def g2o_text(graph: PoseGraph) -> str:
         for i, j, row in zip(graph.first.tolist(), graph.second.tolist(), numbers, strict=True)
     ]
     return "\n".join(lines) + "\n"
-
-
-def _text(file: Path) -> str:
-    try:
-        content = file.read_bytes()
-    except OSError as error:
-        raise TrajectoryError(f"{file.name}: cannot be read: {error.strerror}.") from error
-    text = text_of(content)
-    if text is None:
-        raise TrajectoryError(
-            f"{file.name}: not a text file. Give a g2o file: VERTEX and EDGE lines."
-        )
-    return text
 
 
 def _split(text: str, name: str) -> tuple[dict[str, _Lines], list[tuple[int, int]]]:
@@ -237,6 +233,17 @@ def _information(name: str, lines: _Lines, numbers: Array, size: int) -> Array:
     row, column = np.triu_indices(size)
     made = np.empty((len(numbers), size, size))
     made[:, row, column] = made[:, column, row] = numbers
+    size_of_entry = np.abs(numbers)
+    beyond = (size_of_entry > _MOST_INFORMATION) | (
+        (row == column) & (size_of_entry > 0.0) & (size_of_entry < _LEAST_INFORMATION)
+    )
+    bad = _first(np.any(beyond, axis=1))
+    if bad is not None:
+        raise TrajectoryError(
+            f"{name}: line {lines.line[bad]}: the information matrix has the entry "
+            f"{numbers[bad][beyond[bad]][0]:.3g}, which cannot be computed with. Give 0 for what "
+            f"the edge does not tell, else {_LEAST_INFORMATION:g} to {_MOST_INFORMATION:g}."
+        )
     try:
         np.linalg.cholesky(made)
     except np.linalg.LinAlgError:

@@ -214,7 +214,7 @@ def _describe(
         for message, count in sorted(recording.dropped.items())
     ]
     return LogInfo(
-        name=frames.name.encode(errors="replace").decode(),
+        name=frames.name,
         sha256=frames.sha256,
         size_bytes=len(frames.content),
         format="MAVLink stream" if frames.received_us is None else "MAVLink tlog",

@@ -25,6 +25,7 @@ from pymavlink.dialects.v20 import all as dialect
 
 from px4fuse.arrays import BoolArray, IntArray
 from px4fuse.errors import LogError
+from px4fuse.reading import read_log_bytes, shown
 
 Integers = NDArray[np.int64]
 
@@ -193,10 +194,7 @@ def read_frames(path: Path) -> Frames:
     LogError
         The file cannot be read or holds no MAVLink.
     """
-    try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise LogError(f"{path.name}: cannot be read ({error.strerror}).") from error
+    name, content = shown(path), read_log_bytes(path)
     start, end = _scan(content)
     stamped = bool(len(start)) and _is_stamped(start, end)
     start, end = _without_overlap(start, end, STAMP if stamped else 0)
@@ -204,7 +202,7 @@ def read_frames(path: Path) -> Frames:
     good = int(np.sum(end - start))
     if good < MIN_GOOD_SHARE * len(content) or not len(start):
         raise LogError(
-            f"{path.name}: not a PX4 ULog, and not a MAVLink recording ({len(start)} frames with a "
+            f"{name}: not a PX4 ULog, and not a MAVLink recording ({len(start)} frames with a "
             f"good checksum in {len(content)} bytes). Give the .ulg from the vehicle, or a .tlog "
             "or raw MAVLink stream."
         )
@@ -222,7 +220,7 @@ def read_frames(path: Path) -> Frames:
     if stamped:
         received, link, bad_stamps = _stamps(source, start, end)
     return Frames(
-        name=path.name,
+        name=name,
         content=content,
         sha256=hashlib.sha256(content).hexdigest(),
         start=start,

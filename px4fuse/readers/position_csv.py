@@ -21,7 +21,6 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.errors import LogError, SettingsError
-from px4fuse.readers.files import read_whole
 from px4fuse.readers.position_names import (
     LENGTH_UNITS,
     TIME_KINDS,
@@ -44,6 +43,7 @@ from px4fuse.readers.position_table import (
 )
 from px4fuse.readers.text_table import UNIX_END_S, UNIX_START_S, at_line, quote, seconds_of
 from px4fuse.readers.ulog_topics import increasing
+from px4fuse.reading import read_whole, shown
 
 SAMPLE_COLUMNS = ["x_m", "y_m", "z_m", "sigma_x_m", "sigma_y_m", "sigma_z_m", "quality"]
 SIGMA_COLUMNS = SAMPLE_COLUMNS[3:6]
@@ -143,15 +143,8 @@ def read_position_csv(
     """
     _check_options(columns, time_unit, length_unit)
     path = Path(path)
-    name = path.name.encode(errors="replace").decode()
-    content = read_whole(
-        path,
-        name,
-        MAX_FILE_BYTES,
-        LogError,
-        give="Give the UWB system's CSV file",
-        again="Copy it again",
-    )
+    name = shown(path)
+    content = read_whole(path, LogError, MAX_FILE_BYTES, again="Copy it again")
     table = find_table(name, plain_text(name, content), columns)
     choice = _choose(table, columns)
     ticks, numbers, notes = _read_rows(table, choice)

@@ -20,7 +20,6 @@ from scipy.spatial.transform import Rotation
 
 from px4fuse.arrays import Array, BoolArray
 from px4fuse.errors import TrajectoryError
-from px4fuse.readers.files import read_whole
 from px4fuse.readers.text_table import (
     UNIX_END_S,
     UNIX_START_S,
@@ -30,6 +29,7 @@ from px4fuse.readers.text_table import (
     seconds_of,
     text_of,
 )
+from px4fuse.reading import read_whole, shown
 from px4fuse.trajectory.model import MIN_POSES, Frame, Kind, Trajectory
 
 MAX_FILE_BYTES = 500_000_000
@@ -104,15 +104,8 @@ def read_trajectory(path: str | Path) -> Trajectory:
         back, numbers that are not finite, or quaternions that are far from unit length.
     """
     path = Path(path)
-    name = path.name.encode(errors="replace").decode()
-    content = read_whole(
-        path,
-        name,
-        MAX_FILE_BYTES,
-        TrajectoryError,
-        give="Give a trajectory file",
-        again="Export it again",
-    )
+    name = shown(path)
+    content = read_whole(path, TrajectoryError, MAX_FILE_BYTES, again="Export it again")
     lines = _text(name, content).split("\n")
     comments = "\n".join(line for line in lines if line.lstrip().startswith("#"))
     file = _File(name, lines, comments)

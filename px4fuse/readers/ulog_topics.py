@@ -26,6 +26,7 @@ from px4fuse.arrays import IntArray
 from px4fuse.errors import LogError
 from px4fuse.flight import Dropout, LogInfo
 from px4fuse.readers.px4_topics import IMU, PARAMETERS, Layout, topics
+from px4fuse.reading import read_log_bytes, shown
 
 _MICROSECOND = 1e-6
 # A measurement time stamp further than this from its publication is not on the boot clock
@@ -194,10 +195,7 @@ def read_topics(path: Path) -> Topics:
     LogError
         The file cannot be read, is no ULog, or holds no data with usable time stamps.
     """
-    try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise LogError(f"{path.name}: cannot be read ({error.strerror}).") from error
+    name, content = shown(path), read_log_bytes(path)
     chatter = io.StringIO()
     try:
         with contextlib.redirect_stdout(chatter):  # pyulog prints what it stumbles over
@@ -207,21 +205,21 @@ def read_topics(path: Path) -> Topics:
             placed = tables or _tables(ULog(_handle(content)))
     except _PARSE_ERRORS as error:
         raise LogError(
-            f"{path.name}: not a readable ULog ({str(error) or type(error).__name__}). "
+            f"{name}: not a readable ULog ({str(error) or type(error).__name__}). "
             "Copy the .ulg from the vehicle again."
         ) from error
     notes = _corruption_notes(ulog, chatter.getvalue())
     if not placed:
         raise LogError(
-            f"{path.name}: a ULog without any data (no IMU, no position, no EKF2). If it is cut "
+            f"{name}: a ULog without any data (no IMU, no position, no EKF2). If it is cut "
             "short, copy it again; else record with SDLOG_PROFILE 129."
         )
     if not tables:
         names = sorted({topic for topic, _ in placed})
         notes += (f"none of its topics is one that px4fuse uses (it holds {_listed(names)})",)
-    zero_us, end_us = _data_span(placed, path.name)
+    zero_us, end_us = _data_span(placed, name)
     log = LogInfo(
-        name=path.name.encode(errors="replace").decode(),
+        name=name,
         sha256=hashlib.sha256(content).hexdigest(),
         size_bytes=len(content),
         format="ULog",

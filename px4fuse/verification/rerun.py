@@ -7,12 +7,11 @@ nothing in it names an output.
 
 from __future__ import annotations
 
-import hashlib
 import os
 import re
 import shutil
 import tempfile
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from dataclasses import replace as replaced
 from functools import partial
@@ -54,24 +53,6 @@ class Recomputed:
 
 class _RefusedError(Exception):
     """The analysis cannot be repeated; the text says why."""
-
-
-def hashed(logs: Iterable[Path]) -> dict[str, Path]:
-    """Files by their SHA-256; of a folder all files in it.
-
-    Raises
-    ------
-    OSError
-        A file cannot be read.
-    """
-    found: dict[str, Path] = {}
-    for given in logs:
-        files = sorted(given.rglob("*")) if given.is_dir() else [given]
-        for file in files:
-            if file.is_file() or file is given:
-                with file.open("rb") as content:
-                    found.setdefault(hashlib.file_digest(content, "sha256").hexdigest(), file)
-    return found
 
 
 def log_sha256(results: Mapping[str, Any]) -> str:

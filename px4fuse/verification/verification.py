@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from px4fuse.errors import Px4FuseError
+from px4fuse.reading import files_by_sha256
 from px4fuse.results.build import SCHEMA_NAME, SCHEMA_VERSION
 from px4fuse.verification import rerun
 from px4fuse.verification.agreement import disagreements
@@ -113,7 +114,7 @@ def verify(
         return Verdict("cannot verify", (other_version,), with_log=False)
     if not logs:
         return _without_log(report)
-    files = logs if isinstance(logs, Mapping) else rerun.hashed(logs)
+    files = logs if isinstance(logs, Mapping) else files_by_sha256(logs)
     sha256 = rerun.log_sha256(report.results)
     if sha256 not in files:
         asked = one_line(sha256, 64) or "none"

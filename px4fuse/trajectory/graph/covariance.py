@@ -18,6 +18,9 @@ from px4fuse.trajectory.graph.model import (
     odometry_steps,
 )
 
+# Smallest eigenvalue of a correlation matrix below which rounding is larger than what it says
+_SINGULAR = 1e-13
+
 
 @dataclass(frozen=True)
 class GateResult:
@@ -108,6 +111,13 @@ def _tested(
         )
     seen = directions.T @ residual
     spread = directions.T @ covariance @ directions + np.diag(variance)
+    sigma = np.sqrt(np.diag(spread))
+    if np.linalg.eigvalsh(spread / np.outer(sigma, sigma))[0] <= _SINGULAR:
+        raise TrajectoryError(
+            f"Odometry between vertices {graph.ids[graph.first[edge]]} and "
+            f"{graph.ids[graph.second[edge]]} is too uncertain to test the closure with the digits "
+            "that numbers have. Give its edges more information."
+        )
     d2 = float(seen @ np.linalg.solve(spread, seen))
     p = float(chi2.sf(d2, freedom))
     return GateResult(edge, d2, freedom, p, p >= alpha)

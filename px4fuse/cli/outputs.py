@@ -1,0 +1,153 @@
+"""What commands write and show: files, standard output, and how far they are."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+import click
+
+from px4fuse.errors import OutputError
+from px4fuse.writing import STANDARD_OUTPUT, write_all
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+# Parameters that name files to read; some name a part of a log after a colon
+INPUTS = (
+    "log", "logs", "report", "mavlink", "position", "notes", "source", "estimate", "reference",
+    "closures",
+)  # fmt: skip
+# Under it a run keeps which files it has written, for what is said where it then ends early
+WRITTEN = "px4fuse.written"
+
+
+class Interrupted(Exception):  # noqa: N818 - no error of the program
+    """The run was ended from outside.
+
+    Parameters
+    ----------
+    stopped : KeyboardInterrupt
+        With the number of the signal, where it was not Ctrl-C.
+    left : str
+        What the run leaves.
+    """
+
+    def __init__(self, stopped: KeyboardInterrupt, left: str) -> None:
+        super().__init__(f"interrupted, {left}")
+        self.exit_code = 128 + (stopped.args[0] if stopped.args else signal.SIGINT)
+
+
+class Step(Protocol):
+    """Says what is being done, and how much of it is done where that can be counted."""
+
+    def __call__(self, what: str, done: int = 0, of: int | None = None) -> None:
+        """Show it."""
+
+
+@contextmanager
+def progress(quiet: bool = False) -> Iterator[Step]:
+    """One line on a terminal about what is being done; nothing in a pipe."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
+
+    def silent(what: str, done: int = 0, of: int | None = None) -> None:
+        del what, done, of
+
+    console = Console(stderr=True)
+    if not console.is_terminal or quiet:
+        yield silent
+        return
+    columns = (
+        SpinnerColumn(), TextColumn("{task.description}", markup=False), BarColumn(),
+        TextColumn("{task.fields[count]}"), TimeRemainingColumn(),
+    )  # fmt: skip
+    with Progress(*columns, console=console, transient=True) as bar:
+        task = bar.add_task("starting", total=None, count="")
+
+        def show(what: str, done: int = 0, of: int | None = None) -> None:
+            count = "" if of is None else f"{done}/{of}"
+            bar.update(task, description=what, completed=done, total=of, count=count)
+
+        yield show
+
+
+def report_paths(output: Path, json_path: Path | None) -> tuple[Path, Path]:
+    """Where a report and its results go: the results beside it, unless --json names a file.
+
+    Raises
+    ------
+    OutputError
+        The report is no PDF, both are the same file, or one of them is read by this command.
+    """
+    if output.suffix.lower() != ".pdf":
+        raise OutputError(f"{output}: the report is a PDF. Give a name that ends in .pdf with -o.")
+    beside = output.with_suffix(".json") if json_path in (None, STANDARD_OUTPUT) else json_path
+    if beside.resolve() == output.resolve():
+        raise OutputError(f"{beside}: --json and -o name the same file. Give two names.")
+    spare_inputs([output, beside])
+    return output, beside
+
+
+def write_json(results: dict[str, Any], json_path: Path | None) -> bool:
+    """Write results where --json says; true where they have standard output to themselves."""
+    from px4fuse.results.build import to_json
+
+    if json_path is not None:
+        write_outputs({json_path: to_json(results).encode()})
+    return json_path == STANDARD_OUTPUT
+
+
+def write_outputs(contents: Mapping[Path, bytes]) -> None:
+    """Write results, all or none, and never over a file that this run has read.
+
+    Raises
+    ------
+    OutputError
+        A target is one of the inputs, or cannot be written.
+    """
+    spare_inputs(contents)
+    written: list[Path] = click.get_current_context().meta.setdefault(WRITTEN, [])
+    write_all(contents, written.append)
+
+
+def written_so_far(context: click.Context) -> str:
+    """Which files this run has put in their places, for a run that ends early."""
+    written: list[Path] = context.meta.get(WRITTEN, [])
+    return f"{', '.join(map(str, written))} written before." if written else "nothing was written."
+
+
+def spare_inputs(targets: Iterable[Path]) -> None:
+    """Refuse to write over a file that this command reads.
+
+    Raises
+    ------
+    OutputError
+        A target is one of the inputs.
+    """
+    params = click.get_current_context().params
+    given = [params[name] for name in INPUTS if params.get(name) is not None]
+    several = [one if isinstance(one, tuple) else (one,) for one in given]
+    paths = [path for some in several for path in some]
+    read = [path if path.exists() else Path(str(path).rpartition(":")[0]) for path in paths]
+    for target in targets:
+        for source in read:
+            if target.exists() and source.exists() and target.samefile(source):
+                raise OutputError(
+                    f"{target}: is what this command reads; it was not overwritten. Give another "
+                    "name for the output."
+                )
+
+
+def terminal() -> Console:
+    """Standard output for tables; a reader that has gone, as with ``| head``, is no error."""
+    from rich.console import Console
+
+    class PipeConsole(Console):
+        def on_broken_pipe(self) -> None:
+            raise BrokenPipeError
+
+    return PipeConsole(highlight=False)

@@ -1,0 +1,211 @@
+"""Inputs: regular files within a limit, and one line for everything else."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import socket
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from conftest import REPOSITORY
+from test_bad_logs import patience
+from test_cli import run_main
+
+from px4fuse.errors import LogError, Px4FuseError
+from px4fuse.reading import max_log_bytes, read_text, read_whole, shown
+
+SAMPLES = REPOSITORY / "sample_logs"
+ENDLESS_S = 60.0  # what is refused is refused at once; a pipe that is read never ends
+posix = pytest.mark.skipif(os.name == "nt", reason="devices, pipes and sockets are those of POSIX")
+
+
+@pytest.fixture(scope="module")
+def desk(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """Files of every kind, and things that are no regular files; they are only read."""
+    folder = tmp_path_factory.mktemp("desk")
+    shutil.copy(SAMPLES / "aisle_uwb.ulg", folder / "l.ulg")
+    shutil.copy(SAMPLES / "loop_slam.tum", folder / "s.tum")
+    shutil.copy(REPOSITORY / "reports" / "aisle_uwb.pdf", folder / "r.pdf")
+    (folder / "roster.csv").write_text("id,name\n1,A\n")
+    (folder / "folder").mkdir()
+    for name in ("sparse", "sparse.g2o"):
+        with (folder / name).open("wb") as file:
+            file.write(
+                b"EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\n" * 200 if "." in name else b"ULog\x01\x12\x35"
+            )
+            file.truncate(10_000_000_000)
+    if os.name == "nt":
+        yield folder
+        return
+    os.mkfifo(folder / "pipe")
+    (folder / "zero").symlink_to("/dev/zero")
+    with socket.socket(socket.AF_UNIX) as listening:
+        here = Path.cwd()
+        os.chdir(folder)  # the name of a socket may not be long
+        listening.bind("socket")
+        os.chdir(here)
+        yield folder
+
+
+# What reads a file: the command with {} for the file
+READERS = {
+    "info": "info {}",
+    "compare": "compare {} -o out/c.pdf",
+    "tune": "tune {}",
+    "sync": "sync {}",
+    "extract": "extract {} -o out",
+    "loop": "loop {}",
+    "part": "loop {}:vio",
+    "evaluate": "evaluate {} s.tum",
+    "to evaluate against": "evaluate s.tum {}",
+    "verify": "verify {}",
+    "log to verify with": "verify r.pdf {}",
+    "mavlink": "info l.ulg --mavlink {}",
+    "position": "info l.ulg --position {}",
+    "notes": "compare l.ulg --notes {} -o out/c.pdf",
+    "closures": "loop s.tum --closures {}",
+    "reference": "loop s.tum --reference {}",
+    "roster": "simulate --assignment {} -o out",
+    "secret": "simulate --assignment roster.csv --secret-file {} -o out",
+    "rubric": "grade r.pdf --rubric {} -o out",
+    "answer key": "grade r.pdf --key {} -o out",
+    "log to grade with": "grade r.pdf --logs {} -o out",
+}
+# A folder of logs is welcome there
+OF_FOLDERS = ("log to verify with", "log to grade with")
+
+
+def refusal(monkeypatch, capsys, desk: Path, command: str) -> str:
+    """What a command says on one line, soon and without writing anything."""
+    monkeypatch.chdir(desk)
+    before = sorted(desk.iterdir())
+    with patience(ENDLESS_S):
+        code, out, err = run_main(monkeypatch, capsys, *command.split(" "))
+    assert (code, out) == (2, "")
+    assert err.startswith("px4fuse: ")
+    assert len(err.splitlines()) == 1
+    assert sorted(desk.iterdir()) == before
+    return err
+
+
+@posix
+@pytest.mark.parametrize("what", ["zero", "pipe", "socket"])
+@pytest.mark.parametrize("command", READERS.values(), ids=READERS)
+def test_what_is_no_regular_file_is_refused(desk, monkeypatch, capsys, command, what) -> None:
+    err = refusal(monkeypatch, capsys, desk, command.format(what))
+    assert f"{what}: not a regular file" in err
+
+
+@pytest.mark.parametrize("name", READERS)
+def test_a_folder_is_refused(desk, monkeypatch, capsys, name) -> None:
+    if name in OF_FOLDERS:
+        return
+    err = refusal(monkeypatch, capsys, desk, READERS[name].format("folder"))
+    assert "folder: is a folder" in err
+
+
+@pytest.mark.parametrize("command", READERS.values(), ids=READERS)
+def test_a_file_of_ten_gigabytes_is_refused_at_once(desk, monkeypatch, capsys, command) -> None:
+    err = refusal(monkeypatch, capsys, desk, command.format("sparse"))
+    assert "sparse: 10,000 MB, more than the limit of " in err
+
+
+def test_a_graph_of_ten_gigabytes_is_refused_at_once(desk, monkeypatch, capsys) -> None:
+    err = refusal(monkeypatch, capsys, desk, "loop sparse.g2o")
+    assert "sparse.g2o: 10,000 MB, more than the limit of 500 MB" in err
+
+
+@posix
+def test_special_and_huge_files_in_a_folder_of_logs_are_passed_over(
+    desk, monkeypatch, capsys
+) -> None:
+    monkeypatch.chdir(desk)
+    with patience(ENDLESS_S):
+        code, out, err = run_main(monkeypatch, capsys, "verify", "r.pdf", ".")
+    assert (code, err) == (0, "")
+    assert "r.pdf: verified" in out  # by the log beside them
+
+
+# --- the limit, and its option ---
+
+
+def test_the_limit_of_a_log_can_be_set_for_one_command(desk, monkeypatch, capsys) -> None:
+    monkeypatch.chdir(desk)
+    assert 1_000_000 < (desk / "l.ulg").stat().st_size < 10_000_000
+    before = max_log_bytes.get()
+    err = refusal(monkeypatch, capsys, desk, "info l.ulg --max-size 1")
+    assert "MB, more than the limit of 1.00 MB" in err
+    assert "--max-size MB" in err
+    assert max_log_bytes.get() == before
+    assert run_main(monkeypatch, capsys, "info", "l.ulg", "--max-size", "10")[0] == 0
+
+
+@pytest.mark.parametrize(
+    "command",
+    ["tune {}", "sync {}", "loop {}", "evaluate s.tum {}", "verify r.pdf {}",
+     "grade r.pdf --logs {} -o out", "compare {} -o out/c.pdf", "extract {} -o out"],
+)  # fmt: skip
+def test_every_command_that_reads_logs_has_the_option(desk, monkeypatch, capsys, command) -> None:
+    err = refusal(monkeypatch, capsys, desk, command.format("l.ulg") + " --max-size 1")
+    assert "more than the limit of 1.00 MB" in err
+
+
+def test_the_limit_is_the_last_byte_that_is_read(tmp_path) -> None:
+    path = tmp_path / "x"
+    path.write_bytes(b"x" * 100)
+    assert len(read_whole(path, LogError, 100)) == 100
+    with pytest.raises(LogError, match=r"x: 0\.00 MB, more than the limit"):
+        read_whole(path, LogError, 99)
+
+
+@pytest.mark.skipif(not Path("/proc/kallsyms").exists(), reason="the file is Linux's")
+def test_a_file_that_says_it_is_empty_is_read_no_further_than_the_limit() -> None:
+    path = Path("/proc/kallsyms")
+    assert path.stat().st_size == 0
+    with pytest.raises(LogError, match="more than the limit"):
+        read_whole(path, LogError, 1000)
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
+def test_text_as_every_system_writes_it(tmp_path, encoding) -> None:
+    path = tmp_path / "t"
+    path.write_bytes("σ = 1\n".encode(encoding))
+    assert read_text(path, LogError, 100) == "σ = 1\n"
+    path.write_bytes(b"ab\xff")
+    with pytest.raises(LogError, match=r"t: not a text file in UTF-8 \(byte 2\)"):
+        read_text(path, LogError, 100)
+
+
+# --- names ---
+
+
+@posix
+@pytest.mark.parametrize("command", READERS.values(), ids=READERS)
+def test_a_line_feed_in_a_name_makes_no_second_line(
+    tmp_path, desk, monkeypatch, capsys, command
+) -> None:
+    name = "a\nb\x1b[2J"
+    (tmp_path / name).write_bytes(b"\xff\0 junk")
+    for other in ("l.ulg", "s.tum", "r.pdf", "roster.csv"):
+        (tmp_path / other).symlink_to(desk / other)
+    if command == READERS["log to verify with"] or command == READERS["log to grade with"]:
+        (tmp_path / name).unlink()
+    err = refusal(monkeypatch, capsys, tmp_path, command.format(name))
+    assert "\x1b" not in err
+    assert "a b?[2J" in err
+
+
+@pytest.mark.parametrize("name", READERS)
+@pytest.mark.parametrize("path", [".", "..", "/"])
+def test_a_path_without_a_name_is_shown(desk, monkeypatch, capsys, name, path) -> None:
+    if name in OF_FOLDERS:
+        return
+    err = refusal(monkeypatch, capsys, desk, READERS[name].format(path))
+    assert f"{path}: is a folder. Give a file." in err
+
+
+def test_errors_are_on_one_line() -> None:
+    assert str(Px4FuseError("a\r\nb c\td\x00\ud800")) == "a  b c d??"
+    assert shown(Path("logs") / "σ.ulg") == "σ.ulg"

@@ -1,0 +1,271 @@
+"""Outputs: all or none, nothing replaced that is no regular file, and what is there is said."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+from conftest import REPOSITORY
+from test_cli import run_main
+from ulog_tools import make_log
+
+from px4fuse.errors import OutputError
+from px4fuse.writing import STANDARD_OUTPUT, write_all
+
+SECONDS = 20.0
+SLAM = REPOSITORY / "sample_logs" / "loop_slam.tum"
+posix = pytest.mark.skipif(os.name == "nt", reason="devices, pipes and signals are those of POSIX")
+full = pytest.mark.skipif(not Path("/dev/full").exists(), reason="the device is Linux's")
+
+
+@pytest.fixture
+def desk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with a short log and a trajectory; commands run there."""
+    make_log("v1.16", SECONDS).write(tmp_path / "l.ulg")
+    shutil.copy(SLAM, tmp_path / "s.tum")
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def start(desk: Path, *arguments: str, **kwargs) -> subprocess.Popen[bytes]:
+    command = [sys.executable, "-m", "px4fuse", *arguments]
+    return subprocess.Popen(command, cwd=desk, stderr=subprocess.PIPE, **kwargs)
+
+
+LOOP = ("loop", "s.tum", "--tum", "c.tum")
+
+# --- what is no regular file ---
+
+
+@posix
+def test_a_named_pipe_is_written_to_and_stays(desk, monkeypatch, capsys) -> None:
+    pipe = desk / "pipe"
+    os.mkfifo(pipe)
+    heard = []
+    reader = threading.Thread(target=lambda: heard.append(pipe.read_bytes()), daemon=True)
+    reader.start()
+    assert run_main(monkeypatch, capsys, "info", "l.ulg", "--json", "pipe")[0] == 0
+    reader.join(10.0)
+    assert pipe.is_fifo()
+    assert json.loads(heard[0])["log"]["name"] == "l.ulg"
+    assert names(desk) == ["l.ulg", "pipe", "s.tum"]
+
+
+@posix
+def test_a_device_is_written_to_and_stays(desk) -> None:
+    """By a link, so that a failure replaces the link and not the machine's device."""
+    link = desk / "null"
+    link.symlink_to(os.devnull)
+    write_all({link: b"gone"})
+    assert link.is_symlink()
+    assert Path(os.devnull).is_char_device()
+
+
+@posix
+def test_a_socket_is_refused_and_stays(desk, monkeypatch, capsys) -> None:
+    import socket
+
+    with socket.socket(socket.AF_UNIX) as listening:
+        listening.bind("socket")
+        code, _, err = run_main(monkeypatch, capsys, "info", "l.ulg", "--json", "socket")
+        assert code == 2
+        assert err.startswith("px4fuse: socket: cannot be written")
+        assert (desk / "socket").is_socket()
+
+
+@posix
+def test_symbolic_links_stay_and_lead_to_the_new_content(tmp_path) -> None:
+    (tmp_path / "old").write_bytes(b"old")
+    for link, target in (("a", "old"), ("b", "new"), ("c", "a")):
+        (tmp_path / link).symlink_to(target)
+        write_all({tmp_path / link: link.encode()})
+        assert (tmp_path / link).is_symlink()
+        assert (tmp_path / target).read_bytes() == link.encode()
+    assert names(tmp_path) == ["a", "b", "c", "new", "old"]
+    (tmp_path / "round").symlink_to("round")
+    with pytest.raises(OutputError, match="round: cannot be written"):
+        write_all({tmp_path / "round": b""})
+
+
+@posix
+def test_standard_output_in_a_file_keeps_what_is_in_it(desk) -> None:
+    """By a link, so that a failure replaces the link and not the machine's /dev/stdout."""
+    out = desk / "out.txt"
+    out.write_bytes(b"before\n")
+    (desk / "stdout").symlink_to("/dev/stdout")
+    with out.open("ab") as stream:
+        process = start(desk, "info", "l.ulg", "--json", "stdout", stdout=stream)
+        assert process.communicate()[1] == b""
+    text = out.read_bytes()
+    assert text.startswith(b"before\n{")
+    assert b"What px4fuse can do with it" in text  # the table follows
+
+
+# --- all or none ---
+
+
+def test_a_name_as_long_as_can_be_is_written(tmp_path) -> None:
+    path = tmp_path / ("n" * 250 + ".json")
+    write_all({path: b"x"})
+    assert path.read_bytes() == b"x"
+
+
+def refuse_renames_to(target: Path, monkeypatch: pytest.MonkeyPatch, count: int = 1) -> None:
+    """Let the first renames to a path fail, as those over a file that is open on Windows."""
+    real, left = Path.replace, [count]
+
+    def replace(self: Path, to: Path) -> Path:
+        if Path(to) == target and left[0]:
+            left[0] -= 1
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+        return real(self, to)
+
+    monkeypatch.setattr(Path, "replace", replace)
+
+
+@pytest.mark.parametrize("there", [True, False])
+def test_a_rename_that_fails_half_way_puts_back_what_was_there(
+    tmp_path, monkeypatch, there
+) -> None:
+    paths = [tmp_path / name for name in "abc"]
+    if there:
+        for path in paths:
+            path.write_bytes(b"old")
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    refuse_renames_to(paths[1], monkeypatch)
+    told: list[Path] = []
+    with pytest.raises(OutputError, match=r"b: cannot be written .*No file was written\.$"):
+        write_all(dict.fromkeys(paths, b"new"), told.append)
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+    assert told == []
+
+
+def test_what_cannot_be_put_back_is_said(tmp_path, monkeypatch) -> None:
+    a, b = tmp_path / "a", tmp_path / "b"
+    for path in (a, b, tmp_path / "c"):
+        path.write_bytes(b"old")
+    refuse_renames_to(b, monkeypatch, 2)
+    with pytest.raises(OutputError) as refused:
+        write_all({a: b"new", b: b"new", tmp_path / "c": b"new"})
+    assert a.read_bytes() == b"old"
+    kept = str(refused.value).rpartition("what it held is in ")[2].rstrip(".")
+    assert f"{b} could not be put back" in str(refused.value)
+    assert (tmp_path / f".{kept.lstrip('.')}").read_bytes() == b"old"
+
+
+@posix
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
+def test_a_signal_between_two_renames_waits_for_the_last_one(tmp_path, monkeypatch, name) -> None:
+    number, real = getattr(signal, name), Path.replace
+
+    def replace(self: Path, to: Path) -> Path:
+        made = real(self, to)
+        signal.raise_signal(number)
+        return made
+
+    def stop(number: int, _: object) -> None:
+        raise KeyboardInterrupt(number)
+
+    before = signal.signal(number, stop)
+    monkeypatch.setattr(Path, "replace", replace)
+    told: list[Path] = []
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            write_all({tmp_path / "a": b"new", tmp_path / "b": b"new"}, told.append)
+    finally:
+        signal.signal(number, before)
+    assert names(tmp_path) == ["a", "b"]
+    assert told == [tmp_path / "a", tmp_path / "b"]
+
+
+# --- ended from outside ---
+
+
+@posix
+@pytest.mark.parametrize(("name", "code"), [("SIGINT", 130), ("SIGTERM", 143), ("SIGHUP", 129)])
+def test_who_is_stopped_while_writing_leaves_nothing_and_says_so_in_one_line(
+    desk, name, code
+) -> None:
+    os.mkfifo(desk / "pipe")  # nobody reads it: the run waits with its other file half done
+    process = start(desk, *LOOP, "--json", "pipe", stdout=subprocess.PIPE)
+    deadline = time.monotonic() + 60.0
+    while len(names(desk)) < 4:
+        assert time.monotonic() < deadline
+        assert process.poll() is None
+        time.sleep(0.05)
+    process.send_signal(getattr(signal, name))
+    out, err = process.communicate(timeout=30.0)
+    assert (process.returncode, out) == (code, b"")
+    assert err == b"px4fuse: interrupted, nothing was written.\n"
+    assert names(desk) == ["l.ulg", "pipe", "s.tum"]
+
+
+def test_who_is_stopped_after_writing_says_what_is_there(desk, monkeypatch, capsys) -> None:
+    from px4fuse.report import loop_terminal
+
+    def stopped(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(loop_terminal, "print_loop", stopped)
+    code, _, err = run_main(monkeypatch, capsys, *LOOP, "--json", "c.json")
+    assert (code, err) == (130, "px4fuse: interrupted, c.tum, c.json written before.\n")
+    assert names(desk) == ["c.json", "c.tum", "l.ulg", "s.tum"]
+
+
+# --- standard output that takes nothing ---
+
+
+@full
+def test_results_that_cannot_be_printed_leave_no_files(desk) -> None:
+    with Path("/dev/full").open("wb") as device:
+        process = start(desk, "compare", "l.ulg", "--axis", "north", "-o", "c.pdf", "--json", "-",
+                        stdout=device)  # fmt: skip
+        err = process.communicate()[1].decode()
+    assert process.returncode == 2
+    assert err.startswith("px4fuse: standard output: cannot be written (No space left on device)")
+    assert len(err.splitlines()) == 1
+    assert names(desk) == ["l.ulg", "s.tum"]
+
+
+@full
+def test_a_summary_that_cannot_be_printed_says_what_is_written(desk) -> None:
+    with Path("/dev/full").open("wb") as device:
+        process = start(desk, *LOOP, "--json", "c.json", stdout=device)
+        err = process.communicate()[1].decode()
+    assert process.returncode == 2
+    assert err == (
+        "px4fuse: standard output: cannot be written (No space left on device), c.tum, c.json "
+        "written before.\n"
+    )
+    assert names(desk) == ["c.json", "c.tum", "l.ulg", "s.tum"]
+
+
+def test_a_reader_of_the_results_that_leaves_is_no_reason_to_keep_the_files(desk) -> None:
+    process = start(desk, *LOOP, "--json", "-", stdout=subprocess.PIPE)
+    process.stdout.close()
+    assert process.stderr.read() == b""
+    process.stderr.close()
+    assert process.wait() == 0
+    assert names(desk) == ["c.tum", "l.ulg", "s.tum"]
+
+
+def test_results_are_printed_before_files_are_in_their_places(tmp_path, capsysbinary) -> None:
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(OutputError):
+        write_all({STANDARD_OUTPUT: b"{}", tmp_path / "folder": b""})
+    assert capsysbinary.readouterr().out == b""
+    write_all({tmp_path / "a": b"", STANDARD_OUTPUT: b"{}"})
+    assert capsysbinary.readouterr().out == b"{}"
