@@ -23,7 +23,9 @@ def test_nuls_of_a_power_cut_are_no_text() -> None:
     assert text_of(TEXT.encode() + bytes(512)) == TEXT
 
 
-@pytest.mark.parametrize("content", [b"ULog\x01\x12", b"1,2\n\0\n1,2\n", bytes(range(256))])
+@pytest.mark.parametrize(
+    "content", [b"ULog\x01\x12", b"1,2\n" * 50_000 + b"\0\n1,2\n", bytes(range(256))]
+)
 def test_binary_files_have_no_text(content: bytes) -> None:
     assert text_of(content) is None
 

@@ -165,7 +165,7 @@ def recursion(
     )
     if not q.ndim:  # in plain floats: fifty times as fast as arrays of a single element
         q, r = q.item(), r.item()
-    p, v = legs.initial.position_m + 0.0 * q, legs.initial.velocity_m_s + 0.0 * q
+    p, v = legs.initial.position_m, legs.initial.velocity_m_s + 0.0 * q  # of the grid's shape
     covariance: Symmetric[Any] = INITIAL_COVARIANCE
     for dt, dp, dv, unit, fixed, z, skipped in zip(
         legs.length_s.tolist(),

@@ -33,7 +33,6 @@ from px4fuse.readers.ulog_topics import (
     read_topics,
 )
 
-MAGIC = b"\x55\x4c\x6f\x67\x01\x12\x35"
 # A receiver's UTC outside these is none: PX4's own GPS_EPOCH_SECS (gps_helper.h), and 2100
 UTC_RANGE_S = (1_234_567_890.0, 4_102_444_800.0)
 
