@@ -1,0 +1,275 @@
+"""The recursion of the model: several settings of EKF2 through one stretch at once.
+
+Sources: PX4-Autopilot ``EKF/covariance.cpp`` (limits of the biases), ``EKF/position_fusion.cpp``
+and ``EKF/vel_pos_fusion.cpp`` (gate, fusion), ``ev_pos_control.cpp`` (noise, resets).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from px4fuse.ekf2.inputs import Inputs, Stretch
+from px4fuse.ekf2.legs import (
+    ACCELEROMETER_BIAS,
+    FUSE,
+    GYRO_BIAS,
+    START,
+    STATES,
+    THETA,
+    Legs,
+)
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+# Height and heading come from sensors that logs hold thinly, so that EKF2's own published values
+# stand in for them. Only their size matters little to the horizontal axes: 0.05 m at 10 Hz and
+# 0.03 rad at 2 Hz, as densities (m²·s, rad²·s)
+HEIGHT_NOISE = 0.05**2 * 0.1
+HEADING_NOISE = 0.03**2 * 0.5
+# Variance by which a sample is not taken at all
+NOT_TAKEN = 1e9
+MIN_POSITION_SD_M = 0.01  # ev_pos_control.cpp
+MIN_GATE = 1.0
+# covariance.cpp: at most 0.1 g of bias, at most a ratio of 100 between the axes
+MAX_BIAS_SD = 0.1 * 9.80665
+BIAS_RATIO = 0.01
+HEADING, NORTH, EAST, DOWN = 2, 6, 7, 8
+MEASURED = np.array([HEADING, DOWN, NORTH, EAST])
+HORIZONTAL = np.array([NORTH, EAST])
+BIASES = np.arange(9, 15)
+FORCE_BIAS = np.arange(12, 15)
+EYE = np.eye(4)
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One filter to run.
+
+    Attributes
+    ----------
+    settings : dict
+        All of the model's parameters, by PX4 name.
+    biases : bool
+        Whether the accelerometer's bias is a state; else there is none.
+    attitude : bool
+        Whether attitude and gyro bias are states; else the published attitude holds.
+    gated : bool
+        Whether samples are rejected and positions reset.
+    timed : bool
+        Whether samples count at EKF2's times; else at their stamps.
+    """
+
+    settings: dict[str, float]
+    biases: bool = True
+    attitude: bool = True
+    gated: bool = True
+    timed: bool = True
+
+    def delay_s(self, step_s: float) -> float:
+        """What is taken off the stamps, half a step besides."""
+        return self.settings["EKF2_EV_DELAY"] * 1e-3 if self.timed else -0.5 * step_s
+
+
+@dataclass(frozen=True)
+class Run:
+    """What S variants did in one stretch of E events.
+
+    Attributes
+    ----------
+    innovation_m : ndarray, shape (E, S, 2)
+        Measurement minus state, north and east; NaN where the event has no sample.
+    variance_m2 : ndarray, shape (E, S, 2)
+        S = P + R.
+    rejected, fused, reset : ndarray of bool, shape (E, S)
+    state : ndarray, shape (E + 1, S, 15)
+        At the start and after each event.
+    position_variance_m2, velocity_variance_m2_s2 : ndarray, shape (E + 1, S, 2)
+        After each event.
+    """
+
+    innovation_m: Array
+    variance_m2: Array
+    rejected: Flags
+    fused: Flags
+    reset: Flags
+    state: Array
+    position_variance_m2: Array
+    velocity_variance_m2_s2: Array
+
+
+def run(
+    inputs: Inputs,
+    stretch: Stretch,
+    legs: Sequence[Legs],
+    which: NDArray[np.intp],
+    variants: Sequence[Variant],
+) -> Run:
+    """Run the variants through one stretch.
+
+    Parameters
+    ----------
+    inputs : Inputs
+    stretch : Stretch
+    legs : sequence of Legs
+        One for each delay.
+    which : ndarray of int, shape (S,)
+        The legs of each variant.
+    variants : sequence of Variant, S of them
+    """
+    size, events = len(variants), len(legs[0].end)
+    knob = {name: np.array([v.settings[name] for v in variants]) for name in variants[0].settings}
+    biases = np.array([v.biases for v in variants])
+    attitude = np.array([v.attitude for v in variants])
+    gated = np.array([v.gated for v in variants])
+    pick = which if len(legs) > 1 else slice(None)
+    transition, turn, drive, gyro_noise, force_noise = (
+        np.stack([getattr(leg, name) for leg in legs], axis=1)
+        for name in ("transition", "turn", "drive", "gyro_noise", "accelerometer_noise")
+    )
+    steps = np.stack([leg.steps for leg in legs], axis=1)[:, :, None]
+    duration = np.maximum(np.stack([leg.duration_s for leg in legs], axis=1), 1e-9)
+    times = np.stack([leg.time_s for leg in legs], axis=1)
+    down = np.stack([stretch.down_m[leg.end] for leg in legs], axis=1)
+    actions = np.stack([leg.action for leg in legs], axis=1)[:, which]
+    usable = np.stack([leg.usable for leg in legs], axis=1)[:, which]
+    actions = np.where(gated, actions, np.where(usable, FUSE, 0))
+    measured, noise = _measurements(inputs, stretch, legs, which, knob)
+    sampled = usable.any(axis=1)
+    gate2 = (np.maximum(knob["EKF2_EVP_GATE"], MIN_GATE) ** 2)[:, None]
+    gyro2 = np.where(attitude, knob["EKF2_GYR_NOISE"] ** 2, 0.0)[:, None, None]
+    force2 = (knob["EKF2_ACC_NOISE"] ** 2)[:, None, None]
+    drift = np.repeat(
+        np.stack(
+            [
+                attitude * (knob["EKF2_GYR_B_NOISE"] * inputs.step_s) ** 2,
+                biases * (knob["EKF2_ACC_B_NOISE"] * inputs.step_s) ** 2,
+            ],
+            axis=-1,
+        ),
+        3,
+        axis=-1,
+    )
+    drift_limit = np.repeat(
+        np.stack([knob["EKF2_GYR_NOISE"] ** 2, knob["EKF2_ACC_NOISE"] ** 2], axis=-1), 3, axis=-1
+    )
+    floor = inputs.rules.bias_floor
+    x, P = _start(stretch, biases, attitude)
+    turns = attitude[:, None].astype(np.float64)
+    last = np.full(size, stretch.time_s[0])
+    out = Run(
+        np.full((events, size, 2), np.nan),
+        np.full((events, size, 2), np.nan),
+        np.zeros((events, size), bool),
+        np.zeros((events, size), bool),
+        np.zeros((events, size), bool),
+        np.empty((events + 1, size, STATES)),
+        np.empty((events + 1, size, 2)),
+        np.empty((events + 1, size, 2)),
+    )
+    innovation, R = np.empty((size, 4)), np.empty((size, 4))
+    _keep(out, 0, x, P)
+    for e in range(events):
+        phi = transition[e][pick]
+        # x = Φx + u, P = ΦPΦ' + Q
+        x = (phi @ x[:, :, None])[:, :, 0] + drive[e][pick] + turns * turn[e][pick]
+        P = phi @ P @ np.swapaxes(phi, 1, 2)
+        P += gyro2 * gyro_noise[e][pick] + force2 * force_noise[e][pick]
+        spread = P[:, BIASES, BIASES]
+        P[:, BIASES, BIASES] = spread + (spread < drift_limit) * drift * steps[e][pick]
+        if floor is not None:
+            _limit_bias(P, floor, biases)
+        innovation[:, 0] = -x[:, HEADING]
+        innovation[:, 1] = down[e][pick] - x[:, DOWN]
+        R[:, 0] = HEADING_NOISE / duration[e][pick]
+        R[:, 1] = HEIGHT_NOISE / duration[e][pick]
+        innovation[:, 2:] = 0.0
+        R[:, 2:] = NOT_TAKEN
+        restart = None
+        if inputs.vision_height:
+            R[:, 1] = NOT_TAKEN
+        if sampled[e]:
+            action, now = actions[e], times[e][which]
+            active = action > 0
+            nu = measured[e, :, :2] - x[:, HORIZONTAL]
+            S = P[:, HORIZONTAL, HORIZONTAL] + noise[e, :, :2]
+            beyond = (nu * nu > gate2 * S).any(axis=1) & gated & (action == FUSE)
+            taken = (action == FUSE) & ~beyond
+            restart = (gated & (action == START)) | (beyond & (now - last > inputs.rules.reset_s))
+            last = np.where(taken | restart, now, last)
+            out.innovation_m[e] = np.where(active[:, None], nu, np.nan)
+            out.variance_m2[e] = np.where(active[:, None], S, np.nan)
+            out.rejected[e], out.fused[e], out.reset[e] = beyond, taken, restart
+            innovation[:, 2:] = nu
+            R[taken, 2:] = noise[e, taken, :2]
+            if inputs.vision_height:
+                innovation[:, 1] = measured[e, :, 2] - x[:, DOWN]
+                R[:, 1] = np.where(active, noise[e, :, 2], NOT_TAKEN)
+        # K = PH'(HPH' + R)⁻¹, x = x + Kν, P = P - KHP
+        HP = P[:, MEASURED, :]
+        K = np.swapaxes(HP, 1, 2) @ np.linalg.inv(HP[:, :, MEASURED] + R[:, :, None] * EYE)
+        x = x + (K @ innovation[:, :, None])[:, :, 0]
+        P = P - K @ HP
+        P = 0.5 * (P + np.swapaxes(P, 1, 2))
+        if restart is not None and restart.any():
+            x[restart, NORTH : EAST + 1] = measured[e, restart, :2]
+            P[restart, :, NORTH : EAST + 1] = 0.0
+            P[restart, NORTH : EAST + 1, :] = 0.0
+            P[restart, NORTH, NORTH] = noise[e, restart, 0]
+            P[restart, EAST, EAST] = noise[e, restart, 1]
+        _keep(out, e + 1, x, P)
+    return out
+
+
+def _keep(out: Run, at: int, x: Array, P: Array) -> None:
+    out.state[at] = x
+    out.position_variance_m2[at, :, 0] = P[:, NORTH, NORTH]
+    out.position_variance_m2[at, :, 1] = P[:, EAST, EAST]
+    out.velocity_variance_m2_s2[at, :, 0] = P[:, 3, 3]
+    out.velocity_variance_m2_s2[at, :, 1] = P[:, 4, 4]
+
+
+def _start(stretch: Stretch, biases: Flags, attitude: Flags) -> tuple[Array, Array]:
+    """State and covariance at the start, without what a variant does not estimate."""
+    x = np.tile(stretch.state, (len(biases), 1))
+    P = np.tile(np.diag(stretch.variance), (len(biases), 1, 1))
+    for part, kept in ((THETA, attitude), (GYRO_BIAS, attitude), (ACCELEROMETER_BIAS, biases)):
+        P[~kept, :, part] = 0.0
+        P[~kept, part, :] = 0.0
+        x[~kept, part] = 0.0
+    x[~biases, ACCELEROMETER_BIAS] = -stretch.accelerometer_bias_m_s2
+    return x, P
+
+
+def _limit_bias(P: Array, floor: float, biases: Flags) -> None:
+    """Keep the bias variance within PX4's limits (fixCovarianceErrors, up to v1.14)."""
+    spread = P[:, FORCE_BIAS, FORCE_BIAS]
+    least = np.maximum(BIAS_RATIO * spread.max(axis=1, keepdims=True), floor)
+    limited = np.clip(spread, least, MAX_BIAS_SD**2)
+    P[:, FORCE_BIAS, FORCE_BIAS] = np.where(biases[:, None], limited, spread)
+
+
+def _measurements(
+    inputs: Inputs,
+    stretch: Stretch,
+    legs: Sequence[Legs],
+    which: NDArray[np.intp],
+    knob: dict[str, Array],
+) -> tuple[Array, Array]:
+    """Measured position and its variance, both of shape (E, S, 3)."""
+    vision = inputs.vision
+    sample = np.maximum(legs[0].sample, 0)
+    offset = np.stack([knob[f"EKF2_EV_POS_{axis}"] for axis in "XYZ"], -1) - inputs.imu_offset_m
+    position = np.repeat(vision.position_m[sample][:, None], len(which), axis=1)
+    if offset.any():
+        rotation = np.stack([stretch.rotation[leg.end] for leg in legs], axis=1)[:, which]
+        position = position - np.einsum("esij,sj->esi", rotation, offset)
+    least = np.maximum(knob["EKF2_EVP_NOISE"], MIN_POSITION_SD_M)[:, None] ** 2
+    reported = np.where(
+        knob["EKF2_EV_NOISE_MD"][:, None] == 1.0, 0.0, vision.variance_m2[sample][:, None]
+    )
+    return position, np.maximum(reported, least)
