@@ -72,6 +72,8 @@ class Rules:
         Fusion stops after this time without a sample.
     reset_s : float
         The position is reset to the sample after this time of rejections.
+    resets : int
+        So many resets in a row, then fusion stops until a sample on which it may start.
     bias_floor : float or None
         Least variance of the accelerometer's bias (m²/s⁴), where the release has one.
     """
@@ -79,6 +81,7 @@ class Rules:
     start_interval_s: float
     stop_s: float
     reset_s: float
+    resets: int
     bias_floor: float | None
 
 
@@ -130,6 +133,8 @@ class Stretch:
         At the start, in the same order.
     down_m : ndarray, shape (n + 1,)
         Published height.
+    heading_variance_rad2, down_variance_m2 : ndarray, shape (n + 1,)
+        As the log has them.
     """
 
     time_s: Array
@@ -142,6 +147,8 @@ class Stretch:
     state: Array
     variance: Array
     down_m: Array
+    heading_variance_rad2: Array
+    down_variance_m2: Array
 
 
 @dataclass(frozen=True)
@@ -220,7 +227,7 @@ def prepare(flight: Flight) -> Inputs | Unavailable:
     old = fuses_by_mask(record.parameters)
     floor = 5e-8 / ekf2.step_s**2 if record.per_step_biases else None
     # EV_MAX_INTERVAL, ev_control.cpp; no_aid_timeout_max and reset_timeout_max, common.h
-    rules = Rules(np.inf, 7.0, 7.0, floor) if old else Rules(0.2, 0.4, 1.0, floor)
+    rules = Rules(np.inf, 7.0, 7.0, 1_000_000, floor) if old else Rules(0.2, 0.4, 1.0, 5, floor)
     fusing = ekf2.fusing
     return Inputs(
         settings=settings_in_force(record.parameters),
@@ -391,7 +398,13 @@ def _stretch(
         state=state,
         variance=start[DELAYED_VARIANCE_COLUMNS].to_numpy(dtype=np.float64),
         down_m=np.interp(step_time, ekf2.state.index, ekf2.state["down_m"]),
+        heading_variance_rad2=_at(record.delayed["attitude_down_rad2"], step_time),
+        down_variance_m2=_at(record.delayed["down_m2"], step_time),
     )
+
+
+def _at(series: pd.Series, times: Array) -> Array:
+    return np.interp(times, series.index.to_numpy(), series.to_numpy())
 
 
 def step_ends(interval_s: Array, known: Indices, target_s: float) -> Indices:

@@ -75,6 +75,8 @@ class Legs:
         IDLE, FUSE or START.
     usable : ndarray of bool, shape (E,)
         Whether the event has a sample that is on time, whatever EKF2 does with it.
+    startable : ndarray of bool, shape (E,)
+        Whether fusion may start on it, had it stopped.
     time_s : ndarray, shape (E,)
         Of measurement as EKF2 takes it: stamp - delay - half a step; else of the event.
     transition : ndarray, shape (E, 15, 15)
@@ -91,6 +93,7 @@ class Legs:
     sample: Indices
     action: Indices
     usable: NDArray[np.bool_]
+    startable: NDArray[np.bool_]
     time_s: Array
     transition: Array
     turn: Array
@@ -107,7 +110,7 @@ def make_legs(inputs: Inputs, stretch: Stretch, delay_s: float) -> Legs:
 
     The events of two delays are the same in number and order.
     """
-    end, sample, action, usable, time = _events(inputs, stretch, delay_s)
+    end, sample, action, usable, startable, time = _events(inputs, stretch, delay_s)
     start = np.concatenate([[0], end[:-1]])
     within = _transitions(stretch, start, end)
     gyro, accelerometer = _noises(stretch, start, end)
@@ -134,14 +137,14 @@ def make_legs(inputs: Inputs, stretch: Stretch, delay_s: float) -> Legs:
     drive[moved, VELOCITY] = within.v_input[at]
     drive[moved, POSITION] = within.p_input[at]
     return Legs(
-        end, sample, action, usable, time, transition, turn, drive, gyro, accelerometer,
+        end, sample, action, usable, startable, time, transition, turn, drive, gyro, accelerometer,
         (end - start).astype(np.float64), stretch.time_s[end] - stretch.time_s[start], within,
     )  # fmt: skip
 
 
 def _events(
     inputs: Inputs, stretch: Stretch, delay_s: float
-) -> tuple[Indices, Indices, Indices, NDArray[np.bool_], Array]:
+) -> tuple[Indices, Indices, Indices, NDArray[np.bool_], NDArray[np.bool_], Array]:
     vision = inputs.vision
     first = int(np.searchsorted(vision.stamp_s, stretch.time_s[0]))
     beyond = int(np.searchsorted(vision.stamp_s, stretch.time_s[-1]))
@@ -156,7 +159,7 @@ def _events(
     end = np.maximum.accumulate(end)
     usable &= stretch.time_s[end] < taken + MAX_LATE_S
     usable[:-1] &= end[1:] > end[:-1]  # of two samples in one step the newer one is fused
-    action = _actions(inputs, stretch, taken, end, usable)
+    action, startable = _actions(inputs, stretch, taken, end, usable)
     # further events where vision is silent, as many for every delay
     before = np.concatenate([[stretch.time_s[0]], stamp])
     after = np.concatenate([stamp, [stretch.time_s[-1]]])
@@ -172,11 +175,11 @@ def _events(
     samples[place] = chosen
     actions = np.full(total, IDLE, dtype=np.intp)
     actions[place] = action
-    usables = np.zeros(total, dtype=bool)
-    usables[place] = usable
+    usables, startables = np.zeros((2, total), dtype=bool)
+    usables[place], startables[place] = usable, startable
     time = stretch.time_s[ends].copy()
     time[place] = taken
-    return ends, samples, actions, usables, time
+    return ends, samples, actions, usables, startables, time
 
 
 def _actions(
@@ -185,14 +188,16 @@ def _actions(
     taken_s: Array,
     end: Indices,
     usable: NDArray[np.bool_],
-) -> Indices:
-    """What each sample does, by the rules that start and stop fusion (ev_control.cpp)."""
+) -> tuple[Indices, NDArray[np.bool_]]:
+    """What each sample does, and whether fusion may start on it, by the rules that start and stop fusion (ev_control.cpp)."""
     rules = inputs.rules
     action = np.full(len(taken_s), IDLE, dtype=np.intp)
+    startable = np.zeros(len(taken_s), dtype=bool)
     popped = np.flatnonzero(usable)
     if not len(popped):
-        return action
+        return action, startable
     interval = np.diff(taken_s[popped], prepend=taken_s[popped[0]])
+    startable[popped] = interval < rules.start_interval_s
     # the last step before this sample was fused, and how old the sample before was then
     silence = stretch.time_s[end[popped] - 1] - np.concatenate(
         [[np.inf], taken_s[popped[:-1]]]
@@ -205,7 +210,7 @@ def _actions(
         elif gap < rules.start_interval_s:
             action[popped[at]] = START
             running = True
-    return action
+    return action, startable
 
 
 def _transitions(stretch: Stretch, start: Indices, end: Indices) -> Transitions:

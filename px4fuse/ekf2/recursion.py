@@ -26,11 +26,8 @@ from px4fuse.ekf2.legs import (
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
-# Height and heading come from sensors that logs hold thinly, so that EKF2's own published values
-# stand in for them. Only their size matters little to the horizontal axes: 0.05 m at 10 Hz and
-# 0.03 rad at 2 Hz, as densities (m²·s, rad²·s)
-HEIGHT_NOISE = 0.05**2 * 0.1
-HEADING_NOISE = 0.03**2 * 0.5
+# Height and heading come from sensors that logs hold thinly. The published height and heading stand
+# in for them as measurements, with the noise that brings their variances to the logged ones.
 # Variance by which a sample is not taken at all
 NOT_TAKEN = 1e9
 MIN_POSITION_SD_M = 0.01  # ev_pos_control.cpp
@@ -132,9 +129,12 @@ def run(
         for name in ("transition", "turn", "drive", "gyro_noise", "accelerometer_noise")
     )
     steps = np.stack([leg.steps for leg in legs], axis=1)[:, :, None]
-    duration = np.maximum(np.stack([leg.duration_s for leg in legs], axis=1), 1e-9)
-    times = np.stack([leg.time_s for leg in legs], axis=1)
-    down = np.stack([stretch.down_m[leg.end] for leg in legs], axis=1)
+    times = np.stack([stretch.time_s[leg.end] for leg in legs], axis=1)
+    startable = np.stack([leg.startable for leg in legs], axis=1)[:, which]
+    down, heading_variance, down_variance = (
+        np.stack([part[leg.end] for leg in legs], axis=1)
+        for part in (stretch.down_m, stretch.heading_variance_rad2, stretch.down_variance_m2)
+    )
     actions = np.stack([leg.action for leg in legs], axis=1)[:, which]
     usable = np.stack([leg.usable for leg in legs], axis=1)[:, which]
     actions = np.where(gated, actions, np.where(usable, FUSE, 0))
@@ -161,6 +161,7 @@ def run(
     x, P = _start(stretch, biases, attitude)
     turns = attitude[:, None].astype(np.float64)
     last = np.full(size, stretch.time_s[0])
+    stopped, left = np.zeros(size, bool), np.full(size, inputs.rules.resets)
     out = Run(
         np.full((events, size, 2), np.nan),
         np.full((events, size, 2), np.nan),
@@ -185,8 +186,8 @@ def run(
             _limit_bias(P, floor, biases)
         innovation[:, 0] = -x[:, HEADING]
         innovation[:, 1] = down[e][pick] - x[:, DOWN]
-        R[:, 0] = HEADING_NOISE / duration[e][pick]
-        R[:, 1] = HEIGHT_NOISE / duration[e][pick]
+        R[:, 0] = _down_to(P[:, HEADING, HEADING], heading_variance[e][pick])
+        R[:, 1] = _down_to(P[:, DOWN, DOWN], down_variance[e][pick])
         innovation[:, 2:] = 0.0
         R[:, 2:] = NOT_TAKEN
         restart = None
@@ -198,8 +199,12 @@ def run(
             nu = measured[e, :, :2] - x[:, HORIZONTAL]
             S = P[:, HORIZONTAL, HORIZONTAL] + noise[e, :, :2]
             beyond = (nu * nu > gate2 * S).any(axis=1) & gated & (action == FUSE)
-            taken = (action == FUSE) & ~beyond
-            restart = (gated & (action == START)) | (beyond & (now - last > inputs.rules.reset_s))
+            taken = (action == FUSE) & ~beyond & ~stopped
+            starting = gated & ((action == START) | (stopped & startable[e]))
+            failing = beyond & ~stopped & (now - last > inputs.rules.reset_s)
+            restart = starting | (failing & (left > 0))
+            stopped = (stopped & ~starting) | (failing & (left == 0))
+            left = np.where(starting, inputs.rules.resets, left - (failing & (left > 0)))
             last = np.where(taken | restart, now, last)
             out.innovation_m[e] = np.where(active[:, None], nu, np.nan)
             out.variance_m2[e] = np.where(active[:, None], S, np.nan)
@@ -243,6 +248,12 @@ def _start(stretch: Stretch, biases: Flags, attitude: Flags) -> tuple[Array, Arr
         x[~kept, part] = 0.0
     x[~biases, ACCELEROMETER_BIAS] = -stretch.accelerometer_bias_m_s2
     return x, P
+
+
+def _down_to(variance: Array, target: Array) -> Array:
+    """Noise of the measurement that brings a variance down to a target: 1/target - 1/variance."""
+    surplus = np.maximum(variance - target, variance * target / NOT_TAKEN)
+    return np.where(surplus > 0.0, variance * target / np.where(surplus > 0.0, surplus, 1.0), NOT_TAKEN)
 
 
 def _limit_bias(P: Array, floor: float, biases: Flags) -> None:
