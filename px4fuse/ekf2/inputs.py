@@ -53,6 +53,9 @@ IMU_GAP_S = 0.05
 MAX_IMU_INTERVAL_S = 0.012
 # Fusion must have run so long when the model starts, and the model so long before it is judged
 START_AFTER_S = 1.0
+# and the vehicle so long off the ground: on it EKF2 fuses zero velocity and gravity, and taking off
+# settles what is tilt and what is accelerometer bias
+AIRBORNE_S = 4.0
 SETTLING_S = 5.0
 MIN_STRETCH_S = 10.0
 # Logger limits of the topics that hold a copy of the vision samples (logged_topics.cpp)
@@ -135,6 +138,10 @@ class Stretch:
         Published height.
     heading_variance_rad2, down_variance_m2 : ndarray, shape (n + 1,)
         As the log has them.
+    attitude_error_rad : ndarray, shape (n + 1, 3)
+        Of EKF2's own filter at its horizon, against the nominal attitude.
+    correlation : ndarray, shape (15, 15)
+        Of the state at the start; the log has variances only.
     """
 
     time_s: Array
@@ -149,6 +156,8 @@ class Stretch:
     down_m: Array
     heading_variance_rad2: Array
     down_variance_m2: Array
+    attitude_error_rad: Array
+    correlation: Array
 
 
 @dataclass(frozen=True)
@@ -217,7 +226,7 @@ def prepare(flight: Flight) -> Inputs | Unavailable:
     vision = _vision(flight, ekf2, record, attitude)
     if isinstance(vision, Unavailable):
         return vision
-    stretches = _stretches(imu, attitude, ekf2, record, vision)
+    stretches = _stretches(flight, imu, attitude, ekf2, record, vision)
     if not stretches:
         return Unavailable(
             WHAT,
@@ -308,6 +317,7 @@ def _source(flight: Flight) -> PositionTrack | Unavailable:
 
 
 def _stretches(
+    flight: Flight,
     imu: pd.DataFrame,
     attitude: pd.DataFrame,
     ekf2: Ekf2,
@@ -333,7 +343,11 @@ def _stretches(
         inside = fused[(fused >= low) & (fused <= high)]
         if not len(inside):
             continue
-        at = int(np.searchsorted(delayed_time, inside[0] + START_AFTER_S))
+        begin = inside[0] + START_AFTER_S
+        if not isinstance(flight.airborne, Unavailable):
+            offs = [off + AIRBORNE_S for off, _ in flight.airborne if off < high]
+            begin = max([begin, *offs[:1]])
+        at = int(np.searchsorted(delayed_time, begin))
         if at == len(delayed_time) or high - delayed_time[at] < MIN_STRETCH_S:
             continue
         if np.any(interval[(time[1:] > delayed_time[at]) & (time[:-1] < high)] > IMU_GAP_S):
@@ -377,9 +391,14 @@ def _stretch(
     beyond = multiply(logged, conjugate(interpolate(logged_time, step_time, gyro)))
     extra = interpolate(step_time, logged_time, beyond)
     nominal = multiply(extra, gyro)
+    delayed_time = record.delayed.index.to_numpy()
+    inside = (delayed_time >= step_time[0] - 1e-4) & (delayed_time <= step_time[-1])
+    own = record.delayed.loc[inside, QUATERNION_COLUMNS].to_numpy(copy=True)
+    error = to_vector(
+        multiply(own, conjugate(interpolate(delayed_time[inside], step_time, nominal)))
+    )
     state = np.zeros(15)
-    quaternion = start[QUATERNION_COLUMNS].to_numpy(dtype=np.float64)
-    state[:3] = to_vector(multiply(quaternion, conjugate(nominal[0])))
+    state[:3] = error[0]
     state[3:6] = start[VELOCITY_COLUMNS]
     position = start[POSITION_COLUMNS].to_numpy(dtype=np.float64)
     published = [
@@ -400,6 +419,10 @@ def _stretch(
         down_m=np.interp(step_time, ekf2.state.index, ekf2.state["down_m"]),
         heading_variance_rad2=_at(record.delayed["attitude_down_rad2"], step_time),
         down_variance_m2=_at(record.delayed["down_m2"], step_time),
+        attitude_error_rad=np.column_stack(
+            [np.interp(step_time, delayed_time[inside], part) for part in error.T]
+        ),
+        correlation=np.eye(15),
     )
 
 

@@ -20,7 +20,7 @@ from px4fuse.ekf2.inputs import Inputs, Stretch, prepare
 from px4fuse.ekf2.legs import GRAVITY_M_S2, Legs, make_legs
 from px4fuse.ekf2.output_predictor import follow_attitude, publish
 from px4fuse.ekf2.parameters import check
-from px4fuse.ekf2.recursion import Run, Variant, run
+from px4fuse.ekf2.recursion import Run, Variant, run, with_correlation
 from px4fuse.ekf2.replay import UPDATE_COLUMNS, Agreement, Ekf2Replay
 from px4fuse.flight import STATE_COLUMNS, Flight, Unavailable
 
@@ -91,6 +91,11 @@ def open_model(flight: Flight) -> Model | Unavailable:
     variant = Variant(inputs.settings)
     delay_s = variant.delay_s(inputs.step_s)
     legs = tuple(make_legs(inputs, stretch, delay_s) for stretch in inputs.stretches)
+    stretches = tuple(
+        with_correlation(inputs, stretch, leg)
+        for stretch, leg in zip(inputs.stretches, legs, strict=True)
+    )
+    inputs = replace(inputs, stretches=stretches)
     runs = run_variants(inputs, [variant], {delay_s: legs})
     flown = _assemble(inputs, runs, 0, {})
     agreement = agreement_with_log(flight, flown)
@@ -214,10 +219,9 @@ def _tracks(inputs: Inputs, part: StretchRun, at: int) -> tuple[pd.DataFrame, pd
     bias = np.concatenate([np.repeat(state[:1, 12:15], lag, axis=0), state[:-lag, 12:15]])
     force = stretch.force_m_s2 - bias[1 : len(stretch.step_s) + 1]
     force = np.einsum("nij,nj->ni", stretch.rotation[1:], force)
-    if at and variant.attitude:
-        own, _ = delayed_states(part, 0)
+    if variant.attitude:  # the published attitude followed that of EKF2 itself
         turned = follow_attitude(
-            state[:, :3] - own[:, :3], lag, inputs.step_s, inputs.horizon_s
+            state[:, :3] - stretch.attitude_error_rad, lag, inputs.step_s, inputs.horizon_s
         )
         force = force + np.cross(turned[1:], force)
     velocity, position = publish(

@@ -7,7 +7,7 @@ and ``EKF/vel_pos_fusion.cpp`` (gate, fusion), ``ev_pos_control.cpp`` (noise, re
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +28,8 @@ Flags = NDArray[np.bool_]
 
 # Height and heading come from sensors that logs hold thinly. The published height and heading stand
 # in for them as measurements, with the noise that brings their variances to the logged ones.
+# How long the first pass runs that gives the correlations at the start
+CORRELATING_S = 8.0
 # Variance by which a sample is not taken at all
 NOT_TAKEN = 1e9
 MIN_POSITION_SD_M = 0.01  # ev_pos_control.cpp
@@ -87,6 +89,8 @@ class Run:
         At the start and after each event.
     position_variance_m2, velocity_variance_m2_s2 : ndarray, shape (E + 1, S, 2)
         After each event.
+    covariance : ndarray, shape (S, 15, 15)
+        At the end.
     """
 
     innovation_m: Array
@@ -97,6 +101,7 @@ class Run:
     state: Array
     position_variance_m2: Array
     velocity_variance_m2_s2: Array
+    covariance: Array
 
 
 def run(
@@ -131,9 +136,14 @@ def run(
     steps = np.stack([leg.steps for leg in legs], axis=1)[:, :, None]
     times = np.stack([stretch.time_s[leg.end] for leg in legs], axis=1)
     startable = np.stack([leg.startable for leg in legs], axis=1)[:, which]
-    down, heading_variance, down_variance = (
+    down, heading, heading_variance, down_variance = (
         np.stack([part[leg.end] for leg in legs], axis=1)
-        for part in (stretch.down_m, stretch.heading_variance_rad2, stretch.down_variance_m2)
+        for part in (
+            stretch.down_m,
+            stretch.attitude_error_rad[:, HEADING],
+            stretch.heading_variance_rad2,
+            stretch.down_variance_m2,
+        )
     )
     actions = np.stack([leg.action for leg in legs], axis=1)[:, which]
     usable = np.stack([leg.usable for leg in legs], axis=1)[:, which]
@@ -171,6 +181,7 @@ def run(
         np.empty((events + 1, size, STATES)),
         np.empty((events + 1, size, 2)),
         np.empty((events + 1, size, 2)),
+        np.empty((size, STATES, STATES)),
     )
     innovation, R = np.empty((size, 4)), np.empty((size, 4))
     _keep(out, 0, x, P)
@@ -184,7 +195,7 @@ def run(
         P[:, BIASES, BIASES] = spread + (spread < drift_limit) * drift * steps[e][pick]
         if floor is not None:
             _limit_bias(P, floor, biases)
-        innovation[:, 0] = -x[:, HEADING]
+        innovation[:, 0] = heading[e][pick] - x[:, HEADING]
         innovation[:, 1] = down[e][pick] - x[:, DOWN]
         R[:, 0] = _down_to(P[:, HEADING, HEADING], heading_variance[e][pick])
         R[:, 1] = _down_to(P[:, DOWN, DOWN], down_variance[e][pick])
@@ -218,6 +229,7 @@ def run(
         HP = P[:, MEASURED, :]
         K = np.swapaxes(HP, 1, 2) @ np.linalg.inv(HP[:, :, MEASURED] + R[:, :, None] * EYE)
         x = x + (K @ innovation[:, :, None])[:, :, 0]
+        x[:, HEADING] = np.where(attitude, heading[e][pick], 0.0)
         P = P - K @ HP
         P = 0.5 * (P + np.swapaxes(P, 1, 2))
         if restart is not None and restart.any():
@@ -227,7 +239,28 @@ def run(
             P[restart, NORTH, NORTH] = noise[e, restart, 0]
             P[restart, EAST, EAST] = noise[e, restart, 1]
         _keep(out, e + 1, x, P)
+    out.covariance[:] = P
     return out
+
+
+def with_correlation(inputs: Inputs, stretch: Stretch, legs: Legs) -> Stretch:
+    """The same stretch with the correlations that its first seconds bring about.
+
+    The log holds variances only. Without correlations the first samples would share out anew
+    between tilt and accelerometer bias what EKF2 had long settled.
+    """
+    count = int(np.searchsorted(stretch.time_s[legs.end], stretch.time_s[0] + CORRELATING_S))
+    first = replace(
+        legs,
+        **{
+            field.name: getattr(legs, field.name)[:count]
+            for field in fields(legs)
+            if field.name != "within"
+        },
+    )
+    done = run(inputs, stretch, [first], np.zeros(1, np.intp), [Variant(inputs.settings)])
+    deviation = np.sqrt(np.diagonal(done.covariance[0]))
+    return replace(stretch, correlation=done.covariance[0] / deviation[:, None] / deviation)
 
 
 def _keep(out: Run, at: int, x: Array, P: Array) -> None:
@@ -241,7 +274,9 @@ def _keep(out: Run, at: int, x: Array, P: Array) -> None:
 def _start(stretch: Stretch, biases: Flags, attitude: Flags) -> tuple[Array, Array]:
     """State and covariance at the start, without what a variant does not estimate."""
     x = np.tile(stretch.state, (len(biases), 1))
-    P = np.tile(np.diag(stretch.variance), (len(biases), 1, 1))
+    deviation = np.sqrt(stretch.variance)
+    covariance = deviation[:, None] * stretch.correlation * deviation
+    P = np.tile(covariance, (len(biases), 1, 1))
     for part, kept in ((THETA, attitude), (GYRO_BIAS, attitude), (ACCELEROMETER_BIAS, biases)):
         P[~kept, :, part] = 0.0
         P[~kept, part, :] = 0.0
