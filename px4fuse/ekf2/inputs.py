@@ -60,6 +60,8 @@ SETTLING_S = 5.0
 MIN_STRETCH_S = 10.0
 # Logger limits of the topics that hold a copy of the vision samples (logged_topics.cpp)
 COPY_INTERVAL_S = {"estimator_visual_odometry_aligned": 0.2, "estimator_aid_src_ev_pos": 0.5}
+# The first release that stamps estimator_states with the time of the horizon
+STAMPED_AT_HORIZON = "PX4 v1.13"
 ROTATE_VISION_BIT = 64  # EKF2_AID_MASK, up to v1.13
 
 
@@ -214,8 +216,6 @@ def prepare(flight: Flight) -> Inputs | Unavailable:
             f"EKF2 fused more than vision position horizontally ({', '.join(record.other_aiding)})",
             "Fly with EKF2_GPS_CTRL 0, EKF2_OF_CTRL 0 and without bit 2 of EKF2_EV_CTRL.",
         )
-    if isinstance(ekf2.horizon_s, Unavailable):
-        return Unavailable(WHAT, ekf2.horizon_s.reason, ekf2.horizon_s.remedy)
     interval = float(np.median(np.diff(imu.index.to_numpy())))
     if interval > MAX_IMU_INTERVAL_S:
         return Unavailable(
@@ -226,6 +226,11 @@ def prepare(flight: Flight) -> Inputs | Unavailable:
     vision = _vision(flight, ekf2, record, attitude)
     if isinstance(vision, Unavailable):
         return vision
+    horizon_s = ekf2.horizon_s
+    if isinstance(horizon_s, Unavailable):
+        if not flight.log.firmware.startswith(STAMPED_AT_HORIZON):
+            return Unavailable(WHAT, horizon_s.reason, horizon_s.remedy)
+        horizon_s = 0.0  # a buffer of one step: EKF2_EV_DELAY is at most EKF2_PREDICT_US
     stretches = _stretches(flight, imu, attitude, ekf2, record, vision)
     if not stretches:
         return Unavailable(
@@ -244,7 +249,7 @@ def prepare(flight: Flight) -> Inputs | Unavailable:
         vision=vision,
         rules=rules,
         step_s=ekf2.step_s,
-        horizon_s=ekf2.horizon_s,
+        horizon_s=horizon_s,
         vision_height=isinstance(fusing, pd.DataFrame) and bool(fusing["vertical"].mean() > 0.5),
         imu_offset_m=np.array([record.parameters.get(f"EKF2_IMU_POS_{x}", 0.0) for x in "XYZ"]),
     )
@@ -283,16 +288,11 @@ def _vision(
         position = np.einsum("nij,nj->ni", turn, position)
         variance = np.einsum("nij,nj->ni", turn**2, variance)
     age = record.vision_age_s
-    if len(age) and track.name == age_source(track):
+    if len(age) and "vehicle_visual_odometry" in track.topics:
         arrival = stamp + np.interp(stamp, age.index.to_numpy(), age.to_numpy())
     else:
         arrival = np.full(len(stamp), -np.inf)  # unknown: never taken to be late
     return Vision(stamp, arrival, position, variance, track.name)
-
-
-def age_source(track: PositionTrack) -> str:
-    """The topic whose ages of publication the record holds, if the track is of it."""
-    return "vehicle_visual_odometry" if "vehicle_visual_odometry" in track.topics else ""
 
 
 def _source(flight: Flight) -> PositionTrack | Unavailable:
