@@ -177,6 +177,8 @@ class Inputs:
         Average prediction step.
     horizon_s : float
         How far the fusion runs behind the output.
+    predict_s : float
+        EKF2_PREDICT_US.
     vision_height : bool
         Whether EKF2 took its height from vision.
     imu_offset_m : ndarray, shape (3,)
@@ -189,6 +191,7 @@ class Inputs:
     rules: Rules
     step_s: float
     horizon_s: float
+    predict_s: float
     vision_height: bool
     imu_offset_m: Array
 
@@ -250,6 +253,7 @@ def prepare(flight: Flight) -> Inputs | Unavailable:
         rules=rules,
         step_s=ekf2.step_s,
         horizon_s=horizon_s,
+        predict_s=_predict_s(record),
         vision_height=isinstance(fusing, pd.DataFrame) and bool(fusing["vertical"].mean() > 0.5),
         imu_offset_m=np.array([record.parameters.get(f"EKF2_IMU_POS_{x}", 0.0) for x in "XYZ"]),
     )
@@ -370,11 +374,10 @@ def _stretch(
     to_row = int(np.searchsorted(time, end_s, side="right"))
     time = time[from_row:to_row]
     interval = np.diff(time)
-    target_s = record.parameters.get("EKF2_PREDICT_US", 10_000.0) * 1e-6
     known = np.searchsorted(time, record.delayed.index.to_numpy() - 1e-4)
     known = known[(known < len(time)) & (known > 0)]
     on_sample = np.isin(np.rint(time[known] * 1e6), np.rint(record.delayed.index * 1e6))
-    ends = step_ends(interval, known[on_sample], target_s)
+    ends = step_ends(interval, known[on_sample], _predict_s(record))
     gyro_bias = start[GYRO_BIAS_COLUMNS].to_numpy(dtype=np.float64)
     accelerometer_bias = start[ACCELEROMETER_BIAS_COLUMNS].to_numpy(dtype=np.float64)
     rate = imu[ANGULAR_RATE_COLUMNS].to_numpy()[from_row + 1 : to_row] - gyro_bias
@@ -424,6 +427,10 @@ def _stretch(
         ),
         correlation=np.eye(15),
     )
+
+
+def _predict_s(record: FusionRecord) -> float:
+    return record.parameters.get("EKF2_PREDICT_US", 10_000.0) * 1e-6
 
 
 def _at(series: pd.Series, times: Array) -> Array:

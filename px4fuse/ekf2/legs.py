@@ -25,6 +25,7 @@ from px4fuse.ekf2.rotation import skew
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
+Flags = NDArray[np.bool_]
 
 GRAVITY_M_S2 = np.array([0.0, 0.0, 9.80665])  # CONSTANTS_ONE_G
 STATES = 15
@@ -62,8 +63,8 @@ class Transitions:
 
 
 @dataclass(frozen=True)
-class Legs:
-    """Legs of one stretch for one delay of vision, E of them, each ending in an event.
+class _Events:
+    """The events of one stretch, E of them.
 
     Attributes
     ----------
@@ -77,40 +78,61 @@ class Legs:
         Whether the event has a sample that is on time, whatever EKF2 does with it.
     startable : ndarray of bool, shape (E,)
         Whether fusion may start on it, had it stopped.
+    late, lost : ndarray of bool, shape (E,)
+        Whether the sample arrived after the horizon had passed it: fused late, or never.
     time_s : ndarray, shape (E,)
         Of measurement as EKF2 takes it: stamp - delay - half a step; else of the event.
+    """
+
+    end: Indices
+    sample: Indices
+    action: Indices
+    usable: Flags
+    startable: Flags
+    late: Flags
+    lost: Flags
+    time_s: Array
+
+
+@dataclass(frozen=True)
+class Legs(_Events):
+    """Legs of one stretch, each ending in an event.
+
+    Attributes
+    ----------
     transition : ndarray, shape (E, 15, 15)
     turn, drive : ndarray, shape (E, 15)
         What is added to the state.
     gyro_noise, accelerometer_noise : ndarray, shape (E, 15, 15)
         Covariance added for unit noise.
     steps : ndarray, shape (E,)
-    duration_s : ndarray, shape (E,)
     within : Transitions
     """
 
-    end: Indices
-    sample: Indices
-    action: Indices
-    usable: NDArray[np.bool_]
-    startable: NDArray[np.bool_]
-    time_s: Array
     transition: Array
     turn: Array
     drive: Array
     gyro_noise: Array
     accelerometer_noise: Array
     steps: Array
-    duration_s: Array
     within: Transitions
 
 
-def make_legs(inputs: Inputs, stretch: Stretch, delay_s: float) -> Legs:
-    """Legs of a stretch if vision is taken to be ``delay_s`` old at its stamp.
+@dataclass(frozen=True)
+class Timing:
+    """What of the parameters decides the legs: age of vision at its stamp, and the horizon (s)."""
+
+    delay_s: float
+    horizon_s: float
+
+
+def make_legs(inputs: Inputs, stretch: Stretch, timing: Timing) -> Legs:
+    """Legs of a stretch.
 
     The events of two delays are the same in number and order.
     """
-    end, sample, action, usable, startable, time = _events(inputs, stretch, delay_s)
+    events = _events(inputs, stretch, timing)
+    end = events.end
     start = np.concatenate([[0], end[:-1]])
     within = _transitions(stretch, start, end)
     gyro, accelerometer = _noises(stretch, start, end)
@@ -137,27 +159,36 @@ def make_legs(inputs: Inputs, stretch: Stretch, delay_s: float) -> Legs:
     drive[moved, VELOCITY] = within.v_input[at]
     drive[moved, POSITION] = within.p_input[at]
     return Legs(
-        end, sample, action, usable, startable, time, transition, turn, drive, gyro, accelerometer,
-        (end - start).astype(np.float64), stretch.time_s[end] - stretch.time_s[start], within,
-    )  # fmt: skip
+        **vars(events),
+        transition=transition,
+        turn=turn,
+        drive=drive,
+        gyro_noise=gyro,
+        accelerometer_noise=accelerometer,
+        steps=(end - start).astype(np.float64),
+        within=within,
+    )
 
 
 def _events(
-    inputs: Inputs, stretch: Stretch, delay_s: float
-) -> tuple[Indices, Indices, Indices, NDArray[np.bool_], NDArray[np.bool_], Array]:
+    inputs: Inputs, stretch: Stretch, timing: Timing
+) -> _Events:
     vision = inputs.vision
     first = int(np.searchsorted(vision.stamp_s, stretch.time_s[0]))
     beyond = int(np.searchsorted(vision.stamp_s, stretch.time_s[-1]))
     chosen = np.arange(first, beyond)
     stamp = vision.stamp_s[chosen]
-    taken = stamp - delay_s - 0.5 * inputs.step_s
+    taken = stamp - timing.delay_s - 0.5 * inputs.step_s
     # what arrives after the horizon has passed it is fused late, or not at all
-    due = np.maximum(taken, vision.arrival_s[chosen] - inputs.horizon_s)
+    due = np.maximum(taken, vision.arrival_s[chosen] - timing.horizon_s)
     end = np.searchsorted(stretch.time_s, due - 1e-9)
     usable = (end > 0) & (end < len(stretch.time_s))
     end = np.minimum(end, len(stretch.time_s) - 1)
     end = np.maximum.accumulate(end)
-    usable &= stretch.time_s[end] < taken + MAX_LATE_S
+    in_time = stretch.time_s[end] < taken + MAX_LATE_S
+    late = usable & in_time & (due - taken > inputs.step_s)
+    lost = usable & ~in_time
+    usable &= in_time
     usable[:-1] &= end[1:] > end[:-1]  # of two samples in one step the newer one is fused
     action, startable = _actions(inputs, stretch, taken, end, usable)
     # further events where vision is silent, as many for every delay
@@ -175,11 +206,14 @@ def _events(
     samples[place] = chosen
     actions = np.full(total, IDLE, dtype=np.intp)
     actions[place] = action
-    usables, startables = np.zeros((2, total), dtype=bool)
-    usables[place], startables[place] = usable, startable
+    usables, startables, lates, losts = np.zeros((4, total), dtype=bool)
+    for spread, part in (
+        (usables, usable), (startables, startable), (lates, late), (losts, lost)
+    ):  # fmt: skip
+        spread[place] = part
     time = stretch.time_s[ends].copy()
     time[place] = taken
-    return ends, samples, actions, usables, startables, time
+    return _Events(ends, samples, actions, usables, startables, lates, losts, time)
 
 
 def _actions(
@@ -187,8 +221,8 @@ def _actions(
     stretch: Stretch,
     taken_s: Array,
     end: Indices,
-    usable: NDArray[np.bool_],
-) -> tuple[Indices, NDArray[np.bool_]]:
+    usable: Flags,
+) -> tuple[Indices, Flags]:
     """What each sample does, and whether fusion may start on it, by the rules that start and stop fusion (ev_control.cpp)."""
     rules = inputs.rules
     action = np.full(len(taken_s), IDLE, dtype=np.intp)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from px4fuse.ekf2.agreement import agreement_with_log
 from px4fuse.ekf2.inputs import Inputs, Stretch, prepare
-from px4fuse.ekf2.legs import GRAVITY_M_S2, Legs, make_legs
+from px4fuse.ekf2.legs import GRAVITY_M_S2, Legs, Timing, make_legs
 from px4fuse.ekf2.output_predictor import follow_attitude, publish
 from px4fuse.ekf2.parameters import check
 from px4fuse.ekf2.recursion import Run, Variant, run, with_correlation
@@ -89,14 +89,14 @@ def open_model(flight: Flight) -> Model | Unavailable:
     if isinstance(inputs, Unavailable):
         return inputs
     variant = Variant(inputs.settings)
-    delay_s = variant.delay_s(inputs.step_s)
-    legs = tuple(make_legs(inputs, stretch, delay_s) for stretch in inputs.stretches)
+    timing = variant.timing(inputs)
+    legs = tuple(make_legs(inputs, stretch, timing) for stretch in inputs.stretches)
     stretches = tuple(
         with_correlation(inputs, stretch, leg)
         for stretch, leg in zip(inputs.stretches, legs, strict=True)
     )
     inputs = replace(inputs, stretches=stretches)
-    runs = run_variants(inputs, [variant], {delay_s: legs})
+    runs = run_variants(inputs, [variant], {timing: legs})
     flown = _assemble(inputs, runs, 0, {})
     agreement = agreement_with_log(flight, flown)
     if isinstance(agreement, Unavailable):
@@ -122,19 +122,19 @@ def replay_settings(
     """
     changes = [check(change) for change in settings]
     flown = model.inputs.settings
-    variants = [Variant(flown), *(Variant({**flown, **change}) for change in changes)]
+    variants = [Variant({**flown, **change}) for change in changes]
     return tuple(
         replace(replay, agreement=model.agreement)
-        for replay in replay_variants(model, variants, [{}, *changes])[1:]
+        for replay in replay_variants(model, variants, changes)
     )
 
 
 def replay_variants(
     model: Model, variants: Sequence[Variant], changes: Sequence[Mapping[str, float]]
 ) -> list[Ekf2Replay]:
-    """Replay filters of any kind; the first must be the one that was flown."""
+    """Replay filters of any kind; ``changes`` are what each is said to have changed."""
     inputs = model.inputs
-    made = {Variant(inputs.settings).delay_s(inputs.step_s): model.legs}
+    made = {Variant(inputs.settings).timing(inputs): model.legs}
     runs = run_variants(inputs, variants, made)
     return [_assemble(inputs, runs, at, change) for at, change in enumerate(changes)]
 
@@ -151,17 +151,17 @@ class StretchRun:
 
 
 def run_variants(
-    inputs: Inputs, variants: Sequence[Variant], made: Mapping[float, Sequence[Legs]]
+    inputs: Inputs, variants: Sequence[Variant], made: Mapping[Timing, Sequence[Legs]]
 ) -> list[StretchRun]:
-    """Run variants through every stretch; ``made`` are the legs that there are, by delay."""
-    delays = [variant.delay_s(inputs.step_s) for variant in variants]
-    distinct = list(dict.fromkeys(delays))
-    which = np.array([distinct.index(delay) for delay in delays])
+    """Run variants through every stretch; ``made`` are the legs that there are."""
+    timings = [variant.timing(inputs) for variant in variants]
+    distinct = list(dict.fromkeys(timings))
+    which = np.array([distinct.index(timing) for timing in timings])
     runs = []
     for at, stretch in enumerate(inputs.stretches):
         legs = tuple(
-            made[delay][at] if delay in made else make_legs(inputs, stretch, delay)
-            for delay in distinct
+            made[timing][at] if timing in made else make_legs(inputs, stretch, timing)
+            for timing in distinct
         )
         done = run(inputs, stretch, legs, which, variants)
         runs.append(StretchRun(stretch, legs, which, done, tuple(variants)))
@@ -187,6 +187,8 @@ def _assemble(
             (float(part.stretch.time_s[0]), float(part.stretch.time_s[-1])) for part in runs
         ),
         source=inputs.vision.source,
+        late=sum(int(part.legs[part.which[at]].late.sum()) for part in runs),
+        lost=sum(int(part.legs[part.which[at]].lost.sum()) for part in runs),
     )
 
 
@@ -214,14 +216,15 @@ def _tracks(inputs: Inputs, part: StretchRun, at: int) -> tuple[pd.DataFrame, pd
     """The filter's state and what it publishes, at each step."""
     stretch, variant = part.stretch, part.variants[at]
     state, reset = delayed_states(part, at)
-    lag = max(round(inputs.horizon_s / inputs.step_s), 1)
+    horizon_s = variant.timing(inputs).horizon_s
+    lag = max(round(horizon_s / inputs.step_s), 1)
     # the bias that the newest IMU samples are corrected with is the horizon's
     bias = np.concatenate([np.repeat(state[:1, 12:15], lag, axis=0), state[:-lag, 12:15]])
     force = stretch.force_m_s2 - bias[1 : len(stretch.step_s) + 1]
     force = np.einsum("nij,nj->ni", stretch.rotation[1:], force)
     if variant.attitude:  # the published attitude followed that of EKF2 itself
         turned = follow_attitude(
-            state[:, :3] - stretch.attitude_error_rad, lag, inputs.step_s, inputs.horizon_s
+            state[:, :3] - stretch.attitude_error_rad, lag, inputs.step_s, horizon_s
         )
         force = force + np.cross(turned[1:], force)
     velocity, position = publish(

@@ -39,6 +39,7 @@ PARAMETERS: Mapping[str, Parameter] = {
     "EKF2_EV_NOISE_MD": Parameter("", 0.0, 0.0, 1.0, "1: variances of the sender are not used"),
     "EKF2_EVP_GATE": Parameter("SD", 5.0, 1.0, 1e3, "gate of the vision position innovation"),
     "EKF2_EV_DELAY": Parameter("ms", 0.0, 0.0, 300.0, "age of vision at its stamp"),
+    "EKF2_DELAY_MAX": Parameter("ms", 200.0, 0.0, 1e3, "how far fusion may run behind (v1.15)"),
     "EKF2_EV_POS_X": Parameter("m", 0.0, -math.inf, math.inf, "vision sensor forward of the body"),
     "EKF2_EV_POS_Y": Parameter("m", 0.0, -math.inf, math.inf, "vision sensor right of the body"),
     "EKF2_EV_POS_Z": Parameter("m", 0.0, -math.inf, math.inf, "vision sensor below the body"),

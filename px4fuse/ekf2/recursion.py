@@ -6,6 +6,7 @@ and ``EKF/vel_pos_fusion.cpp`` (gate, fusion), ``ev_pos_control.cpp`` (noise, re
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 
@@ -21,6 +22,7 @@ from px4fuse.ekf2.legs import (
     STATES,
     THETA,
     Legs,
+    Timing,
 )
 
 Array = NDArray[np.float64]
@@ -69,9 +71,17 @@ class Variant:
     gated: bool = True
     timed: bool = True
 
-    def delay_s(self, step_s: float) -> float:
-        """What is taken off the stamps, half a step besides."""
-        return self.settings["EKF2_EV_DELAY"] * 1e-3 if self.timed else -0.5 * step_s
+    def timing(self, inputs: Inputs) -> Timing:
+        """What is taken off the stamps, half a step besides, and how far fusion runs behind."""
+        if not self.timed:
+            return Timing(-0.5 * inputs.step_s, inputs.horizon_s)
+        delay_s = self.settings["EKF2_EV_DELAY"] * 1e-3
+        longest_ms = self.settings["EKF2_DELAY_MAX"]
+        if longest_ms == inputs.settings["EKF2_DELAY_MAX"]:
+            return Timing(delay_s, inputs.horizon_s)
+        # initialise_interface, estimator_interface.cpp: the length of the IMU buffer
+        length = max(math.ceil(longest_ms * 1e-3 / inputs.predict_s), 2)
+        return Timing(delay_s, (length - 1) * inputs.step_s)
 
 
 @dataclass(frozen=True)

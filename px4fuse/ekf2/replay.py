@@ -93,6 +93,8 @@ class Ekf2Replay:
         Parts of the flight that were replayed, each started from the log.
     source : str
         Position track that it was fed with.
+    late, lost : int
+        Vision samples that arrived after the horizon had passed them: fused late, and never.
     agreement : Agreement or None
         Of the replay as flown with the log; None only while that is being made.
     """
@@ -104,4 +106,6 @@ class Ekf2Replay:
     published: pd.DataFrame
     stretches: tuple[tuple[float, float], ...]
     source: str
+    late: int = 0
+    lost: int = 0
     agreement: Agreement | None = None
