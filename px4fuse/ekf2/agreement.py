@@ -41,7 +41,7 @@ def agreement_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavai
     """
     ekf2 = flight.ekf2
     assert isinstance(ekf2, Ekf2)
-    logged = _logged(ekf2)
+    logged = logged_innovations(ekf2)
     updates = replay.updates
     judged = judged_from(replay)
     matched = match(replay, ekf2, logged.index.to_numpy()) if len(logged) else np.empty(0, int)
@@ -63,7 +63,7 @@ def agreement_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavai
     )  # fmt: skip
 
 
-def _logged(ekf2: Ekf2) -> pd.DataFrame:
+def logged_innovations(ekf2: Ekf2) -> pd.DataFrame:
     """Innovations, variances and rejections of north and east, one row per logged sample."""
     parts = {}
     for axis in HORIZONTAL:

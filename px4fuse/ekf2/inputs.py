@@ -62,6 +62,7 @@ MIN_STRETCH_S = 10.0
 COPY_INTERVAL_S = {"estimator_visual_odometry_aligned": 0.2, "estimator_aid_src_ev_pos": 0.5}
 # The first release that stamps estimator_states with the time of the horizon
 STAMPED_AT_HORIZON = "PX4 v1.13"
+NO_LIMIT = 1_000_000
 ROTATE_VISION_BIT = 64  # EKF2_AID_MASK, up to v1.13
 
 
@@ -81,6 +82,8 @@ class Rules:
         So many resets in a row, then fusion stops until a sample on which it may start.
     bias_floor : float or None
         Least variance of the accelerometer's bias (m²/s⁴), where the release has one.
+    horizon_by_delay : bool
+        Whether the longest delay makes the horizon; else EKF2_DELAY_MAX does (from v1.15).
     """
 
     start_interval_s: float
@@ -88,6 +91,7 @@ class Rules:
     reset_s: float
     resets: int
     bias_floor: float | None
+    horizon_by_delay: bool
 
 
 @dataclass(frozen=True)
@@ -244,7 +248,12 @@ def prepare(flight: Flight) -> Inputs | Unavailable:
     old = fuses_by_mask(record.parameters)
     floor = 5e-8 / ekf2.step_s**2 if record.per_step_biases else None
     # EV_MAX_INTERVAL, ev_control.cpp; no_aid_timeout_max and reset_timeout_max, common.h
-    rules = Rules(np.inf, 7.0, 7.0, 1_000_000, floor) if old else Rules(0.2, 0.4, 1.0, 5, floor)
+    by_delay = "EKF2_DELAY_MAX" not in record.parameters
+    rules = (
+        Rules(np.inf, 7.0, 7.0, NO_LIMIT, floor, by_delay)
+        if old
+        else Rules(0.2, 0.4, 1.0, 5, floor, by_delay)
+    )
     fusing = ekf2.fusing
     return Inputs(
         settings=settings_in_force(record.parameters),

@@ -22,6 +22,7 @@ from px4fuse.ekf2.output_predictor import follow_attitude, publish
 from px4fuse.ekf2.parameters import check
 from px4fuse.ekf2.recursion import Run, Variant, run, with_correlation
 from px4fuse.ekf2.replay import UPDATE_COLUMNS, Agreement, Ekf2Replay
+from px4fuse.errors import SettingsError
 from px4fuse.flight import STATE_COLUMNS, Flight, Unavailable
 
 Array = NDArray[np.float64]
@@ -121,6 +122,11 @@ def replay_settings(
         A parameter that the model does not have, or a value outside PX4's range.
     """
     changes = [check(change) for change in settings]
+    if model.inputs.rules.horizon_by_delay and any("EKF2_DELAY_MAX" in c for c in changes):
+        raise SettingsError(
+            f"EKF2_DELAY_MAX: {model.flight.log.firmware} has no such parameter; there the longest "
+            "delay makes the horizon."
+        )
     flown = model.inputs.settings
     variants = [Variant({**flown, **change}) for change in changes]
     return tuple(
@@ -205,6 +211,7 @@ def _updates(part: StretchRun, at: int) -> pd.DataFrame:
             done.reset[seen, at],
             after,
             done.velocity_variance_m2_s2[seen + 1, at],
+            done.noise_m2[seen, at],
             part.stretch.time_s[legs.end[seen]],
         ]
     )

@@ -76,6 +76,9 @@ class Variant:
         if not self.timed:
             return Timing(-0.5 * inputs.step_s, inputs.horizon_s)
         delay_s = self.settings["EKF2_EV_DELAY"] * 1e-3
+        if inputs.rules.horizon_by_delay:  # the longest of the delays makes the buffer
+            length = math.ceil(delay_s / inputs.predict_s)
+            return Timing(delay_s, max(inputs.horizon_s, (length - 1) * inputs.step_s))
         longest_ms = self.settings["EKF2_DELAY_MAX"]
         if longest_ms == inputs.settings["EKF2_DELAY_MAX"]:
             return Timing(delay_s, inputs.horizon_s)
@@ -94,6 +97,8 @@ class Run:
         Measurement minus state, north and east; NaN where the event has no sample.
     variance_m2 : ndarray, shape (E, S, 2)
         S = P + R.
+    noise_m2 : ndarray, shape (E, S, 2)
+        R.
     rejected, fused, reset : ndarray of bool, shape (E, S)
     state : ndarray, shape (E + 1, S, 15)
         At the start and after each event.
@@ -105,6 +110,7 @@ class Run:
 
     innovation_m: Array
     variance_m2: Array
+    noise_m2: Array
     rejected: Flags
     fused: Flags
     reset: Flags
@@ -185,6 +191,7 @@ def run(
     out = Run(
         np.full((events, size, 2), np.nan),
         np.full((events, size, 2), np.nan),
+        np.broadcast_to(noise[:, :, :2], (events, size, 2)),
         np.zeros((events, size), bool),
         np.zeros((events, size), bool),
         np.zeros((events, size), bool),

@@ -12,7 +12,7 @@ UPDATE_COLUMNS = [
     "innovation_north_m", "innovation_east_m", "innovation_variance_north_m2",
     "innovation_variance_east_m2", "rejected", "fused", "reset", "position_variance_north_m2",
     "position_variance_east_m2", "velocity_variance_north_m2_s2", "velocity_variance_east_m2_s2",
-    "fused_at_s",
+    "observation_variance_north_m2", "observation_variance_east_m2", "fused_at_s",
 ]  # fmt: skip
 
 
@@ -80,11 +80,11 @@ class Ekf2Replay:
         All parameters of the model in force, by PX4 name, in PX4's units.
     changed : mapping
         Those that differ from the log's on request.
-    updates : DataFrame, shape (m, 12)
+    updates : DataFrame, shape (m, 14)
         Per vision sample, by the time of measurement as EKF2 takes it (stamp - delay - half a
         step): innovation (measurement minus state) and its variance S, north and east; 1 or 0
         whether it was rejected by the gate, fused, or the position reset to it; variances of
-        position and velocity after it; and the end of the step in which that happened.
+        position and velocity after it, R, and the end of the step in which that happened.
     delayed : DataFrame, shape (n, 6)
         Position and velocity at the fusion horizon at the end of each step (m, m/s, NED).
     published : DataFrame, shape (n, 6)
