@@ -40,26 +40,27 @@ MAX_LATE_S = 0.1
 IDLE, FUSE, START = 0, 1, 2
 
 
+# Columns of what acts within a leg: attitude error, gyro bias and accelerometer bias at its
+# beginning, the correction of the nominal attitude, and gravity with the specific force
+CAUSES = 11
+TURN, INPUT = 9, 10
+
+
 @dataclass(frozen=True)
 class Transitions:
-    """From the beginning of its leg to each step's end; all of shape (n, 3, 3) or (n, 3).
+    """From the beginning of its leg to each step's end.
 
-    ``v_theta`` is ∂v/∂δθ and so on; ``*_turn`` is what the correction of the nominal attitude
-    does, ``*_input`` what gravity and specific force do.
+    Attributes
+    ----------
+    elapsed_s : ndarray, shape (n,)
+    attitude, velocity, position : ndarray, shape (n, 3, 11)
+        What the causes have done to each.
     """
 
     elapsed_s: Array
-    theta_gyro: Array
-    v_theta: Array
-    v_gyro: Array
-    p_theta: Array
-    p_gyro: Array
-    p_accelerometer: Array
-    theta_turn: Array
-    v_turn: Array
-    p_turn: Array
-    v_input: Array
-    p_input: Array
+    attitude: Array
+    velocity: Array
+    position: Array
 
 
 @dataclass(frozen=True)
@@ -135,29 +136,28 @@ def make_legs(inputs: Inputs, stretch: Stretch, timing: Timing) -> Legs:
     end = events.end
     start = np.concatenate([[0], end[:-1]])
     within = _transitions(stretch, start, end)
-    gyro, accelerometer = _noises(stretch, start, end)
     last = np.maximum(end - 1, 0)
     count = len(end)
     transition = np.tile(np.eye(STATES), (count, 1, 1))
     turn, drive = np.zeros((count, STATES)), np.zeros((count, STATES))
     moved = end > start
     at = last[moved]
-    for rows, columns, part in (
-        (THETA, GYRO_BIAS, within.theta_gyro),
-        (VELOCITY, THETA, within.v_theta),
-        (VELOCITY, GYRO_BIAS, within.v_gyro),
-        (VELOCITY, ACCELEROMETER_BIAS, within.theta_gyro),
-        (POSITION, THETA, within.p_theta),
-        (POSITION, GYRO_BIAS, within.p_gyro),
-        (POSITION, ACCELEROMETER_BIAS, within.p_accelerometer),
+    for rows, part in (
+        (THETA, within.attitude),
+        (VELOCITY, within.velocity),
+        (POSITION, within.position),
     ):
-        transition[moved, rows, columns] = part[at]
+        transition[moved, rows, THETA] = part[at, :, 0:3]
+        transition[moved, rows, GYRO_BIAS] = part[at, :, 3:6]
+        transition[moved, rows, ACCELEROMETER_BIAS] = part[at, :, 6:9]
+        turn[moved, rows] = part[at, :, TURN]
+        drive[moved, rows] = part[at, :, INPUT]
     transition[moved, POSITION, VELOCITY] = within.elapsed_s[at, None, None] * np.eye(3)
-    turn[moved, THETA] = within.theta_turn[at]
-    turn[moved, VELOCITY] = within.v_turn[at]
-    turn[moved, POSITION] = within.p_turn[at]
-    drive[moved, VELOCITY] = within.v_input[at]
-    drive[moved, POSITION] = within.p_input[at]
+    gyro, accelerometer = _noises(
+        (end - start).astype(np.float64),
+        stretch.time_s[end] - stretch.time_s[start],
+        transition[:, VELOCITY, THETA],
+    )
     return Legs(
         **vars(events),
         transition=transition,
@@ -250,105 +250,63 @@ def _actions(
 def _transitions(stretch: Stretch, start: Indices, end: Indices) -> Transitions:
     """One step of every leg at a time, from its first on."""
     n = len(stretch.step_s)
-    dt = stretch.step_s
-    force = np.einsum("nij,nj->ni", stretch.rotation[1:], stretch.force_m_s2)
-    tilt = -skew(force) * dt[:, None, None]  # ∂v/∂δθ of a step
-    turned = -stretch.rotation[1:] * dt[:, None, None]  # ∂δθ/∂b_g and ∂v/∂b_a of a step
-    gain = (force + GRAVITY_M_S2) * dt[:, None]
-    leg = np.full(n, -1, dtype=np.intp)
-    length = end - start
-    covered = int(end[-1]) if len(end) else 0
-    leg[:covered] = np.repeat(np.arange(len(end)), length)
-    # steps after the last event are a leg of their own
-    first = np.append(start, covered)
-    leg[covered:] = len(end)
-    place = np.arange(n) - first[leg]
-    order = np.argsort(place, kind="stable")
-    rank_ends = np.cumsum(np.bincount(place, minlength=1))
-    made = {
-        name: np.zeros((n, 3, 3))
-        for name in ("theta_gyro", "v_theta", "v_gyro", "p_theta", "p_gyro", "p_accelerometer")
-    } | {name: np.zeros((n, 3)) for name in ("theta_turn", "v_turn", "p_turn", "v_input", "p_input")}
-    elapsed = np.zeros(n)
-    low = 0
-    for rank, high in enumerate(rank_ends.tolist()):
-        k = order[low:high]
-        low = high
-        m, t = tilt[k], dt[k, None]
-        h = 0.5 * dt[k, None, None]
-        if rank == 0:
-            elapsed[k] = dt[k]
-            made["theta_gyro"][k] = turned[k]
-            made["v_theta"][k] = m
-            made["p_theta"][k] = h * m
-            made["p_accelerometer"][k] = h * turned[k]
-            made["theta_turn"][k] = -stretch.correction_rad[k]
-            made["v_input"][k] = gain[k]
-            made["p_input"][k] = 0.5 * t * gain[k]
-            continue
-        was = {name: values[k - 1] for name, values in made.items()}
-        elapsed[k] = elapsed[k - 1] + dt[k]
-        now = {
-            "theta_gyro": was["theta_gyro"] + turned[k],
-            "v_theta": was["v_theta"] + m,
-            "v_gyro": was["v_gyro"] + m @ was["theta_gyro"],
-            "theta_turn": was["theta_turn"] - stretch.correction_rad[k],
-            "v_turn": was["v_turn"] + np.einsum("nij,nj->ni", m, was["theta_turn"]),
-            "v_input": was["v_input"] + gain[k],
-        }
-        now["p_theta"] = was["p_theta"] + h * (was["v_theta"] + now["v_theta"])
-        now["p_gyro"] = was["p_gyro"] + h * (was["v_gyro"] + now["v_gyro"])
-        # ∂v/∂b_a is the same as ∂δθ/∂b_g
-        now["p_accelerometer"] = was["p_accelerometer"] + h * (
-            was["theta_gyro"] + now["theta_gyro"]
-        )
-        now["p_turn"] = was["p_turn"] + 0.5 * t * (was["v_turn"] + now["v_turn"])
-        now["p_input"] = was["p_input"] + 0.5 * t * (was["v_input"] + now["v_input"])
-        for name, values in now.items():
-            made[name][k] = values
-    return Transitions(elapsed_s=elapsed, **made)
+    first = np.append(start, end[-1] if len(end) else 0)  # after the last event comes one more leg
+    length = np.append(end, n) - first
+    # the first steps of all legs, then their second ones and so on, longer legs before shorter ones
+    longest_first = np.argsort(-length, kind="stable")
+    active = np.searchsorted(-length[longest_first], -np.arange(int(length.max())), side="left")
+    order = np.concatenate([first[longest_first[:count]] + at for at, count in enumerate(active)])
+    dt = stretch.step_s[order][:, None, None]
+    force = np.einsum("nij,nj->ni", stretch.rotation[1:], stretch.force_m_s2)[order]
+    tilt = -skew(force) * dt  # ∂v/∂δθ of a step
+    turned = -stretch.rotation[1:][order] * dt  # ∂δθ/∂b_g and ∂v/∂b_a of a step
+    attitude, velocity, position = np.zeros((3, n, 3, CAUSES))
+    attitude[:, :, 3:6] = turned
+    attitude[:, :, TURN] = -stretch.correction_rad[order]
+    velocity[:, :, 6:9] = turned
+    velocity[:, :, INPUT] = (force + GRAVITY_M_S2) * dt[:, :, 0]
+    elapsed = stretch.step_s[order]
+    low, high = 0, int(active[0])
+    attitude[:high, :, 0:3] = np.eye(3)
+    velocity[:high, :, 0:3] = tilt[:high]
+    position[:high] = 0.5 * dt[:high] * velocity[:high]
+    for count in active[1:].tolist():
+        was, now = slice(low, low + count), slice(high, high + count)
+        velocity[now] += velocity[was] + tilt[now] @ attitude[was]
+        position[now] = position[was] + 0.5 * dt[now] * (velocity[was] + velocity[now])
+        attitude[now] += attitude[was]
+        elapsed[now] += elapsed[was]
+        low, high = high, high + count
+    back = np.empty(n, dtype=np.intp)
+    back[order] = np.arange(n)
+    return Transitions(elapsed[back], attitude[back], velocity[back], position[back])
 
 
-def _noises(stretch: Stretch, start: Indices, end: Indices) -> tuple[Array, Array]:
-    """Covariance at the end of each leg for unit noise of gyro and of accelerometer."""
-    dt = stretch.step_s
-    force = np.einsum("nij,nj->ni", stretch.rotation[:-1], stretch.force_m_s2)
-    tilt = -skew(force) * dt[:, None, None]
-    count = len(end)
-    length = end - start
-    theta = np.zeros((count, 1, 1))
-    vt, vv, pt, pv, pp = (np.zeros((count, 3, 3)) for _ in range(5))
-    a_vv, a_pv, a_pp = (np.zeros(count) for _ in range(3))
-    for rank in range(int(length.max(initial=0))):
-        active = np.flatnonzero(length > rank)
-        k = start[active] + rank
-        d, m = dt[k, None, None], tilt[k]
-        m_t = m.transpose(0, 2, 1)
-        s, v_t, v_v, p_t, p_v = theta[active], vt[active], vv[active], pt[active], pv[active]
-        moved_v_t = v_t + s * m
-        moved_p_t = p_t + d * v_t
-        pp[active] += d * (p_v + p_v.transpose(0, 2, 1)) + d**2 * v_v
-        pv[active] = p_v + d * v_v + moved_p_t @ m_t
-        cross = m @ v_t.transpose(0, 2, 1)
-        vv[active] = v_v + cross + cross.transpose(0, 2, 1) + s * (m @ m_t)
-        vt[active], pt[active], theta[active] = moved_v_t, moved_p_t, s + d**2
-        step = dt[k]
-        a_pp[active] += 2.0 * step * a_pv[active] + step**2 * a_vv[active]
-        a_pv[active] += step * a_vv[active]
-        a_vv[active] += step**2
-    gyro, accelerometer = np.zeros((2, count, STATES, STATES))
+def _noises(steps: Array, duration_s: Array, tilt: Array) -> tuple[Array, Array]:
+    """Covariance at the end of each leg for unit noise of gyro and of accelerometer.
+
+    In closed form, for n equal steps under the leg's mean specific force; unit noise adds dt² to
+    the variance of attitude or velocity in each step. What gyro noise does to velocity and
+    position within a leg is small, so that leading terms do.
+    """
+    n = np.maximum(steps, 1.0)[:, None, None]
+    d = duration_s[:, None, None] / n
+    m = tilt / n  # mean ∂v/∂δθ of a step
+    mm = m @ m.transpose(0, 2, 1)
     eye = np.eye(3)
-    gyro[:, THETA, THETA] = theta * eye
-    for rows, columns, part in (
-        (VELOCITY, THETA, vt),
-        (POSITION, THETA, pt),
-        (POSITION, VELOCITY, pv),
+    gyro, accelerometer = np.zeros((2, len(steps), STATES, STATES))
+    for matrix, rows, columns, part in (
+        (gyro, THETA, THETA, n * d**2 * eye),
+        (gyro, VELOCITY, THETA, m * d**2 * n * (n - 1) / 2),
+        (gyro, POSITION, THETA, m * d**3 * n * (n - 1) * (n - 2) / 6),
+        (gyro, VELOCITY, VELOCITY, mm * d**2 * n * (n - 1) * (2 * n - 1) / 6),
+        (gyro, POSITION, VELOCITY, mm * d**3 * n**4 / 8),
+        (gyro, POSITION, POSITION, mm * d**4 * n**5 / 20),
+        (accelerometer, VELOCITY, VELOCITY, n * d**2 * eye),
+        (accelerometer, POSITION, VELOCITY, d**3 * n * (n - 1) / 2 * eye),
+        (accelerometer, POSITION, POSITION, d**4 * n * (n - 1) * (2 * n - 1) / 6 * eye),
     ):
-        gyro[:, rows, columns] = part
-        gyro[:, columns, rows] = part.transpose(0, 2, 1)
-    gyro[:, VELOCITY, VELOCITY], gyro[:, POSITION, POSITION] = vv, pp
-    accelerometer[:, VELOCITY, VELOCITY] = a_vv[:, None, None] * eye
-    accelerometer[:, POSITION, VELOCITY] = a_pv[:, None, None] * eye
-    accelerometer[:, VELOCITY, POSITION] = a_pv[:, None, None] * eye
-    accelerometer[:, POSITION, POSITION] = a_pp[:, None, None] * eye
+        matrix[:, rows, columns] = part
+        if rows != columns:
+            matrix[:, columns, rows] = part.transpose(0, 2, 1)
     return gyro, accelerometer

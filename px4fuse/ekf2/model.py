@@ -17,7 +17,18 @@ from numpy.typing import NDArray
 
 from px4fuse.ekf2.agreement import agreement_with_log
 from px4fuse.ekf2.inputs import Inputs, Stretch, prepare
-from px4fuse.ekf2.legs import GRAVITY_M_S2, Legs, Timing, make_legs
+from px4fuse.ekf2.legs import (
+    CAUSES,
+    GRAVITY_M_S2,
+    INPUT,
+    POSITION,
+    THETA,
+    TURN,
+    VELOCITY,
+    Legs,
+    Timing,
+    make_legs,
+)
 from px4fuse.ekf2.output_predictor import follow_attitude, publish
 from px4fuse.ekf2.parameters import check
 from px4fuse.ekf2.recursion import Run, Variant, run, with_correlation
@@ -26,6 +37,8 @@ from px4fuse.errors import SettingsError
 from px4fuse.flight import STATE_COLUMNS, Flight, Unavailable
 
 Array = NDArray[np.float64]
+
+MAX_HORIZON_S = 1.0  # EKF2_DELAY_MAX
 
 
 @dataclass(frozen=True)
@@ -223,7 +236,7 @@ def _tracks(inputs: Inputs, part: StretchRun, at: int) -> tuple[pd.DataFrame, pd
     """The filter's state and what it publishes, at each step."""
     stretch, variant = part.stretch, part.variants[at]
     state, reset = delayed_states(part, at)
-    horizon_s = variant.timing(inputs).horizon_s
+    horizon_s = min(variant.timing(inputs).horizon_s, MAX_HORIZON_S)
     lag = max(round(horizon_s / inputs.step_s), 1)
     # the bias that the newest IMU samples are corrected with is the horizon's
     bias = np.concatenate([np.repeat(state[:1, 12:15], lag, axis=0), state[:-lag, 12:15]])
@@ -260,32 +273,20 @@ def delayed_states(part: StretchRun, at: int) -> tuple[Array, Array]:
     reset_m : ndarray, shape (n + 1, 3)
     """
     legs, variant = part.legs[part.which[at]], part.variants[at]
-    steps = np.arange(len(part.stretch.time_s))
-    event = np.searchsorted(legs.end, steps, side="right")
-    begin = np.concatenate([[0], legs.end])[event]
+    count, w = len(part.stretch.step_s), legs.within
     kept = part.run.state[:, at]
-    state = kept[event]
-    moving = np.flatnonzero(steps > begin)
-    k, w = moving - 1, legs.within
-    theta, velocity, position = (kept[event[moving], i : i + 3] for i in (0, 3, 6))
-    gyro, force = (kept[event[moving], i : i + 3] for i in (9, 12))
-    turns = 1.0 if variant.attitude else 0.0
-
-    def times(matrix: Array, vector: Array) -> Array:
-        product: Array = np.einsum("nij,nj->ni", matrix[k], vector)
-        return product
-
-    elapsed = w.elapsed_s[k, None]
-    state[moving, 0:3] = theta + times(w.theta_gyro, gyro) + turns * w.theta_turn[k]
-    state[moving, 3:6] = (
-        velocity + w.v_input[k] + turns * w.v_turn[k]
-        + times(w.v_theta, theta) + times(w.v_gyro, gyro) + times(w.theta_gyro, force)
-    )  # fmt: skip
-    state[moving, 6:9] = (
-        position + elapsed * velocity + w.p_input[k] + turns * w.p_turn[k]
-        + times(w.p_theta, theta) + times(w.p_gyro, gyro) + times(w.p_accelerometer, force)
-    )  # fmt: skip
-    reset = np.zeros((len(steps), 3))
+    was = kept[np.searchsorted(legs.end, np.arange(count), side="right")]
+    causes = np.empty((count, CAUSES))
+    causes[:, 0:3], causes[:, 3:9] = was[:, THETA], was[:, 9:15]
+    causes[:, TURN] = 1.0 if variant.attitude else 0.0
+    causes[:, INPUT] = 1.0
+    state = np.concatenate([kept[:1], was])
+    state[1:, THETA] = np.einsum("nij,nj->ni", w.attitude, causes)
+    state[1:, VELOCITY] += np.einsum("nij,nj->ni", w.velocity, causes)
+    state[1:, POSITION] += w.elapsed_s[:, None] * was[:, VELOCITY]
+    state[1:, POSITION] += np.einsum("nij,nj->ni", w.position, causes)
+    state[legs.end] = kept[1:]
+    reset = np.zeros((count + 1, 3))
     for e in np.flatnonzero(part.run.reset[:, at]):
         # measured position minus the state before: the innovation itself
         reset[legs.end[e] :, :2] += part.run.innovation_m[e, at]

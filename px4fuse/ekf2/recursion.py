@@ -41,6 +41,7 @@ MAX_BIAS_SD = 0.1 * 9.80665
 BIAS_RATIO = 0.01
 HEADING, NORTH, EAST, DOWN = 2, 6, 7, 8
 MEASURED = np.array([HEADING, DOWN, NORTH, EAST])
+OWN = np.array([HEADING, DOWN])
 HORIZONTAL = np.array([NORTH, EAST])
 BIASES = np.arange(9, 15)
 FORCE_BIAS = np.arange(12, 15)
@@ -61,20 +62,20 @@ class Variant:
         Whether attitude and gyro bias are states; else the published attitude holds.
     gated : bool
         Whether samples are rejected and positions reset.
-    timed : bool
-        Whether samples count at EKF2's times; else at their stamps.
+    stamp_offset_s : float or None
+        What is added to the stamps; None: samples count when EKF2 takes them to have been measured.
     """
 
     settings: dict[str, float]
     biases: bool = True
     attitude: bool = True
     gated: bool = True
-    timed: bool = True
+    stamp_offset_s: float | None = None
 
     def timing(self, inputs: Inputs) -> Timing:
         """What is taken off the stamps, half a step besides, and how far fusion runs behind."""
-        if not self.timed:
-            return Timing(-0.5 * inputs.step_s, inputs.horizon_s)
+        if self.stamp_offset_s is not None:
+            return Timing(-self.stamp_offset_s - 0.5 * inputs.step_s, np.inf)
         delay_s = self.settings["EKF2_EV_DELAY"] * 1e-3
         if inputs.rules.horizon_by_delay:  # the longest of the delays makes the buffer
             length = math.ceil(delay_s / inputs.predict_s)
@@ -152,13 +153,11 @@ def run(
     steps = np.stack([leg.steps for leg in legs], axis=1)[:, :, None]
     times = np.stack([stretch.time_s[leg.end] for leg in legs], axis=1)
     startable = np.stack([leg.startable for leg in legs], axis=1)[:, which]
-    down, heading, heading_variance, down_variance = (
+    own, own_variance = (
         np.stack([part[leg.end] for leg in legs], axis=1)
         for part in (
-            stretch.down_m,
-            stretch.attitude_error_rad[:, HEADING],
-            stretch.heading_variance_rad2,
-            stretch.down_variance_m2,
+            np.column_stack([stretch.attitude_error_rad[:, HEADING], stretch.down_m]),
+            np.column_stack([stretch.heading_variance_rad2, stretch.down_variance_m2]),
         )
     )
     actions = np.stack([leg.action for leg in legs], axis=1)[:, which]
@@ -212,10 +211,8 @@ def run(
         P[:, BIASES, BIASES] = spread + (spread < drift_limit) * drift * steps[e][pick]
         if floor is not None:
             _limit_bias(P, floor, biases)
-        innovation[:, 0] = heading[e][pick] - x[:, HEADING]
-        innovation[:, 1] = down[e][pick] - x[:, DOWN]
-        R[:, 0] = _down_to(P[:, HEADING, HEADING], heading_variance[e][pick])
-        R[:, 1] = _down_to(P[:, DOWN, DOWN], down_variance[e][pick])
+        innovation[:, :2] = own[e][pick] - x[:, OWN]
+        R[:, :2] = _down_to(P[:, OWN, OWN], own_variance[e][pick])
         innovation[:, 2:] = 0.0
         R[:, 2:] = NOT_TAKEN
         restart = None
@@ -246,7 +243,7 @@ def run(
         HP = P[:, MEASURED, :]
         K = np.swapaxes(HP, 1, 2) @ np.linalg.inv(HP[:, :, MEASURED] + R[:, :, None] * EYE)
         x = x + (K @ innovation[:, :, None])[:, :, 0]
-        x[:, HEADING] = np.where(attitude, heading[e][pick], 0.0)
+        x[:, HEADING] = np.where(attitude, own[e][pick][:, 0], 0.0)
         P = P - K @ HP
         P = 0.5 * (P + np.swapaxes(P, 1, 2))
         if restart is not None and restart.any():
@@ -304,8 +301,11 @@ def _start(stretch: Stretch, biases: Flags, attitude: Flags) -> tuple[Array, Arr
 
 def _down_to(variance: Array, target: Array) -> Array:
     """Noise of the measurement that brings a variance down to a target: 1/target - 1/variance."""
-    surplus = np.maximum(variance - target, variance * target / NOT_TAKEN)
-    return np.where(surplus > 0.0, variance * target / np.where(surplus > 0.0, surplus, 1.0), NOT_TAKEN)
+    surplus = variance - target
+    noise: Array = np.where(
+        surplus > 0.0, variance * target / np.where(surplus > 0.0, surplus, 1.0), NOT_TAKEN
+    )
+    return noise
 
 
 def _limit_bias(P: Array, floor: float, biases: Flags) -> None:
