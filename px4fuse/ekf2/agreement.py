@@ -6,18 +6,15 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from px4fuse.ekf2.inputs import SETTLING_S
+from px4fuse.ekf2.inputs import AID_SOURCE, SAME_SAMPLE_S, SETTLING_S
 from px4fuse.ekf2.replay import HORIZONTAL, Agreement, AxisAgreement, Ekf2Replay
 from px4fuse.flight import POSITION_COLUMNS, VELOCITY_COLUMNS, Ekf2, Flight, Unavailable
 
 Array = NDArray[np.float64]
 
 MIN_SAMPLES = 20
-# A sample of the aid-source topics carries the time of measurement, one of the older topics that
-# of the step after which it was published, repeated until the next fusion
-SAME_SAMPLE_S = 0.006
+# The older topics repeat a sample until the next fusion, with the time of a later step
 MAX_REPEAT_S = 0.5
-AID_SOURCE = "estimator_aid_src_ev_pos"
 # Measured on simulated flights of v1.13 to main: where the log is complete the correlation is
 # above 0.997 and the median ratio of S within 0.3 %; with a decimated source or with an IMU with
 # dropouts S is off by more than 5 % or the correlation below 0.9 (tests/benchmarks/bench_ekf2.py)

@@ -63,6 +63,11 @@ COPY_INTERVAL_S = {"estimator_visual_odometry_aligned": 0.2, "estimator_aid_src_
 # The first release that stamps estimator_states with the time of the horizon
 STAMPED_AT_HORIZON = "PX4 v1.13"
 NO_LIMIT = 1_000_000
+# The aid-source topics carry the time of measurement, as EKF2 takes it, to about a millisecond
+AID_SOURCE = "estimator_aid_src_ev_pos"
+SAME_SAMPLE_S = 0.006
+# vehicle_local_position is logged every 0.1 s
+RESET_SHOWS_S = 0.2
 ROTATE_VISION_BIT = 64  # EKF2_AID_MASK, up to v1.13
 
 
@@ -105,6 +110,10 @@ class Vision:
         NED.
     variance_m2 : ndarray, shape (m, 3)
         As reported; 0 where the sender gave none.
+    rejected : ndarray, shape (m,)
+        Whether EKF2's gate rejected it, 1 or 0; NaN where the log does not tell.
+    reset : ndarray of bool, shape (m,)
+        Whether EKF2 reset its position to it, where the log tells what it rejected.
     source : str
         Name of the track.
     """
@@ -113,6 +122,8 @@ class Vision:
     arrival_s: Array
     position_m: Array
     variance_m2: Array
+    rejected: Array
+    reset: NDArray[np.bool_]
     source: str
 
 
@@ -305,7 +316,35 @@ def _vision(
         arrival = stamp + np.interp(stamp, age.index.to_numpy(), age.to_numpy())
     else:
         arrival = np.full(len(stamp), -np.inf)  # unknown: never taken to be late
-    return Vision(stamp, arrival, position, variance, track.name)
+    rejected, reset = _decisions(ekf2, record, stamp)
+    return Vision(stamp, arrival, position, variance, rejected, reset, track.name)
+
+
+def _decisions(
+    ekf2: Ekf2, record: FusionRecord, stamp: Array
+) -> tuple[Array, NDArray[np.bool_]]:
+    """What EKF2 rejected and reset to, where its aid-source topic tells, by time of measurement."""
+    rejected, reset = np.full(len(stamp), np.nan), np.zeros(len(stamp), dtype=bool)
+    innovations = ekf2.innovations["north"]
+    if (
+        isinstance(innovations, Unavailable)
+        or isinstance(ekf2.horizon_s, Unavailable)
+        or AID_SOURCE not in ekf2.innovation_topics
+    ):
+        return rejected, reset
+    delay_s = settings_in_force(record.parameters)["EKF2_EV_DELAY"] * 1e-3
+    taken, logged = stamp - delay_s - 0.5 * ekf2.step_s, innovations.index.to_numpy()
+    at = np.clip(np.searchsorted(logged, taken - SAME_SAMPLE_S), 0, len(logged) - 1)
+    same = np.abs(logged[at] - taken) <= SAME_SAMPLE_S
+    rejected[same] = innovations["rejected"].to_numpy()[at[same]]
+    # a reset shows in the first published sample after it, the horizon after the measurement
+    published = taken + ekf2.horizon_s
+    for one in ekf2.resets:
+        before = np.flatnonzero((published <= one.time_s) & (rejected != 0.0))
+        moved = one.quantity == "position" and bool(one.delta[0] or one.delta[1])
+        if moved and len(before) and one.time_s - published[before[-1]] < RESET_SHOWS_S:
+            reset[before[-1]] = True
+    return rejected, reset
 
 
 def _source(flight: Flight) -> PositionTrack | Unavailable:

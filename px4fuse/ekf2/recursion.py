@@ -62,6 +62,9 @@ class Variant:
         Whether attitude and gyro bias are states; else the published attitude holds.
     gated : bool
         Whether samples are rejected and positions reset.
+    as_logged : bool
+        Whether samples are rejected and the position is reset where EKF2 itself did, as far as the
+        log tells.
     stamp_offset_s : float or None
         What is added to the stamps; None: samples count when EKF2 takes them to have been measured.
     """
@@ -70,6 +73,7 @@ class Variant:
     biases: bool = True
     attitude: bool = True
     gated: bool = True
+    as_logged: bool = False
     stamp_offset_s: float | None = None
 
     def timing(self, inputs: Inputs) -> Timing:
@@ -165,6 +169,9 @@ def run(
     actions = np.where(gated, actions, np.where(usable, FUSE, 0))
     measured, noise = _measurements(inputs, stretch, legs, which, knob)
     sampled = usable.any(axis=1)
+    told = inputs.vision.rejected[np.maximum(legs[0].sample, 0)]
+    told_reset = inputs.vision.reset[np.maximum(legs[0].sample, 0)]
+    obeys = np.array([v.as_logged for v in variants])
     gate2 = (np.maximum(knob["EKF2_EVP_GATE"], MIN_GATE) ** 2)[:, None]
     gyro2 = np.where(attitude, knob["EKF2_GYR_NOISE"] ** 2, 0.0)[:, None, None]
     force2 = (knob["EKF2_ACC_NOISE"] ** 2)[:, None, None]
@@ -223,11 +230,18 @@ def run(
             active = action > 0
             nu = measured[e, :, :2] - x[:, HORIZONTAL]
             S = P[:, HORIZONTAL, HORIZONTAL] + noise[e, :, :2]
-            beyond = (nu * nu > gate2 * S).any(axis=1) & gated & (action == FUSE)
+            beyond = (nu * nu > gate2 * S).any(axis=1)
+            if np.isfinite(told[e]):
+                beyond = np.where(obeys, told[e] > 0.0, beyond)
+            beyond &= gated & (action == FUSE)
             taken = (action == FUSE) & ~beyond & ~stopped
             starting = gated & ((action == START) | (stopped & startable[e]))
             failing = beyond & ~stopped & (now - last > inputs.rules.reset_s)
             restart = starting | (failing & (left > 0))
+            if np.isfinite(told[e]) or told_reset[e]:
+                restart = np.where(obeys, gated & told_reset[e], restart)
+                taken &= ~restart
+                failing &= ~obeys
             stopped = (stopped & ~starting) | (failing & (left == 0))
             left = np.where(starting, inputs.rules.resets, left - (failing & (left > 0)))
             last = np.where(taken | restart, now, last)

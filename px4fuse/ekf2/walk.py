@@ -6,7 +6,8 @@ out, and how the result is carried to the present. The mean square difference to
 goes from stage to stage, so that the steps and what is left add up to all of it.
 
 EKF2's small process noise presupposes its bias states: given to a filter without them it makes
-things worse. Therefore the biases come first.
+things worse. Therefore the biases come first. The last replays reject what EKF2 rejected: where it
+rejects much, one sample on the edge of the gate would else lead the model another way.
 """
 
 from __future__ import annotations
@@ -111,7 +112,7 @@ class AxisWalk:
 
 @dataclass(frozen=True)
 class Coast:
-    """The longest run of rejected samples in the replay as flown.
+    """The longest run of rejected samples in flight.
 
     Attributes
     ----------
@@ -184,7 +185,7 @@ def walk(
     tracks = {name: replay.delayed for name, replay in zip(variants, replays, strict=True)}
     if track is not None:
         tracks["student"] = track
-    tracks[OUTPUT] = model.flown.published
+    tracks[OUTPUT] = replays[-1].published
     judged = judged_from(model.flown)
     times = ekf2.state.index.to_numpy()
     inside = settled(times, judged)
@@ -199,7 +200,7 @@ def walk(
         )
     return Walk(
         axes={axis: _axis(model, tracks, axis, times) for axis in HORIZONTAL},
-        coast=_coast(model.flown, tracks[ATTITUDE], judged),
+        coast=_coast(replays[-1], tracks[ATTITUDE], judged),
         tracks=tracks,
         samples=len(times),
     )
@@ -222,7 +223,7 @@ def _variants(model: Model, student: Student) -> dict[str, Variant]:
         BIASES: Variant({**flown, **spread}, attitude=False, gated=False),
         PROCESS: Variant(flown, attitude=False, gated=False),
         ATTITUDE: Variant(flown, gated=False),
-        GATE: Variant(flown),
+        GATE: Variant(flown, as_logged=True),
     }
 
 
