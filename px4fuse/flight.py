@@ -46,8 +46,10 @@ DELAYED_STATE_COLUMNS = [
     *ACCELEROMETER_BIAS_COLUMNS,
 ]  # fmt: skip
 DELAYED_VARIANCE_COLUMNS = [
-    *(f"attitude_{axis}_rad2" for axis in AXIS_NAMES), *VELOCITY_VARIANCE_COLUMNS,
-    *POSITION_VARIANCE_COLUMNS, *(f"{name.removesuffix('_rad_s')}_rad2_s2" for name in GYRO_BIAS_COLUMNS),
+    *(f"attitude_{axis}_rad2" for axis in AXIS_NAMES),
+    *VELOCITY_VARIANCE_COLUMNS,
+    *POSITION_VARIANCE_COLUMNS,
+    *(f"{name.removesuffix('_rad_s')}_rad2_s2" for name in GYRO_BIAS_COLUMNS),
     *(f"{name.removesuffix('_m_s2')}_m2_s4" for name in ACCELEROMETER_BIAS_COLUMNS),
 ]  # fmt: skip
 

@@ -1,13 +1,16 @@
-"""Replay as flown against log: may anything be concluded from replays of this flight?"""
+"""Replay as flown against log: whether anything may be concluded from replays of a flight."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from px4fuse.ekf2.inputs import AID_SOURCE, SAME_SAMPLE_S, SETTLING_S
 from px4fuse.ekf2.replay import HORIZONTAL, Agreement, AxisAgreement, Ekf2Replay
+from px4fuse.ekf2.stretches import SETTLING_S
+from px4fuse.ekf2.vision import AID_SOURCE, SAME_SAMPLE_S
 from px4fuse.flight import POSITION_COLUMNS, VELOCITY_COLUMNS, Ekf2, Flight, Unavailable
 
 Array = NDArray[np.float64]
@@ -21,7 +24,7 @@ MAX_REPEAT_S = 0.5
 MIN_CORRELATION = 0.95
 MAX_S_OFF = 0.05
 # Where EKF2 rejects much, one sample on the edge of the gate decides the next ones: then shares
-# and mean NIS must agree, not single samples
+# and mean NIS must agree, and single samples when the model rejects what EKF2 rejected
 REJECTING_SHARE = 0.1
 MAX_REJECTED_OFF = 0.05
 MAX_NIS_OFF = 0.25
@@ -96,7 +99,8 @@ def match(replay: Ekf2Replay, ekf2: Ekf2, times: Array) -> NDArray[np.intp]:
     fused_at = updates["fused_at_s"].to_numpy()
     at = np.searchsorted(fused_at, times + 1e-4, side="right") - 1
     age = times - fused_at[np.maximum(at, 0)]
-    return np.where((at >= 0) & (age <= MAX_REPEAT_S), at, -1)
+    rows: NDArray[np.intp] = np.where((at >= 0) & (age <= MAX_REPEAT_S), at, -1)
+    return rows
 
 
 def _axis(
@@ -123,14 +127,15 @@ def published_difference(ekf2: Ekf2, replay: Ekf2Replay, column: str) -> Array:
     """Published state, replay minus log, at EKF2's own sample times."""
     times = ekf2.state.index.to_numpy()
     times = times[settled(times, judged_from(replay))]
-    logged = ekf2.state.loc[times, column].to_numpy()
+    logged = at_times(ekf2.state, column, times)
     found: Array = at_times(replay.published, column, times) - logged
     return found
 
 
 def at_times(frame: pd.DataFrame, column: str, times: Array) -> Array:
     """One column of a time-indexed frame, interpolated."""
-    return np.interp(times, frame.index.to_numpy(), frame[column].to_numpy())
+    value: Array = np.interp(times, frame.index.to_numpy(), frame[column].to_numpy())
+    return value
 
 
 def _rms(values: Array) -> float:
@@ -157,11 +162,24 @@ def _verdict(
     off = abs(replayed_share - logged_share)
     nis = max(abs(a.nis_mean_replayed / a.nis_mean_logged - 1.0) for a in axes.values())
     words = (
-        f"{replayed_share:.1%} of the samples are rejected, {logged_share:.1%} in the log, and mean "
-        f"NIS differs by {nis:.0%}"
+        f"{replayed_share:.1%} of the samples are rejected, {logged_share:.1%} in the log, and "
+        f"mean NIS differs by {nis:.0%}"
     )
-    if off <= MAX_REJECTED_OFF and nis <= MAX_NIS_OFF:
-        return True, f"{words}; single samples part, since each rejection decides the next"
-    return False, (
-        f"{words} (at most {MAX_REJECTED_OFF:.0%} and {MAX_NIS_OFF:.0%} are allowed)"
-    )
+    if off > MAX_REJECTED_OFF or nis > MAX_NIS_OFF:
+        return False, f"{words} (at most {MAX_REJECTED_OFF:.0%} and {MAX_NIS_OFF:.0%} are allowed)"
+    return True, f"{words}; single samples part, since each rejection decides the next"
+
+
+def with_obedient(agreement: Agreement, obedient: Agreement) -> Agreement:
+    """The verdict where EKF2 rejects much, given a replay that rejects what EKF2 rejected.
+
+    Parameters
+    ----------
+    agreement, obedient : Agreement
+        Of the replay by its own gate, and of the other.
+    """
+    worst = min(axis.innovation_correlation for axis in obedient.axes.values())
+    with_them = f"with EKF2's own rejections the innovations correlate by {worst:.3f}"
+    if worst >= MIN_CORRELATION:
+        return replace(agreement, reason=f"{agreement.reason}; {with_them} or better")
+    return replace(agreement, good=False, reason=f"{with_them} only (at least {MIN_CORRELATION:g})")

@@ -20,8 +20,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from px4fuse.ekf2.inputs import Inputs, Stretch
+from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.rotation import skew
+from px4fuse.ekf2.stretches import Stretch
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -36,6 +37,8 @@ MAX_LEG_S = 0.25
 # A sample that is this much older than the horizon when it arrives is never fused
 # (RingBuffer.h, pop_first_older_than)
 MAX_LATE_S = 0.1
+# From this on a sample is called late: 3 cm at 1 m/s
+LATE_S = 0.03
 # What a sample does when it is fused: nothing, correct the state, or start with a reset
 IDLE, FUSE, START = 0, 1, 2
 
@@ -170,9 +173,7 @@ def make_legs(inputs: Inputs, stretch: Stretch, timing: Timing) -> Legs:
     )
 
 
-def _events(
-    inputs: Inputs, stretch: Stretch, timing: Timing
-) -> _Events:
+def _events(inputs: Inputs, stretch: Stretch, timing: Timing) -> _Events:
     vision = inputs.vision
     first = int(np.searchsorted(vision.stamp_s, stretch.time_s[0]))
     beyond = int(np.searchsorted(vision.stamp_s, stretch.time_s[-1]))
@@ -186,7 +187,7 @@ def _events(
     end = np.minimum(end, len(stretch.time_s) - 1)
     end = np.maximum.accumulate(end)
     in_time = stretch.time_s[end] < taken + MAX_LATE_S
-    late = usable & in_time & (due - taken > inputs.step_s)
+    late = usable & in_time & (due - taken > LATE_S)
     lost = usable & ~in_time
     usable &= in_time
     usable[:-1] &= end[1:] > end[:-1]  # of two samples in one step the newer one is fused
@@ -223,7 +224,7 @@ def _actions(
     end: Indices,
     usable: Flags,
 ) -> tuple[Indices, Flags]:
-    """What each sample does, and whether fusion may start on it, by the rules that start and stop fusion (ev_control.cpp)."""
+    """What each sample does, and whether fusion may start on it (ev_control.cpp)."""
     rules = inputs.rules
     action = np.full(len(taken_s), IDLE, dtype=np.intp)
     startable = np.zeros(len(taken_s), dtype=bool)
@@ -233,9 +234,7 @@ def _actions(
     interval = np.diff(taken_s[popped], prepend=taken_s[popped[0]])
     startable[popped] = interval < rules.start_interval_s
     # the last step before this sample was fused, and how old the sample before was then
-    silence = stretch.time_s[end[popped] - 1] - np.concatenate(
-        [[np.inf], taken_s[popped[:-1]]]
-    )
+    silence = stretch.time_s[end[popped] - 1] - np.concatenate([[np.inf], taken_s[popped[:-1]]])
     running = True  # a stretch begins while EKF2 fuses
     for at, (gap, silent) in enumerate(zip(interval.tolist(), silence.tolist(), strict=True)):
         running = running and not silent > rules.stop_s

@@ -15,8 +15,8 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from px4fuse.ekf2.agreement import agreement_with_log
-from px4fuse.ekf2.inputs import Inputs, Stretch, prepare
+from px4fuse.ekf2.agreement import REJECTING_SHARE, agreement_with_log, with_obedient
+from px4fuse.ekf2.inputs import Inputs, prepare
 from px4fuse.ekf2.legs import (
     CAUSES,
     GRAVITY_M_S2,
@@ -33,6 +33,7 @@ from px4fuse.ekf2.output_predictor import follow_attitude, publish
 from px4fuse.ekf2.parameters import check
 from px4fuse.ekf2.recursion import Run, Variant, run, with_correlation
 from px4fuse.ekf2.replay import UPDATE_COLUMNS, Agreement, Ekf2Replay
+from px4fuse.ekf2.stretches import Stretch
 from px4fuse.errors import SettingsError
 from px4fuse.flight import STATE_COLUMNS, Flight, Unavailable
 
@@ -115,6 +116,13 @@ def open_model(flight: Flight) -> Model | Unavailable:
     agreement = agreement_with_log(flight, flown)
     if isinstance(agreement, Unavailable):
         return agreement
+    share = max(agreement.rejected_share_logged, agreement.rejected_share_replayed)
+    if agreement.good and share > REJECTING_SHARE and np.isfinite(inputs.vision.rejected).any():
+        variant = Variant(inputs.settings, as_logged=True)
+        obedient = _assemble(inputs, run_variants(inputs, [variant], {timing: legs}), 0, {})
+        obeyed = agreement_with_log(flight, obedient)
+        if isinstance(obeyed, Agreement):
+            agreement = with_obedient(agreement, obeyed)
     return Model(flight, inputs, legs, replace(flown, agreement=agreement), agreement)
 
 

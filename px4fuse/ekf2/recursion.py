@@ -9,21 +9,24 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from px4fuse.ekf2.inputs import Inputs, Stretch
+from px4fuse.ekf2.inputs import Inputs, Rules
 from px4fuse.ekf2.legs import (
     ACCELEROMETER_BIAS,
     FUSE,
     GYRO_BIAS,
+    IDLE,
     START,
     STATES,
     THETA,
     Legs,
     Timing,
 )
+from px4fuse.ekf2.stretches import Stretch
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -148,15 +151,12 @@ def run(
     knob = {name: np.array([v.settings[name] for v in variants]) for name in variants[0].settings}
     biases = np.array([v.biases for v in variants])
     attitude = np.array([v.attitude for v in variants])
-    gated = np.array([v.gated for v in variants])
     pick = which if len(legs) > 1 else slice(None)
     transition, turn, drive, gyro_noise, force_noise = (
         np.stack([getattr(leg, name) for leg in legs], axis=1)
         for name in ("transition", "turn", "drive", "gyro_noise", "accelerometer_noise")
     )
     steps = np.stack([leg.steps for leg in legs], axis=1)[:, :, None]
-    times = np.stack([stretch.time_s[leg.end] for leg in legs], axis=1)
-    startable = np.stack([leg.startable for leg in legs], axis=1)[:, which]
     own, own_variance = (
         np.stack([part[leg.end] for leg in legs], axis=1)
         for part in (
@@ -164,36 +164,19 @@ def run(
             np.column_stack([stretch.heading_variance_rad2, stretch.down_variance_m2]),
         )
     )
-    actions = np.stack([leg.action for leg in legs], axis=1)[:, which]
-    usable = np.stack([leg.usable for leg in legs], axis=1)[:, which]
-    actions = np.where(gated, actions, np.where(usable, FUSE, 0))
     measured, noise = _measurements(inputs, stretch, legs, which, knob)
-    sampled = usable.any(axis=1)
-    told = inputs.vision.rejected[np.maximum(legs[0].sample, 0)]
-    told_reset = inputs.vision.reset[np.maximum(legs[0].sample, 0)]
-    obeys = np.array([v.as_logged for v in variants])
+    schedule = _schedule(inputs, stretch, legs, which, variants)
+    sampled = (schedule.action > IDLE).any(axis=1)
     gate2 = (np.maximum(knob["EKF2_EVP_GATE"], MIN_GATE) ** 2)[:, None]
     gyro2 = np.where(attitude, knob["EKF2_GYR_NOISE"] ** 2, 0.0)[:, None, None]
     force2 = (knob["EKF2_ACC_NOISE"] ** 2)[:, None, None]
-    drift = np.repeat(
-        np.stack(
-            [
-                attitude * (knob["EKF2_GYR_B_NOISE"] * inputs.step_s) ** 2,
-                biases * (knob["EKF2_ACC_B_NOISE"] * inputs.step_s) ** 2,
-            ],
-            axis=-1,
-        ),
-        3,
-        axis=-1,
-    )
-    drift_limit = np.repeat(
-        np.stack([knob["EKF2_GYR_NOISE"] ** 2, knob["EKF2_ACC_NOISE"] ** 2], axis=-1), 3, axis=-1
-    )
+    drift, drift_limit = _drift(inputs, knob, biases, attitude)
     floor = inputs.rules.bias_floor
     x, P = _start(stretch, biases, attitude)
     turns = attitude[:, None].astype(np.float64)
-    last = np.full(size, stretch.time_s[0])
-    stopped, left = np.zeros(size, bool), np.full(size, inputs.rules.resets)
+    fusion = _Fusion(
+        np.full(size, stretch.time_s[0]), np.zeros(size, bool), np.full(size, inputs.rules.resets)
+    )
     out = Run(
         np.full((events, size, 2), np.nan),
         np.full((events, size, 2), np.nan),
@@ -226,25 +209,11 @@ def run(
         if inputs.vision_height:
             R[:, 1] = NOT_TAKEN
         if sampled[e]:
-            action, now = actions[e], times[e][which]
-            active = action > 0
+            active = schedule.action[e] > IDLE
             nu = measured[e, :, :2] - x[:, HORIZONTAL]
             S = P[:, HORIZONTAL, HORIZONTAL] + noise[e, :, :2]
-            beyond = (nu * nu > gate2 * S).any(axis=1)
-            if np.isfinite(told[e]):
-                beyond = np.where(obeys, told[e] > 0.0, beyond)
-            beyond &= gated & (action == FUSE)
-            taken = (action == FUSE) & ~beyond & ~stopped
-            starting = gated & ((action == START) | (stopped & startable[e]))
-            failing = beyond & ~stopped & (now - last > inputs.rules.reset_s)
-            restart = starting | (failing & (left > 0))
-            if np.isfinite(told[e]) or told_reset[e]:
-                restart = np.where(obeys, gated & told_reset[e], restart)
-                taken &= ~restart
-                failing &= ~obeys
-            stopped = (stopped & ~starting) | (failing & (left == 0))
-            left = np.where(starting, inputs.rules.resets, left - (failing & (left > 0)))
-            last = np.where(taken | restart, now, last)
+            outside = (nu * nu > gate2 * S).any(axis=1)
+            beyond, taken, restart, fusion = _decide(inputs.rules, schedule, e, outside, fusion)
             out.innovation_m[e] = np.where(active[:, None], nu, np.nan)
             out.variance_m2[e] = np.where(active[:, None], S, np.nan)
             out.rejected[e], out.fused[e], out.reset[e] = beyond, taken, restart
@@ -269,6 +238,94 @@ def run(
         _keep(out, e + 1, x, P)
     out.covariance[:] = P
     return out
+
+
+@dataclass(frozen=True)
+class _Schedule:
+    """What the clock and the variants decide beforehand, by event and variant."""
+
+    action: NDArray[np.intp]
+    startable: Flags
+    time_s: Array
+    gated: Flags
+    obeys: Flags
+    told: Array
+    told_reset: Flags
+
+
+@dataclass(frozen=True)
+class _Fusion:
+    """Of each variant: time of the last fusion, whether fusion has stopped, resets left."""
+
+    last_s: Array
+    stopped: Flags
+    left: NDArray[np.intp]
+
+
+def _schedule(
+    inputs: Inputs,
+    stretch: Stretch,
+    legs: Sequence[Legs],
+    which: NDArray[np.intp],
+    variants: Sequence[Variant],
+) -> _Schedule:
+    def stacked(parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
+        return np.stack(parts, axis=1)[:, which]
+
+    gated = np.array([v.gated for v in variants])
+    usable = np.where(stacked([leg.usable for leg in legs]), FUSE, IDLE)
+    sample = np.maximum(legs[0].sample, 0)
+    return _Schedule(
+        action=np.where(gated, stacked([leg.action for leg in legs]), usable),
+        startable=stacked([leg.startable for leg in legs]),
+        time_s=stacked([stretch.time_s[leg.end] for leg in legs]),
+        gated=gated,
+        obeys=np.array([v.as_logged for v in variants]),
+        told=inputs.vision.rejected[sample],
+        told_reset=inputs.vision.reset[sample],
+    )
+
+
+def _decide(
+    rules: Rules, schedule: _Schedule, e: int, outside: Flags, fusion: _Fusion
+) -> tuple[Flags, Flags, Flags, _Fusion]:
+    """Which variants reject a sample, fuse it, or reset their position to it.
+
+    As updateEvPosFusion and startEvPosFusion (``ev_pos_control.cpp``): after a time without fusion
+    a reset, some of them in a row, then a stop until a sample on which fusion may start.
+    """
+    action, gated, obeys = schedule.action[e], schedule.gated, schedule.obeys
+    now, told, told_reset = schedule.time_s[e], schedule.told[e], schedule.told_reset[e]
+    known = bool(np.isfinite(told))
+    beyond = np.where(obeys & known, told > 0.0, outside) & gated & (action == FUSE)
+    taken = (action == FUSE) & ~beyond & ~fusion.stopped
+    starting = gated & ((action == START) | (fusion.stopped & schedule.startable[e]))
+    failing = beyond & ~fusion.stopped & (now - fusion.last_s > rules.reset_s)
+    restart = starting | (failing & (fusion.left > 0))
+    if known or told_reset:
+        restart = np.where(obeys, gated & told_reset, restart)
+        taken &= ~restart
+        failing &= ~obeys
+    return (
+        beyond,
+        taken,
+        restart,
+        _Fusion(
+            np.where(taken | restart, now, fusion.last_s),
+            (fusion.stopped & ~starting) | (failing & (fusion.left == 0)),
+            np.where(starting, rules.resets, fusion.left - (failing & (fusion.left > 0))),
+        ),
+    )
+
+
+def _drift(
+    inputs: Inputs, knob: dict[str, Array], biases: Flags, attitude: Flags
+) -> tuple[Array, Array]:
+    """Variance that the biases gain per step, and the variance at which they stop gaining."""
+    gyro = attitude * (knob["EKF2_GYR_B_NOISE"] * inputs.step_s) ** 2
+    force = biases * (knob["EKF2_ACC_B_NOISE"] * inputs.step_s) ** 2
+    limit = np.stack([knob["EKF2_GYR_NOISE"] ** 2, knob["EKF2_ACC_NOISE"] ** 2], axis=-1)
+    return np.repeat(np.stack([gyro, force], axis=-1), 3, axis=-1), np.repeat(limit, 3, axis=-1)
 
 
 def with_correlation(inputs: Inputs, stretch: Stretch, legs: Legs) -> Stretch:

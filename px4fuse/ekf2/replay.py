@@ -7,7 +7,9 @@ from dataclasses import dataclass
 
 import pandas as pd
 
-HORIZONTAL = ("north", "east")
+from px4fuse.flight import AxisName
+
+HORIZONTAL: tuple[AxisName, AxisName] = ("north", "east")
 UPDATE_COLUMNS = [
     "innovation_north_m", "innovation_east_m", "innovation_variance_north_m2",
     "innovation_variance_east_m2", "rejected", "fused", "reset", "position_variance_north_m2",
@@ -50,7 +52,8 @@ class Agreement:
     ----------
     axes : mapping from "north" and "east" to AxisAgreement
     samples : int
-        Logged innovations compared, from :data:`~px4fuse.ekf2.inputs.SETTLING_S` after the start.
+        Logged innovations compared, all but those of each stretch's first seconds
+        (:data:`~px4fuse.ekf2.stretches.SETTLING_S`).
     rejected_share_logged, rejected_share_replayed : float
         Of those.
     same_share : float

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import pandas as pd
@@ -232,8 +233,8 @@ def _axis(model: Model, tracks: Mapping[str, pd.DataFrame], axis: str, times: Ar
     assert isinstance(ekf2, Ekf2)
     at = HORIZONTAL.index(axis)
     position, velocity = POSITION_COLUMNS[at], VELOCITY_COLUMNS[at]
-    logged = ekf2.state.loc[times, position].to_numpy()
-    logged_speed = ekf2.state.loc[times, velocity].to_numpy()
+    logged = at_times(ekf2.state, position, times)
+    logged_speed = at_times(ekf2.state, velocity, times)
     stages = ["student", *STEPS]
     where = {name: at_times(tracks[name], position, times) for name in stages}
     square = {name: float(np.mean((where[name] - logged) ** 2)) for name in stages}
@@ -242,7 +243,7 @@ def _axis(model: Model, tracks: Mapping[str, pd.DataFrame], axis: str, times: Ar
         for name in stages
     }
     steps = []
-    for before, name in zip(stages[:-1], stages[1:], strict=True):
+    for before, name in pairwise(stages):
         moved = np.abs(where[name] - where[before])
         most = int(np.argmax(moved))
         steps.append(
@@ -292,7 +293,7 @@ def _coast(
     time = updates["fused_at_s"].to_numpy()
     begin = float(time[starts[longest]])
     end = float(time[min(ends[longest], len(time) - 1)])
-    part = flown.delayed.loc[begin:end]  # type: ignore[misc]
+    part = flown.delayed.loc[begin:end]
     apart = [
         part[column].to_numpy() - at_times(ungated, column, part.index.to_numpy())
         for column in POSITION_COLUMNS[:2]

@@ -153,7 +153,7 @@ def what_if(model: Model, settings: Sequence[Mapping[str, float]]) -> WhatIf | U
         replayed=_of_replay(flight, model.flown, judged),
         whatif=tuple(_of_replay(flight, replay, judged) for replay in replays),
         judged=judged,
-        notes=tuple(note for replay in replays for note in _notes(replay)),
+        notes=tuple(note for replay in replays for note in _notes(model, replay)),
     )
 
 
@@ -216,9 +216,7 @@ def _of_replay(
     )
 
 
-def _of_log(
-    flight: Flight, replay: Ekf2Replay, judged: tuple[tuple[float, float], ...]
-) -> Summary:
+def _of_log(flight: Flight, replay: Ekf2Replay, judged: tuple[tuple[float, float], ...]) -> Summary:
     ekf2 = flight.ekf2
     assert isinstance(ekf2, Ekf2)
     logged = logged_innovations(ekf2)
@@ -229,7 +227,8 @@ def _of_log(
         for reset in ekf2.resets
         if reset.quantity == "position" and (reset.delta[0] or reset.delta[1])
     ]
-    at = np.array([reset.time_s for reset in resets])
+    horizon_s = 0.0 if isinstance(ekf2.horizon_s, Unavailable) else ekf2.horizon_s
+    at = np.array([reset.time_s - horizon_s for reset in resets])
     replayed = int(settled(replay.updates.index.to_numpy(), judged).sum())
     longest: float | Unavailable = Unavailable(
         "longest time without fusion",
@@ -237,7 +236,8 @@ def _of_log(
         "Log estimator_aid_src_ev_pos at full rate.",
     )
     if len(used) > COMPLETE_SHARE * replayed:
-        longest = _longest(used.index[used["rejected"] == 0].to_numpy(), judged)
+        fused = used.index[used["rejected"] == 0].to_numpy()
+        longest = _longest(np.concatenate([fused, at[settled(at, judged)]]), judged)
     return Summary(
         changed={},
         axes={
@@ -280,7 +280,7 @@ def _logged_sigma(
         return ekf2.variance
     times = _judged_times(ekf2.variance, judged)
     column = POSITION_VARIANCE_COLUMNS[HORIZONTAL.index(axis)]
-    return float(np.sqrt(np.median(ekf2.variance.loc[times, column])))
+    return float(np.sqrt(np.median(at_times(ekf2.variance, column, times))))
 
 
 def _sigma(
@@ -318,12 +318,13 @@ def _longest(fused_s: Array, judged: tuple[tuple[float, float], ...]) -> float:
     return float(np.max(np.diff(np.sort(np.concatenate([fused_s, ends])))))
 
 
-def _notes(replay: Ekf2Replay) -> list[str]:
+def _notes(model: Model, replay: Ekf2Replay) -> list[str]:
     if not replay.late and not replay.lost:
         return []
+    remedy = "" if model.inputs.rules.horizon_by_delay else ": raise EKF2_DELAY_MAX"
     said = ", ".join(f"{name}={value:g}" for name, value in replay.changed.items()) or "as flown"
     return [
         f"{said}: {replay.late + replay.lost} of {len(replay.updates) + replay.lost} samples would "
         f"reach EKF2 after its fusion horizon has passed them ({replay.lost} would never be "
-        "fused): raise EKF2_DELAY_MAX"
+        f"fused){remedy}"
     ]

@@ -48,7 +48,9 @@ Array = NDArray[np.float64]
 class Primary(Protocol):
     """Reads a topic from the instance of EKF2 that was primary at each time."""
 
-    def __call__(self, topic: str, *, read: Callable[[int], pd.DataFrame]) -> pd.DataFrame: ...
+    def __call__(self, topic: str, *, read: Callable[[int], pd.DataFrame]) -> pd.DataFrame:
+        """Rows of the primary instance."""
+        ...
 
 
 def read_record(topics: Topics, step_s: float, primary: Primary) -> FusionRecord | Unavailable:
