@@ -128,7 +128,7 @@ class Run:
     covariance: Array
 
 
-def run(
+def run(  # noqa: PLR0915 (one recursion, read from top to bottom)
     inputs: Inputs,
     stretch: Stretch,
     legs: Sequence[Legs],
