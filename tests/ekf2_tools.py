@@ -26,9 +26,7 @@ def step_matrix(stretch: Stretch, k: int, *, trapezoid: bool = True) -> np.ndarr
 
 
 def step_noise(stretch: Stretch, k: int, gyro: float, force: float) -> np.ndarray:
-    return np.diag(
-        np.repeat([gyro**2, force**2, 0.0, 0.0, 0.0], 3) * stretch.step_s[k] ** 2
-    )
+    return np.diag(np.repeat([gyro**2, force**2, 0.0, 0.0, 0.0], 3) * stretch.step_s[k] ** 2)
 
 
 def step_state(stretch: Stretch, k: int, x: np.ndarray) -> np.ndarray:
@@ -37,9 +35,7 @@ def step_state(stretch: Stretch, k: int, x: np.ndarray) -> np.ndarray:
     force = after @ stretch.force_m_s2[k]
     x = x.copy()
     velocity = x[3:6].copy()
-    x[3:6] += (
-        force + GRAVITY_M_S2 - skew(force) @ x[0:3] - after @ x[12:15]
-    ) * dt
+    x[3:6] += (force + GRAVITY_M_S2 - skew(force) @ x[0:3] - after @ x[12:15]) * dt
     x[6:9] += 0.5 * dt * (velocity + x[3:6])
     x[0:3] += -after @ x[9:12] * dt - stretch.correction_rad[k]
     return x

@@ -129,9 +129,7 @@ def test_several_settings_at_once_are_each_alone(model: Model) -> None:
                 getattr(found, part), getattr(alone, part), rtol=0.0, atol=1e-9
             )
         assert dict(found.changed) == change
-    pd.testing.assert_frame_equal(
-        together[3].published, model.flown.published, rtol=0.0, atol=1e-9
-    )
+    pd.testing.assert_frame_equal(together[3].published, model.flown.published, rtol=0.0, atol=1e-9)
 
 
 def test_replay_by_one_call(sample_flight: Flight, model: Model) -> None:

@@ -101,6 +101,9 @@ def prepare(flight: Flight) -> Inputs | Unavailable:  # noqa: PLR0911 (a reason 
     record = ekf2.record
     if isinstance(record, Unavailable):
         return Unavailable(WHAT, record.reason, record.remedy)
+    fused = ekf2.innovations["north"]
+    if isinstance(fused, Unavailable):
+        return Unavailable(WHAT, fused.reason, fused.remedy)
     if record.other_aiding:
         return Unavailable(
             WHAT,

@@ -148,6 +148,8 @@ def replay_settings(
             f"EKF2_DELAY_MAX: {model.flight.log.firmware} has no such parameter; there the longest "
             "delay makes the horizon."
         )
+    if not changes:
+        return ()
     flown = model.inputs.settings
     variants = [Variant({**flown, **change}) for change in changes]
     return tuple(
