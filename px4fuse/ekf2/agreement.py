@@ -53,7 +53,9 @@ def agreement_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavai
             f"{len(log)} logged innovations to compare with are too few (at least {MIN_SAMPLES})",
             "Fly longer on external vision, and record with SDLOG_PROFILE bit 0 (default).",
         )
-    axes = {axis: _axis(axis, log, model, ekf2, replay) for axis in HORIZONTAL}
+    axes: dict[str, AxisAgreement] = {
+        axis: _axis(axis, log, model, ekf2, replay) for axis in HORIZONTAL
+    }
     by_log = log["rejected"].to_numpy() > 0
     by_model = model["rejected"].to_numpy() > 0
     shares = float(by_log.mean()), float(by_model.mean())

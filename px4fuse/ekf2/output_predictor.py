@@ -75,7 +75,8 @@ def _followed(offset: Array, lag: int, step_s: float, tau_s: float) -> Array:
     start = offset[0]
     late = _later(offset - start, lag)
     corrected: Array = lfilter([g + h, -g], [1.0, g + h - 2.0, 1.0 - g], late, axis=0)
-    return corrected + start
+    total: Array = corrected + start
+    return total
 
 
 def _later(values: Array, lag: int) -> Array:

@@ -166,7 +166,7 @@ def run(  # noqa: PLR0915 (one recursion, read from top to bottom)
     )
     measured, noise = _measurements(inputs, stretch, legs, which, knob)
     schedule = _schedule(inputs, stretch, legs, which, variants)
-    sampled = (schedule.action > IDLE).any(axis=1)
+    sampled: Flags = np.any(schedule.action > IDLE, axis=1)
     gate2 = (np.maximum(knob["EKF2_EVP_GATE"], MIN_GATE) ** 2)[:, None]
     gyro2 = np.where(attitude, knob["EKF2_GYR_NOISE"] ** 2, 0.0)[:, None, None]
     force2 = (knob["EKF2_ACC_NOISE"] ** 2)[:, None, None]

@@ -230,7 +230,8 @@ def predict_s(record: FusionRecord) -> float:
 
 
 def _at(series: pd.Series, times: Array) -> Array:
-    return np.interp(times, series.index.to_numpy(), series.to_numpy())
+    values: Array = np.interp(times, series.index.to_numpy(), series.to_numpy())
+    return values
 
 
 def step_ends(interval_s: Array, known: Indices, target_s: float) -> Indices:
