@@ -37,6 +37,22 @@ SPECIFIC_FORCE_COLUMNS = ["forward_m_s2", "right_m_s2", "down_m_s2"]
 ANGULAR_RATE_COLUMNS = ["forward_rad_s", "right_rad_s", "down_rad_s"]
 QUATERNION_COLUMNS = ["w", "x", "y", "z"]
 ROTATION_VARIANCE_COLUMNS = ["forward_rad2", "right_rad2", "down_rad2"]
+# What EKF2's filter holds at its fusion horizon, whatever the PX4 release logs it as
+GYRO_BIAS_COLUMNS = [f"gyro_bias_{axis}_rad_s" for axis in ("forward", "right", "down")]
+ACCELEROMETER_BIAS_COLUMNS = [
+    f"accelerometer_bias_{axis}_m_s2" for axis in ("forward", "right", "down")
+]
+DELAYED_STATE_COLUMNS = [
+    *QUATERNION_COLUMNS, *VELOCITY_COLUMNS, *POSITION_COLUMNS, *GYRO_BIAS_COLUMNS,
+    *ACCELEROMETER_BIAS_COLUMNS,
+]  # fmt: skip
+DELAYED_VARIANCE_COLUMNS = [
+    *(f"attitude_{axis}_rad2" for axis in AXIS_NAMES),
+    *VELOCITY_VARIANCE_COLUMNS,
+    *POSITION_VARIANCE_COLUMNS,
+    *(f"{name.removesuffix('_rad_s')}_rad2_s2" for name in GYRO_BIAS_COLUMNS),
+    *(f"{name.removesuffix('_m_s2')}_m2_s4" for name in ACCELEROMETER_BIAS_COLUMNS),
+]  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -360,6 +376,42 @@ HORIZON_NOT_LOGGED = Unavailable(
 )
 
 
+RECORD_NOT_LOGGED = Unavailable(
+    "EKF2 fusion record",
+    "no estimator_states, EKF2's state at its fusion horizon",
+    "Record a ULog of PX4 v1.12 or newer with SDLOG_PROFILE bit 0 (default), and give it too.",
+)
+
+
+@dataclass(frozen=True)
+class FusionRecord:
+    """What the log tells of the inside of EKF2's filter: where a replay of it starts from.
+
+    Attributes
+    ----------
+    parameters : mapping
+        Every EKF2_ parameter in the log, by PX4 name, in PX4's units, as at the log's start.
+    delayed : DataFrame, shape (n, 31)
+        State and variances at the fusion horizon. ``w, x, y, z`` turns body FRD into NED; velocity
+        and position NED (horizontal position NaN where PX4 keeps it as latitude and longitude);
+        biases of gyro (rad/s) and accelerometer (m/s²), body FRD; then the variances of attitude
+        error about north, east and down, of velocity, position and the biases.
+    per_step_biases : bool
+        Whether this release keeps the biases as increments per prediction (up to v1.14).
+    other_aiding : tuple of str
+        Horizontal aiding besides vision position that EKF2 used at any time.
+    vision_age_s : Series
+        How long after its measurement stamp each external vision sample was published (s), by that
+        stamp; empty where not logged.
+    """
+
+    parameters: Mapping[str, float]
+    delayed: pd.DataFrame
+    per_step_biases: bool
+    other_aiding: tuple[str, ...]
+    vision_age_s: pd.Series
+
+
 @dataclass(frozen=True)
 class Ekf2:
     """EKF2's output, variances and innovations, of the instance that was primary at each time.
@@ -392,6 +444,8 @@ class Ekf2:
     horizon_s : float or Unavailable
         How far its fusion runs behind its output: the state at t knows measurements up to
         t - horizon, carried to t by the IMU.
+    record : FusionRecord or Unavailable
+        The inside of the filter, as far as it is logged.
     """
 
     state: pd.DataFrame
@@ -406,6 +460,7 @@ class Ekf2:
     accelerometer_bias: pd.DataFrame | Unavailable = BIAS_NOT_LOGGED
     step_s: float = EKF2_STEP_S
     horizon_s: float | Unavailable = HORIZON_NOT_LOGGED
+    record: FusionRecord | Unavailable = RECORD_NOT_LOGGED
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from px4fuse.flight import (
     QUATERNION_COLUMNS,
     Ekf2,
     Flight,
+    FusionRecord,
     InputFile,
     PositionTrack,
     Reset,
@@ -135,6 +136,7 @@ def _shifted(flight: Flight, shift_s: float) -> Flight:
             accelerometer_bias=moved(ekf2.accelerometer_bias),
             resets=tuple(Reset(r.time_s + shift_s, r.quantity, r.delta) for r in ekf2.resets),
             instances=tuple((time + shift_s, number) for time, number in ekf2.instances),
+            record=_later_record(ekf2.record, shift_s),
         )
     if isinstance(truth, Truth):
         truth = replace(
@@ -160,6 +162,17 @@ def _shifted(flight: Flight, shift_s: float) -> Flight:
         ekf2=ekf2,
         truth=truth,
         airborne=airborne,
+    )
+
+
+def _later_record(record: FusionRecord | Unavailable, shift_s: float) -> FusionRecord | Unavailable:
+    if isinstance(record, Unavailable):
+        return record
+    age_s = record.vision_age_s
+    return replace(
+        record,
+        delayed=_later(record.delayed, shift_s),
+        vision_age_s=age_s.set_axis(pd.Index(age_s.index.to_numpy() + shift_s, name="time_s")),
     )
 
 

@@ -26,6 +26,7 @@ from px4fuse.flight import (
     Reset,
     Unavailable,
 )
+from px4fuse.readers.px4_fusion_record import read_record
 from px4fuse.readers.px4_topics import (
     ACCELEROMETER_BIAS_STATE,
     AID_SOURCE,
@@ -102,6 +103,7 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
     notes: list[str] = []
     fusing = _read_fusing(topics, instances)
     innovations, innovation_topics = _read_innovations(topics, instances, fusing, notes)
+    primary = partial(of_primary, topics, instances=instances)
     return Ekf2(
         state=state,
         variance=_read_variance(topics, instances),
@@ -115,6 +117,7 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
         accelerometer_bias=_read_accelerometer_bias(topics, instances),
         step_s=_step_s(topics),
         horizon_s=_horizon_s(topics),
+        record=read_record(topics, _step_s(topics), primary),
     )
 
 

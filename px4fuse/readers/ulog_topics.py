@@ -11,7 +11,8 @@ import hashlib
 import io
 import struct
 from bisect import bisect_left
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -66,12 +67,15 @@ class Topics:
     dropped : dict
         Samples dropped for an impossible time stamp, by topic and instance; :meth:`frame` fills
         it.
+    ekf2_parameters : mapping
+        Every EKF2_ parameter, by PX4 name; ``log`` holds only those that enter the results.
     """
 
     log: LogInfo
     tables: dict[tuple[str, int], dict[str, NDArray[Any]]]
     zero_us: int
     dropped: dict[tuple[str, int], int]
+    ekf2_parameters: Mapping[str, float] = field(default_factory=dict)
 
     def instances(self, topic: str) -> list[int]:
         """Instances of a topic that hold data, in order."""
@@ -242,7 +246,12 @@ def read_topics(path: Path) -> Topics:
         notes=notes,
         autopilot=_text(ulog.msg_info_dict, "sys_name", "PX4"),
     )
-    return Topics(log, tables, zero_us, {})
+    parameters = {
+        name: float(value)
+        for name, value in ulog.initial_parameters.items()
+        if name.startswith("EKF2_") and _is_finite(value)
+    }
+    return Topics(log, tables, zero_us, {}, MappingProxyType(parameters))
 
 
 def _tables(ulog: ULog) -> dict[tuple[str, int], dict[str, NDArray[Any]]]:

@@ -1,0 +1,187 @@
+"""Replay as flown against log: whether anything may be concluded from replays of a flight."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from px4fuse.ekf2.replay import HORIZONTAL, Agreement, AxisAgreement, Ekf2Replay
+from px4fuse.ekf2.stretches import SETTLING_S
+from px4fuse.ekf2.vision import AID_SOURCE, SAME_SAMPLE_S
+from px4fuse.flight import POSITION_COLUMNS, VELOCITY_COLUMNS, Ekf2, Flight, Unavailable
+
+Array = NDArray[np.float64]
+
+MIN_SAMPLES = 20
+# The older topics repeat a sample until the next fusion, with the time of a later step
+MAX_REPEAT_S = 0.5
+# Measured on simulated flights of v1.13 to main: where the log is complete the correlation is
+# above 0.997 and the median ratio of S within 0.3 %; with a decimated source or with an IMU with
+# dropouts S is off by more than 5 % or the correlation below 0.9 (tests/benchmarks/bench_ekf2.py)
+MIN_CORRELATION = 0.95
+MAX_S_OFF = 0.05
+# Where EKF2 rejects much, one sample on the edge of the gate decides the next ones: then shares
+# and mean NIS must agree, and single samples when the model rejects what EKF2 rejected
+REJECTING_SHARE = 0.1
+MAX_REJECTED_OFF = 0.05
+MAX_NIS_OFF = 0.25
+
+
+def agreement_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavailable:
+    """Compare a replay as flown with EKF2's logged innovations and published state.
+
+    Parameters
+    ----------
+    flight : Flight
+    replay : Ekf2Replay
+        With the log's own parameters.
+    """
+    ekf2 = flight.ekf2
+    assert isinstance(ekf2, Ekf2)
+    logged = logged_innovations(ekf2)
+    updates = replay.updates
+    judged = judged_from(replay)
+    matched = match(replay, ekf2, logged.index.to_numpy()) if len(logged) else np.empty(0, int)
+    use = (matched >= 0) & settled(logged.index.to_numpy(), judged)
+    log, model = logged[use], updates.iloc[matched[use]]
+    if len(log) < MIN_SAMPLES:
+        return Unavailable(
+            "EKF2 replay",
+            f"{len(log)} logged innovations to compare with are too few (at least {MIN_SAMPLES})",
+            "Fly longer on external vision, and record with SDLOG_PROFILE bit 0 (default).",
+        )
+    axes: dict[str, AxisAgreement] = {
+        axis: _axis(axis, log, model, ekf2, replay) for axis in HORIZONTAL
+    }
+    by_log = log["rejected"].to_numpy() > 0
+    by_model = model["rejected"].to_numpy() > 0
+    shares = float(by_log.mean()), float(by_model.mean())
+    good, reason = _verdict(axes, *shares)
+    return Agreement(
+        axes, len(log), *shares, float(np.mean(by_log == by_model)), good, reason
+    )  # fmt: skip
+
+
+def logged_innovations(ekf2: Ekf2) -> pd.DataFrame:
+    """Innovations, variances and rejections of north and east, one row per logged sample."""
+    parts = {}
+    for axis in HORIZONTAL:
+        frame = ekf2.innovations[axis]
+        if isinstance(frame, Unavailable):
+            return pd.DataFrame()
+        parts[f"innovation_{axis}_m"] = frame["innovation_m"]
+        parts[f"innovation_variance_{axis}_m2"] = frame["innovation_variance_m2"]
+        parts["rejected"] = frame["rejected"]
+    return pd.DataFrame(parts).dropna()
+
+
+def judged_from(replay: Ekf2Replay) -> tuple[tuple[float, float], ...]:
+    """Parts of the replay that are judged: each stretch without its beginning."""
+    return tuple((start + SETTLING_S, end) for start, end in replay.stretches)
+
+
+def settled(times: Array, judged: tuple[tuple[float, float], ...]) -> NDArray[np.bool_]:
+    """Which times lie in one of some spans."""
+    inside = np.zeros(len(times), dtype=bool)
+    for start, end in judged:
+        inside |= (times > start) & (times < end)
+    return inside
+
+
+def match(replay: Ekf2Replay, ekf2: Ekf2, times: Array) -> NDArray[np.intp]:
+    """Row of the replay's updates of each logged innovation; -1 where there is none."""
+    updates = replay.updates
+    if AID_SOURCE in ekf2.innovation_topics:
+        taken = updates.index.to_numpy()
+        at = np.clip(np.searchsorted(taken, times - SAME_SAMPLE_S), 0, len(taken) - 1)
+        return np.where(np.abs(taken[at] - times) <= SAME_SAMPLE_S, at, -1)
+    fused_at = updates["fused_at_s"].to_numpy()
+    at = np.searchsorted(fused_at, times + 1e-4, side="right") - 1
+    age = times - fused_at[np.maximum(at, 0)]
+    rows: NDArray[np.intp] = np.where((at >= 0) & (age <= MAX_REPEAT_S), at, -1)
+    return rows
+
+
+def _axis(
+    axis: str, log: pd.DataFrame, model: pd.DataFrame, ekf2: Ekf2, replay: Ekf2Replay
+) -> AxisAgreement:
+    nu, nu_log = (f[f"innovation_{axis}_m"].to_numpy() for f in (model, log))
+    s, s_log = (f[f"innovation_variance_{axis}_m2"].to_numpy() for f in (model, log))
+    low, middle, high = np.percentile(s / s_log, [5, 50, 95])
+    at = HORIZONTAL.index(axis)
+    return AxisAgreement(
+        innovation_correlation=float(np.corrcoef(nu, nu_log)[0, 1]),
+        innovation_rms_difference_m=_rms(nu - nu_log),
+        s_ratio_median=float(middle),
+        s_ratio_p5=float(low),
+        s_ratio_p95=float(high),
+        nis_mean_logged=float(np.mean(nu_log**2 / s_log)),
+        nis_mean_replayed=float(np.mean(nu**2 / s)),
+        position_rms_difference_m=_rms(published_difference(ekf2, replay, POSITION_COLUMNS[at])),
+        velocity_rms_difference_m_s=_rms(published_difference(ekf2, replay, VELOCITY_COLUMNS[at])),
+    )
+
+
+def published_difference(ekf2: Ekf2, replay: Ekf2Replay, column: str) -> Array:
+    """Published state, replay minus log, at EKF2's own sample times."""
+    times = ekf2.state.index.to_numpy()
+    times = times[settled(times, judged_from(replay))]
+    logged = at_times(ekf2.state, column, times)
+    found: Array = at_times(replay.published, column, times) - logged
+    return found
+
+
+def at_times(frame: pd.DataFrame, column: str, times: Array) -> Array:
+    """One column of a time-indexed frame, interpolated."""
+    value: Array = np.interp(times, frame.index.to_numpy(), frame[column].to_numpy())
+    return value
+
+
+def _rms(values: Array) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def _verdict(
+    axes: dict[str, AxisAgreement], logged_share: float, replayed_share: float
+) -> tuple[bool, str]:
+    for axis, found in axes.items():
+        if abs(found.s_ratio_median - 1.0) > MAX_S_OFF:
+            return False, (
+                f"the replayed innovation variance is {found.s_ratio_median:.2f} of the logged one "
+                f"({axis}; at most {MAX_S_OFF:.0%} off): EKF2 had other samples than the log holds"
+            )
+    worst = min(found.innovation_correlation for found in axes.values())
+    if worst >= MIN_CORRELATION:
+        return True, f"replayed and logged innovations correlate by {worst:.4f} or better"
+    if max(logged_share, replayed_share) < REJECTING_SHARE:
+        return False, (
+            f"replayed and logged innovations correlate by {worst:.2f} only (at least "
+            f"{MIN_CORRELATION:g})"
+        )
+    off = abs(replayed_share - logged_share)
+    nis = max(abs(a.nis_mean_replayed / a.nis_mean_logged - 1.0) for a in axes.values())
+    words = (
+        f"{replayed_share:.1%} of the samples are rejected, {logged_share:.1%} in the log, and "
+        f"mean NIS differs by {nis:.0%}"
+    )
+    if off > MAX_REJECTED_OFF or nis > MAX_NIS_OFF:
+        return False, f"{words} (at most {MAX_REJECTED_OFF:.0%} and {MAX_NIS_OFF:.0%} are allowed)"
+    return True, f"{words}; single samples part, since each rejection decides the next"
+
+
+def with_obedient(agreement: Agreement, obedient: Agreement) -> Agreement:
+    """The verdict where EKF2 rejects much, given a replay that rejects what EKF2 rejected.
+
+    Parameters
+    ----------
+    agreement, obedient : Agreement
+        Of the replay by its own gate, and of the other.
+    """
+    worst = min(axis.innovation_correlation for axis in obedient.axes.values())
+    with_them = f"with EKF2's own rejections the innovations correlate by {worst:.3f}"
+    if worst >= MIN_CORRELATION:
+        return replace(agreement, reason=f"{agreement.reason}; {with_them} or better")
+    return replace(agreement, good=False, reason=f"{with_them} only (at least {MIN_CORRELATION:g})")

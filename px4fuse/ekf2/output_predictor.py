@@ -1,0 +1,108 @@
+"""From the fusion horizon to what EKF2 publishes: its output predictor.
+
+The filter's state is as old as its horizon. The output predictor carries it to the present with the
+IMU and pulls towards it: each step the buffered output of the horizon's time is compared with the
+state, and velocity and position of the whole buffer are corrected by gain · error + 0.1 · gain² ·
+Σ error, gain = step / τ. All of it is linear and the same at every step, so it runs as recursive
+filters over the whole stretch.
+
+Source: PX4-Autopilot ``EKF/output_predictor/output_predictor.cpp`` (``EKF/ekf.cpp`` before v1.14).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import lfilter
+
+Array = NDArray[np.float64]
+
+INTEGRAL_SHARE = 0.1
+ATTITUDE_SHARE = 0.5
+
+
+def publish(
+    *,
+    gain_m_s: Array,
+    step_s: Array,
+    velocity_m_s: Array,
+    position_m: Array,
+    reset_m: Array,
+    lag: int,
+    tau_velocity_s: float,
+    tau_position_s: float,
+) -> tuple[Array, Array]:
+    """Published velocity and position at each step's end.
+
+    Parameters
+    ----------
+    gain_m_s : ndarray, shape (n, k)
+        Velocity gained in each step by the newest IMU samples, gravity removed.
+    step_s : ndarray, shape (n,)
+    velocity_m_s, position_m : ndarray, shape (n + 1, k)
+        The filter's state, by the time that it is of.
+    reset_m : ndarray, shape (n + 1, k)
+        Sum of the position's resets up to each state.
+    lag : int
+        Steps between the horizon and the present.
+    tau_velocity_s, tau_position_s : float
+        EKF2_TAU_VEL and EKF2_TAU_POS.
+
+    Returns
+    -------
+    velocity_m_s, position_m : ndarray, shape (n + 1, k)
+        Before the first comparison, at step ``lag``, dead reckoning from the first state.
+    """
+    mean_step = float(np.mean(step_s))
+    zero = np.zeros((1, gain_m_s.shape[1]))
+    free = velocity_m_s[0] + np.concatenate([zero, np.cumsum(gain_m_s, axis=0)])
+    velocity = free + _followed(velocity_m_s - free, lag, mean_step, tau_velocity_s)
+    # within a step the velocity grows by what the IMU gives; corrections come at its end
+    moved = (velocity[:-1] + 0.5 * gain_m_s) * step_s[:, None]
+    steady = position_m - reset_m  # the buffer is moved along with a reset
+    free = steady[0] + np.concatenate([zero, np.cumsum(moved, axis=0)])
+    position = free + _followed(steady - free, lag, mean_step, tau_position_s)
+    return velocity, position + _later(reset_m, lag)
+
+
+def _followed(offset: Array, lag: int, step_s: float, tau_s: float) -> Array:
+    """Sum of the corrections up to each step that make the output follow the state.
+
+    With e_k = offset_(k-lag) - c_k: c_(k+1) = c_k + g e_k + 0.1 g² Σ e.
+    """
+    g = step_s / np.clip(tau_s, step_s, 10.0)
+    h = INTEGRAL_SHARE * g**2
+    start = offset[0]
+    late = _later(offset - start, lag)
+    corrected: Array = lfilter([g + h, -g], [1.0, g + h - 2.0, 1.0 - g], late, axis=0)
+    total: Array = corrected + start
+    return total
+
+
+def _later(values: Array, lag: int) -> Array:
+    """The same values ``lag`` steps later, the first one before them."""
+    if lag == 0:
+        return values
+    return np.concatenate([np.repeat(values[:1], lag, axis=0), values[:-lag]])[: len(values)]
+
+
+def follow_attitude(error_rad: Array, lag: int, step_s: float, horizon_s: float) -> Array:
+    """How the published attitude follows a difference of the filter's attitude.
+
+    Each step the newest attitude is turned by 0.5 · step / horizon of the error at the horizon.
+
+    Parameters
+    ----------
+    error_rad : ndarray, shape (n + 1, 3)
+        Rotation vectors, by the time that they are of.
+    lag : int
+    step_s, horizon_s : float
+    """
+    share = ATTITUDE_SHARE * step_s / max(horizon_s, step_s)
+    numerator = np.zeros(lag + 2)
+    numerator[-1] = share
+    denominator = np.zeros(lag + 2)
+    denominator[:2] = 1.0, -1.0
+    denominator[-1] += share
+    followed: Array = lfilter(numerator, denominator, error_rad, axis=0)
+    return followed

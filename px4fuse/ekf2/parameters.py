@@ -1,0 +1,104 @@
+"""The parameters of EKF2 that the model knows: PX4's names, defaults, units and ranges.
+
+Source: PX4-Autopilot ``src/modules/ekf2/module.yaml`` and ``params_*.yaml`` (before v1.15
+``ekf2_params.c``), read from v1.12 to main.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from px4fuse.errors import SettingsError
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One parameter of EKF2.
+
+    Attributes
+    ----------
+    unit : str
+    default : float
+        PX4's, from v1.14 on.
+    minimum, maximum : float
+        PX4's range, both ends included.
+    meaning : str
+    """
+
+    unit: str
+    default: float
+    minimum: float
+    maximum: float
+    meaning: str
+
+
+PARAMETERS: Mapping[str, Parameter] = {
+    "EKF2_EVP_NOISE": Parameter("m", 0.1, 0.01, 1e3, "standard deviation of vision position"),
+    "EKF2_EV_NOISE_MD": Parameter("", 0.0, 0.0, 1.0, "1: variances of the sender are not used"),
+    "EKF2_EVP_GATE": Parameter("SD", 5.0, 1.0, 1e3, "gate of the vision position innovation"),
+    "EKF2_EV_DELAY": Parameter("ms", 0.0, 0.0, 300.0, "age of vision at its stamp"),
+    "EKF2_DELAY_MAX": Parameter("ms", 200.0, 0.0, 1e3, "how far fusion may run behind (v1.15)"),
+    "EKF2_EV_POS_X": Parameter("m", 0.0, -math.inf, math.inf, "vision sensor forward of the body"),
+    "EKF2_EV_POS_Y": Parameter("m", 0.0, -math.inf, math.inf, "vision sensor right of the body"),
+    "EKF2_EV_POS_Z": Parameter("m", 0.0, -math.inf, math.inf, "vision sensor below the body"),
+    "EKF2_ACC_NOISE": Parameter("m/s^2", 0.35, 0.01, 1.0, "noise of the accelerometer"),
+    "EKF2_GYR_NOISE": Parameter("rad/s", 0.015, 0.0001, 0.1, "noise of the gyro"),
+    "EKF2_ACC_B_NOISE": Parameter("m/s^3", 0.003, 0.0, 0.01, "drift of the accelerometer's bias"),
+    "EKF2_GYR_B_NOISE": Parameter("rad/s^2", 0.001, 0.0, 0.01, "drift of the gyro's bias"),
+    "EKF2_TAU_POS": Parameter("s", 0.25, 0.1, 1.0, "output predictor, position"),
+    "EKF2_TAU_VEL": Parameter("s", 0.25, 0.0, 1.0, "output predictor, velocity"),
+}
+# Up to v1.13, ekf2_params.c
+OLD_DEFAULTS: Mapping[str, float] = {"EKF2_EV_DELAY": 175.0}
+
+
+def settings_in_force(logged: Mapping[str, float]) -> dict[str, float]:
+    """The model's parameters as the log has them, PX4's defaults where it has none.
+
+    Parameters
+    ----------
+    logged : mapping
+        Parameters of the log, by PX4 name.
+    """
+    defaults = {name: parameter.default for name, parameter in PARAMETERS.items()}
+    if fuses_by_mask(logged):
+        defaults |= OLD_DEFAULTS
+    return {name: float(logged.get(name, default)) for name, default in defaults.items()}
+
+
+def fuses_by_mask(logged: Mapping[str, float]) -> bool:
+    """Whether the release is one that chooses aiding by EKF2_AID_MASK (up to v1.13)."""
+    return "EKF2_AID_MASK" in logged and "EKF2_EV_CTRL" not in logged
+
+
+def check(chosen: Mapping[str, float]) -> dict[str, float]:
+    """The same parameters, each known to the model and within PX4's range.
+
+    Raises
+    ------
+    SettingsError
+        A name that the model does not know, or a value outside PX4's range.
+
+    Examples
+    --------
+    >>> check({"EKF2_EVP_NOISE": 0.2})
+    {'EKF2_EVP_NOISE': 0.2}
+    """
+    for name, value in chosen.items():
+        if name not in PARAMETERS:
+            raise SettingsError(
+                f"{name}: the model of EKF2 does not have this parameter. It knows "
+                f"{', '.join(PARAMETERS)}."
+            )
+        known = PARAMETERS[name]
+        if not known.minimum <= value <= known.maximum or not math.isfinite(value):
+            unit = f" {known.unit}" if known.unit else ""
+            raise SettingsError(
+                f"{name}={value:g} is outside PX4's range, {known.minimum:g} to "
+                f"{known.maximum:g}{unit} (default {known.default:g})."
+            )
+        if name == "EKF2_EV_NOISE_MD" and value not in (0.0, 1.0):
+            raise SettingsError(f"{name}={value:g}: only 0 and 1 have a meaning.")
+    return {name: float(value) for name, value in chosen.items()}

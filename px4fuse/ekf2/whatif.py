@@ -1,0 +1,330 @@
+"""What EKF2 would have done with other parameters: logged, replayed and changed side by side.
+
+All three are judged over the same times, in the same way.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from px4fuse.consistency import nis_band
+from px4fuse.ekf2.agreement import at_times, judged_from, logged_innovations, settled
+from px4fuse.ekf2.model import Model, replay_settings
+from px4fuse.ekf2.parameters import check
+from px4fuse.ekf2.replay import HORIZONTAL, Agreement, Ekf2Replay
+from px4fuse.errors import SettingsError
+from px4fuse.flight import (
+    POSITION_COLUMNS,
+    POSITION_VARIANCE_COLUMNS,
+    Ekf2,
+    Flight,
+    Truth,
+    Unavailable,
+)
+
+Array = NDArray[np.float64]
+
+WHAT = "EKF2 what-if"
+# Below this share of EKF2's samples in the log, gaps between fusions cannot be told from it
+COMPLETE_SHARE = 0.9
+NO_TRUTH = Unavailable(
+    "RMSE to truth",
+    "the log holds no ground truth",
+    "Record motion capture (ATT_POS_MOCAP) beside the position source, or fly in simulation.",
+)
+SWEEP_VALUES = 9
+MAX_SWEEP_VALUES = 200
+
+
+@dataclass(frozen=True)
+class AxisSummary:
+    """One axis of one EKF2.
+
+    Attributes
+    ----------
+    nis_mean : float
+        Of all samples that it tried to fuse, rejected ones included.
+    nis_band : (float, float)
+        Two-sided 95 % band of that mean for a consistent filter.
+    innovation_std_m : float
+    sigma_p_median_m : float or Unavailable
+        Standard deviation of position that it states.
+    position_rmse_to_truth_m : float or Unavailable
+        Of what it publishes.
+    """
+
+    nis_mean: float
+    nis_band: tuple[float, float]
+    innovation_std_m: float
+    sigma_p_median_m: float | Unavailable
+    position_rmse_to_truth_m: float | Unavailable
+
+
+@dataclass(frozen=True)
+class Summary:
+    """One EKF2: as logged, as replayed, or with other parameters.
+
+    Attributes
+    ----------
+    changed : mapping
+        Parameters that differ from those flown.
+    axes : mapping from "north" and "east" to AxisSummary
+    samples : int
+    rejected_share : float
+    longest_without_fusion_s : float or Unavailable
+    resets : int
+        Of horizontal position.
+    late, lost : int
+        Samples that arrived after the fusion horizon had passed them: fused late, and never.
+    """
+
+    changed: Mapping[str, float]
+    axes: Mapping[str, AxisSummary]
+    samples: int
+    rejected_share: float
+    longest_without_fusion_s: float | Unavailable
+    resets: int
+    late: int = 0
+    lost: int = 0
+
+
+@dataclass(frozen=True)
+class WhatIf:
+    """Side by side.
+
+    Attributes
+    ----------
+    agreement : Agreement
+        Of replay and log: what entitles one to believe the rest.
+    logged, replayed : Summary
+        As flown, by the log and by the model.
+    whatif : tuple of Summary
+        With each of the settings.
+    judged : tuple of (float, float)
+        Times that all of them are judged over.
+    notes : tuple of str
+        What to keep in mind, each a sentence.
+    """
+
+    agreement: Agreement
+    logged: Summary
+    replayed: Summary
+    whatif: tuple[Summary, ...]
+    judged: tuple[tuple[float, float], ...]
+    notes: tuple[str, ...]
+
+
+def what_if(model: Model, settings: Sequence[Mapping[str, float]]) -> WhatIf | Unavailable:
+    """What EKF2 would have done with other parameters.
+
+    Parameters
+    ----------
+    model : Model
+    settings : sequence of mapping
+        What each changes, by PX4 name and in PX4's units.
+
+    Returns
+    -------
+    WhatIf or Unavailable
+        Unavailable where the model does not reproduce what was logged.
+
+    Raises
+    ------
+    SettingsError
+        A parameter that the model does not have, or a value outside PX4's range.
+    """
+    checked = [check(change) for change in settings]
+    if not model.agreement.good:
+        return Unavailable(
+            WHAT,
+            f"the model does not reproduce what EKF2 logged: {model.agreement.reason}",
+            "Record without dropouts, with SDLOG_PROFILE 129 (default and vision).",
+        )
+    replays = replay_settings(model, checked)
+    flight, judged = model.flight, judged_from(model.flown)
+    return WhatIf(
+        agreement=model.agreement,
+        logged=_of_log(flight, model.flown, judged),
+        replayed=_of_replay(flight, model.flown, judged),
+        whatif=tuple(_of_replay(flight, replay, judged) for replay in replays),
+        judged=judged,
+        notes=tuple(note for replay in replays for note in _notes(model, replay)),
+    )
+
+
+def sweep_values(name: str, low: float, high: float, count: int = SWEEP_VALUES) -> list[float]:
+    """Values of a parameter from one to another, both included.
+
+    Equal ratios between values above zero, else equal steps.
+
+    Raises
+    ------
+    SettingsError
+        Unknown name, a value outside PX4's range, ends in the wrong order, or a senseless count.
+
+    Examples
+    --------
+    >>> sweep_values("EKF2_EV_DELAY", 0, 200, 3)
+    [0.0, 100.0, 200.0]
+    """
+    check({name: low})
+    check({name: high})
+    if not low < high:
+        raise SettingsError(f"{name}={low:g}:{high:g}: the first value must be the smaller one.")
+    if not 2 <= count <= MAX_SWEEP_VALUES:
+        raise SettingsError(f"{count} values are not between 2 and {MAX_SWEEP_VALUES}.")
+    values = np.geomspace(low, high, count) if low > 0 else np.linspace(low, high, count)
+    values[[0, -1]] = low, high
+    return [float(value) for value in values]
+
+
+def sweep(model: Model, name: str, values: Sequence[float]) -> WhatIf | Unavailable:
+    """What EKF2 would have done with each value of one parameter; see :func:`what_if`."""
+    return what_if(model, [{name: value} for value in values])
+
+
+def _of_replay(
+    flight: Flight, replay: Ekf2Replay, judged: tuple[tuple[float, float], ...]
+) -> Summary:
+    assert isinstance(flight.ekf2, Ekf2)
+    every = replay.updates
+    used = every[settled(every.index.to_numpy(), judged)]
+    times = _judged_times(flight.ekf2.state, judged)
+    fused = used["fused_at_s"][(used["fused"] > 0) | (used["reset"] > 0)]
+    return Summary(
+        changed=replay.changed,
+        axes={
+            axis: _axis(
+                used[f"innovation_{axis}_m"].to_numpy(),
+                used[f"innovation_variance_{axis}_m2"].to_numpy(),
+                _sigma(flight.ekf2, replay, axis, judged),
+                _to_truth(flight, replay.published, axis, times),
+            )
+            for axis in HORIZONTAL
+        },
+        samples=len(used),
+        rejected_share=float(used["rejected"].mean()),
+        longest_without_fusion_s=_longest(fused.to_numpy(), judged),
+        resets=int(used["reset"].sum()),
+        late=replay.late,
+        lost=replay.lost,
+    )
+
+
+def _of_log(flight: Flight, replay: Ekf2Replay, judged: tuple[tuple[float, float], ...]) -> Summary:
+    ekf2 = flight.ekf2
+    assert isinstance(ekf2, Ekf2)
+    logged = logged_innovations(ekf2)
+    used = logged[settled(logged.index.to_numpy(), judged)]
+    times = _judged_times(ekf2.state, judged)
+    resets = [
+        reset
+        for reset in ekf2.resets
+        if reset.quantity == "position" and (reset.delta[0] or reset.delta[1])
+    ]
+    horizon_s = 0.0 if isinstance(ekf2.horizon_s, Unavailable) else ekf2.horizon_s
+    at = np.array([reset.time_s - horizon_s for reset in resets])
+    replayed = int(settled(replay.updates.index.to_numpy(), judged).sum())
+    longest: float | Unavailable = Unavailable(
+        "longest time without fusion",
+        f"the log holds {len(used)} of about {replayed} innovations",
+        "Log estimator_aid_src_ev_pos at full rate.",
+    )
+    if len(used) > COMPLETE_SHARE * replayed:
+        fused = used.index[used["rejected"] == 0].to_numpy()
+        longest = _longest(np.concatenate([fused, at[settled(at, judged)]]), judged)
+    return Summary(
+        changed={},
+        axes={
+            axis: _axis(
+                used[f"innovation_{axis}_m"].to_numpy(),
+                used[f"innovation_variance_{axis}_m2"].to_numpy(),
+                _logged_sigma(ekf2, axis, judged),
+                _to_truth(flight, ekf2.state, axis, times),
+            )
+            for axis in HORIZONTAL
+        },
+        samples=len(used),
+        rejected_share=float(used["rejected"].mean()),
+        longest_without_fusion_s=longest,
+        resets=int(settled(at, judged).sum()),
+    )
+
+
+def _axis(
+    innovation: Array, variance: Array, sigma: float | Unavailable, rmse: float | Unavailable
+) -> AxisSummary:
+    return AxisSummary(
+        nis_mean=float(np.mean(innovation**2 / variance)),
+        nis_band=nis_band(len(innovation)),
+        innovation_std_m=float(np.std(innovation)),
+        sigma_p_median_m=sigma,
+        position_rmse_to_truth_m=rmse,
+    )
+
+
+def _judged_times(frame: pd.DataFrame, judged: tuple[tuple[float, float], ...]) -> Array:
+    times: Array = frame.index.to_numpy()
+    return times[settled(times, judged)]
+
+
+def _logged_sigma(
+    ekf2: Ekf2, axis: str, judged: tuple[tuple[float, float], ...]
+) -> float | Unavailable:
+    if isinstance(ekf2.variance, Unavailable):
+        return ekf2.variance
+    times = _judged_times(ekf2.variance, judged)
+    column = POSITION_VARIANCE_COLUMNS[HORIZONTAL.index(axis)]
+    return float(np.sqrt(np.median(at_times(ekf2.variance, column, times))))
+
+
+def _sigma(
+    ekf2: Ekf2, replay: Ekf2Replay, axis: str, judged: tuple[tuple[float, float], ...]
+) -> float | Unavailable:
+    """Between the samples the variance grows from after one to before the next."""
+    if isinstance(ekf2.variance, Unavailable):
+        return ekf2.variance
+    updates = replay.updates
+    before = updates[f"innovation_variance_{axis}_m2"] - updates[f"observation_variance_{axis}_m2"]
+    after = updates[f"position_variance_{axis}_m2"]
+    at = updates["fused_at_s"].to_numpy()
+    times = np.column_stack([at - 1e-6, at]).ravel()
+    values = np.column_stack([before, after]).ravel()
+    variance = np.interp(_judged_times(ekf2.variance, judged), times, values)
+    return float(np.sqrt(np.median(variance)))
+
+
+def _to_truth(flight: Flight, track: pd.DataFrame, axis: str, times: Array) -> float | Unavailable:
+    """RMSE of a published position, at EKF2's own sample times within the truth's span."""
+    if not isinstance(flight.truth, Truth):
+        return NO_TRUTH
+    truth = flight.truth.samples
+    times = times[(times >= truth.index[0]) & (times <= truth.index[-1])]
+    if not len(times):
+        return NO_TRUTH
+    column = POSITION_COLUMNS[HORIZONTAL.index(axis)]
+    error = at_times(track, column, times) - at_times(truth, column, times)
+    return float(np.sqrt(np.mean(error**2)))
+
+
+def _longest(fused_s: Array, judged: tuple[tuple[float, float], ...]) -> float:
+    """Longest time between two fusions, the ends of what is judged included."""
+    ends = [time for span in judged[:1] for time in span[:1]] + [judged[-1][1]]
+    return float(np.max(np.diff(np.sort(np.concatenate([fused_s, ends])))))
+
+
+def _notes(model: Model, replay: Ekf2Replay) -> list[str]:
+    if not replay.late and not replay.lost:
+        return []
+    remedy = "" if model.inputs.rules.horizon_by_delay else ": raise EKF2_DELAY_MAX"
+    said = ", ".join(f"{name}={value:g}" for name, value in replay.changed.items()) or "as flown"
+    return [
+        f"{said}: {replay.late + replay.lost} of {len(replay.updates) + replay.lost} samples would "
+        f"reach EKF2 after its fusion horizon has passed them ({replay.lost} would never be "
+        f"fused){remedy}"
+    ]

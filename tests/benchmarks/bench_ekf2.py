@@ -1,0 +1,185 @@
+"""How well EKF2's model agrees with the log, what it says of other parameters, and its speed.
+
+Prints the tables; what is not a time is asserted. Flights are those of the further logs, which are
+not part of the project; without them, the sample flight alone.
+
+    python tests/benchmarks/bench_ekf2.py [FOLDER]
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from px4fuse.ekf2.model import Model, open_model, replay_settings
+from px4fuse.ekf2.walk import STEPS, Walk, walk
+from px4fuse.ekf2.whatif import Summary, WhatIf, what_if
+from px4fuse.flight import Flight, Unavailable
+from px4fuse.readers import read_log
+
+REPOSITORY = Path(__file__).parents[2]
+SHARED = REPOSITORY.parent / "shared" / "logs"
+SIMULATED = SHARED / "simulated"
+SAMPLE = REPOSITORY / "sample_logs" / "aisle_uwb.ulg"
+OVERCONFIDENT, OUTLIERS = "overconfident", "nlos"
+
+
+def opened(path: Path) -> Model | Unavailable:
+    return open_model(read_log(path))
+
+
+def agreement_table(paths: list[Path]) -> dict[str, Model]:
+    """Print and judge the agreement of every flight."""
+    models = {}
+    print("flight | n | correlation | rms m | S median (5 to 95 %) | rejected model / log | same")
+    for path in paths:
+        model = opened(path)
+        if isinstance(model, Unavailable):
+            print(f"{path.stem} | {model.reason}")
+            continue
+        models[path.stem] = model
+        a, (north, east) = model.agreement, model.agreement.axes.values()
+        print(
+            f"{path.stem} | {a.samples} | {north.innovation_correlation:.4f}, "
+            f"{east.innovation_correlation:.4f} | {north.innovation_rms_difference_m:.4f}, "
+            f"{east.innovation_rms_difference_m:.4f} | {north.s_ratio_median:.3f} "
+            f"({min(north.s_ratio_p5, east.s_ratio_p5):.3f} to "
+            f"{max(north.s_ratio_p95, east.s_ratio_p95):.3f}) | "
+            f"{a.rejected_share_replayed:.1%} / {a.rejected_share_logged:.1%} | {a.same_share:.1%}"
+        )
+        judge_agreement(path.stem, model)
+    print("\npublished, model - log, rms: position m, velocity m/s (north, east)")
+    for name, model in models.items():
+        north, east = model.agreement.axes.values()
+        print(
+            f"{name} | {north.position_rms_difference_m:.4f}, "
+            f"{east.position_rms_difference_m:.4f} | {north.velocity_rms_difference_m_s:.4f}, "
+            f"{east.velocity_rms_difference_m_s:.4f}"
+        )
+    return models
+
+
+def judge_agreement(name: str, model: Model) -> None:
+    agreement = model.agreement
+    assert agreement.good, (name, agreement.reason)
+    for axis in agreement.axes.values():
+        if OVERCONFIDENT in name:
+            off = agreement.rejected_share_replayed - agreement.rejected_share_logged
+            assert abs(off) < 0.03, name
+            assert abs(axis.nis_mean_replayed / axis.nis_mean_logged - 1.0) < 0.10, name
+            continue
+        least = 0.99 if OUTLIERS in name else 0.995
+        assert axis.innovation_correlation >= least, name
+        assert abs(axis.s_ratio_median - 1.0) < 0.01, name
+        assert axis.s_ratio_p5 > 0.96, name
+        assert axis.s_ratio_p95 < 1.04, name
+        assert agreement.same_share >= 0.99, name
+        if OUTLIERS not in name:
+            old = name.startswith(("v1.13", "v1.14"))
+            assert axis.position_rms_difference_m < (0.02 if old else 0.012), name
+            assert axis.velocity_rms_difference_m_s < 0.015, name
+
+
+def waterfalls(models: dict[str, Model]) -> None:
+    """Print and judge the walk of every flight: shares of the mean square, both axes together."""
+    print("\nwhy EKF2 differs | total rms m | " + " | ".join(STEPS) + " | left")
+    for name, model in models.items():
+        found = walk(model)
+        assert isinstance(found, Walk), found
+        axes = found.axes.values()
+        total = sum(axis.position_total_m2 for axis in axes)
+        bars = [
+            sum(axis.steps[at].position_mean_square_m2 for axis in axes) / total
+            for at in range(len(STEPS))
+        ]
+        left = sum(axis.position_left_m2 for axis in axes) / total
+        print(f"{name} | {np.sqrt(total):.3f} | " + " | ".join(f"{b:.1%}" for b in bars), end="")
+        print(f" | {left:.1%}")
+        assert abs(sum(bars) + left - 1.0) < 1e-9, name
+        assert left < 0.03, name
+
+
+def horizontal_rmse(summary: Summary) -> float:
+    parts = [axis.position_rmse_to_truth_m for axis in summary.axes.values()]
+    assert all(isinstance(part, float) for part in parts)
+    return float(np.hypot(*parts))
+
+
+def counterfactuals(models: dict[str, Model]) -> None:
+    """Print and judge what other parameters would have done, against the truth."""
+    clean = "v1.16.1_aisle_nominal"
+    print("\nwhat if | mean NIS north, east | rejected | RMSE to truth m (as flown)")
+    for name, change in (
+        ("v1.16.1_aisle_overconfident", {"EKF2_EVP_NOISE": 0.1}),
+        ("v1.16.1_aisle_clock_late", {"EKF2_EV_DELAY": 250.0}),
+        ("v1.16.1_aisle_clock_nosync", {"EKF2_EV_DELAY": 250.0}),
+        ("v1.13.3_aisle_evdelay175", {"EKF2_EV_DELAY": 0.0}),
+    ):
+        if name not in models:
+            continue
+        made = what_if(models[name], [change])
+        assert isinstance(made, WhatIf), made
+        (summary,) = made.whatif
+        nis = [axis.nis_mean for axis in summary.axes.values()]
+        rmse = horizontal_rmse(summary)
+        print(
+            f"{name} {change} | {nis[0]:.2f}, {nis[1]:.2f} | {summary.rejected_share:.1%} | "
+            f"{rmse:.3f} ({horizontal_rmse(made.logged):.3f})"
+        )
+        if "EKF2_EVP_NOISE" in change:
+            assert all(0.9 <= value <= 1.1 for value in nis), nis
+            assert summary.rejected_share == 0.0
+        elif clean in models and name.startswith("v1.16"):
+            reference = what_if(models[clean], [])
+            assert isinstance(reference, WhatIf)
+            assert rmse < 1.2 * horizontal_rmse(reference.logged), (name, rmse)
+
+
+def cpu_s(work: Callable[[], object], runs: int = 5) -> float:
+    """Least CPU time over some runs: what else the machine does only adds to it."""
+    took = []
+    for _ in range(runs):
+        start = time.process_time()
+        work()
+        took.append(time.process_time() - start)
+    return min(took)
+
+
+def speed(flight: Flight, model: Model) -> None:
+    """Print CPU times of a two-minute flight, and their growth with its length."""
+    first = cpu_s(lambda: open_model(flight))
+    print(f"\nfirst replay {first:.3f} s of CPU (aim 0.3 s)")
+    count = 10
+    for name, values in (
+        ("EKF2_EVP_NOISE", np.geomspace(0.05, 0.5, count)),
+        ("EKF2_EV_DELAY", np.linspace(5.0, 150.0, count)),
+    ):
+        settings = [{name: float(value)} for value in values]
+        each = cpu_s(lambda settings=settings: replay_settings(model, settings), 3) / count
+        print(f"{count} values of {name}: {each:.4f} s of CPU each (aim 0.03 s)")
+    for share in (0.25, 0.5, 1.0):
+        assert not isinstance(flight.imu, Unavailable)
+        part = replace(flight, imu=flight.imu.iloc[: int(share * len(flight.imu))])
+        print(f"{share:.0%} of the flight: {cpu_s(lambda part=part: open_model(part)):.3f} s")
+
+
+def main(folder: Path) -> None:
+    paths = [SAMPLE]
+    if folder.is_dir():
+        paths = sorted(folder.glob("*.ulg"))
+    models = agreement_table(paths)
+    waterfalls(models)
+    counterfactuals(models)
+    flight = read_log(SAMPLE)
+    model = open_model(flight)
+    assert isinstance(model, Model), model
+    speed(flight, model)
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]) if sys.argv[1:] else SIMULATED)

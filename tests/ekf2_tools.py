@@ -1,0 +1,89 @@
+"""EKF2's model written down plainly, one prediction at a time: the oracle of the fast one."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from px4fuse.ekf2.inputs import Inputs
+from px4fuse.ekf2.legs import GRAVITY_M_S2
+from px4fuse.ekf2.rotation import skew
+from px4fuse.ekf2.stretches import Stretch
+
+EYE = np.eye(15)
+
+
+def step_matrix(stretch: Stretch, k: int, *, trapezoid: bool = True) -> np.ndarray:
+    """∂(state after step k) / ∂(state before); PX4's covariance has no trapezoid."""
+    dt, after = stretch.step_s[k], stretch.rotation[k + 1]
+    F = EYE.copy()
+    F[0:3, 9:12] = -after * dt
+    F[3:6, 0:3] = -skew(after @ stretch.force_m_s2[k]) * dt
+    F[3:6, 12:15] = -after * dt
+    F[6:9, 3:6] = np.eye(3) * dt
+    if trapezoid:  # half of the velocity before, half of that after
+        F[6:9] = EYE[6:9] + 0.5 * dt * (EYE[3:6] + F[3:6])
+    return F
+
+
+def step_noise(stretch: Stretch, k: int, gyro: float, force: float) -> np.ndarray:
+    return np.diag(np.repeat([gyro**2, force**2, 0.0, 0.0, 0.0], 3) * stretch.step_s[k] ** 2)
+
+
+def step_state(stretch: Stretch, k: int, x: np.ndarray) -> np.ndarray:
+    """One prediction of the state, straight from the equations."""
+    dt, after = stretch.step_s[k], stretch.rotation[k + 1]
+    force = after @ stretch.force_m_s2[k]
+    x = x.copy()
+    velocity = x[3:6].copy()
+    x[3:6] += (force + GRAVITY_M_S2 - skew(force) @ x[0:3] - after @ x[12:15]) * dt
+    x[6:9] += 0.5 * dt * (velocity + x[3:6])
+    x[0:3] += -after @ x[9:12] * dt - stretch.correction_rad[k]
+    return x
+
+
+def plain_replay(
+    inputs: Inputs, stretch: Stretch, ends: np.ndarray, samples: np.ndarray, actions: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Innovations and variances of the flight as flown, for a flight without rejections.
+
+    Covariance and state go on at each prediction; every measurement is fused alone.
+    """
+    settings = inputs.settings
+    gyro, force = settings["EKF2_GYR_NOISE"], settings["EKF2_ACC_NOISE"]
+    drift = np.zeros(15)
+    drift[9:12] = settings["EKF2_GYR_B_NOISE"] ** 2
+    drift[12:15] = settings["EKF2_ACC_B_NOISE"] ** 2
+    deviation = np.sqrt(stretch.variance)
+    P = deviation[:, None] * stretch.correlation * deviation
+    x, k = stretch.state.copy(), 0
+    R = settings["EKF2_EVP_NOISE"] ** 2
+    innovations, variances = [], []
+
+    def fuse(i: int, nu: float, noise: float) -> None:
+        nonlocal x, P
+        K = P[:, i] / (P[i, i] + noise)
+        x = x + K * nu
+        P = P - np.outer(K, P[i])
+
+    for end, sample, action in zip(ends, samples, actions, strict=True):
+        while k < end:
+            F = step_matrix(stretch, k, trapezoid=False)
+            x = step_state(stretch, k, x)
+            P = F @ P @ F.T + step_noise(stretch, k, gyro, force)
+            P += np.diag(drift * inputs.step_s**2)
+            k += 1
+        position = inputs.vision.position_m[sample]
+        if action:
+            innovations.append(position[:2] - x[6:8])
+            variances.append([P[6, 6] + R, P[7, 7] + R])
+        for i, value, target in (
+            (2, stretch.attitude_error_rad[end, 2], stretch.heading_variance_rad2[end]),
+            (8, stretch.down_m[end], stretch.down_variance_m2[end]),
+        ):
+            if P[i, i] > target:
+                fuse(i, value - x[i], P[i, i] * target / (P[i, i] - target))
+        if action:
+            for i in (6, 7):
+                fuse(i, position[i - 6] - x[i], R)
+        x[2] = stretch.attitude_error_rad[end, 2]
+    return np.array(innovations), np.array(variances)

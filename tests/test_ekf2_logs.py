@@ -1,0 +1,64 @@
+"""EKF2's model on every further log: agreement, walk and what-if, or why there is none."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+
+from px4fuse.ekf2.model import Model, open_model
+from px4fuse.flight import Unavailable
+from px4fuse.readers import read_log
+
+sys.path.insert(0, str(Path(__file__).parent / "benchmarks"))
+
+import bench_ekf2
+
+pytestmark = pytest.mark.reallogs
+
+NOT_CARRIED = {
+    "v1.16.1_aisle_2hz_stock": "never fused external vision",
+    "v1.16.1_aisle_hwlog": "estimator_aid_src_ev_pos holds one sample in",
+    "v1.16.1_no_uwb": "never fused external vision",
+}
+REAL = {
+    "vladimireganov_ROS_PX4_MOCAP_log_3_2022-6-9-13-01-36": "estimator_visual_odometry_aligned",
+    "vladimireganov_ROS_PX4_MOCAP_min_snap_01": "estimator_visual_odometry_aligned",
+    "vladimireganov_ROS_PX4_MOCAP_square2": "estimator_visual_odometry_aligned",
+    "PX4_flight-review-rs_battery_brownout": "no vehicle_visual_odometry",
+}
+
+
+def test_the_figures_of_the_benchmark_hold_on_every_simulated_flight(shared_logs: Path) -> None:
+    paths = sorted((shared_logs / "simulated").glob("*.ulg"))
+    models = bench_ekf2.agreement_table(paths)
+    assert {path.stem for path in paths} - models.keys() == NOT_CARRIED.keys()
+    bench_ekf2.waterfalls(models)
+    bench_ekf2.counterfactuals(models)
+
+
+@pytest.mark.parametrize("name", NOT_CARRIED)
+def test_a_simulated_flight_that_cannot_carry_the_model_says_why(
+    shared_logs: Path, name: str
+) -> None:
+    found = open_model(read_log(shared_logs / "simulated" / f"{name}.ulg"))
+    assert isinstance(found, Unavailable)
+    assert NOT_CARRIED[name] in found.reason
+
+
+@pytest.mark.parametrize("name", REAL)
+def test_a_real_flight_with_a_copy_of_vision_only_says_so(shared_logs: Path, name: str) -> None:
+    found = open_model(read_log(shared_logs / "real" / f"{name}.ulg"))
+    assert isinstance(found, Unavailable)
+    assert REAL[name] in found.reason
+
+
+def test_a_real_flight_with_dropouts_does_not_agree(shared_logs: Path) -> None:
+    name = "mengchaoheng_PX4_ulog_plottools_hist_6a8cf408_test3.ulg"
+    found = open_model(read_log(shared_logs / "real" / name))
+    assert isinstance(found, Model)
+    assert not found.agreement.good
+    assert "correlate by" in found.agreement.reason
+    for axis in found.agreement.axes.values():
+        assert axis.s_ratio_median == pytest.approx(1.0, abs=0.05)

@@ -1,0 +1,128 @@
+"""EKF2's output predictor against its buffer, step by step, and rotations against SciPy."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from px4fuse.ekf2.output_predictor import follow_attitude, publish
+from px4fuse.ekf2.rotation import (
+    from_vector,
+    interpolate,
+    matrix,
+    multiply,
+    running_product,
+    skew,
+    to_vector,
+)
+
+STEP_S = 0.01
+
+
+def buffered(gain, velocity, position, reset, lag, tau_v, tau_p):
+    """The predictor as PX4 runs it: a buffer whose every entry is corrected at each step."""
+    n, k = gain.shape
+    buffer = [(velocity[0].copy(), position[0].copy())]
+    v, p = buffer[0]
+    out_v, out_p = [v], [p]
+    v_sum, p_sum = np.zeros(k), np.zeros(k)
+    gv, gp = STEP_S / tau_v, STEP_S / tau_p
+    for at in range(1, n + 1):
+        v0 = v
+        v = v + gain[at - 1]
+        p = p + 0.5 * (v0 + v) * STEP_S
+        buffer.append((v, p))
+        if at >= lag:
+            delayed = at - lag
+            moved = reset[delayed] - reset[delayed - 1] if delayed else np.zeros(k)
+            buffer = [(bv, bp + moved) for bv, bp in buffer]
+            old_v, old_p = buffer[-1 - lag]
+            v_error, p_error = velocity[delayed] - old_v, position[delayed] - old_p
+            v_sum, p_sum = v_sum + v_error, p_sum + p_error
+            dv = v_error * gv + v_sum * gv**2 * 0.1
+            dp = p_error * gp + p_sum * gp**2 * 0.1
+            buffer = [(bv + dv, bp + dp) for bv, bp in buffer]
+        buffer = buffer[-(lag + 2) :]
+        v, p = buffer[-1]
+        out_v.append(v)
+        out_p.append(p)
+    return np.array(out_v), np.array(out_p)
+
+
+@pytest.mark.parametrize("lag", [1, 6, 19])
+def test_the_recursive_filters_are_the_buffer(lag: int) -> None:
+    rng = np.random.default_rng(lag)
+    n = 400
+    gain = rng.normal(0.0, 0.02, (n, 2))
+    velocity = np.cumsum(rng.normal(0.0, 0.03, (n + 1, 2)), axis=0) + 0.3
+    position = np.cumsum(velocity * STEP_S, axis=0) + 4.0
+    reset = np.zeros((n + 1, 2))
+    reset[150:] = 0.7, -0.2
+    position += reset
+    made = publish(
+        gain_m_s=gain, step_s=np.full(n, STEP_S), velocity_m_s=velocity, position_m=position,
+        reset_m=reset, lag=lag, tau_velocity_s=0.25, tau_position_s=0.4,
+    )  # fmt: skip
+    expected = buffered(gain, velocity, position, reset, lag, 0.25, 0.4)
+    for found, known in zip(made, expected, strict=True):
+        assert found == pytest.approx(known, abs=1e-9)
+
+
+def test_a_perfect_state_is_published_as_it_is() -> None:
+    n = 500
+    gain = np.tile([0.02, -0.01], (n, 1))
+    steps = np.arange(n + 1)[:, None]
+    velocity = 0.1 + steps * gain[0]
+    position = np.concatenate(
+        [np.zeros((1, 2)), np.cumsum(0.5 * (velocity[1:] + velocity[:-1]) * STEP_S, axis=0)]
+    )
+    out_v, out_p = publish(
+        gain_m_s=gain, step_s=np.full(n, STEP_S), velocity_m_s=velocity, position_m=position,
+        reset_m=np.zeros((n + 1, 2)), lag=19, tau_velocity_s=0.25, tau_position_s=0.25,
+    )  # fmt: skip
+    assert out_v == pytest.approx(velocity, abs=1e-12)
+    assert out_p == pytest.approx(position, abs=1e-12)
+
+
+def test_the_published_attitude_follows_by_half_a_step_per_horizon() -> None:
+    lag, horizon_s = 19, 0.2
+    error = np.zeros((600, 3))
+    error[100:] = 0.01, 0.0, -0.02
+    made = follow_attitude(error, lag, STEP_S, horizon_s)
+    share, expected = 0.5 * STEP_S / horizon_s, np.zeros((600, 3))
+    for k in range(599):
+        late = k - lag
+        behind = error[late] - expected[late] if late >= 0 else np.zeros(3)
+        expected[k + 1] = expected[k] + share * behind
+    assert made == pytest.approx(expected, abs=1e-12)
+    assert made[-1] == pytest.approx(error[-1], rel=0.01)
+
+
+def test_rotations_are_scipys() -> None:
+    rng = np.random.default_rng(1)
+    turns = rng.normal(0.0, 0.7, (50, 3))
+    q = from_vector(turns)
+    theirs = Rotation.from_rotvec(turns)
+    assert matrix(q) == pytest.approx(theirs.as_matrix(), abs=1e-12)
+    assert to_vector(q) == pytest.approx(turns, abs=1e-12)
+    assert to_vector(-q) == pytest.approx(turns, abs=1e-12)
+    assert to_vector(from_vector(np.zeros((1, 3)))) == pytest.approx(np.zeros((1, 3)))
+    both = multiply(q[:25], q[25:])
+    assert matrix(both) == pytest.approx((theirs[:25] * theirs[25:]).as_matrix(), abs=1e-12)
+    v, u = rng.normal(size=(2, 3))
+    assert skew(v) @ u == pytest.approx(np.cross(v, u))
+    product = running_product(q)
+    known = q[0]
+    for at in range(1, 50):
+        known = multiply(known, q[at])
+    assert product[-1] == pytest.approx(known, abs=1e-12)
+    assert len(running_product(q[:1])) == 1
+
+
+def test_interpolation_does_not_mind_the_sign() -> None:
+    times = np.array([0.0, 1.0, 2.0])
+    known = from_vector(np.array([[0.0, 0.0, 0.10], [0.0, 0.0, 0.12], [0.0, 0.0, 0.14]]))
+    known[1] *= -1.0
+    found = to_vector(interpolate(np.array([0.5, 1.5]), times, known))
+    assert found[:, 2] == pytest.approx([0.11, 0.13], abs=1e-6)

@@ -1,0 +1,127 @@
+"""The inside of EKF2's filter, read from each generation into one layout and unit."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from ulog_tools import covariances, make_log
+
+from px4fuse.flight import (
+    ACCELEROMETER_BIAS_COLUMNS,
+    DELAYED_STATE_COLUMNS,
+    DELAYED_VARIANCE_COLUMNS,
+    GYRO_BIAS_COLUMNS,
+    QUATERNION_COLUMNS,
+    Ekf2,
+    FusionRecord,
+    Unavailable,
+)
+from px4fuse.joining import _later_record
+from px4fuse.readers import read_log
+
+QUATERNION = Rotation.from_euler("ZYX", [40.0, 10.0, -5.0], degrees=True).as_quat(scalar_first=True)
+STATES = [*QUATERNION, 0.5, -0.2, 0.1, 3.0, 4.0, -1.5, 1e-4, 2e-4, 3e-4, 1e-3, 2e-3, 3e-3]
+
+
+@pytest.fixture
+def record_of(tmp_path):
+    """Write a made log and read the record of EKF2's filter."""
+
+    def read(log):
+        ekf2 = read_log(log.write(tmp_path / "made.ulg")).ekf2
+        assert isinstance(ekf2, Ekf2)
+        return ekf2
+
+    return read
+
+
+def made_log(generation, position=True):
+    log = make_log(generation)
+    states = log["estimator_states"]["states"]
+    states[:, :16] = STATES
+    if not position:
+        states[:, 7:9] = 0.0
+    log.parameters |= {"EKF2_EVP_NOISE": 0.2, "EKF2_TAU_POS": 0.3, "EKF2_EV_DELAY": 12}
+    return log
+
+
+@pytest.mark.parametrize("generation", ["v1.12", "v1.14", "v1.15", "v1.16"])
+def test_states_and_variances_have_one_layout(record_of, generation):
+    ekf2 = record_of(made_log(generation, position=generation != "v1.16"))
+    record = ekf2.record
+    assert isinstance(record, FusionRecord)
+    assert list(record.delayed) == DELAYED_STATE_COLUMNS + DELAYED_VARIANCE_COLUMNS
+    row = record.delayed.iloc[3]
+    assert row[QUATERNION_COLUMNS].to_numpy() == pytest.approx(QUATERNION)
+    assert row["north_m_s"] == pytest.approx(0.5)
+    assert row["down_m"] == pytest.approx(-1.5)
+    old = generation in ("v1.12", "v1.14")
+    assert record.per_step_biases == old
+    per = ekf2.step_s if old else 1.0
+    assert row[GYRO_BIAS_COLUMNS].to_numpy() == pytest.approx(np.array([1, 2, 3]) * 1e-4 / per)
+    assert row[ACCELEROMETER_BIAS_COLUMNS].to_numpy() == pytest.approx(
+        np.array([1, 2, 3]) * 1e-3 / per
+    )
+    if generation == "v1.16":
+        assert np.isnan(row["north_m"])
+        assert np.isnan(row["east_m"])
+    else:
+        assert row["north_m"] == pytest.approx(3.0)
+    logged = covariances(16)[4 if old else 3 :]
+    assert row[DELAYED_VARIANCE_COLUMNS[3:9]].to_numpy() == pytest.approx(logged[:6])
+    assert row[DELAYED_VARIANCE_COLUMNS[9:]].to_numpy() == pytest.approx(logged[6:12] / per**2)
+
+
+def test_attitude_variance_of_a_quaternion_is_that_of_many_draws(record_of):
+    log = made_log("v1.14")
+    variance = np.array([1e-5, 4e-5, 2e-5, 3e-5])
+    log["estimator_states"]["covariances"][:, :4] = variance
+    found = record_of(log).record.delayed.iloc[0][DELAYED_VARIANCE_COLUMNS[:3]].to_numpy()
+    rng = np.random.default_rng(7)
+    drawn = QUATERNION + rng.normal(0.0, np.sqrt(variance), (200_000, 4))
+    truth = Rotation.from_quat(QUATERNION, scalar_first=True)
+    errors = (Rotation.from_quat(drawn, scalar_first=True) * truth.inv()).as_rotvec()
+    assert found == pytest.approx(errors.var(axis=0), rel=0.02)
+
+
+def test_every_ekf2_parameter_is_kept_and_results_hold_theirs_only(record_of, tmp_path):
+    log = made_log("v1.16")
+    assert record_of(log).record.parameters == pytest.approx(
+        {name: value for name, value in log.parameters.items() if name.startswith("EKF2_")}
+    )
+    assert "EKF2_TAU_POS" not in read_log(log.write(tmp_path / "again.ulg")).log.parameters
+
+
+@pytest.mark.parametrize(
+    ("flag", "name"),
+    [("cs_gps", "GPS"), ("cs_opt_flow", "optical flow"), ("cs_ev_vel", "vision velocity")],
+)
+def test_other_horizontal_aiding_is_named(record_of, flag, name):
+    log = made_log("v1.16")
+    flags = log["estimator_status_flags"]
+    used = np.zeros(len(flags["timestamp"]), np.bool_)
+    flags[flag] = used.copy()
+    assert record_of(log).record.other_aiding == ()
+    used[4] = True
+    flags[flag] = used
+    assert record_of(log).record.other_aiding == (name,)
+
+
+def test_the_age_of_vision_is_publication_minus_measurement(record_of):
+    log = made_log("v1.16")
+    fields = log["vehicle_visual_odometry"]
+    age = record_of(log).record.vision_age_s
+    expected = (fields["timestamp"].astype(float) - fields["timestamp_sample"]) * 1e-6
+    assert age.to_numpy() == pytest.approx(expected)
+    moved = _later_record(record_of(log).record, 2.5)
+    assert isinstance(moved, FusionRecord)
+    assert moved.vision_age_s.index[0] == pytest.approx(age.index[0] + 2.5)
+    assert moved.delayed.index[0] == pytest.approx(record_of(log).record.delayed.index[0] + 2.5)
+    assert moved.vision_age_s.to_numpy() == pytest.approx(age.to_numpy())
+
+
+def test_without_quaternions_or_topic_there_is_no_record(record_of):
+    assert isinstance(record_of(make_log("v1.16")).record, Unavailable)  # quaternions of zero
+    assert isinstance(record_of(made_log("v1.16").drop("estimator_states")).record, Unavailable)
+    assert isinstance(record_of(make_log("v1.11")).record, Unavailable)

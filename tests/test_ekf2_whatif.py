@@ -1,0 +1,175 @@
+"""What if EKF2 had had other parameters, and why it differs: sums, sweeps and messages."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from px4fuse.ekf2.model import Model, open_model
+from px4fuse.ekf2.parameters import PARAMETERS, check, settings_in_force
+from px4fuse.ekf2.walk import OUTPUT, STEPS, Student, Walk, walk
+from px4fuse.ekf2.whatif import WhatIf, sweep, sweep_values, what_if
+from px4fuse.errors import SettingsError
+from px4fuse.flight import Flight, Unavailable
+
+
+@pytest.fixture(scope="module")
+def model(sample_flight: Flight) -> Model:
+    made = open_model(sample_flight)
+    assert isinstance(made, Model)
+    return made
+
+
+def found(result: WhatIf | Unavailable) -> WhatIf:
+    assert isinstance(result, WhatIf)
+    return result
+
+
+def test_side_by_side(model: Model) -> None:
+    made = found(what_if(model, [{"EKF2_EVP_NOISE": 0.5}, {"EKF2_EVP_NOISE": 0.02}]))
+    wide, narrow = made.whatif
+    for axis in ("north", "east"):
+        logged, replayed = made.logged.axes[axis], made.replayed.axes[axis]
+        assert isinstance(logged.position_rmse_to_truth_m, float)
+        assert isinstance(logged.sigma_p_median_m, float)
+        assert replayed.position_rmse_to_truth_m == pytest.approx(
+            logged.position_rmse_to_truth_m, abs=0.003
+        )
+        assert replayed.sigma_p_median_m == pytest.approx(logged.sigma_p_median_m, rel=0.02)
+        assert replayed.nis_mean == pytest.approx(logged.nis_mean, rel=0.3)
+        assert wide.axes[axis].nis_mean < 0.1
+        assert narrow.axes[axis].nis_mean > 5.0
+        low, high = replayed.nis_band
+        assert low < 1.0 < high
+        # the truth knows which is best: UWB noise is 0.10 m
+        assert narrow.axes[axis].position_rmse_to_truth_m > replayed.position_rmse_to_truth_m
+    assert made.replayed.samples > 2 * made.logged.samples  # the log holds 2 Hz of 5 Hz
+    assert isinstance(made.logged.longest_without_fusion_s, Unavailable)
+    assert made.replayed.longest_without_fusion_s == pytest.approx(0.22, abs=0.04)
+    assert made.replayed.rejected_share == made.logged.rejected_share == 0.0
+    assert narrow.rejected_share > 0.2
+    assert narrow.resets > 0
+    assert isinstance(narrow.longest_without_fusion_s, float)
+    assert narrow.longest_without_fusion_s > 1.0
+    assert not made.notes
+
+
+def test_without_agreement_there_is_no_what_if_and_no_why(model: Model) -> None:
+    doubtful = replace(model, agreement=replace(model.agreement, good=False, reason="no reason"))
+    for result in (what_if(doubtful, [{"EKF2_EVP_NOISE": 0.5}]), walk(doubtful)):
+        assert isinstance(result, Unavailable)
+        assert "no reason" in result.reason
+
+
+def test_a_flight_without_truth_has_no_rmse(model: Model) -> None:
+    blind = replace(model.flight, truth=Unavailable("truth", "none", "None."))
+    made = found(what_if(replace(model, flight=blind), [{"EKF2_EVP_GATE": 3.0}]))
+    for summary in (made.logged, made.replayed, *made.whatif):
+        assert isinstance(summary.axes["north"].position_rmse_to_truth_m, Unavailable)
+
+
+def test_sweeps(model: Model) -> None:
+    values = sweep_values("EKF2_EVP_NOISE", 0.02, 0.5, 5)
+    assert values == pytest.approx(np.geomspace(0.02, 0.5, 5))
+    made = found(sweep(model, "EKF2_EVP_NOISE", values))
+    nis = [summary.axes["north"].nis_mean for summary in made.whatif]
+    assert nis == sorted(nis, reverse=True)
+    assert [summary.changed["EKF2_EVP_NOISE"] for summary in made.whatif] == values
+    assert sweep_values("EKF2_EV_DELAY", 0.0, 200.0, 5) == [0.0, 50.0, 100.0, 150.0, 200.0]
+
+
+@pytest.mark.parametrize(
+    ("name", "low", "high", "count", "said"),
+    [
+        ("EKF2_EVP_NOISE", 0.5, 0.02, 5, "smaller"),
+        ("EKF2_EVP_NOISE", 0.02, 0.5, 1, "between 2 and 200"),
+        ("EKF2_EVP_NOISE", 0.0, 0.5, 5, "outside PX4's range"),
+        ("EKF2_BARO_NOISE", 1.0, 2.0, 5, "does not have this parameter"),
+    ],
+)
+def test_senseless_sweeps_are_refused(
+    name: str, low: float, high: float, count: int, said: str
+) -> None:
+    with pytest.raises(SettingsError, match=said):
+        sweep_values(name, low, high, count)
+
+
+def test_parameters_are_checked_by_name_and_range() -> None:
+    with pytest.raises(SettingsError) as error:
+        check({"EKF2_HEAD_NOISE": 0.3})
+    assert all(name in str(error.value) for name in PARAMETERS)
+    assert "\n" not in str(error.value)
+    for name, value in (
+        ("EKF2_EVP_NOISE", 0.0), ("EKF2_EV_DELAY", -1.0), ("EKF2_EV_DELAY", float("nan")),
+        ("EKF2_EVP_GATE", 0.5), ("EKF2_EV_NOISE_MD", 0.5), ("EKF2_EV_POS_X", float("inf")),
+    ):  # fmt: skip
+        with pytest.raises(SettingsError, match=name):
+            check({name: value})
+    for name, parameter in PARAMETERS.items():
+        assert check({name: parameter.default}) == {name: parameter.default}
+
+
+def test_defaults_are_the_releases() -> None:
+    assert settings_in_force({})["EKF2_EV_DELAY"] == 0.0
+    assert settings_in_force({"EKF2_AID_MASK": 8.0})["EKF2_EV_DELAY"] == 175.0
+    assert settings_in_force({"EKF2_AID_MASK": 0.0, "EKF2_EV_CTRL": 1.0})["EKF2_EV_DELAY"] == 0.0
+    assert settings_in_force({"EKF2_EVP_NOISE": 0.2})["EKF2_EVP_NOISE"] == 0.2
+
+
+def walked(result: Walk | Unavailable) -> Walk:
+    assert isinstance(result, Walk)
+    return result
+
+
+def test_the_bars_add_up_and_little_is_left(model: Model) -> None:
+    made = walked(walk(model))
+    assert made.coast is None
+    for axis in made.axes.values():
+        assert tuple(step.name for step in axis.steps) == STEPS
+        position = sum(step.position_mean_square_m2 for step in axis.steps)
+        velocity = sum(step.velocity_mean_square_m2_s2 for step in axis.steps)
+        assert position + axis.position_left_m2 == pytest.approx(axis.position_total_m2, abs=1e-12)
+        assert velocity + axis.velocity_left_m2_s2 == pytest.approx(
+            axis.velocity_total_m2_s2, abs=1e-12
+        )
+        assert axis.position_left_share < 0.03
+        by_name = {step.name: step for step in axis.steps}
+        # what is the same in both filters moves nothing
+        assert by_name["measurement noise"].position_moved_m < 1e-6
+        assert by_name["gate, missed samples, resets"].position_moved_m < 1e-6
+        largest = sorted(axis.steps, key=lambda step: -step.position_mean_square_m2)[:2]
+        assert {step.name for step in largest} == {"process noise", OUTPUT}
+        last = axis.steps[-1].position_rmse_to_truth_m
+        assert last == pytest.approx(axis.logged_rmse_to_truth_m, abs=0.003)
+
+
+def test_the_walk_starts_where_the_student_is(model: Model) -> None:
+    plain = walked(walk(model))
+    noisy = walked(walk(model, Student(sigma_z_m=0.5)))
+    north = plain.axes["north"], noisy.axes["north"]
+    assert north[1].position_total_m2 != pytest.approx(north[0].position_total_m2, rel=0.05)
+    assert north[1].position_left_m2 == pytest.approx(north[0].position_left_m2, rel=1e-9)
+    assert abs(noisy.axes["north"].steps[1].position_mean_square_m2) > 1e-5
+    late = walked(walk(model, Student(clock_offset_s=-0.3)))
+    assert late.axes["north"].steps[0].position_moved_m > 0.2
+    # a track of one's own: 0.4 m off, so that 0.16 m² more are to be explained by the first step
+    track = plain.tracks["student"].copy()
+    track["north_m"] += 0.4
+    own = walked(walk(model, track=track)).axes["north"]
+    bias = np.mean(track["north_m"] - model.flown.published["north_m"])
+    assert own.position_total_m2 > 0.8 * bias**2
+    assert own.position_total_m2 == pytest.approx(
+        own.position_left_m2 + sum(step.position_mean_square_m2 for step in own.steps), abs=1e-12
+    )
+    assert own.steps[0].position_moved_m > 0.35
+
+
+def test_a_track_of_another_time_is_refused(model: Model) -> None:
+    track = walked(walk(model)).tracks["student"]
+    elsewhere = track.set_axis(pd.Index(track.index.to_numpy() + 1e4, name="time_s"))
+    result = walk(model, track=elsewhere)
+    assert isinstance(result, Unavailable)
+    assert "no time in common" in result.reason
