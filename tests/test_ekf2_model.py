@@ -18,7 +18,7 @@ from px4fuse.ekf2.replay import HORIZONTAL, Ekf2Replay
 from px4fuse.ekf2.stretches import step_ends
 from px4fuse.errors import SettingsError
 from px4fuse.flight import Ekf2, Flight, FusionRecord, Unavailable
-from px4fuse.joining import join
+from px4fuse.placing.joining import join
 from px4fuse.readers import read_log
 
 

@@ -17,7 +17,7 @@ from px4fuse.flight import (
     FusionRecord,
     Unavailable,
 )
-from px4fuse.joining import _later_record
+from px4fuse.placing.joining import _later_record
 from px4fuse.readers import read_log
 
 QUATERNION = Rotation.from_euler("ZYX", [40.0, 10.0, -5.0], degrees=True).as_quat(scalar_first=True)

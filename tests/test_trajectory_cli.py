@@ -214,7 +214,8 @@ def test_the_results_keep_the_command_that_makes_them_again(desk) -> None:
     given = ["--landed-at", "0.1,-0.2,5", "--closures", desk / "closures.txt", "--drift", "2"]
     found = results("loop", desk / "s.tum", *given)
     assert found["provenance"]["command"] == (
-        "px4fuse loop s.tum --landed-at 0.1,-0.2,5 --closure 10,50,0.1 --closure 20,60,0.2 --drift 2"
+        "px4fuse loop s.tum --landed-at 0.1,-0.2,5 --closure 10,50,0.1 --closure 20,60,0.2 "
+        "--drift 2"
     )
     assert len(found["loop"]["closures"]) == 3
 

@@ -12,12 +12,12 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from px4fuse.consistency import nis_band
 from px4fuse.ekf2.agreement import at_times, judged_from, logged_innovations, settled
 from px4fuse.ekf2.model import Model, replay_settings
 from px4fuse.ekf2.parameters import check
 from px4fuse.ekf2.replay import HORIZONTAL, Agreement, Ekf2Replay
 from px4fuse.errors import SettingsError
+from px4fuse.filter.consistency import nis_band
 from px4fuse.flight import (
     POSITION_COLUMNS,
     POSITION_VARIANCE_COLUMNS,
