@@ -160,7 +160,7 @@ BAD_ROSTERS = {
     "binary": (b"\x00\x01\x02id", "not text"),
     "spreadsheet": (b"PK\x03\x04....", "Save it as CSV"),
     "too many": ("id\n" + "\n".join(map(str, range(1001))), "1001 students are too many"),
-    "too long": (b"id\n" + b"1" * 5_000_001, "too many for a roster"),
+    "too long": (b"id\n" + b"1" * 5_000_001, "more than the limit"),
     "huge cell": ('id,name\n1,"' + "x" * 200_000 + '"\n', "not a CSV file"),
 }
 

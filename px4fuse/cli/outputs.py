@@ -6,7 +6,7 @@ import signal
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import IO, TYPE_CHECKING, Any, Protocol
 
 import click
 
@@ -25,7 +25,7 @@ INPUTS = (
 WRITTEN = "px4fuse.written"
 
 
-class Interrupted(Exception):  # noqa: N818 - no error of the program
+class Interrupted(click.ClickException):
     """The run was ended from outside.
 
     Parameters
@@ -38,7 +38,12 @@ class Interrupted(Exception):  # noqa: N818 - no error of the program
 
     def __init__(self, stopped: KeyboardInterrupt, left: str) -> None:
         super().__init__(f"interrupted, {left}")
-        self.exit_code = 128 + (stopped.args[0] if stopped.args else signal.SIGINT)
+        number = stopped.args[0] if stopped.args else signal.SIGINT
+        self.exit_code = 128 + number  # type: ignore[misc]  # read from the instance by click
+
+    def show(self, file: IO[Any] | None = None) -> None:
+        """Say so on one line."""
+        click.echo(f"px4fuse: {self.message}", file=file, err=True)
 
 
 class Step(Protocol):
