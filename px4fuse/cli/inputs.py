@@ -16,6 +16,7 @@ from px4fuse.errors import OutputError, SettingsError
 from px4fuse.request import AUTO
 
 if TYPE_CHECKING:
+    from msgspec import Struct
     from rich.console import Console
 
     from px4fuse.request import ComparisonRequest, PositionFile
@@ -325,9 +326,9 @@ def report_paths(output: Path, json_path: Path | None) -> tuple[Path, Path]:
     return output, beside
 
 
-def write_json(results: dict[str, Any], json_path: Path | None) -> bool:
+def write_json(results: Struct | dict[str, Any], json_path: Path | None) -> bool:
     """Write results where --json says; true where they have standard output to themselves."""
-    from px4fuse.results.build import to_json
+    from px4fuse.results.contract import to_json
 
     text = to_json(results)
     if json_path == STANDARD_OUTPUT:
