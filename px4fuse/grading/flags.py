@@ -6,7 +6,6 @@ everyone to the same number.
 
 from __future__ import annotations
 
-import json
 import math
 import re
 import unicodedata
@@ -225,36 +224,27 @@ def _other_assignment(graded: Sequence[Graded], key: AnswerKey | None) -> Flags:
 
 
 def _same_settings(graded: Sequence[Graded]) -> Flags:
-    chosen = [_chosen(one.settings) for one in graded]
-    for members in _groups(chosen):
+    for members in _groups([one.settings for one in graded]):
         if len({_who(graded[index]) for index in members}) > 1:
             for index in members:
                 others = _others(graded, members, index)
-                yield index, f"The same settings to the last digit as {others}: {chosen[index]}."
+                same = graded[index].settings
+                yield index, f"The same settings to the last digit as {others}: {same}."
 
 
-def _chosen(settings: str) -> str:
+def chosen_settings(results: Reported) -> str:
     """What was chosen, in words; empty for defaults and for what many would type."""
-    try:
-        given = json.loads(settings)
-    except (ValueError, RecursionError):
-        return ""
-    if not isinstance(given, dict):
+    if isinstance(results, LoopResults):
         return ""
     default = Settings()
     own = {
-        name: given[name]
+        name: value
         for name in CHOSEN
-        if isinstance(given.get(name), str | int | float) and given[name] != getattr(default, name)
+        if (value := getattr(results.settings, name)) != getattr(default, name)
     }
-    digits = sum(
-        _digits(float(value))
-        for value in own.values()
-        if isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e12
-    )
-    if digits < MIN_DIGITS:
+    if sum(_digits(value) for value in own.values() if isinstance(value, float)) < MIN_DIGITS:
         return ""
-    return ", ".join(f"{name} {_short(str(value))}" for name, value in own.items())
+    return ", ".join(f"{name} {value}" for name, value in own.items())
 
 
 def _other_version(graded: Sequence[Graded]) -> Flags:

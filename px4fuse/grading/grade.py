@@ -18,12 +18,12 @@ from px4fuse.flight import Unavailable
 from px4fuse.grading import submissions
 from px4fuse.grading.class_page import html_text
 from px4fuse.grading.class_table import csv_text
-from px4fuse.grading.flags import class_flags, own_flags
+from px4fuse.grading.flags import chosen_settings, class_flags, own_flags
 from px4fuse.grading.model import Graded, Item, Submission
 from px4fuse.grading.rubric import Rubric
 from px4fuse.grading.scoring import feedback, gradescope, score, score_refused, values_at
 from px4fuse.grading.workers import Failed, run_bounded
-from px4fuse.results.contract import LoopResults, Reported, to_plain
+from px4fuse.results.contract import Reported, to_plain
 from px4fuse.verification.intake import read_report
 from px4fuse.verification.model import Difference, Refused, Verdict
 from px4fuse.verification.pictures import key_page, picture
@@ -195,7 +195,7 @@ def grade_one(
         sha256=sha256,
         log_sha256=log,
         version=results.provenance.px4fuse,
-        settings=_settings(results),
+        settings=chosen_settings(results),
         notes=results.student.notes,
         picture=b"" if isinstance(drawn, Unavailable) else drawn,
     )
@@ -204,13 +204,6 @@ def grade_one(
 def _numbers(results: Reported) -> dict[str, float]:
     plain = to_plain(results)
     return {title: float(value) for title, path in NUMBERS for _, value in values_at(plain, path)}
-
-
-def _settings(results: Reported) -> str:
-    """The settings as text; "" for a loop, which has none."""
-    if isinstance(results, LoopResults):
-        return ""
-    return json.dumps(to_plain(results.settings), sort_keys=True, ensure_ascii=False)
 
 
 def _refused(
