@@ -7,6 +7,7 @@
     ├── MissingDataError   the log can be read but lacks what was asked for
     ├── TrajectoryError    a trajectory or pose graph cannot be read or used
     ├── SettingsError      a setting is outside its documented range
+    ├── ResultsError       a file holds no results of px4fuse that this version reads
     └── OutputError        a result cannot be written
 
 The text of each is one line for a person: what is wrong, where, and what to do.
@@ -54,6 +55,10 @@ class TrajectoryError(Px4FuseError):
 
 class SettingsError(Px4FuseError):
     """A setting is outside its documented range."""
+
+
+class ResultsError(Px4FuseError):
+    """A file holds no results of px4fuse, or none that this version reads."""
 
 
 class OutputError(Px4FuseError):

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, fields, is_dataclass
+from dataclasses import fields, is_dataclass
 from typing import Any
-
-from px4fuse.flight import Unavailable
 
 
 def plain(value: object) -> Any:
@@ -28,13 +26,3 @@ def plain(value: object) -> Any:
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value
-
-
-def unavailable(part: Unavailable) -> dict[str, Any]:
-    """What stands where a number could not be computed."""
-    return {"unavailable": asdict(part)}
-
-
-def present(values: dict[str, Any]) -> dict[str, Any]:
-    """Without the entries that could not be computed."""
-    return {name: value for name, value in values.items() if value is not None}

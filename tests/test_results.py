@@ -1,22 +1,26 @@
-"""The results contract: every result validates; the shipped example is what the code computes."""
+"""The results contract: all that is written is read back; strangers' results are read strictly."""
 
 import json
 import math
+import subprocess
+import sys
 from pathlib import Path
-from typing import Any
 
 import jsonschema
+import msgspec
 import pytest
 from flights import unexplained
+from results_tools import EXAMPLE, LOOP, changed, decoded
 
 import px4fuse
-from px4fuse.errors import Px4FuseError
+from px4fuse.errors import Px4FuseError, ResultsError
 from px4fuse.report.document import Document
 from px4fuse.report.pdf import render
 from px4fuse.request import ComparisonRequest
 from px4fuse.results import build
-from px4fuse.results.build import schema, to_json
-from px4fuse.results.model import Student
+from px4fuse.results.contract import KINDS, ComparisonResults, schema, to_json
+from px4fuse.results.model import Absent, Student
+from px4fuse.results.reading import read_results
 
 ROOT = Path(__file__).parent.parent
 
@@ -27,7 +31,7 @@ def document(flight: px4fuse.Flight, explained: bool = True, **options: object) 
     return Document(analysis, px4fuse.find(analysis), Student(), "px4fuse compare")
 
 
-def results(made: Document) -> dict[str, Any]:
+def results(made: Document) -> ComparisonResults:
     request = ComparisonRequest(log=made.log[0])
     return build.results(request, made.analysis, made.findings, made.student, made.command)
 
@@ -50,8 +54,43 @@ def assert_close(new: object, old: object, where: str) -> None:
         assert new == old, where
 
 
-def test_schema_is_itself_valid():
-    jsonschema.Draft202012Validator.check_schema(schema())
+SCHEMA = schema()
+
+
+def assert_valid(text: str) -> None:
+    """Valid under the schema, and the same after it was read back."""
+    jsonschema.Draft202012Validator(SCHEMA).validate(json.loads(text))
+    assert to_json(read_results(text.encode())) == text
+
+
+def test_schema_is_itself_valid_and_says_what_it_knows():
+    jsonschema.Draft202012Validator.check_schema(SCHEMA)
+    assert [one["$ref"] for one in SCHEMA["oneOf"]] == [
+        f"#/$defs/{kind.__name__}" for kind in KINDS.values()
+    ]
+
+
+@pytest.mark.parametrize("one", [EXAMPLE, LOOP], ids=["compare", "loop"])
+def test_schema_takes_results_and_nothing_else(one):
+    validator = jsonschema.Draft202012Validator(SCHEMA)
+    assert validator.is_valid(json.loads(json.dumps(one)))
+    for wrong in (
+        changed(one, extra=1),
+        changed(one, provenance=...),
+        changed(one, schema__name="px4fuse-tuning"),
+        changed(one, schema__version="1.0"),
+        changed(one, loop={}),
+        changed(one, loop={"unavailable": {"what": "loop"}}),
+        changed(one, student__name=7),
+    ):
+        assert not validator.is_valid(json.loads(json.dumps(wrong)))
+
+
+def test_schema_is_printed():
+    done = subprocess.run(
+        [sys.executable, "-m", "px4fuse.results"], capture_output=True, check=True, cwd=ROOT
+    )
+    assert json.loads(done.stdout) == json.loads(to_json(SCHEMA))
 
 
 def test_shipped_example_is_what_this_code_computes(sample_flight):
@@ -83,17 +122,100 @@ def test_shipped_pdf_carries_the_shipped_results():
 def test_results_of_every_kind_validate_and_render(sample_flight, options):
     made = document(sample_flight, **options)
     text = to_json(results(made))
-    jsonschema.validate(json.loads(text), schema())
+    assert_valid(text)
     assert render(made, text).startswith(b"%PDF-")
 
 
 def test_nothing_that_could_not_be_computed_is_zero(sample_flight):
     """One second of flight: no consistency statement, but its reason."""
     made = results(document(sample_flight, start_s=40.0, end_s=41.0))
-    north = made["axes"]["north"]
-    assert "too few" in north["kf"]["unavailable"]["reason"]
-    assert "nis_mean" not in north["kf"]
-    jsonschema.validate(json.loads(to_json(made)), schema())
+    north = made.axes["north"]
+    assert isinstance(north.kf, Absent)
+    assert "too few" in north.kf.unavailable.reason
+    assert "nis_mean" not in to_json(north.kf)
+    assert_valid(to_json(made))
+
+
+def test_no_number_is_written_that_is_none(sample_flight):
+    made = decoded(EXAMPLE)
+    for number in (math.nan, math.inf):
+        broken = msgspec.structs.replace(
+            made, settings=msgspec.structs.replace(made.settings, dt_s=number)
+        )
+        with pytest.raises(ValueError, match="not JSON compliant"):
+            to_json(broken)
+
+
+# -- what strangers hand in ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        (b"", "is not JSON"),
+        (b"{", "is not JSON"),
+        (b'{"a": 1} x', "is not JSON"),
+        (b"\xff\xfe{}", "is not UTF-8"),
+        (json.dumps(EXAMPLE).encode("utf-16"), "is not UTF-8"),
+        (b"[" * 1_000_000, "nested too deeply"),
+        (b'{"a":' * 1_000_000, "nested too deeply"),
+        (b"[" * 100 + b"]" * 100, "nested too deeply"),
+        (b"[" + b"0," * 2_200_000 + b"0]", "more values"),
+        (b"[" + b"[]," * 300_000 + b"[]]", "a list that is too long"),
+        (b'["' + b"x" * 300_000 + b'"]', "a text that is too long"),
+        (b'{"' + b"x" * 300_000 + b'": 1}', "a text that is too long"),
+        (b" " * 5_000_001, "larger than 5 MB"),
+        (b"[NaN]", "the number NaN, which is not JSON"),
+        (b"[-Infinity]", "the number -Infinity, which is not JSON"),
+        (b"[1e999]", "a number that is too large"),
+        (b"[" + b"9" * 1_000_000 + b"]", "too many digits"),
+        (b'{"a": 1, "a": 2}', "a key twice"),
+        (b'{"schema": {"name": "px4fuse-other", "version": "2.0"}}', "no results of px4fuse"),
+        (b'{"schema": {"name": ["px4fuse-results"], "version": 1}}', "no results of px4fuse"),
+        (b'{"schema": {"name": "px4fuse-results"}}', "no results of px4fuse"),
+        (b'{"schema": "px4fuse-results"}', "no results of px4fuse"),
+        (b"[]", "no results of px4fuse"),
+        (b"null", "no results of px4fuse"),
+        (b"1", "no results of px4fuse"),
+        (b'{"schema": {"name": "px4fuse-loop", "version": "1.0"}}', "follows version 1.0"),
+        (b'{"schema": {"name": "px4fuse-loop", "version": "2.0"}}', "missing required field"),
+    ],
+    ids=range(27),
+)
+def test_what_is_no_results(given, said):
+    with pytest.raises(ResultsError, match=said) as raised:
+        read_results(given, "r.json")
+    assert str(raised.value).startswith("r.json ")
+    assert str(raised.value).isprintable()
+    assert len(str(raised.value)) < 500
+
+
+@pytest.mark.parametrize(
+    ("values", "said"),
+    [
+        ({"student": {"name": 7, "id": "", "notes": ""}}, r"got `int` - at `\$.student.name`"),
+        ({"student__name": "x" * 10_001}, r"length <= 10000 - at `\$.student.name`"),
+        ({"extra": 1}, "unknown field `extra`"),
+        ({"a\u202eb": 1}, "a key with control characters"),
+        ({"settings__dt_s": True}, "Expected `float`, got `bool`"),
+        ({"settings__dt_s": "0.1"}, "Expected `float`, got `str`"),
+        ({"settings__dt_s": 0}, "Expected `float` > 0"),
+        ({"settings__input": "gps"}, "Invalid enum value 'gps'"),
+        ({"log__sha256": "x"}, "matching regex"),
+        ({"axes": {}}, "length >= 1"),
+        ({"axes__up": EXAMPLE["axes"]["down"]}, "Invalid enum value 'up'"),
+        ({"axes__north__kf__nis_mean": "1"}, r"at `\$.nis_mean` - at `\$.axes\[...\].kf`"),
+        ({"clock__unavailable": {"what": "", "reason": "", "remedy": ""}}, "unknown field"),
+        ({"clock": {"unavailable": {"what": "", "reason": ""}}}, "missing required field"),
+        ({"request__log": ...}, "missing required field `log`"),
+        ({"request__command": "loop"}, "Invalid value 'loop'"),
+        ({"provenance__px4fuse": "1 2"}, "matching regex"),
+    ],
+    ids=str,
+)
+def test_what_breaks_the_contract(values, said):
+    with pytest.raises(ResultsError, match=f"does not follow the schema.*{said}|{said}"):
+        decoded(changed(**values))
 
 
 @pytest.mark.reallogs
@@ -110,7 +232,7 @@ def test_every_log_gives_a_valid_report_or_one_clear_line(shared_logs, subtests)
                 assert log.name in made
                 continue
             text = to_json(results(made))
-            jsonschema.validate(json.loads(text), schema())
+            assert_valid(text)
             assert render(made, text).startswith(b"%PDF-")
             reported += 1
     assert reported >= 24

@@ -9,9 +9,11 @@ import re
 from pathlib import Path
 
 import pytest
+from results_tools import EXAMPLE, LOOP, SHA256, changed, correction, decoded, finding
 
 from px4fuse.assignment.key import Answer, AnswerKey
-from px4fuse.grading.flags import class_flags, own_flags
+from px4fuse.errors import ResultsError
+from px4fuse.grading.flags import chosen_settings, class_flags, own_flags
 from px4fuse.grading.model import Graded
 from px4fuse.grading.rubric import parse_rubric, read_rubric
 from px4fuse.grading.scoring import (
@@ -22,60 +24,25 @@ from px4fuse.grading.scoring import (
     score_refused,
     values_at,
 )
+from px4fuse.results.contract import to_plain
 from px4fuse.verification.intake import read_report
 from px4fuse.verification.model import Report, Verdict
 from px4fuse.verification.verification import verify
 
 ROOT = Path(__file__).parent.parent
-RESULTS = json.loads((ROOT / "reports" / "aisle_uwb.json").read_text(encoding="utf-8"))
 PAGES = ("Two-state Kalman filter against EKF2", "Innovations\nof both", "Provenance\nMade with")
 VERIFIED = Verdict("verified", ("all 900 numbers agree",), with_log=True)
-SHA = RESULTS["log"]["sha256"]
+SHA = SHA256
 WORDS = read_rubric(None).words
-GAP = {"id": "source_gap", "severity": "warning", "message": "It was silent.", "remedy": "See."}
-LOOP = {
-    "schema": {"name": "px4fuse-loop", "version": "1.0"},
-    "track": {"name": "loop.ulg:vio", "sha256": SHA},
-    "loop": {
-        "start_s": 1.0,
-        "end_s": 95.0,
-        "path_length_m": 87.7,
-        "closure_error_m": 1.42,
-        "closure_percent": 1.62,
-        "absolute": False,
-        "closures": [{"accepted": True}],
-        "corrections": {
-            "uncorrected": {"scores": {"slam.tum": {"ate": {"translation_m": {"rmse": 0.41}}}}},
-            "by_distance": {
-                "moved_max_m": 1.4,
-                "scores": {"slam.tum": {"ate": {"translation_m": {"rmse": 0.26}}}},
-            },
-        },
-    },
-    "findings": [],
-}
+GAP = finding("source_gap")
+NONE = {"unavailable": {"what": "it", "reason": "too few of them", "remedy": ""}}
 
 
-def changed(results=RESULTS, **values):
-    """The example with the values at some paths, "__" for dots, replaced; ``...`` removes."""
-    made = copy.deepcopy(results)
-    for path, value in values.items():
-        *parents, last = path.split("__")
-        place = made
-        for parent in parents:
-            place = place.setdefault(parent, {})
-        if value is ...:
-            place.pop(last, None)
-        else:
-            place[last] = value
-    return made
+def report(results=EXAMPLE, pages=PAGES):
+    return Report("0" * 64, 1000, "intact", decoded(results), tuple(pages), b"%PDF")
 
 
-def report(results=RESULTS, pages=PAGES):
-    return Report("0" * 64, 1000, "intact", results, tuple(pages), b"%PDF")
-
-
-def checked(check, results=RESULTS, pages=PAGES, /, verdict=VERIFIED, key=None, **parameters):
+def checked(check, results=EXAMPLE, pages=PAGES, /, verdict=VERIFIED, key=None, **parameters):
     """Share of the points and comment of one check."""
     given = "\n".join(f"{name} = {json.dumps(value)}" for name, value in parameters.items())
     rubric = parse_rubric(f'[[item]]\ntitle = "T"\npoints = 1\ncheck = "{check}"\n{given}', "x")
@@ -86,8 +53,8 @@ def checked(check, results=RESULTS, pages=PAGES, /, verdict=VERIFIED, key=None, 
     return item.points, item.comment
 
 
-def noted(text, **values):
-    return changed(student__notes=text, **values)
+def noted(text, results=EXAMPLE, **values):
+    return changed(results, student__notes=text, **values)
 
 
 # ------------------------------------------------------------------ checks
@@ -131,12 +98,9 @@ class TestStudent:
         points, comment = checked("student", changed(student__name="Ann"))
         assert points == 0.5
         assert "--id" in comment
-        assert checked("student", changed(student=...))[0] == 0.0
+        assert checked("student")[0] == 0.0
+        assert checked("student", changed(LOOP, student__name="Ann", student__id="7"))[0] == 1.0
         assert checked("student", changed(student__name="Ann"), id=False)[0] == 1.0
-
-    def test_report_of_a_loop_says_it_on_its_page(self):
-        page = "A loop\nStudent Ann Lee, 77\nSHA-256 00"
-        assert checked("student", LOOP, [page]) == (1.0, "Your report names Ann Lee, 77.")
 
 
 class TestSections:
@@ -164,7 +128,7 @@ class TestNotes:
         assert points < 0.1
         assert "only 1 different" in comment
 
-    @pytest.mark.parametrize("notes", ["", "  \n", None, 7, ["a"], {}])
+    @pytest.mark.parametrize("notes", ["", "  \n"])
     def test_none(self, notes):
         assert checked("notes", noted(notes))[0] == 0.0
 
@@ -172,9 +136,8 @@ class TestNotes:
         assert Notes("การวัดตำแหน่งมีสัญญาณรบกวนสูงกว่าที่ตั้งไว้").words >= 8
         assert Notes("測定値のノイズが大きい").words >= 5
 
-    def test_notes_of_a_loop_stand_on_its_page(self):
-        page = "Notes by the student\nFive words of my own\npx4fuse · x\npx4fuse 0.1.0 4 / 5"
-        assert "5 words" in checked("notes", LOOP, ["Loop", page])[1]
+    def test_notes_of_a_loop(self):
+        assert "5 words" in checked("notes", noted("Five words of my own", LOOP))[1]
 
     def test_words_belong_together_within_a_sentence(self):
         notes = Notes("The clock is fine. Positions come late.\n- Stamps are 0.2 s later")
@@ -194,7 +157,7 @@ class TestFindings:
         assert checked("findings")[0] == 1.0
 
     def test_named_by_id_by_words_or_not(self):
-        late = {"id": "source_clock_offset", "severity": "error", "message": "Late."}
+        late = finding("source_clock_offset", "error")
         both = {"findings": [GAP, late]}
         points, comment = checked("findings", noted("source_gap: see below.", **both))
         assert points == 0.5
@@ -203,12 +166,9 @@ class TestFindings:
         assert checked("findings", noted(text, **both))[0] == 1.0
 
     def test_what_is_ignored_or_mild_is_not_asked_for(self):
-        ignored = {"id": "ekf2_unavailable", "severity": "warning", "message": ""}
+        ignored = finding("ekf2_unavailable")
         assert checked("findings", changed(findings=[ignored]))[0] == 1.0
         assert checked("findings", severities=["info"])[0] == 0.0
-
-    def test_no_list(self):
-        assert checked("findings", changed(findings=...))[0] == 0.0
 
 
 class TestTuning:
@@ -227,11 +187,11 @@ class TestTuning:
         assert checked("tuning")[0] > 0.5
 
     def test_a_bound_and_nothing(self):
-        bound = {"sigma_z_m_upper_bound": 0.2}
-        results = changed(tuning__horizontal=bound)
+        where = "tuning__horizontal__sigma_z_m"
+        bound = {where: ..., f"{where}_interval": ..., f"{where}_upper_bound": 0.2}
+        results = changed(**bound)
         assert checked("tuning", results, settings=["sigma_z_m"])[0] == 1.0
-        none = {"unavailable": {"what": "tuning", "reason": "too few of them", "remedy": ""}}
-        points, comment = checked("tuning", changed(tuning__horizontal=none))
+        points, comment = checked("tuning", changed(tuning__horizontal=NONE))
         assert points == 0.0
         assert "too few of them" in comment
 
@@ -262,12 +222,17 @@ class TestNumber:
         assert checked("number", LOOP, path=path, at_most=0.3)[0] == 1.0
         assert checked("number", path="clock.interval_s.1", at_most=0.1)[0] == 1.0
 
-    @pytest.mark.parametrize("value", ["0.01", True, None, [], {}, float("nan"), 10**400, ...])
-    def test_what_is_no_number_gives_nothing(self, value):
-        results = changed(axes__north__truth__kf_position_rmse_m=value)
-        points, comment = checked("number", results, path=self.PATH, at_most=1.0)
+    @pytest.mark.parametrize("path", [PATH, "log", "log.name", "log.dropouts", "nothing"])
+    def test_what_is_no_number_gives_nothing(self, path):
+        results = changed(axes__north__truth__kf_position_rmse_m=...)
+        points, comment = checked("number", results, path=path, at_most=1.0)
         assert points == 0.0
         assert "has no number for" in comment
+
+    def test_why_there_is_no_number(self):
+        results = changed(axes__north__kf=NONE)
+        comment = checked("number", results, path="axes.north.kf.nis_mean", at_most=1.0)[1]
+        assert comment == "Your report has no number for axes.north.kf.nis_mean (too few of them)."
 
 
 class TestConsistent:
@@ -286,9 +251,10 @@ class TestConsistent:
         assert "never fused" in comment
 
     def test_outliers_that_no_setting_mends(self):
-        outliers = {"id": "source_outliers", "severity": "error", "message": ""}
+        outliers = finding("source_outliers", "error")
         understated = {
-            "horizontal__kf": {"verdict": "variance understated", "variance_factor": 5.0},
+            "horizontal__kf__verdict": "variance understated",
+            "horizontal__kf__variance_factor": 5.0,
             "findings": [outliers],
         }
         points, comment = checked("consistent", changed(**understated))
@@ -312,7 +278,9 @@ class TestClock:
         points, comment = checked("clock", results)
         assert points == 0.5
         assert "no acceleration" in comment
-        assert checked("clock", changed(clock=...))[0] == 0.0
+        points, comment = checked("clock", changed(clock=NONE))
+        assert (points, "too few of them" in comment) == (0.0, True)
+        assert checked("clock", LOOP)[0] == 0.0
 
     def test_flight_that_was_handed_out_is_not_the_student_s_choice(self):
         results = changed(clock__determinable=False, clock__reason="no acceleration.")
@@ -329,25 +297,30 @@ class TestLoop:
 
     def test_worse_without_reference_uncorrected_and_none(self):
         after = "loop__corrections__by_distance"
-        worse = {f"{after}__scores": {"slam.tum": {"ate": {"translation_m": {"rmse": 0.5}}}}}
-        assert checked("loop", changed(LOOP, **worse))[0] == 0.67
+        worse = {"slam.tum": to_plain(correction(0.5, 1.4))["scores"]["slam.tum"]}
+        assert checked("loop", changed(LOOP, **{f"{after}__scores": worse}))[0] == 0.67
         assert checked("loop", changed(LOOP, **{f"{after}__scores": {}}))[0] == 0.83
-        assert checked("loop", changed(LOOP, **{after: ...}))[0] == 0.33
+        assert checked("loop", changed(LOOP, **{after: NONE}))[0] == 0.33
         points, comment = checked("loop")
         assert points == 0.0
         assert "no external vision with orientation" in comment
         assert checked("loop", changed(LOOP, loop__absolute=True))[0] == 0.0
 
     def test_false_closure_is_rejected_for_a_reason(self):
-        rejected = changed(LOOP, loop__closures=[{"accepted": False}])
+        rejected = copy.deepcopy(LOOP)
+        rejected["loop"]["closures"] = [{**LOOP["loop"]["closures"][0], "accepted": False}]
         assert checked("loop", rejected)[0] == 0.67
-        why = "Notes by the student\nIt is a false closure: we landed 6 m away.\nfoot\nfoot"
-        assert checked("loop", rejected, [why])[0] == 1.0
+        why = noted("It is a false closure: we landed 6 m away.", rejected)
+        assert checked("loop", why)[0] == 1.0
+
+    def test_why_there_is_no_error(self):
+        open_ = changed(LOOP, loop__closure_error_m=..., loop__known_end=NONE)
+        assert "too few of them" in checked("loop", open_)[1]
 
 
 class TestOneAxisOnly:
     def test_why_there_is_nothing_horizontal(self):
-        north = {"axes": {"north": RESULTS["axes"]["north"]}, "tuning": {}, "horizontal": {}}
+        north = {"axes": {"north": EXAMPLE["axes"]["north"]}, "tuning": {}, "horizontal": {}}
         for check, more in (
             ("tuning", {"settings": ["sigma_z_m"]}),
             ("consistent", {}),
@@ -367,10 +340,9 @@ class TestFlight:
         assert "30 s" in comment
         assert checked("flight", LOOP, min_path_m=175.4)[0] == 0.5
 
-    def test_no_motion_and_absent(self):
-        still = changed(findings=[{"id": "no_motion", "severity": "warning", "message": ""}])
+    def test_no_motion(self):
+        still = changed(findings=[finding("no_motion")])
         assert checked("flight", still)[0] == 0.0
-        assert checked("flight", changed(settings=...))[0] == 0.0
 
 
 # ------------------------------------------------------------------ mistakes
@@ -472,27 +444,37 @@ class TestScore:
         for one in (read_rubric(None), key("source_gap")):
             assert pickle.loads(pickle.dumps(one)) == one
 
-    @pytest.mark.parametrize("results", [RESULTS, LOOP], ids=["compare", "loop"])
-    def test_whatever_stands_in_the_results_is_no_exception(self, results):
+    @pytest.mark.parametrize("results", [EXAMPLE, LOOP], ids=["compare", "loop"])
+    def test_whatever_can_be_read_can_be_scored(self, results):
+        """Extreme values, and parts that are absent, wherever the contract allows them."""
         rng = random.Random(0)
-        strange = [None, True, "x" * 2000, -1.0, 0, 10**400, float("nan"), [], {}, [[1, 2]], "\0"]
-        strange += [{"unavailable": 3}, {"unavailable": {"reason": ["x"]}}, [{"id": 3}], -1e308]
-        rubric = read_rubric(None)
-        for _ in range(400):
+        numbers, others = [1e308, -1e308, 5e-324, 0.0, -1, 10**19], [NONE, ..., "x" * 2000, "\0"]
+        rubric, read = read_rubric(None), 0
+        for _ in range(800):
             spoilt = copy.deepcopy(results)
-            for _ in range(rng.randint(1, 6)):
+            for _ in range(rng.randint(1, 3)):
                 place = spoilt
                 while isinstance(place, dict) and place:
                     name = rng.choice(list(place))
-                    if rng.random() < 0.35 or not isinstance(place[name], dict):
-                        place[name] = rng.choice(strange)
+                    if rng.random() < 0.1 or not isinstance(place[name], dict):
+                        strange = numbers if isinstance(place[name], float) else others
+                        value = copy.deepcopy(rng.choice(strange))
+                        place[name] = value
+                        if value is ...:
+                            del place[name]
                         break
                     place = place[name]
-            for item in score(report(spoilt), VERIFIED, rubric, key("source_gap")):
+            try:
+                found = report(spoilt)
+            except ResultsError:
+                continue
+            read += 1
+            for item in score(found, VERIFIED, rubric, key("source_gap")):
                 assert 0.0 <= item.points <= item.of
                 assert len(item.comment) < 1500
                 assert item.comment.isprintable()
-            own_flags(spoilt)
+            own_flags(found.results)
+        assert read > 40
 
     def test_paths_that_lead_nowhere(self):
         for path in (
@@ -506,7 +488,7 @@ class TestScore:
             '""',
             "clock.interval_s.9",
         ):
-            list(values_at(RESULTS, path))
+            list(values_at(EXAMPLE, path))
 
 
 def graded(items=(), **values):
@@ -576,33 +558,32 @@ REASON = "chosen with --start and --end"
 
 class TestOwnFlags:
     def test_none_on_the_example(self):
-        assert own_flags(RESULTS) == ()
-        assert own_flags({}) == ()
-        assert own_flags(LOOP) == ()
+        assert own_flags(decoded(EXAMPLE)) == ()
+        assert own_flags(decoded(LOOP)) == ()
 
     def test_tuned_on_what_is_graded(self):
-        (flag,) = own_flags(changed(**TUNED))
+        (flag,) = own_flags(decoded(changed(**TUNED)))
         assert "tuned on the segment that is graded" in flag
         assert "0.016 nats" in flag
-        assert own_flags(changed(settings__sigma_z_m=0.0966)) == ()
-        assert own_flags(changed(settings__sigma_a_m_s2=0.36, settings__sigma_z_m=0.097))
+        assert own_flags(decoded(changed(settings__sigma_z_m=0.0966))) == ()
+        assert own_flags(decoded(changed(settings__sigma_a_m_s2=0.36, settings__sigma_z_m=0.097)))
 
     def test_part_chosen_by_hand(self):
-        (flag,) = own_flags(changed(settings__segment_reason=REASON, settings__end_s=50.0))
+        (flag,) = own_flags(decoded(changed(settings__segment_reason=REASON, settings__end_s=50.0)))
         assert "37%" in flag
-        assert own_flags(changed(settings__segment_reason=REASON)) == ()
-        assert own_flags(changed(settings__end_s=50.0)) == ()
+        assert own_flags(decoded(changed(settings__segment_reason=REASON))) == ()
+        assert own_flags(decoded(changed(settings__end_s=50.0))) == ()
 
     def test_findings_that_should_be_there(self):
-        (flag,) = own_flags(changed(settings__sigma_z_m=0.3))
+        (flag,) = own_flags(decoded(changed(settings__sigma_z_m=0.3)))
         assert "SIGMA_Z is 3.1 times off" in flag
-        named = [{"id": "sigma_z_large", "severity": "warning", "message": ""}]
-        assert own_flags(changed(settings__sigma_z_m=0.3, findings=named)) == ()
+        named = [finding("sigma_z_large")]
+        assert own_flags(decoded(changed(settings__sigma_z_m=0.3, findings=named))) == ()
 
     def test_parts_left_out(self):
-        (flag,) = own_flags(changed(settings__input="zero"))
+        (flag,) = own_flags(decoded(changed(settings__input="zero")))
         assert "IMU" in flag
-        (flag,) = own_flags(changed(axes={"down": RESULTS["axes"]["down"]}))
+        (flag,) = own_flags(decoded(changed(axes={"down": EXAMPLE["axes"]["down"]})))
         assert "vertical" in flag
 
 
@@ -625,8 +606,7 @@ def of(number, **values):
 
 class TestClassFlags:
     def test_an_honest_class(self):
-        settings = json.dumps({"sigma_a_m_s2": 0.5, "sigma_z_m": 0.1, "start_s": 1.0})
-        assert class_flags([of(n, notes=text_of(n), settings=settings) for n in range(12)]) == {}
+        assert class_flags([of(n, notes=text_of(n)) for n in range(12)]) == {}
         assert class_flags([]) == {}
 
     def test_logs_ids_files_and_versions(self):
@@ -647,15 +627,21 @@ class TestClassFlags:
         }
 
     def test_settings_to_the_last_digit(self):
-        def settings(sigma_a, sigma_z, **more):
-            return json.dumps({"sigma_a_m_s2": sigma_a, "sigma_z_m": sigma_z, **more})
+        def chosen(**values):
+            changes = {f"settings__{name}": value for name, value in values.items()}
+            return chosen_settings(decoded(changed(**changes)))
 
+        typed = {"sigma_a_m_s2": 0.362, "sigma_z_m": 0.097}
+        assert chosen() == chosen(sigma_a_m_s2=0.3, sigma_z_m=0.2) == ""
+        assert (
+            chosen(**typed, start_s=1.0)
+            == chosen(**typed)
+            == ("sigma_a_m_s2 0.362, sigma_z_m 0.097")
+        )
+        assert chosen_settings(decoded(LOOP)) == ""
         same = class_flags(
-            [of(1, settings=settings(0.362, 0.097, start_s=1.0)),
-             of(2, settings=settings(0.362, 0.097, start_s=2.0)),
-             of(3, settings=settings(0.3, 0.2)), of(4, settings=settings(0.3, 0.2)),
-             of(5, settings="["), of(6, settings="[1]")]
-        )  # fmt: skip
+            [of(1, settings=chosen(**typed)), of(2, settings=chosen(**typed)), of(3)]
+        )
         assert set(same) == {0, 1}
         assert "sigma_a_m_s2 0.362" in same[0][0]
 

@@ -54,7 +54,8 @@ def compare(
     from px4fuse.report.document import Document
     from px4fuse.report.pdf import render
     from px4fuse.request import command_line
-    from px4fuse.results.build import results, to_json
+    from px4fuse.results.build import results
+    from px4fuse.results.contract import to_json
 
     person = read_person(given)
     request = comparison_request(log, given)

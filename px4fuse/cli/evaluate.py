@@ -117,7 +117,7 @@ def evaluate(
     """
     from px4fuse.loop.sources import read_source
     from px4fuse.report.loop_terminal import print_evaluation
-    from px4fuse.results.build import evaluation_results
+    from px4fuse.results.build_trajectories import evaluation_results
     from px4fuse.trajectory.evaluation import evaluate as score
 
     for option, value in (("--max-gap", max_gap), ("--time-offset", time_offset)):

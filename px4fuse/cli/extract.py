@@ -67,7 +67,7 @@ def extract(
         )
     from px4fuse.analysis import read_flight
     from px4fuse.contents import extraction
-    from px4fuse.results.build import to_json
+    from px4fuse.results.contract import to_json
 
     flight = read_flight(comparison_request(log, given))
     _refuse_mixture(folder, flight.log.sha256)

@@ -111,7 +111,7 @@ def _print(outcome: Outcome) -> None:
     from rich.table import Table
     from rich.text import Text
 
-    from px4fuse.verification.intake import one_line
+    from px4fuse.results.reading import one_line
 
     console = terminal()
     table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="bold")

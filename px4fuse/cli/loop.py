@@ -30,6 +30,7 @@ from px4fuse.request import FrameName, Landing
 from px4fuse.writing import STANDARD_OUTPUT
 
 if TYPE_CHECKING:
+    from msgspec import Struct
     from rich.console import Console
 
     from px4fuse.loop.loop import Loop
@@ -167,7 +168,8 @@ def loop(
     from px4fuse.report.document import LoopDocument
     from px4fuse.report.loop_terminal import print_loop
     from px4fuse.request import command_line as request_line
-    from px4fuse.results.build import loop_results, to_json
+    from px4fuse.results.build_trajectories import loop_results
+    from px4fuse.results.contract import to_json
 
     person = read_person(given)
     for option, path in (("--tum", tum), ("--g2o", g2o)):
@@ -246,7 +248,7 @@ def _solve(source: Path, json_path: Path | None, g2o: Path | None, robust: bool 
     from px4fuse.loop.sources import split_part
     from px4fuse.readers.g2o import g2o_text, read_g2o
     from px4fuse.report.loop_terminal import print_graph
-    from px4fuse.results.build import graph_results
+    from px4fuse.results.build_trajectories import graph_results
     from px4fuse.trajectory.graph.analysis import analyse_graph
 
     path, part = split_part(str(source))
@@ -270,13 +272,13 @@ def _solve(source: Path, json_path: Path | None, g2o: Path | None, robust: bool 
 
 
 def _finish(
-    results: dict[str, Any],
+    results: Struct,
     json_path: Path | None,
     contents: dict[Path, bytes],
     show: Callable[[Console], None],
 ) -> None:
     """Write all outputs or none; print the results alone, or what was found and written."""
-    from px4fuse.results.build import to_json
+    from px4fuse.results.contract import to_json
 
     if json_path is not None:
         contents = {**contents, json_path: to_json(results).encode()}

@@ -14,6 +14,7 @@ from px4fuse.errors import OutputError
 from px4fuse.writing import STANDARD_OUTPUT, write_all
 
 if TYPE_CHECKING:
+    from msgspec import Struct
     from rich.console import Console
 
 # Parameters that name files to read; some name a part of a log after a colon
@@ -97,9 +98,9 @@ def report_paths(output: Path, json_path: Path | None) -> tuple[Path, Path]:
     return output, beside
 
 
-def write_json(results: dict[str, Any], json_path: Path | None) -> bool:
+def write_json(results: Struct | dict[str, Any], json_path: Path | None) -> bool:
     """Write results where --json says; true where they have standard output to themselves."""
-    from px4fuse.results.build import to_json
+    from px4fuse.results.contract import to_json
 
     if json_path is not None:
         write_outputs({json_path: to_json(results).encode()})

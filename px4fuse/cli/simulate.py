@@ -213,7 +213,7 @@ def simulate(
         truth=not no_truth,
         **scenario,
     )
-    from px4fuse.results.build import to_json
+    from px4fuse.results.contract import to_json
     from px4fuse.simulation import flights
 
     simulation = flights.simulate(chosen, parsed)

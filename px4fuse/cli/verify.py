@@ -83,7 +83,7 @@ def _plain(report: Report, verdict: Verdict) -> dict[str, object]:
 def _print(console: Console, name: str, verdict: Verdict) -> None:
     from rich.text import Text
 
-    from px4fuse.verification.intake import one_line
+    from px4fuse.results.reading import one_line
     from px4fuse.verification.verification import LIMIT
 
     style = STYLES.get(verdict.status, "bold red")

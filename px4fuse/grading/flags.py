@@ -6,7 +6,6 @@ everyone to the same number.
 
 from __future__ import annotations
 
-import json
 import math
 import re
 import unicodedata
@@ -14,12 +13,13 @@ from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import combinations
 from pathlib import PurePosixPath
-from typing import Any
 
 from px4fuse.assignment.key import AnswerKey, folded
 from px4fuse.filter.kalman import Settings
 from px4fuse.filter.tuning import HORIZONTAL
 from px4fuse.grading.model import Graded
+from px4fuse.results.comparison import HeldOut, Tuned
+from px4fuse.results.contract import ComparisonResults, LoopResults, Reported
 
 # Words in a row by which two texts are compared. Five are hardly ever the same by chance, and a
 # changed word costs five shingles of hundreds.
@@ -53,14 +53,10 @@ SHOWN = 4
 # ------------------------------------------------------------------ one report
 
 
-def own_flags(results: Mapping[str, Any]) -> tuple[str, ...]:
-    """What stands out in one report by itself.
-
-    Parameters
-    ----------
-    results : mapping
-        As attached to the report; nothing about them is taken for granted.
-    """
+def own_flags(results: Reported) -> tuple[str, ...]:
+    """What stands out in one report by itself; nothing in one of a loop alone."""
+    if isinstance(results, LoopResults):
+        return ()
     return tuple(
         flag
         for look in (_tuned_here, _hand_picked, _nothing_found, _left_out)
@@ -68,29 +64,29 @@ def own_flags(results: Mapping[str, Any]) -> tuple[str, ...]:
     )
 
 
-def _tuned_here(results: Mapping[str, Any]) -> Iterator[str]:
+def _tuned_here(results: ComparisonResults) -> Iterator[str]:
     """The settings are the optimum of the very flight that they are graded on."""
-    tuned = _mapping(_mapping(results, "tuning"), HORIZONTAL)
-    settings = _mapping(results, "settings")
-    pairs = [
-        (_number(settings, name), _number(tuned, name)) for name in ("sigma_a_m_s2", "sigma_z_m")
-    ]
-    if not all(
-        chosen is not None and best is not None and _as_printed(chosen, best)
-        for chosen, best in pairs
-    ):
+    tuned, settings = results.tuning.get(HORIZONTAL), results.settings
+    if not isinstance(tuned, Tuned) or tuned.sigma_a_m_s2 is None or tuned.sigma_z_m is None:
         return
-    gain = _number(_mapping(tuned, "held_out"), "gain_nats")
+    pairs = (
+        (settings.sigma_a_m_s2, tuned.sigma_a_m_s2),
+        (settings.sigma_z_m, tuned.sigma_z_m),
+    )
+    if not all(_as_printed(chosen, best) for chosen, best in pairs):
+        return
     held = (
-        "no half of the flight was held out"
-        if gain is None
-        else "settings found on its first half alone would be "
-        f"{abs(gain):.2g} nats per measurement {'better' if gain > 0 else 'worse'} on the second"
+        "settings found on its first half alone would be "
+        f"{abs(tuned.held_out.gain_nats):.2g} nats per measurement "
+        f"{'better' if tuned.held_out.gain_nats > 0 else 'worse'} on the second"
+        if isinstance(tuned.held_out, HeldOut)
+        else "no half of the flight was held out"
     )
     yield (
-        f"SIGMA_A {pairs[0][0]:g} and SIGMA_Z {pairs[1][0]:g} are the most likely ones of this "
-        "very flight: they were tuned on the segment that is graded, so that consistency and "
-        f"intervals are met by construction and say nothing about another flight ({held})."
+        f"SIGMA_A {settings.sigma_a_m_s2:g} and SIGMA_Z {settings.sigma_z_m:g} are the most likely "
+        "ones of this very flight: they were tuned on the segment that is graded, so that "
+        "consistency and intervals are met by construction and say nothing about another flight "
+        f"({held})."
     )
 
 
@@ -104,57 +100,47 @@ def _as_printed(chosen: float, best: float) -> bool:
     )
 
 
-def _hand_picked(results: Mapping[str, Any]) -> Iterator[str]:
+def _hand_picked(results: ComparisonResults) -> Iterator[str]:
     """Start or end were chosen by hand, and most of the flight is left out."""
-    settings, log = _mapping(results, "settings"), _mapping(results, "log")
-    start, end = _number(settings, "start_s"), _number(settings, "end_s")
-    whole = _number(log, "duration_s")
-    reason = settings.get("segment_reason")
-    if start is None or end is None or not whole or not isinstance(reason, str):
+    settings, whole = results.settings, results.log.duration_s
+    if not whole:
         return
-    share = (end - start) / whole
-    if reason.startswith("chosen with") and share < HAND_PICKED:
+    share = (settings.end_s - settings.start_s) / whole
+    if settings.segment_reason.startswith("chosen with") and share < HAND_PICKED:
         yield (
-            f"The analysed part was chosen by hand and is {share:.0%} of the log ({start:.1f} to "
-            f"{end:.1f} s of {whole:.1f} s): ask why the rest was left out."
+            f"The analysed part was chosen by hand and is {share:.0%} of the log "
+            f"({settings.start_s:.1f} to {settings.end_s:.1f} s of {whole:.1f} s): ask why the "
+            "rest was left out."
         )
 
 
-def _nothing_found(results: Mapping[str, Any]) -> Iterator[str]:
+def _nothing_found(results: ComparisonResults) -> Iterator[str]:
     """A noise is far off and no finding says so: px4fuse would have."""
-    findings = results.get("findings")
-    if not isinstance(findings, list):
+    ids = {finding.id for finding in results.findings}
+    tuned = results.tuning.get(HORIZONTAL)
+    if "no_motion" in ids or not isinstance(tuned, Tuned):
         return
-    ids = {str(one.get("id")) for one in findings if isinstance(one, dict)}
-    if "no_motion" in ids:
-        return
-    tuned = _mapping(_mapping(results, "tuning"), HORIZONTAL)
     for name, label in (("sigma_z_m", "sigma_z"), ("sigma_a_m_s2", "sigma_a")):
-        chosen = _number(_mapping(results, "settings"), name)
-        best = _number(tuned, name)
-        if not chosen or not best or chosen < 0.0 or best < 0.0:
+        chosen: float = getattr(results.settings, name)
+        best: float | None = getattr(tuned, name)
+        if not best:
             continue
         factor = max(chosen / best, best / chosen)
-        inside = _inside(chosen, tuned.get(f"{name}_interval"))
+        low, high = getattr(tuned, f"{name}_interval") or (math.inf, -math.inf)
         named = {f"{label}_small", f"{label}_large", "process_noise_forgotten"} & ids
-        if factor > SIGMA_FAR_OFF and not inside and not named:
+        if factor > SIGMA_FAR_OFF and not low <= chosen <= high and not named:
             yield (
                 f"{label.upper()} is {factor:.2g} times off what the data ask for, and no finding "
                 "says so: findings may have been taken out."
             )
 
 
-def _left_out(results: Mapping[str, Any]) -> Iterator[str]:
+def _left_out(results: ComparisonResults) -> Iterator[str]:
     """The harder part of the lab was switched off."""
-    axes = results.get("axes")
-    if isinstance(axes, dict) and axes and not {"north", "east", "aisle"} & set(axes):
+    if not {"north", "east", "aisle"} & set(results.axes):
         yield "Only the vertical axis was analysed (--axis)."
-    missing = results.get("findings")
-    without_imu = any(
-        isinstance(one, dict) and one.get("id") == "input_unavailable"
-        for one in (missing if isinstance(missing, list) else [])
-    )
-    if _mapping(results, "settings").get("input") == "zero" and not without_imu:
+    without_imu = any(finding.id == "input_unavailable" for finding in results.findings)
+    if results.settings.input == "zero" and not without_imu:
         yield "The IMU was not used (--input zero)."
 
 
@@ -238,36 +224,27 @@ def _other_assignment(graded: Sequence[Graded], key: AnswerKey | None) -> Flags:
 
 
 def _same_settings(graded: Sequence[Graded]) -> Flags:
-    chosen = [_chosen(one.settings) for one in graded]
-    for members in _groups(chosen):
+    for members in _groups([one.settings for one in graded]):
         if len({_who(graded[index]) for index in members}) > 1:
             for index in members:
                 others = _others(graded, members, index)
-                yield index, f"The same settings to the last digit as {others}: {chosen[index]}."
+                same = graded[index].settings
+                yield index, f"The same settings to the last digit as {others}: {same}."
 
 
-def _chosen(settings: str) -> str:
+def chosen_settings(results: Reported) -> str:
     """What was chosen, in words; empty for defaults and for what many would type."""
-    try:
-        given = json.loads(settings)
-    except (ValueError, RecursionError):
-        return ""
-    if not isinstance(given, dict):
+    if isinstance(results, LoopResults):
         return ""
     default = Settings()
     own = {
-        name: given[name]
+        name: value
         for name in CHOSEN
-        if isinstance(given.get(name), str | int | float) and given[name] != getattr(default, name)
+        if (value := getattr(results.settings, name)) != getattr(default, name)
     }
-    digits = sum(
-        _digits(float(value))
-        for value in own.values()
-        if isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e12
-    )
-    if digits < MIN_DIGITS:
+    if sum(_digits(value) for value in own.values() if isinstance(value, float)) < MIN_DIGITS:
         return ""
-    return ", ".join(f"{name} {_short(str(value))}" for name, value in own.items())
+    return ", ".join(f"{name} {value}" for name, value in own.items())
 
 
 def _other_version(graded: Sequence[Graded]) -> Flags:
@@ -402,26 +379,6 @@ def _short(text: str) -> str:
     kept = "".join(c if unicodedata.category(c)[0] != "C" else " " for c in text[:200])
     line = " ".join(kept.split())
     return line if len(line) <= 80 else line[:79] + "…"
-
-
-def _mapping(given: Mapping[str, Any], name: str) -> Mapping[str, Any]:
-    value = given.get(name)
-    return value if isinstance(value, dict) else {}
-
-
-def _number(given: Mapping[str, Any], name: str) -> float | None:
-    value = given.get(name)
-    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e12:
-        return None
-    return float(value)
-
-
-def _inside(number: float, interval: object) -> bool:
-    if not isinstance(interval, list) or len(interval) != 2:
-        return False
-    bounds = {"low": interval[0], "high": interval[1]}
-    low, high = _number(bounds, "low"), _number(bounds, "high")
-    return low is not None and high is not None and low <= number <= high
 
 
 def _digits(number: float) -> int:

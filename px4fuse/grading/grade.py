@@ -18,15 +18,17 @@ from px4fuse.flight import Unavailable
 from px4fuse.grading import submissions
 from px4fuse.grading.class_page import html_text
 from px4fuse.grading.class_table import csv_text
-from px4fuse.grading.flags import class_flags, own_flags
+from px4fuse.grading.flags import chosen_settings, class_flags, own_flags
 from px4fuse.grading.model import Graded, Item, Submission
 from px4fuse.grading.rubric import Rubric
-from px4fuse.grading.scoring import feedback, gradescope, score, score_refused
+from px4fuse.grading.scoring import feedback, gradescope, score, score_refused, values_at
 from px4fuse.grading.workers import Failed, run_bounded
 from px4fuse.reading import files_by_sha256, max_log_bytes
+from px4fuse.results.contract import Reported, to_plain
 from px4fuse.verification.intake import read_report
-from px4fuse.verification.model import Difference, Refused, Report, Verdict
+from px4fuse.verification.model import Difference, Refused, Verdict
 from px4fuse.verification.pictures import key_page, picture
+from px4fuse.verification.rerun import log_sha256
 from px4fuse.verification.verification import verify
 from px4fuse.writing import write_all
 
@@ -169,7 +171,7 @@ def grade_one(
     report = read_report(content, submission.name)
     if isinstance(report, Refused):
         return _refused(submission, report, sha256, rubric, key)
-    log = _log_of(report)
+    log = log_sha256(report.results)
     # handed out and not among the logs: the instructor's gap, not another log
     missing = key is not None and key.of_log(log) is not None and log not in logs
     verdict = verify(report, {} if missing else logs)
@@ -177,41 +179,24 @@ def grade_one(
     drawn = picture(report.pdf, key_page(report.pages))
     return Graded(
         submission=submission.name,
-        student=_text(results, "student", "name"),
-        student_id=_text(results, "student", "id"),
+        student=results.student.name,
+        student_id=results.student.id,
         verdict=verdict,
         items=score(report, verdict, rubric, key),
         flags=own_flags(results),
         numbers=_numbers(results),
         sha256=sha256,
         log_sha256=log,
-        version=_text(results, "provenance", "px4fuse"),
-        settings=json.dumps(results.get("settings", {}), sort_keys=True, ensure_ascii=False),
-        notes=_text(results, "student", "notes"),
+        version=results.provenance.px4fuse,
+        settings=chosen_settings(results),
+        notes=results.student.notes,
         picture=b"" if isinstance(drawn, Unavailable) else drawn,
     )
 
 
-def _log_of(report: Report) -> str:
-    return _text(report.results, "log", "sha256") or _text(report.results, "track", "sha256")
-
-
-def _text(results: Mapping[str, Any], part: str, name: str) -> str:
-    """A text in the results; those of another version may hold anything in its place."""
-    parts = results.get(part)
-    value = parts.get(name) if isinstance(parts, dict) else None
-    return value if isinstance(value, str) else ""
-
-
-def _numbers(results: Mapping[str, Any]) -> dict[str, float]:
-    found = {}
-    for title, path in NUMBERS:
-        value: Any = results
-        for name in path.split("."):
-            value = value.get(name) if isinstance(value, dict) else None
-        if isinstance(value, int | float) and not isinstance(value, bool):
-            found[title] = float(value)
-    return found
+def _numbers(results: Reported) -> dict[str, float]:
+    plain = to_plain(results)
+    return {title: float(value) for title, path in NUMBERS for _, value in values_at(plain, path)}
 
 
 def _refused(

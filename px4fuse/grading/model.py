@@ -60,7 +60,7 @@ class Graded:
     sha256, log_sha256, version : str
         Of the PDF, of the log it is about, and of px4fuse; "" where unknown.
     settings : str
-        The settings to the last digit, for comparison between students.
+        Those chosen, to the last digit, for comparison between students; "" for usual ones.
     notes : str
         The student's own words.
     picture : bytes

@@ -1,7 +1,7 @@
 """Points by a rubric, and what the student reads about them.
 
-A report comes from a student: whatever stands in its results, a number that is not there or is no
-number gives no points and a comment, never an exception.
+A report comes from a student; its results have been read strictly. A number that is not there gives
+no points and a comment, never an exception.
 """
 
 from __future__ import annotations
@@ -20,7 +20,12 @@ from px4fuse.assignment.key import Answer, AnswerKey
 from px4fuse.filter.tuning import HORIZONTAL
 from px4fuse.grading.model import Graded, Item
 from px4fuse.grading.rubric import Rubric, RubricItem
+from px4fuse.results.comparison import Clock, Filter, HorizontalNis, Tuned
+from px4fuse.results.contract import ComparisonResults, LoopResults, Reported, to_plain
+from px4fuse.results.model import Absent
+from px4fuse.results.trajectories import Correction, Corrections, Loop, Score
 from px4fuse.verification.model import Report, Verdict
+from px4fuse.verification.rerun import log_sha256
 
 # What verification has refuted, rather than what it could not look at
 REFUTED: Mapping[str, str] = {
@@ -38,12 +43,10 @@ LONGEST_SENTENCE = 40
 NEGATIONS = frozenset(("no", "without", "not", "never", "nor", "zero"))
 # In the words of the rubric: what says that a flight has no mistake
 NOTHING = "none"
-NOTES_PAGE = "Notes by the student"
 # Lists are cut where a comment would become longer than a sentence
 NAMED = 4
 # Half is lost where notes name so many kinds of mistakes that some must be guesses
 GUESSING = 0.5
-CORRECTED = ("by_distance", "pose_graph_gated")
 NO_SPACES = re.compile("[\u0e00-\u0eff\u1780-\u17ff]+|[\u3040-\u30ff\u3400-\u9fff]+")
 WORD = re.compile(r"\w+")
 SENTENCE_END = re.compile(r"(?<=[.!?;])\s+|\n\s*\n|\n\s*(?:[-*+#]|\d+[.)])\s*")
@@ -116,61 +119,38 @@ class Evidence:
     key: AnswerKey | None
 
     @property
-    def results(self) -> Mapping[str, Any]:
+    def results(self) -> Reported:
         """The attached results."""
         return self.report.results
 
     @property
+    def comparison(self) -> ComparisonResults | None:
+        """The attached results where they compare filters."""
+        return None if isinstance(self.results, LoopResults) else self.results
+
+    @property
     def kind(self) -> Literal["compare", "loop"]:
         """Which command made the report."""
-        return "loop" if _at(self.results, "schema.name") == "px4fuse-loop" else "compare"
+        return "loop" if isinstance(self.results, LoopResults) else "compare"
 
     @cached_property
-    def student(self) -> tuple[str, str]:
-        """Name and id, as far as they are known."""
-        name, number = (_text(_at(self.results, f"student.{part}")) for part in ("name", "id"))
-        if name or number or self.kind == "compare":
-            return name, number
-        # results of px4fuse loop do not say whose they are; its first page does
-        match = re.search(r"^Student (.+)$", "\n".join(self.report.pages[:1]), re.MULTILINE)
-        name, _, number = (match[1] if match else "").rpartition(", ")
-        return _text(name or number), _text(number if name else "")
+    def plain(self) -> dict[str, Any]:
+        """The attached results, for paths that a rubric names."""
+        return to_plain(self.results)
 
     @cached_property
     def notes(self) -> Notes:
-        """The student's own words, from the pages where the results do not have them."""
-        text = _at(self.results, "student.notes")
-        if not isinstance(text, str) and self.kind == "loop":
-            pages = [page for page in self.report.pages if page.lstrip().startswith(NOTES_PAGE)]
-            # the page's title and its two lines at the foot are not the student's
-            text = "\n".join("\n".join(page.strip().splitlines()[1:-2]) for page in pages)
-        return Notes(text if isinstance(text, str) else "")
-
-    @cached_property
-    def findings(self) -> tuple[tuple[str, str, str], ...]:
-        """Id, severity and message of each finding that is one."""
-        given = self.results.get("findings")
-        listed = [one for one in given if isinstance(one, dict)] if isinstance(given, list) else []
-        return tuple(
-            (_text(one.get("id")), _text(one.get("severity")), _text(one.get("message")))
-            for one in listed
-            if _text(one.get("id"))
-        )
-
-    @property
-    def log_sha256(self) -> str:
-        """Of the log that the report is about."""
-        part = "track" if self.kind == "loop" else "log"
-        return _text(_at(self.results, f"{part}.sha256"))
+        """The student's own words."""
+        return Notes(self.results.student.notes)
 
     def names(self, finding: str, affirmed: bool = False) -> bool:
         """Whether the notes name a finding: by its id, or by words that stand for it."""
         phrases = (finding, finding.replace("_", " "), *self.words.get(finding, ()))
         return self.notes.mention(phrases, affirmed)
 
-    def number(self, path: str) -> float | None:
-        """A finite number in the results."""
-        return _number(_at(self.results, path))
+    def has(self, finding: str) -> bool:
+        """Whether the report lists a finding."""
+        return any(one.id == finding for one in self.results.findings)
 
 
 def values_at(results: Mapping[str, Any], path: str) -> Iterator[tuple[str, Any]]:
@@ -188,7 +168,7 @@ def values_at(results: Mapping[str, Any], path: str) -> Iterator[tuple[str, Any]
             if isinstance(value, dict):
                 keys = list(value) if every else [step] * (step in value)
                 following += [(f"{name}.{key}", value[key]) for key in keys]
-            elif isinstance(value, list):
+            elif isinstance(value, list | tuple):
                 following += [
                     (f"{name}.{place}", value[place])
                     for place in range(len(value))
@@ -198,46 +178,39 @@ def values_at(results: Mapping[str, Any], path: str) -> Iterator[tuple[str, Any]
     yield from ((name.removeprefix("."), value) for name, value in found)
 
 
-def _at(results: Mapping[str, Any], path: str) -> Any:
-    """The value at a path, None where there is none."""
-    return next((value for _, value in values_at(results, path)), None)
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
 
 
-def _number(value: object) -> float | None:
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        return None
-    # false for NaN and for integers that no float can hold
-    return float(value) if abs(value) < 1e300 else None
-
-
-def _interval(value: object) -> tuple[float, float] | None:
-    if not isinstance(value, list) or len(value) != 2:
-        return None
-    low, high = _number(value[0]), _number(value[1])
-    return None if low is None or high is None or low > high else (low, high)
-
-
-def _text(value: object) -> str:
+def _text(value: str) -> str:
     """One line of text, without control characters and not too long to be quoted."""
-    if not isinstance(value, str):
-        return ""
     kept = "".join(c if unicodedata.category(c)[0] != "C" else " " for c in value[: 4 * MAX_QUOTE])
     line = " ".join(kept.split())
     return line if len(line) <= MAX_QUOTE else line[: MAX_QUOTE - 1] + "…"
 
 
-def _why_absent(results: Mapping[str, Any], path: str) -> str:
-    """Why there is no number at a path: what the results themselves say of it."""
+def _why(part: object) -> str:
+    """Why a part is not there, in brackets; "" where it is, or nobody says."""
+    if isinstance(part, Absent):
+        return f" ({_text(part.unavailable.reason).rstrip('.')})"
+    return ""
+
+
+def _why_absent(evidence: Evidence, path: str) -> str:
+    """Why there is nothing at a path of the rubric: what the results themselves say of it."""
     steps = [match[0] for match in STEP.finditer(path)]
     for end in range(len(steps), 0, -1):
-        for _, value in values_at(results, ".".join(steps[:end])):
-            reason = _text(_at(value, "unavailable.reason")) if isinstance(value, dict) else ""
-            if reason:
-                return f" ({reason.rstrip('.')})"
-    axes = results.get("axes")
-    if HORIZONTAL in path and isinstance(axes, dict) and not {"north", "east"} <= set(axes):
-        return " (it needs the axes north and east, which were not both analysed: leave --axis out)"
-    return ""
+        above = ".".join(steps[:end])
+        for _, reason in values_at(evidence.plain, f"{above}.unavailable.reason"):
+            return f" ({_text(reason).rstrip('.')})"
+    return _why_not_horizontal(evidence) if HORIZONTAL in path else ""
+
+
+def _why_not_horizontal(evidence: Evidence) -> str:
+    """Why there is nothing about north and east together."""
+    if evidence.comparison is None or {"north", "east"} <= set(evidence.comparison.axes):
+        return ""
+    return " (it needs the axes north and east, which were not both analysed: leave --axis out)"
 
 
 def _listed(names: Sequence[str]) -> str:
@@ -282,12 +255,12 @@ def _joined(reasons: Sequence[str]) -> str:
 
 
 def _student(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float, str]:
-    name, number = evidence.student
+    student = evidence.results.student
     asked = [
         (what, option, value)
         for what, option, value, wanted in (
-            ("name", "--student", name, given["name"]),
-            ("student id", "--id", number, given["id"]),
+            ("name", "--student", _text(student.name), given["name"]),
+            ("student id", "--id", _text(student.id), given["id"]),
         )
         if wanted
     ]
@@ -308,9 +281,9 @@ def _sections(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float, str]
         if not any(" ".join(wanted.split()).casefold() in page for page in pages)
     ]
     for path in given["results"]:
-        there = [value for _, value in values_at(evidence.results, path)]
+        there = [value for _, value in values_at(evidence.plain, path)]
         if not any(v for v in there if not (isinstance(v, dict) and set(v) == {"unavailable"})):
-            missing.append(f"{path}{_why_absent(evidence.results, path)}")
+            missing.append(f"{path}{_why_absent(evidence, path)}")
     asked = len(given["pages"]) + len(given["results"])
     if not missing:
         return 1.0, f"Your report has all {asked} parts that were asked for."
@@ -335,13 +308,13 @@ def _notes(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float, str]:
 
 
 def _findings(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float, str]:
-    asked = {
-        name: message
-        for name, severity, message in evidence.findings
-        if severity in given["severities"] and name not in given["ignore"]
-    }
-    if not isinstance(evidence.results.get("findings"), list):
-        return 0.0, "Your report has no list of findings, so that none can be looked for."
+    asked = list(
+        dict.fromkeys(
+            one.id
+            for one in evidence.results.findings
+            if one.severity in given["severities"] and one.id not in given["ignore"]
+        )
+    )
     if not asked:
         return 1.0, f"Your report has no {' or '.join(given['severities'])} left to explain."
     missing = [name for name in asked if not evidence.names(name)]
@@ -357,7 +330,7 @@ def _tuning(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float, str]:
     axis = given["axis"]
     shares, said = [], []
     for name in given["settings"]:
-        share, comment = _tuned(evidence, f'tuning."{axis}".{name}', name, given["factor"])
+        share, comment = _tuned(evidence, axis, name, given["factor"])
         shares.append(share)
         said.append(comment)
     if not shares:
@@ -365,17 +338,20 @@ def _tuning(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float, str]:
     return sum(shares) / len(shares), f"{'; '.join(said)}."
 
 
-def _tuned(evidence: Evidence, path: str, name: str, factor: float) -> tuple[float, str]:
+def _tuned(evidence: Evidence, axis: str, name: str, factor: float) -> tuple[float, str]:
     label, unit = {"sigma_z_m": ("SIGMA_Z", "m")}.get(name, ("SIGMA_A", "m/s²"))
-    chosen = evidence.number(f"settings.{name}")
-    if chosen is None or chosen <= 0.0:
+    comparison = evidence.comparison
+    if comparison is None:
         return 0.0, f"Your report does not say which {label} you chose"
-    interval = _interval(_at(evidence.results, f"{path}_interval"))
-    bound = evidence.number(f"{path}_upper_bound")
+    chosen: float = getattr(comparison.settings, name)
+    tuned = comparison.tuning.get(axis)
+    interval = bound = None
+    if isinstance(tuned, Tuned):
+        interval, bound = getattr(tuned, f"{name}_interval"), getattr(tuned, f"{name}_upper_bound")
     if interval is None and bound is not None:
         interval = (0.0, bound)
     if interval is None:
-        why = _why_absent(evidence.results, path)
+        why = _why(tuned) or (_why_not_horizontal(evidence) if axis == HORIZONTAL else "")
         return 0.0, f"Your report has no interval for {label}{why}"
     low, high = interval
     off = max(chosen / high if high > 0.0 else math.inf, low / chosen, 1.0)
@@ -392,17 +368,15 @@ def _number_between(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float
     found: list[tuple[str, float]] = []
     for path in given["path"]:
         found = [
-            (name, number)
-            for name, value in values_at(evidence.results, path)
-            if (number := _number(value)) is not None
+            (name, float(value))
+            for name, value in values_at(evidence.plain, path)
+            if _is_number(value)
         ]
         if found:
             break
     label = given["name"]
     if not found:
-        why = next(
-            (why for path in given["path"] if (why := _why_absent(evidence.results, path))), ""
-        )
+        why = next((why for path in given["path"] if (why := _why_absent(evidence, path))), "")
         return 0.0, f"Your report has no number for {label or given['path'][0]}{why}."
     # of several the one that is worst counts
     name, number = min(found, key=lambda pair: _within(pair[1], given))
@@ -431,26 +405,17 @@ def _consistent(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float, st
     shares, said = [], []
     owner = "your filter" if given["filter"] == "kf" else "EKF2"
     for axis in given["axes"]:
-        where = (
-            f"horizontal.{given['filter']}"
-            if axis == "horizontal"
-            else f'axes."{axis}".{given["filter"]}'
-        )
-        verdict = _text(_at(evidence.results, f"{where}.verdict"))
-        factor = evidence.number(f"{where}.variance_factor")
-        if not verdict or factor is None or factor <= 0.0:
+        judged, why = _judged(evidence, axis, given["filter"])
+        if judged is None:
             shares.append(0.0)
-            said.append(
-                f"there is no verdict on {owner} ({axis}){_why_absent(evidence.results, where)}"
-            )
+            said.append(f"there is no verdict on {owner} ({axis}){why}")
             continue
+        verdict, factor = judged.verdict, judged.variance_factor
         off = max(factor, 1.0 / factor)
         good = verdict == "consistent"
         gone = given["factor"] <= off or given["factor"] <= 1.0
         # no noise explains outliers, and none should be made to
-        outliers = "understated" in verdict and any(
-            name == "source_outliers" for name, *_ in evidence.findings
-        )
+        outliers = "understated" in verdict and evidence.has("source_outliers")
         explained = outliers and evidence.names("source_outliers")
         shares.append(
             1.0
@@ -475,17 +440,29 @@ def _consistent(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float, st
     return sum(shares) / max(len(shares), 1), f"{comment[:1].upper() + comment[1:]}."
 
 
+def _judged(evidence: Evidence, axis: str, which: str) -> tuple[Filter | HorizontalNis | None, str]:
+    """The consistency of a filter along an axis, or why there is none."""
+    comparison = evidence.comparison
+    if comparison is None:
+        return None, ""
+    if axis == HORIZONTAL:
+        return getattr(comparison.horizontal, which), _why_not_horizontal(evidence)
+    analysed = comparison.axes.get(axis)  # type: ignore[call-overload]
+    found = None if analysed is None else getattr(analysed, which)
+    return (found, "") if isinstance(found, Filter) else (None, _why(found))
+
+
 def _clock(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float, str]:
-    interval = _interval(_at(evidence.results, "clock.interval_s"))
-    applied = evidence.number("clock.applied_s")
-    if interval is None or applied is None:
-        why = _why_absent(evidence.results, "clock")
-        return 0.0, f"Your report says nothing about the clock offset{why}."
-    if _at(evidence.results, "clock.determinable") is not True:
-        reason = _text(_at(evidence.results, "clock.reason"))
+    comparison = evidence.comparison
+    clock = None if comparison is None else comparison.clock
+    if not isinstance(clock, Clock):
+        return 0.0, f"Your report says nothing about the clock offset{_why(clock)}."
+    interval, applied = clock.interval_s, clock.applied_s
+    if not clock.determinable:
         said = "Your flight does not determine the clock offset"
-        said += f" ({reason.rstrip('.')})" if reason else ""
-        if evidence.key is not None and evidence.key.of_log(evidence.log_sha256) is not None:
+        said += f" ({_text(clock.reason).rstrip('.')})" if clock.reason else ""
+        key = evidence.key
+        if key is not None and key.of_log(log_sha256(evidence.results)) is not None:
             return 1.0, f"{said}, which is not your choice."
         return given["undeterminable"], f"{said}; fly clear starts and stops."
     low, high = interval
@@ -499,40 +476,34 @@ def _clock(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float, str]:
 
 
 def _loop(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float, str]:
-    error = evidence.number("loop.closure_error_m")
-    if error is None:
-        return 0.0, f"Your report measures no loop{_why_absent(evidence.results, 'loop')}."
-    if _at(evidence.results, "loop.absolute") is True:
+    loop = evidence.results.loop
+    if not isinstance(loop, Loop) or loop.closure_error_m is None:
+        why = _why(loop.known_end if isinstance(loop, Loop) else loop)
+        return 0.0, f"Your report measures no loop{why}."
+    if loop.absolute:
         return 0.0, (
             "Your loop is on a track that follows a positioning system and does not drift; measure "
             "it on odometry."
         )
-    measured = f"You measured a closure error of {error:.3g} m"
-    closures = [v for _, v in values_at(evidence.results, "loop.closures.*") if isinstance(v, dict)]
-    if closures and not any(one.get("accepted") is True for one in closures):
+    measured = f"You measured a closure error of {loop.closure_error_m:.3g} m"
+    if loop.closures and not any(one.accepted for one in loop.closures):
         said = f"{measured} and rejected the closure as false, which leaves the path as it is"
         if evidence.names("false_loop_closure"):
             return 1.0, f"{said}."
         return 2 / 3, f"{said}; your notes should say why it cannot be true."
-    share, comment = _corrected(evidence, given["without_reference"])
+    share, comment = _corrected(loop.corrections, given["without_reference"])
     return (1.0 + share) / 3.0, f"{measured}{comment}"
 
 
-def _corrected(evidence: Evidence, without_reference: float) -> tuple[float, str]:
+def _corrected(corrections: Corrections, without_reference: float) -> tuple[float, str]:
     """One for a corrected path and one for an ATE below the uncorrected one."""
-    done = [
-        name
-        for name in CORRECTED
-        if evidence.number(f"loop.corrections.{name}.moved_max_m") is not None
-    ]
+    tried = (corrections.by_distance, corrections.pose_graph_gated)
+    done = [one for one in tried if isinstance(one, Correction)]
     if not done:
         return 0.0, ", but the path is not corrected."
-    before = _ates(evidence, "uncorrected")
+    before = _ates(corrections.uncorrected)
     pairs = [
-        (before[name], ate)
-        for part in done
-        for name, ate in _ates(evidence, part).items()
-        if before.get(name)
+        (before[name], ate) for one in done for name, ate in _ates(one).items() if before.get(name)
     ]
     if not pairs:
         return 1.0 + without_reference, (
@@ -548,42 +519,27 @@ def _corrected(evidence: Evidence, without_reference: float) -> tuple[float, str
     )
 
 
-def _ates(evidence: Evidence, correction: str) -> dict[str, float]:
+def _ates(correction: Correction | Absent) -> dict[str, float]:
     """ATE (m) of a correction by the reference that it was scored against."""
-    scores = _at(evidence.results, f"loop.corrections.{correction}.scores")
-    found = {}
-    for name, score_ in scores.items() if isinstance(scores, dict) else ():
-        ate = _number(_at(score_, "ate.translation_m.rmse")) if isinstance(score_, dict) else None
-        if ate is not None:
-            found[name] = ate
-    return found
+    scores = correction.scores if isinstance(correction, Correction) else {}
+    return {
+        name: one.ate.translation_m.rmse for name, one in scores.items() if isinstance(one, Score)
+    }
 
 
 def _flight(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float, str]:
-    part = "loop" if evidence.kind == "loop" else "settings"
-    start, end = evidence.number(f"{part}.start_s"), evidence.number(f"{part}.end_s")
-    if start is None or end is None:
-        return 0.0, "Your report does not say which part of the flight it is about."
-    if any(name == "no_motion" for name, *_ in evidence.findings):
+    results = evidence.results
+    part = results.loop if isinstance(results, LoopResults) else results.settings
+    if evidence.has("no_motion"):
         return 0.0, "Your vehicle hardly moved; fly several passes of 5 m or more."
-    value, least, unit = (
-        (evidence.number("loop.path_length_m"), given["min_path_m"], "m of path")
-        if evidence.kind == "loop"
-        else (
-            max(
-                (
-                    number
-                    for _, value in values_at(evidence.results, "axes.*.updates.count")
-                    if (number := _number(value)) is not None
-                ),
-                default=None,
-            ),
-            given["min_measurements"],
-            "measurements",
-        )
-    )
-    shares = [_up_to(end - start, given["min_duration_s"]), _up_to(value or 0.0, least)]
-    said = f"You analysed {end - start:.3g} s with {value or 0.0:.4g} {unit}"
+    value: float
+    if isinstance(results, LoopResults):
+        value, least, unit = results.loop.path_length_m, given["min_path_m"], "m of path"
+    else:
+        value = max(axis.updates.count for axis in results.axes.values())
+        least, unit = given["min_measurements"], "measurements"
+    shares = [_up_to(part.end_s - part.start_s, given["min_duration_s"]), _up_to(value, least)]
+    said = f"You analysed {part.end_s - part.start_s:.3g} s with {value:.4g} {unit}"
     if min(shares) == 1.0:
         return 1.0, f"{said}, which is enough."
     return min(shares), (
@@ -596,18 +552,19 @@ def _up_to(value: float, least: float) -> float:
 
 
 def _mistakes(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float, str]:
-    answer = answer_for(evidence.key, evidence.student[1], evidence.log_sha256)
+    student_id, sha256 = _text(evidence.results.student.id), log_sha256(evidence.results)
+    answer = answer_for(evidence.key, student_id, sha256)
     if answer is None:
         return 0.0, (
-            f"Neither your id ({evidence.student[1] or 'none is given'}) nor your log is in the "
+            f"Neither your id ({student_id or 'none is given'}) nor your log is in the "
             "answer key; make the report of the log that you were given, with your --id."
         )
-    if answer.sha256 != evidence.log_sha256:
+    if answer.sha256 != sha256:
         return 0.0, f"This report is not about the log that you were given, {_text(answer.file)}."
     named = [name for name in sorted(POSSIBLE_FINDINGS) if evidence.names(name, affirmed=True)]
     if not answer.findings:
         return _nothing_wrong(evidence, named, given)
-    shown = {name for name, *_ in evidence.findings}
+    shown = {one.id for one in evidence.results.findings}
     if _applied(evidence, answer):
         shown.add("source_clock_offset")
     shares = {
@@ -654,9 +611,10 @@ def answer_for(key: AnswerKey | None, student_id: str, log_sha256: str) -> Answe
 
 def _applied(evidence: Evidence, answer: Answer) -> bool:
     """Whether the clock offset was mended, so that it is no longer a finding."""
-    applied = evidence.number("settings.clock_offset_s")
+    comparison = evidence.comparison
+    applied = 0.0 if comparison is None else comparison.settings.clock_offset_s
     asked = answer.truth.get("clock_offset_to_add_s", 0.0)
-    return applied is not None and bool(applied) and abs(applied - asked) < abs(asked) / 2.0
+    return bool(applied) and abs(applied - asked) < abs(asked) / 2.0
 
 
 DOES: Mapping[str, Check] = {

@@ -20,7 +20,8 @@ from typing import IO
 
 from px4fuse.errors import SettingsError
 from px4fuse.grading.model import Submission
-from px4fuse.verification.intake import MAX_BYTES, cleaned, one_line
+from px4fuse.results.reading import cleaned, one_line
+from px4fuse.verification.intake import MAX_BYTES
 from px4fuse.verification.model import Refused
 
 MAX_ENTRIES = 10_000

@@ -229,7 +229,7 @@ def _serve(pipe: Connection, function: Callable[[Any], Any], memory_bytes: int |
 
 def _failed(text: str) -> Failed:
     # two seconds to import, in every process, for what mostly does not happen
-    from px4fuse.verification.intake import one_line  # noqa: PLC0415
+    from px4fuse.results.reading import one_line  # noqa: PLC0415
 
     return Failed(one_line(text, 300))
 

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.comparison import Comparison
 from px4fuse.findings import Finding
 from px4fuse.loop.loop import Loop
-from px4fuse.results.model import Student
+from px4fuse.results.model import Provenance, Student
 
 
 @dataclass(frozen=True)
@@ -25,16 +23,15 @@ class Document:
     student : Student
     command : str
         The command line that makes it again, without folders.
-    made : mapping or None
-        Versions to print, as :func:`px4fuse.results.build.provenance` gives them; None for those
-        that run.
+    made : Provenance or None
+        Versions to print; None for those that run.
     """
 
     analysis: Analysis
     findings: tuple[Finding, ...]
     student: Student
     command: str
-    made: Mapping[str, Any] | None = None
+    made: Provenance | None = None
 
     @property
     def comparison(self) -> Comparison:
@@ -63,7 +60,7 @@ class LoopDocument:
         Most severe first.
     student : Student
     command : str
-    made : mapping or None
+    made : Provenance or None
         As in :class:`Document`.
     """
 
@@ -71,7 +68,7 @@ class LoopDocument:
     findings: tuple[Finding, ...]
     student: Student
     command: str
-    made: Mapping[str, Any] | None = None
+    made: Provenance | None = None
 
     @property
     def log(self) -> tuple[str, str]:

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from px4fuse.report.document import Document, LoopDocument
 from px4fuse.report.style import BOTTOM, LEFT, MUTED, NO_GLYPH, lacks_glyphs, page
 from px4fuse.report.words import alignment_words, clock_words
-from px4fuse.results.build import provenance
+from px4fuse.results.parts import provenance
 
 INDENT = LEFT + 0.235
 METHOD = (
@@ -130,9 +130,9 @@ def _made_with(document: Document | LoopDocument) -> Section:
     return (
         "Made with",
         [
-            ("command", made["command"]),
-            ("px4fuse", f"{made['px4fuse']} on Python {made['python']}"),
-            ("libraries", ", ".join(f"{k} {v}" for k, v in made["libraries"].items())),
+            ("command", made.command),
+            ("px4fuse", f"{made.px4fuse} on Python {made.python}"),
+            ("libraries", ", ".join(f"{k} {v}" for k, v in made.libraries.items())),
             ("results", "attached inside this PDF as results.json"),
             *_fonts(document),
         ],

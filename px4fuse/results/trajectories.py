@@ -1,239 +1,241 @@
-"""Loops and scores of trajectories as plain data, for the results contract."""
+"""Results about paths, part by part: scores, loops and their corrections, pose graphs.
+
+Units stand in the names. Positions along the axes of a path's frame go by the axes' names.
+"""
 
 from __future__ import annotations
 
-from dataclasses import asdict
-from typing import Any
+from typing import Annotated, Literal
 
-import numpy as np
+from msgspec import Meta
 
-from px4fuse.arrays import Array
-from px4fuse.flight import Unavailable
-from px4fuse.loop.loop import Correction, Judged, Loop
-from px4fuse.loop.part import KnownEnd
-from px4fuse.plain import present, unavailable
-from px4fuse.trajectory.evaluation import Evaluation
-from px4fuse.trajectory.graph.analysis import SOLUTIONS, SolvedGraph
-from px4fuse.trajectory.model import AXES_OF_FRAME, Trajectory
-from px4fuse.trajectory.scores import Interval, RelativeError, Statistics
+from px4fuse.results.model import Absent, Base, Count, Interval, NotNegative, Part, Share, Vector
+
+Frame = Literal["NED", "FRD", "ENU", "camera", "unknown"]
+Kind = Literal["vio", "ekf2", "kf", "truth", "slam", "unknown"]
+AxisLengths = Annotated[dict[str, float], Meta(min_length=3, max_length=3)]
 
 
-def loop_part(loop: Loop | Unavailable) -> dict[str, Any]:
-    """A loop and its corrections.
+class Track(Base, frozen=True):
+    """A trajectory and the file that it was read from."""
 
-    Returns
-    -------
-    dict
-        Valid as ``loop`` under the results' schema.
+    name: str
+    sha256: Annotated[str, Meta(pattern="^([0-9a-f]{64})?$")]
+    size_bytes: Count
+    kind: Kind
+    frame: Frame
+    poses: Count
+    start_s: float
+    end_s: float
+    orientations: bool
+    notes: tuple[str, ...]
+
+
+class Transform(Base, frozen=True):
+    """What brings the estimate onto the reference: x ↦ scale · R x + t."""
+
+    quaternion_wxyz: tuple[float, float, float, float]
+    translation_m: Vector
+    scale: float
+    degrees_of_freedom: Count
+
+
+class Association(Base, frozen=True):
+    """How poses were paired by time, and how many were left out."""
+
+    method: Literal["interpolate", "nearest"]
+    poses: Count
+    max_gap_s: NotNegative
+    outside: Count
+    in_gaps: Count
+    coverage_estimate: float
+    coverage_reference: float
+
+
+class TimeOffset(Base, frozen=True, kw_only=True):
+    """What was added to the estimate's stamps, with its interval where it was estimated."""
+
+    offset_s: float | None = None
+    interval_s: Interval | None = None
+    determinable: bool
+    reason: str
+
+
+class Statistics(Base, frozen=True):
+    """Of errors, in the unit that the name of the field says."""
+
+    count: Count
+    rmse: NotNegative
+    mean: float
+    median: float
+    std: NotNegative
+    min: float
+    max: float
+
+
+class RmseInterval(Base, frozen=True):
+    """95 % interval of the RMSE, by block bootstrap."""
+
+    low: float
+    high: float
+    block_length: Count
+    blocks: float
+
+
+class AbsoluteError(Base, frozen=True):
+    """ATE: of position (m), with its interval, and of orientation (degrees)."""
+
+    translation_m: Statistics
+    interval_m: Part[RmseInterval]
+    rotation_deg: Part[Statistics]
+
+
+class RelativeError(Base, frozen=True):
+    """RPE over pairs that are ``delta`` apart."""
+
+    delta: float
+    unit: Literal["frames", "m", "s"]
+    all_pairs: bool
+    pairs_from: Literal["estimate", "reference"]
+    translation_m: Part[Statistics]
+    interval_m: Part[RmseInterval]
+    rotation_deg: Part[Statistics]
+
+
+class Score(Base, frozen=True, kw_only=True):
+    """ATE and RPE (Sturm et al. 2012) of a path against a reference."""
+
+    alignment: Literal["none", "yaw", "se3", "sim3"]
+    alignment_reason: str
+    transform: Transform
+    association: Association
+    time_offset: TimeOffset
+    ate: AbsoluteError
+    rpe: tuple[RelativeError, ...]
+    notes: tuple[str, ...]
+    warnings: tuple[str, ...]
+
+
+class KnownEnd(Base, frozen=True, kw_only=True):
+    """Where the vehicle really ended, seen from its start."""
+
+    displacement_m: AxisLengths
+    heading_change_deg: float | None = None
+    sigma_m: NotNegative
+    sigma_heading_deg: NotNegative | None = None
+    source: str
+    assumed: bool
+
+
+class OdometryNoise(Base, frozen=True):
+    """Drift of the odometry in 100 m and by time (1 σ)."""
+
+    position_m: NotNegative
+    heading_deg: NotNegative
+    position_m_per_root_s: NotNegative
+    heading_deg_per_root_s: NotNegative
+    tilt_share: NotNegative
+
+
+class Closure(Base, frozen=True):
+    """Two times at one place, what the gate says of it, and its weights in robust solutions."""
+
+    time_1_s: float
+    time_2_s: float
+    sigma_m: NotNegative
+    source: str
+    distance_m: NotNegative
+    d2: NotNegative
+    degrees_of_freedom: Count
+    p: Share
+    accepted: bool
+    weight_dcs: float | None = None
+    weight_gnc: float | None = None
+
+
+class Correction(Base, frozen=True, kw_only=True):
+    """A path, how far it was moved, and its scores by reference."""
+
+    moved_max_m: NotNegative
+    moved_rms_m: NotNegative
+    cost_initial: NotNegative | None = None
+    cost: NotNegative | None = None
+    iterations: Count | None = None
+    converged: bool | None = None
+    scores: dict[str, Part[Score]]
+
+
+class Corrections(Base, frozen=True):
+    """The path as it is, and by every way to correct it."""
+
+    uncorrected: Part[Correction]
+    by_distance: Part[Correction]
+    pose_graph_all: Part[Correction]
+    pose_graph_gated: Part[Correction]
+    pose_graph_dcs: Part[Correction]
+    pose_graph_gnc: Part[Correction]
+
+
+class Loop(Base, frozen=True, kw_only=True):
+    """A path that truly returns.
+
+    ``closure_error_m`` is how far its end is from where the vehicle really ended;
+    ``closure_percent`` the same in per cent of the path; ``absolute`` says that the track follows
+    a positioning system and does not drift.
     """
-    if isinstance(loop, Unavailable):
-        return unavailable(loop)
-    path = loop.odometry.trajectory
-    error = loop.closure_error_m
-    misclosure, turned = loop.misclosure_m, loop.misclosure_heading_deg
-    return present(
-        {
-            "track": path.name,
-            "kind": path.kind,
-            "frame": path.frame,
-            "start_s": loop.segment.start_s,
-            "end_s": loop.segment.end_s,
-            "part_reason": loop.segment.reason,
-            "poses": len(path),
-            "key_frames": len(loop.nodes),
-            "key_frame_spacing_m": loop.spacing_m,
-            "path_length_m": loop.path_length_m,
-            "end_from_start_m": _axes(path, loop.end_m),
-            "heading_change_deg": loop.heading_change_deg,
-            "known_end": _end(path, loop.known_end),
-            "closure_error_m": error,
-            "closure_percent": None if error is None else 100.0 * error / loop.path_length_m,
-            "closure_error_axes_m": None
-            if isinstance(misclosure, Unavailable)
-            else _axes(path, misclosure),
-            "heading_error_deg": unavailable(turned) if isinstance(turned, Unavailable) else turned,
-            "absolute": loop.absolute,
-            "odometry_noise": asdict(loop.noise),
-            "closures": [_closure(judged) for judged in loop.closures],
-            "corrections": {
-                "uncorrected": _correction(loop.odometry),
-                "by_distance": _correction(loop.by_distance),
-                **{
-                    f"pose_graph_{name}": _correction(loop.solved[name])
-                    for name in SOLUTIONS
-                    if name in loop.solved
-                },
-            },
-            "notes": list(loop.notes),
-        }
-    )
+
+    track: str
+    kind: Kind
+    frame: Frame
+    start_s: float
+    end_s: float
+    part_reason: str
+    poses: Count
+    key_frames: Count
+    key_frame_spacing_m: NotNegative
+    path_length_m: NotNegative
+    end_from_start_m: AxisLengths
+    heading_change_deg: float | None = None
+    known_end: Part[KnownEnd]
+    closure_error_m: NotNegative | None = None
+    closure_percent: NotNegative | None = None
+    closure_error_axes_m: AxisLengths | None = None
+    heading_error_deg: float | Absent
+    absolute: bool
+    odometry_noise: OdometryNoise
+    closures: tuple[Closure, ...]
+    corrections: Corrections
+    notes: tuple[str, ...]
 
 
-def trajectory_part(trajectory: Trajectory) -> dict[str, Any]:
-    """What a trajectory is."""
-    return {
-        "name": trajectory.name,
-        "sha256": trajectory.sha256,
-        "size_bytes": trajectory.size_bytes,
-        "kind": trajectory.kind,
-        "frame": trajectory.frame,
-        "poses": len(trajectory),
-        "start_s": float(trajectory.time_s[0]),
-        "end_s": float(trajectory.time_s[-1]),
-        "orientations": trajectory.rotation is not None,
-        "notes": list(trajectory.notes),
-    }
+class GraphGate(Base, frozen=True):
+    """What the gate says of one closure, by the vertex numbers of the file."""
+
+    first: int
+    second: int
+    d2: NotNegative
+    degrees_of_freedom: Count
+    p: Share
+    accepted: bool
 
 
-def evaluation_part(score: Evaluation | Unavailable) -> dict[str, Any]:
-    """Scores of one trajectory against another."""
-    if isinstance(score, Unavailable):
-        return unavailable(score)
-    transform, matched = score.transform, score.association
-    return {
-        "alignment": score.alignment,
-        "alignment_reason": score.alignment_reason,
-        "transform": {
-            "quaternion_wxyz": transform.rotation.as_quat(scalar_first=True).tolist(),
-            "translation_m": transform.translation_m.tolist(),
-            "scale": transform.scale,
-            "degrees_of_freedom": transform.degrees_of_freedom,
-        },
-        "association": {
-            "method": matched.method,
-            "poses": len(matched),
-            "max_gap_s": matched.max_gap_s,
-            "outside": matched.outside,
-            "in_gaps": matched.in_gaps,
-            "coverage_estimate": matched.coverage_estimate,
-            "coverage_reference": matched.coverage_reference,
-        },
-        "time_offset": present(
-            {
-                "offset_s": score.time_offset.offset_s,
-                "interval_s": None
-                if score.time_offset.interval_s is None
-                else list(score.time_offset.interval_s),
-                "determinable": score.time_offset.determinable,
-                "reason": score.time_offset.reason,
-            }
-        ),
-        "ate": {
-            "translation_m": _statistics(score.ate.translation),
-            "interval_m": _interval(score.ate.interval),
-            "rotation_deg": _statistics(score.ate.rotation),
-        },
-        "rpe": [_relative(one) for one in score.rpe],
-        "notes": list(score.notes),
-        "warnings": list(score.warnings),
-    }
+class GraphSolution(Base, frozen=True):
+    """One solution of a pose graph; ``dropped`` counts edges of weight below a half."""
+
+    cost_initial: NotNegative
+    cost: NotNegative
+    iterations: Count
+    converged: bool
+    dropped: Count
 
 
-def graph_part(name: str, solved: SolvedGraph) -> dict[str, Any]:
-    """A pose graph, its closures and its solutions; edges by the vertex numbers of the file."""
-    graph, gates = solved.graph, solved.gates
-    return {
-        "name": name,
-        "dimension": graph.dimension,
-        "poses": len(graph),
-        "edges": len(graph.first),
-        "initialised": graph.initialised,
-        "gates": unavailable(gates)
-        if isinstance(gates, Unavailable)
-        else [
-            {
-                "first": int(graph.ids[graph.first[gate.edge]]),
-                "second": int(graph.ids[graph.second[gate.edge]]),
-                "d2": gate.d2,
-                "degrees_of_freedom": gate.degrees_of_freedom,
-                "p": gate.p,
-                "accepted": gate.accepted,
-            }
-            for gate in gates
-        ],
-        "solutions": {
-            key: {
-                "cost_initial": solution.initial_cost,
-                "cost": solution.cost,
-                "iterations": solution.iterations,
-                "converged": solution.converged,
-                "dropped": int(np.count_nonzero(solution.weights < 0.5)),
-            }
-            for key, solution in solved.solutions.items()
-        },
-    }
+class Graph(Base, frozen=True):
+    """A pose graph from a file, its closures and its solutions."""
 
-
-def _axes(path: Trajectory, vector: Array) -> dict[str, float]:
-    names = AXES_OF_FRAME[path.frame]
-    return {name: float(value) for name, value in zip(names, vector, strict=True)}
-
-
-def _end(path: Trajectory, end: KnownEnd | Unavailable) -> dict[str, Any]:
-    if isinstance(end, Unavailable):
-        return unavailable(end)
-    return present(
-        {
-            "displacement_m": _axes(path, np.array(end.displacement_m)),
-            "heading_change_deg": end.heading_change_deg,
-            "sigma_m": end.sigma_m,
-            "sigma_heading_deg": None if end.heading_change_deg is None else end.sigma_heading_deg,
-            "source": end.source,
-            "assumed": end.assumed,
-        }
-    )
-
-
-def _closure(judged: Judged) -> dict[str, Any]:
-    closure, gate = judged.closure, judged.gate
-    return present(
-        {
-            "time_1_s": closure.time_1_s,
-            "time_2_s": closure.time_2_s,
-            "sigma_m": closure.sigma_m,
-            "source": closure.source,
-            "distance_m": judged.distance_m,
-            "d2": gate.d2,
-            "degrees_of_freedom": gate.degrees_of_freedom,
-            "p": gate.p,
-            "accepted": gate.accepted,
-            **{f"weight_{name}": weight for name, weight in judged.weights.items()},
-        }
-    )
-
-
-def _correction(correction: Correction | Unavailable) -> dict[str, Any]:
-    if isinstance(correction, Unavailable):
-        return unavailable(correction)
-    solution = correction.solution
-    return present(
-        {
-            "moved_max_m": float(correction.moved_m.max()),
-            "moved_rms_m": float(np.sqrt(np.mean(correction.moved_m**2))),
-            "cost_initial": None if solution is None else solution.initial_cost,
-            "cost": None if solution is None else solution.cost,
-            "iterations": None if solution is None else solution.iterations,
-            "converged": None if solution is None else solution.converged,
-            "scores": {name: evaluation_part(s) for name, s in correction.scores.items()},
-        }
-    )
-
-
-def _relative(error: RelativeError) -> dict[str, Any]:
-    return {
-        "delta": error.delta.value,
-        "unit": error.delta.unit,
-        "all_pairs": error.all_pairs,
-        "pairs_from": error.pairs_from,
-        "translation_m": _statistics(error.translation),
-        "interval_m": _interval(error.interval),
-        "rotation_deg": _statistics(error.rotation),
-    }
-
-
-def _statistics(values: Statistics | Unavailable) -> dict[str, Any]:
-    return unavailable(values) if isinstance(values, Unavailable) else asdict(values)
-
-
-def _interval(interval: Interval | Unavailable) -> dict[str, Any]:
-    return unavailable(interval) if isinstance(interval, Unavailable) else asdict(interval)
+    name: str
+    dimension: Count
+    poses: Count
+    edges: Count
+    initialised: str
+    gates: tuple[GraphGate, ...] | Absent
+    solutions: dict[str, GraphSolution]

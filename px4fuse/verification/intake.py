@@ -9,16 +9,12 @@ from __future__ import annotations
 
 import hashlib
 import io
-import json
 import logging
-import math
 import re
-import unicodedata
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields
-from functools import cache
 from typing import Any
 
 import pypdf
@@ -30,14 +26,16 @@ from pypdf.generic import (
     StreamObject,
 )
 
+from px4fuse.errors import ResultsError
 from px4fuse.report.pdf import RESULTS_NAME
 from px4fuse.report.seal import seal_of
-from px4fuse.results.build import SCHEMA_NAME, SCHEMA_VERSION, schema
+from px4fuse.results.contract import ComparisonResults, LoopResults, Reported
+from px4fuse.results.reading import MAX_BYTES as MAX_ATTACHMENT_BYTES
+from px4fuse.results.reading import cleaned, one_line, read_results
 from px4fuse.verification.model import Refused, Report
 
 MAX_BYTES = 25_000_000
 MAX_PAGES = 100
-MAX_ATTACHMENT_BYTES = 5_000_000
 # Of all pages together, a page counted as often as it is shown; the same for one stream
 MAX_CONTENT_BYTES = 20_000_000
 MAX_DOCUMENT_BYTES = 100_000_000
@@ -46,15 +44,6 @@ MAX_VALUES = 1_000_000
 # Objects that are referred to and not there: pypdf searches the whole file for each of them
 MAX_MISSING = 100
 MAX_PAGE_TEXT = 1_000_000
-
-MAX_JSON_DEPTH = 64
-MAX_JSON_VALUES = 2_000_000
-MAX_JSON_ITEMS = 200_000
-MAX_JSON_STRING = 200_000
-MAX_JSON_DIGITS = 20
-
-LOOP_NAME = "px4fuse-loop"
-LOOP_VERSION = "1.0"
 
 _INSTALL = 'reading reports needs more packages: pip install "px4fuse[grade]".'
 _DAMAGED = "damaged: it cannot be read as a PDF. Hand in the file that px4fuse wrote."
@@ -139,14 +128,12 @@ def read_report(pdf: bytes, name: str) -> Report | Refused:
     Returns
     -------
     Report or Refused
-        The strings of ``results`` and ``pages`` are :func:`cleaned`. Results of the schema's
-        current version are valid under it; those of another version are only bounded in size and
-        depth, and it is for the caller to say so before using them.
+        The strings of ``results`` and ``pages`` are cleaned.
     """
     try:
         with _quiet_pypdf():
             return _read(pdf)
-    except _RefusedError as refusal:
+    except (_RefusedError, ResultsError) as refusal:
         reason = str(refusal)
     except (LimitReachedError, RecursionError, MemoryError):
         reason = _COSTLY
@@ -154,45 +141,6 @@ def read_report(pdf: bytes, name: str) -> Report | Refused:
     except Exception:  # noqa: BLE001
         reason = _DAMAGED
     return Refused(f"{one_line(name, 200)}: {reason}")
-
-
-def cleaned(text: str) -> str:
-    r"""Text without characters that act on a terminal, a page or the order of its neighbours.
-
-    Control characters other than newline and tab, bidirectional embeddings, overrides and
-    isolates, line and paragraph separators, invisible tags, noncharacters and lone surrogates are
-    dropped. Letters and signs of all languages stay.
-
-    >>> cleaned("Zo\u00eb\x1b[2J \u202egnp.exe\ud800")
-    'Zoë[2J gnp.exe'
-    """
-    return text if text.isascii() and text.isprintable() else "".join(filter(_harmless, text))
-
-
-def one_line(text: str, length: int) -> str:
-    r"""A cleaned text on one line, at most ``length`` characters long.
-
-    >>> one_line("a\nb\t c", 4)
-    'a b…'
-    """
-    # whoever sends a million characters shall not have them all looked at
-    line = " ".join(cleaned(text[: 10 * length]).split())
-    return line if len(line) <= length else line[: length - 1].rstrip() + "…"
-
-
-@cache
-def _harmless(character: str) -> bool:
-    code = ord(character)
-    if character in "\n\t":
-        return True
-    return not (
-        unicodedata.category(character) in {"Cc", "Cs", "Zl", "Zp"}
-        or 0x202A <= code <= 0x202E
-        or 0x2066 <= code <= 0x2069
-        or 0xE0000 <= code <= 0xE007F
-        or 0xFDD0 <= code <= 0xFDEF
-        or code & 0xFFFE == 0xFFFE
-    )
 
 
 @contextmanager
@@ -422,135 +370,12 @@ def _streams_of(file: DictionaryObject) -> list[StreamObject]:
     return [part for each in parts if isinstance(part := _resolved(each), StreamObject)]
 
 
-def _results(data: bytes) -> dict[str, Any]:
-    loaded = _loaded(data)
-    named = loaded.get("schema") if isinstance(loaded, dict) else None
-    name, version = (
-        (named.get("name"), named.get("version")) if isinstance(named, dict) else (None, None)
-    )
-    if name not in (SCHEMA_NAME, LOOP_NAME) or not isinstance(version, str):
-        raise _RefusedError(f"{RESULTS_NAME} in it holds no results of px4fuse.")
-    results: dict[str, Any] = _cleaned_tree(loaded)
-    if (name, version) in ((SCHEMA_NAME, SCHEMA_VERSION), (LOOP_NAME, LOOP_VERSION)):
-        _validate(results, name)
-    return results
-
-
-def _loaded(data: bytes) -> object:
-    """JSON, more strictly than Python reads it."""
+def _results(data: bytes) -> Reported:
     where = f"{RESULTS_NAME} in it"
-    try:
-        text = data.decode("utf-8")
-    except UnicodeDecodeError as error:
-        raise _RefusedError(f"{where} is not UTF-8 text.") from error
-    # an upper bound that costs nothing: each further value has a comma or bracket before it
-    if sum(map(text.count, ",[{")) >= MAX_JSON_VALUES:
-        raise _RefusedError(f"{where} holds more values than results can have.")
-    try:
-        loaded = json.loads(
-            text,
-            object_pairs_hook=_without_twins,
-            parse_constant=_no_constant,
-            parse_int=_integer,
-            parse_float=_finite,
-        )
-    except RecursionError as error:
-        raise _RefusedError(f"{where} is nested too deeply.") from error
-    except json.JSONDecodeError as error:
-        raise _RefusedError(f"{where} is not JSON.") from error
-    _check_sizes(loaded)
-    return loaded
-
-
-def _without_twins(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    made = dict(pairs)
-    if len(made) != len(pairs):
-        raise _RefusedError(f"{RESULTS_NAME} in it has a key twice.")
-    return made
-
-
-def _no_constant(name: str) -> float:
-    raise _RefusedError(f"{RESULTS_NAME} in it has the number {name}, which is not JSON.")
-
-
-def _integer(digits: str) -> int:
-    if len(digits) > MAX_JSON_DIGITS:
-        raise _RefusedError(f"{RESULTS_NAME} in it has a number with too many digits.")
-    return int(digits)
-
-
-def _finite(digits: str) -> float:
-    number = float(digits)
-    if not math.isfinite(number):
-        raise _RefusedError(f"{RESULTS_NAME} in it has a number that is too large.")
-    return number
-
-
-def _check_sizes(loaded: object) -> None:
-    left = [(loaded, 1)]
-    while left:
-        value, depth = left.pop()
-        if depth > MAX_JSON_DEPTH:
-            raise _RefusedError(f"{RESULTS_NAME} in it is nested too deeply.")
-        if isinstance(value, str) and len(value) > MAX_JSON_STRING:
-            raise _RefusedError(f"{RESULTS_NAME} in it has a text that is too long.")
-        if isinstance(value, dict | list):
-            if len(value) > MAX_JSON_ITEMS:
-                raise _RefusedError(f"{RESULTS_NAME} in it has a list that is too long.")
-            parts = value.values() if isinstance(value, dict) else value
-            left.extend((part, depth + 1) for part in parts)
-            if isinstance(value, dict):
-                left.extend((key, depth) for key in value)
-
-
-def _cleaned_tree(value: Any) -> Any:
-    if isinstance(value, str):
-        return cleaned(value)
-    if isinstance(value, list):
-        return [_cleaned_tree(part) for part in value]
-    if isinstance(value, dict):
-        if any(cleaned(key) != key for key in value):
-            raise _RefusedError(f"{RESULTS_NAME} in it has a key with control characters.")
-        return {key: _cleaned_tree(part) for key, part in value.items()}
-    return value
-
-
-def _validate(results: dict[str, Any], name: str) -> None:
-    try:
-        from jsonschema import (  # type: ignore[import-untyped]  # noqa: PLC0415
-            Draft202012Validator,
-        )
-    except ImportError as error:
-        raise _RefusedError(_INSTALL) from error
-    rules = schema() if name == SCHEMA_NAME else _loop_schema()
-    # the first error only: all of them could be millions
-    wrong = next(Draft202012Validator(rules).iter_errors(results), None)
-    if wrong is not None:
-        place = one_line(".".join(map(str, wrong.absolute_path)), 100) or "its top"
-        raise _RefusedError(f"{RESULTS_NAME} in it does not follow the schema at {place}.")
-
-
-SHARED = ("loop", "findings", "student", "provenance")
-
-
-def _loop_schema() -> dict[str, Any]:
-    """What the results of ``px4fuse loop`` share with those of ``compare``, and their own keys."""
-    whole = schema()
-    shared = {key: whole["properties"][key] for key in SHARED}
-    own: dict[str, Any] = {
-        "schema": {"type": "object"},
-        "request": {"type": "object"},
-        "track": {"type": "object"},
-        "references": {"type": "array", "items": {"type": "object"}},
-    }
-    return {
-        "$schema": whole["$schema"],
-        "$defs": whole["$defs"],
-        "type": "object",
-        "properties": own | shared,
-        "required": [*own, *shared],
-        "additionalProperties": False,
-    }
+    results = read_results(data, where)
+    if not isinstance(results, ComparisonResults | LoopResults):
+        raise _RefusedError(f"{where} holds no results of a report.")
+    return results
 
 
 def _page_texts(reader: pypdf.PdfReader) -> Iterator[str]:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Literal
+
+from px4fuse.results.contract import Reported
 
 # Whether the file is, to the byte, as px4fuse wrote it
 Seal = Literal["intact", "broken", "missing"]
@@ -20,8 +22,8 @@ class Report:
         Of the PDF.
     size_bytes : int
     seal : {"intact", "broken", "missing"}
-    results : dict
-        The attached results; a JSON object with a ``schema`` of px4fuse's.
+    results : ComparisonResults or LoopResults
+        The attached results.
     pages : tuple of str
         Text of each page.
     pdf : bytes
@@ -31,7 +33,7 @@ class Report:
     sha256: str
     size_bytes: int
     seal: Seal
-    results: dict[str, Any]
+    results: Reported
     pages: tuple[str, ...]
     pdf: bytes = field(repr=False)
 

@@ -16,23 +16,20 @@ from dataclasses import dataclass
 from dataclasses import replace as replaced
 from functools import partial
 from pathlib import Path
-from typing import Any, cast
 
-import msgspec
 from msgspec.structs import replace
 
 from px4fuse.errors import Px4FuseError, SettingsError
 from px4fuse.report.document import Document, LoopDocument
-from px4fuse.request import ComparisonRequest, LoopRequest, Request, command_line
-from px4fuse.results.model import MAX_NOTES_BYTES, Student
+from px4fuse.request import command_line
+from px4fuse.results.contract import ComparisonResults, LoopResults, Reported, to_json
+from px4fuse.results.model import Provenance
 from px4fuse.verification.model import Refused
 
 MAX_NAME_BYTES = 240
-MAX_PERSON = 10_000
 NOT_OURS = "the recorded request is not one that px4fuse can have made"
 # What Windows does not take in a name, or takes for something else than a file
 _WINDOWS = re.compile(r'[<>:"|?*]|^(?:con|prn|aux|nul|com\d|lpt\d)(?:\.|$)|[. ]$', re.IGNORECASE)
-_VERSION = re.compile(r"[0-9A-Za-z.+!_-]{1,60}")
 
 
 @dataclass(frozen=True)
@@ -41,13 +38,13 @@ class Recomputed:
 
     Attributes
     ----------
-    results : dict
+    results : ComparisonResults or LoopResults
         As a report attaches them.
     draw : callable
         Draws the report: with the student, and with the versions, that were recorded.
     """
 
-    results: dict[str, Any]
+    results: Reported
     draw: Callable[[], bytes]
 
 
@@ -55,19 +52,17 @@ class _RefusedError(Exception):
     """The analysis cannot be repeated; the text says why."""
 
 
-def log_sha256(results: Mapping[str, Any]) -> str:
-    """SHA-256 of the log that a report is about; "" where it names none."""
-    part = results.get("log", results.get("track"))
-    found = part.get("sha256") if isinstance(part, Mapping) else None
-    return found if isinstance(found, str) else ""
+def log_sha256(results: Reported) -> str:
+    """SHA-256 of the log that a report is about."""
+    return results.track.sha256 if isinstance(results, LoopResults) else results.log.sha256
 
 
-def recompute(results: Mapping[str, Any], logs: Mapping[str, Path]) -> Recomputed | Refused:
+def recompute(results: Reported, logs: Mapping[str, Path]) -> Recomputed | Refused:
     """Repeat the analysis from what a report recorded.
 
     Parameters
     ----------
-    results : mapping
+    results : ComparisonResults or LoopResults
         What is attached to the report.
     logs : mapping of str to Path
         Files by their SHA-256.
@@ -78,14 +73,12 @@ def recompute(results: Mapping[str, Any], logs: Mapping[str, Path]) -> Recompute
         Refused where the command is not px4fuse's, a file is missing, or the analysis fails.
     """
     try:
-        person = _person(results)
         versions = _versions(results)
-        request = _request(results)
         with tempfile.TemporaryDirectory(prefix="px4fuse-") as folder:
-            files = _Files(results, logs, Path(folder))
-            if isinstance(request, LoopRequest):
-                return _looped(request, files, person, versions)
-            return _compared(request, files, person, versions)
+            files = _Files(logs, Path(folder))
+            if isinstance(results, LoopResults):
+                return _looped(results, files, versions)
+            return _compared(results, files, versions)
     except SettingsError as error:  # no run with these settings can have made a report
         return Refused(f"{NOT_OURS}: {error}")
     except (_RefusedError, Px4FuseError) as error:
@@ -97,44 +90,13 @@ def recompute(results: Mapping[str, Any], logs: Mapping[str, Path]) -> Recompute
 # -- what was recorded -----------------------------------------------------------------------------
 
 
-def _request(results: Mapping[str, Any]) -> Request:
-    """What was analysed and how, as the results record it."""
-    try:
-        request: Request = msgspec.convert(results.get("request"), Request)
-    except msgspec.ValidationError as error:
-        raise _RefusedError(f"{NOT_OURS}: {error}") from error
-    return request
-
-
-def _person(results: Mapping[str, Any]) -> Student:
-    """Whose report it is: words to be printed, no more."""
-    student = results.get("student")
-    parts = [student.get(key) if isinstance(student, Mapping) else None
-             for key in ("name", "id", "notes")]  # fmt: skip
-    limits = (MAX_PERSON, MAX_PERSON, MAX_NOTES_BYTES)
-    for part, limit in zip(parts, limits, strict=True):
-        if not isinstance(part, str) or len(part) > limit:
-            raise _RefusedError("the results do not say whose report it is, as px4fuse does")
-        try:
-            part.encode()
-        except UnicodeEncodeError as error:
-            raise _RefusedError("the student's words are no text") from error
-    name, number, notes = cast(list[str], parts)
-    return Student(name, number, notes)
-
-
-def _versions(results: Mapping[str, Any]) -> dict[str, Any]:
+def _versions(results: Reported) -> Provenance:
     """Versions to print on the page that says what the report was made with."""
-    from px4fuse.results.build import LIBRARIES  # noqa: PLC0415
+    from px4fuse.results.parts import LIBRARIES  # noqa: PLC0415
 
-    made = results["provenance"]
-    libraries = made.get("libraries")
-    if not isinstance(libraries, Mapping) or tuple(libraries) != LIBRARIES:
+    if tuple(results.provenance.libraries) != LIBRARIES:
         raise _RefusedError("the results do not say which libraries they were made with")
-    versions = [made.get("px4fuse"), made.get("python"), *libraries.values()]
-    if not all(isinstance(one, str) and _VERSION.fullmatch(one) for one in versions):
-        raise _RefusedError("the results name versions that are none")
-    return dict(made)
+    return results.provenance
 
 
 # -- files -----------------------------------------------------------------------------------------
@@ -147,14 +109,13 @@ class _Files:
     only where they are plain names.
     """
 
-    def __init__(self, results: Mapping[str, Any], logs: Mapping[str, Path], folder: Path) -> None:
-        self.results = results
+    def __init__(self, logs: Mapping[str, Path], folder: Path) -> None:
         self.logs = logs
         self._folder = folder
 
-    def place(self, recorded: str, sha256: object, what: str) -> Path:
+    def place(self, recorded: str, sha256: str | None, what: str) -> Path:
         """A file with this content and the recorded name."""
-        path = self.logs.get(sha256) if isinstance(sha256, str) else None
+        path = None if sha256 is None else self.logs.get(sha256)
         if path is None:
             raise _RefusedError(f"none of the files given has the SHA-256 of {what}")
         name = recorded
@@ -173,14 +134,9 @@ class _Files:
         return target
 
 
-def _joined(results: Mapping[str, Any], role: str) -> object:
+def _joined(results: ComparisonResults, role: str) -> str | None:
     """SHA-256 of the recording that was joined to the log in a role."""
-    log = results.get("log")
-    joined = log.get("joined") if isinstance(log, Mapping) else None
-    for entry in joined if isinstance(joined, list) else ():
-        if isinstance(entry, Mapping) and entry.get("role") == role:
-            return entry.get("sha256")
-    return None
+    return next((file.sha256 for file in results.log.joined if file.role == role), None)
 
 
 def _part(source: str) -> tuple[str, str]:
@@ -194,22 +150,21 @@ def _part(source: str) -> tuple[str, str]:
 # -- the two kinds of report -----------------------------------------------------------------------
 
 
-def _compared(
-    request: ComparisonRequest, files: _Files, person: Student, versions: dict[str, Any]
-) -> Recomputed:
+def _compared(handed_in: ComparisonResults, files: _Files, versions: Provenance) -> Recomputed:
     from px4fuse.analysis import run  # noqa: PLC0415
     from px4fuse.findings import find  # noqa: PLC0415
-    from px4fuse.results.build import results, to_json  # noqa: PLC0415
+    from px4fuse.results.build import results  # noqa: PLC0415
 
-    recorded = request
-    log = files.place(request.log, log_sha256(files.results), "the log")
+    recorded = request = handed_in.request
+    person = handed_in.student
+    log = files.place(request.log, handed_in.log.sha256, "the log")
     request = replace(request, log=str(log))
     if request.mavlink is not None:
-        sha256 = _joined(files.results, "mavlink")
+        sha256 = _joined(handed_in, "mavlink")
         placed = files.place(request.mavlink, sha256, "--mavlink")
         request = replace(request, mavlink=str(placed))
     if request.position is not None:
-        sha256 = _joined(files.results, "position")
+        sha256 = _joined(handed_in, "position")
         placed = files.place(request.position.path, sha256, "--position")
         request = replace(request, position=replace(request.position, path=str(placed)))
     analysis = run(request)
@@ -218,22 +173,19 @@ def _compared(
     return Recomputed(found, partial(_drawn, document, to_json(found), versions))
 
 
-def _looped(
-    request: LoopRequest, files: _Files, person: Student, versions: dict[str, Any]
-) -> Recomputed:
+def _looped(handed_in: LoopResults, files: _Files, versions: Provenance) -> Recomputed:
     from px4fuse.analysis import run_loop  # noqa: PLC0415
     from px4fuse.findings import find_loop  # noqa: PLC0415
-    from px4fuse.results.build import loop_results, to_json  # noqa: PLC0415
+    from px4fuse.results.build_trajectories import loop_results  # noqa: PLC0415
 
-    recorded = request
+    recorded = request = handed_in.request
+    person = handed_in.student
     path, part = _part(request.source)
-    source = files.place(path, log_sha256(files.results), "the log")
+    source = files.place(path, handed_in.track.sha256, "the log")
     request = replace(request, source=f"{source}{part}")
     if request.reference is not None:
         path, part = _part(request.reference)
-        references = files.results.get("references")
-        last = references[-1] if isinstance(references, list) and references else None
-        sha256 = last.get("sha256") if isinstance(last, Mapping) else None
+        sha256 = handed_in.references[-1].sha256 if handed_in.references else None
         placed = files.place(path, sha256, "--reference")
         request = replace(request, reference=f"{placed}{part}")
     found = run_loop(request)
@@ -242,12 +194,12 @@ def _looped(
     return Recomputed(made, partial(_drawn, document, to_json(made), versions))
 
 
-def _drawn(document: Document | LoopDocument, text: str, versions: dict[str, Any]) -> bytes:
+def _drawn(document: Document | LoopDocument, text: str, versions: Provenance) -> bytes:
     """Draw the report with the versions that were recorded."""
     from px4fuse.report.pdf import render  # noqa: PLC0415
     from px4fuse.report.style import text_width  # noqa: PLC0415
 
-    made = versions | {"command": document.command}
+    made = replace(versions, command=document.command)
     drawn = render(replaced(document, made=made), text)
     text_width.cache_clear()  # it holds every text of every report otherwise
     return drawn

@@ -16,10 +16,11 @@ from typing import Any
 
 from px4fuse.errors import Px4FuseError
 from px4fuse.reading import files_by_sha256
-from px4fuse.results.build import SCHEMA_NAME, SCHEMA_VERSION
+from px4fuse.results.contract import Reported, to_plain
+from px4fuse.results.model import Provenance
+from px4fuse.results.reading import cleaned, one_line
 from px4fuse.verification import rerun
 from px4fuse.verification.agreement import disagreements
-from px4fuse.verification.intake import cleaned, one_line
 from px4fuse.verification.model import Difference, Refused, Report, Status, Verdict
 from px4fuse.verification.page_comparison import (
     TOLERANCE_POINTS,
@@ -32,7 +33,6 @@ from px4fuse.verification.page_comparison import (
 from px4fuse.verification.rerun import Recomputed
 
 LIMIT = "A verified report proves that its numbers belong to the log, not who wrote them."
-SCHEMAS = {SCHEMA_NAME: SCHEMA_VERSION, "px4fuse-loop": "1.0"}
 # Sums over a flight differ between machines in the last few of 16 digits; what is left of a
 # difference of two such sums, after a filter has run over it, in the last 8
 RELATIVE, ABSOLUTE = 1e-6, 1e-9
@@ -56,7 +56,7 @@ PRINTED_SCALES = (1.0, 100.0, 1000.0)
 # Lines of notes on a page, at least
 NOTES_LINES = 80
 
-Recompute = Callable[[Mapping[str, Any], Mapping[str, Path]], Recomputed | Refused]
+Recompute = Callable[[Reported, Mapping[str, Path]], Recomputed | Refused]
 
 
 @dataclass(frozen=True)
@@ -129,20 +129,13 @@ def verify(
     return _with_log(report, again)
 
 
-def _other_version(results: Mapping[str, Any]) -> str:
+def _other_version(results: Reported) -> str:
     """Why this version cannot say anything about the results; "" where it can."""
-    made = results.get("provenance")
-    theirs = made.get("px4fuse") if isinstance(made, Mapping) else None
+    theirs = results.provenance.px4fuse
     ours = metadata.version("px4fuse")
     if theirs != ours:
-        named = one_line(str(theirs), 40)
+        named = one_line(theirs, 40)
         return f"made with px4fuse {named}, this is {ours}: run that version"
-    schema = results.get("schema")
-    name, version = (
-        (schema.get("name"), schema.get("version")) if isinstance(schema, Mapping) else ("", "")
-    )
-    if not isinstance(name, str) or SCHEMAS.get(name) != version:
-        return "its results follow a schema that this version does not know"
     return ""
 
 
@@ -151,7 +144,7 @@ def _other_version(results: Mapping[str, Any]) -> str:
 
 def _without_log(report: Report) -> Verdict:
     try:
-        missing = disagreements(report.results, report.pages)
+        missing = disagreements(to_plain(report.results), report.pages)
     except (Px4FuseError, LookupError, TypeError, ValueError, AttributeError, ArithmeticError):
         reason = "no log was given; the results are not of the form that px4fuse writes"
         return Verdict("cannot verify", (reason,), with_log=False)
@@ -178,7 +171,7 @@ def _file_reasons(report: Report) -> list[str]:
 
 
 def _with_log(report: Report, again: Recomputed) -> Verdict:
-    notes = _notes_of(report.results)
+    notes = report.results.student.notes
     if sum(1 for line in notes.splitlines() if line.strip()) > NOTES_LINES * len(report.pages):
         reason = "the recorded notes are longer than the pages"
         return Verdict("page altered", (reason,), True, (), (len(report.pages),))
@@ -186,12 +179,12 @@ def _with_log(report: Report, again: Recomputed) -> Verdict:
     if drawn == report.pdf:
         reason = "the log gives the same file again, byte for byte"
         return Verdict("verified", (reason, LIMIT), with_log=True)
-    numbers = compare_results(report.results, again.results)
+    numbers = compare_results(to_plain(report.results), to_plain(again.results))
     pages = compare_pdf(report.pdf, drawn, _rounding(numbers.pairs))
     about_pages = [
         f"page {page}: {one_line(why, 200)}" for page, why in sorted(pages.pages.items())
     ]
-    machine = _other_machine(report.results, again.results)
+    machine = _other_machine(report.results.provenance, again.results.provenance)
     about_file = _all_file_reasons(report, pages, machine)
     excuse = _excuse(report, drawn, machine) if pages.pages else ""
     status, reasons = _judged(report, numbers, pages, about_file, excuse)
@@ -222,12 +215,6 @@ def _judged(
     )
 
 
-def _notes_of(results: Mapping[str, Any]) -> str:
-    student = results.get("student")
-    notes = student.get("notes") if isinstance(student, Mapping) else ""
-    return notes if isinstance(notes, str) else ""
-
-
 def _number_reason(numbers: Numbers) -> str:
     first = ", ".join(one.path for one in numbers.differences[:3])
     return (
@@ -245,13 +232,12 @@ def _all_file_reasons(report: Report, pages: Compared, machine: Sequence[str]) -
     return found
 
 
-def _other_machine(recorded: Mapping[str, Any], recomputed: Mapping[str, Any]) -> tuple[str, ...]:
+def _other_machine(theirs: Provenance, ours: Provenance) -> tuple[str, ...]:
     """With which other versions the report was made; Python's alone changes no number."""
-    theirs, ours = recorded["provenance"], recomputed["provenance"]
     others = [
-        f"{name} {theirs['libraries'].get(name)} (here {version})"
-        for name, version in ours["libraries"].items()
-        if theirs["libraries"].get(name) != version
+        f"{name} {theirs.libraries.get(name)} (here {version})"
+        for name, version in ours.libraries.items()
+        if theirs.libraries.get(name) != version
     ]
     return (one_line(f"made with {', '.join(others)}", 400),) if others else ()
 

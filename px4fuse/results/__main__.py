@@ -1,0 +1,8 @@
+"""``python -m px4fuse.results`` prints the JSON Schema of the results."""
+
+import sys
+
+from px4fuse.results.contract import schema, to_json
+
+sys.stdout.reconfigure(encoding="utf-8")  # type: ignore[union-attr]
+sys.stdout.write(to_json(schema()))

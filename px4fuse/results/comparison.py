@@ -1,0 +1,382 @@
+"""Results of a comparison, part by part: log, source, settings, axes, and what explains them.
+
+Units stand in the names; times are seconds from the first data of the log. ``kf`` is px4fuse's
+two-state filter.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from msgspec import Meta
+
+from px4fuse.request import InputName
+from px4fuse.results.model import (
+    Absent,
+    Base,
+    Count,
+    Either,
+    Interval,
+    Missing,
+    NotNegative,
+    Part,
+    Positive,
+    Sha256,
+    Share,
+    Vector,
+)
+
+Verdict = Literal["consistent", "variance overstated", "variance understated"]
+Correlation = Annotated[float, Meta(ge=-1.0, le=1.0)]
+
+
+class Dropout(Base, frozen=True):
+    """A gap of the log itself."""
+
+    start_s: float
+    duration_s: NotNegative
+
+
+class JoinedFile(Base, frozen=True):
+    """A file that was read beside the log."""
+
+    name: str
+    sha256: Sha256
+    size_bytes: Count
+    role: Literal["mavlink", "position"]
+
+
+class ClockMap(Base, frozen=True):
+    """A clock mapped to the autopilot's: boot = stamp + offset + drift (stamp - middle)."""
+
+    clock: str
+    method: Literal[
+        "boot clock",
+        "TIMESYNC",
+        "SYSTEM_TIME",
+        "receive time",
+        "arrival time",
+        "position in the stream",
+    ]
+    pairs: Count
+    offset_s: float
+    drift_ppm: float
+    jitter_s: NotNegative
+    note: str
+    distinct_stamps: Count | None = None
+
+
+class Log(Base, frozen=True, kw_only=True):
+    """The recording.
+
+    ``parameters`` are those of PX4 that bear on fusion and logging; ``start_unix_s`` is the UNIX
+    time of time zero, where the log has it.
+    """
+
+    name: str
+    sha256: Sha256
+    size_bytes: Count
+    format: Literal["ULog", "MAVLink tlog", "MAVLink stream"]
+    firmware: str
+    firmware_hash: str
+    hardware: str
+    boot_time_s: float
+    duration_s: NotNegative
+    dropouts: tuple[Dropout, ...]
+    parameters: dict[str, int | float]
+    notes: tuple[str, ...]
+    autopilot: str
+    start_unix_s: float | None = None
+    joined: tuple[JoinedFile, ...]
+    clocks: tuple[ClockMap, ...]
+
+
+class AvailableTrack(Base, frozen=True):
+    """A position track of the flight."""
+
+    name: str
+    rung: Count
+    samples: Count
+    rate_hz: Positive | None = None
+
+
+class Alignment(Base, frozen=True, kw_only=True):
+    """How a position file was placed into the flight."""
+
+    frame: Literal["ned", "enu", "nwu"]
+    frame_reason: str
+    yaw_deg: float
+    yaw_sigma_deg: NotNegative | None = None
+    yaw_reason: str
+    origin_m: Vector
+    clock_offset_s: float
+    clock_offset_sigma_s: NotNegative | None = None
+    clock_reason: str
+    reference: str
+    correlation: float | None = None
+    residual_rms_m: NotNegative | None = None
+    warnings: tuple[str, ...]
+
+
+class PositionSource(Base, frozen=True):
+    """The position that both filters are judged by.
+
+    ``rung`` is its place in the ladder of sources, 1 is best; ``log`` the file that it was read
+    from.
+    """
+
+    name: str
+    rung: Annotated[int, Meta(ge=1, le=7)]
+    description: str
+    reason: str
+    rate_hz: Positive
+    frame: Literal["NED", "FRD", "unknown"]
+    clock: str
+    reconstructed: bool
+    topics: tuple[str, ...]
+    available: tuple[AvailableTrack, ...]
+    not_in_log: tuple[Missing, ...]
+    log: str
+    alignment: Alignment | None = None
+
+
+class ChosenSettings(Base, frozen=True):
+    """Settings of the filter; ``clock_offset_s`` was added to the source's time stamps."""
+
+    sigma_a_m_s2: Positive
+    sigma_z_m: Positive
+    dt_s: Positive
+    input: InputName
+    start_s: float
+    end_s: float
+    segment_reason: str
+    clock_offset_s: float
+
+
+class Consistency(Base, frozen=True):
+    """Whether innovations are what the filter's own variances say.
+
+    ``nis_mean`` 1 is consistent; ``nis_band`` is its two-sided 95 % band for white innovations;
+    ``variance_factor`` = 1/nis_mean says how many times S is overstated.
+    """
+
+    count: Count
+    innovation_mean_m: float
+    innovation_std_m: NotNegative
+    sqrt_s_median_m: Positive
+    nis_mean: Positive
+    nis_band: tuple[NotNegative, NotNegative]
+    variance_factor: Positive
+    verdict: Verdict
+    outside_two_sigma: Share
+    outside_gate: Share
+    bias_t: float
+    bias_p: Share
+    lag1_autocorrelation: Correlation
+    ljung_box_p: Share
+    ljung_box_lags: Count
+
+
+class Filter(Consistency, frozen=True, kw_only=True):
+    """One filter on one axis: its consistency and its own σ."""
+
+    sigma_p_median_m: Positive | None = None
+    sigma_v_median_m_s: Positive | None = None
+    sigma_p_before_update_m: Positive | None = None
+    sigma_p_after_update_m: Positive | None = None
+
+
+class UnjudgedFilter(Absent, frozen=True, kw_only=True):
+    """A filter whose innovations say nothing, with the reason, and its own σ."""
+
+    sigma_p_median_m: Positive | None = None
+    sigma_v_median_m_s: Positive | None = None
+    sigma_p_before_update_m: Positive | None = None
+    sigma_p_after_update_m: Positive | None = None
+
+
+class HorizontalNis(Base, frozen=True):
+    """NIS of north and east together: two degrees of freedom, divided by two."""
+
+    count: Count
+    nis_mean: Positive
+    nis_band: tuple[NotNegative, NotNegative]
+    variance_factor: Positive
+    verdict: Verdict
+
+
+class Horizontal(Base, frozen=True):
+    """North and east together, by filter."""
+
+    kf: HorizontalNis | None = None
+    ekf2: HorizontalNis | None = None
+
+
+class NoiseAsked(Base, frozen=True):
+    """Measurement noise at which the median NIS takes its chi-square value."""
+
+    sigma_z_m: NotNegative
+    upper_bound: bool
+
+
+class Updates(Base, frozen=True, kw_only=True):
+    """The measurements of one axis; ``input_gap_s`` is the longest gap of the IMU."""
+
+    count: Count
+    first_s: float
+    last_s: float
+    rate_hz: Positive | None = None
+    input_gap_s: NotNegative
+    noise_asked: NoiseAsked | None = None
+
+
+class Difference(Base, frozen=True):
+    """Our filter minus EKF2, at EKF2's own sample times."""
+
+    count: Count
+    position_rmse_m: NotNegative
+    position_mean_m: float
+    position_maximum_m: NotNegative
+    velocity_rmse_m_s: NotNegative
+    velocity_mean_m_s: float
+    velocity_maximum_m_s: NotNegative
+
+
+class AgainstTruth(Base, frozen=True):
+    """Both filters against ground truth that neither has used."""
+
+    kf_count: Count | None = None
+    kf_position_rmse_m: NotNegative | None = None
+    kf_velocity_rmse_m_s: NotNegative | None = None
+    kf_nees_position_mean: NotNegative | None = None
+    kf_nees_velocity_mean: NotNegative | None = None
+    ekf2_count: Count | None = None
+    ekf2_position_rmse_m: NotNegative | None = None
+    ekf2_velocity_rmse_m_s: NotNegative | None = None
+    ekf2_nees_position_mean: NotNegative | None = None
+    ekf2_nees_velocity_mean: NotNegative | None = None
+
+
+class Axis(Base, frozen=True, kw_only=True):
+    """One axis; ``direction`` is its unit vector in NED."""
+
+    heading_deg: float | None = None
+    direction: Vector
+    note: str
+    updates: Updates
+    kf: Either[Filter, UnjudgedFilter]
+    ekf2: Either[Filter, UnjudgedFilter]
+    difference: Part[Difference]
+    truth: Part[AgainstTruth]
+
+
+class HeldOut(Base, frozen=True):
+    """Noises found on the first half, and their gain on the second."""
+
+    sigma_a_m_s2: NotNegative
+    sigma_z_m: NotNegative
+    count: Count
+    gain_nats: float
+
+
+class Tuned(Base, frozen=True, kw_only=True):
+    """Most likely noises, with 95 % intervals.
+
+    An upper bound stands instead of a value where the likelihood has its maximum at zero.
+    ``gain_nats`` is the log-likelihood per measurement above that of the chosen settings;
+    ``als_...`` are by autocovariance least squares.
+    """
+
+    sigma_a_m_s2: NotNegative | None = None
+    sigma_a_m_s2_interval: Interval | None = None
+    sigma_a_m_s2_upper_bound: NotNegative | None = None
+    sigma_a_m_s2_lower_bound: NotNegative | None = None
+    sigma_z_m: NotNegative | None = None
+    sigma_z_m_interval: Interval | None = None
+    sigma_z_m_upper_bound: NotNegative | None = None
+    sigma_z_m_lower_bound: NotNegative | None = None
+    count: Count
+    outliers: Count
+    gain_nats: float
+    before: Part[Consistency]
+    after: Part[Consistency]
+    held_out: Part[HeldOut]
+    als_sigma_a_m_s2: NotNegative | None = None
+    als_sigma_z_m: NotNegative | None = None
+
+
+class PartOffset(Base, frozen=True):
+    """Clock offset of one part of the flight."""
+
+    start_s: float
+    end_s: float
+    offset_s: float
+    sigma_s: NotNegative
+
+
+class Clock(Base, frozen=True, kw_only=True):
+    """What must be added to the source's own stamps, what was applied included.
+
+    ``change_p`` is the p-value of "all parts have the same offset"; ``heading_error_deg`` the turn
+    of the source's frame against the logged attitude, clockwise seen from above.
+    """
+
+    offset_s: float
+    interval_s: Interval
+    sigma_s: NotNegative
+    determinable: bool
+    reason: str | None = None
+    applied_s: float
+    drift_ppm: float | None = None
+    drift_sigma_ppm: NotNegative | None = None
+    change_p: Share | None = None
+    parts: tuple[PartOffset, ...]
+    sigma_a_m_s2: NotNegative
+    sigma_z_m: NotNegative
+    count: Count
+    heading_error_deg: float | None = None
+    heading_sigma_deg: NotNegative | None = None
+
+
+class Effect(Base, frozen=True):
+    """What making one thing like EKF2's does to the difference.
+
+    ``made`` says what; ``without_...`` is with all causes but this one. A share is
+    1 - (RMS after / RMS before)², negative where the difference grows.
+    """
+
+    made: str
+    position_rms_m: NotNegative
+    velocity_rms_m_s: NotNegative
+    position_share: Annotated[float, Meta(le=1.0)]
+    velocity_share: Annotated[float, Meta(le=1.0)]
+    truth_position_rmse_m: NotNegative | None = None
+    truth_velocity_rmse_m_s: NotNegative | None = None
+    without_position_rms_m: NotNegative | None = None
+    without_velocity_rms_m_s: NotNegative | None = None
+    without_truth_position_rmse_m: NotNegative | None = None
+    without_truth_velocity_rmse_m_s: NotNegative | None = None
+
+
+class BudgetTruth(Base, frozen=True, kw_only=True):
+    """Which filter is nearer to the truth, and why."""
+
+    kf_position_rmse_m: NotNegative
+    ekf2_position_rmse_m: NotNegative
+    kf_velocity_rmse_m_s: NotNegative | None = None
+    ekf2_velocity_rmse_m_s: NotNegative | None = None
+    reasons: tuple[str, ...]
+
+
+class Budget(Base, frozen=True, kw_only=True):
+    """RMS difference to EKF2 as set, and with causes made like EKF2's, alone and together."""
+
+    count: Annotated[int, Meta(ge=1)]
+    position_rms_m: NotNegative
+    velocity_rms_m_s: NotNegative
+    truth_position_rmse_m: NotNegative | None = None
+    truth_velocity_rmse_m_s: NotNegative | None = None
+    causes: dict[str, Part[Effect]]
+    together: Part[Effect]
+    clock: Part[Effect]
+    truth: Part[BudgetTruth]

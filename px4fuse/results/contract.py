@@ -1,0 +1,209 @@
+"""The results contract: one JSON object per command, its schema, and how it is written.
+
+Everything that px4fuse writes with a major version is read by the same major version; a new field
+raises the minor one.
+"""
+
+from __future__ import annotations
+
+import json
+from typing import Annotated, Any, Literal
+
+import msgspec
+from msgspec import Meta
+
+from px4fuse.request import AxisName, ComparisonRequest, LoopRequest
+from px4fuse.results.comparison import (
+    Axis,
+    Budget,
+    ChosenSettings,
+    Clock,
+    Horizontal,
+    Log,
+    PositionSource,
+    Tuned,
+)
+from px4fuse.results.model import Base, FoundMistake, Missing, Part, Provenance, Schema, Student
+from px4fuse.results.trajectories import Graph, Loop, Score, Track
+
+VERSION: Literal["2.0"] = "2.0"
+COMPARISON = "px4fuse-results"
+LOOP = "px4fuse-loop"
+
+
+class ComparisonResults(Base, frozen=True):
+    """Results of ``px4fuse compare``, attached to its report.
+
+    Attributes
+    ----------
+    schema : Schema
+    request : ComparisonRequest
+        What was analysed and how.
+    log : Log
+    position_source : PositionSource
+    settings : ChosenSettings
+    axes : mapping of axis name to Axis
+    horizontal : Horizontal
+    tuning : mapping of axis name, or "horizontal" for north and east together, to Tuned
+    clock : Clock
+    budget : mapping of axis name to Budget
+    loop : Loop
+    findings : tuple of FoundMistake
+        Most severe first.
+    notes : tuple of str
+        Choices made on the way.
+    missing : tuple of Missing
+        What was looked for and not found.
+    student : Student
+    provenance : Provenance
+    """
+
+    schema: Schema
+    request: ComparisonRequest
+    log: Log
+    position_source: PositionSource
+    settings: ChosenSettings
+    axes: Annotated[dict[AxisName, Axis], Meta(min_length=1)]
+    horizontal: Horizontal
+    tuning: dict[str, Part[Tuned]]
+    clock: Part[Clock]
+    budget: dict[str, Part[Budget]]
+    loop: Part[Loop]
+    findings: tuple[FoundMistake, ...]
+    notes: tuple[str, ...]
+    missing: tuple[Missing, ...]
+    student: Student
+    provenance: Provenance
+
+
+class TuningResults(Base, frozen=True):
+    """Results of ``px4fuse tune``: the noises that the data ask for, by axis."""
+
+    schema: Schema
+    request: ComparisonRequest
+    log: Log
+    position_source: PositionSource
+    settings: ChosenSettings
+    tuning: dict[str, Part[Tuned]]
+    provenance: Provenance
+
+
+class SyncResults(Base, frozen=True):
+    """Results of ``px4fuse sync``: the clock offset of the position source."""
+
+    schema: Schema
+    request: ComparisonRequest
+    log: Log
+    position_source: PositionSource
+    settings: ChosenSettings
+    clock: Part[Clock]
+    provenance: Provenance
+
+
+class LoopResults(Base, frozen=True):
+    """Results of ``px4fuse loop`` on a flight or a trajectory, attached to its report."""
+
+    schema: Schema
+    request: LoopRequest
+    track: Track
+    references: tuple[Track, ...]
+    loop: Loop
+    findings: tuple[FoundMistake, ...]
+    student: Student
+    provenance: Provenance
+
+
+class GraphResults(Base, frozen=True):
+    """Results of ``px4fuse loop`` on a pose graph."""
+
+    schema: Schema
+    graph: Graph
+    provenance: Provenance
+
+
+class EvaluationResults(Score, frozen=True, kw_only=True):
+    """Results of ``px4fuse evaluate``: the score, and what was scored against what."""
+
+    schema: Schema
+    estimate: Track
+    reference: Track
+    provenance: Provenance
+
+
+Reported = ComparisonResults | LoopResults
+Results = Reported | TuningResults | SyncResults | GraphResults | EvaluationResults
+# By the name in their schema
+KINDS: dict[str, type[Results]] = {
+    COMPARISON: ComparisonResults,
+    LOOP: LoopResults,
+    "px4fuse-tuning": TuningResults,
+    "px4fuse-sync": SyncResults,
+    "px4fuse-graph": GraphResults,
+    "px4fuse-evaluation": EvaluationResults,
+}
+
+
+def schema() -> dict[str, Any]:
+    """JSON Schema (draft 2020-12) of everything that is written as results.
+
+    Returns
+    -------
+    dict
+    """
+    kinds: dict[type, None] = dict.fromkeys(KINDS.values())
+    components: dict[str, Any] = {}
+
+    def either(kind: Any) -> dict[str, Any]:
+        kinds.update(dict.fromkeys(kind.kinds))
+        return {"anyOf": [{"$ref": f"#/$defs/{one.__name__}"} for one in kind.kinds]}
+
+    known = 0
+    while known < len(kinds):  # msgspec does not look into an Either by itself
+        known = len(kinds)
+        _, components = msgspec.json.schema_components(
+            list(kinds), schema_hook=either, ref_template="#/$defs/{name}"
+        )
+    return {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        "$id": f"px4fuse-results-{VERSION}",
+        "title": "Results of px4fuse",
+        "oneOf": [
+            {
+                "$ref": f"#/$defs/{kind.__name__}",
+                "properties": {"schema": {"properties": {"name": {"const": name}}}},
+            }
+            for name, kind in KINDS.items()
+        ],
+        "$defs": components,
+    }
+
+
+def to_plain(results: msgspec.Struct) -> dict[str, Any]:
+    """Results as dicts, lists and numbers, by the names that they have in JSON."""
+    found: dict[str, Any] = msgspec.to_builtins(results, enc_hook=_plain_number)
+    return found
+
+
+def _plain_number(value: Any) -> float:
+    """A number of numpy's as Python's own.
+
+    Raises
+    ------
+    NotImplementedError
+        It is no number.
+    """
+    if isinstance(value, float):
+        return float(value)
+    raise NotImplementedError(f"results cannot hold a {type(value).__name__}")
+
+
+def to_json(results: msgspec.Struct | dict[str, Any]) -> str:
+    """Text of results: stable order, one trailing newline.
+
+    Raises
+    ------
+    ValueError
+        A number in them is not finite.
+    """
+    found = to_plain(results) if isinstance(results, msgspec.Struct) else results
+    return json.dumps(found, indent=2, ensure_ascii=False, allow_nan=False) + "\n"

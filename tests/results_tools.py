@@ -1,0 +1,104 @@
+"""Results to change in tests: of the shipped report, and of a small loop."""
+
+import copy
+import json
+from pathlib import Path
+from typing import Any
+
+from px4fuse.request import LoopRequest
+from px4fuse.results import trajectories as made
+from px4fuse.results.contract import LoopResults, Results, to_plain
+from px4fuse.results.model import Absent, Missing, Student
+from px4fuse.results.parts import provenance, schema_of
+from px4fuse.results.reading import read_results
+
+SHIPPED = Path(__file__).parent.parent / "reports" / "aisle_uwb.json"
+EXAMPLE: dict[str, Any] = json.loads(SHIPPED.read_text(encoding="utf-8"))
+SHA256 = EXAMPLE["log"]["sha256"]
+NONE = Absent(Missing("it", "nobody asked", "Ask."))
+
+
+def correction(rmse: float, moved_m: float) -> made.Correction:
+    """A correction with one score."""
+    statistics = made.Statistics(9, rmse, rmse, rmse, 0.0, rmse, rmse)
+    score = made.Score(
+        alignment="se3",
+        alignment_reason="asked",
+        transform=made.Transform((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 1.0, 6),
+        association=made.Association("interpolate", 9, 0.1, 0, 0, 1.0, 1.0),
+        time_offset=made.TimeOffset(offset_s=0.0, determinable=True, reason=""),
+        ate=made.AbsoluteError(statistics, made.RmseInterval(rmse, rmse, 1, 9.0), NONE),
+        rpe=(made.RelativeError(5.0, "m", True, "reference", statistics, NONE, NONE),),
+        notes=(),
+        warnings=(),
+    )
+    return made.Correction(
+        moved_max_m=moved_m, moved_rms_m=moved_m, scores={"slam.tum": score, "ekf2": NONE}
+    )
+
+
+LOOP = to_plain(
+    LoopResults(
+        schema=schema_of("px4fuse-loop"),
+        request=LoopRequest(source="loop.ulg:vio"),
+        track=made.Track("loop.ulg:vio", SHA256, 9, "vio", "NED", 9, 1.0, 95.0, True, ()),
+        references=(),
+        loop=made.Loop(
+            track="loop.ulg:vio",
+            kind="vio",
+            frame="NED",
+            start_s=1.0,
+            end_s=95.0,
+            part_reason="the flight",
+            poses=9,
+            key_frames=9,
+            key_frame_spacing_m=0.5,
+            path_length_m=87.7,
+            end_from_start_m={"north": 1.42, "east": 0.0, "down": 0.0},
+            known_end=made.KnownEnd(
+                displacement_m={"north": 0.0, "east": 0.0, "down": 0.0},
+                sigma_m=0.1,
+                source="landing",
+                assumed=True,
+            ),
+            closure_error_m=1.42,
+            closure_percent=1.62,
+            heading_error_deg=NONE,
+            absolute=False,
+            odometry_noise=made.OdometryNoise(1.0, 3.0, 0.01, 0.03, 0.1),
+            closures=(made.Closure(1.0, 95.0, 0.1, "landing", 1.4, 2.0, 3, 0.5, True),),
+            corrections=made.Corrections(
+                correction(0.41, 0.0), correction(0.26, 1.4), NONE, NONE, NONE, NONE
+            ),
+            notes=(),
+        ),
+        findings=(),
+        student=Student(),
+        provenance=provenance("px4fuse loop loop.ulg:vio"),
+    )
+)
+
+
+def changed(results: dict[str, Any] = EXAMPLE, **values: Any) -> dict[str, Any]:
+    """Results with the values at some paths, "__" for dots, replaced; ``...`` removes."""
+    changed_ = copy.deepcopy(results)
+    for path, value in values.items():
+        *parents, last = path.split("__")
+        place = changed_
+        for parent in parents:
+            place = place.setdefault(parent, {})
+        if value is ...:
+            place.pop(last, None)
+        else:
+            place[last] = value
+    return changed_
+
+
+def decoded(results: dict[str, Any]) -> Results:
+    """Results as they are read from a report."""
+    return read_results(json.dumps(results).encode())
+
+
+def finding(name: str, severity: str = "warning") -> dict[str, Any]:
+    """A finding as results hold it."""
+    return {"id": name, "severity": severity, "message": "", "evidence": {}, "remedy": ""}
