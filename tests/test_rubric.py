@@ -72,7 +72,7 @@ BAD = {
     "empty": ("", "no items"),
     "no items": ('title = "x"', "no items"),
     "items are one table": ('[item]\ntitle = "x"', "no items"),
-    "item is a number": ("item = [1]", "item 1 is no table"),
+    "item is a number": ("item = [1]", "item 1 is not a table"),
     "unknown key": ("colour = 1\n" + NOTES, "unknown key 'colour'"),
     "unknown check": (ITEM + 'check = "beauty"', "check cannot be 'beauty'"),
     "no check": (ITEM, "no 'check'"),

@@ -116,7 +116,7 @@ def parse_rubric(text: str, where: str) -> Rubric:
 
 def _item(where: str, number: int, given: object) -> RubricItem:
     if not isinstance(given, dict):
-        _refuse(where, f"item {number} is no table; begin it with [[item]]")
+        _refuse(where, f"item {number} is not a table; begin it with [[item]]")
     title = _value(f"{where}: item {number}", "title", given, Parameter("text", required=True))
     here = f"{where}: item {number} ({title!r})"
     if not title.strip():
@@ -157,7 +157,7 @@ def _check_bounds(here: str, given: Mapping[str, Any]) -> None:
 
 def _words(where: str, given: object) -> dict[str, tuple[str, ...]]:
     if not isinstance(given, dict) or len(given) > MAX_ITEMS:
-        _refuse(where, '[words] is no table of finding ids; give ID = ["word", ...]')
+        _refuse(where, '[words] is not a table of finding ids; give ID = ["word", ...]')
     here = f"{where}: [words]"
     return {name: _value(here, name, given, Parameter("texts")) for name in given}
 
