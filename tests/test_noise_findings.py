@@ -12,33 +12,26 @@ from flights import unexplained
 from px4fuse.analysis import Analysis, explain
 from px4fuse.comparison.comparison import compare
 from px4fuse.filter.kalman import Settings
-from px4fuse.findings import Finding
-from px4fuse.findings.noise import (
-    clock_off,
-    ekf2_delay_off,
-    frame_turned,
-    noises_off,
-    outliers,
+from px4fuse.findings import (
+    Finding,
+    ekf2_ev_delay_wrong,
+    sigma,
+    source_clock,
+    source_frame_turned,
+    source_outliers,
 )
 from px4fuse.readers import read_log
 from px4fuse.simulation.flights import simulate_flight
 from px4fuse.simulation.mistakes import parse
 from px4fuse.simulation.scenario import Scenario
 
-DETECTORS = (clock_off, frame_turned, outliers, noises_off, ekf2_delay_off)
+DETECTORS = [
+    module.DETECTOR
+    for module in (source_clock, source_frame_turned, source_outliers, sigma, ekf2_ev_delay_wrong)
+]
 RIGHT = Settings(sigma_a_m_s2=0.27, sigma_z_m=0.10)
 SEED = 3
-NAMED_HERE = {
-    "source_clock_offset",
-    "source_clock_changes",
-    "source_outliers",
-    "source_frame_turned",
-    "sigma_z_small",
-    "sigma_z_large",
-    "sigma_a_small",
-    "sigma_a_large",
-    "ekf2_ev_delay_wrong",
-}
+NAMED_HERE = {name for detector in DETECTORS for name in detector.phrases}
 
 
 @cache
@@ -48,7 +41,7 @@ def flown(settings: Settings = RIGHT, *mistakes: str) -> Analysis:
 
 
 def found(analysis: Analysis) -> dict[str, Finding]:
-    return {finding.id: finding for detector in DETECTORS for finding in detector(analysis)}
+    return {finding.id: finding for detector in DETECTORS for finding in detector.detect(analysis)}
 
 
 def test_a_clean_flight_has_none() -> None:

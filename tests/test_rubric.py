@@ -1,28 +1,26 @@
 """The rubric: the one that ships, and those that an instructor spoils."""
 
+import re
 import tomllib
 
 import pytest
 
 from px4fuse.errors import SettingsError
-from px4fuse.grading.rubric import CHECKS, parse_rubric, read_rubric, rubric_text
-from px4fuse.grading.scoring import DOES
+from px4fuse.findings import phrases
+from px4fuse.grading.rubric import parse_rubric, read_rubric, rubric_text
+from px4fuse.grading.scoring import CHECKS
 
 ITEM = '[[item]]\ntitle = "T"\npoints = 5\n'
 NOTES = ITEM + 'check = "notes"\n'
 NUMBER = ITEM + 'check = "number"\npath = "a.b"\n'
 
 
-def test_every_check_is_described_and_done():
-    assert set(CHECKS) == set(DOES)
-
-
 def test_default_uses_and_explains_every_check_and_parameter():
     text = rubric_text()
     used = {item["check"] for item in tomllib.loads(text)["item"]}
     assert used == set(CHECKS)
-    for known in CHECKS.values():
-        for name in known:
+    for check in CHECKS.values():
+        for name in check.parameters:
             assert f"{name} = " in text or name in text, name
 
 
@@ -37,6 +35,13 @@ def test_copy_of_the_default_is_the_default(tmp_path):
     path = tmp_path / "rubric.toml"
     path.write_bytes(b"\xef\xbb\xbf" + rubric_text().replace("\n", "\r\n").encode())
     assert read_rubric(path) == read_rubric(None)
+
+
+def test_every_finding_can_be_named_and_renamed():
+    """The rubric to copy lists the phrases of each finding, ready to be changed."""
+    listed = re.sub(r'(?m)^# (\w+ = \["?.*\])$', r"\1", rubric_text())
+    words = read_rubric(None).words
+    assert parse_rubric(listed, "x").words == words == phrases() | {"none": words["none"]}
 
 
 def test_words_of_the_default_stay_unless_replaced(tmp_path):
@@ -67,7 +72,7 @@ BAD = {
     "empty": ("", "no items"),
     "no items": ('title = "x"', "no items"),
     "items are one table": ('[item]\ntitle = "x"', "no items"),
-    "item is a number": ("item = [1]", "item 1 is no table"),
+    "item is a number": ("item = [1]", "item 1 is not a table"),
     "unknown key": ("colour = 1\n" + NOTES, "unknown key 'colour'"),
     "unknown check": (ITEM + 'check = "beauty"', "check cannot be 'beauty'"),
     "no check": (ITEM, "no 'check'"),

@@ -31,16 +31,12 @@ from px4fuse.filter.signals import (
     ned_acceleration,
     within,
 )
-from px4fuse.findings.thresholds import (
-    EV_START_INTERVAL,
-    GAP,
-    GAP_INTERVALS,
-    IMU_GAP_TOTAL,
-    MIN_ATTITUDE_RATE,
-    MIN_IMU_RATE,
-    MIN_INNOVATION_SHARE,
-    VISION_PROFILE_BIT,
-)
+from px4fuse.findings.ekf2_innovations_decimated import MIN_INNOVATION_SHARE
+from px4fuse.findings.ekf2_not_fusing import EV_START_INTERVAL
+from px4fuse.findings.imu_gap import IMU_GAP_TOTAL
+from px4fuse.findings.logging_rate_low import MIN_ATTITUDE_RATE, MIN_IMU_RATE
+from px4fuse.findings.source_gap import GAP, GAP_INTERVALS
+from px4fuse.findings.source_not_logged import VISION_PROFILE_BIT
 from px4fuse.flight import (
     VELOCITY_COLUMNS,
     ClockMap,

@@ -1,97 +1,136 @@
-"""The mistakes that px4fuse names: each a detector with evidence and a remedy that can be typed.
+"""The mistakes that px4fuse names: a file each, with all that is said about it.
 
-Thresholds are data, with unit and source. A detector looks at an :class:`Analysis` and yields
-findings; it never prints and never guesses: what it cannot see it does not mention.
+A file declares ids, thresholds with unit and source, the detector (condition, words, remedy), the
+phrases by which notes name the finding, and the flights on which its rate is measured. A detector
+never prints and never guesses: what it cannot see it does not mention.
+
+To add a finding: its file, its name below, its rows of ``rates.csv``
+(``python -m px4fuse.simulation.detector_rates``).
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 
-from px4fuse.analysis import Analysis
-from px4fuse.findings.ekf2 import (
+from px4fuse.analysis import Analysis, explain
+from px4fuse.comparison.comparison import Comparison
+from px4fuse.findings import (
     accelerometer_bias,
-    ekf2_not_fusing,
-    ekf2_rejecting,
-    ekf2_unavailable,
-    resets,
-)
-from px4fuse.findings.filter import process_noise_forgotten, too_few_innovations, variance_wrong
-from px4fuse.findings.loop import find_in_loop, loop_closures
-from px4fuse.findings.model import SEVERITIES, Detector, Finding, Severity
-from px4fuse.findings.noise import (
-    clock_off,
-    ekf2_delay_off,
-    frame_turned,
-    noises_off,
-    outliers,
-)
-from px4fuse.findings.recording import (
     autopilot_restarted,
     companion_not_synchronised,
+    ekf2_ev_delay_wrong,
+    ekf2_innovations_decimated,
+    ekf2_instance_switch,
+    ekf2_not_fusing,
+    ekf2_rejecting,
+    ekf2_resets,
+    imu_gap,
     innovations_need_ulog,
-    other_autopilot,
-    position_file_placement,
-    receipt_out_of_order,
-    samples_lost,
-    stamps_meaningless,
-)
-from px4fuse.findings.source import (
-    gaps,
-    input_unavailable,
     log_damaged,
+    logger_dropouts,
     logging_rate_low,
+    loop_closures,
+    loop_end_assumed,
+    loop_of_absolute_track,
     no_motion,
-    source_frame,
-    source_reconstructed,
+    not_px4,
+    position_file_placement,
+    process_noise_forgotten,
+    receipt_out_of_order,
+    sigma,
+    source_clock,
+    source_frame_not_north,
+    source_frame_turned,
+    source_gap,
+    source_not_logged,
+    source_outliers,
+    source_samples_lost,
+    source_stamps,
+    unavailable,
+    variance,
 )
+from px4fuse.findings.model import SEVERITIES, Detector, Finding, Found, Severity, Subject
 from px4fuse.loop.loop import Loop
 
-__all__ = ["DETECTORS", "SEVERITIES", "Finding", "Severity", "find", "find_loop"]
+__all__ = ["DETECTORS", "SEVERITIES", "Finding", "Severity", "find", "find_loop", "phrases"]
 
 
-def find(analysis: Analysis) -> tuple[Finding, ...]:
-    """All findings of all detectors, most severe first, each detector's own order kept."""
-    return _sorted(finding for detector in DETECTORS for finding in detector(analysis))
+def find(subject: Analysis | Comparison) -> tuple[Finding, ...]:
+    """All findings of all detectors, most severe first, each detector's own order kept.
+
+    Parameters
+    ----------
+    subject : Analysis or Comparison
+        A comparison is explained first, which takes some seconds.
+    """
+    return _find(DETECTORS, explain(subject) if isinstance(subject, Comparison) else subject)
 
 
 def find_loop(loop: Loop) -> tuple[Finding, ...]:
     """All findings about a loop, most severe first."""
-    return _sorted(find_in_loop(loop))
+    return _find(LOOP_DETECTORS, loop)
 
 
-def _sorted(found: Iterable[Finding]) -> tuple[Finding, ...]:
+def phrases() -> dict[str, tuple[str, ...]]:
+    """By which phrases notes name each finding, besides its id: see :class:`Detector`."""
+    return {
+        name: tuple(listed.split(", ")) if listed else ()
+        for detector in DETECTORS
+        for name, listed in detector.phrases.items()
+    }
+
+
+def _find(detectors: Iterable[Detector[Subject]], subject: Subject) -> tuple[Finding, ...]:
+    found = (finding for detector in detectors for finding in detector.detect(subject))
     return tuple(sorted(found, key=lambda finding: SEVERITIES.index(finding.severity)))
 
 
-DETECTORS: tuple[Detector, ...] = (
-    stamps_meaningless,
-    clock_off,
-    frame_turned,
-    outliers,
-    noises_off,
-    loop_closures,
-    ekf2_not_fusing,
-    process_noise_forgotten,
-    variance_wrong,
-    ekf2_rejecting,
-    ekf2_delay_off,
-    accelerometer_bias,
-    companion_not_synchronised,
-    position_file_placement,
-    source_reconstructed,
-    gaps,
-    autopilot_restarted,
-    resets,
-    no_motion,
-    logging_rate_low,
-    source_frame,
-    ekf2_unavailable,
-    input_unavailable,
-    too_few_innovations,
-    log_damaged,
-    samples_lost,
-    other_autopilot,
-    receipt_out_of_order,
-    innovations_need_ulog,
+def _in_flight(detector: Detector[Loop]) -> Detector[Analysis]:
+    """The same about the loop of a flight that holds one."""
+
+    def detect(analysis: Analysis) -> Found:
+        if isinstance(analysis.loop, Loop):
+            yield from detector.detect(analysis.loop)
+
+    return Detector(detect, detector.phrases, detector.measured_on)
+
+
+# Of one severity, the first comes first in a report
+LOOP_DETECTORS: tuple[Detector[Loop], ...] = (
+    loop_closures.DETECTOR,
+    loop_of_absolute_track.DETECTOR,
+    loop_end_assumed.DETECTOR,
+)
+DETECTORS: tuple[Detector[Analysis], ...] = (
+    source_stamps.DETECTOR,
+    source_clock.DETECTOR,
+    source_frame_turned.DETECTOR,
+    source_outliers.DETECTOR,
+    sigma.DETECTOR,
+    *map(_in_flight, LOOP_DETECTORS),
+    ekf2_not_fusing.DETECTOR,
+    process_noise_forgotten.DETECTOR,
+    variance.DETECTOR,
+    ekf2_rejecting.DETECTOR,
+    ekf2_ev_delay_wrong.DETECTOR,
+    accelerometer_bias.DETECTOR,
+    companion_not_synchronised.DETECTOR,
+    position_file_placement.DETECTOR,
+    source_not_logged.DETECTOR,
+    source_gap.DETECTOR,
+    logger_dropouts.DETECTOR,
+    imu_gap.DETECTOR,
+    autopilot_restarted.DETECTOR,
+    ekf2_resets.DETECTOR,
+    ekf2_instance_switch.DETECTOR,
+    no_motion.DETECTOR,
+    logging_rate_low.DETECTOR,
+    ekf2_innovations_decimated.DETECTOR,
+    source_frame_not_north.DETECTOR,
+    unavailable.DETECTOR,
+    log_damaged.DETECTOR,
+    source_samples_lost.DETECTOR,
+    not_px4.DETECTOR,
+    receipt_out_of_order.DETECTOR,
+    innovations_need_ulog.DETECTOR,
 )

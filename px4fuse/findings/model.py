@@ -1,19 +1,15 @@
-"""What a finding is, and what a detector compares with."""
+"""What a finding is, and what its file declares of it."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Generic, Literal, TypeVar
 
 import numpy as np
 import pandas as pd
 
-from px4fuse.analysis import Analysis
-from px4fuse.comparison.comparison import Comparison
-from px4fuse.filter.signals import within
-from px4fuse.flight import POSITION_COLUMNS
-
+Subject = TypeVar("Subject")
 Severity = Literal["error", "warning", "info"]
 SEVERITIES: tuple[Severity, Severity, Severity] = ("error", "warning", "info")
 
@@ -53,7 +49,29 @@ class Threshold:
     source: str
 
 
-Detector = Callable[[Analysis], Iterator[Finding]]
+Found = Iterator[Finding]
+
+
+@dataclass(frozen=True)
+class Detector(Generic[Subject]):
+    """What one file of this package declares: one finding, or those that share a condition.
+
+    Attributes
+    ----------
+    detect : callable
+        From an ``Analysis`` or a ``Loop`` to findings, with condition, words and remedy.
+    phrases : mapping
+        Every id that it may yield, to the phrases by which a student's notes name it besides that
+        id, with commas between them. All words of a phrase must stand in one sentence, in any
+        order; beginnings are enough ("stamp late" is in "the stamps come 0.2 s later").
+    measured_on : mapping
+        Id to the simulated flights on which its rate is measured (``rates.csv``): options of
+        ``px4fuse simulate``, or a field of ``Settings`` with its value.
+    """
+
+    detect: Callable[[Subject], Found]
+    phrases: Mapping[str, str]
+    measured_on: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
 
 def times(count: int) -> str:
@@ -65,13 +83,6 @@ def sentence(note: str) -> str:
     """A note with a capital letter, unless it begins with a file's name."""
     first = note.split(" ", 1)[0]
     return note if "." in first else note[:1].upper() + note[1:]
-
-
-def motion_range_m(comparison: Comparison) -> float:
-    """Larger horizontal extent of the source in the segment, 5 to 95 %."""
-    inside = within(comparison.source.samples, comparison.segment)
-    low, high = inside[POSITION_COLUMNS[:2]].quantile([0.05, 0.95]).to_numpy()
-    return float(np.max(high - low))
 
 
 def step_share(steps: pd.Series, start_s: float, end_s: float) -> float:

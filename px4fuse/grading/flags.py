@@ -42,7 +42,7 @@ MIN_DIGITS = 4
 PRINTED_DIGITS = 3
 # A hand-picked part of the flight below this share leaves most of it out
 HAND_PICKED = 0.5
-# Beyond this factor px4fuse itself names a wrong noise (findings/thresholds.py, NOISE_OFF is 1.5);
+# Beyond this factor px4fuse itself names a wrong noise (findings/sigma.py, NOISE_OFF is 1.5);
 # with a margin for what lies between interval and value
 SIGMA_FAR_OFF = 2.0
 # What a student chooses; the rest of the settings follows from the log

@@ -1,12 +1,87 @@
-"""What is handed in, and what it is worth."""
+"""The rubric, what is handed in, and what it is worth."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any, Literal
 
 from px4fuse.verification.model import Verdict
+
+Kind = Literal["number", "whole", "flag", "text", "texts"]
+Applies = Literal["any", "compare", "loop"]
+Unverified = Literal["zero", "score"]
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """What a check can be told.
+
+    Attributes
+    ----------
+    kind : {"number", "whole", "flag", "text", "texts"}
+    default : object
+        Where it is left out; None says that there is none, which leaves that part out.
+    low, high : float
+        Limits of a number, or of each.
+    choices : tuple of str
+        What a text may be; empty for anything.
+    required : bool
+    """
+
+    kind: Kind
+    default: Any = None
+    low: float = -1e12
+    high: float = 1e12
+    choices: tuple[str, ...] = ()
+    required: bool = False
+
+
+@dataclass(frozen=True)
+class RubricItem:
+    """One part of the grade.
+
+    Attributes
+    ----------
+    title : str
+    points : float
+        The most that it gives.
+    check : str
+        One of :data:`px4fuse.grading.scoring.CHECKS`.
+    report : {"any", "compare", "loop"}
+        The reports that it is for; in others it is left out.
+    parameters : dict
+        Of the check, all of them.
+    """
+
+    title: str
+    points: float
+    check: str
+    report: Applies = "any"
+    parameters: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Rubric:
+    """What a report is worth.
+
+    Attributes
+    ----------
+    title : str
+    unverified : {"zero", "score"}
+        Whether a report whose numbers, pages or log are not what they should be gets nothing, or
+        its points as a proposal.
+    items : tuple of RubricItem
+    words : dict
+        Finding id to words by which notes may name it; "none" to those that say that nothing is
+        wrong.
+    """
+
+    title: str
+    unverified: Unverified
+    items: tuple[RubricItem, ...]
+    words: dict[str, tuple[str, ...]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

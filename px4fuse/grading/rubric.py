@@ -1,21 +1,24 @@
 """The rubric: what a report is worth, as an instructor writes it down.
 
-A TOML file of items, each with a title, points, the name of a check and its parameters. Which
-parameters a check has, and between which limits, is data here; what it does is in
-:mod:`px4fuse.grading.scoring`.
+A TOML file of items, each with a title, points, the name of a check and its parameters. What a
+check does and which parameters it has is in :data:`px4fuse.grading.scoring.CHECKS`.
 """
 
 from __future__ import annotations
 
+import json
 import math
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, Literal, NoReturn, cast
+from typing import Any, NoReturn, cast
 
 from px4fuse.errors import SettingsError
+from px4fuse.findings import phrases
+from px4fuse.grading.model import Applies, Parameter, Rubric, RubricItem, Unverified
+from px4fuse.grading.scoring import CHECKS
 from px4fuse.reading import read_text
 
 DEFAULT = "rubric.toml"
@@ -26,137 +29,22 @@ MAX_TEXT = 200
 MAX_LIST = 50
 HELP = "px4fuse grade --write-rubric FILE.toml writes one that explains itself"
 
-Kind = Literal["number", "whole", "flag", "text", "texts"]
-Applies = Literal["any", "compare", "loop"]
-Unverified = Literal["zero", "score"]
 APPLIES: tuple[Applies, ...] = ("any", "compare", "loop")
 UNVERIFIED: tuple[Unverified, ...] = ("zero", "score")
 
 
-@dataclass(frozen=True)
-class Parameter:
-    """What a check can be told.
-
-    Attributes
-    ----------
-    kind : {"number", "whole", "flag", "text", "texts"}
-    default : object
-        Where it is left out; None says that there is none, which leaves that part out.
-    low, high : float
-        Limits of a number, or of each.
-    choices : tuple of str
-        What a text may be; empty for anything.
-    required : bool
-    """
-
-    kind: Kind
-    default: Any = None
-    low: float = -1e12
-    high: float = 1e12
-    choices: tuple[str, ...] = ()
-    required: bool = False
-
-
-def _share(default: float) -> Parameter:
-    return Parameter("number", default, 0.0, 1.0)
-
-
-CHECKS: Mapping[str, Mapping[str, Parameter]] = {
-    "verified": {"without_log": _share(0.5)},
-    "student": {"name": Parameter("flag", True), "id": Parameter("flag", True)},
-    "sections": {"results": Parameter("texts", ()), "pages": Parameter("texts", ())},
-    "notes": {
-        "min_words": Parameter("whole", 150, 1, 100_000),
-        "min_different": Parameter("whole", 60, 1, 100_000),
-    },
-    "findings": {
-        "severities": Parameter(
-            "texts", ("error", "warning"), choices=("error", "warning", "info")
-        ),
-        "ignore": Parameter("texts", ("ekf2_unavailable",)),
-    },
-    "tuning": {
-        "axis": Parameter("text", "horizontal"),
-        "settings": Parameter(
-            "texts", ("sigma_z_m", "sigma_a_m_s2"), choices=("sigma_z_m", "sigma_a_m_s2")
-        ),
-        "factor": Parameter("number", 2.0, 1.0, 1000.0),
-    },
-    "number": {
-        "path": Parameter("texts", required=True),
-        "name": Parameter("text", ""),
-        "unit": Parameter("text", ""),
-        "at_least": Parameter("number"),
-        "at_most": Parameter("number"),
-        "zero_at": Parameter("number"),
-    },
-    "consistent": {
-        "filter": Parameter("text", "kf", choices=("kf", "ekf2")),
-        "axes": Parameter("texts", ("horizontal",)),
-        "factor": Parameter("number", 1.5, 1.0, 1000.0),
-    },
-    "clock": {"margin_s": Parameter("number", 0.03, 0.0, 10.0), "undeterminable": _share(0.5)},
-    "loop": {"without_reference": _share(0.5)},
-    "flight": {
-        "min_duration_s": Parameter("number", 60.0, 0.0, 1e5),
-        "min_measurements": Parameter("whole", 100, 0, 10_000_000),
-        "min_path_m": Parameter("number", 20.0, 0.0, 1e6),
-    },
-    "mistakes": {"in_report": _share(0.25), "most_named": Parameter("whole", 4, 1, 100)},
-}
 ITEM_KEYS = ("title", "points", "check", "report")
 RUBRIC_KEYS = ("title", "unverified", "item", "words")
 
 
-@dataclass(frozen=True)
-class RubricItem:
-    """One part of the grade.
-
-    Attributes
-    ----------
-    title : str
-    points : float
-        The most that it gives.
-    check : str
-        One of :data:`CHECKS`.
-    report : {"any", "compare", "loop"}
-        The reports that it is for; in others it is left out.
-    parameters : dict
-        Of the check, all of them.
-    """
-
-    title: str
-    points: float
-    check: str
-    report: Applies = "any"
-    parameters: dict[str, Any] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class Rubric:
-    """What a report is worth.
-
-    Attributes
-    ----------
-    title : str
-    unverified : {"zero", "score"}
-        Whether a report whose numbers, pages or log are not what they should be gets nothing, or
-        its points as a proposal.
-    items : tuple of RubricItem
-    words : dict
-        Finding id to words by which notes may name it; "none" to those that say that nothing is
-        wrong.
-    """
-
-    title: str
-    unverified: Unverified
-    items: tuple[RubricItem, ...]
-    words: dict[str, tuple[str, ...]] = field(default_factory=dict)
-
-
 def rubric_text() -> str:
     """The default rubric, comments and all, for an instructor to copy and edit."""
-    return files("px4fuse.grading").joinpath(DEFAULT).read_text(encoding="utf-8")
+    text = files("px4fuse.grading").joinpath(DEFAULT).read_text(encoding="utf-8")
+    own = (
+        f"# {name} = {json.dumps(listed, ensure_ascii=False)}\n"
+        for name, listed in phrases().items()
+    )
+    return text + "".join(own)
 
 
 def read_rubric(path: Path | None) -> Rubric:
@@ -173,7 +61,8 @@ def read_rubric(path: Path | None) -> Rubric:
         It cannot be read, or something in it is not what it should be: the text says which item.
     """
     if path is None:
-        return parse_rubric(rubric_text(), DEFAULT)
+        rubric = parse_rubric(rubric_text(), DEFAULT)
+        return replace(rubric, words={**phrases(), **rubric.words})
     default = read_rubric(None)
     text = read_text(path, SettingsError, MAX_RUBRIC_BYTES, name=str(path))
     rubric = parse_rubric(text, str(path))
@@ -215,7 +104,7 @@ def parse_rubric(text: str, where: str) -> Rubric:
 
 def _item(where: str, number: int, given: object) -> RubricItem:
     if not isinstance(given, dict):
-        _refuse(where, f"item {number} is no table; begin it with [[item]]")
+        _refuse(where, f"item {number} is not a table; begin it with [[item]]")
     title = _value(f"{where}: item {number}", "title", given, Parameter("text", required=True))
     here = f"{where}: item {number} ({title!r})"
     if not title.strip():
@@ -224,7 +113,7 @@ def _item(where: str, number: int, given: object) -> RubricItem:
         here, "points", given, Parameter("number", None, 0.0, MAX_POINTS, required=True)
     )
     check = _value(here, "check", given, Parameter("text", choices=tuple(CHECKS), required=True))
-    known = CHECKS[check]
+    known = CHECKS[check].parameters
     for name in given:
         if name not in ITEM_KEYS and name not in known:
             _refuse(
@@ -256,7 +145,7 @@ def _check_bounds(here: str, given: Mapping[str, Any]) -> None:
 
 def _words(where: str, given: object) -> dict[str, tuple[str, ...]]:
     if not isinstance(given, dict) or len(given) > MAX_ITEMS:
-        _refuse(where, '[words] is no table of finding ids; give ID = ["word", ...]')
+        _refuse(where, '[words] is not a table of finding ids; give ID = ["word", ...]')
     here = f"{where}: [words]"
     return {name: _value(here, name, given, Parameter("texts")) for name in given}
 

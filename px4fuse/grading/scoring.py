@@ -18,8 +18,8 @@ from typing import Any, Literal
 from px4fuse.assignment.assignment import POSSIBLE_FINDINGS
 from px4fuse.assignment.key import Answer, AnswerKey
 from px4fuse.filter.tuning import HORIZONTAL
-from px4fuse.grading.model import Graded, Item
-from px4fuse.grading.rubric import Rubric, RubricItem
+from px4fuse.findings import SEVERITIES
+from px4fuse.grading.model import Graded, Item, Parameter, Rubric, RubricItem
 from px4fuse.results.comparison import Clock, Filter, HorizontalNis, Tuned
 from px4fuse.results.contract import ComparisonResults, LoopResults, Reported, to_plain
 from px4fuse.results.model import Absent
@@ -45,6 +45,7 @@ NEGATIONS = frozenset(("no", "without", "not", "never", "nor", "zero"))
 NOTHING = "none"
 # Lists are cut where a comment would become longer than a sentence
 NAMED = 4
+SIGMAS = ("sigma_z_m", "sigma_a_m_s2")
 # Half is lost where notes name so many kinds of mistakes that some must be guesses
 GUESSING = 0.5
 NO_SPACES = re.compile("[\u0e00-\u0eff\u1780-\u17ff]+|[\u3040-\u30ff\u3400-\u9fff]+")
@@ -56,7 +57,7 @@ NEXT = (
     "was overlooked."
 )
 
-Check = Callable[["Evidence", Mapping[str, Any]], tuple[float, str]]
+Scorer = Callable[["Evidence", Mapping[str, Any]], tuple[float, str]]
 
 
 # ------------------------------------------------------------------ what is looked at
@@ -617,19 +618,69 @@ def _applied(evidence: Evidence, answer: Answer) -> bool:
     return bool(applied) and abs(applied - asked) < abs(asked) / 2.0
 
 
-DOES: Mapping[str, Check] = {
-    "verified": _verified,
-    "student": _student,
-    "sections": _sections,
-    "notes": _notes,
-    "findings": _findings,
-    "tuning": _tuning,
-    "number": _number_between,
-    "consistent": _consistent,
-    "clock": _clock,
-    "loop": _loop,
-    "flight": _flight,
-    "mistakes": _mistakes,
+@dataclass(frozen=True)
+class Check:
+    """What a rubric may ask for: how it is scored, and what it can be told."""
+
+    score: Scorer
+    parameters: Mapping[str, Parameter]
+
+
+def _check(score: Scorer, **parameters: Parameter) -> Check:
+    return Check(score, parameters)
+
+
+def _share(default: float) -> Parameter:
+    return Parameter("number", default, 0.0, 1.0)
+
+
+# A check is a function above, its line here, and an item of rubric.toml that explains it
+CHECKS: Mapping[str, Check] = {
+    "verified": _check(_verified, without_log=_share(0.5)),
+    "student": _check(_student, name=Parameter("flag", True), id=Parameter("flag", True)),
+    "sections": _check(_sections, results=Parameter("texts", ()), pages=Parameter("texts", ())),
+    "notes": _check(
+        _notes,
+        min_words=Parameter("whole", 150, 1, 100_000),
+        min_different=Parameter("whole", 60, 1, 100_000),
+    ),
+    "findings": _check(
+        _findings,
+        severities=Parameter("texts", ("error", "warning"), choices=SEVERITIES),
+        ignore=Parameter("texts", ("ekf2_unavailable",)),
+    ),
+    "tuning": _check(
+        _tuning,
+        axis=Parameter("text", "horizontal"),
+        settings=Parameter("texts", SIGMAS, choices=SIGMAS),
+        factor=Parameter("number", 2.0, 1.0, 1000.0),
+    ),
+    "number": _check(
+        _number_between,
+        path=Parameter("texts", required=True),
+        name=Parameter("text", ""),
+        unit=Parameter("text", ""),
+        at_least=Parameter("number"),
+        at_most=Parameter("number"),
+        zero_at=Parameter("number"),
+    ),
+    "consistent": _check(
+        _consistent,
+        filter=Parameter("text", "kf", choices=("kf", "ekf2")),
+        axes=Parameter("texts", ("horizontal",)),
+        factor=Parameter("number", 1.5, 1.0, 1000.0),
+    ),
+    "clock": _check(
+        _clock, margin_s=Parameter("number", 0.03, 0.0, 10.0), undeterminable=_share(0.5)
+    ),
+    "loop": _check(_loop, without_reference=_share(0.5)),
+    "flight": _check(
+        _flight,
+        min_duration_s=Parameter("number", 60.0, 0.0, 1e5),
+        min_measurements=Parameter("whole", 100, 0, 10_000_000),
+        min_path_m=Parameter("number", 20.0, 0.0, 1e6),
+    ),
+    "mistakes": _check(_mistakes, in_report=_share(0.25), most_named=Parameter("whole", 4, 1, 100)),
 }
 
 
@@ -653,7 +704,7 @@ def score(
             comment = f"No points, since {REFUTED[verdict.status]}{_reason(verdict)}."
             made.append(Item(item.title, 0.0, item.points, comment))
             continue
-        share, comment = DOES[item.check](evidence, item.parameters)
+        share, comment = CHECKS[item.check].score(evidence, item.parameters)
         made.append(
             Item(
                 item.title,

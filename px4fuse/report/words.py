@@ -176,7 +176,7 @@ def clock_advice(comparison: Comparison, clock: ClockOffset | Unavailable) -> li
         lines.append(
             f"PX4      EKF2_EV_DELAY is {delay:g} ms, the data ask for {asked:.0f} ms ("
             f"{-(applied + high) * 1e3:.0f} to {-(applied + low) * 1e3:.0f})"
-            + ("" if inside else "; set it, or mend the clock")
+            + ("" if inside else "; set it, or fix the clock")
         )
     if clock.change_p is not None and clock.change_p < CHANGE_P:
         parts = ", ".join(

@@ -7,11 +7,13 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from importlib.resources import files
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 from scipy.stats import binomtest
@@ -19,7 +21,7 @@ from scipy.stats import binomtest
 from px4fuse.analysis import explain
 from px4fuse.comparison.comparison import compare
 from px4fuse.filter.kalman import Settings
-from px4fuse.findings import find, find_loop
+from px4fuse.findings import DETECTORS, find, find_loop
 from px4fuse.loop.analysis import analyse
 from px4fuse.loop.sources import Source
 from px4fuse.loop.tracks import trajectory_of
@@ -31,7 +33,7 @@ TABLE = "rates.csv"
 CLEAN = "none"
 CLEAN_FLIGHTS, FAULTY_FLIGHTS = 200, 30
 # What simulated flights ask for: the IMU's white noise with what bias and attitude errors add
-RIGHT_NOISES = {"sigma_a_m_s2": 0.27, "sigma_z_m": 0.10}
+RIGHT = Settings(sigma_a_m_s2=0.27, sigma_z_m=0.10)
 # A simulated flight holds no EKF2, and says so
 ALWAYS = ("ekf2_unavailable", "loop_end_assumed")
 
@@ -40,47 +42,40 @@ ALWAYS = ("ekf2_unavailable", "loop_end_assumed")
 class Condition:
     """A mistake of a stated size, and the finding that must name it.
 
-    ``mistakes`` are as ``px4fuse simulate --mistake`` takes them, ``settings`` replace the right
-    ones, ``kind`` is that of the flight.
+    ``typed`` is as the finding's file declares it (``measured_on``).
     """
 
     finding: str
-    mistakes: tuple[str, ...] = ()
-    settings: dict[str, float] = field(default_factory=dict)
-    kind: Kind = "aisle"
+    typed: str
 
     @property
-    def name(self) -> str:
-        """As it is typed."""
-        options = [] if self.kind == "aisle" else [f"--kind {self.kind}"]
-        options += [f"--mistake {mistake}" for mistake in self.mistakes]
-        options += [f"{name}={value:g}" for name, value in self.settings.items()]
-        return " ".join(options)
+    def kind(self) -> Kind:
+        """That of the flight."""
+        return "loop" if "--kind loop" in self.typed else "aisle"
+
+    @property
+    def mistakes(self) -> tuple[str, ...]:
+        """As ``px4fuse simulate --mistake`` takes them."""
+        return tuple(re.findall(r"--mistake (\S+)", self.typed))
+
+    @property
+    def settings(self) -> Settings:
+        """The right ones, with those of this condition in their place."""
+        words = re.sub(r"--\w+ \S+", "", self.typed).split()
+        given: dict[str, Any] = {
+            name: float(value) for name, value in (word.split("=") for word in words)
+        }
+        return replace(RIGHT, **given)
 
 
-CONDITIONS = (
-    *(Condition("source_clock_offset", (f"clock-offset={ms}ms",)) for ms in (40, 80, 120, 250)),
-    *(Condition("source_clock_changes", (f"clock-jump={ms}ms",)) for ms in (150, 250, 400)),
-    *(Condition("source_frame_turned", (f"yaw={degrees}",)) for degrees in (10, 20, 30)),
-    *(Condition("source_outliers", (f"nlos={share}%",)) for share in (1, 2, 5)),
-    *(Condition("source_gap", (f"dropout={seconds}s",)) for seconds in (2, 8)),
-    *(Condition("sigma_z_small", (), {"sigma_z_m": value}) for value in (0.07, 0.05, 0.03)),
-    *(Condition("sigma_z_large", (), {"sigma_z_m": value}) for value in (0.15, 0.2, 0.3)),
-    *(Condition("sigma_a_small", (), {"sigma_a_m_s2": value}) for value in (0.18, 0.1, 0.02)),
-    *(Condition("sigma_a_large", (), {"sigma_a_m_s2": value}) for value in (0.4, 0.8, 2.0)),
-    Condition("kf_variance_understated", (), {"sigma_z_m": 0.03}),
-    Condition("kf_variance_overstated", (), {"sigma_z_m": 0.3}),
-    Condition("process_noise_forgotten", (), {"sigma_a_m_s2": 0.001}),
-    Condition("imu_gap", ("imu-dropout=1s",)),
-    Condition("no_motion", ("no-motion",)),
-    Condition("logging_rate_low", ("imu-rate=20",)),
-    *(
-        Condition("false_loop_closure", (f"open-end={metres}m",), kind="loop")
-        for metres in (3, 5, 8)
-    ),
+CONDITIONS = tuple(
+    Condition(finding, typed)
+    for detector in DETECTORS
+    for finding, conditions in detector.measured_on.items()
+    for typed in conditions
 )
 # Clean flights: without a mistake
-AISLE, LOOP = Condition(""), Condition("", kind="loop")
+AISLE, LOOP = Condition("", ""), Condition("", "--kind loop")
 
 
 def found(seed: int, condition: Condition | None = None) -> tuple[str, ...]:
@@ -100,9 +95,7 @@ def found(seed: int, condition: Condition | None = None) -> tuple[str, ...]:
         loop = analyse(Source(trajectory_of(flight, "vio"), flight))
         return tuple(f.id for f in find_loop(loop) if f.id not in ALWAYS)
     flight = simulate_flight(Scenario(seed=seed), mistakes)
-    noises = {**RIGHT_NOISES, **condition.settings}
-    settings = Settings(sigma_a_m_s2=noises["sigma_a_m_s2"], sigma_z_m=noises["sigma_z_m"])
-    analysis = explain(compare(flight, settings, axes=("north", "east")))
+    analysis = explain(compare(flight, condition.settings, axes=("north", "east")))
     return tuple(f.id for f in find(analysis) if f.id not in ALWAYS)
 
 
@@ -145,7 +138,7 @@ def _rows(
     for condition in CONDITIONS:
         own = [r for (_, c), r in zip(jobs, results, strict=True) if c == condition]
         name = condition.finding
-        yield _row(name, condition.name, [name in r for r in own], [r[:1] == (name,) for r in own])
+        yield _row(name, condition.typed, [name in r for r in own], [r[:1] == (name,) for r in own])
 
 
 def _row(name: str, condition: str, hits: list[bool], first: list[bool]) -> dict[str, object]:

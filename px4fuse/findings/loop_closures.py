@@ -1,11 +1,8 @@
-"""Loop closures: those that are false, or doubtful, and what a closure error rests on."""
+"""Loop closures that the drift cannot explain, or that the others contradict."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
-from px4fuse.analysis import Analysis
-from px4fuse.findings.model import Finding, Threshold
+from px4fuse.findings.model import Detector, Finding, Found, Threshold
 from px4fuse.loop.loop import Judged, Loop
 from px4fuse.trajectory.graph.analysis import GATE_ALPHA
 
@@ -13,14 +10,7 @@ MOST = Threshold(0.5, "share", "of several closures, more are true than false")
 DOUBTFUL_WEIGHT = Threshold(0.5, "weight", "GNC ends at 0 or 1 (Yang et al. 2020)")
 
 
-def loop_closures(analysis: Analysis) -> Iterator[Finding]:
-    """Findings about the loop of a flight that holds one."""
-    if isinstance(analysis.loop, Loop):
-        yield from find_in_loop(analysis.loop)
-
-
-def find_in_loop(loop: Loop) -> Iterator[Finding]:
-    """Closures that the drift cannot explain, that the others contradict, and assumptions."""
+def _detect(loop: Loop) -> Found:
     dropped = [j for j in loop.closures if j.weights.get("gnc", 1.0) < DOUBTFUL_WEIGHT.value]
     most = len(dropped) > MOST.value * len(loop.closures)
     if most:
@@ -44,25 +34,6 @@ def find_in_loop(loop: Loop) -> Iterator[Finding]:
                 "Leave it out, or take the robust solution (GNC).",
                 _evidence(judged) | {"gnc_weight": judged.weights["gnc"]},
             )
-    if loop.absolute:
-        yield Finding(
-            "loop_of_absolute_track",
-            "warning",
-            "This track follows a positioning system and does not drift: its closure error is the "
-            "noise of one position, and to spread it over the path makes the path worse.",
-            "Measure the loop on odometry: send visual-inertial odometry to PX4 as ODOMETRY.",
-            {} if loop.closure_error_m is None else {"closure_error_m": loop.closure_error_m},
-        )
-    if loop.closure_error_m is not None and loop.end_assumed:
-        yield Finding(
-            "loop_end_assumed",
-            "info",
-            "That the vehicle landed where it took off is assumed: every centimetre that it did "
-            "not is counted as closure error.",
-            "Measure where it landed and give --landed-at FORWARD,RIGHT (m, along its nose at "
-            "take-off and to the right of it).",
-            {"closure_error_m": loop.closure_error_m},
-        )
 
 
 def _false(judged: Judged, assumed: bool) -> Finding:
@@ -99,3 +70,20 @@ def _evidence(judged: Judged) -> dict[str, float | str]:
         "p": judged.gate.p,
         "alpha": GATE_ALPHA,
     }
+
+
+DETECTOR = Detector(
+    _detect,
+    {
+        "false_loop_closure": "false closure, false loop, wrong closure, wrong loop, "
+        "closure rejected, closure gate, not closed, did not return, not land where, "
+        "landed elsewhere, loop open",
+        "loop_closure_doubtful": "closure doubt, closure contradict, closure dropped",
+        "loop_drift_understated": "drift understat, drift more, drift larger",
+    },
+    {
+        "false_loop_closure": tuple(
+            f"--kind loop --mistake open-end={metres}m" for metres in (3, 5, 8)
+        )
+    },
+)

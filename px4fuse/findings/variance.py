@@ -1,8 +1,6 @@
-"""What the innovations say about the noise settings, of our filter and of EKF2 alike."""
+"""S larger or smaller than the innovations show it to be, for our filter and for EKF2 alike."""
 
 from __future__ import annotations
-
-from collections.abc import Iterator
 
 import numpy as np
 
@@ -11,23 +9,22 @@ from px4fuse.comparison.comparison import AxisComparison, Comparison
 from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.kalman import Settings
 from px4fuse.filter.likelihood import NoiseAsked, sigma_a_asked
-from px4fuse.findings.model import Finding
-from px4fuse.findings.thresholds import (
-    EKF2_NOISE_FLOOR,
-    LAG1_SLOW,
-    NOISE_ABSURD,
-    NOISE_FITS,
-    OUTLIER_SHARE,
-    RESPONSE_TIME,
-    SMALLEST_NOISE,
-    VARIANCE_FACTOR,
-    VARIANCE_FACTOR_ERROR,
+from px4fuse.findings.model import Detector, Finding, Found, Threshold
+from px4fuse.flight import Unavailable
+
+VARIANCE_FACTOR = Threshold(
+    1.5, "times", "22 % in standard deviation; chance moves it less at n > 100"
 )
-from px4fuse.flight import Unavailable, sample_rate
+VARIANCE_FACTOR_ERROR = Threshold(4.0, "times", "a factor of two in standard deviation")
+EKF2_NOISE_FLOOR = Threshold(0.01, "m", "EKF2 never trusts external vision better, EKF2.cpp")
+NOISE_FITS = Threshold(1.25, "times", "the median's own scatter below n = 100 (1.17/√n, two σ)")
+NOISE_ABSURD = Threshold(2.0, "times", "beyond, a small SIGMA_A explains it rather than the source")
+LAG1_SLOW = Threshold(0.3, "correlation", "white innovations stay below 2/√n, 0.2 at n = 100")
+SMALLEST_NOISE = Threshold(0.001, "m", "below what any positioning system resolves")
+OUTLIER_SHARE = Threshold(0.005, "outside 5√S", "6e-7 is expected")
 
 
-def variance_wrong(analysis: Analysis) -> Iterator[Finding]:
-    """S larger or smaller than the innovations deserve, for our filter and for EKF2 alike."""
+def _detect(analysis: Analysis) -> Found:
     comparison = analysis.comparison
     for owner in ("kf", "ekf2"):
         named: list[tuple[AxisComparison, Consistency]] = []
@@ -145,9 +142,9 @@ def _ekf2_remedy(used: float, asked: NoiseAsked, statement: Consistency) -> str:
 
 
 def _noise_helps(noise: float, used: float, statement: Consistency) -> bool:
-    """Whether another measurement noise mends the variance.
+    """Whether another measurement noise fixes the variance.
 
-    More noise mends one that is understated, less one that is overstated; if the noise already
+    More noise fixes one that is understated, less one that is overstated; if the noise already
     fits, or the other way round, the cause lies elsewhere.
     """
     if 1 / NOISE_FITS.value < noise / used < NOISE_FITS.value:
@@ -173,54 +170,18 @@ def _ekf2_noise(result: AxisComparison) -> float:
     return float(np.sqrt(frame["observation_variance_m2"].median()))
 
 
-def process_noise_forgotten(analysis: Analysis) -> Iterator[Finding]:
-    """SIGMA_A so small that σ hardly grows between updates and new measurements are ignored.
-
-    A slow filter is no mistake where nothing happens: its innovations must say that it lags.
-    """
-    comparison = analysis.comparison
-    for result in comparison.axes:
-        updates, statement = result.replay.updates, result.kf.consistency
-        if isinstance(statement, Unavailable) or statement.verdict != "variance understated":
-            continue
-        if statement.lag1_autocorrelation < LAG1_SLOW.value:
-            continue
-        gain = float(updates["gain_position"].iloc[len(updates) // 2 :].median())
-        response_s = 1.0 / (sample_rate(updates) * gain)
-        if response_s < RESPONSE_TIME.value:
-            continue
-        after = result.replay.steps["position_variance_m2"].reindex(updates.index).to_numpy()
-        before = updates["prior_position_variance_m2"].to_numpy()
-        growth = float(np.median((before[1:] / after[:-1] - 1.0)[len(after) // 2 :]))
-        asked = sigma_a_asked(result.axis, comparison.settings)
-        yield Finding(
-            "process_noise_forgotten",
-            "error",
-            f"Q forgotten: with SIGMA_A {comparison.settings.sigma_a_m_s2:g} m/s² σ_p hardly grows "
-            f"between updates ({growth:.1%} in variance), the gain is {gain:.3f}, and the filter "
-            f"needs {response_s:.0f} s to follow (along {result.axis.name}).",
-            f"Raise SIGMA_A: --sigma-a {asked:.2g} fits these data best.",
-            {
-                "relative_growth": growth,
-                "gain": gain,
-                "response_s": response_s,
-                "sigma_a_asked_m_s2": asked,
-                "axis": result.axis.name,
-            },
-        )
-        return
-
-
-def too_few_innovations(analysis: Analysis) -> Iterator[Finding]:
-    """Our own statistics could not be stated."""
-    comparison = analysis.comparison
-    for result in comparison.axes:
-        if isinstance(result.kf.consistency, Unavailable):
-            yield Finding(
-                "too_few_innovations",
-                "warning",
-                f"No statement on consistency: {result.kf.consistency.reason}.",
-                result.kf.consistency.remedy,
-                {"count": float(len(result.replay.updates))},
-            )
-            return
+DETECTOR = Detector(
+    _detect,
+    {
+        "kf_variance_overstated": "overstat, variance too large, variance large, nis below, "
+        "nis low, conservative",
+        "kf_variance_understated": "understat, variance too small, variance small, nis above, "
+        "nis high, overconfident",
+        "ekf2_variance_overstated": "ekf2 overstat, ekf2 variance, ekf2_evp_noise, ekf2 nis",
+        "ekf2_variance_understated": "ekf2 understat, ekf2 variance, ekf2_evp_noise, ekf2 nis",
+    },
+    {
+        "kf_variance_overstated": ("sigma_z_m=0.3",),
+        "kf_variance_understated": ("sigma_z_m=0.03",),
+    },
+)

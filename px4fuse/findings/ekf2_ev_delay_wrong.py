@@ -1,0 +1,46 @@
+"""EKF2_EV_DELAY is not the delay that the data have."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from px4fuse.analysis import Analysis
+from px4fuse.filter.clock import ClockOffset
+from px4fuse.findings.model import Detector, Finding, Found, Threshold
+from px4fuse.findings.source_clock import CLOCK_OFFSET, CLOCK_SIGMAS
+
+EKF2_UPDATE = Threshold(0.010, "s", "EKF2_PREDICT_US, EKF2's own step")
+
+
+def _detect(analysis: Analysis) -> Found:
+    comparison = analysis.comparison
+    clock = analysis.clock
+    delay = comparison.flight.log.parameters.get("EKF2_EV_DELAY")
+    if not isinstance(clock, ClockOffset) or comparison.source.reconstructed:
+        return
+    if not clock.determinable or delay is None:
+        return
+    applied = comparison.settings.clock_offset_s
+    asked = -applied - np.array([clock.interval_s[1], clock.interval_s[0]])
+    best = -(applied + clock.offset_s)
+    apart = abs(delay * 1e-3 - best)
+    if apart < max(CLOCK_SIGMAS.value * clock.sigma_s + EKF2_UPDATE.value, CLOCK_OFFSET.value):
+        return
+    yield Finding(
+        "ekf2_ev_delay_wrong",
+        "warning",
+        f"EKF2_EV_DELAY is {delay:g} ms, while the data ask for {best * 1e3:.0f} ms (95 % "
+        f"{asked[0] * 1e3:.0f} to {asked[1] * 1e3:.0f}): EKF2 fuses each position at the wrong "
+        "time, and its track lags or leads by the difference.",
+        f"Set EKF2_EV_DELAY to {0.0 if asked[0] <= 0.0 else best * 1e3:.0f}.",
+        {"ekf2_ev_delay_ms": delay, "asked_ms": best * 1e3},
+    )
+
+
+DETECTOR = Detector(
+    _detect,
+    {
+        "ekf2_ev_delay_wrong": "ekf2_ev_delay, ev_delay, delay, clock offset, time offset, "
+        "stamp late, stamp early, latency",
+    },
+)

@@ -1,0 +1,92 @@
+"""EKF2 did not use the source for horizontal position, or not all the time."""
+
+from __future__ import annotations
+
+from px4fuse.analysis import Analysis
+from px4fuse.comparison.comparison import Comparison
+from px4fuse.findings.model import Detector, Finding, Found, Threshold, step_share
+from px4fuse.flight import EXTERNAL_VISION_RUNGS, Unavailable
+
+FUSING_SHARE_ERROR = Threshold(
+    0.5, "of the segment", "below, EKF2's track is mostly not the source's"
+)
+FUSING_SHARE_WARNING = Threshold(0.98, "of the segment", "one second in a flight of a minute")
+EV_START_INTERVAL = Threshold(0.2, "s", "EV_MAX_INTERVAL, PX4 v1.14 and later, ev_control.cpp")
+EV_STOP_INTERVAL = Threshold(0.4, "s", "two times EV_MAX_INTERVAL, ev_pos_control.cpp")
+
+
+def _detect(analysis: Analysis) -> Found:
+    comparison = analysis.comparison
+    ekf2, segment = comparison.flight.ekf2, comparison.segment
+    if isinstance(ekf2, Unavailable) or isinstance(ekf2.fusing, Unavailable):
+        return
+    share = step_share(ekf2.fusing["horizontal"], segment.start_s, segment.end_s)
+    if comparison.source.rung not in EXTERNAL_VISION_RUNGS:
+        if comparison.source.name == "vehicle_mocap_odometry" and share == 0.0:
+            yield Finding(
+                "ekf2_not_fusing",
+                "warning",
+                "EKF2 never fuses motion capture (ATT_POS_MOCAP), and nothing else of external "
+                "vision reached it: its track does not come from this source.",
+                "Send the position as VISION_POSITION_ESTIMATE if EKF2 is to fuse it.",
+                {"fusing_share": share},
+            )
+        return
+    interval = 1.0 / comparison.source.rate_hz
+    evidence: dict[str, float | str] = {"fusing_share": share, "source_interval_s": interval}
+    if share >= FUSING_SHARE_WARNING.value:
+        return
+    if share >= FUSING_SHARE_ERROR.value:
+        yield Finding(
+            "ekf2_fusion_interrupted",
+            "warning",
+            f"EKF2 fused the source in only {share:.0%} of the segment; in between its track "
+            "rests on its other sensors.",
+            "Look at the gaps and rejections below; EKF2 stops after 0.4 s without a sample.",
+            evidence,
+        )
+        return
+    why, remedy = _cause(comparison, interval)
+    often = f"fused the source in only {share:.0%} of the segment"
+    yield Finding(
+        "ekf2_not_fusing",
+        "error",
+        f"EKF2 {often if share else 'never fused the source in this segment'}: {why}.",
+        remedy,
+        evidence,
+    )
+
+
+def _cause(comparison: Comparison, interval: float) -> tuple[str, str]:
+    """Why EKF2 does not fuse a source with this interval (s), and the remedy."""
+    control = comparison.flight.log.parameters.get("EKF2_EV_CTRL")
+    mask = comparison.flight.log.parameters.get("EKF2_AID_MASK")
+    if control is not None and not int(control) & 1:
+        return (
+            f"EKF2_EV_CTRL is {control:.0f}, bit 0 (horizontal position) is not set",
+            f"Set EKF2_EV_CTRL to {int(control) | 1}.",
+        )
+    if control is None and mask is not None and not int(mask) & 8:
+        return (
+            f"EKF2_AID_MASK is {mask:.0f}, bit 3 (vision position) is not set",
+            f"Set EKF2_AID_MASK to {int(mask) | 8}.",
+        )
+    # the rate of a reconstructed source is the logger's, not its own
+    own_rate = control is not None and not comparison.source.reconstructed
+    if own_rate and interval > EV_START_INTERVAL.value:
+        return (
+            f"its samples come every {interval:.2f} s, and EKF2 (v1.14 and later) starts only when "
+            f"they are less than {EV_START_INTERVAL.value:g} s apart and stops after "
+            f"{EV_STOP_INTERVAL.value:g} s",
+            "Send the UWB position at 10 Hz; 5 Hz starts only thanks to jitter.",
+        )
+    return "the log does not show why", "Check EKF2_EV_CTRL (EKF2_AID_MASK before v1.14)."
+
+
+DETECTOR = Detector(
+    _detect,
+    {
+        "ekf2_not_fusing": "not fus, never fus, ekf2 fus",
+        "ekf2_fusion_interrupted": "fusion interrupt, ekf2 fus, stopped fusing",
+    },
+)

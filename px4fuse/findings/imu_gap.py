@@ -1,0 +1,37 @@
+"""The IMU stopped for a while."""
+
+from __future__ import annotations
+
+import pandas as pd
+
+from px4fuse.analysis import Analysis
+from px4fuse.findings.model import Detector, Finding, Found, Threshold
+from px4fuse.flight import sample_rate
+
+IMU_GAP_TOTAL = Threshold(0.2, "s", "two prediction steps")
+
+
+def _detect(analysis: Analysis) -> Found:
+    comparison = analysis.comparison
+    gap_s = comparison.axes[0].replay.input_gap_s
+    imu = comparison.flight.imu
+    interval_s = 1.0 / sample_rate(imu) if isinstance(imu, pd.DataFrame) else 0.0
+    if gap_s > max(IMU_GAP_TOTAL.value, 2.0 * interval_s):
+        yield Finding(
+            "imu_gap",
+            "warning",
+            f"The IMU is missing for {gap_s:.2f} s of the segment; the process noise was raised "
+            "there to the size of the motion.",
+            "Use a faster SD card, or choose a segment without the gap (--start, --end).",
+            {"total_s": gap_s},
+        )
+
+
+DETECTOR = Detector(
+    _detect,
+    {
+        "imu_gap": "gap, imu dropout, imu missing, imu lost, imu silent, imu stop, "
+        "acceler missing, acceler dropout, acceler lost, no imu for",
+    },
+    {"imu_gap": ("--mistake imu-dropout=1s",)},
+)

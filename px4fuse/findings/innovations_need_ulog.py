@@ -1,0 +1,26 @@
+"""MAVLink carries EKF2's states and variances, but no innovations."""
+
+from __future__ import annotations
+
+import pandas as pd
+
+from px4fuse.analysis import Analysis
+from px4fuse.findings.model import Detector, Finding, Found
+from px4fuse.flight import Ekf2
+
+
+def _detect(analysis: Analysis) -> Found:
+    flight = analysis.comparison.flight
+    if not flight.log.format.startswith("MAVLink") or not isinstance(flight.ekf2, Ekf2):
+        return
+    variances = isinstance(flight.ekf2.variance, pd.DataFrame)
+    yield Finding(
+        "innovations_need_ulog",
+        "info",
+        f"A MAVLink recording holds EKF2's states{' and variances' if variances else ''} but not "
+        "its innovations: whether EKF2 is consistent cannot be said from it.",
+        f"Give the ULog of the same flight: px4fuse compare LOG.ulg --mavlink {flight.log.name}.",
+    )
+
+
+DETECTOR = Detector(_detect, {"innovations_need_ulog": ""})

@@ -1,0 +1,48 @@
+"""Topics that were logged too slowly for what is done with them."""
+
+from __future__ import annotations
+
+import pandas as pd
+
+from px4fuse.analysis import Analysis
+from px4fuse.findings.model import Detector, Finding, Found, Threshold
+from px4fuse.flight import sample_rate
+
+MIN_IMU_RATE = Threshold(
+    50.0, "Hz", "5 IMU samples per DT of 0.1 s and 10 with margin for aliasing"
+)
+MIN_ATTITUDE_RATE = Threshold(10.0, "Hz", "PX4's default is 20 Hz; slerp bridges 0.1 s of a tilt")
+RATE_MARGIN = 0.98  # a stream set to a rate runs a little below it
+
+
+def _detect(analysis: Analysis) -> Found:
+    flight = analysis.comparison.flight
+    mavlink = flight.log.format.startswith("MAVLink")
+    for part, name, default, threshold in (
+        (flight.imu, "imu", "sensor_combined", MIN_IMU_RATE),
+        (flight.attitude, "attitude", "vehicle_attitude", MIN_ATTITUDE_RATE),
+    ):
+        topic = flight.streams[name].topics[0] if name in flight.streams else default
+        if isinstance(part, pd.DataFrame) and sample_rate(part) < RATE_MARGIN * threshold.value:
+            yield Finding(
+                "logging_rate_low",
+                "warning",
+                f"{topic} was logged at {sample_rate(part):.1f} Hz, below the "
+                f"{threshold.value:g} Hz that the acceleration needs: motion between samples "
+                "is lost.",
+                f"Raise its stream rate (mavlink stream -d DEVICE -s {topic} -r "
+                f"{2 * threshold.value:g} in PX4's console), or join the ULog (--mavlink)."
+                if mavlink
+                else f'Put the line "{topic} 0" into etc/logging/logger_topics.txt on the SD card.',
+                {"rate_hz": sample_rate(part), "needed_hz": threshold.value, "topic": topic},
+            )
+
+
+DETECTOR = Detector(
+    _detect,
+    {
+        "logging_rate_low": "logging rate, logged slow, imu rate, imu slow, sample rate, "
+        "sampling rate, sensor_combined",
+    },
+    {"logging_rate_low": ("--mistake imu-rate=20",)},
+)

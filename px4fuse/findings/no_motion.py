@@ -1,0 +1,40 @@
+"""The vehicle hardly moved: nothing about dynamics can be identified."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from px4fuse.analysis import Analysis
+from px4fuse.comparison.comparison import Comparison
+from px4fuse.filter.signals import within
+from px4fuse.findings.model import Detector, Finding, Found, Threshold
+from px4fuse.flight import POSITION_COLUMNS
+
+MOTION_RANGE = Threshold(0.5, "m", "5 to 95 % range; a hovering drone with 0.1 m UWB stays below")
+
+
+def motion_range_m(comparison: Comparison) -> float:
+    """Larger horizontal extent of the source in the segment, 5 to 95 %."""
+    inside = within(comparison.source.samples, comparison.segment)
+    low, high = inside[POSITION_COLUMNS[:2]].quantile([0.05, 0.95]).to_numpy()
+    return float(np.max(high - low))
+
+
+def _detect(analysis: Analysis) -> Found:
+    extent = motion_range_m(analysis.comparison)
+    if extent < MOTION_RANGE.value:
+        yield Finding(
+            "no_motion",
+            "warning",
+            f"The vehicle moved only {extent:.2f} m horizontally (5 to 95 %): velocity, heading "
+            "and clock offset cannot be judged from this flight.",
+            "Fly several passes of 5 m or more, with clear starts and stops.",
+            {"range_m": extent},
+        )
+
+
+DETECTOR = Detector(
+    _detect,
+    {"no_motion": "hover, hardly moved, did not move, no movement, stood still"},
+    {"no_motion": ("--mistake no-motion",)},
+)

@@ -1,0 +1,57 @@
+"""SIGMA_A so small that σ hardly grows between updates and new measurements are ignored.
+
+A slow filter is no mistake where nothing happens: its innovations must say that it lags.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from px4fuse.analysis import Analysis
+from px4fuse.filter.likelihood import sigma_a_asked
+from px4fuse.findings.model import Detector, Finding, Found, Threshold
+from px4fuse.findings.variance import LAG1_SLOW
+from px4fuse.flight import Unavailable, sample_rate
+
+RESPONSE_TIME = Threshold(2.5, "s", "five times the lesson's; a vehicle turns around in less")
+
+
+def _detect(analysis: Analysis) -> Found:
+    comparison = analysis.comparison
+    for result in comparison.axes:
+        updates, statement = result.replay.updates, result.kf.consistency
+        if isinstance(statement, Unavailable) or statement.verdict != "variance understated":
+            continue
+        if statement.lag1_autocorrelation < LAG1_SLOW.value:
+            continue
+        gain = float(updates["gain_position"].iloc[len(updates) // 2 :].median())
+        response_s = 1.0 / (sample_rate(updates) * gain)
+        if response_s < RESPONSE_TIME.value:
+            continue
+        after = result.replay.steps["position_variance_m2"].reindex(updates.index).to_numpy()
+        before = updates["prior_position_variance_m2"].to_numpy()
+        growth = float(np.median((before[1:] / after[:-1] - 1.0)[len(after) // 2 :]))
+        asked = sigma_a_asked(result.axis, comparison.settings)
+        yield Finding(
+            "process_noise_forgotten",
+            "error",
+            f"Q forgotten: with SIGMA_A {comparison.settings.sigma_a_m_s2:g} m/s² σ_p hardly grows "
+            f"between updates ({growth:.1%} in variance), the gain is {gain:.3f}, and the filter "
+            f"needs {response_s:.0f} s to follow (along {result.axis.name}).",
+            f"Raise SIGMA_A: --sigma-a {asked:.2g} fits these data best.",
+            {
+                "relative_growth": growth,
+                "gain": gain,
+                "response_s": response_s,
+                "sigma_a_asked_m_s2": asked,
+                "axis": result.axis.name,
+            },
+        )
+        return
+
+
+DETECTOR = Detector(
+    _detect,
+    {"process_noise_forgotten": "process noise, forgot q, q forgot, sigma_a, sigma a"},
+    {"process_noise_forgotten": ("sigma_a_m_s2=0.001",)},
+)

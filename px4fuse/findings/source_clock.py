@@ -1,0 +1,71 @@
+"""The source's stamps are late or early against the IMU, or their error changed in flight."""
+
+from __future__ import annotations
+
+from px4fuse.analysis import Analysis
+from px4fuse.filter.clock import CHANGE_P, ClockOffset
+from px4fuse.findings.model import Detector, Finding, Found, Threshold
+
+CLOCK_OFFSET = Threshold(0.03, "s", "at 1 m/s a third of a good UWB's noise")
+CLOCK_OFFSET_ERROR = Threshold(0.10, "s", "at 1 m/s a good UWB's noise")
+CLOCK_SIGMAS = Threshold(3.0, "standard deviations", "0.3 % of clean flights lie beyond")
+
+
+def _detect(analysis: Analysis) -> Found:
+    comparison = analysis.comparison
+    clock = analysis.clock
+    # what was derived from EKF2's own output has EKF2's stamps, not the source's
+    reconstructed = comparison.source.reconstructed
+    if not isinstance(clock, ClockOffset) or not clock.determinable or reconstructed:
+        return
+    applied = comparison.settings.clock_offset_s
+    low, high = clock.interval_s
+    evidence: dict[str, float | str] = {
+        "offset_s": applied + clock.offset_s,
+        "interval_low_s": applied + low,
+        "interval_high_s": applied + high,
+    }
+    changes = clock.change_p is not None and clock.change_p < CHANGE_P
+    if changes:
+        first, last = clock.parts[0], clock.parts[-1]
+        yield Finding(
+            "source_clock_changes",
+            "error",
+            f"The clock offset of {comparison.source.name} is not the same throughout (p "
+            f"{clock.change_p:.1g}): {applied + first.offset_s:+.2f} s at the beginning, "
+            f"{applied + last.offset_s:+.2f} s at the end. PX4 takes the time of arrival until "
+            "500 TIMESYNC answers have come.",
+            "Let the clocks synchronise for a minute before take-off; analyse one side of the "
+            "change with --start, --end.",
+            {**evidence, "change_p": clock.change_p or 0.0},
+        )
+    sure = abs(clock.offset_s) > CLOCK_SIGMAS.value * clock.sigma_s
+    if sure and abs(clock.offset_s) > CLOCK_OFFSET.value and not changes:
+        yield Finding(
+            "source_clock_offset",
+            "error" if abs(clock.offset_s) > CLOCK_OFFSET_ERROR.value else "warning",
+            f"The stamps of {comparison.source.name} are "
+            f"{'late' if clock.offset_s < 0 else 'early'} by {abs(clock.offset_s):.3f} s against "
+            f"the IMU (95 % {abs(high):.3f} to {abs(low):.3f} s): at 1 m/s that is an error of "
+            f"{abs(clock.offset_s):.2f} m, which neither filter's innovations show.",
+            f"--clock-offset {applied + clock.offset_s:.3f}",
+            evidence,
+        )
+
+
+DETECTOR = Detector(
+    _detect,
+    {
+        "source_clock_offset": "clock offset, time offset, stamp offset, timestamp offset, "
+        "stamp late, stamp early, stamp delay, stamp lag, timestamp late, timestamp early, "
+        "timestamp delay, clock late, clock early, clock delay, clock behind, clock ahead, "
+        "clock shift, time shift, clock synchron, latency",
+        "source_clock_changes": "clock change, clock jump, clock step, clock drift, "
+        "clock converg, offset change, offset jump, offset step, offset differ, stamp change, "
+        "stamp jump, timestamp change, timestamp jump, timesync",
+    },
+    {
+        "source_clock_offset": tuple(f"--mistake clock-offset={ms}ms" for ms in (40, 80, 120, 250)),
+        "source_clock_changes": tuple(f"--mistake clock-jump={ms}ms" for ms in (150, 250, 400)),
+    },
+)

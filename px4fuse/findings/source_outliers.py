@@ -1,0 +1,40 @@
+"""Measurements that no noise explains: reflections, no line of sight."""
+
+from __future__ import annotations
+
+from px4fuse.analysis import Analysis
+from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
+from px4fuse.findings.model import Detector, Finding, Found, Threshold
+
+OUTLIERS = Threshold(0.005, "of the measurements", "a normal source has 0.02 % beyond 3.7 σ")
+OUTLIERS_ERROR = Threshold(0.02, "of the measurements", "every tenth second at 5 Hz")
+MIN_OUTLIERS = 3
+
+
+def _detect(analysis: Analysis) -> Found:
+    tuned = analysis.tuning.get(HORIZONTAL) or next(iter(analysis.tuning.values()), None)
+    if not isinstance(tuned, AxisTuning):
+        return
+    count = len(tuned.outlier_time_s)
+    share = count / tuned.count
+    if share < OUTLIERS.value or count < MIN_OUTLIERS:
+        return
+    times = ", ".join(f"{time:.1f}" for time in tuned.outlier_time_s[:3])
+    yield Finding(
+        "source_outliers",
+        "error" if share >= OUTLIERS_ERROR.value else "warning",
+        f"{count} of {tuned.count} measurements ({share:.1%}) are outliers that no noise explains "
+        f"({tuned.name}; at {times} s{' and more' if count > 3 else ''}): for UWB most likely "
+        "reflections without line of sight. They pull both filters, and look like noise unless "
+        "they are left out.",
+        "Give the tag line of sight to the anchors there, or reject them before they are sent; do "
+        "not raise SIGMA_Z or EKF2_EVP_NOISE for them.",
+        {"count": float(count), "share": share, "first_s": float(tuned.outlier_time_s[0])},
+    )
+
+
+DETECTOR = Detector(
+    _detect,
+    {"source_outliers": "outlier, nlos, line of sight, reflection, multipath, spike"},
+    {"source_outliers": tuple(f"--mistake nlos={share}%" for share in (1, 2, 5))},
+)
