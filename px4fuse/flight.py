@@ -550,10 +550,17 @@ def stretches_of_flight(landed: pd.Series, duration_s: float) -> tuple[tuple[flo
     )
 
 
+# No position, velocity, acceleration or angle of a flight in SI units comes near it
+DAMAGED = 1e9
+
+
 def finite_rows(samples: pd.DataFrame, columns: list[str]) -> pd.DataFrame:
-    """Rows of a frame in which all of some float columns are finite."""
-    finite: BoolArray = np.isfinite(samples[columns].to_numpy()).all(axis=1)
-    return samples[finite]
+    """Rows of a frame in which all of some float columns are finite, and none is beyond physics.
+
+    A value of 1e30 is damage as much as NaN is, and its square would soon be infinite.
+    """
+    possible: BoolArray = (np.abs(samples[columns].to_numpy()) < DAMAGED).all(axis=1)
+    return samples[possible]
 
 
 def orientation_of(samples: pd.DataFrame) -> pd.DataFrame | None:

@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import contextlib
 import io
+import re
 import struct
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -579,3 +581,27 @@ def test_the_sample_log_without_each_topic_in_turn(sample_log, tmp_path):
     for name in sorted(short.names()):
         less = Log([t for t in short.topics if t.name != name], whole.parameters, whole.info)
         assert analysed(less.write(tmp_path / "less.ulg")) is not None, name
+
+
+@pytest.mark.parametrize("command", ["info", "sync", "tune", "loop"])
+@pytest.mark.parametrize("value", [3e38, -1e30, 1e20])
+@pytest.mark.parametrize("whole", [True, False])
+@pytest.mark.parametrize(
+    ("name", "column"),
+    [("vehicle_visual_odometry", "position"), ("sensor_combined", "accelerometer_m_s2")],
+)
+def test_impossible_values_are_damage_and_no_command_computes_with_them(
+    tmp_path, monkeypatch, capsys, name, column, whole, value, command
+) -> None:
+    """Warnings of overflow are errors in these tests."""
+    log = make_log("v1.16", 20.0)
+    values = log[name][column]
+    values[slice(None) if whole else len(values) // 2] = value
+    options = ["--axis", "north"] if command in ("sync", "tune") else []
+    path = log.write(tmp_path / "l.ulg")
+    monkeypatch.setattr(sys, "argv", ["px4fuse", command, str(path), *options])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    out, err = capsys.readouterr()
+    assert (ended.value.code or 0, len(err.splitlines())) in ((0, 0), (2, 1))
+    assert not re.search(r"\b(nan|inf)\b", out)

@@ -280,6 +280,8 @@ def _fit_without_outliers(legs: list[Preintegrated]) -> tuple[_Best, BoolArray]:
         if np.array_equal(outlier, skip):
             break
         skip = outlier
+        if skip.all():  # nothing is left to fit, which the caller says
+            break
         best = _search(legs, skip)
     return best, skip
 

@@ -299,10 +299,8 @@ def _graduated(
     if np.max(excess) > 0.0:
         control = 1.0 / float(np.max(excess))
         for _ in range(_GNC_STAGES):
-            ratio = state.chi2 / bound
-            with np.errstate(divide="ignore"):
-                weights = np.sqrt(control * (control + 1.0) / ratio) - control
-            weights = np.clip(weights, 0.0, 1.0)
+            ratio = np.maximum(state.chi2 / bound, 1e-200)  # where the weight is 1 anyway
+            weights = np.clip(np.sqrt(control * (control + 1.0) / ratio) - control, 0.0, 1.0)
             stage = problem.minimise(
                 state, _least_squares(weights), _STAGE_ITERATIONS, _STAGE_TOLERANCE
             )
