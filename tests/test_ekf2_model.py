@@ -398,3 +398,18 @@ def test_height_of_vision_counts_where_ekf2_fused_it(model: Model, sample_flight
     vision = samples["down_m"].loc[40.0:100.0]
     assert low.mean() == pytest.approx(vision.mean(), abs=0.03)
     assert abs(own.mean() - vision.mean()) > 0.4
+
+
+def test_a_bias_that_ekf2_does_not_learn_is_no_trouble(sample_flight: Flight) -> None:
+    _, record = of(sample_flight)
+    fixed = record.delayed.copy()
+    fixed.loc[:, [name for name in fixed if str(name).endswith("m2_s4")]] = 0.0
+    made = opened(
+        with_record(
+            sample_flight,
+            delayed=fixed,
+            parameters={**record.parameters, "EKF2_ACC_B_NOISE": 0.0},
+        )
+    )
+    assert np.isfinite(made.flown.published.to_numpy()).all()
+    assert np.isfinite(made.flown.updates.to_numpy()).all()
