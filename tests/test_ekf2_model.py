@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from ekf2_tools import plain_replay, step_matrix, step_noise, step_state
+from scipy.spatial.transform import Rotation
 
 from px4fuse.ekf2.inputs import Inputs, prepare
 from px4fuse.ekf2.legs import FUSE, START, Legs, Timing, make_legs
@@ -17,8 +18,20 @@ from px4fuse.ekf2.recursion import Variant, run
 from px4fuse.ekf2.replay import HORIZONTAL, Ekf2Replay
 from px4fuse.ekf2.stretches import step_ends
 from px4fuse.errors import SettingsError
+<<<<<<< HEAD
 from px4fuse.flight import Ekf2, Flight, FusionRecord, Unavailable
 from px4fuse.placing.joining import join
+=======
+from px4fuse.flight import (
+    POSITION_COLUMNS,
+    QUATERNION_COLUMNS,
+    Ekf2,
+    Flight,
+    FusionRecord,
+    Unavailable,
+)
+from px4fuse.placing.joining import join
+>>>>>>> 0a2201fcdde291e9f552a478ad71d7584bd2ab99
 from px4fuse.readers import read_log
 
 
@@ -340,3 +353,68 @@ def test_a_mavlink_recording_gives_the_samples_that_the_log_lacks(sample_flight:
     assert made.flown.source == "VISION_POSITION_ESTIMATE"
     assert made.agreement.good
     assert made.agreement.axes["north"].innovation_correlation > 0.999
+
+
+def test_the_published_attitude_follows_the_replayed_one(model: Model) -> None:
+    """Had EKF2's own attitude been 0.02 rad more about north, the replayed one would be so less."""
+    stretch = model.inputs.stretches[0]
+    tilted = replace(
+        stretch, attitude_error_rad=stretch.attitude_error_rad + np.array([0.02, 0, 0])
+    )
+    other = replace(model, inputs=replace(model.inputs, stretches=(tilted,)))
+    plain, changed = (replay_settings(m, [{"EKF2_TAU_POS": 0.25}])[0] for m in (model, other))
+    pd.testing.assert_frame_equal(plain.updates, changed.updates)
+    moved = (changed.published - plain.published).loc[40.0:120.0].mean()
+    # at the horizon the pull makes up for it; from there on it is dead reckoning
+    assert moved["east_m_s"] == pytest.approx(-0.02 * 9.8 * model.inputs.horizon_s, rel=0.15)
+    assert abs(moved["north_m_s"]) < 0.005
+
+
+def test_a_frame_of_its_own_is_turned_by_the_orientations(
+    model: Model, sample_flight: Flight
+) -> None:
+    assert isinstance(sample_flight.attitude, pd.DataFrame)
+    turn = Rotation.from_euler("Z", -70.0, degrees=True)
+    samples = vision_of(sample_flight).copy()
+    samples[POSITION_COLUMNS] = turn.apply(samples[POSITION_COLUMNS].to_numpy(copy=True))
+    attitude = sample_flight.attitude
+    sent = turn * Rotation.from_quat(attitude.to_numpy(copy=True), scalar_first=True)
+    orientation = pd.DataFrame(sent.as_quat(scalar_first=True), attitude.index, QUATERNION_COLUMNS)
+    made = opened(with_vision(sample_flight, samples, frame="FRD", orientation=orientation))
+    plain, turned = (m.flown.updates["innovation_north_m"].to_numpy() for m in (model, made))
+    assert turned == pytest.approx(plain, abs=2e-3)
+    # where EKF2 takes its yaw from vision, the frame is vision's own
+    ekf2, _ = of(sample_flight)
+    assert isinstance(ekf2.fusing, pd.DataFrame)
+    yawed = replace(sample_flight, ekf2=replace(ekf2, fusing=ekf2.fusing.assign(yaw=1.0)))
+    inputs = prepare(with_vision(yawed, samples, frame="FRD", orientation=orientation))
+    assert isinstance(inputs, Inputs)
+    assert inputs.vision.position_m[:, 0] == pytest.approx(samples["north_m"].to_numpy())
+
+
+def test_height_of_vision_counts_where_ekf2_fused_it(model: Model, sample_flight: Flight) -> None:
+    ekf2, _ = of(sample_flight)
+    assert isinstance(ekf2.fusing, pd.DataFrame)
+    samples = vision_of(sample_flight).copy()
+    samples["down_m"] += 0.7
+    fused = replace(sample_flight, ekf2=replace(ekf2, fusing=ekf2.fusing.assign(vertical=1.0)))
+    low = opened(with_vision(fused, samples)).flown.delayed["down_m"].loc[40.0:100.0]
+    own = model.flown.delayed["down_m"].loc[40.0:100.0]
+    vision = samples["down_m"].loc[40.0:100.0]
+    assert low.mean() == pytest.approx(vision.mean(), abs=0.03)
+    assert abs(own.mean() - vision.mean()) > 0.4
+
+
+def test_a_bias_that_ekf2_does_not_learn_is_no_trouble(sample_flight: Flight) -> None:
+    _, record = of(sample_flight)
+    fixed = record.delayed.copy()
+    fixed.loc[:, [name for name in fixed if str(name).endswith("m2_s4")]] = 0.0
+    made = opened(
+        with_record(
+            sample_flight,
+            delayed=fixed,
+            parameters={**record.parameters, "EKF2_ACC_B_NOISE": 0.0},
+        )
+    )
+    assert np.isfinite(made.flown.published.to_numpy()).all()
+    assert np.isfinite(made.flown.updates.to_numpy()).all()

@@ -13,7 +13,7 @@ from px4fuse.ekf2.parameters import PARAMETERS, check, settings_in_force
 from px4fuse.ekf2.walk import OUTPUT, STEPS, Student, Walk, walk
 from px4fuse.ekf2.whatif import WhatIf, sweep, sweep_values, what_if
 from px4fuse.errors import SettingsError
-from px4fuse.flight import Flight, Unavailable
+from px4fuse.flight import Ekf2, Flight, Unavailable
 
 
 @pytest.fixture(scope="module")
@@ -144,6 +144,26 @@ def test_the_bars_add_up_and_little_is_left(model: Model) -> None:
         assert {step.name for step in largest} == {"process noise", OUTPUT}
         last = axis.steps[-1].position_rmse_to_truth_m
         assert last == pytest.approx(axis.logged_rmse_to_truth_m, abs=0.003)
+
+
+def test_the_ends_of_the_walk_are_student_and_model_against_log(model: Model) -> None:
+    made = walked(walk(model))
+    assert isinstance(model.flight.ekf2, Ekf2)
+    logged = model.flight.ekf2.state
+    student = made.tracks["student"]
+    inside = (logged.index > model.flown.stretches[0][0] + 5.0) & (
+        logged.index < model.flown.stretches[0][1]
+    )
+    times = logged.index[inside]
+    assert made.samples == pytest.approx(len(times), abs=2)
+    for axis in ("north", "east"):
+        for ours, name in (
+            (student, "position_total_m2"),
+            (made.tracks[OUTPUT], "position_left_m2"),
+        ):
+            there = np.interp(times, ours.index, ours[f"{axis}_m"])
+            square = np.mean((there - logged.loc[times, f"{axis}_m"]) ** 2)
+            assert getattr(made.axes[axis], name) == pytest.approx(square, rel=0.02)
 
 
 def test_the_walk_starts_where_the_student_is(model: Model) -> None:

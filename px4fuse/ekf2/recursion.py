@@ -31,10 +31,9 @@ from px4fuse.ekf2.stretches import Stretch
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
-# Height and heading come from sensors that logs hold thinly. The published height and heading stand
-# in for them as measurements, with the noise that brings their variances to the logged ones.
 # How long the first pass runs that gives the correlations at the start
 CORRELATING_S = 8.0
+LEAST_VARIANCE = 1e-30
 # Variance by which a sample is not taken at all
 NOT_TAKEN = 1e9
 MIN_POSITION_SD_M = 0.01  # ev_pos_control.cpp
@@ -344,7 +343,8 @@ def with_correlation(inputs: Inputs, stretch: Stretch, legs: Legs) -> Stretch:
         },
     )
     done = run(inputs, stretch, [first], np.zeros(1, np.intp), [Variant(inputs.settings)])
-    deviation = np.sqrt(np.diagonal(done.covariance[0]))
+    # a bias that EKF2 does not learn has no variance
+    deviation = np.sqrt(np.maximum(np.diagonal(done.covariance[0]), LEAST_VARIANCE))
     return replace(stretch, correlation=done.covariance[0] / deviation[:, None] / deviation)
 
 
@@ -371,7 +371,11 @@ def _start(stretch: Stretch, biases: Flags, attitude: Flags) -> tuple[Array, Arr
 
 
 def _down_to(variance: Array, target: Array) -> Array:
-    """Noise of the measurement that brings a variance down to a target: 1/target - 1/variance."""
+    """Noise of the measurement that brings a variance down to a target: 1/target - 1/variance.
+
+    Height and heading come from sensors that logs hold thinly. EKF2's own ones stand in for them as
+    measurements, so that their variances become the logged ones.
+    """
     surplus = variance - target
     noise: Array = np.where(
         surplus > 0.0, variance * target / np.where(surplus > 0.0, surplus, 1.0), NOT_TAKEN
