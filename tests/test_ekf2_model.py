@@ -18,10 +18,6 @@ from px4fuse.ekf2.recursion import Variant, run
 from px4fuse.ekf2.replay import HORIZONTAL, Ekf2Replay
 from px4fuse.ekf2.stretches import step_ends
 from px4fuse.errors import SettingsError
-<<<<<<< HEAD
-from px4fuse.flight import Ekf2, Flight, FusionRecord, Unavailable
-from px4fuse.placing.joining import join
-=======
 from px4fuse.flight import (
     POSITION_COLUMNS,
     QUATERNION_COLUMNS,
@@ -31,7 +27,6 @@ from px4fuse.flight import (
     Unavailable,
 )
 from px4fuse.placing.joining import join
->>>>>>> 0a2201fcdde291e9f552a478ad71d7584bd2ab99
 from px4fuse.readers import read_log
 
 
