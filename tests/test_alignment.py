@@ -638,7 +638,7 @@ def test_too_few_positions(flight: Flight) -> None:
     [
         (
             {"frame": "utm"},
-            "--position-frame utm: there is no such frame. Choose from ned, enu, nwu.",
+            "--position-frame utm: not a known frame. Choose from ned, enu, nwu.",
         ),
         ({"yaw_deg": float("nan")}, "--position-yaw nan is not a finite number."),
         ({"yaw_deg": "north"}, "--position-yaw north: give degrees, or auto."),

@@ -252,12 +252,12 @@ def test_logs_are_found_by_their_hash_not_their_name(tmp_path) -> None:
     [
         (["grade"], "nothing to grade"),
         (["grade", "in"], "say with -o"),
-        (["grade", "missing", "-o", "out"], "there is no such file or folder"),
+        (["grade", "missing", "-o", "out"], "no such file or folder"),
         (["grade", "in", "-o", "in/out"], "lies inside"),
-        (["grade", "in", "-o", "in/a.pdf"], "is no folder"),
+        (["grade", "in", "-o", "in/a.pdf"], "is not a folder"),
         (["grade", "in", "-o", "out", "--rubric", "missing.toml"], "missing.toml"),
         (["grade", "in", "-o", "out", "--key", "missing.json"], "missing.json"),
-        (["grade", "in", "-o", "out", "--logs", "missing"], "there is no such file or folder"),
+        (["grade", "in", "-o", "out", "--logs", "missing"], "no such file or folder"),
     ],
 )
 def test_bad_input_is_one_line(tmp_path, monkeypatch, arguments, says) -> None:

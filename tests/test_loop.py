@@ -421,7 +421,7 @@ def test_a_part_of_a_log_is_named_after_a_colon(tmp_path: Path) -> None:
     odd = tmp_path / "a:vio"
     odd.write_bytes(b"")
     assert split_part(str(odd)) == (odd, None)
-    with pytest.raises(TrajectoryError, match="'slam' is no part of a flight"):
+    with pytest.raises(TrajectoryError, match="'slam' is not a part of a flight"):
         split_part(f"{SAMPLE}:slam")
 
 

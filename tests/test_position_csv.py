@@ -634,14 +634,14 @@ def test_text_among_iso_times_is_named(read, text):
 def test_text_in_split_times_is_named(read):
     nsecs = [*SPLIT["nsecs"][:-1], "oops"]
     columns = {"secs": SPLIT["secs"], "nsecs": nsecs, "x": X, "y": Y}
-    assert f"line {ROWS + 1}: 'nsecs': 'oops' is no number" in refused(read, table(columns))
+    assert f"line {ROWS + 1}: 'nsecs': 'oops' is not a number" in refused(read, table(columns))
 
 
 def test_text_in_a_file_without_header_is_named(read):
     y = [*Y]
     y[29] = "oops"
     line = refused(read, table({**PLAIN, "y": y}, header=False))
-    assert "line 30: column 3: 'oops' is no number" in line
+    assert "line 30: column 3: 'oops' is not a number" in line
 
 
 def test_several_tags_are_pointed_out(read):
@@ -710,8 +710,8 @@ def test_columns_option_takes_any_column(read):
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"time_unit": "min"}, "--position-time-unit: 'min' is none of s, ms, us, ns."),
-        ({"length_unit": "ft"}, "--position-unit: 'ft' is none of m, cm, mm."),
+        ({"time_unit": "min"}, "--position-time-unit: 'min' is not one of s, ms, us, ns."),
+        ({"length_unit": "ft"}, "--position-unit: 'ft' is not one of m, cm, mm."),
         ({"columns": ("time", "x")}, "does not name four or five different columns"),
         ({"columns": ("time", "x", "x", "z")}, "does not name four or five different columns"),
         ({"columns": ("time", "x", "y", "")}, "does not name four or five different columns"),

@@ -445,7 +445,7 @@ class TestParsing:
     )
     def test_values_have_units(self, text, field, value):
         if value is None:
-            with pytest.raises(SettingsError, match="there is no such mistake"):
+            with pytest.raises(SettingsError, match="not a known mistake"):
                 parse([text])
         else:
             assert getattr(parse([text]), field) == pytest.approx(value)
@@ -704,7 +704,7 @@ def test_help_lists_every_mistake():
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["-o", "flight.ulg", "--mistake", "fog"], "there is no such mistake"),
+        (["-o", "flight.ulg", "--mistake", "fog"], "not a known mistake"),
         (["-o", "flight.ulg", "--sigma-uwb", "-1"], "--sigma-uwb -1 is out of range"),
         (["-o", "flight.pdf"], "ends in .ulg"),
         (["-o", "flight.ulg", "--answer", "flight.ulg"], "name the same file"),

@@ -213,7 +213,7 @@ REFUSED: dict[str, tuple[str | bytes, str]] = {
     "other 8 columns": ("time,x,y,z,vx,vy,vz,sigma\n" + "1,2,3,4,5,6,7,8\n" * 5, "its columns are"),
     "commas, no header": (text(rows(",")), "the place of the quaternion's w is not known"),
     "two poses": (text(TUM_ROWS[:2]), "poses: 2, at least 3 are needed"),
-    "text within": (with_field(7, 2, "abc"), "line 7: column 3: 'abc' is no number"),
+    "text within": (with_field(7, 2, "abc"), "line 7: column 3: 'abc' is not a number"),
     "time that is text": (with_field(7, 0, "abc"), "line 7: column 1: 'abc' is no"),
     "NaN": (with_field(8, 3, "nan"), "line 8: a value that is not finite"),
     "infinite": (with_field(8, 5, "-inf"), "line 8: a value that is not finite"),

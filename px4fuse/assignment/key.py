@@ -141,7 +141,7 @@ def read_key(path: Path) -> AnswerKey:
         _refuse(path, f"of a version other than {SCHEMA_VERSION}")
     students = given.get("students")
     if not isinstance(students, list) or not 1 <= len(students) <= MAX_STUDENTS:
-        _refuse(path, f"'students' is no list of 1 to {MAX_STUDENTS}")
+        _refuse(path, f"'students' is not a list of 1 to {MAX_STUDENTS}")
     key = AnswerKey(
         _text(path, given, "kind", "the key"),
         tuple(_answer(path, number, one) for number, one in enumerate(students, start=1)),
@@ -158,17 +158,17 @@ def read_key(path: Path) -> AnswerKey:
 def _answer(path: Path, number: int, given: object) -> Answer:
     where = f"student {number}"
     if not isinstance(given, dict):
-        _refuse(path, f"{where} is no object")
+        _refuse(path, f"{where} is not an object")
     student_id = _text(path, given, "id", where)
     if not student_id.strip():
         _refuse(path, f"{where} has no id")
     sha256 = _text(path, given, "sha256", where)
     if len(sha256) != 64 or not set(sha256) <= set("0123456789abcdef"):
-        _refuse(path, f"{where}: 'sha256' is none")
+        _refuse(path, f"{where}: 'sha256' is not a valid SHA-256")
     scenario = given.get("scenario", {})
     simple = str | int | float | bool | None
     if not isinstance(scenario, dict) or not all(isinstance(v, simple) for v in scenario.values()):
-        _refuse(path, f"{where}: 'scenario' is no object of numbers and words")
+        _refuse(path, f"{where}: 'scenario' is not an object of numbers and words")
     return Answer(
         student_id,
         _text(path, given, "name", where),
@@ -191,20 +191,20 @@ def _text(path: Path, given: Mapping[str, Any], name: str, where: str) -> str:
 def _texts(path: Path, given: Mapping[str, Any], name: str, where: str) -> tuple[str, ...]:
     value = given.get(name)
     if not isinstance(value, list) or len(value) > 20:
-        _refuse(path, f"{where}: '{name}' is no list of texts")
+        _refuse(path, f"{where}: '{name}' is not a list of texts")
     if not all(isinstance(one, str) and 0 < len(one) <= 200 for one in value):
-        _refuse(path, f"{where}: '{name}' is no list of texts")
+        _refuse(path, f"{where}: '{name}' is not a list of texts")
     return tuple(value)
 
 
 def _numbers(path: Path, given: Mapping[str, Any], name: str, where: str) -> dict[str, float]:
     value = given.get(name, {})
     if not isinstance(value, dict):
-        _refuse(path, f"{where}: '{name}' is no object of numbers")
+        _refuse(path, f"{where}: '{name}' is not an object of numbers")
     for one in value.values():
         finite = isinstance(one, int | float) and not isinstance(one, bool) and abs(one) < 1e12
         if not finite:
-            _refuse(path, f"{where}: '{name}' is no object of numbers")
+            _refuse(path, f"{where}: '{name}' is not an object of numbers")
     return {str(key): float(one) for key, one in value.items()}
 
 

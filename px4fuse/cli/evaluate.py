@@ -46,7 +46,11 @@ class DeltaType(click.ParamType["Delta"]):
             return value
         match = _DELTA.fullmatch(value.strip())
         if match is None or not 0.0 < float(match[1]) <= MAX_DELTA:
-            self.fail(f"{value!r} is no distance (5m), time (10s) or frames (1f).", param, ctx)
+            self.fail(
+                f"{value!r} is not a distance (5m), a time (10s) or a number of frames (1f).",
+                param,
+                ctx,
+            )
         unit = {"m": "m", "s": "s"}.get(match[2], "frames")
         return Delta(float(match[1]), unit)  # type: ignore[arg-type]
 

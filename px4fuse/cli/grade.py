@@ -72,10 +72,10 @@ def grade(
     if output is None:
         raise SettingsError("say with -o where the class table goes.")
     if output.exists() and not output.is_dir():
-        raise OutputError(f"-o {output}: is no folder. Give another place.")
+        raise OutputError(f"-o {output}: is not a folder. Give another place.")
     for path in (*submissions, *logs):
         if not path.exists():
-            raise SettingsError(f"{path}: there is no such file or folder.")
+            raise SettingsError(f"{path}: no such file or folder.")
         if path.is_dir() and output.resolve().is_relative_to(path.resolve()):
             raise OutputError(
                 f"-o {output}: lies inside {path}, which is read; its own output would be graded. "

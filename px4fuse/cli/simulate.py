@@ -241,7 +241,7 @@ def _check_options(assignment: Path | None) -> None:
                 "student. Leave it out."
             )
         if assignment is None and name in ONLY_ASSIGNMENTS:
-            raise SettingsError(f"{parameter.opts[0]} is of use with --assignment ROSTER.csv only.")
+            raise SettingsError(f"{parameter.opts[0]} requires --assignment ROSTER.csv.")
 
 
 def _read_secret(secret: str | None, file: Path | None) -> bytes | None:

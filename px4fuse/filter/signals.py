@@ -337,8 +337,7 @@ def make_axes(
         raise SettingsError(f"--heading {heading_deg:g} is not a finite number.")
     if unknown := [name for name in asked if name not in (*AXIS_NAMES, AISLE)]:
         raise SettingsError(
-            f"axis {unknown[0]}: there is no such axis. Choose from "
-            f"{', '.join((*AXIS_NAMES, AISLE))}."
+            f"axis {unknown[0]}: not a known axis. Choose from {', '.join((*AXIS_NAMES, AISLE))}."
         )
     axes = []
     for name in asked:

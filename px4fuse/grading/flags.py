@@ -211,7 +211,7 @@ def _other_assignment(graded: Sequence[Graded], key: AnswerKey | None) -> Flags:
         if not one.log_sha256:
             continue
         if given is None:
-            yield index, "The log is none of those that were handed out with the assignment."
+            yield index, "The log is not one of those that were handed out with the assignment."
         elif own is None:
             said = (
                 f"the id {_short(one.student_id)} is not in the answer key"

@@ -31,7 +31,7 @@ from px4fuse.verification.rerun import log_sha256
 REFUTED: Mapping[str, str] = {
     "numbers differ": "your report's numbers are not those that its log gives",
     "page altered": "a page of your report is not what px4fuse draws",
-    "other log": "the log of your report is none of those that your instructor has",
+    "other log": "the log of your report is not one of those that your instructor has",
 }
 # What verification says of a report that is sound as far as can be told without its log
 NO_LOG = "no log was given; the pages agree with the results"
@@ -426,9 +426,9 @@ def _consistent(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float, st
             else 1.0 - math.log(off) / math.log(given["factor"])
         )
         because = (
-            ", because of outliers that no setting mends, as your notes say"
+            ", because of outliers that no setting fixes, as your notes say"
             if explained
-            else ", because of outliers that no setting mends; your notes should say so"
+            else ", because of outliers that no setting fixes; your notes should say so"
             if outliers
             else ""
         )
@@ -734,7 +734,7 @@ def _applies(item: RubricItem, key: AnswerKey | None, kind: str) -> bool:
 
 
 def feedback(graded: Graded, class_name: str = "") -> str:
-    """Plain text for the student: the points, why, and where most are to be had.
+    """Plain text for the student: the points, why, and where most can still be gained.
 
     Flags are for the instructor and are not in it.
     """
@@ -752,7 +752,7 @@ def feedback(graded: Graded, class_name: str = "") -> str:
         key=lambda item: item.points - item.of,
     )
     if lost and graded.points > 0.0:
-        lines += ["", "Most points are still to be had here:"]
+        lines += ["", "You can still gain most points here:"]
         lines += [f"  - {_text(i.title)} ({_points(i.of - i.points)})" for i in lost[:3]]
     elif graded.items and not lost:
         lines += ["", "Nothing is missing. Well done."]
@@ -767,7 +767,7 @@ def _verdict_text(verdict: Verdict) -> str:
         "numbers differ": "Numbers in your report are not those that px4fuse computes from the "
         "log with your settings.",
         "page altered": "A page of your report is not what px4fuse draws from its numbers.",
-        "other log": "The log of your report is none of those that your instructor has.",
+        "other log": "The log of your report is not one of those that your instructor has.",
         "cannot verify": "Your report could not be verified.",
     }[verdict.status]
     if verdict.status == "verified":

@@ -188,7 +188,7 @@ def _files(path: Path, notes: list[str]) -> Iterator[tuple[Path, str]]:
         yield path.resolve(), path.name
         return
     if not path.is_dir():
-        raise SettingsError(f"{one_line(str(path), MAX_NAME)}: there is no such file or folder.")
+        raise SettingsError(f"{one_line(str(path), MAX_NAME)}: no such file or folder.")
     root = path.resolve()
     outside = 0
     for folder, folders, files in os.walk(root):  # symbolic links to folders are not entered

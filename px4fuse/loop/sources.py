@@ -43,7 +43,7 @@ def split_part(argument: str) -> tuple[Path, Part | None]:
             return Path(path), part
     if colon and Path(path).is_file():
         raise TrajectoryError(
-            f"{shown(Path(path))}:{tail}: {tail!r} is no part of a flight; take one of "
+            f"{shown(Path(path))}:{tail}: {tail!r} is not a part of a flight. Choose from "
             f"{', '.join(PARTS)}."
         )
     return whole, None

@@ -122,7 +122,7 @@ def _check_options(
 ) -> None:
     if frame is not None and frame not in FRAMES:
         raise SettingsError(
-            f"--position-frame {frame}: there is no such frame. Choose from {', '.join(FRAMES)}."
+            f"--position-frame {frame}: not a known frame. Choose from {', '.join(FRAMES)}."
         )
     if isinstance(yaw_deg, str):
         if yaw_deg != "auto":

@@ -219,7 +219,7 @@ def _poses(name: str, lines: _Lines, numbers: Array, dimension: int) -> Array:
     bad = _first(norm < 1e-6)
     if bad is not None:
         raise TrajectoryError(
-            f"{name}, line {lines.line[bad]}: a quaternion of length 0 is no rotation. Give "
+            f"{name}, line {lines.line[bad]}: a quaternion of length 0 is not a rotation. Give "
             "qx qy qz qw behind the position."
         )
     # What is a unit quaternion already stays as it is, so that writing and reading changes nothing

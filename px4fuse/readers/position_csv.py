@@ -166,7 +166,7 @@ def read_position_csv(
     step = float(np.median(np.diff(numbers.index)))
     if not MIN_INTERVAL_S <= step <= MAX_INTERVAL_S:
         notes.append(
-            f"one sample in {step:.3g} s (median) is no rate of a UWB: check --position-time-unit"
+            f"one sample in {step:.3g} s (median) is not a rate of a UWB: check --position-time-unit"
         )
     units, length_words = _length_units(numbers, choice, length_unit)
     samples = pd.DataFrame(np.nan, index=numbers.index, columns=SAMPLE_COLUMNS)
@@ -204,7 +204,7 @@ def _check_options(
         ("--position-unit", length_unit, LENGTH_UNITS),
     ):
         if value is not None and value not in units:
-            raise SettingsError(f"{option}: {value!r} is none of {', '.join(units)}.")
+            raise SettingsError(f"{option}: {value!r} is not one of {', '.join(units)}.")
     given = [column.strip().casefold() for column in columns or ("1", "2", "3")]
     if not 3 <= len(given) <= 5 or "" in given or len(set(given)) < len(given):
         raise SettingsError(
@@ -471,7 +471,10 @@ def _length_units(
     elif spread <= MAX_SPREAD_M:
         unit, reason = "m", "no unit in the names"
     elif MIN_SPREAD_M <= spread * LENGTH_UNITS["mm"] <= MAX_SPREAD_M:
-        unit, reason = "mm", f"as {spread:.0f} m is no indoor flight; if cm, give --position-unit"
+        unit, reason = (
+            "mm",
+            f"as {spread:.0f} m is not an indoor flight; if cm, give --position-unit",
+        )
     else:
         unit, reason = "m", "assumed, as no unit gives an indoor flight: else give --position-unit"
     units = {index: option or choice.units.get(index, unit) for index in choice.numbers}

@@ -120,7 +120,7 @@ def find_table(file: str, text: str, columns: tuple[str, ...] | None) -> Table:
     separator = max(scores, key=scores.__getitem__)
     if not scores[separator]:
         raise LogError(
-            f"{file}: no row of numbers in its first {len(lines)} lines, so this is no table "
+            f"{file}: no row of numbers in its first {len(lines)} lines, so this is not a table "
             "of positions. Give a CSV file with the columns time, x, y, z."
         )
     fields = [field for line in lines for field in split(line, separator)]

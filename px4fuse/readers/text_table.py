@@ -62,7 +62,7 @@ def quote(text: str) -> str:
 def at_line(name: str, number: int, what: str, remedy: str) -> str:
     """Message on one line of a file.
 
-    >>> at_line("uwb.csv", 7, "'x' is no number", "Correct or remove that line.")
-    "uwb.csv, line 7: 'x' is no number. Correct or remove that line."
+    >>> at_line("uwb.csv", 7, "'x' is not a number", "Correct or remove that line.")
+    "uwb.csv, line 7: 'x' is not a number. Correct or remove that line."
     """
     return f"{name}, line {number}: {what}. {remedy}"

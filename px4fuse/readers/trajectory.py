@@ -314,7 +314,7 @@ def _bad_row(file: _File, layout: _Layout, rows: list[str]) -> TrajectoryError:
             return file.refuse(row, what, "Correct or remove that line.")
         for column, field in enumerate(fields, 1):
             if not is_number(field):
-                what = f"column {column}: {quote(field)} is no number"
+                what = f"column {column}: {quote(field)} is not a number"
                 return file.refuse(row, what, "Correct or remove that line.")
     return TrajectoryError(f"{file.name}: no table of numbers. {_REMEDY}")
 
@@ -344,7 +344,7 @@ def _seconds(file: _File, stamps: list[str]) -> tuple[Array, str]:
                 ticks, per_second
             ), f"Its stamps are {unit} and were divided by {per_second:.0e}."
     raise TrajectoryError(
-        f"{file.name}: its stamps are {step:.3g} apart (median), which is no interval of frames in "
+        f"{file.name}: its stamps are {step:.3g} apart (median), which is not an interval of frames in "
         "seconds or nanoseconds. Give stamps in seconds."
     )
 

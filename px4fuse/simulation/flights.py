@@ -63,9 +63,7 @@ def simulate(scenario: Scenario, mistakes: Mistakes = NO_MISTAKES) -> Simulation
     """
     for name in made(mistakes):
         if MISTAKES[name].kind not in ("", scenario.kind):
-            raise SettingsError(
-                f"--mistake {name} is of use with --kind {MISTAKES[name].kind} only."
-            )
+            raise SettingsError(f"--mistake {name} requires --kind {MISTAKES[name].kind}.")
     motion = plan(scenario, mistakes, sensors.stream(scenario, sensors.Stream.WANDER))
     positions = sensors.positions(scenario, mistakes, motion)
     topics = [

@@ -278,7 +278,7 @@ def relative_error(
 def rotations_of(
     aligned: Trajectory, reference: Trajectory, what: str
 ) -> tuple[Rotation, Rotation] | Unavailable:
-    """Rotations of both, or the reason why what was asked for cannot be had."""
+    """Rotations of both, or the reason why what was asked for is not possible."""
     if aligned.rotation is not None and reference.rotation is not None:
         return aligned.rotation, reference.rotation
     side = "estimate" if aligned.rotation is None else "reference"

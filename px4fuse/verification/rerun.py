@@ -121,9 +121,11 @@ class _Files:
         name = recorded
         plain = name == Path(name).name and "\\" not in name and name.isprintable()
         if not plain or len(name.encode(errors="replace")) > MAX_NAME_BYTES:
-            raise _RefusedError(f"{NOT_OURS}: a file name in it is none")
+            raise _RefusedError(f"{NOT_OURS}: a file name in it is not a plain name")
         if os.name == "nt" and _WINDOWS.search(name):
-            raise _RefusedError("a recorded file name is none on Windows: verify it elsewhere")
+            raise _RefusedError(
+                "a recorded file name is not valid on Windows: verify it on another system"
+            )
         # each in a folder of its own: two may have one name
         folder = Path(tempfile.mkdtemp(dir=self._folder))
         target = folder / name
