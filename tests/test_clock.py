@@ -413,4 +413,4 @@ def test_the_offset_of_simulated_flights(shared_logs, name: str, true_s: float) 
         assert not found.interval_s[0] <= -0.175 <= found.interval_s[1]
         words = "\n".join(clock_advice(compared, found))
         assert "EKF2_EV_DELAY is 175 ms" in words
-        assert "set it, or mend the clock" in words
+        assert "set it, or fix the clock" in words
