@@ -166,7 +166,8 @@ def read_position_csv(
     step = float(np.median(np.diff(numbers.index)))
     if not MIN_INTERVAL_S <= step <= MAX_INTERVAL_S:
         notes.append(
-            f"one sample in {step:.3g} s (median) is not a rate of a UWB: check --position-time-unit"
+            f"one sample in {step:.3g} s (median) is not a rate of a UWB: check "
+            "--position-time-unit"
         )
     units, length_words = _length_units(numbers, choice, length_unit)
     samples = pd.DataFrame(np.nan, index=numbers.index, columns=SAMPLE_COLUMNS)

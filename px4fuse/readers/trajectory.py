@@ -344,8 +344,8 @@ def _seconds(file: _File, stamps: list[str]) -> tuple[Array, str]:
                 ticks, per_second
             ), f"Its stamps are {unit} and were divided by {per_second:.0e}."
     raise TrajectoryError(
-        f"{file.name}: its stamps are {step:.3g} apart (median), which is not an interval of frames in "
-        "seconds or nanoseconds. Give stamps in seconds."
+        f"{file.name}: its stamps are {step:.3g} apart (median), which is not an interval of "
+        "frames in seconds or nanoseconds. Give stamps in seconds."
     )
 
 
