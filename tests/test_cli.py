@@ -11,7 +11,7 @@ import pytest
 from click.testing import CliRunner, Result
 
 from px4fuse.cli import cli, main
-from px4fuse.results.build import schema
+from px4fuse.results.contract import schema
 
 
 def run(*arguments: str | Path) -> Result:
