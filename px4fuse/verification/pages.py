@@ -40,9 +40,7 @@ from px4fuse.verification.intake import cleaned, one_line
 from px4fuse.verification.model import PageDifference
 from px4fuse.verification.pictures import FAILURES, pdfium, rendered
 
-# Pictures of pages are compared at 72 dpi, a pixel per point: the height of a digit is 5
-WIDTH_PX = 595
-# Side of the square (points) over which differences are averaged: about two digits
+# Side of the square over which differences are averaged: about two digits, at a pixel per point
 SQUARE_PX = 8
 # Largest mean difference of grey (0 to 1) over such a square that is no difference. Between what
 # harmless re-saves make (0.07 at the most) and what is seen as another page (from 0.11); see above
@@ -125,8 +123,10 @@ def page_texts(pdf: bytes, most: int = 100) -> tuple[str, ...]:
 
 def _look(document: Any, page: int) -> Look | Unavailable:
     try:
-        grey = np.asarray(rendered(document[page], WIDTH_PX).convert("L"), dtype=np.float32)
-        return Look(tuple(_text(document[page]).split()), grey / 255.0)
+        sheet = document[page]
+        # 72 dpi: a pixel per point
+        grey = np.asarray(rendered(sheet, sheet.get_size()[0]).convert("L"), dtype=np.float32)
+        return Look(tuple(_text(sheet).split()), grey / 255.0)
     except FAILURES as error:
         return Unavailable("page", f"it cannot be drawn ({one_line(str(error), 80)})", "")
 

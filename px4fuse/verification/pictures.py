@@ -94,7 +94,7 @@ def pdfium() -> Any:
         )
 
 
-def rendered(sheet: Any, width_px: int) -> Image.Image:
+def rendered(sheet: Any, width_px: float) -> Image.Image:
     """A page of pypdfium2's in RGB, on white, at most :data:`MAX_PIXELS` large.
 
     With the comments that lie over it, since a viewer shows them; without what was typed into
