@@ -141,7 +141,8 @@ def test_reports_of_one_name_in_two_folders_are_kept_apart(tmp_path) -> None:
     turned.write(folder / "report.pdf")
     output = tmp_path / "class"
     grade([tmp_path / "in"], [], read_rubric(None), output, processes=2)
-    assert len({path.read_bytes() for path in (output / "records").glob("*.png")}) == 2
+    shown = {path.read_bytes() for path in (output / "records").glob("*.handed-in.png")}
+    assert len(shown) == 2
     assert grade([tmp_path / "in"], [], read_rubric(None), output, processes=2).reused == 2
 
 
@@ -219,14 +220,19 @@ def test_a_record_holds_all_of_a_grade() -> None:
     from dataclasses import asdict
 
     from px4fuse.grading.model import Item
-    from px4fuse.verification.model import Difference
+    from px4fuse.verification.model import Difference, PageDifference
 
     whole = Graded(
         "a.pdf", "Ada", "1",
-        Verdict("numbers differ", ("why",), True, (Difference("a.b", "1", "2"),), (2, 3)),
+        Verdict("numbers differ", ("why",), True, (Difference("a.b", "1", "2"),), "differ",
+                (PageDifference(2, "its picture", 0, 0.5),)),
         (Item("t", 1.0, 2.0, "c"),), ("flag",), {"n": 0.5}, "a", "b", "0.1", "{}", "notes",
     )  # fmt: skip
-    values = json.loads(json.dumps({k: v for k, v in asdict(whole).items() if k != "picture"}))
+    values = asdict(whole)
+    for name in ("picture", "handed_in", "redrawn"):
+        del values[name]
+    del values["verdict"]["redrawn"]
+    values = json.loads(json.dumps(values))
     assert graded_from(values) == whole
 
 

@@ -15,12 +15,11 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from pypdf import PdfReader, PdfWriter
+from pypdf import PdfWriter
 from pypdf.generic import (
     ArrayObject,
     DecodedStreamObject,
     DictionaryObject,
-    EncodedStreamObject,
     NameObject,
     NumberObject,
     TextStringObject,
@@ -111,8 +110,6 @@ def test_the_real_report():
     assert isinstance(report, Report)
     assert report.seal == "intact"
     assert to_json(report.results).encode() == JSON
-    assert len(report.pages) == 9
-    assert "Two-state Kalman filter against EKF2" in report.pages[0]
     assert report.size_bytes == len(REAL)
     assert report.pdf is REAL
 
@@ -122,7 +119,7 @@ def test_a_report_that_was_saved_again():
     saved = read_report(written(writer), "r.pdf")
     assert isinstance(saved, Report)
     assert saved.seal == "missing"
-    assert saved.pages == read_report(REAL, "r.pdf").pages
+    assert saved.results == json.loads(JSON)
     changed = read_report(REAL.replace(b"/Title", b"/Titlf"), "r.pdf")
     assert isinstance(changed, Report)
     assert changed.seal == "broken"
@@ -155,7 +152,7 @@ def test_results_of_a_loop():
         (REAL[:300_000] + b"\n%%EOF\n", DAMAGED),
         (b"%PDF-1.4\nstartxref\n5\n%%EOF", DAMAGED),
         (b"%PDF-1.4\n" + bytes(intake.MAX_BYTES), "larger than 25 MB"),
-        (small(None), "no results.json is attached: not a px4fuse report, or printed to PDF again"),
+        (small(None), "printed to PDF, which leaves the results out. Hand in the original"),
         (small(name="../../results.json"), "called '../../results.json', not 'results.json'"),
         (small(name="C:\\results.json"), "the attached file is called"),
         (small(name="\u202ex\x1b[2J" * 50), "the attached file is called"),
@@ -234,30 +231,45 @@ TEXT = TextStringObject("x")
         (on_root("/Names", dictionary(JavaScript=dictionary(Names=ArrayObject()))), "JavaScript"),
         (on_root("/Outlines", dictionary(A=action("JavaScript", JS=TEXT))), "JavaScript"),
         (on_root("/OpenAction", action("Launch", F=TEXT)), "an action that starts a program"),
-        (on_root("/OpenAction", ArrayObject([NumberObject(0)])), "an action on opening"),
-        (on_root("/AA", dictionary(WC=action("JavaScript", JS=TEXT))), "an automatic action"),
-        (on_root("/AcroForm", dictionary(Fields=ArrayObject())), "a form"),
+        (on_root("/AA", dictionary(WC=action("JavaScript", JS=TEXT))), "JavaScript"),
         (on_root("/AcroForm", dictionary(XFA=TEXT)), "an XFA form"),
         (on_root("/Collection", dictionary()), "a portfolio"),
-        (on_root("/Outlines", dictionary(First=dictionary(A=action("URI", URI=TEXT)))), "the web"),
         (on_root("/Outlines", dictionary(A=action("SubmitForm"))), "sends a form"),
         (on_root("/Outlines", dictionary(A=action("GoToR", F=TEXT))), "a link to another file"),
         (on_root("/Outlines", dictionary(A=action("GoToE"))), "a link into an attached file"),
         (on_root("/X", dictionary(Type=NameObject("/Filespec"), F=TEXT)), "a reference to another"),
-        (
-            annotation(Subtype=NameObject("/Link"), A=action("URI", URI=TEXT)),
-            "a link to the web, an annotation (/Link)",
-        ),
-        (annotation(Subtype=NameObject("/FileAttachment")), "a file attached to a page"),
-        (annotation(Subtype=NameObject("/RichMedia")), "an annotation (/RichMedia)"),
-        (annotation(Subtype=NameObject("/FreeText")), "an annotation (/FreeText)"),
-        (annotation(), "an annotation (of no type)"),
+        (annotation(Subtype=NameObject("/Screen"), A=action("Rendition")), "rich media"),
+        (annotation(Subtype=NameObject("/Link"), A=action("Launch")), "starts a program"),
+        (annotation(FS=dictionary(Type=NameObject("/Filespec"))), "a reference to another file"),
     ],
-    ids=range(18),
+    ids=range(14),
 )
 def test_what_acts_is_named(edit, said):
     assert said in reason(small(edit=edit))
     assert "it contains" in reason(small(edit=edit))
+
+
+@pytest.mark.parametrize(
+    "edit",
+    [
+        on_root("/OpenAction", ArrayObject([NumberObject(0)])),
+        on_root("/OpenAction", action("GoTo", D=ArrayObject())),
+        on_root("/AcroForm", dictionary(Fields=ArrayObject())),
+        on_root("/AA", dictionary()),
+        on_root("/Outlines", dictionary(First=dictionary(A=action("URI", URI=TEXT)))),
+        on_root("/Outlines", dictionary(First=dictionary(A=action("Named", N=TEXT)))),
+        annotation(Subtype=NameObject("/Link"), A=action("URI", URI=TEXT)),
+        annotation(Subtype=NameObject("/FreeText")),
+        annotation(Subtype=NameObject("/Widget")),
+        annotation(),
+    ],
+    ids=range(10),
+)
+def test_what_programs_add_that_save_a_report_is_read(edit):
+    """Nothing of it is followed, and the pages are drawn again."""
+    report = read_report(small(edit=edit), "r.pdf")
+    assert isinstance(report, Report), report
+    assert report.results == json.loads(JSON)
 
 
 def test_nothing_hides_behind_escaped_names_or_object_streams():
@@ -332,17 +344,6 @@ def test_bombs_in_a_process_of_their_own():
     assert int(grown) * (1 if sys.platform == "darwin" else 1024) < 100_000_000
 
 
-def test_one_content_on_a_hundred_pages():
-    pages = b"<< /Type /Pages /Kids [%b] /Count 90 >>" % (b"3 0 R " * 90)
-    embedded = [
-        stream(JSON, b"/Type /EmbeddedFile"),
-        b"<< /Type /Filespec /F (results.json) /EF << /F 5 0 R >> >>",
-    ]
-    content = stream(zlib.compress(b"0 0 m " * 100_000), FLATE)
-    catalog = b"<< /Type /Catalog /Pages 2 0 R /Names 6 0 R >>"
-    assert "its pages expand" in reason(raw(catalog, pages, PAGE, content, *embedded))
-
-
 @pytest.mark.parametrize(
     "filters",
     [
@@ -351,10 +352,9 @@ def test_one_content_on_a_hundred_pages():
         b"/Filter /LZWDecode",
         b"/Filter /RunLengthDecode",
         b"/Filter /JBIG2Decode",
-        b"/Filter /DCTDecode",
         b"/Filter /Invented",
+        b"/Filter [/DCTDecode /DCTDecode]",
         b"/Filter 7",
-        b"/Filter []",
     ],
 )
 def test_other_filters(filters):
@@ -370,20 +370,11 @@ def test_stream_words_that_make_us_try_again_and_again():
     assert reason(b"%PDF-1.4\n" + stored + b"%%EOF")
 
 
-def test_a_letter_that_prints_a_book():
-    mapping = b"1 beginbfchar <41> <" + b"0041" * 5000 + b"> endbfchar"
-    fonts = b"/Resources << /Font << /F << /Type /Font /Subtype /Type1 /BaseFont /Helvetica "
-    page = PAGE.replace(b"/Resources << >>", fonts + b"/ToUnicode 7 0 R >> >> >>")
-    pdf = raw(
-        b"<< /Type /Catalog /Pages 2 0 R /Names 6 0 R >>",
-        PAGES,
-        page,
-        stream(b"BT /F 9 Tf (" + b"A" * 100_000 + b") Tj ET"),
-        stream(JSON, b"/Type /EmbeddedFile"),
-        b"<< /Type /Filespec /F (results.json) /EF << /F 5 0 R >> >>",
-        stream(mapping),
-    )
-    assert "more memory or work" in reason(pdf)
+@pytest.mark.parametrize("filters", [b"", b"/Filter []", b"/Filter [/FlateDecode /DCTDecode]"])
+def test_pictures_that_were_packed_again_are_passed_over(filters):
+    embedded = stream(JSON, b"/Type /EmbeddedFile")
+    whole = with_attachment(embedded).replace(stream(b""), stream(b"x", filters))
+    assert isinstance(read_report(whole, "r.pdf"), Report | Refused)
 
 
 # ------------------------------------------------------------------ structure
@@ -541,9 +532,8 @@ def test_any_attachment(content):
     assert isinstance(read_report(small(content), "r.pdf"), Refused)
 
 
-def test_mutated_reports(monkeypatch):
-    """The real report with bytes, words and parts changed; its pages' text costs too much here."""
-    monkeypatch.setattr(intake, "_page_texts", lambda reader: iter(()))
+def test_mutated_reports():
+    """The real report with bytes, words and parts changed."""
     rng = random.Random(6)
     words = [b"obj", b"endobj", b"stream", b"<<", b">>", b"/Kids", b"/Type", b"/Length", b" 0 R"]
     bare = small()
@@ -567,36 +557,6 @@ def test_mutated_reports(monkeypatch):
         assert isinstance(read_report(bytes(content), "r.pdf"), Report | Refused)
 
 
-def test_mutated_reports_with_their_text():
-    rng = random.Random(7)
-    shown = small(edit=lambda writer: writer.pages[0].update({}))
-    reader = PdfReader(io.BytesIO(REAL))
-    writer = PdfWriter()
-    writer.add_page(reader.pages[8])
-    writer.add_attachment("results.json", JSON)
-    page = written(writer)
-    assert isinstance(read_report(page, "r.pdf"), Report)
-    for _ in range(FUZZ // 3):
-        content = bytearray(rng.choice([page, page, shown]))
-        for _ in range(rng.randint(1, 4)):
-            content[rng.randrange(len(content))] = rng.randrange(256)
-        assert isinstance(read_report(bytes(content), "r.pdf"), Report | Refused)
-
-
-@pytest.mark.parametrize("operators", [b"0 0 m ", b"1 ", b"[", b"(a) Tj ", b"[(a)]TJ ", b"/X Do "])
-def test_pages_within_every_size_that_are_slow(operators):
-    content = b"BT " + operators * (19_000_000 // len(operators))
-    pdf = raw(
-        b"<< /Type /Catalog /Pages 2 0 R /Names 6 0 R >>",
-        PAGES,
-        PAGE.replace(b"<< >>", b"<< /Font << >> >>"),
-        stream(zlib.compress(content), FLATE),
-        stream(JSON, b"/Type /EmbeddedFile"),
-        b"<< /Type /Filespec /F (results.json) /EF << /F 5 0 R >> >>",
-    )
-    assert isinstance(read_report(pdf, "r.pdf"), Report | Refused)
-
-
 def test_other_objects_that_pypdf_may_meet():
     """Values of a kind that no reader expects, at every key that intake looks at."""
     odd = [
@@ -610,11 +570,3 @@ def test_other_objects_that_pypdf_may_meet():
         for value in odd:
             report = read_report(small(edit=on_root(key, value)), "r.pdf")
             assert isinstance(report, Report | Refused)
-    broken = EncodedStreamObject()
-    broken._data = b"no zlib" * 100
-    broken[NameObject("/Filter")] = NameObject("/FlateDecode")
-
-    def put(writer):
-        writer.pages[0][NameObject("/Contents")] = writer._add_object(broken)
-
-    assert isinstance(read_report(small(edit=put), "r.pdf"), Refused)

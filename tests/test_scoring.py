@@ -83,12 +83,6 @@ class TestVerified:
         points, comment = checked("verified", verdict=verdict)
         assert points == 0.0
         assert comment == "Your report could not be verified (the log is not here)."
-        two = ("every number and page is what the log gives, but", "the file was saved again")
-        verdict = Verdict("cannot verify", two, with_log=True)
-        assert checked("verified", verdict=verdict)[1] == (
-            "Your report could not be verified (every number and page is what the log gives, but "
-            "the file was saved again)."
-        )
 
 
 class TestStudent:
@@ -419,7 +413,7 @@ class TestScore:
 
     def test_refuted_reports_get_nothing_unless_the_rubric_says_so(self):
         rubric = read_rubric(None)
-        for status in ("numbers differ", "page altered", "other log"):
+        for status in ("numbers differ", "other log"):
             verdict = Verdict(status, ("SIGMA_A is 0.5",), with_log=True)
             items = score(report(), verdict, rubric, None)
             assert {item.points for item in items} == {0.0}

@@ -1,4 +1,4 @@
-"""Reports that prove themselves: whatever is changed in one, it is no longer verified."""
+"""Reports that prove themselves: no change of one reaches what an instructor then looks at."""
 
 from __future__ import annotations
 
@@ -9,31 +9,40 @@ import json
 import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 from click.testing import CliRunner
 from forgery import Anatomy, Numbers, numbers_of, taken_apart
 from pypdf import PdfReader, PdfWriter
-from pypdf.generic import NameObject, TextStringObject
+from pypdf.annotations import Link
+from pypdf.generic import (
+    DecodedStreamObject,
+    EncodedStreamObject,
+    NameObject,
+    TextStringObject,
+)
 
 from px4fuse.cli import cli
 from px4fuse.cli.verify import verify as verify_command
 from px4fuse.errors import ResultsError
 from px4fuse.reading import files_by_sha256
-from px4fuse.report.seal import seal_of, sealed
-from px4fuse.results.contract import ComparisonResults, LoopResults, Reported, to_json, to_plain
+from px4fuse.report.seal import seal_of
+from px4fuse.results.contract import ComparisonResults, LoopResults, Reported, to_json
 from px4fuse.results.reading import read_results
-from px4fuse.verification import rerun
+from px4fuse.verification import pages, rerun
 from px4fuse.verification.intake import read_report
 from px4fuse.verification.model import Refused, Report, Verdict
-from px4fuse.verification.page_comparison import plain_layout
 from px4fuse.verification.rerun import Recomputed
 from px4fuse.verification.verification import (
     ESTIMATE_RELATIVE,
     LIMIT,
+    NO_LOG,
     RELATIVE,
+    SAVED_AGAIN,
     compare_results,
     verify,
 )
@@ -44,13 +53,20 @@ LOOP_LOG = REPOSITORY / "sample_logs" / "loop_vio.ulg"
 SHIPPED = REPOSITORY / "reports" / "aisle_uwb.pdf"
 
 
-def report_of(pdf: bytes, *, with_text: bool = False) -> Report:
+def report_of(pdf: bytes) -> Report:
     """A report, read without care: tests of reading are elsewhere."""
-    reader = PdfReader(io.BytesIO(pdf))
-    results = read_results(reader.attachments["results.json"][0])
+    results = read_results(PdfReader(io.BytesIO(pdf)).attachments["results.json"][0])
     assert isinstance(results, ComparisonResults | LoopResults)
-    pages = tuple(page.extract_text() if with_text else "" for page in reader.pages)
-    return Report(hashlib.sha256(pdf).hexdigest(), len(pdf), seal_of(pdf), results, pages, pdf)
+    return Report(hashlib.sha256(pdf).hexdigest(), len(pdf), seal_of(pdf), results, (), pdf)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _looked_at_once() -> Iterator[None]:
+    """The redrawn report is the same in most tests: it is rasterised once."""
+    pytest.importorskip("pypdfium2", reason='pypdfium2 is absent: pip install "px4fuse[grade]"')
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(pages, "looks", lru_cache(8)(pages.looks))
+        yield
 
 
 def plain(report: Report) -> dict[str, Any]:
@@ -78,23 +94,24 @@ class Base:
     numbers: Numbers
 
     def recompute(self, results: Reported, logs: Mapping[str, Path]) -> Recomputed | Refused:
-        """The analysis from memory, where it is this one; else as it really is."""
-        own = self.again.results
-        if (
-            results.student != own.student
-            or to_plain(results.provenance) != self.results["provenance"]
-            or rerun.log_sha256(results) != rerun.log_sha256(own)
-        ):
-            return rerun.recompute(results, logs)
-        return self.again
+        """What a new run gives; from memory where everything that it rests on is recorded so."""
+        ours, theirs = (
+            # the recorded command is made anew from the request
+            (held.request, held.student, rerun.log_sha256(held),
+             msgspec.structs.replace(held.provenance, command=""))
+            for held in (self.again.results, results)
+        )  # fmt: skip
+        return self.again if ours == theirs else rerun.recompute(results, logs)
 
     def verified(self, pdf: bytes) -> Verdict:
-        """The verdict on a forged report, with the log."""
+        """The verdict on a forged report, with the log: what is redrawn is never touched by it."""
         try:
             report = report_of(pdf)
         except ResultsError as error:  # refused before there is anything to verify
             return Verdict("cannot verify", (str(error),), with_log=False)
-        return verify(report, self.files, recompute=self.recompute)
+        verdict = verify(report, self.files, recompute=self.recompute)
+        assert verdict.redrawn in (b"", self.pdf)
+        return verdict
 
     def with_results(self, results: dict[str, Any]) -> Anatomy:
         """The report with other results attached."""
@@ -152,17 +169,17 @@ def test_a_report_on_a_loop_is_verified(loop: Base) -> None:
 
 def test_nothing_is_verified_without_the_log(aisle: Base, loop: Base) -> None:
     for one in (aisle, loop):
-        verdict = verify(report_of(one.pdf, with_text=True))
+        verdict = verify(report_of(one.pdf))
         assert verdict.status == "cannot verify"
-        assert verdict.reasons == ("no log was given; the pages agree with the results",)
+        assert verdict.reasons == (NO_LOG,)
+        assert verdict.redrawn == b""
         assert not verdict.with_log
 
 
 def test_the_real_reader_gives_the_same(aisle: Base) -> None:
     read = read_report(aisle.pdf, "aisle.pdf")
     assert isinstance(read, Report)
-    assert verify(read, aisle.files, recompute=aisle.recompute).status == "verified"
-    assert verify(read).reasons == ("no log was given; the pages agree with the results",)
+    assert verify(read, aisle.files, recompute=aisle.recompute).outcome == "verified"
 
 
 def nudged(value: Any, share: float) -> Any:
@@ -196,13 +213,13 @@ def test_another_platform_is_still_verified(which: str, request: pytest.FixtureR
     nudged_ = read_again(nudged(json.loads(to_json(one.again.results)), 1e-9))
     elsewhere = Recomputed(nudged_, lambda: drawn)
     verdict = verify(report_of(one.pdf), one.files, recompute=lambda *_: elsewhere)
-    assert verdict.status == "verified", verdict
+    assert verdict.outcome == "verified", verdict
     assert f"within {RELATIVE:g}" in verdict.reasons[0]
     aside = shifted(one.pdf, one.numbers, 0.6)
     elsewhere = Recomputed(one.again.results, lambda: aside)
     verdict = verify(report_of(one.pdf), one.files, recompute=lambda *_: elsewhere)
-    assert verdict.status == "page altered"
-    assert len(verdict.pages) >= len(one.numbers.pages) - 1
+    assert (verdict.status, verdict.outcome) == ("verified", "page differs")
+    assert verdict.redrawn == aside
 
 
 def test_tolerances(aisle: Base) -> None:
@@ -277,15 +294,20 @@ def test_a_hundred_kinds_of_numbers_and_words() -> None:
 
 @pytest.mark.parametrize("path", KINDS, ids=lambda path: ".".join(map(str, path)))
 def test_a_changed_leaf_of_the_results(aisle: Base, path: tuple[Any, ...]) -> None:
-    forged = aisle.with_results(changed(aisle.results, path))
+    found = compare_results(changed(aisle.results, path), aisle.again.results)
+    (difference,) = found.differences
+    assert difference.path.replace("[0]", ".0").startswith(".".join(map(str, path)))
+
+
+def test_a_changed_number_in_the_file(aisle: Base) -> None:
+    forged = aisle.with_results(changed(aisle.results, ("axes", "north", "kf", "nis_mean")))
     for pdf in (forged.sealed(), forged.unsealed()):
         verdict = aisle.verified(pdf)
         if verdict.reasons[0].startswith("results.json does not follow the schema"):
             assert verdict.status == "cannot verify"  # a word or number that the contract has not
             continue
-        assert verdict.status == "numbers differ", verdict
-        (difference,) = verdict.differences
-        assert difference.path.replace("[0]", ".0").startswith(".".join(map(str, path)))
+        assert verdict.status == verdict.outcome == "numbers differ", verdict
+        assert verdict.redrawn == aisle.pdf
 
 
 def without(*path: Any) -> Change:
@@ -389,15 +411,26 @@ COMMANDS = {
     "a million words": "px4fuse compare " + "a " * 1_000_000,
     "axes of a file": "px4fuse loop aisle_uwb.ulg --frame ned",
 }
-# What px4fuse could have recorded, with a file that is not at hand; the others it could not
-LACKING = {"a recording that was not joined", "a position file that was not joined"}
+# Only the request is run again; the command is for people, and one that is not made from it differs
 STRUCTURE |= {
-    f"command: {name}": (
-        put(command, "provenance", "command"),
-        "cannot verify" if name in LACKING else "numbers differ",
-    )
+    f"command: {name}": (put(command, "provenance", "command"), "numbers differ")
     for name, command in COMMANDS.items()
 }
+REQUESTS: dict[str, tuple[Change, str]] = {
+    "no request": (without("request"), "numbers differ"),
+    "another command": (put("tune", "request", "command"), "numbers differ"),
+    "an unknown setting": (put(1, "request", "please"), "numbers differ"),
+    "an output": (put("evil.pdf", "request", "output"), "numbers differ"),
+    "a path": (put("../../etc/passwd", "request", "log"), "numbers differ"),
+    "an absolute path": (put("/etc/passwd", "request", "log"), "numbers differ"),
+    "a path of Windows": (put("..\\aisle_uwb.ulg", "request", "log"), "numbers differ"),
+    "a value out of range": (put(1e9, "request", "sigma_a_m_s2"), "numbers differ"),
+    "a value that is none": (put("much", "request", "sigma_a_m_s2"), "numbers differ"),
+    # what px4fuse could have recorded, with a file that is not at hand
+    "a recording that was not joined": (put("/etc/passwd", "request", "mavlink"), "cannot verify"),
+    "other settings": (put(0.4, "request", "sigma_a_m_s2"), "numbers differ"),
+}
+STRUCTURE |= {f"request: {name}": one for name, one in REQUESTS.items()}
 
 
 @pytest.mark.parametrize("name", STRUCTURE)
@@ -405,17 +438,9 @@ def test_changed_results(aisle: Base, name: str) -> None:
     change, expected = STRUCTURE[name]
     results = copy.deepcopy(aisle.results)
     change(results)
-    forged = aisle.with_results(results)
-    for pdf in (forged.sealed(), forged.unsealed()):
-        verdict = aisle.verified(pdf)
-        assert verdict.status == expected, verdict
-
-
-def test_another_command_gives_other_numbers(aisle: Base) -> None:
-    results = copy.deepcopy(aisle.results)
-    results["provenance"]["command"] = "px4fuse compare other.ulg --axis down"
-    verdict = aisle.verified(aisle.with_results(results).sealed())
-    assert verdict.status == "numbers differ", verdict
+    report = report_of(aisle.with_results(results).sealed())
+    verdict = verify(report, aisle.files, recompute=aisle.recompute)
+    assert verdict.status == verdict.outcome == expected, verdict
 
 
 @pytest.mark.parametrize(
@@ -427,17 +452,17 @@ def test_what_is_printed_from_the_record(loop: Base, path: tuple[str, ...]) -> N
     put({"name": "Eve", "notes": "I flew it."}.get(path[-1], "9.9.9"), *path)(results)
     forged = loop.with_results(results)
     again = rerun.recompute(read_again(results), loop.files)
-    for pdf in (forged.sealed(), forged.unsealed()):
-        verdict = verify(report_of(pdf), loop.files, recompute=lambda *_: again)
-        assert verdict.status == "page altered", verdict
+    verdict = verify(report_of(forged.sealed()), loop.files, recompute=lambda *_: again)
+    assert (verdict.status, verdict.outcome) == ("verified", "page differs"), verdict
+    assert verdict.redrawn != loop.pdf
 
 
 def test_another_matplotlib_is_no_accusation(loop: Base) -> None:
     results = copy.deepcopy(loop.results)
     results["provenance"]["libraries"]["matplotlib"] = "3.10.0"
-    verdict = loop.verified(loop.with_results(results).sealed())
-    assert verdict.status == "cannot verify"
-    assert "matplotlib" in verdict.reasons[0]
+    verdict = verify(report_of(loop.with_results(results).sealed()), loop.files)
+    assert (verdict.status, verdict.outcome) == ("verified", "page differs")
+    assert any("matplotlib 3.10.0" in reason for reason in verdict.reasons)
 
 
 # -- what is changed on the pages ------------------------------------------------------------------
@@ -474,8 +499,8 @@ DRAWING: dict[str, Callable[[bytes], bytes]] = {
     "a digit less": once(rb"\(\x00(\d)\)", b"()"),
     "a point of a line moved": once(rb"([\d.]+) ([\d.]+) l", aside),
     "another point of a line moved": once(rb"([\d.]+) ([\d.]+) l", aside, last=False),
-    "a line more": lambda c: c + b"\n0 0 m\n500 500 l\nS\n",
-    "a white rectangle": lambda c: c + b"\n1 g\n100 100 80 12 re\nf\n",
+    "a line more": lambda c: c + b"\n0 G 1 w\n300 0 m\n300 842 l\nS\n",
+    "a white rectangle": lambda c: c + b"\n1 g\n100 690 300 90 re\nf\n",
     "a text more": lambda c: c + b"\nBT\n/F2 12 Tf\n100 100 Td\n(\x00A) Tj\nET\n",
     "a text moved": once(rb"1 0 -?0 1 ([\d.]+) ([\d.]+) cm\nBT", rb"1 0 -0 1 9\1 \2 cm\nBT"),
     "a text invisible": once(rb"BT\n", b"BT\n3 Tr\n"),
@@ -491,6 +516,9 @@ DRAWING: dict[str, Callable[[bytes], bytes]] = {
     "nothing at all": lambda c: b"\n",
 }
 PAGES = 9
+# Nobody who looks at the page sees these, or reads anything else from it (see pages.DISTANCE)
+UNSEEN = {"a comment", "an inline image", "the end cut off", "a point of a line moved",
+          "another point of a line moved", "a colour"}  # fmt: skip
 
 
 # Every page in two ways, and each of the others on three pages
@@ -504,11 +532,14 @@ DRAWN = [
 
 @pytest.mark.parametrize(("page", "name"), DRAWN)
 def test_a_changed_page(aisle: Base, page: int, name: str) -> None:
-    forged = on_page(page, DRAWING[name])(aisle)
-    for pdf in (forged.sealed(), forged.unsealed()):
-        verdict = aisle.verified(pdf)
-        assert verdict.status == "page altered", verdict
-        assert verdict.pages == (page,)
+    verdict = aisle.verified(on_page(page, DRAWING[name])(aisle).sealed())
+    assert verdict.status == "verified"
+    if name in UNSEEN:
+        assert verdict.outcome == "verified", verdict
+    else:
+        assert verdict.outcome == "page differs", verdict
+        assert [one.page for one in verdict.pages] == [page]
+    assert verdict.redrawn == aisle.pdf
 
 
 def of_object(which: Callable[[Numbers], int], change: Callable[[bytes], bytes]) -> Forge:
@@ -604,59 +635,59 @@ JAVASCRIPT = b"/OpenAction << /S /JavaScript /JS (app.alert\\(1\\)) >>"
 NOTE = (b"/Annots [ << /Type /Annot /Subtype /FreeText /Rect [ 100 100 200 120 ] /Contents (0.01) "
         b"/DA (/Helv 8 Tf) >> ]")  # fmt: skip
 DOCUMENT: dict[str, tuple[Forge, str]] = {
-    "the first page away": (kids(lambda k: k[1:]), "page altered"),
-    "a page away": (kids(lambda k: k[:3] + k[4:]), "page altered"),
-    "the last page away": (kids(lambda k: k[:-1]), "page altered"),
-    "a page twice": (kids(lambda k: [*k[:2], *k[1:]]), "page altered"),
-    "a page again at the end": (kids(lambda k: [*k, k[2]]), "page altered"),
-    "two pages exchanged": (kids(lambda k: [k[1], k[0], *k[2:]]), "page altered"),
-    "pages in reverse": (kids(lambda k: k[::-1]), "page altered"),
-    "one page for all": (kids(lambda k: k[:1] * len(k)), "page altered"),
+    "the first page away": (kids(lambda k: k[1:]), "page differs"),
+    "a page away": (kids(lambda k: k[:3] + k[4:]), "page differs"),
+    "the last page away": (kids(lambda k: k[:-1]), "page differs"),
+    "a page twice": (kids(lambda k: [*k[:2], *k[1:]]), "page differs"),
+    "a page again at the end": (kids(lambda k: [*k, k[2]]), "page differs"),
+    "two pages exchanged": (kids(lambda k: [k[1], k[0], *k[2:]]), "page differs"),
+    "pages in reverse": (kids(lambda k: k[::-1]), "page differs"),
+    "one page for all": (kids(lambda k: k[:1] * len(k)), "page differs"),
     "an annotation": (
         of_object(lambda n: n.pages[1], lambda c: re.sub(rb"/Annots \d+ 0 R", NOTE, c)),
-        "page altered",
+        "page differs",
     ),
-    "a page turned": (of_object(lambda n: n.pages[2], entry(b"/Rotate 180")), "page altered"),
+    "a page turned": (of_object(lambda n: n.pages[2], entry(b"/Rotate 180")), "page differs"),
     "a page cut": (
-        of_object(lambda n: n.pages[2], entry(b"/CropBox [ 0 0 300 300 ]")), "page altered",
+        of_object(lambda n: n.pages[2], entry(b"/CropBox [ 0 0 300 300 ]")), "page differs",
     ),
     "a page smaller": (
-        of_object(lambda n: n.pages[2], lambda c: c.replace(b"841.68", b"641.68")), "page altered",
+        of_object(lambda n: n.pages[2], lambda c: c.replace(b"841.68", b"641.68")), "page differs",
     ),
     "a page in other units": (of_object(lambda n: n.pages[2], entry(b"/UserUnit 2")),
-                              "page altered"),
+                              "verified"),
     "an action of a page": (
         of_object(lambda n: n.pages[2], entry(b"/AA << /O << /S /JavaScript /JS (1) >> >>")),
-        "page altered",
+        "refused",
     ),
-    "all pages turned": (of_object(lambda n: n.tree, entry(b"/Rotate 180")), "page altered"),
+    "all pages turned": (of_object(lambda n: n.tree, entry(b"/Rotate 180")), "page differs"),
     "all pages cut": (
-        of_object(lambda n: n.tree, entry(b"/CropBox [ 0 0 300 300 ]")), "page altered",
+        of_object(lambda n: n.tree, entry(b"/CropBox [ 0 0 300 300 ]")), "page differs",
     ),
-    "glyphs exchanged": (exchanged_glyphs, "page altered"),
-    "a glyph redrawn": (redrawn_glyph, "page altered"),
-    "letters narrower": (narrower_letters, "page altered"),
-    "texts of glyphs exchanged": (rewritten_texts, "page altered"),
-    "marks larger": (another_marker, "page altered"),
-    "a script": (of_object(lambda n: n.root, entry(JAVASCRIPT)), "cannot verify"),
+    "glyphs exchanged": (exchanged_glyphs, "page differs"),
+    "a glyph redrawn": (redrawn_glyph, "page differs"),
+    "letters narrower": (narrower_letters, "page differs"),
+    "texts of glyphs exchanged": (rewritten_texts, "page differs"),
+    "marks larger": (another_marker, "verified"),  # by half a point: see pages.DISTANCE
+    "a script": (of_object(lambda n: n.root, entry(JAVASCRIPT)), "refused"),
     "a form": (of_object(lambda n: n.root, entry(b"/AcroForm << /Fields [ ] >>")),
-               "cannot verify"),
+               "verified"),
     "layers": (of_object(lambda n: n.root, entry(b"/OCProperties << /OCGs [ ] /D << >> >>")),
-               "cannot verify"),
+               "verified"),
     "named scripts": (of_object(lambda n: n.names, entry(b"/JavaScript << /Names [ ] >>")),
-                      "cannot verify"),
+                      "refused"),
     "another title": (
         of_object(lambda n: n.info, lambda c: c.replace(b"/Title (px4", b"/Title (my ")),
-        "cannot verify",
+        "verified",
     ),
     "another creator": (
         of_object(lambda n: n.info, lambda c: c.replace(b"/Creator (px4", b"/Creator (abc")),
-        "cannot verify",
+        "verified",
     ),
-    "an author": (of_object(lambda n: n.info, entry(b"/Author (Eve)")), "cannot verify"),
-    "a date": (of_object(lambda n: n.info, entry(b"/CreationDate (D:20260101)")), "cannot verify"),
+    "an author": (of_object(lambda n: n.info, entry(b"/Author (Eve)")), "verified"),
+    "a date": (of_object(lambda n: n.info, entry(b"/CreationDate (D:20260101)")), "verified"),
     "a part that nothing refers to": (
-        lambda one: one.anatomy.added(b"<< /Eve 1 >>")[0], "cannot verify",
+        lambda one: one.anatomy.added(b"<< /Eve 1 >>")[0], "verified",
     ),
 }  # fmt: skip
 
@@ -664,10 +695,21 @@ DOCUMENT: dict[str, tuple[Forge, str]] = {
 @pytest.mark.parametrize("name", DOCUMENT)
 def test_a_changed_document(aisle: Base, name: str) -> None:
     forge, expected = DOCUMENT[name]
-    forged = forge(aisle)
-    for pdf in (forged.sealed(), forged.unsealed()):
-        verdict = aisle.verified(pdf)
-        assert verdict.status == expected, verdict
+    pdf = forge(aisle).sealed()
+    if isinstance(read_report(pdf, "r.pdf"), Refused):
+        assert expected == "refused"
+        return
+    verdict = aisle.verified(pdf)
+    assert verdict.status == "verified"
+    assert verdict.outcome == expected, verdict
+
+
+def test_a_letter_drawn_as_another_is_found_on_every_page(aisle: Base) -> None:
+    """All texts stay what they are: only the pictures tell."""
+    found = aisle.verified(exchanged_glyphs(aisle).sealed()).pages
+    assert len(found) == PAGES
+    assert not any(one.words for one in found)
+    assert min(one.picture for one in found) > pages.DISTANCE
 
 
 def saved_again(pdf: bytes) -> bytes:
@@ -710,38 +752,87 @@ def with_link(pdf: bytes) -> bytes:
     return out.getvalue()
 
 
+def packed(pdf: bytes) -> bytes:
+    """As programs that save a PDF again pack it: object streams, other compression, a link."""
+    writer = PdfWriter(clone_from=io.BytesIO(pdf))
+    writer.compress_identical_objects(remove_duplicates=True)
+    for page in writer.pages:
+        page.compress_content_streams(level=9)
+    writer.add_metadata({"/Producer": "Another program", "/Author": "Ada"})
+    link = Link(rect=(50, 50, 200, 70), url="http://example.org")
+    writer.add_annotation(0, link)
+    out = io.BytesIO()
+    writer.write(out)
+    return out.getvalue()
+
+
+def unpacked(pdf: bytes) -> bytes:
+    """Every stream as it is, without a filter."""
+    writer = PdfWriter(clone_from=io.BytesIO(pdf))
+    for place, held in enumerate(writer._objects):
+        if isinstance(held, EncodedStreamObject):
+            plain = DecodedStreamObject()
+            plain.update({k: v for k, v in held.items() if k not in ("/Filter", "/Length")})
+            plain.set_data(held.get_data())
+            writer._objects[place] = plain
+    out = io.BytesIO()
+    writer.write(out)
+    return out.getvalue()
+
+
+def with_metadata(pdf: bytes) -> bytes:
+    """An incremental update with another author, as viewers append one."""
+    writer = PdfWriter(io.BytesIO(pdf), incremental=True)
+    writer.add_metadata({"/Author": "Ada"})
+    out = io.BytesIO()
+    writer.write(out)
+    return out.getvalue()
+
+
 FILES: dict[str, tuple[Callable[[Base, Base], bytes], set[str]]] = {
-    "saved again": (lambda a, _: saved_again(a.pdf), {"cannot verify"}),
-    "saved again twice": (lambda a, _: saved_again(saved_again(a.pdf)), {"cannot verify"}),
-    "the seal removed": (lambda a, _: a.anatomy.assembled(), {"cannot verify"}),
-    "the seal of another": (
-        lambda a, b: a.anatomy.assembled() + b.anatomy.seal, {"cannot verify"},
-    ),
-    "bytes appended": (lambda a, _: a.pdf + b"\n% Eve\n", {"cannot verify"}),
-    "a version appended": (
-        lambda a, _: appended_version(a.anatomy.assembled()), {"page altered", "cannot verify"},
-    ),
-    "a page of another report": (pages_of_another, {"page altered"}),
-    "a link": (lambda a, _: with_link(a.pdf), {"cannot verify"}),
+    "saved again": (lambda a, _: saved_again(a.pdf), {"verified"}),
+    "saved again twice": (lambda a, _: saved_again(saved_again(a.pdf)), {"verified"}),
+    "packed in another way": (lambda a, _: packed(a.pdf), {"verified"}),
+    "not packed at all": (lambda a, _: unpacked(a.pdf), {"verified"}),
+    "metadata appended": (lambda a, _: with_metadata(a.pdf), {"verified"}),
+    "the seal removed": (lambda a, _: a.anatomy.assembled(), {"verified"}),
+    "the seal of another": (lambda a, b: a.anatomy.assembled() + b.anatomy.seal, {"verified"}),
+    "bytes appended": (lambda a, _: a.pdf + b"\n% Eve\n", {"verified"}),
+    "a version appended": (lambda a, _: appended_version(a.anatomy.assembled()), {"page differs"}),
+    "a page of another report": (pages_of_another, {"page differs"}),
+    "a link": (lambda a, _: with_link(a.pdf), {"verified"}),
     "results of another report": (
         lambda a, b: a.with_results(b.results).assembled(), {"other log"},
     ),
     "bytes before the first object": (
         lambda a, _: replace(a.anatomy, head=a.anatomy.head + b"% Eve\n").assembled(),
-        {"cannot verify"},
+        {"verified"},
     ),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("name", FILES)
-@pytest.mark.parametrize("resealed", [False, True])
-def test_a_changed_file(aisle: Base, loop: Base, name: str, resealed: bool) -> None:
+def test_a_changed_file(aisle: Base, loop: Base, name: str) -> None:
     forge, expected = FILES[name]
-    if resealed and name.startswith("the seal"):
-        return  # a seal put back where it was
     pdf = forge(aisle, loop)
-    verdict = aisle.verified(sealed(pdf) if resealed else pdf)
-    assert verdict.status in expected, verdict
+    read = read_report(pdf, "r.pdf")
+    assert isinstance(read, Report), read
+    verdict = aisle.verified(pdf)
+    assert verdict.outcome in expected, verdict
+    assert (SAVED_AGAIN in verdict.reasons) == (verdict.status == "verified")
+    assert verdict.redrawn == (aisle.pdf if verdict.status == "verified" else b"")
+
+
+def test_printed_to_pdf_says_what_to_hand_in(aisle: Base) -> None:
+    """What a browser's print to PDF leaves: the pages, without what is attached."""
+    writer = PdfWriter()
+    for page in PdfReader(io.BytesIO(aisle.pdf)).pages:
+        writer.add_page(page)
+    out = io.BytesIO()
+    writer.write(out)
+    read = read_report(out.getvalue(), "r.pdf")
+    assert isinstance(read, Refused)
+    assert read.reason.endswith("Hand in the original file that px4fuse wrote.")
 
 
 def test_another_log(aisle: Base) -> None:
@@ -781,97 +872,6 @@ def test_a_joined_recording_is_found_by_its_content(tmp_path: Path) -> None:
     assert verdict.status == "cannot verify"
     assert "--position" in verdict.reasons[0]
     assert verify(report, [tmp_path / "a", tmp_path / "b"]).status == "verified"
-
-
-# -- without the log -------------------------------------------------------------------------------
-
-PRINTED = [
-    ("log", "name"), ("log", "size_bytes"), ("log", "duration_s"), ("log", "firmware"),
-    ("log", "hardware"), ("log", "boot_time_s"), ("log", "format"), ("log", "sha256"),
-    ("log", "parameters", "EKF2_EV_DELAY"), ("settings", "sigma_a_m_s2"),
-    ("settings", "sigma_z_m"), ("settings", "dt_s"), ("settings", "start_s"),
-    ("settings", "segment_reason"), ("settings", "clock_offset_s"), ("position_source", "name"),
-    ("position_source", "rate_hz"), ("position_source", "reason"),
-    ("axes", "north", "kf", "nis_mean"), ("axes", "east", "kf", "count"),
-    ("axes", "down", "kf", "sqrt_s_median_m"), ("axes", "aisle", "ekf2", "nis_mean"),
-    ("axes", "north", "kf", "variance_factor"), ("axes", "north", "kf", "verdict"),
-    ("axes", "east", "truth", "kf_position_rmse_m"), ("axes", "east", "difference",
-    "velocity_rmse_m_s"), ("findings", 0, "message"), ("findings", 1, "remedy"),
-    ("findings", 0, "severity"), ("notes", 0), ("missing", 0, "reason"),
-    ("provenance", "command"), ("provenance", "python"), ("provenance", "libraries", "numpy"),
-    ("student", "name"),
-]  # fmt: skip
-
-
-@pytest.fixture(scope="module")
-def loop_texts(loop: Base) -> Report:
-    return report_of(loop.pdf, with_text=True)
-
-
-@pytest.fixture(scope="module")
-def aisle_texts(aisle: Base) -> Report:
-    return report_of(aisle.pdf, with_text=True)
-
-
-@pytest.mark.parametrize("path", PRINTED, ids=lambda path: ".".join(map(str, path)))
-def test_without_the_log_pages_and_results_must_agree(
-    aisle: Base, aisle_texts: Report, path: tuple[Any, ...]
-) -> None:
-    results = changed(aisle.results, path)
-    if path[-1] in ("verdict", "severity"):
-        part: Any = results
-        for name in path[:-1]:
-            part = part[name]
-        part[path[-1]] = "consistent" if path[-1] == "verdict" else "error"
-    elif path[-1] in ("duration_s", "size_bytes", "clock_offset_s", "kf_position_rmse_m"):
-        part = results
-        for name in path[:-1]:
-            part = part[name]
-        part[path[-1]] = part[path[-1]] * 1.1 + 0.5
-    verdict = verify(replace(aisle_texts, results=read_again(results)))
-    assert verdict.status == "page altered", verdict
-    assert verdict.pages
-
-
-def test_without_the_log_findings_are_neither_hidden_nor_invented(aisle_texts: Report) -> None:
-    for change in (
-        lambda findings: findings[:-1],
-        lambda findings: findings[::-1],
-        lambda findings: [*findings, findings[0]],
-        lambda findings: [],
-    ):
-        results = plain(aisle_texts)
-        results["findings"] = change(results["findings"])
-        assert verify(replace(aisle_texts, results=read_again(results))).status == "page altered"
-
-
-@pytest.mark.parametrize("name", ["two pages exchanged", "a page away", "a page twice"])
-def test_without_the_log_pages_are_where_they_belong(aisle: Base, name: str) -> None:
-    pdf = DOCUMENT[name][0](aisle).sealed()
-    assert verify(report_of(pdf, with_text=True)).status == "page altered"
-
-
-def test_without_the_log_a_broken_seal_is_told(aisle: Base) -> None:
-    verdict = verify(report_of(saved_again(aisle.pdf), with_text=True))
-    assert verdict.status == "cannot verify"
-    assert any("saved again" in reason for reason in verdict.reasons)
-
-
-@pytest.mark.parametrize(
-    "path",
-    [("closure_error_m",), ("path_length_m",), ("heading_error_deg",), ("key_frames",),
-     ("closures", 0, "d2"), ("closures", 0, "p"), ("closures", 0, "accepted"), ("start_s",),
-     ("closure_error_axes_m", "right"), ("known_end", "source"), ("track",)],
-)  # fmt: skip
-def test_without_the_log_the_figures_of_a_loop(loop_texts: Report, path: tuple[Any, ...]) -> None:
-    report = loop_texts
-    results = changed(plain(report), ("loop", *path))
-    part: Any = results["loop"]
-    for name in path[:-1]:
-        part = part[name]
-    if isinstance(part[path[-1]], float):
-        part[path[-1]] = part[path[-1]] * 1.2 + 0.2
-    assert verify(replace(report, results=read_again(results))).status == "page altered"
 
 
 # -- the command -----------------------------------------------------------------------------------
@@ -922,11 +922,3 @@ def test_help_states_the_limit() -> None:
     code, output = run("--help")
     assert code == 0
     assert "not who wrote them" in " ".join(output.split())
-
-
-def test_a_layout_of_one_piece(aisle: Base) -> None:
-    assert plain_layout(aisle.pdf)
-    assert plain_layout(saved_again(aisle.pdf))
-    assert not plain_layout(appended_version(aisle.anatomy.assembled()))
-    assert not plain_layout(b"%PDF-1.4\n")
-    assert not plain_layout(b"")

@@ -1,21 +1,17 @@
-"""``px4fuse verify``: whether a report is what its log gives."""
+"""``px4fuse verify``: whether a report's numbers are what its log gives, and the report redrawn."""
 
 from __future__ import annotations
 
 import sys
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from px4fuse.cli.inputs import json_option, max_size_option
-from px4fuse.cli.outputs import (
-    progress,
-    spare_inputs,
-    terminal,
-    write_json,
-)
+from px4fuse.cli.inputs import json_option, max_size_option, path_option
+from px4fuse.cli.outputs import progress, spare_inputs, terminal, write_json, write_outputs
 from px4fuse.errors import LogError
 from px4fuse.reading import files_by_sha256, read_whole, shown
 from px4fuse.writing import STANDARD_OUTPUT
@@ -25,27 +21,37 @@ if TYPE_CHECKING:
 
     from px4fuse.verification.model import Report, Verdict
 
-SCHEMA = {"name": "px4fuse-verification", "version": "1.0"}
+SCHEMA = {"name": "px4fuse-verification", "version": "2.0"}
 STYLES = {"verified": "bold green", "cannot verify": "bold yellow"}
+# A flight of ten minutes takes about one; what takes longer than this was made to
+TIMEOUT_S = 1800.0
 
 
 @click.command()
 @click.argument("report", type=click.Path(path_type=Path), metavar="REPORT.pdf")
 @click.argument("logs", type=click.Path(path_type=Path), nargs=-1, metavar="[LOG ...]")
 @max_size_option
+@path_option(
+    "-o", "--output", metavar="FILE.pdf", help="Write the report, drawn again from the log."
+)
 @json_option
-def verify(report: Path, logs: tuple[Path, ...], json_path: Path | None) -> None:
-    """Check that REPORT.pdf is what its log gives: every number, and every page.
+def verify(
+    report: Path, logs: tuple[Path, ...], output: Path | None, json_path: Path | None
+) -> None:
+    """Check that the numbers of REPORT.pdf are what its log gives, and draw the report again.
 
     LOG is the flight log and whatever was read besides it, or folders of such; they are found by
-    their SHA-256. The analysis is run again with the recorded settings. Without LOG only the pages
-    are compared with the attached results, and nothing is verified.
+    their SHA-256. The analysis is run again with the recorded settings. Pages of REPORT.pdf that
+    do not look like the redrawn ones are named: read the redrawn report (-o). Without LOG nothing
+    is verified.
 
     This proves that the numbers belong to the log, not who wrote them.
 
-    Exit code 0: verified; 1: numbers differ, page altered, other log, or cannot verify; 2: bad
+    Exit code 0: verified; 1: numbers differ, page differs, other log, or cannot verify; 2: bad
     input.
     """
+    from px4fuse.grading.grade import MEMORY_BYTES
+    from px4fuse.grading.workers import Failed, run_bounded
     from px4fuse.verification.intake import MAX_BYTES, read_report
     from px4fuse.verification.model import Refused
     from px4fuse.verification.verification import verify as verify_report
@@ -54,40 +60,53 @@ def verify(report: Path, logs: tuple[Path, ...], json_path: Path | None) -> None
     read = read_report(content, shown(report))
     if isinstance(read, Refused):
         raise LogError(read.reason)
-    if json_path not in (None, STANDARD_OUTPUT):
-        spare_inputs([json_path])
+    spare_inputs([path for path in (json_path, output) if path not in (None, STANDARD_OUTPUT)])
     with progress(json_path == STANDARD_OUTPUT) as step:
         step("hashing the logs")
         files = files_by_sha256(logs)
         if logs and not files:
             raise LogError("there is no file in what was given as LOG.")
-        step("running the analysis again" if files else "comparing pages and results")
-        verdict = verify_report(read, files)
+        step("running the analysis again")
+        (verdict,) = run_bounded(
+            partial(verify_report, logs=files),
+            [read],
+            processes=1,
+            timeout_s=TIMEOUT_S,
+            memory_bytes=MEMORY_BYTES,
+            on_done=lambda *_: None,
+        )
+    if isinstance(verdict, Failed):
+        raise LogError(f"{shown(report)}: cannot be verified: {verdict.reason}")
+    if output is not None and verdict.redrawn:
+        write_outputs({output: verdict.redrawn})
     if not write_json(_plain(read, verdict), json_path):
-        _print(terminal(), shown(report), verdict)
-    sys.exit(0 if verdict.status == "verified" else 1)
+        _print(terminal(), shown(report), verdict, output)
+    sys.exit(0 if verdict.outcome == "verified" else 1)
 
 
 def _plain(report: Report, verdict: Verdict) -> dict[str, object]:
     from px4fuse.verification.verification import LIMIT
 
+    values = asdict(verdict)
+    del values["redrawn"]
     return {
         "schema": SCHEMA,
         "report_sha256": report.sha256,
         "seal": report.seal,
-        **asdict(verdict),
+        "outcome": verdict.outcome,
+        **values,
         "limit": LIMIT,
     }
 
 
-def _print(console: Console, name: str, verdict: Verdict) -> None:
+def _print(console: Console, name: str, verdict: Verdict, output: Path | None) -> None:
     from rich.text import Text
 
     from px4fuse.results.reading import one_line
     from px4fuse.verification.verification import LIMIT
 
-    style = STYLES.get(verdict.status, "bold red")
-    console.print(Text.assemble(f"{one_line(name, 200)}: ", (verdict.status, style)))
+    style = STYLES.get(verdict.outcome, "bold red")
+    console.print(Text.assemble(f"{one_line(name, 200)}: ", (verdict.outcome, style)))
     for reason in verdict.reasons:
         if reason != LIMIT:
             console.print(Text(f"  {one_line(reason, 400)}"), soft_wrap=True)
@@ -95,6 +114,10 @@ def _print(console: Console, name: str, verdict: Verdict) -> None:
         console.print(
             Text(f"  {one.path}: {one.recorded}, recomputed {one.recomputed}"), soft_wrap=True
         )
-    if verdict.pages:
-        console.print(Text(f"  Pages: {', '.join(map(str, verdict.pages))}"))
+    if output is not None and verdict.redrawn:
+        console.print(f"Wrote    {output}", markup=False, style="bold", soft_wrap=True)
+    elif output is not None:
+        console.print(Text("Nothing was redrawn, since the analysis was not run again."))
+    elif verdict.pages:
+        console.print(Text("Read the redrawn report instead: -o writes it."))
     console.print(Text(LIMIT), style="dim", soft_wrap=True)

@@ -29,7 +29,6 @@ STATUSES: tuple[Status, ...] = get_args(Status)
 SIGNS = {
     "verified": "✓",
     "numbers differ": "≠",
-    "page altered": "✕",
     "other log": "⇄",
     "cannot verify": "?",
 }
@@ -248,7 +247,15 @@ def _details(one: Graded) -> str:
             if value
         ],
         "notes": _text(one.notes),
-        "picture": base64.b64encode(one.picture).decode() if one.picture.startswith(PNG) else "",
+        "report": one.redrawn_name,
+        "pictures": [
+            [f"Page {one.page}, {said}", base64.b64encode(png).decode()]
+            for png, said in (
+                (one.picture, "drawn again from the log"),
+                (one.handed_in, "as handed in: not verified"),
+            )
+            if png.startswith(PNG)
+        ],
     }
     return f'<script type="application/json">{_inert_json(details)}</script>'
 

@@ -25,13 +25,18 @@ from px4fuse.grading.workers import Failed, run_bounded
 from px4fuse.reading import files_by_sha256, max_log_bytes
 from px4fuse.results.contract import Reported, to_plain
 from px4fuse.verification.intake import read_report
-from px4fuse.verification.model import Difference, Refused, Verdict
+from px4fuse.verification.model import Difference, PageDifference, Refused, Report, Verdict
+from px4fuse.verification.pages import page_texts
 from px4fuse.verification.pictures import key_page, picture
 from px4fuse.verification.rerun import log_sha256
 from px4fuse.verification.verification import verify
 from px4fuse.writing import write_all
 
 RECORDS = "records"
+# Reports drawn again from their logs: what to read instead of what was handed in
+REDRAWN = "reports"
+# What a record keeps besides its JSON, by field of Graded
+FILES = {"picture": ".png", "handed_in": ".handed-in.png", "redrawn": ".pdf"}
 # Of one report: a flight of ten minutes takes about one; what takes longer is no report
 TIMEOUT_S = 300.0
 MEMORY_BYTES = 4_000_000_000
@@ -53,7 +58,7 @@ class Outcome:
     Attributes
     ----------
     graded : tuple of Graded
-        In the order of the submissions, without their pictures.
+        In the order of the submissions, without their pictures and redrawn reports.
     notes : tuple of str
         What was passed over.
     reused : int
@@ -88,8 +93,8 @@ def grade(
         Flight logs and folders of them; a report names its log by SHA-256.
     rubric : Rubric
     output : Path
-        Folder for the class table (``class.csv``, ``class.html``), ``feedback/``, ``gradescope/``
-        and the records that make a second run quick.
+        Folder for the class table (``class.csv``, ``class.html``), the redrawn ``reports/``,
+        ``feedback/``, ``gradescope/`` and the records that make a second run quick.
     key : AnswerKey, optional
         Which mistakes each student's flight has.
     title : str
@@ -129,7 +134,7 @@ def grade(
         else:
             made = result
         _remember(records, found[index], context, made)
-        graded[index] = replace(made, picture=b"")
+        graded[index] = _light(made)
         done += 1
         progress(done, len(found))
 
@@ -174,22 +179,48 @@ def grade_one(
     # handed out and not among the logs: the instructor's gap, not another log
     missing = key is not None and key.of_log(log) is not None and log not in logs
     verdict = verify(report, {} if missing else logs)
+    # what is shown and scored is the redrawn report, as far as there is one
+    report = replace(report, pages=page_texts(verdict.redrawn or report.pdf))
     results = report.results
-    drawn = picture(report.pdf, key_page(report.pages))
+    page = _page_to_show(verdict, report)
+    shown = picture(verdict.redrawn, page - 1) if verdict.redrawn else b""
+    compare = verdict.pages or not verdict.redrawn
+    handed_in = picture(report.pdf, page - 1) if compare else b""
     return Graded(
         submission=submission.name,
         student=results.student.name,
         student_id=results.student.id,
-        verdict=verdict,
+        verdict=replace(verdict, redrawn=b""),
         items=score(report, verdict, rubric, key),
-        flags=own_flags(results),
+        flags=(*_page_flags(verdict), *own_flags(results)),
         numbers=_numbers(results),
         sha256=sha256,
         log_sha256=log,
         version=results.provenance.px4fuse,
         settings=chosen_settings(results),
         notes=results.student.notes,
-        picture=b"" if isinstance(drawn, Unavailable) else drawn,
+        picture=b"" if isinstance(shown, Unavailable) else shown,
+        handed_in=b"" if isinstance(handed_in, Unavailable) else handed_in,
+        page=page,
+        redrawn=verdict.redrawn,
+    )
+
+
+def _page_to_show(verdict: Verdict, report: Report) -> int:
+    """The page that differs most, else the cover; counted from 1."""
+    if verdict.pages:
+        return max(verdict.pages, key=lambda one: (one.picture, one.words)).page
+    return 1 + (0 if verdict.redrawn else key_page(report.pages))
+
+
+def _page_flags(verdict: Verdict) -> tuple[str, ...]:
+    if not verdict.pages:
+        return ()
+    first, *others = verdict.pages
+    more = f" Also: page {', '.join(str(one.page) for one in others)}." if others else ""
+    return (
+        f"Page {first.page} of the PDF that was handed in is not what px4fuse draws from the log: "
+        f"{first.what}.{more} Read the redrawn report.",
     )
 
 
@@ -243,10 +274,18 @@ def _recalled(
 
 def _remember(records: Path, submission: Submission, context: str, made: Graded) -> None:
     path = _record(records, submission)
-    values = asdict(made)
-    del values["picture"]
+    values = asdict(_light(made))
+    for name in FILES:
+        del values[name]
+    del values["verdict"]["redrawn"]
     text = json.dumps({"context": context, "graded": values}, ensure_ascii=False, indent=1)
-    write_all({path: text.encode(), path.with_suffix(".png"): made.picture})
+    kept = {path.with_suffix(end): getattr(made, name) for name, end in FILES.items()}
+    write_all({path: text.encode(), **kept})
+
+
+def _light(made: Graded) -> Graded:
+    """Without what a record keeps in files of their own."""
+    return replace(made, picture=b"", handed_in=b"", redrawn=b"")
 
 
 def graded_from(values: dict[str, Any]) -> Graded:
@@ -260,7 +299,7 @@ def graded_from(values: dict[str, Any]) -> Graded:
                     **verdict,
                     "reasons": tuple(verdict["reasons"]),
                     "differences": tuple(Difference(**d) for d in verdict["differences"]),
-                    "pages": tuple(verdict["pages"]),
+                    "pages": tuple(PageDifference(**page) for page in verdict["pages"]),
                 }
             ),
             "items": tuple(Item(**item) for item in values["items"]),
@@ -276,10 +315,15 @@ def _write(
     output: Path, graded: Sequence[Graded], found: Sequence[Submission], title: str
 ) -> tuple[Path, ...]:
     made_with = f"px4fuse {metadata.version('px4fuse')}"
-    pictured = [
-        replace(one, picture=_picture(output / RECORDS, submission))
-        for one, submission in zip(graded, found, strict=True)
-    ]
+    names = file_names(graded)
+    pictured = []
+    for one, submission, name in zip(graded, found, names, strict=True):
+        path = _record(output / RECORDS, submission)
+        shown, handed_in, redrawn = (_content(path.with_suffix(end)) for end in FILES.values())
+        if redrawn:
+            write_all({output / REDRAWN / f"{name}.pdf": redrawn})
+        where = f"{REDRAWN}/{name}.pdf" if redrawn else ""
+        pictured.append(replace(one, picture=shown, handed_in=handed_in, redrawn_name=where))
     table, page = output / "class.csv", output / "class.html"
     write_all(
         {
@@ -287,7 +331,7 @@ def _write(
             page: html_text(pictured, title, made_with).encode(),
         }
     )
-    for one, name in zip(graded, file_names(graded), strict=True):
+    for one, name in zip(graded, names, strict=True):
         results = json.dumps(gradescope(one), ensure_ascii=False, indent=2)
         write_all(
             {
@@ -295,7 +339,8 @@ def _write(
                 output / "gradescope" / name / "results.json": results.encode(),
             }
         )
-    return table, page, output / "feedback", output / "gradescope"
+    reports = [output / REDRAWN] if any(one.redrawn_name for one in pictured) else []
+    return table, page, *reports, output / "feedback", output / "gradescope"
 
 
 def _left_over(output: Path, graded: Sequence[Graded]) -> tuple[str, ...]:
@@ -311,8 +356,7 @@ def _left_over(output: Path, graded: Sequence[Graded]) -> tuple[str, ...]:
     )
 
 
-def _picture(records: Path, submission: Submission) -> bytes:
-    path = _record(records, submission).with_suffix(".png")
+def _content(path: Path) -> bytes:
     return path.read_bytes() if path.is_file() else b""
 
 

@@ -139,7 +139,16 @@ class Graded:
     notes : str
         The student's own words.
     picture : bytes
-        PNG of the report's key page; empty without.
+        PNG of a redrawn page: the cover, or the one that differs most; empty without.
+    handed_in : bytes
+        PNG of that page as it was handed in, where it differs or nothing could be redrawn; empty
+        without.
+    page : int
+        Which page the pictures show, counted from 1.
+    redrawn : bytes
+        The report drawn again from the log, as a PDF; empty without.
+    redrawn_name : str
+        Where that stands, relative to the class page; "" without.
     """
 
     submission: str
@@ -155,6 +164,10 @@ class Graded:
     settings: str = ""
     notes: str = field(default="", repr=False)
     picture: bytes = field(default=b"", repr=False)
+    handed_in: bytes = field(default=b"", repr=False)
+    page: int = 1
+    redrawn: bytes = field(default=b"", repr=False)
+    redrawn_name: str = ""
 
     @property
     def points(self) -> float:

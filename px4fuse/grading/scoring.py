@@ -26,15 +26,13 @@ from px4fuse.results.model import Absent
 from px4fuse.results.trajectories import Correction, Corrections, Loop, Score
 from px4fuse.verification.model import Report, Verdict
 from px4fuse.verification.rerun import log_sha256
+from px4fuse.verification.verification import NO_LOG
 
 # What verification has refuted, rather than what it could not look at
 REFUTED: Mapping[str, str] = {
     "numbers differ": "your report's numbers are not those that its log gives",
-    "page altered": "a page of your report is not what px4fuse draws",
     "other log": "the log of your report is not one of those that your instructor has",
 }
-# What verification says of a report that is sound as far as can be told without its log
-NO_LOG = "no log was given; the pages agree with the results"
 # As many as px4fuse compare takes
 MAX_NOTES = 200_000
 MAX_QUOTE = 160
@@ -226,8 +224,8 @@ def _verified(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float, str]
     verdict = evidence.verdict
     if _without_log(verdict):
         return given["without_log"], (
-            "Pages and numbers of your report agree with each other, but its log was not at hand "
-            "to compute them again."
+            "The log of your report was not at hand, so that its numbers could not be computed "
+            "again."
         )
     if verdict.status == "verified":
         return 1.0, "Your report's numbers were computed again from its log and agree."
@@ -243,16 +241,13 @@ def _without_log(verdict: Verdict) -> bool:
 
 
 def _reason(verdict: Verdict) -> str:
-    # the first says "..., but" where the second says what
-    first = verdict.reasons[: 2 if verdict.reasons[:1] and verdict.reasons[0][-3:] == "but" else 1]
-    said = _joined(first)
+    said = _joined(verdict.reasons[:1])
     return f" ({said})" if said else ""
 
 
 def _joined(reasons: Sequence[str]) -> str:
     """Reasons as the end of a sentence."""
-    said = "; ".join(text for reason in reasons if (text := _text(reason).rstrip(".")))
-    return said.replace(", but; ", ", but ")
+    return "; ".join(text for reason in reasons if (text := _text(reason).rstrip(".")))
 
 
 def _student(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float, str]:
@@ -762,11 +757,10 @@ def feedback(graded: Graded, class_name: str = "") -> str:
 
 def _verdict_text(verdict: Verdict) -> str:
     said = {
-        "verified": "Your report was verified: its numbers and pages are what px4fuse computes"
+        "verified": "Your report was verified: its numbers are what px4fuse computes"
         + (" from your log." if verdict.with_log else "; its log was not at hand."),
         "numbers differ": "Numbers in your report are not those that px4fuse computes from the "
         "log with your settings.",
-        "page altered": "A page of your report is not what px4fuse draws from its numbers.",
         "other log": "The log of your report is not one of those that your instructor has.",
         "cannot verify": "Your report could not be verified.",
     }[verdict.status]
@@ -774,8 +768,8 @@ def _verdict_text(verdict: Verdict) -> str:
         return said
     if _without_log(verdict):
         return (
-            "The pages of your report agree with its numbers; its log was not at hand to compute "
-            "them again."
+            "The log of your report was not at hand, so that its numbers could not be computed "
+            "again."
         )
     reasons = _joined(verdict.reasons[:NAMED])
     said = f"{said.rstrip('.')}: {reasons}." if reasons else said

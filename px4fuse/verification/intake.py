@@ -3,6 +3,10 @@
 Nothing in the file is executed, followed or written anywhere. Sizes are bounded here before pypdf
 sees the file, and by pypdf's own limits while it reads; what is left (a file made to be slow
 within every limit) is for the time and memory limits of :mod:`px4fuse.grading.workers`.
+
+Of the file only the attached results are read; its pages are only counted, since the report is
+drawn again. A file that another program saved again is therefore as good as the original, as long
+as its results are still attached.
 """
 
 from __future__ import annotations
@@ -31,31 +35,28 @@ from px4fuse.report.pdf import RESULTS_NAME
 from px4fuse.report.seal import seal_of
 from px4fuse.results.contract import ComparisonResults, LoopResults, Reported
 from px4fuse.results.reading import MAX_BYTES as MAX_ATTACHMENT_BYTES
-from px4fuse.results.reading import cleaned, one_line, read_results
+from px4fuse.results.reading import one_line, read_results
 from px4fuse.verification.model import Refused, Report
 
 MAX_BYTES = 25_000_000
 MAX_PAGES = 100
-# Of all pages together, a page counted as often as it is shown; the same for one stream
+# Of one stream, and of all together
 MAX_CONTENT_BYTES = 20_000_000
 MAX_DOCUMENT_BYTES = 100_000_000
 MAX_OBJECTS = 20_000
 MAX_VALUES = 1_000_000
 # Objects that are referred to and not there: pypdf searches the whole file for each of them
 MAX_MISSING = 100
-MAX_PAGE_TEXT = 1_000_000
 
 _INSTALL = 'reading reports needs more packages: pip install "px4fuse[grade]".'
 _DAMAGED = "damaged: it cannot be read as a PDF. Hand in the file that px4fuse wrote."
 _COSTLY = "it takes more memory or work to open than a report can need."
 
-# What a report of px4fuse has none of, by key of a dictionary ...
+# What acts, by key of a dictionary ... Links, comments, forms without scripts and the view to open
+# with are what programs add that save a report again
 _KEYS = {
     "/JS": "JavaScript",
     "/JavaScript": "JavaScript",
-    "/OpenAction": "an action on opening",
-    "/AA": "an automatic action",
-    "/AcroForm": "a form",
     "/XFA": "an XFA form",
     "/RichMediaContent": "rich media",
     "/RichMediaSettings": "rich media",
@@ -66,7 +67,6 @@ _KEYS = {
 _ACTIONS = {
     "/JavaScript": "JavaScript",
     "/Launch": "an action that starts a program",
-    "/URI": "a link to the web",
     "/SubmitForm": "an action that sends a form",
     "/ImportData": "an action that imports data",
     "/GoToR": "a link to another file",
@@ -75,9 +75,6 @@ _ACTIONS = {
     "/RichMediaExecute": "rich media",
     "/Movie": "rich media",
     "/Sound": "rich media",
-    "/Named": "a named action",
-    "/Hide": "an action that hides parts",
-    "/ResetForm": "an action on a form",
 }
 
 # pypdf's defaults are for any PDF. A recovery of broken streams, filters other than Flate, chains
@@ -98,8 +95,11 @@ _PYPDF_LIMITS: dict[str, Any] = {
     "page_tree_maximum_page_entries": 100 * MAX_PAGES,
 }
 
+# Of content that is not ours to decode: what PDF writers use today, and of which none is a bomb
+# that inflating every stream once does not find
+_FILTERS = frozenset(("/FlateDecode", "/DCTDecode"))
+
 _STREAM = re.compile(rb"(?<!end)stream *\r?\n?")
-_LONG_MAPPING = re.compile(rb"<[^<>]{65,}>")
 
 
 class _RefusedError(Exception):
@@ -128,7 +128,7 @@ def read_report(pdf: bytes, name: str) -> Report | Refused:
     Returns
     -------
     Report or Refused
-        The strings of ``results`` and ``pages`` are cleaned.
+        The strings of ``results`` are cleaned.
     """
     try:
         with _quiet_pypdf():
@@ -169,13 +169,12 @@ def _read(pdf: bytes) -> Report:
         if contents.found:
             raise _RefusedError(f"it contains {', '.join(sorted(contents.found))}; no report does.")
         results = _results(_attachment(contents))
-        pages = tuple(_page_texts(reader))
     return Report(
         sha256=hashlib.sha256(pdf).hexdigest(),
         size_bytes=len(pdf),
         seal=seal_of(pdf),
         results=results,
-        pages=pages,
+        pages=(),
         pdf=pdf,
     )
 
@@ -298,9 +297,6 @@ def _look_at(value: DictionaryObject, contents: _Contents) -> None:
     action = _name(value.get("/S"))
     if action in _ACTIONS:
         contents.found.add(_ACTIONS[action])
-    annotations = _resolved(value.get("/Annots"))
-    if isinstance(annotations, ArrayObject):
-        contents.found.update(_annotation(_resolved(each)) for each in annotations)
     if "/EF" in value:
         contents.files.append(value)
     elif _name(value.get("/Type")) in {"/Filespec", "/F"}:
@@ -312,16 +308,10 @@ def _look_at(value: DictionaryObject, contents: _Contents) -> None:
             contents.found.add("a reference to another file")
         filters = _resolved(value.get("/Filter"))
         names = list(filters) if isinstance(filters, ArrayObject) else [filters]
-        if filters is not None and [_name(each) for each in names] != ["/FlateDecode"]:
-            listed = " ".join(_name(each) or "?" for each in names[:3])
+        used = [_name(each) for each in names if each is not None]
+        if not _FILTERS.issuperset(used) or len(set(used)) != len(used):
+            listed = " ".join(each or "?" for each in used[:3])
             contents.found.add(f"a stream packed by other means ({one_line(listed, 60)})")
-
-
-def _annotation(value: object) -> str:
-    kind = _name(value.get("/Subtype")) if isinstance(value, DictionaryObject) else None
-    if kind == "/FileAttachment":
-        return "a file attached to a page"
-    return f"an annotation ({one_line(kind or 'of no type', 40)})"
 
 
 def _resolved(value: object) -> object:
@@ -337,13 +327,16 @@ def _attachment(contents: _Contents) -> bytes:
     """Bytes of the one attached file; its name is compared and used for nothing else."""
     if not contents.files and not contents.embedded:
         raise _RefusedError(
-            f"no {RESULTS_NAME} is attached: not a px4fuse report, or printed to PDF again."
+            f"no {RESULTS_NAME} is attached: not a report of px4fuse, or one that was printed to "
+            "PDF, which leaves the results out. Hand in the original file that px4fuse wrote."
         )
     streams = {id(stream): stream for found in contents.files for stream in _streams_of(found)} | {
         id(stream): stream for stream in contents.embedded
     }
     if len(contents.files) != 1 or len(streams) != 1:
-        raise _RefusedError("more than one file is attached, or none that can be read.")
+        raise _RefusedError(
+            "more than one file is attached, or none that can be read: hand in one report per PDF."
+        )
     names = {
         str(_resolved(contents.files[0].get(key)))
         for key in ("/UF", "/F", "/DOS", "/Mac", "/Unix")
@@ -376,27 +369,3 @@ def _results(data: bytes) -> Reported:
     if not isinstance(results, ComparisonResults | LoopResults):
         raise _RefusedError(f"{where} holds no results of a report.")
     return results
-
-
-def _page_texts(reader: pypdf.PdfReader) -> Iterator[str]:
-    _check_mappings(reader)
-    left = MAX_CONTENT_BYTES
-    for page in reader.pages:
-        content = page.get_contents()
-        left -= 0 if content is None else len(content.get_data())
-        if left < 0:
-            raise _RefusedError("its pages expand to more than a report can hold.")
-    for page in reader.pages:
-        text = page.extract_text()
-        if len(text) > MAX_PAGE_TEXT:
-            raise _RefusedError("a page has more text than a report can hold.")
-        yield cleaned(text)
-
-
-def _check_mappings(reader: pypdf.PdfReader) -> None:
-    """No font may print a book for a letter."""
-    for stored in list(reader.resolved_objects.values()):
-        mapping = stored.get("/ToUnicode") if isinstance(stored, DictionaryObject) else None
-        mapping = _resolved(mapping)
-        if isinstance(mapping, StreamObject) and _LONG_MAPPING.search(mapping.get_data()):
-            raise _RefusedError(_COSTLY)

@@ -9,7 +9,9 @@ from px4fuse.results.contract import Reported
 
 # Whether the file is, to the byte, as px4fuse wrote it
 Seal = Literal["intact", "broken", "missing"]
-Status = Literal["verified", "numbers differ", "page altered", "other log", "cannot verify"]
+# Of the numbers; how the pages look is told apart from it
+Status = Literal["verified", "numbers differ", "other log", "cannot verify"]
+PageStatus = Literal["same", "differ", "not compared"]
 
 
 @dataclass(frozen=True)
@@ -25,7 +27,7 @@ class Report:
     results : ComparisonResults or LoopResults
         The attached results.
     pages : tuple of str
-        Text of each page.
+        Text of each page; empty as it is read. Nothing that verifies a report looks at them.
     pdf : bytes
         The file itself.
     """
@@ -63,23 +65,60 @@ class Difference:
 
 
 @dataclass(frozen=True)
+class PageDifference:
+    """A page that was handed in and does not look like the one that px4fuse draws.
+
+    Attributes
+    ----------
+    page : int
+        Counted from 1.
+    what : str
+        In what it differs: the end of a sentence.
+    words : int
+        Places where its text is another.
+    picture : float
+        How far the pictures are apart, from 0 to 1; see :mod:`px4fuse.verification.pages`.
+    """
+
+    page: int
+    what: str
+    words: int
+    picture: float
+
+
+@dataclass(frozen=True)
 class Verdict:
     """What verification found.
 
     Attributes
     ----------
     status : Status
+        Of the numbers: whether the log gives them.
     reasons : tuple of str
         Sentences: what differs, or why nothing can be said; for "verified" what was checked.
     with_log : bool
         Whether the analysis was run again on the log.
     differences : tuple of Difference
-    pages : tuple of int
-        Pages, counted from 1, that are not what the results print.
+    page_status : {"same", "differ", "not compared"}
+        Whether the pages that were handed in look like the redrawn ones.
+    pages : tuple of PageDifference
+        Those that do not.
+    redrawn : bytes
+        The report as px4fuse draws it from what the log gives, as a PDF: what to read instead of
+        what was handed in. Empty where the analysis was not run again.
     """
 
     status: Status
     reasons: tuple[str, ...]
     with_log: bool
     differences: tuple[Difference, ...] = ()
-    pages: tuple[int, ...] = ()
+    page_status: PageStatus = "not compared"
+    pages: tuple[PageDifference, ...] = ()
+    redrawn: bytes = field(default=b"", repr=False)
+
+    @property
+    def outcome(self) -> str:
+        """In two words: the status, and where that is "verified" what the pages add to it."""
+        if self.status != "verified" or self.page_status == "same":
+            return self.status
+        return "page differs" if self.page_status == "differ" else "pages not compared"

@@ -23,6 +23,11 @@ MAX_POINTS = 14_400.0
 # Headings of the first page of either kind of report
 COVERS = ("Two-state Kalman filter against EKF2", "Loop closure")
 WHAT = "picture of the page"
+# PDFium's own errors are RuntimeErrors; the others come from ctypes and Pillow
+FAILURES = (
+    RuntimeError, ValueError, TypeError, ArithmeticError, LookupError, AssertionError, OSError,
+    MemoryError,
+)  # fmt: skip
 
 
 def key_page(pages: Sequence[str]) -> int:
@@ -64,36 +69,48 @@ def picture(pdf: bytes, page: int, width_px: int = 700) -> bytes | Unavailable:
     bytes or Unavailable
         A PNG of at most :data:`MAX_BYTES`.
     """
+    library = pdfium()
+    if isinstance(library, Unavailable):
+        return library
     try:
-        pdfium: Any = importlib.import_module("pypdfium2")
+        document = library.PdfDocument(pdf)
+        try:
+            if not 0 <= page < len(document):
+                raise ValueError(f"there is no page {page + 1}")
+            return _small_png(rendered(document[page], width_px))
+        finally:
+            document.close()
+    except FAILURES as error:
+        return Unavailable(WHAT, f"it cannot be drawn ({error})", "Open the PDF itself.")
+
+
+def pdfium() -> Any:
+    """The module pypdfium2, or Unavailable."""
+    try:
+        return importlib.import_module("pypdfium2")
     except (ImportError, OSError):
         return Unavailable(
             WHAT, "pypdfium2 is not installed", 'Install it: pip install "px4fuse[grade]".'
         )
-    try:
-        return _small_png(_drawn(pdfium, pdf, page, width_px))
-    # PDFium's own errors are RuntimeErrors; the others come from ctypes and Pillow
-    except (RuntimeError, ValueError, TypeError, ArithmeticError, LookupError, AssertionError,
-            OSError, MemoryError) as error:  # fmt: skip
-        return Unavailable(WHAT, f"it cannot be drawn ({error})", "Open the PDF itself.")
 
 
-def _drawn(pdfium: Any, pdf: bytes, page: int, width_px: int) -> Image.Image:
-    """The page in RGB, on white."""
-    document = pdfium.PdfDocument(pdf)
-    try:
-        if not 0 <= page < len(document):
-            raise ValueError(f"there is no page {page + 1}")
-        sheet = document[page]
-        width, height = sheet.get_size()
-        if not (0.0 < width <= MAX_POINTS and 0.0 < height <= MAX_POINTS):
-            raise ValueError(f"its size is {width:g} by {height:g} points")
-        scale = min(width_px / width, math.sqrt(MAX_PIXELS / (width * height)))
-        # What was typed into forms or drawn as comments over the page is not the report
-        bitmap = sheet.render(scale=scale, may_draw_forms=False, draw_annots=False)
-        return bitmap.to_pil().convert("RGB").copy()  # type: ignore[no-any-return]
-    finally:
-        document.close()
+def rendered(sheet: Any, width_px: float) -> Image.Image:
+    """A page of pypdfium2's in RGB, on white, at most :data:`MAX_PIXELS` large.
+
+    With the comments that lie over it, since a viewer shows them; without what was typed into
+    forms, which pypdfium2 draws only on request.
+
+    Raises
+    ------
+    one of FAILURES
+        It cannot be drawn.
+    """
+    width, height = sheet.get_size()
+    if not (0.0 < width <= MAX_POINTS and 0.0 < height <= MAX_POINTS):
+        raise ValueError(f"its size is {width:g} by {height:g} points")
+    scale = min(width_px / width, math.sqrt(MAX_PIXELS / (width * height)))
+    bitmap = sheet.render(scale=scale, may_draw_forms=False)
+    return bitmap.to_pil().convert("RGB").copy()  # type: ignore[no-any-return]
 
 
 def _small_png(image: Image.Image) -> bytes:

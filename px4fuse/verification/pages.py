@@ -1,0 +1,188 @@
+"""Whether the pages that were handed in look like those that px4fuse draws.
+
+No number rests on the answer, and the instructor reads the redrawn report: it says where to look
+when somebody changed a page. Words are compared as text, everything else as a picture.
+
+How far two pictures of a page are apart (:data:`DISTANCE`), measured on the report of the sample
+flight, on the page where it is largest:
+
+===========================================================  ================
+saved again by pypdf, qpdf (object streams, linearised,      0
+uncompressed, pages moved) or MuPDF (also appended to)
+saved by MuPDF with numbers rounded ("clean")                0.05
+all lines and marks 0.01, 0.05, 0.1 pt aside                 0.01, 0.03, 0.07
+curves thinned by other settings of matplotlib               0.12 to 0.16
+fonts embedded in another way (Type 3)                       0.44
+a point of a curve moved by 2 pt                             0 to 0.03
+one digit replaced (also found as a word)                    0.03 to 0.05
+all of one kind of mark larger; one mark in another colour   0.06; 0.02 to 0.07
+a text invisible, white or moved                             0.11 to 0.21
+a letter drawn as another by an altered font                 0.13 to 0.27
+a highlight or a comment over the page                       0.11 to 0.20
+a text in another font or size                               0.14 to 0.47
+a page clipped, turned, emptied or exchanged                 0.55 to 0.81
+===========================================================  ================
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from difflib import SequenceMatcher
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy.ndimage import uniform_filter
+
+from px4fuse.flight import Unavailable
+from px4fuse.results.reading import cleaned, one_line
+from px4fuse.verification.model import PageDifference
+from px4fuse.verification.pictures import FAILURES, pdfium, rendered
+
+# Side of the square over which differences are averaged: about two digits, at a pixel per point
+SQUARE_PX = 8
+# Largest mean difference of grey (0 to 1) over such a square that is no difference. Between what
+# harmless re-saves make (0.07 at the most) and what is seen as another page (from 0.11); see above
+DISTANCE = 0.07
+# A page that another program wrote may be rounded to whole points
+SIZE_PX = 2
+MAX_PAGE_TEXT = 1_000_000
+
+NumbersAlike = Callable[[str, str], bool]
+
+
+@dataclass(frozen=True)
+class Look:
+    """What is seen of a page: its words in their order, and its grey values from 0 to 1."""
+
+    words: tuple[str, ...]
+    grey: npt.NDArray[np.float32]
+
+
+def compare_pages(
+    submitted: bytes, redrawn: bytes, words_alike: NumbersAlike
+) -> tuple[PageDifference, ...] | Unavailable:
+    """Compare the pages of two PDFs.
+
+    Parameters
+    ----------
+    submitted : bytes
+        May be anything: call it in a process that has limits.
+    redrawn : bytes
+        The report as px4fuse draws it.
+    words_alike : callable
+        Whether two different words are the same up to the rounding of a number.
+
+    Returns
+    -------
+    tuple of PageDifference, or Unavailable
+        In the order of the pages; empty where all look the same. Unavailable without pypdfium2.
+    """
+    ours = looks(redrawn)
+    if isinstance(ours, Unavailable):
+        return ours
+    # whoever hands in a thousand pages shall not have them all drawn
+    theirs = looks(submitted, len(ours) + 1)
+    if isinstance(theirs, Unavailable):
+        return (PageDifference(1, theirs.reason, 0, 1.0),)
+    return tuple(_differences(theirs, ours, words_alike))
+
+
+def looks(pdf: bytes, most: int = 1000) -> tuple[Look | Unavailable, ...] | Unavailable:
+    """What is seen of the first pages of a PDF; Unavailable stands for what cannot be drawn."""
+    library = pdfium()
+    if isinstance(library, Unavailable):
+        return library
+    try:
+        document = library.PdfDocument(pdf)
+    except FAILURES as error:
+        return Unavailable("pages", f"they cannot be drawn ({one_line(str(error), 80)})", "")
+    try:
+        return tuple(_look(document, page) for page in range(min(len(document), most)))
+    finally:
+        document.close()
+
+
+def page_texts(pdf: bytes, most: int = 100) -> tuple[str, ...]:
+    """Text of each page; none without pypdfium2 or where the file cannot be read."""
+    library = pdfium()
+    if isinstance(library, Unavailable):
+        return ()
+    try:
+        document = library.PdfDocument(pdf)
+    except FAILURES:
+        return ()
+    try:
+        return tuple(_text(document[page]) for page in range(min(len(document), most)))
+    except FAILURES:
+        return ()
+    finally:
+        document.close()
+
+
+def _look(document: Any, page: int) -> Look | Unavailable:
+    try:
+        sheet = document[page]
+        # 72 dpi: a pixel per point
+        grey = np.asarray(rendered(sheet, sheet.get_size()[0]).convert("L"), dtype=np.float32)
+        return Look(tuple(_text(sheet).split()), grey / 255.0)
+    except FAILURES as error:
+        return Unavailable("page", f"it cannot be drawn ({one_line(str(error), 80)})", "")
+
+
+def _text(sheet: Any) -> str:
+    text: str = sheet.get_textpage().get_text_range()
+    return cleaned(text[:MAX_PAGE_TEXT].replace("\r\n", "\n"))
+
+
+def _differences(
+    theirs: Sequence[Look | Unavailable], ours: Sequence[Look | Unavailable], alike: NumbersAlike
+) -> Iterator[PageDifference]:
+    for number in range(1, max(len(theirs), len(ours)) + 1):
+        if number > len(theirs):
+            yield PageDifference(number, "it is missing", 0, 1.0)
+            continue
+        if number > len(ours):
+            yield PageDifference(number, f"px4fuse draws only {len(ours)} pages", 0, 1.0)
+            continue
+        found, expected = theirs[number - 1], ours[number - 1]
+        if isinstance(found, Unavailable) or isinstance(expected, Unavailable):
+            why = found if isinstance(found, Unavailable) else expected
+            yield PageDifference(number, getattr(why, "reason", ""), 0, 1.0)
+            continue
+        words = list(_other_words(found.words, expected.words, alike))
+        apart = _distance(found.grey, expected.grey)
+        said = []
+        if words:
+            one, other = (one_line(text, 60) or "nothing" for text in words[0])
+            said.append(f"{len(words)} places in its text, first {one!r} where px4fuse prints "
+                        f"{other!r}")  # fmt: skip
+        if apart > DISTANCE:
+            said.append(f"its picture, by {apart:.2f} of 1 (up to {DISTANCE:g} is no difference)")
+        if said:
+            yield PageDifference(number, " and ".join(said), len(words), round(apart, 3))
+
+
+def _other_words(
+    theirs: Sequence[str], ours: Sequence[str], alike: NumbersAlike
+) -> Iterator[tuple[str, str]]:
+    """Places where the words are others: what stands there, and what should."""
+    if theirs == ours:
+        return
+    matcher = SequenceMatcher(None, theirs[:20_000], ours, autojunk=False)
+    for kind, a, b, c, d in matcher.get_opcodes():
+        if kind == "equal":
+            continue
+        found, expected = theirs[a:b], ours[c:d]
+        if b - a != d - c or not all(map(alike, found, expected)):
+            yield " ".join(found), " ".join(expected)
+
+
+def _distance(one: npt.NDArray[np.float32], other: npt.NDArray[np.float32]) -> float:
+    """Largest mean difference of grey over a square of the page; 1 for pages of other sizes."""
+    if max(abs(a - b) for a, b in zip(one.shape, other.shape, strict=True)) > SIZE_PX:
+        return 1.0
+    height, width = (min(a, b) for a, b in zip(one.shape, other.shape, strict=True))
+    apart = np.abs(one[:height, :width] - other[:height, :width])
+    return float(uniform_filter(apart, SQUARE_PX).max())

@@ -1,0 +1,160 @@
+"""Pages that look the same and pages that do not: words, pictures, and files that are none."""
+
+from __future__ import annotations
+
+import io
+import math
+import random
+import sys
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from matplotlib.backends.backend_pdf import PdfPages
+from matplotlib.figure import Figure
+from pypdf import PdfReader, PdfWriter
+
+from px4fuse.flight import Unavailable
+from px4fuse.report.style import report_style
+from px4fuse.verification.model import PageDifference
+from px4fuse.verification.pages import DISTANCE, compare_pages, looks, page_texts
+
+
+@pytest.fixture(autouse=True)
+def _pdfium() -> None:
+    pytest.importorskip("pypdfium2", reason='pypdfium2 is absent: pip install "px4fuse[grade]"')
+
+
+def drawn(*texts: str, by: float = 0.0, size: float = 10.0, grey: str = "0") -> bytes:
+    """A PDF as a report is made: on each page a text and a curve, ``by`` points aside."""
+    out = io.BytesIO()
+    with report_style(), PdfPages(out, metadata={"CreationDate": None}) as pdf:
+        for text in texts:
+            figure = Figure(figsize=(4, 4))
+            figure.text(0.1, 0.9, text, size=size, color=grey)
+            axes = figure.add_axes((0.0, 0.0, 1.0, 0.8), xlim=(0, 288), ylim=(0, 230))
+            axes.set_axis_off()
+            axes.plot(range(288), [100.0 + by + 50.0 * math.sin(x / 30.0) for x in range(288)])
+            pdf.savefig(figure)
+    return out.getvalue()
+
+
+def exactly(one: str, other: str) -> bool:
+    return one == other
+
+
+def compared(one: bytes, other: bytes) -> tuple[PageDifference, ...]:
+    found = compare_pages(one, other, exactly)
+    assert not isinstance(found, Unavailable)
+    return found
+
+
+def test_the_same_and_the_same_saved_again() -> None:
+    pdf = drawn("one 1.25", "two")
+    again = io.BytesIO()
+    PdfWriter(clone_from=io.BytesIO(pdf)).write(again)
+    assert compared(pdf, pdf) == compared(again.getvalue(), pdf) == ()
+    assert page_texts(pdf) == ("one 1.25", "two")
+
+
+def test_another_word_is_found_on_its_page() -> None:
+    (found,) = compared(drawn("one", "two 2.6 m"), drawn("one", "two 2.5 m"))
+    assert (found.page, found.words) == (2, 1)
+    assert "first '2.6' where px4fuse prints '2.5'" in found.what
+
+
+def test_words_in_another_order_more_and_fewer() -> None:
+    for one, expected in (("a c b d", 2), ("a b c d e", 1), ("a b d", 1), ("", 1)):
+        (found,) = compared(drawn(one), drawn("a b c d"))
+        assert found.words == expected, one
+
+
+def test_rounding_is_for_the_caller_to_allow() -> None:
+    asked = []
+
+    def alike(theirs: str, ours: str) -> bool:
+        asked.append((theirs, ours))
+        return True
+
+    assert compare_pages(drawn("x 2.6 m", size=6.5), drawn("x 2.5 m", size=6.5), alike) == ()
+    assert asked == [("2.6", "2.5")]
+    (found,) = compare_pages(drawn("x 2.6 m"), drawn("x 2.5"), alike)  # type: ignore[misc]
+    assert found.words == 1
+
+
+@pytest.mark.parametrize(("by", "same"), [(0.01, True), (0.05, True), (1.0, False), (5.0, False)])
+def test_a_curve_aside(by: float, same: bool) -> None:
+    found = compared(drawn("a", by=by), drawn("a"))
+    assert (found == ()) == same
+    assert all(not one.words and one.picture > DISTANCE for one in found)
+
+
+@pytest.mark.parametrize("change", [{"grey": "1"}, {"size": 14.0}])
+def test_a_text_that_is_there_and_looks_otherwise(change: dict[str, object]) -> None:
+    (found,) = compared(drawn("2.5 m", **change), drawn("2.5 m"))  # type: ignore[arg-type]
+    assert found.words == 0
+    assert "its picture" in found.what
+
+
+def test_pages_more_fewer_and_of_another_size() -> None:
+    three, two = drawn("a", "b", "c"), drawn("a", "b")
+    assert [(one.page, one.what) for one in compared(three, two)] == [
+        (3, "px4fuse draws only 2 pages")
+    ]
+    assert [(one.page, one.what) for one in compared(two, three)] == [(3, "it is missing")]
+    assert [one.page for one in compared(drawn("b", "a"), two)] == [1, 2]
+    writer = PdfWriter(clone_from=io.BytesIO(two))
+    writer.pages[1].mediabox.upper_right = (288, 250)
+    out = io.BytesIO()
+    writer.write(out)
+    (found,) = compared(out.getvalue(), two)
+    assert (found.page, found.picture) == (2, 1.0)
+
+
+def test_a_thousand_pages_are_not_all_drawn() -> None:
+    many = PdfWriter()
+    page = PdfReader(io.BytesIO(drawn("a"))).pages[0]
+    for _ in range(300):
+        many.add_page(page)
+    out = io.BytesIO()
+    many.write(out)
+    assert len(looks(out.getvalue(), 2) or ()) == 2  # type: ignore[arg-type]
+    assert [one.page for one in compared(out.getvalue(), drawn("a"))] == [2]
+
+
+def test_a_look_is_in_reading_order_and_black_on_white() -> None:
+    (look,) = looks(drawn("two words"))  # type: ignore[misc]
+    assert not isinstance(look, Unavailable)
+    assert look.words == ("two", "words")
+    assert look.grey.shape == (288, 288)
+    assert look.grey.max() == 1.0
+    assert look.grey.min() < 0.2
+
+
+BASE = drawn("a 1.5")
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 2**32), st.integers(1, 40))
+def test_damaged_files_never_raise(seed: int, count: int) -> None:
+    content = bytearray(BASE)
+    dice = random.Random(seed)
+    for _ in range(count):
+        content[dice.randrange(len(content))] = dice.randrange(256)
+    assert isinstance(compared(bytes(content), BASE), tuple)
+    assert isinstance(page_texts(bytes(content)), tuple)
+
+
+@pytest.mark.parametrize("content", [b"", b"%PDF-1.7", b"\0" * 1000])
+def test_what_is_no_pdf_differs(content: bytes) -> None:
+    (found,) = compared(content, BASE)
+    assert "cannot be drawn" in found.what
+    assert page_texts(content) == ()
+
+
+def test_without_pypdfium2_nothing_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pypdfium2", None)
+    found = compare_pages(BASE, BASE, exactly)
+    assert isinstance(found, Unavailable)
+    assert 'pip install "px4fuse[grade]"' in str(found)
+    assert page_texts(BASE) == ()
