@@ -131,6 +131,7 @@ def test_one_packed_attachment_is_read():
 def test_results_of_a_loop():
     loop = {
         "schema": {"name": "px4fuse-loop", "version": "1.0"},
+        "request": {},
         "track": {"name": "x"},
         "references": [],
         **{key: json.loads(JSON)[key] for key in SHARED},
@@ -251,7 +252,7 @@ TEXT = TextStringObject("x")
         (annotation(Subtype=NameObject("/Link"), A=action("Launch")), "starts a program"),
         (annotation(FS=dictionary(Type=NameObject("/Filespec"))), "a reference to another file"),
     ],
-    ids=range(14),
+    ids=range(13),
 )
 def test_what_acts_is_named(edit, said):
     assert said in reason(small(edit=edit))
