@@ -382,7 +382,9 @@ def test_a_row_unfolds_with_its_picture(page: Browser) -> None:
     assert "There." in page.ask("document.querySelector('.more').innerText")
     page.ask("document.images[0].decode().then(() => { window.seen = true; })")
     assert page.ask("document.images[0].naturalWidth") == 7
-    assert page.ask("document.images[0].alt") == "First page of the report of Zoë"
+    assert page.ask("document.images[0].alt") == (
+        "Page 1, drawn again from the log, of the report of Zoë"
+    )
     # It moves with its row, and hides with it
     page.click(head("Points"))
     before = "document.querySelector('.more').previousElementSibling.querySelector('.name')"
@@ -392,6 +394,24 @@ def test_a_row_unfolds_with_its_picture(page: Browser) -> None:
     assert not page.ask("document.querySelector('.more').checkVisibility()")
     assert page.complaints() == []
     assert page.requests() <= {"file", "data"}
+
+
+def test_a_page_that_differs_stands_beside_the_redrawn_one() -> None:
+    one = graded(
+        "Zoë", 18.5, picture=png(3), handed_in=png(4), page=2, redrawn_name="reports/1.pdf"
+    )
+    text = html_text([one, graded("Bo", 1.0, handed_in=png())], "Class", "px4fuse 1")
+    first, second = (
+        json.loads(found)
+        for found in re.findall(r'<script type="application/json">(.*?)</script>', text)
+    )
+    assert [said for said, _ in first["pictures"]] == [
+        "Page 2, drawn again from the log", "Page 2, as handed in: not verified",
+    ]  # fmt: skip
+    assert [base64.b64decode(content) for _, content in first["pictures"]] == [png(3), png(4)]
+    assert first["report"] == "reports/1.pdf"
+    assert [said for said, _ in second["pictures"]] == ["Page 1, as handed in: not verified"]
+    assert second["report"] == ""
 
 
 def test_what_students_wrote_stays_text(page: Browser) -> None:

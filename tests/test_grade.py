@@ -86,18 +86,32 @@ def test_a_report_with_its_log_is_verified_and_a_changed_one_is_not(tmp_path) ->
     changed.add_attachment(name, json.dumps(results).encode())
     with (folder / "b.pdf").open("wb") as file:
         changed.write(file)
+    shorter = PdfWriter(clone_from=io.BytesIO(REPORT.read_bytes()))
+    shorter.remove_page(8)
+    with (folder / "c.pdf").open("wb") as file:
+        shorter.write(file)
     output = tmp_path / "class"
     outcome = grade([folder], [LOG.parent], read_rubric(None), output, processes=2)
-    first, second = outcome.graded
+    first, second, third = outcome.graded
     assert first.verdict.status == "verified"
     assert first.verdict.with_log
     assert first.numbers["SIGMA_Z (m)"] == 0.1
     assert second.verdict.status == "numbers differ"
     assert second.points == 0.0
     assert any("nis_mean" in difference.path for difference in second.verdict.differences)
+    # what is read is drawn again from the log, for both
+    redrawn = [path.read_bytes() for path in (output / "reports").glob("*.pdf")]
+    assert len(redrawn) == 3
+    assert len(set(redrawn)) == 1
+    assert len(PdfReader(io.BytesIO(redrawn[0])).pages) == 9
+    # a page away is a flag, and costs nothing
+    assert (third.verdict.status, third.verdict.outcome) == ("verified", "page differs")
+    assert third.points == first.points
+    assert any("Page 9 of the PDF" in flag and "missing" in flag for flag in third.flags)
+    assert not any("of the PDF" in flag for flag in first.flags)
     # a second run does nothing again, and says the same
     again = grade([folder], [LOG.parent], read_rubric(None), output, processes=2)
-    assert again.reused == 2
+    assert again.reused == 3
     assert again.graded == outcome.graded
 
 

@@ -242,7 +242,7 @@ TEXT = TextStringObject("x")
         (annotation(Subtype=NameObject("/Link"), A=action("Launch")), "starts a program"),
         (annotation(FS=dictionary(Type=NameObject("/Filespec"))), "a reference to another file"),
     ],
-    ids=range(14),
+    ids=range(13),
 )
 def test_what_acts_is_named(edit, said):
     assert said in reason(small(edit=edit))
