@@ -105,7 +105,7 @@ class TestVerified:
         assert points == 0.5
         assert "was not at hand" in comment
         text = " ".join(feedback(graded(verdict=verdict)).split())
-        assert "log was not at hand" in text
+        assert "was not at hand" in text
         assert "Make it again" not in text
         other = dataclasses.replace(verdict, reasons=("made with another version",))
         assert checked("verified", verdict=other)[0] == 0.0
