@@ -499,7 +499,7 @@ DRAWING: dict[str, Callable[[bytes], bytes]] = {
     "a digit less": once(rb"\(\x00(\d)\)", b"()"),
     "a point of a line moved": once(rb"([\d.]+) ([\d.]+) l", aside),
     "another point of a line moved": once(rb"([\d.]+) ([\d.]+) l", aside, last=False),
-    "a line more": lambda c: c + b"\n0 G 1 w\n300 0 m\n300 842 l\nS\n",
+    "a line more": lambda c: c + b"\n0 g\n300 0 1 842 re\nf\n",
     "a white rectangle": lambda c: c + b"\n1 g\n100 690 300 90 re\nf\n",
     "a text more": lambda c: c + b"\nBT\n/F2 12 Tf\n100 100 Td\n(\x00A) Tj\nET\n",
     "a text moved": once(rb"1 0 -?0 1 ([\d.]+) ([\d.]+) cm\nBT", rb"1 0 -0 1 9\1 \2 cm\nBT"),
