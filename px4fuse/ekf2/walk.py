@@ -123,6 +123,9 @@ class AxisWalk:
     position_left_m2, velocity_left_m2_s2 : float
         Of the model to the logged EKF2.
     student_rmse_to_truth_m, logged_rmse_to_truth_m : float or Unavailable
+    apart_m, left_m : ndarray
+        Position of the student's filter, and of the model, minus that of the logged EKF2, at the
+        times of the walk.
     """
 
     steps: tuple[Step, ...]
@@ -132,6 +135,8 @@ class AxisWalk:
     velocity_left_m2_s2: float
     student_rmse_to_truth_m: float | Unavailable
     logged_rmse_to_truth_m: float | Unavailable
+    apart_m: Array
+    left_m: Array
 
     @property
     def position_left_share(self) -> float:
@@ -217,7 +222,7 @@ def walk(
     inside = settled(times, judged)
     own = [line.track for line in lines.values() if line.track is not None]
     for one in (*tracks.values(), *own):
-        inside &= (times >= one.index[0]) & (times <= one.index[-1])
+        inside &= len(one) > 0 and (times >= one.index[0]) & (times <= one.index[-1])
     times = times[inside]
     if not len(times):
         return Unavailable(
@@ -288,6 +293,8 @@ def _axis(model: Model, tracks: Mapping[str, pd.DataFrame], line: Line, times: A
         velocity_left_m2_s2=speed_square[OUTPUT],
         student_rmse_to_truth_m=_to_truth(model, position[STUDENT], line, times),
         logged_rmse_to_truth_m=_to_truth(model, logged, line, times),
+        apart_m=position[STUDENT] - logged,
+        left_m=position[OUTPUT] - logged,
     )
 
 
