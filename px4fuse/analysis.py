@@ -10,8 +10,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from px4fuse import placing
-from px4fuse.comparison.budget import Budget, budget
 from px4fuse.comparison.comparison import Comparison, compare
+from px4fuse.comparison.why import Why, why_ekf2_differs
+from px4fuse.ekf2.model import Model, open_model
+from px4fuse.ekf2.replay import Ekf2Replay
 from px4fuse.errors import LogError, MissingDataError, SettingsError
 from px4fuse.filter.clock import ClockOffset, estimate_clock_offset
 from px4fuse.filter.kalman import Settings
@@ -48,8 +50,10 @@ class Analysis:
         The noises that the data ask for.
     clock : ClockOffset or Unavailable
         What must still be added to the source's stamps.
-    budget : mapping from axis name to Budget or Unavailable
-        What the difference to EKF2 comes from.
+    ekf2_model : Model or Unavailable
+        EKF2 made ready for replays; whether they can be believed is in its agreement.
+    why : mapping from axis name to Why or Unavailable
+        Why EKF2 differs.
     loop : Loop or Unavailable
         Loop closure of the flight's odometry.
     """
@@ -57,8 +61,15 @@ class Analysis:
     comparison: Comparison
     tuning: Tuning
     clock: ClockOffset | Unavailable
-    budget: Mapping[str, Budget | Unavailable]
+    ekf2_model: Model | Unavailable
+    why: Mapping[str, Why | Unavailable]
     loop: Loop | Unavailable
+
+    @property
+    def ekf2_replay(self) -> Ekf2Replay | Unavailable:
+        """EKF2 replayed as flown, with its agreement with the log."""
+        model = self.ekf2_model
+        return model if isinstance(model, Unavailable) else model.flown
 
 
 def run(request: ComparisonRequest, progress: Progress = _silent) -> Analysis:
@@ -211,7 +222,7 @@ def run_loop(request: LoopRequest, progress: Progress = _silent) -> Loop:
 
 
 def explain(comparison: Comparison, progress: Progress = _silent) -> Analysis:
-    """Add tuning, clock offset, difference budget and loop closure to a comparison.
+    """Add tuning, clock offset, why EKF2 differs and loop closure to a comparison.
 
     Parameters
     ----------
@@ -223,9 +234,11 @@ def explain(comparison: Comparison, progress: Progress = _silent) -> Analysis:
     names = REPORTED if {"north", "east"} <= {axis.name for axis in axes} else None
     tuning = tune(axes, comparison.settings, names, lambda name: progress(f"tuning {name}"))
     clock = clock_offset(comparison, tuning, progress)
-    why = budget(comparison, clock, progress)
+    progress("replaying EKF2")
+    model = open_model(comparison.flight)
+    why = why_ekf2_differs(comparison, model, tuning, clock)
     progress("looking for a loop")
-    return Analysis(comparison, tuning, clock, why, loop_in(comparison.flight, progress))
+    return Analysis(comparison, tuning, clock, model, why, loop_in(comparison.flight, progress))
 
 
 def tuned_horizontally(comparison: Comparison) -> Tuning:

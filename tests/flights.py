@@ -327,4 +327,7 @@ def random_walk(
 
 def unexplained(comparison: Comparison) -> Analysis:
     """Make an analysis that knows nothing but the comparison."""
-    return Analysis(comparison, {}, unavailable("clock offset"), {}, unavailable("loop closure"))
+    return Analysis(
+        comparison, {}, unavailable("clock offset"), unavailable("EKF2 replay"), {},
+        unavailable("loop closure"),
+    )  # fmt: skip

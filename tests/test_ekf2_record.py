@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from ulog_tools import covariances, make_log
+from ulog_tools import GENERATIONS, covariances, make_log, stamps, topic
 
 from px4fuse.flight import (
     ACCELEROMETER_BIAS_COLUMNS,
@@ -21,6 +21,7 @@ from px4fuse.placing.joining import _later_record
 from px4fuse.readers import read_log
 
 QUATERNION = Rotation.from_euler("ZYX", [40.0, 10.0, -5.0], degrees=True).as_quat(scalar_first=True)
+BIAS = np.array([0.15, -0.10, 0.08])
 STATES = [*QUATERNION, 0.5, -0.2, 0.1, 3.0, 4.0, -1.5, 1e-4, 2e-4, 3e-4, 1e-3, 2e-3, 3e-3]
 
 
@@ -125,3 +126,62 @@ def test_without_quaternions_or_topic_there_is_no_record(record_of):
     assert isinstance(record_of(make_log("v1.16")).record, Unavailable)  # quaternions of zero
     assert isinstance(record_of(made_log("v1.16").drop("estimator_states")).record, Unavailable)
     assert isinstance(record_of(make_log("v1.11")).record, Unavailable)
+
+
+class TestBiasAndHorizon:
+    """From ULogs of every generation."""
+
+    STEP_S = 0.010  # of EKF2 at the made flight's 100 Hz
+
+    def read(self, tmp_path, log) -> Ekf2:
+        ekf2 = read_log(log.write(tmp_path / "made.ulg")).ekf2
+        assert isinstance(ekf2, Ekf2)
+        return ekf2
+
+    @pytest.mark.parametrize("generation", GENERATIONS)
+    def test_bias_is_in_m_s2_whatever_the_state_vector_holds(self, tmp_path, generation: str):
+        log = make_log(generation)
+        number = int(generation.removeprefix("v1."))
+        holder = log["estimator_states" if number >= 12 else "estimator_status"]
+        holder["states"][:, 13:16] = BIAS * (self.STEP_S if number < 15 else 1.0)
+        ekf2 = self.read(tmp_path, log)
+        assert ekf2.step_s == pytest.approx(self.STEP_S)
+        np.testing.assert_allclose(
+            ekf2.accelerometer_bias, np.tile(BIAS, (len(ekf2.accelerometer_bias), 1)), rtol=1e-5
+        )
+
+    def test_its_own_topic_is_preferred(self, tmp_path):
+        log = make_log("v1.14")
+        time = stamps(10.0, 1.0)
+        log.add(topic("estimator_sensor_bias", time, {"accel_bias": np.tile(BIAS, (10, 1))},
+                      sampled=True))  # fmt: skip
+        bias = self.read(tmp_path, log).accelerometer_bias
+        np.testing.assert_allclose(bias.iloc[0], BIAS, rtol=1e-6)
+        assert bias.index[1] == pytest.approx(1.0)
+
+    def test_step_is_a_whole_number_of_imu_samples(self, tmp_path):
+        log = make_log("v1.14", imu_hz=1.0 / 0.004)
+        log.parameters["EKF2_PREDICT_US"] = 10_000
+        log["estimator_states"]["states"][:, 13:16] = BIAS * 0.008
+        ekf2 = self.read(tmp_path, log)
+        assert ekf2.step_s == pytest.approx(0.008)  # 2.5 samples round to 2
+        np.testing.assert_allclose(ekf2.accelerometer_bias.iloc[0], BIAS, rtol=1e-5)
+
+    def test_horizon_is_the_age_at_publication(self, tmp_path):
+        assert self.read(tmp_path, make_log("v1.16")).horizon_s == pytest.approx(0.060)
+        assert isinstance(self.read(tmp_path, make_log("v1.11")).horizon_s, Unavailable)
+
+    def test_no_states_and_no_horizon_are_said(self, tmp_path):
+        ekf2 = self.read(tmp_path, make_log("v1.16").drop("estimator_states"))
+        assert isinstance(ekf2.accelerometer_bias, Unavailable)
+        assert isinstance(ekf2.horizon_s, Unavailable)
+
+    def test_unusable_horizons_and_few_imu_samples_are_passed_over(self, tmp_path):
+        log = make_log("v1.16")
+        log["estimator_states"]["timestamp_sample"] = log["estimator_states"]["timestamp"].copy()
+        assert isinstance(self.read(tmp_path, log).horizon_s, Unavailable)
+        lone = make_log("v1.16")
+        imu = lone["sensor_combined"]
+        for name in imu:
+            imu[name] = imu[name][:1]
+        assert self.read(tmp_path, lone).step_s == 0.010

@@ -10,7 +10,7 @@ import pytest
 
 from px4fuse.ekf2.model import Model, open_model
 from px4fuse.ekf2.parameters import PARAMETERS, check, settings_in_force
-from px4fuse.ekf2.walk import OUTPUT, STEPS, Student, Walk, walk
+from px4fuse.ekf2.walk import OUTPUT, SAMPLES, STEPS, Line, Student, Walk, walk
 from px4fuse.ekf2.whatif import WhatIf, sweep, sweep_values, what_if
 from px4fuse.errors import SettingsError
 from px4fuse.flight import Ekf2, Flight, Unavailable
@@ -150,12 +150,12 @@ def test_the_ends_of_the_walk_are_student_and_model_against_log(model: Model) ->
     made = walked(walk(model))
     assert isinstance(model.flight.ekf2, Ekf2)
     logged = model.flight.ekf2.state
-    student = made.tracks["student"]
+    student = made.tracks[SAMPLES]
     inside = (logged.index > model.flown.stretches[0][0] + 5.0) & (
         logged.index < model.flown.stretches[0][1]
     )
     times = logged.index[inside]
-    assert made.samples == pytest.approx(len(times), abs=2)
+    assert len(made.times_s) == pytest.approx(len(times), abs=2)
     for axis in ("north", "east"):
         for ours, name in (
             (student, "position_total_m2"),
@@ -172,24 +172,48 @@ def test_the_walk_starts_where_the_student_is(model: Model) -> None:
     north = plain.axes["north"], noisy.axes["north"]
     assert north[1].position_total_m2 != pytest.approx(north[0].position_total_m2, rel=0.05)
     assert north[1].position_left_m2 == pytest.approx(north[0].position_left_m2, rel=1e-9)
-    assert abs(noisy.axes["north"].steps[1].position_mean_square_m2) > 1e-5
+    assert abs(noisy.axes["north"].steps[2].position_mean_square_m2) > 1e-5
     late = walked(walk(model, Student(clock_offset_s=-0.3)))
-    assert late.axes["north"].steps[0].position_moved_m > 0.2
+    assert late.axes["north"].steps[0].position_moved_m == 0.0
+    assert late.axes["north"].steps[1].position_moved_m > 0.2
+
+
+def test_a_track_of_ones_own_is_the_first_step(model: Model) -> None:
+    plain = walked(walk(model))
     # a track of one's own: 0.4 m off, so that 0.16 m² more are to be explained by the first step
-    track = plain.tracks["student"].copy()
-    track["north_m"] += 0.4
-    own = walked(walk(model, track=track)).axes["north"]
-    bias = np.mean(track["north_m"] - model.flown.published["north_m"])
+    track = pd.DataFrame(
+        {
+            "position_m": plain.tracks[SAMPLES]["north_m"] + 0.4,
+            "velocity_m_s": plain.tracks[SAMPLES]["north_m_s"],
+        }
+    )
+    own = walked(walk(model, lines={"north": Line(1.0, 0.0, track)})).axes["north"]
+    bias = np.mean(track["position_m"] - model.flown.published["north_m"])
     assert own.position_total_m2 > 0.8 * bias**2
     assert own.position_total_m2 == pytest.approx(
         own.position_left_m2 + sum(step.position_mean_square_m2 for step in own.steps), abs=1e-12
     )
-    assert own.steps[0].position_moved_m > 0.35
+    assert own.steps[0].position_moved_m == pytest.approx(0.4, abs=1e-6)
+    for ours, theirs in zip(own.steps[1:], plain.axes["north"].steps[1:], strict=True):
+        assert ours.position_mean_square_m2 == pytest.approx(theirs.position_mean_square_m2)
+
+
+def test_a_slanted_axis_is_the_projection(model: Model) -> None:
+    half = np.sqrt(0.5)
+    made = walked(walk(model, lines={"aisle": Line(half, half), "across": Line(half, -half)})).axes
+    plain = walked(walk(model)).axes
+    for name in ("position_total_m2", "position_left_m2", "velocity_total_m2_s2"):
+        sums = [sum(getattr(axis, name) for axis in axes.values()) for axes in (made, plain)]
+        assert sums[0] == pytest.approx(sums[1], rel=1e-9)  # turning keeps the squares
+    assert made["aisle"].position_total_m2 != pytest.approx(plain["north"].position_total_m2)
 
 
 def test_a_track_of_another_time_is_refused(model: Model) -> None:
-    track = walked(walk(model)).tracks["student"]
-    elsewhere = track.set_axis(pd.Index(track.index.to_numpy() + 1e4, name="time_s"))
-    result = walk(model, track=elsewhere)
+    track = walked(walk(model)).tracks[SAMPLES]
+    elsewhere = pd.DataFrame(
+        {"position_m": 0.0, "velocity_m_s": 0.0},
+        index=pd.Index(track.index.to_numpy() + 1e4, name="time_s"),
+    )
+    result = walk(model, lines={"north": Line(1.0, 0.0, elsewhere)})
     assert isinstance(result, Unavailable)
     assert "no time in common" in result.reason

@@ -3,7 +3,9 @@
 Each stage is a replay of the whole flight with one thing more as EKF2 has it; the order is fixed
 and physical: when a sample counts, how much it counts, what is estimated besides, what was left
 out, and how the result is carried to the present. The mean square difference to what EKF2 logged
-goes from stage to stage, so that the steps and what is left add up to all of it.
+goes from stage to stage, so that the steps and what is left add up to all of it. The first step
+takes the student's filter, as it ran on the grid and the source that were chosen, to the same
+filter on EKF2's own samples and prediction steps; without it, other steps would be blamed for that.
 
 EKF2's small process noise presupposes its bias states: given to a filter without them it makes
 things worse. Therefore the biases come first. The last replays reject what EKF2 rejected: where it
@@ -23,13 +25,16 @@ from numpy.typing import NDArray
 from px4fuse.ekf2.agreement import at_times, judged_from, settled
 from px4fuse.ekf2.model import Model, replay_variants
 from px4fuse.ekf2.recursion import Variant
-from px4fuse.ekf2.replay import HORIZONTAL, Ekf2Replay
+from px4fuse.ekf2.replay import Ekf2Replay
 from px4fuse.flight import POSITION_COLUMNS, VELOCITY_COLUMNS, Ekf2, Truth, Unavailable
 
 Array = NDArray[np.float64]
 
+WHAT = "why EKF2 differs"
+STUDENT = "student"
 # The filter of the lesson spreads its process noise over steps of DT (DESIGN: Q per second is
 # SIGMA_A² · DT); EKF2 adds EKF2_ACC_NOISE² · Δt² each step, EKF2_ACC_NOISE² · Δt per second
+SAMPLES = "samples and time steps"
 STAMPS = "stamps and delay"
 NOISE = "measurement noise"
 BIASES = "accelerometer bias as a state"
@@ -37,7 +42,7 @@ PROCESS = "process noise"
 ATTITUDE = "attitude and gyro bias as states"
 GATE = "gate, missed samples, resets"
 OUTPUT = "output predictor"
-STEPS = (STAMPS, NOISE, BIASES, PROCESS, ATTITUDE, GATE, OUTPUT)
+STEPS = (SAMPLES, STAMPS, NOISE, BIASES, PROCESS, ATTITUDE, GATE, OUTPUT)
 
 
 @dataclass(frozen=True)
@@ -55,6 +60,29 @@ class Student:
     sigma_z_m: float = 0.1
     dt_s: float = 0.1
     clock_offset_s: float = 0.0
+
+
+@dataclass(frozen=True)
+class Line:
+    """A horizontal axis to walk along.
+
+    Attributes
+    ----------
+    north, east : float
+        Its unit vector.
+    track : DataFrame or None
+        What the student's filter gave along it: ``position_m, velocity_m_s`` by time (s). None:
+        the same filter on EKF2's samples and steps.
+    """
+
+    north: float
+    east: float
+    track: pd.DataFrame | None = None
+
+    def along(self, frame: pd.DataFrame, columns: list[str], times: Array) -> Array:
+        """North and east columns of a time-indexed frame, interpolated, along this line."""
+        north, east = (at_times(frame, column, times) for column in columns[:2])
+        return self.north * north + self.east * east
 
 
 @dataclass(frozen=True)
@@ -95,6 +123,9 @@ class AxisWalk:
     position_left_m2, velocity_left_m2_s2 : float
         Of the model to the logged EKF2.
     student_rmse_to_truth_m, logged_rmse_to_truth_m : float or Unavailable
+    apart_m, left_m : ndarray
+        Position of the student's filter, and of the model, minus that of the logged EKF2, at the
+        times of the walk.
     """
 
     steps: tuple[Step, ...]
@@ -104,6 +135,8 @@ class AxisWalk:
     velocity_left_m2_s2: float
     student_rmse_to_truth_m: float | Unavailable
     logged_rmse_to_truth_m: float | Unavailable
+    apart_m: Array
+    left_m: Array
 
     @property
     def position_left_share(self) -> float:
@@ -138,24 +171,23 @@ class Walk:
 
     Attributes
     ----------
-    axes : mapping from "north" and "east" to AxisWalk
+    axes : mapping from axis name to AxisWalk
     coast : Coast or None
         None where nothing was rejected.
     tracks : mapping from stage to DataFrame
-        Position and velocity of each stage, at the step ends of the replay; the first is the
-        student's filter, under ``"student"``.
-    samples : int
+        Position and velocity of the filter after each step, at the step ends of the replay.
+    times_s : ndarray
         EKF2's own sample times that the means are over.
     """
 
     axes: Mapping[str, AxisWalk]
     coast: Coast | None
     tracks: Mapping[str, pd.DataFrame]
-    samples: int
+    times_s: Array
 
 
 def walk(
-    model: Model, student: Student | None = None, track: pd.DataFrame | None = None
+    model: Model, student: Student | None = None, lines: Mapping[str, Line] | None = None
 ) -> Walk | Unavailable:
     """Walk from the student's filter to the logged EKF2.
 
@@ -164,9 +196,8 @@ def walk(
     model : Model
     student : Student, optional
         By default the lesson's settings.
-    track : DataFrame, optional
-        What the student's filter gave: ``north_m``, ``east_m``, ``north_m_s``, ``east_m_s`` by time
-        (s). By default the same filter in the model's steps.
+    lines : mapping from axis name to Line, optional
+        By default north and east, without tracks.
 
     Returns
     -------
@@ -175,40 +206,40 @@ def walk(
     """
     if not model.agreement.good:
         return Unavailable(
-            "why EKF2 differs",
+            WHAT,
             f"the model does not reproduce what EKF2 logged: {model.agreement.reason}",
             "Record without dropouts, with SDLOG_PROFILE 129 (default and vision).",
         )
     ekf2 = model.flight.ekf2
     assert isinstance(ekf2, Ekf2)
+    lines = lines or {"north": Line(1.0, 0.0), "east": Line(0.0, 1.0)}
     variants = _variants(model, student or Student())
     replays = replay_variants(model, list(variants.values()), [{}] * len(variants))
     tracks = {name: replay.delayed for name, replay in zip(variants, replays, strict=True)}
-    if track is not None:
-        tracks["student"] = track
     tracks[OUTPUT] = replays[-1].published
     judged = judged_from(model.flown)
     times = ekf2.state.index.to_numpy()
     inside = settled(times, judged)
-    for one in tracks.values():
-        inside &= (times >= one.index[0]) & (times <= one.index[-1])
+    own = [line.track for line in lines.values() if line.track is not None]
+    for one in (*tracks.values(), *own):
+        inside &= len(one) > 0 and (times >= one.index[0]) & (times <= one.index[-1])
     times = times[inside]
     if not len(times):
         return Unavailable(
-            "why EKF2 differs",
+            WHAT,
             "the student's filter and the replay have no time in common",
             "Analyse the part of the flight in which EKF2 fused vision (--start, --end).",
         )
     return Walk(
-        axes={axis: _axis(model, tracks, axis, times) for axis in HORIZONTAL},
-        coast=_coast(replays[-1], tracks[ATTITUDE], judged),
+        axes={name: _axis(model, tracks, line, times) for name, line in lines.items()},
+        coast=_coast(replays[-1], tracks[ATTITUDE], (times[0], times[-1]), judged),
         tracks=tracks,
-        samples=len(times),
+        times_s=times,
     )
 
 
 def _variants(model: Model, student: Student) -> dict[str, Variant]:
-    """The filter of each stage but the last; from one to the next, one thing changes."""
+    """The filter after each step but the last; from one to the next, one thing changes."""
     inputs, flown = model.inputs, model.inputs.settings
     force = float(student.sigma_a_m_s2 * np.sqrt(student.dt_s / inputs.step_s))
     own = {**flown, "EKF2_EVP_NOISE": student.sigma_z_m, "EKF2_EV_NOISE_MD": 1.0}
@@ -218,7 +249,7 @@ def _variants(model: Model, student: Student) -> dict[str, Variant]:
         biases=False, attitude=False, gated=False, stamp_offset_s=student.clock_offset_s,
     )  # fmt: skip
     return {
-        "student": first,
+        SAMPLES: first,
         STAMPS: Variant({**own, **spread}, biases=False, attitude=False, gated=False),
         NOISE: Variant({**flown, **spread}, biases=False, attitude=False, gated=False),
         BIASES: Variant({**flown, **spread}, attitude=False, gated=False),
@@ -228,23 +259,21 @@ def _variants(model: Model, student: Student) -> dict[str, Variant]:
     }
 
 
-def _axis(model: Model, tracks: Mapping[str, pd.DataFrame], axis: str, times: Array) -> AxisWalk:
+def _axis(model: Model, tracks: Mapping[str, pd.DataFrame], line: Line, times: Array) -> AxisWalk:
     ekf2 = model.flight.ekf2
     assert isinstance(ekf2, Ekf2)
-    at = HORIZONTAL.index(axis)
-    position, velocity = POSITION_COLUMNS[at], VELOCITY_COLUMNS[at]
-    logged = at_times(ekf2.state, position, times)
-    logged_speed = at_times(ekf2.state, velocity, times)
-    stages = ["student", *STEPS]
-    where = {name: at_times(tracks[name], position, times) for name in stages}
-    square = {name: float(np.mean((where[name] - logged) ** 2)) for name in stages}
-    speed_square = {
-        name: float(np.mean((at_times(tracks[name], velocity, times) - logged_speed) ** 2))
-        for name in stages
-    }
+    position = {name: line.along(track, POSITION_COLUMNS, times) for name, track in tracks.items()}
+    speed = {name: line.along(track, VELOCITY_COLUMNS, times) for name, track in tracks.items()}
+    own = line.track
+    position[STUDENT] = position[SAMPLES] if own is None else at_times(own, "position_m", times)
+    speed[STUDENT] = speed[SAMPLES] if own is None else at_times(own, "velocity_m_s", times)
+    logged = line.along(ekf2.state, POSITION_COLUMNS, times)
+    logged_speed = line.along(ekf2.state, VELOCITY_COLUMNS, times)
+    square = {name: float(np.mean((there - logged) ** 2)) for name, there in position.items()}
+    speed_square = {name: float(np.mean((v - logged_speed) ** 2)) for name, v in speed.items()}
     steps = []
-    for before, name in pairwise(stages):
-        moved = np.abs(where[name] - where[before])
+    for before, name in pairwise((STUDENT, *STEPS)):
+        moved = np.abs(position[name] - position[before])
         most = int(np.argmax(moved))
         steps.append(
             Step(
@@ -253,21 +282,23 @@ def _axis(model: Model, tracks: Mapping[str, pd.DataFrame], axis: str, times: Ar
                 velocity_mean_square_m2_s2=speed_square[before] - speed_square[name],
                 position_moved_m=float(moved[most]),
                 moved_at_s=float(times[most]),
-                position_rmse_to_truth_m=_to_truth(model, where[name], axis, times),
+                position_rmse_to_truth_m=_to_truth(model, position[name], line, times),
             )
         )
     return AxisWalk(
         steps=tuple(steps),
-        position_total_m2=square["student"],
-        velocity_total_m2_s2=speed_square["student"],
+        position_total_m2=square[STUDENT],
+        velocity_total_m2_s2=speed_square[STUDENT],
         position_left_m2=square[OUTPUT],
         velocity_left_m2_s2=speed_square[OUTPUT],
-        student_rmse_to_truth_m=_to_truth(model, where["student"], axis, times),
-        logged_rmse_to_truth_m=_to_truth(model, logged, axis, times),
+        student_rmse_to_truth_m=_to_truth(model, position[STUDENT], line, times),
+        logged_rmse_to_truth_m=_to_truth(model, logged, line, times),
+        apart_m=position[STUDENT] - logged,
+        left_m=position[OUTPUT] - logged,
     )
 
 
-def _to_truth(model: Model, where: Array, axis: str, times: Array) -> float | Unavailable:
+def _to_truth(model: Model, where: Array, line: Line, times: Array) -> float | Unavailable:
     truth = model.flight.truth
     if not isinstance(truth, Truth):
         return truth
@@ -275,14 +306,18 @@ def _to_truth(model: Model, where: Array, axis: str, times: Array) -> float | Un
     inside = (times >= span[0]) & (times <= span[-1])
     if not inside.any():
         return Unavailable("RMSE to truth", "the truth is of another time", "Record both together.")
-    known = at_times(truth.samples, POSITION_COLUMNS[HORIZONTAL.index(axis)], times)
+    known = line.along(truth.samples, POSITION_COLUMNS, times)
     return float(np.sqrt(np.mean((where - known)[inside] ** 2)))
 
 
 def _coast(
-    flown: Ekf2Replay, ungated: pd.DataFrame, judged: tuple[tuple[float, float], ...]
+    flown: Ekf2Replay,
+    ungated: pd.DataFrame,
+    span: tuple[float, float],
+    judged: tuple[tuple[float, float], ...],
 ) -> Coast | None:
     updates = flown.updates[settled(flown.updates.index.to_numpy(), judged)]
+    updates = updates[updates["fused_at_s"].between(*span)]
     rejected = updates["rejected"].to_numpy() > 0
     if not rejected.any():
         return None

@@ -11,7 +11,6 @@ from matplotlib.figure import Figure
 from pypdf import PdfWriter
 
 from px4fuse.report import (
-    budget,
     clock,
     consistency,
     cover,
@@ -22,6 +21,7 @@ from px4fuse.report import (
     sensitivity,
     tracks,
     variances,
+    why,
 )
 from px4fuse.report.document import Document, LoopDocument
 from px4fuse.report.seal import sealed
@@ -36,7 +36,7 @@ PAGES = (
     consistency.draw,
     sensitivity.draw,
     clock.draw,
-    budget.draw,
+    why.draw,
     loop.draw,
     notes.draw,
     provenance.draw,

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, replace
+from dataclasses import replace
 from typing import Any, cast
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.budget import Budget, Effect
 from px4fuse.comparison.comparison import AgainstTruth, AxisComparison, Comparison, FilterSummary
 from px4fuse.filter.clock import ClockOffset
 from px4fuse.filter.tuning import AxisTuning, Noise
@@ -16,6 +15,7 @@ from px4fuse.findings import Finding
 from px4fuse.flight import Unavailable, sample_rate
 from px4fuse.request import AxisName, ComparisonRequest
 from px4fuse.results import comparison as made
+from px4fuse.results.build_ekf2 import replay_part, why_part
 from px4fuse.results.build_trajectories import loop_part
 from px4fuse.results.contract import (
     COMPARISON,
@@ -58,7 +58,8 @@ def results(
         ),
         tuning={name: _tuned(found) for name, found in analysis.tuning.items()},
         clock=_clock(analysis.clock, comparison.settings.clock_offset_s),
-        budget={name: _budget(found) for name, found in analysis.budget.items()},
+        ekf2_replay=replay_part(analysis.ekf2_replay),
+        why={name: why_part(found) for name, found in analysis.why.items()},
         loop=loop_part(analysis.loop),
         findings=found_mistakes(findings),
         notes=comparison.notes,
@@ -231,29 +232,4 @@ def _clock(clock: ClockOffset | Unavailable, applied_s: float) -> made.Clock | A
         heading_sigma_deg=clock.heading_sigma_deg
         if math.isfinite(clock.heading_sigma_deg)
         else None,
-    )
-
-
-def _budget(found: Budget | Unavailable) -> made.Budget | Absent:
-    if isinstance(found, Unavailable):
-        return absent(found)
-    return made.Budget(
-        count=found.count,
-        **asdict(found.baseline),
-        causes={name.replace(" ", "_"): _effect(effect) for name, effect in found.causes.items()},
-        together=_effect(found.together),
-        clock=_effect(found.clock),
-        truth=copied_or_absent(made.BudgetTruth, found.truth),
-    )
-
-
-def _effect(effect: Effect | Unavailable) -> made.Effect | Absent:
-    if isinstance(effect, Unavailable):
-        return absent(effect)
-    without = {} if effect.without is None else asdict(effect.without)
-    return copied(
-        made.Effect,
-        effect,
-        **asdict(effect.alone),
-        **{f"without_{name}": value for name, value in without.items()},
     )

@@ -15,7 +15,6 @@ from msgspec import Meta
 from px4fuse.request import AxisName, ComparisonRequest, LoopRequest
 from px4fuse.results.comparison import (
     Axis,
-    Budget,
     ChosenSettings,
     Clock,
     Horizontal,
@@ -23,6 +22,7 @@ from px4fuse.results.comparison import (
     PositionSource,
     Tuned,
 )
+from px4fuse.results.ekf2 import Ekf2Replay, Why
 from px4fuse.results.model import Base, FoundMistake, Missing, Part, Provenance, Schema, Student
 from px4fuse.results.trajectories import Graph, Loop, Score, Track
 
@@ -46,7 +46,10 @@ class ComparisonResults(Base, frozen=True):
     horizontal : Horizontal
     tuning : mapping of axis name, or "horizontal" for north and east together, to Tuned
     clock : Clock
-    budget : mapping of axis name to Budget
+    ekf2_replay : Ekf2Replay
+        EKF2 replayed from the log, and how well that agrees with what was logged.
+    why : mapping of axis name to Why
+        Why EKF2 differs.
     loop : Loop
     findings : tuple of FoundMistake
         Most severe first.
@@ -67,7 +70,8 @@ class ComparisonResults(Base, frozen=True):
     horizontal: Horizontal
     tuning: dict[str, Part[Tuned]]
     clock: Part[Clock]
-    budget: dict[str, Part[Budget]]
+    ekf2_replay: Part[Ekf2Replay]
+    why: dict[str, Part[Why]]
     loop: Part[Loop]
     findings: tuple[FoundMistake, ...]
     notes: tuple[str, ...]

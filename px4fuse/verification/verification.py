@@ -42,7 +42,7 @@ RELATIVE, ABSOLUTE = 1e-6, 1e-9
 # more than three digits of these.
 ESTIMATE_RELATIVE, ESTIMATE_ABSOLUTE = 1e-3, 1e-5
 ESTIMATES = (
-    "tuning", "clock", "budget", "findings", "loop.closures", "loop.corrections",
+    "tuning", "clock", "ekf2_replay", "why", "findings", "loop.closures", "loop.corrections",
     "position_source.alignment", "settings.clock_offset_s",
 )  # fmt: skip
 ESTIMATED_WITHIN = "noise_asked"

@@ -1,0 +1,196 @@
+"""Why EKF2 differs: from our filter to the logged EKF2, one change at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from px4fuse.comparison.why import Why
+from px4fuse.ekf2.agreement import settled
+from px4fuse.ekf2.replay import Agreement, Ekf2Replay
+from px4fuse.filter.signals import AISLE
+from px4fuse.flight import Unavailable
+from px4fuse.report.document import Document
+from px4fuse.report.style import (
+    BOTTOM,
+    EKF2,
+    EKF2_BAND,
+    LEFT,
+    MUTED,
+    OURS,
+    OURS_BAND,
+    OURS_LINE,
+    POINTS_PER_HEIGHT,
+    RIGHT,
+    Cursor,
+    page,
+    thin,
+)
+
+TITLE = "Why EKF2 differs"
+LEAD = (
+    "EKF2 is replayed from the log by a model of it (px4fuse's, not PX4's own code). From our "
+    "filter to the logged EKF2 one thing after the other is changed to be as in EKF2; a bar is by "
+    "how much that brings the track nearer to EKF2's (mean square, hatched: farther away, which "
+    "later steps make good). The bars and what is left add up to the whole difference."
+)
+ROW_POINTS = 12.0
+LABELS = 0.185  # of the page's width, for the names of the steps
+GAP = 0.035
+TIME_POINTS = 105.0
+
+
+def draw(document: Document) -> Iterator[Figure]:
+    """Draw as many pages as the axes need."""
+    analysis = document.analysis
+    names = [AISLE] if AISLE in analysis.why else list(analysis.why)
+    if not names:
+        return
+    figure, cursor = page(TITLE, LEAD)
+    replay = analysis.ekf2_replay
+    cursor.write(_believed(replay), size=7.5, colour=MUTED)
+    for at, name in enumerate(names):
+        why = analysis.why[name]
+        if at and cursor.y - _height(cursor, why) < BOTTOM:
+            yield figure
+            figure, cursor = page(f"{TITLE}, continued")
+        cursor.skip(8)
+        if isinstance(why, Unavailable):
+            cursor.write(f"{name}: nothing is concluded", size=9.5, weight="bold")
+            cursor.write(f"{why.reason[:1].upper()}{why.reason[1:]}. {why.remedy}")
+        else:
+            assert isinstance(replay, Ekf2Replay)
+            _axis(figure, cursor, name, why, replay)
+    yield figure
+
+
+def _believed(replay: Ekf2Replay | Unavailable) -> str:
+    """The agreement that entitles one to believe the page."""
+    if isinstance(replay, Unavailable):
+        return "EKF2 could not be replayed from this log."
+    assert replay.agreement is not None
+    return f"Replay against log: {agreement_words(replay.agreement)}."
+
+
+def agreement_words(agreement: Agreement) -> str:
+    """How well the replay as flown agrees with the log, in numbers and in a verdict."""
+    axes = agreement.axes.items()
+    correlation = ", ".join(f"{axis.innovation_correlation:.4f} ({name})" for name, axis in axes)
+    ratio = ", ".join(
+        f"{axis.s_ratio_median:.3f} (5 to 95 % {axis.s_ratio_p5:.3f} to {axis.s_ratio_p95:.3f})"
+        for _, axis in axes
+    )
+    return (
+        f"{agreement.samples} innovations correlate {correlation}; S is {ratio} times the logged "
+        f"one; rejected {agreement.rejected_share_replayed:.1%}, in the log "
+        f"{agreement.rejected_share_logged:.1%}. "
+        + ("It agrees: " if agreement.good else "It does not agree: ")
+        + agreement.reason
+    )
+
+
+def _height(cursor: Cursor, why: Why | Unavailable) -> float:
+    """Height that an axis takes, as a fraction of the page."""
+    if isinstance(why, Unavailable):
+        return cursor.height(f"{why.reason}. {why.remedy}") + 24.0 / POINTS_PER_HEIGHT
+    words = sum(cursor.height(sentence, size=8.5) for sentence in why.sentences)
+    points = 24.0 + 2.0 * len(why.sentences) + ROW_POINTS * (len(why.axis.steps) + 2) + 30.0
+    return words + (points + TIME_POINTS + 40.0) / POINTS_PER_HEIGHT
+
+
+def _axis(figure: Figure, cursor: Cursor, name: str, why: Why, replay: Ekf2Replay) -> None:
+    spans = ", ".join(f"{start:.0f} to {end:.0f} s" for start, end in why.spans)
+    cursor.write(f"{name}, {spans}", size=9.5, weight="bold")
+    cursor.skip(2)
+    for sentence in why.sentences:
+        cursor.write(sentence, size=8.5)
+        cursor.skip(2)
+    cursor.skip(18)
+    axis = why.axis
+    names = [step.name for step in axis.steps]
+    width = (RIGHT - LEFT - LABELS - GAP) / 2.0
+    height = ROW_POINTS * (len(names) + 2) / POINTS_PER_HEIGHT
+    for column, (title, total, steps, left) in enumerate(
+        (
+            (
+                f"position, {np.sqrt(axis.position_total_m2):.3f} m rms",
+                axis.position_total_m2,
+                [step.position_mean_square_m2 for step in axis.steps],
+                axis.position_left_m2,
+            ),
+            (
+                f"velocity, {np.sqrt(axis.velocity_total_m2_s2):.3f} m/s rms",
+                axis.velocity_total_m2_s2,
+                [step.velocity_mean_square_m2_s2 for step in axis.steps],
+                axis.velocity_left_m2_s2,
+            ),
+        )
+    ):
+        start = LEFT + LABELS + column * (width + GAP)
+        axes = figure.add_axes((start, cursor.y - height, width, height))
+        axes.set_title(title)
+        _waterfall(axes, names, total, steps, left)
+        if column:
+            axes.set_yticklabels([])
+    cursor.y -= height
+    cursor.skip(42)
+    height = TIME_POINTS / POINTS_PER_HEIGHT
+    axes = figure.add_axes((LEFT + 0.03, cursor.y - height, RIGHT - LEFT - 0.03, height))
+    _over_time(axes, why, replay)
+    cursor.y -= height
+    cursor.skip(24)
+
+
+def _waterfall(axes: Axes, names: list[str], total: float, steps: list[float], left: float) -> None:
+    """Bars from the whole difference down to what is left, in per cent of the whole."""
+    shares = 100.0 * np.array(steps) / total
+    before = 100.0 - np.concatenate([[0.0], np.cumsum(shares)])
+    rows = len(names) + 2
+    style: dict[str, Any] = {"height": 0.7, "edgecolor": OURS, "lw": 0.6}
+    axes.barh(0, 100.0, color=OURS, **style)
+    for row, (share, start) in enumerate(zip(shares, before, strict=False), start=1):
+        axes.barh(row, -share, left=start, color=OURS_BAND if share >= 0.0 else "white",
+                  hatch="" if share >= 0.0 else "////", **style)  # fmt: skip
+        axes.plot([start] * 2, [row - 1.35, row + 0.35], color=MUTED, lw=0.5)
+    axes.barh(rows - 1, 100.0 * left / total, color=EKF2_BAND, height=0.7, edgecolor=EKF2, lw=0.6)
+    farthest = max(100.0, float(before.max()))
+    numbers = [100.0, *shares, 100.0 * left / total]
+    for row, number in enumerate(numbers):
+        axes.text(1.03 * farthest, row, _percent(number), va="center", size=6.5)
+    axes.set_yticks(range(rows), ["ours to EKF2, all of it", *names, "left unexplained"])
+    axes.set_ylim(rows - 0.4, -0.6)
+    axes.set_xlim(min(0.0, float(before.min())), 1.2 * farthest)
+    axes.set_xlabel("% of the mean square")
+    axes.grid(visible=False)
+
+
+def _percent(number: float) -> str:
+    small = abs(number) < 0.05
+    return "0 %" if small else f"{number:.1f} %" if abs(number) < 9.95 else f"{number:.0f} %"
+
+
+def _over_time(axes: Axes, why: Why, replay: Ekf2Replay) -> None:
+    """Where along the flight both differ, what is left of it, and what was rejected."""
+    axes.set_title("position apart (m)")
+    for start, end in why.spans:
+        inside = (why.times_s > start) & (why.times_s < end)
+        time = why.times_s[inside]
+        first = start == why.spans[0][0]
+        axes.plot(*thin(time, why.axis.apart_m[inside]), **OURS_LINE,
+                  label="ours - EKF2" if first else None)  # fmt: skip
+        axes.plot(*thin(time, why.axis.left_m[inside]), color=EKF2, lw=0.8,
+                  label="model - EKF2" if first else None)  # fmt: skip
+    if why.coast is not None:
+        axes.axvspan(why.coast.start_s, why.coast.start_s + why.coast.duration_s, color=EKF2_BAND,
+                     lw=0, label="longest run of rejections")  # fmt: skip
+    rejected = replay.updates["fused_at_s"][replay.updates["rejected"] > 0].to_numpy()
+    rejected = rejected[settled(rejected, why.spans)]
+    if len(rejected):
+        axes.plot(rejected, np.full(len(rejected), 0.02), "|", color="black", ms=4, mew=0.5,
+                  transform=axes.get_xaxis_transform(), label="rejected (replay)")  # fmt: skip
+    axes.set_xlabel("time (s)")
+    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.0, ncols=4)

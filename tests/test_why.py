@@ -1,0 +1,264 @@
+"""Why EKF2 differs: what the comparison's steps, words, results and page say."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from flights import unexplained
+
+from px4fuse.analysis import Analysis, explain
+from px4fuse.comparison.comparison import Comparison, compare
+from px4fuse.comparison.why import Why, why_ekf2_differs
+from px4fuse.ekf2.model import Model
+from px4fuse.ekf2.walk import SAMPLES, STEPS
+from px4fuse.filter.clock import ClockOffset
+from px4fuse.filter.kalman import Settings, state_at
+from px4fuse.flight import Flight, Unavailable
+from px4fuse.readers import read_log
+from px4fuse.report.style import BOTTOM, report_style
+from px4fuse.report.why import draw
+from px4fuse.request import ComparisonRequest
+from px4fuse.results.build import results
+from px4fuse.results.contract import to_plain
+from px4fuse.results.model import Student
+
+
+@pytest.fixture(scope="module")
+def sample(sample_flight: Flight) -> Analysis:
+    return explain(compare(sample_flight))
+
+
+def model_of(analysis: Analysis) -> Model:
+    assert isinstance(analysis.ekf2_model, Model)
+    return analysis.ekf2_model
+
+
+def of(analysis: Analysis, name: str = "aisle") -> Why:
+    found = analysis.why[name]
+    assert isinstance(found, Why)
+    return found
+
+
+def again(analysis: Analysis, comparison: Comparison, **changes: object) -> Why:
+    """The aisle of the same flight, compared otherwise."""
+    given = {"model": analysis.ekf2_model, "tuning": analysis.tuning, "clock": analysis.clock}
+    found = why_ekf2_differs(comparison, **{**given, **changes})["aisle"]
+    assert isinstance(found, Why)
+    return found
+
+
+def test_all_horizontal_axes_are_walked_and_add_up(sample: Analysis) -> None:
+    assert set(sample.why) == {"north", "east", "aisle"}
+    for name in sample.why:
+        axis = of(sample, name).axis
+        assert tuple(step.name for step in axis.steps) == STEPS
+        position = sum(step.position_mean_square_m2 for step in axis.steps)
+        velocity = sum(step.velocity_mean_square_m2_s2 for step in axis.steps)
+        assert position + axis.position_left_m2 == pytest.approx(axis.position_total_m2, abs=1e-12)
+        assert velocity + axis.velocity_left_m2_s2 == pytest.approx(axis.velocity_total_m2_s2)
+        assert axis.position_left_share < 0.03
+
+
+def test_the_whole_is_our_filter_against_what_ekf2_published(sample: Analysis) -> None:
+    why = of(sample)
+    result = next(r for r in sample.comparison.axes if r.axis.name == "aisle")
+    ours, speed = state_at(result.replay, why.times_s)
+    logged = result.ekf2_state.loc[why.times_s]
+    apart = ours - logged["position_m"].to_numpy()
+    np.testing.assert_allclose(why.axis.apart_m, apart, atol=1e-9)
+    assert why.axis.position_total_m2 == pytest.approx(np.mean(apart**2))
+    v = speed - logged["velocity_m_s"].to_numpy()
+    assert why.axis.velocity_total_m2_s2 == pytest.approx(np.mean(v**2))
+    assert np.mean(why.axis.left_m**2) == pytest.approx(why.axis.position_left_m2)
+
+
+def test_the_words_name_the_largest_steps_with_numbers_and_moments(sample: Analysis) -> None:
+    why = of(sample)
+    first, second = sorted(why.axis.steps, key=lambda step: -step.position_mean_square_m2)[:2]
+    for sentence, step in zip(why.sentences[:2], (first, second), strict=True):
+        assert step.name in sentence
+        assert f"{step.position_mean_square_m2 / why.axis.position_total_m2:.0%}" in sentence
+        assert f"at {step.moved_at_s:.1f} s" in sentence
+        assert f"{step.position_moved_m:.2f} m" in sentence
+    assert "EKF2_EVP_NOISE" not in " ".join(why.sentences)
+    said = " ".join(why.sentences)
+    assert f"equally close, {why.axis.student_rmse_to_truth_m:.3f} m (ours)" in said
+    assert "m/s rms apart" in said
+    assert "late" not in said
+
+
+def test_settings_of_ours_are_in_the_steps_that_they_make(sample: Analysis) -> None:
+    flight = sample.comparison.flight
+    plain = of(sample).axis
+    zero = again(sample, compare(flight, Settings(input="zero"), axes=("aisle",)))
+    assert zero.axis.steps[0].name == SAMPLES
+    assert zero.axis.steps[0].position_mean_square_m2 > 10 * plain.steps[0].position_mean_square_m2
+    assert "ours knows no acceleration (--input zero)" in " ".join(zero.sentences)
+    small = again(sample, compare(flight, Settings(sigma_z_m=0.02), axes=("aisle",)))
+    assert small.axis.steps[2].position_moved_m > 0.05
+    late = again(sample, compare(flight, Settings(clock_offset_s=-0.3), axes=("aisle",)))
+    assert "stamps and delay" in late.sentences[0]
+    assert "ours 300 ms" in late.sentences[0]
+    for other in (zero, small, late):
+        assert other.axis.position_left_m2 == pytest.approx(plain.position_left_m2, rel=0.02)
+
+
+def offset(clock: object, offset_s: float) -> ClockOffset:
+    assert isinstance(clock, ClockOffset)
+    return replace(clock, offset_s=offset_s, determinable=True)
+
+
+def test_a_clock_that_is_wrong_for_both_is_said_first(sample: Analysis) -> None:
+    comparison = compare(sample.comparison.flight, axes=("aisle",))
+    shared = again(sample, comparison, clock=offset(sample.clock, -0.25))
+    assert shared.sentences[0].startswith("The source's stamps are late by 0.25 s for both filters")
+    early = again(sample, comparison, clock=offset(sample.clock, 0.25))
+    assert "early by 0.25 s" in early.sentences[0]
+    # put right in ours: no longer shared
+    ours = compare(sample.comparison.flight, Settings(clock_offset_s=-0.25), axes=("aisle",))
+    for given in (offset(sample.clock, 0.0), replace(offset(sample.clock, -0.25))):
+        said = again(sample, ours, clock=given).sentences
+        assert "for both filters" not in " ".join(said)
+
+
+def test_only_what_was_analysed_is_walked(sample: Analysis) -> None:
+    part = compare(sample.comparison.flight, axes=("aisle",), start_s=30.0, end_s=60.0)
+    why = again(sample, part)
+    assert why.spans[0][0] == pytest.approx(30.0, abs=0.2)
+    assert why.spans[0][1] == pytest.approx(60.0, abs=0.3)
+    assert of(sample).outside is not None
+    assert of(sample).outside.at_s < of(sample).spans[0][0]
+
+
+def test_without_a_horizontal_axis_or_a_model_the_reason_stands(sample: Analysis) -> None:
+    down = compare(sample.comparison.flight, axes=("down",))
+    found = why_ekf2_differs(down, sample.ekf2_model, {}, sample.clock)["down"]
+    assert "horizontal" in found.reason
+    none = Unavailable("EKF2 replay", "no IMU", "Record it.")
+    for name, why in why_ekf2_differs(sample.comparison, none, {}, sample.clock).items():
+        assert name != "down"
+        assert (why.reason, why.remedy) == ("no IMU", "Record it.")
+
+
+def document(analysis: Analysis) -> SimpleNamespace:
+    return SimpleNamespace(analysis=analysis)
+
+
+def drawn(analysis: Analysis) -> list:
+    with report_style():
+        return list(draw(document(analysis)))
+
+
+def texts(figure) -> str:
+    every = [text.get_text() for text in figure.texts]
+    every += [text.get_text() for axes in figure.axes for text in axes.texts]
+    return " ".join(every)
+
+
+def test_the_page_shows_words_bars_and_agreement(sample: Analysis) -> None:
+    (page,) = drawn(sample)
+    said = texts(page)
+    assert "Why EKF2 differs" in said
+    assert "0.9997 (north)" in said
+    for sentence in of(sample).sentences:
+        assert " ".join(sentence.split()[:6]) in said
+    position, velocity, over_time = page.axes
+    for axes, total in ((position, "position_total_m2"), (velocity, "velocity_total_m2_s2")):
+        whole, *steps, left = axes.patches
+        assert whole.get_width() == 100.0
+        assert len(steps) == len(STEPS)
+        end = steps[-1].get_x() + steps[-1].get_width()
+        assert end == pytest.approx(left.get_width(), abs=1e-9)
+        assert getattr(of(sample).axis, total) > 0.0
+    assert len(over_time.lines) == 2
+    assert page.axes[0].get_position().y1 < min(t.get_position()[1] for t in page.texts)
+
+
+def test_doubtful_and_absent_replays_conclude_nothing(sample: Analysis) -> None:
+    model = model_of(sample)
+    agreement = replace(model.agreement, good=False, reason="they part")
+    doubtful = replace(model, agreement=agreement, flown=replace(model.flown, agreement=agreement))
+    why = why_ekf2_differs(sample.comparison, doubtful, sample.tuning, sample.clock)
+    (page,) = drawn(replace(sample, ekf2_model=doubtful, why=why))
+    assert "It does not agree: they part" in texts(page)
+    assert "nothing is concluded" in texts(page)
+    assert not page.axes
+    (page,) = drawn(
+        replace(sample, ekf2_model=Unavailable("x", "y", "z"), why={"down": why["aisle"]})
+    )
+    assert "could not be replayed" in texts(page)
+    assert drawn(unexplained(sample.comparison)) == []
+
+
+def test_what_does_not_fit_on_a_page_begins_the_next(sample: Analysis) -> None:
+    long = Unavailable("why", "a sentence of some length, again " * 160, "None")
+    pages = drawn(replace(sample, why={"north": long, "east": long}))
+    assert len(pages) == 2
+    assert min(text.get_position()[1] for figure in pages for text in figure.texts) >= BOTTOM
+    both = drawn(replace(sample, why={name: of(sample, name) for name in ("north", "east")}))
+    lowest = min(axes.get_position().y0 for figure in both for axes in figure.axes)
+    assert lowest >= BOTTOM
+
+
+def test_results_hold_the_steps_and_the_agreement(sample: Analysis) -> None:
+    made = results(ComparisonRequest(log="aisle_uwb.ulg"), sample, (), Student(), "")
+    said = to_plain(made)
+    aisle = said["why"]["aisle"]
+    assert [step["name"] for step in aisle["steps"]] == list(STEPS)
+    position = sum(step["position_mean_square_m2"] for step in aisle["steps"])
+    assert position + aisle["position_left_mean_square_m2"] == pytest.approx(
+        aisle["position_mean_square_m2"], abs=1e-12
+    )
+    assert "velocity_mean_square_m2_s2" in aisle["steps"][0]
+    agreement = said["ekf2_replay"]["agreement"]
+    north = agreement["north"]
+    assert north["innovation_correlation"] > 0.995
+    assert north["s_ratio_p5"] < north["s_ratio_median"] < north["s_ratio_p95"]
+    assert north["innovation_rms_difference_m"] < 0.01
+    assert agreement["rejected_share_logged"] == agreement["rejected_share_replayed"] == 0.0
+    none = to_plain(
+        results(ComparisonRequest(log="x"), unexplained(sample.comparison), (), Student(), "")
+    )
+    assert none["ekf2_replay"]["unavailable"]["reason"]
+
+
+@pytest.mark.reallogs
+class TestFlownFlights:
+    def of(self, shared_logs, name: str) -> tuple[Analysis, Why]:
+        analysis = explain(compare(read_log(shared_logs / "simulated" / f"{name}.ulg")))
+        return analysis, of(analysis)
+
+    def test_an_overconfident_ekf2_is_named_by_its_parameter(self, shared_logs) -> None:
+        _, why = self.of(shared_logs, "v1.16.1_aisle_overconfident")
+        assert why.sentences[0].startswith("EKF2_EVP_NOISE is too small")
+        assert "55% of the samples" in why.sentences[0]
+        assert why.coast is not None
+        assert f"{why.coast.samples} samples in a row and coasted" in why.sentences[0]
+        assert "the rejections that follow from it are" in why.sentences[0]
+        assert any("through its too small noise and the rejections" in s for s in why.sentences)
+        assert why.axis.position_left_share < 0.03
+
+    def test_outliers_are_of_the_gate_and_no_noise_is_blamed(self, shared_logs) -> None:
+        _, why = self.of(shared_logs, "v1.16.1_aisle_nlos")
+        said = " ".join(why.sentences)
+        assert "EKF2_EVP_NOISE" not in said
+        assert "the gate, missed samples, resets" in said
+        assert "EKF2 is closer to the truth" in said
+        assert "up to 4.0 m apart (at 64 s)" in said  # it did not fuse for 15 s
+
+    def test_on_a_late_clock_no_delay_is_blamed(self, shared_logs) -> None:
+        _, why = self.of(shared_logs, "v1.16.1_aisle_clock_late")
+        assert why.sentences[0].startswith("The source's stamps are late by 0.26 s for both")
+        by_name = {step.name: step for step in why.axis.steps}
+        stamps = by_name["stamps and delay"]
+        assert abs(stamps.position_mean_square_m2) < 0.05 * why.axis.position_total_m2
+        assert by_name["measurement noise"].position_moved_m < 1e-6
+
+    def test_a_delay_at_its_old_default_is_the_largest_step(self, shared_logs) -> None:
+        _, why = self.of(shared_logs, "v1.13.3_aisle_evdelay175")
+        assert "most of it by the stamps and delay" in why.sentences[0]
+        assert "175 ms older than its stamp (EKF2_EV_DELAY), ours 0 ms" in why.sentences[0]
+        assert any("mostly through the stamps and delay" in s for s in why.sentences)
