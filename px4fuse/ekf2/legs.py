@@ -229,7 +229,7 @@ def _actions(
     popped = np.flatnonzero(usable)
     if not len(popped):
         return action, startable
-    interval = np.diff(taken_s[popped], prepend=taken_s[popped[0]])
+    interval = np.diff(taken_s[popped], prepend=-np.inf)
     startable[popped] = interval < rules.start_interval_s
     # the last step before this sample was fused, and how old the sample before was then
     silence = stretch.time_s[end[popped] - 1] - np.concatenate([[np.inf], taken_s[popped[:-1]]])
