@@ -122,6 +122,7 @@ class WithMistakes(click.Command):
     "[default with --assignment: DIR_answers.json]",
 )
 @click.option("--no-truth", is_flag=True, help="Leave the ground truth out of the log.")
+@click.option("--no-ekf2", is_flag=True, help="Fly without EKF2, which is faster.")
 @click.option(
     "--passes",
     type=int,
@@ -182,14 +183,15 @@ def simulate(
     mistakes: tuple[str, ...],
     answer_path: Path | None,
     no_truth: bool,
+    no_ekf2: bool,
     passes: int | None,
     **scenario: Any,
 ) -> None:
     """Simulate a flight with known truth and chosen mistakes, for exercises and exams.
 
     Writes a PX4 ULog that every px4fuse command reads. It says that it was simulated but not which
-    mistakes were made, so that it can be handed out; with ground truth, unless --no-truth. It
-    holds no EKF2, since none was run: for that use the sample logs.
+    mistakes were made, so that it can be handed out; with ground truth, unless --no-truth. Its
+    EKF2 is px4fuse's model of EKF2, not PX4's, and the log says so.
 
     For example, px4fuse simulate -o s07.ulg --seed 7 --mistake nlos=5% --answer s07.json
 
@@ -211,6 +213,7 @@ def simulate(
     chosen = Scenario(
         passes=passes if passes is not None else PASSES[scenario["kind"]],
         truth=not no_truth,
+        ekf2=not no_ekf2,
         **scenario,
     )
     from px4fuse.results.contract import to_json
@@ -328,5 +331,6 @@ def _summary(simulation: Simulation) -> list[str]:
         ),
         *([] if names else ["Mistakes  none"]),
         f"Truth     {'in the log' if scenario.truth else 'not in the log'}",
-        "EKF2      none: it was not run, so that there is nothing of it in the log",
+        "EKF2      "
+        + ("px4fuse's model of it" if scenario.ekf2 else "none: there is nothing of it in the log"),
     ]

@@ -20,6 +20,7 @@ MAX_IMU_INTERVAL_S = 0.012
 # The first release that stamps estimator_states with the time of the horizon
 STAMPED_AT_HORIZON = "PX4 v1.13"
 NO_LIMIT = 1_000_000
+MAX_LEG_S = 0.25
 
 
 @dataclass(frozen=True)
@@ -71,6 +72,8 @@ class Inputs:
         Whether EKF2 took its height from vision.
     imu_offset_m : ndarray, shape (3,)
         EKF2_IMU_POS, body FRD.
+    max_leg_s : float
+        Height and heading are measured at least this often where vision is silent.
     """
 
     settings: dict[str, float]
@@ -82,6 +85,7 @@ class Inputs:
     predict_s: float
     vision_height: bool
     imu_offset_m: Array
+    max_leg_s: float = MAX_LEG_S
 
 
 def prepare(flight: Flight) -> Inputs | Unavailable:  # noqa: PLR0911 (a reason each)

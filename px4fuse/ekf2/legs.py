@@ -32,8 +32,6 @@ GRAVITY_M_S2 = np.array([0.0, 0.0, 9.80665])  # CONSTANTS_ONE_G
 STATES = 15
 THETA, VELOCITY, POSITION = slice(0, 3), slice(3, 6), slice(6, 9)
 GYRO_BIAS, ACCELEROMETER_BIAS = slice(9, 12), slice(12, 15)
-# Height and heading are measured at least this often where vision is silent
-MAX_LEG_S = 0.25
 # A sample that is this much older than the horizon when it arrives is never fused
 # (RingBuffer.h, pop_first_older_than)
 MAX_LATE_S = 0.1
@@ -195,7 +193,7 @@ def _events(inputs: Inputs, stretch: Stretch, timing: Timing) -> _Events:
     # further events where vision is silent, as many for every delay
     before = np.concatenate([[stretch.time_s[0]], stamp])
     after = np.concatenate([stamp, [stretch.time_s[-1]]])
-    more = np.maximum(np.ceil((after - before) / MAX_LEG_S).astype(int) - 1, 0)
+    more = np.maximum(np.ceil((after - before) / inputs.max_leg_s).astype(int) - 1, 0)
     total = len(chosen) + int(more.sum())
     place = np.cumsum(more[:-1] + 1) - 1
     ends = np.full(total, -1, dtype=np.intp)
@@ -231,11 +229,11 @@ def _actions(
     popped = np.flatnonzero(usable)
     if not len(popped):
         return action, startable
-    interval = np.diff(taken_s[popped], prepend=taken_s[popped[0]])
+    interval = np.diff(taken_s[popped], prepend=-np.inf)
     startable[popped] = interval < rules.start_interval_s
     # the last step before this sample was fused, and how old the sample before was then
     silence = stretch.time_s[end[popped] - 1] - np.concatenate([[np.inf], taken_s[popped[:-1]]])
-    running = True  # a stretch begins while EKF2 fuses
+    running = stretch.fusing
     for at, (gap, silent) in enumerate(zip(interval.tolist(), silence.tolist(), strict=True)):
         running = running and not silent > rules.stop_s
         if running:

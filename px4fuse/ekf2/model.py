@@ -40,6 +40,7 @@ from px4fuse.flight import STATE_COLUMNS, Flight, Unavailable
 Array = NDArray[np.float64]
 
 MAX_HORIZON_S = 1.0  # EKF2_DELAY_MAX
+HORIZONTAL_POSITION, HORIZONTAL_VELOCITY = slice(6, 8), slice(3, 5)
 
 
 @dataclass(frozen=True)
@@ -224,7 +225,7 @@ def _assemble(
 def _updates(part: StretchRun, at: int) -> pd.DataFrame:
     legs, done = part.legs[part.which[at]], part.run
     seen = np.flatnonzero(np.isfinite(done.innovation_m[:, at, 0]))
-    after = done.position_variance_m2[seen + 1, at]
+    after = done.variance[seen + 1, at]
     values = np.column_stack(
         [
             done.innovation_m[seen, at],
@@ -232,8 +233,8 @@ def _updates(part: StretchRun, at: int) -> pd.DataFrame:
             done.rejected[seen, at],
             done.fused[seen, at],
             done.reset[seen, at],
-            after,
-            done.velocity_variance_m2_s2[seen + 1, at],
+            after[:, HORIZONTAL_POSITION],
+            after[:, HORIZONTAL_VELOCITY],
             done.noise_m2[seen, at],
             part.stretch.time_s[legs.end[seen]],
         ]

@@ -109,8 +109,8 @@ class Run:
     rejected, fused, reset : ndarray of bool, shape (E, S)
     state : ndarray, shape (E + 1, S, 15)
         At the start and after each event.
-    position_variance_m2, velocity_variance_m2_s2 : ndarray, shape (E + 1, S, 2)
-        After each event.
+    variance : ndarray, shape (E + 1, S, 15)
+        Likewise.
     covariance : ndarray, shape (S, 15, 15)
         At the end.
     """
@@ -122,8 +122,7 @@ class Run:
     fused: Flags
     reset: Flags
     state: Array
-    position_variance_m2: Array
-    velocity_variance_m2_s2: Array
+    variance: Array
     covariance: Array
 
 
@@ -184,8 +183,7 @@ def run(  # noqa: PLR0915 (one recursion, read from top to bottom)
         np.zeros((events, size), bool),
         np.zeros((events, size), bool),
         np.empty((events + 1, size, STATES)),
-        np.empty((events + 1, size, 2)),
-        np.empty((events + 1, size, 2)),
+        np.empty((events + 1, size, STATES)),
         np.empty((size, STATES, STATES)),
     )
     innovation, R = np.empty((size, 4)), np.empty((size, 4))
@@ -350,10 +348,7 @@ def with_correlation(inputs: Inputs, stretch: Stretch, legs: Legs) -> Stretch:
 
 def _keep(out: Run, at: int, x: Array, P: Array) -> None:
     out.state[at] = x
-    out.position_variance_m2[at, :, 0] = P[:, NORTH, NORTH]
-    out.position_variance_m2[at, :, 1] = P[:, EAST, EAST]
-    out.velocity_variance_m2_s2[at, :, 0] = P[:, 3, 3]
-    out.velocity_variance_m2_s2[at, :, 1] = P[:, 4, 4]
+    out.variance[at] = np.diagonal(P, axis1=1, axis2=2)
 
 
 def _start(stretch: Stretch, biases: Flags, attitude: Flags) -> tuple[Array, Array]:

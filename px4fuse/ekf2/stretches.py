@@ -36,6 +36,7 @@ from px4fuse.flight import (
     FusionRecord,
     Unavailable,
 )
+from px4fuse.readers.px4_ekf2 import samples_per_step
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -86,6 +87,8 @@ class Stretch:
         Of EKF2's own filter at its horizon, against the nominal attitude.
     correlation : ndarray, shape (15, 15)
         Of the state at the start; the log has variances only.
+    fusing : bool
+        Whether EKF2 fuses vision when it begins.
     """
 
     time_s: Array
@@ -102,6 +105,7 @@ class Stretch:
     down_variance_m2: Array
     attitude_error_rad: Array
     correlation: Array
+    fusing: bool = True
 
 
 def find_stretches(
@@ -177,7 +181,7 @@ def _stretch(
     accelerometer_bias = start[ACCELEROMETER_BIAS_COLUMNS].to_numpy(dtype=np.float64)
     rate = imu[ANGULAR_RATE_COLUMNS].to_numpy()[from_row + 1 : to_row] - gyro_bias
     force = imu[SPECIFIC_FORCE_COLUMNS].to_numpy()[from_row + 1 : to_row] - accelerometer_bias
-    turn, gain = _down_sampled(rate * interval[:, None], force * interval[:, None], ends)
+    turn, gain = down_sampled(rate * interval[:, None], force * interval[:, None], ends)
     step_time = time[np.concatenate([[0], ends])]
     step = np.diff(step_time)
     gyro = running_product(np.concatenate([[[1.0, 0.0, 0.0, 0.0]], from_vector(turn)]))
@@ -237,8 +241,8 @@ def _at(series: pd.Series, times: Array) -> Array:
 def step_ends(interval_s: Array, known: Indices, target_s: float) -> Indices:
     """Where EKF2's prediction steps end: after how many IMU intervals from the start.
 
-    A step is complete after round(target / interval) samples, or as soon as it is longer than the
-    target. Ends that the log shows set the count again.
+    A step is complete after :func:`samples_per_step`, or as soon as it is longer than the target.
+    Ends that the log shows set the count again.
 
     Parameters
     ----------
@@ -254,7 +258,7 @@ def step_ends(interval_s: Array, known: Indices, target_s: float) -> Indices:
     ndarray of int
         The last is at most n.
     """
-    needed = max(1, round(target_s / float(np.median(interval_s))))
+    needed = samples_per_step(target_s, float(np.median(interval_s)))
     early = np.flatnonzero(np.convolve(interval_s, np.ones(max(needed - 1, 1)), "valid") > target_s)
     ends: list[NDArray[np.intp]] = []
     shown = set(known.tolist())
@@ -281,7 +285,7 @@ def _counted(interval_s: Array, needed: int, target_s: float) -> list[int]:
     return ends
 
 
-def _down_sampled(turn: Array, gain: Array, ends: Indices) -> tuple[Array, Array]:
+def down_sampled(turn: Array, gain: Array, ends: Indices) -> tuple[Array, Array]:
     """Turn and velocity gained in each step, the gain in the body's frame at the step's end."""
     starts = np.concatenate([[0], ends[:-1]])
     turned = np.concatenate([np.zeros((1, 3)), np.cumsum(turn, axis=0)])

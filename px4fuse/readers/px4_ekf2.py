@@ -232,7 +232,17 @@ def _step_s(topics: Topics) -> float:
     if not len(intervals):
         return target
     interval = float(np.median(intervals))
-    return round(target / interval) * interval if interval < target else target
+    return samples_per_step(target, interval) * interval if interval < target else target
+
+
+def samples_per_step(target_s: float, interval_s: float) -> int:
+    """IMU samples that EKF2 gathers for a prediction: the nearest whole number, halves up.
+
+    >>> samples_per_step(0.010, 0.00375), samples_per_step(0.010, 0.004)
+    (3, 3)
+    """
+    # stamps in µs: an interval of 4 ms must not fall to either side by rounding
+    return max(int(target_s / interval_s + 0.5 + 1e-6), 1)
 
 
 def _read_accelerometer_bias(topics: Topics, instances: Instances) -> pd.DataFrame | Unavailable:

@@ -43,6 +43,8 @@ AT_MEASUREMENT = "autopilot boot clock, at measurement"
 AT_PUBLICATION = "autopilot boot clock, at publication"
 MAX_READS = 2_000_000
 RELEASE = 255
+# An info message in which a log says of itself what whoever reads it must know
+NOTE_KEY = "px4fuse_note"
 # A gap longer than this in the IMU's stamps is no dropout: what lies beyond is another boot.
 MAX_DATA_GAP_S = 600.0
 ACCELEROMETER_OFFSET_INVALID_US = 0x7FFFFFFF
@@ -221,6 +223,8 @@ def read_topics(path: Path) -> Topics:
     if not tables:
         names = sorted({topic for topic, _ in placed})
         notes += (f"none of its topics is one that px4fuse uses (it holds {_listed(names)})",)
+    if NOTE_KEY in ulog.msg_info_dict:
+        notes += (_text(ulog.msg_info_dict, NOTE_KEY, ""),)
     zero_us, end_us = _data_span(placed, name)
     log = LogInfo(
         name=name,

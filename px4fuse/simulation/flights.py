@@ -14,8 +14,8 @@ from px4fuse.flight import Flight, LogInfo
 from px4fuse.plain import plain
 from px4fuse.readers import ulog
 from px4fuse.readers.px4_topics import IMU, PARAMETERS
-from px4fuse.readers.ulog_topics import Topics
-from px4fuse.simulation import sensors
+from px4fuse.readers.ulog_topics import NOTE_KEY, Topics
+from px4fuse.simulation import ekf2, sensors
 from px4fuse.simulation.mistakes import MISTAKES, Mistakes, as_typed, made
 from px4fuse.simulation.motion import Motion, plan
 from px4fuse.simulation.scenario import Scenario
@@ -64,10 +64,14 @@ def simulate(scenario: Scenario, mistakes: Mistakes = NO_MISTAKES) -> Simulation
     for name in made(mistakes):
         if MISTAKES[name].kind not in ("", scenario.kind):
             raise SettingsError(f"--mistake {name} requires --kind {MISTAKES[name].kind}.")
+        if MISTAKES[name].of_ekf2 and not scenario.ekf2:
+            raise SettingsError(f"--mistake {name} is one of EKF2's: leave out --no-ekf2.")
     motion = plan(scenario, mistakes, sensors.stream(scenario, sensors.Stream.WANDER))
     positions = sensors.positions(scenario, mistakes, motion)
+    imu = sensors.imu(scenario, mistakes, motion)
+    parameters = _parameters(scenario, mistakes)
     topics = [
-        sensors.imu(scenario, mistakes, motion),
+        sensors.logged_imu(imu, mistakes, motion),
         sensors.logged_attitude(scenario, motion),
         sensors.land_detector(motion),
     ]
@@ -78,9 +82,10 @@ def simulate(scenario: Scenario, mistakes: Mistakes = NO_MISTAKES) -> Simulation
     for topic in topics:
         if len(topic.fields["timestamp"]) < 2:
             raise SettingsError(f"with these mistakes nothing is left of {topic.name}.")
-    return Simulation(
-        scenario, mistakes, motion, positions, tuple(topics), _parameters(scenario, mistakes)
-    )
+    if scenario.ekf2:
+        standing = sensors.at_rest(scenario, mistakes, motion, ekf2.REST_S)
+        topics += ekf2.fly(scenario, motion, imu, positions.topic, parameters, standing)
+    return Simulation(scenario, mistakes, motion, positions, tuple(topics), parameters)
 
 
 def simulate_flight(scenario: Scenario, mistakes: Mistakes = NO_MISTAKES) -> Flight:
@@ -97,6 +102,7 @@ def to_ulog(simulation: Simulation) -> bytes:
         "sys_name": "PX4",
         "ver_hw": HARDWARE,
         "ver_sw_release": RELEASE,
+        **({NOTE_KEY: ekf2.NOTE} if simulation.scenario.ekf2 else {}),
     }
     topics = simulation.topics
     if simulation.scenario.truth:
@@ -126,24 +132,27 @@ def to_flight(simulation: Simulation, name: str = "simulation.ulg") -> Flight:
                 for key in PARAMETERS
                 if key in simulation.parameters
             },
+            notes=(ekf2.NOTE,) if simulation.scenario.ekf2 else (),
         ),
         tables=tables,
         zero_us=int(stamps[0]),
         dropped={},
+        ekf2_parameters={
+            key: float(np.float32(value))
+            for key, value in simulation.parameters.items()
+            if key.startswith("EKF2_")
+        },
     )
     return ulog.to_flight(topics)
 
 
 def _parameters(scenario: Scenario, mistakes: Mistakes) -> dict[str, int | float]:
     return {
-        "EKF2_EN": 0,  # there is no EKF2 in this simulation
-        "EKF2_EVP_GATE": 5.0,
-        "EKF2_EVP_NOISE": sensors.reported_sigma_m(scenario, mistakes),
+        **ekf2.parameters(sensors.reported_sigma_m(scenario, mistakes), mistakes),
+        "EKF2_EN": int(scenario.ekf2),
         "EKF2_EV_CTRL": 1,
-        "EKF2_EV_DELAY": 0.0,
-        "EKF2_EV_NOISE_MD": 0,
         "EKF2_GPS_CTRL": 0,
-        "EKF2_HGT_REF": 3,
+        "EKF2_HGT_REF": 0,
         "SDLOG_PROFILE": PROFILE_DEFAULT if mistakes.no_vvo else PROFILE_WITH_VISION,
     }
 

@@ -71,6 +71,9 @@ class Mistakes:
         The loop ends this far before its start.
     no_vvo : bool
         The position source is not logged.
+    ekf2_noise_m, ekf2_delay_s, ekf2_gate : float
+        EKF2_EVP_NOISE, EKF2_EV_DELAY and EKF2_EVP_GATE as flown; a noise of 0 leaves it as the
+        source reports it.
     """
 
     clock_offset_s: float = 0.0
@@ -95,6 +98,9 @@ class Mistakes:
     no_motion: bool = False
     open_end_m: float = 0.0
     no_vvo: bool = False
+    ekf2_noise_m: float = 0.0
+    ekf2_delay_s: float = 0.0
+    ekf2_gate: float = 5.0
 
 
 @dataclass(frozen=True)
@@ -126,6 +132,8 @@ class Mistake:
         The field that a mistake without arguments sets.
     kind : str
         The only kind of flight that it applies to, empty for both.
+    of_ekf2 : bool
+        Whether it is in EKF2's own parameters.
     """
 
     arguments: tuple[Argument, ...]
@@ -134,6 +142,7 @@ class Mistake:
     finding: str
     switch: str = ""
     kind: str = ""
+    of_ekf2: bool = False
 
     @property
     def usage(self) -> str:
@@ -265,6 +274,29 @@ MISTAKES: Mapping[str, Mistake] = MappingProxyType({
         "vehicle_visual_odometry is not logged, as with SDLOG_PROFILE 1.",
         "No position source in the log: set SDLOG_PROFILE to 129.",
         switch="no_vvo",
+    ),
+    "ekf2-noise": Mistake(
+        (Argument("ekf2_noise_m", "METRES", METRES, 0.01, 100.0),),
+        0.02,
+        "EKF2_EVP_NOISE is this.",
+        "Below the source's noise EKF2's NIS is far above 1 and it rejects good samples; above it "
+        "NIS is far below 1.",
+        of_ekf2=True,
+    ),
+    "ekf2-delay": Mistake(
+        (Argument("ekf2_delay_s", "SECONDS", SECONDS, 0.0, 0.3),),
+        0.175,
+        "EKF2_EV_DELAY is this, while the stamps are right.",
+        "EKF2 takes positions for older than they are, so that its track runs ahead of the truth; "
+        "set EKF2_EV_DELAY to 0.",
+        of_ekf2=True,
+    ),
+    "ekf2-gate": Mistake(
+        (Argument("ekf2_gate", "SD", NUMBER, 1.0, 1000.0),),
+        1.0,
+        "EKF2_EVP_GATE is this: samples further off than so many √S are rejected.",
+        "EKF2 rejects samples that fit: NIS is about 1 and yet many are rejected.",
+        of_ekf2=True,
     ),
 })  # fmt: skip
 

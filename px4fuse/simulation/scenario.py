@@ -85,10 +85,13 @@ class Scenario:
     gyro_noise_rad_s : float
         Of a single sample.
     tilt_error_deg, yaw_error_deg : float
-        Root mean square of the slow error (periods of 20 to 60 s) of the logged attitude.
+        Root mean square of the slow error (periods of 20 to 60 s) of the logged attitude, whose
+        heading EKF2 is given too.
     imu_rate_hz, attitude_rate_hz, truth_rate_hz : float
     truth : bool
         Whether the log holds the ground truth.
+    ekf2 : bool
+        Whether px4fuse's model of EKF2 flies along.
     seed : int
         Decides everything random; each sensor draws from a stream of its own, so that a mistake
         in one leaves the noise of the others as it was.
@@ -124,6 +127,7 @@ class Scenario:
     attitude_rate_hz: float = 50.0
     truth_rate_hz: float = 50.0
     truth: bool = True
+    ekf2: bool = True
     seed: int = 1
 
     def __post_init__(self) -> None:

@@ -47,6 +47,8 @@ class Stream(IntEnum):
     DRIFT = 6
     NLOS = 7
     VIBRATION = 8
+    HEIGHT = 9
+    REST = 10
 
 
 def stream(scenario: Scenario, name: Stream) -> np.random.Generator:
@@ -88,7 +90,7 @@ def biases(scenario: Scenario, mistakes: Mistakes) -> tuple[Array, Array]:
 
 
 def imu(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> Topic:
-    """sensor_combined: the accelerometer's and the gyro's own samples."""
+    """sensor_combined, complete: the accelerometer's and the gyro's own samples."""
     time_us = _grid_us(motion.duration_s, scenario.imu_rate_hz)
     truth = attitude(motion.at(_seconds(time_us)))
     bias_a, bias_g = biases(scenario, mistakes)
@@ -101,20 +103,16 @@ def imu(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> Topic:
     if mistakes.vibration_m_s2:
         sigma = mistakes.vibration_m_s2 * np.sqrt(DT_S * scenario.imu_rate_hz)
         force += sigma * stream(scenario, Stream.VIBRATION).standard_normal(shape)
-    keep = _outside_gap(
-        _seconds(time_us), mistakes.imu_dropout_s, mistakes.imu_dropout_at_s, motion.duration_s
-    )
-    keep &= thinned(_seconds(time_us), mistakes.imu_rate_hz)
-    count = int(np.count_nonzero(keep))
+    count = len(time_us)
     interval_us = round(1e6 / scenario.imu_rate_hz)
     return Topic(
         "sensor_combined",
         {
-            "timestamp": _boot(time_us[keep]),
-            "gyro_rad": rate[keep].astype(np.float32),
+            "timestamp": _boot(time_us),
+            "gyro_rad": rate.astype(np.float32),
             "gyro_integral_dt": np.full(count, interval_us, np.uint32),
             "accelerometer_timestamp_relative": np.zeros(count, np.int32),
-            "accelerometer_m_s2": force[keep].astype(np.float32),
+            "accelerometer_m_s2": force.astype(np.float32),
             "accelerometer_integral_dt": np.full(count, interval_us, np.uint32),
             "accelerometer_clipping": np.zeros(count, np.uint8),
             "gyro_clipping": np.zeros(count, np.uint8),
@@ -122,25 +120,53 @@ def imu(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> Topic:
     )
 
 
+def logged_imu(complete: Topic, mistakes: Mistakes, motion: Motion) -> Topic:
+    """sensor_combined as the logger keeps it."""
+    time_s = (complete.fields["timestamp"].astype(np.int64) - START_US) * 1e-6
+    keep = _outside_gap(
+        time_s, mistakes.imu_dropout_s, mistakes.imu_dropout_at_s, motion.duration_s
+    ) & thinned(time_s, mistakes.imu_rate_hz)
+    return Topic(complete.name, {name: values[keep] for name, values in complete.fields.items()})
+
+
+def at_rest(
+    scenario: Scenario, mistakes: Mistakes, motion: Motion, time_s: float
+) -> tuple[Array, Array]:
+    """Mean of accelerometer (m/s²) and gyro (rad/s) over some time of standing before the log."""
+    truth = attitude(motion.at(np.zeros(1)))
+    bias_a, bias_g = biases(scenario, mistakes)
+    rng = stream(scenario, Stream.REST)
+    share = 1.0 / np.sqrt(time_s * scenario.imu_rate_hz)
+    force = truth.specific_force_m_s2[0] + bias_a
+    force += share * scenario.accelerometer_noise_m_s2 * rng.standard_normal(3)
+    rate = truth.angular_rate_rad_s[0] + bias_g
+    return force, rate + share * scenario.gyro_noise_rad_s * rng.standard_normal(3)
+
+
 def logged_attitude(scenario: Scenario, motion: Motion) -> Topic:
     """vehicle_attitude: the truth with a small slow error, as of a good estimator without EKF2."""
     time_us = _grid_us(motion.duration_s, scenario.attitude_rate_hz)
     truth = attitude(motion.at(_seconds(time_us))).body_to_ned
     error = attitude_error(scenario, _seconds(time_us)).as_matrix()
-    return _attitude_topic("vehicle_attitude", time_us, ATTITUDE_LATENCY_US, error @ truth)
+    return attitude_topic(
+        "vehicle_attitude", time_us, ATTITUDE_LATENCY_US, quaternions(error @ truth)
+    )
 
 
 def true_attitude(scenario: Scenario, motion: Motion) -> Topic:
     """vehicle_attitude_groundtruth."""
     time_us = _grid_us(motion.duration_s, scenario.truth_rate_hz)
     truth = attitude(motion.at(_seconds(time_us))).body_to_ned
-    return _attitude_topic("vehicle_attitude_groundtruth", time_us, 0, truth)
+    return attitude_topic("vehicle_attitude_groundtruth", time_us, 0, quaternions(truth))
 
 
-def _attitude_topic(
-    name: str, time_us: NDArray[np.int64], late_us: int, body_to_ned: Array
-) -> Topic:
-    quaternion = Rotation.from_matrix(body_to_ned).as_quat(scalar_first=True)
+def quaternions(body_to_ned: Array) -> Array:
+    """Rotation matrices as w, x, y, z."""
+    return np.asarray(Rotation.from_matrix(body_to_ned).as_quat(scalar_first=True))
+
+
+def attitude_topic(name: str, time_us: NDArray[np.int64], late_us: int, quaternion: Array) -> Topic:
+    """An attitude from its quaternions, shape (n, 4), published so much later."""
     return Topic(
         name,
         {
@@ -324,7 +350,7 @@ def _odometry(
     unknown = np.full((count, 3), np.nan, np.float32)
     quaternion = np.full((count, 4), np.nan)
     if body_to_ned is not None:
-        quaternion = Rotation.from_matrix(body_to_ned).as_quat(scalar_first=True)
+        quaternion = quaternions(body_to_ned)
     return Topic(
         "vehicle_visual_odometry",
         {

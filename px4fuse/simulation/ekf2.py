@@ -1,0 +1,461 @@
+"""What EKF2 makes of a simulated flight, by px4fuse's own model of it, as PX4 v1.16 logs it.
+
+The model is :mod:`px4fuse.ekf2`, run forward from its own beginning instead of from a log: PX4's
+initial variances, levelled at rest, then IMU and vision as simulated. Height and heading are not
+part of that model; a slow error about the truth stands in for barometer and magnetometer. The
+model is linear about an attitude, here the true one: what the gyro measures beyond it enters as a
+turn, so that nothing of the truth reaches the estimate. The log's vehicle_attitude is not made by
+it, so that what a student's filter is fed with does not depend on EKF2's parameters; the model's
+own attitude is in estimator_states.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from px4fuse.arrays import Array, BoolArray, IntArray
+from px4fuse.ekf2.inputs import Inputs, Rules
+from px4fuse.ekf2.legs import (
+    ACCELEROMETER_BIAS,
+    GRAVITY_M_S2,
+    GYRO_BIAS,
+    POSITION,
+    STATES,
+    THETA,
+    VELOCITY,
+)
+from px4fuse.ekf2.model import StretchRun, delayed_states, run_variants
+from px4fuse.ekf2.output_predictor import follow_attitude, publish
+from px4fuse.ekf2.parameters import PARAMETERS as MODEL_PARAMETERS
+from px4fuse.ekf2.parameters import settings_in_force
+from px4fuse.ekf2.recursion import EAST, HEADING, NORTH, Variant
+from px4fuse.ekf2.rotation import (
+    conjugate,
+    from_vector,
+    multiply,
+    running_product,
+    skew,
+    to_vector,
+)
+from px4fuse.ekf2.stretches import Stretch, down_sampled, step_ends
+from px4fuse.ekf2.vision import Vision
+from px4fuse.simulation import sensors
+from px4fuse.simulation.mistakes import Mistakes
+from px4fuse.simulation.motion import Motion, Sines, attitude
+from px4fuse.simulation.scenario import Scenario
+from px4fuse.simulation.ulog_writer import Topic
+
+NOTE = "EKF2 in this log is px4fuse's model of EKF2, run on the simulated sensors, not PX4's EKF2"
+PREDICT_US = 10_000  # EKF2_PREDICT_US
+# v1.14 to main: EV_MAX_INTERVAL (ev_control.cpp), reset_timeout_max (common.h)
+RULES = Rules(0.2, 0.4, 1.0, 5, None, horizon_by_delay=False)
+# EKF2_NOAID_TOUT: without aiding for longer EKF2 stays where it is (fake_pos_control.cpp)
+NO_AIDING_S = 5.0
+# EKF2_ANGERR_INIT, _GBIAS_INIT, _ABIAS_INIT, _GPS_V_NOISE and _GPS_P_NOISE (covariance.cpp)
+INITIAL_SD = np.repeat([0.1, 0.3, 0.5, 0.1, 0.2], 3)
+# What EKF2 takes from standing still before the log begins, and for how long: the standard
+# deviations that v1.16 logs on the ground are 0.0005 rad/s, 0.06 m/s and 0.17 m/s² (horizontal)
+REST_S = 10.0
+REST_SD = np.repeat([0.05, 0.0005, 0.06], 3)
+# Of heading and height as v1.16 logs them, and of what stands in for the barometer
+HEADING_SD_RAD, HEIGHT_SD_M = 0.03, 0.05
+HEIGHT_ERROR_M = 0.03
+# Fine enough that variances are logged between the samples of a UWB too
+MAX_LEG_S = 0.1
+# Rates (Hz) of v1.16 (logged_topics.cpp), where estimator_aid_src_ev_pos is logged at full rate as
+# in PX4's own simulation
+STATES_HZ, LOCAL_POSITION_HZ, FLAGS_HZ = 2.0, 10.0, 1.0
+PUBLISHED_LATER_US = 100
+
+
+@dataclass(frozen=True)
+class Track:
+    """What the model did, at the end of each prediction step, shape (n + 1, ...).
+
+    Attributes
+    ----------
+    time_us : ndarray of int
+        Since the first data.
+    lag : int
+        Steps from the fusion horizon to what is published.
+    delayed_attitude, delayed : ndarray
+        Quaternions, and velocity, position and both biases at the horizon, by the time that they
+        are of.
+    velocity_m_s, position_m : ndarray
+        Published.
+    resets : tuple of (int, ndarray)
+        Step in which the published position jumped, and by how much (m, north and east).
+    aided : ndarray of bool
+        Whether vision was fused lately enough for a position.
+    """
+
+    time_us: IntArray
+    lag: int
+    delayed_attitude: Array
+    delayed: Array
+    velocity_m_s: Array
+    position_m: Array
+    resets: tuple[tuple[int, Array], ...]
+    aided: BoolArray
+
+
+def parameters(source_sigma_m: float, mistakes: Mistakes) -> dict[str, int | float]:
+    """EKF2's parameters as flown: all that its model has, by PX4 name."""
+    known = {name: each.default for name, each in MODEL_PARAMETERS.items()}
+    return known | {
+        "EKF2_EVP_NOISE": mistakes.ekf2_noise_m or source_sigma_m,
+        "EKF2_EVP_GATE": mistakes.ekf2_gate,
+        "EKF2_EV_DELAY": mistakes.ekf2_delay_s * 1e3,
+        "EKF2_EV_NOISE_MD": 1,
+        # a source that is slow to arrive has been allowed for
+        "EKF2_DELAY_MAX": max(known["EKF2_DELAY_MAX"], 100.0 + 1e3 * mistakes.clock_jump_s),
+        "EKF2_PREDICT_US": PREDICT_US,
+    }
+
+
+def fly(
+    scenario: Scenario,
+    motion: Motion,
+    imu: Topic,
+    source: Topic,
+    flown: Mapping[str, int | float],
+    at_rest: tuple[Array, Array],
+) -> tuple[Topic, ...]:
+    """EKF2's topics of a flight, those that it had anything to say in.
+
+    Parameters
+    ----------
+    scenario : Scenario
+    motion : Motion
+    imu, source : Topic
+        As EKF2 received them, whatever of them is logged.
+    flown : mapping
+        Parameters of the log.
+    at_rest : (ndarray, ndarray), each of shape (3,)
+        What accelerometer (m/s²) and gyro (rad/s) measure on average before the log begins.
+    """
+    stretch, time_us, nominal = _stretch(scenario, motion, imu, at_rest)
+    settings = settings_in_force({name: float(np.float32(v)) for name, v in flown.items()})
+    step_s = float(np.median(stretch.step_s))
+    length = int(np.ceil(settings["EKF2_DELAY_MAX"] * 1e3 / PREDICT_US))
+    inputs = Inputs(
+        settings=settings,
+        stretches=(stretch,),
+        vision=_vision(source),
+        rules=RULES,
+        step_s=step_s,
+        horizon_s=(length - 1) * step_s,
+        predict_s=PREDICT_US * 1e-6,
+        vision_height=False,
+        imu_offset_m=np.zeros(3),
+        max_leg_s=MAX_LEG_S,
+    )
+    done = run_variants(inputs, [Variant(settings)], {})[0]
+    track = _track(inputs, done, time_us, nominal)
+    topics = (
+        _local_position(track),
+        _states(done, track),
+        _aid_source(inputs, done, track),
+        _flags(inputs, done, track),
+    )
+    return tuple(topic for topic in topics if len(topic.fields["timestamp"]))
+
+
+def _stretch(
+    scenario: Scenario, motion: Motion, imu: Topic, at_rest: tuple[Array, Array]
+) -> tuple[Stretch, IntArray, Array]:
+    """The whole flight in prediction steps about the true attitude, and that attitude."""
+    time_us = imu.fields["timestamp"].astype(np.int64) - sensors.START_US
+    interval = np.diff(time_us) * 1e-6
+    ends = step_ends(interval, np.array([], dtype=np.intp), PREDICT_US * 1e-6)
+    rate, force = (
+        imu.fields[name][1:].astype(np.float64) * interval[:, None]
+        for name in ("gyro_rad", "accelerometer_m_s2")
+    )
+    turn, gain = down_sampled(rate, force, ends)
+    step_us = time_us[np.concatenate([[0], ends])]
+    time = step_us * 1e-6
+    rotation = attitude(motion.at(time)).body_to_ned
+    nominal = sensors.quaternions(rotation)
+    gyro = running_product(np.concatenate([nominal[:1], from_vector(turn)]))
+    beyond = multiply(nominal, conjugate(gyro))
+    rng = sensors.stream(scenario, sensors.Stream.HEIGHT)
+    height = Sines.draw(
+        rng, np.array([HEIGHT_ERROR_M]), sensors.ATTITUDE_PERIODS_S, sensors.ATTITUDE_SINES
+    )
+    error = np.zeros((len(time), 3))
+    error[:, HEADING] = sensors.attitude_error(scenario, time).as_rotvec()[:, HEADING]
+    state, covariance = _standing(rotation[0], *at_rest, float(error[0, HEADING]))
+    variance = np.diagonal(covariance).copy()
+    deviation = np.sqrt(variance)
+    return (
+        Stretch(
+            time_s=time,
+            step_s=np.diff(time),
+            rotation=rotation,
+            correction_rad=to_vector(multiply(beyond[1:], conjugate(beyond[:-1]))),
+            force_m_s2=gain / np.diff(time)[:, None],
+            gyro_bias_rad_s=np.zeros(3),
+            accelerometer_bias_m_s2=np.zeros(3),
+            state=state,
+            variance=variance,
+            down_m=motion.at(time).position_m[:, 2] + height.at(time)[0][:, 0],
+            heading_variance_rad2=np.full(len(time), HEADING_SD_RAD**2),
+            down_variance_m2=np.full(len(time), HEIGHT_SD_M**2),
+            attitude_error_rad=error,
+            correlation=covariance / deviation[:, None] / deviation,
+            fusing=False,
+        ),
+        step_us,
+        nominal,
+    )
+
+
+def _standing(
+    rotation: Array, force_m_s2: Array, rate_rad_s: Array, heading_error_rad: float
+) -> tuple[Array, Array]:
+    """State and covariance when the log begins: PX4's initial ones, told that it stands still.
+
+    Standing still, specific force is -g and rotation is nought, up to the biases; the first levels
+    the attitude and ties tilt to accelerometer bias.
+    """
+    H = np.zeros((9, STATES))
+    H[0:3, THETA] = -skew(rotation @ force_m_s2)
+    H[0:3, ACCELEROMETER_BIAS] = -rotation
+    H[3:6, GYRO_BIAS] = np.eye(3)
+    H[6:9, VELOCITY] = np.eye(3)
+    measured = np.concatenate([-GRAVITY_M_S2 - rotation @ force_m_s2, rate_rad_s, np.zeros(3)])
+    P = np.diag(INITIAL_SD**2)
+    x = np.zeros(STATES)
+    P[HEADING, HEADING], x[HEADING] = HEADING_SD_RAD**2, heading_error_rad
+    K = P @ H.T @ np.linalg.inv(H @ P @ H.T + np.diag(REST_SD**2))
+    x += K @ (measured - H @ x)
+    x[HEADING] = heading_error_rad
+    P -= K @ H @ P
+    return x, 0.5 * (P + P.T)
+
+
+def _vision(source: Topic) -> Vision:
+    """The samples in the order of their arrival, without those that are older than the one before.
+
+    EKF2 takes no sample that is not newer than the last (estimator_interface.cpp).
+    """
+    stamp, arrival = (
+        (source.fields[name].astype(np.int64) - sensors.START_US) * 1e-6
+        for name in ("timestamp_sample", "timestamp")
+    )
+    newest = np.maximum.accumulate(np.concatenate([[-np.inf], stamp[:-1]]))
+    kept = stamp > newest
+    return Vision(
+        stamp_s=stamp[kept],
+        arrival_s=arrival[kept],
+        position_m=source.fields["position"][kept].astype(np.float64),
+        variance_m2=source.fields["position_variance"][kept].astype(np.float64),
+        rejected=np.full(int(kept.sum()), np.nan),
+        reset=np.zeros(int(kept.sum()), dtype=bool),
+        source=source.name,
+    )
+
+
+def _track(inputs: Inputs, done: StretchRun, time_us: IntArray, nominal: Array) -> Track:
+    stretch, settings = done.stretch, inputs.settings
+    lag = round(inputs.horizon_s / inputs.step_s)
+    state, _ = delayed_states(done, 0)
+    resets, aided = _held(done, state)
+    moved = np.zeros((len(state), 3))
+    for step, jump in resets:
+        moved[step:, :2] += jump
+    # the newest IMU samples are corrected with the biases of the horizon
+    biases = np.concatenate([np.repeat(state[:1, 9:15], lag, axis=0), state[:-lag, 9:15]])[1:]
+    gyro = np.einsum("nij,nj->ni", stretch.rotation[1:], biases[:, :3])
+    turned = -stretch.correction_rad - gyro * stretch.step_s[:, None]
+    free = state[0, THETA] + np.concatenate([np.zeros((1, 3)), np.cumsum(turned, axis=0)])
+    ours = free + follow_attitude(state[:, THETA] - free, lag, inputs.step_s, inputs.horizon_s)
+    force = np.einsum("nij,nj->ni", stretch.rotation[1:], stretch.force_m_s2 - biases[:, 3:])
+    force = force + np.cross(ours[1:], force)
+    velocity, position = publish(
+        gain_m_s=(force + GRAVITY_M_S2) * stretch.step_s[:, None],
+        step_s=stretch.step_s,
+        velocity_m_s=state[:, VELOCITY],
+        position_m=state[:, POSITION],
+        reset_m=moved,
+        lag=lag,
+        tau_velocity_s=settings["EKF2_TAU_VEL"],
+        tau_position_s=settings["EKF2_TAU_POS"],
+    )
+    return Track(
+        time_us=time_us,
+        lag=lag,
+        delayed_attitude=multiply(from_vector(state[:, THETA]), nominal),
+        delayed=state[:, 3:],
+        velocity_m_s=velocity,
+        position_m=position,
+        resets=tuple((step + lag, jump) for step, jump in resets),
+        aided=aided,
+    )
+
+
+def _held(done: StretchRun, state: Array) -> tuple[list[tuple[int, Array]], BoolArray]:
+    """Resets by step, and where there is aiding; without it for long the position stays.
+
+    EKF2 then fuses a position of its own making. The model has none: ``state`` is held in place.
+    """
+    legs, run, time = done.legs[0], done.run, done.stretch.time_s
+    horizontal = slice(NORTH, EAST + 1)
+    used = np.flatnonzero(run.fused[:, 0] | run.reset[:, 0])
+    last = np.zeros(len(time))
+    last[legs.end[used]] = time[legs.end[used]]
+    aided = time - np.maximum.accumulate(last) <= NO_AIDING_S
+    first = np.flatnonzero(np.diff(aided.astype(int)) == -1) + 1
+    beyond = np.flatnonzero(np.diff(aided.astype(int)) == 1) + 1
+    for start, end in zip(first, [*beyond, len(time)][: len(first)], strict=True):
+        state[start:end, horizontal] = state[start - 1, horizontal]
+        state[start:end, VELOCITY.start : VELOCITY.start + 2] = 0.0
+    resets = []
+    for event in np.flatnonzero(run.reset[:, 0]):
+        step = int(legs.end[event])
+        jump = run.innovation_m[event, 0]
+        if not aided[step - 1]:
+            jump = state[step, horizontal] - state[step - 1, horizontal]
+        resets.append((step, jump))
+    return resets, aided
+
+
+def _local_position(track: Track) -> Topic:
+    rows = np.flatnonzero(sensors.thinned(track.time_us * 1e-6, LOCAL_POSITION_HZ))
+    steps = np.array([step for step, _ in track.resets], dtype=np.intp)
+    jumps = np.array([[0.0, 0.0], *(jump for _, jump in track.resets)])
+    count = np.searchsorted(steps, rows, side="right")
+    fields = _stamped(track.time_us[rows], PUBLISHED_LATER_US)
+    for names, values in (
+        (("x", "y", "z"), track.position_m),
+        (("vx", "vy", "vz"), track.velocity_m_s),
+    ):
+        fields |= {name: values[rows, i].astype(np.float32) for i, name in enumerate(names)}
+    fields["delta_xy"] = jumps[count].astype(np.float32)
+    fields["delta_z"] = np.zeros(len(rows), np.float32)
+    fields["delta_vxy"] = np.zeros((len(rows), 2), np.float32)
+    fields["delta_vz"] = np.zeros(len(rows), np.float32)
+    unknown = np.full(len(rows), np.nan)
+    fields |= {"ref_lat": unknown, "ref_lon": unknown, "ref_alt": unknown.astype(np.float32)}
+    aided = track.aided[np.maximum(rows - track.lag, 0)]
+    for name in ("xy_valid", "v_xy_valid"):
+        fields[name] = aided
+    for name in ("z_valid", "v_z_valid"):
+        fields[name] = np.ones(len(rows), np.bool_)
+    fields["xy_reset_counter"] = (count % 256).astype(np.uint8)
+    for name in ("z_reset_counter", "vxy_reset_counter", "vz_reset_counter"):
+        fields[name] = np.zeros(len(rows), np.uint8)
+    return Topic("vehicle_local_position", fields)
+
+
+def _states(done: StretchRun, track: Track) -> Topic:
+    """estimator_states of v1.16: 25 states with 24 covariances, positions as 0."""
+    end = done.legs[0].end
+    events = np.flatnonzero(np.diff(end, prepend=0) > 0)
+    events = events[end[events] < len(track.time_us) - track.lag]
+    events = events[sensors.thinned(track.time_us[end[events]] * 1e-6, STATES_HZ)]
+    rows = end[events]
+    states = np.zeros((len(rows), 25), np.float32)
+    states[:, 0:4] = track.delayed_attitude[rows]
+    states[:, 4:16] = track.delayed[rows]
+    states[:, 7:9] = 0.0  # horizontally kept as latitude and longitude
+    covariances = np.zeros((len(rows), 24), np.float32)
+    covariances[:, :STATES] = done.run.variance[events + 1, 0]
+    return Topic(
+        "estimator_states",
+        {
+            **_stamped(track.time_us[rows], _horizon_us(track, rows)),
+            "states": states,
+            "covariances": covariances,
+            "n_states": np.full(len(rows), 24, np.uint8),
+        },
+    )
+
+
+def _aid_source(inputs: Inputs, done: StretchRun, track: Track) -> Topic:
+    """estimator_aid_src_ev_pos: a message for every sample that came in time."""
+    legs, run = done.legs[0], done.run
+    seen = np.flatnonzero(legs.usable & (legs.end < len(track.time_us) - track.lag))
+    rows = legs.end[seen]
+    horizontal = slice(NORTH, EAST + 1)
+    innovation, variance = run.innovation_m[seen, 0], run.variance_m2[seen, 0]
+    noise = run.noise_m2[seen, 0]
+    measured = inputs.vision.position_m[legs.sample[seen], :2]
+    idle = np.isnan(innovation[:, 0])
+    # while it is not fused, against the state that there is
+    innovation = np.where(
+        idle[:, None], measured - track.delayed[rows][:, POSITION][:, :2], innovation
+    )
+    variance = np.where(idle[:, None], run.variance[seen + 1, 0, horizontal] + noise, variance)
+    gate = max(inputs.settings["EKF2_EVP_GATE"], 1.0)
+    used = np.where(run.fused[seen, 0] | run.reset[seen, 0], track.time_us[rows], -1)
+    last = np.maximum.accumulate(used)
+    taken_us = np.rint(legs.time_s[seen] * 1e6).astype(np.int64)
+    later_us = track.time_us[rows] + _horizon_us(track, rows) - taken_us
+    return Topic(
+        "estimator_aid_src_ev_pos",
+        {
+            **_stamped(taken_us, later_us),
+            "time_last_fuse": np.where(last >= 0, sensors.START_US + last, 0).astype(np.uint64),
+            "observation": measured.astype(np.float32),
+            "observation_variance": noise.astype(np.float32),
+            "innovation": (-innovation).astype(np.float32),
+            "innovation_variance": variance.astype(np.float32),
+            "test_ratio": (innovation**2 / (gate**2 * variance)).astype(np.float32),
+            "innovation_rejected": run.rejected[seen, 0],
+            "fused": run.fused[seen, 0],
+        },
+    )
+
+
+def _flags(inputs: Inputs, done: StretchRun, track: Track) -> Topic:
+    """estimator_status_flags: once a second, and when fusion of vision starts or stops."""
+    legs, run, time = done.legs[0], done.run, done.stretch.time_s
+    tried = np.flatnonzero(run.fused[:, 0] | run.rejected[:, 0] | run.reset[:, 0])
+    on = np.zeros(len(time), np.bool_)
+    stops = np.append(time[legs.end[tried]], np.inf)[1:]
+    for step, stop in zip(legs.end[tried].tolist(), stops.tolist(), strict=True):
+        until = time[step] + inputs.rules.stop_s
+        on[step : int(np.searchsorted(time, min(stop, until)))] = True
+    changed = np.diff(on.astype(int), prepend=0) != 0
+    kept = changed | sensors.thinned(time, FLAGS_HZ)
+    rows = np.flatnonzero(kept[: len(time) - track.lag])
+    always, never = np.ones(len(rows), np.bool_), np.zeros(len(rows), np.bool_)
+    return Topic(
+        "estimator_status_flags",
+        {
+            **_stamped(track.time_us[rows], _horizon_us(track, rows)),
+            "control_status_changes": np.cumsum(changed)[rows].astype(np.uint32),
+            "cs_tilt_align": always,
+            "cs_yaw_align": always,
+            "cs_gnss_pos": never,
+            "cs_opt_flow": never,
+            "cs_mag_hdg": always,
+            "cs_baro_hgt": always,
+            "cs_ev_pos": on[rows],
+            "cs_ev_yaw": never,
+            "cs_ev_hgt": never,
+            "cs_ev_vel": never,
+        },
+    )
+
+
+def _horizon_us(track: Track, rows: IntArray) -> NDArray[np.int64]:
+    """How much later what the filter did in a step is published."""
+    later: NDArray[np.int64] = track.time_us[rows + track.lag] - track.time_us[rows]
+    return later
+
+
+def _stamped(
+    time_us: NDArray[np.int64], later_us: int | NDArray[np.int64]
+) -> dict[str, NDArray[Any]]:
+    return {
+        "timestamp": (sensors.START_US + time_us + later_us).astype(np.uint64),
+        "timestamp_sample": (sensors.START_US + time_us).astype(np.uint64),
+    }
