@@ -246,7 +246,7 @@ def _vision(source: Topic) -> Vision:
     EKF2 takes no sample that is not newer than the last (estimator_interface.cpp).
     """
     stamp, arrival = (
-        (source.fields[name].astype(np.int64) - sensors.START_US) * 1e-6
+        (source.fields[name].astype(np.float64) - sensors.START_US) * 1e-6
         for name in ("timestamp_sample", "timestamp")
     )
     newest = np.maximum.accumulate(np.concatenate([[-np.inf], stamp[:-1]]))
@@ -327,7 +327,9 @@ def _held(done: StretchRun, state: Array) -> tuple[list[tuple[int, Array]], Bool
 
 
 def _local_position(track: Track) -> Topic:
-    rows = np.flatnonzero(sensors.thinned(track.time_us * 1e-6, LOCAL_POSITION_HZ))
+    rows = np.flatnonzero(
+        sensors.thinned(track.time_us.astype(np.float64) * 1e-6, LOCAL_POSITION_HZ)
+    )
     steps = np.array([step for step, _ in track.resets], dtype=np.intp)
     jumps = np.array([[0.0, 0.0], *(jump for _, jump in track.resets)])
     count = np.searchsorted(steps, rows, side="right")
@@ -359,7 +361,9 @@ def _states(done: StretchRun, track: Track) -> Topic:
     end = done.legs[0].end
     events = np.flatnonzero(np.diff(end, prepend=0) > 0)
     events = events[end[events] < len(track.time_us) - track.lag]
-    events = events[sensors.thinned(track.time_us[end[events]] * 1e-6, STATES_HZ)]
+    events = events[
+        sensors.thinned(track.time_us[end[events]].astype(np.float64) * 1e-6, STATES_HZ)
+    ]
     rows = end[events]
     states = np.zeros((len(rows), 25), np.float32)
     states[:, 0:4] = track.delayed_attitude[rows]

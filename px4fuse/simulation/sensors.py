@@ -122,7 +122,7 @@ def imu(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> Topic:
 
 def logged_imu(complete: Topic, mistakes: Mistakes, motion: Motion) -> Topic:
     """sensor_combined as the logger keeps it."""
-    time_s = (complete.fields["timestamp"].astype(np.int64) - START_US) * 1e-6
+    time_s = (complete.fields["timestamp"].astype(np.float64) - START_US) * 1e-6
     keep = _outside_gap(
         time_s, mistakes.imu_dropout_s, mistakes.imu_dropout_at_s, motion.duration_s
     ) & thinned(time_s, mistakes.imu_rate_hz)
