@@ -20,6 +20,7 @@ from test_noise_findings import NAMED_HERE
 
 from px4fuse import findings as package
 from px4fuse.comparison.comparison import Comparison, compare
+from px4fuse.ekf2.model import MODEL_NOTE
 from px4fuse.filter.consistency import MIN_INNOVATIONS
 from px4fuse.filter.kalman import Settings
 from px4fuse.findings import DETECTORS, SEVERITIES, Finding, find, phrases
@@ -307,6 +308,12 @@ FAULTS = [
         {"ekf2": Estimator(every=3)},
         evidence={"logged": 200.0, "measurements": 600.0},
         remedy="estimator_aid_src_ev_pos 0",
+    ),
+    Fault(
+        "ekf2_is_a_model",
+        "info",
+        says="not PX4's EKF2",
+        change=with_log(notes=(MODEL_NOTE,)),
     ),
     Fault("ekf2_unavailable", "warning", {"ekf2": None}, remedy="Log EKF2"),
     # the position source

@@ -397,7 +397,13 @@ class TestMistakes:
         assert np.abs(hovering.motion.at(time).position_m[:, :2]).max() < 0.2
 
     def test_no_vvo_leaves_no_source(self):
-        flight = to_flight(simulate(AISLE, parse(["no-vvo"])))
+        kept = to_flight(simulate(AISLE, parse(["no-vvo"]))).positions
+        assert {track.name for track in kept} <= {
+            "estimator_aid_src_ev_pos",
+            "ekf2_state_plus_innovation",
+        }
+        assert {round(track.rate_hz) for track in kept} == {2}
+        flight = to_flight(simulate(dataclasses.replace(AISLE, ekf2=False), parse(["no-vvo"])))
         assert flight.positions == ()
         assert flight.log.parameters["SDLOG_PROFILE"] == 1.0
         with pytest.raises(px4fuse.Px4FuseError, match="SDLOG_PROFILE"):
@@ -537,6 +543,10 @@ def test_reader_gives_the_flight_that_is_made_in_memory(scenario, texts, tmp_pat
         elif isinstance(a, Truth):
             assert a.name == b.name
             pd.testing.assert_frame_equal(a.samples, b.samples, check_exact=True)
+        elif part.name == "ekf2":
+            pd.testing.assert_frame_equal(a.state, b.state, check_exact=True)
+            pd.testing.assert_frame_equal(a.variance, b.variance, check_exact=True)
+            assert (a.resets, a.horizon_s, a.gate) == (b.resets, b.horizon_s, b.gate)
         elif part.name == "positions":
             for one, other in zip(a, b, strict=True):
                 pd.testing.assert_frame_equal(one.samples, other.samples, check_exact=True)
@@ -560,16 +570,20 @@ def test_pyulog_reads_it(tmp_path):
     ulog = ULog(str(path))
     assert not ulog.file_corruption
     assert {data.name for data in ulog.data_list} == {
+        "estimator_aid_src_ev_pos",
+        "estimator_states",
+        "estimator_status_flags",
         "sensor_combined",
         "vehicle_attitude",
         "vehicle_attitude_groundtruth",
         "vehicle_land_detected",
+        "vehicle_local_position",
         "vehicle_local_position_groundtruth",
         "vehicle_visual_odometry",
     }
     assert ulog.msg_info_dict["ver_hw"] == "px4fuse simulation"
     assert ulog.msg_info_dict["sys_name"] == "PX4"
-    assert ulog.initial_parameters["EKF2_EN"] == 0
+    assert ulog.initial_parameters["EKF2_EN"] == 1
     odometry = ulog.get_dataset("vehicle_visual_odometry").data
     norm = np.linalg.norm([odometry[f"q[{i}]"] for i in range(4)], axis=0)
     assert np.allclose(norm, 1.0, atol=1e-6)
@@ -628,12 +642,11 @@ def test_ideal_flights_are_consistent_as_often_as_chance_has_it():
 
 
 @pytest.mark.parametrize("scenario", [Scenario(seed=7, passes=4), LOOP], ids=["aisle", "loop"])
-def test_clean_flight_has_one_finding_that_there_is_no_ekf2(scenario):
+def test_clean_flight_has_one_finding_that_its_ekf2_is_a_model(scenario):
     settings = Settings(sigma_a_m_s2=0.2, sigma_z_m=scenario.source_sigma_m)
     compared = px4fuse.compare(simulate_flight(scenario), settings)
     findings = find(unexplained(compared))
-    assert [finding.id for finding in findings] == ["ekf2_unavailable"]
-    assert "EKF2 did not run" in findings[0].message
+    assert [finding.id for finding in findings] == ["ekf2_is_a_model"]
     for axis in compared.axes:
         assert axis.kf_truth.position_rmse_m < (0.12 if scenario.kind == "aisle" else 0.7)
 
@@ -670,7 +683,7 @@ def test_command_writes_log_and_answer(tmp_path):
     result = run("-o", log, *options, "--answer", told)
     assert result.exit_code == 0, result.output
     assert "nlos=5%,2m" in result.output
-    assert "EKF2      none" in result.output
+    assert "EKF2      px4fuse's model of it" in result.output
     first = log.read_bytes()
     content = json.loads(told.read_text(encoding="utf-8"))
     assert set(content["mistakes"]) == {"nlos", "clock-offset"}

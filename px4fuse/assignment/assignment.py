@@ -120,7 +120,7 @@ class Choice:
 
 
 # Clock and heading are estimated from the IMU. A gap of the IMU is not among the choices: it passes
-# for a change of the clock in every second flight.
+# for a change of the clock in every second flight. Outliers make EKF2 reject and its NIS grow too.
 NEED_IMU = ("clock", "frame")
 CHOICES: dict[Kind, tuple[Choice, ...]] = {
     "aisle": (
@@ -132,6 +132,9 @@ CHOICES: dict[Kind, tuple[Choice, ...]] = {
         Choice("nlos", "source_outliers", "outliers", 2, 6, "%"),
         Choice("dropout", "source_gap", "gap", 3, 8, "s", at_s=(30, 70)),
         Choice("imu-rate", "logging_rate_low", "rate", 15, 25, "Hz", hides=NEED_IMU),
+        Choice("ekf2-noise", "ekf2_variance_understated", "ekf2", 2, 3, "cm", hides=("outliers",)),
+        Choice("ekf2-gate", "ekf2_rejecting", "ekf2", 1.5, 2, "", hides=("outliers",)),
+        Choice("ekf2-delay", "ekf2_ev_delay_wrong", "clock", 175, 200, "ms"),
     ),
     "loop": (Choice("open-end", "false_loop_closure", "end", 5, 8, "m"),),
 }

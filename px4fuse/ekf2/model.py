@@ -39,6 +39,10 @@ from px4fuse.flight import STATE_COLUMNS, Flight, Unavailable
 
 Array = NDArray[np.float64]
 
+# Where a log's EKF2 is this model (simulated flights), the log says so in these words
+MODEL_NOTE = (
+    "EKF2 in this log is px4fuse's model of EKF2, run on the simulated sensors, not PX4's EKF2"
+)
 MAX_HORIZON_S = 1.0  # EKF2_DELAY_MAX
 HORIZONTAL_POSITION, HORIZONTAL_VELOCITY = slice(6, 8), slice(3, 5)
 

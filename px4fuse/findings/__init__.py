@@ -21,6 +21,7 @@ from px4fuse.findings import (
     ekf2_ev_delay_wrong,
     ekf2_innovations_decimated,
     ekf2_instance_switch,
+    ekf2_is_a_model,
     ekf2_not_fusing,
     ekf2_rejecting,
     ekf2_resets,
@@ -133,4 +134,5 @@ DETECTORS: tuple[Detector[Analysis], ...] = (
     not_px4.DETECTOR,
     receipt_out_of_order.DETECTOR,
     innovations_need_ulog.DETECTOR,
+    ekf2_is_a_model.DETECTOR,
 )

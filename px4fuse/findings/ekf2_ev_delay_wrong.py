@@ -43,4 +43,5 @@ DETECTOR = Detector(
         "ekf2_ev_delay_wrong": "ekf2_ev_delay, ev_delay, delay, clock offset, time offset, "
         "stamp late, stamp early, latency",
     },
+    {"ekf2_ev_delay_wrong": ("--mistake ekf2-delay=120ms", "--mistake ekf2-delay=175ms")},
 )

@@ -5,7 +5,7 @@ from __future__ import annotations
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.comparison import Comparison
 from px4fuse.findings.model import Detector, Finding, Found, Threshold, step_share
-from px4fuse.flight import EXTERNAL_VISION_RUNGS, Unavailable
+from px4fuse.flight import EXTERNAL_VISION_RUNGS, Ekf2, FusionRecord, Unavailable
 
 FUSING_SHARE_ERROR = Threshold(
     0.5, "of the segment", "below, EKF2's track is mostly not the source's"
@@ -13,6 +13,8 @@ FUSING_SHARE_ERROR = Threshold(
 FUSING_SHARE_WARNING = Threshold(0.98, "of the segment", "one second in a flight of a minute")
 EV_START_INTERVAL = Threshold(0.2, "s", "EV_MAX_INTERVAL, PX4 v1.14 and later, ev_control.cpp")
 EV_STOP_INTERVAL = Threshold(0.4, "s", "two times EV_MAX_INTERVAL, ev_pos_control.cpp")
+
+MAX_LATE = Threshold(0.1, "s", "older than that by the horizon, no sample is fused: RingBuffer.h")
 
 
 def _detect(analysis: Analysis) -> Found:
@@ -71,6 +73,14 @@ def _cause(comparison: Comparison, interval: float) -> tuple[str, str]:
             f"EKF2_AID_MASK is {mask:.0f}, bit 3 (vision position) is not set",
             f"Set EKF2_AID_MASK to {int(mask) | 8}.",
         )
+    age, horizon = _age_s(comparison), _horizon_s(comparison)
+    if age > horizon + MAX_LATE.value:
+        return (
+            f"its samples arrive {age:.2f} s after their stamps, and EKF2 keeps no more than "
+            f"{horizon:.2f} s",
+            "Check the source's clock (stamps that are too early look late), then raise "
+            "EKF2_DELAY_MAX (v1.15 and later).",
+        )
     # the rate of a reconstructed source is the logger's, not its own
     own_rate = control is not None and not comparison.source.reconstructed
     if own_rate and interval > EV_START_INTERVAL.value:
@@ -81,6 +91,24 @@ def _cause(comparison: Comparison, interval: float) -> tuple[str, str]:
             "Send the UWB position at 10 Hz; 5 Hz starts only thanks to jitter.",
         )
     return "the log does not show why", "Check EKF2_EV_CTRL (EKF2_AID_MASK before v1.14)."
+
+
+def _age_s(comparison: Comparison) -> float:
+    """Time (s) from a sample's stamp to its arrival, less what EKF2 takes off; NaN if unknown."""
+    ekf2 = comparison.flight.ekf2
+    record = ekf2.record if isinstance(ekf2, Ekf2) else None
+    if not isinstance(record, FusionRecord) or record.vision_age_s.empty:
+        return float("nan")
+    age = record.vision_age_s.loc[comparison.segment.start_s : comparison.segment.end_s]
+    delay_ms = comparison.flight.log.parameters.get("EKF2_EV_DELAY", 0.0)
+    return float(age.median() + delay_ms * 1e-3)
+
+
+def _horizon_s(comparison: Comparison) -> float:
+    ekf2 = comparison.flight.ekf2
+    if not isinstance(ekf2, Ekf2) or isinstance(ekf2.horizon_s, Unavailable):
+        return float("nan")
+    return ekf2.horizon_s
 
 
 DETECTOR = Detector(

@@ -38,4 +38,6 @@ def _detect(analysis: Analysis) -> Found:
         )
 
 
-DETECTOR = Detector(_detect, {"ekf2_rejecting": "reject"})
+DETECTOR = Detector(
+    _detect, {"ekf2_rejecting": "reject"}, {"ekf2_rejecting": ("--mistake ekf2-gate=2",)}
+)

@@ -183,5 +183,6 @@ DETECTOR = Detector(
     {
         "kf_variance_overstated": ("sigma_z_m=0.3",),
         "kf_variance_understated": ("sigma_z_m=0.03",),
+        "ekf2_variance_understated": ("--mistake ekf2-noise=4cm", "--mistake ekf2-noise=3cm"),
     },
 )

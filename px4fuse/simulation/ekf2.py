@@ -50,7 +50,6 @@ from px4fuse.simulation.motion import Motion, Sines, attitude
 from px4fuse.simulation.scenario import Scenario
 from px4fuse.simulation.ulog_writer import Topic
 
-NOTE = "EKF2 in this log is px4fuse's model of EKF2, run on the simulated sensors, not PX4's EKF2"
 PREDICT_US = 10_000  # EKF2_PREDICT_US
 # v1.14 to main: EV_MAX_INTERVAL (ev_control.cpp), reset_timeout_max (common.h)
 RULES = Rules(0.2, 0.4, 1.0, 5, None, horizon_by_delay=False)
@@ -67,8 +66,9 @@ HEADING_SD_RAD, HEIGHT_SD_M = 0.03, 0.05
 HEIGHT_ERROR_M = 0.03
 # Fine enough that variances are logged between the samples of a UWB too
 MAX_LEG_S = 0.1
-# Rates (Hz) of v1.16 (logged_topics.cpp), where estimator_aid_src_ev_pos is logged at full rate as
-# in PX4's own simulation
+# Rates (Hz) of v1.16 (logged_topics.cpp). PX4's own simulation logs estimator_aid_src_ev_pos at
+# full rate, a vehicle only at this one
+VEHICLE_AID_SOURCE_HZ = 2.0
 STATES_HZ, LOCAL_POSITION_HZ, FLAGS_HZ = 2.0, 10.0, 1.0
 PUBLISHED_LATER_US = 100
 
@@ -125,6 +125,7 @@ def fly(
     source: Topic,
     flown: Mapping[str, int | float],
     at_rest: tuple[Array, Array],
+    aid_source_hz: float = 0.0,
 ) -> tuple[Topic, ...]:
     """EKF2's topics of a flight, those that it had anything to say in.
 
@@ -138,6 +139,8 @@ def fly(
         Parameters of the log.
     at_rest : (ndarray, ndarray), each of shape (3,)
         What accelerometer (m/s²) and gyro (rad/s) measure on average before the log begins.
+    aid_source_hz : float
+        To what estimator_aid_src_ev_pos is thinned; 0 leaves it.
     """
     stretch, time_us, nominal = _stretch(scenario, motion, imu, at_rest)
     settings = settings_in_force({name: float(np.float32(v)) for name, v in flown.items()})
@@ -160,7 +163,7 @@ def fly(
     topics = (
         _local_position(track),
         _states(done, track),
-        _aid_source(inputs, done, track),
+        _aid_source(inputs, done, track, aid_source_hz),
         _flags(inputs, done, track),
     )
     return tuple(topic for topic in topics if len(topic.fields["timestamp"]))
@@ -246,7 +249,7 @@ def _vision(source: Topic) -> Vision:
     EKF2 takes no sample that is not newer than the last (estimator_interface.cpp).
     """
     stamp, arrival = (
-        (source.fields[name].astype(np.float64) - sensors.START_US) * 1e-6
+        sensors.seconds(source.fields[name].astype(np.int64) - sensors.START_US)
         for name in ("timestamp_sample", "timestamp")
     )
     newest = np.maximum.accumulate(np.concatenate([[-np.inf], stamp[:-1]]))
@@ -327,9 +330,7 @@ def _held(done: StretchRun, state: Array) -> tuple[list[tuple[int, Array]], Bool
 
 
 def _local_position(track: Track) -> Topic:
-    rows = np.flatnonzero(
-        sensors.thinned(track.time_us.astype(np.float64) * 1e-6, LOCAL_POSITION_HZ)
-    )
+    rows = np.flatnonzero(sensors.thinned(sensors.seconds(track.time_us), LOCAL_POSITION_HZ))
     steps = np.array([step for step, _ in track.resets], dtype=np.intp)
     jumps = np.array([[0.0, 0.0], *(jump for _, jump in track.resets)])
     count = np.searchsorted(steps, rows, side="right")
@@ -361,9 +362,7 @@ def _states(done: StretchRun, track: Track) -> Topic:
     end = done.legs[0].end
     events = np.flatnonzero(np.diff(end, prepend=0) > 0)
     events = events[end[events] < len(track.time_us) - track.lag]
-    events = events[
-        sensors.thinned(track.time_us[end[events]].astype(np.float64) * 1e-6, STATES_HZ)
-    ]
+    events = events[sensors.thinned(sensors.seconds(track.time_us[end[events]]), STATES_HZ)]
     rows = end[events]
     states = np.zeros((len(rows), 25), np.float32)
     states[:, 0:4] = track.delayed_attitude[rows]
@@ -382,10 +381,11 @@ def _states(done: StretchRun, track: Track) -> Topic:
     )
 
 
-def _aid_source(inputs: Inputs, done: StretchRun, track: Track) -> Topic:
+def _aid_source(inputs: Inputs, done: StretchRun, track: Track, rate_hz: float) -> Topic:
     """estimator_aid_src_ev_pos: a message for every sample that came in time."""
     legs, run = done.legs[0], done.run
     seen = np.flatnonzero(legs.usable & (legs.end < len(track.time_us) - track.lag))
+    seen = seen[sensors.thinned(sensors.seconds(track.time_us[legs.end[seen]]), rate_hz)]
     rows = legs.end[seen]
     horizontal = slice(NORTH, EAST + 1)
     innovation, variance = run.innovation_m[seen, 0], run.variance_m2[seen, 0]

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from px4fuse.ekf2.model import MODEL_NOTE
 from px4fuse.errors import SettingsError
 from px4fuse.flight import Flight, LogInfo
 from px4fuse.plain import plain
@@ -84,7 +85,10 @@ def simulate(scenario: Scenario, mistakes: Mistakes = NO_MISTAKES) -> Simulation
             raise SettingsError(f"with these mistakes nothing is left of {topic.name}.")
     if scenario.ekf2:
         standing = sensors.at_rest(scenario, mistakes, motion, ekf2.REST_S)
-        topics += ekf2.fly(scenario, motion, imu, positions.topic, parameters, standing)
+        aid_source_hz = ekf2.VEHICLE_AID_SOURCE_HZ if mistakes.no_vvo else 0.0
+        topics += ekf2.fly(
+            scenario, motion, imu, positions.topic, parameters, standing, aid_source_hz
+        )
     return Simulation(scenario, mistakes, motion, positions, tuple(topics), parameters)
 
 
@@ -102,7 +106,7 @@ def to_ulog(simulation: Simulation) -> bytes:
         "sys_name": "PX4",
         "ver_hw": HARDWARE,
         "ver_sw_release": RELEASE,
-        **({NOTE_KEY: ekf2.NOTE} if simulation.scenario.ekf2 else {}),
+        **({NOTE_KEY: MODEL_NOTE} if simulation.scenario.ekf2 else {}),
     }
     topics = simulation.topics
     if simulation.scenario.truth:
@@ -132,7 +136,7 @@ def to_flight(simulation: Simulation, name: str = "simulation.ulg") -> Flight:
                 for key in PARAMETERS
                 if key in simulation.parameters
             },
-            notes=(ekf2.NOTE,) if simulation.scenario.ekf2 else (),
+            notes=(MODEL_NOTE,) if simulation.scenario.ekf2 else (),
         ),
         tables=tables,
         zero_us=int(stamps[0]),

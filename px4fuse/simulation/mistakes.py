@@ -272,7 +272,8 @@ MISTAKES: Mapping[str, Mistake] = MappingProxyType({
         (),
         0.0,
         "vehicle_visual_odometry is not logged, as with SDLOG_PROFILE 1.",
-        "No position source in the log: set SDLOG_PROFILE to 129.",
+        "The position source is not in the log, and what EKF2 kept of it stands in, thinned: set "
+        "SDLOG_PROFILE to 129.",
         switch="no_vvo",
     ),
     "ekf2-noise": Mistake(
@@ -295,7 +296,7 @@ MISTAKES: Mapping[str, Mistake] = MappingProxyType({
         (Argument("ekf2_gate", "SD", NUMBER, 1.0, 1000.0),),
         1.0,
         "EKF2_EVP_GATE is this: samples further off than so many √S are rejected.",
-        "EKF2 rejects samples that fit: NIS is about 1 and yet many are rejected.",
+        "EKF2 rejects good samples, loses its track and resets to a sample now and then.",
         of_ekf2=True,
     ),
 })  # fmt: skip

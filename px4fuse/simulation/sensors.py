@@ -92,7 +92,7 @@ def biases(scenario: Scenario, mistakes: Mistakes) -> tuple[Array, Array]:
 def imu(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> Topic:
     """sensor_combined, complete: the accelerometer's and the gyro's own samples."""
     time_us = _grid_us(motion.duration_s, scenario.imu_rate_hz)
-    truth = attitude(motion.at(_seconds(time_us)))
+    truth = attitude(motion.at(seconds(time_us)))
     bias_a, bias_g = biases(scenario, mistakes)
     rng = stream(scenario, Stream.IMU)
     shape = (len(time_us), 3)
@@ -122,7 +122,7 @@ def imu(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> Topic:
 
 def logged_imu(complete: Topic, mistakes: Mistakes, motion: Motion) -> Topic:
     """sensor_combined as the logger keeps it."""
-    time_s = (complete.fields["timestamp"].astype(np.float64) - START_US) * 1e-6
+    time_s = seconds(complete.fields["timestamp"].astype(np.int64) - START_US)
     keep = _outside_gap(
         time_s, mistakes.imu_dropout_s, mistakes.imu_dropout_at_s, motion.duration_s
     ) & thinned(time_s, mistakes.imu_rate_hz)
@@ -146,8 +146,8 @@ def at_rest(
 def logged_attitude(scenario: Scenario, motion: Motion) -> Topic:
     """vehicle_attitude: the truth with a small slow error, as of a good estimator without EKF2."""
     time_us = _grid_us(motion.duration_s, scenario.attitude_rate_hz)
-    truth = attitude(motion.at(_seconds(time_us))).body_to_ned
-    error = attitude_error(scenario, _seconds(time_us)).as_matrix()
+    truth = attitude(motion.at(seconds(time_us))).body_to_ned
+    error = attitude_error(scenario, seconds(time_us)).as_matrix()
     return attitude_topic(
         "vehicle_attitude", time_us, ATTITUDE_LATENCY_US, quaternions(error @ truth)
     )
@@ -156,7 +156,7 @@ def logged_attitude(scenario: Scenario, motion: Motion) -> Topic:
 def true_attitude(scenario: Scenario, motion: Motion) -> Topic:
     """vehicle_attitude_groundtruth."""
     time_us = _grid_us(motion.duration_s, scenario.truth_rate_hz)
-    truth = attitude(motion.at(_seconds(time_us))).body_to_ned
+    truth = attitude(motion.at(seconds(time_us))).body_to_ned
     return attitude_topic("vehicle_attitude_groundtruth", time_us, 0, quaternions(truth))
 
 
@@ -206,7 +206,7 @@ def land_detector(motion: Motion) -> Topic:
 def ground_truth(scenario: Scenario, motion: Motion) -> Topic:
     """vehicle_local_position_groundtruth."""
     time_us = _grid_us(motion.duration_s, scenario.truth_rate_hz)
-    state = motion.at(_seconds(time_us))
+    state = motion.at(seconds(time_us))
     fields: dict[str, NDArray[Any]] = {
         "timestamp": _boot(time_us),
         "timestamp_sample": _boot(time_us),
@@ -391,7 +391,8 @@ def _grid_us(duration_s: float, rate_hz: float) -> NDArray[np.int64]:
     return np.asarray(time_us, dtype=np.int64)
 
 
-def _seconds(time_us: NDArray[np.int64]) -> Array:
+def seconds(time_us: NDArray[np.int64]) -> Array:
+    """Microseconds as seconds."""
     return np.asarray(time_us * 1e-6, dtype=np.float64)
 
 

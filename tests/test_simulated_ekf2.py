@@ -1,0 +1,310 @@
+"""EKF2 of simulated flights against the truth, against its replay, and what it shows."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from click.testing import CliRunner
+from flights import unexplained
+
+from px4fuse.analysis import explain
+from px4fuse.cli import cli
+from px4fuse.comparison.comparison import compare
+from px4fuse.ekf2.model import MODEL_NOTE, open_model, replay_ekf2
+from px4fuse.ekf2.replay import Agreement, Ekf2Replay
+from px4fuse.ekf2.whatif import WhatIf, what_if
+from px4fuse.errors import SettingsError
+from px4fuse.filter.consistency import nis_band
+from px4fuse.filter.kalman import Settings
+from px4fuse.findings import find
+from px4fuse.findings.ekf2_ev_delay_wrong import DETECTOR as DELAY
+from px4fuse.flight import Ekf2, Flight, FusionRecord, Truth, Unavailable
+from px4fuse.readers import read_log
+from px4fuse.readers.px4_ekf2 import samples_per_step
+from px4fuse.simulation import ekf2, sensors
+from px4fuse.simulation.flights import simulate, simulate_flight, to_ulog
+from px4fuse.simulation.mistakes import parse
+from px4fuse.simulation.scenario import Scenario
+
+AISLE = Scenario(passes=3, seed=5)
+RIGHT = Settings(sigma_a_m_s2=0.27, sigma_z_m=0.10)
+
+
+def flown(*texts: str, scenario: Scenario = AISLE) -> Flight:
+    return simulate_flight(scenario, parse(texts))
+
+
+def of(flight: Flight) -> Ekf2:
+    assert isinstance(flight.ekf2, Ekf2)
+    return flight.ekf2
+
+
+def fused(flight: Flight, axis: str = "north") -> pd.DataFrame:
+    """Innovations while airborne."""
+    frame = of(flight).innovations[axis]
+    assert isinstance(frame, pd.DataFrame)
+    assert not isinstance(flight.airborne, Unavailable)
+    start, end = flight.airborne[0]
+    return frame.loc[start:end]
+
+
+def agreement(flight: Flight) -> Agreement:
+    replay = replay_ekf2(flight)
+    assert isinstance(replay, Ekf2Replay), replay
+    assert replay.agreement is not None
+    return replay.agreement
+
+
+def rmse(flight: Flight, start_s: float, end_s: float, column: str = "north_m") -> float:
+    """Of the published position, to the truth."""
+    assert isinstance(flight.truth, Truth)
+    track, truth = of(flight).state.loc[start_s:end_s, column], flight.truth.samples[column]
+    return float(np.sqrt(np.mean((track - np.interp(track.index, truth.index, truth)) ** 2)))
+
+
+def named(flight: Flight) -> set[str]:
+    compared = compare(flight, RIGHT, axes=("north", "east"))
+    return {finding.id for finding in find(unexplained(compared))}
+
+
+@pytest.fixture(scope="module")
+def clean() -> Flight:
+    return flown()
+
+
+@pytest.fixture(scope="module")
+def overconfident() -> Flight:
+    return flown("ekf2-noise=0.02")
+
+
+# --- the model, from take-off
+
+
+def test_a_clean_flight_agrees_with_its_replay_from_the_log(clean: Flight) -> None:
+    found = agreement(clean)
+    assert found.good
+    assert found.same_share == 1.0
+    for axis in found.axes.values():
+        assert axis.innovation_correlation > 0.999
+        assert axis.s_ratio_median == pytest.approx(1.0, abs=0.01)
+        assert (axis.s_ratio_p5, axis.s_ratio_p95) == pytest.approx((1.0, 1.0), abs=0.01)
+        assert axis.position_rms_difference_m < 0.012
+        assert axis.velocity_rms_difference_m_s < 0.03  # vehicle_attitude is not EKF2's
+
+
+@pytest.mark.parametrize(
+    ("texts", "scenario"),
+    [
+        (("nlos=5%",), AISLE),
+        (("dropout=8s",), AISLE),
+        (("ekf2-delay=175ms",), AISLE),
+        ((), Scenario(kind="loop", passes=1, seed=5)),
+    ],
+    ids=["outliers", "dropout", "delay", "loop"],
+)
+def test_flights_with_mistakes_agree_too(texts: tuple[str, ...], scenario: Scenario) -> None:
+    found = agreement(flown(*texts, scenario=scenario))
+    assert found.good
+    assert found.same_share > 0.99
+    for axis in found.axes.values():
+        assert axis.innovation_correlation > 0.99
+        assert axis.s_ratio_median == pytest.approx(1.0, abs=0.01)
+
+
+def test_clean_flights_are_consistent_and_near_the_truth() -> None:
+    values, inside, errors, stated = [], [], [], []
+    for seed in range(20):
+        flight = flown(scenario=Scenario(passes=2, seed=seed))
+        for axis in ("north", "east"):
+            frame = fused(flight, axis)
+            nis = frame["innovation_m"] ** 2 / frame["innovation_variance_m2"]
+            low, high = nis_band(len(frame))
+            values.append(float(nis.mean()))
+            inside.append(low < values[-1] < high)
+            errors.append(rmse(flight, 10.0, 50.0, f"{axis}_m"))
+        variance = of(flight).variance
+        assert isinstance(variance, pd.DataFrame)
+        stated.append(float(np.sqrt(variance["north_m2"].median())))
+    # the heading has an error of 1° that EKF2 takes to be white
+    assert np.mean(values) == pytest.approx(1.0, abs=0.08)
+    assert np.mean(inside) >= 0.85
+    assert np.max(errors) < 0.14  # the UWB alone: 0.10 m, and EKF2 publishes 0.23 s ahead of it
+    assert np.median(stated) == pytest.approx(0.06, abs=0.01)
+
+
+def test_the_horizon_state_is_as_good_as_it_says(clean: Flight) -> None:
+    """Position and velocity at the horizon, their variances, and the biases that it learns."""
+    replay = replay_ekf2(clean)
+    assert isinstance(replay, Ekf2Replay)
+    assert isinstance(clean.truth, Truth)
+    record, truth = of(clean).record, clean.truth.samples
+    assert isinstance(record, FusionRecord)
+    later = record.delayed[record.delayed.index > 15.0]
+    error = later["north_m_s"] - np.interp(later.index, truth.index, truth["north_m_s"])
+    assert 0.5 < np.mean(error**2 / later["north_m2_s2"]) < 2.5
+    bias, gyro_bias = sensors.biases(AISLE, parse([]))
+    last = later.iloc[-1]
+    names = [f"gyro_bias_{axis}_rad_s" for axis in ("forward", "right")]
+    assert last[names].to_numpy(float) == pytest.approx(gyro_bias[:2], abs=0.002)
+    assert last["accelerometer_bias_down_m_s2"] == pytest.approx(bias[2], abs=0.05)
+
+
+def test_where_it_stands_still_the_attitude_is_levelled() -> None:
+    tilt = np.array(
+        [[1.0, 0.0, 0.0], [0.0, np.cos(0.1), -np.sin(0.1)], [0.0, np.sin(0.1), np.cos(0.1)]]
+    )
+    gravity = np.array([0.0, 0.0, 9.80665])
+    bias, rate = np.array([0.03, -0.02, 0.05]), np.array([0.002, -0.001, 0.003])
+    x, P = ekf2._standing(tilt, tilt.T @ -gravity + bias, rate, 0.01)
+    assert x[9:12] == pytest.approx(rate, rel=1e-3)
+    # what is left of the horizontal bias is a tilt that makes up for it
+    force = tilt @ (tilt.T @ -gravity + bias - x[12:15])
+    assert np.cross(x[:3], force) + force == pytest.approx(-gravity, abs=0.01)
+    assert x[14] == pytest.approx(bias[2], abs=0.01)
+    deviation = np.sqrt(np.diag(P))
+    assert deviation[0] * 9.80665 == pytest.approx(0.2, rel=0.1)
+    assert abs(P[0, 13]) / deviation[0] / deviation[13] > 0.95
+
+
+def test_fusion_needs_ten_hertz_stops_and_resets_as_ekf2_does() -> None:
+    slow = flown("decimate=2Hz")
+    fusing = of(slow).fusing
+    assert isinstance(fusing, pd.DataFrame)
+    assert not fusing["horizontal"].any()
+    assert "ekf2_not_fusing" in named(slow)
+    # it stays where it is, instead of drifting away on the IMU
+    assert of(slow).state[["north_m", "east_m"]].abs().max().max() < 5.0
+    gap = flown("dropout=8s,30s")
+    fusing = of(gap).fusing
+    assert isinstance(fusing, pd.DataFrame)
+    off = fusing[fusing["horizontal"] == 0.0].loc[28.0:39.0]
+    assert off.index[0] == pytest.approx(30.4, abs=0.3)
+    resets = [reset for reset in of(gap).resets if reset.time_s > 10.0]
+    assert len(resets) == 1
+    assert 38.2 < resets[0].time_s < 39.2
+    # the step in what is published is the reset that is logged
+    state = of(gap).state["north_m"]
+    at = int(np.searchsorted(state.index, resets[0].time_s))
+    moved = state.iloc[at] - state.iloc[at - 1]
+    assert moved == pytest.approx(resets[0].delta[0], abs=0.3)
+
+
+def test_samples_that_come_too_late_are_never_fused_and_that_is_said() -> None:
+    early = flown("clock-offset=-350ms")
+    compared = compare(early, RIGHT, axes=("north",))
+    (finding,) = (f for f in find(unexplained(compared)) if f.id == "ekf2_not_fusing")
+    assert "arrive 0.38 s after their stamps, and EKF2 keeps no more than 0.23 s" in finding.message
+    assert "EKF2_DELAY_MAX" in finding.remedy
+
+
+def test_a_step_is_the_nearest_number_of_samples() -> None:
+    assert [samples_per_step(0.01, t) for t in (0.00375, 0.004, 0.005, 0.0021, 0.05)] == [
+        3, 3, 2, 5, 1
+    ]  # fmt: skip
+    # a median of stamps is never exactly 4 ms
+    assert samples_per_step(0.01, 0.004 + 1e-12) == samples_per_step(0.01, 0.004 - 1e-12) == 3
+
+
+# --- mistakes of EKF2's own
+
+
+def test_overconfident_ekf2_rejects_and_is_named(overconfident: Flight) -> None:
+    assert fused(overconfident)["rejected"].mean() > 0.3
+    assert {"ekf2_rejecting", "ekf2_variance_understated", "ekf2_resets"} <= named(overconfident)
+    model = open_model(overconfident)
+    assert not isinstance(model, Unavailable)
+    assert model.agreement.good
+    answer = what_if(model, [{"EKF2_EVP_NOISE": 0.1}])
+    assert isinstance(answer, WhatIf)
+    (cured,) = answer.whatif
+    assert cured.rejected_share == 0.0
+    assert cured.axes["north"].nis_mean == pytest.approx(1.0, abs=0.3)
+
+
+def test_a_delay_in_force_is_asked_away() -> None:
+    flight = flown("ekf2-delay=175ms", scenario=Scenario(seed=100))
+    # it takes positions for older than they are: its track runs ahead
+    ahead = rmse(flight, 10.0, 110.0)
+    assert ahead > 1.3 * rmse(flown(scenario=Scenario(seed=100)), 10.0, 110.0)
+    analysis = explain(compare(flight, RIGHT, axes=("north", "east")))
+    (finding,) = DELAY.detect(analysis)
+    assert finding.evidence["ekf2_ev_delay_ms"] == 175.0
+    assert finding.evidence["asked_ms"] == pytest.approx(0.0, abs=60.0)
+    assert "EKF2_EV_DELAY" in finding.remedy
+
+
+def test_a_narrow_gate_rejects_good_samples() -> None:
+    flight = flown("ekf2-gate=2")
+    assert of(flight).gate == 2.0
+    frame = fused(flight)
+    assert 0.05 < frame["rejected"].mean() < 0.5
+    assert "ekf2_rejecting" in named(flight)
+
+
+def test_own_mistakes_leave_everything_else_as_it_was() -> None:
+    plain, own = (
+        {topic.name: topic for topic in simulate(AISLE, parse(texts)).topics}
+        for texts in ([], ["ekf2-noise=0.02", "ekf2-delay=100ms", "ekf2-gate=3"])
+    )
+    without = {topic.name for topic in simulate(replace(AISLE, ekf2=False)).topics}
+    assert set(plain) - without == {
+        "vehicle_local_position", "estimator_states", "estimator_aid_src_ev_pos",
+        "estimator_status_flags",
+    }  # fmt: skip
+    for name in without:
+        for field, values in plain[name].fields.items():
+            assert np.array_equal(values, own[name].fields[field], equal_nan=True)
+    with pytest.raises(SettingsError, match="--no-ekf2"):
+        simulate(replace(AISLE, ekf2=False), parse(["ekf2-noise"]))
+
+
+# --- the log
+
+
+def test_the_log_says_that_it_is_a_model(clean: Flight, tmp_path: Path) -> None:
+    path = tmp_path / "flight.ulg"
+    path.write_bytes(to_ulog(simulate(AISLE)))
+    read = read_log(path)
+    assert read.log.notes == clean.log.notes == (MODEL_NOTE,)
+    assert "ekf2_is_a_model" in named(read)
+    shown = CliRunner().invoke(cli, ["info", str(path)])
+    assert "px4fuse's model of EKF2" in " ".join(shown.output.split())
+    assert MODEL_NOTE in compare(read, RIGHT, axes=("north",)).notes
+    pd.testing.assert_frame_equal(of(read).state, of(clean).state, check_exact=True)
+    pd.testing.assert_frame_equal(fused(read), fused(clean), check_exact=True)
+    one, other = of(read).record, of(clean).record
+    assert isinstance(one, FusionRecord)
+    assert isinstance(other, FusionRecord)
+    assert dict(one.parameters) == dict(other.parameters)
+    pd.testing.assert_frame_equal(one.delayed, other.delayed, check_exact=True)
+
+
+def test_a_log_without_ekf2_has_none_and_no_note(tmp_path: Path) -> None:
+    path = tmp_path / "flight.ulg"
+    told = CliRunner().invoke(
+        cli, ["simulate", "-o", str(path), "--passes", "1", "--no-ekf2"], catch_exceptions=False
+    )
+    assert "EKF2      none" in told.output
+    flight = read_log(path)
+    assert isinstance(flight.ekf2, Unavailable)
+    assert "EKF2_EN is 0" in flight.ekf2.reason
+    assert flight.log.notes == ()
+    assert b"model of EKF2" not in path.read_bytes()
+
+
+def test_rates_are_those_of_v1_16(clean: Flight) -> None:
+    topics = {topic.name: topic.fields for topic in simulate(AISLE).topics}
+    for name, rate_hz in (
+        ("estimator_states", 2.0), ("vehicle_local_position", 10.0),
+        ("estimator_aid_src_ev_pos", 5.0),
+    ):  # fmt: skip
+        stamps = topics[name]["timestamp"].astype(float) * 1e-6
+        assert (len(stamps) - 1) / (stamps[-1] - stamps[0]) == pytest.approx(rate_hz, rel=0.05)
+    assert topics["estimator_states"]["states"].shape[1] == 25
+    assert topics["estimator_states"]["covariances"].shape[1] == 24
+    assert of(clean).horizon_s == pytest.approx(19 * 0.012, abs=1e-9)
+    assert of(clean).step_s == pytest.approx(0.012, abs=1e-9)
