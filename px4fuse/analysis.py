@@ -10,10 +10,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from px4fuse import placing
+from px4fuse.comparison.asked import asked_of_ekf2
 from px4fuse.comparison.comparison import Comparison, compare
 from px4fuse.comparison.why import Why, why_ekf2_differs
 from px4fuse.ekf2.model import Model, open_model
+from px4fuse.ekf2.parameters import check
 from px4fuse.ekf2.replay import Ekf2Replay
+from px4fuse.ekf2.whatif import WhatIf, sweep_values, what_if
 from px4fuse.errors import LogError, MissingDataError, SettingsError
 from px4fuse.filter.clock import ClockOffset, estimate_clock_offset
 from px4fuse.filter.kalman import Settings
@@ -26,7 +29,13 @@ from px4fuse.loop.sources import read_source
 from px4fuse.readers import read_log
 from px4fuse.readers.position_csv import read_position_csv
 from px4fuse.reading import shown
-from px4fuse.request import AUTO, ComparisonRequest, LoopRequest, PositionFile
+from px4fuse.request import (
+    AUTO,
+    ComparisonRequest,
+    LoopRequest,
+    PositionFile,
+    WhatIfRequest,
+)
 
 # What the report shows; each axis by itself is for `px4fuse tune`
 REPORTED = (HORIZONTAL, "down", "aisle")
@@ -219,6 +228,74 @@ def run_loop(request: LoopRequest, progress: Progress = _silent) -> Loop:
         spacing_m=request.key_frames_m,
         progress=progress,
     )
+
+
+@dataclass(frozen=True)
+class Counterfactual:
+    """EKF2 with other parameters.
+
+    Attributes
+    ----------
+    flight : Flight
+    whatif : WhatIf
+        Its ``whatif`` has the changes first, where there are any, then the values of the sweep.
+    changes : mapping from PX4 name to value
+        Empty where only a sweep was asked for.
+    asked : bool
+        Whether the changes are what the data ask for.
+    """
+
+    flight: Flight
+    whatif: WhatIf
+    changes: Mapping[str, float]
+    asked: bool
+
+
+def run_what_if(request: WhatIfRequest, progress: Progress = _silent) -> Counterfactual:
+    """Read a flight and replay its EKF2 with other parameters.
+
+    Parameters
+    ----------
+    request : WhatIfRequest
+    progress : callable
+        Told what is being done.
+
+    Raises
+    ------
+    LogError, MissingDataError, SettingsError
+        A file cannot be read, EKF2 cannot be replayed from it or the replay does not agree with
+        the log, or a parameter is unknown or out of PX4's range.
+    """
+    changes, swept = check(request.changes), request.sweep
+    values: list[float] = []
+    if swept is not None:
+        values = sweep_values(swept.parameter, swept.low, swept.high, swept.count)
+        if swept.parameter in changes:
+            raise SettingsError(f"{swept.parameter}: set and swept. Give one of the two.")
+    recordings = ComparisonRequest(log=request.log, mavlink=request.mavlink, system=request.system)
+    flight = read_flight(recordings, progress)
+    progress("replaying EKF2")
+    model = open_model(flight)
+    if isinstance(model, Unavailable):
+        raise MissingDataError(f"{flight.log.name}: {model}")
+    asked = not changes and swept is None
+    if asked and model.agreement.good:
+        comparison = compare(flight, axes=("north", "east"))
+        tuning = tuned_horizontally(comparison)
+        clock = clock_offset(comparison, tuning, progress)
+        changes = asked_of_ekf2(comparison, model, tuning, clock)
+        if not changes:
+            raise MissingDataError(
+                f"{flight.log.name}: the data do not tell the noise and the delay of what EKF2 "
+                "fused. Say what to change: --set EKF2_EVP_NOISE=0.1."
+            )
+    settings = [changes] if changes else []
+    if swept is not None:
+        settings += [{**changes, swept.parameter: value} for value in values]
+    found = what_if(model, settings)
+    if isinstance(found, Unavailable):
+        raise MissingDataError(f"{flight.log.name}: {found}")
+    return Counterfactual(flight, found, changes, asked)
 
 
 def explain(comparison: Comparison, progress: Progress = _silent) -> Analysis:

@@ -186,7 +186,52 @@ class LoopRequest(
         )
 
 
-Request = ComparisonRequest | LoopRequest
+class Sweep(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Values of one parameter, both ends included; equal ratios above zero, else equal steps."""
+
+    parameter: str
+    low: float
+    high: float
+    count: int = 9
+
+
+class WhatIfRequest(
+    msgspec.Struct,
+    frozen=True,
+    kw_only=True,
+    forbid_unknown_fields=True,
+    tag_field="command",
+    tag="whatif",
+):
+    """A flight whose EKF2 is replayed with other parameters, as ``whatif`` takes it.
+
+    Attributes
+    ----------
+    log : str
+        Path of the ULog; in results its name.
+    mavlink : str or None
+        Path of the MAVLink recording of the same flight.
+    system : int or None
+        MAVLink system id of the vehicle; None for the one with the most data.
+    changes : mapping from PX4 name to value
+        In PX4's units. Empty without a sweep: what the data ask for.
+    sweep : Sweep or None
+        One parameter over several values, the others changed as said.
+    """
+
+    log: str
+    mavlink: str | None = None
+    system: System | None = None
+    changes: dict[str, float] = {}
+    sweep: Sweep | None = None
+
+    def recorded(self) -> WhatIfRequest:
+        """The same with the names of files alone, as results record it."""
+        mavlink = None if self.mavlink is None else _name(self.mavlink)
+        return msgspec.structs.replace(self, log=_name(self.log), mavlink=mavlink)
+
+
+Request = ComparisonRequest | LoopRequest | WhatIfRequest
 
 # The option that gives each field, in the order in which a command line is written
 OPTIONS = {
@@ -230,7 +275,7 @@ def command_line(request: Request, command: str | None = None) -> str:
     ----------
     request : Request
     command : str, optional
-        Of those that take this request; by default ``compare`` or ``loop``.
+        Of those that take this request; by default ``compare``, ``loop`` or ``whatif``.
 
     Returns
     -------
@@ -242,6 +287,15 @@ def command_line(request: Request, command: str | None = None) -> str:
         words = ["px4fuse", command or "loop", recorded.source]
         words += _options(recorded, LOOP_OPTIONS)
         return shlex.join(words if recorded.came_back else [*words, "--open"])
+    if isinstance(recorded, WhatIfRequest):
+        words = ["px4fuse", command or "whatif", recorded.log, *_options(recorded, OPTIONS)]
+        for name, value in recorded.changes.items():
+            words += ["--set", f"{name}={_typed(value)}"]
+        if recorded.sweep is not None:
+            swept = recorded.sweep
+            ends = f"{_typed(swept.low)}:{_typed(swept.high)}:{swept.count}"
+            words += ["--sweep", f"{swept.parameter}={ends}"]
+        return shlex.join(words)
     words = ["px4fuse", command or "compare", recorded.log, *_options(recorded, OPTIONS)]
     if recorded.position is not None:
         words += _options(recorded.position, OPTIONS)

@@ -21,6 +21,7 @@ COMMANDS = {
     "extract": ("px4fuse.cli.extract", "Write a log's data as tidy tables, CSV or Parquet."),
     "tune": ("px4fuse.cli.tune", "Find the noises that the data ask for, with intervals."),
     "sync": ("px4fuse.cli.sync", "Estimate the position source's clock offset."),
+    "whatif": ("px4fuse.cli.whatif", "Say what EKF2 would have done with other parameters."),
     "loop": ("px4fuse.cli.loop", "Measure and correct the closure error of a loop."),
     "evaluate": ("px4fuse.cli.evaluate", "Score a trajectory: ATE and RPE against a reference."),
     "simulate": ("px4fuse.cli.simulate", "Simulate a flight with chosen mistakes, as ULog."),

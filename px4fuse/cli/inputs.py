@@ -251,6 +251,13 @@ def recording_options(command: Callable[..., None]) -> Callable[..., None]:
     return command
 
 
+def flight_options(command: Callable[..., None]) -> Callable[..., None]:
+    """Add the options of commands that read a flight as it was recorded."""
+    for option in reversed((*_RECORDINGS, max_size_option)):
+        command = option(command)
+    return command
+
+
 def analysis_options(command: Callable[..., None]) -> Callable[..., None]:
     """Add the options of every command that runs the filter: settings, segment and recordings."""
     command = recording_options(command)

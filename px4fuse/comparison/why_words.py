@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from px4fuse.comparison.asked import noise_used_m
 from px4fuse.comparison.comparison import Comparison
 from px4fuse.ekf2.model import Model
 from px4fuse.ekf2.walk import (
@@ -67,9 +68,7 @@ class Facts:
     @property
     def noise_used_m(self) -> float:
         """Median √R of EKF2."""
-        updates = self.model.flown.updates
-        columns = ["observation_variance_north_m2", "observation_variance_east_m2"]
-        return float(np.sqrt(updates[columns].to_numpy().mean(axis=1)).mean())
+        return noise_used_m(self.model)
 
     @property
     def too_sure(self) -> bool:

@@ -92,6 +92,21 @@ class Summary:
     late: int = 0
     lost: int = 0
 
+    @property
+    def nis_mean(self) -> float:
+        """Of north and east together."""
+        return float(np.mean([axis.nis_mean for axis in self.axes.values()]))
+
+    @property
+    def position_rmse_to_truth_m(self) -> float | Unavailable:
+        """Horizontal, of what it publishes."""
+        squares = 0.0
+        for axis in self.axes.values():
+            if isinstance(axis.position_rmse_to_truth_m, Unavailable):
+                return axis.position_rmse_to_truth_m
+            squares += axis.position_rmse_to_truth_m**2
+        return float(np.sqrt(squares))
+
 
 @dataclass(frozen=True)
 class WhatIf:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from px4fuse.analysis import Analysis
+from px4fuse.analysis import Analysis, Counterfactual
 from px4fuse.comparison.comparison import Comparison
 from px4fuse.findings import Finding
 from px4fuse.loop.loop import Loop
@@ -47,6 +47,36 @@ class Document:
     def title(self) -> str:
         """Of the PDF."""
         return f"px4fuse compare {self.log[0]}"
+
+
+@dataclass(frozen=True)
+class WhatIfDocument:
+    """A page on EKF2 with other parameters.
+
+    Attributes
+    ----------
+    made_of : Counterfactual
+    command : str
+        The command line that makes it again, without folders.
+    """
+
+    made_of: Counterfactual
+    command: str
+
+    @property
+    def student(self) -> Student:
+        """Nobody: what EKF2 would have done is not handed in."""
+        return Student()
+
+    @property
+    def log(self) -> tuple[str, str]:
+        """Name and SHA-256 of the log."""
+        return self.made_of.flight.log.name, self.made_of.flight.log.sha256
+
+    @property
+    def title(self) -> str:
+        """Of the PDF."""
+        return f"px4fuse whatif {self.log[0]}"
 
 
 @dataclass(frozen=True)

@@ -21,12 +21,14 @@ from px4fuse.report import (
     sensitivity,
     tracks,
     variances,
+    whatif,
     why,
 )
-from px4fuse.report.document import Document, LoopDocument
+from px4fuse.report.document import Document, LoopDocument, WhatIfDocument
 from px4fuse.report.seal import sealed
 from px4fuse.report.style import LEFT, MUTED, RIGHT, printable, report_style, shorten
 
+Report = Document | LoopDocument | WhatIfDocument
 RESULTS_NAME = "results.json"
 PAGES = (
     cover.draw,
@@ -44,12 +46,12 @@ PAGES = (
 LOOP_PAGES = (loop.draw_report, notes.draw, provenance.draw_loop)
 
 
-def render(document: Document | LoopDocument, results_json: str) -> bytes:
+def render(document: Report, results_json: str) -> bytes:
     """Draw the report.
 
     Parameters
     ----------
-    document : Document or LoopDocument
+    document : Document, LoopDocument or WhatIfDocument
     results_json : str
         Attached inside the PDF as ``results.json``, so that the PDF alone can be checked.
 
@@ -70,18 +72,18 @@ def render(document: Document | LoopDocument, results_json: str) -> bytes:
     return _attach(drawn.getvalue(), document, results_json)
 
 
-def _pages(document: Document | LoopDocument) -> Iterator[Figure]:
+def _pages(document: Report) -> Iterator[Figure]:
     if isinstance(document, LoopDocument):
         for draw_loop in LOOP_PAGES:
             yield from draw_loop(document)
+    elif isinstance(document, WhatIfDocument):
+        yield from whatif.draw(document)
     else:
         for draw in PAGES:
             yield from draw(document)
 
 
-def _running_lines(
-    figure: Figure, document: Document | LoopDocument, number: int, count: int
-) -> None:
+def _running_lines(figure: Figure, document: Report, number: int, count: int) -> None:
     """Head and foot of a page: which log, whose, which version, which page."""
     name, sha256 = document.log
     style = {"size": 6.5, "color": MUTED}
@@ -95,7 +97,7 @@ def _running_lines(
     figure.text(RIGHT, 0.022, f"{number} / {count}", ha="right", **style)  # type: ignore[arg-type]
 
 
-def _attach(drawn: bytes, document: Document | LoopDocument, results_json: str) -> bytes:
+def _attach(drawn: bytes, document: Report, results_json: str) -> bytes:
     writer = PdfWriter(clone_from=io.BytesIO(drawn))
     writer.add_attachment(RESULTS_NAME, results_json.encode())
     writer.metadata = {

@@ -29,6 +29,7 @@ from px4fuse.results.parts import (
     copied,
     copied_or_absent,
     found_mistakes,
+    log_part,
     provenance,
     schema_of,
 )
@@ -46,7 +47,7 @@ def results(
     return ComparisonResults(
         schema=schema_of(COMPARISON),
         request=request.recorded(),
-        log=_log(comparison),
+        log=log_part(comparison.flight),
         position_source=_source(comparison),
         settings=_settings(comparison),
         axes={cast(AxisName, axis.axis.name): _axis(axis) for axis in comparison.axes},
@@ -79,7 +80,7 @@ def tuning_results(
     return TuningResults(
         schema=schema_of("px4fuse-tuning"),
         request=request.recorded(),
-        log=_log(comparison),
+        log=log_part(comparison.flight),
         position_source=_source(comparison),
         settings=_settings(comparison),
         tuning={name: _tuned(axis) for name, axis in tuned.items()},
@@ -97,23 +98,11 @@ def sync_results(
     return SyncResults(
         schema=schema_of("px4fuse-sync"),
         request=request.recorded(),
-        log=_log(comparison),
+        log=log_part(comparison.flight),
         position_source=_source(comparison),
         settings=_settings(comparison),
         clock=_clock(clock, comparison.settings.clock_offset_s),
         provenance=provenance(command),
-    )
-
-
-def _log(comparison: Comparison) -> made.Log:
-    log = comparison.flight.log
-    return copied(
-        made.Log,
-        log,
-        dropouts=tuple(copied(made.Dropout, dropout) for dropout in log.dropouts),
-        parameters=dict(log.parameters),
-        joined=tuple(copied(made.JoinedFile, file) for file in comparison.flight.inputs),
-        clocks=tuple(copied(made.ClockMap, clock) for clock in comparison.flight.clocks),
     )
 
 

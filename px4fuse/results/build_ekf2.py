@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from px4fuse.analysis import Counterfactual
 from px4fuse.comparison.why import Why
 from px4fuse.ekf2.replay import Agreement, Ekf2Replay
 from px4fuse.ekf2.whatif import AxisSummary, Summary
 from px4fuse.flight import Unavailable
+from px4fuse.request import WhatIfRequest
 from px4fuse.results import ekf2 as made
+from px4fuse.results.contract import WHATIF, WhatIfResults
 from px4fuse.results.model import Absent
-from px4fuse.results.parts import absent, copied
+from px4fuse.results.parts import absent, copied, log_part, provenance, schema_of
 
 
 def agreement_part(agreement: Agreement) -> made.Agreement:
@@ -52,6 +55,27 @@ def why_part(why: Why | Unavailable) -> made.Why | Absent:
         coast=None if why.coast is None else copied(made.Coast, why.coast),
         outside=None if why.outside is None else copied(made.Outside, why.outside),
         sentences=why.sentences,
+    )
+
+
+def whatif_results(request: WhatIfRequest, made_of: Counterfactual, command: str) -> WhatIfResults:
+    """What ``px4fuse whatif`` found."""
+    found = made_of.whatif
+    every = [outcome(summary) for summary in found.whatif]
+    first = 1 if made_of.changes else 0
+    return WhatIfResults(
+        schema=schema_of(WHATIF),
+        request=request.recorded(),
+        log=log_part(made_of.flight),
+        agreement=agreement_part(found.agreement),
+        judged_s=found.judged,
+        asked=made_of.asked,
+        logged=outcome(found.logged),
+        replayed=outcome(found.replayed),
+        whatif=every[0] if first else None,
+        sweep=tuple(every[first:]),
+        notes=found.notes,
+        provenance=provenance(command),
     )
 
 

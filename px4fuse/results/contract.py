@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 import msgspec
 from msgspec import Meta
 
-from px4fuse.request import AxisName, ComparisonRequest, LoopRequest
+from px4fuse.request import AxisName, ComparisonRequest, LoopRequest, WhatIfRequest
 from px4fuse.results.comparison import (
     Axis,
     ChosenSettings,
@@ -22,13 +22,23 @@ from px4fuse.results.comparison import (
     PositionSource,
     Tuned,
 )
-from px4fuse.results.ekf2 import Ekf2Replay, Why
-from px4fuse.results.model import Base, FoundMistake, Missing, Part, Provenance, Schema, Student
+from px4fuse.results.ekf2 import Agreement, Ekf2Replay, Outcome, Why
+from px4fuse.results.model import (
+    Base,
+    FoundMistake,
+    Interval,
+    Missing,
+    Part,
+    Provenance,
+    Schema,
+    Student,
+)
 from px4fuse.results.trajectories import Graph, Loop, Score, Track
 
 VERSION: Literal["2.0"] = "2.0"
 COMPARISON = "px4fuse-results"
 LOOP = "px4fuse-loop"
+WHATIF = "px4fuse-whatif"
 
 
 class ComparisonResults(Base, frozen=True):
@@ -134,8 +144,29 @@ class EvaluationResults(Score, frozen=True, kw_only=True):
     provenance: Provenance
 
 
+class WhatIfResults(Base, frozen=True, kw_only=True):
+    """Results of ``px4fuse whatif``: EKF2 as logged, as replayed, and with other parameters.
+
+    All are judged over the times ``judged_s``. ``asked`` says that the changes of ``whatif`` are
+    what the data ask for; ``sweep`` has an outcome per value.
+    """
+
+    schema: Schema
+    request: WhatIfRequest
+    log: Log
+    agreement: Agreement
+    judged_s: tuple[Interval, ...]
+    asked: bool
+    logged: Outcome
+    replayed: Outcome
+    whatif: Outcome | None = None
+    sweep: tuple[Outcome, ...] = ()
+    notes: tuple[str, ...]
+    provenance: Provenance
+
+
 Reported = ComparisonResults | LoopResults
-Results = Reported | TuningResults | SyncResults | GraphResults | EvaluationResults
+Results = Reported | TuningResults | SyncResults | GraphResults | EvaluationResults | WhatIfResults
 # By the name in their schema
 KINDS: dict[str, type[Results]] = {
     COMPARISON: ComparisonResults,
@@ -144,6 +175,7 @@ KINDS: dict[str, type[Results]] = {
     "px4fuse-sync": SyncResults,
     "px4fuse-graph": GraphResults,
     "px4fuse-evaluation": EvaluationResults,
+    WHATIF: WhatIfResults,
 }
 
 

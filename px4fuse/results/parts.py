@@ -9,7 +9,8 @@ from typing import Any, TypeVar
 import msgspec
 
 from px4fuse.findings import Finding
-from px4fuse.flight import Unavailable
+from px4fuse.flight import Flight, Unavailable
+from px4fuse.results.comparison import ClockMap, Dropout, JoinedFile, Log
 from px4fuse.results.contract import VERSION
 from px4fuse.results.model import Absent, FoundMistake, Missing, Provenance, Schema
 
@@ -37,6 +38,19 @@ def copied_or_absent(kind: type[S], part: object) -> S | Absent:
 def found_mistakes(findings: tuple[Finding, ...]) -> tuple[FoundMistake, ...]:
     """Findings as results hold them."""
     return tuple(copied(FoundMistake, finding) for finding in findings)
+
+
+def log_part(flight: Flight) -> Log:
+    """The log of a flight and what was joined with it."""
+    log = flight.log
+    return copied(
+        Log,
+        log,
+        dropouts=tuple(copied(Dropout, dropout) for dropout in log.dropouts),
+        parameters=dict(log.parameters),
+        joined=tuple(copied(JoinedFile, file) for file in flight.inputs),
+        clocks=tuple(copied(ClockMap, clock) for clock in flight.clocks),
+    )
 
 
 def schema_of(name: str) -> Schema:

@@ -1,0 +1,122 @@
+"""``px4fuse whatif``: what EKF2 would have done with other parameters."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from px4fuse.cli.inputs import flight_options, json_option, path_option
+from px4fuse.cli.outputs import progress, terminal, write_outputs
+from px4fuse.errors import OutputError, SettingsError
+from px4fuse.writing import STANDARD_OUTPUT
+
+if TYPE_CHECKING:
+    from px4fuse.request import Sweep
+
+
+@click.command()
+@click.argument("log", type=click.Path(path_type=Path))
+@click.option(
+    "--set",
+    "changes",
+    multiple=True,
+    metavar="NAME=VALUE",
+    help="Parameter to change, in PX4's unit; may be repeated.  [default: what the data ask for]",
+)
+@click.option(
+    "--sweep",
+    default=None,
+    metavar="NAME=LOW:HIGH[:COUNT]",
+    help="Parameter to change over several values.",
+)
+@flight_options
+@path_option("-o", "--output", metavar="FILE.pdf", help="Write it as a PDF page.")
+@json_option
+def whatif(
+    log: Path,
+    changes: tuple[str, ...],
+    sweep: str | None,
+    mavlink: Path | None,
+    system: int | None,
+    output: Path | None,
+    json_path: Path | None,
+) -> None:
+    """Replay EKF2 from LOG as flown and with other parameters, side by side.
+
+    By a model of EKF2 that is started from the log, and believed only where it reproduces what EKF2
+    logged. For example, px4fuse whatif log.ulg --set EKF2_EVP_NOISE=0.1. Without --set and --sweep,
+    with the measurement noise and the delay that the data ask for (see tune and sync).
+    """
+    from px4fuse.analysis import run_what_if
+    from px4fuse.request import WhatIfRequest, command_line
+    from px4fuse.results.build_ekf2 import whatif_results
+    from px4fuse.results.contract import to_json
+
+    if output is not None and output.suffix.lower() != ".pdf":
+        raise OutputError(f"{output}: the page is a PDF. Give a name that ends in .pdf with -o.")
+    request = WhatIfRequest(
+        log=str(log),
+        mavlink=None if mavlink is None else str(mavlink),
+        system=system,
+        changes=_changes(changes),
+        sweep=None if sweep is None else _sweep(sweep),
+    )
+    contents: dict[Path, bytes] = {}
+    with progress(json_path == STANDARD_OUTPUT) as step:
+        found = run_what_if(request, step)
+        command = command_line(request)
+        text = to_json(whatif_results(request, found, command))
+        if output is not None:
+            from px4fuse.report.document import WhatIfDocument
+            from px4fuse.report.pdf import render
+
+            step("drawing the page")
+            contents[output] = render(WhatIfDocument(found, command), text)
+    if json_path is not None:
+        if json_path == output:
+            raise OutputError(f"{output}: --json and -o name the same file. Give two names.")
+        contents[json_path] = text.encode()
+    write_outputs(contents)
+    if json_path == STANDARD_OUTPUT:
+        return
+    from px4fuse.report.whatif_terminal import print_what_if
+
+    console = terminal()
+    print_what_if(console, found)
+    if output is not None:
+        console.print(f"Page     {output}", markup=False, style="bold", soft_wrap=True)
+
+
+def _changes(given: tuple[str, ...]) -> dict[str, float]:
+    changes: dict[str, float] = {}
+    for text in given:
+        name, equals, value = text.partition("=")
+        if not equals:
+            raise SettingsError(f"--set {text}: give NAME=VALUE, for example EKF2_EVP_NOISE=0.1.")
+        if name in changes:
+            raise SettingsError(f"--set {name} is given twice.")
+        changes[name] = _number("--set", text, value)
+    return changes
+
+
+def _sweep(text: str) -> Sweep:
+    from px4fuse.request import Sweep
+
+    name, _, ends = text.partition("=")
+    parts = ends.split(":")
+    if len(parts) not in (2, 3) or (len(parts) == 3 and not parts[2].isdecimal()):
+        raise SettingsError(
+            f"--sweep {text}: give NAME=LOW:HIGH or NAME=LOW:HIGH:COUNT, for example "
+            "EKF2_EVP_NOISE=0.02:0.5."
+        )
+    low, high = (_number("--sweep", text, part) for part in parts[:2])
+    return Sweep(name, low, high, *map(int, parts[2:]))
+
+
+def _number(option: str, text: str, value: str) -> float:
+    try:
+        return float(value)
+    except ValueError as error:
+        raise SettingsError(f"{option} {text}: {value!r} is not a number.") from error

@@ -1,0 +1,97 @@
+"""What the data ask of EKF2's parameters, by tuning and by the clock offset."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+
+from px4fuse.comparison.comparison import Comparison
+from px4fuse.ekf2.model import Model
+from px4fuse.ekf2.parameters import PARAMETERS
+from px4fuse.filter.clock import ClockOffset
+from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
+from px4fuse.flight import Unavailable
+
+# EKF2 takes R from the sender where that is more than this many times EKF2_EVP_NOISE
+REPORTED_TIMES = 1.25
+# One prediction of EKF2 (EKF2_PREDICT_US), and what a message takes to arrive
+UPDATE_MS, ARRIVAL_MS = 10.0, 30.0
+DELAY_STEP_MS = 50.0
+
+
+def asked_of_ekf2(
+    comparison: Comparison,
+    model: Model,
+    tuning: Mapping[str, AxisTuning | Unavailable],
+    clock: ClockOffset | Unavailable,
+) -> dict[str, float]:
+    """EKF2's parameters as the data ask for them, by PX4 name and in PX4's units.
+
+    Parameters
+    ----------
+    comparison : Comparison
+    model : Model
+        Of its flight.
+    tuning : mapping from axis name, or "horizontal", to AxisTuning or Unavailable
+    clock : ClockOffset or Unavailable
+
+    Returns
+    -------
+    dict
+        Empty where the data tell nothing, or the source that was analysed is not the one that EKF2
+        fused. The delay only where what was flown is outside its interval.
+    """
+    source = comparison.source
+    if source.name != model.inputs.vision.source or source.alignment is not None:
+        return {}
+    tuned = tuning.get(HORIZONTAL)
+    changes: dict[str, float] = {}
+    if isinstance(tuned, AxisTuning) and tuned.sigma_z.value is not None:
+        changes |= noise_change(model, tuned.sigma_z.value)
+    if isinstance(clock, ClockOffset) and clock.determinable:
+        applied = comparison.settings.clock_offset_s
+        flown = model.inputs.settings["EKF2_EV_DELAY"]
+        high, low = (-1e3 * (applied + end) for end in clock.interval_s)
+        if not low - UPDATE_MS <= flown <= high + UPDATE_MS:
+            changes |= delay_change(model, -1e3 * (applied + clock.offset_s))
+    return changes
+
+
+def noise_change(model: Model, noise_m: float) -> dict[str, float]:
+    """What to set so that EKF2 takes a position's standard deviation (m) to be this.
+
+    Two digits, within PX4's range.
+    """
+    settings = model.inputs.settings
+    least = PARAMETERS["EKF2_EVP_NOISE"].minimum
+    changes = {"EKF2_EVP_NOISE": max(float(f"{noise_m:.2g}"), least)}
+    reported = noise_used_m(model) > REPORTED_TIMES * settings["EKF2_EVP_NOISE"]
+    if reported and noise_m < noise_used_m(model) and settings["EKF2_EV_NOISE_MD"] == 0.0:
+        changes["EKF2_EV_NOISE_MD"] = 1.0
+    return changes
+
+
+def delay_change(model: Model, delay_ms: float) -> dict[str, float]:
+    """What to set so that EKF2 takes positions to be this older than their stamps.
+
+    Nothing where PX4's range ends before; 0 for stamps that are early.
+    """
+    known = PARAMETERS["EKF2_EV_DELAY"]
+    if delay_ms > known.maximum:
+        return {}
+    changes = {"EKF2_EV_DELAY": max(float(round(delay_ms)), known.minimum)}
+    needed = changes["EKF2_EV_DELAY"] + ARRIVAL_MS
+    if not model.inputs.rules.horizon_by_delay and (
+        needed > model.inputs.settings["EKF2_DELAY_MAX"]
+    ):
+        changes["EKF2_DELAY_MAX"] = DELAY_STEP_MS * math.ceil(needed / DELAY_STEP_MS)
+    return {name: value for name, value in changes.items() if value != model.inputs.settings[name]}
+
+
+def noise_used_m(model: Model) -> float:
+    """Median √R (m) of EKF2 as flown."""
+    updates = model.flown.updates
+    columns = ["observation_variance_north_m2", "observation_variance_east_m2"]
+    return float(np.sqrt(np.median(updates[columns].to_numpy())))

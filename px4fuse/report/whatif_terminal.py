@@ -1,0 +1,46 @@
+"""What if EKF2 had had other parameters, on the terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from px4fuse.analysis import Counterfactual
+from px4fuse.report.terminal import print_line
+from px4fuse.report.whatif import heads, reading, rows, sweep_heads, sweep_of, sweep_rows
+from px4fuse.report.why import agreement_words
+
+
+def print_what_if(console: Console, made_of: Counterfactual) -> None:
+    """Print EKF2 as logged, as replayed and with other parameters, and a sweep where there is one.
+
+    Parameters
+    ----------
+    console : Console
+        Standard output.
+    made_of : Counterfactual
+    """
+    log, found = made_of.flight.log, made_of.whatif
+    print_line(console, "Log", f"{log.name}, {log.firmware}, {log.duration_s:.1f} s")
+    spans = ", ".join(f"{start:.1f} to {end:.1f} s" for start, end in found.judged)
+    print_line(console, "Judged", spans)
+    print_line(console, "Replay", agreement_words(found.agreement), whole=True)
+    console.print(_table(["", *heads(made_of)], rows(made_of)))
+    if sweep_of(made_of):
+        console.print()
+        console.print(_table(sweep_heads(made_of), sweep_rows(made_of)))
+    for line in reading(made_of):
+        console.print(Text(line), soft_wrap=True)
+    console.print(Text("Replays are of px4fuse's model of EKF2, not of PX4's own code.", "dim"))
+
+
+def _table(head: Sequence[str], body: list[list[str]]) -> Table:
+    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="bold")
+    for at, name in enumerate(head):
+        table.add_column(Text(name), justify="right" if at else "left", no_wrap=at == 0)
+    for cells in body:
+        table.add_row(*map(Text, cells))
+    return table

@@ -1,0 +1,230 @@
+"""``px4fuse whatif``: side by side as table, results and page; refusals; real logs."""
+
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+
+import jsonschema
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+from pypdf import PdfReader
+
+from px4fuse.analysis import Counterfactual, run_what_if
+from px4fuse.cli import cli
+from px4fuse.ekf2.parameters import PARAMETERS
+from px4fuse.ekf2.whatif import Summary
+from px4fuse.errors import MissingDataError, Px4FuseError, SettingsError
+from px4fuse.report.document import WhatIfDocument
+from px4fuse.report.pdf import render
+from px4fuse.report.whatif import heads, reading, rows, sweep_heads, sweep_rows
+from px4fuse.request import Sweep, WhatIfRequest, command_line
+from px4fuse.results.build_ekf2 import whatif_results
+from px4fuse.results.contract import WhatIfResults, schema, to_json
+from px4fuse.results.reading import read_results
+
+
+@pytest.fixture(scope="module")
+def asked(sample_log: Path) -> Counterfactual:
+    """What the data ask for, of the sample flight."""
+    return run_what_if(WhatIfRequest(log=str(sample_log)))
+
+
+@pytest.fixture(scope="module")
+def swept(sample_log: Path) -> Counterfactual:
+    """A changed gate, and the noise over three values."""
+    sweep = Sweep("EKF2_EVP_NOISE", 0.05, 0.2, 3)
+    request = WhatIfRequest(log=str(sample_log), changes={"EKF2_EVP_GATE": 3.0}, sweep=sweep)
+    return run_what_if(request)
+
+
+def run(*words: str | Path) -> Result:
+    return CliRunner().invoke(cli, ["whatif", *map(str, words)])
+
+
+def test_results_and_table_have_the_three_side_by_side(sample_log: Path) -> None:
+    done = run(sample_log, "--set", "EKF2_EVP_NOISE=0.3", "--json", "-")
+    assert done.exit_code == 0, done.output
+    said = json.loads(done.output)
+    jsonschema.validate(said, schema())
+    assert isinstance(read_results(done.output.encode()), WhatIfResults)
+    assert said["agreement"]["north"]["innovation_correlation"] > 0.995
+    assert said["whatif"]["changed"] == {"EKF2_EVP_NOISE": 0.3}
+    for key in ("logged", "replayed", "whatif"):
+        for axis in ("north", "east"):
+            assert 0.04 < said[key][axis]["position_rmse_to_truth_m"] < 0.09
+            assert said[key][axis]["nis_mean"] > 0.05
+        assert said[key]["rejected_share"] == said[key]["resets"] == 0
+    assert said["whatif"]["north"]["nis_mean"] < 0.3 * said["replayed"]["north"]["nis_mean"]
+    assert "unavailable" in said["logged"]["longest_without_fusion_s"]
+    assert said["asked"] is False
+    assert said["request"]["log"] == "aisle_uwb.ulg"
+    assert "sweep" not in said
+
+
+def test_without_set_it_is_what_the_data_ask_for(asked: Counterfactual) -> None:
+    """The UWB's noise is 0.10 m, and its stamps are right."""
+    assert asked.asked
+    assert set(asked.changes) == {"EKF2_EVP_NOISE"}
+    assert asked.changes["EKF2_EVP_NOISE"] == pytest.approx(0.1, abs=0.01)
+    assert "what the data ask for" in heads(asked)[-1]
+
+
+def test_the_table_says_what_the_summaries_hold(asked: Counterfactual) -> None:
+    table = {label.strip(): cells for label, *cells in rows(asked)}
+    found = asked.whatif
+    every = (found.logged, found.replayed, found.whatif[0])
+    assert len(heads(asked)) == len(every)
+    assert table["north: mean NIS"] == [f"{s.axes['north'].nis_mean:.3g}" for s in every]
+    assert table["samples"] == [str(s.samples) for s in every]
+    assert table["rejected"] == ["0.0%"] * 3
+    assert table["longest without fusion (s)"][0] == "n/a"
+    assert table["position resets"] == ["0"] * 3
+    assert all(len(cells) == 3 for cells in table.values())
+
+
+def test_a_sweep_changes_the_rest_as_set(swept: Counterfactual) -> None:
+    first, *values = swept.whatif.whatif
+    assert dict(first.changed) == {"EKF2_EVP_GATE": 3.0}
+    assert [v.changed["EKF2_EVP_NOISE"] for v in values] == pytest.approx([0.05, 0.1, 0.2])
+    assert all(value.changed["EKF2_EVP_GATE"] == 3.0 for value in values)
+    nis = [value.nis_mean for value in values]
+    assert nis == sorted(nis, reverse=True)
+    assert sweep_heads(swept)[0] == "EKF2_EVP_NOISE (m)"
+    assert [row[0] for row in sweep_rows(swept)] == ["0.05", "0.1", "0.2"]
+    best, error, *_ = reading(swept)
+    assert "nearest to 1 at EKF2_EVP_NOISE 0.1" in best
+    least = min(values, key=lambda value: value.position_rmse_to_truth_m)
+    assert f"least at EKF2_EVP_NOISE {least.changed['EKF2_EVP_NOISE']:.3g}" in error
+    made = whatif_results(WhatIfRequest(log="x"), swept, "")
+    assert made.whatif is not None
+    assert made.whatif.changed == {"EKF2_EVP_GATE": 3.0}
+    assert len(made.sweep) == 3
+
+
+def test_the_page_holds_table_panels_and_results(swept: Counterfactual) -> None:
+    text = to_json(whatif_results(WhatIfRequest(log="x.ulg"), swept, "px4fuse whatif x.ulg"))
+    pdf = render(WhatIfDocument(swept, "px4fuse whatif x.ulg"), text)
+    assert pdf == render(WhatIfDocument(swept, "px4fuse whatif x.ulg"), text)
+    reader = PdfReader(io.BytesIO(pdf))
+    said = " ".join(page.extract_text() for page in reader.pages)
+    for words in ("as logged", "replayed", "not PX4's own code", "EKF2_EVP_GATE 3", "mean NIS",
+                  "position RMSE to truth", "EKF2_EVP_NOISE (m)", "0.9997 (north)"):  # fmt: skip
+        assert words in said, words
+    assert reader.attachments["results.json"][0].decode() == text
+
+
+def test_terminal_and_files(tmp_path: Path, sample_log: Path) -> None:
+    page, results = tmp_path / "page.pdf", tmp_path / "w.json"
+    done = run(sample_log, "--set", "EKF2_EVP_NOISE=0.2", "--sweep", "EKF2_EV_DELAY=0:100:2",
+               "-o", page, "--json", results)  # fmt: skip
+    assert done.exit_code == 0, done.output
+    for words in ("as logged", "what if EKF2_EVP_NOISE", "EKF2_EV_DELAY (ms)", "It agrees", "n/a",
+                  "not of PX4's own code"):  # fmt: skip
+        assert words in done.output, words
+    assert page.read_bytes()[:5] == b"%PDF-"
+    assert json.loads(results.read_text())["request"]["sweep"]["count"] == 2
+
+
+def test_the_request_is_written_as_it_was_typed() -> None:
+    request = WhatIfRequest(
+        log="/a/log.ulg", mavlink="/b/x.tlog", changes={"EKF2_EVP_NOISE": 0.1},
+        sweep=Sweep("EKF2_EV_DELAY", 0.0, 200.0, 5),
+    )  # fmt: skip
+    assert command_line(request) == (
+        "px4fuse whatif log.ulg --mavlink x.tlog --set EKF2_EVP_NOISE=0.1 "
+        "--sweep EKF2_EV_DELAY=0:200:5"
+    )
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--set", "EKF2_BARO_NOISE=1"], ", ".join(PARAMETERS)),
+        (["--set", "EKF2_EVP_NOISE=0"], "outside PX4's range, 0.01 to 1000 m"),
+        (["--set", "EKF2_EVP_NOISE"], "give NAME=VALUE"),
+        (["--set", "EKF2_EVP_NOISE=much"], "'much' is not a number"),
+        (["--set", "EKF2_EVP_NOISE=nan"], "outside PX4's range"),
+        (["--set", "EKF2_EVP_GATE=3", "--set", "EKF2_EVP_GATE=4"], "given twice"),
+        (["--sweep", "EKF2_EVP_NOISE=0.1"], "give NAME=LOW:HIGH"),
+        (["--sweep", "EKF2_EVP_NOISE=0.1:0.2:many"], "give NAME=LOW:HIGH"),
+        (["--sweep", "EKF2_EVP_NOISE=0.2:0.1"], "the first value must be the smaller one"),
+        (["--sweep", "EKF2_EVP_NOISE=0.1:0.2:1"], "not between 2 and 200"),
+        (["--sweep", "NOISE=0.1:0.2"], "does not have this parameter"),
+        (
+            ["--set", "EKF2_EVP_NOISE=0.1", "--sweep", "EKF2_EVP_NOISE=0.1:0.2"],
+            "set and swept",
+        ),
+        (["-o", "page.txt"], "ends in .pdf"),
+    ],
+)
+def test_what_cannot_be_asked_is_one_clear_line(words: list[str], said: str) -> None:
+    """Before the log is read: there is none."""
+    done = run("no_such_log.ulg", *words)
+    assert isinstance(done.exception, Px4FuseError)
+    assert said in str(done.exception)
+    assert "\n" not in str(done.exception)
+
+
+def test_a_log_without_ekf2s_inside_says_why(sample_log: Path) -> None:
+    with pytest.raises(MissingDataError, match="EKF2 replay: no estimator_states"):
+        run_what_if(WhatIfRequest(log=str(sample_log.with_suffix(".tlog"))))
+
+
+@pytest.mark.reallogs
+class TestFlownFlights:
+    def of(self, shared_logs: Path, name: str, **request: object) -> Counterfactual:
+        log = shared_logs / "simulated" / f"{name}.ulg"
+        return run_what_if(WhatIfRequest(log=str(log), **request))
+
+    def test_the_noise_that_the_data_ask_for_ends_the_rejections(self, shared_logs: Path) -> None:
+        found = self.of(shared_logs, "v1.16.1_aisle_overconfident")
+        assert set(found.changes) == {"EKF2_EVP_NOISE"}
+        (cured,) = found.whatif.whatif
+        assert all(0.9 <= axis.nis_mean <= 1.1 for axis in cured.axes.values())
+        assert cured.rejected_share == 0.0
+        assert found.whatif.logged.rejected_share > 0.5
+        assert cured.position_rmse_to_truth_m < 0.4 * error(found.whatif.logged)
+
+    @pytest.mark.parametrize("name", ["v1.16.1_aisle_clock_late", "v1.16.1_aisle_clock_nosync"])
+    def test_the_delay_that_the_data_ask_for_brings_back_the_clean_error(
+        self, shared_logs: Path, name: str
+    ) -> None:
+        found = self.of(shared_logs, name)
+        assert found.changes["EKF2_EV_DELAY"] == pytest.approx(250.0, abs=25.0)
+        clean = self.of(shared_logs, "v1.16.1_aisle_nominal").whatif.logged
+        (cured,) = found.whatif.whatif
+        assert error(cured) < 1.2 * error(clean) < 0.5 * error(found.whatif.logged)
+        assert not any("would reach EKF2 after" in note for note in found.whatif.notes)
+
+    def test_an_old_delay_is_taken_back(self, shared_logs: Path) -> None:
+        found = self.of(shared_logs, "v1.13.3_aisle_evdelay175")
+        assert found.changes["EKF2_EV_DELAY"] == 0.0
+        (cured,) = found.whatif.whatif
+        assert error(cured) < 0.7 * error(found.whatif.logged)
+        with pytest.raises(SettingsError, match="has no such parameter"):
+            self.of(shared_logs, "v1.13.3_aisle_evdelay175", changes={"EKF2_DELAY_MAX": 300.0})
+
+    @pytest.mark.parametrize(
+        ("log", "said"),
+        [
+            ("simulated/v1.16.1_no_uwb", "never fused external vision"),
+            ("real/mengchaoheng_PX4_ulog_plottools_hist_6a8cf408_test3", "correlate by 0.12 only"),
+            ("real/vladimireganov_ROS_PX4_MOCAP_square2", "fewer than EKF2 may have fused"),
+        ],
+    )
+    def test_without_agreement_there_is_no_what_if(
+        self, shared_logs: Path, log: str, said: str
+    ) -> None:
+        with pytest.raises(MissingDataError, match=said):
+            run_what_if(WhatIfRequest(log=str(shared_logs / f"{log}.ulg")))
+
+
+def error(summary: Summary) -> float:
+    """Horizontal error to the truth (m)."""
+    parts = [axis.position_rmse_to_truth_m for axis in summary.axes.values()]
+    assert all(isinstance(part, float) for part in parts)
+    assert summary.position_rmse_to_truth_m == pytest.approx(np.hypot(*parts))
+    return float(np.hypot(*parts))
