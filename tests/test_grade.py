@@ -106,6 +106,7 @@ def test_a_report_with_its_log_is_verified_and_a_changed_one_is_not(tmp_path) ->
     assert len(PdfReader(io.BytesIO(redrawn[0])).pages) == 9
     # a page away is a flag, and costs nothing
     assert (third.verdict.status, third.verdict.outcome) == ("verified", "page differs")
+    assert third.status == "page differs"
     assert third.points == first.points
     assert any("Page 9 of the PDF" in flag and "missing" in flag for flag in third.flags)
     assert not any("of the PDF" in flag for flag in first.flags)

@@ -320,7 +320,7 @@ REFUSED = {
     "two poses": ("loop two.tum", "two.tum: poses: 2"),
     "times that go back": ("loop nonmono.tum", "nonmono.tum, line 102"),
     "not a number": ("loop nan.tum", "nan.tum, line 51"),
-    "zero quaternion": ("loop zero.tum", "zero.tum, line 51: columns 5 to 8 are no quaternion"),
+    "zero quaternion": ("loop zero.tum", "zero.tum, line 51: columns 5 to 8 are not a quaternion"),
     "commas": ("loop comma.tum", "comma.tum: 8 columns between commas"),
     "no motion": ("loop still.tum", "still.tum: the path is 0.00 m long"),
     "closure outside": ("loop s.tum --closure 10,5000", "outside the path"),

@@ -124,16 +124,16 @@ def _print(outcome: Outcome) -> None:
             overflow="fold",
         )
     for one in outcome.graded:
-        style = "green" if one.verdict.status == "verified" else "yellow"
+        style = "green" if one.status == "verified" else "yellow"
         table.add_row(
             Text(one.submission),
             Text(one_line(one.student or one.student_id, 60)),
-            Text(one.verdict.status, style),
+            Text(one.status, style),
             f"{one.points:g} / {one.of:g}" if one.items else "–",
             f"{len(one.flags)}" if one.flags else "",
         )
     console.print(table)
-    counts = Counter(one.verdict.status for one in outcome.graded)
+    counts = Counter(one.status for one in outcome.graded)
     said = ", ".join(f"{count} {status}" for status, count in counts.most_common())
     console.print(f"{len(outcome.graded)} submissions: {said}; {outcome.reused} as before")
     for note in outcome.notes:

@@ -25,12 +25,13 @@ from px4fuse.grading.class_table import distinct, item_points, number
 from px4fuse.grading.model import Graded
 from px4fuse.verification.model import Status
 
-STATUSES: tuple[Status, ...] = get_args(Status)
+STATUSES: tuple[str, ...] = (*get_args(Status), "page differs")
 SIGNS = {
     "verified": "✓",
     "numbers differ": "≠",
     "other log": "⇄",
     "cannot verify": "?",
+    "page differs": "≠",
 }
 BINS = 10
 # Of one submission, on the page; all of it stands in the CSV and the report
@@ -109,7 +110,7 @@ def _summary(graded: Sequence[Graded]) -> str:
         ("Submissions", str(len(graded))),
         ("Mean points", f"{statistics.fmean(points):.1f}{of}" if points else "–"),
         ("Median", f"{statistics.median(points):.1f}{of}" if points else "–"),
-        ("Verified", str(sum(one.verdict.status == "verified" for one in graded))),
+        ("Verified", str(sum(one.status == "verified" for one in graded))),
         ("Flagged", str(sum(bool(one.flags) for one in graded))),
     ]
     return "\n".join(f"<div><dt>{name}</dt><dd>{value}</dd></div>" for name, value in entries)
@@ -146,7 +147,7 @@ def _histogram(graded: Sequence[Graded]) -> str:
 
 
 def _options(graded: Sequence[Graded]) -> str:
-    counts = [(name, sum(one.verdict.status == name for one in graded)) for name in STATUSES]
+    counts = [(name, sum(one.status == name for one in graded)) for name in STATUSES]
     flagged = sum(bool(one.flags) for one in graded)
     return "\n".join(
         [f'<option value="">Every status ({len(graded)})</option>']
@@ -166,7 +167,7 @@ def _heads(titles: Sequence[str], kind: str) -> str:
 
 
 def _row(one: Graded, items: Sequence[str], numbers: Sequence[str], shared: int) -> str:
-    status = one.verdict.status
+    status = one.status
     missing = "" if one.student else ' data-v=""'
     flags = "".join(f"<li dir=auto>{_safe(flag)}</li>" for flag in one.flags)
     number_of_flags = f"{len(one.flags)} flag{'s' if len(one.flags) > 1 else ''}"

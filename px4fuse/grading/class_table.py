@@ -39,7 +39,7 @@ def csv_text(graded: Sequence[Graded]) -> str:
     for one in graded:
         points = item_points(one)
         row: list[str | float | None] = [
-            one.submission, one.student, one.student_id, one.verdict.status, one.points, one.of,
+            one.submission, one.student, one.student_id, one.status, one.points, one.of,
             *(points.get(title) for title in items),
             *(one.numbers.get(title) for title in numbers),
             BETWEEN.join(one.flags), BETWEEN.join(one.verdict.reasons), one.log_sha256,

@@ -170,6 +170,12 @@ class Graded:
     redrawn_name: str = ""
 
     @property
+    def status(self) -> str:
+        """That of the verdict, or "page differs" where only the numbers are verified."""
+        altered = self.verdict.status == "verified" and self.verdict.page_status == "differ"
+        return "page differs" if altered else self.verdict.status
+
+    @property
     def points(self) -> float:
         """Sum over the items."""
         return sum(item.points for item in self.items)

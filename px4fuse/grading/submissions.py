@@ -95,7 +95,7 @@ def collect(paths: Sequence[Path]) -> tuple[tuple[Submission, ...], tuple[str, .
     if others:
         kinds = ", ".join(f"{count} {kind}" for kind, count in others.most_common(5))
         more = ", ..." if len(others) > 5 else ""
-        notes.append(f"Passed over, since they are no PDFs: {kinds}{more}.")
+        notes.append(f"Passed over, since they are not PDFs: {kinds}{more}.")
     if not found:
         why = f" {' '.join(notes)}" if notes else ""
         raise SettingsError(one_line(f"No PDF was found in what was given.{why}", 500))

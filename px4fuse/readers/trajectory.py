@@ -299,7 +299,7 @@ def _parse(file: _File, layout: _Layout, rows: list[str]) -> tuple[list[str], Ar
         row = int(np.argmax(wrong))
         raise file.refuse(
             row,
-            f"columns 5 to 8 are no quaternion: its norm is {norms[row]:.4g}, not 1",
+            f"columns 5 to 8 are not a quaternion: its norm is {norms[row]:.4g}, not 1",
             f"Remove that line, or check the order of the columns. {_REMEDY}",
         )
     return table["stamp"].tolist(), values
