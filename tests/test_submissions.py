@@ -64,7 +64,7 @@ def test_folders_are_searched_and_sorted(tmp_path):
         write(tmp_path / name, PDF)
     found, notes = collect([tmp_path])
     assert [each.name for each in found] == ["A/Report.PDF", "b/report.pdf", "c.pdf"]
-    assert notes == ("Passed over, since they are no PDFs: 2 .docx, 1 .ulg.",)
+    assert notes == ("Passed over, since they are not PDFs: 2 .docx, 1 .ulg.",)
     assert [read(each) for each in found] == [PDF] * 3
     assert all(each.entry == "" for each in found)
 
@@ -109,7 +109,7 @@ def test_a_zip_in_a_zip_is_read_and_no_deeper(tmp_path):
     assert guess_student(found[0].name) == ("Roe", "1")
     assert read(found[0]) == PDF
     assert any("too deep" in note for note in notes)
-    assert notes[-1] == "Passed over, since they are no PDFs: 1 .ulg."
+    assert notes[-1] == "Passed over, since they are not PDFs: 1 .ulg."
 
 
 def test_a_zip_in_a_folder_keeps_its_own_name(tmp_path):
