@@ -35,7 +35,7 @@ from px4fuse.simulation.mistakes import parse
 
 SECRET = b"a secret for tests"
 # What the secret gives student s1: seed, noise and heading, and the mistakes
-PINNED = ((4014383831, 0.095, -146.2), ("dropout=4.5s,48s", "nlos=3.9%"))
+PINNED = ((4014383831, 0.095, -146.2), ("dropout=4.5s,48s", "ekf2-gate=1.9"))
 CLASS = tuple(Student(f"s{n:02d}", f"Name {n}", f"s{n:02d}.ulg") for n in range(3))
 
 

@@ -12,11 +12,8 @@ own attitude is in estimator_states.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from px4fuse.arrays import Array, BoolArray, IntArray
 from px4fuse.ekf2.inputs import Inputs, Rules
@@ -45,6 +42,7 @@ from px4fuse.ekf2.rotation import (
 from px4fuse.ekf2.stretches import Stretch, down_sampled, step_ends
 from px4fuse.ekf2.vision import Vision
 from px4fuse.simulation import sensors
+from px4fuse.simulation.ekf2_topics import Track, ekf2_topics
 from px4fuse.simulation.mistakes import Mistakes
 from px4fuse.simulation.motion import Motion, Sines, attitude
 from px4fuse.simulation.scenario import Scenario
@@ -55,53 +53,17 @@ PREDICT_US = 10_000  # EKF2_PREDICT_US
 RULES = Rules(0.2, 0.4, 1.0, 5, None, horizon_by_delay=False)
 # EKF2_NOAID_TOUT: without aiding for longer EKF2 stays where it is (fake_pos_control.cpp)
 NO_AIDING_S = 5.0
-# EKF2_ANGERR_INIT, _GBIAS_INIT, _ABIAS_INIT, _GPS_V_NOISE and _GPS_P_NOISE (covariance.cpp)
+# EKF2_ANGERR_INIT, _GPS_V_NOISE, _GPS_P_NOISE, _GBIAS_INIT and _ABIAS_INIT (covariance.cpp)
 INITIAL_SD = np.repeat([0.1, 0.3, 0.5, 0.1, 0.2], 3)
 # What EKF2 takes from standing still before the log begins, and for how long: the standard
 # deviations that v1.16 logs on the ground are 0.0005 rad/s, 0.06 m/s and 0.17 m/s² (horizontal)
 REST_S = 10.0
 REST_SD = np.repeat([0.05, 0.0005, 0.06], 3)
-# Of heading and height as v1.16 logs them, and of what stands in for the barometer
-HEADING_SD_RAD, HEIGHT_SD_M = 0.03, 0.05
+# Of heading and height as v1.16 logs them in flight, and of what stands in for the barometer
+HEADING_SD_RAD, HEIGHT_SD_M = 0.03, 0.15
 HEIGHT_ERROR_M = 0.03
 # Fine enough that variances are logged between the samples of a UWB too
 MAX_LEG_S = 0.1
-# Rates (Hz) of v1.16 (logged_topics.cpp). PX4's own simulation logs estimator_aid_src_ev_pos at
-# full rate, a vehicle only at this one
-VEHICLE_AID_SOURCE_HZ = 2.0
-STATES_HZ, LOCAL_POSITION_HZ, FLAGS_HZ = 2.0, 10.0, 1.0
-PUBLISHED_LATER_US = 100
-
-
-@dataclass(frozen=True)
-class Track:
-    """What the model did, at the end of each prediction step, shape (n + 1, ...).
-
-    Attributes
-    ----------
-    time_us : ndarray of int
-        Since the first data.
-    lag : int
-        Steps from the fusion horizon to what is published.
-    delayed_attitude, delayed : ndarray
-        Quaternions, and velocity, position and both biases at the horizon, by the time that they
-        are of.
-    velocity_m_s, position_m : ndarray
-        Published.
-    resets : tuple of (int, ndarray)
-        Step in which the published position jumped, and by how much (m, north and east).
-    aided : ndarray of bool
-        Whether vision was fused lately enough for a position.
-    """
-
-    time_us: IntArray
-    lag: int
-    delayed_attitude: Array
-    delayed: Array
-    velocity_m_s: Array
-    position_m: Array
-    resets: tuple[tuple[int, Array], ...]
-    aided: BoolArray
 
 
 def parameters(source_sigma_m: float, mistakes: Mistakes) -> dict[str, int | float]:
@@ -160,13 +122,7 @@ def fly(
     )
     done = run_variants(inputs, [Variant(settings)], {})[0]
     track = _track(inputs, done, time_us, nominal)
-    topics = (
-        _local_position(track),
-        _states(done, track),
-        _aid_source(inputs, done, track, aid_source_hz),
-        _flags(inputs, done, track),
-    )
-    return tuple(topic for topic in topics if len(topic.fields["timestamp"]))
+    return ekf2_topics(inputs, done, track, aid_source_hz)
 
 
 def _stretch(
@@ -327,139 +283,3 @@ def _held(done: StretchRun, state: Array) -> tuple[list[tuple[int, Array]], Bool
             jump = state[step, horizontal] - state[step - 1, horizontal]
         resets.append((step, jump))
     return resets, aided
-
-
-def _local_position(track: Track) -> Topic:
-    rows = np.flatnonzero(sensors.thinned(sensors.seconds(track.time_us), LOCAL_POSITION_HZ))
-    steps = np.array([step for step, _ in track.resets], dtype=np.intp)
-    jumps = np.array([[0.0, 0.0], *(jump for _, jump in track.resets)])
-    count = np.searchsorted(steps, rows, side="right")
-    fields = _stamped(track.time_us[rows], PUBLISHED_LATER_US)
-    for names, values in (
-        (("x", "y", "z"), track.position_m),
-        (("vx", "vy", "vz"), track.velocity_m_s),
-    ):
-        fields |= {name: values[rows, i].astype(np.float32) for i, name in enumerate(names)}
-    fields["delta_xy"] = jumps[count].astype(np.float32)
-    fields["delta_z"] = np.zeros(len(rows), np.float32)
-    fields["delta_vxy"] = np.zeros((len(rows), 2), np.float32)
-    fields["delta_vz"] = np.zeros(len(rows), np.float32)
-    unknown = np.full(len(rows), np.nan)
-    fields |= {"ref_lat": unknown, "ref_lon": unknown, "ref_alt": unknown.astype(np.float32)}
-    aided = track.aided[np.maximum(rows - track.lag, 0)]
-    for name in ("xy_valid", "v_xy_valid"):
-        fields[name] = aided
-    for name in ("z_valid", "v_z_valid"):
-        fields[name] = np.ones(len(rows), np.bool_)
-    fields["xy_reset_counter"] = (count % 256).astype(np.uint8)
-    for name in ("z_reset_counter", "vxy_reset_counter", "vz_reset_counter"):
-        fields[name] = np.zeros(len(rows), np.uint8)
-    return Topic("vehicle_local_position", fields)
-
-
-def _states(done: StretchRun, track: Track) -> Topic:
-    """estimator_states of v1.16: 25 states with 24 covariances, positions as 0."""
-    end = done.legs[0].end
-    events = np.flatnonzero(np.diff(end, prepend=0) > 0)
-    events = events[end[events] < len(track.time_us) - track.lag]
-    events = events[sensors.thinned(sensors.seconds(track.time_us[end[events]]), STATES_HZ)]
-    rows = end[events]
-    states = np.zeros((len(rows), 25), np.float32)
-    states[:, 0:4] = track.delayed_attitude[rows]
-    states[:, 4:16] = track.delayed[rows]
-    states[:, 7:9] = 0.0  # horizontally kept as latitude and longitude
-    covariances = np.zeros((len(rows), 24), np.float32)
-    covariances[:, :STATES] = done.run.variance[events + 1, 0]
-    return Topic(
-        "estimator_states",
-        {
-            **_stamped(track.time_us[rows], _horizon_us(track, rows)),
-            "states": states,
-            "covariances": covariances,
-            "n_states": np.full(len(rows), 24, np.uint8),
-        },
-    )
-
-
-def _aid_source(inputs: Inputs, done: StretchRun, track: Track, rate_hz: float) -> Topic:
-    """estimator_aid_src_ev_pos: a message for every sample that came in time."""
-    legs, run = done.legs[0], done.run
-    seen = np.flatnonzero(legs.usable & (legs.end < len(track.time_us) - track.lag))
-    seen = seen[sensors.thinned(sensors.seconds(track.time_us[legs.end[seen]]), rate_hz)]
-    rows = legs.end[seen]
-    horizontal = slice(NORTH, EAST + 1)
-    innovation, variance = run.innovation_m[seen, 0], run.variance_m2[seen, 0]
-    noise = run.noise_m2[seen, 0]
-    measured = inputs.vision.position_m[legs.sample[seen], :2]
-    idle = np.isnan(innovation[:, 0])
-    # while it is not fused, against the state that there is
-    innovation = np.where(
-        idle[:, None], measured - track.delayed[rows][:, POSITION][:, :2], innovation
-    )
-    variance = np.where(idle[:, None], run.variance[seen + 1, 0, horizontal] + noise, variance)
-    gate = max(inputs.settings["EKF2_EVP_GATE"], 1.0)
-    used = np.where(run.fused[seen, 0] | run.reset[seen, 0], track.time_us[rows], -1)
-    last = np.maximum.accumulate(used)
-    taken_us = np.rint(legs.time_s[seen] * 1e6).astype(np.int64)
-    later_us = track.time_us[rows] + _horizon_us(track, rows) - taken_us
-    return Topic(
-        "estimator_aid_src_ev_pos",
-        {
-            **_stamped(taken_us, later_us),
-            "time_last_fuse": np.where(last >= 0, sensors.START_US + last, 0).astype(np.uint64),
-            "observation": measured.astype(np.float32),
-            "observation_variance": noise.astype(np.float32),
-            "innovation": (-innovation).astype(np.float32),
-            "innovation_variance": variance.astype(np.float32),
-            "test_ratio": (innovation**2 / (gate**2 * variance)).astype(np.float32),
-            "innovation_rejected": run.rejected[seen, 0],
-            "fused": run.fused[seen, 0],
-        },
-    )
-
-
-def _flags(inputs: Inputs, done: StretchRun, track: Track) -> Topic:
-    """estimator_status_flags: once a second, and when fusion of vision starts or stops."""
-    legs, run, time = done.legs[0], done.run, done.stretch.time_s
-    tried = np.flatnonzero(run.fused[:, 0] | run.rejected[:, 0] | run.reset[:, 0])
-    on = np.zeros(len(time), np.bool_)
-    stops = np.append(time[legs.end[tried]], np.inf)[1:]
-    for step, stop in zip(legs.end[tried].tolist(), stops.tolist(), strict=True):
-        until = time[step] + inputs.rules.stop_s
-        on[step : int(np.searchsorted(time, min(stop, until)))] = True
-    changed = np.diff(on.astype(int), prepend=0) != 0
-    kept = changed | sensors.thinned(time, FLAGS_HZ)
-    rows = np.flatnonzero(kept[: len(time) - track.lag])
-    always, never = np.ones(len(rows), np.bool_), np.zeros(len(rows), np.bool_)
-    return Topic(
-        "estimator_status_flags",
-        {
-            **_stamped(track.time_us[rows], _horizon_us(track, rows)),
-            "control_status_changes": np.cumsum(changed)[rows].astype(np.uint32),
-            "cs_tilt_align": always,
-            "cs_yaw_align": always,
-            "cs_gnss_pos": never,
-            "cs_opt_flow": never,
-            "cs_mag_hdg": always,
-            "cs_baro_hgt": always,
-            "cs_ev_pos": on[rows],
-            "cs_ev_yaw": never,
-            "cs_ev_hgt": never,
-            "cs_ev_vel": never,
-        },
-    )
-
-
-def _horizon_us(track: Track, rows: IntArray) -> NDArray[np.int64]:
-    """How much later what the filter did in a step is published."""
-    later: NDArray[np.int64] = track.time_us[rows + track.lag] - track.time_us[rows]
-    return later
-
-
-def _stamped(
-    time_us: NDArray[np.int64], later_us: int | NDArray[np.int64]
-) -> dict[str, NDArray[Any]]:
-    return {
-        "timestamp": (sensors.START_US + time_us + later_us).astype(np.uint64),
-        "timestamp_sample": (sensors.START_US + time_us).astype(np.uint64),
-    }

@@ -17,6 +17,7 @@ from px4fuse.readers import ulog
 from px4fuse.readers.px4_topics import IMU, PARAMETERS
 from px4fuse.readers.ulog_topics import NOTE_KEY, Topics
 from px4fuse.simulation import ekf2, sensors
+from px4fuse.simulation.ekf2_topics import VEHICLE_AID_SOURCE_HZ
 from px4fuse.simulation.mistakes import MISTAKES, Mistakes, as_typed, made
 from px4fuse.simulation.motion import Motion, plan
 from px4fuse.simulation.scenario import Scenario
@@ -85,7 +86,7 @@ def simulate(scenario: Scenario, mistakes: Mistakes = NO_MISTAKES) -> Simulation
             raise SettingsError(f"with these mistakes nothing is left of {topic.name}.")
     if scenario.ekf2:
         standing = sensors.at_rest(scenario, mistakes, motion, ekf2.REST_S)
-        aid_source_hz = ekf2.VEHICLE_AID_SOURCE_HZ if mistakes.no_vvo else 0.0
+        aid_source_hz = VEHICLE_AID_SOURCE_HZ if mistakes.no_vvo else 0.0
         topics += ekf2.fly(
             scenario, motion, imu, positions.topic, parameters, standing, aid_source_hz
         )
