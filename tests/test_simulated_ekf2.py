@@ -209,6 +209,25 @@ def test_a_step_is_the_nearest_number_of_samples() -> None:
     assert samples_per_step(0.01, 0.004 + 1e-12) == samples_per_step(0.01, 0.004 - 1e-12) == 3
 
 
+def test_what_is_published_is_free_of_the_biases_that_the_filter_knows(clean: Flight) -> None:
+    """Of those of the horizontal axes as well, which are a tilt to it."""
+    biased = flown(scenario=replace(AISLE, accel_bias_sigma_m_s2=0.4))
+    for column in ("north_m_s", "east_m_s", "down_m_s"):
+        assert rmse(biased, 15.0, 60.0, column) < 1.2 * rmse(clean, 15.0, 60.0, column) + 0.01
+
+
+def test_samples_with_older_stamps_than_the_last_are_not_taken() -> None:
+    simulation = simulate(Scenario(passes=4, seed=5), parse(["clock-jump=400ms"]))
+    topics = {topic.name: topic.fields for topic in simulation.topics}
+    sent = topics["vehicle_visual_odometry"]["timestamp_sample"].astype(np.int64)
+    taken = topics["estimator_aid_src_ev_pos"]["timestamp_sample"].astype(np.int64)
+    assert np.any(np.diff(sent) < 0)
+    assert np.all(np.diff(taken) > 0)
+    rows = ekf2._vision(simulation.positions.topic)
+    assert len(rows.stamp_s) < len(sent)
+    assert np.all(np.diff(rows.stamp_s) > 0)
+
+
 # --- mistakes of EKF2's own
 
 
