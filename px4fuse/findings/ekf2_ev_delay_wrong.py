@@ -5,11 +5,31 @@ from __future__ import annotations
 import numpy as np
 
 from px4fuse.analysis import Analysis
+from px4fuse.comparison.asked import delay_change
+from px4fuse.ekf2.parameters import PARAMETERS
 from px4fuse.filter.clock import ClockOffset
+from px4fuse.findings.ekf2_remedy import delay_helps, remedy_words
 from px4fuse.findings.model import Detector, Finding, Found, Threshold
 from px4fuse.findings.source_clock import CLOCK_OFFSET, CLOCK_SIGMAS
+from px4fuse.flight import Unavailable
 
 EKF2_UPDATE = Threshold(0.010, "s", "EKF2_PREDICT_US, EKF2's own step")
+
+
+def delay_remedy(analysis: Analysis, delay_ms: float, flown_ms: float) -> str:
+    """EKF2_EV_DELAY as the data ask for it, as far as PX4's range and a replay allow."""
+    model = analysis.ekf2_model
+    known = PARAMETERS["EKF2_EV_DELAY"]
+    if delay_ms > known.maximum:
+        return f"Correct the stamps at the sender: PX4 allows {known.maximum:g} ms (EKF2_EV_DELAY)."
+    if round(delay_ms) <= 0.0 and flown_ms == 0.0:
+        return "Correct the stamps at the sender: EKF2 has no parameter for stamps that are early."
+    changes = {"EKF2_EV_DELAY": max(float(round(delay_ms)), 0.0)}
+    if not isinstance(model, Unavailable):
+        changes = delay_change(model, delay_ms) or changes
+    return remedy_words(
+        analysis, changes, delay_helps, otherwise="Correct the stamps at the sender:"
+    )
 
 
 def _detect(analysis: Analysis) -> Found:
@@ -32,7 +52,7 @@ def _detect(analysis: Analysis) -> Found:
         f"EKF2_EV_DELAY is {delay:g} ms, while the data ask for {best * 1e3:.0f} ms (95 % "
         f"{asked[0] * 1e3:.0f} to {asked[1] * 1e3:.0f}): EKF2 fuses each position at the wrong "
         "time, and its track lags or leads by the difference.",
-        f"Set EKF2_EV_DELAY to {0.0 if asked[0] <= 0.0 else best * 1e3:.0f}.",
+        delay_remedy(analysis, 0.0 if asked[0] <= 0.0 else best * 1e3, delay),
         {"ekf2_ev_delay_ms": delay, "asked_ms": best * 1e3},
     )
 

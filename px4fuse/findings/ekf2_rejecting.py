@@ -3,11 +3,52 @@
 from __future__ import annotations
 
 from px4fuse.analysis import Analysis
+from px4fuse.comparison.asked import asked_of_ekf2
+from px4fuse.ekf2.parameters import PARAMETERS
+from px4fuse.findings.ekf2_remedy import not_replayed, rejects_less, replayed, settings_words
 from px4fuse.findings.model import Detector, Finding, Found, Threshold
 from px4fuse.flight import Ekf2, Unavailable
 
 REJECTED_SHARE_WARNING = Threshold(0.01, "of the innovations", "5 σ rejects 6e-7 when consistent")
 REJECTED_SHARE_ERROR = Threshold(0.20, "of the innovations", "one in five: R or the clock is wrong")
+
+
+IN_ORDER = (
+    "First make EKF2_EVP_NOISE the source's own noise, then remove outliers (line of sight) and "
+    "check the clock; widen EKF2_EVP_GATE last."
+)
+OUTLIERS = "Remove the outliers (line of sight, anchor survey)."
+
+
+def _remedy(analysis: Analysis) -> str:
+    """The noise or the delay that the data ask for, where that ends the rejections."""
+    model = analysis.ekf2_model
+    if isinstance(model, Unavailable):
+        return f"{IN_ORDER} {not_replayed(model)}"
+    asked = asked_of_ekf2(analysis.comparison, model, analysis.tuning, analysis.clock)
+    delay = {name: value for name, value in asked.items() if "DELAY" in name}
+    noise = {name: value for name, value in asked.items() if name not in delay}
+    both = asked if noise and delay else {}
+    candidates = [changes for changes in (noise, delay, both) if changes]
+    gate = min(2.0 * model.inputs.settings["EKF2_EVP_GATE"], PARAMETERS["EKF2_EVP_GATE"].maximum)
+    found = replayed(analysis, *candidates, {"EKF2_EVP_GATE": gate})
+    if isinstance(found, Unavailable):
+        return f"{IN_ORDER} {not_replayed(found)}"
+    *effects, wider = found
+    for effect in effects:
+        if rejects_less(effect.before, effect.after):
+            return f"Set {settings_words(effect.changes)}: {effect.words()}."
+    said = f"{OUTLIERS} What EKF2 fused does not tell its noise here."
+    if effects:
+        said = (
+            f"With what the data ask for ({settings_words(effects[-1].changes)}) the rejections "
+            f"remain: {effects[-1].words()}. {OUTLIERS}"
+        )
+    if isinstance(wider.after.position_rmse_to_truth_m, Unavailable):
+        return said
+    helps = rejects_less(wider.before, wider.after)
+    verdict = "Widen EKF2_EVP_GATE" if helps else "A wider EKF2_EVP_GATE is no remedy"
+    return f"{said} {verdict}; at {gate:g}: {wider.words()}."
 
 
 def _detect(analysis: Analysis) -> Found:
@@ -32,8 +73,7 @@ def _detect(analysis: Analysis) -> Found:
             "error" if share >= REJECTED_SHARE_ERROR.value else "warning",
             f"EKF2 rejected {share:.1%} of the source's samples for {what} (outside {gate:g} √S): "
             "outliers, a noise set too small, or a late clock.",
-            "First make EKF2_EVP_NOISE the source's own noise, then remove outliers (line of "
-            "sight) and check the clock; widen EKF2_EVP_GATE last.",
+            IN_ORDER if what == "height" else _remedy(analysis),
             {"rejected_share": share, "count": float(len(frame)), "axis": result.axis.name},
         )
 

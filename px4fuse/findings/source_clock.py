@@ -3,12 +3,31 @@
 from __future__ import annotations
 
 from px4fuse.analysis import Analysis
+from px4fuse.comparison.asked import delay_change
 from px4fuse.filter.clock import CHANGE_P, ClockOffset
+from px4fuse.findings.ekf2_remedy import delay_helps, replayed, settings_words
 from px4fuse.findings.model import Detector, Finding, Found, Threshold
+from px4fuse.flight import Unavailable
 
 CLOCK_OFFSET = Threshold(0.03, "s", "at 1 m/s a third of a good UWB's noise")
 CLOCK_OFFSET_ERROR = Threshold(0.10, "s", "at 1 m/s a good UWB's noise")
 CLOCK_SIGMAS = Threshold(3.0, "standard deviations", "0.3 % of clean flights lie beyond")
+
+
+def _for_ekf2(analysis: Analysis, clock: ClockOffset) -> str:
+    """What putting EKF2's delay right would do, where a replay confirms it."""
+    model, comparison = analysis.ekf2_model, analysis.comparison
+    if isinstance(model, Unavailable) or comparison.source.name != model.inputs.vision.source:
+        return ""
+    late_ms = -1e3 * (comparison.settings.clock_offset_s + clock.offset_s)
+    changes = delay_change(model, late_ms)
+    found = replayed(analysis, changes) if changes else None
+    if found is None or isinstance(found, Unavailable):
+        return ""
+    (effect,) = found
+    if not delay_helps(effect.before, effect.after):
+        return ""
+    return f"; for EKF2 set {settings_words(changes)}: {effect.words()}"
 
 
 def _detect(analysis: Analysis) -> Found:
@@ -48,7 +67,7 @@ def _detect(analysis: Analysis) -> Found:
             f"{'late' if clock.offset_s < 0 else 'early'} by {abs(clock.offset_s):.3f} s against "
             f"the IMU (95 % {abs(high):.3f} to {abs(low):.3f} s): at 1 m/s that is an error of "
             f"{abs(clock.offset_s):.2f} m, which neither filter's innovations show.",
-            f"--clock-offset {applied + clock.offset_s:.3f}",
+            f"--clock-offset {applied + clock.offset_s:.3f}{_for_ekf2(analysis, clock)}",
             evidence,
         )
 

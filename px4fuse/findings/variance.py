@@ -5,10 +5,16 @@ from __future__ import annotations
 import numpy as np
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.comparison import AxisComparison, Comparison
+from px4fuse.comparison.comparison import AxisComparison
 from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.kalman import Settings
 from px4fuse.filter.likelihood import NoiseAsked, sigma_a_asked
+from px4fuse.findings.ekf2_remedy import (
+    noise_helps,
+    not_replayed,
+    remedy_words,
+    settings_words,
+)
 from px4fuse.findings.model import Detector, Finding, Found, Threshold
 from px4fuse.flight import Unavailable
 
@@ -22,6 +28,8 @@ NOISE_ABSURD = Threshold(2.0, "times", "beyond, a small SIGMA_A explains it rath
 LAG1_SLOW = Threshold(0.3, "correlation", "white innovations stay below 2/√n, 0.2 at n = 100")
 SMALLEST_NOISE = Threshold(0.001, "m", "below what any positioning system resolves")
 OUTLIER_SHARE = Threshold(0.005, "outside 5√S", "6e-7 is expected")
+
+ONLY_HORIZONTAL = Unavailable("EKF2 replay", "the model of EKF2 is of horizontal position", "None.")
 
 
 def _detect(analysis: Analysis) -> Found:
@@ -39,11 +47,11 @@ def _detect(analysis: Analysis) -> Found:
         for group, axes in (("horizontal", ("north", "east", "aisle")), ("vertical", ("down",))):
             members = [(r, s) for r, s in named if r.axis.name in axes]
             if members:
-                yield _variance_finding(comparison, owner, group, members)
+                yield _variance_finding(analysis, owner, group, members)
 
 
 def _variance_finding(
-    comparison: Comparison,
+    analysis: Analysis,
     owner: str,
     group: str,
     members: list[tuple[AxisComparison, Consistency]],
@@ -69,19 +77,19 @@ def _variance_finding(
         f"{name} innovation variance is {'overstated' if over else 'understated'} "
         f"{factor:.3g} times along {result.axis.name} (mean NIS {statement.nis_mean:.3g}, "
         f"consistent is {low:.2f} to {high:.2f}; {group}).",
-        _noise_remedy(comparison, owner, result, statement),
+        _noise_remedy(analysis, owner, result, statement),
         evidence,
     )
 
 
 def _noise_remedy(
-    comparison: Comparison, owner: str, result: AxisComparison, statement: Consistency
+    analysis: Analysis, owner: str, result: AxisComparison, statement: Consistency
 ) -> str:
     """The measurement noise that the data ask for, as what to type or to set.
 
     It is a property of the source, so our estimate of it serves EKF2 as well.
     """
-    asked, settings = result.noise_asked, comparison.settings
+    asked, settings = result.noise_asked, analysis.comparison.settings
     lag1 = statement.lag1_autocorrelation
     noise_absurd = asked is None or asked.sigma_z_m > NOISE_ABSURD.value * settings.sigma_z_m
     if owner == "kf" and noise_absurd and lag1 > LAG1_SLOW.value:
@@ -96,16 +104,7 @@ def _noise_remedy(
         )
     if owner == "kf":
         return _kf_remedy(settings, asked, statement)
-    parameters = comparison.flight.log.parameters
-    used, set_noise = _ekf2_noise(result), parameters.get("EKF2_EVP_NOISE", np.nan)
-    reported = used > NOISE_FITS.value * set_noise and parameters.get("EKF2_EV_NOISE_MD") != 1.0
-    if reported and statement.variance_factor > 1.0:
-        return (
-            f"R is what the sender reports ({used:.2g} m), since that is more than EKF2_EVP_NOISE: "
-            f"correct it there, or set EKF2_EV_NOISE_MD to 1 and EKF2_EVP_NOISE to "
-            f"{max(asked.sigma_z_m, EKF2_NOISE_FLOOR.value):.2g}."
-        )
-    return _ekf2_remedy(used, asked, statement)
+    return _ekf2_remedy(analysis, result, asked, statement)
 
 
 def _kf_remedy(settings: Settings, asked: NoiseAsked, statement: Consistency) -> str:
@@ -123,7 +122,11 @@ def _kf_remedy(settings: Settings, asked: NoiseAsked, statement: Consistency) ->
     return f"The data ask for SIGMA_Z {noise:.2g} m at this SIGMA_A: --sigma-z {noise:.2g}."
 
 
-def _ekf2_remedy(used: float, asked: NoiseAsked, statement: Consistency) -> str:
+def _ekf2_remedy(
+    analysis: Analysis, result: AxisComparison, asked: NoiseAsked, statement: Consistency
+) -> str:
+    parameters = analysis.comparison.flight.log.parameters
+    used, set_noise = _ekf2_noise(result), parameters.get("EKF2_EVP_NOISE", np.nan)
     noise = asked.sigma_z_m
     if asked.upper_bound:  # EKF2's own innovations bound it too, and less tightly
         noise = float(np.hypot(statement.innovation_std_m, statement.innovation_mean_m))
@@ -133,11 +136,26 @@ def _ekf2_remedy(used: float, asked: NoiseAsked, statement: Consistency) -> str:
             f"It is not EKF2_EVP_NOISE (the source's noise is {noise:.2g} m): look at the clock "
             "(EKF2_EV_DELAY) and at EKF2's process noise (EKF2_ACC_NOISE)."
         )
+    changes = {"EKF2_EVP_NOISE": max(float(f"{noise:.2g}"), EKF2_NOISE_FLOOR.value)}
+    reported = used > NOISE_FITS.value * set_noise and parameters.get("EKF2_EV_NOISE_MD") != 1.0
     bound = "at most " if asked.upper_bound else ""
     was = "" if np.isnan(used) else f" (√R was {used:.2g} m)"
-    return (
-        f"The source's noise is {bound}{noise:.2g} m: set EKF2_EVP_NOISE to "
-        f"{max(noise, EKF2_NOISE_FLOOR.value):.2g}{was}."
+    why = f"The source's noise is {bound}{noise:.2g} m{was}: "
+    if reported and statement.variance_factor > 1.0:
+        changes = {"EKF2_EV_NOISE_MD": 1.0, **changes}
+        why = (
+            f"R is what the sender reports ({used:.2g} m), since that is more than EKF2_EVP_NOISE: "
+            "correct it there, or "
+        )
+    if result.axis.name == "down":
+        return f"{why}set {settings_words(changes)}. {not_replayed(ONLY_HORIZONTAL)}"
+    return remedy_words(
+        analysis,
+        changes,
+        noise_helps,
+        why=why,
+        otherwise="Look at the clock (EKF2_EV_DELAY), the outliers and EKF2's process noise "
+        "(EKF2_ACC_NOISE):",
     )
 
 

@@ -1,0 +1,164 @@
+"""What a replay of EKF2 says of a remedy: no finding, but what the findings about EKF2 share.
+
+A change of EKF2's parameters is proposed with its effect, and only where the replay confirms it.
+Where EKF2 cannot be replayed, the words say so.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+from px4fuse.analysis import Analysis
+from px4fuse.ekf2.parameters import PARAMETERS
+from px4fuse.ekf2.whatif import Summary, what_if
+from px4fuse.findings.model import Threshold
+from px4fuse.flight import Unavailable
+
+NIS_NEARER = Threshold(0.8, "of |log mean NIS|", "a choice: what does less is not its cause")
+REJECTED_FEWER = Threshold(0.5, "of the rejected share", "half is an effect, not a single sample")
+WORSE_ERROR = Threshold(1.05, "times", "the replayed position is off by 5 mm in 0.1 m")
+REJECTED_SHOWN = Threshold(0.005, "of the samples", "fewer are not worth a word")
+
+
+@dataclass(frozen=True)
+class Effect:
+    """EKF2 replayed as flown and with a change.
+
+    Attributes
+    ----------
+    changes : mapping
+        By PX4 name and in PX4's units.
+    before, after : Summary
+    """
+
+    changes: Mapping[str, float]
+    before: Summary
+    after: Summary
+
+    def words(self) -> str:
+        """What the change does, in numbers."""
+        before, after = self.before, self.after
+        parts = []
+        if max(before.rejected_share, after.rejected_share) >= REJECTED_SHOWN.value:
+            parts.append(f"rejected {before.rejected_share:.0%} → {after.rejected_share:.0%}")
+        parts.append(f"mean NIS {_short(before.nis_mean)} → {_short(after.nis_mean)}")
+        errors = before.position_rmse_to_truth_m, after.position_rmse_to_truth_m
+        if any(isinstance(error, Unavailable) for error in errors):
+            parts.append(f"innovations {_std(before):.3f} → {_std(after):.3f} m rms, no truth")
+        else:
+            parts.append(f"position error {errors[0]:.2f} → {errors[1]:.2f} m")
+        return f"{', '.join(parts)} (replayed)"
+
+
+Judge = Callable[[Summary, Summary], bool]
+
+
+def replayed(analysis: Analysis, *candidates: Mapping[str, float]) -> list[Effect] | Unavailable:
+    """What each of some changes would do.
+
+    Parameters
+    ----------
+    analysis : Analysis
+    *candidates : mapping
+        Changes by PX4 name and in PX4's units.
+    """
+    model = analysis.ekf2_model
+    if isinstance(model, Unavailable):
+        return model
+    found = what_if(model, candidates)
+    if isinstance(found, Unavailable):
+        return found
+    return [
+        Effect(changes, found.replayed, after)
+        for changes, after in zip(candidates, found.whatif, strict=True)
+    ]
+
+
+def remedy_words(
+    analysis: Analysis,
+    changes: Mapping[str, float],
+    helps: Judge,
+    *,
+    why: str = "",
+    otherwise: str,
+) -> str:
+    """A change of EKF2's parameters as a remedy, as far as a replay confirms it.
+
+    Parameters
+    ----------
+    analysis : Analysis
+    changes : mapping
+    helps : callable
+        From EKF2 as flown and as changed to whether that is a remedy.
+    why : str
+        Words before it: what the data ask for.
+    otherwise : str
+        What to do where the replay says that it is none.
+    """
+    setting = f"{why}set {settings_words(changes)}"
+    found = replayed(analysis, changes)
+    if isinstance(found, Unavailable):
+        return f"{_capital(setting)}. {not_replayed(found)}"
+    (effect,) = found
+    if helps(effect.before, effect.after):
+        return f"{_capital(setting)}: {effect.words()}."
+    said = ", ".join(f"{name} {value:.3g}" for name, value in changes.items())
+    return f"{otherwise} {said} is no remedy: {effect.words()}."
+
+
+def not_replayed(why: Unavailable) -> str:
+    """That a remedy was not tried, and why."""
+    return f"Not replayed: {why.reason}."
+
+
+def settings_words(changes: Mapping[str, float]) -> str:
+    """Parameters and the values to set."""
+    parts = []
+    for name, value in changes.items():
+        unit = f" {PARAMETERS[name].unit}" if PARAMETERS[name].unit else ""
+        parts.append(f"{name} to {value:.3g}{unit}")
+    return " and ".join(parts)
+
+
+def noise_helps(before: Summary, after: Summary) -> bool:
+    """Whether another noise brings the mean NIS nearer to 1, and neither rejects nor errs more."""
+    nearer = abs(math.log(after.nis_mean)) < NIS_NEARER.value * abs(math.log(before.nis_mean))
+    more = after.rejected_share > before.rejected_share or _errs_more(before, after)
+    return nearer and not more
+
+
+def rejects_less(before: Summary, after: Summary) -> bool:
+    """Whether far fewer samples are rejected, and the position is not worse."""
+    fewer = after.rejected_share < REJECTED_FEWER.value * before.rejected_share
+    return fewer and not _errs_more(before, after)
+
+
+def delay_helps(before: Summary, after: Summary) -> bool:
+    """Whether the innovations become smaller, and the error to the truth where there is one."""
+    errors = before.position_rmse_to_truth_m, after.position_rmse_to_truth_m
+    if isinstance(errors[0], float) and isinstance(errors[1], float) and errors[1] >= errors[0]:
+        return False
+    return _std(after) < _std(before) and after.rejected_share <= before.rejected_share
+
+
+def _errs_more(before: Summary, after: Summary) -> bool:
+    errors = before.position_rmse_to_truth_m, after.position_rmse_to_truth_m
+    if isinstance(errors[0], Unavailable) or isinstance(errors[1], Unavailable):
+        return False
+    return errors[1] > WORSE_ERROR.value * errors[0]
+
+
+def _std(summary: Summary) -> float:
+    """Standard deviation of the innovations per axis (m)."""
+    squares = [axis.innovation_std_m**2 for axis in summary.axes.values()]
+    return math.sqrt(sum(squares) / len(squares))
+
+
+def _short(nis: float) -> str:
+    return f"{nis:.0f}" if nis >= 9.95 else f"{nis:.1f}" if nis >= 0.095 else f"{nis:.2g}"
+
+
+def _capital(words: str) -> str:
+    return words[:1].upper() + words[1:]
