@@ -349,7 +349,7 @@ class TestKey:
             path.write_bytes(content)
             with pytest.raises(SettingsError):
                 read_key(path)
-        with pytest.raises(SettingsError, match="cannot be read"):
+        with pytest.raises(SettingsError, match="is a folder"):
             read_key(tmp_path)
 
 
@@ -366,8 +366,8 @@ BAD_COMMANDS = {
     "seed": ("--assignment roster.csv -o f --seed 3", "--seed is for a single flight"),
     "mistake": ("--assignment roster.csv -o f --mistake nlos", "--mistake is for a single"),
     "too many": ("--assignment roster.csv -o f --mistakes 9", "0 to 2"),
-    "mistakes alone": ("-o f.ulg --mistakes 1", "with --assignment"),
-    "secret alone": ("-o f.ulg --secret abcdefghij", "with --assignment"),
+    "mistakes alone": ("-o f.ulg --mistakes 1", "requires --assignment"),
+    "secret alone": ("-o f.ulg --secret abcdefghij", "requires --assignment"),
     "no roster": ("--assignment none.csv -o f", "cannot be read"),
     "key inside": ("--assignment roster.csv -o f --answer f/k.json", "students' folder"),
     "key is the roster": ("--assignment roster.csv -o f --answer roster.csv", "is the roster"),

@@ -91,7 +91,7 @@ def test_a_missing_file(tmp_path):
 
 def test_a_directory(tmp_path):
     (tmp_path / "folder.ulg").mkdir()
-    assert "cannot be read" in refusal(tmp_path / "folder.ulg")
+    assert "is a folder" in refusal(tmp_path / "folder.ulg")
 
 
 def test_an_empty_file(tmp_path):

@@ -321,7 +321,7 @@ def test_the_bounds_of_the_rate_are_within_them(read, rate):
 def test_a_rate_that_no_unit_explains_is_doubted(read, step):
     texts = [f"{float(step) * i:.6f}" for i in range(ROWS)]
     file = read(table({"time_s": texts, "x": X, "y": Y, "z": Z}))
-    said(file, "is no rate of a UWB", "--position-time-unit")
+    said(file, "is not a rate of a UWB", "--position-time-unit")
     assert file.samples.index[-1] == pytest.approx(float(texts[-1]))
 
 
@@ -423,7 +423,7 @@ def test_names_units_and_frames_of_position(read, case, separator):
     [
         ("E,N,U", ("'E', 'N', 'U' as ENU",)),
         ("up, north, east", ("'east [mm]', 'north [mm]', 'up [mm]' as ENU, in mm (from the n",)),
-        ("mm unsaid", ("mm", "m is no indoor flight", "--position-unit")),
+        ("mm unsaid", ("mm", "m is not an indoor flight", "--position-unit")),
         ("x_m", ("in m (from the names), nine tenths of it within 11.",)),
         ("two tracks", ("'raw_x', 'raw_y', 'raw_z' as x, y, z",)),
     ],
@@ -628,7 +628,7 @@ def test_text_in_a_column_of_numbers_is_named(read, column, text):
 @pytest.mark.parametrize("text", ["2026-11-21T25:00:00Z", "1795253650.9", "later"])
 def test_text_among_iso_times_is_named(read, text):
     line = refused(read, table({**PLAIN, "time": [*iso()[:29], text, *iso()[30:]]}))
-    assert f"line 31: 'time': '{text}' is no time" in line
+    assert f"line 31: 'time': '{text}' is not a time" in line
 
 
 def test_text_in_split_times_is_named(read):
@@ -741,7 +741,7 @@ def test_bad_options(read, options, words):
     [
         (b"", "empty"),
         (b"\n\n \n", "no row of numbers"),
-        (table(PLAIN).replace("\n", "\ns,m,m,m\n", 1), "line 2: 'time': 's' is no time"),
+        (table(PLAIN).replace("\n", "\ns,m,m,m\n", 1), "line 2: 'time': 's' is not a time"),
         ("time,x,y,z,sigma\n1,2\n3,4\n", "no rows with time and position found"),
         (b"\x00\x01time,x,y,z\n1,2,3,4\n", "binary"),
         ((REPOSITORY / "sample_logs" / "aisle_uwb.ulg").read_bytes(), "binary"),

@@ -17,7 +17,6 @@ from px4fuse.errors import LogError, Px4FuseError
 from px4fuse.reading import max_log_bytes, read_text, read_whole, shown
 
 SAMPLES = REPOSITORY / "sample_logs"
-ENDLESS_S = 60.0  # what is refused is refused at once; a pipe that is read never ends
 posix = pytest.mark.skipif(os.name == "nt", reason="devices, pipes and sockets are those of POSIX")
 
 
@@ -81,7 +80,7 @@ def refusal(monkeypatch, capsys, desk: Path, command: str) -> str:
     """What a command says on one line, soon and without writing anything."""
     monkeypatch.chdir(desk)
     before = sorted(desk.iterdir())
-    with patience(ENDLESS_S):
+    with patience():
         code, out, err = run_main(monkeypatch, capsys, *command.split(" "))
     assert (code, out) == (2, "")
     assert err.startswith("px4fuse: ")
@@ -122,7 +121,7 @@ def test_special_and_huge_files_in_a_folder_of_logs_are_passed_over(
     desk, monkeypatch, capsys
 ) -> None:
     monkeypatch.chdir(desk)
-    with patience(ENDLESS_S):
+    with patience():
         code, out, err = run_main(monkeypatch, capsys, "verify", "r.pdf", ".")
     assert (code, err) == (0, "")
     assert "r.pdf: verified" in out  # by the log beside them

@@ -217,7 +217,7 @@ REFUSED: dict[str, tuple[str | bytes, str]] = {
     "time that is text": (with_field(7, 0, "abc"), "line 7: column 1: 'abc' is no"),
     "NaN": (with_field(8, 3, "nan"), "line 8: a value that is not finite"),
     "infinite": (with_field(8, 5, "-inf"), "line 8: a value that is not finite"),
-    "NaN time": (with_field(9, 0, "nan"), "line 9: column 1: 'nan' is no time"),
+    "NaN time": (with_field(9, 0, "nan"), "line 9: column 1: 'nan' is not a time"),
     "too few columns": (changed(10, "1 2 3"), "line 10: 3 columns, where the first line has 8"),
     "too many columns": (changed(11, TUM_ROWS[0] + " 1"), "line 11: 9 columns"),
     "zero quaternion": (changed(12, TUM_ROWS[9].split()[0] + " 1 2 3 0 0 0 0"), "line 12: columns"),
@@ -227,7 +227,10 @@ REFUSED: dict[str, tuple[str | bytes, str]] = {
         text([f"{i // 2} 1 2 3 0 0 0 1" for i in range(99)]),
         "line 2: its time 0.0 s",
     ),
-    "odd unit": (text([f"{i * 33_000} 1 2 3 0 0 0 1" for i in range(9)]), "no interval of frames"),
+    "odd unit": (
+        text([f"{i * 33_000} 1 2 3 0 0 0 1" for i in range(9)]),
+        "not an interval of frames",
+    ),
 }
 
 

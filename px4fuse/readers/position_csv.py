@@ -404,7 +404,7 @@ def _name_text(table: Table, choice: _Choice, texts: pd.DataFrame) -> str:
     return at_line(
         table.file,
         table.first_line + row,
-        f"{table.label(column)}: {quote(str(texts[column].iloc[row]))} is no {kind}",
+        f"{table.label(column)}: {quote(str(texts[column].iloc[row]))} is not a {kind}",
         f"Correct or remove that line, or say where time and position are with {COLUMNS_OPTION}.",
     )
 

@@ -325,12 +325,12 @@ def _seconds(file: _File, stamps: list[str]) -> tuple[Array, str]:
         values = np.array(stamps, dtype=np.float64)
     except ValueError as error:
         row = next(i for i, stamp in enumerate(stamps) if not is_number(stamp.strip()))
-        what = f"column 1: {quote(stamps[row])} is no time"
+        what = f"column 1: {quote(stamps[row])} is not a time"
         raise file.refuse(row, what, "Correct or remove that line.") from error
     finite = np.isfinite(values)
     if not finite.all():
         row = int(np.argmin(finite))
-        raise file.refuse(row, f"column 1: {quote(stamps[row])} is no time", "Remove that line.")
+        raise file.refuse(row, f"column 1: {quote(stamps[row])} is not a time", "Remove that line.")
     step = float(np.median(np.abs(np.diff(values))))
     if step <= MAX_INTERVAL_S and np.abs(values).max() < UNIX_END_S:
         return values, ""
