@@ -34,8 +34,9 @@ def test_the_figures_of_the_benchmark_hold_on_every_simulated_flight(shared_logs
     paths = sorted((shared_logs / "simulated").glob("*.ulg"))
     models = bench_ekf2.agreement_table(paths)
     assert {path.stem for path in paths} - models.keys() == NOT_CARRIED.keys()
-    bench_ekf2.waterfalls(models)
+    left = bench_ekf2.waterfalls(models)
     bench_ekf2.counterfactuals(models)
+    assert bench_ekf2.readme_table(models, left) == bench_ekf2.in_readme()
 
 
 @pytest.mark.parametrize("name", NOT_CARRIED)

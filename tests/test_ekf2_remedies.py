@@ -11,17 +11,17 @@ from flights import Estimator, aisle_flight
 from px4fuse.analysis import Analysis, explain
 from px4fuse.comparison.asked import asked_of_ekf2, delay_change, noise_change, noise_used_m
 from px4fuse.comparison.comparison import Comparison, compare
-from px4fuse.ekf2.model import Model, replay_settings
-from px4fuse.ekf2.whatif import AxisSummary, Summary
-from px4fuse.filter.clock import ClockOffset
-from px4fuse.findings import Finding, ekf2_ev_delay_wrong, ekf2_rejecting, find, source_clock
-from px4fuse.findings.ekf2_remedy import (
+from px4fuse.comparison.remedy import (
     Effect,
     delay_helps,
     noise_helps,
     rejects_less,
     remedy_words,
 )
+from px4fuse.ekf2.model import Model, replay_settings
+from px4fuse.ekf2.whatif import AxisSummary, Summary
+from px4fuse.filter.clock import ClockOffset
+from px4fuse.findings import Finding, ekf2_ev_delay_wrong, ekf2_rejecting, find, source_clock
 from px4fuse.flight import Flight, Unavailable
 from px4fuse.readers import read_log
 
@@ -103,7 +103,7 @@ def test_the_effect_in_words() -> None:
 
 def words(analysis: Analysis, **changes: float) -> str:
     return remedy_words(
-        analysis, changes, noise_helps, why="Because: ", otherwise="Look elsewhere:"
+        analysis.ekf2_model, changes, noise_helps, why="Because: ", otherwise="Look elsewhere:"
     )
 
 

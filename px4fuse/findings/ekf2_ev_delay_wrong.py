@@ -6,9 +6,9 @@ import numpy as np
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.asked import delay_change
+from px4fuse.comparison.remedy import delay_helps, remedy_words
 from px4fuse.ekf2.parameters import PARAMETERS
 from px4fuse.filter.clock import ClockOffset
-from px4fuse.findings.ekf2_remedy import delay_helps, remedy_words
 from px4fuse.findings.model import Detector, Finding, Found, Threshold
 from px4fuse.findings.source_clock import CLOCK_OFFSET, CLOCK_SIGMAS
 from px4fuse.flight import Unavailable
@@ -28,7 +28,7 @@ def delay_remedy(analysis: Analysis, delay_ms: float, flown_ms: float) -> str:
     if not isinstance(model, Unavailable):
         changes = delay_change(model, delay_ms) or changes
     return remedy_words(
-        analysis, changes, delay_helps, otherwise="Correct the stamps at the sender:"
+        analysis.ekf2_model, changes, delay_helps, otherwise="Correct the stamps at the sender:"
     )
 
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.asked import asked_of_ekf2
+from px4fuse.comparison.remedy import not_replayed, rejects_less, replayed, settings_words
 from px4fuse.ekf2.parameters import PARAMETERS
-from px4fuse.findings.ekf2_remedy import not_replayed, rejects_less, replayed, settings_words
 from px4fuse.findings.model import Detector, Finding, Found, Threshold
 from px4fuse.flight import Ekf2, Unavailable
 
@@ -31,7 +31,7 @@ def _remedy(analysis: Analysis) -> str:
     both = asked if noise and delay else {}
     candidates = [changes for changes in (noise, delay, both) if changes]
     gate = min(2.0 * model.inputs.settings["EKF2_EVP_GATE"], PARAMETERS["EKF2_EVP_GATE"].maximum)
-    found = replayed(analysis, *candidates, {"EKF2_EVP_GATE": gate})
+    found = replayed(model, *candidates, {"EKF2_EVP_GATE": gate})
     if isinstance(found, Unavailable):
         return f"{IN_ORDER} {not_replayed(found)}"
     *effects, wider = found

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.asked import delay_change
+from px4fuse.comparison.remedy import delay_helps, replayed, settings_words
 from px4fuse.filter.clock import CHANGE_P, ClockOffset
-from px4fuse.findings.ekf2_remedy import delay_helps, replayed, settings_words
 from px4fuse.findings.model import Detector, Finding, Found, Threshold
 from px4fuse.flight import Unavailable
 
@@ -21,7 +21,7 @@ def _for_ekf2(analysis: Analysis, clock: ClockOffset) -> str:
         return ""
     late_ms = -1e3 * (comparison.settings.clock_offset_s + clock.offset_s)
     changes = delay_change(model, late_ms)
-    found = replayed(analysis, changes) if changes else None
+    found = replayed(model, changes) if changes else None
     if found is None or isinstance(found, Unavailable):
         return ""
     (effect,) = found

@@ -6,15 +6,15 @@ import numpy as np
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.comparison import AxisComparison
-from px4fuse.filter.consistency import Consistency
-from px4fuse.filter.kalman import Settings
-from px4fuse.filter.likelihood import NoiseAsked, sigma_a_asked
-from px4fuse.findings.ekf2_remedy import (
+from px4fuse.comparison.remedy import (
     noise_helps,
     not_replayed,
     remedy_words,
     settings_words,
 )
+from px4fuse.filter.consistency import Consistency
+from px4fuse.filter.kalman import Settings
+from px4fuse.filter.likelihood import NoiseAsked, sigma_a_asked
 from px4fuse.findings.model import Detector, Finding, Found, Threshold
 from px4fuse.flight import Unavailable
 
@@ -150,7 +150,7 @@ def _ekf2_remedy(
     if result.axis.name == "down":
         return f"{why}set {settings_words(changes)}. {not_replayed(ONLY_HORIZONTAL)}"
     return remedy_words(
-        analysis,
+        analysis.ekf2_model,
         changes,
         noise_helps,
         why=why,

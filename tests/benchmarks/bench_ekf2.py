@@ -3,7 +3,9 @@
 Prints the tables; what is not a time is asserted. Flights are those of the further logs, which are
 not part of the project; without them, the sample flight alone.
 
-    python tests/benchmarks/bench_ekf2.py [FOLDER]
+    python tests/benchmarks/bench_ekf2.py [FOLDER] [--readme]
+
+``--readme`` writes the table of the README again.
 """
 
 from __future__ import annotations
@@ -26,6 +28,8 @@ REPOSITORY = Path(__file__).parents[2]
 SHARED = REPOSITORY.parent / "shared" / "logs"
 SIMULATED = SHARED / "simulated"
 SAMPLE = REPOSITORY / "sample_logs" / "aisle_uwb.ulg"
+README = REPOSITORY / "README.md"
+BEGIN, END = "<!-- bench_ekf2: begin -->", "<!-- bench_ekf2: end -->"
 OVERCONFIDENT, OUTLIERS = "overconfident", "nlos"
 
 
@@ -85,8 +89,12 @@ def judge_agreement(name: str, model: Model) -> None:
             assert axis.velocity_rms_difference_m_s < 0.015, name
 
 
-def waterfalls(models: dict[str, Model]) -> None:
-    """Print and judge the walk of every flight: shares of the mean square, both axes together."""
+def waterfalls(models: dict[str, Model]) -> dict[str, float]:
+    """Print and judge the walk of every flight: shares of the mean square, both axes together.
+
+    Returns what is left of each.
+    """
+    unexplained = {}
     print("\nwhy EKF2 differs | total rms m | " + " | ".join(STEPS) + " | left")
     for name, model in models.items():
         found = walk(model)
@@ -102,6 +110,39 @@ def waterfalls(models: dict[str, Model]) -> None:
         print(f" | {left:.1%}")
         assert abs(sum(bars) + left - 1.0) < 1e-9, name
         assert left < 0.03, name
+        unexplained[name] = left
+    return unexplained
+
+
+def readme_table(models: dict[str, Model], left: dict[str, float]) -> str:
+    """Agreement on every flight as the README has it."""
+    lines = [
+        "| flight | innovations | correlation n/e | S replayed / logged, 5 to 95 % | rejected | "
+        "published, m rms n/e | left |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for name, model in models.items():
+        a, (north, east) = model.agreement, model.agreement.axes.values()
+        lines.append(
+            f"| {name} | {a.samples} | {north.innovation_correlation:.4f} / "
+            f"{east.innovation_correlation:.4f} | {min(north.s_ratio_p5, east.s_ratio_p5):.3f} to "
+            f"{max(north.s_ratio_p95, east.s_ratio_p95):.3f} | {a.rejected_share_replayed:.1%} / "
+            f"{a.rejected_share_logged:.1%} | {north.position_rms_difference_m:.3f} / "
+            f"{east.position_rms_difference_m:.3f} | {left[name]:.1%} |"
+        )
+    return "\n".join(lines)
+
+
+def in_readme() -> str:
+    """The table that the README has."""
+    return README.read_text(encoding="utf-8").split(BEGIN)[1].split(END)[0].strip()
+
+
+def write_readme(table: str) -> None:
+    """Put the table into the README."""
+    text = README.read_text(encoding="utf-8")
+    before, end = text.split(BEGIN)[0], text.split(END)[1]
+    README.write_text(f"{before}{BEGIN}\n{table}\n{END}{end}", encoding="utf-8")
 
 
 def horizontal_rmse(summary: Summary) -> float:
@@ -168,12 +209,14 @@ def speed(flight: Flight, model: Model) -> None:
         print(f"{share:.0%} of the flight: {cpu_s(lambda part=part: open_model(part)):.3f} s")
 
 
-def main(folder: Path) -> None:
+def main(folder: Path, *, readme: bool) -> None:
     paths = [SAMPLE]
     if folder.is_dir():
         paths = sorted(folder.glob("*.ulg"))
     models = agreement_table(paths)
-    waterfalls(models)
+    left = waterfalls(models)
+    if readme:
+        write_readme(readme_table(models, left))
     counterfactuals(models)
     flight = read_log(SAMPLE)
     model = open_model(flight)
@@ -182,4 +225,5 @@ def main(folder: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]) if sys.argv[1:] else SIMULATED)
+    folders = [word for word in sys.argv[1:] if word != "--readme"]
+    main(Path(folders[0]) if folders else SIMULATED, readme="--readme" in sys.argv)

@@ -1,4 +1,4 @@
-"""What a replay of EKF2 says of a remedy: no finding, but what the findings about EKF2 share.
+"""What a replay of EKF2 says of a remedy: what the findings about EKF2 share.
 
 A change of EKF2's parameters is proposed with its effect, and only where the replay confirms it.
 Where EKF2 cannot be replayed, the words say so.
@@ -10,16 +10,19 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from px4fuse.analysis import Analysis
+from px4fuse.ekf2.model import Model
 from px4fuse.ekf2.parameters import PARAMETERS
 from px4fuse.ekf2.whatif import Summary, what_if
-from px4fuse.findings.model import Threshold
 from px4fuse.flight import Unavailable
 
-NIS_NEARER = Threshold(0.8, "of |log mean NIS|", "a choice: what does less is not its cause")
-REJECTED_FEWER = Threshold(0.5, "of the rejected share", "half is an effect, not a single sample")
-WORSE_ERROR = Threshold(1.05, "times", "the replayed position is off by 5 mm in 0.1 m")
-REJECTED_SHOWN = Threshold(0.005, "of the samples", "fewer are not worth a word")
+# A noise must bring |log mean NIS| below this share of itself: what does less is not its cause
+NIS_NEARER = 0.8
+# Half of the rejections are an effect, not a single sample
+REJECTED_FEWER = 0.5
+# Times of the error to the truth; the replayed position is off by 5 mm in 0.1 m
+WORSE_ERROR = 1.05
+# Shares of rejected samples below this are not worth a word
+REJECTED_SHOWN = 0.005
 
 
 @dataclass(frozen=True)
@@ -41,7 +44,7 @@ class Effect:
         """What the change does, in numbers."""
         before, after = self.before, self.after
         parts = []
-        if max(before.rejected_share, after.rejected_share) >= REJECTED_SHOWN.value:
+        if max(before.rejected_share, after.rejected_share) >= REJECTED_SHOWN:
             parts.append(f"rejected {before.rejected_share:.0%} → {after.rejected_share:.0%}")
         parts.append(f"mean NIS {_short(before.nis_mean)} → {_short(after.nis_mean)}")
         errors = before.position_rmse_to_truth_m, after.position_rmse_to_truth_m
@@ -55,16 +58,18 @@ class Effect:
 Judge = Callable[[Summary, Summary], bool]
 
 
-def replayed(analysis: Analysis, *candidates: Mapping[str, float]) -> list[Effect] | Unavailable:
+def replayed(
+    model: Model | Unavailable, *candidates: Mapping[str, float]
+) -> list[Effect] | Unavailable:
     """What each of some changes would do.
 
     Parameters
     ----------
-    analysis : Analysis
+    model : Model or Unavailable
+        Of the flight.
     *candidates : mapping
         Changes by PX4 name and in PX4's units.
     """
-    model = analysis.ekf2_model
     if isinstance(model, Unavailable):
         return model
     found = what_if(model, candidates)
@@ -77,7 +82,7 @@ def replayed(analysis: Analysis, *candidates: Mapping[str, float]) -> list[Effec
 
 
 def remedy_words(
-    analysis: Analysis,
+    model: Model | Unavailable,
     changes: Mapping[str, float],
     helps: Judge,
     *,
@@ -88,7 +93,8 @@ def remedy_words(
 
     Parameters
     ----------
-    analysis : Analysis
+    model : Model or Unavailable
+        Of the flight.
     changes : mapping
     helps : callable
         From EKF2 as flown and as changed to whether that is a remedy.
@@ -98,7 +104,7 @@ def remedy_words(
         What to do where the replay says that it is none.
     """
     setting = f"{why}set {settings_words(changes)}"
-    found = replayed(analysis, changes)
+    found = replayed(model, changes)
     if isinstance(found, Unavailable):
         return f"{_capital(setting)}. {not_replayed(found)}"
     (effect,) = found
@@ -124,14 +130,14 @@ def settings_words(changes: Mapping[str, float]) -> str:
 
 def noise_helps(before: Summary, after: Summary) -> bool:
     """Whether another noise brings the mean NIS nearer to 1, and neither rejects nor errs more."""
-    nearer = abs(math.log(after.nis_mean)) < NIS_NEARER.value * abs(math.log(before.nis_mean))
+    nearer = abs(math.log(after.nis_mean)) < NIS_NEARER * abs(math.log(before.nis_mean))
     more = after.rejected_share > before.rejected_share or _errs_more(before, after)
     return nearer and not more
 
 
 def rejects_less(before: Summary, after: Summary) -> bool:
     """Whether far fewer samples are rejected, and the position is not worse."""
-    fewer = after.rejected_share < REJECTED_FEWER.value * before.rejected_share
+    fewer = after.rejected_share < REJECTED_FEWER * before.rejected_share
     return fewer and not _errs_more(before, after)
 
 
@@ -147,7 +153,7 @@ def _errs_more(before: Summary, after: Summary) -> bool:
     errors = before.position_rmse_to_truth_m, after.position_rmse_to_truth_m
     if isinstance(errors[0], Unavailable) or isinstance(errors[1], Unavailable):
         return False
-    return errors[1] > WORSE_ERROR.value * errors[0]
+    return errors[1] > WORSE_ERROR * errors[0]
 
 
 def _std(summary: Summary) -> float:
