@@ -18,6 +18,10 @@ if TYPE_CHECKING:
     from px4fuse.analysis import run as run
     from px4fuse.comparison.comparison import Comparison as Comparison
     from px4fuse.comparison.comparison import compare as compare
+    from px4fuse.ekf2.model import Model as Model
+    from px4fuse.ekf2.model import open_model as open_model
+    from px4fuse.ekf2.model import replay_ekf2 as replay_ekf2
+    from px4fuse.ekf2.whatif import what_if as what_if
     from px4fuse.errors import Px4FuseError as Px4FuseError
     from px4fuse.filter.consistency import Consistency as Consistency
     from px4fuse.filter.consistency import assess as assess
@@ -44,6 +48,7 @@ _HOMES = {
     "Finding": "findings",
     "Flight": "flight",
     "LoopRequest": "request",
+    "Model": "ekf2.model",
     "Px4FuseError": "errors",
     "Settings": "filter.kalman",
     "Unavailable": "flight",
@@ -53,11 +58,14 @@ _HOMES = {
     "evaluate": "trajectory.evaluation",
     "explain": "analysis",
     "find": "findings",
+    "open_model": "ekf2.model",
     "read_log": "readers",
     "read_trajectory": "readers.trajectory",
     "replay": "filter.kalman",
+    "replay_ekf2": "ekf2.model",
     "run": "analysis",
     "tune": "filter.tuning",
+    "what_if": "ekf2.whatif",
 }
 __all__ = list(_HOMES)
 

@@ -134,9 +134,12 @@ def test_what_the_data_ask_for(sample: Analysis) -> None:
 
     assert asked(sample) == {"EKF2_EVP_NOISE": 0.097}
     assert asked(replace(sample, tuning={})) == {}
+    aisle = {"aisle": sample.tuning["aisle"]}  # --axis aisle
+    assert asked(replace(sample, tuning=aisle))["EKF2_EVP_NOISE"] == pytest.approx(0.1, abs=0.01)
     late = asked(offset(sample, -0.25))
     assert late == {"EKF2_EVP_NOISE": 0.097, "EKF2_EV_DELAY": 250.0, "EKF2_DELAY_MAX": 300.0}
     assert asked(offset(sample, -0.14))["EKF2_EV_DELAY"] == 140.0
+    assert "EKF2_EV_DELAY" not in asked(offset(sample, -0.019))  # 0 may be right
     assert "EKF2_DELAY_MAX" not in asked(offset(sample, -0.14))
     assert "EKF2_EV_DELAY" not in asked(offset(sample, -0.4))  # beyond PX4's range
     assert "EKF2_EV_DELAY" not in asked(offset(sample, 0.2))  # early: it is 0 already

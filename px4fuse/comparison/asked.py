@@ -11,6 +11,7 @@ from px4fuse.comparison.comparison import Comparison
 from px4fuse.ekf2.model import Model
 from px4fuse.ekf2.parameters import PARAMETERS
 from px4fuse.filter.clock import ClockOffset
+from px4fuse.filter.signals import AISLE
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.flight import Unavailable
 
@@ -46,10 +47,10 @@ def asked_of_ekf2(
     source = comparison.source
     if source.name != model.inputs.vision.source or source.alignment is not None:
         return {}
-    tuned = tuning.get(HORIZONTAL)
     changes: dict[str, float] = {}
-    if isinstance(tuned, AxisTuning) and tuned.sigma_z.value is not None:
-        changes |= noise_change(model, tuned.sigma_z.value)
+    noise_m = tuned_noise_m(tuning)
+    if noise_m is not None:
+        changes |= noise_change(model, noise_m)
     if isinstance(clock, ClockOffset) and clock.determinable:
         applied = comparison.settings.clock_offset_s
         flown = model.inputs.settings["EKF2_EV_DELAY"]
@@ -57,6 +58,15 @@ def asked_of_ekf2(
         if not low - UPDATE_MS <= flown <= high + UPDATE_MS:
             changes |= delay_change(model, -1e3 * (applied + clock.offset_s))
     return changes
+
+
+def tuned_noise_m(tuning: Mapping[str, AxisTuning | Unavailable]) -> float | None:
+    """Horizontal measurement noise (m) that the data ask for; None where they do not tell."""
+    for name in (HORIZONTAL, AISLE, "north", "east"):
+        tuned = tuning.get(name)
+        if isinstance(tuned, AxisTuning):
+            return tuned.sigma_z.value
+    return None
 
 
 def noise_change(model: Model, noise_m: float) -> dict[str, float]:

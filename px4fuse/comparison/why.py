@@ -12,6 +12,7 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.arrays import Array
+from px4fuse.comparison.asked import tuned_noise_m
 from px4fuse.comparison.comparison import AxisComparison, Comparison
 from px4fuse.comparison.why_words import Facts, sentences
 from px4fuse.ekf2.agreement import judged_from, settled
@@ -19,7 +20,7 @@ from px4fuse.ekf2.model import Model
 from px4fuse.ekf2.walk import WHAT, AxisWalk, Coast, Line, Student, walk
 from px4fuse.filter.clock import ClockOffset
 from px4fuse.filter.kalman import state_at
-from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
+from px4fuse.filter.tuning import AxisTuning
 from px4fuse.flight import Ekf2, Unavailable
 
 
@@ -109,7 +110,7 @@ def why_ekf2_differs(
     if isinstance(walked, Unavailable):
         return dict.fromkeys(results, walked)
     spans = _spans(model, walked.times_s)
-    facts = Facts(comparison, model, walked, _noise_asked(tuning) if same_source else None, clock)
+    facts = Facts(comparison, model, walked, tuned_noise_m(tuning) if same_source else None, clock)
     found: dict[str, Why | Unavailable] = {}
     for name, axis in walked.axes.items():
         outside = _outside(results[name], spans)
@@ -134,11 +135,6 @@ def _line(result: AxisComparison, ekf2: Ekf2) -> Line:
     position, velocity = state_at(result.replay, times.to_numpy())
     track = pd.DataFrame({"position_m": position, "velocity_m_s": velocity}, index=times)
     return Line(float(north), float(east), track)
-
-
-def _noise_asked(tuning: Mapping[str, AxisTuning | Unavailable]) -> float | None:
-    tuned = tuning.get(HORIZONTAL)
-    return tuned.sigma_z.value if isinstance(tuned, AxisTuning) else None
 
 
 def _spans(model: Model, times: Array) -> tuple[tuple[float, float], ...]:

@@ -53,6 +53,13 @@ def agreement_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavai
             f"{len(log)} logged innovations to compare with are too few (at least {MIN_SAMPLES})",
             "Fly longer on external vision, and record with SDLOG_PROFILE bit 0 (default).",
         )
+    columns = [f"innovation_{axis}_m" for axis in HORIZONTAL]
+    if not (np.ptp(log[columns], axis=0).all() and np.ptp(model[columns], axis=0).all()):
+        return Unavailable(
+            "EKF2 replay",
+            "the innovations do not vary, so that nothing tells whether they agree",
+            "Record a flight with motion and measured positions.",
+        )
     axes: dict[str, AxisAgreement] = {
         axis: _axis(axis, log, model, ekf2, replay) for axis in HORIZONTAL
     }
