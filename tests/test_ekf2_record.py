@@ -162,9 +162,9 @@ class TestBiasAndHorizon:
     def test_step_is_a_whole_number_of_imu_samples(self, tmp_path):
         log = make_log("v1.14", imu_hz=1.0 / 0.004)
         log.parameters["EKF2_PREDICT_US"] = 10_000
-        log["estimator_states"]["states"][:, 13:16] = BIAS * 0.008
+        log["estimator_states"]["states"][:, 13:16] = BIAS * 0.012
         ekf2 = self.read(tmp_path, log)
-        assert ekf2.step_s == pytest.approx(0.008)  # 2.5 samples round to 2
+        assert ekf2.step_s == pytest.approx(0.012)  # 2.5 samples round to 3: roundf, away from 0
         np.testing.assert_allclose(ekf2.accelerometer_bias.iloc[0], BIAS, rtol=1e-5)
 
     def test_horizon_is_the_age_at_publication(self, tmp_path):
