@@ -495,7 +495,7 @@ class TestWhatStudentsRead:
         text = feedback(graded(items, flags=("copied",)), "Lab 2")
         assert text.startswith("Lab 2\n")
         assert "Ann Lee, 1001" in text
-        assert "Most points are still to be had here" in text
+        assert "You can still gain most points here" in text
         assert "copied" not in text
         assert all(len(line) <= 100 for line in text.splitlines())
 

@@ -502,7 +502,7 @@ def test_impossible_scenarios_are_refused(changes):
 
 
 def test_what_does_not_fit_is_refused():
-    with pytest.raises(SettingsError, match="--kind loop only"):
+    with pytest.raises(SettingsError, match="requires --kind loop"):
         simulate(AISLE, parse(["open-end"]))
     with pytest.raises(SettingsError, match="at most 6 m"):
         simulate(LOOP, parse(["open-end=7"]))
