@@ -664,7 +664,7 @@ class TestClassFlags:
             answers,
         )  # fmt: skip
         assert "The log was given to s01; the id s01x is not in the answer key." in made[1]
-        assert any("none of those" in flag for flag in made[2])
+        assert any("not one of those" in flag for flag in made[2])
         taken = class_flags([of(1, student_id="s02", log_sha256="a" * 64)], answers)
         assert "given to another student, s01" in taken[0][0]
 
