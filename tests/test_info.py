@@ -349,7 +349,7 @@ def test_a_recording_names_its_senders_clocks_and_dropouts(monkeypatch, tmp_path
     )  # fmt: skip
     clock = ClockMap("UNIX time of system 1, component 197", "TIMESYNC", 512, -1.7e9, 2.5, 0.001)
     flight = dataclasses.replace(sample_flight, log=log, clocks=(clock,))
-    monkeypatch.setattr("px4fuse.readers.read_log", lambda _, **__: flight)
+    monkeypatch.setattr("px4fuse.analysis.read_log", lambda _, **__: flight)
     text = info(tmp_path / "any.tlog")
     assert max(map(len, text.splitlines())) <= WIDTH
     for words in ("1/1", "PX4 quadrotor (this flight)", "12.5%", "unknown", "TIMESYNC",
