@@ -6,24 +6,21 @@ import shlex
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 import click
 from click.core import ParameterSource
 
 from px4fuse.errors import SettingsError
 from px4fuse.reading import max_log_bytes, read_text
-from px4fuse.request import AUTO
+from px4fuse.request import AUTO, AxisName, InputName
 
 if TYPE_CHECKING:
     from px4fuse.request import ComparisonRequest, PositionFile
     from px4fuse.results.model import Student
 
-AXES = ("north", "east", "down", "aisle")
-# Options that name places or people; the command line in the report leaves them out
-NOT_RECORDED = (
-    "output", "json_path", "tum", "g2o", "student", "student_id", "notes", "fail_on", "max_size",
-)  # fmt: skip
+# Options of the commands without a request that say where to write, or what this machine can take
+NOT_RECORDED = ("json_path", "g2o", "max_size")
 
 
 class NumberOrAuto(click.ParamType[float | str]):
@@ -87,14 +84,14 @@ _ANALYSIS = (
     ),
     click.option(
         "--input",
-        type=click.Choice(["imu", "zero"]),
+        type=click.Choice(get_args(InputName)),
         default=None,
         help="Acceleration from the IMU, or constant velocity.  [default: imu where logged]",
     ),
     click.option(
         "--axis",
         "axes",
-        type=click.Choice(AXES),
+        type=click.Choice(get_args(AxisName)),
         multiple=True,
         help="Axis to analyse; may be repeated.  [default: all that the source supports]",
     ),
@@ -354,6 +351,5 @@ def command_line(command: str, *files: Path) -> str:
             continue
         value: Any = context.params[name]
         for single in value if isinstance(value, tuple) else (value,):
-            text = single.name if isinstance(single, Path) else str(single)
-            words += [parameter.opts[-1], encodable(text)]
+            words += [parameter.opts[-1], encodable(str(single))]
     return shlex.join(words)

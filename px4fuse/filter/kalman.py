@@ -6,7 +6,7 @@ Its model, F, B, Q, H and R, stands in :mod:`px4fuse.filter.model`.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import get_args
 
 import numpy as np
 import pandas as pd
@@ -28,9 +28,9 @@ from px4fuse.filter.model import (
 )
 from px4fuse.filter.signals import Axis, step_means
 from px4fuse.flight import Unavailable
+from px4fuse.request import InputName
 
-InputName = Literal["imu", "zero"]
-INPUT_NAMES: tuple[InputName, InputName] = ("imu", "zero")
+INPUT_NAMES: tuple[InputName, ...] = get_args(InputName)
 
 # Ranges outside which a setting is a slip of the keyboard, not a choice.
 SIGMA_A_RANGE_M_S2 = (1e-4, 100.0)

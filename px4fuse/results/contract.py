@@ -226,7 +226,7 @@ def _plain_number(value: Any) -> float:
     Raises
     ------
     NotImplementedError
-        It is no number.
+        It is not a number.
     """
     if isinstance(value, float):
         return float(value)
