@@ -19,6 +19,7 @@ from px4fuse.ekf2.replay import Ekf2Replay
 from px4fuse.ekf2.whatif import WhatIf, sweep_values, what_if
 from px4fuse.errors import LogError, MissingDataError, SettingsError
 from px4fuse.filter.clock import ClockOffset, estimate_clock_offset
+from px4fuse.filter.fitting import Noises
 from px4fuse.filter.kalman import Settings
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, tune
 from px4fuse.flight import Flight, Unavailable
@@ -309,7 +310,13 @@ def explain(comparison: Comparison, progress: Progress = _silent) -> Analysis:
     """
     axes = tuple(result.axis for result in comparison.axes)
     names = REPORTED if {"north", "east"} <= {axis.name for axis in axes} else None
-    tuning = tune(axes, comparison.settings, names, lambda name: progress(f"tuning {name}"))
+    tuning = tune(
+        axes,
+        comparison.settings,
+        names,
+        lambda name: progress(f"tuning {name}"),
+        comparison.flight,
+    )
     clock = clock_offset(comparison, tuning, progress)
     progress("replaying EKF2")
     model = open_model(comparison.flight)
@@ -321,7 +328,7 @@ def explain(comparison: Comparison, progress: Progress = _silent) -> Analysis:
 def tuned_horizontally(comparison: Comparison) -> Tuning:
     """The horizontal noises alone, which is what the clock estimate needs."""
     axes = tuple(result.axis for result in comparison.axes)
-    return tune(axes, comparison.settings, (HORIZONTAL,))
+    return tune(axes, comparison.settings, (HORIZONTAL,), flight=comparison.flight)
 
 
 def clock_offset(
@@ -345,16 +352,14 @@ def clock_offset(
         ),
         None,
     )
-    sigma_z_m, outliers = comparison.settings.sigma_z_m, None
-    if tuned is not None:
-        sigma_z_m = tuned.sigma_z.value or tuned.sigma_z.high or sigma_z_m
-        outliers = tuned.outlier_time_s
+    settings = comparison.settings
+    noises = Noises(settings.sigma_a_m_s2, settings.sigma_z_m)
     return estimate_clock_offset(
         comparison.flight,
         comparison.source,
         comparison.segment,
         comparison.settings,
-        sigma_z_m,
-        outliers,
+        noises if tuned is None else tuned.noises,
+        None if tuned is None else tuned.outlier_time_s,
         progress,
     )

@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.special import expit
 from scipy.stats import chi2
 
 from px4fuse.arrays import Array, BoolArray
@@ -143,6 +142,7 @@ def recursion(
     sigma_a_m_s2: ArrayLike,
     sigma_z_m: ArrayLike,
     skip: BoolArray | None,
+    weight: Array | None = None,
 ) -> Iterator[tuple[Array, Array, Array, Array, Array, Symmetric[Array]]]:
     """Run the filter over a grid of settings, measurement by measurement.
 
@@ -153,6 +153,8 @@ def recursion(
         Broadcast against each other to a grid of shape (...).
     skip : ndarray of bool, shape (m,), or None
         Measurements that are compared but not fused.
+    weight : ndarray, shape (m,), optional
+        What each measurement counts: its variance is SIGMA_Z² over that.
 
     Yields
     ------
@@ -167,7 +169,8 @@ def recursion(
         q, r = q.item(), r.item()
     p, v = legs.initial.position_m, legs.initial.velocity_m_s + 0.0 * q  # of the grid's shape
     covariance: Symmetric[Any] = INITIAL_COVARIANCE
-    for dt, dp, dv, unit, fixed, z, skipped in zip(
+    variance = r
+    for dt, dp, dv, unit, fixed, z, skipped, counts in zip(
         legs.length_s.tolist(),
         legs.delta_position_m.tolist(),
         legs.delta_velocity_m_s.tolist(),
@@ -175,8 +178,10 @@ def recursion(
         legs.noise_fixed.tolist(),
         legs.measurement_m.tolist(),
         [False] * len(legs.measurement_m) if skip is None else skip.tolist(),
+        [1.0] * len(legs.measurement_m) if weight is None else weight.tolist(),
         strict=True,
     ):
+        r = variance / counts
         # x = Fx + Ba, P = FPFᵀ + Q
         p, v = p + dt * v + dp, v + dv
         p00, p01, p11 = spread(covariance, dt)
@@ -219,32 +224,24 @@ def filtered(
     return position_m, velocity_m_s
 
 
-# An innovation is of a wide normal distribution with this probability, WIDTH times as wide: far
-# more tail than a normal one has, and hardly any bias where there are no outliers.
-OUTLIER_SHARE, OUTLIER_WIDTH = 0.005, 10.0
+def total_over_grid(
+    legs: list[Preintegrated], sigma_a_m_s2: Array, sigma_z_m: Array, weight: Array
+) -> Array:
+    """-ln p of all axes but for a constant, of the shape of the grid of settings.
 
-
-def negative_log_likelihood(nu: Array, s: Array) -> Array:
-    """-Σ ln p(ν) over the first dimension, under a normal distribution with heavy tails.
-
-    p = (1 - ε) N(ν; 0, S) + ε N(ν; 0, w²S), the contaminated normal (Tukey 1960).
+    Parameters
+    ----------
+    legs : list of Preintegrated
+    sigma_a_m_s2, sigma_z_m : ndarray
+        Broadcast against each other.
+    weight : ndarray, shape (m,)
+        What each measurement counts: its variance is SIGMA_Z² over that.
     """
-    square = nu**2 / s
-    # logaddexp of both parts, with ln N(ν; 0, S) taken out
-    tail = np.log(OUTLIER_SHARE / OUTLIER_WIDTH) + 0.5 * square * (1.0 - OUTLIER_WIDTH**-2)
-    mixed = np.logaddexp(np.log1p(-OUTLIER_SHARE), tail)
-    return np.asarray(np.sum(0.5 * (np.log(2.0 * np.pi * s) + square) - mixed, axis=0))
-
-
-def outlier_probability(nu: list[Array], s: list[Array]) -> Array:
-    """Probability that each measurement is an outlier, by all its axes, shape (m,)."""
-    square = np.sum([n**2 / v for n, v in zip(nu, s, strict=True)], axis=0)
-    odds = (
-        np.log(OUTLIER_SHARE / (1.0 - OUTLIER_SHARE))
-        - len(nu) * np.log(OUTLIER_WIDTH)
-        + 0.5 * square * (1.0 - OUTLIER_WIDTH**-2)
-    )
-    return np.asarray(expit(odds))
+    total = np.zeros(np.broadcast(sigma_a_m_s2, sigma_z_m).shape)
+    for leg in legs:
+        for nu, s, *_ in recursion(leg, sigma_a_m_s2, sigma_z_m, None, weight):
+            total += 0.5 * (np.log(s) + nu**2 / s)
+    return total
 
 
 MAX_PASSES = 4
@@ -277,20 +274,24 @@ def parabola_vertex(profile: Array, at: int) -> tuple[float, float]:
     return (0.5 * (left - right) / bend if bend > 0.0 else 0.0), bend
 
 
-def profile_interval(grid: Array, profile: Array) -> tuple[float | None, float | None]:
+def profile_interval(
+    grid: Array, profile: Array, allowed: float = PROFILE_DROP
+) -> tuple[float | None, float | None]:
     """Ends of the 95 % interval of a profile likelihood, None where it does not end on the grid.
 
     Parameters
     ----------
     grid, profile : ndarray, shape (n,)
         Values, and the negative log-likelihood at each; between two of them it is a line.
+    allowed : float
+        How far above its minimum the interval reaches.
     """
     drop = profile - profile.min()
-    inside = np.flatnonzero(drop <= PROFILE_DROP)
+    inside = np.flatnonzero(drop <= allowed)
     ends: list[float | None] = []
     for edge, beyond in ((inside[0], inside[0] - 1), (inside[-1], inside[-1] + 1)):
         if 0 <= beyond < len(grid):
-            share = (PROFILE_DROP - drop[edge]) / (drop[beyond] - drop[edge])
+            share = (allowed - drop[edge]) / (drop[beyond] - drop[edge])
             ends.append(float(grid[edge] + share * (grid[beyond] - grid[edge])))
         else:
             ends.append(None)

@@ -14,7 +14,7 @@ from scipy import constants
 from scipy.integrate import cumulative_trapezoid
 from scipy.spatial.transform import Rotation, Slerp
 
-from px4fuse.arrays import Array
+from px4fuse.arrays import Array, BoolArray
 from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.flight import (
     AXIS_NAMES,
@@ -413,8 +413,7 @@ def project_acceleration(
         return Unavailable(
             "IMU", "no IMU sample in the analysed segment", "Choose --start and --end inside it."
         )
-    interval = np.diff(time)
-    is_gap = interval > max(IMU_GAP_S, IMU_GAP_INTERVALS * float(np.median(interval)))
+    interval, is_gap = np.diff(time), imu_gaps(time)
     return Acceleration(
         time_s=time,
         value_m_s2=value,
@@ -422,6 +421,12 @@ def project_acceleration(
         gap_integral_s=np.concatenate([[0.0], np.cumsum(np.where(is_gap, interval, 0.0))]),
         rms_m_s2=float(np.sqrt(np.mean(value[inside] ** 2))),
     )
+
+
+def imu_gaps(time_s: Array) -> BoolArray:
+    """Whether each interval between IMU samples is a gap, shape (n - 1,)."""
+    interval = np.diff(time_s)
+    return interval > max(IMU_GAP_S, IMU_GAP_INTERVALS * float(np.median(interval)))
 
 
 def step_means(acceleration: Acceleration, edges: ArrayLike) -> tuple[Array, Array]:

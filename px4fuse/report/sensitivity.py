@@ -83,7 +83,7 @@ def _map(figure: Figure, top: float, document: Document, name: str) -> None:
     axes.contourf(
         found.map.sigma_z_m, found.map.sigma_a_m_s2, found.map.drop, LEVELS, colors=SHADES
     )
-    best_a, best_z = _point(found.sigma_a), _point(found.sigma_z)
+    best_a, best_z = _point(found.filter_sigma_a), _point(found.sigma_z)
     axes.plot(best_z, best_a, "o", color="white", mec="black", ms=4.5, label="most likely")
     axes.plot(settings.sigma_z_m, settings.sigma_a_m_s2, "X", color=EKF2, mec="black", mew=0.5,
               ms=6.5, label="chosen")  # fmt: skip
@@ -106,8 +106,8 @@ def _map(figure: Figure, top: float, document: Document, name: str) -> None:
     axes.legend(loc="upper left", handlelength=1.0)
     caption(
         axes,
-        f"SIGMA_A {_words(found.sigma_a, 'm/s²')}; SIGMA_Z {_words(found.sigma_z, 'm')}. The "
-        f"chosen pair is {found.gain_nats * found.count:.1f} below the maximum (ln, "
+        f"SIGMA_A {_words(found.filter_sigma_a, 'm/s²')}; SIGMA_Z {_words(found.sigma_z, 'm')}. "
+        f"The chosen pair is {found.gain_nats * found.count:.1f} below the maximum (ln, "
         f"{found.count} measurements).",
     )
 

@@ -92,7 +92,7 @@ def tuning_advice(
     lines = []
     options = [
         f"{option} {noise.value:.3g}"
-        for option, noise in (("--sigma-a", found.sigma_a), ("--sigma-z", found.sigma_z))
+        for option, noise in (("--sigma-a", found.filter_sigma_a), ("--sigma-z", found.sigma_z))
         if noise.value is not None
     ]
     if options:
@@ -116,22 +116,15 @@ def tuning_advice(
             f"PX4      EKF2_EVP_NOISE {found.sigma_z.value:.3g}"
             + (f" (now {now:g})" if now is not None else "")
         )
-    if found.sigma_a.value is None:
+    needed = found.filter_sigma_a
+    if needed.value is None:
         lines.append(
             "SIGMA_A  is not determined by this flight: too little motion, or too short."
-            if found.sigma_a.low is None
-            else f"SIGMA_A  is at least {found.sigma_a.low:.2g} m/s²: the acceleration is wrong."
+            if needed.low is None
+            else f"SIGMA_A  is at least {needed.low:.2g} m/s²: the acceleration is wrong."
         )
-    als = [
-        f"{label} {value:.3g} {unit}"
-        for label, value, unit in (
-            ("SIGMA_A", found.als_sigma_a_m_s2, "m/s²"),
-            ("SIGMA_Z", found.als_sigma_z_m, "m"),
-        )
-        if value is not None
-    ]
-    if als:
-        lines.append(f"Check    autocovariance least squares has {', '.join(als)} ({name})")
+    elif found.biases_fitted:
+        lines.append(f"SIGMA_A  {noise_and_bias_words(found)}")
     if len(found.outlier_time_s):
         lines.append(
             f"Outliers {len(found.outlier_time_s)} of {found.count} measurements ({name}), the "
@@ -144,6 +137,20 @@ def tuning_advice(
             "chosen ones: these are as good as any"
         )
     return lines
+
+
+def noise_and_bias_words(found: AxisTuning) -> str:
+    """Why the filter's SIGMA_A is larger than the noise."""
+    noise = found.sigma_a
+    value = noise.value if noise.value is not None else noise.high
+    if value is None:
+        return "covers noise, bias and tilt together; this flight does not tell them apart"
+    bound = "" if noise.value is not None else "at most "
+    return (
+        f"of the acceleration alone is {bound}{value:.2g} m/s²; the filter has no state for the "
+        f"accelerometer's bias and tilt, and needs {found.filter_sigma_a.value:.2g} m/s² to cover "
+        "them"
+    )
 
 
 def clock_advice(comparison: Comparison, clock: ClockOffset | Unavailable) -> list[str]:

@@ -189,6 +189,7 @@ def _tuned(found: AxisTuning | Unavailable) -> made.Tuned | Absent:
         after=copied_or_absent(made.Consistency, found.after),
         held_out=copied_or_absent(made.HeldOut, found.held_out),
         **_noise("sigma_a_m_s2", found.sigma_a),
+        **_noise("filter_sigma_a_m_s2", found.filter_sigma_a),
         **_noise("sigma_z_m", found.sigma_z),
     )
 

@@ -282,15 +282,21 @@ class HeldOut(Base, frozen=True):
 class Tuned(Base, frozen=True, kw_only=True):
     """Most likely noises, with 95 % intervals.
 
-    An upper bound stands instead of a value where the likelihood has its maximum at zero.
-    ``gain_nats`` is the log-likelihood per measurement above that of the chosen settings;
-    ``als_...`` are by autocovariance least squares.
+    ``sigma_a_m_s2`` and ``sigma_z_m`` are noise alone, with biases and tilt taken out where
+    ``biases_fitted``; ``filter_sigma_a_m_s2`` is what the two-state filter needs, which has no
+    states for them. An upper bound stands instead of a value where the likelihood has its maximum
+    at zero. ``gain_nats`` is the log-likelihood per measurement of that filter above the chosen
+    settings'.
     """
 
     sigma_a_m_s2: NotNegative | None = None
     sigma_a_m_s2_interval: Interval | None = None
     sigma_a_m_s2_upper_bound: NotNegative | None = None
     sigma_a_m_s2_lower_bound: NotNegative | None = None
+    filter_sigma_a_m_s2: NotNegative | None = None
+    filter_sigma_a_m_s2_interval: Interval | None = None
+    filter_sigma_a_m_s2_upper_bound: NotNegative | None = None
+    filter_sigma_a_m_s2_lower_bound: NotNegative | None = None
     sigma_z_m: NotNegative | None = None
     sigma_z_m_interval: Interval | None = None
     sigma_z_m_upper_bound: NotNegative | None = None
@@ -301,8 +307,7 @@ class Tuned(Base, frozen=True, kw_only=True):
     before: Part[Consistency]
     after: Part[Consistency]
     held_out: Part[HeldOut]
-    als_sigma_a_m_s2: NotNegative | None = None
-    als_sigma_z_m: NotNegative | None = None
+    biases_fitted: bool
 
 
 class PartOffset(Base, frozen=True):

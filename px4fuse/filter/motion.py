@@ -1,0 +1,231 @@
+"""Motion as the IMU alone has it, and what every constant error of the IMU would add to it.
+
+The attitude is integrated from the gyros, from the logged attitude at the start of each stretch:
+EKF2's own later attitude was corrected by the very positions that are in question, and carries
+their lateness. To first order the acceleration is linear in ten constants of each stretch: errors
+of the initial attitude (rad, NED), gyro biases (rad/s, body), accelerometer biases (m/s², body)
+and the scale of the positions. Each one's own signal is integrated once, and a clock offset only
+moves where the integrals are read.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+from scipy import constants
+from scipy.integrate import cumulative_trapezoid
+from scipy.spatial.transform import Rotation, Slerp
+
+from px4fuse.arrays import Array, IntArray
+from px4fuse.filter.marginal import Chain, Positions
+from px4fuse.filter.model import move, noise_of_many_steps
+from px4fuse.filter.signals import imu_gaps
+from px4fuse.flight import ANGULAR_RATE_COLUMNS, QUATERNION_COLUMNS, SPECIFIC_FORCE_COLUMNS
+from px4fuse.trajectory.graph import lie
+
+# Standard deviations of the constants, wide for consumer sensors: tilt and heading (rad), gyro
+# (rad/s) and accelerometer (m/s²), scale of the positions (1)
+CONSTANT_SIGMA = np.repeat([0.05, 0.004, 0.3, 0.1], [3, 3, 3, 1])
+HEADING = 2  # which of them is a turn about down
+SCALE = 9
+# To first order only while the angles stay small: longer flights are cut into stretches. A gyro
+# bias of 0.004 rad/s turns by 0.12 rad in one, whose square costs 0.07 m/s².
+STRETCH_S = 30.0
+SEARCH_S = 0.6
+MIN_MEASUREMENTS = 15
+# The IMU is averaged to this interval before it is integrated
+STEP_S = 0.02
+# Of position (1/m²) and velocity (s²/m²) where a stretch starts: as good as nothing, but enough
+# for one in which an axis was hardly measured
+START_PRECISION = 1e-6, 1e-4
+# Slower, and what the acceleration did between samples is not known
+MAX_IMU_INTERVAL_S = 0.025
+
+
+@dataclass(frozen=True)
+class Signals:
+    """Acceleration of one stretch and of each constant, and their integrals.
+
+    ``value``, ``velocity`` and ``position`` have shape (n, 3, 1 + constants); the first is the
+    acceleration with all constants zero. Each value holds from its time to the next.
+    """
+
+    time_s: Array
+    value: Array
+    velocity: Array
+    position: Array
+
+    def at(self, time_s: Array) -> tuple[Array, Array]:
+        """Integrals at other times: velocity and position, shape (..., 3, 1 + constants)."""
+        at = np.clip(np.searchsorted(self.time_s, time_s, side="right") - 1, 0, len(self.value) - 1)
+        ahead = (time_s - self.time_s[at])[..., None, None]
+        position, velocity = move(self.position[at], self.velocity[at], self.value[at], ahead)
+        return velocity, position
+
+
+@dataclass(frozen=True)
+class Motion:
+    """The IMU's signals under the measurements of one source, in stretches.
+
+    Attributes
+    ----------
+    time_s : ndarray, shape (m,)
+        Stamps of the measurements that lie in a stretch.
+    row : ndarray of int, shape (m,)
+        Which of the given measurements they are.
+    edges : ndarray of int, shape (s + 1,)
+        First measurement of each stretch, and their number.
+    signals : tuple of Signals
+        Of each stretch.
+    """
+
+    time_s: Array
+    row: IntArray
+    edges: IntArray
+    signals: tuple[Signals, ...]
+
+    def positions(self, measurement_m: Array, dt_s: float) -> Positions:
+        """Positions along some axes, ready to be fitted.
+
+        Parameters
+        ----------
+        measurement_m : ndarray, shape (given, a)
+            All that were given; NaN where there is none.
+        dt_s : float
+            DT, which gives SIGMA_A its meaning.
+        """
+        end = np.setdiff1d(np.arange(1, len(self.time_s)), self.edges)
+        length = np.diff(self.time_s)[end - 1]
+        unit = dt_s * np.stack(noise_of_many_steps(length), 1)
+        measured = measurement_m[self.row]
+        # from the first of each stretch, whose place nothing says: numbers stay small
+        first = np.nan_to_num(measured[self.edges[:-1]])
+        measured = measured - np.repeat(first, np.diff(self.edges), axis=0)
+        start = np.zeros((len(measured), 2))
+        start[self.edges[:-1]] = START_PRECISION
+        chain = Chain(end, length, unit, np.zeros_like(unit))
+        return Positions(chain, measured, self.edges[:-1], start, CONSTANT_SIGMA)
+
+    def legs(self, directions: Array, offset_s: Array) -> tuple[Array, Array]:
+        """What the acceleration adds on each leg where stamps are corrected by each offset.
+
+        Parameters
+        ----------
+        directions : ndarray, shape (a, 3)
+            Unit vectors in NED.
+        offset_s : ndarray, shape (T,)
+
+        Returns
+        -------
+        delta_position_m, delta_velocity_m_s : ndarray, shape (n, a, T, 1 + constants)
+        """
+        dps, dvs = [], []
+        for begin, end, signals in self._stretches():
+            velocity, position = signals.at(self.time_s[begin:end, None] + offset_s)
+            step = np.diff(self.time_s[begin:end])[:, None, None, None]
+            dvs.append(np.diff(velocity, axis=0))
+            dps.append(np.diff(position, axis=0) - velocity[:-1] * step)
+        dp, dv = (
+            np.einsum("ab,ntbk->natk", directions, np.concatenate(part)) for part in (dps, dvs)
+        )
+        return dp, dv
+
+    def velocity(self, directions: Array, offset_s: float) -> Array:
+        """Velocity of the IMU alone at the measurements, but for a constant, shape (m, a)."""
+        parts = [
+            signals.at(self.time_s[begin:end] + offset_s)[0][..., 0]
+            for begin, end, signals in self._stretches()
+        ]
+        return np.asarray(np.concatenate(parts) @ directions.T)
+
+    def _stretches(self) -> Iterator[tuple[int, int, Signals]]:
+        return zip(self.edges[:-1].tolist(), self.edges[1:].tolist(), self.signals, strict=True)
+
+
+def motion(imu: pd.DataFrame, attitude: pd.DataFrame, time_s: Array) -> Motion | None:
+    """Cut measurements into stretches that the IMU covers without a gap.
+
+    Parameters
+    ----------
+    imu, attitude : DataFrame
+        As in :class:`px4fuse.flight.Flight`.
+    time_s : ndarray, shape (m,)
+
+    Returns
+    -------
+    Motion, or None where no stretch has enough measurements or the IMU is too slow.
+    """
+    imu_time = imu.index.to_numpy()
+    if len(imu_time) < 2 or np.median(np.diff(imu_time)) > MAX_IMU_INTERVAL_S:
+        return None
+    low = max(imu.index[0], attitude.index[0])
+    high = min(imu.index[-1], attitude.index[-1])
+    gaps = np.flatnonzero(imu_gaps(imu_time))
+    begins = np.maximum(imu_time[np.r_[0, gaps + 1]], low)
+    ends = np.minimum(imu_time[np.r_[gaps, len(imu_time) - 1]], high)
+    rows: list[IntArray] = []
+    signals = []
+    for begin, end in zip(begins, ends, strict=True):
+        inside = np.flatnonzero((time_s >= begin + SEARCH_S) & (time_s <= end - SEARCH_S))
+        if not len(inside):
+            continue
+        within = time_s[inside]
+        count = max(1, int(np.ceil((within[-1] - within[0]) / STRETCH_S)))
+        cuts = np.linspace(within[0], within[-1], count + 1)[1:-1]
+        for part in np.split(inside, np.searchsorted(within, cuts)):
+            if len(part) >= MIN_MEASUREMENTS:
+                rows.append(part)
+                around = time_s[part[0]] - SEARCH_S, time_s[part[-1]] + SEARCH_S
+                signals.append(_signals(imu, attitude, around))
+    if not rows:
+        return None
+    row = np.concatenate(rows)
+    edges = np.cumsum([0, *map(len, rows)])
+    return Motion(time_s[row], row, edges, tuple(signals))
+
+
+def _signals(imu: pd.DataFrame, attitude: pd.DataFrame, span: tuple[float, float]) -> Signals:
+    """Acceleration in NED by the gyros' attitude, and what each constant adds to it."""
+    inside = imu.loc[(imu.index >= span[0] - 2 * STEP_S) & (imu.index <= span[1] + 2 * STEP_S)]
+    time = inside.index.to_numpy()
+    columns = [*SPECIFIC_FORCE_COLUMNS, *ANGULAR_RATE_COLUMNS]
+    integral = cumulative_trapezoid(inside[columns].to_numpy(copy=True), time, axis=0, initial=0)
+    edges = np.arange(time[0], time[-1], STEP_S)
+    read = np.column_stack([np.interp(edges, time, one) for one in integral.T])
+    force, angle = read[:, :3], read[:, 3:]
+    turn = _integrate_gyros(edges, angle, attitude)
+    # of each step, in its middle
+    mean = np.diff(force, axis=0) / STEP_S
+    half = turn[:-1] * Rotation.from_rotvec(np.diff(angle, axis=0) / 2.0)
+    body_to_ned = half.as_matrix()
+    specific = np.einsum("nij,nj->ni", body_to_ned, mean)
+    value = np.empty((len(mean), 3, 1 + len(CONSTANT_SIGMA)))
+    value[..., 0] = specific + np.array([0.0, 0.0, constants.g])
+    # a small rotation θ of the attitude adds θ × f; a gyro bias b turns it by -∫ R b dt
+    turned = -STEP_S * (np.cumsum(body_to_ned, axis=0) - body_to_ned / 2.0)
+    for axis in range(3):
+        value[..., 1 + axis] = np.cross(np.eye(3)[axis], specific)
+        value[..., 4 + axis] = np.cross(turned[:, :, axis], specific)
+    value[..., 7:10] = -body_to_ned
+    value[..., 1 + SCALE] = value[..., 0]
+    velocity = np.zeros((len(edges), *value.shape[1:]))
+    np.cumsum(value * STEP_S, axis=0, out=velocity[1:])
+    position = np.zeros_like(velocity)
+    np.cumsum((velocity[:-1] + value * (STEP_S / 2.0)) * STEP_S, axis=0, out=position[1:])
+    return Signals(edges[:-1], value, velocity[:-1], position[:-1])
+
+
+def _integrate_gyros(edges: Array, angle: Array, attitude: pd.DataFrame) -> Rotation:
+    """Attitude (body to NED) from the logged one at the start and the gyros alone."""
+    steps = np.zeros((len(edges) - 1, 7))  # poses that only turn
+    steps[:, 3:] = Rotation.from_rotvec(np.diff(angle, axis=0)).as_quat()
+    known = attitude.index.to_numpy()
+    near = slice(*np.clip(np.searchsorted(known, edges[0]) + np.array([-2, 3]), 0, len(known)))
+    logged = Rotation.from_quat(
+        attitude[QUATERNION_COLUMNS].to_numpy(copy=True)[near], scalar_first=True
+    )
+    start = Slerp(known[near], logged)(np.clip(edges[0], known[near][0], known[near][-1]))
+    return start * Rotation.from_quat(lie.chain(steps)[:, 3:])
