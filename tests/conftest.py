@@ -10,6 +10,7 @@ Keep what it finds as an ``@example`` of the test.
 
 from __future__ import annotations
 
+import signal
 from pathlib import Path
 
 import pytest
@@ -20,6 +21,10 @@ from px4fuse.readers import read_log
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 SHARED_LOGS = REPOSITORY.parent / "shared" / "logs"
+
+# A shell's background jobs ignore Ctrl-C, and so would all that the tests start
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # No limit on time: a slow machine must not fail
 settings.register_profile(
