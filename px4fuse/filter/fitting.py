@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import minimize
+from scipy.optimize import brentq, minimize
 from scipy.special import expit
 from scipy.stats import chi2
 
@@ -36,6 +36,10 @@ SETTLED = 0.01
 FULL_RANK = 1e-3
 # Steps of ln σ for slopes and bends
 SLOPE_STEP, BEND_STEP = 1e-4, 0.05
+# Of those: how far a parabola is followed at once, and how often
+FAR_STEPS, MAX_STEPS = 6.0, 4
+# ln σ at which the end of an interval is sought first
+FIRST_REACH = 0.05
 
 
 @dataclass(frozen=True)
@@ -209,7 +213,8 @@ def profile_end(
     Parameters
     ----------
     score : callable
-        -ln p of ln of the parameter and ln of the other one, which is maximised out.
+        -ln p of ln of the parameter and ln of the other one, which is maximised out where there is
+        one.
     best : (float, float)
         Where it is least.
     side : float
@@ -217,41 +222,32 @@ def profile_end(
     bound : float
         Of ln of the parameter.
     """
-    least = score(*best)
-    h = BEND_STEP
+    least, other = score(*best), best[1]
 
-    def profile(at: float, other: float) -> tuple[float, float]:
-        """Least score over the other parameter, by parabolas, and where."""
-        for _ in range(2):
-            left, middle, right = (score(at, other + k * h) for k in (-1.0, 0.0, 1.0))
-            bend = left - 2.0 * middle + right
-            step = 0.5 * (left - right) / bend if bend > 0.0 else np.sign(left - right)
-            other += float(np.clip(step, -4.0, 4.0)) * h
-            if abs(step) < 1.0:
-                low = middle - 0.125 * (left - right) ** 2 / bend if bend > 0.0 else middle
-                return low, other
-        return score(at, other), other
+    def excess(distance: float) -> float:
+        """How far √(drop), which is nearly a line, lies above that of the interval's end."""
+        nonlocal other
+        lowest, other = _lowest(lambda at: score(best[0] + side * distance, at), other)
+        return float(np.sqrt(max(lowest - least, 0.0)) - np.sqrt(PROFILE_DROP))
 
-    # secant steps on √(drop), which is nearly a line
-    distance, other = 0.1, best[1]
-    known_distance, known_root = 0.0, 0.0
-    for _ in range(12):
-        at = best[0] + side * distance
-        if side * (at - bound) >= 0.0:
-            at = bound
-        value, other = profile(at, other)
-        root = float(np.sqrt(max(value - least, 0.0)))
-        wanted = float(np.sqrt(PROFILE_DROP))
-        if abs(root - wanted) < 0.01:
-            return float(at)
-        if at == bound and root < wanted:
+    reach = side * (bound - best[0])
+    far = min(FIRST_REACH, reach)
+    while excess(far) < 0.0:
+        if far == reach:
             return None
-        here = abs(at - best[0])
-        slope = (root - known_root) / (here - known_distance) if here != known_distance else 0.0
-        if root < wanted:
-            known_distance, known_root = here, root
-        if slope <= 0.0:
-            distance = 2.0 * here
-            continue
-        distance = min(here + (wanted - root) / slope, 3.0 * here)
-    return float(best[0] + side * distance)
+        far = min(2.0 * far, reach)
+    return float(best[0] + side * brentq(excess, 0.0, far, xtol=1e-3 * far))
+
+
+def _lowest(score: Callable[[float], float], near: float) -> tuple[float, float]:
+    """Least value of a score and where it is, by parabolas from near there."""
+    for _ in range(MAX_STEPS):
+        left, middle, right = (score(near + k * BEND_STEP) for k in (-1.0, 0.0, 1.0))
+        if left == middle == right:  # there is no other parameter
+            return middle, near
+        bend = left - 2.0 * middle + right
+        step = 0.5 * (left - right) / bend if bend > 0.0 else np.sign(left - right) * FAR_STEPS
+        near += float(np.clip(step, -FAR_STEPS, FAR_STEPS)) * BEND_STEP
+        if bend > 0.0 and abs(step) <= 1.0:
+            return middle - 0.125 * (left - right) ** 2 / bend, near
+    return score(near), near
