@@ -322,6 +322,8 @@ class PositionTrack:
         about the body's axes ``forward_rad2, right_rad2, down_rad2`` (NaN where none was given).
         None where the sender gave no orientation, or only ever the same one: a positioning
         system, no odometry.
+    notes : tuple of str
+        Joins and what they dropped.
     """
 
     name: str
@@ -336,6 +338,7 @@ class PositionTrack:
     clock_map: ClockMap | None = None
     alignment: Alignment | None = None
     orientation: pd.DataFrame | None = None
+    notes: tuple[str, ...] = ()
 
     @property
     def rate_hz(self) -> float:

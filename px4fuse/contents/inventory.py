@@ -234,7 +234,11 @@ def take_inventory(flight: Flight) -> Inventory:
         missing=flight.missing,
         unused=flight.unused,
         inputs=flight.inputs,
-        notes=(*flight.log.notes, *(flight.ekf2.notes if isinstance(flight.ekf2, Ekf2) else ())),
+        notes=(
+            *flight.log.notes,
+            *(plan.track.notes if plan.track is not None else ()),
+            *(flight.ekf2.notes if isinstance(flight.ekf2, Ekf2) else ()),
+        ),
     )
 
 
