@@ -24,6 +24,7 @@ from px4fuse.flight import (
     missing_parts,
     stretches_of_flight,
 )
+from px4fuse.readers.mavlink_clocks import UNIX_FROM_S
 from px4fuse.readers.mavlink_ekf2 import MIN_NORM, read_ekf2
 from px4fuse.readers.mavlink_frames import Frames, message_ids, read_frames
 from px4fuse.readers.mavlink_messages import ATTITUDE, IMU, LANDED, UNUSED, VEHICLE_TYPES
@@ -233,6 +234,8 @@ def _describe(
 
 def _start_unix_s(recording: Recording) -> float | None:
     """UNIX time of time zero: the autopilot's own, or else the recording computer's."""
+    if recording.zero_s >= UNIX_FROM_S:
+        return recording.zero_s
     zero = np.array([recording.zero_s])
     unix = unix_of_boot(recording)
     if unix is not None:

@@ -34,6 +34,7 @@ HEADER_1, HEADER_2 = 6, 10
 CHECKSUM = 2
 SIGNATURE = 13
 SIGNED = 0x01
+LONGEST_FRAME = HEADER_2 + 255 + CHECKSUM + SIGNATURE
 # QGroundControl and MAVProxy put the time of receipt before each frame: µs, big-endian
 STAMP = 8
 # Bytes that are scanned at a time, which bounds the memory that hostile bytes can claim

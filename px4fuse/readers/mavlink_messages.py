@@ -53,6 +53,11 @@ IMU = (
 )
 # Messages whose time_usec is the autopilot's boot clock; GPS_RAW_INT's, say, is the receiver's
 STAMPED_BY_BOOT_CLOCK = ("HIGHRES_IMU", "ODOMETRY", "ESTIMATOR_STATUS")
+# What an autopilot sends of itself, and nobody else
+OWN_MESSAGES = (
+    "HIGHRES_IMU", "SCALED_IMU", "SCALED_IMU2", "SCALED_IMU3", "RAW_IMU", "ATTITUDE_QUATERNION",
+    "LOCAL_POSITION_NED", "GLOBAL_POSITION_INT", "SYS_STATUS", "ESTIMATOR_STATUS",
+)  # fmt: skip
 # Equally dense ones are taken in this order
 ATTITUDE = ("ATTITUDE_QUATERNION", "ATTITUDE", "ODOMETRY")
 
