@@ -286,6 +286,11 @@ class LogInfo:
     start_unix_s: float | None = None
     senders: tuple[Sender, ...] = ()
 
+    @property
+    def has_ulog(self) -> bool:
+        """Whether its autopilot writes a ULog: ArduPilot writes DataFlash, which is not read."""
+        return self.autopilot != "ArduPilot"
+
 
 @dataclass(frozen=True)
 class PositionTrack:

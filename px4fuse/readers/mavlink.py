@@ -27,7 +27,15 @@ from px4fuse.flight import (
 from px4fuse.readers.mavlink_clocks import UNIX_FROM_S
 from px4fuse.readers.mavlink_ekf2 import MIN_NORM, read_ekf2
 from px4fuse.readers.mavlink_frames import Frames, message_ids, read_frames
-from px4fuse.readers.mavlink_messages import ATTITUDE, IMU, LANDED, UNUSED, VEHICLE_TYPES
+from px4fuse.readers.mavlink_messages import (
+    ATTITUDE,
+    IMU,
+    LANDED,
+    UNUSED,
+    VEHICLE_TYPES,
+    Remedies,
+    remedies_of,
+)
 from px4fuse.readers.mavlink_positions import read_positions, read_truth
 from px4fuse.readers.mavlink_recording import (
     BOOT_CLOCK,
@@ -76,12 +84,13 @@ def read_mavlink(path: Path, system: int | None = None) -> Flight:
     recording = settle_clocks(frames, address)
     mapped = map_senders(recording)
     parameters = _read_parameters(recording, autopilot)
-    imu = _read_imu(recording)
-    attitude = _read_attitude(recording)
+    remedies = remedies_of(autopilot)
+    imu = _read_imu(recording, remedies)
+    attitude = _read_attitude(recording, remedies)
     ekf2 = read_ekf2(recording, parameters, autopilot)
-    positions, missing_positions = read_positions(recording, mapped)
-    truth = read_truth(recording, positions)
-    airborne = _read_airborne(recording)
+    positions, missing_positions = read_positions(recording, mapped, remedies)
+    truth = read_truth(recording, positions, remedies)
+    airborne = _read_airborne(recording, remedies)
     return Flight(
         log=_describe(recording, parameters, autopilot),
         imu=imu,
@@ -97,7 +106,7 @@ def read_mavlink(path: Path, system: int | None = None) -> Flight:
     )
 
 
-def _read_imu(recording: Recording) -> pd.DataFrame | Unavailable:
+def _read_imu(recording: Recording, remedies: Remedies) -> pd.DataFrame | Unavailable:
     found = [(source, recording.rows(source.message)) for source in IMU]
     # HIGHRES_IMU has units and µs; of the others the densest
     source, rows = found[0] if len(found[0][1]) > 1 else max(found, key=lambda pair: len(pair[1]))
@@ -107,8 +116,7 @@ def _read_imu(recording: Recording) -> pd.DataFrame | Unavailable:
         return Unavailable(
             "IMU",
             f"no HIGHRES_IMU or SCALED_IMU{refused}",
-            "Set the stream rate of HIGHRES_IMU to 50 Hz or more (in PX4's console: mavlink stream "
-            "-d DEVICE -s HIGHRES_IMU -r 100), or join the ULog.",
+            remedies.imu,
         )
     table = recording.frames.table(source.message, rows)
     if "id" in (table.dtype.names or ()):
@@ -136,7 +144,7 @@ def _read_imu(recording: Recording) -> pd.DataFrame | Unavailable:
     return imu
 
 
-def _read_attitude(recording: Recording) -> pd.DataFrame | Unavailable:
+def _read_attitude(recording: Recording, remedies: Remedies) -> pd.DataFrame | Unavailable:
     found = [(message, recording.rows(message)) for message in ATTITUDE]
     message, rows = max(found, key=lambda pair: len(pair[1]))
     table = recording.frames.table(message, rows)
@@ -157,13 +165,15 @@ def _read_attitude(recording: Recording) -> pd.DataFrame | Unavailable:
         return Unavailable(
             "attitude",
             f"no usable {', '.join(ATTITUDE[:-1])} or {ATTITUDE[-1]}",
-            "Set the stream rate of ATTITUDE_QUATERNION to 20 Hz or more, or join the ULog.",
+            remedies.attitude,
         )
     recording.came_from("attitude", BOOT_CLOCK, message)
     return attitude
 
 
-def _read_airborne(recording: Recording) -> tuple[tuple[float, float], ...] | Unavailable:
+def _read_airborne(
+    recording: Recording, remedies: Remedies
+) -> tuple[tuple[float, float], ...] | Unavailable:
     """Stretches of flight by the land detector, each from take-off to touch-down."""
     rows = recording.rows("EXTENDED_SYS_STATE")
     table = recording.frames.table("EXTENDED_SYS_STATE", rows)
@@ -172,7 +182,7 @@ def _read_airborne(recording: Recording) -> tuple[tuple[float, float], ...] | Un
         return Unavailable(
             "land detector",
             "no usable EXTENDED_SYS_STATE",
-            "Set the stream rate of EXTENDED_SYS_STATE to 1 Hz, or give --start and --end.",
+            remedies.landed,
         )
     recording.came_from("airborne", RECEIPT_CLOCK, "EXTENDED_SYS_STATE")
     time_s = recording.receipt_boot_s(rows[known]) - recording.zero_s
