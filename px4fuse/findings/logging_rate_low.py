@@ -15,6 +15,11 @@ MIN_ATTITUDE_RATE = Threshold(10.0, "Hz", "PX4's default is 20 Hz; slerp bridges
 RATE_MARGIN = 0.98  # a stream set to a rate runs a little below it
 
 
+def too_slow(samples: pd.DataFrame, needed: Threshold) -> bool:
+    """Whether samples come at a lower rate than is needed."""
+    return sample_rate(samples) < RATE_MARGIN * needed.value
+
+
 def _detect(analysis: Analysis) -> Found:
     flight = analysis.comparison.flight
     for part, name, default, threshold in (
@@ -22,7 +27,7 @@ def _detect(analysis: Analysis) -> Found:
         (flight.attitude, "attitude", "vehicle_attitude", MIN_ATTITUDE_RATE),
     ):
         topic = flight.streams[name].topics[0] if name in flight.streams else default
-        if isinstance(part, pd.DataFrame) and sample_rate(part) < RATE_MARGIN * threshold.value:
+        if isinstance(part, pd.DataFrame) and too_slow(part, threshold):
             yield Finding(
                 "logging_rate_low",
                 "warning",

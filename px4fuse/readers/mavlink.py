@@ -50,6 +50,7 @@ from px4fuse.readers.mavlink_recording import (
     vector,
 )
 from px4fuse.readers.px4_topics import PARAMETERS
+from px4fuse.readers.ulog_topics import dropped_note
 
 # MAV_PARAM_TYPE: below, an integer
 PARAMETER_REAL = 9
@@ -220,8 +221,7 @@ def _describe(
     beats = frames.table("HEARTBEAT", recording.rows("HEARTBEAT"))
     kind = VEHICLE_TYPES.get(int(beats["type"][0]), "vehicle") if len(beats) else "vehicle"
     dropped = [
-        f"{count} samples of {message} were dropped: their time stamps are zero, go back, or lie "
-        "outside the recording"
+        dropped_note(count, message, "zero, go back, or lie outside the recording")
         for message, count in sorted(recording.dropped.items())
     ]
     return LogInfo(
