@@ -9,6 +9,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
+
 from px4fuse import placing
 from px4fuse.comparison.asked import asked_of_ekf2
 from px4fuse.comparison.comparison import Comparison, compare
@@ -40,6 +42,13 @@ from px4fuse.request import (
 
 # What the report shows; each axis by itself is for `px4fuse tune`
 REPORTED = (HORIZONTAL, "down", "aisle")
+
+# Slower, and what the acceleration did between two samples is not known well enough to tell times
+MIN_CLOCK_IMU_HZ = 40.0
+# vehicle_imu integrates at this rate (IMU_INTEG_RATE): slower telemetry leaves samples out
+MIN_TELEMETRY_IMU_HZ = 200.0
+CLOCK_RATE_MARGIN = 0.98
+TELEMETRY_IMU = ("HIGHRES_IMU", "SCALED_IMU", "SCALED_IMU2", "SCALED_IMU3")
 
 Progress = Callable[[str], None]
 Tuning = Mapping[str, AxisTuning | Unavailable]
@@ -344,6 +353,8 @@ def clock_offset(
     progress : callable
         Told what is being done.
     """
+    if slow := imu_too_slow_for_clocks(comparison.flight):
+        return slow
     tuned = next(
         (
             found
@@ -362,4 +373,35 @@ def clock_offset(
         noises if tuned is None else tuned.noises,
         None if tuned is None else tuned.outlier_time_s,
         progress,
+    )
+
+
+def imu_too_slow_for_clocks(flight: Flight) -> Unavailable | None:
+    """Why the IMU of a flight cannot tell a clock offset; None where it can.
+
+    A ULog's sample is the mean over its interval. A telemetry message is the newest of several
+    samples, and PX4 has taken EKF2's own bias out of it (``HIGHRES_IMU.hpp``), which follows the
+    very positions that are in question.
+    """
+    if isinstance(flight.imu, Unavailable) or len(flight.imu) < 2:
+        return None
+    stream = flight.streams.get("imu")
+    telemetry = stream is not None and stream.topics[0] in TELEMETRY_IMU
+    needed = MIN_TELEMETRY_IMU_HZ if telemetry else MIN_CLOCK_IMU_HZ
+    rate = 1.0 / float(np.median(np.diff(flight.imu.index.to_numpy())))
+    if rate >= CLOCK_RATE_MARGIN * needed:
+        return None
+    told = f"{rate:.{1 if rate < 10 else 0}f} Hz"
+    if not telemetry:
+        return Unavailable(
+            "clock offset",
+            f"the IMU was logged at {told}, at least {needed:g} Hz are needed",
+            'Put the line "sensor_combined 0" into etc/logging/logger_topics.txt on the SD card.',
+        )
+    remedy = "Give the ULog of the same flight: px4fuse sync LOG.ulg --mavlink LOG.tlog."
+    return Unavailable(
+        "clock offset",
+        f"the IMU came by telemetry at {told}, each sample picked out of several; at least "
+        f"{needed:g} Hz are needed",
+        remedy if flight.log.has_ulog else f"Have the IMU sent at {needed:g} Hz.",
     )

@@ -286,6 +286,11 @@ class LogInfo:
     start_unix_s: float | None = None
     senders: tuple[Sender, ...] = ()
 
+    @property
+    def has_ulog(self) -> bool:
+        """Whether its autopilot writes a ULog: ArduPilot writes DataFlash, which is not read."""
+        return self.autopilot != "ArduPilot"
+
 
 @dataclass(frozen=True)
 class PositionTrack:
@@ -322,6 +327,8 @@ class PositionTrack:
         about the body's axes ``forward_rad2, right_rad2, down_rad2`` (NaN where none was given).
         None where the sender gave no orientation, or only ever the same one: a positioning
         system, no odometry.
+    notes : tuple of str
+        Joins and what they dropped.
     """
 
     name: str
@@ -336,6 +343,7 @@ class PositionTrack:
     clock_map: ClockMap | None = None
     alignment: Alignment | None = None
     orientation: pd.DataFrame | None = None
+    notes: tuple[str, ...] = ()
 
     @property
     def rate_hz(self) -> float:

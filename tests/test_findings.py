@@ -377,6 +377,15 @@ FAULTS = [
         "warning",
         {"notes": ("the file is damaged, what could be read was used",)},
         evidence={"notes": 1.0},
+        remedy="SD card",
+    ),
+    Fault(
+        "samples_dropped",
+        "info",
+        {"notes": ("2 samples of x were dropped: their time stamps are zero or go back",)},
+        evidence={"notes": 1.0},
+        says="2 samples",
+        remedy="The file is whole",
     ),
     Fault("too_few_innovations", "warning", {"duration_s": 1.5}, evidence={"count": 7.0}),
 ]  # fmt: skip

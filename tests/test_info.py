@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from flights import Estimator, Uwb, aisle_flight
+from mavlink_tools import AUTOPILOT, UNIX_S, Aisle, Recorder, heartbeat
 from test_cli import run_main
 from ulog_tools import Log, load, make_log, odometry, stamps, take, topic
 
@@ -18,6 +19,7 @@ from px4fuse.comparison.comparison import compare
 from px4fuse.contents.inventory import Ability, Inventory, Source, take_inventory, to_plain
 from px4fuse.errors import Px4FuseError
 from px4fuse.filter.signals import choose_source
+from px4fuse.findings import find
 from px4fuse.flight import ClockMap, Dropout, Flight, Sender, Unavailable
 from px4fuse.readers import read_log
 
@@ -222,6 +224,49 @@ def test_slow_topics_name_the_line_that_logs_them(tmp_path):
     said = remedies(inventory_of(log, tmp_path))
     assert any('"sensor_combined 0"' in remedy and "20.0 Hz" in remedy for remedy in said)
     assert not any("vehicle_attitude" in remedy for remedy in said)
+
+
+@pytest.mark.parametrize(
+    ("imu_hz", "said"),
+    [(4.0, "IMU at 4.0 Hz"), (20.0, "IMU at 20 Hz"), (49.5, None), (50.0, None), (100.0, None)],
+)
+def test_an_imu_that_is_too_slow_is_no_acceleration(tmp_path, imu_hz, said):
+    found = ability(inventory_of(make_log(imu_hz=imu_hz), tmp_path), "acceleration")
+    assert found.possible == (said is None)
+    if said is not None:
+        assert said in found.reason
+        assert "50 Hz are needed" in found.reason
+
+
+def test_an_attitude_that_is_too_slow_is_no_acceleration_either():
+    found = ability(take_inventory(aisle_flight(attitude_hz=5.0)), "acceleration")
+    assert not found.possible
+    assert "attitude at 5.0 Hz" in found.reason
+    assert "10 Hz are needed" in found.reason
+
+
+def test_a_stream_a_little_below_its_rate_is_not_told_to_be_faster():
+    advised = take_inventory(aisle_flight(attitude_hz=9.97)).advice
+    assert not any("is below" in advice.remedy for advice in advised)
+
+
+def test_a_recording_with_damage_blames_no_sd_card(tmp_path):
+    path = tmp_path / "damaged.tlog"
+    content = Aisle(seconds=10.0).record().tlog()
+    path.write_bytes(content[: len(content) // 2] + bytes(5000) + content[len(content) // 2 :])
+    inventory = take_inventory(read_log(path))
+    assert any("damaged" in note for note in inventory.notes)
+    assert "link" in remedies(inventory)[0]
+    assert not any("SD card" in remedy for remedy in remedies(inventory))
+    (named,) = [f for f in find(compare(read_log(path))) if f.id == "log_damaged"]
+    assert "SD card" not in named.remedy
+
+
+def test_one_message_is_neither_damage_nor_a_span(tmp_path):
+    path = tmp_path / "one.tlog"
+    path.write_bytes(Recorder().hear(UNIX_S, AUTOPILOT, heartbeat()).tlog() + bytes(14))
+    assert "damaged" not in info(path)
+    assert "a single moment" in info(path)
 
 
 def test_a_slow_source_is_told_to_be_faster(tmp_path):

@@ -12,6 +12,7 @@ import contextlib
 import itertools
 import json
 import os
+import re
 import struct
 from dataclasses import replace
 from pathlib import Path
@@ -47,8 +48,10 @@ from scipy.spatial.transform import Rotation
 from test_bad_logs import patience
 
 from px4fuse.comparison.comparison import compare
-from px4fuse.errors import LogError, Px4FuseError, SettingsError
+from px4fuse.contents.inventory import take_inventory
+from px4fuse.errors import LogError, MissingDataError, Px4FuseError, SettingsError
 from px4fuse.filter.kalman import Settings, state_at
+from px4fuse.findings import find
 from px4fuse.flight import (
     ANGULAR_RATE_COLUMNS,
     POSITION_COLUMNS,
@@ -524,6 +527,30 @@ def test_integer_parameters_are_bytes_in_px4_and_casts_in_ardupilot(read, autopi
     expected = {"EKF2_EV_CTRL": 15.0, "SDLOG_PROFILE": 129.0, "EKF2_EVP_GATE": 3.5}
     assert dict(flight.log.parameters) == expected
     assert flight.ekf2.gate == 3.5
+
+
+@pytest.mark.parametrize(
+    "lacking", [(), ("VISION_POSITION_ESTIMATE",), ("HIGHRES_IMU", "ODOMETRY")]
+)
+def test_whoever_flies_ardupilot_is_told_nothing_that_only_px4_has(read, lacking):
+    """It writes DataFlash (.BIN), and has neither ULog nor PX4's console nor its parameters."""
+    recorder = without(Aisle(imu_hz=4.0, seconds=20.0), *lacking, "EXTENDED_SYS_STATE")
+    for at, (received, sender, made, link) in enumerate(recorder.sent):
+        if made.get_type() == "HEARTBEAT" and sender == AUTOPILOT:
+            recorder.sent[at] = received, sender, heartbeat(2, 3), link
+    flight = read(recorder)
+    assert flight.log.autopilot == "ArduPilot"
+    said = [str(part) for part in take_inventory(flight).advice]
+    said += [str(part) for part in flight.missing]
+    if flight.positions:
+        said += [f"{f.message} {f.remedy}" for f in find(compare(flight)) if f.id != "not_px4"]
+    else:
+        with pytest.raises(MissingDataError) as refused:
+            compare(flight)
+        said.append(str(refused.value))
+    for text in said:
+        assert not re.search(r"ULog|PX4|SDLOG|SD card|EKF2_|mavlink stream", text), text
+    assert len(said) > 3
 
 
 def test_the_version_is_read(read):

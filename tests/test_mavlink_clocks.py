@@ -27,7 +27,7 @@ from mavlink_tools import (
 )
 
 from px4fuse.errors import SettingsError
-from px4fuse.flight import Flight
+from px4fuse.flight import Flight, sample_rate
 from px4fuse.readers import read_log
 from px4fuse.readers.mavlink_clocks import Exchanges, Line, least_delay, map_clock
 
@@ -353,6 +353,84 @@ def test_a_recording_without_a_boot_clock_counts_from_its_first_receipt(read):
     times = flight.positions[0].samples.index.to_numpy()
     assert len(times) >= 199
     np.testing.assert_allclose(np.diff(times), 0.2, atol=1e-3)
+
+
+def renumbered(recorder: Recorder, change) -> Recorder:
+    """Other messages from other senders; ``change`` takes sender and message, None drops it."""
+    sent = [(at, change(sender, made), link) for at, sender, made, link in recorder.sent]
+    recorder.sent = [(at, *found, link) for at, found, link in sent if found is not None]
+    return recorder
+
+
+@pytest.mark.parametrize("autopilot_heard", [True, False])
+def test_a_companion_that_calls_itself_an_autopilot_is_not_the_vehicle(read, autopilot_heard):
+    """As scripts do that copy a heartbeat, and set points whose boot time is a constant."""
+    aisle = Aisle(imu_hz=20.0)
+
+    def change(sender, made):
+        beat = made.get_type() == "HEARTBEAT"
+        if beat and sender == COMPANION:
+            return sender, heartbeat(kind=18, autopilot=0)
+        return None if beat and not autopilot_heard else (sender, made)
+
+    recorder = renumbered(aisle.record(), change)
+    for boot in aisle.times(100.0):
+        made = message("SET_POSITION_TARGET_LOCAL_NED", time_boot_ms=10)
+        recorder.hear(unix(boot), COMPANION, made)
+    flight = read(recorder)
+    assert flight.log.duration_s == pytest.approx(aisle.seconds, abs=0.1)
+    assert sample_rate(flight.imu) == pytest.approx(20.0, rel=0.01)
+
+
+@pytest.mark.parametrize("stamped", [True, False])
+def test_an_autopilot_of_another_component_is_found_by_what_it_sends(read, stamped):
+    aisle = Aisle(replies=False)
+
+    def change(sender, made):
+        if made.get_type() == "HEARTBEAT":
+            return None
+        return ((1, 4), made) if sender == AUTOPILOT else (sender, made)
+
+    flight = read(renumbered(aisle.record(), change), stamped=stamped)
+    assert flight.log.duration_s == pytest.approx(aisle.seconds, abs=0.1)
+    assert len(flight.imu) == aisle.seconds * aisle.imu_hz
+
+
+@pytest.mark.parametrize("stamped", [True, False])
+def test_an_autopilot_whose_clock_is_unix_time_is_placed_by_it(read, stamped):
+    aisle = Aisle(replies=False, state="ODOMETRY")
+
+    def change(sender, made):
+        if sender == AUTOPILOT and hasattr(made, "time_boot_ms"):
+            return None
+        if sender == AUTOPILOT and hasattr(made, "time_usec"):
+            made.time_usec += us(UNIX_S)
+        return sender, made
+
+    flight = read(renumbered(aisle.record(), change), stamped=stamped)
+    assert flight.log.duration_s == pytest.approx(aisle.seconds, abs=0.1)
+    np.testing.assert_allclose(np.diff(flight.imu.index), 1.0 / aisle.imu_hz, atol=1e-5)
+
+
+def test_an_autopilot_whose_stamps_stand_still_is_placed_by_the_time_of_receipt(read):
+    aisle = Aisle(replies=False, state=None)
+
+    def change(sender, made):
+        if sender == AUTOPILOT and hasattr(made, "time_boot_ms"):
+            made.time_boot_ms = 1000
+        if sender == AUTOPILOT and hasattr(made, "time_usec"):
+            made.time_usec = 1_000_000
+        return sender, made
+
+    flight = read(renumbered(aisle.record(), change))
+    assert flight.log.duration_s == pytest.approx(aisle.seconds, abs=0.1)
+    assert sample_rate(flight.imu) == pytest.approx(aisle.imu_hz, rel=0.01)
+
+
+def test_a_stream_without_any_clock_says_so(read):
+    flight = read(Recorder().hear(0.0, AUTOPILOT, heartbeat()), stamped=False)
+    assert flight.log.duration_s == 0.0
+    assert any("no message in the stream carries" in note for note in flight.log.notes)
 
 
 # ---- restarts, late packets, several vehicles ---------------------------------------------------

@@ -274,6 +274,32 @@ def test_a_bad_checksum_costs_its_own_frame(read):
     assert frames.bad_bytes == len(parts[4]) + 8
 
 
+@pytest.mark.parametrize("with_stamps", [True, False])
+def test_frames_of_another_dialect_are_counted_and_are_no_damage(read, with_stamps):
+    """Another definition of a message has another checksum seed (CRC_EXTRA)."""
+    number = 30  # ATTITUDE
+    foreign = [
+        raw_frame(number, bytes([i] * 28), seed=7, sequence=i % 256, v1=i % 2 == 0)
+        for i in range(40)
+    ]
+    parts = beats(20)
+    for i in range(0, 20, 2):
+        parts[i:i] = foreign[2 * i : 2 * i + 4]
+    frames = read(stamped(*parts) if with_stamps else b"".join(parts))
+    assert names(frames) == ["HEARTBEAT"] * 20
+    assert dict(frames.foreign) == {number: 40}
+    assert frames.bad_bytes == 0
+
+
+def test_frames_of_a_known_message_that_were_changed_on_the_way_are_damage(read):
+    parts = [frame(ATTITUDE, sequence=i) for i in range(20)]
+    for i in (3, 9):
+        parts[i] = parts[i][:-1] + bytes([parts[i][-1] ^ 1])
+    frames = read(b"".join(parts))
+    assert dict(frames.foreign) == {}
+    assert frames.bad_bytes == 2 * len(parts[0])
+
+
 @pytest.mark.parametrize("junk", [b"\x00" * 50, b"\xfd" * 50, b"\xfe" * 300, bytes(range(256))])
 def test_junk_between_frames_costs_itself(read, junk):
     parts = beats(6)

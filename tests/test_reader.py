@@ -30,6 +30,7 @@ from ulog_tools import (
     topic,
 )
 
+from px4fuse.comparison.comparison import compare
 from px4fuse.errors import MissingDataError
 from px4fuse.filter.signals import choose_source
 from px4fuse.flight import (
@@ -631,6 +632,33 @@ def test_observations_without_height_leave_height_open(read):
     assert track.name == "estimator_aid_src_ev_pos"
     assert track.samples["down_m"].isna().all()
     assert track.samples["north_m"].notna().all()
+
+
+def test_heights_of_other_stamps_are_joined_and_what_is_dropped_is_counted(read):
+    """Logged by a rate limiter of its own, a height may be that of the sample before or after."""
+    log = make_log("v1.16").drop("vehicle_visual_odometry")
+    stamped = log["estimator_aid_src_ev_hgt"]["timestamp_sample"]
+    assert len(stamped) == 50
+    stamped[10:30] += np.uint64(20_000)
+    stamped[30:33] += np.uint64(90_000)
+    track, _ = choose_source(flight := read(log))
+    open_rows = np.flatnonzero(track.samples["down_m"].isna())
+    np.testing.assert_array_equal(open_rows, [30, 31, 32])
+    # a float32 observation, as in the sample whose height it is
+    np.testing.assert_allclose(
+        track.samples["down_m"].to_numpy()[10:30],
+        (position(at := seconds_of(ev_stamps(10.0))) + ev_error(at))[10:30, 2],
+        **FLOAT32,
+    )
+    (note,) = track.notes
+    for words in ("20 of 50 heights", "20 ms", "3 of 50", "50 ms"):
+        assert words in note
+    assert note in compare(flight).notes
+
+
+def test_heights_of_the_same_stamps_need_no_note(read):
+    track, _ = choose_source(read(make_log("v1.16").drop("vehicle_visual_odometry")))
+    assert track.notes == ()
 
 
 @pytest.mark.parametrize("generation", ["v1.9", "v1.11", "v1.12"])

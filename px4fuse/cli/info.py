@@ -85,7 +85,7 @@ def _facts(inventory: Inventory) -> list[tuple[str, str]]:
     facts = [
         ("Log", f"{log.format}, {size}, SHA-256 {log.sha256[:12]}"),
         ("Vehicle", f"{version}{git}, {hardware}"),
-        ("Data", f"{log.duration_s:.{1 if log.duration_s >= 1 else 3}f} s, {_start(inventory)}"),
+        ("Data", f"{_duration(log.duration_s)}, {_start(inventory)}"),
         ("In flight", _flying(inventory)),
     ]
     if log.dropouts:
@@ -96,6 +96,10 @@ def _facts(inventory: Inventory) -> list[tuple[str, str]]:
         facts.append(("Dropouts", words))
     facts += [(file.role, f"{file.name}, SHA-256 {file.sha256[:12]}") for file in inventory.inputs]
     return facts
+
+
+def _duration(seconds: float) -> str:
+    return f"{seconds:.{1 if seconds >= 1 else 3}f} s" if seconds else "a single moment"
 
 
 def _start(inventory: Inventory) -> str:

@@ -207,7 +207,7 @@ def compare(
     if isinstance(flight.truth, Truth) and flight.truth.name == track.name:
         flight = replace(flight, truth=NOT_ITS_OWN_TRUTH)
     missing = list(flight.missing)
-    notes = list(flight.log.notes)
+    notes = [*flight.log.notes, *track.notes]
     acceleration = lines[0].acceleration
     if settings.input == "imu" and isinstance(acceleration, Unavailable):
         if input_required:

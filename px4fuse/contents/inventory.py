@@ -34,7 +34,7 @@ from px4fuse.filter.signals import (
 from px4fuse.findings.ekf2_innovations_decimated import MIN_INNOVATION_SHARE
 from px4fuse.findings.ekf2_not_fusing import EV_START_INTERVAL
 from px4fuse.findings.imu_gap import IMU_GAP_TOTAL
-from px4fuse.findings.logging_rate_low import MIN_ATTITUDE_RATE, MIN_IMU_RATE
+from px4fuse.findings.logging_rate_low import MIN_ATTITUDE_RATE, MIN_IMU_RATE, too_slow
 from px4fuse.findings.source_gap import GAP, GAP_INTERVALS
 from px4fuse.findings.source_not_logged import VISION_PROFILE_BIT
 from px4fuse.flight import (
@@ -234,7 +234,11 @@ def take_inventory(flight: Flight) -> Inventory:
         missing=flight.missing,
         unused=flight.unused,
         inputs=flight.inputs,
-        notes=(*flight.log.notes, *(flight.ekf2.notes if isinstance(flight.ekf2, Ekf2) else ())),
+        notes=(
+            *flight.log.notes,
+            *(plan.track.notes if plan.track is not None else ()),
+            *(flight.ekf2.notes if isinstance(flight.ekf2, Ekf2) else ()),
+        ),
     )
 
 
@@ -371,10 +375,32 @@ def _abilities(flight: Flight, plan: _Plan) -> Iterator[Ability]:
     acceleration = plan.axes[0].acceleration if plan.axes else ned_acceleration(flight)
     if isinstance(acceleration, Unavailable):
         yield Ability("acceleration", False, f"{acceleration.reason}; velocity is held constant")
+    elif slow := list(_too_slow(flight)):
+        rates = " and ".join(
+            f"{PART_NAMES[key]} at {_hertz(rate)} Hz, while {needed:g} Hz are needed"
+            for key, rate, needed in slow
+        )
+        yield Ability(
+            "acceleration", False, f"{rates}: compare uses it, but motion between samples is lost"
+        )
     else:
         yield Ability("acceleration", True, "IMU turned into NED by the attitude, gravity removed")
     yield from _ekf2_abilities(flight, plan)
     yield _truth_ability(flight, plan)
+
+
+def _too_slow(flight: Flight) -> Iterator[tuple[str, float, float]]:
+    """Part, its rate and the rate that the acceleration needs, where it falls short of that."""
+    for key, part, needed in (
+        ("imu", flight.imu, MIN_IMU_RATE),
+        ("attitude", flight.attitude, MIN_ATTITUDE_RATE),
+    ):
+        if isinstance(part, pd.DataFrame) and too_slow(part, needed):
+            yield key, sample_rate(part), needed.value
+
+
+def _hertz(rate: float) -> str:
+    return f"{rate:.{1 if rate < 10 else 0}f}"
 
 
 def _ekf2_abilities(flight: Flight, plan: _Plan) -> Iterator[Ability]:
@@ -436,7 +462,11 @@ def _advice(flight: Flight, plan: _Plan) -> Iterator[Advice]:
     """Remedies, most important first."""
     log, track, ekf2 = flight.log, plan.track, flight.ekf2
     if any("damaged" in note for note in log.notes):
-        remedy = "Copy the log from the SD card again; if it stays damaged, replace the card."
+        remedy = (
+            "Record where the link loses no bytes: by cable, or on the companion."
+            if log.format.startswith("MAVLink")
+            else "Copy the log from the SD card again; if it stays damaged, replace the card."
+        )
         yield Advice(remedy, ("everything",))
     if plan.remedy:
         yield Advice(f"{plan.remedy[0].upper()}{plan.remedy[1:]}", ("position",))
@@ -482,13 +512,11 @@ def _position_advice(flight: Flight, track: PositionTrack) -> Iterator[Advice]:
 
 
 def _rate_advice(flight: Flight) -> Iterator[Advice]:
-    for key, part, needed in (
-        ("imu", flight.imu, MIN_IMU_RATE),
-        ("attitude", flight.attitude, MIN_ATTITUDE_RATE),
-    ):
+    for key, part in (("imu", flight.imu), ("attitude", flight.attitude)):
         if isinstance(part, Unavailable):
             yield Advice(part.remedy, (PART_NAMES[key],))
-        elif (rate := sample_rate(part)) < needed.value and key in flight.streams:
+    for key, rate, needed in _too_slow(flight):
+        if key in flight.streams:
             topic = flight.streams[key].topics[0]
             how = (
                 f'put the line "{topic} 0" into etc/logging/logger_topics.txt on the SD card'
@@ -496,8 +524,7 @@ def _rate_advice(flight: Flight) -> Iterator[Advice]:
                 else f"request {topic} at a higher rate (MAV_CMD_SET_MESSAGE_INTERVAL)"
             )
             yield Advice(
-                f"{rate:.1f} Hz is below the {needed.value:g} Hz that the acceleration needs: "
-                f"{how}.",
+                f"{rate:.1f} Hz is below the {needed:g} Hz that the acceleration needs: {how}.",
                 (PART_NAMES[key],),
             )
 

@@ -150,7 +150,8 @@ def _no_source(flight: Flight) -> str:
         return (
             f"{flight.log.name}: {damaged}no external position was sent to the autopilot in this "
             "recording (no VISION_POSITION_ESTIMATE, ODOMETRY or ATT_POS_MOCAP). Give the "
-            "positioning system's own file with --position, or the ULog."
+            "positioning system's own file with --position"
+            f"{', or the ULog' if flight.log.has_ulog else ''}."
         )
     gps = any(track.rung > LAST_AUTOMATIC_RUNG for track in flight.positions)
     hint = (

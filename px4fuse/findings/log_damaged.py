@@ -1,4 +1,4 @@
-"""Bytes or samples that the reader had to pass over."""
+"""Bytes that the reader had to pass over, and single samples that it dropped."""
 
 from __future__ import annotations
 
@@ -7,20 +7,39 @@ from px4fuse.findings.model import Detector, Finding, Found, sentence
 
 
 def _detect(analysis: Analysis) -> Found:
-    notes = [n for n in analysis.comparison.flight.log.notes if "damaged" in n or "dropped" in n]
-    if notes:
+    log = analysis.comparison.flight.log
+    damage = [note for note in log.notes if "damaged" in note]
+    dropped = [note for note in log.notes if " dropped: " in note]
+    if damage:
         yield Finding(
             "log_damaged",
             "warning",
-            sentence(notes[0])
-            + (f" (and {len(notes) - 1} more such notes)." if len(notes) > 1 else "."),
-            "Copy the log again; if that does not help, replace the SD card or fix the "
-            "MAVLink link.",
-            {"notes": float(len(notes))},
+            _first_of(damage),
+            "Record where the link loses no bytes: by cable, or on the companion."
+            if log.format.startswith("MAVLink")
+            else "Copy the log again; if that does not help, replace the SD card.",
+            {"notes": float(len(damage))},
         )
+    if dropped:
+        yield Finding(
+            "samples_dropped",
+            "info",
+            _first_of(dropped),
+            "The file is whole: a clock was set back, or messages overtook each other. If it is "
+            "the position source, synchronise its clock before take-off (TIMESYNC).",
+            {"notes": float(len(dropped))},
+        )
+
+
+def _first_of(notes: list[str]) -> str:
+    more = f" (and {len(notes) - 1} more such notes)" if len(notes) > 1 else ""
+    return f"{sentence(notes[0])}{more}."
 
 
 DETECTOR = Detector(
     _detect,
-    {"log_damaged": "damaged, corrupt, logger, stamp go back, stamp backward, samples dropped"},
+    {
+        "log_damaged": "damaged, corrupt, logger",
+        "samples_dropped": "stamp go back, stamp backward, samples dropped",
+    },
 )

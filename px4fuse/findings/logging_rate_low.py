@@ -6,7 +6,7 @@ import pandas as pd
 
 from px4fuse.analysis import Analysis
 from px4fuse.findings.model import Detector, Finding, Found, Threshold
-from px4fuse.flight import sample_rate
+from px4fuse.flight import LogInfo, sample_rate
 
 MIN_IMU_RATE = Threshold(
     50.0, "Hz", "5 IMU samples per DT of 0.1 s and 10 with margin for aliasing"
@@ -15,27 +15,39 @@ MIN_ATTITUDE_RATE = Threshold(10.0, "Hz", "PX4's default is 20 Hz; slerp bridges
 RATE_MARGIN = 0.98  # a stream set to a rate runs a little below it
 
 
+def too_slow(samples: pd.DataFrame, needed: Threshold) -> bool:
+    """Whether samples come at a lower rate than is needed."""
+    return sample_rate(samples) < RATE_MARGIN * needed.value
+
+
 def _detect(analysis: Analysis) -> Found:
     flight = analysis.comparison.flight
-    mavlink = flight.log.format.startswith("MAVLink")
     for part, name, default, threshold in (
         (flight.imu, "imu", "sensor_combined", MIN_IMU_RATE),
         (flight.attitude, "attitude", "vehicle_attitude", MIN_ATTITUDE_RATE),
     ):
         topic = flight.streams[name].topics[0] if name in flight.streams else default
-        if isinstance(part, pd.DataFrame) and sample_rate(part) < RATE_MARGIN * threshold.value:
+        if isinstance(part, pd.DataFrame) and too_slow(part, threshold):
             yield Finding(
                 "logging_rate_low",
                 "warning",
                 f"{topic} was logged at {sample_rate(part):.1f} Hz, below the "
                 f"{threshold.value:g} Hz that the acceleration needs: motion between samples "
                 "is lost.",
-                f"Raise its stream rate (mavlink stream -d DEVICE -s {topic} -r "
-                f"{2 * threshold.value:g} in PX4's console), or join the ULog (--mavlink)."
-                if mavlink
-                else f'Put the line "{topic} 0" into etc/logging/logger_topics.txt on the SD card.',
+                _remedy(flight.log, topic, 2.0 * threshold.value),
                 {"rate_hz": sample_rate(part), "needed_hz": threshold.value, "topic": topic},
             )
+
+
+def _remedy(log: LogInfo, topic: str, rate_hz: float) -> str:
+    if not log.format.startswith("MAVLink"):
+        return f'Put the line "{topic} 0" into etc/logging/logger_topics.txt on the SD card.'
+    if not log.has_ulog:
+        return f"Ask for {topic} at {rate_hz:g} Hz (MAV_CMD_SET_MESSAGE_INTERVAL)."
+    return (
+        f"Raise its stream rate (mavlink stream -d DEVICE -s {topic} -r {rate_hz:g} in PX4's "
+        "console), or join the ULog (--mavlink)."
+    )
 
 
 DETECTOR = Detector(

@@ -23,7 +23,12 @@ def _detect(analysis: Analysis) -> Found:
             "The source's frame is FRD: its x axis is where the vehicle pointed at start, not "
             "north. Whether EKF2 fused its yaw, so that the frames are the same, is not in this "
             "recording.",
-            "Read 'north' as the source's x axis; the ULog says whether EKF2's is the same.",
+            "Read 'north' as the source's x axis"
+            + (
+                "; the ULog says whether EKF2's is the same."
+                if comparison.flight.log.has_ulog
+                else "."
+            ),
         )
         return
     if isinstance(ekf2, Ekf2) and isinstance(ekf2.fusing, pd.DataFrame):

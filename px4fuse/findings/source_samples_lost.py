@@ -29,8 +29,12 @@ def _detect(analysis: Analysis) -> Found:
             "info",
             f"About {share:.0%} of {source.name} is not in the recording ({lost} samples of "
             f"{lost + len(short)} at one per {typical:.2f} s); EKF2 may have received them.",
-            "Record on the companion, or on a link that does not lose messages; the ULog has what "
-            "arrived (SDLOG_PROFILE 129).",
+            "Record on the companion, or on a link that does not lose messages"
+            + (
+                "; the ULog has what arrived (SDLOG_PROFILE 129)."
+                if analysis.comparison.flight.log.has_ulog
+                else "."
+            ),
             {"lost": float(lost), "lost_share": share},
         )
 

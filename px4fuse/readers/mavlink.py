@@ -24,9 +24,18 @@ from px4fuse.flight import (
     missing_parts,
     stretches_of_flight,
 )
+from px4fuse.readers.mavlink_clocks import UNIX_FROM_S
 from px4fuse.readers.mavlink_ekf2 import MIN_NORM, read_ekf2
 from px4fuse.readers.mavlink_frames import Frames, message_ids, read_frames
-from px4fuse.readers.mavlink_messages import ATTITUDE, IMU, LANDED, UNUSED, VEHICLE_TYPES
+from px4fuse.readers.mavlink_messages import (
+    ATTITUDE,
+    IMU,
+    LANDED,
+    UNUSED,
+    VEHICLE_TYPES,
+    Remedies,
+    remedies_of,
+)
 from px4fuse.readers.mavlink_positions import read_positions, read_truth
 from px4fuse.readers.mavlink_recording import (
     BOOT_CLOCK,
@@ -41,6 +50,7 @@ from px4fuse.readers.mavlink_recording import (
     vector,
 )
 from px4fuse.readers.px4_topics import PARAMETERS
+from px4fuse.readers.ulog_topics import dropped_note
 
 # MAV_PARAM_TYPE: below, an integer
 PARAMETER_REAL = 9
@@ -75,12 +85,13 @@ def read_mavlink(path: Path, system: int | None = None) -> Flight:
     recording = settle_clocks(frames, address)
     mapped = map_senders(recording)
     parameters = _read_parameters(recording, autopilot)
-    imu = _read_imu(recording)
-    attitude = _read_attitude(recording)
+    remedies = remedies_of(autopilot)
+    imu = _read_imu(recording, remedies)
+    attitude = _read_attitude(recording, remedies)
     ekf2 = read_ekf2(recording, parameters, autopilot)
-    positions, missing_positions = read_positions(recording, mapped)
-    truth = read_truth(recording, positions)
-    airborne = _read_airborne(recording)
+    positions, missing_positions = read_positions(recording, mapped, remedies)
+    truth = read_truth(recording, positions, remedies)
+    airborne = _read_airborne(recording, remedies)
     return Flight(
         log=_describe(recording, parameters, autopilot),
         imu=imu,
@@ -96,7 +107,7 @@ def read_mavlink(path: Path, system: int | None = None) -> Flight:
     )
 
 
-def _read_imu(recording: Recording) -> pd.DataFrame | Unavailable:
+def _read_imu(recording: Recording, remedies: Remedies) -> pd.DataFrame | Unavailable:
     found = [(source, recording.rows(source.message)) for source in IMU]
     # HIGHRES_IMU has units and µs; of the others the densest
     source, rows = found[0] if len(found[0][1]) > 1 else max(found, key=lambda pair: len(pair[1]))
@@ -106,8 +117,7 @@ def _read_imu(recording: Recording) -> pd.DataFrame | Unavailable:
         return Unavailable(
             "IMU",
             f"no HIGHRES_IMU or SCALED_IMU{refused}",
-            "Set the stream rate of HIGHRES_IMU to 50 Hz or more (in PX4's console: mavlink stream "
-            "-d DEVICE -s HIGHRES_IMU -r 100), or join the ULog.",
+            remedies.imu,
         )
     table = recording.frames.table(source.message, rows)
     if "id" in (table.dtype.names or ()):
@@ -135,7 +145,7 @@ def _read_imu(recording: Recording) -> pd.DataFrame | Unavailable:
     return imu
 
 
-def _read_attitude(recording: Recording) -> pd.DataFrame | Unavailable:
+def _read_attitude(recording: Recording, remedies: Remedies) -> pd.DataFrame | Unavailable:
     found = [(message, recording.rows(message)) for message in ATTITUDE]
     message, rows = max(found, key=lambda pair: len(pair[1]))
     table = recording.frames.table(message, rows)
@@ -156,13 +166,15 @@ def _read_attitude(recording: Recording) -> pd.DataFrame | Unavailable:
         return Unavailable(
             "attitude",
             f"no usable {', '.join(ATTITUDE[:-1])} or {ATTITUDE[-1]}",
-            "Set the stream rate of ATTITUDE_QUATERNION to 20 Hz or more, or join the ULog.",
+            remedies.attitude,
         )
     recording.came_from("attitude", BOOT_CLOCK, message)
     return attitude
 
 
-def _read_airborne(recording: Recording) -> tuple[tuple[float, float], ...] | Unavailable:
+def _read_airborne(
+    recording: Recording, remedies: Remedies
+) -> tuple[tuple[float, float], ...] | Unavailable:
     """Stretches of flight by the land detector, each from take-off to touch-down."""
     rows = recording.rows("EXTENDED_SYS_STATE")
     table = recording.frames.table("EXTENDED_SYS_STATE", rows)
@@ -171,7 +183,7 @@ def _read_airborne(recording: Recording) -> tuple[tuple[float, float], ...] | Un
         return Unavailable(
             "land detector",
             "no usable EXTENDED_SYS_STATE",
-            "Set the stream rate of EXTENDED_SYS_STATE to 1 Hz, or give --start and --end.",
+            remedies.landed,
         )
     recording.came_from("airborne", RECEIPT_CLOCK, "EXTENDED_SYS_STATE")
     time_s = recording.receipt_boot_s(rows[known]) - recording.zero_s
@@ -209,8 +221,7 @@ def _describe(
     beats = frames.table("HEARTBEAT", recording.rows("HEARTBEAT"))
     kind = VEHICLE_TYPES.get(int(beats["type"][0]), "vehicle") if len(beats) else "vehicle"
     dropped = [
-        f"{count} samples of {message} were dropped: their time stamps are zero, go back, or lie "
-        "outside the recording"
+        dropped_note(count, message, "zero, go back, or lie outside the recording")
         for message, count in sorted(recording.dropped.items())
     ]
     return LogInfo(
@@ -233,6 +244,8 @@ def _describe(
 
 def _start_unix_s(recording: Recording) -> float | None:
     """UNIX time of time zero: the autopilot's own, or else the recording computer's."""
+    if recording.zero_s >= UNIX_FROM_S:
+        return recording.zero_s
     zero = np.array([recording.zero_s])
     unix = unix_of_boot(recording)
     if unix is not None:

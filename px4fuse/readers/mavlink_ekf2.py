@@ -23,14 +23,14 @@ from px4fuse.readers.mavlink_messages import (
     EXTENDED_COVARIANCE_DIAGONAL,
     FRAMES_OF_REFERENCE,
     POSE_DIAGONAL,
+    Remedies,
+    remedies_of,
 )
 from px4fuse.readers.mavlink_recording import BOOT_CLOCK, Recording, vector
 from px4fuse.readers.px4_ekf2 import DEFAULT_GATE, NO_SELECTOR
 
 VARIANCE_COLUMNS = POSITION_VARIANCE_COLUMNS + VELOCITY_VARIANCE_COLUMNS
 COVARIANT_POSITION = "LOCAL_POSITION_NED_COV"
-INNOVATIONS_REMEDY = "Give the ULog of the same flight: px4fuse compare LOG.ulg --mavlink LOG.tlog."
-STREAM_REMEDY = "Set the stream rate of ODOMETRY to 30 Hz or more, or join the ULog."
 MIN_NORM = 0.5  # a zero quaternion is no attitude
 
 
@@ -38,6 +38,7 @@ def read_ekf2(
     recording: Recording, parameters: Mapping[str, float], autopilot: str
 ) -> Ekf2 | Unavailable:
     """EKF2's output as the autopilot sent it, or why there is none."""
+    remedies = remedies_of(autopilot)
     messages = ("ODOMETRY", COVARIANT_POSITION, "LOCAL_POSITION_NED")
     found = [(message, recording.rows(message)) for message in messages]
     # the one with variances as long as it is not much sparser than the one without
@@ -45,14 +46,14 @@ def read_ekf2(
     message, rows = next((m, r) for m, r in found if 2 * len(r) >= densest)
     if len(rows) < 2:
         return Unavailable(
-            "EKF2", "no ODOMETRY or LOCAL_POSITION_NED of the autopilot", STREAM_REMEDY
+            "EKF2", "no ODOMETRY or LOCAL_POSITION_NED of the autopilot", remedies.state
         )
     table = recording.frames.table(message, rows)
     notes = [f"EKF2's state is {message} as the autopilot sent it"]
     if autopilot != "PX4":
         notes.append(f"this is {autopilot}: what is called EKF2 here is its own estimator")
     boot_s = recording.boot_s(table, rows)
-    variance: pd.DataFrame | Unavailable = Unavailable("EKF2 variances", "", STREAM_REMEDY)
+    variance: pd.DataFrame | Unavailable = Unavailable("EKF2 variances", "", remedies.variance)
     if message == "ODOMETRY":
         state_values, variances = odometry(table)
         count = int(np.count_nonzero(np.diff(table["reset_counter"].astype(np.int64))))
@@ -75,7 +76,7 @@ def read_ekf2(
         variance = variance[(variance > 0.0).all(axis=1)]
         recording.came_from("ekf2_variance", BOOT_CLOCK, message)
     if isinstance(variance, Unavailable) or variance.empty:
-        variance = _variance_by_accuracy(recording, notes)
+        variance = _variance_by_accuracy(recording, notes, remedies)
     return Ekf2(
         state=state,
         variance=variance,
@@ -83,18 +84,19 @@ def read_ekf2(
             axis: Unavailable(
                 f"EKF2 innovations, {axis}",
                 "MAVLink does not carry EKF2's innovations",
-                INNOVATIONS_REMEDY,
+                remedies.innovations,
             )
             for axis in AXIS_NAMES
         },
         innovation_topics=(),
         fusing=Unavailable(
-            "EKF2 fusion flags", "MAVLink does not carry EKF2's fusion flags", INNOVATIONS_REMEDY
+            "EKF2 fusion flags", "MAVLink does not carry EKF2's fusion flags", remedies.fusing
         ),
         resets=(),
         instances=NO_SELECTOR,
         gate=parameters.get("EKF2_EVP_GATE", DEFAULT_GATE),
         notes=tuple(notes),
+        record=remedies.replay,
     )
 
 
@@ -133,7 +135,9 @@ def odometry(table: NDArray[Any]) -> tuple[Array, Array]:
     return state, variance
 
 
-def _variance_by_accuracy(recording: Recording, notes: list[str]) -> pd.DataFrame | Unavailable:
+def _variance_by_accuracy(
+    recording: Recording, notes: list[str], remedies: Remedies
+) -> pd.DataFrame | Unavailable:
     """Position variances from the accuracies of ESTIMATOR_STATUS, which are one σ.
 
     PX4's horizontal accuracy is the root of the sum over both axes (``get_ekf_lpos_accuracy``).
@@ -150,7 +154,7 @@ def _variance_by_accuracy(recording: Recording, notes: list[str]) -> pd.DataFram
         return Unavailable(
             "EKF2 variances",
             "no ODOMETRY with covariance and no ESTIMATOR_STATUS of the autopilot",
-            STREAM_REMEDY,
+            remedies.variance,
         )
     recording.came_from("ekf2_variance", BOOT_CLOCK, "ESTIMATOR_STATUS")
     notes.append(

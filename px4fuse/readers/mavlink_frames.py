@@ -11,12 +11,12 @@ Sources: MAVLink developer guide, "Packet Serialization"; pymavlink's generated 
 from __future__ import annotations
 
 import hashlib
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from fastcrc.crc16 import mcrf4xx  # CRC-16/MCRF4XX is MAVLink's X.25 checksum
@@ -34,6 +34,7 @@ HEADER_1, HEADER_2 = 6, 10
 CHECKSUM = 2
 SIGNATURE = 13
 SIGNED = 0x01
+LONGEST_FRAME = HEADER_2 + 255 + CHECKSUM + SIGNATURE
 # QGroundControl and MAVProxy put the time of receipt before each frame: µs, big-endian
 STAMP = 8
 # Bytes that are scanned at a time, which bounds the memory that hostile bytes can claim
@@ -74,6 +75,9 @@ class Frames:
         Time of receipt, µs UNIX, of a recording with stamps (damaged ones interpolated).
     unknown : mapping from message id to count
         Whole frames of messages that the dialect does not know; their checksum cannot be checked.
+    foreign : mapping from message id to count
+        Whole frames of messages that the dialect defines otherwise: of those that a sender sent of
+        one message most have another checksum than its definition gives.
     bad_bytes : int
         Bytes that belong to no frame.
     bad_stamps : int
@@ -92,6 +96,7 @@ class Frames:
     payload_length: NDArray[np.uint8]
     received_us: Integers | None
     unknown: Mapping[int, int]
+    foreign: Mapping[int, int]
     bad_bytes: int
     bad_stamps: int
 
@@ -215,7 +220,9 @@ def read_frames(path: Path) -> Frames:
     number[second] |= (source[at + 8].astype(np.int32) << 8) | (
         source[at + 9].astype(np.int32) << 16
     )
-    unknown, bad_bytes = _gaps(content, start, end, STAMP if stamped else 0)
+    system, component = source[sequence + 1], source[sequence + 2]
+    known = Counter(zip(system.tolist(), component.tolist(), number.tolist(), strict=True))
+    unknown, foreign, bad_bytes = _gaps(content, start, end, STAMP if stamped else 0, known)
     received, link, bad_stamps = None, np.zeros(len(start), dtype=np.uint8), 0
     if stamped:
         received, link, bad_stamps = _stamps(source, start, end)
@@ -225,14 +232,15 @@ def read_frames(path: Path) -> Frames:
         sha256=hashlib.sha256(content).hexdigest(),
         start=start,
         message_id=number,
-        system=source[sequence + 1],
-        component=source[sequence + 2],
+        system=system,
+        component=component,
         sequence=source[sequence],
         link=link,
         payload_start=start + np.where(second, HEADER_2, HEADER_1),
         payload_length=source[start + 1],
         received_us=received,
         unknown=unknown,
+        foreign=foreign,
         bad_bytes=bad_bytes,
         bad_stamps=bad_stamps,
     )
@@ -340,45 +348,74 @@ def _without_chance(
     highs = np.concatenate([start[1:] - stamp, [len(content)]])
     lows = np.concatenate([[0], end[:-1]])
     alone = np.flatnonzero((lows != start - stamp) & (highs != end))
-    chance = [
-        at
-        for at in alone.tolist()
-        if (reached := _unknown_frames(content, int(lows[at]), int(highs[at]), stamp))[0]
-        and reached[1] == highs[at]
-    ]
+    chance = []
+    for at in alone.tolist():
+        inside, reached = _whole_frames(content, int(lows[at]), int(highs[at]), stamp)
+        unknown = all(one.message not in dialect.mavlink_map for one in inside)
+        if inside and unknown and reached == highs[at]:
+            chance.append(at)
     return np.delete(start, chance), np.delete(end, chance)
 
 
-def _unknown_frames(content: bytes, at: int, high: int, stamp: int) -> tuple[list[int], int]:
-    """Ids of the whole frames of unknown messages from one offset on, and where they end."""
-    found: list[int] = []
+class _Whole(NamedTuple):
+    """A frame by its header alone."""
+
+    system: int
+    component: int
+    message: int
+    size: int
+
+
+def _whole_frames(content: bytes, at: int, high: int, stamp: int) -> tuple[list[_Whole], int]:
+    """Frames that follow one another from one offset on, by their headers, and where they end."""
+    found: list[_Whole] = []
     while at + stamp + HEADER_1 + CHECKSUM <= high:
         head = content[at + stamp : at + stamp + HEADER_2]
         size = head[1] + HEADER_1 + CHECKSUM
-        number = head[5]
+        system, component, number = head[3], head[4], head[5]
         if head[0] == MAGIC_2 and len(head) == HEADER_2:
             size = head[1] + HEADER_2 + CHECKSUM + SIGNATURE * (head[2] & SIGNED)
-            number = int.from_bytes(head[7:10], "little")
+            system, component, number = head[5], head[6], int.from_bytes(head[7:10], "little")
         elif head[0] != MAGIC_1:
             break
-        if number in dialect.mavlink_map or at + stamp + size > high:
+        if at + stamp + size > high:
             break
-        found.append(number)
+        found.append(_Whole(system, component, number, stamp + size))
         at += stamp + size
     return found, at
 
 
-def _gaps(content: bytes, start: Integers, end: Integers, stamp: int) -> tuple[dict[int, int], int]:
-    """Unknown but whole frames between the good ones, and the bytes that belong to no frame."""
+def _gaps(
+    content: bytes,
+    start: Integers,
+    end: Integers,
+    stamp: int,
+    known: Mapping[tuple[int, int, int], int],
+) -> tuple[dict[int, int], dict[int, int], int]:
+    """Unknown and foreign frames between the good ones, and the bytes that belong to no frame.
+
+    ``known`` counts the good frames by system, component and message.
+    """
     unknown: Counter[int] = Counter()
+    wrong: defaultdict[tuple[int, int, int], list[int]] = defaultdict(list)
     bad = 0
     lows = np.concatenate([[0], end])
     highs = np.concatenate([start - stamp, [len(content)]])
     for gap in np.flatnonzero(highs > lows).tolist():
-        found, at = _unknown_frames(content, int(lows[gap]), int(highs[gap]), stamp)
-        unknown.update(found)
+        found, at = _whole_frames(content, int(lows[gap]), int(highs[gap]), stamp)
         bad += int(highs[gap]) - at
-    return dict(unknown), bad
+        for one in found:
+            if one.message in dialect.mavlink_map:
+                wrong[one[:3]].append(one.size)
+            else:
+                unknown[one.message] += 1
+    foreign: Counter[int] = Counter()
+    for sender, sizes in wrong.items():
+        if len(sizes) > max(known.get(sender, 0), 1):
+            foreign[sender[2]] += len(sizes)
+        else:
+            bad += sum(sizes)
+    return dict(unknown), dict(foreign), bad
 
 
 def _stamps(

@@ -13,6 +13,7 @@ import numpy as np
 from scipy import constants
 
 from px4fuse.arrays import Array
+from px4fuse.flight import RECORD_NOT_LOGGED, Unavailable
 
 AUTOPILOT_COMPONENT = 1  # MAV_COMP_ID_AUTOPILOT1
 NO_AUTOPILOT = 8  # MAV_AUTOPILOT_INVALID: a ground station, a camera, a companion computer
@@ -26,6 +27,66 @@ VEHICLE_TYPES: Mapping[int, str] = {
     18: "companion computer", 19: "VTOL", 20: "VTOL", 21: "VTOL", 22: "VTOL", 26: "gimbal",
     27: "ADS-B receiver", 30: "camera",
 }  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Remedies:
+    """What would have put each part of a flight into a recording, by the autopilot's own means."""
+
+    imu: str
+    attitude: str
+    state: str
+    variance: str
+    innovations: str
+    fusing: str
+    landed: str
+    position: str
+    truth: str
+    replay: Unavailable
+
+
+_JOIN = "Give the ULog of the same flight: px4fuse compare LOG.ulg --mavlink LOG.tlog."
+_FILE = "give the positioning system's own file with --position."
+PX4_REMEDIES = Remedies(
+    imu="Set the stream rate of HIGHRES_IMU to 50 Hz or more (in PX4's console: mavlink stream "
+    "-d DEVICE -s HIGHRES_IMU -r 100), or join the ULog.",
+    attitude="Set the stream rate of ATTITUDE_QUATERNION to 20 Hz or more, or join the ULog.",
+    state="Set the stream rate of ODOMETRY to 30 Hz or more, or join the ULog.",
+    variance="Set the stream rate of ODOMETRY to 30 Hz or more, or join the ULog.",
+    innovations=_JOIN,
+    fusing=_JOIN,
+    landed="Set the stream rate of EXTENDED_SYS_STATE to 1 Hz, or give --start and --end.",
+    position="Record where the companion's link passes (a MAVLink router), or join the ULog of the "
+    f"flight, or {_FILE}",
+    truth="Real flights have truth only from motion capture (send ATT_POS_MOCAP).",
+    replay=RECORD_NOT_LOGGED,
+)
+# Its own log is DataFlash (.BIN), and SRn_ parameters set the streams of its serial port n
+ARDUPILOT_REMEDIES = Remedies(
+    imu="Ask the autopilot for SCALED_IMU2 at 50 Hz (MAV_CMD_SET_MESSAGE_INTERVAL, or SRn_RAW_SENS "
+    "of the recorded link).",
+    attitude="Ask the autopilot for ATTITUDE at 20 Hz (MAV_CMD_SET_MESSAGE_INTERVAL, or SRn_EXTRA1 "
+    "of the recorded link).",
+    state="Ask the autopilot for LOCAL_POSITION_NED at 10 Hz (MAV_CMD_SET_MESSAGE_INTERVAL, or "
+    "SRn_POSITION of the recorded link).",
+    variance="ArduPilot sends no variances; px4fuse does not read its DataFlash log (.BIN).",
+    innovations="ArduPilot keeps them in its DataFlash log (.BIN), which px4fuse does not read.",
+    fusing="ArduPilot keeps them in its DataFlash log (.BIN), which px4fuse does not read.",
+    landed="Ask for EXTENDED_SYS_STATE at 1 Hz, or give --start and --end.",
+    position=f"Record where the companion's link passes (a MAVLink router), or {_FILE}",
+    truth="ArduPilot fuses motion capture itself, so that a real flight's recording has no truth.",
+    replay=Unavailable(
+        "replay of the estimator",
+        "ArduPilot's estimator is another one than the one that px4fuse has a model of",
+        "Read its state as it is.",
+    ),
+)
+
+
+def remedies_of(autopilot: str) -> Remedies:
+    """Remedies for the autopilot of that name; PX4's for all but ArduPilot."""
+    return ARDUPILOT_REMEDIES if autopilot == "ArduPilot" else PX4_REMEDIES
+
 
 # Row-major upper triangle of a 6×6 matrix: x, y, z
 POSE_DIAGONAL = np.array([0, 6, 11])
@@ -53,6 +114,11 @@ IMU = (
 )
 # Messages whose time_usec is the autopilot's boot clock; GPS_RAW_INT's, say, is the receiver's
 STAMPED_BY_BOOT_CLOCK = ("HIGHRES_IMU", "ODOMETRY", "ESTIMATOR_STATUS")
+# What an autopilot sends of itself, and nobody else
+OWN_MESSAGES = (
+    "HIGHRES_IMU", "SCALED_IMU", "SCALED_IMU2", "SCALED_IMU3", "RAW_IMU", "ATTITUDE_QUATERNION",
+    "LOCAL_POSITION_NED", "GLOBAL_POSITION_INT", "SYS_STATUS", "ESTIMATOR_STATUS",
+)  # fmt: skip
 # Equally dense ones are taken in this order
 ATTITUDE = ("ATTITUDE_QUATERNION", "ATTITUDE", "ODOMETRY")
 
@@ -81,18 +147,18 @@ _MOCAP = "motion capture, which EKF2 never fuses"
 POSITION_INPUTS = (
     PositionInput(
         "VISION_POSITION_ESTIMATE", "VISION_POSITION_ESTIMATE", "usec", 2,
-        "external vision position as it was sent to PX4",
+        "external vision position as it was sent to the autopilot",
     ),
-    _odometry("ODOMETRY", 2, "external odometry as it was sent to PX4"),
+    _odometry("ODOMETRY", 2, "external odometry as it was sent to the autopilot"),
     PositionInput("ATT_POS_MOCAP", "ATT_POS_MOCAP", "time_usec", 3, _MOCAP),
 )  # fmt: skip
 # ODOMETRY from outside the autopilot by MAV_ESTIMATOR_TYPE. The others are no measurement: PX4
 # refuses GPS, GPS_INS, LIDAR and AUTOPILOT as input; from the autopilot itself it is EKF2's output.
 ODOMETRY_INPUTS: Mapping[int, PositionInput] = {
-    0: _odometry("ODOMETRY", 2, "external odometry as it was sent to PX4"),
+    0: _odometry("ODOMETRY", 2, "external odometry as it was sent to the autopilot"),
     1: _odometry("ODOMETRY_NAIVE", 2, "external odometry, without covariance", True),
-    2: _odometry("ODOMETRY_VISION", 2, "visual odometry as it was sent to PX4"),
-    3: _odometry("ODOMETRY_VIO", 2, "visual-inertial odometry as it was sent to PX4"),
+    2: _odometry("ODOMETRY_VISION", 2, "visual odometry as it was sent to the autopilot"),
+    3: _odometry("ODOMETRY_VIO", 2, "visual-inertial odometry as it was sent to the autopilot"),
     6: _odometry("ODOMETRY_MOCAP", 3, _MOCAP),
 }
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -29,6 +30,7 @@ from px4fuse.readers.mavlink_messages import (
     POSITION_INPUTS,
     ROTATION_DIAGONAL,
     PositionInput,
+    Remedies,
 )
 from px4fuse.readers.mavlink_recording import RECEIPT_CLOCK, Address, Recording, senders_of, vector
 from px4fuse.readers.px4_positions import (
@@ -42,14 +44,10 @@ from px4fuse.readers.px4_positions import (
 TRACK_COLUMNS = [
     *POSITION_COLUMNS, *POSITION_VARIANCE_COLUMNS, *QUATERNION_COLUMNS, *ROTATION_VARIANCE_COLUMNS,
 ]  # fmt: skip
-ROUTER_REMEDY = (
-    "Record where the companion's link passes (a MAVLink router), or join the ULog of the flight, "
-    "or give the positioning system's own file with --position."
-)
 
 
 def read_positions(
-    recording: Recording, mapped: dict[Address, Mapped]
+    recording: Recording, mapped: dict[Address, Mapped], remedies: Remedies
 ) -> tuple[tuple[PositionTrack, ...], tuple[Unavailable, ...]]:
     """Every external position that was sent to the autopilot, best rung first.
 
@@ -58,6 +56,7 @@ def read_positions(
     recording : Recording
     mapped : mapping from address to Mapped
         Clock of every sender.
+    remedies : Remedies
     """
     found: list[PositionTrack | Unavailable] = []
     for source in POSITION_INPUTS:
@@ -67,13 +66,18 @@ def read_positions(
             suffix = f"_{sender[0]}_{sender[1]}" if len(senders) > 1 else ""
             rows = recording.rows(source.message, sender)
             for kind, part in _kinds(source, recording.frames.table(source.message, rows)):
-                found.append(_read_track(recording, kind, suffix, rows[part], mapped[sender]))
+                track = _read_track(recording, kind, suffix, rows[part], mapped[sender])
+                found.append(
+                    replace(track, remedy=remedies.position)
+                    if isinstance(track, Unavailable)
+                    else track
+                )
         if len(found) == before:
             found.append(
                 Unavailable(
                     f"position source {source.message}",
                     f"no {source.message} to the autopilot in the recording",
-                    ROUTER_REMEDY,
+                    remedies.position,
                 )
             )
     tracks = [part for part in found if isinstance(part, PositionTrack)]
@@ -122,7 +126,7 @@ def _read_track(
     samples = clean_positions(samples, POSITION_COLUMNS)
     if len(samples) < MIN_TRACK_SAMPLES:
         return Unavailable(
-            f"position source {name}", f"{len(samples)} finite samples are too few", ROUTER_REMEDY
+            f"position source {name}", f"{len(samples)} finite samples are too few", ""
         )
     statement = clock.statement
     mapping = (
@@ -168,7 +172,9 @@ def _orientation(source: PositionInput, table: NDArray[Any], frame: str) -> tupl
     return quaternion, variance
 
 
-def read_truth(recording: Recording, positions: tuple[PositionTrack, ...]) -> Truth | Unavailable:
+def read_truth(
+    recording: Recording, positions: tuple[PositionTrack, ...], remedies: Remedies
+) -> Truth | Unavailable:
     """Simulation truth, or motion capture where another track feeds EKF2.
 
     Simulation truth carries no usable clock (``HIL_STATE_QUATERNION.time_usec`` is 0 in PX4), so
@@ -206,7 +212,7 @@ def read_truth(recording: Recording, positions: tuple[PositionTrack, ...]) -> Tr
         return Unavailable(
             "ground truth",
             "neither simulation truth nor motion capture is in the recording",
-            "Real flights have truth only from motion capture (send ATT_POS_MOCAP).",
+            remedies.truth,
         )
     recording.came_from("truth", captured.clock, *captured.topics)
     return captured_truth(captured)

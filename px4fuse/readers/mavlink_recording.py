@@ -22,12 +22,13 @@ from px4fuse.readers.mavlink_clocks import (
     map_clock,
     tells_time,
 )
-from px4fuse.readers.mavlink_frames import Frames, message_name, wire_layout
+from px4fuse.readers.mavlink_frames import LONGEST_FRAME, Frames, message_name, wire_layout
 from px4fuse.readers.mavlink_messages import (
     AUTOPILOT_COMPONENT,
     AUTOPILOTS,
     GROUND_STATION,
     NO_AUTOPILOT,
+    OWN_MESSAGES,
     POSITION_INPUTS,
     STAMPED_BY_BOOT_CLOCK,
     VEHICLE_TYPES,
@@ -53,6 +54,8 @@ MAX_SENDERS = 32
 SEQUENCE_MEANS_NOTHING = 0.9
 # More bytes than this outside of frames are damage; a stream begins and ends in mid-frame
 DAMAGED_SHARE = 0.02
+# From this number on, stamps of the autopilot that stand still are no clock
+MIN_STAMPS = 10
 # Stamps of one sender further apart than this are of two clocks
 OTHER_CLOCK_S = 1e5
 
@@ -146,10 +149,12 @@ class Recording:
 
     def boot_s(self, table: NDArray[Any], rows: IntArray) -> Array:
         """Boot clock (s) of the autopilot's own messages; by receipt where they are not on it."""
+        if not self.boot_of_receipt.pairs:  # no message carries it
+            return self.receipt_boot_s(rows)
         if "time_boot_ms" in (table.dtype.names or ()):
             return np.asarray(table["time_boot_ms"] * 1e-3, dtype=np.float64)
         stamp = table["time_usec"] * 1e-6
-        on_boot = (stamp > 0.0) & (stamp < UNIX_FROM_S)
+        on_boot = (stamp > 0.0) & ((stamp < UNIX_FROM_S) == (self.zero_s < UNIX_FROM_S))
         return np.asarray(np.where(on_boot, stamp, self.receipt_boot_s(rows)), dtype=np.float64)
 
     def came_from(self, part: str, clock: str, *messages: str) -> None:
@@ -199,12 +204,15 @@ def choose_autopilot(frames: Frames, system: int | None) -> tuple[Address, str]:
     counts = dict(_counts(frames))
     vehicles = _vehicles(frames)
     flying = [s for s in counts if s in vehicles and _flies(*vehicles[s])]
-    # without a heartbeat the autopilot is still known by its component
-    candidates = flying or [s for s in counts if s[1] == AUTOPILOT_COMPONENT]
+    own = dict(_counts(frames, np.concatenate([frames.rows(name) for name in OWN_MESSAGES])))
+    # a companion may call itself an autopilot; one without a heartbeat is known by what it sends,
+    # or else by its component
+    candidates = [s for s in flying if s in own] or [s for s in own if s not in vehicles] or flying
+    candidates = candidates or [s for s in counts if s[1] == AUTOPILOT_COMPONENT]
     # nor need it have been heard itself
     candidates = candidates or [(s[0], AUTOPILOT_COMPONENT) for s in counts]
     if system is not None:
-        candidates = [address for address in candidates if address[0] == system]
+        candidates = [address for address in {*flying, *candidates} if address[0] == system]
         if not candidates:
             have = ", ".join(str(number) for number in sorted({s[0] for s in flying})) or "none"
             raise SettingsError(
@@ -230,13 +238,16 @@ def _boot_stamps(frames: Frames, address: Address) -> tuple[IntArray, Array]:
             continue
         rows = frames.rows(name)
         rows = rows[own[rows]]
-        stamps = frames.table(name, rows)[stamp] * unit
-        good = (stamps > 0.0) & (stamps < UNIX_FROM_S)
-        all_rows.append(rows[good])
-        all_stamps.append(stamps[good])
+        all_rows.append(rows)
+        all_stamps.append(frames.table(name, rows)[stamp] * unit)
     if not all_rows:
         return np.zeros(0, dtype=np.intp), np.zeros(0)
     rows, stamps = np.concatenate(all_rows), np.concatenate(all_stamps)
+    from_boot, from_1970 = (stamps > 0.0) & (stamps < UNIX_FROM_S), stamps >= UNIX_FROM_S
+    good = from_boot if np.any(from_boot) else from_1970
+    if np.count_nonzero(good) >= MIN_STAMPS and not tells_time(stamps[good]):
+        good = np.zeros_like(good)
+    rows, stamps = rows[good], stamps[good]
     order = np.argsort(rows, kind="stable")
     return rows[order], stamps[order]
 
@@ -277,6 +288,8 @@ def settle_clocks(frames: Frames, address: Address) -> Recording:
         # no time of receipt: the boot clock of the last stamped message stands in for it
         at = np.clip(np.searchsorted(rows, np.arange(len(frames)), side="right") - 1, 0, None)
         received = stamps[at]
+    else:
+        notes.append("no message in the stream carries a time: nothing in it can be placed in time")
     notes += _frame_notes(frames, received)
     # without a boot clock the receipt must do
     span = stamps if len(stamps) else np.array([0.0, received.max()])
@@ -296,9 +309,20 @@ def _frame_notes(frames: Frames, received: Array) -> list[str]:
     notes = []
     if frames.bad_bytes:
         share = frames.bad_bytes / len(frames.content)
+        # the first and the last frame may be cut
+        inside = frames.bad_bytes - 2 * LONGEST_FRAME
+        damaged = "damaged: " if inside > DAMAGED_SHARE * len(frames.content) else ""
         notes.append(
-            f"{'damaged: ' if share > DAMAGED_SHARE else ''}{frames.bad_bytes} bytes ({share:.2%}) "
-            "belong to no whole MAVLink frame and were passed over"
+            f"{damaged}{frames.bad_bytes} bytes ({share:.2%}) belong to no whole MAVLink frame and "
+            "were passed over"
+        )
+    if frames.foreign:
+        listed = ", ".join(
+            f"{count} of {message_name(number)}" for number, count in sorted(frames.foreign.items())
+        )
+        notes.append(
+            "whole frames of a dialect that px4fuse does not know (it defines these messages "
+            f"otherwise, so that their checksums do not match) were passed over: {listed}"
         )
     if frames.bad_stamps:
         notes.append(f"{frames.bad_stamps} times of receipt are damaged and were interpolated")

@@ -47,6 +47,8 @@ GPS_3D_FIX = 3
 # Samples that are published within this of their measurement have no measured time of their own
 SAME_TIME_US = 100
 ARRIVAL_SHARE = 0.9
+# Heights this far from a position may be joined to it: 2.5 cm at a climb of 0.5 m/s
+HEIGHT_TOLERANCE_S = 0.05
 AID_SOURCE = "estimator_aid_src_ev_pos"
 RECONSTRUCTION = "ekf2_state_plus_innovation"
 GPS_SOURCE = "vehicle_gps_position"
@@ -150,14 +152,11 @@ def _read_aid_observation(topics: Topics, instances: Instances) -> PositionTrack
         return _unavailable(AID_SOURCE, f"no topic {AID_SOURCE} in the log")
     samples = of_primary(topics, layout.topic, instances, partial(topics.frame, layout))
     used = [layout.topic]
+    notes: tuple[str, ...] = ()
     vertical = topics.find(AID_OBSERVATION_VERTICAL)
     if vertical is not None:
-        # both are stamped with the same external vision sample, so the join is exact
         height = of_primary(topics, vertical.topic, instances, partial(topics.frame, vertical))
-        samples = pd.merge_asof(
-            samples, height, left_index=True, right_index=True, direction="nearest",
-            tolerance=1e-4,  # type: ignore[arg-type]
-        )  # fmt: skip
+        samples, notes = _with_height(samples, height)
         used.append(vertical.topic)
     # EKF2 stamps its buffer entries earlier than the sender did: by EKF2_EV_DELAY and by half its
     # update period (estimator_interface.cpp)
@@ -167,10 +166,38 @@ def _read_aid_observation(topics: Topics, instances: Instances) -> PositionTrack
     return _finished(
         PositionTrack(
             AID_SOURCE, 5, "the observations that EKF2 kept of external vision", samples, "NED",
-            AUTOPILOT_CLOCK, True, tuple(used),
+            AUTOPILOT_CLOCK, True, tuple(used), notes=notes,
         ),
         POSITION_COLUMNS[:2],
     )  # fmt: skip
+
+
+def _with_height(
+    samples: pd.DataFrame, height: pd.DataFrame
+) -> tuple[pd.DataFrame, tuple[str, ...]]:
+    """Add the nearest height to each horizontal position, and say what that did.
+
+    EKF2 stamps both with one external vision sample, but the logger thins each topic by itself,
+    and may keep another sample's height.
+    """
+    joined = pd.merge_asof(
+        samples, height.assign(_at=height.index), left_index=True, right_index=True,
+        direction="nearest", tolerance=HEIGHT_TOLERANCE_S,  # type: ignore[arg-type]
+    )  # fmt: skip
+    apart_s = np.abs(joined.pop("_at").to_numpy() - joined.index.to_numpy())
+    moved, dropped = apart_s > SAME_TIME_US * 1e-6, int(np.count_nonzero(np.isnan(apart_s)))
+    notes = []
+    if np.any(moved):
+        notes.append(
+            f"{np.count_nonzero(moved)} of {len(joined)} heights of external vision are those of "
+            f"the sample before or after, up to {1e3 * np.nanmax(apart_s):.0f} ms away"
+        )
+    if dropped:
+        notes.append(
+            f"{dropped} of {len(joined)} positions of external vision have no height within "
+            f"{1e3 * HEIGHT_TOLERANCE_S:.0f} ms"
+        )
+    return joined, ("; ".join(notes),) if notes else ()
 
 
 def _delay_s(topics: Topics) -> float:
@@ -196,14 +223,15 @@ def _reconstruct(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack | Un
     if not {"north_m", "east_m"} <= tracks.keys():
         return _unavailable(RECONSTRUCTION, "EKF2 fused no horizontal external vision position")
     samples = pd.DataFrame({"north_m": tracks["north_m"], "east_m": tracks["east_m"]})
+    notes: tuple[str, ...] = ()
     if "down_m" in tracks:
-        samples["down_m"] = tracks["down_m"].reindex(samples.index, method="nearest", tolerance=0.1)
+        samples, notes = _with_height(samples, tracks["down_m"].to_frame("down_m"))
     samples.index = pd.Index(samples.index.to_numpy() + _delay_s(topics), name="time_s")
     return _finished(
         PositionTrack(
             RECONSTRUCTION, 6, "EKF2's position plus its innovation", samples, "NED",
             "EKF2's time plus EKF2_EV_DELAY; late by up to one interval of the source", True,
-            ("vehicle_local_position", *ekf2.innovation_topics),
+            ("vehicle_local_position", *ekf2.innovation_topics), notes=notes,
         ),
         POSITION_COLUMNS[:2],
     )  # fmt: skip

@@ -29,6 +29,7 @@ from px4fuse.readers.ulog_topics import (
     ACCELEROMETER_OFFSET_INVALID_US,
     AT_MEASUREMENT,
     Topics,
+    dropped_note,
     increasing,
     read_topics,
 )
@@ -70,7 +71,7 @@ def to_flight(topics: Topics) -> Flight:
     truth = read_truth(topics, positions)
     airborne = _read_airborne(topics)
     dropped = tuple(
-        f"{count} samples of {topic} were dropped: their time stamps are zero or go back"
+        dropped_note(count, topic, "zero or go back")
         for (topic, _), count in sorted(topics.dropped.items())
     )
     used = {

@@ -193,6 +193,18 @@ def increasing(time_us: NDArray[np.int64]) -> IntArray:
     return indices[np.array(run[::-1], dtype=np.intp)]
 
 
+def dropped_note(count: int, name: str, why: str) -> str:
+    """What a log's notes say of samples whose time stamps cannot be.
+
+    >>> dropped_note(1, "ATTITUDE", "zero")
+    '1 sample of ATTITUDE was dropped: its time stamp is zero'
+    """
+    if count == 1:
+        why = why.replace("go back", "goes back").replace("lie ", "lies ")
+        return f"1 sample of {name} was dropped: its time stamp is {why}"
+    return f"{count} samples of {name} were dropped: their time stamps are {why}"
+
+
 def read_topics(path: Path) -> Topics:
     """Decode the topics that px4fuse uses.
 
