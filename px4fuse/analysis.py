@@ -12,6 +12,7 @@ from pathlib import Path
 from px4fuse import placing
 from px4fuse.comparison.asked import asked_of_ekf2
 from px4fuse.comparison.comparison import Comparison, compare
+from px4fuse.comparison.drift import may_drift, with_drift
 from px4fuse.comparison.why import Why, why_ekf2_differs
 from px4fuse.ekf2.model import Model, open_model
 from px4fuse.ekf2.parameters import check
@@ -349,7 +350,7 @@ def clock_offset(
     if tuned is not None:
         sigma_z_m = tuned.sigma_z.value or tuned.sigma_z.high or sigma_z_m
         outliers = tuned.outlier_time_s
-    return estimate_clock_offset(
+    found = estimate_clock_offset(
         comparison.flight,
         comparison.source,
         comparison.segment,
@@ -358,3 +359,6 @@ def clock_offset(
         outliers,
         progress,
     )
+    if isinstance(found, ClockOffset) and may_drift(comparison.flight, comparison.source):
+        return with_drift(found)
+    return found
