@@ -16,10 +16,12 @@ from scipy import stats
 
 from px4fuse.arrays import Array
 from px4fuse.filter.clock import MAX_HALF_INTERVAL_S, ClockOffset
-from px4fuse.flight import EXTERNAL_VISION_RUNGS, Ekf2, Flight, PositionTrack, Unavailable
+from px4fuse.flight import Flight, PositionTrack, Unavailable
 
 # Rungs of tracks that carry the sender's own orientation, if it sent one
 WITH_ORIENTATION_RUNGS = (2, 4)
+# Of tracks that are what EKF2 kept of the source
+KEPT_BY_EKF2_RUNGS = (5, 6)
 # A step of the clock that drift cannot imitate: at 1 m/s a good UWB's noise
 CHANGE_S = 0.10
 # On either side of a step, so that each shows its own scatter
@@ -35,13 +37,12 @@ def may_drift(flight: Flight, track: PositionTrack) -> bool:
     positioning system without orientation (UWB), motion capture sent as such (ATT_POS_MOCAP or
     ODOMETRY of that kind), GPS, and a positioning system's own file.
     """
-    if track.rung not in EXTERNAL_VISION_RUNGS:
-        return False
     if track.rung in WITH_ORIENTATION_RUNGS:
         return track.orientation is not None
-    if isinstance(flight.ekf2, Ekf2) and not isinstance(flight.ekf2.fusing, Unavailable):
-        return bool((flight.ekf2.fusing["yaw"] > 0).any())
-    return False
+    ekf2 = flight.ekf2
+    if track.rung not in KEPT_BY_EKF2_RUNGS or isinstance(ekf2, Unavailable):
+        return False
+    return not isinstance(ekf2.fusing, Unavailable) and bool((ekf2.fusing["yaw"] > 0).any())
 
 
 def with_drift(clock: ClockOffset) -> ClockOffset:

@@ -26,11 +26,18 @@ from px4fuse.trajectory.alignment import fit
 
 NEES_LARGE = Threshold(4.0, "times", "errors twice as large as σ; clean flights stay below 3")
 NEES_ERROR = Threshold(16.0, "times", "errors four times as large as σ")
-# So many times what the innovations show by themselves
-HIDDEN = Threshold(4.0, "times the mean NIS", "below, the innovations show it, and say so")
+CONTENT = Threshold(1.5, "mean NIS", "above, the innovations themselves say so (variance.py)")
 SMALL = Threshold(0.5, "mean NIS", "innovations are 30 % smaller than claimed")
 FRAME_SHARE = Threshold(0.5, "of the error", "what is left is less than what turning took away")
 FILTERS = {"kf": "our filter", "ekf2": "EKF2"}
+REMEDIES = {
+    "drift": "Take no noise from these innovations: correct the drift at a loop (px4fuse loop), or "
+    "give the filter a second, absolute source.",
+    "frame": "Turn and shift the source's frame into that of the truth before you judge a filter "
+    "by it, and take no noise from these innovations.",
+    "shared": "Look for an error that source and filter share: the clock (px4fuse sync), the scale "
+    "of the source, the survey of the anchors.",
+}
 
 
 @dataclass(frozen=True)
@@ -57,7 +64,7 @@ def hidden_errors(comparison: Comparison) -> list[Hidden]:
             statement, nees = summary.consistency, truth.nees_position_mean
             if nees is None or isinstance(statement, Unavailable) or nees < NEES_LARGE.value:
                 continue
-            if nees >= HIDDEN.value * statement.nis_mean:
+            if statement.nis_mean < CONTENT.value:
                 found.append(Hidden(owner, result, statement, truth, nees))
     return sorted(found, key=lambda hidden: -hidden.nees)
 
@@ -90,29 +97,22 @@ def _detect(analysis: Analysis) -> Found:
     small = worst.statement.nis_mean < SMALL.value
     words = "; ".join(said) + "."
     frame = _after_turning(comparison, worst.owner)
+    remedy = REMEDIES["drift" if drifts else "shared"]
     if frame is not None:
         before, left = frame
         evidence |= {"position_rmse_horizontal_m": before, "position_rmse_aligned_m": left}
+        remain = f"of {before:.2f} m horizontally {left:.2f} m remain after the best shift and turn"
         if left < FRAME_SHARE.value * before:
-            words += (
-                f" Most of it is how the source's frame lies: of {before:.2f} m horizontally "
-                f"{left:.2f} m remain after the best shift and turn."
-            )
+            words += f" Most of it is how the source's frame lies: {remain}."
+            remedy = REMEDIES["frame"]
         elif drifts:
-            words += (
-                f" The source drifts, and the filter follows it: of {before:.2f} m horizontally "
-                f"{left:.2f} m remain after the best shift and turn."
-            )
+            words += f" The source drifts, and the filter follows it: {remain}."
     yield Finding(
         "errors_larger_than_claimed",
         "error" if worst.nees >= NEES_ERROR.value else "warning",
         f"Innovations {'small, errors large' if small else 'consistent, errors not'}: {words} "
         "Innovations judge a filter against its source, truth judges both.",
-        "Take no noise from these innovations: correct the drift at a loop (px4fuse loop), or give "
-        "the filter a second, absolute source."
-        if drifts
-        else "Look for an error that source and filter share: the clock (px4fuse sync), the "
-        "source's frame and scale, the survey of the anchors.",
+        remedy,
         evidence,
     )
 
