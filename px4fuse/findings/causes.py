@@ -39,6 +39,7 @@ CONSEQUENCES: Mapping[str, tuple[str, ...]] = {
         f"ekf2_variance_understated:{ELSEWHERE}",
     ),
     "source_clock_changes": ("ekf2_ev_delay_wrong", "errors_larger_than_claimed"),
+    "ekf2_ev_delay_wrong": ("errors_larger_than_claimed",),
     "source_frame_turned": ("errors_larger_than_claimed",),
     "errors_larger_than_claimed": _OVERSTATED,
     "source_may_drift": _OVERSTATED,

@@ -35,6 +35,8 @@ REMEDIES = {
     "give the filter a second, absolute source.",
     "frame": "Turn and shift the source's frame into that of the truth before you judge a filter "
     "by it, and take no noise from these innovations.",
+    "ekf2": "Our filter errs less with the same source, so that it is EKF2's own: look at "
+    "EKF2_EV_DELAY, at its heading, and at what else it fuses.",
     "shared": "Look for an error that source and filter share: the clock (px4fuse sync), the scale "
     "of the source, the survey of the anchors.",
 }
@@ -97,7 +99,8 @@ def _detect(analysis: Analysis) -> Found:
     small = worst.statement.nis_mean < SMALL.value
     words = "; ".join(said) + "."
     frame = _after_turning(comparison, worst.owner)
-    remedy = REMEDIES["drift" if drifts else "shared"]
+    alone = all(one.owner == "ekf2" for one in hidden)
+    remedy = REMEDIES["drift" if drifts else "ekf2" if alone else "shared"]
     if frame is not None:
         before, left = frame
         evidence |= {"position_rmse_horizontal_m": before, "position_rmse_aligned_m": left}

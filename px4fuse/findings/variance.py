@@ -20,6 +20,7 @@ from px4fuse.ekf2.parameters import PARAMETERS
 from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.kalman import Settings
 from px4fuse.filter.likelihood import NoiseAsked, sigma_a_asked
+from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.findings.causes import CAUSE, ELSEWHERE, NOISE, OUTLIERS
 from px4fuse.findings.errors_larger_than_claimed import hidden_errors
 from px4fuse.findings.model import Detector, Finding, Found, Severity, Threshold, lowered
@@ -108,9 +109,10 @@ def _variance_finding(analysis: Analysis, owner: str, group: str, members: list[
         "outside_gate": statement.outside_gate,
         CAUSE: cause,
     }
-    if result.noise_asked is not None:
-        evidence["sigma_z_asked_m"] = result.noise_asked.sigma_z_m
-        evidence["sigma_z_asked_is_upper_bound"] = float(result.noise_asked.upper_bound)
+    asked = _asked(analysis, result)
+    if asked is not None:
+        evidence["sigma_z_asked_m"] = asked.sigma_z_m
+        evidence["sigma_z_asked_is_upper_bound"] = float(asked.upper_bound)
     return Finding(
         f"{owner}_variance_{'overstated' if over else 'understated'}",
         severity,
@@ -137,6 +139,14 @@ def _is_default(comparison: Comparison, owner: str, result: AxisComparison) -> b
     return untouched and not abs(np.log(used / default)) > np.log(NOISE_FITS.value)
 
 
+def _asked(analysis: Analysis, result: AxisComparison) -> NoiseAsked | None:
+    """The source's noise: the tuned one, the same in all findings; else at the chosen SIGMA_A."""
+    tuned = analysis.tuning.get("down" if result.axis.name == "down" else HORIZONTAL)
+    if isinstance(tuned, AxisTuning) and tuned.sigma_z.value is not None:
+        return NoiseAsked(tuned.sigma_z.value, upper_bound=False)
+    return result.noise_asked
+
+
 def _noise_remedy(
     analysis: Analysis, owner: str, result: AxisComparison, statement: Consistency
 ) -> tuple[str, str]:
@@ -145,7 +155,7 @@ def _noise_remedy(
     It is a property of the source, so our estimate of it serves EKF2 as well.
     """
     comparison = analysis.comparison
-    asked, settings = result.noise_asked, comparison.settings
+    asked, settings = _asked(analysis, result), comparison.settings
     lag1 = statement.lag1_autocorrelation
     noise_absurd = asked is None or asked.sigma_z_m > NOISE_ABSURD.value * settings.sigma_z_m
     if owner == "kf" and noise_absurd and lag1 > LAG1_SLOW.value:
@@ -191,7 +201,7 @@ def _kf_remedy(
         )  # fmt: skip
     typed = float(f"{noise:.2g}")
     words = filter_words(comparison, replace(settings, sigma_z_m=typed), f"--sigma-z {typed:g}")
-    return f"The data ask for SIGMA_Z {noise:.2g} m at this SIGMA_A. {words}", NOISE
+    return f"The data ask for SIGMA_Z {noise:.2g} m. {words}", NOISE
 
 
 def _ekf2_remedy(
