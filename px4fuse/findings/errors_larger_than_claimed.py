@@ -37,8 +37,8 @@ REMEDIES = {
     "by it, and take no noise from these innovations.",
     "ekf2": "Our filter errs less with the same source, so that it is EKF2's own: look at "
     "EKF2_EV_DELAY, at its heading, and at what else it fuses.",
-    "shared": "Look for an error that source and filter share: the clock (px4fuse sync), the scale "
-    "of the source, the survey of the anchors.",
+    "shared": "Look for an error that source and filter share: the clock (px4fuse sync), a source "
+    "that smooths its positions, its scale, the survey of the anchors.",
 }
 
 

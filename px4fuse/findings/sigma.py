@@ -16,6 +16,7 @@ from px4fuse.comparison.drift import may_drift
 from px4fuse.comparison.remedy import filter_words
 from px4fuse.filter.kalman import Settings
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise
+from px4fuse.findings.errors_larger_than_claimed import hidden_errors
 from px4fuse.findings.model import Detector, Finding, Found, Severity, Threshold, lowered
 from px4fuse.findings.no_motion import MOTION_RANGE, motion_range_m
 from px4fuse.flight import Unavailable
@@ -73,8 +74,9 @@ def _detect(analysis: Analysis) -> Found:
     # without motion the acceleration's noise is hardly seen
     if motion_range_m(comparison) < MOTION_RANGE.value:
         off = [each for each in off if each.label != "SIGMA_A"]
-    # against a source that may drift innovations can show too little noise, never too much
-    if may_drift(comparison.flight, comparison.source):
+    # where a source may drift, or the truth shows it, innovations tell too little noise alone
+    hidden = any(one.owner == "kf" for one in hidden_errors(comparison))
+    if hidden or may_drift(comparison.flight, comparison.source):
         off = [each for each in off if each.factor < 1.0]
     if not off:
         return

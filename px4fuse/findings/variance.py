@@ -174,13 +174,12 @@ def _noise_remedy(
             ELSEWHERE,
         )
     if owner == "kf":
-        return _kf_remedy(comparison, asked, statement)
+        return _kf_remedy(analysis, asked, statement)
     return _ekf2_remedy(analysis, result, asked, statement)
 
 
-def _kf_remedy(
-    comparison: Comparison, asked: NoiseAsked, statement: Consistency
-) -> tuple[str, str]:
+def _kf_remedy(analysis: Analysis, asked: NoiseAsked, statement: Consistency) -> tuple[str, str]:
+    comparison = analysis.comparison
     settings = comparison.settings
     noise = max(asked.sigma_z_m, SMALLEST_NOISE.value)
     if asked.upper_bound:
@@ -193,7 +192,7 @@ def _kf_remedy(
             NOISE,
         )
     if not _noise_helps(noise, settings.sigma_z_m, statement):
-        outliers = _outliers(noise, statement)
+        outliers = _outliers(analysis, noise, statement)
         return (outliers, OUTLIERS) if outliers else (
             f"It is not SIGMA_Z (the source's noise is {noise:.2g} m): look at SIGMA_A (--sigma-a) "
             "and the clock (--clock-offset).",
@@ -214,7 +213,7 @@ def _ekf2_remedy(
         noise = float(np.hypot(statement.innovation_std_m, statement.innovation_mean_m))
     noise = max(noise, SMALLEST_NOISE.value)
     if not _noise_helps(noise, used, statement):
-        outliers = _outliers(noise, statement)
+        outliers = _outliers(analysis, noise, statement)
         return (outliers, OUTLIERS) if outliers else (
             f"It is not EKF2_EVP_NOISE (the source's noise is {noise:.2g} m): look at the clock "
             "(EKF2_EV_DELAY) and at EKF2's process noise (EKF2_ACC_NOISE).",
@@ -250,10 +249,15 @@ def _noise_helps(noise: float, used: float, statement: Consistency) -> bool:
     return not (noise < used if statement.variance_factor < 1.0 else noise > used)
 
 
-def _outliers(noise: float, statement: Consistency) -> str:
+def _outliers(analysis: Analysis, noise: float, statement: Consistency) -> str:
     """What to do about gross outliers, empty where there are none."""
     if statement.variance_factor > 1.0 or statement.outside_gate <= OUTLIER_SHARE.value:
         return ""
+    tuned = analysis.tuning.get(HORIZONTAL)
+    if isinstance(tuned, AxisTuning) and (
+        len(tuned.outlier_time_s) <= OUTLIER_SHARE.value * tuned.count
+    ):
+        return ""  # the source has none: it is the filter that is elsewhere
     return (
         f"{statement.outside_gate:.1%} lie outside the gate while the bulk fits {noise:.2g} m: "
         "remove the outliers (line of sight, anchor survey) instead of raising the noise."

@@ -86,8 +86,8 @@ def verdict_notes(comparison: Comparison) -> list[str]:
     if coloured:
         notes.append(
             f"Of the right size but not white (Ljung-Box): {'; '.join(coloured)}. Each "
-            "follow from those before: positive, the filter lags (SIGMA_A small); negative, it "
-            "overshoots (SIGMA_A large)."
+            "innovation then tells of the next: with a positive lag-1 the filter lags (SIGMA_A is "
+            "small), with a negative one it overshoots (SIGMA_A is large)."
         )
     return notes
 
