@@ -14,6 +14,7 @@ import numpy as np
 from px4fuse import placing
 from px4fuse.comparison.asked import asked_of_ekf2
 from px4fuse.comparison.comparison import Comparison, compare
+from px4fuse.comparison.drift import may_drift, with_drift
 from px4fuse.comparison.why import Why, why_ekf2_differs
 from px4fuse.ekf2.model import Model, open_model
 from px4fuse.ekf2.parameters import check
@@ -325,6 +326,7 @@ def explain(comparison: Comparison, progress: Progress = _silent) -> Analysis:
         names,
         lambda name: progress(f"tuning {name}"),
         comparison.flight,
+        may_drift(comparison.flight, comparison.source),
     )
     clock = clock_offset(comparison, tuning, progress)
     progress("replaying EKF2")
@@ -337,7 +339,8 @@ def explain(comparison: Comparison, progress: Progress = _silent) -> Analysis:
 def tuned_horizontally(comparison: Comparison) -> Tuning:
     """The horizontal noises alone, which is what the clock estimate needs."""
     axes = tuple(result.axis for result in comparison.axes)
-    return tune(axes, comparison.settings, (HORIZONTAL,), flight=comparison.flight)
+    drifts = may_drift(comparison.flight, comparison.source)
+    return tune(axes, comparison.settings, (HORIZONTAL,), flight=comparison.flight, drifts=drifts)
 
 
 def clock_offset(
@@ -365,7 +368,7 @@ def clock_offset(
     )
     settings = comparison.settings
     noises = Noises(settings.sigma_a_m_s2, settings.sigma_z_m)
-    return estimate_clock_offset(
+    found = estimate_clock_offset(
         comparison.flight,
         comparison.source,
         comparison.segment,
@@ -374,6 +377,9 @@ def clock_offset(
         None if tuned is None else tuned.outlier_time_s,
         progress,
     )
+    if isinstance(found, ClockOffset) and may_drift(comparison.flight, comparison.source):
+        return with_drift(found)
+    return found
 
 
 def imu_too_slow_for_clocks(flight: Flight) -> Unavailable | None:

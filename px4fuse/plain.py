@@ -26,3 +26,13 @@ def plain(value: object) -> Any:
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value
+
+
+def factor_words(factor: float) -> str:
+    """A factor with as many digits as a person reads.
+
+    >>> [factor_words(f) for f in (1.18, 9.87, 61.2, 388.0, 3412.0)]
+    ['1.18', '9.9', '61', '390', '3,400']
+    """
+    digits = 3 if factor < 2.0 else 2
+    return f"{float(f'{factor:.{digits}g}'):,g}"

@@ -38,6 +38,7 @@ def tune(log: Path, json_path: Path | None, **given: Any) -> None:
     recording.
     """
     from px4fuse.analysis import run_comparison
+    from px4fuse.comparison.drift import may_drift
     from px4fuse.filter.tuning import tune as tune_axes
     from px4fuse.request import command_line
     from px4fuse.results.build import tuning_results
@@ -51,6 +52,7 @@ def tune(log: Path, json_path: Path | None, **given: Any) -> None:
             compared.settings,
             progress=lambda name: step(f"tuning {name}"),
             flight=compared.flight,
+            drifts=may_drift(compared.flight, compared.source),
         )
     if write_json(
         tuning_results(request, compared, tuned, command_line(request, "tune")), json_path

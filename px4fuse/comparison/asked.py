@@ -8,6 +8,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from px4fuse.comparison.comparison import Comparison
+from px4fuse.comparison.drift import may_drift
 from px4fuse.ekf2.model import Model
 from px4fuse.ekf2.parameters import PARAMETERS
 from px4fuse.filter.clock import ClockOffset
@@ -42,14 +43,17 @@ def asked_of_ekf2(
     -------
     dict
         Empty where the data tell nothing, or the source that was analysed is not the one that EKF2
-        fused. The delay only where what was flown is outside its interval.
+        fused. The delay only where what was flown is outside its interval. The noise of a source
+        that may drift only where EKF2 trusts it even more than its short-term noise allows: small
+        innovations against such a source say nothing about its error.
     """
     source = comparison.source
     if source.name != model.inputs.vision.source or source.alignment is not None:
         return {}
     changes: dict[str, float] = {}
     noise_m = tuned_noise_m(tuning)
-    if noise_m is not None:
+    trusted = noise_m is not None and noise_m <= noise_used_m(model)
+    if noise_m is not None and not (trusted and may_drift(comparison.flight, source)):
         changes |= noise_change(model, noise_m)
     if isinstance(clock, ClockOffset) and clock.determinable:
         applied = comparison.settings.clock_offset_s

@@ -268,7 +268,7 @@ def _compare_axis(
         return AxisComparison(
             axis=axis, replay=run, kf=kf, ekf2=ekf2, ekf2_state=ekf2, ekf2_variance=ekf2,
             ekf2_innovations=ekf2, noise_asked=noise_asked(axis, settings), difference=ekf2,
-            kf_truth=_kf_against_truth(run, truth, times), ekf2_truth=ekf2, truth=truth,
+            kf_truth=kf_against_truth(run, truth, times), ekf2_truth=ekf2, truth=truth,
         )  # fmt: skip
     ekf2_state = project_state(ekf2.state, axis, segment)
     ekf2_variance = project_variance(ekf2, axis, segment)
@@ -284,7 +284,7 @@ def _compare_axis(
         ekf2_innovations=ekf2_innovations,
         noise_asked=noise_asked(axis, settings),
         difference=_difference(run, ekf2_state),
-        kf_truth=_kf_against_truth(run, truth, times),
+        kf_truth=kf_against_truth(run, truth, times),
         ekf2_truth=_ekf2_against_truth(ekf2_state, ekf2_variance, truth),
         truth=truth,
     )
@@ -349,9 +349,10 @@ def _rmse(error: Array) -> float:
     return float(np.sqrt(np.mean(error**2)))
 
 
-def _kf_against_truth(
+def kf_against_truth(
     run: Replay, truth: pd.DataFrame | Unavailable, times: Array
 ) -> AgainstTruth | Unavailable:
+    """Our filter against the truth along one axis, at some times."""
     if isinstance(truth, Unavailable):
         return truth
     return _against_truth(times, state_at(run, times), times, variance_at(run, times), truth)

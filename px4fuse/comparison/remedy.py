@@ -1,7 +1,7 @@
-"""What a replay of EKF2 says of a remedy: what the findings about EKF2 share.
+"""What a replay says of a remedy, of EKF2 or of our filter: what the findings share.
 
-A change of EKF2's parameters is proposed with its effect, and only where the replay confirms it.
-Where EKF2 cannot be replayed, the words say so.
+A change is proposed with its effect, and only where the replay confirms it. Where EKF2 cannot be
+replayed, the words say so.
 """
 
 from __future__ import annotations
@@ -10,9 +10,12 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
+from px4fuse.comparison.comparison import AgainstTruth, Comparison, compare, kf_against_truth
 from px4fuse.ekf2.model import Model
 from px4fuse.ekf2.parameters import PARAMETERS
 from px4fuse.ekf2.whatif import Summary, what_if
+from px4fuse.filter.kalman import Settings, replay
+from px4fuse.filter.signals import AISLE
 from px4fuse.flight import Unavailable
 
 # A noise must bring |log mean NIS| below this share of itself: what does less is not its cause
@@ -21,6 +24,8 @@ NIS_NEARER = 0.8
 REJECTED_FEWER = 0.5
 # Times of the error to the truth; the replayed position is off by 5 mm in 0.1 m
 WORSE_ERROR = 1.05
+# The same of our filter, which is replayed exactly: hardly a settings changes it by less
+WORSE_FILTER_ERROR = 1.005
 # Shares of rejected samples below this are not worth a word
 REJECTED_SHOWN = 0.005
 
@@ -112,6 +117,77 @@ def remedy_words(
         return f"{_capital(setting)}: {effect.words()}."
     said = ", ".join(f"{name} {value:.3g}" for name, value in changes.items())
     return f"{otherwise} {said} is no remedy: {effect.words()}."
+
+
+def filter_errors_m(comparison: Comparison, changed: Settings) -> tuple[float, float] | None:
+    """Position error (m) of our filter to the truth, as it is and with other settings.
+
+    Root of the sum of the mean squares of all axes but the aisle, which is made of the others.
+    None without a truth.
+    """
+    names = {result.axis.name for result in comparison.axes}
+    results = [r for r in comparison.axes if r.axis.name != AISLE or names == {AISLE}]
+    before = [result.kf_truth for result in results]
+    if changed.clock_offset_s == comparison.settings.clock_offset_s:
+        after = [
+            kf_against_truth(
+                replay(result.axis, changed),
+                result.truth,
+                (
+                    result.replay.steps
+                    if isinstance(result.ekf2_state, Unavailable)
+                    else result.ekf2_state
+                ).index.to_numpy(),
+            )
+            for result in results
+        ]
+    else:  # the measurements themselves are at other times
+        again = compare(
+            comparison.flight,
+            changed,
+            axes=tuple(result.axis.name for result in results),
+            heading_deg=results[0].axis.heading_deg if names == {AISLE} else None,
+            position_source=comparison.source.name,
+            start_s=comparison.segment.start_s,
+            end_s=comparison.segment.end_s,
+        )
+        after = [result.kf_truth for result in again.axes]
+    sums = [0.0, 0.0]
+    for i, errors in enumerate((before, after)):
+        for error in errors:
+            if not isinstance(error, AgainstTruth):
+                return None
+            sums[i] += error.position_rmse_m**2
+    return math.sqrt(sums[0]), math.sqrt(sums[1])
+
+
+def filter_words(
+    comparison: Comparison, changed: Settings, typed: str, unseen_nats: float | None = None
+) -> str:
+    """Other settings of our filter as a remedy, as far as truth or unseen data confirm it.
+
+    Parameters
+    ----------
+    comparison : Comparison
+    changed : Settings
+    typed : str
+        The options that make them.
+    unseen_nats : float or None
+        What settings found on one half gain per measurement of the other; None where not known.
+    """
+    errors = filter_errors_m(comparison, changed)
+    if errors is None:
+        if unseen_nats is not None and unseen_nats <= 0.0:
+            return (
+                f"Leave it: {typed} is most likely, but settings found on the first half of the "
+                "flight do no better on the second."
+            )
+        return f"{typed}."
+    before, after = errors
+    effect = f"position error {before:.3f} → {after:.3f} m (replayed)"
+    if after > WORSE_FILTER_ERROR * before:
+        return f"Leave it: {typed} fits the innovations better, but not the truth: {effect}."
+    return f"{typed}: {effect}."
 
 
 def not_replayed(why: Unavailable) -> str:

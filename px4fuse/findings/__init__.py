@@ -4,8 +4,8 @@ A file declares ids, thresholds with unit and source, the detector (condition, w
 phrases by which notes name the finding, and the flights on which its rate is measured. A detector
 never prints and never guesses: what it cannot see it does not mention.
 
-To add a finding: its file, its name below, its rows of ``rates.csv``
-(``python -m px4fuse.simulation.detector_rates``).
+To add a finding: its file, its name below, its place in ``causes.py`` if it follows from another or
+brings others with it, its rows of ``rates.csv`` (``python -m px4fuse.simulation.detector_rates``).
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from px4fuse.findings import (
     ekf2_not_fusing,
     ekf2_rejecting,
     ekf2_resets,
+    errors_larger_than_claimed,
     imu_gap,
     innovations_need_ulog,
     log_damaged,
@@ -43,6 +44,7 @@ from px4fuse.findings import (
     source_frame_not_north,
     source_frame_turned,
     source_gap,
+    source_may_drift,
     source_not_logged,
     source_outliers,
     source_samples_lost,
@@ -50,6 +52,7 @@ from px4fuse.findings import (
     unavailable,
     variance,
 )
+from px4fuse.findings.causes import by_cause
 from px4fuse.findings.model import SEVERITIES, Detector, Finding, Found, Severity, Subject
 from px4fuse.loop.loop import Loop
 
@@ -57,7 +60,7 @@ __all__ = ["DETECTORS", "SEVERITIES", "Finding", "Severity", "find", "find_loop"
 
 
 def find(subject: Analysis | Comparison) -> tuple[Finding, ...]:
-    """All findings of all detectors, most severe first, each detector's own order kept.
+    """One finding per cause, most severe first and what the recording lacks before noises.
 
     Parameters
     ----------
@@ -82,8 +85,7 @@ def phrases() -> dict[str, tuple[str, ...]]:
 
 
 def _find(detectors: Iterable[Detector[Subject]], subject: Subject) -> tuple[Finding, ...]:
-    found = (finding for detector in detectors for finding in detector.detect(subject))
-    return tuple(sorted(found, key=lambda finding: SEVERITIES.index(finding.severity)))
+    return by_cause(finding for detector in detectors for finding in detector.detect(subject))
 
 
 def _in_flight(detector: Detector[Loop]) -> Detector[Analysis]:
@@ -96,7 +98,7 @@ def _in_flight(detector: Detector[Loop]) -> Detector[Analysis]:
     return Detector(detect, detector.phrases, detector.measured_on)
 
 
-# Of one severity, the first comes first in a report
+# Of one severity, the first comes first in a report (causes.py has the exceptions)
 LOOP_DETECTORS: tuple[Detector[Loop], ...] = (
     loop_closures.DETECTOR,
     loop_of_absolute_track.DETECTOR,
@@ -105,6 +107,7 @@ LOOP_DETECTORS: tuple[Detector[Loop], ...] = (
 DETECTORS: tuple[Detector[Analysis], ...] = (
     source_stamps.DETECTOR,
     source_clock.DETECTOR,
+    errors_larger_than_claimed.DETECTOR,
     source_frame_turned.DETECTOR,
     source_outliers.DETECTOR,
     sigma.DETECTOR,
@@ -125,6 +128,7 @@ DETECTORS: tuple[Detector[Analysis], ...] = (
     ekf2_resets.DETECTOR,
     ekf2_instance_switch.DETECTOR,
     no_motion.DETECTOR,
+    source_may_drift.DETECTOR,
     logging_rate_low.DETECTOR,
     ekf2_innovations_decimated.DETECTOR,
     source_frame_not_north.DETECTOR,

@@ -25,7 +25,13 @@ def _remedy(analysis: Analysis) -> str:
     model = analysis.ekf2_model
     if isinstance(model, Unavailable):
         return f"{IN_ORDER} {not_replayed(model)}"
-    asked = asked_of_ekf2(analysis.comparison, model, analysis.tuning, analysis.clock)
+    asked = {
+        name: value
+        for name, value in asked_of_ekf2(
+            analysis.comparison, model, analysis.tuning, analysis.clock
+        ).items()
+        if value != model.inputs.settings[name]
+    }
     delay = {name: value for name, value in asked.items() if "DELAY" in name}
     noise = {name: value for name, value in asked.items() if name not in delay}
     both = asked if noise and delay else {}

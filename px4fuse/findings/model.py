@@ -31,6 +31,8 @@ class Finding:
         Numbers, with units in their names.
     remedy : str
         What to type or to set.
+    consequences : tuple of Finding
+        What the same cause brings with it, each with its own evidence.
     """
 
     id: str
@@ -38,6 +40,12 @@ class Finding:
     message: str
     remedy: str
     evidence: dict[str, float | str] = field(default_factory=dict)
+    consequences: tuple[Finding, ...] = ()
+
+    @property
+    def ids(self) -> tuple[str, ...]:
+        """Its own id and those of its consequences."""
+        return (self.id, *(finding.id for finding in self.consequences))
 
 
 @dataclass(frozen=True)
@@ -72,6 +80,11 @@ class Detector(Generic[Subject]):
     detect: Callable[[Subject], Found]
     phrases: Mapping[str, str]
     measured_on: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+
+
+def lowered(severity: Severity) -> Severity:
+    """One step less severe: what nobody chose is advice."""
+    return SEVERITIES[min(SEVERITIES.index(severity) + 1, len(SEVERITIES) - 1)]
 
 
 def times(count: int) -> str:

@@ -5,9 +5,12 @@ A slow filter is no mistake where nothing happens: its innovations must say that
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from px4fuse.analysis import Analysis
+from px4fuse.comparison.remedy import filter_words
 from px4fuse.filter.likelihood import sigma_a_asked
 from px4fuse.findings.model import Detector, Finding, Found, Threshold
 from px4fuse.findings.variance import LAG1_SLOW
@@ -31,14 +34,15 @@ def _detect(analysis: Analysis) -> Found:
         after = result.replay.steps["position_variance_m2"].reindex(updates.index).to_numpy()
         before = updates["prior_position_variance_m2"].to_numpy()
         growth = float(np.median((before[1:] / after[:-1] - 1.0)[len(after) // 2 :]))
-        asked = sigma_a_asked(result.axis, comparison.settings)
+        asked = float(f"{sigma_a_asked(result.axis, comparison.settings):.2g}")
+        changed = replace(comparison.settings, sigma_a_m_s2=asked)
         yield Finding(
             "process_noise_forgotten",
             "error",
             f"Q forgotten: with SIGMA_A {comparison.settings.sigma_a_m_s2:g} m/s² σ_p hardly grows "
             f"between updates ({growth:.1%} in variance), the gain is {gain:.3f}, and the filter "
             f"needs {response_s:.0f} s to follow (along {result.axis.name}).",
-            f"Raise SIGMA_A: --sigma-a {asked:.2g} fits these data best.",
+            f"Raise SIGMA_A. {filter_words(comparison, changed, f'--sigma-a {asked:g}')}",
             {
                 "relative_growth": growth,
                 "gain": gain,

@@ -2,17 +2,58 @@
 
 The mean NIS alone cannot tell them apart: both make S larger. The likelihood can, since
 SIGMA_A makes the innovations of a stretch agree with each other and SIGMA_Z does not.
+
+Both are fitted together, so that they are put right together: one finding, of the one that is
+further off. A setting that nobody chose is advice, one step less severe than one that was.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+
 from px4fuse.analysis import Analysis
+from px4fuse.comparison.drift import may_drift
+from px4fuse.comparison.remedy import filter_words
+from px4fuse.filter.kalman import Settings
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise
-from px4fuse.findings.model import Detector, Finding, Found, Severity, Threshold
+from px4fuse.findings.errors_larger_than_claimed import hidden_errors
+from px4fuse.findings.model import Detector, Finding, Found, Severity, Threshold, lowered
 from px4fuse.findings.no_motion import MOTION_RANGE, motion_range_m
+from px4fuse.flight import Unavailable
+from px4fuse.plain import factor_words
 
 NOISE_OFF = Threshold(1.5, "times", "in standard deviation; below, hardly a line moves")
 NOISE_OFF_ERROR = Threshold(4.0, "times", "the gain is another one")
+# What a filter is run with where the source is better than its rate can show
+SMALLEST_SIGMA_Z = Threshold(0.005, "m", "what motion capture resolves in flight")
+
+
+@dataclass(frozen=True)
+class Off:
+    """One of the two settings, and what the data ask for in its place."""
+
+    label: str
+    option: str
+    unit: str
+    chosen: float
+    found: Noise
+    value: float
+    severity: Severity
+
+    @property
+    def factor(self) -> float:
+        """Chosen against asked for."""
+        return self.chosen / self.value
+
+    @property
+    def size(self) -> float:
+        """By how much it is off, either way."""
+        return max(self.factor, 1.0 / self.factor)
+
+    @property
+    def id(self) -> str:
+        """Of the finding."""
+        return f"{self.label.lower()}_{'small' if self.factor < 1.0 else 'large'}"
 
 
 def _detect(analysis: Analysis) -> Found:
@@ -20,49 +61,92 @@ def _detect(analysis: Analysis) -> Found:
     tuned = next((tuned for tuned in tunings if isinstance(tuned, AxisTuning)), None)
     if tuned is None:
         return
-    settings = analysis.comparison.settings
+    comparison = analysis.comparison
+    settings = comparison.settings
+    off = [
+        each
+        for each in (
+            _off("SIGMA_Z", "--sigma-z", "m", settings.sigma_z_m, tuned.sigma_z),
+            _off("SIGMA_A", "--sigma-a", "m/s²", settings.sigma_a_m_s2, tuned.sigma_a),
+        )
+        if each is not None
+    ]
     # without motion the acceleration's noise is hardly seen
-    still = motion_range_m(analysis.comparison) < MOTION_RANGE.value
-    for label, option, unit, chosen, found in (
-        ("SIGMA_Z", "--sigma-z", "m", settings.sigma_z_m, tuned.sigma_z),
-        ("SIGMA_A", "--sigma-a", "m/s²", settings.sigma_a_m_s2, tuned.sigma_a),
-    ):
-        factor, severity = _off(chosen, found)
-        if severity is None or (label == "SIGMA_A" and still):
-            continue
-        small = factor < 1.0
-        value = found.value if found.value is not None else found.high
-        assert value is not None
-        bound = "at most " if found.value is None else ""
-        range_ = "" if found.value is None else f", 95 % {found.low or 0.0:.3g} to {found.high:.3g}"
-        yield Finding(
-            f"{label.lower()}_{'small' if small else 'large'}",
-            severity,
-            f"{label} {chosen:g} {unit} is {max(factor, 1.0 / factor):.2g} times too "
-            f"{'small' if small else 'large'}: the innovations ({tuned.name}) ask for "
-            f"{bound}{value:.3g} {unit}{range_}. {_reading(label, small)}",
-            f"{option} {value:.3g}",
+    if motion_range_m(comparison) < MOTION_RANGE.value:
+        off = [each for each in off if each.label != "SIGMA_A"]
+    # where a source may drift, or the truth shows it, innovations tell too little noise alone
+    hidden = any(one.owner == "kf" for one in hidden_errors(comparison))
+    if hidden or may_drift(comparison.flight, comparison.source):
+        off = [each for each in off if each.factor < 1.0]
+    if not off:
+        return
+    off.sort(key=lambda each: -each.size)
+    remedy = _remedy(analysis, tuned, off)
+    found = [
+        Finding(
+            each.id,
+            each.severity,
+            _message(each, tuned),
+            remedy,
             {
-                "chosen": chosen,
-                "most_likely": value,
-                "factor": factor,
+                "chosen": each.chosen,
+                "most_likely": each.value,
+                "factor": each.factor,
                 "lag1_autocorrelation": getattr(tuned.before, "lag1_autocorrelation", float("nan")),
             },
         )
+        for each in off
+    ]
+    yield replace(found[0], consequences=tuple(found[1:]))
 
 
-def _off(chosen: float, found: Noise) -> tuple[float, Severity | None]:
-    """By what factor a chosen noise is off, and how bad that is; None where it is not."""
-    reference = found.value if found.value is not None else found.high
-    if reference is None:
-        return 1.0, None
-    factor = chosen / reference
+def _off(label: str, option: str, unit: str, chosen: float, found: Noise) -> Off | None:
+    """By what factor a setting is off, and how bad that is; None where it is not."""
+    value = found.value if found.value is not None else found.high
+    if value is None:
+        return None
     above = found.high is not None and chosen > found.high
     below = found.value is not None and chosen < (found.low or 0.0)
-    size = max(factor, 1.0 / factor)
+    size = max(chosen / value, value / chosen)
     if not (above or below) or size < NOISE_OFF.value:
-        return factor, None
-    return factor, "error" if size >= NOISE_OFF_ERROR.value else "warning"
+        return None
+    severity: Severity = "error" if size >= NOISE_OFF_ERROR.value else "warning"
+    defaults = Settings()
+    if chosen == (defaults.sigma_z_m if label == "SIGMA_Z" else defaults.sigma_a_m_s2):
+        severity = lowered(severity)
+    return Off(label, option, unit, chosen, found, value, severity)
+
+
+def _message(off: Off, tuned: AxisTuning) -> str:
+    small = off.factor < 1.0
+    bounded = off.found.value is None
+    range_ = "" if bounded else f", 95 % {off.found.low or 0.0:.3g} to {off.found.high:.3g}"
+    return (
+        f"{off.label} {off.chosen:g} {off.unit} is {'at least ' if bounded else ''}"
+        f"{factor_words(off.size)} times too {'small' if small else 'large'}: the innovations "
+        f"({tuned.name}) ask for {'at most ' if bounded else ''}{off.value:.3g} {off.unit}{range_}"
+        f". {_reading(off.label, small)}"
+    )
+
+
+def _remedy(analysis: Analysis, tuned: AxisTuning, off: list[Off]) -> str:
+    """What to type, as far as a replay with it holds what the likelihood promises."""
+    comparison = analysis.comparison
+    values = {
+        each.label: max(float(f"{each.value:.3g}"), SMALLEST_SIGMA_Z.value)
+        if each.label == "SIGMA_Z" and each.found.value is None
+        else float(f"{each.value:.3g}")
+        for each in off
+    }
+    changed = replace(
+        comparison.settings,
+        sigma_z_m=values.get("SIGMA_Z", comparison.settings.sigma_z_m),
+        sigma_a_m_s2=values.get("SIGMA_A", comparison.settings.sigma_a_m_s2),
+    )
+    typed = " ".join(f"{each.option} {values[each.label]:g}" for each in off)
+    held = tuned.held_out
+    unseen = None if isinstance(held, Unavailable) else held.gain_nats
+    return filter_words(comparison, changed, typed, unseen)
 
 
 def _reading(label: str, small: bool) -> str:

@@ -2,9 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.asked import delay_change
-from px4fuse.comparison.remedy import delay_helps, replayed, settings_words
+from px4fuse.comparison.remedy import (
+    WORSE_FILTER_ERROR,
+    delay_helps,
+    filter_errors_m,
+    replayed,
+    settings_words,
+)
 from px4fuse.filter.clock import CHANGE_P, ClockOffset
 from px4fuse.findings.model import Detector, Finding, Found, Threshold
 from px4fuse.flight import Unavailable
@@ -60,6 +68,13 @@ def _detect(analysis: Analysis) -> Found:
         )
     sure = abs(clock.offset_s) > CLOCK_SIGMAS.value * clock.sigma_s
     if sure and abs(clock.offset_s) > CLOCK_OFFSET.value and not changes:
+        remedy = f"--clock-offset {applied + clock.offset_s:.3f}"
+        shifted = replace(comparison.settings, clock_offset_s=float(remedy.split()[1]))
+        errors = filter_errors_m(comparison, shifted)
+        if errors is not None:
+            if errors[1] > WORSE_FILTER_ERROR * errors[0]:
+                return  # the truth knows better
+            remedy += f": position error {errors[0]:.3f} → {errors[1]:.3f} m (replayed)"
         yield Finding(
             "source_clock_offset",
             "error" if abs(clock.offset_s) > CLOCK_OFFSET_ERROR.value else "warning",
@@ -67,7 +82,7 @@ def _detect(analysis: Analysis) -> Found:
             f"{'late' if clock.offset_s < 0 else 'early'} by {abs(clock.offset_s):.3f} s against "
             f"the IMU (95 % {abs(high):.3f} to {abs(low):.3f} s): at 1 m/s that is an error of "
             f"{abs(clock.offset_s):.2f} m, which neither filter's innovations show.",
-            f"--clock-offset {applied + clock.offset_s:.3f}{_for_ekf2(analysis, clock)}",
+            f"{remedy}{_for_ekf2(analysis, clock)}.",
             evidence,
         )
 

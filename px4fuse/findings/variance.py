@@ -2,21 +2,31 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.comparison import AxisComparison
+from px4fuse.comparison.comparison import AxisComparison, Comparison
+from px4fuse.comparison.drift import may_drift
 from px4fuse.comparison.remedy import (
+    filter_words,
     noise_helps,
     not_replayed,
     remedy_words,
     settings_words,
 )
+from px4fuse.ekf2.parameters import PARAMETERS
 from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.kalman import Settings
 from px4fuse.filter.likelihood import NoiseAsked, sigma_a_asked
-from px4fuse.findings.model import Detector, Finding, Found, Threshold
+from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
+from px4fuse.findings.causes import CAUSE, ELSEWHERE, NOISE, OUTLIERS
+from px4fuse.findings.errors_larger_than_claimed import hidden_errors
+from px4fuse.findings.model import Detector, Finding, Found, Severity, Threshold, lowered
+from px4fuse.findings.sigma import SMALLEST_SIGMA_Z
 from px4fuse.flight import Unavailable
+from px4fuse.plain import factor_words
 
 VARIANCE_FACTOR = Threshold(
     1.5, "times", "22 % in standard deviation; chance moves it less at n > 100"
@@ -30,13 +40,25 @@ SMALLEST_NOISE = Threshold(0.001, "m", "below what any positioning system resolv
 OUTLIER_SHARE = Threshold(0.005, "outside 5√S", "6e-7 is expected")
 
 ONLY_HORIZONTAL = Unavailable("EKF2 replay", "the model of EKF2 is of horizontal position", "None.")
+LOOK_ELSEWHERE = (
+    "Look at the clock (EKF2_EV_DELAY), the outliers and EKF2's process noise (EKF2_ACC_NOISE):"
+)
+AGAINST_DRIFT = (
+    "Nothing follows from innovations alone: against a source that may drift they show how well "
+    "the filter follows it, not how wrong both are."
+)
+
+AGAINST_TRUTH = (
+    "Lower no noise for these innovations: the errors against the truth are larger than claimed."
+)
+
+Member = tuple[AxisComparison, Consistency]
 
 
 def _detect(analysis: Analysis) -> Found:
-    comparison = analysis.comparison
     for owner in ("kf", "ekf2"):
-        named: list[tuple[AxisComparison, Consistency]] = []
-        for result in comparison.axes:
+        named: list[Member] = []
+        for result in analysis.comparison.axes:
             summary = result.kf if owner == "kf" else result.ekf2
             if isinstance(summary, Unavailable) or isinstance(summary.consistency, Unavailable):
                 continue
@@ -44,87 +66,146 @@ def _detect(analysis: Analysis) -> Found:
             factor = max(statement.variance_factor, 1.0 / statement.variance_factor)
             if statement.verdict != "consistent" and factor >= VARIANCE_FACTOR.value:
                 named.append((result, statement))
-        for group, axes in (("horizontal", ("north", "east", "aisle")), ("vertical", ("down",))):
-            members = [(r, s) for r, s in named if r.axis.name in axes]
-            if members:
-                yield _variance_finding(analysis, owner, group, members)
+        for over in (True, False):
+            groups = [
+                _variance_finding(analysis, owner, group, members)
+                for group, axes in (
+                    ("horizontal", ("north", "east", "aisle")),
+                    ("vertical", ("down",)),
+                )
+                if (
+                    members := [
+                        (r, s)
+                        for r, s in named
+                        if r.axis.name in axes and (s.variance_factor > 1.0) == over
+                    ]
+                )
+            ]
+            if groups:  # one noise for all axes: the vertical axis tells no other cause
+                yield replace(groups[0], consequences=tuple(groups[1:]))
 
 
-def _variance_finding(
-    analysis: Analysis,
-    owner: str,
-    group: str,
-    members: list[tuple[AxisComparison, Consistency]],
-) -> Finding:
+def _variance_finding(analysis: Analysis, owner: str, group: str, members: list[Member]) -> Finding:
     """One finding for a group of axes, on the axis whose NIS is furthest from 1."""
     result, statement = max(members, key=lambda pair: abs(np.log(pair[1].nis_mean)))
     over = statement.variance_factor > 1.0
     factor = statement.variance_factor if over else 1.0 / statement.variance_factor
     name = "Our" if owner == "kf" else "EKF2's"
     low, high = statement.nis_band
+    comparison = analysis.comparison
+    severity: Severity = "error" if factor >= VARIANCE_FACTOR_ERROR.value else "warning"
+    if _is_default(comparison, owner, result):
+        severity = lowered(severity)
+    if over and may_drift(comparison.flight, comparison.source):
+        severity, remedy, cause = "info", AGAINST_DRIFT, ELSEWHERE
+    elif over and any(hidden.owner == owner for hidden in hidden_errors(comparison)):
+        remedy, cause = AGAINST_TRUTH, ELSEWHERE
+    else:
+        remedy, cause = _noise_remedy(analysis, owner, result, statement)
     evidence: dict[str, float | str] = {
         "axis": result.axis.name,
         "variance_factor": statement.variance_factor,
         "nis_mean": statement.nis_mean,
         "outside_gate": statement.outside_gate,
+        CAUSE: cause,
     }
-    if result.noise_asked is not None:
-        evidence["sigma_z_asked_m"] = result.noise_asked.sigma_z_m
-        evidence["sigma_z_asked_is_upper_bound"] = float(result.noise_asked.upper_bound)
+    asked = _asked(analysis, result)
+    if asked is not None:
+        evidence["sigma_z_asked_m"] = asked.sigma_z_m
+        evidence["sigma_z_asked_is_upper_bound"] = float(asked.upper_bound)
     return Finding(
         f"{owner}_variance_{'overstated' if over else 'understated'}",
-        "error" if factor >= VARIANCE_FACTOR_ERROR.value else "warning",
+        severity,
         f"{name} innovation variance is {'overstated' if over else 'understated'} "
-        f"{factor:.3g} times along {result.axis.name} (mean NIS {statement.nis_mean:.3g}, "
-        f"consistent is {low:.2f} to {high:.2f}; {group}).",
-        _noise_remedy(analysis, owner, result, statement),
+        f"{factor_words(factor)} times along {result.axis.name} (mean NIS "
+        f"{statement.nis_mean:.3g}, consistent is {low:.2f} to {high:.2f}; {group}).",
+        remedy,
         evidence,
     )
 
 
+def _is_default(comparison: Comparison, owner: str, result: AxisComparison) -> bool:
+    """Whether the measurement noise in force is the one that comes with the program."""
+    if owner == "kf":
+        chosen, defaults = comparison.settings, Settings()
+        return (chosen.sigma_z_m, chosen.sigma_a_m_s2) == (
+            defaults.sigma_z_m,
+            defaults.sigma_a_m_s2,
+        )
+    default = PARAMETERS["EKF2_EVP_NOISE"].default
+    used = _ekf2_noise(result)
+    untouched = comparison.flight.log.parameters.get("EKF2_EVP_NOISE", default) == default
+    # a sender that reports a larger variance has chosen it
+    return untouched and not abs(np.log(used / default)) > np.log(NOISE_FITS.value)
+
+
+def _asked(analysis: Analysis, result: AxisComparison) -> NoiseAsked | None:
+    """The source's noise: the tuned one, the same in all findings; else at the chosen SIGMA_A."""
+    tuned = analysis.tuning.get("down" if result.axis.name == "down" else HORIZONTAL)
+    if isinstance(tuned, AxisTuning) and tuned.sigma_z.value is not None:
+        return NoiseAsked(tuned.sigma_z.value, upper_bound=False)
+    return result.noise_asked
+
+
 def _noise_remedy(
     analysis: Analysis, owner: str, result: AxisComparison, statement: Consistency
-) -> str:
-    """The measurement noise that the data ask for, as what to type or to set.
+) -> tuple[str, str]:
+    """The measurement noise that the data ask for, as what to type or to set, and the cause.
 
     It is a property of the source, so our estimate of it serves EKF2 as well.
     """
-    asked, settings = result.noise_asked, analysis.comparison.settings
+    comparison = analysis.comparison
+    asked, settings = _asked(analysis, result), comparison.settings
     lag1 = statement.lag1_autocorrelation
     noise_absurd = asked is None or asked.sigma_z_m > NOISE_ABSURD.value * settings.sigma_z_m
     if owner == "kf" and noise_absurd and lag1 > LAG1_SLOW.value:
+        sigma_a = float(f"{sigma_a_asked(result.axis, settings):.2g}")
+        typed = f"--sigma-a {sigma_a:g}"
+        words = filter_words(comparison, replace(settings, sigma_a_m_s2=sigma_a), typed)
         return (
-            f"The filter follows too slowly (lag-1 correlation {lag1:+.2f}): raise SIGMA_A first, "
-            f"--sigma-a {sigma_a_asked(result.axis, settings):.2g} fits these data best."
+            f"The filter follows too slowly (lag-1 correlation {lag1:+.2f}): raise SIGMA_A first. "
+            f"{words}",
+            ELSEWHERE,
         )
     if asked is None:
         return (
             "No SIGMA_Z up to 30 m explains it: look at the acceleration input "
-            "(IMU rate, gaps, vibration) and at the clocks."
+            "(IMU rate, gaps, vibration) and at the clocks.",
+            ELSEWHERE,
         )
     if owner == "kf":
-        return _kf_remedy(settings, asked, statement)
+        return _kf_remedy(analysis, asked, statement)
     return _ekf2_remedy(analysis, result, asked, statement)
 
 
-def _kf_remedy(settings: Settings, asked: NoiseAsked, statement: Consistency) -> str:
+def _kf_remedy(analysis: Analysis, asked: NoiseAsked, statement: Consistency) -> tuple[str, str]:
+    comparison = analysis.comparison
+    settings = comparison.settings
     noise = max(asked.sigma_z_m, SMALLEST_NOISE.value)
     if asked.upper_bound:
+        typed = float(f"{max(noise, SMALLEST_SIGMA_Z.value):.2g}")
+        words = filter_words(
+            comparison, replace(settings, sigma_z_m=typed), f"--sigma-z {typed:g}, and less SIGMA_A"
+        )
         return (
-            f"The source's noise is at most {noise:.2g} m, below what this rate can show: lower "
-            f"SIGMA_Z (--sigma-z {max(noise, 0.005):.2g}) and SIGMA_A."
+            f"The source's noise is at most {noise:.2g} m, below what this rate can show. {words}",
+            NOISE,
         )
     if not _noise_helps(noise, settings.sigma_z_m, statement):
-        return _outliers(noise, statement) or (
+        outliers = _outliers(analysis, noise, statement)
+        return (outliers, OUTLIERS) if outliers else (
             f"It is not SIGMA_Z (the source's noise is {noise:.2g} m): look at SIGMA_A (--sigma-a) "
-            "and the clock (--clock-offset)."
-        )
-    return f"The data ask for SIGMA_Z {noise:.2g} m at this SIGMA_A: --sigma-z {noise:.2g}."
+            "and the clock (--clock-offset).",
+            ELSEWHERE,
+        )  # fmt: skip
+    typed = float(f"{noise:.2g}")
+    words = filter_words(comparison, replace(settings, sigma_z_m=typed), f"--sigma-z {typed:g}")
+    return f"The data ask for SIGMA_Z {noise:.2g} m. {words}", NOISE
 
 
 def _ekf2_remedy(
     analysis: Analysis, result: AxisComparison, asked: NoiseAsked, statement: Consistency
-) -> str:
+) -> tuple[str, str]:
     parameters = analysis.comparison.flight.log.parameters
     used, set_noise = _ekf2_noise(result), parameters.get("EKF2_EVP_NOISE", np.nan)
     noise = asked.sigma_z_m
@@ -132,10 +213,12 @@ def _ekf2_remedy(
         noise = float(np.hypot(statement.innovation_std_m, statement.innovation_mean_m))
     noise = max(noise, SMALLEST_NOISE.value)
     if not _noise_helps(noise, used, statement):
-        return _outliers(noise, statement) or (
+        outliers = _outliers(analysis, noise, statement)
+        return (outliers, OUTLIERS) if outliers else (
             f"It is not EKF2_EVP_NOISE (the source's noise is {noise:.2g} m): look at the clock "
-            "(EKF2_EV_DELAY) and at EKF2's process noise (EKF2_ACC_NOISE)."
-        )
+            "(EKF2_EV_DELAY) and at EKF2's process noise (EKF2_ACC_NOISE).",
+            ELSEWHERE,
+        )  # fmt: skip
     changes = {"EKF2_EVP_NOISE": max(float(f"{noise:.2g}"), EKF2_NOISE_FLOOR.value)}
     reported = used > NOISE_FITS.value * set_noise and parameters.get("EKF2_EV_NOISE_MD") != 1.0
     bound = "at most " if asked.upper_bound else ""
@@ -148,15 +231,11 @@ def _ekf2_remedy(
             "correct it there, or "
         )
     if result.axis.name == "down":
-        return f"{why}set {settings_words(changes)}. {not_replayed(ONLY_HORIZONTAL)}"
-    return remedy_words(
-        analysis.ekf2_model,
-        changes,
-        noise_helps,
-        why=why,
-        otherwise="Look at the clock (EKF2_EV_DELAY), the outliers and EKF2's process noise "
-        "(EKF2_ACC_NOISE):",
+        return f"{why}set {settings_words(changes)}. {not_replayed(ONLY_HORIZONTAL)}", NOISE
+    words = remedy_words(
+        analysis.ekf2_model, changes, noise_helps, why=why, otherwise=LOOK_ELSEWHERE
     )
+    return words, ELSEWHERE if words.startswith(LOOK_ELSEWHERE) else NOISE
 
 
 def _noise_helps(noise: float, used: float, statement: Consistency) -> bool:
@@ -170,10 +249,15 @@ def _noise_helps(noise: float, used: float, statement: Consistency) -> bool:
     return not (noise < used if statement.variance_factor < 1.0 else noise > used)
 
 
-def _outliers(noise: float, statement: Consistency) -> str:
+def _outliers(analysis: Analysis, noise: float, statement: Consistency) -> str:
     """What to do about gross outliers, empty where there are none."""
     if statement.variance_factor > 1.0 or statement.outside_gate <= OUTLIER_SHARE.value:
         return ""
+    tuned = analysis.tuning.get(HORIZONTAL)
+    if isinstance(tuned, AxisTuning) and (
+        len(tuned.outlier_time_s) <= OUTLIER_SHARE.value * tuned.count
+    ):
+        return ""  # the source has none: it is the filter that is elsewhere
     return (
         f"{statement.outside_gate:.1%} lie outside the gate while the bulk fits {noise:.2g} m: "
         "remove the outliers (line of sight, anchor survey) instead of raising the noise."

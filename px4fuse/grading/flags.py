@@ -116,7 +116,7 @@ def _hand_picked(results: ComparisonResults) -> Iterator[str]:
 
 def _nothing_found(results: ComparisonResults) -> Iterator[str]:
     """A noise is far off and no finding says so: px4fuse would have."""
-    ids = {finding.id for finding in results.findings}
+    ids = {name for finding in results.findings for name in finding.ids}
     tuned = results.tuning.get(HORIZONTAL)
     if "no_motion" in ids or not isinstance(tuned, Tuned):
         return
@@ -127,7 +127,10 @@ def _nothing_found(results: ComparisonResults) -> Iterator[str]:
             continue
         factor = max(chosen / best, best / chosen)
         low, high = getattr(tuned, f"{name}_interval") or (math.inf, -math.inf)
-        named = {f"{label}_small", f"{label}_large", "process_noise_forgotten"} & ids
+        named = {
+            f"{label}_small", f"{label}_large", "process_noise_forgotten", "source_may_drift",
+            "errors_larger_than_claimed",
+        } & ids  # fmt: skip
         if factor > SIGMA_FAR_OFF and not low <= chosen <= high and not named:
             yield (
                 f"{label.upper()} is {factor:.2g} times off what the data ask for, and no finding "

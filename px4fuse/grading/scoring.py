@@ -149,7 +149,7 @@ class Evidence:
 
     def has(self, finding: str) -> bool:
         """Whether the report lists a finding."""
-        return any(one.id == finding for one in self.results.findings)
+        return any(finding in one.ids for one in self.results.findings)
 
 
 def values_at(results: Mapping[str, Any], path: str) -> Iterator[tuple[str, Any]]:
@@ -304,22 +304,26 @@ def _notes(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float, str]:
 
 
 def _findings(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float, str]:
-    asked = list(
-        dict.fromkeys(
-            one.id
-            for one in evidence.results.findings
-            if one.severity in given["severities"] and one.id not in given["ignore"]
-        )
-    )
+    asked = {
+        one.id: one.ids
+        for one in evidence.results.findings
+        if one.severity in given["severities"] and one.id not in given["ignore"]
+    }
     if not asked:
         return 1.0, f"Your report has no {' or '.join(given['severities'])} left to explain."
-    missing = [name for name in asked if not evidence.names(name)]
+    # whoever names what a cause brings with it has seen it too
+    missing = [name for name, ids in asked.items() if not any(map(evidence.names, ids))]
     if not missing:
         return 1.0, f"Your notes take up all {len(asked)} findings of your report."
     return 1.0 - len(missing) / len(asked), (
         f"Your notes take up {len(asked) - len(missing)} of {len(asked)} findings; say what causes "
         f"{_listed(missing)} and what you did about it."
     )
+
+
+def _drifts(evidence: Evidence) -> bool:
+    """Whether the report says that its innovations are no measure of the error."""
+    return evidence.has("source_may_drift") or evidence.has("errors_larger_than_claimed")
 
 
 def _tuning(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float, str]:
@@ -350,9 +354,13 @@ def _tuned(evidence: Evidence, axis: str, name: str, factor: float) -> tuple[flo
         why = _why(tuned) or (_why_not_horizontal(evidence) if axis == HORIZONTAL else "")
         return 0.0, f"Your report has no interval for {label}{why}"
     low, high = interval
-    off = max(chosen / high if high > 0.0 else math.inf, low / chosen, 1.0)
+    above = chosen / high if high > 0.0 else math.inf
+    # small innovations are no reason to trust a source that drifts
+    off = max(1.0 if chosen > high and _drifts(evidence) else above, low / chosen, 1.0)
     said = f"your {label} {chosen:.3g} {unit} is"
     asked = f"what the data ask for ({low:.3g} to {high:.3g} {unit})"
+    if off == 1.0 and chosen > high:
+        return 1.0, f"{said} above {asked}, as it should be for a source that may drift"
     if off == 1.0:
         return 1.0, f"{said} within {asked}"
     share = 1.0 - math.log(off) / math.log(factor) if factor > max(off, 1.0) else 0.0
@@ -409,13 +417,15 @@ def _consistent(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float, st
         verdict, factor = judged.verdict, judged.variance_factor
         off = max(factor, 1.0 / factor)
         good = verdict == "consistent"
+        # small innovations are no reason to trust a source that drifts
+        excused = "overstated" in verdict and _drifts(evidence)
         gone = given["factor"] <= off or given["factor"] <= 1.0
         # no noise explains outliers, and none should be made to
         outliers = "understated" in verdict and evidence.has("source_outliers")
         explained = outliers and evidence.names("source_outliers")
         shares.append(
             1.0
-            if good or explained
+            if good or explained or excused
             else 0.0
             if gone
             else 1.0 - math.log(off) / math.log(given["factor"])
@@ -425,6 +435,8 @@ def _consistent(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float, st
             if explained
             else ", because of outliers that no setting fixes; your notes should say so"
             if outliers
+            else ", as it may be against a source that may drift"
+            if excused
             else ""
         )
         said.append(
@@ -560,7 +572,7 @@ def _mistakes(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float, str]
     named = [name for name in sorted(POSSIBLE_FINDINGS) if evidence.names(name, affirmed=True)]
     if not answer.findings:
         return _nothing_wrong(evidence, named, given)
-    shown = {one.id for one in evidence.results.findings}
+    shown = {name for one in evidence.results.findings for name in one.ids}
     if _applied(evidence, answer):
         shown.add("source_clock_offset")
     shares = {

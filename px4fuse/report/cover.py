@@ -27,7 +27,13 @@ from px4fuse.report.style import (
     Cursor,
     page,
 )
-from px4fuse.report.words import clock_words, settings_words, verdict_words
+from px4fuse.report.words import (
+    clock_words,
+    consequences_words,
+    settings_words,
+    verdict_notes,
+    verdict_words,
+)
 
 LABEL_WIDTH = 0.115
 PLAN_MIN_HEIGHT = 0.27
@@ -71,6 +77,8 @@ def draw(document: Document) -> Iterator[Figure]:
         size=7,
         colour=MUTED,
     )
+    for note in verdict_notes(comparison):
+        cursor.write(note, size=7)
     cursor.skip(8)
     cursor.write("Findings", size=10.5, weight="bold")
     cursor.skip(2)
@@ -224,6 +232,8 @@ def _finding_height(cursor: Cursor, finding: Finding) -> float:
     text = cursor.height(finding.message, x=_TEXT_X) + cursor.height(
         finding.remedy, x=_TEXT_X, size=7.5
     )
+    if finding.consequences:
+        text += cursor.height(consequences_words(finding), x=_TEXT_X, size=7.5)
     return text + 12.0 / POINTS_PER_HEIGHT
 
 
@@ -237,3 +247,5 @@ def write_finding(cursor: Cursor, finding: Finding) -> None:
     cursor.y = top
     cursor.write(finding.message, x=_TEXT_X)
     cursor.write(finding.remedy, x=_TEXT_X, size=7.5, colour=MUTED)
+    if finding.consequences:
+        cursor.write(consequences_words(finding), x=_TEXT_X, size=7.5, colour=MUTED)

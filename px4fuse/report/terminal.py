@@ -13,7 +13,7 @@ from px4fuse.filter.consistency import Consistency
 from px4fuse.findings import Finding, Severity
 from px4fuse.flight import Unavailable
 from px4fuse.report.document import Document
-from px4fuse.report.words import settings_words, verdict_words
+from px4fuse.report.words import consequences_words, settings_words, verdict_notes, verdict_words
 
 MOST_FINDINGS = 4
 # the screen shows the beginning of a long line; the report has it whole
@@ -54,6 +54,8 @@ def print_summary(console: Console, document: Document) -> None:
     )
     console.print(_table(document))
     console.print(Text("vs: RMSE of position (m), velocity (m/s). NIS 1 is consistent.", "dim"))
+    for note in verdict_notes(document.comparison):
+        console.print(Text(note, "dim"), soft_wrap=True)
     if not document.findings:
         console.print(Text("No findings."))
     for finding in document.findings[:MOST_FINDINGS]:
@@ -68,6 +70,8 @@ def print_finding(console: Console, finding: Finding, *, whole: bool = False) ->
     line = Text(f"{finding.severity:9}", style=STYLES[finding.severity])
     console.print(line.append(finding.message, style="none"), **how)
     console.print(Text(" " * 9 + finding.remedy, style="dim"), **how)
+    if finding.consequences:
+        console.print(Text(" " * 9 + consequences_words(finding), style="dim"), **how)
 
 
 def _table(document: Document) -> Table:

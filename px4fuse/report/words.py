@@ -2,17 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+
+import numpy as np
 
 from px4fuse.comparison.comparison import Comparison
+from px4fuse.comparison.drift import may_drift
 from px4fuse.filter.clock import CHANGE_P, ClockOffset
 from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.kalman import Settings
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
+from px4fuse.findings import Finding
+from px4fuse.findings.variance import VARIANCE_FACTOR
 from px4fuse.flight import Alignment, ClockMap, Unavailable
+from px4fuse.plain import factor_words
 
 # One update of EKF2 (EKF2_PREDICT_US)
 NEGLIGIBLE_OFFSET_S = 0.010
+# Below, "white" is wrong: of the eight verdicts of a flight one in a hundred by chance
+WHITE_P = 0.001
 
 
 def settings_words(settings: Settings) -> str:
@@ -30,8 +38,79 @@ def verdict_words(statement: Consistency | Unavailable) -> str:
         return "not available"
     if statement.verdict == "consistent":
         return "consistent"
-    factor = max(statement.variance_factor, 1.0 / statement.variance_factor)
-    return f"{statement.verdict.removeprefix('variance ')} {factor:.3g}×"
+    return f"{_side(statement)} {factor_words(_factor(statement))}×"
+
+
+def _side(statement: Consistency) -> str:
+    return statement.verdict.removeprefix("variance ")
+
+
+def _factor(statement: Consistency) -> float:
+    return max(statement.variance_factor, 1.0 / statement.variance_factor)
+
+
+def verdict_notes(comparison: Comparison) -> list[str]:
+    """What the verdicts mean where they could be misread, a sentence each.
+
+    A source that may drift; factors that are too small for a finding; one mean NIS and two
+    verdicts; innovations of the right size that are not white.
+    """
+    stated = [
+        (result.axis.name, owner, summary.consistency)
+        for result in comparison.axes
+        for owner, summary in (("ours", result.kf), ("EKF2", result.ekf2))
+        if not isinstance(summary, Unavailable) and isinstance(summary.consistency, Consistency)
+    ]
+    notes = []
+    if may_drift(comparison.flight, comparison.source):
+        notes.append(
+            "Consistent with a source that may drift is not correct: these verdicts say how well "
+            "each filter follows it. Truth or a loop judges the error."
+        )
+    small = [
+        f"{owner} {axis} {verdict_words(statement)}"
+        for axis, owner, statement in stated
+        if statement.verdict != "consistent" and _factor(statement) < VARIANCE_FACTOR.value
+    ]
+    if small:
+        notes.append(
+            f"{', '.join(small)}: more than chance, but less than {VARIANCE_FACTOR.value:g}× "
+            f"({np.sqrt(VARIANCE_FACTOR.value) - 1.0:.0%} in σ), from where it is a finding."
+        )
+    notes += _same_nis(stated)
+    coloured = [
+        f"{owner} {axis} p {statement.ljung_box_p:.1g}, lag-1 {statement.lag1_autocorrelation:+.2f}"
+        for axis, owner, statement in stated
+        if statement.verdict == "consistent" and statement.ljung_box_p < WHITE_P
+    ]
+    if coloured:
+        notes.append(
+            f"Of the right size but not white (Ljung-Box): {'; '.join(coloured)}. Each "
+            "innovation then tells of the next: with a positive lag-1 the filter lags (SIGMA_A is "
+            "small), with a negative one it overshoots (SIGMA_A is large)."
+        )
+    return notes
+
+
+def _same_nis(stated: list[tuple[str, str, Consistency]]) -> Iterator[str]:
+    """Two filters on one axis of which only the one with more samples is called wrong."""
+    for axis, owner, wrong in stated:
+        for other, fine in ((o, s) for a, o, s in stated if a == axis):
+            low, high = wrong.nis_band
+            if wrong.verdict == "consistent" or fine.verdict != "consistent":
+                continue
+            if fine.count < wrong.count and not low <= fine.nis_mean <= high:
+                bands = " and ".join("{:.2f}-{:.2f}".format(*s.nis_band) for s in (wrong, fine))
+                yield (
+                    f"Along {axis} only {owner} is called {_side(wrong)} although {other} has "
+                    f"nearly the same mean NIS ({wrong.nis_mean:.2f}, {fine.nis_mean:.2f}): with "
+                    f"{wrong.count} samples against {fine.count} the band is narrower ({bands})."
+                )
+
+
+def consequences_words(finding: Finding) -> str:
+    """What the same cause brings with it, each in one sentence."""
+    return "With it: " + " ".join(one.message for one in finding.consequences)
 
 
 def clock_words(clock: ClockMap) -> str:
@@ -90,10 +169,19 @@ def tuning_advice(
     found = tuned[name]
     assert isinstance(found, AxisTuning)
     lines = []
+    drifts = may_drift(comparison.flight, comparison.source)
+    if drifts:
+        noise = found.sigma_z.value or found.sigma_z.high
+        lines.append(
+            "Drift    the source may drift: these noises make a filter follow it"
+            + ("" if noise is None else f", {noise:.2g} m is how it scatters from second to second")
+            + ", not how wrong it is. Take no SIGMA_Z and no EKF2_EVP_NOISE below what truth or a "
+            "loop shows."
+        )
     options = [
         f"{option} {noise.value:.3g}"
         for option, noise in (("--sigma-a", found.filter_sigma_a), ("--sigma-z", found.sigma_z))
-        if noise.value is not None
+        if noise.value is not None and not drifts
     ]
     if options:
         lines.append(
@@ -111,7 +199,7 @@ def tuning_advice(
             + (f" (at most {bound:.2g} m)" if bound is not None else "")
             + ": between samples the process noise hides it. Log the source at a higher rate."
         )
-    elif comparison.flight.log.autopilot == "PX4":
+    elif comparison.flight.log.autopilot == "PX4" and not drifts:
         lines.append(
             f"PX4      EKF2_EVP_NOISE {found.sigma_z.value:.3g}"
             + (f" (now {now:g})" if now is not None else "")

@@ -109,13 +109,22 @@ class Student(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class FoundMistake(Base, frozen=True):
-    """A finding: what is wrong, the numbers that say so, and what to do."""
+    """A finding: what is wrong, the numbers that say so, and what to do.
+
+    Its ``consequences`` are what the same cause brings with it.
+    """
 
     id: Annotated[str, Meta(pattern="^[a-z0-9_]+$")]
     severity: Literal["error", "warning", "info"]
     message: str
     evidence: dict[str, int | float | str]
     remedy: str
+    consequences: tuple[FoundMistake, ...] = ()
+
+    @property
+    def ids(self) -> tuple[str, ...]:
+        """Its own id and those of its consequences."""
+        return (self.id, *(finding.id for finding in self.consequences))
 
 
 class Provenance(Base, frozen=True):

@@ -37,7 +37,10 @@ def copied_or_absent(kind: type[S], part: object) -> S | Absent:
 
 def found_mistakes(findings: tuple[Finding, ...]) -> tuple[FoundMistake, ...]:
     """Findings as results hold them."""
-    return tuple(copied(FoundMistake, finding) for finding in findings)
+    return tuple(
+        copied(FoundMistake, finding, consequences=found_mistakes(finding.consequences))
+        for finding in findings
+    )
 
 
 def log_part(flight: Flight) -> Log:

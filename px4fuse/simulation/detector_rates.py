@@ -83,7 +83,9 @@ AISLE, LOOP = Condition("", ""), Condition("", "--kind loop")
 
 
 def found(seed: int, condition: Condition | None = None) -> tuple[str, ...]:
-    """Findings on one simulated flight, most severe first, without those that always are.
+    """Findings on one simulated flight, most severe first, each before what it brings with it.
+
+    Those that always are there are left out.
 
     Parameters
     ----------
@@ -99,10 +101,10 @@ def found(seed: int, condition: Condition | None = None) -> tuple[str, ...]:
             Scenario(kind="loop", passes=1, truth=False, ekf2=condition.ekf2, seed=seed), mistakes
         )
         loop = analyse(Source(trajectory_of(flight, "vio"), flight))
-        return tuple(f.id for f in find_loop(loop) if f.id not in ALWAYS)
+        return tuple(i for f in find_loop(loop) for i in f.ids if i not in ALWAYS)
     flight = simulate_flight(Scenario(ekf2=condition.ekf2, seed=seed), mistakes)
     analysis = explain(compare(flight, condition.settings, axes=("north", "east")))
-    return tuple(f.id for f in find(analysis) if f.id not in ALWAYS)
+    return tuple(i for f in find(analysis) for i in f.ids if i not in ALWAYS)
 
 
 def _job(job: tuple[int, Condition]) -> tuple[str, ...]:

@@ -1,0 +1,83 @@
+"""Sources that may drift: which they are, and what is left of their clock estimate."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from flights import Estimator, Uwb, aisle_flight
+from test_findings import as_odometry
+
+from px4fuse.comparison.drift import may_drift, with_drift
+from px4fuse.filter.clock import ClockOffset, PartOffset
+from px4fuse.flight import Flight
+
+
+def clock(*offsets: float, sigma_s: float = 0.02, change_p: float | None = 1e-7) -> ClockOffset:
+    parts = tuple(
+        PartOffset(30.0 * i, 30.0 * (i + 1), each, sigma_s) for i, each in enumerate(offsets)
+    )
+    middle = float(np.mean(offsets))
+    curve = np.array([0.0])
+    return ClockOffset(
+        middle, (middle - 0.02, middle + 0.02), 0.01, True, "", curve, curve, parts, 100.0, 50.0,
+        change_p, 0.2, 0.01, 3000, 0.0, 1.0,
+    )  # fmt: skip
+
+
+def of(flight: Flight) -> bool:
+    return may_drift(flight, flight.positions[0])
+
+
+def test_a_source_with_an_orientation_that_turns_may_drift() -> None:
+    assert not of(aisle_flight())
+    assert of(as_odometry(aisle_flight()))
+
+
+@pytest.mark.parametrize(("rung", "drifts"), [(1, False), (3, False), (7, False), (4, True)])
+def test_a_file_and_motion_capture_as_such_do_not(rung: int, drifts: bool) -> None:
+    assert of(as_odometry(aisle_flight(uwb=Uwb(rung=rung)))) is drifts
+
+
+@pytest.mark.parametrize("fusing_yaw", [0.0, 1.0])
+def test_what_ekf2_kept_of_a_source_drifts_where_ekf2_took_its_heading(fusing_yaw: float) -> None:
+    ekf2 = Estimator(fusing_yaw=fusing_yaw)
+    uwb = Uwb(name="estimator_aid_src_ev_pos", rung=5)
+    assert of(aisle_flight(uwb=uwb, ekf2=ekf2)) is bool(fusing_yaw)
+    # a source that was logged as it arrived says so itself
+    assert not of(aisle_flight(ekf2=ekf2))
+
+
+def test_parts_that_scatter_widen_the_interval_and_are_no_change() -> None:
+    """As measured on a VIO whose stamps were right throughout."""
+    scattered = clock(-0.013, 0.019, 0.076, 0.031, 0.082, 0.107, -0.077, 0.012, -0.007, -0.024)
+    found = with_drift(scattered)
+    scatter = found.sigma_s / scattered.sigma_s
+    assert scatter == pytest.approx(np.std([p.offset_s for p in found.parts], ddof=1) / 0.02)
+    low, high = found.interval_s
+    assert (high - low) / 0.04 == pytest.approx(scatter)
+    assert found.change_p == 1.0
+    assert found.determinable
+
+
+def test_parts_as_far_apart_as_their_noise_change_nothing() -> None:
+    found = with_drift(clock(0.01, -0.01, 0.015, -0.02, 0.0))
+    assert (found.interval_s, found.sigma_s) == (pytest.approx((-0.021, 0.019)), 0.01)
+
+
+def test_a_step_that_drift_cannot_imitate_is_a_change() -> None:
+    found = with_drift(clock(-0.41, -0.36, 0.03, -0.04, 0.02, 0.05, -0.03, 0.0))
+    assert found.change_p is not None
+    assert found.change_p < 1e-3
+
+
+def test_too_wide_an_interval_determines_nothing() -> None:
+    found = with_drift(replace(clock(-0.4, 0.4, -0.3, 0.3), interval_s=(-0.05, 0.05)))
+    assert not found.determinable
+    assert "drifts" in found.reason
+
+
+def test_two_parts_show_no_scatter_of_their_own() -> None:
+    found = with_drift(clock(0.0, 0.3))
+    assert found.change_p is None
