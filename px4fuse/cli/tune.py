@@ -72,15 +72,7 @@ def _print(
 
     console.print(f"Chosen   {settings_words(compared.settings)}", markup=False, soft_wrap=True)
     table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="bold")
-    for name in (
-        "axis",
-        "SIGMA_A, 95 %",
-        "noise alone",
-        "SIGMA_Z, 95 %",
-        "gain",
-        "held out",
-        "lag 1",
-    ):
+    for name in ("axis", "SIGMA_A, 95 %", "SIGMA_Z, 95 %", "gain", "held out", "lag 1"):
         table.add_column(name, justify="left" if name == "axis" else "right", no_wrap=True)
     for name, found in tuned.items():
         if isinstance(found, Unavailable):
@@ -90,7 +82,6 @@ def _print(
         table.add_row(
             name,
             _noise(found.filter_sigma_a),
-            _noise(found.sigma_a) if found.biases_fitted else "",
             _noise(found.sigma_z),
             f"{found.gain_nats:.3f}",
             "" if isinstance(held, Unavailable) else f"{held.gain_nats:+.3f}",
@@ -99,9 +90,8 @@ def _print(
     console.print(table)
     console.print(
         Text(
-            "SIGMA_A: what the filter needs; noise alone: with bias and tilt taken out; gain: "
-            "log-likelihood per measurement above the chosen settings; held out: the same on the "
-            "second half, tuned on the first; lag 1: autocorrelation before and after.",
+            "gain: log-likelihood per measurement above the chosen settings; held out: the same on "
+            "the second half, tuned on the first; lag 1: autocorrelation before and after.",
             "dim",
         )
     )

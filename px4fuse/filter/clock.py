@@ -71,6 +71,8 @@ class ClockOffset:
         Why not, where it is not; else empty.
     curve_s, curve_drop : ndarray, shape (n,)
         Offsets, and how far each lies below the greatest log-likelihood.
+    interval_drop : float
+        How far below it the interval reaches: more than chi-square says, by the IMU's noise.
     parts : tuple of PartOffset
         Offsets of consecutive parts.
     drift_ppm, drift_sigma_ppm : float or None
@@ -94,6 +96,7 @@ class ClockOffset:
     reason: str
     curve_s: Array
     curve_drop: Array
+    interval_drop: float
     parts: tuple[PartOffset, ...]
     drift_ppm: float | None
     drift_sigma_ppm: float | None
@@ -216,6 +219,7 @@ def estimate_clock_offset(
         reason=reason,
         curve_s=curve,
         curve_drop=profile - profile.min(),
+        interval_drop=PROFILE_DROP * factor,
         parts=parts,
         drift_ppm=drift,
         drift_sigma_ppm=drift_sigma,

@@ -67,7 +67,7 @@ def _detect(analysis: Analysis) -> Found:
         each
         for each in (
             _off("SIGMA_Z", "--sigma-z", "m", settings.sigma_z_m, tuned.sigma_z),
-            _off("SIGMA_A", "--sigma-a", "m/s²", settings.sigma_a_m_s2, tuned.sigma_a),
+            _off("SIGMA_A", "--sigma-a", "m/s²", settings.sigma_a_m_s2, tuned.filter_sigma_a),
         )
         if each is not None
     ]

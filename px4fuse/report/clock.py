@@ -6,7 +6,6 @@ from collections.abc import Iterator
 
 from matplotlib.figure import Figure
 
-from px4fuse.filter.likelihood import PROFILE_DROP
 from px4fuse.flight import Unavailable
 from px4fuse.report.document import Document
 from px4fuse.report.style import LEFT, OURS, OURS_BAND, OURS_LINE, RIGHT, caption, page
@@ -42,7 +41,7 @@ def draw(document: Document) -> Iterator[Figure]:
     axes.axvspan(applied + clock.interval_s[0], applied + clock.interval_s[1], color=OURS_BAND,
                  lw=0, label="95 % interval")  # fmt: skip
     axes.plot(applied + clock.curve_s, clock.curve_drop, **OURS_LINE)
-    axes.axhline(PROFILE_DROP, color="black", lw=0.6, ls=":")
+    axes.axhline(clock.interval_drop, color="black", lw=0.6, ls=":")
     axes.axvline(applied, color="black", lw=0.8, ls="--", label="as analysed")
     axes.set_ylim(min(MAX_DROP, float(clock.curve_drop.max()) * 1.05), 0.0)
     axes.set_xlabel("offset added to the source's stamps (s)")
@@ -51,8 +50,8 @@ def draw(document: Document) -> Iterator[Figure]:
     caption(
         axes,
         f"most likely {applied + clock.offset_s:+.3f} s, 95 % {applied + low:+.3f} to "
-        f"{applied + high:+.3f} s, from {clock.count} measurements; noises at the maximum: SIGMA_A "
-        f"{clock.sigma_a_m_s2:.2g} m/s², SIGMA_Z {clock.sigma_z_m:.2g} m",
+        f"{applied + high:+.3f} s, from {clock.count} measurements; dotted: where the interval ends, "
+        "with the noise of the IMU counted",
     )
     if clock.parts:
         bottom -= HEIGHT + 0.09

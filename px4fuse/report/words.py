@@ -265,14 +265,19 @@ def clock_advice(comparison: Comparison, clock: ClockOffset | Unavailable) -> li
         lines.append(f"Re-run   px4fuse compare {log.name} --clock-offset {offset:.3f}")
     delay = log.parameters.get("EKF2_EV_DELAY")
     if delay is not None:
-        asked = -offset * 1e3
         margin = NEGLIGIBLE_OFFSET_S
         inside = -(applied + high + margin) <= delay * 1e-3 <= -(applied + low - margin)
-        lines.append(
-            f"PX4      EKF2_EV_DELAY is {delay:g} ms, the data ask for {asked:.0f} ms ("
-            f"{-(applied + high) * 1e3:.0f} to {-(applied + low) * 1e3:.0f})"
-            + ("" if inside else "; set it, or fix the clock")
-        )
+        if offset > 0.0 and not inside and delay <= 0.0:
+            lines.append(
+                "PX4      EKF2_EV_DELAY is 0 ms and cannot be negative: correct the sender's clock"
+            )
+        else:
+            lines.append(
+                f"PX4      EKF2_EV_DELAY is {delay:g} ms, the data ask for "
+                f"{max(-offset * 1e3, 0.0):.0f} ms ({max(-(applied + high) * 1e3, 0.0):.0f} to "
+                f"{max(-(applied + low) * 1e3, 0.0):.0f})"
+                + ("" if inside else "; set it, or correct the sender's clock")
+            )
     if clock.change_p is not None and clock.change_p < CHANGE_P:
         parts = ", ".join(
             f"{applied + p.offset_s:+.2f} s from {p.start_s:.0f} s" for p in clock.parts

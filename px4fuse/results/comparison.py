@@ -336,8 +336,6 @@ class Clock(Base, frozen=True, kw_only=True):
     drift_sigma_ppm: NotNegative | None = None
     change_p: Share | None = None
     parts: tuple[PartOffset, ...]
-    sigma_a_m_s2: NotNegative
-    sigma_z_m: NotNegative
     count: Count
     heading_error_deg: float | None = None
     heading_sigma_deg: NotNegative | None = None
