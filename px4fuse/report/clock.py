@@ -50,8 +50,8 @@ def draw(document: Document) -> Iterator[Figure]:
     caption(
         axes,
         f"most likely {applied + clock.offset_s:+.3f} s, 95 % {applied + low:+.3f} to "
-        f"{applied + high:+.3f} s, from {clock.count} measurements; dotted: where the interval ends, "
-        "with the noise of the IMU counted",
+        f"{applied + high:+.3f} s, from {clock.count} measurements. Dotted: where the "
+        "interval ends, with the noise of the IMU counted",
     )
     if clock.parts:
         bottom -= HEIGHT + 0.09

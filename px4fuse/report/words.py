@@ -267,7 +267,9 @@ def clock_advice(comparison: Comparison, clock: ClockOffset | Unavailable) -> li
     if delay is not None:
         margin = NEGLIGIBLE_OFFSET_S
         inside = -(applied + high + margin) <= delay * 1e-3 <= -(applied + low - margin)
-        if offset > 0.0 and not inside and delay <= 0.0:
+        if inside:
+            lines.append(f"PX4      EKF2_EV_DELAY {delay:g} ms fits")
+        elif offset > 0.0 and delay <= 0.0:
             lines.append(
                 "PX4      EKF2_EV_DELAY is 0 ms and cannot be negative: correct the sender's clock"
             )
@@ -275,8 +277,7 @@ def clock_advice(comparison: Comparison, clock: ClockOffset | Unavailable) -> li
             lines.append(
                 f"PX4      EKF2_EV_DELAY is {delay:g} ms, the data ask for "
                 f"{max(-offset * 1e3, 0.0):.0f} ms ({max(-(applied + high) * 1e3, 0.0):.0f} to "
-                f"{max(-(applied + low) * 1e3, 0.0):.0f})"
-                + ("" if inside else "; set it, or correct the sender's clock")
+                f"{max(-(applied + low) * 1e3, 0.0):.0f}); set it, or correct the sender's clock"
             )
     if clock.change_p is not None and clock.change_p < CHANGE_P:
         parts = ", ".join(
