@@ -73,7 +73,7 @@ def parameters(remedy: str) -> dict[str, float]:
         ({}, ()),
         ({"sigma_z_m": 0.02}, ()),
         ({"sigma_a_m_s2": 0.001}, ()),
-        ({}, ("ekf2-noise=2cm",)),
+        ({}, ("ekf2-noise=4cm",)),
         ({}, ("ekf2-noise=50cm",)),
         ({}, ("ekf2-delay=175ms",)),
         ({}, ("clock-offset=250ms",)),

@@ -1,0 +1,123 @@
+"""One finding per cause, advice for what nobody chose, and the order in which causes are told."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+from flights import Estimator, aisle_flight, unexplained
+from results_tools import changed, finding
+from test_scoring import checked
+
+from px4fuse.comparison.comparison import Comparison, compare
+from px4fuse.filter.consistency import Consistency
+from px4fuse.filter.kalman import Settings
+from px4fuse.filter.tuning import Noise
+from px4fuse.findings import Finding, find, phrases
+from px4fuse.findings.causes import CONSEQUENCES, NOISES, RECORDING, by_cause
+from px4fuse.findings.sigma import _off
+from px4fuse.flight import Flight
+from px4fuse.report.words import verdict_notes
+
+
+def one(name: str, severity: str = "warning", **evidence: str) -> Finding:
+    return Finding(name, severity, f"{name}.", "Do.", evidence)  # type: ignore[arg-type]
+
+
+def test_the_table_knows_only_findings_that_there_are() -> None:
+    listed = {name.split(":")[0] for names in CONSEQUENCES.values() for name in names}
+    assert listed | set(CONSEQUENCES) | NOISES | RECORDING <= set(phrases())
+
+
+def test_what_a_cause_brings_with_it_is_told_inside_it() -> None:
+    (cause,) = by_cause([one("ekf2_rejecting", "error"), one("ekf2_variance_understated")])
+    assert cause.ids == ("ekf2_variance_understated", "ekf2_rejecting")
+    assert cause.severity == "error"  # as severe as what it brings with it
+    assert cause.consequences[0].message == "ekf2_rejecting."
+
+
+def test_a_variance_follows_from_what_its_evidence_names() -> None:
+    outliers = one("source_outliers")
+    for named, joined in (("outliers", True), ("measurement noise", False)):
+        found = by_cause([outliers, one("kf_variance_understated", cause=named)])
+        assert (len(found) == 1) is joined
+
+
+def test_consequences_of_consequences_are_told_too() -> None:
+    (cause,) = by_cause(
+        [
+            one("source_outliers", "error"),
+            one("ekf2_variance_understated", cause="outliers"),
+            one("ekf2_rejecting"),
+        ]
+    )
+    assert cause.ids == ("source_outliers", "ekf2_variance_understated", "ekf2_rejecting")
+
+
+def test_the_size_of_our_variance_does_not_make_advice_an_error() -> None:
+    (cause,) = by_cause([one("sigma_z_large", "info"), one("kf_variance_overstated", "error")])
+    assert cause.severity == "info"
+
+
+def test_what_the_recording_lacks_comes_before_noises() -> None:
+    order = by_cause(
+        [
+            one("no_motion"), one("sigma_a_large", "error"), one("ekf2_resets", "info"),
+            one("source_gap"), one("source_clock_changes", "error"),
+        ]
+    )  # fmt: skip
+    assert [each.id for each in order] == [
+        "source_clock_changes", "source_gap", "sigma_a_large", "no_motion", "ekf2_resets",
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("chosen", "asked", "severity"),
+    [(0.1, 0.05, "info"), (0.1, 0.01, "warning"), (0.11, 0.05, "warning"), (0.2, 0.01, "error")],
+)
+def test_a_setting_that_nobody_chose_is_advice(chosen: float, asked: float, severity: str) -> None:
+    off = _off("SIGMA_Z", "--sigma-z", "m", chosen, Noise(asked, 0.9 * asked, 1.1 * asked))
+    assert off is not None
+    assert off.severity == severity
+
+
+@pytest.mark.parametrize(("noise_m", "severity"), [(0.10, "warning"), (0.20, "error")])
+def test_ekf2s_untouched_noise_is_advice(noise_m: float, severity: str) -> None:
+    """0.2 m is what the sender reports; EKF2_EVP_NOISE is PX4's 0.1 m."""
+    flight = aisle_flight(ekf2=Estimator(nis=0.1, noise_m=noise_m))
+    (found,) = find(unexplained(compare(flight)))
+    assert found.ids == ("ekf2_variance_overstated", "ekf2_variance_overstated")
+    assert found.severity == severity
+
+
+def test_notes_that_name_a_consequence_take_up_its_cause() -> None:
+    cause = finding("sigma_z_large") | {"consequences": [finding("kf_variance_overstated")]}
+    results = changed(findings=[cause], student__notes="Our variance was overstated.")
+    assert checked("findings", results)[0] == 1.0
+    silent = changed(findings=[cause], student__notes="All is well.")
+    assert checked("findings", silent)[0] == 0.0
+
+
+@pytest.fixture(scope="module")
+def comparison(sample_flight: Flight) -> Comparison:
+    return compare(sample_flight, Settings())
+
+
+def test_verdicts_that_could_be_misread_have_a_sentence(comparison: Comparison) -> None:
+    small, same, white = verdict_notes(comparison)
+    assert "ours aisle overstated 1.18×" in small
+    assert "EKF2 has nearly the same mean NIS (0.84, 0.86)" in same
+    assert "with 624 samples against 250" in same
+    assert "ours down p 5e-05" in white
+
+
+def test_what_is_consistent_and_white_needs_no_words(comparison: Comparison) -> None:
+    (east,) = [result for result in comparison.axes if result.axis.name == "east"]
+    assert isinstance(east.kf.consistency, Consistency)
+    fine = replace(east.kf, consistency=replace(east.kf.consistency, ljung_box_p=0.5))
+    assert verdict_notes(replace(comparison, axes=(replace(east, kf=fine),))) == []
+
+
+def test_a_source_that_may_drift_is_said_to(comparison: Comparison) -> None:
+    turning = replace(comparison.source, orientation=comparison.flight.attitude)
+    assert "is not correct" in verdict_notes(replace(comparison, source=turning))[0]
