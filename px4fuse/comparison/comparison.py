@@ -20,7 +20,6 @@ from px4fuse.comparison.projection import (
 from px4fuse.errors import SettingsError
 from px4fuse.filter.consistency import Consistency, HorizontalNis, assess, assess_horizontal
 from px4fuse.filter.kalman import Replay, Settings, replay, state_at, variance_at
-from px4fuse.filter.likelihood import NoiseAsked, noise_asked
 from px4fuse.filter.signals import (
     Axis,
     Segment,
@@ -103,8 +102,6 @@ class AxisComparison:
     ekf2_innovations : DataFrame or Unavailable
         Columns as :attr:`Ekf2.innovations`, in the segment, plus ``prior_variance_m2`` and
         ``posterior_variance_m2`` (P⁻ = S - R and P⁺ = P⁻R/S, NaN where R is unknown).
-    noise_asked : NoiseAsked or None
-        SIGMA_Z that the data ask for at the chosen SIGMA_A.
     difference : Difference or Unavailable
     kf_truth, ekf2_truth : AgainstTruth or Unavailable
     truth : DataFrame or Unavailable
@@ -118,7 +115,6 @@ class AxisComparison:
     ekf2_state: pd.DataFrame | Unavailable
     ekf2_variance: pd.DataFrame | Unavailable
     ekf2_innovations: pd.DataFrame | Unavailable
-    noise_asked: NoiseAsked | None
     difference: Difference | Unavailable
     kf_truth: AgainstTruth | Unavailable
     ekf2_truth: AgainstTruth | Unavailable
@@ -267,7 +263,7 @@ def _compare_axis(
         times = run.steps.index.to_numpy()
         return AxisComparison(
             axis=axis, replay=run, kf=kf, ekf2=ekf2, ekf2_state=ekf2, ekf2_variance=ekf2,
-            ekf2_innovations=ekf2, noise_asked=noise_asked(axis, settings), difference=ekf2,
+            ekf2_innovations=ekf2, difference=ekf2,
             kf_truth=kf_against_truth(run, truth, times), ekf2_truth=ekf2, truth=truth,
         )  # fmt: skip
     ekf2_state = project_state(ekf2.state, axis, segment)
@@ -282,7 +278,6 @@ def _compare_axis(
         ekf2_state=ekf2_state,
         ekf2_variance=ekf2_variance,
         ekf2_innovations=ekf2_innovations,
-        noise_asked=noise_asked(axis, settings),
         difference=_difference(run, ekf2_state),
         kf_truth=kf_against_truth(run, truth, times),
         ekf2_truth=_ekf2_against_truth(ekf2_state, ekf2_variance, truth),

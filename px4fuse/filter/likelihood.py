@@ -16,7 +16,6 @@ from numpy.typing import ArrayLike
 from scipy.stats import chi2
 
 from px4fuse.arrays import Array, BoolArray
-from px4fuse.filter.consistency import GATE_SIGMA
 from px4fuse.filter.kalman import InitialState, Settings, timeline
 from px4fuse.filter.model import INITIAL_COVARIANCE, Symmetric, move, noise, spread
 from px4fuse.filter.signals import Axis
@@ -244,14 +243,6 @@ def total_over_grid(
     return total
 
 
-MAX_PASSES = 4
-MAX_OUTLIER_SHARE = 0.25
-# The grid on which the measurement noise that the data ask for is sought.
-SIGMA_Z_GRID_M = np.geomspace(1e-3, 30.0, 91)
-# Median of a chi-square variable of one degree of freedom.
-CHI2_MEDIAN = float(chi2.median(1))
-
-
 def parabola_vertex(profile: Array, at: int) -> tuple[float, float]:
     """Vertex of the parabola through three points of a profile.
 
@@ -296,81 +287,3 @@ def profile_interval(
         else:
             ends.append(None)
     return ends[0], ends[1]
-
-
-@dataclass(frozen=True)
-class NoiseAsked:
-    """Measurement noise at which the innovations would match their variances.
-
-    Attributes
-    ----------
-    sigma_z_m : float
-    upper_bound : bool
-        True where even the smallest noise leaves S too large: process noise alone explains the
-        innovations at this rate, and ``sigma_z_m``, their size by the median, bounds the noise.
-    """
-
-    sigma_z_m: float
-    upper_bound: bool
-
-
-def noise_asked(axis: Axis, settings: Settings) -> NoiseAsked | None:
-    """SIGMA_Z at which the *median* NIS takes its chi-square value, SIGMA_A as set.
-
-    The median, and without the outliers, whose effect on the state lasts for several updates: a
-    few gross ones must not raise the noise of all the others. Outliers are found at the noise of
-    the pass before, until they stay the same.
-
-    Parameters
-    ----------
-    axis : Axis
-    settings : Settings
-        ``sigma_a_m_s2``, ``dt_s`` and ``input`` are used.
-
-    Returns
-    -------
-    NoiseAsked, or None where no SIGMA_Z up to 30 m explains the innovations: then the
-    acceleration input is wrong, not the measurement.
-    """
-    legs = preintegrate(axis, settings)
-    skip = np.zeros(len(legs.measurement_m), dtype=bool)
-    asked: NoiseAsked | None = None
-    for _ in range(MAX_PASSES):
-        nu, s = innovations(legs, settings.sigma_a_m_s2, SIGMA_Z_GRID_M, skip)
-        asked = _median_match(nu[~skip], s[~skip])
-        if asked is None or asked.upper_bound:
-            return asked
-        nu, s = innovations(legs, settings.sigma_a_m_s2, asked.sigma_z_m, skip)
-        outlier = nu**2 > GATE_SIGMA**2 * s
-        if np.array_equal(outlier, skip) or np.mean(outlier) > MAX_OUTLIER_SHARE:
-            return asked
-        skip = outlier
-    return asked
-
-
-def _median_match(nu: Array, s: Array) -> NoiseAsked | None:
-    """Point of the grid (second dimension) where the median NIS is that of chi-square."""
-    median = np.median(nu**2 / s, axis=0)
-    above = np.flatnonzero(median >= CHI2_MEDIAN)
-    if not len(above):
-        return NoiseAsked(float(np.sqrt(np.median(nu[:, 0] ** 2) / CHI2_MEDIAN)), True)
-    low = int(above[-1])
-    if low == len(SIGMA_Z_GRID_M) - 1:
-        return None
-    # the median NIS falls with SIGMA_Z: interpolate between the two grid points on log scales
-    x = np.log(SIGMA_Z_GRID_M[[low, low + 1]])
-    y = np.log(median[[low, low + 1]])
-    at = x[0] + (np.log(CHI2_MEDIAN) - y[0]) * (x[1] - x[0]) / (y[1] - y[0])
-    return NoiseAsked(float(np.exp(at)), False)
-
-
-SIGMA_A_GRID_M_S2 = np.geomspace(1e-3, 30.0, 61)
-
-
-def sigma_a_asked(axis: Axis, settings: Settings) -> float:
-    """SIGMA_A (m/s²) of greatest likelihood at the SIGMA_Z that is set, on a coarse grid.
-
-    Minimises ½ Σ (ln S + ν²/S), the negative log-likelihood of the innovations.
-    """
-    nu, s = innovations(preintegrate(axis, settings), SIGMA_A_GRID_M_S2, settings.sigma_z_m)
-    return float(SIGMA_A_GRID_M_S2[np.argmin(np.sum(np.log(s) + nu**2 / s, axis=0))])

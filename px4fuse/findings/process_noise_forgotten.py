@@ -11,9 +11,8 @@ import numpy as np
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.remedy import filter_words
-from px4fuse.filter.likelihood import sigma_a_asked
 from px4fuse.findings.model import Detector, Finding, Found, Threshold
-from px4fuse.findings.variance import LAG1_SLOW
+from px4fuse.findings.variance import LAG1_SLOW, tuned_for
 from px4fuse.flight import Unavailable, sample_rate
 
 RESPONSE_TIME = Threshold(2.5, "s", "five times the lesson's; a vehicle turns around in less")
@@ -34,20 +33,24 @@ def _detect(analysis: Analysis) -> Found:
         after = result.replay.steps["position_variance_m2"].reindex(updates.index).to_numpy()
         before = updates["prior_position_variance_m2"].to_numpy()
         growth = float(np.median((before[1:] / after[:-1] - 1.0)[len(after) // 2 :]))
-        asked = float(f"{sigma_a_asked(result.axis, comparison.settings):.2g}")
-        changed = replace(comparison.settings, sigma_a_m_s2=asked)
+        tuned = tuned_for(analysis, result.axis.name)
+        needed = None if tuned is None else tuned.filter_sigma_a.value
+        remedy = "Raise SIGMA_A."
+        if needed is not None:
+            asked = float(f"{needed:.3g}")
+            changed = replace(comparison.settings, sigma_a_m_s2=asked)
+            remedy += f" {filter_words(comparison, changed, f'--sigma-a {asked:g}')}"
         yield Finding(
             "process_noise_forgotten",
             "error",
             f"Q forgotten: with SIGMA_A {comparison.settings.sigma_a_m_s2:g} m/s² σ_p hardly grows "
             f"between updates ({growth:.1%} in variance), the gain is {gain:.3f}, and the filter "
             f"needs {response_s:.0f} s to follow (along {result.axis.name}).",
-            f"Raise SIGMA_A. {filter_words(comparison, changed, f'--sigma-a {asked:g}')}",
+            remedy,
             {
                 "relative_growth": growth,
                 "gain": gain,
                 "response_s": response_s,
-                "sigma_a_asked_m_s2": asked,
                 "axis": result.axis.name,
             },
         )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -18,8 +18,8 @@ from px4fuse.comparison.remedy import (
 )
 from px4fuse.ekf2.parameters import PARAMETERS
 from px4fuse.filter.consistency import Consistency
+from px4fuse.filter.fitting import SIGMA_Z_SEARCH_M
 from px4fuse.filter.kalman import Settings
-from px4fuse.filter.likelihood import NoiseAsked, sigma_a_asked
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.findings.causes import CAUSE, ELSEWHERE, NOISE, OUTLIERS
 from px4fuse.findings.errors_larger_than_claimed import hidden_errors
@@ -34,7 +34,6 @@ VARIANCE_FACTOR = Threshold(
 VARIANCE_FACTOR_ERROR = Threshold(4.0, "times", "a factor of two in standard deviation")
 EKF2_NOISE_FLOOR = Threshold(0.01, "m", "EKF2 never trusts external vision better, EKF2.cpp")
 NOISE_FITS = Threshold(1.25, "times", "the median's own scatter below n = 100 (1.17/√n, two σ)")
-NOISE_ABSURD = Threshold(2.0, "times", "beyond, a small SIGMA_A explains it rather than the source")
 LAG1_SLOW = Threshold(0.3, "correlation", "white innovations stay below 2/√n, 0.2 at n = 100")
 SMALLEST_NOISE = Threshold(0.001, "m", "below what any positioning system resolves")
 OUTLIER_SHARE = Threshold(0.005, "outside 5√S", "6e-7 is expected")
@@ -139,12 +138,29 @@ def _is_default(comparison: Comparison, owner: str, result: AxisComparison) -> b
     return untouched and not abs(np.log(used / default)) > np.log(NOISE_FITS.value)
 
 
-def _asked(analysis: Analysis, result: AxisComparison) -> NoiseAsked | None:
-    """The source's noise: the tuned one, the same in all findings; else at the chosen SIGMA_A."""
-    tuned = analysis.tuning.get("down" if result.axis.name == "down" else HORIZONTAL)
-    if isinstance(tuned, AxisTuning) and tuned.sigma_z.value is not None:
-        return NoiseAsked(tuned.sigma_z.value, upper_bound=False)
-    return result.noise_asked
+@dataclass(frozen=True)
+class SourceNoise:
+    """The source's noise by tuning, the same in all findings: a value or an upper bound."""
+
+    sigma_z_m: float
+    upper_bound: bool
+
+
+def tuned_for(analysis: Analysis, axis: str) -> AxisTuning | None:
+    """What was tuned for an axis: both horizontal ones together, where there are both."""
+    names = (axis,) if axis == "down" else (HORIZONTAL, axis)
+    found = (analysis.tuning.get(name) for name in names)
+    return next((tuned for tuned in found if isinstance(tuned, AxisTuning)), None)
+
+
+def _asked(analysis: Analysis, result: AxisComparison) -> SourceNoise | None:
+    tuned = tuned_for(analysis, result.axis.name)
+    if tuned is None:
+        return None
+    noise = tuned.sigma_z
+    if noise.value is not None:
+        return SourceNoise(noise.value, upper_bound=False)
+    return None if noise.high is None else SourceNoise(noise.high, upper_bound=True)
 
 
 def _noise_remedy(
@@ -157,9 +173,10 @@ def _noise_remedy(
     comparison = analysis.comparison
     asked, settings = _asked(analysis, result), comparison.settings
     lag1 = statement.lag1_autocorrelation
-    noise_absurd = asked is None or asked.sigma_z_m > NOISE_ABSURD.value * settings.sigma_z_m
-    if owner == "kf" and noise_absurd and lag1 > LAG1_SLOW.value:
-        sigma_a = float(f"{sigma_a_asked(result.axis, settings):.2g}")
+    tuned = tuned_for(analysis, result.axis.name)
+    needed = None if tuned is None else tuned.filter_sigma_a.value
+    if owner == "kf" and needed and needed > settings.sigma_a_m_s2 and lag1 > LAG1_SLOW.value:
+        sigma_a = float(f"{needed:.3g}")
         typed = f"--sigma-a {sigma_a:g}"
         words = filter_words(comparison, replace(settings, sigma_a_m_s2=sigma_a), typed)
         return (
@@ -167,10 +184,12 @@ def _noise_remedy(
             f"{words}",
             ELSEWHERE,
         )
+    if tuned is None:
+        return "Which noise the data ask for could not be told: see tuning.", ELSEWHERE
     if asked is None:
         return (
-            "No SIGMA_Z up to 30 m explains it: look at the acceleration input "
-            "(IMU rate, gaps, vibration) and at the clocks.",
+            f"No SIGMA_Z up to {SIGMA_Z_SEARCH_M[1]:g} m explains it: look at the acceleration "
+            "input (IMU rate, gaps, vibration) and at the clocks.",
             ELSEWHERE,
         )
     if owner == "kf":
@@ -178,7 +197,7 @@ def _noise_remedy(
     return _ekf2_remedy(analysis, result, asked, statement)
 
 
-def _kf_remedy(analysis: Analysis, asked: NoiseAsked, statement: Consistency) -> tuple[str, str]:
+def _kf_remedy(analysis: Analysis, asked: SourceNoise, statement: Consistency) -> tuple[str, str]:
     comparison = analysis.comparison
     settings = comparison.settings
     noise = max(asked.sigma_z_m, SMALLEST_NOISE.value)
@@ -204,7 +223,7 @@ def _kf_remedy(analysis: Analysis, asked: NoiseAsked, statement: Consistency) ->
 
 
 def _ekf2_remedy(
-    analysis: Analysis, result: AxisComparison, asked: NoiseAsked, statement: Consistency
+    analysis: Analysis, result: AxisComparison, asked: SourceNoise, statement: Consistency
 ) -> tuple[str, str]:
     parameters = analysis.comparison.flight.log.parameters
     used, set_noise = _ekf2_noise(result), parameters.get("EKF2_EVP_NOISE", np.nan)

@@ -138,7 +138,6 @@ def _settings(comparison: Comparison) -> made.ChosenSettings:
 
 def _axis(result: AxisComparison) -> made.Axis:
     updates = result.replay.updates
-    asked = result.noise_asked
     north, east, down = result.axis.direction
     return made.Axis(
         heading_deg=result.axis.heading_deg,
@@ -150,7 +149,6 @@ def _axis(result: AxisComparison) -> made.Axis:
             last_s=float(updates.index[-1]),
             rate_hz=sample_rate(updates) if len(updates) > 1 else None,
             input_gap_s=result.replay.input_gap_s,
-            noise_asked=None if asked is None else copied(made.NoiseAsked, asked),
         ),
         kf=_filter(result.kf),
         ekf2=made.UnjudgedFilter(copied(Missing, result.ekf2))

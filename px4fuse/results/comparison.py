@@ -212,13 +212,6 @@ class Horizontal(Base, frozen=True):
     ekf2: HorizontalNis | None = None
 
 
-class NoiseAsked(Base, frozen=True):
-    """Measurement noise at which the median NIS takes its chi-square value."""
-
-    sigma_z_m: NotNegative
-    upper_bound: bool
-
-
 class Updates(Base, frozen=True, kw_only=True):
     """The measurements of one axis; ``input_gap_s`` is the longest gap of the IMU."""
 
@@ -227,7 +220,6 @@ class Updates(Base, frozen=True, kw_only=True):
     last_s: float
     rate_hz: Positive | None = None
     input_gap_s: NotNegative
-    noise_asked: NoiseAsked | None = None
 
 
 class Difference(Base, frozen=True):

@@ -45,7 +45,6 @@ ESTIMATES = (
     "tuning", "clock", "ekf2_replay", "why", "findings", "loop.closures", "loop.corrections",
     "position_source.alignment", "settings.clock_offset_s",
 )  # fmt: skip
-ESTIMATED_WITHIN = "noise_asked"
 # How often a solver went round
 ITERATIONS, MORE_ITERATIONS = "iterations", 2
 # What tells the machine that a report was made on, and no number of it
@@ -222,7 +221,7 @@ def compare_results(recorded: Mapping[str, Any], recomputed: Mapping[str, Any]) 
     pairs: list[tuple[float, float]] = []
     for path, theirs, ours in leaves:
         if _is_number(theirs) and _is_number(ours):
-            wide = everywhere or path.startswith(ESTIMATES) or ESTIMATED_WITHIN in path
+            wide = everywhere or path.startswith(ESTIMATES)
             if not _near(path, theirs, ours, wide):
                 wrong[path] = theirs, ours
             elif theirs != ours:
