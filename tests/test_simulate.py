@@ -642,11 +642,13 @@ def test_ideal_flights_are_consistent_as_often_as_chance_has_it():
 
 
 @pytest.mark.parametrize("scenario", [Scenario(seed=7, passes=4), LOOP], ids=["aisle", "loop"])
-def test_clean_flight_has_one_finding_that_its_ekf2_is_a_model(scenario):
+def test_clean_flight_has_no_mistake(scenario):
+    """A loop's VIO drifts, which is no mistake; that filters follow it is said."""
     settings = Settings(sigma_a_m_s2=0.2, sigma_z_m=scenario.source_sigma_m)
     compared = px4fuse.compare(simulate_flight(scenario), settings)
     findings = find(unexplained(compared))
-    assert [finding.id for finding in findings] == ["ekf2_is_a_model"]
+    drift = ["errors_larger_than_claimed"] if scenario.kind == "loop" else []
+    assert [finding.id for finding in findings] == [*drift, "ekf2_is_a_model"]
     for axis in compared.axes:
         assert axis.kf_truth.position_rmse_m < (0.12 if scenario.kind == "aisle" else 0.7)
 
@@ -667,7 +669,7 @@ def test_clean_flight_has_one_finding_that_its_ekf2_is_a_model(scenario):
 def test_mistake_is_found(text, finding):
     flight = simulate_flight(Scenario(seed=7, passes=2), parse([text]))
     compared = px4fuse.compare(flight, Settings(sigma_a_m_s2=0.2), axes=("aisle", "north"))
-    assert finding in [found.id for found in find(unexplained(compared))]
+    assert finding in [name for found in find(unexplained(compared)) for name in found.ids]
 
 
 # --- the command

@@ -25,13 +25,9 @@ def _remedy(analysis: Analysis) -> str:
     model = analysis.ekf2_model
     if isinstance(model, Unavailable):
         return f"{IN_ORDER} {not_replayed(model)}"
-    asked = {
-        name: value
-        for name, value in asked_of_ekf2(
-            analysis.comparison, model, analysis.tuning, analysis.clock
-        ).items()
-        if value != model.inputs.settings[name]
-    }
+    wanted = asked_of_ekf2(analysis.comparison, model, analysis.tuning, analysis.clock)
+    flown = model.inputs.settings
+    asked = {name: value for name, value in wanted.items() if value != flown[name]}
     delay = {name: value for name, value in asked.items() if "DELAY" in name}
     noise = {name: value for name, value in asked.items() if name not in delay}
     both = asked if noise and delay else {}
@@ -44,7 +40,11 @@ def _remedy(analysis: Analysis) -> str:
     for effect in effects:
         if rejects_less(effect.before, effect.after):
             return f"Set {settings_words(effect.changes)}: {effect.words()}."
-    said = f"{OUTLIERS} What EKF2 fused does not tell its noise here."
+    said = (
+        f"{OUTLIERS} EKF2's parameters are what the data ask for."
+        if wanted
+        else f"{OUTLIERS} What EKF2 fused does not tell its noise here."
+    )
     if effects:
         said = (
             f"With what the data ask for ({settings_words(effects[-1].changes)}) the rejections "
