@@ -8,11 +8,14 @@ from functools import cache
 import numpy as np
 import pandas as pd
 import pytest
+from flights import aisle_flight, unexplained
 from scipy.spatial.transform import Rotation
 
-from px4fuse.filter.heading import DRIFT_P, HeadingError, heading_error
+from px4fuse.comparison.comparison import compare
+from px4fuse.filter.heading import DRIFT_P, HeadingError, HeadingPart, heading_error
 from px4fuse.filter.kalman import Settings
 from px4fuse.filter.signals import choose_segment, choose_source
+from px4fuse.findings import Finding, source_frame_turned
 from px4fuse.flight import QUATERNION_COLUMNS, ROTATION_VARIANCE_COLUMNS, Flight, Unavailable
 from px4fuse.readers import read_log
 from px4fuse.simulation.flights import simulate_flight
@@ -20,7 +23,7 @@ from px4fuse.simulation.mistakes import parse
 from px4fuse.simulation.scenario import Scenario
 
 SIGMA_UWB_M = 0.03
-WANDER_DEG = 24.0
+WANDER_DEG = 40.0
 
 
 @cache
@@ -59,7 +62,7 @@ def test_a_constant_turn_comes_back_and_is_called_constant(turn_deg):
 
 
 def test_a_heading_that_wanders_is_followed():
-    flight, turn = wandering(flown())
+    flight, turn = wandering(flown(passes=6))
     found = estimated(flight)
     assert isinstance(found, HeadingError)
     assert found.by == "positions"
@@ -121,12 +124,58 @@ def test_motion_capture_flights(shared_logs, log, drifts, low, high):
     assert isinstance(found, HeadingError)
     assert found.drifts == drifts
     assert all(low < part.heading_error_deg < high for part in found.parts)
+    middles = [(part.start_s + part.end_s) / 2.0 for part in found.parts]
     # and the positions alone say the same
     tracks = tuple(replace(track, orientation=None) for track in flight.positions)
     alone = estimated(replace(flight, positions=tracks), 0.001)
     assert isinstance(alone, HeadingError)
-    middles = [(part.start_s + part.end_s) / 2.0 for part in alone.parts]
-    turns = [part.heading_error_deg for part in alone.parts]
-    for part in found.parts:
-        turn = np.interp((part.start_s + part.end_s) / 2.0, middles, turns)
-        assert turn == pytest.approx(part.heading_error_deg, abs=6.0)
+    for part in alone.parts:
+        middle = (part.start_s + part.end_s) / 2.0
+        turn = np.interp(middle, middles, [one.heading_error_deg for one in found.parts])
+        assert part.heading_error_deg == pytest.approx(turn, abs=8.0)
+
+
+# ---- what is said of it -------------------------------------------------------------------------
+
+
+def named(heading: HeadingError, **track: object) -> dict[str, Finding]:
+    flight = aisle_flight(duration_s=20.0)
+    (source,) = flight.positions
+    comparison = compare(replace(flight, positions=(replace(source, **track),)), axes=("north",))
+    analysis = replace(unexplained(comparison), heading=heading)
+    return {finding.id: finding for finding in source_frame_turned.DETECTOR.detect(analysis)}
+
+
+def made(*turns_deg: float, drift_p: float) -> HeadingError:
+    parts = [HeadingPart(2.0 * i, 2.0 * i + 2.0, turn, 1.0) for i, turn in enumerate(turns_deg)]
+    return HeadingError(tuple(parts), drift_p, "positions")
+
+
+def test_a_drifting_heading_is_named_with_its_ends_and_no_turn_is_offered():
+    found = named(made(-36.0, -20.0, -9.0, drift_p=1e-9))
+    assert list(found) == ["ekf2_heading_wrong"]
+    finding = found["ekf2_heading_wrong"]
+    assert finding.severity == "error"
+    for words in ("heading drifts", "-36° from 0 to 2 s", "-9° from 4 to 6 s"):
+        assert words in finding.message
+    assert "--position-yaw" not in finding.remedy
+    assert (finding.evidence["from_deg"], finding.evidence["to_deg"]) == (-36.0, -9.0)
+
+
+def test_a_constant_turn_is_offered_to_be_turned_back():
+    found = named(made(20.0, 21.0, 19.0, drift_p=0.5))
+    assert list(found) == ["source_frame_turned"]
+    assert "-20°" in found["source_frame_turned"].remedy
+    assert "--position-yaw" in found["source_frame_turned"].remedy
+
+
+def test_what_ekf2_has_turned_already_is_not_turned_again():
+    found = named(made(20.0, 21.0, 19.0, drift_p=0.5), name="estimator_visual_odometry_aligned")
+    assert list(found) == ["ekf2_heading_wrong"]
+    assert "--position-yaw" not in found["ekf2_heading_wrong"].remedy
+    assert named(made(20.0, 21.0, 19.0, drift_p=0.5), reconstructed=True) == {}
+
+
+def test_changes_within_chance_or_too_small_to_matter_are_none():
+    assert named(made(-3.0, 0.0, 4.0, drift_p=0.2)) == {}
+    assert named(made(-2.0, 0.0, 2.0, drift_p=1e-9)) == {}

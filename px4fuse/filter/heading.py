@@ -40,7 +40,7 @@ MIN_PART_SAMPLES = 3
 # More say nothing new about a heading, but cost time
 MAX_MEASUREMENTS = 1000
 # Parts further apart than chance would put them
-DRIFT_P = 0.001
+DRIFT_P = 0.002
 MIN_DRIFT_DEG = 5.0
 # Turning faster, a late stamp looks like a wrong heading: 0.2 s of it are 2°
 MAX_TURN_RATE_DEG_S = 10.0
