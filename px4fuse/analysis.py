@@ -23,6 +23,7 @@ from px4fuse.ekf2.whatif import WhatIf, sweep_values, what_if
 from px4fuse.errors import LogError, MissingDataError, SettingsError
 from px4fuse.filter.clock import ClockOffset, estimate_clock_offset
 from px4fuse.filter.fitting import Noises
+from px4fuse.filter.heading import HeadingError, heading_error
 from px4fuse.filter.kalman import Settings
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, tune
 from px4fuse.flight import Flight, Unavailable
@@ -76,6 +77,8 @@ class Analysis:
         Why EKF2 differs.
     loop : Loop or Unavailable
         Loop closure of the flight's odometry.
+    heading : HeadingError or Unavailable
+        How the source's frame is turned against the vehicle's heading.
     """
 
     comparison: Comparison
@@ -84,6 +87,7 @@ class Analysis:
     ekf2_model: Model | Unavailable
     why: Mapping[str, Why | Unavailable]
     loop: Loop | Unavailable
+    heading: HeadingError | Unavailable
 
     @property
     def ekf2_replay(self) -> Ekf2Replay | Unavailable:
@@ -332,8 +336,10 @@ def explain(comparison: Comparison, progress: Progress = _silent) -> Analysis:
     progress("replaying EKF2")
     model = open_model(comparison.flight)
     why = why_ekf2_differs(comparison, model, tuning, clock)
+    heading = _heading(comparison, tuning, clock, progress)
     progress("looking for a loop")
-    return Analysis(comparison, tuning, clock, model, why, loop_in(comparison.flight, progress))
+    loop = loop_in(comparison.flight, progress)
+    return Analysis(comparison, tuning, clock, model, why, loop, heading)
 
 
 def tuned_horizontally(comparison: Comparison) -> Tuning:
@@ -380,6 +386,26 @@ def clock_offset(
     if isinstance(found, ClockOffset) and may_drift(comparison.flight, comparison.source):
         return with_drift(found)
     return found
+
+
+def _heading(
+    comparison: Comparison, tuning: Tuning, clock: ClockOffset | Unavailable, progress: Progress
+) -> HeadingError | Unavailable:
+    """Turn of the source's frame, with the noise and the clock offset that were found."""
+    progress("heading")
+    tuned = tuning.get(HORIZONTAL)
+    sigma_z_m = comparison.settings.sigma_z_m
+    if isinstance(tuned, AxisTuning):
+        sigma_z_m = tuned.sigma_z.value or tuned.sigma_z.high or sigma_z_m
+    known = isinstance(clock, ClockOffset) and clock.determinable
+    return heading_error(
+        comparison.flight,
+        comparison.source,
+        comparison.segment,
+        comparison.settings,
+        sigma_z_m,
+        clock.offset_s if known and isinstance(clock, ClockOffset) else 0.0,
+    )
 
 
 def imu_too_slow_for_clocks(flight: Flight) -> Unavailable | None:

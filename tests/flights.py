@@ -329,5 +329,5 @@ def unexplained(comparison: Comparison) -> Analysis:
     """Make an analysis that knows nothing but the comparison."""
     return Analysis(
         comparison, {}, unavailable("clock offset"), unavailable("EKF2 replay"), {},
-        unavailable("loop closure"),
+        unavailable("loop closure"), unavailable("heading error"),
     )  # fmt: skip

@@ -1,0 +1,360 @@
+"""How the frame of the positions is turned against the vehicle's heading, over the flight.
+
+A magnetometer indoors may turn EKF2's heading by tens of degrees within one flight, so that one
+number for the whole flight would be wrong at every moment. Where the source carries an orientation
+of its own, the two headings are compared at its samples. Otherwise the positions are filtered
+along north and east together, with the acceleration of the IMU turned by the logged attitude, and
+the turn is a state that may walk: state [p, v, b, η], b what the acceleration is off by in NED
+(m/s²) and η the turn (rad) beyond the one about which the rotation is taken to first order.
+Whether it walks is told by the likelihood ratio.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import product
+from typing import Literal
+
+import numpy as np
+import pandas as pd
+from scipy.integrate import cumulative_trapezoid
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+
+from px4fuse.arrays import Array
+from px4fuse.filter.kalman import Settings
+from px4fuse.filter.model import INITIAL_SIGMA_P_M, INITIAL_SIGMA_V_M_S, noise_of_many_steps
+from px4fuse.filter.signals import IMU_GAP_S, Segment, ned_acceleration, within
+from px4fuse.flight import (
+    POSITION_COLUMNS,
+    QUATERNION_COLUMNS,
+    Flight,
+    PositionTrack,
+    Unavailable,
+)
+
+PART_S = 2.0
+MIN_PARTS = 3
+MIN_MEASUREMENTS = 50
+MIN_PART_SAMPLES = 3
+# More say nothing new about a heading, but cost time
+MAX_MEASUREMENTS = 1000
+# Parts further apart than chance would put them
+DRIFT_P = 0.002
+MIN_DRIFT_DEG = 5.0
+# Turning faster, a late stamp looks like a wrong heading: 0.2 s of it are 2°
+MAX_TURN_RATE_DEG_S = 10.0
+# What two headings differ by that agree: mounting, vibration, rounding
+LEAST_SIGMA_DEG = 0.5
+# Slower, and the acceleration between IMU samples is not known
+MAX_IMU_INTERVAL_S = 0.025
+LINEARISATIONS = 3
+STATE_COUNT = 7
+TURN = 6
+INITIAL_SIGMA_BIAS_M_S2 = 0.3
+INITIAL_SIGMA_TURN_RAD = 0.6
+GAP_SIGMA = 5.0  # m and m/s, over a gap of the IMU
+# Walks over one second: of the turn (rad; none first), of the acceleration's error (m/s²), and
+# SIGMA_A (m/s²)
+TURN_WALKS = np.radians([0.0, 0.3, 1.0, 3.0])
+BIAS_WALKS = np.array([0.003, 0.03])
+SIGMA_AS = np.array([0.03, 0.1, 0.3, 1.0])
+
+
+@dataclass(frozen=True)
+class HeadingPart:
+    """Turn of one part of the flight: start and end (s), turn and its standard deviation."""
+
+    start_s: float
+    end_s: float
+    heading_error_deg: float
+    sigma_deg: float
+
+
+@dataclass(frozen=True)
+class HeadingError:
+    """By how much the source's frame is turned against the logged attitude, over the flight.
+
+    Attributes
+    ----------
+    parts : tuple of HeadingPart
+        Consecutive, clockwise seen from above; what the frame and the attitude have in common all
+        along is in each.
+    drift_p : float
+        p-value of "it is the same throughout".
+    by : {"orientation", "positions"}
+        What it was found with.
+    """
+
+    parts: tuple[HeadingPart, ...]
+    drift_p: float
+    by: Literal["orientation", "positions"]
+
+    @property
+    def ends(self) -> tuple[HeadingPart, HeadingPart]:
+        """The parts of the least and of the greatest turn, the earlier one first."""
+        turns = [part.heading_error_deg for part in self.parts]
+        first, last = sorted((int(np.argmin(turns)), int(np.argmax(turns))))
+        return self.parts[first], self.parts[last]
+
+    @property
+    def drifts(self) -> bool:
+        """Whether the turn changes beyond chance, and by enough to matter."""
+        first, last = self.ends
+        change = abs(last.heading_error_deg - first.heading_error_deg)
+        return self.drift_p < DRIFT_P and change >= MIN_DRIFT_DEG
+
+    @property
+    def turn_deg(self) -> float:
+        """Mean over the flight."""
+        return float(np.mean([part.heading_error_deg for part in self.parts]))
+
+    @property
+    def sigma_deg(self) -> float:
+        """Standard deviation of the mean: what the parts have in common is not averaged out."""
+        return float(np.mean([part.sigma_deg for part in self.parts]))
+
+
+def heading_error(
+    flight: Flight,
+    track: PositionTrack,
+    segment: Segment,
+    settings: Settings,
+    sigma_z_m: float,
+    offset_s: float = 0.0,
+) -> HeadingError | Unavailable:
+    """Estimate the turn of the source's frame against the logged attitude over the flight.
+
+    Parameters
+    ----------
+    flight : Flight
+    track : PositionTrack
+    segment : Segment
+    settings : Settings
+        ``dt_s`` gives SIGMA_A its meaning.
+    sigma_z_m : float
+        Noise of the positions.
+    offset_s : float
+        To be added to the track's stamps.
+
+    Returns
+    -------
+    HeadingError, or Unavailable where there is no attitude, or too few measurements or IMU samples.
+    """
+    if isinstance(flight.attitude, Unavailable):
+        return flight.attitude
+    compared = None
+    if track.orientation is not None:
+        compared = _by_orientation(flight.attitude, track.orientation, segment, offset_s)
+        if compared is not None and compared.drifts:
+            return compared
+    acceleration = ned_acceleration(flight)
+    if isinstance(acceleration, Unavailable):
+        return acceleration
+    samples = within(track.samples, segment)[POSITION_COLUMNS[:2]].dropna()
+    samples = samples.set_axis(samples.index.to_numpy() + offset_s)
+    low, high = acceleration.index[[0, -1]]
+    samples = samples[(samples.index >= low) & (samples.index <= high)]
+    slow = np.median(np.diff(acceleration.index.to_numpy())) > MAX_IMU_INTERVAL_S
+    if slow or len(samples) < MIN_MEASUREMENTS:
+        return Unavailable(
+            "heading error",
+            "the IMU is too slow" if slow else f"{len(samples)} measurements are too few",
+            "Log sensor_combined at its full rate, and analyse a longer segment.",
+        )
+    samples = samples.iloc[:: int(np.ceil(len(samples) / MAX_MEASUREMENTS))]
+    found = _by_positions(acceleration, samples, settings.dt_s, sigma_z_m)
+    # how the source's own axes lie in the vehicle is not known, but that they do not turn is
+    return found if compared is None else replace(found, drift_p=1.0)
+
+
+def _parts(time: Array, turn: Array, sigma: Array) -> tuple[HeadingPart, ...]:
+    """Means over parts of equal length, in degrees."""
+    count = max(int((time[-1] - time[0]) / PART_S), 1)
+    edges = np.searchsorted(time, np.linspace(time[0], time[-1], count + 1)[1:-1])
+    return tuple(
+        HeadingPart(
+            float(time[rows[0]]),
+            float(time[rows[-1]]),
+            float(np.degrees(turn[rows].mean())),
+            float(np.degrees(np.sqrt(np.mean(sigma[rows] ** 2)))),
+        )
+        for rows in np.split(np.arange(len(time)), edges)
+        if len(rows) >= MIN_PART_SAMPLES
+    )
+
+
+def _yaw(quaternions: pd.DataFrame) -> Array:
+    values = quaternions[QUATERNION_COLUMNS].to_numpy(copy=True)
+    angles: Array = Rotation.from_quat(values, scalar_first=True).as_euler("ZYX")[:, 0]
+    return np.unwrap(angles)
+
+
+def _by_orientation(
+    attitude: pd.DataFrame, orientation: pd.DataFrame, segment: Segment, offset_s: float
+) -> HeadingError | None:
+    """The source's heading minus the attitude's, while the vehicle hardly turns."""
+    inside = within(orientation, segment)
+    time = inside.index.to_numpy() + offset_s
+    known = attitude.index.to_numpy()
+    covered = (time >= known[0]) & (time <= known[-1])
+    if np.count_nonzero(covered) < MIN_PARTS * MIN_PART_SAMPLES:
+        return None
+    own, time = _yaw(inside)[covered], time[covered]
+    yaw = np.interp(time, known, _yaw(attitude))
+    turn = own - yaw
+    turn -= 2.0 * np.pi * np.round(np.median(turn) / (2.0 * np.pi))
+    calm = np.abs(np.gradient(yaw, time)) < np.radians(MAX_TURN_RATE_DEG_S)
+    if np.count_nonzero(calm) < MIN_PARTS * MIN_PART_SAMPLES:
+        return None
+    time, turn = time[calm], turn[calm]
+    # what two neighbours differ by is noise; it does not shrink with their number
+    noise = 1.4826 * np.median(np.abs(np.diff(turn))) / np.sqrt(2.0)
+    sigma = np.full(len(time), max(float(noise), np.radians(LEAST_SIGMA_DEG)))
+    parts = _parts(time, turn, sigma)
+    if len(parts) < MIN_PARTS:
+        return None
+    found = np.array([part.heading_error_deg for part in parts])
+    square = np.sum((found - found.mean()) ** 2) / np.degrees(sigma[0]) ** 2
+    return HeadingError(parts, float(chi2.sf(square, len(parts) - 1)), "orientation")
+
+
+@dataclass(frozen=True)
+class _Legs:
+    """What the acceleration adds between measurements, and F and Q without the turn.
+
+    ``moved`` has shape (n, 4): north and east of position (m), then of velocity (m/s).
+    """
+
+    moved: Array
+    dt_s: Array
+    gap: Array
+
+
+def _by_positions(
+    acceleration: pd.DataFrame, samples: pd.DataFrame, dt_s: float, sigma_z: float
+) -> HeadingError:
+    time, measured = samples.index.to_numpy(), samples.to_numpy()
+    legs = _legs(acceleration, time)
+    grid = np.array(list(product(TURN_WALKS, BIAS_WALKS, SIGMA_AS)))
+    still = grid[grid[:, 0] == 0.0]
+
+    def likelihood(turn: float, noises: Array) -> tuple[Array, Array]:
+        log_p, _, states, _ = _filter(legs, measured, turn, noises, sigma_z, dt_s)
+        return log_p, states[:, TURN]
+
+    turn = 0.0
+    for _ in range(LINEARISATIONS):
+        log_p, found = likelihood(turn, still)
+        turn += float(found[np.argmax(log_p)])
+    turn = float(np.angle(np.exp(1j * turn)))
+    log_p, _ = likelihood(turn, grid)
+    ratio = 2.0 * (log_p.max() - log_p[grid[:, 0] == 0.0].max())
+    smoothed, sigma = _smooth(legs, measured, turn, grid[[np.argmax(log_p)]], sigma_z, dt_s)
+    # at the end of its range a walk is half of the time none
+    p = 0.5 * float(chi2.sf(ratio, 1)) if ratio > 0.0 else 1.0
+    return HeadingError(_parts(time, turn + smoothed, sigma), p, "positions")
+
+
+def _legs(acceleration: pd.DataFrame, time: Array) -> _Legs:
+    known, value = acceleration.index.to_numpy(), acceleration.to_numpy()[:, :2]
+    speed = cumulative_trapezoid(value, known, axis=0, initial=0)
+    way = cumulative_trapezoid(speed, known, axis=0, initial=0)
+    v, p = (
+        np.column_stack([np.interp(time, known, one) for one in both.T]) for both in (speed, way)
+    )
+    dt = np.diff(time)
+    gaps = np.concatenate([[0.0], np.cumsum(np.diff(known) > IMU_GAP_S)])
+    passed = np.diff(np.interp(time, known, gaps)) > 0.0
+    moved = np.hstack([np.diff(p, axis=0) - v[:-1] * dt[:, None], np.diff(v, axis=0)])
+    return _Legs(moved, dt, passed)
+
+
+def _transition(moved: Array, dt: float, turn: float) -> tuple[Array, Array]:
+    """F and the input of one leg, the rotation to first order about ``turn``."""
+    cosine, sine = np.cos(turn), np.sin(turn)
+    rotation = np.array([[cosine, -sine], [sine, cosine]])
+    slope = np.array([[-sine, -cosine], [cosine, -sine]])
+    F = np.eye(STATE_COUNT)
+    F[:2, 2:4] = dt * np.eye(2)
+    F[:2, 4:6] = dt**2 / 2.0 * np.eye(2)
+    F[2:4, 4:6] = dt * np.eye(2)
+    F[:4, TURN] = np.concatenate([slope @ moved[:2], slope @ moved[2:]])
+    push = np.zeros(STATE_COUNT)
+    push[:4] = np.concatenate([rotation @ moved[:2], rotation @ moved[2:]])
+    return F, push
+
+
+def _noise(noises: Array, dt: float, dt_s: float, gap: bool) -> Array:
+    """Q of one leg for each setting, shape (k, 7, 7)."""
+    Q = np.zeros((len(noises), STATE_COUNT, STATE_COUNT))
+    q00, q01, q11 = noise_of_many_steps(dt)
+    level = noises[:, 2] ** 2 * dt_s
+    for axis in range(2):
+        Q[:, axis, axis] = level * q00 + GAP_SIGMA**2 * gap
+        Q[:, axis, axis + 2] = Q[:, axis + 2, axis] = level * q01
+        Q[:, axis + 2, axis + 2] = level * q11 + GAP_SIGMA**2 * gap
+        Q[:, axis + 4, axis + 4] = noises[:, 1] ** 2 * dt
+    Q[:, TURN, TURN] = noises[:, 0] ** 2 * dt
+    return Q
+
+
+def _start(measured: Array, count: int) -> tuple[Array, Array]:
+    x = np.zeros((count, STATE_COUNT))
+    x[:, :2] = measured[0]
+    sigmas = np.repeat(
+        [INITIAL_SIGMA_P_M, INITIAL_SIGMA_V_M_S, INITIAL_SIGMA_BIAS_M_S2, INITIAL_SIGMA_TURN_RAD],
+        [2, 2, 2, 1],
+    )
+    return x, np.broadcast_to(np.diag(sigmas**2), (count, STATE_COUNT, STATE_COUNT)).copy()
+
+
+Step = tuple[Array, Array, Array, Array, Array]
+
+
+def _filter(
+    legs: _Legs, measured: Array, turn: float, noises: Array, sigma_z: float, dt_s: float
+) -> tuple[Array, Array, Array, list[Step]]:
+    """Log-likelihood of each setting with the best scale of all noises, that scale, the last state.
+
+    Also every step's F, prior state and covariance, and posterior ones.
+    """
+    x, P = _start(measured, len(noises))
+    square, log_s = np.zeros(len(noises)), np.zeros(len(noises))
+    steps: list[Step] = []
+    R = sigma_z**2 * np.eye(2)
+    for k, dt in enumerate(legs.dt_s.tolist()):
+        F, push = _transition(legs.moved[k], dt, turn)
+        x = x @ F.T + push
+        P = F @ P @ F.T + _noise(noises, dt, dt_s, bool(legs.gap[k]))
+        prior = x, P
+        S = P[:, :2, :2] + R
+        gain = np.swapaxes(np.linalg.solve(S, P[:, :2, :]), 1, 2)
+        nu = measured[k + 1] - x[:, :2]
+        square += np.einsum("ki,ki->k", nu, np.linalg.solve(S, nu[..., None])[..., 0])
+        log_s += np.log(np.linalg.det(S))
+        x = x + np.einsum("kij,kj->ki", gain, nu)
+        P = P - gain @ P[:, :2, :]
+        P = (P + np.swapaxes(P, 1, 2)) / 2.0
+        steps.append((F, *prior, x, P))
+    count = 2 * len(legs.dt_s)
+    scale = square / count
+    return -0.5 * (count * np.log(scale) + log_s), scale, x, steps
+
+
+def _smooth(
+    legs: _Legs, measured: Array, turn: float, noises: Array, sigma_z: float, dt_s: float
+) -> tuple[Array, Array]:
+    """Turn at every measurement by all of them, and its standard deviation (Rauch et al. 1965)."""
+    _, scale, _, steps = _filter(legs, measured, turn, noises, sigma_z, dt_s)
+    x, P = _start(measured, 1)
+    before = [(x[0], P[0]), *((step[3][0], step[4][0]) for step in steps)]
+    state, covariance = before[-1]
+    turns, variances = [state[TURN]], [covariance[TURN, TURN]]
+    for (x_k, P_k), (F, prior, spread, _, _) in zip(before[-2::-1], steps[::-1], strict=True):
+        gain = np.linalg.solve(spread[0], F @ P_k).T
+        state = x_k + gain @ (state - prior[0])
+        covariance = P_k + gain @ (covariance - spread[0]) @ gain.T
+        turns.append(state[TURN])
+        variances.append(covariance[TURN, TURN])
+    return np.array(turns[::-1]), np.sqrt(scale[0] * np.maximum(np.array(variances[::-1]), 0.0))

@@ -1,0 +1,181 @@
+"""The turn of the source's frame over the flight, against flights whose heading is known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pandas as pd
+import pytest
+from flights import aisle_flight, unexplained
+from scipy.spatial.transform import Rotation
+
+from px4fuse.comparison.comparison import compare
+from px4fuse.filter.heading import DRIFT_P, HeadingError, HeadingPart, heading_error
+from px4fuse.filter.kalman import Settings
+from px4fuse.filter.signals import choose_segment, choose_source
+from px4fuse.findings import Finding, source_frame_turned
+from px4fuse.flight import QUATERNION_COLUMNS, ROTATION_VARIANCE_COLUMNS, Flight, Unavailable
+from px4fuse.readers import read_log
+from px4fuse.simulation.flights import simulate_flight
+from px4fuse.simulation.mistakes import parse
+from px4fuse.simulation.scenario import Scenario
+
+SIGMA_UWB_M = 0.03
+WANDER_DEG = 40.0
+
+
+@cache
+def flown(*mistakes: str, seed: int = 3, **scenario: float) -> Flight:
+    made = Scenario(seed=seed, **{"sigma_uwb_m": SIGMA_UWB_M, "passes": 4, **scenario})
+    return simulate_flight(made, parse(mistakes))
+
+
+def estimated(flight: Flight, sigma_z_m: float = SIGMA_UWB_M) -> HeadingError | Unavailable:
+    track, _ = choose_source(flight)
+    return heading_error(flight, track, choose_segment(flight, track), Settings(), sigma_z_m)
+
+
+def turned(quaternions: pd.DataFrame, turn_deg: np.ndarray) -> pd.DataFrame:
+    """The same orientations with a heading that is wrong."""
+    values = quaternions[QUATERNION_COLUMNS].to_numpy(copy=True)
+    wrong = Rotation.from_euler("Z", turn_deg[:, None], degrees=True)
+    made = (wrong * Rotation.from_quat(values, scalar_first=True)).as_quat(scalar_first=True)
+    return pd.DataFrame(made, index=quaternions.index, columns=QUATERNION_COLUMNS)
+
+
+def wandering(flight: Flight) -> tuple[Flight, np.ndarray]:
+    """A magnetometer turns the logged attitude more and more; and by how much at each sample."""
+    assert isinstance(flight.attitude, pd.DataFrame)
+    turn = WANDER_DEG * np.linspace(0.0, 1.0, len(flight.attitude))
+    return replace(flight, attitude=turned(flight.attitude, turn)), turn
+
+
+@pytest.mark.parametrize("turn_deg", [0.0, 20.0, -40.0])
+def test_a_constant_turn_comes_back_and_is_called_constant(turn_deg):
+    found = estimated(flown(*([f"yaw={turn_deg:g}"] if turn_deg else [])))
+    assert isinstance(found, HeadingError)
+    assert not found.drifts
+    assert found.turn_deg == pytest.approx(turn_deg, abs=3.0 * found.sigma_deg)
+    assert found.sigma_deg < 3.0
+
+
+def test_a_heading_that_wanders_is_followed():
+    flight, turn = wandering(flown(passes=6))
+    found = estimated(flight)
+    assert isinstance(found, HeadingError)
+    assert found.by == "positions"
+    assert found.drift_p < DRIFT_P
+    assert found.drifts
+    for part in found.parts:
+        middle = (part.start_s + part.end_s) / 2.0
+        expected = -np.interp(middle, flight.attitude.index, turn)
+        assert part.heading_error_deg == pytest.approx(expected, abs=3.5 * part.sigma_deg)
+    first, last = found.ends
+    assert first.start_s < last.start_s
+    assert first.heading_error_deg > last.heading_error_deg
+
+
+def test_the_sources_own_orientation_tells_it_at_once():
+    flight, turn = wandering(flown())
+    true = pd.DataFrame(flown().attitude).iloc[::4]
+    oriented = true.assign(**dict.fromkeys(ROTATION_VARIANCE_COLUMNS, 1e-4))
+    tracks = tuple(replace(track, orientation=oriented) for track in flight.positions)
+    found = estimated(replace(flight, positions=tracks))
+    assert isinstance(found, HeadingError)
+    assert found.by == "orientation"
+    assert found.drifts
+    for part in found.parts:
+        middle = (part.start_s + part.end_s) / 2.0
+        expected = -np.interp(middle, flight.attitude.index, turn)
+        assert part.heading_error_deg == pytest.approx(expected, abs=0.5)
+
+
+def test_what_cannot_be_told_says_why():
+    flight = flown()
+    assert isinstance(
+        estimated(replace(flight, attitude=Unavailable("attitude", "", ""))), Unavailable
+    )
+    assert isinstance(estimated(replace(flight, imu=Unavailable("IMU", "", ""))), Unavailable)
+    slow = replace(flight, imu=flight.imu.iloc[::10])
+    found = estimated(slow)
+    assert isinstance(found, Unavailable)
+    assert "too slow" in found.reason
+    few = tuple(replace(t, samples=t.samples.iloc[:40]) for t in flight.positions)
+    found = estimated(replace(flight, positions=few))
+    assert isinstance(found, Unavailable)
+    assert "too few" in found.reason
+
+
+@pytest.mark.reallogs
+@pytest.mark.parametrize(
+    ("log", "drifts", "low", "high"),
+    [
+        ("vladimireganov_ROS_PX4_MOCAP_log_3_2022-6-9-13-01-36", True, -7.0, 3.0),
+        ("vladimireganov_ROS_PX4_MOCAP_square2", True, -30.0, -15.0),
+        ("mengchaoheng_PX4_ulog_plottools_hist_6a8cf408_test3", False, -5.0, 5.0),
+    ],
+)
+def test_motion_capture_flights(shared_logs, log, drifts, low, high):
+    """Their own orientation says how EKF2's heading, by the magnetometer, lies to the frame."""
+    flight = read_log(shared_logs / "real" / f"{log}.ulg")
+    found = estimated(flight, 0.001)
+    assert isinstance(found, HeadingError)
+    assert found.drifts == drifts
+    assert all(low < part.heading_error_deg < high for part in found.parts)
+    middles = [(part.start_s + part.end_s) / 2.0 for part in found.parts]
+    # and the positions alone say the same
+    tracks = tuple(replace(track, orientation=None) for track in flight.positions)
+    alone = estimated(replace(flight, positions=tracks), 0.001)
+    assert isinstance(alone, HeadingError)
+    for part in alone.parts:
+        middle = (part.start_s + part.end_s) / 2.0
+        turn = np.interp(middle, middles, [one.heading_error_deg for one in found.parts])
+        assert part.heading_error_deg == pytest.approx(turn, abs=8.0)
+
+
+# ---- what is said of it -------------------------------------------------------------------------
+
+
+def named(heading: HeadingError, **track: object) -> dict[str, Finding]:
+    flight = aisle_flight(duration_s=20.0)
+    (source,) = flight.positions
+    comparison = compare(replace(flight, positions=(replace(source, **track),)), axes=("north",))
+    analysis = replace(unexplained(comparison), heading=heading)
+    return {finding.id: finding for finding in source_frame_turned.DETECTOR.detect(analysis)}
+
+
+def made(*turns_deg: float, drift_p: float) -> HeadingError:
+    parts = [HeadingPart(2.0 * i, 2.0 * i + 2.0, turn, 1.0) for i, turn in enumerate(turns_deg)]
+    return HeadingError(tuple(parts), drift_p, "positions")
+
+
+def test_a_drifting_heading_is_named_with_its_ends_and_no_turn_is_offered():
+    found = named(made(-36.0, -20.0, -9.0, drift_p=1e-9))
+    assert list(found) == ["ekf2_heading_wrong"]
+    finding = found["ekf2_heading_wrong"]
+    assert finding.severity == "error"
+    for words in ("heading drifts", "-36° from 0 to 2 s", "-9° from 4 to 6 s"):
+        assert words in finding.message
+    assert "--position-yaw" not in finding.remedy
+    assert (finding.evidence["from_deg"], finding.evidence["to_deg"]) == (-36.0, -9.0)
+
+
+def test_a_constant_turn_is_offered_to_be_turned_back():
+    found = named(made(20.0, 21.0, 19.0, drift_p=0.5))
+    assert list(found) == ["source_frame_turned"]
+    assert "-20°" in found["source_frame_turned"].remedy
+    assert "--position-yaw" in found["source_frame_turned"].remedy
+
+
+def test_what_ekf2_has_turned_already_is_not_turned_again():
+    found = named(made(20.0, 21.0, 19.0, drift_p=0.5), name="estimator_visual_odometry_aligned")
+    assert list(found) == ["ekf2_heading_wrong"]
+    assert "--position-yaw" not in found["ekf2_heading_wrong"].remedy
+    assert named(made(20.0, 21.0, 19.0, drift_p=0.5), reconstructed=True) == {}
+
+
+def test_changes_within_chance_or_too_small_to_matter_are_none():
+    assert named(made(-3.0, 0.0, 4.0, drift_p=0.2)) == {}
+    assert named(made(-2.0, 0.0, 2.0, drift_p=1e-9)) == {}
