@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 from px4fuse import placing
@@ -19,8 +20,11 @@ from px4fuse.ekf2.replay import Ekf2Replay
 from px4fuse.ekf2.whatif import WhatIf, sweep_values, what_if
 from px4fuse.errors import LogError, MissingDataError, SettingsError
 from px4fuse.filter.clock import ClockOffset, estimate_clock_offset
+from px4fuse.filter.hypotheses import Explained, explained
 from px4fuse.filter.kalman import Settings
-from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, tune
+from px4fuse.filter.signals import AISLE, Axis
+from px4fuse.filter.smoothing import Smoothing, smoothing
+from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise, tune
 from px4fuse.flight import Flight, Unavailable
 from px4fuse.loop.analysis import analyse, loop_in
 from px4fuse.loop.loop import Loop
@@ -39,6 +43,9 @@ from px4fuse.request import (
 
 # What the report shows; each axis by itself is for `px4fuse tune`
 REPORTED = (HORIZONTAL, "down", "aisle")
+
+# An offset of the clock so far from zero is taken out before anything else is looked for
+SURE_SIGMAS = 3.0
 
 Progress = Callable[[str], None]
 Tuning = Mapping[str, AxisTuning | Unavailable]
@@ -79,6 +86,64 @@ class Analysis:
         """EKF2 replayed as flown, with its agreement with the log."""
         model = self.ekf2_model
         return model if isinstance(model, Unavailable) else model.flown
+
+    @cached_property
+    def explained(self) -> Explained | Unavailable:
+        """Biases, scale and jumps that explain the innovations better than noise."""
+        found = self._horizontally()
+        if isinstance(found, Unavailable):
+            return found
+        axes, tuned, offset_s = found
+        comparison = self.comparison
+        return explained(
+            comparison.flight,
+            axes,
+            comparison.segment,
+            comparison.settings,
+            sigma_a_m_s2=_size(tuned.sigma_a, comparison.settings.sigma_a_m_s2),
+            sigma_z_m=_size(tuned.sigma_z, comparison.settings.sigma_z_m),
+            outlier_time_s=tuned.outlier_time_s,
+            clock_offset_s=offset_s,
+        )
+
+    @cached_property
+    def smoothing(self) -> Smoothing | Unavailable:
+        """A low pass in the source."""
+        found = self._horizontally()
+        if isinstance(found, Unavailable):
+            return found
+        axes, tuned, offset_s = found
+        settings = self.comparison.settings
+        return smoothing(
+            axes,
+            settings,
+            sigma_a_m_s2=_size(tuned.sigma_a, settings.sigma_a_m_s2),
+            sigma_z_m=_size(tuned.sigma_z, settings.sigma_z_m),
+            outlier_time_s=tuned.outlier_time_s,
+            clock_offset_s=offset_s,
+        )
+
+    def _horizontally(self) -> tuple[tuple[Axis, ...], AxisTuning, float] | Unavailable:
+        """The horizontal axes, their noises, and a clock offset (s) that is beyond doubt."""
+        axes = {result.axis.name: result.axis for result in self.comparison.axes}
+        for name, group in ((HORIZONTAL, ("north", "east")), (AISLE, (AISLE,))):
+            tuned = self.tuning.get(name)
+            if isinstance(tuned, AxisTuning) and axes.keys() >= set(group):
+                clock, offset_s = self.clock, 0.0
+                if isinstance(clock, ClockOffset) and clock.determinable:
+                    sure = abs(clock.offset_s) > SURE_SIGMAS * clock.sigma_s
+                    offset_s = clock.offset_s if sure else 0.0
+                return tuple(axes[each] for each in group), tuned, offset_s
+        return Unavailable(
+            "causes beyond noise",
+            "the noises of the horizontal axes are not known",
+            "Analyse north and east, or the aisle (--axis).",
+        )
+
+
+def _size(noise: Noise, otherwise: float) -> float:
+    """Most likely value of a noise, or its bound, or what was set."""
+    return noise.value or noise.high or otherwise
 
 
 def run(request: ComparisonRequest, progress: Progress = _silent) -> Analysis:
