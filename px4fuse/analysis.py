@@ -19,8 +19,8 @@ from px4fuse.ekf2.parameters import check
 from px4fuse.ekf2.replay import Ekf2Replay
 from px4fuse.ekf2.whatif import WhatIf, sweep_values, what_if
 from px4fuse.errors import LogError, MissingDataError, SettingsError
+from px4fuse.filter.causes import Explained, explained
 from px4fuse.filter.clock import ClockOffset, estimate_clock_offset
-from px4fuse.filter.hypotheses import Explained, explained
 from px4fuse.filter.kalman import Settings
 from px4fuse.filter.signals import AISLE, Axis
 from px4fuse.filter.smoothing import Smoothing, smoothing

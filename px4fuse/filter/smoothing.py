@@ -22,9 +22,11 @@ from px4fuse.flight import Unavailable
 
 MIN_MEASUREMENTS = 100
 # Longer flights are judged by their middle, which is enough
-MAX_MEASUREMENTS = 1500
+MAX_MEASUREMENTS = 1000
 # Correlations that are tried, from none on
 CORRELATIONS = np.array([0.0, 0.2, 0.35, 0.5, 0.6, 0.7, 0.78, 0.85, 0.9, 0.94])
+# Where no low pass up to here makes them more likely, there is none
+FIRST_CORRELATIONS = 0.3
 SIGMA_A_FACTORS = np.geomspace(0.2, 2.5, 7)
 SIGMA_Z_FACTORS = np.geomspace(0.5, 4.0, 9)
 # Intervals longer than this many median ones begin anew: the low pass has forgotten
@@ -105,7 +107,7 @@ def smoothing(
             score, sigma = _score(cut, settings, bad, correlation, level)
             if score < best:
                 best, at, noise = score, correlation, sigma
-            elif at > 0.0 and correlations is not None:
+            elif correlations is not None and (at > 0.0 or correlation > FIRST_CORRELATIONS):
                 break
     interval = float(np.median(np.diff(cut[0].measurement_time_s)))
     lag = 0.0 if at == 0.0 else -interval / float(np.log(at))

@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.analysis import Analysis
-from px4fuse.filter.hypotheses import Explained
+from px4fuse.filter.causes import Explained
 from px4fuse.filter.signals import within
 from px4fuse.findings.model import Detector, Finding, Found, Threshold
 from px4fuse.flight import SPECIFIC_FORCE_COLUMNS, Ekf2

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from px4fuse.analysis import Analysis
-from px4fuse.filter.hypotheses import Explained
+from px4fuse.filter.causes import Explained
 from px4fuse.findings.model import Detector, Finding, Found, Threshold, times
 
 JUMP = Threshold(0.2, "m", "twice a good UWB's noise")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from px4fuse.analysis import Analysis
-from px4fuse.filter.hypotheses import AFTER_STEP_S, Explained
+from px4fuse.filter.causes import AFTER_STEP_S, Explained
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.findings.model import Detector, Finding, Found, Threshold
 

@@ -10,12 +10,13 @@ from __future__ import annotations
 import pandas as pd
 
 from px4fuse.analysis import Analysis
-from px4fuse.filter.hypotheses import Explained
+from px4fuse.filter.causes import Explained
 from px4fuse.findings.logging_rate_low import MIN_IMU_RATE, RATE_MARGIN
 from px4fuse.findings.model import Detector, Finding, Found, Threshold
+from px4fuse.findings.source_smoothed import low_pass
 from px4fuse.flight import sample_rate
 
-SCALE = Threshold(0.10, "of the distance", "clean flights of PX4's simulation are within 0.08")
+SCALE = Threshold(0.12, "of the distance", "flights of PX4's simulation are within 0.11")
 SCALE_ERROR = Threshold(0.15, "of the distance", "more than a metre in eight")
 SCALE_SIGMAS = Threshold(3.0, "standard deviations", "0.3 % of clean flights lie beyond")
 
@@ -27,13 +28,15 @@ def _detect(analysis: Analysis) -> Found:
     if not isinstance(imu, pd.DataFrame) or sample_rate(imu) < RATE_MARGIN * MIN_IMU_RATE.value:
         return
     # what odometry makes of a distance drifts, and is no constant
-    if comparison.source.orientation is not None:
+    if comparison.source.orientation is not None or comparison.source.reconstructed:
         return
     found = analysis.explained
     if not isinstance(found, Explained):
         return
     scale = found.scale
     if abs(scale.value) < max(SCALE.value, SCALE_SIGMAS.value * scale.sigma):
+        return
+    if low_pass(analysis) is not None:  # it takes from the motion as well
         return
     yield Finding(
         "source_scale_wrong",

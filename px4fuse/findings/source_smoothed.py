@@ -11,16 +11,24 @@ SMOOTHING_LAG = Threshold(0.05, "s", "at 1 m/s half of a good UWB's noise")
 SMOOTHING_LAG_ERROR = Threshold(0.10, "s", "at 1 m/s a good UWB's noise")
 
 
-def _detect(analysis: Analysis) -> Found:
+def low_pass(analysis: Analysis) -> Smoothing | None:
+    """The low pass in the source, None where there is none or it cannot be told."""
     source = analysis.comparison.source
     # the error of odometry drifts, which makes that of successive positions agree as well; what
     # was made of EKF2's own output has EKF2's filter in it
     if source.orientation is not None or source.reconstructed:
-        return
+        return None
     found = analysis.smoothing
     if not isinstance(found, Smoothing):
-        return
+        return None
     if found.gain_nats < SMOOTHING_GAIN.value or found.lag_s < SMOOTHING_LAG.value:
+        return None
+    return found
+
+
+def _detect(analysis: Analysis) -> Found:
+    found, source = low_pass(analysis), analysis.comparison.source
+    if found is None:
         return
     yield Finding(
         "source_smoothed",

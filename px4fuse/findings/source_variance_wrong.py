@@ -6,10 +6,9 @@ import numpy as np
 
 from px4fuse.analysis import Analysis
 from px4fuse.filter.signals import within
-from px4fuse.filter.smoothing import Smoothing
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.findings.model import Detector, Finding, Found, Threshold
-from px4fuse.findings.source_smoothed import SMOOTHING_GAIN
+from px4fuse.findings.source_smoothed import low_pass
 from px4fuse.flight import POSITION_VARIANCE_COLUMNS
 
 REPORTED = Threshold(2.0, "times", "in variance; EKF2's own NIS is off by about that")
@@ -29,7 +28,9 @@ def _detect(analysis: Analysis) -> Found:
     sigma = float(np.sqrt(reported.to_numpy().mean(axis=1)).mean())
     factor = (sigma / noise.value) ** 2
     size = max(factor, 1.0 / factor)
-    if noise.low <= sigma <= noise.high or size < REPORTED.value or _smoothed(analysis):
+    if noise.low <= sigma <= noise.high or size < REPORTED.value:
+        return
+    if low_pass(analysis) is not None:  # the noise from one position to the next is not all
         return
     small = factor < 1.0
     yield Finding(
@@ -47,12 +48,6 @@ def _detect(analysis: Analysis) -> Found:
             "variance_factor": factor,
         },
     )
-
-
-def _smoothed(analysis: Analysis) -> bool:
-    """Whether the source smooths: then the noise from position to position is not all."""
-    found = analysis.smoothing
-    return isinstance(found, Smoothing) and found.gain_nats >= SMOOTHING_GAIN.value
 
 
 DETECTOR = Detector(
