@@ -169,7 +169,7 @@ class Lines:
     Attributes
     ----------
     time_s : ndarray, shape (m,)
-        Of the measurements.
+        Of the measurements, as they were stamped.
     legs, signals : tuple of Preintegrated and of Signals
         Of each axis.
     prior : ndarray, shape (k,)
@@ -279,9 +279,9 @@ def lines_of(
     ]
     settings = replace(settings, input="imu")
     legs = tuple(preintegrate(axis, settings) for axis in shifted)
-    time_s = shifted[0].measurement_time_s[-len(legs[0].measurement_m) :]
+    time_s = axes[0].measurement_time_s[-len(legs[0].measurement_m) :]
     common = _common_columns(flight.attitude, acceleration)
-    hats = _hats(time_s[0], time_s[-1])
+    hats = _hats(time_s[0] + clock_offset_s, time_s[-1] + clock_offset_s)
     prior = np.concatenate(
         [np.full(CONSTANTS, np.inf), np.full(len(axes) * len(hats), TILT_SIGMA_RAD * constants.g)]
     )

@@ -57,5 +57,10 @@ DETECTOR = Detector(
         "source_scale_wrong": "scale, distance too long, distance too short, anchors survey, "
         "tape measure",
     },
-    {"source_scale_wrong": tuple(f"--mistake scale={percent}%" for percent in (5, 15, 20, 25))},
+    {
+        "source_scale_wrong": (
+            *(f"--mistake scale={percent}%" for percent in (5, 15, 20, 25)),
+            "--uwb-rate 10 --sigma-uwb 0.05 --yaw follow --mistake scale=15%",
+        )
+    },
 )

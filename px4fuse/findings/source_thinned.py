@@ -17,7 +17,9 @@ from px4fuse.findings.source_gap import GAP, GAP_INTERVALS
 
 MIN_INTERVALS = 50
 THINNED_SHARE = Threshold(0.25, "of the source's samples", "more than a link loses")
-MULTIPLE_SHARE = Threshold(0.1, "of the intervals", "single losses pass")
+# What is thinned to a rate alternates between two neighbouring multiples
+NEIGHBOURS = Threshold(0.85, "of the intervals", "bursts have multiples far apart")
+LEAST = Threshold(0.1, "of the intervals", "single losses pass")
 # Of an interval from a whole multiple, root mean square: random ones have 0.29
 WHOLE = Threshold(0.1, "of the shorter interval", "a source's own jitter is 0.03")
 MOST_PARTS = 6
@@ -53,9 +55,11 @@ def _detect(analysis: Analysis) -> Found:
         return
     base, multiples = found
     lost = 1.0 - 1.0 / float(np.mean(multiples))
-    _, counts = np.unique(multiples, return_counts=True)
-    common = np.count_nonzero(counts >= MULTIPLE_SHARE.value * len(multiples))
-    if lost < THINNED_SHARE.value or common < 2:
+    shares = np.bincount(multiples.astype(np.intp)) / len(multiples)
+    pairs = shares[:-1] + shares[1:]
+    at = int(np.argmax(pairs))
+    alternating = pairs[at] >= NEIGHBOURS.value and shares[at : at + 2].min() >= LEAST.value
+    if lost < THINNED_SHARE.value or not alternating:
         return
     rate = 1.0 / float(np.mean(intervals))
     slow = 1.0 / rate > EV_START_INTERVAL.value

@@ -9,10 +9,10 @@ from px4fuse.filter.signals import within
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.findings.model import Detector, Finding, Found, Threshold
 from px4fuse.findings.source_smoothed import low_pass
-from px4fuse.flight import POSITION_VARIANCE_COLUMNS
+from px4fuse.flight import POSITION_VARIANCE_COLUMNS, Unavailable
 
 REPORTED = Threshold(2.0, "times", "in variance; EKF2's own NIS is off by about that")
-REPORTED_ERROR = Threshold(4.0, "times", "in variance: a factor of two in standard deviation")
+REPORTED_ERROR = Threshold(3.0, "times", "in variance: beyond what EKF2's NIS bears")
 
 
 def _detect(analysis: Analysis) -> Found:
@@ -30,7 +30,8 @@ def _detect(analysis: Analysis) -> Found:
     size = max(factor, 1.0 / factor)
     if noise.low <= sigma <= noise.high or size < REPORTED.value:
         return
-    if low_pass(analysis) is not None:  # the noise from one position to the next is not all
+    # where the source smooths, the noise from one position to the next is not all
+    if isinstance(analysis.smoothing, Unavailable) or low_pass(analysis) is not None:
         return
     small = factor < 1.0
     yield Finding(
