@@ -38,7 +38,7 @@ BURST_S = 1.0
 # A run of outliers that begins within this time after a step belongs to it
 AFTER_STEP_S = 6.0
 # Chance that a flight without a step shows one anywhere
-STEP_FALSE_ALARM = 1e-4
+STEP_FALSE_ALARM = 1e-3
 # Mean NIS of what follows a step that is one: of outliers that end, it stays far above 1
 STEP_NIS = 2.5
 MAX_JUMPS = 3
@@ -179,7 +179,8 @@ def _jumps(lines: Lines, sigma_a: float, skip: BoolArray) -> tuple[Jump, ...]:
         starts = np.flatnonzero(found & ~np.concatenate([[False], found[:-1]]))
         proposed = [float(lines.time_s[at]) for at in starts]
         proposed += _scan(lines, sigma_a, found)
-        judged = [_judge(lines, sigma_a, found, time_s) for time_s in proposed]
+        chance = STEP_FALSE_ALARM / max(len(proposed), 1)
+        judged = [_judge(lines, sigma_a, found, time_s, chance) for time_s in proposed]
         named = [jump for jump in judged if jump is not None]
         if not named:
             break
@@ -234,7 +235,7 @@ def _judge(lines: Lines, sigma_a: float, skip: BoolArray, time_s: float) -> Jump
     found = fit(white, lines.priors)
     size, covariance = found.coefficients[columns], found.covariance[np.ix_(columns, columns)]
     chi_square = float(size @ np.linalg.solve(covariance, size)) / max(found.spread, 1.0) ** 2
-    if chi_square < chi2.isf(STEP_FALSE_ALARM, len(columns)):
+    if chi_square < chi2.isf(chance, len(columns)):
         return None
     rest = white.data - white.columns @ found.coefficients
     near = np.tile(after[~later], len(lines.legs))

@@ -10,7 +10,7 @@ import numpy as np
 
 from px4fuse.analysis import Analysis
 from px4fuse.arrays import Array
-from px4fuse.filter.signals import within
+from px4fuse.filter.signals import LADDER, within
 from px4fuse.findings.ekf2_not_fusing import EV_START_INTERVAL
 from px4fuse.findings.model import Detector, Finding, Found, Threshold
 from px4fuse.findings.source_gap import GAP, GAP_INTERVALS
@@ -43,8 +43,9 @@ def _base(intervals: Array) -> tuple[float, Array] | None:
 
 def _detect(analysis: Analysis) -> Found:
     source = analysis.comparison.source
-    if source.clock_map is not None or source.reconstructed:
-        return  # stamps that were made, and a rate that is the logger's
+    # stamps that were made, or a rate that is the logger's (source_not_logged says so)
+    if source.clock_map is not None or source.rung >= LADDER["estimator_visual_odometry_aligned"]:
+        return
     intervals = np.diff(within(source.samples, analysis.comparison.segment).index.to_numpy())
     if len(intervals) < MIN_INTERVALS:
         return

@@ -286,8 +286,9 @@ def _rows(flown: list[Job], results: list[list[tuple[str, ...]]]) -> Iterator[di
     for name in sorted(names):
         for scenario, own in without.items():
             yield _row(name, scenario, CLEAN, own)
-    for condition, own in by_condition.items():
-        if condition.finding:
+    for condition in CONDITIONS:
+        if condition in by_condition:
+            own = by_condition[condition]
             yield _row(condition.finding, condition.scenario, condition.typed, own)
 
 
