@@ -221,8 +221,10 @@ def _scan(lines: Lines, sigma_a: float, skip: BoolArray) -> list[float]:
     return [float(times[best])]
 
 
-def _judge(lines: Lines, sigma_a: float, skip: BoolArray, time_s: float) -> Jump | None:
-    """A step at a time, where what comes later still asks for it; None where it does not."""
+def _judge(
+    lines: Lines, sigma_a: float, skip: BoolArray, time_s: float, chance: float
+) -> Jump | None:
+    """A step at a time, where what comes later still asks for it; None where that is chance."""
     after = _from(lines.time_s, time_s, AFTER_STEP_S)
     burst = _from(lines.time_s, time_s, BURST_S)
     lines = replace(lines, steps=np.hstack([lines.steps, steps(lines.time_s, [time_s])]))
