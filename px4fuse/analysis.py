@@ -10,6 +10,8 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
+import numpy as np
+
 from px4fuse import placing
 from px4fuse.comparison.asked import asked_of_ekf2
 from px4fuse.comparison.comparison import Comparison, compare
@@ -19,7 +21,7 @@ from px4fuse.ekf2.parameters import check
 from px4fuse.ekf2.replay import Ekf2Replay
 from px4fuse.ekf2.whatif import WhatIf, sweep_values, what_if
 from px4fuse.errors import LogError, MissingDataError, SettingsError
-from px4fuse.filter.causes import Explained, explained
+from px4fuse.filter.causes import AFTER_STEP_S, Explained, explained
 from px4fuse.filter.clock import ClockOffset, estimate_clock_offset
 from px4fuse.filter.kalman import Settings
 from px4fuse.filter.signals import AISLE, Axis
@@ -114,12 +116,18 @@ class Analysis:
             return found
         axes, tuned, offset_s = found
         settings = self.comparison.settings
+        # the filter comes to a jump as slowly as a low pass would
+        time_s, left_out = axes[0].measurement_time_s, tuned.outlier_time_s
+        causes = self.explained
+        for jump in causes.jumps if isinstance(causes, Explained) else ():
+            near = (time_s >= jump.time_s) & (time_s < jump.time_s + AFTER_STEP_S)
+            left_out = np.union1d(left_out, time_s[near])
         return smoothing(
             axes,
             settings,
             sigma_a_m_s2=_size(tuned.sigma_a, settings.sigma_a_m_s2),
             sigma_z_m=_size(tuned.sigma_z, settings.sigma_z_m),
-            outlier_time_s=tuned.outlier_time_s,
+            outlier_time_s=left_out,
             clock_offset_s=offset_s,
         )
 
