@@ -50,6 +50,7 @@ from px4fuse.findings import (
     source_scale_wrong,
     source_smoothed,
     source_stamps,
+    source_stamps_of_arrival,
     source_thinned,
     source_variance_wrong,
     unavailable,
@@ -109,6 +110,7 @@ LOOP_DETECTORS: tuple[Detector[Loop], ...] = (
 )
 DETECTORS: tuple[Detector[Analysis], ...] = (
     source_stamps.DETECTOR,
+    source_stamps_of_arrival.DETECTOR,
     source_thinned.DETECTOR,
     source_smoothed.DETECTOR,
     source_jumps.DETECTOR,

@@ -21,13 +21,13 @@ THINNED_SHARE = Threshold(0.25, "of the source's samples", "more than a link los
 NEIGHBOURS = Threshold(0.85, "of the intervals", "bursts have multiples far apart")
 LEAST = Threshold(0.1, "of the intervals", "single losses pass")
 # Of an interval from a whole multiple, root mean square: random ones have 0.29
-WHOLE = Threshold(0.1, "of the shorter interval", "a source's own jitter is 0.03")
-MOST_PARTS = 6
+WHOLE = Threshold(0.06, "of the shorter interval", "a source's own jitter is 0.03")
+MOST_PARTS = 4
 
 
 def _base(intervals: Array) -> tuple[float, Array] | None:
     """Longest interval of which all are whole multiples, and these; None where there is none."""
-    typical = float(np.median(intervals))
+    typical = float(np.sort(intervals)[len(intervals) // 2])  # one of them, no mean of two
     for parts in range(1, MOST_PARTS + 1):
         multiples = np.rint(intervals * parts / typical)
         if np.any(multiples < 1.0):

@@ -43,6 +43,8 @@ CLEAN_FLIGHTS, FAULTY_FLIGHTS = 100, 20
 FAULTY_SEED = 10_000
 ALWAYS = ("ekf2_unavailable", "ekf2_is_a_model", "loop_end_assumed")
 NOT_ASKED = Unavailable("EKF2 replay", "the condition is not about EKF2", "Fly with EKF2.")
+# Beginnings of the findings that are read from what EKF2 logs
+OF_EKF2 = ("ekf2_", "source_stamps_of_arrival")
 # Options of ``px4fuse simulate`` that a scenario may have, and their fields
 OPTIONS = {
     "--kind": "kind",
@@ -124,7 +126,7 @@ class Condition:
     @property
     def ekf2(self) -> bool:
         """Whether EKF2 flies along: not where a mistake is about something else, for speed."""
-        return not self.finding or self.finding.startswith("ekf2_")
+        return not self.finding or self.finding.startswith(OF_EKF2)
 
     @property
     def settings(self) -> Settings:
