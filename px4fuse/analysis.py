@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -21,11 +22,14 @@ from px4fuse.ekf2.parameters import check
 from px4fuse.ekf2.replay import Ekf2Replay
 from px4fuse.ekf2.whatif import WhatIf, sweep_values, what_if
 from px4fuse.errors import LogError, MissingDataError, SettingsError
+from px4fuse.filter.causes import AFTER_STEP_S, Explained, explained
 from px4fuse.filter.clock import ClockOffset, estimate_clock_offset
 from px4fuse.filter.fitting import Noises
 from px4fuse.filter.heading import HeadingError, heading_error
 from px4fuse.filter.kalman import Settings
-from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, tune
+from px4fuse.filter.signals import AISLE, Axis
+from px4fuse.filter.smoothing import Smoothing, smoothing
+from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise, tune
 from px4fuse.flight import Flight, Unavailable
 from px4fuse.loop.analysis import analyse, loop_in
 from px4fuse.loop.loop import Loop
@@ -51,6 +55,8 @@ MIN_CLOCK_IMU_HZ = 40.0
 MIN_TELEMETRY_IMU_HZ = 200.0
 CLOCK_RATE_MARGIN = 0.98
 TELEMETRY_IMU = ("HIGHRES_IMU", "SCALED_IMU", "SCALED_IMU2", "SCALED_IMU3")
+# An offset of the clock so far from zero is taken out before anything else is looked for
+SURE_SIGMAS = 3.0
 
 Progress = Callable[[str], None]
 Tuning = Mapping[str, AxisTuning | Unavailable]
@@ -94,6 +100,70 @@ class Analysis:
         """EKF2 replayed as flown, with its agreement with the log."""
         model = self.ekf2_model
         return model if isinstance(model, Unavailable) else model.flown
+
+    @cached_property
+    def explained(self) -> Explained | Unavailable:
+        """Biases, scale and jumps that explain the innovations better than noise."""
+        found = self._horizontally()
+        if isinstance(found, Unavailable):
+            return found
+        axes, tuned, offset_s = found
+        comparison = self.comparison
+        return explained(
+            comparison.flight,
+            axes,
+            comparison.segment,
+            comparison.settings,
+            sigma_a_m_s2=_size(tuned.filter_sigma_a, comparison.settings.sigma_a_m_s2),
+            sigma_z_m=_size(tuned.sigma_z, comparison.settings.sigma_z_m),
+            outlier_time_s=tuned.outlier_time_s,
+            clock_offset_s=offset_s,
+        )
+
+    @cached_property
+    def smoothing(self) -> Smoothing | Unavailable:
+        """A low pass in the source."""
+        found = self._horizontally()
+        if isinstance(found, Unavailable):
+            return found
+        axes, tuned, offset_s = found
+        settings = self.comparison.settings
+        # the filter comes to a jump as slowly as a low pass would
+        time_s, left_out = axes[0].measurement_time_s, tuned.outlier_time_s
+        causes = self.explained
+        for jump in causes.jumps if isinstance(causes, Explained) else ():
+            near = (time_s >= jump.time_s) & (time_s < jump.time_s + AFTER_STEP_S)
+            left_out = np.union1d(left_out, time_s[near])
+        return smoothing(
+            axes,
+            settings,
+            sigma_a_m_s2=_size(tuned.filter_sigma_a, settings.sigma_a_m_s2),
+            sigma_z_m=_size(tuned.sigma_z, settings.sigma_z_m),
+            outlier_time_s=left_out,
+            clock_offset_s=offset_s,
+        )
+
+    def _horizontally(self) -> tuple[tuple[Axis, ...], AxisTuning, float] | Unavailable:
+        """The horizontal axes, their noises, and a clock offset (s) that is beyond doubt."""
+        axes = {result.axis.name: result.axis for result in self.comparison.axes}
+        for name, group in ((HORIZONTAL, ("north", "east")), (AISLE, (AISLE,))):
+            tuned = self.tuning.get(name)
+            if isinstance(tuned, AxisTuning) and axes.keys() >= set(group):
+                clock, offset_s = self.clock, 0.0
+                if isinstance(clock, ClockOffset) and clock.determinable:
+                    sure = abs(clock.offset_s) > SURE_SIGMAS * clock.sigma_s
+                    offset_s = clock.offset_s if sure else 0.0
+                return tuple(axes[each] for each in group), tuned, offset_s
+        return Unavailable(
+            "causes beyond noise",
+            "the noises of the horizontal axes are not known",
+            "Analyse north and east, or the aisle (--axis).",
+        )
+
+
+def _size(noise: Noise, otherwise: float) -> float:
+    """Most likely value of a noise, or its bound, or what was set."""
+    return noise.value or noise.high or otherwise
 
 
 def run(request: ComparisonRequest, progress: Progress = _silent) -> Analysis:
@@ -336,7 +406,7 @@ def explain(comparison: Comparison, progress: Progress = _silent) -> Analysis:
     progress("replaying EKF2")
     model = open_model(comparison.flight)
     why = why_ekf2_differs(comparison, model, tuning, clock)
-    heading = _heading(comparison, tuning, clock, progress)
+    heading = turned_frame(comparison, tuning, clock, progress)
     progress("looking for a loop")
     loop = loop_in(comparison.flight, progress)
     return Analysis(comparison, tuning, clock, model, why, loop, heading)
@@ -388,8 +458,11 @@ def clock_offset(
     return found
 
 
-def _heading(
-    comparison: Comparison, tuning: Tuning, clock: ClockOffset | Unavailable, progress: Progress
+def turned_frame(
+    comparison: Comparison,
+    tuning: Tuning,
+    clock: ClockOffset | Unavailable,
+    progress: Progress = _silent,
 ) -> HeadingError | Unavailable:
     """Turn of the source's frame, with the noise and the clock offset that were found."""
     progress("heading")

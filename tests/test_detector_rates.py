@@ -4,29 +4,60 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import pandas as pd
 import pytest
 
-from px4fuse.simulation.detector_rates import CLEAN, CONDITIONS, RIGHT, Condition, found, rates
+from px4fuse.simulation.detector_rates import (
+    CLEAN,
+    CONDITIONS,
+    DEFAULT,
+    FAULTY_SEED,
+    OPTIONS,
+    RIGHT,
+    SCENARIOS,
+    Condition,
+    Job,
+    _rows,
+    clean,
+    found,
+    jobs,
+    rates,
+)
+from px4fuse.simulation.scenario import Scenario
 
 TABLE = rates()
+# Sizes that a log cannot show, for the reason in the finding's file; measured all the same
+INVISIBLE = {
+    ("source_scale_wrong", "--mistake scale=5%"),
+    ("source_thinned", "--mistake decimate=2.5Hz"),
+}
 
 
 def test_the_table_covers_every_condition() -> None:
     faulty = TABLE[TABLE["condition"] != CLEAN]
-    pairs = list(zip(faulty["finding"], faulty["condition"], strict=True))
-    assert pairs == [(condition.finding, condition.typed) for condition in CONDITIONS]
+    triples = list(zip(faulty["finding"], faulty["scenario"], faulty["condition"], strict=True))
+    assert triples == [(c.finding, c.scenario, c.typed) for c in CONDITIONS]
 
 
 def test_no_detector_cries_wolf_on_more_than_two_clean_flights_in_a_hundred() -> None:
     clean = TABLE[TABLE["condition"] == CLEAN]
-    assert clean["flights"].min() >= 200
+    assert set(clean["scenario"]) == set(SCENARIOS)
+    assert clean["flights"].min() >= 50
     assert clean["rate"].max() <= 0.02
 
 
 @pytest.mark.parametrize("finding", sorted({condition.finding for condition in CONDITIONS}))
-def test_every_detector_finds_its_mistake_at_the_size_stated(finding) -> None:
+def test_every_detector_names_its_mistake_first_at_the_size_stated(finding) -> None:
     rows = TABLE[(TABLE["finding"] == finding) & (TABLE["condition"] != CLEAN)]
-    assert rows["rate"].max() >= 0.95
+    assert rows["first"].max() >= 0.95
+
+
+def test_what_a_log_cannot_show_is_not_found_by_chance() -> None:
+    for finding, condition in INVISIBLE:
+        (row,) = TABLE[
+            (TABLE["finding"] == finding) & (TABLE["condition"] == condition)
+        ].itertuples()
+        assert row.rate <= 0.1
 
 
 def test_the_code_still_does_what_the_table_says() -> None:
@@ -43,9 +74,47 @@ def test_the_code_still_does_what_the_table_says() -> None:
 
 
 def test_a_condition_is_read_as_it_is_typed() -> None:
-    both = Condition("", "--kind loop --mistake nlos=1% --mistake open-end=3m sigma_z_m=0.3")
-    assert both.kind == "loop"
-    assert both.mistakes == ("nlos=1%", "open-end=3m")
-    assert both.settings == replace(RIGHT, sigma_z_m=0.3)
-    clean = Condition("", "")
-    assert (clean.kind, clean.mistakes, clean.settings) == ("aisle", (), RIGHT)
+    both = Condition("", "--kind loop --mistake nlos=1%,3m --mistake open-end=3m sigma_z_m=0.3")
+    assert both.scenario == "loop, VIO"
+    assert both.mistakes == ("nlos=1%,3m", "open-end=3m")
+    assert both.settings == replace(SCENARIOS["loop, VIO"].settings, sigma_z_m=0.3)
+    assert (both.flight(7).kind, both.flight(7).passes, both.flight(7).seed) == ("loop", 1, 7)
+    usual = Condition("", "")
+    assert (usual.scenario, usual.mistakes, usual.settings) == (DEFAULT, (), RIGHT)
+    assert usual.flight(1) == Scenario(seed=1)
+
+
+@pytest.mark.parametrize("name", SCENARIOS)
+def test_a_scenario_is_flown_as_its_options_say(name) -> None:
+    flown = clean(name).flight(2)
+    assert clean(name).scenario == name
+    assert flown.source_sigma_m == pytest.approx(SCENARIOS[name].settings.sigma_z_m)
+    for option, field in OPTIONS.items():
+        if option in SCENARIOS[name].options:
+            assert getattr(flown, field) != getattr(Scenario(), field) or field == "passes"
+
+
+def test_conditions_that_differ_in_settings_only_share_their_flights() -> None:
+    small, large = Condition("sigma_z_small", "sigma_z_m=0.03"), Condition("a", "sigma_z_m=0.3")
+    yaw = Condition("source_frame_turned", "--mistake yaw=30")
+    made = jobs(1, 2, (DEFAULT,), (small, yaw, large))
+    assert [(job.seed, job.conditions) for job in made] == [
+        (0, (clean(DEFAULT),)),
+        (FAULTY_SEED, (small, large)),
+        (FAULTY_SEED + 1, (small, large)),
+        (FAULTY_SEED, (yaw,)),
+        (FAULTY_SEED + 1, (yaw,)),
+    ]
+
+
+def test_rows_count_what_was_named_and_what_came_first() -> None:
+    usual, yaw = clean(DEFAULT), Condition("source_frame_turned", "--mistake yaw=30")
+    flown = [Job(0, (usual,)), Job(1, (usual,)), Job(FAULTY_SEED, (yaw,))]
+    made = pd.DataFrame(
+        _rows(flown, [[()], [("source_gap", "no_motion")], [("sigma_z_large", yaw.finding)]])
+    ).set_index(["finding", "condition"])
+    assert made.loc[("source_gap", CLEAN), ["rate", "first"]].tolist() == [0.5, 0.5]
+    assert made.loc[("no_motion", CLEAN), ["rate", "first"]].tolist() == [0.5, 0.0]
+    assert made.loc[(yaw.finding, CLEAN), ["rate", "flights"]].tolist() == [0.0, 2]
+    assert made.loc[(yaw.finding, yaw.typed), ["rate", "first"]].tolist() == [1.0, 0.0]
+    assert set(made["scenario"]) == {DEFAULT}

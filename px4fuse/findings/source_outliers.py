@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from px4fuse.analysis import Analysis
+from px4fuse.filter.causes import AFTER_STEP_S, Explained
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.findings.model import Detector, Finding, Found, Threshold
 
@@ -15,11 +16,19 @@ def _detect(analysis: Analysis) -> Found:
     tuned = analysis.tuning.get(HORIZONTAL) or next(iter(analysis.tuning.values()), None)
     if not isinstance(tuned, AxisTuning):
         return
-    count = len(tuned.outlier_time_s)
+    found = analysis.explained
+    jumps = [jump.time_s for jump in found.jumps] if isinstance(found, Explained) else []
+    # a step that stays begins with what passes for outliers
+    outliers = [
+        time
+        for time in tuned.outlier_time_s.tolist()
+        if not any(at <= time < at + AFTER_STEP_S for at in jumps)
+    ]
+    count = len(outliers)
     share = count / tuned.count
     if share < OUTLIERS.value or count < MIN_OUTLIERS:
         return
-    times = ", ".join(f"{time:.1f}" for time in tuned.outlier_time_s[:3])
+    times = ", ".join(f"{time:.1f}" for time in outliers[:3])
     yield Finding(
         "source_outliers",
         "error" if share >= OUTLIERS_ERROR.value else "warning",
@@ -29,7 +38,7 @@ def _detect(analysis: Analysis) -> Found:
         "they are left out.",
         "Give the tag line of sight to the anchors there, or reject them before they are sent; do "
         "not raise SIGMA_Z or EKF2_EVP_NOISE for them.",
-        {"count": float(count), "share": share, "first_s": float(tuned.outlier_time_s[0])},
+        {"count": float(count), "share": share, "first_s": outliers[0]},
     )
 
 

@@ -1,56 +1,122 @@
 """False-alarm rates and power of the detectors, measured on simulated flights.
 
 ``python -m px4fuse.simulation.detector_rates`` measures them again and rewrites
-``findings/rates.csv``, which ships with the package: about a quarter of an hour on two cores.
+``findings/rates.csv``, which ships with the package; it says how long it will take. ``--clean`` and
+``--faulty`` give other numbers of flights, ``--only TEXT`` prints the rows of the scenarios and
+findings whose name holds it, and writes nothing.
 """
 
 from __future__ import annotations
 
+import argparse
 import os
 import re
-from collections.abc import Iterator
+import time
+from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from importlib.resources import files
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import pandas as pd
 from scipy.stats import binomtest
 
-from px4fuse.analysis import explain
+from px4fuse.analysis import Analysis, clock_offset, tuned_horizontally, turned_frame
 from px4fuse.comparison.comparison import compare
+from px4fuse.ekf2.model import open_model
 from px4fuse.filter.kalman import Settings
 from px4fuse.findings import DETECTORS, find, find_loop
-from px4fuse.loop.analysis import analyse
+from px4fuse.flight import Flight, Unavailable
+from px4fuse.loop.analysis import analyse, loop_in
 from px4fuse.loop.sources import Source
 from px4fuse.loop.tracks import trajectory_of
 from px4fuse.simulation.flights import simulate_flight
 from px4fuse.simulation.mistakes import parse
-from px4fuse.simulation.scenario import Kind, Scenario
+from px4fuse.simulation.scenario import Scenario
 
 TABLE = "rates.csv"
 CLEAN = "none"
-CLEAN_FLIGHTS, FAULTY_FLIGHTS = 200, 30
-# What simulated flights ask for: the IMU's white noise with what bias and attitude errors add
-RIGHT = Settings(sigma_a_m_s2=0.27, sigma_z_m=0.10)
+CLEAN_FLIGHTS, FAULTY_FLIGHTS = 100, 20
+# Faulty flights have other seeds than clean ones
+FAULTY_SEED = 10_000
 ALWAYS = ("ekf2_unavailable", "ekf2_is_a_model", "loop_end_assumed")
+NOT_ASKED = Unavailable("EKF2 replay", "the condition is not about EKF2", "Fly with EKF2.")
+# Beginnings of the findings that are read from what EKF2 logs
+OF_EKF2 = ("ekf2_", "source_stamps_of_arrival")
+# Options of ``px4fuse simulate`` that a scenario may have, and their fields
+OPTIONS = {
+    "--kind": "kind",
+    "--passes": "passes",
+    "--pause": "pause_s",
+    "--yaw": "yaw",
+    "--uwb-rate": "uwb_rate_hz",
+    "--sigma-uwb": "sigma_uwb_m",
+}
+
+
+@dataclass(frozen=True)
+class Flown:
+    """One kind of flight without mistakes.
+
+    Attributes
+    ----------
+    options : str
+        As ``px4fuse simulate`` takes them.
+    settings : Settings
+        What such flights ask for: the IMU's white noise with what bias and attitude errors add.
+    true : tuple of str
+        Findings that are no false alarms on it.
+    """
+
+    options: str
+    settings: Settings
+    true: tuple[str, ...] = ()
+
+
+DEFAULT = "5 Hz, 0.10 m"
+SCENARIOS: Mapping[str, Flown] = MappingProxyType({
+    DEFAULT: Flown("", Settings(0.27, 0.10)),
+    "2 Hz": Flown("--uwb-rate 2", Settings(0.27, 0.10), ("ekf2_not_fusing",)),
+    "10 Hz, 0.05 m, yaw follows": Flown(
+        "--uwb-rate 10 --sigma-uwb 0.05 --yaw follow", Settings(0.27, 0.05)
+    ),
+    "30 Hz, 0.03 m": Flown("--uwb-rate 30 --sigma-uwb 0.03", Settings(0.27, 0.03)),
+    "0.30 m": Flown("--sigma-uwb 0.3", Settings(0.27, 0.30)),
+    "hover": Flown("--passes 2 --pause 30", Settings(0.27, 0.10)),
+    "yaw follows": Flown("--yaw follow", Settings(0.27, 0.10)),
+    "loop, VIO": Flown("--kind loop", Settings(0.27, 0.01)),
+})  # fmt: skip
+RIGHT = SCENARIOS[DEFAULT].settings
 
 
 @dataclass(frozen=True)
 class Condition:
     """A mistake of a stated size, and the finding that must name it.
 
-    ``typed`` is as the finding's file declares it (``measured_on``).
+    ``typed`` is as the finding's file declares it (``measured_on``): options of ``px4fuse
+    simulate``, first those of the scenario where it is not the usual one, or a field of
+    ``Settings`` with its value.
     """
 
     finding: str
     typed: str
 
     @property
-    def kind(self) -> Kind:
-        """That of the flight."""
-        return "loop" if "--kind loop" in self.typed else "aisle"
+    def scenario(self) -> str:
+        """Name of the scenario that the options are of, the usual one where there are none."""
+        options = " ".join(self._options)
+        return next(name for name, flown in SCENARIOS.items() if flown.options == options)
+
+    @property
+    def _words(self) -> list[str]:
+        """What is typed besides the mistakes."""
+        return re.sub(r"--mistake \S+", "", self.typed).split()
+
+    @property
+    def _options(self) -> list[str]:
+        return [word for word in self._words if "=" not in word]
 
     @property
     def mistakes(self) -> tuple[str, ...]:
@@ -60,16 +126,26 @@ class Condition:
     @property
     def ekf2(self) -> bool:
         """Whether EKF2 flies along: not where a mistake is about something else, for speed."""
-        return not self.typed or self.finding.startswith("ekf2_")
+        return not self.finding or self.finding.startswith(OF_EKF2)
 
     @property
     def settings(self) -> Settings:
         """The right ones, with those of this condition in their place."""
-        words = re.sub(r"--\w+ \S+", "", self.typed).split()
-        given: dict[str, Any] = {
-            name: float(value) for name, value in (word.split("=") for word in words)
-        }
-        return replace(RIGHT, **given)
+        pairs = (word.split("=") for word in self._words if "=" in word)
+        given: dict[str, Any] = {name: float(value) for name, value in pairs}
+        return replace(SCENARIOS[self.scenario].settings, **given)
+
+    def flight(self, seed: int) -> Scenario:
+        """What is flown."""
+        words = self._options
+        given: dict[str, Any] = {}
+        for option, value in zip(words[::2], words[1::2], strict=True):
+            name = OPTIONS[option]
+            kind = type(getattr(Scenario(), name))
+            given[name] = kind(value) if kind in (int, float) else value
+        if given.get("kind") == "loop":
+            given.setdefault("passes", 1)
+        return Scenario(**given, ekf2=self.ekf2, seed=seed)
 
 
 CONDITIONS = tuple(
@@ -78,8 +154,20 @@ CONDITIONS = tuple(
     for finding, conditions in detector.measured_on.items()
     for typed in conditions
 )
-# Clean flights: without a mistake
-AISLE, LOOP = Condition("", ""), Condition("", "--kind loop")
+
+
+@dataclass(frozen=True)
+class Job:
+    """One flight, and the conditions that are judged on it: they differ in settings only."""
+
+    seed: int
+    conditions: tuple[Condition, ...]
+    weight: float = field(default=1.0, compare=False)
+
+
+def clean(scenario: str) -> Condition:
+    """The condition of flights without a mistake."""
+    return Condition("", SCENARIOS[scenario].options)
 
 
 def found(seed: int, condition: Condition | None = None) -> tuple[str, ...]:
@@ -91,74 +179,136 @@ def found(seed: int, condition: Condition | None = None) -> tuple[str, ...]:
     ----------
     seed : int
     condition : Condition, optional
-        None for a clean flight.
+        None for a clean flight of the usual scenario.
     """
-    condition = condition or AISLE
-    mistakes = parse(condition.mistakes)
-    if condition.kind == "loop":
-        # without the truth, which would tell where it landed
-        flight = simulate_flight(
-            Scenario(kind="loop", passes=1, truth=False, ekf2=condition.ekf2, seed=seed), mistakes
-        )
+    return _fly(Job(seed, (condition or clean(DEFAULT),)))[0]
+
+
+def _fly(job: Job) -> list[tuple[str, ...]]:
+    """Findings for each condition of one flight."""
+    first = job.conditions[0]
+    scenario = first.flight(job.seed)
+    mistakes = parse(first.mistakes)
+    named: list[tuple[str, ...]] = []
+    of_loop: tuple[str, ...] = ()
+    if scenario.kind == "loop":
+        # the loop without the truth, which would tell where it landed
+        flight = simulate_flight(replace(scenario, truth=False), mistakes)
         loop = analyse(Source(trajectory_of(flight, "vio"), flight))
-        return tuple(i for f in find_loop(loop) for i in f.ids if i not in ALWAYS)
-    flight = simulate_flight(Scenario(ekf2=condition.ekf2, seed=seed), mistakes)
-    analysis = explain(compare(flight, condition.settings, axes=("north", "east")))
-    return tuple(i for f in find(analysis) for i in f.ids if i not in ALWAYS)
+        of_loop = tuple(i for f in find_loop(loop) for i in f.ids)
+        if first.finding:
+            return [_named(first, of_loop)]
+    flight = simulate_flight(scenario, mistakes)
+    explained = _explain(flight, first)
+    for condition in job.conditions:
+        compared = explained
+        if condition.settings != first.settings:
+            # the most likely noises and the clock's offset do not depend on the chosen ones
+            compared = replace(
+                explained,
+                comparison=compare(flight, condition.settings, axes=("north", "east")),
+            )
+        ids = tuple(i for f in find(compared) for i in f.ids)
+        named.append(_named(condition, (*ids, *(name for name in of_loop if name not in ids))))
+    return named
 
 
-def _job(job: tuple[int, Condition]) -> tuple[str, ...]:
-    return found(*job)
+def _explain(flight: Flight, condition: Condition) -> Analysis:
+    """What the detectors look at, without why EKF2 differs, for speed."""
+    comparison = compare(flight, condition.settings, axes=("north", "east"))
+    tuning = tuned_horizontally(comparison)
+    clock = clock_offset(comparison, tuning)
+    model = open_model(flight) if condition.ekf2 else NOT_ASKED
+    heading = turned_frame(comparison, tuning, clock)
+    return Analysis(comparison, tuning, clock, model, {}, loop_in(flight), heading)
 
 
-def measure(
-    clean_flights: int = CLEAN_FLIGHTS, faulty_flights: int = FAULTY_FLIGHTS
-) -> pd.DataFrame:
-    """Run every condition, on all cores.
+def _named(condition: Condition, ids: Iterable[str]) -> tuple[str, ...]:
+    expected = (*ALWAYS, *SCENARIOS[condition.scenario].true)
+    return tuple(name for name in ids if name not in expected)
+
+
+def jobs(
+    clean_flights: int = CLEAN_FLIGHTS,
+    faulty_flights: int = FAULTY_FLIGHTS,
+    scenarios: Iterable[str] = tuple(SCENARIOS),
+    conditions: Iterable[Condition] = CONDITIONS,
+) -> list[Job]:
+    """All flights: a scenario's flights without mistakes, and each mistake's.
+
+    Conditions that differ in settings only share their flights.
+    """
+    made = [
+        Job(seed, (clean(scenario),)) for scenario in scenarios for seed in range(clean_flights)
+    ]
+    shared: dict[tuple[str, tuple[str, ...], bool], list[Condition]] = {}
+    for condition in conditions:
+        key = condition.scenario, condition.mistakes, condition.ekf2
+        shared.setdefault(key, []).append(condition)
+    made += [
+        Job(FAULTY_SEED + seed, tuple(group))
+        for group in shared.values()
+        for seed in range(faulty_flights)
+    ]
+    return made
+
+
+def measure(flown: list[Job], processes: int | None = None) -> pd.DataFrame:
+    """Fly every job, on all cores.
 
     Returns
     -------
     DataFrame
-        ``finding``, ``condition`` ("none" for a clean flight: the rate is that of false alarms),
-        ``flights``, ``rate``, its 95 % interval ``low``, ``high`` (Clopper and Pearson 1934), and
-        ``first``, the share in which that finding came first.
+        ``finding``, ``scenario``, ``condition`` ("none" for flights without a mistake: the rate is
+        that of false alarms), ``flights``, ``rate``, its 95 % interval ``low``, ``high`` (Clopper
+        and Pearson 1934), and ``first``, the share in which that finding came first.
     """
-    jobs = [(seed, clean) for clean in (AISLE, LOOP) for seed in range(clean_flights)]
-    # other seeds than the clean flights have
-    jobs += [(10_000 + seed, c) for c in CONDITIONS for seed in range(faulty_flights)]
-    with ProcessPoolExecutor(os.cpu_count()) as pool:
-        results = list(pool.map(_job, jobs, chunksize=2))
-    return pd.DataFrame(_rows(jobs, results))
+    processes = processes or os.cpu_count() or 1
+    with ProcessPoolExecutor(processes) as pool:
+        # one of each kind tells how long all will take
+        kinds = {job.conditions[0].scenario: job for job in flown}
+        started = dict(zip(kinds, pool.map(_seconds, kinds.values()), strict=True))
+        total = sum(started[job.conditions[0].scenario] for job in flown) / processes
+        print(f"{len(flown)} flights, about {total / 60.0:.0f} min", flush=True)  # noqa: T201 - said to who waits
+        results = list(pool.map(_fly, flown, chunksize=2))
+    return pd.DataFrame(_rows(flown, results))
 
 
-def _rows(
-    jobs: list[tuple[int, Condition]], results: list[tuple[str, ...]]
-) -> Iterator[dict[str, object]]:
-    clean = {
-        kind.kind: [result for (_, c), result in zip(jobs, results, strict=True) if c == kind]
-        for kind in (AISLE, LOOP)
-    }
-    kinds = {name: kind for kind, flights in clean.items() for result in flights for name in result}
-    kinds |= {condition.finding: condition.kind for condition in CONDITIONS}
-    for name, kind in sorted(kinds.items()):
-        own = clean[kind]
-        yield _row(name, CLEAN, [name in r for r in own], [r[:1] == (name,) for r in own])
+def _seconds(job: Job) -> float:
+    start = time.perf_counter()
+    _fly(job)
+    return time.perf_counter() - start
+
+
+def _rows(flown: list[Job], results: list[list[tuple[str, ...]]]) -> Iterator[dict[str, object]]:
+    by_condition: dict[Condition, list[tuple[str, ...]]] = {}
+    for job, named in zip(flown, results, strict=True):
+        for condition, ids in zip(job.conditions, named, strict=True):
+            by_condition.setdefault(condition, []).append(ids)
+    without = {c.scenario: own for c, own in by_condition.items() if not c.finding}
+    names = {c.finding for c in CONDITIONS}
+    names |= {name for own in without.values() for ids in own for name in ids}
+    for name in sorted(names):
+        for scenario, own in without.items():
+            yield _row(name, scenario, CLEAN, own)
     for condition in CONDITIONS:
-        own = [r for (_, c), r in zip(jobs, results, strict=True) if c == condition]
-        name = condition.finding
-        yield _row(name, condition.typed, [name in r for r in own], [r[:1] == (name,) for r in own])
+        if condition in by_condition:
+            own = by_condition[condition]
+            yield _row(condition.finding, condition.scenario, condition.typed, own)
 
 
-def _row(name: str, condition: str, hits: list[bool], first: list[bool]) -> dict[str, object]:
-    interval = binomtest(sum(hits), len(hits)).proportion_ci()
+def _row(name: str, scenario: str, condition: str, own: list[tuple[str, ...]]) -> dict[str, object]:
+    hits, first = sum(name in ids for ids in own), sum(ids[:1] == (name,) for ids in own)
+    interval = binomtest(hits, len(own)).proportion_ci()
     return {
         "finding": name,
+        "scenario": scenario,
         "condition": condition,
-        "flights": len(hits),
-        "rate": round(sum(hits) / len(hits), 4),
+        "flights": len(own),
+        "rate": round(hits / len(own), 4),
         "low": round(float(interval.low), 4),
         "high": round(float(interval.high), 4),
-        "first": round(sum(first) / len(first), 4),
+        "first": round(first / len(own), 4),
     }
 
 
@@ -168,6 +318,22 @@ def rates() -> pd.DataFrame:
         return pd.read_csv(file, keep_default_na=False)
 
 
-if __name__ == "__main__":
+def _main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--clean", type=int, default=CLEAN_FLIGHTS)
+    parser.add_argument("--faulty", type=int, default=FAULTY_FLIGHTS)
+    parser.add_argument("--only", default="")
+    given = parser.parse_args()
+    scenarios = [name for name in SCENARIOS if given.only in name]
+    conditions = [c for c in CONDITIONS if given.only in f"{c.finding} {c.typed}"]
+    table = measure(jobs(given.clean, given.faulty, scenarios, conditions))
+    if given.only:
+        shown = table[(table["condition"] != CLEAN) | (table["rate"] > 0.0)]
+        print(shown.to_string(index=False))  # noqa: T201 - asked for
+        return
     target = Path(str(files("px4fuse.findings").joinpath(TABLE)))
-    measure().to_csv(target, index=False, lineterminator="\n")
+    table.to_csv(target, index=False, lineterminator="\n")
+
+
+if __name__ == "__main__":
+    _main()

@@ -1,0 +1,248 @@
+"""Biases, scale and jumps that explain the innovations better than noise does."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.stats import chi2
+
+from px4fuse.arrays import Array, BoolArray
+from px4fuse.filter.hypotheses import (
+    FORWARD,
+    MIN_MEASUREMENTS,
+    RIGHT,
+    TURN,
+    Estimate,
+    Fit,
+    Lines,
+    Signals,
+    fit,
+    lines_of,
+    respond,
+    steps,
+    too_few,
+)
+from px4fuse.filter.kalman import Settings
+from px4fuse.filter.likelihood import parabola_vertex
+from px4fuse.filter.signals import Axis, Segment
+from px4fuse.flight import Flight, Unavailable
+
+# With biases and tilt taken out, less noise of the acceleration is left than the filter needs
+SIGMA_A_FACTORS = np.geomspace(0.2, 2.0, 7)
+SCALES = np.linspace(0.7, 1.3, 7)
+# A step is sought at no more times than these
+MAX_STEPS = 800
+# The vehicle's own reading is relied on across this time, in which bursts of outliers end
+BURST_S = 1.0
+# A run of outliers that begins within this time after a step belongs to it
+AFTER_STEP_S = 6.0
+# Chance that a flight without a step shows one anywhere
+STEP_FALSE_ALARM = 1e-3
+# Mean NIS of what follows a step that is one: of outliers that end, it stays far above 1
+STEP_NIS = 2.5
+MAX_JUMPS = 3
+# Measurements that a step must have on either side
+EDGE = 8
+
+
+@dataclass(frozen=True)
+class Jump:
+    """A step of the source that stays: time (s), size along each axis (m), and its χ²."""
+
+    time_s: float
+    step_m: tuple[Estimate, ...]
+    chi_square: float
+
+    @property
+    def size_m(self) -> float:
+        """Length of the step."""
+        return float(np.hypot.reduce([step.value for step in self.step_m]))
+
+
+@dataclass(frozen=True)
+class Explained:
+    """What explains the innovations of some axes better than noise alone.
+
+    Attributes
+    ----------
+    forward_bias, right_bias : Estimate
+        Accelerometer bias (m/s²) along the body's axes; a constant tilt of the attitude is the
+        same where the nose keeps its heading.
+    scale : Estimate
+        Distances of the source over those that the IMU gives, minus 1.
+    jumps : tuple of Jump
+    sigma_a_m_s2 : float
+        White noise of the acceleration that is left.
+    count : int
+        Measurements that were used.
+    """
+
+    forward_bias: Estimate
+    right_bias: Estimate
+    scale: Estimate
+    jumps: tuple[Jump, ...]
+    sigma_a_m_s2: float
+    count: int
+
+
+def explained(
+    flight: Flight,
+    axes: tuple[Axis, ...],
+    segment: Segment,
+    settings: Settings,
+    *,
+    sigma_a_m_s2: float,
+    sigma_z_m: float,
+    outlier_time_s: Array,
+    clock_offset_s: float = 0.0,
+) -> Explained | Unavailable:
+    """Estimate biases and scale, and look for jumps of the source.
+
+    Parameters
+    ----------
+    flight : Flight
+    axes : tuple of Axis
+        Horizontal, with the same measurement times.
+    segment : Segment
+    settings : Settings
+        ``dt_s`` gives SIGMA_A its meaning.
+    sigma_a_m_s2, sigma_z_m : float
+        Noises that the two-state filter needs.
+    outlier_time_s : ndarray
+        Measurements to leave out.
+    clock_offset_s : float
+        Added to the stamps first.
+
+    Returns
+    -------
+    Explained, or Unavailable where there is no acceleration or too few measurements.
+    """
+    lines = lines_of(flight, axes, segment, settings, sigma_z_m, clock_offset_s)
+    if isinstance(lines, Unavailable):
+        return lines
+    skip = np.isin(axes[0].measurement_time_s[-len(lines.time_s) :], outlier_time_s)
+    if np.count_nonzero(~skip) < MIN_MEASUREMENTS:
+        return too_few(int(np.count_nonzero(~skip)))
+    levels = sigma_a_m_s2 * SIGMA_A_FACTORS
+    sigma_a, found = _fit_noise(lines, levels, skip)
+    jumps = _jumps(lines, sigma_a, skip)
+    if jumps:
+        for jump in jumps:
+            skip = skip & ~_from(lines.time_s, jump.time_s, AFTER_STEP_S)
+        lines = replace(lines, steps=steps(lines.time_s, [jump.time_s for jump in jumps]))
+        sigma_a, found = _fit_noise(lines, levels, skip)
+    return Explained(
+        found.estimate(FORWARD),
+        found.estimate(RIGHT),
+        _scale(lines, sigma_a, skip),
+        jumps,
+        sigma_a,
+        int(np.count_nonzero(~skip)),
+    )
+
+
+def _fit_noise(lines: Lines, levels: Array, skip: BoolArray) -> tuple[float, Fit]:
+    """The most likely of some SIGMA_A, and what is fitted with it."""
+    fits = [lines.fit(float(level), skip) for level in levels]
+    best = int(np.argmin([each.score for each in fits]))
+    return float(levels[best]), fits[best]
+
+
+def _scale(lines: Lines, sigma_a: float, skip: BoolArray) -> Estimate:
+    """Scale of the source minus 1, from the likelihood of a few; a turn's share is put back."""
+    fits = [lines.fit(sigma_a, skip, float(scale)) for scale in SCALES]
+    # with S's logarithm, which grows with the scale, this would be biased towards zero
+    score = np.array([each.square / 2.0 for each in fits])
+    at = int(np.clip(np.argmin(score), 1, len(SCALES) - 2))
+    shift, bend = parabola_vertex(score, at)
+    step = float(SCALES[1] - SCALES[0])
+    if bend <= 0.0:
+        return Estimate(0.0, float("inf"))
+    found = SCALES[at] + float(np.clip(shift, -1.5, 1.5)) * step
+    sigma = step / np.sqrt(bend) * max(fits[at].spread, 1.0)
+    turned = np.hypot(1.0, fits[at].coefficients[TURN])
+    return Estimate(float(found * turned - 1.0), float(sigma))
+
+
+def _jumps(lines: Lines, sigma_a: float, skip: BoolArray) -> tuple[Jump, ...]:
+    """Steps of the source that stay, the largest first found, in order of time.
+
+    Times are proposed by a scan over all, and by where runs of outliers begin: a step begins with
+    one. Each is then judged without what follows within a second, by what the vehicle's own
+    reading makes of the rest, so that a burst of outliers is none.
+    """
+    jumps: list[Jump] = []
+    found = skip
+    for _ in range(MAX_JUMPS):
+        lines = replace(lines, steps=steps(lines.time_s, [jump.time_s for jump in jumps]))
+        starts = np.flatnonzero(found & ~np.concatenate([[False], found[:-1]]))
+        proposed = [float(lines.time_s[at]) for at in starts]
+        proposed += _scan(lines, sigma_a, found)
+        chance = STEP_FALSE_ALARM / max(len(proposed), 1)
+        judged = [_judge(lines, sigma_a, found, time_s, chance) for time_s in proposed]
+        named = [jump for jump in judged if jump is not None]
+        if not named:
+            break
+        best = max(named, key=lambda jump: jump.chi_square)
+        jumps.append(best)
+        found = found & ~_from(lines.time_s, best.time_s, AFTER_STEP_S)
+    return tuple(sorted(jumps, key=lambda jump: jump.time_s))
+
+
+def _from(time_s: Array, start_s: float, length_s: float) -> BoolArray:
+    return np.asarray((time_s >= start_s) & (time_s < start_s + length_s))
+
+
+def _scan(lines: Lines, sigma_a: float, skip: BoolArray) -> list[float]:
+    """The time at which a step would explain most, where that is more than chance would."""
+    white = lines.whiten(sigma_a, skip)
+    base = fit(white, lines.priors)
+    times = lines.time_s[EDGE:-EDGE]
+    times = times[:: max(1, -(-len(times) // MAX_STEPS))]
+    if not len(times):
+        return []
+    candidates = steps(lines.time_s, times)
+    still = np.zeros_like(candidates)
+    signals = Signals(still, still, candidates, np.zeros(len(times)))
+    rest = white.data - white.columns @ base.coefficients
+    chi_square = np.zeros(len(times))
+    rows = np.count_nonzero(~skip)
+    for at, legs in enumerate(lines.legs):
+        response = respond(legs, signals, sigma_a, lines.sigma_z_m, skip)[0][~skip]
+        own = slice(at * rows, (at + 1) * rows)
+        mixed = white.columns[own].T @ response
+        size = np.sum(response**2, axis=0) - np.sum(mixed * (base.covariance @ mixed), axis=0)
+        chi_square += (rest[own] @ response) ** 2 / np.maximum(size, 1e-9)
+    chi_square /= max(base.spread, 1.0) ** 2
+    best = int(np.argmax(chi_square))
+    if chi_square[best] < chi2.isf(STEP_FALSE_ALARM / len(lines.time_s), len(lines.legs)):
+        return []
+    return [float(times[best])]
+
+
+def _judge(
+    lines: Lines, sigma_a: float, skip: BoolArray, time_s: float, chance: float
+) -> Jump | None:
+    """A step at a time, where what comes later still asks for it; None where that is chance."""
+    after = _from(lines.time_s, time_s, AFTER_STEP_S)
+    burst = _from(lines.time_s, time_s, BURST_S)
+    lines = replace(lines, steps=np.hstack([lines.steps, steps(lines.time_s, [time_s])]))
+    columns = len(lines.prior) + lines.steps.shape[1] * (1 + np.arange(len(lines.legs))) - 1
+    later = (skip & ~after) | burst
+    before = np.count_nonzero(~later & (lines.time_s < time_s))
+    if min(before, np.count_nonzero(~later & (lines.time_s >= time_s))) < EDGE:
+        return None
+    white = lines.whiten(sigma_a, later)
+    found = fit(white, lines.priors)
+    size, covariance = found.coefficients[columns], found.covariance[np.ix_(columns, columns)]
+    chi_square = float(size @ np.linalg.solve(covariance, size)) / max(found.spread, 1.0) ** 2
+    if chi_square < chi2.isf(chance, len(columns)):
+        return None
+    rest = white.data - white.columns @ found.coefficients
+    near = np.tile(after[~later], len(lines.legs))
+    if np.mean(rest[near] ** 2) > STEP_NIS * max(found.spread, 1.0) ** 2:
+        return None
+    # its size from all, now that it is known to be one
+    whole = lines.fit(sigma_a, skip & ~after)
+    return Jump(time_s, tuple(whole.estimate(int(at)) for at in columns), chi_square)

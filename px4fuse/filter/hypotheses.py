@@ -1,0 +1,349 @@
+"""What would explain the innovations better than noise: a bias, a scale, a turn, a step.
+
+The filter is linear. Whatever adds a known signal to the measurements or to the acceleration adds
+to the innovations what the same filter, with the same gains, makes of that signal. So each
+hypothesis is a column, the response of the innovations to its unit, and generalised least squares
+(whitened by √S) gives its size, its standard deviation and its likelihood (Willsky and Jones 1976,
+the generalised likelihood ratio). What could pass for it is fitted along: constant accelerometer
+biases, a turn of the frame, and a slow error of the acceleration as a tilt of the attitude makes
+it.
+
+A scale also acts on the noise of the acceleration, so that its regression would be biased (errors
+in variables): what remains is weighed by the variance that it has at each scale (Deming 1943).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from scipy import constants
+from scipy.linalg import cho_factor, cho_solve
+from scipy.spatial.transform import Rotation
+
+from px4fuse.arrays import Array, BoolArray
+from px4fuse.filter.kalman import Settings
+from px4fuse.filter.likelihood import Preintegrated, preintegrate, recursion
+from px4fuse.filter.signals import Axis, Segment, ned_acceleration, project_acceleration
+from px4fuse.flight import AXIS_NAMES, QUATERNION_COLUMNS, Flight, Unavailable
+
+MIN_MEASUREMENTS = 50
+# Slow error of the logged attitude: its root mean square, and how far apart it is independent
+TILT_SIGMA_RAD = 0.002
+KNOT_S = 15.0
+MAX_KNOTS = 40
+FORWARD, RIGHT, TURN = range(3)
+CONSTANTS = 3
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A number and its standard deviation."""
+
+    value: float
+    sigma: float
+
+
+@dataclass(frozen=True)
+class Signals:
+    """Signals of one axis, of which the first is what was measured, the others columns.
+
+    Attributes
+    ----------
+    position_m, velocity_m_s : ndarray, shape (m, k)
+        What the acceleration of each adds between consecutive measurements.
+    measured_m : ndarray, shape (m, k)
+    start_m : ndarray, shape (k,)
+    """
+
+    position_m: Array
+    velocity_m_s: Array
+    measured_m: Array
+    start_m: Array
+
+
+@dataclass(frozen=True)
+class Whitened:
+    """Innovations over √S: data, shape (n,), columns, shape (n, k), and Σ ln S."""
+
+    data: Array
+    columns: Array
+    log_s: float
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Generalised least squares: coefficients, their covariance, and what remains.
+
+    ``square`` is the sum of squares that remains, ``spread`` their root mean, 1 where the noises
+    are right, and ``score`` the restricted negative log-likelihood.
+    """
+
+    coefficients: Array
+    covariance: Array
+    square: float
+    score: float
+    spread: float
+
+    def estimate(self, column: int) -> Estimate:
+        """One coefficient, its σ widened where more remains than the noises say."""
+        sigma = float(np.sqrt(self.covariance[column, column])) * max(self.spread, 1.0)
+        return Estimate(float(self.coefficients[column]), sigma)
+
+
+def respond(
+    legs: Preintegrated, signals: Signals, sigma_a: float, sigma_z: float, skip: BoolArray
+) -> tuple[Array, Array]:
+    """Innovations over √S of many signals, all by the gains of one filter.
+
+    Parameters
+    ----------
+    legs : Preintegrated
+        Of the axis: its lengths and noises are used.
+    signals : Signals
+        k of them.
+    sigma_a, sigma_z : float
+        m/s² and m.
+    skip : ndarray of bool, shape (m,)
+        Measurements that are not fused.
+
+    Returns
+    -------
+    normalised : ndarray, shape (m, k)
+    s : ndarray, shape (m,)
+    """
+    r = sigma_z**2
+    gains = [
+        (s, 0.0, 0.0) if skipped else (s, k0, covariance[1] / r)
+        for (_, s, k0, _, _, covariance), skipped in zip(
+            recursion(legs, sigma_a, sigma_z, skip), skip.tolist(), strict=True
+        )
+    ]
+    position, velocity = signals.start_m.copy(), np.zeros_like(signals.start_m)
+    out = np.empty_like(signals.measured_m)
+    for k, (dt, (_, k0, k1)) in enumerate(zip(legs.length_s.tolist(), gains, strict=True)):
+        position += dt * velocity + signals.position_m[k]
+        velocity += signals.velocity_m_s[k]
+        innovation = signals.measured_m[k] - position
+        out[k] = innovation
+        position += k0 * innovation
+        velocity += k1 * innovation
+    s = np.array([gain[0] for gain in gains])
+    return out / np.sqrt(s)[:, None], s
+
+
+def fit(white: Whitened, prior: Array) -> Fit:
+    """Regress whitened innovations on their columns.
+
+    Parameters
+    ----------
+    white : Whitened
+    prior : ndarray, shape (k,)
+        Standard deviation of each coefficient before the data, infinite where nothing is known.
+    """
+    X, y = white.columns, white.data
+    information = X.T @ X + np.diag(prior**-2.0)
+    # a column that nothing excites (a turn in hover) must not stop the others
+    information += 1e-12 * np.diag(np.diag(information)) + 1e-12 * np.eye(len(prior))
+    factor = cho_factor(information)
+    covariance = cho_solve(factor, np.eye(len(prior)))
+    coefficients = covariance @ (X.T @ y)
+    square = float(y @ y - coefficients @ (X.T @ y))
+    log_determinant = float(np.sum(np.log(np.diag(factor[0]))))
+    return Fit(
+        coefficients,
+        covariance,
+        square,
+        0.5 * (square + white.log_s) + log_determinant,
+        float(np.sqrt(max(square, 0.0) / max(len(y) - CONSTANTS, 1))),
+    )
+
+
+@dataclass(frozen=True)
+class Lines:
+    """Axes with their columns: what every hypothesis is fitted on.
+
+    Attributes
+    ----------
+    time_s : ndarray, shape (m,)
+        Of the measurements, as they were stamped.
+    legs, signals : tuple of Preintegrated and of Signals
+        Of each axis.
+    prior : ndarray, shape (k,)
+        Standard deviations of the columns' coefficients before the data.
+    sigma_z_m : float
+    steps : ndarray, shape (m, j)
+        Added to the measurements, in j more columns for each axis.
+    """
+
+    time_s: Array
+    legs: tuple[Preintegrated, ...]
+    signals: tuple[Signals, ...]
+    prior: Array
+    sigma_z_m: float
+    steps: Array
+
+    def fit(self, sigma_a: float, skip: BoolArray, scale: float = 1.0) -> Fit:
+        """Fit all columns."""
+        return fit(self.whiten(sigma_a, skip, scale), self.priors)
+
+    @property
+    def priors(self) -> Array:
+        """Of all columns, those of the steps included."""
+        return np.append(self.prior, np.full(len(self.legs) * self.steps.shape[1], np.inf))
+
+    def whiten(self, sigma_a: float, skip: BoolArray, scale: float = 1.0) -> Whitened:
+        """Whitened innovations with the acceleration (and its noise) scaled."""
+        data, columns, log_s = [], [], 0.0
+        width, extra = len(self.prior), self.steps.shape[1]
+        for at, (legs, signals) in enumerate(zip(self.legs, self.signals, strict=True)):
+            used = _with_measured(_scaled(signals, scale), self.steps)
+            normalised, s = respond(legs, used, scale * sigma_a, self.sigma_z_m, skip)
+            own = normalised[~skip]
+            block = np.zeros((len(own), width + extra * len(self.legs)))
+            block[:, :width] = own[:, 1 : 1 + width]
+            block[:, width + extra * at : width + extra * (at + 1)] = own[:, 1 + width :]
+            data.append(own[:, 0])
+            columns.append(block)
+            log_s += float(np.sum(np.log(s[~skip])))
+        return Whitened(np.concatenate(data), np.vstack(columns), log_s)
+
+
+def _scaled(signals: Signals, scale: float) -> Signals:
+    """Acceleration in the source's own length: of what was measured, and of a turn of it."""
+    factor = np.ones(signals.position_m.shape[1])
+    factor[[0, 1 + TURN]] = scale
+    return replace(
+        signals,
+        position_m=signals.position_m * factor,
+        velocity_m_s=signals.velocity_m_s * factor,
+    )
+
+
+def _with_measured(signals: Signals, added: Array) -> Signals:
+    still = np.zeros_like(added)
+    return Signals(
+        np.hstack([signals.position_m, still]),
+        np.hstack([signals.velocity_m_s, still]),
+        np.hstack([signals.measured_m, added]),
+        np.concatenate([signals.start_m, np.zeros(added.shape[1])]),
+    )
+
+
+def too_few(count: int) -> Unavailable:
+    """What stands in for an estimate from so few measurements."""
+    return Unavailable(
+        "causes beyond noise",
+        f"{count} measurements are too few (at least {MIN_MEASUREMENTS})",
+        "Analyse a longer segment, or log the source at a higher rate.",
+    )
+
+
+def lines_of(
+    flight: Flight,
+    axes: tuple[Axis, ...],
+    segment: Segment,
+    settings: Settings,
+    sigma_z: float,
+    clock_offset_s: float,
+) -> Lines | Unavailable:
+    """Lay out the axes with the columns that every hypothesis is fitted beside.
+
+    Parameters
+    ----------
+    flight : Flight
+    axes : tuple of Axis
+        Horizontal, with the same measurement times.
+    segment : Segment
+    settings : Settings
+        ``dt_s`` gives SIGMA_A its meaning.
+    sigma_z : float
+        Measurement noise (m).
+    clock_offset_s : float
+        Added to the stamps first.
+    """
+    acceleration = ned_acceleration(flight)
+    if isinstance(acceleration, Unavailable):
+        return acceleration
+    if isinstance(axes[0].acceleration, Unavailable):
+        return axes[0].acceleration
+    if isinstance(flight.attitude, Unavailable):
+        return flight.attitude
+    if len(axes[0].measurement_time_s) <= MIN_MEASUREMENTS:
+        return too_few(len(axes[0].measurement_time_s))
+    shifted = [
+        replace(axis, measurement_time_s=axis.measurement_time_s + clock_offset_s) for axis in axes
+    ]
+    settings = replace(settings, input="imu")
+    legs = tuple(preintegrate(axis, settings) for axis in shifted)
+    time_s = axes[0].measurement_time_s[-len(legs[0].measurement_m) :]
+    common = _common_columns(flight.attitude, acceleration)
+    hats = _hats(time_s[0] + clock_offset_s, time_s[-1] + clock_offset_s)
+    prior = np.concatenate(
+        [np.full(CONSTANTS, np.inf), np.full(len(axes) * len(hats), TILT_SIGMA_RAD * constants.g)]
+    )
+    signals = []
+    for at, (axis, own) in enumerate(zip(shifted, legs, strict=True)):
+        still = np.zeros_like(own.length_s)
+        moved = [(own.delta_position_m, own.delta_velocity_m_s)]
+        moved += [_moved(axis, frame, segment, settings) for frame in common]
+        for group in range(len(axes)):
+            moved += [
+                _moved(axis, _along(hat, axis.direction), segment, settings)
+                if group == at
+                else (still, still)
+                for hat in hats
+            ]
+        position, velocity = (np.stack(part, axis=1) for part in zip(*moved, strict=True))
+        measured, start = np.zeros_like(position), np.zeros(position.shape[1])
+        measured[:, 0], start[0] = own.measurement_m, own.initial.position_m
+        signals.append(Signals(position, velocity, measured, start))
+    return Lines(time_s, legs, tuple(signals), prior, sigma_z, steps(time_s, []))
+
+
+def _common_columns(attitude: pd.DataFrame, acceleration: pd.DataFrame) -> list[pd.DataFrame]:
+    """NED acceleration that takes out a bias forward and right, and that a turn adds."""
+    body_to_ned = Rotation.from_quat(
+        attitude[QUATERNION_COLUMNS].to_numpy(copy=True), scalar_first=True
+    )
+    names: list[Any] = list(AXIS_NAMES)
+    biases = [
+        pd.DataFrame(body_to_ned.apply(np.eye(3)[axis]), index=attitude.index, columns=names)
+        for axis in (FORWARD, RIGHT)
+    ]
+    north, east, _ = acceleration.to_numpy().T
+    turned = np.column_stack([-east, north, np.zeros(len(north))])
+    return [*biases, pd.DataFrame(turned, index=acceleration.index, columns=names)]
+
+
+def _hats(start_s: float, end_s: float) -> list[pd.Series]:
+    """Hat functions between knots, of which any slow signal is made."""
+    count = int(np.clip(np.ceil((end_s - start_s) / KNOT_S), 1, MAX_KNOTS)) + 1
+    knots = np.linspace(start_s, end_s, count)
+    # so fine that no interval passes for a gap
+    time = np.linspace(start_s, end_s, 20 * (count - 1) + 1)
+    return [pd.Series(np.interp(time, knots, hat), index=time) for hat in np.eye(count)]
+
+
+def _along(values: pd.Series, direction: Array) -> pd.DataFrame:
+    """A signal along a direction, in NED."""
+    return pd.DataFrame(
+        np.outer(values.to_numpy(), direction), index=values.index, columns=list(AXIS_NAMES)
+    )
+
+
+def _moved(
+    axis: Axis, acceleration: pd.DataFrame, segment: Segment, settings: Settings
+) -> tuple[Array, Array]:
+    """What another acceleration adds to position and velocity between the measurements."""
+    projected = project_acceleration(acceleration, axis.direction, segment)
+    legs = preintegrate(replace(axis, acceleration=projected), settings)
+    return legs.delta_position_m, legs.delta_velocity_m_s
+
+
+def steps(time_s: Array, starts_s: Iterable[float]) -> Array:
+    """Unit steps of the measurements, shape (m, j)."""
+    return np.asarray(time_s[:, None] >= np.fromiter(starts_s, float)[None, :], dtype=np.float64)
