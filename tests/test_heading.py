@@ -102,6 +102,9 @@ def test_what_cannot_be_told_says_why():
     found = estimated(slow)
     assert isinstance(found, Unavailable)
     assert "too slow" in found.reason
+    found = estimated(replace(flight, attitude=flight.attitude.iloc[::25]))
+    assert isinstance(found, Unavailable)
+    assert "attitude is too slow" in found.reason
     few = tuple(replace(t, samples=t.samples.iloc[:40]) for t in flight.positions)
     found = estimated(replace(flight, positions=few))
     assert isinstance(found, Unavailable)

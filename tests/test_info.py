@@ -15,6 +15,8 @@ from test_cli import run_main
 from ulog_tools import Log, load, make_log, odometry, stamps, take, topic
 
 from px4fuse.cli import cli
+from px4fuse.cli.info import _print
+from px4fuse.cli.outputs import terminal
 from px4fuse.comparison.comparison import compare
 from px4fuse.contents.inventory import Ability, Inventory, Source, take_inventory, to_plain
 from px4fuse.errors import Px4FuseError
@@ -267,6 +269,14 @@ def test_one_message_is_neither_damage_nor_a_span(tmp_path):
     path.write_bytes(Recorder().hear(UNIX_S, AUTOPILOT, heartbeat()).tlog() + bytes(14))
     assert "damaged" not in info(path)
     assert "a single moment" in info(path)
+
+
+def test_a_replay_is_told_by_its_speed_and_not_in_millions_of_ppm(sample_flight, capsys):
+    clock = ClockMap("time of receipt", "receive time", 9, -1.7e9, 26e6, 1.2, "a replay?")
+    _print(terminal(), take_inventory(dataclasses.replace(sample_flight, clocks=(clock,))))
+    said = capsys.readouterr().out
+    assert "27 times its speed" in said
+    assert "ppm" not in said
 
 
 def test_a_slow_source_is_told_to_be_faster(tmp_path):

@@ -24,6 +24,9 @@ if TYPE_CHECKING:
 
     from px4fuse.contents.inventory import Inventory, Source
 
+# No clock drifts by more: the recording was replayed at another speed
+REPLAY_PPM = 10_000.0
+
 
 @click.command()
 @click.argument("log", type=click.Path(path_type=Path))
@@ -120,7 +123,7 @@ def _flying(inventory: Inventory) -> str:
 
 
 def _senders(inventory: Inventory) -> Table:
-    table = _table("sender", "what it is", "messages", "not here", left=2)
+    table = _table("sender", "what it is", "messages", "lost", left=2)
     for sender in inventory.log.senders:
         table.add_row(
             f"{sender.system}/{sender.component}",
@@ -186,11 +189,18 @@ def _clocks(inventory: Inventory) -> list[tuple[str, str]]:
         note = f"; {clock.note}" if clock.note else ""
         words = (
             f"{clock.clock}, mapped by {clock.method} ({clock.pairs} pairs): offset "
-            f"{clock.offset_s:.4f} s, drift {clock.drift_ppm:+.1f} ppm, jitter "
+            f"{clock.offset_s:.4f} s, {_speed(clock.drift_ppm)}, jitter "
             f"{clock.jitter_s * 1e3:.1f} ms{note}"
         )
         lines.append(("-", words))
     return lines
+
+
+def _speed(drift_ppm: float) -> str:
+    """A drift, or how much faster a replay ran."""
+    if abs(drift_ppm) < REPLAY_PPM:
+        return f"drift {drift_ppm:+.1f} ppm"
+    return f"{1.0 + drift_ppm * 1e-6:.3g} times its speed"
 
 
 def _table(*headers: str, left: int) -> Table:

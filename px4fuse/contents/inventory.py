@@ -377,12 +377,11 @@ def _abilities(flight: Flight, plan: _Plan) -> Iterator[Ability]:
         yield Ability("acceleration", False, f"{acceleration.reason}; velocity is held constant")
     elif slow := list(_too_slow(flight)):
         rates = " and ".join(
-            f"{PART_NAMES[key]} at {_hertz(rate)} Hz, while {needed:g} Hz are needed"
+            f"{PART_NAMES[key]} at {_hertz(rate)} Hz ({needed:g} Hz are needed)"
             for key, rate, needed in slow
         )
-        yield Ability(
-            "acceleration", False, f"{rates}: compare uses it, but motion between samples is lost"
-        )
+        taken = "" if segment is None else "; compare takes it all the same"
+        yield Ability("acceleration", False, f"{rates}: motion between samples is lost{taken}")
     else:
         yield Ability("acceleration", True, "IMU turned into NED by the attitude, gravity removed")
     yield from _ekf2_abilities(flight, plan)
@@ -475,7 +474,7 @@ def _advice(flight: Flight, plan: _Plan) -> Iterator[Advice]:
     yield from _rate_advice(flight)
     if isinstance(ekf2, Unavailable):
         yield Advice(ekf2.remedy, ("EKF2",))
-    else:
+    elif log.has_ulog:  # no other autopilot could have recorded more of its estimator
         if track is not None:  # without a position, EKF2 had nothing to fuse
             yield from _innovation_advice(ekf2, track)
         for key, part in (("ekf2_variance", ekf2.variance), ("ekf2_fusing", ekf2.fusing)):
@@ -485,7 +484,7 @@ def _advice(flight: Flight, plan: _Plan) -> Iterator[Advice]:
     if lost_s > IMU_GAP_TOTAL.value:
         yield Advice("Use a faster SD card, or log less (SDLOG_PROFILE).", ("dropouts",))
     for key, last in (("airborne", flight.airborne), ("truth", flight.truth)):
-        if isinstance(last, Unavailable):
+        if isinstance(last, Unavailable) and (key == "airborne" or log.has_ulog):
             yield Advice(last.remedy, (PART_NAMES[key],))
 
 

@@ -48,6 +48,7 @@ MAX_TURN_RATE_DEG_S = 10.0
 LEAST_SIGMA_DEG = 0.5
 # Slower, and the acceleration between IMU samples is not known
 MAX_IMU_INTERVAL_S = 0.025
+MAX_ATTITUDE_INTERVAL_S = 0.11
 LINEARISATIONS = 3
 STATE_COUNT = 7
 TURN = 6
@@ -143,6 +144,8 @@ def heading_error(
     """
     if isinstance(flight.attitude, Unavailable):
         return flight.attitude
+    if np.median(np.diff(flight.attitude.index.to_numpy())) > MAX_ATTITUDE_INTERVAL_S:
+        return Unavailable("heading error", "the attitude is too slow", "Log it at 10 Hz or more.")
     compared = None
     if track.orientation is not None:
         compared = _by_orientation(flight.attitude, track.orientation, segment, offset_s)

@@ -16,13 +16,18 @@ def _detect(analysis: Analysis) -> Found:
     gap_s = comparison.axes[0].replay.input_gap_s
     imu = comparison.flight.imu
     interval_s = 1.0 / sample_rate(imu) if isinstance(imu, pd.DataFrame) else 0.0
+    remedy = (
+        "Record where the link loses no messages"
+        if comparison.flight.log.format.startswith("MAVLink")
+        else "Use a faster SD card"
+    )
     if gap_s > max(IMU_GAP_TOTAL.value, 2.0 * interval_s):
         yield Finding(
             "imu_gap",
             "warning",
             f"The IMU is missing for {gap_s:.2f} s of the segment; the process noise was raised "
             "there to the size of the motion.",
-            "Use a faster SD card, or choose a segment without the gap (--start, --end).",
+            f"{remedy}, or choose a segment without the gap (--start, --end).",
             {"total_s": gap_s},
         )
 

@@ -12,18 +12,18 @@ HEADING_ERROR = Threshold(5.0, "째", "EKF2's magnetic heading was off by 3 to 4�
 HEADING_ERROR_LARGE = Threshold(15.0, "째", "a quarter of each axis goes to the other")
 # Published in EKF2's own frame, after it turned what was sent (EKF2.cpp)
 IN_EKF2_FRAME = "estimator_visual_odometry_aligned"
-HEADING_REMEDY = (
-    "calibrate the magnetometer away from metal and motors, or let EKF2 fuse the source's yaw "
-    "(EKF2_EV_CTRL bit 3; EKF2_AID_MASK bit 4 before v1.14)."
-)
+CALIBRATE = "calibrate the magnetometer away from metal and motors, or let "
+FUSE_YAW = "EKF2 fuse the source's yaw (EKF2_EV_CTRL bit 3; EKF2_AID_MASK bit 4 before v1.14)."
 
 
 def _detect(analysis: Analysis) -> Found:
     source, heading = analysis.comparison.source, analysis.heading
     if isinstance(heading, Unavailable) or source.reconstructed:
         return
+    is_px4 = analysis.comparison.flight.log.has_ulog
+    remedy = CALIBRATE + (FUSE_YAW if is_px4 else "the autopilot fuse the source's yaw.")
     if heading.drifts:
-        yield _drifting(source.name, heading)
+        yield _drifting(source.name, heading, remedy)
         return
     turn, sigma = heading.turn_deg, heading.sigma_deg
     if abs(turn) < max(HEADING_SIGMAS.value * sigma, HEADING_ERROR.value):
@@ -38,7 +38,7 @@ def _detect(analysis: Analysis) -> Found:
             f"The positions that EKF2 fused ({source.name}) lie turned by {stated} against EKF2's "
             "heading, the same throughout: what the IMU measures as north, they show in another "
             "direction.",
-            f"Align the positioning system's frame with north, or {HEADING_REMEDY}",
+            f"Align the positioning system's frame with north, or {remedy}",
             evidence,
         )
         return
@@ -54,7 +54,7 @@ def _detect(analysis: Analysis) -> Found:
     )
 
 
-def _drifting(source: str, heading: HeadingError) -> Finding:
+def _drifting(source: str, heading: HeadingError, remedy: str) -> Finding:
     first, last = heading.ends
     change = last.heading_error_deg - first.heading_error_deg
     how = (
@@ -65,11 +65,12 @@ def _drifting(source: str, heading: HeadingError) -> Finding:
     return Finding(
         "ekf2_heading_wrong",
         "error" if abs(change) >= HEADING_ERROR_LARGE.value else "warning",
-        f"EKF2's heading drifts against {source}: {source}'s frame lies at "
+        f"EKF2's heading drifts against {source}, whose frame lies at "
         f"{first.heading_error_deg:+.0f}째 from {first.start_s:.0f} to {first.end_s:.0f} s and at "
-        f"{last.heading_error_deg:+.0f}째 from {last.start_s:.0f} to {last.end_s:.0f} s "
-        f"(clockwise seen from above, {how}). No constant turn of the positions mends that.",
-        f"{HEADING_REMEDY[0].upper()}{HEADING_REMEDY[1:]}",
+        f"{last.heading_error_deg:+.0f}째 from {last.start_s:.0f} to {last.end_s:.0f} s (clockwise "
+        f"seen from above, {how}): no constant turn of the positions mends that. A magnetometer "
+        "indoors does this, or odometry whose own heading drifts.",
+        f"{remedy[0].upper()}{remedy[1:]}",
         {
             "from_deg": first.heading_error_deg,
             "to_deg": last.heading_error_deg,
