@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from flights import line
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.stats import binom, norm
+from test_clock import SETTINGS, made_flight
 
 from px4fuse.arrays import Array
 from px4fuse.comparison.comparison import compare
@@ -27,7 +29,7 @@ from px4fuse.filter.tuning import (
     tune,
     tune_axes,
 )
-from px4fuse.flight import Unavailable
+from px4fuse.flight import POSITION_COLUMNS, Flight, Unavailable
 from px4fuse.readers import read_log
 
 SIGMA_A, SIGMA_Z = 0.5, 0.10
@@ -84,7 +86,7 @@ def test_estimates_are_unbiased(name: str, true: float) -> None:
     values = np.array([getattr(found, name).value for found in many()])
     error = np.std(values) / np.sqrt(SEEDS)
     assert np.mean(values) == pytest.approx(true, abs=0.01 * true + 2.6 * error)
-    assert error < 0.02 * true  # enough seeds to say so
+    assert error < 0.03 * true  # enough seeds to say so
 
 
 def test_nothing_is_called_an_outlier_where_there_is_none() -> None:
@@ -225,8 +227,6 @@ def test_too_few_measurements_are_said_to_be() -> None:
 
 
 def test_axes_are_named_and_pooled_only_where_they_share_their_times() -> None:
-    from dataclasses import replace
-
     north, east = modelled(1, 60), replace(modelled(2, 60), name="east")
     told: list[str] = []
     found = tune((north, east), TRUE, progress=told.append)
@@ -234,6 +234,47 @@ def test_axes_are_named_and_pooled_only_where_they_share_their_times() -> None:
     assert list(tune((north, east), TRUE, (HORIZONTAL, "down"))) == [HORIZONTAL]
     late = replace(east, measurement_time_s=east.measurement_time_s + 0.01)
     assert list(tune((north, late), TRUE)) == ["north", "east"]
+
+
+# --- noise apart from what is constant ---
+
+
+def horizontal(flight: Flight, *, imu: bool = True, drifts: bool = False) -> AxisTuning:
+    compared = compare(flight, SETTINGS)
+    axes = tuple(result.axis for result in compared.axes)
+    given = compared.flight if imu else None
+    found = tune(axes, SETTINGS, (HORIZONTAL,), flight=given, drifts=drifts)[HORIZONTAL]
+    assert isinstance(found, AxisTuning)
+    assert found.biases_fitted == imu
+    return found
+
+
+def test_biases_and_tilt_are_taken_out_of_the_noise() -> None:
+    """The filter that has no states for them needs more than the noise."""
+    flight, _ = made_flight(3, offset_s=0.1)
+    found, without = horizontal(flight), horizontal(flight, imu=False)
+    assert found.sigma_a.low <= 0.1 <= found.sigma_a.high
+    assert found.sigma_z.low <= 0.1 <= found.sigma_z.high
+    assert found.filter_sigma_a.low > found.sigma_a.high
+    # where the constants are not taken out there is but one SIGMA_A, which is the filter's
+    assert without.sigma_a == without.filter_sigma_a
+    assert without.sigma_a.value == pytest.approx(found.filter_sigma_a.value, rel=0.1)
+    assert len(found.outlier_time_s) == 0
+    assert found.noises.walk_m == 0.0
+
+
+def test_a_source_that_wanders_has_a_walk_of_its_own() -> None:
+    """0.1 m per root of a second, which would otherwise be called acceleration."""
+    flight, _ = made_flight(4, duration_s=90.0)
+    track = flight.positions[0]
+    steps = np.random.default_rng(4).normal(0.0, 0.1 * np.sqrt(0.2), (len(track.samples), 3))
+    samples = track.samples.copy()
+    samples[POSITION_COLUMNS] += np.cumsum(steps, axis=0)
+    wandering = replace(flight, positions=(replace(track, samples=samples),))
+    told, untold = horizontal(wandering, drifts=True), horizontal(wandering)
+    assert told.noises.walk_m == pytest.approx(0.1, rel=0.25)
+    assert told.noises.sigma_z_m == pytest.approx(0.1, rel=0.15)
+    assert untold.noises.sigma_a_m_s2 > 1.5 * told.noises.sigma_a_m_s2
 
 
 # --- real and simulated logs ---
@@ -266,7 +307,7 @@ def truth_of(log: Path) -> tuple[Array, NDArray[np.bool_]]:
 def test_the_noise_injected_is_found_in_simulated_flights(shared_logs, name: str) -> None:
     compared = compare(read_log(shared_logs / "simulated" / f"{name}.ulg"))
     axes = tuple(result.axis for result in compared.axes)
-    found = tune(axes, compared.settings, (HORIZONTAL,))[HORIZONTAL]
+    found = tune(axes, compared.settings, (HORIZONTAL,), flight=compared.flight)[HORIZONTAL]
     assert found.sigma_z.value == pytest.approx(0.10, rel=0.10)
     assert found.sigma_z.low <= 0.10 <= found.sigma_z.high
 
@@ -276,7 +317,7 @@ def test_nlos_is_found(shared_logs) -> None:
     log = shared_logs / "simulated" / "v1.16.1_aisle_nlos.ulg"
     compared = compare(read_log(log))
     axes = tuple(result.axis for result in compared.axes)
-    found = tune(axes, compared.settings, (HORIZONTAL,))[HORIZONTAL]
+    found = tune(axes, compared.settings, (HORIZONTAL,), flight=compared.flight)[HORIZONTAL]
     time, outlier = truth_of(log)
     segment = compared.segment
     truly = time[outlier & (time > segment.start_s) & (time < segment.end_s)]
@@ -295,6 +336,6 @@ def test_motion_capture_bounds_the_noise(shared_logs) -> None:
     for log in logs:
         compared = compare(read_log(log))
         axes = tuple(result.axis for result in compared.axes)
-        found = tune(axes, compared.settings, (HORIZONTAL,))[HORIZONTAL]
+        found = tune(axes, compared.settings, (HORIZONTAL,), flight=compared.flight)[HORIZONTAL]
         assert found.sigma_z.value is None, log.name
         assert found.sigma_z.high < 0.03, log.name
