@@ -214,9 +214,13 @@ def test_marginal_constants_are_a_covariance() -> None:
     np.testing.assert_allclose(ours - ours[0, 0], dense - dense[0, 0], rtol=1e-5, atol=1e-3)
 
 
-def test_an_axis_that_is_hardly_measured_says_nothing() -> None:
-    """One position in a stretch, wherever it is, and none are the same."""
+@pytest.mark.parametrize("start_known", [True, False])
+def test_an_axis_that_is_hardly_measured_says_nothing(start_known: bool) -> None:
+    """One position in a stretch, wherever it is, and none are the same, whatever is known before."""
     part = constants_part()
+    if not start_known:
+        nothing = np.zeros((COUNT, 2))
+        part = replace(part, positions=replace(part.positions, initial=nothing))
     without = part.positions.measurement_m.copy()
     without[15, 2] = np.nan
     weight = np.ones(COUNT)
@@ -348,7 +352,7 @@ def test_weights_mean_the_same_in_both_likelihoods() -> None:
 # --- the ends of an interval ---
 
 
-@pytest.mark.parametrize("slope", [0.0, 0.8, -3.0])
+@pytest.mark.parametrize("slope", [0.0, 0.1, 0.8, -3.0])
 def test_the_ends_of_a_parabola_are_196_sigma_away(slope: float) -> None:
     """With the other parameter free, which follows: its sigma is that of the margin."""
     sigma, other_sigma = 0.2, 0.05
