@@ -14,17 +14,15 @@ from test_kalman import any_axis, any_settings, sample_axes
 
 from px4fuse.filter.kalman import Settings, replay
 from px4fuse.filter.likelihood import (
-    OUTLIER_SHARE,
-    OUTLIER_WIDTH,
     SIGMA_A_GRID_M_S2,
     innovations,
-    negative_log_likelihood,
     noise_asked,
-    outlier_probability,
     parabola_vertex,
     preintegrate,
+    recursion,
     sigma_a_asked,
     states,
+    total_over_grid,
 )
 from px4fuse.filter.signals import Axis
 from px4fuse.flight import Flight
@@ -200,43 +198,32 @@ def test_a_skipped_measurement_is_compared_but_not_fused() -> None:
     assert np.all(nu[skip] != 0.0)
 
 
-def test_likelihood_is_that_of_the_contaminated_normal() -> None:
-    rng = np.random.default_rng(1)
-    s = rng.uniform(0.01, 4.0, (50, 2, 3))
-    nu = rng.normal(0.0, 2.0, s.shape)
-    density = (1.0 - OUTLIER_SHARE) * norm.pdf(nu, scale=np.sqrt(s)) + OUTLIER_SHARE * norm.pdf(
-        nu, scale=OUTLIER_WIDTH * np.sqrt(s)
-    )
-    np.testing.assert_allclose(
-        negative_log_likelihood(nu, s), -np.log(density).sum(axis=0), rtol=1e-12
-    )
+def test_a_weight_is_a_smaller_variance_of_its_measurement() -> None:
+    """A weight of 1/w² is SIGMA_Z times w; hardly any weight is a measurement left out."""
+    legs = preintegrate(walk(count=40), ZERO)
+    rows = list(recursion(legs, 0.5, 0.2, None, np.full(39, 4.0)))
+    heavier = innovations(legs, 0.5, 0.1)
+    np.testing.assert_allclose([row[:2] for row in rows], np.transpose(heavier), rtol=1e-12)
+    skip = np.arange(39) % 7 == 3
+    left_out = list(recursion(legs, 0.5, 0.1, None, np.where(skip, 1e-14, 1.0)))
+    nu, s = innovations(legs, 0.5, 0.1, skip)
+    np.testing.assert_allclose([row[0] for row in left_out], nu, rtol=1e-6)
+    np.testing.assert_allclose(np.array([row[1] for row in left_out])[~skip], s[~skip], rtol=1e-6)
 
 
-@pytest.mark.parametrize("far", [40.0, 1e4, 1e150])
-def test_likelihood_stays_finite_where_the_density_underflows(far: float) -> None:
-    got = negative_log_likelihood(np.array([far]), np.array([1.0]))
-    wide = -np.log(OUTLIER_SHARE) - norm.logpdf(far, scale=OUTLIER_WIDTH)
-    assert got == pytest.approx(wide, rel=1e-12)
-
-
-def test_outlier_probability_goes_from_the_prior_to_certainty() -> None:
-    """Bayes: ε N(ν; 0, w²S) against (1 - ε) N(ν; 0, S), over all axes."""
-    nu, s = np.linspace(0.0, 6.0, 25), np.full(25, 0.04)
-    for axes in (1, 2):
-        narrow = (1.0 - OUTLIER_SHARE) * norm.pdf(nu, scale=0.2) ** axes
-        wide = OUTLIER_SHARE * norm.pdf(nu, scale=0.2 * OUTLIER_WIDTH) ** axes
-        got = outlier_probability([nu] * axes, [s] * axes)
-        known = narrow > 0.0
-        np.testing.assert_allclose(got[known], (wide / (wide + narrow))[known], rtol=1e-9)
-        assert np.all(np.diff(got) >= 0.0)
-        assert got[0] < OUTLIER_SHARE  # no evidence at all speaks against an outlier
-        assert got[-1] == 1.0
-    # beyond every floating-point density
-    assert outlier_probability([np.array([1e100])], [np.array([1.0])]) == 1.0
-    # both axes together see what neither sees alone
-    both = [np.array([3.2]), np.array([3.2])]
-    unit = [np.ones(1), np.ones(1)]
-    assert outlier_probability(both[:1], unit[:1]) < 0.5 < outlier_probability(both, unit)
+def test_the_likelihood_over_a_grid_is_that_of_normal_innovations() -> None:
+    """Of both axes, against scipy's density of the replay's innovations."""
+    axes = walk(4, count=60), walk(5, count=60)
+    a, z = np.array([0.2, 0.5, 2.0]), np.array([0.05, 0.1])
+    legs = [preintegrate(axis, ZERO) for axis in axes]
+    total = total_over_grid(legs, a[:, None], z, np.ones(59))
+    density = np.zeros((3, 2))
+    for axis in axes:
+        for i, j in np.ndindex(3, 2):
+            nu, s = replayed(axis, replace(ZERO, sigma_a_m_s2=a[i], sigma_z_m=z[j]))
+            density[i, j] -= np.sum(norm.logpdf(nu, scale=np.sqrt(s)))
+    constant = 2 * 59 * 0.5 * np.log(2.0 * np.pi)
+    np.testing.assert_allclose(total + constant, density, rtol=1e-10)
 
 
 @pytest.mark.parametrize("vertex", [-0.5, -0.2, 0.0, 0.35, 0.5])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -10,35 +11,31 @@ import numpy as np
 import pytest
 from flights import line
 from numpy.typing import NDArray
-from scipy.stats import binom
+from scipy.interpolate import CubicSpline
+from scipy.stats import binom, norm
+from test_clock import SETTINGS, made_flight
 
 from px4fuse.arrays import Array
 from px4fuse.comparison.comparison import compare
 from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.kalman import Settings
-from px4fuse.filter.likelihood import (
-    PROFILE_DROP,
-    innovations,
-    negative_log_likelihood,
-    preintegrate,
-)
+from px4fuse.filter.likelihood import PROFILE_DROP, innovations, preintegrate
 from px4fuse.filter.signals import Axis
 from px4fuse.filter.tuning import (
     HORIZONTAL,
     MIN_MEASUREMENTS,
     SIGMA_Z_SEARCH_M,
     AxisTuning,
-    _total,
     tune,
     tune_axes,
 )
-from px4fuse.flight import Unavailable
+from px4fuse.flight import POSITION_COLUMNS, Flight, Unavailable
 from px4fuse.readers import read_log
 
 SIGMA_A, SIGMA_Z = 0.5, 0.10
 DT, INTERVAL_S = 0.1, 0.2
 TRUE = Settings(sigma_a_m_s2=SIGMA_A, sigma_z_m=SIGMA_Z, dt_s=DT, input="zero")
-SEEDS, COUNT = 60, 300
+SEEDS, COUNT = 40, 300
 
 
 def modelled(
@@ -54,15 +51,6 @@ def modelled(
     measured = position[::per_leg] + rng.normal(0.0, sigma_z, count + 1)
     measured[0] = 0.0  # the filter starts there, wrong by 0.5 m
     return line(INTERVAL_S * np.arange(count + 1), measured)
-
-
-def spoiled(axis: Axis, seed: int, share: float = 0.05) -> tuple[Axis, NDArray[np.bool_]]:
-    """The axis with outliers of ±1 m, and which measurements after the first they are."""
-    rng = np.random.default_rng(seed)
-    outlier = rng.random(len(axis.measurement_m)) < share
-    outlier[0] = False
-    wrong = axis.measurement_m + np.where(outlier, rng.choice([-1.0, 1.0], len(outlier)), 0.0)
-    return line(axis.measurement_time_s, wrong), outlier
 
 
 def tuned(*axes: Axis, chosen: Settings = TRUE) -> AxisTuning:
@@ -98,7 +86,7 @@ def test_estimates_are_unbiased(name: str, true: float) -> None:
     values = np.array([getattr(found, name).value for found in many()])
     error = np.std(values) / np.sqrt(SEEDS)
     assert np.mean(values) == pytest.approx(true, abs=0.01 * true + 2.6 * error)
-    assert error < 0.02 * true  # enough seeds to say so
+    assert error < 0.03 * true  # enough seeds to say so
 
 
 def test_nothing_is_called_an_outlier_where_there_is_none() -> None:
@@ -130,31 +118,18 @@ def test_bad_settings_lose_on_unseen_data() -> None:
     assert abs(found.after.lag1_autocorrelation) < abs(found.before.lag1_autocorrelation)
 
 
-def test_autocovariance_least_squares_agrees_on_regular_data() -> None:
-    found = [tuned(modelled(seed, 3000)) for seed in range(2)]
-    for each in found:
-        assert each.als_sigma_z_m == pytest.approx(SIGMA_Z, rel=0.15)
-        assert each.als_sigma_a_m_s2 == pytest.approx(SIGMA_A, rel=0.15)
-    values = [each.als_sigma_z_m for each in many()]
-    assert np.median(values) == pytest.approx(SIGMA_Z, rel=0.05)
-
-
-def test_autocovariance_least_squares_declines_irregular_intervals() -> None:
+def test_irregular_intervals_do_not_disturb() -> None:
     rng = np.random.default_rng(2)
     time = np.cumsum(rng.choice([0.1, 0.4], 300))
     found = tuned(line(time, rng.normal(0.0, SIGMA_Z, 300)))
-    assert found.als_sigma_a_m_s2 is None
-    assert found.als_sigma_z_m is None
     assert found.sigma_z.value == pytest.approx(SIGMA_Z, rel=0.15)
 
 
 @pytest.mark.parametrize("at", [8, 14, 20])
-def test_a_short_flight_with_a_gap_is_too_short_for_autocovariances(at: int) -> None:
-    """No stretch between gaps is longer than the lags: there is no autocovariance at all."""
+def test_a_short_flight_with_a_gap_is_tuned(at: int) -> None:
     axis = modelled(1, MIN_MEASUREMENTS)
     time = axis.measurement_time_s + np.where(np.arange(MIN_MEASUREMENTS + 1) >= at, 1.0, 0.0)
     found = tuned(line(time, axis.measurement_m))
-    assert found.als_sigma_z_m is None
     assert found.sigma_z.low < SIGMA_Z < found.sigma_z.high
 
 
@@ -176,8 +151,10 @@ def test_sigma_z_does_not_depend_on_what_was_chosen() -> None:
     settings = [Settings(sigma_a_m_s2=a, sigma_z_m=z, input="zero")
                 for a, z in ((0.01, 5.0), (20.0, 0.01))]  # fmt: skip
     first, second = (tuned(axis, chosen=each) for each in settings)
-    assert first.sigma_z == second.sigma_z
-    assert first.sigma_a == second.sigma_a
+    for one, other in ((first.sigma_z, second.sigma_z), (first.sigma_a, second.sigma_a)):
+        assert [one.value, one.low, one.high] == pytest.approx(
+            [other.value, other.low, other.high], rel=1e-4
+        )
 
 
 # --- the map ---
@@ -186,34 +163,28 @@ def test_sigma_z_does_not_depend_on_what_was_chosen() -> None:
 def test_the_map_is_the_likelihood_on_its_grid_and_the_interval_its_profile() -> None:
     axis = modelled(5)
     found = tuned(axis)
+    assert len(found.outlier_time_s) == 0
     legs = preintegrate(axis, TRUE)
+
+    def total(sigma_a: float, sigma_z: float) -> float:
+        nu, s = innovations(legs, sigma_a, sigma_z)
+        return float(-np.sum(norm.logpdf(nu, scale=np.sqrt(s))))
+
     grid_a, grid_z = found.map.sigma_a_m_s2, found.map.sigma_z_m
-    for i, j in ((0, 0), (10, 40), (63, 5)):
-        here, best = (
-            negative_log_likelihood(*innovations(legs, a, z))
-            for a, z in ((grid_a[i], grid_z[j]), (found.sigma_a.value, found.sigma_z.value))
-        )
-        assert here - best == pytest.approx(found.map.drop[i, j], abs=0.02)
+    best = total(found.sigma_a.value, found.sigma_z.value)
+    for i, j in ((0, 0), (10, 30), (39, 5)):
+        drop = total(grid_a[i], grid_z[j]) - best
+        # what may be an outlier counts a little less
+        assert found.map.drop[i, j] == pytest.approx(drop, rel=0.02, abs=0.02)
     assert found.map.drop.min() == 0.0
-    profile = found.map.drop.min(axis=0)
-    for end in (found.sigma_z.low, found.sigma_z.high):
-        assert np.interp(np.log(end), np.log(grid_z), profile) == pytest.approx(PROFILE_DROP)
-    # the map shows all that is likely
-    assert min(profile[0], profile[-1]) > PROFILE_DROP
-    assert found.sigma_z.low < found.sigma_z.value < found.sigma_z.high
-
-
-def test_scoring_in_blocks_is_scoring_at_once() -> None:
-    """Several legs, a skip, a late start, and more innovations than one block holds."""
-    axes = modelled(1), modelled(2)
-    legs = [preintegrate(axis, TRUE) for axis in axes]
-    skip = np.arange(COUNT) % 17 == 3
-    a, z = np.geomspace(0.1, 2.0, 20)[:, None], np.geomspace(0.02, 0.5, 30)
-    for start in (0, 37):
-        pairs = [innovations(leg, a, z, skip) for leg in legs]
-        whole = sum(negative_log_likelihood(nu[start:], s[start:]) for nu, s in pairs)
-        np.testing.assert_allclose(_total(legs, a, z, skip, start), whole, rtol=1e-10)
-    assert _total(legs, SIGMA_A, SIGMA_Z, skip).shape == ()
+    ends = ((grid_a, 1, found.filter_sigma_a), (grid_z, 0, found.sigma_z))
+    for grid, axis_of_other, noise in ends:
+        profile = CubicSpline(np.log(grid), found.map.drop.min(axis=axis_of_other))
+        for end in (noise.low, noise.high):
+            assert profile(np.log(end)) == pytest.approx(PROFILE_DROP, abs=0.1)
+        # the map shows all that is likely
+        assert min(profile(np.log(grid[[0, -1]]))) > PROFILE_DROP
+        assert noise.low < noise.value < noise.high
 
 
 # --- the edges ---
@@ -256,8 +227,6 @@ def test_too_few_measurements_are_said_to_be() -> None:
 
 
 def test_axes_are_named_and_pooled_only_where_they_share_their_times() -> None:
-    from dataclasses import replace
-
     north, east = modelled(1, 60), replace(modelled(2, 60), name="east")
     told: list[str] = []
     found = tune((north, east), TRUE, progress=told.append)
@@ -267,24 +236,45 @@ def test_axes_are_named_and_pooled_only_where_they_share_their_times() -> None:
     assert list(tune((north, late), TRUE)) == ["north", "east"]
 
 
-# --- outliers ---
+# --- noise apart from what is constant ---
 
 
-@pytest.mark.parametrize("share", [0.05, 0.10])
-def test_outliers_are_found_and_do_not_move_the_noise(share: float) -> None:
-    """At 10 % a fit that takes them for noise hides them; above 15 % it still may."""
-    hits = wrong = missed = 0
-    for seed in range(5):
-        axis, outlier = spoiled(modelled(seed, 400), seed, share)
-        found, clean = tuned(axis), tuned(modelled(seed, 400))
-        assert found.sigma_z.value == pytest.approx(clean.sigma_z.value, rel=0.10)
-        truly = axis.measurement_time_s[outlier]
-        right = np.count_nonzero(np.isin(found.outlier_time_s, truly))
-        hits += right
-        wrong += len(found.outlier_time_s) - right
-        missed += len(truly) - right
-    assert hits / (hits + wrong) > 0.9
-    assert hits / (hits + missed) > 0.9
+def horizontal(flight: Flight, *, imu: bool = True, drifts: bool = False) -> AxisTuning:
+    compared = compare(flight, SETTINGS)
+    axes = tuple(result.axis for result in compared.axes)
+    given = compared.flight if imu else None
+    found = tune(axes, SETTINGS, (HORIZONTAL,), flight=given, drifts=drifts)[HORIZONTAL]
+    assert isinstance(found, AxisTuning)
+    assert found.biases_fitted == imu
+    return found
+
+
+def test_biases_and_tilt_are_taken_out_of_the_noise() -> None:
+    """The filter that has no states for them needs more than the noise."""
+    flight, _ = made_flight(3, offset_s=0.1)
+    found, without = horizontal(flight), horizontal(flight, imu=False)
+    assert found.sigma_a.low <= 0.1 <= found.sigma_a.high
+    assert found.sigma_z.low <= 0.1 <= found.sigma_z.high
+    assert found.filter_sigma_a.low > found.sigma_a.high
+    # where the constants are not taken out there is but one SIGMA_A, which is the filter's
+    assert without.sigma_a == without.filter_sigma_a
+    assert without.sigma_a.value == pytest.approx(found.filter_sigma_a.value, rel=0.1)
+    assert len(found.outlier_time_s) == 0
+    assert found.noises.walk_m == 0.0
+
+
+def test_a_source_that_wanders_has_a_walk_of_its_own() -> None:
+    """0.1 m per root of a second, which would otherwise be called acceleration."""
+    flight, _ = made_flight(4, duration_s=90.0)
+    track = flight.positions[0]
+    steps = np.random.default_rng(4).normal(0.0, 0.1 * np.sqrt(0.2), (len(track.samples), 3))
+    samples = track.samples.copy()
+    samples[POSITION_COLUMNS] += np.cumsum(steps, axis=0)
+    wandering = replace(flight, positions=(replace(track, samples=samples),))
+    told, untold = horizontal(wandering, drifts=True), horizontal(wandering)
+    assert told.noises.walk_m == pytest.approx(0.1, rel=0.25)
+    assert told.noises.sigma_z_m == pytest.approx(0.1, rel=0.15)
+    assert untold.noises.sigma_a_m_s2 > 1.5 * told.noises.sigma_a_m_s2
 
 
 # --- real and simulated logs ---
@@ -317,7 +307,7 @@ def truth_of(log: Path) -> tuple[Array, NDArray[np.bool_]]:
 def test_the_noise_injected_is_found_in_simulated_flights(shared_logs, name: str) -> None:
     compared = compare(read_log(shared_logs / "simulated" / f"{name}.ulg"))
     axes = tuple(result.axis for result in compared.axes)
-    found = tune(axes, compared.settings, (HORIZONTAL,))[HORIZONTAL]
+    found = tune(axes, compared.settings, (HORIZONTAL,), flight=compared.flight)[HORIZONTAL]
     assert found.sigma_z.value == pytest.approx(0.10, rel=0.10)
     assert found.sigma_z.low <= 0.10 <= found.sigma_z.high
 
@@ -327,7 +317,7 @@ def test_nlos_is_found(shared_logs) -> None:
     log = shared_logs / "simulated" / "v1.16.1_aisle_nlos.ulg"
     compared = compare(read_log(log))
     axes = tuple(result.axis for result in compared.axes)
-    found = tune(axes, compared.settings, (HORIZONTAL,))[HORIZONTAL]
+    found = tune(axes, compared.settings, (HORIZONTAL,), flight=compared.flight)[HORIZONTAL]
     time, outlier = truth_of(log)
     segment = compared.segment
     truly = time[outlier & (time > segment.start_s) & (time < segment.end_s)]
@@ -346,6 +336,6 @@ def test_motion_capture_bounds_the_noise(shared_logs) -> None:
     for log in logs:
         compared = compare(read_log(log))
         axes = tuple(result.axis for result in compared.axes)
-        found = tune(axes, compared.settings, (HORIZONTAL,))[HORIZONTAL]
+        found = tune(axes, compared.settings, (HORIZONTAL,), flight=compared.flight)[HORIZONTAL]
         assert found.sigma_z.value is None, log.name
         assert found.sigma_z.high < 0.03, log.name

@@ -294,6 +294,9 @@ def _scatter(problem: _Problem, offset: float, noises: Noises, information: floa
         speed[begin:end] = np.cumsum(speed[begin:end], axis=0)
     error = noises.sigma_z_m * rng.standard_normal(speed.shape)
     nothing = np.zeros_like(dp)
+    # the source's own walk is in the residuals, but nothing that the IMU measured
+    walk = noises.walk_m * np.sqrt(chain.length_s)[:, None, None]
+    dp = dp + walk * rng.standard_normal(dp.shape)
     made = projected_products(
         *arguments(part, noises, np.ones(count)),
         np.concatenate([error, speed], axis=2),
@@ -318,8 +321,8 @@ def _parts(
     problem: _Problem, offset: float, noises: Noises, factor: float
 ) -> tuple[tuple[PartOffset, ...], float | None]:
     """Offset of each stretch by itself, and the p-value of no change, by the likelihood ratio."""
-    grid = np.linspace(-SEARCH_S, SEARCH_S, 2 * COARSE_POINTS - 1)
-    grid = np.unique(np.clip(grid + offset, -SEARCH_S, SEARCH_S))
+    grid = offset + np.linspace(-SEARCH_S, SEARCH_S, 2 * COARSE_POINTS - 1)
+    grid = grid[np.abs(grid) <= SEARCH_S]  # at equal steps, as the parabolas need them
     profiles = problem.fitted(grid, noises).by_stretch()
     found, used = [], []
     for begin, end, profile in zip(

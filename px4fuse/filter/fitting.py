@@ -155,6 +155,8 @@ def most_likely(
         square, count = _squares(parts, noises, weight)
         # outliers raise the noise that hides them: the median does not follow them
         bulk = float(np.median(square / count) / (chi2.median(count[0]) / count[0]))
+        if bulk > SIGMA_Z_SEARCH_M[1] ** 2:  # noise beyond the search is not outliers
+            return NoiseFit(noises, weight, outlier)
         variance = min(noises.sigma_z_m**2, BULK**2 * bulk)
         found = _outlier_probability(square / variance, count, share, width)
         if found.sum() < 0.5 and not outlier.any():

@@ -326,9 +326,10 @@ def _factors(
     while left:
         axes = [axis for axis in left if np.array_equal(known[:, axis], known[:, left[0]])]
         precision = positions.initial.copy()
-        precision[:, 0] += np.where(known[:, axes[0]], 1.0 / variance_m2, 0.0)
         # a stretch that this axis hardly measures is held by its start, and says nothing
         few = np.add.reduceat(known[:, axes[0]].astype(int), positions.start) < 2
+        used = known[:, axes[0]] & ~np.repeat(few, np.diff([*positions.start, len(known)]))
+        precision[:, 0] += np.where(used, 1.0 / variance_m2, 0.0)
         precision[positions.start[few]] += 1.0
         yield axes, factorise(positions.chain, sigma_a_m_s2, precision)
         left = [axis for axis in left if axis not in axes]

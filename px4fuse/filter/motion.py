@@ -102,8 +102,8 @@ class Motion:
         unit = dt_s * np.stack(noise_of_many_steps(length), 1)
         measured = measurement_m[self.row]
         # from the first of each stretch, whose place nothing says: numbers stay small
-        first = np.nan_to_num(measured[self.edges[:-1]])
-        measured = measured - np.repeat(first, np.diff(self.edges), axis=0)
+        stretch = np.repeat(np.arange(len(self.signals)), np.diff(self.edges))
+        measured = measured - pd.DataFrame(measured).groupby(stretch).transform("first").to_numpy()
         start = np.zeros((len(measured), 2))
         start[self.edges[:-1]] = START_PRECISION
         chain = Chain(end, length, unit, np.zeros_like(unit))
