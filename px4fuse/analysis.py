@@ -370,9 +370,14 @@ def run_what_if(request: WhatIfRequest, progress: Progress = _silent) -> Counter
         clock = clock_offset(comparison, tuning, progress)
         changes = asked_of_ekf2(comparison, model, tuning, clock)
         if not changes:
+            why = "the data do not tell the noise and the delay of what EKF2 fused"
+            if may_drift(flight, comparison.source):
+                why = (
+                    f"{comparison.source.name} may drift, so that innovations do not tell its "
+                    "noise, and the delay is as the data ask for or not determinable"
+                )
             raise MissingDataError(
-                f"{flight.log.name}: the data do not tell the noise and the delay of what EKF2 "
-                "fused. Say what to change: --set EKF2_EVP_NOISE=0.1."
+                f"{flight.log.name}: {why}. Say what to change: --set EKF2_EVP_NOISE=0.1."
             )
     settings = [changes] if changes else []
     if swept is not None:

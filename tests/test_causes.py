@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 from flights import Estimator, aisle_flight, unexplained
-from results_tools import changed, finding
+from results_tools import changed, decoded, finding
 from test_scoring import checked
 
 from px4fuse.comparison.comparison import Comparison, compare
@@ -17,6 +17,7 @@ from px4fuse.findings import Finding, find, phrases
 from px4fuse.findings.causes import CONSEQUENCES, NOISES, RECORDING, by_cause
 from px4fuse.findings.sigma import _off
 from px4fuse.flight import Flight
+from px4fuse.grading.flags import own_flags
 from px4fuse.report.words import verdict_notes
 
 
@@ -96,6 +97,20 @@ def test_notes_that_name_a_consequence_take_up_its_cause() -> None:
     assert checked("findings", results)[0] == 1.0
     silent = changed(findings=[cause], student__notes="All is well.")
     assert checked("findings", silent)[0] == 0.0
+
+
+def test_distrusting_a_source_that_may_drift_costs_no_points() -> None:
+    """The data of the example ask for 0.0966 m."""
+    above = {"settings__sigma_z_m": 0.3, "axes__north__kf__verdict": "variance overstated"}
+    drift = changed(**above, findings=[finding("source_may_drift", "info")])
+    asked = {"settings": ["sigma_z_m"]}
+    assert checked("tuning", drift, **asked)[0] == 1.0
+    assert checked("tuning", changed(**above, findings=[]), **asked)[0] == 0.0
+    far = {"axes__north__kf__variance_factor": 9.0, "axes__north__kf__nis_mean": 1.0 / 9.0}
+    for listed, share in (([finding("source_may_drift", "info")], 1.0), ([], 0.0)):
+        results = changed(**above, **far, findings=listed)
+        assert checked("consistent", results, axes=["north"])[0] == share
+    assert own_flags(decoded(drift)) == ()
 
 
 @pytest.fixture(scope="module")
