@@ -132,12 +132,12 @@ def test_what_the_data_ask_for(sample: Analysis) -> None:
     def asked(analysis: Analysis) -> dict[str, float]:
         return asked_of_ekf2(comparison, model, analysis.tuning, analysis.clock)
 
-    assert asked(sample) == {"EKF2_EVP_NOISE": 0.097}
+    assert asked(sample) == {"EKF2_EVP_NOISE": 0.098}
     assert asked(replace(sample, tuning={})) == {}
     aisle = {"aisle": sample.tuning["aisle"]}  # --axis aisle
     assert asked(replace(sample, tuning=aisle))["EKF2_EVP_NOISE"] == pytest.approx(0.1, abs=0.01)
     late = asked(offset(sample, -0.25))
-    assert late == {"EKF2_EVP_NOISE": 0.097, "EKF2_EV_DELAY": 250.0, "EKF2_DELAY_MAX": 300.0}
+    assert late == {"EKF2_EVP_NOISE": 0.098, "EKF2_EV_DELAY": 250.0, "EKF2_DELAY_MAX": 300.0}
     assert asked(offset(sample, -0.14))["EKF2_EV_DELAY"] == 140.0
     assert "EKF2_EV_DELAY" not in asked(offset(sample, -0.019))  # 0 may be right
     assert "EKF2_DELAY_MAX" not in asked(offset(sample, -0.14))
@@ -205,9 +205,9 @@ def test_rejections_are_ended_by_the_noise_that_the_data_ask_for(sample: Analysi
     north = rejecting(replace(sample.comparison, axes=sample.comparison.axes[:1]))
     sure = flown_with(replace(sample, comparison=north), EKF2_EVP_NOISE=0.03)
     remedy = only(ekf2_rejecting, sure).remedy
-    assert remedy.startswith("Set EKF2_EVP_NOISE to 0.097 m: rejected")
+    assert remedy.startswith("Set EKF2_EVP_NOISE to 0.098 m: rejected")
     right = only(ekf2_rejecting, replace(sample, comparison=north)).remedy
-    assert right.startswith("With what the data ask for (EKF2_EVP_NOISE to 0.097 m) the rejections")
+    assert right.startswith("With what the data ask for (EKF2_EVP_NOISE to 0.098 m) the rejections")
     assert "Remove the outliers" in right
     assert "A wider EKF2_EVP_GATE is no remedy; at 10:" in right
     silent = replace(sample, comparison=north, tuning={})
@@ -229,11 +229,11 @@ def test_without_a_replay_the_order_of_doing_is_given() -> None:
         ("v1.16.1_aisle_overconfident", "ekf2_variance_understated",
          "set EKF2_EVP_NOISE to 0.097 m: rejected 53% → 0%, mean NIS 22 → 1.0, position error 0.31 "
          "→ 0.11 m (replayed)"),
-        ("v1.16.1_aisle_overconfident", "ekf2_rejecting", "Set EKF2_EVP_NOISE to 0.097 m"),
+        ("v1.16.1_aisle_overconfident", "ekf2_rejecting", "Set EKF2_EVP_NOISE to 0.094 m"),
         ("v1.16.1_aisle_nlos", "ekf2_variance_understated", "remove the outliers"),
         ("v1.16.1_aisle_nlos", "ekf2_rejecting", "A wider EKF2_EVP_GATE is no remedy; at 10"),
         ("v1.16.1_aisle_clock_late", "ekf2_ev_delay_wrong", "position error 0.34 → 0.11 m"),
-        ("v1.16.1_aisle_clock_late", "source_clock_offset", "for EKF2 set EKF2_EV_DELAY to 264 ms"),
+        ("v1.16.1_aisle_clock_late", "source_clock_offset", "for EKF2 set EKF2_EV_DELAY to 263 ms"),
         ("v1.13.3_aisle_evdelay175", "ekf2_ev_delay_wrong", "position error 0.15 → 0.10 m"),
     ],
 )  # fmt: skip

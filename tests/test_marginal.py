@@ -216,7 +216,7 @@ def test_marginal_constants_are_a_covariance() -> None:
 
 @pytest.mark.parametrize("start_known", [True, False])
 def test_an_axis_that_is_hardly_measured_says_nothing(start_known: bool) -> None:
-    """One position in a stretch, wherever it is, and none are the same, whatever is known before."""
+    """One position in a stretch, wherever it is, and none at all are the same."""
     part = constants_part()
     if not start_known:
         nothing = np.zeros((COUNT, 2))
