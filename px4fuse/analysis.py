@@ -46,8 +46,8 @@ from px4fuse.request import (
     WhatIfRequest,
 )
 
-# What the report shows; each axis by itself is for `px4fuse tune`
-REPORTED = (HORIZONTAL, "down", "aisle")
+# Noises that the report states: those of a source once. Each axis by itself is for `px4fuse tune`
+REPORTED = (HORIZONTAL, "down")
 
 # Slower, and what the acceleration did between two samples is not known well enough to tell times
 MIN_CLOCK_IMU_HZ = 40.0

@@ -11,6 +11,7 @@ from flights import unexplained
 
 from px4fuse.analysis import Analysis, explain
 from px4fuse.comparison.comparison import compare
+from px4fuse.filter.clock import ClockOffset
 from px4fuse.filter.kalman import Settings
 from px4fuse.findings import (
     Finding,
@@ -116,3 +117,21 @@ def test_simulated_px4_flights(shared_logs: Path, log, name) -> None:
     flight = read_log(shared_logs / "simulated" / f"{log}.ulg")
     named = list(found(explain(compare(flight, Settings(0.35, 0.10), axes=("north", "east")))))
     assert named[:1] == ([] if name is None else [name])
+
+
+@pytest.mark.parametrize(
+    ("offset_s", "says", "remedy"),
+    [
+        (-0.120, "the data ask for 120 ms (95 % 110 to 130)", "EKF2_EV_DELAY"),
+        (0.080, "the stamps are early by 80 ms (95 % 70 to 90)", "Correct the stamps"),
+    ],
+)
+def test_no_delay_is_negative(offset_s, says, remedy) -> None:
+    clean = flown()
+    assert isinstance(clean.clock, ClockOffset)
+    interval = offset_s - 0.01, offset_s + 0.01
+    clock = replace(clean.clock, offset_s=offset_s, interval_s=interval, sigma_s=0.005)
+    (finding,) = ekf2_ev_delay_wrong.DETECTOR.detect(replace(clean, clock=clock))
+    assert says in finding.message
+    assert remedy in finding.remedy
+    assert "EKF2_EV_DELAY to -" not in finding.remedy

@@ -26,6 +26,8 @@ SIGMA_A_SEARCH_M_S2 = (1e-3, 30.0)
 SIGMA_Z_SEARCH_M = (1e-3, 10.0)
 WALK_SEARCH_M = (1e-4, 1.0)
 MAX_PASSES = 12
+# Of the maximisation, in the end and while the outliers still change
+MAX_STEPS, ROUGH_STEPS = 50, 3
 # Outliers are at least this many times as wide as the rest: less is not told from it
 LEAST_WIDTH = 3.0
 FIRST_SHARE, FIRST_WIDTH, MAX_SHARE = 0.02, 10.0, 0.4
@@ -37,7 +39,7 @@ FULL_RANK = 1e-3
 # Steps of ln σ for slopes and bends
 SLOPE_STEP, BEND_STEP = 1e-4, 0.05
 # Of those: how far a parabola is followed at once, and how often
-FAR_STEPS, MAX_STEPS = 6.0, 4
+FAR_STEPS, PARABOLAS = 6.0, 4
 # ln σ at which the end of an interval is sought first
 FIRST_REACH = 0.05
 
@@ -169,8 +171,9 @@ def most_likely(
         outlier = found
         if settled:
             break
-        noises = _maximise(parts, replace(noises, sigma_z_m=float(np.sqrt(variance))), weight)
-    return NoiseFit(noises, weight, outlier)
+        guess = replace(noises, sigma_z_m=float(np.sqrt(variance)))
+        noises = _maximise(parts, guess, weight, ROUGH_STEPS)
+    return NoiseFit(_maximise(parts, noises, weight), weight, outlier)
 
 
 def _squares(parts: Sequence[Part], noises: Noises, weight: Array) -> tuple[Array, Array]:
@@ -187,7 +190,9 @@ def _outlier_probability(square: Array, count: Array, share: float, width: float
     return np.asarray(expit(odds + 0.5 * square * (1.0 - width**-2.0)))
 
 
-def _maximise(parts: Sequence[Part], start: Noises, weight: Array) -> Noises:
+def _maximise(
+    parts: Sequence[Part], start: Noises, weight: Array, steps: int = MAX_STEPS
+) -> Noises:
     values = [start.sigma_a_m_s2, start.sigma_z_m, *([start.walk_m] if start.walk_m else [])]
     bounds = np.log([SIGMA_A_SEARCH_M_S2, SIGMA_Z_SEARCH_M, WALK_SEARCH_M][: len(values)])
 
@@ -199,7 +204,7 @@ def _maximise(parts: Sequence[Part], start: Noises, weight: Array) -> Noises:
         np.clip(np.log(values), *bounds.T),
         method="L-BFGS-B",
         bounds=bounds.tolist(),
-        options={"eps": SLOPE_STEP, "ftol": 1e-8},
+        options={"eps": SLOPE_STEP, "ftol": 1e-8, "maxiter": steps},
     )
     return Noises(*np.exp(found.x).tolist())
 
@@ -243,7 +248,7 @@ def profile_end(
 
 def _lowest(score: Callable[[float], float], near: float) -> tuple[float, float]:
     """Least value of a score and where it is, by parabolas from near there."""
-    for _ in range(MAX_STEPS):
+    for _ in range(PARABOLAS):
         left, middle, right = (score(near + k * BEND_STEP) for k in (-1.0, 0.0, 1.0))
         if left == middle == right:  # there is no other parameter
             return middle, near

@@ -64,8 +64,10 @@ class Factor:
     precision : ndarray, shape (m, 2)
         Of the measured position (1/m²) and of the velocity, whose measured value is zero (s²/m²);
         0 where there is none.
-    inverse : ndarray, shape (n, 3)
-        Q⁻¹ by elements 00, 01, 11.
+    length_s : ndarray, shape (m - 1,)
+        Between any two states; 0 where a stretch begins.
+    inverse : ndarray, shape (m - 1, 3)
+        Q⁻¹ by elements 00, 01, 11; zero where a stretch begins.
     lower : ndarray, shape (4, 2m)
         Bands of the Cholesky factor.
     log_determinant : float
@@ -74,6 +76,7 @@ class Factor:
 
     chain: Chain
     precision: Array
+    length_s: Array
     inverse: Array
     lower: Array
     log_determinant: float
@@ -89,39 +92,53 @@ class Factor:
         -------
         state : ndarray, shape (m, 2, k)
             Position and velocity.
-        whitened : ndarray, shape (2m + 2n, k)
-            Rows of measurements (position, velocity), then of legs: their products are those of
-            the signals under the inverse covariance of the data.
+        whitened : ndarray, shape (2m + 2(m - 1), k)
+            Rows of measurements (position, velocity), then of legs between any two states, zero
+            where there is none: their products are those of the signals under the inverse
+            covariance of the data.
         """
-        end, dt = self.chain.end, self.chain.length_s[:, None]
-        i00, i01, i11 = (row[:, None] for row in self.inverse.T)
-        dp, dv = columns.delta_position_m, columns.delta_velocity_m_s
         count = len(self.precision)
+        i00, i01, i11 = (row[:, None] for row in self.inverse.T)
+        dt = self.length_s[:, None]
+        dp, dv = (
+            self._everywhere(part)
+            for part in (columns.delta_position_m, columns.delta_velocity_m_s)
+        )
         right = np.zeros((count, 2, dp.shape[1]))
         right[:, 0] = self.precision[:, :1] * columns.measurement_m
         g0, g1 = i00 * dp + i01 * dv, i01 * dp + i11 * dv
-        right[end, 0] += g0
-        right[end, 1] += g1
-        right[end - 1, 0] -= g0
-        right[end - 1, 1] -= g0 * dt + g1
+        right[1:, 0] += g0
+        right[1:, 1] += g1
+        right[:-1, 0] -= g0
+        g1 += g0 * dt
+        right[:-1, 1] -= g1
         flat = right.reshape(2 * count, -1)
-        solved = cho_solve_banded((self.lower, True), flat, check_finite=False)
-        state = solved.reshape(right.shape)
-        before, after = state[end - 1], state[end]
-        e0 = after[:, 0] - before[:, 0] - dt * before[:, 1] - dp
-        e1 = after[:, 1] - before[:, 1] - dv
-        # Q⁻¹ = UᵀU
+        solved = cho_solve_banded((self.lower, True), flat, overwrite_b=True, check_finite=False)
+        state = np.asarray(solved.reshape(right.shape))
+        position, velocity = state[:, 0], state[:, 1]
+        e0 = position[1:] - position[:-1] - dt * velocity[:-1] - dp
+        e1 = velocity[1:] - velocity[:-1] - dv
+        # Q⁻¹ = UᵀU; where a stretch begins it is zero
         u00 = np.sqrt(i00)
-        u01 = i01 / u00
-        whitened = np.concatenate(
-            [
-                np.sqrt(self.precision[:, :1]) * (columns.measurement_m - state[:, 0]),
-                -np.sqrt(self.precision[:, 1:]) * state[:, 1],
-                u00 * e0 + u01 * e1,
-                np.sqrt(i11 - u01**2) * e1,
-            ]
-        )
-        return np.asarray(state), np.asarray(whitened)
+        u01 = np.divide(i01, u00, out=np.zeros_like(i01), where=u00 > 0.0)
+        whitened = np.empty((4 * count - 2, dp.shape[1]))
+        np.subtract(columns.measurement_m, position, out=whitened[:count])
+        whitened[:count] *= np.sqrt(self.precision[:, :1])
+        np.multiply(-np.sqrt(self.precision[:, 1:]), velocity, out=whitened[count : 2 * count])
+        legs = whitened[2 * count :].reshape(2, count - 1, -1)
+        np.multiply(np.sqrt(i11 - u01**2), e1, out=legs[1])
+        e1 *= u01
+        np.multiply(u00, e0, out=legs[0])
+        legs[0] += e1
+        return state, whitened
+
+    def _everywhere(self, of_legs: Array) -> Array:
+        """One row between any two states, zero where a stretch begins."""
+        if len(of_legs) == len(self.inverse):
+            return of_legs
+        made = np.zeros((len(self.inverse), *of_legs.shape[1:]))
+        made[self.chain.end - 1] = of_legs
+        return made
 
     def position_variance(self) -> Array:
         """Variance of each state's position given all data (m²), shape (m,).
@@ -171,33 +188,34 @@ def factorise(chain: Chain, sigma_a_m_s2: float, precision: Array) -> Factor:
     """
     if precision.ndim == 1:
         precision = np.stack([precision, np.zeros_like(precision)], 1)
-    end, dt = chain.end, chain.length_s
     q00, q01, q11 = (sigma_a_m_s2**2 * chain.noise_unit + chain.noise_fixed).T
     determinant = q00 * q11 - q01**2
-    i00, i01, i11 = q11 / determinant, -q01 / determinant, q00 / determinant
     count = len(precision)
+    inverse, dt = np.zeros((count - 1, 3)), np.zeros(count - 1)
+    inverse[chain.end - 1] = np.stack([q11, -q01, q00], 1) / determinant[:, None]
+    dt[chain.end - 1] = chain.length_s
+    i00, i01, i11 = inverse.T
     bands = np.zeros((4, 2 * count))
     # A = Σ precision + [-F I]ᵀ Q⁻¹ [-F I]
     position, velocity, cross = precision[:, 0].copy(), precision[:, 1].copy(), np.zeros(count)
-    position[end] += i00
-    cross[end] += i01
-    velocity[end] += i11
-    start = end - 1
-    position[start] += i00
-    cross[start] += i00 * dt + i01
-    velocity[start] += i00 * dt**2 + 2.0 * i01 * dt + i11
+    position[1:] += i00
+    cross[1:] += i01
+    velocity[1:] += i11
+    position[:-1] += i00
+    cross[:-1] += i00 * dt + i01
+    velocity[:-1] += i00 * dt**2 + 2.0 * i01 * dt + i11
     bands[0, 0::2], bands[0, 1::2], bands[1, 0::2] = position, velocity, cross
-    bands[2, 2 * start] = -i00
-    bands[1, 2 * start + 1] = -(i00 * dt + i01)
-    bands[3, 2 * start] = -i01
-    bands[2, 2 * start + 1] = -(i01 * dt + i11)
+    bands[2, 0:-2:2] = -i00
+    bands[1, 1:-2:2] = -(i00 * dt + i01)
+    bands[3, 0:-2:2] = -i01
+    bands[2, 1:-2:2] = -(i01 * dt + i11)
     lower = cholesky_banded(bands, overwrite_ab=True, lower=True, check_finite=False)
     log_determinant = (
         2.0 * np.sum(np.log(lower[0]))
         + np.sum(np.log(determinant))
         - np.sum(np.log(precision[precision > 0.0]))
     )
-    return Factor(chain, precision, np.stack([i00, i01, i11], 1), lower, float(log_determinant))
+    return Factor(chain, precision, dt, inverse, lower, float(log_determinant))
 
 
 @dataclass(frozen=True)
@@ -304,17 +322,21 @@ def fit(
 
 def products(positions: Positions, whitened: Array) -> Array:
     """Products of whitened columns by stretch: (rows, a, T, k) to (s, T, k, k)."""
-    m, n = len(positions.measurement_m), len(positions.chain.end)
+    m = len(positions.measurement_m)
     edges = [*positions.start.tolist(), m]
-    legs = np.searchsorted(positions.chain.end, edges).tolist()
-    made = []
-    for begin, end, first, last in zip(edges, edges[1:], legs, legs[1:], strict=False):
-        rows = np.r_[begin:end, m + begin : m + end]
-        rows = np.r_[rows, 2 * m + first : 2 * m + last, 2 * m + n + first : 2 * m + n + last]
-        part = np.moveaxis(whitened[rows], 2, 0)
-        part = part.reshape(len(part), -1, part.shape[-1])
-        made.append(np.swapaxes(part, 1, 2) @ part)
-    return np.array(made)
+    made = np.zeros((len(edges) - 1, whitened.shape[2], whitened.shape[3], whitened.shape[3]))
+    by_offset = np.moveaxis(whitened, 2, 0)
+    for at, (begin, end) in enumerate(zip(edges, edges[1:], strict=False)):
+        for first, size in (
+            (begin, end - begin),
+            (m + begin, end - begin),
+            (2 * m + begin, end - begin - 1),
+            (3 * m - 1 + begin, end - begin - 1),
+        ):
+            part = by_offset[:, first : first + size]
+            part = part.reshape(len(by_offset), -1, whitened.shape[3])
+            made[at] += np.swapaxes(part, 1, 2) @ part
+    return made
 
 
 def _factors(

@@ -46,11 +46,17 @@ def _detect(analysis: Analysis) -> Found:
     apart = abs(delay * 1e-3 - best)
     if apart < max(CLOCK_SIGMAS.value * clock.sigma_s + EKF2_UPDATE.value, CLOCK_OFFSET.value):
         return
+    low_ms, high_ms = asked * 1e3
+    found = (
+        f"the data ask for {best * 1e3:.0f} ms (95 % {low_ms:.0f} to {high_ms:.0f})"
+        if best >= 0.0
+        else f"the stamps are early by {-best * 1e3:.0f} ms (95 % {-high_ms:.0f} to {-low_ms:.0f}),"
+        " for which there is no delay"
+    )
     yield Finding(
         "ekf2_ev_delay_wrong",
         "warning",
-        f"EKF2_EV_DELAY is {delay:g} ms, while the data ask for {best * 1e3:.0f} ms (95 % "
-        f"{asked[0] * 1e3:.0f} to {asked[1] * 1e3:.0f}): EKF2 fuses each position at the wrong "
+        f"EKF2_EV_DELAY is {delay:g} ms, while {found}: EKF2 fuses each position at the wrong "
         "time, and its track lags or leads by the difference.",
         delay_remedy(analysis, 0.0 if asked[0] <= 0.0 else best * 1e3, delay),
         {"ekf2_ev_delay_ms": delay, "asked_ms": best * 1e3},
