@@ -17,6 +17,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+import pandas as pd
 from scipy.interpolate import CubicSpline
 from scipy.stats import chi2
 
@@ -29,7 +30,9 @@ from px4fuse.filter.motion import CONSTANT_SIGMA, HEADING, SEARCH_S, Motion, mot
 from px4fuse.filter.signals import Segment, within
 from px4fuse.flight import POSITION_COLUMNS, Flight, PositionTrack, Unavailable
 
-COARSE_POINTS, FINE_POINTS, CURVE_POINTS = 25, 15, 121
+COARSE_POINTS, FINE_POINTS, CURVE_POINTS = 25, 11, 121
+# Enough to find the offset roughly
+COARSE_MEASUREMENTS = 600
 MIN_MEASUREMENTS = 30
 # A wider interval says nothing that a student could use
 MAX_HALF_INTERVAL_S = 0.15
@@ -172,9 +175,9 @@ def estimate_clock_offset(
         )
     progress("clock offset")
     problem = _Problem(moved, samples.to_numpy(), np.eye(3), settings.dt_s)
-    offset = _coarse(problem, noises)
+    offset = _coarse(flight.imu, flight.attitude, samples, settings.dt_s, noises)
     sigma, width = 0.0, 0.1
-    for _ in range(3):
+    for _ in range(2):
         noises = _noises(problem, offset, noises)
         ends = np.clip([offset - width, offset + width], -SEARCH_S, SEARCH_S)
         curve = np.linspace(ends[0], ends[1], FINE_POINTS)
@@ -232,8 +235,15 @@ def estimate_clock_offset(
     )
 
 
-def _coarse(problem: _Problem, noises: Noises) -> float:
-    """Offset of greatest likelihood over the whole search."""
+def _coarse(
+    imu: pd.DataFrame, attitude: pd.DataFrame, samples: pd.DataFrame, dt_s: float, noises: Noises
+) -> float:
+    """Offset of greatest likelihood over the whole search, from some of the measurements."""
+    some = samples.iloc[:: max(1, len(samples) // COARSE_MEASUREMENTS)]
+    moved = motion(imu, attitude, some.index.to_numpy())
+    if moved is None:
+        return 0.0
+    problem = _Problem(moved, some.to_numpy(), np.eye(3), dt_s)
     grid = np.linspace(-SEARCH_S, SEARCH_S, COARSE_POINTS)
     return float(grid[np.argmin(problem.fitted(grid, noises).total())])
 

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from scipy.linalg import cho_solve_banded, cholesky_banded
@@ -326,7 +327,7 @@ def products(positions: Positions, whitened: Array) -> Array:
     edges = [*positions.start.tolist(), m]
     made = np.zeros((len(edges) - 1, whitened.shape[2], whitened.shape[3], whitened.shape[3]))
     by_offset = np.moveaxis(whitened, 2, 0)
-    for at, (begin, end) in enumerate(zip(edges, edges[1:], strict=False)):
+    for at, (begin, end) in enumerate(pairwise(edges)):
         for first, size in (
             (begin, end - begin),
             (m + begin, end - begin),
