@@ -26,7 +26,7 @@ from px4fuse.filter.fitting import NoiseFit, Noises, Part, arguments, most_likel
 from px4fuse.filter.kalman import Settings
 from px4fuse.filter.likelihood import PROFILE_DROP, parabola_vertex, profile_interval
 from px4fuse.filter.marginal import Fitted, fit, projected_products
-from px4fuse.filter.motion import CONSTANT_SIGMA, HEADING, SEARCH_S, Motion, motion
+from px4fuse.filter.motion import SEARCH_S, Motion, motion
 from px4fuse.filter.signals import Segment, within
 from px4fuse.flight import POSITION_COLUMNS, Flight, PositionTrack, Unavailable
 
@@ -87,9 +87,6 @@ class ClockOffset:
         Noises at the maximum.
     count : int
         Measurements.
-    heading_error_deg, heading_sigma_deg : float
-        By how much the source's frame is turned, clockwise seen from above, against the logged
-        attitude; and its standard deviation.
     """
 
     offset_s: float
@@ -107,8 +104,6 @@ class ClockOffset:
     sigma_a_m_s2: float
     sigma_z_m: float
     count: int
-    heading_error_deg: float
-    heading_sigma_deg: float
 
 
 @dataclass(frozen=True)
@@ -213,7 +208,6 @@ def estimate_clock_offset(
         progress("changes of the clock")
         parts, change_p = _parts(problem, offset, noises, factor)
     drift, drift_sigma = _drift(parts)
-    heading, heading_sigma = _heading_error(problem.fitted(offset, noises))
     return ClockOffset(
         offset_s=offset,
         interval_s=interval,
@@ -230,8 +224,6 @@ def estimate_clock_offset(
         sigma_a_m_s2=noises.sigma_a_m_s2,
         sigma_z_m=noises.sigma_z_m,
         count=count,
-        heading_error_deg=float(np.degrees(heading)),
-        heading_sigma_deg=float(np.degrees(heading_sigma)),
     )
 
 
@@ -349,19 +341,6 @@ def _parts(
     drops = np.array(used) - np.min(used, axis=1)[:, None]
     ratio = 2.0 * float(drops.sum(axis=0).min()) / factor
     return tuple(found), float(chi2.sf(ratio, len(found) - 1))
-
-
-def _heading_error(fitted: Fitted) -> tuple[float, float]:
-    """Heading of the logged attitude that the positions ask for, minus it (rad), and its σ.
-
-    Each stretch has its own; what the prior added is taken out of each before they are joined.
-    """
-    found, covariance = fitted.constants()
-    variance = covariance[:, 0, HEADING, HEADING]
-    weight = np.maximum(1.0 / variance - CONSTANT_SIGMA[HEADING] ** -2.0, 0.0).sum()
-    if weight <= 0.0:
-        return 0.0, float("inf")
-    return float(np.sum(found[:, 0, HEADING] / variance) / weight), float(weight**-0.5)
 
 
 def _drift(parts: tuple[PartOffset, ...]) -> tuple[float | None, float | None]:

@@ -288,8 +288,4 @@ def clock_advice(comparison: Comparison, clock: ClockOffset | Unavailable) -> li
         )
     if clock.drift_ppm is not None and clock.drift_sigma_ppm is not None:
         lines.append(f"Drift    {clock.drift_ppm:+.0f} ± {1.96 * clock.drift_sigma_ppm:.0f} ppm")
-    lines.append(
-        f"Heading  the source's frame is turned by {clock.heading_error_deg:+.1f}° ± "
-        f"{1.96 * clock.heading_sigma_deg:.1f}° against the vehicle's"
-    )
     return lines

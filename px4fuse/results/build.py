@@ -10,6 +10,7 @@ from typing import Any, cast
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.comparison import AgainstTruth, AxisComparison, Comparison, FilterSummary
 from px4fuse.filter.clock import ClockOffset
+from px4fuse.filter.heading import HeadingError
 from px4fuse.filter.tuning import AxisTuning, Noise
 from px4fuse.findings import Finding
 from px4fuse.flight import Unavailable, sample_rate
@@ -59,6 +60,7 @@ def results(
         ),
         tuning={name: _tuned(found) for name, found in analysis.tuning.items()},
         clock=_clock(analysis.clock, comparison.settings.clock_offset_s),
+        heading=_heading(analysis.heading),
         ekf2_replay=replay_part(analysis.ekf2_replay),
         why={name: why_part(found) for name, found in analysis.why.items()},
         loop=loop_part(analysis.loop),
@@ -201,6 +203,13 @@ def _noise(name: str, noise: Noise) -> dict[str, Any]:
     return {name: noise.value, f"{name}_interval": (noise.low or 0.0, noise.high)}
 
 
+def _heading(found: HeadingError | Unavailable) -> made.Heading | Absent:
+    if isinstance(found, Unavailable):
+        return absent(found)
+    parts = tuple(copied(made.HeadingPart, part) for part in found.parts)
+    return copied(made.Heading, found, parts=parts)
+
+
 def _clock(clock: ClockOffset | Unavailable, applied_s: float) -> made.Clock | Absent:
     """Offsets count from the source's own stamps, what was applied already included."""
     if isinstance(clock, Unavailable):
@@ -217,7 +226,4 @@ def _clock(clock: ClockOffset | Unavailable, applied_s: float) -> made.Clock | A
             copied(made.PartOffset, replace(part, offset_s=applied_s + part.offset_s))
             for part in clock.parts
         ),
-        heading_sigma_deg=clock.heading_sigma_deg
-        if math.isfinite(clock.heading_sigma_deg)
-        else None,
     )

@@ -311,11 +311,34 @@ class PartOffset(Base, frozen=True):
     sigma_s: NotNegative
 
 
+class HeadingPart(Base, frozen=True):
+    """Turn of the source's frame in one part of the flight."""
+
+    start_s: float
+    end_s: float
+    heading_error_deg: float
+    sigma_deg: NotNegative
+
+
+class Heading(Base, frozen=True, kw_only=True):
+    """Turn of the source's frame against the logged attitude, clockwise seen from above.
+
+    ``drift_p`` is the p-value of "it is the same throughout"; ``by`` says whether the source's own
+    orientation or its positions and the IMU tell it.
+    """
+
+    turn_deg: float
+    sigma_deg: NotNegative
+    drifts: bool
+    drift_p: Share
+    by: str
+    parts: tuple[HeadingPart, ...]
+
+
 class Clock(Base, frozen=True, kw_only=True):
     """What must be added to the source's own stamps, what was applied included.
 
-    ``change_p`` is the p-value of "all parts have the same offset"; ``heading_error_deg`` the turn
-    of the source's frame against the logged attitude, clockwise seen from above.
+    ``change_p`` is the p-value of "all parts have the same offset".
     """
 
     offset_s: float
@@ -329,5 +352,3 @@ class Clock(Base, frozen=True, kw_only=True):
     change_p: Share | None = None
     parts: tuple[PartOffset, ...]
     count: Count
-    heading_error_deg: float | None = None
-    heading_sigma_deg: NotNegative | None = None

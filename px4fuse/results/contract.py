@@ -80,6 +80,7 @@ class ComparisonResults(Base, frozen=True):
     horizontal: Horizontal
     tuning: dict[str, Part[Tuned]]
     clock: Part[Clock]
+    heading: Part[Heading]
     ekf2_replay: Part[Ekf2Replay]
     why: dict[str, Part[Why]]
     loop: Part[Loop]
