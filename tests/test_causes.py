@@ -44,6 +44,13 @@ def test_a_variance_follows_from_what_its_evidence_names() -> None:
         assert (len(found) == 1) is joined
 
 
+def test_the_table_has_inner_causes_before_outer_ones() -> None:
+    causes = list(CONSEQUENCES)
+    for at, cause in enumerate(causes):
+        inner = {name.split(":")[0] for name in CONSEQUENCES[cause]} & set(causes)
+        assert inner <= set(causes[:at])
+
+
 def test_consequences_of_consequences_are_told_too() -> None:
     (cause,) = by_cause(
         [

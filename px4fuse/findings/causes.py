@@ -17,11 +17,12 @@ CAUSE = "cause"
 NOISE, OUTLIERS, ELSEWHERE = "measurement noise", "outliers", "elsewhere"
 
 _OVERSTATED = ("kf_variance_overstated", "ekf2_variance_overstated")
-# Cause to what it brings with it; "id:cause" only where the evidence names that cause
+# Cause to what it brings with it, read from above: what brings others with it stands before what
+# brings it; "id:cause" only where the evidence names that cause
 CONSEQUENCES: Mapping[str, tuple[str, ...]] = {
     "source_stamps_constant": ("source_receipt_jitter",),
-    "process_noise_forgotten": ("sigma_a_small", "kf_variance_understated"),
     "sigma_a_small": ("kf_variance_understated",),
+    "process_noise_forgotten": ("sigma_a_small", "kf_variance_understated"),
     "sigma_z_small": ("kf_variance_understated",),
     "sigma_a_large": ("kf_variance_overstated",),
     "sigma_z_large": ("kf_variance_overstated",),
@@ -32,6 +33,9 @@ CONSEQUENCES: Mapping[str, tuple[str, ...]] = {
         f"ekf2_variance_understated:{OUTLIERS}",
         "ekf2_rejecting",
     ),
+    "errors_larger_than_claimed": _OVERSTATED,
+    "source_may_drift": _OVERSTATED,
+    "ekf2_ev_delay_wrong": ("errors_larger_than_claimed",),
     "source_clock_offset": (
         "ekf2_ev_delay_wrong",
         "errors_larger_than_claimed",
@@ -39,10 +43,7 @@ CONSEQUENCES: Mapping[str, tuple[str, ...]] = {
         f"ekf2_variance_understated:{ELSEWHERE}",
     ),
     "source_clock_changes": ("ekf2_ev_delay_wrong", "errors_larger_than_claimed"),
-    "ekf2_ev_delay_wrong": ("errors_larger_than_claimed",),
     "source_frame_turned": ("errors_larger_than_claimed",),
-    "errors_larger_than_claimed": _OVERSTATED,
-    "source_may_drift": _OVERSTATED,
     "source_not_logged": ("source_decimated",),
     "source_gap": ("ekf2_fusion_interrupted",),
     "logger_dropouts": ("imu_gap",),

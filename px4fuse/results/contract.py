@@ -62,7 +62,7 @@ class ComparisonResults(Base, frozen=True):
         Why EKF2 differs.
     loop : Loop
     findings : tuple of FoundMistake
-        Most severe first.
+        One per cause, most severe first, what the recording lacks before noises.
     notes : tuple of str
         Choices made on the way.
     missing : tuple of Missing
