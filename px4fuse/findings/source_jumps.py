@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from px4fuse.analysis import Analysis
 from px4fuse.filter.causes import Explained
+from px4fuse.findings import source_stamps_of_arrival
 from px4fuse.findings.model import Detector, Finding, Found, Threshold, times
 
 JUMP = Threshold(0.2, "m", "twice a good UWB's noise")
@@ -13,6 +14,9 @@ JUMP_ERROR = Threshold(0.5, "m", "no longer the same place")
 def _detect(analysis: Analysis) -> Found:
     found = analysis.explained
     if not isinstance(found, Explained):
+        return
+    # a moving vehicle's positions jump where the stamps do
+    if any(source_stamps_of_arrival.DETECTOR.detect(analysis)):
         return
     jumps = [jump for jump in found.jumps if jump.size_m >= JUMP.value]
     if not jumps:
