@@ -26,8 +26,6 @@ from px4fuse.filter.clock import (
     PartOffset,
     _drift,
     _parts,
-    _Problem,
-    _scatter,
     _vertex,
     estimate_clock_offset,
 )

@@ -26,6 +26,7 @@ from px4fuse.results.ekf2 import Agreement, Ekf2Replay, Outcome, Why
 from px4fuse.results.model import (
     Base,
     FoundMistake,
+    Heading,
     Interval,
     Missing,
     Part,
@@ -56,6 +57,8 @@ class ComparisonResults(Base, frozen=True):
     horizontal : Horizontal
     tuning : mapping of axis name, or "horizontal" for north and east together, to Tuned
     clock : Clock
+    heading : Heading
+        How the source's frame is turned against the vehicle's heading.
     ekf2_replay : Ekf2Replay
         EKF2 replayed from the log, and how well that agrees with what was logged.
     why : mapping of axis name to Why
