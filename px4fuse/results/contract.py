@@ -17,6 +17,7 @@ from px4fuse.results.comparison import (
     Axis,
     ChosenSettings,
     Clock,
+    Heading,
     Horizontal,
     Log,
     PositionSource,
@@ -26,7 +27,6 @@ from px4fuse.results.ekf2 import Agreement, Ekf2Replay, Outcome, Why
 from px4fuse.results.model import (
     Base,
     FoundMistake,
-    Heading,
     Interval,
     Missing,
     Part,
