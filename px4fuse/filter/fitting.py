@@ -30,7 +30,7 @@ MAX_PASSES = 12
 MAX_STEPS, ROUGH_STEPS = 50, 3
 # Outliers are at least this many times as wide as the rest: less is not told from it
 LEAST_WIDTH = 3.0
-FIRST_SHARE, FIRST_WIDTH, MAX_SHARE = 0.02, 10.0, 0.4
+FIRST_SHARE, FIRST_WIDTH, MAX_SHARE = 0.005, 10.0, 0.4
 # SIGMA_Z is at most this many times what the median of the squares says
 BULK = 1.2
 SETTLED = 0.01
@@ -161,7 +161,7 @@ def most_likely(
             return NoiseFit(noises, weight, outlier)
         variance = min(noises.sigma_z_m**2, BULK**2 * bulk)
         found = _outlier_probability(square / variance, count, share, width)
-        if found.sum() < 0.5 and not outlier.any():
+        if found.sum() < 1.0 and found.max() < 0.5 and not outlier.any():
             return NoiseFit(noises, weight, outlier)
         share = float(np.clip(found.mean(), 0.5 / len(found), MAX_SHARE))
         wide = float(np.sum(found * square) / max(np.sum(found * count), 1e-9)) / variance
