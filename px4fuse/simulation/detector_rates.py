@@ -38,7 +38,7 @@ from px4fuse.simulation.scenario import Scenario
 
 TABLE = "rates.csv"
 CLEAN = "none"
-CLEAN_FLIGHTS, FAULTY_FLIGHTS = 100, 20
+CLEAN_FLIGHTS, FAULTY_FLIGHTS = 50, 20
 # Faulty flights have other seeds than clean ones
 FAULTY_SEED = 10_000
 ALWAYS = ("ekf2_unavailable", "ekf2_is_a_model", "loop_end_assumed")
