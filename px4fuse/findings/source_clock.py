@@ -15,6 +15,8 @@ from px4fuse.comparison.remedy import (
 )
 from px4fuse.filter.clock import CHANGE_P, ClockOffset
 from px4fuse.findings.model import Detector, Finding, Found, Threshold
+from px4fuse.findings.source_smoothed import low_pass
+from px4fuse.findings.source_stamps_of_arrival import stamps_of_arrival_end_s
 from px4fuse.flight import Unavailable
 
 CLOCK_OFFSET = Threshold(0.03, "s", "at 1 m/s a third of a good UWB's noise")
@@ -45,6 +47,8 @@ def _detect(analysis: Analysis) -> Found:
     reconstructed = comparison.source.reconstructed
     if not isinstance(clock, ClockOffset) or not clock.determinable or reconstructed:
         return
+    if low_pass(analysis) is not None:  # which lags behind the motion by itself
+        return
     applied = comparison.settings.clock_offset_s
     low, high = clock.interval_s
     evidence: dict[str, float | str] = {
@@ -67,6 +71,8 @@ def _detect(analysis: Analysis) -> Found:
             {**evidence, "change_p": clock.change_p or 0.0},
         )
     sure = abs(clock.offset_s) > CLOCK_SIGMAS.value * clock.sigma_s
+    # one offset cannot hold for stamps that are of arrival in a part of the flight only
+    changes = changes or stamps_of_arrival_end_s(analysis) is not None
     if sure and abs(clock.offset_s) > CLOCK_OFFSET.value and not changes:
         remedy = f"--clock-offset {applied + clock.offset_s:.3f}"
         shifted = replace(comparison.settings, clock_offset_s=float(remedy.split()[1]))
@@ -75,12 +81,13 @@ def _detect(analysis: Analysis) -> Found:
             if errors[1] > WORSE_FILTER_ERROR * errors[0]:
                 return  # the truth knows better
             remedy += f": position error {errors[0]:.3f} → {errors[1]:.3f} m (replayed)"
+        ends = (-high, -low) if clock.offset_s < 0 else (low, high)
         yield Finding(
             "source_clock_offset",
             "error" if abs(clock.offset_s) > CLOCK_OFFSET_ERROR.value else "warning",
             f"The stamps of {comparison.source.name} are "
             f"{'late' if clock.offset_s < 0 else 'early'} by {abs(clock.offset_s):.3f} s against "
-            f"the IMU (95 % {abs(high):.3f} to {abs(low):.3f} s): at 1 m/s that is an error of "
+            f"the IMU (95 % {ends[0]:.3f} to {ends[1]:.3f} s): at 1 m/s that is an error of "
             f"{abs(clock.offset_s):.2f} m, which neither filter's innovations show.",
             f"{remedy}{_for_ekf2(analysis, clock)}.",
             evidence,

@@ -66,6 +66,12 @@ def _detect(analysis: Analysis) -> Found:
     )
 
 
+def stamps_of_arrival_end_s(analysis: Analysis) -> float | None:
+    """When the stamps of arrival end (s), None where there are none or nothing else."""
+    found = (finding.evidence for finding in _detect(analysis))
+    return next((float(one["until_s"]) for one in found if "latency_s" in one), None)
+
+
 DETECTOR = Detector(
     _detect,
     {
