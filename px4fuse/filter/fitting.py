@@ -34,8 +34,6 @@ FIRST_SHARE, FIRST_WIDTH, MAX_SHARE = 0.005, 10.0, 0.4
 # SIGMA_Z is at most this many times what the median of the squares says
 BULK = 1.2
 SETTLED = 0.01
-# Share of the position's noise dt³/4 that is added to it; dt³/3 would be that of many steps
-FULL_RANK = 1e-3
 # Steps of ln σ for slopes and bends
 SLOPE_STEP, BEND_STEP = 1e-4, 0.05
 # Of those: how far a parabola is followed at once, and how often
@@ -95,10 +93,7 @@ def filter_part(legs: Preintegrated) -> Part:
     initial = np.zeros((count + 1, 2))
     initial[0] = 1.0 / INITIAL_COVARIANCE[0], 1.0 / INITIAL_COVARIANCE[2]
     measured = np.concatenate([[0.0], legs.measurement_m - legs.initial.position_m])[:, None]
-    # the Q of a leg of a single step is of rank one and has no inverse
-    unit = legs.noise_unit.copy()
-    unit[:, 0] += FULL_RANK * unit[:, 2] * legs.length_s**2 / 4.0
-    chain = Chain(np.arange(1, count + 1), legs.length_s, unit, legs.noise_fixed)
+    chain = Chain(np.arange(1, count + 1), legs.length_s, legs.noise_unit, legs.noise_fixed)
     positions = Positions(chain, measured, np.array([0]), initial, np.array([]))
     dp, dv = legs.delta_position_m, legs.delta_velocity_m_s
     return Part(positions, dp[:, None, None, None], dv[:, None, None, None])
@@ -229,13 +224,15 @@ def profile_end(
     bound : float
         Of ln of the parameter.
     """
-    least, other = score(*best), best[1]
+    least, other, root = score(*best), best[1], float(np.sqrt(PROFILE_DROP))
 
     def excess(distance: float) -> float:
         """How far √(drop), which is nearly a line, lies above that of the interval's end."""
         nonlocal other
+        if distance == 0.0:
+            return -root
         lowest, other = _lowest(lambda at: score(best[0] + side * distance, at), other)
-        return float(np.sqrt(max(lowest - least, 0.0)) - np.sqrt(PROFILE_DROP))
+        return float(np.sqrt(max(lowest - least, 0.0)) - root)
 
     reach = side * (bound - best[0])
     far = min(FIRST_REACH, reach)

@@ -22,6 +22,9 @@ from px4fuse.arrays import Array, IntArray
 
 # Numbers that are worked on at once: more do not fit the processor's cache
 BLOCK = 2**16
+# Position noise of a leg over that of a measurement that is always there: Q has an inverse, also
+# that of a single step, which is of rank one, or without process noise
+LEAST_SHARE = 1e-5
 
 
 @dataclass(frozen=True)
@@ -190,6 +193,7 @@ def factorise(chain: Chain, sigma_a_m_s2: float, precision: Array) -> Factor:
     if precision.ndim == 1:
         precision = np.stack([precision, np.zeros_like(precision)], 1)
     q00, q01, q11 = (sigma_a_m_s2**2 * chain.noise_unit + chain.noise_fixed).T
+    q00 = q00 + LEAST_SHARE**2 / precision.max()
     determinant = q00 * q11 - q01**2
     count = len(precision)
     inverse, dt = np.zeros((count - 1, 3)), np.zeros(count - 1)
