@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 from scipy.optimize import brentq, minimize
@@ -226,6 +227,7 @@ def profile_end(
     """
     least, other, root = score(*best), best[1], float(np.sqrt(PROFILE_DROP))
 
+    @cache  # where the other parameter is sought from depends on the call before
     def excess(distance: float) -> float:
         """How far √(drop), which is nearly a line, lies above that of the interval's end."""
         nonlocal other
