@@ -1,0 +1,85 @@
+"""How often the 95 % intervals of SIGMA_Z, SIGMA_A and the clock offset cover the truth.
+
+``python tests/benchmarks/bench_intervals.py [FLIGHTS]`` flies every scenario of the detectors'
+rates, and the usual one with outliers, with as many seeds (by default 50), and prints a line for
+each: coverage, bias of SIGMA_Z and of the offset with the standard error of its mean, how much the
+offset scatters against its stated sigma, and false clock findings. Nothing is asserted.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
+
+import numpy as np
+
+from px4fuse.analysis import clock_offset, tuned_horizontally
+from px4fuse.comparison.comparison import compare
+from px4fuse.filter.clock import CHANGE_P, ClockOffset
+from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise
+from px4fuse.findings.source_clock import CLOCK_OFFSET, CLOCK_SIGMAS
+from px4fuse.simulation.detector_rates import DEFAULT, SCENARIOS, clean
+from px4fuse.simulation.flights import simulate_flight
+from px4fuse.simulation.mistakes import parse
+
+FIRST_SEED = 2000
+OUTLIERS = ("nlos=2%", "nlos=7%", "nlos=12%", "nlos=6%,0.5m")
+Job = tuple[int, str, str]
+
+
+def covers(noise: Noise, true: float) -> bool:
+    """Whether an interval, open ends included, holds a value."""
+    return (noise.low or 0.0) <= true <= (noise.high or np.inf)
+
+
+def measured(job: Job) -> tuple[float, ...] | None:
+    """What one flight gives; None where there is no estimate."""
+    seed, scenario, mistake = job
+    flown = replace(clean(scenario).flight(seed), ekf2=False, truth=False)
+    flight = simulate_flight(flown, parse((mistake,) if mistake else ()))
+    comparison = compare(flight, axes=("north", "east"))
+    tuning = tuned_horizontally(comparison)
+    tuned, clock = tuning[HORIZONTAL], clock_offset(comparison, tuning)
+    if not isinstance(tuned, AxisTuning) or not isinstance(clock, ClockOffset):
+        return None
+    low, high = clock.interval_s
+    false = abs(clock.offset_s) > max(CLOCK_SIGMAS.value * clock.sigma_s, CLOCK_OFFSET.value)
+    return (
+        (tuned.sigma_z.value or np.nan) / flown.source_sigma_m - 1.0,
+        covers(tuned.sigma_z, flown.source_sigma_m),
+        covers(tuned.sigma_a, flown.sigma_a_m_s2),
+        clock.offset_s,
+        low <= 0.0 <= high,
+        clock.offset_s / clock.sigma_s,
+        clock.determinable,
+        clock.determinable and false,
+        clock.change_p is not None and clock.change_p < CHANGE_P,
+    )
+
+
+def lines(flights: int) -> Iterator[str]:
+    """One line for each scenario."""
+    conditions = [(name, "") for name in SCENARIOS] + [(DEFAULT, each) for each in OUTLIERS]
+    with ProcessPoolExecutor(os.cpu_count()) as pool:
+        for name, mistake in conditions:
+            jobs = [(FIRST_SEED + seed, name, mistake) for seed in range(flights)]
+            rows = np.array([row for row in pool.map(measured, jobs) if row is not None])
+            if not len(rows):
+                yield f"{name} {mistake}: no estimate"
+                continue
+            bias, z, a, offset, clock, score, sure, false, change = rows.T
+            yield (
+                f"{name + ' ' + mistake:32} n {len(rows)}: SIGMA_Z {np.nanmean(bias):+.1%}, "
+                f"covered {z.mean():.0%}; SIGMA_A covered {a.mean():.0%}; clock {offset.mean() * 1e3:+.1f} "
+                f"± {offset.std() / np.sqrt(len(rows)) * 1e3:.1f} ms, covered {clock.mean():.0%}, "
+                f"scatter {score.std():.2f} sigma, determinable {sure.mean():.0%}; false offset "
+                f"{false.mean():.1%}, change {change.mean():.1%}"
+            )
+
+
+if __name__ == "__main__":
+    for line in lines(int(sys.argv[1]) if len(sys.argv) > 1 else 50):
+        print(line, flush=True)
