@@ -302,8 +302,6 @@ DETECTOR = Detector(
         "ekf2_variance_understated": "ekf2 understat, ekf2 variance, ekf2_evp_noise, ekf2 nis",
     },
     {
-        "kf_variance_overstated": ("sigma_z_m=0.3",),
-        "kf_variance_understated": ("sigma_z_m=0.03",),
         "ekf2_variance_understated": ("--mistake ekf2-noise=4cm", "--mistake ekf2-noise=3cm"),
     },
 )

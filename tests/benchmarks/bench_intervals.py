@@ -73,8 +73,9 @@ def lines(flights: int) -> Iterator[str]:
             bias, z, a, offset, clock, score, sure, false, change = rows.T
             yield (
                 f"{name + ' ' + mistake:32} n {len(rows)}: SIGMA_Z {np.nanmean(bias):+.1%}, "
-                f"covered {z.mean():.0%}; SIGMA_A covered {a.mean():.0%}; clock {offset.mean() * 1e3:+.1f} "
-                f"± {offset.std() / np.sqrt(len(rows)) * 1e3:.1f} ms, covered {clock.mean():.0%}, "
+                f"covered {z.mean():.0%}; SIGMA_A covered {a.mean():.0%}; "
+                f"clock {offset.mean() * 1e3:+.1f} ± {1e3 * offset.std() / len(rows) ** 0.5:.1f} ms, "
+                f"covered {clock.mean():.0%}, "
                 f"scatter {score.std():.2f} sigma, determinable {sure.mean():.0%}; false offset "
                 f"{false.mean():.1%}, change {change.mean():.1%}"
             )

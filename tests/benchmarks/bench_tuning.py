@@ -38,25 +38,25 @@ def main() -> None:
 
     from px4fuse.comparison.comparison import compare
     from px4fuse.filter.kalman import Settings, replay
-    from px4fuse.filter.likelihood import preintegrate
-    from px4fuse.filter.tuning import HORIZONTAL, _total, tune
+    from px4fuse.filter.likelihood import preintegrate, total_over_grid
+    from px4fuse.filter.tuning import HORIZONTAL, tune
     from px4fuse.readers import read_log
 
     axis = compare(read_log(LOG), axes=("north",)).axes[0].axis
     single = seconds(lambda: replay(axis, Settings()))
     legs = preintegrate(axis, Settings())
-    skip = np.zeros(len(legs.measurement_m), dtype=bool)
+    weight = np.ones(len(legs.measurement_m))
     a, z = np.geomspace(0.05, 5.0, 64)[:, None], np.geomspace(0.01, 1.0, 64)
-    grid = seconds(lambda: _total([preintegrate(axis, Settings())], a, z, skip))
+    grid = seconds(lambda: total_over_grid([preintegrate(axis, Settings())], a, z, weight))
     print(
-        f"64 x 64 settings, {len(skip)} measurements: {grid:.2f} s, {4096 / grid:.0f} settings/s; "
+        f"64 x 64 settings, {len(weight)} measurements: {grid:.2f} s, {4096 / grid:.0f} settings/s; "
         f"filterpy {single:.2f} s for one; {4096 * single / grid:.0f} times as fast"
     )
     test_clock.IMU_HZ = 250.0
     flight, _ = test_clock.made_flight(1, duration_s=600.0, offset_s=-0.1)
     axes = tuple(each.axis for each in compare(flight, test_clock.SETTINGS).axes)
     for names in (None, (HORIZONTAL,)):
-        took = seconds(lambda names=names: tune(axes, test_clock.SETTINGS, names), 1)
+        took = seconds(lambda names=names: tune(axes, test_clock.SETTINGS, names, flight=flight), 1)
         print(f"tune, {names[0] if names else 'all axes'}, 600 s: {took:.1f} s (aim 5 s)")
     took = seconds(lambda: test_clock.estimate(flight), 1)
     print(f"clock offset, 600 s: {took:.1f} s (aim 10 s)")
