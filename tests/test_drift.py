@@ -21,8 +21,8 @@ def clock(*offsets: float, sigma_s: float = 0.02, change_p: float | None = 1e-7)
     middle = float(np.mean(offsets))
     curve = np.array([0.0])
     return ClockOffset(
-        middle, (middle - 0.02, middle + 0.02), 0.01, True, "", curve, curve, parts, 100.0, 50.0,
-        change_p, 0.2, 0.01, 3000, 0.0, 1.0,
+        middle, (middle - 0.02, middle + 0.02), 0.01, True, "", curve, curve, 1.92, parts, 100.0,
+        50.0, change_p, 0.2, 0.01, 3000,
     )  # fmt: skip
 
 

@@ -16,7 +16,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from flights import Estimator, Imu, Uwb, aisle_flight, unexplained
-from test_causes import NAMED_HERE as NAMED_AS_CAUSES
+from test_hypotheses import NAMED_HERE as NAMED_AS_CAUSES
 from test_loop import NAMED_HERE as NAMED_IN_LOOPS
 from test_noise_findings import NAMED_HERE
 

@@ -60,7 +60,7 @@ def analysed(flight: Flight, **span: float) -> Analysis:
     comparison = compare(flight, RIGHT, axes=("north", "east"), **span)
     return Analysis(
         comparison, tuned_horizontally(comparison), unavailable("clock offset"),
-        unavailable("EKF2 replay"), {}, unavailable("loop closure"),
+        unavailable("EKF2 replay"), {}, unavailable("loop closure"), unavailable("heading error"),
     )  # fmt: skip
 
 

@@ -14,13 +14,10 @@ from test_kalman import any_axis, any_settings, sample_axes
 
 from px4fuse.filter.kalman import Settings, replay
 from px4fuse.filter.likelihood import (
-    SIGMA_A_GRID_M_S2,
     innovations,
-    noise_asked,
     parabola_vertex,
     preintegrate,
     recursion,
-    sigma_a_asked,
     states,
     total_over_grid,
 )
@@ -87,71 +84,6 @@ def test_settings_broadcast_to_a_grid(
     np.testing.assert_allclose(
         [nu, s], np.broadcast_to(single, (2, 11, *shape)), rtol=1e-12, atol=1e-14
     )
-
-
-@pytest.mark.parametrize("sigma_z", [0.05, 0.1, 0.5])
-@pytest.mark.parametrize("seed", [1, 2, 3])
-def test_noise_asked_is_the_noise_injected(seed: int, sigma_z: float) -> None:
-    asked = noise_asked(walk(seed, sigma_z=sigma_z), ZERO)
-    assert not asked.upper_bound
-    assert asked.sigma_z_m == pytest.approx(sigma_z, rel=0.10)
-
-
-def test_noise_asked_does_not_depend_on_the_chosen_sigma_z() -> None:
-    axis = walk()
-    chosen = [Settings(sigma_a_m_s2=0.5, sigma_z_m=z, input="zero") for z in (0.001, 0.1, 10.0)]
-    assert len({noise_asked(axis, each) for each in chosen}) == 1
-
-
-@pytest.mark.parametrize("sigma_z", [0.0, 0.0005, 0.002])
-def test_noise_below_what_the_rate_can_show_is_bounded_from_above(sigma_z: float) -> None:
-    """Half the process noise that the filter is told: it alone explains the innovations."""
-    rng = np.random.default_rng(7)
-    axis = random_walk(rng, count=500, interval_s=0.2, sigma_a=0.25, sigma_z=sigma_z)
-    asked = noise_asked(axis, ZERO)
-    assert asked.upper_bound
-    assert sigma_z <= asked.sigma_z_m < 0.02
-
-
-def test_no_noise_up_to_30_m_explains_absurd_measurements() -> None:
-    rng = np.random.default_rng(5)
-    assert noise_asked(line(0.2 * np.arange(100), rng.normal(0.0, 1000.0, 100)), ZERO) is None
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_five_percent_gross_outliers_hardly_move_the_noise_asked(seed: int) -> None:
-    clean = walk(seed, count=1000)
-    rng = np.random.default_rng(seed)
-    outlier = rng.random(1000) < 0.05
-    measured = clean.measurement_m + np.where(outlier, rng.choice([-3.0, 3.0], 1000), 0.0)
-    asked = noise_asked(line(clean.measurement_time_s, measured), ZERO)
-    assert asked.sigma_z_m == pytest.approx(noise_asked(clean, ZERO).sigma_z_m, rel=0.20)
-
-
-@pytest.mark.parametrize("seed", [1, 2, 3])
-def test_sigma_a_asked_is_the_one_that_moved_the_flight(seed: int) -> None:
-    """At the noise injected; the grid's points are 19 % apart."""
-    for injected in (0.5, 2.0):
-        rng = np.random.default_rng(seed)
-        axis = random_walk(rng, count=2000, interval_s=0.2, sigma_a=injected, sigma_z=0.1)
-        for start in (0.01, 10.0):
-            chosen = Settings(sigma_a_m_s2=start, sigma_z_m=0.1, input="zero")
-            assert sigma_a_asked(axis, chosen) == pytest.approx(injected, rel=0.2)
-
-
-def test_sigma_a_asked_is_of_the_greatest_likelihood() -> None:
-    """Against the density of the replay's innovations, with scipy's normal distribution."""
-    axis = walk(seed=4, count=60)
-    for sigma_z in (0.03, 0.1, 0.4):
-        chosen = replace(ZERO, sigma_z_m=sigma_z)
-        log_likelihood = []
-        for sigma_a in SIGMA_A_GRID_M_S2:
-            nu, s = replayed(axis, replace(chosen, sigma_a_m_s2=float(sigma_a)))
-            log_likelihood.append(np.sum(norm.logpdf(nu, scale=np.sqrt(s))))
-        best = SIGMA_A_GRID_M_S2[np.argmax(log_likelihood)]
-        assert sigma_a_asked(axis, chosen) == pytest.approx(best, rel=1e-12)
-    assert len(SIGMA_A_GRID_M_S2) == 61
-    assert SIGMA_A_GRID_M_S2[[0, -1]] == pytest.approx([1e-3, 30.0])
 
 
 def test_states_on_a_grid_equal_the_replay_at_the_measurements(sample_flight: Flight) -> None:

@@ -24,6 +24,7 @@ from px4fuse.plain import factor_words
 
 NOISE_OFF = Threshold(1.5, "times", "in standard deviation; below, hardly a line moves")
 NOISE_OFF_ERROR = Threshold(4.0, "times", "the gain is another one")
+BEYOND = Threshold(1.5, "times the 95 % interval's reach", "0.3 % of clean flights lie beyond")
 # What a filter is run with where the source is better than its rate can show
 SMALLEST_SIGMA_Z = Threshold(0.005, "m", "what motion capture resolves in flight")
 
@@ -51,6 +52,11 @@ class Off:
         return max(self.factor, 1.0 / self.factor)
 
     @property
+    def is_advice(self) -> bool:
+        """Whether nobody chose it."""
+        return self.severity == "info"
+
+    @property
     def id(self) -> str:
         """Of the finding."""
         return f"{self.label.lower()}_{'small' if self.factor < 1.0 else 'large'}"
@@ -76,8 +82,10 @@ def _detect(analysis: Analysis) -> Found:
         off = [each for each in off if each.label != "SIGMA_A"]
     # where a source may drift, or the truth shows it, innovations tell too little noise alone
     hidden = any(one.owner == "kf" for one in hidden_errors(comparison))
-    if hidden or may_drift(comparison.flight, comparison.source):
-        off = [each for each in off if each.factor < 1.0]
+    # and a filter may follow such a source as closely as it likes
+    drifts = may_drift(comparison.flight, comparison.source)
+    if hidden or drifts:
+        off = [each for each in off if each.factor < 1.0 and not (drifts and each.is_advice)]
     if not off:
         return
     off.sort(key=lambda each: -each.size)
@@ -105,8 +113,12 @@ def _off(label: str, option: str, unit: str, chosen: float, found: Noise) -> Off
     value = found.value if found.value is not None else found.high
     if value is None:
         return None
-    above = found.high is not None and chosen > found.high
-    below = found.value is not None and chosen < (found.low or 0.0)
+    high, low = found.high, found.low or 0.0
+    if found.value is not None and high is not None:
+        high = found.value * (high / found.value) ** BEYOND.value
+        low = found.value * (low / found.value) ** BEYOND.value
+    above = high is not None and chosen > high
+    below = found.value is not None and chosen < low
     size = max(chosen / value, value / chosen)
     if not (above or below) or size < NOISE_OFF.value:
         return None

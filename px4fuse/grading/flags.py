@@ -18,7 +18,7 @@ from px4fuse.assignment.key import AnswerKey, folded
 from px4fuse.filter.kalman import Settings
 from px4fuse.filter.tuning import HORIZONTAL
 from px4fuse.grading.model import Graded
-from px4fuse.results.comparison import HeldOut, Tuned
+from px4fuse.results.comparison import ASKED, HeldOut, Tuned
 from px4fuse.results.contract import ComparisonResults, LoopResults, Reported
 
 # Words in a row by which two texts are compared. Five are hardly ever the same by chance, and a
@@ -67,10 +67,10 @@ def own_flags(results: Reported) -> tuple[str, ...]:
 def _tuned_here(results: ComparisonResults) -> Iterator[str]:
     """The settings are the optimum of the very flight that they are graded on."""
     tuned, settings = results.tuning.get(HORIZONTAL), results.settings
-    if not isinstance(tuned, Tuned) or tuned.sigma_a_m_s2 is None or tuned.sigma_z_m is None:
+    if not isinstance(tuned, Tuned) or tuned.filter_sigma_a_m_s2 is None or tuned.sigma_z_m is None:
         return
     pairs = (
-        (settings.sigma_a_m_s2, tuned.sigma_a_m_s2),
+        (settings.sigma_a_m_s2, tuned.filter_sigma_a_m_s2),
         (settings.sigma_z_m, tuned.sigma_z_m),
     )
     if not all(_as_printed(chosen, best) for chosen, best in pairs):
@@ -122,11 +122,11 @@ def _nothing_found(results: ComparisonResults) -> Iterator[str]:
         return
     for name, label in (("sigma_z_m", "sigma_z"), ("sigma_a_m_s2", "sigma_a")):
         chosen: float = getattr(results.settings, name)
-        best: float | None = getattr(tuned, name)
+        best: float | None = getattr(tuned, ASKED[name])
         if not best:
             continue
         factor = max(chosen / best, best / chosen)
-        low, high = getattr(tuned, f"{name}_interval") or (math.inf, -math.inf)
+        low, high = getattr(tuned, f"{ASKED[name]}_interval") or (math.inf, -math.inf)
         named = {
             f"{label}_small", f"{label}_large", "process_noise_forgotten", "source_may_drift",
             "errors_larger_than_claimed",

@@ -20,7 +20,7 @@ from px4fuse.assignment.key import Answer, AnswerKey
 from px4fuse.filter.tuning import HORIZONTAL
 from px4fuse.findings import SEVERITIES
 from px4fuse.grading.model import Graded, Item, Parameter, Rubric, RubricItem
-from px4fuse.results.comparison import Clock, Filter, HorizontalNis, Tuned
+from px4fuse.results.comparison import ASKED, Clock, Filter, HorizontalNis, Tuned
 from px4fuse.results.contract import ComparisonResults, LoopResults, Reported, to_plain
 from px4fuse.results.model import Absent
 from px4fuse.results.trajectories import Correction, Corrections, Loop, Score
@@ -347,7 +347,9 @@ def _tuned(evidence: Evidence, axis: str, name: str, factor: float) -> tuple[flo
     tuned = comparison.tuning.get(axis)
     interval = bound = None
     if isinstance(tuned, Tuned):
-        interval, bound = getattr(tuned, f"{name}_interval"), getattr(tuned, f"{name}_upper_bound")
+        asked = ASKED[name]
+        interval = getattr(tuned, f"{asked}_interval")
+        bound = getattr(tuned, f"{asked}_upper_bound")
     if interval is None and bound is not None:
         interval = (0.0, bound)
     if interval is None:
@@ -358,14 +360,14 @@ def _tuned(evidence: Evidence, axis: str, name: str, factor: float) -> tuple[flo
     # small innovations are no reason to trust a source that drifts
     off = max(1.0 if chosen > high and _drifts(evidence) else above, low / chosen, 1.0)
     said = f"your {label} {chosen:.3g} {unit} is"
-    asked = f"what the data ask for ({low:.3g} to {high:.3g} {unit})"
+    wanted = f"what the data ask for ({low:.3g} to {high:.3g} {unit})"
     if off == 1.0 and chosen > high:
-        return 1.0, f"{said} above {asked}, as it should be for a source that may drift"
+        return 1.0, f"{said} above {wanted}, as it should be for a source that may drift"
     if off == 1.0:
-        return 1.0, f"{said} within {asked}"
+        return 1.0, f"{said} within {wanted}"
     share = 1.0 - math.log(off) / math.log(factor) if factor > max(off, 1.0) else 0.0
     side = "above" if chosen > high else "below"
-    return share, f"{said} {side} {asked}, by a factor of {off:.3g}"
+    return share, f"{said} {side} {wanted}, by a factor of {off:.3g}"
 
 
 def _number_between(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float, str]:

@@ -271,6 +271,10 @@ class HeldOut(Base, frozen=True):
     gain_nats: float
 
 
+# Field of Tuned that says what each setting of the filter should be
+ASKED = {"sigma_a_m_s2": "filter_sigma_a_m_s2", "sigma_z_m": "sigma_z_m"}
+
+
 class Tuned(Base, frozen=True, kw_only=True):
     """Most likely noises, with 95 % intervals.
 

@@ -71,10 +71,11 @@ def lines(flights: int) -> Iterator[str]:
                 yield f"{name} {mistake}: no estimate"
                 continue
             bias, z, a, offset, clock, score, sure, false, change = rows.T
+            error = offset.std() / len(rows) ** 0.5
             yield (
                 f"{name + ' ' + mistake:32} n {len(rows)}: SIGMA_Z {np.nanmean(bias):+.1%}, "
                 f"covered {z.mean():.0%}; SIGMA_A covered {a.mean():.0%}; "
-                f"clock {offset.mean() * 1e3:+.1f} ± {1e3 * offset.std() / len(rows) ** 0.5:.1f} ms, "
+                f"clock {1e3 * offset.mean():+.1f} ± {1e3 * error:.1f} ms, "
                 f"covered {clock.mean():.0%}, "
                 f"scatter {score.std():.2f} sigma, determinable {sure.mean():.0%}; false offset "
                 f"{false.mean():.1%}, change {change.mean():.1%}"

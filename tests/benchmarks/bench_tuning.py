@@ -49,7 +49,7 @@ def main() -> None:
     a, z = np.geomspace(0.05, 5.0, 64)[:, None], np.geomspace(0.01, 1.0, 64)
     grid = seconds(lambda: total_over_grid([preintegrate(axis, Settings())], a, z, weight))
     print(
-        f"64 x 64 settings, {len(weight)} measurements: {grid:.2f} s, {4096 / grid:.0f} settings/s; "
+        f"64 x 64 settings, {len(weight)} measurements: {grid:.2f} s, {4096 / grid:.0f} a second; "
         f"filterpy {single:.2f} s for one; {4096 * single / grid:.0f} times as fast"
     )
     test_clock.IMU_HZ = 250.0
