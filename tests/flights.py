@@ -9,7 +9,7 @@ say, and innovations whose NIS is what the test wants.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
@@ -20,6 +20,7 @@ from px4fuse.analysis import Analysis
 from px4fuse.arrays import Array
 from px4fuse.comparison.comparison import Comparison
 from px4fuse.filter.signals import Axis, Segment, project_acceleration
+from px4fuse.filter.tuning import HORIZONTAL, tune
 from px4fuse.flight import (
     ANGULAR_RATE_COLUMNS,
     AXIS_NAMES,
@@ -331,3 +332,10 @@ def unexplained(comparison: Comparison) -> Analysis:
         comparison, {}, unavailable("clock offset"), unavailable("EKF2 replay"), {},
         unavailable("loop closure"), unavailable("heading error"),
     )  # fmt: skip
+
+
+def with_noises(comparison: Comparison) -> Analysis:
+    """Make an analysis that knows the noises that the two-state filter asks for, and no more."""
+    axes = tuple(result.axis for result in comparison.axes)
+    tuning = tune(axes, comparison.settings, (HORIZONTAL, "down"))
+    return replace(unexplained(comparison), tuning=tuning)

@@ -46,22 +46,22 @@ CONSEQUENCES: Mapping[str, tuple[str, ...]] = {
         "ekf2_variance_understated",
         "errors_larger_than_claimed",
     ),
-    "source_stamps_of_arrival": ("source_clock_changes",),
     "source_jumps": ("errors_larger_than_claimed",),
     "source_scale_wrong": ("errors_larger_than_claimed",),
     "accelerometer_bias": ("errors_larger_than_claimed",),
+    # a step of the stamps moves positions of a vehicle that moves
+    "source_clock_changes": (
+        "source_jumps",
+        "ekf2_ev_delay_wrong",
+        "errors_larger_than_claimed",
+    ),
+    "source_stamps_of_arrival": ("source_clock_changes",),
     "source_clock_offset": (
         "source_stamps_of_arrival",
         "ekf2_ev_delay_wrong",
         "errors_larger_than_claimed",
         f"kf_variance_understated:{ELSEWHERE}",
         f"ekf2_variance_understated:{ELSEWHERE}",
-    ),
-    # a step of the stamps moves positions of a vehicle that moves
-    "source_clock_changes": (
-        "source_jumps",
-        "ekf2_ev_delay_wrong",
-        "errors_larger_than_claimed",
     ),
     "source_frame_turned": ("errors_larger_than_claimed",),
     "source_not_logged": ("source_decimated",),

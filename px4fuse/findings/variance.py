@@ -175,7 +175,8 @@ def _noise_remedy(
     lag1 = statement.lag1_autocorrelation
     tuned = tuned_for(analysis, result.axis.name)
     needed = None if tuned is None else tuned.filter_sigma_a.value
-    if owner == "kf" and needed and needed > settings.sigma_a_m_s2 and lag1 > LAG1_SLOW.value:
+    slow = statement.variance_factor < 1.0 and lag1 > LAG1_SLOW.value
+    if owner == "kf" and slow and needed and needed > settings.sigma_a_m_s2:
         sigma_a = float(f"{needed:.3g}")
         typed = f"--sigma-a {sigma_a:g}"
         words = filter_words(comparison, replace(settings, sigma_a_m_s2=sigma_a), typed)
