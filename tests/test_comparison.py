@@ -281,7 +281,7 @@ class TestMadeFlight:
         assert [result.axis.name for result in alone.axes] == ["east"]
         assert alone.horizontal_kf is None
         assert alone.horizontal_ekf2 is None
-        for part in ("kf", "ekf2", "difference", "kf_truth", "ekf2_truth", "noise_asked"):
+        for part in ("kf", "ekf2", "difference", "kf_truth", "ekf2_truth"):
             assert getattr(alone.axes[0], part) == getattr(along(made, "east"), part)
 
     def test_north_and_east_alone_have_the_same_horizontal_numbers(self, made: Comparison) -> None:

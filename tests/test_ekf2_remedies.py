@@ -134,7 +134,7 @@ def test_what_the_data_ask_for(sample: Analysis) -> None:
 
     assert asked(sample) == {"EKF2_EVP_NOISE": 0.098}
     assert asked(replace(sample, tuning={})) == {}
-    aisle = {"aisle": sample.tuning["aisle"]}  # --axis aisle
+    aisle = {"aisle": sample.tuning["horizontal"]}  # --axis aisle
     assert asked(replace(sample, tuning=aisle))["EKF2_EVP_NOISE"] == pytest.approx(0.1, abs=0.01)
     late = asked(offset(sample, -0.25))
     assert late == {"EKF2_EVP_NOISE": 0.098, "EKF2_EV_DELAY": 250.0, "EKF2_DELAY_MAX": 300.0}
@@ -227,9 +227,9 @@ def test_without_a_replay_the_order_of_doing_is_given() -> None:
     ("log", "name", "said"),
     [
         ("v1.16.1_aisle_overconfident", "ekf2_variance_understated",
-         "set EKF2_EVP_NOISE to 0.097 m: rejected 53% → 0%, mean NIS 22 → 1.0, position error 0.31 "
+         "set EKF2_EVP_NOISE to 0.099 m: rejected 53% → 0%, mean NIS 22 → 1.0, position error 0.31 "
          "→ 0.11 m (replayed)"),
-        ("v1.16.1_aisle_overconfident", "ekf2_rejecting", "Set EKF2_EVP_NOISE to 0.094 m"),
+        ("v1.16.1_aisle_overconfident", "ekf2_rejecting", "Set EKF2_EVP_NOISE to 0.099 m"),
         ("v1.16.1_aisle_nlos", "ekf2_variance_understated", "remove the outliers"),
         ("v1.16.1_aisle_nlos", "ekf2_rejecting", "A wider EKF2_EVP_GATE is no remedy; at 10"),
         ("v1.16.1_aisle_clock_late", "ekf2_ev_delay_wrong", "position error 0.34 → 0.11 m"),
