@@ -68,7 +68,7 @@ def _drifting(source: str, heading: HeadingError, remedy: str) -> Finding:
         f"EKF2's heading drifts against {source}, whose frame lies at "
         f"{first.heading_error_deg:+.0f}° from {first.start_s:.0f} to {first.end_s:.0f} s and at "
         f"{last.heading_error_deg:+.0f}° from {last.start_s:.0f} to {last.end_s:.0f} s (clockwise "
-        f"seen from above, {how}): no constant turn of the positions mends that. A magnetometer "
+        f"seen from above, {how}): no constant turn of the positions fixes that. A magnetometer "
         "indoors does this, or odometry whose own heading drifts.",
         f"{remedy[0].upper()}{remedy[1:]}",
         {
