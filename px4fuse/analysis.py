@@ -404,7 +404,7 @@ def explain(comparison: Comparison, progress: Progress = _silent) -> Analysis:
         comparison.settings,
         names,
         lambda name: progress(f"tuning {name}"),
-        comparison.flight,
+        with_usable_imu(comparison.flight),
         may_drift(comparison.flight, comparison.source),
     )
     clock = clock_offset(comparison, tuning, progress)
@@ -421,7 +421,14 @@ def tuned_horizontally(comparison: Comparison) -> Tuning:
     """The horizontal noises alone, which is what the clock estimate needs."""
     axes = tuple(result.axis for result in comparison.axes)
     drifts = may_drift(comparison.flight, comparison.source)
-    return tune(axes, comparison.settings, (HORIZONTAL,), flight=comparison.flight, drifts=drifts)
+    flight = with_usable_imu(comparison.flight)
+    return tune(axes, comparison.settings, (HORIZONTAL,), flight=flight, drifts=drifts)
+
+
+def with_usable_imu(flight: Flight) -> Flight:
+    """The flight, without an IMU that is too slow to tell biases and times."""
+    slow = imu_too_slow_for_clocks(flight)
+    return flight if slow is None else replace(flight, imu=slow)
 
 
 def clock_offset(

@@ -37,7 +37,7 @@ def tune(log: Path, json_path: Path | None, **given: Any) -> None:
     --sigma-a and --sigma-z are what they are compared with. LOG is a PX4 ULog or a MAVLink
     recording.
     """
-    from px4fuse.analysis import run_comparison
+    from px4fuse.analysis import run_comparison, with_usable_imu
     from px4fuse.comparison.drift import may_drift
     from px4fuse.filter.tuning import tune as tune_axes
     from px4fuse.request import command_line
@@ -51,7 +51,7 @@ def tune(log: Path, json_path: Path | None, **given: Any) -> None:
             axes,
             compared.settings,
             progress=lambda name: step(f"tuning {name}"),
-            flight=compared.flight,
+            flight=with_usable_imu(compared.flight),
             drifts=may_drift(compared.flight, compared.source),
         )
     if write_json(

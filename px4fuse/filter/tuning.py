@@ -124,7 +124,8 @@ class AxisTuning:
     noises : Noises
         The most likely ones, with the random walk of a source that may wander.
     biases_fitted : bool
-        Whether biases and tilt were taken out; without the IMU, SIGMA_A covers them.
+        Whether biases and tilt were taken out; where the IMU is too slow for that, SIGMA_A of the
+        filter bounds the noise.
     """
 
     name: str
@@ -227,6 +228,9 @@ def tune_axes(
     sigma_a, sigma_z = (_noise(searched, best, which) for which in (0, 1))
     at_z = sigma_z.value or sigma_z.high or best.noises.sigma_z_m
     needed = sigma_a if found is None else _needed(parts, alone, at_z)
+    if found is None and flight is not None and settings.input == "imu":
+        # the noise alone is not told; with what else the filter has to cover it is this
+        sigma_a = Noise(None, None, needed.high)
     after = Noises(needed.value or needed.high or alone.noises.sigma_a_m_s2, at_z)
     gain = _score(parts, chosen, alone) - _score(parts, after, alone)
     return AxisTuning(
