@@ -41,7 +41,7 @@ MIN_PART_SAMPLES = 3
 MAX_MEASUREMENTS = 1000
 # Parts further apart than chance would put them
 DRIFT_P = 0.002
-MIN_DRIFT_DEG = 5.0
+MIN_DRIFT_DEG = 5.5
 # Turning faster, a late stamp looks like a wrong heading: 0.2 s of it are 2°
 MAX_TURN_RATE_DEG_S = 10.0
 # What two headings differ by that agree: mounting, vibration, rounding

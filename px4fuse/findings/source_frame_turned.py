@@ -7,7 +7,7 @@ from px4fuse.filter.heading import DRIFT_P, HeadingError
 from px4fuse.findings.model import Detector, Finding, Found, Severity, Threshold
 from px4fuse.flight import Unavailable
 
-HEADING_SIGMAS = Threshold(3.0, "standard deviations", "0.3 % of clean flights lie beyond")
+HEADING_SIGMAS = Threshold(4.0, "standard deviations", "clean flights were seen up to 3.2")
 HEADING_ERROR = Threshold(5.0, "°", "EKF2's magnetic heading was off by 3 to 4° in flights seen")
 HEADING_ERROR_LARGE = Threshold(15.0, "°", "a quarter of each axis goes to the other")
 # Published in EKF2's own frame, after it turned what was sent (EKF2.cpp)
