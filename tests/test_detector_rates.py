@@ -26,9 +26,9 @@ from px4fuse.simulation.detector_rates import (
 from px4fuse.simulation.scenario import Scenario
 
 TABLE = rates()
-# Sizes that a log cannot show, for the reason in the finding's file; measured all the same
 # A narrow gate that costs so many positions that EKF2 parts from them is told inside what S then is
 FIRST = {"ekf2_rejecting": 0.8}
+# Sizes that a log cannot show, for the reason in the finding's file; measured all the same
 INVISIBLE = {
     ("source_scale_wrong", "--mistake scale=5%"),
     ("source_thinned", "--mistake decimate=2.5Hz"),
