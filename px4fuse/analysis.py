@@ -27,6 +27,7 @@ from px4fuse.filter.clock import ClockOffset, estimate_clock_offset
 from px4fuse.filter.fitting import Noises
 from px4fuse.filter.heading import HeadingError, heading_error
 from px4fuse.filter.kalman import Settings
+from px4fuse.filter.motion import MAX_IMU_INTERVAL_S
 from px4fuse.filter.signals import AISLE, Axis
 from px4fuse.filter.smoothing import Smoothing, smoothing
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise, tune
@@ -49,8 +50,7 @@ from px4fuse.request import (
 # Noises that the report states: those of a source once. Each axis by itself is for `px4fuse tune`
 REPORTED = (HORIZONTAL, "down")
 
-# Slower, and what the acceleration did between two samples is not known well enough to tell times
-MIN_CLOCK_IMU_HZ = 40.0
+MIN_CLOCK_IMU_HZ = 1.0 / MAX_IMU_INTERVAL_S
 # vehicle_imu integrates at this rate (IMU_INTEG_RATE): slower telemetry leaves samples out
 MIN_TELEMETRY_IMU_HZ = 200.0
 CLOCK_RATE_MARGIN = 0.98
@@ -399,14 +399,7 @@ def explain(comparison: Comparison, progress: Progress = _silent) -> Analysis:
     """
     axes = tuple(result.axis for result in comparison.axes)
     names = REPORTED if {"north", "east"} <= {axis.name for axis in axes} else None
-    tuning = tune(
-        axes,
-        comparison.settings,
-        names,
-        lambda name: progress(f"tuning {name}"),
-        with_usable_imu(comparison.flight),
-        may_drift(comparison.flight, comparison.source),
-    )
+    tuning = tuned(comparison, names, progress)
     clock = clock_offset(comparison, tuning, progress)
     progress("replaying EKF2")
     model = open_model(comparison.flight)
@@ -419,16 +412,32 @@ def explain(comparison: Comparison, progress: Progress = _silent) -> Analysis:
 
 def tuned_horizontally(comparison: Comparison) -> Tuning:
     """The horizontal noises alone, which is what the clock estimate needs."""
-    axes = tuple(result.axis for result in comparison.axes)
-    drifts = may_drift(comparison.flight, comparison.source)
-    flight = with_usable_imu(comparison.flight)
-    return tune(axes, comparison.settings, (HORIZONTAL,), flight=flight, drifts=drifts)
+    return tuned(comparison, (HORIZONTAL,))
 
 
-def with_usable_imu(flight: Flight) -> Flight:
-    """The flight, without an IMU that is too slow to tell biases and times."""
+def tuned(
+    comparison: Comparison, names: tuple[str, ...] | None = None, progress: Progress = _silent
+) -> dict[str, AxisTuning | Unavailable]:
+    """Most likely noises of a comparison's axes; an IMU too slow to tell biases is left out.
+
+    Parameters
+    ----------
+    comparison : Comparison
+    names : tuple of str, optional
+        Axis names and "horizontal"; by default all that there are.
+    progress : callable
+        Told what is being done.
+    """
+    flight = comparison.flight
     slow = imu_too_slow_for_clocks(flight)
-    return flight if slow is None else replace(flight, imu=slow)
+    return tune(
+        tuple(result.axis for result in comparison.axes),
+        comparison.settings,
+        names,
+        lambda name: progress(f"tuning {name}"),
+        flight if slow is None else replace(flight, imu=slow),
+        may_drift(flight, comparison.source),
+    )
 
 
 def clock_offset(
@@ -481,7 +490,7 @@ def turned_frame(
     tuned = tuning.get(HORIZONTAL)
     sigma_z_m = comparison.settings.sigma_z_m
     if isinstance(tuned, AxisTuning):
-        sigma_z_m = tuned.sigma_z.value or tuned.sigma_z.high or sigma_z_m
+        sigma_z_m = _size(tuned.sigma_z, sigma_z_m)
     known = isinstance(clock, ClockOffset) and clock.determinable
     return heading_error(
         comparison.flight,

@@ -37,23 +37,15 @@ def tune(log: Path, json_path: Path | None, **given: Any) -> None:
     --sigma-a and --sigma-z are what they are compared with. LOG is a PX4 ULog or a MAVLink
     recording.
     """
-    from px4fuse.analysis import run_comparison, with_usable_imu
-    from px4fuse.comparison.drift import may_drift
-    from px4fuse.filter.tuning import tune as tune_axes
+    from px4fuse.analysis import run_comparison
+    from px4fuse.analysis import tuned as tuned_noises
     from px4fuse.request import command_line
     from px4fuse.results.build import tuning_results
 
     request = comparison_request(log, given)
     with progress(json_path == STANDARD_OUTPUT) as step:
         compared = run_comparison(request, step)
-        axes = tuple(result.axis for result in compared.axes)
-        tuned = tune_axes(
-            axes,
-            compared.settings,
-            progress=lambda name: step(f"tuning {name}"),
-            flight=with_usable_imu(compared.flight),
-            drifts=may_drift(compared.flight, compared.source),
-        )
+        tuned = tuned_noises(compared, progress=step)
     if write_json(
         tuning_results(request, compared, tuned, command_line(request, "tune")), json_path
     ):

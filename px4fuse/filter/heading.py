@@ -24,6 +24,7 @@ from scipy.stats import chi2
 from px4fuse.arrays import Array
 from px4fuse.filter.kalman import Settings
 from px4fuse.filter.model import INITIAL_SIGMA_P_M, INITIAL_SIGMA_V_M_S, noise_of_many_steps
+from px4fuse.filter.motion import MAX_IMU_INTERVAL_S
 from px4fuse.filter.signals import IMU_GAP_S, Segment, ned_acceleration, within
 from px4fuse.flight import (
     POSITION_COLUMNS,
@@ -46,8 +47,6 @@ MIN_DRIFT_DEG = 5.5
 MAX_TURN_RATE_DEG_S = 10.0
 # What two headings differ by that agree: mounting, vibration, rounding
 LEAST_SIGMA_DEG = 0.5
-# Slower, and the acceleration between IMU samples is not known
-MAX_IMU_INTERVAL_S = 0.025
 MAX_ATTITUDE_INTERVAL_S = 0.11
 LINEARISATIONS = 3
 STATE_COUNT = 7

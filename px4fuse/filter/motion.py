@@ -29,7 +29,6 @@ from px4fuse.trajectory.graph import lie
 # Standard deviations of the constants, wide for consumer sensors: tilt and heading (rad), gyro
 # (rad/s) and accelerometer (m/s²), scale of the positions (1)
 CONSTANT_SIGMA = np.repeat([0.05, 0.004, 0.3, 0.1], [3, 3, 3, 1])
-HEADING = 2  # which of them is a turn about down
 SCALE = 9
 # To first order only while the angles stay small: longer flights are cut into stretches. A gyro
 # bias of 0.004 rad/s turns by 0.12 rad in one, whose square costs 0.07 m/s².
@@ -132,14 +131,6 @@ class Motion:
             np.einsum("ab,ntbk->natk", directions, np.concatenate(part)) for part in (dps, dvs)
         )
         return dp, dv
-
-    def velocity(self, directions: Array, offset_s: float) -> Array:
-        """Velocity of the IMU alone at the measurements, but for a constant, shape (m, a)."""
-        parts = [
-            signals.at(self.time_s[begin:end] + offset_s)[0][..., 0]
-            for begin, end, signals in self._stretches()
-        ]
-        return np.asarray(np.concatenate(parts) @ directions.T)
 
     def _stretches(self) -> Iterator[tuple[int, int, Signals]]:
         return zip(self.edges[:-1].tolist(), self.edges[1:].tolist(), self.signals, strict=True)
