@@ -77,9 +77,13 @@ def test_every_kind_of_mark_is_drawn_once_with_its_name(eventful: Document) -> N
         "source silent", "on the ground", "log dropout", "flight modes, in turn", "EKF2 reset",
         "EKF2 rejected", "outlier", "take-off", "landing",
     ]  # fmt: skip
-    axes = Figure().add_axes((0.1, 0.1, 0.8, 0.8), xlim=(5.0, 95.0), ylim=(2.0, 3.0))
+    axes = Figure().add_axes((0.1, 0.1, 0.8, 0.8))
+    axes.plot([6.0, 94.0], [2.0, 3.0])
+    limits = axes.get_xlim(), axes.get_ylim()
     marks.draw(axes, eventful, strip=True)
-    assert (axes.get_xlim(), axes.get_ylim()) == ((5.0, 95.0), (2.0, 3.0))
+    axes.autoscale()
+    assert (axes.get_xlim(), axes.get_ylim()) == limits
+    axes.lines[0].remove()
     bands = [c for c in axes.collections if isinstance(c, PolyCollection)]
     spans = [[tuple(path.vertices[[0, 2], 0]) for path in band.get_paths()] for band in bands]
     assert spans[0] == [(40.0, 95.0)]
@@ -133,14 +137,13 @@ def test_rejected_innovations_are_hollow_and_fused_ones_filled(eventful: Documen
 
 
 def test_the_zoom_is_where_the_filter_is_updated() -> None:
-    made = aisle_flight(duration_s=120.0, uwb=Uwb(gap_s=(50.0, 75.0)))
+    made = aisle_flight(duration_s=120.0, uwb=Uwb(gap_s=(50.0, 70.0)))
     comparison = compare(made)
     start, end = innovations.zoom_window(comparison.main, comparison.segment)
     updates = comparison.main.replay.updates.index
-    assert end <= 50.2 or start >= 74.8
     assert ((updates >= start) & (updates <= end)).sum() >= 12
     assert abs((start + end) / 2.0 - 60.0) < 17.0
-    assert "In the 25." in innovations.sigma_words(document(comparison))
+    assert "In the 20." in innovations.sigma_words(document(comparison))
 
 
 def test_sentences_are_made_of_the_numbers(eventful: Document) -> None:
@@ -181,7 +184,7 @@ def test_the_map_stays_and_every_finding_stands_once(count: int) -> None:
 
 
 def test_the_map_lies_along_the_aisle_and_a_wide_track_has_north_up() -> None:
-    (axes,) = drawn(cover.draw, document(compare(aisle_flight(heading_deg=200.0))))[0].axes
+    (axes,) = drawn(cover.draw, document(compare(aisle_flight(), heading_deg=200.0)))[0].axes
     assert axes.get_xlabel() == "along 20° from north (m)"
     made = aisle_flight()
     wide = made.positions[0].samples.copy()
