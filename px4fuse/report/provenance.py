@@ -6,8 +6,9 @@ from collections.abc import Iterator
 
 from matplotlib.figure import Figure
 
+from px4fuse.report import fonts
 from px4fuse.report.document import Document, LoopDocument
-from px4fuse.report.style import BOTTOM, LEFT, MUTED, NO_GLYPH, lacks_glyphs, page
+from px4fuse.report.style import BOTTOM, LEFT, MUTED, page
 from px4fuse.report.words import alignment_words, clock_words
 from px4fuse.results.parts import provenance
 
@@ -176,10 +177,10 @@ def _layout(sections: list[Section]) -> Iterator[Figure]:
 
 def _fonts(document: Document | LoopDocument) -> list[tuple[str, str]]:
     student = document.student
-    if not lacks_glyphs(student.name + student.id + student.notes):
+    if not fonts.missing(student.name + student.id + student.notes):
         return []
     text = (
-        f"{NO_GLYPH} stands for characters that no font on this machine has; results.json holds "
-        "the text as given"
+        f"{fonts.NO_GLYPH} stands for characters that no font on this machine has; results.json "
+        "holds the text as given"
     )
     return [("fonts", text)]

@@ -6,7 +6,9 @@ in grey. Text from outside (names, notes) is drawn as it is: no mathematics, no 
 
 from __future__ import annotations
 
+import logging
 import textwrap
+import unicodedata
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -22,6 +24,7 @@ from matplotlib.ft2font import LoadFlags
 from matplotlib.ticker import MaxNLocator
 
 from px4fuse.arrays import Array
+from px4fuse.report import fonts
 
 A4_INCHES = (8.27, 11.69)
 LEFT, RIGHT, TOP, BOTTOM = 0.085, 0.945, 0.95, 0.05
@@ -46,13 +49,6 @@ EKF2_DOTS: dict[str, Any] = {
     "color": EKF2, "marker": "s", "ms": 2.8, "mew": 0.6, "mfc": "none", "ls": "none",
 }  # fmt: skip
 
-# The first is matplotlib's own and always there; the others serve scripts that it lacks.
-FONTS = (
-    "DejaVu Sans", "Noto Sans", "Noto Sans Thai", "Leelawadee UI", "Thonburi", "Noto Sans CJK SC",
-    "Noto Sans CJK JP", "WenQuanYi Zen Hei", "Microsoft YaHei", "PingFang SC", "Hiragino Sans GB",
-    "Malgun Gothic", "Noto Sans Arabic", "Noto Sans Devanagari", "Segoe UI", "Arial Unicode MS",
-)  # fmt: skip
-NO_GLYPH = "\N{WHITE SQUARE}"
 # What the eye can see across a page, and across a third of it: longer series are thinned to their
 # extremes per bucket.
 MAX_POINTS = 1500
@@ -60,11 +56,17 @@ MAX_POINTS_NARROW = 500
 
 
 @contextmanager
-def report_style() -> Iterator[None]:
-    """Matplotlib settings of the report, for the duration of a block."""
-    with mpl.rc_context(
+def report_style(outside: str = "") -> Iterator[None]:
+    """Matplotlib settings of the report, for the duration of a block.
+
+    Parameters
+    ----------
+    outside : str
+        What comes from outside (names, notes), for fonts that have its characters.
+    """
+    with _quiet(), mpl.rc_context(
         {
-            "font.family": list(_available_fonts()),
+            "font.family": fonts.families(outside),
             "font.size": 7.5,
             "axes.titlesize": 8.5,
             "axes.titlelocation": "left",
@@ -100,10 +102,16 @@ def report_style() -> Iterator[None]:
         yield
 
 
-@cache
-def _available_fonts() -> tuple[str, ...]:
-    installed = {entry.name for entry in font_manager.fontManager.ttflist}
-    return tuple(name for name in FONTS if name in installed)
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Without matplotlib's remarks that a font has no regular weight."""
+    logger = logging.getLogger(font_manager.__name__)
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        logger.setLevel(level)
 
 
 @cache
@@ -119,39 +127,24 @@ def printable(text: str) -> str:
         if character in "\n" or (character.isprintable() and _has_glyph(character)):
             drawn.append(character)
         elif character.isprintable():
-            drawn.append(NO_GLYPH)
+            drawn.append(fonts.NO_GLYPH)
     return "".join(drawn)
 
 
-def lacks_glyphs(text: str) -> bool:
-    """Whether a part of a text can only be drawn as white squares here."""
-    return NO_GLYPH in printable(text.replace(NO_GLYPH, ""))
-
-
-@cache
 def _has_glyph(character: str) -> bool:
-    code = ord(character)
-    return any(_font(name, "normal").get_char_index(code) for name in _available_fonts())
+    return fonts.font_of(character) in mpl.rcParams["font.family"]
 
 
 @cache
 def text_width(text: str, size: float, weight: str = "normal") -> float:
-    """Width of a line of text in points, kerning and all fonts but the first left out."""
-    font = _font(FONTS[0], weight)
-    font.set_size(size, 72.0)
-    width = 0.0
-    for character in text:
-        if font.get_char_index(ord(character)):
-            width += _advance(character, weight) * size
-        else:
-            width += 1.05 * size  # wide scripts: an em and a little
-    return width
+    """Width of a line of text in points, kerning and shaping left out."""
+    return size * sum(_advance(character, weight) for character in text)
 
 
 @cache
 def _advance(character: str, weight: str) -> float:
     """Advance of one character in em."""
-    font = _font(FONTS[0], weight)
+    font = _font(fonts.font_of(character) or fonts.FONT, weight)
     font.set_size(100.0, 72.0)
     return (
         float(font.load_char(ord(character), flags=LoadFlags.NO_HINTING).linearHoriAdvance)
@@ -164,13 +157,13 @@ def wrap(text: str, size: float, width_points: float, weight: str = "normal") ->
     """Break text into lines that fit; a word longer than a line is broken too."""
     lines: list[str] = []
     for paragraph in text.split("\n"):
-        line = ""
-        for word in paragraph.split(" "):
-            candidate = f"{line} {word}" if line else word
+        line = " " * (len(paragraph) - len(paragraph.lstrip(" ")))
+        for word in paragraph.lstrip(" ").split(" "):
+            candidate = f"{line} {word}" if line.strip() else line + word
             if text_width(candidate, size, weight) <= width_points:
                 line = candidate
                 continue
-            if line:
+            if line.strip():
                 lines.append(line)
             line = word
             while (fitting := _fitting(line, size, width_points, weight)) < len(line):
@@ -193,7 +186,7 @@ def _fitting(text: str, size: float, width_points: float, weight: str) -> int:
     width = 0.0
     for count, character in enumerate(text):
         width += text_width(character, size, weight)
-        if width > width_points:
+        if width > width_points and not unicodedata.category(character).startswith("M"):
             return max(count, 1)
     return len(text)
 
