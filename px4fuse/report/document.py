@@ -6,7 +6,9 @@ from dataclasses import dataclass
 from functools import cached_property
 
 from px4fuse.analysis import Analysis, Counterfactual
-from px4fuse.comparison.comparison import Comparison
+from px4fuse.comparison.comparison import AxisComparison, Comparison
+from px4fuse.comparison.events import Events, happened
+from px4fuse.filter.signals import AISLE
 from px4fuse.findings import Finding
 from px4fuse.findings.story import story
 from px4fuse.loop.loop import Loop
@@ -44,6 +46,17 @@ class Document:
     def story(self) -> tuple[str, ...]:
         """What happened, in up to three sentences."""
         return story(self.analysis, self.findings)
+
+    @property
+    def main(self) -> AxisComparison:
+        """The axis of the lab: the aisle, or else the first."""
+        axes = self.comparison.axes
+        return next((axis for axis in axes if axis.axis.name == AISLE), axes[0])
+
+    @cached_property
+    def events(self) -> Events:
+        """What is marked on every time axis."""
+        return happened(self.comparison)
 
     @property
     def log(self) -> tuple[str, str]:
