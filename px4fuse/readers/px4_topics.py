@@ -360,8 +360,9 @@ def topics() -> list[str]:
     """Every topic named in this table, sorted: all that a reader needs to decode."""
     groups = (
         IMU, ATTITUDE, LOCAL_POSITION, ESTIMATOR_STATES, SENSOR_BIAS, SELECTOR, FUSING,
-        LAND_DETECTED, FLIGHT_MODE, TRUTH_LOCAL, TRUTH_GLOBAL, TRUTH_ATTITUDE, GPS, AID_OBSERVATION_HORIZONTAL,
-        AID_OBSERVATION_VERTICAL, *AID_SOURCE.values(), *(track.layouts for track in TRACKS),
+        LAND_DETECTED, FLIGHT_MODE, TRUTH_LOCAL, TRUTH_GLOBAL, TRUTH_ATTITUDE, GPS,
+        AID_OBSERVATION_HORIZONTAL, AID_OBSERVATION_VERTICAL, *AID_SOURCE.values(),
+        *(track.layouts for track in TRACKS),
     )  # fmt: skip
     names = {layout.topic for group in groups for layout in group} | UNUSED.keys()
     for layout in INNOVATIONS:

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from functools import cached_property
 
 from px4fuse.analysis import Analysis, Counterfactual
-from px4fuse.comparison.comparison import AxisComparison, Comparison
+from px4fuse.comparison.comparison import Comparison
 from px4fuse.comparison.events import Events, happened
-from px4fuse.filter.signals import AISLE
 from px4fuse.findings import Finding
 from px4fuse.findings.story import story
+from px4fuse.flight import Unavailable
 from px4fuse.loop.loop import Loop
 from px4fuse.results.model import Provenance, Student
 
@@ -48,10 +48,9 @@ class Document:
         return story(self.analysis, self.findings)
 
     @property
-    def main(self) -> AxisComparison:
-        """The axis of the lab: the aisle, or else the first."""
-        axes = self.comparison.axes
-        return next((axis for axis in axes if axis.axis.name == AISLE), axes[0])
+    def truth_known(self) -> bool:
+        """Whether the log has a truth to compare with."""
+        return not isinstance(self.comparison.flight.truth, Unavailable)
 
     @cached_property
     def events(self) -> Events:

@@ -16,7 +16,7 @@ from px4fuse.arrays import Array
 from px4fuse.comparison.events import Span
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.report.document import Document
-from px4fuse.report.style import EKF2, MUTED, POINTS_PER_WIDTH, text_width
+from px4fuse.report.style import EKF2_REJECTED, MUTED, POINTS_PER_WIDTH, text_width
 
 # Bands differ in grey by hatch and depth; marks stand on two lines at the foot of the axes
 GROUND: dict[str, Any] = {"facecolor": "#e4e4e4", "edgecolor": "none", "lw": 0.0}
@@ -24,9 +24,6 @@ GAP: dict[str, Any] = {"facecolor": "#fbfbfb", "edgecolor": "#9a9a9a", "lw": 0.0
 DROPOUT: dict[str, Any] = {"facecolor": "#a8a8a8", "edgecolor": "none", "lw": 0.0}
 MODE: dict[str, Any] = {"facecolor": "#f6f0e2", "edgecolor": "none", "lw": 0.0}
 RESET: dict[str, Any] = {"color": "#8a4508", "lw": 0.8, "ls": (0, (6, 1.5, 1, 1.5))}
-REJECTED: dict[str, Any] = {
-    "color": EKF2, "marker": "s", "ms": 2.6, "mew": 0.6, "mfc": "white", "ls": "none",
-}  # fmt: skip
 OUTLIER: dict[str, Any] = {"color": "black", "marker": "x", "ms": 3.0, "mew": 0.7, "ls": "none"}
 TAKE_OFF: dict[str, Any] = {"color": "black", "marker": "^", "ms": 4.5, "mew": 0, "ls": "none"}
 LANDING: dict[str, Any] = {"color": "black", "marker": "v", "ms": 4.5, "mew": 0, "ls": "none"}
@@ -69,10 +66,10 @@ def draw(axes: Axes, document: Document, *, axis: str | None = None, strip: bool
             ),
             autolim=False,
         )  # fmt: skip
-    name = document.main.axis.name if axis is None else axis
+    name = document.comparison.main.axis.name if axis is None else axis
     span = segment.end_s - segment.start_s
     for times, height, style in (
-        (events.rejected_s.get(name, ()), REJECTED_LINE, REJECTED),
+        (events.rejected_s.get(name, ()), REJECTED_LINE, EKF2_REJECTED),
         (outliers(document), OUTLIER_LINE, OUTLIER),
         (events.take_off_s, 0.0, TAKE_OFF),
         (events.landing_s, 0.0, LANDING),
@@ -96,7 +93,7 @@ def outliers(document: Document) -> Array:
     found = [
         tuned.outlier_time_s
         for name, tuned in document.analysis.tuning.items()
-        if isinstance(tuned, AxisTuning) and name in (HORIZONTAL, document.main.axis.name)
+        if isinstance(tuned, AxisTuning) and name in (HORIZONTAL, document.comparison.main.axis.name)
     ]
     times: Array = np.unique(np.concatenate(found)) if found else np.empty(0)
     return times
@@ -109,11 +106,11 @@ def handles(document: Document) -> list[Artist]:
         (events.gaps, Patch(**GAP, label="source silent")),
         (events.ground, Patch(**GROUND, label="on the ground")),
         (events.dropouts, Patch(**DROPOUT, label="log dropout")),
-        (events.modes[1:], Patch(**MODE, label="every second flight mode")),
+        (events.modes[1:], Patch(**MODE, label="flight modes, in turn")),
         (events.resets_s, Line2D([], [], **RESET, label="EKF2 reset")),
         (
             any(len(times) for times in events.rejected_s.values()),
-            Line2D([], [], **REJECTED, label="EKF2 rejected"),
+            Line2D([], [], **EKF2_REJECTED, label="EKF2 rejected"),
         ),
         (outliers(document).size, Line2D([], [], **OUTLIER, label="outlier")),
         (events.take_off_s, Line2D([], [], **TAKE_OFF, label="take-off")),
