@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
+import numpy as np
 from matplotlib.figure import Figure
 
 from px4fuse.comparison.comparison import AgainstTruth, Difference, FilterSummary
@@ -11,8 +12,8 @@ from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.signals import AISLE
 from px4fuse.findings import Finding
 from px4fuse.flight import Unavailable
-from px4fuse.report import plan
 from px4fuse.report.document import Document
+from px4fuse.report.plan import plan
 from px4fuse.report.style import (
     BOTTOM,
     EKF2,
@@ -34,6 +35,8 @@ from px4fuse.report.words import (
 
 LABEL_WIDTH = 0.085
 TEXT_X = LEFT + LABEL_WIDTH
+# Points before the map, and for the line that says that findings follow
+BEFORE_MAP, MORE = 14.0, 13.0
 SECOND = 0.5 * (LEFT + RIGHT)  # where the right half of the page begins
 TABLE_SIZE = 7.6
 # Right (numbers) or left (words) edges of the columns of the other axes, fractions of the page
@@ -60,19 +63,35 @@ def draw(document: Document) -> Iterator[Figure]:
     _verdict(figure, cursor, document)
     _other_axes(figure, cursor, document)
     cursor.skip(10)
-    floor = plan.draw(figure, document, facts(document))
+    above = plan(document, facts(document))
     cursor.write("Findings", size=10.5, weight="bold")
     if not document.findings:
         cursor.write("None: no detector has anything to say about this flight.")
-    for number, finding in enumerate(document.findings):
-        if cursor.y - _finding_height(cursor, finding) < floor:
-            left = len(document.findings) - number
-            more = "finding follows" if left == 1 else f"of {number + left} findings follow"
-            cursor.skip(3)
-            cursor.write(f"{left} {more} on the next page.", x=TEXT_X, size=7.5, colour=MUTED)
+    room = cursor.y - BOTTOM - above.least(cursor) - BEFORE_MAP / POINTS_PER_HEIGHT
+    heights = np.cumsum([_finding_height(cursor, finding) for finding in document.findings])
+    fitting = int(np.searchsorted(heights, room))
+    if fitting < len(heights):
+        fitting = int(np.searchsorted(heights, room - MORE / POINTS_PER_HEIGHT))
+    for finding in document.findings[:fitting]:
+        write_finding(cursor, finding)
+    rest = document.findings[fitting:]
+    if rest:
+        cursor.skip(3)
+        more = f"{len(rest)} of {len(document.findings)} findings: next page."
+        cursor.write(more, x=TEXT_X, size=7.5, colour=MUTED)
+    cursor.skip(BEFORE_MAP)
+    above.draw(figure, cursor)
+    yield figure
+    if rest:
+        yield from _continued(rest)
+
+
+def _continued(findings: tuple[Finding, ...]) -> Iterator[Figure]:
+    figure, cursor = page("Findings, continued")
+    for finding in findings:
+        if cursor.y - _finding_height(cursor, finding) < BOTTOM:
             yield figure
             figure, cursor = page("Findings, continued")
-            floor = BOTTOM
         write_finding(cursor, finding)
     yield figure
 
@@ -101,9 +120,9 @@ def _verdict(figure: Figure, cursor: Cursor, document: Document) -> None:
             cursor.write(f"{summary.reason}.", size=8.0, x=left, right=right)
         else:
             statement = summary.consistency
-            known = isinstance(statement, Consistency)
-            shade = colour if known else MUTED
+            shade = colour if isinstance(statement, Consistency) else MUTED
             cursor.write(verdict_words(statement), size=16.0, weight="bold", colour=shade, x=left)
+            cursor.skip(2)
             cursor.write(_large_numbers(summary, truth), size=8.0, x=left, right=right - 0.02)
         ends.append(cursor.y)
     cursor.y = min(ends)

@@ -26,6 +26,7 @@ from px4fuse.report.style import (
     OURS_BAND,
     OURS_LINE,
     POINTS_PER_HEIGHT,
+    TIME_LABEL,
     TRUTH_LINE,
     Cursor,
     bare_x,
@@ -34,11 +35,11 @@ from px4fuse.report.style import (
     panel,
     thin,
 )
+from px4fuse.report.why import nothing_concluded
 
-TIME_LABEL = "time since first data (s)"
 # Titles, sentences, numbers and gaps of one panel, in points
 AROUND = 62.0
-TALLEST = 190.0
+TALLEST = 200.0
 
 
 def draw(document: Document) -> Iterator[Figure]:
@@ -55,7 +56,11 @@ def draw(document: Document) -> Iterator[Figure]:
     ]
     if not isinstance(reference, Unavailable):
         panels.append((error_title(result), error_words(result), draw_error, error_numbers))
-    room = (cursor.y - BOTTOM) * POINTS_PER_HEIGHT - 20.0
+    reasons = [nothing_concluded(document)]
+    if isinstance(reference, Unavailable):
+        reasons.append(f"No error is drawn: {reference.reason}. {reference.remedy}")
+    foot = sum(cursor.height(reason) for reason in filter(None, reasons))
+    room = (cursor.y - foot - BOTTOM) * POINTS_PER_HEIGHT - 20.0
     height = min(room / len(panels) - AROUND, TALLEST)
     for place, (title, say, draw_panel, numbers) in enumerate(panels):
         strip = place == 0 and bool(document.events.modes)
@@ -70,8 +75,8 @@ def draw(document: Document) -> Iterator[Figure]:
             axes.set_xlabel(TIME_LABEL)
             below(cursor, numbers(result), points=23.0)
         cursor.skip(10)
-    if isinstance(reference, Unavailable):
-        cursor.write(f"No error is drawn: {reference.reason}. {reference.remedy}", size=8.0)
+    for reason in filter(None, reasons):
+        cursor.write(reason)
     yield figure
 
 

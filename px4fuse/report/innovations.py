@@ -19,7 +19,6 @@ from px4fuse.filter.signals import AISLE, Segment
 from px4fuse.flight import Unavailable
 from px4fuse.report import marks
 from px4fuse.report.document import Document
-from px4fuse.report.flight import TIME_LABEL
 from px4fuse.report.style import (
     EKF2,
     EKF2_DOTS,
@@ -32,6 +31,7 @@ from px4fuse.report.style import (
     OURS_BAND,
     OURS_DOTS,
     OURS_LINE,
+    TIME_LABEL,
     Cursor,
     bare_x,
     below,

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection, PolyCollection
+from matplotlib.collections import PolyCollection
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
@@ -18,16 +18,17 @@ from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.report.document import Document
 from px4fuse.report.style import EKF2_REJECTED, MUTED, POINTS_PER_WIDTH, text_width
 
-# Bands differ in grey by hatch and depth; marks stand on two lines at the foot of the axes
+# Bands differ in grey by hatch and depth; marks stand on lines at the foot of the axes, resets
+# hang from their top
 GROUND: dict[str, Any] = {"facecolor": "#e4e4e4", "edgecolor": "none", "lw": 0.0}
 GAP: dict[str, Any] = {"facecolor": "#fbfbfb", "edgecolor": "#9a9a9a", "lw": 0.0, "hatch": "/////"}
 DROPOUT: dict[str, Any] = {"facecolor": "#a8a8a8", "edgecolor": "none", "lw": 0.0}
 MODE: dict[str, Any] = {"facecolor": "#f6f0e2", "edgecolor": "none", "lw": 0.0}
-RESET: dict[str, Any] = {"color": "#8a4508", "lw": 0.8, "ls": (0, (6, 1.5, 1, 1.5))}
+RESET: dict[str, Any] = {"color": "#8a4508", "marker": 2, "ms": 6.0, "mew": 1.2, "ls": "none"}
 OUTLIER: dict[str, Any] = {"color": "black", "marker": "x", "ms": 3.0, "mew": 0.7, "ls": "none"}
 TAKE_OFF: dict[str, Any] = {"color": "black", "marker": "^", "ms": 4.5, "mew": 0, "ls": "none"}
 LANDING: dict[str, Any] = {"color": "black", "marker": "v", "ms": 4.5, "mew": 0, "ls": "none"}
-REJECTED_LINE, OUTLIER_LINE = 0.025, 0.075
+REJECTED_LINE, OUTLIER_LINE, RESET_LINE = 0.025, 0.075, 0.92
 # Marks closer than this share of the segment fall on one another
 CLOSEST = 1.0 / 300.0
 STRIP_SIZE = 6.5
@@ -57,20 +58,12 @@ def draw(axes: Axes, document: Document, *, axis: str | None = None, strip: bool
         (events.dropouts, DROPOUT, 0.4),
     ):
         _bands(axes, spans, {**style, "zorder": order})
-    if events.resets_s:
-        axes.add_collection(
-            LineCollection(
-                [[(time, 0.0), (time, 1.0)] for time in events.resets_s],
-                transform=axes.get_xaxis_transform(), colors=RESET["color"],
-                linewidths=RESET["lw"], linestyles=[RESET["ls"]], zorder=1.5,
-            ),
-            autolim=False,
-        )  # fmt: skip
     name = document.comparison.main.axis.name if axis is None else axis
     span = segment.end_s - segment.start_s
     for times, height, style in (
         (events.rejected_s.get(name, ()), REJECTED_LINE, EKF2_REJECTED),
         (outliers(document), OUTLIER_LINE, OUTLIER),
+        (events.resets_s, RESET_LINE, RESET),
         (events.take_off_s, 0.0, TAKE_OFF),
         (events.landing_s, 0.0, LANDING),
     ):
@@ -90,10 +83,11 @@ def draw(axes: Axes, document: Document, *, axis: str | None = None, strip: bool
 
 def outliers(document: Document) -> Array:
     """Times of the measurements that tuning takes for outliers, of all its axes together."""
+    names = HORIZONTAL, document.comparison.main.axis.name
     found = [
         tuned.outlier_time_s
         for name, tuned in document.analysis.tuning.items()
-        if isinstance(tuned, AxisTuning) and name in (HORIZONTAL, document.comparison.main.axis.name)
+        if isinstance(tuned, AxisTuning) and name in names
     ]
     times: Array = np.unique(np.concatenate(found)) if found else np.empty(0)
     return times

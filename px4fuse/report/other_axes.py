@@ -12,13 +12,13 @@ from px4fuse.comparison.comparison import AxisComparison, Difference, FilterSumm
 from px4fuse.flight import Unavailable
 from px4fuse.report import flight, innovations, marks
 from px4fuse.report.document import Document
-from px4fuse.report.flight import TIME_LABEL
 from px4fuse.report.style import (
     BOTTOM,
     LEFT,
     MAX_POINTS_NARROW,
     POINTS_PER_HEIGHT,
     RIGHT,
+    TIME_LABEL,
     Cursor,
     bare_x,
     caption,

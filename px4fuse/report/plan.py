@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -34,66 +34,103 @@ from px4fuse.report.style import (
 
 # A track so many times longer than wide lies along the page, else north is up
 LONG = 2.2
-TALLEST, LOWEST, BESIDE = 150.0, 62.0, 190.0  # points
+TALLEST, LOWEST = 150.0, 62.0  # points
+LEAST_BESIDE, MOST_BESIDE = 150.0, 290.0
 # Width of a map that has north up, fraction of the page
-WIDE = 0.40
-LABELS = 34.0  # points below the axes: ticks, label, a gap
+WIDE = 0.43
+HEAD, LABELS = 22.0, 34.0  # points above the axes, and below them: ticks, label, a gap
 FACT_SIZE = 7.0
 FACT_WIDTH = 0.085
+BESIDE_X = PANEL_LEFT + WIDE + 0.03
 Pair = tuple[Array, Array]
 
 
 @dataclass(frozen=True)
-class _View:
+class View:
     """How the map lies on the page: the heading (rad) of its x axis, and the names of both."""
 
     heading: float
     labels: tuple[str, str]
 
     def __call__(self, north: Array, east: Array) -> Pair:
+        """Where positions (m) lie on the page: to the right, and up."""
         c, s = np.cos(self.heading), np.sin(self.heading)
         return c * north + s * east, s * north - c * east
 
 
-def draw(figure: Figure, document: Document, facts: Sequence[tuple[str, str]]) -> float:
-    """Draw the map and write the facts below or beside it, from the foot of the page upwards.
+@dataclass(frozen=True)
+class Plan:
+    """A map with the facts below or beside it, ready to be drawn.
 
-    Returns
-    -------
-    float
-        Height on the page (fraction) that is free above them.
+    Attributes
+    ----------
+    document : Document
+    tracks : mapping from name to arrays
+        North and east, m.
+    view : View
+    long : bool
+        Whether the map takes the page's width, with the facts below it.
+    facts : sequence of (str, str)
+        Labels and sentences.
     """
-    comparison = document.comparison
-    tracks = _tracks(comparison)
-    points = np.column_stack(tracks["measurement"])
-    view, ratio = _view(comparison, points)
-    x, y = view(points[:, 0], points[:, 1])
-    if ratio >= LONG:
-        width = RIGHT - PANEL_LEFT
-        scale = width * POINTS_PER_WIDTH / (1.1 * float(np.ptp(x)) + 1e-6)
-        height = float(np.clip(1.3 * float(np.ptp(y)) * scale, LOWEST, TALLEST))
-        below = Cursor(figure, BOTTOM)
-        foot = sum(below.height(text, size=FACT_SIZE, x=LEFT + FACT_WIDTH) for _, text in facts)
-        box = (PANEL_LEFT, BOTTOM + foot + LABELS / POINTS_PER_HEIGHT, width)
-        below.y = BOTTOM + foot
-        _facts(below, facts, LEFT)
-    else:
-        height = BESIDE
-        box = (PANEL_LEFT, BOTTOM + LABELS / POINTS_PER_HEIGHT, WIDE)
-        beside = Cursor(figure, box[1] + height / POINTS_PER_HEIGHT)
-        _facts(beside, facts, PANEL_LEFT + WIDE + 0.03)
-    axes = figure.add_axes((*box, height / POINTS_PER_HEIGHT))
-    _map(axes, document, view, tracks)
-    top = box[1] + height / POINTS_PER_HEIGHT
-    title = Cursor(figure, top + 24.0 / POINTS_PER_HEIGHT)
-    title.write("From above", size=10.5, weight="bold")
-    handles, labels = axes.get_legend_handles_labels()
-    figure.legend(
-        handles, labels, loc="upper right", ncols=len(labels), borderaxespad=0.0, borderpad=0.0,
-        bbox_to_anchor=(RIGHT, top + 21.0 / POINTS_PER_HEIGHT), handlelength=1.8,
-        columnspacing=1.2, markerscale=1.5,
-    )  # fmt: skip
-    return top + 40.0 / POINTS_PER_HEIGHT
+
+    document: Document
+    tracks: Mapping[str, Pair]
+    view: View
+    long: bool
+    facts: Sequence[tuple[str, str]]
+
+    def least(self, cursor: Cursor) -> float:
+        """Height on the page (fraction) that it needs."""
+        map_points = (self._height() if self.long else LEAST_BESIDE) + HEAD + LABELS
+        facts = self._facts_height(cursor, LEFT if self.long else BESIDE_X)
+        if self.long:
+            return map_points / POINTS_PER_HEIGHT + facts
+        return max(map_points / POINTS_PER_HEIGHT, HEAD / POINTS_PER_HEIGHT + facts)
+
+    def draw(self, figure: Figure, cursor: Cursor) -> None:
+        """Draw it below the cursor."""
+        cursor.write("From above", size=10.5, weight="bold")
+        top = cursor.y - 6.0 / POINTS_PER_HEIGHT
+        room = (top - BOTTOM) * POINTS_PER_HEIGHT - LABELS
+        height = self._height() if self.long else min(room, MOST_BESIDE)
+        width = RIGHT - PANEL_LEFT if self.long else WIDE
+        bottom = top - height / POINTS_PER_HEIGHT
+        axes = figure.add_axes((PANEL_LEFT, bottom, width, height / POINTS_PER_HEIGHT))
+        _map(axes, self.document, self.view, self.tracks)
+        handles, labels = axes.get_legend_handles_labels()
+        figure.legend(
+            handles, labels, loc="lower right", ncols=len(labels), borderaxespad=0.0,
+            borderpad=0.0, bbox_to_anchor=(RIGHT, cursor.y), handlelength=1.8, columnspacing=1.2,
+        )  # fmt: skip
+        if self.long:
+            _facts(Cursor(figure, bottom - LABELS / POINTS_PER_HEIGHT), self.facts, LEFT)
+        else:
+            _facts(Cursor(figure, top), self.facts, BESIDE_X)
+
+    def _height(self) -> float:
+        """Of a map of the page's width, in points."""
+        x, y = self.view(*self.tracks["measurement"])
+        scale = (RIGHT - PANEL_LEFT) * POINTS_PER_WIDTH / (1.1 * float(np.ptp(x)) + 1e-6)
+        return float(np.clip(1.3 * float(np.ptp(y)) * scale, LOWEST, TALLEST))
+
+    def _facts_height(self, cursor: Cursor, left: float) -> float:
+        return sum(
+            cursor.height(text, size=FACT_SIZE, x=left + FACT_WIDTH) for _, text in self.facts
+        )
+
+
+def plan(document: Document, facts: Sequence[tuple[str, str]]) -> Plan:
+    """The map of a document's flight.
+
+    Parameters
+    ----------
+    document : Document
+    facts : sequence of (str, str)
+    """
+    tracks = _tracks(document.comparison)
+    view, ratio = _view(document.comparison, np.column_stack(tracks["measurement"]))
+    return Plan(document, tracks, view, ratio >= LONG, facts)
 
 
 def _tracks(comparison: Comparison) -> dict[str, Pair]:
@@ -124,7 +161,7 @@ def _tracks(comparison: Comparison) -> dict[str, Pair]:
     return tracks
 
 
-def _view(comparison: Comparison, points: Array) -> tuple[_View, float]:
+def _view(comparison: Comparison, points: Array) -> tuple[View, float]:
     """Along the track where it is long and narrow, else with north up; how long against wide."""
     aisle = next((a.axis for a in comparison.axes if a.axis.name == AISLE), None)
     centred = points - points.mean(axis=0)
@@ -136,16 +173,16 @@ def _view(comparison: Comparison, points: Array) -> tuple[_View, float]:
     if np.sin(heading) < 0.0:  # north is up rather than down
         heading += np.pi
     degrees = np.rad2deg(heading) % 360.0
-    along = _View(heading, (f"along {degrees:.0f}° from north (m)", "to its left (m)"))
+    along = View(heading, (f"along {degrees:.0f}° from north (m)", "to its left (m)"))
     x, y = along(points[:, 0], points[:, 1])
     ratio = float(np.ptp(x)) / max(float(np.ptp(y)), 1e-6)
     if ratio >= LONG:
         return along, ratio
-    return _View(np.pi / 2.0, ("east (m)", "north (m)")), ratio
+    return View(np.pi / 2.0, ("east (m)", "north (m)")), ratio
 
 
-def _map(axes: Axes, document: Document, view: _View, tracks: dict[str, Pair]) -> None:
-    axes.plot(*view(*tracks["measurement"]), **MEASURED, label="measurement")
+def _map(axes: Axes, document: Document, view: View, tracks: Mapping[str, Pair]) -> None:
+    axes.plot(*view(*tracks["measurement"]), **{**MEASURED, "ms": 3.0}, label="measurement")
     for name, style in (("EKF2", EKF2_LINE), ("ours", OURS_LINE), ("truth", TRUTH_LINE)):
         if name in tracks:
             axes.plot(*_thinned(view(*tracks[name])), **style, label=name)
@@ -174,14 +211,14 @@ def _thinned(track: Pair, most: int = 2000) -> Pair:
     return track[0][::every], track[1][::every]
 
 
-def _north(axes: Axes, view: _View) -> None:
+def _north(axes: Axes, view: View) -> None:
     """An arrow to the north in the corner."""
     x, y = view(np.array([1.0]), np.array([0.0]))
     axes.annotate(
-        "N", xy=(0.985, 0.80), xycoords="axes fraction",
-        xytext=(-22.0 * float(x[0]), -22.0 * float(y[0])), textcoords="offset points",
-        arrowprops={"arrowstyle": "<-", "color": MUTED, "lw": 0.8}, size=7, color=MUTED,
-        ha="center", va="center",
+        "N", xy=(0.97, 0.6), xycoords="axes fraction",
+        xytext=(20.0 * float(x[0]), 20.0 * float(y[0])), textcoords="offset points",
+        arrowprops={"arrowstyle": "<-", "color": MUTED, "lw": 0.8, "shrinkA": 1, "shrinkB": 0},
+        size=7, color=MUTED, ha="center", va="center",
     )  # fmt: skip
 
 

@@ -29,6 +29,8 @@ PANEL_LEFT = LEFT + 0.04  # of axes: the numbers beside them stand in between
 POINTS_PER_WIDTH = A4_INCHES[0] * 72.0
 POINTS_PER_HEIGHT = A4_INCHES[1] * 72.0
 
+TIME_LABEL = "time since first data (s)"
+
 OURS = "#123f7a"
 OURS_BAND = "#b9cbe4"
 EKF2 = "#e0741a"
