@@ -110,7 +110,7 @@ def _same_nis(stated: list[tuple[str, str, Consistency]]) -> Iterator[str]:
 
 def consequences_words(finding: Finding) -> str:
     """What the same cause brings with it, each in one sentence."""
-    return "With it: " + " ".join(one.message for one in finding.consequences)
+    return "With it: " + " ".join(f"{one.headline}." for one in finding.consequences)
 
 
 def clock_words(clock: ClockMap) -> str:
