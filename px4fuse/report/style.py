@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 import textwrap
 import unicodedata
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
@@ -222,6 +222,28 @@ class Cursor:
             self.y -= size * spacing / POINTS_PER_HEIGHT
             self.figure.text(x, self.y, line, size=size, weight=weight, color=colour, va="baseline")
 
+    def columns(
+        self, columns: Mapping[float, tuple[str, Sequence[str]]], *, size: float = 7.6
+    ) -> None:
+        """Write a table and move below it.
+
+        Parameters
+        ----------
+        columns : mapping from float to (str, sequence of str)
+            Left edge (fraction of the page) to head and cells.
+        """
+        count = max(len(cells) for _, cells in columns.values())
+        self.skip(size * 1.35)
+        for x, (head, cells) in columns.items():
+            self.figure.text(x, self.y, printable(head), size=size, color=MUTED)
+            for number, cell in enumerate(cells, start=1):
+                if cell:
+                    y = self.y - (3.0 + number * size * 1.4) / POINTS_PER_HEIGHT
+                    self.figure.text(x, y, printable(cell), size=size)
+        self.skip(3.0)
+        self.rule()
+        self.skip(count * size * 1.4)
+
     def height(
         self, text: str, *, size: float = 8.0, weight: str = "normal", x: float = LEFT,
         right: float = RIGHT, spacing: float = 1.32,
@@ -305,6 +327,22 @@ def panel(
     axes.xaxis.set_major_locator(MaxNLocator(8))
     axes.yaxis.set_major_locator(MaxNLocator(4))
     return axes
+
+
+def legend_beside_title(axes: Axes, top: float, **options: Any) -> None:
+    """Legend of a panel on the line of its title, at the right, where nothing lies beneath.
+
+    Parameters
+    ----------
+    top : float
+        Where the cursor stood before the panel.
+    """
+    figure, right = axes.figure, axes.get_position().x1
+    axes.legend(
+        loc="lower right", bbox_to_anchor=(right, top - 12.5 / POINTS_PER_HEIGHT), ncols=9,
+        bbox_transform=figure.transFigure, borderaxespad=0.0, borderpad=0.0, columnspacing=1.2,
+        **options,
+    )  # fmt: skip
 
 
 def bare_x(axes: Axes) -> None:
