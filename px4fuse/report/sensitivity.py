@@ -51,8 +51,8 @@ SETTINGS = (
 )
 # Names, columns of SETTINGS, and what the pair does
 PAIRS = (
-    ("Four times SIGMA_A, or a quarter of SIGMA_Z: restless", (1, 2)),
-    ("A quarter of SIGMA_A, or four times SIGMA_Z: sluggish", (3, 4)),
+    ("Four times SIGMA_A, or a quarter of SIGMA_Z: larger gain", (1, 2)),
+    ("A quarter of SIGMA_A, or four times SIGMA_Z: smaller gain", (3, 4)),
 )
 CURVE = FACTOR ** np.linspace(-2.0, 2.0, 17)
 # ln of how much less likely a pair is than the best: the joint 95 % region, then powers of ten
