@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shlex
 import subprocess
 import sys
@@ -20,6 +21,7 @@ from test_lesson import EXAMPLE_2
 from test_outputs import contents
 
 from px4fuse.cli import cli
+from px4fuse.loop.loop import BY_DISTANCE, PLAIN
 from px4fuse.results.contract import schema
 
 LOG = REPOSITORY / "sample_logs" / "loop_vio.ulg"
@@ -133,6 +135,9 @@ def test_loop_writes_report_results_path_and_graph(made) -> None:
     assert sorted(path.name for path in folder.iterdir()) == ["r.g2o", "r.json", "r.pdf", "r.tum"]
     assert "1.42 m" in result.output
     assert "REJECTED" in result.output  # 10,60 is no closure
+    for name in (PLAIN, BY_DISTANCE):  # with the score of each against the truth and against SLAM
+        assert len(re.findall(rf"^{name} +0\.[23]", result.output, re.MULTILINE)) == 2
+    assert "Example 2" in result.output
     for name in ("r.g2o", "r.json", "r.pdf", "r.tum"):
         assert f"Wrote    {folder / name}" in result.output
 

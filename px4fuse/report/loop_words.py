@@ -91,6 +91,23 @@ def closure_name(judged: Judged, loop: Loop) -> str:
     return f"{closure.time_1_s - zero:.2f} s and {closure.time_2_s - zero:.2f} s"
 
 
+def by_distance_words(loop: Loop) -> str:
+    """What the corrections by distance are; nothing where there is none."""
+    if isinstance(loop.plain, Unavailable):
+        return ""
+    example = (
+        "By distance, positions only, is the lesson's Example 2: each position moves by its share "
+        "of the gap, and the path keeps the bend of its headings."
+    )
+    turned = loop.misclosure_heading_deg
+    if isinstance(turned, Unavailable):
+        return f"{example} Headings are not turned: {turned.reason}."
+    return (
+        f"{example} Headings too: each step is first turned back by its share of the {turned:+.1f}°"
+        " that the heading is off at the end, and what is left of the gap is spread as before."
+    )
+
+
 def redundancy_words(loop: Loop) -> str:
     """That one loop has no redundancy, or nothing."""
     return SINGLE_LOOP if len(loop.closures) == 1 else ""
