@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,16 +12,18 @@ import click
 from px4fuse.cli.inputs import (
     NumberOrAuto,
     command_line,
-    json_option,
     max_size_option,
+    path_option,
     system_option,
 )
 from px4fuse.cli.outputs import (
     progress,
+    report_paths,
+    spare_inputs,
     terminal,
-    write_json,
+    write_outputs,
 )
-from px4fuse.errors import SettingsError
+from px4fuse.errors import OutputError, SettingsError
 from px4fuse.request import AUTO
 from px4fuse.writing import STANDARD_OUTPUT
 
@@ -28,6 +31,8 @@ if TYPE_CHECKING:
     from px4fuse.trajectory.scores import Delta
 
 MAX_DELTA = 1e6
+# Of each of the two names in the default name of the report: with both it stays below 255
+MAX_NAME_BYTES = 100
 _DELTA = re.compile(r"(\d+\.?\d*|\.\d+) ?(m|s|frames|f)")
 
 
@@ -101,7 +106,24 @@ class DeltaType(click.ParamType["Delta"]):
 )
 @system_option
 @max_size_option
-@json_option
+@path_option(
+    "-o",
+    "--output",
+    metavar="FILE.pdf",
+    help="The page.  [default: reports/ESTIMATE_against_REFERENCE.pdf]",
+)
+@path_option(
+    "--picture",
+    metavar="FILE.png",
+    help="The picture: the path by its error, APE, RPE.  [default: beside the PDF]",
+)
+@path_option(
+    "--json",
+    "json_path",
+    metavar="FILE",
+    help="The results; - prints them alone, and nothing else is written unless named.  [default: "
+    "beside the PDF]",
+)
 def evaluate(
     estimate: Path,
     reference: Path,
@@ -112,21 +134,34 @@ def evaluate(
     rpe: tuple[Any, ...],
     consecutive: bool,
     system: int | None,
+    output: Path | None,
+    picture: Path | None,
     json_path: Path | None,
 ) -> None:
     """Score a trajectory against a reference: ATE and RPE, with intervals.
 
     Either is a trajectory file (TUM, EuRoC, ORB-SLAM3) or a part of a flight log: LOG:vio,
-    LOG:ekf2, LOG:kf (our filter) or LOG:truth.
+    LOG:ekf2, LOG:kf (our filter) or LOG:truth. Writes a page (PDF), a picture (PNG) and the results
+    (JSON).
     """
     from px4fuse.loop.sources import read_source
     from px4fuse.report.loop_terminal import print_evaluation
     from px4fuse.results.build_trajectories import evaluation_results
+    from px4fuse.results.contract import to_json
     from px4fuse.trajectory.evaluation import evaluate as score
 
     for option, value in (("--max-gap", max_gap), ("--time-offset", time_offset)):
         if isinstance(value, float) and not abs(value) < float("inf"):
             raise SettingsError(f"{option} {value:g} is not a finite number.")
+    if output is None and json_path != STANDARD_OUTPUT:
+        output = Path("reports", f"{_name(estimate)}_against_{_name(reference)}.pdf")
+    beside = json_path
+    if output is not None:
+        output, beside = report_paths(output, json_path)
+        picture = picture or output.with_suffix(".png")
+    if picture is not None:
+        _check_picture(picture, beside)
+    contents: dict[Path, bytes] = {}
     with progress(json_path == STANDARD_OUTPUT) as step:
         step("reading")
         first = read_source(str(estimate), system=system)
@@ -142,8 +177,44 @@ def evaluate(
             rpe_deltas=rpe or None,
             all_pairs=not consecutive,
         )
-    if write_json(
-        evaluation_results(found, command_line("evaluate", estimate, reference)), json_path
-    ):
+        text = to_json(evaluation_results(found, command_line("evaluate", estimate, reference)))
+        if output is not None:
+            from px4fuse.report.document import EvaluationDocument
+            from px4fuse.report.pdf import render
+
+            step("drawing the page")
+            contents[output] = render(EvaluationDocument(found), text)
+        if picture is not None:
+            from px4fuse.report.evaluation import picture as draw
+
+            step("drawing the picture")
+            contents[picture] = draw(found)
+    for path in (beside, json_path):
+        if path is not None:
+            contents[path] = text.encode()
+    write_outputs(contents)
+    if json_path == STANDARD_OUTPUT:
         return
-    print_evaluation(terminal(), found)
+    console = terminal()
+    print_evaluation(console, found)
+    for path in contents:
+        console.print(f"Wrote    {path}", markup=False, style="bold", soft_wrap=True)
+
+
+def _name(source: Path) -> str:
+    """What a trajectory is called in a file name: ``flight_vio`` of ``flight.ulg:vio``."""
+    from px4fuse.loop.sources import split_part
+
+    path, part = split_part(str(source))
+    stem = os.fsencode(path.stem)[:MAX_NAME_BYTES].decode(errors="ignore")
+    return stem if part is None else f"{stem}_{part}"
+
+
+def _check_picture(picture: Path, results: Path | None) -> None:
+    if picture.suffix.lower() != ".png":
+        raise OutputError(
+            f"{picture}: the picture is a PNG. Give a name that ends in .png with --picture."
+        )
+    if results is not None and picture.resolve() == results.resolve():
+        raise OutputError(f"{picture}: --picture and --json name the same file. Give two names.")
+    spare_inputs([picture])

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
@@ -20,6 +18,7 @@ from px4fuse.report.loop_words import (
     redundancy_words,
     refusals,
     score_words,
+    track_words,
     unscored,
 )
 from px4fuse.report.terminal import print_finding, print_line
@@ -90,8 +89,8 @@ def _scores(score: Evaluation | Unavailable, over: list[Delta]) -> list[str]:
 
 def print_evaluation(console: Console, score: Evaluation) -> None:
     """Print the scores of one trajectory against another."""
-    print_line(console, "Estimate", _described(score.estimate), whole=True)
-    print_line(console, "Against", _described(score.reference), whole=True)
+    print_line(console, "Estimate", track_words(score.estimate), whole=True)
+    print_line(console, "Against", track_words(score.reference), whole=True)
     print_line(console, "How", score_words(score), whole=True)
     ate = score.ate
     table = _table("error", "RMSE", "95 %", "mean", "median", "max", "n")
@@ -150,13 +149,6 @@ def print_graph(console: Console, name: str, solved: SolvedGraph) -> None:
             "" if key == "all" else f"{(solution.weights < 0.5).sum()}",
         )
     console.print(table)
-
-
-def _described(trajectory: Any) -> str:
-    return (
-        f"{trajectory.name}: {trajectory.kind}, {len(trajectory)} poses over "
-        f"{trajectory.time_s[-1] - trajectory.time_s[0]:.1f} s, frame {trajectory.frame}"
-    )
 
 
 def _statistics(table: Table, label: str, values: Statistics, interval: str = "") -> None:

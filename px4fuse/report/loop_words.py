@@ -164,6 +164,14 @@ def moved_words(correction: Correction) -> str:
     return f"{np.sqrt(np.mean(correction.moved_m**2)):.2f} / {correction.moved_m.max():.2f}"
 
 
+def track_words(path: Trajectory) -> str:
+    """A trajectory by its name, what it is, its length in time and its frame."""
+    return (
+        f"{path.name}: {path.kind}, {len(path)} poses over "
+        f"{path.time_s[-1] - path.time_s[0]:.1f} s, frame {path.frame}"
+    )
+
+
 def score_words(score: Evaluation) -> str:
     """How a score was made, in one sentence."""
     matched = score.association
