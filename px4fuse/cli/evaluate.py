@@ -4,35 +4,39 @@ from __future__ import annotations
 
 import os
 import re
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from px4fuse.cli.inputs import (
-    NumberOrAuto,
     command_line,
     max_size_option,
     path_option,
     system_option,
 )
 from px4fuse.cli.outputs import (
+    free_report,
     progress,
     report_paths,
     spare_inputs,
     terminal,
     write_outputs,
 )
+from px4fuse.cli.quantity import Quantity
 from px4fuse.errors import OutputError, SettingsError
 from px4fuse.request import AUTO
 from px4fuse.writing import STANDARD_OUTPUT
 
 if TYPE_CHECKING:
+    from px4fuse.results.contract import EvaluationResults
     from px4fuse.trajectory.scores import Delta
 
+STEPS = ("reading", "scoring", "drawing the page", "drawing the picture")
 MAX_DELTA = 1e6
 # Of each of the two names in the default name of the report: with both it stays below 255
-MAX_NAME_BYTES = 100
+MAX_NAME_BYTES = 90
 _DELTA = re.compile(r"(\d+\.?\d*|\.\d+) ?(m|s|frames|f)")
 
 
@@ -87,7 +91,7 @@ class DeltaType(click.ParamType["Delta"]):
 )
 @click.option(
     "--time-offset",
-    type=NumberOrAuto(),
+    type=Quantity("s", auto=True),
     default=None,
     metavar="S|auto",
     help="Added to the estimate's stamps; auto finds it from the motion.  [default: auto where the "
@@ -153,16 +157,10 @@ def evaluate(
     for option, value in (("--max-gap", max_gap), ("--time-offset", time_offset)):
         if isinstance(value, float) and not abs(value) < float("inf"):
             raise SettingsError(f"{option} {value:g} is not a finite number.")
-    if output is None and json_path != STANDARD_OUTPUT:
-        output = Path("reports", f"{_name(estimate)}_against_{_name(reference)}.pdf")
-    beside = json_path
-    if output is not None:
-        output, beside = report_paths(output, json_path)
-        picture = picture or output.with_suffix(".png")
-    if picture is not None:
-        _check_picture(picture, beside)
+    alone = json_path == STANDARD_OUTPUT
+    _targets(output, picture, json_path)  # before the work, not after it
     contents: dict[Path, bytes] = {}
-    with progress(json_path == STANDARD_OUTPUT) as step:
+    with progress(alone, STEPS) as step:
         step("reading")
         first = read_source(str(estimate), system=system)
         second = read_source(str(reference), default="truth", system=system)
@@ -177,7 +175,11 @@ def evaluate(
             rpe_deltas=rpe or None,
             all_pairs=not consecutive,
         )
-        text = to_json(evaluation_results(found, command_line("evaluate", estimate, reference)))
+        results = evaluation_results(found, command_line("evaluate", estimate, reference))
+        text = to_json(results)
+        if output is not None or not alone:
+            output = output or _default(estimate, reference, results)
+        output, picture, beside = _targets(output, picture, json_path)
         if output is not None:
             from px4fuse.report.document import EvaluationDocument
             from px4fuse.report.pdf import render
@@ -193,12 +195,29 @@ def evaluate(
         if path is not None:
             contents[path] = text.encode()
     write_outputs(contents)
-    if json_path == STANDARD_OUTPUT:
+    if alone:
         return
+    from px4fuse.report.screen import print_file
+
     console = terminal()
     print_evaluation(console, found)
     for path in contents:
-        console.print(f"Wrote    {path}", markup=False, style="bold", soft_wrap=True)
+        print_file(console, "Wrote", path)
+
+
+def _default(estimate: Path, reference: Path, mine: EvaluationResults) -> Path:
+    """Where a page goes that was given no name: the two and the settings are in its name."""
+    from px4fuse.results.contract import EvaluationResults, Results
+
+    def is_same(old: Results) -> bool:
+        return isinstance(old, EvaluationResults) and (
+            (old.provenance.command, old.estimate.sha256, old.reference.sha256)
+            == (mine.provenance.command, mine.estimate.sha256, mine.reference.sha256)
+        )
+
+    given = " ".join(shlex.split(mine.provenance.command)[4:]).split("--")[1:]
+    settings = "".join(re.sub(r"[^\w.,+-]+", "-", f"_{part.strip()}") for part in given)
+    return free_report(f"{_name(estimate)}_against_{_name(reference)}", settings, is_same)
 
 
 def _name(source: Path) -> str:
@@ -210,7 +229,16 @@ def _name(source: Path) -> str:
     return stem if part is None else f"{stem}_{part}"
 
 
-def _check_picture(picture: Path, results: Path | None) -> None:
+def _targets(
+    output: Path | None, picture: Path | None, json_path: Path | None
+) -> tuple[Path | None, Path | None, Path | None]:
+    """Page, picture and results, the latter two beside the page unless they are named."""
+    results = None if json_path == STANDARD_OUTPUT else json_path
+    if output is not None:
+        output, results = report_paths(output, json_path)
+        picture = picture or output.with_suffix(".png")
+    if picture is None:
+        return output, picture, results
     if picture.suffix.lower() != ".png":
         raise OutputError(
             f"{picture}: the picture is a PNG. Give a name that ends in .png with --picture."
@@ -218,3 +246,4 @@ def _check_picture(picture: Path, results: Path | None) -> None:
     if results is not None and picture.resolve() == results.resolve():
         raise OutputError(f"{picture}: --picture and --json name the same file. Give two names.")
     spare_inputs([picture])
+    return output, picture, results

@@ -21,6 +21,7 @@ from px4fuse.errors import SettingsError
 from px4fuse.filter.consistency import Consistency, HorizontalNis, assess, assess_horizontal
 from px4fuse.filter.kalman import Replay, Settings, replay, state_at, variance_at
 from px4fuse.filter.signals import (
+    AISLE,
     Axis,
     Segment,
     choose_segment,
@@ -151,6 +152,11 @@ class Comparison:
     horizontal_ekf2: HorizontalNis | None
     notes: tuple[str, ...]
     missing: tuple[Unavailable, ...]
+
+    @property
+    def main(self) -> AxisComparison:
+        """The axis of the lab: the aisle, else the first."""
+        return next((axis for axis in self.axes if axis.axis.name == AISLE), self.axes[0])
 
 
 def compare(

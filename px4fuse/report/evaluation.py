@@ -55,7 +55,7 @@ from px4fuse.report.style import (
     wrap,
 )
 from px4fuse.trajectory.evaluation import Evaluation
-from px4fuse.trajectory.model import AXES_OF_FRAME, Frame
+from px4fuse.trajectory.model import AXES_OF_FRAME, MIN_POSES, Frame
 from px4fuse.trajectory.scores import Interval, RelativeError, Statistics
 
 # Indices of the axes that are right, up the page and vertical; and whether the last points down
@@ -428,6 +428,8 @@ def _from_zero(axes: Axes, along: Array, highest: float) -> None:
 
 def _gaps(time_s: Array, least_s: float = 0.0) -> IntArray:
     """Indices of the poses after a gap in time."""
+    if len(time_s) < MIN_POSES:
+        return np.empty(0, dtype=np.intp)
     steps = np.diff(time_s)
     found: IntArray = np.flatnonzero(steps > max(GAP_STEPS * np.median(steps), least_s)) + 1
     return found
