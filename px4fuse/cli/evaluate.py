@@ -125,8 +125,7 @@ class DeltaType(click.ParamType["Delta"]):
     "--json",
     "json_path",
     metavar="FILE",
-    help="The results; - prints them alone, and nothing else is written unless named.  [default: "
-    "beside the PDF]",
+    help="The results; - prints them alone on standard output.  [default: beside the PDF]",
 )
 def evaluate(
     estimate: Path,
@@ -146,7 +145,8 @@ def evaluate(
 
     Either is a trajectory file (TUM, EuRoC, ORB-SLAM3) or a part of a flight log: LOG:vio,
     LOG:ekf2, LOG:kf (our filter) or LOG:truth. Writes a page (PDF), a picture (PNG) and the results
-    (JSON).
+    (JSON); where -o, --picture or --json names a file, only what is named and what stands beside
+    the PDF.
     """
     from px4fuse.loop.sources import read_source
     from px4fuse.report.loop_terminal import print_evaluation
@@ -177,8 +177,8 @@ def evaluate(
         )
         results = evaluation_results(found, command_line("evaluate", estimate, reference))
         text = to_json(results)
-        if output is not None or not alone:
-            output = output or _default(estimate, reference, results)
+        if output is None and picture is None and json_path is None:
+            output = _default(estimate, reference, results)
         output, picture, beside = _targets(output, picture, json_path)
         if output is not None:
             from px4fuse.report.document import EvaluationDocument

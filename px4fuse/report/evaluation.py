@@ -284,7 +284,7 @@ def _path(axes: Axes, score: Evaluation, view: View, scale: Axes | None) -> None
     error, gaps = score.position_error_m, _gaps(score.time_s)
     at = np.unique(np.linspace(0, len(error) - 1, min(len(error), PIECES)).astype(np.intp))
     corners = view.of(score.estimate_m)[at]
-    before_gap = np.searchsorted(gaps, at)  # how many gaps come before each corner
+    before_gap = np.searchsorted(gaps, at, side="right")  # how many gaps come before each corner
     unbroken = np.diff(before_gap) == 0
     largest = np.maximum.reduceat(error, at[:-1])
     pieces = np.stack([corners[:-1], corners[1:]], axis=1)[unbroken]
