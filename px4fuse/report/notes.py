@@ -26,6 +26,7 @@ from px4fuse.report.style import (
     POINTS_PER_HEIGHT,
     POINTS_PER_WIDTH,
     RIGHT,
+    appendix,
     page,
     printable,
     text_width,
@@ -96,7 +97,7 @@ def draw(document: Document | LoopDocument) -> Iterator[Figure]:
     """Draw as many pages as the notes need; none without notes."""
     title = "Notes by the student"
     if isinstance(document, Document):
-        title = f"Appendix: {title[0].lower()}{title[1:]}"
+        title = appendix(title)
     rows = [
         row for block in read(document.student.notes)
         for row in (_lines(block) if isinstance(block, Line) else _rows(block))
@@ -162,9 +163,9 @@ def _rows(table: Table) -> Iterator[Row]:
 
 
 def read(notes: str) -> Iterator[Line | Table]:
-    """Markdown as lines and tables, in their order.
+    r"""Markdown as lines and tables, in their order.
 
-    >>> [line.text for line in read("# A *b*\\n\\n- $\\\\sigma_z^2$ is `R`\\n\\n![a map](m.png)")]
+    >>> [line.text for line in read("# A *b*\n\n- $\\sigma_z^2$ is `R`\n\n![a map](m.png)")]
     ['A b', 'σ_z² is R', '[picture: a map]']
     """
     markdown = MarkdownIt("commonmark", {"html": True}).enable(["table", "strikethrough"])

@@ -146,8 +146,8 @@ def _made_with(document: Document | LoopDocument) -> Section:
     )
 
 
-def _layout(title: str, sections: list[Section]) -> Iterator[Figure]:
-    figure, cursor = page(title)
+def _layout(heading: str, sections: list[Section]) -> Iterator[Figure]:
+    figure, cursor = page(heading)
     for title, entries in sections:
         if not entries:
             continue
@@ -161,7 +161,7 @@ def _layout(title: str, sections: list[Section]) -> Iterator[Figure]:
             )
             if cursor.y - height - (needed if position == 0 else 0.0) < BOTTOM:
                 yield figure
-                figure, cursor = page(f"{title}, continued")
+                figure, cursor = page(f"{heading}, continued")
             if position == 0:
                 cursor.write(title, size=9.5, weight="bold")
                 cursor.skip(1)

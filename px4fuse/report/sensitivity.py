@@ -97,7 +97,9 @@ def draw(document: Document) -> Iterator[Figure]:
     _gains(beside, ratio, curve)
     cursor.y = min(cursor.y, beside.y)
     cursor.skip(8)
-    window = _window(result, run.velocity_m_s[:, 0], [*document.events.gaps, *document.events.dropouts])
+    window = _window(
+        result, run.velocity_m_s[:, 0], [*document.events.gaps, *document.events.dropouts]
+    )
     for place, (title, pair) in enumerate(PAIRS):
         top = cursor.y
         axes = panel(cursor, title, _apart_words(run, pair), TRACK)
@@ -183,8 +185,8 @@ def _map_words(found: AxisTuning) -> str:
     lost = number_words(max(found.gain_nats * found.count, 0.0), 2)
     return (
         f"Asked for: SIGMA_A {_words(found.filter_sigma_a, 'm/s²')}, SIGMA_Z "
-        f"{_words(found.sigma_z, 'm')}. The chosen pair lies {lost} below (ln). Along a dotted line "
-        "the gain is the same."
+        f"{_words(found.sigma_z, 'm')}. The chosen pair lies {lost} below (ln). Along a dotted "
+        "line the gain is the same."
     )
 
 
@@ -204,7 +206,7 @@ def _point(noise: Noise) -> float:
 
 
 def _drop(document: Document, name: str, found: AxisTuning, a: Array, z: Array) -> Array:
-    """ln of how much less likely each pair is than the best of them, shape (n, m)."""
+    """Ln of how much less likely each pair is than the best of them, shape (n, m)."""
     comparison = document.comparison
     axes = [
         one.axis for one in comparison.axes
@@ -226,7 +228,7 @@ def _round_ticks(axes: Axes) -> None:
         ticks = steps[(low <= steps) & (steps <= high)]
         if len(ticks) > 6:
             ticks = ones[(low <= ones) & (ones <= high)]
-        axis.set_major_locator(FixedLocator(ticks))
+        axis.set_major_locator(FixedLocator(ticks.tolist()))
         axis.set_major_formatter(lambda value, _: number_words(value))
         axis.set_minor_locator(NullLocator())
         axis.set_minor_formatter(NullFormatter())
@@ -240,9 +242,7 @@ def _gains(cursor: Cursor, ratio: float, gains: Array) -> None:
         f"a quarter of SIGMA_Z; {gains[3]:.2f} with a quarter of SIGMA_A and {gains[4]:.2f} with "
         "four times SIGMA_Z: each square holds its circle."
     )
-    axes = panel(
-        cursor, "Gain of position, settled, over the ratio", say, MAP, left=MIDDLE + 0.04
-    )
+    axes = panel(cursor, "Gain of position, settled, over the ratio", say, MAP, left=MIDDLE + 0.04)
     axes.plot(ratio * CURVE, gains[len(SETTINGS) :], color=MUTED, lw=1.0)
     axes.plot(np.array(at)[[1, 3]], gains[[1, 3]], **OF_A, label="SIGMA_A × or / 4")
     axes.plot(np.array(at)[[2, 4]], gains[[2, 4]], **OF_Z, label="SIGMA_Z / or × 4")
@@ -250,7 +250,7 @@ def _gains(cursor: Cursor, ratio: float, gains: Array) -> None:
     axes.set_xscale("log")
     axes.set_xlim(ratio * CURVE[0], ratio * CURVE[-1])
     axes.set_ylim(0.0, 1.0)
-    axes.xaxis.set_major_locator(FixedLocator(ratio * CURVE[::4]))
+    axes.xaxis.set_major_locator(FixedLocator((ratio * CURVE[::4]).tolist()))
     axes.xaxis.set_major_formatter(lambda value, _: number_words(value, 2))
     axes.xaxis.set_minor_locator(NullLocator())
     axes.set_xlabel("SIGMA_A / SIGMA_Z (1/s²)")
@@ -278,16 +278,16 @@ def _apart_words(run: States, pair: tuple[int, int]) -> str:
     return f"{same} m/s RMS from one another, {moved:.3f} m/s from the chosen track.{why}"
 
 
-def _window(result: AxisComparison, velocity: Array, gaps: Sequence[Span]) -> Span:
-    """The stretch with the most motion, among those with the least silence of the source."""
+def _window(result: AxisComparison, velocity: Array, missing: Sequence[Span]) -> Span:
+    """The stretch with the most motion, among those in which the least is missing."""
     time = result.axis.measurement_time_s[-len(velocity) :]
     latest = max(time[-1] - WINDOW_S, time[0])
 
     def worth(start: float) -> tuple[float, float]:
         end = start + WINDOW_S
-        silent = sum(max(0.0, min(end, g_end) - max(start, g_start)) for g_start, g_end in gaps)
+        lost = sum(max(0.0, min(end, until) - max(start, since)) for since, until in missing)
         inside = velocity[(start <= time) & (time <= end)]
-        return -silent, float(np.ptp(inside)) if len(inside) else 0.0
+        return -lost, float(np.ptp(inside)) if len(inside) else 0.0
 
     best = max(np.arange(time[0], latest + 1e-9, WINDOW_STEP_S).tolist(), key=worth)
     return best, min(best + WINDOW_S, float(time[-1]))

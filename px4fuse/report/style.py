@@ -72,40 +72,43 @@ def report_style(outside: str = "") -> Iterator[None]:
     outside : str
         What comes from outside (names, notes), for fonts that have its characters.
     """
-    with _quiet(), mpl.rc_context(
-        {
-            "font.family": fonts.families(outside),
-            "font.size": 7.5,
-            "axes.titlesize": 8.5,
-            "axes.titlelocation": "left",
-            "axes.titlepad": 4,
-            "axes.titley": 1.0,  # fixed: placing titles automatically lays every axis out twice
-            "axes.labelsize": 7.5,
-            "axes.labelpad": 2,
-            "axes.linewidth": 0.6,
-            "axes.spines.top": False,
-            "axes.spines.right": False,
-            "axes.unicode_minus": True,
-            "axes.grid": True,
-            "axes.grid.axis": "y",
-            "grid.color": "#e3e3e3",
-            "grid.linewidth": 0.5,
-            "axes.axisbelow": True,
-            "xtick.labelsize": 7,
-            "ytick.labelsize": 7,
-            "xtick.major.width": 0.6,
-            "ytick.major.width": 0.6,
-            "xtick.major.size": 2.5,
-            "ytick.major.size": 2.5,
-            "legend.fontsize": 7,
-            "legend.frameon": False,
-            "legend.handlelength": 2.4,
-            "text.parse_math": False,
-            "pdf.fonttype": 42,
-            "pdf.compression": 6,
-            "path.simplify": True,
-            "path.simplify_threshold": 0.5,
-        }
+    with (
+        _quiet(),
+        mpl.rc_context(
+            {
+                "font.family": fonts.families(outside),
+                "font.size": 7.5,
+                "axes.titlesize": 8.5,
+                "axes.titlelocation": "left",
+                "axes.titlepad": 4,
+                "axes.titley": 1.0,  # fixed: placing titles automatically lays every axis out twice
+                "axes.labelsize": 7.5,
+                "axes.labelpad": 2,
+                "axes.linewidth": 0.6,
+                "axes.spines.top": False,
+                "axes.spines.right": False,
+                "axes.unicode_minus": True,
+                "axes.grid": True,
+                "axes.grid.axis": "y",
+                "grid.color": "#e3e3e3",
+                "grid.linewidth": 0.5,
+                "axes.axisbelow": True,
+                "xtick.labelsize": 7,
+                "ytick.labelsize": 7,
+                "xtick.major.width": 0.6,
+                "ytick.major.width": 0.6,
+                "xtick.major.size": 2.5,
+                "ytick.major.size": 2.5,
+                "legend.fontsize": 7,
+                "legend.frameon": False,
+                "legend.handlelength": 2.4,
+                "text.parse_math": False,
+                "pdf.fonttype": 42,
+                "pdf.compression": 6,
+                "path.simplify": True,
+                "path.simplify_threshold": 0.5,
+            }
+        ),
     ):
         yield
 
@@ -273,6 +276,15 @@ def page(title: str, lead: str = "") -> tuple[Figure, Cursor]:
         cursor.write(lead, size=8.0, colour=MUTED)
     cursor.skip(6)
     return figure, cursor
+
+
+def appendix(title: str) -> str:
+    """Title of a page that stands after the core.
+
+    >>> appendix("Notes by the student")
+    'Appendix: notes by the student'
+    """
+    return f"Appendix: {title[0].lower()}{title[1:]}"
 
 
 def panels(

@@ -114,7 +114,8 @@ def verdict_notes(comparison: Comparison) -> list[str]:
         )
     notes += _same_nis(stated)
     coloured = [
-        f"{owner} {axis} {p_words(statement.ljung_box_p)}, lag-1 {statement.lag1_autocorrelation:+.2f}"
+        f"{owner} {axis} {p_words(statement.ljung_box_p)}, lag-1 "
+        f"{statement.lag1_autocorrelation:+.2f}"
         for axis, owner, statement in stated
         if statement.verdict == "consistent" and statement.ljung_box_p < WHITE_P
     ]
