@@ -21,7 +21,7 @@ from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.kalman import state_at
 from px4fuse.findings.model import Detector, Finding, Found, Threshold
 from px4fuse.flight import Unavailable
-from px4fuse.plain import factor_words
+from px4fuse.plain import factor_words, number_words
 from px4fuse.trajectory.alignment import fit
 
 NEES_LARGE = Threshold(4.0, "times", "errors twice as large as σ; clean flights stay below 3")
@@ -31,14 +31,14 @@ SMALL = Threshold(0.5, "mean NIS", "innovations are 30 % smaller than claimed")
 FRAME_SHARE = Threshold(0.5, "of the error", "what is left is less than what turning took away")
 FILTERS = {"kf": "our filter", "ekf2": "EKF2"}
 REMEDIES = {
-    "drift": "Take no noise from these innovations: correct the drift at a loop (px4fuse loop), or "
-    "give the filter a second, absolute source.",
+    "drift": "Take no noise from these innovations: correct the drift at a loop (px4fuse loop "
+    "LOG), or give the filter a second, absolute source.",
     "frame": "Turn and shift the source's frame into that of the truth before you judge a filter "
     "by it, and take no noise from these innovations.",
     "ekf2": "Our filter errs less with the same source, so that it is EKF2's own: look at "
     "EKF2_EV_DELAY, at its heading, and at what else it fuses.",
-    "shared": "Look for an error that source and filter share: the clock (px4fuse sync), a source "
-    "that smooths its positions, its scale, the survey of the anchors.",
+    "shared": "Look for an error that source and filter share: the clock (px4fuse sync LOG), a "
+    "source that smooths its positions, its scale, the survey of the anchors.",
 }
 
 
@@ -94,7 +94,7 @@ def _detect(analysis: Analysis) -> Found:
         said.append(
             f"{name} claims σ {claimed:.2g} m along {one.result.axis.name} and errs by "
             f"{one.truth.position_rmse_m:.2f} m RMS (mean NEES {factor_words(one.nees)}, mean NIS "
-            f"{one.statement.nis_mean:.2g}; 1 is consistent)"
+            f"{number_words(one.statement.nis_mean, 2)}; 1 is consistent)"
         )
     small = worst.statement.nis_mean < SMALL.value
     words = "; ".join(said) + "."

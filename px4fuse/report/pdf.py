@@ -16,6 +16,7 @@ from px4fuse.report import (
     clock,
     consistency,
     cover,
+    evaluation,
     flight,
     innovations,
     loop,
@@ -26,11 +27,11 @@ from px4fuse.report import (
     whatif,
     why,
 )
-from px4fuse.report.document import Document, LoopDocument, WhatIfDocument
+from px4fuse.report.document import Document, EvaluationDocument, LoopDocument, WhatIfDocument
 from px4fuse.report.seal import sealed
 from px4fuse.report.style import LEFT, MUTED, RIGHT, printable, report_style, shorten
 
-Report = Document | LoopDocument | WhatIfDocument
+Report = Document | LoopDocument | WhatIfDocument | EvaluationDocument
 RESULTS_NAME = "results.json"
 PAGES = (
     cover.draw,
@@ -53,7 +54,7 @@ def render(document: Report, results_json: str) -> bytes:
 
     Parameters
     ----------
-    document : Document, LoopDocument or WhatIfDocument
+    document : Document, LoopDocument, WhatIfDocument or EvaluationDocument
     results_json : str
         Attached inside the PDF as ``results.json``, so that the PDF alone can be checked.
 
@@ -63,7 +64,7 @@ def render(document: Report, results_json: str) -> bytes:
         The same for the same input and the same versions: no dates, no random identifiers.
     """
     drawn = io.BytesIO()
-    with report_style():
+    with report_style(_outside(document)):
         figures = list(_pages(document))
         with PdfPages(
             drawn, metadata={"CreationDate": None, "Creator": None, "Producer": None}
@@ -75,12 +76,21 @@ def render(document: Report, results_json: str) -> bytes:
     return _attach(drawn.getvalue(), document, results_json)
 
 
+def _outside(document: Report) -> str:
+    """What is not px4fuse's own words."""
+    student = document.student
+    command = "" if isinstance(document, EvaluationDocument) else document.command
+    return "".join((document.title, student.name, student.id, student.notes, command))
+
+
 def _pages(document: Report) -> Iterator[Figure]:
     if isinstance(document, LoopDocument):
         for draw_loop in LOOP_PAGES:
             yield from draw_loop(document)
     elif isinstance(document, WhatIfDocument):
         yield from whatif.draw(document)
+    elif isinstance(document, EvaluationDocument):
+        yield from evaluation.draw(document)
     else:
         for draw in PAGES:
             yield from draw(document)
