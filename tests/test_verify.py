@@ -515,7 +515,7 @@ DRAWING: dict[str, Callable[[bytes], bytes]] = {
     "turned over": lambda c: b"-1 0 0 1 595 0 cm\n" + c,
     "nothing at all": lambda c: b"\n",
 }
-PAGES = 9
+PAGES = 8
 # Nobody who looks at the page sees these, or reads anything else from it (see pages.DISTANCE)
 UNSEEN = {"a comment", "an inline image", "the end cut off", "a point of a line moved",
           "another point of a line moved", "a colour"}  # fmt: skip
