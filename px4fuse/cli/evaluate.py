@@ -20,7 +20,6 @@ from px4fuse.cli.outputs import (
     free_report,
     progress,
     report_paths,
-    spare_inputs,
     terminal,
     write_outputs,
 )
@@ -245,5 +244,4 @@ def _targets(
         )
     if results is not None and picture.resolve() == results.resolve():
         raise OutputError(f"{picture}: --picture and --json name the same file. Give two names.")
-    spare_inputs([picture])
     return output, picture, results
