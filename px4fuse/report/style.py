@@ -104,6 +104,7 @@ def report_style(outside: str = "") -> Iterator[None]:
                 "legend.handlelength": 2.4,
                 "text.parse_math": False,
                 "pdf.fonttype": 42,
+                "ps.fonttype": 42,  # by which the PDF too is cut: one file per font, not two
                 "pdf.compression": 6,
                 "path.simplify": True,
                 "path.simplify_threshold": 0.5,
