@@ -500,12 +500,12 @@ DRAWING: dict[str, Callable[[bytes], bytes]] = {
     "another point of a line moved": once(rb"([\d.]+) ([\d.]+) l", aside, last=False),
     "a line more": lambda c: c + b"\n0 g\n300 0 1 842 re\nf\n",
     "a white rectangle": lambda c: c + b"\n1 g\n100 690 300 90 re\nf\n",
-    "a text more": lambda c: c + b"\nBT\n/F2 12 Tf\n100 100 Td\n(\x00A) Tj\nET\n",
+    "a text more": lambda c: c + b"\nBT\n/F1 12 Tf\n100 100 Td\n(\x00A) Tj\nET\n",
     "a text moved": once(rb"1 0 -?0 1 ([\d.]+) ([\d.]+) cm\nBT", rb"1 0 -0 1 9\1 \2 cm\nBT"),
     "a text invisible": once(rb"BT\n", b"BT\n3 Tr\n"),
     "a text white": once(rb"BT\n", b"1 g\nBT\n"),
     "a text larger": once(rb"(/F\d+) [\d.]+ Tf", rb"\1 14 Tf"),
-    "another font": once(rb"/F2 ", b"/F3 "),
+    "another font": once(rb"/F1 ", b"/F2 "),
     "a colour": once(rb"[\d.]+ g\n", b"0.123 g\n"),
     "the end cut off": lambda c: c[: c.rindex(b"\nQ")],
     "a comment": lambda c: c + b"\n% nothing\n",
@@ -578,7 +578,7 @@ def font_part(name: str, path: list[str]) -> Callable[[Base], int]:
 
 def exchanged_glyphs(one: Base) -> Anatomy:
     """A font that draws a 9 where the text has a 1: all texts stay, the page reads otherwise."""
-    number = font_part("/F2", ["/DescendantFonts", "0", "/CIDToGIDMap"])(one)
+    number = font_part("/F1", ["/DescendantFonts", "0", "/CIDToGIDMap"])(one)
 
     def change(content: bytes) -> bytes:
         glyphs = bytearray(content)
@@ -593,8 +593,8 @@ def redrawn_glyph(one: Base) -> Anatomy:
     """A font whose outlines were edited."""
     from fontTools.ttLib import TTFont  # type: ignore[import-untyped]
 
-    number = font_part("/F2", ["/DescendantFonts", "0", "/FontDescriptor", "/FontFile2"])(one)
-    glyphs = font_part("/F2", ["/DescendantFonts", "0", "/CIDToGIDMap"])(one)
+    number = font_part("/F1", ["/DescendantFonts", "0", "/FontDescriptor", "/FontFile2"])(one)
+    glyphs = font_part("/F1", ["/DescendantFonts", "0", "/CIDToGIDMap"])(one)
     stream: Any = PdfReader(io.BytesIO(one.pdf)).get_object(glyphs)
     data = stream.get_data()
 
@@ -611,12 +611,12 @@ def redrawn_glyph(one: Base) -> Anatomy:
 
 
 def narrower_letters(one: Base) -> Anatomy:
-    number = font_part("/F2", ["/DescendantFonts", "0", "/W"])(one)
+    number = font_part("/F1", ["/DescendantFonts", "0", "/W"])(one)
     return one.anatomy.edited(number, lambda c: c.replace(b"636", b"036"))
 
 
 def rewritten_texts(one: Base) -> Anatomy:
-    number = font_part("/F2", ["/ToUnicode"])(one)
+    number = font_part("/F1", ["/ToUnicode"])(one)
     return one.anatomy.streamed(number, lambda c: c.replace(b"<0031>]", b"<0039>]").replace(
         b"<0031> <0032>", b"<0039> <0032>"))  # fmt: skip
 
