@@ -35,6 +35,7 @@ from px4fuse.report.style import (
     below,
     empty,
     legend_beside_title,
+    level,
     page,
     panel,
     thin,
@@ -95,10 +96,9 @@ def draw(document: Document) -> Iterator[Figure]:
     run = states(preintegrate(result.axis, settings), *(chosen[:, None] * factors))
     curve = _settled(run.gain)
     beside = Cursor(figure, cursor.y)
-    _map(cursor, document)
-    _gains(beside, ratio, curve)
+    level((_map(cursor, document), _gains(beside, ratio, curve)))
     cursor.y = min(cursor.y, beside.y)
-    cursor.skip(8)
+    cursor.skip(60)
     window = _window(
         result, run.velocity_m_s[:, 0], [*document.events.gaps, *document.events.dropouts]
     )
@@ -125,7 +125,7 @@ def draw(document: Document) -> Iterator[Figure]:
     yield figure
 
 
-def _map(cursor: Cursor, document: Document) -> None:
+def _map(cursor: Cursor, document: Document) -> Axes:
     """Likelihood of every pair, with the lines on which the gain is the same."""
     tuning, settings = document.analysis.tuning, document.comparison.settings
     main = document.comparison.main.axis.name
@@ -133,8 +133,9 @@ def _map(cursor: Cursor, document: Document) -> None:
     found = tuning[name]
     title = f"How likely the innovations are ({name})"
     if isinstance(found, Unavailable):
-        empty(panel(cursor, title, "", MAP, right=MIDDLE - 0.03), f"No map: {found.reason}.")
-        return
+        axes = panel(cursor, title, "", MAP, right=MIDDLE - 0.03)
+        empty(axes, f"No map: {found.reason}.")
+        return axes
     axes = panel(cursor, title, _map_words(found), MAP, right=MIDDLE - 0.03)
     best = _point(found.filter_sigma_a), _point(found.sigma_z)
     grids, shown = [], []
@@ -179,12 +180,13 @@ def _map(cursor: Cursor, document: Document) -> None:
         handles=[*shades, *axes.get_legend_handles_labels()[0]], loc="upper left", ncols=4,
         bbox_to_anchor=(-0.1, -0.2), borderaxespad=0.0, handlelength=1.2, columnspacing=1.0,
     )  # fmt: skip
-    cursor.skip(52)
+    return axes
 
 
 def _map_words(found: AxisTuning) -> str:
     lost = number_words(max(found.gain_nats * found.count, 0.0), 2)
-    wander = " What the source wanders is not in them." if found.noises.walk_m else ""
+    wanders = found.noises.walk_m > found.noises.sigma_z_m
+    wander = " What the source wanders is not in them." if wanders else ""
     return (
         f"Asked for: SIGMA_A {_words(found.filter_sigma_a, 'm/s²')}, SIGMA_Z "
         f"{_words(found.sigma_z, 'm')}. The chosen pair lies {lost} below (ln). Along a dotted "
@@ -236,7 +238,7 @@ def _round_ticks(axes: Axes) -> None:
         axis.set_minor_formatter(NullFormatter())
 
 
-def _gains(cursor: Cursor, ratio: float, gains: Array) -> None:
+def _gains(cursor: Cursor, ratio: float, gains: Array) -> Axes:
     """Settled gain over the ratio: a curve, on which both knobs stand."""
     at = [ratio * a / z for _, a, z in SETTINGS]
     say = (
@@ -258,7 +260,7 @@ def _gains(cursor: Cursor, ratio: float, gains: Array) -> None:
     axes.set_xlabel("SIGMA_A / SIGMA_Z (1/s²)")
     axes.legend(loc="upper left", ncols=3, bbox_to_anchor=(-0.08, -0.2), borderaxespad=0.0,
                 handlelength=1.0, columnspacing=1.0)  # fmt: skip
-    cursor.skip(40)
+    return axes
 
 
 def _settled(values: Array) -> Array:

@@ -342,6 +342,15 @@ def panel(
     return axes
 
 
+def level(beside: Sequence[Axes]) -> float:
+    """Move axes that stand beside one another to the lowest of them; returns how low that is."""
+    lowest = min(float(axes.get_position().y0) for axes in beside)
+    for axes in beside:
+        box = axes.get_position()
+        axes.set_position((box.x0, lowest, box.width, box.height))
+    return lowest
+
+
 def legend_beside_title(axes: Axes, top: float, **options: Any) -> None:
     """Legend of a panel on the line of its title, at the right, where nothing lies beneath.
 
