@@ -20,8 +20,8 @@ from test_cli import run_main
 
 import px4fuse.report.pdf
 from px4fuse.analysis import run as analyse
-from px4fuse.analysis import run_loop, run_what_if
-from px4fuse.cli import cli, compare, loop, whatif
+from px4fuse.analysis import run_comparison, run_loop, run_what_if, tuned
+from px4fuse.cli import cli, compare, loop, tune, whatif
 from px4fuse.cli.outputs import default_report, progress, terminal
 from px4fuse.cli.quantity import NAMES, in_unit
 from px4fuse.findings import find
@@ -405,11 +405,15 @@ def test_names_of_reports_are_names_of_files() -> None:
 
 def test_every_step_of_the_bar_is_said_in_its_order(sample_log) -> None:
     slam = sample_log.parent / "loop_vio.ulg"
-    told: dict[str, list[str]] = {"compare": [], "whatif": [], "loop": []}
+    told: dict[str, list[str]] = {"compare": [], "tune": [], "whatif": [], "loop": []}
     analyse(ComparisonRequest(log=str(sample_log)), told["compare"].append)
+    tuned(
+        run_comparison(ComparisonRequest(log=str(sample_log)), told["tune"].append),
+        progress=told["tune"].append,
+    )
     run_what_if(WhatIfRequest(log=str(sample_log)), told["whatif"].append)
     run_loop(LoopRequest(source=str(slam)), told["loop"].append)
-    for name, module in (("compare", compare), ("whatif", whatif), ("loop", loop)):
+    for name, module in (("compare", compare), ("tune", tune), ("whatif", whatif), ("loop", loop)):
         steps = [step for step in module.STEPS if step != "drawing"]  # said by the command itself
         at = [next(i for i, what in enumerate(told[name]) if what.startswith(s)) for s in steps]
         assert at == sorted(at), name
@@ -428,7 +432,7 @@ def test_the_bar_shows_what_remains_on_a_terminal_only(monkeypatch, capsys) -> N
         step("reading again")
     shown = capsys.readouterr().err
     assert "reading again" in shown
-    assert "1 of 2" in shown
+    assert "step 2 of 2" in shown
     with progress(quiet=True, steps=("reading",)) as step:
         step("reading x")
     assert capsys.readouterr().err == ""

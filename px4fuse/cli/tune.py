@@ -27,6 +27,11 @@ if TYPE_CHECKING:
     from px4fuse.flight import Unavailable
     from px4fuse.request import ComparisonRequest
 
+STEPS = (
+    "reading", "filtering",
+    *(f"tuning {name}" for name in ("north", "east", "down", "aisle", "horizontal")),
+)  # fmt: skip
+
 
 @click.command()
 @click.argument("log", type=click.Path(path_type=Path))
@@ -44,7 +49,7 @@ def tune(log: Path, json_path: Path | None, **given: Any) -> None:
     from px4fuse.results.build import tuning_results
 
     request = comparison_request(log, given)
-    with progress(json_path == STANDARD_OUTPUT, ("reading", "filtering", "tuning")) as step:
+    with progress(json_path == STANDARD_OUTPUT, STEPS) as step:
         compared = run_comparison(request, step)
         tuned = tuned_noises(compared, progress=step)
     if write_json(
