@@ -15,13 +15,13 @@ from px4fuse.report import (
     consistency,
     cover,
     evaluation,
+    flight,
     innovations,
     loop,
     notes,
+    other_axes,
     provenance,
     sensitivity,
-    tracks,
-    variances,
     whatif,
     why,
 )
@@ -33,13 +33,13 @@ Report = Document | LoopDocument | WhatIfDocument | EvaluationDocument
 RESULTS_NAME = "results.json"
 PAGES = (
     cover.draw,
-    tracks.draw,
+    flight.draw,
     innovations.draw,
-    variances.draw,
+    why.draw,
+    other_axes.draw,
     consistency.draw,
     sensitivity.draw,
     clock.draw,
-    why.draw,
     loop.draw,
     notes.draw,
     provenance.draw,
@@ -62,7 +62,7 @@ def render(document: Report, results_json: str) -> bytes:
         The same for the same input and the same versions: no dates, no random identifiers.
     """
     drawn = io.BytesIO()
-    with report_style():
+    with report_style(_outside(document)):
         figures = list(_pages(document))
         with PdfPages(
             drawn, metadata={"CreationDate": None, "Creator": None, "Producer": None}
@@ -71,6 +71,13 @@ def render(document: Report, results_json: str) -> bytes:
                 _running_lines(figure, document, number, len(figures))
                 pdf.savefig(figure)
     return _attach(drawn.getvalue(), document, results_json)
+
+
+def _outside(document: Report) -> str:
+    """What is not px4fuse's own words."""
+    student = document.student
+    command = "" if isinstance(document, EvaluationDocument) else document.command
+    return "".join((document.title, student.name, student.id, student.notes, command))
 
 
 def _pages(document: Report) -> Iterator[Figure]:

@@ -6,8 +6,10 @@ in grey. Text from outside (names, notes) is drawn as it is: no mathematics, no 
 
 from __future__ import annotations
 
+import logging
 import textwrap
-from collections.abc import Iterator, Sequence
+import unicodedata
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
@@ -22,11 +24,15 @@ from matplotlib.ft2font import LoadFlags
 from matplotlib.ticker import MaxNLocator
 
 from px4fuse.arrays import Array
+from px4fuse.report import fonts
 
 A4_INCHES = (8.27, 11.69)
 LEFT, RIGHT, TOP, BOTTOM = 0.085, 0.945, 0.95, 0.05
+PANEL_LEFT = LEFT + 0.04  # of axes: the numbers beside them stand in between
 POINTS_PER_WIDTH = A4_INCHES[0] * 72.0
 POINTS_PER_HEIGHT = A4_INCHES[1] * 72.0
+
+TIME_LABEL = "time since first data (s)"
 
 OURS = "#123f7a"
 OURS_BAND = "#b9cbe4"
@@ -42,17 +48,15 @@ OURS_LINE: dict[str, Any] = {"color": OURS, "lw": 1.0, "ls": "-"}
 EKF2_LINE: dict[str, Any] = {"color": EKF2, "lw": 1.1, "ls": (0, (4, 1.6))}
 TRUTH_LINE: dict[str, Any] = {"color": TRUTH, "lw": 0.7, "ls": (0, (1, 1.5))}
 OURS_DOTS: dict[str, Any] = {"color": OURS, "marker": "o", "ms": 2.0, "mew": 0, "ls": "none"}
-EKF2_DOTS: dict[str, Any] = {
-    "color": EKF2, "marker": "s", "ms": 2.8, "mew": 0.6, "mfc": "none", "ls": "none",
+EKF2_DOTS: dict[str, Any] = {"color": EKF2, "marker": "s", "ms": 2.2, "mew": 0, "ls": "none"}
+# What EKF2 did not fuse is hollow everywhere
+EKF2_REJECTED: dict[str, Any] = {
+    "color": EKF2, "marker": "s", "ms": 2.8, "mew": 0.6, "mfc": "white", "ls": "none",
+}  # fmt: skip
+MEASURED: dict[str, Any] = {
+    "color": MEASUREMENT, "marker": ".", "ms": 1.8, "mew": 0, "ls": "none",
 }  # fmt: skip
 
-# The first is matplotlib's own and always there; the others serve scripts that it lacks.
-FONTS = (
-    "DejaVu Sans", "Noto Sans", "Noto Sans Thai", "Leelawadee UI", "Thonburi", "Noto Sans CJK SC",
-    "Noto Sans CJK JP", "WenQuanYi Zen Hei", "Microsoft YaHei", "PingFang SC", "Hiragino Sans GB",
-    "Malgun Gothic", "Noto Sans Arabic", "Noto Sans Devanagari", "Segoe UI", "Arial Unicode MS",
-)  # fmt: skip
-NO_GLYPH = "\N{WHITE SQUARE}"
 # What the eye can see across a page, and across a third of it: longer series are thinned to their
 # extremes per bucket.
 MAX_POINTS = 1500
@@ -60,50 +64,65 @@ MAX_POINTS_NARROW = 500
 
 
 @contextmanager
-def report_style() -> Iterator[None]:
-    """Matplotlib settings of the report, for the duration of a block."""
-    with mpl.rc_context(
-        {
-            "font.family": list(_available_fonts()),
-            "font.size": 7.5,
-            "axes.titlesize": 8.5,
-            "axes.titlelocation": "left",
-            "axes.titlepad": 4,
-            "axes.titley": 1.0,  # fixed: placing titles automatically lays every axis out twice
-            "axes.labelsize": 7.5,
-            "axes.labelpad": 2,
-            "axes.linewidth": 0.6,
-            "axes.spines.top": False,
-            "axes.spines.right": False,
-            "axes.unicode_minus": True,
-            "axes.grid": True,
-            "axes.grid.axis": "y",
-            "grid.color": "#e3e3e3",
-            "grid.linewidth": 0.5,
-            "axes.axisbelow": True,
-            "xtick.labelsize": 7,
-            "ytick.labelsize": 7,
-            "xtick.major.width": 0.6,
-            "ytick.major.width": 0.6,
-            "xtick.major.size": 2.5,
-            "ytick.major.size": 2.5,
-            "legend.fontsize": 7,
-            "legend.frameon": False,
-            "legend.handlelength": 2.4,
-            "text.parse_math": False,
-            "pdf.fonttype": 42,
-            "pdf.compression": 6,
-            "path.simplify": True,
-            "path.simplify_threshold": 0.5,
-        }
+def report_style(outside: str = "") -> Iterator[None]:
+    """Matplotlib settings of the report, for the duration of a block.
+
+    Parameters
+    ----------
+    outside : str
+        What comes from outside (names, notes), for fonts that have its characters.
+    """
+    with (
+        _quiet(),
+        mpl.rc_context(
+            {
+                "font.family": fonts.families(outside),
+                "font.size": 7.5,
+                "axes.titlesize": 8.5,
+                "axes.titlelocation": "left",
+                "axes.titlepad": 4,
+                "axes.titley": 1.0,  # fixed: placing titles automatically lays every axis out twice
+                "axes.labelsize": 7.5,
+                "axes.labelpad": 2,
+                "axes.linewidth": 0.6,
+                "axes.spines.top": False,
+                "axes.spines.right": False,
+                "axes.unicode_minus": True,
+                "axes.grid": True,
+                "axes.grid.axis": "y",
+                "grid.color": "#e3e3e3",
+                "grid.linewidth": 0.5,
+                "axes.axisbelow": True,
+                "xtick.labelsize": 7,
+                "ytick.labelsize": 7,
+                "xtick.major.width": 0.6,
+                "ytick.major.width": 0.6,
+                "xtick.major.size": 2.5,
+                "ytick.major.size": 2.5,
+                "legend.fontsize": 7,
+                "legend.frameon": False,
+                "legend.handlelength": 2.4,
+                "text.parse_math": False,
+                "pdf.fonttype": 42,
+                "pdf.compression": 6,
+                "path.simplify": True,
+                "path.simplify_threshold": 0.5,
+            }
+        ),
     ):
         yield
 
 
-@cache
-def _available_fonts() -> tuple[str, ...]:
-    installed = {entry.name for entry in font_manager.fontManager.ttflist}
-    return tuple(name for name in FONTS if name in installed)
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Without matplotlib's remarks that a font has no regular weight."""
+    logger = logging.getLogger(font_manager.__name__)
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        logger.setLevel(level)
 
 
 @cache
@@ -119,39 +138,24 @@ def printable(text: str) -> str:
         if character in "\n" or (character.isprintable() and _has_glyph(character)):
             drawn.append(character)
         elif character.isprintable():
-            drawn.append(NO_GLYPH)
+            drawn.append(fonts.NO_GLYPH)
     return "".join(drawn)
 
 
-def lacks_glyphs(text: str) -> bool:
-    """Whether a part of a text can only be drawn as white squares here."""
-    return NO_GLYPH in printable(text.replace(NO_GLYPH, ""))
-
-
-@cache
 def _has_glyph(character: str) -> bool:
-    code = ord(character)
-    return any(_font(name, "normal").get_char_index(code) for name in _available_fonts())
+    return fonts.font_of(character) in mpl.rcParams["font.family"]
 
 
 @cache
 def text_width(text: str, size: float, weight: str = "normal") -> float:
-    """Width of a line of text in points, kerning and all fonts but the first left out."""
-    font = _font(FONTS[0], weight)
-    font.set_size(size, 72.0)
-    width = 0.0
-    for character in text:
-        if font.get_char_index(ord(character)):
-            width += _advance(character, weight) * size
-        else:
-            width += 1.05 * size  # wide scripts: an em and a little
-    return width
+    """Width of a line of text in points, kerning and shaping left out."""
+    return size * sum(_advance(character, weight) for character in text)
 
 
 @cache
 def _advance(character: str, weight: str) -> float:
     """Advance of one character in em."""
-    font = _font(FONTS[0], weight)
+    font = _font(fonts.font_of(character) or fonts.FONT, weight)
     font.set_size(100.0, 72.0)
     return (
         float(font.load_char(ord(character), flags=LoadFlags.NO_HINTING).linearHoriAdvance)
@@ -164,13 +168,13 @@ def wrap(text: str, size: float, width_points: float, weight: str = "normal") ->
     """Break text into lines that fit; a word longer than a line is broken too."""
     lines: list[str] = []
     for paragraph in text.split("\n"):
-        line = ""
-        for word in paragraph.split(" "):
-            candidate = f"{line} {word}" if line else word
+        line = " " * (len(paragraph) - len(paragraph.lstrip(" ")))
+        for word in paragraph.lstrip(" ").split(" "):
+            candidate = f"{line} {word}" if line.strip() else line + word
             if text_width(candidate, size, weight) <= width_points:
                 line = candidate
                 continue
-            if line:
+            if line.strip():
                 lines.append(line)
             line = word
             while (fitting := _fitting(line, size, width_points, weight)) < len(line):
@@ -193,7 +197,7 @@ def _fitting(text: str, size: float, width_points: float, weight: str) -> int:
     width = 0.0
     for count, character in enumerate(text):
         width += text_width(character, size, weight)
-        if width > width_points:
+        if width > width_points and not unicodedata.category(character).startswith("M"):
             return max(count, 1)
     return len(text)
 
@@ -220,6 +224,28 @@ class Cursor:
         for line in wrap(printable(text), size, (right - x) * POINTS_PER_WIDTH, weight):
             self.y -= size * spacing / POINTS_PER_HEIGHT
             self.figure.text(x, self.y, line, size=size, weight=weight, color=colour, va="baseline")
+
+    def columns(
+        self, columns: Mapping[float, tuple[str, Sequence[str]]], *, size: float = 7.6
+    ) -> None:
+        """Write a table and move below it.
+
+        Parameters
+        ----------
+        columns : mapping from float to (str, sequence of str)
+            Left edge (fraction of the page) to head and cells.
+        """
+        count = max(len(cells) for _, cells in columns.values())
+        self.skip(size * 1.35)
+        for x, (head, cells) in columns.items():
+            self.figure.text(x, self.y, printable(head), size=size, color=MUTED)
+            for number, cell in enumerate(cells, start=1):
+                if cell:
+                    y = self.y - (3.0 + number * size * 1.4) / POINTS_PER_HEIGHT
+                    self.figure.text(x, y, printable(cell), size=size)
+        self.skip(3.0)
+        self.rule()
+        self.skip(count * size * 1.4)
 
     def height(
         self, text: str, *, size: float = 8.0, weight: str = "normal", x: float = LEFT,
@@ -252,6 +278,15 @@ def page(title: str, lead: str = "") -> tuple[Figure, Cursor]:
     return figure, cursor
 
 
+def appendix(title: str) -> str:
+    """Title of a page that stands after the core.
+
+    >>> appendix("Notes by the student")
+    'Appendix: notes by the student'
+    """
+    return f"Appendix: {title[0].lower()}{title[1:]}"
+
+
 def panels(
     figure: Figure,
     top: float,
@@ -280,6 +315,57 @@ def panels(
             if row is not axes[-1]:
                 single.tick_params(axis="x", labelbottom=False, bottom=False)
     return axes
+
+
+def panel(
+    cursor: Cursor, title: str, say: str, height_points: float, *, left: float = PANEL_LEFT,
+    right: float = RIGHT, above: float = 4.0,
+) -> Axes:  # fmt: skip
+    """Axes below their title and the sentence that says what to see; the cursor moves below them.
+
+    Parameters
+    ----------
+    height_points : float
+        Of the axes alone.
+    above : float
+        Points between the sentence and the axes.
+    """
+    cursor.write(title, size=9.0, weight="bold", x=left - PANEL_LEFT + LEFT, right=right)
+    cursor.write(say, size=8.0, x=left - PANEL_LEFT + LEFT, right=right)
+    cursor.skip(above)
+    height = height_points / POINTS_PER_HEIGHT
+    cursor.y -= height
+    axes = cursor.figure.add_axes((left, cursor.y, right - left, height))
+    axes.xaxis.set_major_locator(MaxNLocator(8))
+    axes.yaxis.set_major_locator(MaxNLocator(4))
+    return axes
+
+
+def legend_beside_title(axes: Axes, top: float, **options: Any) -> None:
+    """Legend of a panel on the line of its title, at the right, where nothing lies beneath.
+
+    Parameters
+    ----------
+    top : float
+        Where the cursor stood before the panel.
+    """
+    figure, right = axes.figure, axes.get_position().x1
+    axes.legend(
+        loc="lower right", bbox_to_anchor=(right, top - 12.5 / POINTS_PER_HEIGHT), ncols=9,
+        bbox_transform=figure.transFigure, borderaxespad=0.0, borderpad=0.0, columnspacing=1.2,
+        **options,
+    )  # fmt: skip
+
+
+def bare_x(axes: Axes) -> None:
+    """Leave out the numbers of an x axis that another below it shows."""
+    axes.tick_params(axis="x", labelbottom=False)
+
+
+def below(cursor: Cursor, text: str, *, size: float = 7.0, points: float = 1.0) -> None:
+    """Write numbers under an axes of the page's width."""
+    cursor.skip(points)
+    cursor.write(text, size=size, colour=MUTED, spacing=1.25)
 
 
 def caption(axes: Axes, text: str, *, size: float = 7.0) -> None:
