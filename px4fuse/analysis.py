@@ -200,7 +200,7 @@ def read_flight(request: ComparisonRequest, progress: Progress = _silent) -> Fli
         other = read_log(Path(request.mavlink), system=request.system)
         if not other.log.format.startswith("MAVLink"):
             raise LogError(
-                f"--mavlink {other.log.name}: this is a {other.log.format}, not a MAVLink "
+                f"`mavlink` {other.log.name}: this is a {other.log.format}, not a MAVLink "
                 "recording. Give the ULog first: px4fuse compare LOG.ulg --mavlink LOG.tlog."
             )
         flight = placing.join(flight, other)
@@ -244,12 +244,12 @@ def run_comparison(request: ComparisonRequest, progress: Progress = _silent) -> 
         clock_offset_s=asked if isinstance(asked, float) and request.position is None else 0.0,
     )
     for name, value in (
-        ("--start", request.start_s),
-        ("--end", request.end_s),
-        ("--clock-offset", asked),
+        ("start_s", request.start_s),
+        ("end_s", request.end_s),
+        ("clock_offset_s", asked),
     ):
         if isinstance(value, float) and not abs(value) < float("inf"):
-            raise SettingsError(f"{name} {value:g} is not a finite number.")
+            raise SettingsError(f"`{name}` {value:g} is not a finite number.")
     flight = read_flight(request, progress)
 
     def compared(settings: Settings) -> Comparison:
@@ -271,8 +271,8 @@ def run_comparison(request: ComparisonRequest, progress: Progress = _silent) -> 
     found = clock_offset(comparison, tuned_horizontally(comparison), progress)
     if isinstance(found, Unavailable) or not found.determinable:
         raise MissingDataError(
-            f"{flight.log.name}: --clock-offset auto: not determinable: {found.reason}. "
-            "Give the seconds to add, or leave the option out."
+            f"{flight.log.name}: `clock_offset_s` auto: not determinable: {found.reason}. "
+            "Give the seconds to add, or leave it out."
         )
     return compared(replace(settings, clock_offset_s=found.offset_s))
 
@@ -285,15 +285,15 @@ def run_loop(request: LoopRequest, progress: Progress = _silent) -> Loop:
     TrajectoryError, LogError, MissingDataError, SettingsError
         A file cannot be read or lacks what was asked for, or a setting is out of range.
     """
-    for name, value in (("--from", request.start_s), ("--to", request.end_s)):
+    for name, value in (("start_s", request.start_s), ("end_s", request.end_s)):
         if value is not None and not abs(value) < float("inf"):
-            raise SettingsError(f"{name} {value:g} is not a finite number.")
+            raise SettingsError(f"`{name}` {value:g} is not a finite number.")
     progress(f"reading {shown(Path(request.source))}")
     source = read_source(request.source, frame=request.frame, system=request.system)
     if request.frame is not None and source.flight is not None:
         raise SettingsError(
-            f"--frame {request.frame.lower()} is for trajectory files; {source.flight.log.name} is "
-            "a flight log, which states its frame. Leave --frame out."
+            f"`frame` {request.frame.lower()} is for trajectory files; {source.flight.log.name} is "
+            "a flight log, which states its frame. Leave `frame` out."
         )
     reference = None
     if request.reference is not None:
@@ -377,7 +377,7 @@ def run_what_if(request: WhatIfRequest, progress: Progress = _silent) -> Counter
                     "noise, and the delay is as the data ask for or not determinable"
                 )
             raise MissingDataError(
-                f"{flight.log.name}: {why}. Say what to change: --set EKF2_EVP_NOISE=0.1."
+                f"{flight.log.name}: {why}. Say what to change: `changes` EKF2_EVP_NOISE=0.1."
             )
     settings = [changes] if changes else []
     if swept is not None:

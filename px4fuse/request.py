@@ -6,8 +6,9 @@ can be made again without its command line.
 
 from __future__ import annotations
 
+import re
 import shlex
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import PurePath
 from typing import Annotated, Any, Literal
 
@@ -266,6 +267,26 @@ LOOP_OPTIONS = {
     "heading_drift_deg": "--heading-drift",
     "key_frames_m": "--key-frames",
 }
+
+# What the errors of a command may name: its arguments in Python, to its options
+ARGUMENTS = OPTIONS | {"position": "--position", "changes": "--set"}
+LOOP_ARGUMENTS = LOOP_OPTIONS | {"came_back": "--open"}
+EVALUATION_ARGUMENTS = {
+    "alignment": "--alignment",
+    "max_gap_s": "--max-gap",
+    "time_offset_s": "--time-offset",
+    "rpe_deltas": "--rpe",
+    "system": "--system",
+}
+
+
+def with_options(text: str, options: Mapping[str, str] = ARGUMENTS) -> str:
+    """The text of an error with options in the place of the arguments that it names.
+
+    >>> with_options("`sigma_z_m` 0 is out of range: give 0.0001 to 100 m.")
+    '--sigma-z 0 is out of range: give 0.0001 to 100 m.'
+    """
+    return re.sub(r"`(\w+)`", lambda name: options.get(name[1], name[0]), text)
 
 
 def command_line(request: Request, command: str | None = None) -> str:

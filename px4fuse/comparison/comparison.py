@@ -207,7 +207,7 @@ def compare(
     acceleration = lines[0].acceleration
     if settings.input == "imu" and isinstance(acceleration, Unavailable):
         if input_required:
-            raise SettingsError(f"{flight.log.name}: --input imu: {acceleration}")
+            raise SettingsError(f"{flight.log.name}: `input` imu: {acceleration}")
         settings = replace(settings, input="zero")
         notes.append(f"no acceleration input ({acceleration.reason}): constant velocity was used")
         if acceleration not in missing:

@@ -150,12 +150,12 @@ def _no_source(flight: Flight) -> str:
         return (
             f"{flight.log.name}: {damaged}no external position was sent to the autopilot in this "
             "recording (no VISION_POSITION_ESTIMATE, ODOMETRY or ATT_POS_MOCAP). Give the "
-            "positioning system's own file with --position"
+            "positioning system's own file with `position`"
             f"{', or the ULog' if flight.log.has_ulog else ''}."
         )
     gps = any(track.rung > LAST_AUTOMATIC_RUNG for track in flight.positions)
     hint = (
-        "Only GPS is in it: give --position-source vehicle_gps_position to use that, or s"
+        "Only GPS is in it: give `position_source` vehicle_gps_position to use that, or s"
         if gps
         else "S"
     )
@@ -163,7 +163,7 @@ def _no_source(flight: Flight) -> str:
         f"{flight.log.name}: {damaged}no external position in this log (no "
         "vehicle_visual_odometry, motion capture or EKF2 innovations of external vision). "
         f"{hint}et SDLOG_PROFILE to 129 and send the UWB position to PX4 as "
-        "VISION_POSITION_ESTIMATE, or give the UWB's own file with --position."
+        "VISION_POSITION_ESTIMATE, or give the UWB's own file with `position`."
     )
 
 
@@ -335,7 +335,7 @@ def make_axes(
     if not asked:
         raise SettingsError("no axis was asked for.")
     if heading_deg is not None and not np.isfinite(heading_deg):
-        raise SettingsError(f"--heading {heading_deg:g} is not a finite number.")
+        raise SettingsError(f"`heading_deg` {heading_deg:g} is not a finite number.")
     if unknown := [name for name in asked if name not in (*AXIS_NAMES, AISLE)]:
         raise SettingsError(
             f"axis {unknown[0]}: not a known axis. Choose from {', '.join((*AXIS_NAMES, AISLE))}."

@@ -248,13 +248,14 @@ def close_loop(
     path = part_of(whole, segment, at_rest)
     spacing = key_frame_spacing_m(path.position_m) if spacing_m is None else spacing_m
     if not 1e-3 <= spacing <= 100.0:
-        raise SettingsError(f"--key-frames {spacing:g} is outside 0.001 to 100 m.")
+        raise SettingsError(f"`key_frames_m` {spacing:g} is outside 0.001 to 100 m.")
     frames = key_frames(path.position_m, spacing)
     along = cumulative_distance(path.position_m[frames])
     if not along[-1] >= max(MIN_PATH_M * min(1.0, spacing / 0.5), 1e-6):
         raise TrajectoryError(
             f"{trajectory.name}: the path is {along[-1]:.2f} m long on key frames {spacing:g} m "
-            "apart, too short for a loop. Give the part with --from and --to, or --key-frames."
+            "apart, too short for a loop. Give the part with `start_s` and `end_s`, or "
+            "`key_frames_m`."
         )
     distance = np.interp(path.time_s, path.time_s[frames], along)
     end_m = path.position_m[-1] - path.position_m[0]

@@ -184,6 +184,6 @@ def _no_overlap(
     return (
         f"{estimate.name}: {what} in time: it spans {time_s[0]:.3f} to {time_s[-1]:.3f} s{added}, "
         f"the reference {reference.name} {reference.time_s[0]:.3f} to {reference.time_s[-1]:.3f} "
-        "s. Check that both are of the same flight; if their clocks differ, give --time-offset "
-        "auto."
+        "s. Check that both are of the same flight; if their clocks differ, give "
+        "`time_offset_s` auto."
     )
