@@ -14,9 +14,10 @@ import numpy as np
 
 from px4fuse import placing
 from px4fuse.comparison.asked import asked_of_ekf2
-from px4fuse.comparison.comparison import Comparison, compare
+from px4fuse.comparison.comparison import AxisComparison, Comparison, compare
 from px4fuse.comparison.drift import may_drift, with_drift
 from px4fuse.comparison.why import Why, why_ekf2_differs
+from px4fuse.display import Shown, brief
 from px4fuse.ekf2.model import Model, open_model
 from px4fuse.ekf2.parameters import check
 from px4fuse.ekf2.replay import Ekf2Replay
@@ -66,8 +67,8 @@ def _silent(_: str) -> None:
     """Progress that nobody watches."""
 
 
-@dataclass(frozen=True)
-class Analysis:
+@dataclass(frozen=True, repr=False)
+class Analysis(Shown):
     """A comparison and what explains it.
 
     Attributes
@@ -94,6 +95,25 @@ class Analysis:
     why: Mapping[str, Why | Unavailable]
     loop: Loop | Unavailable
     heading: HeadingError | Unavailable
+
+    @property
+    def flight(self) -> Flight:
+        """What was compared."""
+        return self.comparison.flight
+
+    @property
+    def settings(self) -> Settings:
+        """The filter's, as used."""
+        return self.comparison.settings
+
+    @property
+    def axes(self) -> tuple[AxisComparison, ...]:
+        """Everything about each axis."""
+        return self.comparison.axes
+
+    def __getitem__(self, axis: str) -> AxisComparison:
+        """Everything about one axis, by its name."""
+        return self.comparison[axis]
 
     @property
     def ekf2_replay(self) -> Ekf2Replay | Unavailable:
@@ -166,7 +186,9 @@ def _size(noise: Noise, otherwise: float) -> float:
     return noise.value or noise.high or otherwise
 
 
-def run(request: ComparisonRequest, progress: Progress = _silent) -> Analysis:
+def run(
+    request: ComparisonRequest, progress: Progress = _silent, flight: Flight | None = None
+) -> Analysis:
     """Read a flight, compare it with EKF2 and explain the comparison.
 
     Parameters
@@ -174,13 +196,15 @@ def run(request: ComparisonRequest, progress: Progress = _silent) -> Analysis:
     request : ComparisonRequest
     progress : callable
         Told what is being done.
+    flight : Flight, optional
+        What the request's recordings hold, where they have been read.
 
     Raises
     ------
     LogError, MissingDataError, SettingsError
         A file cannot be read, the flight lacks what was asked for, or a setting is out of range.
     """
-    return explain(run_comparison(request, progress), progress)
+    return explain(run_comparison(request, progress, flight), progress)
 
 
 def read_flight(request: ComparisonRequest, progress: Progress = _silent) -> Flight:
@@ -226,7 +250,9 @@ def _placed(flight: Flight, position: PositionFile, clock_offset: float | str | 
     )
 
 
-def run_comparison(request: ComparisonRequest, progress: Progress = _silent) -> Comparison:
+def run_comparison(
+    request: ComparisonRequest, progress: Progress = _silent, flight: Flight | None = None
+) -> Comparison:
     """Read a flight and compare it with EKF2, without what explains the comparison.
 
     Raises
@@ -250,11 +276,11 @@ def run_comparison(request: ComparisonRequest, progress: Progress = _silent) -> 
     ):
         if isinstance(value, float) and not abs(value) < float("inf"):
             raise SettingsError(f"`{name}` {value:g} is not a finite number.")
-    flight = read_flight(request, progress)
+    read = flight or read_flight(request, progress)
 
     def compared(settings: Settings) -> Comparison:
         return compare(
-            flight,
+            read,
             settings,
             axes=request.axes or None,
             heading_deg=request.heading_deg,
@@ -271,7 +297,7 @@ def run_comparison(request: ComparisonRequest, progress: Progress = _silent) -> 
     found = clock_offset(comparison, tuned_horizontally(comparison), progress)
     if isinstance(found, Unavailable) or not found.determinable:
         raise MissingDataError(
-            f"{flight.log.name}: `clock_offset_s` auto: not determinable: {found.reason}. "
+            f"{read.log.name}: `clock_offset_s` auto: not determinable: {found.reason}. "
             "Give the seconds to add, or leave it out."
         )
     return compared(replace(settings, clock_offset_s=found.offset_s))
@@ -290,11 +316,6 @@ def run_loop(request: LoopRequest, progress: Progress = _silent) -> Loop:
             raise SettingsError(f"`{name}` {value:g} is not a finite number.")
     progress(f"reading {shown(Path(request.source))}")
     source = read_source(request.source, frame=request.frame, system=request.system)
-    if request.frame is not None and source.flight is not None:
-        raise SettingsError(
-            f"`frame` {request.frame.lower()} is for trajectory files; {source.flight.log.name} is "
-            "a flight log, which states its frame. Leave `frame` out."
-        )
     reference = None
     if request.reference is not None:
         reference = read_source(
@@ -335,6 +356,8 @@ class Counterfactual:
     changes: Mapping[str, float]
     asked: bool
 
+    __repr__ = brief
+
 
 def run_what_if(request: WhatIfRequest, progress: Progress = _silent) -> Counterfactual:
     """Read a flight and replay its EKF2 with other parameters.
@@ -365,20 +388,7 @@ def run_what_if(request: WhatIfRequest, progress: Progress = _silent) -> Counter
         raise MissingDataError(f"{flight.log.name}: {model}")
     asked = not changes and swept is None
     if asked and model.agreement.good:
-        comparison = compare(flight, axes=("north", "east"))
-        tuning = tuned_horizontally(comparison)
-        clock = clock_offset(comparison, tuning, progress)
-        changes = asked_of_ekf2(comparison, model, tuning, clock)
-        if not changes:
-            why = "the data do not tell the noise and the delay of what EKF2 fused"
-            if may_drift(flight, comparison.source):
-                why = (
-                    f"{comparison.source.name} may drift, so that innovations do not tell its "
-                    "noise, and the delay is as the data ask for or not determinable"
-                )
-            raise MissingDataError(
-                f"{flight.log.name}: {why}. Say what to change: `changes` EKF2_EVP_NOISE=0.1."
-            )
+        changes = asked_changes(model, progress)
     settings = [changes] if changes else []
     if swept is not None:
         settings += [{**changes, swept.parameter: value} for value in values]
@@ -386,6 +396,32 @@ def run_what_if(request: WhatIfRequest, progress: Progress = _silent) -> Counter
     if isinstance(found, Unavailable):
         raise MissingDataError(f"{flight.log.name}: {found}")
     return Counterfactual(flight, found, changes, asked)
+
+
+def asked_changes(model: Model, progress: Progress = _silent) -> dict[str, float]:
+    """EKF2's noise and delay as the data ask for them, by PX4 name.
+
+    Raises
+    ------
+    MissingDataError
+        The data do not tell.
+    """
+    flight = model.flight
+    comparison = compare(flight, axes=("north", "east"))
+    tuning = tuned_horizontally(comparison)
+    clock = clock_offset(comparison, tuning, progress)
+    changes = asked_of_ekf2(comparison, model, tuning, clock)
+    if not changes:
+        why = "the data do not tell the noise and the delay of what EKF2 fused"
+        if may_drift(flight, comparison.source):
+            why = (
+                f"{comparison.source.name} may drift, so that innovations do not tell its "
+                "noise, and the delay is as the data ask for or not determinable"
+            )
+        raise MissingDataError(
+            f"{flight.log.name}: {why}. Say what to change: `changes` EKF2_EVP_NOISE=0.1."
+        )
+    return changes
 
 
 def explain(comparison: Comparison, progress: Progress = _silent) -> Analysis:

@@ -17,7 +17,8 @@ from px4fuse.comparison.projection import (
     project_truth,
     project_variance,
 )
-from px4fuse.errors import SettingsError
+from px4fuse.display import Shown
+from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.filter.consistency import Consistency, HorizontalNis, assess, assess_horizontal
 from px4fuse.filter.kalman import Replay, Settings, replay, state_at, variance_at
 from px4fuse.filter.signals import (
@@ -86,8 +87,8 @@ class AgainstTruth:
     nees_velocity_mean: float | None
 
 
-@dataclass(frozen=True)
-class AxisComparison:
+@dataclass(frozen=True, repr=False)
+class AxisComparison(Shown):
     """Everything about one axis.
 
     Attributes
@@ -121,8 +122,8 @@ class AxisComparison:
     truth: pd.DataFrame | Unavailable
 
 
-@dataclass(frozen=True)
-class Comparison:
+@dataclass(frozen=True, repr=False)
+class Comparison(Shown):
     """The result of ``px4fuse compare``.
 
     Attributes
@@ -151,6 +152,19 @@ class Comparison:
     horizontal_ekf2: HorizontalNis | None
     notes: tuple[str, ...]
     missing: tuple[Unavailable, ...]
+
+    def __getitem__(self, axis: str) -> AxisComparison:
+        """Everything about one axis, by its name.
+
+        Raises
+        ------
+        MissingDataError
+            It was not analysed.
+        """
+        names = {result.axis.name: result for result in self.axes}
+        if axis not in names:
+            raise MissingDataError(f"no axis {axis!r} here: {', '.join(names)}.")
+        return names[axis]
 
 
 def compare(

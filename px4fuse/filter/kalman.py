@@ -13,6 +13,7 @@ import pandas as pd
 from filterpy.kalman import KalmanFilter
 
 from px4fuse.arrays import Array, BoolArray, IntArray
+from px4fuse.display import brief
 from px4fuse.errors import SettingsError
 from px4fuse.filter.model import (
     COVARIANCES,
@@ -120,6 +121,8 @@ class Replay:
     steps: pd.DataFrame
     updates: pd.DataFrame
     input_gap_s: float = field(default=0.0)
+
+    __repr__ = brief
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from scipy.integrate import cumulative_trapezoid
 from scipy.spatial.transform import Rotation, Slerp
 
 from px4fuse.arrays import Array, BoolArray
+from px4fuse.display import brief
 from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.flight import (
     AXIS_NAMES,
@@ -78,6 +79,8 @@ class Acceleration:
     gap_integral_s: Array
     rms_m_s2: float
 
+    __repr__ = brief
+
 
 @dataclass(frozen=True)
 class Axis:
@@ -106,6 +109,8 @@ class Axis:
     measurement_time_s: Array
     measurement_m: Array
     acceleration: Acceleration | Unavailable
+
+    __repr__ = brief
 
 
 def choose_source(flight: Flight, name: str | None = None) -> tuple[PositionTrack, str]:

@@ -42,6 +42,9 @@ class Finding:
     evidence: dict[str, float | str] = field(default_factory=dict)
     consequences: tuple[Finding, ...] = ()
 
+    def __repr__(self) -> str:
+        return f"<{self.severity} {self.id}: {self.message} {self.remedy}>"
+
     @property
     def ids(self) -> tuple[str, ...]:
         """Its own id and those of its consequences."""

@@ -9,6 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from px4fuse.arrays import Array, BoolArray, IntArray
+from px4fuse.display import Shown, brief
 from px4fuse.errors import MissingDataError, Px4FuseError, SettingsError, TrajectoryError
 from px4fuse.filter.signals import Segment
 from px4fuse.flight import Unavailable
@@ -80,9 +81,11 @@ class Correction:
     scores: Mapping[str, Evaluation | Unavailable] = field(default_factory=dict)
     solution: Solution | None = None
 
+    __repr__ = brief
 
-@dataclass(frozen=True)
-class Loop:
+
+@dataclass(frozen=True, repr=False)
+class Loop(Shown):
     """The result of ``px4fuse loop``.
 
     Attributes

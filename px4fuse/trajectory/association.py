@@ -9,6 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Slerp
 
 from px4fuse.arrays import Array, BoolArray, IntArray
+from px4fuse.display import brief
 from px4fuse.errors import TrajectoryError
 from px4fuse.trajectory.model import MIN_POSES, Trajectory
 
@@ -54,6 +55,8 @@ class Association:
     in_gaps: int
     coverage_estimate: float
     coverage_reference: float
+
+    __repr__ = brief
 
     def __len__(self) -> int:
         return len(self.estimate)
