@@ -36,3 +36,26 @@ def factor_words(factor: float) -> str:
     """
     digits = 3 if factor < 2.0 else 2
     return f"{float(f'{factor:.{digits}g}'):,g}"
+
+
+def length_words(metres: float) -> str:
+    """A length as a person says it.
+
+    >>> [length_words(m) for m in (0.0041, 0.0612, 0.336, 1.42, 23.4, 250.0)]
+    ['4 mm', '6 cm', '34 cm', '1.4 m', '23 m', '250 m']
+    """
+    for limit, unit, scale in ((0.0095, "mm", 1e3), (0.995, "cm", 1e2)):
+        if metres < limit:
+            return f"{metres * scale:.0f} {unit}"
+    return f"{metres:.{1 if metres < 9.95 else 0}f} m"
+
+
+def excess_words(factor: float) -> str:
+    """By how much something is too large, from how many times (1 or more) it is.
+
+    >>> [excess_words(f) for f in (1.18, 1.96, 2.4, 24.3)]
+    ['18 %', '96 %', '2.4 times', '24 times']
+    """
+    return f"{factor - 1.0:.0%}".replace("%", " %") if factor < 2.0 else (
+        f"{factor_words(factor)} times"
+    )  # fmt: skip

@@ -343,7 +343,7 @@ FAULTS = [
         "warning",
         {"uwb": Uwb(name=ALIGNED, rung=4, rate_hz=4.0), "parameters": NO_VISION},
         evidence={"rate_hz": about(4.0), "sdlog_profile": 1.0},
-        says="No vehicle_visual_odometry, the position as it arrived",
+        says="The log lacks vehicle_visual_odometry, the position as it arrived",
         remedy="SDLOG_PROFILE to 129",
     ),
     Fault(
@@ -507,7 +507,8 @@ def test_the_faults_below_cover_every_finding() -> None:
 
 def test_every_file_is_listed() -> None:
     """One that nobody lists would never find anything."""
-    names = {module.name for module in pkgutil.iter_modules(package.__path__)} - {"model", "causes"}
+    modules = {module.name for module in pkgutil.iter_modules(package.__path__)}
+    names = modules - {"causes", "model", "story"}
     ids = [
         name
         for file in names

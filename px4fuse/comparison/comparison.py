@@ -22,6 +22,7 @@ from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.filter.consistency import Consistency, HorizontalNis, assess, assess_horizontal
 from px4fuse.filter.kalman import Replay, Settings, replay, state_at, variance_at
 from px4fuse.filter.signals import (
+    AISLE,
     Axis,
     Segment,
     choose_segment,
@@ -165,6 +166,11 @@ class Comparison(Shown):
         if axis not in names:
             raise MissingDataError(f"no axis {axis!r} here: {', '.join(names)}.")
         return names[axis]
+
+    @property
+    def main(self) -> AxisComparison:
+        """The axis of the lab: the aisle, else the first."""
+        return next((axis for axis in self.axes if axis.axis.name == AISLE), self.axes[0])
 
 
 def compare(

@@ -24,6 +24,7 @@ from px4fuse.ekf2.walk import (
     Walk,
 )
 from px4fuse.filter.clock import ClockOffset
+from px4fuse.filter.signals import AISLE
 from px4fuse.flight import Unavailable
 
 # A noise this many times below what the data ask for is too small: as of EKF2's findings
@@ -153,12 +154,17 @@ def _part(steps: list[Step]) -> _Part:
     )
 
 
+def the(axis: str) -> str:
+    """The name of an axis in a sentence."""
+    return f"the {axis}" if axis == AISLE else axis
+
+
 def _share(square: float, total: float) -> str:
     return f"{square / total:.0%} of the mean square"
 
 
 def _first(name: str, axis: AxisWalk, part: _Part, facts: Facts) -> str:
-    apart = f"{np.sqrt(axis.position_total_m2):.3f} m rms along {name}"
+    apart = f"{np.sqrt(axis.position_total_m2):.3f} m rms"
     share = _share(part.square_m2, axis.position_total_m2)
     if facts.too_sure:
         return (
@@ -166,10 +172,10 @@ def _first(name: str, axis: AxisWalk, part: _Part, facts: Facts) -> str:
             f"{facts.noise_used_m:.2g} m, the data ask for {facts.noise_asked_m:.2g} m, so its "
             f"gate rejects {facts.rejected:.0%} of the samples{_coasted(facts)}. This noise and "
             "the rejections that follow from it "
-            f"are {share} of what ours and EKF2 are apart ({apart})."
+            f"are {share} of what ours and EKF2 are apart along {the(name)} ({apart})."
         )
     return (
-        f"Ours and EKF2 are {apart} apart, most of it by {part.label} ({share}): "
+        f"Along {the(name)} ours and EKF2 are {apart} apart, most of it by {part.label} ({share}): "
         f"{_because(part, facts)}."
     )
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from px4fuse.analysis import Analysis
-from px4fuse.findings.model import Detector, Finding, Found, times
+from px4fuse.findings.model import Detector, Finding, Found, moments, times
 from px4fuse.flight import Unavailable
 
 
@@ -20,6 +20,7 @@ def _detect(analysis: Analysis) -> Found:
             f"{switches[0]:.1f} s; each part of the comparison uses the one in charge.",
             "Compare the IMUs (vehicle_imu_status); set EKF2_MULTI_IMU to 1 for a lab flight.",
             {"count": float(len(switches)), "at_s": switches[0]},
+            spans_s=moments(switches),
         )
 
 

@@ -4,7 +4,14 @@ from __future__ import annotations
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.comparison import Comparison
-from px4fuse.findings.model import Detector, Finding, Found, Threshold, step_share
+from px4fuse.findings.model import (
+    Detector,
+    Finding,
+    Found,
+    Threshold,
+    off_spans,
+    step_share,
+)
 from px4fuse.flight import EXTERNAL_VISION_RUNGS, Ekf2, FusionRecord, Unavailable
 
 FUSING_SHARE_ERROR = Threshold(
@@ -46,6 +53,7 @@ def _detect(analysis: Analysis) -> Found:
             "rests on its other sensors.",
             "Look at the gaps and rejections below; EKF2 stops after 0.4 s without a sample.",
             evidence,
+            spans_s=off_spans(ekf2.fusing["horizontal"], segment.start_s, segment.end_s),
         )
         return
     why, remedy = _cause(comparison, interval)

@@ -6,7 +6,7 @@ from px4fuse.analysis import Analysis
 from px4fuse.comparison.asked import asked_of_ekf2
 from px4fuse.comparison.remedy import not_replayed, rejects_less, replayed, settings_words
 from px4fuse.ekf2.parameters import PARAMETERS
-from px4fuse.findings.model import Detector, Finding, Found, Threshold
+from px4fuse.findings.model import Detector, Finding, Found, Threshold, moments
 from px4fuse.flight import Ekf2, Unavailable
 
 REJECTED_SHARE_WARNING = Threshold(0.01, "of the innovations", "5 σ rejects 6e-7 when consistent")
@@ -81,6 +81,7 @@ def _detect(analysis: Analysis) -> Found:
             "outliers, a noise set too small, or a late clock.",
             IN_ORDER if what == "height" else _remedy(analysis),
             {"rejected_share": share, "count": float(len(frame)), "axis": result.axis.name},
+            spans_s=moments(known.index[known > 0.0]),
         )
 
 

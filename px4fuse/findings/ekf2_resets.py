@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from px4fuse.analysis import Analysis
-from px4fuse.findings.model import Detector, Finding, Found, times
+from px4fuse.findings.model import Detector, Finding, Found, moments, times
 from px4fuse.flight import Unavailable
 
 
@@ -35,6 +35,7 @@ def _detect(analysis: Analysis) -> Found:
         else "A height reset at take-off is usual; in mid-flight look for a change of the "
         "height source.",
         {"count": float(len(inside)), "largest_m": max(sizes), "at_s": largest.time_s},
+        spans_s=moments(reset.time_s for reset in inside),
     )
 
 

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pandas as pd
 
 from px4fuse.analysis import Analysis
-from px4fuse.findings.model import Detector, Finding, Found, Threshold
+from px4fuse.arrays import Array
+from px4fuse.filter.signals import Segment, imu_gaps
+from px4fuse.findings.model import MOMENT_S, Detector, Finding, Found, Threshold
 from px4fuse.flight import sample_rate
 
 IMU_GAP_TOTAL = Threshold(0.2, "s", "two prediction steps")
@@ -29,7 +32,25 @@ def _detect(analysis: Analysis) -> Found:
             "there to the size of the motion.",
             f"{remedy}, or choose a segment without the gap (--start, --end).",
             {"total_s": gap_s},
+            spans_s=_spans(imu.index.to_numpy(), comparison.segment)
+            if isinstance(imu, pd.DataFrame)
+            else (),
         )
+
+
+def _spans(time_s: Array, segment: Segment) -> tuple[tuple[float, float], ...]:
+    """From when to when the IMU is missing, at the ends of the segment too."""
+    gap = imu_gaps(time_s)
+    spans = np.column_stack([time_s[:-1][gap], time_s[1:][gap]])
+    outside = [(segment.start_s, time_s[0]), (time_s[-1], segment.end_s)]
+    missing = [*spans.tolist(), *(pair for pair in outside if pair[1] - pair[0] > MOMENT_S)]
+    return tuple(
+        sorted(
+            (float(start), float(end))
+            for start, end in missing
+            if end > segment.start_s and start < segment.end_s
+        )
+    )
 
 
 DETECTOR = Detector(

@@ -21,6 +21,7 @@ def _detect(analysis: Analysis) -> Found:
             f"{max(d.duration_s for d in lost):.2f} s.",
             "Use a faster SD card, or log less (SDLOG_PROFILE).",
             {"count": float(len(lost)), "total_s": total},
+            spans_s=tuple((d.start_s, d.start_s + d.duration_s) for d in lost),
         )
 
 

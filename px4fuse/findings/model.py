@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Generic, Literal, TypeVar
 
@@ -33,6 +34,8 @@ class Finding:
         What to type or to set.
     consequences : tuple of Finding
         What the same cause brings with it, each with its own evidence.
+    spans_s : tuple of (float, float)
+        From when to when it shows, seconds from the first data; empty where that is throughout.
     """
 
     id: str
@@ -41,6 +44,24 @@ class Finding:
     remedy: str
     evidence: dict[str, float | str] = field(default_factory=dict)
     consequences: tuple[Finding, ...] = ()
+    spans_s: tuple[tuple[float, float], ...] = ()
+
+    @property
+    def when(self) -> str:
+        """When it shows, in words; empty where that is throughout."""
+        if len(self.spans_s) > MOST_SPANS:
+            return f"from {self.spans_s[0][0]:.1f} s to {self.spans_s[-1][1]:.1f} s"
+        told = [
+            f"{start:.1f} s to {end:.1f} s" if end - start > MOMENT_S else f"{start:.1f} s"
+            for start, end in self.spans_s
+        ]
+        return ", ".join(told)
+
+    @property
+    def headline(self) -> str:
+        """What the message says before it explains: no brackets, no full stop."""
+        told = re.sub(r" \([^()]*\)", "", self.message)
+        return re.split(r"[:;.] |\.$", told, maxsplit=1)[0]
 
     def __repr__(self) -> str:
         return f"<{self.severity} {self.id}: {self.message} {self.remedy}>"
@@ -61,6 +82,16 @@ class Threshold:
 
 
 Found = Iterator[Finding]
+
+# More are not listed one by one
+MOST_SPANS = 3
+# Shorter is told as one moment
+MOMENT_S = 0.05
+
+
+def moments(times_s: Iterable[float]) -> tuple[tuple[float, float], ...]:
+    """Spans of no length, for what happens at a moment."""
+    return tuple((float(time), float(time)) for time in times_s)
 
 
 @dataclass(frozen=True)
@@ -99,6 +130,15 @@ def sentence(note: str) -> str:
     """A note with a capital letter, unless it begins with a file's name."""
     first = note.split(" ", 1)[0]
     return note if "." in first else note[:1].upper() + note[1:]
+
+
+def off_spans(steps: pd.Series, start_s: float, end_s: float) -> tuple[tuple[float, float], ...]:
+    """Parts of a span in which a 0/1 step function is 0."""
+    begins = np.clip(steps.index.to_numpy(), start_s, end_s)
+    begins[0] = start_s  # its first value also holds before
+    ends = np.append(begins[1:], end_s)
+    off = (steps.to_numpy() == 0.0) & (ends > begins)
+    return tuple(zip(begins[off].tolist(), ends[off].tolist(), strict=True))
 
 
 def step_share(steps: pd.Series, start_s: float, end_s: float) -> float:

@@ -43,9 +43,9 @@ def _detect(analysis: Analysis) -> Found:
         yield Finding(
             "process_noise_forgotten",
             "error",
-            f"Q forgotten: with SIGMA_A {comparison.settings.sigma_a_m_s2:g} m/s² σ_p hardly grows "
-            f"between updates ({growth:.1%} in variance), the gain is {gain:.3f}, and the filter "
-            f"needs {response_s:.0f} s to follow (along {result.axis.name}).",
+            f"With SIGMA_A {comparison.settings.sigma_a_m_s2:g} m/s² Q is forgotten: σ_p hardly "
+            f"grows between updates ({growth:.1%} in variance), the gain is {gain:.3f}, and the "
+            f"filter needs {response_s:.0f} s to follow (along {result.axis.name}).",
             remedy,
             {
                 "relative_growth": growth,

@@ -18,7 +18,8 @@ def _detect(analysis: Analysis) -> Found:
     limit = max(GAP.value, GAP_INTERVALS.value / comparison.source.rate_hz)
     long = intervals[intervals > limit]
     if len(long):
-        at = float(measured_s[:-1][intervals > limit][np.argmax(long)])
+        starts = measured_s[:-1][intervals > limit]
+        at = float(starts[np.argmax(long)])
         yield Finding(
             "source_gap",
             "warning",
@@ -27,6 +28,7 @@ def _detect(analysis: Analysis) -> Found:
             "Check line of sight to the anchors and the link; analyse one side with --start, "
             "--end.",
             {"count": float(len(long)), "longest_s": float(long.max()), "at_s": at},
+            spans_s=tuple(zip(starts.tolist(), (starts + long).tolist(), strict=True)),
         )
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from px4fuse.analysis import Analysis
 from px4fuse.filter.causes import Explained
 from px4fuse.findings import source_stamps_of_arrival
-from px4fuse.findings.model import Detector, Finding, Found, Threshold, times
+from px4fuse.findings.model import Detector, Finding, Found, Threshold, moments, times
 
 JUMP = Threshold(0.2, "m", "twice a good UWB's noise")
 JUMP_ERROR = Threshold(0.5, "m", "no longer the same place")
@@ -38,6 +38,7 @@ def _detect(analysis: Analysis) -> Found:
             "at_s": largest.time_s,
             "sigma_m": sigma,
         },
+        spans_s=moments(jump.time_s for jump in jumps),
     )
 
 

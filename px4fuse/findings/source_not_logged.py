@@ -30,7 +30,7 @@ def _detect(analysis: Analysis) -> Found:
     yield Finding(
         "source_not_logged",
         "warning",
-        f"No vehicle_visual_odometry, the position as it arrived ({why}); "
+        f"The log lacks vehicle_visual_odometry, the position as it arrived ({why}); "
         f"{source.name} ({source.description}) stands in for it at {source.rate_hz:.1f} Hz.",
         f"Set SDLOG_PROFILE to {profile | VISION_PROFILE_BIT} and fly again.",
         {"rate_hz": source.rate_hz, "sdlog_profile": float(profile)},

@@ -5,7 +5,7 @@ from __future__ import annotations
 from px4fuse.analysis import Analysis
 from px4fuse.filter.causes import AFTER_STEP_S, Explained
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
-from px4fuse.findings.model import Detector, Finding, Found, Threshold
+from px4fuse.findings.model import Detector, Finding, Found, Threshold, moments
 
 OUTLIERS = Threshold(0.005, "of the measurements", "a normal source has 0.02 % beyond 3.7 σ")
 OUTLIERS_ERROR = Threshold(0.02, "of the measurements", "every tenth second at 5 Hz")
@@ -39,6 +39,7 @@ def _detect(analysis: Analysis) -> Found:
         "Give the tag line of sight to the anchors there, or reject them before they are sent; do "
         "not raise SIGMA_Z or EKF2_EVP_NOISE for them.",
         {"count": float(count), "share": share, "first_s": outliers[0]},
+        spans_s=moments(outliers),
     )
 
 

@@ -63,6 +63,7 @@ def _detect(analysis: Analysis) -> Found:
         f"Analyse the rest (--start {until:.0f}), and let the clocks synchronise for a minute "
         "before take-off.",
         {"until_s": until, "latency_s": latency},
+        spans_s=((float(age.index[0]), until),),
     )
 
 

@@ -16,7 +16,6 @@ from px4fuse.comparison.why import Why
 from px4fuse.display import frame
 from px4fuse.ekf2.whatif import WhatIf
 from px4fuse.filter.clock import ClockOffset
-from px4fuse.filter.signals import AISLE
 from px4fuse.filter.tuning import AxisTuning
 from px4fuse.flight import Flight, Unavailable
 from px4fuse.loop.loop import Loop
@@ -98,8 +97,8 @@ def axis_comparison(result: AxisComparison, ax: Any = None) -> Any:
 
 def comparison(result: Comparison | Analysis, axis: str | None = None, ax: Any = None) -> Any:
     """One axis, by default the aisle where there is one."""
-    names = [part.axis.name for part in result.axes]
-    return axis_comparison(result[axis or (AISLE if AISLE in names else names[0])], ax)
+    whole = result.comparison if isinstance(result, Analysis) else result
+    return axis_comparison(whole.main if axis is None else whole[axis], ax)
 
 
 def why(result: Why, ax: Axes | None = None) -> Axes:

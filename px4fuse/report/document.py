@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 from px4fuse.analysis import Analysis, Counterfactual
 from px4fuse.comparison.comparison import Comparison
 from px4fuse.findings import Finding
+from px4fuse.findings.story import story
 from px4fuse.loop.loop import Loop
 from px4fuse.results.model import Provenance, Student
 
@@ -37,6 +39,11 @@ class Document:
     def comparison(self) -> Comparison:
         """The comparison itself, without what explains it."""
         return self.analysis.comparison
+
+    @cached_property
+    def story(self) -> tuple[str, ...]:
+        """What happened, in up to three sentences."""
+        return story(self.analysis, self.findings)
 
     @property
     def log(self) -> tuple[str, str]:

@@ -35,7 +35,7 @@ START_S = 5.0
 def draw(document: Document) -> Iterator[Figure]:
     """Draw one page: two zooms on one axis, then σ_p and σ_v of the flight, log scale."""
     comparison = document.comparison
-    main = next((a for a in comparison.axes if a.axis.name == "aisle"), comparison.axes[0])
+    main = comparison.main
     others = [a for a in comparison.axes if a.axis.name == "down" and a is not main]
     figure, cursor = page(
         "Variances",

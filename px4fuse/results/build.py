@@ -12,6 +12,7 @@ from px4fuse.filter.clock import ClockOffset
 from px4fuse.filter.heading import HeadingError
 from px4fuse.filter.tuning import AxisTuning, Noise
 from px4fuse.findings import Finding
+from px4fuse.findings.story import story
 from px4fuse.flight import Unavailable, sample_rate
 from px4fuse.request import AxisName, ComparisonRequest
 from px4fuse.results import comparison as made
@@ -63,6 +64,7 @@ def results(
         ekf2_replay=replay_part(analysis.ekf2_replay),
         why={name: why_part(found) for name, found in analysis.why.items()},
         loop=loop_part(analysis.loop),
+        story=story(analysis, findings),
         findings=found_mistakes(findings),
         notes=comparison.notes,
         missing=tuple(copied(Missing, part) for part in comparison.missing),

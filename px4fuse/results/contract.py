@@ -64,6 +64,8 @@ class ComparisonResults(Base, frozen=True):
     why : mapping of axis name to Why
         Why EKF2 differs.
     loop : Loop
+    story : tuple of str
+        What happened, in up to three sentences.
     findings : tuple of FoundMistake
         One per cause, most severe first, what the recording lacks before noises.
     notes : tuple of str
@@ -87,6 +89,7 @@ class ComparisonResults(Base, frozen=True):
     ekf2_replay: Part[Ekf2Replay]
     why: dict[str, Part[Why]]
     loop: Part[Loop]
+    story: tuple[str, ...]
     findings: tuple[FoundMistake, ...]
     notes: tuple[str, ...]
     missing: tuple[Missing, ...]

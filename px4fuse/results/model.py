@@ -111,7 +111,8 @@ class Student(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class FoundMistake(Base, frozen=True):
     """A finding: what is wrong, the numbers that say so, and what to do.
 
-    Its ``consequences`` are what the same cause brings with it.
+    Its ``consequences`` are what the same cause brings with it; ``spans_s`` says from when to when
+    it shows, and is empty where that is throughout.
     """
 
     id: Annotated[str, Meta(pattern="^[a-z0-9_]+$")]
@@ -120,6 +121,7 @@ class FoundMistake(Base, frozen=True):
     evidence: dict[str, int | float | str]
     remedy: str
     consequences: tuple[FoundMistake, ...] = ()
+    spans_s: tuple[Interval, ...] = ()
 
     @property
     def ids(self) -> tuple[str, ...]:

@@ -1,0 +1,146 @@
+"""The sentences that open a report: what they say is what was made to happen."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from flights import Estimator, Uwb, aisle_flight, motion, unexplained, with_noises
+
+from px4fuse.comparison.comparison import Comparison, compare
+from px4fuse.filter.kalman import Settings
+from px4fuse.findings import find
+from px4fuse.findings.model import Finding, moments, off_spans
+from px4fuse.findings.story import MOST_SENTENCES, story
+from px4fuse.flight import Dropout, Reset, Unavailable
+
+ALONG_DEG = 30.0
+
+
+def told(comparison: Comparison, *, tuned: bool = True) -> tuple[str, ...]:
+    """Story of a comparison, each sentence checked for form."""
+    analysis = with_noises(comparison) if tuned else unexplained(comparison)
+    sentences = story(analysis, find(analysis))
+    assert 1 <= len(sentences) <= MOST_SENTENCES
+    for sentence in sentences:
+        assert re.fullmatch(r"[A-Z0-9].*[^.]\.", sentence), sentence
+        assert "nan" not in sentence
+    return sentences
+
+
+def test_a_clean_flight_is_told_in_one_sentence_with_its_errors() -> None:
+    flight = aisle_flight(heading_deg=ALONG_DEG, ekf2=Estimator(sigma_p_m=0.05))
+    comparison = compare(flight)
+    (only,) = told(comparison)
+    steps = comparison.main.replay.steps
+    true = motion(steps.index.to_numpy(), ALONG_DEG, 10.0)[0] @ comparison.main.axis.direction
+    ours_cm = 100.0 * float(np.sqrt(np.mean((steps["position_m"] - true) ** 2)))
+    assert only == (
+        "Along the aisle EKF2 was 5 cm from the truth (RMS) and honest about it; our filter was "
+        f"{ours_cm:.0f} cm from the truth (RMS) and honest about it."
+    )
+
+
+@pytest.mark.parametrize(
+    ("settings", "knows", "since"),
+    [
+        (Settings(sigma_z_m=0.03), "too sure of itself", "SIGMA_Z 0.03 is smaller than the 0.1"),
+        (Settings(sigma_z_m=0.3), "too modest", "SIGMA_Z 0.3 is larger than the 0.1"),
+        (Settings(sigma_a_m_s2=3.0), "too modest", "SIGMA_A 3 is larger than the 0."),
+    ],
+)
+def test_a_wrong_setting_is_told_with_what_the_flight_asks_for(
+    settings: Settings, knows: str, since: str
+) -> None:
+    first, *_ = told(compare(aisle_flight(), settings))
+    ours = first.split("our filter was ")[1]
+    assert knows in ours
+    assert f"since {since}" in ours
+
+
+def test_a_setting_is_not_blamed_for_what_it_does_not_cause() -> None:
+    # a larger SIGMA_Z makes no filter too sure of itself
+    flight = aisle_flight(uwb=Uwb(outlier_share=0.1))
+    first, *_ = told(compare(flight, Settings(sigma_z_m=0.5)))
+    assert "smaller" not in first
+
+
+def test_a_silent_source_is_told_with_how_far_both_filters_coasted() -> None:
+    silence = (50.0, 58.0)
+    comparison = compare(aisle_flight(uwb=Uwb(gap_s=silence), heading_deg=ALONG_DEG))
+    sentences = told(comparison)
+    gap = next(sentence for sentence in sentences if "silent" in sentence)
+    assert gap.startswith("From 50 s to 58 s the source was silent: both filters coasted")
+    steps = comparison.main.replay.steps
+    before = steps[steps.index < silence[1]].iloc[-1]
+    moved = before["velocity_m_s"] * (silence[1] - steps.index[steps.index < silence[1]][-1])
+    true = motion(np.array([silence[1]]), ALONG_DEG, 10.0)[0][0] @ comparison.main.axis.direction
+    off = abs(before["position_m"] + moved - true)
+    assert f"ours was {off:.1f} m " in gap
+
+
+def test_an_ekf2_that_is_too_sure_is_told_by_how_much() -> None:
+    first, *_ = told(compare(aisle_flight(ekf2=Estimator(nis=9.0, every=1))), tuned=False)
+    factor = float(re.search(r"and ([\d.]+) times too sure of itself; our", first)[1])
+    assert factor == pytest.approx(9.0, rel=0.15)
+
+
+def test_without_truth_nobody_is_called_right() -> None:
+    first, *_ = told(compare(aisle_flight(truth=False)))
+    assert "the log has no truth" in first
+    assert "from the truth" not in first
+    assert "by their own innovations both are honest about it" in first
+
+
+def test_without_ekf2_its_absence_is_told_with_the_reason() -> None:
+    first, *_ = told(compare(aisle_flight(ekf2=None)))
+    assert "there is no EKF2 beside it: no topic for EKF2" in first
+
+
+def test_what_cannot_be_judged_is_not_called_honest() -> None:
+    first, *_ = told(compare(aisle_flight(ekf2=Estimator(innovations_logged=False))))
+    ekf2, ours = first.split(";")
+    assert "cannot be judged by innovations" in ekf2
+    assert "honest" not in ekf2
+    assert "honest" in ours
+
+
+def test_findings_say_when_they_show() -> None:
+    resets = (
+        Reset(31.0, "position", (0.5, 0.0, 0.0)),
+        Reset(72.5, "position", (-0.5, 0.0, 0.0)),
+    )
+    flight = aisle_flight(
+        uwb=Uwb(gap_s=(50.0, 58.0)),
+        ekf2=Estimator(resets=resets, fusing=((0.0, 1.0), (51.0, 0.0), (58.5, 1.0))),
+        dropouts=(Dropout(20.0, 0.3),),
+    )
+    analysis = unexplained(compare(flight))
+    when = {
+        one.id: one.when for top in find(analysis) for one in (top, *top.consequences)
+    }  # fmt: skip
+    assert when["source_gap"] == "50.0 s to 58.0 s"
+    assert when["ekf2_resets"] == "31.0 s, 72.5 s"
+    assert when["logger_dropouts"] == "20.0 s to 20.3 s"
+    assert when["ekf2_fusion_interrupted"] == "51.0 s to 58.5 s"
+
+
+def test_a_step_function_is_off_from_its_change_to_the_next() -> None:
+    flight = aisle_flight(ekf2=Estimator(fusing=((0.0, 0.0), (5.0, 1.0), (9.0, 0.0), (9.5, 1.0))))
+    assert not isinstance(flight.ekf2, Unavailable)
+    assert not isinstance(flight.ekf2.fusing, Unavailable)
+    steps = flight.ekf2.fusing["horizontal"]
+    assert off_spans(steps, 2.0, 100.0) == ((2.0, 5.0), (9.0, 9.5))
+    assert off_spans(steps, 5.0, 9.2) == ((9.0, 9.2),)
+
+
+def test_words_of_a_finding() -> None:
+    finding = Finding("x", "info", "The noise (0.1 m) is large: look at 1.5 s. Then go on.", "Go.")
+    assert finding.headline == "The noise is large"
+    assert finding.when == ""
+    at = replace(finding, spans_s=moments([3.0, 4.0]))
+    assert at.when == "3.0 s, 4.0 s"
+    assert replace(finding, spans_s=((3.0, 4.25),)).when == "3.0 s to 4.2 s"
+    assert replace(finding, spans_s=moments(range(9))).when == "from 0.0 s to 8.0 s"
