@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from textwrap import wrap
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,8 @@ from px4fuse.ekf2.whatif import Summary, WhatIf
 from px4fuse.filter.clock import ClockOffset
 from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.tuning import AxisTuning, Noise
+from px4fuse.findings import SEVERITIES, find
+from px4fuse.findings.story import story
 from px4fuse.flight import (
     POSITION_COLUMNS,
     QUATERNION_COLUMNS,
@@ -33,6 +36,7 @@ from px4fuse.trajectory.scores import RelativeError
 
 EKF2 = "EKF2"
 OURS = "our filter"
+WIDTH = 100
 
 
 def number(value: Any) -> float:
@@ -138,10 +142,13 @@ def _(comparison: Comparison) -> str:
 
 @words.register
 def _(analysis: Analysis) -> str:
-    lines = [words(analysis.comparison)]
-    lines += [words(t) for t in analysis.tuning.values() if isinstance(t, AxisTuning)]
-    lines += [words(analysis.clock)] if isinstance(analysis.clock, ClockOffset) else []
-    lines += [words(analysis.loop)] if isinstance(analysis.loop, Loop) else []
+    found = find(analysis)
+    lines = [f"{analysis.flight.log.name}, {settings_words(analysis.settings)}"]
+    for sentence in story(analysis, found):
+        lines += wrap(sentence, WIDTH)
+    for severity in SEVERITIES:
+        if names := ", ".join(finding.id for finding in found if finding.severity == severity):
+            lines += wrap(f"{severity}: {names}", WIDTH)
     return "\n".join(lines)
 
 
