@@ -359,7 +359,9 @@ class Counterfactual:
     __repr__ = brief
 
 
-def run_what_if(request: WhatIfRequest, progress: Progress = _silent) -> Counterfactual:
+def run_what_if(
+    request: WhatIfRequest, progress: Progress = _silent, flight: Flight | None = None
+) -> Counterfactual:
     """Read a flight and replay its EKF2 with other parameters.
 
     Parameters
@@ -367,6 +369,8 @@ def run_what_if(request: WhatIfRequest, progress: Progress = _silent) -> Counter
     request : WhatIfRequest
     progress : callable
         Told what is being done.
+    flight : Flight, optional
+        What the request's recordings hold, where they have been read.
 
     Raises
     ------
@@ -381,14 +385,27 @@ def run_what_if(request: WhatIfRequest, progress: Progress = _silent) -> Counter
         if swept.parameter in changes:
             raise SettingsError(f"{swept.parameter}: set and swept. Give one of the two.")
     recordings = ComparisonRequest(log=request.log, mavlink=request.mavlink, system=request.system)
-    flight = read_flight(recordings, progress)
+    flight = flight or read_flight(recordings, progress)
     progress("replaying EKF2")
     model = open_model(flight)
     if isinstance(model, Unavailable):
         raise MissingDataError(f"{flight.log.name}: {model}")
     asked = not changes and swept is None
     if asked and model.agreement.good:
-        changes = asked_changes(model, progress)
+        comparison = compare(flight, axes=("north", "east"))
+        tuning = tuned_horizontally(comparison)
+        clock = clock_offset(comparison, tuning, progress)
+        changes = asked_of_ekf2(comparison, model, tuning, clock)
+        if not changes:
+            why = "the data do not tell the noise and the delay of what EKF2 fused"
+            if may_drift(flight, comparison.source):
+                why = (
+                    f"{comparison.source.name} may drift, so that innovations do not tell its "
+                    "noise, and the delay is as the data ask for or not determinable"
+                )
+            raise MissingDataError(
+                f"{flight.log.name}: {why}. Say what to change: `changes` EKF2_EVP_NOISE=0.1."
+            )
     settings = [changes] if changes else []
     if swept is not None:
         settings += [{**changes, swept.parameter: value} for value in values]
@@ -396,32 +413,6 @@ def run_what_if(request: WhatIfRequest, progress: Progress = _silent) -> Counter
     if isinstance(found, Unavailable):
         raise MissingDataError(f"{flight.log.name}: {found}")
     return Counterfactual(flight, found, changes, asked)
-
-
-def asked_changes(model: Model, progress: Progress = _silent) -> dict[str, float]:
-    """EKF2's noise and delay as the data ask for them, by PX4 name.
-
-    Raises
-    ------
-    MissingDataError
-        The data do not tell.
-    """
-    flight = model.flight
-    comparison = compare(flight, axes=("north", "east"))
-    tuning = tuned_horizontally(comparison)
-    clock = clock_offset(comparison, tuning, progress)
-    changes = asked_of_ekf2(comparison, model, tuning, clock)
-    if not changes:
-        why = "the data do not tell the noise and the delay of what EKF2 fused"
-        if may_drift(flight, comparison.source):
-            why = (
-                f"{comparison.source.name} may drift, so that innovations do not tell its "
-                "noise, and the delay is as the data ask for or not determinable"
-            )
-        raise MissingDataError(
-            f"{flight.log.name}: {why}. Say what to change: `changes` EKF2_EVP_NOISE=0.1."
-        )
-    return changes
 
 
 def explain(comparison: Comparison, progress: Progress = _silent) -> Analysis:

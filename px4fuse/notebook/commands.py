@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-from px4fuse.analysis import Analysis, asked_changes, run
+from px4fuse.analysis import Analysis, run, run_what_if
 from px4fuse.ekf2 import whatif
 from px4fuse.ekf2.model import Model, open_model
 from px4fuse.ekf2.whatif import WhatIf
@@ -26,6 +26,7 @@ from px4fuse.request import (
     GivenClosure,
     InputName,
     PositionFile,
+    WhatIfRequest,
 )
 from px4fuse.trajectory import evaluation
 from px4fuse.trajectory.evaluation import Evaluation
@@ -242,13 +243,14 @@ def what_if(
         The log cannot be read, EKF2 cannot be replayed from it or the replay does not agree with
         the log, or a parameter is unknown or out of PX4's range.
     """
-    if not isinstance(log, Flight | Model):
-        log = read_log(log)
-    model = log if isinstance(log, Model) else open_model(log)
+    flight = log.flight if isinstance(log, Model) else log
+    if not isinstance(flight, Flight):
+        flight = read_log(flight)
+    if changes is None:
+        return run_what_if(WhatIfRequest(log=flight.log.name), flight=flight).whatif
+    model = log if isinstance(log, Model) else open_model(flight)
     if isinstance(model, Unavailable):
         raise MissingDataError(str(model))
-    if changes is None:
-        changes = asked_changes(model)
     found = whatif.what_if(model, [changes] if isinstance(changes, Mapping) else changes)
     if isinstance(found, Unavailable):
         raise MissingDataError(str(found))
