@@ -11,15 +11,15 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
+from math import floor
 
 import numpy as np
 from scipy.optimize import brentq, minimize
-from scipy.special import expit
-from scipy.stats import chi2
+from scipy.special import comb, expit, gammaincinv
 
 from px4fuse.arrays import Array
 from px4fuse.filter.likelihood import PROFILE_DROP, Preintegrated
-from px4fuse.filter.marginal import Chain, Positions, fit, squares
+from px4fuse.filter.marginal import Chain, Fitted, Positions, centred, fit, squares
 from px4fuse.filter.model import INITIAL_COVARIANCE
 
 SIGMA_A_SEARCH_M_S2 = (1e-3, 30.0)
@@ -39,13 +39,17 @@ SETTLED = 0.01
 SLOPE_STEP, BEND_STEP = 1e-4, 0.05
 # Of those: how far a parabola is followed at once, and how often
 FAR_STEPS, PARABOLAS = 6.0, 4
+# Nodes about each place, and their distance in ln σ
+NODES, NODE_STEP = 10, 0.25
+# Precision of a start that is known (1/m² and s²/m²): to a micrometre
+KNOWN = 1e12
 # ln σ at which the end of an interval is sought first
 FIRST_REACH = 0.05
 
 
 @dataclass(frozen=True)
 class Part:
-    """Axes that are fitted together, with the legs under them, shape (n, a, 1, 1 + c)."""
+    """Axes that are fitted together, with the legs under them, shape (a, T, 1 + c, n)."""
 
     positions: Positions
     delta_position_m: Array
@@ -70,6 +74,94 @@ class Noises:
     walk_m: float = 0.0
 
 
+class Likelihood:
+    """-ln p of the measurements but for a constant, over the noises.
+
+    Where nothing but the noises of acceleration and measurements is random, all but a scale depends
+    on their ratio alone, smoothly: it is evaluated at nodes of ln(SIGMA_A/SIGMA_Z) and ln SIGMA_Z,
+    when they are first needed, and polynomials give what is between. Singularities of the
+    likelihood lie π/2 off the real axis, so that these are as good as rounding.
+
+    Parameters
+    ----------
+    parts : sequence of Part
+        With one choice of the legs.
+    weight : ndarray, shape (m,)
+    sigma_z_m : float
+        About what it will be: what is as good as known or unknown at a start scales with it.
+    """
+
+    def __init__(self, parts: Sequence[Part], weight: Array, sigma_z_m: float) -> None:
+        self.parts, self.weight, self.sigma_z_m = parts, weight, sigma_z_m
+        self.tabulated = not any(part.positions.chain.noise_fixed.any() for part in parts)
+        self._fits: dict[int, list[Fitted]] = {}
+        self._values: dict[tuple[int, int], Array] = {}
+
+    def __call__(self, noises: Noises) -> float:
+        """-ln p with some noises."""
+        if noises.walk_m or not self.tabulated:
+            return negative_log_likelihood(self.parts, noises, self.weight)
+        ln_z = float(np.log(noises.sigma_z_m)) / NODE_STEP
+        ln_ratio = float(np.log(noises.sigma_a_m_s2)) / NODE_STEP - ln_z
+        first = floor(ln_ratio) - NODES // 2 + 1, floor(ln_z) - NODES // 2 + 1
+        if first not in self._values:
+            self._values[first] = self._nodes(*first)
+        across, along = _between(ln_ratio - first[0]), _between(ln_z - first[1])
+        return float(across @ self._values[first] @ along)
+
+    def _nodes(self, of_ratio: int, of_z: int) -> Array:
+        """Values at the nodes about one place, from the first ones on."""
+        scales = np.exp(NODE_STEP * (of_z + np.arange(NODES))).tolist()
+        values = np.empty((NODES, NODES))
+        for row in range(NODES):
+            at = of_ratio + row
+            if at not in self._fits:
+                ratio = float(np.exp(NODE_STEP * at))
+                self._fits[at] = [
+                    of_ratio_alone(part, ratio, 0.0, self.weight, self.sigma_z_m)
+                    for part in self.parts
+                ]
+            values[row] = sum(fitted.totals(scales) for fitted in self._fits[at])
+        return values
+
+
+def _between(at: float) -> Array:
+    """Weights of values at 0, 1, ... for the polynomial through them (Berrut, Trefethen 2004)."""
+    nodes = np.arange(NODES)
+    away = at - nodes
+    if not away.all():
+        return np.asarray(away == 0.0, dtype=np.float64)
+    weights = (-1.0) ** nodes * comb(NODES - 1, nodes) / away
+    return np.asarray(weights / weights.sum())
+
+
+def of_ratio_alone(
+    part: Part, ratio: float, walk: float, weight: Array, sigma_z_m: float
+) -> Fitted:
+    """Fit with noises over SIGMA_Z; what is fixed is taken at a SIGMA_Z.
+
+    Parameters
+    ----------
+    part : Part
+    ratio : float
+        SIGMA_A / SIGMA_Z, 1/s².
+    walk : float
+        Walk of the source over SIGMA_Z.
+    weight : ndarray, shape (m,)
+    sigma_z_m : float
+    """
+    positions = part.positions
+    chain = positions.chain
+    fixed = chain.noise_fixed / sigma_z_m**2
+    chain = replace(chain, noise_fixed=fixed + np.outer(chain.length_s * walk**2, [1.0, 0.0, 0.0]))
+    positions = replace(positions, chain=chain, initial=positions.initial * sigma_z_m**2)
+    extra = np.ones(
+        len(positions.measurement_m) - len(weight)
+    )
+    variance = 1.0 / np.concatenate([extra, weight])
+    return fit(positions, part.delta_position_m, part.delta_velocity_m_s, ratio, variance)
+
+
 @dataclass(frozen=True)
 class NoiseFit:
     """Noises of greatest likelihood.
@@ -81,23 +173,30 @@ class NoiseFit:
         What each measurement counts: 1 for a good one, 1/width² for an outlier.
     outlier : ndarray, shape (m,)
         Probability that it is one.
+    score : Likelihood
+        With these weights.
     """
 
     noises: Noises
     weight: Array
     outlier: Array
+    score: Likelihood
 
 
 def filter_part(legs: Preintegrated) -> Part:
-    """The lesson's filter of one axis: it starts with P₀ and knows no constants."""
+    """The lesson's filter of one axis: its constants are the errors of its start, with P₀."""
     count = len(legs.measurement_m)
     initial = np.zeros((count + 1, 2))
-    initial[0] = 1.0 / INITIAL_COVARIANCE[0], 1.0 / INITIAL_COVARIANCE[2]
-    measured = np.concatenate([[0.0], legs.measurement_m - legs.initial.position_m])[:, None]
+    initial[0] = KNOWN
+    measured = np.concatenate([[np.nan], legs.measurement_m - legs.initial.position_m])[:, None]
     chain = Chain(np.arange(1, count + 1), legs.length_s, legs.noise_unit, legs.noise_fixed)
-    positions = Positions(chain, measured, np.array([0]), initial, np.array([]))
-    dp, dv = legs.delta_position_m, legs.delta_velocity_m_s
-    return Part(positions, dp[:, None, None, None], dv[:, None, None, None])
+    sigma = np.sqrt([INITIAL_COVARIANCE[0], INITIAL_COVARIANCE[2]])
+    positions = Positions(chain, measured, np.array([0]), initial, sigma)
+    dp, dv = np.zeros((2, 1, 1, 3, count))
+    dp[0, 0, 0], dv[0, 0, 0] = legs.delta_position_m, legs.delta_velocity_m_s
+    # an error of the start moves the first leg
+    dp[0, 0, 1:, 0], dv[0, 0, 2, 0] = (1.0, legs.length_s[0]), 1.0
+    return Part(*centred(positions, dp, dv))
 
 
 def negative_log_likelihood(parts: Sequence[Part], noises: Noises, weight: Array) -> float:
@@ -109,7 +208,14 @@ def negative_log_likelihood(parts: Sequence[Part], noises: Noises, weight: Array
     noises : Noises
     weight : ndarray, shape (m,)
     """
-    return float(sum(fit(*arguments(part, noises, weight)).total()[0] for part in parts))
+    return float(sum(fitted(part, noises, weight).total()[0] for part in parts))
+
+
+def fitted(part: Part, noises: Noises, weight: Array) -> Fitted:
+    """Fit a part with some noises and weights."""
+    sigma = noises.sigma_z_m
+    ratios = noises.sigma_a_m_s2 / sigma, noises.walk_m / sigma
+    return of_ratio_alone(part, *ratios, weight, sigma).scaled(sigma)
 
 
 def arguments(
@@ -119,8 +225,8 @@ def arguments(
     variance = noises.sigma_z_m**2 / weight
     positions = part.positions
     extra = len(positions.measurement_m) - len(variance)
-    if extra:  # the filter's start, which counts by its own precision
-        variance = np.concatenate([np.full(extra, np.inf), variance])
+    if extra:  # the filter's start, which is not measured
+        variance = np.concatenate([np.ones(extra), variance])
     if noises.walk_m:
         chain = positions.chain
         walk = np.outer(chain.length_s * noises.walk_m**2, [1.0, 0.0, 0.0])
@@ -145,31 +251,34 @@ def most_likely(
     outliers : bool
         Whether they are sought; else the weights stay.
     """
-    noises = _maximise(parts, start, weight)
+    score = Likelihood(parts, weight, start.sigma_z_m)
+    noises = _maximise(score, start)
+    outlier = np.zeros_like(weight)
     if not outliers:
-        return NoiseFit(noises, weight, np.zeros_like(weight))
-    share, width, outlier = FIRST_SHARE, FIRST_WIDTH, np.zeros_like(weight)
+        return NoiseFit(noises, weight, outlier, score)
+    share, width = FIRST_SHARE, FIRST_WIDTH
     for _ in range(MAX_PASSES):
         square, count = _squares(parts, noises, weight)
         # outliers raise the noise that hides them: the median does not follow them
-        bulk = float(np.median(square / count) / (chi2.median(count[0]) / count[0]))
+        bulk = float(np.median(square / count) / (chi_square_median(count[0]) / count[0]))
         if bulk > SIGMA_Z_SEARCH_M[1] ** 2:  # noise beyond the search is not outliers
-            return NoiseFit(noises, weight, outlier)
+            return NoiseFit(noises, weight, outlier, score)
         variance = min(noises.sigma_z_m**2, BULK**2 * bulk)
         found = _outlier_probability(square / variance, count, share, width)
         if found.sum() < 1.0 and found.max() < 0.5 and not outlier.any():
-            return NoiseFit(noises, weight, outlier)
+            return NoiseFit(noises, weight, outlier, score)
         share = float(np.clip(found.mean(), 0.5 / len(found), MAX_SHARE))
         wide = float(np.sum(found * square) / max(np.sum(found * count), 1e-9)) / variance
         width = max(LEAST_WIDTH, float(np.sqrt(wide)))
         weight = 1.0 - found * (1.0 - width**-2.0)
+        score = Likelihood(parts, weight, start.sigma_z_m)
         settled = bool(np.max(np.abs(found - outlier)) < SETTLED)
         outlier = found
         if settled:
             break
         guess = replace(noises, sigma_z_m=float(np.sqrt(variance)))
-        noises = _maximise(parts, guess, weight, ROUGH_STEPS)
-    return NoiseFit(_maximise(parts, noises, weight), weight, outlier)
+        noises = _maximise(score, guess, ROUGH_STEPS)
+    return NoiseFit(_maximise(score, noises), weight, outlier, score)
 
 
 def _squares(parts: Sequence[Part], noises: Noises, weight: Array) -> tuple[Array, Array]:
@@ -181,19 +290,22 @@ def _squares(parts: Sequence[Part], noises: Noises, weight: Array) -> tuple[Arra
     )
 
 
+def chi_square_median(freedom: float) -> float:
+    """Median of chi-square."""
+    return 2.0 * float(gammaincinv(freedom / 2.0, 0.5))
+
+
 def _outlier_probability(square: Array, count: Array, share: float, width: float) -> Array:
     odds = np.log(share / (1.0 - share)) - count * np.log(width)
     return np.asarray(expit(odds + 0.5 * square * (1.0 - width**-2.0)))
 
 
-def _maximise(
-    parts: Sequence[Part], start: Noises, weight: Array, steps: int = MAX_STEPS
-) -> Noises:
+def _maximise(likelihood: Likelihood, start: Noises, steps: int = MAX_STEPS) -> Noises:
     values = [start.sigma_a_m_s2, start.sigma_z_m, *([start.walk_m] if start.walk_m else [])]
     bounds = np.log([SIGMA_A_SEARCH_M_S2, SIGMA_Z_SEARCH_M, WALK_SEARCH_M][: len(values)])
 
     def score(logs: Array) -> float:
-        return negative_log_likelihood(parts, Noises(*np.exp(logs).tolist()), weight)
+        return likelihood(Noises(*np.exp(logs).tolist()))
 
     found = minimize(
         score,
