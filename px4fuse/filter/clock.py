@@ -278,7 +278,7 @@ def _profiled(problem: _Problem, curve: Array, noises: Noises, offset: float) ->
     def at(shift_a: int, shift_z: int) -> Array:
         scale = sigma_z * float(np.exp(NOISE_STEP * shift_z))
         found = of_ratio(NOISE_STEP * (shift_a - shift_z), noises.walk_m / scale)
-        return np.array([each.totals([scale])[0] for each in found])
+        return np.array([each.totals(np.array([scale]))[0, 0] for each in found])
 
     made = at(0, 0)
     ahead, back = (np.array([at(sign, 0), at(0, sign)]) for sign in (1, -1))

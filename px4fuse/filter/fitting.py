@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from math import floor
+from math import floor, log
 
 import numpy as np
 from scipy.optimize import brentq, minimize
@@ -39,8 +39,8 @@ SETTLED = 0.01
 SLOPE_STEP, BEND_STEP = 1e-4, 0.05
 # Of those: how far a parabola is followed at once, and how often
 FAR_STEPS, PARABOLAS = 6.0, 4
-# Nodes about each place, and their distance in ln σ
-NODES, NODE_STEP = 10, 0.25
+# Nodes about each place, and their distance in ln σ; while the outliers still change, few
+NODES, ROUGH_NODES = (10, 0.25), (6, 0.2)
 # Precision of a start that is known (1/m² and s²/m²): to a micrometre
 KNOWN = 1e12
 # ln σ at which the end of an interval is sought first
@@ -89,11 +89,16 @@ class Likelihood:
     weight : ndarray, shape (m,)
     sigma_z_m : float
         About what it will be: what is as good as known or unknown at a start scales with it.
+    rough : bool
+        Whether the maximum only needs to be near.
     """
 
-    def __init__(self, parts: Sequence[Part], weight: Array, sigma_z_m: float) -> None:
+    def __init__(
+        self, parts: Sequence[Part], weight: Array, sigma_z_m: float, rough: bool = False
+    ) -> None:
         self.parts, self.weight, self.sigma_z_m = parts, weight, sigma_z_m
         self.tabulated = not any(part.positions.chain.noise_fixed.any() for part in parts)
+        self.nodes, self.step = ROUGH_NODES if rough else NODES
         self._fits: dict[int, list[Fitted]] = {}
         self._values: dict[tuple[int, int], Array] = {}
 
@@ -101,37 +106,42 @@ class Likelihood:
         """-ln p with some noises."""
         if noises.walk_m or not self.tabulated:
             return negative_log_likelihood(self.parts, noises, self.weight)
-        ln_z = float(np.log(noises.sigma_z_m)) / NODE_STEP
-        ln_ratio = float(np.log(noises.sigma_a_m_s2)) / NODE_STEP - ln_z
-        first = floor(ln_ratio) - NODES // 2 + 1, floor(ln_z) - NODES // 2 + 1
+        ln_z = log(noises.sigma_z_m) / self.step
+        ln_ratio = log(noises.sigma_a_m_s2) / self.step - ln_z
+        first = tuple(floor(at) - (self.nodes - 1) // 2 for at in (ln_ratio, ln_z))
         if first not in self._values:
-            self._values[first] = self._nodes(*first)
-        across, along = _between(ln_ratio - first[0]), _between(ln_z - first[1])
+            self._values[first] = self._around(*first)
+        across, along = (
+            _between(at - low, self.nodes) for at, low in zip((ln_ratio, ln_z), first, strict=True)
+        )
         return float(across @ self._values[first] @ along)
 
-    def _nodes(self, of_ratio: int, of_z: int) -> Array:
+    def _around(self, of_ratio: int, of_z: int) -> Array:
         """Values at the nodes about one place, from the first ones on."""
-        scales = np.exp(NODE_STEP * (of_z + np.arange(NODES))).tolist()
-        values = np.empty((NODES, NODES))
-        for row in range(NODES):
-            at = of_ratio + row
-            if at not in self._fits:
-                ratio = float(np.exp(NODE_STEP * at))
-                self._fits[at] = [
-                    of_ratio_alone(part, ratio, 0.0, self.weight, self.sigma_z_m)
-                    for part in self.parts
-                ]
-            values[row] = sum(fitted.totals(scales) for fitted in self._fits[at])
-        return values
+        scales = np.exp(self.step * (of_z + np.arange(self.nodes)))
+        return np.array([self._row(of_ratio + row, scales) for row in range(self.nodes)])
+
+    def _row(self, of_ratio: int, scales: Array) -> Array:
+        if of_ratio not in self._fits:
+            ratio = float(np.exp(self.step * of_ratio))
+            self._fits[of_ratio] = [
+                of_ratio_alone(part, ratio, 0.0, self.weight, self.sigma_z_m) for part in self.parts
+            ]
+        return np.sum([fitted.totals(scales)[:, 0] for fitted in self._fits[of_ratio]], axis=0)
 
 
-def _between(at: float) -> Array:
+@cache
+def _signs(count: int) -> Array:
+    nodes = np.arange(count)
+    return np.asarray((-1.0) ** nodes * comb(count - 1, nodes))
+
+
+def _between(at: float, count: int) -> Array:
     """Weights of values at 0, 1, ... for the polynomial through them (Berrut, Trefethen 2004)."""
-    nodes = np.arange(NODES)
-    away = at - nodes
+    away = at - np.arange(count)
     if not away.all():
         return np.asarray(away == 0.0, dtype=np.float64)
-    weights = (-1.0) ** nodes * comb(NODES - 1, nodes) / away
+    weights = _signs(count) / away
     return np.asarray(weights / weights.sum())
 
 
@@ -251,34 +261,31 @@ def most_likely(
     outliers : bool
         Whether they are sought; else the weights stay.
     """
-    score = Likelihood(parts, weight, start.sigma_z_m)
-    noises = _maximise(score, start)
     outlier = np.zeros_like(weight)
-    if not outliers:
-        return NoiseFit(noises, weight, outlier, score)
-    share, width = FIRST_SHARE, FIRST_WIDTH
-    for _ in range(MAX_PASSES):
+    share, width, noises = FIRST_SHARE, FIRST_WIDTH, start
+    for again in range(MAX_PASSES if outliers else 0):
+        likelihood = Likelihood(parts, weight, start.sigma_z_m, rough=True)
+        noises = _maximise(likelihood, noises, ROUGH_STEPS if again else MAX_STEPS)
         square, count = _squares(parts, noises, weight)
         # outliers raise the noise that hides them: the median does not follow them
         bulk = float(np.median(square / count) / (chi_square_median(count[0]) / count[0]))
         if bulk > SIGMA_Z_SEARCH_M[1] ** 2:  # noise beyond the search is not outliers
-            return NoiseFit(noises, weight, outlier, score)
+            break
         variance = min(noises.sigma_z_m**2, BULK**2 * bulk)
         found = _outlier_probability(square / variance, count, share, width)
         if found.sum() < 1.0 and found.max() < 0.5 and not outlier.any():
-            return NoiseFit(noises, weight, outlier, score)
+            break
         share = float(np.clip(found.mean(), 0.5 / len(found), MAX_SHARE))
         wide = float(np.sum(found * square) / max(np.sum(found * count), 1e-9)) / variance
         width = max(LEAST_WIDTH, float(np.sqrt(wide)))
         weight = 1.0 - found * (1.0 - width**-2.0)
-        score = Likelihood(parts, weight, start.sigma_z_m)
         settled = bool(np.max(np.abs(found - outlier)) < SETTLED)
         outlier = found
         if settled:
             break
-        guess = replace(noises, sigma_z_m=float(np.sqrt(variance)))
-        noises = _maximise(score, guess, ROUGH_STEPS)
-    return NoiseFit(_maximise(score, noises), weight, outlier, score)
+        noises = replace(noises, sigma_z_m=float(np.sqrt(variance)))
+    likelihood = Likelihood(parts, weight, start.sigma_z_m)
+    return NoiseFit(_maximise(likelihood, noises), weight, outlier, likelihood)
 
 
 def _squares(parts: Sequence[Part], noises: Noises, weight: Array) -> tuple[Array, Array]:

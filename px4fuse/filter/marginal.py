@@ -23,6 +23,7 @@ from px4fuse.arrays import Array, IntArray
 # Position noise of a leg over that of a measurement that is always there: Q has an inverse, also
 # that of a single step, which is of rank one, or without process noise
 LEAST_SHARE = 1e-5
+ONE = np.ones(1)
 # SIGMA_A and SIGMA_Z of a smooth path
 PATH_NOISES = 0.5, 0.1
 # Precision of a start (1/m²) above which it is known, below which as good as nothing is
@@ -282,22 +283,30 @@ class Fitted:
         found = -np.einsum("stij,stj->sti", covariance, self.gram[..., 1:, 0])
         return np.asarray(found), np.asarray(covariance)
 
-    def by_stretch(self) -> Array:
-        """-ln p of each stretch but for what the noises alone make, shape (s, T)."""
-        square = self.gram[..., 0, 0]
+    def by_stretch(self, scales: Array = ONE) -> Array:
+        """-ln p of each stretch but for what the noises alone make, shape (s, T).
+
+        Parameters
+        ----------
+        scales : ndarray, shape (k,), optional
+            By which all noises are multiplied: the shape is then (k, s, T).
+        """
+        gram = self.gram if scales is ONE else self.gram / scales[:, None, None, None, None] ** 2
+        square = gram[..., 0, 0]
         if not len(self.constant_sigma):
             return np.asarray(0.5 * square)
         scale = self.constant_sigma
-        information = self.gram[..., 1:, 1:] * np.outer(scale, scale) + np.eye(len(scale))
-        cross = self.gram[..., 1:, 0] * scale
+        information = gram[..., 1:, 1:] * np.outer(scale, scale) + np.eye(len(scale))
+        cross = gram[..., 1:, 0] * scale
         lower = np.linalg.cholesky(information)
         solved = np.linalg.solve(information, cross[..., None])[..., 0]
         log_lower = np.log(np.diagonal(lower, axis1=-2, axis2=-1)).sum(axis=-1)
         return np.asarray(0.5 * (square - np.sum(cross * solved, axis=-1)) + log_lower)
 
-    def totals(self, scales: list[float]) -> Array:
-        """-ln p with all noises so many times as large, shape (k,), of the first choice of T."""
-        return np.array([self.scaled(scale).total()[0] for scale in scales])
+    def totals(self, scales: Array) -> Array:
+        """-ln p of all with all noises so many times as large, but for a constant, (k, T)."""
+        noises_alone = 0.5 * self.log_determinant + self.freedom * np.log(scales)
+        return np.asarray(self.by_stretch(scales).sum(axis=1) + noises_alone[:, None])
 
     def total(self) -> Array:
         """-ln p of all, but for a constant, shape (T,)."""
