@@ -165,9 +165,7 @@ def of_ratio_alone(
     fixed = chain.noise_fixed / sigma_z_m**2
     chain = replace(chain, noise_fixed=fixed + np.outer(chain.length_s * walk**2, [1.0, 0.0, 0.0]))
     positions = replace(positions, chain=chain, initial=positions.initial * sigma_z_m**2)
-    extra = np.ones(
-        len(positions.measurement_m) - len(weight)
-    )
+    extra = np.ones(len(positions.measurement_m) - len(weight))
     variance = 1.0 / np.concatenate([extra, weight])
     return fit(positions, part.delta_position_m, part.delta_velocity_m_s, ratio, variance)
 

@@ -302,9 +302,7 @@ def _replayed(
             position, velocity = position + gain * nu, velocity + velocity_gain * nu
             count += 1
         state[step], covariance[step] = (position, velocity), _elements(kalman.P)
-    time, updated = (
-        pd.Index(each, name="time_s") for each in (line.time_s, line.time_s[update])
-    )
+    time, updated = (pd.Index(each, name="time_s") for each in (line.time_s, line.time_s[update]))
     runs = []
     for at, (axis, own) in enumerate(zip(axes, lines, strict=True)):
         steps = pd.DataFrame(
