@@ -27,14 +27,13 @@ from px4fuse.filter.fitting import (
     Noises,
     Part,
     arguments,
-    fitted,
     most_likely,
-    of_ratio_alone,
+    of_ratios,
 )
 from px4fuse.filter.kalman import Settings
 from px4fuse.filter.likelihood import PROFILE_DROP, parabola_vertex, profile_interval
 from px4fuse.filter.marginal import Columns, Fitted, centred, paired_products
-from px4fuse.filter.motion import CONSTANT_SIGMA, SEARCH_S, Motion, motion
+from px4fuse.filter.motion import CONSTANT_SIGMA, SEARCH_S, Made, Motion, motion
 from px4fuse.filter.signals import Segment, within
 from px4fuse.flight import POSITION_COLUMNS, Flight, PositionTrack, Unavailable
 
@@ -130,15 +129,24 @@ class _Problem:
         return Part(*centred(self.motion.positions(self.positions_m, self.dt_s), *legs))
 
     def fitted(self, offset_s: Array | float, noises: Noises) -> Fitted:
+        sigma = noises.sigma_z_m
+        ratio, walk = noises.sigma_a_m_s2 / sigma, noises.walk_m / sigma
+        return self.of_ratios(np.atleast_1d(offset_s), [ratio], walk, sigma)[0].scaled(sigma)
+
+    def of_ratios(
+        self, offset_s: Array, ratios: list[float], walk: float, sigma_z_m: float
+    ) -> list[Fitted]:
         """Fit at some offsets, a few at a time: their signals are long."""
-        offsets = np.atleast_1d(offset_s)
         count = len(self.motion.time_s)
         each = max(1, BLOCK // (count * len(self.directions) * (1 + len(CONSTANT_SIGMA))))
-        found = [
-            fitted(self.part(offsets[at : at + each]), noises, np.ones(count))
-            for at in range(0, len(offsets), each)
+        made = [
+            of_ratios(self.part(offset_s[at : at + each]), ratios, walk, np.ones(count), sigma_z_m)
+            for at in range(0, len(offset_s), each)
         ]
-        return replace(found[0], gram=np.concatenate([part.gram for part in found], axis=1))
+        return [
+            replace(of_one[0], gram=np.concatenate([part.gram for part in of_one], axis=1))
+            for of_one in zip(*made, strict=True)
+        ]
 
 
 def estimate_clock_offset(
@@ -149,6 +157,7 @@ def estimate_clock_offset(
     noises: Noises,
     outlier_time_s: Array | None = None,
     progress: Callable[[str], None] = lambda _: None,
+    made: Made | None = None,
 ) -> ClockOffset | Unavailable:
     """Estimate what must be added to the stamps of a position track.
 
@@ -166,6 +175,8 @@ def estimate_clock_offset(
     outlier_time_s : ndarray, optional
         Measurements to leave out.
     progress : callable
+    made : dict, optional
+        As :func:`px4fuse.filter.motion.motion` has it.
 
     Returns
     -------
@@ -178,7 +189,7 @@ def estimate_clock_offset(
     samples = within(track.samples, segment)[POSITION_COLUMNS].dropna(subset=POSITION_COLUMNS[:2])
     if outlier_time_s is not None and len(outlier_time_s):
         samples = samples[~np.isin(samples.index.to_numpy(), outlier_time_s)]
-    moved = motion(flight.imu, flight.attitude, samples.index.to_numpy())
+    moved = motion(flight.imu, flight.attitude, samples.index.to_numpy(), made)
     count = 0 if moved is None else len(moved.time_s)
     if moved is None or count < MIN_MEASUREMENTS:
         return Unavailable(
@@ -247,10 +258,7 @@ def estimate_clock_offset(
 
 def _coarse(problem: _Problem, noises: Noises) -> float:
     """Offset of greatest likelihood over the whole search, from some of the measurements."""
-    count = len(problem.motion.time_s)
-    some = problem.motion.only(np.arange(count) % max(1, count // COARSE_MEASUREMENTS) == 0)
-    if some is None:
-        return 0.0
+    some = problem.motion.thinned(COARSE_MEASUREMENTS) or problem.motion
     grid = np.linspace(-SEARCH_S, SEARCH_S, COARSE_POINTS)
     return float(grid[np.argmin(replace(problem, motion=some).fitted(grid, noises).total())])
 
@@ -267,18 +275,14 @@ def _profiled(problem: _Problem, curve: Array, noises: Noises, offset: float) ->
     The step's slopes are taken at each offset; the bends, which hardly change, at the best one.
     """
     sigma_z, sigma_a = noises.sigma_z_m, noises.sigma_a_m_s2
-    legs = [problem.part(at) for at in np.append(curve, offset).tolist()]
-    weight = np.ones(len(problem.motion.time_s))
-
-    @cache
-    def of_ratio(shift: float, walk: float) -> list[Fitted]:
-        ratio = sigma_a / sigma_z * float(np.exp(shift))
-        return [of_ratio_alone(part, ratio, walk, weight, sigma_z) for part in legs]
+    offsets = np.append(curve, offset)
+    ratios = sigma_a / sigma_z * np.exp(NOISE_STEP * np.array([-1.0, 0.0, 1.0]))
+    fits = cache(lambda walk: problem.of_ratios(offsets, ratios.tolist(), walk, sigma_z))
 
     def at(shift_a: int, shift_z: int) -> Array:
         scale = sigma_z * float(np.exp(NOISE_STEP * shift_z))
-        found = of_ratio(NOISE_STEP * (shift_a - shift_z), noises.walk_m / scale)
-        return np.array([each.totals(np.array([scale]))[0, 0] for each in found])
+        found: Fitted = fits(noises.walk_m / scale)[1 + shift_a - shift_z]
+        return found.totals(np.array([scale]))[0]
 
     made = at(0, 0)
     ahead, back = (np.array([at(sign, 0), at(0, sign)]) for sign in (1, -1))

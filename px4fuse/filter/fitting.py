@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, cached_property
 from math import floor, log
 
 import numpy as np
@@ -18,6 +18,7 @@ from scipy.optimize import brentq, minimize
 from scipy.special import comb, expit, gammaincinv
 
 from px4fuse.arrays import Array
+from px4fuse.filter.lanes import Lanes, lanes
 from px4fuse.filter.likelihood import PROFILE_DROP, Preintegrated
 from px4fuse.filter.marginal import Chain, Fitted, Positions, centred, fit, squares
 from px4fuse.filter.model import INITIAL_COVARIANCE
@@ -54,6 +55,11 @@ class Part:
     positions: Positions
     delta_position_m: Array
     delta_velocity_m_s: Array
+
+    @cached_property
+    def lanes(self) -> Lanes | None:
+        """The same, stretches side by side, where there are several."""
+        return lanes(self.positions, self.delta_position_m, self.delta_velocity_m_s)
 
 
 @dataclass(frozen=True)
@@ -99,7 +105,7 @@ class Likelihood:
         self.parts, self.weight, self.sigma_z_m = parts, weight, sigma_z_m
         self.tabulated = not any(part.positions.chain.noise_fixed.any() for part in parts)
         self.nodes, self.step = ROUGH_NODES if rough else NODES
-        self._fits: dict[int, list[Fitted]] = {}
+        self._fits: dict[int, tuple[Fitted, ...]] = {}
         self._values: dict[tuple[int, int], Array] = {}
 
     def __call__(self, noises: Noises) -> float:
@@ -118,16 +124,18 @@ class Likelihood:
 
     def _around(self, of_ratio: int, of_z: int) -> Array:
         """Values at the nodes about one place, from the first ones on."""
+        rows = range(of_ratio, of_ratio + self.nodes)
+        new = [row for row in rows if row not in self._fits]
+        ratios = np.exp(self.step * np.array(new)).tolist()
+        fits = [of_ratios(part, ratios, 0.0, self.weight, self.sigma_z_m) for part in self.parts]
+        self._fits |= dict(zip(new, zip(*fits, strict=True), strict=True))
         scales = np.exp(self.step * (of_z + np.arange(self.nodes)))
-        return np.array([self._row(of_ratio + row, scales) for row in range(self.nodes)])
-
-    def _row(self, of_ratio: int, scales: Array) -> Array:
-        if of_ratio not in self._fits:
-            ratio = float(np.exp(self.step * of_ratio))
-            self._fits[of_ratio] = [
-                of_ratio_alone(part, ratio, 0.0, self.weight, self.sigma_z_m) for part in self.parts
+        return np.array(
+            [
+                np.sum([fitted.totals(scales)[:, 0] for fitted in self._fits[row]], axis=0)
+                for row in rows
             ]
-        return np.sum([fitted.totals(scales)[:, 0] for fitted in self._fits[of_ratio]], axis=0)
+        )
 
 
 @cache
@@ -145,15 +153,15 @@ def _between(at: float, count: int) -> Array:
     return np.asarray(weights / weights.sum())
 
 
-def of_ratio_alone(
-    part: Part, ratio: float, walk: float, weight: Array, sigma_z_m: float
-) -> Fitted:
+def of_ratios(
+    part: Part, ratios: Sequence[float], walk: float, weight: Array, sigma_z_m: float
+) -> list[Fitted]:
     """Fit with noises over SIGMA_Z; what is fixed is taken at a SIGMA_Z.
 
     Parameters
     ----------
     part : Part
-    ratio : float
+    ratios : sequence of float
         SIGMA_A / SIGMA_Z, 1/s².
     walk : float
         Walk of the source over SIGMA_Z.
@@ -165,9 +173,13 @@ def of_ratio_alone(
     fixed = chain.noise_fixed / sigma_z_m**2
     chain = replace(chain, noise_fixed=fixed + np.outer(chain.length_s * walk**2, [1.0, 0.0, 0.0]))
     positions = replace(positions, chain=chain, initial=positions.initial * sigma_z_m**2)
+    # the filter's start is not measured
     extra = np.ones(len(positions.measurement_m) - len(weight))
     variance = 1.0 / np.concatenate([extra, weight])
-    return fit(positions, part.delta_position_m, part.delta_velocity_m_s, ratio, variance)
+    if part.lanes is not None:
+        return replace(part.lanes, positions=positions).fit(ratios, variance)
+    legs = part.delta_position_m, part.delta_velocity_m_s
+    return [fit(positions, *legs, ratio, variance) for ratio in ratios]
 
 
 @dataclass(frozen=True)
@@ -222,8 +234,8 @@ def negative_log_likelihood(parts: Sequence[Part], noises: Noises, weight: Array
 def fitted(part: Part, noises: Noises, weight: Array) -> Fitted:
     """Fit a part with some noises and weights."""
     sigma = noises.sigma_z_m
-    ratios = noises.sigma_a_m_s2 / sigma, noises.walk_m / sigma
-    return of_ratio_alone(part, *ratios, weight, sigma).scaled(sigma)
+    ratio, walk = noises.sigma_a_m_s2 / sigma, noises.walk_m / sigma
+    return of_ratios(part, [ratio], walk, weight, sigma)[0].scaled(sigma)
 
 
 def arguments(

@@ -19,7 +19,7 @@ from scipy import constants
 from scipy.integrate import cumulative_trapezoid
 from scipy.spatial.transform import Rotation, Slerp
 
-from px4fuse.arrays import Array, BoolArray, IntArray
+from px4fuse.arrays import Array, IntArray
 from px4fuse.filter.marginal import Chain, Positions
 from px4fuse.filter.model import move, noise_of_many_steps
 from px4fuse.filter.signals import imu_gaps
@@ -35,6 +35,8 @@ SCALE = 9
 STRETCH_S = 30.0
 SEARCH_S = 0.6
 MIN_MEASUREMENTS = 15
+# Of a stretch of which only some are taken
+FEW_MEASUREMENTS = 5
 # The IMU is averaged to this interval before it is integrated
 STEP_S = 0.02
 # Of position (1/m²) and velocity (s²/m²) where a stretch starts: as good as nothing, but enough
@@ -90,15 +92,16 @@ class Motion:
     edges: IntArray
     signals: tuple[Signals, ...]
 
-    def only(self, kept: BoolArray) -> Motion | None:
-        """Some of the measurements, in the stretches that still have enough; None where none has.
+    def thinned(self, count: int) -> Motion | None:
+        """About so many of the measurements, in the stretches that keep a few; None without one.
 
         Parameters
         ----------
-        kept : ndarray of bool, shape (m,)
+        count : int
         """
+        kept = np.arange(len(self.time_s)) % max(1, len(self.time_s) // count) == 0
         counts = np.add.reduceat(kept.astype(int), self.edges[:-1])
-        enough = counts >= MIN_MEASUREMENTS
+        enough = counts >= FEW_MEASUREMENTS
         if not enough.any():
             return None
         kept = kept & np.repeat(enough, np.diff(self.edges))
@@ -170,7 +173,12 @@ class Motion:
         return zip(self.edges[:-1].tolist(), self.edges[1:].tolist(), self.signals, strict=True)
 
 
-def motion(imu: pd.DataFrame, attitude: pd.DataFrame, time_s: Array) -> Motion | None:
+Made = dict[tuple[float, float], Signals]
+
+
+def motion(
+    imu: pd.DataFrame, attitude: pd.DataFrame, time_s: Array, made: Made | None = None
+) -> Motion | None:
     """Cut measurements into stretches that the IMU covers without a gap.
 
     Parameters
@@ -178,11 +186,14 @@ def motion(imu: pd.DataFrame, attitude: pd.DataFrame, time_s: Array) -> Motion |
     imu, attitude : DataFrame
         As in :class:`px4fuse.flight.Flight`.
     time_s : ndarray, shape (m,)
+    made : dict, optional
+        Signals of this flight by their span, which are kept there and used again.
 
     Returns
     -------
     Motion, or None where no stretch has enough measurements or the IMU is too slow.
     """
+    made = {} if made is None else made
     imu_time = imu.index.to_numpy()
     if len(imu_time) < 2 or np.median(np.diff(imu_time)) > MAX_IMU_INTERVAL_S:
         return None
@@ -204,7 +215,9 @@ def motion(imu: pd.DataFrame, attitude: pd.DataFrame, time_s: Array) -> Motion |
             if len(part) >= MIN_MEASUREMENTS:
                 rows.append(part)
                 around = time_s[part[0]] - SEARCH_S, time_s[part[-1]] + SEARCH_S
-                signals.append(_signals(imu, attitude, around))
+                if around not in made:
+                    made[around] = _signals(imu, attitude, around)
+                signals.append(made[around])
     if not rows:
         return None
     row = np.concatenate(rows)
@@ -214,8 +227,9 @@ def motion(imu: pd.DataFrame, attitude: pd.DataFrame, time_s: Array) -> Motion |
 
 def _signals(imu: pd.DataFrame, attitude: pd.DataFrame, span: tuple[float, float]) -> Signals:
     """Acceleration in NED by the gyros' attitude, and what each constant adds to it."""
-    inside = imu.loc[(imu.index >= span[0] - 2 * STEP_S) & (imu.index <= span[1] + 2 * STEP_S)]
-    time = inside.index.to_numpy()
+    time = imu.index.to_numpy()
+    first, last = np.searchsorted(time, [span[0] - 2 * STEP_S, span[1] + 2 * STEP_S], side="left")
+    inside, time = imu.iloc[first:last], time[first:last]
     columns = [*SPECIFIC_FORCE_COLUMNS, *ANGULAR_RATE_COLUMNS]
     integral = cumulative_trapezoid(inside[columns].to_numpy(copy=True), time, axis=0, initial=0)
     edges = np.arange(time[0], time[-1], STEP_S)

@@ -31,7 +31,7 @@ from px4fuse.filter.fitting import (
 from px4fuse.filter.kalman import Settings
 from px4fuse.filter.likelihood import Preintegrated, innovations, preintegrate, total_over_grid
 from px4fuse.filter.marginal import centred
-from px4fuse.filter.motion import SEARCH_S, motion
+from px4fuse.filter.motion import SEARCH_S, Made, motion
 from px4fuse.filter.signals import Axis
 from px4fuse.flight import Flight, Unavailable
 
@@ -43,6 +43,7 @@ MIN_MEASUREMENTS = 30
 MAX_OUTLIER_SHARE = 0.3
 # The clock offset is a nuisance here: a rough one is enough
 OFFSET_POINTS = 25
+COARSE_MEASUREMENTS = 600
 SIGMA_A_FACTORS = (0.1, 0.3, 1.0)
 FIRST_WALK_M = 0.02
 # A value this near to the end of its search lies there
@@ -150,6 +151,7 @@ def tune(
     progress: Callable[[str], None] = lambda _: None,
     flight: Flight | None = None,
     drifts: bool = False,
+    made: Made | None = None,
 ) -> dict[str, AxisTuning | Unavailable]:
     """Most likely SIGMA_A and SIGMA_Z of each axis, and of north and east together.
 
@@ -166,6 +168,8 @@ def tune(
         Whose IMU tells biases and tilt from noise.
     drifts : bool
         Whether the source may wander by itself, as odometry does.
+    made : dict, optional
+        As :func:`px4fuse.filter.motion.motion` has it.
 
     Returns
     -------
@@ -177,10 +181,11 @@ def tune(
         if np.array_equal(pair[0].measurement_time_s, pair[1].measurement_time_s):
             groups[HORIZONTAL] = pair
     tuned = {}
+    made = {} if made is None else made
     for name, group in groups.items():
         if names is None or name in names:
             progress(name)
-            tuned[name] = tune_axes(name, group, settings, flight, drifts)
+            tuned[name] = tune_axes(name, group, settings, flight, drifts, made)
     return tuned
 
 
@@ -190,6 +195,7 @@ def tune_axes(
     settings: Settings,
     flight: Flight | None = None,
     drifts: bool = False,
+    made: Made | None = None,
 ) -> AxisTuning | Unavailable:
     """Most likely noises that several axes share.
 
@@ -204,6 +210,8 @@ def tune_axes(
         Whose IMU tells biases and tilt from noise.
     drifts : bool
         Whether the source may wander by itself, as odometry does.
+    made : dict, optional
+        As :func:`px4fuse.filter.motion.motion` has it.
     """
     legs = [preintegrate(axis, settings) for axis in axes]
     count = len(legs[0].measurement_m)
@@ -216,7 +224,7 @@ def tune_axes(
     parts = [filter_part(leg) for leg in legs]
     chosen = Noises(settings.sigma_a_m_s2, settings.sigma_z_m)
     alone = most_likely(parts, chosen, np.ones(count))
-    found = _with_biases(axes, settings, flight, alone, drifts)
+    found = _with_biases(axes, settings, flight, alone, drifts, made)
     best = alone if found is None else found
     skip = alone.outlier > 0.5
     if np.mean(skip) > MAX_OUTLIER_SHARE:
@@ -256,30 +264,35 @@ def _with_biases(
     flight: Flight | None,
     alone: NoiseFit,
     drifts: bool,
+    made: Made | None = None,
 ) -> NoiseFit | None:
     """Noises with the IMU's constants and the clock offset taken out, None without an IMU."""
     if flight is None or settings.input == "zero":
         return None
     if isinstance(flight.imu, Unavailable) or isinstance(flight.attitude, Unavailable):
         return None
-    moved = motion(flight.imu, flight.attitude, axes[0].measurement_time_s)
+    moved = motion(flight.imu, flight.attitude, axes[0].measurement_time_s, made)
     if moved is None or len(moved.time_s) < MIN_MEASUREMENTS:
         return None
     # the filter starts at the first measurement, which it does not weigh
     weight = np.concatenate([np.ones(len(axes[0].measurement_m) - len(alone.weight)), alone.weight])
     weight = weight[moved.row]
-    positions = moved.positions(
-        np.column_stack([axis.measurement_m for axis in axes]), settings.dt_s
-    )
+    measured = np.column_stack([axis.measurement_m for axis in axes])
     directions = np.array([axis.direction for axis in axes])
     start = replace(alone.noises, walk_m=FIRST_WALK_M if drifts else 0.0)
     offsets = np.linspace(-SEARCH_S, SEARCH_S, OFFSET_POINTS)
-    part = Part(positions, *moved.legs(directions, offsets))
+    some = moved.thinned(COARSE_MEASUREMENTS) or moved
+    part = Part(
+        some.positions(measured, settings.dt_s),
+        *some.legs(directions, offsets),
+    )
     levels = [
         replace(start, sigma_a_m_s2=start.sigma_a_m_s2 * factor) for factor in SIGMA_A_FACTORS
     ]
-    scores = [fitted(part, noises, weight).total() for noises in levels]
+    of_some = weight[np.isin(moved.row, some.row)]
+    scores = [fitted(part, noises, of_some).total() for noises in levels]
     level, at = np.unravel_index(np.argmin(scores), np.shape(scores))
+    positions = moved.positions(measured, settings.dt_s)
     parts = [Part(*centred(positions, *moved.legs(directions, offsets[[at]])))]
     return most_likely(parts, levels[level], weight)
 
