@@ -16,6 +16,7 @@ from px4fuse.arrays import Array, IntArray
 from px4fuse.filter.fitting import (
     FIRST_SHARE,
     FIRST_WIDTH,
+    Likelihood,
     NoiseFit,
     Noises,
     Part,
@@ -281,7 +282,9 @@ def test_paired_products_are_under_the_covariance_with_the_constants() -> None:
     rng = np.random.default_rng(8)
     signal = rng.normal(0.0, 1.0, (COUNT, 3, 2))
     nothing = np.zeros((3, 1, len(part.positions.chain.end)))
-    first, second = (Columns(signal[..., [at]].transpose(1, 2, 0), nothing, nothing) for at in (0, 1))
+    first, second = (
+        Columns(signal[..., [at]].transpose(1, 2, 0), nothing, nothing) for at in (0, 1)
+    )
     given = arguments(part, noises, np.ones(COUNT))
     ours = paired_products(*given, first, second)
     variance = np.full(COUNT, noises.sigma_z_m**2)
@@ -296,6 +299,59 @@ def test_paired_products_are_under_the_covariance_with_the_constants() -> None:
             covariance[block, block] += made[axis][2]
         expected = picked.T @ np.linalg.solve(covariance, picked)
         np.testing.assert_allclose(ours[stretch], expected[0, 1], rtol=1e-4, atol=1e-4)
+
+
+def test_side_by_side_stretches_are_those_of_the_factorisation() -> None:
+    """At all offsets, with weights and a walk; stretches of 11 and 13, axes with gaps of theirs."""
+    part = constants_part()
+    weight = np.random.default_rng(2).uniform(0.1, 1.0, COUNT)
+    assert part.lanes is not None
+    given = [arguments(part, noises, weight) for noises in SOME_NOISES]
+    ours = [
+        replace(part.lanes, positions=positions).fit([sigma_a], variance)[0]
+        for positions, _, _, sigma_a, variance in given
+    ]
+    expected = [fit(*each) for each in given]
+    for one, other in zip(ours, expected, strict=True):
+        assert one.freedom == other.freedom
+        np.testing.assert_allclose(one.gram, other.gram, rtol=1e-6, atol=1e-6)
+    total, factorised = (np.array([each.total() for each in both]) for both in (ours, expected))
+    np.testing.assert_allclose(
+        total - total[0, 0], factorised - factorised[0, 0], rtol=1e-6, atol=1e-5
+    )
+    # several ratios at once are each by itself
+    positions, _, _, _, variance = given[0]
+    together = replace(part.lanes, positions=positions).fit([0.5, 2.0], variance)
+    np.testing.assert_allclose(together[0].gram, ours[0].gram, rtol=1e-9)
+    np.testing.assert_allclose(together[1].gram, ours[2].gram, rtol=1e-9)
+
+
+def test_a_start_that_is_known_is_not_laid_side_by_side() -> None:
+    assert filter_part(preintegrate(modelled(1, 80), TRUE)).lanes is None
+
+
+@pytest.mark.parametrize("which", ["filter", "constants"])
+def test_the_likelihood_between_its_nodes_is_the_likelihood(which: str) -> None:
+    """Over four powers of ten of the ratio and of SIGMA_Z, but for one number always the same."""
+    if which == "filter":
+        count, parts = 80, [filter_part(preintegrate(modelled(seed, 80), TRUE)) for seed in (1, 2)]
+    else:
+        count, part = COUNT, constants_part(offsets=1)
+        chain = replace(part.positions.chain, noise_fixed=0.0 * part.positions.chain.noise_fixed)
+        parts = [replace(part, positions=replace(part.positions, chain=chain))]
+    weight = np.random.default_rng(3).uniform(0.1, 1.0, count)
+    # far from its maximum the start with constants, which is as good as unknown, tells
+    for rough, error in ((False, 1e-6 if which == "filter" else 1e-4), (True, 2e-3)):
+        score = Likelihood(parts, weight, 0.1, rough)
+        assert score.tabulated
+        some = [
+            Noises(*pair)
+            for pair in np.exp(np.random.default_rng(4).uniform(-4.6, 1.0, (30, 2))).tolist()
+        ]
+        ours = np.array([score(noises) for noises in some])
+        direct = np.array([negative_log_likelihood(parts, noises, weight) for noises in some])
+        assert np.ptp(direct) > 100.0
+        np.testing.assert_allclose(ours - ours[0], direct - direct[0], rtol=error, atol=1e-3)
 
 
 # --- the filter's own likelihood ---

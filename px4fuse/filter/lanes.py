@@ -63,8 +63,10 @@ class Lanes:
             used &= np.count_nonzero(used, axis=0) >= 2  # fewer say nothing
             gains = self._gains(np.square(ratios), variance, used)
             log_s += len(axes) * np.sum(np.log(gains[0]), axis=(0, 2), where=used[:, None])
-            spanned = np.count_nonzero(used.any(axis=0))
-            freedom += len(axes) * (np.count_nonzero(used) - 2 * spanned)
+            # a start that is as good as unknown does not count
+            unknown = positions.initial[positions.start][used.any(axis=0)]
+            log_s += len(axes) * np.sum(np.log(unknown))
+            freedom += len(axes) * (np.count_nonzero(used) - unknown.size)
             gram += self._gram(axes, gains, used)
         sigma = positions.constant_sigma
         return [
