@@ -9,10 +9,10 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from px4fuse import placing
 from px4fuse.comparison.asked import asked_of_ekf2
 from px4fuse.comparison.comparison import Comparison, compare
 from px4fuse.comparison.drift import may_drift, with_drift
@@ -32,12 +32,7 @@ from px4fuse.filter.signals import AISLE, Axis
 from px4fuse.filter.smoothing import Smoothing, smoothing
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise, tune
 from px4fuse.flight import Flight, Unavailable
-from px4fuse.loop.analysis import analyse, loop_in
-from px4fuse.loop.loop import Loop
-from px4fuse.loop.odometry import OdometryNoise
-from px4fuse.loop.sources import read_source
 from px4fuse.readers import read_log
-from px4fuse.readers.position_csv import read_position_csv
 from px4fuse.reading import shown
 from px4fuse.request import (
     AUTO,
@@ -46,6 +41,9 @@ from px4fuse.request import (
     PositionFile,
     WhatIfRequest,
 )
+
+if TYPE_CHECKING:
+    from px4fuse.loop.loop import Loop
 
 # Noises that the report states: those of a source once. Each axis by itself is for `px4fuse tune`
 REPORTED = (HORIZONTAL, "down")
@@ -203,7 +201,9 @@ def read_flight(request: ComparisonRequest, progress: Progress = _silent) -> Fli
                 f"--mavlink {other.log.name}: this is a {other.log.format}, not a MAVLink "
                 "recording. Give the ULog first: px4fuse compare LOG.ulg --mavlink LOG.tlog."
             )
-        flight = placing.join(flight, other)
+        from px4fuse.placing import join  # noqa: PLC0415
+
+        flight = join(flight, other)
     if request.position is None:
         return flight
     return _placed(flight, request.position, request.clock_offset_s)
@@ -211,13 +211,17 @@ def read_flight(request: ComparisonRequest, progress: Progress = _silent) -> Fli
 
 def _placed(flight: Flight, position: PositionFile, clock_offset: float | str | None) -> Flight:
     """The flight with a position file, whose clock offset is found unless it is given."""
+    # scipy.signal and scipy.ndimage cost a fifth of a second: only where a file is placed
+    from px4fuse.placing import place  # noqa: PLC0415
+    from px4fuse.readers.position_csv import read_position_csv  # noqa: PLC0415
+
     file = read_position_csv(
         Path(position.path),
         columns=position.columns,
         time_unit=position.time_unit,
         length_unit=position.length_unit,
     )
-    return placing.place(
+    return place(
         flight,
         file,
         frame=position.frame,
@@ -285,6 +289,10 @@ def run_loop(request: LoopRequest, progress: Progress = _silent) -> Loop:
     TrajectoryError, LogError, MissingDataError, SettingsError
         A file cannot be read or lacks what was asked for, or a setting is out of range.
     """
+    from px4fuse.loop.analysis import analyse  # noqa: PLC0415 (tune and sync have none)
+    from px4fuse.loop.odometry import OdometryNoise  # noqa: PLC0415
+    from px4fuse.loop.sources import read_source  # noqa: PLC0415
+
     for name, value in (("--from", request.start_s), ("--to", request.end_s)):
         if value is not None and not abs(value) < float("inf"):
             raise SettingsError(f"{name} {value:g} is not a finite number.")
@@ -406,6 +414,8 @@ def explain(comparison: Comparison, progress: Progress = _silent) -> Analysis:
     why = why_ekf2_differs(comparison, model, tuning, clock)
     heading = turned_frame(comparison, tuning, clock, progress)
     progress("looking for a loop")
+    from px4fuse.loop.analysis import loop_in  # noqa: PLC0415 (tune and sync have none)
+
     loop = loop_in(comparison.flight, progress)
     return Analysis(comparison, tuning, clock, model, why, loop, heading)
 

@@ -17,11 +17,10 @@ from typing import Literal
 
 import numpy as np
 import pandas as pd
-from scipy.integrate import cumulative_trapezoid
 from scipy.spatial.transform import Rotation
 from scipy.special import chdtrc
 
-from px4fuse.arrays import Array
+from px4fuse.arrays import Array, cumulative_integral
 from px4fuse.filter.kalman import Settings
 from px4fuse.filter.model import INITIAL_SIGMA_P_M, INITIAL_SIGMA_V_M_S, noise_of_many_steps
 from px4fuse.filter.motion import MAX_IMU_INTERVAL_S
@@ -261,8 +260,8 @@ def _by_positions(
 
 def _legs(acceleration: pd.DataFrame, time: Array) -> _Legs:
     known, value = acceleration.index.to_numpy(), acceleration.to_numpy()[:, :2]
-    speed = cumulative_trapezoid(value, known, axis=0, initial=0)
-    way = cumulative_trapezoid(speed, known, axis=0, initial=0)
+    speed = cumulative_integral(value, known)
+    way = cumulative_integral(speed, known)
     v, p = (
         np.column_stack([np.interp(time, known, one) for one in both.T]) for both in (speed, way)
     )

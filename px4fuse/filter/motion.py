@@ -16,10 +16,9 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 from scipy import constants
-from scipy.integrate import cumulative_trapezoid
 from scipy.spatial.transform import Rotation, Slerp
 
-from px4fuse.arrays import Array, IntArray
+from px4fuse.arrays import Array, IntArray, cumulative_integral
 from px4fuse.filter.marginal import Chain, Positions
 from px4fuse.filter.model import move, noise_of_many_steps
 from px4fuse.filter.signals import imu_gaps
@@ -231,7 +230,7 @@ def _signals(imu: pd.DataFrame, attitude: pd.DataFrame, span: tuple[float, float
     first, last = np.searchsorted(time, [span[0] - 2 * STEP_S, span[1] + 2 * STEP_S], side="left")
     inside, time = imu.iloc[first:last], time[first:last]
     columns = [*SPECIFIC_FORCE_COLUMNS, *ANGULAR_RATE_COLUMNS]
-    integral = cumulative_trapezoid(inside[columns].to_numpy(copy=True), time, axis=0, initial=0)
+    integral = cumulative_integral(inside[columns].to_numpy(), time)
     edges = np.arange(time[0], time[-1], STEP_S)
     read = np.column_stack([np.interp(edges, time, one) for one in integral.T])
     force, angle = read[:, :3], read[:, 3:]
