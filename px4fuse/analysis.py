@@ -27,7 +27,7 @@ from px4fuse.filter.clock import ClockOffset, estimate_clock_offset
 from px4fuse.filter.fitting import Noises
 from px4fuse.filter.heading import HeadingError, heading_error
 from px4fuse.filter.kalman import Settings
-from px4fuse.filter.motion import MAX_IMU_INTERVAL_S
+from px4fuse.filter.motion import MAX_IMU_INTERVAL_S, Made
 from px4fuse.filter.signals import AISLE, Axis
 from px4fuse.filter.smoothing import Smoothing, smoothing
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise, tune
@@ -407,8 +407,10 @@ def explain(comparison: Comparison, progress: Progress = _silent) -> Analysis:
     """
     axes = tuple(result.axis for result in comparison.axes)
     names = REPORTED if {"north", "east"} <= {axis.name for axis in axes} else None
-    tuning = tuned(comparison, names, progress)
-    clock = clock_offset(comparison, tuning, progress)
+    made: Made = {}  # tuning and clock need the same signals of the IMU
+    tuning = tuned(comparison, names, progress, made)
+    clock = clock_offset(comparison, tuning, progress, made)
+    del made
     progress("replaying EKF2")
     model = open_model(comparison.flight)
     why = why_ekf2_differs(comparison, model, tuning, clock)
@@ -426,7 +428,10 @@ def tuned_horizontally(comparison: Comparison) -> Tuning:
 
 
 def tuned(
-    comparison: Comparison, names: tuple[str, ...] | None = None, progress: Progress = _silent
+    comparison: Comparison,
+    names: tuple[str, ...] | None = None,
+    progress: Progress = _silent,
+    made: Made | None = None,
 ) -> dict[str, AxisTuning | Unavailable]:
     """Most likely noises of a comparison's axes; an IMU too slow to tell biases is left out.
 
@@ -437,6 +442,8 @@ def tuned(
         Axis names and "horizontal"; by default all that there are.
     progress : callable
         Told what is being done.
+    made : dict, optional
+        As :func:`px4fuse.filter.motion.motion` has it.
     """
     flight = comparison.flight
     slow = imu_too_slow_for_clocks(flight)
@@ -447,11 +454,15 @@ def tuned(
         lambda name: progress(f"tuning {name}"),
         flight if slow is None else replace(flight, imu=slow),
         may_drift(flight, comparison.source),
+        made,
     )
 
 
 def clock_offset(
-    comparison: Comparison, tuning: Tuning, progress: Progress = _silent
+    comparison: Comparison,
+    tuning: Tuning,
+    progress: Progress = _silent,
+    made: Made | None = None,
 ) -> ClockOffset | Unavailable:
     """What must still be added to the stamps of the source, beyond the offset that was set.
 
@@ -462,6 +473,8 @@ def clock_offset(
         Its measurement noise and outliers are used where it has them.
     progress : callable
         Told what is being done.
+    made : dict, optional
+        As :func:`px4fuse.filter.motion.motion` has it.
     """
     if slow := imu_too_slow_for_clocks(comparison.flight):
         return slow
@@ -483,6 +496,7 @@ def clock_offset(
         noises if tuned is None else tuned.noises,
         None if tuned is None else tuned.outlier_time_s,
         progress,
+        made,
     )
     if isinstance(found, ClockOffset) and may_drift(comparison.flight, comparison.source):
         return with_drift(found)

@@ -296,10 +296,13 @@ def delayed_states(part: StretchRun, at: int) -> tuple[Array, Array]:
     causes[:, TURN] = 1.0 if variant.attitude else 0.0
     causes[:, INPUT] = 1.0
     state = np.concatenate([kept[:1], was])
-    state[1:, THETA] = np.einsum("nij,nj->ni", w.attitude, causes)
-    state[1:, VELOCITY] += np.einsum("nij,nj->ni", w.velocity, causes)
-    state[1:, POSITION] += w.elapsed_s[:, None] * was[:, VELOCITY]
-    state[1:, POSITION] += np.einsum("nij,nj->ni", w.position, causes)
+    # the rows of w are in an order of their own
+    of_cause, was = causes[w.step], was[w.step]
+    rows = 1 + w.step
+    state[rows, THETA] = np.einsum("nij,nj->ni", w.attitude, of_cause)
+    state[rows, VELOCITY] += np.einsum("nij,nj->ni", w.velocity, of_cause)
+    state[rows, POSITION] += w.elapsed_s[:, None] * was[:, VELOCITY]
+    state[rows, POSITION] += np.einsum("nij,nj->ni", w.position, of_cause)
     state[legs.end] = kept[1:]
     reset = np.zeros((count + 1, 3))
     for e in np.flatnonzero(part.run.reset[:, at]):

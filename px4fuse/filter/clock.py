@@ -50,7 +50,7 @@ CHANGE_P = 0.005
 # Flights simulated for the scatter that the IMU's noise adds
 REPLICATES = 96
 # Numbers of signals that are made at once
-BLOCK = 2**20
+BLOCK = 2**18
 # Steps of ln σ by which the noises are tried at every offset
 NOISE_STEP = 0.1
 
@@ -310,17 +310,20 @@ def _scatter(problem: _Problem, offset: float, noises: Noises, information: floa
     axes = len(problem.directions)
     rng = np.random.default_rng(count)
     q00, q01, q11 = (noises.sigma_a_m_s2**2 * chain.noise_unit).T[:, :, None, None]
-    first, second = rng.standard_normal((2, len(q00), axes, REPLICATES))
-    dp = np.sqrt(q00) * first
-    dv = q01 / np.sqrt(q00) * first + np.sqrt(q11 - q01**2 / q00) * second
+    # the noise of each leg, made in place: these are the longest signals of all
+    dp, dv = rng.standard_normal((2, len(q00), axes, REPLICATES))
+    dv *= np.sqrt(q11 - q01**2 / q00)
+    dp *= np.sqrt(q00)
+    dv += q01 / q00 * dp
     speed = np.zeros((count, axes, REPLICATES))
     speed[chain.end] = dv
     for begin, end in zip(problem.motion.edges, problem.motion.edges[1:], strict=False):
-        speed[begin:end] = np.cumsum(speed[begin:end], axis=0)
-    error = noises.sigma_z_m * rng.standard_normal(speed.shape)
+        np.cumsum(speed[begin:end], axis=0, out=speed[begin:end])
+    error = rng.standard_normal(speed.shape)
+    error *= noises.sigma_z_m
     if noises.walk_m:  # the source's own walk is in the residuals, but nothing the IMU measured
         walk = noises.walk_m * np.sqrt(chain.length_s)[:, None, None]
-        dp = dp + walk * rng.standard_normal(dp.shape)
+        dp += walk * rng.standard_normal(dp.shape)
     still = np.broadcast_to(0.0, (axes, REPLICATES, len(q00)))
     moved = (np.transpose(each, (1, 2, 0)) for each in (error, dp, dv))
     score = paired_products(
