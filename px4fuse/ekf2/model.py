@@ -173,6 +173,28 @@ def replay_variants(
     return [_assemble(inputs, runs, at, change) for at, change in enumerate(changes)]
 
 
+def delayed_variants(
+    model: Model, variants: Sequence[Variant]
+) -> tuple[list[pd.DataFrame], Ekf2Replay]:
+    """Tracks of the filters at their horizon, and all that the last one did.
+
+    What a filter publishes is as long again, and takes as long to make.
+    """
+    made = {Variant(model.inputs.settings).timing(model.inputs): model.legs}
+    runs = run_variants(model.inputs, variants, made)
+    last = _assemble(model.inputs, runs, len(variants) - 1, {})
+    tracks = [
+        pd.concat([_delayed(part, delayed_states(part, at)[0]) for part in runs])
+        for at in range(len(variants) - 1)
+    ]
+    return [*tracks, last.delayed], last
+
+
+def _delayed(part: StretchRun, state: Array) -> pd.DataFrame:
+    index = pd.Index(part.stretch.time_s, name="time_s")
+    return pd.DataFrame(np.hstack([state[:, 6:9], state[:, 3:6]]), index, STATE_COLUMNS)
+
+
 @dataclass(frozen=True)
 class StretchRun:
     """One stretch with its legs by delay, and what the variants did in it."""
@@ -274,7 +296,7 @@ def _tracks(inputs: Inputs, part: StretchRun, at: int) -> tuple[pd.DataFrame, pd
     )
     index = pd.Index(stretch.time_s, name="time_s")
     return (
-        pd.DataFrame(np.hstack([state[:, 6:9], state[:, 3:6]]), index, STATE_COLUMNS),
+        _delayed(part, state),
         pd.DataFrame(np.hstack([position, velocity]), index, STATE_COLUMNS),
     )
 
