@@ -9,10 +9,10 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from px4fuse import placing
 from px4fuse.comparison.asked import asked_of_ekf2
 from px4fuse.comparison.comparison import AxisComparison, Comparison, compare
 from px4fuse.comparison.drift import may_drift, with_drift
@@ -28,17 +28,12 @@ from px4fuse.filter.clock import ClockOffset, estimate_clock_offset
 from px4fuse.filter.fitting import Noises
 from px4fuse.filter.heading import HeadingError, heading_error
 from px4fuse.filter.kalman import Settings
-from px4fuse.filter.motion import MAX_IMU_INTERVAL_S
+from px4fuse.filter.motion import MAX_IMU_INTERVAL_S, Made
 from px4fuse.filter.signals import AISLE, Axis
 from px4fuse.filter.smoothing import Smoothing, smoothing
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise, tune
 from px4fuse.flight import Flight, Unavailable
-from px4fuse.loop.analysis import analyse, loop_in
-from px4fuse.loop.loop import Loop
-from px4fuse.loop.odometry import OdometryNoise
-from px4fuse.loop.sources import read_source
 from px4fuse.readers import read_log
-from px4fuse.readers.position_csv import read_position_csv
 from px4fuse.reading import shown
 from px4fuse.request import (
     AUTO,
@@ -47,6 +42,9 @@ from px4fuse.request import (
     PositionFile,
     WhatIfRequest,
 )
+
+if TYPE_CHECKING:
+    from px4fuse.loop.loop import Loop
 
 # Noises that the report states: those of a source once. Each axis by itself is for `px4fuse tune`
 REPORTED = (HORIZONTAL, "down")
@@ -227,7 +225,9 @@ def read_flight(request: ComparisonRequest, progress: Progress = _silent) -> Fli
                 f"`mavlink` {other.log.name}: this is a {other.log.format}, not a MAVLink "
                 "recording. Give the ULog as LOG, and the recording (.tlog) with `mavlink`."
             )
-        flight = placing.join(flight, other)
+        from px4fuse.placing import join  # noqa: PLC0415
+
+        flight = join(flight, other)
     if request.position is None:
         return flight
     return _placed(flight, request.position, request.clock_offset_s)
@@ -235,13 +235,17 @@ def read_flight(request: ComparisonRequest, progress: Progress = _silent) -> Fli
 
 def _placed(flight: Flight, position: PositionFile, clock_offset: float | str | None) -> Flight:
     """The flight with a position file, whose clock offset is found unless it is given."""
+    # scipy.signal and scipy.ndimage cost a fifth of a second: only where a file is placed
+    from px4fuse.placing import place  # noqa: PLC0415
+    from px4fuse.readers.position_csv import read_position_csv  # noqa: PLC0415
+
     file = read_position_csv(
         Path(position.path),
         columns=position.columns,
         time_unit=position.time_unit,
         length_unit=position.length_unit,
     )
-    return placing.place(
+    return place(
         flight,
         file,
         frame=position.frame,
@@ -311,6 +315,10 @@ def run_loop(request: LoopRequest, progress: Progress = _silent) -> Loop:
     TrajectoryError, LogError, MissingDataError, SettingsError
         A file cannot be read or lacks what was asked for, or a setting is out of range.
     """
+    from px4fuse.loop.analysis import analyse  # noqa: PLC0415 (tune and sync have none)
+    from px4fuse.loop.odometry import OdometryNoise  # noqa: PLC0415
+    from px4fuse.loop.sources import read_source  # noqa: PLC0415
+
     for name, value in (("start_s", request.start_s), ("end_s", request.end_s)):
         if value is not None and not abs(value) < float("inf"):
             raise SettingsError(f"`{name}` {value:g} is not a finite number.")
@@ -442,13 +450,17 @@ def explain(comparison: Comparison, progress: Progress = _silent) -> Analysis:
     """
     axes = tuple(result.axis for result in comparison.axes)
     names = REPORTED if {"north", "east"} <= {axis.name for axis in axes} else None
-    tuning = tuned(comparison, names, progress)
-    clock = clock_offset(comparison, tuning, progress)
+    made: Made = {}  # tuning and clock need the same signals of the IMU
+    tuning = tuned(comparison, names, progress, made)
+    clock = clock_offset(comparison, tuning, progress, made)
+    del made
     progress("replaying EKF2")
     model = open_model(comparison.flight)
     why = why_ekf2_differs(comparison, model, tuning, clock)
     heading = turned_frame(comparison, tuning, clock, progress)
     progress("looking for a loop")
+    from px4fuse.loop.analysis import loop_in  # noqa: PLC0415 (tune and sync have none)
+
     loop = loop_in(comparison.flight, progress)
     return Analysis(comparison, tuning, clock, model, why, loop, heading)
 
@@ -459,7 +471,10 @@ def tuned_horizontally(comparison: Comparison) -> Tuning:
 
 
 def tuned(
-    comparison: Comparison, names: tuple[str, ...] | None = None, progress: Progress = _silent
+    comparison: Comparison,
+    names: tuple[str, ...] | None = None,
+    progress: Progress = _silent,
+    made: Made | None = None,
 ) -> dict[str, AxisTuning | Unavailable]:
     """Most likely noises of a comparison's axes; an IMU too slow to tell biases is left out.
 
@@ -470,6 +485,8 @@ def tuned(
         Axis names and "horizontal"; by default all that there are.
     progress : callable
         Told what is being done.
+    made : dict, optional
+        As :func:`px4fuse.filter.motion.motion` has it.
     """
     flight = comparison.flight
     slow = imu_too_slow_for_clocks(flight)
@@ -480,11 +497,15 @@ def tuned(
         lambda name: progress(f"tuning {name}"),
         flight if slow is None else replace(flight, imu=slow),
         may_drift(flight, comparison.source),
+        made,
     )
 
 
 def clock_offset(
-    comparison: Comparison, tuning: Tuning, progress: Progress = _silent
+    comparison: Comparison,
+    tuning: Tuning,
+    progress: Progress = _silent,
+    made: Made | None = None,
 ) -> ClockOffset | Unavailable:
     """What must still be added to the stamps of the source, beyond the offset that was set.
 
@@ -495,6 +516,8 @@ def clock_offset(
         Its measurement noise and outliers are used where it has them.
     progress : callable
         Told what is being done.
+    made : dict, optional
+        As :func:`px4fuse.filter.motion.motion` has it.
     """
     if slow := imu_too_slow_for_clocks(comparison.flight):
         return slow
@@ -516,6 +539,7 @@ def clock_offset(
         noises if tuned is None else tuned.noises,
         None if tuned is None else tuned.outlier_time_s,
         progress,
+        made,
     )
     if isinstance(found, ClockOffset) and may_drift(comparison.flight, comparison.source):
         return with_drift(found)

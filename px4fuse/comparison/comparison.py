@@ -20,7 +20,7 @@ from px4fuse.comparison.projection import (
 from px4fuse.display import Shown
 from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.filter.consistency import Consistency, HorizontalNis, assess, assess_horizontal
-from px4fuse.filter.kalman import Replay, Settings, replay, state_at, variance_at
+from px4fuse.filter.kalman import Replay, Settings, replay_all, state_at, variance_at
 from px4fuse.filter.signals import (
     AISLE,
     Axis,
@@ -202,7 +202,7 @@ def compare(
     input_required : bool
         Raise instead of falling back to ``input="zero"`` where the log has no acceleration.
     progress : callable
-        Told the name of each axis as it starts.
+        Told the names of the axes as they start.
 
     Returns
     -------
@@ -238,10 +238,10 @@ def compare(
         notes += [f"EKF2 {statement}"] if statement else []
         notes += ekf2.notes
         ekf2 = replace(ekf2, state=state)
-    results = []
-    for line in lines:
-        progress(line.name)
-        results.append(_compare_axis(flight, ekf2, track, segment, line, settings))
+    progress(", ".join(line.name for line in lines))
+    results = [
+        _compare_axis(flight, ekf2, track, segment, run) for run in replay_all(lines, settings)
+    ]
     return Comparison(
         flight=flight,
         source=track,
@@ -261,11 +261,10 @@ def _compare_axis(
     ekf2: Ekf2 | Unavailable,
     track: PositionTrack,
     segment: Segment,
-    axis: Axis,
-    settings: Settings,
+    run: Replay,
 ) -> AxisComparison:
     """Everything about one axis; ``ekf2`` is the flight's, its resets treated."""
-    run = replay(axis, settings)
+    axis = run.axis
     truth = project_truth(flight.truth, axis, segment)
     kf = FilterSummary(
         consistency=assess(

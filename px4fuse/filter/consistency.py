@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from scipy import stats
+from scipy.special import chdtrc, gammaincinv, stdtr
 
 from px4fuse.arrays import Array
 from px4fuse.display import Shown
@@ -83,8 +83,8 @@ def nis_band(count: int, dimensions: int = 1) -> tuple[float, float]:
     (1.67, 2.36)
     """
     freedom = count * dimensions
-    low = float(stats.chi2.ppf((1 - CONFIDENCE) / 2, freedom)) / freedom
-    high = float(stats.chi2.ppf((1 + CONFIDENCE) / 2, freedom)) / freedom
+    low = 2.0 * float(gammaincinv(freedom / 2.0, (1 - CONFIDENCE) / 2)) / freedom
+    high = 2.0 * float(gammaincinv(freedom / 2.0, (1 + CONFIDENCE) / 2)) / freedom
     return low, high
 
 
@@ -155,9 +155,9 @@ def assess(
         outside_two_sigma=float(np.mean(np.abs(normalised) > 2.0)),
         outside_gate=float(np.mean(np.abs(normalised) > gate)),
         bias_t=bias_t,
-        bias_p=float(2.0 * stats.t.sf(abs(bias_t), count - 1)),
+        bias_p=float(2.0 * stdtr(count - 1, -abs(bias_t))),
         lag1_autocorrelation=float(r[0]),
-        ljung_box_p=float(stats.chi2.sf(q, lags)),
+        ljung_box_p=float(chdtrc(lags, q)),
         ljung_box_lags=lags,
     )
 

@@ -11,10 +11,9 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike
 from scipy import constants
-from scipy.integrate import cumulative_trapezoid
 from scipy.spatial.transform import Rotation, Slerp
 
-from px4fuse.arrays import Array, BoolArray
+from px4fuse.arrays import Array, BoolArray, cumulative_integral
 from px4fuse.display import brief
 from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.flight import (
@@ -423,7 +422,7 @@ def project_acceleration(
     return Acceleration(
         time_s=time,
         value_m_s2=value,
-        integral_m_s=cumulative_trapezoid(value, time, initial=0),
+        integral_m_s=cumulative_integral(value, time),
         gap_integral_s=np.concatenate([[0.0], np.cumsum(np.where(is_gap, interval, 0.0))]),
         rms_m_s2=float(np.sqrt(np.mean(value[inside] ** 2))),
     )
