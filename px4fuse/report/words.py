@@ -99,7 +99,8 @@ def _same_nis(stated: list[tuple[str, str, Consistency]]) -> Iterator[str]:
             low, high = wrong.nis_band
             if wrong.verdict == "consistent" or fine.verdict != "consistent":
                 continue
-            if fine.count < wrong.count and not low <= fine.nis_mean <= high:
+            same_side = (fine.nis_mean < 1.0) == (wrong.nis_mean < 1.0)
+            if fine.count < wrong.count and same_side and not low <= fine.nis_mean <= high:
                 bands = " and ".join("{:.2f}-{:.2f}".format(*s.nis_band) for s in (wrong, fine))
                 yield (
                     f"Along {axis} only {owner} is called {_side(wrong)} although {other} has "
