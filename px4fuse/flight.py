@@ -87,6 +87,15 @@ class Dropout:
 
 
 @dataclass(frozen=True)
+class FlightMode:
+    """A stretch (s) in one flight mode, by the name that PX4's users know."""
+
+    start_s: float
+    end_s: float
+    name: str
+
+
+@dataclass(frozen=True)
 class Sender:
     """One MAVLink sender that a recording heard.
 
@@ -500,6 +509,10 @@ class Truth:
 
     __repr__ = brief
 
+MODES_NOT_LOGGED = Unavailable(
+    "flight modes", "no usable vehicle_status", "Record with SDLOG_PROFILE bit 0 (default)."
+)
+
 
 @dataclass(frozen=True, repr=False)
 class Flight(Shown):
@@ -529,6 +542,8 @@ class Flight(Shown):
         What the log holds besides, and why it is not used.
     inputs : tuple of InputFile
         Files read beside the log.
+    modes : tuple of FlightMode, or Unavailable
+        In order of time, without overlap.
     """
 
     log: LogInfo
@@ -543,6 +558,7 @@ class Flight(Shown):
     clocks: tuple[ClockMap, ...] = ()
     unused: tuple[Unused, ...] = ()
     inputs: tuple[InputFile, ...] = ()
+    modes: tuple[FlightMode, ...] | Unavailable = MODES_NOT_LOGGED
 
 
 def missing_parts(
@@ -566,6 +582,17 @@ def stretches_of_flight(landed: pd.Series, duration_s: float) -> tuple[tuple[flo
         (max(float(start), 0.0), float(end))
         for start, end, value in zip(changes.index, ends, changes, strict=True)
         if not value and end > max(start, 0.0)
+    )
+
+
+def stretches_of_modes(names: pd.Series, end_s: float) -> tuple[FlightMode, ...]:
+    """Stretches (s) of a step function of time whose values are names of flight modes."""
+    changes = names[names.ne(names.shift())]
+    starts = np.maximum.accumulate(np.maximum(changes.index.to_numpy(), 0.0))
+    return tuple(
+        FlightMode(float(start), float(end), name)
+        for start, end, name in zip(starts, [*starts[1:], end_s], changes, strict=True)
+        if end > start
     )
 
 

@@ -14,6 +14,7 @@ from px4fuse.flight import (
     QUATERNION_COLUMNS,
     Ekf2,
     Flight,
+    FlightMode,
     FusionRecord,
     InputFile,
     PositionTrack,
@@ -69,7 +70,7 @@ def join(flight: Flight, other: Flight) -> Flight:
     agreement = _agreement(flight, moved)
     taken: dict[str, object] = {}
     streams = dict(flight.streams)
-    for part in ("imu", "attitude", "ekf2", "truth", "airborne"):
+    for part in ("imu", "attitude", "ekf2", "truth", "airborne", "modes"):
         mine, theirs = getattr(flight, part), getattr(moved, part)
         if isinstance(mine, Unavailable) and not isinstance(theirs, Unavailable):
             taken[part] = theirs
@@ -125,7 +126,7 @@ def _shifted(flight: Flight, shift_s: float) -> Flight:
     def moved(part: pd.DataFrame | Unavailable) -> pd.DataFrame | Unavailable:
         return part if isinstance(part, Unavailable) else _later(part, shift_s)
 
-    ekf2, truth, airborne = flight.ekf2, flight.truth, flight.airborne
+    ekf2, truth, airborne, modes = flight.ekf2, flight.truth, flight.airborne, flight.modes
     if isinstance(ekf2, Ekf2):
         ekf2 = replace(
             ekf2,
@@ -146,6 +147,8 @@ def _shifted(flight: Flight, shift_s: float) -> Flight:
         )
     if not isinstance(airborne, Unavailable):
         airborne = tuple((start + shift_s, end + shift_s) for start, end in airborne)
+    if not isinstance(modes, Unavailable):
+        modes = tuple(FlightMode(m.start_s + shift_s, m.end_s + shift_s, m.name) for m in modes)
     tracks: list[PositionTrack] = [
         replace(
             track,
@@ -162,6 +165,7 @@ def _shifted(flight: Flight, shift_s: float) -> Flight:
         ekf2=ekf2,
         truth=truth,
         airborne=airborne,
+        modes=modes,
     )
 
 

@@ -18,19 +18,25 @@ from px4fuse.flight import (
     QUATERNION_COLUMNS,
     SPECIFIC_FORCE_COLUMNS,
     Flight,
+    FlightMode,
     LogInfo,
     Unavailable,
     Unused,
     missing_parts,
     stretches_of_flight,
+    stretches_of_modes,
 )
 from px4fuse.readers.mavlink_clocks import UNIX_FROM_S
 from px4fuse.readers.mavlink_ekf2 import MIN_NORM, read_ekf2
 from px4fuse.readers.mavlink_frames import Frames, message_ids, read_frames
 from px4fuse.readers.mavlink_messages import (
     ATTITUDE,
+    AUTO_MODE,
+    AUTO_MODES,
     IMU,
     LANDED,
+    MAIN_MODES,
+    NO_MODES,
     UNUSED,
     VEHICLE_TYPES,
     Remedies,
@@ -92,6 +98,7 @@ def read_mavlink(path: Path, system: int | None = None) -> Flight:
     positions, missing_positions = read_positions(recording, mapped, remedies)
     truth = read_truth(recording, positions, remedies)
     airborne = _read_airborne(recording, remedies)
+    modes = _read_modes(recording) if autopilot == "PX4" else NO_MODES
     return Flight(
         log=_describe(recording, parameters, autopilot),
         imu=imu,
@@ -100,6 +107,7 @@ def read_mavlink(path: Path, system: int | None = None) -> Flight:
         ekf2=ekf2,
         truth=truth,
         airborne=airborne,
+        modes=modes,
         missing=(*missing_parts(imu, attitude, ekf2, truth), *missing_positions),
         streams=MappingProxyType(recording.streams),
         clocks=clock_maps(recording, mapped),
@@ -189,6 +197,21 @@ def _read_airborne(
     time_s = recording.receipt_boot_s(rows[known]) - recording.zero_s
     landed = pd.Series(table["landed_state"][known] == LANDED, index=time_s)
     return stretches_of_flight(landed, recording.duration_s)
+
+
+def _read_modes(recording: Recording) -> tuple[FlightMode, ...] | Unavailable:
+    rows = recording.rows("HEARTBEAT")
+    if not len(rows):
+        return NO_MODES
+    modes = recording.frames.table("HEARTBEAT", rows)["custom_mode"].astype(np.int64)
+    names = [
+        AUTO_MODES.get(mode >> 24 & 0xFF, "Auto")
+        if (main := mode >> 16 & 0xFF) == AUTO_MODE
+        else MAIN_MODES.get(main, f"mode {main}")
+        for mode in modes.tolist()
+    ]
+    time_s = recording.receipt_boot_s(rows) - recording.zero_s
+    return stretches_of_modes(pd.Series(names, index=time_s), recording.duration_s)
 
 
 def _read_parameters(recording: Recording, autopilot: str) -> MappingProxyType[str, float]:

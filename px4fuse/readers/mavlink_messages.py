@@ -27,6 +27,19 @@ VEHICLE_TYPES: Mapping[int, str] = {
     18: "companion computer", 19: "VTOL", 20: "VTOL", 21: "VTOL", 22: "VTOL", 26: "gimbal",
     27: "ADS-B receiver", 30: "camera",
 }  # fmt: skip
+# HEARTBEAT.custom_mode, px4_custom_mode.h: main mode in bits 16 to 23, that of Auto above them
+AUTO_MODE = 4
+MAIN_MODES: Mapping[int, str] = {
+    1: "Manual", 2: "Altitude", 3: "Position", 5: "Acro", 6: "Offboard", 7: "Stabilized",
+    8: "Rattitude", 10: "Termination",
+}  # fmt: skip
+AUTO_MODES: Mapping[int, str] = {
+    2: "Takeoff", 3: "Hold", 4: "Mission", 5: "Return", 6: "Land", 8: "Follow Me",
+    9: "Precision Land", 10: "VTOL Takeoff",
+}  # fmt: skip
+NO_MODES = Unavailable(
+    "flight modes", "no HEARTBEAT of a PX4 autopilot", "Record the link of a PX4 vehicle."
+)
 
 
 @dataclass(frozen=True)

@@ -187,6 +187,17 @@ INNOVATIONS = (
 
 LAND_DETECTED = (Layout("vehicle_land_detected", {"landed": "landed"}, "v1.8"),)
 
+FLIGHT_MODE = (Layout("vehicle_status", {"nav_state": "nav_state"}, "v1.8"),)
+# vehicle_status.nav_state as QGroundControl names it, msg/VehicleStatus.msg; the numbers that are
+# missing here were never flown in v1.12 to v1.16
+NAV_STATES: Mapping[int, str] = {
+    0: "Manual", 1: "Altitude", 2: "Position", 3: "Mission", 4: "Hold", 5: "Return",
+    6: "Position Slow", 8: "Altitude Cruise", 10: "Acro", 12: "Descend", 13: "Termination",
+    14: "Offboard", 15: "Stabilized", 16: "Rattitude", 17: "Takeoff", 18: "Land",
+    19: "Follow Me", 20: "Precision Land", 21: "Orbit", 22: "VTOL Takeoff",
+    **{22 + number: f"External {number}" for number in range(1, 9)},
+}  # fmt: skip
+
 TRUTH_LOCAL = (
     Layout(
         "vehicle_local_position_groundtruth",
@@ -349,8 +360,9 @@ def topics() -> list[str]:
     """Every topic named in this table, sorted: all that a reader needs to decode."""
     groups = (
         IMU, ATTITUDE, LOCAL_POSITION, ESTIMATOR_STATES, SENSOR_BIAS, SELECTOR, FUSING,
-        LAND_DETECTED, TRUTH_LOCAL, TRUTH_GLOBAL, TRUTH_ATTITUDE, GPS, AID_OBSERVATION_HORIZONTAL,
-        AID_OBSERVATION_VERTICAL, *AID_SOURCE.values(), *(track.layouts for track in TRACKS),
+        LAND_DETECTED, FLIGHT_MODE, TRUTH_LOCAL, TRUTH_GLOBAL, TRUTH_ATTITUDE, GPS,
+        AID_OBSERVATION_HORIZONTAL, AID_OBSERVATION_VERTICAL, *AID_SOURCE.values(),
+        *(track.layouts for track in TRACKS),
     )  # fmt: skip
     names = {layout.topic for group in groups for layout in group} | UNUSED.keys()
     for layout in INNOVATIONS:

@@ -11,9 +11,11 @@ import pandas as pd
 from px4fuse.arrays import Array
 from px4fuse.flight import (
     ANGULAR_RATE_COLUMNS,
+    MODES_NOT_LOGGED,
     QUATERNION_COLUMNS,
     SPECIFIC_FORCE_COLUMNS,
     Flight,
+    FlightMode,
     Stream,
     Truth,
     Unavailable,
@@ -21,10 +23,19 @@ from px4fuse.flight import (
     finite_rows,
     missing_parts,
     stretches_of_flight,
+    stretches_of_modes,
 )
 from px4fuse.readers.px4_ekf2 import ekf2_topics, read_ekf2
 from px4fuse.readers.px4_positions import GPS_3D_FIX, read_positions, read_truth
-from px4fuse.readers.px4_topics import ATTITUDE, GPS, IMU, LAND_DETECTED, UNUSED
+from px4fuse.readers.px4_topics import (
+    ATTITUDE,
+    FLIGHT_MODE,
+    GPS,
+    IMU,
+    LAND_DETECTED,
+    NAV_STATES,
+    UNUSED,
+)
 from px4fuse.readers.ulog_topics import (
     ACCELEROMETER_OFFSET_INVALID_US,
     AT_MEASUREMENT,
@@ -91,6 +102,7 @@ def to_flight(topics: Topics) -> Flight:
         ekf2=ekf2,
         truth=truth,
         airborne=airborne,
+        modes=_read_modes(topics),
         missing=(*missing_parts(imu, attitude, ekf2, truth), *missing_positions),
         streams={part: _stream(topics, part, names) for part, names in used.items() if names},
         unused=tuple(
@@ -176,3 +188,12 @@ def _read_airborne(topics: Topics) -> tuple[tuple[float, float], ...] | Unavaila
             "Record with SDLOG_PROFILE bit 0 (default), or give --start and --end.",
         )
     return stretches_of_flight(landed, topics.log.duration_s)
+
+
+def _read_modes(topics: Topics) -> tuple[FlightMode, ...] | Unavailable:
+    layout = topics.find(FLIGHT_MODE)
+    states = None if layout is None else topics.frame(layout, step=True)["nav_state"].dropna()
+    if states is None or states.empty:
+        return MODES_NOT_LOGGED
+    names = states.map(lambda state: NAV_STATES.get(int(state), f"mode {state:.0f}"))
+    return stretches_of_modes(names, topics.log.duration_s)

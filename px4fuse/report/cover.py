@@ -1,26 +1,25 @@
-"""Cover: who, which log, what was compared with what, verdicts and findings."""
+"""Cover: what happened, the verdict, the findings, and the flight from above."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
-import pandas as pd
+import numpy as np
 from matplotlib.figure import Figure
 
-from px4fuse.comparison.comparison import AgainstTruth, AxisComparison, Difference, FilterSummary
+from px4fuse.comparison.comparison import AgainstTruth, Difference, FilterSummary
 from px4fuse.filter.consistency import Consistency
+from px4fuse.filter.signals import AISLE
 from px4fuse.findings import Finding
 from px4fuse.flight import Unavailable
 from px4fuse.report.document import Document
+from px4fuse.report.plan import plan
 from px4fuse.report.style import (
     BOTTOM,
     EKF2,
-    EKF2_LINE,
     LEFT,
-    MEASUREMENT,
     MUTED,
     OURS,
-    OURS_LINE,
     POINTS_PER_HEIGHT,
     RIGHT,
     SEVERITY_COLOURS,
@@ -31,221 +30,240 @@ from px4fuse.report.words import (
     clock_words,
     consequences_words,
     settings_words,
-    verdict_notes,
     verdict_words,
 )
 
-LABEL_WIDTH = 0.115
-PLAN_MIN_HEIGHT = 0.27
+LABEL_WIDTH = 0.085
+TEXT_X = LEFT + LABEL_WIDTH
+# Points before the map, and for the line that says that findings follow
+BEFORE_MAP, MORE = 14.0, 13.0
+SECOND = 0.5 * (LEFT + RIGHT)  # where the right half of the page begins
 TABLE_SIZE = 7.6
-# Right (numbers) or left (words) edges of the verdict table's columns, fractions of the page
-COLUMNS = (
-    ("axis", LEFT, "left"),
-    ("filter", 0.150, "left"),
-    ("n", 0.262, "right"),
-    ("mean NIS", 0.345, "right"),
-    ("95 % band", 0.440, "right"),
-    ("innovation variance", 0.460, "left"),
-    ("√S", 0.665, "right"),
-    ("std ν", 0.725, "right"),
-    ("σ_p", 0.783, "right"),
-    ("p RMSE", 0.866, "right"),
-    ("v RMSE", RIGHT, "right"),
+# Right (numbers) or left (words) edges of the columns of the other axes, fractions of the page
+COLUMNS: tuple[tuple[float, str], ...] = (
+    (LEFT, "left"), (TEXT_X, "left"), (0.385, "right"), (0.47, "right"),
+    (0.515, "left"), (0.73, "right"), (0.815, "right"), (RIGHT, "right"),
+)  # fmt: skip
+EXPLANATION = (
+    "Mean NIS is 1 where the innovations are as large as a filter's own variance says; below its "
+    "95 % band the variance is overstated, above it understated."
 )
 
 
 def draw(document: Document) -> Iterator[Figure]:
     """Draw the cover, and a further page where the findings need one."""
-    comparison = document.comparison
     figure, cursor = page("Two-state Kalman filter against EKF2")
-    _facts(cursor, document)
-    cursor.skip(8)
-    cursor.write("Verdict", size=10.5, weight="bold")
-    cursor.skip(3)
-    _verdicts(figure, cursor, document)
-    cursor.skip(3)
-    truth = comparison.flight.truth
-    against = (
-        "RMSE of the rows ours and EKF2 is against ground truth, of ours - EKF2 between the two. "
-        if not isinstance(truth, Unavailable)
-        else "RMSE is between the two filters at EKF2's sample times; the log has no ground truth. "
-    )
-    cursor.write(
-        "Mean NIS is 1 when a filter's innovations ν are as large as its own variance S says; "
-        "below the band S is overstated, above it understated, by the factor given. "
-        f"{against}√S, std ν, σ_p and p RMSE in m, v RMSE in m/s.",
-        size=7,
-        colour=MUTED,
-    )
-    for note in verdict_notes(comparison):
-        cursor.write(note, size=7)
-    cursor.skip(8)
+    cursor.write(_subtitle(document), size=8.0, colour=MUTED)
+    if document.story:
+        cursor.skip(5)
+        for sentence in document.story:
+            cursor.skip(2)
+            cursor.write(sentence, size=10.5)
+    cursor.skip(12)
+    _verdict(figure, cursor, document)
+    _other_axes(figure, cursor, document)
+    cursor.skip(10)
+    above = plan(document, facts(document))
     cursor.write("Findings", size=10.5, weight="bold")
-    cursor.skip(2)
     if not document.findings:
         cursor.write("None: no detector has anything to say about this flight.")
-    for finding in document.findings:
+    room = cursor.y - BOTTOM - above.least(cursor) - BEFORE_MAP / POINTS_PER_HEIGHT
+    heights = np.cumsum([_finding_height(cursor, finding) for finding in document.findings])
+    fitting = int(np.searchsorted(heights, room))
+    if fitting < len(heights):
+        fitting = int(np.searchsorted(heights, room - MORE / POINTS_PER_HEIGHT))
+    for finding in document.findings[:fitting]:
+        write_finding(cursor, finding)
+    rest = document.findings[fitting:]
+    if rest:
+        cursor.skip(3)
+        more = f"{len(rest)} of {len(document.findings)} findings: next page."
+        cursor.write(more, x=TEXT_X, size=7.5, colour=MUTED)
+    cursor.skip(BEFORE_MAP)
+    above.draw(figure, cursor)
+    yield figure
+    if rest:
+        yield from _continued(rest)
+
+
+def _continued(findings: tuple[Finding, ...]) -> Iterator[Figure]:
+    figure, cursor = page("Findings, continued")
+    for finding in findings:
         if cursor.y - _finding_height(cursor, finding) < BOTTOM:
             yield figure
             figure, cursor = page("Findings, continued")
         write_finding(cursor, finding)
-    _plan(figure, cursor, document)
     yield figure
 
 
-def _plan(figure: Figure, cursor: Cursor, document: Document) -> None:
-    """The flight from above, where the page has room for it."""
-    room = cursor.y - BOTTOM
-    axes_of = {result.axis.name: result for result in document.comparison.axes}
-    if room < PLAN_MIN_HEIGHT or not {"north", "east"} <= axes_of.keys():
-        return
-    cursor.skip(14)
-    cursor.write("From above", size=10.5, weight="bold")
-    bottom = BOTTOM + 0.04
-    axes = figure.add_axes((LEFT + 0.03, bottom, RIGHT - LEFT - 0.03, cursor.y - 0.01 - bottom))
-    north, east = axes_of["north"], axes_of["east"]
-    axes.plot(east.axis.measurement_m, north.axis.measurement_m, ".", color=MEASUREMENT, ms=1.8,
-              mew=0, label="measurement")  # fmt: skip
-    if isinstance(north.ekf2_state, pd.DataFrame) and isinstance(east.ekf2_state, pd.DataFrame):
-        axes.plot(
-            east.ekf2_state["position_m"], north.ekf2_state["position_m"], **EKF2_LINE, label="EKF2"
+def _subtitle(document: Document) -> str:
+    log = document.comparison.flight.log
+    who = ", ".join(part for part in (document.student.name, document.student.id) if part)
+    about = (who, log.name, f"{log.duration_s:.1f} s", f"{log.firmware}, {log.hardware}")
+    return " · ".join(part for part in about if part)
+
+
+def _verdict(figure: Figure, cursor: Cursor, document: Document) -> None:
+    """The main axis, large: each filter on its half of the page."""
+    result = document.comparison.main
+    along = "the aisle" if result.axis.name == AISLE else result.axis.name
+    top = cursor.y
+    ends = []
+    for label, summary, truth, colour, left, right in (
+        (f"Along {along} our filter's variance is", result.kf, result.kf_truth, OURS, LEFT, SECOND),
+        (f"Along {along} EKF2's variance is", result.ekf2, result.ekf2_truth, EKF2, SECOND, RIGHT),
+    ):
+        if isinstance(summary, Unavailable):
+            continue
+        cursor.y = top
+        statement = summary.consistency
+        shade = colour if isinstance(statement, Consistency) else MUTED
+        cursor.write(label, size=8.0, x=left, right=right)
+        cursor.write(verdict_words(statement), size=16.0, weight="bold", colour=shade, x=left)
+        cursor.skip(2)
+        cursor.write(_large_numbers(summary, truth), size=8.0, x=left, right=right - 0.02)
+        ends.append(cursor.y)
+    cursor.y = min(ends)
+    cursor.skip(2)
+    if isinstance(result.difference, Difference):
+        part = result.difference
+        cursor.write(
+            f"Ours - EKF2: {part.position_rmse_m:.3f} m and {part.velocity_rmse_m_s:.3f} m/s RMS, "
+            f"at most {part.position_maximum_m:.2f} m."
+            + ("" if document.truth_known else " The log has no truth to say who is right."),
+            size=8.0,
         )
-    axes.plot(
-        east.replay.steps["position_m"], north.replay.steps["position_m"], **OURS_LINE, label="ours"
+    elif isinstance(result.ekf2, Unavailable):
+        cursor.write(f"There is no EKF2 to compare with: {result.ekf2.reason}.", size=8.0)
+    cursor.skip(2)
+    cursor.write(EXPLANATION, size=7.0, colour=MUTED)
+
+
+def _large_numbers(summary: FilterSummary, truth: AgainstTruth | Unavailable) -> str:
+    statement = summary.consistency
+    if isinstance(statement, Consistency):
+        low, high = statement.nis_band
+        words = (
+            f"Mean NIS {statement.nis_mean:.3g}, band {low:.2f} to {high:.2f}, from "
+            f"{statement.count} innovations."
+        )
+    else:
+        words = f"{statement.reason}."
+    if isinstance(truth, AgainstTruth):
+        words += f" {truth.position_rmse_m:.3f} m"
+        if truth.velocity_rmse_m_s is not None:
+            words += f" and {truth.velocity_rmse_m_s:.3f} m/s"
+        words += " RMS from the truth."
+    return words
+
+
+def _other_axes(figure: Figure, cursor: Cursor, document: Document) -> None:
+    """The axes beside the main one, a row each."""
+    others = [axis for axis in document.comparison.axes if axis is not document.comparison.main]
+    if not others:
+        return
+    to_truth = "to truth (m)" if document.truth_known else ""
+    beside = not isinstance(document.comparison.main.ekf2, Unavailable)
+    names = ("variance", "mean NIS", to_truth)
+    blank = ("",) * 3
+    cursor.skip(5)
+    _row(
+        figure, cursor, ("", "our filter", "", "", "EKF2" if beside else "", "", "", ""),
+        [MUTED] * 8,
+    )  # fmt: skip
+    apart = "ours - EKF2 (m)" if beside else ""
+    _row(figure, cursor, ("axis", *names, *(names if beside else blank), apart), [MUTED] * 8)
+    cursor.skip(2.5)
+    cursor.rule()
+    colours = ["black", *[OURS] * 3, *[EKF2] * 3, "black"]
+    for result in others:
+        difference = result.difference
+        cells = (
+            result.axis.name,
+            *_cells(result.kf, result.kf_truth),
+            *(_cells(result.ekf2, result.ekf2_truth) if beside else blank),
+            f"{difference.position_rmse_m:.3f}" if isinstance(difference, Difference) else "",
+        )
+        _row(figure, cursor, cells, colours)
+
+
+def _row(figure: Figure, cursor: Cursor, cells: Sequence[str], colours: Sequence[str]) -> None:
+    cursor.y -= TABLE_SIZE * 1.4 / POINTS_PER_HEIGHT
+    for (x, align), text, colour in zip(COLUMNS, cells, colours, strict=True):
+        if text:
+            figure.text(
+                x, cursor.y, text, size=TABLE_SIZE, ha=align, va="baseline", color=colour,
+                weight="bold" if text.startswith(("over", "under")) else "normal",
+            )  # fmt: skip
+
+
+def _cells(
+    summary: FilterSummary | Unavailable, truth: AgainstTruth | Unavailable
+) -> tuple[str, str, str]:
+    if isinstance(summary, Unavailable):
+        return "not available", "", ""
+    statement = summary.consistency
+    return (
+        verdict_words(statement),
+        f"{statement.nis_mean:.3g}" if isinstance(statement, Consistency) else "",
+        f"{truth.position_rmse_m:.3f}" if isinstance(truth, AgainstTruth) else "",
     )
-    axes.set_aspect("equal", adjustable="datalim", anchor="W")
-    axes.set_xlabel("east (m)")
-    axes.set_ylabel("north (m)")
-    axes.legend(loc="upper right", markerscale=3.0)
 
 
-def _facts(cursor: Cursor, document: Document) -> None:
+def facts(document: Document) -> list[tuple[str, str]]:
+    """What was compared, in labels and sentences."""
     comparison = document.comparison
     log, source, segment = comparison.flight.log, comparison.source, comparison.segment
-    files = comparison.flight.inputs
-    who = ", ".join(part for part in (document.student.name, document.student.id) if part)
-    looked = [
-        part.what.removeprefix("position source ")
-        for part in comparison.missing
-        if part.what == "position source vehicle_visual_odometry"
-    ]
     source_text = (
         f"{source.name}: {source.description}, {source.rate_hz:.1f} Hz, {source.frame}; "
         f"{comparison.source_reason}"
     )
-    if looked:
+    if any(part.what == "position source vehicle_visual_odometry" for part in comparison.missing):
         source_text += ". SDLOG_PROFILE 129 would have logged it as it arrived"
-    facts = [
-        ("Student", who),
-        ("Log", f"{log.name}, {log.size_bytes / 1e6:.2f} MB, {log.duration_s:.1f} s of data"),
-        ("SHA-256", log.sha256),
-        ("With", ", ".join(f"{f.name}, SHA-256 {f.sha256[:12]}…" for f in files)),
-        ("Vehicle", f"{log.firmware}, {log.hardware}"),
+    clock = ""
+    if source.clock_map is not None:
+        clock = clock_words(source.clock_map)
+    elif source.alignment is not None:
+        clock = source.clock
+    aisle = next((axis.axis for axis in comparison.axes if axis.axis.name == AISLE), None)
+    listed = [
         ("Position", source_text),
-        ("Clock", _clock(document)),
+        ("Clock", clock),
         ("Segment", f"{segment.start_s:.2f} s to {segment.end_s:.2f} s, {segment.reason}"),
         ("Our filter", settings_words(comparison.settings)),
+        ("Aisle", "" if aisle is None else f"{aisle.heading_deg:.1f}° from north ({aisle.note})"),
+        (
+            "With",
+            ", ".join(f"{f.name}, SHA-256 {f.sha256[:12]}…" for f in comparison.flight.inputs),
+        ),
+        ("SHA-256", f"{log.sha256}, {log.size_bytes / 1e6:.2f} MB"),
     ]
-    aisle = next((a.axis for a in comparison.axes if a.axis.name == "aisle"), None)
-    if aisle is not None:
-        facts.append(("Aisle", f"{aisle.heading_deg:.1f}° from north ({aisle.note})"))
-    for label, text in facts:
-        if not text:
-            continue
-        top = cursor.y
-        cursor.write(label, weight="bold", right=LEFT + LABEL_WIDTH)
-        cursor.y = top
-        cursor.write(text, x=LEFT + LABEL_WIDTH)
-
-
-def _clock(document: Document) -> str:
-    """Clock of the source, where it was mapped or matched here."""
-    source = document.comparison.source
-    if source.clock_map is not None:
-        return clock_words(source.clock_map)
-    return "" if source.alignment is None else source.clock
-
-
-def _verdicts(figure: Figure, cursor: Cursor, document: Document) -> None:
-    comparison = document.comparison
-    _table_row(figure, cursor, [name for name, _, _ in COLUMNS], colour=MUTED)
-    cursor.skip(2.5)
-    cursor.rule()
-    for result in comparison.axes:
-        _table_row(
-            figure, cursor, [result.axis.name, "ours", *_cells(result.kf, result.kf_truth)], OURS
-        )
-        if isinstance(result.ekf2, Unavailable):
-            _table_row(figure, cursor, ["", "EKF2", "", "", "", "not available"], EKF2)
-        else:
-            _table_row(figure, cursor, ["", "EKF2", *_cells(result.ekf2, result.ekf2_truth)], EKF2)
-            _table_row(figure, cursor, ["", "ours - EKF2", *[""] * 7, *_difference(result)], MUTED)
-        cursor.skip(2.5)
-        cursor.rule("#dddddd")
-
-
-def _table_row(figure: Figure, cursor: Cursor, cells: list[str], colour: str) -> None:
-    cursor.y -= TABLE_SIZE * 1.4 / POINTS_PER_HEIGHT
-    for (name, x, align), text in zip(COLUMNS, cells, strict=False):
-        weight = "bold" if name == "axis" or text.startswith(("over", "under")) else "normal"
-        figure.text(
-            x, cursor.y, text, size=TABLE_SIZE, ha=align, va="baseline", weight=weight,
-            color="black" if name == "axis" else colour,
-        )  # fmt: skip
-
-
-def _cells(summary: FilterSummary, truth: AgainstTruth | Unavailable) -> list[str]:
-    statement = summary.consistency
-    errors = ["", ""]
-    if isinstance(truth, AgainstTruth):
-        velocity = truth.velocity_rmse_m_s
-        errors = [f"{truth.position_rmse_m:.3f}", "" if velocity is None else f"{velocity:.3f}"]
-    sigma = "" if summary.sigma_p_median_m is None else f"{summary.sigma_p_median_m:.3f}"
-    if not isinstance(statement, Consistency):
-        return ["", "", "", verdict_words(statement), "", "", sigma, *errors]
-    low, high = statement.nis_band
-    return [
-        f"{statement.count}",
-        f"{statement.nis_mean:.3g}",
-        f"{low:.2f} – {high:.2f}",
-        verdict_words(statement),
-        f"{statement.sqrt_s_median_m:.3f}",
-        f"{statement.innovation_std_m:.3f}",
-        sigma,
-        *errors,
-    ]
-
-
-def _difference(result: AxisComparison) -> list[str]:
-    if not isinstance(result.difference, Difference):
-        return ["", ""]
-    return [
-        f"{result.difference.position_rmse_m:.3f}",
-        f"{result.difference.velocity_rmse_m_s:.3f}",
-    ]
-
-
-_TEXT_X = LEFT + 0.085
+    return [(label, text) for label, text in listed if text]
 
 
 def _finding_height(cursor: Cursor, finding: Finding) -> float:
-    text = cursor.height(finding.message, x=_TEXT_X) + cursor.height(
-        finding.remedy, x=_TEXT_X, size=7.5
+    text = sum(cursor.height(part, x=TEXT_X, size=size) for part, size in _finding_parts(finding))
+    beside = cursor.height(finding.severity, size=7.5) + cursor.height(
+        finding.when, size=6.5, right=TEXT_X - 0.01
     )
-    if finding.consequences:
-        text += cursor.height(consequences_words(finding), x=_TEXT_X, size=7.5)
-    return text + 12.0 / POINTS_PER_HEIGHT
+    return max(text, beside) + 4.0 / POINTS_PER_HEIGHT
+
+
+def _finding_parts(finding: Finding) -> list[tuple[str, float]]:
+    parts = [(finding.message, 8.0), (finding.remedy, 7.5)]
+    return [*parts, (consequences_words(finding), 7.5)] if finding.consequences else parts
 
 
 def write_finding(cursor: Cursor, finding: Finding) -> None:
-    """Write severity, sentence and remedy."""
-    cursor.skip(3)
+    """Write severity, when it shows, sentence and remedy."""
+    cursor.skip(4)
     top = cursor.y
     cursor.write(
         finding.severity, size=7.5, weight="bold", colour=SEVERITY_COLOURS[finding.severity]
     )
-    cursor.y = top
-    cursor.write(finding.message, x=_TEXT_X)
-    cursor.write(finding.remedy, x=_TEXT_X, size=7.5, colour=MUTED)
-    if finding.consequences:
-        cursor.write(consequences_words(finding), x=_TEXT_X, size=7.5, colour=MUTED)
+    if finding.when:
+        cursor.write(finding.when, size=6.5, colour=MUTED, right=TEXT_X - 0.01)
+    beside, cursor.y = cursor.y, top
+    for text, size in _finding_parts(finding):
+        cursor.write(text, x=TEXT_X, size=size, colour="black" if size == 8.0 else MUTED)
+    cursor.y = min(cursor.y, beside)

@@ -7,8 +7,10 @@ from functools import cached_property
 
 from px4fuse.analysis import Analysis, Counterfactual
 from px4fuse.comparison.comparison import Comparison
+from px4fuse.comparison.events import Events, happened
 from px4fuse.findings import Finding
 from px4fuse.findings.story import story
+from px4fuse.flight import Unavailable
 from px4fuse.loop.loop import Loop
 from px4fuse.results.model import Provenance, Student
 
@@ -44,6 +46,16 @@ class Document:
     def story(self) -> tuple[str, ...]:
         """What happened, in up to three sentences."""
         return story(self.analysis, self.findings)
+
+    @property
+    def truth_known(self) -> bool:
+        """Whether the log has a truth to compare with."""
+        return not isinstance(self.comparison.flight.truth, Unavailable)
+
+    @cached_property
+    def events(self) -> Events:
+        """What is marked on every time axis."""
+        return happened(self.comparison)
 
     @property
     def log(self) -> tuple[str, str]:

@@ -1,70 +1,154 @@
-"""Innovations of both filters on common axes, with ±2√S and the share outside."""
+"""Innovations and variances of both filters on one time axis; a zoom into predict and update."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from scipy.stats import norm
+from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
 from px4fuse.arrays import Array
 from px4fuse.comparison.comparison import AxisComparison, FilterSummary
+from px4fuse.comparison.events import Span
 from px4fuse.filter.consistency import Consistency
+from px4fuse.filter.signals import AISLE, Segment
 from px4fuse.flight import Unavailable
+from px4fuse.report import marks
 from px4fuse.report.document import Document
 from px4fuse.report.style import (
-    BOTTOM,
     EKF2,
-    EKF2_BAND,
     EKF2_DOTS,
     EKF2_LINE,
+    EKF2_REJECTED,
+    MAX_POINTS,
+    MEASUREMENT,
+    MUTED,
     OURS,
     OURS_BAND,
     OURS_DOTS,
-    caption,
+    OURS_LINE,
+    TIME_LABEL,
+    Cursor,
+    bare_x,
+    below,
     page,
-    panels,
+    panel,
     thin,
 )
+from px4fuse.report.words import verdict_notes, verdict_words
 
 # The axes reach this much beyond 2√S, or beyond 99 % of the innovations if that is further, but
 # not beyond so many √S; what lies outside is drawn at the edge and counted.
 EDGE = 1.3
 LARGEST_SIGMA = 5.0
-HISTOGRAM_BINS = 41
+ZOOM_UPDATES = 15
+ZOOM_RANGE_S = (1.0, 12.0)
+# Of the updates that a zoom of its length can hold, it must hold this share
+ZOOM_FILLED = 0.8
+START_S = 5.0
+ZOOM_RIGHT, START_LEFT = 0.635, 0.715
+# Heights of the axes in points
+INNOVATIONS, SIGMA_P, SIGMA_V, ZOOM = 140.0, 80.0, 60.0, 140.0
 
 
 def draw(document: Document) -> Iterator[Figure]:
-    """Draw one page with a row per axis: the series, and beside it how they are distributed."""
-    comparison = document.comparison
-    figure, cursor = page(
-        "Innovations",
-        "Innovation = measurement - prediction, before the update. About 95 % should lie inside "
-        "±2√S, the filter's own expectation: many more outside means that S is too small, hardly "
-        "any means that S is too large. Both filters on one scale; EKF2's sign is turned to ours.",
+    """Draw one page: innovations, σ_p and σ_v on one time axis, then the zooms."""
+    result, segment = document.comparison.main, document.comparison.segment
+    name = result.axis.name
+    along = "the aisle" if name == AISLE else name
+    figure, cursor = page(f"Innovations and variances along {along}")
+    strip = bool(document.events.modes)
+    axes = panel(
+        cursor,
+        "Innovation = measurement - prediction (m)",
+        innovation_words(result),
+        INNOVATIONS,
+        above=12.0 if strip else 4.0,
     )
-    rows = len(comparison.axes)
-    grid = panels(
-        figure, cursor.y - 0.035, BOTTOM + 0.045, rows, 2, widths=(4.6, 1.0), hspace=0.36,
-        wspace=0.06,
-    )  # fmt: skip
-    for row, result in zip(grid, comparison.axes, strict=True):
-        limit = _limit(result)
-        _series(row[0], result, limit)
-        row[0].set_xlim(comparison.segment.start_s, comparison.segment.end_s)
-        _distribution(row[1], result, limit)
-        if row is grid[-1]:
-            row[0].set_xlabel("time since first data (s)")
-        _numbers(row[0], result)
-    handles, labels = grid[0][0].get_legend_handles_labels()
-    figure.legend(
-        handles, labels, loc="lower left", ncols=len(labels),
-        bbox_to_anchor=(grid[0][0].get_position().x0 - 0.012, cursor.y - 0.02), borderaxespad=0.0,
-    )  # fmt: skip
+    draw_innovations(axes, result, MAX_POINTS)
+    axes.set_xlim(segment.start_s, segment.end_s)
+    marks.draw(axes, document, axis="", strip=strip)
+    bare_x(axes)
+    below(cursor, innovation_numbers(result, axes.get_ylim()[1]), points=4.0)
+    cursor.skip(8)
+    for title, say, height, column in (
+        (
+            "Standard deviation of position (m), log scale",
+            sigma_words(document),
+            SIGMA_P,
+            "position_variance_m2",
+        ),
+        (
+            "Standard deviation of velocity (m/s), log scale",
+            f"Median σ: {_medians(result, 'sigma_v_median_m_s', 'm/s')}.",
+            SIGMA_V,
+            "velocity_variance_m2_s2",
+        ),
+    ):
+        axes = panel(cursor, title, say, height)
+        draw_sigma(axes, result, column, MAX_POINTS)
+        axes.set_xlim(segment.start_s, segment.end_s)
+        marks.draw(axes, document)
+        if column.startswith("position"):
+            bare_x(axes)
+        else:
+            axes.set_xlabel(TIME_LABEL)
+            cursor.skip(22)
+        cursor.skip(10)
+    _zooms(cursor, document)
+    for note in verdict_notes(document.comparison):
+        cursor.skip(2)
+        cursor.write(note, size=7, colour=MUTED, spacing=1.25)
     yield figure
+
+
+def _zooms(cursor: Cursor, document: Document) -> None:
+    """Two zooms beside one another: in flight, and from the start."""
+    result, segment = document.comparison.main, document.comparison.segment
+    top = cursor.y
+    window = zoom_window(result, segment)
+    start = panel(
+        cursor, "The first seconds, log scale", start_words(result), ZOOM, left=START_LEFT,
+        above=7.0,
+    )  # fmt: skip
+    bottom, cursor.y = cursor.y, top
+    axes = panel(
+        cursor,
+        f"Standard deviation of position (m), {window[1] - window[0]:.1f} s of the flight",
+        zoom_words(result),
+        ZOOM,
+        right=ZOOM_RIGHT,
+        above=7.0,
+    )
+    low = min(bottom, cursor.y)
+    for each in (axes, start):
+        box = each.get_position()
+        each.set_position((box.x0, low, box.width, box.y1 - low))
+    cursor.y = low
+    _sawtooth(axes, result, window)
+    first = float(result.replay.steps.index[0])
+    _sawtooth(start, result, (first, min(first + START_S, segment.end_s)))
+    start.set_yscale("log")
+    _log_ticks(start)
+    updates = result.replay.updates.index.to_numpy()
+    inside = updates[(updates >= window[0]) & (updates <= window[1])]
+    axes.vlines(inside, 0.0, 0.03, transform=axes.get_xaxis_transform(), color=MEASUREMENT, lw=1.2)
+    axes.set_xlabel(TIME_LABEL)
+    start.set_xlabel("time (s)")
+    cursor.skip(22)
+    below(
+        cursor,
+        "Line: our filter, predict and update; grey ticks: measurements. "
+        + (
+            "EKF2: triangle up just before an update, down just after, square as logged."
+            if isinstance(result.ekf2_innovations, pd.DataFrame)
+            else ""
+        ),
+    )
 
 
 def _limit(result: AxisComparison) -> float:
@@ -78,94 +162,254 @@ def _limit(result: AxisComparison) -> float:
     return EDGE * max(limits)
 
 
-def _series(axes: Axes, result: AxisComparison, limit: float) -> None:
-    axes.set_title(f"{result.axis.name}: innovation (m)")
+def draw_innovations(axes: Axes, result: AxisComparison, limit: int) -> None:
+    """Innovations of both filters with ±2√S; what EKF2 rejected is hollow."""
+    edge = _limit(result)
     updates = result.replay.updates
     time = updates.index.to_numpy()
     two_sigma = 2.0 * np.sqrt(updates["innovation_variance_m2"].to_numpy())
-    band_time, band = thin(time, two_sigma)
-    axes.fill_between(band_time, -band, band, color=OURS_BAND, lw=0, label="ours ±2√S")
+    band_time, band = thin(time, two_sigma, limit)
+    axes.fill_between(band_time, -band, band, color=OURS_BAND, lw=0)
     axes.axhline(0.0, color="black", lw=0.5)
     frame = result.ekf2_innovations
     if isinstance(frame, pd.DataFrame):
-        ekf2_time = frame.index.to_numpy()
+        ekf2_time, nu = frame.index.to_numpy(), frame["innovation_m"].to_numpy()
         two_sigma = 2.0 * np.sqrt(frame["innovation_variance_m2"].to_numpy())
-        axes.plot(*thin(ekf2_time, two_sigma), **EKF2_LINE, label="EKF2 ±2√S")
-        axes.plot(*thin(ekf2_time, -two_sigma), **EKF2_LINE)
-        axes.plot(
-            *_inside(ekf2_time, frame["innovation_m"].to_numpy(), limit),
-            **EKF2_DOTS, label="EKF2 innovation",
-        )  # fmt: skip
-        _edge(axes, ekf2_time, frame["innovation_m"].to_numpy(), limit, EKF2)
+        axes.plot(*thin(ekf2_time, two_sigma, limit), **EKF2_LINE)
+        axes.plot(*thin(ekf2_time, -two_sigma, limit), **EKF2_LINE)
+        rejected = (frame["rejected"] > 0).to_numpy()
+        for part, style in ((~rejected, EKF2_DOTS), (rejected, EKF2_REJECTED)):
+            shown = part & (np.abs(nu) <= edge)
+            axes.plot(*thin(ekf2_time[shown], nu[shown], limit), **style)
+            _at_edge(axes, ekf2_time[part], nu[part], edge, style)
     nu = updates["innovation_m"].to_numpy()
-    axes.plot(*_inside(time, nu, limit), **OURS_DOTS, label="our innovation")
-    _edge(axes, time, nu, limit, OURS)
-    axes.set_ylim(-limit, limit)
+    shown = np.abs(nu) <= edge
+    axes.plot(*thin(time[shown], nu[shown], limit), **OURS_DOTS)
+    _at_edge(axes, time, nu, edge, OURS_DOTS)
+    axes.set_ylim(-edge, edge)
 
 
-def _inside(time: Array, nu: Array, limit: float) -> tuple[Array, Array]:
-    keep = np.abs(nu) <= limit
-    return thin(time[keep], nu[keep])
-
-
-def _edge(axes: Axes, time: Array, nu: Array, limit: float, colour: str) -> None:
+def _at_edge(axes: Axes, time: Array, nu: Array, limit: float, style: dict[str, Any]) -> None:
     """Mark what lies beyond the axes with a triangle at its edge."""
     for sign, marker in ((1.0, "^"), (-1.0, "v")):
         beyond = sign * nu > limit
         if np.any(beyond):
             axes.plot(
                 time[beyond], np.full(np.count_nonzero(beyond), sign * 0.96 * limit),
-                marker=marker, ls="none", color=colour, ms=3.2, mew=0, clip_on=False,
+                **{**style, "marker": marker, "ms": 3.2}, clip_on=False,
             )  # fmt: skip
 
 
-def _distribution(axes: Axes, result: AxisComparison, limit: float) -> None:
-    """Histograms of both beside what each filter expects, on the same scale."""
-    bins = np.linspace(-limit, limit, HISTOGRAM_BINS)
-    centres = (bins[:-1] + bins[1:]) / 2.0
-    axes.set_title("distribution")
-    updates = result.replay.updates
-    sources = [(updates, OURS, "-")]
-    if isinstance(result.ekf2_innovations, pd.DataFrame):
-        sources.append((result.ekf2_innovations, EKF2, (0, (4, 1.6))))  # type: ignore[arg-type]
-    widest = 0.0
-    for frame, colour, line in sources:
-        density, _ = np.histogram(frame["innovation_m"], bins=bins, density=True)
-        axes.step(density, centres, where="mid", color=colour, lw=0.8, ls=line)
-        expected = norm.pdf(centres, scale=np.sqrt(frame["innovation_variance_m2"].median()))
-        axes.fill_betweenx(
-            centres, 0.0, expected, lw=0, alpha=0.55,
-            color=OURS_BAND if colour == OURS else EKF2_BAND,
-        )  # fmt: skip
-        widest = max(widest, float(np.max(density, initial=0.0)), float(expected.max()))
-    axes.set_xlim(0.0, 1.05 * widest if widest > 0 else 1.0)
-    axes.set_ylim(-limit, limit)
-    axes.set_yticklabels([])
-    axes.set_xticks([])
-    axes.spines["bottom"].set_visible(False)
-
-
-def _numbers(axes: Axes, result: AxisComparison) -> None:
-    limit = axes.get_ylim()[1]
-    nu = result.replay.updates["innovation_m"]
-    texts = [_statement("ours", result.kf, int((nu.abs() > limit).sum()))]
+def innovation_words(result: AxisComparison) -> str:
+    """What to see in the innovations."""
+    words = [_outside_words("Ours", result.kf)]
     if isinstance(result.ekf2, Unavailable):
-        texts.append(result.ekf2.reason)
+        words.append(f"EKF2: {result.ekf2.reason}")
     elif isinstance(result.ekf2_innovations, Unavailable):
-        texts.append(result.ekf2_innovations.reason)
+        words.append(f"EKF2: {result.ekf2_innovations.reason}")
     else:
-        nu = result.ekf2_innovations["innovation_m"]
-        texts.append(_statement("EKF2", result.ekf2, int((nu.abs() > limit).sum())))
-    caption(axes, "\n".join(texts))
+        words.append(_outside_words("EKF2", result.ekf2))
+        count = int((result.ekf2_innovations["rejected"] > 0).sum())
+        if count:
+            words.append(f"It rejected {count} of them (hollow)")
+    return ". ".join(words) + "."
 
 
-def _statement(name: str, summary: FilterSummary, beyond: int) -> str:
+def _outside_words(name: str, summary: FilterSummary) -> str:
     statement = summary.consistency
     if not isinstance(statement, Consistency):
         return f"{name}: {statement.reason}"
     return (
-        f"{name}: mean {statement.innovation_mean_m:+.3f} m, "
-        f"std {statement.innovation_std_m:.3f} m, √S {statement.sqrt_s_median_m:.3f} m, "
-        f"{statement.outside_two_sigma:.1%} outside ±2√S "
-        f"(n {statement.count})" + (f", {beyond} beyond the axis" if beyond else "")
+        f"{name}: {statement.outside_two_sigma:.1%} of {statement.count} outside its own ±2√S, "
+        f"where 5% should be: {verdict_words(statement)}"
     )
+
+
+def innovation_numbers(result: AxisComparison, limit: float) -> str:
+    """Numbers of the innovations, and how many lie beyond the axes."""
+    words = [_numbers("ours", result.kf, result.replay.updates, limit)]
+    if isinstance(result.ekf2, FilterSummary):
+        words.append(_numbers("EKF2", result.ekf2, result.ekf2_innovations, limit))
+    return "; ".join(filter(None, words))
+
+
+def _numbers(
+    name: str, summary: FilterSummary, frame: pd.DataFrame | Unavailable, limit: float
+) -> str:
+    statement = summary.consistency
+    if not isinstance(statement, Consistency) or isinstance(frame, Unavailable):
+        return ""
+    beyond = int((frame["innovation_m"].abs() > limit).sum())
+    return (
+        f"{name}: mean {statement.innovation_mean_m:+.3f} m, std "
+        f"{statement.innovation_std_m:.3f} m, median √S {statement.sqrt_s_median_m:.3f} m"
+        + (f", {beyond} beyond the axis (triangles)" if beyond else "")
+    )
+
+
+def short_numbers(result: AxisComparison) -> str:
+    """Verdict and share outside ±2√S of both filters, a line each."""
+    return "\n".join(
+        f"{name}: {statement.outside_two_sigma:.1%} outside, {verdict_words(statement)}"
+        if isinstance(statement := summary.consistency, Consistency)
+        else f"{name}: not available"
+        for name, summary in (("ours", result.kf), ("EKF2", result.ekf2))
+        if isinstance(summary, FilterSummary)
+    )
+
+
+def sigma_numbers(result: AxisComparison) -> str:
+    """Median σ_p of both filters."""
+    return f"median: {_medians(result, 'sigma_p_median_m', 'm')}"
+
+
+def draw_sigma(axes: Axes, result: AxisComparison, column: str, limit: int) -> None:
+    """σ of position or velocity of both filters, log scale."""
+    steps = result.replay.steps
+    axes.plot(*thin(steps.index.to_numpy(), np.sqrt(steps[column].to_numpy()), limit), **OURS_LINE)
+    frame = result.ekf2_variance
+    if isinstance(frame, pd.DataFrame):
+        axes.plot(
+            *thin(frame.index.to_numpy(), np.sqrt(frame[column].to_numpy()), limit), **EKF2_LINE
+        )
+    axes.set_yscale("log")
+    _log_ticks(axes)
+
+
+def sigma_words(document: Document) -> str:
+    """What to see in σ_p."""
+    result, gaps = document.comparison.main, document.events.gaps
+    words = f"Median σ: {_medians(result, 'sigma_p_median_m', 'm')}."
+    if gaps:
+        start, end = max(gaps, key=lambda gap: gap[1] - gap[0])
+        words += (
+            f" In the {end - start:.1f} s without measurements from {start:.0f} s on ours grew to "
+            f"{_largest(result.replay.steps, start, end):.2g} m"
+        )
+        if isinstance(result.ekf2_variance, pd.DataFrame):
+            largest = _largest(result.ekf2_variance, start, end)
+            words += f", EKF2's to {largest:.2g} m" if np.isfinite(largest) else ""
+        words += "."
+    return words
+
+
+def _largest(frame: pd.DataFrame, start_s: float, end_s: float) -> float:
+    inside = frame["position_variance_m2"][(frame.index >= start_s) & (frame.index <= end_s)]
+    return float(np.sqrt(inside.max()))
+
+
+def _medians(result: AxisComparison, field: str, unit: str) -> str:
+    filters = [("ours", result.kf)]
+    if isinstance(result.ekf2, FilterSummary):
+        filters.append(("EKF2", result.ekf2))
+    values = [(name, getattr(summary, field)) for name, summary in filters]
+    return ", ".join(
+        f"{name} not logged" if value is None else f"{name} {value:.3f} {unit}"
+        for name, value in values
+    )
+
+
+def zoom_window(result: AxisComparison, segment: Segment) -> Span:
+    """Part of the flight with about fifteen updates, near the middle of what EKF2 logged too.
+
+    Never in a gap of the source, if it has enough updates anywhere.
+    """
+    updates = result.replay.updates.index.to_numpy()
+    if len(updates) < 2:
+        return segment.start_s, min(segment.start_s + ZOOM_RANGE_S[0], segment.end_s)
+    interval = float(np.median(np.diff(updates)))
+    length = float(np.clip(ZOOM_UPDATES * interval, *ZOOM_RANGE_S))
+    times = updates
+    if isinstance(result.ekf2_innovations, pd.DataFrame) and len(result.ekf2_innovations):
+        times = result.ekf2_innovations.index.to_numpy()
+    last = max(segment.end_s - length, segment.start_s)
+    starts = np.clip(times - length / 2.0, segment.start_s, last)
+    held = np.searchsorted(updates, starts + length) - np.searchsorted(updates, starts)
+    near = np.abs(starts + length / 2.0 - times[len(times) // 2])
+    full = held >= min(ZOOM_FILLED * length / interval, float(held.max()))
+    start = float(starts[np.argmin(np.where(full, near, np.inf))])
+    return start, min(start + length, segment.end_s)
+
+
+def sawtooth(result: AxisComparison) -> tuple[Array, Array]:
+    """Time and σ_p of our filter with both values at each update: just before and just after."""
+    steps, updates = result.replay.steps, result.replay.updates
+    time = np.concatenate([updates.index.to_numpy(), steps.index.to_numpy()])
+    variance = np.concatenate(
+        [
+            updates["prior_position_variance_m2"].to_numpy(),
+            steps["position_variance_m2"].to_numpy(),
+        ]
+    )
+    order = np.argsort(time, kind="stable")  # the prior stands first at equal times
+    return time[order], np.sqrt(variance[order])
+
+
+def _sawtooth(axes: Axes, result: AxisComparison, window: Span) -> None:
+    time, sigma = sawtooth(result)
+    shown = (time >= window[0]) & (time <= window[1])
+    axes.plot(time[shown], sigma[shown], color=OURS, lw=1.1, marker=".", ms=2.4, mew=0)
+    frame = result.ekf2_innovations
+    if isinstance(frame, pd.DataFrame):
+        cut = frame[(frame.index >= window[0]) & (frame.index <= window[1])]
+        cut = cut.dropna(subset=["prior_variance_m2"])
+        before = np.sqrt(cut["prior_variance_m2"].to_numpy())
+        after = np.sqrt(cut["posterior_variance_m2"].to_numpy())
+        at = cut.index.to_numpy()
+        axes.vlines(at, after, before, color=EKF2, lw=1.0)
+        axes.plot(at, before, ls="none", marker="^", ms=3.6, mew=0.7, mfc="none", color=EKF2)
+        axes.plot(at, after, ls="none", marker="v", ms=3.6, mew=0, color=EKF2)
+    if isinstance(result.ekf2_variance, pd.DataFrame):
+        variance = result.ekf2_variance["position_variance_m2"]
+        variance = variance[(variance.index >= window[0]) & (variance.index <= window[1])]
+        axes.plot(variance.index.to_numpy(), np.sqrt(variance.to_numpy()), ls="none", marker="s",
+                  ms=3.0, mew=0.7, mfc="white", color=EKF2)  # fmt: skip
+    axes.set_xlim(*window)
+
+
+def zoom_words(result: AxisComparison) -> str:
+    """What to see in the zoom."""
+    words = []
+    if result.kf.sigma_p_before_update_m is not None:
+        words.append(
+            f"Without measurement σ grows, by SIGMA_A {result.replay.settings.sigma_a_m_s2:g} m/s² "
+            f"(predict); each measurement shrinks it ({_before_after('ours', result.kf)})"
+        )
+    if isinstance(result.ekf2, FilterSummary):
+        words.append(_before_after("EKF2", result.ekf2))
+    return "; ".join(words) + "."
+
+
+def _before_after(name: str, summary: FilterSummary) -> str:
+    before, after = summary.sigma_p_before_update_m, summary.sigma_p_after_update_m
+    if before is None or after is None:
+        return f"{name}: S or R not logged, so no before and after"
+    shrink = 1.0 - after**2 / before**2
+    return f"{name} {before:.3f} to {after:.3f} m, {shrink:.0%} of the variance"
+
+
+def start_words(result: AxisComparison) -> str:
+    """What to see in the first seconds."""
+    initial = float(np.sqrt(result.replay.steps["position_variance_m2"].iloc[0]))
+    steady = result.kf.sigma_p_after_update_m
+    if steady is None:
+        return f"From σ {initial:g} m (P₀) on."
+    time, sigma = result.replay.steps.index, np.sqrt(result.replay.steps["position_variance_m2"])
+    settled = time[(sigma < 1.2 * steady).to_numpy()]
+    if not len(settled):
+        return f"From σ {initial:g} m (P₀) on."
+    return (
+        f"From σ {initial:g} m (P₀) to its steady {steady:.2g} m within "
+        f"{settled[0] - time[0]:.1f} s."
+    )
+
+
+def _log_ticks(axes: Axes) -> None:
+    """Plain numbers on a log axis, at 1, 2 and 5 in each decade; of many decades at 1."""
+    low, high = axes.get_ylim()
+    low, high = low / 1.15, high * 1.25
+    axes.set_ylim(low, high)
+    subs = (1.0, 2.0, 5.0) if high / low < 30.0 else (1.0, 3.0) if high / low < 300.0 else (1.0,)
+    axes.yaxis.set_major_locator(LogLocator(base=10.0, subs=subs))
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.yaxis.set_minor_locator(NullLocator())

@@ -6,21 +6,23 @@ import io
 from collections.abc import Iterator
 from importlib import metadata
 
+from matplotlib.artist import Artist
 from matplotlib.backends.backend_pdf import PdfPages
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 from pypdf import PdfWriter
 
 from px4fuse.report import (
     clock,
     consistency,
     cover,
+    flight,
     innovations,
     loop,
     notes,
+    other_axes,
     provenance,
     sensitivity,
-    tracks,
-    variances,
     whatif,
     why,
 )
@@ -32,13 +34,13 @@ Report = Document | LoopDocument | WhatIfDocument
 RESULTS_NAME = "results.json"
 PAGES = (
     cover.draw,
-    tracks.draw,
+    flight.draw,
     innovations.draw,
-    variances.draw,
+    why.draw,
+    other_axes.draw,
     consistency.draw,
     sensitivity.draw,
     clock.draw,
-    why.draw,
     loop.draw,
     notes.draw,
     provenance.draw,
@@ -68,6 +70,7 @@ def render(document: Report, results_json: str) -> bytes:
         ) as pdf:
             for number, figure in enumerate(figures, start=1):
                 _running_lines(figure, document, number, len(figures))
+                _without_ligatures(figure)
                 pdf.savefig(figure)
     return _attach(drawn.getvalue(), document, results_json)
 
@@ -95,6 +98,18 @@ def _running_lines(figure: Figure, document: Report, number: int, count: int) ->
     version = metadata.version("px4fuse")
     figure.text(LEFT, 0.022, f"px4fuse {version}", **style)  # type: ignore[arg-type]
     figure.text(RIGHT, 0.022, f"{number} / {count}", ha="right", **style)  # type: ignore[arg-type]
+
+
+def _without_ligatures(figure: Figure) -> None:
+    """Draw "fi" as two letters: a ligature takes a second copy of its font into the file."""
+    drawn: list[Artist] = list(figure.texts)
+    for legend in (*figure.legends, *(axes.get_legend() for axes in figure.axes)):
+        drawn += [] if legend is None else legend.get_texts()
+    for axes in figure.axes:
+        drawn += [axes.xaxis.label, axes.yaxis.label, *axes.get_children()]
+    for artist in drawn:
+        if isinstance(artist, Text) and hasattr(artist, "set_fontfeatures"):
+            artist.set_fontfeatures(("-liga",))  # before 3.11 matplotlib knew none
 
 
 def _attach(drawn: bytes, document: Report, results_json: str) -> bytes:

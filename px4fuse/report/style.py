@@ -25,8 +25,11 @@ from px4fuse.arrays import Array
 
 A4_INCHES = (8.27, 11.69)
 LEFT, RIGHT, TOP, BOTTOM = 0.085, 0.945, 0.95, 0.05
+PANEL_LEFT = LEFT + 0.04  # of axes: the numbers beside them stand in between
 POINTS_PER_WIDTH = A4_INCHES[0] * 72.0
 POINTS_PER_HEIGHT = A4_INCHES[1] * 72.0
+
+TIME_LABEL = "time since first data (s)"
 
 OURS = "#123f7a"
 OURS_BAND = "#b9cbe4"
@@ -42,8 +45,13 @@ OURS_LINE: dict[str, Any] = {"color": OURS, "lw": 1.0, "ls": "-"}
 EKF2_LINE: dict[str, Any] = {"color": EKF2, "lw": 1.1, "ls": (0, (4, 1.6))}
 TRUTH_LINE: dict[str, Any] = {"color": TRUTH, "lw": 0.7, "ls": (0, (1, 1.5))}
 OURS_DOTS: dict[str, Any] = {"color": OURS, "marker": "o", "ms": 2.0, "mew": 0, "ls": "none"}
-EKF2_DOTS: dict[str, Any] = {
-    "color": EKF2, "marker": "s", "ms": 2.8, "mew": 0.6, "mfc": "none", "ls": "none",
+EKF2_DOTS: dict[str, Any] = {"color": EKF2, "marker": "s", "ms": 2.2, "mew": 0, "ls": "none"}
+# What EKF2 did not fuse is hollow everywhere
+EKF2_REJECTED: dict[str, Any] = {
+    "color": EKF2, "marker": "s", "ms": 2.8, "mew": 0.6, "mfc": "white", "ls": "none",
+}  # fmt: skip
+MEASURED: dict[str, Any] = {
+    "color": MEASUREMENT, "marker": ".", "ms": 1.8, "mew": 0, "ls": "none",
 }  # fmt: skip
 
 # The first is matplotlib's own and always there; the others serve scripts that it lacks.
@@ -280,6 +288,41 @@ def panels(
             if row is not axes[-1]:
                 single.tick_params(axis="x", labelbottom=False, bottom=False)
     return axes
+
+
+def panel(
+    cursor: Cursor, title: str, say: str, height_points: float, *, left: float = PANEL_LEFT,
+    right: float = RIGHT, above: float = 4.0,
+) -> Axes:  # fmt: skip
+    """Axes below their title and the sentence that says what to see; the cursor moves below them.
+
+    Parameters
+    ----------
+    height_points : float
+        Of the axes alone.
+    above : float
+        Points between the sentence and the axes.
+    """
+    cursor.write(title, size=9.0, weight="bold", x=left - PANEL_LEFT + LEFT, right=right)
+    cursor.write(say, size=8.0, x=left - PANEL_LEFT + LEFT, right=right)
+    cursor.skip(above)
+    height = height_points / POINTS_PER_HEIGHT
+    cursor.y -= height
+    axes = cursor.figure.add_axes((left, cursor.y, right - left, height))
+    axes.xaxis.set_major_locator(MaxNLocator(8))
+    axes.yaxis.set_major_locator(MaxNLocator(4))
+    return axes
+
+
+def bare_x(axes: Axes) -> None:
+    """Leave out the numbers of an x axis that another below it shows."""
+    axes.tick_params(axis="x", labelbottom=False)
+
+
+def below(cursor: Cursor, text: str, *, size: float = 7.0, points: float = 1.0) -> None:
+    """Write numbers under an axes of the page's width."""
+    cursor.skip(points)
+    cursor.write(text, size=size, colour=MUTED, spacing=1.25)
 
 
 def caption(axes: Axes, text: str, *, size: float = 7.0) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -10,10 +10,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from px4fuse.comparison.why import Why
-from px4fuse.ekf2.agreement import settled
 from px4fuse.ekf2.replay import Agreement, Ekf2Replay
 from px4fuse.filter.signals import AISLE
 from px4fuse.flight import Unavailable
+from px4fuse.report import marks
 from px4fuse.report.document import Document
 from px4fuse.report.style import (
     BOTTOM,
@@ -26,17 +26,19 @@ from px4fuse.report.style import (
     OURS_LINE,
     POINTS_PER_HEIGHT,
     RIGHT,
+    TIME_LABEL,
     Cursor,
+    below,
     page,
+    panel,
     thin,
 )
 
 TITLE = "Why EKF2 differs"
 LEAD = (
-    "EKF2 is replayed from the log by a model of it (px4fuse's, not PX4's own code). From our "
-    "filter to the logged EKF2 one thing after the other is changed to be as in EKF2; a bar is by "
-    "how much that brings the track nearer to EKF2's (mean square, hatched: farther away, which "
-    "later steps make good). The bars and what is left add up to the whole difference."
+    "From our filter to the logged EKF2, one thing after the other is changed to be as in EKF2, in "
+    "px4fuse's own model of it. A bar is by how much that brings our track nearer to EKF2's (mean "
+    "square; hatched: farther away, which later steps make good). They add up to the whole."
 )
 ROW_POINTS = 12.0
 LABELS = 0.185  # of the page's width, for the names of the steps
@@ -45,17 +47,13 @@ TIME_POINTS = 105.0
 
 
 def draw(document: Document) -> Iterator[Figure]:
-    """Draw as many pages as the axes need."""
-    analysis = document.analysis
-    names = [AISLE] if AISLE in analysis.why else list(analysis.why)
-    if not names:
+    """Draw as many pages as the axes need; none where nothing is concluded for any."""
+    found = _walks(document)
+    if not any(isinstance(why, Why) for why in found.values()):
         return
     figure, cursor = page(TITLE, LEAD)
-    replay = analysis.ekf2_replay
-    cursor.write(_believed(replay), size=7.5, colour=MUTED)
-    for at, name in enumerate(names):
-        why = analysis.why[name]
-        if at and cursor.y - _height(cursor, why) < BOTTOM:
+    for place, (name, why) in enumerate(found.items()):
+        if place and cursor.y - _height(cursor, why) < BOTTOM:
             yield figure
             figure, cursor = page(f"{TITLE}, continued")
         cursor.skip(8)
@@ -63,9 +61,26 @@ def draw(document: Document) -> Iterator[Figure]:
             cursor.write(f"{name}: nothing is concluded", size=9.5, weight="bold")
             cursor.write(f"{why.reason[:1].upper()}{why.reason[1:]}. {why.remedy}")
         else:
-            assert isinstance(replay, Ekf2Replay)
-            _axis(figure, cursor, name, why, replay)
+            _axis(figure, cursor, name, why, document)
+    below(cursor, _believed(document.analysis.ekf2_replay))
     yield figure
+
+
+def _walks(document: Document) -> Mapping[str, Why | Unavailable]:
+    """Of the aisle, or else of every axis."""
+    found = document.analysis.why
+    return {AISLE: found[AISLE]} if AISLE in found else found
+
+
+def nothing_concluded(document: Document) -> str:
+    """Why there is no such page, in a line; empty where there is one, or no EKF2 to explain."""
+    found = list(_walks(document).values())
+    if isinstance(document.comparison.flight.ekf2, Unavailable) or any(
+        isinstance(why, Why) for why in found
+    ):
+        return ""
+    reasons = {f"{why.reason}. {why.remedy}": None for why in found if isinstance(why, Unavailable)}
+    return f"{TITLE}: nothing is concluded, {' '.join(reasons)}" if reasons else ""
 
 
 def _believed(replay: Ekf2Replay | Unavailable) -> str:
@@ -99,10 +114,10 @@ def _height(cursor: Cursor, why: Why | Unavailable) -> float:
         return cursor.height(f"{why.reason}. {why.remedy}") + 24.0 / POINTS_PER_HEIGHT
     words = sum(cursor.height(sentence, size=8.5) for sentence in why.sentences)
     points = 24.0 + 2.0 * len(why.sentences) + ROW_POINTS * (len(why.axis.steps) + 2) + 30.0
-    return words + (points + TIME_POINTS + 40.0) / POINTS_PER_HEIGHT
+    return words + (points + TIME_POINTS + 100.0) / POINTS_PER_HEIGHT
 
 
-def _axis(figure: Figure, cursor: Cursor, name: str, why: Why, replay: Ekf2Replay) -> None:
+def _axis(figure: Figure, cursor: Cursor, name: str, why: Why, document: Document) -> None:
     spans = ", ".join(f"{start:.0f} to {end:.0f} s" for start, end in why.spans)
     cursor.write(f"{name}, {spans}", size=9.5, weight="bold")
     cursor.skip(2)
@@ -137,11 +152,17 @@ def _axis(figure: Figure, cursor: Cursor, name: str, why: Why, replay: Ekf2Repla
         if column:
             axes.set_yticklabels([])
     cursor.y -= height
-    cursor.skip(42)
-    height = TIME_POINTS / POINTS_PER_HEIGHT
-    axes = figure.add_axes((LEFT + 0.03, cursor.y - height, RIGHT - LEFT - 0.03, height))
-    _over_time(axes, why, replay)
-    cursor.y -= height
+    cursor.skip(36)
+    strip = bool(document.events.modes)
+    axes = panel(
+        cursor, "Position apart (m): ours - EKF2 (dark), and what the model leaves of it (light)",
+        _time_words(why), TIME_POINTS, above=12.0 if strip else 4.0,
+    )  # fmt: skip
+    _over_time(axes, why)
+    segment = document.comparison.segment
+    axes.set_xlim(segment.start_s, segment.end_s)
+    marks.draw(axes, document, axis=name, strip=strip)
+    axes.set_xlabel(TIME_LABEL)
     cursor.skip(24)
 
 
@@ -173,24 +194,30 @@ def _percent(number: float) -> str:
     return "0 %" if small else f"{number:.1f} %" if abs(number) < 9.95 else f"{number:.0f} %"
 
 
-def _over_time(axes: Axes, why: Why, replay: Ekf2Replay) -> None:
-    """Where along the flight both differ, what is left of it, and what was rejected."""
-    axes.set_title("position apart (m)")
+def _time_words(why: Why) -> str:
+    """What to see along the flight."""
+    farthest = int(np.argmax(np.abs(why.axis.apart_m)))
+    words = (
+        f"Farthest apart at {why.times_s[farthest]:.1f} s, "
+        f"{abs(why.axis.apart_m[farthest]):.2g} m; the model leaves "
+        f"{np.sqrt(np.mean(why.axis.left_m**2)):.2g} m RMS"
+    )
+    if why.coast is None:
+        return f"{words}."
+    start, length = why.coast.start_s, why.coast.duration_s
+    return (
+        f"{words}. EKF2's longest run of rejections, {start:.1f} s to {start + length:.1f} s, "
+        + ("is shaded.")
+    )
+
+
+def _over_time(axes: Axes, why: Why) -> None:
+    """Where along the flight both differ, and what the model leaves of it."""
     for start, end in why.spans:
         inside = (why.times_s > start) & (why.times_s < end)
         time = why.times_s[inside]
-        first = start == why.spans[0][0]
-        axes.plot(*thin(time, why.axis.apart_m[inside]), **OURS_LINE,
-                  label="ours - EKF2" if first else None)  # fmt: skip
-        axes.plot(*thin(time, why.axis.left_m[inside]), color=EKF2, lw=0.8,
-                  label="model - EKF2" if first else None)  # fmt: skip
+        axes.plot(*thin(time, why.axis.apart_m[inside]), **OURS_LINE)
+        axes.plot(*thin(time, why.axis.left_m[inside]), color=EKF2, lw=0.8)
     if why.coast is not None:
-        axes.axvspan(why.coast.start_s, why.coast.start_s + why.coast.duration_s, color=EKF2_BAND,
-                     lw=0, label="longest run of rejections")  # fmt: skip
-    rejected = replay.updates["fused_at_s"][replay.updates["rejected"] > 0].to_numpy()
-    rejected = rejected[settled(rejected, why.spans)]
-    if len(rejected):
-        axes.plot(rejected, np.full(len(rejected), 0.02), "|", color="black", ms=4, mew=0.5,
-                  transform=axes.get_xaxis_transform(), label="rejected (replay)")  # fmt: skip
-    axes.set_xlabel("time (s)")
-    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.0, ncols=4)
+        start = why.coast.start_s
+        axes.axvspan(start, start + why.coast.duration_s, color=EKF2_BAND, lw=0, zorder=0.5)

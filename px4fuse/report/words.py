@@ -99,7 +99,8 @@ def _same_nis(stated: list[tuple[str, str, Consistency]]) -> Iterator[str]:
             low, high = wrong.nis_band
             if wrong.verdict == "consistent" or fine.verdict != "consistent":
                 continue
-            if fine.count < wrong.count and not low <= fine.nis_mean <= high:
+            same_side = (fine.nis_mean < 1.0) == (wrong.nis_mean < 1.0)
+            if fine.count < wrong.count and same_side and not low <= fine.nis_mean <= high:
                 bands = " and ".join("{:.2f}-{:.2f}".format(*s.nis_band) for s in (wrong, fine))
                 yield (
                     f"Along {axis} only {owner} is called {_side(wrong)} although {other} has "
@@ -110,7 +111,7 @@ def _same_nis(stated: list[tuple[str, str, Consistency]]) -> Iterator[str]:
 
 def consequences_words(finding: Finding) -> str:
     """What the same cause brings with it, each in one sentence."""
-    return "With it: " + " ".join(one.message for one in finding.consequences)
+    return "With it: " + " ".join(f"{one.headline}." for one in finding.consequences)
 
 
 def clock_words(clock: ClockMap) -> str:

@@ -1,0 +1,106 @@
+"""What happened when, for the time axes of every page: one list for all of them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+
+from px4fuse.arrays import Array
+from px4fuse.comparison.comparison import Comparison
+from px4fuse.flight import Ekf2, FlightMode, Unavailable
+
+# A source is silent where it leaves out this long, and so many of its intervals: jitter and single
+# losses pass
+GAP_S = 1.0
+GAP_INTERVALS = 5.0
+
+Span = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Events:
+    """What happened in the segment of a comparison; times in s from the first data.
+
+    Attributes
+    ----------
+    gaps : tuple of (float, float)
+        Stretches without a position measurement, see :func:`source_gaps`.
+    dropouts : tuple of (float, float)
+        Stretches that the logger lost.
+    ground : tuple of (float, float)
+        Stretches on the ground, by the land detector.
+    take_off_s, landing_s : tuple of float
+    modes : tuple of FlightMode
+        Empty where they are not logged.
+    resets_s : tuple of float
+        Of EKF2's position or velocity.
+    rejected_s : mapping from axis name to ndarray
+        Measurements that EKF2 rejected.
+    """
+
+    gaps: tuple[Span, ...]
+    dropouts: tuple[Span, ...]
+    ground: tuple[Span, ...]
+    take_off_s: tuple[float, ...]
+    landing_s: tuple[float, ...]
+    modes: tuple[FlightMode, ...]
+    resets_s: tuple[float, ...]
+    rejected_s: Mapping[str, Array]
+
+
+def source_gaps(time_s: Array, rate_hz: float) -> tuple[Span, ...]:
+    """Stretches (s) between measurements in which the source was silent.
+
+    Parameters
+    ----------
+    time_s : ndarray, shape (n,)
+        Of the measurements.
+    rate_hz : float
+        Of the source between gaps.
+    """
+    long = np.diff(time_s) > max(GAP_S, GAP_INTERVALS / rate_hz)
+    return tuple(zip(time_s[:-1][long].tolist(), time_s[1:][long].tolist(), strict=True))
+
+
+def happened(comparison: Comparison) -> Events:
+    """Everything that is worth a mark on a time axis.
+
+    Parameters
+    ----------
+    comparison : Comparison
+    """
+    flight, segment = comparison.flight, comparison.segment
+    low, high = segment.start_s, segment.end_s
+
+    def inside(spans: Iterator[Span] | tuple[Span, ...]) -> tuple[Span, ...]:
+        cut = ((max(start, low), min(end, high)) for start, end in spans)
+        return tuple((start, end) for start, end in cut if end > start)
+
+    airborne = () if isinstance(flight.airborne, Unavailable) else flight.airborne
+    edges = [low, *(time for span in airborne for time in span), high]
+    known = not isinstance(flight.airborne, Unavailable)
+    modes = () if isinstance(flight.modes, Unavailable) else flight.modes
+    resets = flight.ekf2.resets if isinstance(flight.ekf2, Ekf2) else ()
+    return Events(
+        gaps=source_gaps(comparison.axes[0].axis.measurement_time_s, comparison.source.rate_hz),
+        dropouts=inside(
+            (lost.start_s, lost.start_s + lost.duration_s) for lost in flight.log.dropouts
+        ),
+        ground=inside(zip(edges[::2], edges[1::2], strict=True)) if known else (),
+        take_off_s=tuple(start for start, _ in airborne if low <= start <= high),
+        landing_s=tuple(end for _, end in airborne if low <= end <= high),
+        modes=tuple(
+            FlightMode(max(mode.start_s, low), min(mode.end_s, high), mode.name)
+            for mode in modes
+            if mode.start_s < high and mode.end_s > low
+        ),
+        resets_s=tuple(sorted({reset.time_s for reset in resets if low <= reset.time_s <= high})),
+        rejected_s={
+            result.axis.name: frame.index[frame["rejected"] > 0].to_numpy()
+            for result in comparison.axes
+            if isinstance(frame := result.ekf2_innovations, pd.DataFrame)
+        },
+    )
