@@ -225,7 +225,7 @@ def read_flight(request: ComparisonRequest, progress: Progress = _silent) -> Fli
         if not other.log.format.startswith("MAVLink"):
             raise LogError(
                 f"`mavlink` {other.log.name}: this is a {other.log.format}, not a MAVLink "
-                "recording. Give the ULog first: px4fuse compare LOG.ulg --mavlink LOG.tlog."
+                "recording. Give the ULog as LOG, and the recording (.tlog) with `mavlink`."
             )
         flight = placing.join(flight, other)
     if request.position is None:
@@ -349,12 +349,16 @@ class Counterfactual:
         Empty where only a sweep was asked for.
     asked : bool
         Whether the changes are what the data ask for.
+    why : mapping from axis name to Why or Unavailable
+        Why EKF2 as flown differs from our filter at its defaults; empty where they cannot be
+        compared.
     """
 
     flight: Flight
     whatif: WhatIf
     changes: Mapping[str, float]
     asked: bool
+    why: Mapping[str, Why | Unavailable]
 
     __repr__ = brief
 
@@ -391,28 +395,40 @@ def run_what_if(
     if isinstance(model, Unavailable):
         raise MissingDataError(f"{flight.log.name}: {model}")
     asked = not changes and swept is None
-    if asked and model.agreement.good:
-        comparison = compare(flight, axes=("north", "east"))
-        tuning = tuned_horizontally(comparison)
-        clock = clock_offset(comparison, tuning, progress)
-        changes = asked_of_ekf2(comparison, model, tuning, clock)
-        if not changes:
-            why = "the data do not tell the noise and the delay of what EKF2 fused"
-            if may_drift(flight, comparison.source):
-                why = (
-                    f"{comparison.source.name} may drift, so that innovations do not tell its "
-                    "noise, and the delay is as the data ask for or not determinable"
-                )
-            raise MissingDataError(
-                f"{flight.log.name}: {why}. Say what to change: `changes` EKF2_EVP_NOISE=0.1."
-            )
+    why: Mapping[str, Why | Unavailable] = {}
+    if model.agreement.good:
+        try:
+            compared = compare(flight, axes=("north", "east", AISLE))
+        except MissingDataError:  # EKF2 can be replayed all the same
+            if asked:
+                raise
+        else:
+            tuning = tuned_horizontally(compared)
+            clock = clock_offset(compared, tuning, progress)
+            why = why_ekf2_differs(compared, model, tuning, clock)
+            if asked:
+                changes = asked_of_ekf2(compared, model, tuning, clock)
+                if not changes:
+                    raise MissingDataError(_not_told(compared))
     settings = [changes] if changes else []
     if swept is not None:
         settings += [{**changes, swept.parameter: value} for value in values]
+    progress("replaying with other parameters")
     found = what_if(model, settings)
     if isinstance(found, Unavailable):
         raise MissingDataError(f"{flight.log.name}: {found}")
-    return Counterfactual(flight, found, changes, asked)
+    return Counterfactual(flight, found, changes, asked, why)
+
+
+def _not_told(compared: Comparison) -> str:
+    name, source = compared.flight.log.name, compared.source
+    why = "the data do not tell the noise and the delay of what EKF2 fused"
+    if may_drift(compared.flight, source):
+        why = (
+            f"{source.name} may drift, so that innovations do not tell its noise, and the delay is "
+            "as the data ask for or not determinable"
+        )
+    return f"{name}: {why}. Say what to change: `changes` EKF2_EVP_NOISE=0.1."
 
 
 def explain(comparison: Comparison, progress: Progress = _silent) -> Analysis:
@@ -551,7 +567,7 @@ def imu_too_slow_for_clocks(flight: Flight) -> Unavailable | None:
             f"the IMU was logged at {told}, at least {needed:g} Hz are needed",
             'Put the line "sensor_combined 0" into etc/logging/logger_topics.txt on the SD card.',
         )
-    remedy = "Give the ULog of the same flight: px4fuse sync LOG.ulg --mavlink LOG.tlog."
+    remedy = "Give the ULog of the same flight as LOG, and this recording with --mavlink."
     return Unavailable(
         "clock offset",
         f"the IMU came by telemetry at {told}, each sample picked out of several; at least "

@@ -509,6 +509,7 @@ class Truth:
 
     __repr__ = brief
 
+
 MODES_NOT_LOGGED = Unavailable(
     "flight modes", "no usable vehicle_status", "Record with SDLOG_PROFILE bit 0 (default)."
 )

@@ -6,8 +6,10 @@ can be made again without its command line.
 
 from __future__ import annotations
 
+import os
 import re
 import shlex
+import subprocess
 from collections.abc import Iterator, Mapping
 from pathlib import PurePath
 from typing import Annotated, Any, Literal
@@ -289,38 +291,55 @@ def with_options(text: str, options: Mapping[str, str] = ARGUMENTS) -> str:
     return re.sub(r"`(\w+)`", lambda name: options.get(name[1], name[0]), text)
 
 
-def command_line(request: Request, command: str | None = None) -> str:
-    """The command that makes this again, for people to read: without folders and defaults.
+def command_line(request: Request, command: str | None = None, *, typed: bool = False) -> str:
+    """The command that makes this again, for people to read: without defaults.
 
     Parameters
     ----------
     request : Request
     command : str, optional
         Of those that take this request; by default ``compare``, ``loop`` or ``whatif``.
-
-    Returns
-    -------
-    str
-        As a POSIX shell reads it.
+    typed : bool
+        With the paths as they were typed, for the shell of this system; else with the names of
+        files alone, as a POSIX shell reads it.
     """
-    recorded = request.recorded()
-    if isinstance(recorded, LoopRequest):
-        words = ["px4fuse", command or "loop", recorded.source]
-        words += _options(recorded, LOOP_OPTIONS)
-        return shlex.join(words if recorded.came_back else [*words, "--open"])
-    if isinstance(recorded, WhatIfRequest):
-        words = ["px4fuse", command or "whatif", recorded.log, *_options(recorded, OPTIONS)]
-        for name, value in recorded.changes.items():
+    given = request if typed else request.recorded()
+    if isinstance(given, LoopRequest):
+        words = [command or "loop", _file(given.source), *_options(given, LOOP_OPTIONS)]
+        words += [] if given.came_back else ["--open"]
+    elif isinstance(given, WhatIfRequest):
+        words = [command or "whatif", _file(given.log), *_options(given, OPTIONS)]
+        for name, value in given.changes.items():
             words += ["--set", f"{name}={_typed(value)}"]
-        if recorded.sweep is not None:
-            swept = recorded.sweep
+        if (swept := given.sweep) is not None:
             ends = f"{_typed(swept.low)}:{_typed(swept.high)}:{swept.count}"
             words += ["--sweep", f"{swept.parameter}={ends}"]
-        return shlex.join(words)
-    words = ["px4fuse", command or "compare", recorded.log, *_options(recorded, OPTIONS)]
-    if recorded.position is not None:
-        words += _options(recorded.position, OPTIONS)
-    return shlex.join(words)
+    else:
+        words = [command or "compare", _file(given.log), *_options(given, OPTIONS)]
+        words += [] if given.position is None else _options(given.position, OPTIONS)
+    join = subprocess.list2cmdline if typed and os.name == "nt" else shlex.join
+    return join(["px4fuse", *words])
+
+
+def settings_name(request: ComparisonRequest) -> str:
+    """What is not at its default, as a part of a file name.
+
+    >>> settings_name(ComparisonRequest(log="a.ulg", sigma_z_m=0.05, mavlink="b/c.tlog"))
+    '_mavlink-c_sigma-z-0.05'
+    """
+    given = request.recorded()
+    words = [*_options(given, OPTIONS)]
+    words += [] if given.position is None else _options(given.position, OPTIONS)
+    parts = ""
+    for option, value in zip(words[::2], words[1::2], strict=True):
+        is_file = option in ("--mavlink", "--position")
+        parts += f"_{option[2:]}-{PurePath(value).stem if is_file else value}"
+    return re.sub(r"[^\w.,+-]+", "-", parts)
+
+
+def _file(path: str) -> str:
+    """A path that is not taken for an option."""
+    return f"./{path}" if path.startswith("-") else path
 
 
 def _options(struct: msgspec.Struct, options: dict[str, str]) -> Iterator[str]:

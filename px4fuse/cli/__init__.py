@@ -48,6 +48,24 @@ class LazyGroup(click.Group):
         command: click.Command = getattr(module, cmd_name)
         return command
 
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """Find the command; what is nearly one, or a file without one, is told how to be typed."""
+        name = args[0]
+        if name not in COMMANDS and not name.startswith("-"):
+            import difflib
+            import shlex
+            from pathlib import Path
+
+            said = f"No such command {name!r}."
+            if near := difflib.get_close_matches(name.lower(), COMMANDS):
+                said += f" Did you mean {near[0]!r}?"
+            elif Path(name).is_file():
+                said = f"Say what to do with it: {shlex.join(['px4fuse', 'compare', *args])}."
+            ctx.fail(said)
+        return super().resolve_command(ctx, args)
+
     def invoke(self, ctx: click.Context) -> object:
         """Invoke a command; what ends it early is told apart before click sees it."""
         try:

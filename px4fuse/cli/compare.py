@@ -16,6 +16,7 @@ from px4fuse.cli.inputs import (
     report_options,
 )
 from px4fuse.cli.outputs import (
+    default_report,
     progress,
     report_paths,
     terminal,
@@ -23,6 +24,10 @@ from px4fuse.cli.outputs import (
 )
 from px4fuse.writing import STANDARD_OUTPUT
 
+STEPS = (
+    "reading", "filtering", "tuning", "clock offset", "changes of the clock", "replaying EKF2",
+    "heading", "looking for a loop", "drawing",
+)  # fmt: skip
 SEVERITIES = ("error", "warning", "info")
 
 
@@ -47,7 +52,7 @@ def compare(
     """Compare a flight's EKF2 with a two-state Kalman filter over IMU and position.
 
     LOG is a PX4 ULog or a MAVLink recording (.tlog or raw stream). Writes a PDF report and its
-    results as JSON.
+    results as JSON, for example reports/LOG_sigma-z-0.05.pdf and .json.
     """
     from px4fuse.analysis import run
     from px4fuse.findings import find
@@ -59,22 +64,26 @@ def compare(
 
     person = read_person(given)
     request = comparison_request(log, given)
-    target, beside = report_paths(output or Path("reports") / f"{log.stem}.pdf", json_path)
-    with progress(json_path == STANDARD_OUTPUT) as step:
+    alone = json_path == STANDARD_OUTPUT
+    report_paths(output or Path("reports/LOG.pdf"), json_path)  # before the work, not after it
+    contents: dict[Path, bytes] = {}
+    target = None
+    with progress(alone, STEPS) as step:
         analysis = run(request, step)
         document = Document(analysis, find(analysis), person, command_line(request))
-        text = to_json(results(request, analysis, document.findings, person, document.command))
-        step("drawing the report")
-        contents = {target: render(document, text), beside: text.encode()}
-    if json_path == STANDARD_OUTPUT:
+        found = results(request, analysis, document.findings, person, document.command)
+        text = to_json(found)
+        if output is not None or not alone:
+            step("drawing the report")
+            target, beside = report_paths(output or default_report(request, found), json_path)
+            contents |= {target: render(document, text), beside: text.encode()}
+    if alone:
         contents[STANDARD_OUTPUT] = text.encode()
     write_outputs(contents)
-    if json_path != STANDARD_OUTPUT:
+    if not alone:
         from px4fuse.report.terminal import print_summary
 
-        console = terminal()
-        print_summary(console, document)
-        console.print(f"Report   {target}", markup=False, style="bold", soft_wrap=True)
+        print_summary(terminal(), document, request, target)
     if fail_on is not None:
         worst = SEVERITIES[: SEVERITIES.index(fail_on) + 1]
         if any(finding.severity in worst for finding in document.findings):

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from px4fuse.cli.inputs import (
-    NumberOrAuto,
     command_line,
     json_option,
     max_size_option,
@@ -20,6 +19,7 @@ from px4fuse.cli.outputs import (
     terminal,
     write_json,
 )
+from px4fuse.cli.quantity import Quantity
 from px4fuse.errors import SettingsError
 from px4fuse.request import AUTO
 from px4fuse.writing import STANDARD_OUTPUT
@@ -82,7 +82,7 @@ class DeltaType(click.ParamType["Delta"]):
 )
 @click.option(
     "--time-offset",
-    type=NumberOrAuto(),
+    type=Quantity("s", auto=True),
     default=None,
     metavar="S|auto",
     help="Added to the estimate's stamps; auto finds it from the motion.  [default: auto where the "

@@ -108,21 +108,16 @@ def grade(
 def _print(outcome: Outcome) -> None:
     from collections import Counter
 
-    from rich.table import Table
     from rich.text import Text
 
+    from px4fuse.report.screen import plain_table, print_file, say
     from px4fuse.results.reading import one_line
 
     console = terminal()
-    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="bold")
-    for name in ("submission", "student", "status", "points", "flags"):
-        wraps = name in ("submission", "student")
-        table.add_column(
-            name,
-            justify="right" if name == "points" else "left",
-            no_wrap=not wraps,
-            overflow="fold",
-        )
+    table = plain_table(
+        ("submission", "left"), ("student", "left"), ("status", "left"), ("points", "right"),
+        ("flags", "right"),
+    )  # fmt: skip
     for one in outcome.graded:
         style = "green" if one.status == "verified" else "yellow"
         table.add_row(
@@ -135,8 +130,8 @@ def _print(outcome: Outcome) -> None:
     console.print(table)
     counts = Counter(one.status for one in outcome.graded)
     said = ", ".join(f"{count} {status}" for status, count in counts.most_common())
-    console.print(f"{len(outcome.graded)} submissions: {said}; {outcome.reused} as before")
+    say(console, f"{len(outcome.graded)} submissions: {said}; {outcome.reused} as before")
     for note in outcome.notes:
-        console.print(Text(note, "dim"))
+        say(console, Text(note, "dim"))
     for path in outcome.written:
-        console.print(f"Wrote    {path}", markup=False, style="bold", soft_wrap=True)
+        print_file(console, "Wrote", path)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,15 +13,18 @@ from px4fuse.cli.inputs import (
     recording_options,
 )
 from px4fuse.cli.outputs import (
+    progress,
     terminal,
     write_json,
 )
+from px4fuse.writing import STANDARD_OUTPUT
 
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
     from px4fuse.contents.inventory import Inventory, Source
+    from px4fuse.request import ComparisonRequest
 
 # No clock drifts by more: the recording was replayed at another speed
 REPLAY_PPM = 10_000.0
@@ -41,13 +43,22 @@ def info(
     from px4fuse.analysis import read_flight
     from px4fuse.contents.inventory import take_inventory, to_plain
 
-    inventory = take_inventory(read_flight(comparison_request(log, given)))
+    request = comparison_request(log, given)
+    with progress(json_path == STANDARD_OUTPUT, ("reading", "looking")) as step:
+        flight = read_flight(request, step)
+        step("looking at what is in it")
+        inventory = take_inventory(flight)
     if write_json(to_plain(inventory), json_path):
         return
-    _print(terminal(), inventory)
+    _print(terminal(), inventory, request)
 
 
-def _print(console: Console, inventory: Inventory) -> None:
+def _print(console: Console, inventory: Inventory, request: ComparisonRequest) -> None:
+    from rich.text import Text
+
+    from px4fuse.report.screen import print_command, print_list
+    from px4fuse.request import command_line
+
     log = inventory.log
     console.print(log.name, style="bold", markup=False)
     _list(console, "", _facts(inventory))
@@ -59,13 +70,15 @@ def _print(console: Console, inventory: Inventory) -> None:
     _list(console, "Clocks", _clocks(inventory))
     console.print()
     console.print("What px4fuse can do with it", style="bold")
-    _rows(
+    print_list(
         console,
         (
-            ("yes" if a.possible else "no", a.name, a.reason, "green" if a.possible else "yellow")
+            (Text(*(("yes", "green") if a.possible else ("no", "yellow"))), a.name, a.reason)
             for a in inventory.abilities
         ),
     )
+    if next(ability.possible for ability in inventory.abilities if ability.name == "compare"):
+        print_command(console, command_line(request, "compare", typed=True), "Compare")
     _list(
         console,
         "Next time",
@@ -123,7 +136,11 @@ def _flying(inventory: Inventory) -> str:
 
 
 def _senders(inventory: Inventory) -> Table:
-    table = _table("sender", "what it is", "messages", "lost", left=2)
+    from px4fuse.report.screen import plain_table
+
+    table = plain_table(
+        ("sender", "left"), ("what it is", "left"), ("messages", "right"), ("lost", "right")
+    )
     for sender in inventory.log.senders:
         table.add_row(
             f"{sender.system}/{sender.component}",
@@ -137,7 +154,12 @@ def _senders(inventory: Inventory) -> Table:
 def _sources(inventory: Inventory) -> Table:
     from rich.text import Text
 
-    table = _table("", "source", "samples", "Hz", "gaps", "span (s)", left=2)
+    from px4fuse.report.screen import plain_table
+
+    table = plain_table(
+        ("", "left"), ("source", "left"), ("samples", "right"), ("Hz", "right"),
+        ("gaps", "right"), ("span (s)", "right"),
+    )  # fmt: skip
     previous = ""
     for source in inventory.sources:
         part = source.part if source.part != previous else ""
@@ -203,46 +225,13 @@ def _speed(drift_ppm: float) -> str:
     return f"{1.0 + drift_ppm * 1e-6:.3g} times its speed"
 
 
-def _table(*headers: str, left: int) -> Table:
-    """A table whose first columns are left-aligned, and whose rows are one line each."""
-    from rich.table import Table
-
-    table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="bold")
-    for at, header in enumerate(headers):
-        table.add_column(
-            header,
-            justify="left" if at < left else "right",
-            no_wrap=True,
-            overflow="ellipsis",
-        )
-    return table
-
-
 def _list(console: Console, title: str, lines: list[tuple[str, str]]) -> None:
     """A titled list with hanging indents; nothing where there is nothing to say."""
-    from rich.table import Table
-    from rich.text import Text
+    from px4fuse.report.screen import print_list
 
     if not lines:
         return
     if title:
         console.print()
         console.print(title, style="bold")
-    grid = Table.grid(padding=(0, 1))
-    grid.add_column(no_wrap=True)
-    grid.add_column(overflow="fold")
-    for label, text in lines:
-        grid.add_row(Text(label), Text(text))
-    console.print(grid)
-
-
-def _rows(console: Console, lines: Iterable[tuple[str, str, str, str]]) -> None:
-    from rich.table import Table
-    from rich.text import Text
-
-    grid = Table.grid(padding=(0, 1))
-    for name in ("", "", ""):
-        grid.add_column(name)
-    for answer, name, reason, style in lines:
-        grid.add_row(Text(answer, style), Text(name, no_wrap=True), Text(reason))
-    console.print(grid)
+    print_list(console, lines)

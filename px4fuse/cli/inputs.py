@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING, Any, get_args
 import click
 from click.core import ParameterSource
 
+from px4fuse.cli.quantity import Quantity
 from px4fuse.errors import SettingsError
 from px4fuse.reading import max_log_bytes, read_text
-from px4fuse.request import AUTO, AxisName, InputName
+from px4fuse.request import AxisName, InputName
 
 if TYPE_CHECKING:
     from px4fuse.request import ComparisonRequest, PositionFile
@@ -21,23 +22,6 @@ if TYPE_CHECKING:
 
 # Options of the commands without a request that say where to write, or what this machine can take
 NOT_RECORDED = ("json_path", "g2o", "max_size")
-
-
-class NumberOrAuto(click.ParamType[float | str]):
-    """A number, or the word ``auto``."""
-
-    name = "number"
-
-    def convert(
-        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> float | str:
-        """Convert what was typed."""
-        if value == AUTO or isinstance(value, float):
-            return value  # type: ignore[no-any-return]
-        try:
-            return float(value)
-        except ValueError:
-            self.fail(f"{value!r} is neither a number nor 'auto'.", param, ctx)
 
 
 class ColumnNames(click.ParamType["tuple[str, ...]"]):
@@ -58,7 +42,7 @@ _ANALYSIS = (
     click.option(
         "--sigma-a",
         "sigma_a_m_s2",
-        type=float,
+        type=Quantity("m/s²", 0.5),
         default=0.5,
         show_default=True,
         metavar="M/S²",
@@ -67,7 +51,7 @@ _ANALYSIS = (
     click.option(
         "--sigma-z",
         "sigma_z_m",
-        type=float,
+        type=Quantity("m"),
         default=0.10,
         show_default=True,
         metavar="M",
@@ -76,7 +60,7 @@ _ANALYSIS = (
     click.option(
         "--dt",
         "dt_s",
-        type=float,
+        type=Quantity("s"),
         default=0.1,
         show_default=True,
         metavar="S",
@@ -98,7 +82,7 @@ _ANALYSIS = (
     click.option(
         "--heading",
         "heading_deg",
-        type=float,
+        type=Quantity("°", 30.0),
         default=None,
         metavar="DEG",
         help="Heading of the aisle, clockwise from north.  [default: from the track]",
@@ -106,7 +90,7 @@ _ANALYSIS = (
     click.option(
         "--start",
         "start_s",
-        type=float,
+        type=Quantity("s", 20.0),
         default=None,
         metavar="S",
         help="Start, seconds from the first data.  [default: take-off]",
@@ -114,7 +98,7 @@ _ANALYSIS = (
     click.option(
         "--end",
         "end_s",
-        type=float,
+        type=Quantity("s", 60.0),
         default=None,
         metavar="S",
         help="End.  [default: touch-down]",
@@ -173,7 +157,7 @@ _POSITION = (
     ),
     click.option(
         "--position-yaw",
-        type=NumberOrAuto(),
+        type=Quantity("°", 30.0, auto=True),
         default=None,
         metavar="DEG|auto",
         help="Turn it clockwise, seen from above; auto finds yaw and origin.  [default: 0]",
@@ -209,7 +193,7 @@ _POSITION_FIELDS = {
 clock_offset_option = click.option(
     "--clock-offset",
     "clock_offset_s",
-    type=NumberOrAuto(),
+    type=Quantity("s", auto=True),
     default=None,
     metavar="S|auto",
     help="Added to the position source's time stamps; auto estimates it.  [default: 0; auto with "
@@ -230,13 +214,18 @@ _PERSON = (
 )
 _REPORT = (
     path_option(
-        "-o", "--output", metavar="FILE.pdf", help="The report.  [default: reports/LOG.pdf]"
+        "-o",
+        "--output",
+        metavar="FILE.pdf",
+        help="The report.  [default: reports/LOG.pdf, settings that are not at their defaults in "
+        "its name]",
     ),
     path_option(
         "--json",
         "json_path",
         metavar="FILE",
-        help="The results; - prints them alone on standard output.  [default: beside the PDF]",
+        help="The results; - prints them alone on standard output, and without -o writes no "
+        "report.  [default: beside the PDF]",
     ),
 )
 

@@ -24,6 +24,7 @@ from px4fuse.cli.outputs import (
     terminal,
     write_outputs,
 )
+from px4fuse.cli.quantity import Quantity
 from px4fuse.errors import SettingsError
 from px4fuse.reading import shown
 from px4fuse.request import FrameName, Landing
@@ -36,6 +37,10 @@ if TYPE_CHECKING:
     from px4fuse.loop.loop import Loop
     from px4fuse.request import LoopRequest
 
+STEPS = (
+    "reading", *(f"solving: pose graph, {name}" for name in ("all", "gated", "DCS", "GNC")),
+    "drawing",
+)  # fmt: skip
 # Nobody's tape is longer
 MAX_LANDED_AT = 10_000.0
 # What may be given with a pose graph
@@ -75,14 +80,19 @@ class FrameType(click.Choice[str]):
 @click.option(
     "--from",
     "start_s",
-    type=float,
+    type=Quantity("s", 20.0),
     default=None,
     metavar="S",
     help="Start of the loop: seconds from the first data, or a trajectory's own stamps.  "
     "[default: take-off]",
 )
 @click.option(
-    "--to", "end_s", type=float, default=None, metavar="S", help="End.  [default: landing]"
+    "--to",
+    "end_s",
+    type=Quantity("s", 60.0),
+    default=None,
+    metavar="S",
+    help="End.  [default: landing]",
 )
 @click.option(
     "--landed-at",
@@ -108,7 +118,7 @@ class FrameType(click.Choice[str]):
 @click.option(
     "--drift",
     "position_drift_m",
-    type=float,
+    type=Quantity("m", 1.0),
     default=1.0,
     show_default=True,
     metavar="M",
@@ -117,7 +127,7 @@ class FrameType(click.Choice[str]):
 @click.option(
     "--heading-drift",
     "heading_drift_deg",
-    type=float,
+    type=Quantity("°", 3.0),
     default=3.0,
     show_default=True,
     metavar="DEG",
@@ -126,7 +136,7 @@ class FrameType(click.Choice[str]):
 @click.option(
     "--key-frames",
     "key_frames_m",
-    type=float,
+    type=Quantity("m", 0.2),
     default=None,
     metavar="M",
     help="Distance between key frames.  [default: a fiftieth of the extent, 0.02 to 0.5]",
@@ -180,7 +190,7 @@ def loop(
         return
     request = loop_request(source, given)
     _spare(tum, g2o, *((json_path,) if output is None else report_paths(output, json_path)))
-    with progress(json_path == STANDARD_OUTPUT) as step:
+    with progress(json_path == STANDARD_OUTPUT, STEPS) as step:
         found = run_loop(request, step)
         findings = find_loop(found)
         command = request_line(request)
@@ -195,7 +205,9 @@ def loop(
             document = LoopDocument(found, findings, person, command)
             contents |= {pdf: render(document, text), beside: text.encode()}
             json_path = json_path if json_path == STANDARD_OUTPUT else None
-    _finish(results, json_path, contents, lambda console: print_loop(console, found, findings))
+    _finish(
+        results, json_path, contents, lambda console: print_loop(console, found, findings, request)
+    )
 
 
 def loop_request(source: Path, given: dict[str, Any]) -> LoopRequest:
@@ -278,6 +290,7 @@ def _finish(
     show: Callable[[Console], None],
 ) -> None:
     """Write all outputs or none; print the results alone, or what was found and written."""
+    from px4fuse.report.screen import print_file
     from px4fuse.results.contract import to_json
 
     if json_path is not None:
@@ -289,4 +302,4 @@ def _finish(
     console = terminal()
     show(console)
     for path in contents:
-        console.print(f"Wrote    {path}", markup=False, style="bold", soft_wrap=True)
+        print_file(console, "Wrote", path)

@@ -2,21 +2,30 @@
 
 from __future__ import annotations
 
+import os
 import signal
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, Protocol
 
 import click
 
-from px4fuse.errors import OutputError
+from px4fuse.errors import OutputError, ResultsError
+from px4fuse.request import settings_name
 from px4fuse.writing import STANDARD_OUTPUT, write_all
 
 if TYPE_CHECKING:
     from msgspec import Struct
     from rich.console import Console
 
+    from px4fuse.request import ComparisonRequest
+    from px4fuse.results.contract import ComparisonResults
+
+# Of a report that is named by its settings: file systems take 255 bytes
+LONGEST_NAME = 200
+# Columns of a line that no paragraph fills
+UNWRAPPED = 10_000
 # Parameters that name files to read; some name a part of a log after a colon
 INPUTS = (
     "log", "logs", "report", "mavlink", "position", "notes", "source", "estimate", "reference",
@@ -55,10 +64,26 @@ class Step(Protocol):
 
 
 @contextmanager
-def progress(quiet: bool = False) -> Iterator[Step]:
-    """One line on a terminal about what is being done; nothing in a pipe."""
+def progress(quiet: bool = False, steps: Sequence[str] = ()) -> Iterator[Step]:
+    """A bar on a terminal about what is being done and what remains; nothing in a pipe.
+
+    Parameters
+    ----------
+    quiet : bool
+        Show nothing on a terminal either.
+    steps : sequence of str
+        With what each step of the work begins, in their order; what is said besides is a part of
+        the step before.
+    """
     from rich.console import Console
-    from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
+    from rich.progress import (
+        BarColumn,
+        Progress,
+        SpinnerColumn,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
 
     def silent(what: str, done: int = 0, of: int | None = None) -> None:
         del what, done, of
@@ -69,16 +94,66 @@ def progress(quiet: bool = False) -> Iterator[Step]:
         return
     columns = (
         SpinnerColumn(), TextColumn("{task.description}", markup=False), BarColumn(),
-        TextColumn("{task.fields[count]}"), TimeRemainingColumn(),
+        TextColumn("{task.fields[count]}"), TimeElapsedColumn(),
+        # of work that is counted; steps are not equally long
+        *(() if steps else (TextColumn("of which left"), TimeRemainingColumn())),
     )  # fmt: skip
     with Progress(*columns, console=console, transient=True) as bar:
-        task = bar.add_task("starting", total=None, count="")
+        task = bar.add_task("starting", total=len(steps) or None, count="")
+        at = 0
 
         def show(what: str, done: int = 0, of: int | None = None) -> None:
-            count = "" if of is None else f"{done}/{of}"
+            nonlocal at
+            if steps:
+                begun = (number for number, step in enumerate(steps) if what.startswith(step))
+                at = max(at, next(begun, at))
+                done, of = at, len(steps)
+            count = "" if of is None else f"{done} of {of}"
             bar.update(task, description=what, completed=done, total=of, count=count)
 
         yield show
+
+
+def default_report(request: ComparisonRequest, results: ComparisonResults) -> Path:
+    """Where a report goes that was given no name: what is not at its default is in its name.
+
+    What an earlier run of the same wrote is written over. Where another file has the name (of
+    another log or another student, or no report), a number is added.
+    """
+    folder, stem = Path("reports"), Path(request.log).stem
+    name = f"{stem}{settings_name(request)}"
+    name = name if len(os.fsencode(name)) <= LONGEST_NAME else stem
+    number, path = 1, folder / f"{name}.pdf"
+    while not all(_same_run(file, results) for file in (path, path.with_suffix(".json"))):
+        number += 1
+        path = folder / f"{name}_{number}.pdf"
+    return path
+
+
+def _same_run(file: Path, mine: ComparisonResults) -> bool:
+    """Whether a report or its results are of the same recordings, settings and student, or new."""
+    from pypdf import PdfReader
+    from pypdf.errors import PyPdfError
+
+    from px4fuse.report.pdf import RESULTS_NAME
+    from px4fuse.results.contract import ComparisonResults
+    from px4fuse.results.reading import read_results
+
+    if not file.exists():
+        return True
+    try:
+        results = file.suffix == ".json"
+        text = file.read_bytes() if results else PdfReader(file).attachments[RESULTS_NAME][0]
+        old = read_results(text)
+    except (OSError, PyPdfError, KeyError, ValueError, ResultsError):
+        return False  # not a report, or not one that this version reads
+    return (
+        isinstance(old, ComparisonResults)
+        and old.request == mine.request
+        and [old.log.sha256, *(file.sha256 for file in old.log.joined)]
+        == [mine.log.sha256, *(file.sha256 for file in mine.log.joined)]
+        and (old.student.name, old.student.id) in (("", ""), (mine.student.name, mine.student.id))
+    )
 
 
 def report_paths(output: Path, json_path: Path | None) -> tuple[Path, Path]:
@@ -149,11 +224,18 @@ def spare_inputs(targets: Iterable[Path]) -> None:
 
 
 def terminal() -> Console:
-    """Standard output for tables; a reader that has gone, as with ``| head``, is no error."""
+    """Standard output for people; a reader that has gone, as with ``| head``, is no error.
+
+    As wide as the terminal. In a pipe lines do not wrap, unless COLUMNS says how wide they are: a
+    paragraph is one line.
+    """
     from rich.console import Console
 
     class PipeConsole(Console):
         def on_broken_pipe(self) -> None:
             raise BrokenPipeError
 
-    return PipeConsole(highlight=False)
+    console = PipeConsole(highlight=False)
+    if not console.is_terminal and "COLUMNS" not in os.environ:
+        console.width = UNWRAPPED
+    return console

@@ -14,6 +14,7 @@ from px4fuse.cli.inputs import (
     path_option,
 )
 from px4fuse.cli.outputs import progress, write_outputs
+from px4fuse.cli.quantity import Quantity
 from px4fuse.errors import OutputError, SettingsError
 from px4fuse.reading import read_text
 from px4fuse.simulation.mistakes import MISTAKES, as_typed, made, parse
@@ -34,10 +35,14 @@ MAX_SECRET_BYTES = 10_000
 Command = TypeVar("Command", bound=Callable[..., None])
 
 
-def _scenario_option(name: str, field: str, **details: Any) -> Callable[[Command], Command]:
+def _scenario_option(
+    name: str, field: str, unit: str | None, **details: Any
+) -> Callable[[Command], Command]:
     """Option that sets one real number of the scenario, whose own value is the default."""
     default = getattr(_DEFAULT, field)
-    return click.option(name, field, type=float, default=default, show_default=True, **details)
+    between = (0.0, 360.0) if unit == "°" else None
+    kind = float if unit is None else Quantity(unit, default, between=between)
+    return click.option(name, field, type=kind, default=default, show_default=True, **details)
 
 
 class WithMistakes(click.Command):
@@ -133,13 +138,15 @@ class WithMistakes(click.Command):
 @_scenario_option(
     "--length",
     "length_m",
+    "m",
     metavar="M",
     help="Of the aisle, or of a side of the square.",
 )
-@_scenario_option("--speed", "speed_m_s", metavar="M/S")
+@_scenario_option("--speed", "speed_m_s", "m/s", metavar="M/S")
 @_scenario_option(
     "--heading",
     "heading_deg",
+    "°",
     metavar="DEG",
     help="Of the aisle or of the first side, clockwise from north.",
 )
@@ -152,25 +159,29 @@ class WithMistakes(click.Command):
 @_scenario_option(
     "--sigma-uwb",
     "sigma_uwb_m",
+    "m",
     metavar="M",
     help="White noise of the UWB, per axis: the true SIGMA_Z.",
 )
-@_scenario_option("--uwb-rate", "uwb_rate_hz", metavar="HZ")
+@_scenario_option("--uwb-rate", "uwb_rate_hz", "Hz", metavar="HZ")
 @_scenario_option(
     "--sigma-a",
     "sigma_a_m_s2",
+    "m/s²",
     metavar="M/S²",
     help="White noise of the accelerometer's mean over 0.1 s: the true SIGMA_A.",
 )
 @_scenario_option(
     "--accel-bias-sigma",
     "accel_bias_sigma_m_s2",
+    "m/s²",
     metavar="M/S²",
     help="Width from which the accelerometer's constant bias is drawn.",
 )
 @_scenario_option(
     "--vio-drift",
     "vio_drift",
+    None,
     metavar="SHARE",
     help="Drift of the VIO, as a share of the distance.",
 )
@@ -219,8 +230,11 @@ def simulate(
     from px4fuse.results.contract import to_json
     from px4fuse.simulation import flights
 
-    simulation = flights.simulate(chosen, parsed)
-    contents = {output: flights.to_ulog(simulation)}
+    with progress(steps=("flying", "writing")) as step:
+        step("flying")
+        simulation = flights.simulate(chosen, parsed)
+        step("writing the log")
+        contents = {output: flights.to_ulog(simulation)}
     if answer_path is not None:
         contents[answer_path] = to_json(flights.answer(simulation)).encode()
     write_outputs(contents)

@@ -14,9 +14,12 @@ from px4fuse.cli.inputs import (
 )
 from px4fuse.cli.outputs import (
     progress,
+    terminal,
     write_json,
 )
 from px4fuse.writing import STANDARD_OUTPUT
+
+STEPS = ("reading", "filtering", "tuning", "clock offset", "changes of the clock")
 
 
 @click.command()
@@ -30,15 +33,16 @@ def sync(log: Path, json_path: Path | None, **given: Any) -> None:
     or a MAVLink recording.
     """
     from px4fuse.analysis import clock_offset, run_comparison, tuned_horizontally
+    from px4fuse.report.terminal import print_advice
     from px4fuse.report.words import clock_advice
     from px4fuse.request import command_line
     from px4fuse.results.build import sync_results
 
     request = comparison_request(log, given)
-    with progress(json_path == STANDARD_OUTPUT) as step:
+    with progress(json_path == STANDARD_OUTPUT, STEPS) as step:
         compared = run_comparison(request, step)
+        step("tuning")
         found = clock_offset(compared, tuned_horizontally(compared), step)
     if write_json(sync_results(request, compared, found, command_line(request, "sync")), json_path):
         return
-    for line in clock_advice(compared, found):
-        click.echo(line)
+    print_advice(terminal(), clock_advice(compared, found), request)

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from px4fuse.comparison.comparison import Comparison
     from px4fuse.filter.tuning import AxisTuning, Noise
     from px4fuse.flight import Unavailable
+    from px4fuse.request import ComparisonRequest
 
 
 @click.command()
@@ -43,32 +44,39 @@ def tune(log: Path, json_path: Path | None, **given: Any) -> None:
     from px4fuse.results.build import tuning_results
 
     request = comparison_request(log, given)
-    with progress(json_path == STANDARD_OUTPUT) as step:
+    with progress(json_path == STANDARD_OUTPUT, ("reading", "filtering", "tuning")) as step:
         compared = run_comparison(request, step)
         tuned = tuned_noises(compared, progress=step)
     if write_json(
         tuning_results(request, compared, tuned, command_line(request, "tune")), json_path
     ):
         return
-    _print(terminal(), compared, tuned)
+    _print(terminal(), compared, tuned, request)
 
 
 def _print(
-    console: Console, compared: Comparison, tuned: dict[str, AxisTuning | Unavailable]
+    console: Console,
+    compared: Comparison,
+    tuned: dict[str, AxisTuning | Unavailable],
+    request: ComparisonRequest,
 ) -> None:
-    from rich.table import Table
     from rich.text import Text
 
     from px4fuse.flight import Unavailable
+    from px4fuse.report.screen import plain_table, print_line, say
+    from px4fuse.report.terminal import print_advice
     from px4fuse.report.words import settings_words, tuning_advice
 
-    console.print(f"Chosen   {settings_words(compared.settings)}", markup=False, soft_wrap=True)
-    table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="bold")
-    for name in ("axis", "SIGMA_A, 95 %", "SIGMA_Z, 95 %", "gain", "held out", "lag 1"):
-        table.add_column(name, justify="left" if name == "axis" else "right", no_wrap=True)
+    print_line(console, "Chosen", settings_words(compared.settings))
+    table = plain_table(
+        ("axis", "left"), ("SIGMA_A (m/s²)\nvalue, 95 %", "right"),
+        ("SIGMA_Z (m)\nvalue, 95 %", "right"), ("\ngain", "right"), ("held\nout", "right"),
+        ("lag 1\nbefore after", "right"),
+    )  # fmt: skip
+    reasons = []
     for name, found in tuned.items():
         if isinstance(found, Unavailable):
-            table.add_row(name, Text(found.reason, "dim"))
+            reasons.append((name, found))
             continue
         held = found.held_out
         table.add_row(
@@ -79,16 +87,17 @@ def _print(
             "" if isinstance(held, Unavailable) else f"{held.gain_nats:+.3f}",
             _whiteness(found),
         )
-    console.print(table)
-    console.print(
-        Text(
+    if table.row_count:
+        console.print(table)
+    for name, missing in reasons:
+        print_line(console, name, Text(f"{missing.reason}. {missing.remedy}", "dim"))
+    if table.row_count:
+        note = (
             "gain: log-likelihood per measurement above the chosen settings; held out: the same on "
-            "the second half, tuned on the first; lag 1: autocorrelation before and after.",
-            "dim",
+            "the second half, tuned on the first; lag 1: autocorrelation of the innovations."
         )
-    )
-    for line in tuning_advice(compared, tuned):
-        console.print(line, markup=False, soft_wrap=True)
+        say(console, Text(note, "dim"))
+    print_advice(console, tuning_advice(compared, tuned), request)
 
 
 def _noise(noise: Noise) -> str:

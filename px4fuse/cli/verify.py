@@ -61,7 +61,7 @@ def verify(
     if isinstance(read, Refused):
         raise LogError(read.reason)
     spare_inputs([path for path in (json_path, output) if path not in (None, STANDARD_OUTPUT)])
-    with progress(json_path == STANDARD_OUTPUT) as step:
+    with progress(json_path == STANDARD_OUTPUT, ("hashing", "running")) as step:
         step("hashing the logs")
         files = files_by_sha256(logs)
         if logs and not files:
@@ -102,22 +102,21 @@ def _plain(report: Report, verdict: Verdict) -> dict[str, object]:
 def _print(console: Console, name: str, verdict: Verdict, output: Path | None) -> None:
     from rich.text import Text
 
+    from px4fuse.report.screen import print_file, say
     from px4fuse.results.reading import one_line
     from px4fuse.verification.verification import LIMIT
 
     style = STYLES.get(verdict.outcome, "bold red")
-    console.print(Text.assemble(f"{one_line(name, 200)}: ", (verdict.outcome, style)))
+    say(console, Text.assemble(f"{one_line(name, 200)}: ", (verdict.outcome, style)))
     for reason in verdict.reasons:
         if reason != LIMIT:
-            console.print(Text(f"  {one_line(reason, 400)}"), soft_wrap=True)
+            say(console, one_line(reason, 400), "  ", 2)
     for one in verdict.differences:
-        console.print(
-            Text(f"  {one.path}: {one.recorded}, recomputed {one.recomputed}"), soft_wrap=True
-        )
+        say(console, f"{one.path}: {one.recorded}, recomputed {one.recomputed}", "  ", 2)
     if output is not None and verdict.redrawn:
-        console.print(f"Wrote    {output}", markup=False, style="bold", soft_wrap=True)
+        print_file(console, "Wrote", output)
     elif output is not None:
-        console.print(Text("Nothing was redrawn, since the analysis was not run again."))
+        say(console, "Nothing was redrawn, since the analysis was not run again.")
     elif verdict.pages:
-        console.print(Text("Read the redrawn report instead: -o writes it."))
-    console.print(Text(LIMIT), style="dim", soft_wrap=True)
+        say(console, "Read the redrawn report instead: -o writes it.")
+    say(console, Text(LIMIT, "dim"))

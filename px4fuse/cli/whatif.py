@@ -15,6 +15,11 @@ from px4fuse.writing import STANDARD_OUTPUT
 if TYPE_CHECKING:
     from px4fuse.request import Sweep
 
+STEPS = (
+    "reading", "replaying EKF2", "clock offset", "changes of the clock", "replaying with",
+    "drawing",
+)  # fmt: skip
+
 
 @click.command()
 @click.argument("log", type=click.Path(path_type=Path))
@@ -64,7 +69,7 @@ def whatif(
         sweep=None if sweep is None else _sweep(sweep),
     )
     contents: dict[Path, bytes] = {}
-    with progress(json_path == STANDARD_OUTPUT) as step:
+    with progress(json_path == STANDARD_OUTPUT, STEPS) as step:
         found = run_what_if(request, step)
         command = command_line(request)
         text = to_json(whatif_results(request, found, command))
@@ -81,12 +86,13 @@ def whatif(
     write_outputs(contents)
     if json_path == STANDARD_OUTPUT:
         return
+    from px4fuse.report.screen import print_file
     from px4fuse.report.whatif_terminal import print_what_if
 
     console = terminal()
     print_what_if(console, found)
     if output is not None:
-        console.print(f"Page     {output}", markup=False, style="bold", soft_wrap=True)
+        print_file(console, "Page", output)
 
 
 def _changes(given: tuple[str, ...]) -> dict[str, float]:

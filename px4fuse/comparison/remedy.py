@@ -18,6 +18,8 @@ from px4fuse.filter.kalman import Settings, replay
 from px4fuse.filter.signals import AISLE
 from px4fuse.flight import Unavailable
 
+# How a remedy to type is written; who prints it knows the log (px4fuse.report.commands)
+COMMAND = "px4fuse compare LOG"
 # A noise must bring |log mean NIS| below this share of itself: what does less is not its cause
 NIS_NEARER = 0.8
 # Half of the rejections are an effect, not a single sample
@@ -182,12 +184,12 @@ def filter_words(
                 f"Leave it: {typed} is most likely, but settings found on the first half of the "
                 "flight do no better on the second."
             )
-        return f"{typed}."
+        return f"{COMMAND} {typed}."
     before, after = errors
     effect = f"position error {before:.3f} → {after:.3f} m (replayed)"
     if after > WORSE_FILTER_ERROR * before:
         return f"Leave it: {typed} fits the innovations better, but not the truth: {effect}."
-    return f"{typed}: {effect}."
+    return f"{COMMAND} {typed}: {effect}."
 
 
 def not_replayed(why: Unavailable) -> str:

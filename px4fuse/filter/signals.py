@@ -332,15 +332,15 @@ def make_axes(
     MissingDataError
         An axis was asked for that the source has no finite samples for, or none has any.
     SettingsError
-        An axis has an unknown name, or the heading is not finite.
+        An axis has an unknown name, or the heading is not between 0 and 360.
     """
     samples = within(track.samples, segment)
     acceleration = ned_acceleration(flight)
     asked = tuple(dict.fromkeys((*AXIS_NAMES, AISLE) if names is None else names))
     if not asked:
         raise SettingsError("no axis was asked for.")
-    if heading_deg is not None and not np.isfinite(heading_deg):
-        raise SettingsError(f"`heading_deg` {heading_deg:g} is not a finite number.")
+    if heading_deg is not None and not 0.0 <= heading_deg <= 360.0:
+        raise SettingsError(f"`heading_deg` {heading_deg:g} is not between 0 and 360 degrees.")
     if unknown := [name for name in asked if name not in (*AXIS_NAMES, AISLE)]:
         raise SettingsError(
             f"axis {unknown[0]}: not a known axis. Choose from {', '.join((*AXIS_NAMES, AISLE))}."

@@ -31,14 +31,14 @@ SMALL = Threshold(0.5, "mean NIS", "innovations are 30 % smaller than claimed")
 FRAME_SHARE = Threshold(0.5, "of the error", "what is left is less than what turning took away")
 FILTERS = {"kf": "our filter", "ekf2": "EKF2"}
 REMEDIES = {
-    "drift": "Take no noise from these innovations: correct the drift at a loop (px4fuse loop), or "
-    "give the filter a second, absolute source.",
+    "drift": "Take no noise from these innovations: correct the drift at a loop (px4fuse loop "
+    "LOG), or give the filter a second, absolute source.",
     "frame": "Turn and shift the source's frame into that of the truth before you judge a filter "
     "by it, and take no noise from these innovations.",
     "ekf2": "Our filter errs less with the same source, so that it is EKF2's own: look at "
     "EKF2_EV_DELAY, at its heading, and at what else it fuses.",
-    "shared": "Look for an error that source and filter share: the clock (px4fuse sync), a source "
-    "that smooths its positions, its scale, the survey of the anchors.",
+    "shared": "Look for an error that source and filter share: the clock (px4fuse sync LOG), a "
+    "source that smooths its positions, its scale, the survey of the anchors.",
 }
 
 

@@ -19,7 +19,7 @@ def _detect(analysis: Analysis) -> Found:
         "info",
         f"A MAVLink recording holds EKF2's states{' and variances' if variances else ''} but not "
         "its innovations: whether EKF2 is consistent cannot be said from it.",
-        f"Give the ULog of the same flight: px4fuse compare LOG.ulg --mavlink {flight.log.name}."
+        "Give the ULog of the same flight as LOG, and this recording with --mavlink."
         if flight.log.has_ulog
         else "They are in the autopilot's own DataFlash log (.BIN), which px4fuse does not read.",
     )

@@ -6,7 +6,9 @@ from dataclasses import replace
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.asked import delay_change
+from px4fuse.comparison.comparison import Comparison
 from px4fuse.comparison.remedy import (
+    COMMAND,
     WORSE_FILTER_ERROR,
     delay_helps,
     filter_errors_m,
@@ -74,8 +76,8 @@ def _detect(analysis: Analysis) -> Found:
     # one offset cannot hold for stamps that are of arrival in a part of the flight only
     changes = changes or stamps_of_arrival_end_s(analysis) is not None
     if sure and abs(clock.offset_s) > CLOCK_OFFSET.value and not changes:
-        remedy = f"--clock-offset {applied + clock.offset_s:.3f}"
-        shifted = replace(comparison.settings, clock_offset_s=float(remedy.split()[1]))
+        remedy = f"{COMMAND} --clock-offset {typed_offset_s(comparison, clock):.3f}"
+        shifted = replace(comparison.settings, clock_offset_s=round(applied + clock.offset_s, 3))
         errors = filter_errors_m(comparison, shifted)
         if errors is not None:
             if errors[1] > WORSE_FILTER_ERROR * errors[0]:
@@ -92,6 +94,16 @@ def _detect(analysis: Analysis) -> Found:
             f"{remedy}{_for_ekf2(analysis, clock)}.",
             evidence,
         )
+
+
+def typed_offset_s(comparison: Comparison, clock: ClockOffset) -> float:
+    """What to type as ``--clock-offset``: what was applied, with what is missing (s).
+
+    That of a position file was spent on placing it, and is not in the settings.
+    """
+    placed = comparison.source.alignment
+    applied = comparison.settings.clock_offset_s if placed is None else placed.clock_offset_s
+    return applied + clock.offset_s
 
 
 DETECTOR = Detector(

@@ -39,7 +39,7 @@ def _detect(analysis: Analysis) -> Found:
         f"Consistency with {comparison.source.name} is not correctness: it comes with a heading of "
         "its own, as odometry (VIO, SLAM) does, and odometry drifts. Innovations say how well a "
         f"filter follows its source, not where the vehicle was.{scatter}{closed}",
-        "Judge it by a loop (px4fuse loop) or by a truth (ATT_POS_MOCAP). Only if it is motion "
+        "Judge it by a loop (px4fuse loop LOG) or by a truth (ATT_POS_MOCAP). Only if it is motion "
         "capture, which does not drift, do its innovations tell its noise.",
         evidence,
     )

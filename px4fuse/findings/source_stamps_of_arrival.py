@@ -60,8 +60,8 @@ def _detect(analysis: Analysis) -> Found:
         f"then on those of the measurement, {latency:.3f} s before it arrives: the clocks were not "
         "synchronised before (PX4 wants 500 TIMESYNC answers). One clock offset cannot hold for "
         "both parts.",
-        f"Analyse the rest (--start {until:.0f}), and let the clocks synchronise for a minute "
-        "before take-off.",
+        f"Analyse the rest (px4fuse compare LOG --start {until:.0f}), and let the clocks "
+        "synchronise for a minute before take-off.",
         {"until_s": until, "latency_s": latency},
         spans_s=((float(age.index[0]), until),),
     )

@@ -58,7 +58,7 @@ class Remedies:
     replay: Unavailable
 
 
-_JOIN = "Give the ULog of the same flight: px4fuse compare LOG.ulg --mavlink LOG.tlog."
+_JOIN = "Give the ULog of the same flight as LOG, and this recording with --mavlink."
 _FILE = "give the positioning system's own file with --position."
 PX4_REMEDIES = Remedies(
     imu="Set the stream rate of HIGHRES_IMU to 50 Hz or more (in PX4's console: mavlink stream "

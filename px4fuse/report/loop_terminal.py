@@ -22,7 +22,9 @@ from px4fuse.report.loop_words import (
     score_words,
     unscored,
 )
-from px4fuse.report.terminal import print_finding, print_line
+from px4fuse.report.screen import plain_table, print_line, say
+from px4fuse.report.terminal import print_finding
+from px4fuse.request import LoopRequest
 from px4fuse.trajectory.evaluation import Evaluation
 from px4fuse.trajectory.graph.analysis import MANY_CLOSURES, SOLUTIONS, SolvedGraph
 from px4fuse.trajectory.scores import Statistics
@@ -30,10 +32,12 @@ from px4fuse.trajectory.scores import Statistics
 MOST_ROWS = 10
 
 
-def print_loop(console: Console, loop: Loop, findings: tuple[Finding, ...]) -> None:
+def print_loop(
+    console: Console, loop: Loop, findings: tuple[Finding, ...], request: LoopRequest
+) -> None:
     """Print what was found about a loop."""
     for label, text in loop_lines(loop):
-        print_line(console, label, text, whole=True)
+        print_line(console, label, text)
     references = [reference.name for reference in loop.references]
     table = _table("path", "moved RMS / max (m)", *(f"ATE to {name} (m)" for name in references))
     for part in loop.reported:
@@ -56,16 +60,16 @@ def print_loop(console: Console, loop: Loop, findings: tuple[Finding, ...]) -> N
         console.print(closures)
     for text in (redundancy_words(loop), *refusals(loop), *unscored(loop)):
         if text:
-            console.print(Text(text, "dim"), soft_wrap=True)
+            say(console, Text(text, "dim"))
     for finding in findings:
-        print_finding(console, finding, whole=True)
+        print_finding(console, finding, request)
 
 
 def print_evaluation(console: Console, score: Evaluation) -> None:
     """Print the scores of one trajectory against another."""
-    print_line(console, "Estimate", _described(score.estimate), whole=True)
-    print_line(console, "Against", _described(score.reference), whole=True)
-    print_line(console, "How", score_words(score), whole=True)
+    print_line(console, "Estimate", _described(score.estimate))
+    print_line(console, "Against", _described(score.reference))
+    print_line(console, "How", score_words(score))
     ate = score.ate
     table = _table("error", "RMSE", "95 %", "mean", "median", "max", "n")
     _statistics(table, "ATE (m)", ate.translation, interval_words(ate.interval).strip(" ()"))
@@ -81,11 +85,11 @@ def print_evaluation(console: Console, score: Evaluation) -> None:
     missing = [part for part in (ate.interval, ate.rotation) if isinstance(part, Unavailable)]
     missing += [e.translation for e in score.rpe if isinstance(e.translation, Unavailable)]
     for reason in dict.fromkeys(f"No {part.what}: {part.reason}." for part in missing):
-        console.print(Text(reason, "dim"), soft_wrap=True)
+        say(console, Text(reason, "dim"))
     for text in score.notes:
-        console.print(Text(text, "dim"), soft_wrap=True)
+        say(console, Text(text, "dim"))
     for text in score.warnings:
-        console.print(Text(text, "yellow"), soft_wrap=True)
+        say(console, Text(text, "yellow"))
 
 
 def print_graph(console: Console, name: str, solved: SolvedGraph) -> None:
@@ -96,11 +100,10 @@ def print_graph(console: Console, name: str, solved: SolvedGraph) -> None:
         "Graph",
         f"{name}: {graph.dimension}-D, {len(graph)} poses, {len(graph.first)} edges; poses from "
         f"{graph.initialised}",
-        whole=True,
     )
     gates = solved.gates
     if isinstance(gates, Unavailable):
-        print_line(console, "Gate", f"none: {gates.reason}", whole=True)
+        print_line(console, "Gate", f"none: {gates.reason}")
     elif not gates:
         print_line(console, "Gate", "no closures to judge: every edge is odometry")
     else:
@@ -140,8 +143,5 @@ def _statistics(table: Table, label: str, values: Statistics, interval: str = ""
 
 
 def _table(*names: str) -> Table:
-    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="bold")
-    for name in names:
-        left = name in ("path", "closure", "error", "gate", "edge")
-        table.add_column(name, justify="left" if left else "right")
-    return table
+    left = ("path", "closure", "error", "gate", "edge")
+    return plain_table(*((name, "left" if name in left else "right") for name in names))

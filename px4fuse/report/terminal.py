@@ -1,27 +1,47 @@
-"""The summary on the terminal: what was compared with what, verdicts, findings, on one screen."""
+"""The summary on the terminal: what happened, what was compared with what, verdicts, findings."""
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Iterable, Mapping
 
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from px4fuse.comparison.comparison import AgainstTruth, AxisComparison, Difference, FilterSummary
+from px4fuse.comparison.comparison import Difference
+from px4fuse.comparison.why import Why
 from px4fuse.filter.consistency import Consistency
+from px4fuse.filter.signals import AISLE
 from px4fuse.findings import Finding, Severity
 from px4fuse.flight import Unavailable
+from px4fuse.report.commands import runnable
 from px4fuse.report.document import Document
-from px4fuse.report.words import consequences_words, settings_words, verdict_notes, verdict_words
+from px4fuse.report.screen import (
+    INDENT,
+    plain_table,
+    print_command,
+    print_file,
+    print_line,
+    say,
+)
+from px4fuse.report.words import (
+    consequences_words,
+    difference_cells,
+    error_cells,
+    settings_words,
+    statement_cells,
+    verdict_notes,
+)
+from px4fuse.request import Request
 
 MOST_FINDINGS = 4
-# the screen shows the beginning of a long line; the report has it whole
-ONE_LINE: dict[str, Any] = {"no_wrap": True, "overflow": "ellipsis", "crop": True}
+LEGEND = "Apart: ours - EKF2, RMS of position and velocity. NIS in the band: consistent."
 STYLES: dict[Severity, str] = {"error": "bold red", "warning": "yellow", "info": "cyan"}
 
 
-def print_summary(console: Console, document: Document) -> None:
+def print_summary(
+    console: Console, document: Document, request: Request, report: object = None
+) -> None:
     """Print the summary of one comparison.
 
     Parameters
@@ -29,6 +49,10 @@ def print_summary(console: Console, document: Document) -> None:
     console : Console
         Standard output.
     document : Document
+    request : Request
+        As it was typed: the commands that are printed run.
+    report : Path, optional
+        Where the report was written.
     """
     comparison = document.comparison
     log = comparison.flight.log
@@ -53,76 +77,80 @@ def print_summary(console: Console, document: Document) -> None:
         console, "Segment", f"{segment.start_s:.1f} s to {segment.end_s:.1f} s, {segment.reason}"
     )
     console.print(_table(document))
-    console.print(Text("vs: RMSE of position (m), velocity (m/s). NIS 1 is consistent.", "dim"))
-    for note in verdict_notes(document.comparison):
-        console.print(Text(note, "dim"), soft_wrap=True)
+    say(console, Text(LEGEND, "dim"))
+    for note in verdict_notes(comparison):
+        say(console, Text(note, "dim"))
+    print_why(console, document.analysis.why)
     if not document.findings:
-        console.print(Text("No findings."))
+        say(console, "No findings.")
     for finding in document.findings[:MOST_FINDINGS]:
-        print_finding(console, finding)
+        print_finding(console, finding, request)
     if (more := len(document.findings) - MOST_FINDINGS) > 0:
-        console.print(Text(f"and {more} more in the report"))
+        say(console, f"and {more} more in the report" if report else f"and {more} more")
+    if report is not None:
+        print_file(console, "Report", report)
 
 
-def print_finding(console: Console, finding: Finding, *, whole: bool = False) -> None:
-    """Print severity, sentence and remedy, cut at the screen's edge unless all of it is wanted."""
-    how = {"soft_wrap": True} if whole else ONE_LINE
-    line = Text(f"{finding.severity:9}", style=STYLES[finding.severity])
-    console.print(line.append(finding.message, style="none"), **how)
-    console.print(Text(" " * 9 + finding.remedy, style="dim"), **how)
+def print_why(console: Console, why: Mapping[str, Why | Unavailable]) -> None:
+    """Print in one sentence why EKF2 differs, along the aisle where there is one."""
+    if not why:
+        return
+    found = why.get(AISLE, next(iter(why.values())))
+    if isinstance(found, Unavailable):
+        print_line(console, "Why", f"EKF2 differs is not known: {found.reason}.", "dim")
+    else:
+        print_line(console, "Why", found.sentences[0])
+
+
+def print_advice(console: Console, lines: Iterable[str], request: Request) -> None:
+    """Print lines whose first columns are a label, with the commands in them in full."""
+    for line in lines:
+        label, (text, commands) = line[:INDENT].strip(), runnable(line[INDENT:], request)
+        print_line(console, label, text)
+        for command in commands:
+            print_command(console, command)
+
+
+def print_finding(console: Console, finding: Finding, request: Request) -> None:
+    """Print severity, sentence, remedy and the commands that the remedy names."""
+    head = Text(finding.severity.ljust(INDENT), STYLES[finding.severity])
+    say(console, finding.message, head, INDENT)
+    remedy, commands = runnable(finding.remedy, request)
+    print_line(console, "", remedy, "dim")
     if finding.consequences:
-        console.print(Text(" " * 9 + consequences_words(finding), style="dim"), **how)
+        print_line(console, "", consequences_words(finding), "dim")
+    for command in commands:
+        print_command(console, command)
 
 
 def _table(document: Document) -> Table:
-    truth = not isinstance(document.comparison.flight.truth, Unavailable)
-    table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="bold")
-    columns = ["axis", "filter", "mean NIS", "95 % band", "innovation S", "vs EKF2"]
-    columns += ["vs truth"] if truth else []
-    for name in columns:
-        left = name in ("axis", "filter", "innovation S")
-        table.add_column(name, justify="left" if left else "right", no_wrap=True)
-    for result in document.comparison.axes:
-        table.add_row(
-            result.axis.name, "ours", *_statement(result.kf), _difference(result),
-            *([_errors(result.kf_truth)] if truth else []),
-        )  # fmt: skip
-        if not isinstance(result.ekf2, Unavailable):
+    comparison = document.comparison
+    truth = not isinstance(comparison.flight.truth, Unavailable)
+    ekf2 = any(isinstance(result.difference, Difference) for result in comparison.axes)
+    table = plain_table(
+        ("axis", "left"), ("filter", "left"), ("mean\nNIS", "right"), ("95 %\nband", "right"),
+        ("innovation\nvariance", "left"),
+        *((("apart\n(m)", "right"), ("\n(m/s)", "right")) if ekf2 else ()),
+        *((("to truth\n(m)", "right"), ("\n(m/s)", "right")) if truth else ()),
+    )  # fmt: skip
+    for result in sorted(comparison.axes, key=lambda result: result.axis.name != AISLE):
+        for owner, summary, against in (
+            ("ours", result.kf, result.kf_truth), ("EKF2", result.ekf2, result.ekf2_truth),
+        ):  # fmt: skip
+            if isinstance(summary, Unavailable):
+                continue
+            ours = owner == "ours"
+            verdict = statement_cells(summary.consistency)
             table.add_row(
-                "", "EKF2", *_statement(result.ekf2), "",
-                *([_errors(result.ekf2_truth)] if truth else []),
+                Text(result.axis.name if ours else "", "bold"), owner, verdict.nis, verdict.band,
+                Text(verdict.words, _style(summary.consistency)),
+                *((difference_cells(result.difference) if ours else ("", "")) if ekf2 else ()),
+                *(error_cells(against) if truth else ()),
             )  # fmt: skip
     return table
 
 
-def print_line(console: Console, label: str, text: str, *, whole: bool = False) -> None:
-    """Print a label and a text, cut at the screen's edge unless all of it is wanted."""
-    line = Text(f"{label:9}", style="bold").append(text, style="none")
-    console.print(line, **({"soft_wrap": True} if whole else ONE_LINE))
-
-
-def _statement(summary: FilterSummary) -> tuple[str, str, Text]:
-    statement = summary.consistency
-    if not isinstance(statement, Consistency):
-        return "", "", Text(verdict_words(statement), style="dim")
-    low, high = statement.nis_band
-    style = "green" if statement.verdict == "consistent" else "yellow"
-    return (
-        f"{statement.nis_mean:.3g}",
-        f"{low:.2f}-{high:.2f}",
-        Text(verdict_words(statement), style=style),
-    )
-
-
-def _errors(truth: AgainstTruth | Unavailable) -> str:
-    if isinstance(truth, Unavailable):
-        return ""
-    if truth.velocity_rmse_m_s is None:
-        return f"{truth.position_rmse_m:.3f}"
-    return f"{truth.position_rmse_m:.3f} {truth.velocity_rmse_m_s:.3f}"
-
-
-def _difference(result: AxisComparison) -> str:
-    if not isinstance(result.difference, Difference):
-        return ""
-    return f"{result.difference.position_rmse_m:.3f} {result.difference.velocity_rmse_m_s:.3f}"
+def _style(statement: Consistency | Unavailable) -> str:
+    if isinstance(statement, Unavailable):
+        return "dim"
+    return "green" if statement.verdict == "consistent" else "yellow"

@@ -9,7 +9,8 @@ from rich.table import Table
 from rich.text import Text
 
 from px4fuse.analysis import Counterfactual
-from px4fuse.report.terminal import print_line
+from px4fuse.report.screen import plain_table, print_line, say
+from px4fuse.report.terminal import print_why
 from px4fuse.report.whatif import heads, reading, rows, sweep_heads, sweep_of, sweep_rows
 from px4fuse.report.why import agreement_words
 
@@ -27,20 +28,19 @@ def print_what_if(console: Console, made_of: Counterfactual) -> None:
     print_line(console, "Log", f"{log.name}, {log.firmware}, {log.duration_s:.1f} s")
     spans = ", ".join(f"{start:.1f} to {end:.1f} s" for start, end in found.judged)
     print_line(console, "Judged", spans)
-    print_line(console, "Replay", agreement_words(found.agreement), whole=True)
+    print_line(console, "Replay", agreement_words(found.agreement))
+    print_why(console, made_of.why)
     console.print(_table(["", *heads(made_of)], rows(made_of)))
     if sweep_of(made_of):
         console.print()
         console.print(_table(sweep_heads(made_of), sweep_rows(made_of)))
     for line in reading(made_of):
-        console.print(Text(line), soft_wrap=True)
-    console.print(Text("Replays are of px4fuse's model of EKF2, not of PX4's own code.", "dim"))
+        say(console, line)
+    say(console, Text("Replays are of px4fuse's model of EKF2, not of PX4's own code.", "dim"))
 
 
 def _table(head: Sequence[str], body: list[list[str]]) -> Table:
-    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="bold")
-    for at, name in enumerate(head):
-        table.add_column(Text(name), justify="right" if at else "left", no_wrap=at == 0)
+    table = plain_table(*((name, "right" if at else "left") for at, name in enumerate(head)))
     for cells in body:
         table.add_row(*map(Text, cells))
     return table

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 
 import numpy as np
 
-from px4fuse.comparison.comparison import Comparison
+from px4fuse.comparison.comparison import AgainstTruth, Comparison, Difference
 from px4fuse.comparison.drift import may_drift
 from px4fuse.filter.clock import CHANGE_P, ClockOffset
 from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.kalman import Settings
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.findings import Finding
+from px4fuse.findings.source_clock import typed_offset_s
 from px4fuse.findings.variance import VARIANCE_FACTOR
 from px4fuse.flight import Alignment, ClockMap, Unavailable
 from px4fuse.plain import factor_words
@@ -39,6 +41,39 @@ def verdict_words(statement: Consistency | Unavailable) -> str:
     if statement.verdict == "consistent":
         return "consistent"
     return f"{_side(statement)} {factor_words(_factor(statement))}×"
+
+
+@dataclass(frozen=True)
+class VerdictCells:
+    """Mean NIS, its band and the verdict, as every table shows them."""
+
+    nis: str
+    band: str
+    words: str
+
+
+def statement_cells(statement: Consistency | Unavailable) -> VerdictCells:
+    """A verdict and its numbers, empty where there is none."""
+    words = verdict_words(statement)
+    if isinstance(statement, Unavailable):
+        return VerdictCells("", "", words)
+    low, high = statement.nis_band
+    return VerdictCells(f"{statement.nis_mean:.3g}", f"{low:.2f} – {high:.2f}", words)
+
+
+def error_cells(truth: AgainstTruth | Unavailable) -> tuple[str, str]:
+    """RMSE of position (m) and velocity (m/s) to the truth, empty where there is none."""
+    if isinstance(truth, Unavailable):
+        return "", ""
+    velocity = truth.velocity_rmse_m_s
+    return f"{truth.position_rmse_m:.3f}", "" if velocity is None else f"{velocity:.3f}"
+
+
+def difference_cells(difference: Difference | Unavailable) -> tuple[str, str]:
+    """RMSE of position (m) and velocity (m/s) of ours against EKF2, empty where there is none."""
+    if isinstance(difference, Unavailable):
+        return "", ""
+    return f"{difference.position_rmse_m:.3f}", f"{difference.velocity_rmse_m_s:.3f}"
 
 
 def _side(statement: Consistency) -> str:
@@ -99,8 +134,11 @@ def _same_nis(stated: list[tuple[str, str, Consistency]]) -> Iterator[str]:
             low, high = wrong.nis_band
             if wrong.verdict == "consistent" or fine.verdict != "consistent":
                 continue
-            same_side = (fine.nis_mean < 1.0) == (wrong.nis_mean < 1.0)
-            if fine.count < wrong.count and same_side and not low <= fine.nis_mean <= high:
+            same_side = max(wrong.nis_mean, fine.nis_mean) < low or (
+                min(wrong.nis_mean, fine.nis_mean) > high
+            )
+            wide_low, wide_high = fine.nis_band
+            if same_side and fine.count < wrong.count and wide_low < wrong.nis_mean < wide_high:
                 bands = " and ".join("{:.2f}-{:.2f}".format(*s.nis_band) for s in (wrong, fine))
                 yield (
                     f"Along {axis} only {owner} is called {_side(wrong)} although {other} has "
@@ -161,7 +199,11 @@ def alignment_words(alignment: Alignment) -> list[tuple[str, str]]:
 def tuning_advice(
     comparison: Comparison, tuned: Mapping[str, AxisTuning | Unavailable]
 ) -> list[str]:
-    """What follows from tuning: the command to run again, PX4's parameter, and cautions."""
+    """What follows from tuning: the command to run again, PX4's parameter, and cautions.
+
+    Lines whose first nine columns are a label; ``px4fuse compare LOG`` as in
+    :mod:`px4fuse.report.commands`.
+    """
     name = next(
         (n for n in (HORIZONTAL, "aisle", *tuned) if isinstance(tuned.get(n), AxisTuning)), None
     )
@@ -185,9 +227,7 @@ def tuning_advice(
         if noise.value is not None and not drifts
     ]
     if options:
-        lines.append(
-            f"Re-run   px4fuse compare {comparison.flight.log.name} {' '.join(options)}   ({name})"
-        )
+        lines.append(f"Re-run   px4fuse compare LOG {' '.join(options)} ({name})")
     now = comparison.flight.log.parameters.get("EKF2_EVP_NOISE")
     if found.sigma_z.value is None and found.sigma_z.low is not None:
         lines.append(
@@ -243,16 +283,16 @@ def noise_and_bias_words(found: AxisTuning) -> str:
 
 
 def clock_advice(comparison: Comparison, clock: ClockOffset | Unavailable) -> list[str]:
-    """What the clock estimate says, and what follows from it."""
+    """What the clock estimate says, and what follows from it: lines as of tuning_advice."""
     if isinstance(clock, Unavailable):
-        return [f"Not determinable: {clock.reason}. {clock.remedy}"]
+        return [f"Offset   not determinable: {clock.reason}. {clock.remedy}"]
     applied = comparison.settings.clock_offset_s
     offset, (low, high) = applied + clock.offset_s, clock.interval_s
     log = comparison.flight.log
     lines = []
     if not clock.determinable:
-        lines.append(f"Not determinable: {clock.reason}.")
-        lines.append("Fly passes of 5 m or more with clear starts and stops.")
+        lines.append(f"Offset   not determinable: {clock.reason}.")
+        lines.append("Next     fly passes of 5 m or more with clear starts and stops.")
         return lines
     lines.append(
         f"Offset   {offset:+.3f} s, 95 % {applied + low:+.3f} s to {applied + high:+.3f} s, to be "
@@ -263,7 +303,8 @@ def clock_advice(comparison: Comparison, clock: ClockOffset | Unavailable) -> li
         lines.append("Reading  the stamps are right as far as this flight can tell")
     else:
         lines.append(f"Reading  the stamps are {side} by {abs(offset):.3f} s")
-        lines.append(f"Re-run   px4fuse compare {log.name} --clock-offset {offset:.3f}")
+        typed = typed_offset_s(comparison, clock)
+        lines.append(f"Re-run   px4fuse compare LOG --clock-offset {typed:.3f}")
     delay = log.parameters.get("EKF2_EV_DELAY")
     if delay is not None:
         margin = NEGLIGIBLE_OFFSET_S
