@@ -68,7 +68,7 @@ LOOP = to_plain(
             odometry_noise=made.OdometryNoise(1.0, 3.0, 0.01, 0.03, 0.1),
             closures=(made.Closure(1.0, 95.0, 0.1, "landing", 1.4, 2.0, 3, 0.5, True),),
             corrections=made.Corrections(
-                correction(0.41, 0.0), correction(0.26, 1.4), NONE, NONE, NONE, NONE
+                correction(0.41, 0.0), NONE, correction(0.26, 1.4), NONE, NONE, NONE, NONE
             ),
             notes=(),
         ),

@@ -10,18 +10,28 @@ import pytest
 from conftest import REPOSITORY
 from pyulog import ULog
 from scipy.spatial.transform import Rotation, Slerp
+from test_lesson import EXAMPLE_2
 
 from px4fuse.errors import SettingsError, TrajectoryError
 from px4fuse.findings import find_loop
 from px4fuse.flight import Unavailable
+from px4fuse.lesson import ODOMETRY_M
 from px4fuse.loop.analysis import analyse, loop_in
-from px4fuse.loop.loop import SINGLE_LOOP, Correction, Loop, close_loop
+from px4fuse.loop.loop import (
+    BY_DISTANCE,
+    PLAIN,
+    SINGLE_LOOP,
+    Correction,
+    Loop,
+    close_loop,
+)
 from px4fuse.loop.odometry import Closure, OdometryNoise, odometry_variances
 from px4fuse.loop.sources import Source, read_source, split_part
 from px4fuse.readers.closures import parse_closure, read_closures
 from px4fuse.request import GivenClosure
 from px4fuse.trajectory.evaluation import Evaluation
 from px4fuse.trajectory.model import Trajectory
+from px4fuse.trajectory.scores import Statistics
 
 SAMPLE = REPOSITORY / "sample_logs" / "loop_vio.ulg"
 SLAM = REPOSITORY / "sample_logs" / "loop_slam.tum"
@@ -105,10 +115,70 @@ def test_both_corrections_bring_the_sample_closer(sample_loop: Loop, reference: 
     assert rmse(sample_loop.solved["gated"], reference) < 0.8 * before
 
 
+def test_example_2_through_the_loop_is_the_lessons_digit_for_digit() -> None:
+    corners = np.column_stack([np.array(ODOMETRY_M), np.zeros(len(ODOMETRY_M))])
+    path = Trajectory("corners", "vio", np.arange(5.0), corners, None, "FRD")
+    found = close_loop(path)
+    assert isinstance(found.plain, Correction)
+    error, total = found.misclosure_m, found.path_length_m
+    assert isinstance(error, np.ndarray)
+    lines = [
+        f"loop closure error ({error[0]:.1f}, {error[1]:.1f}) m over {total:.1f} m = "
+        f"{found.closure_error_m / total:.1%}",
+        *(
+            f"({x:5.1f}, {y:5.1f}) -> ({a:5.2f}, {b:5.2f})"
+            for (x, y), (a, b, _) in zip(ODOMETRY_M, found.plain.trajectory.position_m, strict=True)
+        ),
+    ]
+    assert lines == EXAMPLE_2.splitlines()
+
+
+def test_the_plain_correction_moves_each_pose_by_its_share_and_turns_none(
+    sample_loop: Loop,
+) -> None:
+    plain, path = sample_loop.plain, sample_loop.odometry.trajectory
+    assert isinstance(plain, Correction)
+    share = sample_loop.distance_m / sample_loop.distance_m[-1]
+    moved = path.position_m - plain.trajectory.position_m
+    np.testing.assert_allclose(moved, np.outer(share, sample_loop.misclosure_m), atol=1e-12)
+    assert plain.trajectory.rotation is path.rotation
+
+
+def test_headings_too_keep_the_shape_that_positions_alone_bend(sample_loop: Loop) -> None:
+    """The sample's heading drifts: over 10 m only the one that turns is as good as the odometry."""
+    over = [
+        next(e.translation for e in score(part).rpe if str(e.delta) == "10 m")
+        for part in (sample_loop.odometry, sample_loop.by_distance, sample_loop.plain)
+    ]
+    before, turned, plain = (e.rmse for e in over if isinstance(e, Statistics))
+    assert turned < 1.05 * before
+    assert plain > 1.1 * before
+
+
+def test_without_a_known_heading_there_is_one_correction_by_distance(
+    sample: Source, sample_loop: Loop
+) -> None:
+    assert [part.name for part in sample_loop.reported[1:3]] == [PLAIN, BY_DISTANCE]
+    found = analyse(sample, landed_at=(0.0, 0.0, None))
+    assert isinstance(found.misclosure_heading_deg, Unavailable)
+    names = [part.name for part in found.reported]
+    assert PLAIN in names
+    assert BY_DISTANCE not in names
+    assert isinstance(found.plain, Correction)
+    assert isinstance(found.by_distance, Correction)
+    np.testing.assert_allclose(
+        found.plain.trajectory.position_m, found.by_distance.trajectory.position_m, atol=1e-9
+    )
+
+
 def test_a_corrected_path_ends_where_the_vehicle_did(sample_loop: Loop) -> None:
     assert not isinstance(sample_loop.known_end, Unavailable)
     end = np.array(sample_loop.known_end.displacement_m)
-    for part, within in ((sample_loop.by_distance, 1e-9), (sample_loop.solved["gated"], 0.02)):
+    for part, within in (
+        (sample_loop.plain, 1e-9),
+        (sample_loop.by_distance, 1e-9),
+        (sample_loop.solved["gated"], 0.02),
+    ):
         assert isinstance(part, Correction)
         moved = part.trajectory.position_m[-1] - part.trajectory.position_m[0]
         assert np.linalg.norm(moved - end) < within

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shlex
 import subprocess
 import sys
@@ -20,6 +21,7 @@ from test_lesson import EXAMPLE_2
 from test_outputs import contents
 
 from px4fuse.cli import cli
+from px4fuse.loop.loop import BY_DISTANCE, PLAIN
 from px4fuse.results.contract import schema
 
 LOG = REPOSITORY / "sample_logs" / "loop_vio.ulg"
@@ -97,7 +99,8 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "n.md": ["my own words"],
     }.items():
         write(folder / name, rows)
-    (folder / "hard.json").hardlink_to(folder / "s.tum")
+    for name in ("hard.json", "hard.png"):
+        (folder / name).hardlink_to(folder / "s.tum")
     (folder / "soft.json").symlink_to(folder / "l.ulg")
     (folder / "s.pdf").write_bytes((folder / "s.tum").read_bytes())
     return folder
@@ -133,6 +136,9 @@ def test_loop_writes_report_results_path_and_graph(made) -> None:
     assert sorted(path.name for path in folder.iterdir()) == ["r.g2o", "r.json", "r.pdf", "r.tum"]
     assert "1.42 m" in result.output
     assert "REJECTED" in result.output  # 10,60 is no closure
+    for name in (PLAIN, BY_DISTANCE):  # with the score of each against the truth and against SLAM
+        assert len(re.findall(rf"^{name} +0\.[23]", result.output, re.MULTILINE)) == 2
+    assert "Example 2" in result.output
     for name in ("r.g2o", "r.json", "r.pdf", "r.tum"):
         assert f"Wrote    {folder / name}" in result.output
 
@@ -235,6 +241,68 @@ def test_evaluate_writes_what_it_prints(desk, tmp_path) -> None:
     assert [(one["delta"], one["unit"]) for one in found["rpe"]] == [
         (5.0, "m"), (10.0, "s"), (1.0, "frames"),
     ]  # fmt: skip
+
+
+def test_evaluate_writes_page_picture_and_results(desk, tmp_path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    command = ["evaluate", desk / "s.tum", desk / "l.ulg:truth"]
+    result = run(*command)
+    assert result.exit_code == 0, result.output
+    name = "s_against_l_truth"
+    assert set(contents(tmp_path)) == {f"{name}.pdf", f"{name}.png", f"{name}.json"}
+    for end in ("pdf", "png", "json"):
+        assert f"Wrote    {Path('reports', name)}.{end}" in result.output
+    folder = tmp_path / "reports"
+    assert (folder / f"{name}.png").read_bytes()[:4] == b"\x89PNG"
+    reader = pypdf.PdfReader(folder / f"{name}.pdf")
+    text = (folder / f"{name}.json").read_bytes()
+    assert reader.attachments["results.json"] == [text]
+    jsonschema.validate(json.loads(text), schema())
+    assert json.loads(text) == results(*command)
+    assert str(tmp_path) not in "".join(page.extract_text() for page in reader.pages)
+    before = contents(tmp_path)
+    assert run(*command).exit_code == 0
+    assert contents(tmp_path) == before
+
+
+def test_evaluate_with_other_settings_or_files_writes_over_no_page(
+    desk, tmp_path, monkeypatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "other").mkdir()
+    write(tmp_path / "other" / "s.tum", ROWS[:-50])
+    commands = [
+        ("evaluate", desk / "s.tum", desk / "s.tum"),
+        ("evaluate", desk / "s.tum", desk / "s.tum", "--rpe", "5m", "--consecutive"),
+        ("evaluate", tmp_path / "other" / "s.tum", desk / "s.tum"),
+    ]
+    names = ["s_against_s", "s_against_s_rpe-5-m_consecutive", "s_against_s_2"]
+    for count, command in enumerate(commands, start=1):
+        assert run(*command).exit_code == 0
+        written = {Path(name).stem for name in contents(tmp_path / "reports")}
+        assert written == set(names[:count])
+
+
+@pytest.mark.parametrize(
+    ("options", "written"),
+    [
+        (["-o", "p.pdf"], {"p.pdf", "p.png", "p.json"}),
+        (["-o", "p.pdf", "--picture", "q.png", "--json", "r.json"], {"p.pdf", "q.png", "r.json"}),
+        (["--picture", "q.png"], {"q.png"}),
+        (["--json", "r.json"], {"r.json"}),
+        (["--json", "-"], set()),
+        (["--json", "-", "--picture", "q.png"], {"q.png"}),
+    ],
+    ids=["page", "all", "picture", "results", "printed", "printed with picture"],
+)
+def test_evaluate_writes_what_is_named(desk, tmp_path, monkeypatch, options, written) -> None:
+    monkeypatch.chdir(tmp_path)
+    result = run("evaluate", desk / "s.tum", desk / "l.ulg:truth", *options)
+    assert result.exit_code == 0, result.output
+    assert set(contents(tmp_path)) == written
+    alone = "-" in options
+    assert alone == result.output.startswith("{")
+    assert alone == ("ATE (m)" not in result.output)
 
 
 @pytest.mark.parametrize("name", ["s.tum", "l.ulg:vio", "l.ulg:truth"])
@@ -397,13 +465,18 @@ REFUSED = {
     "endless gap": ("evaluate s.tum s.tum --max-gap inf", "--max-gap inf is not a finite"),
     "offset of NaN": ("evaluate s.tum s.tum --time-offset nan", "--time-offset nan is not"),
     "endless offset": ("evaluate s.tum s.tum --time-offset inf", "--time-offset inf is not"),
-    "offset of words": ("evaluate s.tum s.tum --time-offset abc", "neither a number nor 'auto'"),
+    "offset of words": ("evaluate s.tum s.tum --time-offset abc", "give seconds, as 0.1, or auto"),
     "RPE over km": ("evaluate s.tum s.tum --rpe 5km", "'5km' is not a distance"),
     "RPE over nothing": ("evaluate s.tum s.tum --rpe 0m", "'0m' is not a distance"),
     "RPE backwards": ("evaluate s.tum s.tum --rpe -1m", "'-1m' is not a distance"),
     "RPE over half a frame": ("evaluate s.tum s.tum --rpe 1.5f", "frames come whole"),
     "RPE over too many": (f"evaluate s.tum s.tum --rpe {'9' * 26}f", "is not a distance"),
     "results into a file": ("evaluate s.tum s.tum --json n.md/e.json", "cannot be written"),
+    "page as text": ("evaluate s.tum s.tum -o page.txt", "ends in .pdf"),
+    "picture as JPEG": ("evaluate s.tum s.tum --picture p.jpg", "ends in .png"),
+    "picture to print": ("evaluate s.tum s.tum --picture -", "ends in .png"),
+    "picture for results": ("evaluate s.tum s.tum --picture p.png --json p.png", "Give two names"),
+    "picture into a file": ("evaluate s.tum s.tum --picture n.md/e.png", "cannot be written"),
 }
 
 
@@ -432,6 +505,9 @@ SPARED = {
     "pose graph by its results": "loop g.g2o --json ./g.g2o",
     "estimate": "evaluate s.tum s.tum --json s.tum",
     "reference of evaluate": "evaluate s.tum l.ulg:truth --json l.ulg",
+    "estimate by its page": "evaluate s.pdf s.tum -o s.pdf",
+    "estimate by its picture": "evaluate s.tum s.tum --picture hard.png",
+    "estimate by the page's picture": "evaluate s.tum s.tum -o hard.pdf",
 }
 
 

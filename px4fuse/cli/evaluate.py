@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import re
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -10,24 +12,31 @@ import click
 
 from px4fuse.cli.inputs import (
     command_line,
-    json_option,
     max_size_option,
+    path_option,
     system_option,
 )
 from px4fuse.cli.outputs import (
+    free_report,
     progress,
+    report_paths,
+    spare_inputs,
     terminal,
-    write_json,
+    write_outputs,
 )
 from px4fuse.cli.quantity import Quantity
-from px4fuse.errors import SettingsError
+from px4fuse.errors import OutputError, SettingsError
 from px4fuse.request import AUTO
 from px4fuse.writing import STANDARD_OUTPUT
 
 if TYPE_CHECKING:
+    from px4fuse.results.contract import EvaluationResults
     from px4fuse.trajectory.scores import Delta
 
+STEPS = ("reading", "scoring", "drawing the page", "drawing the picture")
 MAX_DELTA = 1e6
+# Of each of the two names in the default name of the report: with both it stays below 255
+MAX_NAME_BYTES = 90
 _DELTA = re.compile(r"(\d+\.?\d*|\.\d+) ?(m|s|frames|f)")
 
 
@@ -101,7 +110,23 @@ class DeltaType(click.ParamType["Delta"]):
 )
 @system_option
 @max_size_option
-@json_option
+@path_option(
+    "-o",
+    "--output",
+    metavar="FILE.pdf",
+    help="The page.  [default: reports/ESTIMATE_against_REFERENCE.pdf]",
+)
+@path_option(
+    "--picture",
+    metavar="FILE.png",
+    help="The picture: the path by its error, APE, RPE.  [default: beside the PDF]",
+)
+@path_option(
+    "--json",
+    "json_path",
+    metavar="FILE",
+    help="The results; - prints them alone on standard output.  [default: beside the PDF]",
+)
 def evaluate(
     estimate: Path,
     reference: Path,
@@ -112,22 +137,30 @@ def evaluate(
     rpe: tuple[Any, ...],
     consecutive: bool,
     system: int | None,
+    output: Path | None,
+    picture: Path | None,
     json_path: Path | None,
 ) -> None:
     """Score a trajectory against a reference: ATE and RPE, with intervals.
 
     Either is a trajectory file (TUM, EuRoC, ORB-SLAM3) or a part of a flight log: LOG:vio,
-    LOG:ekf2, LOG:kf (our filter) or LOG:truth.
+    LOG:ekf2, LOG:kf (our filter) or LOG:truth. Writes a page (PDF), a picture (PNG) and the results
+    (JSON); where -o, --picture or --json names a file, only what is named and what stands beside
+    the PDF.
     """
     from px4fuse.loop.sources import read_source
     from px4fuse.report.loop_terminal import print_evaluation
     from px4fuse.results.build_trajectories import evaluation_results
+    from px4fuse.results.contract import to_json
     from px4fuse.trajectory.evaluation import evaluate as score
 
     for option, value in (("--max-gap", max_gap), ("--time-offset", time_offset)):
         if isinstance(value, float) and not abs(value) < float("inf"):
             raise SettingsError(f"{option} {value:g} is not a finite number.")
-    with progress(json_path == STANDARD_OUTPUT) as step:
+    alone = json_path == STANDARD_OUTPUT
+    _targets(output, picture, json_path)  # before the work, not after it
+    contents: dict[Path, bytes] = {}
+    with progress(alone, STEPS) as step:
         step("reading")
         first = read_source(str(estimate), system=system)
         second = read_source(str(reference), default="truth", system=system)
@@ -142,8 +175,75 @@ def evaluate(
             rpe_deltas=rpe or None,
             all_pairs=not consecutive,
         )
-    if write_json(
-        evaluation_results(found, command_line("evaluate", estimate, reference)), json_path
-    ):
+        results = evaluation_results(found, command_line("evaluate", estimate, reference))
+        text = to_json(results)
+        if output is None and picture is None and json_path is None:
+            output = _default(estimate, reference, results)
+        output, picture, beside = _targets(output, picture, json_path)
+        if output is not None:
+            from px4fuse.report.document import EvaluationDocument
+            from px4fuse.report.pdf import render
+
+            step("drawing the page")
+            contents[output] = render(EvaluationDocument(found), text)
+        if picture is not None:
+            from px4fuse.report.evaluation import picture as draw
+
+            step("drawing the picture")
+            contents[picture] = draw(found)
+    for path in (beside, json_path):
+        if path is not None:
+            contents[path] = text.encode()
+    write_outputs(contents)
+    if alone:
         return
-    print_evaluation(terminal(), found)
+    from px4fuse.report.screen import print_file
+
+    console = terminal()
+    print_evaluation(console, found)
+    for path in contents:
+        print_file(console, "Wrote", path)
+
+
+def _default(estimate: Path, reference: Path, mine: EvaluationResults) -> Path:
+    """Where a page goes that was given no name: the two and the settings are in its name."""
+    from px4fuse.results.contract import EvaluationResults, Results
+
+    def is_same(old: Results) -> bool:
+        return isinstance(old, EvaluationResults) and (
+            (old.provenance.command, old.estimate.sha256, old.reference.sha256)
+            == (mine.provenance.command, mine.estimate.sha256, mine.reference.sha256)
+        )
+
+    given = " ".join(shlex.split(mine.provenance.command)[4:]).split("--")[1:]
+    settings = "".join(re.sub(r"[^\w.,+-]+", "-", f"_{part.strip()}") for part in given)
+    return free_report(f"{_name(estimate)}_against_{_name(reference)}", settings, is_same)
+
+
+def _name(source: Path) -> str:
+    """What a trajectory is called in a file name: ``flight_vio`` of ``flight.ulg:vio``."""
+    from px4fuse.loop.sources import split_part
+
+    path, part = split_part(str(source))
+    stem = os.fsencode(path.stem)[:MAX_NAME_BYTES].decode(errors="ignore")
+    return stem if part is None else f"{stem}_{part}"
+
+
+def _targets(
+    output: Path | None, picture: Path | None, json_path: Path | None
+) -> tuple[Path | None, Path | None, Path | None]:
+    """Page, picture and results, the latter two beside the page unless they are named."""
+    results = None if json_path == STANDARD_OUTPUT else json_path
+    if output is not None:
+        output, results = report_paths(output, json_path)
+        picture = picture or output.with_suffix(".png")
+    if picture is None:
+        return output, picture, results
+    if picture.suffix.lower() != ".png":
+        raise OutputError(
+            f"{picture}: the picture is a PNG. Give a name that ends in .png with --picture."
+        )
+    if results is not None and picture.resolve() == results.resolve():
+        raise OutputError(f"{picture}: --picture and --json name the same file. Give two names.")
+    spare_inputs([picture])
+    return output, picture, results

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from px4fuse.results.model import Student
 
 # Options of the commands without a request that say where to write, or what this machine can take
-NOT_RECORDED = ("json_path", "g2o", "max_size")
+NOT_RECORDED = ("json_path", "g2o", "max_size", "output", "picture")
 
 
 class ColumnNames(click.ParamType["tuple[str, ...]"]):

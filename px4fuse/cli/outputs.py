@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, Protocol
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from px4fuse.request import ComparisonRequest
-    from px4fuse.results.contract import ComparisonResults
+    from px4fuse.results.contract import ComparisonResults, Results
 
 # Of a report that is named by its settings: file systems take 255 bytes
 LONGEST_NAME = 200
@@ -120,23 +120,38 @@ def default_report(request: ComparisonRequest, results: ComparisonResults) -> Pa
     What an earlier run of the same wrote is written over. Where another file has the name (of
     another log or another student, or no report), a number is added.
     """
-    folder, stem = Path("reports"), Path(request.log).stem
-    name = f"{stem}{settings_name(request)}"
+    from px4fuse.results.contract import ComparisonResults
+
+    def is_same(old: Results) -> bool:
+        return (
+            isinstance(old, ComparisonResults)
+            and old.request == results.request
+            and [old.log.sha256, *(file.sha256 for file in old.log.joined)]
+            == [results.log.sha256, *(file.sha256 for file in results.log.joined)]
+            and (old.student.name, old.student.id)
+            in (("", ""), (results.student.name, results.student.id))
+        )
+
+    return free_report(Path(request.log).stem, settings_name(request), is_same)
+
+
+def free_report(stem: str, settings: str, is_same: Callable[[Results], bool]) -> Path:
+    """A name in ``reports`` that is free, or that of an earlier report of the same."""
+    name = f"{stem}{settings}"
     name = name if len(os.fsencode(name)) <= LONGEST_NAME else stem
-    number, path = 1, folder / f"{name}.pdf"
-    while not all(_same_run(file, results) for file in (path, path.with_suffix(".json"))):
+    number, path = 1, Path("reports", f"{name}.pdf")
+    while not all(_is_ours(file, is_same) for file in (path, path.with_suffix(".json"))):
         number += 1
-        path = folder / f"{name}_{number}.pdf"
+        path = Path("reports", f"{name}_{number}.pdf")
     return path
 
 
-def _same_run(file: Path, mine: ComparisonResults) -> bool:
-    """Whether a report or its results are of the same recordings, settings and student, or new."""
+def _is_ours(file: Path, is_same: Callable[[Results], bool]) -> bool:
+    """Whether a report or its results are of the same, or not there yet."""
     from pypdf import PdfReader
     from pypdf.errors import PyPdfError
 
     from px4fuse.report.pdf import RESULTS_NAME
-    from px4fuse.results.contract import ComparisonResults
     from px4fuse.results.reading import read_results
 
     if not file.exists():
@@ -144,16 +159,9 @@ def _same_run(file: Path, mine: ComparisonResults) -> bool:
     try:
         results = file.suffix == ".json"
         text = file.read_bytes() if results else PdfReader(file).attachments[RESULTS_NAME][0]
-        old = read_results(text)
+        return is_same(read_results(text))
     except (OSError, PyPdfError, KeyError, ValueError, ResultsError):
         return False  # not a report, or not one that this version reads
-    return (
-        isinstance(old, ComparisonResults)
-        and old.request == mine.request
-        and [old.log.sha256, *(file.sha256 for file in old.log.joined)]
-        == [mine.log.sha256, *(file.sha256 for file in mine.log.joined)]
-        and (old.student.name, old.student.id) in (("", ""), (mine.student.name, mine.student.id))
-    )
 
 
 def report_paths(output: Path, json_path: Path | None) -> tuple[Path, Path]:

@@ -507,7 +507,9 @@ def _loop(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float, str]:
 
 def _corrected(corrections: Corrections, without_reference: float) -> tuple[float, str]:
     """One for a corrected path and one for an ATE below the uncorrected one."""
-    tried = (corrections.by_distance, corrections.pose_graph_gated)
+    tried = (
+        corrections.by_distance_plain, corrections.by_distance, corrections.pose_graph_gated,
+    )  # fmt: skip
     done = [one for one in tried if isinstance(one, Correction)]
     if not done:
         return 0.0, ", but the path is not corrected."

@@ -15,6 +15,7 @@ from px4fuse.filter.signals import Segment
 from px4fuse.flight import Unavailable
 from px4fuse.loop.closure import (
     correct_by_distance,
+    distribute_by_distance,
     heading_change_rad,
     key_frame_spacing_m,
     key_frames,
@@ -30,7 +31,8 @@ from px4fuse.trajectory.model import Frame, Trajectory, cumulative_distance
 
 LANDING = "landing"
 UNCORRECTED = "uncorrected"
-BY_DISTANCE = "by distance"
+PLAIN = "by distance, positions only"
+BY_DISTANCE = "by distance, headings too"
 # A path that is shorter is no loop, whatever its ends
 MIN_PATH_M = 2.0
 SINGLE_LOOP = (
@@ -114,7 +116,10 @@ class Loop(Shown):
     noise : OdometryNoise
     graph : PoseGraph or Unavailable
         With all closures, before it is solved.
+    plain : Correction or Unavailable
+        By distance as in the lesson's Example 2: positions alone.
     by_distance : Correction or Unavailable
+        Headings too, where it is known how far they are off; else the same as ``plain``.
     solved : mapping from "all", "gated", "dcs" and "gnc" to Correction or Unavailable
     references : tuple of Trajectory
     notes : tuple of str
@@ -137,6 +142,7 @@ class Loop(Shown):
     closures: tuple[Judged, ...]
     noise: OdometryNoise
     graph: PoseGraph | Unavailable
+    plain: Correction | Unavailable
     by_distance: Correction | Unavailable
     solved: Mapping[str, Correction | Unavailable]
     references: tuple[Trajectory, ...]
@@ -163,9 +169,13 @@ class Loop(Shown):
 
     @property
     def reported(self) -> tuple[Correction, ...]:
-        """The paths worth a row: each solution of the pose graph once."""
-        accepted = all(judged.gate.accepted for judged in self.closures)
-        return tuple(c for c in self.corrections if not (accepted and c.name == SOLUTIONS["all"]))
+        """The paths worth a row: each once."""
+        same = set()
+        if all(judged.gate.accepted for judged in self.closures):
+            same.add(SOLUTIONS["all"])
+        if isinstance(self.misclosure_heading_deg, Unavailable):
+            same.add(BY_DISTANCE)
+        return tuple(part for part in self.corrections if part.name not in same)
 
     @property
     def best(self) -> Correction:
@@ -194,7 +204,7 @@ class Loop(Shown):
     @property
     def corrections(self) -> tuple[Correction, ...]:
         """Every path that there is, the odometry first."""
-        every = (self.odometry, self.by_distance, *self.solved.values())
+        every = (self.odometry, self.plain, self.by_distance, *self.solved.values())
         return tuple(part for part in every if isinstance(part, Correction))
 
 
@@ -284,11 +294,12 @@ def close_loop(
         path, frames, every, noise, references, offset, progress
     )
     notes.append(statement)
-    by_distance = _by_distance(
-        path, distance, misclosure_m, misclosure_heading, judged if came_back else ()
+    plain, by_distance = (
+        _scored(part, references, offset) if isinstance(part, Correction) else part
+        for part in _by_distance(
+            path, distance, misclosure_m, misclosure_heading, judged if came_back else ()
+        )
     )
-    if isinstance(by_distance, Correction):
-        by_distance = _scored(by_distance, references, offset)
     return Loop(
         odometry=raw,
         segment=segment,
@@ -303,6 +314,7 @@ def close_loop(
         closures=judged,
         noise=noise,
         graph=graph,
+        plain=plain,
         by_distance=by_distance,
         solved=solved,
         references=references,
@@ -371,14 +383,22 @@ def _by_distance(
     misclosure_m: Array | Unavailable,
     heading: float | Unavailable,
     judged: tuple[Judged, ...],
-) -> Correction | Unavailable:
+) -> tuple[Correction | Unavailable, Correction | Unavailable]:
+    """Positions alone (the lesson's Example 2), and headings too."""
     if isinstance(misclosure_m, Unavailable):
-        return misclosure_m
+        return misclosure_m, misclosure_m
     if judged and not judged[0].gate.accepted:
-        return _refused("correction by distance", judged[0])
+        refused = _refused("correction by distance", judged[0])
+        return refused, refused
+    plain = replace(
+        path,
+        position_m=distribute_by_distance(path.position_m, misclosure_m, distance),
+        position_variance_m2=None,
+        rotation_variance_rad2=None,
+    )
     turned = 0.0 if isinstance(heading, Unavailable) else float(np.radians(heading))
     corrected = correct_by_distance(path, distance, misclosure_m, turned)
-    return _correction(BY_DISTANCE, path, corrected)
+    return _correction(PLAIN, path, plain), _correction(BY_DISTANCE, path, corrected)
 
 
 def _refused(what: str, judged: Judged) -> Unavailable:

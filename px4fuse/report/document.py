@@ -13,6 +13,7 @@ from px4fuse.findings.story import story
 from px4fuse.flight import Unavailable
 from px4fuse.loop.loop import Loop
 from px4fuse.results.model import Provenance, Student
+from px4fuse.trajectory.evaluation import Evaluation
 
 
 @dataclass(frozen=True)
@@ -96,6 +97,33 @@ class WhatIfDocument:
     def title(self) -> str:
         """Of the PDF."""
         return f"px4fuse whatif {self.log[0]}"
+
+
+@dataclass(frozen=True)
+class EvaluationDocument:
+    """A page on the errors of a trajectory.
+
+    Attributes
+    ----------
+    score : Evaluation
+    """
+
+    score: Evaluation
+
+    @property
+    def student(self) -> Student:
+        """Nobody: a score is handed in with the loop that it is about."""
+        return Student()
+
+    @property
+    def log(self) -> tuple[str, str]:
+        """Name and SHA-256 of what the estimate was read from."""
+        return self.score.estimate.name, self.score.estimate.sha256
+
+    @property
+    def title(self) -> str:
+        """Of the PDF."""
+        return f"px4fuse evaluate {self.log[0]} {self.score.reference.name}"
 
 
 @dataclass(frozen=True)

@@ -12,11 +12,12 @@ from matplotlib.figure import Figure
 from px4fuse.arrays import Array
 from px4fuse.findings import Finding
 from px4fuse.flight import Unavailable
-from px4fuse.loop.loop import BY_DISTANCE, UNCORRECTED, Correction, Loop
+from px4fuse.loop.loop import BY_DISTANCE, PLAIN, UNCORRECTED, Correction, Loop
 from px4fuse.report.cover import write_finding
 from px4fuse.report.document import Document, LoopDocument
 from px4fuse.report.loop_words import (
     ate_words,
+    by_distance_words,
     closure_name,
     loop_lines,
     moved_words,
@@ -52,6 +53,7 @@ Value = Statistics | Unavailable
 GREEN = "#3a7d5c"
 STYLES: Mapping[str, dict[str, Any]] = {
     UNCORRECTED: {"color": EKF2, "lw": 1.1, "ls": (0, (4, 1.6))},
+    PLAIN: {"color": "#79b294", "lw": 1.3, "ls": (0, (1.2, 1.2))},
     BY_DISTANCE: {"color": GREEN, "lw": 1.0, "ls": (0, (6, 1.2, 1, 1.2))},
     SOLUTIONS["gated"]: {"color": OURS, "lw": 1.2, "ls": "-"},
     SOLUTIONS["all"]: {"color": "#8d6a9f", "lw": 0.9, "ls": (0, (2, 1))},
@@ -84,12 +86,13 @@ def draw_loop(
     figure, cursor = page(
         "Loop closure",
         "A path that truly returns must close; the gap is what the odometry drifted. Each "
-        "correction spreads it over the path, by distance or as a pose graph weighs it. A closure "
+        "correction spreads it over the path: by distance (positions only as in the lesson's "
+        "Example 2, or headings too), or as a pose graph weighs it. A closure "
         "that is not true would warp the whole path, so that each one is tested before its use.",
     )
     for label, text in (*facts, *loop_lines(loop)):
         _line(cursor, label, text)
-    for text in (redundancy_words(loop), *refusals(loop)):
+    for text in (by_distance_words(loop), redundancy_words(loop), *refusals(loop)):
         if text:
             cursor.skip(2)
             cursor.write(text, colour=MUTED)

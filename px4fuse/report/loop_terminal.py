@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
@@ -12,7 +10,7 @@ from px4fuse.findings import Finding
 from px4fuse.flight import Unavailable
 from px4fuse.loop.loop import Loop
 from px4fuse.report.loop_words import (
-    ate_words,
+    by_distance_words,
     closure_name,
     interval_words,
     loop_lines,
@@ -20,6 +18,7 @@ from px4fuse.report.loop_words import (
     redundancy_words,
     refusals,
     score_words,
+    track_words,
     unscored,
 )
 from px4fuse.report.screen import plain_table, print_line, say
@@ -27,7 +26,7 @@ from px4fuse.report.terminal import print_finding
 from px4fuse.request import LoopRequest
 from px4fuse.trajectory.evaluation import Evaluation
 from px4fuse.trajectory.graph.analysis import MANY_CLOSURES, SOLUTIONS, SolvedGraph
-from px4fuse.trajectory.scores import Statistics
+from px4fuse.trajectory.scores import Delta, Statistics
 
 MOST_ROWS = 10
 
@@ -38,13 +37,7 @@ def print_loop(
     """Print what was found about a loop."""
     for label, text in loop_lines(loop):
         print_line(console, label, text)
-    references = [reference.name for reference in loop.references]
-    table = _table("path", "moved RMS / max (m)", *(f"ATE to {name} (m)" for name in references))
-    for part in loop.reported:
-        table.add_row(
-            part.name, moved_words(part), *(ate_words(part.scores[name]) for name in references)
-        )
-    console.print(table)
+    _print_paths(console, loop)
     if len(loop.closures) > 1:
         closures = _table("closure", "missed by (m)", "d²", "p", "gate", "DCS", "GNC")
         for judged in loop.closures:
@@ -58,17 +51,50 @@ def print_loop(
                 *(f"{judged.weights.get(name, float('nan')):.2f}" for name in ("dcs", "gnc")),
             )
         console.print(closures)
-    for text in (redundancy_words(loop), *refusals(loop), *unscored(loop)):
+    for text in (
+        by_distance_words(loop), redundancy_words(loop), *refusals(loop), *unscored(loop),
+    ):  # fmt: skip
         if text:
             say(console, Text(text, "dim"))
     for finding in findings:
         print_finding(console, finding, request)
 
 
+def _print_paths(console: Console, loop: Loop) -> None:
+    """Every path with how far it moved, and a table of its scores for each reference."""
+    table = _table("path", "moved RMS (m)", "max (m)")
+    for part in loop.reported:
+        table.add_row(part.name, *moved_words(part).split(" / "))
+    console.print(table)
+    for name in (reference.name for reference in loop.references):
+        scores = {part.name: part.scores[name] for part in loop.reported}
+        known = [score for score in scores.values() if isinstance(score, Evaluation)]
+        if not known:
+            continue
+        over = [e.delta for e in known[0].rpe if e.delta.unit == "m"][-2:]
+        say(console, Text(f"Against {name}", "bold"))
+        table = _table("path", "ATE (m)", "95 %", *(f"RPE {delta} (m)" for delta in over))
+        for path, score in scores.items():
+            table.add_row(path, *_scores(score, over))
+        console.print(table)
+
+
+def _scores(score: Evaluation | Unavailable, over: list[Delta]) -> list[str]:
+    """ATE, its interval, and RPE over some distances."""
+    if isinstance(score, Unavailable):
+        return ["–"]
+    rpe = [next(e.translation for e in score.rpe if e.delta == delta) for delta in over]
+    return [
+        f"{score.ate.translation.rmse:.3f}",
+        interval_words(score.ate.interval).strip(" ()"),
+        *(f"{e.rmse:.3f}" if isinstance(e, Statistics) else "–" for e in rpe),
+    ]
+
+
 def print_evaluation(console: Console, score: Evaluation) -> None:
     """Print the scores of one trajectory against another."""
-    print_line(console, "Estimate", _described(score.estimate))
-    print_line(console, "Against", _described(score.reference))
+    print_line(console, "Estimate", track_words(score.estimate))
+    print_line(console, "Against", track_words(score.reference))
     print_line(console, "How", score_words(score))
     ate = score.ate
     table = _table("error", "RMSE", "95 %", "mean", "median", "max", "n")
@@ -126,13 +152,6 @@ def print_graph(console: Console, name: str, solved: SolvedGraph) -> None:
             "" if key == "all" else f"{(solution.weights < 0.5).sum()}",
         )
     console.print(table)
-
-
-def _described(trajectory: Any) -> str:
-    return (
-        f"{trajectory.name}: {trajectory.kind}, {len(trajectory)} poses over "
-        f"{trajectory.time_s[-1] - trajectory.time_s[0]:.1f} s, frame {trajectory.frame}"
-    )
 
 
 def _statistics(table: Table, label: str, values: Statistics, interval: str = "") -> None:

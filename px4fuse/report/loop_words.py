@@ -91,6 +91,23 @@ def closure_name(judged: Judged, loop: Loop) -> str:
     return f"{closure.time_1_s - zero:.2f} s and {closure.time_2_s - zero:.2f} s"
 
 
+def by_distance_words(loop: Loop) -> str:
+    """What the corrections by distance are; nothing where there is none."""
+    if isinstance(loop.plain, Unavailable):
+        return ""
+    example = (
+        "By distance, positions only, is the lesson's Example 2: each position moves by its share "
+        "of the gap, and the path keeps the bend of its headings."
+    )
+    turned = loop.misclosure_heading_deg
+    if isinstance(turned, Unavailable):
+        return f"{example} Headings are not turned: {turned.reason}."
+    return (
+        f"{example} Headings too: each step is first turned back by its share of the {turned:+.1f}°"
+        " that the heading is off at the end, and what is left of the gap is spread as before."
+    )
+
+
 def redundancy_words(loop: Loop) -> str:
     """That one loop has no redundancy, or nothing."""
     return SINGLE_LOOP if len(loop.closures) == 1 else ""
@@ -145,6 +162,14 @@ def moved_words(correction: Correction) -> str:
     if not correction.moved_m.any():
         return "–"
     return f"{np.sqrt(np.mean(correction.moved_m**2)):.2f} / {correction.moved_m.max():.2f}"
+
+
+def track_words(path: Trajectory) -> str:
+    """A trajectory by its name, what it is, its length in time and its frame."""
+    return (
+        f"{path.name}: {path.kind}, {len(path)} poses over "
+        f"{path.time_s[-1] - path.time_s[0]:.1f} s, frame {path.frame}"
+    )
 
 
 def score_words(score: Evaluation) -> str:

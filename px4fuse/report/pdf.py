@@ -16,6 +16,7 @@ from px4fuse.report import (
     clock,
     consistency,
     cover,
+    evaluation,
     flight,
     innovations,
     loop,
@@ -26,11 +27,11 @@ from px4fuse.report import (
     whatif,
     why,
 )
-from px4fuse.report.document import Document, LoopDocument, WhatIfDocument
+from px4fuse.report.document import Document, EvaluationDocument, LoopDocument, WhatIfDocument
 from px4fuse.report.seal import sealed
 from px4fuse.report.style import LEFT, MUTED, RIGHT, printable, report_style, shorten
 
-Report = Document | LoopDocument | WhatIfDocument
+Report = Document | LoopDocument | WhatIfDocument | EvaluationDocument
 RESULTS_NAME = "results.json"
 PAGES = (
     cover.draw,
@@ -53,7 +54,7 @@ def render(document: Report, results_json: str) -> bytes:
 
     Parameters
     ----------
-    document : Document, LoopDocument or WhatIfDocument
+    document : Document, LoopDocument, WhatIfDocument or EvaluationDocument
     results_json : str
         Attached inside the PDF as ``results.json``, so that the PDF alone can be checked.
 
@@ -81,6 +82,8 @@ def _pages(document: Report) -> Iterator[Figure]:
             yield from draw_loop(document)
     elif isinstance(document, WhatIfDocument):
         yield from whatif.draw(document)
+    elif isinstance(document, EvaluationDocument):
+        yield from evaluation.draw(document)
     else:
         for draw in PAGES:
             yield from draw(document)

@@ -125,6 +125,7 @@ def _loop(loop: Loop) -> made.Loop:
         closures=tuple(_closure(judged) for judged in loop.closures),
         corrections=made.Corrections(
             uncorrected=_correction(loop.odometry),
+            by_distance_plain=_correction(loop.plain),
             by_distance=_correction(loop.by_distance),
             **{f"pose_graph_{name}": _correction(loop.solved[name]) for name in SOLUTIONS},
         ),

@@ -166,9 +166,14 @@ class Correction(Base, frozen=True, kw_only=True):
 
 
 class Corrections(Base, frozen=True):
-    """The path as it is, and by every way to correct it."""
+    """The path as it is, and by every way to correct it.
+
+    ``by_distance_plain`` moves positions alone, as the lesson's Example 2; ``by_distance`` turns
+    headings too, where it is known how far they are off.
+    """
 
     uncorrected: Part[Correction]
+    by_distance_plain: Part[Correction]
     by_distance: Part[Correction]
     pose_graph_all: Part[Correction]
     pose_graph_gated: Part[Correction]

@@ -1,0 +1,451 @@
+"""Errors of a trajectory as evo's users know them: path by error, APE and RPE, on one page."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from importlib import metadata
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.colors import Colormap, LinearSegmentedColormap, Normalize
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+
+from px4fuse.arrays import Array, IntArray
+from px4fuse.flight import Unavailable
+from px4fuse.report.document import EvaluationDocument
+from px4fuse.report.evaluation_words import (
+    after_words,
+    before_words,
+    distance_words,
+    growth_words,
+    metres,
+    reasons,
+    relative_words,
+    score_rows,
+    summary,
+    time_words,
+    zero_s,
+)
+from px4fuse.report.loop_words import score_words, track_words
+from px4fuse.report.style import (
+    BOTTOM,
+    EKF2,
+    LEFT,
+    MAX_POINTS_NARROW,
+    MUTED,
+    OURS,
+    POINTS_PER_HEIGHT,
+    POINTS_PER_WIDTH,
+    RIGHT,
+    SEVERITY_COLOURS,
+    TRUTH,
+    Cursor,
+    caption,
+    empty,
+    page,
+    printable,
+    report_style,
+    thin,
+    wrap,
+)
+from px4fuse.trajectory.evaluation import Evaluation
+from px4fuse.trajectory.model import AXES_OF_FRAME, MIN_POSES, Frame
+from px4fuse.trajectory.scores import Interval, RelativeError, Statistics
+
+# Indices of the axes that are right, up the page and vertical; and whether the last points down
+_AXES: Mapping[Frame, tuple[int, int, int, bool]] = {
+    "NED": (1, 0, 2, True),
+    "FRD": (1, 0, 2, True),
+    "ENU": (0, 1, 2, False),
+    "camera": (0, 2, 1, True),
+    "unknown": (0, 1, 2, False),
+}
+# A path whose height is less than this share of its length is seen from above alone
+FLAT = 0.1
+# Steps of so many median ones are gaps: no line crosses them
+GAP_STEPS = 10.0
+# and over time those that are this share of it: shorter ones do not show
+GAP_SHARE = 0.01
+PIECES = 1200
+# Axes of errors reach at least this far: rounding is no error to look at
+LEAST_SCALE_M = 1e-3
+# In points: heights of a panel, of one that has a page for itself, of the words below it, of a
+# title and of a line of words
+PANEL, TALL, BELOW, TITLE, LINE = 84.0, 190.0, 52.0, 16.0, 8.9
+# The least and the largest height of the maps with their words
+LEAST_MAPS, MOST_MAPS = 215.0, 480.0
+MOST_CURVES, MOST_BOXES = 3, 12
+TABLE_SIZE = 7.4
+TABLE_EDGES = (LEFT, 0.21, 0.30, 0.43, 0.51, 0.59, 0.67, 0.75, 0.82)
+TABLE_HEADS = (
+    "error", "RMSE", "95 % interval", "mean", "median", "std", "max", "n", "rotation RMSE (°)",
+)  # fmt: skip
+REFERENCE: dict[str, Any] = {"color": TRUTH, "lw": 0.8, "ls": (0, (4, 2))}
+STATISTICS: tuple[tuple[str, str, dict[str, Any]], ...] = (
+    ("max", "max", {"color": MUTED, "lw": 0.8, "ls": (0, (1, 1.5))}),
+    ("rmse", "RMSE", {"color": EKF2, "lw": 1.4, "ls": "-"}),
+    ("mean", "mean", {"color": "black", "lw": 0.9, "ls": (0, (5, 2))}),
+    ("median", "median", {"color": "black", "lw": 0.9, "ls": (0, (5, 1.5, 1, 1.5))}),
+)
+CURVES: tuple[dict[str, Any], ...] = (
+    {"color": "#9db7d5", "lw": 0.8},
+    {"color": "#4f7fb5", "lw": 0.9, "ls": (0, (4, 1))},
+    {"color": OURS, "lw": 1.1},
+)
+PICTURE_INCHES, PICTURE_DPI = (10.0, 5.4), 150
+
+
+def _darkening() -> Colormap:
+    """Colours from light to dark, so that grey shows them in order; none is as light as paper."""
+    colours = mpl.colormaps["YlOrRd"](np.linspace(0.3, 1.0, 128)) * (1.0, 1.0, 1.0, 1.0)
+    colours[:, :3] *= np.linspace(1.0, 0.55, 128)[:, np.newaxis]
+    return LinearSegmentedColormap.from_list("error", colours)
+
+
+COLOURS = _darkening()
+
+
+@dataclass(frozen=True)
+class View:
+    """From where a path is seen: the axes across and up the page."""
+
+    title: str
+    across: int
+    up: int
+    down: bool = False
+
+    def of(self, position_m: Array) -> Array:
+        """Coordinates on the page, shape (n, 3) to (n, 2)."""
+        seen: Array = position_m[:, (self.across, self.up)]
+        return seen
+
+
+def views(score: Evaluation) -> list[View]:
+    """From above; and from the side where the path is not flat."""
+    across, up, vertical, down = _AXES[score.reference.frame]
+    names = AXES_OF_FRAME[score.reference.frame]
+    known = score.reference.frame != "unknown"
+    extent = np.maximum(np.ptp(score.reference_m, axis=0), np.ptp(score.estimate_m, axis=0))
+    level = across if extent[across] >= extent[up] else up
+    title = "from above" if known else f"{names[across]} and {names[up]}"
+    side = "from the side" if known else f"{names[level]} and {names[vertical]}"
+    seen = [View(title, across, up)]
+    if extent[vertical] > FLAT * extent[level]:
+        seen.append(View(side, level, vertical, down))
+    return seen
+
+
+def draw(document: EvaluationDocument) -> Iterator[Figure]:
+    """Draw the page, and another where the table of a run over many deltas fills the first."""
+    score = document.score
+    figure, cursor = page(
+        "Trajectory error",
+        "APE: how far a pose is from the reference; over all poses, the ATE. RPE: how wrong a "
+        "motion over a delta is.",
+    )
+    cursor.write(summary(score), size=9.0, weight="bold")
+    cursor.skip(3)
+    for text in (
+        f"Estimate {track_words(score.estimate)}. Reference {track_words(score.reference)}.",
+        f"{score_words(score)}.".replace("alignment", "Alignment", 1),
+    ):
+        cursor.write(text, size=7.2, colour=MUTED)
+    for text in score.warnings:
+        cursor.write(text, size=8.0, weight="bold", colour=SEVERITY_COLOURS["warning"])
+    cursor.skip(6)
+    for cells in (TABLE_HEADS, *score_rows(score)):
+        if cursor.y < BOTTOM + 0.03:
+            yield figure
+            figure, cursor = page("Trajectory error, continued")
+        _row(cursor, cells, head=cells is TABLE_HEADS)
+    cursor.skip(2)
+    cursor.write(" ".join([*reasons(score), *score.notes]), size=7.0, colour=MUTED)
+    cursor.skip(4)
+    panels = 2 * (TITLE + PANEL + BELOW) + TITLE
+    free = (cursor.y - BOTTOM) * POINTS_PER_HEIGHT
+    if free < LEAST_MAPS:
+        yield figure
+        figure, cursor = page("Trajectory error: where and when")
+        free = (cursor.y - BOTTOM) * POINTS_PER_HEIGHT
+    is_one_page = free - panels >= LEAST_MAPS
+    _maps(figure, cursor, score, min(free - panels if is_one_page else free, MOST_MAPS))
+    if not is_one_page:
+        yield figure
+        figure, cursor = page("Trajectory error: when")
+    _panels(figure, cursor, score, PANEL if is_one_page else TALL)
+    yield figure
+
+
+def picture(score: Evaluation) -> bytes:
+    """The path by error, APE over time and RPE per delta, as PNG for a slide or a notebook."""
+    with report_style():
+        figure = Figure(figsize=PICTURE_INCHES)
+        title = "\n".join(wrap(printable(summary(score)), 9.5, PICTURE_INCHES[0] * 69, "bold"))
+        figure.text(0.015, 0.985, title, size=9.5, weight="bold", va="top")
+        axes = figure.add_axes((0.06, 0.14, 0.40, 0.74), title="the path, by its error (APE)")
+        scale = figure.add_axes((0.475, 0.14, 0.012, 0.74))
+        _path(axes, score, views(score)[0], scale)
+        handles, labels = axes.get_legend_handles_labels()
+        figure.legend(handles, labels, loc="lower left", ncols=4, bbox_to_anchor=(0.02, 0.01))
+        over_time = figure.add_axes((0.58, 0.60, 0.40, 0.28), title="APE over time (m)")
+        _absolute(over_time, score, score.time_s - zero_s(score))
+        over_time.set_xlabel(_time_label(score))
+        over_time.legend(loc="upper right", bbox_to_anchor=(1.01, -0.19), ncols=4,
+                         columnspacing=1.0, handlelength=1.9, borderaxespad=0.0)  # fmt: skip
+        _boxes(figure.add_axes((0.58, 0.14, 0.40, 0.28), title="RPE per delta (m); diamond: RMSE"),
+               score)  # fmt: skip
+        out = io.BytesIO()
+        software = f"px4fuse {metadata.version('px4fuse')}"
+        figure.savefig(out, format="png", dpi=PICTURE_DPI, metadata={"Software": software})
+    return out.getvalue()
+
+
+def _row(cursor: Cursor, cells: Sequence[str], *, head: bool) -> None:
+    """One row of the table of scores."""
+    cursor.y -= TABLE_SIZE * 1.45 / POINTS_PER_HEIGHT
+    for x, text in zip(TABLE_EDGES, cells, strict=True):
+        cursor.figure.text(x, cursor.y, text, size=TABLE_SIZE, color=MUTED if head else "black")
+    if head:
+        cursor.skip(2.5)
+        cursor.rule()
+
+
+def _maps(figure: Figure, cursor: Cursor, score: Evaluation, points: float) -> None:
+    """The two as they stand, and the aligned path by its error, from one or two sides."""
+    seen = views(score)
+    is_aligned = score.alignment != "none"
+    said = [*([before_words(score)] if is_aligned else []), after_words(score)]
+    said += [_side_words(score, side) for side in seen[1:]]
+    shares = [*([1.0] if is_aligned else []), *(1.5 for _ in seen)]
+    left, right, gap = LEFT + 0.02, RIGHT - 0.065, 0.055
+    width = (right - left - gap * (len(shares) - 1)) / sum(shares)
+    lines = max(
+        len(wrap(text, 7.0, width * share * POINTS_PER_WIDTH))
+        for text, share in zip(said, shares, strict=True)
+    )
+    words = 24.0 + LINE * lines
+    height = (points - TITLE - words - TITLE) / POINTS_PER_HEIGHT
+    cursor.skip(TITLE)
+    cursor.y -= height
+    places = []
+    for share in shares:
+        places.append(figure.add_axes((left, cursor.y, width * share, height)))
+        left += width * share + gap
+    scale = figure.add_axes((right + 0.012, cursor.y, 0.011, height))
+    title = "after alignment, by error" if is_aligned else "by error"
+    after = places[int(is_aligned) :]
+    for axes, view in zip(after, seen, strict=True):
+        axes.set_title(f"{title}, {view.title}")
+        _path(axes, score, view, scale if view is seen[0] else None)
+    handles, labels = after[0].get_legend_handles_labels()
+    if is_aligned:
+        _before(places[0], score, seen[0])
+        first, names = places[0].get_legend_handles_labels()
+        handles, labels = [first[-1], *handles], [names[-1], *labels]
+    for axes, text in zip(places, said, strict=True):
+        caption(axes, text)
+    cursor.skip(words + TITLE)
+    figure.legend(handles, labels, loc="lower left", ncols=6, borderaxespad=0.0,
+                  bbox_to_anchor=(LEFT + 0.02, cursor.y))  # fmt: skip
+
+
+def _side_words(score: Evaluation, side: View) -> str:
+    """How much of the squared error is vertical."""
+    squares = ((score.estimate_m - score.reference_m) ** 2).mean(axis=0)
+    total = float(squares.sum())
+    name = AXES_OF_FRAME[score.reference.frame][side.up]
+    if total == 0.0:
+        return f"There is no error along {name}."
+    return (
+        f"Along {name} the RMSE is {metres(float(np.sqrt(squares[side.up])))}: "
+        f"{squares[side.up] / total:.0%} of the squared error."
+    )
+
+
+def _before(axes: Axes, score: Evaluation, view: View) -> None:
+    axes.set_title("before alignment")
+    matched = score.association
+    for track, style, label in (
+        (matched.reference, REFERENCE, "reference"),
+        (matched.estimate, {"color": OURS, "lw": 1.2}, "estimate before alignment"),
+    ):
+        _way(axes, view.of(track.position_m), score.time_s, label=label, **style)
+    _framed(axes, score, view)
+
+
+def _path(axes: Axes, score: Evaluation, view: View, scale: Axes | None) -> None:
+    """The aligned path by its error, the reference dashed upon it."""
+    error, gaps = score.position_error_m, _gaps(score.time_s)
+    at = np.unique(np.linspace(0, len(error) - 1, min(len(error), PIECES)).astype(np.intp))
+    corners = view.of(score.estimate_m)[at]
+    before_gap = np.searchsorted(gaps, at, side="right")  # how many gaps come before each corner
+    unbroken = np.diff(before_gap) == 0
+    largest = np.maximum.reduceat(error, at[:-1])
+    pieces = np.stack([corners[:-1], corners[1:]], axis=1)[unbroken]
+    norm = Normalize(0.0, max(float(error.max()), LEAST_SCALE_M))
+    drawn = LineCollection(list(pieces), cmap=COLOURS, norm=norm, lw=3.0, capstyle="round")
+    drawn.set_array(largest[unbroken])
+    axes.add_collection(drawn)
+    _way(axes, view.of(score.reference_m), score.time_s, label="reference", **REFERENCE)
+    start, worst = view.of(score.estimate_m)[[0, int(np.argmax(error))]]
+    axes.plot(*start, "o", color="white", mec="black", ms=5, mew=1.0, label="start", zorder=5)
+    axes.plot(*worst, "x", color="black", ms=7, mew=1.6, label="largest error", zorder=5)
+    _framed(axes, score, view)
+    if scale is not None:
+        figure = axes.get_figure()
+        assert isinstance(figure, Figure)
+        bar = figure.colorbar(drawn, cax=scale)
+        bar.set_label("APE (m)", labelpad=1)
+        bar.outline.set_linewidth(0.5)
+
+
+def _framed(axes: Axes, score: Evaluation, view: View) -> None:
+    names = AXES_OF_FRAME[score.reference.frame]
+    axes.autoscale_view()
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.grid(True, axis="both")
+    axes.xaxis.set_major_locator(MaxNLocator(4))
+    axes.yaxis.set_major_locator(MaxNLocator(6))
+    axes.set_xlabel(f"{names[view.across]} (m)")
+    axes.set_ylabel(f"{names[view.up]} (m)")
+    if view.down:
+        axes.invert_yaxis()
+
+
+def _panels(figure: Figure, cursor: Cursor, score: Evaluation, points: float) -> None:
+    """APE over time and over distance; RPE over time and per delta."""
+    height, gap = points / POINTS_PER_HEIGHT, 0.06
+    width = (RIGHT - LEFT - 0.02 - gap) / 2
+    rows = []
+    cursor.skip(TITLE)  # for the legend of both panels on the APE
+    for _ in range(2):
+        cursor.skip(TITLE)
+        cursor.y -= height
+        rows.append(
+            [figure.add_axes((LEFT + 0.02 + k * (width + gap), cursor.y, width, height))
+             for k in range(2)]
+        )  # fmt: skip
+        cursor.skip(BELOW)
+    (over_time, over_distance), (relative, boxes) = rows
+    zero = zero_s(score)
+    over_time.set_title("APE over time (m)")
+    _absolute(over_time, score, score.time_s - zero)
+    over_time.set_xlabel(_time_label(score))
+    caption(over_time, time_words(score))
+    over_distance.set_title("APE over distance (m)")
+    _absolute(over_distance, score, score.distance_m)
+    over_distance.set_xlabel("distance along the reference (m)")
+    caption(over_distance, distance_words(score))
+    handles, labels = over_time.get_legend_handles_labels()
+    above = over_time.get_position().y1 + TITLE / POINTS_PER_HEIGHT
+    figure.legend(handles, labels, loc="lower left", ncols=4, borderaxespad=0.0,
+                  bbox_to_anchor=(LEFT + 0.02, above))  # fmt: skip
+    _relative(relative, score)
+    boxes.set_title("RPE per delta (m)")
+    _boxes(boxes, score)
+    if any(isinstance(error.translation, Statistics) for error in score.rpe):
+        caption(boxes, growth_words(score.rpe))
+
+
+def _absolute(axes: Axes, score: Evaluation, along: Array) -> None:
+    """APE with its statistics as lines."""
+    _line(axes, along, score.position_error_m, score.time_s, color=OURS, lw=0.8)
+    for name, label, style in STATISTICS:
+        value = getattr(score.ate.translation, name)
+        axes.axhline(value, label=f"{label} {metres(value)}", zorder=3, **style)
+    _from_zero(axes, along, float(score.position_error_m.max()))
+
+
+def _relative(axes: Axes, score: Evaluation) -> None:
+    """RPE over time, of the distances where there are any."""
+    axes.set_title("RPE over time (m)")
+    known = [e for e in score.rpe if isinstance(e.translation, Statistics)]
+    if not known:
+        _none(axes, score)
+        return
+    unit = "m" if any(e.delta.unit == "m" for e in known) else known[0].delta.unit
+    shown = [e for e in known if e.delta.unit == unit][-MOST_CURVES:]
+    zero = zero_s(score)
+    for error, style in zip(shown, CURVES[-len(shown) :], strict=True):
+        ends = score.time_s[error.end]
+        _line(axes, ends - zero, error.translation_error_m, ends, label=f"{error.delta}", **style)
+    _from_zero(axes, score.time_s - zero, max(float(e.translation_error_m.max()) for e in shown))
+    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3, borderaxespad=0.1,
+                handlelength=1.8, columnspacing=1.0)  # fmt: skip
+    axes.set_xlabel(_time_label(score))
+    caption(axes, relative_words(shown, score.time_s, zero))
+
+
+def _boxes(axes: Axes, score: Evaluation) -> None:
+    """RPE of every delta as a box, with its RMSE and the interval of that."""
+    known: list[tuple[RelativeError, Statistics]] = [
+        (e, e.translation) for e in score.rpe if isinstance(e.translation, Statistics)
+    ]
+    if not known:
+        _none(axes, score)
+        return
+    known = known[:: -(-len(known) // MOST_BOXES)]
+    axes.boxplot(
+        [error.translation_error_m for error, _ in known], whis=(0, 100), widths=0.5,
+        tick_labels=[f"{error.delta}" for error, _ in known], patch_artist=True,
+        boxprops={"facecolor": "#dbe5f1", "edgecolor": OURS, "lw": 0.8},
+        medianprops={"color": "black", "lw": 1.0}, whiskerprops={"color": OURS, "lw": 0.8},
+        capprops={"color": OURS, "lw": 0.8},
+    )  # fmt: skip
+    for place, (error, found) in enumerate(known, start=1):
+        if isinstance(error.interval, Interval):
+            ends = (error.interval.low, error.interval.high)
+            axes.plot([place + 0.36] * 2, ends, color=EKF2, lw=1.2, solid_capstyle="butt")
+        axes.plot(place + 0.36, found.rmse, "D", color=EKF2, mec="black", mew=0.5, ms=3.6)
+    axes.set_ylim(0.0, max(axes.get_ylim()[1], LEAST_SCALE_M))
+    axes.set_xlim(0.5, len(known) + 0.6)
+    axes.set_xlabel("delta")
+
+
+def _none(axes: Axes, score: Evaluation) -> None:
+    reason = next((e.translation.reason for e in score.rpe
+                   if isinstance(e.translation, Unavailable)),
+                  "the path is too short for a delta")  # fmt: skip
+    empty(axes, f"No RPE: {reason}.")
+
+
+def _time_label(score: Evaluation) -> str:
+    return "time from the first pose (s)" if zero_s(score) else "time (s)"
+
+
+def _from_zero(axes: Axes, along: Array, highest: float) -> None:
+    axes.set_ylim(0.0, 1.08 * max(highest, LEAST_SCALE_M))
+    axes.set_xlim(float(along[0]), max(float(along[-1]), float(along[0]) + 1e-6))
+    axes.xaxis.set_major_locator(MaxNLocator(6))
+    axes.yaxis.set_major_locator(MaxNLocator(4))
+
+
+def _gaps(time_s: Array, least_s: float = 0.0) -> IntArray:
+    """Indices of the poses after a gap in time."""
+    if len(time_s) < MIN_POSES:
+        return np.empty(0, dtype=np.intp)
+    steps = np.diff(time_s)
+    found: IntArray = np.flatnonzero(steps > max(GAP_STEPS * np.median(steps), least_s)) + 1
+    return found
+
+
+def _line(axes: Axes, x: Array, y: Array, time_s: Array, **style: Any) -> None:
+    """A line over time or distance, thinned to its extremes; no gap that shows is crossed."""
+    gaps = _gaps(time_s, GAP_SHARE * float(time_s[-1] - time_s[0]))
+    kept, values = thin(x, y, MAX_POINTS_NARROW)
+    after = np.searchsorted(kept, x[gaps])
+    axes.plot(np.insert(kept, after, np.nan), np.insert(values, after, np.nan), **style)
+
+
+def _way(axes: Axes, seen: Array, time_s: Array, **style: Any) -> None:
+    """A path on a map, shape (n, 2), thinned evenly; no gap in time is crossed."""
+    gaps = _gaps(time_s)
+    even = np.linspace(0, len(seen) - 1, min(len(seen), PIECES)).astype(np.intp)
+    kept = np.unique(np.concatenate([even, gaps]))
+    axes.plot(*np.insert(seen[kept], np.searchsorted(kept, gaps), np.nan, axis=0).T, **style)

@@ -1,0 +1,370 @@
+"""The page and the picture of ``evaluate``: what they say and draw, against closed forms."""
+
+from __future__ import annotations
+
+import io
+import itertools
+import re
+from dataclasses import replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+from conftest import REPOSITORY
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from PIL import Image
+from pypdf import PdfReader
+from scipy.spatial.transform import Rotation
+from test_evaluation import PUBLISHED, flight, moved, published
+
+from px4fuse.loop.sources import read_source
+from px4fuse.report.document import EvaluationDocument
+from px4fuse.report.evaluation import COLOURS, draw, picture, views
+from px4fuse.report.evaluation_words import (
+    after_words,
+    before_words,
+    distance_words,
+    growth_words,
+    quarters,
+    score_rows,
+    summary,
+    time_words,
+)
+from px4fuse.report.pdf import render
+from px4fuse.report.style import report_style
+from px4fuse.trajectory.evaluation import Evaluation, evaluate
+from px4fuse.trajectory.model import Frame, Trajectory
+from px4fuse.trajectory.scores import Delta, Statistics
+
+LOOP = REPOSITORY / "sample_logs" / "loop_vio.ulg"
+DELTAS = (Delta(1.0, "m"), Delta(10.0, "m"))
+
+
+@cache
+def sample() -> Evaluation:
+    """The sample's odometry against its SLAM trajectory, which has a gap."""
+    return evaluate(
+        read_source(f"{LOOP}:vio").trajectory,
+        read_source(str(LOOP.with_name("loop_slam.tum"))).trajectory,
+    )
+
+
+def line(count: int = 2001) -> Trajectory:
+    """A straight flight at 1 m/s and 10 Hz, level and without turning."""
+    along = 0.1 * np.arange(count)
+    position = np.column_stack([along, np.zeros(count), np.full(count, -1.5)])
+    return Trajectory("line.tum", "truth", along.copy(), position, Rotation.identity(count), "NED")
+
+
+def wrong_by(error: np.ndarray) -> Evaluation:
+    """An estimate of the line that is wrong by this, shape (n, 3), and not aligned."""
+    true = line(len(error))
+    estimate = replace(true, name="e.tum", kind="vio", position_m=true.position_m + error)
+    return evaluate(estimate, true, alignment="none", rpe_deltas=DELTAS)
+
+
+def across(values: np.ndarray) -> np.ndarray:
+    return np.column_stack([np.zeros_like(values), values, np.zeros_like(values)])
+
+
+def figures(score: Evaluation) -> list[Figure]:
+    with report_style():
+        return list(draw(EvaluationDocument(score)))
+
+
+def panel(score: Evaluation, title: str) -> Axes:
+    """The panel whose title begins so."""
+    every = (axes for figure in figures(score) for axes in figure.axes)
+    return next(axes for axes in every if axes.get_title(loc="left").startswith(title))
+
+
+def said(score: Evaluation) -> str:
+    pages = PdfReader(io.BytesIO(render(EvaluationDocument(score), "{}"))).pages
+    return " ".join(" ".join(page.extract_text().split()) for page in pages)
+
+
+# -- what is said ----------------------------------------------------------------------------------
+
+
+def test_before_alignment_the_error_is_that_of_evo_without_alignment() -> None:
+    pytest.importorskip("evo")
+    from evo.core import metrics, sync
+    from evo.core.trajectory import PoseTrajectory3D
+
+    true = flight()
+    estimate = moved(true, Rotation.from_euler("z", 0.5), np.array([3.0, -1.0, 0.2]))
+    score = evaluate(replace(estimate, kind="vio"), true)
+
+    def of_evo(one: Trajectory) -> Any:
+        assert one.rotation is not None
+        return PoseTrajectory3D(
+            positions_xyz=one.position_m,
+            orientations_quat_wxyz=one.rotation.as_quat(scalar_first=True),
+            timestamps=one.time_s,
+        )
+
+    ape = metrics.APE(metrics.PoseRelation.translation_part)
+    ape.process_data(sync.associate_trajectories(of_evo(true), of_evo(estimate)))
+    rmse = ape.get_statistic(metrics.StatisticsType.rmse)
+    words = before_words(score)
+    assert f"{rmse:.3f} m apart (RMSE)" in words
+    assert f"Turned by {np.degrees(0.5):.1f}°" in words
+    assert "scaled" not in words
+    centre = true.position_m.mean(axis=0) - estimate.position_m.mean(axis=0)
+    assert f"moved {np.linalg.norm(centre):.3f} m" in words
+    assert "0.000 m (RMSE) after alignment" in after_words(score)
+
+
+def test_a_scale_that_was_fitted_is_said() -> None:
+    true = flight()
+    half = moved(true, Rotation.identity(), np.zeros(3), 0.5, kind="slam")
+    assert "scaled 2 times" in before_words(evaluate(half, true, alignment="sim3"))
+
+
+def test_an_error_that_grows_with_distance_has_the_quarters_of_a_ramp() -> None:
+    score = wrong_by(across(np.linspace(0.0, 4.0, 2001)))
+    ends = np.arange(5.0)  # ∫ x² dx over a quarter
+    expected = np.sqrt((ends[1:] ** 3 - ends[:-1] ** 3) / 3.0)
+    np.testing.assert_allclose(quarters(score), expected, rtol=0.01)
+    assert ", ".join(f"{q:.3f}" for q in quarters(score)) in distance_words(score)
+    assert "grows along the path, as drift does" in distance_words(score)
+
+
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [
+        (np.abs(np.linspace(-2.0, 2.0, 2001)), "high at both ends"),
+        (np.linspace(2.0, 0.1, 2001), "largest in the first, no steady growth"),
+        (np.where(np.arange(2001) // 500 == 2, 1.0, 0.1), "largest in the third"),
+    ],
+    ids=["both ends", "falling", "a quarter"],
+)
+def test_other_shapes_along_the_path_are_no_growth(error: np.ndarray, words: str) -> None:
+    assert words in distance_words(wrong_by(across(error)))
+
+
+def test_whether_a_few_moments_decide_is_the_share_of_the_worst_tenth() -> None:
+    even = time_words(wrong_by(across(np.full(2000, 0.3))))
+    assert "makes 10% of the squared error: it is spread over time" in even
+    peak = np.zeros(2000)
+    peak[700:800] = 1.0
+    assert "makes 100% of the squared error: a few moments decide" in time_words(
+        wrong_by(across(peak))
+    )
+
+
+@pytest.mark.parametrize(("kind", "times"), [("noise", 1.0), ("walk", 10**0.5), ("scale", 10.0)])
+def test_the_growth_of_the_rpe_tells_noise_from_drift(kind: str, times: float) -> None:
+    rng = np.random.default_rng(3)
+    n = 20_001
+    error = {
+        "noise": rng.normal(0.0, 0.1, (n, 3)),
+        "walk": np.cumsum(rng.normal(0.0, 0.01, (n, 3)), axis=0),
+        "scale": 0.05 * line(n).position_m,
+    }[kind]
+    words = growth_words(wrong_by(error).rpe)
+    found = re.search(r"From 1 to 10 m, 10 times, the RMSE grows ([\d.]+) times", words)
+    assert found is not None
+    assert float(found[1]) == pytest.approx(times, rel=0.1)
+    assert "1 is noise of each pose, 3.2 a random walk, 10 a wrong scale" in words
+
+
+def test_one_delta_tells_nothing_about_growth() -> None:
+    assert "A second distance" in growth_words(wrong_by(across(np.full(2001, 0.3))).rpe[:1])
+
+
+def test_the_table_holds_the_statistics() -> None:
+    score = sample()
+    rows = {label: cells for label, *cells in score_rows(score)}
+    ate = score.ate.translation
+    numbers = (ate.rmse, ate.mean, ate.median, ate.std, ate.max)
+    assert [rows["ATE (m)"][k] for k in (0, 2, 3, 4, 5)] == [f"{x:.4f}" for x in numbers]
+    assert len(rows) == 1 + len(score.rpe)
+    for error in score.rpe:
+        assert isinstance(error.translation, Statistics)
+        assert rows[f"RPE {error.delta} (m)"][0] == f"{error.translation.rmse:.4f}"
+        assert rows[f"RPE {error.delta} (m)"][6] == str(error.translation.count)
+
+
+def test_no_error_is_said_to_be_none() -> None:
+    score = wrong_by(np.zeros((2001, 3)))
+    text = said(score)
+    assert "There is no error at any time." in text
+    assert "there is no error." in text
+    assert "grows" not in text
+
+
+# -- what is drawn ---------------------------------------------------------------------------------
+
+
+def test_the_path_is_coloured_by_its_error_and_crosses_no_gap() -> None:
+    score = sample()
+    axes = panel(score, "after alignment, by error, from above")
+    (path,) = (c for c in axes.collections if isinstance(c, LineCollection))
+    values = np.asarray(path.get_array())
+    assert values.max() == pytest.approx(score.position_error_m.max())
+    assert path.norm.vmin == 0.0
+    assert path.norm.vmax == pytest.approx(score.position_error_m.max())
+    assert score.reference.frame == "camera"
+    seen = score.estimate_m[:, (0, 2)]  # right and forward
+    gap = int(np.argmax(np.diff(score.time_s)))
+    assert np.diff(score.time_s)[gap] > 2.0
+    pieces = np.array(path.get_segments())
+    assert len(pieces) > 1000
+    for (start, end), value in zip(pieces, values, strict=True):
+        first, last = (int(np.argmin(((seen - at) ** 2).sum(axis=1))) for at in (start, end))
+        assert 0 < last - first < 5
+        assert value == score.position_error_m[first:last].max()
+        assert not first <= gap < last
+    assert axes.get_aspect() == 1.0
+
+
+def test_both_panels_have_the_ape_and_lines_of_its_statistics() -> None:
+    score = sample()
+    for title, along in (("APE over time", score.time_s), ("APE over distance", score.distance_m)):
+        curve, *lines = panel(score, title).get_lines()
+        x, y = np.asarray(curve.get_xdata()), np.asarray(curve.get_ydata())
+        assert np.nanmax(y) == pytest.approx(score.position_error_m.max())
+        assert x[np.nanargmax(y)] == pytest.approx(along[np.argmax(score.position_error_m)])
+        assert np.isnan(y).sum() == 1  # the gap
+        ate = score.ate.translation
+        levels = {str(line.get_label()).split()[0]: line.get_ydata()[0] for line in lines}
+        assert levels == {
+            "max": ate.max, "RMSE": ate.rmse, "mean": ate.mean, "median": ate.median,
+        }  # fmt: skip
+
+
+def test_the_rpe_stands_at_the_end_of_each_motion_as_evo_draws_it() -> None:
+    score = sample()
+    axes = panel(score, "RPE over time")
+    shown = {str(line.get_label()): line for line in axes.get_lines()}
+    assert list(shown) == ["1 m", "5 m", "10 m"]
+    for error in score.rpe:
+        if str(error.delta) in shown:
+            curve = shown[str(error.delta)]
+            x, y = np.asarray(curve.get_xdata()), np.asarray(curve.get_ydata())
+            worst = int(np.argmax(error.translation_error_m))
+            assert np.nanmax(y) == pytest.approx(error.translation_error_m[worst])
+            assert x[np.nanargmax(y)] == pytest.approx(score.time_s[error.end[worst]])
+
+
+def test_each_delta_has_a_box_and_its_rmse() -> None:
+    score = sample()
+    axes = panel(score, "RPE per delta")
+    assert [text.get_text() for text in axes.get_xticklabels()] == [str(e.delta) for e in score.rpe]
+    drawn = [line.get_ydata()[0] for line in axes.get_lines() if line.get_marker() == "D"]
+    assert drawn == [e.translation.rmse for e in score.rpe if isinstance(e.translation, Statistics)]
+
+
+def test_many_deltas_fill_the_table_and_some_boxes() -> None:
+    deltas = [Delta(0.5 * k, "m") for k in range(1, 61)]
+    score = replace_rpe(sample(), deltas)
+    pages = figures(score)
+    assert len(pages) >= 2
+    for figure in pages:
+        heights = [text.get_position()[1] for text in figure.texts]
+        assert min(heights) > 0.03
+    text = said(score)
+    assert "RPE 0.5 m (m)" in text
+    assert "RPE 30 m (m)" in text
+
+
+def replace_rpe(score: Evaluation, deltas: list[Delta]) -> Evaluation:
+    return evaluate(score.estimate, score.reference, rpe_deltas=deltas)
+
+
+@pytest.mark.parametrize(
+    ("frame", "axes"),
+    [("NED", (1, 0)), ("FRD", (1, 0)), ("ENU", (0, 1)), ("camera", (0, 2)), ("unknown", (0, 1))],
+)
+def test_a_flat_path_is_seen_from_above_and_another_from_the_side_too(
+    frame: Frame, axes: tuple[int, int]
+) -> None:
+    spatial = replace(flight(), frame=frame)
+    vertical = 3 - sum(axes)
+    level = spatial.position_m.copy()
+    level[:, vertical] *= 0.01
+    for position, count in ((spatial.position_m, 2), (level, 1)):
+        one = replace(spatial, position_m=position)
+        seen = views(evaluate(one, one, alignment="none"))
+        assert (seen[0].across, seen[0].up) == axes
+        assert len(seen) == count
+    side = views(evaluate(spatial, spatial, alignment="none"))[1]
+    assert side.up == vertical
+    assert side.down == (frame in ("NED", "FRD", "camera"))
+
+
+def test_without_alignment_there_is_no_panel_before_it() -> None:
+    score = wrong_by(across(np.full(2001, 0.3)))
+    titles = [axes.get_title(loc="left") for axes in figures(score)[0].axes]
+    assert not any("alignment" in title for title in titles)
+    assert "without alignment" in summary(score)
+
+
+def test_without_orientations_the_page_says_why_there_is_no_rpe() -> None:
+    bare = replace(flight(), rotation=None, kind="vio")
+    score = evaluate(bare, flight())
+    assert said(score).count("the estimate has no orientation") >= 3
+    assert picture(score)[:4] == b"\x89PNG"
+
+
+def test_the_colours_darken_so_that_grey_shows_them() -> None:
+    red, green, blue, _ = COLOURS(np.linspace(0.0, 1.0, 64)).T
+    grey = 0.299 * red + 0.587 * green + 0.114 * blue
+    assert (np.diff(grey) < 0.0).all()
+    assert grey[0] < 0.85  # paper is 1
+    assert grey[-1] < 0.15
+
+
+def test_same_bytes_with_the_results_inside_and_no_date() -> None:
+    score = sample()
+    document = EvaluationDocument(score)
+    pdf = render(document, '{"a": 1}')
+    assert pdf == render(document, '{"a": 1}')
+    reader = PdfReader(io.BytesIO(pdf))
+    assert reader.attachments["results.json"] == [b'{"a": 1}']
+    assert reader.metadata is not None
+    assert reader.metadata.creation_date is None
+    assert len(reader.pages) == 1
+    drawn = picture(score)
+    assert drawn == picture(score)
+    image = Image.open(io.BytesIO(drawn))
+    assert image.size == (1500, 810)
+    assert not any("time" in str(key).lower() or "date" in str(key).lower() for key in image.info)
+
+
+def test_names_from_outside_are_drawn_as_they_are() -> None:
+    score = sample()
+    name = "$x^2_{y$ <b>&.tum:vio"
+    odd = replace(score, estimate=replace(score.estimate, name=name))
+    assert name in said(odd)
+    assert picture(odd)[:4] == b"\x89PNG"
+
+
+def test_nothing_that_is_drawn_lies_upon_another() -> None:
+    """Titles, axes and the words below them, on the page of one and of two views."""
+    spatial = evaluate(
+        moved(flight(), Rotation.from_euler("z", 0.5), np.ones(3), kind="vio"), flight()
+    )
+    for score in (sample(), spatial):
+        (figure,) = figures(score)
+        boxes = [axes.get_position() for axes in figure.axes]
+        for one, other in itertools.combinations(boxes, 2):
+            assert min(one.x1, other.x1) <= max(one.x0, other.x0) or (
+                min(one.y1, other.y1) <= max(one.y0, other.y0)
+            )
+        assert all(0.05 < box.x0 < box.x1 < 0.96 for box in boxes)
+        assert all(box.y0 > 0.08 for box in boxes)
+
+
+@pytest.mark.reallogs
+@pytest.mark.parametrize("pair", PUBLISHED, ids=[name for name, _ in PUBLISHED])
+def test_published_trajectories_are_drawn_on_one_page(pair: tuple[str, str]) -> None:
+    estimate, reference = map(published, pair)
+    score = evaluate(estimate, reference)
+    assert len(PdfReader(io.BytesIO(render(EvaluationDocument(score), "{}"))).pages) == 1
+    text = said(score)
+    assert f"{score.ate.translation.rmse:.4f}" in text
