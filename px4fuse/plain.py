@@ -1,10 +1,11 @@
-"""Results as plain data: what JSON can hold, without NaN."""
+"""Results as plain data: what JSON can hold, without NaN; and numbers as people read them."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
+from decimal import Decimal
 from typing import Any
 
 
@@ -28,14 +29,31 @@ def plain(value: object) -> Any:
     return value
 
 
+def number_words(value: float, digits: int = 3) -> str:
+    """A number with as many digits as a person reads, never with an exponent.
+
+    >>> [number_words(value) for value in (0.811, 22.41, 3412.0, 4.2e6, 0.0129, 2.9e-05, 0.0)]
+    ['0.811', '22.4', '3,410', '4,200,000', '0.0129', '0.000029', '0']
+    """
+    return f"{Decimal(f'{value:.{digits}g}'):,f}"
+
+
 def factor_words(factor: float) -> str:
     """A factor with as many digits as a person reads.
 
-    >>> [factor_words(f) for f in (1.18, 9.87, 61.2, 388.0, 3412.0)]
-    ['1.18', '9.9', '61', '390', '3,400']
+    >>> [factor_words(f) for f in (1.18, 9.87, 61.2, 388.0, 3412.0, 5.13e6)]
+    ['1.18', '9.9', '61', '390', '3,400', '5,100,000']
     """
-    digits = 3 if factor < 2.0 else 2
-    return f"{float(f'{factor:.{digits}g}'):,g}"
+    return number_words(factor, 3 if factor < 2.0 else 2)
+
+
+def p_words(p: float) -> str:
+    """A p-value as it is read: small is small.
+
+    >>> [p_words(p) for p in (0.43, 0.0214, 0.00051, 3e-113, 0.0)]
+    ['p 0.43', 'p 0.021', 'p < 0.001', 'p < 0.001', 'p < 0.001']
+    """
+    return "p < 0.001" if p < 0.001 else f"p {number_words(p, 2)}"
 
 
 def length_words(metres: float) -> str:

@@ -310,7 +310,19 @@ def read_person(given: dict[str, Any]) -> Student:
     from px4fuse.results.model import Student
 
     name, number = given.pop("student"), given.pop("student_id")
-    return Student(encodable(name), encodable(number), _read_notes(given.pop("notes")))
+    person = Student(encodable(name), encodable(number), _read_notes(given.pop("notes")))
+    _tell_fonts(person.name + person.id + person.notes)
+    return person
+
+
+def _tell_fonts(text: str) -> None:
+    """Say before all work that the report will lack characters, and what to install."""
+    if text.isascii():
+        return
+    from px4fuse.report.fonts import advice, missing
+
+    if lacking := missing(text):
+        click.echo(f"px4fuse: {advice(lacking)}", err=True)
 
 
 def _read_notes(path: Path | None) -> str:

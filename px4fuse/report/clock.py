@@ -1,79 +1,158 @@
-"""Clock: the offset of the position source's stamps, how sure it is, and whether it changed."""
+"""Appendix: the clock. Its page when there is something to say, else a line of provenance."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
+import numpy as np
 from matplotlib.figure import Figure
 
+from px4fuse.filter.clock import CHANGE_P, ClockOffset
 from px4fuse.flight import Unavailable
+from px4fuse.plain import p_words
+from px4fuse.report import marks
 from px4fuse.report.document import Document
-from px4fuse.report.style import LEFT, OURS, OURS_BAND, OURS_LINE, RIGHT, caption, page
-from px4fuse.report.words import clock_advice
+from px4fuse.report.style import (
+    LEFT,
+    OURS,
+    OURS_BAND,
+    OURS_LINE,
+    TIME_LABEL,
+    Cursor,
+    legend_beside_title,
+    page,
+    panel,
+)
+from px4fuse.report.words import clock_advice, delay_wrong, stamps_wrong
 
-HEIGHT = 0.24
+# Heights of the axes in points
+CURVE, PARTS = 170.0, 150.0
 # Beyond this the curve tells nothing more
 MAX_DROP = 12.0
+# How many intervals the curve is drawn over, to either side
+REACH = 2.5
+# |z| of which CHANGE_P is the two-sided p-value
+DRIFT_SIGMAS = 2.81
+LABEL_WIDTH = 0.085
+
+
+def line(document: Document) -> str:
+    """What the clock estimate says, in one line."""
+    clock, applied = document.analysis.clock, document.comparison.settings.clock_offset_s
+    if isinstance(clock, Unavailable):
+        return f"not determinable: {clock.reason}. {clock.remedy}"
+    if has_page(document):
+        return "see its page"
+    low, high = clock.interval_s
+    return (
+        f"the stamps are right as far as this flight can tell: {applied + clock.offset_s:+.3f} s "
+        f"(95 % {applied + low:+.3f} to {applied + high:+.3f} s) would have to be added, from "
+        f"{clock.count} measurements"
+    )
+
+
+def has_page(document: Document) -> bool:
+    """Whether the flight says more about the clock than that it is right."""
+    clock, comparison = document.analysis.clock, document.comparison
+    if isinstance(clock, Unavailable):
+        return False
+    return (
+        not clock.determinable
+        or stamps_wrong(comparison, clock)
+        or delay_wrong(comparison, clock)
+        or _changes(clock)
+        or _drifts(clock)
+    )
+
+
+def _changes(clock: ClockOffset) -> bool:
+    return clock.change_p is not None and clock.change_p < CHANGE_P
+
+
+def _drifts(clock: ClockOffset) -> bool:
+    if clock.drift_ppm is None or clock.drift_sigma_ppm is None:
+        return False
+    return abs(clock.drift_ppm) > DRIFT_SIGMAS * clock.drift_sigma_ppm
 
 
 def draw(document: Document) -> Iterator[Figure]:
-    """Draw one page."""
-    comparison = document.comparison
+    """Draw one page; none where a line says it all."""
     clock = document.analysis.clock
+    if isinstance(clock, Unavailable) or not has_page(document):
+        return
     figure, cursor = page(
-        "Clock",
+        "Appendix: the clock of the position source",
         "Late or early stamps hardly show in the innovations, since the filter follows. They show "
         "in when the positions answer to what the IMU felt. So the likelihood of the positions is "
         "maximised over the offset, jointly with sensor biases, attitude errors and noises; the "
         "attitude is from the gyros alone, because EKF2's was corrected by these very positions.",
     )
-    for line in clock_advice(comparison, clock):
-        cursor.write(line, size=8.5)
+    for text in clock_advice(document.comparison, clock):
+        top = cursor.y
+        cursor.write(text[:9].strip(), size=8.5, weight="bold", right=LEFT + LABEL_WIDTH)
+        cursor.y = top
+        cursor.write(text[9:], size=8.5, x=LEFT + LABEL_WIDTH)
         cursor.skip(1)
-    if isinstance(clock, Unavailable):
-        yield figure
-        return
-    applied = comparison.settings.clock_offset_s
-    cursor.skip(20)
-    bottom = cursor.y - HEIGHT
-    axes = figure.add_axes((LEFT + 0.03, bottom, RIGHT - LEFT - 0.03, HEIGHT))
-    axes.set_title("log-likelihood below its maximum, against the offset")
-    axes.axvspan(applied + clock.interval_s[0], applied + clock.interval_s[1], color=OURS_BAND,
-                 lw=0, label="95 % interval")  # fmt: skip
+    cursor.skip(14)
+    applied = document.comparison.settings.clock_offset_s
+    _curve(cursor, clock, applied)
+    if len(clock.parts) > 1:
+        _parts(cursor, clock, document)
+    yield figure
+
+
+def _curve(cursor: Cursor, clock: ClockOffset, applied: float) -> None:
+    """Likelihood over the offset."""
+    low, high = (applied + end for end in clock.interval_s)
+    best = applied + clock.offset_s
+    top = cursor.y
+    axes = panel(
+        cursor,
+        "ln of how much less likely each offset is than the best",
+        f"Best at {best:+.3f} s; 95 % from {low:+.3f} to {high:+.3f} s, wider than the curve alone "
+        f"would say because the IMU's noise moves it too. From {clock.count} measurements.",
+        CURVE,
+    )
+    axes.axvspan(low, high, color=OURS_BAND, lw=0, label="95 % interval")
     axes.plot(applied + clock.curve_s, clock.curve_drop, **OURS_LINE)
-    axes.axhline(clock.interval_drop, color="black", lw=0.6, ls=":")
     axes.axvline(applied, color="black", lw=0.8, ls="--", label="as analysed")
     axes.set_ylim(min(MAX_DROP, float(clock.curve_drop.max()) * 1.05), 0.0)
-    axes.set_xlabel("offset added to the source's stamps (s)")
-    axes.legend(loc="lower left")
-    low, high = clock.interval_s
-    caption(
-        axes,
-        f"most likely {applied + clock.offset_s:+.3f} s, 95 % {applied + low:+.3f} to "
-        f"{applied + high:+.3f} s, from {clock.count} measurements. Dotted: where the "
-        "interval ends, with the noise of the IMU counted",
+    reach = REACH * max(high - best, best - low)
+    ends = applied + clock.curve_s[0], applied + clock.curve_s[-1]
+    axes.set_xlim(
+        min(max(best - reach, ends[0]), applied - 0.1 * reach),
+        max(min(best + reach, ends[1]), applied + 0.1 * reach),
     )
-    if clock.parts:
-        bottom -= HEIGHT + 0.09
-        axes = figure.add_axes((LEFT + 0.03, bottom, RIGHT - LEFT - 0.03, HEIGHT))
-        axes.set_title("offset of each part of the flight by itself (s)")
-        axes.axhspan(applied + low, applied + high, color=OURS_BAND, lw=0)
-        for part in clock.parts:
-            middle = (part.start_s + part.end_s) / 2.0
-            axes.errorbar(
-                middle, applied + part.offset_s, xerr=(part.end_s - part.start_s) / 2.0,
-                yerr=1.96 * part.sigma_s, fmt="o", color=OURS, ms=4, lw=1.0, capsize=2,
-            )  # fmt: skip
-        axes.set_xlabel("time since first data (s)")
-        change = (
-            "one part only: nothing to compare"
-            if clock.change_p is None
-            else f"p {clock.change_p:.2g} for one and the same offset throughout"
+    axes.set_xlabel("offset added to the source's stamps (s)")
+    legend_beside_title(axes, top)
+    cursor.skip(42)
+
+
+def _parts(cursor: Cursor, clock: ClockOffset, document: Document) -> None:
+    """Offset of each part of the flight over time."""
+    comparison = document.comparison
+    applied, segment = comparison.settings.clock_offset_s, comparison.segment
+    said = ["Too few parts to compare them."]
+    if clock.change_p is not None:
+        same = "The offset changes" if _changes(clock) else "One and the same offset fits"
+        said = [f"{same} ({p_words(clock.change_p)} for one throughout)."]
+    if clock.drift_ppm is not None and clock.drift_sigma_ppm is not None:
+        sure = "" if _drifts(clock) else ", which may be chance"
+        said.append(
+            f"Drift {clock.drift_ppm:+,.0f} ± {1.96 * clock.drift_sigma_ppm:,.0f} ppm{sure}."
         )
-        drift = (
-            ""
-            if clock.drift_ppm is None or clock.drift_sigma_ppm is None
-            else f"; drift {clock.drift_ppm:+.0f} ± {1.96 * clock.drift_sigma_ppm:.0f} ppm"
-        )
-        caption(axes, f"{change}{drift}. Band: 95 % interval of the whole flight.")
-    yield figure
+    said.append("Band: 95 % interval of the whole flight.")
+    axes = panel(cursor, "Offset of each part of the flight by itself (s)", " ".join(said), PARTS)
+    axes.axhspan(
+        applied + clock.interval_s[0], applied + clock.interval_s[1], color=OURS_BAND, lw=0
+    )
+    ends = np.array([(part.start_s, part.end_s) for part in clock.parts])
+    axes.errorbar(
+        ends.mean(axis=1), [applied + part.offset_s for part in clock.parts],
+        xerr=np.diff(ends, axis=1)[:, 0] / 2.0, yerr=[1.96 * part.sigma_s for part in clock.parts],
+        fmt="o", color=OURS, ms=4, lw=1.0, capsize=2,
+    )  # fmt: skip
+    axes.set_xlim(segment.start_s, segment.end_s)
+    marks.draw(axes, document)
+    axes.set_xlabel(TIME_LABEL)
+    cursor.skip(30)

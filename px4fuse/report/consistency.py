@@ -1,150 +1,238 @@
-"""Consistency: NIS, distribution and whiteness of both filters, by the same rules."""
+"""Appendix: NIS, distribution and whiteness of both filters, by the same rules."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from scipy.stats import norm
 
 from px4fuse.arrays import Array
 from px4fuse.comparison.comparison import AxisComparison, FilterSummary
 from px4fuse.filter.consistency import MIN_INNOVATIONS, Consistency, autocorrelation, nis_band
+from px4fuse.filter.signals import AISLE
 from px4fuse.flight import Unavailable
+from px4fuse.plain import number_words, p_words
+from px4fuse.report import marks
 from px4fuse.report.document import Document
 from px4fuse.report.style import (
-    BOTTOM,
     EKF2,
     EKF2_LINE,
+    LEFT,
     OURS,
     OURS_BAND,
     OURS_LINE,
-    caption,
-    empty,
+    RIGHT,
+    TIME_LABEL,
+    Cursor,
+    legend_beside_title,
     page,
-    panels,
+    panel,
     thin,
 )
 from px4fuse.report.words import verdict_words
 
 LAGS = 20
-BINS = np.linspace(-4.0, 4.0, 33)
+WIDEST = 4.0
+BINS = np.linspace(-WIDEST, WIDEST, 33)
+# Of the normal curve's 0.4: higher bars are cut, so that the curve stays in sight
+HIGHEST = 1.6
+BEYOND_TWO_SIGMA = 0.0455
+# t of the mean, and p of "white", beyond which a word is said
+LARGE_T, SMALL_P = 2.0, 0.01
+# Heights of the axes in points
+RUNNING, BELOW = 150.0, 170.0
+MIDDLE = 0.50
+
+
+class Series(NamedTuple):
+    """Innovations over √S of one filter, and what they state."""
+
+    name: str
+    colour: str
+    time_s: Array
+    values: Array
+    statement: Consistency
 
 
 def draw(document: Document) -> Iterator[Figure]:
-    """Draw one page with a row per axis: running NIS, histogram, autocorrelation."""
-    comparison = document.comparison
+    """Draw one page: the axis of the lab in three panels, all axes in a table."""
+    result = document.comparison.main
+    along = "the aisle" if result.axis.name == AISLE else result.axis.name
     figure, cursor = page(
-        "Consistency",
-        "Left: the mean NIS so far must end inside its 95 % band around 1. Middle: innovations "
-        "divided by √S must follow the normal curve (4.6 % beyond 2√S, Student's t of the mean "
-        "within ±2); narrower is S overstated. Right: they must "
-        "not predict one another; a positive first lag says that the filter follows too slowly "
-        "(R too large or Q too small), a negative one that it jumps after every measurement.",
+        "Appendix: consistency",
+        "Innovations ν of a filter that knows its own variance S are as large as S says (NIS = "
+        "ν²/S is 1 in the mean), normal about zero, and do not predict one another. Both filters "
+        f"are judged by the same rules, along {along}; the table has all axes.",
     )
-    rows = len(comparison.axes)
-    grid = panels(figure, cursor.y - 0.03, BOTTOM + 0.05, rows, 3, hspace=0.5, wspace=0.24)
-    for row, result in zip(grid, comparison.axes, strict=True):
-        series = _normalised(result)
-        if not series:
-            for axes, reason in zip(row, (_reason(result), "", ""), strict=True):
-                empty(axes, f"{result.axis.name}: {reason}" if reason else "")
-            continue
-        _running_nis(row[0], result, series)
-        _histogram(row[1], series)
-        _autocorrelation(row[2], series)
-        for axes, label, say in zip(
-            row,
-            ("measurement number", "ν / √S", "lag"),
-            (_nis_words, _shape_words, _white_words),
-            strict=True,
-        ):
-            if row is grid[-1]:
-                axes.set_xlabel(label)
-            caption(axes, _words(result, say), size=6.6)
+    series = _series(result)
+    if series:
+        top = cursor.y
+        axes = panel(cursor, "Mean NIS so far, log scale", _nis_words(series), RUNNING)
+        _running(axes, series)
+        axes.set_xlim(document.comparison.segment.start_s, document.comparison.segment.end_s)
+        marks.draw(axes, document)
+        legend_beside_title(axes, top)
+        cursor.skip(36)
+        top, beside = cursor.y, Cursor(figure, cursor.y)
+        left = panel(cursor, "Size: ν / √S", _shape_words(series), BELOW, right=MIDDLE - 0.02)
+        right = panel(
+            beside, "Autocorrelation", _white_words(series), BELOW,
+            left=MIDDLE + 0.05,
+        )  # fmt: skip
+        # the sentences above may differ in their lines, the axes shall not
+        lower = min(cursor.y, beside.y)
+        for axes in (left, right):
+            box = axes.get_position()
+            axes.set_position((box.x0, lower, box.width, box.height))
+        _histogram(left, series)
+        _autocorrelation(right, series)
+        for axes in (left, right):
+            legend_beside_title(axes, top, handlelength=1.4)
+        cursor.y = lower
+        cursor.skip(40)
+    else:
+        cursor.write(f"Along {along}: {_reason(result)}.")
+        cursor.skip(8)
+    _table(cursor, document.comparison.axes)
     yield figure
 
 
-Series = list[tuple[str, str, Array]]
-
-
-def _normalised(result: AxisComparison) -> Series:
-    """Innovations over √S of each filter that has enough of them."""
+def _series(result: AxisComparison) -> list[Series]:
+    """Of each filter that has enough innovations."""
     series = []
-    for name, colour, frame in (
-        ("ours", OURS, result.replay.updates),
-        ("EKF2", EKF2, result.ekf2_innovations),
+    for name, colour, frame, summary in (
+        ("ours", OURS, result.replay.updates, result.kf),
+        ("EKF2", EKF2, result.ekf2_innovations, result.ekf2),
     ):
-        if isinstance(frame, pd.DataFrame) and len(frame) >= MIN_INNOVATIONS:
-            normalised = frame["innovation_m"] / np.sqrt(frame["innovation_variance_m2"])
-            series.append((name, colour, normalised.to_numpy()))
+        if (
+            isinstance(frame, pd.DataFrame)
+            and len(frame) >= MIN_INNOVATIONS
+            and isinstance(summary, FilterSummary)
+            and isinstance(summary.consistency, Consistency)
+        ):
+            values = frame["innovation_m"] / np.sqrt(frame["innovation_variance_m2"])
+            known = values[np.isfinite(values)]
+            time = known.index.to_numpy(dtype=np.float64)
+            series.append(Series(name, colour, time, known.to_numpy(), summary.consistency))
     return series
 
 
-def _running_nis(axes: Axes, result: AxisComparison, series: Series) -> None:
-    axes.set_title(f"{result.axis.name}: running mean of the NIS")
-    longest = max(len(values) for _, _, values in series)
-    counts = np.unique(np.geomspace(3, longest, 60).astype(int))
-    bands = np.array([nis_band(int(count)) for count in counts])
-    axes.fill_between(counts, bands[:, 0], bands[:, 1], color="#dcdcdc", lw=0, label="95 % band")
-    axes.axhline(1.0, color="black", lw=0.5)
-    lowest, highest = 0.4, 2.5
-    for name, colour, values in series:
-        running = np.cumsum(values**2) / np.arange(1, len(values) + 1)
-        line = OURS_LINE if colour == OURS else EKF2_LINE
-        axes.plot(*thin(np.arange(3.0, len(values) + 1), running[2:]), **line, label=name)
+def _running(axes: Axes, series: list[Series]) -> None:
+    lowest, highest = 0.5, 2.0
+    for one in series:
+        number = np.arange(1, len(one.values) + 1)
+        running = np.cumsum(one.values**2) / number
+        line = OURS_LINE if one.colour == OURS else EKF2_LINE
+        axes.plot(*thin(one.time_s[2:], running[2:]), **line, label=one.name)
+        shown = np.unique(np.geomspace(3, len(number), 60).astype(int))
+        bands = np.array([nis_band(int(count)) for count in shown])
+        time = one.time_s[shown - 1]
+        if one.colour == OURS:
+            axes.fill_between(time, bands[:, 0], bands[:, 1], color="#dcdcdc", lw=0,
+                              label="95 % band of ours")  # fmt: skip
+        else:
+            for side in (0, 1):
+                axes.plot(time, bands[:, side], color=EKF2, lw=0.6, ls=(0, (1, 1.5)),
+                          label="of EKF2" if side else None)  # fmt: skip
         settled = running[len(running) // 4 :]
-        lowest, highest = min(lowest, 0.7 * settled.min()), max(highest, 1.6 * settled.max())
+        lowest, highest = min(lowest, 0.7 * settled.min()), max(highest, 1.4 * settled.max())
+    axes.axhline(1.0, color="black", lw=0.5)
     axes.set_yscale("log")
     axes.set_ylim(lowest, highest)
-    axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
+    axes.yaxis.set_major_formatter(lambda value, _: number_words(value, 1))
+    few = highest / lowest < 30.0
     axes.yaxis.set_minor_formatter(
-        lambda value, _: f"{value:g}" if highest / lowest < 30 and f"{value:.0e}"[0] in "25" else ""
+        lambda value, _: number_words(value, 1) if few and f"{value:.0e}"[0] in "25" else ""
     )
     axes.tick_params(axis="y", which="minor", labelsize=7, size=1.5)
-    axes.set_xlim(3, longest)
-    axes.legend(loc="upper right", ncols=3, borderaxespad=0.1, handlelength=1.4, columnspacing=0.8)
+    axes.set_xlabel(TIME_LABEL)
 
 
-def _histogram(axes: Axes, series: Series) -> None:
-    axes.set_title("normalised innovations")
-    x = np.linspace(-4.0, 4.0, 161)
-    axes.fill_between(x, norm.pdf(x), color="#dcdcdc", lw=0, label="normal")
+def _histogram(axes: Axes, series: list[Series]) -> None:
+    x = np.linspace(-WIDEST, WIDEST, 81)
+    normal = np.exp(-0.5 * x**2) / np.sqrt(2.0 * np.pi)
+    axes.fill_between(x, normal, color="#dcdcdc", lw=0, label="normal")
     highest = 0.4
-    for name, colour, values in series:
-        density, _ = np.histogram(np.clip(values, -4.0, 4.0), bins=BINS, density=True)
-        line = "-" if colour == OURS else (0, (4, 1.6))
-        axes.stairs(density, BINS, color=colour, lw=0.9, ls=line, label=name)
+    for one in series:
+        inside = np.clip(one.values, -WIDEST, WIDEST)
+        density, _ = np.histogram(inside, bins=BINS, density=True)
+        line = "-" if one.colour == OURS else (0, (4, 1.6))
+        axes.stairs(density, BINS, color=one.colour, lw=1.0, ls=line, label=one.name)
         highest = max(highest, float(density.max()))
-    axes.set_ylim(0.0, 1.3 * highest)
+    axes.set_xlim(-WIDEST, WIDEST)
+    axes.set_ylim(0.0, min(1.15 * highest, HIGHEST))
     axes.set_yticks([])
-    axes.legend(loc="upper right", borderaxespad=0.1, handlelength=1.4)
+    axes.set_xlabel("ν / √S")
 
 
-def _autocorrelation(axes: Axes, series: Series) -> None:
-    axes.set_title("autocorrelation")
-    for shift, (name, colour, values) in zip((-0.18, 0.18), series, strict=False):
-        lags = min(LAGS, len(values) // 3)
-        r = autocorrelation(values, lags)
+def _autocorrelation(axes: Axes, series: list[Series]) -> None:
+    for shift, one in zip((-0.18, 0.18), series, strict=False):
+        ours = one.colour == OURS
+        lags = min(LAGS, len(one.values) // 3)
+        r = autocorrelation(one.values, lags)
         at = np.arange(1, lags + 1) + shift
-        axes.vlines(at, 0.0, r, color=colour, lw=1.2)
-        marker = {"marker": "o", "ms": 2.6} if colour == OURS else {"marker": "s", "ms": 2.6}
-        axes.plot(at, r, ls="none", color=colour, mew=0.6,
-                  mfc=colour if colour == OURS else "white", label=name, **marker)  # type: ignore[arg-type]  # fmt: skip
-        bound = 1.96 / np.sqrt(len(values))
-        if colour == OURS:
-            axes.axhspan(-bound, bound, color=OURS_BAND, lw=0, zorder=0.5)
+        axes.vlines(at, 0.0, r, color=one.colour, lw=1.2)
+        axes.plot(at, r, ls="none", color=one.colour, marker="o" if ours else "s", ms=3.0, mew=0.6,
+                  mfc=one.colour if ours else "white", label=one.name)  # fmt: skip
+        bound = 1.96 / np.sqrt(len(one.values))
+        if ours:
+            axes.axhspan(-bound, bound, color=OURS_BAND, lw=0, zorder=0.5, label="95 % of white")
         else:
             for level in (-bound, bound):
-                axes.axhline(level, **EKF2_LINE | {"lw": 0.7})
+                axes.axhline(level, color=EKF2, lw=0.6, ls=(0, (1, 1.5)))
     axes.axhline(0.0, color="black", lw=0.5)
     low, high = axes.get_ylim()
-    axes.set_ylim(min(low, -0.3), max(high, 0.3) * 1.25)
+    axes.set_ylim(max(min(low, -0.3), -1.05), min(max(high, 0.3), 1.05))
     axes.set_xlim(0.0, LAGS + 1)
-    axes.legend(loc="upper right", ncols=2, borderaxespad=0.1, handlelength=1.0)
+    axes.set_xlabel("lag (measurements)")
+
+
+def _nis_words(series: list[Series]) -> str:
+    return " ".join(
+        f"{_capital(one.name)} ends at {number_words(one.statement.nis_mean)} ("
+        f"{one.statement.nis_band[0]:.2f} to {one.statement.nis_band[1]:.2f} is consistent): "
+        f"{verdict_words(one.statement)}."
+        for one in series
+    )
+
+
+def _shape_words(series: list[Series]) -> str:
+    said = [
+        f"{_capital(one.name)}: {one.statement.outside_two_sigma:.1%} beyond 2√S, "
+        f"{_mean_words(one.statement)}."
+        for one in series
+    ]
+    return "\n".join([*said, f"{BEYOND_TWO_SIGMA:.1%} are expected there."])
+
+
+def _mean_words(statement: Consistency) -> str:
+    if abs(statement.bias_t) < LARGE_T:
+        return "mean near zero"
+    return f"mean {statement.innovation_mean_m:+.3f} m ({p_words(statement.bias_p)})"
+
+
+def _white_words(series: list[Series]) -> str:
+    said = []
+    for one in series:
+        r, p = one.statement.lag1_autocorrelation, one.statement.ljung_box_p
+        if p >= SMALL_P:
+            reading = "white"
+        elif r > 1.96 / np.sqrt(one.statement.count):
+            reading = "it follows too slowly"
+        elif r < -1.96 / np.sqrt(one.statement.count):
+            reading = "it jumps after every measurement"
+        else:
+            reading = "not white"
+        said.append(f"{_capital(one.name)}: lag 1 {r:+.2f}, Ljung-Box {p_words(p)}: {reading}.")
+    return "\n".join(said)
+
+
+def _capital(text: str) -> str:
+    return text[0].upper() + text[1:]
 
 
 def _reason(result: AxisComparison) -> str:
@@ -152,25 +240,29 @@ def _reason(result: AxisComparison) -> str:
     return statement.reason if isinstance(statement, Unavailable) else "too few innovations"
 
 
-def _words(result: AxisComparison, say: Callable[[Consistency], str]) -> str:
-    parts = []
-    for name, summary in (("ours", result.kf), ("EKF2", result.ekf2)):
-        if isinstance(summary, FilterSummary) and isinstance(summary.consistency, Consistency):
-            parts.append(f"{name}: {say(summary.consistency)}")
-    return "\n".join(parts)
-
-
-def _nis_words(statement: Consistency) -> str:
-    low, high = statement.nis_band
-    return f"{statement.nis_mean:.3g} ({low:.2f}–{high:.2f}), {verdict_words(statement)}"
-
-
-def _shape_words(statement: Consistency) -> str:
-    return (
-        f"{statement.outside_two_sigma:.1%} beyond 2√S, "
-        f"t {statement.bias_t:+.1f} (p {statement.bias_p:.2g})"
-    )
-
-
-def _white_words(statement: Consistency) -> str:
-    return f"lag 1 {statement.lag1_autocorrelation:+.2f}, Ljung-Box p {statement.ljung_box_p:.2g}"
+def _table(cursor: Cursor, axes: tuple[AxisComparison, ...]) -> None:
+    """Every axis and filter with its numbers."""
+    heads = ("axis", "filter", "n", "mean NIS", "95 % band", "innovation variance", "beyond 2√S",
+             "t of mean", "lag 1", "Ljung-Box")  # fmt: skip
+    rows = []
+    for result in axes:
+        for owner, summary in (("ours", result.kf), ("EKF2", result.ekf2)):
+            axis = result.axis.name if owner == "ours" else ""
+            statement = summary if isinstance(summary, Unavailable) else summary.consistency
+            if isinstance(statement, Unavailable):
+                rows.append((axis, owner, *[""] * 3, "not available", *[""] * 4))
+                continue
+            low, high = statement.nis_band
+            rows.append(
+                (
+                    axis, owner, f"{statement.count}", number_words(statement.nis_mean),
+                    f"{low:.2f} – {high:.2f}", verdict_words(statement),
+                    f"{statement.outside_two_sigma:.1%}", f"{statement.bias_t:+.1f}",
+                    f"{statement.lag1_autocorrelation:+.2f}", p_words(statement.ljung_box_p),
+                )
+            )  # fmt: skip
+    cursor.write("All axes", size=9.0, weight="bold")
+    widths = np.array([0.06, 0.055, 0.05, 0.085, 0.105, 0.155, 0.095, 0.085, 0.065, 0.085])
+    edges = LEFT + np.concatenate([[0.0], np.cumsum(widths)[:-1]]) * (RIGHT - LEFT) / widths.sum()
+    cells = list(zip(*rows, strict=True))
+    cursor.columns(dict(zip(edges.tolist(), zip(heads, cells, strict=True), strict=True)))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -13,6 +13,7 @@ from px4fuse.arrays import Array
 from px4fuse.findings import Finding
 from px4fuse.flight import Unavailable
 from px4fuse.loop.loop import BY_DISTANCE, PLAIN, UNCORRECTED, Correction, Loop
+from px4fuse.plain import p_words
 from px4fuse.report.cover import write_finding
 from px4fuse.report.document import Document, LoopDocument
 from px4fuse.report.loop_words import (
@@ -37,6 +38,7 @@ from px4fuse.report.style import (
     RIGHT,
     TRUTH_LINE,
     Cursor,
+    appendix,
     caption,
     page,
     panels,
@@ -69,7 +71,7 @@ def draw(document: Document) -> Iterator[Figure]:
     """Draw the loop's pages; none where the flight holds no loop."""
     loop = document.analysis.loop
     if isinstance(loop, Loop):
-        yield from draw_loop(loop)
+        yield from draw_loop(loop, name=appendix)
 
 
 def draw_report(document: LoopDocument) -> Iterator[Figure]:
@@ -81,10 +83,11 @@ def draw_loop(
     loop: Loop,
     findings: tuple[Finding, ...] = (),
     facts: tuple[tuple[str, str], ...] = (),
+    name: Callable[[str], str] = str,
 ) -> Iterator[Figure]:
-    """Draw the pages about one loop."""
+    """Draw the pages about one loop, their titles made by ``name``."""
     figure, cursor = page(
-        "Loop closure",
+        name("Loop closure"),
         "A path that truly returns must close; the gap is what the odometry drifted. Each "
         "correction spreads it over the path: by distance (positions only as in the lesson's "
         "Example 2, or headings too), or as a pose graph weighs it. A closure "
@@ -102,19 +105,19 @@ def draw_loop(
     _table(figure, cursor, loop)
     if cursor.y - BOTTOM < MAP_MIN_HEIGHT:
         yield figure
-        figure, cursor = page("Loop closure: the map")
+        figure, cursor = page(name("Loop closure: the map"))
     cursor.skip(10)
     _map(figure, cursor, loop)
     yield figure
     figure, cursor = page(
-        "Along the path",
+        name("Along the path"),
         "How far each correction moved each pose, and how far the path is from the reference after "
         "alignment. A correction that helps brings the error down along most of the path, not only "
         "at its end.",
     )
     _along(figure, cursor, loop)
     yield figure
-    yield from _scores(loop)
+    yield from _scores(loop, name)
 
 
 def _line(cursor: Cursor, label: str, text: str) -> None:
@@ -285,10 +288,10 @@ def _fit(axes: Axes) -> None:
         axes.set_ylim(0.0, 1.15 * max(*highest, 1e-3))
 
 
-def _scores(loop: Loop) -> Iterator[Figure]:
+def _scores(loop: Loop, name: Callable[[str], str]) -> Iterator[Figure]:
     """Tables: every closure with its gate and weights, RPE, and how scores were made."""
     figure, cursor = page(
-        "Closures and scores",
+        name("Closures and scores"),
         "d² is the squared misclosure against what drift and closure explain together; p is the "
         "chance of a larger one if the closure is true. Robust solving (dynamic covariance "
         "scaling, DCS; graduated non-convexity, GNC) weighs each closure by how well the others "
@@ -304,7 +307,7 @@ def _scores(loop: Loop) -> Iterator[Figure]:
     for judged in loop.closures:
         if cursor.y < BOTTOM + 0.03:
             yield figure
-            figure, cursor = page("Closures and scores, continued")
+            figure, cursor = page(name("Closures and scores, continued"))
         gate = judged.gate
         weights = [
             f"{judged.weights[name]:.2f}" if name in judged.weights else "–"
@@ -312,7 +315,7 @@ def _scores(loop: Loop) -> Iterator[Figure]:
         ]
         cells = [
             closure_name(judged, loop), f"{judged.distance_m:.2f}", f"{gate.d2:.1f}",
-            f"{gate.degrees_of_freedom}", f"{gate.p:.2g}",
+            f"{gate.degrees_of_freedom}", p_words(gate.p).removeprefix("p "),
             "accepted" if gate.accepted else "REJECTED", *weights,
         ]  # fmt: skip
         _row(figure, cursor, list(zip(edges, cells, strict=True)),
@@ -324,7 +327,7 @@ def _scores(loop: Loop) -> Iterator[Figure]:
                    if isinstance(s := p.scores[reference.name], Evaluation))  # fmt: skip
         if cursor.y - 0.14 - rows * TABLE_SIZE * 1.45 / POINTS_PER_HEIGHT < BOTTOM:
             yield figure
-            figure, cursor = page("Closures and scores, continued")
+            figure, cursor = page(name("Closures and scores, continued"))
         cursor.skip(12)
         _relative(figure, cursor, loop, reference.name)
     yield figure

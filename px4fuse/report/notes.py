@@ -1,54 +1,292 @@
-"""The student's own words, from a Markdown file, as plain text with headings and bullets."""
+"""The student's own words, from a Markdown file, as text: headings, lists, code and tables.
+
+Mathematics between dollar signs becomes letters (σ, ², √), a picture its description, and HTML
+what it says: nothing is printed as markup, nothing is loaded and nothing runs.
+"""
 
 from __future__ import annotations
 
+import html
 import re
+import unicodedata
 from collections.abc import Iterator
-from typing import Any
+from dataclasses import dataclass
+from itertools import accumulate, zip_longest
 
+from markdown_it import MarkdownIt
+from markdown_it.rules_inline import StateInline
+from markdown_it.tree import SyntaxTreeNode
 from matplotlib.figure import Figure
 
 from px4fuse.report.document import Document, LoopDocument
-from px4fuse.report.style import BOTTOM, LEFT, POINTS_PER_WIDTH, RIGHT, page, printable, wrap
+from px4fuse.report.style import (
+    BOTTOM,
+    LEFT,
+    MUTED,
+    POINTS_PER_HEIGHT,
+    POINTS_PER_WIDTH,
+    RIGHT,
+    appendix,
+    page,
+    printable,
+    text_width,
+    wrap,
+)
 
-HEADING = re.compile(r"^(#{1,6})\s+(.*?)\s*#*$")
-BULLET = re.compile(r"^(\s*)(?:[-*+]|(\d+)[.)])\s+(.*)$")
-EMPHASIS = re.compile(r"(\*\*|__)(?=\S)(.+?)(?<=\S)\1")
 BODY_SIZE = 8.5
+HEADING_SIZES = {"h1": 12.0, "h2": 10.8, "h3": 9.6}
+INDENT = 0.022
+MOST_INDENTS = 8
+MARK_WIDTH = 0.016
+SPACING = 1.32
+TABLE_SIZE = 8.0
+COLUMN_GAP_POINTS = 10.0
+# $ opens before what is no space and closes after it, not before a digit: prices stay prices
+MATHS = re.compile(r"\$\$(.+?)\$\$|\$(?!\s)((?:\\.|[^$\\])+?)(?<!\s)\$(?!\d)", re.DOTALL)
+COMMAND = re.compile(r"\\([A-Za-z]+|.)")
+FRACTION = re.compile(r"\\frac\s*\{([^{}]*)\}\s*\{([^{}]*)\}")
+ROOT = re.compile(r"\\sqrt\s*\{([^{}]*)\}")
+INDEX = re.compile(r"_\{([^{}]*\W[^{}]*)\}")
+POWER = re.compile(r"\^\{([-+]?\d+)\}|\^(\d)")
+# HTML: what is no text, pictures with what they are called, ends of lines, all other tags
+SILENT = re.compile(r"<!--.*?-->|<(script|style)\b.*?(</\1\s*>|$)", re.DOTALL | re.IGNORECASE)
+IMAGE = re.compile(r"""<img\b(?:[^>]*?\balt\s*=\s*(["'])(.*?)\1)?[^>]*>""", re.IGNORECASE)
+BREAK = re.compile(r"<(br|/p|/div|/tr|/li|/h\d)\b[^>]*>", re.IGNORECASE)
+TAG = re.compile(r"<[^>]*>")
+SYMBOLS = {
+    "cdot": "·", "times": "×", "pm": "±", "le": "≤", "leq": "≤", "ge": "≥", "geq": "≥",
+    "approx": "≈", "neq": "≠", "sim": "~", "infty": "∞", "sum": "Σ", "int": "∫", "partial": "∂",
+    "to": "→", "rightarrow": "→", "degree": "°", "circ": "°", "sqrt": "√", "ldots": "…",
+    "left": "", "right": "", "mathrm": "", "text": "", "mathbf": "", "hat": "", "bar": "",
+    "varepsilon": "ε", "quad": " ", ",": " ", ";": " ", "!": "", " ": " ",
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Line:
+    """A paragraph, or a line of code: its words, how they look, and the mark of a list before."""
+
+    text: str
+    size: float = BODY_SIZE
+    weight: str = "normal"
+    colour: str = "black"
+    indents: int = 0
+    mark: str = ""
+    above: float = 4.0
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows of cells, the first one the head."""
+
+    rows: tuple[tuple[str, ...], ...]
+    indents: int = 0
+
+
+@dataclass(frozen=True)
+class Row:
+    """What is written at one height: at each x (fraction of the page) one line or more."""
+
+    cells: tuple[tuple[float, tuple[str, ...]], ...]
+    like: Line
+    above: float = 0.0
+    ruled: bool = False
 
 
 def draw(document: Document | LoopDocument) -> Iterator[Figure]:
     """Draw as many pages as the notes need; none without notes."""
-    text = document.student.notes
-    if not text.strip():
+    title = "Notes by the student"
+    if isinstance(document, Document):
+        title = appendix(title)
+    rows = [
+        row for block in read(document.student.notes)
+        for row in (_lines(block) if isinstance(block, Line) else _rows(block))
+    ]  # fmt: skip
+    if not rows:
         return
-    figure, cursor = page("Notes by the student")
-    for line in text.splitlines():
-        words, style = _style(line)
-        if not words.strip():
-            cursor.skip(5)
-            continue
-        # written line by line, so that a paragraph may run over a page's end
-        x = style.pop("x")
-        for piece in wrap(printable(words), style["size"], (RIGHT - x) * POINTS_PER_WIDTH):
-            if cursor.y - 0.016 < BOTTOM:
-                yield figure
-                figure, cursor = page("Notes by the student, continued")
-            cursor.write(piece, x=x, **style)
+    figure, cursor = page(title)
+    for row in rows:
+        height = max(len(lines) for _, lines in row.cells) * row.like.size * SPACING
+        if cursor.y - (row.above + height + 3.0) / POINTS_PER_HEIGHT < BOTTOM:
+            yield figure
+            figure, cursor = page(f"{title}, continued")
+        else:
+            cursor.skip(row.above)
+        for x, lines in row.cells:
+            for number, text in enumerate(lines, start=1):
+                figure.text(
+                    x, cursor.y - number * row.like.size * SPACING / POINTS_PER_HEIGHT, text,
+                    size=row.like.size, weight=row.like.weight, color=row.like.colour,
+                )  # fmt: skip
+        cursor.skip(height)
+        if row.ruled:
+            cursor.skip(3.0)
+            cursor.rule()
     yield figure
 
 
-def _style(line: str) -> tuple[str, dict[str, Any]]:
-    """Text of one Markdown line without its marks, and how to write it."""
-    if heading := HEADING.match(line):
-        size = max(BODY_SIZE, 12.0 - 1.2 * (len(heading[1]) - 1))
-        return _plain(heading[2]), {"x": LEFT, "size": size, "weight": "bold"}
-    if bullet := BULLET.match(line):
-        mark = f"{bullet[2]}." if bullet[2] else "•"
-        indent = LEFT + 0.015 + 0.008 * min(len(bullet[1].expandtabs(4)), 12)
-        return f"{mark} {_plain(bullet[3])}", {"x": indent, "size": BODY_SIZE}
-    return _plain(line), {"x": LEFT, "size": BODY_SIZE}
+def _left(indents: int) -> float:
+    return LEFT + INDENT * min(indents, MOST_INDENTS)
 
 
-def _plain(text: str) -> str:
-    return EMPHASIS.sub(r"\2", text)
+def _lines(line: Line) -> Iterator[Row]:
+    """One row per line of a paragraph, so that it may run over a page's end."""
+    x = _left(line.indents)
+    lines = wrap(printable(line.text), line.size, (RIGHT - x) * POINTS_PER_WIDTH, line.weight)
+    for number, text in enumerate(lines):
+        mark = ((x - MARK_WIDTH, (line.mark,)),) if line.mark and not number else ()
+        yield Row((*mark, (x, (text,))), line, 0.0 if number else line.above)
+
+
+def _rows(table: Table) -> Iterator[Row]:
+    """Rows of a table; its columns are as wide as their words, or share what there is."""
+    body, head = Line("", TABLE_SIZE), Line("", TABLE_SIZE, "bold")
+    left = _left(table.indents)
+    natural = [
+        max(text_width(printable(cell), TABLE_SIZE, "bold") for cell in column) + COLUMN_GAP_POINTS
+        for column in zip_longest(*table.rows, fillvalue="")
+    ]
+    room = (RIGHT - left) * POINTS_PER_WIDTH
+    fair = room / len(natural)
+    wanted = sum(width for width in natural if width > fair)
+    rest = room - sum(width for width in natural if width <= fair)
+    shares = min(1.0, rest / wanted) if wanted else 1.0
+    widths = [width if width <= fair else width * shares for width in natural]
+    edges = list(accumulate((width / POINTS_PER_WIDTH for width in widths), initial=left))
+    for number, cells in enumerate(table.rows):
+        like = body if number else head
+        wrapped = [
+            (x, tuple(wrap(printable(cell), like.size, width - COLUMN_GAP_POINTS, like.weight)))
+            for x, cell, width in zip(edges, cells, widths, strict=False)
+        ]
+        yield Row(tuple(wrapped), like, 1.0 if number else 6.0, ruled=not number)
+
+
+def read(notes: str) -> Iterator[Line | Table]:
+    r"""Markdown as lines and tables, in their order.
+
+    >>> [line.text for line in read("# A *b*\n\n- $\\sigma_z^2$ is `R`\n\n![a map](m.png)")]
+    ['A b', 'σ_z² is R', '[picture: a map]']
+    """
+    markdown = MarkdownIt("commonmark", {"html": True}).enable(["table", "strikethrough"])
+    markdown.inline.ruler.before("escape", "maths", _maths)
+    yield from _blocks(SyntaxTreeNode(markdown.parse(notes)), 0)
+
+
+def _blocks(node: SyntaxTreeNode, indents: int) -> Iterator[Line | Table]:
+    for child in node.children:
+        match child.type:
+            case "heading":
+                size = HEADING_SIZES.get(child.tag, BODY_SIZE)
+                yield Line(_inline(child), size, "bold", indents=indents, above=8.0)
+            case "bullet_list" | "ordered_list":
+                yield from _items(child, indents)
+            case "blockquote":
+                yield from _blocks(child, indents + 1)
+            case "fence" | "code_block":
+                for number, text in enumerate(child.content.rstrip("\n").split("\n")):
+                    yield Line(text or " ", 7.5, colour=MUTED, indents=indents + 1,
+                               above=0.0 if number else 4.0)  # fmt: skip
+            case "table":
+                rows = [row for part in child.children for row in part.children]
+                yield Table(tuple(tuple(_inline(c) for c in row.children) for row in rows), indents)
+            case "html_block":
+                for text in _said(child.content).split("\n"):
+                    if text.strip():
+                        yield Line(text.strip(), indents=indents)
+            case "hr":
+                yield Line("")
+            case _:
+                yield Line(_inline(child), indents=indents)
+
+
+def _items(node: SyntaxTreeNode, indents: int) -> Iterator[Line | Table]:
+    """Items of a list, the first line of each with its mark."""
+    first = int(node.attrs.get("start", 1))
+    for number, item in enumerate(node.children, start=first):
+        mark = "•" if node.type == "bullet_list" else f"{number}."
+        blocks = list(_blocks(item, indents + 1))
+        if not blocks or not isinstance(blocks[0], Line) or blocks[0].mark:
+            blocks.insert(0, Line("", indents=indents + 1))
+        head = blocks[0]
+        assert isinstance(head, Line)
+        yield Line(head.text, head.size, head.weight, head.colour, head.indents, mark, 2.0)
+        yield from blocks[1:]
+
+
+def _inline(node: SyntaxTreeNode) -> str:
+    """Words of a block without their marks."""
+    said = []
+    for child in node.children:
+        match child.type:
+            case "text" | "code_inline":
+                said.append(child.content)
+            case "maths":
+                said.append(_letters(child.content))
+            case "softbreak":
+                said.append(" ")
+            case "hardbreak":
+                said.append("\n")
+            case "image":
+                said.append(_picture(child.content))
+            case "html_inline":
+                said.append(_said(child.content))
+            case "link":
+                words, address = _inline(child), str(child.attrs.get("href", ""))
+                said.append(words if words in (address, "") else f"{words} ({address})")
+            case _:
+                said.append(_inline(child))
+    return "".join(said)
+
+
+def _picture(description: str) -> str:
+    return f"[picture: {description}]" if description else "[picture]"
+
+
+def _said(markup: str) -> str:
+    """What HTML says: its text, and what pictures in it are called."""
+    text = SILENT.sub("", markup)
+    text = IMAGE.sub(lambda found: _picture(found[2] or ""), text)
+    return html.unescape(TAG.sub("", BREAK.sub("\n", text)))
+
+
+def _maths(state: StateInline, silent: bool) -> bool:
+    """Mathematics in dollar signs, as a rule of the parser: code and escapes come before it."""
+    found = MATHS.match(state.src, state.pos)
+    if found is None:
+        return False
+    if not silent:
+        state.push("maths", "", 0).content = (found[1] or found[2]).strip()
+    state.pos = found.end()
+    return True
+
+
+def _letters(maths: str) -> str:
+    """TeX as letters, as far as letters go."""
+    text = INDEX.sub(r"_(\1)", FRACTION.sub(_fraction, ROOT.sub(r"√(\1)", maths)))
+    text = POWER.sub(lambda m: "".join(map(_superscript, m[1] or m[2])), text)
+    return COMMAND.sub(_symbol, text).replace("{", "").replace("}", "").replace("~", " ")
+
+
+def _fraction(found: re.Match[str]) -> str:
+    return "/".join(part if part.isalnum() else f"({part})" for part in found.groups())
+
+
+def _superscript(character: str) -> str:
+    if character in "+-":
+        return "⁺" if character == "+" else "⁻"
+    return unicodedata.lookup(f"SUPERSCRIPT {unicodedata.name(character).split()[-1]}")
+
+
+def _symbol(found: re.Match[str]) -> str:
+    name = found[1]
+    if name in SYMBOLS:
+        return SYMBOLS[name]
+    if not name.isalpha():
+        return name
+    size = "CAPITAL" if name[0].isupper() else "SMALL"
+    greek = "LAMDA" if name.lower() == "lambda" else name.upper()
+    try:
+        return unicodedata.lookup(f"GREEK {size} LETTER {greek}")
+    except KeyError:
+        return name

@@ -6,8 +6,9 @@ from collections.abc import Iterator
 
 from matplotlib.figure import Figure
 
+from px4fuse.report import clock, fonts
 from px4fuse.report.document import Document, LoopDocument
-from px4fuse.report.style import BOTTOM, LEFT, MUTED, NO_GLYPH, lacks_glyphs, page
+from px4fuse.report.style import BOTTOM, LEFT, MUTED, page
 from px4fuse.report.words import alignment_words, clock_words
 from px4fuse.results.parts import provenance
 
@@ -86,6 +87,7 @@ def draw(document: Document) -> Iterator[Figure]:
             ],
         ),
         ("Clocks, to the autopilot's boot clock", [("", clock_words(c)) for c in flight.clocks]),
+        (f"Stamps of {source.name}, by the IMU", [("", clock.line(document))]),
         (
             f"Placement of {source.name}",
             [] if source.alignment is None else alignment_words(source.alignment),
@@ -101,7 +103,7 @@ def draw(document: Document) -> Iterator[Figure]:
         ),
         ("How the numbers are made", [("", text) for text in METHOD]),
     ]
-    yield from _layout(sections)
+    yield from _layout("Appendix: provenance", sections)
 
 
 def draw_loop(document: LoopDocument) -> Iterator[Figure]:
@@ -110,6 +112,7 @@ def draw_loop(document: LoopDocument) -> Iterator[Figure]:
     files = [("track", loop.odometry.trajectory)]
     files += [("reference", reference) for reference in loop.references]
     yield from _layout(
+        "Provenance",
         [
             _made_with(document),
             (
@@ -125,7 +128,7 @@ def draw_loop(document: LoopDocument) -> Iterator[Figure]:
             ),
             ("Choices made on the way", [("", note) for note in loop.notes] or [("", "none")]),
             ("How the numbers are made", [("", text) for text in LOOP_METHOD]),
-        ]
+        ],
     )
 
 
@@ -143,8 +146,8 @@ def _made_with(document: Document | LoopDocument) -> Section:
     )
 
 
-def _layout(sections: list[Section]) -> Iterator[Figure]:
-    figure, cursor = page("Provenance")
+def _layout(heading: str, sections: list[Section]) -> Iterator[Figure]:
+    figure, cursor = page(heading)
     for title, entries in sections:
         if not entries:
             continue
@@ -158,7 +161,7 @@ def _layout(sections: list[Section]) -> Iterator[Figure]:
             )
             if cursor.y - height - (needed if position == 0 else 0.0) < BOTTOM:
                 yield figure
-                figure, cursor = page("Provenance, continued")
+                figure, cursor = page(f"{heading}, continued")
             if position == 0:
                 cursor.write(title, size=9.5, weight="bold")
                 cursor.skip(1)
@@ -176,10 +179,10 @@ def _layout(sections: list[Section]) -> Iterator[Figure]:
 
 def _fonts(document: Document | LoopDocument) -> list[tuple[str, str]]:
     student = document.student
-    if not lacks_glyphs(student.name + student.id + student.notes):
+    if not fonts.missing(student.name + student.id + student.notes):
         return []
     text = (
-        f"{NO_GLYPH} stands for characters that no font on this machine has; results.json holds "
-        "the text as given"
+        f"{fonts.NO_GLYPH} stands for characters that no font on this machine has; results.json "
+        "holds the text as given"
     )
     return [("fonts", text)]

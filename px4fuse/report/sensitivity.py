@@ -1,139 +1,262 @@
-"""Sensitivity: what SIGMA_A and SIGMA_Z do, and which of them the data ask for."""
+"""Appendix: what the knobs do. The ratio SIGMA_A/SIGMA_Z makes the track, their size the claims."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FixedLocator, NullFormatter, ScalarFormatter
+from matplotlib.patches import Patch
+from matplotlib.ticker import FixedLocator, NullFormatter, NullLocator
 
 from px4fuse.arrays import Array
 from px4fuse.comparison.comparison import AxisComparison
-from px4fuse.filter.likelihood import PROFILE_DROP, States, preintegrate, states
+from px4fuse.comparison.events import Span
+from px4fuse.filter.fitting import FIRST_WIDTH
+from px4fuse.filter.likelihood import States, preintegrate, states, total_over_grid
 from px4fuse.filter.signals import AISLE
-from px4fuse.filter.tuning import HORIZONTAL, Noise
+from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise
 from px4fuse.flight import Unavailable
+from px4fuse.plain import factor_words, number_words
+from px4fuse.report import marks
 from px4fuse.report.document import Document
 from px4fuse.report.style import (
-    BOTTOM,
-    EKF2,
     LEFT,
     MUTED,
     OURS,
-    OURS_LINE,
+    OURS_BAND,
     RIGHT,
+    TIME_LABEL,
     TRUTH_LINE,
-    caption,
+    Cursor,
+    bare_x,
+    below,
     empty,
+    legend_beside_title,
     page,
-    panels,
+    panel,
+    thin,
 )
 
-FACTORS = (0.25, 0.5, 1.0, 2.0, 4.0)
-# Drops of log-likelihood: the 95 % intervals of one parameter, then further down
-LEVELS = (0.0, PROFILE_DROP, 4.6, 9.0)
-SHADES = ("#123f7a", "#6f93c4", "#c9d8ec")
-WINDOW_S = 20.0
-MAP_HEIGHT = 0.235
+FACTOR = 4.0
+# The chosen pair, and what is done to SIGMA_A and SIGMA_Z: two of them share each other gain
+SETTINGS = (
+    ("as chosen", 1.0, 1.0),
+    ("SIGMA_A × 4", FACTOR, 1.0),
+    ("SIGMA_Z / 4", 1.0, 1.0 / FACTOR),
+    ("SIGMA_A / 4", 1.0 / FACTOR, 1.0),
+    ("SIGMA_Z × 4", 1.0, FACTOR),
+)
+# Names, columns of SETTINGS, and what the pair does
+PAIRS = (
+    ("Four times SIGMA_A, or a quarter of SIGMA_Z: larger gain", (1, 2)),
+    ("A quarter of SIGMA_A, or four times SIGMA_Z: smaller gain", (3, 4)),
+)
+CURVE = FACTOR ** np.linspace(-2.0, 2.0, 17)
+# ln of how much less likely a pair is than the best: the joint 95 % region, then powers of ten
+REGION = float(-np.log(0.05))
+LEVELS = (0.0, REGION, 10.0, 100.0, 1000.0, 10_000.0)
+SHADES = ("#0b2a55", "#3f6aa8", "#86a7d3", "#c3d4ea", "#e6edf6")
+COARSE_POINTS, FINE_POINTS = 14, 11
+# Beyond what has to be seen, as a factor; and how many intervals the fine points reach
+MARGIN, FINE_REACH = 1.3, 2.3
+# Tracks further apart than this share of what the knobs do are not the same
+LITTLE_APART = 0.1
+WINDOW_S, WINDOW_STEP_S = 20.0, 0.5
+# Heights of the axes in points
+MAP, TRACK = 150.0, 88.0
+MIDDLE = 0.53
+THICK: dict[str, Any] = {"color": OURS_BAND, "lw": 4.0, "ls": "-", "solid_capstyle": "butt"}
+THIN: dict[str, Any] = {"color": OURS, "lw": 1.0, "ls": (0, (4, 1.6))}
+OF_A: dict[str, Any] = {"color": OURS, "marker": "o", "ms": 5.0, "mew": 0, "ls": "none"}
+OF_Z: dict[str, Any] = {"color": "black", "marker": "s", "ms": 8.0, "mew": 0.8, "mfc": "none",
+                        "ls": "none"}  # fmt: skip
 
 
 def draw(document: Document) -> Iterator[Figure]:
     """Draw one page; none where nothing was tuned."""
-    comparison, tuning = document.comparison, document.analysis.tuning
-    name = next((n for n in (HORIZONTAL, AISLE) if n in tuning), None)
-    if name is None:
-        name = next(iter(tuning), None)
-    if name is None:
+    if not document.analysis.tuning:
         return
-    results = {result.axis.name: result for result in comparison.axes}
-    result = results.get(AISLE, comparison.axes[0])
+    result, settings = document.comparison.main, document.comparison.settings
+    name = result.axis.name
     figure, cursor = page(
-        "What the knobs do",
-        "Top: how likely the innovations are under every pair of SIGMA_A and SIGMA_Z; darkest is "
-        "most likely. Right and below: the same flight at a quarter, half, twice and four times "
-        f"the chosen value of each ({result.axis.name}). A larger SIGMA_A or a smaller SIGMA_Z "
-        "gives a larger gain: the filter follows the measurements, noise and all.",
+        "Appendix: what the knobs do",
+        "The filter's gain depends on SIGMA_A / SIGMA_Z alone. Their size does not move the track: "
+        "it scales what the filter claims about it, σ and S, and so the NIS. NIS tells the size, "
+        "the track the ratio; maximum likelihood weighs both.",
     )
-    legs = preintegrate(result.axis, comparison.settings)
-    by_a = states(legs, np.array(FACTORS) * comparison.settings.sigma_a_m_s2,
-                  comparison.settings.sigma_z_m)  # fmt: skip
-    by_z = states(legs, comparison.settings.sigma_a_m_s2,
-                  np.array(FACTORS) * comparison.settings.sigma_z_m)  # fmt: skip
-    top = cursor.y - 0.02
-    _map(figure, top, document, name)
-    _curves(figure, top, by_a, by_z)
-    grid = panels(figure, top - MAP_HEIGHT - 0.095, BOTTOM + 0.045, 4, len(FACTORS),
-                  hspace=0.62, wspace=0.12)  # fmt: skip
-    for rows, symbol, run in ((grid[:2], "SIGMA_A", by_a), (grid[2:], "SIGMA_Z", by_z)):
-        _multiples(rows, symbol, run, result)
+    chosen = np.array([settings.sigma_a_m_s2, settings.sigma_z_m])
+    ratio = chosen[0] / chosen[1]
+    factors = np.array([(a, z) for _, a, z in SETTINGS] + [(f, 1.0) for f in CURVE]).T
+    run = states(preintegrate(result.axis, settings), *(chosen[:, None] * factors))
+    curve = _settled(run.gain)
+    beside = Cursor(figure, cursor.y)
+    _map(cursor, document)
+    _gains(beside, ratio, curve)
+    cursor.y = min(cursor.y, beside.y)
+    cursor.skip(8)
+    window = _window(
+        result, run.velocity_m_s[:, 0], [*document.events.gaps, *document.events.dropouts]
+    )
+    for place, (title, pair) in enumerate(PAIRS):
+        top = cursor.y
+        axes = panel(cursor, title, _apart_words(run, pair), TRACK)
+        _tracks(axes, result, run, pair, window)
+        legend_beside_title(axes, top)
+        marks.draw(axes, document)
+        if place < len(PAIRS) - 1:
+            bare_x(axes)
+            cursor.skip(8)
+        else:
+            axes.set_xlabel(TIME_LABEL)
+            cursor.skip(24)
+    along = "the aisle" if name == AISLE else name
+    below(
+        cursor,
+        f"Velocity along {along} (m/s) over the {window[1] - window[0]:.0f} s with the most "
+        "motion in which nothing is missing.",
+    )
+    cursor.skip(10)
+    _table(cursor, result, run, chosen)
     yield figure
 
 
-def _map(figure: Figure, top: float, document: Document, name: str) -> None:
-    """Likelihood map with the optimum, its intervals and the chosen point."""
-    width = (RIGHT - LEFT) * 0.45
-    axes = figure.add_axes((LEFT + 0.015, top - MAP_HEIGHT, width, MAP_HEIGHT))
-    found = document.analysis.tuning[name]
+def _map(cursor: Cursor, document: Document) -> None:
+    """Likelihood of every pair, with the lines on which the gain is the same."""
+    tuning, settings = document.analysis.tuning, document.comparison.settings
+    main = document.comparison.main.axis.name
+    name = next((n for n in (HORIZONTAL, main) if n in tuning), next(iter(tuning)))
+    found = tuning[name]
+    title = f"How likely the innovations are ({name})"
     if isinstance(found, Unavailable):
-        empty(axes, f"No likelihood map: {found.reason}.")
+        empty(panel(cursor, title, "", MAP, right=MIDDLE - 0.03), f"No map: {found.reason}.")
         return
-    settings = document.comparison.settings
-    axes.contourf(
-        found.map.sigma_z_m, found.map.sigma_a_m_s2, found.map.drop, LEVELS, colors=SHADES
-    )
-    best_a, best_z = _point(found.filter_sigma_a), _point(found.sigma_z)
-    axes.plot(best_z, best_a, "o", color="white", mec="black", ms=4.5, label="most likely")
-    axes.plot(settings.sigma_z_m, settings.sigma_a_m_s2, "X", color=EKF2, mec="black", mew=0.5,
-              ms=6.5, label="chosen")  # fmt: skip
+    axes = panel(cursor, title, _map_words(found), MAP, right=MIDDLE - 0.03)
+    best = _point(found.filter_sigma_a), _point(found.sigma_z)
+    grids, shown = [], []
+    for value, asked, noise in (
+        (settings.sigma_a_m_s2, best[0], found.filter_sigma_a),
+        (settings.sigma_z_m, best[1], found.sigma_z),
+    ):
+        needed = (value / FACTOR, value * FACTOR, asked, noise.low or asked, noise.high or asked)
+        low, high = min(needed) / MARGIN, max(needed) * MARGIN
+        spread = max((noise.high or asked) / asked, asked / (noise.low or asked), 1.02)
+        fine = asked * spread ** np.linspace(-FINE_REACH, FINE_REACH, FINE_POINTS)
+        grid = np.concatenate([np.geomspace(low, high, COARSE_POINTS), fine])
+        grids.append(np.unique(grid[(low <= grid) & (grid <= high)]))
+        shown.append((low, high))
+    a, z = grids
+    drop = _drop(document, name, found, a, z)
+    axes.contourf(z, a, drop, LEVELS, colors=SHADES)
+    for factor in (1.0 / FACTOR, 1.0, FACTOR):
+        slope = factor * settings.sigma_a_m_s2 / settings.sigma_z_m
+        axes.plot(z[[0, -1]], slope * z[[0, -1]], color="black", lw=0.7, ls=(0, (1, 1.5)))
+    for (_, of_a, of_z), style in zip(SETTINGS[1:], (OF_A, OF_Z, OF_A, OF_Z), strict=True):
+        axes.plot(settings.sigma_z_m * of_z, settings.sigma_a_m_s2 * of_a, **style | {"ms": 4.0})
+    axes.plot(best[1], best[0], "o", color="white", mec="black", ms=6.0, label="asked for")
+    axes.plot(settings.sigma_z_m, settings.sigma_a_m_s2, "X", color="#e0741a", mec="black",
+              mew=0.6, ms=7.0, label="chosen")  # fmt: skip
     axes.set_xscale("log")
     axes.set_yscale("log")
-    for low, high, chosen, limit in (
-        (*found.map.sigma_z_m[[0, -1]], settings.sigma_z_m, axes.set_xlim),
-        (*found.map.sigma_a_m_s2[[0, -1]], settings.sigma_a_m_s2, axes.set_ylim),
-    ):
-        limit(min(low, chosen / 1.3), max(high, chosen * 1.3))
-    for axis in (axes.xaxis, axes.yaxis):
-        low, high = axis.get_view_interval()
-        axis.set_major_locator(FixedLocator(_ticks(low, high)))
-        axis.set_major_formatter(ScalarFormatter())
-        axis.set_minor_formatter(NullFormatter())
+    axes.set_ylim(*shown[0])
+    axes.set_xlim(*shown[1])
+    _round_ticks(axes)
     axes.grid(False)
-    axes.set_title(f"{name}: log-likelihood")
     axes.set_xlabel("SIGMA_Z (m)")
     axes.set_ylabel("SIGMA_A (m/s²)")
-    axes.legend(loc="upper left", handlelength=1.0)
-    caption(
-        axes,
-        f"SIGMA_A {_words(found.filter_sigma_a, 'm/s²')}; SIGMA_Z {_words(found.sigma_z, 'm')}. "
-        f"The chosen pair is {found.gain_nats * found.count:.1f} below the maximum (ln, "
-        f"{found.count} measurements).",
+    shades = [
+        Patch(facecolor=shade, label=label)
+        for shade, label, level in zip(
+            SHADES, ("95 % region", "10 below", "100", "1,000", "10,000"), LEVELS,
+            strict=False,
+        )
+        if level < drop.max()
+    ]  # fmt: skip
+    axes.legend(
+        handles=[*shades, *axes.get_legend_handles_labels()[0]], loc="upper left", ncols=4,
+        bbox_to_anchor=(-0.1, -0.2), borderaxespad=0.0, handlelength=1.2, columnspacing=1.0,
+    )  # fmt: skip
+    cursor.skip(52)
+
+
+def _map_words(found: AxisTuning) -> str:
+    lost = number_words(max(found.gain_nats * found.count, 0.0), 2)
+    return (
+        f"Asked for: SIGMA_A {_words(found.filter_sigma_a, 'm/s²')}, SIGMA_Z "
+        f"{_words(found.sigma_z, 'm')}. The chosen pair lies {lost} below (ln). Along a dotted "
+        "line the gain is the same."
     )
-
-
-def _ticks(low: float, high: float) -> list[float]:
-    """A few round numbers on a log scale."""
-    steps = [m * 10.0**e for e in range(-5, 4) for m in (1, 2, 5)]
-    inside = [step for step in steps if low <= step <= high]
-    if len(inside) >= 2:
-        return inside
-    return [float(f"{value:.2g}") for value in np.geomspace(low, high, 5)[1:-1]]
-
-
-def _point(noise: Noise) -> float:
-    return noise.value if noise.value is not None else (noise.high or noise.low or float("nan"))
 
 
 def _words(noise: Noise, unit: str) -> str:
     if noise.value is None:
         if noise.high is None:
-            return "not determined by this flight"
-        return f"at most {noise.high:.2g} {unit} (95 %)"
+            return "not determined"
+        return f"at most {number_words(noise.high)} {unit}"
+    low, high = (number_words(end or 0.0) for end in (noise.low, noise.high))
     if noise.high is None:
-        return f"{noise.value:.3g} {unit}, without an upper bound"
-    low = 0.0 if noise.low is None else noise.low
-    return f"{noise.value:.3g} {unit} (95 % {low:.3g} to {noise.high:.3g})"
+        return f"{number_words(noise.value)} {unit} or more"
+    return f"{number_words(noise.value)} {unit} ({low} to {high})"
+
+
+def _point(noise: Noise) -> float:
+    return noise.value or noise.high or noise.low or float("nan")
+
+
+def _drop(document: Document, name: str, found: AxisTuning, a: Array, z: Array) -> Array:
+    """Ln of how much less likely each pair is than the best of them, shape (n, m)."""
+    comparison = document.comparison
+    axes = [
+        one.axis for one in comparison.axes
+        if one.axis.name == name or (name == HORIZONTAL and one.axis.name in ("north", "east"))
+    ]  # fmt: skip
+    legs = [preintegrate(axis, comparison.settings) for axis in axes]
+    time = axes[0].measurement_time_s[-len(legs[0].measurement_m) :]
+    weight = np.where(np.isin(time, found.outlier_time_s), FIRST_WIDTH**-2.0, 1.0)
+    total = total_over_grid(legs, a[:, None], z[None, :], weight)
+    return np.asarray(total - total.min())
+
+
+def _round_ticks(axes: Axes) -> None:
+    """A few round numbers on both logarithmic axes."""
+    for axis in (axes.xaxis, axes.yaxis):
+        low, high = axis.get_view_interval()
+        ones = 10.0 ** np.arange(-5, 4)
+        steps = np.sort(np.concatenate([ones, 2 * ones, 5 * ones]))
+        ticks = steps[(low <= steps) & (steps <= high)]
+        if len(ticks) > 6:
+            ticks = ones[(low <= ones) & (ones <= high)]
+        axis.set_major_locator(FixedLocator(ticks.tolist()))
+        axis.set_major_formatter(lambda value, _: number_words(value))
+        axis.set_minor_locator(NullLocator())
+        axis.set_minor_formatter(NullFormatter())
+
+
+def _gains(cursor: Cursor, ratio: float, gains: Array) -> None:
+    """Settled gain over the ratio: a curve, on which both knobs stand."""
+    at = [ratio * a / z for _, a, z in SETTINGS]
+    say = (
+        f"{gains[0]:.2f} as chosen; {gains[1]:.2f} with four times SIGMA_A and {gains[2]:.2f} with "
+        f"a quarter of SIGMA_Z; {gains[3]:.2f} with a quarter of SIGMA_A and {gains[4]:.2f} with "
+        "four times SIGMA_Z: each square holds its circle."
+    )
+    axes = panel(cursor, "Gain of position, settled, over the ratio", say, MAP, left=MIDDLE + 0.04)
+    axes.plot(ratio * CURVE, gains[len(SETTINGS) :], color=MUTED, lw=1.0)
+    axes.plot(np.array(at)[[1, 3]], gains[[1, 3]], **OF_A, label="SIGMA_A × or / 4")
+    axes.plot(np.array(at)[[2, 4]], gains[[2, 4]], **OF_Z, label="SIGMA_Z / or × 4")
+    axes.plot(at[0], gains[0], "X", color="#e0741a", mec="black", mew=0.6, ms=7.0, label="chosen")
+    axes.set_xscale("log")
+    axes.set_xlim(ratio * CURVE[0], ratio * CURVE[-1])
+    axes.set_ylim(0.0, 1.0)
+    axes.xaxis.set_major_locator(FixedLocator((ratio * CURVE[::4]).tolist()))
+    axes.xaxis.set_major_formatter(lambda value, _: number_words(value, 2))
+    axes.xaxis.set_minor_locator(NullLocator())
+    axes.set_xlabel("SIGMA_A / SIGMA_Z (1/s²)")
+    axes.legend(loc="upper left", ncols=3, bbox_to_anchor=(-0.08, -0.2), borderaxespad=0.0,
+                handlelength=1.0, columnspacing=1.0)  # fmt: skip
+    cursor.skip(40)
 
 
 def _settled(values: Array) -> Array:
@@ -141,72 +264,85 @@ def _settled(values: Array) -> Array:
     return np.asarray(np.median(values[len(values) // 2 :], axis=0))
 
 
-def _curves(figure: Figure, top: float, by_a: States, by_z: States) -> None:
-    """Settled gain and σ against the factor on each knob."""
-    left = LEFT + (RIGHT - LEFT) * 0.56
-    height = MAP_HEIGHT * 0.4
-    for at, (title, column) in enumerate(
-        (("settled gain (position)", "gain"), ("settled σ of position (m)", "sigma_p_m"))
-    ):
-        bottom = top - height - at * (MAP_HEIGHT - height)
-        axes = figure.add_axes((left, bottom, RIGHT - left, height))
-        for run, style, label in (
-            (by_a, {"color": OURS, "marker": "o", "ls": "-"}, "SIGMA_A × factor"),
-            (by_z, {"color": EKF2, "marker": "s", "ls": "--", "mfc": "none"}, "SIGMA_Z × factor"),
-        ):
-            axes.plot(FACTORS, _settled(getattr(run, column)), ms=3.5, lw=1.0, label=label, **style)  # type: ignore[arg-type]
-        axes.set_xscale("log", base=2)
-        axes.set_xticks(FACTORS, [f"{factor:g}" for factor in FACTORS])
-        axes.xaxis.set_minor_formatter(NullFormatter())
-        axes.set_ylim(bottom=0.0)
-        axes.set_title(title)
-        if at == 0:
-            axes.tick_params(axis="x", labelbottom=False)
-        else:
-            axes.legend(loc="upper left")
-            gain, sigma = _settled(by_a.gain), _settled(by_a.sigma_p_m)
-            axes.set_xlabel("factor on the chosen value")
-            caption(axes, f"at the chosen values: gain {gain[2]:.2f}, σ_p {sigma[2]:.3f} m")
+def _apart_words(run: States, pair: tuple[int, int]) -> str:
+    """How far the two tracks of a pair are from one another and from the chosen one."""
+    settled = run.velocity_m_s[len(run.velocity_m_s) // 2 :]
+    apart = float(np.sqrt(np.mean((settled[:, pair[0]] - settled[:, pair[1]]) ** 2)))
+    moved = float(np.sqrt(np.mean((settled[:, pair[0]] - settled[:, 0]) ** 2)))
+    same = "Less than 0.001" if apart < 0.0005 else f"{apart:.3f}"
+    why = (
+        " What gaps of the IMU add to the variance does not scale with them."
+        if apart > LITTLE_APART * moved
+        else ""
+    )
+    return f"{same} m/s RMS from one another, {moved:.3f} m/s from the chosen track.{why}"
 
 
-def _multiples(rows: list[list[Axes]], symbol: str, run: States, result: AxisComparison) -> None:
-    """Velocity and σ of velocity over a stretch of the flight, one column per factor."""
+def _window(result: AxisComparison, velocity: Array, missing: Sequence[Span]) -> Span:
+    """The stretch with the most motion, among those in which the least is missing."""
+    time = result.axis.measurement_time_s[-len(velocity) :]
+    latest = max(time[-1] - WINDOW_S, time[0])
+
+    def worth(start: float) -> tuple[float, float]:
+        end = start + WINDOW_S
+        lost = sum(max(0.0, min(end, until) - max(start, since)) for since, until in missing)
+        inside = velocity[(start <= time) & (time <= end)]
+        return -lost, float(np.ptp(inside)) if len(inside) else 0.0
+
+    best = max(np.arange(time[0], latest + 1e-9, WINDOW_STEP_S).tolist(), key=worth)
+    return best, min(best + WINDOW_S, float(time[-1]))
+
+
+def _tracks(
+    axes: Axes, result: AxisComparison, run: States, pair: tuple[int, int], window: Span
+) -> None:
+    """Two tracks on one another, and the truth."""
     time = result.axis.measurement_time_s[-len(run.velocity_m_s) :]
-    middle = (time[0] + time[-1]) / 2.0
-    inside = np.abs(time - middle) <= WINDOW_S / 2.0
-    settled = slice(len(time) // 2, None)
-    truth = None if isinstance(result.truth, Unavailable) else result.truth["velocity_m_s"].dropna()
-    against = truth if truth is not None and len(truth) else None
-    low, high = run.velocity_m_s[inside].min(), run.velocity_m_s[inside].max()
-    for column, factor in enumerate(FACTORS):
-        axes, below = rows[0][column], rows[1][column]
-        value, sigma = run.velocity_m_s[:, column], run.sigma_v_m_s[:, column]
-        if against is not None:
-            shown = against[np.abs(against.index - middle) <= WINDOW_S / 2.0]
-            axes.plot(shown.index, shown, **TRUTH_LINE)
-        axes.plot(time[inside], value[inside], **OURS_LINE)
-        axes.set_ylim(low - 0.1 * (high - low) - 1e-3, high + 0.1 * (high - low) + 1e-3)
-        axes.set_title(f"{symbol} × {factor:g}", size=7.5)
-        below.plot(time[inside], sigma[inside], **OURS_LINE)
-        below.set_ylim(0.0, 1.15 * float(run.sigma_v_m_s[inside].max()))
-        for single in (axes, below):
-            single.tick_params(axis="y", labelleft=column == 0)
-            single.tick_params(axis="x", labelbottom=False, bottom=False)
-        numbers = f"mean NIS {np.mean(run.nis[settled, column]):.2f}"
-        if against is not None:
-            error = value - np.interp(time, against.index, against)
-            numbers = f"RMSE {np.sqrt(np.mean(error[settled] ** 2)):.3f} m/s; " + numbers
-        caption(axes, numbers, size=6.3)
-        caption(below, f"σ_v {np.median(sigma[settled]):.3f} m/s", size=6.3)
-    rows[0][0].set_ylabel("v (m/s)")
-    rows[1][0].set_ylabel("σ_v (m/s)")
-    figure = rows[0][0].get_figure()
-    if figure is not None and symbol == "SIGMA_Z":
-        box = rows[1][0].get_position()
-        figure.text(
-            box.x0, BOTTOM + 0.01,
-            f"{WINDOW_S:g} s about the middle of the flight"
-            + (", dotted: truth" if against is not None else "")
-            + "; numbers over its second half.",
-            size=6.8, color=MUTED,
-        )  # fmt: skip
+    inside = (window[0] <= time) & (time <= window[1])
+    truth = _truth(result)
+    for column, style in zip(pair, (THICK, THIN), strict=True):
+        axes.plot(*thin(time[inside], run.velocity_m_s[inside, column]), **style,
+                  label=SETTINGS[column][0])  # fmt: skip
+    if truth is not None:
+        shown = (window[0] <= truth[0]) & (truth[0] <= window[1])
+        axes.plot(*thin(truth[0][shown], truth[1][shown]), **TRUTH_LINE, label="truth")
+    axes.set_xlim(*window)
+
+
+def _truth(result: AxisComparison) -> tuple[Array, Array] | None:
+    """Times and velocities of the truth."""
+    if isinstance(result.truth, Unavailable):
+        return None
+    known = result.truth["velocity_m_s"].dropna()
+    return (known.index.to_numpy(), known.to_numpy()) if len(known) else None
+
+
+def _table(cursor: Cursor, result: AxisComparison, run: States, chosen: Array) -> None:
+    """What each setting claims, beside what it does: one text per column."""
+    time = result.axis.measurement_time_s[-len(run.nis) :]
+    half = slice(len(time) // 2, None)
+    truth = _truth(result)
+    count = len(SETTINGS)
+    gains, sigmas = _settled(run.gain), _settled(run.sigma_p_m)
+    nis = np.mean(run.nis[half], axis=0)
+    columns = [
+        ("", [label for label, _, _ in SETTINGS]),
+        ("SIGMA_A (m/s²)", [number_words(chosen[0] * a) for _, a, _ in SETTINGS]),
+        ("SIGMA_Z (m)", [number_words(chosen[1] * z) for _, _, z in SETTINGS]),
+        ("gain", [f"{gain:.2f}" for gain in gains[:count]]),
+        ("σ_p (m)", [number_words(sigma) for sigma in sigmas[:count]]),
+        ("mean NIS", [number_words(value) for value in nis[:count]]),
+    ]
+    if truth is not None:
+        error = run.velocity_m_s[half, :count] - np.interp(time[half], *truth)[:, None]
+        rmse = np.sqrt(np.mean(error**2, axis=0))
+        columns.append(("v RMSE to truth (m/s)", [f"{value:.3f}" for value in rmse]))
+    cursor.write("One track, two claims", size=9.0, weight="bold")
+    cursor.write(
+        f"With four times SIGMA_A σ_p is {factor_words(sigmas[1] / sigmas[2])} times what it is "
+        f"with a quarter of SIGMA_Z, and the NIS {factor_words(nis[2] / nis[1])} times smaller, "
+        "about the same track. Numbers over the second half of the flight."
+    )
+    cursor.skip(3)
+    edges = np.linspace(LEFT, RIGHT, len(columns) + 1)
+    cursor.columns(dict(zip(edges.tolist(), columns, strict=False)), size=7.6)

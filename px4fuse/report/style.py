@@ -6,8 +6,10 @@ in grey. Text from outside (names, notes) is drawn as it is: no mathematics, no 
 
 from __future__ import annotations
 
+import logging
 import textwrap
-from collections.abc import Iterator, Sequence
+import unicodedata
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
@@ -22,6 +24,7 @@ from matplotlib.ft2font import LoadFlags
 from matplotlib.ticker import MaxNLocator
 
 from px4fuse.arrays import Array
+from px4fuse.report import fonts
 
 A4_INCHES = (8.27, 11.69)
 LEFT, RIGHT, TOP, BOTTOM = 0.085, 0.945, 0.95, 0.05
@@ -54,13 +57,6 @@ MEASURED: dict[str, Any] = {
     "color": MEASUREMENT, "marker": ".", "ms": 1.8, "mew": 0, "ls": "none",
 }  # fmt: skip
 
-# The first is matplotlib's own and always there; the others serve scripts that it lacks.
-FONTS = (
-    "DejaVu Sans", "Noto Sans", "Noto Sans Thai", "Leelawadee UI", "Thonburi", "Noto Sans CJK SC",
-    "Noto Sans CJK JP", "WenQuanYi Zen Hei", "Microsoft YaHei", "PingFang SC", "Hiragino Sans GB",
-    "Malgun Gothic", "Noto Sans Arabic", "Noto Sans Devanagari", "Segoe UI", "Arial Unicode MS",
-)  # fmt: skip
-NO_GLYPH = "\N{WHITE SQUARE}"
 # What the eye can see across a page, and across a third of it: longer series are thinned to their
 # extremes per bucket.
 MAX_POINTS = 1500
@@ -68,50 +64,65 @@ MAX_POINTS_NARROW = 500
 
 
 @contextmanager
-def report_style() -> Iterator[None]:
-    """Matplotlib settings of the report, for the duration of a block."""
-    with mpl.rc_context(
-        {
-            "font.family": list(_available_fonts()),
-            "font.size": 7.5,
-            "axes.titlesize": 8.5,
-            "axes.titlelocation": "left",
-            "axes.titlepad": 4,
-            "axes.titley": 1.0,  # fixed: placing titles automatically lays every axis out twice
-            "axes.labelsize": 7.5,
-            "axes.labelpad": 2,
-            "axes.linewidth": 0.6,
-            "axes.spines.top": False,
-            "axes.spines.right": False,
-            "axes.unicode_minus": True,
-            "axes.grid": True,
-            "axes.grid.axis": "y",
-            "grid.color": "#e3e3e3",
-            "grid.linewidth": 0.5,
-            "axes.axisbelow": True,
-            "xtick.labelsize": 7,
-            "ytick.labelsize": 7,
-            "xtick.major.width": 0.6,
-            "ytick.major.width": 0.6,
-            "xtick.major.size": 2.5,
-            "ytick.major.size": 2.5,
-            "legend.fontsize": 7,
-            "legend.frameon": False,
-            "legend.handlelength": 2.4,
-            "text.parse_math": False,
-            "pdf.fonttype": 42,
-            "pdf.compression": 6,
-            "path.simplify": True,
-            "path.simplify_threshold": 0.5,
-        }
+def report_style(outside: str = "") -> Iterator[None]:
+    """Matplotlib settings of the report, for the duration of a block.
+
+    Parameters
+    ----------
+    outside : str
+        What comes from outside (names, notes), for fonts that have its characters.
+    """
+    with (
+        _quiet(),
+        mpl.rc_context(
+            {
+                "font.family": fonts.families(outside),
+                "font.size": 7.5,
+                "axes.titlesize": 8.5,
+                "axes.titlelocation": "left",
+                "axes.titlepad": 4,
+                "axes.titley": 1.0,  # fixed: placing titles automatically lays every axis out twice
+                "axes.labelsize": 7.5,
+                "axes.labelpad": 2,
+                "axes.linewidth": 0.6,
+                "axes.spines.top": False,
+                "axes.spines.right": False,
+                "axes.unicode_minus": True,
+                "axes.grid": True,
+                "axes.grid.axis": "y",
+                "grid.color": "#e3e3e3",
+                "grid.linewidth": 0.5,
+                "axes.axisbelow": True,
+                "xtick.labelsize": 7,
+                "ytick.labelsize": 7,
+                "xtick.major.width": 0.6,
+                "ytick.major.width": 0.6,
+                "xtick.major.size": 2.5,
+                "ytick.major.size": 2.5,
+                "legend.fontsize": 7,
+                "legend.frameon": False,
+                "legend.handlelength": 2.4,
+                "text.parse_math": False,
+                "pdf.fonttype": 42,
+                "pdf.compression": 6,
+                "path.simplify": True,
+                "path.simplify_threshold": 0.5,
+            }
+        ),
     ):
         yield
 
 
-@cache
-def _available_fonts() -> tuple[str, ...]:
-    installed = {entry.name for entry in font_manager.fontManager.ttflist}
-    return tuple(name for name in FONTS if name in installed)
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Without matplotlib's remarks that a font has no regular weight."""
+    logger = logging.getLogger(font_manager.__name__)
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        logger.setLevel(level)
 
 
 @cache
@@ -127,39 +138,24 @@ def printable(text: str) -> str:
         if character in "\n" or (character.isprintable() and _has_glyph(character)):
             drawn.append(character)
         elif character.isprintable():
-            drawn.append(NO_GLYPH)
+            drawn.append(fonts.NO_GLYPH)
     return "".join(drawn)
 
 
-def lacks_glyphs(text: str) -> bool:
-    """Whether a part of a text can only be drawn as white squares here."""
-    return NO_GLYPH in printable(text.replace(NO_GLYPH, ""))
-
-
-@cache
 def _has_glyph(character: str) -> bool:
-    code = ord(character)
-    return any(_font(name, "normal").get_char_index(code) for name in _available_fonts())
+    return fonts.font_of(character) in mpl.rcParams["font.family"]
 
 
 @cache
 def text_width(text: str, size: float, weight: str = "normal") -> float:
-    """Width of a line of text in points, kerning and all fonts but the first left out."""
-    font = _font(FONTS[0], weight)
-    font.set_size(size, 72.0)
-    width = 0.0
-    for character in text:
-        if font.get_char_index(ord(character)):
-            width += _advance(character, weight) * size
-        else:
-            width += 1.05 * size  # wide scripts: an em and a little
-    return width
+    """Width of a line of text in points, kerning and shaping left out."""
+    return size * sum(_advance(character, weight) for character in text)
 
 
 @cache
 def _advance(character: str, weight: str) -> float:
     """Advance of one character in em."""
-    font = _font(FONTS[0], weight)
+    font = _font(fonts.font_of(character) or fonts.FONT, weight)
     font.set_size(100.0, 72.0)
     return (
         float(font.load_char(ord(character), flags=LoadFlags.NO_HINTING).linearHoriAdvance)
@@ -172,13 +168,13 @@ def wrap(text: str, size: float, width_points: float, weight: str = "normal") ->
     """Break text into lines that fit; a word longer than a line is broken too."""
     lines: list[str] = []
     for paragraph in text.split("\n"):
-        line = ""
-        for word in paragraph.split(" "):
-            candidate = f"{line} {word}" if line else word
+        line = " " * (len(paragraph) - len(paragraph.lstrip(" ")))
+        for word in paragraph.lstrip(" ").split(" "):
+            candidate = f"{line} {word}" if line.strip() else line + word
             if text_width(candidate, size, weight) <= width_points:
                 line = candidate
                 continue
-            if line:
+            if line.strip():
                 lines.append(line)
             line = word
             while (fitting := _fitting(line, size, width_points, weight)) < len(line):
@@ -201,7 +197,7 @@ def _fitting(text: str, size: float, width_points: float, weight: str) -> int:
     width = 0.0
     for count, character in enumerate(text):
         width += text_width(character, size, weight)
-        if width > width_points:
+        if width > width_points and not unicodedata.category(character).startswith("M"):
             return max(count, 1)
     return len(text)
 
@@ -228,6 +224,28 @@ class Cursor:
         for line in wrap(printable(text), size, (right - x) * POINTS_PER_WIDTH, weight):
             self.y -= size * spacing / POINTS_PER_HEIGHT
             self.figure.text(x, self.y, line, size=size, weight=weight, color=colour, va="baseline")
+
+    def columns(
+        self, columns: Mapping[float, tuple[str, Sequence[str]]], *, size: float = 7.6
+    ) -> None:
+        """Write a table and move below it.
+
+        Parameters
+        ----------
+        columns : mapping from float to (str, sequence of str)
+            Left edge (fraction of the page) to head and cells.
+        """
+        count = max(len(cells) for _, cells in columns.values())
+        self.skip(size * 1.35)
+        for x, (head, cells) in columns.items():
+            self.figure.text(x, self.y, printable(head), size=size, color=MUTED)
+            for number, cell in enumerate(cells, start=1):
+                if cell:
+                    y = self.y - (3.0 + number * size * 1.4) / POINTS_PER_HEIGHT
+                    self.figure.text(x, y, printable(cell), size=size)
+        self.skip(3.0)
+        self.rule()
+        self.skip(count * size * 1.4)
 
     def height(
         self, text: str, *, size: float = 8.0, weight: str = "normal", x: float = LEFT,
@@ -258,6 +276,15 @@ def page(title: str, lead: str = "") -> tuple[Figure, Cursor]:
         cursor.write(lead, size=8.0, colour=MUTED)
     cursor.skip(6)
     return figure, cursor
+
+
+def appendix(title: str) -> str:
+    """Title of a page that stands after the core.
+
+    >>> appendix("Notes by the student")
+    'Appendix: notes by the student'
+    """
+    return f"Appendix: {title[0].lower()}{title[1:]}"
 
 
 def panels(
@@ -312,6 +339,22 @@ def panel(
     axes.xaxis.set_major_locator(MaxNLocator(8))
     axes.yaxis.set_major_locator(MaxNLocator(4))
     return axes
+
+
+def legend_beside_title(axes: Axes, top: float, **options: Any) -> None:
+    """Legend of a panel on the line of its title, at the right, where nothing lies beneath.
+
+    Parameters
+    ----------
+    top : float
+        Where the cursor stood before the panel.
+    """
+    figure, right = axes.figure, axes.get_position().x1
+    axes.legend(
+        loc="lower right", bbox_to_anchor=(right, top - 12.5 / POINTS_PER_HEIGHT), ncols=9,
+        bbox_transform=figure.transFigure, borderaxespad=0.0, borderpad=0.0, columnspacing=1.2,
+        **options,
+    )  # fmt: skip
 
 
 def bare_x(axes: Axes) -> None:

@@ -17,7 +17,7 @@ from px4fuse.findings import Finding
 from px4fuse.findings.source_clock import typed_offset_s
 from px4fuse.findings.variance import VARIANCE_FACTOR
 from px4fuse.flight import Alignment, ClockMap, Unavailable
-from px4fuse.plain import factor_words
+from px4fuse.plain import factor_words, p_words
 
 # One update of EKF2 (EKF2_PREDICT_US)
 NEGLIGIBLE_OFFSET_S = 0.010
@@ -114,7 +114,8 @@ def verdict_notes(comparison: Comparison) -> list[str]:
         )
     notes += _same_nis(stated)
     coloured = [
-        f"{owner} {axis} p {statement.ljung_box_p:.1g}, lag-1 {statement.lag1_autocorrelation:+.2f}"
+        f"{owner} {axis} {p_words(statement.ljung_box_p)}, lag-1 "
+        f"{statement.lag1_autocorrelation:+.2f}"
         for axis, owner, statement in stated
         if statement.verdict == "consistent" and statement.ljung_box_p < WHITE_P
     ]
@@ -282,6 +283,24 @@ def noise_and_bias_words(found: AxisTuning) -> str:
     )
 
 
+def stamps_wrong(comparison: Comparison, clock: ClockOffset) -> bool:
+    """Whether the stamps of the source are late or early beyond doubt, as they were recorded."""
+    applied = comparison.settings.clock_offset_s
+    low, high = clock.interval_s
+    negligible = abs(applied + clock.offset_s) < NEGLIGIBLE_OFFSET_S
+    return clock.determinable and not (low <= -applied <= high or negligible)
+
+
+def delay_wrong(comparison: Comparison, clock: ClockOffset) -> bool:
+    """Whether PX4's EKF2_EV_DELAY is known, and not what the data ask for."""
+    delay = comparison.flight.log.parameters.get("EKF2_EV_DELAY")
+    if delay is None or not clock.determinable:
+        return False
+    asked = comparison.settings.clock_offset_s + np.array(clock.interval_s)
+    margin = NEGLIGIBLE_OFFSET_S
+    return not -(asked[1] + margin) <= delay * 1e-3 <= -(asked[0] - margin)
+
+
 def clock_advice(comparison: Comparison, clock: ClockOffset | Unavailable) -> list[str]:
     """What the clock estimate says, and what follows from it: lines as of tuning_advice."""
     if isinstance(clock, Unavailable):
@@ -299,7 +318,7 @@ def clock_advice(comparison: Comparison, clock: ClockOffset | Unavailable) -> li
         "added to the stamps of the source"
     )
     side = "late" if offset < 0.0 else "early"
-    if low <= -applied <= high or abs(offset) < NEGLIGIBLE_OFFSET_S:
+    if not stamps_wrong(comparison, clock):
         lines.append("Reading  the stamps are right as far as this flight can tell")
     else:
         lines.append(f"Reading  the stamps are {side} by {abs(offset):.3f} s")
@@ -307,9 +326,7 @@ def clock_advice(comparison: Comparison, clock: ClockOffset | Unavailable) -> li
         lines.append(f"Re-run   px4fuse compare LOG --clock-offset {typed:.3f}")
     delay = log.parameters.get("EKF2_EV_DELAY")
     if delay is not None:
-        margin = NEGLIGIBLE_OFFSET_S
-        inside = -(applied + high + margin) <= delay * 1e-3 <= -(applied + low - margin)
-        if inside:
+        if not delay_wrong(comparison, clock):
             lines.append(f"PX4      EKF2_EV_DELAY {delay:g} ms fits")
         elif offset > 0.0 and delay <= 0.0:
             lines.append(
@@ -326,7 +343,7 @@ def clock_advice(comparison: Comparison, clock: ClockOffset | Unavailable) -> li
             f"{applied + p.offset_s:+.2f} s from {p.start_s:.0f} s" for p in clock.parts
         )
         lines.append(
-            f"Changes  the offset is not the same throughout (p {clock.change_p:.1g}): {parts}"
+            f"Changes  the offset is not the same throughout ({p_words(clock.change_p)}): {parts}"
         )
     if clock.drift_ppm is not None and clock.drift_sigma_ppm is not None:
         lines.append(f"Drift    {clock.drift_ppm:+.0f} ± {1.96 * clock.drift_sigma_ppm:.0f} ppm")

@@ -1,0 +1,116 @@
+"""Fonts for names and notes in every script: which of this machine draw a text, or what to install.
+
+Matplotlib shapes text with HarfBuzz from version 3.11, so that Arabic joins, Devanagari orders and
+Thai stacks as they should. What it needs is a font that has the characters.
+"""
+
+from __future__ import annotations
+
+import sys
+import unicodedata
+from functools import cache
+
+from matplotlib import font_manager
+from matplotlib.font_manager import FontEntry, FontPath
+
+# Matplotlib's own, always there: Latin, Greek, Cyrillic, Arabic, Hebrew and symbols
+FONT = "DejaVu Sans"
+# Taken before the others that have a character. Those with PostScript outlines come late: they are
+# embedded as if they were TrueType, and not every viewer forgives that
+PREFERRED = (
+    "Noto Sans", "Noto Sans Thai", "Noto Sans Devanagari", "Leelawadee UI", "Thonburi",
+    "Nirmala UI", "Devanagari MT", "Noto Sans SC", "Microsoft YaHei", "Malgun Gothic", "Yu Gothic",
+    "WenQuanYi Zen Hei", "Arial Unicode MS", "Noto Sans CJK SC", "Hiragino Sans GB", "Segoe UI",
+)  # fmt: skip
+# These have a box for every character
+BOXES = ("lastresort", "last resort", "blank", "notdef")
+NO_GLYPH = "\N{WHITE SQUARE}"
+MOST_SHOWN = 12
+# First word of Unicode's name of a character, for scripts that people call otherwise
+SCRIPTS = {"CJK": "Chinese", "HIRAGANA": "Japanese", "KATAKANA": "Japanese", "HANGUL": "Korean"}
+# Where it is not "Noto Sans" and the script; and Debian's package where that is not fonts-noto-core
+NOTO = {
+    "Chinese": "Noto Sans SC", "Japanese": "Noto Sans JP", "Korean": "Noto Sans KR",
+    "symbol": "Noto Emoji",
+}  # fmt: skip
+PACKAGES = dict.fromkeys(("Chinese", "Japanese", "Korean"), "fonts-wqy-zenhei") | {
+    "symbol": "fonts-symbola"
+}
+
+
+@cache
+def font_of(character: str) -> str | None:
+    """The font that draws a character: DejaVu Sans, else the first of the machine that has it."""
+    if ord(character) in _characters(font_manager.findfont(FONT)):
+        return FONT
+    return next((name for name, path in _others() if ord(character) in _characters(path)), None)
+
+
+def families(text: str) -> list[str]:
+    """Fonts that draw a text, DejaVu Sans first."""
+    found = [font_of(character) for character in _foreign(text)]
+    return list(dict.fromkeys([FONT, *(name for name in found if name is not None)]))
+
+
+def missing(text: str) -> str:
+    """Characters of a text that no font of this machine has, each once."""
+    return "".join(character for character in _foreign(text) if font_of(character) is None)
+
+
+def advice(characters: str) -> str:
+    """What to install for :func:`missing` characters, as one sentence or two."""
+    scripts = list(dict.fromkeys(map(_script, characters)))
+    shown = characters[:MOST_SHOWN] + ("…" if len(characters) > MOST_SHOWN else "")
+    noto = " and ".join(dict.fromkeys(NOTO.get(s, f"Noto Sans {s}") for s in scripts))
+    if sys.platform.startswith("linux"):
+        packages = dict.fromkeys(PACKAGES.get(s, "fonts-noto-core") for s in scripts)
+        install = f"Install a font that has them: sudo apt install {' '.join(packages)}."
+    else:
+        install = f"Install a font that has them: {noto}, from fonts.google.com/noto."
+    return (
+        f"No font of this machine has the {' and '.join(scripts)} characters {shown}: the report "
+        f"shows {NO_GLYPH} for each. {install}"
+    )
+
+
+def _foreign(text: str) -> list[str]:
+    return [c for c in dict.fromkeys(text) if not c.isascii() and c.isprintable()]
+
+
+def _script(character: str) -> str:
+    if unicodedata.category(character).startswith("S"):
+        return "symbol"
+    word = unicodedata.name(character, "unknown").split()[0]
+    return SCRIPTS.get(word, word.capitalize())
+
+
+@cache
+def _others() -> tuple[tuple[str, FontPath], ...]:
+    """Every other font of the machine, also those newer than matplotlib's own list."""
+    manager = font_manager.fontManager
+    known = {str(entry.fname) for entry in manager.ttflist}
+    for path in sorted(set(font_manager.findSystemFonts()) - known):
+        try:
+            manager.addfont(path)
+        except (OSError, RuntimeError, NotImplementedError):
+            continue  # what matplotlib cannot read draws nothing
+    entries = [
+        entry for entry in manager.ttflist
+        if entry.style == "normal" and not any(word in entry.name.lower() for word in BOXES)
+    ]  # fmt: skip
+    return tuple(
+        (entry.name, FontPath(entry.fname, entry.index)) for entry in sorted(entries, key=_order)
+    )
+
+
+def _order(entry: FontEntry) -> tuple[object, ...]:
+    rank = PREFERRED.index(entry.name) if entry.name in PREFERRED else len(PREFERRED)
+    weight = entry.weight if isinstance(entry.weight, int) else 400
+    postscript = str(entry.fname).lower().endswith(".otf")
+    sans = "Sans" in entry.name
+    return rank, postscript, not sans, abs(weight - 400), entry.name, str(entry.fname), entry.index
+
+
+@cache
+def _characters(path: FontPath) -> frozenset[int]:
+    return frozenset(font_manager.get_font(path).get_charmap())
