@@ -21,7 +21,7 @@ from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.kalman import state_at
 from px4fuse.findings.model import Detector, Finding, Found, Threshold
 from px4fuse.flight import Unavailable
-from px4fuse.plain import factor_words
+from px4fuse.plain import factor_words, number_words
 from px4fuse.trajectory.alignment import fit
 
 NEES_LARGE = Threshold(4.0, "times", "errors twice as large as σ; clean flights stay below 3")
@@ -94,7 +94,7 @@ def _detect(analysis: Analysis) -> Found:
         said.append(
             f"{name} claims σ {claimed:.2g} m along {one.result.axis.name} and errs by "
             f"{one.truth.position_rmse_m:.2f} m RMS (mean NEES {factor_words(one.nees)}, mean NIS "
-            f"{one.statement.nis_mean:.2g}; 1 is consistent)"
+            f"{number_words(one.statement.nis_mean, 2)}; 1 is consistent)"
         )
     small = worst.statement.nis_mean < SMALL.value
     words = "; ".join(said) + "."

@@ -10,6 +10,7 @@ from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.findings.model import Detector, Finding, Found, Threshold
 from px4fuse.findings.source_smoothed import low_pass
 from px4fuse.flight import POSITION_VARIANCE_COLUMNS, Unavailable
+from px4fuse.plain import factor_words
 
 REPORTED = Threshold(2.0, "times", "in variance; EKF2's own NIS is off by about that")
 REPORTED_ERROR = Threshold(3.0, "times", "in variance: beyond what EKF2's NIS bears")
@@ -39,8 +40,8 @@ def _detect(analysis: Analysis) -> Found:
         "error" if size >= REPORTED_ERROR.value else "warning",
         f"{source.name} reports a standard deviation of {sigma:.3g} m, and its noise is "
         f"{noise.value:.3g} m (95 % {noise.low:.3g} to {noise.high:.3g}): the variance that it "
-        f"sends is {size:.2g} times too {'small' if small else 'large'}. EKF2 takes R from it "
-        "(EKF2_EV_NOISE_MD 0), though never less than EKF2_EVP_NOISE.",
+        f"sends is {factor_words(size)} times too {'small' if small else 'large'}. EKF2 takes R "
+        "from it (EKF2_EV_NOISE_MD 0), though never less than EKF2_EVP_NOISE.",
         f"Correct it at the sender: a variance of {noise.value**2:.2g} m², or set "
         f"EKF2_EV_NOISE_MD to 1 and EKF2_EVP_NOISE to {noise.value:.2g}.",
         {

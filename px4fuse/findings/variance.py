@@ -26,7 +26,7 @@ from px4fuse.findings.errors_larger_than_claimed import hidden_errors
 from px4fuse.findings.model import Detector, Finding, Found, Severity, Threshold, lowered
 from px4fuse.findings.sigma import SMALLEST_SIGMA_Z
 from px4fuse.flight import Unavailable
-from px4fuse.plain import factor_words
+from px4fuse.plain import factor_words, number_words
 
 VARIANCE_FACTOR = Threshold(
     1.5, "times", "22 % in standard deviation; chance moves it less at n > 100"
@@ -117,7 +117,7 @@ def _variance_finding(analysis: Analysis, owner: str, group: str, members: list[
         severity,
         f"{name} innovation variance is {'overstated' if over else 'understated'} "
         f"{factor_words(factor)} times along {result.axis.name} (mean NIS "
-        f"{statement.nis_mean:.3g}, consistent is {low:.2f} to {high:.2f}; {group}).",
+        f"{number_words(statement.nis_mean)}, consistent is {low:.2f} to {high:.2f}; {group}).",
         remedy,
         evidence,
     )

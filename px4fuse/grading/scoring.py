@@ -20,6 +20,7 @@ from px4fuse.assignment.key import Answer, AnswerKey
 from px4fuse.filter.tuning import HORIZONTAL
 from px4fuse.findings import SEVERITIES
 from px4fuse.grading.model import Graded, Item, Parameter, Rubric, RubricItem
+from px4fuse.plain import factor_words
 from px4fuse.results.comparison import ASKED, Clock, Filter, HorizontalNis, Tuned
 from px4fuse.results.contract import ComparisonResults, LoopResults, Reported, to_plain
 from px4fuse.results.model import Absent
@@ -367,7 +368,7 @@ def _tuned(evidence: Evidence, axis: str, name: str, factor: float) -> tuple[flo
         return 1.0, f"{said} within {wanted}"
     share = 1.0 - math.log(off) / math.log(factor) if factor > max(off, 1.0) else 0.0
     side = "above" if chosen > high else "below"
-    return share, f"{said} {side} {wanted}, by a factor of {off:.3g}"
+    return share, f"{said} {side} {wanted}, by a factor of {factor_words(off)}"
 
 
 def _number_between(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float, str]:
@@ -444,7 +445,7 @@ def _consistent(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float, st
         said.append(
             f"{owner} is consistent ({axis})"
             if good
-            else f"{verdict} by a factor of {off:.3g} ({owner}, {axis}){because}"
+            else f"{verdict} by a factor of {factor_words(off)} ({owner}, {axis}){because}"
         )
     comment = "; ".join(said) or "the rubric names no axis"
     return sum(shares) / max(len(shares), 1), f"{comment[:1].upper() + comment[1:]}."

@@ -12,6 +12,7 @@ from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.signals import AISLE
 from px4fuse.findings import Finding
 from px4fuse.flight import Unavailable
+from px4fuse.plain import number_words
 from px4fuse.report.document import Document
 from px4fuse.report.plan import plan
 from px4fuse.report.style import (
@@ -144,7 +145,7 @@ def _large_numbers(summary: FilterSummary, truth: AgainstTruth | Unavailable) ->
     if isinstance(statement, Consistency):
         low, high = statement.nis_band
         words = (
-            f"Mean NIS {statement.nis_mean:.3g}, band {low:.2f} to {high:.2f}, from "
+            f"Mean NIS {number_words(statement.nis_mean)}, band {low:.2f} to {high:.2f}, from "
             f"{statement.count} innovations."
         )
     else:
@@ -205,7 +206,7 @@ def _cells(
     statement = summary.consistency
     return (
         verdict_words(statement),
-        f"{statement.nis_mean:.3g}" if isinstance(statement, Consistency) else "",
+        number_words(statement.nis_mean) if isinstance(statement, Consistency) else "",
         f"{truth.position_rmse_m:.3f}" if isinstance(truth, AgainstTruth) else "",
     )
 

@@ -15,6 +15,7 @@ from px4fuse.ekf2.parameters import PARAMETERS
 from px4fuse.ekf2.replay import HORIZONTAL
 from px4fuse.ekf2.whatif import Summary
 from px4fuse.flight import Unavailable
+from px4fuse.plain import number_words
 from px4fuse.report.document import WhatIfDocument
 from px4fuse.report.style import (
     BOTTOM,
@@ -40,7 +41,7 @@ WIDE = 5.0  # values that span more are drawn on a logarithmic scale
 def change_words(changed: dict[str, float]) -> str:
     """Parameters with their values and units."""
     return ", ".join(
-        f"{name} {value:.3g}{f' {PARAMETERS[name].unit}' if PARAMETERS[name].unit else ''}"
+        " ".join(filter(None, (name, number_words(value), PARAMETERS[name].unit)))
         for name, value in changed.items()
     )
 
@@ -59,7 +60,7 @@ def rows(made_of: Counterfactual) -> list[list[str]]:
     made = []
     for axis in HORIZONTAL:
         of = [summary.axes[axis] for summary in every]
-        made.append([f"{axis}: mean NIS", *(f"{a.nis_mean:.3g}" for a in of)])
+        made.append([f"{axis}: mean NIS", *(number_words(a.nis_mean) for a in of)])
         made.append(
             ["    consistent is", *(f"{a.nis_band[0]:.2f} to {a.nis_band[1]:.2f}" for a in of)]
         )
@@ -94,8 +95,8 @@ def sweep_rows(made_of: Counterfactual) -> list[list[str]]:
         axes = [summary.axes[axis] for axis in HORIZONTAL]
         made.append(
             [
-                f"{summary.changed[name]:.3g}",
-                ", ".join(f"{a.nis_mean:.3g}" for a in axes),
+                number_words(summary.changed[name]),
+                ", ".join(number_words(a.nis_mean) for a in axes),
                 f"{summary.rejected_share:.1%}",
                 _number(summary.longest_without_fusion_s, 2),
                 f"{summary.resets}",
@@ -124,7 +125,8 @@ def reading(made_of: Counterfactual) -> list[str]:
         name = swept(made_of)
         best = min(summaries, key=lambda s: abs(math.log(s.nis_mean)))
         lines.append(
-            f"Mean NIS is nearest to 1 at {name} {best.changed[name]:.3g} ({best.nis_mean:.2f})."
+            f"Mean NIS is nearest to 1 at {name} {number_words(best.changed[name])} "
+            f"({number_words(best.nis_mean)})."
         )
         errors = {
             error: summary.changed[name]
@@ -134,7 +136,7 @@ def reading(made_of: Counterfactual) -> list[str]:
         if errors:
             least = min(errors)
             lines.append(
-                f"The position error to the truth is least at {name} {errors[least]:.3g} "
+                f"The position error to the truth is least at {name} {number_words(errors[least])} "
                 f"({least:.3f} m, horizontally)."
             )
     shares = [s.rejected_share for s in (made_of.whatif.replayed, *made_of.whatif.whatif)]
@@ -249,6 +251,6 @@ def _panel(axes: Axes, values: list[float], lines: list[list[float | Unavailable
     if min(values) > 0.0:
         axes.set_xscale("log")
     ticks = values[:: math.ceil(len(values) / MAX_TICKS)]
-    axes.set_xticks(ticks, [f"{value:.3g}" for value in ticks])
+    axes.set_xticks(ticks, [number_words(value) for value in ticks])
     axes.xaxis.set_minor_locator(NullLocator())
     axes.margins(x=0.02)

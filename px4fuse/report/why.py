@@ -62,7 +62,11 @@ def draw(document: Document) -> Iterator[Figure]:
             cursor.write(f"{why.reason[:1].upper()}{why.reason[1:]}. {why.remedy}")
         else:
             _axis(figure, cursor, name, why, document)
-    below(cursor, _believed(document.analysis.ekf2_replay))
+    believed = _believed(document.analysis.ekf2_replay)
+    if cursor.y - cursor.height(believed, size=7.0) < BOTTOM:
+        yield figure
+        figure, cursor = page(f"{TITLE}, continued")
+    below(cursor, believed)
     yield figure
 
 

@@ -17,7 +17,7 @@ from px4fuse.findings import Finding
 from px4fuse.findings.source_clock import typed_offset_s
 from px4fuse.findings.variance import VARIANCE_FACTOR
 from px4fuse.flight import Alignment, ClockMap, Unavailable
-from px4fuse.plain import factor_words, p_words
+from px4fuse.plain import factor_words, number_words, p_words
 
 # One update of EKF2 (EKF2_PREDICT_US)
 NEGLIGIBLE_OFFSET_S = 0.010
@@ -58,7 +58,7 @@ def statement_cells(statement: Consistency | Unavailable) -> VerdictCells:
     if isinstance(statement, Unavailable):
         return VerdictCells("", "", words)
     low, high = statement.nis_band
-    return VerdictCells(f"{statement.nis_mean:.3g}", f"{low:.2f} – {high:.2f}", words)
+    return VerdictCells(number_words(statement.nis_mean), f"{low:.2f} – {high:.2f}", words)
 
 
 def error_cells(truth: AgainstTruth | Unavailable) -> tuple[str, str]:
