@@ -315,14 +315,6 @@ EVALUATION_OPTIONS = {
 
 # What the errors of a command may name: its arguments in Python, to its options
 ARGUMENTS = OPTIONS | {"position": "--position", "changes": "--set"}
-LOOP_ARGUMENTS = LOOP_OPTIONS | {"came_back": "--open"}
-EVALUATION_ARGUMENTS = {
-    "alignment": "--alignment",
-    "max_gap_s": "--max-gap",
-    "time_offset_s": "--time-offset",
-    "rpe_deltas": "--rpe",
-    "system": "--system",
-}
 
 
 def with_options(text: str, options: Mapping[str, str] = ARGUMENTS) -> str:

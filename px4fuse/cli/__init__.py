@@ -136,9 +136,9 @@ def main() -> None:
 
 def _in_options(text: str, command: str | None) -> str:
     """The text of an error as somebody who typed a command reads it."""
-    from px4fuse.request import ARGUMENTS, EVALUATION_ARGUMENTS, LOOP_ARGUMENTS, with_options
+    from px4fuse.request import ARGUMENTS, EVALUATION_OPTIONS, LOOP_OPTIONS, with_options
 
-    tables = {"loop": LOOP_ARGUMENTS, "evaluate": EVALUATION_ARGUMENTS}
+    tables = {"loop": LOOP_OPTIONS, "evaluate": EVALUATION_OPTIONS}
     return with_options(text, tables.get(command or "", ARGUMENTS))
 
 
