@@ -10,9 +10,10 @@ from collections.abc import Mapping
 from dataclasses import fields
 from functools import singledispatch
 from html import escape
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import pandas as pd
+if TYPE_CHECKING:
+    import pandas as pd
 
 MAX_TEXT, MAX_ROWS = 60, 12
 
@@ -20,6 +21,7 @@ MAX_TEXT, MAX_ROWS = 60, 12
 def brief(result: object) -> str:
     """A dataclass on one line, its tables and arrays by their shapes.
 
+    >>> import pandas as pd
     >>> from px4fuse.flight import Truth
     >>> brief(Truth("mocap", pd.DataFrame({"north_m": [0.0, 1.0]})))
     "Truth(name='mocap', samples=<2 × 1>)"

@@ -123,7 +123,7 @@ def compare(
         dt_s=chosen.dt_s if dt_s is None else dt_s,
         # "imu", the default of settings, asks for the IMU where it is logged
         input=input or ("zero" if chosen.input == "zero" else None),
-        axes=tuple(name for name in known if name in asked),
+        axes=tuple(name for one in asked for name in known if name == one),
         heading_deg=heading_deg,
         start_s=start_s,
         end_s=end_s,

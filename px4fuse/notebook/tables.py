@@ -347,14 +347,16 @@ def _(loop: Loop) -> str:
     gap = loop.closure_error_m
     closes = "does not say where it ended" if gap is None else f"fails to close by {gap:.2f} m"
     share = "" if gap is None else f" ({gap / loop.path_length_m:.1%})"
-    said = f"{path.name}: {loop.path_length_m:.1f} m, {closes}{share}"
-    scores = [
-        f"{correction.name} {score.ate.translation.rmse:.3g} m"
-        for correction in loop.reported
-        for score in correction.scores.values()
-        if isinstance(score, Evaluation)
-    ]
-    return f"{said}\nATE: {', '.join(scores)}" if scores else said
+    lines = [f"{path.name}: {loop.path_length_m:.1f} m, {closes}{share}"]
+    for reference in loop.references:
+        scores = ((path.name, path.scores.get(reference.name)) for path in loop.reported)
+        found = ", ".join(
+            f"{name} {score.ate.translation.rmse:.3g} m"
+            for name, score in scores
+            if isinstance(score, Evaluation)
+        )
+        lines += [f"ATE to {reference.name}: {found}"] if found else []
+    return "\n".join(lines)
 
 
 @frame.register

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pypdfium2
-from PIL import Image, ImageChops
+from PIL import Image, ImageChops, ImageOps
 
 from px4fuse.cli import cli
 
@@ -41,7 +41,7 @@ class Picture:
 
 PICTURES = (
     Picture("aisle_uwb", AISLE, "Two-state Kalman filter against EKF2", 0.64),
-    Picture("lab_1", AISLE, "The flight along the aisle", 0.66),
+    Picture("lab_1", AISLE, "The flight along the aisle", 0.64),
     Picture("lab_2", f"{AISLE} --sigma-a 0.001", "Innovations and variances"),
     Picture("lab_3", AISLE, "Why EKF2 differs", 0.66),
     Picture("lab_4", "loop sample_logs/loop_vio.ulg", "Loop closure"),
@@ -72,7 +72,7 @@ def made(picture: Picture, folder: Path) -> Image.Image:
             raise SystemExit(f"{picture.name}: no page of {picture.command} has {picture.page!r}")
     part = whole.crop((0, int(HEAD * whole.height), whole.width, int(picture.until * whole.height)))
     left, top, right, bottom = ImageChops.invert(part).getbbox() or (0, 0, *part.size)
-    return part.crop((left - MARGIN, top - MARGIN, right + MARGIN, bottom + MARGIN))
+    return ImageOps.expand(part.crop((left, top, right, bottom)), MARGIN, "white")
 
 
 def run(words: list[str]) -> None:
