@@ -467,6 +467,7 @@ def test_another_matplotlib_is_no_accusation(loop: Base) -> None:
 # -- what is changed on the pages ------------------------------------------------------------------
 
 Forge = Callable[[Base], Anatomy]
+LETTERS = "/F1"  # the font of nearly all text; /F2 is bold
 
 
 def on_page(number: int, change: Callable[[bytes], bytes]) -> Forge:
@@ -490,7 +491,7 @@ def other_digit(match: re.Match[bytes]) -> bytes:
 
 
 def aside(match: re.Match[bytes]) -> bytes:
-    return b"%.6f %s l" % (float(match[1]) + 2.0, match[2])
+    return b"%.6f %s l" % (float(match[1]) + 1.0, match[2])
 
 
 DRAWING: dict[str, Callable[[bytes], bytes]] = {
@@ -500,12 +501,12 @@ DRAWING: dict[str, Callable[[bytes], bytes]] = {
     "another point of a line moved": once(rb"([\d.]+) ([\d.]+) l", aside, last=False),
     "a line more": lambda c: c + b"\n0 g\n300 0 1 842 re\nf\n",
     "a white rectangle": lambda c: c + b"\n1 g\n100 690 300 90 re\nf\n",
-    "a text more": lambda c: c + b"\nBT\n/F2 12 Tf\n100 100 Td\n(\x00A) Tj\nET\n",
+    "a text more": lambda c: c + b"\nBT\n/F1 12 Tf\n100 100 Td\n(\x00A) Tj\nET\n",
     "a text moved": once(rb"1 0 -?0 1 ([\d.]+) ([\d.]+) cm\nBT", rb"1 0 -0 1 9\1 \2 cm\nBT"),
     "a text invisible": once(rb"BT\n", b"BT\n3 Tr\n"),
     "a text white": once(rb"BT\n", b"1 g\nBT\n"),
     "a text larger": once(rb"(/F\d+) [\d.]+ Tf", rb"\1 14 Tf"),
-    "another font": once(rb"/F2 ", b"/F3 "),
+    "another font": once(rb"/F1 ", b"/F2 "),
     "a colour": once(rb"[\d.]+ g\n", b"0.123 g\n"),
     "the end cut off": lambda c: c[: c.rindex(b"\nQ")],
     "a comment": lambda c: c + b"\n% nothing\n",
@@ -514,7 +515,7 @@ DRAWING: dict[str, Callable[[bytes], bytes]] = {
     "turned over": lambda c: b"-1 0 0 1 595 0 cm\n" + c,
     "nothing at all": lambda c: b"\n",
 }
-PAGES = 9
+PAGES = 8
 # Nobody who looks at the page sees these, or reads anything else from it (see pages.DISTANCE)
 UNSEEN = {"a comment", "an inline image", "the end cut off", "a point of a line moved",
           "another point of a line moved", "a colour"}  # fmt: skip
@@ -578,7 +579,7 @@ def font_part(name: str, path: list[str]) -> Callable[[Base], int]:
 
 def exchanged_glyphs(one: Base) -> Anatomy:
     """A font that draws a 9 where the text has a 1: all texts stay, the page reads otherwise."""
-    number = font_part("/F2", ["/DescendantFonts", "0", "/CIDToGIDMap"])(one)
+    number = font_part(LETTERS, ["/DescendantFonts", "0", "/CIDToGIDMap"])(one)
 
     def change(content: bytes) -> bytes:
         glyphs = bytearray(content)
@@ -593,8 +594,8 @@ def redrawn_glyph(one: Base) -> Anatomy:
     """A font whose outlines were edited."""
     from fontTools.ttLib import TTFont  # type: ignore[import-untyped]
 
-    number = font_part("/F2", ["/DescendantFonts", "0", "/FontDescriptor", "/FontFile2"])(one)
-    glyphs = font_part("/F2", ["/DescendantFonts", "0", "/CIDToGIDMap"])(one)
+    number = font_part(LETTERS, ["/DescendantFonts", "0", "/FontDescriptor", "/FontFile2"])(one)
+    glyphs = font_part(LETTERS, ["/DescendantFonts", "0", "/CIDToGIDMap"])(one)
     stream: Any = PdfReader(io.BytesIO(one.pdf)).get_object(glyphs)
     data = stream.get_data()
 
@@ -611,12 +612,12 @@ def redrawn_glyph(one: Base) -> Anatomy:
 
 
 def narrower_letters(one: Base) -> Anatomy:
-    number = font_part("/F2", ["/DescendantFonts", "0", "/W"])(one)
+    number = font_part(LETTERS, ["/DescendantFonts", "0", "/W"])(one)
     return one.anatomy.edited(number, lambda c: c.replace(b"636", b"036"))
 
 
 def rewritten_texts(one: Base) -> Anatomy:
-    number = font_part("/F2", ["/ToUnicode"])(one)
+    number = font_part(LETTERS, ["/ToUnicode"])(one)
     return one.anatomy.streamed(number, lambda c: c.replace(b"<0031>]", b"<0039>]").replace(
         b"<0031> <0032>", b"<0039> <0032>"))  # fmt: skip
 
@@ -628,7 +629,7 @@ def another_state(one: Base) -> Anatomy:
 
 def another_marker(one: Base) -> Anatomy:
     found: Any = PdfReader(io.BytesIO(one.pdf)).pages[0]["/Resources"]["/XObject"]  # type: ignore[index]
-    return one.anatomy.streamed(found.raw_get("/M0").idnum, lambda c: c.replace(b"0.45", b"4.5"))
+    return one.anatomy.streamed(found.raw_get("/M1").idnum, lambda c: c.replace(b"0.45", b"4.5"))
 
 
 JAVASCRIPT = b"/OpenAction << /S /JavaScript /JS (app.alert\\(1\\)) >>"

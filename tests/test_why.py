@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,8 +17,9 @@ from px4fuse.filter.clock import ClockOffset
 from px4fuse.filter.kalman import Settings, state_at
 from px4fuse.flight import Flight, Unavailable
 from px4fuse.readers import read_log
+from px4fuse.report.document import Document
 from px4fuse.report.style import BOTTOM, report_style
-from px4fuse.report.why import draw
+from px4fuse.report.why import draw, nothing_concluded
 from px4fuse.request import ComparisonRequest
 from px4fuse.results.build import results
 from px4fuse.results.contract import to_plain
@@ -143,8 +143,8 @@ def test_without_a_horizontal_axis_or_a_model_the_reason_stands(sample: Analysis
         assert (why.reason, why.remedy) == ("no IMU", "Record it.")
 
 
-def document(analysis: Analysis) -> SimpleNamespace:
-    return SimpleNamespace(analysis=analysis)
+def document(analysis: Analysis) -> Document:
+    return Document(analysis, (), Student(), "px4fuse compare")
 
 
 def drawn(analysis: Analysis) -> list:
@@ -173,8 +173,13 @@ def test_the_page_shows_words_bars_and_agreement(sample: Analysis) -> None:
         end = steps[-1].get_x() + steps[-1].get_width()
         assert end == pytest.approx(left.get_width(), abs=1e-9)
         assert getattr(of(sample).axis, total) > 0.0
-    assert len(over_time.lines) == 2
-    assert page.axes[0].get_position().y1 < min(t.get_position()[1] for t in page.texts)
+    ours, left = over_time.lines[:2]
+    assert abs(ours.get_ydata()).max() == abs(of(sample).axis.apart_m).max()
+    assert abs(left.get_ydata()).max() == abs(of(sample).axis.left_m).max()
+    by_height = sorted(page.texts, key=lambda text: text.get_position()[1])
+    for axes in page.axes:
+        box = axes.get_position()
+        assert not [t for t in by_height if box.y0 < t.get_position()[1] < box.y1]
 
 
 def test_doubtful_and_absent_replays_conclude_nothing(sample: Analysis) -> None:
@@ -182,21 +187,24 @@ def test_doubtful_and_absent_replays_conclude_nothing(sample: Analysis) -> None:
     agreement = replace(model.agreement, good=False, reason="they part")
     doubtful = replace(model, agreement=agreement, flown=replace(model.flown, agreement=agreement))
     why = why_ekf2_differs(sample.comparison, doubtful, sample.tuning, sample.clock)
-    (page,) = drawn(replace(sample, ekf2_model=doubtful, why=why))
-    assert "It does not agree: they part" in texts(page)
-    assert "nothing is concluded" in texts(page)
-    assert not page.axes
-    (page,) = drawn(
-        replace(sample, ekf2_model=Unavailable("x", "y", "z"), why={"down": why["aisle"]})
-    )
-    assert "could not be replayed" in texts(page)
+    parted = replace(sample, ekf2_model=doubtful, why=why)
+    absent = Unavailable("EKF2 replay", "no IMU", "Record it.")
+    without = replace(sample, ekf2_model=absent, why={"north": absent, "east": absent})
+    for analysis, reason in ((parted, "they part"), (without, "no IMU")):
+        assert drawn(analysis) == []
+        line = nothing_concluded(document(analysis))
+        assert line.startswith("Why EKF2 differs: nothing is concluded")
+        assert line.count(reason) == 1
     assert drawn(unexplained(sample.comparison)) == []
+    assert not nothing_concluded(document(unexplained(sample.comparison)))
+    assert not nothing_concluded(document(sample))
 
 
 def test_what_does_not_fit_on_a_page_begins_the_next(sample: Analysis) -> None:
-    long = Unavailable("why", "a sentence of some length, again " * 160, "None")
-    pages = drawn(replace(sample, why={"north": long, "east": long}))
+    long = Unavailable("why", "a sentence of some length, again " * 100, "None")
+    pages = drawn(replace(sample, why={"north": of(sample), "east": long}))
     assert len(pages) == 2
+    assert "east: nothing is concluded" in texts(pages[1])
     assert min(text.get_position()[1] for figure in pages for text in figure.texts) >= BOTTOM
     both = drawn(replace(sample, why={name: of(sample, name) for name in ("north", "east")}))
     lowest = min(axes.get_position().y0 for figure in both for axes in figure.axes)

@@ -2,33 +2,30 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from px4fuse.analysis import Analysis
+from px4fuse.comparison import events
 from px4fuse.findings.model import Detector, Finding, Found, Threshold, times
 
-GAP = Threshold(1.0, "s", "ten prediction steps without a measurement")
-GAP_INTERVALS = Threshold(5.0, "median intervals", "jitter and single losses pass")
+GAP = Threshold(events.GAP_S, "s", "ten prediction steps without a measurement")
+GAP_INTERVALS = Threshold(events.GAP_INTERVALS, "median intervals", "jitter and single losses pass")
 
 
 def _detect(analysis: Analysis) -> Found:
     comparison = analysis.comparison
-    measured_s = comparison.axes[0].axis.measurement_time_s
-    intervals = np.diff(measured_s)
-    limit = max(GAP.value, GAP_INTERVALS.value / comparison.source.rate_hz)
-    long = intervals[intervals > limit]
-    if len(long):
-        starts = measured_s[:-1][intervals > limit]
-        at = float(starts[np.argmax(long)])
+    rate_hz = comparison.source.rate_hz
+    gaps = events.source_gaps(comparison.axes[0].axis.measurement_time_s, rate_hz)
+    if gaps:
+        at, until = max(gaps, key=lambda gap: gap[1] - gap[0])
         yield Finding(
             "source_gap",
             "warning",
-            f"The source was silent {times(len(long))} for more than {limit:.1f} s, the longest "
-            f"time {long.max():.1f} s at {at:.1f} s: only the IMU carries the position there.",
+            f"The source was silent {times(len(gaps))} for more than "
+            f"{max(GAP.value, GAP_INTERVALS.value / rate_hz):.1f} s, the longest time "
+            f"{until - at:.1f} s at {at:.1f} s: only the IMU carries the position there.",
             "Check line of sight to the anchors and the link; analyse one side with --start, "
             "--end.",
-            {"count": float(len(long)), "longest_s": float(long.max()), "at_s": at},
-            spans_s=tuple(zip(starts.tolist(), (starts + long).tolist(), strict=True)),
+            {"count": float(len(gaps)), "longest_s": until - at, "at_s": at},
+            spans_s=gaps,
         )
 
 

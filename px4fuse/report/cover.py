@@ -114,28 +114,28 @@ def _verdict(figure: Figure, cursor: Cursor, document: Document) -> None:
         (f"Along {along} our filter's variance is", result.kf, result.kf_truth, OURS, LEFT, SECOND),
         (f"Along {along} EKF2's variance is", result.ekf2, result.ekf2_truth, EKF2, SECOND, RIGHT),
     ):
-        cursor.y = top
-        cursor.write(label, size=8.0, x=left, right=right)
         if isinstance(summary, Unavailable):
-            cursor.write("not available", size=16.0, weight="bold", colour=MUTED, x=left)
-            cursor.write(f"{summary.reason}.", size=8.0, x=left, right=right)
-        else:
-            statement = summary.consistency
-            shade = colour if isinstance(statement, Consistency) else MUTED
-            cursor.write(verdict_words(statement), size=16.0, weight="bold", colour=shade, x=left)
-            cursor.skip(2)
-            cursor.write(_large_numbers(summary, truth), size=8.0, x=left, right=right - 0.02)
+            continue
+        cursor.y = top
+        statement = summary.consistency
+        shade = colour if isinstance(statement, Consistency) else MUTED
+        cursor.write(label, size=8.0, x=left, right=right)
+        cursor.write(verdict_words(statement), size=16.0, weight="bold", colour=shade, x=left)
+        cursor.skip(2)
+        cursor.write(_large_numbers(summary, truth), size=8.0, x=left, right=right - 0.02)
         ends.append(cursor.y)
     cursor.y = min(ends)
+    cursor.skip(2)
     if isinstance(result.difference, Difference):
         part = result.difference
-        cursor.skip(2)
         cursor.write(
             f"Ours - EKF2: {part.position_rmse_m:.3f} m and {part.velocity_rmse_m_s:.3f} m/s RMS, "
             f"at most {part.position_maximum_m:.2f} m."
             + ("" if document.truth_known else " The log has no truth to say who is right."),
             size=8.0,
         )
+    elif isinstance(result.ekf2, Unavailable):
+        cursor.write(f"There is no EKF2 to compare with: {result.ekf2.reason}.", size=8.0)
     cursor.skip(2)
     cursor.write(EXPLANATION, size=7.0, colour=MUTED)
 
@@ -163,29 +163,29 @@ def _other_axes(figure: Figure, cursor: Cursor, document: Document) -> None:
     others = [axis for axis in document.comparison.axes if axis is not document.comparison.main]
     if not others:
         return
-    known = document.truth_known
+    to_truth = "to truth (m)" if document.truth_known else ""
+    beside = not isinstance(document.comparison.main.ekf2, Unavailable)
+    names = ("variance", "mean NIS", to_truth)
+    blank = ("",) * 3
     cursor.skip(5)
-    _row(figure, cursor, ("", "our filter", "", "", "EKF2", "", "", ""), [MUTED] * 8)
-    to_truth = "to truth (m)" if known else ""
     _row(
-        figure, cursor,
-        ("axis", "variance", "mean NIS", to_truth, "variance", "mean NIS", to_truth,
-         "ours - EKF2 (m)"), [MUTED] * 8,
+        figure, cursor, ("", "our filter", "", "", "EKF2" if beside else "", "", "", ""),
+        [MUTED] * 8,
     )  # fmt: skip
+    apart = "ours - EKF2 (m)" if beside else ""
+    _row(figure, cursor, ("axis", *names, *(names if beside else blank), apart), [MUTED] * 8)
     cursor.skip(2.5)
     cursor.rule()
     colours = ["black", *[OURS] * 3, *[EKF2] * 3, "black"]
     for result in others:
-        apart = result.difference
-        _row(
-            figure, cursor,
-            (
-                result.axis.name,
-                *_cells(result.kf, result.kf_truth),
-                *_cells(result.ekf2, result.ekf2_truth),
-                f"{apart.position_rmse_m:.3f}" if isinstance(apart, Difference) else "",
-            ), colours,
-        )  # fmt: skip
+        difference = result.difference
+        cells = (
+            result.axis.name,
+            *_cells(result.kf, result.kf_truth),
+            *(_cells(result.ekf2, result.ekf2_truth) if beside else blank),
+            f"{difference.position_rmse_m:.3f}" if isinstance(difference, Difference) else "",
+        )
+        _row(figure, cursor, cells, colours)
 
 
 def _row(figure: Figure, cursor: Cursor, cells: Sequence[str], colours: Sequence[str]) -> None:

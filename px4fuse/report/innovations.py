@@ -64,7 +64,7 @@ def draw(document: Document) -> Iterator[Figure]:
     strip = bool(document.events.modes)
     axes = panel(
         cursor,
-        "Innovation = measurement - prediction (m), with ±2√S of each filter",
+        "Innovation = measurement - prediction (m)",
         innovation_words(result),
         INNOVATIONS,
         above=12.0 if strip else 4.0,
@@ -76,10 +76,15 @@ def draw(document: Document) -> Iterator[Figure]:
     below(cursor, innovation_numbers(result, axes.get_ylim()[1]), points=4.0)
     cursor.skip(8)
     for title, say, height, column in (
-        ("σ of position (m), log scale", sigma_words(document), SIGMA_P, "position_variance_m2"),
         (
-            "σ of velocity (m/s), log scale",
-            f"Median: {_medians(result, 'sigma_v_median_m_s', 'm/s')}.",
+            "Standard deviation of position (m), log scale",
+            sigma_words(document),
+            SIGMA_P,
+            "position_variance_m2",
+        ),
+        (
+            "Standard deviation of velocity (m/s), log scale",
+            f"Median σ: {_medians(result, 'sigma_v_median_m_s', 'm/s')}.",
             SIGMA_V,
             "velocity_variance_m2_s2",
         ),
@@ -107,15 +112,17 @@ def _zooms(cursor: Cursor, document: Document) -> None:
     top = cursor.y
     window = zoom_window(result, segment)
     start = panel(
-        cursor, "The first seconds, log scale", start_words(result), ZOOM, left=START_LEFT
-    )
+        cursor, "The first seconds, log scale", start_words(result), ZOOM, left=START_LEFT,
+        above=7.0,
+    )  # fmt: skip
     bottom, cursor.y = cursor.y, top
     axes = panel(
         cursor,
-        f"σ of position (m), {window[1] - window[0]:.1f} s of the flight",
+        f"Standard deviation of position (m), {window[1] - window[0]:.1f} s of the flight",
         zoom_words(result),
         ZOOM,
         right=ZOOM_RIGHT,
+        above=7.0,
     )
     low = min(bottom, cursor.y)
     for each in (axes, start):
@@ -133,15 +140,13 @@ def _zooms(cursor: Cursor, document: Document) -> None:
     axes.set_xlabel(TIME_LABEL)
     start.set_xlabel("time (s)")
     cursor.skip(22)
-    below(
-        cursor,
-        "Line: our filter, predict and update; grey ticks: measurements. "
-        + (
-            "EKF2: triangle up just before an update, down just after, square as logged."
-            if isinstance(result.ekf2_innovations, pd.DataFrame)
-            else f"EKF2: {result.ekf2_innovations.reason}."
-        ),
-    )
+    shown = []
+    if isinstance(result.ekf2_innovations, pd.DataFrame):
+        shown += ["triangle up just before an update", "down just after"]
+    if isinstance(result.ekf2_variance, pd.DataFrame):
+        shown.append("square as logged")
+    ekf2 = f" EKF2: {', '.join(shown)}." if shown else ""
+    below(cursor, f"Line: our filter, predict and update; grey ticks: measurements.{ekf2}")
 
 
 def _limit(result: AxisComparison) -> float:
@@ -272,7 +277,7 @@ def draw_sigma(axes: Axes, result: AxisComparison, column: str, limit: int) -> N
 def sigma_words(document: Document) -> str:
     """What to see in σ_p."""
     result, gaps = document.comparison.main, document.events.gaps
-    words = f"Median: {_medians(result, 'sigma_p_median_m', 'm')}."
+    words = f"Median σ: {_medians(result, 'sigma_p_median_m', 'm')}."
     if gaps:
         start, end = max(gaps, key=lambda gap: gap[1] - gap[0])
         words += (

@@ -49,7 +49,6 @@ def draw(axes: Axes, document: Document, *, axis: str | None = None, strip: bool
         Name the flight modes above the axes.
     """
     events, segment = document.events, document.comparison.segment
-    limits = axes.get_xlim(), axes.get_ylim(), axes.get_autoscalex_on(), axes.get_autoscaley_on()
     modes = [(mode.start_s, mode.end_s) for mode in events.modes]
     for spans, style, order in (
         (modes[1::2], MODE, 0.1),
@@ -69,14 +68,12 @@ def draw(axes: Axes, document: Document, *, axis: str | None = None, strip: bool
     ):
         shown = _apart(times, CLOSEST * span)
         if len(shown):
-            axes.add_line(
+            axes.add_artist(  # which leaves the limits alone
                 Line2D(
                     shown, np.full(len(shown), height), transform=axes.get_xaxis_transform(),
                     zorder=2.6, clip_on=height > 0.0, **style,
                 )
             )  # fmt: skip
-    axes.set_xlim(limits[0], auto=limits[2])
-    axes.set_ylim(limits[1], auto=limits[3])
     if strip:
         _strip(axes, document)
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
+from matplotlib.ticker import MaxNLocator, NullLocator
 
 from px4fuse.comparison.comparison import AxisComparison, Difference, FilterSummary
 from px4fuse.flight import Unavailable
@@ -20,7 +20,6 @@ from px4fuse.report.style import (
     RIGHT,
     TIME_LABEL,
     Cursor,
-    bare_x,
     caption,
     page,
 )
@@ -65,7 +64,7 @@ def draw(document: Document) -> Iterator[Figure]:
         left = LEFT + column * (width + GAP)
         head.write(result.axis.name, size=9.0, weight="bold", x=left, right=left + width + INDENT)
         head.write(_axis_words(result), size=7.5, x=left, right=left + width + INDENT)
-        top = min(top, head.y)
+        top = min(top, head.y - 4.0 / POINTS_PER_HEIGHT)
     height = (top - BOTTOM - 20.0 / POINTS_PER_HEIGHT) / len(rows)
     for column, result in enumerate(others):
         left = LEFT + INDENT + column * (width + GAP)
@@ -87,16 +86,14 @@ def _panel(
     title, draw_panel, numbers = row
     segment = document.comparison.segment
     axes = figure.add_axes(box, title=title)
-    axes.xaxis.set_major_locator(MaxNLocator(5))
-    axes.yaxis.set_major_locator(MaxNLocator(4))
+    axes.xaxis.set_major_locator(MaxNLocator(4) if last else NullLocator())
+    axes.yaxis.set_major_locator(MaxNLocator(3))
     draw_panel(axes, result, MAX_POINTS_NARROW)
     axes.set_xlim(segment.start_s, segment.end_s)
     shown = "" if draw_panel is innovations.draw_innovations else result.axis.name
     marks.draw(axes, document, axis=shown)
     if last:
         axes.set_xlabel(TIME_LABEL)
-    else:
-        bare_x(axes)
     caption(axes, numbers(result), size=PANEL_SIZE)
 
 

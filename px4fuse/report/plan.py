@@ -35,7 +35,7 @@ from px4fuse.report.style import (
 # A track so many times longer than wide lies along the page, else north is up
 LONG = 2.2
 TALLEST, LOWEST = 150.0, 62.0  # points
-LEAST_BESIDE, MOST_BESIDE = 150.0, 290.0
+LEAST_BESIDE, MOST_BESIDE = 122.0, 290.0
 # Width of a map that has north up, fraction of the page
 WIDE = 0.43
 HEAD, LABELS = 22.0, 34.0  # points above the axes, and below them: ticks, label, a gap

@@ -62,7 +62,11 @@ def draw(document: Document) -> Iterator[Figure]:
             cursor.write(f"{why.reason[:1].upper()}{why.reason[1:]}. {why.remedy}")
         else:
             _axis(figure, cursor, name, why, document)
-    below(cursor, _believed(document.analysis.ekf2_replay))
+    believed = _believed(document.analysis.ekf2_replay)
+    if cursor.y - cursor.height(believed, size=7.0) < BOTTOM:
+        yield figure
+        figure, cursor = page(f"{TITLE}, continued")
+    below(cursor, believed)
     yield figure
 
 
@@ -73,14 +77,14 @@ def _walks(document: Document) -> Mapping[str, Why | Unavailable]:
 
 
 def nothing_concluded(document: Document) -> str:
-    """Why there is no such page, in a line; empty where there is one, or nothing to explain."""
-    found = [why for why in _walks(document).values() if isinstance(why, Unavailable)]
-    if not found or len(found) < len(_walks(document)):
+    """Why there is no such page, in a line; empty where there is one, or no EKF2 to explain."""
+    found = list(_walks(document).values())
+    if isinstance(document.comparison.flight.ekf2, Unavailable) or any(
+        isinstance(why, Why) for why in found
+    ):
         return ""
-    reason, remedy = found[0].reason, found[0].remedy
-    return f"{TITLE}: nothing is concluded. {reason[:1].upper()}{reason[1:]}. {remedy} " + (
-        _believed(document.analysis.ekf2_replay)
-    )
+    reasons = {f"{why.reason}. {why.remedy}": None for why in found if isinstance(why, Unavailable)}
+    return f"{TITLE}: nothing is concluded, {' '.join(reasons)}" if reasons else ""
 
 
 def _believed(replay: Ekf2Replay | Unavailable) -> str:

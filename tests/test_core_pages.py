@@ -1,0 +1,246 @@
+"""The core pages and the other axes: what they show, where, and what they say instead."""
+
+from __future__ import annotations
+
+import io
+from collections import Counter
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from flights import Estimator, Uwb, aisle_flight, unexplained, with_noises
+from matplotlib.collections import PolyCollection
+from matplotlib.figure import Figure
+from pypdf import PdfReader
+
+from px4fuse.comparison.comparison import Comparison, compare
+from px4fuse.findings import Finding, find
+from px4fuse.flight import Dropout, Flight, FlightMode, Reset, Unavailable
+from px4fuse.report import cover, flight, innovations, marks, other_axes
+from px4fuse.report.document import Document
+from px4fuse.report.pdf import render
+from px4fuse.report.style import BOTTOM, EKF2_REJECTED, report_style
+from px4fuse.results.model import Student
+
+MODES = (FlightMode(0.0, 40.0, "Offboard"), FlightMode(40.0, 100.0, "Land"))
+
+
+def document(comparison: Comparison, findings: tuple[Finding, ...] = ()) -> Document:
+    return Document(unexplained(comparison), findings, Student("Ada"), "px4fuse compare aisle.ulg")
+
+
+def drawn(draw, of: Document) -> list[Figure]:
+    with report_style():
+        return list(draw(of))
+
+
+def words(*figures: Figure) -> str:
+    return " ".join(
+        text.get_text()
+        for figure in figures
+        for text in (*figure.texts, *(t for axes in figure.axes for t in axes.texts))
+    )
+
+
+@pytest.fixture(scope="module")
+def eventful() -> Document:
+    """A flight on which everything happens that is marked."""
+    made = aisle_flight(
+        duration_s=100.0,
+        uwb=Uwb(gap_s=(60.0, 65.0), outlier_share=0.03),
+        ekf2=Estimator(rejected_share=0.1, resets=(Reset(30.0, "position", (1.0, 0.0, 0.0)),)),
+        dropouts=(Dropout(50.0, 0.5),),
+    )
+    made = replace(made, airborne=((20.0, 90.0),), modes=MODES)
+    comparison = compare(made, start_s=5.0, end_s=95.0)
+    return replace(document(comparison), analysis=with_noises(comparison))
+
+
+def test_the_order_of_a_report(sample_flight: Flight) -> None:
+    pdf = render(document(compare(sample_flight)), "{}")
+    titles = [page.extract_text().splitlines() for page in PdfReader(io.BytesIO(pdf)).pages]
+    told = [" ".join(lines) for lines in titles]
+    for page, title in enumerate(
+        (
+            "Two-state Kalman filter against EKF2",
+            "The flight along the aisle",
+            "Innovations and variances along the aisle",
+            "Appendix: other axes",
+        )
+    ):
+        assert title in told[page], page
+
+
+def test_every_kind_of_mark_is_drawn_once_with_its_name(eventful: Document) -> None:
+    said = [artist.get_label() for artist in marks.handles(eventful)]
+    assert said == [
+        "source silent", "on the ground", "log dropout", "flight modes, in turn", "EKF2 reset",
+        "EKF2 rejected", "outlier", "take-off", "landing",
+    ]  # fmt: skip
+    axes = Figure().add_axes((0.1, 0.1, 0.8, 0.8))
+    axes.plot([6.0, 94.0], [2.0, 3.0])
+    limits = axes.get_xlim(), axes.get_ylim()
+    marks.draw(axes, eventful, strip=True)
+    axes.autoscale()
+    assert (axes.get_xlim(), axes.get_ylim()) == limits
+    axes.lines[0].remove()
+    bands = [c for c in axes.collections if isinstance(c, PolyCollection)]
+    spans = [[tuple(path.vertices[[0, 2], 0]) for path in band.get_paths()] for band in bands]
+    assert spans[0] == [(40.0, 95.0)]
+    assert spans[1] == [(5.0, 20.0), (90.0, 95.0)]
+    assert spans[2] == list(eventful.events.gaps)
+    assert spans[3] == [(50.0, 50.5)]
+    assert {text.get_text() for text in axes.texts} == {"Offboard", "Land"}
+    # rejected, outliers, resets, take-off, landing
+    assert [len(line.get_xdata()) for line in axes.lines[2:]] == [1, 1, 1]
+    assert set(axes.lines[1].get_xdata()) <= set(marks.outliers(eventful))
+
+
+def test_a_quiet_flight_has_no_marks() -> None:
+    quiet = document(compare(replace(aisle_flight(), airborne=Unavailable("a", "b", "c"))))
+    assert marks.handles(quiet) == []
+    axes = Figure().add_axes((0.1, 0.1, 0.8, 0.8))
+    marks.draw(axes, quiet, strip=True)
+    assert not [*axes.lines, *axes.collections, *axes.texts]
+
+
+def test_marks_of_a_long_flight_do_not_pile_up() -> None:
+    time_s = np.linspace(0.0, 3600.0, 20_000)
+    kept = marks._apart(time_s, 3600.0 * marks.CLOSEST)
+    assert len(kept) <= 1.0 / marks.CLOSEST + 1.0
+    assert set(kept) <= set(time_s)
+
+
+def test_all_time_axes_of_the_core_are_one(eventful: Document) -> None:
+    (page,) = drawn(flight.draw, eventful)
+    (other,) = drawn(innovations.draw, eventful)
+    boxes = {(a.get_xlim(), a.get_position().x0, a.get_position().x1) for a in page.axes}
+    assert len(page.axes) == 3
+    assert boxes == {
+        (a.get_xlim(), a.get_position().x0, a.get_position().x1) for a in other.axes[:3]
+    }
+    assert len(boxes) == 1
+
+
+def test_rejected_innovations_are_hollow_and_fused_ones_filled(eventful: Document) -> None:
+    result = eventful.comparison.main
+    axes = Figure().add_axes((0.1, 0.1, 0.8, 0.8))
+    innovations.draw_innovations(axes, result, 10_000)
+    hollow = [
+        line
+        for line in axes.lines
+        if line.get_markerfacecolor() == EKF2_REJECTED["mfc"] and line.get_linestyle() == "None"
+    ]
+    count = int((result.ekf2_innovations["rejected"] > 0).sum())
+    assert sum(len(line.get_xdata()) for line in hollow) == count
+    assert f"rejected {count} of them (hollow)" in innovations.innovation_words(result)
+
+
+def test_the_zoom_is_where_the_filter_is_updated() -> None:
+    made = aisle_flight(duration_s=120.0, uwb=Uwb(gap_s=(50.0, 70.0)))
+    comparison = compare(made)
+    start, end = innovations.zoom_window(comparison.main, comparison.segment)
+    updates = comparison.main.replay.updates.index
+    assert ((updates >= start) & (updates <= end)).sum() >= 12
+    assert abs((start + end) / 2.0 - 60.0) < 17.0
+    assert "In the 20." in innovations.sigma_words(document(comparison))
+
+
+def test_sentences_are_made_of_the_numbers(eventful: Document) -> None:
+    result = eventful.comparison.main
+    (page,) = drawn(flight.draw, eventful)
+    assert f"{flight.inside_share(result):.0%} of our error lies in our own ±2σ" in words(page)
+    steps = result.replay.steps
+    truth = np.interp(steps.index, result.truth.index, result.truth["position_m"])
+    inside = abs(steps["position_m"] - truth) <= 2.0 * np.sqrt(steps["position_variance_m2"])
+    assert flight.inside_share(result) == pytest.approx(inside.mean(), abs=1e-3)
+    assert flight._nearer(1.0, 1.05) == "Ours and EKF2 are equally near to the truth"
+    assert flight._nearer(3.0, 1.0) == "EKF2 is 3 times nearer to the truth than ours"
+    assert flight._nearer(1.0, 2.5) == "Ours is 2.5 times nearer to the truth than EKF2"
+
+
+@pytest.mark.parametrize("count", [0, 3, 40])
+def test_the_map_stays_and_every_finding_stands_once(count: int) -> None:
+    findings = tuple(
+        Finding(f"f{i}", "warning", f"Finding number {i}. " * 6, "Do it.", spans_s=((1.0, 2.0),))
+        for i in range(count)
+    )
+    pages = drawn(cover.draw, document(compare(aisle_flight()), findings))
+    (axes,) = pages[0].axes
+    assert axes.get_aspect() == 1.0
+    assert axes.get_position().y0 > BOTTOM
+    told = Counter(
+        i for i in range(count) for page in pages if f"Finding number {i}." in words(page)
+    )
+    assert set(told.values()) <= {1}
+    assert len(told) == count
+    beside = [text.get_text() for page in pages for text in page.texts]
+    assert beside.count("1.0 s to 2.0 s") == count
+    assert (len(pages) > 1) == (count == 40)
+    assert ("findings: next page" in words(pages[0])) == (count == 40)
+    for page in pages:
+        lowest = min(text.get_position()[1] for text in page.texts)
+        assert lowest >= BOTTOM - 0.005
+
+
+def test_the_map_lies_along_the_aisle_and_a_wide_track_has_north_up() -> None:
+    (axes,) = drawn(cover.draw, document(compare(aisle_flight(), heading_deg=200.0)))[0].axes
+    assert axes.get_xlabel() == "along 20° from north (m)"
+    made = aisle_flight()
+    wide = made.positions[0].samples.copy()
+    wide["east_m"] = 5.0 * np.sin(wide.index.to_numpy() / 7.0)
+    track = replace(made.positions[0], samples=wide)
+    (axes,) = drawn(cover.draw, document(compare(replace(made, positions=(track,)))))[0].axes
+    assert (axes.get_xlabel(), axes.get_ylabel()) == ("east (m)", "north (m)")
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"ekf2": None}, "There is no EKF2 to compare with"),
+        ({"truth": False}, "The log has no truth"),
+        ({"ekf2": Estimator(innovations_logged=False, variance_logged=False)}, "not available"),
+        ({"ekf2": None, "truth": False}, "No error is drawn"),
+    ],
+)
+def test_what_is_absent_leaves_a_line_and_no_empty_panel(changes, says: str) -> None:
+    of = document(compare(aisle_flight(**changes)))
+    pages = [
+        page
+        for draw in (cover.draw, flight.draw, innovations.draw, other_axes.draw)
+        for page in drawn(draw, of)
+    ]
+    assert says in words(*pages)
+    assert len(pages) == 4
+    for page in pages:
+        for axes in page.axes:
+            assert axes.axison
+            assert axes.lines or axes.patches
+        assert min(axes.get_position().y0 for axes in page.axes) >= BOTTOM
+
+
+def test_one_axis_is_the_core_alone() -> None:
+    of = document(compare(aisle_flight(), axes=("north",)))
+    assert drawn(other_axes.draw, of) == []
+    (page,) = drawn(flight.draw, of)
+    assert "The flight along north" in words(page)
+    (first,) = drawn(cover.draw, of)
+    assert len(first.axes) == 1
+    assert "axis" not in [text.get_text() for text in first.texts]
+
+
+def test_other_axes_stand_in_columns() -> None:
+    (page,) = drawn(other_axes.draw, document(compare(aisle_flight())))
+    assert len(page.axes) == 15
+    for name in ("north", "east", "down"):
+        assert name in [text.get_text() for text in page.texts]
+
+
+def test_the_sample_tells_its_story(sample_flight: Flight) -> None:
+    comparison = compare(sample_flight)
+    analysis = with_noises(comparison)
+    of = Document(analysis, find(analysis), Student("Ada", "7"), "px4fuse compare aisle_uwb.ulg")
+    said = " ".join(words(drawn(cover.draw, of)[0]).split())
+    for sentence in of.story:
+        assert " ".join(sentence.split()[:8]) in said
+    assert "Ada, 7" in said

@@ -1,0 +1,106 @@
+"""What happened when: flight modes as read, and the list that every time axis marks."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from flights import Estimator, Uwb, aisle_flight
+
+from px4fuse.comparison.comparison import compare
+from px4fuse.comparison.events import happened, source_gaps
+from px4fuse.flight import (
+    Dropout,
+    Flight,
+    FlightMode,
+    Reset,
+    Unavailable,
+    stretches_of_modes,
+)
+from px4fuse.placing.joining import join
+from px4fuse.readers import read_log
+from px4fuse.readers.px4_topics import NAV_STATES
+
+MODES = (FlightMode(0.0, 40.0, "Offboard"), FlightMode(40.0, 90.0, "Land"))
+
+
+def test_modes_of_the_sample(sample_flight: Flight) -> None:
+    assert [mode.name for mode in sample_flight.modes] == ["Offboard", "Land", "Offboard"]
+    _, land, last = sample_flight.modes
+    assert (land.start_s, land.end_s) == pytest.approx((120.48, 128.74), abs=0.01)
+    assert last.end_s == sample_flight.log.duration_s
+    # the land detector agrees: landing ends in it
+    assert land.start_s < sample_flight.airborne[-1][1] < land.end_s
+
+
+def test_a_recording_tells_the_same_modes(sample_flight: Flight, sample_log: Path) -> None:
+    recording = read_log(sample_log.with_suffix(".tlog"))
+    assert [mode.name for mode in recording.modes] == ["Hold", "Offboard", "Land", "Offboard"]
+    shift = recording.log.boot_time_s - sample_flight.log.boot_time_s
+    # a heartbeat comes once in a second
+    for mine, theirs in zip(sample_flight.modes[1:], recording.modes[2:], strict=True):
+        assert 0.0 <= theirs.start_s + shift - mine.start_s <= 1.1
+    joined = join(replace(sample_flight, modes=Unavailable("modes", "", "")), recording)
+    assert joined.modes[2].start_s == pytest.approx(recording.modes[2].start_s + shift)
+    assert join(sample_flight, recording).modes == sample_flight.modes
+
+
+def test_stretches_join_what_is_the_same_and_never_overlap() -> None:
+    names = pd.Series(["a", "a", "b", "c", "a"], index=[-3.0, 1.0, 2.0, 1.5, 6.0])
+    assert stretches_of_modes(names, 8.0) == (
+        FlightMode(0.0, 2.0, "a"), FlightMode(2.0, 6.0, "c"), FlightMode(6.0, 8.0, "a"),
+    )  # fmt: skip
+
+
+def test_the_modes_that_students_fly_have_the_names_of_qgroundcontrol() -> None:
+    told = {2: "Position", 4: "Hold", 14: "Offboard", 17: "Takeoff", 18: "Land", 23: "External 1"}
+    assert {number: NAV_STATES[number] for number in told} == told
+
+
+def test_a_gap_is_longer_than_a_second_and_five_intervals() -> None:
+    time_s = np.array([0.0, 0.2, 0.4, 1.4, 1.6, 3.0, 3.2])
+    assert source_gaps(time_s, 5.0) == ((1.6, 3.0),)
+    assert source_gaps(time_s, 1.0) == ()
+    assert source_gaps(time_s[:1], 5.0) == ()
+
+
+def test_all_that_happened_is_listed_and_cut_to_the_segment() -> None:
+    resets = tuple(Reset(time, "position", (1.0, 0.0, 0.0)) for time in (5.0, 30.0, 30.0, 95.0))
+    flight = aisle_flight(
+        duration_s=100.0,
+        uwb=Uwb(gap_s=(60.0, 65.0)),
+        ekf2=Estimator(resets=resets),
+        dropouts=(Dropout(9.0, 2.0), Dropout(50.0, 0.5), Dropout(98.0, 1.0)),
+    )
+    flight = replace(flight, airborne=((20.0, 70.0), (80.0, 99.0)), modes=MODES)
+    comparison = compare(flight, start_s=10.0, end_s=90.0)
+    found = happened(comparison)
+    ((start, end),) = found.gaps
+    assert (start, end) == pytest.approx((60.0, 65.0), abs=0.21)
+    assert found.dropouts == ((10.0, 11.0), (50.0, 50.5))
+    assert found.ground == ((10.0, 20.0), (70.0, 80.0))
+    assert (found.take_off_s, found.landing_s) == ((20.0, 80.0), (70.0,))
+    assert found.modes == (FlightMode(10.0, 40.0, "Offboard"), FlightMode(40.0, 90.0, "Land"))
+    assert found.resets_s == (30.0,)
+
+
+def test_rejections_are_of_each_axis() -> None:
+    comparison = compare(aisle_flight(ekf2=Estimator(rejected_share=0.2)))
+    found = happened(comparison)
+    for result in comparison.axes:
+        frame = result.ekf2_innovations
+        assert list(found.rejected_s[result.axis.name]) == list(frame.index[frame["rejected"] > 0])
+    assert len(found.rejected_s["aisle"]) > 50
+
+
+def test_what_is_not_logged_is_not_marked() -> None:
+    flight = aisle_flight(ekf2=None)
+    absent = Unavailable("land detector", "no topic", "Record it.")
+    found = happened(compare(replace(flight, airborne=absent)))
+    assert (found.gaps, found.dropouts, found.ground, found.modes) == ((), (), (), ())
+    assert (found.take_off_s, found.resets_s, dict(found.rejected_s)) == ((), (), {})
+    never = compare(replace(flight, airborne=()))
+    assert happened(never).ground == ((never.segment.start_s, never.segment.end_s),)
