@@ -10,7 +10,7 @@ import os
 import re
 import shlex
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import PurePath
 from typing import Annotated, Any, Literal
 
@@ -312,6 +312,18 @@ EVALUATION_OPTIONS = {
     "consecutive": "--consecutive",
     "system": "--system",
 }
+
+# What the errors of a command may name: its arguments in Python, to its options
+ARGUMENTS = OPTIONS | {"position": "--position", "changes": "--set"}
+
+
+def with_options(text: str, options: Mapping[str, str] = ARGUMENTS) -> str:
+    """The text of an error with options in the place of the arguments that it names.
+
+    >>> with_options("`sigma_z_m` 0 is out of range: give 0.0001 to 100 m.")
+    '--sigma-z 0 is out of range: give 0.0001 to 100 m.'
+    """
+    return re.sub(r"`(\w+)`", lambda name: options.get(name[1], name[0]), text)
 
 
 def command_line(

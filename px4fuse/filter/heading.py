@@ -17,11 +17,10 @@ from typing import Literal
 
 import numpy as np
 import pandas as pd
-from scipy.integrate import cumulative_trapezoid
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
-from px4fuse.arrays import Array
+from px4fuse.arrays import Array, cumulative_integral
 from px4fuse.filter.kalman import Settings
 from px4fuse.filter.model import INITIAL_SIGMA_P_M, INITIAL_SIGMA_V_M_S, noise_of_many_steps
 from px4fuse.filter.motion import MAX_IMU_INTERVAL_S
@@ -172,7 +171,8 @@ def heading_error(
 
 def _parts(time: Array, turn: Array, sigma: Array) -> tuple[HeadingPart, ...]:
     """Means over parts of equal length, in degrees."""
-    count = max(int((time[-1] - time[0]) / PART_S), 1)
+    # of a long flight only some measurements were taken
+    count = max(int(min((time[-1] - time[0]) / PART_S, len(time) / (2 * MIN_PART_SAMPLES))), 1)
     edges = np.searchsorted(time, np.linspace(time[0], time[-1], count + 1)[1:-1])
     return tuple(
         HeadingPart(
@@ -218,7 +218,7 @@ def _by_orientation(
         return None
     found = np.array([part.heading_error_deg for part in parts])
     square = np.sum((found - found.mean()) ** 2) / np.degrees(sigma[0]) ** 2
-    return HeadingError(parts, float(chi2.sf(square, len(parts) - 1)), "orientation")
+    return HeadingError(parts, float(chdtrc(len(parts) - 1, square)), "orientation")
 
 
 @dataclass(frozen=True)
@@ -254,14 +254,14 @@ def _by_positions(
     ratio = 2.0 * (log_p.max() - log_p[grid[:, 0] == 0.0].max())
     smoothed, sigma = _smooth(legs, measured, turn, grid[[np.argmax(log_p)]], sigma_z, dt_s)
     # at the end of its range a walk is half of the time none
-    p = 0.5 * float(chi2.sf(ratio, 1)) if ratio > 0.0 else 1.0
+    p = 0.5 * float(chdtrc(1, ratio)) if ratio > 0.0 else 1.0
     return HeadingError(_parts(time, turn + smoothed, sigma), p, "positions")
 
 
 def _legs(acceleration: pd.DataFrame, time: Array) -> _Legs:
     known, value = acceleration.index.to_numpy(), acceleration.to_numpy()[:, :2]
-    speed = cumulative_trapezoid(value, known, axis=0, initial=0)
-    way = cumulative_trapezoid(speed, known, axis=0, initial=0)
+    speed = cumulative_integral(value, known)
+    way = cumulative_integral(speed, known)
     v, p = (
         np.column_stack([np.interp(time, known, one) for one in both.T]) for both in (speed, way)
     )

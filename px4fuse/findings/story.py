@@ -35,7 +35,7 @@ MOST_SENTENCES = 3
 TOLD_FIRST = frozenset(
     {
         "kf_variance_overstated", "kf_variance_understated", "ekf2_variance_overstated",
-        "ekf2_variance_understated", "errors_larger_than_claimed",
+        "ekf2_variance_understated", "errors_larger_than_claimed", "ekf2_unavailable",
     }
 )  # fmt: skip
 SETTINGS = frozenset({"sigma_a_large", "sigma_a_small", "sigma_z_large", "sigma_z_small"})
