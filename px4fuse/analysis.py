@@ -14,9 +14,10 @@ import numpy as np
 
 from px4fuse import placing
 from px4fuse.comparison.asked import asked_of_ekf2
-from px4fuse.comparison.comparison import Comparison, compare
+from px4fuse.comparison.comparison import AxisComparison, Comparison, compare
 from px4fuse.comparison.drift import may_drift, with_drift
 from px4fuse.comparison.why import Why, why_ekf2_differs
+from px4fuse.display import Shown, brief
 from px4fuse.ekf2.model import Model, open_model
 from px4fuse.ekf2.parameters import check
 from px4fuse.ekf2.replay import Ekf2Replay
@@ -66,8 +67,8 @@ def _silent(_: str) -> None:
     """Progress that nobody watches."""
 
 
-@dataclass(frozen=True)
-class Analysis:
+@dataclass(frozen=True, repr=False)
+class Analysis(Shown):
     """A comparison and what explains it.
 
     Attributes
@@ -94,6 +95,25 @@ class Analysis:
     why: Mapping[str, Why | Unavailable]
     loop: Loop | Unavailable
     heading: HeadingError | Unavailable
+
+    @property
+    def flight(self) -> Flight:
+        """What was compared."""
+        return self.comparison.flight
+
+    @property
+    def settings(self) -> Settings:
+        """The filter's, as used."""
+        return self.comparison.settings
+
+    @property
+    def axes(self) -> tuple[AxisComparison, ...]:
+        """Everything about each axis."""
+        return self.comparison.axes
+
+    def __getitem__(self, axis: str) -> AxisComparison:
+        """Everything about one axis, by its name."""
+        return self.comparison[axis]
 
     @property
     def ekf2_replay(self) -> Ekf2Replay | Unavailable:
@@ -166,7 +186,9 @@ def _size(noise: Noise, otherwise: float) -> float:
     return noise.value or noise.high or otherwise
 
 
-def run(request: ComparisonRequest, progress: Progress = _silent) -> Analysis:
+def run(
+    request: ComparisonRequest, progress: Progress = _silent, flight: Flight | None = None
+) -> Analysis:
     """Read a flight, compare it with EKF2 and explain the comparison.
 
     Parameters
@@ -174,13 +196,15 @@ def run(request: ComparisonRequest, progress: Progress = _silent) -> Analysis:
     request : ComparisonRequest
     progress : callable
         Told what is being done.
+    flight : Flight, optional
+        What the request's recordings hold, where they have been read.
 
     Raises
     ------
     LogError, MissingDataError, SettingsError
         A file cannot be read, the flight lacks what was asked for, or a setting is out of range.
     """
-    return explain(run_comparison(request, progress), progress)
+    return explain(run_comparison(request, progress, flight), progress)
 
 
 def read_flight(request: ComparisonRequest, progress: Progress = _silent) -> Flight:
@@ -200,8 +224,8 @@ def read_flight(request: ComparisonRequest, progress: Progress = _silent) -> Fli
         other = read_log(Path(request.mavlink), system=request.system)
         if not other.log.format.startswith("MAVLink"):
             raise LogError(
-                f"--mavlink {other.log.name}: this is a {other.log.format}, not a MAVLink "
-                "recording. Give the ULog as LOG, and the recording (.tlog) with --mavlink."
+                f"`mavlink` {other.log.name}: this is a {other.log.format}, not a MAVLink "
+                "recording. Give the ULog as LOG, and the recording (.tlog) with `mavlink`."
             )
         flight = placing.join(flight, other)
     if request.position is None:
@@ -226,7 +250,9 @@ def _placed(flight: Flight, position: PositionFile, clock_offset: float | str | 
     )
 
 
-def run_comparison(request: ComparisonRequest, progress: Progress = _silent) -> Comparison:
+def run_comparison(
+    request: ComparisonRequest, progress: Progress = _silent, flight: Flight | None = None
+) -> Comparison:
     """Read a flight and compare it with EKF2, without what explains the comparison.
 
     Raises
@@ -244,17 +270,17 @@ def run_comparison(request: ComparisonRequest, progress: Progress = _silent) -> 
         clock_offset_s=asked if isinstance(asked, float) and request.position is None else 0.0,
     )
     for name, value in (
-        ("--start", request.start_s),
-        ("--end", request.end_s),
-        ("--clock-offset", asked),
+        ("start_s", request.start_s),
+        ("end_s", request.end_s),
+        ("clock_offset_s", asked),
     ):
         if isinstance(value, float) and not abs(value) < float("inf"):
-            raise SettingsError(f"{name} {value:g} is not a finite number.")
-    flight = read_flight(request, progress)
+            raise SettingsError(f"`{name}` {value:g} is not a finite number.")
+    read = flight or read_flight(request, progress)
 
     def compared(settings: Settings) -> Comparison:
         return compare(
-            flight,
+            read,
             settings,
             axes=request.axes or None,
             heading_deg=request.heading_deg,
@@ -271,8 +297,8 @@ def run_comparison(request: ComparisonRequest, progress: Progress = _silent) -> 
     found = clock_offset(comparison, tuned_horizontally(comparison), progress)
     if isinstance(found, Unavailable) or not found.determinable:
         raise MissingDataError(
-            f"{flight.log.name}: --clock-offset auto: not determinable: {found.reason}. "
-            "Give the seconds to add, or leave the option out."
+            f"{read.log.name}: `clock_offset_s` auto: not determinable: {found.reason}. "
+            "Give the seconds to add, or leave it out."
         )
     return compared(replace(settings, clock_offset_s=found.offset_s))
 
@@ -285,16 +311,11 @@ def run_loop(request: LoopRequest, progress: Progress = _silent) -> Loop:
     TrajectoryError, LogError, MissingDataError, SettingsError
         A file cannot be read or lacks what was asked for, or a setting is out of range.
     """
-    for name, value in (("--from", request.start_s), ("--to", request.end_s)):
+    for name, value in (("start_s", request.start_s), ("end_s", request.end_s)):
         if value is not None and not abs(value) < float("inf"):
-            raise SettingsError(f"{name} {value:g} is not a finite number.")
+            raise SettingsError(f"`{name}` {value:g} is not a finite number.")
     progress(f"reading {shown(Path(request.source))}")
     source = read_source(request.source, frame=request.frame, system=request.system)
-    if request.frame is not None and source.flight is not None:
-        raise SettingsError(
-            f"--frame {request.frame.lower()} is for trajectory files; {source.flight.log.name} is "
-            "a flight log, which states its frame. Leave --frame out."
-        )
     reference = None
     if request.reference is not None:
         reference = read_source(
@@ -339,8 +360,12 @@ class Counterfactual:
     asked: bool
     why: Mapping[str, Why | Unavailable]
 
+    __repr__ = brief
 
-def run_what_if(request: WhatIfRequest, progress: Progress = _silent) -> Counterfactual:
+
+def run_what_if(
+    request: WhatIfRequest, progress: Progress = _silent, flight: Flight | None = None
+) -> Counterfactual:
     """Read a flight and replay its EKF2 with other parameters.
 
     Parameters
@@ -348,6 +373,8 @@ def run_what_if(request: WhatIfRequest, progress: Progress = _silent) -> Counter
     request : WhatIfRequest
     progress : callable
         Told what is being done.
+    flight : Flight, optional
+        What the request's recordings hold, where they have been read.
 
     Raises
     ------
@@ -362,7 +389,7 @@ def run_what_if(request: WhatIfRequest, progress: Progress = _silent) -> Counter
         if swept.parameter in changes:
             raise SettingsError(f"{swept.parameter}: set and swept. Give one of the two.")
     recordings = ComparisonRequest(log=request.log, mavlink=request.mavlink, system=request.system)
-    flight = read_flight(recordings, progress)
+    flight = flight or read_flight(recordings, progress)
     progress("replaying EKF2")
     model = open_model(flight)
     if isinstance(model, Unavailable):
@@ -401,7 +428,7 @@ def _not_told(compared: Comparison) -> str:
             f"{source.name} may drift, so that innovations do not tell its noise, and the delay is "
             "as the data ask for or not determinable"
         )
-    return f"{name}: {why}. Say what to change: --set EKF2_EVP_NOISE=0.1."
+    return f"{name}: {why}. Say what to change: `changes` EKF2_EVP_NOISE=0.1."
 
 
 def explain(comparison: Comparison, progress: Progress = _silent) -> Analysis:

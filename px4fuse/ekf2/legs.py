@@ -20,6 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from px4fuse.display import brief
 from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.rotation import skew
 from px4fuse.ekf2.stretches import Stretch
@@ -62,6 +63,8 @@ class Transitions:
     attitude: Array
     velocity: Array
     position: Array
+
+    __repr__ = brief
 
 
 @dataclass(frozen=True)
@@ -118,6 +121,8 @@ class Legs(_Events):
     accelerometer_noise: Array
     steps: Array
     within: Transitions
+
+    __repr__ = brief
 
 
 @dataclass(frozen=True)

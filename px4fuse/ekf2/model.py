@@ -15,6 +15,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from px4fuse.display import brief
 from px4fuse.ekf2.agreement import REJECTING_SHARE, agreement_with_log, with_obedient
 from px4fuse.ekf2.inputs import Inputs, prepare
 from px4fuse.ekf2.legs import (
@@ -68,6 +69,8 @@ class Model:
     legs: tuple[Legs, ...]
     flown: Ekf2Replay
     agreement: Agreement
+
+    __repr__ = brief
 
 
 def replay_ekf2(

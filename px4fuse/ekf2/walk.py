@@ -22,6 +22,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from px4fuse.display import brief
 from px4fuse.ekf2.agreement import at_times, judged_from, settled
 from px4fuse.ekf2.model import Model, replay_variants
 from px4fuse.ekf2.recursion import Variant
@@ -137,6 +138,8 @@ class AxisWalk:
     logged_rmse_to_truth_m: float | Unavailable
     apart_m: Array
     left_m: Array
+
+    __repr__ = brief
 
     @property
     def position_left_share(self) -> float:

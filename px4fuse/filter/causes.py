@@ -8,6 +8,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from px4fuse.arrays import Array, BoolArray
+from px4fuse.display import brief
 from px4fuse.filter.hypotheses import (
     FORWARD,
     MIN_MEASUREMENTS,
@@ -84,6 +85,8 @@ class Explained:
     jumps: tuple[Jump, ...]
     sigma_a_m_s2: float
     count: int
+
+    __repr__ = brief
 
 
 def explained(

@@ -22,6 +22,7 @@ from scipy.interpolate import CubicSpline
 from scipy.stats import chi2
 
 from px4fuse.arrays import Array
+from px4fuse.display import Shown
 from px4fuse.filter.fitting import NoiseFit, Noises, Part, arguments, most_likely
 from px4fuse.filter.kalman import Settings
 from px4fuse.filter.likelihood import PROFILE_DROP, parabola_vertex, profile_interval
@@ -56,8 +57,8 @@ class PartOffset:
     sigma_s: float
 
 
-@dataclass(frozen=True)
-class ClockOffset:
+@dataclass(frozen=True, repr=False)
+class ClockOffset(Shown):
     """What must be added to the position source's stamps.
 
     Attributes

@@ -13,6 +13,7 @@ import numpy as np
 from scipy import stats
 
 from px4fuse.arrays import Array
+from px4fuse.display import Shown
 from px4fuse.flight import Unavailable
 
 Verdict = Literal["consistent", "variance overstated", "variance understated"]
@@ -24,8 +25,8 @@ LJUNG_BOX_LAGS = 10
 GATE_SIGMA = 5.0  # EKF2_EVP_GATE's default, used where no gate is in force
 
 
-@dataclass(frozen=True)
-class Consistency:
+@dataclass(frozen=True, repr=False)
+class Consistency(Shown):
     """Whether a filter's innovations are what its own variances say.
 
     Attributes

@@ -13,6 +13,7 @@ import pandas as pd
 from filterpy.kalman import KalmanFilter
 
 from px4fuse.arrays import Array, BoolArray, IntArray
+from px4fuse.display import brief
 from px4fuse.errors import SettingsError
 from px4fuse.filter.model import (
     COVARIANCES,
@@ -72,17 +73,17 @@ class Settings:
 
     def __post_init__(self) -> None:
         for name, value, (low, high), unit in (
-            ("--sigma-a", self.sigma_a_m_s2, SIGMA_A_RANGE_M_S2, "m/s²"),
-            ("--sigma-z", self.sigma_z_m, SIGMA_Z_RANGE_M, "m"),
-            ("--dt", self.dt_s, DT_RANGE_S, "s"),
-            ("--clock-offset", self.clock_offset_s, CLOCK_OFFSET_RANGE_S, "s"),
+            ("sigma_a_m_s2", self.sigma_a_m_s2, SIGMA_A_RANGE_M_S2, "m/s²"),
+            ("sigma_z_m", self.sigma_z_m, SIGMA_Z_RANGE_M, "m"),
+            ("dt_s", self.dt_s, DT_RANGE_S, "s"),
+            ("clock_offset_s", self.clock_offset_s, CLOCK_OFFSET_RANGE_S, "s"),
         ):
             if not low <= value <= high:  # false for NaN too
                 raise SettingsError(
-                    f"{name} {value:g} is out of range: give {low:g} to {high:g} {unit}."
+                    f"`{name}` {value:g} is out of range: give {low:g} to {high:g} {unit}."
                 )
         if self.input not in INPUT_NAMES:
-            raise SettingsError(f"--input {self.input}: give {' or '.join(INPUT_NAMES)}.")
+            raise SettingsError(f"`input` {self.input}: give {' or '.join(INPUT_NAMES)}.")
 
 
 @dataclass(frozen=True)
@@ -120,6 +121,8 @@ class Replay:
     steps: pd.DataFrame
     updates: pd.DataFrame
     input_gap_s: float = field(default=0.0)
+
+    __repr__ = brief
 
 
 @dataclass(frozen=True)
@@ -180,7 +183,7 @@ def timeline(axis: Axis, settings: Settings, initial: InitialState | None = None
     if settings.input == "zero":
         return Timeline(time, measurement, np.zeros(steps), np.zeros(steps), 0.0)
     if isinstance(axis.acceleration, Unavailable):
-        raise SettingsError(f"--input imu needs an acceleration. {axis.acceleration}")
+        raise SettingsError(f"`input` imu needs an acceleration. {axis.acceleration}")
     mean, gap = step_means(axis.acceleration, time)
     gap_s = gap * np.diff(time)
     # Unknown acceleration persists through a gap: after T seconds it has moved the velocity by

@@ -15,6 +15,7 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 from px4fuse.arrays import Array, BoolArray
+from px4fuse.display import Shown, brief
 from px4fuse.filter.consistency import Consistency, assess
 from px4fuse.filter.fitting import (
     SIGMA_A_SEARCH_M_S2,
@@ -75,6 +76,8 @@ class LikelihoodMap:
     sigma_z_m: Array
     drop: Array
 
+    __repr__ = brief
+
 
 @dataclass(frozen=True)
 class HeldOut:
@@ -97,8 +100,8 @@ class HeldOut:
     gain_nats: float
 
 
-@dataclass(frozen=True)
-class AxisTuning:
+@dataclass(frozen=True, repr=False)
+class AxisTuning(Shown):
     """The noises of one axis, or of the horizontal axes together.
 
     Attributes

@@ -9,6 +9,7 @@ from rich.table import Table
 from rich.text import Text
 
 from px4fuse.analysis import Counterfactual
+from px4fuse.filter.signals import AISLE
 from px4fuse.report.screen import plain_table, print_line, say
 from px4fuse.report.terminal import print_why
 from px4fuse.report.whatif import heads, reading, rows, sweep_heads, sweep_of, sweep_rows
@@ -29,7 +30,8 @@ def print_what_if(console: Console, made_of: Counterfactual) -> None:
     spans = ", ".join(f"{start:.1f} to {end:.1f} s" for start, end in found.judged)
     print_line(console, "Judged", spans)
     print_line(console, "Replay", agreement_words(found.agreement))
-    print_why(console, made_of.why)
+    if AISLE in made_of.why:
+        print_why(console, made_of.why[AISLE])
     console.print(_table(["", *heads(made_of)], rows(made_of)))
     if sweep_of(made_of):
         console.print()
