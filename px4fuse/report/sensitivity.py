@@ -17,7 +17,7 @@ from px4fuse.comparison.events import Span
 from px4fuse.filter.fitting import FIRST_WIDTH
 from px4fuse.filter.likelihood import States, preintegrate, states, total_over_grid
 from px4fuse.filter.signals import AISLE
-from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise
+from px4fuse.filter.tuning import HORIZONTAL, MIN_MEASUREMENTS, AxisTuning, Noise
 from px4fuse.flight import Unavailable
 from px4fuse.plain import factor_words, number_words
 from px4fuse.report import marks
@@ -65,6 +65,7 @@ COARSE_POINTS, FINE_POINTS = 14, 11
 MARGIN, FINE_REACH = 1.3, 2.3
 # Tracks further apart than this share of what the knobs do are not the same
 LITTLE_APART = 0.1
+SAME_GAIN = 0.02
 WINDOW_S, WINDOW_STEP_S = 20.0, 0.5
 # Heights of the axes in points
 MAP, TRACK = 150.0, 88.0
@@ -79,10 +80,10 @@ OF_Z: dict[str, Any] = {"color": "black", "marker": "s", "ms": 8.0, "mew": 0.8, 
 
 
 def draw(document: Document) -> Iterator[Figure]:
-    """Draw one page; none where nothing was tuned."""
-    if not document.analysis.tuning:
-        return
+    """Draw one page; none where nothing was tuned, or the start is not forgotten."""
     result, settings = document.comparison.main, document.comparison.settings
+    if not document.analysis.tuning or len(result.replay.updates) < MIN_MEASUREMENTS:
+        return
     name = result.axis.name
     figure, cursor = page(
         "Appendix: what the knobs do",
@@ -244,8 +245,10 @@ def _gains(cursor: Cursor, ratio: float, gains: Array) -> Axes:
     say = (
         f"{gains[0]:.2f} as chosen; {gains[1]:.2f} with four times SIGMA_A and {gains[2]:.2f} with "
         f"a quarter of SIGMA_Z; {gains[3]:.2f} with a quarter of SIGMA_A and {gains[4]:.2f} with "
-        "four times SIGMA_Z: each square holds its circle."
+        "four times SIGMA_Z."
     )
+    if np.allclose(gains[[1, 3]], gains[[2, 4]], atol=SAME_GAIN):
+        say = f"{say[:-1]}: each square holds its circle."
     axes = panel(cursor, "Gain of position, settled, over the ratio", say, MAP, left=MIDDLE + 0.04)
     axes.plot(ratio * CURVE, gains[len(SETTINGS) :], color=MUTED, lw=1.0)
     axes.plot(np.array(at)[[1, 3]], gains[[1, 3]], **OF_A, label="SIGMA_A × or / 4")
@@ -275,7 +278,7 @@ def _apart_words(run: States, pair: tuple[int, int]) -> str:
     moved = float(np.sqrt(np.mean((settled[:, pair[0]] - settled[:, 0]) ** 2)))
     same = "Less than 0.001" if apart < 0.0005 else f"{apart:.3f}"
     why = (
-        " What gaps of the IMU add to the variance does not scale with them."
+        " What the start and gaps of the IMU add to the variance does not scale with them."
         if apart > LITTLE_APART * moved
         else ""
     )
