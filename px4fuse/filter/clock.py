@@ -282,7 +282,7 @@ def _profiled(problem: _Problem, curve: Array, noises: Noises, offset: float) ->
     def at(shift_a: int, shift_z: int) -> Array:
         scale = sigma_z * float(np.exp(NOISE_STEP * shift_z))
         found: Fitted = fits(noises.walk_m / scale)[1 + shift_a - shift_z]
-        return found.totals(np.array([scale]))[0]
+        return np.asarray(found.totals(np.array([scale]))[0])
 
     made = at(0, 0)
     ahead, back = (np.array([at(sign, 0), at(0, sign)]) for sign in (1, -1))

@@ -114,13 +114,12 @@ class Likelihood:
             return negative_log_likelihood(self.parts, noises, self.weight)
         ln_z = log(noises.sigma_z_m) / self.step
         ln_ratio = log(noises.sigma_a_m_s2) / self.step - ln_z
-        first = tuple(floor(at) - (self.nodes - 1) // 2 for at in (ln_ratio, ln_z))
-        if first not in self._values:
-            self._values[first] = self._around(*first)
-        across, along = (
-            _between(at - low, self.nodes) for at, low in zip((ln_ratio, ln_z), first, strict=True)
-        )
-        return float(across @ self._values[first] @ along)
+        low, below = (floor(at) - (self.nodes - 1) // 2 for at in (ln_ratio, ln_z))
+        if (low, below) not in self._values:
+            self._values[low, below] = self._around(low, below)
+        values = self._values[low, below]
+        found = _between(ln_ratio - low, self.nodes) @ values @ _between(ln_z - below, self.nodes)
+        return float(found)
 
     def _around(self, of_ratio: int, of_z: int) -> Array:
         """Values at the nodes about one place, from the first ones on."""

@@ -92,7 +92,8 @@ def moved(line: Timeline, acceleration_m_s2: Array) -> tuple[Array, Array]:
     _, leg, rest = _legs(line)
     still = np.zeros(len(rest))
     dp, dv = move(*move(still, still, acceleration_m_s2, np.diff(line.time_s)), still, rest)
-    return np.bincount(leg, dp), np.bincount(leg, dv)
+    delta_position, delta_velocity = (np.bincount(leg, part) * 1.0 for part in (dp, dv))
+    return delta_position, delta_velocity
 
 
 def _legs(line: Timeline) -> tuple[IntArray, IntArray, Array]:

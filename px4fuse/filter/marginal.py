@@ -387,7 +387,7 @@ def _factors(
         # where the start is as good as unknown, what is known of it does not count
         vague = float(np.sum(np.log(precision[(precision > 0.0) & ~said])))
         factor = replace(factor, log_determinant=factor.log_determinant + vague)
-        yield axes, factor, np.count_nonzero(said) - 2 * len(positions.start)
+        yield axes, factor, int(np.count_nonzero(said)) - 2 * len(positions.start)
         left = [axis for axis in left if axis not in axes]
 
 
