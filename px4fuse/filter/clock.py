@@ -22,6 +22,7 @@ from scipy.interpolate import CubicSpline
 from scipy.special import chdtrc
 
 from px4fuse.arrays import Array
+from px4fuse.filter.chain import Columns
 from px4fuse.filter.fitting import (
     NoiseFit,
     Noises,
@@ -32,7 +33,7 @@ from px4fuse.filter.fitting import (
 )
 from px4fuse.filter.kalman import Settings
 from px4fuse.filter.likelihood import PROFILE_DROP, parabola_vertex, profile_interval
-from px4fuse.filter.marginal import Columns, Fitted, centred, paired_products
+from px4fuse.filter.marginal import Fitted, centred, paired_products
 from px4fuse.filter.motion import CONSTANT_SIGMA, SEARCH_S, Made, Motion, motion
 from px4fuse.filter.signals import Segment, within
 from px4fuse.flight import POSITION_COLUMNS, Flight, PositionTrack, Unavailable

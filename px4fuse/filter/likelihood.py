@@ -92,8 +92,8 @@ def moved(line: Timeline, acceleration_m_s2: Array) -> tuple[Array, Array]:
     _, leg, rest = _legs(line)
     still = np.zeros(len(rest))
     dp, dv = move(*move(still, still, acceleration_m_s2, np.diff(line.time_s)), still, rest)
-    delta_position, delta_velocity = (np.bincount(leg, part) * 1.0 for part in (dp, dv))
-    return delta_position, delta_velocity
+    made: list[Array] = [np.asarray(np.bincount(leg, each), np.float64) for each in (dp, dv)]
+    return made[0], made[1]
 
 
 def _legs(line: Timeline) -> tuple[IntArray, IntArray, Array]:
