@@ -13,6 +13,7 @@ from scipy.stats import norm
 from test_tuning import SIGMA_A, SIGMA_Z, TRUE, modelled
 
 from px4fuse.arrays import Array, IntArray
+from px4fuse.filter.chain import Chain, Columns, factorise
 from px4fuse.filter.fitting import (
     FIRST_SHARE,
     FIRST_WIDTH,
@@ -30,10 +31,7 @@ from px4fuse.filter.fitting import (
 from px4fuse.filter.kalman import Settings
 from px4fuse.filter.likelihood import PROFILE_DROP, innovations, preintegrate, total_over_grid
 from px4fuse.filter.marginal import (
-    Chain,
-    Columns,
     Positions,
-    factorise,
     fit,
     paired_products,
     squares,

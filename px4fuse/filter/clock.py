@@ -23,6 +23,7 @@ from scipy.special import chdtrc
 
 from px4fuse.arrays import Array
 from px4fuse.display import Shown
+from px4fuse.filter.chain import Columns
 from px4fuse.filter.fitting import (
     NoiseFit,
     Noises,
@@ -33,7 +34,7 @@ from px4fuse.filter.fitting import (
 )
 from px4fuse.filter.kalman import Settings
 from px4fuse.filter.likelihood import PROFILE_DROP, parabola_vertex, profile_interval
-from px4fuse.filter.marginal import Columns, Fitted, centred, paired_products
+from px4fuse.filter.marginal import Fitted, centred, paired_products
 from px4fuse.filter.motion import CONSTANT_SIGMA, SEARCH_S, Made, Motion, motion
 from px4fuse.filter.signals import Segment, within
 from px4fuse.flight import POSITION_COLUMNS, Flight, PositionTrack, Unavailable
@@ -283,8 +284,7 @@ def _profiled(problem: _Problem, curve: Array, noises: Noises, offset: float) ->
     def at(shift_a: int, shift_z: int) -> Array:
         scale = sigma_z * float(np.exp(NOISE_STEP * shift_z))
         found: Fitted = fits(noises.walk_m / scale)[1 + shift_a - shift_z]
-        total: Array = found.totals(np.array([scale]))[0]
-        return total
+        return np.asarray(found.totals(np.array([scale]))[0])
 
     made = at(0, 0)
     ahead, back = (np.array([at(sign, 0), at(0, sign)]) for sign in (1, -1))

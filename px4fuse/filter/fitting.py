@@ -18,9 +18,10 @@ from scipy.optimize import brentq, minimize
 from scipy.special import comb, expit, gammaincinv
 
 from px4fuse.arrays import Array
+from px4fuse.filter.chain import Chain
 from px4fuse.filter.lanes import Lanes, lanes
 from px4fuse.filter.likelihood import PROFILE_DROP, Preintegrated
-from px4fuse.filter.marginal import Chain, Fitted, Positions, centred, fit, squares
+from px4fuse.filter.marginal import Fitted, Positions, centred, fit, squares
 from px4fuse.filter.model import INITIAL_COVARIANCE
 
 SIGMA_A_SEARCH_M_S2 = (1e-3, 30.0)

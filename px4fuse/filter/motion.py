@@ -19,7 +19,8 @@ from scipy import constants
 from scipy.spatial.transform import Rotation, Slerp
 
 from px4fuse.arrays import Array, IntArray, cumulative_integral
-from px4fuse.filter.marginal import Chain, Positions
+from px4fuse.filter.chain import Chain
+from px4fuse.filter.marginal import Positions
 from px4fuse.filter.model import move, noise_of_many_steps
 from px4fuse.filter.signals import imu_gaps
 from px4fuse.flight import ANGULAR_RATE_COLUMNS, QUATERNION_COLUMNS, SPECIFIC_FORCE_COLUMNS
