@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, cached_property
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -34,7 +34,7 @@ from px4fuse.filter.fitting import (
 )
 from px4fuse.filter.kalman import Settings
 from px4fuse.filter.likelihood import PROFILE_DROP, parabola_vertex, profile_interval
-from px4fuse.filter.marginal import Fitted, centred, paired_products
+from px4fuse.filter.marginal import Fitted, Positions, centred, paired_products
 from px4fuse.filter.motion import CONSTANT_SIGMA, SEARCH_S, Made, Motion, motion
 from px4fuse.filter.signals import Segment, within
 from px4fuse.flight import POSITION_COLUMNS, Flight, PositionTrack, Unavailable
@@ -126,9 +126,13 @@ class _Problem:
     directions: Array
     dt_s: float
 
+    @cached_property
+    def positions(self) -> Positions:
+        return self.motion.positions(self.positions_m, self.dt_s)
+
     def part(self, offset_s: Array | float) -> Part:
         legs = self.motion.legs(self.directions, np.atleast_1d(offset_s))
-        return Part(*centred(self.motion.positions(self.positions_m, self.dt_s), *legs))
+        return Part(*centred(self.positions, *legs))
 
     def fitted(self, offset_s: Array | float, noises: Noises) -> Fitted:
         sigma = noises.sigma_z_m

@@ -59,7 +59,7 @@ class Signals:
     velocity: Array
     position: Array
 
-    def at(self, time_s: Array, axes: list[int] | slice = slice(None)) -> tuple[Array, Array]:
+    def at(self, time_s: Array, axes: slice = slice(None)) -> tuple[Array, Array]:
         """Integrals at other times: velocity and position, shape (axes, 1 + constants, ...)."""
         last = len(self.time_s) - 1
         at = np.clip(np.searchsorted(self.time_s, time_s, side="right") - 1, 0, last)
@@ -149,8 +149,10 @@ class Motion:
             Zero where a stretch begins.
         """
         # most directions are axes themselves
-        axes = np.flatnonzero(np.any(directions, axis=0)).tolist()
-        turned = None if np.array_equal(directions[:, axes], np.eye(len(axes))) else directions
+        used = np.flatnonzero(np.any(directions, axis=0))
+        axes = slice(int(used[0]), int(used[-1]) + 1)  # a view of the signals
+        own = directions[:, axes]
+        turned = None if np.array_equal(own, np.eye(own.shape[1])) else own
         width = self.signals[0].value.shape[1]
         dp, dv = np.zeros((2, len(directions), len(offset_s), width, len(self.time_s) - 1))
         for begin, end, signals in self._stretches():
@@ -159,7 +161,7 @@ class Motion:
                 velocity, position = signals.at(self.time_s[begin:end] + offset, axes)
                 if turned is not None:
                     velocity, position = (
-                        np.tensordot(turned[:, axes], part, 1) for part in (velocity, position)
+                        np.tensordot(turned, part, 1) for part in (velocity, position)
                     )
                 np.subtract(
                     velocity[..., 1:], velocity[..., :-1], out=dv[:, at, :, begin : end - 1]
