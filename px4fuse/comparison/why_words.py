@@ -35,6 +35,7 @@ REJECTED_SHARE = 0.01
 EQUALLY_CLOSE = 0.05
 # Stamps that are wrong by less do not show at flying speed
 CLOCK_S = 0.03
+STAMPS_WRONG = "The source's stamps are"
 # Shares of the mean square below this are not worth a word
 NOTABLE = 0.05
 # How much farther apart than where they were walked both must be elsewhere to be told (m, times)
@@ -321,7 +322,7 @@ def _clock(facts: Facts) -> list[str]:
     if min(abs(clock.offset_s), abs(both + delay_s)) < CLOCK_S or abs(own + delay_s) > CLOCK_S:
         return []
     return [
-        f"The source's stamps are {'late' if both < 0 else 'early'} by {abs(both):.2f} s for both "
+        f"{STAMPS_WRONG} {'late' if both < 0 else 'early'} by {abs(both):.2f} s for both "
         "filters alike: positions and IMU contradict each other, and the steps only say how each "
         "filter settles that. Set the clock right first (page Clock)."
     ]
