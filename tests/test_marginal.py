@@ -107,6 +107,17 @@ def test_the_factor_is_that_of_the_dense_normal_equations(seed: int) -> None:
     np.testing.assert_allclose(factor.position_variance(), variance, rtol=1e-6)
 
 
+def test_legs_of_one_step_are_factorised_far_beyond_the_search() -> None:
+    """Their Q is of rank one: of what makes it invertible, rounding leaves nothing."""
+    step = 0.09755900000000004
+    unit = 0.1 * step * np.array([step**2 / 4.0, step / 2.0, 1.0])
+    chain = Chain(np.arange(1, 20), np.full(19, step), np.tile(unit, (19, 1)), np.zeros((19, 3)))
+    tried = np.geomspace(1e4, 1e6, 100).tolist()
+    values = [factorise(chain, sigma_a, np.ones(20)).log_determinant for sigma_a in tried]
+    # with more noise the innovations are larger
+    assert np.all(np.diff(values) > 0.0)
+
+
 def test_a_stretch_without_measurements_cannot_be_factorised() -> None:
     chain = chain_of(np.random.default_rng(1), 8, [0, 4])
     with pytest.raises(np.linalg.LinAlgError):

@@ -18,9 +18,11 @@ from scipy.linalg import lapack
 
 from px4fuse.arrays import Array, IntArray
 
-# Position noise of a leg over that of a measurement that is always there: Q has an inverse, also
-# that of a single step, which is of rank one, or without process noise
+# Position noise of a leg that is always there, over a measurement's and over its own: Q has an
+# inverse, also that of a single step, which is of rank one, or without process noise
 LEAST_SHARE = 1e-5
+# A determinant below this share of its terms is their rounding
+SINGULAR = 1e-12
 
 
 @dataclass(frozen=True)
@@ -71,6 +73,8 @@ class Factor:
         Between any two states; 0 where a stretch begins.
     inverse : ndarray, shape (m - 1, 3)
         Q⁻¹ by elements 00, 01, 11; zero where a stretch begins.
+    root : ndarray, shape (m - 1,)
+        1/√Q₁₁, as Q⁻¹ has it but for rounding; zero where a stretch begins.
     bands, lower : ndarray, shape (4, 2m)
         Bands of A and of its Cholesky factor.
     log_determinant : float
@@ -81,6 +85,7 @@ class Factor:
     precision: Array
     length_s: Array
     inverse: Array
+    root: Array
     bands: Array
     lower: Array
     log_determinant: float
@@ -102,13 +107,13 @@ class Factor:
         explained : ndarray, shape (..., 2m)
         """
         dp, dv = self._everywhere(columns)
-        i00, i01, i11 = self.inverse.T
+        i00, i01, _ = self.inverse.T
         # Q⁻¹ = UᵀU; where a stretch begins it is zero
         u00 = np.sqrt(i00)
         u01 = np.divide(i01, u00, out=np.zeros_like(i01), where=u00 > 0.0)
         rows = np.empty((*dp.shape, 2))
         np.add(u00 * dp, u01 * dv, out=rows[..., 0])
-        np.multiply(np.sqrt(i11 - u01**2), dv, out=rows[..., 1])
+        np.multiply(self.root, dv, out=rows[..., 1])
         right = self._right(columns.measurement_m, dp, dv)
         explained, _ = lapack.dtbtrs(self.lower, right.T, uplo="L", overwrite_b=1)
         return rows.reshape(*dp.shape[:-1], -1), explained.T.reshape(*dp.shape[:-1], -1)
@@ -184,11 +189,15 @@ def factorise(chain: Chain, sigma_a_m_s2: float, precision: Array) -> Factor:
         precision = np.stack([precision, np.zeros_like(precision)], 1)
     q00, q01, q11 = (sigma_a_m_s2**2 * chain.noise_unit + chain.noise_fixed).T
     measured = precision[:, 0]
-    q00 = q00 + LEAST_SHARE**2 / np.median(measured[measured > 0.0])
-    determinant = q00 * q11 - q01**2
+    least = LEAST_SHARE**2 * (1.0 / np.median(measured[measured > 0.0]) + q00)
+    # of a single step Q has no inverse but for that, which rounding would hide
+    own = q00 * q11 - q01**2
+    determinant = np.where(own > SINGULAR * q00 * q11, own, 0.0) + least * q11
+    q00 = q00 + least
     count = len(precision)
-    inverse, dt = np.zeros((count - 1, 3)), np.zeros(count - 1)
+    inverse, root, dt = np.zeros((count - 1, 3)), np.zeros(count - 1), np.zeros(count - 1)
     inverse[chain.end - 1] = np.stack([q11, -q01, q00], 1) / determinant[:, None]
+    root[chain.end - 1] = 1.0 / np.sqrt(q11)
     dt[chain.end - 1] = chain.length_s
     i00, i01, i11 = inverse.T
     bands = np.zeros((4, 2 * count))
@@ -213,4 +222,4 @@ def factorise(chain: Chain, sigma_a_m_s2: float, precision: Array) -> Factor:
         + np.sum(np.log(determinant))
         - np.sum(np.log(precision[precision > 0.0]))
     )
-    return Factor(chain, precision, dt, inverse, bands, lower, float(log_determinant))
+    return Factor(chain, precision, dt, inverse, root, bands, lower, float(log_determinant))
