@@ -16,7 +16,6 @@ from px4fuse.analysis import Analysis
 from px4fuse.arrays import Array
 from px4fuse.comparison.comparison import AgainstTruth, AxisComparison, Comparison, FilterSummary
 from px4fuse.comparison.events import happened
-from px4fuse.comparison.why_words import the
 from px4fuse.explore.packing import COARSE, Packer
 from px4fuse.filter.consistency import CONFIDENCE, Consistency, nis_band
 from px4fuse.filter.kalman import (
@@ -27,7 +26,7 @@ from px4fuse.filter.kalman import (
     Settings,
 )
 from px4fuse.filter.model import INITIAL_COVARIANCE
-from px4fuse.filter.signals import Acceleration, along, choose_source, imu_gaps, within
+from px4fuse.filter.signals import Acceleration, Axis, along, choose_source, imu_gaps, within
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.findings.model import Finding
 from px4fuse.findings.story import story
@@ -63,22 +62,22 @@ def flight_data(
         Whether it stands beside another flight: then times are from the start of its segment.
     """
     comparison = analysis.comparison
-    raw = raw_source(comparison)
+    signals = signals_of(comparison, packer)
     settings, segment = comparison.settings, comparison.segment
     events = happened(comparison)
     return {
         "log": comparison.flight.log.name,
         "source": comparison.source.name,
         "shift": segment.start_s if beside else 0.0,
-        "segment": [segment.start_s, segment.end_s],
-        "reason": segment.reason,
         "story": list(story(analysis, findings)),
         "notes": list(comparison.notes),
         "settings": _settings(settings),
         "main": comparison.main.axis.name,
-        "start": list(INITIAL_COVARIANCE),
-        "imu": _imu(comparison, packer),
-        "axes": [_axis(analysis, result, raw, packer) for result in comparison.axes],
+        **signals,
+        "axes": [
+            own | _others(analysis, result, packer)
+            for own, result in zip(signals["axes"], comparison.axes, strict=True)
+        ],
         "maps": _maps(analysis),
         "plan": _plan(comparison, packer),
         "events": {
@@ -91,6 +90,23 @@ def flight_data(
         "findings": [_finding(one) for one in findings],
         "command": _command(request, comparison),
         "offset": _offset(request, settings),
+    }
+
+
+def signals_of(comparison: Comparison, packer: Packer) -> dict[str, Any]:
+    """What the page's engine replays: measurements, IMU integrals, segment and start.
+
+    Parameters
+    ----------
+    comparison : Comparison
+    packer : Packer
+    """
+    raw = raw_source(comparison)
+    return {
+        "segment": [comparison.segment.start_s, comparison.segment.end_s],
+        "start": list(INITIAL_COVARIANCE),
+        "imu": _imu(comparison, packer),
+        "axes": [_signals(comparison, result.axis, raw, packer) for result in comparison.axes],
     }
 
 
@@ -154,10 +170,10 @@ def _used(comparison: Comparison, acceleration: Acceleration) -> slice:
     return slice(max(low, 0), high)
 
 
-def _axis(
-    analysis: Analysis, result: AxisComparison, raw: PositionTrack, packer: Packer
+def _signals(
+    comparison: Comparison, axis: Axis, raw: PositionTrack, packer: Packer
 ) -> dict[str, Any]:
-    comparison, axis = analysis.comparison, result.axis
+    """One axis: measurements as they were stamped, also beyond the segment, and acceleration."""
     segment = comparison.segment
     time = raw.samples.index.to_numpy()
     value = along(raw.samples, POSITION_COLUMNS, axis.direction)
@@ -166,15 +182,9 @@ def _axis(
     near &= np.isfinite(value)
     made: dict[str, Any] = {
         "name": axis.name,
-        "title": the(axis.name),
-        "heading": axis.heading_deg,
-        "note": axis.note,
         "time": packer.add_times(time[near]),
         "z": packer.add(value[near]),
-        "bands": _bands(int(np.count_nonzero(near)), packer),
-        "map": _map_of(analysis, axis.name),
-        "ekf2": _ekf2(result, packer),
-        "truth": _truth(result, packer),
+        "count": int(np.count_nonzero(near)),
     }
     if isinstance(axis.acceleration, Acceleration):
         used = axis.acceleration.integral_m_s[_used(comparison, axis.acceleration)]
@@ -182,11 +192,26 @@ def _axis(
     return made
 
 
+def _others(analysis: Analysis, result: AxisComparison, packer: Packer) -> dict[str, Any]:
+    """What stands beside our filter along one axis."""
+    return {
+        "heading": result.axis.heading_deg,
+        "note": result.axis.note,
+        "bands": _bands(len(result.axis.measurement_time_s), packer),
+        "map": _map_of(analysis, result.axis.name),
+        "ekf2": _ekf2(result, packer),
+        "truth": _truth(result, packer),
+    }
+
+
 def _bands(count: int, packer: Packer) -> list[int]:
-    """Bands of the mean NIS for every number of innovations up to all: places of both ends."""
-    freedom = np.arange(1, count + 1)
+    """Bands of the mean NIS for every number of innovations: places of both ends.
+
+    Another clock offset moves measurements into the segment and out of it.
+    """
+    freedom = np.arange(1, 2 * count + 1)
     ends = ((1.0 - CONFIDENCE) / 2.0, (1.0 + CONFIDENCE) / 2.0)
-    return [packer.add(np.asarray(stats.chi2.ppf(end, freedom)) / freedom) for end in ends]
+    return [packer.add(np.asarray(stats.chi2.ppf(end, freedom)) / freedom, COARSE) for end in ends]
 
 
 def _ekf2(result: AxisComparison, packer: Packer) -> dict[str, Any] | str:
@@ -202,7 +227,7 @@ def _ekf2(result: AxisComparison, packer: Packer) -> dict[str, Any] | str:
         "r": None,
     }
     if isinstance(result.ekf2_variance, pd.DataFrame):
-        sigma = np.sqrt(result.ekf2_variance).dropna()
+        sigma = result.ekf2_variance.dropna().pow(0.5)
         made["variance"] = _frame(
             sigma, ["position_variance_m2", "velocity_variance_m2_s2"], packer
         )

@@ -7,18 +7,19 @@ from typing import Any
 import numpy as np
 from bokeh.document import Document
 from bokeh.models import (
-    BoxAnnotation,
     ColumnDataSource,
     FactorRange,
     HoverTool,
     LinearColorMapper,
     Range1d,
-    Span,
 )
+from bokeh.models.annotations import BoxAnnotation, Span
 from bokeh.plotting import figure
 
 from px4fuse.analysis import Tuning
 from px4fuse.arrays import Array
+from px4fuse.explore.data import RUNNING
+from px4fuse.filter.consistency import nis_band
 from px4fuse.filter.tuning import AxisTuning
 from px4fuse.report.style import EKF2, MEASUREMENT, OURS, TRUTH
 
@@ -30,6 +31,57 @@ EKF2_LINE: dict[str, Any] = {
 }  # fmt: skip
 TRUTH_LINE: dict[str, Any] = {
     "line_color": TRUTH, "line_width": 1.2, "line_dash": [1, 3], "name": "truth",
+}  # fmt: skip
+NIS_BAND: dict[str, Any] = {
+    "level": "underlay", "fill_alpha": 0.15, "fill_color": "#4a8f5a", "line_color": "#4a8f5a",
+}  # fmt: skip
+LEFT = 96
+# What the page fills, by column
+SOURCES = {
+    "steps": "t p v sp sv",
+    "updates": "t nu plus minus k0 k1 running",
+    "measured": "t z",
+    "state": "t p v",
+    "variance": "t sp sv",
+    "fused": "t nu",
+    "rejected": "t nu",
+    "limits": "t plus minus",
+    "running": "t running",
+    "truth_p": "t p",
+    "truth_v": "t v",
+    "error": "t e",
+    "error_ekf2": "t e",
+}
+# Label, height, scale and unit of each plot, and its lines: source, column, style, name at the
+# pointer. Ours lies on top
+PLOTS: dict[str, tuple[str, int, Any, str, tuple[tuple[str, str, dict[str, Any], str], ...]]] = {
+    "position": ("position (m)", TALL, "linear", "m", (
+        ("truth_p", "p", TRUTH_LINE, "truth"), ("state", "p", EKF2_LINE, "EKF2"),
+        ("steps", "p", OURS_LINE, "ours"),
+    )),
+    "velocity": ("velocity (m/s)", HEIGHT, "linear", "m/s", (
+        ("truth_v", "v", TRUTH_LINE, "truth"), ("state", "v", EKF2_LINE, "EKF2"),
+        ("steps", "v", OURS_LINE, "ours"),
+    )),
+    "error": ("error (m)", HEIGHT, "linear", "m", (
+        ("error_ekf2", "e", EKF2_LINE, "EKF2"), ("error", "e", OURS_LINE, "ours"),
+    )),
+    "innovation": ("innovation ν (m)", TALL, "linear", "m", (
+        ("limits", "plus", EKF2_LINE, ""), ("limits", "minus", EKF2_LINE, ""),
+    )),
+    "sigma_p": ("σ of position (m)", HEIGHT, "log", "m", (
+        ("variance", "sp", EKF2_LINE, "EKF2"), ("steps", "sp", OURS_LINE, "ours"),
+    )),
+    "sigma_v": ("σ of velocity (m/s)", HEIGHT, "log", "m/s", (
+        ("variance", "sv", EKF2_LINE, "EKF2"), ("steps", "sv", OURS_LINE, "ours"),
+    )),
+    "nis": ("running mean of NIS", HEIGHT, "log", "", (
+        ("running", "running", EKF2_LINE, "EKF2"), ("updates", "running", OURS_LINE, "ours"),
+    )),
+    "gain": ("gain K (1, 1/s)", HEIGHT, "linear", "", (
+        ("updates", "k0", OURS_LINE, "of position"),
+        ("updates", "k1", OURS_LINE | {"line_dash": [2, 2]}, "of velocity, 1/s"),
+    )),
 }  # fmt: skip
 # Rows of the strip of events
 STRIP = ["EKF2 reset", "EKF2 rejected", "log dropout", "source silent", "on the ground", "mode"]
@@ -54,7 +106,7 @@ def document_json(
         Of each flight, for its likelihood maps.
     """
     document = Document()
-    time_range = Range1d(0.0, 1.0, name="time")
+    time_range = _range("time")
     places: dict[str, str] = {}
     for number, (data, tuning) in enumerate(zip(flights, tunings, strict=True)):
         plots = _plots(number, data, time_range)
@@ -71,125 +123,84 @@ def document_json(
 
 
 def _plots(number: int, data: dict[str, Any], time_range: Range1d) -> dict[str, Any]:
-    sources = {
-        name: _source(name, number, columns)
-        for name, columns in {
-            "steps": "t p v sp sv",
-            "updates": "t nu plus minus k0 k1 running",
-            "measured": "t z",
-            "state": "t p v",
-            "variance": "t sp sv",
-            "fused": "t nu",
-            "rejected": "t nu",
-            "limits": "t plus minus",
-            "running": "t running",
-            "truth_p": "t p",
-            "truth_v": "t v",
-            "error": "t e",
-            "error_ekf2": "t e",
-        }.items()
+    """Every plot against time of one flight, by its name."""
+    sources = {name: _source(name, number, columns) for name, columns in SOURCES.items()}
+    lacking = {
+        kind
+        for kind in ("ekf2", "truth")
+        if not any(isinstance(axis[kind], dict) for axis in data["axes"])
     }
-    has_ekf2 = any(isinstance(axis["ekf2"], dict) for axis in data["axes"])
-    has_truth = any(isinstance(axis["truth"], dict) for axis in data["axes"])
-
-    def plot(name: str, label: str, height: int = HEIGHT, **more: Any) -> Any:
-        made = figure(
+    plots: dict[str, Any] = {}
+    for name, (label, height, scale, unit, lines) in PLOTS.items():
+        if name == "error" and "truth" in lacking:
+            continue
+        made = plots[name] = figure(
             name=f"{name}-{number}", height=height, sizing_mode="stretch_width",
-            x_range=time_range, y_range=Range1d(0.0, 1.0), toolbar_location=None,
+            x_range=time_range, y_range=_range(), toolbar_location=None, y_axis_type=scale,
             tools="xbox_zoom,xpan,tap", active_drag="xbox_zoom", y_axis_label=label,
-            output_backend="canvas", lod_threshold=None, min_border_left=96, **more,
+            lod_threshold=None, min_border_left=LEFT,
         )  # fmt: skip
+        if name == "position":
+            made.scatter(
+                "t", "z", source=sources["measured"], size=3, fill_color=MEASUREMENT,
+                line_color=None, name="measured",
+            )  # fmt: skip
+        if name == "innovation":
+            _innovations(made, sources, with_ekf2="ekf2" not in lacking)
+        if name == "nis":
+            low, high = nis_band(RUNNING)
+            made.add_layout(BoxAnnotation(bottom=low, top=high, **NIS_BAND))
+        for source, column, style, who in lines:
+            if style["name"] in lacking:
+                continue
+            drawn = made.line("t", column, source=sources[source], **style)
+            if who:
+                _hover(made, drawn, (who, f"@{column}{{0.000}} {unit}"))
         made.add_layout(Span(dimension="height", location=0.0, visible=False, name="cursor"))
         shift = data["shift"]
         for low, high, style in _bands(data):
             made.add_layout(
                 BoxAnnotation(left=low - shift, right=high - shift, level="underlay", **style)
             )
-        return made
+    return plots
 
-    def dots(made: Any, source: str, column: str, **style: Any) -> Any:
-        return made.scatter("t", column, source=sources[source], **style)
 
-    def hover(made: Any, renderers: list[Any], *rows: tuple[str, str]) -> None:
-        made.add_tools(
-            HoverTool(renderers=renderers, tooltips=[("time", "@t{0.00} s"), *rows], mode="vline")
-        )
-
-    plots: dict[str, Any] = {}
-    made = plots["position"] = plot("position", "position (m)", TALL)
-    dots(made, "measured", "z", size=3, fill_color=MEASUREMENT, line_color=None, name="measured")
-    if has_truth:
-        made.line("t", "p", source=sources["truth_p"], **TRUTH_LINE)
-    if has_ekf2:
-        theirs = made.line("t", "p", source=sources["state"], **EKF2_LINE)
-        hover(made, [theirs], ("EKF2", "@p{0.000} m"))
-    ours = made.line("t", "p", source=sources["steps"], **OURS_LINE)
-    hover(made, [ours], ("ours", "@p{0.000} m"))
-
-    made = plots["velocity"] = plot("velocity", "velocity (m/s)")
-    if has_truth:
-        made.line("t", "v", source=sources["truth_v"], **TRUTH_LINE)
-    if has_ekf2:
-        theirs = made.line("t", "v", source=sources["state"], **EKF2_LINE)
-        hover(made, [theirs], ("EKF2", "@v{0.000} m/s"))
-    ours = made.line("t", "v", source=sources["steps"], **OURS_LINE)
-    hover(made, [ours], ("ours", "@v{0.000} m/s"))
-
-    if has_truth:
-        made = plots["error"] = plot("error", "error (m)")
-        made.line("t", "e", source=sources["error_ekf2"], **EKF2_LINE)
-        ours = made.line("t", "e", source=sources["error"], **OURS_LINE)
-        hover(made, [ours], ("ours", "@e{0.000} m"))
-
-    made = plots["innovation"] = plot("innovation", "innovation ν (m)", TALL)
+def _innovations(made: Any, sources: dict[str, ColumnDataSource], *, with_ekf2: bool) -> None:
+    """Innovations of both filters as dots, and our ±2√S as a band."""
     updates = sources["updates"]
     made.varea(
         "t", "minus", "plus", source=updates, fill_color=OURS, fill_alpha=0.15, name="ours_band"
     )
-    if has_ekf2:
-        for side in ("plus", "minus"):
-            made.line("t", side, source=sources["limits"], **EKF2_LINE)
-        theirs = dots(made, "fused", "nu", size=4, marker="square", fill_color=EKF2,
-                      line_color=None, name="ekf2")  # fmt: skip
-        hollow = dots(made, "rejected", "nu", size=7, marker="square", fill_color=None,
-                      line_color=EKF2, name="ekf2")  # fmt: skip
-        hover(made, [theirs], ("EKF2", "@nu{0.000} m"))
-        hover(made, [hollow], ("EKF2 rejected", "@nu{0.000} m"))
-    ours = dots(
-        made, "updates", "nu", size=4, marker="circle", fill_color=OURS, line_color=None,
-        name="ours",
-    )  # fmt: skip
-    hover(made, [ours], ("ours", "@nu{0.000} m"), ("2√S", "@plus{0.000} m"))
+    if with_ekf2:
+        square: dict[str, Any] = {"marker": "square", "name": "ekf2"}
+        fused = made.scatter(
+            "t", "nu", source=sources["fused"], size=4, fill_color=EKF2, line_color=None, **square
+        )
+        rejected = made.scatter(
+            "t", "nu", source=sources["rejected"], size=7, fill_color=None, line_color=EKF2,
+            **square,
+        )  # fmt: skip
+        _hover(made, fused, ("EKF2", "@nu{0.000} m"))
+        _hover(made, rejected, ("EKF2 rejected", "@nu{0.000} m"))
+    ours = made.scatter(
+        "t", "nu", source=updates, size=4, fill_color=OURS, line_color=None, name="ours"
+    )
+    _hover(made, ours, ("ours", "@nu{0.000} m"), ("2√S", "@plus{0.000} m"))
 
-    for name, label, column, unit in (
-        ("sigma_p", "σ of position (m)", "sp", "m"), ("sigma_v", "σ of velocity (m/s)", "sv", "m/s")
-    ):  # fmt: skip
-        made = plots[name] = plot(name, label, y_axis_type="log")
-        if has_ekf2:
-            theirs = made.line("t", column, source=sources["variance"], **EKF2_LINE)
-            hover(made, [theirs], ("EKF2", f"@{column}{{0.0000}} {unit}"))
-        ours = made.line("t", column, source=sources["steps"], **OURS_LINE)
-        hover(made, [ours], ("ours", f"@{column}{{0.0000}} {unit}"))
 
-    made = plots["nis"] = plot("nis", "running mean of NIS", y_axis_type="log")
-    made.add_layout(BoxAnnotation(name="nis_band", level="underlay", fill_alpha=0.15,
-                                  fill_color="#4a8f5a", line_color="#4a8f5a"))  # fmt: skip
-    if has_ekf2:
-        theirs = made.line("t", "running", source=sources["running"], **EKF2_LINE)
-        hover(made, [theirs], ("EKF2", "@running{0.00}"))
-    ours = made.line("t", "running", source=updates, **OURS_LINE)
-    hover(made, [ours], ("ours", "@running{0.00}"))
+def _hover(made: Any, renderer: Any, *rows: tuple[str, str]) -> None:
+    tips = [("time", "@t{0.00} s"), *rows]
+    made.add_tools(HoverTool(renderers=[renderer], tooltips=tips, mode="vline"))
 
-    made = plots["gain"] = plot("gain", "gain K (1, 1/s)")
-    first = made.line("t", "k0", source=updates, **OURS_LINE)
-    made.line("t", "k1", source=updates, **(OURS_LINE | {"line_dash": [2, 2]}))
-    hover(made, [first], ("position", "@k0{0.0000}"), ("velocity", "@k1{0.0000} 1/s"))
-    return plots
+
+def _range(name: str | None = None) -> Range1d:
+    """For the page to set."""
+    return Range1d(start=0.1, end=1.0, name=name)
 
 
 def _source(name: str, number: int, columns: str) -> ColumnDataSource:
     """Empty, for the page to fill."""
-    empty: dict[str, list[float]] = {column: [] for column in columns.split()}
+    empty: dict[str, Any] = {column: [] for column in columns.split()}
     return ColumnDataSource(empty, name=f"{name}-source-{number}")
 
 
@@ -214,7 +225,7 @@ def _strip(number: int, data: dict[str, Any], time_range: Range1d) -> Any:
     made = figure(
         name=f"strip-{number}", height=28 * len(rows) + 24, sizing_mode="stretch_width",
         x_range=time_range, y_range=FactorRange(factors=rows), toolbar_location=None,
-        tools="xbox_zoom,xpan", active_drag="xbox_zoom", min_border_left=96,
+        tools="xbox_zoom,xpan", active_drag="xbox_zoom", min_border_left=LEFT,
         x_axis_label="time (s)",
     )  # fmt: skip
     made.hbar(
@@ -233,7 +244,7 @@ def _map(number: int, tuning: Tuning) -> Any:
     """How likely the innovations are over both noises, and where the sliders stand."""
     made = figure(
         name=f"map-{number}", height=250, sizing_mode="stretch_width", x_axis_type="log",
-        y_axis_type="log", x_range=Range1d(0.1, 1.0), y_range=Range1d(0.01, 1.0), tools="tap",
+        y_axis_type="log", x_range=_range(), y_range=_range(), tools="tap",
         toolbar_location=None, x_axis_label="SIGMA_A (m/s²)", y_axis_label="SIGMA_Z (m)",
     )  # fmt: skip
     mapper = LinearColorMapper(palette=MAP_COLOURS, low=0.0, high=MAP_SIGMAS)
@@ -243,10 +254,8 @@ def _map(number: int, tuning: Tuning) -> Any:
             y, dh = _outer(tuned.map.sigma_z_m)
             # rows are SIGMA_Z
             image = np.sqrt(2.0 * np.maximum(tuned.map.drop.T, 0.0)).astype(np.float32)
-            made.image(
-                [image], [x], [y], [dw], [dh], color_mapper=mapper, name=f"map:{name}",
-                visible=False,
-            )  # fmt: skip
+            draw: Any = made.image  # its colours stand in no signature
+            draw([image], x, y, dw, dh, color_mapper=mapper, name=f"map:{name}", visible=False)
     trail = _source("trail", number, "x y")
     best = _source("best", number, "x y")
     point = _source("point", number, "x y")
@@ -294,8 +303,8 @@ def _plan(number: int) -> Any:
 def _step(number: int) -> Any:
     """One measurement: what was predicted, what was measured, and what both make."""
     made = figure(
-        name=f"step-{number}", height=230, sizing_mode="stretch_width", x_range=Range1d(0.0, 1.0),
-        y_range=Range1d(0.0, 1.0), tools="", toolbar_location=None,
+        name=f"step-{number}", height=230, sizing_mode="stretch_width", x_range=_range(),
+        y_range=_range(), tools="", toolbar_location=None,
         x_axis_label="position (m)", y_axis_label="density (1/m)",
     )  # fmt: skip
     for name, style in (
