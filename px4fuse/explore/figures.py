@@ -53,7 +53,7 @@ SOURCES = {
     "error_ekf2": "t e",
 }
 # Label, height, scale and unit of each plot, and its lines: source, column, style, name at the
-# pointer. Ours lies on top
+# pointer. Later ones lie on top
 PLOTS: dict[str, tuple[str, int, Any, str, tuple[tuple[str, str, dict[str, Any], str], ...]]] = {
     "position": ("position (m)", TALL, "linear", "m", (
         ("truth_p", "p", TRUTH_LINE, "truth"), ("state", "p", EKF2_LINE, "EKF2"),
@@ -70,10 +70,10 @@ PLOTS: dict[str, tuple[str, int, Any, str, tuple[tuple[str, str, dict[str, Any],
         ("limits", "plus", EKF2_LINE, ""), ("limits", "minus", EKF2_LINE, ""),
     )),
     "sigma_p": ("σ of position (m)", HEIGHT, "log", "m", (
-        ("variance", "sp", EKF2_LINE, "EKF2"), ("steps", "sp", OURS_LINE, "ours"),
+        ("steps", "sp", OURS_LINE, "ours"), ("variance", "sp", EKF2_LINE, "EKF2"),
     )),
     "sigma_v": ("σ of velocity (m/s)", HEIGHT, "log", "m/s", (
-        ("variance", "sv", EKF2_LINE, "EKF2"), ("steps", "sv", OURS_LINE, "ours"),
+        ("steps", "sv", OURS_LINE, "ours"), ("variance", "sv", EKF2_LINE, "EKF2"),
     )),
     "nis": ("running mean of NIS", HEIGHT, "log", "", (
         ("running", "running", EKF2_LINE, "EKF2"), ("updates", "running", OURS_LINE, "ours"),

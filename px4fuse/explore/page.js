@@ -108,7 +108,7 @@ const Explore = (async () => {
   }
   const axisOf = (flight) => flight.axes.find((axis) => axis.name === settings.axis);
   const say = (text) => { $("said").textContent = text; };
-  const mapOf = (flight) => flight.maps[axisOf(flight).map];
+  const mapOf = (flight) => flight.maps[axisOf(flight).map] ?? "not made";
 
   $("lesson").addEventListener("click", () => {
     const { sigmaA, sigmaZ, dt } = ranges.lesson;
