@@ -16,6 +16,7 @@ from px4fuse.analysis import Analysis
 from px4fuse.arrays import Array
 from px4fuse.comparison.comparison import AgainstTruth, AxisComparison, Comparison, FilterSummary
 from px4fuse.comparison.events import happened
+from px4fuse.explore.ekf2_grid import grid_data
 from px4fuse.explore.packing import COARSE, Packer
 from px4fuse.filter.consistency import CONFIDENCE, Consistency, nis_band
 from px4fuse.filter.kalman import (
@@ -79,6 +80,7 @@ def flight_data(
             for own, result in zip(signals["axes"], comparison.axes, strict=True)
         ],
         "maps": _maps(analysis),
+        "grid": grid_data(analysis, packer),
         "plan": _plan(comparison, packer),
         "events": {
             "silent": list(events.gaps),
@@ -197,6 +199,7 @@ def _others(analysis: Analysis, result: AxisComparison, packer: Packer) -> dict[
     return {
         "heading": result.axis.heading_deg,
         "note": result.axis.note,
+        "direction": result.axis.direction.tolist(),
         "bands": _bands(len(result.axis.measurement_time_s), packer),
         "map": _map_of(analysis, result.axis.name),
         "ekf2": _ekf2(result, packer),

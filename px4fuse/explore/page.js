@@ -282,7 +282,8 @@ const Explore = (async () => {
     ["Velocity: RMS to truth", (x) => x.truthV?.toFixed(3).concat(" m/s")],
   ];
   function drawTable(flight, axis, ours) {
-    const ekf2 = typeof axis.ekf2 === "string" ? { why: axis.ekf2 } : axis.ekf2.summary;
+    const other = Grid.chosen(flight, axis);
+    const ekf2 = other ? other.axes[axis.name] : typeof axis.ekf2 === "string" ? { why: axis.ekf2 } : axis.ekf2.summary;
     let own = $(`table-${flight.number}`);
     if (own === null) {
       own = make("table", undefined, { id: `table-${flight.number}` });
@@ -297,6 +298,7 @@ const Explore = (async () => {
       }
       $("tables").append(own, make("p", "", { className: "note", id: `why-${flight.number}` }));
     }
+    own.tHead.rows[0].cells[2].textContent = other ? "EKF2 replayed" : "EKF2";
     ROWS.forEach(([, words], i) => {
       const row = own.tBodies[0].rows[i], left = ours && words(ours), right = words(ekf2);
       row.cells[1].textContent = left ?? "–";
@@ -352,12 +354,13 @@ const Explore = (async () => {
     const shift = flight.shift, seen = {};
     const give = (name, columns, keys) => { seen[name] = thin(columns, keys); put(name, flight, seen[name]); };
     if (typeof axis.ekf2 !== "string") {
+      // the page holds only the innovations of EKF2 with other parameters
       const { state, variance, innovations } = axis.ekf2;
       const own = table(["t", "p", "v"], state);
       give("state", { ...own, t: later(own.t, shift) }, ["p", "v"]);
       const sigma = table(["t", "sp", "sv"], variance);
       give("variance", { ...sigma, t: later(sigma.t, shift) }, ["sp", "sv"]);
-      const rows = table(["t", "nu", "sigma", "rejected"], innovations), t = later(rows.t, shift);
+      const rows = Grid.rows(flight, axis) ?? table(["t", "nu", "sigma", "rejected"], innovations), t = later(rows.t, shift);
       for (const [name, flag] of [["fused", 0], ["rejected", 1]]) {
         const which = [...t.keys()].filter((i) => rows.rejected[i] === flag);
         give(name, { t: Float64Array.from(which, (i) => t[i]),
@@ -488,6 +491,7 @@ const Explore = (async () => {
     $("likely").disabled = typeof found === "string" || found.likely.includes(null);
     $("ekf2-r").disabled = typeof axis.ekf2 === "string" || axis.ekf2.r === null;
     $("map-note").textContent = mapWords();
+    Grid.say(lone, axis);
     const another = axisShown !== settings.axis;
     axisShown = settings.axis;
     for (const flight of flights) {
@@ -513,6 +517,7 @@ const Explore = (async () => {
     }
   }
 
+  Grid.start(flights, arrays, () => { axisShown = null; show(); });
   const times = Times.start({ flights, settings, chosen, runs, model, put, timeRange, figures, look, toAddress, axisOf, later });
   addEventListener("hashchange", () => { fromAddress(); show(); });
   fromAddress();

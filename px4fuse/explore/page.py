@@ -51,7 +51,7 @@ def html_text(flights: list[Explored]) -> str:
     scripts = {
         "bokeh": _bokeh(),
         "engine": _file("engine.js"),
-        "script": _file("times.js") + _file("page.js"),
+        "script": _file("grid.js") + _file("times.js") + _file("page.js"),
     }
     names = " and ".join(one["log"] for one in data)
     return Template(_file("page.html")).substitute(
