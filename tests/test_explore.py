@@ -25,8 +25,12 @@ from px4fuse.cli import cli
 from px4fuse.cli.compare import compare as compare_command
 from px4fuse.cli.inputs import comparison_request, read_person
 from px4fuse.comparison.comparison import AxisComparison, compare
+from px4fuse.ekf2.model import replay_settings
+from px4fuse.ekf2.whatif import what_if
 from px4fuse.explore.page import html_text
 from px4fuse.filter.consistency import Consistency
+from px4fuse.filter.kalman import Settings
+from px4fuse.filter.signals import within
 from px4fuse.findings import find
 from px4fuse.flight import Flight, Unavailable
 from px4fuse.request import ComparisonRequest
@@ -35,6 +39,8 @@ MARKUP = '<img src=x onerror="window.alive=1"></script><script>window.alive=2</s
 NOTHING = Unavailable("it", "not asked for", "")
 TABLE = """Object.fromEntries([...document.querySelectorAll('#tables tbody tr')].map((row) =>
   [row.cells[0].textContent, [row.cells[1].textContent, row.cells[2].textContent]]))"""
+
+VALUES = "[...document.querySelectorAll('.knob input[type=number]')].map((node) => node.value)"
 
 
 @pytest.fixture(scope="module")
@@ -308,6 +314,103 @@ def test_findings_and_buttons_move_all_plots(page: Browser) -> None:
     page.call("Input.dispatchKeyEvent", type="keyDown", key="+", text="+")
     settle(page)
     assert page.ask(span) != whole
+
+
+def test_ekf2_at_a_stop_is_what_whatif_says(page: Browser, made: tuple[Path, Analysis]) -> None:
+    model = made[1].ekf2_model
+    assert not isinstance(model, Unavailable)
+    changes = {"EKF2_EVP_NOISE": 0.05, "EKF2_EV_DELAY": 200.0, "EKF2_EVP_GATE": 3.0}
+    asked = what_if(model, [changes])
+    assert not isinstance(asked, Unavailable)
+    (told,) = asked.whatif
+    page.click("#axes input[value=north]")
+    for name, value in changes.items():
+        page.ask(
+            f"(() => {{ const node = document.getElementById('{name}');"
+            f"const stop = [...Array(Number(node.max) + 1).keys()].find((at) => {{ node.value = at;"
+            "node.dispatchEvent(new Event('input'));"
+            f"return parseFloat(node.previousElementSibling.textContent) === {value}; }});"
+            "if (stop === undefined) throw new Error('no such stop'); })()"
+        )
+    settle(page)
+    shown = page.ask(TABLE)
+    north = told.axes["north"]
+    assert shown["Mean NIS (1 is right)"][1] == f"{north.nis_mean:.2f}"
+    assert shown["Measurements"][1] == str(told.samples)
+    assert shown["Position: RMS to truth"][1] == f"{north.position_rmse_to_truth_m:.3f} m"
+    said = page.ask("document.getElementById('grid-said').textContent")
+    assert told.rejected_share > 0.05
+    assert said.startswith(f"{100 * told.rejected_share:.1f} % rejected, {told.resets} reset")
+    counts = ask(
+        page,
+        "Explore.then((e) => e.model('strip-source-0').data.row"
+        ".filter((row) => row === 'EKF2 rejected').length)",
+    )
+    (replay,) = replay_settings(model, [changes])
+    segment = made[1].comparison.segment
+    assert counts == within(replay.updates, segment)["rejected"].sum()
+    drawn = ask(page, "Explore.then((e) => Array.from(e.model('rejected-source-0').data.nu))")
+    expected = within(replay.updates, segment)
+    nu = expected["innovation_north_m"][expected["rejected"] > 0]
+    np.testing.assert_allclose(drawn, nu, rtol=0.0, atol=6e-4)
+    page.click("#axes input[value=down]")
+    settle(page)
+    assert "no height" in page.ask("document.getElementById('grid-said').textContent")
+    page.click("#other-ekf2")
+    settle(page)
+    assert page.ask(TABLE)["Measurements"][1] != str(told.samples)
+
+
+def test_a_box_on_the_track_is_a_time(page: Browser) -> None:
+    span = "document.getElementById('span').textContent"
+    whole = page.ask(span)
+    x, y, width, height = page.ask(
+        "(() => { const node = document.getElementById('plan-0');"
+        "node.scrollIntoView({block: 'center'}); const box = node.getBoundingClientRect();"
+        "return [box.x, box.y, box.width, box.height]; })()"
+    )
+    # the first half of the drawing, from above: the track's far end is left once and reached thrice
+    for kind, across, down in (
+        ("mousePressed", 0.25, 0.05), ("mouseMoved", 0.5, 0.2), ("mouseMoved", 0.95, 0.35),
+        ("mouseReleased", 0.95, 0.35),
+    ):  # fmt: skip
+        page.call(
+            "Input.dispatchMouseEvent", type=kind, x=x + across * width, y=y + down * height,
+            button="left", buttons=1, clickCount=1,
+        )  # fmt: skip
+    settle(page)
+    low, high = (float(word) for word in re.findall(r"[\d.]+", page.ask(span)))
+    assert page.ask(span) != whole
+    # it is there from 22 s to 106 s, see the picture of the position
+    assert 15.0 < low < 30.0
+    assert 95.0 < high < 112.0
+
+
+def test_two_flights_stand_on_the_same_axes(browser: Browser, tmp_path: Path) -> None:
+    pair = [bare(aisle_flight(duration_s=length, length_m=length)) for length in (20.0, 30.0)]
+    requests = [ComparisonRequest(log=name) for name in ("first.ulg", "second.ulg")]
+    file = tmp_path / "two.html"
+    told = [(one, (), request) for one, request in zip(pair, requests, strict=True)]
+    file.write_bytes(html_text(told).encode())
+    show(browser, file)
+    drag(browser, "sigma-z", 0.6)
+    ranges = ask(
+        browser,
+        "Explore.then((e) => [0, 1].map((n) => { const r = e.model(`position-${n}`);"
+        "return [r.x_range.start, r.x_range.end, r.y_range.start, r.y_range.end]; }))",
+    )
+    assert ranges[0] == ranges[1]
+    assert ranges[0][0] == 0.0
+    z = float(browser.ask("document.getElementById('sigma-z-value').value"))
+    for number, analysis in enumerate(pair):
+        comparison = compare(analysis.comparison.flight, Settings(sigma_z_m=z))
+        statement = comparison.main.kf.consistency
+        assert isinstance(statement, Consistency)
+        shown = browser.ask(TABLE.replace("#tables", f"#table-{number}"))
+        assert shown["Mean NIS (1 is right)"][0] == f"{statement.nis_mean:.2f}"
+        line = browser.ask(f"document.querySelector('#command-{number}').textContent")
+        assert line == f"px4fuse compare {requests[number].log} --sigma-z {z:g}"
+    assert browser.complaints() == []
 
 
 def test_text_from_a_log_is_text(browser: Browser, tmp_path: Path) -> None:

@@ -80,7 +80,7 @@ def flight_data(
             for own, result in zip(signals["axes"], comparison.axes, strict=True)
         ],
         "maps": _maps(analysis),
-        "grid": grid_data(analysis, packer),
+        "grid": "only for one log" if beside else grid_data(analysis, packer),
         "plan": _plan(comparison, packer),
         "events": {
             "silent": list(events.gaps),

@@ -9,10 +9,8 @@ const Grid = (() => {
   function start(flights, arrays, redraw) {
     lone = flights[0];
     const { grid } = lone, box = $("other-ekf2");
-    // side by side every flight would need knobs of its own
-    const why = flights.length > 1 ? "only for one log" : typeof grid === "string" ? grid : "";
-    if (why) {
-      $("grid-note").textContent = `Not here: ${why}.`;
+    if (typeof grid === "string") {
+      $("grid-note").textContent = `Not here: ${grid}.`;
       box.disabled = true;
       return;
     }

@@ -217,13 +217,23 @@ const Explore = (async () => {
     names.map((name, i) => [name, columns.length ? columns[i] : EMPTY]));
   const later = (t, by) => by ? t.map((x) => x - by) : t;
 
-  function frame(name, flight, low, high, log) {
-    const plot = model(`${name}-${flight.number}`);
-    if (!plot) return;
-    if (!(high > low)) { [low, high] = Number.isFinite(low) ? [low - 1, low + 1] : [0.1, 1]; }
-    const edge = log ? 1.15 : 0.06 * (high - low);
-    [plot.y_range.start, plot.y_range.end] =
-      log ? [Math.max(low, 1e-6) / edge, high * edge] : [low - edge, high + edge];
+  /* Heights of the plots; two flights have the same, so that they can be compared */
+  const heights = new Map();
+  function frame(name, flight, low, high, log = false) {
+    const known = heights.get(name) ?? [Infinity, -Infinity, log];
+    heights.set(name, [Math.min(known[0], low), Math.max(known[1], high), log]);
+  }
+  function setHeights() {
+    for (const [name, [least, most, log]] of heights) {
+      let [low, high] = [least, most];
+      if (!(high > low)) [low, high] = Number.isFinite(low) ? [0.9 * low - 0.1, 1.1 * low + 0.1] : [0.1, 1];
+      const edge = log ? 1.15 : 0.06 * (high - low);
+      for (const { number } of flights) {
+        const range = model(`${name}-${number}`)?.y_range;
+        if (range) [range.start, range.end] = log ? [Math.max(low, 1e-6) / edge, high * edge] : [low - edge, high + edge];
+      }
+    }
+    heights.clear();
   }
   function extent(...columns) {
     let low = Infinity, high = -Infinity;
@@ -504,6 +514,7 @@ const Explore = (async () => {
       if (done.run) frames(flight, drawOurs(flight, done), others[flight.number]);
       times.step(flight);
     }
+    setHeights();
     toAddress();
   }
   /* After a zoom: the same replay, other rows of it */
@@ -515,6 +526,7 @@ const Explore = (async () => {
       if (done.run) frames(flight, drawOurs(flight, done), others[flight.number]);
       times.plan(flight);
     }
+    setHeights();
   }
 
   Grid.start(flights, arrays, () => { axisShown = null; show(); });

@@ -113,7 +113,7 @@ PANELS = (
     ("position", "Position"),
     ("velocity", "Velocity"),
     ("error", "Error of position against the truth"),
-    ("innovation", "Innovations with ±2√S"),
+    ("innovation", "Innovations with ±2√S (the farthest may lie beyond the axis)"),
     ("sigma_p", "Standard deviation of position: grows on predict, shrinks on update"),
     ("sigma_v", "Standard deviation of velocity"),
     ("nis", "Running mean of NIS: 1 is right, the band holds 95 %"),

@@ -263,8 +263,9 @@ const Times = (() => {
       if (name === "ours_band") { glyph.fill_color = colours.ours; return; }
       if (name === "ink") { glyph.text_color = colours.ink; return; }
       if (name === null || colours[name] === undefined) return;
-      if (glyph.line_color?.value ?? glyph.line_color) glyph.line_color = colours[name];
-      if (glyph.fill_color !== undefined && (glyph.fill_color?.value ?? glyph.fill_color)) glyph.fill_color = colours[name];
+      const drawn = (one) => Boolean(one !== null && typeof one === "object" ? one.value : one);
+      if (drawn(glyph.line_color)) glyph.line_color = colours[name];
+      if (drawn(glyph.fill_color)) glyph.fill_color = colours[name]; // what is hollow stays so
     }
     dark.addEventListener("change", paint);
     paint();
