@@ -9,14 +9,15 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from px4fuse import placing
 from px4fuse.comparison.asked import asked_of_ekf2
-from px4fuse.comparison.comparison import Comparison, compare
+from px4fuse.comparison.comparison import AxisComparison, Comparison, compare
 from px4fuse.comparison.drift import may_drift, with_drift
 from px4fuse.comparison.why import Why, why_ekf2_differs
+from px4fuse.display import Shown, brief
 from px4fuse.ekf2.model import Model, open_model
 from px4fuse.ekf2.parameters import check
 from px4fuse.ekf2.replay import Ekf2Replay
@@ -27,17 +28,12 @@ from px4fuse.filter.clock import ClockOffset, estimate_clock_offset
 from px4fuse.filter.fitting import Noises
 from px4fuse.filter.heading import HeadingError, heading_error
 from px4fuse.filter.kalman import Settings
-from px4fuse.filter.motion import MAX_IMU_INTERVAL_S
+from px4fuse.filter.motion import MAX_IMU_INTERVAL_S, Made
 from px4fuse.filter.signals import AISLE, Axis
 from px4fuse.filter.smoothing import Smoothing, smoothing
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise, tune
 from px4fuse.flight import Flight, Unavailable
-from px4fuse.loop.analysis import analyse, loop_in
-from px4fuse.loop.loop import Loop
-from px4fuse.loop.odometry import OdometryNoise
-from px4fuse.loop.sources import read_source
 from px4fuse.readers import read_log
-from px4fuse.readers.position_csv import read_position_csv
 from px4fuse.reading import shown
 from px4fuse.request import (
     AUTO,
@@ -46,6 +42,9 @@ from px4fuse.request import (
     PositionFile,
     WhatIfRequest,
 )
+
+if TYPE_CHECKING:
+    from px4fuse.loop.loop import Loop
 
 # Noises that the report states: those of a source once. Each axis by itself is for `px4fuse tune`
 REPORTED = (HORIZONTAL, "down")
@@ -66,8 +65,8 @@ def _silent(_: str) -> None:
     """Progress that nobody watches."""
 
 
-@dataclass(frozen=True)
-class Analysis:
+@dataclass(frozen=True, repr=False)
+class Analysis(Shown):
     """A comparison and what explains it.
 
     Attributes
@@ -94,6 +93,25 @@ class Analysis:
     why: Mapping[str, Why | Unavailable]
     loop: Loop | Unavailable
     heading: HeadingError | Unavailable
+
+    @property
+    def flight(self) -> Flight:
+        """What was compared."""
+        return self.comparison.flight
+
+    @property
+    def settings(self) -> Settings:
+        """The filter's, as used."""
+        return self.comparison.settings
+
+    @property
+    def axes(self) -> tuple[AxisComparison, ...]:
+        """Everything about each axis."""
+        return self.comparison.axes
+
+    def __getitem__(self, axis: str) -> AxisComparison:
+        """Everything about one axis, by its name."""
+        return self.comparison[axis]
 
     @property
     def ekf2_replay(self) -> Ekf2Replay | Unavailable:
@@ -166,7 +184,9 @@ def _size(noise: Noise, otherwise: float) -> float:
     return noise.value or noise.high or otherwise
 
 
-def run(request: ComparisonRequest, progress: Progress = _silent) -> Analysis:
+def run(
+    request: ComparisonRequest, progress: Progress = _silent, flight: Flight | None = None
+) -> Analysis:
     """Read a flight, compare it with EKF2 and explain the comparison.
 
     Parameters
@@ -174,13 +194,15 @@ def run(request: ComparisonRequest, progress: Progress = _silent) -> Analysis:
     request : ComparisonRequest
     progress : callable
         Told what is being done.
+    flight : Flight, optional
+        What the request's recordings hold, where they have been read.
 
     Raises
     ------
     LogError, MissingDataError, SettingsError
         A file cannot be read, the flight lacks what was asked for, or a setting is out of range.
     """
-    return explain(run_comparison(request, progress), progress)
+    return explain(run_comparison(request, progress, flight), progress)
 
 
 def read_flight(request: ComparisonRequest, progress: Progress = _silent) -> Flight:
@@ -200,10 +222,12 @@ def read_flight(request: ComparisonRequest, progress: Progress = _silent) -> Fli
         other = read_log(Path(request.mavlink), system=request.system)
         if not other.log.format.startswith("MAVLink"):
             raise LogError(
-                f"--mavlink {other.log.name}: this is a {other.log.format}, not a MAVLink "
-                "recording. Give the ULog as LOG, and the recording (.tlog) with --mavlink."
+                f"`mavlink` {other.log.name}: this is a {other.log.format}, not a MAVLink "
+                "recording. Give the ULog as LOG, and the recording (.tlog) with `mavlink`."
             )
-        flight = placing.join(flight, other)
+        from px4fuse.placing import join  # noqa: PLC0415
+
+        flight = join(flight, other)
     if request.position is None:
         return flight
     return _placed(flight, request.position, request.clock_offset_s)
@@ -211,13 +235,17 @@ def read_flight(request: ComparisonRequest, progress: Progress = _silent) -> Fli
 
 def _placed(flight: Flight, position: PositionFile, clock_offset: float | str | None) -> Flight:
     """The flight with a position file, whose clock offset is found unless it is given."""
+    # scipy.signal and scipy.ndimage cost a fifth of a second: only where a file is placed
+    from px4fuse.placing import place  # noqa: PLC0415
+    from px4fuse.readers.position_csv import read_position_csv  # noqa: PLC0415
+
     file = read_position_csv(
         Path(position.path),
         columns=position.columns,
         time_unit=position.time_unit,
         length_unit=position.length_unit,
     )
-    return placing.place(
+    return place(
         flight,
         file,
         frame=position.frame,
@@ -226,7 +254,9 @@ def _placed(flight: Flight, position: PositionFile, clock_offset: float | str | 
     )
 
 
-def run_comparison(request: ComparisonRequest, progress: Progress = _silent) -> Comparison:
+def run_comparison(
+    request: ComparisonRequest, progress: Progress = _silent, flight: Flight | None = None
+) -> Comparison:
     """Read a flight and compare it with EKF2, without what explains the comparison.
 
     Raises
@@ -244,17 +274,17 @@ def run_comparison(request: ComparisonRequest, progress: Progress = _silent) -> 
         clock_offset_s=asked if isinstance(asked, float) and request.position is None else 0.0,
     )
     for name, value in (
-        ("--start", request.start_s),
-        ("--end", request.end_s),
-        ("--clock-offset", asked),
+        ("start_s", request.start_s),
+        ("end_s", request.end_s),
+        ("clock_offset_s", asked),
     ):
         if isinstance(value, float) and not abs(value) < float("inf"):
-            raise SettingsError(f"{name} {value:g} is not a finite number.")
-    flight = read_flight(request, progress)
+            raise SettingsError(f"`{name}` {value:g} is not a finite number.")
+    read = flight or read_flight(request, progress)
 
     def compared(settings: Settings) -> Comparison:
         return compare(
-            flight,
+            read,
             settings,
             axes=request.axes or None,
             heading_deg=request.heading_deg,
@@ -271,8 +301,8 @@ def run_comparison(request: ComparisonRequest, progress: Progress = _silent) -> 
     found = clock_offset(comparison, tuned_horizontally(comparison), progress)
     if isinstance(found, Unavailable) or not found.determinable:
         raise MissingDataError(
-            f"{flight.log.name}: --clock-offset auto: not determinable: {found.reason}. "
-            "Give the seconds to add, or leave the option out."
+            f"{read.log.name}: `clock_offset_s` auto: not determinable: {found.reason}. "
+            "Give the seconds to add, or leave it out."
         )
     return compared(replace(settings, clock_offset_s=found.offset_s))
 
@@ -285,16 +315,15 @@ def run_loop(request: LoopRequest, progress: Progress = _silent) -> Loop:
     TrajectoryError, LogError, MissingDataError, SettingsError
         A file cannot be read or lacks what was asked for, or a setting is out of range.
     """
-    for name, value in (("--from", request.start_s), ("--to", request.end_s)):
+    from px4fuse.loop.analysis import analyse  # noqa: PLC0415 (tune and sync have none)
+    from px4fuse.loop.odometry import OdometryNoise  # noqa: PLC0415
+    from px4fuse.loop.sources import read_source  # noqa: PLC0415
+
+    for name, value in (("start_s", request.start_s), ("end_s", request.end_s)):
         if value is not None and not abs(value) < float("inf"):
-            raise SettingsError(f"{name} {value:g} is not a finite number.")
+            raise SettingsError(f"`{name}` {value:g} is not a finite number.")
     progress(f"reading {shown(Path(request.source))}")
     source = read_source(request.source, frame=request.frame, system=request.system)
-    if request.frame is not None and source.flight is not None:
-        raise SettingsError(
-            f"--frame {request.frame.lower()} is for trajectory files; {source.flight.log.name} is "
-            "a flight log, which states its frame. Leave --frame out."
-        )
     reference = None
     if request.reference is not None:
         reference = read_source(
@@ -339,8 +368,12 @@ class Counterfactual:
     asked: bool
     why: Mapping[str, Why | Unavailable]
 
+    __repr__ = brief
 
-def run_what_if(request: WhatIfRequest, progress: Progress = _silent) -> Counterfactual:
+
+def run_what_if(
+    request: WhatIfRequest, progress: Progress = _silent, flight: Flight | None = None
+) -> Counterfactual:
     """Read a flight and replay its EKF2 with other parameters.
 
     Parameters
@@ -348,6 +381,8 @@ def run_what_if(request: WhatIfRequest, progress: Progress = _silent) -> Counter
     request : WhatIfRequest
     progress : callable
         Told what is being done.
+    flight : Flight, optional
+        What the request's recordings hold, where they have been read.
 
     Raises
     ------
@@ -362,7 +397,7 @@ def run_what_if(request: WhatIfRequest, progress: Progress = _silent) -> Counter
         if swept.parameter in changes:
             raise SettingsError(f"{swept.parameter}: set and swept. Give one of the two.")
     recordings = ComparisonRequest(log=request.log, mavlink=request.mavlink, system=request.system)
-    flight = read_flight(recordings, progress)
+    flight = flight or read_flight(recordings, progress)
     progress("replaying EKF2")
     model = open_model(flight)
     if isinstance(model, Unavailable):
@@ -401,7 +436,7 @@ def _not_told(compared: Comparison) -> str:
             f"{source.name} may drift, so that innovations do not tell its noise, and the delay is "
             "as the data ask for or not determinable"
         )
-    return f"{name}: {why}. Say what to change: --set EKF2_EVP_NOISE=0.1."
+    return f"{name}: {why}. Say what to change: `changes` EKF2_EVP_NOISE=0.1."
 
 
 def explain(comparison: Comparison, progress: Progress = _silent) -> Analysis:
@@ -415,13 +450,17 @@ def explain(comparison: Comparison, progress: Progress = _silent) -> Analysis:
     """
     axes = tuple(result.axis for result in comparison.axes)
     names = REPORTED if {"north", "east"} <= {axis.name for axis in axes} else None
-    tuning = tuned(comparison, names, progress)
-    clock = clock_offset(comparison, tuning, progress)
+    made: Made = {}  # tuning and clock need the same signals of the IMU
+    tuning = tuned(comparison, names, progress, made)
+    clock = clock_offset(comparison, tuning, progress, made)
+    del made
     progress("replaying EKF2")
     model = open_model(comparison.flight)
     why = why_ekf2_differs(comparison, model, tuning, clock)
     heading = turned_frame(comparison, tuning, clock, progress)
     progress("looking for a loop")
+    from px4fuse.loop.analysis import loop_in  # noqa: PLC0415 (tune and sync have none)
+
     loop = loop_in(comparison.flight, progress)
     return Analysis(comparison, tuning, clock, model, why, loop, heading)
 
@@ -432,7 +471,10 @@ def tuned_horizontally(comparison: Comparison) -> Tuning:
 
 
 def tuned(
-    comparison: Comparison, names: tuple[str, ...] | None = None, progress: Progress = _silent
+    comparison: Comparison,
+    names: tuple[str, ...] | None = None,
+    progress: Progress = _silent,
+    made: Made | None = None,
 ) -> dict[str, AxisTuning | Unavailable]:
     """Most likely noises of a comparison's axes; an IMU too slow to tell biases is left out.
 
@@ -443,6 +485,8 @@ def tuned(
         Axis names and "horizontal"; by default all that there are.
     progress : callable
         Told what is being done.
+    made : dict, optional
+        As :func:`px4fuse.filter.motion.motion` has it.
     """
     flight = comparison.flight
     slow = imu_too_slow_for_clocks(flight)
@@ -453,11 +497,15 @@ def tuned(
         lambda name: progress(f"tuning {name}"),
         flight if slow is None else replace(flight, imu=slow),
         may_drift(flight, comparison.source),
+        made,
     )
 
 
 def clock_offset(
-    comparison: Comparison, tuning: Tuning, progress: Progress = _silent
+    comparison: Comparison,
+    tuning: Tuning,
+    progress: Progress = _silent,
+    made: Made | None = None,
 ) -> ClockOffset | Unavailable:
     """What must still be added to the stamps of the source, beyond the offset that was set.
 
@@ -468,6 +516,8 @@ def clock_offset(
         Its measurement noise and outliers are used where it has them.
     progress : callable
         Told what is being done.
+    made : dict, optional
+        As :func:`px4fuse.filter.motion.motion` has it.
     """
     if slow := imu_too_slow_for_clocks(comparison.flight):
         return slow
@@ -489,6 +539,7 @@ def clock_offset(
         noises if tuned is None else tuned.noises,
         None if tuned is None else tuned.outlier_time_s,
         progress,
+        made,
     )
     if isinstance(found, ClockOffset) and may_drift(comparison.flight, comparison.source):
         return with_drift(found)

@@ -10,8 +10,9 @@
     ├── ResultsError       a file holds no results of px4fuse that this version reads
     └── OutputError        a result cannot be written
 
-The text of each is one line for a person: what is wrong, where, and what to do.
-The command line prints it on standard error and ends with exit code 2.
+The text of each is one line for a person: what is wrong, where, and what to do. It names arguments
+as Python does, in backticks (`sigma_z_m`); the command line puts its options in their place
+(:func:`px4fuse.request.with_options`), prints it on standard error and ends with exit code 2.
 """
 
 from __future__ import annotations

@@ -20,6 +20,7 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.arrays import BoolArray
+from px4fuse.display import Shown, brief
 
 AxisName = Literal["north", "east", "down"]
 # Below this share of intervals near the median, samples come in bursts
@@ -295,6 +296,8 @@ class LogInfo:
     start_unix_s: float | None = None
     senders: tuple[Sender, ...] = ()
 
+    __repr__ = brief
+
     @property
     def has_ulog(self) -> bool:
         """Whether its autopilot writes a ULog: ArduPilot writes DataFlash, which is not read."""
@@ -353,6 +356,8 @@ class PositionTrack:
     alignment: Alignment | None = None
     orientation: pd.DataFrame | None = None
     notes: tuple[str, ...] = ()
+
+    __repr__ = brief
 
     @property
     def rate_hz(self) -> float:
@@ -428,6 +433,8 @@ class FusionRecord:
     other_aiding: tuple[str, ...]
     vision_age_s: pd.Series
 
+    __repr__ = brief
+
 
 @dataclass(frozen=True)
 class Ekf2:
@@ -479,6 +486,8 @@ class Ekf2:
     horizon_s: float | Unavailable = HORIZON_NOT_LOGGED
     record: FusionRecord | Unavailable = RECORD_NOT_LOGGED
 
+    __repr__ = brief
+
 
 @dataclass(frozen=True)
 class Truth:
@@ -498,14 +507,16 @@ class Truth:
     samples: pd.DataFrame
     attitude: pd.DataFrame | None = None
 
+    __repr__ = brief
+
 
 MODES_NOT_LOGGED = Unavailable(
     "flight modes", "no usable vehicle_status", "Record with SDLOG_PROFILE bit 0 (default)."
 )
 
 
-@dataclass(frozen=True)
-class Flight:
+@dataclass(frozen=True, repr=False)
+class Flight(Shown):
     """One recorded flight.
 
     Attributes

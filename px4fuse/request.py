@@ -10,7 +10,7 @@ import os
 import re
 import shlex
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import PurePath
 from typing import Annotated, Any, Literal
 
@@ -234,6 +234,39 @@ class WhatIfRequest(
         return msgspec.structs.replace(self, log=_name(self.log), mavlink=mavlink)
 
 
+class EvaluationRequest(msgspec.Struct, frozen=True, kw_only=True):
+    """Two trajectories to score, as ``evaluate`` takes them.
+
+    Attributes
+    ----------
+    estimate, reference : str
+        Paths of trajectories or flight logs, as ``FILE`` or ``LOG:PART``.
+    alignment, association, max_gap_s, time_offset_s
+        As :func:`px4fuse.evaluate` takes them; None as it chooses.
+    rpe : tuple of str
+        Deltas with their units; empty for some that suit the path.
+    consecutive : bool
+    system : int or None
+        MAVLink system id of the vehicle.
+    """
+
+    estimate: str
+    reference: str
+    alignment: str | None = None
+    association: str = "interpolate"
+    max_gap_s: float | None = None
+    time_offset_s: float | str | None = None
+    rpe: tuple[str, ...] = ()
+    consecutive: bool = False
+    system: System | None = None
+
+    def recorded(self) -> EvaluationRequest:
+        """The same with the names of files alone."""
+        return msgspec.structs.replace(
+            self, estimate=_name(self.estimate), reference=_name(self.reference)
+        )
+
+
 Request = ComparisonRequest | LoopRequest | WhatIfRequest
 
 # The option that gives each field, in the order in which a command line is written
@@ -268,52 +301,76 @@ LOOP_OPTIONS = {
     "position_drift_m": "--drift",
     "heading_drift_deg": "--heading-drift",
     "key_frames_m": "--key-frames",
+    "came_back": "--open",
+}
+EVALUATION_OPTIONS = {
+    "alignment": "--alignment",
+    "association": "--association",
+    "max_gap_s": "--max-gap",
+    "time_offset_s": "--time-offset",
+    "rpe": "--rpe",
+    "consecutive": "--consecutive",
+    "system": "--system",
 }
 
+# What the errors of a command may name: its arguments in Python, to its options
+ARGUMENTS = OPTIONS | {"position": "--position", "changes": "--set"}
 
-def command_line(request: Request, command: str | None = None, *, typed: bool = False) -> str:
+
+def with_options(text: str, options: Mapping[str, str] = ARGUMENTS) -> str:
+    """The text of an error with options in the place of the arguments that it names.
+
+    >>> with_options("`sigma_z_m` 0 is out of range: give 0.0001 to 100 m.")
+    '--sigma-z 0 is out of range: give 0.0001 to 100 m.'
+    """
+    return re.sub(r"`(\w+)`", lambda name: options.get(name[1], name[0]), text)
+
+
+def command_line(
+    request: Request | EvaluationRequest, command: str | None = None, *, typed: bool = False
+) -> str:
     """The command that makes this again, for people to read: without defaults.
 
     Parameters
     ----------
-    request : Request
+    request : Request or EvaluationRequest
     command : str, optional
-        Of those that take this request; by default ``compare``, ``loop`` or ``whatif``.
+        Of those that take this request; by default ``compare``, ``loop``, ``whatif`` or
+        ``evaluate``.
     typed : bool
         With the paths as they were typed, for the shell of this system; else with the names of
         files alone, as a POSIX shell reads it.
     """
     given = request if typed else request.recorded()
-    if isinstance(given, LoopRequest):
-        words = [command or "loop", _file(given.source), *_options(given, LOOP_OPTIONS)]
-        words += [] if given.came_back else ["--open"]
-    elif isinstance(given, WhatIfRequest):
-        words = [command or "whatif", _file(given.log), *_options(given, OPTIONS)]
+    if isinstance(given, EvaluationRequest):
+        words = [command or "evaluate", _file(given.estimate), _file(given.reference)]
+    elif isinstance(given, LoopRequest):
+        words = [command or "loop", _file(given.source)]
+    else:
+        name = "whatif" if isinstance(given, WhatIfRequest) else "compare"
+        words = [command or name, _file(given.log)]
+    words += [word for pair in _all_options(given) for word in pair if word is not None]
+    if isinstance(given, WhatIfRequest):
         for name, value in given.changes.items():
             words += ["--set", f"{name}={_typed(value)}"]
         if (swept := given.sweep) is not None:
             ends = f"{_typed(swept.low)}:{_typed(swept.high)}:{swept.count}"
             words += ["--sweep", f"{swept.parameter}={ends}"]
-    else:
-        words = [command or "compare", _file(given.log), *_options(given, OPTIONS)]
-        words += [] if given.position is None else _options(given.position, OPTIONS)
     join = subprocess.list2cmdline if typed and os.name == "nt" else shlex.join
     return join(["px4fuse", *words])
 
 
-def settings_name(request: ComparisonRequest) -> str:
+def settings_name(request: ComparisonRequest | EvaluationRequest) -> str:
     """What is not at its default, as a part of a file name.
 
     >>> settings_name(ComparisonRequest(log="a.ulg", sigma_z_m=0.05, mavlink="b/c.tlog"))
     '_mavlink-c_sigma-z-0.05'
     """
-    given = request.recorded()
-    words = [*_options(given, OPTIONS)]
-    words += [] if given.position is None else _options(given.position, OPTIONS)
     parts = ""
-    for option, value in zip(words[::2], words[1::2], strict=True):
+    for option, value in _all_options(request.recorded()):
         is_file = option in ("--mavlink", "--position")
-        parts += f"_{option[2:]}-{PurePath(value).stem if is_file else value}"
+        typed = PurePath(value).stem if is_file and value is not None else value
+        parts += f"_{option[2:]}" + ("" if typed is None else f"-{typed}")
     return re.sub(r"[^\w.,+-]+", "-", parts)
 
 
@@ -322,16 +379,29 @@ def _file(path: str) -> str:
     return f"./{path}" if path.startswith("-") else path
 
 
-def _options(struct: msgspec.Struct, options: dict[str, str]) -> Iterator[str]:
+def _all_options(
+    request: Request | EvaluationRequest,
+) -> Iterator[tuple[str, str | None]]:
+    """Options with their values, None for a flag."""
+    if isinstance(request, EvaluationRequest):
+        yield from _options(request, EVALUATION_OPTIONS)
+    elif isinstance(request, LoopRequest):
+        yield from _options(request, LOOP_OPTIONS)
+    else:
+        yield from _options(request, OPTIONS)
+        if isinstance(request, ComparisonRequest) and request.position is not None:
+            yield from _options(request.position, OPTIONS)
+
+
+def _options(struct: msgspec.Struct, options: dict[str, str]) -> Iterator[tuple[str, str | None]]:
     """Options with their values, for the fields that are not at their defaults."""
     for field in msgspec.structs.fields(struct):
         value = getattr(struct, field.name)
         if field.name not in options or value == field.default:
             continue
-        several = value if field.name in ("axes", "closures") else (value,)
+        several = value if field.name in ("axes", "closures", "rpe") else (value,)
         for single in several:
-            yield options[field.name]
-            yield _typed(single)
+            yield options[field.name], None if isinstance(single, bool) else _typed(single)
 
 
 def _typed(value: Any) -> str:

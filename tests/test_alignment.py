@@ -313,7 +313,7 @@ def test_an_aisle_at_45_degrees_without_height_does_not_tell_the_frame() -> None
     flight = flight_along(partial(passes, across_m=0.0), heading_deg=45.0)
     file = recorded(flight, frame="enu")
     file.samples["z_m"] = np.nan
-    with pytest.raises(MissingDataError, match=r"no frame fits .*Give --position-frame ned\|enu"):
+    with pytest.raises(MissingDataError, match=r"no frame fits .*Give `frame`"):
         place(flight, file)
     alignment, track = placed(flight, file, frame="enu")
     assert abs(alignment.clock_offset_s - OFFSET_S) < 0.03
@@ -529,7 +529,7 @@ def test_no_motion_is_one_line_with_both_spans() -> None:
         with pytest.raises(MissingDataError) as caught:
             place(replace(flight, **parts), recorded(flight), frame="enu")
         assert caught.match(r"^uwb\.csv: .*hardly moves; " + BOTH_SPANS)
-        assert caught.match(r"Give --clock-offset SECONDS\.$")
+        assert caught.match(r"Give `clock_offset_s`\.$")
         assert "\n" not in str(caught.value)
 
 
@@ -550,8 +550,8 @@ def test_no_reference_at_all() -> None:
     ) as e:
         place(flight, file)
     assert e.match(BOTH_SPANS)
-    assert e.match(r"Give --clock-offset SECONDS and --position-frame ned\|enu\|nwu\.$")
-    with pytest.raises(MissingDataError, match=r"Give --position-yaw DEGREES\.$"):
+    assert e.match(r"Give `clock_offset_s` and `frame`\.$")
+    with pytest.raises(MissingDataError, match=r"Give `yaw_deg`\.$"):
         place(flight, file, frame="enu", yaw_deg="auto", clock_offset_s=OFFSET_S)
     alignment, track = placed(flight, file, frame="enu", clock_offset_s=OFFSET_S)
     assert (alignment.reference, alignment.correlation, alignment.residual_rms_m) == (
@@ -586,7 +586,7 @@ def test_a_flight_that_repeats_itself_needs_the_offset(yaw: Any) -> None:
     with pytest.raises(MissingDataError) as caught:
         place(flight, file, frame="enu", yaw_deg=yaw)
     assert caught.match(r"path leaves the clock open: offsets [1-6]0\.\d s apart fit")
-    assert caught.match(BOTH_SPANS + r".*Give --clock-offset SECONDS\.$")
+    assert caught.match(BOTH_SPANS + r".*Give `clock_offset_s`\.$")
     alignment, _ = placed(flight, file, frame="enu", yaw_deg=yaw, clock_offset_s=OFFSET_S)
     assert alignment.residual_rms_m == pytest.approx(0.11, abs=0.02)
 
@@ -610,9 +610,7 @@ def test_on_a_circle_any_offset_fits_with_some_yaw() -> None:
 
     flight = flight_along(circle, duration_s=45.0)
     file = recorded(flight)
-    with pytest.raises(
-        MissingDataError, match=r"leaves the clock open.*Give --clock-offset SECONDS\.$"
-    ):
+    with pytest.raises(MissingDataError, match=r"leaves the clock open.*Give `clock_offset_s`\.$"):
         place(flight, file, frame="enu", yaw_deg="auto")
     alignment, _ = placed(flight, file, frame="enu")
     assert abs(alignment.clock_offset_s - OFFSET_S) < 0.05
@@ -638,11 +636,11 @@ def test_too_few_positions(flight: Flight) -> None:
     [
         (
             {"frame": "utm"},
-            "--position-frame utm: not a known frame. Choose from ned, enu, nwu.",
+            "`frame` utm: not a known frame. Choose from ned, enu, nwu.",
         ),
-        ({"yaw_deg": float("nan")}, "--position-yaw nan is not a finite number."),
-        ({"yaw_deg": "north"}, "--position-yaw north: give degrees, or auto."),
-        ({"clock_offset_s": float("inf")}, "--clock-offset inf is not a finite number."),
+        ({"yaw_deg": float("nan")}, "`yaw_deg` nan is not a finite number."),
+        ({"yaw_deg": "north"}, "`yaw_deg` north: give degrees, or auto."),
+        ({"clock_offset_s": float("inf")}, "`clock_offset_s` inf is not a finite number."),
     ],
 )
 def test_invalid_options(flight: Flight, options: dict[str, Any], message: str) -> None:

@@ -130,7 +130,7 @@ def test_verdicts_that_could_be_misread_have_a_sentence(comparison: Comparison) 
     assert "ours aisle overstated 1.18×" in small
     assert "EKF2 has nearly the same mean NIS (0.84, 0.86)" in same
     assert "with 624 samples against 250" in same
-    assert "ours down p 5e-05" in white
+    assert "ours down p < 0.001" in white
 
 
 def test_what_is_consistent_and_white_needs_no_words(comparison: Comparison) -> None:

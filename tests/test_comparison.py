@@ -325,7 +325,7 @@ class TestMissingParts:
         assert isinstance(comparison.axes[0].axis.acceleration, Unavailable)
         assert comparison.axes[0].axis.acceleration in comparison.missing
         assert consistency(comparison.axes[0].kf).count == 600
-        with pytest.raises(SettingsError, match="--input imu"):
+        with pytest.raises(SettingsError, match="`input` imu"):
             compare(flight, input_required=True)
 
     def test_zero_input_asked_for_is_not_noted_as_missing(self, made: Comparison) -> None:

@@ -264,7 +264,7 @@ def line(noise_m: float) -> tuple[np.ndarray, np.ndarray]:
 def test_a_turn_about_the_line_of_motion_is_refused(noise_m: float) -> None:
     x, y = line(noise_m)
     for kind in ("se3", "sim3"):
-        with pytest.raises(TrajectoryError, match=r"along a line.*--alignment yaw"):
+        with pytest.raises(TrajectoryError, match=r"along a line.*`alignment` yaw"):
             fit(x, y, kind)  # type: ignore[arg-type]
     assert fit(x, y, "yaw").rotation.magnitude() < 0.02
 
@@ -274,7 +274,7 @@ def test_alignments_without_motion_are_refused() -> None:
     still = random.normal(0.0, 0.01, (200, 3))
     up = np.linspace(0.0, 3.0, 200)[:, None] * [0.0, 0.0, 1.0]
     for x, y in ((up, up), (up + 0.01 * random.normal(size=up.shape), up + still)):
-        with pytest.raises(TrajectoryError, match=r"yaw cannot be found.*--alignment none"):
+        with pytest.raises(TrajectoryError, match=r"yaw cannot be found.*`alignment` none"):
             fit(x, y, "yaw")
     for kind in ("se3", "sim3"):
         with pytest.raises(TrajectoryError, match="does not move"):
@@ -355,7 +355,7 @@ def test_no_overlap_names_both_spans_and_the_remedy() -> None:
             TrajectoryError, match=r"boot.tum: no poses match.*500.000 to 559.950 s"
         ):
             associate(estimate, reference, method=method)  # type: ignore[arg-type]
-    with pytest.raises(TrajectoryError, match=r"0.000 to 59.950 s.*--time-offset auto"):
+    with pytest.raises(TrajectoryError, match=r"0.000 to 59.950 s.*`time_offset_s` auto"):
         evaluate(estimate, reference, time_offset_s=0.0)
     assert evaluate(estimate, reference, time_offset_s=-500.0).ate.translation.rmse < 1e-9
 
@@ -509,7 +509,7 @@ def test_an_aisle_is_aligned_by_yaw_where_z_is_vertical() -> None:
     got = evaluate(replace(aisle, kind="unknown", position_m=x), aisle)
     assert got.alignment == "yaw"
     assert "along a line" in got.alignment_reason
-    with pytest.raises(TrajectoryError, match="--alignment yaw"):
+    with pytest.raises(TrajectoryError, match="`alignment` yaw"):
         evaluate(replace(aisle, kind="slam", frame="camera", position_m=x), aisle)
 
 

@@ -166,7 +166,7 @@ def test_the_growth_of_the_rpe_tells_noise_from_drift(kind: str, times: float) -
         "scale": 0.05 * line(n).position_m,
     }[kind]
     words = growth_words(wrong_by(error).rpe)
-    found = re.search(r"From 1 to 10 m, 10 times, the RMSE grows ([\d.]+) times", words)
+    found = re.search(r"From 1 to 10 m, 10 times, the RMSE is ([\d.]+) times as large", words)
     assert found is not None
     assert float(found[1]) == pytest.approx(times, rel=0.1)
     assert "1 is noise of each pose, 3.2 a random walk, 10 a wrong scale" in words
@@ -194,7 +194,7 @@ def test_no_error_is_said_to_be_none() -> None:
     text = said(score)
     assert "There is no error at any time." in text
     assert "there is no error." in text
-    assert "grows" not in text
+    assert "as large" not in text
 
 
 # -- what is drawn ---------------------------------------------------------------------------------

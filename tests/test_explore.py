@@ -187,7 +187,9 @@ def cells(result: AxisComparison) -> dict[str, list[str]]:
     return told
 
 
-def test_dragging_gives_what_the_command_on_the_page_gives(page: Browser, sample_log: Path) -> None:
+def test_dragging_gives_what_the_command_on_the_page_gives(
+    page: Browser, made: tuple[Path, Analysis], sample_log: Path
+) -> None:
     before = page.ask(TABLE)
     for knob, share in (("sigma-a", 0.72), ("sigma-z", 0.38), ("dt", 0.3), ("clock-offset", 0.55)):
         drag(page, knob, share)
@@ -205,6 +207,10 @@ def test_dragging_gives_what_the_command_on_the_page_gives(page: Browser, sample
     assert request.dt_s < 0.05
     assert isinstance(request.clock_offset_s, float)
     assert 0.03 < request.clock_offset_s < 0.09
+    # what the stamps decide otherwise is held where it is
+    segment = made[1].comparison.segment
+    assert (request.start_s, request.end_s) == pytest.approx((segment.start_s, segment.end_s))
+    assert request.heading_deg == pytest.approx(made[1].comparison.main.axis.heading_deg)
     comparison = run_comparison(request)
     north = next(result for result in comparison.axes if result.axis.name == "north")
     shown = page.ask(TABLE)

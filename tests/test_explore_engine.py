@@ -18,7 +18,7 @@ from flights import Imu, Uwb, aisle_flight
 from px4fuse.comparison.comparison import Comparison, compare
 from px4fuse.explore.data import OFFSET_REACH_S, raw_source, signals_of
 from px4fuse.explore.packing import FINE, Packer
-from px4fuse.filter.kalman import Replay, Settings, replay
+from px4fuse.filter.kalman import Replay, Settings, replay, state_at
 from px4fuse.filter.signals import make_axes, shift_clock
 from px4fuse.readers import read_log
 
@@ -38,7 +38,9 @@ SCRIPT = """(async () => {
     const run = Engine.replay(flight, flight.axes[at], settings);
     const lists = (part) => Object.fromEntries(
       Object.entries(part).map(([name, values]) => [name, Array.from(values)]));
-    return { steps: lists(run.steps), updates: lists(run.updates) };
+    const between = Float64Array.from({ length: 400 }, (_, i) => flight.segment[0] - 1 + 0.0813 * i);
+    return { steps: lists(run.steps), updates: lists(run.updates),
+      between: lists({ time: between, ...Engine.stateAt(run, between) }) };
   });
 })()"""
 
@@ -135,6 +137,11 @@ def test_the_page_replays_as_python_does(engine: Browser, sample_log: Path, name
         }
         for column, values in theirs.items():
             close(made["updates"][column], values, column, settings)
+        times = np.array(made["between"]["time"])
+        for column, values in zip(("p", "v"), state_at(run, times), strict=True):
+            # JSON has null where there is no state
+            found = np.array(made["between"][column], dtype=float)
+            close(list(found), values, column, settings)
     assert (gaps > 0) == (name == "IMU with a gap")
 
 

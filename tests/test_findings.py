@@ -183,7 +183,7 @@ FAULTS = [
         "innovations_need_ulog",
         "info",
         says="states and variances but not its innovations",
-        remedy="--mavlink aisle.ulg",
+        remedy="with --mavlink",
         change=as_recording,
     ),
     Fault("not_px4", "info", says="ArduPilot", change=with_log(autopilot="ArduPilot")),

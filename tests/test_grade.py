@@ -87,7 +87,7 @@ def test_a_report_with_its_log_is_verified_and_a_changed_one_is_not(tmp_path) ->
     with (folder / "b.pdf").open("wb") as file:
         changed.write(file)
     shorter = PdfWriter(clone_from=io.BytesIO(REPORT.read_bytes()))
-    shorter.remove_page(8)
+    shorter.remove_page(7)
     with (folder / "c.pdf").open("wb") as file:
         shorter.write(file)
     output = tmp_path / "class"
@@ -103,12 +103,12 @@ def test_a_report_with_its_log_is_verified_and_a_changed_one_is_not(tmp_path) ->
     redrawn = [path.read_bytes() for path in (output / "reports").glob("*.pdf")]
     assert len(redrawn) == 3
     assert len(set(redrawn)) == 1
-    assert len(PdfReader(io.BytesIO(redrawn[0])).pages) == 9
+    assert len(PdfReader(io.BytesIO(redrawn[0])).pages) == 8
     # a page away is a flag, and costs nothing
     assert (third.verdict.status, third.verdict.outcome) == ("verified", "page differs")
     assert third.status == "page differs"
     assert third.points == first.points
-    assert any("Page 9 of the PDF" in flag and "missing" in flag for flag in third.flags)
+    assert any("Page 8 of the PDF" in flag and "missing" in flag for flag in third.flags)
     assert not any("of the PDF" in flag for flag in first.flags)
     # a second run does nothing again, and says the same
     again = grade([folder], [LOG.parent], read_rubric(None), output, processes=2)

@@ -12,6 +12,7 @@ from flights import aisle_flight, unexplained
 from scipy.spatial.transform import Rotation
 
 from px4fuse.comparison.comparison import compare
+from px4fuse.filter import heading
 from px4fuse.filter.heading import DRIFT_P, HeadingError, HeadingPart, heading_error
 from px4fuse.filter.kalman import Settings
 from px4fuse.filter.signals import choose_segment, choose_source
@@ -182,3 +183,13 @@ def test_what_ekf2_has_turned_already_is_not_turned_again():
 def test_changes_within_chance_or_too_small_to_matter_are_none():
     assert named(made(-3.0, 0.0, 4.0, drift_p=0.2)) == {}
     assert named(made(-2.0, 0.0, 2.0, drift_p=1e-9)) == {}
+
+
+def test_a_long_flight_whose_positions_are_thinned_still_has_parts() -> None:
+    """1,000 measurements over 25 minutes: further apart than a third of a short part."""
+    time = np.linspace(0.0, 1500.0, 1000)
+    parts = heading._parts(time, np.radians(np.full(1000, 4.0)), np.radians(np.full(1000, 1.0)))
+    assert len(parts) > 100
+    assert parts[0].start_s == 0.0
+    assert parts[-1].end_s == 1500.0
+    assert all(part.heading_error_deg == pytest.approx(4.0) for part in parts)

@@ -118,7 +118,7 @@ def test_sigma_is_widened_where_more_remains_than_the_noises_say() -> None:
 
 def test_hats_make_up_every_slow_signal() -> None:
     hats = hypotheses._hats(10.0, 100.0)
-    np.testing.assert_allclose(sum(hat.to_numpy() for hat in hats), 1.0)
+    np.testing.assert_allclose(sum(hat.value_m_s2 for hat in hats), 1.0)
 
 
 # ------------------------------------------------------------------ the causes

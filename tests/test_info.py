@@ -24,14 +24,26 @@ from px4fuse.filter.signals import choose_source
 from px4fuse.findings import find
 from px4fuse.flight import ClockMap, Dropout, Flight, Sender, Unavailable
 from px4fuse.readers import read_log
+from px4fuse.request import ComparisonRequest
 
 WIDTH = 80
+
+
+@pytest.fixture(autouse=True)
+def screen(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A terminal of the usual width: in a pipe lines do not wrap."""
+    monkeypatch.setenv("COLUMNS", str(WIDTH))
 
 
 def info(*arguments: str | Path) -> str:
     result = CliRunner().invoke(cli, ["info", *map(str, arguments)])
     assert result.exit_code == 0, result.output
     return result.stdout
+
+
+def widest(text: str) -> int:
+    """Of all lines but the command, which is to be copied."""
+    return max(len(line) for line in text.splitlines() if not line.startswith("Compare"))
 
 
 def inventory_of(log: Log, tmp_path: Path) -> Inventory:
@@ -59,7 +71,7 @@ def without_position(log: Log) -> Log:
 
 def test_it_fits_the_screen_and_is_plain_in_a_pipe(sample_log):
     text = info(sample_log)
-    assert max(map(len, text.splitlines())) <= WIDTH
+    assert widest(text) <= WIDTH
     assert len(text.splitlines()) <= 50
     assert "\x1b" not in text
     assert "…" not in text
@@ -273,7 +285,8 @@ def test_one_message_is_neither_damage_nor_a_span(tmp_path):
 
 def test_a_replay_is_told_by_its_speed_and_not_in_millions_of_ppm(sample_flight, capsys):
     clock = ClockMap("time of receipt", "receive time", 9, -1.7e9, 26e6, 1.2, "a replay?")
-    _print(terminal(), take_inventory(dataclasses.replace(sample_flight, clocks=(clock,))))
+    replayed = take_inventory(dataclasses.replace(sample_flight, clocks=(clock,)))
+    _print(terminal(), replayed, ComparisonRequest(log="x.tlog"))
     said = capsys.readouterr().out
     assert "27 times its speed" in said
     assert "ppm" not in said
@@ -406,7 +419,7 @@ def test_a_recording_names_its_senders_clocks_and_dropouts(monkeypatch, tmp_path
     flight = dataclasses.replace(sample_flight, log=log, clocks=(clock,))
     monkeypatch.setattr("px4fuse.analysis.read_log", lambda _, **__: flight)
     text = info(tmp_path / "any.tlog")
-    assert max(map(len, text.splitlines())) <= WIDTH
+    assert widest(text) <= WIDTH
     for words in ("1/1", "PX4 quadrotor (this flight)", "12.5%", "unknown", "TIMESYNC",
                   "2 of the logger", "2023-11-14 22:13:20 UTC", "faster SD card"):  # fmt: skip
         assert words in text
@@ -437,7 +450,7 @@ def test_every_log_is_described_or_refused_in_one_line(shared_logs, monkeypatch,
     for path in paths:
         code, out, err = run_main(monkeypatch, capsys, "info", path)
         assert (code, err) == (0, ""), path.name  # all of these are ULogs that hold data
-        assert max(map(len, out.splitlines())) <= WIDTH, path.name
+        assert widest(out) <= WIDTH, path.name
         inventory = take_inventory(read_log(path))
         strict(json.dumps(to_plain(inventory)))
         assert len(inventory.abilities) == 6, path.name

@@ -220,14 +220,14 @@ NOT_FINITE = (math.nan, math.inf, -math.inf)
 )
 def test_settings_out_of_range_are_refused_in_one_line(name: str, value: float) -> None:
     with pytest.raises(
-        SettingsError, match=r"^--[a-z-]+ \S+ is out of range: give .+\.$"
+        SettingsError, match=rf"^`{name}` \S+ is out of range: give .+\.$"
     ) as raised:
         Settings(**{name: value})
     assert "\n" not in str(raised.value)
 
 
 def test_imu_input_without_an_imu_is_refused() -> None:
-    with pytest.raises(SettingsError, match="--input imu needs an acceleration"):
+    with pytest.raises(SettingsError, match="`input` imu needs an acceleration"):
         replay(line([0.0, 0.2, 0.4], [0.0, 0.0, 0.0]), Settings(input="imu"))
 
 

@@ -475,7 +475,7 @@ def test_impossible_closures_are_refused(sample: Source, closure: GivenClosure, 
 
 
 def test_impossible_parts_are_refused(sample: Source) -> None:
-    with pytest.raises(SettingsError, match="--from or --to"):
+    with pytest.raises(SettingsError, match="`start_s` or `end_s`"):
         analyse(sample, start_s=50.0, end_s=20.0)
     with pytest.raises(TrajectoryError, match="too few"):
         analyse(sample, start_s=500.0, end_s=600.0)

@@ -13,9 +13,11 @@ from scipy.stats import norm
 from test_tuning import SIGMA_A, SIGMA_Z, TRUE, modelled
 
 from px4fuse.arrays import Array, IntArray
+from px4fuse.filter.chain import Chain, Columns, factorise
 from px4fuse.filter.fitting import (
     FIRST_SHARE,
     FIRST_WIDTH,
+    Likelihood,
     NoiseFit,
     Noises,
     Part,
@@ -29,12 +31,9 @@ from px4fuse.filter.fitting import (
 from px4fuse.filter.kalman import Settings
 from px4fuse.filter.likelihood import PROFILE_DROP, innovations, preintegrate, total_over_grid
 from px4fuse.filter.marginal import (
-    Chain,
-    Columns,
     Positions,
-    factorise,
     fit,
-    projected_products,
+    paired_products,
     squares,
 )
 from px4fuse.filter.model import noise_of_many_steps
@@ -72,14 +71,14 @@ def test_the_factor_is_that_of_the_dense_normal_equations(seed: int) -> None:
     precision[rng.integers(1, count), 0] = 0.0
     sigma_a = float(rng.uniform(0.1, 2.0))
     columns = Columns(
-        rng.normal(size=(count, 3)),
-        rng.normal(size=(len(chain.end), 3)),
-        rng.normal(size=(len(chain.end), 3)),
+        rng.normal(size=(3, count)),
+        rng.normal(size=(3, len(chain.end))),
+        rng.normal(size=(3, len(chain.end))),
     )
     # rows of what is known, over their standard deviations
     rows = np.diag(np.sqrt(precision.ravel()))
     known = np.zeros((2 * count, 3))
-    known[0::2] = np.sqrt(precision[:, :1]) * columns.measurement_m
+    known[0::2] = np.sqrt(precision[:, :1]) * columns.measurement_m.T
     log_determinant = -np.log(precision[precision > 0.0]).sum()
     for leg, q in enumerate(covariances(chain, sigma_a)):
         white = np.linalg.inv(np.linalg.cholesky(q))
@@ -88,7 +87,7 @@ def test_the_factor_is_that_of_the_dense_normal_equations(seed: int) -> None:
         row[:, at - 2 : at] = -np.array([[1.0, chain.length_s[leg]], [0.0, 1.0]])
         row[:, at : at + 2] = np.eye(2)
         rows = np.vstack([rows, white @ row])
-        added = np.stack([columns.delta_position_m[leg], columns.delta_velocity_m_s[leg]])
+        added = np.stack([columns.delta_position_m[:, leg], columns.delta_velocity_m_s[:, leg]])
         known = np.vstack([known, white @ added])
         log_determinant += np.linalg.slogdet(q)[1]
     expected = np.linalg.lstsq(rows, known, rcond=None)[0]
@@ -97,9 +96,12 @@ def test_the_factor_is_that_of_the_dense_normal_equations(seed: int) -> None:
     log_determinant += np.linalg.slogdet(normal)[1]
 
     factor = factorise(chain, sigma_a, precision)
-    state, whitened = factor.solve(columns)
-    np.testing.assert_allclose(state.reshape(2 * count, 3), expected, rtol=1e-6, atol=1e-6)
-    np.testing.assert_allclose(whitened.T @ whitened, left.T @ left, rtol=1e-6, atol=1e-6)
+    state = factor.solve(columns).reshape(3, 2 * count)
+    np.testing.assert_allclose(state.T, expected, rtol=1e-6, atol=1e-6)
+    rows_over_sigma, explained = factor.whiten(columns)
+    measured = np.sqrt(precision[:, 0]) * columns.measurement_m
+    products = measured @ measured.T + rows_over_sigma @ rows_over_sigma.T - explained @ explained.T
+    np.testing.assert_allclose(products, left.T @ left, rtol=1e-6, atol=1e-6)
     assert factor.log_determinant == pytest.approx(log_determinant, abs=1e-6)
     variance = np.diag(np.linalg.inv(normal))[0::2]
     np.testing.assert_allclose(factor.position_variance(), variance, rtol=1e-6)
@@ -135,7 +137,7 @@ def constants_part(seed: int = 5, offsets: int = 3) -> Part:
     initial = np.zeros((COUNT, 2))
     initial[START] = WEAK
     positions = Positions(chain, measured, START, initial, np.array([0.3, 1.0, 0.1]))
-    dp, dv = rng.normal(0.0, 0.3, (2, len(chain.end), 3, offsets, 4))
+    dp, dv = np.moveaxis(rng.normal(0.0, 0.3, (2, len(chain.end), 3, offsets, 4)), 1, -1)
     return Part(positions, dp, dv)
 
 
@@ -155,7 +157,7 @@ def stretch_normal(
         leg = int(np.flatnonzero(chain.end == row)[0])
         f = np.array([[1.0, chain.length_s[leg]], [0.0, 1.0]])
         added = np.stack(
-            [part.delta_position_m[leg, axis, at], part.delta_velocity_m_s[leg, axis, at]]
+            [part.delta_position_m[axis, at, :, leg], part.delta_velocity_m_s[axis, at, :, leg]]
         )
         means.append(f @ means[-1] + added)
         for j in range(k):
@@ -261,8 +263,8 @@ def test_constants_and_squares_are_those_of_the_conditional_distribution() -> No
     # two axes: of a third that is hardly measured the square would say nothing
     part = Part(
         replace(part.positions, measurement_m=part.positions.measurement_m[:, :2]),
-        part.delta_position_m[:, :2],
-        part.delta_velocity_m_s[:, :2],
+        part.delta_position_m[:2],
+        part.delta_velocity_m_s[:2],
     )
     for noises in SOME_NOISES[:5]:
         given = arguments(part, noises, np.ones(COUNT))
@@ -273,13 +275,16 @@ def test_constants_and_squares_are_those_of_the_conditional_distribution() -> No
         np.testing.assert_array_equal(count, np.isfinite(part.positions.measurement_m).sum(axis=1))
 
 
-def test_projected_products_are_under_the_covariance_with_the_constants() -> None:
+def test_paired_products_are_under_the_covariance_with_the_constants() -> None:
     part, noises = constants_part(offsets=1), Noises(0.5, 0.1)
     rng = np.random.default_rng(8)
     signal = rng.normal(0.0, 1.0, (COUNT, 3, 2))
-    nothing = np.zeros((len(part.positions.chain.end), 3, 2))
+    nothing = np.zeros((3, 1, len(part.positions.chain.end)))
+    first, second = (
+        Columns(signal[..., [at]].transpose(1, 2, 0), nothing, nothing) for at in (0, 1)
+    )
     given = arguments(part, noises, np.ones(COUNT))
-    ours = projected_products(*given, signal, nothing, nothing)
+    ours = paired_products(*given, first, second)
     variance = np.full(COUNT, noises.sigma_z_m**2)
     for stretch in range(2):
         made = [stretch_normal(part, noises, variance, stretch, axis, 0) for axis in range(3)]
@@ -291,7 +296,60 @@ def test_projected_products_are_under_the_covariance_with_the_constants() -> Non
             block = slice(size[axis], size[axis + 1])
             covariance[block, block] += made[axis][2]
         expected = picked.T @ np.linalg.solve(covariance, picked)
-        np.testing.assert_allclose(ours[stretch], expected, rtol=1e-4, atol=1e-4)
+        np.testing.assert_allclose(ours[stretch], expected[0, 1], rtol=1e-4, atol=1e-4)
+
+
+def test_side_by_side_stretches_are_those_of_the_factorisation() -> None:
+    """At all offsets, with weights and a walk; stretches of 11 and 13, axes with gaps of theirs."""
+    part = constants_part()
+    weight = np.random.default_rng(2).uniform(0.1, 1.0, COUNT)
+    assert part.lanes is not None
+    given = [arguments(part, noises, weight) for noises in SOME_NOISES]
+    ours = [
+        replace(part.lanes, positions=positions).fit([sigma_a], variance)[0]
+        for positions, _, _, sigma_a, variance in given
+    ]
+    expected = [fit(*each) for each in given]
+    for one, other in zip(ours, expected, strict=True):
+        assert one.freedom == other.freedom
+        np.testing.assert_allclose(one.gram, other.gram, rtol=1e-6, atol=1e-6)
+    total, factorised = (np.array([each.total() for each in both]) for both in (ours, expected))
+    np.testing.assert_allclose(
+        total - total[0, 0], factorised - factorised[0, 0], rtol=1e-6, atol=1e-5
+    )
+    # several ratios at once are each by itself
+    positions, _, _, _, variance = given[0]
+    together = replace(part.lanes, positions=positions).fit([0.5, 2.0], variance)
+    np.testing.assert_allclose(together[0].gram, ours[0].gram, rtol=1e-9)
+    np.testing.assert_allclose(together[1].gram, ours[2].gram, rtol=1e-9)
+
+
+def test_a_start_that_is_known_is_not_laid_side_by_side() -> None:
+    assert filter_part(preintegrate(modelled(1, 80), TRUE)).lanes is None
+
+
+@pytest.mark.parametrize("which", ["filter", "constants"])
+def test_the_likelihood_between_its_nodes_is_the_likelihood(which: str) -> None:
+    """Over four powers of ten of the ratio and of SIGMA_Z, but for one number always the same."""
+    if which == "filter":
+        count, parts = 80, [filter_part(preintegrate(modelled(seed, 80), TRUE)) for seed in (1, 2)]
+    else:
+        count, part = COUNT, constants_part(offsets=1)
+        chain = replace(part.positions.chain, noise_fixed=0.0 * part.positions.chain.noise_fixed)
+        parts = [replace(part, positions=replace(part.positions, chain=chain))]
+    weight = np.random.default_rng(3).uniform(0.1, 1.0, count)
+    # far from its maximum the start with constants, which is as good as unknown, tells
+    for rough, error in ((False, 1e-6 if which == "filter" else 1e-4), (True, 2e-3)):
+        score = Likelihood(parts, weight, 0.1, rough)
+        assert score.tabulated
+        some = [
+            Noises(*pair)
+            for pair in np.exp(np.random.default_rng(4).uniform(-4.6, 1.0, (30, 2))).tolist()
+        ]
+        ours = np.array([score(noises) for noises in some])
+        direct = np.array([negative_log_likelihood(parts, noises, weight) for noises in some])
+        assert np.ptp(direct) > 100.0
+        np.testing.assert_allclose(ours - ours[0], direct - direct[0], rtol=error, atol=1e-3)
 
 
 # --- the filter's own likelihood ---

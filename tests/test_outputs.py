@@ -15,6 +15,7 @@ from ulog_tools import ev_error, ev_stamps, make_log, position
 import px4fuse.report.pdf
 from px4fuse.analysis import run_comparison
 from px4fuse.errors import MissingDataError
+from px4fuse.report import fonts
 from px4fuse.request import ComparisonRequest
 
 SECONDS = 20.0
@@ -60,6 +61,26 @@ REFUSED = {
     "--json ../{folder}/c.csv",
     "compare over notes": "compare l.ulg --notes n.md -o r.pdf --json n.md",
 }
+
+
+@pytest.mark.parametrize(("name", "said"), [("王小明", True), ("Ångström", False)])
+def test_a_name_that_no_font_has_is_said_before_the_report(
+    desk, monkeypatch, capsys, name: str, said: bool
+) -> None:
+    told = []
+
+    def render(document: object, text: str) -> bytes:
+        told.append(capsys.readouterr().err)
+        return b"%PDF-"
+
+    monkeypatch.setattr(px4fuse.report.pdf, "render", render)
+    monkeypatch.setattr(fonts, "_others", lambda: ())
+    fonts.font_of.cache_clear()
+    run_main(monkeypatch, capsys, *f"compare l.ulg -o r.pdf --student {name}".split())
+    fonts.font_of.cache_clear()
+    (before,) = told
+    assert (f"No font of this machine has the Chinese characters {name}" in before) == said
+    assert ("Install a font that has them" in before) == said
 
 
 @pytest.mark.usefixtures("no_drawing")

@@ -710,8 +710,8 @@ def test_columns_option_takes_any_column(read):
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"time_unit": "min"}, "--position-time-unit: 'min' is not one of s, ms, us, ns."),
-        ({"length_unit": "ft"}, "--position-unit: 'ft' is not one of m, cm, mm."),
+        ({"time_unit": "min"}, "`time_unit`: 'min' is not one of s, ms, us, ns."),
+        ({"length_unit": "ft"}, "`length_unit`: 'ft' is not one of m, cm, mm."),
         ({"columns": ("time", "x")}, "does not name four or five different columns"),
         ({"columns": ("time", "x", "x", "z")}, "does not name four or five different columns"),
         ({"columns": ("time", "x", "y", "")}, "does not name four or five different columns"),
@@ -751,7 +751,7 @@ def test_bad_options(read, options, words):
         (table({"time": UNIX_S, "a": X, "b": Y}), "no position columns found (the columns are 't"),
         (table({"time": UNIX_S, "x": X, "b": Y}), "no position columns found"),
         (table({"time": UNIX_S, "x [ft]": X, "y [ft]": Y}), "no position columns found"),
-        (table({"t": UNIX_S, "lat": X, "lon": Y}), "'lat', 'lon'). Name them with --position-col"),
+        (table({"t": UNIX_S, "lat": X, "lon": Y}), "'lat', 'lon'). Name them with `columns`"),
         (table(PLAIN, decimal=","), "names 4 columns, but rows have 8, as with a decimal comma"),
         ("time,x,y,z\n" + table({"n": JUNK, **PLAIN}, header=False), "4 columns, but rows have 5"),
         (

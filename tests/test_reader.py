@@ -566,7 +566,7 @@ def test_gps_is_used_only_when_asked_for(read):
     log = make_log("v1.16")
     names = [n for n in log.names() if "_ev_" in n or n == "vehicle_visual_odometry"]
     flight = read(log.drop(*names).add(gps()))
-    with pytest.raises(MissingDataError, match="--position-source vehicle_gps_position"):
+    with pytest.raises(MissingDataError, match="`position_source` vehicle_gps_position"):
         choose_source(flight)
     assert choose_source(flight, "vehicle_gps_position")[0].rung == 7
 

@@ -5,8 +5,10 @@ import shlex
 import shutil
 from pathlib import Path
 
+import matplotlib as mpl
 import pytest
 from click.testing import CliRunner
+from matplotlib import pyplot
 
 from px4fuse.cli import COMMANDS, cli
 
@@ -56,6 +58,7 @@ def test_the_instructors_four_commands_run_in_order(at_root):
 
 def test_python_examples_run(at_root, capsys):
     """In the README's order, on the tables that its own command extracts."""
+    mpl.use("Agg")
     extracts = [line for line in LINES if line.startswith("px4fuse extract")]
     for line in extracts:
         assert CliRunner().invoke(cli, shlex.split(line)[1:]).exit_code == 0
@@ -63,9 +66,47 @@ def test_python_examples_run(at_root, capsys):
     assert len(blocks) == 2
     for block in blocks:
         exec(compile(block, "README.md", "exec"), {})
-        numbers = re.findall(r"-?\d+\.\d+", capsys.readouterr().out)
+        said = capsys.readouterr().out
+        numbers = re.findall(r"-?\d+\.\d+", said)
         assert numbers
         assert all(abs(float(number)) < 1e3 for number in numbers)
+        assert len(said.splitlines()) < 150 or "gain" in said  # no table is printed whole
+    assert len(pyplot.get_fignums()) == len(re.findall(r"\S\.plot\(\)", blocks[0]))
+    pyplot.close("all")
+
+
+def test_the_lab_has_a_command_and_a_picture_for_each_step():
+    lab = README.split("## The lab in five steps")[1].split("\n## ")[0]
+    steps = re.split(r"\n\*\*\d\. ", lab)[1:]
+    assert len(steps) == 5
+    for number, step in enumerate(steps, 1):
+        assert 1 <= len(re.findall(r"^px4fuse ", step, re.MULTILINE)) <= 2
+        assert f"](reports/lab_{number}.png)" in step
+
+
+def test_pictures_are_small_and_made_by_the_script():
+    script = (ROOT / "tests" / "benchmarks" / "readme_pictures.py").read_text(encoding="utf-8")
+    pictures = re.findall(r"!\[[^]]+\]\((\S+\.png)\)", README)
+    assert len(pictures) == 6
+    for picture in pictures:
+        assert (ROOT / picture).stat().st_size <= 100_000
+        assert f'Picture("{Path(picture).stem}"' in script
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_shells_complete_as_said(shell, monkeypatch, capsys):
+    assert f"_PX4FUSE_COMPLETE={shell}_source px4fuse" in README or f"`{shell}_source`" in README
+    monkeypatch.setenv("_PX4FUSE_COMPLETE", f"{shell}_source")
+    with pytest.raises(SystemExit) as done:
+        cli.main(prog_name="px4fuse")
+    assert done.value.code == 0
+    assert "px4fuse" in capsys.readouterr().out
+    monkeypatch.setenv("_PX4FUSE_COMPLETE", f"{shell}_complete")
+    monkeypatch.setenv("COMP_WORDS", "px4fuse comp")
+    monkeypatch.setenv("COMP_CWORD", "comp" if shell == "fish" else "1")
+    with pytest.raises(SystemExit):
+        cli.main(prog_name="px4fuse")
+    assert "compare" in capsys.readouterr().out
 
 
 def test_every_command_is_in_the_table():

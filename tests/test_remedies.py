@@ -159,5 +159,6 @@ def test_a_remedy_of_our_filter_that_the_truth_contradicts_is_not_given() -> Non
     blind = replace(
         comparison, axes=tuple(replace(a, truth=truth, kf_truth=truth) for a in comparison.axes)
     )
-    assert filter_words(blind, Settings(sigma_z_m=0.2), "--sigma-z 0.2", 0.1) == "--sigma-z 0.2."
+    typed = "px4fuse compare LOG --sigma-z 0.2."
+    assert filter_words(blind, Settings(sigma_z_m=0.2), "--sigma-z 0.2", 0.1) == typed
     assert filter_words(blind, Settings(sigma_z_m=0.2), "--sigma-z 0.2", -0.1).startswith("Leave")

@@ -13,6 +13,7 @@ from flights import unexplained
 from results_tools import EXAMPLE, LOOP, changed, decoded
 
 import px4fuse
+from px4fuse.comparison.comparison import compare
 from px4fuse.errors import Px4FuseError, ResultsError
 from px4fuse.report.document import Document
 from px4fuse.report.pdf import render
@@ -26,7 +27,7 @@ ROOT = Path(__file__).parent.parent
 
 
 def document(flight: px4fuse.Flight, explained: bool = True, **options: object) -> Document:
-    comparison = px4fuse.compare(flight, **options)
+    comparison = compare(flight, **options)
     analysis = px4fuse.explain(comparison) if explained else unexplained(comparison)
     return Document(analysis, px4fuse.find(analysis), Student(), "px4fuse compare")
 

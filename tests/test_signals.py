@@ -354,7 +354,7 @@ def test_gps_is_taken_only_when_asked_for(rung):
     if rung <= 6:
         assert choose_source(flight)[0] is track
     else:
-        with pytest.raises(MissingDataError, match="--position-source"):
+        with pytest.raises(MissingDataError, match="`position_source`"):
             choose_source(flight)
     assert choose_source(flight, "source") == (track, "chosen with --position-source")
 

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 import px4fuse
 from px4fuse.cli import cli, main
+from px4fuse.comparison.comparison import compare
 from px4fuse.errors import SettingsError
 from px4fuse.filter.consistency import nis_band
 from px4fuse.filter.kalman import Settings
@@ -407,7 +408,7 @@ class TestMistakes:
         assert flight.positions == ()
         assert flight.log.parameters["SDLOG_PROFILE"] == 1.0
         with pytest.raises(px4fuse.Px4FuseError, match="SDLOG_PROFILE"):
-            px4fuse.compare(flight)
+            compare(flight)
 
     def test_leave_the_noise_of_other_sensors_as_it_was(self):
         kept = {
@@ -645,7 +646,7 @@ def test_ideal_flights_are_consistent_as_often_as_chance_has_it():
 def test_clean_flight_has_no_mistake(scenario):
     """A loop's VIO drifts, which is no mistake; that filters follow it is said."""
     settings = Settings(sigma_a_m_s2=0.2, sigma_z_m=scenario.source_sigma_m)
-    compared = px4fuse.compare(simulate_flight(scenario), settings)
+    compared = compare(simulate_flight(scenario), settings)
     findings = find(unexplained(compared))
     drift = ["errors_larger_than_claimed"] if scenario.kind == "loop" else []
     assert [finding.id for finding in findings] == [*drift, "ekf2_is_a_model"]
@@ -668,7 +669,7 @@ def test_clean_flight_has_no_mistake(scenario):
 )
 def test_mistake_is_found(text, finding):
     flight = simulate_flight(Scenario(seed=7, passes=2), parse([text]))
-    compared = px4fuse.compare(flight, Settings(sigma_a_m_s2=0.2), axes=("aisle", "north"))
+    compared = compare(flight, Settings(sigma_a_m_s2=0.2), axes=("aisle", "north"))
     assert finding in [name for found in find(unexplained(compared)) for name in found.ids]
 
 

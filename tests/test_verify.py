@@ -467,7 +467,7 @@ def test_another_matplotlib_is_no_accusation(loop: Base) -> None:
 # -- what is changed on the pages ------------------------------------------------------------------
 
 Forge = Callable[[Base], Anatomy]
-LETTERS = "/F1"  # the font of nearly all text; /F3 is bold
+LETTERS = "/F1"  # the font of nearly all text; /F2 is bold
 
 
 def on_page(number: int, change: Callable[[bytes], bytes]) -> Forge:
@@ -506,7 +506,7 @@ DRAWING: dict[str, Callable[[bytes], bytes]] = {
     "a text invisible": once(rb"BT\n", b"BT\n3 Tr\n"),
     "a text white": once(rb"BT\n", b"1 g\nBT\n"),
     "a text larger": once(rb"(/F\d+) [\d.]+ Tf", rb"\1 14 Tf"),
-    "another font": once(rb"/F1 ", b"/F3 "),
+    "another font": once(rb"/F1 ", b"/F2 "),
     "a colour": once(rb"[\d.]+ g\n", b"0.123 g\n"),
     "the end cut off": lambda c: c[: c.rindex(b"\nQ")],
     "a comment": lambda c: c + b"\n% nothing\n",
@@ -515,7 +515,7 @@ DRAWING: dict[str, Callable[[bytes], bytes]] = {
     "turned over": lambda c: b"-1 0 0 1 595 0 cm\n" + c,
     "nothing at all": lambda c: b"\n",
 }
-PAGES = 9
+PAGES = 8
 # Nobody who looks at the page sees these, or reads anything else from it (see pages.DISTANCE)
 UNSEEN = {"a comment", "an inline image", "the end cut off", "a point of a line moved",
           "another point of a line moved", "a colour"}  # fmt: skip

@@ -11,10 +11,12 @@ from flights import unexplained
 from px4fuse.analysis import Analysis, explain
 from px4fuse.comparison.comparison import Comparison, compare
 from px4fuse.comparison.why import Why, why_ekf2_differs
+from px4fuse.comparison.why_words import STAMPS_WRONG
 from px4fuse.ekf2.model import Model
 from px4fuse.ekf2.walk import SAMPLES, STEPS
 from px4fuse.filter.clock import ClockOffset
 from px4fuse.filter.kalman import Settings, state_at
+from px4fuse.findings.story import story
 from px4fuse.flight import Flight, Unavailable
 from px4fuse.readers import read_log
 from px4fuse.report.document import Document
@@ -267,6 +269,16 @@ class TestFlownFlights:
 
     def test_a_delay_at_its_old_default_is_the_largest_step(self, shared_logs) -> None:
         _, why = self.of(shared_logs, "v1.13.3_aisle_evdelay175")
-        assert "most of it by the stamps and delay" in why.sentences[0]
+        assert "is the stamps and delay" in why.sentences[0]
         assert "175 ms older than its stamp (EKF2_EV_DELAY), ours 0 ms" in why.sentences[0]
         assert any("mostly through the stamps and delay" in s for s in why.sentences)
+
+
+def test_the_story_leaves_wrong_stamps_to_their_finding(sample: Analysis) -> None:
+    sentences = (
+        f"{STAMPS_WRONG} late by 0.30 s for both filters alike.",
+        "Most of it is the noise (60% of the mean square): 0.1 m; most at 3.0 s, where it moves.",
+    )
+    why = {"aisle": replace(of(sample), sentences=sentences)}
+    told = story(replace(sample, why=why), ())
+    assert told[1:] == ("Most of it is the noise (60% of the mean square): 0.1 m.",)

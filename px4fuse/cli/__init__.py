@@ -71,6 +71,9 @@ class LazyGroup(click.Group):
         """Invoke a command; what ends it early is told apart before click sees it."""
         try:
             return super().invoke(ctx)
+        except Px4FuseError as error:
+            error.args = (_in_options(str(error), ctx.invoked_subcommand),)
+            raise
         except BrokenPipeError as error:
             # click itself ends with exit code 1 where it sees errno EPIPE
             raise BrokenPipeError from error
@@ -130,6 +133,14 @@ def main() -> None:
     except OSError:  # said before
         _abandon_output()
     sys.exit(code if isinstance(code, int) else 0)
+
+
+def _in_options(text: str, command: str | None) -> str:
+    """The text of an error as somebody who typed a command reads it."""
+    from px4fuse.request import ARGUMENTS, EVALUATION_OPTIONS, LOOP_OPTIONS, with_options
+
+    tables = {"loop": LOOP_OPTIONS, "evaluate": EVALUATION_OPTIONS}
+    return with_options(text, tables.get(command or "", ARGUMENTS))
 
 
 def _say(text: str) -> None:

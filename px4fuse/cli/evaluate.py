@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import os
 import re
-import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from px4fuse.cli.inputs import (
-    command_line,
     max_size_option,
     path_option,
     system_option,
@@ -20,13 +18,12 @@ from px4fuse.cli.outputs import (
     free_report,
     progress,
     report_paths,
-    spare_inputs,
     terminal,
     write_outputs,
 )
 from px4fuse.cli.quantity import Quantity
 from px4fuse.errors import OutputError, SettingsError
-from px4fuse.request import AUTO
+from px4fuse.request import AUTO, EvaluationRequest, command_line, settings_name
 from px4fuse.writing import STANDARD_OUTPUT
 
 if TYPE_CHECKING:
@@ -157,6 +154,17 @@ def evaluate(
     for option, value in (("--max-gap", max_gap), ("--time-offset", time_offset)):
         if isinstance(value, float) and not abs(value) < float("inf"):
             raise SettingsError(f"{option} {value:g} is not a finite number.")
+    request = EvaluationRequest(
+        estimate=str(estimate),
+        reference=str(reference),
+        alignment=alignment,
+        association=association,
+        max_gap_s=max_gap,
+        time_offset_s=time_offset,
+        rpe=tuple(map(str, rpe)),
+        consecutive=consecutive,
+        system=system,
+    )
     alone = json_path == STANDARD_OUTPUT
     _targets(output, picture, json_path)  # before the work, not after it
     contents: dict[Path, bytes] = {}
@@ -175,10 +183,10 @@ def evaluate(
             rpe_deltas=rpe or None,
             all_pairs=not consecutive,
         )
-        results = evaluation_results(found, command_line("evaluate", estimate, reference))
+        results = evaluation_results(found, command_line(request))
         text = to_json(results)
         if output is None and picture is None and json_path is None:
-            output = _default(estimate, reference, results)
+            output = _default(estimate, reference, settings_name(request), results)
         output, picture, beside = _targets(output, picture, json_path)
         if output is not None:
             from px4fuse.report.document import EvaluationDocument
@@ -205,7 +213,7 @@ def evaluate(
         print_file(console, "Wrote", path)
 
 
-def _default(estimate: Path, reference: Path, mine: EvaluationResults) -> Path:
+def _default(estimate: Path, reference: Path, settings: str, mine: EvaluationResults) -> Path:
     """Where a page goes that was given no name: the two and the settings are in its name."""
     from px4fuse.results.contract import EvaluationResults, Results
 
@@ -215,8 +223,6 @@ def _default(estimate: Path, reference: Path, mine: EvaluationResults) -> Path:
             == (mine.provenance.command, mine.estimate.sha256, mine.reference.sha256)
         )
 
-    given = " ".join(shlex.split(mine.provenance.command)[4:]).split("--")[1:]
-    settings = "".join(re.sub(r"[^\w.,+-]+", "-", f"_{part.strip()}") for part in given)
     return free_report(f"{_name(estimate)}_against_{_name(reference)}", settings, is_same)
 
 
@@ -245,5 +251,4 @@ def _targets(
         )
     if results is not None and picture.resolve() == results.resolve():
         raise OutputError(f"{picture}: --picture and --json name the same file. Give two names.")
-    spare_inputs([picture])
     return output, picture, results

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
 import click
-from click.core import ParameterSource
 
 from px4fuse.cli.quantity import Quantity
 from px4fuse.errors import SettingsError
@@ -19,9 +17,6 @@ from px4fuse.request import AxisName, InputName
 if TYPE_CHECKING:
     from px4fuse.request import ComparisonRequest, PositionFile
     from px4fuse.results.model import Student
-
-# Options of the commands without a request that say where to write, or what this machine can take
-NOT_RECORDED = ("json_path", "g2o", "max_size", "output", "picture")
 
 
 class ColumnNames(click.ParamType["tuple[str, ...]"]):
@@ -336,21 +331,3 @@ def _read_notes(path: Path | None) -> str:
 def encodable(text: str) -> str:
     """Text without the stray bytes that a terminal may hand over."""
     return text.encode(errors="replace").decode()
-
-
-def command_line(command: str, *files: Path) -> str:
-    """The command that makes this again: what was given, without folders and names."""
-    context = click.get_current_context()
-    words = ["px4fuse", command, *(encodable(file.name) for file in files)]
-    for parameter in context.command.params:
-        name = parameter.name or ""
-        given = context.get_parameter_source(name) == ParameterSource.COMMANDLINE
-        if not given or name in NOT_RECORDED or isinstance(parameter, click.Argument):
-            continue
-        if getattr(parameter, "is_flag", False):
-            words.append(parameter.opts[-1])
-            continue
-        value: Any = context.params[name]
-        for single in value if isinstance(value, tuple) else (value,):
-            words += [parameter.opts[-1], encodable(str(single))]
-    return shlex.join(words)

@@ -10,7 +10,6 @@ import click
 from click.core import ParameterSource
 
 from px4fuse.cli.inputs import (
-    command_line,
     max_size_option,
     path_option,
     person_options,
@@ -177,7 +176,7 @@ def loop(
     from px4fuse.loop.sources import is_g2o, split_part
     from px4fuse.report.document import LoopDocument
     from px4fuse.report.loop_terminal import print_loop
-    from px4fuse.request import command_line as request_line
+    from px4fuse.request import command_line
     from px4fuse.results.build_trajectories import loop_results
     from px4fuse.results.contract import to_json
 
@@ -193,7 +192,7 @@ def loop(
     with progress(json_path == STANDARD_OUTPUT, STEPS) as step:
         found = run_loop(request, step)
         findings = find_loop(found)
-        command = request_line(request)
+        command = command_line(request)
         results = loop_results(request, found, findings, person, command)
         contents = _files(found, tum, g2o)
         if output is not None:
@@ -260,6 +259,7 @@ def _solve(source: Path, json_path: Path | None, g2o: Path | None, robust: bool 
     from px4fuse.loop.sources import split_part
     from px4fuse.readers.g2o import g2o_text, read_g2o
     from px4fuse.report.loop_terminal import print_graph
+    from px4fuse.request import LoopRequest, command_line
     from px4fuse.results.build_trajectories import graph_results
     from px4fuse.trajectory.graph.analysis import analyse_graph
 
@@ -278,7 +278,8 @@ def _solve(source: Path, json_path: Path | None, g2o: Path | None, robust: bool 
     with progress(json_path == STANDARD_OUTPUT) as step:
         step(f"reading {shown(source)}")
         solved = analyse_graph(read_g2o(path), step, robust=robust)
-    results = graph_results(shown(source), solved, command_line("loop", source))
+    command = command_line(LoopRequest(source=str(source))) + (" --robust" if robust else "")
+    results = graph_results(shown(source), solved, command)
     contents = {} if g2o is None else {g2o: g2o_text(solved.graph).encode()}
     _finish(results, json_path, contents, lambda to: print_graph(to, shown(source), solved))
 

@@ -108,7 +108,7 @@ def progress(quiet: bool = False, steps: Sequence[str] = ()) -> Iterator[Step]:
                 begun = (number for number, step in enumerate(steps) if what.startswith(step))
                 at = max(at, next(begun, at))
                 done, of = at, len(steps)
-            count = "" if of is None else f"{done} of {of}"
+            count = f"step {at + 1} of {of}" if steps else "" if of is None else f"{done} of {of}"
             bar.update(task, description=what, completed=done, total=of, count=count)
 
         yield show

@@ -1,4 +1,4 @@
-"""Options that are numbers with a unit, which is not typed."""
+"""Numbers with a unit, which is not typed: who types it is told the number."""
 
 from __future__ import annotations
 
@@ -9,31 +9,51 @@ import click
 
 from px4fuse.request import AUTO
 
-# Name of each unit, and what others are of it
-_UNITS: dict[str, tuple[str, dict[str, float]]] = {
-    "m": ("metres", {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "dm": 0.1, "km": 1e3, "in": 0.0254,
-                     "ft": 0.3048}),
-    "m/s": ("metres per second", {"m/s": 1.0, "mps": 1.0, "cm/s": 1e-2, "km/h": 1.0 / 3.6}),
-    "m/s²": ("metres per second squared", {"m/s²": 1.0, "m/s2": 1.0, "m/s^2": 1.0, "m/s/s": 1.0,
-                                           "cm/s²": 1e-2, "cm/s2": 1e-2, "mm/s2": 1e-3,
-                                           "g": 9.80665, "mg": 9.80665e-3}),
-    "s": ("seconds", {"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9,
-                      "min": 60.0, "h": 3600.0}),
-    "°": ("degrees", {"°": 1.0, "deg": 1.0, "degrees": 1.0, "rad": 57.29577951308232}),
-    "Hz": ("hertz", {"hz": 1.0, "khz": 1e3}),
+NAMES = {
+    "m": "metres", "m/s": "metres per second", "m/s²": "metres per second squared",
+    "s": "seconds", "ms": "milliseconds", "°": "degrees", "Hz": "hertz",
+}  # fmt: skip
+_LENGTHS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "dm": 0.1, "km": 1e3, "in": 0.0254, "ft": 0.3048}
+_TIMES = {"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "min": 60.0}
+# Units that people type, in each of ours
+_UNITS: dict[str, dict[str, float]] = {
+    "m": _LENGTHS,
+    "m/s": {"m/s": 1.0, "cm/s": 1e-2, "km/h": 1.0 / 3.6},
+    "m/s²": {"m/s²": 1.0, "m/s2": 1.0, "m/s^2": 1.0, "cm/s²": 1e-2, "cm/s2": 1e-2,
+             "g": 9.80665, "mg": 9.80665e-3},
+    "s": _TIMES,
+    "ms": {unit: 1e3 * seconds for unit, seconds in _TIMES.items()},
+    "°": {"°": 1.0, "deg": 1.0, "degrees": 1.0, "rad": 57.29577951308232},
+    "Hz": {"hz": 1.0, "khz": 1e3},
 }  # fmt: skip
 _TYPED = re.compile(r"([-+]?[\d.,]+(?:e[-+]?\d+)?)\s*(\S*)", re.IGNORECASE)
 
 
+def in_unit(typed: str, unit: str) -> float | None:
+    """What a number with a unit or with a comma is in one of ours; None where it is none.
+
+    >>> in_unit("10cm", "m"), in_unit("0,5", "s"), in_unit("10 apples", "m")
+    (0.1, 0.5, None)
+    """
+    found = _TYPED.fullmatch(typed.strip())
+    scale = _UNITS.get(unit, {}).get(found[2].lower() or unit.lower()) if found else None
+    if found is None or scale is None:
+        return None
+    try:
+        return float(f"{float(found[1].replace(',', '.')) * scale:.12g}")
+    except ValueError:  # several points
+        return None
+
+
 class Quantity(click.ParamType["float | str"]):
-    """A number in a unit; what is typed with a unit or a comma is told how to be typed.
+    """A number in a unit.
 
     Parameters
     ----------
     unit : str
-        "m", "m/s", "m/s²", "s", "°" or "Hz".
+        One of ``NAMES``.
     example : float
-        Shown where what was typed cannot be read.
+        Shown where what was typed cannot be understood.
     auto : bool
         Also take the word ``auto``.
     between : (float, float), optional
@@ -58,28 +78,16 @@ class Quantity(click.ParamType["float | str"]):
         """Convert what was typed."""
         if self.auto and value == AUTO:
             return str(value)
-        name, units = _UNITS[self.unit]
+        name = NAMES[self.unit]
         try:
             number = float(value)
         except ValueError:
-            meant = self._meant(value, units)
-            example = f"{self.example if meant is None else meant:.12g}"
+            meant = in_unit(value, self.unit)
+            shown = f"{self.example if meant is None else meant:.12g}"
             self.fail(
-                f"{value!r}: give {name}, as {example}{', or auto' if self.auto else ''}.",
-                param,
-                ctx,
+                f"{value!r}: give {name}, as {shown}{', or auto' if self.auto else ''}.", param, ctx
             )
         if self.between is not None and not self.between[0] <= number <= self.between[1]:
             low, high = self.between
             self.fail(f"{value} is not between {low:g} and {high:g} {name}.", param, ctx)
         return number
-
-    def _meant(self, value: str, units: dict[str, float]) -> float | None:
-        """What a number with a unit is in ours; None where it cannot be told."""
-        typed = _TYPED.fullmatch(value.strip())
-        if typed is None or (typed[2] and typed[2].lower() not in units):
-            return None
-        try:
-            return float(typed[1].replace(",", ".")) * units.get(typed[2].lower(), 1.0)
-        except ValueError:
-            return None

@@ -27,6 +27,11 @@ if TYPE_CHECKING:
     from px4fuse.flight import Unavailable
     from px4fuse.request import ComparisonRequest
 
+STEPS = (
+    "reading", "filtering",
+    *(f"tuning {name}" for name in ("north", "east", "down", "aisle", "horizontal")),
+)  # fmt: skip
+
 
 @click.command()
 @click.argument("log", type=click.Path(path_type=Path))
@@ -44,7 +49,7 @@ def tune(log: Path, json_path: Path | None, **given: Any) -> None:
     from px4fuse.results.build import tuning_results
 
     request = comparison_request(log, given)
-    with progress(json_path == STANDARD_OUTPUT, ("reading", "filtering", "tuning")) as step:
+    with progress(json_path == STANDARD_OUTPUT, STEPS) as step:
         compared = run_comparison(request, step)
         tuned = tuned_noises(compared, progress=step)
     if write_json(
@@ -63,7 +68,7 @@ def _print(
     from rich.text import Text
 
     from px4fuse.flight import Unavailable
-    from px4fuse.report.screen import plain_table, print_line, say
+    from px4fuse.report.screen import plain_table, print_line, print_list, say
     from px4fuse.report.terminal import print_advice
     from px4fuse.report.words import settings_words, tuning_advice
 
@@ -76,7 +81,7 @@ def _print(
     reasons = []
     for name, found in tuned.items():
         if isinstance(found, Unavailable):
-            reasons.append((name, found))
+            reasons.append((name, Text(f"{found.reason}. {found.remedy}", "dim")))
             continue
         held = found.held_out
         table.add_row(
@@ -89,8 +94,7 @@ def _print(
         )
     if table.row_count:
         console.print(table)
-    for name, missing in reasons:
-        print_line(console, name, Text(f"{missing.reason}. {missing.remedy}", "dim"))
+    print_list(console, [(f"{name}:", missing) for name, missing in reasons])
     if table.row_count:
         note = (
             "gain: log-likelihood per measurement above the chosen settings; held out: the same on "

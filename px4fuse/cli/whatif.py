@@ -9,6 +9,7 @@ import click
 
 from px4fuse.cli.inputs import flight_options, json_option, path_option
 from px4fuse.cli.outputs import progress, terminal, write_outputs
+from px4fuse.cli.quantity import NAMES, in_unit
 from px4fuse.errors import OutputError, SettingsError
 from px4fuse.writing import STANDARD_OUTPUT
 
@@ -103,7 +104,7 @@ def _changes(given: tuple[str, ...]) -> dict[str, float]:
             raise SettingsError(f"--set {text}: give NAME=VALUE, for example EKF2_EVP_NOISE=0.1.")
         if name in changes:
             raise SettingsError(f"--set {name} is given twice.")
-        changes[name] = _number("--set", text, value)
+        changes[name] = _number(f"--set {text}", name, value)
     return changes
 
 
@@ -117,12 +118,17 @@ def _sweep(text: str) -> Sweep:
             f"--sweep {text}: give NAME=LOW:HIGH or NAME=LOW:HIGH:COUNT, for example "
             "EKF2_EVP_NOISE=0.02:0.5."
         )
-    low, high = (_number("--sweep", text, part) for part in parts[:2])
+    low, high = (_number(f"--sweep {text}", name, part) for part in parts[:2])
     return Sweep(name, low, high, *map(int, parts[2:]))
 
 
-def _number(option: str, text: str, value: str) -> float:
+def _number(typed: str, name: str, value: str) -> float:
+    from px4fuse.ekf2.parameters import PARAMETERS
+
     try:
         return float(value)
     except ValueError as error:
-        raise SettingsError(f"{option} {text}: {value!r} is not a number.") from error
+        unit = PARAMETERS[name].unit.replace("^2", "²") if name in PARAMETERS else ""
+        meant = in_unit(value, unit)
+        told = " is not a number" if meant is None else f": give {NAMES[unit]}, as {meant:g}"
+        raise SettingsError(f"{typed}: {value!r}{told}.") from error

@@ -17,9 +17,10 @@ from px4fuse.comparison.projection import (
     project_truth,
     project_variance,
 )
-from px4fuse.errors import SettingsError
+from px4fuse.display import Shown
+from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.filter.consistency import Consistency, HorizontalNis, assess, assess_horizontal
-from px4fuse.filter.kalman import Replay, Settings, replay, state_at, variance_at
+from px4fuse.filter.kalman import Replay, Settings, replay_all, state_at, variance_at
 from px4fuse.filter.signals import (
     AISLE,
     Axis,
@@ -87,8 +88,8 @@ class AgainstTruth:
     nees_velocity_mean: float | None
 
 
-@dataclass(frozen=True)
-class AxisComparison:
+@dataclass(frozen=True, repr=False)
+class AxisComparison(Shown):
     """Everything about one axis.
 
     Attributes
@@ -122,8 +123,8 @@ class AxisComparison:
     truth: pd.DataFrame | Unavailable
 
 
-@dataclass(frozen=True)
-class Comparison:
+@dataclass(frozen=True, repr=False)
+class Comparison(Shown):
     """The result of ``px4fuse compare``.
 
     Attributes
@@ -152,6 +153,19 @@ class Comparison:
     horizontal_ekf2: HorizontalNis | None
     notes: tuple[str, ...]
     missing: tuple[Unavailable, ...]
+
+    def __getitem__(self, axis: str) -> AxisComparison:
+        """Everything about one axis, by its name.
+
+        Raises
+        ------
+        MissingDataError
+            It was not analysed.
+        """
+        names = {result.axis.name: result for result in self.axes}
+        if axis not in names:
+            raise MissingDataError(f"no axis {axis!r} here: {', '.join(names)}.")
+        return names[axis]
 
     @property
     def main(self) -> AxisComparison:
@@ -188,7 +202,7 @@ def compare(
     input_required : bool
         Raise instead of falling back to ``input="zero"`` where the log has no acceleration.
     progress : callable
-        Told the name of each axis as it starts.
+        Told the names of the axes as they start.
 
     Returns
     -------
@@ -213,7 +227,7 @@ def compare(
     acceleration = lines[0].acceleration
     if settings.input == "imu" and isinstance(acceleration, Unavailable):
         if input_required:
-            raise SettingsError(f"{flight.log.name}: --input imu: {acceleration}")
+            raise SettingsError(f"{flight.log.name}: `input` imu: {acceleration}")
         settings = replace(settings, input="zero")
         notes.append(f"no acceleration input ({acceleration.reason}): constant velocity was used")
         if acceleration not in missing:
@@ -224,10 +238,10 @@ def compare(
         notes += [f"EKF2 {statement}"] if statement else []
         notes += ekf2.notes
         ekf2 = replace(ekf2, state=state)
-    results = []
-    for line in lines:
-        progress(line.name)
-        results.append(_compare_axis(flight, ekf2, track, segment, line, settings))
+    progress(", ".join(line.name for line in lines))
+    results = [
+        _compare_axis(flight, ekf2, track, segment, run) for run in replay_all(lines, settings)
+    ]
     return Comparison(
         flight=flight,
         source=track,
@@ -247,11 +261,10 @@ def _compare_axis(
     ekf2: Ekf2 | Unavailable,
     track: PositionTrack,
     segment: Segment,
-    axis: Axis,
-    settings: Settings,
+    run: Replay,
 ) -> AxisComparison:
     """Everything about one axis; ``ekf2`` is the flight's, its resets treated."""
-    run = replay(axis, settings)
+    axis = run.axis
     truth = project_truth(flight.truth, axis, segment)
     kf = FilterSummary(
         consistency=assess(

@@ -12,7 +12,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from scipy import stats
+from scipy.special import stdtr
 
 from px4fuse.arrays import Array
 from px4fuse.filter.clock import MAX_HALF_INTERVAL_S, ClockOffset
@@ -97,6 +97,6 @@ def _step_p(offset: Array, weight: Array) -> float | None:
             continue
         scatter = max(1.0, sum(_square(x, w) for x, w in sides) / (count - 2))
         sigma = np.sqrt(scatter * sum(1.0 / np.sum(w) for _, w in sides))
-        p = 2.0 * float(stats.t.sf(abs(step) / sigma, count - 2))
+        p = 2.0 * float(stdtr(count - 2, -abs(step) / sigma))
         smallest = min(smallest, p * len(places))
     return smallest if places else None

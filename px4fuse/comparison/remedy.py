@@ -14,7 +14,7 @@ from px4fuse.comparison.comparison import AgainstTruth, Comparison, compare, kf_
 from px4fuse.ekf2.model import Model
 from px4fuse.ekf2.parameters import PARAMETERS
 from px4fuse.ekf2.whatif import Summary, what_if
-from px4fuse.filter.kalman import Settings, replay
+from px4fuse.filter.kalman import Settings, replay_all
 from px4fuse.filter.signals import AISLE
 from px4fuse.flight import Unavailable
 
@@ -131,9 +131,10 @@ def filter_errors_m(comparison: Comparison, changed: Settings) -> tuple[float, f
     results = [r for r in comparison.axes if r.axis.name != AISLE or names == {AISLE}]
     before = [result.kf_truth for result in results]
     if changed.clock_offset_s == comparison.settings.clock_offset_s:
+        runs = replay_all(tuple(result.axis for result in results), changed)
         after = [
             kf_against_truth(
-                replay(result.axis, changed),
+                run,
                 result.truth,
                 (
                     result.replay.steps
@@ -141,7 +142,7 @@ def filter_errors_m(comparison: Comparison, changed: Settings) -> tuple[float, f
                     else result.ekf2_state
                 ).index.to_numpy(),
             )
-            for result in results
+            for result, run in zip(results, runs, strict=True)
         ]
     else:  # the measurements themselves are at other times
         again = compare(

@@ -15,6 +15,7 @@ from px4fuse.arrays import Array
 from px4fuse.comparison.asked import tuned_noise_m
 from px4fuse.comparison.comparison import AxisComparison, Comparison
 from px4fuse.comparison.why_words import Facts, sentences
+from px4fuse.display import Shown
 from px4fuse.ekf2.agreement import judged_from, settled
 from px4fuse.ekf2.model import Model
 from px4fuse.ekf2.walk import WHAT, AxisWalk, Coast, Line, Student, walk
@@ -40,8 +41,8 @@ class Outside:
     at_s: float
 
 
-@dataclass(frozen=True)
-class Why:
+@dataclass(frozen=True, repr=False)
+class Why(Shown):
     """Why EKF2 differs, along one axis.
 
     Attributes

@@ -35,6 +35,7 @@ REJECTED_SHARE = 0.01
 EQUALLY_CLOSE = 0.05
 # Stamps that are wrong by less do not show at flying speed
 CLOCK_S = 0.03
+STAMPS_WRONG = "The source's stamps are"
 # Shares of the mean square below this are not worth a word
 NOTABLE = 0.05
 # How much farther apart than where they were walked both must be elsewhere to be told (m, times)
@@ -164,7 +165,6 @@ def _share(square: float, total: float) -> str:
 
 
 def _first(name: str, axis: AxisWalk, part: _Part, facts: Facts) -> str:
-    apart = f"{np.sqrt(axis.position_total_m2):.3f} m rms"
     share = _share(part.square_m2, axis.position_total_m2)
     if facts.too_sure:
         return (
@@ -172,10 +172,10 @@ def _first(name: str, axis: AxisWalk, part: _Part, facts: Facts) -> str:
             f"{facts.noise_used_m:.2g} m, the data ask for {facts.noise_asked_m:.2g} m, so its "
             f"gate rejects {facts.rejected:.0%} of the samples{_coasted(facts)}. This noise and "
             "the rejections that follow from it "
-            f"are {share} of what ours and EKF2 are apart along {the(name)} ({apart})."
+            f"are {share} of what ours and EKF2 are apart along {the(name)}."
         )
     return (
-        f"Along {the(name)} ours and EKF2 are {apart} apart, most of it by {part.label} ({share}): "
+        f"Most of what ours and EKF2 are apart along {the(name)} is {part.label} ({share}): "
         f"{_because(part, facts)}."
     )
 
@@ -277,11 +277,12 @@ def _velocity(axis: AxisWalk, parts: list[_Part]) -> str:
     first = max(parts, key=lambda part: part.speed_square_m2_s2)
     share = first.speed_square_m2_s2 / total
     # more than all of it makes good what an earlier step did: no cause by itself
-    mostly = f", most of it by {first.label} ({share:.0%})" if share <= 1.0 else ""
+    mostly = f", in velocity mostly by {first.label} ({share:.0%})" if share <= 1.0 else ""
+    position = axis.position_total_m2
     return (
-        f"In velocity they are {np.sqrt(total):.3f} m/s rms apart{mostly}; what the model leaves "
-        f"unexplained is {axis.position_left_m2 / axis.position_total_m2:.1%} in position and "
-        f"{axis.velocity_left_m2_s2 / total:.1%} in velocity."
+        f"Where EKF2 was replayed they are {np.sqrt(position):.3f} m and {np.sqrt(total):.3f} m/s "
+        f"rms apart{mostly}; the model leaves {axis.position_left_m2 / position:.1%} of that in "
+        f"position and {axis.velocity_left_m2_s2 / total:.1%} in velocity unexplained."
     )
 
 
@@ -321,7 +322,7 @@ def _clock(facts: Facts) -> list[str]:
     if min(abs(clock.offset_s), abs(both + delay_s)) < CLOCK_S or abs(own + delay_s) > CLOCK_S:
         return []
     return [
-        f"The source's stamps are {'late' if both < 0 else 'early'} by {abs(both):.2f} s for both "
+        f"{STAMPS_WRONG} {'late' if both < 0 else 'early'} by {abs(both):.2f} s for both "
         "filters alike: positions and IMU contradict each other, and the steps only say how each "
         "filter settles that. Set the clock right first (page Clock)."
     ]

@@ -50,6 +50,7 @@ from px4fuse.flight import (
     sample_rate,
 )
 from px4fuse.plain import plain
+from px4fuse.request import with_options
 
 SCHEMA_NAME = "px4fuse-info"
 SCHEMA_VERSION = "1.0"
@@ -265,7 +266,7 @@ def _plan(flight: Flight) -> _Plan:
         segment = choose_segment(flight, track)
         return _Plan(track, segment, make_axes(flight, track, segment), reason, "")
     except Px4FuseError as error:
-        text = str(error).removeprefix(f"{flight.log.name}: ")
+        text = with_options(str(error)).removeprefix(f"{flight.log.name}: ")
         reason, _, remedy = text.partition(". ")
         if not isinstance(error, MissingDataError):
             remedy = "Record more of the flight: the logger from arming on (SDLOG_MODE 0)."

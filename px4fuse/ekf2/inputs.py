@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from px4fuse.display import brief
 from px4fuse.ekf2.parameters import fuses_by_mask, settings_in_force
 from px4fuse.ekf2.stretches import MIN_STRETCH_S, Stretch, find_stretches, predict_s
 from px4fuse.ekf2.vision import WHAT, Vision, read_vision
@@ -86,6 +87,8 @@ class Inputs:
     vision_height: bool
     imu_offset_m: Array
     max_leg_s: float = MAX_LEG_S
+
+    __repr__ = brief
 
 
 def prepare(flight: Flight) -> Inputs | Unavailable:  # noqa: PLR0911 (a reason each)

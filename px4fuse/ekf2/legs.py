@@ -16,10 +16,12 @@ errors of gyro bias b_g and accelerometer bias b_a. Equations as in PX4-Autopilo
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from px4fuse.display import brief
 from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.rotation import skew
 from px4fuse.ekf2.stretches import Stretch
@@ -53,15 +55,31 @@ class Transitions:
 
     Attributes
     ----------
+    step : ndarray of int, shape (n,)
+        Which step each row below is of: they are long, and stay as they were made.
     elapsed_s : ndarray, shape (n,)
     attitude, velocity, position : ndarray, shape (n, 3, 11)
         What the causes have done to each.
     """
 
+    step: Indices
     elapsed_s: Array
     attitude: Array
     velocity: Array
     position: Array
+
+    __repr__ = brief
+
+    def rows(self, step: Indices) -> Indices:
+        """Rows of some steps."""
+        place = np.empty(len(self.step), dtype=np.intp)
+        place[self.step] = np.arange(len(self.step))
+        return place[step]
+
+    def rounded(self) -> Transitions:
+        """In half of the memory: within a leg less than a metre, to a tenth of a micrometre."""
+        parts: list[Any] = [self.attitude, self.velocity, self.position]
+        return Transitions(self.step, self.elapsed_s, *(p.astype(np.float32) for p in parts))
 
 
 @dataclass(frozen=True)
@@ -119,6 +137,8 @@ class Legs(_Events):
     steps: Array
     within: Transitions
 
+    __repr__ = brief
+
 
 @dataclass(frozen=True)
 class Timing:
@@ -142,7 +162,7 @@ def make_legs(inputs: Inputs, stretch: Stretch, timing: Timing) -> Legs:
     transition = np.tile(np.eye(STATES), (count, 1, 1))
     turn, drive = np.zeros((count, STATES)), np.zeros((count, STATES))
     moved = end > start
-    at = last[moved]
+    at = within.rows(last[moved])
     for rows, part in (
         (THETA, within.attitude),
         (VELOCITY, within.velocity),
@@ -167,7 +187,7 @@ def make_legs(inputs: Inputs, stretch: Stretch, timing: Timing) -> Legs:
         gyro_noise=gyro,
         accelerometer_noise=accelerometer,
         steps=(end - start).astype(np.float64),
-        within=within,
+        within=within.rounded(),
     )
 
 
@@ -274,9 +294,7 @@ def _transitions(stretch: Stretch, start: Indices, end: Indices) -> Transitions:
         attitude[now] += attitude[was]
         elapsed[now] += elapsed[was]
         low, high = high, high + count
-    back = np.empty(n, dtype=np.intp)
-    back[order] = np.arange(n)
-    return Transitions(elapsed[back], attitude[back], velocity[back], position[back])
+    return Transitions(order, elapsed, attitude, velocity, position)
 
 
 def _noises(steps: Array, duration_s: Array, tilt: Array) -> tuple[Array, Array]:

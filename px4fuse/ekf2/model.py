@@ -15,6 +15,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from px4fuse.display import brief
 from px4fuse.ekf2.agreement import REJECTING_SHARE, agreement_with_log, with_obedient
 from px4fuse.ekf2.inputs import Inputs, prepare
 from px4fuse.ekf2.legs import (
@@ -68,6 +69,8 @@ class Model:
     legs: tuple[Legs, ...]
     flown: Ekf2Replay
     agreement: Agreement
+
+    __repr__ = brief
 
 
 def replay_ekf2(
@@ -173,6 +176,28 @@ def replay_variants(
     return [_assemble(inputs, runs, at, change) for at, change in enumerate(changes)]
 
 
+def delayed_variants(
+    model: Model, variants: Sequence[Variant]
+) -> tuple[list[pd.DataFrame], Ekf2Replay]:
+    """Tracks of the filters at their horizon, and all that the last one did.
+
+    What a filter publishes is as long again, and takes as long to make.
+    """
+    made = {Variant(model.inputs.settings).timing(model.inputs): model.legs}
+    runs = run_variants(model.inputs, variants, made)
+    last = _assemble(model.inputs, runs, len(variants) - 1, {})
+    tracks = [
+        pd.concat([_delayed(part, delayed_states(part, at)[0]) for part in runs])
+        for at in range(len(variants) - 1)
+    ]
+    return [*tracks, last.delayed], last
+
+
+def _delayed(part: StretchRun, state: Array) -> pd.DataFrame:
+    index = pd.Index(part.stretch.time_s, name="time_s")
+    return pd.DataFrame(np.hstack([state[:, 6:9], state[:, 3:6]]), index, STATE_COLUMNS)
+
+
 @dataclass(frozen=True)
 class StretchRun:
     """One stretch with its legs by delay, and what the variants did in it."""
@@ -274,7 +299,7 @@ def _tracks(inputs: Inputs, part: StretchRun, at: int) -> tuple[pd.DataFrame, pd
     )
     index = pd.Index(stretch.time_s, name="time_s")
     return (
-        pd.DataFrame(np.hstack([state[:, 6:9], state[:, 3:6]]), index, STATE_COLUMNS),
+        _delayed(part, state),
         pd.DataFrame(np.hstack([position, velocity]), index, STATE_COLUMNS),
     )
 
@@ -296,10 +321,13 @@ def delayed_states(part: StretchRun, at: int) -> tuple[Array, Array]:
     causes[:, TURN] = 1.0 if variant.attitude else 0.0
     causes[:, INPUT] = 1.0
     state = np.concatenate([kept[:1], was])
-    state[1:, THETA] = np.einsum("nij,nj->ni", w.attitude, causes)
-    state[1:, VELOCITY] += np.einsum("nij,nj->ni", w.velocity, causes)
-    state[1:, POSITION] += w.elapsed_s[:, None] * was[:, VELOCITY]
-    state[1:, POSITION] += np.einsum("nij,nj->ni", w.position, causes)
+    # the rows of w are in an order of their own
+    of_cause, was = causes[w.step], was[w.step]
+    rows = 1 + w.step
+    state[rows, THETA] = np.einsum("nij,nj->ni", w.attitude, of_cause)
+    state[rows, VELOCITY] += np.einsum("nij,nj->ni", w.velocity, of_cause)
+    state[rows, POSITION] += w.elapsed_s[:, None] * was[:, VELOCITY]
+    state[rows, POSITION] += np.einsum("nij,nj->ni", w.position, of_cause)
     state[legs.end] = kept[1:]
     reset = np.zeros((count + 1, 3))
     for e in np.flatnonzero(part.run.reset[:, at]):

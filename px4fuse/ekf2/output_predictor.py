@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import lfilter
+from scipy.linalg import lapack
 
 Array = NDArray[np.float64]
 
@@ -74,7 +74,7 @@ def _followed(offset: Array, lag: int, step_s: float, tau_s: float) -> Array:
     h = INTEGRAL_SHARE * g**2
     start = offset[0]
     late = _later(offset - start, lag)
-    corrected: Array = lfilter([g + h, -g], [1.0, g + h - 2.0, 1.0 - g], late, axis=0)
+    corrected = _recursive(np.array([g + h, -g]), np.array([1.0, g + h - 2.0, 1.0 - g]), late)
     total: Array = corrected + start
     return total
 
@@ -104,5 +104,15 @@ def follow_attitude(error_rad: Array, lag: int, step_s: float, horizon_s: float)
     denominator = np.zeros(lag + 2)
     denominator[:2] = 1.0, -1.0
     denominator[-1] += share
-    followed: Array = lfilter(numerator, denominator, error_rad, axis=0)
-    return followed
+    return _recursive(numerator, denominator, error_rad)
+
+
+def _recursive(numerator: Array, denominator: Array, values: Array) -> Array:
+    """Values through a recursive filter: a triangular system whose bands are the denominator."""
+    count = len(values)
+    driven = np.zeros((values.shape[1], count))
+    for late in np.flatnonzero(numerator[:count]).tolist():
+        driven[:, late:] += numerator[late] * values[: count - late].T
+    bands = np.broadcast_to(denominator, (count, len(denominator))).T
+    filtered, _ = lapack.dtbtrs(bands, driven.T, uplo="L", overwrite_b=1)
+    return np.asarray(filtered)

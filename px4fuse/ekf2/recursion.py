@@ -151,7 +151,10 @@ def run(  # noqa: PLR0915 (one recursion, read from top to bottom)
     attitude = np.array([v.attitude for v in variants])
     pick = which if len(legs) > 1 else slice(None)
     transition, turn, drive, gyro_noise, force_noise = (
+        # they are long: one delay needs no copy
         np.stack([getattr(leg, name) for leg in legs], axis=1)
+        if len(legs) > 1
+        else getattr(legs[0], name)[:, None]
         for name in ("transition", "turn", "drive", "gyro_noise", "accelerometer_noise")
     )
     steps = np.stack([leg.steps for leg in legs], axis=1)[:, :, None]

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import pandas as pd
 
+from px4fuse.display import brief
 from px4fuse.flight import AxisName
 
 HORIZONTAL: tuple[AxisName, AxisName] = ("north", "east")
@@ -112,3 +113,5 @@ class Ekf2Replay:
     late: int = 0
     lost: int = 0
     agreement: Agreement | None = None
+
+    __repr__ = brief

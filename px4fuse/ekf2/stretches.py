@@ -12,6 +12,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from px4fuse.display import brief
 from px4fuse.ekf2.rotation import (
     conjugate,
     from_vector,
@@ -106,6 +107,8 @@ class Stretch:
     attitude_error_rad: Array
     correlation: Array
     fusing: bool = True
+
+    __repr__ = brief
 
 
 def find_stretches(

@@ -12,6 +12,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from px4fuse.display import brief
 from px4fuse.ekf2.parameters import fuses_by_mask, settings_in_force
 from px4fuse.ekf2.rotation import conjugate, interpolate, matrix, multiply
 from px4fuse.flight import (
@@ -64,6 +65,8 @@ class Vision:
     rejected: Array
     reset: NDArray[np.bool_]
     source: str
+
+    __repr__ = brief
 
 
 def read_vision(

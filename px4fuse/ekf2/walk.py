@@ -22,8 +22,9 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from px4fuse.display import brief
 from px4fuse.ekf2.agreement import at_times, judged_from, settled
-from px4fuse.ekf2.model import Model, replay_variants
+from px4fuse.ekf2.model import Model, delayed_variants
 from px4fuse.ekf2.recursion import Variant
 from px4fuse.ekf2.replay import Ekf2Replay
 from px4fuse.flight import POSITION_COLUMNS, VELOCITY_COLUMNS, Ekf2, Truth, Unavailable
@@ -138,6 +139,8 @@ class AxisWalk:
     apart_m: Array
     left_m: Array
 
+    __repr__ = brief
+
     @property
     def position_left_share(self) -> float:
         """What is left of the mean square, as a share of all of it."""
@@ -214,9 +217,9 @@ def walk(
     assert isinstance(ekf2, Ekf2)
     lines = lines or {"north": Line(1.0, 0.0), "east": Line(0.0, 1.0)}
     variants = _variants(model, student or Student())
-    replays = replay_variants(model, list(variants.values()), [{}] * len(variants))
-    tracks = {name: replay.delayed for name, replay in zip(variants, replays, strict=True)}
-    tracks[OUTPUT] = replays[-1].published
+    delayed, flown = delayed_variants(model, list(variants.values()))
+    tracks = dict(zip(variants, delayed, strict=True))
+    tracks[OUTPUT] = flown.published
     judged = judged_from(model.flown)
     times = ekf2.state.index.to_numpy()
     inside = settled(times, judged)
@@ -232,7 +235,7 @@ def walk(
         )
     return Walk(
         axes={name: _axis(model, tracks, line, times) for name, line in lines.items()},
-        coast=_coast(replays[-1], tracks[ATTITUDE], (times[0], times[-1]), judged),
+        coast=_coast(flown, tracks[ATTITUDE], (times[0], times[-1]), judged),
         tracks=tracks,
         times_s=times,
     )

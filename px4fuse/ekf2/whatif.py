@@ -12,6 +12,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from px4fuse.display import Shown
 from px4fuse.ekf2.agreement import at_times, judged_from, logged_innovations, settled
 from px4fuse.ekf2.model import Model, replay_settings
 from px4fuse.ekf2.parameters import check
@@ -108,8 +109,8 @@ class Summary:
         return float(np.sqrt(squares))
 
 
-@dataclass(frozen=True)
-class WhatIf:
+@dataclass(frozen=True, repr=False)
+class WhatIf(Shown):
     """Side by side.
 
     Attributes

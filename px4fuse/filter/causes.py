@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from px4fuse.arrays import Array, BoolArray
+from px4fuse.display import brief
 from px4fuse.filter.hypotheses import (
     FORWARD,
     MIN_MEASUREMENTS,
@@ -20,6 +23,7 @@ from px4fuse.filter.hypotheses import (
     fit,
     lines_of,
     respond,
+    same_gains,
     steps,
     too_few,
 )
@@ -85,6 +89,8 @@ class Explained:
     sigma_a_m_s2: float
     count: int
 
+    __repr__ = brief
+
 
 def explained(
     flight: Flight,
@@ -144,24 +150,34 @@ def explained(
 
 def _fit_noise(lines: Lines, levels: Array, skip: BoolArray) -> tuple[float, Fit]:
     """The most likely of some SIGMA_A, and what is fitted with it."""
-    fits = [lines.fit(float(level), skip) for level in levels]
-    best = int(np.argmin([each.score for each in fits]))
-    return float(levels[best]), fits[best]
+    fitted = cache(lambda at: lines.fit(float(levels[at]), skip))
+    best = _lowest(lambda at: fitted(at).score, len(levels))
+    return float(levels[best]), fitted(best)
+
+
+def _lowest(score: Callable[[int], float], count: int) -> int:
+    """Index of the least of some scores that have one minimum, sought from the middle."""
+    at = count // 2
+    step = 1 if at + 1 < count and score(at + 1) < score(at) else -1
+    while 0 <= at + step < count and score(at + step) < score(at):
+        at += step
+    return at
 
 
 def _scale(lines: Lines, sigma_a: float, skip: BoolArray) -> Estimate:
     """Scale of the source minus 1, from the likelihood of a few; a turn's share is put back."""
-    fits = [lines.fit(sigma_a, skip, float(scale)) for scale in SCALES]
+    fitted = cache(lambda at: lines.fit(sigma_a, skip, float(SCALES[at])))
     # with S's logarithm, which grows with the scale, this would be biased towards zero
-    score = np.array([each.square / 2.0 for each in fits])
-    at = int(np.clip(np.argmin(score), 1, len(SCALES) - 2))
-    shift, bend = parabola_vertex(score, at)
+    lowest = _lowest(lambda at: fitted(at).square, len(SCALES))
+    at = int(np.clip(lowest, 1, len(SCALES) - 2))
+    score = np.array([fitted(near).square / 2.0 for near in (at - 1, at, at + 1)])
+    shift, bend = parabola_vertex(score, 1)
     step = float(SCALES[1] - SCALES[0])
     if bend <= 0.0:
         return Estimate(0.0, float("inf"))
     found = SCALES[at] + float(np.clip(shift, -1.5, 1.5)) * step
-    sigma = step / np.sqrt(bend) * max(fits[at].spread, 1.0)
-    turned = np.hypot(1.0, fits[at].coefficients[TURN])
+    sigma = step / np.sqrt(bend) * max(fitted(at).spread, 1.0)
+    turned = np.hypot(1.0, fitted(at).coefficients[TURN])
     return Estimate(float(found * turned - 1.0), float(sigma))
 
 
@@ -208,15 +224,17 @@ def _scan(lines: Lines, sigma_a: float, skip: BoolArray) -> list[float]:
     rest = white.data - white.columns @ base.coefficients
     chi_square = np.zeros(len(times))
     rows = np.count_nonzero(~skip)
+    together = same_gains(lines.legs)
     for at, legs in enumerate(lines.legs):
-        response = respond(legs, signals, sigma_a, lines.sigma_z_m, skip)[0][~skip]
+        if at == 0 or not together:
+            response = respond(legs, signals, sigma_a, lines.sigma_z_m, skip)[0][~skip]
         own = slice(at * rows, (at + 1) * rows)
         mixed = white.columns[own].T @ response
         size = np.sum(response**2, axis=0) - np.sum(mixed * (base.covariance @ mixed), axis=0)
         chi_square += (rest[own] @ response) ** 2 / np.maximum(size, 1e-9)
     chi_square /= max(base.spread, 1.0) ** 2
     best = int(np.argmax(chi_square))
-    if chi_square[best] < chi2.isf(STEP_FALSE_ALARM / len(lines.time_s), len(lines.legs)):
+    if chi_square[best] < chdtri(len(lines.legs), STEP_FALSE_ALARM / len(lines.time_s)):
         return []
     return [float(times[best])]
 
@@ -237,7 +255,7 @@ def _judge(
     found = fit(white, lines.priors)
     size, covariance = found.coefficients[columns], found.covariance[np.ix_(columns, columns)]
     chi_square = float(size @ np.linalg.solve(covariance, size)) / max(found.spread, 1.0) ** 2
-    if chi_square < chi2.isf(chance, len(columns)):
+    if chi_square < chdtri(len(columns), chance):
         return None
     rest = white.data - white.columns @ found.coefficients
     near = np.tile(after[~later], len(lines.legs))

@@ -14,19 +14,28 @@ interval is as much wider (a sandwich estimate: White 1982).
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cache, cached_property
 
 import numpy as np
-import pandas as pd
 from scipy.interpolate import CubicSpline
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from px4fuse.arrays import Array
-from px4fuse.filter.fitting import NoiseFit, Noises, Part, arguments, most_likely
+from px4fuse.display import Shown
+from px4fuse.filter.chain import Columns
+from px4fuse.filter.fitting import (
+    NoiseFit,
+    Noises,
+    Part,
+    arguments,
+    most_likely,
+    of_ratios,
+)
 from px4fuse.filter.kalman import Settings
 from px4fuse.filter.likelihood import PROFILE_DROP, parabola_vertex, profile_interval
-from px4fuse.filter.marginal import Fitted, fit, projected_products
-from px4fuse.filter.motion import SEARCH_S, Motion, motion
+from px4fuse.filter.marginal import Fitted, Positions, centred, paired_products
+from px4fuse.filter.motion import CONSTANT_SIGMA, SEARCH_S, Made, Motion, motion
 from px4fuse.filter.signals import Segment, within
 from px4fuse.flight import POSITION_COLUMNS, Flight, PositionTrack, Unavailable
 
@@ -42,6 +51,8 @@ MAX_PART_SIGMA_S = 0.15
 CHANGE_P = 0.005
 # Flights simulated for the scatter that the IMU's noise adds
 REPLICATES = 96
+# Numbers of signals that are made at once
+BLOCK = 2**18
 # Steps of ln σ by which the noises are tried at every offset
 NOISE_STEP = 0.1
 
@@ -56,8 +67,8 @@ class PartOffset:
     sigma_s: float
 
 
-@dataclass(frozen=True)
-class ClockOffset:
+@dataclass(frozen=True, repr=False)
+class ClockOffset(Shown):
     """What must be added to the position source's stamps.
 
     Attributes
@@ -115,12 +126,33 @@ class _Problem:
     directions: Array
     dt_s: float
 
+    @cached_property
+    def positions(self) -> Positions:
+        return self.motion.positions(self.positions_m, self.dt_s)
+
     def part(self, offset_s: Array | float) -> Part:
         legs = self.motion.legs(self.directions, np.atleast_1d(offset_s))
-        return Part(self.motion.positions(self.positions_m, self.dt_s), *legs)
+        return Part(*centred(self.positions, *legs))
 
     def fitted(self, offset_s: Array | float, noises: Noises) -> Fitted:
-        return fit(*arguments(self.part(offset_s), noises, np.ones(len(self.motion.time_s))))
+        sigma = noises.sigma_z_m
+        ratio, walk = noises.sigma_a_m_s2 / sigma, noises.walk_m / sigma
+        return self.of_ratios(np.atleast_1d(offset_s), [ratio], walk, sigma)[0].scaled(sigma)
+
+    def of_ratios(
+        self, offset_s: Array, ratios: list[float], walk: float, sigma_z_m: float
+    ) -> list[Fitted]:
+        """Fit at some offsets, a few at a time: their signals are long."""
+        count = len(self.motion.time_s)
+        each = max(1, BLOCK // (count * len(self.directions) * (1 + len(CONSTANT_SIGMA))))
+        made = [
+            of_ratios(self.part(offset_s[at : at + each]), ratios, walk, np.ones(count), sigma_z_m)
+            for at in range(0, len(offset_s), each)
+        ]
+        return [
+            replace(of_one[0], gram=np.concatenate([part.gram for part in of_one], axis=1))
+            for of_one in zip(*made, strict=True)
+        ]
 
 
 def estimate_clock_offset(
@@ -131,6 +163,7 @@ def estimate_clock_offset(
     noises: Noises,
     outlier_time_s: Array | None = None,
     progress: Callable[[str], None] = lambda _: None,
+    made: Made | None = None,
 ) -> ClockOffset | Unavailable:
     """Estimate what must be added to the stamps of a position track.
 
@@ -148,6 +181,8 @@ def estimate_clock_offset(
     outlier_time_s : ndarray, optional
         Measurements to leave out.
     progress : callable
+    made : dict, optional
+        As :func:`px4fuse.filter.motion.motion` has it.
 
     Returns
     -------
@@ -160,7 +195,7 @@ def estimate_clock_offset(
     samples = within(track.samples, segment)[POSITION_COLUMNS].dropna(subset=POSITION_COLUMNS[:2])
     if outlier_time_s is not None and len(outlier_time_s):
         samples = samples[~np.isin(samples.index.to_numpy(), outlier_time_s)]
-    moved = motion(flight.imu, flight.attitude, samples.index.to_numpy())
+    moved = motion(flight.imu, flight.attitude, samples.index.to_numpy(), made)
     count = 0 if moved is None else len(moved.time_s)
     if moved is None or count < MIN_MEASUREMENTS:
         return Unavailable(
@@ -170,7 +205,7 @@ def estimate_clock_offset(
         )
     progress("clock offset")
     problem = _Problem(moved, samples.to_numpy(), np.eye(3), settings.dt_s)
-    offset = _coarse(flight.imu, flight.attitude, samples, settings.dt_s, noises)
+    offset = _coarse(problem, noises)
     sigma, width = 0.0, 0.1
     for _ in range(2):
         noises = _noises(problem, offset, noises)
@@ -227,17 +262,11 @@ def estimate_clock_offset(
     )
 
 
-def _coarse(
-    imu: pd.DataFrame, attitude: pd.DataFrame, samples: pd.DataFrame, dt_s: float, noises: Noises
-) -> float:
+def _coarse(problem: _Problem, noises: Noises) -> float:
     """Offset of greatest likelihood over the whole search, from some of the measurements."""
-    some = samples.iloc[:: max(1, len(samples) // COARSE_MEASUREMENTS)]
-    moved = motion(imu, attitude, some.index.to_numpy())
-    if moved is None:
-        return 0.0
-    problem = _Problem(moved, some.to_numpy(), np.eye(3), dt_s)
+    some = problem.motion.thinned(COARSE_MEASUREMENTS) or problem.motion
     grid = np.linspace(-SEARCH_S, SEARCH_S, COARSE_POINTS)
-    return float(grid[np.argmin(problem.fitted(grid, noises).total())])
+    return float(grid[np.argmin(replace(problem, motion=some).fitted(grid, noises).total())])
 
 
 def _noises(problem: _Problem, offset: float, start: Noises) -> Noises:
@@ -251,24 +280,24 @@ def _profiled(problem: _Problem, curve: Array, noises: Noises, offset: float) ->
 
     The step's slopes are taken at each offset; the bends, which hardly change, at the best one.
     """
-    made = problem.fitted(curve, noises).total()
-    logs = np.log([noises.sigma_a_m_s2, noises.sigma_z_m])
-    steps = NOISE_STEP * np.eye(2)
+    sigma_z, sigma_a = noises.sigma_z_m, noises.sigma_a_m_s2
+    offsets = np.append(curve, offset)
+    ratios = sigma_a / sigma_z * np.exp(NOISE_STEP * np.array([-1.0, 0.0, 1.0]))
+    fits = cache(lambda walk: problem.of_ratios(offsets, ratios.tolist(), walk, sigma_z))
 
-    def at(shift: Array, offsets: Array | float) -> Array:
-        sigma_a, sigma_z = np.exp(logs + shift).tolist()
-        return problem.fitted(offsets, Noises(sigma_a, sigma_z, noises.walk_m)).total()
+    def at(shift_a: int, shift_z: int) -> Array:
+        scale = sigma_z * float(np.exp(NOISE_STEP * shift_z))
+        found: Fitted = fits(noises.walk_m / scale)[1 + shift_a - shift_z]
+        return np.asarray(found.totals(np.array([scale]))[0])
 
-    slope = np.array([at(step, curve) - at(-step, curve) for step in steps]) / (2.0 * NOISE_STEP)
-    middle = at(np.zeros(2), offset)[0]
-    bend = np.zeros((2, 2))
-    for i, first in enumerate(steps):
-        bend[i, i] = at(first, offset)[0] - 2.0 * middle + at(-first, offset)[0]
-    both = steps.sum(axis=0)
-    bend[0, 1] = bend[1, 0] = 0.5 * (
-        at(both, offset)[0] + at(-both, offset)[0] - 2.0 * middle - bend[0, 0] - bend[1, 1]
-    )
+    made = at(0, 0)
+    ahead, back = (np.array([at(sign, 0), at(0, sign)]) for sign in (1, -1))
+    slope = (ahead - back)[:, :-1] / (2.0 * NOISE_STEP)
+    bend = np.diag((ahead + back)[:, -1] - 2.0 * made[-1])
+    both = at(1, 1)[-1] + at(-1, -1)[-1] - 2.0 * made[-1]
+    bend[0, 1] = bend[1, 0] = 0.5 * (both - bend[0, 0] - bend[1, 1])
     bend /= NOISE_STEP**2
+    made = made[:-1]
     if np.any(np.linalg.eigvalsh(bend) <= 0.0):  # SIGMA_A at the end of its search
         return made
     gain = 0.5 * np.einsum("it,ij,jt->t", slope, np.linalg.inv(bend), slope)
@@ -287,25 +316,27 @@ def _scatter(problem: _Problem, offset: float, noises: Noises, information: floa
     axes = len(problem.directions)
     rng = np.random.default_rng(count)
     q00, q01, q11 = (noises.sigma_a_m_s2**2 * chain.noise_unit).T[:, :, None, None]
-    first, second = rng.standard_normal((2, len(q00), axes, REPLICATES))
-    dp = np.sqrt(q00) * first
-    dv = q01 / np.sqrt(q00) * first + np.sqrt(q11 - q01**2 / q00) * second
+    # the noise of each leg, made in place: these are the longest signals of all
+    dp, dv = rng.standard_normal((2, len(q00), axes, REPLICATES))
+    dv *= np.sqrt(q11 - q01**2 / q00)
+    dp *= np.sqrt(q00)
+    dv += q01 / q00 * dp
     speed = np.zeros((count, axes, REPLICATES))
     speed[chain.end] = dv
     for begin, end in zip(problem.motion.edges, problem.motion.edges[1:], strict=False):
-        speed[begin:end] = np.cumsum(speed[begin:end], axis=0)
-    error = noises.sigma_z_m * rng.standard_normal(speed.shape)
-    nothing = np.zeros_like(dp)
-    # the source's own walk is in the residuals, but nothing that the IMU measured
-    walk = noises.walk_m * np.sqrt(chain.length_s)[:, None, None]
-    dp = dp + walk * rng.standard_normal(dp.shape)
-    made = projected_products(
+        np.cumsum(speed[begin:end], axis=0, out=speed[begin:end])
+    error = rng.standard_normal(speed.shape)
+    error *= noises.sigma_z_m
+    if noises.walk_m:  # the source's own walk is in the residuals, but nothing the IMU measured
+        walk = noises.walk_m * np.sqrt(chain.length_s)[:, None, None]
+        dp += walk * rng.standard_normal(dp.shape)
+    still = np.broadcast_to(0.0, (axes, REPLICATES, len(q00)))
+    moved = (np.transpose(each, (1, 2, 0)) for each in (error, dp, dv))
+    score = paired_products(
         *arguments(part, noises, np.ones(count)),
-        np.concatenate([error, speed], axis=2),
-        np.concatenate([dp, nothing], axis=2),
-        np.concatenate([dv, nothing], axis=2),
-    )
-    score = np.einsum("srr->r", made[:, :REPLICATES, REPLICATES:])
+        Columns(*moved),
+        Columns(np.transpose(speed, (1, 2, 0)), still, still),
+    ).sum(axis=0)
     return 1.0 + float(np.var(score)) / information
 
 
@@ -340,7 +371,7 @@ def _parts(
         return tuple(found), None
     drops = np.array(used) - np.min(used, axis=1)[:, None]
     ratio = 2.0 * float(drops.sum(axis=0).min()) / factor
-    return tuple(found), float(chi2.sf(ratio, len(found) - 1))
+    return tuple(found), float(chdtrc(len(found) - 1, ratio))
 
 
 def _drift(parts: tuple[PartOffset, ...]) -> tuple[float | None, float | None]:

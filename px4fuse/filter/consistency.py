@@ -10,9 +10,10 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from scipy import stats
+from scipy.special import chdtrc, gammaincinv, stdtr
 
 from px4fuse.arrays import Array
+from px4fuse.display import Shown
 from px4fuse.flight import Unavailable
 
 Verdict = Literal["consistent", "variance overstated", "variance understated"]
@@ -24,8 +25,8 @@ LJUNG_BOX_LAGS = 10
 GATE_SIGMA = 5.0  # EKF2_EVP_GATE's default, used where no gate is in force
 
 
-@dataclass(frozen=True)
-class Consistency:
+@dataclass(frozen=True, repr=False)
+class Consistency(Shown):
     """Whether a filter's innovations are what its own variances say.
 
     Attributes
@@ -82,8 +83,8 @@ def nis_band(count: int, dimensions: int = 1) -> tuple[float, float]:
     (1.67, 2.36)
     """
     freedom = count * dimensions
-    low = float(stats.chi2.ppf((1 - CONFIDENCE) / 2, freedom)) / freedom
-    high = float(stats.chi2.ppf((1 + CONFIDENCE) / 2, freedom)) / freedom
+    low = 2.0 * float(gammaincinv(freedom / 2.0, (1 - CONFIDENCE) / 2)) / freedom
+    high = 2.0 * float(gammaincinv(freedom / 2.0, (1 + CONFIDENCE) / 2)) / freedom
     return low, high
 
 
@@ -154,9 +155,9 @@ def assess(
         outside_two_sigma=float(np.mean(np.abs(normalised) > 2.0)),
         outside_gate=float(np.mean(np.abs(normalised) > gate)),
         bias_t=bias_t,
-        bias_p=float(2.0 * stats.t.sf(abs(bias_t), count - 1)),
+        bias_p=float(2.0 * stdtr(count - 1, -abs(bias_t))),
         lag1_autocorrelation=float(r[0]),
-        ljung_box_p=float(stats.chi2.sf(q, lags)),
+        ljung_box_p=float(chdtrc(lags, q)),
         ljung_box_lags=lags,
     )
 

@@ -10,16 +10,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, cached_property
+from math import floor, log
 
 import numpy as np
 from scipy.optimize import brentq, minimize
-from scipy.special import expit
-from scipy.stats import chi2
+from scipy.special import comb, expit, gammaincinv
 
 from px4fuse.arrays import Array
+from px4fuse.filter.chain import Chain
+from px4fuse.filter.lanes import Lanes, lanes
 from px4fuse.filter.likelihood import PROFILE_DROP, Preintegrated
-from px4fuse.filter.marginal import Chain, Positions, fit, squares
+from px4fuse.filter.marginal import Fitted, Positions, centred, fit, squares
 from px4fuse.filter.model import INITIAL_COVARIANCE
 
 SIGMA_A_SEARCH_M_S2 = (1e-3, 30.0)
@@ -39,17 +41,26 @@ SETTLED = 0.01
 SLOPE_STEP, BEND_STEP = 1e-4, 0.05
 # Of those: how far a parabola is followed at once, and how often
 FAR_STEPS, PARABOLAS = 6.0, 4
+# Nodes about each place, and their distance in ln σ; while the outliers still change, few
+NODES, ROUGH_NODES = (10, 0.25), (6, 0.2)
+# Precision of a start that is known (1/m² and s²/m²): to a micrometre
+KNOWN = 1e12
 # ln σ at which the end of an interval is sought first
 FIRST_REACH = 0.05
 
 
 @dataclass(frozen=True)
 class Part:
-    """Axes that are fitted together, with the legs under them, shape (n, a, 1, 1 + c)."""
+    """Axes that are fitted together, with the legs under them, shape (a, T, 1 + c, n)."""
 
     positions: Positions
     delta_position_m: Array
     delta_velocity_m_s: Array
+
+    @cached_property
+    def lanes(self) -> Lanes | None:
+        """The same, stretches side by side, where there are several."""
+        return lanes(self.positions, self.delta_position_m, self.delta_velocity_m_s)
 
 
 @dataclass(frozen=True)
@@ -70,6 +81,108 @@ class Noises:
     walk_m: float = 0.0
 
 
+class Likelihood:
+    """-ln p of the measurements but for a constant, over the noises.
+
+    Where nothing but the noises of acceleration and measurements is random, all but a scale depends
+    on their ratio alone, smoothly: it is evaluated at nodes of ln(SIGMA_A/SIGMA_Z) and ln SIGMA_Z,
+    when they are first needed, and polynomials give what is between. Singularities of the
+    likelihood lie π/2 off the real axis, so that these are as good as rounding.
+
+    Parameters
+    ----------
+    parts : sequence of Part
+        With one choice of the legs.
+    weight : ndarray, shape (m,)
+    sigma_z_m : float
+        About what it will be: what is as good as known or unknown at a start scales with it.
+    rough : bool
+        Whether the maximum only needs to be near.
+    """
+
+    def __init__(
+        self, parts: Sequence[Part], weight: Array, sigma_z_m: float, rough: bool = False
+    ) -> None:
+        self.parts, self.weight, self.sigma_z_m = parts, weight, sigma_z_m
+        self.tabulated = not any(part.positions.chain.noise_fixed.any() for part in parts)
+        self.nodes, self.step = ROUGH_NODES if rough else NODES
+        self._fits: dict[int, tuple[Fitted, ...]] = {}
+        self._values: dict[tuple[int, int], Array] = {}
+
+    def __call__(self, noises: Noises) -> float:
+        """-ln p with some noises."""
+        if noises.walk_m or not self.tabulated:
+            return negative_log_likelihood(self.parts, noises, self.weight)
+        ln_z = log(noises.sigma_z_m) / self.step
+        ln_ratio = log(noises.sigma_a_m_s2) / self.step - ln_z
+        before = (self.nodes - 1) // 2
+        first = (floor(ln_ratio) - before, floor(ln_z) - before)
+        if first not in self._values:
+            self._values[first] = self._around(*first)
+        across = _between(ln_ratio - first[0], self.nodes)
+        along = _between(ln_z - first[1], self.nodes)
+        return float(across @ self._values[first] @ along)
+
+    def _around(self, of_ratio: int, of_z: int) -> Array:
+        """Values at the nodes about one place, from the first ones on."""
+        rows = range(of_ratio, of_ratio + self.nodes)
+        new = [row for row in rows if row not in self._fits]
+        ratios = np.exp(self.step * np.array(new)).tolist()
+        fits = [of_ratios(part, ratios, 0.0, self.weight, self.sigma_z_m) for part in self.parts]
+        self._fits |= dict(zip(new, zip(*fits, strict=True), strict=True))
+        scales = np.exp(self.step * (of_z + np.arange(self.nodes)))
+        return np.array(
+            [
+                np.sum([fitted.totals(scales)[:, 0] for fitted in self._fits[row]], axis=0)
+                for row in rows
+            ]
+        )
+
+
+@cache
+def _signs(count: int) -> Array:
+    nodes = np.arange(count)
+    return np.asarray((-1.0) ** nodes * comb(count - 1, nodes))
+
+
+def _between(at: float, count: int) -> Array:
+    """Weights of values at 0, 1, ... for the polynomial through them (Berrut, Trefethen 2004)."""
+    away = at - np.arange(count)
+    if not away.all():
+        return np.asarray(away == 0.0, dtype=np.float64)
+    weights = _signs(count) / away
+    return np.asarray(weights / weights.sum())
+
+
+def of_ratios(
+    part: Part, ratios: Sequence[float], walk: float, weight: Array, sigma_z_m: float
+) -> list[Fitted]:
+    """Fit with noises over SIGMA_Z; what is fixed is taken at a SIGMA_Z.
+
+    Parameters
+    ----------
+    part : Part
+    ratios : sequence of float
+        SIGMA_A / SIGMA_Z, 1/s².
+    walk : float
+        Walk of the source over SIGMA_Z.
+    weight : ndarray, shape (m,)
+    sigma_z_m : float
+    """
+    positions = part.positions
+    chain = positions.chain
+    fixed = chain.noise_fixed / sigma_z_m**2
+    chain = replace(chain, noise_fixed=fixed + np.outer(chain.length_s * walk**2, [1.0, 0.0, 0.0]))
+    positions = replace(positions, chain=chain, initial=positions.initial * sigma_z_m**2)
+    # the filter's start is not measured
+    extra = np.ones(len(positions.measurement_m) - len(weight))
+    variance = 1.0 / np.concatenate([extra, weight])
+    if part.lanes is not None:
+        return replace(part.lanes, positions=positions).fit(ratios, variance)
+    legs = part.delta_position_m, part.delta_velocity_m_s
+    return [fit(positions, *legs, ratio, variance) for ratio in ratios]
+
+
 @dataclass(frozen=True)
 class NoiseFit:
     """Noises of greatest likelihood.
@@ -81,23 +194,30 @@ class NoiseFit:
         What each measurement counts: 1 for a good one, 1/width² for an outlier.
     outlier : ndarray, shape (m,)
         Probability that it is one.
+    score : Likelihood
+        With these weights.
     """
 
     noises: Noises
     weight: Array
     outlier: Array
+    score: Likelihood
 
 
 def filter_part(legs: Preintegrated) -> Part:
-    """The lesson's filter of one axis: it starts with P₀ and knows no constants."""
+    """The lesson's filter of one axis: its constants are the errors of its start, with P₀."""
     count = len(legs.measurement_m)
     initial = np.zeros((count + 1, 2))
-    initial[0] = 1.0 / INITIAL_COVARIANCE[0], 1.0 / INITIAL_COVARIANCE[2]
-    measured = np.concatenate([[0.0], legs.measurement_m - legs.initial.position_m])[:, None]
+    initial[0] = KNOWN
+    measured = np.concatenate([[np.nan], legs.measurement_m - legs.initial.position_m])[:, None]
     chain = Chain(np.arange(1, count + 1), legs.length_s, legs.noise_unit, legs.noise_fixed)
-    positions = Positions(chain, measured, np.array([0]), initial, np.array([]))
-    dp, dv = legs.delta_position_m, legs.delta_velocity_m_s
-    return Part(positions, dp[:, None, None, None], dv[:, None, None, None])
+    sigma = np.sqrt([INITIAL_COVARIANCE[0], INITIAL_COVARIANCE[2]])
+    positions = Positions(chain, measured, np.array([0]), initial, sigma)
+    dp, dv = np.zeros((2, 1, 1, 3, count))
+    dp[0, 0, 0], dv[0, 0, 0] = legs.delta_position_m, legs.delta_velocity_m_s
+    # an error of the start moves the first leg
+    dp[0, 0, 1:, 0], dv[0, 0, 2, 0] = (1.0, legs.length_s[0]), 1.0
+    return Part(*centred(positions, dp, dv))
 
 
 def negative_log_likelihood(parts: Sequence[Part], noises: Noises, weight: Array) -> float:
@@ -109,7 +229,14 @@ def negative_log_likelihood(parts: Sequence[Part], noises: Noises, weight: Array
     noises : Noises
     weight : ndarray, shape (m,)
     """
-    return float(sum(fit(*arguments(part, noises, weight)).total()[0] for part in parts))
+    return float(sum(fitted(part, noises, weight).total()[0] for part in parts))
+
+
+def fitted(part: Part, noises: Noises, weight: Array) -> Fitted:
+    """Fit a part with some noises and weights."""
+    sigma = noises.sigma_z_m
+    ratio, walk = noises.sigma_a_m_s2 / sigma, noises.walk_m / sigma
+    return of_ratios(part, [ratio], walk, weight, sigma)[0].scaled(sigma)
 
 
 def arguments(
@@ -119,8 +246,8 @@ def arguments(
     variance = noises.sigma_z_m**2 / weight
     positions = part.positions
     extra = len(positions.measurement_m) - len(variance)
-    if extra:  # the filter's start, which counts by its own precision
-        variance = np.concatenate([np.full(extra, np.inf), variance])
+    if extra:  # the filter's start, which is not measured
+        variance = np.concatenate([np.ones(extra), variance])
     if noises.walk_m:
         chain = positions.chain
         walk = np.outer(chain.length_s * noises.walk_m**2, [1.0, 0.0, 0.0])
@@ -145,20 +272,20 @@ def most_likely(
     outliers : bool
         Whether they are sought; else the weights stay.
     """
-    noises = _maximise(parts, start, weight)
-    if not outliers:
-        return NoiseFit(noises, weight, np.zeros_like(weight))
-    share, width, outlier = FIRST_SHARE, FIRST_WIDTH, np.zeros_like(weight)
-    for _ in range(MAX_PASSES):
+    outlier = np.zeros_like(weight)
+    share, width, noises = FIRST_SHARE, FIRST_WIDTH, start
+    for again in range(MAX_PASSES if outliers else 0):
+        likelihood = Likelihood(parts, weight, start.sigma_z_m, rough=True)
+        noises = _maximise(likelihood, noises, ROUGH_STEPS if again else MAX_STEPS)
         square, count = _squares(parts, noises, weight)
         # outliers raise the noise that hides them: the median does not follow them
-        bulk = float(np.median(square / count) / (chi2.median(count[0]) / count[0]))
+        bulk = float(np.median(square / count) / (chi_square_median(count[0]) / count[0]))
         if bulk > SIGMA_Z_SEARCH_M[1] ** 2:  # noise beyond the search is not outliers
-            return NoiseFit(noises, weight, outlier)
+            break
         variance = min(noises.sigma_z_m**2, BULK**2 * bulk)
         found = _outlier_probability(square / variance, count, share, width)
         if found.sum() < 1.0 and found.max() < 0.5 and not outlier.any():
-            return NoiseFit(noises, weight, outlier)
+            break
         share = float(np.clip(found.mean(), 0.5 / len(found), MAX_SHARE))
         wide = float(np.sum(found * square) / max(np.sum(found * count), 1e-9)) / variance
         width = max(LEAST_WIDTH, float(np.sqrt(wide)))
@@ -167,9 +294,9 @@ def most_likely(
         outlier = found
         if settled:
             break
-        guess = replace(noises, sigma_z_m=float(np.sqrt(variance)))
-        noises = _maximise(parts, guess, weight, ROUGH_STEPS)
-    return NoiseFit(_maximise(parts, noises, weight), weight, outlier)
+        noises = replace(noises, sigma_z_m=float(np.sqrt(variance)))
+    likelihood = Likelihood(parts, weight, start.sigma_z_m)
+    return NoiseFit(_maximise(likelihood, noises), weight, outlier, likelihood)
 
 
 def _squares(parts: Sequence[Part], noises: Noises, weight: Array) -> tuple[Array, Array]:
@@ -181,19 +308,22 @@ def _squares(parts: Sequence[Part], noises: Noises, weight: Array) -> tuple[Arra
     )
 
 
+def chi_square_median(freedom: float) -> float:
+    """Median of chi-square."""
+    return 2.0 * float(gammaincinv(freedom / 2.0, 0.5))
+
+
 def _outlier_probability(square: Array, count: Array, share: float, width: float) -> Array:
     odds = np.log(share / (1.0 - share)) - count * np.log(width)
     return np.asarray(expit(odds + 0.5 * square * (1.0 - width**-2.0)))
 
 
-def _maximise(
-    parts: Sequence[Part], start: Noises, weight: Array, steps: int = MAX_STEPS
-) -> Noises:
+def _maximise(likelihood: Likelihood, start: Noises, steps: int = MAX_STEPS) -> Noises:
     values = [start.sigma_a_m_s2, start.sigma_z_m, *([start.walk_m] if start.walk_m else [])]
     bounds = np.log([SIGMA_A_SEARCH_M_S2, SIGMA_Z_SEARCH_M, WALK_SEARCH_M][: len(values)])
 
     def score(logs: Array) -> float:
-        return negative_log_likelihood(parts, Noises(*np.exp(logs).tolist()), weight)
+        return likelihood(Noises(*np.exp(logs).tolist()))
 
     found = minimize(
         score,

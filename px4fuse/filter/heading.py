@@ -17,11 +17,10 @@ from typing import Literal
 
 import numpy as np
 import pandas as pd
-from scipy.integrate import cumulative_trapezoid
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
-from px4fuse.arrays import Array
+from px4fuse.arrays import Array, cumulative_integral
 from px4fuse.filter.kalman import Settings
 from px4fuse.filter.model import INITIAL_SIGMA_P_M, INITIAL_SIGMA_V_M_S, noise_of_many_steps
 from px4fuse.filter.motion import MAX_IMU_INTERVAL_S
@@ -51,6 +50,7 @@ MAX_ATTITUDE_INTERVAL_S = 0.11
 LINEARISATIONS = 3
 STATE_COUNT = 7
 TURN = 6
+CROSSED = np.array([[1.0, -1.0], [-1.0, 1.0]])
 INITIAL_SIGMA_BIAS_M_S2 = 0.3
 INITIAL_SIGMA_TURN_RAD = 0.6
 GAP_SIGMA = 5.0  # m and m/s, over a gap of the IMU
@@ -172,7 +172,8 @@ def heading_error(
 
 def _parts(time: Array, turn: Array, sigma: Array) -> tuple[HeadingPart, ...]:
     """Means over parts of equal length, in degrees."""
-    count = max(int((time[-1] - time[0]) / PART_S), 1)
+    # of a long flight only some measurements were taken
+    count = max(int(min((time[-1] - time[0]) / PART_S, len(time) / (2 * MIN_PART_SAMPLES))), 1)
     edges = np.searchsorted(time, np.linspace(time[0], time[-1], count + 1)[1:-1])
     return tuple(
         HeadingPart(
@@ -218,7 +219,7 @@ def _by_orientation(
         return None
     found = np.array([part.heading_error_deg for part in parts])
     square = np.sum((found - found.mean()) ** 2) / np.degrees(sigma[0]) ** 2
-    return HeadingError(parts, float(chi2.sf(square, len(parts) - 1)), "orientation")
+    return HeadingError(parts, float(chdtrc(len(parts) - 1, square)), "orientation")
 
 
 @dataclass(frozen=True)
@@ -254,14 +255,14 @@ def _by_positions(
     ratio = 2.0 * (log_p.max() - log_p[grid[:, 0] == 0.0].max())
     smoothed, sigma = _smooth(legs, measured, turn, grid[[np.argmax(log_p)]], sigma_z, dt_s)
     # at the end of its range a walk is half of the time none
-    p = 0.5 * float(chi2.sf(ratio, 1)) if ratio > 0.0 else 1.0
+    p = 0.5 * float(chdtrc(1, ratio)) if ratio > 0.0 else 1.0
     return HeadingError(_parts(time, turn + smoothed, sigma), p, "positions")
 
 
 def _legs(acceleration: pd.DataFrame, time: Array) -> _Legs:
     known, value = acceleration.index.to_numpy(), acceleration.to_numpy()[:, :2]
-    speed = cumulative_trapezoid(value, known, axis=0, initial=0)
-    way = cumulative_trapezoid(speed, known, axis=0, initial=0)
+    speed = cumulative_integral(value, known)
+    way = cumulative_integral(speed, known)
     v, p = (
         np.column_stack([np.interp(time, known, one) for one in both.T]) for both in (speed, way)
     )
@@ -272,18 +273,19 @@ def _legs(acceleration: pd.DataFrame, time: Array) -> _Legs:
     return _Legs(moved, dt, passed)
 
 
-def _transition(moved: Array, dt: float, turn: float) -> tuple[Array, Array]:
-    """F and the input of one leg, the rotation to first order about ``turn``."""
+def _transitions(legs: _Legs, turn: float) -> tuple[Array, Array]:
+    """F and the input of every leg, the rotation to first order about ``turn``."""
+    count, dt = len(legs.dt_s), legs.dt_s[:, None, None]
     cosine, sine = np.cos(turn), np.sin(turn)
     rotation = np.array([[cosine, -sine], [sine, cosine]])
     slope = np.array([[-sine, -cosine], [cosine, -sine]])
-    F = np.eye(STATE_COUNT)
-    F[:2, 2:4] = dt * np.eye(2)
-    F[:2, 4:6] = dt**2 / 2.0 * np.eye(2)
-    F[2:4, 4:6] = dt * np.eye(2)
-    F[:4, TURN] = np.concatenate([slope @ moved[:2], slope @ moved[2:]])
-    push = np.zeros(STATE_COUNT)
-    push[:4] = np.concatenate([rotation @ moved[:2], rotation @ moved[2:]])
+    moved = legs.moved.reshape(count, 2, 2)
+    F = np.tile(np.eye(STATE_COUNT), (count, 1, 1))
+    F[:, :2, 2:4] = F[:, 2:4, 4:6] = dt * np.eye(2)
+    F[:, :2, 4:6] = dt**2 / 2.0 * np.eye(2)
+    F[:, :4, TURN] = (moved @ slope.T).reshape(count, 4)
+    push = np.zeros((count, STATE_COUNT))
+    push[:, :4] = (moved @ rotation.T).reshape(count, 4)
     return F, push
 
 
@@ -292,11 +294,12 @@ def _noise(noises: Array, dt: float, dt_s: float, gap: bool) -> Array:
     Q = np.zeros((len(noises), STATE_COUNT, STATE_COUNT))
     q00, q01, q11 = noise_of_many_steps(dt)
     level = noises[:, 2] ** 2 * dt_s
-    for axis in range(2):
-        Q[:, axis, axis] = level * q00 + GAP_SIGMA**2 * gap
-        Q[:, axis, axis + 2] = Q[:, axis + 2, axis] = level * q01
-        Q[:, axis + 2, axis + 2] = level * q11 + GAP_SIGMA**2 * gap
-        Q[:, axis + 4, axis + 4] = noises[:, 1] ** 2 * dt
+    position, velocity, bias = (slice(axis, axis + 2) for axis in (0, 2, 4))
+    pair = np.eye(2)
+    Q[:, position, position] = (level * q00 + GAP_SIGMA**2 * gap)[:, None, None] * pair
+    Q[:, position, velocity] = Q[:, velocity, position] = (level * q01)[:, None, None] * pair
+    Q[:, velocity, velocity] = (level * q11 + GAP_SIGMA**2 * gap)[:, None, None] * pair
+    Q[:, bias, bias] = (noises[:, 1] ** 2 * dt)[:, None, None] * pair
     Q[:, TURN, TURN] = noises[:, 0] ** 2 * dt
     return Q
 
@@ -325,17 +328,20 @@ def _filter(
     square, log_s = np.zeros(len(noises)), np.zeros(len(noises))
     steps: list[Step] = []
     R = sigma_z**2 * np.eye(2)
-    for k, dt in enumerate(legs.dt_s.tolist()):
-        F, push = _transition(legs.moved[k], dt, turn)
+    transitions = zip(*_transitions(legs, turn), strict=True)
+    for k, (dt, (F, push)) in enumerate(zip(legs.dt_s.tolist(), transitions, strict=True)):
         x = x @ F.T + push
         P = F @ P @ F.T + _noise(noises, dt, dt_s, bool(legs.gap[k]))
         prior = x, P
         S = P[:, :2, :2] + R
-        gain = np.swapaxes(np.linalg.solve(S, P[:, :2, :]), 1, 2)
-        nu = measured[k + 1] - x[:, :2]
-        square += np.einsum("ki,ki->k", nu, np.linalg.solve(S, nu[..., None])[..., 0])
-        log_s += np.log(np.linalg.det(S))
-        x = x + np.einsum("kij,kj->ki", gain, nu)
+        # S⁻¹ of two rows and columns, written out
+        determinant = S[:, 0, 0] * S[:, 1, 1] - S[:, 0, 1] ** 2
+        inverse = S[:, ::-1, ::-1] * CROSSED / determinant[:, None, None]
+        gain = np.swapaxes(P[:, :2, :], 1, 2) @ inverse
+        nu = (measured[k + 1] - x[:, :2])[..., None]
+        square += (np.swapaxes(nu, 1, 2) @ inverse @ nu)[:, 0, 0]
+        log_s += np.log(determinant)
+        x = x + (gain @ nu)[..., 0]
         P = P - gain @ P[:, :2, :]
         P = (P + np.swapaxes(P, 1, 2)) / 2.0
         steps.append((F, *prior, x, P))

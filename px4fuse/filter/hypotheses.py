@@ -14,8 +14,8 @@ in variables): what remains is weighed by the variance that it has at each scale
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Sequence
+from dataclasses import astuple, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -25,9 +25,16 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.spatial.transform import Rotation
 
 from px4fuse.arrays import Array, BoolArray
-from px4fuse.filter.kalman import Settings
-from px4fuse.filter.likelihood import Preintegrated, preintegrate, recursion
-from px4fuse.filter.signals import Axis, Segment, ned_acceleration, project_acceleration
+from px4fuse.filter.kalman import Settings, Timeline, timeline
+from px4fuse.filter.likelihood import Preintegrated, moved, preintegrate, recursion
+from px4fuse.filter.signals import (
+    Acceleration,
+    Axis,
+    Segment,
+    ned_acceleration,
+    project_acceleration,
+    step_means,
+)
 from px4fuse.flight import AXIS_NAMES, QUATERNION_COLUMNS, Flight, Unavailable
 
 MIN_MEASUREMENTS = 50
@@ -123,16 +130,24 @@ def respond(
         )
     ]
     position, velocity = signals.start_m.copy(), np.zeros_like(signals.start_m)
-    out = np.empty_like(signals.measured_m)
-    for k, (dt, (_, k0, k1)) in enumerate(zip(legs.length_s.tolist(), gains, strict=True)):
-        position += dt * velocity + signals.position_m[k]
-        velocity += signals.velocity_m_s[k]
-        innovation = signals.measured_m[k] - position
-        out[k] = innovation
-        position += k0 * innovation
-        velocity += k1 * innovation
+    out = signals.measured_m.copy()
+    for dt, (_, k0, k1), dp, dv, nu in zip(
+        legs.length_s.tolist(),
+        gains,
+        signals.position_m,
+        signals.velocity_m_s,
+        out,
+        strict=True,
+    ):
+        position += dt * velocity
+        position += dp
+        velocity += dv
+        np.subtract(nu, position, out=nu)
+        position += k0 * nu
+        velocity += k1 * nu
     s = np.array([gain[0] for gain in gains])
-    return out / np.sqrt(s)[:, None], s
+    out /= np.sqrt(s)[:, None]
+    return out, s
 
 
 def fit(white: Whitened, prior: Array) -> Fit:
@@ -199,17 +214,48 @@ class Lines:
         """Whitened innovations with the acceleration (and its noise) scaled."""
         data, columns, log_s = [], [], 0.0
         width, extra = len(self.prior), self.steps.shape[1]
-        for at, (legs, signals) in enumerate(zip(self.legs, self.signals, strict=True)):
-            used = _with_measured(_scaled(signals, scale), self.steps)
-            normalised, s = respond(legs, used, scale * sigma_a, self.sigma_z_m, skip)
+        own_hats = (width - CONSTANTS) // len(self.legs)
+        signals = [_with_measured(_scaled(each, scale), self.steps) for each in self.signals]
+        for at, (normalised, s) in enumerate(
+            respond_each(self.legs, signals, scale * sigma_a, self.sigma_z_m, skip)
+        ):
             own = normalised[~skip]
             block = np.zeros((len(own), width + extra * len(self.legs)))
-            block[:, :width] = own[:, 1 : 1 + width]
-            block[:, width + extra * at : width + extra * (at + 1)] = own[:, 1 + width :]
+            block[:, :CONSTANTS] = own[:, 1 : 1 + CONSTANTS]
+            first = CONSTANTS + own_hats * at
+            last = 1 + CONSTANTS + own_hats
+            block[:, first : first + own_hats] = own[:, 1 + CONSTANTS : last]
+            block[:, width + extra * at : width + extra * (at + 1)] = own[:, last:]
             data.append(own[:, 0])
             columns.append(block)
             log_s += float(np.sum(np.log(s[~skip])))
         return Whitened(np.concatenate(data), np.vstack(columns), log_s)
+
+
+def respond_each(
+    legs: Sequence[Preintegrated],
+    signals: Sequence[Signals],
+    sigma_a: float,
+    sigma_z: float,
+    skip: BoolArray,
+) -> list[tuple[Array, Array]]:
+    """:func:`respond` of each axis; those with the same legs go through one filter together."""
+    if not same_gains(legs):
+        return [respond(*pair, sigma_a, sigma_z, skip) for pair in zip(legs, signals, strict=True)]
+    parts = [astuple(each) for each in signals]
+    joined = Signals(*(np.concatenate(part, axis=-1) for part in zip(*parts, strict=True)))
+    normalised, s = respond(legs[0], joined, sigma_a, sigma_z, skip)
+    widths = np.cumsum([len(each.start_m) for each in signals])[:-1]
+    return [(part, s) for part in np.split(normalised, widths, axis=1)]
+
+
+def same_gains(legs: Sequence[Preintegrated]) -> bool:
+    """Whether the filters of some axes have the same gains."""
+    return all(
+        np.array_equal(getattr(legs[0], name), getattr(each, name))
+        for each in legs[1:]
+        for name in ("length_s", "noise_unit", "noise_fixed")
+    )
 
 
 def _scaled(signals: Signals, scale: float) -> Signals:
@@ -286,22 +332,25 @@ def lines_of(
         [np.full(CONSTANTS, np.inf), np.full(len(axes) * len(hats), TILT_SIGMA_RAD * constants.g)]
     )
     signals = []
-    for at, (axis, own) in enumerate(zip(shifted, legs, strict=True)):
-        still = np.zeros_like(own.length_s)
-        moved = [(own.delta_position_m, own.delta_velocity_m_s)]
-        moved += [_moved(axis, frame, segment, settings) for frame in common]
-        for group in range(len(axes)):
-            moved += [
-                _moved(axis, _along(hat, axis.direction), segment, settings)
-                if group == at
-                else (still, still)
-                for hat in hats
-            ]
-        position, velocity = (np.stack(part, axis=1) for part in zip(*moved, strict=True))
+    line = timeline(shifted[0], settings)
+    ramps = [moved(line, _step_means(hat, line)) for hat in hats]
+    for axis, own in zip(shifted, legs, strict=True):
+        columns = [(own.delta_position_m, own.delta_velocity_m_s)]
+        for frame in common:
+            pushed = project_acceleration(frame, axis.direction, segment)
+            columns.append(moved(line, _step_means(pushed, line)))
+        position, velocity = (np.stack(part, axis=1) for part in zip(*columns, *ramps, strict=True))
         measured, start = np.zeros_like(position), np.zeros(position.shape[1])
         measured[:, 0], start[0] = own.measurement_m, own.initial.position_m
         signals.append(Signals(position, velocity, measured, start))
     return Lines(time_s, legs, tuple(signals), prior, sigma_z, steps(time_s, []))
+
+
+def _step_means(acceleration: Acceleration | Unavailable, line: Timeline) -> Array:
+    """Over each step; zero where there is none."""
+    if isinstance(acceleration, Unavailable):
+        return np.zeros(len(line.time_s) - 1)
+    return step_means(acceleration, line.time_s)[0]
 
 
 def _common_columns(attitude: pd.DataFrame, acceleration: pd.DataFrame) -> list[pd.DataFrame]:
@@ -319,29 +368,15 @@ def _common_columns(attitude: pd.DataFrame, acceleration: pd.DataFrame) -> list[
     return [*biases, pd.DataFrame(turned, index=acceleration.index, columns=names)]
 
 
-def _hats(start_s: float, end_s: float) -> list[pd.Series]:
+def _hats(start_s: float, end_s: float) -> list[Acceleration | Unavailable]:
     """Hat functions between knots, of which any slow signal is made."""
     count = int(np.clip(np.ceil((end_s - start_s) / KNOT_S), 1, MAX_KNOTS)) + 1
     knots = np.linspace(start_s, end_s, count)
     # so fine that no interval passes for a gap
     time = np.linspace(start_s, end_s, 20 * (count - 1) + 1)
-    return [pd.Series(np.interp(time, knots, hat), index=time) for hat in np.eye(count)]
-
-
-def _along(values: pd.Series, direction: Array) -> pd.DataFrame:
-    """A signal along a direction, in NED."""
-    return pd.DataFrame(
-        np.outer(values.to_numpy(), direction), index=values.index, columns=list(AXIS_NAMES)
-    )
-
-
-def _moved(
-    axis: Axis, acceleration: pd.DataFrame, segment: Segment, settings: Settings
-) -> tuple[Array, Array]:
-    """What another acceleration adds to position and velocity between the measurements."""
-    projected = project_acceleration(acceleration, axis.direction, segment)
-    legs = preintegrate(replace(axis, acceleration=projected), settings)
-    return legs.delta_position_m, legs.delta_velocity_m_s
+    between = Segment(start_s, end_s, "between the knots")
+    hats = (pd.DataFrame(np.interp(time, knots, hat), time) for hat in np.eye(count))
+    return [project_acceleration(hat, np.ones(1), between) for hat in hats]
 
 
 def steps(time_s: Array, starts_s: Iterable[float]) -> Array:

@@ -10,16 +10,15 @@ from typing import get_args
 
 import numpy as np
 import pandas as pd
-from filterpy.kalman import KalmanFilter
 
 from px4fuse.arrays import Array, BoolArray, IntArray
+from px4fuse.display import brief
 from px4fuse.errors import SettingsError
 from px4fuse.filter.model import (
     COVARIANCES,
     INITIAL_COVARIANCE,
     STATES,
     H,
-    input_matrix,
     matrix,
     move,
     noise,
@@ -72,17 +71,17 @@ class Settings:
 
     def __post_init__(self) -> None:
         for name, value, (low, high), unit in (
-            ("--sigma-a", self.sigma_a_m_s2, SIGMA_A_RANGE_M_S2, "m/s²"),
-            ("--sigma-z", self.sigma_z_m, SIGMA_Z_RANGE_M, "m"),
-            ("--dt", self.dt_s, DT_RANGE_S, "s"),
-            ("--clock-offset", self.clock_offset_s, CLOCK_OFFSET_RANGE_S, "s"),
+            ("sigma_a_m_s2", self.sigma_a_m_s2, SIGMA_A_RANGE_M_S2, "m/s²"),
+            ("sigma_z_m", self.sigma_z_m, SIGMA_Z_RANGE_M, "m"),
+            ("dt_s", self.dt_s, DT_RANGE_S, "s"),
+            ("clock_offset_s", self.clock_offset_s, CLOCK_OFFSET_RANGE_S, "s"),
         ):
             if not low <= value <= high:  # false for NaN too
                 raise SettingsError(
-                    f"{name} {value:g} is out of range: give {low:g} to {high:g} {unit}."
+                    f"`{name}` {value:g} is out of range: give {low:g} to {high:g} {unit}."
                 )
         if self.input not in INPUT_NAMES:
-            raise SettingsError(f"--input {self.input}: give {' or '.join(INPUT_NAMES)}.")
+            raise SettingsError(f"`input` {self.input}: give {' or '.join(INPUT_NAMES)}.")
 
 
 @dataclass(frozen=True)
@@ -120,6 +119,8 @@ class Replay:
     steps: pd.DataFrame
     updates: pd.DataFrame
     input_gap_s: float = field(default=0.0)
+
+    __repr__ = brief
 
 
 @dataclass(frozen=True)
@@ -180,7 +181,7 @@ def timeline(axis: Axis, settings: Settings, initial: InitialState | None = None
     if settings.input == "zero":
         return Timeline(time, measurement, np.zeros(steps), np.zeros(steps), 0.0)
     if isinstance(axis.acceleration, Unavailable):
-        raise SettingsError(f"--input imu needs an acceleration. {axis.acceleration}")
+        raise SettingsError(f"`input` imu needs an acceleration. {axis.acceleration}")
     mean, gap = step_means(axis.acceleration, time)
     gap_s = gap * np.diff(time)
     # Unknown acceleration persists through a gap: after T seconds it has moved the velocity by
@@ -218,73 +219,121 @@ def replay(axis: Axis, settings: Settings, initial: InitialState | None = None) 
     """
     line = timeline(axis, settings, initial)
     start = initial or InitialState(line.time_s[0], axis.measurement_m[0])
+    return _replayed((axis,), settings, (line,), (start,))[0]
+
+
+def replay_all(axes: tuple[Axis, ...], settings: Settings) -> tuple[Replay, ...]:
+    """Run the filter over several axes, as :func:`replay` does each.
+
+    Axes with the same steps have the same P, S and K, which are computed once.
+
+    Parameters
+    ----------
+    axes : tuple of Axis
+    settings : Settings
+
+    Raises
+    ------
+    SettingsError
+        ``settings.input`` is "imu" and an axis has no acceleration.
+    """
+    lines = [timeline(axis, settings) for axis in axes]
+    made: dict[int, Replay] = {}
+    for at, line in enumerate(lines):
+        if at in made:
+            continue
+        same = [k for k in range(at, len(axes)) if k not in made and _same_steps(line, lines[k])]
+        runs = _replayed(
+            tuple(axes[k] for k in same),
+            settings,
+            tuple(lines[k] for k in same),
+            tuple(InitialState(line.time_s[0], axes[k].measurement_m[0]) for k in same),
+        )
+        made |= dict(zip(same, runs, strict=True))
+    return tuple(made[at] for at in range(len(axes)))
+
+
+def _same_steps(one: Timeline, other: Timeline) -> bool:
+    return all(
+        np.array_equal(getattr(one, name), getattr(other, name))
+        for name in ("time_s", "measurement", "input_variance_m2_s4")
+    )
+
+
+def _replayed(
+    axes: tuple[Axis, ...],
+    settings: Settings,
+    lines: tuple[Timeline, ...],
+    starts: tuple[InitialState, ...],
+) -> tuple[Replay, ...]:
+    """Run one filter over axes whose steps are the same: P, S and K by filterpy, x of each."""
+    # scipy.stats, which filterpy imports, costs a third of a second: not where nothing is replayed
+    from filterpy.kalman import KalmanFilter  # noqa: PLC0415
+
+    line = lines[0]
     kalman = KalmanFilter(dim_x=2, dim_z=1, dim_u=1)
-    kalman.x = np.array([[start.position_m], [start.velocity_m_s]])
     kalman.P = matrix(INITIAL_COVARIANCE)
     kalman.H = H
     kalman.R = np.array([[settings.sigma_z_m**2]])
     lengths = np.diff(line.time_s)
-    states = np.empty((len(line.time_s), 5))
-    updates = np.empty((np.count_nonzero(line.measurement >= 0), 8))
-    updated_at: list[float] = []
-    states[0] = _state_row(kalman)
-    for step, (dt, acceleration, extra) in enumerate(
-        zip(lengths, line.acceleration_m_s2, line.input_variance_m2_s4, strict=True), start=1
+    acceleration = np.stack([each.acceleration_m_s2 for each in lines], axis=1)
+    measured = np.stack([axis.measurement_m for axis in axes], axis=1)
+    state = np.empty((len(line.time_s), 2, len(axes)))
+    covariance = np.empty((len(line.time_s), 3))
+    update = np.flatnonzero(line.measurement >= 0)
+    innovation, prior_position = np.empty((2, len(update), len(axes)))
+    shared = np.empty((len(update), 5))  # S, K, and the prior variances
+    position = np.array([each.position_m for each in starts])
+    velocity = np.array([each.velocity_m_s for each in starts])
+    state[0], covariance[0] = (position, velocity), _elements(kalman.P)
+    count = 0
+    for step, (dt, extra) in enumerate(
+        zip(lengths.tolist(), line.input_variance_m2_s4.tolist(), strict=True), start=1
     ):
-        kalman.predict(
-            u=np.array([[acceleration]]),
-            B=input_matrix(dt),
-            F=transition(dt),
-            Q=process_noise(dt, settings, extra),
-        )
+        kalman.predict(F=transition(dt), Q=process_noise(dt, settings, extra))
+        # x = Fx + Ba
+        position, velocity = move(position, velocity, acceleration[step - 1], dt)
         at = line.measurement[step]
         if at >= 0:
-            prior_position = kalman.x[0, 0]
-            prior_variance = kalman.P[0, 0], kalman.P[1, 1]
-            kalman.update(axis.measurement_m[at])
-            updates[len(updated_at)] = (
-                axis.measurement_m[at],
-                kalman.y[0, 0],
-                kalman.S[0, 0],
-                kalman.K[0, 0],
-                kalman.K[1, 0],
-                prior_position,
-                *prior_variance,
-            )
-            updated_at.append(line.time_s[step])
-        states[step] = _state_row(kalman)
-    steps = pd.DataFrame(
-        states,
-        index=pd.Index(line.time_s, name="time_s"),
-        columns=STATES + COVARIANCES,
-    )
-    steps["acceleration_m_s2"] = np.append(line.acceleration_m_s2, 0.0)
-    steps["input_variance_m2_s4"] = np.append(line.input_variance_m2_s4, 0.0)
-    return Replay(
-        axis,
-        settings,
-        steps,
-        pd.DataFrame(
-            updates,
-            index=pd.Index(updated_at, name="time_s"),
-            columns=[
-                "measurement_m",
-                "innovation_m",
-                "innovation_variance_m2",
-                "gain_position",
-                "gain_velocity",
-                "prior_position_m",
-                "prior_position_variance_m2",
-                "prior_velocity_variance_m2_s2",
-            ],
-        ),
-        line.input_gap_s,
-    )
+            prior_position[count] = position
+            shared[count, 3:] = kalman.P[0, 0], kalman.P[1, 1]
+            kalman.update(0.0)  # what was measured enters neither S nor K nor P
+            gain, velocity_gain = kalman.K[:, 0].tolist()
+            shared[count, :3] = kalman.S[0, 0], gain, velocity_gain
+            # ν = z - Hx, x = x + Kν
+            nu = innovation[count] = measured[at] - position
+            position, velocity = position + gain * nu, velocity + velocity_gain * nu
+            count += 1
+        state[step], covariance[step] = (position, velocity), _elements(kalman.P)
+    time, updated = (pd.Index(each, name="time_s") for each in (line.time_s, line.time_s[update]))
+    runs = []
+    for at, (axis, own) in enumerate(zip(axes, lines, strict=True)):
+        steps = pd.DataFrame(
+            np.column_stack([state[..., at], covariance]),
+            index=time,
+            columns=STATES + COVARIANCES,
+        )
+        steps["acceleration_m_s2"] = np.append(own.acceleration_m_s2, 0.0)
+        steps["input_variance_m2_s4"] = np.append(line.input_variance_m2_s4, 0.0)
+        updates = pd.DataFrame(
+            {
+                "measurement_m": measured[line.measurement[update], at],
+                "innovation_m": innovation[:, at],
+                "innovation_variance_m2": shared[:, 0],
+                "gain_position": shared[:, 1],
+                "gain_velocity": shared[:, 2],
+                "prior_position_m": prior_position[:, at],
+                "prior_position_variance_m2": shared[:, 3],
+                "prior_velocity_variance_m2_s2": shared[:, 4],
+            },
+            index=updated,
+        )
+        runs.append(Replay(axis, settings, steps, updates, own.input_gap_s))
+    return tuple(runs)
 
 
-def _state_row(kalman: KalmanFilter) -> tuple[float, float, float, float, float]:
-    x, p = kalman.x, kalman.P
-    return x[0, 0], x[1, 0], p[0, 0], p[0, 1], p[1, 1]
+def _elements(covariance: Array) -> tuple[float, float, float]:
+    return covariance[0, 0], covariance[0, 1], covariance[1, 1]
 
 
 def _ahead(run: Replay, times: Array) -> tuple[IntArray, Array, BoolArray]:

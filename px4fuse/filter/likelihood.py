@@ -13,15 +13,15 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.stats import chi2
+from scipy.special import chdtri
 
-from px4fuse.arrays import Array, BoolArray
-from px4fuse.filter.kalman import InitialState, Settings, timeline
+from px4fuse.arrays import Array, BoolArray, IntArray
+from px4fuse.filter.kalman import InitialState, Settings, Timeline, timeline
 from px4fuse.filter.model import INITIAL_COVARIANCE, Symmetric, move, noise, spread
 from px4fuse.filter.signals import Axis
 
 # Half of the 95 % point of chi-square: the drop of log-likelihood that bounds an interval
-PROFILE_DROP = float(chi2.ppf(0.95, 1)) / 2.0
+PROFILE_DROP = float(chdtri(1, 0.05)) / 2.0
 
 
 @dataclass(frozen=True)
@@ -59,29 +59,48 @@ def preintegrate(axis: Axis, settings: Settings) -> Preintegrated:
         ``settings.input`` is "imu" and the axis has no acceleration.
     """
     line = timeline(axis, settings)
-    ends = np.flatnonzero(line.measurement >= 0)
+    ends, leg, rest = _legs(line)
     time = line.time_s
-    dt = np.diff(time)
-    end_of_step = ends[np.searchsorted(ends, np.arange(1, len(time)))]  # where each step's leg ends
-    leg = np.searchsorted(ends, np.arange(1, len(time)))
-    rest = time[end_of_step] - time[1:]  # from the end of a step to the end of its leg
-    still = np.zeros(len(dt))
-    dp, dv = move(*move(still, still, line.acceleration_m_s2, dt), still, rest)
-    unit = settings.dt_s * np.stack(spread(noise(dt), rest), 1)
-    count = len(ends)
-
-    def total(values: Array) -> Array:
-        return np.asarray(np.bincount(leg, weights=values, minlength=count), dtype=np.float64)
-
+    unit = settings.dt_s * np.stack(spread(noise(np.diff(time)), rest), 1)
+    dp, dv = moved(line, line.acceleration_m_s2)
     return Preintegrated(
         length_s=np.diff(time[np.concatenate([[0], ends])]),
-        delta_position_m=total(dp),
-        delta_velocity_m_s=total(dv),
-        noise_unit=np.stack([total(unit[:, i]) for i in range(3)], 1),
-        noise_fixed=np.stack([total(unit[:, i] * line.input_variance_m2_s4) for i in range(3)], 1),
+        delta_position_m=dp,
+        delta_velocity_m_s=dv,
+        noise_unit=np.stack([np.bincount(leg, unit[:, i]) for i in range(3)], 1),
+        noise_fixed=np.stack(
+            [np.bincount(leg, unit[:, i] * line.input_variance_m2_s4) for i in range(3)], 1
+        ),
         measurement_m=axis.measurement_m[line.measurement[ends]],
         initial=InitialState(float(time[0]), float(axis.measurement_m[0])),
     )
+
+
+def moved(line: Timeline, acceleration_m_s2: Array) -> tuple[Array, Array]:
+    """What an acceleration adds to position (m) and velocity (m/s) between the measurements.
+
+    Parameters
+    ----------
+    line : Timeline
+    acceleration_m_s2 : ndarray, shape (n - 1,)
+        Over each of its steps.
+
+    Returns
+    -------
+    delta_position_m, delta_velocity_m_s : ndarray, shape (m,)
+    """
+    _, leg, rest = _legs(line)
+    still = np.zeros(len(rest))
+    dp, dv = move(*move(still, still, acceleration_m_s2, np.diff(line.time_s)), still, rest)
+    # numpy's stubs call the sums of weights integers
+    return np.asarray(np.bincount(leg, dp), float), np.asarray(np.bincount(leg, dv), float)
+
+
+def _legs(line: Timeline) -> tuple[IntArray, IntArray, Array]:
+    """Last step of each leg; of each step its leg, and the time from its end to the leg's."""
+    ends = np.flatnonzero(line.measurement >= 0)
+    leg = np.searchsorted(ends, np.arange(1, len(line.time_s)))
+    return ends, leg, line.time_s[ends[leg]] - line.time_s[1:]
 
 
 def innovations(

@@ -16,11 +16,11 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 from scipy import constants
-from scipy.integrate import cumulative_trapezoid
 from scipy.spatial.transform import Rotation, Slerp
 
-from px4fuse.arrays import Array, IntArray
-from px4fuse.filter.marginal import Chain, Positions
+from px4fuse.arrays import Array, IntArray, cumulative_integral
+from px4fuse.filter.chain import Chain
+from px4fuse.filter.marginal import Positions
 from px4fuse.filter.model import move, noise_of_many_steps
 from px4fuse.filter.signals import imu_gaps
 from px4fuse.flight import ANGULAR_RATE_COLUMNS, QUATERNION_COLUMNS, SPECIFIC_FORCE_COLUMNS
@@ -35,6 +35,8 @@ SCALE = 9
 STRETCH_S = 30.0
 SEARCH_S = 0.6
 MIN_MEASUREMENTS = 15
+# Of a stretch of which only some are taken
+FEW_MEASUREMENTS = 5
 # The IMU is averaged to this interval before it is integrated
 STEP_S = 0.02
 # Of position (1/m²) and velocity (s²/m²) where a stretch starts: as good as nothing, but enough
@@ -48,8 +50,8 @@ MAX_IMU_INTERVAL_S = 0.025
 class Signals:
     """Acceleration of one stretch and of each constant, and their integrals.
 
-    ``value``, ``velocity`` and ``position`` have shape (n, 3, 1 + constants); the first is the
-    acceleration with all constants zero. Each value holds from its time to the next.
+    ``value``, ``velocity`` and ``position`` have shape (3, 1 + constants, n); the first column is
+    the acceleration with all constants zero. Each value holds from its time to the next.
     """
 
     time_s: Array
@@ -57,11 +59,15 @@ class Signals:
     velocity: Array
     position: Array
 
-    def at(self, time_s: Array) -> tuple[Array, Array]:
-        """Integrals at other times: velocity and position, shape (..., 3, 1 + constants)."""
-        at = np.clip(np.searchsorted(self.time_s, time_s, side="right") - 1, 0, len(self.value) - 1)
-        ahead = (time_s - self.time_s[at])[..., None, None]
-        position, velocity = move(self.position[at], self.velocity[at], self.value[at], ahead)
+    def at(self, time_s: Array, axes: slice = slice(None)) -> tuple[Array, Array]:
+        """Integrals at other times: velocity and position, shape (axes, 1 + constants, ...)."""
+        last = len(self.time_s) - 1
+        at = np.clip(np.searchsorted(self.time_s, time_s, side="right") - 1, 0, last)
+        ahead = time_s - self.time_s[at]
+        position, velocity, value = (
+            np.take(part[axes], at, axis=-1) for part in (self.position, self.velocity, self.value)
+        )
+        position, velocity = move(position, velocity, value, ahead)
         return velocity, position
 
 
@@ -85,6 +91,26 @@ class Motion:
     row: IntArray
     edges: IntArray
     signals: tuple[Signals, ...]
+
+    def thinned(self, count: int) -> Motion | None:
+        """About so many of the measurements, in the stretches that keep a few; None without one.
+
+        Parameters
+        ----------
+        count : int
+        """
+        kept = np.arange(len(self.time_s)) % max(1, len(self.time_s) // count) == 0
+        counts = np.add.reduceat(kept.astype(int), self.edges[:-1])
+        enough = counts >= FEW_MEASUREMENTS
+        if not enough.any():
+            return None
+        kept = kept & np.repeat(enough, np.diff(self.edges))
+        return Motion(
+            self.time_s[kept],
+            self.row[kept],
+            np.cumsum([0, *counts[enough]]),
+            tuple(each for each, good in zip(self.signals, enough, strict=True) if good),
+        )
 
     def positions(self, measurement_m: Array, dt_s: float) -> Positions:
         """Positions along some axes, ready to be fitted.
@@ -119,24 +145,42 @@ class Motion:
 
         Returns
         -------
-        delta_position_m, delta_velocity_m_s : ndarray, shape (n, a, T, 1 + constants)
+        delta_position_m, delta_velocity_m_s : ndarray, shape (a, T, 1 + constants, m - 1)
+            Zero where a stretch begins.
         """
-        dps, dvs = [], []
+        # most directions are axes themselves
+        used = np.flatnonzero(np.any(directions, axis=0))
+        axes = slice(int(used[0]), int(used[-1]) + 1)  # a view of the signals
+        own = directions[:, axes]
+        turned = None if np.array_equal(own, np.eye(own.shape[1])) else own
+        width = self.signals[0].value.shape[1]
+        dp, dv = np.zeros((2, len(directions), len(offset_s), width, len(self.time_s) - 1))
         for begin, end, signals in self._stretches():
-            velocity, position = signals.at(self.time_s[begin:end, None] + offset_s)
-            step = np.diff(self.time_s[begin:end])[:, None, None, None]
-            dvs.append(np.diff(velocity, axis=0))
-            dps.append(np.diff(position, axis=0) - velocity[:-1] * step)
-        dp, dv = (
-            np.einsum("ab,ntbk->natk", directions, np.concatenate(part)) for part in (dps, dvs)
-        )
+            step = np.diff(self.time_s[begin:end])
+            for at, offset in enumerate(offset_s.tolist()):
+                velocity, position = signals.at(self.time_s[begin:end] + offset, axes)
+                if turned is not None:
+                    velocity, position = (
+                        np.tensordot(turned, part, 1) for part in (velocity, position)
+                    )
+                np.subtract(
+                    velocity[..., 1:], velocity[..., :-1], out=dv[:, at, :, begin : end - 1]
+                )
+                way = dp[:, at, :, begin : end - 1]
+                np.subtract(position[..., 1:], position[..., :-1], out=way)
+                way -= velocity[..., :-1] * step
         return dp, dv
 
     def _stretches(self) -> Iterator[tuple[int, int, Signals]]:
         return zip(self.edges[:-1].tolist(), self.edges[1:].tolist(), self.signals, strict=True)
 
 
-def motion(imu: pd.DataFrame, attitude: pd.DataFrame, time_s: Array) -> Motion | None:
+Made = dict[tuple[float, float], Signals]
+
+
+def motion(
+    imu: pd.DataFrame, attitude: pd.DataFrame, time_s: Array, made: Made | None = None
+) -> Motion | None:
     """Cut measurements into stretches that the IMU covers without a gap.
 
     Parameters
@@ -144,11 +188,14 @@ def motion(imu: pd.DataFrame, attitude: pd.DataFrame, time_s: Array) -> Motion |
     imu, attitude : DataFrame
         As in :class:`px4fuse.flight.Flight`.
     time_s : ndarray, shape (m,)
+    made : dict, optional
+        Signals of this flight by their span, which are kept there and used again.
 
     Returns
     -------
     Motion, or None where no stretch has enough measurements or the IMU is too slow.
     """
+    made = {} if made is None else made
     imu_time = imu.index.to_numpy()
     if len(imu_time) < 2 or np.median(np.diff(imu_time)) > MAX_IMU_INTERVAL_S:
         return None
@@ -170,7 +217,9 @@ def motion(imu: pd.DataFrame, attitude: pd.DataFrame, time_s: Array) -> Motion |
             if len(part) >= MIN_MEASUREMENTS:
                 rows.append(part)
                 around = time_s[part[0]] - SEARCH_S, time_s[part[-1]] + SEARCH_S
-                signals.append(_signals(imu, attitude, around))
+                if around not in made:
+                    made[around] = _signals(imu, attitude, around)
+                signals.append(made[around])
     if not rows:
         return None
     row = np.concatenate(rows)
@@ -180,10 +229,11 @@ def motion(imu: pd.DataFrame, attitude: pd.DataFrame, time_s: Array) -> Motion |
 
 def _signals(imu: pd.DataFrame, attitude: pd.DataFrame, span: tuple[float, float]) -> Signals:
     """Acceleration in NED by the gyros' attitude, and what each constant adds to it."""
-    inside = imu.loc[(imu.index >= span[0] - 2 * STEP_S) & (imu.index <= span[1] + 2 * STEP_S)]
-    time = inside.index.to_numpy()
+    time = imu.index.to_numpy()
+    first, last = np.searchsorted(time, [span[0] - 2 * STEP_S, span[1] + 2 * STEP_S], side="left")
+    inside, time = imu.iloc[first:last], time[first:last]
     columns = [*SPECIFIC_FORCE_COLUMNS, *ANGULAR_RATE_COLUMNS]
-    integral = cumulative_trapezoid(inside[columns].to_numpy(copy=True), time, axis=0, initial=0)
+    integral = cumulative_integral(inside[columns].to_numpy(), time)
     edges = np.arange(time[0], time[-1], STEP_S)
     read = np.column_stack([np.interp(edges, time, one) for one in integral.T])
     force, angle = read[:, :3], read[:, 3:]
@@ -192,21 +242,25 @@ def _signals(imu: pd.DataFrame, attitude: pd.DataFrame, span: tuple[float, float
     mean = np.diff(force, axis=0) / STEP_S
     half = turn[:-1] * Rotation.from_rotvec(np.diff(angle, axis=0) / 2.0)
     body_to_ned = half.as_matrix()
-    specific = np.einsum("nij,nj->ni", body_to_ned, mean)
-    value = np.empty((len(mean), 3, 1 + len(CONSTANT_SIGMA)))
-    value[..., 0] = specific + np.array([0.0, 0.0, constants.g])
+    specific = np.einsum("nij,nj->in", body_to_ned, mean)
+    value = np.empty((3, 1 + len(CONSTANT_SIGMA), len(mean)))
+    value[:, 0] = specific
+    value[2, 0] += constants.g
     # a small rotation θ of the attitude adds θ × f; a gyro bias b turns it by -∫ R b dt
-    turned = -STEP_S * (np.cumsum(body_to_ned, axis=0) - body_to_ned / 2.0)
+    by_axis = np.moveaxis(body_to_ned, 0, -1)
+    turned = -STEP_S * (np.cumsum(by_axis, axis=-1) - by_axis / 2.0)
     for axis in range(3):
-        value[..., 1 + axis] = np.cross(np.eye(3)[axis], specific)
-        value[..., 4 + axis] = np.cross(turned[:, :, axis], specific)
-    value[..., 7:10] = -body_to_ned
-    value[..., 1 + SCALE] = value[..., 0]
-    velocity = np.zeros((len(edges), *value.shape[1:]))
-    np.cumsum(value * STEP_S, axis=0, out=velocity[1:])
-    position = np.zeros_like(velocity)
-    np.cumsum((velocity[:-1] + value * (STEP_S / 2.0)) * STEP_S, axis=0, out=position[1:])
-    return Signals(edges[:-1], value, velocity[:-1], position[:-1])
+        after, last = (axis + 1) % 3, (axis + 2) % 3
+        value[axis, 1 + axis] = 0.0
+        value[after, 1 + axis], value[last, 1 + axis] = -specific[last], specific[after]
+        value[axis, 4:7] = turned[after] * specific[last] - turned[last] * specific[after]
+    value[:, 7:10] = -by_axis
+    value[:, 1 + SCALE] = value[:, 0]
+    velocity, position = np.zeros((2, *value.shape))
+    np.cumsum(value[..., :-1] * STEP_S, axis=-1, out=velocity[..., 1:])
+    step = velocity[..., :-1] + value[..., :-1] * (STEP_S / 2.0)
+    np.cumsum(step * STEP_S, axis=-1, out=position[..., 1:])
+    return Signals(edges[:-1], value, velocity, position)
 
 
 def _integrate_gyros(edges: Array, angle: Array, attitude: pd.DataFrame) -> Rotation:

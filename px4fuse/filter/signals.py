@@ -11,10 +11,10 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike
 from scipy import constants
-from scipy.integrate import cumulative_trapezoid
 from scipy.spatial.transform import Rotation, Slerp
 
-from px4fuse.arrays import Array, BoolArray
+from px4fuse.arrays import Array, BoolArray, cumulative_integral
+from px4fuse.display import brief
 from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.flight import (
     AXIS_NAMES,
@@ -78,6 +78,8 @@ class Acceleration:
     gap_integral_s: Array
     rms_m_s2: float
 
+    __repr__ = brief
+
 
 @dataclass(frozen=True)
 class Axis:
@@ -106,6 +108,8 @@ class Axis:
     measurement_time_s: Array
     measurement_m: Array
     acceleration: Acceleration | Unavailable
+
+    __repr__ = brief
 
 
 def choose_source(flight: Flight, name: str | None = None) -> tuple[PositionTrack, str]:
@@ -150,12 +154,12 @@ def _no_source(flight: Flight) -> str:
         return (
             f"{flight.log.name}: {damaged}no external position was sent to the autopilot in this "
             "recording (no VISION_POSITION_ESTIMATE, ODOMETRY or ATT_POS_MOCAP). Give the "
-            "positioning system's own file with --position"
+            "positioning system's own file with `position`"
             f"{', or the ULog' if flight.log.has_ulog else ''}."
         )
     gps = any(track.rung > LAST_AUTOMATIC_RUNG for track in flight.positions)
     hint = (
-        "Only GPS is in it: give --position-source vehicle_gps_position to use that, or s"
+        "Only GPS is in it: give `position_source` vehicle_gps_position to use that, or s"
         if gps
         else "S"
     )
@@ -163,7 +167,7 @@ def _no_source(flight: Flight) -> str:
         f"{flight.log.name}: {damaged}no external position in this log (no "
         "vehicle_visual_odometry, motion capture or EKF2 innovations of external vision). "
         f"{hint}et SDLOG_PROFILE to 129 and send the UWB position to PX4 as "
-        "VISION_POSITION_ESTIMATE, or give the UWB's own file with --position."
+        "VISION_POSITION_ESTIMATE, or give the UWB's own file with `position`."
     )
 
 
@@ -335,7 +339,7 @@ def make_axes(
     if not asked:
         raise SettingsError("no axis was asked for.")
     if heading_deg is not None and not 0.0 <= heading_deg <= 360.0:
-        raise SettingsError(f"--heading {heading_deg:g} is not between 0 and 360 degrees.")
+        raise SettingsError(f"`heading_deg` {heading_deg:g} is not between 0 and 360 degrees.")
     if unknown := [name for name in asked if name not in (*AXIS_NAMES, AISLE)]:
         raise SettingsError(
             f"axis {unknown[0]}: not a known axis. Choose from {', '.join((*AXIS_NAMES, AISLE))}."
@@ -418,7 +422,7 @@ def project_acceleration(
     return Acceleration(
         time_s=time,
         value_m_s2=value,
-        integral_m_s=cumulative_trapezoid(value, time, initial=0),
+        integral_m_s=cumulative_integral(value, time),
         gap_integral_s=np.concatenate([[0.0], np.cumsum(np.where(is_gap, interval, 0.0))]),
         rms_m_s2=float(np.sqrt(np.mean(value[inside] ** 2))),
     )

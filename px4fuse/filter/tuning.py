@@ -10,11 +10,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 from scipy.optimize import minimize_scalar
 
 from px4fuse.arrays import Array, BoolArray
+from px4fuse.display import Shown, brief
 from px4fuse.filter.consistency import Consistency, assess
 from px4fuse.filter.fitting import (
     SIGMA_A_SEARCH_M_S2,
@@ -22,16 +24,15 @@ from px4fuse.filter.fitting import (
     NoiseFit,
     Noises,
     Part,
-    arguments,
     filter_part,
+    fitted,
     most_likely,
-    negative_log_likelihood,
     profile_end,
 )
 from px4fuse.filter.kalman import Settings
 from px4fuse.filter.likelihood import Preintegrated, innovations, preintegrate, total_over_grid
-from px4fuse.filter.marginal import fit
-from px4fuse.filter.motion import SEARCH_S, motion
+from px4fuse.filter.marginal import centred
+from px4fuse.filter.motion import SEARCH_S, Made, motion
 from px4fuse.filter.signals import Axis
 from px4fuse.flight import Flight, Unavailable
 
@@ -43,6 +44,7 @@ MIN_MEASUREMENTS = 30
 MAX_OUTLIER_SHARE = 0.3
 # The clock offset is a nuisance here: a rough one is enough
 OFFSET_POINTS = 25
+COARSE_MEASUREMENTS = 2000
 SIGMA_A_FACTORS = (0.1, 0.3, 1.0)
 FIRST_WALK_M = 0.02
 # A value this near to the end of its search lies there
@@ -75,6 +77,8 @@ class LikelihoodMap:
     sigma_z_m: Array
     drop: Array
 
+    __repr__ = brief
+
 
 @dataclass(frozen=True)
 class HeldOut:
@@ -97,8 +101,8 @@ class HeldOut:
     gain_nats: float
 
 
-@dataclass(frozen=True)
-class AxisTuning:
+@dataclass(frozen=True, repr=False)
+class AxisTuning(Shown):
     """The noises of one axis, or of the horizontal axes together.
 
     Attributes
@@ -150,6 +154,7 @@ def tune(
     progress: Callable[[str], None] = lambda _: None,
     flight: Flight | None = None,
     drifts: bool = False,
+    made: Made | None = None,
 ) -> dict[str, AxisTuning | Unavailable]:
     """Most likely SIGMA_A and SIGMA_Z of each axis, and of north and east together.
 
@@ -166,6 +171,8 @@ def tune(
         Whose IMU tells biases and tilt from noise.
     drifts : bool
         Whether the source may wander by itself, as odometry does.
+    made : dict, optional
+        As :func:`px4fuse.filter.motion.motion` has it.
 
     Returns
     -------
@@ -177,10 +184,11 @@ def tune(
         if np.array_equal(pair[0].measurement_time_s, pair[1].measurement_time_s):
             groups[HORIZONTAL] = pair
     tuned = {}
+    made = {} if made is None else made
     for name, group in groups.items():
         if names is None or name in names:
             progress(name)
-            tuned[name] = tune_axes(name, group, settings, flight, drifts)
+            tuned[name] = tune_axes(name, group, settings, flight, drifts, made)
     return tuned
 
 
@@ -190,6 +198,7 @@ def tune_axes(
     settings: Settings,
     flight: Flight | None = None,
     drifts: bool = False,
+    made: Made | None = None,
 ) -> AxisTuning | Unavailable:
     """Most likely noises that several axes share.
 
@@ -204,6 +213,8 @@ def tune_axes(
         Whose IMU tells biases and tilt from noise.
     drifts : bool
         Whether the source may wander by itself, as odometry does.
+    made : dict, optional
+        As :func:`px4fuse.filter.motion.motion` has it.
     """
     legs = [preintegrate(axis, settings) for axis in axes]
     count = len(legs[0].measurement_m)
@@ -216,8 +227,8 @@ def tune_axes(
     parts = [filter_part(leg) for leg in legs]
     chosen = Noises(settings.sigma_a_m_s2, settings.sigma_z_m)
     alone = most_likely(parts, chosen, np.ones(count))
-    found = _with_biases(axes, settings, flight, alone, drifts)
-    best, searched = (alone, parts) if found is None else found
+    found = _with_biases(axes, settings, flight, alone, drifts, made)
+    best = alone if found is None else found
     skip = alone.outlier > 0.5
     if np.mean(skip) > MAX_OUTLIER_SHARE:
         return Unavailable(
@@ -225,14 +236,14 @@ def tune_axes(
             f"{np.mean(skip):.0%} of the measurements look like outliers",
             "Fix the source first; noises cannot be told from outliers.",
         )
-    sigma_a, sigma_z = (_noise(searched, best, which) for which in (0, 1))
+    sigma_a, sigma_z = (_noise(best, which) for which in (0, 1))
     at_z = sigma_z.value or sigma_z.high or best.noises.sigma_z_m
-    needed = sigma_a if found is None else _needed(parts, alone, at_z)
+    needed = sigma_a if found is None else _needed(alone, at_z)
     if found is None and flight is not None and settings.input == "imu":
         # the noise alone is not told; with what else the filter has to cover it is this
         sigma_a = Noise(None, None, needed.high)
     after = Noises(needed.value or needed.high or alone.noises.sigma_a_m_s2, at_z)
-    gain = _score(parts, chosen, alone) - _score(parts, after, alone)
+    gain = alone.score(chosen) - alone.score(after)
     return AxisTuning(
         name=name,
         sigma_a=sigma_a,
@@ -256,39 +267,40 @@ def _with_biases(
     flight: Flight | None,
     alone: NoiseFit,
     drifts: bool,
-) -> tuple[NoiseFit, list[Part]] | None:
+    made: Made | None = None,
+) -> NoiseFit | None:
     """Noises with the IMU's constants and the clock offset taken out, None without an IMU."""
     if flight is None or settings.input == "zero":
         return None
     if isinstance(flight.imu, Unavailable) or isinstance(flight.attitude, Unavailable):
         return None
-    moved = motion(flight.imu, flight.attitude, axes[0].measurement_time_s)
+    moved = motion(flight.imu, flight.attitude, axes[0].measurement_time_s, made)
     if moved is None or len(moved.time_s) < MIN_MEASUREMENTS:
         return None
     # the filter starts at the first measurement, which it does not weigh
     weight = np.concatenate([np.ones(len(axes[0].measurement_m) - len(alone.weight)), alone.weight])
     weight = weight[moved.row]
-    positions = moved.positions(
-        np.column_stack([axis.measurement_m for axis in axes]), settings.dt_s
-    )
+    measured = np.column_stack([axis.measurement_m for axis in axes])
     directions = np.array([axis.direction for axis in axes])
     start = replace(alone.noises, walk_m=FIRST_WALK_M if drifts else 0.0)
     offsets = np.linspace(-SEARCH_S, SEARCH_S, OFFSET_POINTS)
-    part = Part(positions, *moved.legs(directions, offsets))
+    some = moved.thinned(COARSE_MEASUREMENTS) or moved
+    part = Part(
+        some.positions(measured, settings.dt_s),
+        *some.legs(directions, offsets),
+    )
     levels = [
         replace(start, sigma_a_m_s2=start.sigma_a_m_s2 * factor) for factor in SIGMA_A_FACTORS
     ]
-    scores = [fit(*arguments(part, noises, weight)).total() for noises in levels]
+    of_some = weight[np.isin(moved.row, some.row)]
+    scores = [fitted(part, noises, of_some).total() for noises in levels]
     level, at = np.unravel_index(np.argmin(scores), np.shape(scores))
-    parts = [Part(positions, *moved.legs(directions, offsets[[at]]))]
-    return most_likely(parts, levels[level], weight), parts
+    positions = moved.positions(measured, settings.dt_s)
+    parts = [Part(*centred(positions, *moved.legs(directions, offsets[[at]])))]
+    return most_likely(parts, levels[level], weight)
 
 
-def _score(parts: Sequence[Part], noises: Noises, found: NoiseFit) -> float:
-    return negative_log_likelihood(parts, noises, found.weight)
-
-
-def _noise(parts: Sequence[Part], best: NoiseFit, which: int) -> Noise:
+def _noise(best: NoiseFit, which: int) -> Noise:
     """Value and 95 % interval of SIGMA_A (0) or SIGMA_Z (1), the other one maximised out."""
     values = best.noises.sigma_a_m_s2, best.noises.sigma_z_m
     search = (SIGMA_A_SEARCH_M_S2, SIGMA_Z_SEARCH_M)[which]
@@ -296,7 +308,7 @@ def _noise(parts: Sequence[Part], best: NoiseFit, which: int) -> Noise:
     def score(log_value: float, log_other: float) -> float:
         pair = (log_value, log_other) if which == 0 else (log_other, log_value)
         sigma_a, sigma_z = np.exp(pair).tolist()
-        return _score(parts, Noises(sigma_a, sigma_z, best.noises.walk_m), best)
+        return best.score(Noises(sigma_a, sigma_z, best.noises.walk_m))
 
     at, other = np.log(values[which]), np.log(values[1 - which])
     return _bounded(
@@ -307,11 +319,11 @@ def _noise(parts: Sequence[Part], best: NoiseFit, which: int) -> Noise:
     )
 
 
-def _needed(parts: Sequence[Part], found: NoiseFit, sigma_z: float) -> Noise:
+def _needed(found: NoiseFit, sigma_z: float) -> Noise:
     """SIGMA_A of the two-state filter at a SIGMA_Z, with its 95 % interval."""
 
     def score(log_a: float, _: float = 0.0) -> float:
-        return _score(parts, Noises(float(np.exp(log_a)), sigma_z), found)
+        return found.score(Noises(float(np.exp(log_a)), sigma_z))
 
     low, high = np.log(SIGMA_A_SEARCH_M_S2)
     at = float(minimize_scalar(score, bounds=(low, high), options={"xatol": 1e-3}).x)
@@ -349,7 +361,10 @@ def _map(
         ends = at * (below / at) ** reach, at * (above / at) ** reach
         grids.append(np.geomspace(max(ends[0], low), min(ends[1], high), GRID))
     a, z = grids
-    total = total_over_grid(legs, a[:, None], z[None, :], found.weight)
+    if found.score.tabulated:
+        total = np.array([[found.score(Noises(*pair)) for pair in product([x], z)] for x in a])
+    else:
+        total = total_over_grid(legs, a[:, None], z[None, :], found.weight)
     return LikelihoodMap(a, z, total - total.min())
 
 
@@ -369,14 +384,12 @@ def _hold_out(
             f"half of the segment holds {half} measurements (at least {MIN_MEASUREMENTS})",
             "Analyse a longer segment.",
         )
-    whole, part = [filter_part(leg) for leg in legs], [filter_part(_cut(leg, half)) for leg in legs]
+    part = [filter_part(_cut(leg, half)) for leg in legs]
     weight = found.weight[:half]
-    tuned = most_likely(part, found.noises, weight, outliers=False).noises
+    first = most_likely(part, found.noises, weight, outliers=False)
+    tuned = first.noises
     # of the second half given the first
-    scores = [
-        _score(whole, noises, found) - negative_log_likelihood(part, noises, weight)
-        for noises in (chosen, tuned)
-    ]
+    scores = [found.score(noises) - first.score(noises) for noises in (chosen, tuned)]
     count = len(found.weight) - half
     return HeldOut(tuned.sigma_a_m_s2, tuned.sigma_z_m, count, (scores[0] - scores[1]) / count)
 

@@ -63,6 +63,9 @@ class Finding:
         told = re.sub(r" \([^()]*\)", "", self.message)
         return re.split(r"[:;.] |\.$", told, maxsplit=1)[0]
 
+    def __repr__(self) -> str:
+        return f"<{self.severity} {self.id}: {self.message} {self.remedy}>"
+
     @property
     def ids(self) -> tuple[str, ...]:
         """Its own id and those of its consequences."""

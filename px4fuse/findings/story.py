@@ -21,7 +21,7 @@ from px4fuse.comparison.comparison import (
 )
 from px4fuse.comparison.drift import may_drift
 from px4fuse.comparison.why import Why
-from px4fuse.comparison.why_words import the
+from px4fuse.comparison.why_words import STAMPS_WRONG, the
 from px4fuse.filter.kalman import Settings, state_at
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise
 from px4fuse.findings.errors_larger_than_claimed import hidden_errors
@@ -35,7 +35,7 @@ MOST_SENTENCES = 3
 TOLD_FIRST = frozenset(
     {
         "kf_variance_overstated", "kf_variance_understated", "ekf2_variance_overstated",
-        "ekf2_variance_understated", "errors_larger_than_claimed",
+        "ekf2_variance_understated", "errors_larger_than_claimed", "ekf2_unavailable",
     }
 )  # fmt: skip
 SETTINGS = frozenset({"sigma_a_large", "sigma_a_small", "sigma_z_large", "sigma_z_small"})
@@ -209,5 +209,7 @@ def _differences(analysis: Analysis) -> Iterator[str]:
         )
     why = analysis.why.get(analysis.comparison.main.axis.name)
     if isinstance(why, Why):
-        # the first sentence without its moment
-        yield re.split(r"; most at|(?<=\D)\. ", why.sentences[0])[0].removesuffix(".") + "."
+        # wrong stamps are a finding of their own
+        first = next(each for each in why.sentences if not each.startswith(STAMPS_WRONG))
+        # without its moment
+        yield re.split(r"; most at|(?<=\D)\. ", first)[0].removesuffix(".") + "."

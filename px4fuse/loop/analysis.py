@@ -90,7 +90,7 @@ def analyse(
     notes: tuple[str, ...] = ()
     if landed_at is not None:
         if not came_back:
-            raise SettingsError("--landed-at and --open exclude each other. Leave one out.")
+            raise SettingsError("`landed_at` and `came_back` exclude each other. Leave one out.")
         known = measured_end(trajectory, segment, at_rest, *landed_at)
     elif truth is not None and came_back:
         found = true_end(trajectory, truth, segment, at_rest)

@@ -9,6 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from px4fuse.arrays import Array, BoolArray, IntArray
+from px4fuse.display import Shown, brief
 from px4fuse.errors import MissingDataError, Px4FuseError, SettingsError, TrajectoryError
 from px4fuse.filter.signals import Segment
 from px4fuse.flight import Unavailable
@@ -82,9 +83,11 @@ class Correction:
     scores: Mapping[str, Evaluation | Unavailable] = field(default_factory=dict)
     solution: Solution | None = None
 
+    __repr__ = brief
 
-@dataclass(frozen=True)
-class Loop:
+
+@dataclass(frozen=True, repr=False)
+class Loop(Shown):
     """The result of ``px4fuse loop``.
 
     Attributes
@@ -258,13 +261,14 @@ def close_loop(
     path = part_of(whole, segment, at_rest)
     spacing = key_frame_spacing_m(path.position_m) if spacing_m is None else spacing_m
     if not 1e-3 <= spacing <= 100.0:
-        raise SettingsError(f"--key-frames {spacing:g} is outside 0.001 to 100 m.")
+        raise SettingsError(f"`key_frames_m` {spacing:g} is outside 0.001 to 100 m.")
     frames = key_frames(path.position_m, spacing)
     along = cumulative_distance(path.position_m[frames])
     if not along[-1] >= max(MIN_PATH_M * min(1.0, spacing / 0.5), 1e-6):
         raise TrajectoryError(
             f"{trajectory.name}: the path is {along[-1]:.2f} m long on key frames {spacing:g} m "
-            "apart, too short for a loop. Give the part with --from and --to, or --key-frames."
+            "apart, too short for a loop. Give the part with `start_s` and `end_s`, or "
+            "`key_frames_m`."
         )
     distance = np.interp(path.time_s, path.time_s[frames], along)
     end_m = path.position_m[-1] - path.position_m[0]

@@ -49,9 +49,12 @@ class OdometryNoise:
     tilt_share: float = 0.1
 
     def __post_init__(self) -> None:
-        for option, value in (("--drift", self.position_m), ("--heading-drift", self.heading_deg)):
+        for name, value in (
+            ("position_drift_m", self.position_m),
+            ("heading_drift_deg", self.heading_deg),
+        ):
             if not 1e-4 <= value <= 100.0:
-                raise SettingsError(f"{option} {value:g} is outside 0.0001 to 100.")
+                raise SettingsError(f"`{name}` {value:g} is outside 0.0001 to 100.")
 
 
 def odometry_variances(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from px4fuse.errors import MissingDataError, TrajectoryError
+from px4fuse.errors import MissingDataError, SettingsError, TrajectoryError
 from px4fuse.flight import Flight, Unavailable
 from px4fuse.loop.tracks import PARTS, Part, odometry_of, trajectory_of
 from px4fuse.readers import read_log
@@ -99,6 +99,8 @@ def read_source(
     ------
     TrajectoryError, LogError, MissingDataError
         It cannot be read, or lacks the part.
+    SettingsError
+        A flight log states its frame.
     """
     path, part = split_part(argument)
     if not head_of(path):
@@ -115,6 +117,11 @@ def read_source(
             )
         trajectory = read_trajectory(path)
         return Source(trajectory if frame is None else replace(trajectory, frame=frame), None)
+    if frame is not None:
+        raise SettingsError(
+            f"`frame` {frame.lower()} is for trajectory files; {shown(path)} is a flight log, "
+            "which states its frame. Leave `frame` out."
+        )
     flight = read_log(path, system=system)
     chosen = part or default or _odometry_or_ekf2(flight)
     return Source(trajectory_of(flight, chosen), flight)

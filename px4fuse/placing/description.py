@@ -11,7 +11,6 @@ import pandas as pd
 from px4fuse.flight import Alignment, Flight, Unavailable
 from px4fuse.placing.fitting import MIN_CONCORDANCE, capped_rms
 from px4fuse.placing.matching import (
-    FRAME_OPTION,
     GOOD_CONCORDANCE,
     Match,
     is_sound,
@@ -214,7 +213,7 @@ def _height_warnings(flight: Flight, placed: pd.DataFrame) -> list[str]:
         return []
     return [
         "The file's height runs against EKF2's (one rises where the other sinks): its z points the "
-        f"other way. Give another {FRAME_OPTION}."
+        "other way. Give another --position-frame."
     ]
 
 

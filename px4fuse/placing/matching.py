@@ -39,7 +39,6 @@ from px4fuse.trajectory.offset import RIVAL_RATIO, STEP_S
 
 # nwu is enu turned by 90°
 TURNABLE_FRAMES = ("ned", "enu")
-FRAME_OPTION = f"--position-frame {'|'.join(FRAMES)}"
 MAX_SPAN_S = 86400.0  # a day takes five seconds on the tracks' grid
 # Concordance below which a match is rough: a warning says so, and it overrules nothing
 GOOD_CONCORDANCE = {EKF2_POSITION: 0.9, IMU: 0.7}
@@ -98,12 +97,8 @@ def find_match(
         With its remedy.
     """
     sought = [
-        option
-        for option, known in (
-            ("--clock-offset SECONDS", lag_s),
-            (FRAME_OPTION, frame),
-            ("--position-yaw DEGREES", yaw_rad),
-        )
+        f"`{name}`"
+        for name, known in (("clock_offset_s", lag_s), ("frame", frame), ("yaw_deg", yaw_rad))
         if known is None
     ]
     reasons = []
@@ -194,20 +189,20 @@ def _check_match(match: Match) -> None:
         raise NoMatchError(
             f"the flight's path leaves the clock open: offsets {abs(peak.rival_s):.1f} s apart fit "
             f"the {name} equally well",
-            "Give --clock-offset SECONDS",
+            "Give `clock_offset_s`",
         )
     if fit.lag_sigma_s is not None and fit.lag_sigma_s > MAX_CLOCK_SIGMA_S:
         raise NoMatchError(
             "the flight's path leaves the clock open (standard deviation of the offset above "
             f"{MAX_CLOCK_SIGMA_S:g} s)",
-            "Give --clock-offset SECONDS",
+            "Give `clock_offset_s`",
         )
     if len(match.misfits_m) > 1:
         best, second = (np.hypot(m, RESIDUAL_FLOOR_M) for m in [*match.misfits_m.values()][:2])
         if second < FRAME_RATIO * best:
             raise NoMatchError(
                 f"no frame fits the {name} clearly best ({residual_words(match.misfits_m)})",
-                f"Give {FRAME_OPTION}{' or --position-yaw auto' if match.turned else ''}",
+                f"Give `frame`{' or `yaw_deg` auto' if match.turned else ''}",
             )
 
 

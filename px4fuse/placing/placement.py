@@ -81,7 +81,7 @@ def place(
     lag_s = None if clock_offset_s is None else start_s + clock_offset_s - boot_s
     if lag_s is not None and not start_s - end_s <= lag_s <= flight.log.duration_s:
         raise MissingDataError(
-            f"{file.name}: with --clock-offset {clock_offset_s:.3f} it does not overlap the log; "
+            f"{file.name}: with `clock_offset_s` {clock_offset_s:.3f} it does not overlap the log; "
             f"{spans}. Correct the offset, or leave it out to have it found."
         )
     yaw_rad = None if yaw_deg == "auto" else float(np.radians(yaw_deg or 0.0))
@@ -121,13 +121,11 @@ def _check_options(
     frame: str | None, yaw_deg: float | str | None, clock_offset_s: float | None
 ) -> None:
     if frame is not None and frame not in FRAMES:
-        raise SettingsError(
-            f"--position-frame {frame}: not a known frame. Choose from {', '.join(FRAMES)}."
-        )
+        raise SettingsError(f"`frame` {frame}: not a known frame. Choose from {', '.join(FRAMES)}.")
     if isinstance(yaw_deg, str):
         if yaw_deg != "auto":
-            raise SettingsError(f"--position-yaw {yaw_deg}: give degrees, or auto.")
+            raise SettingsError(f"`yaw_deg` {yaw_deg}: give degrees, or auto.")
     elif yaw_deg is not None and not np.isfinite(yaw_deg):
-        raise SettingsError(f"--position-yaw {yaw_deg:g} is not a finite number.")
+        raise SettingsError(f"`yaw_deg` {yaw_deg:g} is not a finite number.")
     if clock_offset_s is not None and not np.isfinite(clock_offset_s):
-        raise SettingsError(f"--clock-offset {clock_offset_s:g} is not a finite number.")
+        raise SettingsError(f"`clock_offset_s` {clock_offset_s:g} is not a finite number.")

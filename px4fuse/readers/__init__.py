@@ -42,7 +42,7 @@ def read_log(path: str | Path, *, system: int | None = None) -> Flight:
     # each reader is imported when its format is met: pyulog and pymavlink cost time
     if head.startswith(ULOG_MAGIC):
         if system is not None:
-            raise SettingsError(f"{name}: --system is for MAVLink recordings; this is a ULog.")
+            raise SettingsError(f"{name}: `system` is for MAVLink recordings; this is a ULog.")
         from px4fuse.readers.ulog import read_ulog  # noqa: PLC0415
 
         return read_ulog(path)

@@ -216,7 +216,7 @@ def choose_autopilot(frames: Frames, system: int | None) -> tuple[Address, str]:
         if not candidates:
             have = ", ".join(str(number) for number in sorted({s[0] for s in flying})) or "none"
             raise SettingsError(
-                f"{frames.name}: --system {system}: no autopilot has this system id; autopilots "
+                f"{frames.name}: `system` {system}: no autopilot has this system id; autopilots "
                 f"in the file: {have}."
             )
     best = max(candidates, key=lambda address: counts.get(address, 0))

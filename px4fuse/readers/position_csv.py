@@ -32,7 +32,7 @@ from px4fuse.readers.position_names import (
     meaning,
 )
 from px4fuse.readers.position_table import (
-    COLUMNS_OPTION,
+    COLUMNS,
     ISO_TIME,
     MIN_COLUMNS,
     MISSING,
@@ -160,7 +160,7 @@ def read_position_csv(
         raise LogError(
             f"{name}: usable rows: {len(keep)}, at least {MIN_ROWS} are needed"
             f"{''.join('; ' + note for note in notes)}. Copy the file again, or say where time and "
-            f"position are with {COLUMNS_OPTION}."
+            f"position are with {COLUMNS}."
         )
     numbers = numbers.iloc[keep].set_index(pd.Index(seconds[keep], name="time_s"))
     step = float(np.median(np.diff(numbers.index)))
@@ -200,16 +200,16 @@ def _check_options(
     columns: tuple[str, ...] | None, time_unit: str | None, length_unit: str | None
 ) -> None:
     """Refuse option values that are wrong for any file."""
-    for option, value, units in (
-        ("--position-time-unit", time_unit, TIME_UNITS),
-        ("--position-unit", length_unit, LENGTH_UNITS),
+    for name, value, units in (
+        ("time_unit", time_unit, TIME_UNITS),
+        ("length_unit", length_unit, LENGTH_UNITS),
     ):
         if value is not None and value not in units:
-            raise SettingsError(f"{option}: {value!r} is not one of {', '.join(units)}.")
+            raise SettingsError(f"`{name}`: {value!r} is not one of {', '.join(units)}.")
     given = [column.strip().casefold() for column in columns or ("1", "2", "3")]
     if not 3 <= len(given) <= 5 or "" in given or len(set(given)) < len(given):
         raise SettingsError(
-            f"{COLUMNS_OPTION}[,SIGMA]: {','.join(given)!r} does not name four or five different "
+            f"{COLUMNS}[,SIGMA]: {','.join(given)!r} does not name four or five different "
             "columns (three where there is no height)."
         )
 
@@ -317,7 +317,7 @@ def _resolve(columns: tuple[str, ...], table: Table, width: int) -> list[int]:
             raise SettingsError(table.not_found(f"column {quote(column)}"))
         found.append(names.index(wanted) if wanted in names else int(wanted) - 1)
     if len(set(found)) < len(found):
-        raise SettingsError(f"{COLUMNS_OPTION}: {quote(','.join(columns))} names one column twice.")
+        raise SettingsError(f"{COLUMNS}: {quote(','.join(columns))} names one column twice.")
     return found
 
 
@@ -405,7 +405,7 @@ def _name_text(table: Table, choice: _Choice, texts: pd.DataFrame) -> str:
         table.file,
         table.first_line + row,
         f"{table.label(column)}: {quote(str(texts[column].iloc[row]))} is not a {kind}",
-        f"Correct or remove that line, or say where time and position are with {COLUMNS_OPTION}.",
+        f"Correct or remove that line, or say where time and position are with {COLUMNS}.",
     )
 
 

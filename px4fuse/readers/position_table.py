@@ -12,7 +12,7 @@ from px4fuse.errors import LogError
 from px4fuse.readers.position_names import find_position, meaning
 from px4fuse.readers.text_table import NUMBER, quote, text_of
 
-COLUMNS_OPTION = "--position-columns TIME,X,Y,Z"
+COLUMNS = "`columns` TIME,X,Y,Z"
 
 # The layout is decided from the first lines, up to both of these
 HEAD_LINES = 1000
@@ -35,7 +35,7 @@ def plain_text(name: str, content: bytes) -> str:
     if text is None:
         raise LogError(
             f"{name}: a binary file, not a text table. Give the CSV file of the UWB system; a "
-            "flight log is read without --position."
+            "flight log is read without `position`."
         )
     if '"' in text:  # what looks like a separator is none within a quoted field: "1,5"
         quoted = re.compile(r'(?<![^,;\t\n ])"([^"\n]*)"(?![^,;\t\n ])')
@@ -69,10 +69,7 @@ class Table:
     def not_found(self, what: str) -> str:
         """Say that a column is not there, and which are."""
         names = self.labels(range(len(self.names))) or "unnamed"
-        return (
-            f"{self.file}: no {what} found (the columns are {names}). "
-            f"Name them with {COLUMNS_OPTION}."
-        )
+        return f"{self.file}: no {what} found (the columns are {names}). Name them with {COLUMNS}."
 
     def column(self, index: int) -> list[str]:
         """Texts of one column in the first rows, without those for missing values."""
@@ -149,7 +146,7 @@ def find_table(file: str, text: str, columns: tuple[str, ...] | None) -> Table:
         raise LogError(
             f"{file}: the header names {len(names)} columns, but rows have {table.width()}"
             f"{', as with a decimal comma between commas' if is_double else ''}. Export it with "
-            f"semicolons, or give the columns' numbers with {COLUMNS_OPTION}."
+            f"semicolons, or give the columns' numbers with {COLUMNS}."
         )
     return table
 

@@ -29,6 +29,7 @@ from px4fuse.report.style import (
     TIME_LABEL,
     Cursor,
     legend_beside_title,
+    level,
     page,
     panel,
     thin,
@@ -83,16 +84,11 @@ def draw(document: Document) -> Iterator[Figure]:
             beside, "Autocorrelation", _white_words(series), BELOW,
             left=MIDDLE + 0.05,
         )  # fmt: skip
-        # the sentences above may differ in their lines, the axes shall not
-        lower = min(cursor.y, beside.y)
-        for axes in (left, right):
-            box = axes.get_position()
-            axes.set_position((box.x0, lower, box.width, box.height))
+        cursor.y = level((left, right))
         _histogram(left, series)
         _autocorrelation(right, series)
         for axes in (left, right):
             legend_beside_title(axes, top, handlelength=1.4)
-        cursor.y = lower
         cursor.skip(40)
     else:
         cursor.write(f"Along {along}: {_reason(result)}.")

@@ -12,7 +12,6 @@ from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.signals import AISLE
 from px4fuse.findings import Finding
 from px4fuse.flight import Unavailable
-from px4fuse.plain import number_words
 from px4fuse.report.document import Document
 from px4fuse.report.plan import plan
 from px4fuse.report.style import (
@@ -30,7 +29,10 @@ from px4fuse.report.style import (
 from px4fuse.report.words import (
     clock_words,
     consequences_words,
+    difference_cells,
+    error_cells,
     settings_words,
+    statement_cells,
     verdict_words,
 )
 
@@ -129,7 +131,7 @@ def _verdict(figure: Figure, cursor: Cursor, document: Document) -> None:
     if isinstance(result.difference, Difference):
         part = result.difference
         cursor.write(
-            f"Ours - EKF2: {part.position_rmse_m:.3f} m and {part.velocity_rmse_m_s:.3f} m/s RMS, "
+            f"Ours - EKF2: {' m and '.join(difference_cells(part))} m/s RMS, "
             f"at most {part.position_maximum_m:.2f} m."
             + ("" if document.truth_known else " The log has no truth to say who is right."),
             size=8.0,
@@ -143,18 +145,13 @@ def _verdict(figure: Figure, cursor: Cursor, document: Document) -> None:
 def _large_numbers(summary: FilterSummary, truth: AgainstTruth | Unavailable) -> str:
     statement = summary.consistency
     if isinstance(statement, Consistency):
-        low, high = statement.nis_band
-        words = (
-            f"Mean NIS {number_words(statement.nis_mean)}, band {low:.2f} to {high:.2f}, from "
-            f"{statement.count} innovations."
-        )
+        cells = statement_cells(statement)
+        words = f"Mean NIS {cells.nis}, band {cells.band}, from {statement.count} innovations."
     else:
         words = f"{statement.reason}."
     if isinstance(truth, AgainstTruth):
-        words += f" {truth.position_rmse_m:.3f} m"
-        if truth.velocity_rmse_m_s is not None:
-            words += f" and {truth.velocity_rmse_m_s:.3f} m/s"
-        words += " RMS from the truth."
+        position, velocity = error_cells(truth)
+        words += f" {position} m{f' and {velocity} m/s' if velocity else ''} RMS from the truth."
     return words
 
 
@@ -178,12 +175,11 @@ def _other_axes(figure: Figure, cursor: Cursor, document: Document) -> None:
     cursor.rule()
     colours = ["black", *[OURS] * 3, *[EKF2] * 3, "black"]
     for result in others:
-        difference = result.difference
         cells = (
             result.axis.name,
             *_cells(result.kf, result.kf_truth),
             *(_cells(result.ekf2, result.ekf2_truth) if beside else blank),
-            f"{difference.position_rmse_m:.3f}" if isinstance(difference, Difference) else "",
+            difference_cells(result.difference)[0],
         )
         _row(figure, cursor, cells, colours)
 
@@ -203,11 +199,11 @@ def _cells(
 ) -> tuple[str, str, str]:
     if isinstance(summary, Unavailable):
         return "not available", "", ""
-    statement = summary.consistency
+    cells = statement_cells(summary.consistency)
     return (
-        verdict_words(statement),
-        number_words(statement.nis_mean) if isinstance(statement, Consistency) else "",
-        f"{truth.position_rmse_m:.3f}" if isinstance(truth, AgainstTruth) else "",
+        cells.words,
+        cells.nis,
+        error_cells(truth)[0],
     )
 
 

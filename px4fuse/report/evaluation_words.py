@@ -173,7 +173,7 @@ def growth_words(rpe: tuple[RelativeError, ...]) -> str:
     ratio = high / low
     unit = next(unit for unit, found in by_unit.items() if found is several)
     return (
-        f"{boxes} From {low:g} to {high:g} {unit}, {ratio:.3g} times, the RMSE grows "
-        f"{large / small:.2g} times: 1 is noise of each pose, {np.sqrt(ratio):.2g} a random walk, "
-        f"{ratio:.3g} a wrong scale or heading."
+        f"{boxes} From {low:g} to {high:g} {unit}, {ratio:.3g} times, the RMSE is "
+        f"{large / small:.2g} times as large: 1 is noise of each pose, {np.sqrt(ratio):.2g} a "
+        f"random walk, {ratio:.3g} a wrong scale or heading."
     )

@@ -140,15 +140,13 @@ def _zooms(cursor: Cursor, document: Document) -> None:
     axes.set_xlabel(TIME_LABEL)
     start.set_xlabel("time (s)")
     cursor.skip(22)
-    below(
-        cursor,
-        "Line: our filter, predict and update; grey ticks: measurements. "
-        + (
-            "EKF2: triangle up just before an update, down just after, square as logged."
-            if isinstance(result.ekf2_innovations, pd.DataFrame)
-            else ""
-        ),
-    )
+    shown = []
+    if isinstance(result.ekf2_innovations, pd.DataFrame):
+        shown += ["triangle up just before an update", "down just after"]
+    if isinstance(result.ekf2_variance, pd.DataFrame):
+        shown.append("square as logged")
+    ekf2 = f" EKF2: {', '.join(shown)}." if shown else ""
+    below(cursor, f"Line: our filter, predict and update; grey ticks: measurements.{ekf2}")
 
 
 def _limit(result: AxisComparison) -> float:

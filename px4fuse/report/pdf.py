@@ -6,7 +6,6 @@ import io
 from collections.abc import Iterator
 from importlib import metadata
 
-from matplotlib.artist import Artist
 from matplotlib.backends.backend_pdf import PdfPages
 from matplotlib.figure import Figure
 from matplotlib.text import Text
@@ -111,15 +110,15 @@ def _running_lines(figure: Figure, document: Report, number: int, count: int) ->
 
 
 def _without_ligatures(figure: Figure) -> None:
-    """Draw "fi" as two letters: a ligature takes a second copy of its font into the file."""
-    drawn: list[Artist] = list(figure.texts)
-    for legend in (*figure.legends, *(axes.get_legend() for axes in figure.axes)):
-        drawn += [] if legend is None else legend.get_texts()
+    """Draw "fi" as two letters: a ligature costs every font a second file in the PDF."""
+    texts = list(figure.texts)
+    legends = [*figure.legends, *(axes.get_legend() for axes in figure.axes)]
+    texts += [text for legend in legends if legend is not None for text in legend.get_texts()]
     for axes in figure.axes:
-        drawn += [axes.xaxis.label, axes.yaxis.label, *axes.get_children()]
-    for artist in drawn:
-        if isinstance(artist, Text) and hasattr(artist, "set_fontfeatures"):
-            artist.set_fontfeatures(("-liga",))  # before 3.11 matplotlib knew none
+        titles = [child for child in axes.get_children() if isinstance(child, Text)]
+        texts += [*titles, axes.xaxis.label, axes.yaxis.label]
+    for text in texts:
+        text.set_fontfeatures(("-liga",))
 
 
 def _attach(drawn: bytes, document: Report, results_json: str) -> bytes:

@@ -17,7 +17,7 @@ from px4fuse.comparison.events import Span
 from px4fuse.filter.fitting import FIRST_WIDTH
 from px4fuse.filter.likelihood import States, preintegrate, states, total_over_grid
 from px4fuse.filter.signals import AISLE
-from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise
+from px4fuse.filter.tuning import HORIZONTAL, MIN_MEASUREMENTS, AxisTuning, Noise
 from px4fuse.flight import Unavailable
 from px4fuse.plain import factor_words, number_words
 from px4fuse.report import marks
@@ -35,6 +35,7 @@ from px4fuse.report.style import (
     below,
     empty,
     legend_beside_title,
+    level,
     page,
     panel,
     thin,
@@ -64,22 +65,25 @@ COARSE_POINTS, FINE_POINTS = 14, 11
 MARGIN, FINE_REACH = 1.3, 2.3
 # Tracks further apart than this share of what the knobs do are not the same
 LITTLE_APART = 0.1
+SAME_GAIN = 0.02
 WINDOW_S, WINDOW_STEP_S = 20.0, 0.5
 # Heights of the axes in points
 MAP, TRACK = 150.0, 88.0
 MIDDLE = 0.53
 THICK: dict[str, Any] = {"color": OURS_BAND, "lw": 4.0, "ls": "-", "solid_capstyle": "butt"}
 THIN: dict[str, Any] = {"color": OURS, "lw": 1.0, "ls": (0, (4, 1.6))}
+CHOSEN: dict[str, Any] = {"color": "black", "marker": "X", "mec": "white", "mew": 0.8, "ms": 8.0,
+                          "ls": "none"}  # fmt: skip
 OF_A: dict[str, Any] = {"color": OURS, "marker": "o", "ms": 5.0, "mew": 0, "ls": "none"}
 OF_Z: dict[str, Any] = {"color": "black", "marker": "s", "ms": 8.0, "mew": 0.8, "mfc": "none",
                         "ls": "none"}  # fmt: skip
 
 
 def draw(document: Document) -> Iterator[Figure]:
-    """Draw one page; none where nothing was tuned."""
-    if not document.analysis.tuning:
-        return
+    """Draw one page; none where nothing was tuned, or the start is not forgotten."""
     result, settings = document.comparison.main, document.comparison.settings
+    if not document.analysis.tuning or len(result.replay.updates) < MIN_MEASUREMENTS:
+        return
     name = result.axis.name
     figure, cursor = page(
         "Appendix: what the knobs do",
@@ -93,10 +97,9 @@ def draw(document: Document) -> Iterator[Figure]:
     run = states(preintegrate(result.axis, settings), *(chosen[:, None] * factors))
     curve = _settled(run.gain)
     beside = Cursor(figure, cursor.y)
-    _map(cursor, document)
-    _gains(beside, ratio, curve)
+    level((_map(cursor, document), _gains(beside, ratio, curve)))
     cursor.y = min(cursor.y, beside.y)
-    cursor.skip(8)
+    cursor.skip(60)
     window = _window(
         result, run.velocity_m_s[:, 0], [*document.events.gaps, *document.events.dropouts]
     )
@@ -123,7 +126,7 @@ def draw(document: Document) -> Iterator[Figure]:
     yield figure
 
 
-def _map(cursor: Cursor, document: Document) -> None:
+def _map(cursor: Cursor, document: Document) -> Axes:
     """Likelihood of every pair, with the lines on which the gain is the same."""
     tuning, settings = document.analysis.tuning, document.comparison.settings
     main = document.comparison.main.axis.name
@@ -131,8 +134,9 @@ def _map(cursor: Cursor, document: Document) -> None:
     found = tuning[name]
     title = f"How likely the innovations are ({name})"
     if isinstance(found, Unavailable):
-        empty(panel(cursor, title, "", MAP, right=MIDDLE - 0.03), f"No map: {found.reason}.")
-        return
+        axes = panel(cursor, title, "", MAP, right=MIDDLE - 0.03)
+        empty(axes, f"No map: {found.reason}.")
+        return axes
     axes = panel(cursor, title, _map_words(found), MAP, right=MIDDLE - 0.03)
     best = _point(found.filter_sigma_a), _point(found.sigma_z)
     grids, shown = [], []
@@ -156,8 +160,7 @@ def _map(cursor: Cursor, document: Document) -> None:
     for (_, of_a, of_z), style in zip(SETTINGS[1:], (OF_A, OF_Z, OF_A, OF_Z), strict=True):
         axes.plot(settings.sigma_z_m * of_z, settings.sigma_a_m_s2 * of_a, **style | {"ms": 4.0})
     axes.plot(best[1], best[0], "o", color="white", mec="black", ms=6.0, label="asked for")
-    axes.plot(settings.sigma_z_m, settings.sigma_a_m_s2, "X", color="#e0741a", mec="black",
-              mew=0.6, ms=7.0, label="chosen")  # fmt: skip
+    axes.plot(settings.sigma_z_m, settings.sigma_a_m_s2, **CHOSEN, label="chosen")
     axes.set_xscale("log")
     axes.set_yscale("log")
     axes.set_ylim(*shown[0])
@@ -178,15 +181,17 @@ def _map(cursor: Cursor, document: Document) -> None:
         handles=[*shades, *axes.get_legend_handles_labels()[0]], loc="upper left", ncols=4,
         bbox_to_anchor=(-0.1, -0.2), borderaxespad=0.0, handlelength=1.2, columnspacing=1.0,
     )  # fmt: skip
-    cursor.skip(52)
+    return axes
 
 
 def _map_words(found: AxisTuning) -> str:
     lost = number_words(max(found.gain_nats * found.count, 0.0), 2)
+    wanders = found.noises.walk_m > found.noises.sigma_z_m
+    wander = " What the source wanders is not in them." if wanders else ""
     return (
         f"Asked for: SIGMA_A {_words(found.filter_sigma_a, 'm/s²')}, SIGMA_Z "
         f"{_words(found.sigma_z, 'm')}. The chosen pair lies {lost} below (ln). Along a dotted "
-        "line the gain is the same."
+        f"line the gain is the same.{wander}"
     )
 
 
@@ -234,19 +239,21 @@ def _round_ticks(axes: Axes) -> None:
         axis.set_minor_formatter(NullFormatter())
 
 
-def _gains(cursor: Cursor, ratio: float, gains: Array) -> None:
+def _gains(cursor: Cursor, ratio: float, gains: Array) -> Axes:
     """Settled gain over the ratio: a curve, on which both knobs stand."""
     at = [ratio * a / z for _, a, z in SETTINGS]
     say = (
         f"{gains[0]:.2f} as chosen; {gains[1]:.2f} with four times SIGMA_A and {gains[2]:.2f} with "
         f"a quarter of SIGMA_Z; {gains[3]:.2f} with a quarter of SIGMA_A and {gains[4]:.2f} with "
-        "four times SIGMA_Z: each square holds its circle."
+        "four times SIGMA_Z."
     )
+    if np.allclose(gains[[1, 3]], gains[[2, 4]], atol=SAME_GAIN):
+        say = f"{say[:-1]}: each square holds its circle."
     axes = panel(cursor, "Gain of position, settled, over the ratio", say, MAP, left=MIDDLE + 0.04)
     axes.plot(ratio * CURVE, gains[len(SETTINGS) :], color=MUTED, lw=1.0)
     axes.plot(np.array(at)[[1, 3]], gains[[1, 3]], **OF_A, label="SIGMA_A × or / 4")
     axes.plot(np.array(at)[[2, 4]], gains[[2, 4]], **OF_Z, label="SIGMA_Z / or × 4")
-    axes.plot(at[0], gains[0], "X", color="#e0741a", mec="black", mew=0.6, ms=7.0, label="chosen")
+    axes.plot(at[0], gains[0], **CHOSEN, label="chosen")
     axes.set_xscale("log")
     axes.set_xlim(ratio * CURVE[0], ratio * CURVE[-1])
     axes.set_ylim(0.0, 1.0)
@@ -256,7 +263,7 @@ def _gains(cursor: Cursor, ratio: float, gains: Array) -> None:
     axes.set_xlabel("SIGMA_A / SIGMA_Z (1/s²)")
     axes.legend(loc="upper left", ncols=3, bbox_to_anchor=(-0.08, -0.2), borderaxespad=0.0,
                 handlelength=1.0, columnspacing=1.0)  # fmt: skip
-    cursor.skip(40)
+    return axes
 
 
 def _settled(values: Array) -> Array:
@@ -271,7 +278,7 @@ def _apart_words(run: States, pair: tuple[int, int]) -> str:
     moved = float(np.sqrt(np.mean((settled[:, pair[0]] - settled[:, 0]) ** 2)))
     same = "Less than 0.001" if apart < 0.0005 else f"{apart:.3f}"
     why = (
-        " What gaps of the IMU add to the variance does not scale with them."
+        " What the start and gaps of the IMU add to the variance does not scale with them."
         if apart > LITTLE_APART * moved
         else ""
     )
@@ -336,7 +343,7 @@ def _table(cursor: Cursor, result: AxisComparison, run: States, chosen: Array) -
     if truth is not None:
         error = run.velocity_m_s[half, :count] - np.interp(time[half], *truth)[:, None]
         rmse = np.sqrt(np.mean(error**2, axis=0))
-        columns.append(("v RMSE to truth (m/s)", [f"{value:.3f}" for value in rmse]))
+        columns.append(("v RMSE (m/s)", [f"{value:.3f}" for value in rmse]))
     cursor.write("One track, two claims", size=9.0, weight="bold")
     cursor.write(
         f"With four times SIGMA_A σ_p is {factor_words(sigmas[1] / sigmas[2])} times what it is "

@@ -104,6 +104,7 @@ def report_style(outside: str = "") -> Iterator[None]:
                 "legend.handlelength": 2.4,
                 "text.parse_math": False,
                 "pdf.fonttype": 42,
+                "ps.fonttype": 42,  # by which the PDF too is cut: one file per font, not two
                 "pdf.compression": 6,
                 "path.simplify": True,
                 "path.simplify_threshold": 0.5,
@@ -339,6 +340,15 @@ def panel(
     axes.xaxis.set_major_locator(MaxNLocator(8))
     axes.yaxis.set_major_locator(MaxNLocator(4))
     return axes
+
+
+def level(beside: Sequence[Axes]) -> float:
+    """Move axes that stand beside one another to the lowest of them; returns how low that is."""
+    lowest = min(float(axes.get_position().y0) for axes in beside)
+    for axes in beside:
+        box = axes.get_position()
+        axes.set_position((box.x0, lowest, box.width, box.height))
+    return lowest
 
 
 def legend_beside_title(axes: Axes, top: float, **options: Any) -> None:

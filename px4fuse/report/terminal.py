@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 
 from rich.console import Console
 from rich.table import Table
@@ -11,7 +11,6 @@ from rich.text import Text
 from px4fuse.comparison.comparison import Difference
 from px4fuse.comparison.why import Why
 from px4fuse.filter.consistency import Consistency
-from px4fuse.filter.signals import AISLE
 from px4fuse.findings import Finding, Severity
 from px4fuse.flight import Unavailable
 from px4fuse.report.commands import runnable
@@ -28,6 +27,7 @@ from px4fuse.report.words import (
     consequences_words,
     difference_cells,
     error_cells,
+    finding_words,
     settings_words,
     statement_cells,
     verdict_notes,
@@ -56,6 +56,9 @@ def print_summary(
     """
     comparison = document.comparison
     log = comparison.flight.log
+    for sentence in document.story:
+        say(console, sentence)
+    console.print()
     opponent = "" if isinstance(comparison.flight.ekf2, Unavailable) else ", against EKF2"
     names = " + ".join([log.name, *(file.name for file in comparison.flight.inputs)])
     print_line(console, "Log", f"{names}, {log.firmware}, {log.duration_s:.1f} s")
@@ -80,7 +83,9 @@ def print_summary(
     say(console, Text(LEGEND, "dim"))
     for note in verdict_notes(comparison):
         say(console, Text(note, "dim"))
-    print_why(console, document.analysis.why)
+    why = document.analysis.why.get(comparison.main.axis.name)
+    if why is not None and not _told(why, document.story):
+        print_why(console, why)
     if not document.findings:
         say(console, "No findings.")
     for finding in document.findings[:MOST_FINDINGS]:
@@ -91,15 +96,19 @@ def print_summary(
         print_file(console, "Report", report)
 
 
-def print_why(console: Console, why: Mapping[str, Why | Unavailable]) -> None:
-    """Print in one sentence why EKF2 differs, along the aisle where there is one."""
-    if not why:
-        return
-    found = why.get(AISLE, next(iter(why.values())))
-    if isinstance(found, Unavailable):
-        print_line(console, "Why", f"EKF2 differs is not known: {found.reason}.", "dim")
+def print_why(console: Console, why: Why | Unavailable) -> None:
+    """Print in one sentence why EKF2 differs."""
+    if isinstance(why, Unavailable):
+        print_line(console, "Why", f"EKF2 differs is not known: {why.reason}.", "dim")
     else:
-        print_line(console, "Why", found.sentences[0])
+        print_line(console, "Why", why.sentences[0])
+
+
+def _told(why: Why | Unavailable, story: tuple[str, ...]) -> bool:
+    """Whether the story has the sentence, which it cuts where it names the moment."""
+    if isinstance(why, Unavailable):
+        return False
+    return any(why.sentences[0].startswith(sentence.removesuffix(".")) for sentence in story)
 
 
 def print_advice(console: Console, lines: Iterable[str], request: Request) -> None:
@@ -114,7 +123,7 @@ def print_advice(console: Console, lines: Iterable[str], request: Request) -> No
 def print_finding(console: Console, finding: Finding, request: Request) -> None:
     """Print severity, sentence, remedy and the commands that the remedy names."""
     head = Text(finding.severity.ljust(INDENT), STYLES[finding.severity])
-    say(console, finding.message, head, INDENT)
+    say(console, finding_words(finding), head, INDENT)
     remedy, commands = runnable(finding.remedy, request)
     print_line(console, "", remedy, "dim")
     if finding.consequences:
@@ -133,7 +142,8 @@ def _table(document: Document) -> Table:
         *((("apart\n(m)", "right"), ("\n(m/s)", "right")) if ekf2 else ()),
         *((("to truth\n(m)", "right"), ("\n(m/s)", "right")) if truth else ()),
     )  # fmt: skip
-    for result in sorted(comparison.axes, key=lambda result: result.axis.name != AISLE):
+    main = comparison.main
+    for result in (main, *(result for result in comparison.axes if result is not main)):
         for owner, summary, against in (
             ("ours", result.kf, result.kf_truth), ("EKF2", result.ekf2, result.ekf2_truth),
         ):  # fmt: skip

@@ -148,6 +148,12 @@ def _same_nis(stated: list[tuple[str, str, Consistency]]) -> Iterator[str]:
                 )
 
 
+def finding_words(finding: Finding) -> str:
+    """What a finding says, with when it shows where the message does not say that."""
+    told = any(f"{time:.1f} s" in finding.message for span in finding.spans_s for time in span)
+    return finding.message if told or not finding.when else f"{finding.message} At {finding.when}."
+
+
 def consequences_words(finding: Finding) -> str:
     """What the same cause brings with it, each in one sentence."""
     return "With it: " + " ".join(f"{one.headline}." for one in finding.consequences)
@@ -228,7 +234,8 @@ def tuning_advice(
         if noise.value is not None and not drifts
     ]
     if options:
-        lines.append(f"Re-run   px4fuse compare LOG {' '.join(options)} ({name})")
+        typed = f"px4fuse compare LOG {' '.join(options)}"
+        lines.append(f"Re-run   with the noises of {name}: {typed}")
     now = comparison.flight.log.parameters.get("EKF2_EVP_NOISE")
     if found.sigma_z.value is None and found.sigma_z.low is not None:
         lines.append(

@@ -25,7 +25,6 @@ MIN_SHARE, MIN_SPREAD_M = 1e-6, 1e-6
 # The turn's standard deviation is residual / (spread · √n). Two spreads of mere noise leave √2 of
 # one as residual in the plane, and √6 around a line: chance decides the turn
 MAX_PLANE_RATIO, MAX_LINE_RATIO = 1.0, 2.0
-_OPTION = "--alignment"
 
 
 @dataclass(frozen=True)
@@ -77,7 +76,7 @@ def fit(estimate_m: Array, reference_m: Array, kind: AlignmentKind) -> Transform
     if len(estimate_m) < MIN_POSES:
         raise TrajectoryError(
             f"Only {len(estimate_m)} poses match in time: an alignment needs {MIN_POSES}. Check "
-            "that both are of the same flight, and their clocks (--time-offset auto)."
+            "that both are of the same flight, and their clocks (`time_offset_s` auto)."
         )
     if kind == "none":
         return Transform(Rotation.identity(), np.zeros(3), 1.0, 0)
@@ -141,7 +140,7 @@ def _check_yaw(transform: Transform, x: Array, y: Array, reference_m: Array) -> 
         raise TrajectoryError(
             f"The horizontal motion is {moved:.2g} m (RMS) and what an alignment leaves is "
             f"{left:.2g} m: a yaw cannot be found from it. The vehicle did not move, or the "
-            f"estimate does not follow; {_OPTION} none compares without turning."
+            f"estimate does not follow; `alignment` none compares without turning."
         )
 
 
@@ -158,12 +157,12 @@ def _check_turn(
     rms = float(np.sqrt((left * left).sum(axis=1).mean()))
     if length < MIN_SPREAD_M or _spread(estimate_m)[0] < MIN_SPREAD_M:
         raise TrajectoryError(
-            f"One of the two does not move, so {kind} cannot be found from it. {_OPTION} none "
+            f"One of the two does not move, so {kind} cannot be found from it. `alignment` none "
             "compares without turning."
         )
     if width < MIN_SHARE * length or rms > MAX_LINE_RATIO * width:
         raise TrajectoryError(
             f"The motion is along a line: {length:.2g} m (RMS) by {width:.2g} m across it, where "
             f"an alignment leaves {rms:.2g} m, so the turn about that line and with it {kind} "
-            f"cannot be found. Use {_OPTION} yaw if z is vertical in both, or {_OPTION} none."
+            f"cannot be found. Use `alignment` yaw if z is vertical in both, or `alignment` none."
         )

@@ -9,6 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Slerp
 
 from px4fuse.arrays import Array, BoolArray, IntArray
+from px4fuse.display import brief
 from px4fuse.errors import TrajectoryError
 from px4fuse.trajectory.model import MIN_POSES, Trajectory
 
@@ -54,6 +55,8 @@ class Association:
     in_gaps: int
     coverage_estimate: float
     coverage_reference: float
+
+    __repr__ = brief
 
     def __len__(self) -> int:
         return len(self.estimate)
@@ -184,6 +187,6 @@ def _no_overlap(
     return (
         f"{estimate.name}: {what} in time: it spans {time_s[0]:.3f} to {time_s[-1]:.3f} s{added}, "
         f"the reference {reference.name} {reference.time_s[0]:.3f} to {reference.time_s[-1]:.3f} "
-        "s. Check that both are of the same flight; if their clocks differ, give --time-offset "
-        "auto."
+        "s. Check that both are of the same flight; if their clocks differ, give "
+        "`time_offset_s` auto."
     )

@@ -15,6 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from px4fuse.arrays import Array
+from px4fuse.display import Shown
 from px4fuse.errors import TrajectoryError
 from px4fuse.flight import Unavailable
 from px4fuse.trajectory.alignment import AlignmentKind, Transform, fit, umeyama
@@ -53,8 +54,8 @@ class AbsoluteError:
     rotation: Statistics | Unavailable
 
 
-@dataclass(frozen=True)
-class Evaluation:
+@dataclass(frozen=True, repr=False)
+class Evaluation(Shown):
     """An estimate's scores against a reference.
 
     Attributes

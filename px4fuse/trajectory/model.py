@@ -10,6 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from px4fuse.arrays import Array, BoolArray, IntArray
+from px4fuse.display import Shown
 
 # What made it; "slam" is a system whose world is its first key frame (ORB-SLAM3 and the like)
 Kind = Literal["vio", "ekf2", "kf", "truth", "slam", "unknown"]
@@ -25,8 +26,8 @@ AXES_OF_FRAME: Mapping[Frame, tuple[str, str, str]] = {
 }
 
 
-@dataclass(frozen=True)
-class Trajectory:
+@dataclass(frozen=True, repr=False)
+class Trajectory(Shown):
     """Poses over time.
 
     Attributes

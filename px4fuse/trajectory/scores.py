@@ -14,6 +14,7 @@ from scipy.stats import norm
 from scipy.stats import t as student_t
 
 from px4fuse.arrays import Array, IntArray
+from px4fuse.display import Shown
 from px4fuse.errors import SettingsError
 from px4fuse.flight import Unavailable
 from px4fuse.trajectory.correlation import autocovariance
@@ -77,8 +78,8 @@ class Interval:
     blocks: float
 
 
-@dataclass(frozen=True)
-class RelativeError:
+@dataclass(frozen=True, repr=False)
+class RelativeError(Shown):
     """RPE over one delta.
 
     Attributes

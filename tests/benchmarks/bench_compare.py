@@ -4,17 +4,30 @@ The floor is what the same libraries need for the same file and the same number 
 reads the same topics, matplotlib saves empty pages. Both run in turn, so that the ratio holds on a
 machine whose speed drifts. Nothing here can fail: run it, read it.
 
-    python tests/benchmarks/bench_compare.py [RUNS]
+    python tests/benchmarks/bench_compare.py [RUNS] [--log FULL.ulg] [--px4 SCRIPT]
+
+``--log`` is a flight with all its topics, of some megabytes, on which compare is measured against
+PX4's own report. That is ``Tools/ecl_ekf/process_logdata_ekf.py`` of PX4-Autopilot, which is not
+shipped here::
+
+    git clone --depth 1 --filter=blob:none --sparse https://github.com/PX4/PX4-Autopilot
+    git -C PX4-Autopilot sparse-checkout set Tools/ecl_ekf
+
+Then ``--px4 PX4-Autopilot/Tools/ecl_ekf/process_logdata_ekf.py``; it needs pyulog, numpy, scipy and
+matplotlib, runs on a copy of the log and writes its PDF beside that. Without it a stand-in does
+what it has to do at least: pyulog reads every topic, matplotlib draws thirty pages of four panels.
 """
 
 from __future__ import annotations
 
+import argparse
+import shutil
 import statistics
-import subprocess
 import sys
 import tempfile
-import time
 from pathlib import Path
+
+from measured import Measured, measured
 
 LOG = Path(__file__).parents[2] / "sample_logs" / "aisle_uwb.ulg"
 FLOOR = """
@@ -28,12 +41,39 @@ with PdfPages(sys.argv[2]) as pdf:
     for _ in range(int(sys.argv[4])):
         pdf.savefig(Figure(figsize=(8.27, 11.69)))
 """
+STAND_IN = """
+import sys
+from itertools import cycle, islice
+from matplotlib.backends.backend_pdf import PdfPages
+from matplotlib.figure import Figure
+from pyulog import ULog
+lines = cycle(
+    (data.data["timestamp"], data.data[name], f"{data.name} {name}")
+    for data in ULog(sys.argv[1]).data_list
+    for name in data.data
+)
+with PdfPages(sys.argv[2]) as pdf:
+    for _ in range(30):
+        page = Figure(figsize=(8.27, 11.69))
+        for axes, (time, values, label) in zip(page.subplots(4).flat, islice(lines, 4)):
+            axes.plot(time, values, label=label)
+            axes.legend()
+            axes.grid()
+        pdf.savefig(page)
+"""
 
 
-def seconds(command: list[str]) -> float:
-    start = time.perf_counter()
-    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
-    return time.perf_counter() - start
+def print_ratio(name: str, ours: list[str], peer: list[str], runs: int, more: str = "") -> None:
+    """Run both in turn, and print the medians of their ratios."""
+    pairs: list[tuple[Measured, Measured]] = [(measured(ours), measured(peer)) for _ in range(runs)]
+    told = []
+    for what in ("wall", "cpu"):
+        a, b = ([getattr(side, f"{what}_s") for side in both] for both in zip(*pairs, strict=True))
+        ratio = statistics.median(x / y for x, y in zip(a, b, strict=True))
+        told.append(
+            f"{ratio:.2f} {what} ({statistics.median(a):.2f} s / {statistics.median(b):.2f} s)"
+        )
+    print(f"{name}: {', '.join(told)}, {runs} pairs{more}")
 
 
 def main() -> None:
@@ -41,28 +81,34 @@ def main() -> None:
 
     from px4fuse.readers.px4_topics import topics
 
-    runs = int(sys.argv[1]) if len(sys.argv) > 1 else 5
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("runs", nargs="?", type=int, default=5)
+    parser.add_argument("--log", type=Path)
+    parser.add_argument("--px4", type=Path)
+    given = parser.parse_args()
+    python = sys.executable
     with tempfile.TemporaryDirectory() as folder:
         report = Path(folder) / "report.pdf"
-        compare = [sys.executable, "-m", "px4fuse", "compare", str(LOG), "-o", str(report)]
-        seconds(compare)  # warm the file cache and count the pages
+        compare = [python, "-m", "px4fuse", "compare", str(LOG), "-o", str(report)]
+        measured(compare)  # warm the file cache and count the pages
         pages = len(PdfReader(report).pages)
-        floor = [
-            sys.executable, "-c", FLOOR, str(LOG), str(Path(folder) / "floor.pdf"),
-            ",".join(topics()), str(pages),
-        ]  # fmt: skip
-        help_command = [sys.executable, "-m", "px4fuse", "--help"]
-        bare = [sys.executable, "-c", "import click"]
-        rows = {
-            "compare / floor": (compare, floor),
-            "--help / python with click": (help_command, bare),
-        }
-        for name, (ours, peer) in rows.items():
-            pairs = [(seconds(ours), seconds(peer)) for _ in range(runs)]
-            ratio = statistics.median(a / b for a, b in pairs)
-            a = statistics.median(a for a, _ in pairs)
-            b = statistics.median(b for _, b in pairs)
-            print(f"{name}: {ratio:.2f} ({a:.2f} s / {b:.2f} s, {runs} pairs, {pages} pages)")
+        floor_pdf = str(Path(folder) / "floor.pdf")
+        floor = [python, "-c", FLOOR, str(LOG), floor_pdf, ",".join(topics()), str(pages)]
+        print_ratio("compare / floor", compare, floor, given.runs, f", {pages} pages")
+        print_ratio(
+            "--help / python with click",
+            [python, "-m", "px4fuse", "--help"],
+            [python, "-c", "import click"],
+            given.runs,
+        )
+        if given.log is None:
+            return
+        log = Path(shutil.copy(given.log, folder))
+        compare = [python, "-m", "px4fuse", "compare", str(log), "-o", str(report)]
+        peer, name = [python, "-c", STAND_IN, str(log), floor_pdf], "all topics and thirty pages"
+        if given.px4 is not None:
+            peer, name = [python, str(given.px4), str(log)], "process_logdata_ekf.py"
+        print_ratio(f"compare / {name}", compare, peer, given.runs)
 
 
 if __name__ == "__main__":

@@ -9,6 +9,7 @@ from scipy import sparse
 from scipy.sparse.csgraph import breadth_first_order, connected_components
 
 from px4fuse.arrays import Array, BoolArray, IntArray
+from px4fuse.display import brief
 from px4fuse.errors import TrajectoryError
 from px4fuse.trajectory.graph import lie
 
@@ -53,6 +54,8 @@ class PoseGraph:
     measurements: Array
     information: Array
     initialised: str = FROM_FILE
+
+    __repr__ = brief
 
     def __post_init__(self) -> None:
         if self.dimension not in {2, 3}:

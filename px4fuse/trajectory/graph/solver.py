@@ -11,6 +11,7 @@ from scipy import sparse
 from scipy.stats import chi2
 
 from px4fuse.arrays import Array, BoolArray
+from px4fuse.display import brief
 from px4fuse.errors import TrajectoryError
 from px4fuse.trajectory.graph import lie
 from px4fuse.trajectory.graph.model import PoseGraph, ranks, require_connected
@@ -64,6 +65,8 @@ class Solution:
     iterations: int
     converged: bool
     weights: Array
+
+    __repr__ = brief
 
 
 @dataclass(frozen=True)

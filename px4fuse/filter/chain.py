@@ -1,0 +1,216 @@
+"""Likelihood of positions under the two-state model, by one banded Cholesky factorisation.
+
+Given the acceleration, the states x_k = [p, v] at the measurements form a chain, and what is known
+of them is a sum of squares: each leg's x_{k+1} - Fx_k - [Δp, Δv] over its Q, and each measurement's
+z - p over its variance. Its matrix A has three bands below the diagonal, so that LAPACK factorises
+a flight in a millisecond; the marginal likelihood of the measurements, which is that of the
+filter's innovations (Schweppe 1965), follows from log|A| and the squares that remain at the
+minimum. Signals that enter linearly (data, or what a bias would add to them) are columns: the
+factorisation does not depend on them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import lapack
+
+from px4fuse.arrays import Array, IntArray
+
+# Position noise of a leg over that of a measurement that is always there: Q has an inverse, also
+# that of a single step, which is of rank one, or without process noise
+LEAST_SHARE = 1e-5
+
+
+@dataclass(frozen=True)
+class Chain:
+    """States at the measurements, and the legs that connect them.
+
+    Attributes
+    ----------
+    end : ndarray of int, shape (n,)
+        State at which each leg ends; it starts at the one before. Where no leg ends, a stretch
+        begins that knows nothing of what was before.
+    length_s : ndarray, shape (n,)
+    noise_unit : ndarray, shape (n, 3)
+        Q's elements 00, 01, 11 for SIGMA_A = 1 m/s².
+    noise_fixed : ndarray, shape (n, 3)
+        What is added to them, whatever SIGMA_A is.
+    """
+
+    end: IntArray
+    length_s: Array
+    noise_unit: Array
+    noise_fixed: Array
+
+
+@dataclass(frozen=True)
+class Columns:
+    """Signals that enter linearly, time last: measurements (..., m), Δp and Δv of the legs.
+
+    Legs have shape (..., n), or (..., m - 1) with any value where a stretch begins.
+    """
+
+    measurement_m: Array
+    delta_position_m: Array
+    delta_velocity_m_s: Array
+
+
+@dataclass(frozen=True)
+class Factor:
+    """The chain for one SIGMA_A and one variance of each measurement, factorised.
+
+    Attributes
+    ----------
+    chain : Chain
+    precision : ndarray, shape (m, 2)
+        Of the measured position (1/m²) and of the velocity, whose measured value is zero (s²/m²);
+        0 where there is none.
+    length_s : ndarray, shape (m - 1,)
+        Between any two states; 0 where a stretch begins.
+    inverse : ndarray, shape (m - 1, 3)
+        Q⁻¹ by elements 00, 01, 11; zero where a stretch begins.
+    bands, lower : ndarray, shape (4, 2m)
+        Bands of A and of its Cholesky factor.
+    log_determinant : float
+        ln|A| + Σ ln|Q| - Σ ln precision: twice the part of -ln p that no signal enters.
+    """
+
+    chain: Chain
+    precision: Array
+    length_s: Array
+    inverse: Array
+    bands: Array
+    lower: Array
+    log_determinant: float
+
+    def whiten(self, columns: Columns) -> tuple[Array, Array]:
+        """Signals such that the products under the inverse covariance are a difference of two.
+
+        Those of the rows, less those of what the states explain, and of the measurements over
+        their sigma besides, which most signals have none of.
+
+        Parameters
+        ----------
+        columns : Columns
+
+        Returns
+        -------
+        rows : ndarray, shape (..., 2m - 2)
+            Legs over their covariance's root, two for each, zero where a stretch begins.
+        explained : ndarray, shape (..., 2m)
+        """
+        dp, dv = self._everywhere(columns)
+        i00, i01, i11 = self.inverse.T
+        # Q⁻¹ = UᵀU; where a stretch begins it is zero
+        u00 = np.sqrt(i00)
+        u01 = np.divide(i01, u00, out=np.zeros_like(i01), where=u00 > 0.0)
+        rows = np.empty((*dp.shape, 2))
+        np.add(u00 * dp, u01 * dv, out=rows[..., 0])
+        np.multiply(np.sqrt(i11 - u01**2), dv, out=rows[..., 1])
+        right = self._right(columns.measurement_m, dp, dv)
+        explained, _ = lapack.dtbtrs(self.lower, right.T, uplo="L", overwrite_b=1)
+        return rows.reshape(*dp.shape[:-1], -1), explained.T.reshape(*dp.shape[:-1], -1)
+
+    def solve(self, columns: Columns) -> Array:
+        """Most likely states: position and velocity, shape (..., m, 2)."""
+        dp, dv = self._everywhere(columns)
+        right = self._right(columns.measurement_m, dp, dv)
+        state, _ = lapack.dpbtrs(self.lower, right.T, lower=1, overwrite_b=1)
+        return np.asarray(state.T.reshape(*dp.shape[:-1], -1, 2))
+
+    def _right(self, measured: Array, dp: Array, dv: Array) -> Array:
+        """The right side of the normal equations, shape (columns, 2m)."""
+        i00, i01, i11 = self.inverse.T
+        right = np.zeros((*dp.shape[:-1], len(self.precision), 2))
+        right[..., 0] = self.precision[:, 0] * measured
+        g0, g1 = i00 * dp + i01 * dv, i01 * dp + i11 * dv
+        right[..., 1:, 0] += g0
+        right[..., 1:, 1] += g1
+        right[..., :-1, 0] -= g0
+        g1 += g0 * self.length_s
+        right[..., :-1, 1] -= g1
+        return right.reshape(-1, 2 * len(self.precision))
+
+    def _everywhere(self, columns: Columns) -> tuple[Array, Array]:
+        """Legs between any two states, whatever where a stretch begins."""
+        dp, dv = columns.delta_position_m, columns.delta_velocity_m_s
+        if dp.shape[-1] == len(self.inverse):
+            return dp, dv
+        made = np.zeros((2, *dp.shape[:-1], len(self.inverse)))
+        made[0][..., self.chain.end - 1], made[1][..., self.chain.end - 1] = dp, dv
+        return made[0], made[1]
+
+    def position_variance(self) -> Array:
+        """Variance of each state's position given all data (m²), shape (m,).
+
+        The information about a state is what all before it and what all after it leave of its own
+        block of A: the Cholesky factor's blocks from either end (Fraser and Potter 1969).
+        """
+        # A with its rows and columns in reverse
+        turned = np.zeros_like(self.bands)
+        for below in range(4):
+            turned[below, : len(turned.T) - below] = self.bands[below, : len(turned.T) - below][
+                ::-1
+            ]
+        behind, _ = lapack.dpbtrf(turned, lower=1, overwrite_ab=1)
+        (a, c), b = (self.lower[0, at::2] for at in (0, 1)), self.lower[1, 0::2]
+        # of the reverse, each block has the velocity first
+        (d, f), e = (behind[0, at::2][::-1] for at in (0, 1)), behind[1, 0::2][::-1]
+        p00 = a**2 + e**2 + f**2 - self.bands[0, 0::2]
+        p01 = a * b + d * e - self.bands[1, 0::2]
+        p11 = b**2 + c**2 + d**2 - self.bands[0, 1::2]
+        return np.asarray(p11 / (p00 * p11 - p01**2))
+
+
+def factorise(chain: Chain, sigma_a_m_s2: float, precision: Array) -> Factor:
+    """Factorise a chain.
+
+    Parameters
+    ----------
+    chain : Chain
+    sigma_a_m_s2 : float
+    precision : ndarray, shape (m,) or (m, 2)
+        Of the measured positions, 1/m², 0 for one that is not used; with a second column, of the
+        velocities around zero.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        A stretch has too few measurements for a position and a velocity.
+    """
+    if precision.ndim == 1:
+        precision = np.stack([precision, np.zeros_like(precision)], 1)
+    q00, q01, q11 = (sigma_a_m_s2**2 * chain.noise_unit + chain.noise_fixed).T
+    measured = precision[:, 0]
+    q00 = q00 + LEAST_SHARE**2 / np.median(measured[measured > 0.0])
+    determinant = q00 * q11 - q01**2
+    count = len(precision)
+    inverse, dt = np.zeros((count - 1, 3)), np.zeros(count - 1)
+    inverse[chain.end - 1] = np.stack([q11, -q01, q00], 1) / determinant[:, None]
+    dt[chain.end - 1] = chain.length_s
+    i00, i01, i11 = inverse.T
+    bands = np.zeros((4, 2 * count))
+    # A = Σ precision + [-F I]ᵀ Q⁻¹ [-F I]
+    position, velocity, cross = precision[:, 0].copy(), precision[:, 1].copy(), np.zeros(count)
+    position[1:] += i00
+    cross[1:] += i01
+    velocity[1:] += i11
+    position[:-1] += i00
+    cross[:-1] += i00 * dt + i01
+    velocity[:-1] += i00 * dt**2 + 2.0 * i01 * dt + i11
+    bands[0, 0::2], bands[0, 1::2], bands[1, 0::2] = position, velocity, cross
+    bands[2, 0:-2:2] = -i00
+    bands[1, 1:-2:2] = -(i00 * dt + i01)
+    bands[3, 0:-2:2] = -i01
+    bands[2, 1:-2:2] = -(i01 * dt + i11)
+    lower, broken = lapack.dpbtrf(bands, lower=1)
+    if broken:
+        raise np.linalg.LinAlgError("a stretch has too few measurements")
+    log_determinant = (
+        2.0 * np.sum(np.log(lower[0]))
+        + np.sum(np.log(determinant))
+        - np.sum(np.log(precision[precision > 0.0]))
+    )
+    return Factor(chain, precision, dt, inverse, bands, lower, float(log_determinant))

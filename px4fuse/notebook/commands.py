@@ -1,0 +1,257 @@
+"""``compare``, ``close_loop``, ``evaluate`` and ``what_if`` as a notebook calls them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+from px4fuse.analysis import Analysis, run, run_what_if
+from px4fuse.ekf2 import whatif
+from px4fuse.ekf2.model import Model, open_model
+from px4fuse.ekf2.whatif import WhatIf
+from px4fuse.errors import MissingDataError, SettingsError
+from px4fuse.filter.kalman import Settings
+from px4fuse.flight import Flight, Unavailable
+from px4fuse.loop.analysis import analyse
+from px4fuse.loop.loop import Loop
+from px4fuse.loop.odometry import OdometryNoise
+from px4fuse.loop.sources import Source, read_source
+from px4fuse.readers import read_log
+from px4fuse.request import (
+    AUTO,
+    AxisName,
+    ComparisonRequest,
+    FrameName,
+    GivenClosure,
+    InputName,
+    PositionFile,
+    WhatIfRequest,
+)
+from px4fuse.trajectory import evaluation
+from px4fuse.trajectory.evaluation import Evaluation
+from px4fuse.trajectory.model import Trajectory
+
+Pathlike = str | Path
+Progress = Callable[[str], None]
+
+
+def _silent(_: str) -> None:
+    """Progress that nobody watches."""
+
+
+def compare(
+    log: Pathlike | Flight,
+    settings: Settings | None = None,
+    *,
+    sigma_a_m_s2: float | None = None,
+    sigma_z_m: float | None = None,
+    dt_s: float | None = None,
+    input: InputName | None = None,  # noqa: A002 - the name of the setting
+    clock_offset_s: float | Literal["auto"] | None = None,
+    axes: str | Sequence[str] = (),
+    heading_deg: float | None = None,
+    start_s: float | None = None,
+    end_s: float | None = None,
+    position_source: str | None = None,
+    position: Pathlike | PositionFile | None = None,
+    mavlink: Pathlike | None = None,
+    system: int | None = None,
+    progress: Progress = _silent,
+) -> Analysis:
+    """Compare a flight's EKF2 with the two-state filter, and explain it, as the command line does.
+
+    Parameters
+    ----------
+    log : str, Path or Flight
+        A ULog or a MAVLink recording, or a flight that was read.
+    settings : Settings, optional
+        The filter's; what is given besides goes before it.
+    sigma_a_m_s2, sigma_z_m, dt_s, input
+        See :class:`Settings`.
+    clock_offset_s : float or "auto", optional
+        Added to the source's stamps; "auto" finds it.
+    axes : str or sequence of str
+        From "north", "east", "down", "aisle"; by default all that the source supports.
+    heading_deg : float, optional
+        Of the aisle.
+    start_s, end_s : float, optional
+        Segment, seconds from the first data.
+    position_source : str, optional
+        Name of a track of the flight.
+    position : str, Path or PositionFile, optional
+        The positioning system's own recording.
+    mavlink : str or Path, optional
+        MAVLink recording of the same flight.
+    system : int, optional
+        MAVLink system id of the vehicle.
+    progress : callable
+        Told what is being done.
+
+    Returns
+    -------
+    Analysis
+        :func:`px4fuse.find` names the mistakes in it.
+
+    Raises
+    ------
+    LogError, MissingDataError, SettingsError
+        A file cannot be read, the flight lacks what was asked for, or a setting is out of range.
+    """
+    known: tuple[AxisName, ...] = get_args(AxisName)
+    asked = (axes,) if isinstance(axes, str) else tuple(axes)
+    if unknown := [name for name in asked if name not in known]:
+        raise SettingsError(f"`axes` {unknown[0]!r}: choose from {', '.join(known)}.")
+    if isinstance(log, Flight) and (position, mavlink, system) != (None, None, None):
+        raise SettingsError(
+            "`position`, `mavlink` and `system` say what is read beside a log, and this flight has "
+            "been read. Give the path of its log."
+        )
+    if isinstance(clock_offset_s, str) and clock_offset_s != AUTO:
+        raise SettingsError(f"`clock_offset_s` {clock_offset_s!r}: give seconds, or 'auto'.")
+    chosen = settings or Settings()
+    if clock_offset_s is None:
+        clock_offset_s = chosen.clock_offset_s or None
+    request = ComparisonRequest(
+        log=log.log.name if isinstance(log, Flight) else str(log),
+        mavlink=None if mavlink is None else str(mavlink),
+        system=system,
+        position=PositionFile(path=str(position)) if isinstance(position, str | Path) else position,
+        position_source=position_source,
+        sigma_a_m_s2=chosen.sigma_a_m_s2 if sigma_a_m_s2 is None else sigma_a_m_s2,
+        sigma_z_m=chosen.sigma_z_m if sigma_z_m is None else sigma_z_m,
+        dt_s=chosen.dt_s if dt_s is None else dt_s,
+        # "imu", the default of settings, asks for the IMU where it is logged
+        input=input or ("zero" if chosen.input == "zero" else None),
+        axes=tuple(name for one in asked for name in known if name == one),
+        heading_deg=heading_deg,
+        start_s=start_s,
+        end_s=end_s,
+        clock_offset_s=float(clock_offset_s) if isinstance(clock_offset_s, int) else clock_offset_s,
+    )
+    return run(request, progress, log if isinstance(log, Flight) else None)
+
+
+def evaluate(
+    estimate: Pathlike | Trajectory, reference: Pathlike | Trajectory, **how: Any
+) -> Evaluation:
+    """Score an estimate against a reference: ATE and RPE, with intervals.
+
+    Parameters
+    ----------
+    estimate, reference : str, Path or Trajectory
+        A trajectory file, or a part of a flight log as "LOG:vio", "LOG:ekf2", "LOG:kf" (our
+        filter) or "LOG:truth".
+    **how
+        As :func:`px4fuse.trajectory.evaluation.evaluate` takes it: ``alignment``,
+        ``association``, ``max_gap_s``, ``time_offset_s``, ``rpe_deltas``, ``all_pairs``.
+
+    Raises
+    ------
+    TrajectoryError, LogError, MissingDataError, SettingsError
+        A file cannot be read, the two do not overlap in time, the motion does not determine the
+        alignment, or a delta is not above zero.
+    """
+    if not isinstance(estimate, Trajectory):
+        estimate = read_source(str(estimate)).trajectory
+    if not isinstance(reference, Trajectory):
+        reference = read_source(str(reference), default="truth").trajectory
+    return evaluation.evaluate(estimate, reference, **how)
+
+
+def close_loop(
+    source: Pathlike | Trajectory,
+    *,
+    start_s: float | None = None,
+    end_s: float | None = None,
+    landed_at: tuple[float, float] | tuple[float, float, float] | None = None,
+    came_back: bool = True,
+    closures: Sequence[GivenClosure] = (),
+    reference: Pathlike | Trajectory | None = None,
+    position_drift_m: float = 1.0,
+    heading_drift_deg: float = 3.0,
+    key_frames_m: float | None = None,
+    frame: FrameName | None = None,
+    progress: Progress = _silent,
+) -> Loop:
+    """Measure how far a loop fails to close, and correct its path.
+
+    Parameters
+    ----------
+    source : str, Path or Trajectory
+        A trajectory file or a flight log, as :func:`evaluate` takes it.
+    start_s, end_s : float, optional
+        Override take-off and landing.
+    landed_at : tuple of float, optional
+        Where it landed, m along its nose at take-off and m to the right of it, and degrees that it
+        was turned clockwise.
+    came_back : bool
+        False where the landing closes no loop.
+    closures : sequence of GivenClosure
+        Further times at which it was at the same place.
+    reference : str, Path or Trajectory, optional
+        What the paths are scored against, besides the log's ground truth.
+    position_drift_m, heading_drift_deg : float
+        What the odometry drifts in 100 m (1 σ).
+    key_frames_m : float, optional
+        Distance between key frames.
+    frame : str, optional
+        What a trajectory file's axes are: "NED", "FRD", "ENU" or "camera".
+    progress : callable
+        Told what is being done.
+
+    Raises
+    ------
+    TrajectoryError, LogError, MissingDataError, SettingsError
+        A file cannot be read or lacks what was asked for, or a number is out of range.
+    """
+    if reference is not None and not isinstance(reference, Trajectory):
+        reference = read_source(str(reference), default="truth").trajectory
+    return analyse(
+        Source(source, None)
+        if isinstance(source, Trajectory)
+        else read_source(str(source), frame=frame),
+        start_s=start_s,
+        end_s=end_s,
+        landed_at=None if landed_at is None else (*landed_at, None)[:3],
+        came_back=came_back,
+        closures=tuple(closures),
+        noise=OdometryNoise(position_drift_m, heading_drift_deg),
+        reference=reference,
+        spacing_m=key_frames_m,
+        progress=progress,
+    )
+
+
+def what_if(
+    log: Pathlike | Flight | Model,
+    changes: Mapping[str, float] | Sequence[Mapping[str, float]] | None = None,
+) -> WhatIf:
+    """What EKF2 would have done with other parameters.
+
+    Parameters
+    ----------
+    log : str, Path, Flight or Model
+        A model is a flight made ready for several questions, see :func:`px4fuse.open_model`.
+    changes : mapping or sequence of mappings, optional
+        Values by PX4 name, in PX4's units; by default the noise and the delay that the data ask
+        for.
+
+    Raises
+    ------
+    LogError, MissingDataError, SettingsError
+        The log cannot be read, EKF2 cannot be replayed from it or the replay does not agree with
+        the log, or a parameter is unknown or out of PX4's range.
+    """
+    flight = log.flight if isinstance(log, Model) else log
+    if not isinstance(flight, Flight):
+        flight = read_log(flight)
+    if changes is None:
+        return run_what_if(WhatIfRequest(log=flight.log.name), flight=flight).whatif
+    model = log if isinstance(log, Model) else open_model(flight)
+    if isinstance(model, Unavailable):
+        raise MissingDataError(str(model))
+    found = whatif.what_if(model, [changes] if isinstance(changes, Mapping) else changes)
+    if isinstance(found, Unavailable):
+        raise MissingDataError(str(found))
+    return found

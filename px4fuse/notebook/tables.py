@@ -1,0 +1,468 @@
+"""Results in words and as tables; importing this module teaches them both."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from textwrap import wrap
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from px4fuse.analysis import Analysis
+from px4fuse.comparison.comparison import AxisComparison, Comparison, FilterSummary
+from px4fuse.comparison.why import Why
+from px4fuse.display import frame, words
+from px4fuse.ekf2.whatif import Summary, WhatIf
+from px4fuse.filter.clock import ClockOffset
+from px4fuse.filter.consistency import Consistency
+from px4fuse.filter.tuning import AxisTuning, Noise
+from px4fuse.findings import SEVERITIES, find
+from px4fuse.findings.story import story
+from px4fuse.flight import (
+    POSITION_COLUMNS,
+    QUATERNION_COLUMNS,
+    Ekf2,
+    Flight,
+    PositionTrack,
+    Truth,
+    Unavailable,
+)
+from px4fuse.loop.loop import Loop
+from px4fuse.report.words import settings_words, verdict_words
+from px4fuse.trajectory.evaluation import AbsoluteError, Evaluation
+from px4fuse.trajectory.model import AXES_OF_FRAME, Trajectory
+from px4fuse.trajectory.scores import RelativeError
+
+EKF2 = "EKF2"
+OURS = "our filter"
+WIDTH = 100
+
+
+def number(value: Any) -> float:
+    """A number of a table; what is not available is missing there."""
+    return np.nan if value is None or isinstance(value, Unavailable) else float(value)
+
+
+def tracks(flight: Flight) -> Iterator[tuple[str, pd.DataFrame]]:
+    """Every position over time that a flight has, by name."""
+    for track in flight.positions:
+        yield track.name, track.samples
+    if isinstance(flight.ekf2, Ekf2):
+        yield EKF2, flight.ekf2.state
+    if isinstance(flight.truth, Truth):
+        yield f"truth, {flight.truth.name}", flight.truth.samples
+
+
+# -- a flight --------------------------------------------------------------------------------------
+
+
+@words.register
+def _(flight: Flight) -> str:
+    log = flight.log
+    airborne = flight.airborne
+    flown = ""
+    if not isinstance(airborne, Unavailable) and airborne:
+        flown = f", in the air {airborne[0][0]:.1f} to {airborne[-1][1]:.1f} s"
+    has = [_track(track) for track in flight.positions] or ["no position source"]
+    has += [EKF2] if isinstance(flight.ekf2, Ekf2) else ["no EKF2"]
+    has += [f"truth {flight.truth.name}"] if isinstance(flight.truth, Truth) else []
+    return f"{log.name}: {log.format}, {log.firmware}, {log.duration_s:.1f} s{flown}\n" + "; ".join(
+        has
+    )
+
+
+def _track(track: PositionTrack) -> str:
+    return f"{track.name} at {track.rate_hz:.1f} Hz"
+
+
+@frame.register
+def _(flight: Flight) -> pd.DataFrame:
+    """Positions, one below the other: ``track, time_s, north_m, east_m, down_m``."""
+    parts = [
+        samples[POSITION_COLUMNS].reset_index().assign(track=name)
+        for name, samples in tracks(flight)
+    ]
+    columns = ["track", "time_s", *POSITION_COLUMNS]
+    if not parts:
+        return pd.DataFrame(columns=columns)
+    return pd.concat(parts, ignore_index=True)[columns]
+
+
+# -- a comparison ----------------------------------------------------------------------------------
+
+
+def _filters(
+    result: AxisComparison,
+) -> tuple[tuple[str, FilterSummary | Unavailable, Any], tuple[str, Any, Any]]:
+    return (OURS, result.kf, result.kf_truth), (EKF2, result.ekf2, result.ekf2_truth)
+
+
+@words.register
+def _(result: AxisComparison) -> str:
+    parts = []
+    for name, summary, truth in _filters(result):
+        if isinstance(summary, Unavailable):
+            parts.append(f"no {name}")
+            continue
+        said = _nis(summary.consistency)
+        if not isinstance(truth, Unavailable):
+            said += f", {truth.position_rmse_m:.3g} m RMS from the truth"
+        parts.append(f"{name} {said}")
+    return f"{result.axis.name}: {'; '.join(parts)}"
+
+
+def _nis(statement: Consistency | Unavailable) -> str:
+    if isinstance(statement, Unavailable):
+        return f"not judged ({statement.reason})"
+    return f"mean NIS {statement.nis_mean:.2f} ({verdict_words(statement)})"
+
+
+@words.register
+def _(statement: Consistency) -> str:
+    low, high = statement.nis_band
+    return (
+        f"{_nis(statement)}, 95 % band {low:.2f} to {high:.2f}, {statement.count} innovations of "
+        f"{statement.innovation_std_m:.3g} m (standard deviation) where √S is "
+        f"{statement.sqrt_s_median_m:.3g} m"
+    )
+
+
+@words.register
+def _(comparison: Comparison) -> str:
+    segment = comparison.segment
+    return "\n".join(
+        [
+            f"{comparison.flight.log.name}, {segment.start_s:.1f} to {segment.end_s:.1f} s, "
+            f"{comparison.source.name}; {settings_words(comparison.settings)}",
+            *map(words, comparison.axes),
+        ]
+    )
+
+
+@words.register
+def _(analysis: Analysis) -> str:
+    found = find(analysis)
+    lines = [f"{analysis.flight.log.name}, {settings_words(analysis.settings)}"]
+    for sentence in story(analysis, found):
+        lines += wrap(sentence, WIDTH)
+    for severity in SEVERITIES:
+        if names := ", ".join(finding.id for finding in found if finding.severity == severity):
+            lines += wrap(f"{severity}: {names}", WIDTH)
+    return "\n".join(lines)
+
+
+def _consistency_row(statement: Consistency | Unavailable) -> dict[str, Any]:
+    if isinstance(statement, Unavailable):
+        return {}
+    low, high = statement.nis_band
+    return {
+        "innovations": statement.count,
+        "nis_mean": statement.nis_mean,
+        "nis_low": low,
+        "nis_high": high,
+        "verdict": statement.verdict,
+        "innovation_mean_m": statement.innovation_mean_m,
+        "innovation_std_m": statement.innovation_std_m,
+        "sqrt_s_median_m": statement.sqrt_s_median_m,
+        "outside_two_sigma": statement.outside_two_sigma,
+        "lag1_autocorrelation": statement.lag1_autocorrelation,
+    }
+
+
+@frame.register
+def _(statement: Consistency) -> pd.DataFrame:
+    return pd.DataFrame([_consistency_row(statement)])
+
+
+@frame.register
+def _(comparison: Comparison) -> pd.DataFrame:
+    """A row per axis and filter."""
+    rows = []
+    for result in comparison.axes:
+        for name, summary, truth in _filters(result):
+            row: dict[str, Any] = {"axis": result.axis.name, "filter": name}
+            if isinstance(summary, FilterSummary):
+                row |= _consistency_row(summary.consistency)
+                row |= {
+                    "sigma_p_median_m": number(summary.sigma_p_median_m),
+                    "sigma_v_median_m_s": number(summary.sigma_v_median_m_s),
+                }
+            if not isinstance(truth, Unavailable):
+                row |= {
+                    "position_rmse_to_truth_m": truth.position_rmse_m,
+                    "velocity_rmse_to_truth_m_s": number(truth.velocity_rmse_m_s),
+                }
+            rows.append(row)
+    table = pd.DataFrame(rows)
+    return table.astype({"innovations": "Int64"}) if "innovations" in table else table
+
+
+@frame.register
+def _(analysis: Analysis) -> pd.DataFrame:
+    return frame(analysis.comparison)
+
+
+@frame.register
+def _(result: AxisComparison) -> pd.DataFrame:
+    """Over time, at the filter's steps; EKF2 and truth interpolated, innovations at updates."""
+    steps, updates = result.replay.steps, result.replay.updates
+    table = pd.DataFrame(
+        {
+            "kf_position_m": steps["position_m"],
+            "kf_velocity_m_s": steps["velocity_m_s"],
+            "kf_sigma_p_m": np.sqrt(steps["position_variance_m2"]),
+            "kf_sigma_v_m_s": np.sqrt(steps["velocity_variance_m2_s2"]),
+            "measurement_m": updates["measurement_m"],
+            "kf_innovation_m": updates["innovation_m"],
+            "kf_sqrt_s_m": np.sqrt(updates["innovation_variance_m2"]),
+        },
+        index=steps.index,
+    )
+    for owner, series in (("ekf2", result.ekf2_state), ("truth", result.truth)):
+        if isinstance(series, pd.DataFrame):
+            for column in ("position_m", "velocity_m_s"):
+                table[f"{owner}_{column}"] = _at(series[column], steps.index)
+    if isinstance(result.ekf2_variance, pd.DataFrame):
+        variance = result.ekf2_variance
+        table["ekf2_sigma_p_m"] = np.sqrt(_at(variance["position_variance_m2"], steps.index))
+        table["ekf2_sigma_v_m_s"] = np.sqrt(_at(variance["velocity_variance_m2_s2"], steps.index))
+    return table
+
+
+def _at(series: pd.Series, times: pd.Index) -> Any:
+    return np.interp(times, series.index, series, left=np.nan, right=np.nan)
+
+
+@words.register
+def _(why: Why) -> str:
+    walk = why.axis
+    heaviest = sorted(walk.steps, key=lambda step: -abs(step.position_mean_square_m2))[:2]
+    said = " and ".join(
+        f"{step.name} ({step.position_mean_square_m2 / walk.position_total_m2:.0%})"
+        for step in heaviest
+    )
+    apart = walk.position_total_m2**0.5
+    return (
+        f"{OURS} and EKF2 are {apart:.3g} m RMS apart, mostly by {said} of the mean square; "
+        f"{walk.position_left_share:.1%} is left unexplained"
+    )
+
+
+@frame.register
+def _(why: Why) -> pd.DataFrame:
+    """What each step brings our filter nearer to EKF2, in mean square."""
+    walk = why.axis
+    rows = [
+        (step.name, step.position_mean_square_m2, step.velocity_mean_square_m2_s2)
+        for step in walk.steps
+    ]
+    rows += [("left", walk.position_left_m2, walk.velocity_left_m2_s2)]
+    columns = ["step", "position_mean_square_m2", "velocity_mean_square_m2_s2"]
+    return pd.DataFrame(rows, columns=columns)
+
+
+# -- noises and clock ------------------------------------------------------------------------------
+
+
+@words.register
+def _(tuning: AxisTuning) -> str:
+    return (
+        f"{tuning.name}: SIGMA_A {_noise(tuning.filter_sigma_a, 'm/s²')}, SIGMA_Z "
+        f"{_noise(tuning.sigma_z, 'm')}; {len(tuning.outlier_time_s)} of {tuning.count} "
+        "measurements are outliers"
+    )
+
+
+def _noise(noise: Noise, unit: str) -> str:
+    if noise.value is None:
+        return "not determinable" if noise.high is None else f"at most {noise.high:.2g} {unit}"
+    low, high = (f"{end:.2g}" if end is not None else "?" for end in (noise.low or 0.0, noise.high))
+    return f"{noise.value:.3g} {unit} (95 %: {low} to {high})"
+
+
+@frame.register
+def _(tuning: AxisTuning) -> pd.DataFrame:
+    row: dict[str, Any] = {"axis": tuning.name}
+    for name, unit, noise in (
+        ("filter_sigma_a", "m_s2", tuning.filter_sigma_a),
+        ("sigma_a", "m_s2", tuning.sigma_a),
+        ("sigma_z", "m", tuning.sigma_z),
+    ):
+        row[f"{name}_{unit}"] = number(noise.value)
+        row[f"{name}_low_{unit}"] = number(noise.low)
+        row[f"{name}_high_{unit}"] = number(noise.high)
+    counts = {"measurements": tuning.count, "outliers": len(tuning.outlier_time_s)}
+    return pd.DataFrame([row | counts | {"gain_nats": tuning.gain_nats}])
+
+
+@words.register
+def _(clock: ClockOffset) -> str:
+    if not clock.determinable:
+        return f"clock offset not determinable: {clock.reason}"
+    low, high = clock.interval_s
+    return f"clock offset {clock.offset_s:+.3f} s to add (95 %: {low:+.3f} to {high:+.3f} s)"
+
+
+@frame.register
+def _(clock: ClockOffset) -> pd.DataFrame:
+    """The whole flight first, then its consecutive parts."""
+    rows = [("flight", np.nan, np.nan, clock.offset_s, clock.sigma_s)]
+    rows += [
+        (f"part {at}", part.start_s, part.end_s, part.offset_s, part.sigma_s)
+        for at, part in enumerate(clock.parts, 1)
+    ]
+    return pd.DataFrame(rows, columns=["part", "start_s", "end_s", "offset_s", "sigma_s"])
+
+
+# -- paths -----------------------------------------------------------------------------------------
+
+
+@words.register
+def _(trajectory: Trajectory) -> str:
+    oriented = "" if trajectory.rotation is not None else ", positions only"
+    start, end = trajectory.time_s[[0, -1]]
+    return (
+        f"{trajectory.name}: {len(trajectory):,} poses in {trajectory.frame}, {start:.2f} to "
+        f"{end:.2f} s{oriented}"
+    )
+
+
+@frame.register
+def _(trajectory: Trajectory) -> pd.DataFrame:
+    names = [f"{axis}_m" for axis in AXES_OF_FRAME[trajectory.frame]]
+    table = pd.DataFrame(
+        trajectory.position_m, pd.Index(trajectory.time_s, name="time_s"), columns=names
+    )
+    if trajectory.rotation is not None:
+        x, y, z, w = trajectory.rotation.as_quat().T
+        for name, part in zip(QUATERNION_COLUMNS, (w, x, y, z), strict=True):
+            table[name] = part
+    return table
+
+
+@words.register
+def _(loop: Loop) -> str:
+    path = loop.odometry.trajectory
+    gap = loop.closure_error_m
+    closes = "does not say where it ended" if gap is None else f"fails to close by {gap:.2f} m"
+    share = "" if gap is None else f" ({gap / loop.path_length_m:.1%})"
+    lines = [f"{path.name}: {loop.path_length_m:.1f} m, {closes}{share}"]
+    for reference in loop.references:
+        scores = ((path.name, path.scores.get(reference.name)) for path in loop.reported)
+        found = ", ".join(
+            f"{name} {score.ate.translation.rmse:.3g} m"
+            for name, score in scores
+            if isinstance(score, Evaluation)
+        )
+        lines += [f"ATE to {reference.name}: {found}"] if found else []
+    return "\n".join(lines)
+
+
+@frame.register
+def _(loop: Loop) -> pd.DataFrame:
+    """A row per path and reference."""
+    rows = []
+    for path in loop.reported:
+        moved = {"path": path.name, "moved_max_m": float(path.moved_m.max())}
+        scores: Mapping[str, Evaluation | Unavailable] = path.scores
+        for name, score in scores.items():
+            ate = np.nan if isinstance(score, Unavailable) else score.ate.translation.rmse
+            rows.append(moved | {"reference": name, "ate_rmse_m": ate})
+        if not scores:
+            rows.append(moved | {"reference": None, "ate_rmse_m": np.nan})
+    return pd.DataFrame(rows)
+
+
+@words.register
+def _(found: Evaluation) -> str:
+    ate = found.ate
+    low_high = ""
+    if not isinstance(ate.interval, Unavailable):
+        low_high = f" (95 %: {ate.interval.low:.3g} to {ate.interval.high:.3g} m)"
+    said = (
+        f"{found.estimate.name} against {found.reference.name}, alignment {found.alignment}: "
+        f"ATE {ate.translation.rmse:.3g} m{low_high}"
+    )
+    return "\n".join([said, *map(words, found.rpe)])
+
+
+@frame.register
+def _(found: Evaluation) -> pd.DataFrame:
+    """ATE, then the RPE over each delta; over poses, or pairs of them."""
+    rows = [_score("ATE", found.ate), *(_score(f"RPE {part.delta}", part) for part in found.rpe)]
+    return pd.DataFrame(rows)
+
+
+def _score(name: str, part: AbsoluteError | RelativeError) -> dict[str, Any]:
+    row: dict[str, Any] = {"score": name}
+    if not isinstance(part.translation, Unavailable):
+        row |= {"count": part.translation.count, "rmse_m": part.translation.rmse}
+        row |= {"mean_m": part.translation.mean, "median_m": part.translation.median}
+        row["max_m"] = part.translation.max
+    if not isinstance(part.interval, Unavailable):
+        row |= {"rmse_low_m": part.interval.low, "rmse_high_m": part.interval.high}
+    if not isinstance(part.rotation, Unavailable):
+        row["rotation_rmse_deg"] = part.rotation.rmse
+    return row
+
+
+@words.register
+def _(part: RelativeError) -> str:
+    if isinstance(part.translation, Unavailable):
+        return f"RPE over {part.delta}: {part.translation.reason}"
+    return f"RPE over {part.delta}: {part.translation.rmse:.3g} m, {part.translation.count} pairs"
+
+
+@frame.register
+def _(part: RelativeError) -> pd.DataFrame:
+    """Every pair: its poses, as indices into the evaluation, and its errors."""
+    return pd.DataFrame(
+        {
+            "start": part.start,
+            "end": part.end,
+            "translation_error_m": part.translation_error_m,
+            "rotation_error_deg": part.rotation_error_deg,
+        }
+    )
+
+
+# -- what if ---------------------------------------------------------------------------------------
+
+
+def variants(found: WhatIf) -> list[tuple[str, Summary]]:
+    """Every EKF2 of a what-if, by what was changed."""
+    changed = [
+        (", ".join(f"{name}={value:g}" for name, value in part.changed.items()) or "as flown", part)
+        for part in found.whatif
+    ]
+    return [("logged", found.logged), ("replayed", found.replayed), *changed]
+
+
+@words.register
+def _(found: WhatIf) -> str:
+    lines = []
+    for name, part in variants(found):
+        truth = part.position_rmse_to_truth_m
+        lines.append(
+            f"{name}: mean NIS {part.nis_mean:.2f}, {part.rejected_share:.1%} rejected"
+            + ("" if isinstance(truth, Unavailable) else f", {truth:.3g} m RMS from the truth")
+        )
+    return "\n".join(lines)
+
+
+@frame.register
+def _(found: WhatIf) -> pd.DataFrame:
+    return pd.DataFrame(
+        [
+            {
+                "ekf2": name,
+                "nis_mean": part.nis_mean,
+                "rejected_share": part.rejected_share,
+                "longest_without_fusion_s": number(part.longest_without_fusion_s),
+                "resets": part.resets,
+                "position_rmse_to_truth_m": number(part.position_rmse_to_truth_m),
+            }
+            for name, part in variants(found)
+        ]
+    )

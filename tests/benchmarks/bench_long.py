@@ -1,0 +1,63 @@
+"""Time and memory of ``compare``, ``tune`` and ``sync`` on flights of 2 to 60 minutes.
+
+The flights are simulated. The floor is what pyulog needs for the same topics: it runs in turn with
+each, so that the ratio holds on a machine whose speed drifts. Nothing here can fail: run it, read
+it. Linux and macOS.
+
+    python tests/benchmarks/bench_long.py [MINUTES ...]
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+import tempfile
+from pathlib import Path
+
+from measured import Measured, measured
+
+MINUTES = (2, 10, 23, 60)
+PASSES_PER_MINUTE = 96 / 23
+READ = "import sys; from pyulog import ULog; ULog(sys.argv[1], sys.argv[2].split(','))"
+
+
+def main() -> None:
+    from px4fuse.readers.px4_topics import topics
+
+    px4fuse = [sys.executable, "-m", "px4fuse"]
+    found: dict[str, list[tuple[float, Measured]]] = {}
+    with tempfile.TemporaryDirectory() as folder:
+        for minutes in [int(word) for word in sys.argv[1:]] or MINUTES:
+            log = Path(folder) / f"{minutes}.ulg"
+            passes = max(1, round(minutes * PASSES_PER_MINUTE))
+            measured([*px4fuse, "simulate", "--passes", str(passes), "-o", str(log)])
+            commands = {
+                "compare": ["compare", str(log), "-o", str(Path(folder) / "report.pdf")],
+                "tune": ["tune", str(log)],
+                "sync": ["sync", str(log)],
+            }
+            for name, words in commands.items():
+                took = measured([*px4fuse, *words])
+                read = measured([sys.executable, "-c", READ, str(log), ",".join(topics())])
+                found.setdefault(name, []).append((minutes, took))
+                print(
+                    f"{minutes} min, {log.stat().st_size / 1e6:.1f} MB, {name}: "
+                    f"{took.cpu_s:.2f} s CPU, {took.wall_s:.2f} s wall, "
+                    f"{took.cpu_s / read.cpu_s:.1f} x pyulog alone; peak {took.peak_mb:.0f} MB "
+                    f"(pyulog {read.peak_mb:.0f} MB)",
+                    flush=True,
+                )
+            log.unlink()
+    for name, rows in found.items():
+        (short, first), *_, (long, last) = [rows[0], *rows]
+        if long > short:
+            power = math.log(last.cpu_s / first.cpu_s) / math.log(long / short)
+            each = (last.cpu_s - first.cpu_s) / (long - short)
+            print(
+                f"{name}: {each:.2f} s more for each minute; time grows as minutes^{power:.2f} "
+                f"from {short:g} to {long:g} min"
+            )
+
+
+if __name__ == "__main__":
+    main()

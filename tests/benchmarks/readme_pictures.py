@@ -1,0 +1,96 @@
+"""Make the README's pictures again, from the pages that its own commands write.
+
+    python tests/benchmarks/readme_pictures.py
+
+It takes a minute, needs what ``pip install -e ".[test]"`` installs, and writes ``reports/*.png``:
+the part of a page named below, on a palette, below 100 kB each.
+"""
+
+from __future__ import annotations
+
+import shlex
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import pypdfium2
+from PIL import Image, ImageChops, ImageOps
+
+from px4fuse.cli import cli
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+REPORTS = REPOSITORY / "reports"
+AISLE = "compare sample_logs/aisle_uwb.ulg"
+DPI, COLOURS, MAX_BYTES = 96, 64, 100_000
+# Head and foot of a page, as shares of its height, are left out; a margin (pixels) stays
+HEAD, FOOT, MARGIN = 0.035, 0.965, 12
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A picture, the command whose report has it, the page that begins so, and how much of it.
+
+    Without a page it is the picture that the command itself writes.
+    """
+
+    name: str
+    command: str
+    page: str = ""
+    until: float = FOOT
+
+
+PICTURES = (
+    Picture("aisle_uwb", AISLE, "Two-state Kalman filter against EKF2", 0.64),
+    Picture("lab_1", AISLE, "The flight along the aisle", 0.64),
+    Picture("lab_2", f"{AISLE} --sigma-a 0.001", "Innovations and variances"),
+    Picture("lab_3", AISLE, "Why EKF2 differs", 0.66),
+    Picture("lab_4", "loop sample_logs/loop_vio.ulg", "Loop closure"),
+    Picture("lab_5", "evaluate sample_logs/loop_vio.ulg:vio sample_logs/loop_slam.tum"),
+)
+
+
+def made(picture: Picture, folder: Path) -> Image.Image:
+    """The picture in full colour; reports are made once."""
+    stem = picture.command.replace("/", "_").replace(" ", "_").replace(":", "_")
+    report = folder / f"{stem}.pdf"
+    words = shlex.split(picture.command)
+    if not picture.page:
+        target = folder / f"{stem}.png"
+        run([*words, "-o", str(report), "--picture", str(target)])
+        with Image.open(target) as drawn:
+            return drawn.convert("RGB").resize(
+                (int(drawn.width * 0.7), int(drawn.height * 0.7)), Image.Resampling.LANCZOS
+            )
+    if not report.exists():
+        run([*words, "-o", str(report)])
+    with pypdfium2.PdfDocument(report) as document:
+        for page in document:
+            if picture.page in page.get_textpage().get_text_bounded():
+                whole = page.render(scale=DPI / 72).to_pil().convert("RGB")
+                break
+        else:
+            raise SystemExit(f"{picture.name}: no page of {picture.command} has {picture.page!r}")
+    part = whole.crop((0, int(HEAD * whole.height), whole.width, int(picture.until * whole.height)))
+    left, top, right, bottom = ImageChops.invert(part).getbbox() or (0, 0, *part.size)
+    return ImageOps.expand(part.crop((left, top, right, bottom)), MARGIN, "white")
+
+
+def run(words: list[str]) -> None:
+    """Run one of px4fuse's commands."""
+    cli.main(words, standalone_mode=False)
+
+
+def main() -> None:
+    """Write every picture and say how large it is."""
+    with tempfile.TemporaryDirectory() as folder:
+        for picture in PICTURES:
+            target = REPORTS / f"{picture.name}.png"
+            made(picture, Path(folder)).quantize(COLOURS).save(target, optimize=True)
+            size = target.stat().st_size
+            print(f"{target.name}: {size:,} bytes")
+            if size > MAX_BYTES:
+                raise SystemExit(f"{target.name} is larger than {MAX_BYTES:,} bytes.")
+
+
+if __name__ == "__main__":
+    main()

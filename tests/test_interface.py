@@ -1,0 +1,368 @@
+"""What somebody who works in a notebook meets: names, errors, results that show themselves."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import subprocess
+import sys
+from html.parser import HTMLParser
+from pathlib import Path
+
+import matplotlib as mpl
+import numpy as np
+import pandas as pd
+import pytest
+from click.testing import CliRunner
+from matplotlib.axes import Axes
+
+import px4fuse
+from px4fuse.cli import cli
+from px4fuse.display import Shown
+from px4fuse.request import with_options
+
+# A terminal's width and a half; results that hold several others have a line for each
+LINE = 200
+
+
+@pytest.fixture(autouse=True)
+def unseen():
+    """Figures that nobody looks at are drawn without a window, and closed."""
+    mpl.use("Agg")
+    yield
+    from matplotlib import pyplot as plt
+
+    plt.close("all")
+
+
+@pytest.fixture(scope="module")
+def analysis(sample_log) -> px4fuse.Analysis:
+    return px4fuse.compare(sample_log, sigma_z_m=0.2)
+
+
+@pytest.fixture(scope="module")
+def results(sample_log, analysis) -> dict[str, Shown]:
+    """Everything that shows itself."""
+    vio, slam = sample_log.with_name("loop_vio.ulg"), sample_log.with_name("loop_slam.tum")
+    loop = px4fuse.close_loop(vio, reference=slam)
+    evaluation = px4fuse.evaluate(f"{vio}:vio", slam)
+    return {
+        "Flight": analysis.flight,
+        "Comparison": analysis.comparison,
+        "Analysis": analysis,
+        "AxisComparison": analysis["aisle"],
+        "Consistency": analysis["aisle"].kf.consistency,
+        "Why": analysis.why["aisle"],
+        "AxisTuning": analysis.tuning["horizontal"],
+        "ClockOffset": analysis.clock,
+        "Loop": loop,
+        "Trajectory": loop.odometry.trajectory,
+        "Evaluation": evaluation,
+        "RelativeError": evaluation.rpe[0],
+        "WhatIf": px4fuse.what_if(analysis.ekf2_model, {"EKF2_EVP_NOISE": 0.3}),
+    }
+
+
+NAMES = [
+    "Flight", "Comparison", "Analysis", "AxisComparison", "Consistency", "Why", "AxisTuning",
+    "ClockOffset", "Loop", "Trajectory", "Evaluation", "RelativeError", "WhatIf",
+]  # fmt: skip
+
+
+# -- names -----------------------------------------------------------------------------------------
+
+
+def test_dir_shows_the_public_names_alone():
+    assert dir(px4fuse) == sorted(px4fuse.__all__)
+    assert {"compare", "find", "read_log", "Settings"} <= set(dir(px4fuse))
+    for name in dir(px4fuse):
+        assert getattr(px4fuse, name).__name__ == name
+    # what completes by reading the source sees no other name either
+    names = {name for name in vars(px4fuse) if not name.startswith("_")}
+    modules = {name for name in names if f"px4fuse.{name}" in sys.modules}
+    assert names - modules <= set(px4fuse.__all__)
+
+
+def test_the_type_checker_sees_what_is_there():
+    source = Path(px4fuse.__file__).read_text(encoding="utf-8")
+    for name in px4fuse.__all__:
+        assert f"import {name} as {name}\n" in source
+    assert Path(px4fuse.__file__).with_name("py.typed").is_file()
+
+
+def test_importing_is_instant():
+    script = "import px4fuse, sys; print([m for m in ('numpy', 'pandas') if m in sys.modules])"
+    said = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=True
+    )
+    assert said.stdout.strip() == "[]"
+
+
+# -- compare and find ------------------------------------------------------------------------------
+
+
+def test_findings_are_those_of_the_command_line(sample_log, analysis, tmp_path):
+    command = ["compare", str(sample_log), "--sigma-z", "0.2", "--json", "-"]
+    done = CliRunner().invoke(cli, [*command, "-o", str(tmp_path / "r.pdf")])
+    typed = [(f["id"], f["message"], f["remedy"]) for f in json.loads(done.stdout)["findings"]]
+    found = px4fuse.find(analysis)
+    assert [(f.id, f.message, f.remedy) for f in found] == typed
+    assert "sigma_z" in " ".join(finding.id for finding in found)
+    assert px4fuse.find(analysis.comparison) == found
+
+
+def test_a_flight_that_was_read_gives_the_same(sample_log, analysis):
+    settings = px4fuse.Settings(sigma_z_m=0.2)
+    again = px4fuse.compare(px4fuse.read_log(str(sample_log)), settings)
+    assert again.settings == analysis.settings
+    pd.testing.assert_frame_equal(again.to_frame(), analysis.to_frame())
+    assert px4fuse.find(again) == px4fuse.find(analysis)
+
+
+def test_arguments_do_what_the_options_do(sample_log, analysis):
+    flight = analysis.flight
+    chosen = px4fuse.Settings(sigma_a_m_s2=0.3, clock_offset_s=1.0)
+    found = px4fuse.compare(flight, chosen, sigma_z_m=0.3, axes="aisle", heading_deg=30, end_s=60)
+    assert [axis.axis.name for axis in found.axes] == ["aisle"]
+    assert found["aisle"].axis.heading_deg == 30
+    assert found.comparison.segment.end_s == 60
+    expected = dataclasses.replace(chosen, sigma_z_m=0.3)
+    assert found.settings == expected
+    assert px4fuse.compare(flight, axes=["down"], clock_offset_s=1).settings.clock_offset_s == 1.0
+    assert px4fuse.compare(flight, axes=["down"], input="zero").settings.input == "zero"
+    csv = sample_log.with_name("aisle_uwb_external.csv")
+    placed = px4fuse.compare(sample_log, position=csv, axes=["down"])
+    assert placed.comparison.source.name == csv.name
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ({"axes": "ailse"}, "`axes` 'ailse': choose from north, east, down, aisle."),
+        ({"clock_offset_s": "find"}, "`clock_offset_s` 'find': give seconds, or 'auto'."),
+        ({"mavlink": "a.tlog"}, "`position`, `mavlink` and `system` say what is read"),
+        ({"sigma_a_m_s2": -1}, "`sigma_a_m_s2` -1 is out of range"),
+        ({"start_s": float("nan")}, "`start_s` nan is not a finite number."),
+        ({"position_source": "gps"}, "position source gps: no such source."),
+    ],
+)
+def test_arguments_that_make_no_sense_are_refused(analysis, arguments, said):
+    with pytest.raises(px4fuse.Px4FuseError) as raised:
+        px4fuse.compare(analysis.flight, **arguments)
+    assert said in str(raised.value)
+
+
+def test_an_axis_that_was_not_analysed_is_named(analysis):
+    with pytest.raises(px4fuse.Px4FuseError, match="no axis 'up' here: north, east, down, aisle"):
+        analysis["up"]
+
+
+# -- errors ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("argument", "option", "value"),
+    [
+        ("sigma_z_m", "--sigma-z", 0.0),
+        ("dt_s", "--dt", 2.0),
+        ("clock_offset_s", "--clock-offset", 99.0),
+    ],
+)
+def test_errors_name_arguments_in_python_and_options_on_the_command_line(
+    argument, option, value, sample_log
+):
+    with pytest.raises(px4fuse.Px4FuseError) as raised:
+        px4fuse.Settings(**{argument: value})
+    assert str(raised.value).startswith(f"`{argument}` {value:g} is out of range")
+    error = str(CliRunner().invoke(cli, ["tune", str(sample_log), option, str(value)]).exception)
+    assert error.startswith(f"{option} {value:g} is out of range")
+    assert "`" not in error
+
+
+@pytest.mark.parametrize(
+    ("typed", "said"),
+    [
+        ("loop {vio} --from 50 --to 40", "Change --from or --to."),
+        ("loop {vio} --drift 0", "--drift 0 is outside"),
+        ("loop {vio} --heading-drift 0", "--heading-drift 0 is outside"),
+        ("loop {vio} --key-frames 0", "--key-frames 0 is outside"),
+        ("loop {vio} --landed-at 1,1 --open", "--landed-at and --open exclude"),
+        ("loop {vio} --frame ned", "--frame ned is for trajectory files"),
+        ("compare {ulg} --system 1", "--system is for MAVLink"),
+        ("compare {ulg} --heading nan", "--heading nan is not"),
+        ("compare {ulg} --mavlink {ulg}", "--mavlink aisle_uwb.ulg: this is a ULog"),
+        ("evaluate {vio}:vio {slam} --time-offset 9e5", "give --time-offset auto"),
+    ],
+)
+def test_every_command_translates_to_its_own_options(typed, said, sample_log):
+    folder = sample_log.parent
+    words = typed.format(
+        ulg=sample_log, vio=folder / "loop_vio.ulg", slam=folder / "loop_slam.tum"
+    ).split()
+    error = str(CliRunner().invoke(cli, words).exception)
+    assert said in error
+    assert "`" not in error
+
+
+def test_only_arguments_are_translated():
+    text = "`my log`.ulg: `no_argument` and `dt_s`"
+    assert with_options(text) == "`my log`.ulg: `no_argument` and --dt"
+
+
+# -- results that show themselves ------------------------------------------------------------------
+
+
+def test_everything_that_shows_itself_is_tested(results):
+    assert list(results) == NAMES == [type(result).__name__ for result in results.values()]
+    assert {part.__name__ for part in Shown.__subclasses__()} == set(NAMES)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_texts_are_short_and_hold_numbers(results, name):
+    text = repr(results[name])
+    assert len(text.splitlines()) <= 10
+    assert all(len(line) <= LINE for line in text.splitlines()), text
+    assert any(character.isdigit() for character in text)
+
+
+def test_nothing_prints_a_whole_table(results):
+    """What is reached from a result by its fields is short too."""
+    seen: set[int] = set()
+
+    def walk(value: object, path: str) -> None:
+        if (
+            dataclasses.is_dataclass(value)
+            and not isinstance(value, type)
+            and id(value) not in seen
+        ):
+            seen.add(id(value))
+            whole = [getattr(value, field.name) for field in dataclasses.fields(value)]
+            if any(isinstance(part, pd.DataFrame | np.ndarray) for part in whole):
+                assert len(repr(value)) < 1000, path
+                assert "\n0 " not in repr(value), path
+            for field, part in zip(dataclasses.fields(value), whole, strict=True):
+                walk(part, f"{path}.{field.name}")
+        elif isinstance(value, tuple):
+            for part in value:
+                walk(part, f"{path}[]")
+        elif isinstance(value, dict):
+            for key, part in value.items():
+                walk(part, f"{path}[{key}]")
+
+    for name, result in results.items():
+        walk(result, name)
+    assert len(seen) > 50
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_tables_are_tidy_with_units(results, name):
+    table = results[name].to_frame()
+    assert len(table) >= 1
+    assert table.columns.is_unique
+    without_unit = {
+        "nis_mean", "nis_low", "nis_high", "outside_two_sigma", "lag1_autocorrelation", "gain_nats",
+        "rejected_share", "w", "x", "y", "z",
+    }  # fmt: skip
+    units = ("_m", "_s", "_m_s", "_m_s2", "_m2", "_m2_s2", "_deg")
+    for column in table.select_dtypes("floating"):
+        assert column in without_unit or column.endswith(units), column
+
+
+def test_tables_hold_the_results(results, analysis):
+    table = results["Comparison"].to_frame().set_index(["axis", "filter"])
+    assert (
+        table.loc[("aisle", "our filter"), "nis_mean"] == analysis["aisle"].kf.consistency.nis_mean
+    )
+    assert table.loc[("aisle", "EKF2"), "nis_mean"] == analysis["aisle"].ekf2.consistency.nis_mean
+    assert np.isnan(table.loc[("down", "EKF2"), "nis_mean"])  # not fused, so not judged
+    series = results["AxisComparison"].to_frame()
+    error = (series["kf_position_m"] - series["truth_position_m"]).to_numpy()
+    assert np.sqrt(np.nanmean(error[50:] ** 2)) == pytest.approx(
+        analysis["aisle"].kf_truth.position_rmse_m, rel=0.1
+    )
+    updates = analysis["aisle"].replay.updates
+    innovations = series["kf_innovation_m"].dropna()
+    assert list(innovations) == list(updates["innovation_m"])
+    positions = results["Flight"].to_frame().groupby("track")
+    assert positions.size()["EKF2"] == len(analysis.flight.ekf2.state)
+    evaluation = results["Evaluation"]
+    scores = evaluation.to_frame().set_index("score")["rmse_m"]
+    assert scores["ATE"] == evaluation.ate.translation.rmse
+    assert scores["RPE 5 m"] == evaluation.rpe[1].translation.rmse
+    changed = results["WhatIf"].to_frame().set_index("ekf2")["nis_mean"]
+    assert changed["EKF2_EVP_NOISE=0.3"] < 0.3 * changed["logged"]
+
+
+class Tags(HTMLParser):
+    """Opened and not yet closed."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.seen: set[str] = set()
+
+    def handle_starttag(self, tag, attrs):
+        self.open.append(tag)
+        self.seen.add(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_notebooks_show_text_and_table(results, name):
+    parser = Tags()
+    html = results[name]._repr_html_()
+    parser.feed(html)
+    assert parser.open == []
+    assert {"pre", "table", "td"} <= parser.seen
+    assert len(html) < 20_000
+
+
+def test_names_of_files_are_no_markup(results):
+    flight = results["Flight"]
+    log = dataclasses.replace(flight.log, name="<b>&.ulg")
+    html = dataclasses.replace(flight, log=log)._repr_html_()
+    assert "&lt;b&gt;&amp;.ulg" in html
+    assert "<b>" not in html
+
+
+@pytest.mark.parametrize("name", [name for name in NAMES if name != "Consistency"])
+def test_pictures_are_axes(results, name):
+    drawn = np.atleast_1d(results[name].plot()).ravel()
+    assert all(isinstance(ax, Axes) for ax in drawn)
+    for ax in drawn:
+        assert ax.has_data()
+        assert ax.get_xlabel() or ax.get_ylabel()
+    drawn[0].figure.canvas.draw()
+    # onto axes that somebody else made
+    again = results[name].plot(ax=drawn if len(drawn) > 1 else drawn[0])
+    assert np.atleast_1d(again).ravel()[0] is drawn[0]
+
+
+def test_another_axis_can_be_drawn(results):
+    ours = results["Analysis"].plot(axis="down")[0].lines[0]
+    table = results["Analysis"]["down"].to_frame()
+    expected = table["kf_position_m"] - table["truth_position_m"]
+    np.testing.assert_array_equal(ours.get_ydata(), expected)
+
+
+def test_what_has_no_picture_says_so(results):
+    with pytest.raises(TypeError, match="Consistency has no picture"):
+        results["Consistency"].plot()
+
+
+def test_a_flight_without_anything_shows_itself(analysis):
+    nothing = px4fuse.Unavailable("it", "not logged", "Log it.")
+    empty = dataclasses.replace(
+        analysis.flight, positions=(), ekf2=nothing, truth=nothing, airborne=nothing
+    )
+    assert "no position source; no EKF2" in repr(empty)
+    assert len(empty.to_frame()) == 0
+    without = dataclasses.replace(
+        analysis["aisle"], ekf2=nothing, ekf2_state=nothing, ekf2_variance=nothing,
+        ekf2_innovations=nothing, truth=nothing, kf_truth=nothing, ekf2_truth=nothing,
+    )  # fmt: skip
+    assert "no EKF2" in repr(without)
+    assert not any(column.startswith(("ekf2", "truth")) for column in without.to_frame())
+    assert without.plot()[0].get_ylabel() == "position, m"

@@ -1,0 +1,306 @@
+"""Words on pages: names in every script, Markdown notes, numbers; and when the clock has a page."""
+
+from __future__ import annotations
+
+import io
+import sys
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+import pytest
+from flights import random_walk
+from hypothesis import given
+from hypothesis import strategies as st
+from matplotlib import font_manager
+from matplotlib.backends.backend_pdf import PdfPages
+from matplotlib.figure import Figure
+from matplotlib.ft2font import LoadFlags
+from pypdf import PdfReader
+
+from px4fuse.filter.clock import ClockOffset, PartOffset
+from px4fuse.filter.kalman import Settings
+from px4fuse.filter.likelihood import preintegrate, states
+from px4fuse.flight import Unavailable
+from px4fuse.report import clock, fonts, notes
+from px4fuse.report.document import Document
+from px4fuse.report.notes import Line, Table, read
+from px4fuse.report.sensitivity import PAIRS, SETTINGS, WINDOW_S, _settled, _window
+from px4fuse.report.style import Cursor, printable, report_style, text_width, wrap
+from px4fuse.results.model import Student
+
+THAI, HAN, ARABIC = "สมชาย", "王小明", "محمد"
+
+
+def lines(markdown: str) -> list[str]:
+    return [block.text for block in read(markdown) if isinstance(block, Line)]
+
+
+@pytest.fixture
+def _fresh(monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Fonts are looked up anew, before and after."""
+
+    def forget() -> None:
+        for cached in (fonts.font_of, fonts._others):
+            cached.cache_clear()
+
+    forget()
+    yield
+    monkeypatch.undo()
+    forget()
+
+
+def with_font(monkeypatch: pytest.MonkeyPatch, name: str, characters: str) -> None:
+    """A machine with one more font, which has these characters."""
+    monkeypatch.setattr(fonts, "_others", lambda: ((name, "path"),))
+    own = fonts._characters
+    monkeypatch.setattr(
+        fonts,
+        "_characters",
+        lambda path: frozenset(map(ord, characters)) if path == "path" else own(path),
+    )
+
+
+@pytest.mark.usefixtures("_fresh")
+def test_letters_of_latin_greek_cyrillic_and_arabic_are_always_there() -> None:
+    assert fonts.missing(f"Ångström σ Жанна {ARABIC} 5 ≤ 6") == ""
+    assert fonts.families(f"Ångström {ARABIC}") == [fonts.FONT]
+
+
+@pytest.mark.usefixtures("_fresh")
+def test_a_font_of_the_machine_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+    with_font(monkeypatch, "Some Thai", THAI)
+    assert fonts.families(f"{THAI} and me") == [fonts.FONT, "Some Thai"]
+    assert fonts.missing(f"{THAI} {HAN}") == HAN
+
+
+@pytest.mark.usefixtures("_fresh")
+def test_what_no_font_has_is_a_square_and_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fonts, "_others", lambda: ())
+    with report_style(THAI + HAN):
+        assert mpl.rcParams["font.family"] == [fonts.FONT]
+        assert printable(f"a {HAN} b") == "a □□□ b"
+    monkeypatch.setattr(sys, "platform", "linux")
+    assert "sudo apt install fonts-noto-core fonts-wqy-zenhei." in fonts.advice(THAI + HAN)
+    assert "Thai and Chinese characters สมชาย王小明:" in fonts.advice(THAI + HAN)
+    monkeypatch.setattr(sys, "platform", "win32")
+    assert "Noto Sans Thai and Noto Sans SC, from fonts.google.com" in fonts.advice(THAI + HAN)
+
+
+@pytest.mark.usefixtures("_fresh")
+def test_a_font_that_has_a_box_for_everything_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    own = font_manager.findfont(fonts.FONT)
+    entries = [
+        SimpleNamespace(name=name, style="normal", weight=400, fname=str(own), index=0)
+        for name in ("Zebra", "Noto Sans Thai", "LastResort", "Adobe Blank", "An Alphabet Sans")
+    ]
+    manager = SimpleNamespace(ttflist=entries, addfont=lambda _: None)
+    monkeypatch.setattr(font_manager, "fontManager", manager)
+    monkeypatch.setattr(font_manager, "findSystemFonts", list)
+    assert [name for name, _ in fonts._others()] == ["Noto Sans Thai", "An Alphabet Sans", "Zebra"]
+
+
+def test_arabic_is_joined_and_written_from_the_right() -> None:
+    """Shaped: the letters take other glyphs than alone, from the right to the left."""
+    font = font_manager.get_font(font_manager.findfont(fonts.FONT))
+    alone = [font.get_char_index(ord(letter)) for letter in ARABIC]
+    shaped = [item.glyph_index for item in font._layout(ARABIC, LoadFlags.NO_HINTING)]
+    assert len(shaped) == len(alone)
+    assert not set(shaped) & set(alone[:-1])
+
+
+def test_a_mark_is_not_parted_from_its_letter() -> None:
+    text = "e\N{COMBINING ACUTE ACCENT}" * 40
+    with report_style():
+        for line in wrap(text, 8.0, 60.0):
+            assert not line.startswith("\N{COMBINING ACUTE ACCENT}")
+            assert text_width(line, 8.0) <= 68.0
+
+
+def test_markdown_is_read() -> None:
+    assert lines("# A *b* **c**\n\nd `e` ~~f~~ g\nh\n\n> i") == ["A b c", "d e f g h", "i"]
+    assert lines("a  \nb") == ["a\nb"]
+    assert lines("[x](https://y.z) <https://y.z>") == ["x (https://y.z) https://y.z"]
+    assert lines("SIGMA_A and SIGMA_Z, 2 * 3 * 4") == ["SIGMA_A and SIGMA_Z, 2 * 3 * 4"]
+
+
+def test_lists_keep_their_marks_and_depth() -> None:
+    blocks = list(read("- a\n  - b\n\n    c\n- d\n\n7. e\n8. f\n\n- - g\n"))
+    assert [(b.mark, b.text, b.indents) for b in blocks if isinstance(b, Line)] == [
+        ("•", "a", 1), ("•", "b", 2), ("", "c", 2), ("•", "d", 1),
+        ("7.", "e", 1), ("8.", "f", 1), ("•", "", 1), ("•", "g", 2),
+    ]  # fmt: skip
+
+
+def test_code_keeps_its_spaces_and_dollars() -> None:
+    assert lines("```\nif x:\n    $y$ <b>\n```") == ["if x:", "    $y$ <b>"]
+    with report_style():
+        assert wrap("    x = 1", 8.0, 500.0) == ["    x = 1"]
+        assert wrap("  aa bb", 8.0, text_width("  aa", 8.0) + 1.0) == ["  aa", "bb"]
+
+
+def test_a_table_is_a_table() -> None:
+    (table,) = read("| a | *b* |\n|---|--:|\n| 1 | $x^2$ |\n")
+    assert table == Table((("a", "b"), ("1", "x²")))
+
+
+@pytest.mark.parametrize(
+    ("written", "read_as"),
+    [
+        (r"$\sigma_z^2$", "σ_z²"),
+        (r"$\hat{x}_{k|k-1}$", "x_(k|k-1)"),
+        (r"$$\frac{a}{b+1}$$", "a/(b+1)"),
+        (r"$\sqrt{S} \le 5 \times 10^{-3}$", "√(S) ≤ 5 × 10⁻³"),
+        (r"$\Delta t$ and $\lambda$", "Δ t and λ"),
+        (r"$\unknown{x}$", "unknownx"),
+        ("costs $5 and $10", "costs $5 and $10"),
+        (r"\$5 and `$x$`", "$5 and $x$"),
+    ],
+)
+def test_mathematics_becomes_letters_and_prices_stay(written: str, read_as: str) -> None:
+    assert lines(written) == [read_as]
+
+
+@pytest.mark.parametrize(
+    ("written", "read_as"),
+    [
+        ("![a map](m.png)", ["[picture: a map]"]),
+        ("![](m.png)", ["[picture]"]),
+        ('a <b>c</b><br>d &amp; e <img src="x" alt="f">', ["a c\nd & e [picture: f]"]),
+        ("<div><p>a</p><p>b</p></div>", ["a", "b"]),
+        ("<script>alert(1)</script>\n\n<!-- no -->\n\nyes", ["yes"]),
+        ("<style>a{}", []),
+    ],
+)
+def test_pictures_and_html_are_not_printed_raw(written: str, read_as: list[str]) -> None:
+    assert lines(written) == read_as
+
+
+@given(st.text(st.sampled_from("#*-_`$|<>[]()!\\ \n1.ab{}^&;~="), max_size=80))
+def test_any_markdown_is_read(text: str) -> None:
+    for block in read(text):
+        assert isinstance(block, Line | Table)
+
+
+def document(student: Student) -> Document:
+    return Document(SimpleNamespace(), (), student, "px4fuse compare x.ulg")  # type: ignore[arg-type]
+
+
+def test_long_notes_run_over_pages_and_lose_nothing() -> None:
+    words = [f"word{number}" for number in range(1500)]
+    table = "| a | b |\n|---|---|\n" + "".join(f"| r{i} | {'cell ' * 30} |\n" for i in range(40))
+    out = io.BytesIO()
+    with report_style(), PdfPages(out) as pdf:
+        for figure in notes.draw(document(Student("", "", " ".join(words) + "\n\n" + table))):
+            pdf.savefig(figure)
+    pages = [page.extract_text() for page in PdfReader(out).pages]
+    assert len(pages) > 2
+    assert pages[0].startswith("Appendix: notes by the student")
+    text = " ".join(pages).split()
+    assert [word for word in text if word.startswith("word")] == words
+    assert sum(word == "cell" for word in text) == 1200
+    assert not list(notes.draw(document(Student("", "", " \n <!-- nothing --> \n"))))
+
+
+def test_a_table_of_columns_moves_the_cursor_below_itself() -> None:
+    with report_style():
+        figure = Figure()
+        cursor = Cursor(figure, 0.9)
+        cursor.columns({0.1: ("head", ["a", "", "c"]), 0.5: ("other", ["1", "2", "3"])})
+    heights = [text.get_position()[1] for text in figure.texts]
+    assert len(heights) == 7
+    assert max(heights) < 0.9
+    assert cursor.y <= min(heights)
+
+
+def offset(**changes: Any) -> ClockOffset:
+    curve = np.linspace(-0.1, 0.1, 21)
+    parts = tuple(PartOffset(10.0 * i, 10.0 * i + 9.0, 0.0, 0.02) for i in range(3))
+    return replace(
+        ClockOffset(
+            offset_s=0.005, interval_s=(-0.02, 0.03), sigma_s=0.012, determinable=True, reason="",
+            curve_s=curve, curve_drop=curve**2 * 1e3, interval_drop=2.0, parts=parts,
+            drift_ppm=100.0, drift_sigma_ppm=300.0, change_p=0.4, sigma_a_m_s2=0.1, sigma_z_m=0.1,
+            count=200,
+        ),
+        **changes,
+    )  # fmt: skip
+
+
+def with_clock(found: ClockOffset | Unavailable, applied_s: float, delay_ms: float) -> Document:
+    comparison = SimpleNamespace(
+        settings=SimpleNamespace(clock_offset_s=applied_s),
+        flight=SimpleNamespace(
+            log=SimpleNamespace(name="x.ulg", parameters={"EKF2_EV_DELAY": delay_ms})
+        ),
+    )
+    analysis = SimpleNamespace(clock=found, comparison=comparison)
+    return Document(analysis, (), Student(), "")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("changes", "applied_s", "delay_ms", "has_page"),
+    [
+        ({}, 0.0, 0.0, False),
+        ({"offset_s": -0.25, "interval_s": (-0.28, -0.22)}, 0.0, 250.0, True),  # late
+        ({"offset_s": 0.0}, -0.25, 250.0, True),  # late, as found and applied before
+        ({}, 0.0, 175.0, True),  # EKF2 waits for what is not late
+        ({"change_p": 0.001}, 0.0, 0.0, True),
+        ({"drift_ppm": 1000.0}, 0.0, 0.0, True),
+        ({"drift_ppm": None, "drift_sigma_ppm": None, "change_p": None}, 0.0, 0.0, False),
+        ({"determinable": False, "reason": "no motion"}, 0.0, 175.0, True),
+    ],
+)
+def test_the_clock_has_its_page_when_there_is_something_to_say(
+    changes: dict[str, Any], applied_s: float, delay_ms: float, has_page: bool
+) -> None:
+    made = with_clock(offset(**changes), applied_s, delay_ms)
+    assert clock.has_page(made) == has_page
+    assert ("see its page" in clock.line(made)) == has_page
+    assert has_page or "the stamps are right" in clock.line(made)
+    if not has_page:
+        assert not list(clock.draw(made))
+
+
+def test_without_an_estimate_the_line_says_what_to_do() -> None:
+    made = with_clock(Unavailable("clock offset", "no IMU", "Give the ULog."), 0.0, 0.0)
+    assert clock.line(made) == "not determinable: no IMU. Give the ULog."
+    assert not list(clock.draw(made))
+
+
+def test_only_the_ratio_moves_the_gain_and_the_track() -> None:
+    """What the page of the knobs says: the tracks coincide, σ and NIS scale."""
+    rng = np.random.default_rng(3)
+    axis = random_walk(rng, count=600, interval_s=0.2, sigma_a=0.5, sigma_z=0.1)
+    factors = np.array([(a, z) for _, a, z in SETTINGS]).T
+    run = states(preintegrate(axis, Settings(input="zero")), 0.5 * factors[0], 0.1 * factors[1])
+    gains, sigmas = _settled(run.gain), _settled(run.sigma_p_m)
+    for (_, (one, other)), scale in zip(PAIRS, (4.0, 0.25), strict=True):
+        assert gains[one] == pytest.approx(gains[other], rel=1e-6)
+        assert sigmas[one] / sigmas[other] == pytest.approx(scale, rel=1e-6)
+        half = slice(300, None)
+        np.testing.assert_allclose(
+            run.velocity_m_s[half, one], run.velocity_m_s[half, other], atol=1e-6
+        )
+        np.testing.assert_allclose(
+            run.nis[half, one] * scale**2, run.nis[half, other], rtol=1e-4, atol=1e-9
+        )
+    assert gains[1] > gains[0] > gains[3]
+
+
+def test_the_window_lies_where_nothing_is_missing_and_something_moves() -> None:
+    time = np.arange(0.0, 100.0, 0.2)
+    result = SimpleNamespace(axis=SimpleNamespace(measurement_time_s=time))
+    velocity = np.where(time < 50.0, 3.0 * np.sin(time), 0.5 * np.sin(time))
+    start, end = _window(result, velocity, [])  # type: ignore[arg-type]
+    assert end <= 50.0
+    start, end = _window(result, velocity, [(10.0, 12.0), (30.0, 45.0)])  # type: ignore[arg-type]
+    assert end - start == WINDOW_S
+    assert start >= 45.0
+    # where every window holds a gap, the one that holds the least of them
+    start, end = _window(result, velocity, [(5.0 * i, 5.0 * i + 4.0) for i in range(16)])  # type: ignore[arg-type]
+    assert start >= 78.0
+    short = SimpleNamespace(axis=SimpleNamespace(measurement_time_s=time[:20]))
+    assert _window(short, velocity[:20], []) == (0.0, pytest.approx(3.8))  # type: ignore[arg-type]

@@ -1,0 +1,452 @@
+"""What a student reads and pastes: whole words, commands that run, files that are not lost."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pypdf
+import pytest
+from click.testing import CliRunner, Result
+from msgspec.structs import replace
+from rich.console import Console
+from test_cli import run_main
+
+import px4fuse.report.pdf
+from px4fuse.analysis import run as analyse
+from px4fuse.analysis import run_comparison, run_loop, run_what_if, tuned
+from px4fuse.cli import cli, compare, loop, tune, whatif
+from px4fuse.cli.outputs import default_report, progress, terminal
+from px4fuse.cli.quantity import NAMES, in_unit
+from px4fuse.findings import find
+from px4fuse.report.commands import runnable
+from px4fuse.report.document import Document
+from px4fuse.report.pdf import render
+from px4fuse.report.screen import print_list, say
+from px4fuse.report.terminal import print_summary
+from px4fuse.request import (
+    ComparisonRequest,
+    LoopRequest,
+    PositionFile,
+    WhatIfRequest,
+    command_line,
+    settings_name,
+)
+from px4fuse.results.build import results
+from px4fuse.results.contract import ComparisonResults, to_json
+from px4fuse.results.model import Student
+from px4fuse.simulation import flights
+from px4fuse.simulation.mistakes import parse
+from px4fuse.simulation.scenario import Scenario
+
+WIDTH = 80
+
+
+def run(*words: str | Path, width: int | None = None) -> Result:
+    env = {"COLUMNS": None if width is None else str(width)}
+    return CliRunner().invoke(cli, [str(word) for word in words], env=env)
+
+
+def commands(text: str) -> list[str]:
+    """The commands that are printed, as whoever copies them does."""
+    return re.findall(r"^.{9}(px4fuse .*)$", text, re.MULTILINE)
+
+
+def page_of(_: object, text: str) -> bytes:
+    """An empty page with results attached."""
+    writer = pypdf.PdfWriter()
+    writer.add_blank_page(100, 100)
+    writer.add_attachment("results.json", text.encode())
+    out = io.BytesIO()
+    writer.write(out)
+    return out.getvalue()
+
+
+@pytest.fixture
+def no_drawing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pages take most of the time, and none of them is looked at."""
+    monkeypatch.setattr(px4fuse.report.pdf, "render", page_of)
+
+
+@pytest.fixture(scope="module")
+def flown() -> bytes:
+    """A short flight whose stamps are late."""
+    scenario = Scenario(passes=3, truth=False, seed=3)
+    return flights.to_ulog(flights.simulate(scenario, parse(("clock-offset=250ms",))))
+
+
+@pytest.fixture
+def desk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, flown: bytes) -> Path:
+    """A folder whose name a shell would take apart, with a log; the commands run there."""
+    folder = tmp_path / "Ana's flights & more"
+    folder.mkdir()
+    (folder / "l.ulg").write_bytes(flown)
+    monkeypatch.chdir(folder)
+    return folder
+
+
+# --- words wrap, nothing is cut ---
+
+
+@pytest.fixture(scope="module")
+def document(sample_log: Path) -> Document:
+    """The sample with a setting that gives a finding."""
+    request = ComparisonRequest(log=str(sample_log), sigma_z_m=0.3)
+    analysis = analyse(request)
+    return Document(analysis, find(analysis), Student(), command_line(request))
+
+
+@pytest.fixture(scope="module")
+def summaries(document: Document, sample_log: Path) -> dict[int | None, str]:
+    """Its summary on a screen, on a narrow one, and in a pipe."""
+    request = ComparisonRequest(log=str(sample_log), sigma_z_m=0.3)
+    made: dict[int | None, str] = {}
+    with pytest.MonkeyPatch.context() as patch:
+        for width in (WIDTH, 60, None):
+            patch.delenv("COLUMNS", raising=False)
+            if width is not None:
+                patch.setenv("COLUMNS", str(width))
+            console = terminal()
+            with console.capture() as captured:
+                print_summary(console, document, request, "reports/a.pdf")
+            made[width] = captured.get()
+    return made
+
+
+def test_nothing_is_cut_and_words_are_whole(summaries) -> None:
+    whole = summaries[None].split()
+    for width in (WIDTH, 60):
+        assert "…" not in summaries[width]
+        assert "--sigma-z" in summaries[width]
+    assert summaries[WIDTH].split() == whole
+    long = [line for line in summaries[WIDTH].splitlines() if len(line) > WIDTH]
+    assert all(commands(line) or line.startswith("Report") for line in long)  # to be copied
+    assert "\x1b" not in summaries[None]
+
+
+def test_in_a_pipe_a_paragraph_is_one_line(summaries) -> None:
+    lines = summaries[None].splitlines()
+    for line in summaries[WIDTH].splitlines():
+        if not line.startswith(("axis", "     ")):
+            continue
+        assert any(line.strip() in other for other in lines), line
+
+
+def test_the_summary_opens_with_the_story(summaries, document) -> None:
+    lines = summaries[None].splitlines()
+    assert lines[: len(document.story) + 1] == [*document.story, ""]
+
+
+def test_numbers_are_those_of_the_cover(summaries, document) -> None:
+    pages = pypdf.PdfReader(io.BytesIO(render(document, "{}"))).pages
+    cover = pages[0].extract_text()
+    rows = [
+        line for line in summaries[None].splitlines() if re.search(r"^\w* +(ours|EKF2)  ", line)
+    ]
+    assert len(rows) == 8
+    for at, row in enumerate(rows):
+        # the cover has bands and velocities of the main axis alone
+        pattern = r"\d+\.\d+" if at < 2 else r"(?<=ours )\d\S+|(?<=EKF2 )\d\S+|\d\S+(?=×)"
+        for number in re.findall(pattern, re.sub(" +", " ", row)):
+            assert number in cover, (number, row)
+
+
+def test_a_paragraph_hangs_beside_its_label(capsys) -> None:
+    console = Console(width=30, highlight=False)
+    say(console, "one two three four five six seven", "Label", 9)
+    print_list(console, [("yes", "aisle", "one two three four five"), ("no", "up", "six")])
+    assert capsys.readouterr().out.splitlines() == [
+        "Label    one two three four",
+        "         five six seven",
+        "yes aisle one two three four",
+        "          five",
+        "no  up    six",
+    ]
+
+
+def test_how_wide_a_pipe_is_can_be_said(monkeypatch) -> None:
+    monkeypatch.setenv("COLUMNS", "44")
+    assert terminal().width == 44
+    monkeypatch.delenv("COLUMNS")
+    assert terminal().width > 1000
+
+
+# --- commands run when pasted ---
+
+
+def test_commands_are_written_with_what_was_typed() -> None:
+    request = ComparisonRequest(
+        log="my flights/a'b.ulg", mavlink="-t.tlog", position=PositionFile(path="u w/b.csv"),
+        start_s=12.5, sigma_z_m=0.3,
+    )  # fmt: skip
+    text, (command, loops) = runnable(
+        "Try px4fuse compare LOG --sigma-z 0.2 --clock-offset -0.125: better. Or (px4fuse loop "
+        "LOG). Not px4fuse sync LOG.ulg.",
+        request,
+    )
+    assert text == (
+        "Try --sigma-z 0.2 --clock-offset -0.125: better. Or (px4fuse loop). Not px4fuse sync "
+        "LOG.ulg."
+    )
+    assert shlex.split(command) == [
+        "px4fuse", "compare", "my flights/a'b.ulg", "--mavlink", "-t.tlog", "--sigma-z", "0.2",
+        "--start", "12.5", "--clock-offset", "-0.125", "--position", "u w/b.csv",
+    ]  # fmt: skip
+    assert shlex.split(loops) == ["px4fuse", "loop", "my flights/a'b.ulg", "--from", "12.5"]
+
+
+def test_a_log_that_looks_like_an_option_is_none() -> None:
+    assert command_line(ComparisonRequest(log="-a.ulg"), "tune", typed=True) == (
+        "px4fuse tune ./-a.ulg"
+    )
+
+
+@pytest.mark.usefixtures("no_drawing")
+@pytest.mark.parametrize(
+    "typed",
+    ["compare {log} --sigma-z 0.5", "tune {log} --axis north --start 8", "sync {log} --dt 0.05",
+     "info {log}"],
+)  # fmt: skip
+def test_what_is_printed_runs_when_pasted(desk, monkeypatch, typed) -> None:
+    monkeypatch.chdir(desk.parent)  # so that the path as typed has blanks and a quote in it
+    words = shlex.split(typed.format(log=shlex.quote(f"{desk.name}/l.ulg")))
+    printed = commands(run(*words, width=WIDTH).stdout)
+    assert printed
+    for command in printed:
+        pasted = shlex.split(command)
+        assert pasted[:3] == ["px4fuse", "compare", f"{desk.name}/l.ulg"]
+        assert {word for word in words if word.startswith("--")} <= set(pasted)
+        done = run(*pasted[1:])
+        assert done.exit_code == 0, (command, done.output)
+
+
+@pytest.mark.usefixtures("no_drawing")
+def test_the_command_of_a_finding_removes_it(desk) -> None:
+    first = run("compare", "l.ulg", "--sigma-z", "0.12", "--json", "a.json")
+    assert "reports/l_sigma-z-0.12.pdf" in first.stdout.replace(os.sep, "/")
+    command = next(command for command in commands(first.stdout) if "--clock-offset" in command)
+    run(*shlex.split(command)[1:], "--json", "b.json")
+    findings = [
+        {one["id"] for one in json.loads(Path(name).read_text())["findings"]}
+        for name in ("a.json", "b.json")
+    ]
+    assert "source_clock_offset" in findings[0] - findings[1]
+
+
+def test_a_shell_runs_what_is_printed(desk) -> None:
+    """In a real pipe, by a real shell."""
+    program = f'px4fuse() {{ {shlex.quote(sys.executable)} -m px4fuse "$@"; }}; '
+    env = {key: value for key, value in os.environ.items() if key != "COLUMNS"}
+
+    def shell(line: str) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(
+            ["sh", "-c", program + line], capture_output=True, text=True, check=False, env=env,
+            cwd=desk.parent,
+        )  # fmt: skip
+
+    told = shell(f"px4fuse info {shlex.quote(desk.name)}/l.ulg | cat")
+    assert told.stderr == ""  # no progress bar
+    (command,) = commands(told.stdout)
+    assert shell(f"{command} --axis north --json - | head -c 1").stdout == "{"
+    assert not (desk.parent / "reports").exists()
+
+
+@pytest.mark.reallogs
+@pytest.mark.usefixtures("no_drawing")
+@pytest.mark.parametrize("name", ["aisle_overconfident", "aisle_clock_late"])
+@pytest.mark.parametrize("command", ["compare", "tune", "sync", "whatif", "loop"])
+def test_what_is_printed_of_shared_logs_runs(shared_logs, tmp_path, monkeypatch, name, command):
+    monkeypatch.chdir(tmp_path)
+    (log,) = shared_logs.glob(f"simulated/*{name}*.ulg")
+    done = run(command, log, width=WIDTH)
+    assert done.exit_code == 0, done.output
+    for printed in commands(done.stdout):
+        again = run(*shlex.split(printed)[1:], "--json", "-")
+        assert again.exit_code == 0, (printed, again.output)
+
+
+# --- what is typed wrongly ---
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["comapre", "x.ulg"], "Did you mean 'compare'?"),
+        (["Compare", "x.ulg"], "Did you mean 'compare'?"),
+        (["l.ulg", "--dt", "0.2"], "px4fuse compare l.ulg --dt 0.2"),
+        (["compare", "l.ulg", "--sigmaz", "1"], "--sigma-z"),
+        (["compare", "l.ulg", "--sigma-z", "10cm"], "give metres, as 0.1"),
+        (["compare", "l.ulg", "--sigma-z", "0,1"], "give metres, as 0.1"),
+        (["compare", "l.ulg", "--sigma-a", "50 cm/s2"], "give metres per second squared, as 0.5"),
+        (["tune", "l.ulg", "--start", "20s"], "give seconds, as 20"),
+        (["sync", "l.ulg", "--clock-offset", "-120ms"], "give seconds, as -0.12, or auto"),
+        (["compare", "l.ulg", "--heading", "30deg"], "give degrees, as 30"),
+        (["compare", "l.ulg", "--heading", "-30"], "not between 0 and 360"),
+        (["compare", "l.ulg", "--heading", "361"], "not between 0 and 360"),
+        (["compare", "l.ulg", "--heading", "north"], "give degrees, as 30"),
+        (["simulate", "-o", "s.ulg", "--heading", "-1"], "not between 0 and 360"),
+        (["simulate", "-o", "s.ulg", "--speed", "3.6km/h"], "give metres per second, as 1"),
+        (["loop", "l.ulg", "--drift", "1 m"], "give metres, as 1"),
+        (["whatif", "l.ulg", "--set", "EKF2_EV_DELAY=0.1s"], "give milliseconds, as 100"),
+        (["whatif", "l.ulg", "--set", "EKF2_EVP_NOISE=10cm"], "give metres, as 0.1"),
+    ],
+)
+def test_slips_are_one_line_that_says_what_to_type(desk, monkeypatch, capsys, words, said) -> None:
+    code, out, err = run_main(monkeypatch, capsys, *words)
+    assert (code, out) == (2, "")
+    assert err.startswith("px4fuse: ")
+    assert len(err.splitlines()) == 1
+    assert said in err
+    assert [path.name for path in desk.iterdir()] == ["l.ulg"]
+
+
+@pytest.mark.parametrize("unit", NAMES)
+def test_every_unit_is_read_with_itself(unit) -> None:
+    assert in_unit(f"2.5{unit}", unit) == in_unit("2,5", unit) == 2.5
+    assert in_unit("1.2.3", unit) is in_unit("2.5 apples", unit) is None
+
+
+def test_headings_to_360_are_taken(desk) -> None:
+    for heading in ("0", "360"):
+        done = run("tune", "l.ulg", "--axis", "aisle", "--heading", heading, "--json", "-")
+        assert done.exit_code == 0, done.output
+
+
+# --- files ---
+
+
+def files(folder: Path) -> set[str]:
+    return {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.mark.parametrize("command", ["compare", "tune", "sync", "whatif", "loop", "info"])
+def test_results_on_standard_output_write_no_file(command, desk) -> None:
+    done = run(command, "l.ulg", "--json", "-")
+    assert done.exit_code == 0, done.output
+    assert json.loads(done.stdout)
+    assert files(desk) == {"l.ulg"}
+
+
+@pytest.mark.usefixtures("no_drawing")
+def test_a_report_that_is_asked_for_is_written_beside_standard_output(desk) -> None:
+    run("compare", "l.ulg", "--axis", "north", "-o", "r.pdf", "--json", "-")
+    assert files(desk) == {"l.ulg", "r.pdf", "r.json"}
+
+
+@pytest.fixture
+def made(document: Document, sample_log: Path, tmp_path, monkeypatch) -> ComparisonResults:
+    """Results of a run in an empty folder."""
+    monkeypatch.chdir(tmp_path)
+    request = ComparisonRequest(log=str(sample_log))
+    return results(request, document.analysis, document.findings, Student(), "")
+
+
+def reported(made: ComparisonResults, **changes: object) -> str:
+    """Write a report without pages where it goes by default."""
+    student = Student(name=str(changes.pop("student", "")))
+    request = replace(made.request, **changes)
+    changed = replace(made, request=request.recorded(), student=student)
+    path = default_report(request, changed)
+    path.parent.mkdir(exist_ok=True)
+    path.write_bytes(page_of(None, to_json(changed)))
+    path.with_suffix(".json").write_text(to_json(changed), encoding="utf-8")
+    return path.name
+
+
+def test_other_settings_do_not_overwrite_a_report_and_the_same_do(made) -> None:
+    assert reported(made) == reported(made) == "aisle_uwb.pdf"
+    assert reported(made, sigma_z_m=0.05) == "aisle_uwb_sigma-z-0.05.pdf"
+    assert reported(made) == "aisle_uwb.pdf"
+    # a name is added to what had none; another student's is kept
+    assert reported(made, student="Ana") == "aisle_uwb.pdf"
+    assert reported(made, student="Ben") == reported(made, student="Ben") == "aisle_uwb_2.pdf"
+    assert reported(made) == "aisle_uwb_3.pdf"
+
+
+def test_another_flight_of_the_same_name_is_another_report(made) -> None:
+    reported(made)
+    other = replace(made, log=replace(made.log, sha256="0" * 64))
+    assert reported(other) == reported(other) == "aisle_uwb_2.pdf"
+    assert reported(made) == "aisle_uwb.pdf"
+
+
+@pytest.mark.parametrize("name", ["aisle_uwb.pdf", "aisle_uwb.json"])
+def test_what_is_no_report_is_kept(made, name) -> None:
+    mine = Path("reports") / name
+    mine.parent.mkdir()
+    mine.write_text("mine")
+    assert reported(made) == "aisle_uwb_2.pdf"
+    assert mine.read_text() == "mine"
+
+
+def test_a_name_that_is_too_long_is_a_number(made) -> None:
+    log = f"{'ü' * 110}.ulg"
+    assert reported(made, log=log) == f"{'ü' * 110}.pdf"
+    assert reported(made, log=log, sigma_z_m=0.05) == f"{'ü' * 110}_2.pdf"
+
+
+def test_names_of_reports_are_names_of_files() -> None:
+    request = ComparisonRequest(
+        log="a.ulg", axes=("north", "east"), clock_offset_s=-0.12, heading_deg=30.0,
+        position=PositionFile(path="/home/x/u wb.csv", columns=("t", "x/y", "*")),
+    )  # fmt: skip
+    assert settings_name(request) == (
+        "_axis-north_axis-east_heading-30_clock-offset--0.12_position-u-wb_position-columns-t,x-y,-"
+    )
+    assert settings_name(ComparisonRequest(log="a.ulg")) == ""
+
+
+# --- how far it is ---
+
+
+def test_every_step_of_the_bar_is_said_in_its_order(sample_log) -> None:
+    slam = sample_log.parent / "loop_vio.ulg"
+    told: dict[str, list[str]] = {"compare": [], "tune": [], "whatif": [], "loop": []}
+    analyse(ComparisonRequest(log=str(sample_log)), told["compare"].append)
+    tuned(
+        run_comparison(ComparisonRequest(log=str(sample_log)), told["tune"].append),
+        progress=told["tune"].append,
+    )
+    run_what_if(WhatIfRequest(log=str(sample_log)), told["whatif"].append)
+    run_loop(LoopRequest(source=str(slam)), told["loop"].append)
+    for name, module in (("compare", compare), ("tune", tune), ("whatif", whatif), ("loop", loop)):
+        steps = [step for step in module.STEPS if step != "drawing"]  # said by the command itself
+        at = [next(i for i, what in enumerate(told[name]) if what.startswith(s)) for s in steps]
+        assert at == sorted(at), name
+
+
+def test_the_bar_shows_what_remains_on_a_terminal_only(monkeypatch, capsys) -> None:
+    with progress(steps=("reading", "fitting")) as step:
+        step("reading x")
+    assert capsys.readouterr().err == ""
+    monkeypatch.setenv("TTY_COMPATIBLE", "1")
+    monkeypatch.setenv("COLUMNS", "100")
+    with progress(steps=("reading", "fitting")) as step:
+        step("reading x")
+        step("fitting y")
+        step("a detail of it")
+        step("reading again")
+    shown = capsys.readouterr().err
+    assert "reading again" in shown
+    assert "step 2 of 2" in shown
+    with progress(quiet=True, steps=("reading",)) as step:
+        step("reading x")
+    assert capsys.readouterr().err == ""
+
+
+# --- why ---
+
+
+def test_whatif_says_why_ekf2_differs(sample_log) -> None:
+    (line,) = [x for x in run("whatif", sample_log).stdout.splitlines() if x.startswith("Why")]
+    assert "is the process noise" in line
+
+
+def test_compare_says_why_ekf2_differs_once(summaries) -> None:
+    assert summaries[None].count("Most of what ours and EKF2") == 1
