@@ -367,6 +367,45 @@ def test_ekf2_at_a_stop_is_what_whatif_says(page: Browser, made: tuple[Path, Ana
     assert page.ask(TABLE)["Measurements"][1] != str(told.samples)
 
 
+def test_the_pointer_tells_values_and_the_dark_has_its_colours(page: Browser) -> None:
+    x, y = page.ask(
+        "(() => { const node = document.getElementById('position-0');"
+        "node.scrollIntoView({block: 'center'}); const box = node.getBoundingClientRect();"
+        "return [box.x + box.width / 2, box.y + box.height / 2]; })()"
+    )
+    for step in range(3):
+        page.call("Input.dispatchMouseEvent", type="mouseMoved", x=x + step, y=y)
+        settle(page)
+    # tips stand in the shadow roots of the plots
+    told = page.ask(
+        "(() => { const all = (root) => [...root.querySelectorAll('*')].flatMap((node) =>"
+        "node.shadowRoot ? [...node.shadowRoot.children].map((one) => one.textContent)"
+        ".concat(all(node.shadowRoot)) : []);"
+        "return all(document.body).join(' '); })()"
+    )
+    assert re.search(r"ours: *-?[\d.]+ m", told)
+    assert re.search(r"EKF2: *-?[\d.]+ m", told)
+    back = "Explore.then((e) => e.model('position-0').background_fill_color)"
+    light = ask(page, back)
+    dark = [{"name": "prefers-color-scheme", "value": "dark"}]
+    page.call("Emulation.setEmulatedMedia", features=dark)
+    settle(page)
+    assert ask(page, back) != light
+    page.call("Emulation.setEmulatedMedia", features=[])
+    settle(page)
+    assert ask(page, back) == light
+
+
+def test_copies_the_command(page: Browser) -> None:
+    page.call("Browser.grantPermissions", permissions=["clipboardReadWrite"])
+    page.click("#copy-0")
+    settle(page)
+    said = page.ask("document.getElementById('copy-0').nextSibling.textContent")
+    assert said == " copied"
+    line = page.ask("document.getElementById('command-0').textContent")
+    assert ask(page, "navigator.clipboard.readText()") == line
+
+
 def test_a_box_on_the_track_is_a_time(page: Browser) -> None:
     span = "document.getElementById('span').textContent"
     whole = page.ask(span)

@@ -38,7 +38,8 @@ SCRIPT = """(async () => {
     const run = Engine.replay(flight, flight.axes[at], settings);
     const lists = (part) => Object.fromEntries(
       Object.entries(part).map(([name, values]) => [name, Array.from(values)]));
-    const between = Float64Array.from({ length: 400 }, (_, i) => flight.segment[0] - 1 + 0.0813 * i);
+    const early = flight.segment[0] - 1;
+    const between = Float64Array.from({ length: 400 }, (_, i) => early + 0.0813 * i);
     return { steps: lists(run.steps), updates: lists(run.updates),
       between: lists({ time: between, ...Engine.stateAt(run, between) }) };
   });

@@ -71,7 +71,6 @@ def flight_data(
         "source": comparison.source.name,
         "shift": segment.start_s if beside else 0.0,
         "story": list(story(analysis, findings)),
-        "notes": list(comparison.notes),
         "settings": _settings(settings),
         "main": comparison.main.axis.name,
         **signals,
@@ -186,7 +185,6 @@ def _signals(
         "name": axis.name,
         "time": packer.add_times(time[near]),
         "z": packer.add(value[near]),
-        "count": int(np.count_nonzero(near)),
     }
     if isinstance(axis.acceleration, Acceleration):
         used = axis.acceleration.integral_m_s[_used(comparison, axis.acceleration)]
@@ -327,7 +325,6 @@ def _finding(finding: Finding) -> dict[str, Any]:
         "severity": finding.severity,
         "message": finding.message,
         "remedy": finding.remedy,
-        "when": finding.when,
         "spans": [list(span) for span in finding.spans_s[:20]],
         "more": [_finding(one) for one in finding.consequences],
     }

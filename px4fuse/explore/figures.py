@@ -190,7 +190,8 @@ def _innovations(made: Any, sources: dict[str, ColumnDataSource], *, with_ekf2: 
 
 def _hover(made: Any, renderer: Any, *rows: tuple[str, str]) -> None:
     tips = [("time", "@t{0.00} s"), *rows]
-    made.add_tools(HoverTool(renderers=[renderer], tooltips=tips, mode="vline"))
+    side: Any = {"EKF2": "right", "truth": "above"}.get(rows[0][0], "left")  # none hides another
+    made.add_tools(HoverTool(renderers=[renderer], tooltips=tips, mode="vline", attachment=side))
 
 
 def _range(name: str | None = None) -> Range1d:
@@ -205,13 +206,15 @@ def _source(name: str, number: int, columns: str) -> ColumnDataSource:
 
 
 def _bands(data: dict[str, Any]) -> list[tuple[float, float, dict[str, Any]]]:
-    """Shading behind every plot against time: where the source is silent, and on the ground."""
+    """Shading behind every plot against time: modes in turn, ground, silence, dropouts."""
     grey: dict[str, Any] = {"fill_color": "#888888", "line_color": None}
     hatched: dict[str, Any] = {
         "hatch_pattern": "/", "hatch_color": "#888888", "hatch_alpha": 0.6, "fill_alpha": 0.05,
     }  # fmt: skip
     events = data["events"]
+    sand: dict[str, Any] = {"fill_color": "#b08a3a", "fill_alpha": 0.1, "line_color": None}
     return [
+        *((low, high, sand) for low, high, _ in events["modes"][1::2]),
         *((low, high, grey | {"fill_alpha": 0.18}) for low, high in events["ground"]),
         *((low, high, grey | hatched) for low, high in events["silent"]),
         *((low, high, grey | {"fill_alpha": 0.45}) for low, high in events["dropout"]),

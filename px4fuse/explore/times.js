@@ -213,6 +213,8 @@ const Times = (() => {
     }
 
     // ------------------------------------------------------------------ findings and words
+    $("facts").textContent = flights.map((flight) => `${flights.length > 1 ? `${flight.log}: ` : ""}positions `
+      + `from ${flight.source}, ${flight.segment.map((t) => t.toFixed(1)).join(" s to ")} s`).join("; ");
     $("story").textContent = flights.length === 1 ? lone.story.join(" ") : "";
     for (const flight of flights) {
       if (flights.length > 1) $("found").append(make("h3", flight.log));
