@@ -14,6 +14,7 @@ import signal
 from pathlib import Path
 
 import pytest
+from browser import browser  # noqa: F401 - a fixture
 from hypothesis import HealthCheck, settings
 
 from px4fuse.flight import Flight

@@ -1,0 +1,67 @@
+"""``px4fuse explore``: the filter's knobs, on a page that replays the flight."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from px4fuse.cli.inputs import analysis_options, comparison_request, path_option
+from px4fuse.cli.outputs import progress, spare_inputs, terminal, write_outputs
+from px4fuse.errors import OutputError, SettingsError
+from px4fuse.request import settings_name
+from px4fuse.writing import STANDARD_OUTPUT
+
+STEPS = (
+    "reading", "filtering", "tuning", "clock offset", "changes of the clock", "replaying EKF2",
+    "heading", "looking for a loop", "writing the page",
+)  # fmt: skip
+ENDINGS = (".html", ".htm")
+
+
+@click.command()
+@click.argument("logs", nargs=-1, required=True, type=click.Path(path_type=Path))
+@analysis_options
+@path_option("-o", "--output", metavar="FILE.html", help="The page.  [default: reports/LOG.html]")
+@click.option("--open", "show", is_flag=True, help="Open it in the browser.")
+def explore(logs: tuple[Path, ...], output: Path | None, show: bool, **given: Any) -> None:
+    """Write a web page with sliders for SIGMA_A, SIGMA_Z, DT and the clock offset.
+
+    LOG is a PX4 ULog or a MAVLink recording; with two of them, both stand side by side. The page is
+    one file that needs no network: it replays the filter in the browser at every move and shows
+    what that does to innovations, variances and errors.
+    """
+    from px4fuse.analysis import run
+    from px4fuse.findings import find
+
+    if len(logs) > 2:
+        raise SettingsError(f"{len(logs)} logs: give one, or two to see them side by side.")
+    if len(logs) == 2 and (given["mavlink"] is not None or given["position"] is not None):
+        raise SettingsError("--mavlink and --position belong to one log: give only one LOG.")
+    if output is not None and output.suffix.lower() not in ENDINGS and output != STANDARD_OUTPUT:
+        raise OutputError(f"{output}: a web page. Give a name that ends in .html with -o.")
+    requests = [comparison_request(log, dict(given)) for log in logs]
+    stems = "_".join(log.stem for log in logs)
+    target = output or Path("reports", f"{stems}{settings_name(requests[0])}.html")
+    spare_inputs([target])  # before the work, not after it
+    with progress(target == STANDARD_OUTPUT, STEPS) as step:
+        found = []
+        for request in requests:
+            analysis = run(request, step)
+            found.append((analysis, find(analysis), request))
+        step("writing the page")
+        # Bokeh takes long to import, and bad input needs none of it
+        from px4fuse.explore.page import html_text
+
+        content = html_text(found).encode()
+    write_outputs({target: content})
+    if target == STANDARD_OUTPUT:
+        return
+    from px4fuse.report.screen import print_file
+
+    print_file(terminal(), "Page", target)
+    if show:
+        import webbrowser
+
+        webbrowser.open(target.resolve().as_uri())

@@ -1,0 +1,1 @@
+"""One HTML page on which a flight's filter is turned and watched: Analysis → page."""

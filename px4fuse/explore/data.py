@@ -1,0 +1,362 @@
+"""What the page holds of a flight: the signals that the filter runs on, EKF2, truth and marks.
+
+Python projects, integrates and judges EKF2; the page only replays our filter.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+import numpy as np
+import pandas as pd
+from scipy import stats
+
+from px4fuse.analysis import Analysis
+from px4fuse.arrays import Array
+from px4fuse.comparison.comparison import AgainstTruth, AxisComparison, Comparison, FilterSummary
+from px4fuse.comparison.events import happened
+from px4fuse.explore.ekf2_grid import grid_data
+from px4fuse.explore.packing import COARSE, Packer
+from px4fuse.filter.consistency import CONFIDENCE, Consistency, nis_band
+from px4fuse.filter.kalman import (
+    CLOCK_OFFSET_RANGE_S,
+    DT_RANGE_S,
+    SIGMA_A_RANGE_M_S2,
+    SIGMA_Z_RANGE_M,
+    Settings,
+)
+from px4fuse.filter.model import INITIAL_COVARIANCE
+from px4fuse.filter.signals import Acceleration, Axis, along, choose_source, imu_gaps, within
+from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
+from px4fuse.findings.model import Finding
+from px4fuse.findings.story import story
+from px4fuse.flight import POSITION_COLUMNS, PositionTrack, Unavailable
+from px4fuse.request import ComparisonRequest, command_line
+
+# How far the stamps can be moved on the page; --clock-offset takes more
+OFFSET_REACH_S = 0.6
+# Innovations that the running mean of NIS is taken over
+RUNNING = 30
+# The track on the plan is drawn with at most so many points
+MAX_PLAN_POINTS = 2000
+
+
+def flight_data(
+    analysis: Analysis,
+    findings: tuple[Finding, ...],
+    request: ComparisonRequest,
+    packer: Packer,
+    *,
+    beside: bool = False,
+) -> dict[str, Any]:
+    """Everything about one flight, as JSON can hold it; arrays are places in the packer.
+
+    Parameters
+    ----------
+    analysis : Analysis
+    findings : tuple of Finding
+    request : ComparisonRequest
+        That the analysis was made from.
+    packer : Packer
+    beside : bool
+        Whether it stands beside another flight: then times are from the start of its segment.
+    """
+    comparison = analysis.comparison
+    signals = signals_of(comparison, packer)
+    settings, segment = comparison.settings, comparison.segment
+    events = happened(comparison)
+    return {
+        "log": comparison.flight.log.name,
+        "source": comparison.source.name,
+        "shift": segment.start_s if beside else 0.0,
+        "story": list(story(analysis, findings)),
+        "settings": _settings(settings),
+        "main": comparison.main.axis.name,
+        **signals,
+        "axes": [
+            own | _others(analysis, result, packer)
+            for own, result in zip(signals["axes"], comparison.axes, strict=True)
+        ],
+        "maps": _maps(analysis),
+        "grid": "only for one log" if beside else grid_data(analysis, packer),
+        "plan": _plan(comparison, packer),
+        "events": {
+            "silent": list(events.gaps),
+            "dropout": list(events.dropouts),
+            "ground": list(events.ground),
+            "modes": [[mode.start_s, mode.end_s, mode.name] for mode in events.modes],
+            "reset": list(events.resets_s),
+        },
+        "findings": [_finding(one) for one in findings],
+        "command": _command(request, comparison),
+        "offset": _offset(request, settings),
+    }
+
+
+def signals_of(comparison: Comparison, packer: Packer) -> dict[str, Any]:
+    """What the page's engine replays: measurements, IMU integrals, segment and start.
+
+    Parameters
+    ----------
+    comparison : Comparison
+    packer : Packer
+    """
+    raw = raw_source(comparison)
+    return {
+        "segment": [comparison.segment.start_s, comparison.segment.end_s],
+        "start": list(INITIAL_COVARIANCE),
+        "imu": _imu(comparison, packer),
+        "axes": [_signals(comparison, result.axis, raw, packer) for result in comparison.axes],
+    }
+
+
+def ranges() -> dict[str, Any]:
+    """What the settings may be, as the command line takes them, and the lesson's values."""
+    return {
+        "sigma-a": list(SIGMA_A_RANGE_M_S2),
+        "sigma-z": list(SIGMA_Z_RANGE_M),
+        "dt": list(DT_RANGE_S),
+        "clock-offset": list(CLOCK_OFFSET_RANGE_S),
+        "lesson": _settings(Settings()),
+        "running": [RUNNING, *nis_band(RUNNING)],
+    }
+
+
+def raw_source(comparison: Comparison) -> PositionTrack:
+    """The comparison's source with the stamps that it came with."""
+    return choose_source(comparison.flight, comparison.source.name)[0]
+
+
+def _settings(settings: Settings) -> dict[str, Any]:
+    return {
+        "sigmaA": settings.sigma_a_m_s2,
+        "sigmaZ": settings.sigma_z_m,
+        "dt": settings.dt_s,
+        "input": settings.input,
+        "offset": settings.clock_offset_s,
+    }
+
+
+def _offset(request: ComparisonRequest, settings: Settings) -> dict[str, Any]:
+    """How far the stamps can be moved, and why not where they cannot."""
+    if request.position is not None:
+        return {"why": "the clock offset of a position file is spent on placing it"}
+    centre = settings.clock_offset_s
+    return {"from": centre - OFFSET_REACH_S, "to": centre + OFFSET_REACH_S}
+
+
+def _imu(comparison: Comparison, packer: Packer) -> dict[str, Any] | str:
+    """Times, gaps and span of the acceleration; why not where there is none."""
+    acceleration = comparison.axes[0].axis.acceleration
+    if isinstance(acceleration, Unavailable):
+        return acceleration.reason
+    time = acceleration.time_s
+    gap = np.flatnonzero(imu_gaps(time))
+    edges = np.stack([time[gap], time[gap + 1]], 1)
+    total = np.cumsum(edges[:, 1] - edges[:, 0])
+    return {
+        "time": packer.add_times(time[_used(comparison, acceleration)]),
+        "span": [time[0], time[-1]],
+        "gapEdges": edges.ravel().tolist(),
+        "gapSum": np.stack([np.concatenate([[0.0], total])[:-1], total], 1).ravel().tolist(),
+    }
+
+
+def _used(comparison: Comparison, acceleration: Acceleration) -> slice:
+    """The samples that steps inside the segment can need, one beyond either end."""
+    segment, time = comparison.segment, acceleration.time_s
+    low = int(np.searchsorted(time, segment.start_s, side="right")) - 1
+    high = int(np.searchsorted(time, segment.end_s)) + 1
+    return slice(max(low, 0), high)
+
+
+def _signals(
+    comparison: Comparison, axis: Axis, raw: PositionTrack, packer: Packer
+) -> dict[str, Any]:
+    """One axis: measurements as they were stamped, also beyond the segment, and acceleration."""
+    segment = comparison.segment
+    time = raw.samples.index.to_numpy()
+    value = along(raw.samples, POSITION_COLUMNS, axis.direction)
+    reach = OFFSET_REACH_S + abs(comparison.settings.clock_offset_s)
+    near = (time >= segment.start_s - reach) & (time <= segment.end_s + reach)
+    near &= np.isfinite(value)
+    made: dict[str, Any] = {
+        "name": axis.name,
+        "time": packer.add_times(time[near]),
+        "z": packer.add(value[near]),
+    }
+    if isinstance(axis.acceleration, Acceleration):
+        used = axis.acceleration.integral_m_s[_used(comparison, axis.acceleration)]
+        made |= {"integral": packer.add(used - used[0]), "rms": axis.acceleration.rms_m_s2}
+    return made
+
+
+def _others(analysis: Analysis, result: AxisComparison, packer: Packer) -> dict[str, Any]:
+    """What stands beside our filter along one axis."""
+    return {
+        "heading": result.axis.heading_deg,
+        "note": result.axis.note,
+        "direction": result.axis.direction.tolist(),
+        "bands": _bands(len(result.axis.measurement_time_s), packer),
+        "map": _map_of(analysis, result.axis.name),
+        "ekf2": _ekf2(result, packer),
+        "truth": _truth(result, packer),
+    }
+
+
+def _bands(count: int, packer: Packer) -> list[int]:
+    """Bands of the mean NIS for every number of innovations: places of both ends.
+
+    Another clock offset moves measurements into the segment and out of it.
+    """
+    freedom = np.arange(1, 2 * count + 1)
+    ends = ((1.0 - CONFIDENCE) / 2.0, (1.0 + CONFIDENCE) / 2.0)
+    return [packer.add(np.asarray(stats.chi2.ppf(end, freedom)) / freedom, COARSE) for end in ends]
+
+
+def _ekf2(result: AxisComparison, packer: Packer) -> dict[str, Any] | str:
+    """What EKF2 did, which no setting of ours changes; why not where there is none."""
+    if isinstance(result.ekf2_state, Unavailable):
+        return result.ekf2_state.reason
+    state = result.ekf2_state.dropna()
+    made: dict[str, Any] = {
+        "state": _frame(state, ["position_m", "velocity_m_s"], packer),
+        "variance": "",
+        "innovations": "",
+        "summary": _summary(result.ekf2, result.ekf2_truth),
+        "r": None,
+    }
+    if isinstance(result.ekf2_variance, pd.DataFrame):
+        sigma = result.ekf2_variance.dropna().pow(0.5)
+        made["variance"] = _frame(
+            sigma, ["position_variance_m2", "velocity_variance_m2_s2"], packer
+        )
+    if isinstance(result.ekf2_innovations, pd.DataFrame):
+        frame = result.ekf2_innovations
+        shown = frame[np.isfinite(frame["innovation_m"]) & (frame["innovation_variance_m2"] > 0)]
+        used = shown.assign(
+            rejected=(shown["rejected"] > 0).astype(float),
+            sigma=np.sqrt(shown["innovation_variance_m2"]),
+        )
+        made["innovations"] = _frame(used, ["innovation_m", "sigma", "rejected"], packer)
+        r = frame["observation_variance_m2"].dropna()
+        made["r"] = float(np.sqrt(r.median())) if len(r) else None
+    else:
+        made["why"] = result.ekf2_innovations.reason
+    return made
+
+
+def _truth(result: AxisComparison, packer: Packer) -> dict[str, Any] | str:
+    if isinstance(result.truth, Unavailable):
+        return result.truth.reason
+    position = result.truth[["position_m"]].dropna()
+    velocity = result.truth[["velocity_m_s"]].dropna()
+    return {
+        "p": _frame(position, ["position_m"], packer),
+        "v": _frame(velocity, ["velocity_m_s"], packer) if len(velocity) else None,
+    }
+
+
+def _frame(frame: pd.DataFrame, columns: list[str], packer: Packer) -> list[int]:
+    """Places of the times and of some columns."""
+    values = [packer.add(frame[column].to_numpy(), COARSE) for column in columns]
+    return [packer.add_times(frame.index.to_numpy()), *values]
+
+
+def _summary(
+    summary: FilterSummary | Unavailable, truth: AgainstTruth | Unavailable
+) -> dict[str, Any]:
+    """EKF2's column of the table."""
+    made: dict[str, Any] = {"why": ""}
+    statement = summary if isinstance(summary, Unavailable) else summary.consistency
+    if isinstance(statement, Consistency):
+        made |= {
+            "count": statement.count,
+            "nis": statement.nis_mean,
+            "band": list(statement.nis_band),
+            "outside": statement.outside_two_sigma,
+            "lag1": statement.lag1_autocorrelation,
+        }
+    else:
+        made["why"] = statement.reason
+    if isinstance(truth, AgainstTruth):
+        made |= {"truthP": truth.position_rmse_m, "truthV": truth.velocity_rmse_m_s}
+    return made
+
+
+def _map_of(analysis: Analysis, name: str) -> str:
+    """Which likelihood map tells of an axis: the joint one of the horizontal axes, or its own."""
+    joint = HORIZONTAL if name != "down" else "down"
+    return joint if joint in analysis.tuning else name
+
+
+def _maps(analysis: Analysis) -> dict[str, Any]:
+    """What the map of each axis shows; why not where there is none."""
+    return {
+        name: {
+            "sigmaA": tuned.map.sigma_a_m_s2[[0, -1]].tolist(),
+            "sigmaZ": tuned.map.sigma_z_m[[0, -1]].tolist(),
+            "likely": [tuned.filter_sigma_a.value, tuned.sigma_z.value],
+            "count": tuned.count,
+        }
+        if isinstance(tuned, AxisTuning)
+        else tuned.reason
+        for name, tuned in analysis.tuning.items()
+    }
+
+
+def _plan(comparison: Comparison, packer: Packer) -> list[int] | str:
+    """The source's track seen from above: places of time, north and east."""
+    samples = within(comparison.source.samples, comparison.segment)
+    track = samples[POSITION_COLUMNS[:2]].dropna()
+    if not len(track):
+        return "the source has no horizontal position"
+    some = track.iloc[:: max(1, -(-len(track) // MAX_PLAN_POINTS))]
+    columns: list[Array] = list(some.to_numpy().T)
+    return [
+        packer.add_times(some.index.to_numpy()),
+        *(packer.add(column, COARSE) for column in columns),
+    ]
+
+
+def _finding(finding: Finding) -> dict[str, Any]:
+    return {
+        "severity": finding.severity,
+        "message": finding.message,
+        "remedy": finding.remedy,
+        "spans": [list(span) for span in finding.spans_s[:20]],
+        "more": [_finding(one) for one in finding.consequences],
+    }
+
+
+def _command(request: ComparisonRequest, comparison: Comparison) -> dict[str, Any]:
+    """The command without what the page sets, and what holds the analysed part where it is.
+
+    The segment and the aisle are found from the stamps, so that another clock offset would move
+    them: then they are said.
+    """
+    bare = msgspec.structs.replace(
+        request, sigma_a_m_s2=0.5, sigma_z_m=0.10, dt_s=0.1, input=None, clock_offset_s=None
+    )
+    if request.position is not None:
+        bare = msgspec.structs.replace(bare, clock_offset_s=request.clock_offset_s)
+    heading = next(
+        (result.axis.heading_deg for result in comparison.axes if result.axis.name == "aisle"), None
+    )
+    held = msgspec.structs.replace(
+        bare,
+        start_s=comparison.segment.start_s,
+        end_s=comparison.segment.end_s,
+        heading_deg=heading if bare.heading_deg is None else bare.heading_deg,
+    )
+    return {
+        "bare": command_line(bare),
+        "held": command_line(held),
+        "input": request.input,
+        "found": "zero" if isinstance(_first_acceleration(comparison), Unavailable) else "imu",
+    }
+
+
+def _first_acceleration(comparison: Comparison) -> Acceleration | Unavailable:
+    return comparison.axes[0].axis.acceleration

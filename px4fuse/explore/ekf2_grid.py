@@ -1,0 +1,181 @@
+"""EKF2 with other parameters, on a grid of stops: replayed here, since the page has no EKF2.
+
+Only where the model of EKF2 agrees with the log, and only at the stops: nothing between them is
+made up.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from px4fuse.analysis import Analysis
+from px4fuse.arrays import Array, BoolArray
+from px4fuse.ekf2.agreement import at_times, judged_from, settled
+from px4fuse.ekf2.model import Model, replay_settings
+from px4fuse.ekf2.parameters import PARAMETERS
+from px4fuse.ekf2.replay import HORIZONTAL, Ekf2Replay
+from px4fuse.explore.packing import Packer
+from px4fuse.filter.consistency import Consistency, assess
+from px4fuse.filter.signals import within
+from px4fuse.flight import POSITION_COLUMNS, Ekf2, Truth, Unavailable
+
+# As multiples of the noise as flown, and beside the delay (ms) and the gate as flown
+NOISES = (0.25, 0.5, 1.0, 2.0, 4.0)
+DELAYS_MS = (0.0, 50.0, 100.0, 150.0, 200.0)
+GATES = (3.0, 5.0)
+# Innovations of all stops together that the page draws; of more it draws every second, third, …
+MOST_DRAWN = 60_000
+MILLIMETRES, TENTHS = 1e3, 1e4
+
+
+def grid_data(analysis: Analysis, packer: Packer) -> dict[str, Any] | str:
+    """Innovations, verdicts and rejections at every stop; why not where there are none.
+
+    Parameters
+    ----------
+    analysis : Analysis
+    packer : Packer
+    """
+    model = analysis.ekf2_model
+    if isinstance(model, Unavailable):
+        return model.reason
+    if not model.agreement.good:
+        return f"the model does not reproduce what EKF2 logged: {model.agreement.reason}"
+    stops = _stops(model.inputs.settings)
+    settings = [
+        dict(zip(stops, values, strict=True)) for values in itertools.product(*stops.values())
+    ]
+    segment = analysis.comparison.segment
+    replays = replay_settings(model, settings)
+    count = sum(len(within(replay.updates, segment)) for replay in replays)
+    every = -(-count // MOST_DRAWN) if count else 1
+    directions = {
+        result.axis.name: result.axis.direction
+        for result in analysis.comparison.axes
+        if result.axis.direction[2] == 0.0
+    }
+    flown = model.inputs.settings
+    return {
+        "stops": [[name, PARAMETERS[name].unit, values] for name, values in stops.items()],
+        "flown": [stops[name].index(_told(flown[name])) for name in stops],
+        "agreement": model.agreement.reason,
+        "every": every,
+        "cases": [_case(analysis, model, replay, directions, every, packer) for replay in replays],
+    }
+
+
+def _told(value: float) -> float:
+    """Without what a parameter's single precision adds: 0.1, not 0.10000000149."""
+    return float(f"{value:.6g}")
+
+
+def _stops(flown: Mapping[str, float]) -> dict[str, list[float]]:
+    noise, delay, gate = (
+        _told(flown[name]) for name in ("EKF2_EVP_NOISE", "EKF2_EV_DELAY", "EKF2_EVP_GATE")
+    )
+    wanted = {
+        "EKF2_EVP_NOISE": {_told(noise * factor) for factor in NOISES},
+        "EKF2_EV_DELAY": {*DELAYS_MS, delay},
+        "EKF2_EVP_GATE": {*GATES, gate},
+    }
+    return {
+        name: sorted(
+            value
+            for value in values
+            if PARAMETERS[name].minimum <= value <= PARAMETERS[name].maximum
+            or value == _told(flown[name])
+        )
+        for name, values in wanted.items()
+    }
+
+
+def _case(
+    analysis: Analysis,
+    model: Model,
+    replay: Ekf2Replay,
+    directions: Mapping[str, Array],
+    every: int,
+    packer: Packer,
+) -> dict[str, Any]:
+    """One stop: north and east as drawn, and the numbers of each horizontal axis."""
+    judged = judged_from(model.flown)
+    used = replay.updates[settled(replay.updates.index.to_numpy(), judged)]
+    shown = within(replay.updates, analysis.comparison.segment)
+    drawn = shown.iloc[::every]
+    return {
+        "time": packer.add_times(np.round(drawn.index.to_numpy(), 6)),
+        "nu": [
+            packer.add(drawn[f"innovation_{axis}_m"].to_numpy(), MILLIMETRES) for axis in HORIZONTAL
+        ],
+        "sigma": [
+            packer.add(np.sqrt(drawn[f"innovation_variance_{axis}_m2"].to_numpy()), TENTHS)
+            for axis in HORIZONTAL
+        ],
+        "flag": packer.add(drawn["rejected"].to_numpy(), 1.0),
+        "rejected": packer.add(np.round(_times(shown, "rejected"), 3), MILLIMETRES),
+        "reset": packer.add(np.round(_times(shown, "reset"), 3), MILLIMETRES),
+        "share": float(used["rejected"].mean()) if len(used) else 0.0,
+        "resets": int(used["reset"].sum()),
+        "lost": replay.late + replay.lost,
+        "axes": {
+            name: _numbers(analysis, replay, used, direction, judged)
+            for name, direction in directions.items()
+        },
+    }
+
+
+def _times(updates: pd.DataFrame, column: str) -> Array:
+    times: Array = updates.index.to_numpy()[updates[column].to_numpy() > 0]
+    return times
+
+
+def _along(updates: pd.DataFrame, direction: Array) -> tuple[Array, Array]:
+    """Innovation and variance along a horizontal direction; EKF2 fuses north and east apart."""
+    c, s = float(direction[0]), float(direction[1])
+    north, east = (updates[f"innovation_{axis}_m"].to_numpy() for axis in HORIZONTAL)
+    s_north, s_east = (updates[f"innovation_variance_{axis}_m2"].to_numpy() for axis in HORIZONTAL)
+    return c * north + s * east, c * c * s_north + s * s * s_east
+
+
+def _numbers(
+    analysis: Analysis,
+    replay: Ekf2Replay,
+    used: pd.DataFrame,
+    direction: Array,
+    judged: tuple[tuple[float, float], ...],
+) -> dict[str, Any]:
+    """EKF2's column of the table at this stop."""
+    flight = analysis.comparison.flight
+    statement = assess(*_along(used, direction))
+    made: dict[str, Any] = {"why": ""}
+    if isinstance(statement, Consistency):
+        made |= {
+            "count": statement.count,
+            "nis": statement.nis_mean,
+            "band": list(statement.nis_band),
+            "outside": statement.outside_two_sigma,
+            "lag1": statement.lag1_autocorrelation,
+        }
+    else:
+        made["why"] = statement.reason
+    if isinstance(flight.truth, Truth) and isinstance(flight.ekf2, Ekf2):
+        truth = flight.truth.samples.dropna(subset=POSITION_COLUMNS[:2])
+        times = flight.ekf2.state.index.to_numpy()
+        known: BoolArray = settled(times, judged)
+        known &= (times >= truth.index[0]) & (times <= truth.index[-1])
+        if np.any(known):
+            error = sum(
+                weight
+                * (
+                    at_times(replay.published, column, times[known])
+                    - at_times(truth, column, times[known])
+                )
+                for weight, column in zip(direction[:2], POSITION_COLUMNS[:2], strict=True)
+            )
+            made["truthP"] = float(np.sqrt(np.mean(np.square(error))))
+    return made

@@ -1,0 +1,320 @@
+"""The page's plots, empty: the page fills them with what its settings give."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from bokeh.document import Document
+from bokeh.models import (
+    ColumnDataSource,
+    FactorRange,
+    HoverTool,
+    LinearColorMapper,
+    Range1d,
+)
+from bokeh.models.annotations import BoxAnnotation, Span
+from bokeh.plotting import figure
+
+from px4fuse.analysis import Tuning
+from px4fuse.arrays import Array
+from px4fuse.explore.data import RUNNING
+from px4fuse.filter.consistency import nis_band
+from px4fuse.filter.tuning import AxisTuning
+from px4fuse.report.style import EKF2, MEASUREMENT, OURS, TRUTH
+
+HEIGHT, TALL = 190, 250
+# Ours is dark, solid and round; EKF2 is lighter, dashed and square, as in the report
+OURS_LINE: dict[str, Any] = {"line_color": OURS, "line_width": 1.6, "name": "ours"}
+EKF2_LINE: dict[str, Any] = {
+    "line_color": EKF2, "line_width": 1.6, "line_dash": [6, 3], "name": "ekf2",
+}  # fmt: skip
+TRUTH_LINE: dict[str, Any] = {
+    "line_color": TRUTH, "line_width": 1.2, "line_dash": [1, 3], "name": "truth",
+}  # fmt: skip
+NIS_BAND: dict[str, Any] = {
+    "level": "underlay", "fill_alpha": 0.15, "fill_color": "#4a8f5a", "line_color": "#4a8f5a",
+}  # fmt: skip
+LEFT = 96
+# What the page fills, by column
+SOURCES = {
+    "steps": "t p v sp sv",
+    "updates": "t nu plus minus k0 k1 running",
+    "measured": "t z",
+    "state": "t p v",
+    "variance": "t sp sv",
+    "fused": "t nu",
+    "rejected": "t nu",
+    "limits": "t plus minus",
+    "running": "t running",
+    "truth_p": "t p",
+    "truth_v": "t v",
+    "error": "t e",
+    "error_ekf2": "t e",
+}
+# Label, height, scale and unit of each plot, and its lines: source, column, style, name at the
+# pointer. Later ones lie on top
+PLOTS: dict[str, tuple[str, int, Any, str, tuple[tuple[str, str, dict[str, Any], str], ...]]] = {
+    "position": ("position (m)", TALL, "linear", "m", (
+        ("truth_p", "p", TRUTH_LINE, "truth"), ("state", "p", EKF2_LINE, "EKF2"),
+        ("steps", "p", OURS_LINE, "ours"),
+    )),
+    "velocity": ("velocity (m/s)", HEIGHT, "linear", "m/s", (
+        ("truth_v", "v", TRUTH_LINE, "truth"), ("state", "v", EKF2_LINE, "EKF2"),
+        ("steps", "v", OURS_LINE, "ours"),
+    )),
+    "error": ("error (m)", HEIGHT, "linear", "m", (
+        ("error_ekf2", "e", EKF2_LINE, "EKF2"), ("error", "e", OURS_LINE, "ours"),
+    )),
+    "innovation": ("innovation ν (m)", TALL, "linear", "m", (
+        ("limits", "plus", EKF2_LINE, ""), ("limits", "minus", EKF2_LINE, ""),
+    )),
+    "sigma_p": ("σ of position (m)", HEIGHT, "log", "m", (
+        ("steps", "sp", OURS_LINE, "ours"), ("variance", "sp", EKF2_LINE, "EKF2"),
+    )),
+    "sigma_v": ("σ of velocity (m/s)", HEIGHT, "log", "m/s", (
+        ("steps", "sv", OURS_LINE, "ours"), ("variance", "sv", EKF2_LINE, "EKF2"),
+    )),
+    "nis": ("running mean of NIS", HEIGHT, "log", "", (
+        ("running", "running", EKF2_LINE, "EKF2"), ("updates", "running", OURS_LINE, "ours"),
+    )),
+    "gain": ("gain K (1, 1/s)", HEIGHT, "linear", "", (
+        ("updates", "k0", OURS_LINE, "of position"),
+        ("updates", "k1", OURS_LINE | {"line_dash": [2, 2]}, "of velocity, 1/s"),
+    )),
+}  # fmt: skip
+# Rows of the strip of events
+STRIP = ["EKF2 reset", "EKF2 rejected", "log dropout", "source silent", "on the ground", "mode"]
+# √(2 · drop of log-likelihood): as far as so many standard deviations
+MAP_SIGMAS = 6.0
+MAP_COLOURS = [
+    "#f7fbff", "#deebf7", "#c6dbef", "#9ecae1", "#6baed6", "#4292c6",
+    "#3182bd", "#2171b5", "#11599d", "#08519c", "#084285", "#08306b",
+][::-1]  # fmt: skip
+
+
+def document_json(
+    flights: list[dict[str, Any]], tunings: list[Tuning]
+) -> tuple[Any, dict[str, str]]:
+    """Bokeh's document, and of each root the id of the element that it goes into.
+
+    Parameters
+    ----------
+    flights : list of dict
+        From :func:`px4fuse.explore.data.flight_data`.
+    tunings : list of mapping
+        Of each flight, for its likelihood maps.
+    """
+    document = Document()
+    time_range = _range("time")
+    places: dict[str, str] = {}
+    for number, (data, tuning) in enumerate(zip(flights, tunings, strict=True)):
+        plots = _plots(number, data, time_range)
+        plots |= {
+            "strip": _strip(number, data, time_range),
+            "map": _map(number, tuning),
+            "plan": _plan(number),
+            "step": _step(number),
+        }
+        for name, plot in plots.items():
+            document.add_root(plot)
+            places[plot.id] = f"{name}-{number}"
+    return document.to_json(deferred=False), places
+
+
+def _plots(number: int, data: dict[str, Any], time_range: Range1d) -> dict[str, Any]:
+    """Every plot against time of one flight, by its name."""
+    sources = {name: _source(name, number, columns) for name, columns in SOURCES.items()}
+    lacking = {
+        kind
+        for kind in ("ekf2", "truth")
+        if not any(isinstance(axis[kind], dict) for axis in data["axes"])
+    }
+    plots: dict[str, Any] = {}
+    for name, (label, height, scale, unit, lines) in PLOTS.items():
+        if name == "error" and "truth" in lacking:
+            continue
+        made = plots[name] = figure(
+            name=f"{name}-{number}", height=height, sizing_mode="stretch_width",
+            x_range=time_range, y_range=_range(), toolbar_location=None, y_axis_type=scale,
+            tools="xbox_zoom,xpan,tap", active_drag="xbox_zoom", y_axis_label=label,
+            lod_threshold=None, min_border_left=LEFT,
+        )  # fmt: skip
+        if name == "position":
+            made.scatter(
+                "t", "z", source=sources["measured"], size=3, fill_color=MEASUREMENT,
+                line_color=None, name="measured",
+            )  # fmt: skip
+        if name == "innovation":
+            _innovations(made, sources, with_ekf2="ekf2" not in lacking)
+        if name == "nis":
+            low, high = nis_band(RUNNING)
+            made.add_layout(BoxAnnotation(bottom=low, top=high, **NIS_BAND))
+        for source, column, style, who in lines:
+            if style["name"] in lacking:
+                continue
+            drawn = made.line("t", column, source=sources[source], **style)
+            if who:
+                _hover(made, drawn, (who, f"@{column}{{0.000}} {unit}"))
+        made.add_layout(Span(dimension="height", location=0.0, visible=False, name="cursor"))
+        shift = data["shift"]
+        for low, high, style in _bands(data):
+            made.add_layout(
+                BoxAnnotation(left=low - shift, right=high - shift, level="underlay", **style)
+            )
+    return plots
+
+
+def _innovations(made: Any, sources: dict[str, ColumnDataSource], *, with_ekf2: bool) -> None:
+    """Innovations of both filters as dots, and our ±2√S as a band."""
+    updates = sources["updates"]
+    made.varea(
+        "t", "minus", "plus", source=updates, fill_color=OURS, fill_alpha=0.15, name="ours_band"
+    )
+    if with_ekf2:
+        square: dict[str, Any] = {"marker": "square", "name": "ekf2"}
+        fused = made.scatter(
+            "t", "nu", source=sources["fused"], size=4, fill_color=EKF2, line_color=None, **square
+        )
+        rejected = made.scatter(
+            "t", "nu", source=sources["rejected"], size=7, fill_color=None, line_color=EKF2,
+            **square,
+        )  # fmt: skip
+        _hover(made, fused, ("EKF2", "@nu{0.000} m"))
+        _hover(made, rejected, ("EKF2 rejected", "@nu{0.000} m"))
+    ours = made.scatter(
+        "t", "nu", source=updates, size=4, fill_color=OURS, line_color=None, name="ours"
+    )
+    _hover(made, ours, ("ours", "@nu{0.000} m"), ("2√S", "@plus{0.000} m"))
+
+
+def _hover(made: Any, renderer: Any, *rows: tuple[str, str]) -> None:
+    tips = [("time", "@t{0.00} s"), *rows]
+    side: Any = {"EKF2": "right", "truth": "above"}.get(rows[0][0], "left")  # none hides another
+    made.add_tools(HoverTool(renderers=[renderer], tooltips=tips, mode="vline", attachment=side))
+
+
+def _range(name: str | None = None) -> Range1d:
+    """For the page to set."""
+    return Range1d(start=0.1, end=1.0, name=name)
+
+
+def _source(name: str, number: int, columns: str) -> ColumnDataSource:
+    """Empty, for the page to fill."""
+    empty: dict[str, Any] = {column: [] for column in columns.split()}
+    return ColumnDataSource(empty, name=f"{name}-source-{number}")
+
+
+def _bands(data: dict[str, Any]) -> list[tuple[float, float, dict[str, Any]]]:
+    """Shading behind every plot against time: modes in turn, ground, silence, dropouts."""
+    grey: dict[str, Any] = {"fill_color": "#888888", "line_color": None}
+    hatched: dict[str, Any] = {
+        "hatch_pattern": "/", "hatch_color": "#888888", "hatch_alpha": 0.6, "fill_alpha": 0.05,
+    }  # fmt: skip
+    events = data["events"]
+    sand: dict[str, Any] = {"fill_color": "#b08a3a", "fill_alpha": 0.1, "line_color": None}
+    return [
+        *((low, high, sand) for low, high, _ in events["modes"][1::2]),
+        *((low, high, grey | {"fill_alpha": 0.18}) for low, high in events["ground"]),
+        *((low, high, grey | hatched) for low, high in events["silent"]),
+        *((low, high, grey | {"fill_alpha": 0.45}) for low, high in events["dropout"]),
+    ]
+
+
+def _strip(number: int, data: dict[str, Any], time_range: Range1d) -> Any:
+    """What happened when, a row for each kind, so that no colour is needed to tell them apart."""
+    source = _source("strip", number, "row left right text")
+    rows = STRIP if any(isinstance(axis["ekf2"], dict) for axis in data["axes"]) else STRIP[2:]
+    made = figure(
+        name=f"strip-{number}", height=28 * len(rows) + 24, sizing_mode="stretch_width",
+        x_range=time_range, y_range=FactorRange(factors=rows), toolbar_location=None,
+        tools="xbox_zoom,xpan", active_drag="xbox_zoom", min_border_left=LEFT,
+        x_axis_label="time (s)",
+    )  # fmt: skip
+    made.hbar(
+        y="row", left="left", right="right", height=0.55, source=source, fill_color="#7d8894",
+        line_color="#7d8894", name="event",
+    )  # fmt: skip
+    made.text(
+        "left", "row", "text", source=source, text_font_size="11px", text_baseline="middle",
+        x_offset=3, name="ink",
+    )  # fmt: skip
+    made.add_layout(Span(dimension="height", location=0.0, visible=False, name="cursor"))
+    return made
+
+
+def _map(number: int, tuning: Tuning) -> Any:
+    """How likely the innovations are over both noises, and where the sliders stand."""
+    made = figure(
+        name=f"map-{number}", height=250, sizing_mode="stretch_width", x_axis_type="log",
+        y_axis_type="log", x_range=_range(), y_range=_range(), tools="tap",
+        toolbar_location=None, x_axis_label="SIGMA_A (m/s²)", y_axis_label="SIGMA_Z (m)",
+    )  # fmt: skip
+    mapper = LinearColorMapper(palette=MAP_COLOURS, low=0.0, high=MAP_SIGMAS)
+    for name, tuned in tuning.items():
+        if isinstance(tuned, AxisTuning):
+            x, dw = _outer(tuned.map.sigma_a_m_s2)
+            y, dh = _outer(tuned.map.sigma_z_m)
+            # rows are SIGMA_Z
+            image = np.sqrt(2.0 * np.maximum(tuned.map.drop.T, 0.0)).astype(np.float32)
+            draw: Any = made.image  # its colours stand in no signature
+            draw([image], x, y, dw, dh, color_mapper=mapper, name=f"map:{name}", visible=False)
+    trail = _source("trail", number, "x y")
+    best = _source("best", number, "x y")
+    point = _source("point", number, "x y")
+    made.line("x", "y", source=trail, line_color=EKF2, line_width=1.2, name="ekf2")
+    made.scatter("x", "y", source=trail, size=3, fill_color=EKF2, line_color=None, name="ekf2")
+    made.scatter("x", "y", source=best, size=13, marker="cross", line_color="white", line_width=2.5)
+    made.scatter(
+        "x", "y", source=point, size=12, marker="circle", fill_color=EKF2, line_color="white",
+        line_width=2.0,
+    )  # fmt: skip
+    return made
+
+
+def _outer(values: Array) -> tuple[float, float]:
+    """Where the pixels of a logarithmic axis begin, and how far they reach."""
+    half = float(np.sqrt(values[1] / values[0]))
+    return float(values[0]) / half, float(values[-1]) * half - float(values[0]) / half
+
+
+def _plan(number: int) -> Any:
+    """The track seen from above; what is chosen on it is the time that all plots show."""
+    made = figure(
+        name=f"plan-{number}", height=250, sizing_mode="stretch_width", match_aspect=True,
+        tools="box_select,tap", active_drag="box_select", toolbar_location=None,
+        x_axis_label="east (m)", y_axis_label="north (m)",
+    )  # fmt: skip
+    track = _source("plan", number, "t east north")
+    shown = _source("shown", number, "east north")
+    here = _source("here", number, "east north")
+    made.line("east", "north", source=track, line_color=MEASUREMENT, line_width=1.0)
+    made.scatter(
+        "east", "north", source=track, size=3, fill_color=MEASUREMENT, line_color=None,
+        nonselection_fill_alpha=0.6,
+    )  # fmt: skip
+    made.scatter(
+        "east", "north", source=shown, size=4, fill_color=OURS, line_color=None, name="ours"
+    )
+    made.scatter(
+        "east", "north", source=here, size=12, marker="circle_x", fill_color=None,
+        line_color=EKF2, line_width=2.0, name="ekf2",
+    )  # fmt: skip
+    return made
+
+
+def _step(number: int) -> Any:
+    """One measurement: what was predicted, what was measured, and what both make."""
+    made = figure(
+        name=f"step-{number}", height=230, sizing_mode="stretch_width", x_range=_range(),
+        y_range=_range(), tools="", toolbar_location=None,
+        x_axis_label="position (m)", y_axis_label="density (1/m)",
+    )  # fmt: skip
+    for name, style in (
+        ("before", OURS_LINE | {"line_dash": [6, 3]}),
+        ("posterior", OURS_LINE | {"line_width": 2.6}),
+        ("measurement", {"line_color": MEASUREMENT, "line_width": 2.0, "line_dash": [2, 2]}),
+    ):
+        source = _source(name, number, "x y")
+        made.line("x", "y", source=source, **style)
+    return made

@@ -1,0 +1,539 @@
+/* What moves on the page: settings to replay, replay to plots and numbers. Text from the log goes
+   into the page as text only. */
+"use strict";
+const Explore = (async () => {
+  const MOST_POINTS = 3000;
+  const read = (id) => JSON.parse(document.getElementById(id).textContent);
+  const content = read("content"), ranges = content.ranges;
+  const $ = (id) => document.getElementById(id);
+  const make = (tag, text, properties) => {
+    const node = Object.assign(document.createElement(tag), properties);
+    if (text !== undefined) node.textContent = text;
+    return node;
+  };
+  if (typeof DecompressionStream === "undefined") {
+    $("problem").textContent = "This browser is too old for this page: use one of 2023 or newer.";
+    $("problem").hidden = false;
+    return null;
+  }
+
+  // ------------------------------------------------------------------ the flights' data
+  const arrays = await Engine.unpack($("arrays").textContent, content.packed);
+  const take = (places) => places.map((place) => arrays[place]);
+  const flights = content.flights.map((flight, number) => ({
+    ...flight, number,
+    imu: typeof flight.imu === "string" ? flight.imu
+      : { ...flight.imu, time: arrays[flight.imu.time] },
+    plan: typeof flight.plan === "string" ? flight.plan : take(flight.plan),
+    axes: flight.axes.map((axis) => ({
+      ...axis, time: arrays[axis.time], z: arrays[axis.z], bands: take(axis.bands),
+      integral: axis.integral === undefined ? null : arrays[axis.integral],
+      ekf2: typeof axis.ekf2 === "string" ? axis.ekf2 : {
+        ...axis.ekf2, state: take(axis.ekf2.state), variance: take(axis.ekf2.variance || []),
+        innovations: take(axis.ekf2.innovations || []),
+      },
+      truth: typeof axis.truth === "string" ? axis.truth : {
+        p: take(axis.truth.p), v: axis.truth.v === null ? null : take(axis.truth.v),
+      },
+    })),
+  }));
+  const lone = flights[0];
+
+  // ------------------------------------------------------------------ settings
+  const KNOBS = [
+    { id: "sigma-a", key: "sigmaA", title: "SIGMA_A", unit: "m/s²", log: [0.001, 100],
+      hint: "process noise" },
+    { id: "sigma-z", key: "sigmaZ", title: "SIGMA_Z", unit: "m", log: [0.001, 10],
+      hint: "measurement noise" },
+    { id: "dt", key: "dt", title: "DT", unit: "s", log: [0.01, 1], hint: "prediction step" },
+    { id: "clock-offset", key: "offset", title: "Clock offset", unit: "s",
+      hint: "added to the source's stamps" },
+  ];
+  const TICKS = 600;
+  const settings = { ...lone.settings, axis: lone.main };
+  const chosen = { step: null }; // the measurement that is looked at, from 0
+  const round = (value, digits) => Number(value.toPrecision(digits));
+  const why = lone.offset.why;
+  const reach = why ? [settings.offset, settings.offset] : [lone.offset.from, lone.offset.to];
+  const limits = (knob) => knob.key === "offset" ? reach : ranges[knob.id];
+  const fromSlider = (knob, tick) => {
+    if (!knob.log) return Math.round((reach[0] + (reach[1] - reach[0]) * tick / TICKS) * 1e4) / 1e4;
+    const [low, high] = knob.log.map(Math.log);
+    return round(Math.exp(low + (high - low) * tick / TICKS), 3);
+  };
+  const toSlider = (knob, value) => {
+    const [low, high] = knob.log ? knob.log.map(Math.log) : reach;
+    const at = (knob.log ? Math.log(value) : value) - low;
+    return Math.round(Math.min(Math.max(at / (high - low || 1), 0), 1) * TICKS);
+  };
+  for (const knob of KNOBS) {
+    const box = make("div", undefined, { className: "knob" });
+    const label = make("label", `${knob.title} `, { htmlFor: `${knob.id}-value` });
+    label.append(make("small", `${knob.unit}, ${knob.hint}`));
+    knob.number = make("input", undefined, { type: "number", id: `${knob.id}-value`, step: "any" });
+    knob.slider = make("input", undefined, {
+      type: "range", id: knob.id, min: 0, max: TICKS, step: 1, ariaLabel: knob.title });
+    knob.slider.addEventListener("input", () => {
+      set({ [knob.key]: fromSlider(knob, Number(knob.slider.value)) });
+    });
+    knob.number.addEventListener("change", () => {
+      const value = knob.number.value === "" ? NaN : Number(knob.number.value);
+      const [low, high] = limits(knob);
+      if (value >= low && value <= high) return set({ [knob.key]: value });
+      say(`${knob.title}: give ${low} to ${high} ${knob.unit}.`);
+      show();
+    });
+    box.append(label, knob.number, knob.slider);
+    if (knob.key === "offset" && why) {
+      knob.number.disabled = knob.slider.disabled = true;
+      box.append(make("p", why, { className: "note" }));
+    }
+    $("knobs").append(box);
+  }
+  const names = lone.axes.map((axis) => axis.name)
+    .filter((name) => flights.every((flight) => flight.axes.some((axis) => axis.name === name)));
+  for (const name of names) {
+    const label = make("label");
+    label.append(make("input", undefined, { type: "radio", name: "axis", value: name }), ` ${name}`);
+    $("axes").append(label);
+  }
+  $("axes").addEventListener("change", (event) => set({ axis: event.target.value }));
+  const hasImu = flights.every((flight) => typeof flight.imu !== "string");
+  for (const radio of document.querySelectorAll("[name=input]")) {
+    radio.addEventListener("change", () => set({ input: radio.value }));
+    if (radio.value === "imu" && !hasImu) {
+      radio.disabled = true;
+      $("input-note").textContent = flights.map((f) => f.imu).find((imu) => typeof imu === "string");
+    }
+  }
+  const axisOf = (flight) => flight.axes.find((axis) => axis.name === settings.axis);
+  const say = (text) => { $("said").textContent = text; };
+  const mapOf = (flight) => flight.maps[axisOf(flight).map] ?? "not made";
+
+  $("lesson").addEventListener("click", () => {
+    const { sigmaA, sigmaZ, dt } = ranges.lesson;
+    set({ sigmaA, sigmaZ, dt });
+    say("The values of the lesson.");
+  });
+  $("likely").addEventListener("click", () => {
+    const [sigmaA, sigmaZ] = mapOf(lone).likely;
+    set({ sigmaA: round(sigmaA, 3), sigmaZ: round(sigmaZ, 3), dt: lone.settings.dt });
+    say("What makes the innovations of this flight most likely.");
+  });
+  $("ekf2-r").addEventListener("click", () => {
+    set({ sigmaZ: round(axisOf(lone).ekf2.r, 3) });
+    say("SIGMA_Z is the standard deviation that EKF2 gave the measurements (median).");
+  });
+
+  /* Take over what differs, replay and draw; wait = false draws at once */
+  let waiting = false;
+  function set(changes) {
+    Object.assign(settings, changes);
+    say("");
+    if (!waiting) {
+      waiting = true;
+      requestAnimationFrame(() => { waiting = false; show(); });
+    }
+  }
+
+  // ------------------------------------------------------------------ the address
+  function toAddress() {
+    const parts = { axis: settings.axis, input: settings.input };
+    for (const knob of KNOBS) parts[knob.id] = String(settings[knob.key]);
+    if (chosen.step !== null) parts.measurement = String(chosen.step + 1);
+    const text = `#${new URLSearchParams(parts)}`;
+    if (text !== location.hash) history.replaceState(null, "", text);
+  }
+  function fromAddress() {
+    const parts = new URLSearchParams(location.hash.slice(1)), ignored = [];
+    for (const knob of KNOBS) {
+      if (!parts.has(knob.id) || (knob.key === "offset" && why)) continue;
+      const text = parts.get(knob.id), value = text === "" ? NaN : Number(text);
+      const [low, high] = limits(knob);
+      if (value >= low && value <= high) settings[knob.key] = value;
+      else ignored.push(knob.id);
+    }
+    if (names.includes(parts.get("axis"))) settings.axis = parts.get("axis");
+    else if (parts.has("axis")) ignored.push("axis");
+    const input = parts.get("input");
+    if (input === "zero" || (input === "imu" && hasImu)) settings.input = input;
+    else if (input !== null) ignored.push("input");
+    const step = Number(parts.get("measurement"));
+    if (Number.isInteger(step) && step > 0) chosen.step = step - 1;
+    if (ignored.length) say(`The address has no usable ${ignored.join(", ")}: left as it was.`);
+  }
+
+  // ------------------------------------------------------------------ Bokeh
+  Bokeh.logger.set_level("off");
+  await Bokeh.embed.embed_items({ page: readDocument() }, [
+    { docid: "page", roots: content.places, root_ids: Object.keys(content.places) }]);
+  const page = Bokeh.documents[0];
+  function readDocument() {
+    // the places of map, plan and step are made here, since they stand beside words
+    for (const flight of flights) {
+      $("maps").append(make("div", undefined, { id: `map-${flight.number}` }));
+      $("lower").append(Times.places(flight));
+    }
+    return read("document");
+  }
+  const known = new Map();
+  const model = (name) => {
+    if (!known.has(name)) known.set(name, page.get_model_by_name(name));
+    return known.get(name);
+  };
+  const put = (name, flight, columns) => { model(`${name}-source-${flight.number}`).data = columns; };
+  const timeRange = model("time");
+  const figures = (flight) => ["position", "velocity", "error", "innovation", "sigma_p", "sigma_v",
+    "nis", "gain", "strip"].map((name) => model(`${name}-${flight.number}`)).filter(Boolean);
+
+  /* Rows of columns between two times, the extremes of every column kept where there are many */
+  function thin(columns, keys) {
+    const t = columns.t, n = t.length;
+    const below = (x) => { let a = 0, b = n; while (a < b) { const c = (a + b) >> 1;
+      if (t[c] < x) a = c + 1; else b = c; } return a; };
+    const from = Math.max(below(timeRange.start) - 1, 0), to = Math.min(below(timeRange.end) + 2, n);
+    const names = Object.keys(columns), out = {};
+    if (to - from <= MOST_POINTS) {
+      for (const name of names) out[name] = columns[name].subarray(from, to);
+      return out;
+    }
+    const bins = Math.floor(MOST_POINTS / 2 / keys.length), kept = [];
+    for (let b = 0; b < bins; b++) {
+      const low = from + Math.floor((to - from) * b / bins);
+      const high = from + Math.floor((to - from) * (b + 1) / bins), own = new Set();
+      for (const key of keys) {
+        const y = columns[key];
+        let least = low, most = low;
+        for (let i = low; i < high; i++) { if (y[i] < y[least]) least = i; if (y[i] > y[most]) most = i; }
+        own.add(least).add(most);
+      }
+      kept.push(...[...own].sort((a, b) => a - b));
+    }
+    for (const name of names) out[name] = Float64Array.from(kept, (i) => columns[name][i]);
+    return out;
+  }
+  const EMPTY = new Float64Array(0);
+  const table = (names, columns) => Object.fromEntries(
+    names.map((name, i) => [name, columns.length ? columns[i] : EMPTY]));
+  const later = (t, by) => by ? t.map((x) => x - by) : t;
+
+  /* Heights of the plots; two flights have the same, so that they can be compared */
+  const heights = new Map();
+  function frame(name, flight, low, high, log = false) {
+    const known = heights.get(name) ?? [Infinity, -Infinity, log];
+    heights.set(name, [Math.min(known[0], low), Math.max(known[1], high), log]);
+  }
+  function setHeights() {
+    for (const [name, [least, most, log]] of heights) {
+      let [low, high] = [least, most];
+      if (!(high > low)) [low, high] = Number.isFinite(low) ? [0.9 * low - 0.1, 1.1 * low + 0.1] : [0.1, 1];
+      const edge = log ? 1.15 : 0.06 * (high - low);
+      for (const { number } of flights) {
+        const range = model(`${name}-${number}`)?.y_range;
+        if (range) [range.start, range.end] = log ? [Math.max(low, 1e-6) / edge, high * edge] : [low - edge, high + edge];
+      }
+    }
+    heights.clear();
+  }
+  function extent(...columns) {
+    let low = Infinity, high = -Infinity;
+    for (const column of columns) for (const y of column) {
+      if (y < low) low = y;
+      if (y > high) high = y;
+    }
+    return [low, high];
+  }
+  const quantile = (values, share) => {
+    const sorted = Float64Array.from(values, Math.abs).sort();
+    return sorted.length ? sorted[Math.min(Math.floor(share * sorted.length), sorted.length - 1)] : 0;
+  };
+
+  // ------------------------------------------------------------------ a replay and its numbers
+  const runs = [];
+  function replayed(flight) {
+    const axis = axisOf(flight), run = Engine.replay(flight, axis, settings);
+    if (run === null) return { run, axis, rows: null };
+    return { run, axis, numbers: numbers(axis, run) };
+  }
+  function numbers(axis, run) {
+    const ours = Engine.assess(run.updates.nu, run.updates.s) ?? { count: run.updates.nu.length };
+    if (ours.nis !== undefined) ours.band = axis.bands.map((ends) => ends[ours.count - 1]);
+    let times = run.steps.time;
+    if (typeof axis.ekf2 !== "string") {
+      const [time, p, v] = axis.ekf2.state, at = Engine.stateAt(run, time);
+      ours.ekf2P = Engine.rmse(at.p, p);
+      ours.ekf2V = Engine.rmse(at.v, v);
+      times = time;
+    }
+    if (typeof axis.truth !== "string") {
+      const at = Engine.stateAt(run, times), { p, v } = axis.truth;
+      ours.truthP = Engine.rmse(at.p, Engine.interp(times, p[0], p[1], NaN));
+      ours.truthV = v === null ? null : Engine.rmse(at.v, Engine.interp(times, v[0], v[1], NaN));
+    }
+    return ours;
+  }
+  const verdict = ({ nis, band }) => {
+    if (nis === undefined) return "not known";
+    if (nis >= band[0] && nis <= band[1]) return "consistent";
+    const [word, factor] = nis < band[0] ? ["large", 1 / nis] : ["small", nis];
+    return `S ${factor < 100 ? factor.toPrecision(2) : Math.round(factor)}× too ${word}`;
+  };
+  const ROWS = [
+    ["Mean NIS (1 is right)", (x) => x.nis?.toFixed(2)],
+    ["95 % band of it", (x) => x.band && `${x.band[0].toFixed(2)}–${x.band[1].toFixed(2)}`],
+    ["Verdict", verdict],
+    ["Outside ±2√S (5 % is right)", (x) => x.outside === undefined ? undefined
+      : `${(100 * x.outside).toFixed(1)} %`],
+    ["Lag-1 correlation of ν", (x) => x.lag1?.toFixed(2)],
+    ["Measurements", (x) => x.count && String(x.count)],
+    ["Position: RMS to EKF2", (x) => x.ekf2P?.toFixed(3).concat(" m")],
+    ["Velocity: RMS to EKF2", (x) => x.ekf2V?.toFixed(3).concat(" m/s")],
+    ["Position: RMS to truth", (x) => x.truthP?.toFixed(3).concat(" m")],
+    ["Velocity: RMS to truth", (x) => x.truthV?.toFixed(3).concat(" m/s")],
+  ];
+  function drawTable(flight, axis, ours) {
+    const other = Grid.chosen(flight, axis);
+    const ekf2 = other ? other.axes[axis.name] : typeof axis.ekf2 === "string" ? { why: axis.ekf2 } : axis.ekf2.summary;
+    let own = $(`table-${flight.number}`);
+    if (own === null) {
+      own = make("table", undefined, { id: `table-${flight.number}` });
+      if (flights.length > 1) own.append(make("caption", flight.log));
+      const head = own.createTHead().insertRow();
+      for (const name of ["", "ours", "EKF2"]) head.append(make("th", name, { scope: "col" }));
+      const body = own.createTBody();
+      for (const [title] of ROWS) {
+        const row = body.insertRow();
+        row.append(make("th", title, { scope: "row" }), make("td", "", { className: "ours" }),
+          make("td", "", { className: "ekf2" }));
+      }
+      $("tables").append(own, make("p", "", { className: "note", id: `why-${flight.number}` }));
+    }
+    own.tHead.rows[0].cells[2].textContent = other ? "EKF2 replayed" : "EKF2";
+    ROWS.forEach(([, words], i) => {
+      const row = own.tBodies[0].rows[i], left = ours && words(ours), right = words(ekf2);
+      row.cells[1].textContent = left ?? "–";
+      row.cells[2].textContent = right ?? "–";
+      row.hidden = (left ?? right) === undefined && i > 5;
+    });
+    const missing = [];
+    if (ours === null) missing.push("Ours: too few measurements are left in the analysed part.");
+    if (ekf2.why) missing.push(`EKF2: ${ekf2.why}.`);
+    if (typeof axis.truth === "string") missing.push(`Truth: ${axis.truth}.`);
+    $(`why-${flight.number}`).textContent = missing.join(" ");
+  }
+
+  // ------------------------------------------------------------------ plots against time
+  function drawOurs(flight, { run, axis }) {
+    const shift = flight.shift, { steps, updates } = run;
+    const n = steps.time.length, m = updates.nu.length, size = n + m;
+    const saw = table(["t", "p", "v", "sp", "sv"], Array.from({ length: 5 }, () => new Float64Array(size)));
+    for (let i = 0, k = 0, u = 0; i < n; i++) {
+      if (u < m && updates.step[u] === i) { // just before the update, then just after it
+        saw.t[k] = steps.time[i] - shift; saw.p[k] = updates.p[u]; saw.v[k] = updates.v[u];
+        saw.sp[k] = Math.sqrt(updates.p00[u]); saw.sv[k++] = Math.sqrt(updates.p11[u++]);
+      }
+      saw.t[k] = steps.time[i] - shift; saw.p[k] = steps.p[i]; saw.v[k] = steps.v[i];
+      saw.sp[k] = Math.sqrt(steps.p00[i]); saw.sv[k++] = Math.sqrt(steps.p11[i]);
+    }
+    const rows = { t: updates.time.map((t) => t - shift), nu: updates.nu,
+      plus: updates.s.map((s) => 2 * Math.sqrt(s)), minus: updates.s.map((s) => -2 * Math.sqrt(s)),
+      k0: updates.k0, k1: updates.k1, running: running(updates.nu, updates.s) };
+    const seen = { steps: thin(saw, ["p", "sp"]), updates: thin(rows, ["nu", "plus"]) };
+    put("steps", flight, seen.steps);
+    put("updates", flight, seen.updates);
+    seen.measured = thin({ t: later(axis.time, shift - settings.offset), z: axis.z }, ["z"]);
+    put("measured", flight, seen.measured);
+    if (typeof axis.truth !== "string") {
+      const known = Engine.interp(steps.time, ...axis.truth.p, NaN);
+      seen.error = thin({ t: later(steps.time, shift), e: steps.p.map((p, i) => p - known[i]) }, ["e"]);
+      put("error", flight, seen.error);
+    }
+    return seen;
+  }
+  function running(nu, s) {
+    const over = ranges.running[0], out = new Float64Array(nu.length).fill(NaN);
+    for (let i = 0, sum = 0; i < nu.length; i++) {
+      sum += nu[i] * nu[i] / s[i];
+      if (i >= over) sum -= nu[i - over] * nu[i - over] / s[i - over];
+      if (i >= over - 1) out[i] = sum / over;
+    }
+    return out;
+  }
+  /* EKF2, truth: only an axis or a zoom changes them */
+  function drawOthers(flight, axis) {
+    const shift = flight.shift, seen = {};
+    const give = (name, columns, keys) => { seen[name] = thin(columns, keys); put(name, flight, seen[name]); };
+    if (typeof axis.ekf2 !== "string") {
+      // the page holds only the innovations of EKF2 with other parameters
+      const { state, variance, innovations } = axis.ekf2;
+      const own = table(["t", "p", "v"], state);
+      give("state", { ...own, t: later(own.t, shift) }, ["p", "v"]);
+      const sigma = table(["t", "sp", "sv"], variance);
+      give("variance", { ...sigma, t: later(sigma.t, shift) }, ["sp", "sv"]);
+      const rows = Grid.rows(flight, axis) ?? table(["t", "nu", "sigma", "rejected"], innovations), t = later(rows.t, shift);
+      for (const [name, flag] of [["fused", 0], ["rejected", 1]]) {
+        const which = [...t.keys()].filter((i) => rows.rejected[i] === flag);
+        give(name, { t: Float64Array.from(which, (i) => t[i]),
+          nu: Float64Array.from(which, (i) => rows.nu[i]) }, ["nu"]);
+      }
+      give("limits", { t, plus: rows.sigma.map((s) => 2 * s), minus: rows.sigma.map((s) => -2 * s) }, ["plus"]);
+      give("running", { t, running: running(rows.nu, rows.sigma.map((s) => s * s)) }, ["running"]);
+    }
+    if (typeof axis.truth !== "string") {
+      const { p, v } = axis.truth;
+      give("truth_p", { t: later(p[0], shift), p: p[1] }, ["p"]);
+      if (v !== null) give("truth_v", { t: later(v[0], shift), v: v[1] }, ["v"]);
+      if (typeof axis.ekf2 !== "string") {
+        const [time, own] = axis.ekf2.state, known = Engine.interp(time, ...p, NaN);
+        give("error_ekf2", { t: later(time, shift), e: own.map((x, i) => x - known[i]) }, ["e"]);
+      }
+    }
+    return seen;
+  }
+  function frames(flight, ours, others) {
+    const of = (part, column) => part?.[column] ?? EMPTY;
+    const { steps, updates } = ours;
+    frame("position", flight, ...extent(steps.p, of(others.state, "p"), of(others.truth_p, "p")));
+    frame("velocity", flight, ...extent(steps.v, of(others.state, "v"), of(others.truth_v, "v")));
+    frame("error", flight, ...extent(of(ours.error, "e"), of(others.error_ekf2, "e")));
+    // neither outliers nor a gap may flatten all the rest
+    const reach = 1.3 * Math.max(...[[updates.nu, updates.plus],
+      [of(others.fused, "nu"), of(others.limits, "plus")]].map(([nu, plus]) => {
+        const typical = quantile(plus, 0.5);
+        return Math.max(typical, Math.min(quantile(nu, 0.99), 2.5 * typical));
+      }));
+    frame("innovation", flight, -reach, reach);
+    frame("sigma_p", flight, ...extent(steps.sp, of(others.variance, "sp")), true);
+    frame("sigma_v", flight, ...extent(steps.sv, of(others.variance, "sv")), true);
+    frame("nis", flight, ...extent(updates.running, of(others.running, "running"), ranges.running.slice(1)), true);
+    frame("gain", flight, ...extent(updates.k0, updates.k1, [0]));
+  }
+
+  // ------------------------------------------------------------------ the map of both noises
+  const trails = flights.map(() => ({ x: [], y: [] }));
+  const mapShown = flights.map(() => null);
+  function drawMap(flight) {
+    const found = mapOf(flight), number = flight.number, plot = model(`map-${number}`);
+    const known = typeof found !== "string";
+    $(`map-${number}`).hidden = !known;
+    if (!known) return;
+    const trail = trails[number], last = trail.x.length - 1;
+    if (trail.x[last] !== settings.sigmaA || trail.y[last] !== settings.sigmaZ) {
+      trail.x.push(settings.sigmaA);
+      trail.y.push(settings.sigmaZ);
+      if (trail.x.length > 200) { trail.x.shift(); trail.y.shift(); }
+    }
+    const [[a0, a1], [z0, z1]] = [found.sigmaA, found.sigmaZ], name = axisOf(flight).map;
+    if (mapShown[number] !== name) {
+      mapShown[number] = name;
+      for (const one of plot.renderers) {
+        if (one.name?.startsWith("map:")) one.visible = one.name === `map:${name}`;
+      }
+      const likely = found.likely.every((x) => x !== null);
+      put("best", flight, likely ? { x: [found.likely[0]], y: [found.likely[1]] } : { x: [], y: [] });
+    }
+    put("trail", flight, { x: [...trail.x], y: [...trail.y] });
+    put("point", flight, { x: [settings.sigmaA], y: [settings.sigmaZ] });
+    [plot.x_range.start, plot.x_range.end] = [Math.min(a0, settings.sigmaA / 1.3), Math.max(a1, settings.sigmaA * 1.3)];
+    [plot.y_range.start, plot.y_range.end] = [Math.min(z0, settings.sigmaZ / 1.3), Math.max(z1, settings.sigmaZ * 1.3)];
+  }
+  function mapWords() {
+    const found = mapOf(lone), made = lone.settings;
+    if (typeof found === "string") return `Not known: ${found}.`;
+    const axis = axisOf(lone).map === "horizontal" ? "north and east together" : `axis ${axisOf(lone).map}`;
+    const other = made.dt !== settings.dt || made.offset !== settings.offset || made.input !== settings.input;
+    return `Of ${axis}, from ${found.count} measurements, at DT ${made.dt} s, input ${made.input}, clock `
+      + `offset ${round(made.offset, 4)} s. Dark is likely, the cross is the best, each shade half a standard `
+      + `deviation.${other ? " DT, input or clock offset are now others: the map would be another." : ""}`;
+  }
+
+  // ------------------------------------------------------------------ the command
+  const quoted = (x) => String(round(x, 12));
+  function command(flight) {
+    const { bare, held, input, found } = flight.command, lesson = ranges.lesson;
+    const moved = settings.offset !== flight.settings.offset;
+    const words = [moved ? held : bare];
+    for (const knob of KNOBS) {
+      const usual = knob.key === "offset" ? 0 : lesson[knob.key];
+      if (knob.key === "offset" && flight.offset.why) continue;
+      if (settings[knob.key] !== usual) words.push(`--${knob.id} ${quoted(settings[knob.key])}`);
+    }
+    if (settings.input !== found || input !== null) words.push(`--input ${settings.input}`);
+    return words.join(" ");
+  }
+  for (const flight of flights) {
+    const code = make("code", "", { className: "command", id: `command-${flight.number}` });
+    const button = make("button", "Copy", { type: "button", id: `copy-${flight.number}` });
+    const done = make("span", "", { className: "note" });
+    done.setAttribute("role", "status");
+    button.addEventListener("click", async () => {
+      done.textContent = await copied(code) ? " copied" : " marked: press Ctrl+C";
+    });
+    const line = make("p", undefined, { className: "buttons" });
+    line.append(button, done);
+    $("commands").append(code, line);
+  }
+  async function copied(node) {
+    try {
+      await navigator.clipboard.writeText(node.textContent);
+      return true;
+    } catch { // where the browser does not allow it, as from a file
+      getSelection().selectAllChildren(node);
+      return document.execCommand("copy");
+    }
+  }
+
+  // ------------------------------------------------------------------ all of it
+  let axisShown = null;
+  const others = [];
+  function show() {
+    for (const knob of KNOBS) {
+      knob.number.value = settings[knob.key];
+      knob.slider.value = toSlider(knob, settings[knob.key]);
+      knob.slider.ariaValueText = `${settings[knob.key]} ${knob.unit}`;
+    }
+    for (const name of ["axis", "input"]) {
+      for (const radio of document.querySelectorAll(`[name=${name}]`)) radio.checked = radio.value === settings[name];
+    }
+    const axis = axisOf(lone), found = mapOf(lone);
+    $("axis-note").textContent = [axis.heading === null ? "" : `heading ${axis.heading.toFixed(1)}°`, axis.note]
+      .filter(Boolean).join(", ");
+    $("likely").disabled = typeof found === "string" || found.likely.includes(null);
+    $("ekf2-r").disabled = typeof axis.ekf2 === "string" || axis.ekf2.r === null;
+    $("map-note").textContent = mapWords();
+    Grid.say(lone, axis);
+    const another = axisShown !== settings.axis;
+    axisShown = settings.axis;
+    for (const flight of flights) {
+      const done = runs[flight.number] = replayed(flight);
+      drawTable(flight, done.axis, done.run && done.numbers);
+      $(`command-${flight.number}`).textContent = command(flight);
+      drawMap(flight);
+      if (another) others[flight.number] = drawOthers(flight, done.axis);
+      if (another) times.strip(flight, done.axis);
+      if (done.run) frames(flight, drawOurs(flight, done), others[flight.number]);
+      times.step(flight);
+    }
+    setHeights();
+    toAddress();
+  }
+  /* After a zoom: the same replay, other rows of it */
+  function look() {
+    for (const flight of flights) {
+      const done = runs[flight.number];
+      if (!done) continue;
+      others[flight.number] = drawOthers(flight, done.axis);
+      if (done.run) frames(flight, drawOurs(flight, done), others[flight.number]);
+      times.plan(flight);
+    }
+    setHeights();
+  }
+
+  Grid.start(flights, arrays, () => { axisShown = null; show(); });
+  const times = Times.start({ flights, settings, chosen, runs, model, put, timeRange, figures, look, toAddress, axisOf, later });
+  addEventListener("hashchange", () => { fromAddress(); show(); });
+  fromAddress();
+  show();
+  look();
+  return { settings, set, show, runs, flights, model, command, numbers, timeRange };
+})();

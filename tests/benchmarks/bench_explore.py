@@ -1,0 +1,67 @@
+"""How soon the page of explore is redrawn after a slider moves, in Chromium without a GPU.
+
+Of the sample flight, two minutes long, in a window of 1400 by 900: from the slider's event until
+the frame after it has been drawn, at every axis; the replay alone; and the page's size. Nothing
+here can fail: run it, read it.
+
+    python tests/benchmarks/bench_explore.py
+"""
+
+from __future__ import annotations
+
+import shutil
+import sys
+import tempfile
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+LOG = Path(__file__).parents[2] / "sample_logs" / "aisle_uwb.ulg"
+SCRIPT = """(async () => {
+  const page = await Explore, slider = document.getElementById("%s"), whole = [], alone = [];
+  const frame = () => new Promise((done) => requestAnimationFrame(() => setTimeout(done)));
+  for (let move = 0; move < 60; move++) {
+    await frame();
+    slider.value = 150 + 5 * move;
+    let start = performance.now();
+    slider.dispatchEvent(new Event("input"));
+    await frame();
+    whole.push(performance.now() - start);
+    start = performance.now();
+    Engine.replay(page.flights[0], page.flights[0].axes[3], page.settings);
+    alone.push(performance.now() - start);
+  }
+  const at = (values, share) => values.sort((a, b) => a - b)[Math.floor(share * 59)];
+  return [at(whole, 0.5), at(whole, 0.9), at(alone, 0.5)];
+})()"""
+
+
+def main() -> None:
+    from browser import BROWSERS, Browser
+    from explore_tools import ask, open_page
+
+    from px4fuse.analysis import run
+    from px4fuse.request import ComparisonRequest
+
+    program = next(filter(None, map(shutil.which, BROWSERS)), None)
+    if program is None:
+        sys.exit("no Chromium or Chrome is installed")
+    request = ComparisonRequest(log=str(LOG))
+    with tempfile.TemporaryDirectory() as folder:
+        browser = Browser(program, Path(folder, "profile"))
+        try:
+            file = Path(folder, "page.html")
+            open_page(browser, file, [(run(request), request)])
+            print(f"page: {file.stat().st_size / 1e6:.2f} MB")
+            for knob in ("sigma-a", "sigma-z", "dt", "clock-offset"):
+                median, most, alone = ask(browser, SCRIPT % knob)
+                print(
+                    f"{knob}: {median:.0f} ms until redrawn (median), {most:.0f} ms (nine of ten); "
+                    f"the replay alone {alone:.1f} ms"
+                )
+        finally:
+            browser.close()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,533 @@
+"""The page of explore in a real browser, its numbers against Python; the command's refusals."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import re
+import shlex
+from collections.abc import Iterator
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from browser import Browser
+from click.testing import CliRunner, Result
+from explore_tools import ask, show
+from flights import Imu, aisle_flight
+
+from px4fuse.analysis import Analysis, run, run_comparison
+from px4fuse.cli import cli
+from px4fuse.cli.compare import compare as compare_command
+from px4fuse.cli.inputs import comparison_request, read_person
+from px4fuse.comparison.comparison import AxisComparison, compare
+from px4fuse.ekf2.model import replay_settings
+from px4fuse.ekf2.whatif import what_if
+from px4fuse.explore.page import html_text
+from px4fuse.filter.consistency import Consistency
+from px4fuse.filter.kalman import Settings
+from px4fuse.filter.signals import within
+from px4fuse.findings import find
+from px4fuse.flight import Flight, Unavailable
+from px4fuse.request import ComparisonRequest
+
+MARKUP = '<img src=x onerror="window.alive=1"></script><script>window.alive=2</script>\u202e'
+NOTHING = Unavailable("it", "not asked for", "")
+TABLE = """Object.fromEntries([...document.querySelectorAll('#tables tbody tr')].map((row) =>
+  [row.cells[0].textContent, [row.cells[1].textContent, row.cells[2].textContent]]))"""
+
+VALUES = "[...document.querySelectorAll('.knob input[type=number]')].map((node) => node.value)"
+
+
+@pytest.fixture(scope="module")
+def made(sample_log: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Analysis]:
+    """The page of the sample flight."""
+    request = ComparisonRequest(log=str(sample_log))
+    analysis = run(request)
+    file = tmp_path_factory.mktemp("explore") / "sample.html"
+    file.write_bytes(html_text([(analysis, find(analysis), request)]).encode())
+    return file, analysis
+
+
+@pytest.fixture
+def page(browser: Browser, made: tuple[Path, Analysis]) -> Iterator[Browser]:
+    yield show(browser, made[0])
+    assert browser.complaints() == []
+    assert browser.requests() <= {"file", "data", "blob"}
+
+
+def bare(flight: Flight) -> Analysis:
+    """Without what takes long and the page can do without."""
+    return Analysis(compare(flight), {}, NOTHING, NOTHING, {}, NOTHING, NOTHING)
+
+
+def page_of(analysis: Analysis, file: Path) -> Path:
+    request = ComparisonRequest(log=analysis.comparison.flight.log.name)
+    file.write_bytes(html_text([(analysis, (), request)]).encode())
+    return file
+
+
+# ------------------------------------------------------------------ without a browser
+
+
+class Elements(HTMLParser):
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.found: list[tuple[str, dict[str, str | None]]] = []
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attributes: list[tuple[str, str | None]]) -> None:
+        self.found.append((tag, dict(attributes)))
+
+
+def test_the_policy_allows_the_scripts_that_are_there_and_no_network(
+    made: tuple[Path, Analysis],
+) -> None:
+    text = made[0].read_text(encoding="utf-8")
+    policy = next(a["content"] or "" for _, a in Elements(text).found if a.get("http-equiv"))
+    assert "default-src 'none'" in policy
+    assert "unsafe-eval" not in policy
+    assert not re.search(r"https?:|connect-src|script-src[^;]*unsafe", policy)
+    scripts = re.findall(r"<script>(.*?)</script>", text, re.DOTALL)
+    assert len(scripts) == 3
+    for script in scripts:
+        digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+        assert f"'sha256-{digest}'" in policy
+    assert policy.count("sha256") == 3
+    for tag, attributes in Elements(text).found:
+        assert tag not in ("img", "iframe", "object", "a", "base")
+        assert "src" not in attributes
+        assert attributes.get("href") in (None, "data:,")
+
+
+def test_it_is_small_and_says_nothing_of_the_machine(made: tuple[Path, Analysis]) -> None:
+    text = made[0].read_text(encoding="utf-8")
+    assert len(text.encode()) < 3e6
+    own = text.replace(text[text.index("<script>") : text.index("</script>", 10**6)], "")
+    assert str(made[0].parent) not in own
+    assert "/home/" not in own
+    assert "/tmp/" not in own
+
+
+def test_ten_minutes_at_full_rate_stay_below_six_megabytes(tmp_path: Path) -> None:
+    analysis = bare(aisle_flight(duration_s=600.0, imu=Imu(rate_hz=250.0)))
+    assert page_of(analysis, tmp_path / "long.html").stat().st_size < 6e6
+
+
+# ------------------------------------------------------------------ numbers
+
+
+def drag(page: Browser, knob: str, share: float) -> None:
+    """With the mouse, from where the slider stands."""
+    x, y, width, now = page.ask(
+        f"(() => {{ const node = document.getElementById({json.dumps(knob)});"
+        "node.scrollIntoView({block: 'center'}); const box = node.getBoundingClientRect();"
+        "return [box.x, box.y + box.height / 2, box.width, node.value / node.max]; })()"
+    )
+    # the middle of the thumb never reaches the ends
+    places = [x + 8 + (width - 16) * at for at in np.linspace(now, share, 6)]
+    for kind, at in [
+        ("mousePressed", places[0]), *(("mouseMoved", at) for at in places[1:]),
+        ("mouseReleased", places[-1]),
+    ]:  # fmt: skip
+        page.call(
+            "Input.dispatchMouseEvent", type=kind, x=at, y=y, button="left", buttons=1,
+            clickCount=1,
+        )  # fmt: skip
+    settle(page)
+
+
+def settle(page: Browser) -> None:
+    ask(page, "new Promise((r) => requestAnimationFrame(() => requestAnimationFrame(r)))")
+
+
+def of_command(page: Browser, sample_log: Path) -> ComparisonRequest:
+    """The request that the page's own command line makes."""
+    words = shlex.split(page.ask("document.querySelector('#command-0').textContent"))
+    assert words[:2] == ["px4fuse", "compare"]
+    with compare_command.make_context("compare", words[2:]) as context:
+        given = dict(context.params)
+        for name in ("output", "json_path", "fail_on"):
+            given.pop(name)
+        read_person(given)
+        given.pop("log")
+        return comparison_request(sample_log, given)
+
+
+def cells(result: AxisComparison) -> dict[str, list[str]]:
+    def statement(found: Any) -> list[str]:
+        assert isinstance(found, Consistency)
+        low, high = found.nis_band
+        return [
+            f"{found.nis_mean:.2f}", f"{low:.2f}–{high:.2f}",
+            f"{100 * found.outside_two_sigma:.1f} %", f"{found.lag1_autocorrelation:.2f}",
+            str(found.count),
+        ]  # fmt: skip
+
+    names = ["Mean NIS (1 is right)", "95 % band of it", "Outside ±2√S (5 % is right)",
+             "Lag-1 correlation of ν", "Measurements"]  # fmt: skip
+    assert not isinstance(result.ekf2, Unavailable)
+    both = zip(statement(result.kf.consistency), statement(result.ekf2.consistency), strict=True)
+    told = {name: list(pair) for name, pair in zip(names, both, strict=True)}
+    difference, ours, theirs = result.difference, result.kf_truth, result.ekf2_truth
+    assert not isinstance(difference, Unavailable)
+    assert not isinstance(ours, Unavailable)
+    assert not isinstance(theirs, Unavailable)
+    told["Position: RMS to EKF2"] = [f"{difference.position_rmse_m:.3f} m", "–"]
+    told["Velocity: RMS to EKF2"] = [f"{difference.velocity_rmse_m_s:.3f} m/s", "–"]
+    for name, unit in (("Position", "m"), ("Velocity", "m/s")):
+        field = "position_rmse_m" if unit == "m" else "velocity_rmse_m_s"
+        told[f"{name}: RMS to truth"] = [
+            f"{getattr(one, field):.3f} {unit}" for one in (ours, theirs)
+        ]
+    return told
+
+
+def test_dragging_gives_what_the_command_on_the_page_gives(
+    page: Browser, made: tuple[Path, Analysis], sample_log: Path
+) -> None:
+    before = page.ask(TABLE)
+    for knob, share in (("sigma-a", 0.72), ("sigma-z", 0.38), ("dt", 0.3), ("clock-offset", 0.55)):
+        drag(page, knob, share)
+    page.click("#axes input[value=north]")
+    settle(page)
+    request = of_command(page, sample_log)
+    values = page.ask(
+        "[...document.querySelectorAll('.knob input[type=number]')].map(n => n.value)"
+    )
+    assert [float(value) for value in values] == [
+        request.sigma_a_m_s2, request.sigma_z_m, request.dt_s, request.clock_offset_s
+    ]  # fmt: skip
+    assert request.sigma_a_m_s2 > 2.0
+    assert request.sigma_z_m < 0.05
+    assert request.dt_s < 0.05
+    assert isinstance(request.clock_offset_s, float)
+    assert 0.03 < request.clock_offset_s < 0.09
+    # what the stamps decide otherwise is held where it is
+    segment = made[1].comparison.segment
+    assert (request.start_s, request.end_s) == pytest.approx((segment.start_s, segment.end_s))
+    assert request.heading_deg == pytest.approx(made[1].comparison.main.axis.heading_deg)
+    comparison = run_comparison(request)
+    north = next(result for result in comparison.axes if result.axis.name == "north")
+    shown = page.ask(TABLE)
+    assert shown != before
+    told = cells(north)
+    assert {name: shown[name] for name in told} == told
+    assert re.fullmatch(r"S \d+(\.\d)?× too small", shown["Verdict"][0])
+
+
+def test_as_it_opens_it_says_what_the_report_says(
+    page: Browser, made: tuple[Path, Analysis]
+) -> None:
+    told = cells(made[1].comparison.main)
+    shown = page.ask(TABLE)
+    assert {name: shown[name] for name in told} == told
+    assert page.ask("document.querySelector('#command-0').textContent") == (
+        "px4fuse compare aisle_uwb.ulg"
+    )
+
+
+def test_buttons_and_address(page: Browser, made: tuple[Path, Analysis]) -> None:
+    tuned = made[1].tuning["horizontal"]
+    assert not isinstance(tuned, Unavailable)
+    page.click("#likely")
+    settle(page)
+    a, z = (float(page.ask(f"document.getElementById('{name}-value').value"))
+            for name in ("sigma-a", "sigma-z"))  # fmt: skip
+    assert a == pytest.approx(tuned.filter_sigma_a.value, rel=5e-3)
+    assert z == pytest.approx(tuned.sigma_z.value, rel=5e-3)
+    address = page.ask("location.hash")
+    assert f"sigma-a={a:g}&sigma-z={z:g}" in address
+    page.click("#ekf2-r")
+    settle(page)
+    frame = made[1].comparison.main.ekf2_innovations
+    assert not isinstance(frame, Unavailable)
+    r = float(np.sqrt(frame["observation_variance_m2"].median()))
+    assert float(page.ask("document.getElementById('sigma-z-value').value")) == pytest.approx(r)
+    page.click("#lesson")
+    settle(page)
+    assert page.ask("document.querySelector('#command-0').textContent").endswith("aisle_uwb.ulg")
+    page.ask(f"location.hash = {json.dumps(address)}")
+    settle(page)
+    assert page.ask("document.getElementById('sigma-a-value').value") == f"{a:g}"
+
+
+def test_a_bad_address_or_number_is_refused_in_words(page: Browser) -> None:
+    page.ask("location.hash = '#sigma-a=-1&sigma-z=0.2&dt=abc&axis=<b>&input=gps'")
+    settle(page)
+    said = page.ask("document.getElementById('said').textContent")
+    assert said == "The address has no usable sigma-a, dt, axis, input: left as it was."
+    values = page.ask(
+        "[...document.querySelectorAll('.knob input[type=number]')].map(n => n.value)"
+    )
+    assert values[:3] == ["0.5", "0.2", "0.1"]
+    page.ask(
+        "(() => { const n = document.getElementById('sigma-z-value'); n.value = '500';"
+        "n.dispatchEvent(new Event('change')); })()"
+    )
+    settle(page)
+    assert "give 0.0001 to 100 m" in page.ask("document.getElementById('said').textContent")
+    assert page.ask("document.getElementById('sigma-z-value').value") == "0.2"
+
+
+def test_steps_through_measurements(page: Browser, made: tuple[Path, Analysis]) -> None:
+    result = made[1].comparison.main
+    updates, steps = result.replay.updates, result.replay.steps
+    page.click("#next-0")
+    page.click("#next-0")
+    page.click("#next-0")
+    page.click("#previous-0")
+    now = page.ask("document.getElementById('now-0').textContent")
+    assert now == f"Measurement 2 of {len(updates)}, at {updates.index[1]:.3f} s"
+    text = page.ask("document.getElementById('numbers-0').innerText")
+    row, after = updates.iloc[1], steps.loc[updates.index[1]]
+    for part in (
+        f"z = {row['measurement_m']:.4f} m",
+        f"ν = z − Hx⁻ = {row['innovation_m']:.4f} m",
+        f"S = HP⁻Hᵀ + R = {row['innovation_variance_m2']:.5f} m²",
+        f"K = P⁻Hᵀ/S = [{row['gain_position']:.4f}, {row['gain_velocity']:.4f} 1/s]",
+        f"x⁺ = x⁻ + Kν = [{after['position_m']:.4f} m, {after['velocity_m_s']:.4f} m/s]",
+        f"σ_p shrinks: {np.sqrt(row['prior_position_variance_m2']):.4f} to "
+        f"{np.sqrt(after['position_variance_m2']):.4f} m",
+    ):
+        assert part in text
+    assert "measurement=2" in page.ask("location.hash")
+    page.press("Tab")
+    page.ask("document.activeElement.blur()")
+    page.call("Input.dispatchKeyEvent", type="keyDown", key="n", text="n")
+    assert page.ask("document.getElementById('now-0').textContent").startswith("Measurement 3 ")
+
+
+def test_findings_and_buttons_move_all_plots(page: Browser) -> None:
+    span = "document.getElementById('span').textContent"
+    whole = page.ask(span)
+    page.click(".jump")
+    settle(page)
+    low, high = (float(word) for word in re.findall(r"[\d.]+", page.ask(span)))
+    finding = page.ask("document.querySelector('.jump').textContent")
+    assert low < float(re.findall(r"[\d.]+", finding)[0]) < high < low + 10.0
+    points = ask(
+        page, "Explore.then((e) => Array.from(e.model('steps-source-0').data.t.slice(0, 2)))"
+    )
+    assert low - 1.0 < points[0] <= low
+    page.click("#whole")
+    settle(page)
+    assert page.ask(span) == whole
+    page.call("Input.dispatchKeyEvent", type="keyDown", key="+", text="+")
+    settle(page)
+    assert page.ask(span) != whole
+
+
+def test_ekf2_at_a_stop_is_what_whatif_says(page: Browser, made: tuple[Path, Analysis]) -> None:
+    model = made[1].ekf2_model
+    assert not isinstance(model, Unavailable)
+    changes = {"EKF2_EVP_NOISE": 0.05, "EKF2_EV_DELAY": 200.0, "EKF2_EVP_GATE": 3.0}
+    asked = what_if(model, [changes])
+    assert not isinstance(asked, Unavailable)
+    (told,) = asked.whatif
+    page.click("#axes input[value=north]")
+    for name, value in changes.items():
+        page.ask(
+            f"(() => {{ const node = document.getElementById('{name}');"
+            f"const stop = [...Array(Number(node.max) + 1).keys()].find((at) => {{ node.value = at;"
+            "node.dispatchEvent(new Event('input'));"
+            f"return parseFloat(node.previousElementSibling.textContent) === {value}; }});"
+            "if (stop === undefined) throw new Error('no such stop'); })()"
+        )
+    settle(page)
+    shown = page.ask(TABLE)
+    north = told.axes["north"]
+    assert shown["Mean NIS (1 is right)"][1] == f"{north.nis_mean:.2f}"
+    assert shown["Measurements"][1] == str(told.samples)
+    assert shown["Position: RMS to truth"][1] == f"{north.position_rmse_to_truth_m:.3f} m"
+    said = page.ask("document.getElementById('grid-said').textContent")
+    assert told.rejected_share > 0.05
+    assert said.startswith(f"{100 * told.rejected_share:.1f} % rejected, {told.resets} reset")
+    counts = ask(
+        page,
+        "Explore.then((e) => e.model('strip-source-0').data.row"
+        ".filter((row) => row === 'EKF2 rejected').length)",
+    )
+    (replay,) = replay_settings(model, [changes])
+    segment = made[1].comparison.segment
+    assert counts == within(replay.updates, segment)["rejected"].sum()
+    drawn = ask(page, "Explore.then((e) => Array.from(e.model('rejected-source-0').data.nu))")
+    expected = within(replay.updates, segment)
+    nu = expected["innovation_north_m"][expected["rejected"] > 0]
+    np.testing.assert_allclose(drawn, nu, rtol=0.0, atol=6e-4)
+    page.click("#axes input[value=down]")
+    settle(page)
+    assert "no height" in page.ask("document.getElementById('grid-said').textContent")
+    page.click("#other-ekf2")
+    settle(page)
+    assert page.ask(TABLE)["Measurements"][1] != str(told.samples)
+
+
+def test_the_pointer_tells_values_and_the_dark_has_its_colours(page: Browser) -> None:
+    x, y = page.ask(
+        "(() => { const node = document.getElementById('position-0');"
+        "node.scrollIntoView({block: 'center'}); const box = node.getBoundingClientRect();"
+        "return [box.x + box.width / 2, box.y + box.height / 2]; })()"
+    )
+    for step in range(3):
+        page.call("Input.dispatchMouseEvent", type="mouseMoved", x=x + step, y=y)
+        settle(page)
+    # tips stand in the shadow roots of the plots
+    told = page.ask(
+        "(() => { const all = (root) => [...root.querySelectorAll('*')].flatMap((node) =>"
+        "node.shadowRoot ? [...node.shadowRoot.children].map((one) => one.textContent)"
+        ".concat(all(node.shadowRoot)) : []);"
+        "return all(document.body).join(' '); })()"
+    )
+    assert re.search(r"ours: *-?[\d.]+ m", told)
+    assert re.search(r"EKF2: *-?[\d.]+ m", told)
+    back = "Explore.then((e) => e.model('position-0').background_fill_color)"
+    light = ask(page, back)
+    dark = [{"name": "prefers-color-scheme", "value": "dark"}]
+    page.call("Emulation.setEmulatedMedia", features=dark)
+    settle(page)
+    assert ask(page, back) != light
+    page.call("Emulation.setEmulatedMedia", features=[])
+    settle(page)
+    assert ask(page, back) == light
+
+
+def test_copies_the_command(page: Browser) -> None:
+    page.call("Browser.grantPermissions", permissions=["clipboardReadWrite"])
+    page.click("#copy-0")
+    settle(page)
+    said = page.ask("document.getElementById('copy-0').nextSibling.textContent")
+    assert said == " copied"
+    line = page.ask("document.getElementById('command-0').textContent")
+    assert ask(page, "navigator.clipboard.readText()") == line
+
+
+def test_a_box_on_the_track_is_a_time(page: Browser) -> None:
+    span = "document.getElementById('span').textContent"
+    whole = page.ask(span)
+    x, y, width, height = page.ask(
+        "(() => { const node = document.getElementById('plan-0');"
+        "node.scrollIntoView({block: 'center'}); const box = node.getBoundingClientRect();"
+        "return [box.x, box.y, box.width, box.height]; })()"
+    )
+    # the first half of the drawing, from above: the track's far end is left once and reached thrice
+    for kind, across, down in (
+        ("mousePressed", 0.25, 0.05), ("mouseMoved", 0.5, 0.2), ("mouseMoved", 0.95, 0.35),
+        ("mouseReleased", 0.95, 0.35),
+    ):  # fmt: skip
+        page.call(
+            "Input.dispatchMouseEvent", type=kind, x=x + across * width, y=y + down * height,
+            button="left", buttons=1, clickCount=1,
+        )  # fmt: skip
+    settle(page)
+    low, high = (float(word) for word in re.findall(r"[\d.]+", page.ask(span)))
+    assert page.ask(span) != whole
+    # it is there from 22 s to 106 s, see the picture of the position
+    assert 15.0 < low < 30.0
+    assert 95.0 < high < 112.0
+
+
+def test_two_flights_stand_on_the_same_axes(browser: Browser, tmp_path: Path) -> None:
+    pair = [bare(aisle_flight(duration_s=length, length_m=length)) for length in (20.0, 30.0)]
+    requests = [ComparisonRequest(log=name) for name in ("first.ulg", "second.ulg")]
+    file = tmp_path / "two.html"
+    told = [(one, (), request) for one, request in zip(pair, requests, strict=True)]
+    file.write_bytes(html_text(told).encode())
+    show(browser, file)
+    drag(browser, "sigma-z", 0.6)
+    ranges = ask(
+        browser,
+        "Explore.then((e) => [0, 1].map((n) => { const r = e.model(`position-${n}`);"
+        "return [r.x_range.start, r.x_range.end, r.y_range.start, r.y_range.end]; }))",
+    )
+    assert ranges[0] == ranges[1]
+    assert ranges[0][0] == 0.0
+    z = float(browser.ask("document.getElementById('sigma-z-value').value"))
+    for number, analysis in enumerate(pair):
+        comparison = compare(analysis.comparison.flight, Settings(sigma_z_m=z))
+        statement = comparison.main.kf.consistency
+        assert isinstance(statement, Consistency)
+        shown = browser.ask(TABLE.replace("#tables", f"#table-{number}"))
+        assert shown["Mean NIS (1 is right)"][0] == f"{statement.nis_mean:.2f}"
+        line = browser.ask(f"document.querySelector('#command-{number}').textContent")
+        assert line == f"px4fuse compare {requests[number].log} --sigma-z {z:g}"
+    assert browser.complaints() == []
+
+
+def test_text_from_a_log_is_text(browser: Browser, tmp_path: Path) -> None:
+    flight = aisle_flight(duration_s=20.0)
+    flight = replace(flight, log=replace(flight.log, name=f"{MARKUP}.ulg"))
+    show(browser, page_of(bare(flight), tmp_path / "hostile.html"))
+    assert browser.ask("window.alive") is None
+    assert browser.ask("document.querySelectorAll('img').length") == 0
+    assert "onerror" in browser.ask("document.querySelector('header').textContent")
+    assert "\u202e" not in browser.ask("document.body.innerText")
+    assert browser.complaints() == []
+
+
+def test_without_ekf2_truth_and_imu(browser: Browser, tmp_path: Path) -> None:
+    flight = aisle_flight(duration_s=20.0, ekf2=None, truth=False, imu=None)
+    show(browser, page_of(bare(flight), tmp_path / "bare.html"))
+    table = browser.ask(TABLE)
+    assert {pair[1] for name, pair in table.items() if name != "Verdict"} == {"–"}
+    assert table["Verdict"][1] == "not known"
+    assert "Truth: " in browser.ask("document.getElementById('why-0').textContent")
+    assert browser.ask("document.querySelector('[value=imu]').disabled")
+    assert browser.ask("document.getElementById('likely').disabled")
+    assert browser.complaints() == []
+
+
+@pytest.mark.parametrize("width", [390, 1400])
+def test_nothing_is_wider_than_the_screen(
+    browser: Browser, made: tuple[Path, Analysis], width: int
+) -> None:
+    show(browser, made[0], width=width)
+    assert browser.ask("document.documentElement.scrollWidth") <= width
+
+
+# ------------------------------------------------------------------ the command
+
+
+def explore(*words: str | Path) -> Result:
+    return CliRunner().invoke(cli, ["explore", *map(str, words)])
+
+
+def test_the_command_writes_one_file(
+    sample_log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    done = explore(sample_log, "--start", "20", "--end", "40", "--sigma-z", "0.2")
+    assert done.exit_code == 0, done.output
+    written = [file for file in tmp_path.rglob("*") if file.is_file()]
+    name = "aisle_uwb_sigma-z-0.2_start-20_end-40.html"
+    assert written == [tmp_path / "reports" / name]
+    assert f"reports/{name}" in done.output
+    assert written[0].read_bytes().startswith(b"<!DOCTYPE html>")
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["missing.ulg"], "missing.ulg"),
+        (["LOG", "-o", "page.pdf"], "ends in .html"),
+        (["LOG", "LOG", "LOG"], "give one, or two"),
+        (["LOG", "LOG", "--mavlink", "a.tlog"], "only one LOG"),
+        (["LOG", "--sigma-a", "0"], "--sigma-a 0 is out of range"),
+    ],
+)
+def test_bad_input_leaves_nothing(
+    sample_log: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    words: list[str],
+    said: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    done = explore(*(sample_log if word == "LOG" else word for word in words))
+    assert done.exit_code != 0
+    assert said in f"{done.output}{done.exception}"
+    assert list(tmp_path.iterdir()) == []
