@@ -275,11 +275,12 @@ const Explore = (async () => {
   const verdict = ({ nis, band }) => {
     if (nis === undefined) return "not known";
     if (nis >= band[0] && nis <= band[1]) return "consistent";
-    const [word, factor] = nis < band[0] ? ["large", 1 / nis] : ["small", nis];
-    return `S ${factor < 100 ? factor.toPrecision(2) : Math.round(factor)}× too ${word}`;
+    const [word, factor] = nis < band[0] ? ["overstated", 1 / nis] : ["understated", nis];
+    // as many digits as in the report
+    return `${word} ${Number(factor.toPrecision(factor < 2 ? 3 : 2)).toLocaleString("en")}×`;
   };
   const ROWS = [
-    ["Mean NIS (1 is right)", (x) => x.nis?.toFixed(2)],
+    ["Mean NIS (1 is consistent)", (x) => x.nis?.toFixed(2)],
     ["95 % band of it", (x) => x.band && `${x.band[0].toFixed(2)}–${x.band[1].toFixed(2)}`],
     ["Verdict", verdict],
     ["Outside ±2√S (5 % is right)", (x) => x.outside === undefined ? undefined

@@ -2,13 +2,16 @@
 
     python tests/benchmarks/readme_pictures.py
 
-It takes a minute, needs what ``pip install -e ".[test]"`` installs, and writes ``reports/*.png``:
-the part of a page named below, on a palette, below 100 kB each.
+It takes a minute, needs Chromium and what ``pip install -e ".[test]"`` installs, and writes
+``reports/*.png``: the part of a page named below, on a palette, below 100 kB each.
 """
 
 from __future__ import annotations
 
 import shlex
+import shutil
+import subprocess
+import sys
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +22,11 @@ from PIL import Image, ImageChops, ImageOps
 from px4fuse.cli import cli
 
 REPOSITORY = Path(__file__).resolve().parents[2]
+sys.path.insert(0, str(REPOSITORY / "tests"))
+
+from browser import BROWSERS  # noqa: E402 - it stands among the tests
+
+WINDOW = "1360,1010"
 REPORTS = REPOSITORY / "reports"
 AISLE = "compare sample_logs/aisle_uwb.ulg"
 DPI, COLOURS, MAX_BYTES = 96, 64, 100_000
@@ -41,6 +49,7 @@ class Picture:
 
 PICTURES = (
     Picture("aisle_uwb", AISLE, "Two-state Kalman filter against EKF2", 0.64),
+    Picture("explore", "explore sample_logs/aisle_uwb.ulg"),
     Picture("lab_1", AISLE, "The flight along the aisle", 0.64),
     Picture("lab_2", f"{AISLE} --sigma-a 0.001", "Innovations and variances"),
     Picture("lab_3", AISLE, "Why EKF2 differs", 0.66),
@@ -54,13 +63,13 @@ def made(picture: Picture, folder: Path) -> Image.Image:
     stem = picture.command.replace("/", "_").replace(" ", "_").replace(":", "_")
     report = folder / f"{stem}.pdf"
     words = shlex.split(picture.command)
+    if words[0] == "explore":
+        return screenshot(words, folder)
     if not picture.page:
         target = folder / f"{stem}.png"
         run([*words, "-o", str(report), "--picture", str(target)])
         with Image.open(target) as drawn:
-            return drawn.convert("RGB").resize(
-                (int(drawn.width * 0.7), int(drawn.height * 0.7)), Image.Resampling.LANCZOS
-            )
+            return smaller(drawn)
     if not report.exists():
         run([*words, "-o", str(report)])
     with pypdfium2.PdfDocument(report) as document:
@@ -73,6 +82,31 @@ def made(picture: Picture, folder: Path) -> Image.Image:
     part = whole.crop((0, int(HEAD * whole.height), whole.width, int(picture.until * whole.height)))
     left, top, right, bottom = ImageChops.invert(part).getbbox() or (0, 0, *part.size)
     return ImageOps.expand(part.crop((left, top, right, bottom)), MARGIN, "white")
+
+
+def screenshot(words: list[str], folder: Path) -> Image.Image:
+    """What a web page shows first."""
+    browser = next((found for name in BROWSERS if (found := shutil.which(name))), None)
+    if browser is None:
+        raise SystemExit("A picture of a web page requires Chromium on the path.")
+    page, target = folder / "page.html", folder / "page.png"
+    run([*words, "-o", str(page)])
+    subprocess.run(
+        [
+            browser, "--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars",
+            "--virtual-time-budget=10000", f"--window-size={WINDOW}", f"--screenshot={target}",
+            page.as_uri(),
+        ],
+        check=True, stderr=subprocess.DEVNULL,
+    )  # fmt: skip
+    with Image.open(target) as drawn:
+        return smaller(drawn)
+
+
+def smaller(drawn: Image.Image) -> Image.Image:
+    """A picture as wide as the others."""
+    size = int(drawn.width * 0.7), int(drawn.height * 0.7)
+    return drawn.convert("RGB").resize(size, Image.Resampling.LANCZOS)
 
 
 def run(words: list[str]) -> None:
