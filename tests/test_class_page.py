@@ -10,12 +10,11 @@ import json
 import re
 import struct
 import zlib
-from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
 import pytest
-from browser import Browser
+from browser import Browser, Elements
 from hypothesis import given
 from hypothesis import strategies as st
 from pypdf import PdfReader
@@ -71,18 +70,6 @@ CLASS = (
 
 
 # ------------------------------------------------------------------ without a browser
-
-
-class Elements(HTMLParser):
-    """Every element and attribute, as an HTML parser finds them."""
-
-    def __init__(self, text: str) -> None:
-        super().__init__()
-        self.found: list[tuple[str, dict[str, str | None]]] = []
-        self.feed(text)
-
-    def handle_starttag(self, tag: str, attributes: list[tuple[str, str | None]]) -> None:
-        self.found.append((tag, dict(attributes)))
 
 
 def shape(text: str) -> list[tuple[str, list[str]]]:

@@ -9,13 +9,12 @@ import re
 import shlex
 from collections.abc import Iterator
 from dataclasses import replace
-from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from browser import Browser
+from browser import Browser, Elements
 from click.testing import CliRunner, Result
 from explore_tools import ask, show
 from flights import Imu, aisle_flight
@@ -72,16 +71,6 @@ def page_of(analysis: Analysis, file: Path) -> Path:
 
 
 # ------------------------------------------------------------------ without a browser
-
-
-class Elements(HTMLParser):
-    def __init__(self, text: str) -> None:
-        super().__init__()
-        self.found: list[tuple[str, dict[str, str | None]]] = []
-        self.feed(text)
-
-    def handle_starttag(self, tag: str, attributes: list[tuple[str, str | None]]) -> None:
-        self.found.append((tag, dict(attributes)))
 
 
 def test_the_policy_allows_the_scripts_that_are_there_and_no_network(

@@ -16,9 +16,9 @@ from px4fuse.analysis import Analysis
 from px4fuse.arrays import Array
 from px4fuse.comparison.comparison import AgainstTruth, AxisComparison, Comparison, FilterSummary
 from px4fuse.comparison.events import happened
-from px4fuse.explore.ekf2_grid import grid_data
+from px4fuse.explore.ekf2_grid import grid_data, judged_numbers
 from px4fuse.explore.packing import COARSE, Packer
-from px4fuse.filter.consistency import CONFIDENCE, Consistency, nis_band
+from px4fuse.filter.consistency import CONFIDENCE, nis_band
 from px4fuse.filter.kalman import (
     CLOCK_OFFSET_RANGE_S,
     DT_RANGE_S,
@@ -268,18 +268,7 @@ def _summary(
     summary: FilterSummary | Unavailable, truth: AgainstTruth | Unavailable
 ) -> dict[str, Any]:
     """EKF2's column of the table."""
-    made: dict[str, Any] = {"why": ""}
-    statement = summary if isinstance(summary, Unavailable) else summary.consistency
-    if isinstance(statement, Consistency):
-        made |= {
-            "count": statement.count,
-            "nis": statement.nis_mean,
-            "band": list(statement.nis_band),
-            "outside": statement.outside_two_sigma,
-            "lag1": statement.lag1_autocorrelation,
-        }
-    else:
-        made["why"] = statement.reason
+    made = judged_numbers(summary if isinstance(summary, Unavailable) else summary.consistency)
     if isinstance(truth, AgainstTruth):
         made |= {"truthP": truth.position_rmse_m, "truthV": truth.velocity_rmse_m_s}
     return made

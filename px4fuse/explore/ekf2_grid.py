@@ -142,6 +142,20 @@ def _along(updates: pd.DataFrame, direction: Array) -> tuple[Array, Array]:
     return c * north + s * east, c * c * s_north + s * s * s_east
 
 
+def judged_numbers(statement: Consistency | Unavailable) -> dict[str, Any]:
+    """What the page's table shows of a filter's innovations; why not where they say nothing."""
+    if isinstance(statement, Unavailable):
+        return {"why": statement.reason}
+    return {
+        "why": "",
+        "count": statement.count,
+        "nis": statement.nis_mean,
+        "band": list(statement.nis_band),
+        "outside": statement.outside_two_sigma,
+        "lag1": statement.lag1_autocorrelation,
+    }
+
+
 def _numbers(
     analysis: Analysis,
     replay: Ekf2Replay,
@@ -151,18 +165,7 @@ def _numbers(
 ) -> dict[str, Any]:
     """EKF2's column of the table at this stop."""
     flight = analysis.comparison.flight
-    statement = assess(*_along(used, direction))
-    made: dict[str, Any] = {"why": ""}
-    if isinstance(statement, Consistency):
-        made |= {
-            "count": statement.count,
-            "nis": statement.nis_mean,
-            "band": list(statement.nis_band),
-            "outside": statement.outside_two_sigma,
-            "lag1": statement.lag1_autocorrelation,
-        }
-    else:
-        made["why"] = statement.reason
+    made = judged_numbers(assess(*_along(used, direction)))
     if isinstance(flight.truth, Truth) and isinstance(flight.ekf2, Ekf2):
         truth = flight.truth.samples.dropna(subset=POSITION_COLUMNS[:2])
         times = flight.ekf2.state.index.to_numpy()
