@@ -12,8 +12,8 @@ from matplotlib.figure import Figure
 
 from px4fuse.arrays import Array
 from px4fuse.comparison.comparison import AxisComparison, FilterSummary
+from px4fuse.comparison.why_words import the
 from px4fuse.filter.consistency import MIN_INNOVATIONS, Consistency, autocorrelation, nis_band
-from px4fuse.filter.signals import AISLE
 from px4fuse.flight import Unavailable
 from px4fuse.plain import number_words, p_words
 from px4fuse.report import marks
@@ -62,7 +62,7 @@ class Series(NamedTuple):
 def draw(document: Document) -> Iterator[Figure]:
     """Draw one page: the axis of the lab in three panels, all axes in a table."""
     result = document.comparison.main
-    along = "the aisle" if result.axis.name == AISLE else result.axis.name
+    along = the(result.axis.name)
     figure, cursor = page(
         "Appendix: consistency",
         "Innovations ν of a filter that knows its own variance S are as large as S says (NIS = "

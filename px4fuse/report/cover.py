@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from px4fuse.comparison.comparison import AgainstTruth, Difference, FilterSummary
+from px4fuse.comparison.why_words import the
 from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.signals import AISLE
 from px4fuse.findings import Finding
@@ -109,7 +110,7 @@ def _subtitle(document: Document) -> str:
 def _verdict(figure: Figure, cursor: Cursor, document: Document) -> None:
     """The main axis, large: each filter on its half of the page."""
     result = document.comparison.main
-    along = "the aisle" if result.axis.name == AISLE else result.axis.name
+    along = the(result.axis.name)
     top = cursor.y
     ends = []
     for label, summary, truth, colour, left, right in (

@@ -13,7 +13,7 @@ from matplotlib.patches import Patch
 
 from px4fuse.arrays import Array
 from px4fuse.comparison.comparison import AgainstTruth, AxisComparison, Difference
-from px4fuse.filter.signals import AISLE
+from px4fuse.comparison.why_words import the
 from px4fuse.flight import Unavailable
 from px4fuse.report import marks
 from px4fuse.report.document import Document
@@ -46,7 +46,7 @@ def draw(document: Document) -> Iterator[Figure]:
     """Draw one page."""
     result, segment = document.comparison.main, document.comparison.segment
     name = result.axis.name
-    along = "the aisle" if name == AISLE else name
+    along = the(name)
     figure, cursor = page(f"The flight along {along}")
     legend(figure, cursor, document)
     reference = error_reference(result)

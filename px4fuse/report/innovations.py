@@ -14,8 +14,9 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 from px4fuse.arrays import Array
 from px4fuse.comparison.comparison import AxisComparison, FilterSummary
 from px4fuse.comparison.events import Span
+from px4fuse.comparison.why_words import the
 from px4fuse.filter.consistency import Consistency
-from px4fuse.filter.signals import AISLE, Segment
+from px4fuse.filter.signals import Segment
 from px4fuse.flight import Unavailable
 from px4fuse.report import marks
 from px4fuse.report.document import Document
@@ -59,7 +60,7 @@ def draw(document: Document) -> Iterator[Figure]:
     """Draw one page: innovations, σ_p and σ_v on one time axis, then the zooms."""
     result, segment = document.comparison.main, document.comparison.segment
     name = result.axis.name
-    along = "the aisle" if name == AISLE else name
+    along = the(name)
     figure, cursor = page(f"Innovations and variances along {along}")
     strip = bool(document.events.modes)
     axes = panel(
