@@ -296,7 +296,8 @@ def _with_biases(
     scores = [fitted(part, noises, of_some).total() for noises in levels]
     level, at = np.unravel_index(np.argmin(scores), np.shape(scores))
     positions = moved.positions(measured, settings.dt_s)
-    parts = [Part(*centred(positions, *moved.legs(directions, offsets[[at]])))]
+    legs = moved.legs(directions, offsets[[at]])
+    parts = [Part(*centred(positions, *legs, scaled=True))]
     return most_likely(parts, levels[level], weight)
 
 
