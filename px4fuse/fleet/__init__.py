@@ -1,0 +1,1 @@
+"""Many logs, and what changed between two."""
