@@ -108,7 +108,6 @@ _ROWS = (
     *_of_filter("kf", "ours"),
     _Row("difference.position_rmse_m", "ours - EKF2", "m", "low"),
     _Row("difference.velocity_rmse_m_s", "ours - EKF2, velocity", "m/s", "low"),
-    _Row("difference.position_maximum_m", "ours - EKF2, largest", "m", "low"),
 )
 # Errors of the state by what they are of
 _ERRORS = {"position_m": "position_rmse_m", "velocity_m_s": "velocity_rmse_m_s"}

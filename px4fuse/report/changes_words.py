@@ -7,7 +7,7 @@ from px4fuse.results.changes import NumberChange
 from px4fuse.results.contract import ChangeResults
 
 # A number without a test is told where it moved by so much
-TOLD_RATIO = 0.10
+TOLD_RATIO = 0.25
 
 
 def told(results: ChangeResults) -> list[NumberChange]:
