@@ -15,6 +15,7 @@ from px4fuse.results.comparison import (
     Clock,
     Difference,
     Filter,
+    Log,
     Tuned,
     UnjudgedFilter,
 )
@@ -68,19 +69,8 @@ def rows_of(found: ComparisonResults) -> list[Row]:
     ----------
     found : ComparisonResults
     """
-    log = found.log
-    start = log.start_unix_s
-    common: Row = {
-        "name": log.name,
-        "log_sha256": log.sha256,
+    common = log_columns(found.log) | {
         "px4fuse": found.provenance.px4fuse,
-        "vehicle": log.vehicle,
-        "firmware": log.firmware,
-        "firmware_hash": log.firmware_hash,
-        "airframe": f"{airframe:g}" if (airframe := log.parameters.get("SYS_AUTOSTART")) else "",
-        "hardware": log.hardware,
-        "date": "" if start is None else f"{datetime.fromtimestamp(start, UTC):%Y-%m-%dT%H:%M:%SZ}",
-        "duration_s": log.duration_s,
         "source": found.position_source.name,
         "source_rate_hz": found.position_source.rate_hz,
         "story": "\n".join(found.story),
@@ -101,6 +91,22 @@ def rows_of(found: ComparisonResults) -> list[Row]:
         | _agreement(found, name)
         for name, axis in found.axes.items()
     ]
+
+
+def log_columns(log: Log) -> Row:
+    """What is known of a log once it is read."""
+    start = log.start_unix_s
+    return {
+        "name": log.name,
+        "log_sha256": log.sha256,
+        "vehicle": log.vehicle,
+        "firmware": log.firmware,
+        "firmware_hash": log.firmware_hash,
+        "airframe": f"{airframe:g}" if (airframe := log.parameters.get("SYS_AUTOSTART")) else "",
+        "hardware": log.hardware,
+        "date": "" if start is None else f"{datetime.fromtimestamp(start, UTC):%Y-%m-%dT%H:%M:%SZ}",
+        "duration_s": log.duration_s,
+    }
 
 
 def _axis(axis: Axis) -> Row:
