@@ -17,6 +17,7 @@ from px4fuse.writing import STOPPING
 # Command name to module and one-line help: --help must not import what the commands need.
 COMMANDS = {
     "compare": ("px4fuse.cli.compare", "Compare a flight's EKF2 with a two-state Kalman filter."),
+    "batch": ("px4fuse.cli.batch", "Compare many logs, on this computer or a cluster."),
     "explore": ("px4fuse.cli.explore", "Turn the filter's knobs on a flight, in a web page."),
     "info": ("px4fuse.cli.info", "Say what is in a log and what can be done with it."),
     "extract": ("px4fuse.cli.extract", "Write a log's data as tidy tables, CSV or Parquet."),

@@ -1,1 +1,1 @@
-"""Many logs, and what changed between two."""
+"""Many logs: one table with a row per log and axis; and what changed between two."""
