@@ -23,10 +23,10 @@ from px4fuse.analysis import Analysis
 from px4fuse.arrays import Array
 from px4fuse.comparison.comparison import AxisComparison
 from px4fuse.filter.kalman import state_at
+from px4fuse.filter.signals import AISLE
 from px4fuse.flight import Unavailable
 from px4fuse.results.comparison import Clock, Filter, Heading
 from px4fuse.results.contract import ComparisonResults
-from px4fuse.results.ekf2 import Ekf2Replay
 from px4fuse.results.model import Absent
 from px4fuse.trajectory.scores import rmse_interval
 
@@ -136,7 +136,7 @@ def _of_flight(results: ComparisonResults) -> Iterator[tuple[str, Number]]:
                     f"{label} found, {name}", unit, value, found, "low", "ratio",
                     LIKELIHOOD, f"tuning.*.{field}",
                 )  # fmt: skip
-    clock, heading, replay = results.clock, results.heading, results.ekf2_replay
+    clock, heading = results.clock, results.heading
     if isinstance(clock, Clock) and clock.determinable:
         yield "clock.offset_s", Number(
             "clock offset", "s", clock.offset_s, clock.interval_s, "zero",
@@ -149,13 +149,16 @@ def _of_flight(results: ComparisonResults) -> Iterator[tuple[str, Number]]:
             (heading.turn_deg - half, heading.turn_deg + half), "zero", "difference", LIKELIHOOD,
             "heading.turn_deg",
         )  # fmt: skip
-    if isinstance(replay, Ekf2Replay):
-        share = replay.agreement.rejected_share_logged
-        judged = [f for a in results.axes.values() if isinstance(f := a.ekf2, Filter)]
-        count = replay.agreement.samples * min(map(_independent, judged), default=1.0)
-        yield "ekf2_replay.agreement.rejected_share_logged", Number(
-            "rejected by EKF2", "", share, _share_interval(share, count), "low",
-            "difference", WILSON, "rejected",
+    # EKF2 rejects a horizontal position as a whole
+    level = next((name for name in (AISLE, "north", "east") if name in results.axes), "")
+    for at, label in ((level, "horizontal"), ("down", "down")):
+        axis = next((axis for name, axis in results.axes.items() if name == at), None)
+        if axis is None or axis.rejected_share is None or not isinstance(axis.ekf2, Filter):
+            continue
+        interval = _share_interval(axis.rejected_share, axis.ekf2.count * _independent(axis.ekf2))
+        yield f"axes.{at}.rejected_share", Number(
+            f"rejected by EKF2, {label}", "", axis.rejected_share, interval, "low", "difference",
+            WILSON, "axes.*.rejected_share",
         )  # fmt: skip
     plain: tuple[tuple[str, str, str, Aim], ...] = (
         ("loop.closure_error_m", "closure error of the loop", "m", "low"),
