@@ -11,8 +11,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from px4fuse.grading.class_table import MAX_CHARACTERS, csv_text, neutral
+from px4fuse.grading.class_table import csv_text
 from px4fuse.grading.model import Graded, Item
+from px4fuse.spreadsheet import MAX_CHARACTERS, neutral
 from px4fuse.verification.model import Verdict
 
 DANGEROUS = (

@@ -12,6 +12,7 @@ from matplotlib.text import Text
 from pypdf import PdfWriter
 
 from px4fuse.report import (
+    changes,
     clock,
     consistency,
     cover,
@@ -26,11 +27,17 @@ from px4fuse.report import (
     whatif,
     why,
 )
-from px4fuse.report.document import Document, EvaluationDocument, LoopDocument, WhatIfDocument
+from px4fuse.report.document import (
+    ChangesDocument,
+    Document,
+    EvaluationDocument,
+    LoopDocument,
+    WhatIfDocument,
+)
 from px4fuse.report.seal import sealed
 from px4fuse.report.style import LEFT, MUTED, RIGHT, printable, put, report_style, shorten
 
-Report = Document | LoopDocument | WhatIfDocument | EvaluationDocument
+Report = Document | LoopDocument | WhatIfDocument | EvaluationDocument | ChangesDocument
 RESULTS_NAME = "results.json"
 PAGES = (
     cover.draw,
@@ -53,7 +60,7 @@ def render(document: Report, results_json: str) -> bytes:
 
     Parameters
     ----------
-    document : Document, LoopDocument, WhatIfDocument or EvaluationDocument
+    document : Document, LoopDocument, WhatIfDocument, EvaluationDocument or ChangesDocument
     results_json : str
         Attached inside the PDF as ``results.json``, so that the PDF alone can be checked.
 
@@ -90,6 +97,8 @@ def _pages(document: Report) -> Iterator[Figure]:
         yield from whatif.draw(document)
     elif isinstance(document, EvaluationDocument):
         yield from evaluation.draw(document)
+    elif isinstance(document, ChangesDocument):
+        yield from changes.draw(document)
     else:
         for draw in PAGES:
             yield from draw(document)
