@@ -304,6 +304,7 @@ def graded_from(values: dict[str, Any]) -> Graded:
             ),
             "items": tuple(Item(**item) for item in values["items"]),
             "flags": tuple(values["flags"]),
+            "to_read": tuple((why, passage) for why, passage in values["to_read"]),
         }
     )
 

@@ -135,6 +135,10 @@ class Graded:
         In the rubric's order.
     flags : tuple of str
         What an instructor should look at: sentences.
+    pending : str
+        One sentence: what the instructor can do so that the points count; "" where they count.
+    to_read : tuple of (str, str)
+        What no rule can judge: why, and the passage of the notes.
     numbers : mapping
         A few for the class table, by column title; absent ones are left out.
     sha256, log_sha256, version : str
@@ -162,6 +166,8 @@ class Graded:
     verdict: Verdict
     items: tuple[Item, ...] = ()
     flags: tuple[str, ...] = ()
+    pending: str = ""
+    to_read: tuple[tuple[str, str], ...] = ()
     numbers: Mapping[str, float] = field(default_factory=dict)
     sha256: str = ""
     log_sha256: str = ""
@@ -182,8 +188,13 @@ class Graded:
 
     @property
     def points(self) -> float:
-        """Sum over the items."""
+        """Sum over the items; while :attr:`pending` a proposal, never to be added to anything."""
         return sum(item.points for item in self.items)
+
+    @property
+    def counted(self) -> float | None:
+        """The points that count; None while they are pending."""
+        return None if self.pending else self.points
 
     @property
     def of(self) -> float:
