@@ -262,7 +262,7 @@ def _check_options(assignment: Path | None) -> None:
 
 
 def _read_secret(secret: str | None, file: Path | None) -> bytes | None:
-    from px4fuse.assignment.assignment import secret_of
+    from px4fuse.assignment.drawing import secret_of
 
     if secret is not None and file is not None:
         raise SettingsError("--secret and --secret-file: give one of them.")
@@ -287,7 +287,8 @@ def _assign(
     truth: bool,
 ) -> None:
     """Write a flight for everyone, and the answer key."""
-    from px4fuse.assignment.assignment import assign, key_path, read_roster
+    from px4fuse.assignment.assignment import assign, key_path
+    from px4fuse.assignment.roster import read_roster
 
     students = read_roster(roster)
     key_file = key_path(folder, answer_path)

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Literal
 
-from px4fuse.assignment.assignment import POSSIBLE_FINDINGS
+from px4fuse.assignment.drawing import POSSIBLE_FINDINGS
 from px4fuse.assignment.key import Answer, AnswerKey
 from px4fuse.filter.tuning import HORIZONTAL
 from px4fuse.findings import SEVERITIES
