@@ -9,14 +9,13 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from px4fuse.assignment.drawing import draw, most_mistakes
-from px4fuse.assignment.key import Answer, AnswerKey, folded, key_text, read_key
+from px4fuse.assignment.drawing import Drawn, Kinds, draw, most_mistakes
+from px4fuse.assignment.key import SCHEMA_VERSION, Answer, AnswerKey, folded, key_text, read_key
 from px4fuse.assignment.roster import Student
 from px4fuse.errors import OutputError, SettingsError
 from px4fuse.plain import plain
 from px4fuse.simulation import flights
 from px4fuse.simulation.mistakes import parse
-from px4fuse.simulation.scenario import Kind
 from px4fuse.writing import write_all
 
 # Of the numbers that only the instructor knows
@@ -25,24 +24,31 @@ TRUTH = ("duration_s", "sigma_z_m", "sigma_a_m_s2", "reported_sigma_m", "clock_o
 
 
 def fly(
-    secret: bytes, student: Student, kind: Kind, count: int | None = None, truth: bool = True
+    secret: bytes, student: Student, kind: Kinds, count: int | None = None, truth: bool = True
 ) -> tuple[bytes, Answer]:
     """One student's log, and the answer to it."""
-    scenario, chosen, typed = draw(secret, student.id, kind, count, truth)
-    simulation = flights.simulate(scenario, parse(typed))
+    drawn = draw(secret, student.id, kind, count, truth)
+    simulation = flights.simulate(drawn.scenario, parse(drawn.typed))
     log = flights.to_ulog(simulation)
+    return log, answer_to(student, drawn, simulation, hashlib.sha256(log).hexdigest())
+
+
+def answer_to(
+    student: Student, drawn: Drawn, simulation: flights.Simulation, sha256: str
+) -> Answer:
+    """The answer to a flight as drawn, whose log has this SHA-256."""
     known = flights.answer(simulation)["truth"]
-    answer = Answer(
+    return Answer(
         student_id=student.id,
         name=student.name,
         file=student.file,
-        sha256=hashlib.sha256(log).hexdigest(),
-        scenario=plain(asdict(scenario)),
-        mistakes=typed,
-        findings=tuple(choice.finding for choice in chosen),
+        sha256=sha256,
+        scenario=plain(asdict(drawn.scenario)),
+        mistakes=drawn.typed,
+        findings=drawn.findings,
         truth={name: float(known[name]) for name in TRUTH},
+        difficulty=drawn.difficulty,
     )
-    return log, answer
 
 
 @dataclass(frozen=True)
@@ -82,7 +88,7 @@ def assign(
     folder: Path,
     key_file: Path,
     secret: bytes | None,
-    kind: Kind,
+    kind: Kinds,
     count: int | None = None,
     truth: bool = True,
     step: Callable[[int, int], None] = lambda done, of: None,
@@ -99,7 +105,7 @@ def assign(
     folder, key_file : Path
     secret : bytes or None
         None takes that of the key that is there already, or makes one up.
-    kind : {"aisle", "loop"}
+    kind : {"aisle", "loop", "mixed"}
     count : int, optional
         Mistakes per flight; None draws it.
     truth : bool
@@ -114,12 +120,8 @@ def assign(
     OutputError
         A file is there already with other content, or cannot be written.
     """
-    if count is not None and not 0 <= count <= most_mistakes(kind):
-        raise SettingsError(
-            f"--mistakes {count}: a flight of kind {kind} can have 0 to {most_mistakes(kind)}, of "
-            "which each is still found beside the others."
-        )
-    before = read_key(key_file) if key_file.exists() else None
+    _check_count(kind, count)
+    before = _key_before(key_file)
     made_up = before.secret if before is not None else ""
     if secret is None:
         made_up = made_up or secrets.token_urlsafe(24)
@@ -152,6 +154,53 @@ def assign(
         if not known and folder.is_dir() and not any(folder.iterdir()):
             folder.rmdir()
     return Assigned(key, len(staged), len(students) - len(staged))
+
+
+def preview(
+    students: Sequence[Student],
+    key_file: Path,
+    secret: bytes | None,
+    kind: Kinds,
+    count: int | None = None,
+) -> list[Drawn]:
+    """What :func:`assign` would draw for each, without a flight and without a file.
+
+    Raises
+    ------
+    SettingsError
+        So many mistakes cannot be in one flight, or there is no secret to draw from.
+    OutputError
+        The key that is there was made by an earlier px4fuse.
+    """
+    _check_count(kind, count)
+    before = _key_before(key_file)
+    if secret is None:
+        if before is None or not before.secret:
+            raise SettingsError(
+                "--preview requires --secret-file or --secret: one that is made up is not kept, "
+                "and would give others each time."
+            )
+        secret = before.secret.encode()
+    return [draw(secret, student.id, kind, count) for student in students]
+
+
+def _check_count(kind: Kinds, count: int | None) -> None:
+    if count is not None and not 0 <= count <= most_mistakes(kind):
+        raise SettingsError(
+            f"--mistakes {count}: a flight of kind {kind} can have 0 to {most_mistakes(kind)}, of "
+            "which each is still found beside the others."
+        )
+
+
+def _key_before(key_file: Path) -> AnswerKey | None:
+    """The key that is there already, to which students may be added."""
+    before = read_key(key_file) if key_file.exists() else None
+    if before is not None and before.version != SCHEMA_VERSION:
+        raise OutputError(
+            f"{key_file}: was made by an earlier px4fuse, which draws other flights. Grade with it "
+            "as it is, and give another folder with -o for new flights."
+        )
+    return before
 
 
 def _there(target: Path, log: bytes) -> bool:
