@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from px4fuse.assignment.assignment import POSSIBLE_FINDINGS
+from px4fuse.assignment.drawing import POSSIBLE_FINDINGS
 from px4fuse.assignment.key import Answer, AnswerKey
 from px4fuse.grading.evidence import Evidence, list_words, text_of
 from px4fuse.verification.rerun import log_sha256

@@ -12,8 +12,8 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from px4fuse.assignment.assignment import RESERVED
 from px4fuse.assignment.key import AnswerKey
+from px4fuse.assignment.roster import RESERVED
 from px4fuse.flight import Unavailable
 from px4fuse.grading import submissions
 from px4fuse.grading.class_page import html_text
