@@ -12,15 +12,17 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from px4fuse.assignment.assignment import RESERVED
 from px4fuse.assignment.key import AnswerKey
+from px4fuse.assignment.roster import RESERVED
 from px4fuse.flight import Unavailable
 from px4fuse.grading import submissions
 from px4fuse.grading.class_page import html_text
 from px4fuse.grading.class_table import csv_text
+from px4fuse.grading.evidence import values_at
+from px4fuse.grading.feedback import feedback, gradescope
 from px4fuse.grading.flags import chosen_settings, class_flags, own_flags
 from px4fuse.grading.model import Graded, Item, Rubric, Submission
-from px4fuse.grading.scoring import feedback, gradescope, score, score_refused, values_at
+from px4fuse.grading.scoring import score, score_refused
 from px4fuse.grading.workers import Failed, run_bounded
 from px4fuse.reading import files_by_sha256, max_log_bytes
 from px4fuse.results.contract import Reported, to_plain
