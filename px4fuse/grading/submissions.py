@@ -57,6 +57,7 @@ _DAMAGED = (
     OverflowError,
 )
 
+
 def collect(paths: Sequence[Path]) -> tuple[tuple[Submission, ...], tuple[str, ...]]:
     """Find the PDFs in files, folders and zip files.
 
@@ -302,7 +303,7 @@ def _listed(archive: zipfile.ZipFile, shown: str, notes: list[str]) -> Iterator[
 def _time(entry: zipfile.ZipInfo) -> datetime | None:
     """When an entry was changed, in the time zone of who packed it; None where that is nonsense."""
     try:
-        time = datetime(*entry.date_time)  # noqa: DTZ001 - a zip file says no zone
+        time = datetime(*entry.date_time)
     except ValueError:
         return None
     return time if time.year > ZIP_EPOCH else None
