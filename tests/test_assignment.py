@@ -11,18 +11,10 @@ from click.testing import CliRunner
 import px4fuse
 from px4fuse.analysis import explain
 from px4fuse.assignment import assignment
-from px4fuse.assignment.assignment import (
-    CHOICES,
-    COUNTS,
-    Student,
-    assign,
-    draw,
-    file_stem,
-    fly,
-    key_path,
-    read_roster,
-)
+from px4fuse.assignment.assignment import assign, fly, key_path
+from px4fuse.assignment.drawing import CHOICES, COUNTS, draw
 from px4fuse.assignment.key import AnswerKey, key_text, read_key
+from px4fuse.assignment.roster import Student, file_stem, read_roster
 from px4fuse.cli import cli, main
 from px4fuse.comparison.comparison import compare
 from px4fuse.errors import OutputError, SettingsError

@@ -13,17 +13,13 @@ from results_tools import EXAMPLE, LOOP, SHA256, changed, correction, decoded, f
 
 from px4fuse.assignment.key import Answer, AnswerKey
 from px4fuse.errors import ResultsError
+from px4fuse.grading.evidence import values_at
+from px4fuse.grading.feedback import feedback, gradescope
 from px4fuse.grading.flags import chosen_settings, class_flags, own_flags
 from px4fuse.grading.model import Graded, Item
+from px4fuse.grading.notes import Notes
 from px4fuse.grading.rubric import parse_rubric, read_rubric
-from px4fuse.grading.scoring import (
-    Notes,
-    feedback,
-    gradescope,
-    score,
-    score_refused,
-    values_at,
-)
+from px4fuse.grading.scoring import score, score_refused
 from px4fuse.results.contract import to_plain
 from px4fuse.verification.intake import read_report
 from px4fuse.verification.model import Report, Verdict

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from datetime import datetime
 from pathlib import Path
 from typing import Any, Literal
 
@@ -97,11 +98,15 @@ class Submission:
     name : str
         For people: without folders of this machine, control characters or more than 200
         characters. Unique within a run.
+    time : datetime or None
+        Of the entry in the zip file, in an unknown time zone: when the platform took it, or when
+        it packed the zip file.
     """
 
     file: Path
     entry: str
     name: str
+    time: datetime | None = None
 
 
 @dataclass(frozen=True)
