@@ -12,6 +12,7 @@ import pandas as pd
 from px4fuse.fleet.logs import Log, finding_words
 from px4fuse.plain import factor_words
 from px4fuse.webpage.charts import Scale, axis, bar, grid, over_time, plot, spread
+from px4fuse.webpage.frame import card, note, opens, picks
 from px4fuse.webpage.safe import clean, escaped
 
 MOST_GROUPS = 10
@@ -57,14 +58,6 @@ def overstated_words(factor: float) -> str:
     return f"{factor_words(off)} × too {'large' if factor > 1.0 else 'small'}"
 
 
-def _card(title: str, *content: str) -> str:
-    return f'<section class="card"><h2>{escaped(title)}</h2>{"".join(content)}</section>'
-
-
-def _note(text: str) -> str:
-    return f'<p class="note">{escaped(text)}</p>'
-
-
 def _summary(logs: Sequence[Log]) -> str:
     statuses = Counter(log.status for log in logs)
     dates = sorted(log.texts["date"][:10] for log in logs if log.texts["date"])
@@ -86,20 +79,6 @@ def _summary(logs: Sequence[Log]) -> str:
     return f'<section class="card summary" aria-label="Summary"><dl>{listed}</dl></section>'
 
 
-def _button(tag: str, text: str) -> str:
-    return (
-        f'<button type="button" class="link" data-tag="{escaped(tag)}" dir="auto">'
-        f"{escaped(text)}</button>"
-    )
-
-
-def _opens(index: int, text: str) -> str:
-    return (
-        f'<button type="button" class="link" data-open="{index}" dir="auto">{escaped(text)}'
-        "</button>"
-    )
-
-
 # ------------------------------------------------------------------ honest, and since when
 
 
@@ -111,7 +90,7 @@ def _honesty(logs: Sequence[Log], by: str, names: Mapping[str, str], scale: Scal
         if log.factors:
             groups[log.texts[by]].append(log)
     if not groups:
-        return _card(title, _note("No log has updates that could be judged."))
+        return card(title, note("No log has updates that could be judged."))
     ordered = sorted(groups.items(), key=lambda item: (-len(item[1]), item[0]))
     lines = []
     for name, members in ordered[:MOST_GROUPS]:
@@ -122,16 +101,16 @@ def _honesty(logs: Sequence[Log], by: str, names: Mapping[str, str], scale: Scal
             medians.append(factor_words(float(np.median(values))) if len(values) else "–")
         said = names.get(name, name) or f"no {by} named"
         lines.append(
-            f'<tr><th scope="row">{_button(f"{by}:{name}", said)}</th>'
+            f'<tr><th scope="row">{picks(f"{by}:{name}", said)}</th>'
             f'<td class="n wide-only">{len(members)}</td>'
             f'<td class="chart">{plot(30, "", drawn)}</td>'
             + "".join(f'<td class="n">{median}</td>' for median in medians)
             + "</tr>"
         )
-    others = _note(f"And {len(ordered) - MOST_GROUPS} more, with fewer logs.")
-    return _card(
+    others = note(f"And {len(ordered) - MOST_GROUPS} more, with fewer logs.")
+    return card(
         title,
-        _note(
+        note(
             "How many times each filter overstates the variance S of its innovations: 1 is right, "
             "right of it too large (too modest), left of it too small (too sure). The mark is the "
             "median, the box the middle half of the logs, the line nine tenths; few logs are drawn "
@@ -166,7 +145,7 @@ def _over_time(
     table = table.dropna(subset=["date"]).sort_values("date", kind="stable")
     left_out = f"{undated} logs that have no date are left out." if undated else ""
     if table.empty or scale is None:
-        return _card(title, _note(f"No log with a date has it. {left_out}"))
+        return card(title, note(f"No log with a date has it. {left_out}"))
     span = table["date"].iloc[0], table["date"].iloc[-1]
     counts = table["vehicle"].value_counts()
     ordered = sorted(counts.index, key=lambda vehicle: (-counts[vehicle], vehicle))
@@ -177,19 +156,19 @@ def _over_time(
         told = _told(mine["value"], unit, each)
         said = names.get(vehicle, vehicle) or "no vehicle named"
         panels.append(
-            f"<div><h3>{_button(f'vehicle:{vehicle}', said)} <span>{escaped(told)}</span></h3>"
+            f"<div><h3>{picks(f'vehicle:{vehicle}', said)} <span>{escaped(told)}</span></h3>"
             f"{plot(74, f'{title} of {said} over time: {told}', [*marks, _dates(span)])}</div>"
         )
     more = len(ordered) - MOST_PANELS
     ends = "logarithmic" if scale.log else "linear"
-    return _card(
+    return card(
         title,
-        _note(
+        note(
             f"In {unit} ({ends}), over the date of the log; the line through a mark is its 95 % "
             f"interval. {hint} {left_out}"
         ),
         f'<div class="panels">{"".join(panels)}</div>',
-        _note(f"And {more} vehicles with fewer logs.") if more > 0 else "",
+        note(f"And {more} vehicles with fewer logs.") if more > 0 else "",
     )
 
 
@@ -221,21 +200,21 @@ def _frequent(logs: Sequence[Log]) -> str:
     title = "Findings, most frequent first"
     counts = Counter(finding for log in logs for finding in set(log.findings))
     if not counts:
-        return _card(title, _note("Nothing was found."))
+        return card(title, note("Nothing was found."))
     ordered = sorted(counts.items(), key=lambda item: (-item[1], item[0]))
     most = ordered[0][1]
     judged = sum(log.status != "failed" for log in logs)
     lines = "".join(
-        f"<li>{bar(count / most)}{_button(f'finding:{finding}', finding_words(finding))}"
+        f"<li>{bar(count / most)}{picks(f'finding:{finding}', finding_words(finding))}"
         f"<span>{count} ({count / judged:.0%})</span></li>"
         for finding, count in ordered[:MOST_FINDINGS]
     )
     more = len(ordered) - MOST_FINDINGS
-    return _card(
+    return card(
         title,
-        _note(f"Of {judged} logs that were read; press one to see its logs."),
+        note(f"Of {judged} logs that were read; press one to see its logs."),
         f'<ol class="ranks">{lines}</ol>',
-        _note(f"And {more} others, under Finding below.") if more > 0 else "",
+        note(f"And {more} others, under Finding below.") if more > 0 else "",
     )
 
 
@@ -248,7 +227,7 @@ def _worst(logs: Sequence[Log]) -> str:
         if log.factors
     ]
     if not off:
-        return _card(title, _note("No log has updates that could be judged."))
+        return card(title, note("No log has updates that could be judged."))
     ordered = sorted(off, key=lambda item: (-item[0], item[1]))[:WORST]
     lines = []
     for _, index in ordered:
@@ -256,12 +235,12 @@ def _worst(logs: Sequence[Log]) -> str:
         whose = max(log.factors, key=lambda name: abs(math.log(log.factors[name])))
         who = "EKF2's" if whose == "ekf2" else "our"
         lines.append(
-            f"<li>{_opens(index, log.name)}<span>{who} S is "
+            f"<li>{opens(index, log.name)}<span>{who} S is "
             f"{overstated_words(log.factors[whose])}</span></li>"
         )
-    return _card(
+    return card(
         title,
-        _note("By how far the variance S of either filter is off, whichever is farther."),
+        note("By how far the variance S of either filter is off, whichever is farther."),
         f'<ol class="ranks">{"".join(lines)}</ol>',
     )
 
@@ -274,7 +253,7 @@ def _missing(logs: Sequence[Log]) -> str:
         if log.status != "done":
             groups[log.remedy].append(log)
     if not groups:
-        return _card(title, _note("Every log was judged."))
+        return card(title, note("Every log was judged."))
     ordered = sorted(groups.items(), key=lambda item: (-len(item[1]), item[0]))
     lines = []
     for remedy, members in ordered[:MOST_REMEDIES]:
@@ -283,13 +262,13 @@ def _missing(logs: Sequence[Log]) -> str:
         rest = f" (and {len(reasons) - len(said)} more)" if len(reasons) > len(said) else ""
         count = f"{len(members)} log{'' if len(members) == 1 else 's'}"
         lines.append(
-            f"<li>{_button(f'remedy:{remedy}', count)}"
+            f"<li>{picks(f'remedy:{remedy}', count)}"
             f'<p dir="auto"><strong>{escaped(remedy or "No advice.")}</strong></p>'
             f'<p class="note" dir="auto">{escaped(" / ".join(said) + rest)}</p></li>'
         )
     more = len(ordered) - MOST_REMEDIES
-    return _card(
+    return card(
         title,
         f'<ol class="ranks">{"".join(lines)}</ol>',
-        _note(f"And {more} more, under To set below.") if more > 0 else "",
+        note(f"And {more} more, under To set below.") if more > 0 else "",
     )

@@ -106,6 +106,16 @@ def histogram(values: Sequence[float], most: float, caption: str) -> str:
     )
 
 
+def bins(shares: Sequence[float]) -> str:
+    """A small histogram of shares from 0 to 1, in tenths, for a table that says the numbers."""
+    counts, _ = np.histogram(np.clip(shares, 0.0, 1.0), BINS, (0.0, 1.0))
+    marks = [_line(0.0, 100.0, 27.5, 27.5, "grid")]
+    for place, count in enumerate(counts / counts.max()):
+        if count:
+            marks.append(_rect(10.0 * place + 1.0, 27.0 - 25.0 * count, 8.0, 25.0 * count, "bar"))
+    return plot(30, "", marks)
+
+
 def plot(height: int, told: str, marks: Sequence[str]) -> str:
     """The drawing itself; ``told`` is what a screen reader says, "" where a table says it."""
     said = f'role="img" aria-label="{escaped(told)}"' if told else 'aria-hidden="true"'

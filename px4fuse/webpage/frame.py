@@ -140,9 +140,13 @@ def links(title: str, rows: Sequence[tuple[str, str]]) -> Part:
     return ["links", clean(title), [[clean(text), to] for text, to in rows if to]]
 
 
-def pictures(rows: Sequence[tuple[str, str, str]]) -> Part:
+def pictures(title: str, rows: Sequence[tuple[str, str, str]]) -> Part:
     """Caption, words for who does not see it, and address (local, or data:image/png)."""
-    return ["pictures", "", [[clean(said), clean(alt), source] for said, alt, source in rows]]
+    return [
+        "pictures",
+        clean(title),
+        [[clean(said), clean(alt), source] for said, alt, source in rows],
+    ]
 
 
 def sides(title: str, left: Sequence[tuple[str, bool]], right: Sequence[tuple[str, bool]]) -> Part:
@@ -152,6 +156,36 @@ def sides(title: str, left: Sequence[tuple[str, bool]], right: Sequence[tuple[st
         clean(title),
         [[[clean(text), marked] for text, marked in side] for side in (left, right)],
     ]
+
+
+# ------------------------------------------------------------------ above the table
+
+
+def card(title: str, *content: str) -> str:
+    """A box with a heading; the content is HTML."""
+    return f'<section class="card"><h2>{escaped(title)}</h2>{"".join(content)}</section>'
+
+
+def note(text: str) -> str:
+    """A small grey paragraph."""
+    return f'<p class="note">{escaped(text)}</p>'
+
+
+def picks(tag: str, text: str) -> str:
+    """A button that chooses a filter's tag."""
+    return _button("tag", tag, text)
+
+
+def opens(index: int, text: str) -> str:
+    """A button that shows and unfolds a row, counted from 0."""
+    return _button("open", str(index), text)
+
+
+def _button(does: str, value: str, text: str) -> str:
+    return (
+        f'<button type="button" class="link" data-{does}="{escaped(value)}" dir="auto">'
+        f"{escaped(text)}</button>"
+    )
 
 
 # ------------------------------------------------------------------ the page
@@ -282,6 +316,6 @@ def _class(column: Column) -> str:
 
 def _plain_cell(tag: str, column: Column, cell: Cell) -> str:
     below = f'<span class="file" dir="auto">{escaped(cell.below)}</span>' if cell.below else ""
-    text = escaped(cell.text).replace("\n", "<br>")
+    text = escaped(cell.text)
     name = ' class="name"' if tag == "th" else ""
     return f'<{tag}{_class(column)}><span{name} dir="auto">{text}</span>{below}</{tag}>'
