@@ -127,7 +127,8 @@ def test_nothing_is_loaded_and_nothing_hangs_on_an_attribute() -> None:
 def test_text_makes_no_elements(text: str) -> None:
     def page(word: str) -> str:
         one = row(
-            word, 5.0, id=word, file=word, flags=(word,), reasons=(word,), notes=f"So: {word}",
+            word, 5.0, id=word, file=f"{word}.pdf", flags=(word,), reasons=(word,),
+            notes=f"So: {word}",
             numbers={word: 1.0}, items=(Item(word, 5.0, 20.0, word),), mistakes={word: False},
             pending=word, to_read=((word, word),), comment=word, pseudonym="",
         )  # fmt: skip

@@ -93,15 +93,15 @@ def _items(entries: Sequence[Entry], veil: Veil) -> str:
         lines.append(
             f'<tr><th scope="row" dir="auto">{escaped(veil.hide(title))}</th>'
             f'<td class="chart">{bins([v / of if of else 0.0 for v in values])}</td>'
-            f'<td class="n">{mean:.1f}&nbsp;/&nbsp;{number(of)}</td><td class="n">{none}</td>'
-            f'<td class="n">{full}</td></tr>'
+            f'<td class="n">{mean:.1f}&nbsp;/&nbsp;{number(of)}</td><td class="n wide-only">{none}</td>'
+            f'<td class="n wide-only">{full}</td></tr>'
         )
     return card(
         "Points by item",
         note("From none to all, in tenths; pending reports left out."),
         '<table class="spread"><thead><tr><th scope="col">Item</th>'
         '<th scope="col" class="chart">none to all</th><th scope="col" class="n">Mean</th>'
-        '<th scope="col" class="n">None</th><th scope="col" class="n">All</th></tr></thead>'
+        '<th scope="col" class="n wide-only">None</th><th scope="col" class="n wide-only">All</th></tr></thead>'
         f"<tbody>{''.join(lines)}</tbody></table>",
     )
 

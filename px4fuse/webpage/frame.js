@@ -246,7 +246,7 @@
     const up = heads[column].getAttribute("aria-sort") !== "ascending";
     for (const head of heads) head.setAttribute("aria-sort", "none");
     heads[column].setAttribute("aria-sort", up ? "ascending" : "descending");
-    const numeric = columns[column][1] === "number";
+    const numeric = ["number", "rank"].includes(columns[column][1]);
     const sign = up ? 1 : -1;
     order = order.slice().sort((one, other) => {
       const a = one.values[column];

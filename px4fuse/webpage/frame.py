@@ -26,8 +26,8 @@ class Column:
     Attributes
     ----------
     title : str
-    kind : {"text", "line", "number"}
-        How it is sorted; a line is text that stays in one.
+    kind : {"text", "line", "number", "rank"}
+        How it is sorted; a line is text that stays in one, a rank is text sorted by a number.
     group : str
         Shown only while the box of this group is ticked; "" for always.
     narrow : {"always", "tablet", "desk"}
@@ -37,7 +37,7 @@ class Column:
     """
 
     title: str
-    kind: Literal["text", "line", "number"] = "text"
+    kind: Literal["text", "line", "number", "rank"] = "text"
     group: str = ""
     narrow: Literal["always", "tablet", "desk"] = "always"
     mark: float | None = None
