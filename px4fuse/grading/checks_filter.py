@@ -78,7 +78,7 @@ def consistent(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float, str
         gone = given["factor"] <= off or given["factor"] <= 1.0
         # no noise explains outliers, and none should be made to
         outliers = "understated" in verdict and evidence.has("source_outliers")
-        explained = outliers and evidence.names("source_outliers")
+        explained = outliers and evidence.claims_that("source_outliers")
         shares.append(
             1.0
             if good or explained or excused
