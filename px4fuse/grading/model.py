@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from datetime import datetime
 from pathlib import Path
 from typing import Any, Literal
 
@@ -143,11 +144,15 @@ class Submission:
     name : str
         For people: without folders of this machine, control characters or more than 200
         characters. Unique within a run.
+    time : datetime or None
+        Of the entry in the zip file, in an unknown time zone: when the platform took it, or when
+        it packed the zip file.
     """
 
     file: Path
     entry: str
     name: str
+    time: datetime | None = None
 
 
 @dataclass(frozen=True)
@@ -241,3 +246,62 @@ class Graded:
     def of(self) -> float:
         """The most that there is to have."""
         return sum(item.of for item in self.items)
+
+
+@dataclass(frozen=True)
+class Override:
+    """What the instructor says instead: points, or words, or both."""
+
+    points: float | None = None
+    comment: str = ""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One row of the class: a student, or a report that belongs to nobody known.
+
+    Attributes
+    ----------
+    student, student_id : str
+        As the roster says; of somebody who is not in it, as the report or the platform says.
+    counting : Graded or None
+        The attempt that counts; None where nothing was handed in.
+    others : tuple of Graded
+        Further attempts, earliest first.
+    handed_in : str
+        When the counting one was handed in, as the platform says; "" where unknown.
+    late_s : float or None
+        After the due time (s), 0 in time; None where one of both is unknown.
+    deduction : float
+        Points taken off for being late, from the sum over the items.
+    overrides : mapping
+        What the instructor says, by the title of an item (numbered like the table's columns) or
+        "total".
+    comment : str
+        The instructor's own words on all of it.
+    total : float or None
+        What is entered as the grade; None while pending or missing.
+    of : float
+        The most that there is to have.
+    email : str
+        As the roster says.
+    remarks : tuple of str
+        On who this is and what counts: sentences for the instructor.
+    pseudonym : str
+        What the class page shows instead of name, id and names of files; "" to show them.
+    """
+
+    student: str
+    student_id: str
+    counting: Graded | None
+    others: tuple[Graded, ...] = ()
+    handed_in: str = ""
+    late_s: float | None = None
+    deduction: float = 0.0
+    overrides: Mapping[str, Override] = field(default_factory=dict)
+    comment: str = ""
+    total: float | None = None
+    of: float = 0.0
+    email: str = ""
+    remarks: tuple[str, ...] = ()
+    pseudonym: str = ""
