@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from px4fuse.grading.claims import in_words
 from px4fuse.grading.evidence import (
     Evidence,
     also_named,
@@ -15,7 +16,6 @@ from px4fuse.grading.evidence import (
     values_at,
     why_absent,
 )
-from px4fuse.grading.claims import in_words
 from px4fuse.results.contract import LoopResults
 from px4fuse.verification.model import Verdict
 from px4fuse.verification.verification import NO_LOG

@@ -36,7 +36,7 @@ def disguised(text: str) -> bool:
     """
     seen = unicodedata.normalize("NFKD", text)
     latin = [c for c in seen if c.isascii() and c.isalpha()]
-    others = [c for c in seen if c.isalpha() and not c.isascii()]
+    others = [c for c in seen if c.isalpha() and "LATIN" not in unicodedata.name(c, "LATIN")]
     hidden = any(_prints_nothing(c) for c in seen.strip("\ufeff"))
     return len(latin) > 2 and (hidden or any(_folded(c).isascii() for c in others))
 
@@ -66,9 +66,7 @@ def _alike() -> dict[str, str]:
     try:
         from confusable_homoglyphs.confusables import confusables_data  # noqa: PLC0415 - a megabyte
     except ImportError as error:
-        raise SettingsError(
-            'grading needs more packages: pip install "px4fuse[grade]".'
-        ) from error
+        raise SettingsError('grading needs more packages: pip install "px4fuse[grade]".') from error
     made = {}
     for character, listed in confusables_data.items():
         looks = [one["c"] for one in listed if len(one["c"]) == 1]

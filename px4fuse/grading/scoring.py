@@ -96,9 +96,7 @@ CHECKS: Mapping[str, Check] = {
         min_measurements=Parameter("whole", 100, 0, 10_000_000),
         min_path_m=Parameter("number", 20.0, 0.0, 1e6),
     ),
-    "mistakes": _check(
-        checks_mistakes.mistakes, in_report=_share(0.25)
-    ),
+    "mistakes": _check(checks_mistakes.mistakes, in_report=_share(0.25)),
 }
 
 
@@ -128,13 +126,18 @@ class Assessment:
 
 
 def assess(
-    report: Report, verdict: Verdict, rubric: Rubric, key: AnswerKey | None
+    report: Report,
+    verdict: Verdict,
+    rubric: Rubric,
+    key: AnswerKey | None,
+    owner_id: str = "",
 ) -> Assessment:
     """Points for one report, whether they count, and what is left for the instructor.
 
     Items for another kind of report are left out, and without an answer key those on mistakes.
+    ``owner_id`` is that of who handed it in, where a platform says so and the report does not.
     """
-    evidence = Evidence(report, verdict, rubric, key)
+    evidence = Evidence(report, verdict, rubric, key, owner_id)
     fate, why = _fate(evidence)
     made = []
     for item in rubric.items:
