@@ -303,6 +303,6 @@ DETECTOR = Detector(
         "ekf2_variance_understated": "ekf2 understat, ekf2 variance, ekf2_evp_noise, ekf2 nis",
     },
     {
-        "ekf2_variance_understated": tuple(f"--mistake ekf2-noise={cm}cm" for cm in (5, 4, 3)),
+        "ekf2_variance_understated": tuple(f"--mistake ekf2-noise={cm}cm" for cm in (4, 3)),
     },
 )
