@@ -164,7 +164,7 @@ def ideal(one: Flown) -> tuple[Reported, str]:
         if better == request:
             break
         request, report = better, one.report(better)
-    return report, fairness_notes.notes(report, one.drawn.typed, one.number // 2)
+    return report, fairness_notes.notes(report, one.drawn, one.number // 2)
 
 
 def _advised(request: Request, report: Reported, number: int) -> Request:
@@ -230,7 +230,10 @@ def items(one: Flown, who: str, rubric: Rubric) -> tuple[Item, ...]:
 
 
 def measured(one: Flown, rubric: Rubric) -> dict[str, object]:
-    """A row of the table."""
+    """A row of the table.
+
+    ``missed``: what the key names and the report as the command makes it does not list.
+    """
     answer = one.answer()
     found = {i for top in by_default(one)[0].findings for i in (top.id, *_ids(top.consequences))}
     row: dict[str, object] = {
@@ -238,7 +241,7 @@ def measured(one: Flown, rubric: Rubric) -> dict[str, object]:
         "kind": one.drawn.scenario.kind,
         "mistakes": " ".join(answer.mistakes) or NONE,
         "difficulty": answer.difficulty,
-        "found": found.issuperset(answer.findings),
+        "missed": " ".join(sorted({*answer.findings} - found)),
     }
     for who in STUDENTS:
         made = items(one, who, rubric)
@@ -264,25 +267,29 @@ def summary(table: pd.DataFrame) -> pd.DataFrame:
     -------
     DataFrame
         One row per mistake and size ("plain" or "small", above and below the middle of the band),
-        with ``flights``, ``found`` (share of its flights whose report shows all that the key names)
-        and the means of the three. A flight with two mistakes is in two rows.
+        with ``flights``, ``found`` (share of them whose report lists it) and the means of the
+        three. A flight with two mistakes is in two rows.
     """
-    single = table.assign(mistake=table["mistakes"].str.split()).explode("mistake")
-    name, choices = single["mistake"].str.partition("=")[0], _choices()
-    single["size"] = [
-        _size(choices.get(each), typed) for each, typed in zip(name, single["mistake"], strict=True)
-    ]
+    choices = {choice.mistake: choice for kind in CHOICES.values() for choice in kind}
+    rows = []
+    for row in table.to_dict("records"):
+        for typed in row["mistakes"].split():
+            choice = choices.get(typed.partition("=")[0])
+            rows.append(
+                {
+                    "mistake": f"{NONE}, {row['kind']}" if choice is None else choice.mistake,
+                    "size": _size(choice, typed),
+                    "found": choice is None or choice.finding not in row["missed"].split(),
+                    **{who: row[who] for who in STUDENTS},
+                }
+            )
     return (
-        single.assign(mistake=name + single["kind"].radd(" in a ").where(name == NONE, ""))
+        pd.DataFrame(rows)
         .groupby(["mistake", "size"])
         .agg(flights=("found", "size"), **{key: (key, "mean") for key in ("found", *STUDENTS)})
         .round(3)
         .reset_index()
     )
-
-
-def _choices() -> dict[str, Choice]:
-    return {choice.mistake: choice for kind in CHOICES.values() for choice in kind}
 
 
 def _size(choice: Choice | None, typed: str) -> str:

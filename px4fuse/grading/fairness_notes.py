@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+from px4fuse.assignment.drawing import Drawn
 from px4fuse.filter.tuning import HORIZONTAL
 from px4fuse.results.comparison import Filter, Tuned
 from px4fuse.results.contract import ComparisonResults, LoopResults, Reported
@@ -80,6 +81,19 @@ SENTENCES: Mapping[str, tuple[str, str]] = {
         "rejects the wrong closure and the path must not be corrected with it.",
     ),
 }  # fmt: skip
+# Of what mistakes bring with them, where the report lists it by itself
+EFFECTS: Mapping[str, str] = {
+    "ekf2_resets": "EKF2 resets its position to a sample several times. That is only an effect: "
+    "after a second of rejections it starts again from there.",
+    "kf_variance_understated": "The variance of my filter is understated, since the bad samples "
+    "pull its NIS up. I kept SIGMA_Z, because most samples fit.",
+    "errors_larger_than_claimed": "Against the truth the error is larger than claimed: what causes "
+    "it moves all positions together, and so the innovations hide it.",
+    "ekf2_ev_delay_wrong": "EKF2 is still told EKF2_EV_DELAY 0 and fuses these positions at the "
+    "wrong time; its delay follows from the clock and needs the same correction.",
+    "ekf2_variance_understated": "The EKF2 variance is understated as well, and its NIS too high, "
+    "for the same reason.",
+}
 NO_MISTAKE = (
     "I looked for a clock error, a turned frame, bad samples and missing data, and found no "
     "mistake in this flight.",
@@ -93,25 +107,32 @@ def sentence(typed: str, wording: int) -> str:
     return SENTENCES[name][wording % 2].format(size=values.partition(",")[0].lstrip("-"))
 
 
-def notes(results: Reported, mistakes: Sequence[str], wording: int) -> str:
-    """Notes on a report that name these mistakes, and explain what else the report finds.
+def notes(results: Reported, drawn: Drawn, wording: int) -> str:
+    """Notes on a report that name the mistakes, and explain what else the report finds.
 
     Parameters
     ----------
     results : ComparisonResults or LoopResults
         The report's.
-    mistakes : sequence of str
-        As typed for ``px4fuse simulate``; empty names none.
+    drawn : Drawn
+        The flight.
     wording : int
         Which of the two.
     """
-    others = [_explained(one) for one in results.findings if one.severity != "info"]
+    others = [
+        _explained(one)
+        for one in results.findings
+        if one.severity != "info" and not {*one.ids} & {*drawn.findings}
+    ]
     more = ["# What else the report says", " ".join(others)] if others else []
-    return "\n\n".join((guessed(results, mistakes, wording), *more)) + "\n"
+    return "\n\n".join((guessed(results, drawn.typed, wording), *more)) + "\n"
 
 
 def guessed(results: Reported, mistakes: Sequence[str], wording: int) -> str:
-    """The same of a student who has not read the findings."""
+    """Notes that name these mistakes, typed as for ``px4fuse simulate``, or say that none is there.
+
+    So writes who has not read the findings of the report.
+    """
     named = [sentence(one, wording) for one in mistakes] or [NO_MISTAKE[wording % 2]]
     did = _loop(results) if isinstance(results, LoopResults) else _compared(results)
     parts = ("# What I did", did, "# What is wrong with this flight", " ".join(named))
@@ -119,10 +140,12 @@ def guessed(results: Reported, mistakes: Sequence[str], wording: int) -> str:
 
 
 def _explained(finding: FoundMistake) -> str:
-    """A finding in the words of the report, as a student would quote it."""
-    message = finding.message.split(". ")[0].rstrip(".")
-    remedy = finding.remedy.split(". ")[0].rstrip(".")
-    return f"The report says: {message}. To fix this: {remedy}."
+    """What a student says of a finding besides the mistakes; else what the report says."""
+    message, remedy = (
+        text.split(". ")[0].rstrip(".") for text in (finding.message, finding.remedy)
+    )
+    quoted = f"The report says: {message}. To fix this: {remedy}."
+    return EFFECTS.get(finding.id, quoted)
 
 
 def _compared(results: ComparisonResults) -> str:
