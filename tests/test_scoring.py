@@ -13,17 +13,13 @@ from results_tools import EXAMPLE, LOOP, SHA256, changed, correction, decoded, f
 
 from px4fuse.assignment.key import Answer, AnswerKey
 from px4fuse.errors import ResultsError
+from px4fuse.grading.evidence import values_at
+from px4fuse.grading.feedback import feedback, gradescope
 from px4fuse.grading.flags import chosen_settings, class_flags, own_flags
-from px4fuse.grading.model import Graded
+from px4fuse.grading.model import Graded, Item
+from px4fuse.grading.notes import Notes
 from px4fuse.grading.rubric import parse_rubric, read_rubric
-from px4fuse.grading.scoring import (
-    Notes,
-    feedback,
-    gradescope,
-    score,
-    score_refused,
-    values_at,
-)
+from px4fuse.grading.scoring import score, score_refused
 from px4fuse.results.contract import to_plain
 from px4fuse.verification.intake import read_report
 from px4fuse.verification.model import Report, Verdict
@@ -487,6 +483,13 @@ class TestScore:
 def graded(items=(), **values):
     given = {"submission": "a.pdf", "student": "Ann Lee", "student_id": "1001"}
     return Graded(**{**given, "verdict": VERIFIED, "items": tuple(items), **values})
+
+
+def test_pending_points_do_not_count():
+    items = (Item("T", 3.0, 5.0, "Why."),)
+    assert (graded(items).points, graded(items).counted) == (3.0, 3.0)
+    waiting = graded(items, pending="Add uwb.csv to --logs.")
+    assert (waiting.points, waiting.counted) == (3.0, None)
 
 
 class TestWhatStudentsRead:
