@@ -7,9 +7,9 @@ number of flights, ``--only TEXT`` takes those whose mistakes hold it and writes
 analysis changes.
 
 The default student hands in the report as the command makes it, without notes. The ideal one sets
-what the report advises and names the mistakes in sentences. The guesser names mistakes drawn at
-random in the same sentences, with default or random settings. All of them hand in honest numbers,
-which are taken for verified.
+what the report advises and names the mistakes in sentences, in two wordings. The guesser names one
+to three mistakes drawn at random in the same sentences, with default and with random settings: the
+mean of eight guesses. All of them hand in honest numbers, which are taken for verified.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from functools import partial
 from importlib import metadata
 from importlib.resources import files
 from pathlib import Path
+from statistics import fmean
 from typing import cast
 
 import msgspec
@@ -41,7 +42,8 @@ from px4fuse.filter.tuning import HORIZONTAL
 from px4fuse.findings import find, find_loop
 from px4fuse.flight import Flight
 from px4fuse.grading import fairness_notes
-from px4fuse.grading.model import Item, Rubric
+from px4fuse.grading.fairness_notes import WORDINGS
+from px4fuse.grading.model import Graded, Rubric
 from px4fuse.grading.rubric import read_rubric
 from px4fuse.grading.scoring import score
 from px4fuse.loop.analysis import analyse
@@ -65,12 +67,15 @@ FLIGHTS = 300
 BOUNDS = {"ideal": 0.95, "default": 0.50, "guesser": 0.30}
 VERIFIED = Verdict("verified", ("taken for verified",), with_log=True, page_status="same")
 NONE = "none"
-# Of half the guessers, who set what comes to their mind: the factor from the default is log-uniform
+# Of half the guesses, whose settings come to mind: the factor from the default is log-uniform
 WILD = 3.0
 MOST_GUESSES = 3
 # The ideal student runs again until what the report asks for is what was set
 MOST_RUNS = 3
+GUESSES = 8
 Request = ComparisonRequest | LoopRequest
+# Reports with their notes: what one kind of student hands in, of which the mean counts
+HandIns = tuple[tuple[Reported, str], ...]
 
 
 # ------------------------------------------------------------------ flights and reports
@@ -144,9 +149,9 @@ def _results(flight: Flight, request: Request) -> Reported:
 # ------------------------------------------------------------------ students
 
 
-def by_default(one: Flown) -> tuple[Reported, str]:
+def by_default(one: Flown) -> HandIns:
     """The report as the command makes it, without notes."""
-    return one.report(_asked(one)), ""
+    return ((one.report(_asked(one)), ""),)
 
 
 def _asked(one: Flown) -> Request:
@@ -155,26 +160,28 @@ def _asked(one: Flown) -> Request:
     return ComparisonRequest(log=one.student.file)
 
 
-def ideal(one: Flown) -> tuple[Reported, str]:
-    """Settings as the report advises, and notes that name the mistakes in sentences."""
-    request = _asked(one)
-    report = one.report(request)
-    for _ in range(MOST_RUNS):
-        better = _advised(request, report, one.number)
-        if better == request:
-            break
-        request, report = better, one.report(better)
-    return report, fairness_notes.notes(report, one.drawn, one.number // 2)
+def ideal(one: Flown) -> HandIns:
+    """Settings as the report advises, and notes that name the mistakes: in each wording."""
+    handed_in = []
+    for wording in range(WORDINGS):
+        request = _asked(one)
+        report = one.report(request)
+        for _ in range(MOST_RUNS):
+            better = _advised(request, report, leaves_open=wording == 0)
+            if better == request:
+                break
+            request, report = better, one.report(better)
+        handed_in.append((report, fairness_notes.notes(report, one.drawn, wording)))
+    return tuple(handed_in)
 
 
-def _advised(request: Request, report: Reported, number: int) -> Request:
+def _advised(request: Request, report: Reported, leaves_open: bool) -> Request:
     """What the report asks for."""
     found = {each.id: each for top in report.findings for each in (top, *top.consequences)}
     if isinstance(request, LoopRequest):
-        # half of them leave the landing out, as the finding advises
-        return msgspec.structs.replace(
-            request, came_back="false_loop_closure" not in found or number % 2 == 0
-        )
+        # the finding advises to leave the landing out; who does not has it rejected, which is right
+        wrong = "false_loop_closure" in found and leaves_open
+        return msgspec.structs.replace(request, came_back=request.came_back and not wrong)
     changes: dict[str, float] = {}
     arrival, offset = found.get("source_stamps_of_arrival"), found.get("source_clock_offset")
     if arrival is not None and request.start_s is None:
@@ -190,24 +197,29 @@ def _advised(request: Request, report: Reported, number: int) -> Request:
     return msgspec.structs.replace(request, **changes)
 
 
-def guesser(one: Flown) -> tuple[Reported, str]:
-    """Mistakes drawn at random, named in sentences, with default or random settings."""
+def guesser(one: Flown) -> HandIns:
+    """Mistakes drawn at random, named in sentences: with default settings, and with random ones."""
     rng = np.random.default_rng(one.number)
     choices = [choice for kind in CHOICES.values() for choice in kind]
-    picked = rng.choice(len(choices), rng.integers(1, MOST_GUESSES, endpoint=True), replace=False)
-    named = [choices[at].typed(rng.uniform(EASIEST, HARDEST)) for at in picked]
-    request = _asked(one)
-    if isinstance(request, ComparisonRequest) and one.number % 2:
+    requests = [_asked(one)]
+    if isinstance(requests[0], ComparisonRequest):
         wild = {
-            name: float(f"{getattr(request, name) * WILD ** rng.uniform(-1.0, 1.0):.3g}")
+            name: float(f"{getattr(requests[0], name) * WILD ** rng.uniform(-1.0, 1.0):.3g}")
             for name in ASKED
         }
-        request = msgspec.structs.replace(request, **wild)
-    report = one.report(request)
-    return report, fairness_notes.guessed(report, named, one.number // 2)
+        requests.append(msgspec.structs.replace(requests[0], **wild))
+    reports = [one.report(request) for request in requests]
+    handed_in = []
+    for guess in range(GUESSES):
+        count = rng.integers(1, MOST_GUESSES, endpoint=True)
+        picked = rng.choice(len(choices), count, replace=False)
+        named = [choices[at].typed(rng.uniform(EASIEST, HARDEST)) for at in picked]
+        report = reports[guess % len(reports)]
+        handed_in.append((report, fairness_notes.guessed(report, named, guess // 2)))
+    return tuple(handed_in)
 
 
-STUDENTS: Mapping[str, Callable[[Flown], tuple[Reported, str]]] = {
+STUDENTS: Mapping[str, Callable[[Flown], HandIns]] = {
     "ideal": ideal,
     "default": by_default,
     "guesser": guesser,
@@ -217,16 +229,16 @@ STUDENTS: Mapping[str, Callable[[Flown], tuple[Reported, str]]] = {
 # ------------------------------------------------------------------ points
 
 
-def items(one: Flown, who: str, rubric: Rubric) -> tuple[Item, ...]:
-    """What one of the three earns, part by part."""
+def earned(one: Flown, results: Reported, notes: str, rubric: Rubric) -> Graded:
+    """What a report with its notes earns, part by part."""
     answer = one.answer()
-    results, notes = STUDENTS[who](one)
     student = Student(name=answer.name, id=answer.student_id, notes=notes)
     # the pages of a report that px4fuse drew
     pages = {page for item in rubric.items for page in item.parameters.get("pages", ())}
     results = msgspec.structs.replace(results, student=student)
     report = Report("", 0, "intact", results, (" ".join(sorted(pages)),), b"")
-    return score(report, VERIFIED, rubric, AnswerKey("mixed", (answer,)))
+    made = score(report, VERIFIED, rubric, AnswerKey("mixed", (answer,)))
+    return Graded(answer.file, answer.name, answer.student_id, VERIFIED, made)
 
 
 def measured(one: Flown, rubric: Rubric) -> dict[str, object]:
@@ -235,7 +247,7 @@ def measured(one: Flown, rubric: Rubric) -> dict[str, object]:
     ``missed``: what the key names and the report as the command makes it does not list.
     """
     answer = one.answer()
-    found = {i for top in by_default(one)[0].findings for i in (top.id, *_ids(top.consequences))}
+    found = {i for top in by_default(one)[0][0].findings for i in (top.id, *_ids(top.consequences))}
     row: dict[str, object] = {
         "student": answer.student_id,
         "kind": one.drawn.scenario.kind,
@@ -243,9 +255,9 @@ def measured(one: Flown, rubric: Rubric) -> dict[str, object]:
         "difficulty": answer.difficulty,
         "missed": " ".join(sorted({*answer.findings} - found)),
     }
-    for who in STUDENTS:
-        made = items(one, who, rubric)
-        row[who] = round(sum(i.points for i in made) / sum(i.of for i in made), 4)
+    for who, hand_in in STUDENTS.items():
+        made = [earned(one, *each, rubric) for each in hand_in(one)]
+        row[who] = round(fmean(each.points / each.of for each in made), 4)
     return row
 
 

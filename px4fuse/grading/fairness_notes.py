@@ -13,6 +13,7 @@ from px4fuse.results.comparison import Filter, Tuned
 from px4fuse.results.contract import ComparisonResults, LoopResults, Reported
 from px4fuse.results.model import FoundMistake
 
+WORDINGS = 2
 # By name of the mistake, with its size as {size}
 SENTENCES: Mapping[str, tuple[str, str]] = {
     "clock-offset": (
@@ -104,7 +105,7 @@ NO_MISTAKE = (
 def sentence(typed: str, wording: int) -> str:
     """What names one mistake, as it was typed for ``px4fuse simulate``."""
     name, _, values = typed.partition("=")
-    return SENTENCES[name][wording % 2].format(size=values.partition(",")[0].lstrip("-"))
+    return SENTENCES[name][wording % WORDINGS].format(size=values.partition(",")[0].lstrip("-"))
 
 
 def notes(results: Reported, drawn: Drawn, wording: int) -> str:
@@ -117,7 +118,7 @@ def notes(results: Reported, drawn: Drawn, wording: int) -> str:
     drawn : Drawn
         The flight.
     wording : int
-        Which of the two.
+        Which of them.
     """
     others = [
         _explained(one)
@@ -133,7 +134,7 @@ def guessed(results: Reported, mistakes: Sequence[str], wording: int) -> str:
 
     So writes who has not read the findings of the report.
     """
-    named = [sentence(one, wording) for one in mistakes] or [NO_MISTAKE[wording % 2]]
+    named = [sentence(one, wording) for one in mistakes] or [NO_MISTAKE[wording % WORDINGS]]
     did = _loop(results) if isinstance(results, LoopResults) else _compared(results)
     parts = ("# What I did", did, "# What is wrong with this flight", " ".join(named))
     return "\n\n".join(parts)

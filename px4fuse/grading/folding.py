@@ -66,9 +66,7 @@ def _alike() -> dict[str, str]:
     try:
         from confusable_homoglyphs.confusables import confusables_data  # noqa: PLC0415 - a megabyte
     except ImportError as error:
-        raise SettingsError(
-            'grading needs more packages: pip install "px4fuse[grade]".'
-        ) from error
+        raise SettingsError('grading needs more packages: pip install "px4fuse[grade]".') from error
     made = {}
     for character, listed in confusables_data.items():
         looks = [one["c"] for one in listed if len(one["c"]) == 1]

@@ -97,7 +97,9 @@ def parse_rubric(text: str, where: str) -> Rubric:
         other = titles.setdefault((item.title, item.report), number)
         if other != number:
             _refuse(where, f"items {other} and {number} have the same title; give each its own")
-    fates = {name: cast(Doubtful, _value(where, name, given, one)) for name, one in DOUBTFUL.items()}
+    fates = {
+        name: cast(Doubtful, _value(where, name, given, one)) for name, one in DOUBTFUL.items()
+    }
     return Rubric(
         title=_value(where, "title", given, Parameter("text", "")),
         items=read,
