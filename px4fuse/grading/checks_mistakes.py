@@ -58,7 +58,7 @@ def _nothing_wrong(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float,
     was = "Your flight was made without a mistake"
     wrong = evidence.charged
     if wrong:
-        return 0.0, f"{was}{also_named(wrong)}."
+        return -float(len(wrong)), f"{was}{also_named(wrong)}."
     if evidence.notes.claims(evidence.words.get(NOTHING, ())):
         return 1.0, f"{was}, and your notes say so."
     return given["in_report"], f"{was}; your notes should say that you looked and found none."

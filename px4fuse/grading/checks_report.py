@@ -122,12 +122,20 @@ def findings(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float, str]:
         for one in evidence.results.findings
         if one.severity in given["severities"] and one.id not in ignored
     }
-    if not asked:
-        return 1.0, f"Your report has no {' or '.join(given['severities'])} left to explain."
+    left = f"no {' or '.join(given['severities'])} left to explain"
+    if evidence.notes.problem or not evidence.notes.words:
+        named = in_words(asked)
+        return 0.0, (
+            f"Your notes do not take up what your report finds: {list_words(named)}."
+            if named
+            else f"Your report has {left}; say in your notes what you looked at to be sure."
+        )
     # whoever names what a cause brings with it has seen it too
     missing = [name for name, one in asked.items() if not any(map(evidence.names, one.ids))]
     wrong = evidence.charged
-    share = 1.0 - (len(missing) + len(wrong)) / len(asked)
+    share = 1.0 - (len(missing) + len(wrong)) / max(len(asked), 1)
+    if not asked:
+        return share, f"Your report has {left}{also_named(wrong)}."
     if not missing and not wrong:
         return 1.0, f"Your notes take up all {len(asked)} findings of your report."
     said = f"Your notes take up {len(asked) - len(missing)} of {len(asked)} findings"
@@ -186,13 +194,15 @@ def flight(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float, str]:
     else:
         value = max(axis.updates.count for axis in results.axes.values())
         least, unit = given["min_measurements"], "measurements"
-    shares = [_up_to(part.end_s - part.start_s, given["min_duration_s"]), _up_to(value, least)]
-    said = f"You analysed {part.end_s - part.start_s:.3g} s with {value:.4g} {unit}"
+    analysed_s, least_s = part.end_s - part.start_s, given["min_duration_s"]
+    if evidence.answer is not None:  # how long it is was not the student's choice
+        whole_s = evidence.answer.truth.get("duration_s", least_s)
+        least_s = min(least_s, given["handed_out"] * whole_s)
+    shares = [_up_to(analysed_s, least_s), _up_to(value, least)]
+    said = f"You analysed {analysed_s:.3g} s with {value:.4g} {unit}"
     if min(shares) == 1.0:
         return 1.0, f"{said}, which is enough."
-    return min(shares), (
-        f"{said}; {given['min_duration_s']:g} s and {least:g} {unit} were asked for."
-    )
+    return min(shares), f"{said}; {least_s:.3g} s and {least:g} {unit} were asked for."
 
 
 def _up_to(value: float, least: float) -> float:

@@ -234,8 +234,11 @@ class Graded:
 
     @property
     def points(self) -> float:
-        """Sum over the items; while :attr:`pending` a proposal, never to be added to anything."""
-        return sum(item.points for item in self.items)
+        """Sum over the items; while :attr:`pending` a proposal, never to be added to anything.
+
+        Wrong claims can cost more than their item gives, but never more than there is.
+        """
+        return max(sum(item.points for item in self.items), 0.0)
 
     @property
     def counted(self) -> float | None:

@@ -19,6 +19,8 @@ from px4fuse.grading.names import named
 from px4fuse.grading.notes import MANY_DISGUISED
 from px4fuse.verification.model import Refused, Report, Verdict
 
+# Checks in which a wrong claim costs what a right one earns, so that guessing does not pay
+COSTLY = frozenset(("findings", "mistakes"))
 # Passages for the instructor to read, of one report
 MOST_TO_READ = 6
 
@@ -95,8 +97,9 @@ CHECKS: Mapping[str, Check] = {
         min_duration_s=Parameter("number", 60.0, 0.0, 1e5),
         min_measurements=Parameter("whole", 100, 0, 10_000_000),
         min_path_m=Parameter("number", 20.0, 0.0, 1e6),
+        handed_out=_share(0.4),
     ),
-    "mistakes": _check(checks_mistakes.mistakes, in_report=_share(0.25)),
+    "mistakes": _check(checks_mistakes.mistakes, in_report=_share(0.0)),
 }
 
 
@@ -146,7 +149,8 @@ def assess(
         share, comment = 0.0, f"No points, since {why}."
         if fate != "zero":
             share, comment = CHECKS[item.check].score(evidence, item.parameters)
-        points = round(item.points * min(max(share, 0.0), 1.0), 2)
+        least = -1.0 if item.check in COSTLY else 0.0
+        points = round(item.points * min(max(share, least), 1.0), 2)
         made.append(Item(item.title, points, item.points, comment[:1].upper() + comment[1:]))
     return Assessment(
         tuple(made),
