@@ -127,7 +127,8 @@ class TestNotes:
 
 class TestFindings:
     def test_none_left(self):
-        assert checked("findings")[0] == 1.0
+        assert checked("findings", noted("I looked at all pages of it."))[0] == 1.0
+        assert checked("findings")[0] == 0.0
 
     def test_named_by_id_by_words_or_not(self):
         late = finding("source_clock_offset", "error")
@@ -143,7 +144,8 @@ class TestFindings:
 
     def test_what_is_ignored_or_mild_is_not_asked_for(self):
         ignored = finding("ekf2_unavailable")
-        assert checked("findings", changed(findings=[ignored]))[0] == 1.0
+        said = noted("I looked at all pages of it.", findings=[ignored])
+        assert checked("findings", said)[0] == 1.0
         assert checked("findings", severities=["info"])[0] == 0.0
 
 
@@ -357,7 +359,7 @@ class TestMistakes:
         assert "a time without positions" in comment
         assert "source_gap" not in comment
         shown = noted("Outliers at 20 s.", student__id="s01", findings=[GAP])
-        assert checked("mistakes", shown, key=two)[0] == 0.62
+        assert checked("mistakes", shown, key=two, in_report=0.25)[0] == 0.62
         both = noted("Outliers at 20 s and a gap at 40 s.", student__id="s01")
         assert checked("mistakes", both, key=two)[0] == 1.0
 
@@ -408,16 +410,18 @@ class TestMistakes:
     def test_clock_that_was_mended_counts_as_shown(self):
         own = key("source_clock_offset", truth={"clock_offset_to_add_s": -0.25})
         mended = noted("", student__id="s01", settings__clock_offset_s=-0.24)
-        assert checked("mistakes", mended, key=own)[0] == 0.25
-        assert checked("mistakes", noted("", student__id="s01"), key=own)[0] == 0.0
+        assert checked("mistakes", mended, key=own, in_report=0.25)[0] == 0.25
+        unmended = noted("", student__id="s01")
+        assert checked("mistakes", unmended, key=own, in_report=0.25)[0] == 0.0
 
     def test_nothing_wrong(self):
         def points(text):
-            return checked("mistakes", noted(text, student__id="s01"), key=key())[0]
+            given = noted(text, student__id="s01")
+            return checked("mistakes", given, key=key(), in_report=0.25)[0]
 
         assert points("I looked and found no mistakes, and no outliers.") == 1.0
         assert points("") == 0.25
-        assert points("There are outliers.") == 0.0
+        assert points("There are outliers.") == -1.0
 
     def test_another_log_an_unknown_id_and_no_id(self):
         other = key("source_gap", sha256="c" * 64)
@@ -532,7 +536,7 @@ class TestScore:
                 continue
             read += 1
             for item in score(found, VERIFIED, rubric, key("source_gap")):
-                assert 0.0 <= item.points <= item.of
+                assert -item.of <= item.points <= item.of
                 assert len(item.comment) < 1500
                 assert item.comment.isprintable()
             own_flags(found.results)
