@@ -8,7 +8,7 @@ from typing import Literal
 
 import pandas as pd
 
-from px4fuse.fleet.logs import Log, finding_words, logs_of, short_names
+from px4fuse.fleet.by_log import Log, finding_words, logs_of, short_names
 from px4fuse.fleet.questions import above, overstated_words
 from px4fuse.plain import number_words
 from px4fuse.webpage.charts import Scale, around_one, linear_scale, log_scale

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import pandas as pd
 
-from px4fuse.fleet.logs import Log, finding_words
+from px4fuse.fleet.by_log import Log, finding_words
 from px4fuse.plain import factor_words
 from px4fuse.webpage.charts import Scale, axis, bar, grid, over_time, plot, spread
 from px4fuse.webpage.frame import card, note, opens, picks

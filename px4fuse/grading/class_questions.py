@@ -93,8 +93,8 @@ def _items(entries: Sequence[Entry], veil: Veil) -> str:
         lines.append(
             f'<tr><th scope="row" dir="auto">{escaped(veil.hide(title))}</th>'
             f'<td class="chart">{bins([v / of if of else 0.0 for v in values])}</td>'
-            f'<td class="n">{mean:.1f}&nbsp;/&nbsp;{number(of)}</td><td class="n wide-only">{none}</td>'
-            f'<td class="n wide-only">{full}</td></tr>'
+            f'<td class="n">{mean:.1f}&nbsp;/&nbsp;{number(of)}</td>'
+            f'<td class="n wide-only">{none}</td><td class="n wide-only">{full}</td></tr>'
         )
     return card(
         "Points by item",

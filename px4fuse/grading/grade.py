@@ -322,6 +322,7 @@ def _scored(
         flags=(*_page_flags(verdict), *own_flags(results), *made.flags),
         pending=made.pending,
         to_read=made.to_read,
+        mistakes=made.mistakes,
         numbers=_numbers(results),
         sha256=sha256,
         log_sha256=log_sha256(results),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 
-from px4fuse.assignment.key import folded
+from px4fuse.grading.folding import folded
 
 # Words in a row that are the same in both
 SAME_WORDS = 5
