@@ -206,7 +206,7 @@ def _frequent(logs: Sequence[Log]) -> str:
     judged = sum(log.status != "failed" for log in logs)
     lines = "".join(
         f"<li>{bar(count / most)}{picks(f'finding:{finding}', finding_words(finding))}"
-        f"<span>{count} ({count / judged:.0%})</span></li>"
+        f'<span class="right">{count} ({count / judged:.0%})</span></li>'
         for finding, count in ordered[:MOST_FINDINGS]
     )
     more = len(ordered) - MOST_FINDINGS
@@ -235,7 +235,7 @@ def _worst(logs: Sequence[Log]) -> str:
         whose = max(log.factors, key=lambda name: abs(math.log(log.factors[name])))
         who = "EKF2's" if whose == "ekf2" else "our"
         lines.append(
-            f"<li>{opens(index, log.name)}<span>{who} S is "
+            f"<li>{opens(index, log.name)}<span class='right'>{who} S is "
             f"{overstated_words(log.factors[whose])}</span></li>"
         )
     return card(

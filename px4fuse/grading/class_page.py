@@ -95,6 +95,7 @@ def html_text(entries: Sequence[Entry], title: str, made_with: str) -> str:
     # The folder or zip file that all are in says nothing in a row
     common = posixpath.commonprefix([one.submission for one in graded]).rpartition("/")
     shared = len(common[0] + common[1])
+    timed = any(entry.handed_in or entry.late_s for entry in entries)
     minutes = {at: reading_minutes(entry.counting) for at, entry in enumerate(entries)}
     return page(
         title=title,
@@ -107,20 +108,20 @@ def html_text(entries: Sequence[Entry], title: str, made_with: str) -> str:
             Column("Id", "line", narrow="tablet"),
             Column("Status", "rank"),
             Column("Points", "number"),
-            Column("Handed in", "line", narrow="desk"),
+            *[Column("Handed in", "line", narrow="desk")] * timed,
             Column("To read (min)", "number", narrow="desk"),
             Column("Flags", "rank", narrow="desk"),
             *(Column(veil.hide(name), "number", "items") for name in items),
             *(Column(veil.hide(name), "number", "numbers") for name in numbers),
         ),
         rows=[
-            _row(at, entries, veil, copied.get(at, ()), items, numbers, shared, minutes[at])
+            _row(at, entries, veil, copied.get(at, ()), items, numbers, shared, minutes[at], timed)
             for at in range(len(entries))
         ],
         filters=_filters(entries),
         groups=(
             ("items", "Points of each item", False),
-            ("numbers", "Numbers", True),
+            ("numbers", "Numbers", False),
         ),
         placeholder="name, id, file, flag",
         otherwise="All rows are in class.csv.",
@@ -177,7 +178,7 @@ def _filters(entries: Sequence[Entry]) -> list[tuple[str, list[tuple[str, str]]]
 
 def _row(
     at: int, entries: Sequence[Entry], veil: Veil, copied: Sequence[Copied],
-    items: Sequence[str], numbers: Sequence[str], shared: int, minutes: float,
+    items: Sequence[str], numbers: Sequence[str], shared: int, minutes: float, timed: bool,
 ) -> Row:  # fmt: skip
     entry = entries[at]
     one = entry.counting
@@ -193,7 +194,7 @@ def _row(
             f"{SIGNS[status]} {status}", float(STATUSES.index(status)), _few(flags), LOOKS[status]
         ),
         _points(entry),
-        Cell(entry.handed_in, entry.handed_in or None, late_words(entry)),
+        *[Cell(entry.handed_in, entry.handed_in or None, late_words(entry))] * timed,
         figure(minutes or None, f"{math.ceil(minutes)}"),
         Cell("\n".join(map(veil.hide, flags)), float(len(flags)), "", "flags"),
         *(figure(points.get(title)) for title in items),
@@ -201,7 +202,7 @@ def _row(
     )
     beside = _beside(entry, one, veil) if one else ()
     alike = (_side_by_side(entry, entries[to], share, veil) for share, to in copied[:MAX_COPIES])
-    return Row(cells, tuple(_tags(entry)), (*_details(entry, veil), *alike), beside)
+    return Row(cells, tuple(_tags(entry)), _details(entry, veil, tuple(alike)), beside)
 
 
 def _rank(status: str) -> float:
@@ -249,7 +250,7 @@ def late_words(entry: Entry) -> str:
 # ------------------------------------------------------------------ what a row unfolds to
 
 
-def _details(entry: Entry, veil: Veil) -> tuple[Part, ...]:
+def _details(entry: Entry, veil: Veil, alike: tuple[Part, ...]) -> tuple[Part, ...]:
     one = entry.counting
     comment = [veil.hide(text) for text in (entry.comment,) if text]
     if one is None:
@@ -261,7 +262,10 @@ def _details(entry: Entry, veil: Veil) -> tuple[Part, ...]:
         listed("Pending: what you can do", [veil.hide(one.pending)] if one.pending else [], True),
         listed(
             "For you to judge",
-            [f"{veil.hide(why)}: “{veil.hide(said, own_words=True)}”" for why, said in one.to_read],
+            [
+                f"{veil.hide(why).rstrip('.')}: “{veil.hide(said, own_words=True)}”"
+                for why, said in one.to_read
+            ],
         ),
         listed("Verification", [veil.hide(reason) for reason in verdict.reasons]),
         tabled(
@@ -283,6 +287,7 @@ def _details(entry: Entry, veil: Veil) -> tuple[Part, ...]:
             ],
         ),
         prose("The student's notes", veil.hide(one.notes, own_words=True)),
+        *alike,
         tabled(
             "Other attempts",
             ("File", "Status", "Points") if entry.others else (),
