@@ -241,7 +241,8 @@ def test_a_record_holds_all_of_a_grade() -> None:
         "a.pdf", "Ada", "1",
         Verdict("numbers differ", ("why",), True, (Difference("a.b", "1", "2"),), "differ",
                 (PageDifference(2, "its picture", 0, 0.5),)),
-        (Item("t", 1.0, 2.0, "c"),), ("flag",), {"n": 0.5}, "a", "b", "0.1", "{}", "notes",
+        (Item("t", 1.0, 2.0, "c"),), ("flag",), "why", (("why", "passage"),), {"n": 0.5},
+        "a", "b", "0.1", "{}", "notes",
     )  # fmt: skip
     values = asdict(whole)
     for name in ("picture", "handed_in", "redrawn"):

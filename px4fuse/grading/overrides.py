@@ -1,0 +1,115 @@
+"""What the instructor says instead of the rules: a table that is read and never written over."""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from px4fuse.assignment.key import folded
+from px4fuse.errors import SettingsError
+from px4fuse.grading.model import Entry, Override
+from px4fuse.grading.sheet import read_sheet
+from px4fuse.results.reading import cleaned, one_line
+
+NAME = "overrides.csv"
+TITLES = ("id", "item", "points", "comment")
+TEMPLATE = "\ufeff" + ",".join(TITLES) + "\r\n"
+TOTAL = "total"
+MOST = 1e6
+MAX_COMMENT = 10_000
+
+# Id as it was typed, to item as it was typed ("" for all of it), to what is said
+Overrides = Mapping[str, Mapping[str, Override]]
+
+
+def read_overrides(path: Path) -> Overrides:
+    """Read ``overrides.csv``; nothing where it is not there.
+
+    Its columns are id (as in class.csv, or the file's name), item (a title of the rubric, "total",
+    or empty for a comment on all of it), points and comment.
+
+    Raises
+    ------
+    SettingsError
+        A column is missing, or a row says no number of points where it should.
+    """
+    if not path.exists():
+        return {}
+    sheet = read_sheet(path)
+    missing = [title for title in TITLES if sheet.column((title,)) is None]
+    if missing:
+        raise SettingsError(
+            f"{path}: no column {', '.join(missing)}. Its columns are {', '.join(TITLES)}."
+        )
+    found: dict[str, dict[str, Override]] = defaultdict(dict)
+    for number, row in zip(sheet.numbers, sheet.rows, strict=True):
+        student, item, points = (sheet.cell(row, (title,)) for title in TITLES[:3])
+        comment = cleaned(sheet.cell(row, ("comment",))[:MAX_COMMENT])
+        if item in found[student]:
+            raise SettingsError(
+                f"{path}: row {number}: {one_line(student, 40)}, {one_line(item, 40) or 'all'} "
+                "stands there twice. Keep one of them."
+            )
+        value = _points(points)
+        if (points and value is None) or (value is not None and not item):
+            raise SettingsError(
+                f"{path}: row {number}: points {one_line(points, 20)!r} "
+                + ("are not a number from 0 up." if item else "without an item. Name it, or total.")
+            )
+        found[student][item] = Override(value, comment)
+    return found
+
+
+def _points(text: str) -> float | None:
+    try:
+        # 7,5 in a table that is separated by semicolons
+        value = float(text.replace(",", "."))
+    except ValueError:
+        return None
+    return value if math.isfinite(value) and 0.0 <= value <= MOST else None
+
+
+def of_entry(overrides: Overrides, entry: Entry, items: Sequence[str]) -> dict[str, Override]:
+    """What is said of one entry, by the titles of its items, "total" and "" for all of it."""
+    said: dict[str, Override] = {}
+    for student, rows in overrides.items():
+        if not _is(entry, student):
+            continue
+        for item, override in rows.items():
+            title = next((one for one in (*items, TOTAL, "") if folded(one) == folded(item)), None)
+            if title is not None:
+                said[title] = override
+    return said
+
+
+def unknown(
+    overrides: Overrides, entries: Sequence[Entry], items: Mapping[int, Sequence[str]]
+) -> tuple[str, ...]:
+    """A sentence for every row that nobody is, or no item.
+
+    Parameters
+    ----------
+    overrides : mapping
+    entries : sequence of Entry
+    items : mapping
+        Index into ``entries`` to the titles of its items.
+    """
+    notes = []
+    for student, rows in overrides.items():
+        places = [index for index, entry in enumerate(entries) if _is(entry, student)]
+        if not places:
+            notes.append(f"{NAME}: nobody has the id {one_line(student, 40) or '(empty)'}.")
+        titles = {folded(one) for at in places for one in (*items[at], TOTAL, "")}
+        notes += [
+            f"{NAME}: {one_line(student, 40)} has no item {one_line(item, 60)!r}."
+            for item in rows
+            if places and folded(item) not in titles
+        ]
+    return tuple(notes)
+
+
+def _is(entry: Entry, student: str) -> bool:
+    names = [entry.student_id, *([entry.counting.submission] if entry.counting else [])]
+    return any(folded(name) == folded(student) != "" for name in names)
