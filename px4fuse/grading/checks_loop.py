@@ -114,7 +114,6 @@ def loop(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float, str]:
             "Your loop is on a track that follows a positioning system and does not drift; measure "
             "it on odometry."
         )
-    wrong = contradictions(evidence)
     if opened and not loop.closures:
         share, why = _open_end(evidence)
         return (1.0 + 2.0 * share) / 3.0 if share else 0.0, (
@@ -123,26 +122,32 @@ def loop(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float, str]:
     measured = f"You measured a closure error of {loop.closure_error_m or 0.0:.3g} m"
     if opened:
         measured = f"You left the end open (--open) and gave {len(loop.closures)} closures"
-    if wrong:
-        return 1 / 3, f"{measured}, but {wrong[0][:1].lower() + wrong[0][1:]}"
-    if loop.closures and not any(one.accepted for one in loop.closures):
-        if evidence.notes.claims(evidence.words.get(ACCEPTED, ())):
-            return 0.0, (
-                f"{measured}, which is more than drift explains, and your notes call the closure "
-                "true. Say where it landed (--landed-at) or leave the end open (--open)."
-            )
-        share, why = _open_end(evidence)
-        said = f"{measured}; the closure was rejected as false, which leaves the path as it is"
-        return (1.0 + 2.0 * share) / 3.0, f"{said}, {why}."
+    wrong = contradictions(evidence)
+    if loop.closures and not any(one.accepted for one in loop.closures) and not wrong:
+        return _rejected(evidence, measured)
     landed, request = _landed_m(evidence), getattr(results, "request", None)
     assumed = isinstance(request, LoopRequest) and request.landed_at is None and not opened
     if landed is not None and landed > TAPE_M and assumed:
-        return 1 / 3, (
-            f"{measured} against the place of take-off, where it did not land: say where it did "
-            "(--landed-at) or leave the end open (--open)."
+        wrong += (
+            "It did not land at the place of take-off: say where it did (--landed-at) or leave "
+            "the end open (--open).",
         )
+    if wrong:
+        return 1 / 3, f"{measured}, but {wrong[0][:1].lower() + wrong[0][1:]}"
     share, comment = _corrected(loop.corrections, given["without_reference"])
     return (1.0 + share) / 3.0, f"{measured}{comment}"
+
+
+def _rejected(evidence: Evidence, measured: str) -> tuple[float, str]:
+    """A closure that the gate rejected, and what the notes make of it."""
+    if evidence.notes.claims(evidence.words.get(ACCEPTED, ())):
+        return 0.0, (
+            f"{measured}, which is more than drift explains, and your notes call the closure "
+            "true. Say where it landed (--landed-at) or leave the end open (--open)."
+        )
+    share, why = _open_end(evidence)
+    said = f"{measured}; the closure was rejected as false, which leaves the path as it is"
+    return (1.0 + 2.0 * share) / 3.0, f"{said}, {why}."
 
 
 def closure(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float, str]:

@@ -36,7 +36,7 @@ def disguised(text: str) -> bool:
     """
     seen = unicodedata.normalize("NFKD", text)
     latin = [c for c in seen if c.isascii() and c.isalpha()]
-    others = [c for c in seen if c.isalpha() and not c.isascii()]
+    others = [c for c in seen if c.isalpha() and "LATIN" not in unicodedata.name(c, "LATIN")]
     hidden = any(_prints_nothing(c) for c in seen.strip("\ufeff"))
     return len(latin) > 2 and (hidden or any(_folded(c).isascii() for c in others))
 

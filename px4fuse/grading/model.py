@@ -242,8 +242,8 @@ class Graded:
 
     @property
     def counted(self) -> float | None:
-        """The points that count; None while they are pending."""
-        return None if self.pending else self.points
+        """The points that count, never below zero; None while they are pending."""
+        return None if self.pending else max(self.points, 0.0)
 
     @property
     def of(self) -> float:

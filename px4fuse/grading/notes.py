@@ -13,7 +13,7 @@ from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import product
+from itertools import islice, product
 from typing import Literal
 
 from px4fuse.grading.folding import disguised, folded
@@ -174,9 +174,13 @@ class Notes:
         places = [
             [at for at, word in enumerate(sentence.words) if _begins(word, stem)] for stem in stems
         ]
-        for number, chosen in enumerate(product(*places)):
-            if number >= MAX_TRIES:
-                return
+        for chosen in islice(product(*places), MAX_TRIES):
+            if not self.words_of_rubric.negations.isdisjoint(stems):
+                # "not closed" is no two words of one sentence
+                span = chosen[-1] - chosen[0]
+                apart = sentence.clause[chosen[0]] != sentence.clause[chosen[-1]]
+                if apart or span > len(stems) + 1 or list(chosen) != sorted(set(chosen)):
+                    continue
             yield self._stance(sentence, chosen)
 
     def _stance(self, sentence: Sentence, chosen: Sequence[int]) -> Stance:
@@ -187,29 +191,26 @@ class Notes:
             if sentence.clause[first] <= sentence.clause[at] <= sentence.clause[last]
             and at not in chosen
         ]  # fmt: skip
-        said = [words[at] for at in same]
+        said = {words[at] for at in same}
         denying = [at for at in same if words[at] in known.negations]
+        one_clause = sentence.clause[first] == sentence.clause[last]
+        before = {
+            word for word, clause in zip(words, sentence.clause, strict=True)
+            if clause < sentence.clause[first]
+        }  # fmt: skip
+        goes_on = len(same) + len(chosen) <= SHORT_CLAUSE and not known.contrasts & said
         if any(first - DENIES_BEFORE <= at < first for at in denying):
             return "denied"
-        one_clause = sentence.clause[first] == sentence.clause[last]
-        if any(first < at < last for at in denying):
+        if any(first < at < last for at in denying) or known.reassurances & said:
             return "denied" if one_clause else "open"
-        if known.reassurances & set(said):
-            return "denied" if one_clause else "open"
-        if any(at < first or at <= last + DENIES_AFTER for at in denying):
-            return "open"
-        if any(words[at] in known.doubts for at in same if at < first):
-            return "open"
-        if sentence.text.rstrip().endswith(("?", "？", "؟")):
-            return "open"
-        if len(same) + len(chosen) <= SHORT_CLAUSE and not known.contrasts & set(said):
-            before = {
-                word for word, clause in zip(words, sentence.clause, strict=True)
-                if clause < sentence.clause[first]
-            }  # fmt: skip
-            if before & (known.negations | known.doubts):
-                return "open"
-        return "claimed"
+        unclear = (
+            any(at < first or at <= last + DENIES_AFTER for at in denying),
+            any(words[at] in known.doubts for at in same if at < first)
+            and not known.negations.intersection(words[at] for at in chosen),
+            sentence.text.rstrip().endswith(("?", "？", "؟")),
+            goes_on and before & (known.negations | known.doubts),
+        )
+        return "open" if any(unclear) else "claimed"
 
 
 _ORDER: dict[Stance, int] = {"claimed": 0, "open": 1, "denied": 2}
@@ -267,32 +268,39 @@ def _problem(
 ) -> str:
     """Why a text is no text of the student's about a flight; "" where no rule can say so."""
     words = [word for sentence in own for word in sentence.words]
-    length = sum(map(_weight, words))
+    length, names = sum(map(_weight, words)), sum(word in ids for word in words)
     if length + notes.quoted < rules.judged_from:
         return ""
-    if notes.quoted > rules.quoted * (length + notes.quoted):
-        return "are mostly sentences of px4fuse itself"
-    if sum(word in ids for word in words) > rules.ids * len(words):
-        return "are mostly names of findings"
     packed = " ".join(words).encode()
-    if len(packed) >= MIN_PACKED_BYTES:
-        share = len(zlib.compress(packed, 9)) / len(packed)
-        if share < rules.packed:
-            return "say the same again and again"
-    if notes.words < rules.in_sentences * length:
-        return "are mostly not sentences"
     spaced = [word for word in words if not NO_SPACES.match(word)]
-    if len(spaced) >= max(MIN_COUNTED, len(words) // 2):
-        common = sum(count for _, count in Counter(spaced).most_common(COMMONEST))
-        if common < rules.common * len(spaced):
-            return "are words without the small ones that make sentences of them"
+    common = sum(count for _, count in Counter(spaced).most_common(COMMONEST))
     about = sum(
         one.length for one in notes.sentences
         if any(any(c.isdigit() for c in word) or _is_term(word, terms) for word in one.words)
     )  # fmt: skip
-    if about < rules.about * notes.words:
-        return "say nothing about the flight: no numbers, no words of the field"
-    return ""
+    broken = (
+        (
+            notes.quoted > rules.quoted * (length + notes.quoted),
+            "are mostly sentences of px4fuse itself",
+        ),
+        (names > rules.ids * len(words), "are mostly names of findings"),
+        (
+            len(packed) >= MIN_PACKED_BYTES
+            and len(zlib.compress(packed, 9)) < rules.packed * len(packed),
+            "say the same again and again",
+        ),
+        (notes.words < rules.in_sentences * length, "are mostly not sentences"),
+        (
+            len(spaced) >= max(MIN_COUNTED, len(words) // 2)
+            and common < rules.common * len(spaced),
+            "are words without the small ones that make sentences of them",
+        ),
+        (
+            about < rules.about * notes.words,
+            "say nothing about the flight: no numbers, no words of the field",
+        ),
+    )
+    return next((said for holds, said in broken if holds), "")
 
 
 def _is_term(word: str, terms: Collection[str]) -> bool:

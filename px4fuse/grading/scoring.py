@@ -128,12 +128,19 @@ class Assessment:
     to_read: tuple[tuple[str, str], ...] = ()
 
 
-def assess(report: Report, verdict: Verdict, rubric: Rubric, key: AnswerKey | None) -> Assessment:
+def assess(
+    report: Report,
+    verdict: Verdict,
+    rubric: Rubric,
+    key: AnswerKey | None,
+    owner_id: str = "",
+) -> Assessment:
     """Points for one report, whether they count, and what is left for the instructor.
 
     Items for another kind of report are left out, and without an answer key those on mistakes.
+    ``owner_id`` is that of who handed it in, where a platform says so and the report does not.
     """
-    evidence = Evidence(report, verdict, rubric, key)
+    evidence = Evidence(report, verdict, rubric, key, owner_id)
     fate, why = _fate(evidence)
     made = []
     for item in rubric.items:
