@@ -74,6 +74,7 @@ CHECKS: Mapping[str, Check] = {
         at_least=Parameter("number"),
         at_most=Parameter("number"),
         zero_at=Parameter("number"),
+        advice=Parameter("text", ""),
     ),
     "consistent": _check(
         checks_filter.consistent,
