@@ -35,8 +35,9 @@ METADATA = {
     "previous_submissions": [],
 }  # fmt: skip
 # "Autograder Specifications" of the same
-TOP = {"score", "execution_time", "output", "output_format", "test_output_format", "tests",
-       "test_name_format", "visibility", "stdout_visibility", "extra_data", "leaderboard"}  # fmt: skip
+TOP = {"score", "execution_time", "output", "output_format", "test_output_format",
+       "test_name_format", "visibility", "stdout_visibility", "extra_data", "tests",
+       "leaderboard"}  # fmt: skip
 TEST = {"score", "max_score", "status", "name", "name_format", "number", "output", "output_format",
         "tags", "visibility", "extra_data"}  # fmt: skip
 VISIBLE = {"visible", "hidden", "after_due_date", "after_published"}
