@@ -127,7 +127,7 @@ class Choice:
 NEED_IMU = ("clock", "frame")
 CHOICES: dict[Kind, tuple[Choice, ...]] = {
     "aisle": (
-        Choice("clock-offset", "source_clock_offset", "clock", 200, "ms", either_sign=True),
+        Choice("clock-offset", "source_clock_offset", "clock", 150, "ms", either_sign=True),
         Choice(
             "clock-jump", "source_stamps_of_arrival", "clock", 50, "ms", hides=("frame", "gap")
         ),
@@ -147,7 +147,7 @@ CHOICES: dict[Kind, tuple[Choice, ...]] = {
         Choice("ekf2-delay", "ekf2_ev_delay_wrong", "clock", 150, "ms"),
         Choice("ekf2-off", "ekf2_not_fusing", "ekf2"),
     ),
-    "loop": (Choice("open-end", "false_loop_closure", "end", 5, "m"),),
+    "loop": (Choice("open-end", "false_loop_closure", "end", 4, "m"),),
 }  # fmt: skip
 POSSIBLE_FINDINGS = frozenset(choice.finding for kind in CHOICES.values() for choice in kind)
 

@@ -86,7 +86,5 @@ def _detect(analysis: Analysis) -> Found:
 
 
 DETECTOR = Detector(
-    _detect,
-    {"ekf2_rejecting": "reject"},
-    {"ekf2_rejecting": ("--mistake ekf2-gate=2.5", "--mistake ekf2-gate=2")},
+    _detect, {"ekf2_rejecting": "reject"}, {"ekf2_rejecting": ("--mistake ekf2-gate=2",)}
 )

@@ -10,8 +10,9 @@ from px4fuse.filter.tuning import HORIZONTAL
 from px4fuse.grading.evidence import Evidence, absence, drifts, text_of, why_not_horizontal
 from px4fuse.plain import factor_words
 from px4fuse.results.comparison import ASKED, Clock, Filter, HorizontalNis, Tuned
-from px4fuse.verification.rerun import log_sha256
 
+# Findings about stamps for which no single offset is right
+CHANGING = ("source_clock_changes", "source_stamps_of_arrival")
 SIGMAS = ("sigma_z_m", "sigma_a_m_s2")
 
 
@@ -57,7 +58,11 @@ def _tuned(evidence: Evidence, axis: str, name: str, factor: float) -> tuple[flo
         return 1.0, f"{said} within {wanted}"
     share = 1.0 - math.log(off) / math.log(factor) if factor > max(off, 1.0) else 0.0
     side = "above" if chosen > high else "below"
-    return share, f"{said} {side} {wanted}, by a factor of {factor_words(off)}"
+    option = "--sigma-z" if label == "SIGMA_Z" else "--sigma-a"
+    return share, (
+        f"{said} {side} {wanted}, by a factor of {factor_words(off)}: try a value between with "
+        f"{option}"
+    )
 
 
 def consistent(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float, str]:
@@ -78,10 +83,11 @@ def consistent(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float, str
         gone = given["factor"] <= off or given["factor"] <= 1.0
         # no noise explains outliers, and none should be made to
         outliers = "understated" in verdict and evidence.has("source_outliers")
-        explained = outliers and evidence.names("source_outliers")
+        explained = outliers and evidence.claims_that("source_outliers")
+        handed = not explained and _nothing_more(evidence)
         shares.append(
             1.0
-            if good or explained or excused
+            if good or explained or excused or handed
             else 0.0
             if gone
             else 1.0 - math.log(off) / math.log(given["factor"])
@@ -93,7 +99,9 @@ def consistent(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float, str
             if outliers
             else ", as it may be against a source that may drift"
             if excused
-            else ""
+            else ", because of what is wrong with the log that you were given, as your notes say"
+            if handed
+            else ": look at what the tuning page asks for, and for what the model does not explain"
         )
         said.append(
             f"{owner} is consistent ({axis})"
@@ -102,6 +110,19 @@ def consistent(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float, str
         )
     comment = "; ".join(said) or "the rubric names no axis"
     return sum(shares) / max(len(shares), 1), f"{comment[:1].upper() + comment[1:]}."
+
+
+def _handed_out(evidence: Evidence) -> tuple[str, ...]:
+    """What is wrong with the log that the student was given."""
+    return () if evidence.answer is None else evidence.answer.findings
+
+
+def _nothing_more(evidence: Evidence) -> bool:
+    """Whether a student has found all that is wrong with the log, and set what the data ask for."""
+    named = set(_handed_out(evidence))
+    return bool(named) and named <= evidence.claims.earned and not evidence.notes.problem and all(
+        _tuned(evidence, HORIZONTAL, name, 2.0)[0] == 1.0 for name in SIGMAS
+    )  # fmt: skip
 
 
 def _judged(evidence: Evidence, axis: str, which: str) -> tuple[Filter | HorizontalNis | None, str]:
@@ -126,10 +147,13 @@ def clock(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float, str]:
     if not clock.determinable:
         said = "Your flight does not determine the clock offset"
         said += f" ({text_of(clock.reason).rstrip('.')})" if clock.reason else ""
-        key = evidence.key
-        if key is not None and key.of_log(log_sha256(evidence.results)) is not None:
-            return 1.0, f"{said}, which is not your choice."
-        return given["undeterminable"], f"{said}; fly clear starts and stops."
+        handed_out = evidence.answer is not None
+        return 1.0 if handed_out else given["undeterminable"], (
+            f"{said}, which is not your choice." if handed_out
+            else f"{said}; fly clear starts and stops."
+        )  # fmt: skip
+    if any(evidence.has(name) or name in _handed_out(evidence) for name in CHANGING):
+        return _changing(evidence, given["undeterminable"])
     low, high = interval
     said = f"You applied a clock offset of {applied:.3f} s"
     if low - given["margin_s"] <= applied <= high + given["margin_s"]:
@@ -138,3 +162,11 @@ def clock(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float, str]:
         f"{said} where the data ask for {low:.3f} to {high:.3f} s; set it with --clock-offset, or "
         "use --clock-offset auto."
     )
+
+
+def _changing(evidence: Evidence, unnoticed: float) -> tuple[float, str]:
+    """Stamps for which no single offset is right."""
+    said = "The offset of the position stamps changes in your flight: no single one is right"
+    if any(map(evidence.claims_that, CHANGING)):
+        return 1.0, f"{said}, as your notes say."
+    return unnoticed, f"{said}; say in your notes from when on it holds, and why."

@@ -2,77 +2,66 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
-from px4fuse.assignment.drawing import POSSIBLE_FINDINGS
-from px4fuse.assignment.key import Answer, AnswerKey
-from px4fuse.grading.evidence import Evidence, list_words, text_of
+from px4fuse.assignment.key import Answer
+from px4fuse.grading.claims import in_words
+from px4fuse.grading.evidence import Evidence, also_named, list_words, text_of
 from px4fuse.verification.rerun import log_sha256
 
 # In the words of the rubric: what says that a flight has no mistake
 NOTHING = "none"
-# Half is lost where notes name so many kinds of mistakes that some must be guesses
-GUESSING = 0.5
+TRY = (
+    "Look at the report's findings and at where the innovations leave their band, and say what the "
+    "cause is, how large it is, and how you know"
+)
 
 
 def mistakes(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float, str]:
     """The notes name the mistakes of the student's flight and no others."""
-    student_id, sha256 = text_of(evidence.results.student.id), log_sha256(evidence.results)
-    answer = answer_for(evidence.key, student_id, sha256)
+    student_id = text_of(evidence.results.student.id)
+    theirs = None if evidence.key is None else evidence.key.of_student(student_id)
+    if theirs is not None and theirs.sha256 != log_sha256(evidence.results):
+        return 0.0, f"This report is not about the log that you were given, {text_of(theirs.file)}."
+    answer = evidence.answer
     if answer is None:
         return 0.0, (
             f"Neither your id ({student_id or 'none is given'}) nor your log is in the "
             "answer key; make the report of the log that you were given, with your --id."
         )
-    if answer.sha256 != sha256:
-        return 0.0, f"This report is not about the log that you were given, {text_of(answer.file)}."
-    named = [name for name in sorted(POSSIBLE_FINDINGS) if evidence.names(name, affirmed=True)]
+    if evidence.notes.problem:
+        return 0.0, f"Your notes {evidence.notes.problem}: nothing in them counts. {TRY}."
     if not answer.findings:
-        return _nothing_wrong(evidence, named, given)
+        return _nothing_wrong(evidence, given)
     shown = {name for one in evidence.results.findings for name in one.ids}
     if _applied(evidence, answer):
         shown.add("source_clock_offset")
-    shares = {
-        name: 1.0 if evidence.names(name, affirmed=True) else given["in_report"] * (name in shown)
-        for name in answer.findings
-    }
-    share = sum(shares.values()) / len(shares)
-    found = [name for name, part in shares.items() if part == 1.0]
-    left = [name for name in shares if name not in found]
-    was = f"Your flight was made with {list_words([text_of(one) for one in answer.mistakes])}"
-    if len(named) > given["most_named"]:
-        return share * GUESSING, (
-            f"{was}, but your notes name {len(named)} kinds of mistakes as if all were there; say "
-            "which of them your log has."
-        )
-    if not left:
+    earned = evidence.claims.earned
+    found = [name for name in answer.findings if name in earned]
+    left = [name for name in answer.findings if name not in earned]
+    listed = [name for name in left if name in shown]
+    wrong = evidence.charged
+    share = (len(found) + given["in_report"] * len(listed) - len(wrong)) / len(answer.findings)
+    was = f"Your flight has {list_words(in_words(answer.findings))}"
+    if not left and not wrong:
         return share, f"{was}, and your notes name {'it' if len(found) == 1 else 'all of it'}."
-    listed = any(name in shown for name in left)
-    return share, (
-        f"{was}; your notes name {len(found)} of {len(shares)}, missing: {list_words(left)}"
-        + (", which your report shows but your notes do not explain." if listed else ".")
-    )
+    said = f"{was}; your notes plainly name {len(found)} of {len(answer.findings)}"
+    if left:
+        said += f", not {list_words(in_words(left))}"
+        said += ", which your report shows" if listed else ""
+    said += also_named(wrong)
+    return share, f"{said}. {TRY}." if left else f"{said}."
 
 
-def _nothing_wrong(
-    evidence: Evidence, named: Sequence[str], given: Mapping[str, Any]
-) -> tuple[float, str]:
+def _nothing_wrong(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float, str]:
     was = "Your flight was made without a mistake"
-    if evidence.notes.mention(evidence.words.get(NOTHING, ())):
-        if not named:
-            return 1.0, f"{was}, and your notes say so."
-        return given["in_report"], f"{was}; your notes say so but also name {list_words(named)}."
-    if named:
-        return 0.0, f"{was}, but your notes name {list_words(named)}."
+    wrong = evidence.charged
+    if wrong:
+        return -float(len(wrong)), f"{was}{also_named(wrong)}."
+    if evidence.notes.claims(evidence.words.get(NOTHING, ())):
+        return 1.0, f"{was}, and your notes say so."
     return given["in_report"], f"{was}; your notes should say that you looked and found none."
-
-
-def answer_for(key: AnswerKey | None, student_id: str, log_sha256: str) -> Answer | None:
-    """The answer that counts: the student's own, or for an id that is not in the key the log's."""
-    if key is None:
-        return None
-    return key.of_student(student_id) or key.of_log(log_sha256)
 
 
 def _applied(evidence: Evidence, answer: Answer) -> bool:

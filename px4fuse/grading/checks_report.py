@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from px4fuse.grading.claims import in_words
 from px4fuse.grading.evidence import (
     Evidence,
+    also_named,
     is_number,
     list_words,
     reason_of,
@@ -14,9 +16,13 @@ from px4fuse.grading.evidence import (
     values_at,
     why_absent,
 )
+from px4fuse.grading.names import part
 from px4fuse.results.contract import LoopResults
 from px4fuse.verification.model import Verdict
 from px4fuse.verification.verification import NO_LOG
+
+# Findings about a recording that are no question to whoever was handed the log
+NOT_ASKED = frozenset(("log_damaged", "samples_dropped", "source_samples_lost"))
 
 
 def verified(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float, str]:
@@ -71,25 +77,35 @@ def sections(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float, str]:
     for path in given["results"]:
         there = [value for _, value in values_at(evidence.plain, path)]
         if not any(v for v in there if not (isinstance(v, dict) and set(v) == {"unavailable"})):
-            missing.append(f"{path}{why_absent(evidence, path)}")
+            missing.append(f"{part(path)}{why_absent(evidence, path)}")
     asked = len(given["pages"]) + len(given["results"])
     if not missing:
         return 1.0, f"Your report has all {asked} parts that were asked for."
     return 1.0 - len(missing) / asked, (
-        f"Your report has {asked - len(missing)} of {asked} parts; missing: {list_words(missing)}."
+        f"Your report has {asked - len(missing)} of {asked} parts; missing: {list_words(missing)}. "
+        "Make the report with px4fuse as it comes, on a whole flight."
     )
 
 
 def notes(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float, str]:
     """The student has written enough."""
-    words, different = evidence.notes.words, evidence.notes.different
-    if not words:
+    read = evidence.notes
+    words, different = read.words, read.different
+    if not evidence.results.student.notes.strip():
         return 0.0, "Your report has no notes of your own; write them and add them with --notes."
+    if read.problem:
+        return 0.0, (
+            f"Your notes {read.problem}: that earns nothing. Say in sentences of your own what "
+            "you see in this flight, how large it is, and what you did about it."
+        )
     share = min(words / given["min_words"], different / given["min_different"], 1.0)
     if share == 1.0:
         return 1.0, f"Your notes have {words} words."
     if words < given["min_words"]:
-        return share, f"Your notes have {words} words; {given['min_words']} were asked for."
+        return share, (
+            f"Your notes have {words} words in sentences of your own; {given['min_words']} were "
+            "asked for."
+        )
     return share, (
         f"Your notes have {words} words, but only {different} different ones; "
         f"{given['min_different']} were asked for."
@@ -97,22 +113,37 @@ def notes(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float, str]:
 
 
 def findings(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float, str]:
-    """The notes take up what the report finds."""
+    """The notes take up what the report finds, and nothing that the log does not have."""
+    ignored = {*given["ignore"]}
+    if evidence.answer is not None:
+        ignored |= NOT_ASKED  # which nobody who was handed a log can help
+    if evidence.has("ekf2_unavailable"):
+        ignored |= {one for one in evidence.words if one.startswith("ekf2_")}
     asked = {
-        one.id: one.ids
+        one.id: one
         for one in evidence.results.findings
-        if one.severity in given["severities"] and one.id not in given["ignore"]
+        if one.severity in given["severities"] and one.id not in ignored
     }
-    if not asked:
-        return 1.0, f"Your report has no {' or '.join(given['severities'])} left to explain."
+    left = f"no {' or '.join(given['severities'])} left to explain"
+    if evidence.notes.problem or not evidence.notes.words:
+        named = in_words(asked)
+        return 0.0, (
+            f"Your notes do not take up what your report finds: {list_words(named)}."
+            if named
+            else f"Your report has {left}; say in your notes what you looked at to be sure."
+        )
     # whoever names what a cause brings with it has seen it too
-    missing = [name for name, ids in asked.items() if not any(map(evidence.names, ids))]
-    if not missing:
+    missing = [name for name, one in asked.items() if not any(map(evidence.names, one.ids))]
+    wrong = evidence.charged
+    share = 1.0 - (len(missing) + len(wrong)) / max(len(asked), 1)
+    if not asked:
+        return share, f"Your report has {left}{also_named(wrong)}."
+    if not missing and not wrong:
         return 1.0, f"Your notes take up all {len(asked)} findings of your report."
-    return 1.0 - len(missing) / len(asked), (
-        f"Your notes take up {len(asked) - len(missing)} of {len(asked)} findings; say what causes "
-        f"{list_words(missing)} and what you did about it."
-    )
+    said = f"Your notes take up {len(asked) - len(missing)} of {len(asked)} findings"
+    if missing:
+        said += f"; say what causes {list_words(in_words(missing))} and what you did about it"
+    return share, f"{said}{also_named(wrong)}."
 
 
 def number_between(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float, str]:
@@ -129,7 +160,7 @@ def number_between(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float,
     label = given["name"]
     if not found:
         why = next((why for path in given["path"] if (why := why_absent(evidence, path))), "")
-        return 0.0, f"Your report has no number for {label or given['path'][0]}{why}."
+        return 0.0, f"Your report has no number for {label or part(given['path'][0])}{why}."
     # of several the one that is worst counts
     name, number = min(found, key=lambda pair: _within(pair[1], given))
     share = _within(number, given)
@@ -139,7 +170,8 @@ def number_between(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float,
     shown = f"{number:.4g} {given['unit']}".strip()
     what = label or f"the number {text_of(name)}"
     what += f" ({text_of(name)})" * (bool(label) and len(found) > 1)
-    return share, f"{what[:1].upper() + what[1:]} is {shown}; {limits} was asked for."
+    advice = f" {given['advice']}" if share < 1.0 and given["advice"] else ""
+    return share, f"{what[:1].upper() + what[1:]} is {shown}; {limits} was asked for.{advice}"
 
 
 def _within(number: float, given: Mapping[str, Any]) -> float:
@@ -165,13 +197,15 @@ def flight(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float, str]:
     else:
         value = max(axis.updates.count for axis in results.axes.values())
         least, unit = given["min_measurements"], "measurements"
-    shares = [_up_to(part.end_s - part.start_s, given["min_duration_s"]), _up_to(value, least)]
-    said = f"You analysed {part.end_s - part.start_s:.3g} s with {value:.4g} {unit}"
+    analysed_s, least_s = part.end_s - part.start_s, given["min_duration_s"]
+    if evidence.answer is not None:  # how long it is was not the student's choice
+        whole_s = evidence.answer.truth.get("duration_s", least_s)
+        least_s = min(least_s, given["handed_out"] * whole_s)
+    shares = [_up_to(analysed_s, least_s), _up_to(value, least)]
+    said = f"You analysed {analysed_s:.3g} s with {value:.4g} {unit}"
     if min(shares) == 1.0:
         return 1.0, f"{said}, which is enough."
-    return min(shares), (
-        f"{said}; {given['min_duration_s']:g} s and {least:g} {unit} were asked for."
-    )
+    return min(shares), f"{said}; {least_s:.3g} s and {least:g} {unit} were asked for."
 
 
 def _up_to(value: float, least: float) -> float:

@@ -5,20 +5,30 @@ from __future__ import annotations
 import re
 import unicodedata
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
 from typing import Any, Literal
 
-from px4fuse.assignment.key import AnswerKey
+from px4fuse.assignment.drawing import POSSIBLE_FINDINGS
+from px4fuse.assignment.key import Answer, AnswerKey
 from px4fuse.filter.tuning import HORIZONTAL
-from px4fuse.grading.notes import Notes
+from px4fuse.grading.claims import TOPICS, Claims, claims_of, family
+from px4fuse.grading.folding import folded
+from px4fuse.grading.model import Rubric
+from px4fuse.grading.names import named
+from px4fuse.grading.notes import WORD, Mention, Notes, Words, read_notes
 from px4fuse.results.contract import ComparisonResults, LoopResults, Reported, to_plain
 from px4fuse.results.model import Absent
 from px4fuse.verification.model import Report, Verdict
+from px4fuse.verification.rerun import log_sha256
 
 MAX_QUOTE = 160
+MAX_PASSAGE = 80
 # Lists are cut where a comment would become longer than a sentence
 NAMED = 4
+# Words of the field: these, and the longer ones of the rubric's phrases
+LONG = 6
+FIELD = frozenset(("ekf", "gps", "imu", "nis", "uwb", "vio"))
 STEP = re.compile(r'"([^"]*)"|([^."]+)')
 
 Scorer = Callable[["Evidence", Mapping[str, Any]], tuple[float, str]]
@@ -30,8 +40,9 @@ class Evidence:
 
     report: Report
     verdict: Verdict
-    words: Mapping[str, tuple[str, ...]]
+    rubric: Rubric
     key: AnswerKey | None
+    owner_id: str = ""
 
     @property
     def results(self) -> Reported:
@@ -53,19 +64,102 @@ class Evidence:
         """The attached results, for paths that a rubric names."""
         return to_plain(self.results)
 
+    @property
+    def words(self) -> Mapping[str, tuple[str, ...]]:
+        """The rubric's words."""
+        return self.rubric.words
+
+    @cached_property
+    def answer(self) -> Answer | None:
+        """What is wrong with this log, where it is one of the answer key."""
+        return None if self.key is None else self.key.of_log(log_sha256(self.results))
+
+    @cached_property
+    def own(self) -> bool:
+        """Whether the answer key gave this log to this student; without a key nobody knows."""
+        if self.key is None:
+            return True
+        given = self.key.of_student(text_of(self.results.student.id) or self.owner_id)
+        return given is not None and given.sha256 == log_sha256(self.results)
+
     @cached_property
     def notes(self) -> Notes:
-        """The student's own words."""
-        return Notes(self.results.student.notes)
+        """The student's own words; what names everything is refused as a whole."""
+        notes = self._notes
+        if self.claims.count > self.rubric.notes.most_named:
+            problem = f"name {self.claims.count} kinds of mistakes as if all were there"
+            return replace(notes, problem=problem)
+        return notes
 
-    def names(self, finding: str, affirmed: bool = False) -> bool:
-        """Whether the notes name a finding: by its id, or by words that stand for it."""
+    @cached_property
+    def _notes(self) -> Notes:
+        ids = {name for name in self.words if "_" in name}
+        phrases = (phrase for name in ids for phrase in self.words[name])
+        terms = {stem for phrase in phrases for stem in WORD.findall(folded(phrase))}
+        known = (
+            frozenset(folded(word) for word in self.words.get(name, ()))
+            for name in ("negation", "doubt", "reassurance", "contrast")
+        )
+        return read_notes(
+            self.results.student.notes,
+            Words(*known),
+            self.rubric.notes,
+            ids,
+            tuple(_texts({**self.plain, "student": None})),
+            {stem for stem in terms if len(stem) > LONG} | FIELD,
+        )
+
+    @cached_property
+    def claims(self) -> Claims:
+        """What the notes claim against what the answer key, or else the report, has."""
+        shown = {one for found in self.results.findings for one in found.ids}
+        there = shown if self.answer is None else set(self.answer.findings)
+        return claims_of(
+            partial(self._mention, self._notes), there, POSSIBLE_FINDINGS, family(there | shown)
+        )
+
+    @property
+    def charged(self) -> Mapping[str, str]:
+        """Mistakes that the notes wrongly claim, with the passages; only a key knows which."""
+        return {} if self.answer is None or self.notes.problem else self.claims.wrong
+
+    def _mention(self, notes: Notes, finding: str) -> tuple[Mention | None, bool]:
+        """What notes say of a finding, and whether they only touch upon it."""
+        topics = set(self.words.get(TOPICS, ()))
         phrases = (finding, finding.replace("_", " "), *self.words.get(finding, ()))
-        return self.notes.mention(phrases, affirmed)
+        plain = notes.mention([one for one in phrases if one not in topics])
+        if plain is not None and plain.stance == "claimed":
+            return plain, False
+        touched = notes.mention([one for one in phrases if one in topics])
+        if touched is not None and (plain is None or touched.stance == "claimed"):
+            return touched, True
+        return plain, False
+
+    def names(self, finding: str) -> bool:
+        """Whether the notes take a finding up: they do not deny it."""
+        said, _ = self._mention(self.notes, finding)
+        return said is not None and said.stance != "denied"
+
+    def claims_that(self, finding: str) -> bool:
+        """Whether the notes say plainly that it is so."""
+        said, weak = self._mention(self.notes, finding)
+        return said is not None and said.stance == "claimed" and not weak
 
     def has(self, finding: str) -> bool:
         """Whether the report lists a finding."""
         return any(finding in one.ids for one in self.results.findings)
+
+
+def _texts(value: object) -> Iterator[str]:
+    """All texts in plain results."""
+    if isinstance(value, str):
+        yield value
+    elif isinstance(value, dict):
+        for part in value.values():
+            yield from _texts(part)
+    elif isinstance(value, list):
+        for part in value:
+            yield from _texts(part)
 
 
 def values_at(results: Mapping[str, Any], path: str) -> Iterator[tuple[str, Any]]:
@@ -149,3 +243,19 @@ def joined(reasons: Sequence[str]) -> str:
 def drifts(evidence: Evidence) -> bool:
     """Whether the report says that its innovations are no measure of the error."""
     return evidence.has("source_may_drift") or evidence.has("errors_larger_than_claimed")
+
+
+def also_named(wrong: Mapping[str, str]) -> str:
+    """What notes wrongly claim, as the end of a sentence; empty without any."""
+    if not wrong:
+        return ""
+    passages = [f"{named(one)} (\u201c{_short(said)}\u201d)" for one, said in wrong.items()]
+    return (
+        f"; they also name {list_words(passages)}, which your log does not have: that costs as "
+        "much as naming what it has earns"
+    )
+
+
+def _short(passage: str) -> str:
+    line = text_of(passage)
+    return line if len(line) <= MAX_PASSAGE else line[: MAX_PASSAGE - 1] + "…"

@@ -25,7 +25,7 @@ from px4fuse.grading.overrides import NAME, read_overrides
 from px4fuse.grading.platforms import Origin, with_metadata
 from px4fuse.grading.records import Verified, verified
 from px4fuse.grading.roster import Person, Register, people_of_key, people_of_sheet, same_id
-from px4fuse.grading.scoring import score, score_refused
+from px4fuse.grading.scoring import assess, refused
 from px4fuse.grading.sheet import Sheet
 from px4fuse.grading.workers import Failed, run_bounded
 from px4fuse.reading import files_by_sha256, max_log_bytes
@@ -247,7 +247,7 @@ def grade_all(
     def on_done(index: int, result: tuple[Graded, bool] | Failed) -> None:
         nonlocal reused, done
         if isinstance(result, Failed):
-            why = Refused(f"Grading it failed: {result.reason}")
+            why = Refused(f"Grading it failed: {result.reason}", "Read it yourself.")
             graded[index] = _refused(found[index], why, "", rubric, key)
         else:
             graded[index], recalled = result
@@ -310,13 +310,16 @@ def _scored(
     key: AnswerKey | None,
 ) -> Graded:
     results, verdict = found.report.results, found.verdict
+    made = assess(_owned(found.report, owner_id, key), verdict, rubric, key, owner_id)
     return Graded(
         submission=submission.name,
         student=results.student.name,
         student_id=results.student.id,
         verdict=verdict,
-        items=score(_owned(found.report, owner_id, key), verdict, rubric, key),
-        flags=(*_page_flags(verdict), *own_flags(results)),
+        items=made.items,
+        flags=(*_page_flags(verdict), *own_flags(results), *made.flags),
+        pending=made.pending,
+        to_read=made.to_read,
         numbers=_numbers(results),
         sha256=sha256,
         log_sha256=log_sha256(results),
@@ -362,5 +365,5 @@ def _refused(
     submission: Submission, why: Refused, sha256: str, rubric: Rubric, key: AnswerKey | None
 ) -> Graded:
     verdict = Verdict("cannot verify", (why.reason,), with_log=False)
-    items = score_refused(rubric, key, why.reason)
-    return Graded(submission.name, "", "", verdict, items, sha256=sha256)
+    made = refused(rubric, key, why)
+    return Graded(submission.name, "", "", verdict, made.items, pending=made.pending, sha256=sha256)

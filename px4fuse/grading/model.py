@@ -12,7 +12,8 @@ from px4fuse.verification.model import Verdict
 
 Kind = Literal["number", "whole", "flag", "text", "texts"]
 Applies = Literal["any", "compare", "loop"]
-Unverified = Literal["zero", "score"]
+# What is done with points that nobody can vouch for: left for the instructor, taken, or counted
+Doubtful = Literal["pending", "zero", "count"]
 
 
 @dataclass(frozen=True)
@@ -64,25 +65,70 @@ class RubricItem:
 
 
 @dataclass(frozen=True)
+class Reading:
+    """From when on notes are a text of one's own; shares are of words.
+
+    Attributes
+    ----------
+    judged_from : float
+        Words below which nothing can be said.
+    shortest, longest : float
+        Words of a sentence.
+    in_sentences : float
+        Least share that is in sentences.
+    ids : float
+        Most that may be ids of findings, of a sentence and of all.
+    quoted : float
+        Most that may be in sentences of px4fuse.
+    packed : float
+        Least size, packed by zlib, against the text: what repeats itself packs well.
+    common : float
+        Least share of the five commonest words.
+    about : float
+        Least share in sentences that hold a number or a word of the field.
+    most_named : float
+        Kinds of mistakes; who names more is guessing.
+    """
+
+    judged_from: float = 20
+    shortest: float = 3
+    longest: float = 60
+    in_sentences: float = 0.5
+    ids: float = 0.25
+    quoted: float = 0.5
+    packed: float = 0.2
+    common: float = 0.06
+    about: float = 0.2
+    most_named: float = 4
+
+
+@dataclass(frozen=True)
 class Rubric:
     """What a report is worth.
 
     Attributes
     ----------
     title : str
-    unverified : {"zero", "score"}
-        Whether a report whose numbers, pages or log are not what they should be gets nothing, or
-        its points as a proposal.
+    unverified : {"pending", "zero"}
+        What becomes of the points of a report that cannot be verified.
+    others_log : {"pending", "zero", "count"}
+        What becomes of those of a report on a log that was not given to the student.
+    pages : {"count", "pending", "zero"}
+        What becomes of those of a verified report whose pages look otherwise.
     items : tuple of RubricItem
     words : dict
-        Finding id to words by which notes may name it; "none" to those that say that nothing is
-        wrong.
+        Finding id to words by which notes may name it, and what says or changes something about
+        them: see rubric.toml.
+    notes : Reading
     """
 
     title: str
-    unverified: Unverified
+    unverified: Doubtful
     items: tuple[RubricItem, ...]
     words: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    others_log: Doubtful = "pending"
+    pages: Doubtful = "count"
+    notes: Reading = field(default_factory=Reading)
 
 
 @dataclass(frozen=True)
@@ -188,13 +234,16 @@ class Graded:
 
     @property
     def points(self) -> float:
-        """Sum over the items; while :attr:`pending` a proposal, never to be added to anything."""
-        return sum(item.points for item in self.items)
+        """Sum over the items; while :attr:`pending` a proposal, never to be added to anything.
+
+        Wrong claims can cost more than their item gives, but never more than there is.
+        """
+        return max(sum(item.points for item in self.items), 0.0)
 
     @property
     def counted(self) -> float | None:
-        """The points that count; None while they are pending."""
-        return None if self.pending else self.points
+        """The points that count, never below zero; None while they are pending."""
+        return None if self.pending else max(self.points, 0.0)
 
     @property
     def of(self) -> float:
