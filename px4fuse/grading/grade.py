@@ -157,9 +157,11 @@ def grade(
     entries = _flagged(entries, key)
     written, more = write_class(
         Class(entries, register or Register([]), title, course.worksheets, course.column,
-              course.anonymous, {one.name: of for one, of in zip(found, origins, strict=True)}),
+              course.anonymous, {one.name: of for one, of in zip(found, origins, strict=True)},
+              {one.name: one for one in found}),
         output,
         output / RECORDS,
+        processes,
     )  # fmt: skip
     return Outcome(entries, (*notes, *unknown, *more), reused, written)
 
@@ -320,6 +322,7 @@ def _scored(
         flags=(*_page_flags(verdict), *own_flags(results), *made.flags),
         pending=made.pending,
         to_read=made.to_read,
+        mistakes=made.mistakes,
         numbers=_numbers(results),
         sha256=sha256,
         log_sha256=log_sha256(results),
