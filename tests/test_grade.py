@@ -20,7 +20,7 @@ from px4fuse.cli import cli
 from px4fuse.grading.grade import Outcome, grade
 from px4fuse.grading.model import Entry, Graded
 from px4fuse.grading.outputs import file_names
-from px4fuse.grading.rubric import parse_rubric, read_rubric, rubric_text
+from px4fuse.grading.rubric import read_rubric, rubric_text
 from px4fuse.reading import files_by_sha256
 from px4fuse.verification.model import Verdict
 
@@ -138,7 +138,8 @@ def test_another_rubric_scores_anew_and_verifies_nothing(handed_in, tmp_path) ->
     rubric = read_rubric(None)
     before = grade([handed_in], [], rubric, output, processes=2)
     doubled = re.sub(r"(?m)^points = (\d+)", lambda m: f"points = {2 * int(m[1])}", rubric_text())
-    after = grade([handed_in], [], parse_rubric(doubled, "x.toml"), output, processes=2)
+    (tmp_path / "x.toml").write_text(doubled, encoding="utf-8")
+    after = grade([handed_in], [], read_rubric(tmp_path / "x.toml"), output, processes=2)
     assert after.reused == 6
     assert [one.points for one in after.graded] == pytest.approx(
         [2 * one.points for one in before.graded], abs=0.1
