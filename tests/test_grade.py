@@ -287,6 +287,13 @@ def test_logs_are_found_by_their_hash_not_their_name(tmp_path) -> None:
         (["grade", "in", "-o", "out", "--rubric", "missing.toml"], "missing.toml"),
         (["grade", "in", "-o", "out", "--key", "missing.json"], "missing.json"),
         (["grade", "in", "-o", "out", "--logs", "missing"], "no such file or folder"),
+        (["grade", "in", "-o", "out", "--roster", "missing"], "cannot be read"),
+        (["grade", "in", "-o", "out", "--worksheet", "missing"], "cannot be read"),
+        (["grade", "in", "-o", "out", "--late", "10%/day"], "--due"),
+        (["grade", "in", "-o", "out", "--due", "soon"], "--due"),
+        (["grade", "in", "-o", "out", "--due", "2026-11-20", "--late", "10"], "--late"),
+        (["grade", "--gradescope", "missing"], "missing"),
+        (["grade", "--write-autograder", "a.zip"], "--logs"),
     ],
 )
 def test_bad_input_is_one_line(tmp_path, monkeypatch, arguments, says) -> None:
@@ -296,7 +303,36 @@ def test_bad_input_is_one_line(tmp_path, monkeypatch, arguments, says) -> None:
     result = CliRunner().invoke(cli, arguments)
     assert result.exit_code != 0
     assert says in str(result.exception)
+    assert "\n" not in str(result.exception)
     assert not Path("out").exists()
+
+
+def test_the_options_of_a_term_reach_it(tmp_path, monkeypatch) -> None:
+    import px4fuse.grading.grade as module
+
+    given = {}
+
+    def noted(*_: object, **named: object) -> Outcome:
+        given.update(named)
+        return Outcome((), (), 0, ())
+
+    monkeypatch.setattr(module, "grade", noted)
+    monkeypatch.chdir(tmp_path)
+    shutil.copy(REPORT, "a.pdf")
+    Path("roster.csv").write_text("id,name\n0042,Jane Doe\n")
+    Path("sheet.csv").write_text("id,Grade\n0042,\n")
+    words = [
+        "grade", "a.pdf", "-o", "out", "--roster", "roster.csv", "--worksheet", "sheet.csv",
+        "--column", "Grade", "--attempt", "best", "--due", "2026-11-20 23:59 +01:00",
+        "--late", "5%/hour", "--anonymous",
+    ]  # fmt: skip
+    assert CliRunner().invoke(cli, words).exit_code == 0
+    course = given["course"]
+    assert [person.student_id for person in course.roster] == ["0042"]
+    assert course.worksheets[0].head == ("id", "Grade")
+    assert (course.column, course.anonymous, course.term.attempt) == ("Grade", True, "best")
+    assert course.term.due.isoformat() == "2026-11-20T23:59:00+01:00"
+    assert course.term.late.text == "5%/hour"
 
 
 def test_the_default_rubric_is_written_to_be_edited(tmp_path, monkeypatch) -> None:
