@@ -8,6 +8,7 @@ from typing import Any, cast
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.comparison import AgainstTruth, AxisComparison, Comparison, FilterSummary
+from px4fuse.comparison.preparation import Prepared
 from px4fuse.filter.clock import ClockOffset
 from px4fuse.filter.heading import HeadingError
 from px4fuse.filter.tuning import AxisTuning, Noise
@@ -75,7 +76,7 @@ def results(
 
 def tuning_results(
     request: ComparisonRequest,
-    comparison: Comparison,
+    comparison: Prepared,
     tuned: Mapping[str, AxisTuning | Unavailable],
     command: str,
 ) -> TuningResults:
@@ -93,7 +94,7 @@ def tuning_results(
 
 def sync_results(
     request: ComparisonRequest,
-    comparison: Comparison,
+    comparison: Prepared,
     clock: ClockOffset | Unavailable,
     command: str,
 ) -> SyncResults:
@@ -109,7 +110,7 @@ def sync_results(
     )
 
 
-def _source(comparison: Comparison) -> made.PositionSource:
+def _source(comparison: Comparison | Prepared) -> made.PositionSource:
     source = comparison.source
     looked_for = [m for m in comparison.missing if m.what.startswith("position source ")]
     return copied(
@@ -125,7 +126,7 @@ def _source(comparison: Comparison) -> made.PositionSource:
     )
 
 
-def _settings(comparison: Comparison) -> made.ChosenSettings:
+def _settings(comparison: Comparison | Prepared) -> made.ChosenSettings:
     settings = comparison.settings
     alignment = comparison.source.alignment
     placed_s = 0.0 if alignment is None else alignment.clock_offset_s
