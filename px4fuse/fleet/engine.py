@@ -23,11 +23,15 @@ Result = TypeVar("Result")
 CONNECT_S = 15.0
 # A cluster's machines may come one by one; none for so long is none
 WORKERS_S = 120.0
+# Until a worker that hangs is killed and, on most machines, has begun again
+RESTART_S = 15.0
 # How often the clocks of running jobs are looked at
 TICK_S = 1.0
 _CONFIG = {
     # whose worker died is tried once more: somebody else may have ended it
     "distributed.scheduler.allowed-failures": 1,
+    # after this a worker that is just then being restarted, for the second time, is given up
+    "distributed.deploy.lost-worker-timeout": "24 hours",
     # results are small, so all memory is the log's: nothing to spill, and a pause would not help
     "distributed.worker.memory.target": False,
     "distributed.worker.memory.spill": False,
@@ -105,6 +109,7 @@ def connected(
             threads_per_worker=1,
             memory_limit=memory,
             dashboard_address=None,
+            preload=["px4fuse.fleet.job"],
             silence_logs=logging.CRITICAL,
         ) as cluster,
         Client(cluster) as client,
@@ -192,7 +197,7 @@ def outcomes(
                 ended = [future for future in running if str(future.key) in keys]
                 if ended:
                     client.cancel(ended)
-                    client.restart_workers(late, raise_for_error=False)
+                    client.restart_workers(late, timeout=RESTART_S, raise_for_error=False)
                 for future in ended:
                     yield (
                         running.pop(future),
