@@ -213,11 +213,12 @@ def test_a_log_that_hangs_or_crashes_costs_that_log(client, flights, tmp_path, m
     for seed, name in enumerate(("hang", "crash", "well"), 1):
         (logs / f"{name}.ulg").write_bytes(tiny_log(seed))
     table = px4fuse.batch(logs, timeout_s=20.0).set_index("name")
-    assert table.loc["well", "status"].tolist() == ["done"] * 4
-    assert table.loc["hang", "reason"] == "it took longer than 20 s and was ended"
-    assert table.loc["hang", "remedy"] == "Allow more with --timeout."
-    assert "ended 3 times" in table.loc["crash", "reason"]
-    assert (table.loc[["hang", "crash"], "status"] == "failed").all()
+    assert table.loc["well.ulg", "status"].tolist() == ["done"] * 4
+    hang, crash = table.loc["hang.ulg"], table.loc["crash.ulg"]
+    assert (hang["status"], crash["status"]) == ("failed", "failed")
+    assert hang["reason"] == "it took longer than 20 s and was ended"
+    assert hang["remedy"] == "Allow more with --timeout."
+    assert "ended 3 times" in crash["reason"]
     client.wait_for_workers(2, timeout=60)
 
 
