@@ -1,89 +1,73 @@
-"""What the tests of many logs share: tiny flights, jobs that go wrong, processes of Dask's."""
+"""A fleet as px4fuse batch writes it, made up: what its page and its reports are tested on."""
 
 from __future__ import annotations
 
-import os
-import re
-import subprocess
-import sys
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
-from pathlib import Path
+import numpy as np
+import pandas as pd
 
-from px4fuse.fleet import job
-from px4fuse.simulation.flights import simulate, to_ulog
-from px4fuse.simulation.scenario import Scenario
-
-REPOSITORY = Path(__file__).resolve().parents[1]
+VEHICLES = ("000200000000373731353237510500260033", "bench-2", "")
+FIRMWARE = ("v1.13.3", "v1.14.0", "v1.16.1")
+STORY = "Along the aisle EKF2 was 6 cm from the truth.\nThe clock of the source is late."
+NOT_LOGGED = ("position: the log has no vehicle_visual_odometry", "Set SDLOG_PROFILE to 129.")
+DAMAGED = ("not a ULog file", "Give the log as the flight controller wrote it.")
 
 
-def tiny_log(seed: int, **options: object) -> bytes:
-    """A simulated flight of a quarter of a minute, compared within a second."""
-    return to_ulog(simulate(Scenario(seed=seed, passes=1, length_m=6.0, ekf2=False, **options)))
+def made_up(count: int, seed: int = 1) -> pd.DataFrame:
+    """Logs of three vehicles over a year: every tenth fails, every twelfth cannot be judged.
 
-
-def tiny_logs(folder: Path, count: int) -> Path:
-    folder.mkdir()
-    for seed in range(1, count + 1):
-        (folder / f"f{seed}.ulg").write_bytes(tiny_log(seed))
-    return folder
-
-
-def act(work):
-    """What a job says."""
-    what, value = work
-    match what:
-        case "square":
-            return value * value
-        case "exit":
-            os._exit(value)
-        case "hang":
-            time.sleep(600)
-        case "hold the interpreter":
-            re.match(r"(a+)+b", "a" * 60)
-        case "hog":
-            return len(bytearray(os.urandom(1_000_000)) * value)
-        case "raise":
-            raise ValueError(value)
-        case "process":
-            return os.getpid()
-        case "variable":
-            return os.environ.get(value)
-    return None
-
-
-def analyse(work: job.Job) -> job.Outcome:
-    """As the worker does, but a log called "hang" never ends, and one called "crash" crashes."""
-    name = Path(work.address).stem
-    if name in ("hang", "crash"):
-        act(("hang", 0) if name == "hang" else ("exit", 3))
-    return job.analyse(work)
-
-
-def environment(**more: str) -> dict[str, str]:
-    return os.environ | {"PYTHONPATH": str(REPOSITORY)} | more
-
-
-@contextmanager
-def started(*command: str, says: str, log: Path, **more: str) -> Iterator[str]:
-    """A process of Dask's, once it has said that it is ready; the line in which it said so."""
-    with (
-        log.open("w") as file,
-        subprocess.Popen(
-            [sys.executable, "-m", "dask", *command], stderr=file, env=environment(**more)
-        ) as process,
-    ):
-        try:
-            yield _line(process, log, says)
-        finally:
-            process.terminate()
-
-
-def _line(process: subprocess.Popen[bytes], log: Path, says: str) -> str:
-    while process.poll() is None:
-        for line in log.read_text().splitlines():
-            if says in line:
-                return line
-        time.sleep(0.1)
-    raise AssertionError(log.read_text())
+    The first vehicle's SIGMA_Z triples in the middle of the year; the second one's clock jumps.
+    """
+    rng = np.random.default_rng(seed)
+    rows = []
+    dates = pd.date_range("2026-01-01", periods=max(count, 1), freq=f"{7200 // max(count, 1)}h")
+    for number in range(count):
+        late = number > count / 2
+        row = {
+            "log": f"flights/{number // 100}/flight {number:04d}.ulg",
+            "name": f"flight {number:04d}.ulg",
+            "log_sha256": f"{number:064x}", "px4fuse": "0.2.0", "settings": "a1b2",
+            "status": "done", "vehicle": VEHICLES[number % 3],
+        }  # fmt: skip
+        if number % 10 == 9:
+            rows.append(row | {"status": "failed", "reason": DAMAGED[0], "remedy": DAMAGED[1]})
+            continue
+        row |= {
+            "firmware": FIRMWARE[min(number * 3 // count, 2)], "firmware_hash": "deadbeef",
+            "airframe": "4001", "hardware": "PX4_FMU_V6X",
+            "date": f"{dates[number]:%Y-%m-%dT%H:%M:%SZ}",
+            "duration_s": 60.0 + 200.0 * rng.random(), "source": "vehicle_visual_odometry",
+            "source_rate_hz": 10.0 + rng.normal(0.0, 0.2),
+        }  # fmt: skip
+        if number % 12 == 7:
+            rows.append(
+                row | {"status": "not judged", "reason": NOT_LOGGED[0], "remedy": NOT_LOGGED[1]}
+            )
+            continue
+        sigma = 0.1 * (3.0 if late and number % 3 == 0 else 1.0) * np.exp(rng.normal(0.0, 0.1))
+        offset = (0.08 if late and number % 3 == 1 else 0.01) + rng.normal(0.0, 0.004)
+        findings = ["source_gap"] * (number % 4 == 0) + ["ekf2_rejecting"] * (number % 5 == 0)
+        findings += ["sigma_z_small"] if sigma > 0.2 else []
+        for axis in ("north", "east", "down"):
+            nis = np.exp(rng.normal(0.0, 0.2)) * (sigma / 0.1) ** 2
+            theirs = 0.3 * np.exp(rng.normal(0.0, 0.6)) * (sigma / 0.1) ** 2
+            error = 0.05 * np.exp(rng.normal(0.0, 0.2))
+            rows.append(
+                row
+                | {
+                    "axis": axis, "updates": int(row["duration_s"] * 10),
+                    "kf_nis_mean": nis, "kf_factor": 1.0 / nis,
+                    "kf_verdict": "overconfident" if nis > 1.3 else "consistent",
+                    "ekf2_nis_mean": theirs, "ekf2_factor": 1.0 / theirs,
+                    "ekf2_verdict": "underconfident" if theirs < 0.8 else "consistent",
+                    "position_rmse_m": error, "velocity_rmse_m_s": 2.0 * error,
+                    "sigma_z_m": sigma, "sigma_z_low_m": 0.9 * sigma, "sigma_z_high_m": 1.1 * sigma,
+                    "sigma_a_m_s2": 0.3, "sigma_a_low_m_s2": 0.2, "sigma_a_high_m_s2": 0.4,
+                    "clock_offset_s": offset, "clock_offset_low_s": offset - 0.006,
+                    "clock_offset_high_s": offset + 0.006, "rejected_share": 0.01,
+                    "model_correlation": 0.97, "story": STORY, "findings": ";".join(findings),
+                    "results": f"results/flight {number:04d}.json",
+                    "report": f"reports/flight {number:04d}.pdf",
+                    "change": "RMSE between, east: 0.05 to 0.09 m" if number % 25 == 1 else "",
+                }
+            )  # fmt: skip
+    return pd.DataFrame(rows)

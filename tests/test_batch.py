@@ -12,11 +12,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import fleet_tools
+import batch_tools
 import pandas as pd
 import pytest
 from click.testing import CliRunner
-from fleet_tools import environment, started, tiny_log, tiny_logs
+from batch_tools import environment, started, tiny_log, tiny_logs
 
 import px4fuse
 from px4fuse.cli import cli
@@ -207,7 +207,7 @@ def test_ctrl_c_at_a_terminal_keeps_what_is_done_and_says_so_on_one_line(
 
 
 def test_a_log_that_hangs_or_crashes_costs_that_log(client, flights, tmp_path, monkeypatch):
-    monkeypatch.setattr(run, "analyse", fleet_tools.analyse)
+    monkeypatch.setattr(run, "analyse", batch_tools.analyse)
     logs = tmp_path / "logs"
     logs.mkdir()
     for seed, name in enumerate(("hang", "crash", "well"), 1):
@@ -387,7 +387,7 @@ def test_a_scheduler_and_two_workers_that_run_already(flights, undisturbed, tmp_
             assert result.exit_code == 0, result.output
             table = pd.read_parquet(tmp_path / "out" / "fleet.parquet")
             assert_same(table, undisturbed)
-            path = f"{tmp_path}{os.pathsep}{fleet_tools.REPOSITORY}"
+            path = f"{tmp_path}{os.pathsep}{batch_tools.REPOSITORY}"
             with worker("third", PYTHONPATH=path):
                 result = command(*arguments)
                 assert "has px4fuse 9.9, and this is" in str(result.exception)

@@ -27,6 +27,7 @@ COMMANDS = {
     "loop": ("px4fuse.cli.loop", "Measure and correct the closure error of a loop."),
     "evaluate": ("px4fuse.cli.evaluate", "Score a trajectory: ATE and RPE against a reference."),
     "simulate": ("px4fuse.cli.simulate", "Simulate a flight with chosen mistakes, as ULog."),
+    "diff": ("px4fuse.cli.diff", "Say what changed between two flights or two settings."),
     "verify": ("px4fuse.cli.verify", "Check a report against its log, number by number."),
     "grade": ("px4fuse.cli.grade", "Verify and score a class's reports."),
     "lesson": ("px4fuse.cli.lesson", "Run the lesson's worked examples through this engine."),

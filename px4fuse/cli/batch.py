@@ -13,13 +13,13 @@ import click
 
 from px4fuse.cli.compare import SEVERITIES
 from px4fuse.cli.inputs import path_option, settings_options
-from px4fuse.cli.outputs import Interrupted, Step, progress, terminal
+from px4fuse.cli.outputs import Interrupted, Step, progress, terminal, write_outputs
 from px4fuse.errors import OutputError, SettingsError
 
 if TYPE_CHECKING:
     from px4fuse.fleet.run import Fleet
 
-FAILED = "failed"
+FAILED, WORSE = "failed", "worse"
 # How a cluster of each kind is started, for people who have one
 CLUSTERS = {
     "slurm": """\
@@ -98,12 +98,24 @@ LOGS should be URLs (s3://, gs://), whose package (s3fs, gcsfs) is in the image 
     help="Dask scheduler that runs already, as tcp://host:8786; slurm or kubernetes prints how to "
     "start one.",
 )
+@path_option(
+    "--baseline",
+    metavar="FILE.parquet",
+    help="Table of an earlier run: the column change says what is worse than in it.",
+)
+@path_option(
+    "--junit",
+    "junit_path",
+    metavar="FILE.xml",
+    help="Write JUnit XML: a test case per log, which fails where the log failed or is worse.",
+)
 @settings_options
 @click.option(
     "--fail-on",
-    type=click.Choice((FAILED, *SEVERITIES)),
+    type=click.Choice((FAILED, WORSE, *SEVERITIES)),
     default=None,
-    help="Exit with 1 if a log has failed, or there is a finding of at least this severity.",
+    help="Exit with 1 if a log has failed, is worse than the baseline (or has failed), or there is "
+    "a finding of at least this severity.",
 )
 def batch(
     logs: tuple[str, ...],
@@ -113,6 +125,8 @@ def batch(
     workers: int | None,
     memory: str | None,
     scheduler: str | None,
+    baseline: Path | None,
+    junit_path: Path | None,
     fail_on: str | None,
     **given: Any,
 ) -> None:
@@ -134,13 +148,18 @@ def batch(
             "--workers and --memory are of a cluster that px4fuse starts; with --scheduler they "
             "are given to dask worker."
         )
+    if fail_on == WORSE and baseline is None:
+        raise SettingsError("--fail-on worse requires --baseline: worse than what?")
     from px4fuse.fleet.engine import connected
+    from px4fuse.fleet.junit import junit
     from px4fuse.fleet.logs import find_logs
+    from px4fuse.fleet.regressions import read_baseline
     from px4fuse.fleet.run import fleet_request, run
 
     gc.enable()  # a long run, of a library that leaves circles
     found = find_logs(logs)
     request = fleet_request(given)
+    before = None if baseline is None else read_baseline(baseline)
     try:
         with progress() as step:
             step("starting the workers")
@@ -152,14 +171,18 @@ def batch(
                     client,
                     reports=reports,
                     timeout_s=timeout_s,
+                    baseline=before,
                     progress=partial(_shown, step, time.monotonic()),
                 )
     except KeyboardInterrupt as stopped:
         left = f"what is done is kept in {output}. The same command goes on from there."
         raise Interrupted(stopped, left) from None
+    if junit_path is not None:
+        write_outputs({junit_path: junit(fleet.table)})
     _print(fleet)
     severities = SEVERITIES[: SEVERITIES.index(fail_on) + 1] if fail_on in SEVERITIES else ()
     failed = fail_on is not None and bool((fleet.table["status"] == FAILED).any())
+    failed |= fail_on == WORSE and bool((fleet.table["change"] != "").any())
     if failed or fleet.severities & set(severities):
         sys.exit(1)
 
@@ -201,6 +224,10 @@ def _print(fleet: Fleet) -> None:
     found = logs["findings"].str.split(";").explode()
     for finding, count in found[found != ""].value_counts().head(5).items():
         say(console, f"{count} × {finding}")
+    for row in fleet.table[fleet.table["change"] != ""].itertuples():
+        say(console, Text(f"worse: {row.log} {row.axis}: {row.change}", "red"))
+    if fleet.against:
+        say(console, fleet.against)
     counts = logs["status"].value_counts()
     said = ", ".join(f"{count} {status}" for status, count in counts.items())
     again = " The same command tries those that failed again." if FAILED in counts else ""

@@ -125,4 +125,5 @@ DETECTOR = Detector(
         "ekf2_not_fusing": "not fus, never fus, ekf2 fus",
         "ekf2_fusion_interrupted": "fusion interrupt, ekf2 fus, stopped fusing",
     },
+    {"ekf2_not_fusing": ("--mistake ekf2-off",)},
 )

@@ -19,6 +19,7 @@ from px4fuse.filter.kalman import Settings
 from px4fuse.fleet.engine import Failed, connected, outcomes
 from px4fuse.fleet.job import Job, Outcome, analyse, file_stem, identify, refused
 from px4fuse.fleet.logs import FoundLog, find_logs
+from px4fuse.fleet.regressions import marked
 from px4fuse.fleet.rows import FAILED, NOT_JUDGED, Row, csv_bytes, table_of
 from px4fuse.fleet.store import Store, opened
 from px4fuse.reading import max_log_bytes
@@ -53,12 +54,15 @@ class Fleet:
     severities : frozenset of str
         Of all findings.
     written : tuple of Path
+    against : str
+        What the logs were held against; empty without a baseline.
     """
 
     table: pd.DataFrame
     reused: int
     severities: frozenset[str]
     written: tuple[Path, ...]
+    against: str = ""
 
 
 @dataclass(frozen=True)
@@ -68,6 +72,7 @@ class _Found:
     logs: Sequence[FoundLog]
     output: Path
     store: Store
+    baseline: pd.DataFrame | None = None
     hash_of: dict[str, str] = field(default_factory=dict)  # by address
     lost: dict[str, Row] = field(default_factory=dict)  # rows of those that give none
     reused: set[str] = field(default_factory=set)
@@ -79,6 +84,7 @@ def batch(
     *,
     reports: bool = False,
     timeout_s: float = TIMEOUT_S,
+    baseline: pd.DataFrame | None = None,
     scheduler: str | None = None,
     workers: int | None = None,
     memory: str = "auto",
@@ -101,6 +107,8 @@ def batch(
         Also every log's PDF.
     timeout_s : float
         For one log.
+    baseline : DataFrame, optional
+        An earlier table: the column ``change`` says what is worse than in it.
     scheduler : str, optional
         Address of a Dask scheduler.
     workers : int, optional
@@ -138,6 +146,7 @@ def batch(
             client,
             reports=reports and output is not None,
             timeout_s=timeout_s,
+            baseline=baseline,
             progress=progress,
         )
     files = {} if output is not None else {"results": "", "report": ""}
@@ -170,6 +179,7 @@ def run(
     *,
     reports: bool = False,
     timeout_s: float = TIMEOUT_S,
+    baseline: pd.DataFrame | None = None,
     progress: Progress = _silent,
 ) -> Fleet:
     """Compare logs on a cluster, and write rows, results and the table into a folder.
@@ -188,6 +198,7 @@ def run(
     reports : bool
     timeout_s : float
         For one log.
+    baseline : DataFrame, optional
     progress : callable
         As :func:`batch`.
 
@@ -205,7 +216,7 @@ def run(
     version, settings = metadata.version("px4fuse"), command_line(request)
     job = Job("", request, reports, max_log_bytes.get(), version)
     with opened(output / ROWS, version, settings) as store:
-        found = _Found(logs, output, store)
+        found = _Found(logs, output, store, baseline)
         try:
             _identify(found, client, job, timeout_s, progress)
             todo = list(_todo(found, job))
@@ -327,7 +338,10 @@ def _written(found: _Found) -> Fleet:
                     "report": report,
                 }
 
-    table = table_of(rows())
+    table, against = table_of(rows()), ""
+    if found.baseline is not None:
+        held = marked(table, found.baseline)
+        table, against = held.table, held.words
     parquet = io.BytesIO()
     table.to_parquet(parquet, index=False)
     contents = {
@@ -335,4 +349,4 @@ def _written(found: _Found) -> Fleet:
         found.output / "fleet.csv": csv_bytes(table),
     }
     write_all(contents)
-    return Fleet(table, len(found.reused), frozenset(severities), tuple(contents))
+    return Fleet(table, len(found.reused), frozenset(severities), tuple(contents), against)
