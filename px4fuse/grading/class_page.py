@@ -85,7 +85,8 @@ def html_text(entries: Sequence[Entry], title: str, made_with: str) -> str:
     str
         Write it as UTF-8. The same for the same input: no dates of today.
     """
-    if entries and all(entry.pseudonym for entry in entries):
+    named = not entries or not all(entry.pseudonym for entry in entries)
+    if not named:
         entries = sorted(entries, key=lambda entry: entry.pseudonym)
     veil = Veil(entries)
     copied = _copied(entries)
@@ -105,7 +106,7 @@ def html_text(entries: Sequence[Entry], title: str, made_with: str) -> str:
         noun=("student", "students"),
         columns=(
             Column("Student"),
-            Column("Id", "line", narrow="tablet"),
+            *[Column("Id", "line", narrow="tablet")] * named,
             Column("Status", "rank"),
             Column("Points", "number"),
             *[Column("Handed in", "line", narrow="desk")] * timed,
@@ -115,7 +116,18 @@ def html_text(entries: Sequence[Entry], title: str, made_with: str) -> str:
             *(Column(veil.hide(name), "number", "numbers") for name in numbers),
         ),
         rows=[
-            _row(at, entries, veil, copied.get(at, ()), items, numbers, shared, minutes[at], timed)
+            _row(
+                at,
+                entries,
+                veil,
+                copied.get(at, ()),
+                items,
+                numbers,
+                shared,
+                minutes[at],
+                timed,
+                named,
+            )
             for at in range(len(entries))
         ],
         filters=_filters(entries),
@@ -178,7 +190,7 @@ def _filters(entries: Sequence[Entry]) -> list[tuple[str, list[tuple[str, str]]]
 
 def _row(
     at: int, entries: Sequence[Entry], veil: Veil, copied: Sequence[Copied],
-    items: Sequence[str], numbers: Sequence[str], shared: int, minutes: float, timed: bool,
+    items: Sequence[str], numbers: Sequence[str], shared: int, minutes: float, timed: bool, named: bool,
 ) -> Row:  # fmt: skip
     entry = entries[at]
     one = entry.counting
@@ -189,7 +201,7 @@ def _row(
     points = overridden_points(entry)
     cells = (
         Cell(entry.called, known or None, file),
-        words("" if entry.pseudonym else entry.student_id),
+        *[words("" if entry.pseudonym else entry.student_id)] * named,
         Cell(
             f"{SIGNS[status]} {status}", float(STATUSES.index(status)), _few(flags), LOOKS[status]
         ),
