@@ -56,9 +56,23 @@ def test_a_log_is_one_row_with_its_axes_inside() -> None:
         "reports/flight%200000.pdf", "results/flight%200000.json",
     ]  # fmt: skip
     failed = parts(made["rows"][9])
-    assert failed["Why it was not judged"][2] == [DAMAGED[0]]
+    assert failed["Not judged"][2] == [DAMAGED[0]]
     assert failed["What to set"][2] == [DAMAGED[1]]
     assert "Axes" not in failed
+
+
+def test_what_a_judged_log_lacks_is_told_too() -> None:
+    table = made_up(30)
+    table.loc[table["axis"] == "down", ["reason", "remedy"]] = ("EKF2, down: no heights", "Set it.")
+    text = html_text(table, "Bench", "px4fuse 1")
+    inside = parts(content(text)["rows"][0])
+    assert inside["Not judged"][2] == ["EKF2, down: no heights"]
+    assert inside["What to set"][2] == ["Set it."]
+    judged = table.loc[table["axis"] == "down", "log"].nunique()
+    assert f"{judged} logs (in part)" in text
+    # those that could not be judged at all come first, although they are fewer
+    assert text.index(f"<strong>{DAMAGED[1]}") < text.index("<strong>Set it.")
+    assert "Showing" not in text.split("<script")[0]
 
 
 def test_what_speaks_for_a_log_is_its_horizontal_axes() -> None:
@@ -84,7 +98,7 @@ def test_a_column_without_numbers_is_absent_not_zero() -> None:
     table["updates"] = table["updates"].astype("Int64")
     text = html_text(table, "Bench", "px4fuse 1")
     made = content(text)
-    assert made["rows"][0][0][6:10] == [[], [], [], []]
+    assert made["rows"][0][0][6:9] == [[], [], []]
     assert "No log with a date has it." in text
     assert "NaN" not in json.dumps(made)
     assert "nan" not in text.split("<script")[0].split("</style>")[1]
