@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from browser import Browser, Elements, contrast
-from fleet_tools import DAMAGED, NOT_LOGGED, STORY, VEHICLES, made_up
+from made_up_fleet import DAMAGED, NOT_LOGGED, STORY, VEHICLES, made_up
 from hypothesis import given
 from hypothesis import strategies as st
 
