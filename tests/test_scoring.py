@@ -9,15 +9,16 @@ import re
 from pathlib import Path
 
 import pytest
-from notes_samples import ENGLISH
+from notes_samples import ENGLISH, HONEST
 from results_tools import EXAMPLE, LOOP, SHA256, changed, correction, decoded, finding
 
 from px4fuse.assignment.key import Answer, AnswerKey
 from px4fuse.errors import ResultsError
 from px4fuse.grading.evidence import values_at
-from px4fuse.grading.feedback import feedback, gradescope
+from px4fuse.grading.feedback import feedback
 from px4fuse.grading.flags import chosen_settings, class_flags, own_flags
 from px4fuse.grading.model import Graded, Item
+from px4fuse.grading.names import NAMES
 from px4fuse.grading.rubric import parse_rubric, read_rubric
 from px4fuse.grading.scoring import assess, refused, score
 from px4fuse.results.contract import to_plain
@@ -600,26 +601,25 @@ class TestWhatStudentsRead:
         assert "\x1b" not in text
         assert "=cmd|' /C calc'!A0 <script>" in text
 
-    def test_gradescope(self):
+    def test_points_that_are_pending_are_said_to_be(self):
         items = score(report(), VERIFIED, read_rubric(None), None)
-        made = json.loads(json.dumps(gradescope(graded(items, flags=("copied",)))))
-        assert made["score"] == pytest.approx(sum(test["score"] for test in made["tests"]))
-        assert made["output_format"] == "text"
-        assert made["visibility"] == "after_published"
-        *shown, hidden = made["tests"]
-        assert len(shown) == len(items)
-        for test in shown:
-            assert {"name", "score", "max_score", "output"} <= set(test)
-            assert test["visibility"] == "after_published"
-        assert hidden["visibility"] == "hidden"
-        assert "copied" not in made["output"]
+        text = feedback(graded(items, pending="Add uwb.csv to --logs."))
+        assert "pending: they do not count yet" in text
+        assert "--logs" not in text
 
-    def test_gradescope_of_a_refused_file(self):
-        verdict = Verdict("cannot verify", ("Not a PDF.",), with_log=False)
-        made = gradescope(graded(verdict=verdict))
-        assert made["score"] == 0.0
-        assert made["tests"] == []
-        assert "Not a PDF." in made["output"]
+    def test_words_never_ids(self):
+        """Whatever is missing is told in words; paths and ids are the program's own."""
+        wrong = [finding(name, "error") for name in read_rubric(None).words if name in NAMES]
+        spoilt = [
+            changed(findings=wrong, student__notes="It is a flight of 5 s.", tuning={}, clock=NONE),
+            changed(LOOP, findings=wrong, student__notes="Very short notes.", loop=NONE),
+            noted("There are outliers at 5 s.", student__id="s01", findings=wrong),
+        ]
+        for results in spoilt:
+            for answers in (None, key(*NAMES), key()):
+                for item in score(report(results), VERIFIED, read_rubric(None), answers):
+                    left = re.sub(r"px4fuse_\w+", "", item.comment)
+                    assert not re.search(r"[a-z]+_[a-z]+|\w\.\*|\w\.[a-z]", left), item.comment
 
 
 # ------------------------------------------------------------------ flags
@@ -726,6 +726,28 @@ class TestClassFlags:
         made = class_flags([of(1, notes=own), of(2, notes=changed_), of(3, notes=text_of(3))])
         assert set(made) == {0, 1}
         assert "whole passages" in made[0][0]
+
+    @pytest.mark.parametrize(
+        "disguise",
+        [
+            lambda text: text.translate(str.maketrans("aeopcx", "аеорсх")),  # Cyrillic
+            lambda text: text.replace("o", "o\u200b").replace("r", "r\u2060"),
+            lambda text: text.translate({ord("a") + n: 0x1D41A + n for n in range(26)}),  # bold
+            lambda text: text.replace("o", "ο").replace("a", "а").replace("i", "і"),
+            lambda text: text.replace(" ", "").upper(),
+            lambda text: " ".join(text[at : at + 3] for at in range(0, len(text), 3)),
+            lambda text: text.replace("e", "e\u0301").replace(" ", "\u3164"),
+        ],
+    )
+    def test_disguised_copies(self, disguise):
+        made = class_flags([of(1, notes=ENGLISH), of(2, notes=disguise(ENGLISH))])
+        assert set(made) == {0, 1}
+        share = int(re.search(r"(\d+)% of both", made[0][0])[1])
+        assert share >= 95
+
+    def test_notes_on_one_lab_in_other_words_are_no_copies(self):
+        notes = list(HONEST.values())
+        assert class_flags([of(n, notes=text) for n, text in enumerate(notes)]) == {}
 
     def test_short_notes_and_a_template_are_not(self):
         assert class_flags([of(1, notes="All is well."), of(2, notes="All is well.")]) == {}

@@ -58,7 +58,11 @@ def _tuned(evidence: Evidence, axis: str, name: str, factor: float) -> tuple[flo
         return 1.0, f"{said} within {wanted}"
     share = 1.0 - math.log(off) / math.log(factor) if factor > max(off, 1.0) else 0.0
     side = "above" if chosen > high else "below"
-    return share, f"{said} {side} {wanted}, by a factor of {factor_words(off)}"
+    option = "--sigma-z" if label == "SIGMA_Z" else "--sigma-a"
+    return share, (
+        f"{said} {side} {wanted}, by a factor of {factor_words(off)}: try a value between with "
+        f"{option}"
+    )
 
 
 def consistent(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float, str]:
@@ -97,7 +101,7 @@ def consistent(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float, str
             if excused
             else ", because of what is wrong with the log that you were given, as your notes say"
             if handed
-            else ""
+            else ": look at what the tuning page asks for, and for what the model does not explain"
         )
         said.append(
             f"{owner} is consistent ({axis})"

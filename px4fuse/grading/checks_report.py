@@ -16,6 +16,7 @@ from px4fuse.grading.evidence import (
     values_at,
     why_absent,
 )
+from px4fuse.grading.names import part
 from px4fuse.results.contract import LoopResults
 from px4fuse.verification.model import Verdict
 from px4fuse.verification.verification import NO_LOG
@@ -76,12 +77,13 @@ def sections(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float, str]:
     for path in given["results"]:
         there = [value for _, value in values_at(evidence.plain, path)]
         if not any(v for v in there if not (isinstance(v, dict) and set(v) == {"unavailable"})):
-            missing.append(f"{path}{why_absent(evidence, path)}")
+            missing.append(f"{part(path)}{why_absent(evidence, path)}")
     asked = len(given["pages"]) + len(given["results"])
     if not missing:
         return 1.0, f"Your report has all {asked} parts that were asked for."
     return 1.0 - len(missing) / asked, (
-        f"Your report has {asked - len(missing)} of {asked} parts; missing: {list_words(missing)}."
+        f"Your report has {asked - len(missing)} of {asked} parts; missing: {list_words(missing)}. "
+        "Make the report with px4fuse as it comes, on a whole flight."
     )
 
 
@@ -158,7 +160,7 @@ def number_between(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float,
     label = given["name"]
     if not found:
         why = next((why for path in given["path"] if (why := why_absent(evidence, path))), "")
-        return 0.0, f"Your report has no number for {label or given['path'][0]}{why}."
+        return 0.0, f"Your report has no number for {label or part(given['path'][0])}{why}."
     # of several the one that is worst counts
     name, number = min(found, key=lambda pair: _within(pair[1], given))
     share = _within(number, given)
@@ -168,7 +170,8 @@ def number_between(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float,
     shown = f"{number:.4g} {given['unit']}".strip()
     what = label or f"the number {text_of(name)}"
     what += f" ({text_of(name)})" * (bool(label) and len(found) > 1)
-    return share, f"{what[:1].upper() + what[1:]} is {shown}; {limits} was asked for."
+    advice = f" {given['advice']}" if share < 1.0 and given["advice"] else ""
+    return share, f"{what[:1].upper() + what[1:]} is {shown}; {limits} was asked for.{advice}"
 
 
 def _within(number: float, given: Mapping[str, Any]) -> float:

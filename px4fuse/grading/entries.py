@@ -8,11 +8,10 @@ from dataclasses import dataclass, replace
 from datetime import datetime
 from typing import Literal
 
-from px4fuse.grading import overrides as said_by_instructor
 from px4fuse.grading.class_table import item_points
 from px4fuse.grading.lateness import LateRule, in_zone_of
 from px4fuse.grading.model import Entry, Graded, Override, Submission
-from px4fuse.grading.overrides import TOTAL, Overrides
+from px4fuse.grading.overrides import TOTAL, Overrides, matched
 from px4fuse.grading.platforms import Origin
 from px4fuse.grading.roster import Person, Register
 from px4fuse.results.reading import one_line
@@ -122,12 +121,10 @@ def class_entries(
         entry = _entry(person, tries([index]), term)
         made.append(replace(entry, remarks=(note, *entry.remarks)))
     titles = [tuple(item_points(one.counting)) if one.counting else () for one in made]
-    notes = said_by_instructor.unknown(overrides, made, dict(enumerate(titles)))
+    said, notes = matched(overrides, made, titles)
     most = max((one.of for one in graded), default=0.0)
-    return tuple(
-        _settled(one, said_by_instructor.of_entry(overrides, one, items), most)
-        for one, items in zip(made, titles, strict=True)
-    ), notes
+    settled = (_settled(one, words, most) for one, words in zip(made, said, strict=True))
+    return tuple(settled), notes
 
 
 def owner(graded: Graded, origin: Origin, register: Register) -> int | None:

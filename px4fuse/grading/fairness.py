@@ -116,7 +116,10 @@ class Flown:
     def _kept(self, what: str, make: Callable[[], str]) -> str:
         if self.cache is None:
             return make()
-        identity = repr((metadata.version("px4fuse"), self.number, self.drawn, what))
+        drawn = self.drawn
+        identity = repr(
+            (metadata.version("px4fuse"), self.number, drawn.scenario, drawn.typed, what)
+        )
         path = self.cache / f"{hashlib.sha256(identity.encode()).hexdigest()}.json"
         if not path.exists():
             path.write_text(make(), encoding="utf-8")

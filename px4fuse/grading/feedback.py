@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import textwrap
-import unicodedata
-from collections.abc import Iterator, Sequence
-from typing import Any
 
 from px4fuse.grading.checks_report import without_log
 from px4fuse.grading.evidence import NAMED, joined, text_of
@@ -19,14 +16,17 @@ NEXT = (
 
 
 def feedback(graded: Graded, class_name: str = "") -> str:
-    """Plain text for the student: the points, absence, and where most can still be gained.
+    """Plain text for the student: the points, why, and where most can still be gained.
 
     Flags are for the instructor and are not in it.
     """
     who = ", ".join(part for part in (text_of(graded.student), text_of(graded.student_id)) if part)
     lines = [*([class_name] if class_name else []), f"Report   {text_of(graded.submission)}"]
     lines += [f"Student  {who}"] if who else []
-    lines += [f"Points   {_points(graded.points)} of {_points(graded.of)}"] if graded.items else []
+    points = f"{_points(graded.points)} of {_points(graded.of)}"
+    if graded.pending:
+        points = f"pending: they do not count yet (as it is: {points})"
+    lines += [f"Points   {points}"] if graded.items else []
     lines += ["", *_wrapped(verdict_text(graded.verdict))]
     lines += [""] if graded.items else []
     for item in graded.items:
@@ -75,47 +75,3 @@ def _wrapped(text: str, width: int = 88) -> list[str]:
 
 def _points(value: float) -> str:
     return f"{value:.2f}".rstrip("0").rstrip(".")
-
-
-def gradescope(graded: Graded) -> dict[str, Any]:
-    """``results.json`` for Gradescope's autograder, to be shown once grades are published.
-
-    Valid for refused files too, whose score is 0. Flags go into a test that students never see.
-    """
-    tests: list[dict[str, Any]] = [
-        {
-            "name": text_of(item.title),
-            "name_format": "text",
-            "score": item.points,
-            "max_score": item.of,
-            "output": item.comment,
-            "output_format": "text",
-            "visibility": "after_published",
-        }
-        for item in graded.items
-    ]
-    if graded.flags:
-        tests.append(
-            {
-                "name": "For the instructor",
-                "name_format": "text",
-                "score": 0.0,
-                "max_score": 0.0,
-                "output": "\n".join(_plain_lines(graded.flags)),
-                "output_format": "text",
-                "visibility": "hidden",
-            }
-        )
-    return {
-        "score": round(graded.points, 2),
-        "output": verdict_text(graded.verdict),
-        "output_format": "text",
-        "visibility": "after_published",
-        "stdout_visibility": "hidden",
-        "tests": tests,
-    }
-
-
-def _plain_lines(texts: Sequence[str]) -> Iterator[str]:
-    for text in texts:
-        yield "".join(c if unicodedata.category(c)[0] != "C" else " " for c in text)

@@ -66,6 +66,24 @@ NAMES: Mapping[str, str] = {
 }
 
 
+# Places in the results that the default rubric names
+PARTS: Mapping[str, str] = {
+    "axes.*.kf": "the consistency of the filter",
+    "clock": "the clock offset",
+    "loop.closure_error_m": "the closure error",
+    "loop.closures": "the closures and what the gate says of them",
+    "loop.corrections": "the corrected paths",
+    "tuning": "the noises that the data ask for",
+    "tuning.horizontal.held_out.gain_nats": "what tuning would still gain",
+    "why": "why EKF2 differs",
+}
+
+
+def part(path: str) -> str:
+    """A place in the results as part of a sentence."""
+    return PARTS.get(path, path)
+
+
 def named(finding: str) -> str:
     """A finding as part of a sentence.
 

@@ -12,6 +12,7 @@ import json
 import re
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
+from functools import cache
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -127,6 +128,7 @@ def _page_to_show(verdict: Verdict, report: Report) -> int:
     return 1 + (0 if verdict.redrawn else key_page(report.pages))
 
 
+@cache
 def _versions() -> dict[str, str]:
     found = {}
     for name in MADE_WITH:

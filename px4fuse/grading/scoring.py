@@ -74,6 +74,7 @@ CHECKS: Mapping[str, Check] = {
         at_least=Parameter("number"),
         at_most=Parameter("number"),
         zero_at=Parameter("number"),
+        advice=Parameter("text", ""),
     ),
     "consistent": _check(
         checks_filter.consistent,
@@ -142,7 +143,7 @@ def assess(
     """Points for one report, whether they count, and what is left for the instructor.
 
     Items for another kind of report are left out, and without an answer key those on mistakes.
-    ``owner_id`` is that of who handed it in, where a platform says so and the report does not.
+    ``owner_id`` is that of who handed it in, where a platform says so, whatever the report says.
     """
     evidence = Evidence(report, verdict, rubric, key, owner_id)
     fate, why = _fate(evidence)
@@ -205,6 +206,8 @@ def _whose(evidence: Evidence) -> str:
     """What the instructor can do about a log that is not the student's."""
     student_id = text_of(evidence.results.student.id)
     said = f"the report gives the id {student_id}" if student_id else "the report gives no id"
+    if evidence.owner_id:
+        said += f", and {text_of(evidence.owner_id)} handed it in"
     if evidence.answer is None:
         return "Ask for a report on the log that was handed out: this one is about another."
     whose = text_of(evidence.answer.student_id)
