@@ -26,8 +26,8 @@ MAX_QUOTE = 160
 MAX_PASSAGE = 80
 # Lists are cut where a comment would become longer than a sentence
 NAMED = 4
-# Words of the field: these, and the longer ones of the rubric's phrases
-LONG = 6
+# Words of the field: these, and those of the rubric's phrases that are not shorter
+SHORT = 3
 FIELD = frozenset(("ekf", "gps", "imu", "nis", "uwb", "vio"))
 STEP = re.compile(r'"([^"]*)"|([^."]+)')
 
@@ -106,7 +106,7 @@ class Evidence:
             self.rubric.notes,
             ids,
             tuple(_texts({**self.plain, "student": None})),
-            {stem for stem in terms if len(stem) > LONG} | FIELD,
+            {stem for stem in terms if len(stem) > SHORT} | FIELD,
         )
 
     @cached_property
@@ -136,9 +136,11 @@ class Evidence:
         return plain, False
 
     def names(self, finding: str) -> bool:
-        """Whether the notes take a finding up: they do not deny it."""
-        said, _ = self._mention(self.notes, finding)
-        return said is not None and said.stance != "denied"
+        """Whether the notes take a finding up."""
+        said, weak = self._mention(self.notes, finding)
+        if said is None or said.stance != "claimed":
+            return False
+        return not weak or finding not in POSSIBLE_FINDINGS or not self.claims.unsure_wrong
 
     def claims_that(self, finding: str) -> bool:
         """Whether the notes say plainly that it is so."""
@@ -157,7 +159,7 @@ def _texts(value: object) -> Iterator[str]:
     elif isinstance(value, dict):
         for part in value.values():
             yield from _texts(part)
-    elif isinstance(value, list):
+    elif isinstance(value, list | tuple):
         for part in value:
             yield from _texts(part)
 

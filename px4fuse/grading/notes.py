@@ -34,6 +34,8 @@ MAX_TRIES = 500
 MIN_COUNTED = 80
 COMMONEST = 5
 MIN_PACKED_BYTES = 600
+# Words of so many letters ("late", "rate", "offset") stand in any text
+COMMON_LETTERS = 4, 6
 # From so many words with letters of other scripts in them that is no slip
 MANY_DISGUISED = 3
 
@@ -273,10 +275,11 @@ def _problem(
         return ""
     packed = " ".join(words).encode()
     spaced = [word for word in words if not NO_SPACES.match(word)]
-    common = sum(count for _, count in Counter(spaced).most_common(COMMONEST))
+    common = [count for _, count in Counter(spaced).most_common(COMMONEST)] or [0]
+    field = {term for term in terms if not COMMON_LETTERS[0] <= len(term) <= COMMON_LETTERS[1]}
     about = sum(
         one.length for one in notes.sentences
-        if any(any(c.isdigit() for c in word) or _is_term(word, terms) for word in one.words)
+        if any(any(c.isdigit() for c in word) or _is_term(word, field) for word in one.words)
     )  # fmt: skip
     broken = (
         (
@@ -292,8 +295,17 @@ def _problem(
         (notes.words < rules.in_sentences * length, "are mostly not sentences"),
         (
             len(spaced) >= max(MIN_COUNTED, len(words) // 2)
-            and common < rules.common * len(spaced),
+            and sum(common) < rules.common * len(spaced),
             "are words without the small ones that make sentences of them",
+        ),
+        (
+            len(spaced) >= MIN_COUNTED and common[0] > rules.commonest * len(spaced),
+            "hold one word again and again",
+        ),
+        (
+            length >= MIN_COUNTED
+            and sum(_is_term(word, terms) for word in words) > rules.terms * len(words),
+            "are mostly words for mistakes",
         ),
         (
             about < rules.about * notes.words,
@@ -337,6 +349,8 @@ def _whole(sentence: Sentence, rules: Reading, ids: Collection[str]) -> bool:
 
 
 def _runs(words: Sequence[str]) -> Iterator[tuple[str, ...]]:
+    """Words in a row, whatever their numbers."""
+    words = ["0" if word[0].isdigit() else word for word in words]
     for at in range(len(words) - QUOTE_WORDS + 1):
         yield tuple(words[at : at + QUOTE_WORDS])
 
