@@ -140,7 +140,8 @@ def loop(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float, str]:
 
 def _rejected(evidence: Evidence, measured: str) -> tuple[float, str]:
     """A closure that the gate rejected, and what the notes make of it."""
-    if evidence.notes.claims(evidence.words.get(ACCEPTED, ())):
+    accepted = evidence.notes.claims(evidence.words.get(ACCEPTED, ()))
+    if accepted and not evidence.claims_that(OPEN):
         return 0.0, (
             f"{measured}, which is more than drift explains, and your notes call the closure "
             "true. Say where it landed (--landed-at) or leave the end open (--open)."
