@@ -178,7 +178,9 @@ NOTES: dict[str, tuple[Callable[[Flight], str], str]] = {
         lambda _: " ".join(f"There is {kind.replace('_', ' ')} here." for kind in KINDS), "nothing",
     ),
     "everything named": (lambda _: sentences("In this flight there is a {}. "), "nothing"),
-    "everything in one sentence": (lambda _: ", ".join(PLAIN) + " are all in here.", "nothing"),
+    "everything in one sentence": (
+        lambda _: ", ".join(PLAIN) + " are all of them in here and make it hard to see.", "words",
+    ),
     "everything in a table": (
         lambda _: f"| {' | '.join(PLAIN)} |\n|{'---|' * len(PLAIN)}", "nothing",
     ),
@@ -252,7 +254,9 @@ NOTES: dict[str, tuple[Callable[[Flight], str], str]] = {
     "one of two, and one that is not there": (
         lambda _: "There are outliers, 3 % of them. The stamps come late by 0.2 s.", "less",
     ),
-    "nothing is wrong": (lambda _: "I looked at all of it and there is no mistake in 70 s.", "less"),
+    "nothing is wrong": (
+        lambda _: "I looked at all of it and there is no mistake in 70 s.", "less",
+    ),
     "no notes": (lambda _: "", "nothing"),
 }  # fmt: skip
 
@@ -464,6 +468,9 @@ LOOPS: dict[str, tuple[Any, str, dict[str, Any], dict[str, Any], float, float]] 
     "left open and said nothing": (OPEN, "", {"came_back": False}, NO_END, 10, 25),
     "rejected and said nothing": (OPEN, "", {}, REJECTED, 10, 25),
     "left open although it came back": (CLOSED, ELSEWHERE, {"came_back": False}, NO_END, 0, 0),
+    "rejected, called true and false": (
+        OPEN, f"{ELSEWHERE} The loop closed and the closure is true.", {}, REJECTED, 10, 20,
+    ),
     "rejected and called true": (
         OPEN, "The loop closes well and the closure is accepted.", {}, REJECTED, 0, 0,
     ),

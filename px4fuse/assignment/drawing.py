@@ -123,7 +123,8 @@ class Choice:
 
 
 # Clock and heading are estimated from the IMU. A gap of the IMU is not among the choices: it passes
-# for a change of the clock in every second flight. Outliers make EKF2 reject and its NIS grow too.
+# for a change of the clock in every second flight. Outliers make EKF2 reject and its NIS grow too,
+# and pull the heading; a delay is seen by what EKF2 does with good samples.
 NEED_IMU = ("clock", "frame")
 CHOICES: dict[Kind, tuple[Choice, ...]] = {
     "aisle": (
@@ -132,7 +133,7 @@ CHOICES: dict[Kind, tuple[Choice, ...]] = {
             "clock-jump", "source_stamps_of_arrival", "clock", 50, "ms", hides=("frame", "gap")
         ),
         Choice("yaw", "source_frame_turned", "frame", 15, "deg", either_sign=True),
-        Choice("nlos", "source_outliers", "outliers", 1, "%"),
+        Choice("nlos", "source_outliers", "outliers", 1, "%", hides=("frame",)),
         Choice("dropout", "source_gap", "gap", 2, "s", at_s=(30, 70)),
         Choice(
             "imu-rate", "logging_rate_low", "rate", 40, "Hz", less_is_plainer=True, hides=NEED_IMU
@@ -144,7 +145,7 @@ CHOICES: dict[Kind, tuple[Choice, ...]] = {
         Choice(
             "ekf2-gate", "ekf2_rejecting", "ekf2", 2, less_is_plainer=True, hides=("outliers",)
         ),
-        Choice("ekf2-delay", "ekf2_ev_delay_wrong", "clock", 150, "ms"),
+        Choice("ekf2-delay", "ekf2_ev_delay_wrong", "clock", 150, "ms", hides=("ekf2",)),
         Choice("ekf2-off", "ekf2_not_fusing", "ekf2"),
     ),
     "loop": (Choice("open-end", "false_loop_closure", "end", 4, "m"),),

@@ -29,6 +29,9 @@ NAMED = 4
 # Words of the field: these, and those of the rubric's phrases that are not shorter
 SHORT = 3
 FIELD = frozenset(("ekf", "gps", "imu", "nis", "uwb", "vio"))
+# In the words of the rubric: what says that a flight has no mistake
+NOTHING = "none"
+NUMBER = re.compile(r"(?<![\w.])\d+(?:\.\d+)?")
 STEP = re.compile(r'"([^"]*)"|([^."]+)')
 
 Scorer = Callable[["Evidence", Mapping[str, Any]], tuple[float, str]]
@@ -120,8 +123,28 @@ class Evidence:
 
     @property
     def charged(self) -> Mapping[str, str]:
-        """Mistakes that the notes wrongly claim, with the passages; only a key knows which."""
-        return {} if self.answer is None or self.notes.problem else self.claims.wrong
+        """Mistakes that the notes wrongly claim, with the passages; only a key knows which.
+
+        Notes that name nothing of what is there have named the subjects to which they give a size:
+        "a clock offset of 0.2 s", but not "the clock offset is 0.00 s".
+        """
+        if self.answer is None or self.notes.problem:
+            return {}
+        claims = self.claims
+        charged = dict(claims.wrong)
+        right = bool(claims.earned or claims.unsure or claims.open)
+        if not self.answer.findings:
+            right = self.finds_nothing
+        for finding, passage in () if right else claims.unsure_wrong.items():
+            sized = any(float(number) for number in NUMBER.findall(passage))
+            if sized and finding not in family(charged):
+                charged[finding] = passage
+        return charged
+
+    @property
+    def finds_nothing(self) -> bool:
+        """Whether the notes say plainly that the flight has no mistake."""
+        return self.notes.claims(self.words.get(NOTHING, ()))
 
     def _mention(self, notes: Notes, finding: str) -> tuple[Mention | None, bool]:
         """What notes say of a finding, and whether they only touch upon it."""

@@ -28,6 +28,7 @@ QUOTE_WORDS = 7
 DENIES_BEFORE, DENIES_AFTER = 3, 3
 # "no outliers, gaps or jumps": shorter parts of a sentence go with the part before them
 SHORT_CLAUSE = 4
+SHORT = 2
 # Combinations of words that are looked at in one sentence
 MAX_TRIES = 500
 # Below so many words nothing can be said about how often the commonest come
@@ -205,12 +206,14 @@ class Notes:
             return "denied"
         if any(first < at < last for at in denying) or known.reassurances & said:
             return "denied" if one_clause else "open"
+        # "I looked at everything: nothing wrong" leaves nothing open
+        denies = known.negations.intersection(words[at] for at in chosen)
+        unsettling = known.negations if denies else known.negations | known.doubts
         unclear = (
             any(at < first or at <= last + DENIES_AFTER for at in denying),
-            any(words[at] in known.doubts for at in same if at < first)
-            and not known.negations.intersection(words[at] for at in chosen),
+            any(words[at] in known.doubts for at in same if at < first) and not denies,
             sentence.text.rstrip().endswith(("?", "？", "؟")),
-            goes_on and before & (known.negations | known.doubts),
+            goes_on and before & unsettling,
         )
         return "open" if any(unclear) else "claimed"
 
@@ -365,8 +368,13 @@ def _quoted(sentence: Sentence, runs: Collection[tuple[str, ...]]) -> bool:
 
 
 def _begins(word: str, stem: str) -> bool:
-    """Whether a word begins like this one; in scripts that do not part words, holds it."""
-    return stem in word if NO_SPACES.match(stem) else word.startswith(stem)
+    """Whether a word begins like this one; in scripts that do not part words, holds it.
+
+    Two letters are a word of their own: "no" is not the beginning of "nothing".
+    """
+    if NO_SPACES.match(stem):
+        return stem in word
+    return word == stem if len(stem) <= SHORT else word.startswith(stem)
 
 
 def _weight(word: str) -> int:
