@@ -95,12 +95,12 @@ def due_time(text: str) -> datetime:
     elif offset := re.search(r"(?<=:\d\d)(Z|[+-]\d\d:?\d\d)$", words[-1] if words else ""):
         words[-1] = words[-1].removesuffix(offset[0])
         zone = _zone(offset[0], text)
-    for form in _REST:
+    for form, rest in _REST.items():
         try:
             found = datetime.strptime(" ".join(words), form)
         except ValueError:
             continue
-        found += _REST[form]
+        found += rest
         return found.replace(tzinfo=zone) if zone else found.astimezone()
     raise SettingsError(
         f"--due {text!r}: give a time such as '2026-11-20 23:59' or "
