@@ -8,11 +8,10 @@ from dataclasses import dataclass, replace
 from datetime import datetime
 from typing import Literal
 
-from px4fuse.grading import overrides as said_by_instructor
 from px4fuse.grading.class_table import item_points
 from px4fuse.grading.lateness import LateRule, in_zone_of
 from px4fuse.grading.model import Entry, Graded, Override, Submission
-from px4fuse.grading.overrides import TOTAL, Overrides
+from px4fuse.grading.overrides import TOTAL, Overrides, matched
 from px4fuse.grading.platforms import Origin
 from px4fuse.grading.roster import Person, Register
 from px4fuse.results.reading import one_line
@@ -122,12 +121,10 @@ def class_entries(
         entry = _entry(person, tries([index]), term)
         made.append(replace(entry, remarks=(note, *entry.remarks)))
     titles = [tuple(item_points(one.counting)) if one.counting else () for one in made]
-    notes = said_by_instructor.unknown(overrides, made, dict(enumerate(titles)))
+    said, notes = matched(overrides, made, titles)
     most = max((one.of for one in graded), default=0.0)
-    return tuple(
-        _settled(one, said_by_instructor.of_entry(overrides, one, items), most)
-        for one, items in zip(made, titles, strict=True)
-    ), notes
+    settled = (_settled(one, words, most) for one, words in zip(made, said, strict=True))
+    return tuple(settled), notes
 
 
 def owner(graded: Graded, origin: Origin, register: Register) -> int | None:
@@ -180,13 +177,14 @@ def _try(
     late_s = None
     remarks = []
     if term.due is not None and time is not None:
-        late_s = max((time - term.due).total_seconds(), 0.0)
+        # not their difference: in one zone Python takes the clock's, also over a change of it
+        late_s = max(time.timestamp() - term.due.timestamp(), 0.0)
     elif origin.late:
         remarks.append(
             f"{origin.platform.capitalize()} marks it as late and does not say by how much: nothing"
             " was taken off; say in overrides.csv what is."
         )
-    elif term.due is not None and packed is not None and packed > term.due:
+    elif term.due is not None and packed is not None and packed.timestamp() > term.due.timestamp():
         remarks.append(
             f"The zip file dates it {packed.strftime(SHOWN)}, after the due time; that may be when "
             "it was downloaded, so nothing was taken off."

@@ -273,7 +273,8 @@ def _other_version(graded: Sequence[Graded]) -> Flags:
 # ------------------------------------------------------------------ notes
 
 
-def _copied_notes(graded: Sequence[Graded]) -> Flags:
+def copied_notes(graded: Sequence[Graded]) -> list[tuple[float, int, int]]:
+    """Pairs whose notes share passages: which share of both, and their places."""
     shingles = [_shingles(one.notes) for one in graded]
     counted = Counter(part for parts in shingles for part in parts)
     # one that hands in twice does not make a template
@@ -283,7 +284,7 @@ def _copied_notes(graded: Sequence[Graded]) -> Flags:
     long = [index for index, parts in enumerate(shingles) if len(parts) >= MIN_SHINGLES]
     # most of what anyone writes nobody else does: what is compared pair by pair is short
     shared = {i: {part for part in shingles[i] if counted[part] > 1} for i in long}
-    alike: dict[int, list[tuple[float, int]]] = defaultdict(list)
+    pairs = []
     for first, second in combinations(long, 2):
         # no smaller than this share, whatever the rest
         most = min(len(shared[first]), len(shared[second]))
@@ -293,8 +294,15 @@ def _copied_notes(graded: Sequence[Graded]) -> Flags:
         both = len(shared[first] & shared[second])
         share = both / (len(shingles[first]) + len(shingles[second]) - both)
         if share >= COPIED:
-            alike[first].append((share, second))
-            alike[second].append((share, first))
+            pairs.append((share, first, second))
+    return pairs
+
+
+def _copied_notes(graded: Sequence[Graded]) -> Flags:
+    alike: dict[int, list[tuple[float, int]]] = defaultdict(list)
+    for share, first, second in copied_notes(graded):
+        alike[first].append((share, second))
+        alike[second].append((share, first))
     for index, others in sorted(alike.items()):
         others.sort(reverse=True)
         named = ", ".join(

@@ -10,8 +10,6 @@ from datetime import datetime
 from functools import partial
 from pathlib import Path
 
-from msgspec.structs import replace as replaced
-
 from px4fuse.assignment.key import AnswerKey
 from px4fuse.grading import submissions
 from px4fuse.grading.entries import Term, class_entries
@@ -24,13 +22,13 @@ from px4fuse.grading.outputs import Class, write_class
 from px4fuse.grading.overrides import NAME, read_overrides
 from px4fuse.grading.platforms import Origin, with_metadata
 from px4fuse.grading.records import Verified, verified
-from px4fuse.grading.roster import Person, Register, people_of_key, people_of_sheet, same_id
+from px4fuse.grading.roster import Person, Register, people_of_key, people_of_sheet
 from px4fuse.grading.scoring import assess, refused
 from px4fuse.grading.sheet import Sheet
 from px4fuse.grading.workers import Failed, run_bounded
 from px4fuse.reading import files_by_sha256, max_log_bytes
 from px4fuse.results.contract import Reported, to_plain
-from px4fuse.verification.model import Refused, Report, Verdict
+from px4fuse.verification.model import Refused, Verdict
 from px4fuse.verification.rerun import log_sha256
 
 RECORDS = "records"
@@ -157,9 +155,11 @@ def grade(
     entries = _flagged(entries, key)
     written, more = write_class(
         Class(entries, register or Register([]), title, course.worksheets, course.column,
-              course.anonymous, {one.name: of for one, of in zip(found, origins, strict=True)}),
+              course.anonymous, {one.name: of for one, of in zip(found, origins, strict=True)},
+              {one.name: one for one in found}),
         output,
         output / RECORDS,
+        processes,
     )  # fmt: skip
     return Outcome(entries, (*notes, *unknown, *more), reused, written)
 
@@ -310,7 +310,7 @@ def _scored(
     key: AnswerKey | None,
 ) -> Graded:
     results, verdict = found.report.results, found.verdict
-    made = assess(_owned(found.report, owner_id, key), verdict, rubric, key, owner_id)
+    made = assess(found.report, verdict, rubric, key, owner_id)
     return Graded(
         submission=submission.name,
         student=results.student.name,
@@ -320,6 +320,7 @@ def _scored(
         flags=(*_page_flags(verdict), *own_flags(results), *made.flags),
         pending=made.pending,
         to_read=made.to_read,
+        mistakes=made.mistakes,
         numbers=_numbers(results),
         sha256=sha256,
         log_sha256=log_sha256(results),
@@ -328,21 +329,6 @@ def _scored(
         notes=results.student.notes,
         page=found.page,
     )
-
-
-def _owned(report: Report, owner_id: str, key: AnswerKey | None) -> Report:
-    """The report with the id of who handed it in, where the platform contradicts it.
-
-    Else a copy of somebody's report would be looked up in the answer key under that one's id.
-    """
-    answer = key.of_student(owner_id) if key and owner_id else None
-    claimed = report.results.student.id
-    if answer is None or same_id(claimed, owner_id):
-        return report
-    if not claimed.strip() and answer.sha256 == log_sha256(report.results):
-        return report
-    student = replaced(report.results.student, id=owner_id)
-    return replace(report, results=replaced(report.results, student=student))
 
 
 def _page_flags(verdict: Verdict) -> tuple[str, ...]:

@@ -199,13 +199,18 @@ class Graded:
         Those chosen, to the last digit, for comparison between students; "" for usual ones.
     notes : str
         The student's own words.
-    picture : bytes
-        PNG of a redrawn page: the cover, or the one that differs most; empty without.
+    mistakes : mapping
+        What the answer key says is wrong in the student's flight, in words, and whether the notes
+        name it.
     handed_in : bytes
-        PNG of that page as it was handed in, where it differs or nothing could be redrawn; empty
-        without.
+        PNG of a page as it was handed in: the cover where nothing could be redrawn, else the one
+        that differs most; empty without.
     page : int
-        Which page the pictures show, counted from 1.
+        Which page that is, counted from 1.
+    sheets : tuple of str
+        Where pictures of the redrawn pages stand, relative to the class page.
+    handed_in_name : str
+        Where the PDF stands that was handed in, relative to the class page; "" without.
     redrawn : bytes
         The report drawn again from the log, as a PDF; empty without.
     redrawn_name : str
@@ -226,11 +231,13 @@ class Graded:
     version: str = ""
     settings: str = ""
     notes: str = field(default="", repr=False)
-    picture: bytes = field(default=b"", repr=False)
+    mistakes: Mapping[str, bool] = field(default_factory=dict)
     handed_in: bytes = field(default=b"", repr=False)
     page: int = 1
     redrawn: bytes = field(default=b"", repr=False)
     redrawn_name: str = ""
+    sheets: tuple[str, ...] = ()
+    handed_in_name: str = ""
 
     @property
     def status(self) -> str:
@@ -314,3 +321,8 @@ class Entry:
     email: str = ""
     remarks: tuple[str, ...] = ()
     pseudonym: str = ""
+
+    @property
+    def called(self) -> str:
+        """What the class page calls the student."""
+        return self.pseudonym or self.student or self.student_id or "no name"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import hashlib
 import io
 import itertools
 import json
@@ -13,21 +14,27 @@ from importlib import metadata
 from pathlib import Path
 
 from px4fuse.assignment.roster import RESERVED
-from px4fuse.grading import exports
+from px4fuse.grading import exports, submissions
+from px4fuse.grading.anonymous import hidden_words
 from px4fuse.grading.class_page import html_text
 from px4fuse.grading.class_table import csv_text, neutral, neutral_id
 from px4fuse.grading.gradescope import results
-from px4fuse.grading.model import Entry, Graded
+from px4fuse.grading.model import Entry, Graded, Submission
 from px4fuse.grading.overrides import NAME, TEMPLATE
 from px4fuse.grading.platforms import Origin, seen
-from px4fuse.grading.records import HANDED_IN, PICTURE, REDRAWN, file_of
+from px4fuse.grading.records import HANDED_IN, REDRAWN, file_of
 from px4fuse.grading.returned import returned_text
 from px4fuse.grading.roster import Register
 from px4fuse.grading.sheet import Sheet, read_sheet
+from px4fuse.grading.sheets import draw_sheets
+from px4fuse.verification.model import Refused
 from px4fuse.writing import write_all
 
 # Reports drawn again from their logs: what to read instead of what was handed in
 REPORTS = "reports"
+# Pictures of their pages, and the students' own files, both for the class page
+SHEETS = "pages"
+ORIGINALS = "handed_in"
 FEEDBACK = "feedback"
 GRADES = "grades"
 NAMES = "names.csv"
@@ -50,6 +57,8 @@ class Class:
     anonymous : bool
     origins : mapping
         Name of a submission to where it came from.
+    files : mapping
+        Name of a submission to where it is read.
     """
 
     entries: tuple[Entry, ...]
@@ -59,10 +68,11 @@ class Class:
     column: str
     anonymous: bool
     origins: Mapping[str, Origin]
+    files: Mapping[str, Submission]
 
 
 def write_class(
-    made: Class, output: Path, records: Path
+    made: Class, output: Path, records: Path, processes: int | None = None
 ) -> tuple[tuple[Path, ...], tuple[str, ...]]:
     """Write everything, and say what could not be entered.
 
@@ -74,10 +84,11 @@ def write_class(
         The folder cannot be written.
     """
     names = file_names([_stem(entry) for entry in made.entries])
-    pictured = [
-        _pictured(entry, name, output, records, made.anonymous)
+    written_out = [
+        _with_files(entry, name, made, output, records)
         for entry, name in zip(made.entries, names, strict=True)
     ]
+    pictured = _with_sheets(written_out, output, made.anonymous, processes)
     texts = {at: returned_text(entry, made.title) for at, entry in enumerate(made.entries)}
     table, page, said = output / "class.csv", output / "class.html", output / NAME
     contents = {table: csv_text(made.entries).encode()}
@@ -85,9 +96,7 @@ def write_class(
         pictured, listed = _pseudonyms(pictured, output / NAMES)
         contents[output / NAMES] = listed.encode()
     made_with = f"px4fuse {metadata.version('px4fuse')}"
-    contents[page] = html_text(
-        [entry.counting for entry in pictured if entry.counting], made.title, made_with
-    ).encode()
+    contents[page] = html_text(pictured, made.title, made_with).encode()
     if not said.exists():
         contents[said] = TEMPLATE.encode()
     for at, (entry, name) in enumerate(zip(made.entries, names, strict=True)):
@@ -100,7 +109,7 @@ def write_class(
     write_all(contents)
     folders = [output / FEEDBACK, output / "gradescope"]
     if any(one.redrawn_name for entry in pictured for one in _files(entry)):
-        folders.insert(0, output / REPORTS)
+        folders = [output / REPORTS, output / SHEETS, *folders]
     written = (table, page, *folders, *([output / GRADES] if grades else []), said)
     return written, (*notes, *_left_over(output, names))
 
@@ -109,19 +118,24 @@ def _files(entry: Entry) -> tuple[Graded, ...]:
     return (*([entry.counting] if entry.counting else []), *entry.others)
 
 
-def _pictured(entry: Entry, name: str, output: Path, records: Path, anonymous: bool) -> Entry:
-    """With its pictures, and the redrawn reports in a folder to read them."""
+def _with_files(entry: Entry, name: str, made: Class, output: Path, records: Path) -> Entry:
+    """With the redrawn reports, and what was handed in, in folders to read them."""
 
     def whole(one: Graded, stem: str) -> Graded:
-        shown, handed_in, redrawn = (
+        handed_in, redrawn = (
             _content(file_of(records, one.sha256, end)) if one.sha256 else b""
-            for end in (PICTURE, HANDED_IN, REDRAWN)
+            for end in (HANDED_IN, REDRAWN)
         )
         where = f"{REPORTS}/{stem}.pdf" if redrawn else ""
         if redrawn:
             write_all({output / where: redrawn})
+        original = f"{ORIGINALS}/{stem}.pdf"
+        there = _copied(one, made.files.get(one.submission), output / original)
         return replace(
-            one, picture=shown, handed_in=handed_in, redrawn_name="" if anonymous else where
+            one,
+            handed_in=handed_in,
+            redrawn_name=where,
+            handed_in_name=original if there else "",
         )
 
     return replace(
@@ -131,6 +145,41 @@ def _pictured(entry: Entry, name: str, output: Path, records: Path, anonymous: b
             whole(one, f"{name}_other_{at}") for at, one in enumerate(entry.others, start=1)
         ),
     )
+
+
+def _copied(one: Graded, submission: Submission | None, to: Path) -> bool:
+    """Whether the student's own PDF stands where the class page leads to it."""
+    if submission is None or not one.sha256:
+        return False
+    if hashlib.sha256(_content(to)).hexdigest() == one.sha256:
+        return True
+    content = submissions.read(submission)
+    if isinstance(content, Refused) or not content.startswith(b"%PDF"):
+        return False
+    write_all({to: content})
+    return True
+
+
+def _with_sheets(
+    entries: Sequence[Entry], output: Path, anonymous: bool, processes: int | None
+) -> list[Entry]:
+    """With pictures of every page of the redrawn reports that count."""
+    reports = {
+        one.redrawn_name: (
+            output / one.redrawn_name,
+            hidden_words(entry, one) if anonymous else (),
+        )
+        for entry in entries
+        if (one := entry.counting) and one.redrawn_name
+    }
+    drawn = draw_sheets(reports, output / SHEETS, processes)
+    made = []
+    for entry in entries:
+        one = entry.counting
+        names = drawn.get(one.redrawn_name, ()) if one else ()
+        sheets = tuple(f"{SHEETS}/{name}" for name in names)
+        made.append(replace(entry, counting=replace(one, sheets=sheets)) if one else entry)
+    return made
 
 
 def _content(path: Path) -> bytes:
@@ -184,7 +233,13 @@ def _grades(made: Class, texts: Mapping[int, str]) -> tuple[dict[str, bytes], tu
     notes: list[str] = []
     for sheet in made.worksheets:
         filled = exports.filled(sheet, made.entries, made.register, made.column, texts)
-        contents[sheet.path.name] = filled.sheet.content()
+        name = next(
+            name
+            for number in itertools.count(1)
+            if (name := f"{sheet.path.stem}{f'-{number}' if number > 1 else ''}{sheet.path.suffix}")
+            not in contents
+        )
+        contents[name] = filled.sheet.content()
         notes += filled.notes
     platforms = seen(made.origins.values())
     if "moodle" in platforms:
@@ -194,7 +249,7 @@ def _grades(made: Class, texts: Mapping[int, str]) -> tuple[dict[str, bytes], tu
             text = exports.plain_grades(
                 platform, made.title, made.entries, made.origins, made.register, texts
             )
-            contents[f"{platform}.csv"] = text.encode()
+            contents[f"plain_{platform}.csv"] = text.encode()
     return contents, tuple(notes)
 
 

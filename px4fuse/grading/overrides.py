@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from px4fuse.assignment.key import folded
 from px4fuse.errors import SettingsError
 from px4fuse.grading.model import Entry, Override
+from px4fuse.grading.roster import same_id
 from px4fuse.grading.sheet import read_sheet
 from px4fuse.results.reading import cleaned, one_line
 
@@ -71,45 +72,51 @@ def _points(text: str) -> float | None:
     return value if math.isfinite(value) and 0.0 <= value <= MOST else None
 
 
-def of_entry(overrides: Overrides, entry: Entry, items: Sequence[str]) -> dict[str, Override]:
-    """What is said of one entry, by the titles of its items, "total" and "" for all of it."""
-    said: dict[str, Override] = {}
-    for student, rows in overrides.items():
-        if not _is(entry, student):
-            continue
-        for item, override in rows.items():
-            title = next((one for one in (*items, TOTAL, "") if folded(one) == folded(item)), None)
-            if title is not None:
-                said[title] = override
-    return said
-
-
-def unknown(
-    overrides: Overrides, entries: Sequence[Entry], items: Mapping[int, Sequence[str]]
-) -> tuple[str, ...]:
-    """A sentence for every row that nobody is, or no item.
+def matched(
+    overrides: Overrides, entries: Sequence[Entry], items: Sequence[Sequence[str]]
+) -> tuple[list[dict[str, Override]], tuple[str, ...]]:
+    """What is said of whom, and a sentence for every row that fits nobody, or no item.
 
     Parameters
     ----------
     overrides : mapping
     entries : sequence of Entry
-    items : mapping
-        Index into ``entries`` to the titles of its items.
+    items : sequence of sequence of str
+        Titles of the items of each entry.
+
+    Returns
+    -------
+    said : list of dict
+        For each entry, by the title of an item, "total", or "" for all of it.
+    notes : tuple of str
     """
+    said: list[dict[str, Override]] = [{} for _ in entries]
     notes = []
     for student, rows in overrides.items():
-        places = [index for index, entry in enumerate(entries) if _is(entry, student)]
-        if not places:
+        place = _place(entries, student)
+        if place is None:
             notes.append(f"{NAME}: nobody has the id {one_line(student, 40) or '(empty)'}.")
-        titles = {folded(one) for at in places for one in (*items[at], TOTAL, "")}
-        notes += [
-            f"{NAME}: {one_line(student, 40)} has no item {one_line(item, 60)!r}."
-            for item in rows
-            if places and folded(item) not in titles
-        ]
-    return tuple(notes)
+            continue
+        titles = {folded(one): one for one in (*items[place], TOTAL, "")}
+        for item, override in rows.items():
+            title = titles.get(folded(item))
+            if title is None:
+                name = one_line(item, 60)
+                notes.append(f"{NAME}: {one_line(student, 40)} has no item {name!r}.")
+            else:
+                said[place][title] = override
+    return said, tuple(notes)
 
 
-def _is(entry: Entry, student: str) -> bool:
-    names = [entry.student_id, *([entry.counting.submission] if entry.counting else [])]
-    return any(folded(name) == folded(student) != "" for name in names)
+def _place(entries: Sequence[Entry], student: str) -> int | None:
+    """Whose row it is: by the very id, the id but for leading zeros, or the file's name."""
+    looks: tuple[Callable[[Entry], bool], ...] = (
+        lambda entry: folded(entry.student_id) == folded(student) != "",
+        lambda entry: same_id(entry.student_id, student),
+        lambda entry: entry.counting is not None and entry.counting.submission == student,
+    )
+    for look in looks:
+        places = [place for place, entry in enumerate(entries) if look(entry)]
+        if len(places) == 1:
+            return places[0]
+    return None

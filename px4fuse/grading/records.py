@@ -12,6 +12,7 @@ import json
 import re
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
+from functools import cache
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -28,7 +29,7 @@ from px4fuse.verification.rerun import log_sha256
 from px4fuse.verification.verification import verify
 from px4fuse.writing import write_all
 
-PICTURE, HANDED_IN, REDRAWN, RESULTS = ".png", ".handed-in.png", ".pdf", ".results.json"
+HANDED_IN, REDRAWN, RESULTS = ".handed-in.png", ".pdf", ".results.json"
 MADE_WITH = ("px4fuse", "numpy", "scipy", "matplotlib", "pypdfium2", "pillow")
 THE_FILE = "The file"
 _SHA256 = re.compile(rb'"([0-9a-f]{64})"')
@@ -91,7 +92,6 @@ def verified(
     # what is shown and scored is the redrawn report, as far as there is one
     seen = replace(report, pages=page_texts(verdict.redrawn or pdf))
     page = _page_to_show(verdict, seen)
-    shown = picture(verdict.redrawn, page - 1) if verdict.redrawn else b""
     handed_in = picture(pdf, page - 1) if verdict.pages or not verdict.redrawn else b""
     results = to_json(report.results).encode()
     values = {
@@ -104,7 +104,6 @@ def verified(
     }
     parts = {
         RESULTS: results,
-        PICTURE: b"" if isinstance(shown, Unavailable) else shown,
         HANDED_IN: b"" if isinstance(handed_in, Unavailable) else handed_in,
         REDRAWN: verdict.redrawn,
     }
@@ -129,6 +128,7 @@ def _page_to_show(verdict: Verdict, report: Report) -> int:
     return 1 + (0 if verdict.redrawn else key_page(report.pages))
 
 
+@cache
 def _versions() -> dict[str, str]:
     found = {}
     for name in MADE_WITH:

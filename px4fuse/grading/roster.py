@@ -84,7 +84,7 @@ def people_of_sheet(sheet: Sheet) -> tuple[Person, ...]:
         if canvas and (user := sheet.cell(row, ("id",))):
             numbers["canvas"] = user
         student_id = one_line(sheet.cell(row, ids), MAX_NAME) or login or email
-        if student_id or name:
+        if student_id or name or numbers:
             people.append(Person(student_id, name, email, login, numbers))
     _check_unique(sheet, people)
     return tuple(people)
@@ -128,8 +128,14 @@ class Register:
                 )
 
     def place(self, other: Person) -> int | None:
-        """Where somebody stands of whom another list knows: by id, email, login, then name."""
+        """Where somebody stands of whom another list knows: by number, id, email, login or name."""
         looks: tuple[Callable[[], int | None], ...] = (
+            *(
+                lambda platform=platform, said=said: self._of(
+                    lambda one: one.numbers.get(platform, ""), said
+                )
+                for platform, said in other.numbers.items()
+            ),
             lambda: self._by_id(other.student_id),
             lambda: self._of(lambda one: one.email, other.email),
             lambda: self._of(lambda one: one.login, other.login),

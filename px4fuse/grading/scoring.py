@@ -7,7 +7,7 @@ no points and a comment, never an exception.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from px4fuse.assignment.key import AnswerKey
 from px4fuse.findings import SEVERITIES
@@ -121,12 +121,16 @@ class Assessment:
         What stands out: sentences.
     to_read : tuple of (str, str)
         What no rule can judge: why, and the passage of the notes.
+    mistakes : mapping
+        What the answer key says is wrong in the student's own flight, in words, and whether the
+        notes name it.
     """
 
     items: tuple[Item, ...]
     pending: str = ""
     flags: tuple[str, ...] = ()
     to_read: tuple[tuple[str, str], ...] = ()
+    mistakes: Mapping[str, bool] = field(default_factory=dict)
 
 
 def assess(
@@ -139,7 +143,7 @@ def assess(
     """Points for one report, whether they count, and what is left for the instructor.
 
     Items for another kind of report are left out, and without an answer key those on mistakes.
-    ``owner_id`` is that of who handed it in, where a platform says so and the report does not.
+    ``owner_id`` is that of who handed it in, where a platform says so, whatever the report says.
     """
     evidence = Evidence(report, verdict, rubric, key, owner_id)
     fate, why = _fate(evidence)
@@ -158,7 +162,15 @@ def assess(
         why if fate == "pending" else "",
         (*_notes_flags(evidence), *checks_loop.contradictions(evidence)),
         tuple(_to_read(evidence)),
+        _mistakes(evidence),
     )
+
+
+def _mistakes(evidence: Evidence) -> dict[str, bool]:
+    if evidence.answer is None or not evidence.own:
+        return {}
+    earned = frozenset() if evidence.notes.problem else evidence.claims.earned
+    return {named(finding): finding in earned for finding in evidence.answer.findings}
 
 
 def score(
@@ -194,6 +206,8 @@ def _whose(evidence: Evidence) -> str:
     """What the instructor can do about a log that is not the student's."""
     student_id = text_of(evidence.results.student.id)
     said = f"the report gives the id {student_id}" if student_id else "the report gives no id"
+    if evidence.owner_id:
+        said += f", and {text_of(evidence.owner_id)} handed it in"
     if evidence.answer is None:
         return "Ask for a report on the log that was handed out: this one is about another."
     whose = text_of(evidence.answer.student_id)

@@ -1,0 +1,1 @@
+"""Many logs: one table with a row per log and axis."""
