@@ -19,7 +19,7 @@ from px4fuse.grading.returned import returned_text
 from px4fuse.grading.roster import Person, Register
 from px4fuse.verification.model import Verdict
 
-DUE = due_time("2026-11-20 12:00 +01:00")
+DUE = due_time("2026-11-20 12:00:00 +01:00")
 LATEST = Term()
 PEOPLE = (Person("1", "Ada Lovelace", login="ada"), Person("2", "Grace Hopper", login="grace"))
 
@@ -64,6 +64,13 @@ def test_late_is_what_comes_after_the_due_time_in_its_zone() -> None:
              blackboard("ada", "22-10-00-00"): graded("", 7.0)}  # fmt: skip
     (ada, _), _ = laid_out(files, replace(term, attempt="best"))
     assert (ada.late_s, ada.deduction, ada.total) == (0.0, 0.0, 6.0)
+
+
+def test_an_hour_that_the_clock_goes_back_is_an_hour() -> None:
+    """In the night to 25 October 2026 Berlin has the hour from 2 to 3 twice."""
+    term = Term("latest", due_time("2026-10-24 23:00:00 Europe/Berlin"))
+    (ada, _), _ = laid_out({"Lab_ada_attempt_2026-10-25-05-00-00_r.pdf": graded("", 4.0)}, term)
+    assert ada.late_s == 7 * 3600.0
 
 
 def test_nobody_has_less_than_nothing() -> None:

@@ -10,7 +10,7 @@ import pytest
 from px4fuse.errors import SettingsError
 from px4fuse.grading.lateness import due_time, in_zone_of, late_rule, moodle_time
 
-BERLIN = "2026-11-20T23:59:00+01:00"
+BERLIN = "2026-11-20T23:59:59+01:00"
 
 
 @pytest.mark.parametrize(
@@ -19,9 +19,9 @@ BERLIN = "2026-11-20T23:59:00+01:00"
         ("2026-11-20 23:59 +01:00", BERLIN),
         ("2026-11-20 23:59 Europe/Berlin", BERLIN),
         ("2026-11-20T23:59+01:00", BERLIN),
-        ("2026-11-20 22:59:00 +0000", BERLIN),
+        ("2026-11-20 22:59:59 +0000", BERLIN),
         ("2026-11-20T22:59Z", BERLIN),
-        ("2026-07-20 23:59 Europe/Berlin", "2026-07-20T23:59:00+02:00"),  # summer
+        ("2026-07-20 23:59 Europe/Berlin", "2026-07-20T23:59:59+02:00"),  # summer
         ("2026-11-20 +01:00", "2026-11-20T23:59:59+01:00"),
     ],
 )
@@ -33,7 +33,7 @@ def test_without_a_zone_it_is_this_computers(monkeypatch) -> None:
     monkeypatch.setenv("TZ", "America/New_York")
     time.tzset()
     try:
-        assert due_time("2026-11-20 23:59") == datetime(2026, 11, 21, 4, 59, tzinfo=UTC)
+        assert due_time("2026-11-20 23:59") == datetime(2026, 11, 21, 4, 59, 59, tzinfo=UTC)
     finally:
         monkeypatch.undo()
         time.tzset()
@@ -65,7 +65,7 @@ def test_what_is_no_rule_is_one_line(text) -> None:
 
 
 def test_platforms_times_without_a_zone_are_in_that_of_the_due_time() -> None:
-    due = due_time("2026-11-20 23:59 +05:30")
+    due = due_time("2026-11-20 23:59:00 +05:30")
     bare = datetime(2026, 11, 21, 0, 59)
     assert (in_zone_of(bare, due) - due).total_seconds() == 3600.0
     told = datetime(2026, 11, 20, 18, 29, tzinfo=timezone(timedelta(0)))

@@ -612,7 +612,14 @@ class TestWhatStudentsRead:
         wrong = [finding(name, "error") for name in read_rubric(None).words if name in NAMES]
         spoilt = [
             changed(findings=wrong, student__notes="It is a flight of 5 s.", tuning={}, clock=NONE),
-            changed(LOOP, findings=wrong, student__notes="Very short notes.", loop=NONE),
+            changed(
+                LOOP,
+                findings=wrong,
+                student__notes="Very short notes.",
+                loop__closure_error_m=...,
+                loop__known_end=NONE,
+                loop__closures=[],
+            ),
             noted("There are outliers at 5 s.", student__id="s01", findings=wrong),
         ]
         for results in spoilt:

@@ -137,7 +137,7 @@ class Lab:
         return table(self.folder / "grades.csv", HEADS["blackboard"], rows, "\t")
 
     def grade(self, rubric=None) -> Outcome:
-        due = due_time("2026-11-20 12:00 Europe/Berlin")
+        due = due_time("2026-11-20 12:00:00 Europe/Berlin")
         course = Course(self.roster, tuple(map(read_sheet, self.sheets)), "",
                         Term("latest", due, late_rule("10%/day")), anonymous=True)  # fmt: skip
         return grade(self.exports, [self.logs], rubric or read_rubric(None), self.output,

@@ -7,6 +7,7 @@ import platform
 import tempfile
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from px4fuse.assignment.key import key_text, read_key
@@ -85,6 +86,11 @@ def run_autograder(folder: Path, late: LateRule | None) -> None:
             key=lambda one: -1.0 if one.total is None else one.total,
         )
         text = returned_text(entry)
+        if register and register.by_platform(origin) is None:
+            unknown = (
+                f"The answer key has nobody of the name {name or '(none)'}: compare the report's."
+            )
+            entry = replace(entry, remarks=(unknown, *entry.remarks))
     made = results(entry, text, time.perf_counter() - start)
     content = json.dumps(made, ensure_ascii=False, indent=2)
     write_all({folder / "results" / "results.json": content.encode()})

@@ -142,7 +142,10 @@ def clock(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float, str]:
     comparison = evidence.comparison
     clock = None if comparison is None else comparison.clock
     if not isinstance(clock, Clock):
-        return 0.0, f"Your report says nothing about the clock offset{absence(clock)}."
+        said = f"Your report says nothing about the clock offset{absence(clock)}"
+        if comparison is None or evidence.answer is None:
+            return 0.0, f"{said}."
+        return 1.0, f"{said}, which is not your choice."
     interval, applied = clock.interval_s, clock.applied_s
     if not clock.determinable:
         said = "Your flight does not determine the clock offset"
@@ -152,12 +155,12 @@ def clock(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float, str]:
             f"{said}, which is not your choice." if handed_out
             else f"{said}; fly clear starts and stops."
         )  # fmt: skip
-    if any(evidence.has(name) or name in _handed_out(evidence) for name in CHANGING):
-        return _changing(evidence, given["undeterminable"])
     low, high = interval
     said = f"You applied a clock offset of {applied:.3f} s"
     if low - given["margin_s"] <= applied <= high + given["margin_s"]:
         return 1.0, f"{said}, which is what the data ask for ({low:.3f} to {high:.3f} s)."
+    if any(evidence.has(name) or name in _handed_out(evidence) for name in CHANGING):
+        return _changing(evidence, given["undeterminable"])
     return 0.0, (
         f"{said} where the data ask for {low:.3f} to {high:.3f} s; set it with --clock-offset, or "
         "use --clock-offset auto."

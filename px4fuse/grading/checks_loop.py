@@ -141,9 +141,11 @@ def loop(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float, str]:
 def _rejected(evidence: Evidence, measured: str) -> tuple[float, str]:
     """A closure that the gate rejected, and what the notes make of it."""
     if evidence.notes.claims(evidence.words.get(ACCEPTED, ())):
-        return 0.0, (
-            f"{measured}, which is more than drift explains, and your notes call the closure "
-            "true. Say where it landed (--landed-at) or leave the end open (--open)."
+        both = evidence.claims_that(OPEN)
+        return 1 / 3 if both else 0.0, (
+            f"{measured}, which is more than drift explains, and your notes "
+            f"{'also call' if both else 'call'} the closure true. Say where it landed "
+            "(--landed-at) or leave the end open (--open), and which of the two holds."
         )
     share, why = _open_end(evidence)
     said = f"{measured}; the closure was rejected as false, which leaves the path as it is"

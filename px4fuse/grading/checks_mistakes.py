@@ -10,8 +10,6 @@ from px4fuse.grading.claims import in_words
 from px4fuse.grading.evidence import Evidence, also_named, list_words, text_of
 from px4fuse.verification.rerun import log_sha256
 
-# In the words of the rubric: what says that a flight has no mistake
-NOTHING = "none"
 TRY = (
     "Look at the report's findings and at where the innovations leave their band, and say what the "
     "cause is, how large it is, and how you know"
@@ -59,7 +57,7 @@ def _nothing_wrong(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float,
     wrong = evidence.charged
     if wrong:
         return -float(len(wrong)), f"{was}{also_named(wrong)}."
-    if evidence.notes.claims(evidence.words.get(NOTHING, ())):
+    if evidence.finds_nothing:
         return 1.0, f"{was}, and your notes say so."
     return given["in_report"], f"{was}; your notes should say that you looked and found none."
 

@@ -98,6 +98,12 @@ def notes(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float, str]:
             f"Your notes {read.problem}: that earns nothing. Say in sentences of your own what "
             "you see in this flight, how large it is, and what you did about it."
         )
+    wrong = evidence.charged
+    if wrong and not evidence.claims.earned:
+        return 0.0, (
+            "Your notes name only mistakes that your log does not have: that earns nothing. Look "
+            "at the report's findings first, and say what you see in this flight."
+        )
     share = min(words / given["min_words"], different / given["min_different"], 1.0)
     if share == 1.0:
         return 1.0, f"Your notes have {words} words."

@@ -177,13 +177,14 @@ def _try(
     late_s = None
     remarks = []
     if term.due is not None and time is not None:
-        late_s = max((time - term.due).total_seconds(), 0.0)
+        # not their difference: in one zone Python takes the clock's, also over a change of it
+        late_s = max(time.timestamp() - term.due.timestamp(), 0.0)
     elif origin.late:
         remarks.append(
             f"{origin.platform.capitalize()} marks it as late and does not say by how much: nothing"
             " was taken off; say in overrides.csv what is."
         )
-    elif term.due is not None and packed is not None and packed > term.due:
+    elif term.due is not None and packed is not None and packed.timestamp() > term.due.timestamp():
         remarks.append(
             f"The zip file dates it {packed.strftime(SHOWN)}, after the due time; that may be when "
             "it was downloaded, so nothing was taken off."

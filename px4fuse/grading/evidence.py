@@ -26,9 +26,12 @@ MAX_QUOTE = 160
 MAX_PASSAGE = 80
 # Lists are cut where a comment would become longer than a sentence
 NAMED = 4
-# Words of the field: these, and the longer ones of the rubric's phrases
-LONG = 6
+# Words of the field: these, and those of the rubric's phrases that are not shorter
+SHORT = 3
 FIELD = frozenset(("ekf", "gps", "imu", "nis", "uwb", "vio"))
+# In the words of the rubric: what says that a flight has no mistake
+NOTHING = "none"
+NUMBER = re.compile(r"(?<![\w.])\d+(?:\.\d+)?")
 STEP = re.compile(r'"([^"]*)"|([^."]+)')
 
 Scorer = Callable[["Evidence", Mapping[str, Any]], tuple[float, str]]
@@ -107,7 +110,7 @@ class Evidence:
             self.rubric.notes,
             ids,
             tuple(_texts({**self.plain, "student": None})),
-            {stem for stem in terms if len(stem) > LONG} | FIELD,
+            {stem for stem in terms if len(stem) > SHORT} | FIELD,
         )
 
     @cached_property
@@ -121,8 +124,28 @@ class Evidence:
 
     @property
     def charged(self) -> Mapping[str, str]:
-        """Mistakes that the notes wrongly claim, with the passages; only a key knows which."""
-        return {} if self.answer is None or self.notes.problem else self.claims.wrong
+        """Mistakes that the notes wrongly claim, with the passages; only a key knows which.
+
+        Notes that name nothing of what is there have named the subjects to which they give a size:
+        "a clock offset of 0.2 s", but not "the clock offset is 0.00 s".
+        """
+        if self.answer is None or self.notes.problem:
+            return {}
+        claims = self.claims
+        charged = dict(claims.wrong)
+        right = bool(claims.earned or claims.unsure or claims.open)
+        if not self.answer.findings:
+            right = self.finds_nothing
+        for finding, passage in () if right else claims.unsure_wrong.items():
+            sized = any(float(number) for number in NUMBER.findall(passage))
+            if sized and finding not in family(charged):
+                charged[finding] = passage
+        return charged
+
+    @property
+    def finds_nothing(self) -> bool:
+        """Whether the notes say plainly that the flight has no mistake."""
+        return self.notes.claims(self.words.get(NOTHING, ()))
 
     def _mention(self, notes: Notes, finding: str) -> tuple[Mention | None, bool]:
         """What notes say of a finding, and whether they only touch upon it."""
@@ -137,9 +160,11 @@ class Evidence:
         return plain, False
 
     def names(self, finding: str) -> bool:
-        """Whether the notes take a finding up: they do not deny it."""
-        said, _ = self._mention(self.notes, finding)
-        return said is not None and said.stance != "denied"
+        """Whether the notes take a finding up."""
+        said, weak = self._mention(self.notes, finding)
+        if said is None or said.stance != "claimed":
+            return False
+        return not weak or finding not in POSSIBLE_FINDINGS or not self.claims.unsure_wrong
 
     def claims_that(self, finding: str) -> bool:
         """Whether the notes say plainly that it is so."""
@@ -158,7 +183,7 @@ def _texts(value: object) -> Iterator[str]:
     elif isinstance(value, dict):
         for part in value.values():
             yield from _texts(part)
-    elif isinstance(value, list):
+    elif isinstance(value, list | tuple):
         for part in value:
             yield from _texts(part)
 

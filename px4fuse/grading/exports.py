@@ -91,7 +91,8 @@ def grade_column(sheet: Sheet, wanted: str) -> int:
         There is none, or several and none was named.
     """
     kind = kind_of(sheet)
-    if kind in ("moodle", "other") and not wanted:
+    named = any(folded(wanted) == folded(title) for title in sheet.head)
+    if (kind == "moodle" and not named) or (kind == "other" and not wanted):
         place = sheet.column(GRADE)
         found = {} if place is None else {place: sheet.head[place]}
     else:

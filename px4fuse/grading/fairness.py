@@ -9,7 +9,7 @@ analysis changes.
 The default student hands in the report as the command makes it, without notes. The ideal one sets
 what the report advises and names the mistakes in sentences, in two wordings. The guesser names one
 to three mistakes drawn at random in the same sentences, with default and with random settings: the
-mean of eight guesses. All of them hand in honest numbers, which are taken for verified.
+mean of 32 guesses. All of them hand in honest numbers, which are taken for verified.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ WILD = 3.0
 MOST_GUESSES = 3
 # The ideal student runs again until what the report asks for is what was set
 MOST_RUNS = 3
-GUESSES = 8
+GUESSES = 32
 Request = ComparisonRequest | LoopRequest
 # Reports with their notes: what one kind of student hands in, of which the mean counts
 HandIns = tuple[tuple[Reported, str], ...]

@@ -19,7 +19,12 @@ _RULE = re.compile(
     r"(?P<rate>\d+(?:\.\d+)?)\s*%\s*/\s*(?P<unit>day|hour)"
     r"(?:\s+up to\s+(?P<most>\d+(?:\.\d+)?)\s*%)?"
 )
-_FORMATS = ("%Y-%m-%d %H:%M:%S", "%Y-%m-%d %H:%M", "%Y-%m-%d")
+# What is left of the minute or day that is named
+_REST = {
+    "%Y-%m-%d %H:%M:%S": timedelta(0),
+    "%Y-%m-%d %H:%M": timedelta(seconds=59),
+    "%Y-%m-%d": timedelta(hours=23, minutes=59, seconds=59),
+}
 # Moodle's strftimedaydatetime in English, with hours of twelve and of twenty-four
 _MOODLE_FORMATS = ("%A, %d %B %Y, %I:%M %p", "%A, %d %B %Y, %H:%M")
 
@@ -75,7 +80,8 @@ def late_rule(text: str) -> LateRule:
 def due_time(text: str) -> datetime:
     """Read a due time: ``2026-11-20 23:59``, with a zone ``+01:00`` or ``Europe/Berlin`` behind it.
 
-    Without a zone it is that of this computer; a date alone means the end of that day.
+    Without a zone it is that of this computer. A date alone means the end of that day, and a time
+    without seconds the end of that minute.
 
     Raises
     ------
@@ -89,13 +95,12 @@ def due_time(text: str) -> datetime:
     elif offset := re.search(r"(?<=:\d\d)(Z|[+-]\d\d:?\d\d)$", words[-1] if words else ""):
         words[-1] = words[-1].removesuffix(offset[0])
         zone = _zone(offset[0], text)
-    for form in _FORMATS:
+    for form, rest in _REST.items():
         try:
             found = datetime.strptime(" ".join(words), form)
         except ValueError:
             continue
-        if form == _FORMATS[-1]:
-            found += timedelta(hours=23, minutes=59, seconds=59)
+        found += rest
         return found.replace(tzinfo=zone) if zone else found.astimezone()
     raise SettingsError(
         f"--due {text!r}: give a time such as '2026-11-20 23:59' or "

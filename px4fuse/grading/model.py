@@ -84,6 +84,10 @@ class Reading:
         Least size, packed by zlib, against the text: what repeats itself packs well.
     common : float
         Least share of the five commonest words.
+    commonest : float
+        Most that one word may have.
+    terms : float
+        Most that may be words by which the rubric names mistakes.
     about : float
         Least share in sentences that hold a number or a word of the field.
     most_named : float
@@ -98,7 +102,9 @@ class Reading:
     quoted: float = 0.5
     packed: float = 0.2
     common: float = 0.06
-    about: float = 0.2
+    commonest: float = 0.2
+    terms: float = 0.4
+    about: float = 0.35
     most_named: float = 4
 
 

@@ -71,7 +71,7 @@ PARTS: Mapping[str, str] = {
     "axes.*.kf": "the consistency of the filter",
     "clock": "the clock offset",
     "loop.closure_error_m": "the closure error",
-    "loop.closures": "the closures and what the gate says of them",
+    "loop.path_length_m": "the length of the path",
     "loop.corrections": "the corrected paths",
     "tuning": "the noises that the data ask for",
     "tuning.horizontal.held_out.gain_nats": "what tuning would still gain",

@@ -28,12 +28,15 @@ QUOTE_WORDS = 7
 DENIES_BEFORE, DENIES_AFTER = 3, 3
 # "no outliers, gaps or jumps": shorter parts of a sentence go with the part before them
 SHORT_CLAUSE = 4
+SHORT = 2
 # Combinations of words that are looked at in one sentence
 MAX_TRIES = 500
 # Below so many words nothing can be said about how often the commonest come
 MIN_COUNTED = 80
 COMMONEST = 5
 MIN_PACKED_BYTES = 600
+# Words of so many letters ("late", "rate", "offset") stand in any text
+COMMON_LETTERS = 4, 6
 # From so many words with letters of other scripts in them that is no slip
 MANY_DISGUISED = 3
 
@@ -203,12 +206,14 @@ class Notes:
             return "denied"
         if any(first < at < last for at in denying) or known.reassurances & said:
             return "denied" if one_clause else "open"
+        # "I looked at everything: nothing wrong" leaves nothing open
+        denies = known.negations.intersection(words[at] for at in chosen)
+        unsettling = known.negations if denies else known.negations | known.doubts
         unclear = (
             any(at < first or at <= last + DENIES_AFTER for at in denying),
-            any(words[at] in known.doubts for at in same if at < first)
-            and not known.negations.intersection(words[at] for at in chosen),
+            any(words[at] in known.doubts for at in same if at < first) and not denies,
             sentence.text.rstrip().endswith(("?", "？", "؟")),
-            goes_on and before & (known.negations | known.doubts),
+            goes_on and before & unsettling,
         )
         return "open" if any(unclear) else "claimed"
 
@@ -273,10 +278,11 @@ def _problem(
         return ""
     packed = " ".join(words).encode()
     spaced = [word for word in words if not NO_SPACES.match(word)]
-    common = sum(count for _, count in Counter(spaced).most_common(COMMONEST))
+    common = [count for _, count in Counter(spaced).most_common(COMMONEST)] or [0]
+    field = {term for term in terms if not COMMON_LETTERS[0] <= len(term) <= COMMON_LETTERS[1]}
     about = sum(
         one.length for one in notes.sentences
-        if any(any(c.isdigit() for c in word) or _is_term(word, terms) for word in one.words)
+        if any(any(c.isdigit() for c in word) or _is_term(word, field) for word in one.words)
     )  # fmt: skip
     broken = (
         (
@@ -292,8 +298,17 @@ def _problem(
         (notes.words < rules.in_sentences * length, "are mostly not sentences"),
         (
             len(spaced) >= max(MIN_COUNTED, len(words) // 2)
-            and common < rules.common * len(spaced),
+            and sum(common) < rules.common * len(spaced),
             "are words without the small ones that make sentences of them",
+        ),
+        (
+            len(spaced) >= MIN_COUNTED and common[0] > rules.commonest * len(spaced),
+            "hold one word again and again",
+        ),
+        (
+            length >= MIN_COUNTED
+            and sum(_is_term(word, terms) for word in words) > rules.terms * len(words),
+            "are mostly words for mistakes",
         ),
         (
             about < rules.about * notes.words,
@@ -337,6 +352,8 @@ def _whole(sentence: Sentence, rules: Reading, ids: Collection[str]) -> bool:
 
 
 def _runs(words: Sequence[str]) -> Iterator[tuple[str, ...]]:
+    """Words in a row, whatever their numbers."""
+    words = ["0" if word[0].isdigit() else word for word in words]
     for at in range(len(words) - QUOTE_WORDS + 1):
         yield tuple(words[at : at + QUOTE_WORDS])
 
@@ -351,8 +368,13 @@ def _quoted(sentence: Sentence, runs: Collection[tuple[str, ...]]) -> bool:
 
 
 def _begins(word: str, stem: str) -> bool:
-    """Whether a word begins like this one; in scripts that do not part words, holds it."""
-    return stem in word if NO_SPACES.match(stem) else word.startswith(stem)
+    """Whether a word begins like this one; in scripts that do not part words, holds it.
+
+    Two letters are a word of their own: "no" is not the beginning of "nothing".
+    """
+    if NO_SPACES.match(stem):
+        return stem in word
+    return word == stem if len(stem) <= SHORT else word.startswith(stem)
 
 
 def _weight(word: str) -> int:

@@ -234,7 +234,13 @@ def _grades(made: Class, texts: Mapping[int, str]) -> tuple[dict[str, bytes], tu
     notes: list[str] = []
     for sheet in made.worksheets:
         filled = exports.filled(sheet, made.entries, made.register, made.column, texts)
-        contents[sheet.path.name] = filled.sheet.content()
+        name = next(
+            name
+            for number in itertools.count(1)
+            if (name := f"{sheet.path.stem}{f'-{number}' if number > 1 else ''}{sheet.path.suffix}")
+            not in contents
+        )
+        contents[name] = filled.sheet.content()
         notes += filled.notes
     platforms = seen(made.origins.values())
     if "moodle" in platforms:
@@ -244,7 +250,7 @@ def _grades(made: Class, texts: Mapping[int, str]) -> tuple[dict[str, bytes], tu
             text = exports.plain_grades(
                 platform, made.title, made.entries, made.origins, made.register, texts
             )
-            contents[f"{platform}.csv"] = text.encode()
+            contents[f"plain_{platform}.csv"] = text.encode()
     return contents, tuple(notes)
 
 
