@@ -105,9 +105,8 @@ class Marked:
     def words(self) -> str:
         """Against what the logs were held."""
         return (
-            f"Baseline: {self.same} logs are in it, {self.by_vehicle} were held against "
-            f"{MIN_FLIGHTS} or more flights of their vehicle, {self.neither} could not be held "
-            "against anything."
+            f"Held against the baseline: {self.same} by the same log, {self.by_vehicle} by "
+            f"{MIN_FLIGHTS} or more flights of the vehicle; {self.neither} with neither there."
         )
 
 
