@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import signal
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
@@ -175,3 +176,10 @@ def file_stem(name: str, sha256: str) -> str:
     'Flug_3-abababababab'
     """
     return f"{re.sub(r'[^A-Za-z0-9_.-]+', '_', Path(name).stem)[:60]}-{sha256[:12]}"
+
+
+def dask_setup(worker: object) -> None:
+    """Begin a worker of this computer, as Dask calls a module that it preloads."""
+    del worker
+    # Ctrl-C in a terminal reaches all its processes; it is for the one that ends the others
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
