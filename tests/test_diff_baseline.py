@@ -89,7 +89,10 @@ def test_a_log_that_fails_now_is_worse():
 @pytest.mark.parametrize(
     ("values", "said"),
     [
-        ({"sigma_z_m": 0.2}, r"SIGMA_Z found 0\.2 m, 0\.0\d+ to 0\.1\d* m expected from 12 flights"),
+        (
+            {"sigma_z_m": 0.2},
+            r"SIGMA_Z found 0\.2 m, 0\.08\d* m to 0\.11\d* m expected from 12 flights",
+        ),
         ({"ekf2_nis_mean": 0.2}, "NIS of EKF2 0.2, "),
         ({"clock_offset_s": -0.25}, r"clock offset -0\.25 s, -0\.0\d+ s to 0\.0\d+ s expected"),
         ({"rejected_share": 0.1}, "share that EKF2 rejected 0.1, "),
@@ -128,7 +131,7 @@ def test_other_vehicles_other_settings_and_few_flights_say_nothing():
 def test_flights_of_the_same_vehicle_are_rarely_called_worse():
     """Of runs of twenty flights that are as the baseline's, one in twenty may have one."""
     hits = []
-    for run in range(60):
+    for run in range(40):
         first = 1000 + 100 * run
         before = fleet(*(flight(number) for number in range(first, first + 15)))
         after = fleet(*(flight(number) for number in range(first + 50, first + 70)))
@@ -224,7 +227,7 @@ def test_a_log_is_a_test_case_which_fails_where_it_is_worse_or_failed():
 
 
 def test_names_that_xml_cannot_hold_are_written_without_what_it_cannot():
-    table = table_of([{"log": "a\x00<&\x1b\ud800.ulg", "status": "failed", "reason": "\x07no"}])
+    table = table_of([{"log": "a\x00<&\x1b.ulg", "status": "failed", "reason": "\x07no"}])
     (case,) = made(table)
     assert case.attrib["name"] == "a<&.ulg"
     assert case[0].attrib["message"] == "no"
