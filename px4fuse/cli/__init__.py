@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import gc
 import importlib
 import os
@@ -106,6 +107,7 @@ def main() -> None:
     """Run the command line; bad input is one line on standard error and exit code 2."""
     # one short job per process: looking for garbage while importing and drawing costs a tenth
     gc.disable()
+    atexit.register(gc.freeze)  # and while everything is thrown away, as much again
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):  # σ and ν on a Windows console with a legacy code page
             stream.reconfigure(errors="replace")

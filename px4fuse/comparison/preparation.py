@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from px4fuse.display import Shown
+from px4fuse.display import brief
 from px4fuse.errors import SettingsError
 from px4fuse.filter.kalman import Settings
 from px4fuse.filter.signals import (
@@ -24,8 +24,8 @@ NOT_ITS_OWN_TRUTH = Unavailable(
 )
 
 
-@dataclass(frozen=True, repr=False)
-class Prepared(Shown):
+@dataclass(frozen=True)
+class Prepared:
     """What a comparison begins with: everything but the filter's run.
 
     Attributes
@@ -45,6 +45,8 @@ class Prepared(Shown):
     lines: tuple[Axis, ...]
     notes: tuple[str, ...]
     missing: tuple[Unavailable, ...]
+
+    __repr__ = brief
 
 
 def prepare(
