@@ -15,8 +15,8 @@ from typing import Any
 import batch_tools
 import pandas as pd
 import pytest
-from click.testing import CliRunner
 from batch_tools import environment, started, tiny_log, tiny_logs
+from click.testing import CliRunner
 
 import px4fuse
 from px4fuse.cli import cli

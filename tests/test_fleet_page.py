@@ -11,9 +11,9 @@ import numpy as np
 import pandas as pd
 import pytest
 from browser import Browser, Elements, contrast
-from made_up_fleet import DAMAGED, NOT_LOGGED, STORY, VEHICLES, made_up
 from hypothesis import given
 from hypothesis import strategies as st
+from made_up_fleet import DAMAGED, NOT_LOGGED, STORY, VEHICLES, made_up
 
 from px4fuse.fleet.by_log import logs_of
 from px4fuse.fleet.page import html_text
