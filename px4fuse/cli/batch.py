@@ -134,8 +134,8 @@ def batch(
     """Compare many logs, as px4fuse compare does each, into one table.
 
     LOGS are files, folders, globs and URLs (s3://, gs://, https://, sftp://). Writes
-    fleet.parquet, fleet.csv and every log's results into DIR. A second run does only what is new,
-    and tries again what has failed; Ctrl-C keeps what is done.
+    fleet.html, fleet.csv, fleet.parquet and every log's results into DIR. A second run does only
+    what is new, and tries again what has failed; Ctrl-C keeps what is done.
     """
     if scheduler in CLUSTERS:
         click.echo(CLUSTERS[scheduler], nl=False)

@@ -19,6 +19,7 @@ from px4fuse.filter.kalman import Settings
 from px4fuse.fleet.engine import Failed, connected, outcomes
 from px4fuse.fleet.job import Job, Outcome, analyse, file_stem, identify, refused
 from px4fuse.fleet.logs import FoundLog, find_logs
+from px4fuse.fleet.page import html_text
 from px4fuse.fleet.regressions import marked
 from px4fuse.fleet.rows import FAILED, NOT_JUDGED, Row, csv_bytes, table_of
 from px4fuse.fleet.store import Store, opened
@@ -342,11 +343,13 @@ def _written(found: _Found) -> Fleet:
     if found.baseline is not None:
         held = marked(table, found.baseline)
         table, against = held.table, held.words
+    page = html_text(table, found.output.resolve().name, f"px4fuse {found.store.px4fuse}")
     parquet = io.BytesIO()
     table.to_parquet(parquet, index=False)
     contents = {
         found.output / "fleet.parquet": parquet.getvalue(),
         found.output / "fleet.csv": csv_bytes(table),
+        found.output / "fleet.html": page.encode(),
     }
     write_all(contents)
     return Fleet(table, len(found.reused), frozenset(severities), tuple(contents), against)
