@@ -59,7 +59,14 @@ class SettingsError(Px4FuseError):
 
 
 class ResultsError(Px4FuseError):
-    """A file holds no results of px4fuse, or none that this version reads."""
+    """A file holds no results of px4fuse, or none that this version reads.
+
+    ``remedy`` is what helps; "" where nothing but another file does.
+    """
+
+    def __init__(self, reason: str, remedy: str = "") -> None:
+        super().__init__(reason)
+        self.remedy = remedy
 
 
 class OutputError(Px4FuseError):

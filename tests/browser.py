@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import re
 import select
 import shutil
 import subprocess
@@ -129,6 +130,35 @@ class Browser:
         assert "exceptionDetails" not in answer, answer
         return answer["result"].get("value")
 
+    def ask_later(self, script: str) -> Any:
+        """What a promise gives."""
+        answer = self.call(
+            "Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True
+        )
+        assert "exceptionDetails" not in answer, answer
+        return answer["result"].get("value")
+
+    def contrasts(self) -> list[tuple[str, str, str]]:
+        """Colour, that of what is behind, and class of everything that shows text."""
+        return list(
+            self.ask(
+                """(() => {
+                  const behind = (node) => {
+                    for (let n = node; n; n = n.parentElement) {
+                      const colour = getComputedStyle(n).backgroundColor;
+                      if (colour !== "rgba(0, 0, 0, 0)") return colour;
+                    }
+                    return "rgb(255, 255, 255)";
+                  };
+                  return [...document.querySelectorAll(
+                    "h1, h2, small, dt, dd, th, td, .chip, .name, .file, li, label, .count,"
+                    + "figcaption, .note, button, kbd, mark"
+                  )].filter((node) => node.checkVisibility())
+                    .map((node) => [getComputedStyle(node).color, behind(node), node.className]);
+                })()"""
+            )
+        )
+
     def click(self, selector: str) -> None:
         """Where a finger would: so that it fails on what is covered or hidden."""
         x, y = self.ask(
@@ -144,17 +174,27 @@ class Browser:
             words = {"text": text} if text and kind == "keyDown" else {}
             self.call(
                 "Input.dispatchKeyEvent", type=kind, key=key, code=key,
-                windowsVirtualKeyCode={"Enter": 13, "Tab": 9}[key], **words,
+                windowsVirtualKeyCode={"Enter": 13, "Tab": 9, "Escape": 27}.get(key, ord(key[0])),
+                **words,
             )  # fmt: skip
 
     def write(self, text: str) -> None:
         self.call("Input.insertText", text=text)
 
+    def choose(self, selector: str, value: str) -> None:
+        """An option of a select."""
+        self.ask(
+            f"(() => {{ const select = document.querySelector({json.dumps(selector)});"
+            f"select.value = {json.dumps(value)};"
+            "select.dispatchEvent(new Event('change')); })()"
+        )
+
     def names(self) -> list[str]:
+        """What the table's rows are called."""
         return list(
             self.ask(
-                "[...document.querySelectorAll('.list > tbody > tr[data-status]:not([hidden])"
-                " .name')].map((name) => name.textContent)"
+                "[...document.querySelectorAll('.list > tbody > tr[data-row] .name')]"
+                ".map((name) => name.textContent)"
             )
         )
 
@@ -172,6 +212,18 @@ class Browser:
             for event in self.events
             if event["method"] == "Network.requestWillBeSent"
         }
+
+
+def contrast(one: str, other: str) -> float:
+    """Of two colours as a browser writes them, by WCAG 2."""
+
+    def luminance(colour: str) -> float:
+        parts = [int(part) / 255.0 for part in re.findall(r"\d+", colour)[:3]]
+        linear = [p / 12.92 if p <= 0.04045 else ((p + 0.055) / 1.055) ** 2.4 for p in parts]
+        return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
+
+    low, high = sorted((luminance(one), luminance(other)))
+    return (high + 0.05) / (low + 0.05)
 
 
 @pytest.fixture(scope="module")

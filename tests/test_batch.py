@@ -12,11 +12,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import fleet_tools
+import batch_tools
 import pandas as pd
 import pytest
+from batch_tools import environment, started, tiny_log, tiny_logs
 from click.testing import CliRunner
-from fleet_tools import environment, started, tiny_log, tiny_logs
 
 import px4fuse
 from px4fuse.cli import cli
@@ -207,17 +207,18 @@ def test_ctrl_c_at_a_terminal_keeps_what_is_done_and_says_so_on_one_line(
 
 
 def test_a_log_that_hangs_or_crashes_costs_that_log(client, flights, tmp_path, monkeypatch):
-    monkeypatch.setattr(run, "analyse", fleet_tools.analyse)
+    monkeypatch.setattr(run, "analyse", batch_tools.analyse)
     logs = tmp_path / "logs"
     logs.mkdir()
     for seed, name in enumerate(("hang", "crash", "well"), 1):
         (logs / f"{name}.ulg").write_bytes(tiny_log(seed))
     table = px4fuse.batch(logs, timeout_s=20.0).set_index("name")
-    assert table.loc["well", "status"].tolist() == ["done"] * 4
-    assert table.loc["hang", "reason"] == "it took longer than 20 s and was ended"
-    assert table.loc["hang", "remedy"] == "Allow more with --timeout."
-    assert "ended 3 times" in table.loc["crash", "reason"]
-    assert (table.loc[["hang", "crash"], "status"] == "failed").all()
+    assert table.loc["well.ulg", "status"].tolist() == ["done"] * 4
+    hang, crash = table.loc["hang.ulg"], table.loc["crash.ulg"]
+    assert (hang["status"], crash["status"]) == ("failed", "failed")
+    assert hang["reason"] == "it took longer than 20 s and was ended"
+    assert hang["remedy"] == "Allow more with --timeout."
+    assert "ended 3 times" in crash["reason"]
     client.wait_for_workers(2, timeout=60)
 
 
@@ -386,7 +387,7 @@ def test_a_scheduler_and_two_workers_that_run_already(flights, undisturbed, tmp_
             assert result.exit_code == 0, result.output
             table = pd.read_parquet(tmp_path / "out" / "fleet.parquet")
             assert_same(table, undisturbed)
-            path = f"{tmp_path}{os.pathsep}{fleet_tools.REPOSITORY}"
+            path = f"{tmp_path}{os.pathsep}{batch_tools.REPOSITORY}"
             with worker("third", PYTHONPATH=path):
                 result = command(*arguments)
                 assert "has px4fuse 9.9, and this is" in str(result.exception)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 
 import pytest
-from fleet_tools import act
+from batch_tools import act
 
 import px4fuse
 from px4fuse.errors import SettingsError

@@ -4,29 +4,32 @@ from __future__ import annotations
 
 import base64
 import hashlib
-import html
 import io
 import json
 import re
 import struct
+import unicodedata
 import zlib
 from pathlib import Path
 from typing import Any
 
 import pytest
-from browser import Browser, Elements
+from browser import Browser, Elements, contrast
 from hypothesis import given
 from hypothesis import strategies as st
 from pypdf import PdfReader
 
-from px4fuse.grading.class_page import MAX_CHARACTERS, STATUSES, html_text
-from px4fuse.grading.model import Graded, Item
+from px4fuse.grading.anonymous import NAME
+from px4fuse.grading.class_page import STATUSES, html_text
+from px4fuse.grading.model import Entry, Graded, Item, Override
 from px4fuse.verification.model import Difference, Verdict
+from px4fuse.webpage.safe import MAX_CHARACTERS
 
 MARKUP = '<img src=x onerror="window.alive=1"><b>bold</b>'
-BREAKOUT = "</script><script>window.alive=2</script><!-- \u2028 ]]> & &lt;"
+BREAKOUT = "</script ></script\n<script>window.alive=2</script><!-- \u2028 ]]> & &lt;"
 FORMULA = "=cmd|' /C calc'!A0"
 REVERSED = "\u202egnp.exe\u202c"
+TURNED = "\N{REPLACEMENT CHARACTER}gnp.exe\N{REPLACEMENT CHARACTER}"
 LONG = "W" * 5000
 
 
@@ -55,17 +58,37 @@ def graded(name: str, points: float | None, **more: Any) -> Graded:
     )  # fmt: skip
 
 
+def row(name: str, points: float | None, **more: Any) -> Entry:
+    """A student with one report; what Entry has goes there, the rest to the report."""
+    own = {
+        key: more.pop(key)
+        for key in ("handed_in_at", "late_s", "deduction", "overrides", "comment", "total",
+                    "pseudonym", "others", "remarks")
+        if key in more
+    }  # fmt: skip
+    one = graded(name, points, **more)
+    own["handed_in"] = own.pop("handed_in_at", "")
+    own.setdefault("total", None if points is None else one.counted)
+    return Entry(name, one.student_id, one, of=one.of, **own)
+
+
 CLASS = (
-    graded("Zoë", 18.5, id="1007", numbers={"mean NIS": 1.02}, picture=png()),
-    graded("ada", 9.0, id="1001", status="numbers differ", flags=("The same log as Zoë.",)),
-    graded("Émile", 9.0, id="1010", numbers={"mean NIS": 0.5}),
-    graded("Bo", 20.0, id="99", numbers={"mean NIS": -3.0}),
-    graded("", None, file="broken.pdf", status="cannot verify", reasons=("Not a PDF.",)),
-    graded(MARKUP, 5.0, id=FORMULA, file=BREAKOUT, flags=(MARKUP,), picture=b"<svg onload=x>",
-           notes=BREAKOUT, reasons=(BREAKOUT,), numbers={MARKUP: 1.0},
-           items=(Item(BREAKOUT, 5.0, 20.0, MARKUP),)),
-    graded(REVERSED, 8.0, id="5"),
-    graded(LONG, 7.0, id="6"),
+    row("Zoë", 18.5, id="1007", numbers={"mean NIS": 1.02}, sheets=("pages/z 1.png", "pages/2.png"),
+        mistakes={"positions that jump": True}),
+    row("ada", 9.0, id="1001", status="numbers differ", flags=("The same log as Zoë.",),
+        mistakes={"positions that jump": False, "outliers": False}, late_s=7200.0, deduction=1.0),
+    row("Émile", 9.0, id="1010", numbers={"mean NIS": 0.5}),
+    row("Bo", 20.0, id="99", numbers={"mean NIS": -3.0}),
+    row("", None, file="broken.pdf", status="cannot verify", reasons=("Not a PDF.",)),
+    row(MARKUP, 5.0, id=FORMULA, file=BREAKOUT, flags=(MARKUP,), handed_in=b"<svg onload=x>",
+        notes=BREAKOUT, reasons=(BREAKOUT,), numbers={MARKUP: 1.0}, pending=MARKUP,
+        to_read=((MARKUP, BREAKOUT),), mistakes={MARKUP: False}, remarks=(MARKUP,),
+        sheets=("//example.org/x.png",), redrawn_name="javascript:alert(1)", comment=BREAKOUT,
+        items=(Item(BREAKOUT, 5.0, 20.0, MARKUP),), handed_in_at=MARKUP,
+        overrides={BREAKOUT: Override(None, MARKUP)}),
+    row(REVERSED, 8.0, id="5"),
+    row(LONG, 7.0, id="6"),
+    Entry("Mia", "1011", None),
 )  # fmt: skip
 
 
@@ -74,6 +97,12 @@ CLASS = (
 
 def shape(text: str) -> list[tuple[str, list[str]]]:
     return [(tag, sorted(attributes)) for tag, attributes in Elements(text).found]
+
+
+def content(text: str) -> Any:
+    """What the page's script reads."""
+    (found,) = re.findall(r'<script type="application/json" id="content">(.*?)</script>', text)
+    return json.loads(found)
 
 
 def test_every_inline_block_is_what_the_policy_allows() -> None:
@@ -88,11 +117,6 @@ def test_every_inline_block_is_what_the_policy_allows() -> None:
         assert f"{tag}-src 'sha256-{digest}'" in policy
 
 
-def test_a_file_s_name_is_not_cut_at_its_first_space() -> None:
-    page = html_text([graded("Ada", 1.0)], "Class", "px4fuse")
-    assert re.search(r"\.file \{[^}]*word-break: break-all", page)
-
-
 def test_nothing_is_loaded_and_nothing_hangs_on_an_attribute() -> None:
     for tag, attributes in Elements(html_text(CLASS, "Class", "px4fuse 1")).found:
         assert tag not in ("img", "iframe", "object", "embed", "a", "base")
@@ -103,9 +127,11 @@ def test_nothing_is_loaded_and_nothing_hangs_on_an_attribute() -> None:
 @given(text=st.text(max_size=60) | st.sampled_from([MARKUP, BREAKOUT, "\0\x1b\ud800", "$title"]))
 def test_text_makes_no_elements(text: str) -> None:
     def page(word: str) -> str:
-        one = graded(
-            word, 5.0, id=word, file=word, flags=(word,), reasons=(word,), notes=word,
-            numbers={word: 1.0}, items=(Item(word, 5.0, 20.0, word),),
+        one = row(
+            word, 5.0, id=word, file=f"{word}.pdf", flags=(word,), reasons=(word,),
+            notes=f"So: {word}",
+            numbers={word: 1.0}, items=(Item(word, 5.0, 20.0, word),), mistakes={word: False},
+            pending=word, to_read=((word, word),), comment=word, pseudonym="",
         )  # fmt: skip
         return html_text([one], word, word)
 
@@ -116,14 +142,109 @@ def test_text_makes_no_elements(text: str) -> None:
 
 
 def test_an_empty_class_and_numbers_that_are_none() -> None:
-    assert "0 submissions" in html_text([], "Class", "px4fuse 1")
-    odd = graded("Odd", 3.0, numbers={"NIS": float("nan"), "gap": float("inf")})
+    assert "0 students" in html_text([], "Class", "px4fuse 1")
+    odd = row("Odd", 3.0, numbers={"NIS": float("nan"), "gap": float("inf")})
     assert "nan" not in html_text([odd], "Class", "px4fuse 1").lower().split("<script>")[0]
 
 
 def test_what_is_too_long_is_cut() -> None:
-    text = html_text([graded("x" * 10**6, 3.0, notes="y" * 10**6)], "Class", "px4fuse 1")
-    assert len(text) < 12 * MAX_CHARACTERS
+    text = html_text([row("x" * 10**6, 3.0, notes="y" * 10**6)], "Class", "px4fuse 1")
+    assert len(text) < 16 * MAX_CHARACTERS
+
+
+def test_pending_points_stand_apart_from_those_that_count() -> None:
+    entries = [
+        row("Ada", 10.0),
+        row("Bo", 20.0),
+        row("Cy", 12.0, pending="Run with px4fuse 0.1.1."),
+        row("Di", 8.0, overrides={"Notes": Override(9.0, "Good.")}, total=13.0, deduction=0.0),
+    ]
+    text = html_text(entries, "Class", "px4fuse 1")
+    assert "14.3 <small>of 20" in text  # of 10, 20 and 13
+    assert "1 <small>12 points, not counted" in text
+    cells = [row[0][3] for row in content(text)["rows"]]
+    assert cells[2] == ["pending", "", "12 proposed"]
+    assert cells[3][:3] == ["13 / 20", 13.0, "said by you"]
+    items = next(part for part in content(text)["rows"][3][2] if part[1] == "Points")
+    assert items[3][1] == ["Notes", "9", "16", "You: 4 → 9. Good. –"]
+    waits = next(part for part in content(text)["rows"][2][2] if part[1].startswith("Pending"))
+    assert waits[2] == ["Run with px4fuse 0.1.1."]
+    # of 16 points for notes those that count had 6, 16 and, as the instructor says, 9
+    assert "10.3&nbsp;/&nbsp;16" in text
+
+
+SHARED = " ".join(f"word{n}" for n in range(60))
+
+
+def test_notes_that_are_alike_stand_side_by_side() -> None:
+    entries = [
+        row("Ada", 9.0, id="1", notes=f"I begin here. {SHARED} and I end."),
+        row("Bo", 9.0, id="2", notes=f"Another start: {SHARED.upper()}."),
+        row("Cy", 9.0, id="3", notes=" ".join(f"own{n}" for n in range(60))),
+    ]
+    made = content(html_text(entries, "Class", "px4fuse 1"))["rows"]
+    (found,) = [part for part in made[0][2] if part[0] == "sides"]
+    assert re.fullmatch(r"Notes shared with Bo: \d\d%", found[1])
+    assert found[2][0] == [
+        ["Ada", False], ["I begin here. ", False], [SHARED, True], [" and I end.", False],
+    ]  # fmt: skip
+    assert found[2][1][2] == [SHARED.upper(), True]
+    assert not [part for part in made[2][2] if part[0] == "sides"]
+
+
+def test_reading_time_is_of_words_and_pages() -> None:
+    one = row("Ada", 9.0, notes="word " * 400, sheets=("pages/1.png",) * 6)
+    text = html_text([one], "Class", "px4fuse 1")
+    assert content(text)["rows"][0][0][4][1] == 5.0  # 2 minutes of notes, 3 of pages
+    assert "200 words of notes a minute" in text
+
+
+PEOPLE = (
+    ("Ada Lovelace", "10017", "Lovelace Ada_4711_assignsubmission_file_/ada report.pdf"),
+    ("Émile du Châtelet", "s-2031", "chatelet/Émile_du_Châtelet.pdf"),
+    ("王小明", "30044", "30044.pdf"),
+    ("Quirin Mikkelsen", "30055", ""),
+)
+SAYS = "With Ada and LOVELACE, s-2031 and 30044; by E\u0301mile du Cha\u0302telet, ask ada."
+
+
+def anonymous_class() -> list[Entry]:
+    entries = []
+    for number, (name, student_id, file) in enumerate(PEOPLE):
+        others = [one for one in PEOPLE if one[0] != name]
+        flag = f"The same log as {others[0][0]}, {others[0][1]} ({others[0][2] or 'x'})."
+        said = f"Your report names {name}, {student_id}. {SAYS}"
+        entry = row(
+            name, 9.0, id=student_id, file=file, flags=(flag,), reasons=(said,), pending=said,
+            notes=f"{name} ({student_id}): {SHARED} {SAYS} 王小明", to_read=((said, SAYS),),
+            numbers={f"NIS of {name}": 1.0}, items=(Item(f"For {name}", 9.0, 20.0, said),),
+            mistakes={"positions that jump": False}, comment=said, remarks=(said,),
+            overrides={f"For {name}": Override(10.0, said)},
+            others=(graded(name, 3.0, file=f"old/{file}"),),
+            sheets=("pages/0123-001-of-001.png",), redrawn_name=f"reports/{student_id}.pdf",
+            handed_in=png(), handed_in_name=f"handed_in/{student_id}.pdf", sha256="ab" * 32,
+            pseudonym=f"Student {(7 * number) % 4 + 1:03}",
+        )  # fmt: skip
+        entries.append(entry if file else Entry(name, student_id, None, pseudonym=entry.pseudonym))
+    return entries
+
+
+def test_an_anonymous_class_names_nobody() -> None:
+    text = html_text(anonymous_class(), "Class", "px4fuse 1")
+    written = unicodedata.normalize("NFC", text + json.dumps(content(text), ensure_ascii=False))
+    for name, student_id, file in PEOPLE:
+        for word in (*name.split(), student_id, *re.split(r"[/. _]", file)):
+            if len(word) > 2 and word.lower() not in ("pdf", "report", "file", "assignsubmission"):
+                assert word.casefold() not in written.casefold(), word
+    assert NAME in written
+    assert "Student 003" in written
+    # no link to a PDF, which names its student, and no picture of what was handed in
+    assert ".pdf" not in written
+    assert "data:image/png" not in written
+    assert "pages/0123-001-of-001.png" in written
+    # in the order of the pseudonyms, which says nothing of the names
+    names = [row[0][0][0] for row in content(text)["rows"]]
+    assert names == sorted(names)
 
 
 # ------------------------------------------------------------------ in a browser
@@ -131,26 +252,29 @@ def test_what_is_too_long_is_cut() -> None:
 
 @pytest.fixture
 def page(browser: Browser, tmp_path: Path) -> Browser:
+    (tmp_path / "pages").mkdir()
+    (tmp_path / "pages" / "z 1.png").write_bytes(png(7))
+    (tmp_path / "pages" / "2.png").write_bytes(png(8))
     file = tmp_path / "class.html"
     file.write_bytes(html_text(CLASS, "Navigation lab & more", "px4fuse 1").encode())
     browser.open(file)
     return browser
 
 
+HEADS = ("Student", "Id", "Status", "Points", "Handed in", "To read", "Flags", "Pages", "Notes",
+         BREAKOUT, "mean NIS", MARKUP)  # fmt: skip
+
+
 def head(title: str) -> str:
-    place = ("Student", "Id", "Status", "Points", "Flags", "Pages", "Notes", "mean NIS")
-    # Between Notes and mean NIS stands the hostile item
-    column = place.index(title) + 1 + (title == "mean NIS")
-    return f".list > thead th:nth-child({column}) button"
+    return f".list > thead th:nth-child({HEADS.index(title) + 1}) button"
 
 
 def test_sorts_both_ways_and_keeps_the_order_of_equals(page: Browser) -> None:
+    absent = ["no name", MARKUP, "Mia"]
     page.click(head("Points"))
-    up = [LONG, REVERSED, "ada", "Émile", "Zoë", "Bo", "no name"]
-    assert [name for name in page.names() if name != MARKUP] == up
-    assert page.names()[0] == MARKUP
+    assert page.names() == [LONG, TURNED, "ada", "Émile", "Zoë", "Bo", *absent]
     page.click(head("Points"))
-    assert page.names() == ["Bo", "Zoë", "ada", "Émile", REVERSED, LONG, MARKUP, "no name"]
+    assert page.names() == ["Bo", "Zoë", "ada", "Émile", TURNED, LONG, *absent]
     sorts = "[...document.querySelectorAll('thead [aria-sort]')].map((h) => h.ariaSort)"
     assert page.ask(sorts)[:5] == ["none", "none", "none", "descending", "none"]
     assert page.complaints() == []
@@ -159,14 +283,18 @@ def test_sorts_both_ways_and_keeps_the_order_of_equals(page: Browser) -> None:
 def test_sorts_text_as_people_do_and_by_keyboard(page: Browser) -> None:
     page.ask(f"document.querySelector({json.dumps(head('Id'))}).focus()")
     page.press("Enter", "\r")
-    ids = page.ask("[...document.querySelectorAll('tbody .id')].map((cell) => cell.textContent)")
-    assert ids == [FORMULA, "5", "6", "99", "1001", "1007", "1010", ""]
+    ids = page.ask(
+        "[...document.querySelectorAll('.list > tbody > tr > :nth-child(2)')]"
+        ".map((cell) => cell.textContent)"
+    )
+    assert ids == [FORMULA, "5", "6", "99", "1001", "1007", "1010", "1011", ""]
     page.click(head("Student"))
-    names = [name for name in page.names() if name in ("ada", "Bo", "Émile", "Zoë", "no name")]
-    assert names == ["ada", "Bo", "Émile", "Zoë", "no name"]
+    names = [name for name in page.names() if name in ("ada", "Bo", "Émile", "Zoë", "Mia")]
+    assert names == ["ada", "Bo", "Émile", "Mia", "Zoë"]
 
 
 def test_absent_numbers_come_last_both_ways(page: Browser) -> None:
+    page.click("[data-group='numbers']")
     page.click(head("mean NIS"))
     assert page.names()[:3] == ["Bo", "Émile", "Zoë"]
     page.click(head("mean NIS"))
@@ -184,29 +312,49 @@ def test_filters_by_text_and_status_with_a_count(page: Browser) -> None:
     page.write(" nobody")
     assert page.names() == []
     assert page.ask("document.querySelector('.none').checkVisibility()")
-    page.ask("document.querySelector('#text').value = ''")
+    page.click("#all")
+    assert len(page.names()) == len(CLASS)
     for status, names in (
         ("numbers differ", ["ada"]),
         ("flagged", ["ada", MARKUP]),
         ("cannot verify", ["no name"]),
+        ("pending", [MARKUP]),
+        ("to read", [MARKUP]),
+        ("late", ["ada"]),
+        ("nothing handed in", ["Mia"]),
     ):
-        page.ask(
-            f"(() => {{ const s = document.querySelector('#status'); s.value = '{status}';"
-            "s.dispatchEvent(new Event('change')); })()"
-        )
+        page.choose("#filter-0", status)
         assert page.names() == names
     assert page.complaints() == []
 
 
-def test_a_row_unfolds_with_its_picture(page: Browser) -> None:
+def test_who_missed_which_mistake_filters_and_opens(page: Browser) -> None:
+    told = page.ask("document.querySelector('[data-tag=\"missed:positions that jump\"]')"
+                    ".closest('li').innerText.replace(/\\s+/g, ' ')")  # fmt: skip
+    assert told == "positions that jump 1 of 2 named it Not named by ada."
+    page.click('[data-tag="missed:outliers"]')
+    assert page.names() == ["ada"]
+    assert page.ask("document.querySelector('#filter-1').value") == "missed:outliers"
+    page.click('[data-tag="missed:outliers"]')
+    assert len(page.names()) == len(CLASS)
+    page.click('[data-open="1"]')
+    assert page.ask("document.querySelector('.more').previousElementSibling.dataset.row") == "1"
+    assert page.complaints() == []
+
+
+def test_a_row_unfolds_with_all_its_pages(page: Browser) -> None:
     assert page.ask("document.images.length") == 0
     page.click("tbody tr:first-child .name")
     assert page.ask("document.querySelector('.unfold').ariaExpanded") == "true"
     assert "There." in page.ask("document.querySelector('.more').innerText")
-    page.ask("document.images[0].decode().then(() => { window.seen = true; })")
-    assert page.ask("document.images[0].naturalWidth") == 7
-    assert page.ask("document.images[0].alt") == (
-        "Page 1, drawn again from the log, of the report of Zoë"
+    page.ask("document.querySelector('.beside').scrollIntoView()")
+    widths = page.ask_later(
+        "Promise.all([...document.images].map((one) => one.decode()))"
+        ".then(() => [...document.images].map((one) => one.naturalWidth))"
+    )
+    assert widths == [7, 8]
+    assert page.ask("document.images[1].alt") == (
+        "Page 2 of the report of Zoë, drawn again from the log"
     )
     # It moves with its row, and hides with it
     page.click(head("Points"))
@@ -214,45 +362,61 @@ def test_a_row_unfolds_with_its_picture(page: Browser) -> None:
     assert page.ask(f"{before}.textContent") == "Zoë"
     page.click("#text")
     page.write("ada")
-    assert not page.ask("document.querySelector('.more').checkVisibility()")
+    assert page.ask("document.querySelector('.more') === null")
     assert page.complaints() == []
     assert page.requests() <= {"file", "data"}
 
 
+def test_keys_step_through_the_reports(page: Browser) -> None:
+    opened = "[...document.querySelectorAll('tr.open .name')].map((name) => name.textContent)"
+    for key, names in (("j", ["Zoë"]), ("n", ["ada"]), ("j", ["Émile"]), ("k", ["ada"]),
+                       ("p", ["Zoë"]), ("k", ["Zoë"])):  # fmt: skip
+        page.press(key, key)
+        assert page.ask(opened) == names
+    assert page.ask("document.activeElement.textContent") == "Zoë"
+    page.press("Escape")
+    assert page.ask(opened) == []
+    # what is typed into the search is text
+    page.press("/", "/")
+    page.press("j", "j")
+    assert page.ask("document.activeElement.id + document.activeElement.value") == "textj"
+    assert page.ask(opened) == []
+    assert "next student" in page.ask("document.querySelector('.keys').innerText")
+
+
 def test_a_page_that_differs_stands_beside_the_redrawn_one() -> None:
-    one = graded(
-        "Zoë", 18.5, picture=png(3), handed_in=png(4), page=2, redrawn_name="reports/1.pdf"
-    )
-    text = html_text([one, graded("Bo", 1.0, handed_in=png())], "Class", "px4fuse 1")
-    first, second = (
-        json.loads(found)
-        for found in re.findall(r'<script type="application/json">(.*?)</script>', text)
-    )
-    assert [said for said, _ in first["pictures"]] == [
-        "Page 2, drawn again from the log", "Page 2, as handed in: not verified",
-    ]  # fmt: skip
-    assert [base64.b64decode(content) for _, content in first["pictures"]] == [png(3), png(4)]
-    assert first["report"] == "reports/1.pdf"
-    assert [said for said, _ in second["pictures"]] == ["Page 1, as handed in: not verified"]
-    assert second["report"] == ""
+    one = row("Zoë", 18.5, sheets=("pages/1.png", "pages/2.png"), handed_in=png(4), page=2,
+              redrawn_name="reports/1.pdf", handed_in_name="handed_in/1.pdf")  # fmt: skip
+    made = content(html_text([one, row("Bo", 1.0, handed_in=png())], "Class", "px4fuse 1"))
+    both, every = (part for part in made["rows"][0][3] if part[0] == "pictures")
+    assert [said for said, *_ in both[2]] == ["Page 2 of 2", "Page 2, as handed in: not verified"]
+    assert both[2][0][2] == "pages/2.png"
+    assert base64.b64decode(both[2][1][2].split(",")[1]) == png(4)
+    assert [source for *_, source in every[2]] == ["pages/1.png", "pages/2.png"]
+    (leads,) = (part for part in made["rows"][0][3] if part[0] == "links")
+    assert [to for _, to in leads[2]] == ["reports/1.pdf", "handed_in/1.pdf"]
+    (only,) = made["rows"][1][3]
+    assert [said for said, *_ in only[2]] == ["Page 1, as handed in: not verified"]
 
 
 def test_what_students_wrote_stays_text(page: Browser) -> None:
-    for place in range(1, len(CLASS) + 1):
-        page.click(f".list > tbody > tr:nth-child({2 * place - 1}) .name")
-    assert page.names() == [one.student or "no name" for one in CLASS]
+    page.ask("[...document.querySelectorAll('.unfold')].forEach((button) => button.click())")
+    named = [TURNED if one.student == REVERSED else one.called for one in CLASS]
+    assert page.names() == named
     row = page.ask(
-        "[...document.querySelectorAll('.list > tbody > tr:nth-child(11) :is(.id, .file, li)')]"
+        "[...document.querySelectorAll('[data-row=\"5\"] :is(td:nth-child(2), .file, li)')]"
         ".map((node) => node.textContent)"
     )
-    assert row == [BREAKOUT, FORMULA, MARKUP]
-    shown = page.ask("document.querySelector('.list > tbody > tr:nth-child(12)').textContent")
-    assert shown.count(BREAKOUT) == 4  # item, reason, notes, file
-    assert shown.count(MARKUP) == 4  # flag, comment, number, name
+    assert row == [BREAKOUT, FORMULA, "2 flags", "5 proposed", MARKUP, MARKUP]
+    shown = page.ask("document.querySelector('[data-row=\"5\"]').nextSibling.textContent")
+    assert shown.count(BREAKOUT) >= 4  # reason, notes, item, what is to be judged
+    assert shown.count(MARKUP) >= 4  # flag, comment, pending, name
     assert LONG in page.ask("document.querySelector('.list > tbody').textContent")
     assert page.ask("document.querySelectorAll('b, svg[onload], img[onerror]').length") == 0
-    assert page.ask("document.images.length") == 1
-    assert page.ask("document.scripts.length") == len(CLASS) + 1
+    assert page.ask("document.images.length") == 2
+    assert page.ask("document.scripts.length") == 2
+    leads = page.ask("[...document.links].map((link) => link.protocol)")
+    assert set(leads) == {"file:"}
     assert page.ask("window.alive === undefined")
     assert page.complaints() == []
     assert page.requests() <= {"file", "data"}
@@ -267,6 +431,7 @@ def test_the_policy_stops_what_would_come_to_life(page: Browser) -> None:
     assert page.ask("window.alive === undefined")
     refusals = [c["entry"]["text"] for c in page.complaints() if "entry" in c]
     assert len([text for text in refusals if "Content Security Policy" in text]) >= 2
+    assert any("img-src" in text and "127.0.0.1" in text for text in refusals)
 
 
 def test_without_scripts_it_is_a_plain_table(browser: Browser, tmp_path: Path) -> None:
@@ -275,33 +440,36 @@ def test_without_scripts_it_is_a_plain_table(browser: Browser, tmp_path: Path) -
     browser.open(file, scripts=False)
     browser.call("Emulation.setScriptExecutionDisabled", value=False)
     assert not browser.ask("document.querySelector('.controls').checkVisibility()")
-    assert browser.ask("document.querySelectorAll('button').length") == 0
     text = browser.ask("document.body.innerText")
     for one in CLASS:
-        assert one.verdict.status in text
+        assert (one.counting.verdict.status if one.counting else "nothing handed in") in text
     assert "The same log as Zoë." in text
     assert "18.5 / 20" in text
+    assert "All rows are in class.csv." in text
 
 
 @pytest.mark.parametrize("width", [360, 800, 1400])
 def test_nothing_sticks_out_of_the_window(page: Browser, width: int) -> None:
     page.resize(width, 800)
-    page.click("tbody tr:nth-child(6) .name")
+    page.click("[data-row='5'] .name")
     assert page.ask("document.documentElement.scrollWidth") <= width
-    page.click("#items")
+    page.click("[data-group='items']")
     assert page.ask("document.documentElement.scrollWidth") <= width
 
 
 def test_printed_every_page_has_the_table_s_head(browser: Browser, tmp_path: Path) -> None:
     file = tmp_path / "class.html"
-    many = [graded(f"Student {n}", 9.0, flags=("Look here.",)) for n in range(60)]
+    many = [row(f"Student {n}", 9.0, flags=("Look here.",)) for n in range(130)]
     file.write_bytes(html_text(many, "Class", "px4fuse 1").encode())
     browser.open(file)
     printed = browser.call("Page.printToPDF", preferCSSPageSize=True)["data"]
     pages = [page.extract_text() for page in PdfReader(io.BytesIO(base64.b64decode(printed))).pages]
-    assert len(pages) > 1
-    assert all("Points" in text and "Look here." in text for text in pages)
+    listed = [text for text in pages if "Look here." in text]
+    assert len(listed) > 1
+    assert all("Points" in text for text in listed)
     assert not any("Find" in text for text in pages)
+    # all of them, not those on screen
+    assert "Student 129" in "".join(pages)
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
@@ -311,72 +479,45 @@ def test_contrast_is_enough_for_weak_eyes(page: Browser, scheme: str) -> None:
         features=[{"name": "prefers-color-scheme", "value": scheme}],
     )
     page.click("tbody tr:nth-child(2) .name")
-    pairs = page.ask(
-        """(() => {
-          const behind = (node) => {
-            for (let n = node; n; n = n.parentElement) {
-              const colour = getComputedStyle(n).backgroundColor;
-              if (colour !== "rgba(0, 0, 0, 0)") return colour;
-            }
-            return "rgb(255, 255, 255)";
-          };
-          return [...document.querySelectorAll(
-            "h1, small, dt, dd, th, td, .chip, .name, .file, li, label, .count, figcaption"
-          )].filter((node) => node.checkVisibility())
-            .map((node) => [getComputedStyle(node).color, behind(node), node.className]);
-        })()"""
-    )
+    pairs = page.contrasts()
     page.call("Emulation.setEmulatedMedia", features=[])
     assert len(pairs) > 50
     for front, back, name in pairs:
         assert contrast(front, back) >= 4.5, (front, back, name)
 
 
-def contrast(one: str, other: str) -> float:
-    def luminance(colour: str) -> float:
-        parts = [int(part) / 255.0 for part in re.findall(r"\d+", colour)[:3]]
-        linear = [p / 12.92 if p <= 0.04045 else ((p + 0.055) / 1.055) ** 2.4 for p in parts]
-        return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
-
-    low, high = sorted((luminance(one), luminance(other)))
-    return (high + 0.05) / (low + 0.05)
-
-
-def test_three_hundred_are_sorted_at_once(browser: Browser, tmp_path: Path) -> None:
+def test_three_hundred_are_one_page_of_a_megabyte(browser: Browser, tmp_path: Path) -> None:
     many = [
-        graded(
+        row(
             f"Student {n * 7 % 300}", 4.0 + n * 13 % 160 / 10.0, id=str(n),
-            status=STATUSES[n % 4], picture=png() + b"\0" * 30_000,
-            numbers={f"number {k}": float(n * k) for k in range(6)},
+            status=STATUSES[n % 4], sheets=tuple(f"pages/{n}-{k}.png" for k in range(9)),
+            numbers={f"number {k}": float(n * k) for k in range(6)}, notes="word " * 200,
             items=tuple(Item(f"item {k}", float(n % 3), 2.0, "Why.") for k in range(10)),
         )
         for n in range(300)
     ]  # fmt: skip
-    content = html_text(many, "Class", "px4fuse 1").encode()
-    assert len(content) < 15_000_000
+    text = html_text(many, "Class", "px4fuse 1").encode()
+    assert len(text) < 2_000_000
     file = tmp_path / "class.html"
-    file.write_bytes(content)
+    file.write_bytes(text)
     browser.open(file)
-    took_ms = browser.ask(
-        f"(() => {{ const start = performance.now(); document.querySelector('{head('Points')}')"
-        ".click(); document.body.offsetHeight; return performance.now() - start; })()"
-    )
-    assert took_ms < 1000.0  # 30 on a desk, and tests share their machine
+    assert len(browser.names()) == 100
+    browser.click(head("Points"))
     points = browser.ask(
-        "[...document.querySelectorAll('tbody .p')].map((cell) => Number(cell.dataset.v))"
+        "[...document.querySelectorAll('.list > tbody > tr')]"
+        ".map((row) => Number(row.cells[3].textContent.split(' /')[0]))"
     )
-    assert points == sorted(points)
-    print(f"sorting 300 rows took {took_ms:.0f} ms")
+    assert points == sorted(entry.total for entry in many if entry.total is not None)[:100]
 
 
 def test_differences_are_listed(browser: Browser, tmp_path: Path) -> None:
     apart = tuple(Difference(f"axes.{n}", "1.0", "2.0") for n in range(60))
     one = Graded("a.pdf", "Ada", "1", Verdict("numbers differ", ("60.",), True, apart))
     file = tmp_path / "class.html"
-    file.write_bytes(html_text([one], "Class", "px4fuse 1").encode())
+    file.write_bytes(html_text([Entry("Ada", "1", one)], "Class", "px4fuse 1").encode())
     browser.open(file)
     browser.click(".name")
     text = browser.ask("document.querySelector('.more').innerText")
     assert "axes.49" in text
     assert "and 10 more" in text
-    assert html.escape("axes.50") not in text
+    assert "axes.50" not in text

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 import io
 import math
 import unicodedata
@@ -11,8 +12,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from px4fuse.grading.class_table import csv_text
-from px4fuse.grading.model import Graded, Item
+from px4fuse.grading.class_table import FIRST, LAST, csv_text, neutral_id
+from px4fuse.grading.model import Entry, Graded, Item, Override
 from px4fuse.spreadsheet import MAX_CHARACTERS, neutral
 from px4fuse.verification.model import Verdict
 
@@ -28,13 +29,19 @@ texts = (
 finite = st.floats(allow_nan=False, allow_infinity=False, width=32)
 
 
-def graded(text: str, numbers: dict[str, float] | None = None, points: float = 1.0) -> Graded:
-    return Graded(
+def entry(graded: Graded, **more) -> Entry:
+    values = {"total": graded.points, "of": graded.of} | more
+    return Entry(graded.student, graded.student_id, graded, **values)
+
+
+def graded(text: str, numbers: dict[str, float] | None = None, points: float = 1.0) -> Entry:
+    one = Graded(
         submission=text, student=text, student_id=text,
         verdict=Verdict("cannot verify", (text, text), with_log=False),
         items=(Item(text, points, 2.0, text),), flags=(text, text), numbers=numbers or {},
         log_sha256="ab" * 32,
     )  # fmt: skip
+    return entry(one, others=(one,), handed_in=text, comment=text, remarks=(text, text))
 
 
 def cells(text: str, delimiter: str = ",") -> list[list[str]]:
@@ -69,14 +76,17 @@ def test_no_cell_is_live_whatever_the_program_splits_at(text: str) -> None:
 @given(st.lists(st.tuples(texts, st.dictionaries(texts, finite, max_size=3)), max_size=4))
 def test_read_back_it_is_what_was_made_safe(rows: list[tuple[str, dict[str, float]]]) -> None:
     head, *rest = cells(csv_text([graded(text, numbers) for text, numbers in rows]))
-    assert head[:6] == ["file", "student", "id", "status", "points", "of"]
-    assert head[-3:] == ["flags", "reasons", "log SHA-256"]
+    assert tuple(head[: len(FIRST)]) == FIRST
+    assert tuple(head[-len(LAST) :]) == LAST
     assert len(rest) == len(rows)
     for (text, numbers), row in zip(rows, rest, strict=True):
         assert len(row) == len(head)
-        assert row[:6] == [neutral(text)] * 3 + ["cannot verify", "1", "2"]
-        assert row[-3:] == [neutral(f"{text} | {text}")] * 2 + ["ab" * 32]
-        found = sorted(float(cell) for cell in row[6:-3] if cell)
+        said = [neutral(text)] * 2 + [neutral_id(text), "cannot verify", "1", "2", "", "1"]
+        assert row[: len(FIRST)] == said
+        both = neutral(f"{text} | {text}")
+        said = [neutral(text), "", "", neutral(text), both, both, neutral(text), both, "ab" * 32]
+        assert row[-len(LAST) :] == said
+        found = sorted(float(cell) for cell in row[len(FIRST) : -len(LAST)] if cell)
         assert found == pytest.approx(sorted([*numbers.values(), 1.0]), rel=1e-9, abs=1e-300)
 
 
@@ -115,17 +125,42 @@ def test_numbers_stay_numbers_and_what_is_none_is_empty() -> None:
         ]
     )
     head, first, second = cells(made)
-    assert head[6:-3] == ["a", "b", "NIS", "gap"]
-    assert first[4:-3] == ["0.3", "2", "0.3", "", "-0.125", ""]
-    assert second[4:-3] == ["1", "2", "", "1", "", "1e-07"]
+    own = slice(len(FIRST), -len(LAST))
+    assert head[own] == ["a", "b", "NIS", "gap"]
+    assert first[4:8] == ["0.3", "2", "", "0.3"]
+    assert first[own] == ["0.3", "", "-0.125", ""]
+    assert second[own] == ["", "1", "", "1e-07"]
 
 
 def test_items_of_one_title_keep_a_column_each() -> None:
     items = (Item("notes", 1.0, 2.0, ""), Item("notes", 2.0, 2.0, ""), Item("=x", 0.0, 1.0, ""))
     one = Graded("a.pdf", "A", "1", Verdict("verified", (), True), items)
-    head, row = cells(csv_text([one]))
-    assert head[6:-3] == ["notes", "notes (2)", "'=x"]
-    assert row[4:-3] == ["3", "5", "1", "2", "0"]
+    head, row = cells(csv_text([entry(one)]))
+    assert head[len(FIRST) : -len(LAST)] == ["notes", "notes (2)", "'=x"]
+    assert row[len(FIRST) : -len(LAST)] == ["1", "2", "0"]
+
+
+def test_late_overridden_pending_and_missing_ones_say_so() -> None:
+    items = (Item("notes", 1.0, 2.0, ""), Item("cover", 2.0, 2.0, ""))
+    one = Graded("a.pdf", "A", "0042", Verdict("verified", (), True), items)
+    said = {"cover": Override(0.5, "why")}
+    late = entry(one, late_s=5400.0, deduction=0.4, total=1.1, overrides=said, comment="see me")
+    pending = entry(dataclasses.replace(one, pending="Run 0.1.1."), total=None)
+    missing = Entry("C", "-17", None, of=4.0)
+    head, *rest = cells(csv_text([late, pending, missing]))
+    rows = [dict(zip(head, row, strict=True)) for row in rest]
+    asked = ("id", "status", "points", "deducted", "total", "cover", "hours late", "pending")
+    assert [[row[name] for name in asked] for row in rows] == [
+        ["0042", "verified", "1.5", "0.4", "1.1", "0.5", "1.5", ""],
+        ["0042", "verified", "3", "", "", "2", "", "Run 0.1.1."],
+        ["-17", "missing", "", "", "", "", "", ""],
+    ]
+    assert rows[0]["comment"] == "see me"
+
+
+@pytest.mark.parametrize("text", ["0042", "-17", "+49", "a.b@c.de", "s1", "x-y", "日本"])
+def test_ids_stay_as_they_are(text: str) -> None:
+    assert neutral_id(text) == text
 
 
 def test_a_cell_holds_no_more_than_excel_takes() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+import re
 import shutil
 import zipfile
 from pathlib import Path
@@ -16,9 +17,10 @@ from pypdf import PdfReader, PdfWriter
 
 from px4fuse.assignment.key import Answer, AnswerKey
 from px4fuse.cli import cli
-from px4fuse.grading.grade import file_names, grade, graded_from
-from px4fuse.grading.model import Graded
-from px4fuse.grading.rubric import parse_rubric, read_rubric, rubric_text
+from px4fuse.grading.grade import Outcome, grade
+from px4fuse.grading.model import Entry, Graded
+from px4fuse.grading.outputs import file_names
+from px4fuse.grading.rubric import read_rubric, rubric_text
 from px4fuse.reading import files_by_sha256
 from px4fuse.verification.model import Verdict
 
@@ -123,12 +125,38 @@ def test_only_what_changed_is_done_again(handed_in, tmp_path) -> None:
     same = grade([handed_in], [], rubric, output, processes=2)
     assert same.reused == 6
     html = (output / "class.html").read_bytes()
+    # what is known is known by its content, under any name
     (handed_in / "essay.pdf").write_bytes(REPORT.read_bytes())
-    assert grade([handed_in], [], rubric, output, processes=2).reused == 5
+    assert grade([handed_in], [], rubric, output, processes=2).reused == 6
     assert (output / "class.html").read_bytes() != html
-    other = parse_rubric(rubric_text().replace("points = 15", "points = 14"), "other.toml")
-    assert other != rubric
-    assert grade([handed_in], [], other, output, processes=2).reused == 0
+    (handed_in / "essay.pdf").write_bytes(b"%PDF-1.7\nanother one")
+    assert grade([handed_in], [], rubric, output, processes=2).reused == 5
+
+
+def test_another_rubric_scores_anew_and_verifies_nothing(handed_in, tmp_path) -> None:
+    output = tmp_path / "class"
+    rubric = read_rubric(None)
+    before = grade([handed_in], [], rubric, output, processes=2)
+    doubled = re.sub(r"(?m)^points = (\d+)", lambda m: f"points = {2 * int(m[1])}", rubric_text())
+    (tmp_path / "x.toml").write_text(doubled, encoding="utf-8")
+    after = grade([handed_in], [], read_rubric(tmp_path / "x.toml"), output, processes=2)
+    assert after.reused == 6
+    assert [one.points for one in after.graded] == pytest.approx(
+        [2 * one.points for one in before.graded], abs=0.1
+    )
+    assert max(one.points for one in after.graded) > 0.0
+
+
+def test_another_log_at_hand_verifies_again(tmp_path) -> None:
+    (tmp_path / "in").mkdir()
+    shutil.copy(REPORT, tmp_path / "in" / "a.pdf")
+    said = []
+    for logs in ([], [LOG], [LOG], []):
+        outcome = grade([tmp_path / "in"], logs, read_rubric(None), tmp_path / "out", processes=1)
+        said.append((outcome.graded[0].verdict.status, outcome.reused))
+    assert said == [
+        ("cannot verify", 0), ("verified", 0), ("verified", 1), ("cannot verify", 0)
+    ]  # fmt: skip
 
 
 def test_a_log_that_was_handed_out_and_is_not_at_hand_costs_nobody_everything(tmp_path) -> None:
@@ -197,7 +225,8 @@ def test_names_are_one_line_in_the_terminal(tmp_path, monkeypatch) -> None:
     import px4fuse.grading.grade as module
 
     one = Graded("a.pdf", "Ada\nPoints 120\n" + "A" * 100_000, "1", UNKNOWN)
-    monkeypatch.setattr(module, "grade", lambda *_, **__: module.Outcome((one,), (), 0, ()))
+    entry = Entry(one.student, one.student_id, one)
+    monkeypatch.setattr(module, "grade", lambda *_, **__: Outcome((entry,), (), 0, ()))
     monkeypatch.chdir(tmp_path)
     shutil.copy(REPORT, "a.pdf")
     result = CliRunner().invoke(cli, ["grade", "a.pdf", "-o", "out"])
@@ -225,38 +254,17 @@ def test_a_damaged_record_is_made_again(handed_in, tmp_path) -> None:
     rubric = read_rubric(None)
     first = grade([handed_in], [], rubric, output, processes=2)
     for record in (output / "records").glob("*.json"):
-        record.write_text('{"graded": {"verdict": 3}}')
-    again = grade([handed_in], [], rubric, output, processes=2)
-    assert again.reused == 0
+        record.write_text('{"made_with": {"verdict": 3}}')
+    again = grade([handed_in], [], rubric, output, processes=1)
+    # of one report there are three copies
+    assert again.reused == 2
     assert again.graded == first.graded
 
 
-def test_a_record_holds_all_of_a_grade() -> None:
-    from dataclasses import asdict
-
-    from px4fuse.grading.model import Item
-    from px4fuse.verification.model import Difference, PageDifference
-
-    whole = Graded(
-        "a.pdf", "Ada", "1",
-        Verdict("numbers differ", ("why",), True, (Difference("a.b", "1", "2"),), "differ",
-                (PageDifference(2, "its picture", 0, 0.5),)),
-        (Item("t", 1.0, 2.0, "c"),), ("flag",), {"n": 0.5}, "a", "b", "0.1", "{}", "notes",
-    )  # fmt: skip
-    values = asdict(whole)
-    for name in ("picture", "handed_in", "redrawn"):
-        del values[name]
-    del values["verdict"]["redrawn"]
-    values = json.loads(json.dumps(values))
-    assert graded_from(values) == whole
-
-
 def test_names_of_files_are_safe_and_unique() -> None:
-    names = ["12345", "12345", "../../etc/passwd", "CON", "", "a" * 300, "日本"]
-    graded = [Graded(f"{name}.pdf", "", name, UNKNOWN) for name in names]
-    found = file_names(graded)
+    found = file_names(["12345", "12345", "../../etc/passwd", "CON", "", "a" * 300, "日本"])
     assert found[:4] == ["12345", "12345-2", "______etc_passwd", "report_CON"]
-    assert len({name.lower() for name in found}) == len(found)
+    assert len({name.lower() for name in found}) == len(found) == 7
     assert all(name.replace("-", "").replace("_", "").isalnum() or set(name) <= {"_"}
                for name in found)  # fmt: skip
     assert max(map(len, found)) < 80
@@ -279,6 +287,13 @@ def test_logs_are_found_by_their_hash_not_their_name(tmp_path) -> None:
         (["grade", "in", "-o", "out", "--rubric", "missing.toml"], "missing.toml"),
         (["grade", "in", "-o", "out", "--key", "missing.json"], "missing.json"),
         (["grade", "in", "-o", "out", "--logs", "missing"], "no such file or folder"),
+        (["grade", "in", "-o", "out", "--roster", "missing"], "cannot be read"),
+        (["grade", "in", "-o", "out", "--worksheet", "missing"], "cannot be read"),
+        (["grade", "in", "-o", "out", "--late", "10%/day"], "--due"),
+        (["grade", "in", "-o", "out", "--due", "soon"], "--due"),
+        (["grade", "in", "-o", "out", "--due", "2026-11-20", "--late", "10"], "--late"),
+        (["grade", "--gradescope", "missing"], "missing"),
+        (["grade", "--write-autograder", "a.zip"], "--logs"),
     ],
 )
 def test_bad_input_is_one_line(tmp_path, monkeypatch, arguments, says) -> None:
@@ -288,7 +303,36 @@ def test_bad_input_is_one_line(tmp_path, monkeypatch, arguments, says) -> None:
     result = CliRunner().invoke(cli, arguments)
     assert result.exit_code != 0
     assert says in str(result.exception)
+    assert "\n" not in str(result.exception)
     assert not Path("out").exists()
+
+
+def test_the_options_of_a_term_reach_it(tmp_path, monkeypatch) -> None:
+    import px4fuse.grading.grade as module
+
+    given = {}
+
+    def noted(*_: object, **named: object) -> Outcome:
+        given.update(named)
+        return Outcome((), (), 0, ())
+
+    monkeypatch.setattr(module, "grade", noted)
+    monkeypatch.chdir(tmp_path)
+    shutil.copy(REPORT, "a.pdf")
+    Path("roster.csv").write_text("id,name\n0042,Jane Doe\n")
+    Path("sheet.csv").write_text("id,Grade\n0042,\n")
+    words = [
+        "grade", "a.pdf", "-o", "out", "--roster", "roster.csv", "--worksheet", "sheet.csv",
+        "--column", "Grade", "--attempt", "best", "--due", "2026-11-20 23:59 +01:00",
+        "--late", "5%/hour", "--anonymous",
+    ]  # fmt: skip
+    assert CliRunner().invoke(cli, words).exit_code == 0
+    course = given["course"]
+    assert [person.student_id for person in course.roster] == ["0042"]
+    assert course.worksheets[0].head == ("id", "Grade")
+    assert (course.column, course.anonymous, course.term.attempt) == ("Grade", True, "best")
+    assert course.term.due.isoformat() == "2026-11-20T23:59:59+01:00"
+    assert course.term.late.text == "5%/hour"
 
 
 def test_the_default_rubric_is_written_to_be_edited(tmp_path, monkeypatch) -> None:

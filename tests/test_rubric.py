@@ -7,6 +7,7 @@ import pytest
 
 from px4fuse.errors import SettingsError
 from px4fuse.findings import phrases
+from px4fuse.grading.names import NAMES
 from px4fuse.grading.rubric import parse_rubric, read_rubric, rubric_text
 from px4fuse.grading.scoring import CHECKS
 
@@ -41,7 +42,10 @@ def test_every_finding_can_be_named_and_renamed():
     """The rubric to copy lists the phrases of each finding, ready to be changed."""
     listed = re.sub(r'(?m)^# (\w+ = \["?.*\])$', r"\1", rubric_text())
     words = read_rubric(None).words
-    assert parse_rubric(listed, "x").words == words == phrases() | {"none": words["none"]}
+    others = {"none", "negation", "doubt", "reassurance", "contrast", "closure_accepted", "topic"}
+    assert parse_rubric(listed, "x").words == words
+    assert words == phrases() | {name: words[name] for name in others}
+    assert set(NAMES) >= set(phrases())
 
 
 def test_words_of_the_default_stay_unless_replaced(tmp_path):
@@ -100,6 +104,11 @@ BAD = {
     "too many": (NOTES * 101, "at most 100"),
     "words are text": ('words = "x"\n' + NOTES, "[words]"),
     "words hold numbers": (NOTES + "[words]\nsource_gap = [1]", "[words]: source_gap"),
+    "notes is a number": ("notes = 1\n" + NOTES, "[notes] is not a table"),
+    "unknown rule for notes": (NOTES + "[notes]\nbeauty = 1", "[notes]: unknown key 'beauty'"),
+    "rule for notes is text": (NOTES + '[notes]\npacked = "x"', "packed cannot be 'x'"),
+    "others' log": ('others_log = "maybe"\n' + NOTES, "others_log cannot be 'maybe'"),
+    "pages": ('pages = "maybe"\n' + NOTES, "pages cannot be 'maybe'"),
     "unverified": ('unverified = "maybe"\n' + NOTES, "unverified cannot be 'maybe'"),
 }
 

@@ -9,24 +9,21 @@ import re
 from pathlib import Path
 
 import pytest
+from notes_samples import ENGLISH, HONEST
 from results_tools import EXAMPLE, LOOP, SHA256, changed, correction, decoded, finding
 
 from px4fuse.assignment.key import Answer, AnswerKey
 from px4fuse.errors import ResultsError
+from px4fuse.grading.evidence import values_at
+from px4fuse.grading.feedback import feedback
 from px4fuse.grading.flags import chosen_settings, class_flags, own_flags
-from px4fuse.grading.model import Graded
+from px4fuse.grading.model import Graded, Item
+from px4fuse.grading.names import NAMES
 from px4fuse.grading.rubric import parse_rubric, read_rubric
-from px4fuse.grading.scoring import (
-    Notes,
-    feedback,
-    gradescope,
-    score,
-    score_refused,
-    values_at,
-)
+from px4fuse.grading.scoring import assess, refused, score
 from px4fuse.results.contract import to_plain
 from px4fuse.verification.intake import read_report
-from px4fuse.verification.model import Report, Verdict
+from px4fuse.verification.model import Refused, Report, Verdict
 from px4fuse.verification.verification import verify
 
 ROOT = Path(__file__).parent.parent
@@ -46,7 +43,7 @@ def checked(check, results=EXAMPLE, pages=PAGES, /, verdict=VERIFIED, key=None, 
     """Share of the points and comment of one check."""
     given = "\n".join(f"{name} = {json.dumps(value)}" for name, value in parameters.items())
     rubric = parse_rubric(f'[[item]]\ntitle = "T"\npoints = 1\ncheck = "{check}"\n{given}', "x")
-    rubric = dataclasses.replace(rubric, unverified="score", words=WORDS)
+    rubric = dataclasses.replace(rubric, words=WORDS)
     (item,) = score(report(results, pages), verdict, rubric, key)
     assert item.comment.endswith(".")
     assert "\n" not in item.comment
@@ -110,57 +107,46 @@ class TestSections:
 
 class TestNotes:
     def test_length(self):
-        long = " ".join(f"word{number}" for number in range(150))
-        assert checked("notes", noted(long))[0] == 1.0
-        points, comment = checked("notes", noted("five words of my own"))
+        points, comment = checked("notes", noted(ENGLISH))
+        assert (points, comment) == (1.0, "Your notes have 180 words.")
+        points, comment = checked("notes", noted("Five words of my own."))
         assert points == pytest.approx(5 / 150, abs=0.01)
-        assert "5 words; 150" in comment
+        assert "5 words in sentences of your own; 150" in comment
 
-    def test_one_word_again_and_again_is_not_enough(self):
-        points, comment = checked("notes", noted("word " * 500))
-        assert points < 0.1
-        assert "only 1 different" in comment
+    def test_one_sentence_again_and_again_counts_once(self):
+        points, comment = checked("notes", noted("The gap lasts 5 s. " * 3))
+        assert points == pytest.approx(5 / 150, abs=0.01)
+        assert "5 words" in comment
 
     @pytest.mark.parametrize("notes", ["", "  \n"])
     def test_none(self, notes):
         assert checked("notes", noted(notes))[0] == 0.0
 
-    def test_languages_without_spaces_count(self):
-        assert Notes("การวัดตำแหน่งมีสัญญาณรบกวนสูงกว่าที่ตั้งไว้").words >= 8
-        assert Notes("測定値のノイズが大きい").words >= 5
-
     def test_notes_of_a_loop(self):
         assert "5 words" in checked("notes", noted("Five words of my own", LOOP))[1]
-
-    def test_words_belong_together_within_a_sentence(self):
-        notes = Notes("The clock is fine. Positions come late.\n- Stamps are 0.2 s later")
-        assert not notes.mention(["clock late"])
-        assert notes.mention(["stamp late"])
-        assert notes.mention(["outlier", "fine"])
-
-    def test_no_before_a_word_denies_it(self):
-        notes = Notes("There are no outliers, and the gap is not long")
-        assert notes.mention(["outlier"])
-        assert not notes.mention(["outlier"], affirmed=True)
-        assert notes.mention(["gap"], affirmed=True)
 
 
 class TestFindings:
     def test_none_left(self):
-        assert checked("findings")[0] == 1.0
+        assert checked("findings", noted("I looked at all pages of it."))[0] == 1.0
+        assert checked("findings")[0] == 0.0
 
     def test_named_by_id_by_words_or_not(self):
         late = finding("source_clock_offset", "error")
         both = {"findings": [GAP, late]}
-        points, comment = checked("findings", noted("source_gap: see below.", **both))
+        assert checked("findings", noted("source_gap: see below.", **both))[0] == 0.0
+        explained = noted("source_gap at 40 s, where an anchor had no power.", **both)
+        points, comment = checked("findings", explained)
         assert points == 0.5
-        assert "source_clock_offset" in comment
+        assert "source_clock_offset" not in comment
+        assert "position stamps that are early or late" in comment
         text = "UWB was silent for 5 s. The stamps come late by 0.2 s."
         assert checked("findings", noted(text, **both))[0] == 1.0
 
     def test_what_is_ignored_or_mild_is_not_asked_for(self):
         ignored = finding("ekf2_unavailable")
-        assert checked("findings", changed(findings=[ignored]))[0] == 1.0
+        said = noted("I looked at all pages of it.", findings=[ignored])
+        assert checked("findings", said)[0] == 1.0
         assert checked("findings", severities=["info"])[0] == 0.0
 
 
@@ -281,6 +267,18 @@ class TestClock:
         assert points == 1.0
         assert "fly" not in comment.replace("flight", "")
 
+    def test_a_clock_that_jumps_has_no_single_offset(self):
+        late = {"clock__applied_s": 0.25, "student__id": "s01"}
+        own = key("source_stamps_of_arrival")
+        assert checked("clock", changed(**late), key=own)[0] == 0.5
+        said = noted("The clock jumps by 0.1 s at 30 s.", **late)
+        assert checked("clock", said, key=own)[0] == 1.0
+        assert checked("clock", said, key=key("source_gap"))[0] == 0.0
+        found = noted(
+            "The clock jumps at 30 s.", **late, findings=[finding("source_clock_changes")]
+        )
+        assert checked("clock", found)[0] == 1.0
+
 
 class TestLoop:
     def test_corrected(self):
@@ -356,34 +354,75 @@ class TestMistakes:
 
     def test_named_shown_missed(self):
         two = key("source_gap", "source_outliers")
-        notes = noted("Outliers at 20 s.", student__id="S01 ")
+        notes = noted("There are outliers at 20 s.", student__id="S01 ")
         points, comment = checked("mistakes", notes, key=two)
         assert points == 0.5
-        assert "source_gap" in comment
+        assert "a time without positions" in comment
+        assert "source_gap" not in comment
         shown = noted("Outliers at 20 s.", student__id="s01", findings=[GAP])
-        assert checked("mistakes", shown, key=two)[0] == 0.62
+        assert checked("mistakes", shown, key=two, in_report=0.25)[0] == 0.62
         both = noted("Outliers at 20 s and a gap at 40 s.", student__id="s01")
         assert checked("mistakes", both, key=two)[0] == 1.0
 
-    def test_a_list_of_everything_finds_half(self):
-        text = "Outliers. Gap. Clock offset. Clock jump. Yaw error. Logging rate."
-        points, comment = checked("mistakes", noted(text, student__id="s01"), key=key("source_gap"))
-        assert points == 0.5
-        assert "kinds of mistakes" in comment
+    def test_a_wrong_claim_costs_what_a_right_one_earns(self):
+        own = key("source_gap", "source_outliers")
+        both = "The UWB was silent for 5 s. There are outliers at 20 s."
+        wrong = f"{both} The stamps come late by 0.2 s."
+        more = f"{wrong} The position frame is rotated by 20 degrees."
+        shares = [
+            checked("mistakes", noted(text, student__id="s01"), key=own)[0]
+            for text in (both, wrong, more)
+        ]
+        assert shares == [1.0, 0.5, 0.0]
+        comment = checked("mistakes", noted(wrong, student__id="s01"), key=own)[1]
+        assert "The stamps come late by 0.2 s." in comment
+        listed = {"findings": [GAP, finding("source_outliers")], "student__id": "s01"}
+        assert checked("findings", noted(both, **listed), key=own)[0] == 1.0
+        assert checked("findings", noted(wrong, **listed), key=own)[0] == 0.5
+        # what belongs to a mistake is no other one
+        related = f"{both} EKF2 rejects them. It did not fuse anything in between."
+        assert checked("mistakes", noted(related, student__id="s01"), key=own)[0] == 1.0
+
+    def test_a_list_of_everything_earns_nothing(self):
+        text = (
+            "There are outliers. The UWB was silent for a while. The stamps come late. The "
+            "position frame is rotated. The IMU was logged slowly."
+        )
+        given = noted(text, student__id="s01")
+        for check in ("mistakes", "notes", "findings"):
+            points = checked(check, given | {"findings": [GAP]}, key=key("source_gap"))[0]
+            assert points == 0.0, check
+        made = assess(report(given), VERIFIED, read_rubric(None), key("source_gap"))
+        assert any("5 kinds of mistakes" in flag for flag in made.flags)
+
+    def test_subjects_are_no_claims_where_others_are_touched_upon_too(self):
+        own = key("source_clock_offset")
+        subject = "The clock offset is 0.2 s in this log."
+        assert checked("mistakes", noted(subject, student__id="s01"), key=own)[0] == 1.0
+        more = f"{subject} The heading error is 2 degrees. The IMU rate is 100 Hz."
+        assert checked("mistakes", noted(more, student__id="s01"), key=own)[0] == 0.0
+        made = assess(report(noted(more, student__id="s01")), VERIFIED, read_rubric(None), own)
+        assert made.to_read == (
+            ("May name position stamps that are early or late, which the log has.", subject),
+        )
+        plain = f"{more} The stamps come late by 0.2 s."
+        assert checked("mistakes", noted(plain, student__id="s01"), key=own)[0] == 1.0
 
     def test_clock_that_was_mended_counts_as_shown(self):
         own = key("source_clock_offset", truth={"clock_offset_to_add_s": -0.25})
         mended = noted("", student__id="s01", settings__clock_offset_s=-0.24)
-        assert checked("mistakes", mended, key=own)[0] == 0.25
-        assert checked("mistakes", noted("", student__id="s01"), key=own)[0] == 0.0
+        assert checked("mistakes", mended, key=own, in_report=0.25)[0] == 0.25
+        unmended = noted("", student__id="s01")
+        assert checked("mistakes", unmended, key=own, in_report=0.25)[0] == 0.0
 
     def test_nothing_wrong(self):
         def points(text):
-            return checked("mistakes", noted(text, student__id="s01"), key=key())[0]
+            given = noted(text, student__id="s01")
+            return checked("mistakes", given, key=key(), in_report=0.25)[0]
 
         assert points("I looked and found no mistakes, and no outliers.") == 1.0
         assert points("") == 0.25
-        assert points("There are outliers.") == 0.0
+        assert points("There are outliers.") == -1.0
 
     def test_another_log_an_unknown_id_and_no_id(self):
         other = key("source_gap", sha256="c" * 64)
@@ -391,8 +430,6 @@ class TestMistakes:
         assert points == 0.0
         assert "s01.ulg" in comment
         assert checked("mistakes", noted("A gap.", student__id="zz"), key=other)[0] == 0.0
-        # the log says which flight it is
-        assert checked("mistakes", noted("A gap."), key=key("source_gap"))[0] == 1.0
 
     def test_ids_without_their_leading_zeros(self):
         answers = AnswerKey("aisle", (Answer("0042", "", "", SHA), Answer("7", "", "", "b" * 64)))
@@ -410,26 +447,63 @@ class TestScore:
         assert sum(item.of for item in items) == 100
         assert 50 < sum(item.points for item in items) < 80
 
-    def test_refuted_reports_get_nothing_unless_the_rubric_says_so(self):
-        rubric = read_rubric(None)
-        for status in ("numbers differ", "other log"):
-            verdict = Verdict(status, ("SIGMA_A is 0.5",), with_log=True)
-            items = score(report(), verdict, rubric, None)
-            assert {item.points for item in items} == {0.0}
-            assert all("SIGMA_A is 0.5" in item.comment for item in items)
-            assert all("px4fuse wrote" not in item.comment for item in items)
-            kept = score(report(), verdict, dataclasses.replace(rubric, unverified="score"), None)
-            assert kept[0].points == 0.0
-            assert sum(item.points for item in kept) > 40
+    def test_refuted_reports_get_nothing(self):
+        verdict = Verdict("numbers differ", ("SIGMA_A is 0.5",), with_log=True)
+        made = assess(report(), verdict, read_rubric(None), None)
+        assert {item.points for item in made.items} == {0.0}
+        assert all("SIGMA_A is 0.5" in item.comment for item in made.items)
+        assert made.pending == ""
 
-    def test_unverified_report_keeps_its_points_as_a_proposal(self):
-        verdict = Verdict("cannot verify", ("no log",), with_log=False)
-        items = score(report(), verdict, read_rubric(None), None)
-        assert items[0].points == 0.0
-        assert sum(item.points for item in items) > 40
+    @pytest.mark.parametrize("status", ["other log", "cannot verify"])
+    def test_what_cannot_be_verified_is_pending_unless_the_rubric_says_so(self, status):
+        rubric = read_rubric(None)
+        verdict = Verdict(status, ("no log",), False, remedy="Add a.ulg to --logs.")
+        made = assess(report(), verdict, rubric, None)
+        assert made.items[0].points == 0.0
+        assert sum(item.points for item in made.items) > 30
+        assert made.pending == "Add a.ulg to --logs."
+        zero = assess(report(), verdict, dataclasses.replace(rubric, unverified="zero"), None)
+        assert {item.points for item in zero.items} == {0.0}
+        assert zero.pending == ""
+
+    @pytest.mark.parametrize(
+        ("student_id", "said"),
+        [("s02", "given to s01, the report gives the id s02"),
+         ("s77", "given to s01, the report gives the id s77"),
+         ("", "given to s01, the report gives no id")],
+    )  # fmt: skip
+    def test_somebody_else_s_log_is_pending_unless_the_rubric_says_so(self, student_id, said):
+        rubric, given = read_rubric(None), noted("A gap of 5 s.", student__id=student_id)
+        made = assess(report(given), VERIFIED, rubric, key("source_gap"))
+        assert said in made.pending
+        for rule, counts, points in (("zero", True, False), ("count", True, True)):
+            rubric = dataclasses.replace(rubric, others_log=rule)
+            made = assess(report(given), VERIFIED, rubric, key("source_gap"))
+            assert (made.pending == "") == counts
+            assert any(item.points for item in made.items) == points
+        mine = noted("A gap of 5 s.", student__id="s01")
+        assert assess(report(mine), VERIFIED, read_rubric(None), key("source_gap")).pending == ""
+        # the platform says whose it is
+        nameless = report(noted("A gap of 5 s."))
+        made = assess(nameless, VERIFIED, read_rubric(None), key("source_gap"), "s01")
+        assert made.pending == ""
+
+    def test_a_log_that_nobody_was_given(self):
+        answers = key("source_gap", sha256="c" * 64)
+        made = assess(report(noted("", student__id="s01")), VERIFIED, read_rubric(None), answers)
+        assert "Ask for a report on the log that was handed out" in made.pending
+
+    def test_altered_pages(self):
+        verdict = Verdict("verified", (), True, page_status="differ")
+        rubric = read_rubric(None)
+        assert assess(report(), verdict, rubric, None).pending == ""
+        waiting = assess(report(), verdict, dataclasses.replace(rubric, pages="pending"), None)
+        assert "redrawn" in waiting.pending
+        none = assess(report(), verdict, dataclasses.replace(rubric, pages="zero"), None)
+        assert {item.points for item in none.items} == {0.0}
 
     def test_refused_file_has_every_item_with_nothing(self):
-        items = score_refused(read_rubric(None), None, "not a PDF")
+        items = refused(read_rubric(None), None, Refused("not a PDF")).items
         assert sum(item.of for item in items) == 100
         assert {item.points for item in items} == {0.0}
 
@@ -463,7 +537,7 @@ class TestScore:
                 continue
             read += 1
             for item in score(found, VERIFIED, rubric, key("source_gap")):
-                assert 0.0 <= item.points <= item.of
+                assert -item.of <= item.points <= item.of
                 assert len(item.comment) < 1500
                 assert item.comment.isprintable()
             own_flags(found.results)
@@ -487,6 +561,13 @@ class TestScore:
 def graded(items=(), **values):
     given = {"submission": "a.pdf", "student": "Ann Lee", "student_id": "1001"}
     return Graded(**{**given, "verdict": VERIFIED, "items": tuple(items), **values})
+
+
+def test_pending_points_do_not_count():
+    items = (Item("T", 3.0, 5.0, "Why."),)
+    assert (graded(items).points, graded(items).counted) == (3.0, 3.0)
+    waiting = graded(items, pending="Add uwb.csv to --logs.")
+    assert (waiting.points, waiting.counted) == (3.0, None)
 
 
 class TestWhatStudentsRead:
@@ -520,26 +601,32 @@ class TestWhatStudentsRead:
         assert "\x1b" not in text
         assert "=cmd|' /C calc'!A0 <script>" in text
 
-    def test_gradescope(self):
+    def test_points_that_are_pending_are_said_to_be(self):
         items = score(report(), VERIFIED, read_rubric(None), None)
-        made = json.loads(json.dumps(gradescope(graded(items, flags=("copied",)))))
-        assert made["score"] == pytest.approx(sum(test["score"] for test in made["tests"]))
-        assert made["output_format"] == "text"
-        assert made["visibility"] == "after_published"
-        *shown, hidden = made["tests"]
-        assert len(shown) == len(items)
-        for test in shown:
-            assert {"name", "score", "max_score", "output"} <= set(test)
-            assert test["visibility"] == "after_published"
-        assert hidden["visibility"] == "hidden"
-        assert "copied" not in made["output"]
+        text = feedback(graded(items, pending="Add uwb.csv to --logs."))
+        assert "pending: they do not count yet" in text
+        assert "--logs" not in text
 
-    def test_gradescope_of_a_refused_file(self):
-        verdict = Verdict("cannot verify", ("Not a PDF.",), with_log=False)
-        made = gradescope(graded(verdict=verdict))
-        assert made["score"] == 0.0
-        assert made["tests"] == []
-        assert "Not a PDF." in made["output"]
+    def test_words_never_ids(self):
+        """Whatever is missing is told in words; paths and ids are the program's own."""
+        wrong = [finding(name, "error") for name in read_rubric(None).words if name in NAMES]
+        spoilt = [
+            changed(findings=wrong, student__notes="It is a flight of 5 s.", tuning={}, clock=NONE),
+            changed(
+                LOOP,
+                findings=wrong,
+                student__notes="Very short notes.",
+                loop__closure_error_m=...,
+                loop__known_end=NONE,
+                loop__closures=[],
+            ),
+            noted("There are outliers at 5 s.", student__id="s01", findings=wrong),
+        ]
+        for results in spoilt:
+            for answers in (None, key(*NAMES), key()):
+                for item in score(report(results), VERIFIED, read_rubric(None), answers):
+                    left = re.sub(r"px4fuse_\w+", "", item.comment)
+                    assert not re.search(r"[a-z]+_[a-z]+|\w\.\*|\w\.[a-z]", left), item.comment
 
 
 # ------------------------------------------------------------------ flags
@@ -646,6 +733,28 @@ class TestClassFlags:
         made = class_flags([of(1, notes=own), of(2, notes=changed_), of(3, notes=text_of(3))])
         assert set(made) == {0, 1}
         assert "whole passages" in made[0][0]
+
+    @pytest.mark.parametrize(
+        "disguise",
+        [
+            lambda text: text.translate(str.maketrans("aeopcx", "аеорсх")),  # Cyrillic
+            lambda text: text.replace("o", "o\u200b").replace("r", "r\u2060"),
+            lambda text: text.translate({ord("a") + n: 0x1D41A + n for n in range(26)}),  # bold
+            lambda text: text.replace("o", "ο").replace("a", "а").replace("i", "і"),
+            lambda text: text.replace(" ", "").upper(),
+            lambda text: " ".join(text[at : at + 3] for at in range(0, len(text), 3)),
+            lambda text: text.replace("e", "e\u0301").replace(" ", "\u3164"),
+        ],
+    )
+    def test_disguised_copies(self, disguise):
+        made = class_flags([of(1, notes=ENGLISH), of(2, notes=disguise(ENGLISH))])
+        assert set(made) == {0, 1}
+        share = int(re.search(r"(\d+)% of both", made[0][0])[1])
+        assert share >= 95
+
+    def test_notes_on_one_lab_in_other_words_are_no_copies(self):
+        notes = list(HONEST.values())
+        assert class_flags([of(n, notes=text) for n, text in enumerate(notes)]) == {}
 
     def test_short_notes_and_a_template_are_not(self):
         assert class_flags([of(1, notes="All is well."), of(2, notes="All is well.")]) == {}

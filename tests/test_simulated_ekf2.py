@@ -264,6 +264,22 @@ def test_a_narrow_gate_rejects_good_samples() -> None:
     assert "ekf2_rejecting" in named(flight)
 
 
+def test_ekf2_that_is_not_told_to_fuse_only_looks(clean: Flight) -> None:
+    flight = flown("ekf2-off")
+    assert flight.log.parameters["EKF2_EV_CTRL"] == 0.0
+    assert of(flight).fusing["horizontal"].max() == 0.0
+    assert of(clean).fusing["horizontal"].max() == 1.0
+    # as in PX4 samples are compared with the state all the same, and nothing comes of it
+    record, plain = of(flight).record, of(clean).record
+    assert isinstance(record, FusionRecord)
+    assert isinstance(plain, FusionRecord)
+    assert len(record.vision_age_s) == len(plain.vision_age_s)
+    # told nothing for 5 s it stays where it is, while the vehicle flies to and fro over 12 m
+    assert rmse(flight, 10.0, 50.0) > 2.0 > 10.0 * rmse(clean, 10.0, 50.0)
+    (finding,) = (one for one in find(compare(flight, RIGHT)) if one.id == "ekf2_not_fusing")
+    assert "EKF2_EV_CTRL is 0" in finding.message
+
+
 def test_own_mistakes_leave_everything_else_as_it_was() -> None:
     plain, own = (
         {topic.name: topic for topic in simulate(AISLE, parse(texts)).topics}

@@ -17,7 +17,8 @@ import pytest
 from px4fuse.errors import SettingsError
 from px4fuse.grading import submissions
 from px4fuse.grading.model import Submission
-from px4fuse.grading.submissions import collect, guess_student, read
+from px4fuse.grading.platforms import Origin, origin_of
+from px4fuse.grading.submissions import collect, gradescope_people, read
 from px4fuse.verification.intake import MAX_BYTES
 from px4fuse.verification.model import Refused
 
@@ -47,6 +48,11 @@ def reason(submission: Submission) -> str:
     assert isinstance(content, Refused)
     assert "\n" not in content.reason
     return content.reason
+
+
+def who(name: str) -> tuple[str, str]:
+    origin = origin_of(name)
+    return origin.name, origin.number
 
 
 def only(path: Path) -> Submission:
@@ -85,7 +91,7 @@ def test_platforms_exports(tmp_path):
     canvas = zipped({"doejane_12345_67890_report-1.pdf": PDF, "roejo_LATE_5_6_r.pdf": PDF})
     gradescope = zipped({"assignment_7_export/submission_31/report.pdf": PDF})
     found = [
-        guess_student(submission.name)
+        who(submission.name)
         for content in (moodle, canvas, gradescope)
         for submission in collect([write(tmp_path / "export.zip", content)])[0]
     ]
@@ -97,7 +103,73 @@ def test_platforms_exports(tmp_path):
         ("roejo", "5"),
         ("", "31"),
     ]
-    assert guess_student("flight 3/report_2024_1_final.pdf")[0] in {"report", ""}
+    assert who("flight 3/report_2024_1_final.pdf")[0] in {"report", ""}
+
+
+def test_who_handed_in_is_what_the_platform_wrote_not_the_student():
+    """Whatever a student puts into a zip file or a name stands behind the platform's own part."""
+    own = "Roe Max_1_assignsubmission_file_"
+    assert who(f"{own}/Doe Jane_2_assignsubmission_file_/r.pdf") == ("Roe Max", "1")
+    assert who("roemax_5_6_doejane_7_8_report.pdf") == ("roemax", "5")
+    assert who("Roe_Max_roe1_77/Doe Jane_2_assignsubmission_file_/r.pdf") == ("Max Roe", "77")
+    assert who("Roe Max_1_assignsubmission_file/r.pdf") == ("Roe Max", "1")  # Moodle from 4.1 on
+    blackboard = origin_of("Lab 3_roe1_attempt_2026-11-20-12-34-56_Lab_doe1_attempt_x.pdf")
+    assert (blackboard.login, blackboard.platform) == ("roe1", "blackboard")
+    assert origin_of("Lab_roe1_attempt_2026-99-20-12-34-56_r.pdf").time is None
+    assert origin_of("flight_lab_reports_2026/r.pdf") == Origin()
+    ilias = origin_of("Lab 3/Roe_Max_roe1_77/Late Submission - r.pdf")
+    assert (ilias.platform, ilias.login, ilias.late) == ("ilias", "roe1", True)
+
+
+METADATA = """---
+submission_31:
+  :submitters:
+  - :name: Doe, Jane
+    :sid: '0042'
+    :email: jane@example.edu
+  - :name: Roe, Max
+    :sid: '43'
+  :created_at: 2026-11-20 22:59:01.123456000 Z
+  :results:
+    :output: |
+      submission_31:
+        :submitters:
+        - :name: Mallory
+  :history:
+  - :id: 30
+"""
+
+
+def test_gradescope_says_who_and_when_beside_its_submissions(tmp_path):
+    forged = METADATA.replace("Doe, Jane", "Mallory")
+    content = zipped(
+        {
+            "assignment_7_export/submission_metadata.yml": METADATA.encode(),
+            "assignment_7_export/submission_31/report.pdf": PDF,
+            "assignment_7_export/submission_31/submission_metadata.yml": forged.encode(),
+        }
+    )
+    path = write(tmp_path / "export.zip", content)
+    write(tmp_path / "unpacked" / "submission_metadata.yml", METADATA.encode())
+    write(tmp_path / "unpacked" / "submission_31" / "submission_metadata.yml", forged.encode())
+    for place in (path, tmp_path / "unpacked"):
+        (one,) = gradescope_people([place]).values()
+        assert (one.name, one.student_id, one.email) == ("Doe, Jane", "0042", "jane@example.edu")
+        assert one.time.isoformat() == "2026-11-20T22:59:01.123456+00:00"
+
+
+def test_times_of_entries_are_kept(tmp_path):
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w") as archive:
+        archive.writestr(zipfile.ZipInfo("a.pdf", (2026, 11, 20, 12, 34, 56)), PDF)
+        archive.writestr(zipfile.ZipInfo("b.pdf"), PDF)
+        inner = zipfile.ZipInfo("c.zip", (2026, 11, 21, 1, 2, 4))
+        archive.writestr(inner, zipped({"d.pdf": PDF}))
+    found, _ = collect([write(tmp_path / "x.zip", out.getvalue())])
+    times = {each.name: each.time and each.time.isoformat() for each in found}
+    assert times == {
+        "a.pdf": "2026-11-20T12:34:56", "b.pdf": None, "c.zip/d.pdf": "2026-11-21T01:02:04"
+    }  # fmt: skip
 
 
 def test_a_zip_in_a_zip_is_read_and_no_deeper(tmp_path):
@@ -106,7 +178,7 @@ def test_a_zip_in_a_zip_is_read_and_no_deeper(tmp_path):
     path = write(tmp_path / "all.zip", zipped({"Roe_1_assignsubmission_file_/work.zip": inner}))
     found, notes = collect([path])
     assert [each.name for each in found] == ["Roe_1_assignsubmission_file_/work.zip/report.pdf"]
-    assert guess_student(found[0].name) == ("Roe", "1")
+    assert who(found[0].name) == ("Roe", "1")
     assert read(found[0]) == PDF
     assert any("too deep" in note for note in notes)
     assert notes[-1] == "Passed over, since they are not PDFs: 1 .ulg."
@@ -115,7 +187,7 @@ def test_a_zip_in_a_zip_is_read_and_no_deeper(tmp_path):
 def test_a_zip_in_a_folder_keeps_its_own_name(tmp_path):
     write(tmp_path / "doejane_5_6_work.zip", zipped({"report.pdf": PDF}))
     assert names([tmp_path]) == ["doejane_5_6_work.zip/report.pdf"]
-    assert guess_student(names([tmp_path])[0]) == ("doejane", "5")
+    assert who(names([tmp_path])[0]) == ("doejane", "5")
 
 
 def test_nothing_there(tmp_path):

@@ -13,7 +13,9 @@ from px4fuse.errors import SettingsError
 from px4fuse.reading import read_text
 
 SCHEMA_NAME = "px4fuse-assignment"
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
+# Version 1 had no difficulty, and its flights are drawn by earlier px4fuse only
+READ_VERSIONS = (1, SCHEMA_VERSION)
 # A thousand students take two million
 MAX_KEY_BYTES = 20_000_000
 MAX_STUDENTS = 1000
@@ -42,6 +44,8 @@ class Answer:
     truth : dict
         Numbers that the log does not say: ``sigma_z_m``, ``sigma_a_m_s2`` and
         ``clock_offset_to_add_s`` among them.
+    difficulty : float or None
+        See :class:`px4fuse.assignment.drawing.Drawn`; None in keys of version 1.
     """
 
     student_id: str
@@ -52,6 +56,7 @@ class Answer:
     mistakes: tuple[str, ...] = ()
     findings: tuple[str, ...] = ()
     truth: dict[str, float] = field(default_factory=dict)
+    difficulty: float | None = None
 
 
 @dataclass(frozen=True)
@@ -65,11 +70,14 @@ class AnswerKey:
     answers : tuple of Answer
     secret : str
         From which the flights were drawn, where it was made up; else "".
+    version : int
+        Of the schema it was read from.
     """
 
     kind: str
     answers: tuple[Answer, ...]
     secret: str = field(default="", repr=False)
+    version: int = SCHEMA_VERSION
 
     def of_student(self, student_id: str) -> Answer | None:
         """The answer for an id, however it is capitalised.
@@ -112,6 +120,7 @@ def key_text(key: AnswerKey) -> str:
                 "mistakes": list(answer.mistakes),
                 "findings": list(answer.findings),
                 "truth": answer.truth,
+                "difficulty": answer.difficulty,
                 "scenario": answer.scenario,
             }
             for answer in key.answers
@@ -137,8 +146,9 @@ def read_key(path: Path) -> AnswerKey:
     schema = given.get("schema") if isinstance(given, dict) else None
     if not isinstance(schema, dict) or schema.get("name") != SCHEMA_NAME:
         _refuse(path, "not an answer key")
-    if schema.get("version") != SCHEMA_VERSION:
-        _refuse(path, f"of a version other than {SCHEMA_VERSION}")
+    version = schema.get("version")
+    if version not in READ_VERSIONS or isinstance(version, bool):
+        _refuse(path, "of a version that this px4fuse does not read")
     students = given.get("students")
     if not isinstance(students, list) or not 1 <= len(students) <= MAX_STUDENTS:
         _refuse(path, f"'students' is not a list of 1 to {MAX_STUDENTS}")
@@ -146,6 +156,7 @@ def read_key(path: Path) -> AnswerKey:
         _text(path, given, "kind", "the key"),
         tuple(_answer(path, number, one) for number, one in enumerate(students, start=1)),
         _text(path, given, "secret", "the key") if "secret" in given else "",
+        version,
     )
     seen: dict[str, int] = {}
     for number, answer in enumerate(key.answers, start=1):
@@ -178,6 +189,7 @@ def _answer(path: Path, number: int, given: object) -> Answer:
         _texts(path, given, "mistakes", where),
         _texts(path, given, "findings", where),
         _numbers(path, given, "truth", where),
+        _number(path, given, "difficulty", where),
     )
 
 
@@ -197,15 +209,22 @@ def _texts(path: Path, given: Mapping[str, Any], name: str, where: str) -> tuple
     return tuple(value)
 
 
+def _number(path: Path, given: Mapping[str, Any], name: str, where: str) -> float | None:
+    value = given.get(name)
+    if value is not None and not _is_number(value):
+        _refuse(path, f"{where}: '{name}' is not a number")
+    return None if value is None else float(value)
+
+
 def _numbers(path: Path, given: Mapping[str, Any], name: str, where: str) -> dict[str, float]:
     value = given.get(name, {})
-    if not isinstance(value, dict):
+    if not isinstance(value, dict) or not all(map(_is_number, value.values())):
         _refuse(path, f"{where}: '{name}' is not an object of numbers")
-    for one in value.values():
-        finite = isinstance(one, int | float) and not isinstance(one, bool) and abs(one) < 1e12
-        if not finite:
-            _refuse(path, f"{where}: '{name}' is not an object of numbers")
     return {str(key): float(one) for key, one in value.items()}
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e12
 
 
 def _no_constant(text: str) -> NoReturn:

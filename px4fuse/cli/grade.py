@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import click
 
@@ -32,6 +32,38 @@ if TYPE_CHECKING:
 @path_option("--key", metavar="FILE.json", help="Answer key of px4fuse simulate --assignment.")
 @path_option("-o", "--output", metavar="DIR", help="Folder for the class table and the feedback.")
 @click.option("--title", default="Class", show_default=True, help="Of the class page.")
+@path_option(
+    "--roster", metavar="FILE.csv", help="Everyone in the class.  [default: those of --key]"
+)
+@click.option(
+    "--attempt",
+    type=click.Choice(["latest", "best", "first"]),
+    default="latest",
+    show_default=True,
+    help="Which of a student's files counts.",
+)
+@click.option(
+    "--due",
+    metavar="TIME",
+    help="When it was due: '2026-11-20 23:59', in this computer's time zone or with "
+    "'+01:00' or 'Europe/Berlin' behind it. Platforms' times without a zone are in the same.",
+)
+@click.option(
+    "--late",
+    metavar="RULE",
+    help="What being late costs: '10%/day' or '10%/day up to 50%' of all points, per started day.",
+)
+@path_option(
+    "--worksheet",
+    multiple=True,
+    metavar="FILE.csv",
+    help="Moodle's grading worksheet, Canvas's gradebook or Blackboard's grades as exported: a "
+    "copy with the grades filled in is written. May be repeated.",
+)
+@click.option("--column", default="", metavar="TITLE", help="Of the worksheets, for the grade.")
+@click.option(
+    "--anonymous", is_flag=True, help="The class page shows pseudonyms; names.csv says whose."
+)
 @click.option(
     "--jobs",
     type=click.IntRange(1, 256),
@@ -42,6 +74,12 @@ if TYPE_CHECKING:
 @path_option(
     "--write-rubric", metavar="FILE.toml", help="Write the default rubric, to edit it, and stop."
 )
+@path_option(
+    "--write-autograder",
+    metavar="FILE.zip",
+    help="Write an autograder for Gradescope, with --logs, --key, --rubric and --late, and stop.",
+)
+@path_option("--gradescope", metavar="DIR", help="Run inside that autograder, on its folder.")
 def grade(
     submissions: tuple[Path, ...],
     logs: tuple[Path, ...],
@@ -49,24 +87,50 @@ def grade(
     key: Path | None,
     output: Path | None,
     title: str,
+    roster: Path | None,
+    attempt: Literal["latest", "best", "first"],
+    due: str | None,
+    late: str | None,
+    worksheet: tuple[Path, ...],
+    column: str,
+    anonymous: bool,
     jobs: int | None,
     write_rubric: Path | None,
+    write_autograder: Path | None,
+    gradescope: Path | None,
 ) -> None:
     """Verify and score reports: PDFs, folders of them, and zip files of learning platforms.
 
-    Writes class.csv, class.html, one feedback text per student and Gradescope's results.json into
-    DIR. A second run does again only what has changed. What students hand in is read within bounds
-    of time and memory, and nothing in it is executed.
+    Writes class.csv, class.html, a feedback text per student and files that learning platforms
+    import into DIR. What you write into its overrides.csv (id, item or total, points, comment)
+    counts and is never written over. A second run verifies again only what has changed, so that
+    a new rubric takes seconds. What students hand in is read within bounds of time and memory, and
+    nothing in it is executed.
     """
+    from px4fuse.grading.entries import Term
+    from px4fuse.grading.grade import Course
     from px4fuse.grading.grade import grade as grade_all
+    from px4fuse.grading.lateness import due_time, late_rule
+    from px4fuse.grading.roster import people_of_sheet
     from px4fuse.grading.rubric import read_rubric, rubric_text
+    from px4fuse.grading.sheet import read_sheet
 
     if write_rubric is not None:
-        if write_rubric.exists():
-            raise OutputError(f"{write_rubric}: exists already; it was not overwritten.")
-        write_outputs({write_rubric: rubric_text().encode()})
-        click.echo(f"Wrote    {write_rubric}")
+        _write_new(write_rubric, rubric_text().encode())
         return
+    rule = late_rule(late) if late else None
+    if gradescope is not None:
+        from px4fuse.grading.autograding import run_autograder
+
+        run_autograder(gradescope, rule)
+        return
+    if write_autograder is not None:
+        from px4fuse.grading.autograding import autograder_zip
+
+        _write_new(write_autograder, autograder_zip(logs, rubric, key, rule))
+        return
+    if rule is not None and due is None:
+        raise SettingsError("--late: say with --due when it was due.")
     if not submissions:
         raise SettingsError("nothing to grade: give PDFs, folders or zip files.")
     if output is None:
@@ -87,6 +151,13 @@ def grade(
 
         answers = read_key(key)
     chosen = read_rubric(rubric)
+    course = Course(
+        None if roster is None else people_of_sheet(read_sheet(roster)),
+        tuple(map(read_sheet, worksheet)),
+        column,
+        Term(attempt, due_time(due) if due else None, rule),
+        anonymous,
+    )
     try:
         with progress() as step:
             outcome = grade_all(
@@ -95,6 +166,7 @@ def grade(
                 chosen,
                 output,
                 key=answers,
+                course=course,
                 title=title,
                 processes=jobs,
                 progress=partial(step, "grading"),
@@ -103,6 +175,13 @@ def grade(
         left = "but what is graded is kept. The same command goes on from there."
         raise Interrupted(stopped, left) from None
     _print(outcome)
+
+
+def _write_new(path: Path, content: bytes) -> None:
+    if path.exists():
+        raise OutputError(f"{path}: exists already; it was not overwritten.")
+    write_outputs({path: content})
+    click.echo(f"Wrote    {path}")
 
 
 def _print(outcome: Outcome) -> None:
@@ -115,22 +194,33 @@ def _print(outcome: Outcome) -> None:
 
     console = terminal()
     table = plain_table(
-        ("submission", "left"), ("student", "left"), ("status", "left"), ("points", "right"),
+        ("student", "left"), ("submission", "left"), ("status", "left"), ("points", "right"),
         ("flags", "right"),
     )  # fmt: skip
-    for one in outcome.graded:
-        style = "green" if one.status == "verified" else "yellow"
+    for entry in outcome.entries:
+        one = entry.counting
+        status = one.status if one else "missing"
+        if one and entry.total is None:
+            status += ", pending"
+        style = "green" if status == "verified" else "yellow"
+        total = "–" if entry.total is None else f"{entry.total:g}"
+        flags = len(entry.remarks) + (len(one.flags) if one else 0)
         table.add_row(
-            Text(one.submission),
-            Text(one_line(one.student or one.student_id, 60)),
-            Text(one.status, style),
-            f"{one.points:g} / {one.of:g}" if one.items else "–",
-            f"{len(one.flags)}" if one.flags else "",
+            Text(one_line(entry.student or entry.student_id, 60)),
+            Text(one.submission if one else ""),
+            Text(status, style),
+            f"{total} / {entry.of:g}",
+            f"{flags}" if flags else "",
         )
     console.print(table)
     counts = Counter(one.status for one in outcome.graded)
     said = ", ".join(f"{count} {status}" for status, count in counts.most_common())
-    say(console, f"{len(outcome.graded)} submissions: {said}; {outcome.reused} as before")
+    missing = sum(entry.counting is None for entry in outcome.entries)
+    say(
+        console,
+        f"{len(outcome.graded)} submissions: {said or 'none'}; {missing} of "
+        f"{len(outcome.entries)} students handed in nothing; {outcome.reused} as verified before",
+    )
     for note in outcome.notes:
         say(console, Text(note, "dim"))
     for path in outcome.written:

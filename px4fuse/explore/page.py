@@ -2,11 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import hashlib
-import json
-import unicodedata
-from html import escape
 from importlib.metadata import version
 from importlib.resources import files
 from string import Template
@@ -20,6 +15,8 @@ from px4fuse.explore.figures import document_json
 from px4fuse.explore.packing import Packer
 from px4fuse.findings.model import Finding
 from px4fuse.request import ComparisonRequest
+from px4fuse.webpage.safe import clean, escaped, inert_json, policy_hash
+from px4fuse.webpage.safe import part as shared
 
 # Longer text from a log is cut
 MAX_CHARACTERS = 2000
@@ -55,11 +52,11 @@ def html_text(flights: list[Explored]) -> str:
     }
     names = " and ".join(one["log"] for one in data)
     return Template(_file("page.html")).substitute(
-        {f"{name}_hash": _hash(text) for name, text in scripts.items()},
+        {f"{name}_hash": policy_hash(text) for name, text in scripts.items()},
         **scripts,
-        style=_file("page.css"),
-        title=escape(_text(names)),
-        made_with=escape(f"px4fuse {version('px4fuse')}"),
+        style=shared("base.css") + _file("page.css"),
+        title=escaped(names),
+        made_with=escaped(f"px4fuse {version('px4fuse')}"),
         content=inert_json(_plain(content)),
         document=inert_json(document),
         arrays=packer.text(),
@@ -78,33 +75,14 @@ def _bokeh() -> str:
     return Resources(mode="inline", components=["bokeh"]).js_raw[0]
 
 
-def _hash(text: str) -> str:
-    """What the content security policy allows: this very text."""
-    return base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
-
-
-def _text(text: str) -> str:
-    """Text from a log without what a page cannot hold, and without what turns its direction."""
-    text = text if len(text) <= MAX_CHARACTERS else text[:MAX_CHARACTERS] + "…"
-    return "".join(
-        c if c in "\n\t" or unicodedata.category(c) not in ("Cc", "Cf", "Cs") else "�" for c in text
-    )
-
-
-def inert_json(value: object) -> str:
-    """JSON in which an HTML parser finds nothing: no <, > or &, and ASCII only."""
-    text = json.dumps(value, ensure_ascii=True, allow_nan=False, separators=(",", ":"))
-    return text.replace("<", r"\u003c").replace(">", r"\u003e").replace("&", r"\u0026")
-
-
 def _plain(value: Any) -> Any:
     """Numbers of numpy as Python's, and every text without what a page cannot hold."""
     if isinstance(value, dict):
-        return {_text(str(name)): _plain(part) for name, part in value.items()}
+        return {clean(str(name), MAX_CHARACTERS): _plain(part) for name, part in value.items()}
     if isinstance(value, (list, tuple)):
         return [_plain(part) for part in value]
     if isinstance(value, str):
-        return _text(value)
+        return clean(value, MAX_CHARACTERS)
     return value.item() if hasattr(value, "item") else value
 
 
@@ -130,5 +108,5 @@ def _panels(number: int, data: dict[str, Any]) -> str:
         for name, title in PANELS
         if name != "error" or truth
     ]
-    head = f'<h2 dir="auto">{escape(_text(data["log"]))}</h2>'
+    head = f'<h2 dir="auto">{escaped(data["log"])}</h2>'
     return f'<section class="flight">{head}{"".join(shown)}</section>'

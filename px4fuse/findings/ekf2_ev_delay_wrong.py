@@ -66,8 +66,8 @@ def _detect(analysis: Analysis) -> Found:
 DETECTOR = Detector(
     _detect,
     {
-        "ekf2_ev_delay_wrong": "ekf2_ev_delay, ev_delay, delay, clock offset, time offset, "
-        "stamp late, stamp early, latency",
+        "ekf2_ev_delay_wrong": "ev_delay wrong, ev_delay should, delay wrong, ekf2_ev_delay, "
+        "ev_delay, delay, clock offset, time offset, stamp late, stamp early, latency",
     },
-    {"ekf2_ev_delay_wrong": ("--mistake ekf2-delay=120ms", "--mistake ekf2-delay=175ms")},
+    {"ekf2_ev_delay_wrong": tuple(f"--mistake ekf2-delay={ms}ms" for ms in (120, 150, 175))},
 )

@@ -122,7 +122,8 @@ def _horizon_s(comparison: Comparison) -> float:
 DETECTOR = Detector(
     _detect,
     {
-        "ekf2_not_fusing": "not fus, never fus, ekf2 fus",
-        "ekf2_fusion_interrupted": "fusion interrupt, ekf2 fus, stopped fusing",
+        "ekf2_not_fusing": "not fus, never fus, ekf2_ev_ctrl, ekf2_aid_mask",
+        "ekf2_fusion_interrupted": "fusion interrupt, stopped fusing, stops fusing",
     },
+    {"ekf2_not_fusing": ("--mistake ekf2-off",)},
 )

@@ -56,5 +56,5 @@ DETECTOR = Detector(
         "logging_rate_low": "logging rate, logged slow, imu rate, imu slow, sample rate, "
         "sampling rate, sensor_combined",
     },
-    {"logging_rate_low": ("--mistake imu-rate=20",)},
+    {"logging_rate_low": ("--mistake imu-rate=40", "--mistake imu-rate=20")},
 )

@@ -83,7 +83,7 @@ DETECTOR = Detector(
     },
     {
         "false_loop_closure": tuple(
-            f"--kind loop --mistake open-end={metres}m" for metres in (3, 5, 8)
+            f"--kind loop --mistake open-end={metres}m" for metres in (3, 4, 5, 8)
         )
     },
 )

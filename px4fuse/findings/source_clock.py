@@ -118,7 +118,9 @@ DETECTOR = Detector(
         "stamp jump, timestamp change, timestamp jump, timesync",
     },
     {
-        "source_clock_offset": tuple(f"--mistake clock-offset={ms}ms" for ms in (40, 80, 120, 250)),
+        "source_clock_offset": tuple(
+            f"--mistake clock-offset={ms}ms" for ms in (40, 80, 120, 150, 200, 250)
+        ),
         "source_clock_changes": tuple(f"--mistake clock-jump={ms}ms" for ms in (150, 250, 400)),
     },
 )

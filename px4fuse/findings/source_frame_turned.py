@@ -92,5 +92,5 @@ DETECTOR = Detector(
         "ekf2_heading_wrong": "heading drift, heading wander, heading change, yaw drift, "
         "heading not constant, magnetometer, mag heading, compass",
     },
-    {"source_frame_turned": tuple(f"--mistake yaw={degrees}" for degrees in (10, 20, 30))},
+    {"source_frame_turned": tuple(f"--mistake yaw={degrees}" for degrees in (10, 15, 20, 30))},
 )

@@ -300,9 +300,10 @@ DETECTOR = Detector(
         "kf_variance_understated": "understat, variance too small, variance small, nis above, "
         "nis high, overconfident",
         "ekf2_variance_overstated": "ekf2 overstat, ekf2 variance, ekf2_evp_noise, ekf2 nis",
-        "ekf2_variance_understated": "ekf2 understat, ekf2 variance, ekf2_evp_noise, ekf2 nis",
+        "ekf2_variance_understated": "ekf2 understat, ekf2 variance, ekf2_evp_noise, ekf2 nis, "
+        "ekf2 overconfident",
     },
     {
-        "ekf2_variance_understated": ("--mistake ekf2-noise=4cm", "--mistake ekf2-noise=3cm"),
+        "ekf2_variance_understated": tuple(f"--mistake ekf2-noise={cm}cm" for cm in (4, 3)),
     },
 )

@@ -79,9 +79,14 @@ def connected(
     """
     try:
         import dask  # noqa: PLC0415 - of the extra `batch`
+        from dask.utils import parse_bytes  # noqa: PLC0415
         from distributed import Client, LocalCluster, default_client  # noqa: PLC0415
     except ImportError as error:
         raise SettingsError('many logs require Dask. Run pip install "px4fuse[batch]".') from error
+    try:
+        limit = memory if memory == "auto" else parse_bytes(memory)
+    except ValueError as error:
+        raise SettingsError(f"`memory` {memory}: not a size. Give one like 2GB.") from error
     if scheduler is not None:
         try:
             client = Client(scheduler, timeout=CONNECT_S)
@@ -107,7 +112,7 @@ def connected(
         LocalCluster(
             n_workers=workers,
             threads_per_worker=1,
-            memory_limit=memory,
+            memory_limit=limit,
             dashboard_address=None,
             # its web server starts all the same, and warns where its usual port is taken
             scheduler_kwargs={"dashboard_address": "127.0.0.1:0"},
@@ -222,10 +227,10 @@ def _late(
     latest_s: float,
 ) -> list[str]:
     """Workers whose job began before a time; keeps account of what each began, and when."""
-    order = {str(future.key): number for number, future in enumerate(running)}
+    known = {str(future.key) for future in running}
     late = []
     for address, keys in client.processing().items():
-        ours = sorted(order.keys() & set(map(str, keys)), key=order.__getitem__)
+        ours = [key for key in map(str, keys) if key in known]  # as they were handed out
         if not ours:
             begun.pop(address, None)
             continue

@@ -1,52 +1,82 @@
-"""A class as one self-contained page, in which nothing that a student wrote comes to life.
+"""A class as one web page: a student per row, and on top what an instructor asks.
 
-The page's only script and style are allowed by their hash, and nothing else is: no network, no
-markup from data. Rows stand in the page as escaped text; what a row unfolds to is JSON, which the
-script puts into the page as text.
+Nothing that a student wrote comes to life: see :mod:`px4fuse.webpage`. Pictures of redrawn pages
+and PDFs stand in folders beside the page and are loaded as they are unfolded.
 """
 
 from __future__ import annotations
 
 import base64
-import hashlib
-import json
 import math
 import posixpath
-import re
-import statistics
-import unicodedata
+from collections import Counter
 from collections.abc import Sequence
-from html import escape
-from importlib.resources import files
-from string import Template
-from typing import Any, get_args
+from dataclasses import dataclass
+from typing import get_args
 
+from px4fuse.grading.anonymous import Veil
+from px4fuse.grading.class_questions import Copied, above
 from px4fuse.grading.class_table import distinct, item_points, number
-from px4fuse.grading.model import Graded
+from px4fuse.grading.flags import copied_notes
+from px4fuse.grading.model import Entry, Graded, Override
+from px4fuse.grading.passages import shared_passages
 from px4fuse.verification.model import Status
+from px4fuse.webpage.frame import (
+    Cell,
+    Column,
+    Part,
+    Row,
+    figure,
+    links,
+    listed,
+    page,
+    pairs,
+    pictures,
+    prose,
+    sides,
+    tabled,
+    words,
+)
+from px4fuse.webpage.safe import local_link
 
-STATUSES: tuple[str, ...] = (*get_args(Status), "page differs")
+MISSING = "nothing handed in"
+STATUSES: tuple[str, ...] = (*get_args(Status), "page differs", MISSING)
+LOOKS = {
+    "verified": "good",
+    "numbers differ": "bad",
+    "other log": "odd",
+    "cannot verify": "open",
+    "page differs": "odd",
+    MISSING: "open",
+}
 SIGNS = {
     "verified": "✓",
     "numbers differ": "≠",
     "other log": "⇄",
     "cannot verify": "?",
     "page differs": "≠",
+    MISSING: "–",
 }
-BINS = 10
-# Of one submission, on the page; all of it stands in the CSV and the report
+# Of one submission, on the page; all of it stands in the report
 MAX_DIFFERENCES = 50
-MAX_CHARACTERS = 20_000
+MAX_COPIES = 3
 PNG = b"\x89PNG\r\n\x1a\n"
+# Reading time: words a minute of notes in a language that may be the reader's second, and of a page
+WORDS_PER_MINUTE = 200.0
+MINUTES_PER_PAGE = 0.5
+SHOWN = (
+    "verified", "numbers differ", "other log", "cannot verify", "page differs", MISSING, "pending",
+    "to read", "flagged", "late", "said by you",
+)  # fmt: skip
 
 
-def html_text(graded: Sequence[Graded], title: str, made_with: str) -> str:
+def html_text(entries: Sequence[Entry], title: str, made_with: str) -> str:
     """Lay out a class as one HTML file.
 
     Parameters
     ----------
-    graded : sequence of Graded
-        With their pictures, of which each takes four thirds of its size.
+    entries : sequence of Entry
+        One per student. Where they have pseudonyms, no name, id or file's name is on the page.
     title : str
     made_with : str
         Name and version of the program.
@@ -54,214 +84,317 @@ def html_text(graded: Sequence[Graded], title: str, made_with: str) -> str:
     Returns
     -------
     str
-        Write it as UTF-8. The same for the same input: no dates.
+        Write it as UTF-8. The same for the same input: no dates of today.
     """
-    template = files("px4fuse.grading").joinpath("class_page.html").read_text(encoding="utf-8")
+    named = not entries or not all(entry.pseudonym for entry in entries)
+    if not named:
+        entries = sorted(entries, key=lambda entry: entry.pseudonym)
+    veil = Veil(entries)
+    copied = _copied(entries)
+    graded = [one for entry in entries if (one := entry.counting)]
     items = tuple(dict.fromkeys(name for one in graded for name in item_points(one)))
     numbers = tuple(dict.fromkeys(name for one in graded for name in one.numbers))
     # The folder or zip file that all are in says nothing in a row
     common = posixpath.commonprefix([one.submission for one in graded]).rpartition("/")
     shared = len(common[0] + common[1])
-    return Template(template).substitute(
-        style_hash=_hash_of("style", template),
-        script_hash=_hash_of("script", template),
-        title=_safe(title),
-        made_with=_safe(made_with),
-        count=len(graded),
-        submissions="submission" if len(graded) == 1 else "submissions",
-        summary=_summary(graded),
-        histogram=_histogram(graded),
-        options=_options(graded),
-        item_heads=_heads(items, "i"),
-        number_heads=_heads(numbers, "x"),
-        rows="\n".join(_row(one, items, numbers, shared) for one in graded),
-        details="\n".join(_details(one) for one in graded),
+    timed = any(entry.handed_in or entry.late_s for entry in entries)
+    layout = _Layout(items, numbers, shared, timed, named)
+    minutes = {at: reading_minutes(entry.counting) for at, entry in enumerate(entries)}
+    return page(
+        title=title,
+        subtitle=f"{len(entries)} {'student' if len(entries) == 1 else 'students'}, graded with "
+        f"{made_with}",
+        above=above(entries, veil, copied, minutes),
+        noun=("student", "students"),
+        columns=(
+            Column("Student"),
+            *[Column("Id", "line", narrow="tablet")] * named,
+            Column("Status", "rank"),
+            Column("Points", "number"),
+            *[Column("Handed in", "line", narrow="desk")] * timed,
+            Column("To read (min)", "number", narrow="desk"),
+            Column("Flags", "rank", narrow="desk"),
+            *(Column(veil.hide(name), "number", "items") for name in items),
+            *(Column(veil.hide(name), "number", "numbers") for name in numbers),
+        ),
+        rows=[
+            _row(entry, layout, veil, minutes[at], _alike(at, entries, copied.get(at, ()), veil))
+            for at, entry in enumerate(entries)
+        ],
+        filters=_filters(entries),
+        groups=(
+            ("items", "Points of each item", False),
+            ("numbers", "Numbers", False),
+        ),
+        placeholder="name, id, file, flag",
+        otherwise="All rows are in class.csv.",
     )
 
 
-def _hash_of(tag: str, template: str) -> str:
-    """What the content security policy allows: this very text."""
-    match = re.search(rf"<{tag}>(.*?)</{tag}>", template, re.DOTALL)
-    assert match is not None
-    return base64.b64encode(hashlib.sha256(match[1].encode()).digest()).decode()
+def reading_minutes(one: Graded | None) -> float:
+    """How long reading a report takes, roughly: its notes and a look at each page."""
+    if one is None:
+        return 0.0
+    return len(one.notes.split()) / WORDS_PER_MINUTE + MINUTES_PER_PAGE * len(one.sheets)
 
 
-def _text(text: str) -> str:
-    """Text without what HTML cannot hold, of a length that a page can."""
-    if len(text) > MAX_CHARACTERS:
-        text = text[:MAX_CHARACTERS] + "…"
-    return "".join(
-        c if c in "\n\t" or unicodedata.category(c) not in ("Cc", "Cs") else "�" for c in text
+def _copied(entries: Sequence[Entry]) -> dict[int, list[Copied]]:
+    """By entry, whose notes share passages with its own, most alike first."""
+    places = [at for at, entry in enumerate(entries) if entry.counting]
+    found: dict[int, list[Copied]] = {}
+    for share, first, second in copied_notes([one for e in entries if (one := e.counting)]):
+        for mine, theirs in ((first, second), (second, first)):
+            found.setdefault(places[mine], []).append((share, places[theirs]))
+    return {at: sorted(others, key=lambda o: (-o[0], o[1])) for at, others in found.items()}
+
+
+# ------------------------------------------------------------------ rows
+
+
+def status_of(entry: Entry) -> str:
+    """That of the counting report."""
+    return entry.counting.status if entry.counting else MISSING
+
+
+def _tags(entry: Entry) -> list[str]:
+    one = entry.counting
+    tags = [status_of(entry)]
+    if one:
+        tags += ["pending"] * bool(one.pending) + ["to read"] * bool(one.to_read)
+        tags += ["flagged"] * bool(one.flags or entry.remarks)
+        tags += [f"missed:{mistake}" for mistake, named in one.mistakes.items() if not named]
+    tags += ["late"] * bool(entry.late_s)
+    tags += ["said by you"] * bool(entry.overrides or entry.comment)
+    return tags
+
+
+def _filters(entries: Sequence[Entry]) -> list[tuple[str, list[tuple[str, str]]]]:
+    counts = Counter(tag for entry in entries for tag in _tags(entry))
+    shown = [(name, f"{name} ({counts[name]})") for name in SHOWN if counts[name]]
+    filters = [("Status", [("", f"Everyone ({len(entries)})"), *shown])]
+    missed = sorted(tag for tag in counts if tag.startswith("missed:"))
+    if missed:
+        options = [(tag, f"{tag.removeprefix('missed:')} ({counts[tag]})") for tag in missed]
+        filters.append(("Missed", [("", "Whatever was missed"), *options]))
+    return filters
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """Columns that depend on the class."""
+
+    items: tuple[str, ...]
+    numbers: tuple[str, ...]
+    # Characters that all names of files begin with
+    shared: int
+    timed: bool
+    named: bool
+
+
+def _row(entry: Entry, layout: _Layout, veil: Veil, minutes: float, alike: tuple[Part, ...]) -> Row:
+    one = entry.counting
+    status = status_of(entry)
+    flags = [*entry.remarks, *(one.flags if one else ())]
+    known = entry.pseudonym or entry.student
+    file = one.submission[layout.shared :] if one and not entry.pseudonym else ""
+    points = overridden_points(entry)
+    cells = (
+        Cell(entry.called, known or None, file),
+        *[words("" if entry.pseudonym else entry.student_id)] * layout.named,
+        Cell(
+            f"{SIGNS[status]} {status}", float(STATUSES.index(status)), _few(flags), LOOKS[status]
+        ),
+        _points(entry),
+        *[Cell(entry.handed_in, entry.handed_in or None, late_words(entry))] * layout.timed,
+        figure(minutes or None, f"{math.ceil(minutes)}"),
+        Cell("\n".join(map(veil.hide, flags)), float(len(flags)), "", "flags"),
+        *(figure(points.get(title)) for title in layout.items),
+        *(figure(one.numbers.get(title) if one else None) for title in layout.numbers),
     )
+    beside = _beside(entry, one, veil) if one else ()
+    return Row(cells, tuple(_tags(entry)), _details(entry, veil, alike), beside)
 
 
-def _safe(text: str) -> str:
-    return escape(_text(text))
+def _few(flags: Sequence[str]) -> str:
+    return f"{len(flags)} flag{'s' if len(flags) > 1 else ''}" if flags else ""
 
 
-# ------------------------------------------------------------------ above the table
+def _points(entry: Entry) -> Cell:
+    one = entry.counting
+    of = entry.of or (one.of if one else 0.0)
+    if entry.total is None:
+        proposed = f"{number(one.points)} proposed" if one and one.pending else ""
+        return Cell("pending" if proposed else "–", None, proposed)
+    share = (min(max(entry.total / of, 0.0), 1.0),) if of > 0.0 else ()
+    said = [f"{number(entry.deduction)} off for being late"] * bool(entry.deduction)
+    said += ["said by you"] * any(each.points is not None for each in entry.overrides.values())
+    text = f"{number(entry.total)} / {number(of)}" if of > 0.0 else number(entry.total)
+    return Cell(text, entry.total, ", ".join(said), "", share)
 
 
-def _summary(graded: Sequence[Graded]) -> str:
-    points = [one.points for one in graded if one.of > 0.0]
-    most = {one.of for one in graded if one.of > 0.0}
-    of = f" <small>of {number(most.pop())}</small>" if len(most) == 1 else ""
-    entries = [
-        ("Submissions", str(len(graded))),
-        ("Mean points", f"{statistics.fmean(points):.1f}{of}" if points else "–"),
-        ("Median", f"{statistics.median(points):.1f}{of}" if points else "–"),
-        ("Verified", str(sum(one.status == "verified" for one in graded))),
-        ("Flagged", str(sum(bool(one.flags) for one in graded))),
-    ]
-    return "\n".join(f"<div><dt>{name}</dt><dd>{value}</dd></div>" for name, value in entries)
+def overridden_points(entry: Entry) -> dict[str, float]:
+    """Points by item, as the instructor says where they do."""
+    points = item_points(entry.counting) if entry.counting else {}
+    said = {title: each.points for title, each in entry.overrides.items() if title in points}
+    return points | {title: value for title, value in said.items() if value is not None}
 
 
-def _histogram(graded: Sequence[Graded]) -> str:
-    """Bars of how many have how many points; empty without any."""
-    points = [one.points for one in graded if one.of > 0.0]
-    most = max((one.of for one in graded), default=0.0)
-    if not points:
+def late_words(entry: Entry) -> str:
+    """How late it came.
+
+    >>> late_words(Entry("", "", None, late_s=3 * 3600.0 + 1.0))
+    '3 h late'
+    """
+    if not entry.late_s:
         return ""
-    counts = [0] * BINS
-    for value in points:
-        counts[min(max(math.floor(value / most * BINS), 0), BINS - 1)] += 1
-    edges = [number(round(most * edge / BINS, 2)) for edge in range(BINS + 1)]
-    words = "; ".join(
-        f"{edges[place]} to {edges[place + 1]}: {count}" for place, count in enumerate(counts)
-    )
-    bars = []
-    for place, count in enumerate(counts):
-        height = 64.0 * count / max(counts)
-        bars.append(
-            f'<rect x="{place * 34 + 3}" y="{80.0 - height:.1f}" width="30" height="{height:.1f}"/>'
-        )
-        if count:
-            bars.append(f'<text x="{place * 34 + 18}" y="{76.0 - height:.1f}">{count}</text>')
-    ticks = [f'<text x="{edge * 34 + 1}" y="94">{edges[edge]}</text>' for edge in range(0, 11, 2)]
-    return (
-        '<figure><svg viewBox="-12 0 366 98" role="img" '
-        f'aria-label="Submissions by points. {words}">{"".join(bars)}'
-        f'<path d="M-2 80.5H344"/>{"".join(ticks)}</svg>'
-        "<figcaption>Submissions by points</figcaption></figure>"
-    )
-
-
-def _options(graded: Sequence[Graded]) -> str:
-    counts = [(name, sum(one.status == name for one in graded)) for name in STATUSES]
-    flagged = sum(bool(one.flags) for one in graded)
-    return "\n".join(
-        [f'<option value="">Every status ({len(graded)})</option>']
-        + [f'<option value="{name}">{name} ({count})</option>' for name, count in counts if count]
-        + [f'<option value="flagged">flagged ({flagged})</option>']
-    )
-
-
-# ------------------------------------------------------------------ the table
-
-
-def _heads(titles: Sequence[str], kind: str) -> str:
-    return "\n".join(
-        f'<th scope="col" class="n {kind}" data-kind="number">{_safe(title)}</th>'
-        for title in titles
-    )
-
-
-def _row(one: Graded, items: Sequence[str], numbers: Sequence[str], shared: int) -> str:
-    status = one.status
-    missing = "" if one.student else ' data-v=""'
-    flags = "".join(f"<li dir=auto>{_safe(flag)}</li>" for flag in one.flags)
-    number_of_flags = f"{len(one.flags)} flag{'s' if len(one.flags) > 1 else ''}"
-    points = item_points(one)
-    parts = [
-        f'<tr data-status="{status}" data-flagged="{"yes" if one.flags else ""}">'
-        f'<th scope="row"{missing}><span class="name" dir="auto">'
-        f"{_safe(one.student) or 'no name'}</span>"
-        f'<span class="file" dir="auto">{_safe(one.submission[shared:])}</span></th>',
-        f'<td class="id"><span dir="auto">{_safe(one.student_id)}</span></td>',
-        f'<td data-v="{STATUSES.index(status)}"><span class="chip s{STATUSES.index(status)}">'
-        f'<span aria-hidden="true">{SIGNS[status]}</span> {status}</span>'
-        + (f'<span class="few">{number_of_flags}</span>' if flags else "")
-        + "</td>",
-        _points(one),
-        f'<td data-v="{len(one.flags)}" class="flags">{f"<ul>{flags}</ul>" if flags else ""}</td>',
-        *(_number(points.get(title), "i") for title in items),
-        *(_number(one.numbers.get(title), "x") for title in numbers),
-        "</tr>",
-    ]
-    return "".join(parts)
-
-
-def _points(one: Graded) -> str:
-    if one.of <= 0.0:
-        return '<td class="n p" data-v="">–</td>'
-    width = 56.0 * min(max(one.points / one.of, 0.0), 1.0)
-    return (
-        f'<td class="n p" data-v="{number(one.points)}">{number(one.points)} '
-        f'<small>/ {number(one.of)}</small><svg width="56" height="4" aria-hidden="true">'
-        f'<rect width="56" height="4" class="all"/><rect width="{width:.1f}" height="4"/></svg>'
-        "</td>"
-    )
-
-
-def _number(value: float | None, kind: str) -> str:
-    if value is None or not math.isfinite(value):
-        return f'<td class="n {kind}" data-v=""></td>'
-    return f'<td class="n {kind}" data-v="{number(value)}">{value:.4g}</td>'
+    for unit, size in (("days", 86400.0), ("h", 3600.0)):
+        if entry.late_s >= (2.0 if unit == "days" else 1.0) * size:
+            return f"{entry.late_s / size:.0f} {unit} late"
+    return f"{math.ceil(entry.late_s / 60.0)} min late"
 
 
 # ------------------------------------------------------------------ what a row unfolds to
 
 
-def _details(one: Graded) -> str:
-    differences = one.verdict.differences
-    more = len(differences) - MAX_DIFFERENCES
-    details: dict[str, Any] = {
-        "student": _text(one.student),
-        "reasons": [_text(reason) for reason in one.verdict.reasons],
-        "flags": [_text(flag) for flag in one.flags],
-        "items": [
-            [_text(title), number(item.points), number(item.of), _text(item.comment)]
-            for title, item in zip(
-                distinct(item.title for item in one.items), one.items, strict=True
-            )
-        ],
-        "differences": [
-            [_text(part) for part in (each.path, each.recorded, each.recomputed)]
-            for each in differences[:MAX_DIFFERENCES]
-        ],
-        "more": f"and {more} more" if more > 0 else "",
-        "numbers": [
-            [_text(title), f"{value:.6g}"]
-            for title, value in one.numbers.items()
-            if math.isfinite(value)
-        ],
-        "facts": [
-            [title, _text(value)]
-            for title, value in (
-                ("Name", one.student),
-                ("Id", one.student_id),
-                ("File", one.submission),
-                ("Version", f"px4fuse {one.version}" if one.version else ""),
-                ("SHA-256 of the PDF", one.sha256),
-                ("SHA-256 of the log", one.log_sha256),
-            )
-            if value
-        ],
-        "notes": _text(one.notes),
-        "report": one.redrawn_name,
-        "pictures": [
-            [f"Page {one.page}, {said}", base64.b64encode(png).decode()]
-            for png, said in (
-                (one.picture, "drawn again from the log"),
-                (one.handed_in, "as handed in: not verified"),
-            )
-            if png.startswith(PNG)
-        ],
-    }
-    return f'<script type="application/json">{_inert_json(details)}</script>'
+def _details(entry: Entry, veil: Veil, alike: tuple[Part, ...]) -> tuple[Part, ...]:
+    one = entry.counting
+    comment = [veil.hide(text) for text in (entry.comment,) if text]
+    if one is None:
+        return listed("Missing", ["Nothing was handed in."]), listed("Your comment", comment)
+    verdict = one.verdict
+    more = len(verdict.differences) - MAX_DIFFERENCES
+    return (
+        listed("Flags", [veil.hide(text) for text in (*entry.remarks, *one.flags)], warn=True),
+        listed("Pending: what you can do", [veil.hide(one.pending)] if one.pending else [], True),
+        listed(
+            "For you to judge",
+            [
+                f"{veil.hide(why).rstrip('.')}: “{veil.hide(said, own_words=True)}”"
+                for why, said in one.to_read
+            ],
+        ),
+        listed("Verification", [veil.hide(reason) for reason in verdict.reasons]),
+        tabled(
+            "Numbers that differ",
+            ("Where", "Report", "New run") if verdict.differences else (),
+            [
+                [veil.hide(text) for text in (each.path, each.recorded, each.recomputed)]
+                for each in verdict.differences[:MAX_DIFFERENCES]
+            ],
+            after=f"and {more} more" if more > 0 else "",
+        ),
+        _item_table(entry, one, veil),
+        listed("Your comment", comment),
+        listed(
+            "Mistakes of this flight",
+            [
+                f"{mistake}: {'named' if named else 'not named'}"
+                for mistake, named in one.mistakes.items()
+            ],
+        ),
+        prose("The student's notes", veil.hide(one.notes, own_words=True)),
+        *alike,
+        tabled(
+            "Other attempts",
+            ("File", "Status", "Points") if entry.others else (),
+            [
+                [
+                    f"attempt {at}" if entry.pseudonym else other.submission,
+                    other.status,
+                    "pending" if other.pending else f"{number(other.points)} / {number(other.of)}",
+                ]
+                for at, other in enumerate(entry.others, start=1)
+            ],
+            (2,),
+        ),
+        pairs(
+            "Numbers",
+            [
+                (veil.hide(title), f"{value:.6g}")
+                for title, value in one.numbers.items()
+                if math.isfinite(value)
+            ],
+        ),
+        pairs("Submission", _facts(entry, one)),
+    )
 
 
-def _inert_json(value: object) -> str:
-    """JSON in which an HTML parser finds nothing: no <, > or &, and ASCII only."""
-    text = json.dumps(value, ensure_ascii=True, allow_nan=False, separators=(",", ":"))
-    return text.replace("<", r"\u003c").replace(">", r"\u003e").replace("&", r"\u0026")
+def _facts(entry: Entry, one: Graded) -> list[tuple[str, str]]:
+    version = f"px4fuse {one.version}" if one.version else ""
+    facts = [("Handed in", entry.handed_in), ("Late", late_words(entry)), ("Version", version)]
+    if entry.pseudonym:
+        return facts
+    return [
+        ("Name", entry.student),
+        ("Id", entry.student_id),
+        ("File", one.submission),
+        *facts,
+        ("SHA-256 of the PDF", one.sha256),
+        ("SHA-256 of the log", one.log_sha256),
+    ]
+
+
+def _item_table(entry: Entry, one: Graded, veil: Veil) -> Part:
+    rows = []
+    for title, item in zip(distinct(item.title for item in one.items), one.items, strict=True):
+        said = entry.overrides.get(title, Override())
+        own = "" if said.points is None else f"You: {number(item.points)} → {number(said.points)}. "
+        comment = f"{own}{said.comment} {item.comment}" if own or said.comment else item.comment
+        points = item.points if said.points is None else said.points
+        rows.append([veil.hide(title), number(points), number(item.of), veil.hide(comment)])
+    heads = ("Item", "Points", "Of", "Comment") if rows else ()
+    return tabled("Points (proposed)" if one.pending else "Points", heads, rows, (1, 2))
+
+
+def _alike(
+    at: int, entries: Sequence[Entry], copied: Sequence[Copied], veil: Veil
+) -> tuple[Part, ...]:
+    return tuple(
+        _side_by_side(entries[at], entries[to], share, veil) for share, to in copied[:MAX_COPIES]
+    )
+
+
+def _side_by_side(entry: Entry, other: Entry, share: float, veil: Veil) -> Part:
+    assert entry.counting is not None
+    assert other.counting is not None
+    texts = shared_passages(
+        *(veil.hide(one.notes, own_words=True) for one in (entry.counting, other.counting))
+    )
+    return sides(
+        f"Notes shared with {other.called}: {share:.0%}",
+        ((entry.called, False), *texts[0]),
+        ((other.called, False), *texts[1]),
+    )
+
+
+def _beside(entry: Entry, one: Graded, veil: Veil) -> tuple[Part, ...]:
+    """The report's pages, and links to it, but for those that would name its student."""
+    whose = f"of the report of {entry.called}"
+    drawn = [
+        (f"Page {at} of {len(one.sheets)}", f"Page {at} {whose}, drawn again from the log", link)
+        for at, name in enumerate(one.sheets, start=1)
+        if (link := local_link(name))
+    ]
+    if entry.pseudonym:
+        return (pictures("Every page, drawn again from the log", drawn),)
+    handed_in = []
+    if one.handed_in.startswith(PNG):
+        said = f"Page {one.page}, as handed in: not verified"
+        source = f"data:image/png;base64,{base64.b64encode(one.handed_in).decode()}"
+        handed_in = [(said, f"Page {one.page} {whose}, as handed in", source)]
+        # the redrawn one stands beside it
+        handed_in = [*drawn[one.page - 1 : one.page], *handed_in]
+    return (
+        links(
+            "The report",
+            [
+                ("Drawn again from the log (PDF): read this one", local_link(one.redrawn_name)),
+                (
+                    "As it was handed in (PDF): the student's own file",
+                    local_link(one.handed_in_name),
+                ),
+            ],
+        ),
+        pictures("The page that differs" if drawn else "As handed in", handed_in),
+        pictures("Every page, drawn again from the log", drawn),
+    )

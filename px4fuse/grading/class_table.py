@@ -5,22 +5,29 @@ from __future__ import annotations
 import csv
 import io
 import math
+import re
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 
-from px4fuse.grading.model import Graded
+from px4fuse.grading.model import Entry, Graded, Override
 from px4fuse.spreadsheet import neutral
 
-FIRST = ("file", "student", "id", "status", "points", "of")
-LAST = ("flags", "reasons", "log SHA-256")
+FIRST = ("file", "student", "id", "status", "points", "of", "deducted", "total")
+LAST = (
+    "handed in", "hours late", "pending", "comment", "remarks", "flags", "other files", "reasons",
+    "log SHA-256",
+)  # fmt: skip
 BETWEEN = " | "
 
 
-def csv_text(graded: Sequence[Graded]) -> str:
+def csv_text(entries: Sequence[Entry]) -> str:
     """Lay out a class as CSV, for Excel and LibreOffice.
+
+    Points of the items are those that count, the instructor's where there are some.
 
     Parameters
     ----------
-    graded : sequence of Graded
+    entries : sequence of Entry
 
     Returns
     -------
@@ -28,21 +35,47 @@ def csv_text(graded: Sequence[Graded]) -> str:
         Begins with the byte order mark by which Excel knows UTF-8; lines end with CRLF. Write it
         without translating line ends.
     """
-    items = tuple(dict.fromkeys(title for one in graded for title in item_points(one)))
-    numbers = tuple(dict.fromkeys(title for one in graded for title in one.numbers))
+    settled = [settled_report(entry) for entry in entries]
+    items = tuple(dict.fromkeys(title for one in settled if one for title in item_points(one)))
+    numbers = tuple(dict.fromkeys(title for one in settled if one for title in one.numbers))
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\r\n")
     writer.writerow(neutral(title) for title in (*FIRST, *items, *numbers, *LAST))
-    for one in graded:
-        points = item_points(one)
+    for entry, one in zip(entries, settled, strict=True):
+        points = item_points(one) if one else {}
         row: list[str | float | None] = [
-            one.submission, one.student, one.student_id, one.status, one.points, one.of,
+            one.submission if one else "", entry.student, None, one.status if one else "missing",
+            one.points if one else None, entry.of, entry.deduction or None, entry.total,
             *(points.get(title) for title in items),
-            *(one.numbers.get(title) for title in numbers),
-            BETWEEN.join(one.flags), BETWEEN.join(one.verdict.reasons), one.log_sha256,
+            *((one.numbers if one else {}).get(title) for title in numbers),
+            entry.handed_in, None if entry.late_s is None else entry.late_s / 3600.0,
+            one.pending if one else "", entry.comment, BETWEEN.join(entry.remarks),
+            BETWEEN.join(one.flags) if one else "",
+            BETWEEN.join(other.submission for other in entry.others),
+            BETWEEN.join(one.verdict.reasons) if one else "", one.log_sha256 if one else "",
         ]  # fmt: skip
-        writer.writerow(neutral(part) if isinstance(part, str) else number(part) for part in row)
+        cells = [neutral(part) if isinstance(part, str) else number(part) for part in row]
+        cells[FIRST.index("id")] = neutral_id(entry.student_id)
+        writer.writerow(cells)
     return "\ufeff" + out.getvalue()
+
+
+def settled_report(entry: Entry) -> Graded | None:
+    """The report that counts, with the instructor's points and comments on its items."""
+    graded = entry.counting
+    if graded is None or not entry.overrides:
+        return graded
+    items = []
+    for title, item in zip(item_points(graded), graded.items, strict=True):
+        said = entry.overrides.get(title, Override())
+        points = item.points if said.points is None else said.points
+        comment = (
+            f"{item.comment} Your instructor: {said.comment}" if said.comment else item.comment
+        )
+        if said.points is not None and said.points != item.points:
+            comment = f"{comment} (Your instructor gave {number(points)} points.)"
+        items.append(replace(item, points=points, comment=comment))
+    return replace(graded, items=tuple(items))
 
 
 def item_points(one: Graded) -> dict[str, float]:
@@ -76,3 +109,12 @@ def number(value: float | None) -> str:
     ('7', '0.3', '')
     """
     return "" if value is None or not math.isfinite(value) else f"{value:.10g}"
+
+
+def neutral_id(text: str) -> str:
+    """An id as it is where a spreadsheet cannot take it for a formula, else :func:`neutral`.
+
+    >>> neutral_id("0042"), neutral_id("-17"), neutral_id("a.b@c.de"), neutral_id("=1")
+    ('0042', '-17', 'a.b@c.de', "'=1")
+    """
+    return text if re.fullmatch(r"[+-]\d+|\w[\w.@+-]*", text) else neutral(text)

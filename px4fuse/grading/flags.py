@@ -14,27 +14,36 @@ from collections.abc import Iterator, Mapping, Sequence
 from itertools import combinations
 from pathlib import PurePosixPath
 
-from px4fuse.assignment.key import AnswerKey, folded
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+
+from px4fuse.assignment.key import AnswerKey
+from px4fuse.assignment.key import folded as same_id
 from px4fuse.filter.kalman import Settings
 from px4fuse.filter.tuning import HORIZONTAL
+from px4fuse.grading.folding import folded
 from px4fuse.grading.model import Graded
 from px4fuse.results.comparison import ASKED, HeldOut, Tuned
 from px4fuse.results.contract import ComparisonResults, LoopResults, Reported
 
-# Words in a row by which two texts are compared. Five are hardly ever the same by chance, and a
-# changed word costs five shingles of hundreds.
-SHINGLE_WORDS = 5
+# Letters and digits in a row by which two texts are compared, so that spaces do not count: of
+# five words, hardly ever the same by chance, and a changed word costs as many of thousands
+SHINGLE_LETTERS = 25
+# One in so many shingles is kept, by its own value, so that a class takes seconds
+KEPT = 8
+# Knuth's, for hashes: 2^64 over the golden ratio, odd
+MULTIPLIER = 0x9E3779B97F4A7C15
 # Share of the shingles of two notes that are in both. Notes written apart on one lab share a few
 # per cent; at a quarter, two in five sentences are the same.
 COPIED = 0.25
 # Shorter notes are the same by chance
-MIN_SHINGLES = 40
+MIN_SHINGLES = 25
 # What more than half of the class has is the instructor's template, from a class of this size on;
 # in a smaller one the copy itself would be taken for it
 TEMPLATE_SHARE = 0.5
 TEMPLATE_CLASS = 5
-# Of notes longer than this only the beginning is compared, so that a class takes seconds
-MAX_WORDS = 5000
+# Of notes longer than this only the beginning is compared
+MAX_LETTERS = 30_000
 # Chosen noises have so many digits together before they are the same by chance only once in a
 # thousand pairs: 0.3 and 0.1 are what many would type
 MIN_DIGITS = 4
@@ -193,7 +202,7 @@ def _same_report(graded: Sequence[Graded]) -> Flags:
 
 
 def _same_id(graded: Sequence[Graded]) -> Flags:
-    for members in _groups([folded(one.student_id) for one in graded]):
+    for members in _groups([same_id(one.student_id) for one in graded]):
         for index in members:
             yield index, f"The same student id as in {_others(graded, members, index)}."
 
@@ -264,7 +273,8 @@ def _other_version(graded: Sequence[Graded]) -> Flags:
 # ------------------------------------------------------------------ notes
 
 
-def _copied_notes(graded: Sequence[Graded]) -> Flags:
+def copied_notes(graded: Sequence[Graded]) -> list[tuple[float, int, int]]:
+    """Pairs whose notes share passages: which share of both, and their places."""
     shingles = [_shingles(one.notes) for one in graded]
     counted = Counter(part for parts in shingles for part in parts)
     # one that hands in twice does not make a template
@@ -274,7 +284,7 @@ def _copied_notes(graded: Sequence[Graded]) -> Flags:
     long = [index for index, parts in enumerate(shingles) if len(parts) >= MIN_SHINGLES]
     # most of what anyone writes nobody else does: what is compared pair by pair is short
     shared = {i: {part for part in shingles[i] if counted[part] > 1} for i in long}
-    alike: dict[int, list[tuple[float, int]]] = defaultdict(list)
+    pairs = []
     for first, second in combinations(long, 2):
         # no smaller than this share, whatever the rest
         most = min(len(shared[first]), len(shared[second]))
@@ -284,8 +294,15 @@ def _copied_notes(graded: Sequence[Graded]) -> Flags:
         both = len(shared[first] & shared[second])
         share = both / (len(shingles[first]) + len(shingles[second]) - both)
         if share >= COPIED:
-            alike[first].append((share, second))
-            alike[second].append((share, first))
+            pairs.append((share, first, second))
+    return pairs
+
+
+def _copied_notes(graded: Sequence[Graded]) -> Flags:
+    alike: dict[int, list[tuple[float, int]]] = defaultdict(list)
+    for share, first, second in copied_notes(graded):
+        alike[first].append((share, second))
+        alike[second].append((share, first))
     for index, others in sorted(alike.items()):
         others.sort(reverse=True)
         named = ", ".join(
@@ -296,12 +313,19 @@ def _copied_notes(graded: Sequence[Graded]) -> Flags:
 
 
 def _shingles(text: str) -> frozenset[int]:
-    """Hashes of all runs of words, spelling and punctuation aside."""
-    normal = unicodedata.normalize("NFKC", text).casefold()
-    words = re.findall(r"\w+", normal)[:MAX_WORDS]
-    return frozenset(
-        hash(tuple(words[at : at + SHINGLE_WORDS])) for at in range(len(words) - SHINGLE_WORDS + 1)
-    )
+    """Hashes of runs of letters, what looks alike taken for the same, spaces and signs aside.
+
+    Of all runs those that are 0 modulo :data:`KEPT` stand for the others (Manber 1994): the same in
+    every text that holds them.
+    """
+    letters = "".join(filter(str.isalnum, folded(text[: 2 * MAX_LETTERS])))[:MAX_LETTERS]
+    if len(letters) < SHINGLE_LETTERS:
+        return frozenset()
+    codes = np.frombuffer(letters.encode("utf-32-le"), np.uint32).astype(np.uint64)
+    # 64-bit arithmetic wraps around, as a hash may
+    powers = np.cumprod(np.full(SHINGLE_LETTERS, MULTIPLIER, np.uint64))
+    hashes = sliding_window_view(codes, SHINGLE_LETTERS) @ powers >> np.uint64(20)
+    return frozenset(hashes[hashes % KEPT == 0].tolist())
 
 
 # ------------------------------------------------------------------ names
@@ -309,21 +333,21 @@ def _shingles(text: str) -> frozenset[int]:
 
 def _other_name(graded: Sequence[Graded], key: AnswerKey | None) -> Flags:
     """The file's name is that of another student of the class."""
-    people = {folded(one.student_id): one.student for one in graded if one.student_id.strip()}
-    people |= {folded(a.student_id): a.name for a in (key.answers if key else ())}
+    people = {same_id(one.student_id): one.student for one in graded if one.student_id.strip()}
+    people |= {same_id(a.student_id): a.name for a in (key.answers if key else ())}
     names = {
-        parts: folded(student_id)
+        parts: same_id(student_id)
         for student_id, name in people.items()
         # one word is too short to be told from other words of a file name
         if len(parts := frozenset(_words(name))) > 1
     }
     for index, one in enumerate(graded):
-        own_id, own_words = folded(one.student_id), frozenset(_words(one.student))
+        own_id, own_words = same_id(one.student_id), frozenset(_words(one.student))
         # the key's spelling, where a spreadsheet took away leading zeros
         given = key.of_student(one.student_id) if key else None
-        own_ids = {own_id} | ({folded(given.student_id)} if given else set())
+        own_ids = {own_id} | ({same_id(given.student_id)} if given else set())
         stem = PurePosixPath(one.submission.replace("\\", "/")).stem
-        words = frozenset(_words(one.submission.removesuffix(".pdf"))) | {folded(stem)}
+        words = frozenset(_words(one.submission.removesuffix(".pdf"))) | {same_id(stem)}
         says_own = bool(own_ids & words) or (own_words and own_words <= words)
         if says_own or not (own_id or own_words):
             continue
@@ -343,7 +367,7 @@ def _looks_like(stem: str, student_id: str) -> bool:
 
 def _words(text: str) -> list[str]:
     """Words of a name or a file's name; ids with signs in them stay whole as well."""
-    plain = folded(text)
+    plain = same_id(text)
     parts = (*re.findall(r"[^\W_]+", plain), *re.split(r"[\s_/(),]+", plain))
     return [part for part in parts if part]
 
@@ -361,7 +385,7 @@ def _groups(values: Sequence[str]) -> list[list[int]]:
 
 
 def _who(one: Graded) -> str:
-    return folded(one.student_id) or folded(one.student) or one.submission
+    return same_id(one.student_id) or same_id(one.student) or one.submission
 
 
 def _name(one: Graded) -> str:

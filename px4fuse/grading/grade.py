@@ -1,42 +1,37 @@
-"""A folder of submissions becomes a class table: in parallel, within bounds, and resumable."""
+"""Submissions become a class: in parallel, within bounds, and quick where nothing has changed."""
 
 from __future__ import annotations
 
 import hashlib
-import json
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, field, replace
+from datetime import datetime
 from functools import partial
-from importlib import metadata
 from pathlib import Path
-from typing import Any
 
-from px4fuse.assignment.assignment import RESERVED
 from px4fuse.assignment.key import AnswerKey
-from px4fuse.flight import Unavailable
 from px4fuse.grading import submissions
-from px4fuse.grading.class_page import html_text
-from px4fuse.grading.class_table import csv_text
+from px4fuse.grading.entries import Term, class_entries
+from px4fuse.grading.evidence import values_at
+from px4fuse.grading.exports import grade_column, kind_of
 from px4fuse.grading.flags import chosen_settings, class_flags, own_flags
-from px4fuse.grading.model import Graded, Item, Rubric, Submission
-from px4fuse.grading.scoring import feedback, gradescope, score, score_refused, values_at
+from px4fuse.grading.lateness import moodle_time
+from px4fuse.grading.model import Entry, Graded, Rubric, Submission
+from px4fuse.grading.outputs import Class, write_class
+from px4fuse.grading.overrides import NAME, read_overrides
+from px4fuse.grading.platforms import Origin, with_metadata
+from px4fuse.grading.records import Verified, verified
+from px4fuse.grading.roster import Person, Register, people_of_key, people_of_sheet
+from px4fuse.grading.scoring import assess, refused
+from px4fuse.grading.sheet import Sheet
 from px4fuse.grading.workers import Failed, run_bounded
 from px4fuse.reading import files_by_sha256, max_log_bytes
 from px4fuse.results.contract import Reported, to_plain
-from px4fuse.verification.intake import read_report
-from px4fuse.verification.model import Difference, PageDifference, Refused, Report, Verdict
-from px4fuse.verification.pages import page_texts
-from px4fuse.verification.pictures import key_page, picture
+from px4fuse.verification.model import Refused, Verdict
 from px4fuse.verification.rerun import log_sha256
-from px4fuse.verification.verification import verify
-from px4fuse.writing import write_all
 
 RECORDS = "records"
-# Reports drawn again from their logs: what to read instead of what was handed in
-REDRAWN = "reports"
-# What a record keeps besides its JSON, by field of Graded
-FILES = {"picture": ".png", "handed_in": ".handed-in.png", "redrawn": ".pdf"}
 # Of one report: a flight of ten minutes takes about one; what takes longer is no report
 TIMEOUT_S = 300.0
 MEMORY_BYTES = 4_000_000_000
@@ -52,24 +47,54 @@ NUMBERS = (
 
 
 @dataclass(frozen=True)
+class Course:
+    """What is known of a class besides what it handed in.
+
+    Attributes
+    ----------
+    roster : tuple of Person or None
+        Without one the students of the answer key, else those of the worksheets.
+    worksheets : tuple of Sheet
+        Tables of learning platforms, to be filled in.
+    column : str
+        Of the worksheets, for the grade; "" where there is only one.
+    term : Term
+        Which attempt counts, and what being late costs.
+    anonymous : bool
+        Whether the class page shows pseudonyms.
+    """
+
+    roster: tuple[Person, ...] | None = None
+    worksheets: tuple[Sheet, ...] = ()
+    column: str = ""
+    term: Term = field(default_factory=Term)
+    anonymous: bool = False
+
+
+@dataclass(frozen=True)
 class Outcome:
     """What grading a class gave.
 
     Attributes
     ----------
-    graded : tuple of Graded
-        In the order of the submissions, without their pictures and redrawn reports.
+    entries : tuple of Entry
+        Everyone in the roster, then who is not in it; without pictures and redrawn reports.
     notes : tuple of str
         What was passed over.
     reused : int
-        How many were not done again, since nothing of theirs has changed.
+        How many reports were not verified again, since nothing of theirs has changed.
     written : tuple of Path
     """
 
-    graded: tuple[Graded, ...]
+    entries: tuple[Entry, ...]
     notes: tuple[str, ...]
     reused: int
     written: tuple[Path, ...]
+
+    @property
+    def graded(self) -> tuple[Graded, ...]:
+        """Every file that was handed in, those that count first, in the order of the entries."""
+        return tuple(one for one in _all_of(self.entries))
 
 
 def grade(
@@ -79,6 +104,7 @@ def grade(
     output: Path,
     *,
     key: AnswerKey | None = None,
+    course: Course | None = None,
     title: str = "Class",
     processes: int | None = None,
     progress: Callable[[int, int], None] = lambda done, of: None,
@@ -94,9 +120,11 @@ def grade(
     rubric : Rubric
     output : Path
         Folder for the class table (``class.csv``, ``class.html``), the redrawn ``reports/``,
-        ``feedback/``, ``gradescope/`` and the records that make a second run quick.
+        ``feedback/``, ``gradescope/``, ``grades/`` for learning platforms, and the records that
+        make a second run quick. Its ``overrides.csv`` is read.
     key : AnswerKey, optional
         Which mistakes each student's flight has.
+    course : Course, optional
     title : str
         Of the class page.
     processes : int, optional
@@ -107,110 +135,200 @@ def grade(
     Raises
     ------
     SettingsError
-        Nothing was handed in.
+        Nothing was handed in, or a table that was given is not what it should be.
     OutputError
         The folder cannot be written.
     """
+    course = course or Course()
+    overrides = read_overrides(output / NAME)
+    for sheet in course.worksheets:
+        grade_column(sheet, course.column)
     found, notes = submissions.collect(paths)
-    known = files_by_sha256(logs)
-    records = output / RECORDS
-    context = _context(rubric, key)
-    graded: list[Graded | None] = [None] * len(found)
-    todo: list[int] = []
-    for index, submission in enumerate(found):
-        graded[index] = _recalled(records, submission, context, known)
-        if graded[index] is None:
-            todo.append(index)
-    reused = len(found) - len(todo)
-    progress(reused, len(found))
-    done = reused
+    people = submissions.gradescope_people(paths)
+    origins = [with_metadata(one.name, people) for one in found]
+    register = register_of(course, key)
+    graded, reused = grade_all(
+        found, origins, logs, rubric, output / RECORDS, key, register, processes, progress
+    )
+    term = replace(course.term, times=_moodle_times(course, register))
+    entries, unknown = class_entries(graded, found, origins, register, term, overrides)
+    entries = _flagged(entries, key)
+    written, more = write_class(
+        Class(entries, register or Register([]), title, course.worksheets, course.column,
+              course.anonymous, {one.name: of for one, of in zip(found, origins, strict=True)},
+              {one.name: one for one in found}),
+        output,
+        output / RECORDS,
+        processes,
+    )  # fmt: skip
+    return Outcome(entries, (*notes, *unknown, *more), reused, written)
 
-    def on_done(position: int, result: Graded | Failed) -> None:
-        nonlocal done
-        index = todo[position]
+
+def register_of(course: Course, key: AnswerKey | None) -> Register | None:
+    """Who is in the class, with what the worksheets know of them; None where nothing says it."""
+    listed = [people_of_sheet(sheet) for sheet in course.worksheets]
+    people = course.roster or (people_of_key(key) if key else None)
+    if people is None and listed:
+        people = listed[0]
+    if people is None:
+        return None
+    register = Register(people)
+    for others in listed:
+        register.add(others)
+    return register
+
+
+def _moodle_times(course: Course, register: Register | None) -> dict[int, datetime]:
+    """When Moodle's worksheets say that people of the class handed in."""
+    times = {}
+    for sheet in course.worksheets:
+        if kind_of(sheet) != "moodle" or register is None:
+            continue
+        for row in sheet.rows:
+            time = moodle_time(sheet.cell(row, ("lastmodifiedsubmission",)))
+            (person,) = people_of_sheet(replace(sheet, rows=(row,))) or (None,)
+            place = register.place(person) if person else None
+            if time is not None and place is not None:
+                times[place] = time
+    return times
+
+
+def _all_of(entries: Sequence[Entry]) -> list[Graded]:
+    return [
+        one
+        for entry in entries
+        for one in (*([entry.counting] if entry.counting else []), *entry.others)
+    ]
+
+
+def _flagged(entries: Sequence[Entry], key: AnswerKey | None) -> tuple[Entry, ...]:
+    """With what stands out between the reports that count."""
+    places = [at for at, entry in enumerate(entries) if entry.counting]
+    counting = [one for entry in entries if (one := entry.counting)]
+    flags = class_flags(counting, key)
+    made = list(entries)
+    for index, (at, one) in enumerate(zip(places, counting, strict=True)):
+        whole = replace(one, flags=(*one.flags, *flags.get(index, ())))
+        made[at] = replace(entries[at], counting=whole)
+    return tuple(made)
+
+
+# ------------------------------------------------------------------ the reports
+
+
+@dataclass(frozen=True)
+class Job:
+    """One file, and whose it is where the platform says it."""
+
+    submission: Submission
+    owner_id: str
+
+
+def grade_all(
+    found: Sequence[Submission],
+    origins: Sequence[Origin],
+    logs: Sequence[Path],
+    rubric: Rubric,
+    records: Path,
+    key: AnswerKey | None,
+    register: Register | None,
+    processes: int | None = None,
+    progress: Callable[[int, int], None] = lambda done, of: None,
+) -> tuple[tuple[Graded, ...], int]:
+    """Verify, or recall, and score every file, each within bounds; and how many were recalled."""
+    jobs = []
+    for submission, origin in zip(found, origins, strict=True):
+        person = register.of_platform(origin) if register else None
+        jobs.append(Job(submission, person.student_id if person else ""))
+    graded: list[Graded | None] = [None] * len(found)
+    reused = done = 0
+    progress(0, len(found))
+
+    def on_done(index: int, result: tuple[Graded, bool] | Failed) -> None:
+        nonlocal reused, done
         if isinstance(result, Failed):
-            why = Refused(f"Grading it failed: {result.reason}")
-            made = _refused(found[index], why, "", rubric, key)
+            why = Refused(f"Grading it failed: {result.reason}", "Read it yourself.")
+            graded[index] = _refused(found[index], why, "", rubric, key)
         else:
-            made = result
-        _remember(records, found[index], context, made)
-        graded[index] = _light(made)
+            graded[index], recalled = result
+            reused += recalled
         done += 1
         progress(done, len(found))
 
     run_bounded(
         partial(
-            grade_one, logs=known, rubric=rubric, key=key, largest_log_bytes=max_log_bytes.get()
+            grade_one,
+            logs=files_by_sha256(logs),
+            rubric=rubric,
+            key=key,
+            records=records,
+            largest_log_bytes=max_log_bytes.get(),
         ),
-        [found[index] for index in todo],
-        processes=processes or os.cpu_count() or 1,
+        jobs,
+        processes=min(processes or os.cpu_count() or 1, len(jobs)),
         timeout_s=TIMEOUT_S,
         memory_bytes=MEMORY_BYTES,
         on_done=on_done,
         keep=False,
     )
-    complete = [one for one in graded if one is not None]
-    flags = class_flags(complete, key)
-    complete = [
-        replace(one, flags=(*one.flags, *flags.get(index, ())))
-        for index, one in enumerate(complete)
-    ]
-    written = _write(output, complete, found, title)
-    return Outcome(tuple(complete), (*notes, *_left_over(output, complete)), reused, written)
+    named = [
+        one if one.student or one.student_id or not origin.platform
+        else replace(one, student=origin.name)
+        for one, origin in zip((one for one in graded if one is not None), origins, strict=True)
+    ]  # fmt: skip
+    return tuple(named), reused
 
 
 def grade_one(
-    submission: Submission,
+    job: Job,
     logs: Mapping[str, Path],
     rubric: Rubric,
     key: AnswerKey | None,
+    records: Path,
     largest_log_bytes: int,
-) -> Graded:
-    """Read, verify and score one submission; runs in a process of its own, within bounds."""
+) -> tuple[Graded, bool]:
+    """Read, verify or recall, and score one submission; runs in a process of its own."""
     max_log_bytes.set(largest_log_bytes)
+    submission = job.submission
     content = submissions.read(submission)
     if isinstance(content, Refused):
-        return _refused(submission, content, "", rubric, key)
+        return _refused(submission, content, "", rubric, key), False
     sha256 = hashlib.sha256(content).hexdigest()
-    report = read_report(content, submission.name)
-    if isinstance(report, Refused):
-        return _refused(submission, report, sha256, rubric, key)
-    log = log_sha256(report.results)
-    # handed out and not among the logs: the instructor's gap, not another log
-    missing = key is not None and key.of_log(log) is not None and log not in logs
-    verdict = verify(report, {} if missing else logs)
-    # what is shown and scored is the redrawn report, as far as there is one
-    report = replace(report, pages=page_texts(verdict.redrawn or report.pdf))
-    results = report.results
-    page = _page_to_show(verdict, report)
-    shown = picture(verdict.redrawn, page - 1) if verdict.redrawn else b""
-    compare = verdict.pages or not verdict.redrawn
-    handed_in = picture(report.pdf, page - 1) if compare else b""
+    handed_out = frozenset(answer.sha256 for answer in key.answers) if key else frozenset()
+    found, recalled = verified(records, content, logs, handed_out)
+    if isinstance(found, Refused):
+        return _refused(submission, found, sha256, rubric, key), recalled
+    return _scored(submission, found, sha256, job.owner_id, rubric, key), recalled
+
+
+def _scored(
+    submission: Submission,
+    found: Verified,
+    sha256: str,
+    owner_id: str,
+    rubric: Rubric,
+    key: AnswerKey | None,
+) -> Graded:
+    results, verdict = found.report.results, found.verdict
+    made = assess(found.report, verdict, rubric, key, owner_id)
     return Graded(
         submission=submission.name,
         student=results.student.name,
         student_id=results.student.id,
-        verdict=replace(verdict, redrawn=b""),
-        items=score(report, verdict, rubric, key),
-        flags=(*_page_flags(verdict), *own_flags(results)),
+        verdict=verdict,
+        items=made.items,
+        flags=(*_page_flags(verdict), *own_flags(results), *made.flags),
+        pending=made.pending,
+        to_read=made.to_read,
+        mistakes=made.mistakes,
         numbers=_numbers(results),
         sha256=sha256,
-        log_sha256=log,
+        log_sha256=log_sha256(results),
         version=results.provenance.px4fuse,
         settings=chosen_settings(results),
         notes=results.student.notes,
-        picture=b"" if isinstance(shown, Unavailable) else shown,
-        handed_in=b"" if isinstance(handed_in, Unavailable) else handed_in,
-        page=page,
-        redrawn=verdict.redrawn,
+        page=found.page,
     )
-
-
-def _page_to_show(verdict: Verdict, report: Report) -> int:
-    """The page that differs most, else the cover; counted from 1."""
-    if verdict.pages:
-        return max(verdict.pages, key=lambda one: (one.picture, one.words)).page
-    return 1 + (0 if verdict.redrawn else key_page(report.pages))
 
 
 def _page_flags(verdict: Verdict) -> tuple[str, ...]:
@@ -232,146 +350,6 @@ def _numbers(results: Reported) -> dict[str, float]:
 def _refused(
     submission: Submission, why: Refused, sha256: str, rubric: Rubric, key: AnswerKey | None
 ) -> Graded:
-    student, student_id = submissions.guess_student(submission.name)
     verdict = Verdict("cannot verify", (why.reason,), with_log=False)
-    items = score_refused(rubric, key, why.reason)
-    return Graded(submission.name, student, student_id, verdict, items, sha256=sha256)
-
-
-# ------------------------------------------------------------------ records of earlier runs
-
-
-def _context(rubric: Rubric, key: AnswerKey | None) -> str:
-    """Hash of what all results depend on besides the submission and its log."""
-    made_with = [metadata.version(name) for name in ("px4fuse", "numpy", "scipy", "matplotlib")]
-    text = json.dumps([made_with, repr(rubric), repr(key)])
-    return hashlib.sha256(text.encode()).hexdigest()
-
-
-def _record(records: Path, submission: Submission) -> Path:
-    # not by the name of the file: platforms put everyone's report.pdf into a folder of its own
-    name = hashlib.sha256(f"{submission.name}\0{submission.entry}".encode()).hexdigest()
-    return records / f"{name}.json"
-
-
-def _recalled(
-    records: Path, submission: Submission, context: str, logs: Mapping[str, Path]
-) -> Graded | None:
-    """What an earlier run found, if nothing that it rests on has changed."""
-    path = _record(records, submission)
-    try:
-        record = json.loads(path.read_text(encoding="utf-8"))
-        made = graded_from(record["graded"])
-    except (OSError, ValueError, KeyError, TypeError):  # none, or not one of ours: done again
-        return None
-    content = submissions.read(submission)
-    sha256 = "" if isinstance(content, Refused) else hashlib.sha256(content).hexdigest()
-    same = record.get("context") == context and made.sha256 == sha256 != ""
-    if not same or made.submission != submission.name:
-        return None
-    return made if made.verdict.with_log == (made.log_sha256 in logs) else None
-
-
-def _remember(records: Path, submission: Submission, context: str, made: Graded) -> None:
-    path = _record(records, submission)
-    values = asdict(_light(made))
-    for name in FILES:
-        del values[name]
-    del values["verdict"]["redrawn"]
-    text = json.dumps({"context": context, "graded": values}, ensure_ascii=False, indent=1)
-    kept = {path.with_suffix(end): getattr(made, name) for name, end in FILES.items()}
-    write_all({path: text.encode(), **kept})
-
-
-def _light(made: Graded) -> Graded:
-    """Without what a record keeps in files of their own."""
-    return replace(made, picture=b"", handed_in=b"", redrawn=b"")
-
-
-def graded_from(values: dict[str, Any]) -> Graded:
-    """A record's part back as what it was."""
-    verdict = values["verdict"]
-    return Graded(
-        **{
-            **values,
-            "verdict": Verdict(
-                **{
-                    **verdict,
-                    "reasons": tuple(verdict["reasons"]),
-                    "differences": tuple(Difference(**d) for d in verdict["differences"]),
-                    "pages": tuple(PageDifference(**page) for page in verdict["pages"]),
-                }
-            ),
-            "items": tuple(Item(**item) for item in values["items"]),
-            "flags": tuple(values["flags"]),
-        }
-    )
-
-
-# ------------------------------------------------------------------ outputs
-
-
-def _write(
-    output: Path, graded: Sequence[Graded], found: Sequence[Submission], title: str
-) -> tuple[Path, ...]:
-    made_with = f"px4fuse {metadata.version('px4fuse')}"
-    names = file_names(graded)
-    pictured = []
-    for one, submission, name in zip(graded, found, names, strict=True):
-        path = _record(output / RECORDS, submission)
-        shown, handed_in, redrawn = (_content(path.with_suffix(end)) for end in FILES.values())
-        if redrawn:
-            write_all({output / REDRAWN / f"{name}.pdf": redrawn})
-        where = f"{REDRAWN}/{name}.pdf" if redrawn else ""
-        pictured.append(replace(one, picture=shown, handed_in=handed_in, redrawn_name=where))
-    table, page = output / "class.csv", output / "class.html"
-    write_all(
-        {
-            table: csv_text(graded).encode(),
-            page: html_text(pictured, title, made_with).encode(),
-        }
-    )
-    for one, name in zip(graded, names, strict=True):
-        results = json.dumps(gradescope(one), ensure_ascii=False, indent=2)
-        write_all(
-            {
-                output / "feedback" / f"{name}.txt": feedback(one, title).encode(),
-                output / "gradescope" / name / "results.json": results.encode(),
-            }
-        )
-    reports = [output / REDRAWN] if any(one.redrawn_name for one in pictured) else []
-    return table, page, *reports, output / "feedback", output / "gradescope"
-
-
-def _left_over(output: Path, graded: Sequence[Graded]) -> tuple[str, ...]:
-    """What an earlier run wrote for others: never taken away, but told."""
-    names = set(file_names(graded))
-    others = sorted(p.stem for p in (output / "feedback").glob("*.txt") if p.stem not in names)
-    if not others:
-        return ()
-    shown = ", ".join(others[:4]) + (", ..." if len(others) > 4 else "")
-    return (
-        f"feedback and gradescope also hold {len(others)} of an earlier run, which are not among "
-        f"these submissions: {shown}. Delete them if they are out of date.",
-    )
-
-
-def _content(path: Path) -> bytes:
-    return path.read_bytes() if path.is_file() else b""
-
-
-def file_names(graded: Sequence[Graded]) -> list[str]:
-    """A name for each submission's files, unique ignoring case: letters, digits, - and _ only."""
-    taken: set[str] = set()
-    names = []
-    for one in graded:
-        stem = one.student_id or Path(one.submission).stem
-        safe = "".join(c if c.isascii() and (c.isalnum() or c in "-_") else "_" for c in stem)[:60]
-        if not safe or safe.casefold() in RESERVED:
-            safe = f"report_{safe}"
-        name, number = safe, 2
-        while name.lower() in taken:
-            name, number = f"{safe}-{number}", number + 1
-        taken.add(name.lower())
-        names.append(name)
-    return names
+    made = refused(rubric, key, why)
+    return Graded(submission.name, "", "", verdict, made.items, pending=made.pending, sha256=sha256)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from datetime import datetime
 from pathlib import Path
 from typing import Any, Literal
 
@@ -11,7 +12,8 @@ from px4fuse.verification.model import Verdict
 
 Kind = Literal["number", "whole", "flag", "text", "texts"]
 Applies = Literal["any", "compare", "loop"]
-Unverified = Literal["zero", "score"]
+# What is done with points that nobody can vouch for: left for the instructor, taken, or counted
+Doubtful = Literal["pending", "zero", "count"]
 
 
 @dataclass(frozen=True)
@@ -63,25 +65,76 @@ class RubricItem:
 
 
 @dataclass(frozen=True)
+class Reading:
+    """From when on notes are a text of one's own; shares are of words.
+
+    Attributes
+    ----------
+    judged_from : float
+        Words below which nothing can be said.
+    shortest, longest : float
+        Words of a sentence.
+    in_sentences : float
+        Least share that is in sentences.
+    ids : float
+        Most that may be ids of findings, of a sentence and of all.
+    quoted : float
+        Most that may be in sentences of px4fuse.
+    packed : float
+        Least size, packed by zlib, against the text: what repeats itself packs well.
+    common : float
+        Least share of the five commonest words.
+    commonest : float
+        Most that one word may have.
+    terms : float
+        Most that may be words by which the rubric names mistakes.
+    about : float
+        Least share in sentences that hold a number or a word of the field.
+    most_named : float
+        Kinds of mistakes; who names more is guessing.
+    """
+
+    judged_from: float = 20
+    shortest: float = 3
+    longest: float = 60
+    in_sentences: float = 0.5
+    ids: float = 0.25
+    quoted: float = 0.5
+    packed: float = 0.2
+    common: float = 0.06
+    commonest: float = 0.2
+    terms: float = 0.4
+    about: float = 0.35
+    most_named: float = 4
+
+
+@dataclass(frozen=True)
 class Rubric:
     """What a report is worth.
 
     Attributes
     ----------
     title : str
-    unverified : {"zero", "score"}
-        Whether a report whose numbers, pages or log are not what they should be gets nothing, or
-        its points as a proposal.
+    unverified : {"pending", "zero"}
+        What becomes of the points of a report that cannot be verified.
+    others_log : {"pending", "zero", "count"}
+        What becomes of those of a report on a log that was not given to the student.
+    pages : {"count", "pending", "zero"}
+        What becomes of those of a verified report whose pages look otherwise.
     items : tuple of RubricItem
     words : dict
-        Finding id to words by which notes may name it; "none" to those that say that nothing is
-        wrong.
+        Finding id to words by which notes may name it, and what says or changes something about
+        them: see rubric.toml.
+    notes : Reading
     """
 
     title: str
-    unverified: Unverified
+    unverified: Doubtful
     items: tuple[RubricItem, ...]
     words: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    others_log: Doubtful = "pending"
+    pages: Doubtful = "count"
+    notes: Reading = field(default_factory=Reading)
 
 
 @dataclass(frozen=True)
@@ -97,11 +150,15 @@ class Submission:
     name : str
         For people: without folders of this machine, control characters or more than 200
         characters. Unique within a run.
+    time : datetime or None
+        Of the entry in the zip file, in an unknown time zone: when the platform took it, or when
+        it packed the zip file.
     """
 
     file: Path
     entry: str
     name: str
+    time: datetime | None = None
 
 
 @dataclass(frozen=True)
@@ -130,6 +187,10 @@ class Graded:
         In the rubric's order.
     flags : tuple of str
         What an instructor should look at: sentences.
+    pending : str
+        One sentence: what the instructor can do so that the points count; "" where they count.
+    to_read : tuple of (str, str)
+        What no rule can judge: why, and the passage of the notes.
     numbers : mapping
         A few for the class table, by column title; absent ones are left out.
     sha256, log_sha256, version : str
@@ -138,13 +199,18 @@ class Graded:
         Those chosen, to the last digit, for comparison between students; "" for usual ones.
     notes : str
         The student's own words.
-    picture : bytes
-        PNG of a redrawn page: the cover, or the one that differs most; empty without.
+    mistakes : mapping
+        What the answer key says is wrong in the student's flight, in words, and whether the notes
+        name it.
     handed_in : bytes
-        PNG of that page as it was handed in, where it differs or nothing could be redrawn; empty
-        without.
+        PNG of a page as it was handed in: the cover where nothing could be redrawn, else the one
+        that differs most; empty without.
     page : int
-        Which page the pictures show, counted from 1.
+        Which page that is, counted from 1.
+    sheets : tuple of str
+        Where pictures of the redrawn pages stand, relative to the class page.
+    handed_in_name : str
+        Where the PDF stands that was handed in, relative to the class page; "" without.
     redrawn : bytes
         The report drawn again from the log, as a PDF; empty without.
     redrawn_name : str
@@ -157,17 +223,21 @@ class Graded:
     verdict: Verdict
     items: tuple[Item, ...] = ()
     flags: tuple[str, ...] = ()
+    pending: str = ""
+    to_read: tuple[tuple[str, str], ...] = ()
     numbers: Mapping[str, float] = field(default_factory=dict)
     sha256: str = ""
     log_sha256: str = ""
     version: str = ""
     settings: str = ""
     notes: str = field(default="", repr=False)
-    picture: bytes = field(default=b"", repr=False)
+    mistakes: Mapping[str, bool] = field(default_factory=dict)
     handed_in: bytes = field(default=b"", repr=False)
     page: int = 1
     redrawn: bytes = field(default=b"", repr=False)
     redrawn_name: str = ""
+    sheets: tuple[str, ...] = ()
+    handed_in_name: str = ""
 
     @property
     def status(self) -> str:
@@ -177,10 +247,82 @@ class Graded:
 
     @property
     def points(self) -> float:
-        """Sum over the items."""
-        return sum(item.points for item in self.items)
+        """Sum over the items; while :attr:`pending` a proposal, never to be added to anything.
+
+        Wrong claims can cost more than their item gives, but never more than there is.
+        """
+        return max(sum(item.points for item in self.items), 0.0)
+
+    @property
+    def counted(self) -> float | None:
+        """The points that count, never below zero; None while they are pending."""
+        return None if self.pending else max(self.points, 0.0)
 
     @property
     def of(self) -> float:
         """The most that there is to have."""
         return sum(item.of for item in self.items)
+
+
+@dataclass(frozen=True)
+class Override:
+    """What the instructor says instead: points, or words, or both."""
+
+    points: float | None = None
+    comment: str = ""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One row of the class: a student, or a report that belongs to nobody known.
+
+    Attributes
+    ----------
+    student, student_id : str
+        As the roster says; of somebody who is not in it, as the report or the platform says.
+    counting : Graded or None
+        The attempt that counts; None where nothing was handed in.
+    others : tuple of Graded
+        Further attempts, earliest first.
+    handed_in : str
+        When the counting one was handed in, as the platform says; "" where unknown.
+    late_s : float or None
+        After the due time (s), 0 in time; None where one of both is unknown.
+    deduction : float
+        Points taken off for being late, from the sum over the items.
+    overrides : mapping
+        What the instructor says, by the title of an item (numbered like the table's columns) or
+        "total".
+    comment : str
+        The instructor's own words on all of it.
+    total : float or None
+        What is entered as the grade; None while pending or missing.
+    of : float
+        The most that there is to have.
+    email : str
+        As the roster says.
+    remarks : tuple of str
+        On who this is and what counts: sentences for the instructor.
+    pseudonym : str
+        What the class page shows instead of name, id and names of files; "" to show them.
+    """
+
+    student: str
+    student_id: str
+    counting: Graded | None
+    others: tuple[Graded, ...] = ()
+    handed_in: str = ""
+    late_s: float | None = None
+    deduction: float = 0.0
+    overrides: Mapping[str, Override] = field(default_factory=dict)
+    comment: str = ""
+    total: float | None = None
+    of: float = 0.0
+    email: str = ""
+    remarks: tuple[str, ...] = ()
+    pseudonym: str = ""
+
+    @property
+    def called(self) -> str:
+        """What the class page calls the student."""
+        return self.pseudonym or self.student or self.student_id or "no name"

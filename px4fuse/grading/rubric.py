@@ -10,14 +10,14 @@ import json
 import math
 import tomllib
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import fields, replace
 from importlib.resources import files
 from pathlib import Path
 from typing import Any, NoReturn, cast
 
 from px4fuse.errors import SettingsError
 from px4fuse.findings import phrases
-from px4fuse.grading.model import Applies, Parameter, Rubric, RubricItem, Unverified
+from px4fuse.grading.model import Applies, Doubtful, Parameter, Reading, Rubric, RubricItem
 from px4fuse.grading.scoring import CHECKS
 from px4fuse.reading import read_text
 
@@ -26,15 +26,19 @@ MAX_RUBRIC_BYTES = 1_000_000
 MAX_ITEMS = 100
 MAX_POINTS = 1000.0
 MAX_TEXT = 200
-MAX_LIST = 50
+MAX_LIST = 100
 HELP = "px4fuse grade --write-rubric FILE.toml writes one that explains itself"
 
 APPLIES: tuple[Applies, ...] = ("any", "compare", "loop")
-UNVERIFIED: tuple[Unverified, ...] = ("zero", "score")
-
+# What becomes of points that nobody can vouch for
+DOUBTFUL = {
+    "unverified": Parameter("text", "pending", choices=("pending", "zero")),
+    "others_log": Parameter("text", "pending", choices=("pending", "zero", "count")),
+    "pages": Parameter("text", "count", choices=("count", "pending", "zero")),
+}
 
 ITEM_KEYS = ("title", "points", "check", "report")
-RUBRIC_KEYS = ("title", "unverified", "item", "words")
+RUBRIC_KEYS = ("title", *DOUBTFUL, "notes", "item", "words")
 
 
 def rubric_text() -> str:
@@ -93,12 +97,15 @@ def parse_rubric(text: str, where: str) -> Rubric:
         other = titles.setdefault((item.title, item.report), number)
         if other != number:
             _refuse(where, f"items {other} and {number} have the same title; give each its own")
-    unverified = _value(where, "unverified", given, Parameter("text", "zero", choices=UNVERIFIED))
+    fates = {
+        name: cast(Doubtful, _value(where, name, given, one)) for name, one in DOUBTFUL.items()
+    }
     return Rubric(
         title=_value(where, "title", given, Parameter("text", "")),
-        unverified=cast(Unverified, unverified),
         items=read,
         words=_words(where, given.get("words", {})),
+        notes=_reading(where, given.get("notes", {})),
+        **fates,
     )
 
 
@@ -148,6 +155,22 @@ def _words(where: str, given: object) -> dict[str, tuple[str, ...]]:
         _refuse(where, '[words] is not a table of finding ids; give ID = ["word", ...]')
     here = f"{where}: [words]"
     return {name: _value(here, name, given, Parameter("texts")) for name in given}
+
+
+def _reading(where: str, given: object) -> Reading:
+    if not isinstance(given, dict):
+        _refuse(where, "[notes] is not a table; give NAME = NUMBER")
+    here = f"{where}: [notes]"
+    known = {one.name: one.default for one in fields(Reading)}
+    for name in given:
+        if name not in known:
+            _refuse(here, f"unknown key {name!r}; it may have {', '.join(known)}")
+    return Reading(
+        **{
+            name: _value(here, name, given, Parameter("number", default, 0.0, 1e5))
+            for name, default in known.items()
+        }
+    )
 
 
 def _value(here: str, name: str, given: Mapping[str, Any], parameter: Parameter) -> Any:

@@ -14,12 +14,14 @@ import zipfile
 import zlib
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from datetime import datetime
 from pathlib import Path
 from typing import IO
 
 from px4fuse.errors import SettingsError
 from px4fuse.grading.model import Submission
+from px4fuse.grading.platforms import METADATA, Origin, gradescope_metadata
 from px4fuse.results.reading import cleaned, one_line
 from px4fuse.verification.intake import MAX_BYTES
 from px4fuse.verification.model import Refused
@@ -33,6 +35,11 @@ MAX_INNER_BYTES = 500_000_000
 # PDFs are compressed inside; what still shrinks a hundred times is empty
 MAX_RATIO = 100
 MAX_NAME = 200
+# The year that stands where a program knew no time
+ZIP_EPOCH = 1980
+
+# Entry as Submission keeps it, its name for people, and when it was changed
+Found = tuple[str, str, datetime | None]
 
 # Between a zip file's entry and the entry of the zip file in it; no name can hold it
 _INSIDE = "\0"
@@ -49,13 +56,6 @@ _DAMAGED = (
     KeyError,
     OverflowError,
 )
-
-# mod/assign/locallib.php of Moodle: {full name}_{participant}_assignsubmission_{plugin}_
-_MOODLE = re.compile(r"(?P<name>[^/]+?)_(?P<id>\d+)_assignsubmission_[a-z]+_?(?:/|$|[^/]*$)")
-# Canvas: {surnamefirst}[_LATE]_{user}_{submission}_{file}
-_CANVAS = re.compile(r"(?P<name>[^\W\d_][^/_]*)(?:_LATE)?_(?P<id>\d+)_\d+_[^/]+(?:/|$)")
-# Gradescope: submission_{number}/ or submission_{number}.pdf
-_GRADESCOPE = re.compile(r"submission_(?P<id>\d+)(?:/|\.pdf$)")
 
 
 def collect(paths: Sequence[Path]) -> tuple[tuple[Submission, ...], tuple[str, ...]]:
@@ -81,15 +81,15 @@ def collect(paths: Sequence[Path]) -> tuple[tuple[Submission, ...], tuple[str, .
     """
     notes: list[str] = []
     others: Counter[str] = Counter()
-    found: dict[tuple[Path, str], str] = {}
+    found: dict[tuple[Path, str], tuple[str, datetime | None]] = {}
     for path in paths:
         for file, name in _files(path, notes):
             if name.lower().endswith(".pdf"):
-                found.setdefault((file, ""), name)
+                found.setdefault((file, ""), (name, None))
             elif name.lower().endswith(".zip"):
                 prefix = f"{name}/" if path.is_dir() else ""
-                for entry, inner in _entries_of_file(file, name, notes, others):
-                    found.setdefault((file, entry), prefix + inner)
+                for entry, inner, time in _entries_of_file(file, name, notes, others):
+                    found.setdefault((file, entry), (prefix + inner, time))
             else:
                 others[_kind(name)] += 1
     if others:
@@ -99,9 +99,12 @@ def collect(paths: Sequence[Path]) -> tuple[tuple[Submission, ...], tuple[str, .
     if not found:
         why = f" {' '.join(notes)}" if notes else ""
         raise SettingsError(one_line(f"No PDF was found in what was given.{why}", 500))
-    order = sorted(found.items(), key=lambda item: (item[1].casefold(), item[1], item[0]))
-    names = _unique(_shown(name) for _, name in order)
-    made = (Submission(*where, name) for (where, _), name in zip(order, names, strict=True))
+    order = sorted(found.items(), key=lambda item: (item[1][0].casefold(), item[1][0], item[0]))
+    names = _unique(_shown(name) for _, (name, _) in order)
+    made = (
+        Submission(*where, name, time)
+        for (where, (_, time)), name in zip(order, names, strict=True)
+    )
     return tuple(made), tuple(notes)
 
 
@@ -130,27 +133,38 @@ def read(submission: Submission) -> bytes | Refused:
     return content
 
 
-def guess_student(name: str) -> tuple[str, str]:
-    """Student's name and number, as far as a learning platform's file name tells.
+def gradescope_people(paths: Sequence[Path]) -> dict[str, Origin]:
+    """What Gradescope's export says of its submissions; empty where nothing came from there.
 
-    The number is the platform's (Moodle's participant, Canvas's user, Gradescope's submission),
-    not the university's.
-
-    >>> guess_student("Doe Jane_4711_assignsubmission_file_/report.pdf")
-    ('Doe Jane', '4711')
-    >>> guess_student("doejane_LATE_12345_67890_report-1.pdf")
-    ('doejane', '12345')
-    >>> guess_student("report.pdf")
-    ('', '')
+    Only the file beside the submissions is read, never one that a student handed in.
     """
-    parts = name.split("/")
-    tails = ["/".join(parts[index:]) for index in range(len(parts))]
-    for pattern in (_MOODLE, _CANVAS, _GRADESCOPE):
-        for tail in tails:
-            match = pattern.match(tail)
-            if match is not None:
-                return match.groupdict().get("name", ""), match["id"]
-    return "", ""
+    found: dict[str, Origin] = {}
+    for path in paths:
+        for file, name in _files(path, []):
+            texts: list[bytes] = []
+            if _is_metadata(name):
+                with file.open("rb") as stream:
+                    texts.append(stream.read(MAX_BYTES))
+            elif name.lower().endswith(".zip"):
+                with suppress(_EntryError, MemoryError, *_DAMAGED):
+                    texts += _metadata_inside(file)
+            for text in texts:
+                found |= gradescope_metadata(text.decode("utf-8", errors="replace"))
+    return found
+
+
+def _metadata_inside(file: Path) -> list[bytes]:
+    with file.open("rb") as stream, _archive(stream) as archive:
+        return [
+            _unpacked(archive, entry.filename)
+            for entry in archive.infolist()
+            if _is_metadata(_label(entry))
+        ]
+
+
+def _is_metadata(name: str) -> bool:
+    *folders, last = name.split("/")
+    return last == METADATA and not any(one.startswith("submission_") for one in folders)
 
 
 class _EntryError(Exception):
@@ -223,15 +237,15 @@ def _kind(name: str) -> str:
 
 def _entries_of_file(
     file: Path, name: str, notes: list[str], others: Counter[str]
-) -> Iterator[tuple[str, str]]:
-    """PDFs in a zip file: entry as :class:`Submission` keeps it, and its name for people."""
+) -> Iterator[Found]:
+    """PDFs in a zip file."""
     shown = _shown(name)
     try:
         with file.open("rb") as stream, _archive(stream) as archive:
             inner_left = MAX_INNER_BYTES
             for entry, label in _listed(archive, shown, notes):
                 if label.lower().endswith(".pdf"):
-                    yield entry, label
+                    yield entry, label, _time(archive.getinfo(entry))
                 elif label.lower().endswith(".zip"):
                     inner_left -= archive.getinfo(entry).file_size
                     if inner_left < 0:
@@ -249,14 +263,16 @@ def _entries_of_file(
 
 def _entries_inside(
     archive: zipfile.ZipFile, entry: str, label: str, notes: list[str], others: Counter[str]
-) -> Iterator[tuple[str, str]]:
-    """PDFs in a zip file in a zip file."""
+) -> Iterator[Found]:
+    """PDFs in a zip file in a zip file, with the time of the outer one."""
     shown = _shown(label)
+    # the student set the clock of what is in the inner one
+    time = _time(archive.getinfo(entry))
     try:
         with _archive(io.BytesIO(_unpacked(archive, entry))) as inner:
             for inner_entry, inner_label in _listed(inner, shown, notes):
                 if inner_label.lower().endswith(".pdf"):
-                    yield f"{entry}{_INSIDE}{inner_entry}", f"{label}/{inner_label}"
+                    yield f"{entry}{_INSIDE}{inner_entry}", f"{label}/{inner_label}", time
                 elif inner_label.lower().endswith(".zip"):
                     notes.append(f"{shown}: a zip file in it was passed over: too deep.")
                 else:
@@ -282,6 +298,15 @@ def _listed(archive: zipfile.ZipFile, shown: str, notes: list[str]) -> Iterator[
         label = _label(entry)
         if not any(map(_hidden, label.split("/"))):
             yield entry.filename, label
+
+
+def _time(entry: zipfile.ZipInfo) -> datetime | None:
+    """When an entry was changed, in the time zone of who packed it; None where that is nonsense."""
+    try:
+        time = datetime(*entry.date_time)
+    except ValueError:
+        return None
+    return time if time.year > ZIP_EPOCH else None
 
 
 def _label(entry: zipfile.ZipInfo) -> str:

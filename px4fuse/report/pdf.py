@@ -35,7 +35,7 @@ from px4fuse.report.document import (
     WhatIfDocument,
 )
 from px4fuse.report.seal import sealed
-from px4fuse.report.style import LEFT, MUTED, RIGHT, printable, report_style, shorten
+from px4fuse.report.style import LEFT, MUTED, RIGHT, printable, put, report_style, shorten
 
 Report = Document | LoopDocument | WhatIfDocument | EvaluationDocument | ChangesDocument
 RESULTS_NAME = "results.json"
@@ -111,11 +111,11 @@ def _running_lines(figure: Figure, document: Report, number: int, count: int) ->
     who = " · ".join(part for part in (document.student.name, document.student.id) if part)
     room = 330 if who else 500
     head = shorten(printable(f"px4fuse · {name} · SHA-256 {sha256[:12]}"), 6.5, room)
-    figure.text(LEFT, 0.972, head, **style)  # type: ignore[arg-type]
+    put(figure, LEFT, 0.972, head, **style)
     if who:
         figure.text(RIGHT, 0.972, shorten(printable(who), 6.5, 170), ha="right", **style)  # type: ignore[arg-type]
     version = metadata.version("px4fuse")
-    figure.text(LEFT, 0.022, f"px4fuse {version}", **style)  # type: ignore[arg-type]
+    put(figure, LEFT, 0.022, f"px4fuse {version}", **style)
     figure.text(RIGHT, 0.022, f"{number} / {count}", ha="right", **style)  # type: ignore[arg-type]
 
 

@@ -47,7 +47,8 @@ def read_results(data: bytes, name: str = "results.json") -> Results:
     except RecursionError as error:
         raise ResultsError(f"{name} is nested too deeply.") from error
     except _RefusedError as refusal:
-        raise ResultsError(f"{name} {refusal}.") from refusal
+        why, *remedy = refusal.args
+        raise ResultsError(f"{name} {why}.", *remedy) from refusal
 
 
 def cleaned(text: str) -> str:
@@ -170,7 +171,8 @@ def _decoded(value: Any) -> Results:
     if version != VERSION:
         raise _RefusedError(
             f"follows version {one_line(version, 20)} of the results' schema, this px4fuse reads "
-            f"version {VERSION}: make the report again with it"
+            f"version {VERSION}: make the report again with it",
+            "Run it with the px4fuse that the report was made with.",
         )
     try:
         found: Results = msgspec.convert(value, KINDS[name], dec_hook=choose)

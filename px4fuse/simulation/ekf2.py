@@ -12,6 +12,7 @@ own attitude is in estimator_states.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 
@@ -112,7 +113,8 @@ def fly(
         settings=settings,
         stretches=(stretch,),
         vision=_vision(source),
-        rules=RULES,
+        # ev_pos_control.cpp: without bit 0 samples are only compared with the state
+        rules=RULES if int(flown["EKF2_EV_CTRL"]) & 1 else replace(RULES, start_interval_s=0.0),
         step_s=step_s,
         horizon_s=(length - 1) * step_s,
         predict_s=PREDICT_US * 1e-6,

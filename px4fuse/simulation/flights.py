@@ -155,7 +155,7 @@ def _parameters(scenario: Scenario, mistakes: Mistakes) -> dict[str, int | float
     return {
         **ekf2.parameters(sensors.reported_sigma_m(scenario, mistakes), mistakes),
         "EKF2_EN": int(scenario.ekf2),
-        "EKF2_EV_CTRL": 1,
+        "EKF2_EV_CTRL": 0 if mistakes.ekf2_off else 1,
         "EKF2_GPS_CTRL": 0,
         "EKF2_HGT_REF": 0,
         "SDLOG_PROFILE": PROFILE_DEFAULT if mistakes.no_vvo else PROFILE_WITH_VISION,

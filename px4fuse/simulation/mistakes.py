@@ -74,6 +74,8 @@ class Mistakes:
     ekf2_noise_m, ekf2_delay_s, ekf2_gate : float
         EKF2_EVP_NOISE, EKF2_EV_DELAY and EKF2_EVP_GATE as flown; a noise of 0 leaves it as the
         source reports it.
+    ekf2_off : bool
+        EKF2_EV_CTRL is 0, so that EKF2 fuses no position.
     """
 
     clock_offset_s: float = 0.0
@@ -101,6 +103,7 @@ class Mistakes:
     ekf2_noise_m: float = 0.0
     ekf2_delay_s: float = 0.0
     ekf2_gate: float = 5.0
+    ekf2_off: bool = False
 
 
 @dataclass(frozen=True)
@@ -297,6 +300,14 @@ MISTAKES: Mapping[str, Mistake] = MappingProxyType({
         1.0,
         "EKF2_EVP_GATE is this: samples further off than so many √S are rejected.",
         "EKF2 rejects good samples, loses its track and resets to a sample now and then.",
+        of_ekf2=True,
+    ),
+    "ekf2-off": Mistake(
+        (),
+        0.0,
+        "EKF2_EV_CTRL is 0.",
+        "EKF2 never fuses the positions and does not know where it is; set EKF2_EV_CTRL to 1.",
+        switch="ekf2_off",
         of_ekf2=True,
     ),
 })  # fmt: skip

@@ -130,17 +130,20 @@ def read_report(pdf: bytes, name: str) -> Report | Refused:
     Report or Refused
         The strings of ``results`` are cleaned.
     """
+    remedy = ""
     try:
         with _quiet_pypdf():
             return _read(pdf)
-    except (_RefusedError, ResultsError) as refusal:
+    except ResultsError as refusal:
+        reason, remedy = str(refusal), refusal.remedy
+    except _RefusedError as refusal:
         reason = str(refusal)
     except (LimitReachedError, RecursionError, MemoryError):
         reason = _COSTLY
     # pypdf names no closed set of exceptions for what is broken in a file
     except Exception:  # noqa: BLE001
         reason = _DAMAGED
-    return Refused(f"{one_line(name, 200)}: {reason}")
+    return Refused(f"{one_line(name, 200)}: {reason}", remedy)
 
 
 @contextmanager

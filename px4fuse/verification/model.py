@@ -42,9 +42,13 @@ class Report:
 
 @dataclass(frozen=True)
 class Refused:
-    """A submission that cannot be read as a report, and why: one sentence for a person."""
+    """A submission that cannot be read as a report, and why: one sentence for a person.
+
+    ``remedy`` is what whoever verifies it can do; "" where nothing helps but another file.
+    """
 
     reason: str
+    remedy: str = ""
 
 
 @dataclass(frozen=True)
@@ -106,6 +110,8 @@ class Verdict:
     redrawn : bytes
         The report as px4fuse draws it from what the log gives, as a PDF: what to read instead of
         what was handed in. Empty where the analysis was not run again.
+    remedy : str
+        What whoever verifies it can do where nothing could be said: one sentence.
     """
 
     status: Status
@@ -115,6 +121,7 @@ class Verdict:
     page_status: PageStatus = "not compared"
     pages: tuple[PageDifference, ...] = ()
     redrawn: bytes = field(default=b"", repr=False)
+    remedy: str = ""
 
     @property
     def outcome(self) -> str:

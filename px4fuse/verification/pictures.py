@@ -8,14 +8,14 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-from PIL import Image
+from PIL import Image, ImageDraw
 
 from px4fuse.flight import Unavailable
 
 # Enough to keep our blue, EKF2's orange and the severities apart, with smooth letters
 COLOURS = 16
-# A page of text and lines at 700 pixels takes 25 to 40 kB; a photograph is made smaller
-MAX_BYTES = 40_000
+# A page of text and lines at 700 pixels takes 15 to 55 kB; a photograph is made smaller
+MAX_BYTES = 60_000
 MAX_PIXELS = 2_000_000
 MAX_DRAWN_COLOURS = 20_000
 # PDF's own limit is 14,400 points, or 200 inches
@@ -23,6 +23,9 @@ MAX_POINTS = 14_400.0
 # Headings of the first page of either kind of report
 COVERS = ("Two-state Kalman filter against EKF2", "Loop closure")
 WHAT = "picture of the page"
+# Where a report's pages name log and student, and what names are covered with
+HEAD = 0.045
+COVER = (190, 190, 190)
 # PDFium's own errors are RuntimeErrors; the others come from ctypes and Pillow
 FAILURES = (
     RuntimeError, ValueError, TypeError, ArithmeticError, LookupError, AssertionError, OSError,
@@ -84,6 +87,64 @@ def picture(pdf: bytes, page: int, width_px: int = 700) -> bytes | Unavailable:
         return Unavailable(WHAT, f"it cannot be drawn ({error})", "Open the PDF itself.")
 
 
+def page_pictures(
+    pdf: bytes, hide: Sequence[str] = (), width_px: int = 700
+) -> tuple[bytes, ...] | Unavailable:
+    """Draw every page of a report that px4fuse drew.
+
+    Parameters
+    ----------
+    pdf : bytes
+    hide : sequence of str
+        Words that must not be read in the pictures: they are covered, and so is the head of each
+        page. Where none of them is found on the first page, nothing is drawn: the words are there
+        in letters that cannot be searched.
+    width_px : int
+
+    Returns
+    -------
+    tuple of bytes or Unavailable
+        A PNG per page.
+    """
+    library = pdfium()
+    if isinstance(library, Unavailable):
+        return library
+    try:
+        document = library.PdfDocument(pdf)
+        try:
+            made = []
+            for number in range(len(document)):
+                sheet = document[number]
+                image = rendered(sheet, width_px)
+                if hide and not _cover(image, sheet, hide) and not number:
+                    raise ValueError("a name on its first page cannot be found to cover it")
+                made.append(_small_png(image))
+            return tuple(made)
+        finally:
+            document.close()
+    except FAILURES as error:
+        return Unavailable(WHAT, f"it cannot be drawn ({error})", "Open the PDF itself.")
+
+
+def _cover(image: Image.Image, sheet: Any, hide: Sequence[str]) -> int:
+    """Cover words and the head of a page; how many places below the head there were."""
+    scale = image.width / sheet.get_width()
+    pen = ImageDraw.Draw(image)
+    pen.rectangle((0.0, 0.0, image.width, HEAD * image.height), COVER)
+    text = sheet.get_textpage()
+    found = 0
+    for word in hide:
+        search = text.search(word, match_case=False, match_whole_word=False)
+        while (place := search.get_next()) is not None:
+            for each in range(text.count_rects(*place)):
+                left, bottom, right, top = text.get_rect(each)
+                box = (left, sheet.get_height() - top, right, sheet.get_height() - bottom)
+                x0, y0, x1, y1 = (scale * edge for edge in box)
+                pen.rectangle((x0 - 2.0, y0 - 2.0, x1 + 2.0, y1 + 2.0), COVER)
+                found += y1 > HEAD * image.height
+    return found
+
+
 def pdfium() -> Any:
     """The module pypdfium2, or Unavailable."""
     try:
@@ -120,7 +181,7 @@ def _small_png(image: Image.Image) -> bytes:
         method = Image.Quantize.MAXCOVERAGE if drawn else Image.Quantize.FASTOCTREE
         reduced = image.quantize(COLOURS, method, dither=Image.Dither.NONE)
         out = io.BytesIO()
-        reduced.save(out, "PNG", optimize=True)
+        reduced.save(out, "PNG")
         if out.tell() <= MAX_BYTES:
             return out.getvalue()
         ratio = min(0.9, math.sqrt(MAX_BYTES / out.tell()))

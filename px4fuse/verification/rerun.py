@@ -24,9 +24,11 @@ from px4fuse.report.document import Document, LoopDocument
 from px4fuse.request import command_line
 from px4fuse.results.contract import ComparisonResults, LoopResults, Reported, to_json
 from px4fuse.results.model import Provenance
+from px4fuse.results.reading import one_line
 from px4fuse.verification.model import Refused
 
 MAX_NAME_BYTES = 240
+ASK = "Ask how the report was made, and for the log and all files that it was made from."
 NOT_OURS = "the recorded request is not one that px4fuse can have made"
 # What Windows does not take in a name, or takes for something else than a file
 _WINDOWS = re.compile(r'[<>:"|?*]|^(?:con|prn|aux|nul|com\d|lpt\d)(?:\.|$)|[. ]$', re.IGNORECASE)
@@ -49,7 +51,11 @@ class Recomputed:
 
 
 class _RefusedError(Exception):
-    """The analysis cannot be repeated; the text says why."""
+    """The analysis cannot be repeated: why, and what helps."""
+
+    def __init__(self, reason: str, remedy: str) -> None:
+        super().__init__(reason)
+        self.remedy = remedy
 
 
 def log_sha256(results: Reported) -> str:
@@ -80,11 +86,13 @@ def recompute(results: Reported, logs: Mapping[str, Path]) -> Recomputed | Refus
                 return _looped(results, files, versions)
             return _compared(results, files, versions)
     except SettingsError as error:  # no run with these settings can have made a report
-        return Refused(f"{NOT_OURS}: {error}")
-    except (_RefusedError, Px4FuseError) as error:
-        return Refused(str(error))
+        return Refused(f"{NOT_OURS}: {error}", ASK)
+    except _RefusedError as error:
+        return Refused(str(error), error.remedy)
+    except Px4FuseError as error:
+        return Refused(str(error), ASK)
     except Exception as error:  # noqa: BLE001 - settings made to fail may fail anywhere
-        return Refused(f"the analysis cannot be repeated ({type(error).__name__})")
+        return Refused(f"the analysis cannot be repeated ({type(error).__name__})", ASK)
 
 
 # -- what was recorded -----------------------------------------------------------------------------
@@ -95,7 +103,7 @@ def _versions(results: Reported) -> Provenance:
     from px4fuse.results.parts import LIBRARIES  # noqa: PLC0415
 
     if tuple(results.provenance.libraries) != LIBRARIES:
-        raise _RefusedError("the results do not say which libraries they were made with")
+        raise _RefusedError("the results do not say which libraries they were made with", ASK)
     return results.provenance
 
 
@@ -117,14 +125,18 @@ class _Files:
         """A file with this content and the recorded name."""
         path = None if sha256 is None else self.logs.get(sha256)
         if path is None:
-            raise _RefusedError(f"none of the files given has the SHA-256 of {what}")
+            raise _RefusedError(
+                f"none of the files given has the SHA-256 of {what}",
+                f"Add {one_line(recorded, 80)} to --logs.",
+            )
         name = recorded
         plain = name == Path(name).name and "\\" not in name and name.isprintable()
         if not plain or len(name.encode(errors="replace")) > MAX_NAME_BYTES:
-            raise _RefusedError(f"{NOT_OURS}: a file name in it is not a plain name")
+            raise _RefusedError(f"{NOT_OURS}: a file name in it is not a plain name", ASK)
         if os.name == "nt" and _WINDOWS.search(name):
             raise _RefusedError(
-                "a recorded file name is not valid on Windows: verify it on another system"
+                "a recorded file name is not valid on Windows",
+                "Verify it on Linux or macOS.",
             )
         # each in a folder of its own: two may have one name
         folder = Path(tempfile.mkdtemp(dir=self._folder))
@@ -141,7 +153,7 @@ def _joined(results: ComparisonResults, role: str) -> str | None:
     return next((file.sha256 for file in results.log.joined if file.role == role), None)
 
 
-def _part(source: str) -> tuple[str, str]:
+def split_part(source: str) -> tuple[str, str]:
     """File and part of ``LOG:vio``, without a look at any file."""
     from px4fuse.loop.tracks import PARTS  # noqa: PLC0415
 
@@ -182,11 +194,11 @@ def _looped(handed_in: LoopResults, files: _Files, versions: Provenance) -> Reco
 
     recorded = request = handed_in.request
     person = handed_in.student
-    path, part = _part(request.source)
+    path, part = split_part(request.source)
     source = files.place(path, handed_in.track.sha256, "the log")
     request = replace(request, source=f"{source}{part}")
     if request.reference is not None:
-        path, part = _part(request.reference)
+        path, part = split_part(request.reference)
         sha256 = handed_in.references[-1].sha256 if handed_in.references else None
         placed = files.place(path, sha256, "--reference")
         request = replace(request, reference=f"{placed}{part}")

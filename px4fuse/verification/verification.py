@@ -20,7 +20,7 @@ from typing import Any
 
 from px4fuse.flight import Unavailable
 from px4fuse.reading import files_by_sha256
-from px4fuse.results.contract import Reported, to_plain
+from px4fuse.results.contract import LoopResults, Reported, to_plain
 from px4fuse.results.model import Provenance
 from px4fuse.results.reading import cleaned, one_line
 from px4fuse.verification import rerun
@@ -111,37 +111,40 @@ def verify(
     OSError
         A log cannot be read.
     """
-    other_version = _other_version(report.results)
-    if other_version:
-        return Verdict("cannot verify", (other_version,), with_log=False)
+    theirs, ours = report.results.provenance.px4fuse, metadata.version("px4fuse")
+    if theirs != ours:
+        named = one_line(theirs, 40)
+        reason = f"made with px4fuse {named}, this is {ours}"
+        return _unknown(reason, f"Run it with px4fuse {named}.")
     if not logs:
-        return Verdict("cannot verify", (NO_LOG,), with_log=False)
+        return _unknown(NO_LOG, f"Add {_log_name(report.results)} to --logs.")
     files = logs if isinstance(logs, Mapping) else files_by_sha256(logs)
     sha256 = rerun.log_sha256(report.results)
     if sha256 not in files:
         asked = one_line(sha256, 64) or "none"
         reason = f"none of the {len(files)} files given is the log, whose SHA-256 is {asked}"
-        return Verdict("other log", (reason,), with_log=False)
+        remedy = f"If it is a log of yours, add {_log_name(report.results)} to --logs."
+        return Verdict("other log", (reason,), with_log=False, remedy=remedy)
     if report.results.student.notes.count("\n") > MAX_NOTES_LINES:
         reason = f"its notes have more than {MAX_NOTES_LINES} lines, which is no report"
-        return Verdict("cannot verify", (reason,), with_log=False)
+        return _unknown(reason, rerun.ASK)
     again = recompute(report.results, files)
     if isinstance(again, Refused):
-        # what px4fuse cannot have recorded contradicts the report; what it could, does not
-        forged = again.reason.startswith(rerun.NOT_OURS)
-        status: Status = "numbers differ" if forged else "cannot verify"
-        return Verdict(status, (one_line(again.reason, 400),), with_log=False)
+        return _unknown(one_line(again.reason, 400), again.remedy)
     return _with_log(report, again)
 
 
-def _other_version(results: Reported) -> str:
-    """Why this version cannot say anything about the results; "" where it can."""
-    theirs = results.provenance.px4fuse
-    ours = metadata.version("px4fuse")
-    if theirs != ours:
-        named = one_line(theirs, 40)
-        return f"made with px4fuse {named}, this is {ours}: run that version"
-    return ""
+def _unknown(reason: str, remedy: str) -> Verdict:
+    return Verdict("cannot verify", (reason,), with_log=False, remedy=remedy)
+
+
+def _log_name(results: Reported) -> str:
+    """Name of the log, as the report gives it."""
+    if isinstance(results, LoopResults):
+        name, _ = rerun.split_part(results.track.name)
+    else:
+        name = results.log.name
+    return one_line(name, 80) or "its log"
 
 
 # -- with the log ----------------------------------------------------------------------------------

@@ -1,0 +1,266 @@
+"""What is drawn for a student: which flight, which mistakes, of which sizes.
+
+It follows from the instructor's secret and the student's id by HMAC (RFC 2104), so that nobody
+without the secret can guess another's, and a second run gives the same.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+import math
+import re
+from bisect import bisect
+from dataclasses import dataclass
+from functools import partial
+from itertools import accumulate
+from typing import Any, Literal
+
+from px4fuse.assignment.key import folded
+from px4fuse.errors import SettingsError
+from px4fuse.simulation.scenario import KINDS, Kind, Scenario
+
+# Of a class: one kind of flight for all, or drawn for each
+Kinds = Literal["aisle", "loop", "mixed"]
+
+MIN_SECRET = 8
+_SIZE = re.compile(r"[\w-]+=([-+]?[\d.]+)")
+# Named in every draw: another text gives other flights, and keys of another text cannot be extended
+DRAWN = "px4fuse assignment 2"
+# What is drawn, and from where to where, with the decimals that are kept
+NOISES: dict[Kind, dict[str, tuple[float, float, int]]] = {
+    "aisle": {
+        "sigma_uwb_m": (0.07, 0.12, 3),
+        "sigma_a_m_s2": (0.15, 0.30, 3),
+        "speed_m_s": (0.9, 1.3, 2),
+        "heading_deg": (-180.0, 180.0, 1),
+    },
+    "loop": {
+        "vio_drift": (0.008, 0.02, 4),
+        "sigma_vio_m": (0.008, 0.015, 4),
+        "sigma_a_m_s2": (0.15, 0.30, 3),
+        "speed_m_s": (0.8, 1.2, 2),
+        "heading_deg": (-180.0, 180.0, 1),
+    },
+}
+PASSES: dict[Kind, int] = {"aisle": 6, "loop": 1}
+# Shares of flights with so many mistakes, where the number is not given. The loop has one mistake
+# to offer; with fewer flights without it, "false closure" would be a safe guess.
+COUNTS: dict[Kind, tuple[float, ...]] = {"aisle": (0.1, 0.5, 0.4), "loop": (0.4, 0.6)}
+# Of a class of both kinds
+LOOPS = 1 / 3
+# Of the smallest size of a mistake that px4fuse finds in 19 of 20 flights, over the size in the
+# flight: between these everyone's lies
+EASIEST, HARDEST = 0.6, 1.0
+
+
+@dataclass(frozen=True)
+class Choice:
+    """A mistake that may be drawn, at sizes at which it is found.
+
+    Attributes
+    ----------
+    mistake : str
+        Name in :data:`px4fuse.simulation.mistakes.MISTAKES`.
+    finding : str
+        What names it.
+    group : str
+        Of two of the same group, one would hide the other.
+    limit : float or None
+        The smallest size, in ``unit``, from which on findings/rates.csv has the finding in 19 of
+        20 flights; None for a mistake without a size.
+    unit : str
+        As it is typed.
+    less_is_plainer : bool
+        Whether a smaller number is the larger mistake.
+    either_sign : bool
+    at_s : (float, float) or None
+        When it begins, where that can be said.
+    hides : tuple of str
+        Other groups whose mistakes this one hides, or whose mistakes hide it.
+    """
+
+    mistake: str
+    finding: str
+    group: str
+    limit: float | None = None
+    unit: str = ""
+    less_is_plainer: bool = False
+    either_sign: bool = False
+    at_s: tuple[float, float] | None = None
+    hides: tuple[str, ...] = ()
+
+    def goes_with(self, other: Choice) -> bool:
+        """Whether both are found in one flight."""
+        return not (
+            self.group == other.group or self.group in other.hides or other.group in self.hides
+        )
+
+    def typed(self, difficulty: float, sign: float = 1.0, at: float = 0.5) -> str:
+        """As ``px4fuse simulate --mistake`` takes it, of the size that is as difficult.
+
+        ``at``: when it begins, as a share of the span in which it may.
+        """
+        if self.limit is None:
+            return self.mistake
+        size = self.limit * difficulty if self.less_is_plainer else self.limit / difficulty
+        text = f"{self.mistake}={math.copysign(float(f'{size:.3g}'), sign):g}{self.unit}"
+        if self.at_s is None:
+            return text
+        first, last = self.at_s
+        return f"{text},{first + at * (last - first):.0f}s"
+
+    def difficulty(self, typed: str) -> float:
+        """From ``EASIEST`` to ``HARDEST``: the limit over the size, or the size over the limit.
+
+        What has no size cannot be missed for being small, and is the easiest.
+        """
+        size = _SIZE.match(typed)
+        if self.limit is None or size is None:
+            return EASIEST
+        ratio = self.limit / abs(float(size[1]))
+        return round(1.0 / ratio if self.less_is_plainer else ratio, 2)
+
+
+# Clock and heading are estimated from the IMU. A gap of the IMU is not among the choices: it passes
+# for a change of the clock in every second flight. Outliers make EKF2 reject and its NIS grow too,
+# and pull the heading; a delay is seen by what EKF2 does with good samples.
+NEED_IMU = ("clock", "frame")
+CHOICES: dict[Kind, tuple[Choice, ...]] = {
+    "aisle": (
+        Choice("clock-offset", "source_clock_offset", "clock", 150, "ms", either_sign=True),
+        Choice(
+            "clock-jump", "source_stamps_of_arrival", "clock", 50, "ms", hides=("frame", "gap")
+        ),
+        Choice("yaw", "source_frame_turned", "frame", 15, "deg", either_sign=True),
+        Choice("nlos", "source_outliers", "outliers", 1, "%", hides=("frame",)),
+        Choice("dropout", "source_gap", "gap", 2, "s", at_s=(30, 70)),
+        Choice(
+            "imu-rate", "logging_rate_low", "rate", 40, "Hz", less_is_plainer=True, hides=NEED_IMU
+        ),
+        Choice(
+            "ekf2-noise", "ekf2_variance_understated", "ekf2", 4, "cm", less_is_plainer=True,
+            hides=("outliers",),
+        ),
+        Choice(
+            "ekf2-gate", "ekf2_rejecting", "ekf2", 2, less_is_plainer=True, hides=("outliers",)
+        ),
+        Choice("ekf2-delay", "ekf2_ev_delay_wrong", "clock", 150, "ms", hides=("ekf2",)),
+        Choice("ekf2-off", "ekf2_not_fusing", "ekf2"),
+    ),
+    "loop": (Choice("open-end", "false_loop_closure", "end", 4, "m"),),
+}  # fmt: skip
+POSSIBLE_FINDINGS = frozenset(choice.finding for kind in CHOICES.values() for choice in kind)
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """What was drawn for a student.
+
+    Attributes
+    ----------
+    scenario : Scenario
+    chosen : tuple of Choice
+    typed : tuple of str
+        The mistakes as typed, in the same order.
+    """
+
+    scenario: Scenario
+    chosen: tuple[Choice, ...]
+    typed: tuple[str, ...]
+
+    @property
+    def difficulty(self) -> float:
+        """That of the hardest mistake.
+
+        Only who has looked for the smallest can say that there is none: such a flight is among the
+        hardest.
+        """
+        each = [one.difficulty(text) for one, text in zip(self.chosen, self.typed, strict=True)]
+        return max(each, default=HARDEST)
+
+    @property
+    def findings(self) -> tuple[str, ...]:
+        """Ids of the findings that name the mistakes."""
+        return tuple(choice.finding for choice in self.chosen)
+
+
+def uniform(secret: bytes, student_id: str, kind: Kinds, label: str) -> float:
+    """A number in [0, 1) that only those who know the secret can tell."""
+    message = "\0".join((DRAWN, kind, folded(student_id), label))
+    digest = hmac.new(secret, message.encode(errors="replace"), hashlib.sha256).digest()
+    return int.from_bytes(digest[:7], "big") / 2**56
+
+
+def draw(
+    secret: bytes, student_id: str, kind: Kinds, count: int | None = None, truth: bool = True
+) -> Drawn:
+    """Draw one student's flight.
+
+    Parameters
+    ----------
+    secret : bytes
+    student_id : str
+    kind : {"aisle", "loop", "mixed"}
+        "mixed" draws which of the two.
+    count : int, optional
+        Of mistakes; None draws it.
+    truth : bool
+        Whether an aisle's log holds the truth. A loop's does not: it would tell where it landed.
+    """
+    if kind == "mixed":
+        kind = "loop" if uniform(secret, student_id, kind, "kind") < LOOPS else "aisle"
+    one = partial(uniform, secret, student_id, kind)
+    if count is None:
+        count = bisect(list(accumulate(COUNTS[kind][:-1])), one("count"))
+    chosen: list[Choice] = []
+    for choice in sorted(CHOICES[kind], key=lambda c: one(f"order {c.mistake}")):
+        if len(chosen) < count and all(map(choice.goes_with, chosen)):
+            chosen.append(choice)
+    typed = tuple(
+        choice.typed(
+            EASIEST + (HARDEST - EASIEST) * one(f"size {choice.mistake}"),
+            -1.0 if choice.either_sign and one(f"sign {choice.mistake}") < 0.5 else 1.0,
+            one(f"at {choice.mistake}"),
+        )
+        for choice in chosen
+    )
+    scenario = draw_scenario(secret, student_id, kind, truth)
+    return Drawn(scenario, tuple(chosen), typed)
+
+
+def draw_scenario(secret: bytes, student_id: str, kind: Kind, truth: bool = True) -> Scenario:
+    """Noises, speed and heading of one student's flight, without mistakes."""
+    numbers: dict[str, Any] = {
+        name: round(low + (high - low) * uniform(secret, student_id, kind, name), decimals)
+        for name, (low, high, decimals) in NOISES[kind].items()
+    }
+    return Scenario(
+        kind=kind,
+        passes=PASSES[kind],
+        truth=truth and kind == "aisle",
+        seed=int(uniform(secret, student_id, kind, "seed") * 2**32),
+        **numbers,
+    )
+
+
+def most_mistakes(kind: Kinds) -> int:
+    """How many mistakes every flight can have."""
+    return min(len(COUNTS[one]) for one in (KINDS if kind == "mixed" else (kind,))) - 1
+
+
+def secret_of(text: str, where: str) -> bytes:
+    """A secret as bytes, from an option or a file.
+
+    Raises
+    ------
+    SettingsError
+        It is too short to be one.
+    """
+    stripped = text.strip()
+    if len(stripped) < MIN_SECRET:
+        raise SettingsError(
+            f"{where}: a secret of {len(stripped)} characters can be guessed. Give "
+            f"{MIN_SECRET} or more, or leave it out: one is made up and kept in the answer key."
+        )
+    return stripped.encode(errors="replace")

@@ -1,0 +1,133 @@
+"""Which mistakes the notes say that a flight has: rightly, wrongly, or so that nobody can tell."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass
+
+from px4fuse.findings.causes import CONSEQUENCES
+from px4fuse.grading.names import named
+from px4fuse.grading.notes import Mention
+
+# In the words of the rubric: what names a subject rather than a mistake
+TOPICS = "topic"
+# What a student rightly says of a mistake although it has a finding of its own
+_BRINGS: Mapping[str, tuple[str, ...]] = {"source_gap": ("ekf2_not_fusing", "ekf2_rejecting")}
+
+
+@dataclass(frozen=True)
+class Claims:
+    """What notes claim, against what a flight has.
+
+    Attributes
+    ----------
+    right : frozenset of str
+        Findings that are there and claimed plainly.
+    unsure : mapping of str to str
+        Findings that are there and touched upon, with the passage.
+    open : mapping of str to str
+        Findings that are there, with a passage that may claim or deny them.
+    wrong : mapping of str to str
+        Findings that are not there and are claimed plainly, with the passage: one per kind.
+    unsure_wrong : mapping of str to str
+        Findings that are not there and touched upon, with the passage.
+    """
+
+    right: frozenset[str]
+    unsure: Mapping[str, str]
+    open: Mapping[str, str]
+    wrong: Mapping[str, str]
+    unsure_wrong: Mapping[str, str]
+
+    @property
+    def count(self) -> int:
+        """How many kinds of mistakes are claimed plainly."""
+        return len(self.right) + len(self.wrong)
+
+    @property
+    def earned(self) -> frozenset[str]:
+        """Findings that count as named.
+
+        A subject ("the clock offset is 0.2 s") is as good as a claim where every subject that is
+        touched upon is one: who touches upon all of them has claimed nothing.
+        """
+        return self.right if self.unsure_wrong else self.right | frozenset(self.unsure)
+
+
+def claims_of(
+    mention: Callable[[str], tuple[Mention | None, bool]],
+    there: Collection[str],
+    possible: Collection[str],
+    excused: Collection[str],
+) -> Claims:
+    """Compare what notes say with what a flight has.
+
+    Parameters
+    ----------
+    mention : callable
+        What the notes say of a finding, and whether they only touch upon it.
+    there : collection of str
+        What the flight has.
+    possible : collection of str
+        What it might have.
+    excused : collection of str
+        What belongs to that, and may be said as well.
+    """
+    right: set[str] = set()
+    unsure: dict[str, str] = {}
+    open_: dict[str, str] = {}
+    wrong: dict[str, str] = {}
+    unsure_wrong: dict[str, str] = {}
+    for finding in sorted({*there, *possible}):
+        said, weak = mention(finding)
+        if said is None or said.stance == "denied":
+            continue
+        plain = said.stance == "claimed" and not weak
+        if finding in there:
+            if plain:
+                right.add(finding)
+            elif said.stance == "claimed":
+                unsure[finding] = said.passage
+            else:
+                open_[finding] = said.passage
+        elif finding not in excused:
+            if plain and finding not in family(wrong):
+                wrong[finding] = said.passage
+            elif not plain and said.stance == "claimed":
+                unsure_wrong[finding] = said.passage
+    return Claims(frozenset(right), unsure, open_, wrong, unsure_wrong)
+
+
+def family(findings: Collection[str]) -> frozenset[str]:
+    """Findings with what they bring with them and what brings them."""
+    found = set(findings)
+    for start in findings:
+        found |= _reached(start, _followers) | _reached(start, _causes)
+    return frozenset(found)
+
+
+def _reached(start: str, step: Callable[[str], Collection[str]]) -> set[str]:
+    found, left = {start}, [start]
+    while left:
+        for one in step(left.pop()):
+            if one not in found:
+                found.add(one)
+                left.append(one)
+    return found
+
+
+def _followers(finding: str) -> Collection[str]:
+    listed = (*CONSEQUENCES.get(finding, ()), *_BRINGS.get(finding, ()))
+    return {one.partition(":")[0] for one in listed}
+
+
+def _causes(finding: str) -> Collection[str]:
+    return {
+        cause for cause, listed in CONSEQUENCES.items()
+        if finding in {one.partition(":")[0] for one in listed}
+    }  # fmt: skip
+
+
+def in_words(findings: Collection[str]) -> list[str]:
+    """Their names, for a sentence."""
+    return [named(one) for one in sorted(findings)]

@@ -1,0 +1,122 @@
+"""What the instructor says instead of the rules: a table that is read and never written over."""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+from px4fuse.assignment.key import folded
+from px4fuse.errors import SettingsError
+from px4fuse.grading.model import Entry, Override
+from px4fuse.grading.roster import same_id
+from px4fuse.grading.sheet import read_sheet
+from px4fuse.results.reading import cleaned, one_line
+
+NAME = "overrides.csv"
+TITLES = ("id", "item", "points", "comment")
+TEMPLATE = "\ufeff" + ",".join(TITLES) + "\r\n"
+TOTAL = "total"
+MOST = 1e6
+MAX_COMMENT = 10_000
+
+# Id as it was typed, to item as it was typed ("" for all of it), to what is said
+Overrides = Mapping[str, Mapping[str, Override]]
+
+
+def read_overrides(path: Path) -> Overrides:
+    """Read ``overrides.csv``; nothing where it is not there.
+
+    Its columns are id (as in class.csv, or the file's name), item (a title of the rubric, "total",
+    or empty for a comment on all of it), points and comment.
+
+    Raises
+    ------
+    SettingsError
+        A column is missing, or a row says no number of points where it should.
+    """
+    if not path.exists():
+        return {}
+    sheet = read_sheet(path)
+    missing = [title for title in TITLES if sheet.column((title,)) is None]
+    if missing:
+        raise SettingsError(
+            f"{path}: no column {', '.join(missing)}. Its columns are {', '.join(TITLES)}."
+        )
+    found: dict[str, dict[str, Override]] = defaultdict(dict)
+    for number, row in zip(sheet.numbers, sheet.rows, strict=True):
+        student, item, points = (sheet.cell(row, (title,)) for title in TITLES[:3])
+        comment = cleaned(sheet.cell(row, ("comment",))[:MAX_COMMENT])
+        if item in found[student]:
+            raise SettingsError(
+                f"{path}: row {number}: {one_line(student, 40)}, {one_line(item, 40) or 'all'} "
+                "stands there twice. Keep one of them."
+            )
+        value = _points(points)
+        if (points and value is None) or (value is not None and not item):
+            raise SettingsError(
+                f"{path}: row {number}: points {one_line(points, 20)!r} "
+                + ("are not a number from 0 up." if item else "without an item. Name it, or total.")
+            )
+        found[student][item] = Override(value, comment)
+    return found
+
+
+def _points(text: str) -> float | None:
+    try:
+        # 7,5 in a table that is separated by semicolons
+        value = float(text.replace(",", "."))
+    except ValueError:
+        return None
+    return value if math.isfinite(value) and 0.0 <= value <= MOST else None
+
+
+def matched(
+    overrides: Overrides, entries: Sequence[Entry], items: Sequence[Sequence[str]]
+) -> tuple[list[dict[str, Override]], tuple[str, ...]]:
+    """What is said of whom, and a sentence for every row that fits nobody, or no item.
+
+    Parameters
+    ----------
+    overrides : mapping
+    entries : sequence of Entry
+    items : sequence of sequence of str
+        Titles of the items of each entry.
+
+    Returns
+    -------
+    said : list of dict
+        For each entry, by the title of an item, "total", or "" for all of it.
+    notes : tuple of str
+    """
+    said: list[dict[str, Override]] = [{} for _ in entries]
+    notes = []
+    for student, rows in overrides.items():
+        place = _place(entries, student)
+        if place is None:
+            notes.append(f"{NAME}: nobody has the id {one_line(student, 40) or '(empty)'}.")
+            continue
+        titles = {folded(one): one for one in (*items[place], TOTAL, "")}
+        for item, override in rows.items():
+            title = titles.get(folded(item))
+            if title is None:
+                name = one_line(item, 60)
+                notes.append(f"{NAME}: {one_line(student, 40)} has no item {name!r}.")
+            else:
+                said[place][title] = override
+    return said, tuple(notes)
+
+
+def _place(entries: Sequence[Entry], student: str) -> int | None:
+    """Whose row it is: by the very id, the id but for leading zeros, or the file's name."""
+    looks: tuple[Callable[[Entry], bool], ...] = (
+        lambda entry: folded(entry.student_id) == folded(student) != "",
+        lambda entry: same_id(entry.student_id, student),
+        lambda entry: entry.counting is not None and entry.counting.submission == student,
+    )
+    for look in looks:
+        places = [place for place, entry in enumerate(entries) if look(entry)]
+        if len(places) == 1:
+            return places[0]
+    return None

@@ -1,0 +1,185 @@
+"""What verifying a report found, kept apart from its points: they change, the flight does not.
+
+A record is found by the content of the PDF, whoever handed it in and under what name, and holds
+for the versions that made it and the files that were there: the report says which log and which
+request. Rubric, answer key, roster and overrides are not in it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from functools import cache
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from px4fuse.errors import ResultsError
+from px4fuse.flight import Unavailable
+from px4fuse.results.contract import ComparisonResults, LoopResults, Reported, to_json
+from px4fuse.results.reading import read_results
+from px4fuse.verification.intake import read_report
+from px4fuse.verification.model import Difference, PageDifference, Refused, Report, Verdict
+from px4fuse.verification.pages import page_texts
+from px4fuse.verification.pictures import key_page, picture
+from px4fuse.verification.rerun import log_sha256
+from px4fuse.verification.verification import verify
+from px4fuse.writing import write_all
+
+HANDED_IN, REDRAWN, RESULTS = ".handed-in.png", ".pdf", ".results.json"
+MADE_WITH = ("px4fuse", "numpy", "scipy", "matplotlib", "pypdfium2", "pillow")
+THE_FILE = "The file"
+_SHA256 = re.compile(rb'"([0-9a-f]{64})"')
+
+
+@dataclass(frozen=True)
+class Verified:
+    """A report as it was found to be; pictures and the redrawn PDF stay in their files.
+
+    Attributes
+    ----------
+    report : Report
+        Without its bytes; its pages are those of the redrawn report, as far as there is one.
+    verdict : Verdict
+    page : int
+        Which page the pictures show, counted from 1.
+    """
+
+    report: Report
+    verdict: Verdict
+    page: int
+
+
+def file_of(records: Path, sha256: str, end: str = ".json") -> Path:
+    """Where a part of the record of a PDF stands."""
+    return records / f"{sha256}{end}"
+
+
+def verified(
+    records: Path, pdf: bytes, logs: Mapping[str, Path], handed_out: frozenset[str]
+) -> tuple[Verified | Refused, bool]:
+    """Read and verify a report, or recall what an earlier run found.
+
+    Parameters
+    ----------
+    records : Path
+    pdf : bytes
+        Anything.
+    logs : mapping
+        Files by SHA-256.
+    handed_out : frozenset of str
+        SHA-256 of the logs in the answer key: one of them that is not at hand is the
+        instructor's gap, not another log.
+
+    Returns
+    -------
+    Verified or Refused
+    recalled : bool
+    """
+    sha256 = hashlib.sha256(pdf).hexdigest()
+    found = _recalled(records, sha256, logs, handed_out)
+    if found is not None:
+        return found, True
+    report = read_report(pdf, THE_FILE)
+    if isinstance(report, Refused):
+        _keep(records, sha256, {"refused": report.reason, "files": {}, "gap": False}, {})
+        return report, False
+    gap = _is_gap(report.results, logs, handed_out)
+    verdict = verify(report, {} if gap else logs)
+    # what is shown and scored is the redrawn report, as far as there is one
+    seen = replace(report, pages=page_texts(verdict.redrawn or pdf))
+    page = _page_to_show(verdict, seen)
+    handed_in = picture(pdf, page - 1) if verdict.pages or not verdict.redrawn else b""
+    results = to_json(report.results).encode()
+    values = {
+        "files": {name: name in logs for name in _named(results)},
+        "gap": gap,
+        "verdict": asdict(replace(verdict, redrawn=b"")) | {"redrawn": ""},
+        "seal": report.seal,
+        "pages": seen.pages,
+        "page": page,
+    }
+    parts = {
+        RESULTS: results,
+        HANDED_IN: b"" if isinstance(handed_in, Unavailable) else handed_in,
+        REDRAWN: verdict.redrawn,
+    }
+    _keep(records, sha256, values, parts)
+    return Verified(replace(seen, pdf=b""), replace(verdict, redrawn=b""), page), False
+
+
+def _is_gap(results: Reported, logs: Mapping[str, Path], handed_out: frozenset[str]) -> bool:
+    log = log_sha256(results)
+    return log in handed_out and log not in logs
+
+
+def _named(results: bytes) -> list[str]:
+    """The SHA-256 of every file that a report rests on."""
+    return sorted({match[1].decode() for match in _SHA256.finditer(results)})
+
+
+def _page_to_show(verdict: Verdict, report: Report) -> int:
+    """The page that differs most, else the cover; counted from 1."""
+    if verdict.pages:
+        return max(verdict.pages, key=lambda one: (one.picture, one.words)).page
+    return 1 + (0 if verdict.redrawn else key_page(report.pages))
+
+
+@cache
+def _versions() -> dict[str, str]:
+    found = {}
+    for name in MADE_WITH:
+        try:
+            found[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:  # pictures are an extra
+            found[name] = ""
+    return found
+
+
+def _keep(
+    records: Path, sha256: str, values: Mapping[str, Any], parts: Mapping[str, bytes]
+) -> None:
+    text = json.dumps({"made_with": _versions(), **values}, ensure_ascii=False, indent=1)
+    files = {file_of(records, sha256, end): content for end, content in parts.items()}
+    write_all({**files, file_of(records, sha256): text.encode()})
+
+
+def _recalled(
+    records: Path, sha256: str, logs: Mapping[str, Path], handed_out: frozenset[str]
+) -> Verified | Refused | None:
+    """What an earlier run found, if nothing that it rests on has changed."""
+    try:
+        kept = json.loads(file_of(records, sha256).read_text(encoding="utf-8"))
+        if kept["made_with"] != _versions():
+            return None
+        if "refused" in kept:
+            return Refused(str(kept["refused"]))
+        data = file_of(records, sha256, RESULTS).read_bytes()
+        results = read_results(data)
+        files = kept["files"]
+        if not isinstance(results, ComparisonResults | LoopResults) or files != {
+            name: name in logs for name in _named(data)
+        }:
+            return None
+        if kept["gap"] != _is_gap(results, logs, handed_out):
+            return None
+        report = Report(sha256, 0, kept["seal"], results, tuple(kept["pages"]), b"")
+        return Verified(report, _verdict_from(kept["verdict"]), int(kept["page"]))
+    # none, or not one of ours: done again
+    except (OSError, ValueError, KeyError, TypeError, ResultsError):
+        return None
+
+
+def _verdict_from(values: Mapping[str, Any]) -> Verdict:
+    return Verdict(
+        **{
+            **values,
+            "redrawn": b"",
+            "reasons": tuple(values["reasons"]),
+            "differences": tuple(Difference(**one) for one in values["differences"]),
+            "pages": tuple(PageDifference(**one) for one in values["pages"]),
+        }
+    )

@@ -1,0 +1,366 @@
+"use strict";
+(() => {
+  const at = (id) => document.getElementById(id);
+  const { columns, rows, size, nouns } = JSON.parse(at("content").textContent);
+  const collator = new Intl.Collator(undefined, { numeric: true, sensitivity: "base" });
+  const fold = (text) => text.normalize("NFD").replace(/\p{M}/gu, "").toLowerCase();
+  const frame = document.querySelector(".frame");
+  const selects = [...document.querySelectorAll(".controls select")];
+  const boxes = [...document.querySelectorAll("[data-group]")];
+  const tagged = [...document.querySelectorAll("button[data-tag]")];
+
+  // Text from data only ever becomes a text node
+  const make = (tag, text = "", kind = "") => {
+    const node = document.createElement(tag);
+    if (text) node.textContent = text;
+    if (kind) node.className = kind;
+    return node;
+  };
+  const isolated = (tag, text, kind = "") => {
+    const node = make(tag, text, kind);
+    node.dir = "auto";
+    return node;
+  };
+  const pressable = (kind, ...content) => {
+    const button = make("button", "", kind);
+    button.type = "button";
+    button.append(...content);
+    return button;
+  };
+  const drawn = (tag, attributes) => {
+    const node = document.createElementNS("http://www.w3.org/2000/svg", tag);
+    for (const [name, value] of Object.entries(attributes)) node.setAttribute(name, value);
+    return node;
+  };
+
+  const entries = rows.map(([cells, tags, details, beside], index) => ({
+    index, cells, tags: new Set(tags), details, beside, open: false,
+    words: fold(cells.map(([text = "", , below = ""]) => text + "\n" + below).join("\n")),
+    values: cells.map(([text = "", value = ""]) =>
+      (value === "" ? null : value === true ? text : value)),
+  }));
+  let order = entries;
+  let fitting = entries;
+  let first = 0;
+  let current = null;
+
+  // ------------------------------------------------------------ what a row unfolds to
+
+  const list = (texts, warn) => {
+    const made = make("ul", "", warn ? "warn" : "");
+    made.append(...texts.map((text) => isolated("li", text)));
+    return made;
+  };
+  const prose = (text) => isolated("p", text, "notes");
+  const pairs = (lines) => {
+    const made = make("dl");
+    for (const [title, value] of lines) made.append(make("dt", title), isolated("dd", value));
+    return made;
+  };
+  const table = (heads, lines, numeric, after) => {
+    const made = make("table");
+    const head = made.createTHead().insertRow();
+    heads.forEach((title, column) => {
+      const cell = make("th", title, numeric.includes(column) ? "n" : "");
+      cell.scope = "col";
+      head.append(cell);
+    });
+    const rest = made.createTBody();
+    for (const texts of lines) {
+      rest.insertRow().append(...texts.map((text, column) =>
+        isolated("td", text, numeric.includes(column) ? "n" : "")));
+    }
+    const box = make("div", "", "scroll");
+    box.append(made, make("small", after));
+    return box;
+  };
+  const links = (lines) => {
+    const made = make("ul");
+    for (const [text, to] of lines) {
+      const link = make("a", text);
+      link.href = to;
+      link.rel = "noreferrer";
+      made.append(make("li"));
+      made.lastChild.append(link);
+    }
+    return made;
+  };
+  const pictures = (lines) => {
+    const made = make("div", "", lines.length > 1 ? "sheets" : "sheets one");
+    for (const [said, alt, source] of lines) {
+      const sheet = make("figure");
+      const picture = make("img");
+      const large = make("a");
+      picture.alt = alt;
+      picture.loading = "lazy";
+      picture.width = 700;
+      picture.height = 990;
+      picture.src = source;
+      if (source.startsWith("data:")) large.append(picture);
+      else {
+        large.href = source;
+        large.append(picture);
+      }
+      sheet.append(large, make("figcaption", said));
+      made.append(sheet);
+    }
+    return made;
+  };
+  const sides = (both) => {
+    const made = make("div", "", "sides");
+    for (const [heading, ...pieces] of both) {
+      const side = make("section");
+      const text = isolated("p", "", "notes");
+      text.append(...pieces.map(([words, marked]) => make(marked ? "mark" : "span", words)));
+      side.append(isolated("h3", heading[0]), text);
+      made.append(side);
+    }
+    return made;
+  };
+  const makers = { list, prose, pairs, table, links, pictures, sides };
+
+  const section = (parts, name) => {
+    const made = make("section", "", name);
+    for (const [kind, title, ...rest] of parts) {
+      if (title) made.append(make("h2", title));
+      made.append(makers[kind](...rest));
+    }
+    return made;
+  };
+  const detail = (entry) => {
+    const box = make("div", "", "detail");
+    box.append(section(entry.details, ""));
+    if (entry.beside.length) box.append(section(entry.beside, "beside"));
+    else box.classList.add("bare");
+    return box;
+  };
+
+  // ------------------------------------------------------------ the table
+
+  const sketch = (parts, mark) => {
+    const made = drawn("svg", { width: 72, height: 10, "aria-hidden": "true", class: "sketch" });
+    const x = (share) => 2 + 68 * Math.min(Math.max(share, 0), 1);
+    if (parts.length === 1) {
+      made.append(drawn("rect", { x: 2, y: 3, width: 68, height: 4, class: "all" }),
+        drawn("rect", { x: 2, y: 3, width: x(parts[0]) - 2, height: 4 }));
+      return made;
+    }
+    if (mark !== null) {
+      made.append(drawn("rect", { x: x(mark) - .5, y: 0, width: 1, height: 10, class: "mark" }));
+    }
+    const [low, value, high] = parts;
+    made.append(drawn("rect", { x: x(low), y: 4, width: Math.max(x(high) - x(low), 1), height: 2,
+      class: "span" }), drawn("circle", { cx: x(value), cy: 5, r: 3 }));
+    return made;
+  };
+
+  const classes = (kind, narrow, group) =>
+    [{ number: "n", line: "line" }[kind], narrow, group && "g-" + group].filter(Boolean);
+  const cell = ([text = "", , below = "", look = "", parts = []], column) => {
+    const [, kind, group, narrow, mark] = columns[column];
+    const made = make(column ? "td" : "th", "",
+      [...classes(kind, narrow, group), look === "flags" ? look : ""].join(" "));
+    if (look === "flags") {
+      made.append(list(text ? text.split("\n") : [], false));
+    } else if (look) made.append(make("span", text, "chip " + look));
+    else if (text) made.append(isolated("span", text));
+    if (parts.length) made.append(sketch(parts, mark));
+    if (below) made.append(isolated("span", below, "file"));
+    return made;
+  };
+
+  const unfold = (entry, open) => {
+    entry.open = open;
+    if (!entry.row) return;
+    if (open && !entry.more) {
+      entry.more = make("tr", "", "more");
+      entry.more.id = "more-" + entry.index;
+      const whole = entry.more.insertCell();
+      whole.colSpan = columns.length;
+      whole.append(detail(entry));
+      entry.button.setAttribute("aria-controls", entry.more.id);
+    }
+    if (open) entry.row.after(entry.more);
+    else if (entry.more) entry.more.remove();
+    entry.row.classList.toggle("open", open);
+    entry.button.setAttribute("aria-expanded", String(open));
+  };
+
+  const line = (entry) => {
+    const row = make("tr");
+    row.dataset.row = entry.index;
+    row.append(...entry.cells.map(cell));
+    const head = row.cells[0];
+    head.scope = "row";
+    const name = head.firstChild;
+    name.className = "name";
+    entry.button = pressable("unfold", name);
+    entry.button.addEventListener("click", () => {
+      current = entry;
+      unfold(entry, !entry.open);
+    });
+    head.prepend(entry.button);
+    entry.row = row;
+    entry.more = null;
+    return row;
+  };
+
+  const whole = make("table", "", "list");
+  const top = whole.createTHead().insertRow();
+  const body = whole.createTBody();
+  const heads = columns.map(([title, kind, group, narrow], column) => {
+    const head = make("th", "", classes(kind, narrow, group).join(" "));
+    head.scope = "col";
+    head.setAttribute("aria-sort", "none");
+    const button = pressable("", title);
+    button.addEventListener("click", () => sort(column));
+    head.append(button);
+    return head;
+  });
+  top.append(...heads);
+
+  const draw = (count = size) => {
+    for (const entry of entries) entry.row = null;
+    const shown = fitting.slice(first, first + count);
+    body.replaceChildren(...shown.map(line));
+    for (const entry of shown) unfold(entry, entry.open);
+    const last = Math.ceil(fitting.length / size);
+    document.querySelector(".pager").hidden = last < 2;
+    at("place").textContent = nouns[1][0].toUpperCase() + nouns[1].slice(1) + " " + (first + 1)
+      + " to " + (first + shown.length) + " of " + fitting.length;
+    at("back").disabled = first === 0;
+    at("on").disabled = first + size >= fitting.length;
+    fit();
+  };
+
+  const fit = () => {
+    frame.classList.remove("wide");
+    const wide = whole.scrollWidth > frame.clientWidth;
+    frame.classList.toggle("wide", wide);
+    // A region that scrolls must be reached by keyboard
+    frame.tabIndex = wide ? 0 : -1;
+    frame.style.setProperty("--width", frame.clientWidth + "px");
+  };
+
+  const sort = (column) => {
+    const up = heads[column].getAttribute("aria-sort") !== "ascending";
+    for (const head of heads) head.setAttribute("aria-sort", "none");
+    heads[column].setAttribute("aria-sort", up ? "ascending" : "descending");
+    const numeric = ["number", "rank"].includes(columns[column][1]);
+    const sign = up ? 1 : -1;
+    order = order.slice().sort((one, other) => {
+      const a = one.values[column];
+      const b = other.values[column];
+      // What is absent comes last both ways
+      if (a === null || b === null) return (a === null) - (b === null);
+      return sign * (numeric ? a - b : collator.compare(a, b));
+    });
+    filter();
+  };
+
+  const filter = () => {
+    const words = fold(at("text").value).split(/\s+/).filter(Boolean);
+    const tags = selects.map((select) => select.value).filter(Boolean);
+    fitting = order.filter((entry) => tags.every((tag) => entry.tags.has(tag))
+      && words.every((word) => entry.words.includes(word)));
+    first = 0;
+    document.querySelector(".count").textContent =
+      "Showing " + fitting.length + " of " + entries.length;
+    document.querySelector(".none").hidden = fitting.length > 0;
+    at("all").hidden = fitting.length === entries.length;
+    for (const button of tagged) {
+      button.setAttribute("aria-pressed", String(tags.includes(button.dataset.tag)));
+    }
+    draw();
+  };
+
+  const clear = () => {
+    at("text").value = "";
+    for (const select of selects) select.value = "";
+    filter();
+  };
+
+  const groups = () => {
+    for (const box of boxes) whole.classList.toggle("with-" + box.dataset.group, box.checked);
+    fit();
+  };
+
+  const turn = (to) => {
+    first = to;
+    draw();
+    frame.scrollIntoView({ block: "start" });
+  };
+
+  const show = (entry) => {
+    const place = fitting.indexOf(entry);
+    if (current && current !== entry) unfold(current, false);
+    current = entry;
+    entry.open = true;
+    const start = place - place % size;
+    if (start !== first) {
+      first = start;
+      draw();
+    } else unfold(entry, true);
+    entry.button.focus({ preventScroll: true });
+    entry.row.scrollIntoView({ block: "start" });
+  };
+
+  const step = (by) => {
+    const place = fitting.indexOf(current);
+    const next = fitting[place < 0 ? (by > 0 ? first : first - 1) : place + by];
+    if (next) show(next);
+  };
+
+  const KEYS = {
+    j: () => step(1), n: () => step(1), k: () => step(-1), p: () => step(-1),
+    "/": () => at("text").focus(),
+    Escape: () => {
+      if (current) unfold(current, false);
+      if (current && current.row) current.button.focus();
+    },
+  };
+
+  document.addEventListener("keydown", (event) => {
+    const busy = event.target.closest("input, select, textarea") && event.key !== "Escape";
+    if (busy || event.ctrlKey || event.metaKey || event.altKey || !KEYS[event.key]) return;
+    event.preventDefault();
+    KEYS[event.key]();
+  });
+  document.querySelector(".controls").addEventListener("submit", (event) => event.preventDefault());
+  at("text").addEventListener("input", filter);
+  at("all").addEventListener("click", clear);
+  at("back").addEventListener("click", () => turn(Math.max(first - size, 0)));
+  at("on").addEventListener("click", () => turn(first + size));
+  for (const select of selects) select.addEventListener("change", filter);
+  for (const box of boxes) {
+    box.checked = box.hasAttribute("data-ticked") && window.innerWidth >= 1200;
+    box.addEventListener("change", groups);
+  }
+  for (const button of tagged) {
+    button.addEventListener("click", () => {
+      const tag = button.dataset.tag;
+      const select = selects.find((one) => [...one.options].some((each) => each.value === tag));
+      select.value = select.value === tag ? "" : tag;
+      filter();
+      frame.scrollIntoView({ block: "start" });
+    });
+  }
+  for (const button of document.querySelectorAll("button[data-open]")) {
+    button.addEventListener("click", () => {
+      clear();
+      show(entries[Number(button.dataset.open)]);
+    });
+  }
+  window.addEventListener("resize", fit);
+  window.addEventListener("beforeprint", () => {
+    first = 0;
+    draw(fitting.length);
+  });
+  window.addEventListener("afterprint", () => draw());
+  document.documentElement.classList.add("live");
+  document.querySelector(".controls").hidden = false;
+  document.querySelector(".keys").hidden = false;
+  frame.prepend(whole);
+  filter();
+  groups();
+})();

@@ -1,0 +1,321 @@
+"""One page with one table: sorted, searched, filtered and unfolded by the page's own script.
+
+Rows are JSON, and the script draws a hundred of them at a time, so that thousands stay fluid.
+Without scripts the page shows its first rows as a plain table.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from string import Template
+from typing import Any, Literal
+
+from px4fuse.webpage.safe import clean, escaped, inert_json, part, policy_hash
+
+# Rows that the script draws at once, and that are there without it
+PAGE_ROWS = 100
+PLAIN_ROWS = 300
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of the table.
+
+    Attributes
+    ----------
+    title : str
+    kind : {"text", "line", "number", "rank"}
+        How it is sorted; a line is text that stays in one, a rank is text sorted by a number.
+    group : str
+        Shown only while the box of this group is ticked; "" for always.
+    narrow : {"always", "tablet", "desk"}
+        The smallest screen on which it is shown.
+    mark : float or None
+        Where the pictures of its cells have a line, from 0 to 1.
+    """
+
+    title: str
+    kind: Literal["text", "line", "number", "rank"] = "text"
+    group: str = ""
+    narrow: Literal["always", "tablet", "desk"] = "always"
+    mark: float | None = None
+
+
+@dataclass(frozen=True)
+class Cell:
+    """What stands in a row under one column.
+
+    Attributes
+    ----------
+    text : str
+    value : float, str or None
+        By which it is sorted; None comes last both ways.
+    below : str
+        A second, small line.
+    look : str
+        "" for text, "flags" for one flag per line, else the class of a chip.
+    picture : tuple of float
+        From 0 to 1 of the column's scale: (value,) is a bar, (low, value, high) an interval.
+    """
+
+    text: str = ""
+    value: float | str | None = None
+    below: str = ""
+    look: str = ""
+    picture: tuple[float, ...] = ()
+
+
+def words(text: str, below: str = "", look: str = "") -> Cell:
+    """A cell that is sorted by its text."""
+    return Cell(text, text or None, below, look)
+
+
+def figure(
+    value: float | None, text: str | None = None, picture: tuple[float, ...] = (), below: str = ""
+) -> Cell:
+    """A cell that is sorted by a number; empty for what is absent or not finite."""
+    if value is None or not math.isfinite(value):
+        return Cell()
+    return Cell(f"{value:.4g}" if text is None else text, value, below, "", picture)
+
+
+Part = list[Any]
+
+
+@dataclass(frozen=True)
+class Row:
+    """A row of the table.
+
+    Attributes
+    ----------
+    cells : tuple of Cell
+        One per column; the first names the row and unfolds it.
+    tags : tuple of str
+        What filters look for.
+    details, beside : tuple of Part
+        What it unfolds to, and what stands at the right of it: of :func:`listed` and the like;
+        those with nothing in them are left out.
+    """
+
+    cells: tuple[Cell, ...]
+    tags: tuple[str, ...] = ()
+    details: tuple[Part, ...] = ()
+    beside: tuple[Part, ...] = ()
+
+
+# ------------------------------------------------------------------ what a row unfolds to
+
+
+def listed(title: str, texts: Sequence[str], warn: bool = False) -> Part:
+    """A list of sentences."""
+    return ["list", clean(title), [clean(text) for text in texts], warn]
+
+
+def prose(title: str, text: str) -> Part:
+    """Text with its own lines."""
+    return ["prose", clean(title), clean(text)]
+
+
+def pairs(title: str, rows: Sequence[tuple[str, str]]) -> Part:
+    """Names and what they are; those without a value are left out."""
+    return ["pairs", clean(title), [[clean(name), clean(value)] for name, value in rows if value]]
+
+
+def tabled(
+    title: str,
+    heads: Sequence[str],
+    rows: Sequence[Sequence[str]],
+    numeric: Sequence[int] = (),
+    after: str = "",
+) -> Part:
+    """A small table; ``numeric`` are the columns that end flush."""
+    lines = [[clean(text) for text in row] for row in rows]
+    return ["table", clean(title), [clean(head) for head in heads], lines, list(numeric), after]
+
+
+def links(title: str, rows: Sequence[tuple[str, str]]) -> Part:
+    """Words and where they lead: addresses of :func:`px4fuse.webpage.safe.local_link` only."""
+    return ["links", clean(title), [[clean(text), to] for text, to in rows if to]]
+
+
+def pictures(title: str, rows: Sequence[tuple[str, str, str]]) -> Part:
+    """Caption, words for who does not see it, and address (local, or data:image/png)."""
+    return [
+        "pictures",
+        clean(title),
+        [[clean(said), clean(alt), source] for said, alt, source in rows],
+    ]
+
+
+def sides(title: str, left: Sequence[tuple[str, bool]], right: Sequence[tuple[str, bool]]) -> Part:
+    """Two texts beside each other, in pieces that are marked or not; the first is the heading."""
+    return [
+        "sides",
+        clean(title),
+        [[[clean(text), marked] for text, marked in side] for side in (left, right)],
+    ]
+
+
+# ------------------------------------------------------------------ above the table
+
+
+def card(title: str, *content: str) -> str:
+    """A box with a heading; the content is HTML."""
+    return f'<section class="card"><h2>{escaped(title)}</h2>{"".join(content)}</section>'
+
+
+def note(text: str) -> str:
+    """A small grey paragraph."""
+    return f'<p class="note">{escaped(text)}</p>'
+
+
+def picks(tag: str, text: str) -> str:
+    """A button that chooses a filter's tag."""
+    return _button("tag", tag, text)
+
+
+def opens(index: int, text: str) -> str:
+    """A button that shows and unfolds a row, counted from 0."""
+    return _button("open", str(index), text)
+
+
+def _button(does: str, value: str, text: str) -> str:
+    return (
+        f'<button type="button" class="link" data-{does}="{escaped(value)}" dir="auto">'
+        f"{escaped(text)}</button>"
+    )
+
+
+# ------------------------------------------------------------------ the page
+
+
+def page(
+    *,
+    title: str,
+    subtitle: str,
+    above: str,
+    noun: tuple[str, str],
+    columns: Sequence[Column],
+    rows: Sequence[Row],
+    filters: Sequence[tuple[str, Sequence[tuple[str, str]]]],
+    groups: Sequence[tuple[str, str, bool]] = (),
+    placeholder: str,
+    otherwise: str,
+) -> str:
+    """Lay out a page.
+
+    Parameters
+    ----------
+    title, subtitle : str
+    above : str
+        HTML for above the table, of text made safe with :func:`~px4fuse.webpage.safe.escaped`.
+    noun : (str, str)
+        What a row is, one and many.
+    columns : sequence of Column
+    rows : sequence of Row
+    filters : sequence of (label, ((tag, words), ...))
+        Rows that have the chosen tag are shown.
+    groups : sequence of (group, label, ticked)
+        Boxes that show more columns; ticked holds on wide screens alone.
+    placeholder : str
+        What one may search for.
+    otherwise : str
+        Sentence: where all rows are for whom the page shows only some of them.
+
+    Returns
+    -------
+    str
+        Write it as UTF-8. The same for the same input.
+    """
+    style = part("base.css") + part("frame.css")
+    script = part("frame.js")
+    content = {
+        "columns": [
+            [clean(c.title), c.kind, c.group, c.narrow, c.mark] for c in columns
+        ],
+        "rows": [
+            [
+                [_compact(cell) for cell in row.cells],
+                [clean(tag) for tag in row.tags],
+                *([part for part in side if part[2]] for side in (row.details, row.beside)),
+            ]
+            for row in rows
+        ],
+        "size": PAGE_ROWS,
+        "nouns": noun,
+    }  # fmt: skip
+    return Template(part("frame.html")).substitute(
+        style_hash=policy_hash(style),
+        script_hash=policy_hash(script),
+        style=style,
+        script=script,
+        title=escaped(title),
+        subtitle=escaped(subtitle),
+        above=above,
+        placeholder=escaped(placeholder),
+        filters="\n".join(_select(number, *each) for number, each in enumerate(filters)),
+        groups="\n".join(_box(*group) for group in groups),
+        label=escaped(noun[1].capitalize()),
+        one=escaped(noun[0]),
+        plain=_plain(columns, rows, noun, otherwise),
+        content=inert_json(content),
+    )
+
+
+def _select(number: int, label: str, options: Sequence[tuple[str, str]]) -> str:
+    made = "".join(
+        f'<option value="{escaped(tag)}">{escaped(said)}</option>' for tag, said in options
+    )
+    return (
+        f'<label>{escaped(label)} <select id="filter-{number}" autocomplete="off">{made}'
+        "</select></label>"
+    )
+
+
+def _box(group: str, label: str, ticked: bool) -> str:
+    return (
+        f'<label><input type="checkbox" data-group="{escaped(group)}" autocomplete="off"'
+        f"{' data-ticked' * ticked}> {escaped(label)}</label>"
+    )
+
+
+def _compact(cell: Cell) -> list[Any]:
+    """Its fields without those at the end that are empty; true stands for a value like its text."""
+    value = True if cell.value == cell.text else cell.value
+    text = clean(cell.text)
+    fields = [text, value if value is not None else "", clean(cell.below), cell.look,
+              [round(number, 3) for number in cell.picture]]  # fmt: skip
+    while fields and fields[-1] in ("", []):
+        fields.pop()
+    return fields
+
+
+def _plain(
+    columns: Sequence[Column], rows: Sequence[Row], noun: tuple[str, str], otherwise: str
+) -> str:
+    """The first rows for who allows no scripts."""
+    heads = "".join(f'<th scope="col"{_class(c)}>{escaped(c.title)}</th>' for c in columns)
+    lines = []
+    for row in rows[:PLAIN_ROWS]:
+        first, *others = zip(columns, row.cells, strict=True)
+        cells = "".join(_plain_cell("td", *other) for other in others)
+        lines.append(f"<tr>{_plain_cell('th', *first)}{cells}</tr>")
+    said = f"The first {PLAIN_ROWS} of {len(rows)} {noun[1]}. " if len(rows) > PLAIN_ROWS else ""
+    return (
+        f'<p class="note">{escaped(said)}Sorting, searching and unfolding need scripts, which are '
+        f'part of this page. {escaped(otherwise)}</p><table class="list"><thead><tr>{heads}</tr>'
+        f"</thead><tbody>{''.join(lines)}</tbody></table>"
+    )
+
+
+def _class(column: Column) -> str:
+    return ' class="n"' if column.kind == "number" else ""
+
+
+def _plain_cell(tag: str, column: Column, cell: Cell) -> str:
+    below = f'<span class="file" dir="auto">{escaped(cell.below)}</span>' if cell.below else ""
+    text = escaped(cell.text)
+    name = ' class="name"' if tag == "th" else ""
+    return f'<{tag}{_class(column)}><span{name} dir="auto">{text}</span>{below}</{tag}>'

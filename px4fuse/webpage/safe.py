@@ -1,0 +1,60 @@
+"""Text and numbers from data, so that they do nothing in a web page."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import re
+from html import escape
+from importlib.resources import files
+from pathlib import PurePosixPath
+from urllib.parse import quote
+
+MAX_CHARACTERS = 20_000
+# Controls but for tab and line end, surrogates, and what turns the direction of all that follows
+HARMFUL = re.compile("[\0-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff\u202a-\u202e\u2066-\u2069]")
+
+
+def clean(text: str, most: int = MAX_CHARACTERS) -> str:
+    r"""Text without what HTML cannot hold and what turns the direction of others; cut when long.
+
+    >>> clean("a\x1b\u202eb", 10), clean("abcdef", 3)
+    ('a��b', 'abc…')
+    """
+    text = text if len(text) <= most else text[:most] + "…"
+    return HARMFUL.sub("\N{REPLACEMENT CHARACTER}", text)
+
+
+def escaped(text: str) -> str:
+    """Clean text for HTML, between tags or in an attribute's quotes."""
+    return escape(clean(text))
+
+
+def inert_json(value: object) -> str:
+    """JSON in which an HTML parser finds nothing: no <, > or &, and ASCII only."""
+    text = json.dumps(value, ensure_ascii=True, allow_nan=False, separators=(",", ":"))
+    return text.replace("<", r"\u003c").replace(">", r"\u003e").replace("&", r"\u0026")
+
+
+def policy_hash(text: str) -> str:
+    """What a content security policy allows: this very script or style."""
+    return base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
+
+
+def local_link(path: str) -> str:
+    r"""A path relative to the page as a link, and "" for any other: nothing that data could call.
+
+    >>> local_link("results/a b.json"), local_link("javascript:alert(1)")
+    ('results/a%20b.json', 'javascript%3Aalert%281%29')
+    >>> local_link("//example.org/x"), local_link("C:\\x")
+    ('', 'C%3A%5Cx')
+    """
+    if PurePosixPath(path).is_absolute():
+        return ""
+    return quote(path.encode("utf-8", "replace"))
+
+
+def part(name: str) -> str:
+    """A file of this package."""
+    return files("px4fuse.webpage").joinpath(name).read_text(encoding="utf-8")

@@ -1,0 +1,87 @@
+"""Classes made up for tests: reports under any name, exports of platforms, and grading at once."""
+
+from __future__ import annotations
+
+import io
+import json
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+
+from conftest import REPOSITORY
+from pypdf import PdfReader, PdfWriter
+
+from px4fuse.grading import grade as grading
+from px4fuse.grading import records
+from px4fuse.grading.model import Entry, Graded, Item
+from px4fuse.verification.model import Verdict
+from px4fuse.verification.rerun import log_sha256
+from px4fuse.verification.verification import verify
+
+REPORT = REPOSITORY / "reports" / "aisle_uwb.pdf"
+VERIFIED = Verdict("verified", ("the log gives every value again",), True)
+
+
+class Reports:
+    """The sample's report, with another student, notes and log in its results."""
+
+    def __init__(self) -> None:
+        pdf = REPORT.read_bytes()
+        reader = PdfReader(io.BytesIO(pdf))
+        (self._name,) = reader.attachments
+        self._results = json.loads(reader.attachments[self._name][0])
+        self._pdf = pdf
+
+    def of(self, name: str, student_id: str, log: str = "", notes: str = "") -> bytes:
+        results = {**self._results, "student": {"name": name, "id": student_id, "notes": notes}}
+        if log:
+            results["log"] = {**results["log"], "sha256": log}
+        writer = PdfWriter(clone_from=io.BytesIO(self._pdf))
+        writer._root_object.pop("/Names", None)
+        writer.add_attachment(self._name, json.dumps(results).encode())
+        for _ in range(len(writer.pages) - 1):  # pages are drawn, which takes time
+            writer.remove_page(1)
+        out = io.BytesIO()
+        writer.write(out)
+        return out.getvalue()
+
+
+def at_once(monkeypatch) -> list[str]:
+    """Grade in this process, and believe every report whose log is there; gives what was verified.
+
+    Bounds and verification have tests of their own, and take seconds per report.
+    """
+    asked: list[str] = []
+
+    def believed(report, logs):
+        asked.append(report.results.student.id)
+        return VERIFIED if log_sha256(report.results) in logs else verify(report, logs)
+
+    def in_turn(function, jobs, *, on_done, **_):
+        for index, job in enumerate(jobs):
+            on_done(index, function(job))
+
+    monkeypatch.setattr(records, "verify", believed)
+    monkeypatch.setattr(grading, "run_bounded", in_turn)
+    return asked
+
+
+def zipped(path: Path, entries: Mapping[str, bytes], date=(2026, 11, 20, 12, 0, 0)) -> Path:
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, content in entries.items():
+            archive.writestr(zipfile.ZipInfo(name, date), content)
+    return path
+
+
+def graded(name: str, *points: float, student: str = "", student_id: str = "", **more) -> Graded:
+    """A report with items A, B, … of ten points each."""
+    items = tuple(
+        Item(chr(ord("A") + at), each, 10.0, "Because.") for at, each in enumerate(points)
+    )
+    values = {"sha256": name, "version": "0.2.0"} | more
+    return Graded(name, student, student_id, VERIFIED, items, **values)
+
+
+def entry(student_id: str, name: str, total: float | None, **more) -> Entry:
+    one = None if total is None else graded(f"{student_id}.pdf", total, student_id=student_id)
+    return Entry(name, student_id, one, total=total, **({"of": 10.0} | more))

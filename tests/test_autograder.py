@@ -1,0 +1,159 @@
+"""Gradescope: results with all that it takes, and an autograder that runs as it is unpacked."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+from class_tools import REPORT, Reports, at_once, entry, graded
+from click.testing import CliRunner
+
+from px4fuse.cli import cli
+from px4fuse.errors import SettingsError
+from px4fuse.grading import autograding
+from px4fuse.grading.gradescope import results, submission_metadata
+from px4fuse.grading.lateness import late_rule
+from px4fuse.grading.model import Entry
+from px4fuse.grading.rubric import read_rubric
+
+LOG = REPORT.parents[1] / "sample_logs" / "aisle_uwb.ulg"
+# The example of "Submission Metadata", gradescope-autograders.readthedocs.io
+METADATA = {
+    "id": 123456,
+    "created_at": "2026-11-21T14:22:32.365935-07:00",
+    "assignment": {
+        "due_date": "2026-11-20T23:00:00.000000-07:00", "group_size": 4, "group_submission": True,
+        "id": 25828, "course_id": 1234, "late_due_date": None,
+        "release_date": "2026-11-02T00:00:00.000000-07:00", "title": "Lab", "total_points": "20.0",
+    },
+    "submission_method": "upload",
+    "users": [{"email": "ada@example.com", "id": 1234, "name": "Ada Lovelace"}],
+    "previous_submissions": [],
+}  # fmt: skip
+# "Autograder Specifications" of the same
+TOP = {"score", "execution_time", "output", "output_format", "test_output_format",
+       "test_name_format", "visibility", "stdout_visibility", "extra_data", "tests",
+       "leaderboard"}  # fmt: skip
+TEST = {"score", "max_score", "status", "name", "name_format", "number", "output", "output_format",
+        "tags", "visibility", "extra_data"}  # fmt: skip
+VISIBLE = {"visible", "hidden", "after_due_date", "after_published"}
+
+
+def check(made: dict) -> None:
+    assert set(made) <= TOP
+    assert {"score", "execution_time", "output", "visibility", "tests"} <= set(made)
+    assert isinstance(made["score"], int | float)
+    assert made["visibility"] == "after_due_date"
+    assert made["stdout_visibility"] in VISIBLE
+    for number, test in enumerate(made["tests"], start=1):
+        assert set(test) <= TEST
+        assert test["number"] == str(number)
+        assert test["visibility"] in VISIBLE
+        assert test.get("status", "passed") in {"passed", "failed"}
+        assert all(isinstance(tag, str) for tag in test["tags"])
+        assert 0.0 <= test["score"] <= test["max_score"] or test["max_score"] == 0.0
+
+
+def test_results_have_every_part_that_gradescope_names() -> None:
+    one = graded("a.pdf", 10.0, 4.0, flags=("a\x00flag",), pending="Run 0.1.1.")
+    made = results(
+        Entry("Ada", "1", one, remarks=("Late.",), total=14.0, of=20.0), "Points 14", 1.234
+    )
+    check(made)
+    assert (made["score"], made["execution_time"], made["output"]) == (14.0, 1.23, "Points 14")
+    assert [(test["status"], test["score"]) for test in made["tests"][:2]] == [
+        ("passed", 10.0), ("failed", 4.0)
+    ]  # fmt: skip
+    hidden = made["tests"][2]
+    assert hidden["visibility"] == "hidden"
+    assert hidden["output"] == "Pending: Run 0.1.1.\nLate.\na flag"
+    assert not any("flag" in str(test) for test in made["tests"][:2])
+    missing = results(entry("1", "Ada", None), "Nothing was handed in.", 0.1)
+    check(missing)
+    assert missing["score"] == 0.0
+    json.dumps(made, allow_nan=False)
+
+
+def unpacked(tmp_path: Path, *options: str) -> Path:
+    """An autograder as Gradescope unpacks it."""
+    words = ["grade", "--write-autograder", str(tmp_path / "a.zip"), "--logs", str(LOG), *options]
+    result = CliRunner().invoke(cli, words)
+    assert result.exit_code == 0, result.exception
+    folder = tmp_path / "autograder"
+    with zipfile.ZipFile(tmp_path / "a.zip") as archive:
+        modes = {one.filename: one.external_attr >> 16 for one in archive.infolist()}
+        archive.extractall(folder / "source")
+    assert {name for name, mode in modes.items() if mode & 0o111} == {
+        "setup.sh", "run_autograder"
+    }  # fmt: skip
+    (folder / "submission").mkdir()
+    (folder / "submission_metadata.json").write_text(json.dumps(METADATA))
+    return folder
+
+
+def test_the_autograder_holds_px4fuse_as_a_wheel_that_installs(tmp_path) -> None:
+    folder = unpacked(tmp_path, "--late", "10%/day")
+    source = folder / "source"
+    (wheel,) = source.glob("*.whl")
+    assert wheel.name in (source / "setup.sh").read_text()
+    for script in ("setup.sh", "run_autograder"):
+        subprocess.run(["bash", "-n", str(source / script)], check=True)
+    assert '--gradescope /autograder --late "10%/day"' in (source / "run_autograder").read_text()
+    assert "numpy==" in (source / "constraints.txt").read_text()
+    assert read_rubric(source / "rubric.toml") == read_rubric(None)
+    assert next((source / "logs").iterdir()).read_bytes() == LOG.read_bytes()
+    place = tmp_path / "site"
+    words = ["-m", "pip", "install", "-q", "--no-deps", "--no-index", "--target", str(place)]
+    subprocess.run([sys.executable, *words, str(wheel)], check=True, capture_output=True)
+    assert (place / "px4fuse" / "grading" / "rubric.toml").exists()
+    code = "import px4fuse, importlib.metadata as m; print(px4fuse.__file__, m.version('px4fuse'))"
+    ran = subprocess.run(
+        [sys.executable, "-c", code],
+        env={"PYTHONPATH": str(place)}, capture_output=True, text=True, check=True, cwd=tmp_path,
+    )  # fmt: skip
+    assert str(place) in ran.stdout
+    again = CliRunner().invoke(cli, ["grade", "--write-autograder", str(tmp_path / "a.zip")])
+    assert "--logs" in str(again.exception)
+
+
+def run(folder: Path, late: str | None = None) -> dict:
+    autograding.run_autograder(folder, late_rule(late) if late else None)
+    made = json.loads((folder / "results" / "results.json").read_text())
+    check(made)
+    return made
+
+
+def test_it_grades_what_is_in_its_folder(tmp_path, monkeypatch) -> None:
+    folder = unpacked(tmp_path)
+    at_once(monkeypatch)
+    nothing = run(folder)
+    assert nothing["score"] == 0.0
+    assert "No PDF" in nothing["output"]
+    (folder / "submission" / "report.pdf").write_bytes(Reports().of("Ada Lovelace", "1"))
+    full = run(folder)
+    assert full["score"] > 0.0
+    assert full["score"] == pytest.approx(sum(test["score"] for test in full["tests"]), abs=0.01)
+    # a day late, by Gradescope's own times
+    late = run(folder, "10%/day")
+    most = sum(test["max_score"] for test in full["tests"])
+    assert late["score"] == pytest.approx(full["score"] - 0.1 * most, abs=0.01)
+    assert "late" in late["output"]
+    (folder / "submission" / "report.pdf").write_bytes(b"%PDF-1.7\n%%EOF")
+    assert run(folder)["score"] == 0.0
+
+
+def test_its_metadata_says_who_and_when(tmp_path) -> None:
+    path = tmp_path / "submission_metadata.json"
+    assert submission_metadata(tmp_path) == ("", "", None, None)
+    path.write_text(json.dumps(METADATA))
+    name, email, created, due = submission_metadata(tmp_path)
+    assert (name, email) == ("Ada Lovelace", "ada@example.com")
+    assert (created - due).total_seconds() == pytest.approx(15.3756 * 3600, abs=1.0)
+    for bad in ("[]", '{"users": 3}', '{"created_at": "x"}', "{"):
+        path.write_text(bad)
+        with pytest.raises(SettingsError, match=r"submission_metadata\.json"):
+            submission_metadata(tmp_path)

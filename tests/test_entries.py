@@ -1,0 +1,230 @@
+"""One row per student: which attempt counts, what being late costs, what the instructor says."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from datetime import datetime
+from pathlib import Path
+
+import pytest
+from class_tools import graded
+
+from px4fuse.errors import SettingsError
+from px4fuse.grading.entries import Term, class_entries
+from px4fuse.grading.lateness import due_time, late_rule
+from px4fuse.grading.model import Override, Submission
+from px4fuse.grading.overrides import read_overrides
+from px4fuse.grading.platforms import origin_of
+from px4fuse.grading.returned import returned_text
+from px4fuse.grading.roster import Person, Register
+from px4fuse.verification.model import Verdict
+
+DUE = due_time("2026-11-20 12:00:00 +01:00")
+LATEST = Term()
+PEOPLE = (Person("1", "Ada Lovelace", login="ada"), Person("2", "Grace Hopper", login="grace"))
+
+
+def laid_out(files, term=LATEST, overrides=None, people=PEOPLE, packed=None):
+    """Entries by id, of reports by the names of their files."""
+    reports = [replace(one, submission=name, sha256=name) for name, one in files.items()]
+    found = [Submission(Path("x.zip"), name, name, (packed or {}).get(name)) for name in files]
+    register = None if people is None else Register(people)
+    origins = [origin_of(name) for name in files]
+    entries, notes = class_entries(reports, found, origins, register, term, overrides or {})
+    return entries, notes
+
+
+def blackboard(login: str, stamp: str, name: str = "r.pdf") -> str:
+    return f"Lab_{login}_attempt_2026-11-{stamp}_{name}"
+
+
+THREE = {
+    blackboard("ada", "19-10-00-00"): graded("", 4.0),
+    blackboard("ada", "20-11-00-00"): graded("", 9.0),
+    blackboard("ada", "22-10-00-00"): graded("", 7.0),
+}
+
+
+@pytest.mark.parametrize(("attempt", "points"), [("latest", 7.0), ("first", 4.0), ("best", 9.0)])
+def test_one_attempt_counts_and_the_others_are_beneath(attempt, points) -> None:
+    (ada, grace), _ = laid_out(THREE, Term(attempt))
+    assert ada.counting.points == ada.total == points
+    assert len(ada.others) == 2
+    assert ada.counting not in ada.others
+    assert (grace.counting, grace.total, grace.of) == (None, None, 10.0)
+
+
+def test_late_is_what_comes_after_the_due_time_in_its_zone() -> None:
+    term = Term("latest", DUE, late_rule("10%/day"))
+    (ada, _), _ = laid_out(THREE, term)
+    assert (ada.late_s, ada.deduction, ada.total) == (46 * 3600.0, 2.0, 5.0)
+    assert ada.handed_in == "2026-11-22 10:00"
+    # of the best, the loss for being late is part
+    files = {blackboard("ada", "20-11-00-00"): graded("", 6.0),
+             blackboard("ada", "22-10-00-00"): graded("", 7.0)}  # fmt: skip
+    (ada, _), _ = laid_out(files, replace(term, attempt="best"))
+    assert (ada.late_s, ada.deduction, ada.total) == (0.0, 0.0, 6.0)
+
+
+def test_an_hour_that_the_clock_goes_back_is_an_hour() -> None:
+    """In the night to 25 October 2026 Berlin has the hour from 2 to 3 twice."""
+    term = Term("latest", due_time("2026-10-24 23:00:00 Europe/Berlin"))
+    (ada, _), _ = laid_out({"Lab_ada_attempt_2026-10-25-05-00-00_r.pdf": graded("", 4.0)}, term)
+    assert ada.late_s == 7 * 3600.0
+
+
+def test_nobody_has_less_than_nothing() -> None:
+    term = Term("latest", DUE, late_rule("100%/day"))
+    (ada, _), _ = laid_out(THREE, term)
+    assert (ada.deduction, ada.total) == (10.0, 0.0)
+
+
+def test_a_late_mark_without_a_time_takes_nothing_off_and_is_said() -> None:
+    term = Term("latest", DUE, late_rule("10%/day"))
+    (_, grace), _ = laid_out({"hoppergrace_LATE_7_8_r.pdf": graded("", 7.0)}, term)
+    assert (grace.late_s, grace.total) == (None, 7.0)
+    assert "Canvas marks it as late" in grace.remarks[0]
+
+
+def test_a_zip_files_time_orders_attempts_and_costs_nothing() -> None:
+    term = Term("latest", DUE, late_rule("10%/day"))
+    files = {
+        "hoppergrace_7_9_a.pdf": graded("", 7.0), "hoppergrace_7_8_b.pdf": graded("", 9.0)
+    }  # fmt: skip
+    packed = {
+        "hoppergrace_7_9_a.pdf": datetime(2026, 11, 25),
+        "hoppergrace_7_8_b.pdf": datetime(2026, 11, 24),
+    }
+    (_, grace), _ = laid_out(files, term, packed=packed)
+    assert (grace.total, grace.late_s, grace.handed_in) == (7.0, None, "")
+    assert "nothing was taken off" in grace.remarks[0]
+
+
+def test_what_is_no_report_counts_only_where_nothing_else_is_there() -> None:
+    essay = replace(graded("", 0.0), version="", verdict=Verdict("cannot verify", ("x",), False))
+    files = {blackboard("ada", "19-10-00-00"): graded("", 4.0),
+             blackboard("ada", "20-10-00-00"): essay}  # fmt: skip
+    (ada, _), _ = laid_out(files)
+    assert ada.total == 4.0
+    assert "cannot be read as a report" in ada.remarks[0]
+    (ada, _), _ = laid_out({blackboard("ada", "20-10-00-00"): essay})
+    assert ada.total == 0.0
+
+
+def test_of_two_files_of_one_submission_the_better_one_counts() -> None:
+    files = {blackboard("ada", "19-10-00-00", "a.pdf"): graded("", 8.0),
+             blackboard("ada", "19-10-00-00", "b.pdf"): graded("", 2.0)}  # fmt: skip
+    for attempt in ("first", "latest", "best"):
+        (ada, _), _ = laid_out(files, Term(attempt))
+        assert ada.total == 8.0, attempt
+
+
+def test_who_handed_in_is_the_platforms_word_and_a_false_id_is_said() -> None:
+    files = {blackboard("grace", "19-10-00-00"): graded("", 8.0, student="Ada", student_id="1")}
+    (ada, grace), _ = laid_out(files)
+    assert ada.counting is None
+    assert grace.total == 8.0
+    assert "gives the id of 1 (Ada Lovelace)" in grace.remarks[0]
+
+
+def test_who_is_not_in_the_roster_has_a_row_that_says_so() -> None:
+    files = {
+        "report.pdf": graded("", 8.0, student="Mallory", student_id="9"),
+        "other.pdf": graded("", 3.0, student="lovelace ADA"),
+    }
+    (ada, grace, stranger), _ = laid_out(files)
+    assert (ada.total, grace.total) == (3.0, None)
+    assert (stranger.student, stranger.student_id, stranger.total) == ("Mallory", "9", 8.0)
+    assert stranger.remarks == ("Not in the roster.",)
+
+
+def test_without_a_roster_everyone_who_is_named_has_one_row() -> None:
+    files = {
+        "Doe Jane_5_assignsubmission_file_/a.pdf": graded("", 1.0, student="Jane", student_id="42"),
+        "Roe Max_6_assignsubmission_file_/a.pdf": graded("", 2.0, student="Jane", student_id="42"),
+        "b.pdf": graded("", 3.0, student="Kim", student_id="44"),
+        "c.pdf": graded("", 4.0, student="Kim", student_id="44"),
+        "d.pdf": graded("", 5.0),
+    }
+    entries, _ = laid_out(files, people=None)
+    assert [(one.student, one.student_id, one.total) for one in entries] == [
+        ("Jane", "42", 1.0), ("Roe Max", "6", 2.0), ("Kim", "44", 4.0), ("", "", 5.0)
+    ]  # fmt: skip
+
+
+# ------------------------------------------------------------------ overrides
+
+
+def said(tmp_path: Path, *rows: str, head: str = "id,item,points,comment"):
+    path = tmp_path / "overrides.csv"
+    path.write_text("\n".join([head, *rows]) + "\n", encoding="utf-8")
+    return read_overrides(path)
+
+
+TWO = {"1.pdf": graded("", 4.0, 6.0, student_id="1"), "2.pdf": graded("", 1.0, student_id="2")}
+
+
+def test_the_instructors_word_is_the_last(tmp_path) -> None:
+    rows = said(
+        tmp_path, "1,a,9.5,A good idea.", "01,,,Come and see me.", "2,total,3,", "3,total,1,",
+        "1,C,1,", '2,B,2,"x"',
+    )  # fmt: skip
+    (ada, grace), notes = laid_out(TWO, overrides=rows)
+    assert ada.overrides == {"A": Override(9.5, "A good idea.")}
+    assert (ada.total, grace.total) == (15.5, 3.0)
+    assert notes == (
+        "overrides.csv: 1 has no item 'C'.",
+        "overrides.csv: 2 has no item 'B'.",
+        "overrides.csv: nobody has the id 3.",
+    )
+    assert ada.comment == "Come and see me."
+    text = returned_text(ada, "Lab")
+    assert "9.5 of 10" in text
+    assert "A good idea." in text
+
+
+def test_own_comments_and_feedback_stand_in_one_text(tmp_path) -> None:
+    rows = said(tmp_path, '1,,,"First line.', 'Second."', "1,total,8,Agreed.")
+    (ada, _), _ = laid_out(TWO, overrides=rows)
+    text = returned_text(ada)
+    assert "Because." in text
+    assert text.endswith(
+        "Total    8 of 20\n\nFrom your instructor:\n\nFirst line.\nSecond.\nAgreed.\n"
+    )
+
+
+def test_pending_points_do_not_count_until_the_instructor_says_so(tmp_path) -> None:
+    files = {"1.pdf": graded("", 4.0, student_id="1", pending="Run 0.1.1.")}
+    (ada, _), _ = laid_out(files, overrides=said(tmp_path, "1,A,9,"))
+    assert ada.total is None
+    (ada, _), _ = laid_out(files, overrides=said(tmp_path, "1,total,9,"))
+    assert ada.total == 9.0
+
+
+def test_who_handed_in_nothing_can_be_given_points(tmp_path) -> None:
+    (_, grace), notes = laid_out({}, overrides=said(tmp_path, "2,Total,5,Shown in class."))
+    assert (grace.total, notes) == (5.0, ())
+    assert "Shown in class." in returned_text(grace)
+
+
+def test_a_semicolon_table_with_decimal_commas_is_read(tmp_path) -> None:
+    rows = said(tmp_path, "1;A;7,5;", head="\ufeffid;item;points;comment")
+    assert rows == {"1": {"A": Override(7.5)}}
+    assert read_overrides(tmp_path / "none.csv") == {}
+
+
+@pytest.mark.parametrize(
+    ("row", "says"),
+    [
+        ("1,A,abc,", "row 2: points 'abc' are not a number"),
+        ("1,A,-1,", "not a number from 0 up"),
+        ("1,A,nan,", "not a number"),
+        ("1,,5,", "without an item"),
+        ("1,A,5,\n1,A,6,", "stands there twice"),
+    ],
+)
+def test_what_the_instructor_cannot_have_meant_stops_the_run(tmp_path, row, says) -> None:
+    with pytest.raises(SettingsError, match=says):
+        said(tmp_path, row)
+    with pytest.raises(SettingsError, match="no column comment"):
+        said(tmp_path, row, head="id,item,points")

@@ -1,0 +1,184 @@
+"""Grades in the tables that learning platforms import, with the titles that they write."""
+
+from __future__ import annotations
+
+import csv
+import io
+import zipfile
+from pathlib import Path
+
+import pytest
+from class_tools import entry, graded
+
+from px4fuse.errors import SettingsError
+from px4fuse.grading.exports import as_html, filled, grade_column, moodle_feedback, plain_grades
+from px4fuse.grading.model import Entry
+from px4fuse.grading.platforms import Origin
+from px4fuse.grading.roster import Person, Register, people_of_sheet
+from px4fuse.grading.sheet import read_sheet
+
+# As mod/assign/gradingtable.php of Moodle writes it
+MOODLE = (
+    'Identifier,"Full name","Email address",Status,Grade,"Maximum Grade","Grade can be changed",'
+    '"Last modified (submission)","Last modified (grade)","Feedback comments"\r\n'
+    '"Participant 4711","Doe Jane",jane@x.edu,"Submitted for grading",,100.00,Yes,'
+    '"Friday, 20 November 2026, 11:58 PM",-,\r\n'
+    '"Participant 4712","=Roe, ""Max""",max@x.edu,"No submission",,100.00,Yes,-,-,\r\n'
+    '"Participant 4713","Pending Pat",pat@x.edu,"No submission",55.00,100.00,Yes,-,-,old\r\n'
+)
+CANVAS = (
+    "Student,ID,SIS User ID,SIS Login ID,Section,Quiz (8),Lab 3 (9),Final Score\n"
+    ",,,,,,Manual Posting,\n"
+    "    Points Possible,,,,,10.00,100.00,(read only)\n"
+    '"Doe, Jane",12345,0042,jdoe,A,8.00,,90\n'
+    '"Roe, Max",12346,43,mroe,A,7.00,,80\n'
+    '"Pat, Pending",12347,44,ppat,A,7.00,,80\n'
+)
+BLACKBOARD = (
+    '"Last Name"\t"First Name"\t"Username"\t"Student ID"\t"Lab 3 [Total Pts: 100 Score] |1281892"\t'
+    '"Grading Notes"\t"Notes Format"\t"Feedback to Learner"\t"Feedback Format"\n'
+    '"Doe"\t"Jane"\t"jdoe"\t"0042"\t""\t""\t""\t""\t""\n'
+    '"Roe"\t"Max"\t"mroe"\t"43"\t""\t""\t""\t""\t""\n'
+    '"Pat"\t"Pending"\t"ppat"\t"44"\t"1"\t""\t""\t""\t""\n'
+)
+PEOPLE = [
+    Person("0042", "Jane Doe", "jane@x.edu", "jdoe"),
+    Person("43", "Max Roe", "max@x.edu", "mroe"),
+    Person("44", "Pending Pat", "pat@x.edu", "ppat"),
+]
+ENTRIES = (
+    entry("0042", "Jane Doe", 87.5, of=120.0),
+    entry("43", "Max Roe", 104.0, of=120.0),
+    entry("44", "Pending Pat", None, of=120.0),
+)
+TEXTS = {0: "Points 87.5\n  <b>=1+1</b>\n", 1: "Well done.\n", 2: "Pending.\n"}
+
+
+def table(tmp_path: Path, text: str, encoding: str = "utf-8-sig"):
+    path = tmp_path / "table.csv"
+    path.write_bytes(text.encode(encoding))
+    return read_sheet(path)
+
+
+def rows(text: str, separator: str = ",") -> list[dict[str, str]]:
+    return list(csv.DictReader(io.StringIO(text, newline=""), delimiter=separator))
+
+
+def register(sheet) -> Register:
+    made = Register(PEOPLE)
+    made.add(people_of_sheet(sheet))
+    return made
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
+@pytest.mark.parametrize(
+    ("text", "column", "title", "feedback"),
+    [
+        (MOODLE, "", "Grade", "Feedback comments"),
+        (CANVAS, "Lab 3", "Lab 3 (9)", None),
+        (BLACKBOARD, "", "Lab 3 [Total Pts: 100 Score] |1281892", "Feedback to Learner"),
+    ],
+)
+def test_a_platforms_table_comes_back_with_two_columns_filled(
+    tmp_path, text, column, title, feedback, encoding
+) -> None:
+    sheet = table(tmp_path, text, encoding)
+    made = filled(sheet, ENTRIES, register(sheet), column, TEXTS)
+    content = made.sheet.content()
+    assert content[:2] == sheet.path.read_bytes()[:2]
+    separator = "\t" if text is BLACKBOARD else ","
+    before, after = rows(text, separator), rows(content.decode(encoding), separator)
+    assert list(after[0]) == list(before[0])
+    assert len(after) == len(before)
+    changed = {title, feedback, "Feedback Format"} if feedback else {title}
+    people = after[2:] if text is CANVAS else after
+    for old, new in zip(before, after, strict=True):
+        assert {k: v for k, v in old.items() if k not in changed} == {
+            k: v for k, v in new.items() if k not in changed
+        }
+    grades = [row[title] for row in people]
+    assert grades[:2] == ["87.5", "104"]
+    # who has no grade keeps what is there: an empty cell would delete, a zero would count
+    assert after[-1] == before[-1]
+    assert made.entered == 2
+    if feedback:
+        assert people[0][feedback] == "Points 87.5<br>&nbsp;&nbsp;&lt;b&gt;=1+1&lt;/b&gt;"
+    assert any("more than the platform's 100" in note for note in made.notes)
+
+
+def test_a_row_is_found_by_participant_email_id_or_name(tmp_path) -> None:
+    hidden = MOODLE.replace("Doe Jane", "").replace("jane@x.edu", "")
+    sheet = table(tmp_path, hidden)
+    people = Register([Person("0042", numbers={"moodle": "4711"}), *PEOPLE[1:]])
+    assert filled(sheet, ENTRIES, people, "", {}).sheet.rows[0][4] == "87.5"
+
+
+def test_who_is_not_in_the_table_is_said(tmp_path) -> None:
+    sheet = table(tmp_path, "\r\n".join(MOODLE.split("\r\n")[:2]) + "\r\n")
+    made = filled(sheet, ENTRIES, register(sheet), "", {})
+    assert made.notes == ("table.csv: it has no row for Max Roe.",)
+
+
+def test_a_german_table_has_its_separator_and_comma(tmp_path) -> None:
+    text = "Matrikelnummer;Name;Punkte;Kommentar\n0042;Jane Doe;;\n"
+    sheet = table(tmp_path, text, "cp1252")
+    made = filled(sheet, ENTRIES, Register(PEOPLE), "", TEXTS)
+    assert made.sheet.content() == b"Matrikelnummer;Name;Punkte;Kommentar\n0042;Jane Doe;87.5;\n"
+    moodle = MOODLE.replace(",100.00,", ',"100,00",')
+    sheet = table(tmp_path, moodle)
+    made = filled(sheet, ENTRIES, register(sheet), "", {})
+    assert made.sheet.rows[0][4] == "87,5"
+
+
+@pytest.mark.parametrize(
+    ("text", "column", "says"),
+    [
+        (CANVAS, "", r"several columns.*--column: Quiz, Lab 3"),
+        (CANVAS, "Lab 4", "no column for the grade"),
+        (CANVAS, "Final Score", "no column for the grade"),
+        ("id,name\n1,A\n", "", "no column for the grade"),
+    ],
+)
+def test_the_column_of_the_grade_is_named_or_the_only_one(tmp_path, text, column, says) -> None:
+    with pytest.raises(SettingsError, match=says) as caught:
+        grade_column(table(tmp_path, text), column)
+    assert "\n" not in str(caught.value)
+
+
+def test_moodles_feedback_zip_has_the_folders_that_it_reads_back() -> None:
+    """The rule of importziplib.php: split at "_", the second part is the participant."""
+    origins = {
+        "a.pdf": Origin("moodle", "4711", "Doe_Jane"),
+        "b.pdf": Origin("moodle", "4712", "../=Roe"),
+        "c.pdf": Origin("canvas", "5", "pat"),
+    }
+    entries = tuple(
+        Entry(name, name, graded(f"{name}.pdf", 1.0), total=1.0) for name in ("a", "b", "c")
+    )
+    content = moodle_feedback(entries, origins, TEXTS)
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        found = {}
+        for name in archive.namelist():
+            folder, file = name.split("/")
+            _, number, kind, plugin, _ = folder.split("_", 4)
+            assert (kind, plugin, file) == ("assignfeedback", "file", "feedback.txt")
+            found[number] = archive.read(name).decode("utf-8-sig")
+    assert found == {"4711": TEXTS[0], "4712": TEXTS[1]}
+
+
+def test_blackboard_and_ilias_get_plain_tables_with_their_ids() -> None:
+    origins = {
+        "0042.pdf": Origin("blackboard", login="jdoe"), "43.pdf": Origin("ilias", "77", "x", "mroe")
+    }  # fmt: skip
+    for platform, head, first in (
+        ("blackboard", "Lab [Total Pts: 120 Score]", ["jdoe", "0042", "Jane Doe", "87.5"]),
+        ("ilias", "Mark", ["mroe", "77", "43", "Max Roe", "104"]),
+    ):
+        text = plain_grades(platform, "Lab", ENTRIES, origins, Register(PEOPLE), TEXTS)
+        (row,) = csv.reader(io.StringIO(text.split("\r\n")[1]))
+        assert row[: len(first)] == first
+        assert head in text
+
+
+def test_html_of_feedback_holds_no_markup() -> None:
+    assert as_html("<script>&\n\n  x\n") == "&lt;script&gt;&amp;<br><br>&nbsp;&nbsp;x"

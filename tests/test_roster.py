@@ -1,0 +1,127 @@
+"""Class lists as platforms export them, and whose a file is."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from px4fuse.errors import SettingsError
+from px4fuse.grading.platforms import Origin
+from px4fuse.grading.roster import Person, Register, people_of_sheet
+from px4fuse.grading.sheet import read_sheet
+
+MOODLE = (
+    'Identifier,"Full name","ID number","Email address",Status,Grade,"Maximum Grade"\r\n'
+    'Participant 4711,"Doe Jane",0042,jane@x.edu,"No submission",,100.00\r\n'
+)
+CANVAS = (
+    "Student,ID,SIS User ID,SIS Login ID,Section,Lab 3 (9),Final Score\n"
+    "    Points Possible,,,,,100.00,(read only)\n"
+    '"Doe, Jane",12345,0042,jdoe,A,,90\n'
+)
+BLACKBOARD = '"Last Name","First Name","Username","Student ID"\n"Doe","Jane","jdoe","0042"\n'
+ILIAS = "Nachname;Vorname;Benutzername;Matrikelnummer\nDoe;Jane;jdoe;0042\n"
+
+
+def people(tmp_path: Path, content: bytes) -> tuple[Person, ...]:
+    path = tmp_path / "roster.csv"
+    path.write_bytes(content)
+    return people_of_sheet(read_sheet(path))
+
+
+@pytest.mark.parametrize(
+    ("text", "is_"),
+    [
+        (MOODLE, Person("0042", "Doe Jane", "jane@x.edu", "", {"moodle": "4711"})),
+        (CANVAS, Person("0042", "Doe, Jane", "", "jdoe", {"canvas": "12345"})),
+        (BLACKBOARD, Person("0042", "Jane Doe", "", "jdoe")),
+        (ILIAS, Person("0042", "Jane Doe", "", "jdoe")),
+        ("id,name\n0042,Jane Doe\n", Person("0042", "Jane Doe")),
+        ("name\nJane Doe\n", Person("", "Jane Doe")),
+        ("Email\njane@x.edu\n", Person("jane@x.edu", "", "jane@x.edu")),
+    ],
+)
+def test_columns_are_found_by_the_titles_that_platforms_write(tmp_path, text, is_) -> None:
+    assert people(tmp_path, text.encode()) == (is_,)
+    assert people(tmp_path, b"\xef\xbb\xbf" + text.encode()) == (is_,)
+    assert people(tmp_path, text.encode("utf-16")) == (is_,)
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("a,b\n1,2\n", "no column tells who"),
+        ("id\n1\n1\n", "stands there twice"),
+        ("", "empty"),
+        ("PK\x03\x04", "a spreadsheet"),
+        ("id\n\0\n", "not text"),
+    ],
+)
+def test_what_is_no_class_list_is_one_line(tmp_path, text, says) -> None:
+    with pytest.raises(SettingsError, match=says) as caught:
+        people(tmp_path, text.encode())
+    assert "\n" not in str(caught.value)
+
+
+CLASS = Register(
+    [
+        Person("0042", "Jane Doe", "jane@x.edu", "jdoe", {"moodle": "4711", "canvas": "12345"}),
+        Person("43", "Max Roe", numbers={"moodle": "42"}),
+        Person("44", "Zoë Doe"),
+        Person("4711", "Li Lei"),
+        Person("45", "Kim Min"),
+        Person("46", "Min Kim"),
+    ]
+)
+
+
+@pytest.mark.parametrize(
+    ("origin", "place"),
+    [
+        (Origin("moodle", "4711", "Nobody"), 0),  # the participant, not the student of that id
+        (Origin("moodle", "42", "Nobody"), 1),
+        (Origin("moodle", "99", "doe JANE"), 0),
+        (Origin("canvas", "12345", "x"), 0),
+        (Origin("canvas", "99", "roemax"), 1),
+        (Origin("moodle", "99", "Zoe\u0308 Doe"), 2),  # the same letter, written as two
+        (Origin("blackboard", login="JDoe"), 0),
+        (Origin("ilias", "7", "Roe Max", "mroe"), 1),
+        (Origin("ilias", "7", "?", "45"), 4),
+        (Origin("gradescope", "7", student_id="42"), 0),
+        (Origin("gradescope", "7", email="Jane@X.edu"), 0),
+        (Origin("moodle", "99", "Kim Min"), None),  # two of that name
+        (Origin("moodle", "99", "Jane"), None),
+        (Origin(name="Jane Doe"), None),
+    ],
+)
+def test_whose_a_file_is_by_what_the_platform_says(origin, place) -> None:
+    assert CLASS.by_platform(origin) == place
+
+
+@pytest.mark.parametrize(
+    ("student_id", "name", "place"),
+    [
+        ("42", "Max Roe", 0),
+        ("0043", "", 1),
+        ("", "Roe, Max", 1),
+        ("99", "Jane Doe", 0),
+        ("", "", None),
+    ],
+)
+def test_whose_a_report_is_by_id_then_by_name(student_id, name, place) -> None:
+    assert CLASS.by_report(student_id, name) == place
+
+
+def test_of_two_ids_that_differ_by_zeros_the_exact_one_is_meant() -> None:
+    register = Register([Person("042"), Person("42")])
+    assert register.by_report("42", "") == 1
+    assert register.by_report("0042", "") is None
+
+
+def test_a_worksheet_adds_what_it_knows() -> None:
+    register = Register([Person("0042", "Jane Doe"), Person("43", "Max Roe")])
+    register.add([Person("42", "Doe J", "j@x.edu", "jdoe", {"moodle": "7"}), Person("9", "No One")])
+    assert register.people == [
+        Person("0042", "Jane Doe", "j@x.edu", "jdoe", {"moodle": "7"}), Person("43", "Max Roe"),
+    ]  # fmt: skip

@@ -1,0 +1,296 @@
+"""A term: forty students on three platforms, graded, edited, overridden, regraded, imported."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import io
+import json
+import re
+import zipfile
+from pathlib import Path
+
+import pytest
+from class_tools import Reports, at_once, zipped
+
+from px4fuse.assignment.key import Answer, AnswerKey
+from px4fuse.grading.entries import Term
+from px4fuse.grading.grade import Course, Outcome, grade
+from px4fuse.grading.lateness import due_time, late_rule
+from px4fuse.grading.model import Entry
+from px4fuse.grading.roster import people_of_sheet
+from px4fuse.grading.rubric import read_rubric, rubric_text
+from px4fuse.grading.sheet import read_sheet
+
+STUDENTS = range(1, 41)
+MOODLE, CANVAS, BLACKBOARD = range(1, 16), range(16, 28), range(28, 39)  # 39 and 40 hand in nothing
+LATE, RESUBMITTED, COPIED, HOSTILE, INTRUDER = 30, 31, 20, 5, 9
+WORDS = (
+    "I looked at the innovations of both axes. The source has outliers, which are rejected by the "
+    "gate. The noise fits the data and the filter is consistent."
+)
+HEADS = {
+    "moodle": ["Identifier", "Full name", "ID number", "Email address", "Status", "Grade",
+               "Maximum Grade", "Grade can be changed", "Last modified (submission)",
+               "Last modified (grade)", "Feedback comments"],
+    "canvas": ["Student", "ID", "SIS User ID", "SIS Login ID", "Section", "Lab (77)"],
+    "blackboard": ["Last Name", "First Name", "Username", "Student ID",
+                   "Lab [Total Pts: 200 Score] |99", "Feedback to Learner", "Feedback Format"],
+}  # fmt: skip
+
+
+def student_id(number: int) -> str:
+    return f"{number:04}"
+
+
+def first(number: int) -> str:
+    return f"Anna{chr(65 + number % 26)}{chr(65 + number // 26)}"
+
+
+def last(number: int) -> str:
+    return "=Doe" if number == HOSTILE else f"Doe{chr(65 + number // 26)}{chr(65 + number % 26)}"
+
+
+def name(number: int) -> str:
+    return f"{first(number)} {last(number)}"
+
+
+def log(number: int) -> bytes:
+    return f"the log of {number}".encode()
+
+
+def table(path: Path, head: list[str], rows: list[list[str]], separator: str = ",") -> Path:
+    with path.open("w", newline="", encoding="utf-8-sig") as file:
+        writer = csv.writer(file, delimiter=separator)
+        writer.writerows([head, *rows])
+    return path
+
+
+class Lab:
+    """The folder of an instructor in the middle of a term."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.output, self.logs = folder, folder / "class", folder / "logs"
+        self.logs.mkdir()
+        for number in STUDENTS:
+            (self.logs / f"{number}.ulg").write_bytes(log(number))
+        answers = (
+            Answer(student_id(n), name(n), f"{n}.ulg", hashlib.sha256(log(n)).hexdigest(),
+                   mistakes=("nlos=5%",), findings=("source_outliers",))
+            for n in STUDENTS
+        )  # fmt: skip
+        self.key = AnswerKey("aisle", tuple(answers))
+        make = Reports()
+        self.pdf = {
+            n: make.of(name(n), student_id(n), hashlib.sha256(log(n)).hexdigest(), f"{WORDS} {n}")
+            for n in STUDENTS
+        }
+        self.better = make.of(
+            name(RESUBMITTED), student_id(RESUBMITTED), self.key.answers[RESUBMITTED - 1].sha256
+        )
+        self.exports = [self.moodle(), self.canvas(), self.blackboard()]
+        rows = [[student_id(n), first(n), last(n), f"s{n}@x.edu"] for n in STUDENTS]
+        roster = table(folder / "roster.csv", ["id", "first name", "last name", "email"], rows)
+        self.sheets = [self.worksheet(), self.gradebook(), self.grades()]
+        self.roster = people_of_sheet(read_sheet(roster))
+
+    def moodle(self) -> Path:
+        files = {f"{name(n)}_{9000 + n}_assignsubmission_file_/report.pdf": self.pdf[n]
+                 for n in MOODLE}  # fmt: skip
+        own = f"{name(HOSTILE)}_{9000 + HOSTILE}_assignsubmission_file_"
+        files[f"{own}/report.pdf"] = b"%PDF-1.7 /JavaScript %%EOF"
+        # a zip file with another student's folder in it
+        inner = io.BytesIO()
+        with zipfile.ZipFile(inner, "w") as archive:
+            archive.writestr(f"{name(1)}_9001_assignsubmission_file_/report.pdf", b"%PDF- none")
+        files[f"{name(INTRUDER)}_{9000 + INTRUDER}_assignsubmission_file_/w.zip"] = inner.getvalue()
+        return zipped(self.folder / "moodle.zip", files)
+
+    def canvas(self) -> Path:
+        self.pdf[COPIED] = self.pdf[3]
+        return zipped(
+            self.folder / "canvas.zip",
+            {f"{(last(n) + first(n)).lower()}_{'LATE_' if n == 17 else ''}{700 + n}_{n}_r.pdf":
+             self.pdf[n] for n in CANVAS},
+        )  # fmt: skip
+
+    def blackboard(self) -> Path:
+        files = {f"Lab_user{n}_attempt_2026-11-{20 if n != LATE else 22}-11-00-00_r.pdf":
+                 self.pdf[n] for n in BLACKBOARD}  # fmt: skip
+        files[f"Lab_user{RESUBMITTED}_attempt_2026-11-20-11-30-00_r.pdf"] = self.better
+        return zipped(self.folder / "blackboard.zip", files)
+
+    def worksheet(self) -> Path:
+        rows = [[f"Participant {9000 + n}", name(n), "", f"s{n}@x.edu", "Submitted for grading", "",
+                 "200.00", "Yes", "Friday, 20 November 2026, 11:58 PM" if n == 2 else
+                 "Friday, 20 November 2026, 10:58 AM", "-", ""] for n in (*MOODLE, 39)]  # fmt: skip
+        return table(self.folder / "worksheet.csv", HEADS["moodle"], rows)
+
+    def gradebook(self) -> Path:
+        rows = [["    Points Possible", "", "", "", "", "200.00"]]
+        rows += [[f"{last(n)}, {first(n)}", f"{700 + n}", student_id(n), f"s{n}", "A", ""]
+                 for n in CANVAS]  # fmt: skip
+        return table(self.folder / "gradebook.csv", HEADS["canvas"], rows)
+
+    def grades(self) -> Path:
+        rows = [[last(n), first(n), f"user{n}", student_id(n), "", "", ""] for n in BLACKBOARD]
+        return table(self.folder / "grades.csv", HEADS["blackboard"], rows, "\t")
+
+    def grade(self, rubric=None) -> Outcome:
+        due = due_time("2026-11-20 12:00:00 Europe/Berlin")
+        course = Course(self.roster, tuple(map(read_sheet, self.sheets)), "",
+                        Term("latest", due, late_rule("10%/day")), anonymous=True)  # fmt: skip
+        return grade(self.exports, [self.logs], rubric or read_rubric(None), self.output,
+                     key=self.key, course=course, title="Lab", processes=1)  # fmt: skip
+
+    def filled(self, file: str, separator: str = ",") -> list[dict[str, str]]:
+        text = (self.output / "grades" / file).read_text(encoding="utf-8-sig")
+        return list(csv.DictReader(io.StringIO(text, newline=""), delimiter=separator))
+
+
+@pytest.fixture
+def lab(tmp_path: Path) -> Lab:
+    return Lab(tmp_path)
+
+
+def of(outcome: Outcome, number: int) -> Entry:
+    return next(one for one in outcome.entries if one.student_id == student_id(number))
+
+
+def points(outcome: Outcome) -> dict[str, float | None]:
+    return {one.student_id: one.total for one in outcome.entries}
+
+
+def test_a_term(lab, monkeypatch) -> None:
+    verified = at_once(monkeypatch)
+    outcome = lab.grade()
+    everyone_has_a_row(outcome)
+    late_and_resubmitted(outcome)
+    copied_and_hostile(outcome)
+    count = len(verified)
+    another_rubric(lab, outcome)
+    last = the_instructors_word(lab, outcome)
+    assert len(verified) == count  # points changed, and no report was looked at again
+    imported(lab, last)
+    anonymous(lab, last)
+
+
+def everyone_has_a_row(outcome: Outcome) -> None:
+    """Missing ones included, and nobody has two."""
+    entries = outcome.entries
+    assert [one.student_id for one in entries] == [student_id(n) for n in STUDENTS]
+    assert [one.student_id for one in entries if one.counting is None] == ["0039", "0040"]
+    assert outcome.reused == 1  # the copy
+    assert len(outcome.graded) == 40
+    usual = of(outcome, 1)
+    assert usual.counting.status == "verified"
+    assert usual.remarks == ()
+
+
+def late_and_resubmitted(outcome: Outcome) -> None:
+    """Moodle's worksheet and Blackboard's names say when; Canvas says only that it was late."""
+    usual, late = of(outcome, 1), of(outcome, LATE)
+    assert (usual.handed_in, usual.late_s) == ("2026-11-20 10:58", 0.0)
+    assert of(outcome, 2).deduction == 0.1 * usual.of
+    assert late.late_s == 47 * 3600.0
+    assert late.deduction == pytest.approx(0.2 * late.of)
+    assert late.total == pytest.approx(max(late.counting.points - late.deduction, 0.0))
+    assert "Canvas marks it as late" in of(outcome, 17).remarks[0]
+    again = of(outcome, RESUBMITTED)
+    assert "11-30-00" in again.counting.submission
+    assert len(again.others) == 1
+
+
+def copied_and_hostile(outcome: Outcome) -> None:
+    """A copy is its owner's by the platform's word and earns less; what is no report, nothing."""
+    copied = of(outcome, COPIED)
+    assert "gives the id of 0003" in copied.remarks[0]
+    assert any("The same file" in flag for flag in copied.counting.flags)
+    assert copied.total is None
+    assert "given to 0003" in copied.counting.pending
+    assert "0020 handed it in" in copied.counting.pending
+    hostile = of(outcome, HOSTILE)
+    assert (hostile.total, hostile.counting.status) == (0.0, "cannot verify")
+    intruder = of(outcome, INTRUDER)
+    assert intruder.counting.status == "verified"
+    assert of(outcome, 1).others == ()  # what lies in 9's zip file is 9's
+    assert len(intruder.others) == 1
+
+
+def another_rubric(lab: Lab, outcome: Outcome) -> None:
+    doubled = re.sub(r"(?m)^points = (\d+)", lambda m: f"points = {2 * int(m[1])}", rubric_text())
+    (lab.folder / "lab.toml").write_text(doubled, encoding="utf-8")
+    second = lab.grade(read_rubric(lab.folder / "lab.toml"))
+    assert second.reused == 40
+    assert of(second, 1).total == pytest.approx(2 * of(outcome, 1).total, abs=0.2)
+
+
+def the_instructors_word(lab: Lab, outcome: Outcome) -> Outcome:
+    """Overrides are read, never written over, and kept by every regrade."""
+    usual = of(outcome, 1)
+    item = usual.counting.items[0].title
+    said = lab.output / "overrides.csv"
+    assert said.read_text(encoding="utf-8-sig") == "id,item,points,comment\n"
+    with said.open("a", encoding="utf-8", newline="") as file:
+        csv.writer(file).writerows(
+            [["0001", item, "1", "Not shown."], ["40", "total", "12", "Seen in the lab."],
+             ["0001", "", "", "Well argued."], ["0099", "total", "1", ""]]
+        )  # fmt: skip
+    before = said.read_bytes()
+    third = lab.grade()
+    assert said.read_bytes() == before
+    expected = usual.total - usual.counting.items[0].points + 1.0
+    assert of(third, 1).total == pytest.approx(expected)
+    assert of(third, 40).total == 12.0
+    assert "overrides.csv: nobody has the id 0099." in third.notes
+    changed = {key for key, value in points(third).items() if value != points(outcome)[key]}
+    assert changed == {"0001", "0040"}
+    text = (lab.output / "feedback" / "0001.txt").read_text(encoding="utf-8")
+    assert "Well argued." in text
+    assert "Not shown." in text
+    table_of = (lab.output / "class.csv").read_bytes()
+    assert lab.grade().entries == third.entries
+    assert (lab.output / "class.csv").read_bytes() == table_of
+    return third
+
+
+def imported(lab: Lab, outcome: Outcome) -> None:
+    """What each platform takes back, with the columns that it wrote."""
+    for platform, file, column, separator in (
+        ("moodle", "worksheet.csv", "Grade", ","),
+        ("canvas", "gradebook.csv", "Lab (77)", ","),
+        ("blackboard", "grades.csv", "Lab [Total Pts: 200 Score] |99", "\t"),
+    ):
+        rows = lab.filled(file, separator)
+        assert list(rows[0]) == HEADS[platform]
+        found = {}
+        for row in rows:
+            number = re.sub(r"\D", "", {
+                "moodle": row.get("Identifier", ""), "canvas": row.get("SIS User ID", ""),
+                "blackboard": row.get("Student ID", ""),
+            }[platform])  # fmt: skip
+            if number:
+                key = int(number) - (9000 if platform == "moodle" else 0)
+                found[student_id(key)] = row[column]
+        assert len(found) == {"moodle": 16, "canvas": 12, "blackboard": 11}[platform]
+        for key, value in found.items():
+            total = points(outcome)[key]
+            assert value == ("" if total is None else f"{total:.10g}"), (platform, key)
+    names = {row["Full name"] for row in lab.filled("worksheet.csv")}
+    assert name(HOSTILE) in names  # Moodle's own cells stay as they were
+    with zipfile.ZipFile(lab.output / "grades" / "moodle_feedback.zip") as archive:
+        folders = {one.split("/")[0].split("_")[1] for one in archive.namelist()}
+    assert folders == {str(9000 + n) for n in MOODLE}
+    for path in (lab.output / "gradescope").rglob("results.json"):
+        assert json.loads(path.read_text(encoding="utf-8"))["tests"]
+    table_of = (lab.output / "class.csv").read_text(encoding="utf-8-sig")
+    assert not re.search(r"(?m)(^|,)\"?[=+@]", table_of)
+
+
+def anonymous(lab: Lab, outcome: Outcome) -> None:
+    """Who is who stands in a file of its own, and stays."""
+    text = (lab.output / "names.csv").read_text(encoding="utf-8-sig")
+    rows = list(csv.DictReader(io.StringIO(text, newline="")))
+    assert {row["id"] for row in rows} == {one.student_id for one in outcome.entries}
+    assert len({row["pseudonym"] for row in rows}) == 40
+    assert [row["id"] for row in rows] != sorted(row["id"] for row in rows)
