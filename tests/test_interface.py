@@ -15,11 +15,18 @@ import pandas as pd
 import pytest
 from click.testing import CliRunner
 from matplotlib.axes import Axes
+from results_tools import SHIPPED
 
 import px4fuse
 from px4fuse.cli import cli
 from px4fuse.display import Shown
+from px4fuse.fleet.changes import changes
+from px4fuse.fleet.sides import Side
 from px4fuse.request import with_options
+from px4fuse.results.build import results as build
+from px4fuse.results.contract import ComparisonResults
+from px4fuse.results.model import Student
+from px4fuse.results.reading import read_results
 
 # A terminal's width and a half; results that hold several others have a line for each
 LINE = 200
@@ -60,12 +67,21 @@ def results(sample_log, analysis) -> dict[str, Shown]:
         "Evaluation": evaluation,
         "RelativeError": evaluation.rpe[0],
         "WhatIf": px4fuse.what_if(analysis.ekf2_model, {"EKF2_EVP_NOISE": 0.3}),
+        "Changes": changes(
+            Side("aisle_uwb.json", "results", read_results(SHIPPED.read_bytes())),
+            Side("small.ulg", "log", results_of(analysis), analysis),
+        ),
     }
+
+
+def results_of(analysis: px4fuse.Analysis) -> ComparisonResults:
+    request = px4fuse.ComparisonRequest(log="aisle_uwb.ulg", sigma_z_m=0.2)
+    return build(request, analysis, px4fuse.find(analysis), Student(), "px4fuse compare")
 
 
 NAMES = [
     "Flight", "Comparison", "Analysis", "AxisComparison", "Consistency", "Why", "AxisTuning",
-    "ClockOffset", "Loop", "Trajectory", "Evaluation", "RelativeError", "WhatIf",
+    "ClockOffset", "Loop", "Trajectory", "Evaluation", "RelativeError", "WhatIf", "Changes",
 ]  # fmt: skip
 
 
@@ -262,6 +278,7 @@ def test_tables_are_tidy_with_units(results, name):
     without_unit = {
         "nis_mean", "nis_low", "nis_high", "outside_two_sigma", "lag1_autocorrelation", "gain_nats",
         "rejected_share", "w", "x", "y", "z",
+        "a", "b", "change", "change_low", "change_high", "p", "q",  # a column has the unit
     }  # fmt: skip
     units = ("_m", "_s", "_m_s", "_m_s2", "_m2", "_m2_s2", "_deg")
     for column in table.select_dtypes("floating"):

@@ -6,12 +6,14 @@ import shlex
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from textwrap import shorten
+from typing import Any
 
 import numpy as np
 import pandas as pd
 from msgspec.structs import replace
 
-from px4fuse.display import Shown, frame, words
+from px4fuse.display import Shown, draw, frame, words
 from px4fuse.fleet import told
 from px4fuse.fleet.measures import Number, numbers
 from px4fuse.fleet.sides import Progress, Side, read_sides
@@ -32,13 +34,14 @@ from px4fuse.results.changes import (
     Status,
     Which,
 )
-from px4fuse.results.contract import CHANGES, ChangeResults, to_plain
+from px4fuse.results.contract import CHANGES, ChangeResults
 from px4fuse.results.parts import provenance, schema_of
 
 Numbers = Mapping[str, Number]
 Pairs = Mapping[str, tuple[Number, Number]]
 # What stands first of the significant changes; and of these, causes before what they bring
 _ORDER: tuple[Judgement, ...] = ("worse", "better", "changed", "")
+MAX_LINE, MAX_CHANGES, MAX_DRAWN = 160, 4, 20
 _CAUSES = ("tuning", "clock", "heading")
 
 
@@ -66,13 +69,51 @@ class Changes(Shown):
 
 @words.register
 def _(found: Changes) -> str:
-    lines = [f"{c.judgement:7} {c.label}: {c.why}" for c in found.results.numbers if c.judgement]
-    return "\n".join([*found.results.summary, *lines])
+    results = found.results
+    first = [f"{c.judgement:7} {c.label}: {c.why}" for c in results.numbers if c.judgement]
+    # a few lines: the table has them all
+    return "\n".join(shorten(line, MAX_LINE) for line in [*results.summary, *first[:MAX_CHANGES]])
 
 
 @frame.register
 def _(found: Changes) -> pd.DataFrame:
-    return pd.DataFrame([to_plain(change) for change in found.results.numbers])
+    nothing = (np.nan, np.nan)
+    return pd.DataFrame(
+        {
+            "path": change.path,
+            "label": change.label,
+            "unit": change.unit,
+            "a": change.a,
+            "b": change.b,
+            "scale": change.scale,
+            "change": np.nan if change.change is None else change.change,
+            "change_low": (change.change_interval or nothing)[0],
+            "change_high": (change.change_interval or nothing)[1],
+            "p": np.nan if change.p is None else change.p,
+            "q": np.nan if change.q is None else change.q,
+            "status": change.status,
+            "judgement": change.judgement,
+        }
+        for change in found.results.numbers
+    )
+
+
+@draw.register
+def _(found: Changes, ax: Any = None) -> Any:
+    """The first ratios with their intervals."""
+    from matplotlib import pyplot as plt  # noqa: PLC0415 - takes its time
+
+    ax = ax or plt.subplots(layout="constrained")[1]
+    table = frame(found)
+    table = table[(table["scale"] == "ratio") & table["change"].notna()].head(MAX_DRAWN).iloc[::-1]
+    low, high = (table[name].fillna(table["change"]) for name in ("change_low", "change_high"))
+    ax.errorbar(
+        table["change"], table["label"], fmt="o", ms=4, color="black",
+        xerr=[table["change"] - low, high - table["change"]],
+    )  # fmt: skip
+    ax.axvline(1.0, color="black", lw=0.8)
+    ax.set(xscale="log", xlabel="B / A, with 95 % intervals")
+    return ax
 
 
 def diff(a: str | Path, b: str | Path, *, progress: Progress = lambda _: None) -> Changes:

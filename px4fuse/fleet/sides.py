@@ -11,6 +11,7 @@ from typing import Literal
 from msgspec.structs import replace
 
 from px4fuse.analysis import Analysis, run
+from px4fuse.display import brief
 from px4fuse.errors import LogError, ResultsError
 from px4fuse.findings import find
 from px4fuse.reading import read_head, read_whole, shown
@@ -32,7 +33,7 @@ _FILTER = ("sigma_a_m_s2", "sigma_z_m", "dt_s", "input", "axes", "clock_offset_s
 _PART = ("heading_deg", "start_s", "end_s", "position_source")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Side:
     """One of two comparisons.
 
@@ -50,6 +51,8 @@ class Side:
     kind: Kind
     results: ComparisonResults
     analysis: Analysis | None = None
+
+    __repr__ = brief
 
 
 def read_sides(a: Path, b: Path, progress: Progress = lambda _: None) -> tuple[Side, Side]:

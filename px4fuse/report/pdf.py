@@ -108,8 +108,9 @@ def _running_lines(figure: Figure, document: Report, number: int, count: int) ->
     """Head and foot of a page: which log, whose, which version, which page."""
     name, sha256 = document.log
     style = {"size": 6.5, "color": MUTED}
-    head = shorten(printable(f"px4fuse · {name} · SHA-256 {sha256[:12]}"), 6.5, 330)
     who = " · ".join(part for part in (document.student.name, document.student.id) if part)
+    room = 330 if who else 500
+    head = shorten(printable(f"px4fuse · {name} · SHA-256 {sha256[:12]}"), 6.5, room)
     put(figure, LEFT, 0.972, head, **style)
     if who:
         figure.text(RIGHT, 0.972, shorten(printable(who), 6.5, 170), ha="right", **style)  # type: ignore[arg-type]
