@@ -28,6 +28,7 @@ if _typing.TYPE_CHECKING:
     from px4fuse.filter.tuning import tune as tune
     from px4fuse.findings import Finding as Finding
     from px4fuse.findings import find as find
+    from px4fuse.fleet.run import batch as batch
     from px4fuse.flight import Flight as Flight
     from px4fuse.flight import Unavailable as Unavailable
     from px4fuse.loop.loop import Loop as Loop
@@ -64,6 +65,7 @@ _HOMES = {
     "Unavailable": "flight",
     "WhatIf": "ekf2.whatif",
     "assess": "filter.consistency",
+    "batch": "fleet.run",
     "close_loop": "notebook.commands",
     "compare": "notebook.commands",
     "evaluate": "notebook.commands",

@@ -278,6 +278,8 @@ class LogInfo:
         UNIX time of time zero, by whichever clock the log has it from; None where it has none.
     senders : tuple of Sender
         Of a MAVLink recording, most messages first.
+    vehicle : str
+        Identifier of the flight controller, hexadecimal; empty where the log has none.
     """
 
     name: str
@@ -295,6 +297,7 @@ class LogInfo:
     autopilot: str = "PX4"
     start_unix_s: float | None = None
     senders: tuple[Sender, ...] = ()
+    vehicle: str = ""
 
     __repr__ = brief
 

@@ -18,7 +18,7 @@ from px4fuse.analysis import Analysis, tuned_horizontally
 from px4fuse.comparison.comparison import compare
 from px4fuse.filter import hypotheses
 from px4fuse.filter.causes import Explained, explained
-from px4fuse.filter.hypotheses import Fit, Signals, Whitened, fit, respond
+from px4fuse.filter.hypotheses import Fit, Signals, Whitened, fit, gains, respond
 from px4fuse.filter.kalman import Settings, replay
 from px4fuse.filter.likelihood import preintegrate
 from px4fuse.filter.smoothing import Smoothing, smoothing
@@ -94,7 +94,8 @@ def test_a_response_is_what_the_filter_itself_makes_of_a_signal() -> None:
     still = np.zeros((len(legs.length_s), 1))
     signals = Signals(still, still, step[1:, None], step[:1])
     none = np.zeros(len(still), dtype=bool)
-    response, s = respond(legs, signals, RIGHT.sigma_a_m_s2, RIGHT.sigma_z_m, none)
+    s, gain = gains(legs, RIGHT.sigma_a_m_s2, RIGHT.sigma_z_m, none)
+    response = respond(legs, signals, s, gain)
     np.testing.assert_allclose(response[:, 0], expected, atol=1e-9)
     np.testing.assert_allclose(s, north.replay.updates["innovation_variance_m2"], rtol=1e-9)
 

@@ -9,6 +9,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from filterpy.kalman import KalmanFilter
 from flights import line
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -18,11 +19,11 @@ from px4fuse.filter.kalman import (
     InitialState,
     Replay,
     Settings,
-    process_noise,
     replay,
     state_at,
     variance_at,
 )
+from px4fuse.filter.model import H, input_matrix, matrix, noise, transition
 from px4fuse.filter.signals import Axis, choose_segment, choose_source, make_axes
 from px4fuse.flight import Flight
 
@@ -196,14 +197,37 @@ def test_updates_report_the_textbook_gain_and_prior(axis: Axis) -> None:
 def test_process_noise_at_dt_is_the_lessons(dt: float, sigma_a: float) -> None:
     q = sigma_a**2
     lessons = [[q * dt**4 / 4, q * dt**3 / 2], [q * dt**3 / 2, q * dt**2]]
-    ours = process_noise(dt, Settings(sigma_a_m_s2=sigma_a, dt_s=dt))
-    np.testing.assert_allclose(ours, lessons, rtol=1e-14)
+    np.testing.assert_allclose(q * dt * matrix(noise(dt)), lessons, rtol=1e-14)
 
 
 def test_velocity_noise_per_second_does_not_depend_on_the_step() -> None:
-    chosen = Settings(sigma_a_m_s2=0.7)
-    per_second = [process_noise(dt, chosen)[1, 1] / dt for dt in (0.001, 0.004, 0.1, 0.37)]
-    np.testing.assert_allclose(per_second, 0.7**2 * 0.1, rtol=1e-12)
+    per_second = [noise(dt)[2] / dt for dt in (0.001, 0.004, 0.1, 0.37)]
+    np.testing.assert_allclose(per_second, 1.0, rtol=1e-12)
+
+
+@settings(max_examples=40)
+@given(axis=any_axis(), chosen=any_settings)
+def test_replay_is_filterpys_predict_and_update(axis: Axis, chosen: Settings) -> None:
+    run = replay(axis, chosen)
+    kalman = KalmanFilter(dim_x=2, dim_z=1, dim_u=1)
+    kalman.x = np.array([[axis.measurement_m[0]], [0.0]])
+    kalman.P, kalman.H = np.diag([0.5**2, 1.0**2]), H
+    kalman.R = np.array([[chosen.sigma_z_m**2]])
+    expected = [[*kalman.x[:, 0], *kalman.P[[0, 0, 1], [0, 1, 1]]]]
+    accelerations = run.steps["acceleration_m_s2"].tolist()
+    added = run.steps["input_variance_m2_s4"].tolist()
+    for (before, now), a, extra in zip(
+        pairwise(run.steps.index), accelerations[:-1], added[:-1], strict=True
+    ):
+        dt = now - before
+        q = (chosen.sigma_a_m_s2**2 + extra) * chosen.dt_s
+        kalman.predict(
+            u=np.array([[a]]), B=input_matrix(dt), F=transition(dt), Q=q * matrix(noise(dt))
+        )
+        if now in run.updates.index:
+            kalman.update(run.updates["measurement_m"][now])
+        expected.append([*kalman.x[:, 0], *kalman.P[[0, 0, 1], [0, 1, 1]]])
+    np.testing.assert_allclose(run.steps[STATE], expected, rtol=1e-12, atol=1e-12)
 
 
 NOT_FINITE = (math.nan, math.inf, -math.inf)

@@ -9,6 +9,9 @@ import pytest
 from flights import line, random_walk
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.differentiate import hessian
+from scipy.optimize import minimize
+from scipy.special import expit
 from scipy.stats import norm
 from test_tuning import SIGMA_A, SIGMA_Z, TRUE, modelled
 
@@ -27,6 +30,7 @@ from px4fuse.filter.fitting import (
     most_likely,
     negative_log_likelihood,
     profile_end,
+    widened_by_outliers,
 )
 from px4fuse.filter.kalman import Settings
 from px4fuse.filter.likelihood import PROFILE_DROP, innovations, preintegrate, total_over_grid
@@ -506,6 +510,41 @@ def test_outliers_are_found_and_do_not_move_the_noise(
     assert np.mean(ratio) == pytest.approx(1.0, abs=0.025)
     assert hits / (hits + missed) > least_found
     assert hits / (hits + wrong) > 0.9
+
+
+@pytest.mark.parametrize(("axes", "share", "width"), [(1, 0.15, 4.0), (2, 0.1, 5.0), (2, 0.3, 3.0)])
+def test_noise_is_as_uncertain_as_the_likelihood_of_the_mixture_is_curved(
+    axes: int, share: float, width: float
+) -> None:
+    """Of measurements without any motion, whose likelihood can be written down."""
+    rng = np.random.default_rng(axes)
+    wrong = rng.random(4000) < share
+    square = np.sum(
+        rng.normal(0.0, np.where(wrong, width, 1.0)[:, None], (4000, axes)) ** 2, axis=1
+    )
+
+    def score(parameters: Array) -> Array:
+        log_sigma, log_width, odds = (
+            parameters[:, None] if parameters.ndim == 1 else (parameters[..., None])
+        )
+        variance = np.exp(2.0 * log_sigma)
+        wide = variance * np.exp(2.0 * log_width)
+        chance = expit(odds)
+        each = [
+            np.log(part) - 0.5 * axes * np.log(of) - 0.5 * square / of
+            for part, of in ((1.0 - chance, variance), (chance, wide))
+        ]
+        return -np.logaddexp(*each).sum(axis=-1)
+
+    start = np.array([0.0, np.log(width), np.log(share / (1.0 - share))])
+    best = minimize(score, start, method="BFGS", options={"gtol": 1e-4}).x
+    curved = np.linalg.inv(hessian(score, best, initial_step=0.05).ddf)[0, 0]
+    sigma, wide = np.exp(best[0]), np.exp(best[1])
+    over = square / sigma**2
+    found = _outlier_probability(over, np.full(4000, axes), float(expit(best[2])), float(wide))
+    widening = widened_by_outliers(over, np.full(4000, axes), found, float(wide))
+    assert widening > 1.1
+    assert widening == pytest.approx(curved * 2.0 * axes * 4000, rel=0.01)
 
 
 def test_what_one_axis_sees_both_leave_out() -> None:

@@ -7,15 +7,25 @@ import random
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from matplotlib import rc_context
 from matplotlib.figure import Figure
 from PIL import Image
 from pypdf import PdfReader, PdfWriter
 
 from px4fuse.flight import Unavailable
-from px4fuse.verification.pictures import MAX_BYTES, MAX_PIXELS, key_page, picture
+from px4fuse.grading.sheets import draw_sheets
+from px4fuse.verification.pictures import (
+    COVER,
+    MAX_BYTES,
+    MAX_PIXELS,
+    key_page,
+    page_pictures,
+    picture,
+)
 
 REPORT = Path(__file__).resolve().parents[1] / "reports" / "aisle_uwb.pdf"
 
@@ -128,3 +138,80 @@ def test_without_pypdfium2_it_says_what_to_install(monkeypatch: pytest.MonkeyPat
     made = picture(REPORT.read_bytes(), 0)
     assert isinstance(made, Unavailable)
     assert 'pip install "px4fuse[grade]"' in str(made)
+
+
+# ------------------------------------------------------------------ every page, and whose it is
+
+
+def written(*lines: tuple[float, str]) -> bytes:
+    """A page of A4 with texts at heights from 0 to 1."""
+    figure = Figure(figsize=(8.27, 11.69))
+    for height, text in lines:
+        figure.text(0.3, height, text, size=12)
+    out = io.BytesIO()
+    with rc_context({"pdf.fonttype": 42}):
+        figure.savefig(out, format="pdf")
+    return out.getvalue()
+
+
+def darkest(made: bytes, top: float, bottom: float) -> int:
+    """Of a strip of the picture, heights from 0 at the bottom to 1."""
+    image = opened(made).convert("L")
+    box = (0, round((1 - top) * image.height), image.width, round((1 - bottom) * image.height))
+    low, _ = image.crop(box).getextrema()
+    assert isinstance(low, int)
+    return low
+
+
+def test_every_page_of_a_report_is_drawn() -> None:
+    made = page_pictures(REPORT.read_bytes())
+    assert not isinstance(made, Unavailable)
+    assert len(made) == len(PdfReader(REPORT).pages)
+    assert {opened(one).size for one in made} == {(700, 990)}
+    assert made[0] == picture(REPORT.read_bytes(), 0)
+
+
+def test_names_are_covered_and_nothing_else() -> None:
+    pdf = written(
+        (0.98, "1001.ulg by Ada"), (0.9, "by Ada Lovelace, 10017"), (0.5, "what was seen")
+    )
+    (shown,), (hidden,) = page_pictures(pdf), page_pictures(pdf, ("Ada", "LOVELACE", "10017"))
+    assert darkest(shown, 1.0, 0.97) < 60
+    assert darkest(shown, 0.92, 0.89) < 60
+    # the head as a whole, as light as what covers it
+    assert darkest(hidden, 1.0, 0.97) >= min(COVER) - 20
+    assert darkest(hidden, 0.52, 0.49) < 60
+    # "by" stays, and the comma; of the names there is one grey
+    line = np.asarray(opened(hidden).convert("L"))[round(0.085 * 990) : round(0.105 * 990)]
+    dark = np.flatnonzero(line.min(axis=0) < 60)
+    assert len(dark)
+    assert np.sum(dark > 250) < 12
+
+
+def test_a_name_that_cannot_be_found_is_not_shown() -> None:
+    made = page_pictures(written((0.9, "by somebody")), ("Ada", "10017"))
+    assert isinstance(made, Unavailable)
+    assert "cannot be found" in made.reason
+
+
+def test_pages_are_drawn_once_and_named_by_what_they_show(tmp_path: Path) -> None:
+    (tmp_path / "a.pdf").write_bytes(REPORT.read_bytes())
+    (tmp_path / "b.pdf").write_bytes(written((0.9, "by Ada")))
+    (tmp_path / "c.pdf").write_bytes(b"%PDF-1.7 broken")
+    reports = {name: (tmp_path / f"{name}.pdf", ()) for name in "abc"}
+    folder = tmp_path / "pages"
+    made = draw_sheets(reports, folder, processes=1)
+    assert {name: len(files) for name, files in made.items()} == {
+        "a": len(PdfReader(REPORT).pages), "b": 1,
+    }  # fmt: skip
+    first = {path: path.stat().st_mtime_ns for path in folder.iterdir()}
+    assert {path.name for path in first} == {file for files in made.values() for file in files}
+    assert (folder / made["a"][0]).read_bytes() == picture(REPORT.read_bytes(), 0)
+    # one that is not whole is drawn again, the others are not
+    (folder / made["b"][0]).unlink()
+    assert draw_sheets(reports, folder, processes=1) == made
+    kept = folder / made["a"][3]
+    assert kept.stat().st_mtime_ns == first[kept]
+    hidden = draw_sheets({"b": (tmp_path / "b.pdf", ("Ada",))}, folder, processes=1)
+    assert hidden["b"] != made["b"]
+    assert not any("ada" in file.casefold() for files in hidden.values() for file in files)

@@ -263,6 +263,15 @@ def test_biases_and_tilt_are_taken_out_of_the_noise() -> None:
     assert found.noises.walk_m == 0.0
 
 
+def test_noise_as_large_as_the_motion_does_not_pass_for_a_scale() -> None:
+    """A scale whose signal held the noise itself would take a part of it (errors in variables)."""
+    ratios = [
+        horizontal(made_flight(seed, moving=0.1, sigma_a=0.5)[0]).noises.sigma_a_m_s2 / 0.5
+        for seed in range(6)
+    ]
+    assert np.mean(ratios) == pytest.approx(1.0, abs=2.6 * np.std(ratios) / np.sqrt(len(ratios)))
+
+
 def test_a_source_that_wanders_has_a_walk_of_its_own() -> None:
     """0.1 m per root of a second, which would otherwise be called acceleration."""
     flight, _ = made_flight(4, duration_s=90.0)

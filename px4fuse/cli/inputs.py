@@ -247,6 +247,13 @@ def analysis_options(command: Callable[..., None]) -> Callable[..., None]:
     return command
 
 
+def settings_options(command: Callable[..., None]) -> Callable[..., None]:
+    """Add the options of an analysis that hold for many logs: no other files of one flight."""
+    for option in reversed((*_ANALYSIS, system_option, clock_offset_option, max_size_option)):
+        command = option(command)
+    return command
+
+
 def person_options(command: Callable[..., None]) -> Callable[..., None]:
     """Add the options that say whose report it is."""
     for option in reversed(_PERSON):

@@ -21,6 +21,7 @@ from px4fuse.filter.hypotheses import (
     Lines,
     Signals,
     fit,
+    gains,
     lines_of,
     respond,
     same_gains,
@@ -37,6 +38,8 @@ SIGMA_A_FACTORS = np.geomspace(0.2, 2.0, 7)
 SCALES = np.linspace(0.7, 1.3, 7)
 # A step is sought at no more times than these
 MAX_STEPS = 800
+# So many of them are tried together: the responses of all would be the largest arrays of a run
+STEPS_AT_ONCE = 50
 # The vehicle's own reading is relied on across this time, in which bursts of outliers end
 BURST_S = 1.0
 # A run of outliers that begins within this time after a step belongs to it
@@ -218,20 +221,31 @@ def _scan(lines: Lines, sigma_a: float, skip: BoolArray) -> list[float]:
     times = times[:: max(1, -(-len(times) // MAX_STEPS))]
     if not len(times):
         return []
-    candidates = steps(lines.time_s, times)
-    still = np.zeros_like(candidates)
-    signals = Signals(still, still, candidates, np.zeros(len(times)))
     rest = white.data - white.columns @ base.coefficients
-    chi_square = np.zeros(len(times))
     rows = np.count_nonzero(~skip)
     together = same_gains(lines.legs)
-    for at, legs in enumerate(lines.legs):
-        if at == 0 or not together:
-            response = respond(legs, signals, sigma_a, lines.sigma_z_m, skip)[0][~skip]
-        own = slice(at * rows, (at + 1) * rows)
-        mixed = white.columns[own].T @ response
-        size = np.sum(response**2, axis=0) - np.sum(mixed * (base.covariance @ mixed), axis=0)
-        chi_square += (rest[own] @ response) ** 2 / np.maximum(size, 1e-9)
+    made = [
+        gains(legs, sigma_a, lines.sigma_z_m, skip)
+        for legs in lines.legs[: 1 if together else None]
+    ]
+
+    def explains(block: Array) -> Array:
+        """χ² that a step at each of some times takes away."""
+        candidates = steps(lines.time_s, block)
+        still = np.zeros_like(candidates)
+        signals = Signals(still, still, candidates, np.zeros(len(block)))
+        chi_square = np.zeros(len(block))
+        for at, legs in enumerate(lines.legs):
+            if at == 0 or not together:
+                response = respond(legs, signals, *made[at])[~skip]
+            own = slice(at * rows, (at + 1) * rows)
+            mixed = white.columns[own].T @ response
+            size = np.sum(response**2, axis=0) - np.sum(mixed * (base.covariance @ mixed), axis=0)
+            chi_square += (rest[own] @ response) ** 2 / np.maximum(size, 1e-9)
+        return chi_square
+
+    blocks = np.array_split(times, -(-len(times) // STEPS_AT_ONCE))
+    chi_square = np.concatenate([explains(block) for block in blocks])
     chi_square /= max(base.spread, 1.0) ** 2
     best = int(np.argmax(chi_square))
     if chi_square[best] < chdtri(len(lines.legs), STEP_FALSE_ALARM / len(lines.time_s)):

@@ -132,7 +132,7 @@ class _Problem:
 
     def part(self, offset_s: Array | float) -> Part:
         legs = self.motion.legs(self.directions, np.atleast_1d(offset_s))
-        return Part(*centred(self.positions, *legs))
+        return Part(*centred(self.positions, *legs, scaled=True))
 
     def fitted(self, offset_s: Array | float, noises: Noises) -> Fitted:
         sigma = noises.sigma_z_m

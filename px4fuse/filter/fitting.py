@@ -196,12 +196,16 @@ class NoiseFit:
         Probability that it is one.
     score : Likelihood
         With these weights.
+    widening : float
+        How much larger the variance of ln SIGMA_Z is than the score's bend says, since outliers,
+        their share and their width are themselves found.
     """
 
     noises: Noises
     weight: Array
     outlier: Array
     score: Likelihood
+    widening: float
 
 
 def filter_part(legs: Preintegrated) -> Part:
@@ -296,7 +300,12 @@ def most_likely(
             break
         noises = replace(noises, sigma_z_m=float(np.sqrt(variance)))
     likelihood = Likelihood(parts, weight, start.sigma_z_m)
-    return NoiseFit(_maximise(likelihood, noises), weight, outlier, likelihood)
+    noises = _maximise(likelihood, noises)
+    widening = 1.0
+    if outlier.any():
+        square, count = _squares(parts, noises, weight)
+        widening = widened_by_outliers(square / noises.sigma_z_m**2, count, outlier, width)
+    return NoiseFit(noises, weight, outlier, likelihood, widening)
 
 
 def _squares(parts: Sequence[Part], noises: Noises, weight: Array) -> tuple[Array, Array]:
@@ -316,6 +325,39 @@ def chi_square_median(freedom: float) -> float:
 def _outlier_probability(square: Array, count: Array, share: float, width: float) -> Array:
     odds = np.log(share / (1.0 - share)) - count * np.log(width)
     return np.asarray(expit(odds + 0.5 * square * (1.0 - width**-2.0)))
+
+
+def widened_by_outliers(square: Array, count: Array, outlier: Array, width: float) -> float:
+    """Variance of ln σ over that with known outliers, at the maximum of the likelihood.
+
+    The information of the data is that of the complete data, in which each measurement is known to
+    be an outlier or not, less what is missing: the covariance of the score over what it may be
+    (Louis 1982). Parameters are ln σ, ln width and the log odds of the share.
+
+    Parameters
+    ----------
+    square : ndarray, shape (m,)
+        Of each measurement's error over σ², summed over its axes.
+    count : ndarray, shape (m,)
+        Axes.
+    outlier : ndarray, shape (m,)
+        Probability that it is one.
+    width : float
+        Outliers' σ over σ.
+    """
+    share = float(np.mean(outlier))
+    total, wide = 2.0 * float(np.sum(count)), 2.0 * float(np.sum(count * outlier))
+    complete = np.array(
+        [[total, wide, 0.0], [wide, wide, 0.0], [0.0, 0.0, len(square) * share * (1.0 - share)]]
+    )
+    steps = np.stack(
+        [square * (width**-2.0 - 1.0), square * width**-2.0 - count, np.ones_like(square)]
+    )
+    missing = (steps * (outlier * (1.0 - outlier))) @ steps.T
+    observed = complete - missing
+    if np.linalg.eigvalsh(observed)[0] <= 0.0:  # hardly any outlier: what they are adds nothing
+        return 1.0
+    return max(1.0, total * float(np.linalg.inv(observed)[0, 0]))
 
 
 def _maximise(likelihood: Likelihood, start: Noises, steps: int = MAX_STEPS) -> Noises:
@@ -340,6 +382,7 @@ def profile_end(
     best: tuple[float, float],
     side: float,
     bound: float,
+    widening: float = 1.0,
 ) -> float | None:
     """End of a 95 % profile-likelihood interval, None where it lies beyond a bound.
 
@@ -354,8 +397,10 @@ def profile_end(
         -1.0 for the low end, +1.0 for the high one.
     bound : float
         Of ln of the parameter.
+    widening : float
+        Of the variance, by what the score does not hold.
     """
-    least, other, root = score(*best), best[1], float(np.sqrt(PROFILE_DROP))
+    least, other, root = score(*best), best[1], float(np.sqrt(PROFILE_DROP * widening))
 
     @cache  # where the other parameter is sought from depends on the call before
     def excess(distance: float) -> float:

@@ -25,6 +25,7 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.spatial.transform import Rotation
 
 from px4fuse.arrays import Array, BoolArray
+from px4fuse.filter.driven import driven
 from px4fuse.filter.kalman import Settings, Timeline, timeline
 from px4fuse.filter.likelihood import Preintegrated, moved, preintegrate, recursion
 from px4fuse.filter.signals import (
@@ -101,53 +102,45 @@ class Fit:
         return Estimate(float(self.coefficients[column]), sigma)
 
 
-def respond(
-    legs: Preintegrated, signals: Signals, sigma_a: float, sigma_z: float, skip: BoolArray
+def gains(
+    legs: Preintegrated, sigma_a: float, sigma_z: float, skip: BoolArray
 ) -> tuple[Array, Array]:
-    """Innovations over √S of many signals, all by the gains of one filter.
+    """S, shape (m,), and K, shape (m, 2), of a filter; K is zero for what is not fused.
 
     Parameters
     ----------
     legs : Preintegrated
         Of the axis: its lengths and noises are used.
-    signals : Signals
-        k of them.
     sigma_a, sigma_z : float
         m/s² and m.
     skip : ndarray of bool, shape (m,)
         Measurements that are not fused.
-
-    Returns
-    -------
-    normalised : ndarray, shape (m, k)
-    s : ndarray, shape (m,)
     """
-    r = sigma_z**2
-    gains = [
-        (s, 0.0, 0.0) if skipped else (s, k0, covariance[1] / r)
-        for (_, s, k0, _, _, covariance), skipped in zip(
-            recursion(legs, sigma_a, sigma_z, skip), skip.tolist(), strict=True
-        )
-    ]
-    position, velocity = signals.start_m.copy(), np.zeros_like(signals.start_m)
-    out = signals.measured_m.copy()
-    for dt, (_, k0, k1), dp, dv, nu in zip(
-        legs.length_s.tolist(),
-        gains,
-        signals.position_m,
-        signals.velocity_m_s,
-        out,
-        strict=True,
-    ):
-        position += dt * velocity
-        position += dp
-        velocity += dv
-        np.subtract(nu, position, out=nu)
-        position += k0 * nu
-        velocity += k1 * nu
-    s = np.array([gain[0] for gain in gains])
-    out /= np.sqrt(s)[:, None]
-    return out, s
+    made = np.array(
+        [
+            (s, k0, covariance[1] / sigma_z**2)
+            for _, s, k0, _, _, covariance in recursion(legs, sigma_a, sigma_z, skip)
+        ]
+    )
+    return made[:, 0], np.where(skip[:, None], 0.0, made[:, 1:])
+
+
+def respond(legs: Preintegrated, signals: Signals, s: Array, gain: Array) -> Array:
+    """Innovations over √S of many signals, all by the gains of one filter, shape (m, k).
+
+    Parameters
+    ----------
+    legs : Preintegrated
+        Of the axis: its lengths are used.
+    signals : Signals
+        k of them.
+    s, gain : ndarray
+        As :func:`gains` returns them.
+    """
+    start = np.stack([signals.start_m, np.zeros_like(signals.start_m)])
+    pushed = signals.position_m, signals.velocity_m_s
+    prior, _ = driven(legs.length_s, gain, *pushed, signals.measured_m, start)
+    return (signals.measured_m - prior) / np.sqrt(s)[:, None]
 
 
 def fit(white: Whitened, prior: Array) -> Fit:
@@ -241,10 +234,15 @@ def respond_each(
 ) -> list[tuple[Array, Array]]:
     """:func:`respond` of each axis; those with the same legs go through one filter together."""
     if not same_gains(legs):
-        return [respond(*pair, sigma_a, sigma_z, skip) for pair in zip(legs, signals, strict=True)]
+        made = [gains(leg, sigma_a, sigma_z, skip) for leg in legs]
+        return [
+            (respond(leg, each, *own), own[0])
+            for leg, each, own in zip(legs, signals, made, strict=True)
+        ]
     parts = [astuple(each) for each in signals]
     joined = Signals(*(np.concatenate(part, axis=-1) for part in zip(*parts, strict=True)))
-    normalised, s = respond(legs[0], joined, sigma_a, sigma_z, skip)
+    s, gain = gains(legs[0], sigma_a, sigma_z, skip)
+    normalised = respond(legs[0], joined, s, gain)
     widths = np.cumsum([len(each.start_m) for each in signals])[:-1]
     return [(part, s) for part in np.split(normalised, widths, axis=1)]
 

@@ -14,16 +14,17 @@ import pandas as pd
 from px4fuse.arrays import Array, BoolArray, IntArray
 from px4fuse.display import brief
 from px4fuse.errors import SettingsError
+from px4fuse.filter.driven import driven
 from px4fuse.filter.model import (
     COVARIANCES,
     INITIAL_COVARIANCE,
     STATES,
     H,
+    Symmetric,
     matrix,
     move,
     noise,
     spread,
-    transition,
 )
 from px4fuse.filter.signals import Axis, step_means
 from px4fuse.flight import Unavailable
@@ -146,12 +147,6 @@ class Timeline:
     input_gap_s: float
 
 
-def process_noise(dt_s: float, settings: Settings, input_variance_m2_s4: float = 0.0) -> Array:
-    """Q(dt) for one step, shape (2, 2)."""
-    q = (settings.sigma_a_m_s2**2 + input_variance_m2_s4) * settings.dt_s
-    return q * matrix(noise(dt_s))
-
-
 def timeline(axis: Axis, settings: Settings, initial: InitialState | None = None) -> Timeline:
     """Lay out the filter's steps.
 
@@ -266,50 +261,51 @@ def _replayed(
     lines: tuple[Timeline, ...],
     starts: tuple[InitialState, ...],
 ) -> tuple[Replay, ...]:
-    """Run one filter over axes whose steps are the same: P, S and K by filterpy, x of each."""
+    """Run one filter over axes whose steps are the same: P, S and K once, x of each.
+
+    Each measurement is an update of filterpy's. Between them P = FPFᵀ + Q is written out in plain
+    floats, which filterpy's matrices take twenty times as long for.
+    """
     # scipy.stats, which filterpy imports, costs a third of a second: not where nothing is replayed
     from filterpy.kalman import KalmanFilter  # noqa: PLC0415
 
     line = lines[0]
-    kalman = KalmanFilter(dim_x=2, dim_z=1, dim_u=1)
-    kalman.P = matrix(INITIAL_COVARIANCE)
+    kalman = KalmanFilter(dim_x=2, dim_z=1)
     kalman.H = H
     kalman.R = np.array([[settings.sigma_z_m**2]])
     lengths = np.diff(line.time_s)
-    acceleration = np.stack([each.acceleration_m_s2 for each in lines], axis=1)
-    measured = np.stack([axis.measurement_m for axis in axes], axis=1)
-    state = np.empty((len(line.time_s), 2, len(axes)))
-    covariance = np.empty((len(line.time_s), 3))
-    update = np.flatnonzero(line.measurement >= 0)
-    innovation, prior_position = np.empty((2, len(update), len(axes)))
-    shared = np.empty((len(update), 5))  # S, K, and the prior variances
-    position = np.array([each.position_m for each in starts])
-    velocity = np.array([each.velocity_m_s for each in starts])
-    state[0], covariance[0] = (position, velocity), _elements(kalman.P)
-    count = 0
-    for step, (dt, extra) in enumerate(
-        zip(lengths.tolist(), line.input_variance_m2_s4.tolist(), strict=True), start=1
-    ):
-        kalman.predict(F=transition(dt), Q=process_noise(dt, settings, extra))
-        # x = Fx + Ba
-        position, velocity = move(position, velocity, acceleration[step - 1], dt)
-        at = line.measurement[step]
-        if at >= 0:
-            prior_position[count] = position
-            shared[count, 3:] = kalman.P[0, 0], kalman.P[1, 1]
+    measures = line.measurement[1:] >= 0
+    noises = (settings.sigma_a_m_s2**2 + line.input_variance_m2_s4) * settings.dt_s
+    covariance: Symmetric[float] = INITIAL_COVARIANCE
+    covariances, shared = [covariance], []  # of updates: S, K, and the prior variances
+    for dt, q, measured in zip(lengths.tolist(), noises.tolist(), measures.tolist(), strict=True):
+        p00, p01, p11 = spread(covariance, dt)
+        q00, q01, q11 = noise(dt)
+        covariance = p00 + q * q00, p01 + q * q01, p11 + q * q11
+        if measured:
+            kalman.P = matrix(covariance)
             kalman.update(0.0)  # what was measured enters neither S nor K nor P
-            gain, velocity_gain = kalman.K[:, 0].tolist()
-            shared[count, :3] = kalman.S[0, 0], gain, velocity_gain
-            # ν = z - Hx, x = x + Kν
-            nu = innovation[count] = measured[at] - position
-            position, velocity = position + gain * nu, velocity + velocity_gain * nu
-            count += 1
-        state[step], covariance[step] = (position, velocity), _elements(kalman.P)
+            gains = kalman.K[:, 0].tolist()
+            shared.append((kalman.S[0, 0], *gains, covariance[0], covariance[2]))
+            (p00, p01), (_, p11) = kalman.P.tolist()
+            covariance = p00, p01, p11
+        covariances.append(covariance)
+    told = np.array(shared)
+    gain, fused = np.zeros((len(lengths), 2)), np.zeros((len(lengths), len(axes)))
+    gain[measures] = told[:, 1:3]
+    update = np.flatnonzero(line.measurement >= 0)
+    fused[measures] = np.stack([axis.measurement_m for axis in axes], 1)[line.measurement[update]]
+    acceleration = np.stack([each.acceleration_m_s2 for each in lines], axis=1)
+    step = lengths[:, None]
+    begin = np.array([[at.position_m for at in starts], [at.velocity_m_s for at in starts]])
+    prior, state = driven(
+        lengths, gain, acceleration * step**2 / 2.0, acceleration * step, fused, begin
+    )
     time, updated = (pd.Index(each, name="time_s") for each in (line.time_s, line.time_s[update]))
     runs = []
     for at, (axis, own) in enumerate(zip(axes, lines, strict=True)):
         steps = pd.DataFrame(
-            np.column_stack([state[..., at], covariance]),
+            np.column_stack([state[..., at], covariances]),
             index=time,
             columns=STATES + COVARIANCES,
         )
@@ -317,23 +313,19 @@ def _replayed(
         steps["input_variance_m2_s4"] = np.append(line.input_variance_m2_s4, 0.0)
         updates = pd.DataFrame(
             {
-                "measurement_m": measured[line.measurement[update], at],
-                "innovation_m": innovation[:, at],
-                "innovation_variance_m2": shared[:, 0],
-                "gain_position": shared[:, 1],
-                "gain_velocity": shared[:, 2],
-                "prior_position_m": prior_position[:, at],
-                "prior_position_variance_m2": shared[:, 3],
-                "prior_velocity_variance_m2_s2": shared[:, 4],
+                "measurement_m": fused[measures, at],
+                "innovation_m": (fused - prior)[measures, at],
+                "innovation_variance_m2": told[:, 0],
+                "gain_position": told[:, 1],
+                "gain_velocity": told[:, 2],
+                "prior_position_m": prior[measures, at],
+                "prior_position_variance_m2": told[:, 3],
+                "prior_velocity_variance_m2_s2": told[:, 4],
             },
             index=updated,
         )
         runs.append(Replay(axis, settings, steps, updates, own.input_gap_s))
     return tuple(runs)
-
-
-def _elements(covariance: Array) -> tuple[float, float, float]:
-    return covariance[0, 0], covariance[0, 1], covariance[1, 1]
 
 
 def _ahead(run: Replay, times: Array) -> tuple[IntArray, Array, BoolArray]:

@@ -191,7 +191,11 @@ def _factors(
 
 
 def centred(
-    positions: Positions, delta_position_m: Array, delta_velocity_m_s: Array
+    positions: Positions,
+    delta_position_m: Array,
+    delta_velocity_m_s: Array,
+    *,
+    scaled: bool = False,
 ) -> tuple[Positions, Array, Array]:
     """The same data about a smooth path through them, from zero where a stretch starts.
 
@@ -202,6 +206,8 @@ def centred(
     positions : Positions
     delta_position_m, delta_velocity_m_s : ndarray, shape (a, T, 1 + c, n)
         Changed in place.
+    scaled : bool
+        Whether the last constant is a scale of the positions: its signal becomes the path's.
     """
     measured = positions.measurement_m.copy()
     chain = positions.chain
@@ -218,6 +224,8 @@ def centred(
         for axis, p, v in zip(axes, way[:, of_leg], np.diff(speed)[:, of_leg], strict=True):
             delta_position_m[axis, :, 0] -= p
             delta_velocity_m_s[axis, :, 0] -= v
+            if scaled:
+                delta_position_m[axis, :, -1], delta_velocity_m_s[axis, :, -1] = p, v
     return replace(positions, measurement_m=measured), delta_position_m, delta_velocity_m_s
 
 

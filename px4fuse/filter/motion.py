@@ -5,7 +5,9 @@ EKF2's own later attitude was corrected by the very positions that are in questi
 their lateness. To first order the acceleration is linear in ten constants of each stretch: errors
 of the initial attitude (rad, NED), gyro biases (rad/s, body), accelerometer biases (m/s², body)
 and the scale of the positions. Each one's own signal is integrated once, and a clock offset only
-moves where the integrals are read.
+moves where the integrals are read. The signal of the scale is the path's own acceleration, which
+:func:`px4fuse.filter.marginal.centred` puts in: that of the IMU holds the very noise that is
+sought, and would pass much of it off as scale (errors in variables, Fuller 1987).
 """
 
 from __future__ import annotations
@@ -29,7 +31,6 @@ from px4fuse.trajectory.graph import lie
 # Standard deviations of the constants, wide for consumer sensors: tilt and heading (rad), gyro
 # (rad/s) and accelerometer (m/s²), scale of the positions (1)
 CONSTANT_SIGMA = np.repeat([0.05, 0.004, 0.3, 0.1], [3, 3, 3, 1])
-SCALE = 9
 # To first order only while the angles stay small: longer flights are cut into stretches. A gyro
 # bias of 0.004 rad/s turns by 0.12 rad in one, whose square costs 0.07 m/s².
 STRETCH_S = 30.0
@@ -50,8 +51,9 @@ MAX_IMU_INTERVAL_S = 0.025
 class Signals:
     """Acceleration of one stretch and of each constant, and their integrals.
 
-    ``value``, ``velocity`` and ``position`` have shape (3, 1 + constants, n); the first column is
-    the acceleration with all constants zero. Each value holds from its time to the next.
+    ``value``, ``velocity`` and ``position`` have shape (3, constants, n): the acceleration with all
+    constants zero, then what each constant but the scale adds. Each value holds from its time to
+    the next.
     """
 
     time_s: Array
@@ -60,7 +62,7 @@ class Signals:
     position: Array
 
     def at(self, time_s: Array, axes: slice = slice(None)) -> tuple[Array, Array]:
-        """Integrals at other times: velocity and position, shape (axes, 1 + constants, ...)."""
+        """Integrals at other times: velocity and position, shape (axes, constants, ...)."""
         last = len(self.time_s) - 1
         at = np.clip(np.searchsorted(self.time_s, time_s, side="right") - 1, 0, last)
         ahead = time_s - self.time_s[at]
@@ -146,14 +148,14 @@ class Motion:
         Returns
         -------
         delta_position_m, delta_velocity_m_s : ndarray, shape (a, T, 1 + constants, m - 1)
-            Zero where a stretch begins.
+            Zero where a stretch begins, and for the scale.
         """
         # most directions are axes themselves
         used = np.flatnonzero(np.any(directions, axis=0))
         axes = slice(int(used[0]), int(used[-1]) + 1)  # a view of the signals
         own = directions[:, axes]
         turned = None if np.array_equal(own, np.eye(own.shape[1])) else own
-        width = self.signals[0].value.shape[1]
+        width = 1 + len(CONSTANT_SIGMA)
         dp, dv = np.zeros((2, len(directions), len(offset_s), width, len(self.time_s) - 1))
         for begin, end, signals in self._stretches():
             step = np.diff(self.time_s[begin:end])
@@ -163,10 +165,9 @@ class Motion:
                     velocity, position = (
                         np.tensordot(turned, part, 1) for part in (velocity, position)
                     )
-                np.subtract(
-                    velocity[..., 1:], velocity[..., :-1], out=dv[:, at, :, begin : end - 1]
-                )
-                way = dp[:, at, :, begin : end - 1]
+                leg = np.s_[:, at, :-1, begin : end - 1]
+                np.subtract(velocity[..., 1:], velocity[..., :-1], out=dv[leg])
+                way = dp[leg]
                 np.subtract(position[..., 1:], position[..., :-1], out=way)
                 way -= velocity[..., :-1] * step
         return dp, dv
@@ -243,7 +244,7 @@ def _signals(imu: pd.DataFrame, attitude: pd.DataFrame, span: tuple[float, float
     half = turn[:-1] * Rotation.from_rotvec(np.diff(angle, axis=0) / 2.0)
     body_to_ned = half.as_matrix()
     specific = np.einsum("nij,nj->in", body_to_ned, mean)
-    value = np.empty((3, 1 + len(CONSTANT_SIGMA), len(mean)))
+    value = np.empty((3, len(CONSTANT_SIGMA), len(mean)))
     value[:, 0] = specific
     value[2, 0] += constants.g
     # a small rotation θ of the attitude adds θ × f; a gyro bias b turns it by -∫ R b dt
@@ -255,7 +256,6 @@ def _signals(imu: pd.DataFrame, attitude: pd.DataFrame, span: tuple[float, float
         value[after, 1 + axis], value[last, 1 + axis] = -specific[last], specific[after]
         value[axis, 4:7] = turned[after] * specific[last] - turned[last] * specific[after]
     value[:, 7:10] = -by_axis
-    value[:, 1 + SCALE] = value[:, 0]
     velocity, position = np.zeros((2, *value.shape))
     np.cumsum(value[..., :-1] * STEP_S, axis=-1, out=velocity[..., 1:])
     step = velocity[..., :-1] + value[..., :-1] * (STEP_S / 2.0)

@@ -296,7 +296,8 @@ def _with_biases(
     scores = [fitted(part, noises, of_some).total() for noises in levels]
     level, at = np.unravel_index(np.argmin(scores), np.shape(scores))
     positions = moved.positions(measured, settings.dt_s)
-    parts = [Part(*centred(positions, *moved.legs(directions, offsets[[at]])))]
+    legs = moved.legs(directions, offsets[[at]])
+    parts = [Part(*centred(positions, *legs, scaled=True))]
     return most_likely(parts, levels[level], weight)
 
 
@@ -311,12 +312,12 @@ def _noise(best: NoiseFit, which: int) -> Noise:
         return best.score(Noises(sigma_a, sigma_z, best.noises.walk_m))
 
     at, other = np.log(values[which]), np.log(values[1 - which])
-    return _bounded(
-        values[which],
-        profile_end(score, (at, other), -1.0, np.log(search[0])),
-        profile_end(score, (at, other), 1.0, np.log(search[1])),
-        search,
+    widening = best.widening if which == 1 else 1.0
+    low, high = (
+        profile_end(score, (at, other), side, np.log(bound), widening)
+        for side, bound in zip((-1.0, 1.0), search, strict=True)
     )
+    return _bounded(values[which], low, high, search)
 
 
 def _needed(found: NoiseFit, sigma_z: float) -> Noise:

@@ -1,1 +1,1 @@
-"""Many logs: one table with a row per log and axis."""
+"""Many logs: one table with a row per log and axis; and what changed between two."""

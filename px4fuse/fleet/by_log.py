@@ -41,8 +41,8 @@ class Log:
         of all updates of the main axes.
     status : {"done", "not judged", "failed"}
         The best of its axes.
-    reason, remedy : str
-        Why there is nothing to show, and what helps; "" where it is done.
+    lacking : tuple of (str, str)
+        Why something of it could not be judged, and what to set; also of a log that is done.
     changes : tuple of str
         What is worse than in the baseline.
     axes : tuple of mapping
@@ -53,8 +53,7 @@ class Log:
     numbers: Mapping[str, float]
     factors: Mapping[str, float]
     status: str
-    reason: str
-    remedy: str
+    lacking: tuple[tuple[str, str], ...]
     changes: tuple[str, ...]
     axes: tuple[Mapping[str, Any], ...]
 
@@ -77,9 +76,7 @@ class Log:
         for name in ("vehicle", "firmware"):
             tags[f"{name}:{self.texts[name]}"] = self.texts[name] or f"no {name} named"
         tags |= {f"finding:{finding}": finding_words(finding) for finding in self.findings}
-        if self.status != "done":
-            tags[f"remedy:{self.remedy}"] = self.remedy or "no advice"
-        return tags
+        return tags | {f"remedy:{remedy}": remedy or "no advice" for _, remedy in self.lacking}
 
 
 def finding_words(finding: str) -> str:
@@ -119,8 +116,8 @@ def _log(rows: Sequence[Mapping[str, Any]]) -> Log:
         (found for names in MAIN if (found := [axis for axis in axes if axis["axis"] in names])),
         list(rows),
     )
-    done = next((row for row in (*main, *axes) if row["status"] == "done"), None)
-    spoken = done or next((row for row in rows if "reason" in row), rows[0])
+    statuses = [str(row["status"]) for row in (*main, *rows)]
+    lacking = [(str(row.get("reason", "")), str(row.get("remedy", ""))) for row in rows]
     return Log(
         texts={name: str(_first(rows, name) or "") for name in TEXTS},
         numbers={
@@ -131,9 +128,8 @@ def _log(rows: Sequence[Mapping[str, Any]]) -> Log:
             whose: factor for whose in ("kf", "ekf2")
             if (factor := _factor(main, f"{whose}_nis_mean")) is not None
         },
-        status=str(spoken["status"]),
-        reason="" if done else str(spoken.get("reason", "")),
-        remedy="" if done else str(spoken.get("remedy", "")),
+        status="done" if "done" in statuses else statuses[0],
+        lacking=tuple(dict.fromkeys(one for one in lacking if any(one))),
         changes=tuple(dict.fromkeys(str(row["change"]) for row in rows if "change" in row)),
         axes=tuple(axes),
     )  # fmt: skip

@@ -43,6 +43,7 @@ AXES = (
     ("Correlation of EKF2's model with the log", "model_correlation"),
 )
 MORE: tuple[tuple[str, Literal["text", "number"], str], ...] = (
+    ("RMSE between (m)", "number", "position_rmse_m"),
     ("Duration (s)", "number", "duration_s"),
     ("SIGMA_A (m/s²)", "number", "sigma_a_m_s2"),
     ("Source", "text", "source"),
@@ -119,8 +120,7 @@ def html_text(table: pd.DataFrame, title: str, made_with: str) -> str:
             Column("Variance S, EKF2", "number", narrow="tablet", mark=one),
             Column("SIGMA_Z (m)", "number", narrow="tablet"),
             Column("Clock offset (s)", "number", narrow="desk", mark=zero),
-            Column("RMSE between (m)", "number", narrow="desk"),
-            Column("Findings", "number", narrow="desk"),
+            Column("Findings", "rank", narrow="desk"),
             *(Column(name, kind, "numbers") for name, kind, _ in MORE),
         ),
         rows=[_row(log, names, factor, sigma, clock) for log in logs],
@@ -137,7 +137,7 @@ def _row(
     named = [finding_words(finding) for finding in log.findings]
     few = ", ".join(named[:2]) + (f" and {len(named) - 2} more" if len(named) > 2 else "")
     folder = log.texts["log"].rpartition("/")[0]
-    worse = "worse than in the baseline" if log.changes else ""
+    worse = "worse than before" if log.changes else ""
     cells = (
         Cell(log.name, log.name, folder),
         words(log.texts["date"][:10]),
@@ -147,7 +147,6 @@ def _row(
         *(_factor(log.factors.get(whose), factor) for whose in ("kf", "ekf2")),
         _interval(log, "sigma_z", "m", sigma),
         _interval(log, "clock_offset", "s", clock),
-        figure(log.numbers.get("position_rmse_m")),
         figure(float(len(named)), below=few) if log.status != "failed" else Cell(),
         *(
             words(log.texts[name]) if kind == "text" else figure(log.numbers.get(name))
@@ -177,8 +176,8 @@ def _interval(log: Log, name: str, unit: str, scale: Scale | None) -> Cell:
 
 def _details(log: Log) -> tuple[Part, ...]:
     return (
-        listed("Why it was not judged", [log.reason] if log.reason else [], warn=True),
-        listed("What to set", [log.remedy] if log.remedy else []),
+        listed("Not judged", [reason for reason, _ in log.lacking if reason], warn=True),
+        listed("What to set", list(dict.fromkeys(remedy for _, remedy in log.lacking if remedy))),
         listed("Worse than in the baseline", log.changes, warn=True),
         listed("What happened", [line for line in log.texts["story"].splitlines() if line]),
         listed("Findings", [f"{finding_words(one)} ({one})" for one in log.findings]),

@@ -206,7 +206,7 @@ def _frequent(logs: Sequence[Log]) -> str:
     judged = sum(log.status != "failed" for log in logs)
     lines = "".join(
         f"<li>{bar(count / most)}{picks(f'finding:{finding}', finding_words(finding))}"
-        f"<span>{count} ({count / judged:.0%})</span></li>"
+        f'<span class="right">{count} ({count / judged:.0%})</span></li>'
         for finding, count in ordered[:MOST_FINDINGS]
     )
     more = len(ordered) - MOST_FINDINGS
@@ -220,7 +220,7 @@ def _frequent(logs: Sequence[Log]) -> str:
 
 def _worst(logs: Sequence[Log]) -> str:
     """Those in which one of the filters is farthest from honest."""
-    title = "The ten logs farthest from right"
+    title = "The ten worst logs"
     off = [
         (max(abs(math.log(factor)) for factor in log.factors.values()), index)
         for index, log in enumerate(logs)
@@ -235,32 +235,39 @@ def _worst(logs: Sequence[Log]) -> str:
         whose = max(log.factors, key=lambda name: abs(math.log(log.factors[name])))
         who = "EKF2's" if whose == "ekf2" else "our"
         lines.append(
-            f"<li>{opens(index, log.name)}<span>{who} S is "
+            f"<li>{opens(index, log.name)}<span class='right'>{who} S is "
             f"{overstated_words(log.factors[whose])}</span></li>"
         )
     return card(
         title,
-        note("By how far the variance S of either filter is off, whichever is farther."),
+        note("Those in which the variance S of one of the filters is farthest from right."),
         f'<ol class="ranks">{"".join(lines)}</ol>',
     )
 
 
 def _missing(logs: Sequence[Log]) -> str:
-    """Logs that could not be judged, by what to set so that the next can."""
+    """What could not be judged, by what to set so that the next can; whole logs first."""
     title = "Not judged, and what to set so that the next can"
-    groups: dict[str, list[Log]] = defaultdict(list)
+    groups: dict[str, list[tuple[Log, str]]] = defaultdict(list)
     for log in logs:
-        if log.status != "done":
-            groups[log.remedy].append(log)
+        for reason, remedy in log.lacking:
+            groups[remedy].append((log, reason))
     if not groups:
         return card(title, note("Every log was judged."))
-    ordered = sorted(groups.items(), key=lambda item: (-len(item[1]), item[0]))
+
+    def rank(item: tuple[str, list[tuple[Log, str]]]) -> tuple[bool, int, str]:
+        remedy, members = item
+        return all(log.status == "done" for log, _ in members), -len(members), remedy
+
+    ordered = sorted(groups.items(), key=rank)
     lines = []
     for remedy, members in ordered[:MOST_REMEDIES]:
-        reasons = Counter(log.reason for log in members if log.reason)
+        reasons = Counter(reason for _, reason in members if reason)
         said = [clean(reason, 300) for reason, _ in reasons.most_common(MOST_REASONS)]
         rest = f" (and {len(reasons) - len(said)} more)" if len(reasons) > len(said) else ""
-        count = f"{len(members)} log{'' if len(members) == 1 else 's'}"
+        whole = {log.texts["log"]: log.status for log, _ in members}
+        part = " (in part)" if set(whole.values()) == {"done"} else ""
+        count = f"{len(whole)} log{'' if len(whole) == 1 else 's'}{part}"
         lines.append(
             f"<li>{picks(f'remedy:{remedy}', count)}"
             f'<p dir="auto"><strong>{escaped(remedy or "No advice.")}</strong></p>'

@@ -11,6 +11,7 @@ import math
 import posixpath
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import get_args
 
 from px4fuse.grading.anonymous import Veil
@@ -85,7 +86,8 @@ def html_text(entries: Sequence[Entry], title: str, made_with: str) -> str:
     str
         Write it as UTF-8. The same for the same input: no dates of today.
     """
-    if entries and all(entry.pseudonym for entry in entries):
+    named = not entries or not all(entry.pseudonym for entry in entries)
+    if not named:
         entries = sorted(entries, key=lambda entry: entry.pseudonym)
     veil = Veil(entries)
     copied = _copied(entries)
@@ -95,6 +97,8 @@ def html_text(entries: Sequence[Entry], title: str, made_with: str) -> str:
     # The folder or zip file that all are in says nothing in a row
     common = posixpath.commonprefix([one.submission for one in graded]).rpartition("/")
     shared = len(common[0] + common[1])
+    timed = any(entry.handed_in or entry.late_s for entry in entries)
+    layout = _Layout(items, numbers, shared, timed, named)
     minutes = {at: reading_minutes(entry.counting) for at, entry in enumerate(entries)}
     return page(
         title=title,
@@ -104,23 +108,23 @@ def html_text(entries: Sequence[Entry], title: str, made_with: str) -> str:
         noun=("student", "students"),
         columns=(
             Column("Student"),
-            Column("Id", "line", narrow="tablet"),
+            *[Column("Id", "line", narrow="tablet")] * named,
             Column("Status", "rank"),
             Column("Points", "number"),
-            Column("Handed in", "line", narrow="desk"),
+            *[Column("Handed in", "line", narrow="desk")] * timed,
             Column("To read (min)", "number", narrow="desk"),
             Column("Flags", "rank", narrow="desk"),
             *(Column(veil.hide(name), "number", "items") for name in items),
             *(Column(veil.hide(name), "number", "numbers") for name in numbers),
         ),
         rows=[
-            _row(at, entries, veil, copied.get(at, ()), items, numbers, shared, minutes[at])
-            for at in range(len(entries))
+            _row(entry, layout, veil, minutes[at], _alike(at, entries, copied.get(at, ()), veil))
+            for at, entry in enumerate(entries)
         ],
         filters=_filters(entries),
         groups=(
             ("items", "Points of each item", False),
-            ("numbers", "Numbers", True),
+            ("numbers", "Numbers", False),
         ),
         placeholder="name, id, file, flag",
         otherwise="All rows are in class.csv.",
@@ -175,37 +179,40 @@ def _filters(entries: Sequence[Entry]) -> list[tuple[str, list[tuple[str, str]]]
     return filters
 
 
-def _row(
-    at: int, entries: Sequence[Entry], veil: Veil, copied: Sequence[Copied],
-    items: Sequence[str], numbers: Sequence[str], shared: int, minutes: float,
-) -> Row:  # fmt: skip
-    entry = entries[at]
+@dataclass(frozen=True)
+class _Layout:
+    """Columns that depend on the class."""
+
+    items: tuple[str, ...]
+    numbers: tuple[str, ...]
+    # Characters that all names of files begin with
+    shared: int
+    timed: bool
+    named: bool
+
+
+def _row(entry: Entry, layout: _Layout, veil: Veil, minutes: float, alike: tuple[Part, ...]) -> Row:
     one = entry.counting
     status = status_of(entry)
     flags = [*entry.remarks, *(one.flags if one else ())]
     known = entry.pseudonym or entry.student
-    file = one.submission[shared:] if one and not entry.pseudonym else ""
+    file = one.submission[layout.shared :] if one and not entry.pseudonym else ""
     points = overridden_points(entry)
     cells = (
         Cell(entry.called, known or None, file),
-        words("" if entry.pseudonym else entry.student_id),
+        *[words("" if entry.pseudonym else entry.student_id)] * layout.named,
         Cell(
             f"{SIGNS[status]} {status}", float(STATUSES.index(status)), _few(flags), LOOKS[status]
         ),
         _points(entry),
-        Cell(entry.handed_in, entry.handed_in or None, late_words(entry)),
+        *[Cell(entry.handed_in, entry.handed_in or None, late_words(entry))] * layout.timed,
         figure(minutes or None, f"{math.ceil(minutes)}"),
         Cell("\n".join(map(veil.hide, flags)), float(len(flags)), "", "flags"),
-        *(figure(points.get(title)) for title in items),
-        *(figure(one.numbers.get(title) if one else None) for title in numbers),
+        *(figure(points.get(title)) for title in layout.items),
+        *(figure(one.numbers.get(title) if one else None) for title in layout.numbers),
     )
     beside = _beside(entry, one, veil) if one else ()
-    alike = (_side_by_side(entry, entries[to], share, veil) for share, to in copied[:MAX_COPIES])
-    return Row(cells, tuple(_tags(entry)), (*_details(entry, veil), *alike), beside)
-
-
-def _rank(status: str) -> float:
-    return float(STATUSES.index(status))
+    return Row(cells, tuple(_tags(entry)), _details(entry, veil, alike), beside)
 
 
 def _few(flags: Sequence[str]) -> str:
@@ -249,7 +256,7 @@ def late_words(entry: Entry) -> str:
 # ------------------------------------------------------------------ what a row unfolds to
 
 
-def _details(entry: Entry, veil: Veil) -> tuple[Part, ...]:
+def _details(entry: Entry, veil: Veil, alike: tuple[Part, ...]) -> tuple[Part, ...]:
     one = entry.counting
     comment = [veil.hide(text) for text in (entry.comment,) if text]
     if one is None:
@@ -261,7 +268,10 @@ def _details(entry: Entry, veil: Veil) -> tuple[Part, ...]:
         listed("Pending: what you can do", [veil.hide(one.pending)] if one.pending else [], True),
         listed(
             "For you to judge",
-            [f"{veil.hide(why)}: “{veil.hide(said, own_words=True)}”" for why, said in one.to_read],
+            [
+                f"{veil.hide(why).rstrip('.')}: “{veil.hide(said, own_words=True)}”"
+                for why, said in one.to_read
+            ],
         ),
         listed("Verification", [veil.hide(reason) for reason in verdict.reasons]),
         tabled(
@@ -283,6 +293,7 @@ def _details(entry: Entry, veil: Veil) -> tuple[Part, ...]:
             ],
         ),
         prose("The student's notes", veil.hide(one.notes, own_words=True)),
+        *alike,
         tabled(
             "Other attempts",
             ("File", "Status", "Points") if entry.others else (),
@@ -333,6 +344,14 @@ def _item_table(entry: Entry, one: Graded, veil: Veil) -> Part:
         rows.append([veil.hide(title), number(points), number(item.of), veil.hide(comment)])
     heads = ("Item", "Points", "Of", "Comment") if rows else ()
     return tabled("Points (proposed)" if one.pending else "Points", heads, rows, (1, 2))
+
+
+def _alike(
+    at: int, entries: Sequence[Entry], copied: Sequence[Copied], veil: Veil
+) -> tuple[Part, ...]:
+    return tuple(
+        _side_by_side(entries[at], entries[to], share, veil) for share, to in copied[:MAX_COPIES]
+    )
 
 
 def _side_by_side(entry: Entry, other: Entry, share: float, veil: Veil) -> Part:

@@ -98,10 +98,11 @@ def _items(entries: Sequence[Entry], veil: Veil) -> str:
         )
     return card(
         "Points by item",
-        note("From none to all, in tenths; pending reports left out."),
+        note("From none to all, in tenths, below none with none; pending reports left out."),
         '<table class="spread"><thead><tr><th scope="col">Item</th>'
         '<th scope="col" class="chart">none to all</th><th scope="col" class="n">Mean</th>'
-        '<th scope="col" class="n wide-only">None</th><th scope="col" class="n wide-only">All</th></tr></thead>'
+        '<th scope="col" class="n wide-only">None</th>'
+        '<th scope="col" class="n wide-only">All</th></tr></thead>'
         f"<tbody>{''.join(lines)}</tbody></table>",
     )
 
@@ -124,8 +125,8 @@ def _mistakes(entries: Sequence[Entry]) -> str:
         by = f"<p>Not named by {', '.join(missed[:MOST_NAMES])}{more}.</p>" if missed else ""
         said = picks(f"missed:{mistake}", mistake) if missed else f"<span>{escaped(mistake)}</span>"
         lines.append(
-            f"<li>{bar(named / len(those))}{said}<span>{named} of {len(those)} named it</span>"
-            f"{by}</li>"
+            f"<li>{bar(named / len(those))}{said}"
+            f"<span class='right'>{named} of {len(those)} named it</span>{by}</li>"
         )
     return card(
         "Who missed which mistake",
@@ -147,7 +148,7 @@ def _to_judge(entries: Sequence[Entry]) -> str:
             passages = "a passage" if len(one.to_read) == 1 else f"{len(one.to_read)} passages"
             waiting.append(f"{passages} of the notes")
         if waiting:
-            said = f"<span>{escaped(' and '.join(waiting))}</span>"
+            said = f"<span class='right'>{escaped(' and '.join(waiting))}</span>"
             lines.append(f"<li>{opens(at, entry.called)}{said}</li>")
     if not lines:
         return ""
@@ -171,7 +172,8 @@ def _pairs(entries: Sequence[Entry], copied: Mapping[int, Sequence[Copied]]) -> 
         return ""
     lines = "".join(
         f"<li><span>{opens(at, entries[at].called)} and "
-        f"{opens(other, entries[other].called)}</span><span>{-share:.0%} of both</span></li>"
+        f"{opens(other, entries[other].called)}</span>"
+        f"<span class='right'>{-share:.0%} of both</span></li>"
         for share, at, other in found[:MOST_PAIRS]
     )
     more = len(found) - MOST_PAIRS

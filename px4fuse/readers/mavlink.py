@@ -233,6 +233,7 @@ def _describe(
 ) -> LogInfo:
     frames = recording.frames
     firmware, firmware_hash = f"{autopilot} (version not in the recording)", "unknown"
+    vehicle = ""
     rows = recording.rows("AUTOPILOT_VERSION")
     if len(rows):
         version = frames.table("AUTOPILOT_VERSION", rows[:1])[0]
@@ -241,6 +242,8 @@ def _describe(
             firmware = f"{autopilot} v{major}.{minor}.{patch}"
         text = bytes(version["flight_custom_version"][::-1]).hex()
         firmware_hash = text if text.strip("0") else "unknown"
+        uid = bytes(version["uid2"]).hex()
+        vehicle = uid if uid.strip("0") else ""
     beats = frames.table("HEARTBEAT", recording.rows("HEARTBEAT"))
     kind = VEHICLE_TYPES.get(int(beats["type"][0]), "vehicle") if len(beats) else "vehicle"
     dropped = [
@@ -262,6 +265,7 @@ def _describe(
         autopilot=autopilot,
         start_unix_s=_start_unix_s(recording),
         senders=describe_senders(recording),
+        vehicle=vehicle,
     )
 
 

@@ -337,7 +337,8 @@ UNUSED: Mapping[str, str] = {
     "uwb_grid": "positions of the UWB anchors and of the landing target, not the vehicle's",
 }
 
-# Parameters that bear on fusion and on what is logged; only these enter the results
+# Parameters that bear on fusion and on what is logged, and the airframe; only these enter the
+# results
 PARAMETERS = (
     "EKF2_AID_MASK",
     "EKF2_EN",
@@ -352,6 +353,7 @@ PARAMETERS = (
     "EKF2_PREDICT_US",
     "EKF2_GPS_CTRL",
     "SDLOG_PROFILE",
+    "SYS_AUTOSTART",
     "SYS_MC_EST_GROUP",
 )
 

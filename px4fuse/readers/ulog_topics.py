@@ -261,6 +261,7 @@ def read_topics(path: Path) -> Topics:
         ),
         notes=notes,
         autopilot=_text(ulog.msg_info_dict, "sys_name", "PX4"),
+        vehicle=_text(ulog.msg_info_dict, "sys_uuid", ""),
     )
     parameters = {
         name: float(value)

@@ -12,6 +12,7 @@ from px4fuse.findings import Finding
 from px4fuse.findings.story import story
 from px4fuse.flight import Unavailable
 from px4fuse.loop.loop import Loop
+from px4fuse.results.contract import ChangeResults
 from px4fuse.results.model import Provenance, Student
 from px4fuse.trajectory.evaluation import Evaluation
 
@@ -124,6 +125,43 @@ class EvaluationDocument:
     def title(self) -> str:
         """Of the PDF."""
         return f"px4fuse evaluate {self.log[0]} {self.score.reference.name}"
+
+
+@dataclass(frozen=True)
+class ChangesDocument:
+    """Pages on what changed from A to B.
+
+    Attributes
+    ----------
+    results : ChangeResults
+    a, b : Analysis or None
+        Where their logs are at hand.
+    """
+
+    results: ChangeResults
+    a: Analysis | None
+    b: Analysis | None
+
+    @property
+    def student(self) -> Student:
+        """Nobody: a difference is not handed in."""
+        return Student()
+
+    @property
+    def command(self) -> str:
+        """The command line that makes it again, without folders."""
+        return self.results.provenance.command
+
+    @property
+    def log(self) -> tuple[str, str]:
+        """Names of both logs with the SHA-256 of A, and the SHA-256 of B."""
+        a, b = self.results.a, self.results.b
+        return f"A {a.log}, SHA-256 {a.log_sha256[:12]} · B {b.log}", b.log_sha256
+
+    @property
+    def title(self) -> str:
+        """Of the PDF."""
+        return f"px4fuse diff {self.results.a.given} {self.results.b.given}"
 
 
 @dataclass(frozen=True)

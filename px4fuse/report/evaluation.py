@@ -50,6 +50,7 @@ from px4fuse.report.style import (
     empty,
     page,
     printable,
+    put,
     report_style,
     thin,
     wrap,
@@ -210,7 +211,8 @@ def _row(cursor: Cursor, cells: Sequence[str], *, head: bool) -> None:
     """One row of the table of scores."""
     cursor.y -= TABLE_SIZE * 1.45 / POINTS_PER_HEIGHT
     for x, text in zip(TABLE_EDGES, cells, strict=True):
-        cursor.figure.text(x, cursor.y, text, size=TABLE_SIZE, color=MUTED if head else "black")
+        colour = MUTED if head else "black"
+        put(cursor.figure, x, cursor.y, text, size=TABLE_SIZE, color=colour)
     if head:
         cursor.skip(2.5)
         cursor.rule()

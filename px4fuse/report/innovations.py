@@ -134,7 +134,7 @@ def _zooms(cursor: Cursor, document: Document) -> None:
     first = float(result.replay.steps.index[0])
     _sawtooth(start, result, (first, min(first + START_S, segment.end_s)))
     start.set_yscale("log")
-    _log_ticks(start)
+    log_ticks(start)
     updates = result.replay.updates.index.to_numpy()
     inside = updates[(updates >= window[0]) & (updates <= window[1])]
     axes.vlines(inside, 0.0, 0.03, transform=axes.get_xaxis_transform(), color=MEASUREMENT, lw=1.2)
@@ -272,7 +272,7 @@ def draw_sigma(axes: Axes, result: AxisComparison, column: str, limit: int) -> N
             *thin(frame.index.to_numpy(), np.sqrt(frame[column].to_numpy()), limit), **EKF2_LINE
         )
     axes.set_yscale("log")
-    _log_ticks(axes)
+    log_ticks(axes)
 
 
 def sigma_words(document: Document) -> str:
@@ -403,7 +403,7 @@ def start_words(result: AxisComparison) -> str:
     )
 
 
-def _log_ticks(axes: Axes) -> None:
+def log_ticks(axes: Axes) -> None:
     """Plain numbers on a log axis, at 1, 2 and 5 in each decade; of many decades at 1."""
     low, high = axes.get_ylim()
     low, high = low / 1.15, high * 1.25

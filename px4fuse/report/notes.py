@@ -29,6 +29,7 @@ from px4fuse.report.style import (
     appendix,
     page,
     printable,
+    put,
     text_width,
     wrap,
 )
@@ -114,10 +115,9 @@ def draw(document: Document | LoopDocument) -> Iterator[Figure]:
             cursor.skip(row.above)
         for x, lines in row.cells:
             for number, text in enumerate(lines, start=1):
-                figure.text(
-                    x, cursor.y - number * row.like.size * SPACING / POINTS_PER_HEIGHT, text,
-                    size=row.like.size, weight=row.like.weight, color=row.like.colour,
-                )  # fmt: skip
+                y = cursor.y - number * row.like.size * SPACING / POINTS_PER_HEIGHT
+                like = {"size": row.like.size, "weight": row.like.weight, "color": row.like.colour}
+                put(figure, x, y, text, **like)
         cursor.skip(height)
         if row.ruled:
             cursor.skip(3.0)

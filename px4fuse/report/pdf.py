@@ -12,6 +12,7 @@ from matplotlib.text import Text
 from pypdf import PdfWriter
 
 from px4fuse.report import (
+    changes,
     clock,
     consistency,
     cover,
@@ -26,11 +27,17 @@ from px4fuse.report import (
     whatif,
     why,
 )
-from px4fuse.report.document import Document, EvaluationDocument, LoopDocument, WhatIfDocument
+from px4fuse.report.document import (
+    ChangesDocument,
+    Document,
+    EvaluationDocument,
+    LoopDocument,
+    WhatIfDocument,
+)
 from px4fuse.report.seal import sealed
-from px4fuse.report.style import LEFT, MUTED, RIGHT, printable, report_style, shorten
+from px4fuse.report.style import LEFT, MUTED, RIGHT, printable, put, report_style, shorten
 
-Report = Document | LoopDocument | WhatIfDocument | EvaluationDocument
+Report = Document | LoopDocument | WhatIfDocument | EvaluationDocument | ChangesDocument
 RESULTS_NAME = "results.json"
 PAGES = (
     cover.draw,
@@ -53,7 +60,7 @@ def render(document: Report, results_json: str) -> bytes:
 
     Parameters
     ----------
-    document : Document, LoopDocument, WhatIfDocument or EvaluationDocument
+    document : Document, LoopDocument, WhatIfDocument, EvaluationDocument or ChangesDocument
     results_json : str
         Attached inside the PDF as ``results.json``, so that the PDF alone can be checked.
 
@@ -90,6 +97,8 @@ def _pages(document: Report) -> Iterator[Figure]:
         yield from whatif.draw(document)
     elif isinstance(document, EvaluationDocument):
         yield from evaluation.draw(document)
+    elif isinstance(document, ChangesDocument):
+        yield from changes.draw(document)
     else:
         for draw in PAGES:
             yield from draw(document)
@@ -101,11 +110,11 @@ def _running_lines(figure: Figure, document: Report, number: int, count: int) ->
     style = {"size": 6.5, "color": MUTED}
     head = shorten(printable(f"px4fuse · {name} · SHA-256 {sha256[:12]}"), 6.5, 330)
     who = " · ".join(part for part in (document.student.name, document.student.id) if part)
-    figure.text(LEFT, 0.972, head, **style)  # type: ignore[arg-type]
+    put(figure, LEFT, 0.972, head, **style)
     if who:
         figure.text(RIGHT, 0.972, shorten(printable(who), 6.5, 170), ha="right", **style)  # type: ignore[arg-type]
     version = metadata.version("px4fuse")
-    figure.text(LEFT, 0.022, f"px4fuse {version}", **style)  # type: ignore[arg-type]
+    put(figure, LEFT, 0.022, f"px4fuse {version}", **style)
     figure.text(RIGHT, 0.022, f"{number} / {count}", ha="right", **style)  # type: ignore[arg-type]
 
 

@@ -19,8 +19,10 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib import font_manager
 from matplotlib.axes import Axes
+from matplotlib.backend_bases import RendererBase
 from matplotlib.figure import Figure
 from matplotlib.ft2font import LoadFlags
+from matplotlib.text import Text
 from matplotlib.ticker import MaxNLocator
 
 from px4fuse.arrays import Array
@@ -203,6 +205,29 @@ def _fitting(text: str, size: float, width_points: float, weight: str) -> int:
     return len(text)
 
 
+class Words(Text):
+    """A line of text from a point to the right, drawn without being measured before."""
+
+    def draw(self, renderer: RendererBase) -> None:
+        """Draw it."""
+        if self.get_text():
+            x, y = self.get_transform().transform(self.get_position())
+            gc = renderer.new_gc()
+            gc.set_foreground(self.get_color())
+            if renderer.flipy():
+                y = renderer.get_canvas_width_height()[1] - y
+            shaped = self.get_text(), self.get_fontproperties()
+            renderer.draw_text(gc, x, y, *shaped, 0.0, ismath=False, mtext=self)
+            gc.restore()
+
+
+def put(figure: Figure, x: float, y: float, text: str, **style: Any) -> None:
+    """Put a line of text on a page, its baseline's left end at a point (fractions)."""
+    line = Words(x, y, text, transform=figure.transSubfigure, **style)
+    line.set_figure(figure)
+    figure.texts.append(line)
+
+
 @dataclass
 class Cursor:
     """A place on a page for text that runs down it; moves as text is written."""
@@ -224,7 +249,7 @@ class Cursor:
         """Write wrapped text and move below it."""
         for line in wrap(printable(text), size, (right - x) * POINTS_PER_WIDTH, weight):
             self.y -= size * spacing / POINTS_PER_HEIGHT
-            self.figure.text(x, self.y, line, size=size, weight=weight, color=colour, va="baseline")
+            put(self.figure, x, self.y, line, size=size, weight=weight, color=colour)
 
     def columns(
         self, columns: Mapping[float, tuple[str, Sequence[str]]], *, size: float = 7.6
@@ -239,11 +264,11 @@ class Cursor:
         count = max(len(cells) for _, cells in columns.values())
         self.skip(size * 1.35)
         for x, (head, cells) in columns.items():
-            self.figure.text(x, self.y, printable(head), size=size, color=MUTED)
+            put(self.figure, x, self.y, printable(head), size=size, color=MUTED)
             for number, cell in enumerate(cells, start=1):
                 if cell:
                     y = self.y - (3.0 + number * size * 1.4) / POINTS_PER_HEIGHT
-                    self.figure.text(x, y, printable(cell), size=size)
+                    put(self.figure, x, y, printable(cell), size=size)
         self.skip(3.0)
         self.rule()
         self.skip(count * size * 1.4)
@@ -405,8 +430,10 @@ def thin(time: Array, value: Array, limit: int = MAX_POINTS) -> tuple[Array, Arr
     """Thin a series to at most ``limit`` points, keeping the extremes of every bucket."""
     if len(time) <= limit:
         return time, value
-    buckets = np.array_split(np.arange(len(time)), limit // 2)
-    keep = np.unique(
-        [b[i] for b in buckets for i in (int(np.argmin(value[b])), int(np.argmax(value[b])))]
-    )
-    return time[keep], value[keep]
+    size, larger = divmod(len(time), limit // 2)
+    cut, keep = larger * (size + 1), []
+    for first, last, width in ((0, cut, size + 1), (cut, len(time), size)):
+        buckets, starts = value[first:last].reshape(-1, width), np.arange(first, last, width)
+        keep += [starts + buckets.argmin(axis=1), starts + buckets.argmax(axis=1)]
+    kept = np.unique(np.concatenate(keep))
+    return time[kept], value[kept]

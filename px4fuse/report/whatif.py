@@ -28,6 +28,7 @@ from px4fuse.report.style import (
     RIGHT,
     Cursor,
     page,
+    put,
 )
 from px4fuse.report.why import agreement_words
 
@@ -202,7 +203,7 @@ def _table(
     for cells in body:
         cursor.y -= SIZE * 1.4 / POINTS_PER_HEIGHT
         for text, start in zip(cells, starts, strict=True):
-            figure.text(start, cursor.y, text, size=SIZE, va="baseline")
+            put(figure, start, cursor.y, text, size=SIZE)
 
 
 def _panels(figure: Figure, cursor: Cursor, made_of: Counterfactual) -> None:

@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, cast
 
+import pandas as pd
+
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.comparison import AgainstTruth, AxisComparison, Comparison, FilterSummary
 from px4fuse.filter.clock import ClockOffset
@@ -159,7 +161,15 @@ def _axis(result: AxisComparison) -> made.Axis:
         else _filter(result.ekf2),
         difference=copied_or_absent(made.Difference, result.difference),
         truth=_truth(result),
+        rejected_share=_rejected_share(result.ekf2_innovations),
     )
+
+
+def _rejected_share(innovations: pd.DataFrame | Unavailable) -> float | None:
+    if isinstance(innovations, Unavailable):
+        return None
+    known = innovations["rejected"].dropna()
+    return float(known.mean()) if len(known) else None
 
 
 def _filter(summary: FilterSummary) -> made.Filter | made.UnjudgedFilter:

@@ -70,7 +70,8 @@ class Log(Base, frozen=True, kw_only=True):
     """The recording.
 
     ``parameters`` are those of PX4 that bear on fusion and logging; ``start_unix_s`` is the UNIX
-    time of time zero, where the log has it.
+    time of time zero, where the log has it; ``vehicle`` identifies the flight controller, and is
+    empty where the log does not.
     """
 
     name: str
@@ -89,6 +90,7 @@ class Log(Base, frozen=True, kw_only=True):
     start_unix_s: float | None = None
     joined: tuple[JoinedFile, ...]
     clocks: tuple[ClockMap, ...]
+    vehicle: str = ""
 
 
 class AvailableTrack(Base, frozen=True):
@@ -250,7 +252,10 @@ class AgainstTruth(Base, frozen=True):
 
 
 class Axis(Base, frozen=True, kw_only=True):
-    """One axis; ``direction`` is its unit vector in NED."""
+    """One axis; ``direction`` is its unit vector in NED.
+
+    ``rejected_share`` is of the source's samples that EKF2 rejected, where that is logged.
+    """
 
     heading_deg: float | None = None
     direction: Vector
@@ -260,6 +265,7 @@ class Axis(Base, frozen=True, kw_only=True):
     ekf2: Either[Filter, UnjudgedFilter]
     difference: Part[Difference]
     truth: Part[AgainstTruth]
+    rejected_share: Share | None = None
 
 
 class HeldOut(Base, frozen=True):

@@ -13,6 +13,14 @@ import msgspec
 from msgspec import Meta
 
 from px4fuse.request import AxisName, ComparisonRequest, LoopRequest, WhatIfRequest
+from px4fuse.results.changes import (
+    Compared,
+    Counts,
+    FindingChange,
+    NumberChange,
+    OneSided,
+    TextChange,
+)
 from px4fuse.results.comparison import (
     Axis,
     ChosenSettings,
@@ -40,6 +48,7 @@ VERSION: Literal["2.0"] = "2.0"
 COMPARISON = "px4fuse-results"
 LOOP = "px4fuse-loop"
 WHATIF = "px4fuse-whatif"
+CHANGES = "px4fuse-changes"
 
 
 class ComparisonResults(Base, frozen=True):
@@ -172,8 +181,53 @@ class WhatIfResults(Base, frozen=True, kw_only=True):
     provenance: Provenance
 
 
+class ChangeResults(Base, frozen=True, kw_only=True):
+    """Results of ``px4fuse diff``: what changed from A to B.
+
+    Attributes
+    ----------
+    schema : Schema
+    a, b : Compared
+    paired : bool
+        Both are of one flight, so that nothing is left to chance.
+    summary : tuple of str
+        Sentences.
+    counts : Counts
+    numbers : tuple of NumberChange
+        Significant ones first, worse before better.
+    texts : tuple of TextChange
+    findings : tuple of FindingChange
+    one_sided : tuple of OneSided
+    methods, notes : tuple of str
+        How significance was decided, and what to mind, a sentence each.
+    provenance : Provenance
+    """
+
+    schema: Schema
+    a: Compared
+    b: Compared
+    paired: bool
+    summary: tuple[str, ...]
+    counts: Counts
+    numbers: tuple[NumberChange, ...]
+    texts: tuple[TextChange, ...]
+    findings: tuple[FindingChange, ...]
+    one_sided: tuple[OneSided, ...]
+    methods: tuple[str, ...]
+    notes: tuple[str, ...]
+    provenance: Provenance
+
+
 Reported = ComparisonResults | LoopResults
-Results = Reported | TuningResults | SyncResults | GraphResults | EvaluationResults | WhatIfResults
+Results = (
+    Reported
+    | TuningResults
+    | SyncResults
+    | GraphResults
+    | EvaluationResults
+    | WhatIfResults
+    | ChangeResults
+)
 # By the name in their schema
 KINDS: dict[str, type[Results]] = {
     COMPARISON: ComparisonResults,
@@ -183,6 +237,7 @@ KINDS: dict[str, type[Results]] = {
     "px4fuse-graph": GraphResults,
     "px4fuse-evaluation": EvaluationResults,
     WHATIF: WhatIfResults,
+    CHANGES: ChangeResults,
 }
 
 

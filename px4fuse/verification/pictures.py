@@ -14,8 +14,8 @@ from px4fuse.flight import Unavailable
 
 # Enough to keep our blue, EKF2's orange and the severities apart, with smooth letters
 COLOURS = 16
-# A page of text and lines at 700 pixels takes 30 to 45 kB; a photograph is made smaller
-MAX_BYTES = 50_000
+# A page of text and lines at 700 pixels takes 15 to 55 kB; a photograph is made smaller
+MAX_BYTES = 60_000
 MAX_PIXELS = 2_000_000
 MAX_DRAWN_COLOURS = 20_000
 # PDF's own limit is 14,400 points, or 200 inches

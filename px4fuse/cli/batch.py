@@ -1,0 +1,236 @@
+"""``px4fuse batch``: many logs become one table."""
+
+from __future__ import annotations
+
+import gc
+import sys
+import time
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from px4fuse.cli.compare import SEVERITIES
+from px4fuse.cli.inputs import path_option, settings_options
+from px4fuse.cli.outputs import Interrupted, Step, progress, terminal, write_outputs
+from px4fuse.errors import OutputError, SettingsError
+
+if TYPE_CHECKING:
+    from px4fuse.fleet.run import Fleet
+
+FAILED, WORSE = "failed", "worse"
+# How a cluster of each kind is started, for people who have one
+CLUSTERS = {
+    "slurm": """\
+px4fuse uses a Dask cluster that runs. On Slurm, Dask starts one with dask-jobqueue. On a login
+node, with px4fuse[batch] installed where the jobs run:
+
+    pip install dask-jobqueue
+    python - <<'END'
+    from dask_jobqueue import SLURMCluster
+    cluster = SLURMCluster(cores=1, processes=1, memory="4GB", walltime="04:00:00")
+    cluster.scale(jobs=50)  # each is a worker with one thread, as px4fuse requires
+    print(cluster.scheduler_address, flush=True)
+    input("Press Enter to end the cluster. ")
+    END
+
+Then, in another shell, with the address that it printed:
+
+    px4fuse batch LOGS -o DIR --scheduler tcp://ADDRESS:PORT
+
+LOGS must lie on a disk that all nodes see at the same path, or be URLs.
+""",
+    "kubernetes": """\
+px4fuse uses a Dask cluster that runs. On Kubernetes, Dask starts one with dask-kubernetes. Build
+an image of Python with px4fuse[batch], then, where kubectl works:
+
+    pip install dask-kubernetes
+    helm install --repo https://helm.dask.org --create-namespace -n dask-operator \\
+        --generate-name dask-kubernetes-operator
+    python - <<'END'
+    from dask_kubernetes.operator import KubeCluster
+    cluster = KubeCluster(name="px4fuse", image="YOUR/IMAGE", n_workers=50,
+        worker_command="dask worker --nthreads 1")
+    input("Press Enter to end the cluster. ")
+    END
+
+Then, in another shell:
+
+    kubectl port-forward service/px4fuse-scheduler 8786
+    px4fuse batch LOGS -o DIR --scheduler tcp://localhost:8786
+
+LOGS should be URLs (s3://, gs://), whose package (s3fs, gcsfs) is in the image too.
+""",
+}
+
+
+@click.command()
+@click.argument("logs", nargs=-1, metavar="LOGS...")
+@path_option("-o", "--output", metavar="DIR", help="Folder for the table and every log's results.")
+@click.option("--reports", is_flag=True, help="Make every log's PDF report too.")
+@click.option(
+    "--timeout",
+    "timeout_s",
+    type=click.FloatRange(min=1.0),
+    default=600.0,
+    show_default=True,
+    metavar="SECONDS",
+    help="Time for one log; what takes longer is ended.",
+)
+@click.option(
+    "--workers",
+    type=click.IntRange(1, 1024),
+    default=None,
+    metavar="N",
+    help="How many logs at once on this computer.  [default: one per core]",
+)
+@click.option(
+    "--memory",
+    default=None,
+    metavar="SIZE",
+    help="Memory for each, as 2GB.  [default: an equal share of this computer's]",
+)
+@click.option(
+    "--scheduler",
+    default=None,
+    metavar="ADDRESS",
+    help="Dask scheduler that runs already, as tcp://host:8786; slurm or kubernetes prints how to "
+    "start one.",
+)
+@path_option(
+    "--baseline",
+    metavar="FILE.parquet",
+    help="Table of an earlier run: the column change says what is worse than in it.",
+)
+@path_option(
+    "--junit",
+    "junit_path",
+    metavar="FILE.xml",
+    help="Write JUnit XML: a test case per log, which fails where the log failed or is worse.",
+)
+@settings_options
+@click.option(
+    "--fail-on",
+    type=click.Choice((FAILED, WORSE, *SEVERITIES)),
+    default=None,
+    help="Exit with 1 if a log has failed, is worse than the baseline (or has failed), or there is "
+    "a finding of at least this severity.",
+)
+def batch(
+    logs: tuple[str, ...],
+    output: Path | None,
+    reports: bool,
+    timeout_s: float,
+    workers: int | None,
+    memory: str | None,
+    scheduler: str | None,
+    baseline: Path | None,
+    junit_path: Path | None,
+    fail_on: str | None,
+    **given: Any,
+) -> None:
+    """Compare many logs, as px4fuse compare does each, into one table.
+
+    LOGS are files, folders, globs and URLs (s3://, gs://, https://, sftp://). Writes
+    fleet.parquet, fleet.csv and every log's results into DIR. A second run does only what is new,
+    and tries again what has failed; Ctrl-C keeps what is done.
+    """
+    if scheduler in CLUSTERS:
+        click.echo(CLUSTERS[scheduler], nl=False)
+        return
+    if output is None:
+        raise SettingsError("say with -o which folder the table goes to.")
+    if output.exists() and not output.is_dir():
+        raise OutputError(f"-o {output}: is not a folder. Give another place.")
+    if scheduler is not None and (workers, memory) != (None, None):
+        raise SettingsError(
+            "--workers and --memory are of a cluster that px4fuse starts; with --scheduler they "
+            "are given to dask worker."
+        )
+    if fail_on == WORSE and baseline is None:
+        raise SettingsError("--fail-on worse requires --baseline: worse than what?")
+    from px4fuse.fleet.engine import connected
+    from px4fuse.fleet.junit import junit
+    from px4fuse.fleet.logs import find_logs
+    from px4fuse.fleet.regressions import read_baseline
+    from px4fuse.fleet.run import fleet_request, run
+
+    gc.enable()  # a long run, of a library that leaves circles
+    found = find_logs(logs)
+    request = fleet_request(given)
+    before = None if baseline is None else read_baseline(baseline)
+    try:
+        with progress() as step:
+            step("starting the workers")
+            with connected(scheduler, workers, memory or "auto") as client:
+                fleet = run(
+                    found,
+                    output,
+                    request,
+                    client,
+                    reports=reports,
+                    timeout_s=timeout_s,
+                    baseline=before,
+                    progress=partial(_shown, step, time.monotonic()),
+                )
+    except KeyboardInterrupt as stopped:
+        left = f"what is done is kept in {output}. The same command goes on from there."
+        raise Interrupted(stopped, left) from None
+    if junit_path is not None:
+        write_outputs({junit_path: junit(fleet.table)})
+    _print(fleet)
+    severities = SEVERITIES[: SEVERITIES.index(fail_on) + 1] if fail_on in SEVERITIES else ()
+    failed = fail_on is not None and bool((fleet.table["status"] == FAILED).any())
+    failed |= fail_on == WORSE and bool((fleet.table["change"] != "").any())
+    if failed or fleet.severities & set(severities):
+        sys.exit(1)
+
+
+def _shown(step: Step, since_s: float, what: str, done: int, of: int) -> None:
+    """How far it is, with its rate."""
+    per_minute = 60.0 * done / (time.monotonic() - since_s)
+    step(f"{what}, {per_minute:.3g} per minute" if done else what, done, of)
+
+
+def _print(fleet: Fleet) -> None:
+    from rich.text import Text
+
+    from px4fuse.plain import factor_words
+    from px4fuse.report.screen import plain_table, print_file, say
+
+    console = terminal()
+    logs = fleet.table.drop_duplicates("log")
+    for status, kind in (("not judged", "yellow"), (FAILED, "red")):
+        for row in logs[logs["status"].eq(status) & logs["axis"].eq("")].itertuples():
+            say(console, Text(f"{row.log}: {status}: {row.reason}. {row.remedy}".rstrip(), kind))
+    table = plain_table(
+        ("axis", "left"),
+        *(
+            (f"{whose}\n{what}", "right")
+            for whose in ("ours", "EKF2")
+            for what in ("logs", "factor")
+        ),
+    )
+    for axis, rows in fleet.table[fleet.table["axis"] != ""].groupby("axis", sort=False):
+        cells = []
+        for factors in (rows["kf_factor"].dropna(), rows["ekf2_factor"].dropna()):
+            median = factor_words(float(factors.median())) if len(factors) else "–"
+            cells += [f"{len(factors)}", median]
+        table.add_row(str(axis), *cells)
+    if table.row_count:
+        console.print(table)
+        say(console, Text("factor: median of how many times S is overstated (above 1)", "dim"))
+    found = logs["findings"].str.split(";").explode()
+    for finding, count in found[found != ""].value_counts().head(5).items():
+        say(console, f"{count} × {finding}")
+    for row in fleet.table[fleet.table["change"] != ""].itertuples():
+        say(console, Text(f"worse: {row.log} {row.axis}: {row.change}", "red"))
+    if fleet.against:
+        say(console, fleet.against)
+    counts = logs["status"].value_counts()
+    said = ", ".join(f"{count} {status}" for status, count in counts.items())
+    again = " The same command tries those that failed again." if FAILED in counts else ""
+    say(console, f"{len(logs)} logs: {said}; {fleet.reused} as before.{again}")
+    for path in fleet.written:
+        print_file(console, "Wrote", path)

@@ -1,0 +1,250 @@
+"""Jobs on a Dask cluster: what hangs, crashes or eats memory is lost alone."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib import metadata
+from itertools import islice
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from px4fuse.errors import Px4FuseError, SettingsError
+from px4fuse.results.reading import one_line
+
+if TYPE_CHECKING:
+    from distributed import Client, Future
+
+Job = TypeVar("Job")
+Result = TypeVar("Result")
+
+CONNECT_S = 15.0
+# A cluster's machines may come one by one; none for so long is none
+WORKERS_S = 120.0
+# How often the clocks of running jobs are looked at
+TICK_S = 1.0
+_CONFIG = {
+    # whose worker died is tried once more: somebody else may have ended it
+    "distributed.scheduler.allowed-failures": 1,
+    # results are small, so all memory is the log's: nothing to spill, and a pause would not help
+    "distributed.worker.memory.target": False,
+    "distributed.worker.memory.spill": False,
+    "distributed.worker.memory.pause": False,
+    # a worker shall not import a module that lies in the folder of the logs
+    "distributed.nanny.pre-spawn-environ.PYTHONSAFEPATH": 1,
+}
+_START = "Start workers with: dask worker {} --nthreads 1"
+
+
+@dataclass(frozen=True)
+class Failed:
+    """Stands for the result of a job that gave none.
+
+    Attributes
+    ----------
+    line : str
+        Why, and what to do.
+    """
+
+    line: str
+
+
+@contextmanager
+def connected(
+    scheduler: str | None = None, workers: int | None = None, memory: str = "auto"
+) -> Iterator[Client]:
+    """A client of the cluster that does the work.
+
+    Parameters
+    ----------
+    scheduler : str, optional
+        Address of a scheduler that runs; without one, the client that this session has, as in a
+        notebook, or else a cluster of this computer that lives as long as the context.
+    workers : int, optional
+        Processes of such a cluster; by default one per core.
+    memory : str
+        Of each, as "2 GB"; "auto" shares this computer's.
+
+    Raises
+    ------
+    SettingsError
+        Dask is not installed, the scheduler does not answer or has no workers, or its workers
+        cannot do this work.
+    """
+    try:
+        import dask  # noqa: PLC0415 - of the extra `batch`
+        from distributed import Client, LocalCluster, default_client  # noqa: PLC0415
+    except ImportError as error:
+        raise SettingsError('many logs require Dask. Run pip install "px4fuse[batch]".') from error
+    if scheduler is not None:
+        try:
+            client = Client(scheduler, timeout=CONNECT_S)
+        except (OSError, ValueError) as error:
+            raise SettingsError(
+                f"`scheduler` {scheduler}: no Dask scheduler answers there "
+                f"({one_line(str(error), 120)}). Start one with: dask scheduler"
+            ) from error
+        with client:
+            _check(client, scheduler)
+            yield client
+        return
+    try:
+        own = default_client()
+    except ValueError:  # this session has none
+        pass
+    else:
+        _check(own, own.scheduler.address)
+        yield own
+        return
+    with (
+        dask.config.set(_CONFIG),
+        LocalCluster(
+            n_workers=workers,
+            threads_per_worker=1,
+            memory_limit=memory,
+            dashboard_address=None,
+            silence_logs=logging.CRITICAL,
+        ) as cluster,
+        Client(cluster) as client,
+    ):
+        yield client
+
+
+def _check(client: Client, address: str) -> None:
+    """Refuse workers that cannot do this work."""
+    try:
+        client.wait_for_workers(1, timeout=CONNECT_S)
+    except TimeoutError as error:
+        raise SettingsError(f"{address}: has no workers. {_START.format(address)}") from error
+    for name, worker in client.scheduler_info(n_workers=-1)["workers"].items():
+        # matplotlib draws in one thread only, and what hangs must be ended alone
+        if worker["nthreads"] != 1 or worker["nanny"] is None:
+            lacks = "no nanny" if worker["nanny"] is None else f"{worker['nthreads']} threads"
+            raise SettingsError(
+                f"worker {name} has {lacks}; each log requires a process of its own, which can be "
+                f"ended. {_START.format(address)}"
+            )
+    here = metadata.version("px4fuse")
+    for name, there in client.run(metadata.version, "px4fuse", on_error="return").items():
+        if there != here:
+            other = f"px4fuse {there}" if isinstance(there, str) else "no px4fuse"
+            raise SettingsError(
+                f"worker {name} has {other}, and this is {here}. Install the same on both."
+            )
+
+
+def outcomes(
+    client: Client,
+    function: Callable[[Job], Result],
+    jobs: Iterable[Job],
+    *,
+    timeout_s: float,
+) -> Iterator[tuple[Job, Result | Failed]]:
+    """Call a function on every job on a cluster, and give what comes of each as it comes.
+
+    No more jobs are handed out than there are workers, so that none waits behind one that is
+    ended; and nothing of a finished one is kept.
+
+    Parameters
+    ----------
+    client : Client
+        Of workers with one thread each, and a nanny.
+    function : callable
+        At the top level of a module.
+    jobs : iterable
+    timeout_s : float
+        For one job, once it runs.
+
+    Raises
+    ------
+    Px4FuseError
+        The cluster is gone.
+    """
+    from distributed import CancelledError, wait  # noqa: PLC0415
+
+    waiting = iter(jobs)
+    running: dict[Future[Any], Job] = {}
+    begun: dict[str, tuple[str, float]] = {}
+    seen_s = looked_s = time.monotonic()
+    try:
+        while True:
+            workers = len(client.nthreads())
+            seen_s = time.monotonic() if workers else seen_s
+            if time.monotonic() - seen_s > WORKERS_S:
+                raise Px4FuseError("the cluster has lost all its workers.")
+            for job in islice(waiting, max(1, workers) - len(running)):
+                running[client.submit(function, job, pure=False)] = job
+            if not running:
+                return
+            try:
+                done = wait(list(running), timeout=TICK_S, return_when="FIRST_COMPLETED").done
+            except TimeoutError:
+                done = set()
+            for future in done:
+                yield running.pop(future), _result(future, timeout_s)
+            done.clear()
+            if time.monotonic() - looked_s >= TICK_S:
+                looked_s = time.monotonic()
+                late = _late(client, running, begun, looked_s - timeout_s)
+                keys = {begun.pop(address)[0] for address in late}
+                ended = [future for future in running if str(future.key) in keys]
+                if ended:
+                    client.cancel(ended)
+                    client.restart_workers(late, raise_for_error=False)
+                for future in ended:
+                    yield (
+                        running.pop(future),
+                        Failed(
+                            f"it took longer than {timeout_s:g} s and was ended. Allow more with "
+                            "--timeout."
+                        ),
+                    )
+    except (CancelledError, OSError) as error:
+        raise Px4FuseError(f"the scheduler is gone ({one_line(str(error), 120)}).") from error
+    finally:
+        if running and client.status == "running":
+            client.cancel(list(running))
+
+
+def _late(
+    client: Client,
+    running: Iterable[Future[Any]],
+    begun: dict[str, tuple[str, float]],
+    latest_s: float,
+) -> list[str]:
+    """Workers whose job began before a time; keeps account of what each began, and when."""
+    order = {str(future.key): number for number, future in enumerate(running)}
+    late = []
+    for address, keys in client.processing().items():
+        ours = sorted(order.keys() & set(map(str, keys)), key=order.__getitem__)
+        if not ours:
+            begun.pop(address, None)
+            continue
+        if begun.get(address, ("", 0.0))[0] not in ours:
+            begun[address] = (ours[0], time.monotonic())
+        if begun[address][1] < latest_s:
+            late.append(address)
+    return late
+
+
+def _result(future: Future[Any], timeout_s: float) -> Any:
+    from distributed import KilledWorker  # noqa: PLC0415
+
+    if future.status == "finished":
+        return future.result(timeout=timeout_s)
+    error = future.exception()
+    if isinstance(error, KilledWorker):
+        return Failed(
+            f"the process that read it ended {error.allowed_failures + 1} times: it crashed, or "
+            "needed more memory than it may take. Give each more with --memory, or look at this "
+            "log with px4fuse compare."
+        )
+    if isinstance(error, MemoryError):
+        return Failed("it needs more memory than there is. Use fewer --workers.")
+    if isinstance(error, Px4FuseError):
+        return Failed(str(error))
+    return Failed(
+        f"{type(error).__name__}: {one_line(str(error), 300)}. Look at it with px4fuse compare."
+    )

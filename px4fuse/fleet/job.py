@@ -1,0 +1,177 @@
+"""What a worker does with one log: reads it where it lies and gives back rows and files."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import msgspec
+
+from px4fuse.errors import LogError, MissingDataError, Px4FuseError, SettingsError
+from px4fuse.fleet.logs import CHANGED, local_file
+from px4fuse.fleet.rows import FAILED, NOT_JUDGED, Row, log_columns, rows_of
+from px4fuse.reading import files_by_sha256, max_log_bytes
+from px4fuse.request import ComparisonRequest, command_line, with_options
+
+if TYPE_CHECKING:
+    from px4fuse.flight import Flight
+
+
+@dataclass(frozen=True)
+class Job:
+    """One log and what to do with it.
+
+    Attributes
+    ----------
+    address : str
+        Absolute path or URL.
+    request : ComparisonRequest
+        Its settings count.
+    reports : bool
+        Whether the PDF is made too.
+    max_bytes : int
+        Largest log that is read.
+    px4fuse : str
+        Version that must do it.
+    sha256 : str
+        Of the log where that is known already, else empty.
+    """
+
+    address: str
+    request: ComparisonRequest
+    reports: bool
+    max_bytes: int
+    px4fuse: str
+    sha256: str = ""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came of one log.
+
+    Attributes
+    ----------
+    rows : tuple of Row
+        An axis each; one where the log could not be compared.
+    severities : tuple of str
+        Of its findings.
+    results, report : bytes
+        JSON and PDF; empty where there is none.
+    """
+
+    rows: tuple[Row, ...]
+    severities: tuple[str, ...] = ()
+    results: bytes = b""
+    report: bytes = b""
+
+
+def identify(job: Job) -> str:
+    """SHA-256 of a log.
+
+    Raises
+    ------
+    LogError
+        It cannot be read.
+    """
+    max_log_bytes.set(job.max_bytes)
+    with local_file(job.address) as path:
+        return _sha256(path)
+
+
+def analyse(job: Job) -> Outcome:
+    """Compare one log as ``px4fuse compare`` does.
+
+    Parameters
+    ----------
+    job : Job
+
+    Returns
+    -------
+    Outcome
+        Also of a log that cannot be compared: its one row says why.
+
+    Raises
+    ------
+    SettingsError
+        This is another version of px4fuse.
+    """
+    version = metadata.version("px4fuse")
+    if version != job.px4fuse:
+        raise SettingsError(f"a worker has px4fuse {version}, not {job.px4fuse}.")
+    max_log_bytes.set(job.max_bytes)
+    sha256 = job.sha256
+    try:
+        with local_file(job.address) as path:
+            sha256 = _sha256(path)
+            if job.sha256 not in ("", sha256):
+                raise LogError(CHANGED)
+            outcome = _compared(job, path, sha256)
+            if _sha256(path) != sha256:
+                raise LogError(CHANGED)
+            return outcome
+    except Px4FuseError as error:
+        return Outcome((refused(str(error), FAILED) | {"log_sha256": sha256},))
+
+
+def refused(text: str, status: str) -> Row:
+    """The row of a log from the line of an error: what is wrong, and then what to do."""
+    reason, _, remedy = with_options(text).partition(". ")
+    return {"status": status, "reason": reason.removesuffix("."), "remedy": remedy}
+
+
+def _compared(job: Job, path: Path, sha256: str) -> Outcome:
+    from px4fuse.analysis import read_flight  # noqa: PLC0415 - only workers need all of it
+
+    request = msgspec.structs.replace(job.request, log=str(path))
+    known: Row = {"name": path.name, "log_sha256": sha256}
+    try:
+        flight = read_flight(request)
+        known |= _columns(flight)
+        return _explained(job, request, flight)
+    except Px4FuseError as error:
+        status = NOT_JUDGED if isinstance(error, MissingDataError) else FAILED
+        text = str(error).removeprefix(f"{path.name}: ")
+        return Outcome((known | refused(text, status),))
+
+
+def _columns(flight: Flight) -> Row:
+    from px4fuse.results.parts import log_part  # noqa: PLC0415
+
+    return log_columns(log_part(flight))
+
+
+def _explained(job: Job, request: ComparisonRequest, flight: Flight) -> Outcome:
+    from px4fuse.analysis import run  # noqa: PLC0415
+    from px4fuse.findings import find  # noqa: PLC0415
+    from px4fuse.results.build import results  # noqa: PLC0415
+    from px4fuse.results.contract import to_json  # noqa: PLC0415
+    from px4fuse.results.model import Student  # noqa: PLC0415
+
+    analysis, command = run(request, flight=flight), command_line(request)
+    findings = find(analysis)
+    found = results(request, analysis, findings, Student(), command)
+    text, report = to_json(found), b""
+    if job.reports:
+        from px4fuse.report.document import Document  # noqa: PLC0415
+        from px4fuse.report.pdf import render  # noqa: PLC0415
+
+        report = render(Document(analysis, findings, Student(), command), text)
+    severities = tuple(finding.severity for finding in findings)
+    return Outcome(tuple(rows_of(found)), severities, text.encode(), report)
+
+
+def _sha256(path: Path) -> str:
+    (sha256,) = files_by_sha256([path])
+    return sha256
+
+
+def file_stem(name: str, sha256: str) -> str:
+    """Name of a log's files: its own as far as any file system takes it, and its hash.
+
+    >>> file_stem("Flug 3.ulg", "ab" * 32)
+    'Flug_3-abababababab'
+    """
+    return f"{re.sub(r'[^A-Za-z0-9_.-]+', '_', Path(name).stem)[:60]}-{sha256[:12]}"

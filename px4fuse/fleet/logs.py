@@ -1,0 +1,177 @@
+"""The logs of a fleet, wherever they lie: files, folders, globs, and URLs that fsspec knows."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any
+
+from px4fuse.errors import LogError, SettingsError
+from px4fuse.reading import max_log_bytes
+from px4fuse.results.reading import one_line
+
+if TYPE_CHECKING:
+    from fsspec import AbstractFileSystem
+
+#: What is taken from a folder; a file that is named itself may be called anything
+SUFFIXES = (".ulg", ".tlog", ".bin")
+CHANGED = "it changed while it was read. Run the same command again when it is complete."
+# By these, as far as a file system has them, a file is the same as before
+_SAME = (
+    "size", "mtime", "ETag", "etag", "LastModified", "last_modified", "updated", "md5Hash",
+)  # fmt: skip
+
+
+@dataclass(frozen=True, order=True)
+class FoundLog:
+    """A log before it is read.
+
+    Attributes
+    ----------
+    name : str
+        Without its folder.
+    log : str
+        As a person gave it.
+    address : str
+        Absolute path or URL, as a worker opens it.
+    size_bytes : int or None
+        None where the file system does not say.
+    """
+
+    name: str
+    log: str
+    address: str
+    size_bytes: int | None
+
+
+def find_logs(given: Iterable[str]) -> list[FoundLog]:
+    """Logs by what a person gave, each once, in the order of their names.
+
+    Parameters
+    ----------
+    given : iterable of str
+        Files, folders (all logs in them, by their suffixes), globs and URLs.
+
+    Raises
+    ------
+    SettingsError
+        There is no log in one of them, or a package is missing that its kind of URL requires.
+    """
+    found: dict[str, FoundLog] = {}
+    for one in given:
+        logs = _logs_in(one)
+        if not logs:
+            raise SettingsError(
+                f"{one}: no logs in it ({', '.join(SUFFIXES)}). Give a folder that holds some."
+            )
+        for log in logs:
+            found.setdefault(log.address, log)
+    if not found:
+        raise SettingsError("no logs: give files, folders, globs or URLs.")
+    return sorted(found.values())
+
+
+def _logs_in(given: str) -> list[FoundLog]:
+    try:
+        files, root = _file_system(given)
+        if files.isfile(root):
+            infos = {root: files.info(root)}
+        elif files.isdir(root):
+            every = files.find(root, detail=True)
+            infos = {path: info for path, info in every.items() if _suffix(path) in SUFFIXES}
+        elif any(sign in given for sign in "*?["):
+            every = files.glob(root, detail=True)
+            infos = {path: info for path, info in every.items() if info["type"] == "file"}
+        elif files.exists(root):  # a device or pipe: its worker says so
+            infos = {root: {}}
+        else:
+            raise SettingsError(f"{given}: no such file or folder.")
+    except SettingsError:
+        raise
+    # OSError, and what the package of each kind of URL defines: no account, no such bucket
+    except Exception as error:
+        raise SettingsError(
+            f"{given}: cannot be read ({one_line(str(error), 200) or type(error).__name__})."
+        ) from error
+    return [_found(given, files, path, info) for path, info in infos.items()]
+
+
+def _found(given: str, files: AbstractFileSystem, path: str, info: dict[str, Any]) -> FoundLog:
+    if _is_local(files):
+        address = log = path
+        if not Path(given).is_absolute():
+            log = os.path.relpath(path)
+    else:
+        address = log = files.unstrip_protocol(path)
+    name = PurePosixPath(path.partition("?")[0]).name or "log"
+    return FoundLog(name, log, address, info.get("size"))
+
+
+@contextmanager
+def local_file(address: str) -> Iterator[Path]:
+    """A log as a file of this computer; what is fetched for it is deleted afterwards.
+
+    Parameters
+    ----------
+    address : str
+        Absolute path or URL.
+
+    Raises
+    ------
+    LogError
+        It is too large, or it changed while it was fetched.
+    SettingsError
+        A package is missing that its kind of URL requires.
+    """
+    files, path = _file_system(address)
+    if _is_local(files):
+        yield Path(path)
+        return
+    before = _identity(files, path)
+    size, limit = before.get("size"), max_log_bytes.get()
+    if size is not None and size > limit:
+        raise LogError(
+            f"{size / 1e6:,.0f} MB, more than the limit of {limit / 1e6:,.0f} MB. Allow more with "
+            "--max-size MB."
+        )
+    with TemporaryDirectory(prefix="px4fuse-") as folder:
+        local = Path(folder, PurePosixPath(path.partition("?")[0]).name or "log")
+        files.get_file(path, str(local))
+        files.invalidate_cache()
+        if _identity(files, path) != before:
+            raise LogError(CHANGED)
+        yield local
+
+
+def _identity(files: AbstractFileSystem, path: str) -> dict[str, Any]:
+    info = files.info(path)
+    return {name: info[name] for name in _SAME if info.get(name) is not None}
+
+
+def _file_system(address: str) -> tuple[AbstractFileSystem, str]:
+    from fsspec.core import url_to_fs  # noqa: PLC0415 - of the extra `batch`
+
+    try:
+        files, path = url_to_fs(address)
+    except ImportError as error:  # its cause names the module, which is the package's name
+        package = getattr(error.__cause__, "name", None) or "the package that it names"
+        raise SettingsError(
+            f'{address}: this kind of URL requires a package. Run pip install "{package}".'
+        ) from error
+    except ValueError as error:  # of a protocol that nobody knows
+        raise SettingsError(f"{address}: {error}. Give a path or another URL.") from error
+    return files, path
+
+
+def _is_local(files: AbstractFileSystem) -> bool:
+    from fsspec.implementations.local import LocalFileSystem  # noqa: PLC0415
+
+    return isinstance(files, LocalFileSystem)
+
+
+def _suffix(path: str) -> str:
+    return PurePosixPath(path).suffix.lower()

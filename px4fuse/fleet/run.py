@@ -1,0 +1,349 @@
+"""Logs → the fleet's table: each log compared by a worker, its rows kept, the table written."""
+
+from __future__ import annotations
+
+import io
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from importlib import metadata
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any
+
+import pandas as pd
+
+from px4fuse.errors import OutputError, Px4FuseError, SettingsError
+from px4fuse.filter.kalman import Settings
+from px4fuse.fleet.engine import Failed, connected, outcomes
+from px4fuse.fleet.job import Job, Outcome, analyse, file_stem, identify, refused
+from px4fuse.fleet.logs import FoundLog, find_logs
+from px4fuse.fleet.regressions import marked
+from px4fuse.fleet.rows import FAILED, NOT_JUDGED, Row, csv_bytes, table_of
+from px4fuse.fleet.store import Store, opened
+from px4fuse.reading import max_log_bytes
+from px4fuse.request import ComparisonRequest, command_line
+from px4fuse.writing import write_all
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+TIMEOUT_S = 600.0
+RESULTS = "results"
+ROWS = "rows.sqlite"
+_GOES_ON = "What is done is kept: the same command goes on from there."
+
+Progress = Callable[[str, int, int], None]
+
+
+def _silent(what: str, done: int, of: int) -> None:
+    """Progress that nobody watches."""
+
+
+@dataclass(frozen=True)
+class Fleet:
+    """What came of many logs.
+
+    Attributes
+    ----------
+    table : DataFrame
+        A row per log and axis, with the columns of :data:`px4fuse.fleet.rows.COLUMNS`.
+    reused : int
+        How many logs an earlier run has compared.
+    severities : frozenset of str
+        Of all findings.
+    written : tuple of Path
+    against : str
+        What the logs were held against; empty without a baseline.
+    """
+
+    table: pd.DataFrame
+    reused: int
+    severities: frozenset[str]
+    written: tuple[Path, ...]
+    against: str = ""
+
+
+@dataclass(frozen=True)
+class _Found:
+    """What is known of the logs so far."""
+
+    logs: Sequence[FoundLog]
+    output: Path
+    store: Store
+    baseline: pd.DataFrame | None = None
+    hash_of: dict[str, str] = field(default_factory=dict)  # by address
+    lost: dict[str, Row] = field(default_factory=dict)  # rows of those that give none
+    reused: set[str] = field(default_factory=set)
+
+
+def batch(
+    paths: str | Path | Iterable[str | Path],
+    output: str | Path | None = None,
+    *,
+    reports: bool = False,
+    timeout_s: float = TIMEOUT_S,
+    baseline: pd.DataFrame | None = None,
+    scheduler: str | None = None,
+    workers: int | None = None,
+    memory: str = "auto",
+    progress: Progress = _silent,
+    **settings: Any,
+) -> pd.DataFrame:
+    """Compare many logs, on this computer or a Dask cluster.
+
+    In a session with a Dask client of its own (``distributed.Client``), that one's cluster does
+    the work.
+
+    Parameters
+    ----------
+    paths : str, Path or iterable of them
+        Files, folders, globs and URLs.
+    output : str or Path, optional
+        Folder for the table and every log's results; a second run does only what is new. Without
+        it nothing is kept.
+    reports : bool
+        Also every log's PDF.
+    timeout_s : float
+        For one log.
+    baseline : DataFrame, optional
+        An earlier table: the column ``change`` says what is worse than in it.
+    scheduler : str, optional
+        Address of a Dask scheduler.
+    workers : int, optional
+        Processes on this computer; by default one per core.
+    memory : str
+        Of each, as "2 GB".
+    progress : callable
+        Told what is being done, how many logs are done, and of how many.
+    **settings
+        Fields of :class:`px4fuse.ComparisonRequest`, as ``sigma_z_m``.
+
+    Returns
+    -------
+    DataFrame
+        A row per log and axis; one that says why for a log that could not be compared.
+
+    Raises
+    ------
+    SettingsError
+        There are no logs, a setting is out of range, or the cluster cannot do this.
+    OutputError
+        A result cannot be written.
+    """
+    single = isinstance(paths, str | Path)
+    logs = find_logs(map(str, (paths,) if single else paths))  # type: ignore[arg-type]
+    request = fleet_request(settings)
+    with (
+        TemporaryDirectory(prefix="px4fuse-") as scratch,
+        connected(scheduler, workers, memory) as client,
+    ):
+        fleet = run(
+            logs,
+            Path(scratch if output is None else output),
+            request,
+            client,
+            reports=reports and output is not None,
+            timeout_s=timeout_s,
+            baseline=baseline,
+            progress=progress,
+        )
+    files = {} if output is not None else {"results": "", "report": ""}
+    return fleet.table.assign(**files)
+
+
+def fleet_request(settings: dict[str, Any]) -> ComparisonRequest:
+    """The request of every log, without its log.
+
+    Raises
+    ------
+    SettingsError
+        A setting is unknown or out of range.
+    """
+    try:
+        request = ComparisonRequest(log="LOG", **settings)
+    except TypeError as error:
+        raise SettingsError(f"no such setting ({error}).") from error
+    if request.mavlink is not None or request.position is not None:
+        raise SettingsError("`mavlink` and `position` belong to one flight, not to many.")
+    Settings(request.sigma_a_m_s2, request.sigma_z_m, request.dt_s)
+    return request
+
+
+def run(
+    logs: Sequence[FoundLog],
+    output: Path,
+    request: ComparisonRequest,
+    client: Client,
+    *,
+    reports: bool = False,
+    timeout_s: float = TIMEOUT_S,
+    baseline: pd.DataFrame | None = None,
+    progress: Progress = _silent,
+) -> Fleet:
+    """Compare logs on a cluster, and write rows, results and the table into a folder.
+
+    What ends the run early (Ctrl-C, a full disk, a cluster that is gone) costs what was not done
+    by then; what was done is in the folder, and in the table as far as it can be written.
+
+    Parameters
+    ----------
+    logs : sequence of FoundLog
+    output : Path
+        Folder.
+    request : ComparisonRequest
+        Its settings count for every log.
+    client : Client
+    reports : bool
+    timeout_s : float
+        For one log.
+    baseline : DataFrame, optional
+    progress : callable
+        As :func:`batch`.
+
+    Raises
+    ------
+    OutputError
+        A result cannot be written.
+    Px4FuseError
+        The cluster is gone.
+    """
+    try:
+        output.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"{output}: cannot be made ({error.strerror}). Give another.") from error
+    version, settings = metadata.version("px4fuse"), command_line(request)
+    job = Job("", request, reports, max_log_bytes.get(), version)
+    with opened(output / ROWS, version, settings) as store:
+        found = _Found(logs, output, store, baseline)
+        try:
+            _identify(found, client, job, timeout_s, progress)
+            todo = list(_todo(found, job))
+            try:
+                _compare(found, client, todo, timeout_s, progress)
+            finally:
+                fleet = _written(found)
+        except OutputError as error:
+            raise OutputError(f"{error} {_GOES_ON}") from error
+        except Px4FuseError as error:
+            raise Px4FuseError(f"{error} {_GOES_ON}") from error
+    return fleet
+
+
+def _identify(
+    found: _Found, client: Client, job: Job, timeout_s: float, progress: Progress
+) -> None:
+    """Hash the logs that may be known, or be the same as another: those of a size that is."""
+    sizes, known = Counter(log.size_bytes for log in found.logs), found.store.sizes()
+    asked = [
+        replace(job, address=log.address)
+        for log in found.logs
+        if log.size_bytes is None or sizes[log.size_bytes] > 1 or log.size_bytes in known
+    ]
+    for number, (one, sha256) in enumerate(outcomes(client, identify, asked, timeout_s=timeout_s)):
+        if isinstance(sha256, Failed):
+            found.lost[one.address] = refused(sha256.line, FAILED)
+        else:
+            found.hash_of[one.address] = sha256
+        progress("looking for what is new", number + 1, len(asked))
+    first_of: dict[str, FoundLog] = {}
+    for log in found.logs:
+        if log.address not in found.hash_of:
+            continue
+        first = first_of.setdefault(found.hash_of[log.address], log)
+        if first is not log:
+            found.lost[log.address] = {
+                "status": NOT_JUDGED,
+                "log_sha256": found.hash_of[log.address],
+                "reason": f"the same file as {first.log}, and was compared once",
+            }
+
+
+def _todo(found: _Found, job: Job) -> Iterator[Job]:
+    """Jobs of the logs of which not everything is there."""
+    for log in found.logs:
+        if log.address in found.lost:
+            continue
+        sha256 = found.hash_of.get(log.address, "")
+        rows, _ = found.store.rows(sha256)
+        if rows and ("axis" not in rows[0] or all(_files(found, rows[0])[: 1 + job.reports])):
+            found.reused.add(sha256)
+        else:
+            yield replace(job, address=log.address, sha256=sha256)
+
+
+def _files(found: _Found, row: Row) -> tuple[str, str]:
+    """Results and report of a log, relative to the folder; empty where there is none."""
+    stem = f"{RESULTS}/{file_stem(row['name'], row['log_sha256'])}"
+    results, report = f"{stem}.json", f"{stem}.pdf"
+    return (
+        results if (found.output / results).is_file() else "",
+        report if (found.output / report).is_file() else "",
+    )
+
+
+def _compare(
+    found: _Found, client: Client, jobs: Sequence[Job], timeout_s: float, progress: Progress
+) -> None:
+    sizes = {log.address: log.size_bytes for log in found.logs}
+    failed = 0
+    progress("comparing", 0, len(jobs))
+    for number, (job, result) in enumerate(outcomes(client, analyse, jobs, timeout_s=timeout_s)):
+        if isinstance(result, Failed):
+            found.lost[job.address] = refused(result.line, FAILED) | {"log_sha256": job.sha256}
+        elif result.rows[0]["status"] == FAILED:
+            found.lost[job.address] = result.rows[0]
+        else:
+            found.hash_of[job.address] = _keep(found, result, sizes[job.address])
+        failed += job.address in found.lost
+        progress(f"comparing, {failed} failed", number + 1, len(jobs))
+
+
+def _keep(found: _Found, outcome: Outcome, size_bytes: int | None) -> str:
+    """Write a log's files, then its rows: rows without files are never there."""
+    row = outcome.rows[0]
+    sha256: str = row["log_sha256"]
+    stem = found.output / RESULTS / file_stem(row["name"], sha256)
+    files = {".json": outcome.results, ".pdf": outcome.report}
+    write_all(
+        {stem.with_name(stem.name + end): content for end, content in files.items() if content}
+    )
+    found.store.keep(sha256, size_bytes, outcome.severities, outcome.rows)
+    return sha256
+
+
+def _written(found: _Found) -> Fleet:
+    """Make the table of all that is known by now, and write it."""
+    severities: set[str] = set()
+
+    def rows() -> Iterator[Row]:
+        for log in found.logs:
+            if (lost := found.lost.get(log.address)) is not None:
+                kept, severe = [lost], set[str]()
+            else:
+                kept, severe = found.store.rows(found.hash_of.get(log.address, ""))
+            severities.update(severe)
+            judged = bool(kept) and "axis" in kept[0]
+            results, report = _files(found, kept[0]) if judged else ("", "")
+            for row in kept:
+                yield row | {
+                    "log": log.log,
+                    "name": log.name,
+                    "px4fuse": found.store.px4fuse,
+                    "settings": found.store.settings,
+                    "results": results,
+                    "report": report,
+                }
+
+    table, against = table_of(rows()), ""
+    if found.baseline is not None:
+        held = marked(table, found.baseline)
+        table, against = held.table, held.words
+    parquet = io.BytesIO()
+    table.to_parquet(parquet, index=False)
+    contents = {
+        found.output / "fleet.parquet": parquet.getvalue(),
+        found.output / "fleet.csv": csv_bytes(table),
+    }
+    write_all(contents)
+    return Fleet(table, len(found.reused), frozenset(severities), tuple(contents), against)

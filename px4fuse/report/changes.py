@@ -1,0 +1,404 @@
+"""What changed from A to B: numbers in a table, then tracks, innovations and σ over each other."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+
+from px4fuse.analysis import Analysis
+from px4fuse.arrays import Array
+from px4fuse.comparison.comparison import AxisComparison
+from px4fuse.comparison.events import happened
+from px4fuse.comparison.why_words import the
+from px4fuse.filter.kalman import state_at
+from px4fuse.filter.signals import AISLE
+from px4fuse.plain import number_words
+from px4fuse.report.changes_words import (
+    chance_words,
+    change_words,
+    folded_words,
+    judgement_words,
+    told,
+    value_words,
+)
+from px4fuse.report.document import ChangesDocument
+from px4fuse.report.innovations import log_ticks
+from px4fuse.report.style import (
+    BOTTOM,
+    LEFT,
+    MAX_POINTS,
+    MUTED,
+    PANEL_LEFT,
+    POINTS_PER_HEIGHT,
+    POINTS_PER_WIDTH,
+    RIGHT,
+    SEVERITY_COLOURS,
+    Cursor,
+    bare_x,
+    legend_beside_title,
+    page,
+    panel,
+    printable,
+    shorten,
+    thin,
+)
+from px4fuse.results.changes import NumberChange
+from px4fuse.results.contract import ChangeResults
+
+# A is dark and solid, B lighter and dashed, so that they stay apart in grey; neither has a colour
+# of one of the filters
+STYLES: dict[str, dict[str, Any]] = {
+    "A": {"color": "#4b2e83", "lw": 1.1, "ls": "-"},
+    "B": {"color": "#2e9e6b", "lw": 1.1, "ls": (0, (4, 1.6))},
+}
+DOTS: dict[str, dict[str, Any]] = {
+    "A": {"color": "#4b2e83", "marker": "o", "ms": 1.9, "mew": 0, "ls": "none"},
+    "B": {"color": "#2e9e6b", "marker": "s", "ms": 2.1, "mew": 0, "ls": "none"},
+}
+COLOURS = {"worse": SEVERITY_COLOURS["error"], "better": "#1f6b3a"}
+SIZE = 7.6
+EDGES = (LEFT, 0.16, 0.44, 0.515, 0.61, 0.86)
+HEADS = ("", "number", "A", "B", "change, with its 95 % interval", "by chance?")
+# The axes of innovations reach so many of the larger median 2√S
+EDGE = 2.2
+MAP, PANEL = 190.0, 118.0
+
+
+@dataclass(frozen=True)
+class Track:
+    """One of the two on an axis that both have; its times count from ``zero_s``."""
+
+    name: str
+    analysis: Analysis
+    result: AxisComparison
+    zero_s: float
+
+    def since(self, index: pd.Index) -> Array:
+        """Times of a frame since its time zero (s)."""
+        time: Array = index.to_numpy() - self.zero_s
+        return time
+
+
+def draw(document: ChangesDocument) -> Iterator[Figure]:
+    """Draw the summary, and where both logs are at hand what they show."""
+    yield from _numbers(document.results)
+    a, b = document.a, document.b
+    if a is None or b is None:
+        return
+    named = [{result.axis.name for result in analysis.axes} for analysis in (a, b)]
+    common = [n for n in (AISLE, "north", "east", "down") if all(n in names for names in named)]
+    if not common:
+        return
+    tracks, since = _tracks(a, b, common[0])
+    yield _drawn_tracks(tracks, since)
+    yield _drawn_innovations(tracks, since)
+
+
+# -- numbers ---------------------------------------------------------------------------------------
+
+
+def _numbers(results: ChangeResults) -> Iterator[Figure]:
+    figure, cursor = page("What changed from A to B")
+    for text in results.summary[:1]:
+        cursor.write(text, size=10.0, weight="bold")
+        cursor.skip(2)
+    for text in results.summary[1:]:
+        cursor.write(text, size=8.6)
+    cursor.skip(4)
+    for name, side in (("A", results.a), ("B", results.b)):
+        kind = {"log": "its log", "report": "its report", "results": "its results"}[side.kind]
+        cursor.write(
+            f"{name}: {side.given}, {kind}; SHA-256 {side.log_sha256[:12]}, px4fuse {side.px4fuse}",
+            size=7.4,
+            colour=MUTED,
+        )
+    cursor.skip(6)
+    shown = told(results)
+    cells = [HEADS, *map(_cells, shown)] if shown else []
+    for at, row in enumerate(cells):
+        if cursor.y < BOTTOM + 0.03:
+            yield figure
+            figure, cursor = page("What changed from A to B, continued")
+        _row(cursor, row, is_head=at == 0)
+    cursor.skip(3)
+    lines = [(folded_words(results), MUTED)]
+    lines += [
+        (f"{text.kind.capitalize()}: {text.what}, {text.a} in A, {text.b} in B.", "black")
+        for text in results.texts
+    ]
+    lines += [
+        (f"{'New' if one.only_in == 'B' else 'Gone'} ({one.severity}): {one.message}",
+         SEVERITY_COLOURS[one.severity])
+        for one in results.findings
+    ]  # fmt: skip
+    lines += [(text, MUTED) for text in (*results.notes, *results.methods)]
+    for text, colour in lines:
+        if cursor.y - cursor.height(text, size=SIZE) < BOTTOM:
+            yield figure
+            figure, cursor = page("What changed from A to B, continued")
+        cursor.write(text, size=SIZE, colour=colour)
+        cursor.skip(2.5)
+    yield figure
+
+
+def _cells(change: NumberChange) -> tuple[str, ...]:
+    return (
+        judgement_words(change),
+        change.label,
+        value_words(change, change.a),
+        value_words(change, change.b, unit=True),
+        change_words(change),
+        chance_words(change),
+    )
+
+
+def _row(cursor: Cursor, cells: Sequence[str], *, is_head: bool) -> None:
+    cursor.y -= SIZE * 1.5 / POINTS_PER_HEIGHT
+    plain = MUTED if is_head else "black"
+    for at, (x, end, text) in enumerate(zip(EDGES, (*EDGES[1:], RIGHT), cells, strict=True)):
+        cursor.figure.text(
+            x, cursor.y, shorten(printable(text), SIZE, (end - x) * POINTS_PER_WIDTH),
+            size=SIZE, color=COLOURS.get(text, plain), weight="normal" if at else "bold",
+        )  # fmt: skip
+    if is_head:
+        cursor.skip(2.5)
+        cursor.rule()
+
+
+# -- pictures --------------------------------------------------------------------------------------
+
+
+def _tracks(a: Analysis, b: Analysis, axis: str) -> tuple[tuple[Track, Track], str]:
+    """Both on one axis, and what their times count from."""
+    took_off = [happened(analysis.comparison).take_off_s for analysis in (a, b)]
+    zeros = [times[0] for times in took_off if times]
+    since = "take-off"
+    if len(zeros) < len(took_off):
+        zeros = [float(x[axis].axis.measurement_time_s[0]) for x in (a, b)]
+        since = "the first measurement"
+    first, second = (
+        Track(name, analysis, analysis[axis], zero)
+        for name, analysis, zero in zip("AB", (a, b), zeros, strict=True)
+    )
+    return (first, second), f"time since {since} (s)"
+
+
+def _drawn_tracks(tracks: tuple[Track, Track], since: str) -> Figure:
+    along = the(tracks[0].result.axis.name)
+    figure, cursor = page(
+        "Tracks of A and B", "A is dark and solid, B lighter and dashed, on common axes."
+    )
+    top = cursor.y
+    middle = (PANEL_LEFT + RIGHT) / 2
+    drawn = False
+    for title, left, right, of in (
+        ("EKF2 from above", PANEL_LEFT, middle - 0.02, _ekf2_path),
+        ("Ours from above", middle + 0.05, RIGHT, _our_path),
+    ):
+        cursor.y = top
+        paths = [(track.name, path) for track in tracks if (path := of(track.analysis)) is not None]
+        say = "" if len(paths) == len(tracks) else "Not both have it."
+        axes = panel(cursor, title, say or "North is up.", MAP, left=left, right=right)
+        for name, (north, east) in paths:
+            every = max(1, len(north) // MAX_POINTS)
+            axes.plot(east[::every], north[::every], **STYLES[name], label=name)
+        axes.set_aspect("equal", adjustable="datalim")
+        axes.grid(visible=True, axis="both")
+        axes.xaxis.set_major_locator(MaxNLocator(5))
+        axes.set_xlabel("east (m)")
+        if not drawn and paths:
+            axes.set_ylabel("north (m)")
+            legend_beside_title(axes, top)
+            drawn = True
+    cursor.skip(34)
+    _series(
+        cursor, tracks, since,
+        (f"Position along {along}, EKF2 (m)", "As EKF2 published it.", _ekf2_position),
+        (f"Ours - EKF2 along {along} (m)", _rms_words(tracks, _apart), _apart),
+        (f"Error of EKF2 along {along} (m)", _rms_words(tracks, _error), _error),
+    )  # fmt: skip
+    return figure
+
+
+def _drawn_innovations(tracks: tuple[Track, Track], since: str) -> Figure:
+    along = the(tracks[0].result.axis.name)
+    figure, cursor = page(
+        f"Innovations and variances along {along}",
+        "Dots: innovations; lines: ±2√S of A (solid) and B (dashed). About 95 % of the dots "
+        "belong between their lines.",
+    )
+    for title, of in (
+        ("Innovations of EKF2 (m)", lambda track: track.result.ekf2_innovations),
+        ("Innovations of ours (m)", lambda track: track.result.replay.updates),
+    ):
+        _innovations(cursor, tracks, title, of)
+    _series(
+        cursor, tracks, since,
+        ("σ of position, EKF2 (m), log scale", _median_words(tracks, _ekf2_sigma), _ekf2_sigma),
+        ("σ of position, ours, before each measurement (m), log scale",
+         _median_words(tracks, _our_sigma), _our_sigma),
+        log=True,
+    )  # fmt: skip
+    return figure
+
+
+Series = tuple[Array, Array]
+Of = Callable[[Track], Series | None]
+
+
+def _series(
+    cursor: Cursor, tracks: Sequence[Track], since: str, *panels: tuple[str, str, Of],
+    log: bool = False,
+) -> None:  # fmt: skip
+    """One series of both per panel; what neither has is left out, the last says what times are."""
+    found = [(title, say, [(t, made) for t in tracks if (made := of(t)) is not None])
+             for title, say, of in panels]  # fmt: skip
+    found = [panel for panel in found if panel[2]]
+    for at, (title, say, drawn) in enumerate(found):
+        top = cursor.y
+        only = f" Only {drawn[0][0].name} has it." if len(drawn) < len(tracks) else ""
+        axes = panel(cursor, title, say + only, PANEL)
+        for track, made in drawn:
+            axes.plot(*thin(*made), **STYLES[track.name], label=track.name)
+        if log:
+            axes.set_yscale("log")
+            log_ticks(axes)
+        _finish(cursor, axes, tracks, since if at == len(found) - 1 else "")
+        legend_beside_title(axes, top)
+
+
+def _innovations(
+    cursor: Cursor,
+    tracks: Sequence[Track],
+    title: str,
+    of: Callable[[Track], Any],
+) -> None:
+    top = cursor.y
+    frames = [(track, frame) for track in tracks if isinstance(frame := of(track), pd.DataFrame)]
+    missing = [track.name for track in tracks if not isinstance(of(track), pd.DataFrame)]
+    sigmas = {t.name: 2.0 * np.sqrt(f["innovation_variance_m2"].to_numpy()) for t, f in frames}
+    edge = EDGE * max((float(np.median(s)) for s in sigmas.values()), default=1.0)
+    outside = [
+        f"{track.name} {np.mean(np.abs(frame['innovation_m']) > sigmas[track.name]):.1%}"
+        for track, frame in frames
+    ]
+    beyond = sum(int((frame["innovation_m"].abs() > edge).sum()) for _, frame in frames)
+    say = f"Outside their own ±2√S: {', '.join(outside)}." if outside else ""
+    say += f" {beyond} lie beyond the axis." if beyond else ""
+    say += f" Not available in {' and '.join(missing)}." if missing else ""
+    axes = panel(cursor, title, say.strip(), PANEL)
+    for track, frame in frames:
+        time, nu = track.since(frame.index), frame["innovation_m"].to_numpy()
+        for sign in (1.0, -1.0):
+            line = thin(time, sign * sigmas[track.name])
+            axes.plot(*line, **{**STYLES[track.name], "lw": 0.8})
+        inside = np.abs(nu) <= edge
+        axes.plot(*thin(time[inside], nu[inside]), **DOTS[track.name], label=track.name)
+    axes.axhline(0.0, color="black", lw=0.5)
+    axes.set_ylim(-edge, edge)
+    _finish(cursor, axes, tracks, "")
+    if frames:
+        legend_beside_title(axes, top, markerscale=2.0)
+
+
+def _finish(cursor: Cursor, axes: Axes, tracks: Sequence[Track], since: str) -> None:
+    """Common limits in time, whose numbers stand at the last panel alone."""
+    segments = [(track.analysis.comparison.segment, track.zero_s) for track in tracks]
+    axes.set_xlim(
+        min(segment.start_s - zero for segment, zero in segments),
+        max(segment.end_s - zero for segment, zero in segments),
+    )
+    if since:
+        axes.set_xlabel(since)
+        cursor.skip(24)
+    else:
+        bare_x(axes)
+    cursor.skip(10)
+
+
+def _ekf2_position(track: Track) -> Series | None:
+    state = track.result.ekf2_state
+    if not isinstance(state, pd.DataFrame):
+        return None
+    return track.since(state.index), state["position_m"].to_numpy()
+
+
+def _ekf2_sigma(track: Track) -> Series | None:
+    variance = track.result.ekf2_variance
+    if not isinstance(variance, pd.DataFrame):
+        return None
+    return track.since(variance.index), np.sqrt(variance["position_variance_m2"].to_numpy())
+
+
+def _our_sigma(track: Track) -> Series | None:
+    updates = track.result.replay.updates
+    return track.since(updates.index), np.sqrt(updates["prior_position_variance_m2"].to_numpy())
+
+
+def _apart(track: Track) -> Series | None:
+    """Ours minus EKF2, at EKF2's times."""
+    state = track.result.ekf2_state
+    if not isinstance(state, pd.DataFrame):
+        return None
+    ours, _ = state_at(track.result.replay, state.index.to_numpy())
+    return _known(track.since(state.index), ours - state["position_m"].to_numpy())
+
+
+def _error(track: Track) -> Series | None:
+    """EKF2 against the truth."""
+    state, truth = track.result.ekf2_state, track.result.truth
+    if not isinstance(state, pd.DataFrame) or not isinstance(truth, pd.DataFrame):
+        return None
+    true = np.interp(
+        state.index, truth.index, truth["position_m"], left=np.nan, right=np.nan
+    )  # fmt: skip
+    return _known(track.since(state.index), state["position_m"].to_numpy() - true)
+
+
+def _known(time: Array, values: Array) -> Series | None:
+    finite = np.isfinite(values)
+    return (time[finite], values[finite]) if finite.any() else None
+
+
+def _rms_words(tracks: Sequence[Track], of: Of) -> str:
+    said = [
+        f"{track.name} {number_words(float(np.sqrt(np.mean(found[1] ** 2))))} m"
+        for track in tracks
+        if (found := of(track)) is not None
+    ]
+    return f"Root mean square: {', '.join(said)}." if said else ""
+
+
+def _median_words(tracks: Sequence[Track], of: Of) -> str:
+    said = [
+        f"{track.name} {number_words(float(np.median(found[1])))} m"
+        for track in tracks
+        if (found := of(track)) is not None
+    ]
+    return f"Median: {', '.join(said)}." if said else ""
+
+
+def _ekf2_path(analysis: Analysis) -> tuple[Array, Array] | None:
+    return _path(analysis, lambda result: result.ekf2_state)
+
+
+def _our_path(analysis: Analysis) -> tuple[Array, Array] | None:
+    return _path(analysis, lambda result: result.replay.steps)
+
+
+def _path(analysis: Analysis, of: Callable[[AxisComparison], Any]) -> tuple[Array, Array] | None:
+    """North and east (m), where both were analysed."""
+    axes = {result.axis.name: of(result) for result in analysis.axes}
+    frames = [axes.get(name) for name in ("north", "east")]
+    north, east = (
+        frame["position_m"].to_numpy() if isinstance(frame, pd.DataFrame) else None
+        for frame in frames
+    )
+    return None if north is None or east is None else (north, east)

@@ -1,0 +1,65 @@
+"""What changed from A to B, on the terminal."""
+
+from __future__ import annotations
+
+from rich.console import Console
+from rich.text import Text
+
+from px4fuse.report.changes_words import (
+    change_words,
+    folded_words,
+    judgement_words,
+    told,
+    value_words,
+)
+from px4fuse.report.screen import plain_table, print_file, print_line, say
+from px4fuse.report.terminal import STYLES
+from px4fuse.results.contract import ChangeResults
+
+MOST = 15
+JUDGED = {"worse": "bold red", "better": "green", "changed": "bold", "no test": "dim"}
+HEADS = {"setting": "Setting", "parameter": "PX4", "flight": "Flight"}
+
+
+def print_changes(console: Console, results: ChangeResults, report: object = None) -> None:
+    """Print what changed, significant changes first.
+
+    Parameters
+    ----------
+    console : Console
+        Standard output.
+    results : ChangeResults
+    report : Path, optional
+        Where the page was written.
+    """
+    say(console, Text(results.summary[0], "bold"))
+    console.print()
+    for name, side in (("A", results.a), ("B", results.b)):
+        of = "" if side.given == side.log else f", of {side.log}"
+        print_line(console, name, f"{side.given}{of}")
+    shown = told(results)
+    if shown:
+        table = plain_table(
+            ("", "left"), ("number", "left"), ("A", "right"), ("B", "right"),
+            ("change (95 %)", "left"),
+        )  # fmt: skip
+        for change in shown[:MOST]:
+            judged = judgement_words(change)
+            table.add_row(
+                Text(judged, JUDGED[judged]), change.label, value_words(change, change.a),
+                value_words(change, change.b, unit=True), change_words(change),
+            )  # fmt: skip
+        console.print(table)
+    if (more := len(shown) - MOST) > 0:
+        say(console, f"and {more} more in the report" if report else f"and {more} more (--json)")
+    if folded := folded_words(results):
+        say(console, Text(folded, "dim"))
+    for text in results.texts:
+        print_line(console, HEADS[text.kind], f"{text.what}: {text.a} → {text.b}")
+    for one in results.findings:
+        head = "New" if one.only_in == "B" else "Gone"
+        print_line(console, head, Text(f"{one.severity}: {one.message}", STYLES[one.severity]))
+    for note in (*results.notes, *results.methods[:1]):
+        say(console, Text(note, "dim"))
+    if report is not None:
+        print_file(console, "Report", report)

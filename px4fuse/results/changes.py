@@ -1,0 +1,102 @@
+"""Results of ``px4fuse diff``: what changed from A to B, number by number."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from px4fuse.results.model import Base, Count, Interval, Sha256, Share, Version
+
+Status = Literal["significant", "within chance", "not tested", "differs", "same"]
+Which = Literal["A", "B"]
+Judgement = Literal["better", "worse", "changed", ""]
+
+
+class Compared(Base, frozen=True, kw_only=True):
+    """One of the two: what was given, and the flight that it is of."""
+
+    given: str
+    kind: Literal["log", "report", "results"]
+    log: str
+    log_sha256: Sha256
+    px4fuse: Version
+
+
+class NumberChange(Base, frozen=True, kw_only=True):
+    """One number of both.
+
+    Attributes
+    ----------
+    path : str
+        Where it stands in the results of both: ``axes.aisle.ekf2.nis_mean``.
+    label, unit : str
+    a, b : float
+    a_interval, b_interval : (float, float)
+        95 %; absent where there is none.
+    scale : {"ratio", "difference"}
+        What ``change`` is: b/a or b - a.
+    change : float
+        Absent where it is a ratio to zero.
+    change_interval : (float, float)
+        95 %, with what two flights with the same equipment are apart by.
+    p, q : float
+        p-value of "no change", and the same corrected for the number of tests.
+    status : str
+        "significant", "within chance" or "not tested" between two flights; "differs" or "same"
+        between two settings of one flight, where nothing is left to chance.
+    judgement : {"better", "worse", "changed", ""}
+        "changed" where B is neither; "" where the change is not significant.
+    why : str
+        What the status rests on, in words.
+    """
+
+    path: str
+    label: str
+    unit: str
+    a: float
+    b: float
+    a_interval: Interval | None = None
+    b_interval: Interval | None = None
+    scale: Literal["ratio", "difference"]
+    change: float | None = None
+    change_interval: Interval | None = None
+    p: Share | None = None
+    q: Share | None = None
+    status: Status
+    judgement: Judgement
+    why: str
+
+
+class TextChange(Base, frozen=True):
+    """A setting, a parameter of PX4 or a fact about the flight that is not the same."""
+
+    kind: Literal["setting", "parameter", "flight"]
+    what: str
+    a: str
+    b: str
+
+
+class FindingChange(Base, frozen=True):
+    """A finding that only one of the two has."""
+
+    id: str
+    severity: Literal["error", "warning", "info"]
+    message: str
+    only_in: Which
+
+
+class OneSided(Base, frozen=True):
+    """A number that only one of the two has."""
+
+    path: str
+    label: str
+    only_in: Which
+
+
+class Counts(Base, frozen=True):
+    """How many numbers are compared, tested, changed (significantly, or at all) and judged."""
+
+    compared: Count
+    tested: Count
+    changed: Count
+    better: Count
+    worse: Count

@@ -1,0 +1,39 @@
+"""Text of strangers in tables for spreadsheets, in which none of it comes to life."""
+
+from __future__ import annotations
+
+import unicodedata
+
+FORMULA = "=+-@"
+# Excel cuts off at 32,767 characters
+MAX_CHARACTERS = 32_000
+
+
+def neutral(text: str) -> str:
+    r"""Text that a spreadsheet shows as text, after OWASP's advice on CSV injection.
+
+    >>> neutral("=1+1"), neutral(" \uff0b1"), neutral("a;=1+1"), neutral("3 - 2")
+    ("'=1+1", "' ＋1", "a;'=1+1", '3 - 2')
+    """
+    # Where the computer's region says so, Excel splits at semicolons instead, even within quotes
+    parts = (f"'{part}" if _is_formula(part) else part for part in text.split(";"))
+    safe = "".join(map(_fit, ";".join(parts)))
+    return safe if len(safe) <= MAX_CHARACTERS else safe[:MAX_CHARACTERS] + "…"
+
+
+def _is_formula(text: str) -> bool:
+    """Whether its first visible character, quotes passed over, may begin a formula."""
+    if text.startswith(("\t", "\r")):
+        return True
+    for character in text:
+        # Separators, controls, formatting characters, surrogates
+        if character in "\"'" or unicodedata.category(character)[0] in "ZC":
+            continue
+        return unicodedata.normalize("NFKC", character)[0] in FORMULA
+    return False
+
+
+def _fit(character: str) -> str:
+    if unicodedata.category(character) in ("Cc", "Cs", "Zl", "Zp"):
+        return " " if character.isspace() else "\N{REPLACEMENT CHARACTER}"
+    return character

@@ -1,0 +1,347 @@
+"""The fleet's page in a real browser: five thousand logs, and names that would come to life."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from browser import Browser, Elements, contrast
+from fleet_tools import DAMAGED, NOT_LOGGED, STORY, VEHICLES, made_up
+from hypothesis import given
+from hypothesis import strategies as st
+
+from px4fuse.fleet.by_log import logs_of
+from px4fuse.fleet.page import html_text
+from px4fuse.webpage.charts import Scale, around_one, histogram, log_scale, over_time
+from px4fuse.webpage.frame import PAGE_ROWS
+
+MARKUP = '<img src=x onerror="window.alive=1"><b>bold</b>'
+BREAKOUT = "</script></noscript><script>window.alive=2</script><!-- \u2028 & &lt;"
+HOSTILE = (MARKUP, BREAKOUT, "\0\x1b\u202e", "$title", "javascript:alert(1)", "//a.b/c", "; ;")
+TEXTS = (
+    "name", "log_sha256", "px4fuse", "settings", "reason", "remedy", "vehicle", "firmware",
+    "firmware_hash", "airframe", "hardware", "source", "kf_verdict", "story", "results", "report",
+    "change",
+)  # fmt: skip
+
+
+def content(text: str) -> Any:
+    (found,) = re.findall(r'<script type="application/json" id="content">(.*?)</script>', text)
+    return json.loads(found)
+
+
+def parts(row: list[Any]) -> dict[str, Any]:
+    return {part[1]: part for part in (*row[2], *row[3])}
+
+
+# ------------------------------------------------------------------ without a browser
+
+
+def test_a_log_is_one_row_with_its_axes_inside() -> None:
+    table = made_up(40)
+    made = content(html_text(table, "Bench", "px4fuse 1"))
+    assert len(made["rows"]) == 40
+    row = made["rows"][0]
+    assert row[0][0][0] == "flight 0000.ulg"
+    inside = parts(row)
+    assert inside["What happened"][2] == STORY.splitlines()
+    assert inside["Axes"][2] == ["", "north", "east", "down"]
+    assert inside["Findings"][2][0] == "source gap (source_gap)"
+    assert [to for _, to in inside["Files"][2]] == [
+        "reports/flight%200000.pdf", "results/flight%200000.json",
+    ]  # fmt: skip
+    failed = parts(made["rows"][9])
+    assert failed["Not judged"][2] == [DAMAGED[0]]
+    assert failed["What to set"][2] == [DAMAGED[1]]
+    assert "Axes" not in failed
+
+
+def test_what_a_judged_log_lacks_is_told_too() -> None:
+    table = made_up(30)
+    table.loc[table["axis"] == "down", ["reason", "remedy"]] = ("EKF2, down: no heights", "Set it.")
+    text = html_text(table, "Bench", "px4fuse 1")
+    inside = parts(content(text)["rows"][0])
+    assert inside["Not judged"][2] == ["EKF2, down: no heights"]
+    assert inside["What to set"][2] == ["Set it."]
+    judged = table.loc[table["axis"] == "down", "log"].nunique()
+    assert f"{judged} logs (in part)" in text
+    # those that could not be judged at all come first, although they are fewer
+    assert text.index(f"<strong>{DAMAGED[1]}") < text.index("<strong>Set it.")
+    assert "Showing" not in text.split("<script")[0]
+
+
+def test_what_speaks_for_a_log_is_its_horizontal_axes() -> None:
+    table = made_up(3)
+    first = table[table["log"] == table["log"][0]].set_index("axis")
+    (log, *_) = logs_of(table)
+    nis = first.loc[["north", "east"], "kf_nis_mean"].mean()  # both have as many updates
+    assert log.factors["kf"] == pytest.approx(1.0 / nis)
+    aisle = first.loc["north"].copy()
+    aisle["kf_nis_mean"], aisle.name = 4.0, "aisle"
+    both = pd.concat([first, aisle.to_frame().T]).rename_axis("axis").reset_index()
+    assert logs_of(both)[0].factors["kf"] == pytest.approx(0.25)
+    # weighted by how many updates there are
+    first.loc["north", "updates"] = 3 * first.loc["east", "updates"]
+    weighted = (3.0 * first.loc["north", "kf_nis_mean"] + first.loc["east", "kf_nis_mean"]) / 4.0
+    assert logs_of(first.reset_index())[0].factors["kf"] == pytest.approx(1.0 / weighted)
+
+
+def test_a_column_without_numbers_is_absent_not_zero() -> None:
+    table = made_up(4)
+    for name in ("clock_offset_s", "sigma_z_m", "ekf2_nis_mean", "position_rmse_m"):
+        table[name] = np.nan
+    table["updates"] = table["updates"].astype("Int64")
+    text = html_text(table, "Bench", "px4fuse 1")
+    made = content(text)
+    assert made["rows"][0][0][6:9] == [[], [], []]
+    assert "No log with a date has it." in text
+    assert "NaN" not in json.dumps(made)
+    assert "nan" not in text.split("<script")[0].split("</style>")[1]
+
+
+def quarters(told: str) -> list[float]:
+    return [float(value) for value in re.findall(r"quarter ([\d.]+)", told)]
+
+
+def test_a_step_in_the_middle_of_the_year_is_told_in_words() -> None:
+    text = html_text(made_up(300), "Bench", "px4fuse 1")
+    (told,) = re.findall(r'aria-label="(SIGMA_Z[^"]*…00260033[^"]*)"', text)
+    first, last = quarters(told)
+    assert first == pytest.approx(0.1, rel=0.1)
+    assert last == pytest.approx(0.3, rel=0.1)
+    (steady,) = re.findall(r'aria-label="(SIGMA_Z[^"]*bench-2[^"]*)"', text)
+    first, last = quarters(steady)
+    assert last == pytest.approx(first, rel=0.1)
+
+
+def test_the_same_table_gives_the_same_page() -> None:
+    assert html_text(made_up(50), "a", "b") == html_text(made_up(50), "a", "b")
+
+
+def test_an_empty_fleet_and_one_that_only_failed() -> None:
+    assert "0 logs" in html_text(made_up(0), "Bench", "px4fuse 1")
+    table = made_up(30)
+    text = html_text(table[table["status"] == "failed"].reset_index(drop=True), "B", "px4fuse 1")
+    assert "No log has updates that could be judged." in text
+    assert DAMAGED[1] in text
+
+
+def hostile_table(word: str, count: int = 2) -> pd.DataFrame:
+    table = made_up(12).iloc[: 3 * count].copy()
+    logs = [f"{place // 3}{word}" for place in range(3 * count)]
+    return table.assign(**dict.fromkeys(TEXTS, word), findings=f"{word};x", log=logs)
+
+
+@given(text=st.text(max_size=40) | st.sampled_from(HOSTILE))
+def test_text_makes_no_elements(text: str) -> None:
+    def shape(word: str) -> list[tuple[str, list[str]]]:
+        made = html_text(hostile_table(f"a{word}z"), word, word)
+        made.encode()
+        return [(tag, sorted(attributes)) for tag, attributes in Elements(made).found]
+
+    # what parts findings makes more of them
+    assert shape(text.replace(";", ",").replace("/", "|")) == shape("x")
+
+
+def test_links_lead_nowhere_but_beside_the_page() -> None:
+    table = made_up(3)
+    for bad in ("//example.org/a", "/etc/passwd", "javascript:alert(1)", "https://example.org/"):
+        made = content(html_text(table.assign(report=bad, results=""), "a", "b"))
+        files = parts(made["rows"][0]).get("Files", ["", "", []])[2]
+        assert all(":" not in to and not to.startswith("/") for _, to in files)
+
+
+# ------------------------------------------------------------------ charts
+
+
+def test_scales_put_values_where_they_belong() -> None:
+    scale = Scale(0.1, 10.0, log=True)
+    assert [scale.share(value) for value in (0.01, 0.1, 1.0, 10.0, 99.0)] == [0, 0, 0.5, 1, 1]
+    assert scale.ticks == pytest.approx([0.1, 0.3, 1.0, 3.0, 10.0])
+    assert Scale(-0.02, 0.09).ticks == pytest.approx([0.0, 0.05])
+    around = around_one([0.5, 7.0, 3.0])
+    assert around.share(1.0) == pytest.approx(0.5)
+    assert around.high == pytest.approx(10.0)
+    assert log_scale([0.2, 0.2]).share(0.2) == pytest.approx(0.5)
+
+
+def test_marks_over_time_are_values_or_medians_of_stretches() -> None:
+    def drawn(count: int) -> tuple[list[str], int]:
+        times = pd.Series(pd.date_range("2026-01-01", periods=count, freq="h", tz="UTC"))
+        values = pd.DataFrame({"value": 1.0, "low": 0.9, "high": np.nan}, index=times.index)
+        return over_time(times, values, (times.iloc[0], times.iloc[-1]), Scale(0.5, 2.0, log=True))
+
+    marks, each = drawn(10)
+    assert (sum("<circle" in mark for mark in marks), each) == (10, 1)
+    assert not any('class="span"' in mark for mark in marks)  # an interval with one end is none
+    marks, each = drawn(600)
+    assert (sum("<circle" in mark for mark in marks), each) == (60, 10)
+
+
+def test_a_histogram_says_its_counts() -> None:
+    text = histogram([0.0, 5.0, 5.5, 10.0], 10.0, "Students by points")
+    assert "0 to 1: 1; 1 to 2: 0" in text
+    assert "5 to 6: 2" in text
+    assert "9 to 10: 1" in text
+
+
+# ------------------------------------------------------------------ in a browser
+
+
+@pytest.fixture
+def page(browser: Browser, tmp_path: Path) -> Browser:
+    file = tmp_path / "fleet.html"
+    file.write_bytes(html_text(made_up(240), "Bench & more", "px4fuse 1").encode())
+    browser.open(file)
+    return browser
+
+
+def head(title: str) -> str:
+    titles = ("Log", "Date", "Vehicle", "Firmware", "Status", "ours", "EKF2", "SIGMA_Z")
+    return f".list > thead th:nth-child({titles.index(title) + 1}) button"
+
+
+COUNT = "document.querySelector('.count').textContent"
+
+
+def test_sorts_filters_and_unfolds(page: Browser) -> None:
+    # what the table shows as "3 × too small" is sorted by the factor behind it
+    page.click(head("ours"))
+    page.click("tbody tr:first-child .name")
+    factors = {log.name: log.factors["kf"] for log in logs_of(made_up(240)) if log.factors}
+    assert page.names()[:3] == sorted(factors, key=lambda name: factors[name])[:3]
+    assert STORY.splitlines()[0] in page.ask("document.querySelector('.more').innerText")
+    assert "flight%20" in page.ask("document.querySelector('.more a').href")
+    page.choose("#filter-0", "status:failed")
+    assert page.ask(COUNT) == "Showing 24 of 240"
+    page.click("#all")
+    page.click("#text")
+    page.write("bench-2 v1.16")
+    assert 0 < len(page.names()) < 40
+    assert page.complaints() == []
+    assert page.requests() <= {"file", "data"}
+
+
+def test_what_is_pressed_above_filters_below(page: Browser) -> None:
+    table = made_up(240).drop_duplicates("log")
+    page.click('[data-tag="finding:ekf2_rejecting"]')
+    found = table["findings"].fillna("").str.contains("ekf2_rejecting").sum()
+    assert page.ask(COUNT) == f"Showing {found} of 240"
+    page.click(f'[data-tag="vehicle:{VEHICLES[1]}"]')
+    both = table["findings"].fillna("").str.contains("ekf2_rejecting") & (
+        table["vehicle"] == VEHICLES[1]
+    )
+    assert page.ask(COUNT) == f"Showing {both.sum()} of 240"
+    page.click("#all")
+    page.click(f'[data-tag="remedy:{NOT_LOGGED[1]}"]')
+    assert page.ask(COUNT) == f"Showing {(table['remedy'] == NOT_LOGGED[1]).sum()} of 240"
+    # the first of the worst ten, wherever the table stood
+    page.click("[data-open]")
+    worst = page.ask("document.querySelector('[data-open]').textContent")
+    assert page.ask("document.querySelector('tr.open .name').textContent") == worst
+    assert page.complaints() == []
+
+
+def test_five_thousand_logs_are_a_hundred_rows(browser: Browser, tmp_path: Path) -> None:
+    file = tmp_path / "fleet.html"
+    file.write_bytes(html_text(made_up(5000), "Fleet", "px4fuse 1").encode())
+    browser.open(file)
+    rows = "document.querySelectorAll('.list > tbody > tr').length"
+    everything = "document.querySelectorAll('*').length"
+    assert browser.ask(rows) == PAGE_ROWS
+    assert browser.ask(everything) < 8000
+    assert browser.ask(COUNT) == "Showing 5000 of 5000"
+    browser.click(head("SIGMA_Z"))
+    browser.click("#text")
+    browser.write("v1.14")
+    assert browser.ask(rows) == PAGE_ROWS
+    browser.click("#all")
+    browser.click("#on")
+    assert browser.ask("document.querySelector('#place').textContent") == "Logs 101 to 200 of 5000"
+    # stepping goes over the end of a page
+    browser.click(".list > tbody > tr:last-child .name")
+    name = browser.names()[-1]
+    browser.press("j", "j")
+    assert browser.ask("document.querySelector('#place').textContent") == "Logs 201 to 300 of 5000"
+    assert browser.ask("document.querySelectorAll('tr.open').length") == 1
+    browser.press("k", "k")
+    assert browser.ask("document.querySelector('tr.open .name').textContent") == name
+    assert browser.ask(rows) == PAGE_ROWS + 1
+    assert browser.complaints() == []
+    assert browser.requests() <= {"file", "data"}
+
+
+def test_hostile_logs_stay_text(browser: Browser, tmp_path: Path) -> None:
+    tables = [hostile_table(word) for word in HOSTILE]
+    file = tmp_path / "fleet.html"
+    file.write_bytes(html_text(pd.concat(tables, ignore_index=True), MARKUP, BREAKOUT).encode())
+    browser.open(file)
+    browser.ask("[...document.querySelectorAll('.unfold')].forEach((button) => button.click())")
+    assert MARKUP in browser.names()
+    assert browser.ask("document.querySelectorAll('b, img, [onerror]').length") == 0
+    assert browser.ask("document.scripts.length") == 2
+    assert browser.ask("window.alive === undefined")
+    leads = browser.ask("[...document.links].map((link) => link.protocol)")
+    assert set(leads) <= {"file:"}
+    page_tag = f"vehicle:{MARKUP}"
+    browser.ask(
+        f"[...document.querySelectorAll('[data-tag]')].find((b) => b.dataset.tag === "
+        f"{json.dumps(page_tag)}).click()"
+    )
+    assert browser.names() == [MARKUP] * 2
+    assert browser.complaints() == []
+    assert browser.requests() <= {"file", "data"}
+
+
+def test_without_scripts_it_is_a_plain_table(browser: Browser, tmp_path: Path) -> None:
+    file = tmp_path / "fleet.html"
+    file.write_bytes(html_text(made_up(400), "Fleet", "px4fuse 1").encode())
+    browser.open(file, scripts=False)
+    browser.call("Emulation.setScriptExecutionDisabled", value=False)
+    text = browser.ask("document.body.innerText")
+    assert "The first 300 of 400 logs." in text
+    assert "All rows are in fleet.csv." in text
+    assert "flight 0299.ulg" in text
+    assert "flight 0300.ulg" not in text.split("Sorting, searching")[1]
+
+
+@pytest.mark.parametrize("width", [360, 800, 1400])
+def test_nothing_sticks_out_of_the_window(page: Browser, width: int) -> None:
+    page.resize(width, 800)
+    page.click("tbody tr:nth-child(3) .name")
+    assert page.ask("document.documentElement.scrollWidth") <= width
+    page.click("[data-group='numbers']")
+    assert page.ask("document.documentElement.scrollWidth") <= width
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_contrast_is_enough_for_weak_eyes(page: Browser, scheme: str) -> None:
+    page.call(
+        "Emulation.setEmulatedMedia",
+        features=[{"name": "prefers-color-scheme", "value": scheme}],
+    )
+    page.click("tbody tr:nth-child(2) .name")
+    found = page.contrasts()
+    page.call("Emulation.setEmulatedMedia", features=[])
+    assert len(found) > 200
+    for front, back, name in found:
+        assert contrast(front, back) >= 4.5, (front, back, name)
+
+
+def test_every_chart_is_told_to_who_does_not_see_it(page: Browser) -> None:
+    told = page.ask(
+        "[...document.querySelectorAll('svg.plot')].map((one) => "
+        "one.getAttribute('aria-label') || one.getAttribute('aria-hidden'))"
+    )
+    assert told
+    assert all(told)
+    # those hidden from a screen reader stand in a table that has the numbers
+    assert page.ask(
+        "[...document.querySelectorAll('svg.plot[aria-hidden]')]"
+        ".every((one) => one.closest('table.spread'))"
+    )
