@@ -27,12 +27,12 @@ MOODLE = (
     '"Participant 4713","Pending Pat",pat@x.edu,"No submission",55.00,100.00,Yes,-,-,old\r\n'
 )
 CANVAS = (
-    "Student,ID,SIS User ID,SIS Login ID,Section,Quiz (8),Lab 3 (9),Final Score\n"
-    ",,,,,,Manual Posting,\n"
-    "    Points Possible,,,,,10.00,100.00,(read only)\n"
-    '"Doe, Jane",12345,0042,jdoe,A,8.00,,90\n'
-    '"Roe, Max",12346,43,mroe,A,7.00,,80\n'
-    '"Pat, Pending",12347,44,ppat,A,7.00,,80\n'
+    "Student,ID,SIS User ID,SIS Login ID,Section,Quiz (8),Lab 3 (9),Roll (7),Final Score\n"
+    ",,,,,,Manual Posting,,\n"
+    "    Points Possible,,,,,10.00,100.00,(read only),(read only)\n"
+    '"Doe, Jane",12345,0042,jdoe,A,8.00,,1,90\n'
+    '"Roe, Max",12346,43,mroe,A,7.00,,1,80\n'
+    '"Pat, Pending",12347,44,ppat,A,7.00,,1,80\n'
 )
 BLACKBOARD = (
     '"Last Name"\t"First Name"\t"Username"\t"Student ID"\t"Lab 3 [Total Pts: 100 Score] |1281892"\t'
@@ -133,7 +133,8 @@ def test_a_german_table_has_its_separator_and_comma(tmp_path) -> None:
 @pytest.mark.parametrize(
     ("text", "column", "says"),
     [
-        (CANVAS, "", r"several columns.*--column: Quiz, Lab 3"),
+        (CANVAS, "", r"several columns.*--column: Quiz, Lab 3\."),
+        (CANVAS, "Roll", "no column for the grade"),
         (CANVAS, "Lab 4", "no column for the grade"),
         (CANVAS, "Final Score", "no column for the grade"),
         ("id,name\n1,A\n", "", "no column for the grade"),

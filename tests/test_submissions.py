@@ -153,9 +153,18 @@ def test_gradescope_says_who_and_when_beside_its_submissions(tmp_path):
     write(tmp_path / "unpacked" / "submission_metadata.yml", METADATA.encode())
     write(tmp_path / "unpacked" / "submission_31" / "submission_metadata.yml", forged.encode())
     for place in (path, tmp_path / "unpacked"):
-        (one,) = gradescope_people([place]).values()
+        people, notes = gradescope_people([place])
+        (one,) = people.values()
+        assert notes == ()
         assert (one.name, one.student_id, one.email) == ("Doe, Jane", "0042", "jane@example.edu")
         assert one.time.isoformat() == "2026-11-20T22:59:01.123456+00:00"
+
+
+def test_metadata_that_cannot_be_read_is_said(tmp_path):
+    bomb = zipped({"submission_metadata.yml": b" " * 5_000_000})
+    people, (note,) = gradescope_people([write(tmp_path / "export.zip", bomb)])
+    assert people == {}
+    assert note.startswith("export.zip: who handed in is not known: it shrinks more than 100 times")
 
 
 def test_times_of_entries_are_kept(tmp_path):

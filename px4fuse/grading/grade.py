@@ -144,7 +144,7 @@ def grade(
     for sheet in course.worksheets:
         grade_column(sheet, course.column)
     found, notes = submissions.collect(paths)
-    people = submissions.gradescope_people(paths)
+    people, unread = submissions.gradescope_people(paths)
     origins = [with_metadata(one.name, people) for one in found]
     register = register_of(course, key)
     graded, reused = grade_all(
@@ -161,7 +161,7 @@ def grade(
         output / RECORDS,
         processes,
     )  # fmt: skip
-    return Outcome(entries, (*notes, *unknown, *more), reused, written)
+    return Outcome(entries, (*notes, *unread, *unknown, *more), reused, written)
 
 
 def register_of(course: Course, key: AnswerKey | None) -> Register | None:

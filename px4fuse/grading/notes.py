@@ -10,9 +10,9 @@ from __future__ import annotations
 import re
 import zlib
 from collections import Counter
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
 from itertools import islice, product
 from typing import Literal
 
@@ -170,12 +170,14 @@ class Notes:
         return index
 
     def _with(self, stem: str) -> set[int]:
-        return set().union(*(at for word, at in self._index.items() if _begins(word, stem)))
+        begins = _beginning(stem)
+        return set().union(*(at for word, at in self._index.items() if begins(word)))
 
     def _stances(self, sentence: Sentence, stems: Sequence[str]) -> Iterator[Stance]:
         """What a sentence says of a phrase, for each place where its words stand."""
         places = [
-            [at for at, word in enumerate(sentence.words) if _begins(word, stem)] for stem in stems
+            [at for at, word in enumerate(sentence.words) if _beginning(stem)(word)]
+            for stem in stems
         ]
         for chosen in islice(product(*places), MAX_TRIES):
             if not self.words_of_rubric.negations.isdisjoint(stems):
@@ -367,14 +369,17 @@ def _quoted(sentence: Sentence, runs: Collection[tuple[str, ...]]) -> bool:
     return 2 * len(covered) >= len(sentence.words) > 0
 
 
-def _begins(word: str, stem: str) -> bool:
+@cache
+def _beginning(stem: str) -> Callable[[str], bool]:
     """Whether a word begins like this one; in scripts that do not part words, holds it.
 
     Two letters are a word of their own: "no" is not the beginning of "nothing".
     """
     if NO_SPACES.match(stem):
-        return stem in word
-    return word == stem if len(stem) <= SHORT else word.startswith(stem)
+        return lambda word: stem in word
+    if len(stem) <= SHORT:
+        return stem.__eq__
+    return lambda word: word.startswith(stem)
 
 
 def _weight(word: str) -> int:

@@ -14,7 +14,7 @@ import zipfile
 import zlib
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path
 from typing import IO
@@ -133,12 +133,20 @@ def read(submission: Submission) -> bytes | Refused:
     return content
 
 
-def gradescope_people(paths: Sequence[Path]) -> dict[str, Origin]:
+def gradescope_people(paths: Sequence[Path]) -> tuple[dict[str, Origin], tuple[str, ...]]:
     """What Gradescope's export says of its submissions; empty where nothing came from there.
 
     Only the file beside the submissions is read, never one that a student handed in.
+
+    Returns
+    -------
+    people : dict
+        Number of a submission to who handed it in.
+    notes : tuple of str
+        Why such a file was not read.
     """
     found: dict[str, Origin] = {}
+    notes: list[str] = []
     for path in paths:
         for file, name in _files(path, []):
             texts: list[bytes] = []
@@ -146,11 +154,15 @@ def gradescope_people(paths: Sequence[Path]) -> dict[str, Origin]:
                 with file.open("rb") as stream:
                     texts.append(stream.read(MAX_BYTES))
             elif name.lower().endswith(".zip"):
-                with suppress(_EntryError, MemoryError, *_DAMAGED):
+                try:
                     texts += _metadata_inside(file)
+                except _EntryError as error:
+                    notes.append(f"{_shown(name)}: who handed in is not known: {error}")
+                except (MemoryError, *_DAMAGED):  # collect says so of the whole zip file
+                    continue
             for text in texts:
                 found |= gradescope_metadata(text.decode("utf-8", errors="replace"))
-    return found
+    return found, tuple(notes)
 
 
 def _metadata_inside(file: Path) -> list[bytes]:
