@@ -81,7 +81,7 @@ def test_read_back_it_is_what_was_made_safe(rows: list[tuple[str, dict[str, floa
     assert len(rest) == len(rows)
     for (text, numbers), row in zip(rows, rest, strict=True):
         assert len(row) == len(head)
-        said = [neutral(text)] * 2 + [neutral_id(text), "cannot verify", "1", "2", "", "1"]
+        said = [neutral(text)] * 2 + [neutral_id(text), "cannot verify", "1", "", "2", "", "1"]
         assert row[: len(FIRST)] == said
         both = neutral(f"{text} | {text}")
         said = [neutral(text), "", "", neutral(text), both, both, neutral(text), both, "ab" * 32]
@@ -127,7 +127,7 @@ def test_numbers_stay_numbers_and_what_is_none_is_empty() -> None:
     head, first, second = cells(made)
     own = slice(len(FIRST), -len(LAST))
     assert head[own] == ["a", "b", "NIS", "gap"]
-    assert first[4:8] == ["0.3", "2", "", "0.3"]
+    assert first[4:9] == ["0.3", "", "2", "", "0.3"]
     assert first[own] == ["0.3", "", "-0.125", ""]
     assert second[own] == ["", "1", "", "1e-07"]
 
@@ -149,11 +149,21 @@ def test_late_overridden_pending_and_missing_ones_say_so() -> None:
     missing = Entry("C", "-17", None, of=4.0)
     head, *rest = cells(csv_text([late, pending, missing]))
     rows = [dict(zip(head, row, strict=True)) for row in rest]
-    asked = ("id", "status", "points", "deducted", "total", "cover", "hours late", "pending")
+    asked = (
+        "id",
+        "status",
+        "points",
+        "pending points",
+        "deducted",
+        "total",
+        "cover",
+        "hours late",
+        "pending",
+    )
     assert [[row[name] for name in asked] for row in rows] == [
-        ["0042", "verified", "1.5", "0.4", "1.1", "0.5", "1.5", ""],
-        ["0042", "verified", "3", "", "", "2", "", "Run 0.1.1."],
-        ["-17", "missing", "", "", "", "", "", ""],
+        ["0042", "verified", "1.5", "", "0.4", "1.1", "0.5", "1.5", ""],
+        ["0042", "verified", "", "3", "", "", "2", "", "Run 0.1.1."],
+        ["-17", "missing", "", "", "", "", "", "", ""],
     ]
     assert rows[0]["comment"] == "see me"
 

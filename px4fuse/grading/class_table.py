@@ -12,7 +12,7 @@ from dataclasses import replace
 from px4fuse.grading.model import Entry, Graded, Override
 from px4fuse.spreadsheet import neutral
 
-FIRST = ("file", "student", "id", "status", "points", "of", "deducted", "total")
+FIRST = ("file", "student", "id", "status", "points", "pending points", "of", "deducted", "total")
 LAST = (
     "handed in", "hours late", "pending", "comment", "remarks", "flags", "other files", "reasons",
     "log SHA-256",
@@ -45,7 +45,8 @@ def csv_text(entries: Sequence[Entry]) -> str:
         points = item_points(one) if one else {}
         row: list[str | float | None] = [
             one.submission if one else "", entry.student, None, one.status if one else "missing",
-            one.points if one else None, entry.of, entry.deduction or None, entry.total,
+            one.counted if one else None, one.points if one and one.pending else None,
+            entry.of, entry.deduction or None, entry.total,
             *(points.get(title) for title in items),
             *((one.numbers if one else {}).get(title) for title in numbers),
             entry.handed_in, None if entry.late_s is None else entry.late_s / 3600.0,
