@@ -67,7 +67,7 @@ DETECTOR = Detector(
     _detect,
     {
         "ekf2_ev_delay_wrong": "ev_delay wrong, ev_delay should, delay wrong, ekf2_ev_delay, "
-        "ev_delay, delay, clock offset, time offset, stamp late, stamp early, latency",
+        "ev_delay, delay",
     },
     {"ekf2_ev_delay_wrong": tuple(f"--mistake ekf2-delay={ms}ms" for ms in (120, 150, 175))},
 )

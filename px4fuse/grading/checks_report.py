@@ -98,11 +98,11 @@ def notes(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float, str]:
             f"Your notes {read.problem}: that earns nothing. Say in sentences of your own what "
             "you see in this flight, how large it is, and what you did about it."
         )
-    wrong = evidence.charged
+    wrong = evidence.answer is not None and (evidence.answer.findings or evidence.charged)
     if wrong and not evidence.claims.earned:
         return 0.0, (
-            "Your notes name only mistakes that your log does not have: that earns nothing. Look "
-            "at the report's findings first, and say what you see in this flight."
+            "Your notes name nothing that is wrong with this flight: that earns nothing. Look at "
+            "the report's findings first, and say what you see in this flight."
         )
     share = min(words / given["min_words"], different / given["min_different"], 1.0)
     if share == 1.0:

@@ -12,7 +12,13 @@ from px4fuse.grading.notes import Mention
 # In the words of the rubric: what names a subject rather than a mistake
 TOPICS = "topic"
 # What a student rightly says of a mistake although it has a finding of its own
-_BRINGS: Mapping[str, tuple[str, ...]] = {"source_gap": ("ekf2_not_fusing", "ekf2_rejecting")}
+_BRINGS: Mapping[str, tuple[str, ...]] = {
+    "source_gap": ("ekf2_not_fusing", "ekf2_rejecting"),
+    "source_stamps_of_arrival": ("source_clock_offset",),
+    "source_clock_changes": ("source_clock_offset", "source_stamps_of_arrival"),
+}
+# Told with an offset of the clock where both are there, but never its effect
+_OF_ITS_OWN = frozenset(("source_stamps_of_arrival",))
 
 
 @dataclass(frozen=True)
@@ -96,6 +102,14 @@ def claims_of(
             elif not plain and said.stance == "claimed":
                 unsure_wrong[finding] = said.passage
     return Claims(frozenset(right), unsure, open_, wrong, unsure_wrong)
+
+
+def entailed(findings: Collection[str]) -> frozenset[str]:
+    """Findings with what they bring with them, as far as that is no mistake of its own."""
+    brought: frozenset[str] = frozenset().union(
+        *(_reached(start, _followers) for start in findings)
+    )
+    return frozenset(findings) | (brought - _OF_ITS_OWN)
 
 
 def family(findings: Collection[str]) -> frozenset[str]:

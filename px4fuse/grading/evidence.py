@@ -12,7 +12,7 @@ from typing import Any, Literal
 from px4fuse.assignment.drawing import POSSIBLE_FINDINGS
 from px4fuse.assignment.key import Answer, AnswerKey
 from px4fuse.filter.tuning import HORIZONTAL
-from px4fuse.grading.claims import TOPICS, Claims, claims_of, family
+from px4fuse.grading.claims import TOPICS, Claims, claims_of, entailed, family
 from px4fuse.grading.folding import folded
 from px4fuse.grading.model import Rubric
 from px4fuse.grading.names import named
@@ -119,7 +119,7 @@ class Evidence:
         shown = {one for found in self.results.findings for one in found.ids}
         there = shown if self.answer is None else set(self.answer.findings)
         return claims_of(
-            partial(self._mention, self._notes), there, POSSIBLE_FINDINGS, family(there | shown)
+            partial(self._mention, self._notes), there, POSSIBLE_FINDINGS, entailed(there) | shown
         )
 
     @property
