@@ -28,6 +28,8 @@ if _typing.TYPE_CHECKING:
     from px4fuse.filter.tuning import tune as tune
     from px4fuse.findings import Finding as Finding
     from px4fuse.findings import find as find
+    from px4fuse.fleet.changes import Changes as Changes
+    from px4fuse.fleet.changes import diff as diff
     from px4fuse.fleet.run import batch as batch
     from px4fuse.flight import Flight as Flight
     from px4fuse.flight import Unavailable as Unavailable
@@ -48,6 +50,7 @@ if _typing.TYPE_CHECKING:
 _HOMES = {
     "Analysis": "analysis",
     "AxisTuning": "filter.tuning",
+    "Changes": "fleet.changes",
     "ClockOffset": "filter.clock",
     "Comparison": "comparison.comparison",
     "ComparisonRequest": "request",
@@ -68,6 +71,7 @@ _HOMES = {
     "batch": "fleet.run",
     "close_loop": "notebook.commands",
     "compare": "notebook.commands",
+    "diff": "fleet.changes",
     "evaluate": "notebook.commands",
     "explain": "analysis",
     "find": "findings",

@@ -14,8 +14,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from px4fuse.comparison.asked import asked_of_ekf2
-from px4fuse.comparison.comparison import AxisComparison, Comparison, compare
+from px4fuse.comparison.comparison import (
+    AxisComparison,
+    Comparison,
+    compare,
+    compare_prepared,
+)
 from px4fuse.comparison.drift import may_drift, with_drift
+from px4fuse.comparison.preparation import Prepared, prepare
 from px4fuse.comparison.why import Why, why_ekf2_differs
 from px4fuse.display import Shown, brief
 from px4fuse.ekf2.model import Model, open_model
@@ -264,6 +270,21 @@ def run_comparison(
     LogError, MissingDataError, SettingsError
         As :func:`run`.
     """
+    return compare_prepared(
+        run_preparation(request, progress, flight), lambda name: progress(f"filtering {name}")
+    )
+
+
+def run_preparation(
+    request: ComparisonRequest, progress: Progress = _silent, flight: Flight | None = None
+) -> Prepared:
+    """Read a flight and choose what is compared, which is all that tuning and clock need.
+
+    Raises
+    ------
+    LogError, MissingDataError, SettingsError
+        As :func:`run`.
+    """
     asked = request.clock_offset_s
     settings = Settings(
         sigma_a_m_s2=request.sigma_a_m_s2,
@@ -282,8 +303,8 @@ def run_comparison(
             raise SettingsError(f"`{name}` {value:g} is not a finite number.")
     read = flight or read_flight(request, progress)
 
-    def compared(settings: Settings) -> Comparison:
-        return compare(
+    def prepared(settings: Settings) -> Prepared:
+        return prepare(
             read,
             settings,
             axes=request.axes or None,
@@ -292,19 +313,18 @@ def run_comparison(
             start_s=request.start_s,
             end_s=request.end_s,
             input_required=request.input == "imu",
-            progress=lambda name: progress(f"filtering {name}"),
         )
 
-    comparison = compared(settings)
+    first = prepared(settings)
     if asked != AUTO or request.position is not None:
-        return comparison
-    found = clock_offset(comparison, tuned_horizontally(comparison), progress)
+        return first
+    found = clock_offset(first, tuned_horizontally(first), progress)
     if isinstance(found, Unavailable) or not found.determinable:
         raise MissingDataError(
             f"{read.log.name}: `clock_offset_s` auto: not determinable: {found.reason}. "
             "Give the seconds to add, or leave it out."
         )
-    return compared(replace(settings, clock_offset_s=found.offset_s))
+    return prepared(replace(settings, clock_offset_s=found.offset_s))
 
 
 def run_loop(request: LoopRequest, progress: Progress = _silent) -> Loop:
@@ -465,13 +485,13 @@ def explain(comparison: Comparison, progress: Progress = _silent) -> Analysis:
     return Analysis(comparison, tuning, clock, model, why, loop, heading)
 
 
-def tuned_horizontally(comparison: Comparison) -> Tuning:
+def tuned_horizontally(comparison: Comparison | Prepared) -> Tuning:
     """The horizontal noises alone, which is what the clock estimate needs."""
     return tuned(comparison, (HORIZONTAL,))
 
 
 def tuned(
-    comparison: Comparison,
+    comparison: Comparison | Prepared,
     names: tuple[str, ...] | None = None,
     progress: Progress = _silent,
     made: Made | None = None,
@@ -480,7 +500,7 @@ def tuned(
 
     Parameters
     ----------
-    comparison : Comparison
+    comparison : Comparison or Prepared
     names : tuple of str, optional
         Axis names and "horizontal"; by default all that there are.
     progress : callable
@@ -491,7 +511,7 @@ def tuned(
     flight = comparison.flight
     slow = imu_too_slow_for_clocks(flight)
     return tune(
-        tuple(result.axis for result in comparison.axes),
+        comparison.lines,
         comparison.settings,
         names,
         lambda name: progress(f"tuning {name}"),
@@ -502,7 +522,7 @@ def tuned(
 
 
 def clock_offset(
-    comparison: Comparison,
+    comparison: Comparison | Prepared,
     tuning: Tuning,
     progress: Progress = _silent,
     made: Made | None = None,
@@ -511,7 +531,7 @@ def clock_offset(
 
     Parameters
     ----------
-    comparison : Comparison
+    comparison : Comparison or Prepared
     tuning : mapping
         Its measurement noise and outliers are used where it has them.
     progress : callable

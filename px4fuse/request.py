@@ -314,7 +314,12 @@ EVALUATION_OPTIONS = {
 }
 
 # What the errors of a command may name: its arguments in Python, to its options
-ARGUMENTS = OPTIONS | {"position": "--position", "changes": "--set"}
+ARGUMENTS = OPTIONS | {
+    "position": "--position",
+    "changes": "--set",
+    "scheduler": "--scheduler",
+    "memory": "--memory",
+}
 
 
 def with_options(text: str, options: Mapping[str, str] = ARGUMENTS) -> str:

@@ -8,6 +8,7 @@ import io
 import json
 import re
 import struct
+import unicodedata
 import zlib
 from pathlib import Path
 from typing import Any
@@ -25,7 +26,7 @@ from px4fuse.verification.model import Difference, Verdict
 from px4fuse.webpage.safe import MAX_CHARACTERS
 
 MARKUP = '<img src=x onerror="window.alive=1"><b>bold</b>'
-BREAKOUT = "</script><script>window.alive=2</script><!-- \u2028 ]]> & &lt;"
+BREAKOUT = "</script ></script\n<script>window.alive=2</script><!-- \u2028 ]]> & &lt;"
 FORMULA = "=cmd|' /C calc'!A0"
 REVERSED = "\u202egnp.exe\u202c"
 TURNED = "\N{REPLACEMENT CHARACTER}gnp.exe\N{REPLACEMENT CHARACTER}"
@@ -230,7 +231,7 @@ def anonymous_class() -> list[Entry]:
 
 def test_an_anonymous_class_names_nobody() -> None:
     text = html_text(anonymous_class(), "Class", "px4fuse 1")
-    written = text + json.dumps(content(text), ensure_ascii=False)
+    written = unicodedata.normalize("NFC", text + json.dumps(content(text), ensure_ascii=False))
     for name, student_id, file in PEOPLE:
         for word in (*name.split(), student_id, *re.split(r"[/. _]", file)):
             if len(word) > 2 and word.lower() not in ("pdf", "report", "file", "assignsubmission"):
@@ -430,6 +431,7 @@ def test_the_policy_stops_what_would_come_to_life(page: Browser) -> None:
     assert page.ask("window.alive === undefined")
     refusals = [c["entry"]["text"] for c in page.complaints() if "entry" in c]
     assert len([text for text in refusals if "Content Security Policy" in text]) >= 2
+    assert any("img-src" in text and "127.0.0.1" in text for text in refusals)
 
 
 def test_without_scripts_it_is_a_plain_table(browser: Browser, tmp_path: Path) -> None:

@@ -73,7 +73,8 @@ def test_a_leg_is_the_product_of_its_steps(model: Model, legs: Legs) -> None:
     stretch = model.inputs.stretches[0]
     starts = np.concatenate([[0], legs.end[:-1]])
     gyro, force = (model.inputs.settings[f"EKF2_{name}_NOISE"] for name in ("GYR", "ACC"))
-    noise = gyro**2 * legs.gyro_noise + force**2 * legs.accelerometer_noise
+    noise = np.zeros_like(legs.transition)
+    noise[:, :9, :9] = gyro**2 * legs.gyro_noise + force**2 * legs.accelerometer_noise
     for leg in (0, 1, 57, 300, len(legs.end) - 1):
         F, Q = np.eye(15), np.zeros((15, 15))
         x = x0 = np.random.default_rng(leg).normal(0.0, 0.01, 15)

@@ -11,9 +11,9 @@ import numpy as np
 import pandas as pd
 import pytest
 from browser import Browser, Elements, contrast
-from fleet_tools import DAMAGED, NOT_LOGGED, STORY, VEHICLES, made_up
 from hypothesis import given
 from hypothesis import strategies as st
+from made_up_fleet import DAMAGED, NOT_LOGGED, STORY, VEHICLES, made_up
 
 from px4fuse.fleet.by_log import logs_of
 from px4fuse.fleet.page import html_text
@@ -21,7 +21,7 @@ from px4fuse.webpage.charts import Scale, around_one, histogram, log_scale, over
 from px4fuse.webpage.frame import PAGE_ROWS
 
 MARKUP = '<img src=x onerror="window.alive=1"><b>bold</b>'
-BREAKOUT = "</script></noscript><script>window.alive=2</script><!-- \u2028 & &lt;"
+BREAKOUT = "</script ></noscript\n><script>window.alive=2</script><!-- \u2028 & &lt;"
 HOSTILE = (MARKUP, BREAKOUT, "\0\x1b\u202e", "$title", "javascript:alert(1)", "//a.b/c", "; ;")
 TEXTS = (
     "name", "log_sha256", "px4fuse", "settings", "reason", "remedy", "vehicle", "firmware",

@@ -189,7 +189,7 @@ def test_names_are_covered_and_nothing_else() -> None:
 
 
 def test_a_name_that_cannot_be_found_is_not_shown() -> None:
-    made = page_pictures(written((0.9, "by somebody")), ("Ada", "10017"))
+    made = page_pictures(written((0.98, "Ada"), (0.9, "by somebody")), ("Ada", "10017"))
     assert isinstance(made, Unavailable)
     assert "cannot be found" in made.reason
 
@@ -208,9 +208,9 @@ def test_pages_are_drawn_once_and_named_by_what_they_show(tmp_path: Path) -> Non
     assert {path.name for path in first} == {file for files in made.values() for file in files}
     assert (folder / made["a"][0]).read_bytes() == picture(REPORT.read_bytes(), 0)
     # one that is not whole is drawn again, the others are not
-    (folder / made["b"][0]).unlink()
+    (folder / made["a"][3]).unlink()
     assert draw_sheets(reports, folder, processes=1) == made
-    kept = folder / made["a"][3]
+    kept = folder / made["b"][0]
     assert kept.stat().st_mtime_ns == first[kept]
     hidden = draw_sheets({"b": (tmp_path / "b.pdf", ("Ada",))}, folder, processes=1)
     assert hidden["b"] != made["b"]

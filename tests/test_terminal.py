@@ -20,7 +20,7 @@ from test_cli import run_main
 
 import px4fuse.report.pdf
 from px4fuse.analysis import run as analyse
-from px4fuse.analysis import run_comparison, run_loop, run_what_if, tuned
+from px4fuse.analysis import run_loop, run_preparation, run_what_if, tuned
 from px4fuse.cli import cli, compare, loop, tune, whatif
 from px4fuse.cli.outputs import default_report, progress, terminal
 from px4fuse.cli.quantity import NAMES, in_unit
@@ -410,7 +410,7 @@ def test_every_step_of_the_bar_is_said_in_its_order(sample_log) -> None:
     told: dict[str, list[str]] = {"compare": [], "tune": [], "whatif": [], "loop": []}
     analyse(ComparisonRequest(log=str(sample_log)), told["compare"].append)
     tuned(
-        run_comparison(ComparisonRequest(log=str(sample_log)), told["tune"].append),
+        run_preparation(ComparisonRequest(log=str(sample_log)), told["tune"].append),
         progress=told["tune"].append,
     )
     run_what_if(WhatIfRequest(log=str(sample_log)), told["whatif"].append)

@@ -13,13 +13,14 @@ import click
 
 from px4fuse.cli.compare import SEVERITIES
 from px4fuse.cli.inputs import path_option, settings_options
-from px4fuse.cli.outputs import Interrupted, Step, progress, terminal, write_outputs
+from px4fuse.cli.outputs import Interrupted, Step, progress, spare_inputs, terminal, write_outputs
 from px4fuse.errors import OutputError, SettingsError
 
 if TYPE_CHECKING:
     from px4fuse.fleet.run import Fleet
 
 FAILED, WORSE = "failed", "worse"
+MOST_WORSE = 10
 # How a cluster of each kind is started, for people who have one
 CLUSTERS = {
     "slurm": """\
@@ -148,6 +149,7 @@ def batch(
             "--workers and --memory are of a cluster that px4fuse starts; with --scheduler they "
             "are given to dask worker."
         )
+    spare_inputs([] if junit_path is None else [junit_path])  # before the work, not after it
     if fail_on == WORSE and baseline is None:
         raise SettingsError("--fail-on worse requires --baseline: worse than what?")
     from px4fuse.fleet.engine import connected
@@ -224,8 +226,11 @@ def _print(fleet: Fleet) -> None:
     found = logs["findings"].str.split(";").explode()
     for finding, count in found[found != ""].value_counts().head(5).items():
         say(console, f"{count} × {finding}")
-    for row in fleet.table[fleet.table["change"] != ""].itertuples():
+    worse = fleet.table[fleet.table["change"] != ""]
+    for row in worse.head(MOST_WORSE).itertuples():
         say(console, Text(f"worse: {row.log} {row.axis}: {row.change}", "red"))
+    if len(worse) > MOST_WORSE:
+        say(console, f"and {len(worse) - MOST_WORSE} more in the column change")
     if fleet.against:
         say(console, fleet.against)
     counts = logs["status"].value_counts()

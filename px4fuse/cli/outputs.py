@@ -29,7 +29,7 @@ UNWRAPPED = 10_000
 # Parameters that name files to read; some name a part of a log after a colon
 INPUTS = (
     "log", "logs", "report", "mavlink", "position", "notes", "source", "estimate", "reference",
-    "closures", "a", "b",
+    "closures", "a", "b", "baseline",
 )  # fmt: skip
 # Under it a run keeps which files it has written, for what is said where it then ends early
 WRITTEN = "px4fuse.written"
@@ -220,7 +220,7 @@ def spare_inputs(targets: Iterable[Path]) -> None:
     params = click.get_current_context().params
     given = [params[name] for name in INPUTS if params.get(name) is not None]
     several = [one if isinstance(one, tuple) else (one,) for one in given]
-    paths = [path for some in several for path in some]
+    paths = [Path(path) for some in several for path in some]  # URLs are texts
     read = [path if path.exists() else Path(str(path).rpartition(":")[0]) for path in paths]
     for target in targets:
         for source in read:

@@ -19,7 +19,7 @@ from px4fuse.cli.outputs import (
 )
 from px4fuse.writing import STANDARD_OUTPUT
 
-STEPS = ("reading", "filtering", "tuning", "clock offset", "changes of the clock")
+STEPS = ("reading", "tuning", "clock offset", "changes of the clock")
 
 
 @click.command()
@@ -32,7 +32,7 @@ def sync(log: Path, json_path: Path | None, **given: Any) -> None:
     From the acceleration that the IMU felt; EKF2 and its attitude are not asked. LOG is a PX4 ULog
     or a MAVLink recording.
     """
-    from px4fuse.analysis import clock_offset, run_comparison, tuned_horizontally
+    from px4fuse.analysis import clock_offset, run_preparation, tuned_horizontally
     from px4fuse.report.terminal import print_advice
     from px4fuse.report.words import clock_advice
     from px4fuse.request import command_line
@@ -40,7 +40,7 @@ def sync(log: Path, json_path: Path | None, **given: Any) -> None:
 
     request = comparison_request(log, given)
     with progress(json_path == STANDARD_OUTPUT, STEPS) as step:
-        compared = run_comparison(request, step)
+        compared = run_preparation(request, step)
         step("tuning")
         found = clock_offset(compared, tuned_horizontally(compared), step)
     if write_json(sync_results(request, compared, found, command_line(request, "sync")), json_path):

@@ -22,13 +22,13 @@ from px4fuse.writing import STANDARD_OUTPUT
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from px4fuse.comparison.comparison import Comparison
+    from px4fuse.comparison.preparation import Prepared
     from px4fuse.filter.tuning import AxisTuning, Noise
     from px4fuse.flight import Unavailable
     from px4fuse.request import ComparisonRequest
 
 STEPS = (
-    "reading", "filtering",
+    "reading",
     *(f"tuning {name}" for name in ("north", "east", "down", "aisle", "horizontal")),
 )  # fmt: skip
 
@@ -43,14 +43,14 @@ def tune(log: Path, json_path: Path | None, **given: Any) -> None:
     --sigma-a and --sigma-z are what they are compared with. LOG is a PX4 ULog or a MAVLink
     recording.
     """
-    from px4fuse.analysis import run_comparison
+    from px4fuse.analysis import run_preparation
     from px4fuse.analysis import tuned as tuned_noises
     from px4fuse.request import command_line
     from px4fuse.results.build import tuning_results
 
     request = comparison_request(log, given)
     with progress(json_path == STANDARD_OUTPUT, STEPS) as step:
-        compared = run_comparison(request, step)
+        compared = run_preparation(request, step)
         tuned = tuned_noises(compared, progress=step)
     if write_json(
         tuning_results(request, compared, tuned, command_line(request, "tune")), json_path
@@ -61,7 +61,7 @@ def tune(log: Path, json_path: Path | None, **given: Any) -> None:
 
 def _print(
     console: Console,
-    compared: Comparison,
+    compared: Prepared,
     tuned: dict[str, AxisTuning | Unavailable],
     request: ComparisonRequest,
 ) -> None:

@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.arrays import Array
+from px4fuse.comparison.preparation import Prepared, prepare
 from px4fuse.comparison.projection import (
     MIN_COMMON_SAMPLES,
     continuous_state,
@@ -18,25 +19,15 @@ from px4fuse.comparison.projection import (
     project_variance,
 )
 from px4fuse.display import Shown
-from px4fuse.errors import MissingDataError, SettingsError
+from px4fuse.errors import MissingDataError
 from px4fuse.filter.consistency import Consistency, HorizontalNis, assess, assess_horizontal
 from px4fuse.filter.kalman import Replay, Settings, replay_all, state_at, variance_at
 from px4fuse.filter.signals import (
     AISLE,
     Axis,
     Segment,
-    choose_segment,
-    choose_source,
-    make_axes,
-    shift_clock,
 )
-from px4fuse.flight import Ekf2, Flight, PositionTrack, Truth, Unavailable
-
-NOT_ITS_OWN_TRUTH = Unavailable(
-    "ground truth",
-    "the position source is the only reference in the log, and it is what our filter was given",
-    "Choose another --position-source to have it as the truth.",
-)
+from px4fuse.flight import Ekf2, Flight, PositionTrack, Unavailable
 
 
 @dataclass(frozen=True)
@@ -168,6 +159,11 @@ class Comparison(Shown):
         return names[axis]
 
     @property
+    def lines(self) -> tuple[Axis, ...]:
+        """The axes alone."""
+        return tuple(result.axis for result in self.axes)
+
+    @property
     def main(self) -> AxisComparison:
         """The axis of the lab: the aisle, else the first."""
         return next((axis for axis in self.axes if axis.axis.name == AISLE), self.axes[0])
@@ -215,44 +211,40 @@ def compare(
     SettingsError
         An empty segment, or no acceleration while ``input_required``.
     """
-    settings = settings or Settings()
-    track, reason = choose_source(flight, position_source)
-    track = shift_clock(track, settings.clock_offset_s)
-    segment = choose_segment(flight, track, start_s, end_s)
-    lines = make_axes(flight, track, segment, names=axes, heading_deg=heading_deg)
-    if isinstance(flight.truth, Truth) and flight.truth.name == track.name:
-        flight = replace(flight, truth=NOT_ITS_OWN_TRUTH)
-    missing = list(flight.missing)
-    notes = [*flight.log.notes, *track.notes]
-    acceleration = lines[0].acceleration
-    if settings.input == "imu" and isinstance(acceleration, Unavailable):
-        if input_required:
-            raise SettingsError(f"{flight.log.name}: `input` imu: {acceleration}")
-        settings = replace(settings, input="zero")
-        notes.append(f"no acceleration input ({acceleration.reason}): constant velocity was used")
-        if acceleration not in missing:
-            missing.append(acceleration)
-    ekf2 = flight.ekf2
+    prepared = prepare(
+        flight, settings, axes=axes, heading_deg=heading_deg, position_source=position_source,
+        start_s=start_s, end_s=end_s, input_required=input_required,
+    )  # fmt: skip
+    return compare_prepared(prepared, progress)
+
+
+def compare_prepared(
+    prepared: Prepared, progress: Callable[[str], None] = lambda _: None
+) -> Comparison:
+    """:func:`compare`, with what it begins with made."""
+    flight, track, segment = prepared.flight, prepared.source, prepared.segment
+    notes, ekf2 = list(prepared.notes), prepared.flight.ekf2
     if isinstance(ekf2, Ekf2):
         state, statement = continuous_state(ekf2, track, segment)
         notes += [f"EKF2 {statement}"] if statement else []
         notes += ekf2.notes
         ekf2 = replace(ekf2, state=state)
-    progress(", ".join(line.name for line in lines))
+    progress(", ".join(line.name for line in prepared.lines))
     results = [
-        _compare_axis(flight, ekf2, track, segment, run) for run in replay_all(lines, settings)
+        _compare_axis(flight, ekf2, track, segment, run)
+        for run in replay_all(prepared.lines, prepared.settings)
     ]
     return Comparison(
         flight=flight,
         source=track,
-        source_reason=reason,
+        source_reason=prepared.source_reason,
         segment=segment,
-        settings=settings,
+        settings=prepared.settings,
         axes=tuple(results),
         horizontal_kf=_horizontal(results, lambda axis: axis.replay.updates),
         horizontal_ekf2=_horizontal(results, lambda axis: axis.ekf2_innovations),
         notes=tuple(notes),
-        missing=tuple(missing),
+        missing=prepared.missing,
     )
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from px4fuse.comparison.comparison import NOT_ITS_OWN_TRUTH
+from px4fuse.comparison.preparation import NOT_ITS_OWN_TRUTH
 from px4fuse.comparison.projection import (
     MIN_COMMON_SAMPLES,
     project_innovations,

@@ -32,6 +32,7 @@ Flags = NDArray[np.bool_]
 
 GRAVITY_M_S2 = np.array([0.0, 0.0, 9.80665])  # CONSTANTS_ONE_G
 STATES = 15
+MOVED = 9  # of them, those that the IMU moves: all but the biases
 THETA, VELOCITY, POSITION = slice(0, 3), slice(3, 6), slice(6, 9)
 GYRO_BIAS, ACCELEROMETER_BIAS = slice(9, 12), slice(12, 15)
 # A sample that is this much older than the horizon when it arrives is never fused
@@ -123,8 +124,8 @@ class Legs(_Events):
     transition : ndarray, shape (E, 15, 15)
     turn, drive : ndarray, shape (E, 15)
         What is added to the state.
-    gyro_noise, accelerometer_noise : ndarray, shape (E, 15, 15)
-        Covariance added for unit noise.
+    gyro_noise, accelerometer_noise : ndarray, shape (E, 9, 9)
+        Covariance of attitude, velocity and position added for unit noise.
     steps : ndarray, shape (E,)
     within : Transitions
     """
@@ -309,7 +310,7 @@ def _noises(steps: Array, duration_s: Array, tilt: Array) -> tuple[Array, Array]
     m = tilt / n  # mean ∂v/∂δθ of a step
     mm = m @ m.transpose(0, 2, 1)
     eye = np.eye(3)
-    gyro, accelerometer = np.zeros((2, len(steps), STATES, STATES))
+    gyro, accelerometer = np.zeros((2, len(steps), MOVED, MOVED))
     for matrix, rows, columns, part in (
         (gyro, THETA, THETA, n * d**2 * eye),
         (gyro, VELOCITY, THETA, m * d**2 * n * (n - 1) / 2),

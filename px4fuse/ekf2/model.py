@@ -315,18 +315,18 @@ def delayed_states(part: StretchRun, at: int) -> tuple[Array, Array]:
     legs, variant = part.legs[part.which[at]], part.variants[at]
     count, w = len(part.stretch.step_s), legs.within
     kept = part.run.state[:, at]
-    was = kept[np.searchsorted(legs.end, np.arange(count), side="right")]
-    causes = np.empty((count, CAUSES))
-    causes[:, 0:3], causes[:, 3:9] = was[:, THETA], was[:, 9:15]
+    leg = np.searchsorted(legs.end, np.arange(count), side="right")
+    causes = np.empty((len(kept), CAUSES))
+    causes[:, 0:3], causes[:, 3:9] = kept[:, THETA], kept[:, 9:15]
     causes[:, TURN] = 1.0 if variant.attitude else 0.0
     causes[:, INPUT] = 1.0
-    state = np.concatenate([kept[:1], was])
+    state = np.concatenate([kept[:1], kept[leg]])
     # the rows of w are in an order of their own
-    of_cause, was = causes[w.step], was[w.step]
-    rows = 1 + w.step
+    leg, rows = leg[w.step], 1 + w.step
+    of_cause = causes[leg]
     state[rows, THETA] = np.einsum("nij,nj->ni", w.attitude, of_cause)
     state[rows, VELOCITY] += np.einsum("nij,nj->ni", w.velocity, of_cause)
-    state[rows, POSITION] += w.elapsed_s[:, None] * was[:, VELOCITY]
+    state[rows, POSITION] += w.elapsed_s[:, None] * kept[leg, VELOCITY]
     state[rows, POSITION] += np.einsum("nij,nj->ni", w.position, of_cause)
     state[legs.end] = kept[1:]
     reset = np.zeros((count + 1, 3))

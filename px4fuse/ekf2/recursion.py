@@ -20,6 +20,7 @@ from px4fuse.ekf2.legs import (
     FUSE,
     GYRO_BIAS,
     IDLE,
+    MOVED,
     START,
     STATES,
     THETA,
@@ -34,6 +35,8 @@ Flags = NDArray[np.bool_]
 # How long the first pass runs that gives the correlations at the start
 CORRELATING_S = 8.0
 LEAST_VARIANCE = 1e-30
+# Events whose legs are stacked at once
+TOGETHER = 64
 # Variance by which a sample is not taken at all
 NOT_TAKEN = 1e9
 MIN_POSITION_SD_M = 0.01  # ev_pos_control.cpp
@@ -150,13 +153,6 @@ def run(  # noqa: PLR0915 (one recursion, read from top to bottom)
     biases = np.array([v.biases for v in variants])
     attitude = np.array([v.attitude for v in variants])
     pick = which if len(legs) > 1 else slice(None)
-    transition, turn, drive, gyro_noise, force_noise = (
-        # they are long: one delay needs no copy
-        np.stack([getattr(leg, name) for leg in legs], axis=1)
-        if len(legs) > 1
-        else getattr(legs[0], name)[:, None]
-        for name in ("transition", "turn", "drive", "gyro_noise", "accelerometer_noise")
-    )
     steps = np.stack([leg.steps for leg in legs], axis=1)[:, :, None]
     own, own_variance = (
         np.stack([part[leg.end] for leg in legs], axis=1)
@@ -168,6 +164,7 @@ def run(  # noqa: PLR0915 (one recursion, read from top to bottom)
     measured, noise = _measurements(inputs, stretch, legs, which, knob)
     schedule = _schedule(inputs, stretch, legs, which, variants)
     sampled: Flags = np.any(schedule.action > IDLE, axis=1)
+    quiet = schedule.quiet()
     gate2 = (np.maximum(knob["EKF2_EVP_GATE"], MIN_GATE) ** 2)[:, None]
     gyro2 = np.where(attitude, knob["EKF2_GYR_NOISE"] ** 2, 0.0)[:, None, None]
     force2 = (knob["EKF2_ACC_NOISE"] ** 2)[:, None, None]
@@ -190,13 +187,18 @@ def run(  # noqa: PLR0915 (one recursion, read from top to bottom)
         np.empty((size, STATES, STATES)),
     )
     innovation, R = np.empty((size, 4)), np.empty((size, 4))
+    stopped = False  # the fusion of any
     _keep(out, 0, x, P)
     for e in range(events):
-        phi = transition[e][pick]
+        within = e % TOGETHER
+        if not within:  # legs are long: a few at a time
+            transition, turn, drive, gyro_noise, force_noise = _stacked(legs, e)
+        phi = transition[within][pick]
         # x = Φx + u, P = ΦPΦ' + Q
-        x = (phi @ x[:, :, None])[:, :, 0] + drive[e][pick] + turns * turn[e][pick]
+        x = (phi @ x[:, :, None])[:, :, 0] + drive[within][pick] + turns * turn[within][pick]
         P = phi @ P @ np.swapaxes(phi, 1, 2)
-        P += gyro2 * gyro_noise[e][pick] + force2 * force_noise[e][pick]
+        P[:, :MOVED, :MOVED] += gyro2 * gyro_noise[within][pick]
+        P[:, :MOVED, :MOVED] += force2 * force_noise[within][pick]
         spread = P[:, BIASES, BIASES]
         P[:, BIASES, BIASES] = spread + (spread < drift_limit) * drift * steps[e][pick]
         if floor is not None:
@@ -213,12 +215,17 @@ def run(  # noqa: PLR0915 (one recursion, read from top to bottom)
             nu = measured[e, :, :2] - x[:, HORIZONTAL]
             S = P[:, HORIZONTAL, HORIZONTAL] + noise[e, :, :2]
             outside = (nu * nu > gate2 * S).any(axis=1)
-            beyond, taken, restart, fusion = _decide(inputs.rules, schedule, e, outside, fusion)
             out.innovation_m[e] = np.where(active[:, None], nu, np.nan)
             out.variance_m2[e] = np.where(active[:, None], S, np.nan)
-            out.rejected[e], out.fused[e], out.reset[e] = beyond, taken, restart
             innovation[:, 2:] = nu
-            R[taken, 2:] = noise[e, taken, :2]
+            if quiet[e] and not (outside.any() or stopped):
+                last_s, out.fused[e], R[:, 2:] = schedule.time_s[e], True, noise[e, :, :2]
+                fusion = replace(fusion, last_s=last_s)
+            else:
+                beyond, taken, restart, fusion = _decide(inputs.rules, schedule, e, outside, fusion)
+                out.rejected[e], out.fused[e], out.reset[e] = beyond, taken, restart
+                R[taken, 2:] = noise[e, taken, :2]
+                stopped = bool(fusion.stopped.any())
             if inputs.vision_height:
                 innovation[:, 1] = measured[e, :, 2] - x[:, DOWN]
                 R[:, 1] = np.where(active, noise[e, :, 2], NOT_TAKEN)
@@ -252,6 +259,12 @@ class _Schedule:
     told: Array
     told_reset: Flags
 
+    def quiet(self) -> Flags:
+        """Events on which every variant fuses unless its gate says otherwise, shape (E,)."""
+        return np.asarray(
+            np.all(self.action == FUSE, axis=1) & ~self.told_reset & ~(self.told > 0.0)
+        )
+
 
 @dataclass(frozen=True)
 class _Fusion:
@@ -260,6 +273,13 @@ class _Fusion:
     last_s: Array
     stopped: Flags
     left: NDArray[np.intp]
+
+
+def _stacked(legs: Sequence[Legs], first: int) -> list[Array]:
+    """What each of some events does to state and covariance, shape (events, legs, ...)."""
+    some = slice(first, first + TOGETHER)
+    names = "transition", "turn", "drive", "gyro_noise", "accelerometer_noise"
+    return [np.stack([getattr(leg, name)[some] for leg in legs], axis=1) for name in names]
 
 
 def _schedule(

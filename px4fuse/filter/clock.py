@@ -51,6 +51,8 @@ MAX_PART_SIGMA_S = 0.15
 CHANGE_P = 0.005
 # Flights simulated for the scatter that the IMU's noise adds
 REPLICATES = 96
+# Of these so many are weighed together: whitened they are twice as long
+REPLICATES_AT_ONCE = 16
 # Numbers of signals that are made at once
 BLOCK = 2**18
 # Steps of ln σ by which the noises are tried at every offset
@@ -330,13 +332,15 @@ def _scatter(problem: _Problem, offset: float, noises: Noises, information: floa
     if noises.walk_m:  # the source's own walk is in the residuals, but nothing the IMU measured
         walk = noises.walk_m * np.sqrt(chain.length_s)[:, None, None]
         dp += walk * rng.standard_normal(dp.shape)
-    still = np.broadcast_to(0.0, (axes, REPLICATES, len(q00)))
-    moved = (np.transpose(each, (1, 2, 0)) for each in (error, dp, dv))
-    score = paired_products(
-        *arguments(part, noises, np.ones(count)),
-        Columns(*moved),
-        Columns(np.transpose(speed, (1, 2, 0)), still, still),
-    ).sum(axis=0)
+    given = arguments(part, noises, np.ones(count))
+    still = np.broadcast_to(0.0, (axes, REPLICATES_AT_ONCE, len(q00)))
+    scores = []
+    for first in range(0, REPLICATES, REPLICATES_AT_ONCE):
+        some = slice(first, first + REPLICATES_AT_ONCE)
+        moved = Columns(*(np.transpose(each[..., some], (1, 2, 0)) for each in (error, dp, dv)))
+        sped = Columns(np.transpose(speed[..., some], (1, 2, 0)), still, still)
+        scores.append(paired_products(*given, moved, sped).sum(axis=0))
+    score = np.concatenate(scores)
     return 1.0 + float(np.var(score)) / information
 
 

@@ -289,19 +289,20 @@ def _transitions(legs: _Legs, turn: float) -> tuple[Array, Array]:
     return F, push
 
 
-def _noise(noises: Array, dt: float, dt_s: float, gap: bool) -> Array:
-    """Q of one leg for each setting, shape (k, 7, 7)."""
-    Q = np.zeros((len(noises), STATE_COUNT, STATE_COUNT))
-    q00, q01, q11 = noise_of_many_steps(dt)
-    level = noises[:, 2] ** 2 * dt_s
+def _noise(legs: _Legs, noises: Array, dt_s: float) -> Array:
+    """Q of every leg for each of k settings, shape (n, k, 7, 7)."""
     position, velocity, bias = (slice(axis, axis + 2) for axis in (0, 2, 4))
-    pair = np.eye(2)
-    Q[:, position, position] = (level * q00 + GAP_SIGMA**2 * gap)[:, None, None] * pair
-    Q[:, position, velocity] = Q[:, velocity, position] = (level * q01)[:, None, None] * pair
-    Q[:, velocity, velocity] = (level * q11 + GAP_SIGMA**2 * gap)[:, None, None] * pair
-    Q[:, bias, bias] = (noises[:, 1] ** 2 * dt)[:, None, None] * pair
-    Q[:, TURN, TURN] = noises[:, 0] ** 2 * dt
-    return Q
+    pair, count = np.eye(2), len(noises)
+    level = (noises[:, 2] ** 2 * dt_s)[:, None, None] * pair
+    # of each: what is added for one of q00, q01, q11, a second and a gap
+    of_00, of_01, of_11, of_second, of_gap = made = np.zeros((5, count, STATE_COUNT, STATE_COUNT))
+    of_00[:, position, position] = of_11[:, velocity, velocity] = level
+    of_01[:, position, velocity] = of_01[:, velocity, position] = level
+    of_second[:, bias, bias] = (noises[:, 1] ** 2)[:, None, None] * pair
+    of_second[:, TURN, TURN] = noises[:, 0] ** 2
+    of_gap[:, position, position] = of_gap[:, velocity, velocity] = GAP_SIGMA**2 * pair
+    amounts = np.stack([*noise_of_many_steps(legs.dt_s), legs.dt_s, legs.gap], axis=1)
+    return np.asarray((amounts @ made.reshape(5, -1)).reshape(-1, *made.shape[1:]))
 
 
 def _start(measured: Array, count: int) -> tuple[Array, Array]:
@@ -328,10 +329,10 @@ def _filter(
     square, log_s = np.zeros(len(noises)), np.zeros(len(noises))
     steps: list[Step] = []
     R = sigma_z**2 * np.eye(2)
-    transitions = zip(*_transitions(legs, turn), strict=True)
-    for k, (dt, (F, push)) in enumerate(zip(legs.dt_s.tolist(), transitions, strict=True)):
+    each = zip(*_transitions(legs, turn), _noise(legs, noises, dt_s), strict=True)
+    for k, (F, push, Q) in enumerate(each):
         x = x @ F.T + push
-        P = F @ P @ F.T + _noise(noises, dt, dt_s, bool(legs.gap[k]))
+        P = F @ P @ F.T + Q
         prior = x, P
         S = P[:, :2, :2] + R
         # S⁻¹ of two rows and columns, written out

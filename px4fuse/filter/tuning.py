@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property, partial
 from itertools import product
 
 import numpy as np
@@ -21,6 +22,7 @@ from px4fuse.filter.consistency import Consistency, assess
 from px4fuse.filter.fitting import (
     SIGMA_A_SEARCH_M_S2,
     SIGMA_Z_SEARCH_M,
+    Likelihood,
     NoiseFit,
     Noises,
     Part,
@@ -112,8 +114,6 @@ class AxisTuning(Shown):
         m/s² and m: what is noise, biases and tilt taken out where the IMU tells them.
     filter_sigma_a : Noise
         SIGMA_A that the two-state filter needs at this SIGMA_Z, since it has no states for biases.
-    map : LikelihoodMap
-        Of the two-state filter, around its optimum.
     gain_nats : float
         Log-likelihood per measurement of the two-state filter with ``filter_sigma_a`` and
         ``sigma_z`` above that of the chosen settings.
@@ -130,13 +130,14 @@ class AxisTuning(Shown):
     biases_fitted : bool
         Whether biases and tilt were taken out; where the IMU is too slow for that, SIGMA_A of the
         filter bounds the noise.
+    make_map : callable
+        Makes :attr:`map`, which takes as long as a fit and is seldom looked at.
     """
 
     name: str
     sigma_a: Noise
     sigma_z: Noise
     filter_sigma_a: Noise
-    map: LikelihoodMap
     gain_nats: float
     before: Consistency | Unavailable
     after: Consistency | Unavailable
@@ -145,6 +146,12 @@ class AxisTuning(Shown):
     held_out: HeldOut | Unavailable
     noises: Noises
     biases_fitted: bool
+    make_map: Callable[[], LikelihoodMap]
+
+    @cached_property
+    def map(self) -> LikelihoodMap:
+        """Likelihood of the two-state filter around its optimum."""
+        return self.make_map()
 
 
 def tune(
@@ -249,7 +256,6 @@ def tune_axes(
         sigma_a=sigma_a,
         sigma_z=sigma_z,
         filter_sigma_a=needed,
-        map=_map(legs, alone, needed, sigma_z, after),
         gain_nats=gain / count,
         before=_assess(legs[0], chosen, skip),
         after=_assess(legs[0], after, skip),
@@ -258,6 +264,7 @@ def tune_axes(
         held_out=_hold_out(name, legs, chosen, alone),
         noises=best.noises,
         biases_fitted=found is not None,
+        make_map=partial(_map, legs, alone.weight, chosen.sigma_z_m, needed, sigma_z, after),
     )
 
 
@@ -349,7 +356,12 @@ def _bounded(
 
 
 def _map(
-    legs: list[Preintegrated], found: NoiseFit, sigma_a: Noise, sigma_z: Noise, best: Noises
+    legs: list[Preintegrated],
+    weight: Array,
+    start_z_m: float,
+    sigma_a: Noise,
+    sigma_z: Noise,
+    best: Noises,
 ) -> LikelihoodMap:
     """Likelihood of the two-state filter all around its optimum."""
     grids = []
@@ -362,10 +374,11 @@ def _map(
         ends = at * (below / at) ** reach, at * (above / at) ** reach
         grids.append(np.geomspace(max(ends[0], low), min(ends[1], high), GRID))
     a, z = grids
-    if found.score.tabulated:
-        total = np.array([[found.score(Noises(*pair)) for pair in product([x], z)] for x in a])
+    score = Likelihood([filter_part(leg) for leg in legs], weight, start_z_m)
+    if score.tabulated:
+        total = np.array([[score(Noises(*pair)) for pair in product([x], z)] for x in a])
     else:
-        total = total_over_grid(legs, a[:, None], z[None, :], found.weight)
+        total = total_over_grid(legs, a[:, None], z[None, :], weight)
     return LikelihoodMap(a, z, total - total.min())
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import metadata
@@ -23,11 +23,15 @@ Result = TypeVar("Result")
 CONNECT_S = 15.0
 # A cluster's machines may come one by one; none for so long is none
 WORKERS_S = 120.0
+# Until a worker that hangs is killed and, on most machines, has begun again
+RESTART_S = 15.0
 # How often the clocks of running jobs are looked at
 TICK_S = 1.0
 _CONFIG = {
-    # whose worker died is tried once more: somebody else may have ended it
-    "distributed.scheduler.allowed-failures": 1,
+    # whose worker died is tried twice more: another log, or another program, may have ended it
+    "distributed.scheduler.allowed-failures": 2,
+    # after this a worker that is just then being restarted, for the second time, is given up
+    "distributed.deploy.lost-worker-timeout": "24 hours",
     # results are small, so all memory is the log's: nothing to spill, and a pause would not help
     "distributed.worker.memory.target": False,
     "distributed.worker.memory.spill": False,
@@ -75,9 +79,14 @@ def connected(
     """
     try:
         import dask  # noqa: PLC0415 - of the extra `batch`
+        from dask.utils import parse_bytes  # noqa: PLC0415
         from distributed import Client, LocalCluster, default_client  # noqa: PLC0415
     except ImportError as error:
         raise SettingsError('many logs require Dask. Run pip install "px4fuse[batch]".') from error
+    try:
+        limit = memory if memory == "auto" else parse_bytes(memory)
+    except ValueError as error:
+        raise SettingsError(f"`memory` {memory}: not a size. Give one like 2GB.") from error
     if scheduler is not None:
         try:
             client = Client(scheduler, timeout=CONNECT_S)
@@ -103,8 +112,11 @@ def connected(
         LocalCluster(
             n_workers=workers,
             threads_per_worker=1,
-            memory_limit=memory,
+            memory_limit=limit,
             dashboard_address=None,
+            # its web server starts all the same, and warns where its usual port is taken
+            scheduler_kwargs={"dashboard_address": "127.0.0.1:0"},
+            preload=["px4fuse.fleet.job"],
             silence_logs=logging.CRITICAL,
         ) as cluster,
         Client(cluster) as client,
@@ -141,7 +153,7 @@ def outcomes(
     jobs: Iterable[Job],
     *,
     timeout_s: float,
-) -> Iterator[tuple[Job, Result | Failed]]:
+) -> Generator[tuple[Job, Result | Failed]]:
     """Call a function on every job on a cluster, and give what comes of each as it comes.
 
     No more jobs are handed out than there are workers, so that none waits behind one that is
@@ -174,7 +186,7 @@ def outcomes(
             seen_s = time.monotonic() if workers else seen_s
             if time.monotonic() - seen_s > WORKERS_S:
                 raise Px4FuseError("the cluster has lost all its workers.")
-            for job in islice(waiting, max(1, workers) - len(running)):
+            for job in islice(waiting, max(max(1, workers) - len(running), 0)):
                 running[client.submit(function, job, pure=False)] = job
             if not running:
                 return
@@ -192,7 +204,7 @@ def outcomes(
                 ended = [future for future in running if str(future.key) in keys]
                 if ended:
                     client.cancel(ended)
-                    client.restart_workers(late, raise_for_error=False)
+                    client.restart_workers(late, timeout=RESTART_S, raise_for_error=False)
                 for future in ended:
                     yield (
                         running.pop(future),
@@ -215,10 +227,10 @@ def _late(
     latest_s: float,
 ) -> list[str]:
     """Workers whose job began before a time; keeps account of what each began, and when."""
-    order = {str(future.key): number for number, future in enumerate(running)}
+    known = {str(future.key) for future in running}
     late = []
     for address, keys in client.processing().items():
-        ours = sorted(order.keys() & set(map(str, keys)), key=order.__getitem__)
+        ours = [key for key in map(str, keys) if key in known]  # as they were handed out
         if not ours:
             begun.pop(address, None)
             continue

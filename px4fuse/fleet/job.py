@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+import signal
+from contextvars import copy_context
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
@@ -76,6 +78,10 @@ def identify(job: Job) -> str:
     LogError
         It cannot be read.
     """
+    return copy_context().run(_identified, job)
+
+
+def _identified(job: Job) -> str:
     max_log_bytes.set(job.max_bytes)
     with local_file(job.address) as path:
         return _sha256(path)
@@ -101,6 +107,10 @@ def analyse(job: Job) -> Outcome:
     version = metadata.version("px4fuse")
     if version != job.px4fuse:
         raise SettingsError(f"a worker has px4fuse {version}, not {job.px4fuse}.")
+    return copy_context().run(_analysed, job)
+
+
+def _analysed(job: Job) -> Outcome:
     max_log_bytes.set(job.max_bytes)
     sha256 = job.sha256
     try:
@@ -175,3 +185,10 @@ def file_stem(name: str, sha256: str) -> str:
     'Flug_3-abababababab'
     """
     return f"{re.sub(r'[^A-Za-z0-9_.-]+', '_', Path(name).stem)[:60]}-{sha256[:12]}"
+
+
+def dask_setup(worker: object) -> None:
+    """Begin a worker of this computer, as Dask calls a module that it preloads."""
+    del worker
+    # Ctrl-C in a terminal reaches all its processes; it is for the one that ends the others
+    signal.signal(signal.SIGINT, signal.SIG_IGN)

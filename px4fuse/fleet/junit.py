@@ -38,7 +38,7 @@ def junit(table: pd.DataFrame) -> bytes:
             for axis, change in zip(rows["axis"], rows["change"], strict=True)
             if change
         ]
-        reason = cleaned(f"{first['reason']} {first['remedy']}".strip())
+        reason = cleaned(". ".join(filter(None, (first["reason"], first["remedy"]))))
         if worse or first["status"] == FAILED:
             kind = "worse" if worse else FAILED
             text = cleaned("\n".join(worse)) or reason

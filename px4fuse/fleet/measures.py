@@ -155,7 +155,9 @@ def _of_flight(results: ComparisonResults) -> Iterator[tuple[str, Number]]:
         axis = next((axis for name, axis in results.axes.items() if name == at), None)
         if axis is None or axis.rejected_share is None or not isinstance(axis.ekf2, Filter):
             continue
-        interval = _share_interval(axis.rejected_share, axis.ekf2.count * _independent(axis.ekf2))
+        interval = share_interval(
+            axis.rejected_share, axis.ekf2.count * independent_share(axis.ekf2)
+        )
         yield f"axes.{at}.rejected_share", Number(
             f"rejected by EKF2, {label}", "", axis.rejected_share, interval, "low", "difference",
             WILSON, "axes.*.rejected_share",
@@ -181,7 +183,7 @@ def _of_axes(results: ComparisonResults, analysis: Analysis | None) -> Iterator[
                 continue
             # where a truth judges both, their distance from each other is neither good nor bad
             aim = "" if known_truth and row.path.startswith("difference.") else row.aim
-            interval, method = _interval(row.path, value, _at_filter(axis, row.path), series)
+            interval, method = interval_of(row.path, value, _at_filter(axis, row.path), series)
             yield f"axes.{name}.{row.path}", Number(
                 f"{row.label}, {name}", row.unit, value, interval, aim, row.scale, method,
                 f"axes.*.{row.path}",
@@ -199,7 +201,7 @@ def _at_filter(axis: object, path: str) -> Filter | None:
     return judged if isinstance(judged, Filter) else None
 
 
-def _interval(
+def interval_of(
     path: str, value: float, judged: Filter | None, series: Mapping[str, Array]
 ) -> tuple[Bounds | None, str]:
     """95 % interval of a number of an axis, and how it was found."""
@@ -212,9 +214,9 @@ def _interval(
         return (found.low**power, found.high**power), BOOTSTRAP
     if judged is None:
         return None, ""
-    count = judged.count * _independent(judged)
+    count = judged.count * independent_share(judged)
     if field == "outside_gate":
-        return _share_interval(value, count), WILSON
+        return share_interval(value, count), WILSON
     if field in ("nis_mean", "innovation_std_m") and _is_normal(judged, count):
         power = 1.0 if field == "nis_mean" else 0.5
         low, high = (count / chi2.ppf(p, count) for p in (0.5 + LEVEL / 2, 0.5 - LEVEL / 2))
@@ -222,7 +224,7 @@ def _interval(
     return None, ""
 
 
-def _independent(judged: Filter) -> float:
+def independent_share(judged: Filter) -> float:
     """Share of the innovations' squares that are as good as independent.
 
     With the autocorrelation r^k of a first-order process squares have r^2k, hence
@@ -240,7 +242,7 @@ def _is_normal(judged: Filter, count: float) -> bool:
     return bool(off <= NOT_NORMAL_SIGMAS * sigma + 0.5 / count)
 
 
-def _share_interval(share: float, count: float) -> Bounds:
+def share_interval(share: float, count: float) -> Bounds:
     """Wilson's (1927), for so many independent trials."""
     trials = max(round(count), 1)
     found = binomtest(round(share * trials), trials).proportion_ci(LEVEL, method="wilson")

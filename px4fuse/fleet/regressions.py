@@ -8,13 +8,16 @@ range in which the next such flight is expected.
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterator, Mapping
+import math
+from collections import defaultdict
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import pandas as pd
-from scipy.stats import t as student_t
+from scipy.special import stdtr, stdtrit
 
 from px4fuse.arrays import Array
 from px4fuse.errors import SettingsError
@@ -32,6 +35,7 @@ from px4fuse.reading import size_of
 #: A vehicle's flights tell a range from so many on
 MIN_FLIGHTS = 5
 BETWEEN_CHANGES = "; "
+Number = TypeVar("Number", float, Array)
 
 
 @dataclass(frozen=True)
@@ -62,9 +66,9 @@ class _Column:
             return float(np.log1p(LEAST_RATIO))
         return LEAST_DIFFERENCE[self.unit]
 
-    def farther(self, now: Array, before: Array) -> Array:
+    def farther(self, now: Number, before: Number) -> Number:
         """By how much numbers are farther from what is best."""
-        return now - before if self.aim == "low" else np.abs(now) - np.abs(before)
+        return now - before if self.aim == "low" else abs(now) - abs(before)
 
 
 _TRUTH = "ekf2_position_rmse_to_truth_m"
@@ -80,7 +84,35 @@ _COLUMNS = {
     "clock_offset_s": _Column("clock offset", "s", "zero", "difference"),
     "rejected_share": _Column("share that EKF2 rejected", "", "low", "difference"),
 }
-Test = tuple[int, float, str]
+# By what a flight is known, and the flights that it is held against
+_LOG, _VEHICLE = ["log_sha256", "axis"], ["vehicle", "settings", "axis"]
+
+
+@dataclass(frozen=True)
+class _Test:
+    """One number of a row against those of its vehicle's flights, on the column's scale."""
+
+    at: int
+    column: _Column
+    now: float
+    count: int
+    mean: float
+    std: float
+
+    @property
+    def sigma(self) -> float:
+        """Of the next flight's number."""
+        return max(self.std, self.column.least) * math.sqrt(1.0 + 1.0 / self.count)
+
+    @property
+    def words(self) -> str:
+        """The number and its range."""
+        half = float(stdtrit(self.count - 1, 0.975)) * self.sigma
+        now, low, high = map(self.column.words, (self.now, self.mean - half, self.mean + half))
+        return (
+            f"{self.column.label} {now}, {low} to {high} expected from {self.count} flights of "
+            "the vehicle"
+        )
 
 
 @dataclass(frozen=True)
@@ -105,9 +137,8 @@ class Marked:
     def words(self) -> str:
         """Against what the logs were held."""
         return (
-            f"Baseline: {self.same} logs are in it, {self.by_vehicle} were held against "
-            f"{MIN_FLIGHTS} or more flights of their vehicle, {self.neither} could not be held "
-            "against anything."
+            f"Held against the baseline: {self.same} by the same log, {self.by_vehicle} by "
+            f"{MIN_FLIGHTS} or more flights of the vehicle; {self.neither} with neither there."
         )
 
 
@@ -120,9 +151,10 @@ def read_baseline(path: Path) -> pd.DataFrame:
         It cannot be read, or is not the table of ``px4fuse batch``.
     """
     size_of(path, SettingsError)
+    texts = dict.fromkeys((name for name, kind in COLUMNS.items() if kind == "str"), str)
     try:
         if path.suffix.lower() == ".csv":
-            found = pd.read_csv(path, encoding="utf-8-sig")
+            found = pd.read_csv(path, encoding="utf-8-sig", dtype=texts)
         else:
             found = pd.read_parquet(path)
     except (OSError, ValueError) as error:  # pyarrow's and pandas' own are ValueErrors
@@ -132,8 +164,7 @@ def read_baseline(path: Path) -> pd.DataFrame:
         raise SettingsError(
             f"{path.name}: has no column {lacking[0]}. Give the fleet.parquet of px4fuse batch."
         )
-    texts = {name: "" for name, kind in COLUMNS.items() if kind == "str" and name in found}
-    return found.fillna(texts)
+    return found.fillna(dict.fromkeys(texts.keys() & set(found.columns), ""))
 
 
 def marked(table: pd.DataFrame, baseline: pd.DataFrame) -> Marked:
@@ -145,79 +176,58 @@ def marked(table: pd.DataFrame, baseline: pd.DataFrame) -> Marked:
         As :func:`px4fuse.batch` gives them.
     """
     known = baseline[baseline["status"] == DONE]
-    by_log = dict(iter(known.groupby(["log_sha256", "axis"])))
-    by_vehicle = dict(iter(known.groupby(["vehicle", "settings", "axis"])))
-    worse: dict[int, list[str]] = {}
-    tests: list[Test] = []
-    held: dict[str, str] = {}
-    for at, row in enumerate(table.to_dict("records")):
-        if row["status"] == FAILED and _was_done(row, known):
-            worse[at] = ["fails, and was compared before"]
-        if row["status"] != DONE:
-            continue
-        log = str(row["log"])
-        now = table.iloc[[at]]
-        before = by_log.get((row["log_sha256"], row["axis"]))
-        flights = by_vehicle.get((row["vehicle"], row["settings"], row["axis"]))
-        if before is not None:
-            held[log] = "same"
-            worse[at] = list(_than_itself(now, before.tail(1)))
-        elif row["vehicle"] and flights is not None and len(flights) >= MIN_FLIGHTS:
-            held[log] = "vehicle"
-            tests += _than_expected(at, now, flights)
-        else:
-            held.setdefault(log, "neither")
-    for (at, _, text), q in zip(tests, corrected([p for _, p, _ in tests]), strict=True):
-        if q < FALSE_DISCOVERY_RATE and text:
-            worse.setdefault(at, []).append(text)
+    latest = known.drop_duplicates(_LOG, keep="last").set_index(_LOG)
+    of_log, of_vehicle = (pd.MultiIndex.from_frame(table[keys]) for keys in (_LOG, _VEHICLE))
+    done = table["status"].eq(DONE).to_numpy()
+    is_same = done & of_log.isin(latest.index)
+    others = done & ~is_same & table["vehicle"].ne("").to_numpy()
+    has_truth = table[_TRUTH].notna().to_numpy()
+    worse: dict[int, list[str]] = defaultdict(list)
+    tests: list[_Test] = []
+    held = np.zeros(len(table), dtype=bool)
+    for at in np.flatnonzero(table["status"].eq(FAILED) & _was_done(table, known)):
+        worse[int(at)].append("fails, and was compared before")
+    for name, column in _COLUMNS.items():
+        # where a truth judges both, how far they are apart is neither good nor bad
+        judged = ~has_truth if name == _APART else np.ones(len(table), dtype=bool)
+        now, was = column.scaled(table[name]), column.scaled(latest[name].reindex(of_log))
+        for at in np.flatnonzero(judged & is_same & (column.farther(now, was) >= column.least)):
+            said = f"{column.label} {column.words(now[at])}, was {column.words(was[at])}"
+            worse[int(at)].append(said)
+        flights = known[_VEHICLE].assign(value=column.scaled(known[name])).groupby(_VEHICLE)
+        found = flights["value"].agg(["count", "mean", "std"]).reindex(of_vehicle)
+        n, mean, std = found.fillna(0.0).to_numpy().T
+        tested = judged & others & (n >= MIN_FLIGHTS) & np.isfinite(now)
+        held |= tested
+        tests += [
+            _Test(int(at), column, float(now[at]), int(n[at]), float(mean[at]), float(std[at]))
+            for at in np.flatnonzero(tested)
+        ]
+    for test, q in zip(tests, corrected(_p(tests)), strict=True):
+        if q < FALSE_DISCOVERY_RATE and test.column.farther(test.now, test.mean) > 0.0:
+            worse[test.at].append(test.words)
     change = [BETWEEN_CHANGES.join(worse.get(at, ())) for at in range(len(table))]
-    how = list(held.values())
+    same, by_vehicle = (table["log"][rows].nunique() for rows in (is_same, held))
     return Marked(
         table.assign(change=pd.Series(change, index=table.index, dtype=COLUMNS["change"])),
-        *(how.count(one) for one in ("same", "vehicle", "neither")),
+        same=same,
+        by_vehicle=by_vehicle,
+        neither=table["log"][done].nunique() - same - by_vehicle,
     )
 
 
-def _was_done(row: Mapping[Hashable, object], known: pd.DataFrame) -> bool:
-    sha256 = row["log_sha256"]
-    return bool(((known["log_sha256"] == sha256) if sha256 else (known["log"] == row["log"])).any())
+def _was_done(table: pd.DataFrame, known: pd.DataFrame) -> pd.Series:
+    """Whether the baseline has a log, by its hash or, where there is none, its name."""
+    hashes = table["log_sha256"]
+    return hashes.isin(known["log_sha256"]) | (hashes.eq("") & table["log"].isin(known["log"]))
 
 
-def _judged(now: pd.DataFrame) -> Iterator[tuple[str, _Column]]:
-    """The columns that say better or worse: how far two filters are apart only without a truth."""
-    for name, column in _COLUMNS.items():
-        if name != _APART or now[_TRUTH].isna().all():
-            yield name, column
-
-
-def _than_itself(now: pd.DataFrame, before: pd.DataFrame) -> Iterator[str]:
-    for name, column in _judged(now):
-        x, y = column.scaled(now[name]), column.scaled(before[name])
-        if column.farther(x, y)[0] >= column.least:
-            yield f"{column.label} {column.words(x[0])}, was {column.words(y[0])}"
-
-
-def _than_expected(at: int, now: pd.DataFrame, flights: pd.DataFrame) -> Iterator[Test]:
-    """Row, two-sided p-value of each number among its vehicle's, and what to say of a worse one.
+def _p(tests: Sequence[_Test]) -> list[float]:
+    """Two-sided p-values of numbers among their vehicle's.
 
     The next of n normal numbers lies about their mean as Student's t with n - 1 degrees of freedom,
     times s √(1 + 1/n).
     """
-    for name, column in _judged(now):
-        x = column.scaled(now[name])
-        values = column.scaled(flights[name])
-        values = values[np.isfinite(values)]
-        n = len(values)
-        if n < MIN_FLIGHTS or not np.isfinite(x[0]):
-            continue
-        mean = values.mean()
-        sigma = max(float(values.std(ddof=1)), column.least) * np.sqrt(1.0 + 1.0 / n)
-        p = float(2.0 * student_t.sf(abs(x[0] - mean) / sigma, n - 1))
-        half = float(student_t.isf(0.025, n - 1)) * sigma
-        low, high = column.words(mean - half), column.words(mean + half)
-        is_worse = column.farther(x, mean)[0] > 0.0
-        text = (
-            f"{column.label} {column.words(x[0])}, {low} to {high} expected from {n} flights of "
-            "the vehicle"
-        )
-        yield at, p, text if is_worse else ""
+    t = np.array([abs(test.now - test.mean) / test.sigma for test in tests])
+    freedom = np.array([test.count - 1 for test in tests])
+    return [float(p) for p in 2.0 * stdtr(freedom, -t)]

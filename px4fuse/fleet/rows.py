@@ -173,9 +173,9 @@ def table_of(rows: Iterable[Mapping[str, Any]]) -> pd.DataFrame:
     rows : iterable of mapping
         Absent numbers and texts may be left out or None.
     """
-    frame = pd.DataFrame(list(rows), columns=list(COLUMNS))
-    texts = [name for name, kind in COLUMNS.items() if kind == "str"]
-    return frame.fillna(dict.fromkeys(texts, "")).astype(COLUMNS)
+    texts = dict.fromkeys((name for name, kind in COLUMNS.items() if kind == "str"), "")
+    known = [{name: value for name, value in row.items() if value is not None} for row in rows]
+    return pd.DataFrame([texts | row for row in known], columns=list(COLUMNS)).astype(COLUMNS)
 
 
 def csv_bytes(table: pd.DataFrame) -> bytes:

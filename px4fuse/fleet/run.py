@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import closing
 from dataclasses import dataclass, field, replace
 from importlib import metadata
 from pathlib import Path
@@ -240,12 +241,13 @@ def _identify(
         for log in found.logs
         if log.size_bytes is None or sizes[log.size_bytes] > 1 or log.size_bytes in known
     ]
-    for number, (one, sha256) in enumerate(outcomes(client, identify, asked, timeout_s=timeout_s)):
-        if isinstance(sha256, Failed):
-            found.lost[one.address] = refused(sha256.line, FAILED)
-        else:
-            found.hash_of[one.address] = sha256
-        progress("looking for what is new", number + 1, len(asked))
+    with closing(outcomes(client, identify, asked, timeout_s=timeout_s)) as identified:
+        for number, (one, sha256) in enumerate(identified, 1):
+            if isinstance(sha256, Failed):
+                found.lost[one.address] = refused(sha256.line, FAILED)
+            else:
+                found.hash_of[one.address] = sha256
+            progress("looking for what is new", number, len(asked))
     first_of: dict[str, FoundLog] = {}
     for log in found.logs:
         if log.address not in found.hash_of:
@@ -255,7 +257,7 @@ def _identify(
             found.lost[log.address] = {
                 "status": NOT_JUDGED,
                 "log_sha256": found.hash_of[log.address],
-                "reason": f"the same file as {first.log}, and was compared once",
+                "reason": f"the same file as {first.log}, whose rows stand for both",
             }
 
 
@@ -288,15 +290,16 @@ def _compare(
     sizes = {log.address: log.size_bytes for log in found.logs}
     failed = 0
     progress("comparing", 0, len(jobs))
-    for number, (job, result) in enumerate(outcomes(client, analyse, jobs, timeout_s=timeout_s)):
-        if isinstance(result, Failed):
-            found.lost[job.address] = refused(result.line, FAILED) | {"log_sha256": job.sha256}
-        elif result.rows[0]["status"] == FAILED:
-            found.lost[job.address] = result.rows[0]
-        else:
-            found.hash_of[job.address] = _keep(found, result, sizes[job.address])
-        failed += job.address in found.lost
-        progress(f"comparing, {failed} failed", number + 1, len(jobs))
+    with closing(outcomes(client, analyse, jobs, timeout_s=timeout_s)) as compared:
+        for number, (job, result) in enumerate(compared, 1):
+            if isinstance(result, Failed):
+                found.lost[job.address] = refused(result.line, FAILED) | {"log_sha256": job.sha256}
+            elif result.rows[0]["status"] == FAILED:
+                found.lost[job.address] = result.rows[0]
+            else:
+                found.hash_of[job.address] = _keep(found, result, sizes[job.address])
+            failed += job.address in found.lost
+            progress(f"comparing, {failed} failed", number, len(jobs))
 
 
 def _keep(found: _Found, outcome: Outcome, size_bytes: int | None) -> str:

@@ -121,7 +121,7 @@ def summary(found: ChangeResults) -> tuple[str, ...]:
     of_these = f" ({', '.join(judged)})" if judged else ""
     if found.paired:
         sentence = (
-            f"{found.a.log} with two settings: {counts.changed} of {counts.compared} numbers "
+            f"Both are of {found.a.log}: {counts.changed} of {counts.compared} numbers "
             f"differ{of_these}."
         )
     elif not counts.tested:

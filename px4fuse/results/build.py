@@ -10,6 +10,7 @@ import pandas as pd
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.comparison import AgainstTruth, AxisComparison, Comparison, FilterSummary
+from px4fuse.comparison.preparation import Prepared
 from px4fuse.filter.clock import ClockOffset
 from px4fuse.filter.heading import HeadingError
 from px4fuse.filter.tuning import AxisTuning, Noise
@@ -77,7 +78,7 @@ def results(
 
 def tuning_results(
     request: ComparisonRequest,
-    comparison: Comparison,
+    comparison: Prepared,
     tuned: Mapping[str, AxisTuning | Unavailable],
     command: str,
 ) -> TuningResults:
@@ -95,7 +96,7 @@ def tuning_results(
 
 def sync_results(
     request: ComparisonRequest,
-    comparison: Comparison,
+    comparison: Prepared,
     clock: ClockOffset | Unavailable,
     command: str,
 ) -> SyncResults:
@@ -111,7 +112,7 @@ def sync_results(
     )
 
 
-def _source(comparison: Comparison) -> made.PositionSource:
+def _source(comparison: Comparison | Prepared) -> made.PositionSource:
     source = comparison.source
     looked_for = [m for m in comparison.missing if m.what.startswith("position source ")]
     return copied(
@@ -127,7 +128,7 @@ def _source(comparison: Comparison) -> made.PositionSource:
     )
 
 
-def _settings(comparison: Comparison) -> made.ChosenSettings:
+def _settings(comparison: Comparison | Prepared) -> made.ChosenSettings:
     settings = comparison.settings
     alignment = comparison.source.alignment
     placed_s = 0.0 if alignment is None else alignment.clock_offset_s

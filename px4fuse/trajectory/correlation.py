@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
-from scipy.signal import correlate
 
 from px4fuse.arrays import Array, BoolArray, Complex
 
@@ -48,8 +47,7 @@ def moments(a: Series, b: Series, a_known: BoolArray, b_known: BoolArray) -> Mom
 
     def over(x: Array | Complex, y: Array | Complex) -> Complex:
         """Σ conj(x) y over the overlap."""
-        sums: Complex = correlate(y, x, mode="full", method="fft")
-        return sums
+        return _correlated(y, x)
 
     # about their means, else roundings matter
     a, b = (
@@ -76,5 +74,12 @@ def autocovariance(values: Array | Complex) -> Array:
     values : ndarray, shape (n,)
         Real or complex.
     """
-    sums: Array = correlate(values, values, mode="full", method="fft")[len(values) - 1 :].real
-    return sums
+    return np.asarray(_correlated(values, values)[len(values) - 1 :].real)
+
+
+def _correlated(a: Array | Complex, b: Array | Complex) -> Complex:
+    """Σ a conj(b) over the overlap, for every lag."""
+    # costs a tenth of a second to import: most flights have nothing to correlate
+    from scipy.signal import correlate  # noqa: PLC0415
+
+    return np.asarray(correlate(a, b, mode="full", method="fft"))

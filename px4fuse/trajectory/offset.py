@@ -17,7 +17,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d, maximum_filter1d
 from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Slerp
-from scipy.stats import t as student_t
+from scipy.special import stdtrit
 
 from px4fuse.arrays import Array, BoolArray
 from px4fuse.trajectory.alignment import Transform, umeyama
@@ -300,7 +300,7 @@ class _OffsetFit:
         variance = max(float(score @ score) + 2.0 * float(weights @ products), 0.0)
         variance = max(variance, float(score @ score))
         runs = max(n / lags - 1.0, 1.0)
-        quantile = float(student_t.ppf(0.5 + LEVEL / 2.0, runs))
+        quantile = float(stdtrit(runs, 0.5 + LEVEL / 2.0))
         return quantile * float(np.sqrt(variance)) / information
 
 

@@ -10,8 +10,7 @@ from typing import Literal
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from scipy.stats import norm
-from scipy.stats import t as student_t
+from scipy.special import ndtr, stdtrit
 
 from px4fuse.arrays import Array, IntArray
 from px4fuse.display import Shown
@@ -330,8 +329,8 @@ def rmse_interval(
     blocks = n / length
     drawn = np.random.default_rng(seed).integers(0, n, (resamples, round(blocks)))
     means = block_means[drawn].mean(axis=1)
-    quantile = float(student_t.ppf(0.5 + LEVEL / 2.0, blocks - 1.0))
-    tail = float(norm.cdf(-quantile * np.sqrt(blocks / (blocks - 1.0))))
+    quantile = float(stdtrit(blocks - 1.0, 0.5 + LEVEL / 2.0))
+    tail = float(ndtr(-quantile * np.sqrt(blocks / (blocks - 1.0))))
     low, high = np.sqrt(np.maximum(np.quantile(means, [tail, 1.0 - tail]), 0.0))
     return Interval(float(low), float(high), length, blocks)
 

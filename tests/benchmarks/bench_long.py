@@ -9,9 +9,9 @@ it. Linux and macOS.
 
 from __future__ import annotations
 
-import math
 import sys
 import tempfile
+from itertools import pairwise
 from pathlib import Path
 
 from measured import Measured, measured
@@ -49,14 +49,14 @@ def main() -> None:
                 )
             log.unlink()
     for name, rows in found.items():
-        (short, first), *_, (long, last) = [rows[0], *rows]
-        if long > short:
-            power = math.log(last.cpu_s / first.cpu_s) / math.log(long / short)
-            each = (last.cpu_s - first.cpu_s) / (long - short)
-            print(
-                f"{name}: {each:.2f} s more for each minute; time grows as minutes^{power:.2f} "
-                f"from {short:g} to {long:g} min"
-            )
+        first = rows[0][1].cpu_s
+        ratios = ", ".join(f"{took.cpu_s / first:.2f} at {minutes:g} min" for minutes, took in rows)
+        print(f"{name}: CPU time over that of the shortest flight: {ratios}")
+        each = ", ".join(
+            f"{(now.cpu_s - before.cpu_s) / (long - short):.2f} s from {short:g} to {long:g} min"
+            for (short, before), (long, now) in pairwise(rows)
+        )
+        print(f"{name}: more for each minute, the same where time grows linearly: {each}")
 
 
 if __name__ == "__main__":

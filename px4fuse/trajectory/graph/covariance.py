@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from px4fuse.arrays import Array, IntArray
 from px4fuse.errors import TrajectoryError
@@ -119,7 +119,7 @@ def _tested(
             "that numbers have. Give its edges more information."
         )
     d2 = float(seen @ np.linalg.solve(spread, seen))
-    p = float(chi2.sf(d2, freedom))
+    p = float(chdtrc(freedom, d2))
     return GateResult(edge, d2, freedom, p, p >= alpha)
 
 

@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 from scipy import sparse
-from scipy.stats import chi2
+from scipy.special import gammaincinv
 
 from px4fuse.arrays import Array, BoolArray
 from px4fuse.display import brief
@@ -268,8 +268,8 @@ def _gnc(
     bound = np.full(len(doubtful), np.inf)
     price = np.zeros(len(doubtful))
     told = doubtful & (freedom > 0)
-    bound[told] = chi2.ppf(GNC_PROBABILITY, freedom[told])
-    price[told] = chi2.ppf(DROP_PROBABILITY, freedom[told])
+    bound[told] = 2.0 * gammaincinv(freedom[told] / 2.0, GNC_PROBABILITY)
+    price[told] = 2.0 * gammaincinv(freedom[told] / 2.0, DROP_PROBABILITY)
 
     def priced(state: _State, kept: Array) -> float:
         return 0.5 * float(np.sum(np.where(kept > 0.0, state.chi2, price)))

@@ -1,0 +1,89 @@
+"""What the tests of many logs share: tiny flights, jobs that go wrong, processes of Dask's."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from px4fuse.fleet import job
+from px4fuse.simulation.flights import simulate, to_ulog
+from px4fuse.simulation.scenario import Scenario
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+
+
+def tiny_log(seed: int, **options: object) -> bytes:
+    """A simulated flight of a quarter of a minute, compared within a second."""
+    return to_ulog(simulate(Scenario(seed=seed, passes=1, length_m=6.0, ekf2=False, **options)))
+
+
+def tiny_logs(folder: Path, count: int) -> Path:
+    folder.mkdir()
+    for seed in range(1, count + 1):
+        (folder / f"f{seed}.ulg").write_bytes(tiny_log(seed))
+    return folder
+
+
+def act(work):
+    """What a job says."""
+    what, value = work
+    match what:
+        case "square":
+            return value * value
+        case "exit":
+            os._exit(value)
+        case "hang":
+            time.sleep(600)
+        case "hold the interpreter":
+            re.match(r"(a+)+b", "a" * 60)
+        case "hog":
+            return len(bytearray(os.urandom(1_000_000)) * value)
+        case "raise":
+            raise ValueError(value)
+        case "process":
+            return os.getpid()
+        case "variable":
+            return os.environ.get(value)
+    return None
+
+
+def analyse(work: job.Job) -> job.Outcome:
+    """As the worker does, but a log called "hang" never ends, and one called "crash" crashes."""
+    name = Path(work.address).stem
+    if name in ("hang", "crash"):
+        act(("hang", 0) if name == "hang" else ("exit", 3))
+    return job.analyse(work)
+
+
+def environment(**more: str) -> dict[str, str]:
+    return os.environ | {"PYTHONPATH": str(REPOSITORY)} | more
+
+
+@contextmanager
+def started(*command: str, says: str, log: Path, **more: str) -> Iterator[str]:
+    """A process of Dask's, once it has said that it is ready; the line in which it said so."""
+    with (
+        log.open("w") as file,
+        subprocess.Popen(
+            [sys.executable, "-m", "dask", *command], stderr=file, env=environment(**more)
+        ) as process,
+    ):
+        try:
+            yield _line(process, log, says)
+        finally:
+            process.terminate()
+
+
+def _line(process: subprocess.Popen[bytes], log: Path, says: str) -> str:
+    while process.poll() is None:
+        for line in log.read_text().splitlines():
+            if says in line:
+                return line
+        time.sleep(0.1)
+    raise AssertionError(log.read_text())

@@ -1,0 +1,414 @@
+"""Many logs: the table, what is kept, and what a bad log, worker, cluster or disk costs."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import batch_tools
+import pandas as pd
+import pytest
+from batch_tools import environment, started, tiny_log, tiny_logs
+from click.testing import CliRunner
+
+import px4fuse
+from px4fuse.cli import cli
+from px4fuse.errors import OutputError, SettingsError
+from px4fuse.fleet import job, run, store
+from px4fuse.fleet.engine import connected
+from px4fuse.fleet.job import Job
+from px4fuse.fleet.logs import find_logs
+from px4fuse.fleet.rows import COLUMNS, csv_bytes, table_of
+from px4fuse.reading import max_log_bytes
+from px4fuse.request import ComparisonRequest
+from px4fuse.results.reading import read_results
+
+
+@pytest.fixture(scope="module")
+def client() -> Iterator[Any]:
+    """Two workers; they are the session's own, which px4fuse.batch uses."""
+    with connected(workers=2, memory="2GB") as client:
+        yield client
+
+
+@pytest.fixture(scope="module")
+def flights(tmp_path_factory) -> Path:
+    return tiny_logs(tmp_path_factory.mktemp("flights") / "logs", 4)
+
+
+@pytest.fixture(scope="module")
+def undisturbed(client, flights, tmp_path_factory) -> pd.DataFrame:
+    return px4fuse.batch(flights, tmp_path_factory.mktemp("undisturbed"))
+
+
+def assert_same(table: pd.DataFrame, expected: pd.DataFrame) -> None:
+    pd.testing.assert_frame_equal(table, expected, check_exact=True)
+
+
+def command(*arguments: str | Path) -> Any:
+    return CliRunner().invoke(cli, ["batch", *map(str, arguments)])
+
+
+# ------------------------------------------------------------------ the table
+
+
+def test_every_log_is_in_the_table_with_its_numbers_or_its_line(client, tmp_path):
+    logs = tiny_logs(tmp_path / "logs", 2)
+    (logs / "inner").mkdir()
+    shutil.copy(logs / "f1.ulg", logs / "inner" / "twin.ulg")
+    (logs / "broken.ulg").write_bytes(tiny_log(1)[:40])
+    (logs / "dataflash.BIN").write_bytes(b"\xa3\x95" * 50)
+    (logs / "notes.txt").write_text("no log")
+    output = tmp_path / "out"
+    table = px4fuse.batch(logs, output, reports=True)
+
+    assert list(table.columns) == list(COLUMNS)
+    of = {name: rows.reset_index(drop=True) for name, rows in table.groupby("name")}
+    assert set(of) == {"f1.ulg", "f2.ulg", "twin.ulg", "broken.ulg", "dataflash.BIN"}
+    assert list(table["name"]) == sorted(table["name"])
+    analysis = px4fuse.compare(logs / "f1.ulg")
+    first = of["f1.ulg"]
+    assert list(first["axis"]) == [axis.axis.name for axis in analysis.axes]
+    assert list(first["kf_nis_mean"]) == [axis.kf.consistency.nis_mean for axis in analysis.axes]
+    assert list(first["kf_factor"] * first["kf_nis_mean"]) == pytest.approx([1.0] * 4)
+    tuned = analysis.tuning["horizontal"].sigma_z
+    assert first.loc[0, ["sigma_z_m", "sigma_z_low_m", "sigma_z_high_m"]].tolist() == [
+        tuned.value, tuned.low, tuned.high,
+    ]  # fmt: skip
+    assert (first["status"] == "done").all()
+    # it says the same as compare, whose report and results these are
+    results = read_results((output / first.loc[0, "results"]).read_bytes())
+    assert results.request.log == "f1.ulg"
+    assert results.axes["east"].kf.nis_mean == first.loc[1, "kf_nis_mean"]
+    assert results.story == tuple(first.loc[0, "story"].split("\n"))
+    assert (output / first.loc[0, "report"]).read_bytes().startswith(b"%PDF")
+
+    twin = of["twin.ulg"].loc[0]
+    assert (twin["status"], twin["log_sha256"]) == ("not judged", first.loc[0, "log_sha256"])
+    assert "the same file as" in twin["reason"]
+    assert "f1.ulg" in twin["reason"]
+    assert of["broken.ulg"].loc[0, "status"] == of["dataflash.BIN"].loc[0, "status"] == "failed"
+    assert "DataFlash" in of["dataflash.BIN"].loc[0, "reason"]
+    assert of["dataflash.BIN"].loc[0, "remedy"].startswith("Give the .tlog")
+
+    assert_same(pd.read_parquet(output / "fleet.parquet"), table)
+    written = pd.read_csv(output / "fleet.csv", dtype=COLUMNS, keep_default_na=False, na_values={
+        name: [""] for name, kind in COLUMNS.items() if kind != "str"
+    })  # fmt: skip
+    pd.testing.assert_frame_equal(written, table, rtol=1e-9)
+
+
+def test_absent_numbers_are_empty_and_texts_are_no_formulas():
+    table = table_of([{"name": "=1+1.ulg", "updates": 3, "kf_nis_mean": None}, {"reason": None}])
+    assert table["kf_nis_mean"].isna().all()
+    assert table["updates"].isna().tolist() == [False, True]
+    head, row, _ = csv_bytes(table).decode("utf-8-sig").splitlines()
+    values = dict(zip(head.split(","), row.split(","), strict=True))
+    assert values["name"] == "'=1+1.ulg"
+    assert (values["updates"], values["kf_nis_mean"]) == ("3", "")
+
+
+@pytest.mark.reallogs
+def test_logs_without_a_position_are_not_judged_but_known(shared_logs, client):
+    (log,) = shared_logs.glob("simulated/*no_uwb.ulg")
+    row = px4fuse.batch(log).loc[0]
+    assert (row["status"], row["axis"]) == ("not judged", "")
+    assert row["firmware"] == "PX4 v1.16.1"
+    assert row["duration_s"] > 10
+    assert row["date"].startswith("20")
+    assert "--position-source vehicle_gps_position" in row["remedy"]
+
+
+# ------------------------------------------------------------------ resuming
+
+
+def test_a_second_run_does_only_what_is_new(client, flights, tmp_path):
+    logs, output = tmp_path / "logs", tmp_path / "out"
+    shutil.copytree(flights, logs)
+    (logs / "f4.ulg").rename(tmp_path / "f4.ulg")
+    (logs / "late.ulg").write_bytes(b"")
+    px4fuse.batch(logs, output)
+    times = {file: file.stat().st_mtime_ns for file in (output / "results").iterdir()}
+    assert len(times) == 3
+    (tmp_path / "f4.ulg").rename(logs / "f4.ulg")
+    (logs / "f2.ulg").rename(logs / "renamed.ulg")
+    (logs / "late.ulg").write_bytes(tiny_log(9))  # what failed is tried again
+    said: list[tuple[str, int, int]] = []
+    table = px4fuse.batch(logs, output, progress=lambda *step: said.append(step))
+    assert said[-1] == ("comparing, 0 failed", 2, 2)
+    after = {file: file.stat().st_mtime_ns for file in (output / "results").iterdir()}
+    assert {file: after[file] for file in times} == times
+    assert len(after) == 5
+    fresh = px4fuse.batch(logs)
+    assert_same(table.assign(results=""), fresh)
+    # other settings are another comparison
+    other = px4fuse.batch(logs / "f1.ulg", output, sigma_z_m=0.2)
+    assert other.loc[0, "settings"] == "px4fuse compare LOG --sigma-z 0.2"
+    assert other.loc[0, "kf_nis_mean"] < table.loc[0, "kf_nis_mean"]
+
+
+def test_a_killed_worker_costs_nothing(client, flights, undisturbed, tmp_path):
+    killed = []
+
+    def kill(what: str, done: int, of: int) -> None:
+        if what.startswith("comparing,") and not killed:
+            killed.extend(client.run(os.getpid).values())
+            for process in killed:
+                os.kill(process, signal.SIGKILL)
+
+    table = px4fuse.batch(flights, tmp_path, progress=kill)
+    assert len(killed) == 2
+    assert_same(table, undisturbed)
+    client.wait_for_workers(2, timeout=60)
+
+
+def test_interrupted_and_resumed_it_is_the_same_table(client, flights, undisturbed, tmp_path):
+    def interrupt(what: str, done: int, of: int) -> None:
+        if what.startswith("comparing,"):
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        px4fuse.batch(flights, tmp_path, progress=interrupt)
+    begun = pd.read_parquet(tmp_path / "fleet.parquet")
+    assert len(set(begun["name"])) == 1
+    assert_same(px4fuse.batch(flights, tmp_path), undisturbed)
+
+
+def test_ctrl_c_at_a_terminal_keeps_what_is_done_and_says_so_on_one_line(
+    flights, undisturbed, tmp_path
+):
+    arguments = [sys.executable, "-m", "px4fuse", "batch", flights, "-o", tmp_path]
+    process = subprocess.Popen(
+        arguments, stderr=subprocess.PIPE, text=True, env=environment(), start_new_session=True
+    )
+    while not any(tmp_path.glob("results/*.json")):
+        assert process.poll() is None
+        time.sleep(0.05)
+    os.killpg(process.pid, signal.SIGINT)  # as a terminal does: the workers too
+    _, said = process.communicate()
+    assert process.returncode == 130
+    assert said.startswith("px4fuse: interrupted, what is done is kept in")
+    assert said.count("\n") == 1
+    again = subprocess.run(arguments, capture_output=True, text=True, env=environment(), check=True)
+    assert "4 logs: 4 done" in again.stdout
+    assert "0 as before" not in again.stdout
+    # the session's own folder is the current one, so the paths differ as typed
+    assert_same(pd.read_parquet(tmp_path / "fleet.parquet"), undisturbed)
+
+
+# ------------------------------------------------------------------ what goes wrong
+
+
+def test_a_log_that_hangs_or_crashes_costs_that_log(client, flights, tmp_path, monkeypatch):
+    monkeypatch.setattr(run, "analyse", batch_tools.analyse)
+    logs = tmp_path / "logs"
+    logs.mkdir()
+    for seed, name in enumerate(("hang", "crash", "well"), 1):
+        (logs / f"{name}.ulg").write_bytes(tiny_log(seed))
+    table = px4fuse.batch(logs, timeout_s=20.0).set_index("name")
+    assert table.loc["well.ulg", "status"].tolist() == ["done"] * 4
+    hang, crash = table.loc["hang.ulg"], table.loc["crash.ulg"]
+    assert (hang["status"], crash["status"]) == ("failed", "failed")
+    assert hang["reason"] == "it took longer than 20 s and was ended"
+    assert hang["remedy"] == "Allow more with --timeout."
+    assert "ended 3 times" in crash["reason"]
+    client.wait_for_workers(2, timeout=60)
+
+
+def test_a_log_that_changes_while_it_is_read_says_so(flights, tmp_path, monkeypatch):
+    log = tmp_path / "f.ulg"
+    shutil.copy(flights / "f1.ulg", log)
+    work = Job(str(log), ComparisonRequest(log="LOG"), False, max_log_bytes.get(), "0.2.0")
+    work = Job(**vars(work) | {"px4fuse": run.metadata.version("px4fuse")})
+    sha256 = job.identify(work)
+    compared = job._compared
+
+    def grows(work: Job, path: Path, sha256: str) -> job.Outcome:
+        outcome = compared(work, path, sha256)
+        with path.open("ab") as file:
+            file.write(b"more")
+        return outcome
+
+    assert job.analyse(work).rows[0]["status"] == "done"
+    monkeypatch.setattr(job, "_compared", grows)
+    (row,) = job.analyse(work).rows
+    assert (row["status"], row["log_sha256"]) == ("failed", sha256)
+    assert row["reason"] == "it changed while it was read"
+    # and between the two times that it is read
+    monkeypatch.undo()
+    (row,) = job.analyse(Job(**vars(work) | {"sha256": sha256})).rows
+    assert row["reason"] == "it changed while it was read"
+
+
+def test_a_worker_that_comes_later_with_another_version_is_refused(flights):
+    work = Job(str(flights / "f1.ulg"), ComparisonRequest(log="LOG"), False, 10**9, "9.9")
+    with pytest.raises(SettingsError, match=r"a worker has px4fuse .*, not 9\.9"):
+        job.analyse(work)
+
+
+def test_a_full_disk_keeps_what_is_done(client, flights, undisturbed, tmp_path, monkeypatch):
+    write_all, written = run.write_all, []
+
+    def full(contents: dict[Path, bytes]) -> None:
+        if written:
+            raise OutputError("results/f.json: cannot be written (No space left on device).")
+        write_all(contents)
+        written.append(contents)
+
+    monkeypatch.setattr(run, "write_all", full)
+    with pytest.raises(OutputError, match=r"No space left .* What is done is kept: the same"):
+        px4fuse.batch(flights, tmp_path)
+    monkeypatch.undo()
+    said: list[tuple[str, int, int]] = []
+    table = px4fuse.batch(flights, tmp_path, progress=lambda *step: said.append(step))
+    assert said[-1] == ("comparing, 0 failed", 3, 3)
+    assert_same(table, undisturbed)
+
+
+def test_rows_are_kept_whole_when_the_disk_is_full(tmp_path):
+    path, row = tmp_path / "rows.sqlite", {"name": "a.ulg", "story": "x" * 50_000}
+
+    def fill() -> None:
+        with store.opened(path, "1", "s") as rows:
+            rows.connection.execute("pragma max_page_count = 60")
+            for number in range(100):
+                rows.keep(f"{number}", number, ["error", "info"], [row])
+
+    with pytest.raises(OutputError, match=r"database or disk is full.* make room"):
+        fill()
+    with store.opened(path, "1", "s") as rows:
+        kept = rows.hashes()
+        assert 0 < len(kept) < 100
+        assert all(rows.rows(sha256) == ([row], {"error", "info"}) for sha256 in kept)
+        assert rows.sizes() == {int(sha256) for sha256 in kept}
+        assert rows.rows("99") == ([], set())
+    with store.opened(path, "2", "s") as rows:
+        assert rows.hashes() == set()
+    path.write_bytes(b"not a database" * 100)
+    with pytest.raises(OutputError, match="not a database"), store.opened(path, "1", "s"):
+        pass
+
+
+def test_bad_input_is_one_line(tmp_path, flights):
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "file").touch()
+    for arguments, said in (
+        ([tmp_path / "empty", "-o", tmp_path / "o"], "no logs in it"),
+        ([tmp_path / "none.ulg", "-o", tmp_path / "o"], "no such file or folder"),
+        ([tmp_path / "*.ulg", "-o", tmp_path / "o"], "no logs in it"),
+        (["-o", tmp_path / "o"], "no logs"),
+        ([flights], "-o"),
+        ([flights, "-o", tmp_path / "file"], "is not a folder"),
+        ([flights, "-o", tmp_path / "o", "--sigma-z", "0"], "sigma"),
+        ([flights, "-o", tmp_path / "o", "--scheduler", "tcp://h:1", "--workers", 2], "--workers"),
+        ([flights, "-o", tmp_path / "o", "--memory", "lots"], "--memory"),
+        (["s3://bucket/logs", "-o", tmp_path / "o"], 'pip install "s3fs"'),
+        (["nonsense://x", "-o", tmp_path / "o"], "nonsense"),
+    ):
+        result = command(*arguments)
+        assert result.exit_code != 0, arguments
+        assert said in str(result.exception or result.output) + result.output
+    assert not (tmp_path / "o").exists()
+
+
+def test_slurm_and_kubernetes_are_told_how_to_start():
+    for name, package in (("slurm", "dask-jobqueue"), ("kubernetes", "dask-kubernetes")):
+        result = command("--scheduler", name)
+        assert result.exit_code == 0
+        assert f"pip install {package}" in result.output
+
+
+def test_settings_of_one_flight_are_refused(flights):
+    for settings in ({"mavlink": "a.tlog"}, {"sigma": 1.0}, {"sigma_z_m": 0.0}):
+        with pytest.raises(SettingsError):
+            px4fuse.batch(flights, **settings)
+
+
+# ------------------------------------------------------------------ where logs lie
+
+
+def test_logs_are_found_in_folders_globs_and_urls(tmp_path, monkeypatch):
+    import fsspec
+
+    monkeypatch.chdir(tmp_path)
+    for name in ("logs/b.ulg", "logs/deep/a.TLOG", "logs/c.txt", "logs/d[1].ulg", "named"):
+        path = tmp_path / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(b"12345")
+    assert [(log.name, log.log) for log in find_logs(["logs"])] == [
+        ("a.TLOG", "logs/deep/a.TLOG"), ("b.ulg", "logs/b.ulg"), ("d[1].ulg", "logs/d[1].ulg"),
+    ]  # fmt: skip
+    # each once, however it is given; a file that is named may be called anything
+    again = find_logs(["logs/*.ulg", str(tmp_path / "logs/b.ulg"), "logs/d[1].ulg", "named"])
+    assert [log.name for log in again] == ["b.ulg", "d[1].ulg", "named"]
+    assert {log.size_bytes for log in again} == {5}
+    memory = fsspec.filesystem("memory")
+    memory.pipe("/fleet/x.ulg", tiny_log(3))
+    (log,) = find_logs(["memory://fleet"])
+    assert (log.name, log.log) == ("x.ulg", "memory:///fleet/x.ulg")
+    work = Job(log.address, ComparisonRequest(log="LOG"), False, 10**9, "")
+    sha256 = job.identify(work)
+    version = run.metadata.version("px4fuse")
+    outcome = job.analyse(Job(**vars(work) | {"px4fuse": version}))
+    assert {row["log_sha256"] for row in outcome.rows} == {sha256}
+    assert {row["name"] for row in outcome.rows} == {"x.ulg"}
+    small = job.analyse(Job(**vars(work) | {"px4fuse": version, "max_bytes": 10}))
+    assert "more than the limit" in small.rows[0]["reason"]
+
+
+# ------------------------------------------------------------------ a cluster of its own
+
+
+def test_a_scheduler_and_two_workers_that_run_already(flights, undisturbed, tmp_path):
+    other = tmp_path / "px4fuse-9.9.dist-info"
+    other.mkdir()
+    (other / "METADATA").write_text("Metadata-Version: 2.1\nName: px4fuse\nVersion: 9.9\n")
+    no_dashboard = ("--no-dashboard", "--host", "127.0.0.1")
+    scheduler = ("scheduler", "--port", "0", "--dashboard-address", ":0", "--host", "127.0.0.1")
+
+    def worker(name: str, *options: str, **more: str):
+        return started(
+            "worker", address, "--nthreads", "1", *no_dashboard, *options,
+            says="Starting Worker plugin", log=tmp_path / name, **more,
+        )  # fmt: skip
+
+    with started(*scheduler, says="Scheduler at:", log=tmp_path / "scheduler") as line:
+        address = line.split()[-1]
+        with worker("first"), worker("second"):
+            arguments = [str(flights), "-o", str(tmp_path / "out"), "--scheduler", address]
+            result = command(*arguments, "--fail-on", "failed")
+            assert result.exit_code == 0, result.output
+            table = pd.read_parquet(tmp_path / "out" / "fleet.parquet")
+            assert_same(table, undisturbed)
+            path = f"{tmp_path}{os.pathsep}{batch_tools.REPOSITORY}"
+            with worker("third", PYTHONPATH=path):
+                result = command(*arguments)
+                assert "has px4fuse 9.9, and this is" in str(result.exception)
+
+
+@pytest.mark.reallogs
+def test_all_shared_logs_in_one_run(client, shared_logs, tmp_path):
+    files = [
+        str(file)
+        for file in sorted(shared_logs.rglob("*"))
+        if file.is_file() and file.suffix not in (".json", ".md")
+    ]
+    table = px4fuse.batch(files, tmp_path)
+    assert set(table["log"]) == set(files)
+    for log, rows in table.groupby("log"):
+        first = rows.iloc[0]
+        if first["axis"]:
+            assert rows["kf_nis_mean"].notna().any() or first["reason"], log
+            assert (tmp_path / first["results"]).is_file()
+        else:
+            assert len(rows) == 1
+            assert first["reason"], log
+            assert first["status"] in ("not judged", "failed")
+    assert (table.drop_duplicates("log")["status"] == "done").sum() >= 20

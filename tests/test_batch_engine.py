@@ -1,0 +1,74 @@
+"""Jobs on a cluster: what hangs, crashes or eats memory is lost alone."""
+
+from __future__ import annotations
+
+import sys
+
+import pytest
+from batch_tools import act
+
+import px4fuse
+from px4fuse.errors import SettingsError
+from px4fuse.fleet import engine
+from px4fuse.fleet.engine import Failed, connected, outcomes
+
+
+def test_each_bad_job_is_lost_alone_and_its_worker_begins_again(subtests):
+    jobs = [
+        ("square", 3), ("exit", 3), ("hang", 0), ("square", 4), ("hold the interpreter", 0),
+        ("hog", 4_000), ("raise", "no number"), ("square", 5), ("process", 0), ("square", 6),
+        ("variable", "OMP_NUM_THREADS"),
+    ]  # fmt: skip
+    with connected(workers=2, memory="1GB") as client:
+        found = dict(outcomes(client, act, jobs, timeout_s=8.0))
+        client.wait_for_workers(2, timeout=60)  # both have begun again
+    assert list(found) != jobs  # they come as they are done
+    for work, expected in {
+        ("square", 3): 9,
+        ("square", 4): 16,
+        ("square", 5): 25,
+        ("square", 6): 36,
+        ("variable", "OMP_NUM_THREADS"): "1",
+        ("exit", 3): "ended 3 times",
+        ("hang", 0): "longer than 8 s",
+        ("hold the interpreter", 0): "longer than 8 s",
+        ("hog", 4_000): "needed more memory",
+        ("raise", "no number"): "ValueError: no number",
+    }.items():
+        with subtests.test(work=work):
+            result = found.pop(work)
+            if isinstance(result, Failed):
+                assert expected in result.line
+            else:
+                assert result == expected
+    assert set(found) == {("process", 0)}
+
+
+def test_workers_that_cannot_be_ended_are_refused():
+    from distributed import Client
+
+    with (
+        Client(
+            processes=False,
+            n_workers=1,
+            threads_per_worker=2,
+            dashboard_address=None,
+            scheduler_kwargs={"dashboard_address": "127.0.0.1:0"},
+        ),
+        pytest.raises(SettingsError, match=r"has no nanny; .* --nthreads 1"),
+        connected(),
+    ):
+        pass
+
+
+def test_a_scheduler_that_does_not_answer_is_one_line(monkeypatch):
+    monkeypatch.setattr(engine, "CONNECT_S", 0.5)
+    for address in ("tcp://127.0.0.1:1", "nonsense://x", ""):
+        with pytest.raises(SettingsError, match="no Dask scheduler answers"), connected(address):
+            pass
+
+
+def test_without_dask_the_extra_is_named(monkeypatch, sample_log):
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(SettingsError, match=r'pip install "px4fuse\[batch\]"'):
+        px4fuse.batch(sample_log)

@@ -1,0 +1,250 @@
+"""A fleet against an earlier one: what is worse, and the same as JUnit XML."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from xml.etree import ElementTree as ET
+
+import numpy as np
+import pandas as pd
+import pytest
+from click.testing import CliRunner
+
+from px4fuse.cli import cli
+from px4fuse.errors import SettingsError
+from px4fuse.fleet.junit import junit
+from px4fuse.fleet.regressions import MIN_FLIGHTS, marked, read_baseline
+from px4fuse.fleet.rows import csv_bytes, table_of
+
+AXES = ("north", "east")
+
+
+def flight(number: int, *, vehicle: str = "quad", settings: str = "usual", **values) -> list[dict]:
+    """Rows of one flight that is as all others are, but for some values."""
+    rng = np.random.default_rng(number)
+    return [
+        {
+            "log": f"{number}.ulg",
+            "name": f"{number}.ulg",
+            "log_sha256": f"{number:064x}",
+            "px4fuse": "1",
+            "settings": settings,
+            "status": "done",
+            "vehicle": vehicle,
+            "axis": axis,
+            "ekf2_nis_mean": np.exp(rng.normal(0.0, 0.1)),
+            "kf_nis_mean": np.exp(rng.normal(-0.1, 0.1)),
+            "sigma_z_m": 0.1 * np.exp(rng.normal(0.0, 0.05)),
+            "sigma_a_m_s2": 0.3 * np.exp(rng.normal(0.0, 0.2)),
+            "clock_offset_s": rng.normal(0.0, 0.02),
+            "rejected_share": 0.0,
+            "position_rmse_m": 0.07 * np.exp(rng.normal(0.0, 0.1)),
+            **values,
+        }
+        for axis in AXES
+    ]
+
+
+def fleet(*flights: list[dict]) -> pd.DataFrame:
+    return table_of(row for one in flights for row in one)
+
+
+BEFORE = fleet(*(flight(number) for number in range(12)))
+
+
+def changes_of(table: pd.DataFrame, baseline: pd.DataFrame = BEFORE) -> dict[tuple[str, str], str]:
+    found = marked(table, baseline).table
+    return {(row.log, row.axis): row.change for row in found.itertuples() if row.change}
+
+
+# -- the same log ----------------------------------------------------------------------------------
+
+
+def test_a_log_is_held_against_itself_whatever_its_settings():
+    again = fleet(flight(3, settings="other", ekf2_nis_mean=4.0, sigma_z_m=0.05))
+    found = marked(again, BEFORE)
+    assert (found.same, found.by_vehicle, found.neither) == (1, 0, 0)
+    change = found.table["change"].iloc[0]
+    was = BEFORE.loc[BEFORE["log"] == "3.ulg", "ekf2_nis_mean"].iloc[0]
+    assert change == f"NIS of EKF2 4, was {was:.3g}"  # a smaller noise is better
+
+
+def test_the_same_table_is_not_worse_than_itself():
+    assert changes_of(BEFORE) == {}
+
+
+def test_a_log_that_fails_now_is_worse():
+    lost = table_of(
+        [{"log": "3.ulg", "name": "3.ulg", "status": "failed", "reason": "ended after 5 s"}]
+    )
+    assert changes_of(lost) == {("3.ulg", ""): "fails, and was compared before"}
+    new = table_of([{"log": "99.ulg", "name": "99.ulg", "status": "failed", "reason": "damaged"}])
+    assert changes_of(new) == {}
+
+
+# -- the vehicle's flights -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("values", "said"),
+    [
+        (
+            {"sigma_z_m": 0.2},
+            r"SIGMA_Z found 0\.2 m, 0\.08\d* m to 0\.11\d* m expected from 12 flights",
+        ),
+        ({"ekf2_nis_mean": 0.2}, "NIS of EKF2 0.2, "),
+        ({"clock_offset_s": -0.25}, r"clock offset -0\.25 s, -0\.0\d+ s to 0\.0\d+ s expected"),
+        ({"rejected_share": 0.1}, "share that EKF2 rejected 0.1, "),
+        ({"position_rmse_m": 0.3}, "ours - EKF2 0.3 m"),
+    ],
+)
+def test_what_lies_outside_the_range_of_the_vehicle_is_worse(values, said):
+    found = changes_of(fleet(flight(50, **values), flight(51)))
+    assert set(found) == {("50.ulg", axis) for axis in AXES}
+    assert re.search(said, found["50.ulg", "north"])
+    assert ";" not in found["50.ulg", "north"]
+
+
+def test_what_is_better_is_not_marked():
+    assert changes_of(fleet(flight(50, sigma_z_m=0.04), flight(51, ekf2_nis_mean=1.0))) == {}
+
+
+def test_with_a_truth_the_distance_of_the_two_filters_says_nothing():
+    known = {"ekf2_position_rmse_to_truth_m": 0.05}
+    before = fleet(*(flight(number, **known) for number in range(12)))
+    assert changes_of(fleet(flight(50, position_rmse_m=0.3, **known)), before) == {}
+    worse = fleet(flight(50, ekf2_position_rmse_to_truth_m=0.06))
+    assert "error of EKF2" in changes_of(worse, before)["50.ulg", "north"]
+
+
+def test_other_vehicles_other_settings_and_few_flights_say_nothing():
+    bad = {"sigma_z_m": 0.5}
+    table = fleet(flight(50, vehicle="hexa", **bad), flight(51, settings="other", **bad))
+    found = marked(table, BEFORE)
+    assert (found.neither, set(found.table["change"])) == (2, {""})
+    few = fleet(*(flight(number) for number in range(MIN_FLIGHTS - 1)))
+    assert changes_of(fleet(flight(52, **bad)), few) == {}
+    assert changes_of(fleet(flight(52, vehicle="", **bad))) == {}
+
+
+def test_flights_of_the_same_vehicle_are_rarely_called_worse():
+    """Of runs of twenty flights that are as the baseline's, one in twenty may have one."""
+    hits = []
+    for run in range(40):
+        first = 1000 + 100 * run
+        before = fleet(*(flight(number) for number in range(first, first + 15)))
+        after = fleet(*(flight(number) for number in range(first + 50, first + 70)))
+        hits.append(bool(changes_of(after, before)))
+    assert np.mean(hits) <= 0.1
+
+
+# -- files -----------------------------------------------------------------------------------------
+
+
+def test_the_baseline_is_a_table_of_batch(tmp_path):
+    BEFORE.to_parquet(tmp_path / "fleet.parquet")
+    (tmp_path / "fleet.csv").write_bytes(csv_bytes(BEFORE))
+    worse = fleet(flight(3, ekf2_nis_mean=4.0), flight(50, sigma_z_m=0.2))
+    said = [changes_of(worse, read_baseline(tmp_path / f"fleet.{e}")) for e in ("parquet", "csv")]
+    assert said[0] == said[1] == changes_of(worse)
+    assert len(said[0]) == 4
+
+
+def test_what_is_no_table_of_batch_is_refused(tmp_path):
+    other, text = tmp_path / "other.parquet", tmp_path / "text.parquet"
+    pd.DataFrame({"log": ["a"]}).to_parquet(other)
+    text.write_text("hello", encoding="utf-8")
+    with pytest.raises(SettingsError, match="has no column axis"):
+        read_baseline(other)
+    with pytest.raises(SettingsError, match="cannot be read as a table"):
+        read_baseline(text)
+    with pytest.raises(SettingsError, match="cannot be read"):
+        read_baseline(tmp_path / "missing.parquet")
+
+
+def test_worse_than_nothing_is_refused(tmp_path):
+    done = CliRunner().invoke(cli, ["batch", "x.ulg", "-o", str(tmp_path), "--fail-on", "worse"])
+    assert "requires --baseline" in str(done.exception)
+
+
+# -- JUnit -----------------------------------------------------------------------------------------
+
+# Elements of Jenkins' junit-10.xsd that a suite of ours may have, their attributes and children
+SCHEMA = {
+    "testsuites": ({"name", "time", "tests", "failures", "disabled", "errors"}, {"testsuite"}),
+    "testsuite": (
+        {"name", "tests", "failures", "errors", "time", "disabled", "skipped", "timestamp",
+         "hostname", "id", "package"},
+        {"properties", "testcase", "system-out", "system-err"},
+    ),
+    "testcase": (
+        {"name", "assertions", "time", "classname", "status"},
+        {"skipped", "error", "failure", "system-out", "system-err"},
+    ),
+    "failure": ({"type", "message"}, set()),
+    "skipped": ({"message"}, set()),
+}  # fmt: skip
+
+
+def made(table: pd.DataFrame) -> ET.Element:
+    """The XML, which must be as the common schema has it."""
+    root = ET.fromstring(junit(table))
+    for element in root.iter():
+        attributes, children = SCHEMA[element.tag]
+        assert set(element.attrib) <= attributes
+        assert {child.tag for child in element} <= children
+        if element.tag in ("testsuite", "testcase"):
+            assert element.get("name")
+    suite = root.find("testsuite")
+    assert suite is not None
+    for name, path in (("tests", "testcase"), ("failures", "testcase/failure"),
+                       ("skipped", "testcase/skipped")):  # fmt: skip
+        assert int(suite.attrib[name]) == len(suite.findall(path))
+    return suite
+
+
+def test_a_log_is_a_test_case_which_fails_where_it_is_worse_or_failed():
+    table = table_of(
+        [
+            *flight(50),
+            *flight(51, sigma_z_m=0.3),
+            {"log": "52.ulg", "status": "failed", "reason": "ended after 5 s", "remedy": "Cut it."},
+            {"log": "53.ulg", "status": "not judged", "reason": "no position", "remedy": "Log it."},
+        ]
+    )
+    suite = made(marked(table, BEFORE).table)
+    cases = {case.attrib["name"]: case for case in suite}
+    assert list(cases) == ["50.ulg", "51.ulg", "52.ulg", "53.ulg"]
+    assert [child.tag for case in cases.values() for child in case] == [
+        "failure", "failure", "skipped",
+    ]  # fmt: skip
+    worse, failed = (cases[name].find("failure") for name in ("51.ulg", "52.ulg"))
+    assert worse.attrib["type"] == "worse"
+    assert worse.text.splitlines()[1].startswith("east: SIGMA_Z found 0.3 m")
+    assert failed.attrib == {"type": "failed", "message": "ended after 5 s. Cut it."}
+    assert cases["50.ulg"].attrib["classname"] == "quad"
+
+
+def test_names_that_xml_cannot_hold_are_written_without_what_it_cannot():
+    table = table_of([{"log": "a\x00<&\x1b.ulg", "status": "failed", "reason": "\x07no"}])
+    (case,) = made(table)
+    assert case.attrib["name"] == "a<&.ulg"
+    assert case[0].attrib["message"] == "no"
+
+
+def test_the_command_marks_writes_and_fails(sample_log, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    common = ["batch", str(sample_log), "--workers", "1", "--axis", "north"]
+    first = CliRunner().invoke(cli, [*common, "-o", "before"])
+    assert first.exit_code == 0, first.output
+    options = ["--baseline", "before/fleet.parquet", "--junit", "j.xml", "--fail-on", "worse"]
+    same = CliRunner().invoke(cli, [*common, "-o", "after", *options])
+    assert same.exit_code == 0, same.output
+    assert "Held against the baseline: 1 by the same log" in same.output
+    assert made(pd.read_parquet("after/fleet.parquet")).get("failures") == "0"
+    worse = CliRunner().invoke(cli, [*common, "-o", "worse", "--sigma-z", "0.3", *options])
+    assert worse.exit_code == 1, worse.output
+    table = pd.read_parquet("worse/fleet.parquet")
+    assert table["change"].iloc[0].startswith("NIS of ours")
+    assert Path("j.xml").read_bytes() == junit(table)
