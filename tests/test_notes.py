@@ -128,6 +128,9 @@ def test_ids_and_quotes():
     theirs = ("The stamps of the UWB are late by 0.25 s against the IMU, which no filter shows.",)
     copied = theirs[0].replace("0.25", "0.31")
     assert read(copied * 3, theirs=theirs).problem == "are mostly sentences of px4fuse itself"
+    numbers = ("From 20 s to 25 s there are 14 of 600 samples 2 m beside the track here.",)
+    others = "From 21 s to 24 s there are 15 of 601 samples 3 m beside the track here."
+    assert read(others * 2, theirs=numbers).sentences == ()
     mixed = f"{ENGLISH}\n\n{copied}"
     made = read(mixed, theirs=theirs)
     assert (made.problem, made.quoted) == ("", 18)
@@ -138,6 +141,11 @@ def test_what_a_page_does_not_show_is_not_read():
     hidden = "<!-- There are outliers at 20 s. -->\n\n[a]: http://b 'There are outliers at 20 s.'"
     assert read(hidden).words == 0
     assert read("A `code` with outliers at **20 s** is read.").words == 9
+
+
+def test_greek_and_cyrillic_capitals_are_folded():
+    assert folded("ΒΟΤΗ ΝΙЅ, Ιnnovation") == "both nis, innovation"
+    assert folded("٢٥ ２５ ㎳") == "25 25 ms"
 
 
 def test_disguised_words():

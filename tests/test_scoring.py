@@ -601,6 +601,12 @@ class TestWhatStudentsRead:
         assert "\x1b" not in text
         assert "=cmd|' /C calc'!A0 <script>" in text
 
+    def test_a_file_that_is_missing_is_asked_for(self):
+        verdict = Verdict("cannot verify", ("why",), False, remedy="Add uwb.csv to --logs.")
+        text = " ".join(feedback(graded(verdict=verdict)).split())
+        assert "Hand in uwb.csv too, if your instructor does not have it." in text
+        assert "--logs" not in text
+
     def test_points_that_are_pending_are_said_to_be(self):
         items = score(report(), VERIFIED, read_rubric(None), None)
         text = feedback(graded(items, pending="Add uwb.csv to --logs."))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import textwrap
 
 from px4fuse.grading.checks_report import without_log
@@ -9,6 +10,8 @@ from px4fuse.grading.evidence import NAMED, joined, text_of
 from px4fuse.grading.model import Graded
 from px4fuse.verification.model import Verdict
 
+# What an instructor is told, from which a student learns what to hand in
+MISSING = re.compile(r"Add (.*) to --logs\.")
 NEXT = (
     "Your instructor has these points as a proposal and decides; ask if you think that something "
     "was overlooked."
@@ -64,6 +67,9 @@ def verdict_text(verdict: Verdict) -> str:
         )
     reasons = joined(verdict.reasons[:NAMED])
     said = f"{said.rstrip('.')}: {reasons}." if reasons else said
+    missing = MISSING.fullmatch(verdict.remedy)
+    if missing:
+        return f"{said} Hand in {text_of(missing[1])} too, if your instructor does not have it."
     if verdict.status == "other log":
         return f"{said} Make the report of the log that you were given, or hand in your log too."
     return f"{said} Make it again with px4fuse and hand in the PDF as it was written."
