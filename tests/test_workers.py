@@ -131,6 +131,9 @@ def test_what_eats_memory_is_ended():
 def test_processes_are_replaced_after_some_jobs(monkeypatch):
     monkeypatch.setattr(workers, "JOBS_PER_WORKER", 2)
     results, _ = run([("process", 0)] * 5, processes=1)
+    assert len(set(results)) == 1  # quick ones
+    monkeypatch.setattr(workers, "QUICK_S", 0.0)
+    results, _ = run([("process", 0)] * 5, processes=1)
     assert len(set(results)) == 3
     assert results[0] == results[1] != results[2]
 

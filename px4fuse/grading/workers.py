@@ -23,8 +23,10 @@ from px4fuse.errors import Px4FuseError
 Job = TypeVar("Job")
 Result = TypeVar("Result")
 
-# A worker is replaced after so many jobs: what libraries cache does not grow with the class
+# A worker is replaced after so many jobs: what libraries cache does not grow with the class. What
+# is done in less than this fills no cache, and a new process takes two seconds to import
 JOBS_PER_WORKER = 40
+QUICK_S = 0.5
 # Until a new process has imported what the function needs, on a slow and busy machine
 START_S = 180.0
 # Read by an interpreter and by libraries as they start, before any code of ours runs
@@ -64,6 +66,7 @@ class _Worker:
         self.ready = False
         self.job: int | None = None
         self.jobs_done = 0
+        self.sent = time.monotonic()
         self.deadline = time.monotonic() + START_S
 
     def end(self) -> None:
@@ -118,7 +121,7 @@ def run_bounded(
 
     def done(worker: _Worker, result: Any) -> None:
         index, worker.job = worker.job, None
-        worker.jobs_done += 1
+        worker.jobs_done += time.monotonic() - worker.sent >= QUICK_S
         if index is not None:
             if keep:
                 results[index] = result
@@ -166,6 +169,7 @@ def _wait_for_any(workers: list[_Worker]) -> list[Any]:
 
 def _send(worker: _Worker, jobs: Sequence[Any]) -> None:
     assert worker.job is not None
+    worker.sent = time.monotonic()
     # a process that died in between shows at the next look at its pipe
     with suppress(BrokenPipeError, ConnectionResetError):
         worker.pipe.send(jobs[worker.job])
