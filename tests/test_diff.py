@@ -200,6 +200,14 @@ def test_each_number_has_its_direction(aim, a, b, judgement):
     assert (change.status, change.judgement, change.p) == ("differs", judgement, None)
 
 
+def test_on_the_other_side_of_the_best_it_must_be_farther_by_more_than_chance():
+    first, second = (number(v, (v / 1.1, v * 1.1), aim="one") for v in (0.25, 4.1))
+    (change,) = number_changes({"it": (first, second)}, paired=False)
+    assert (change.status, change.judgement) == ("significant", "changed")
+    (change,) = number_changes({"it": (first, second)}, paired=True)
+    assert change.judgement == "worse"
+
+
 def test_an_offset_is_better_nearer_to_zero():
     made = [normal(v, 0.01, aim="zero") for v in (-0.25, 0.02, -0.02)]
     (better,) = number_changes({"it": (made[0], made[1])}, paired=False)
