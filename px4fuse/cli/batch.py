@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from px4fuse.fleet.run import Fleet
 
 FAILED, WORSE = "failed", "worse"
+# Reasons why logs are not compared, and findings, that the terminal shows
+SHOWN = 8
 # How a cluster of each kind is started, for people who have one
 CLUSTERS = {
     "slurm": """\
@@ -201,9 +203,17 @@ def _print(fleet: Fleet) -> None:
 
     console = terminal()
     logs = fleet.table.drop_duplicates("log")
-    for status, kind in (("not judged", "yellow"), (FAILED, "red")):
-        for row in logs[logs["status"].eq(status) & logs["axis"].eq("")].itertuples():
-            say(console, Text(f"{row.log}: {status}: {row.reason}. {row.remedy}".rstrip(), kind))
+    alone = logs[logs["axis"] == ""]
+    causes = alone.groupby(["status", "reason", "remedy"], sort=False)["log"].agg(
+        ["count", "first"]
+    )
+    most = causes.sort_values("count", ascending=False, kind="stable")
+    for cause in most.head(SHOWN).reset_index().itertuples():
+        which = cause.one if cause.logs == 1 else f"{cause.logs} logs, one is {cause.one}"
+        text = f"{which!s}: {cause.status}: {cause.reason}. {cause.remedy}".rstrip()
+        say(console, Text(text, "red" if cause.status == FAILED else "yellow"))
+    if len(most) > SHOWN:
+        say(console, f"{len(most) - SHOWN} more reasons are in fleet.html.")
     table = plain_table(
         ("axis", "left"),
         *(
@@ -222,7 +232,7 @@ def _print(fleet: Fleet) -> None:
         console.print(table)
         say(console, Text("factor: median of how many times S is overstated (above 1)", "dim"))
     found = logs["findings"].str.split(";").explode()
-    for finding, count in found[found != ""].value_counts().head(5).items():
+    for finding, count in found[found != ""].value_counts().head(SHOWN).items():
         say(console, f"{count} × {finding}")
     for row in fleet.table[fleet.table["change"] != ""].itertuples():
         say(console, Text(f"worse: {row.log} {row.axis}: {row.change}", "red"))
