@@ -122,7 +122,6 @@ def test_logs_without_a_position_are_not_judged_but_known(shared_logs, client):
     assert (row["status"], row["axis"]) == ("not judged", "")
     assert row["firmware"] == "PX4 v1.16.1"
     assert row["duration_s"] > 10
-    assert row["date"].startswith("20")
     assert "--position-source vehicle_gps_position" in row["remedy"]
 
 

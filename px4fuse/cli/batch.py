@@ -20,7 +20,8 @@ if TYPE_CHECKING:
     from px4fuse.fleet.run import Fleet
 
 FAILED, WORSE = "failed", "worse"
-MOST_WORSE = 10
+# Reasons why logs are not compared, findings and what is worse, that the terminal shows
+SHOWN = 8
 # How a cluster of each kind is started, for people who have one
 CLUSTERS = {
     "slurm": """\
@@ -203,9 +204,17 @@ def _print(fleet: Fleet) -> None:
 
     console = terminal()
     logs = fleet.table.drop_duplicates("log")
-    for status, kind in (("not judged", "yellow"), (FAILED, "red")):
-        for row in logs[logs["status"].eq(status) & logs["axis"].eq("")].itertuples():
-            say(console, Text(f"{row.log}: {status}: {row.reason}. {row.remedy}".rstrip(), kind))
+    alone = logs[logs["axis"] == ""]
+    causes = alone.groupby(["status", "reason", "remedy"], sort=False)["log"].agg(
+        ["count", "first"]
+    )
+    most = causes.sort_values("count", ascending=False, kind="stable")
+    for cause in most.head(SHOWN).reset_index().itertuples():
+        which = cause.one if cause.logs == 1 else f"{cause.logs} logs, one is {cause.one}"
+        text = f"{which!s}: {cause.status}: {cause.reason}. {cause.remedy}".rstrip()
+        say(console, Text(text, "red" if cause.status == FAILED else "yellow"))
+    if len(most) > SHOWN:
+        say(console, f"{len(most) - SHOWN} more reasons are in fleet.html.")
     table = plain_table(
         ("axis", "left"),
         *(
@@ -224,13 +233,13 @@ def _print(fleet: Fleet) -> None:
         console.print(table)
         say(console, Text("factor: median of how many times S is overstated (above 1)", "dim"))
     found = logs["findings"].str.split(";").explode()
-    for finding, count in found[found != ""].value_counts().head(5).items():
+    for finding, count in found[found != ""].value_counts().head(SHOWN).items():
         say(console, f"{count} × {finding}")
     worse = fleet.table[fleet.table["change"] != ""]
-    for row in worse.head(MOST_WORSE).itertuples():
+    for row in worse.head(SHOWN).itertuples():
         say(console, Text(f"worse: {row.log} {row.axis}: {row.change}", "red"))
-    if len(worse) > MOST_WORSE:
-        say(console, f"and {len(worse) - MOST_WORSE} more in the column change")
+    if len(worse) > SHOWN:
+        say(console, f"and {len(worse) - SHOWN} more in the column change")
     if fleet.against:
         say(console, fleet.against)
     counts = logs["status"].value_counts()
