@@ -17,15 +17,18 @@ import pandas as pd
 import pytest
 from batch_tools import environment, started, tiny_log, tiny_logs
 from click.testing import CliRunner
+from made_up_fleet import DAMAGED, made_up
 
 import px4fuse
 from px4fuse.cli import cli
+from px4fuse.cli.batch import _print
 from px4fuse.errors import OutputError, SettingsError
 from px4fuse.fleet import job, run, store
 from px4fuse.fleet.engine import connected
 from px4fuse.fleet.job import Job
 from px4fuse.fleet.logs import find_logs
 from px4fuse.fleet.rows import COLUMNS, csv_bytes, table_of
+from px4fuse.fleet.run import Fleet
 from px4fuse.reading import max_log_bytes
 from px4fuse.request import ComparisonRequest
 from px4fuse.results.reading import read_results
@@ -103,6 +106,15 @@ def test_every_log_is_in_the_table_with_its_numbers_or_its_line(client, tmp_path
         name: [""] for name, kind in COLUMNS.items() if kind != "str"
     })  # fmt: skip
     pd.testing.assert_frame_equal(written, table, rtol=1e-9)
+
+
+def test_the_terminal_counts_what_is_wrong_with_whole_logs(capsys):
+    table = made_up(60).fillna({"axis": "", "change": ""})
+    _print(Fleet(table, 3, frozenset(), ()))
+    said = " ".join(capsys.readouterr().out.split())
+    failed = table[table["status"] == "failed"]
+    assert f"{len(failed)} logs, one is {failed['log'].iloc[0]}: failed: {DAMAGED[0]}" in said
+    assert f"60 logs: {(table.drop_duplicates('log')['status'] == 'done').sum()} done" in said
 
 
 def test_absent_numbers_are_empty_and_texts_are_no_formulas():

@@ -205,11 +205,11 @@ def _print(fleet: Fleet) -> None:
     console = terminal()
     logs = fleet.table.drop_duplicates("log")
     alone = logs[logs["axis"] == ""]
-    causes = alone.groupby(["status", "reason", "remedy"], sort=False)["log"].agg(
-        ["count", "first"]
+    causes = alone.groupby(["status", "reason", "remedy"], sort=False, as_index=False).agg(
+        logs=("log", "count"), one=("log", "first")
     )
-    most = causes.sort_values("count", ascending=False, kind="stable")
-    for cause in most.head(SHOWN).reset_index().itertuples():
+    most = causes.sort_values("logs", ascending=False, kind="stable")
+    for cause in most.head(SHOWN).itertuples():
         which = cause.one if cause.logs == 1 else f"{cause.logs} logs, one is {cause.one}"
         text = f"{which!s}: {cause.status}: {cause.reason}. {cause.remedy}".rstrip()
         say(console, Text(text, "red" if cause.status == FAILED else "yellow"))
