@@ -117,6 +117,13 @@ def test_the_terminal_counts_what_is_wrong_with_whole_logs(capsys):
     assert f"60 logs: {(table.drop_duplicates('log')['status'] == 'done').sum()} done" in said
 
 
+def test_a_name_that_is_not_utf_8_has_its_row(tmp_path):
+    table = table_of([{"log": os.fsdecode(b"flight-\xff.ulg"), "status": "failed"}])
+    table.to_parquet(tmp_path / "fleet.parquet")
+    assert pd.read_parquet(tmp_path / "fleet.parquet")["log"].item() == "flight-?.ulg"
+    assert "flight-?.ulg" in csv_bytes(table).decode()
+
+
 def test_absent_numbers_are_empty_and_texts_are_no_formulas():
     table = table_of([{"name": "=1+1.ulg", "updates": 3, "kf_nis_mean": None}, {"reason": None}])
     assert table["kf_nis_mean"].isna().all()

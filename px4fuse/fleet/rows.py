@@ -171,11 +171,18 @@ def table_of(rows: Iterable[Mapping[str, Any]]) -> pd.DataFrame:
     Parameters
     ----------
     rows : iterable of mapping
-        Absent numbers and texts may be left out or None.
+        Absent numbers and texts may be left out or None. Of a file's name that is not UTF-8, what no
+        table can hold is replaced.
     """
     texts = dict.fromkeys((name for name, kind in COLUMNS.items() if kind == "str"), "")
-    known = [{name: value for name, value in row.items() if value is not None} for row in rows]
+    known = [
+        {name: _held(value) for name, value in row.items() if value is not None} for row in rows
+    ]
     return pd.DataFrame([texts | row for row in known], columns=list(COLUMNS)).astype(COLUMNS)
+
+
+def _held(value: Any) -> Any:
+    return value.encode(errors="replace").decode() if isinstance(value, str) else value
 
 
 def csv_bytes(table: pd.DataFrame) -> bytes:
