@@ -171,8 +171,8 @@ def table_of(rows: Iterable[Mapping[str, Any]]) -> pd.DataFrame:
     Parameters
     ----------
     rows : iterable of mapping
-        Absent numbers and texts may be left out or None. Of a file's name that is not UTF-8, what no
-        table can hold is replaced.
+        Absent numbers and texts may be left out or None. What is not UTF-8 in a file's name, which
+        no table can hold, is replaced.
     """
     texts = dict.fromkeys((name for name, kind in COLUMNS.items() if kind == "str"), "")
     known = [
