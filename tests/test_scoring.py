@@ -638,7 +638,7 @@ class TestWhatStudentsRead:
 # ------------------------------------------------------------------ flags
 
 
-TUNED = {"settings__sigma_a_m_s2": 0.363, "settings__sigma_z_m": 0.0983}
+TUNED = {"settings__sigma_a_m_s2": 0.363, "settings__sigma_z_m": 0.0977}
 REASON = "chosen with --start and --end"
 
 
@@ -651,7 +651,7 @@ class TestOwnFlags:
         (flag,) = own_flags(decoded(changed(**TUNED)))
         assert "tuned on the segment that is graded" in flag
         assert "0.015 nats" in flag
-        assert own_flags(decoded(changed(settings__sigma_z_m=0.0983))) == ()
+        assert own_flags(decoded(changed(settings__sigma_z_m=0.0977))) == ()
         assert own_flags(decoded(changed(settings__sigma_a_m_s2=0.36, settings__sigma_z_m=0.098)))
 
     def test_part_chosen_by_hand(self):

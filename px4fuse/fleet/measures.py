@@ -150,7 +150,7 @@ def _of_flight(results: ComparisonResults) -> Iterator[tuple[str, Number]]:
             "heading.turn_deg",
         )  # fmt: skip
     # EKF2 rejects a horizontal position as a whole
-    level = next((name for name in (AISLE, "north", "east") if name in results.axes), "")
+    level = next((name for name in ("north", "east", AISLE) if name in results.axes), "")
     for at, label in ((level, "horizontal"), ("down", "down")):
         axis = next((axis for name, axis in results.axes.items() if name == at), None)
         if axis is None or axis.rejected_share is None or not isinstance(axis.ekf2, Filter):
