@@ -138,10 +138,14 @@ class Browser:
         assert "exceptionDetails" not in answer, answer
         return answer["result"].get("value")
 
-    def contrasts(self) -> list[tuple[str, str, str]]:
-        """Colour, that of what is behind, and class of everything that shows text."""
-        return list(
-            self.ask(
+    def contrasts(self, scheme: str) -> dict[tuple[str, str, str], float]:
+        """Contrast of everything that shows text, by its colour, that behind it, and its class."""
+        self.call(
+            "Emulation.setEmulatedMedia",
+            features=[{"name": "prefers-color-scheme", "value": scheme}],
+        )
+        try:
+            found = self.ask(
                 """(() => {
                   const behind = (node) => {
                     for (let n = node; n; n = n.parentElement) {
@@ -157,7 +161,9 @@ class Browser:
                     .map((node) => [getComputedStyle(node).color, behind(node), node.className]);
                 })()"""
             )
-        )
+        finally:
+            self.call("Emulation.setEmulatedMedia", features=[])
+        return {(front, back, name): contrast(front, back) for front, back, name in found}
 
     def click(self, selector: str) -> None:
         """Where a finger would: so that it fails on what is covered or hidden."""
