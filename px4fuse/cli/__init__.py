@@ -19,6 +19,7 @@ from px4fuse.writing import STOPPING
 COMMANDS = {
     "compare": ("px4fuse.cli.compare", "Compare a flight's EKF2 with a two-state Kalman filter."),
     "batch": ("px4fuse.cli.batch", "Compare many logs, on this computer or a cluster."),
+    "diff": ("px4fuse.cli.diff", "Say what changed between two flights or two settings."),
     "explore": ("px4fuse.cli.explore", "Turn the filter's knobs on a flight, in a web page."),
     "info": ("px4fuse.cli.info", "Say what is in a log and what can be done with it."),
     "extract": ("px4fuse.cli.extract", "Write a log's data as tidy tables, CSV or Parquet."),
@@ -28,7 +29,6 @@ COMMANDS = {
     "loop": ("px4fuse.cli.loop", "Measure and correct the closure error of a loop."),
     "evaluate": ("px4fuse.cli.evaluate", "Score a trajectory: ATE and RPE against a reference."),
     "simulate": ("px4fuse.cli.simulate", "Simulate a flight with chosen mistakes, as ULog."),
-    "diff": ("px4fuse.cli.diff", "Say what changed between two flights or two settings."),
     "verify": ("px4fuse.cli.verify", "Check a report against its log, number by number."),
     "grade": ("px4fuse.cli.grade", "Verify and score a class's reports."),
     "lesson": ("px4fuse.cli.lesson", "Run the lesson's worked examples through this engine."),
