@@ -39,7 +39,7 @@ def at_root(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("line", LINES)
 def test_command_runs(at_root, line):
-    result = CliRunner().invoke(cli, shlex.split(line)[1:])
+    result = CliRunner().invoke(cli, shlex.split(line, comments=True)[1:])
     assert result.exit_code == 0, result.output
 
 
