@@ -23,7 +23,7 @@ from px4fuse.filter.kalman import (
     state_at,
     variance_at,
 )
-from px4fuse.filter.model import H, input_matrix, matrix, noise, transition
+from px4fuse.filter.model import H, matrix, noise
 from px4fuse.filter.signals import Axis, choose_segment, choose_source, make_axes
 from px4fuse.flight import Flight
 
@@ -221,9 +221,8 @@ def test_replay_is_filterpys_predict_and_update(axis: Axis, chosen: Settings) ->
     ):
         dt = now - before
         q = (chosen.sigma_a_m_s2**2 + extra) * chosen.dt_s
-        kalman.predict(
-            u=np.array([[a]]), B=input_matrix(dt), F=transition(dt), Q=q * matrix(noise(dt))
-        )
+        f, b = np.array([[1.0, dt], [0.0, 1.0]]), np.array([[dt**2 / 2.0], [dt]])
+        kalman.predict(u=np.array([[a]]), B=b, F=f, Q=q * matrix(noise(dt)))
         if now in run.updates.index:
             kalman.update(run.updates["measurement_m"][now])
         expected.append([*kalman.x[:, 0], *kalman.P[[0, 0, 1], [0, 1, 1]]])

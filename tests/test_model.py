@@ -14,15 +14,14 @@ P = (0.5, -0.2, 0.7)
 
 @pytest.mark.parametrize("dt", [0.01, 0.1, 0.7])
 def test_elements_are_those_of_the_matrices(dt: float) -> None:
-    f = model.transition(dt)
+    f, b = np.array([[1.0, dt], [0.0, 1.0]]), np.array([[dt**2 / 2.0], [dt]])
     np.testing.assert_allclose(
         model.matrix(model.spread(P, dt)), f @ model.matrix(P) @ f.T, rtol=1e-14
     )
     x = np.array([[1.5], [-2.0]])
-    moved = f @ x + model.input_matrix(dt) * 3.0
+    moved = f @ x + b * 3.0
     np.testing.assert_allclose(model.move(1.5, -2.0, 3.0, dt), moved[:, 0], rtol=1e-14)
     # Q = B Bᵀ / dt: the acceleration is constant over the step
-    b = model.input_matrix(dt)
     np.testing.assert_allclose(model.matrix(model.noise(dt)), b @ b.T / dt, rtol=1e-14)
 
 

@@ -8,8 +8,7 @@ State x = [position, velocity]; input a, the acceleration averaged over the step
 With dt = DT, Q is the lesson's SIGMA_A² · [[dt⁴/4, dt³/2], [dt³/2, dt²]] digit for digit. For other
 steps it keeps the velocity noise per second, so that SIGMA_A means the same at every rate.
 
-:func:`transition`, :func:`input_matrix` and :data:`H` are matrices. The other functions write out
-their products for what is symmetric, element by element, so that they serve plain floats (one
+The functions write out the products, element by element, so that they serve plain floats (one
 filter, where arrays of one element would take fifty times as long) and arrays (many at once).
 A covariance is its elements 00, 01, 11.
 """
@@ -32,16 +31,6 @@ H = np.array([[1.0, 0.0]])
 
 T = TypeVar("T", float, Array)
 Symmetric = tuple[T, T, T]
-
-
-def transition(dt_s: float) -> Array:
-    """F, shape (2, 2)."""
-    return np.array([[1.0, dt_s], [0.0, 1.0]])
-
-
-def input_matrix(dt_s: float) -> Array:
-    """B, shape (2, 1)."""
-    return np.array([[dt_s * dt_s / 2.0], [dt_s]])
 
 
 def matrix(covariance: Symmetric[float]) -> Array:
