@@ -6,8 +6,7 @@ import tomllib
 import pytest
 
 from px4fuse.errors import SettingsError
-from px4fuse.findings import phrases
-from px4fuse.grading.names import NAMES
+from px4fuse.findings import names, phrases
 from px4fuse.grading.rubric import parse_rubric, read_rubric, rubric_text
 from px4fuse.grading.scoring import CHECKS
 
@@ -45,7 +44,7 @@ def test_every_finding_can_be_named_and_renamed():
     others = {"none", "negation", "doubt", "reassurance", "contrast", "closure_accepted", "topic"}
     assert parse_rubric(listed, "x").words == words
     assert words == phrases() | {name: words[name] for name in others}
-    assert set(NAMES) >= set(phrases())
+    assert set(names()) >= set(phrases())
 
 
 def test_words_of_the_default_stay_unless_replaced(tmp_path):

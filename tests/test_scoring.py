@@ -14,11 +14,11 @@ from results_tools import EXAMPLE, LOOP, SHA256, changed, correction, decoded, f
 
 from px4fuse.assignment.key import Answer, AnswerKey
 from px4fuse.errors import ResultsError
+from px4fuse.findings import names
 from px4fuse.grading.evidence import values_at
 from px4fuse.grading.feedback import feedback
 from px4fuse.grading.flags import chosen_settings, class_flags, own_flags
 from px4fuse.grading.model import Graded, Item
-from px4fuse.grading.names import NAMES
 from px4fuse.grading.rubric import parse_rubric, read_rubric
 from px4fuse.grading.scoring import assess, refused, score
 from px4fuse.results.contract import to_plain
@@ -615,7 +615,7 @@ class TestWhatStudentsRead:
 
     def test_words_never_ids(self):
         """Whatever is missing is told in words; paths and ids are the program's own."""
-        wrong = [finding(name, "error") for name in read_rubric(None).words if name in NAMES]
+        wrong = [finding(name, "error") for name in read_rubric(None).words if name in names()]
         spoilt = [
             changed(findings=wrong, student__notes="It is a flight of 5 s.", tuning={}, clock=NONE),
             changed(
@@ -629,7 +629,7 @@ class TestWhatStudentsRead:
             noted("There are outliers at 5 s.", student__id="s01", findings=wrong),
         ]
         for results in spoilt:
-            for answers in (None, key(*NAMES), key()):
+            for answers in (None, key(*names()), key()):
                 for item in score(report(results), VERIFIED, read_rubric(None), answers):
                     left = re.sub(r"px4fuse_\w+", "", item.comment)
                     assert not re.search(r"[a-z]+_[a-z]+|\w\.\*|\w\.[a-z]", left), item.comment

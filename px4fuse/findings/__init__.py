@@ -1,7 +1,8 @@
 """The mistakes that px4fuse names: a file each, with all that is said about it.
 
-A file declares ids, thresholds with unit and source, the detector (condition, words, remedy), the
-phrases by which notes name the finding, and the flights on which its rate is measured. A detector
+A file declares ids, thresholds with unit and source, the detector (condition, words, remedy), what
+the finding is called and the phrases by which notes name it, and the flights on which its rate is
+measured. A detector
 never prints and never guesses: what it cannot see it does not mention.
 
 To add a finding: its file, its name below, its place in ``causes.py`` if it follows from another or
@@ -11,6 +12,7 @@ brings others with it, its rows of ``rates.csv`` (``python -m px4fuse.simulation
 from __future__ import annotations
 
 from collections.abc import Iterable
+from functools import cache
 
 from px4fuse.analysis import Analysis, explain
 from px4fuse.comparison.comparison import Comparison
@@ -62,7 +64,16 @@ from px4fuse.findings.causes import by_cause
 from px4fuse.findings.model import SEVERITIES, Detector, Finding, Found, Severity, Subject
 from px4fuse.loop.loop import Loop
 
-__all__ = ["DETECTORS", "SEVERITIES", "Finding", "Severity", "find", "find_loop", "phrases"]
+__all__ = [
+    "DETECTORS",
+    "SEVERITIES",
+    "Finding",
+    "Severity",
+    "find",
+    "find_loop",
+    "names",
+    "phrases",
+]
 
 
 def find(subject: Analysis | Comparison) -> tuple[Finding, ...]:
@@ -90,6 +101,12 @@ def phrases() -> dict[str, tuple[str, ...]]:
     }
 
 
+@cache
+def names() -> dict[str, str]:
+    """What each finding is called within a sentence: a student reads words, never ids."""
+    return {name: said for detector in DETECTORS for name, said in detector.names.items()}
+
+
 def _find(detectors: Iterable[Detector[Subject]], subject: Subject) -> tuple[Finding, ...]:
     return by_cause(finding for detector in detectors for finding in detector.detect(subject))
 
@@ -101,7 +118,7 @@ def _in_flight(detector: Detector[Loop]) -> Detector[Analysis]:
         if isinstance(analysis.loop, Loop):
             yield from detector.detect(analysis.loop)
 
-    return Detector(detect, detector.phrases, detector.measured_on)
+    return Detector(detect, detector.phrases, detector.measured_on, names=detector.names)
 
 
 # Of one severity, the first comes first in a report (causes.py has the exceptions)

@@ -17,4 +17,8 @@ def _detect(analysis: Analysis) -> Found:
             )
 
 
-DETECTOR = Detector(_detect, {"autopilot_restarted": ""})
+DETECTOR = Detector(
+    _detect,
+    {"autopilot_restarted": ""},
+    names={"autopilot_restarted": "a restart of the autopilot"},
+)

@@ -70,4 +70,5 @@ DETECTOR = Detector(
         "ev_delay, delay",
     },
     {"ekf2_ev_delay_wrong": tuple(f"--mistake ekf2-delay={ms}ms" for ms in (120, 150, 175))},
+    names={"ekf2_ev_delay_wrong": "a delay set in EKF2 that is not that of the positions"},
 )

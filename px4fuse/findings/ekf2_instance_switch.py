@@ -24,4 +24,8 @@ def _detect(analysis: Analysis) -> Found:
         )
 
 
-DETECTOR = Detector(_detect, {"ekf2_instance_switch": "instance"})
+DETECTOR = Detector(
+    _detect,
+    {"ekf2_instance_switch": "instance"},
+    names={"ekf2_instance_switch": "a change of the EKF2 instance"},
+)

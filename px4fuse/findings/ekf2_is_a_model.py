@@ -18,4 +18,8 @@ def _detect(analysis: Analysis) -> Found:
         )
 
 
-DETECTOR = Detector(_detect, {"ekf2_is_a_model": ""})
+DETECTOR = Detector(
+    _detect,
+    {"ekf2_is_a_model": ""},
+    names={"ekf2_is_a_model": "EKF2 that is a model of it"},
+)

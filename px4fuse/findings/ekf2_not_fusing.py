@@ -126,4 +126,8 @@ DETECTOR = Detector(
         "ekf2_fusion_interrupted": "fusion interrupt, stopped fusing, stops fusing",
     },
     {"ekf2_not_fusing": ("--mistake ekf2-off",)},
+    names={
+        "ekf2_not_fusing": "EKF2 that never used the positions",
+        "ekf2_fusion_interrupted": "EKF2 that stopped fusing for a time",
+    },
 )

@@ -161,4 +161,5 @@ DETECTOR = Detector(
         "errors_larger_than_claimed": "nees, error larger, errors larger, error claim, "
         "source drift, vio drift, odometry drift, truth overconfident",
     },
+    names={"errors_larger_than_claimed": "errors larger than the filter claims"},
 )

@@ -60,4 +60,5 @@ DETECTOR = Detector(
         "acceler missing, acceler dropout, acceler lost, no imu for",
     },
     {"imu_gap": ("--mistake imu-dropout=1s",)},
+    names={"imu_gap": "a gap in the IMU's samples"},
 )

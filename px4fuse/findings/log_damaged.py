@@ -42,4 +42,8 @@ DETECTOR = Detector(
         "log_damaged": "damaged, corrupt, logger",
         "samples_dropped": "stamp go back, stamp backward, samples dropped",
     },
+    names={
+        "log_damaged": "a damaged log",
+        "samples_dropped": "samples that were dropped because their stamps went back",
+    },
 )

@@ -57,4 +57,5 @@ DETECTOR = Detector(
         "sampling rate, sensor_combined",
     },
     {"logging_rate_low": ("--mistake imu-rate=40", "--mistake imu-rate=20")},
+    names={"logging_rate_low": "an IMU that was logged too slowly"},
 )

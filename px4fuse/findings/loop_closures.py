@@ -86,4 +86,9 @@ DETECTOR = Detector(
             f"--kind loop --mistake open-end={metres}m" for metres in (3, 4, 5, 8)
         )
     },
+    names={
+        "false_loop_closure": "a loop that does not end where it began",
+        "loop_closure_doubtful": "a closure that the others contradict",
+        "loop_drift_understated": "odometry that drifts more than was stated",
+    },
 )

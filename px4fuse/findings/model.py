@@ -106,6 +106,8 @@ class Detector(Generic[Subject]):
         Every id that it may yield, to the phrases by which a student's notes name it besides that
         id, with commas between them. All words of a phrase must stand in one sentence, in any
         order; beginnings are enough ("stamp late" is in "the stamps come 0.2 s later").
+    names : mapping
+        Every such id to what it is called within a sentence.
     measured_on : mapping
         Id to the simulated flights on which its rate is measured (``rates.csv``): options of
         ``px4fuse simulate``, or a field of ``Settings`` with its value.
@@ -113,6 +115,7 @@ class Detector(Generic[Subject]):
 
     detect: Callable[[Subject], Found]
     phrases: Mapping[str, str]
+    names: Mapping[str, str] = field(kw_only=True)
     measured_on: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
 

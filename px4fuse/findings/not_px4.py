@@ -22,4 +22,8 @@ def _detect(analysis: Analysis) -> Found:
     )
 
 
-DETECTOR = Detector(_detect, {"not_px4": ""})
+DETECTOR = Detector(
+    _detect,
+    {"not_px4": ""},
+    names={"not_px4": "a log that is not of PX4"},
+)

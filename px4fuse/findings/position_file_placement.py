@@ -24,4 +24,8 @@ def _detect(analysis: Analysis) -> Found:
         )
 
 
-DETECTOR = Detector(_detect, {"position_file_placement": ""})
+DETECTOR = Detector(
+    _detect,
+    {"position_file_placement": ""},
+    names={"position_file_placement": "the placing of the position file"},
+)

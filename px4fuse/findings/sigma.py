@@ -192,4 +192,10 @@ DETECTOR = Detector(
         "sigma_a_small": tuple(f"sigma_a_m_s2={value:g}" for value in (0.18, 0.1, 0.02)),
         "sigma_a_large": tuple(f"sigma_a_m_s2={value:g}" for value in (0.4, 0.8, 2.0)),
     },
+    names={
+        "sigma_z_small": "a SIGMA_Z that is too small",
+        "sigma_z_large": "a SIGMA_Z that is too large",
+        "sigma_a_small": "a SIGMA_A that is too small",
+        "sigma_a_large": "a SIGMA_A that is too large",
+    },
 )

@@ -124,4 +124,8 @@ DETECTOR = Detector(
         ),
         "source_clock_changes": tuple(f"--mistake clock-jump={ms}ms" for ms in (150, 250, 400)),
     },
+    names={
+        "source_clock_offset": "position stamps that are early or late",
+        "source_clock_changes": "position stamps whose offset changes in flight",
+    },
 )

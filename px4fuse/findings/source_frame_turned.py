@@ -93,4 +93,8 @@ DETECTOR = Detector(
         "heading not constant, magnetometer, mag heading, compass",
     },
     {"source_frame_turned": tuple(f"--mistake yaw={degrees}" for degrees in (10, 15, 20, 30))},
+    names={
+        "source_frame_turned": "positions that are turned against north",
+        "ekf2_heading_wrong": "a heading of EKF2 that is wrong or drifts",
+    },
 )

@@ -37,4 +37,5 @@ DETECTOR = Detector(
         "measurements missing, uwb lost, position lost, uwb stop, no position for, no uwb for",
     },
     {"source_gap": ("--mistake dropout=2s", "--mistake dropout=8s")},
+    names={"source_gap": "a time without positions"},
 )

@@ -49,4 +49,5 @@ DETECTOR = Detector(
         "relocali, shifted, teleport",
     },
     {"source_jumps": tuple(f"--mistake jump={size}" for size in ("0.5m", "1m", "2m"))},
+    names={"source_jumps": "positions that jump"},
 )

@@ -46,5 +46,7 @@ def _detect(analysis: Analysis) -> Found:
 
 
 DETECTOR = Detector(
-    _detect, {"source_may_drift": "source drift, vio drift, odometry drift, not correct"}
+    _detect,
+    {"source_may_drift": "source drift, vio drift, odometry drift, not correct"},
+    names={"source_may_drift": "a position source that may drift"},
 )

@@ -54,4 +54,8 @@ DETECTOR = Detector(
         "source_not_logged": "sdlog_profile, not logged",
         "source_decimated": "sdlog_profile, decimat, logged at",
     },
+    names={
+        "source_not_logged": "a position source that was not logged",
+        "source_decimated": "positions logged too slowly",
+    },
 )

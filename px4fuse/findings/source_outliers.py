@@ -50,4 +50,5 @@ DETECTOR = Detector(
         "reflection, multipath, spike",
     },
     {"source_outliers": tuple(f"--mistake nlos={share}%" for share in (1, 2, 5))},
+    names={"source_outliers": "outliers among the positions"},
 )

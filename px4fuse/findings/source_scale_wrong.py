@@ -63,4 +63,5 @@ DETECTOR = Detector(
             "--uwb-rate 10 --sigma-uwb 0.05 --yaw follow --mistake scale=15%",
         )
     },
+    names={"source_scale_wrong": "positions whose scale is wrong"},
 )

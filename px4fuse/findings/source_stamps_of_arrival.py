@@ -81,4 +81,8 @@ DETECTOR = Detector(
         "offset change, offset jump",
     },
     {"source_stamps_of_arrival": tuple(f"--mistake clock-jump={ms}ms" for ms in (50, 150, 300))},
+    names={
+        "source_stamps_of_arrival": "position stamps that are times of arrival until the clocks "
+        "agree",
+    },
 )

@@ -83,4 +83,5 @@ DETECTOR = Detector(
         "samples missing, positions missing",
     },
     {"source_thinned": tuple(f"--mistake decimate={rate}" for rate in ("2Hz", "3Hz", "2.5Hz"))},
+    names={"source_thinned": "positions that were thinned before they were sent"},
 )

@@ -64,4 +64,5 @@ DETECTOR = Detector(
             f"--mistake r-scale={factor:g}" for factor in (0.1, 0.25, 0.5, 4.0)
         )
     },
+    names={"source_variance_wrong": "a variance that the position source states wrongly"},
 )

@@ -45,4 +45,9 @@ DETECTOR = Detector(
         "input_unavailable": "no acceler, no imu, constant velocity",
         "too_few_innovations": "too few, few innovations",
     },
+    names={
+        "ekf2_unavailable": "a log without EKF2",
+        "input_unavailable": "a log without acceleration",
+        "too_few_innovations": "too few measurements to judge a filter by",
+    },
 )

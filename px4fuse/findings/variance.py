@@ -306,4 +306,10 @@ DETECTOR = Detector(
     {
         "ekf2_variance_understated": tuple(f"--mistake ekf2-noise={cm}cm" for cm in (4, 3)),
     },
+    names={
+        "kf_variance_overstated": "a filter variance that is too large",
+        "kf_variance_understated": "a filter variance that is too small",
+        "ekf2_variance_overstated": "EKF2 that is too cautious about its variance",
+        "ekf2_variance_understated": "EKF2 that is too sure: its variance is too small",
+    },
 )
