@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import unicodedata
 
 FORMULA = "=+-@"
@@ -19,6 +20,15 @@ def neutral(text: str) -> str:
     parts = (f"'{part}" if _is_formula(part) else part for part in text.split(";"))
     safe = "".join(map(_fit, ";".join(parts)))
     return safe if len(safe) <= MAX_CHARACTERS else safe[:MAX_CHARACTERS] + "…"
+
+
+def neutral_id(text: str) -> str:
+    """An id as it is where a spreadsheet cannot take it for a formula, else :func:`neutral`.
+
+    >>> neutral_id("0042"), neutral_id("-17"), neutral_id("a.b@c.de"), neutral_id("=1")
+    ('0042', '-17', 'a.b@c.de', "'=1")
+    """
+    return text if re.fullmatch(r"[+-]\d+|\w[\w.@+-]*", text) else neutral(text)
 
 
 def _is_formula(text: str) -> bool:

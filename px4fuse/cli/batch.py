@@ -7,7 +7,7 @@ import sys
 import time
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
@@ -15,13 +15,9 @@ from px4fuse.cli.compare import SEVERITIES
 from px4fuse.cli.inputs import path_option, settings_options
 from px4fuse.cli.outputs import Interrupted, Step, progress, spare_inputs, terminal, write_outputs
 from px4fuse.errors import OutputError, SettingsError
-
-if TYPE_CHECKING:
-    from px4fuse.fleet.run import Fleet
+from px4fuse.fleet import TIMEOUT_S
 
 FAILED, WORSE = "failed", "worse"
-# Reasons why logs are not compared, findings and what is worse, that the terminal shows
-SHOWN = 8
 # How a cluster of each kind is started, for people who have one
 CLUSTERS = {
     "slurm": """\
@@ -75,7 +71,7 @@ LOGS should be URLs (s3://, gs://), whose package (s3fs, gcsfs) is in the image 
     "--timeout",
     "timeout_s",
     type=click.FloatRange(min=1.0),
-    default=600.0,
+    default=TIMEOUT_S,
     show_default=True,
     metavar="SECONDS",
     help="Time for one log; what takes longer is ended.",
@@ -158,6 +154,7 @@ def batch(
     from px4fuse.fleet.logs import find_logs
     from px4fuse.fleet.regressions import read_baseline
     from px4fuse.fleet.run import fleet_request, run
+    from px4fuse.fleet.terminal import print_fleet
 
     gc.enable()  # a long run, of a library that leaves circles
     found = find_logs(logs)
@@ -182,7 +179,7 @@ def batch(
         raise Interrupted(stopped, left) from None
     if junit_path is not None:
         write_outputs({junit_path: junit(fleet.table)})
-    _print(fleet)
+    print_fleet(terminal(), fleet)
     severities = SEVERITIES[: SEVERITIES.index(fail_on) + 1] if fail_on in SEVERITIES else ()
     failed = fail_on is not None and bool((fleet.table["status"] == FAILED).any())
     failed |= fail_on == WORSE and bool((fleet.table["change"] != "").any())
@@ -194,57 +191,3 @@ def _shown(step: Step, since_s: float, what: str, done: int, of: int) -> None:
     """How far it is, with its rate."""
     per_minute = 60.0 * done / (time.monotonic() - since_s)
     step(f"{what}, {per_minute:.3g} per minute" if done else what, done, of)
-
-
-def _print(fleet: Fleet) -> None:
-    from rich.text import Text
-
-    from px4fuse.plain import factor_words
-    from px4fuse.report.screen import plain_table, print_file, say
-
-    console = terminal()
-    logs = fleet.table.drop_duplicates("log")
-    alone = logs[logs["axis"] == ""]
-    causes = alone.groupby(["status", "reason", "remedy"], sort=False, as_index=False).agg(
-        logs=("log", "count"), one=("log", "first")
-    )
-    most = causes.sort_values("logs", ascending=False, kind="stable")
-    for cause in most.head(SHOWN).itertuples():
-        which = cause.one if cause.logs == 1 else f"{cause.logs} logs, one is {cause.one}"
-        text = f"{which!s}: {cause.status}: {cause.reason}. {cause.remedy}".rstrip()
-        say(console, Text(text, "red" if cause.status == FAILED else "yellow"))
-    if len(most) > SHOWN:
-        say(console, f"{len(most) - SHOWN} more reasons are in fleet.html.")
-    table = plain_table(
-        ("axis", "left"),
-        *(
-            (f"{whose}\n{what}", "right")
-            for whose in ("ours", "EKF2")
-            for what in ("logs", "factor")
-        ),
-    )
-    for axis, rows in fleet.table[fleet.table["axis"] != ""].groupby("axis", sort=False):
-        cells = []
-        for factors in (rows["kf_factor"].dropna(), rows["ekf2_factor"].dropna()):
-            median = factor_words(float(factors.median())) if len(factors) else "–"
-            cells += [f"{len(factors)}", median]
-        table.add_row(str(axis), *cells)
-    if table.row_count:
-        console.print(table)
-        say(console, Text("factor: median of how many times S is overstated (above 1)", "dim"))
-    found = logs["findings"].str.split(";").explode()
-    for finding, count in found[found != ""].value_counts().head(SHOWN).items():
-        say(console, f"{count} × {finding}")
-    worse = fleet.table[fleet.table["change"] != ""]
-    for row in worse.head(SHOWN).itertuples():
-        say(console, Text(f"worse: {row.log} {row.axis}: {row.change}", "red"))
-    if len(worse) > SHOWN:
-        say(console, f"and {len(worse) - SHOWN} more in the column change")
-    if fleet.against:
-        say(console, fleet.against)
-    counts = logs["status"].value_counts()
-    said = ", ".join(f"{count} {status}" for status, count in counts.items())
-    again = " The same command tries those that failed again." if FAILED in counts else ""
-    say(console, f"{len(logs)} logs: {said}; {fleet.reused} as before.{again}")
-    for path in fleet.written:
-        print_file(console, "Wrote", path)

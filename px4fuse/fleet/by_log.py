@@ -10,6 +10,8 @@ from typing import Any
 
 import pandas as pd
 
+from px4fuse.fleet.rows import BETWEEN_FINDINGS
+
 # Columns that are the same for all axes of a log
 TEXTS = (
     "log", "name", "log_sha256", "px4fuse", "settings", "vehicle", "firmware", "firmware_hash",
@@ -65,7 +67,7 @@ class Log:
     @property
     def findings(self) -> tuple[str, ...]:
         """Ids."""
-        return tuple(part for part in self.texts["findings"].split(";") if part)
+        return tuple(part for part in self.texts["findings"].split(BETWEEN_FINDINGS) if part)
 
     @property
     def tags(self) -> dict[str, str]:

@@ -12,7 +12,7 @@ import pandas as pd
 from px4fuse.fleet.by_log import Log, finding_words
 from px4fuse.plain import factor_words
 from px4fuse.webpage.charts import Scale, axis, bar, grid, over_time, plot, spread
-from px4fuse.webpage.frame import card, note, opens, picks
+from px4fuse.webpage.frame import card, note, opens, picks, summary
 from px4fuse.webpage.safe import clean, escaped
 
 MOST_GROUPS = 10
@@ -73,10 +73,7 @@ def _summary(logs: Sequence[Log]) -> str:
     worse = sum(bool(log.changes) for log in logs)
     if worse:
         entries.append(("Worse than the baseline", f"{worse}"))
-    listed = "".join(
-        f"<div><dt>{name}</dt><dd>{escaped(value)}</dd></div>" for name, value in entries if value
-    )
-    return f'<section class="card summary" aria-label="Summary"><dl>{listed}</dl></section>'
+    return summary([(name, escaped(value)) for name, value in entries if value])
 
 
 # ------------------------------------------------------------------ honest, and since when

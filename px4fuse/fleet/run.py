@@ -16,6 +16,7 @@ import pandas as pd
 
 from px4fuse.errors import OutputError, Px4FuseError, SettingsError
 from px4fuse.filter.kalman import Settings
+from px4fuse.fleet import TIMEOUT_S
 from px4fuse.fleet.engine import Failed, connected, outcomes
 from px4fuse.fleet.job import Job, Outcome, analyse, file_stem, identify, refused
 from px4fuse.fleet.logs import FoundLog, find_logs
@@ -30,7 +31,6 @@ from px4fuse.writing import write_all
 if TYPE_CHECKING:
     from distributed import Client
 
-TIMEOUT_S = 600.0
 RESULTS = "results"
 ROWS = "rows.sqlite"
 _GOES_ON = "What is done is kept: the same command goes on from there."

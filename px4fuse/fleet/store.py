@@ -38,17 +38,11 @@ class Store:
 
     def sizes(self) -> set[int]:
         """Sizes of the logs that it knows."""
-        return {size for (size,) in self._select("size_bytes")}
-
-    def hashes(self) -> set[str]:
-        """Hashes of the logs that it knows."""
-        return {sha256 for (sha256,) in self._select("sha256")}
-
-    def _select(self, column: str) -> sqlite3.Cursor:
-        return self.connection.execute(
-            f"select {column} from rows where px4fuse = ? and settings = ?",
+        found = self.connection.execute(
+            "select size_bytes from rows where px4fuse = ? and settings = ?",
             (self.px4fuse, self.settings),
         )
+        return {size for (size,) in found}
 
     def keep(
         self, sha256: str, size_bytes: int | None, severities: Sequence[str], rows: Sequence[Row]

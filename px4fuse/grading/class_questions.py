@@ -10,7 +10,7 @@ from px4fuse.grading.anonymous import Veil
 from px4fuse.grading.class_table import distinct, number
 from px4fuse.grading.model import Entry
 from px4fuse.webpage.charts import bar, bins, histogram
-from px4fuse.webpage.frame import card, note, opens, picks
+from px4fuse.webpage.frame import card, note, opens, picks, summary
 from px4fuse.webpage.safe import escaped
 
 # How alike the notes are, and the place of the other entry
@@ -56,17 +56,13 @@ def _summary(entries: Sequence[Entry], minutes: Mapping[int, float]) -> str:
         )
     if whole:
         cells.append(("To read", f"{whole / 60.0:.1f} h" if whole >= 90.0 else f"{whole:.0f} min"))
-    told = "".join(f"<div><dt>{name}</dt><dd>{value}</dd></div>" for name, value in cells)
     of_all = max((entry.of for entry in entries), default=0.0) or 1.0
     drawn = histogram(totals, of_all, "Students by points")
     reading = note(
         "Points that are pending are in no sum here. The time to read is an estimate: 200 words of "
         "notes a minute, and half a minute for each page."
     )
-    return (
-        '<section class="card summary" aria-label="Summary">'
-        f"<dl>{told}</dl>{drawn}{reading}</section>"
-    )
+    return summary(cells, drawn, reading)
 
 
 def _items(entries: Sequence[Entry], veil: Veil) -> str:

@@ -5,12 +5,11 @@ from __future__ import annotations
 import csv
 import io
 import math
-import re
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 from px4fuse.grading.model import Entry, Graded, Override
-from px4fuse.spreadsheet import neutral
+from px4fuse.spreadsheet import neutral, neutral_id
 
 FIRST = ("file", "student", "id", "status", "points", "pending points", "of", "deducted", "total")
 LAST = (
@@ -110,12 +109,3 @@ def number(value: float | None) -> str:
     ('7', '0.3', '')
     """
     return "" if value is None or not math.isfinite(value) else f"{value:.10g}"
-
-
-def neutral_id(text: str) -> str:
-    """An id as it is where a spreadsheet cannot take it for a formula, else :func:`neutral`.
-
-    >>> neutral_id("0042"), neutral_id("-17"), neutral_id("a.b@c.de"), neutral_id("=1")
-    ('0042', '-17', 'a.b@c.de', "'=1")
-    """
-    return text if re.fullmatch(r"[+-]\d+|\w[\w.@+-]*", text) else neutral(text)

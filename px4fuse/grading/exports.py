@@ -33,7 +33,7 @@ from typing import Literal
 
 from px4fuse.assignment.key import folded
 from px4fuse.errors import SettingsError
-from px4fuse.grading.class_table import neutral_id, number
+from px4fuse.grading.class_table import number
 from px4fuse.grading.model import Entry
 from px4fuse.grading.platforms import Origin
 from px4fuse.grading.roster import (
@@ -42,7 +42,7 @@ from px4fuse.grading.roster import (
 )
 from px4fuse.grading.sheet import Sheet
 from px4fuse.results.reading import one_line
-from px4fuse.spreadsheet import neutral
+from px4fuse.spreadsheet import neutral, neutral_id
 
 Kind = Literal["moodle", "canvas", "blackboard", "other"]
 GRADE = ("grade", "bewertung", "points", "punkte", "mark", "note", "score")

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from px4fuse.assignment.key import AnswerKey
-from px4fuse.assignment.key import folded as same_id
+from px4fuse.assignment.key import folded as folded_id
 from px4fuse.filter.kalman import Settings
 from px4fuse.filter.tuning import HORIZONTAL
 from px4fuse.grading.folding import folded
@@ -202,7 +202,7 @@ def _same_report(graded: Sequence[Graded]) -> Flags:
 
 
 def _same_id(graded: Sequence[Graded]) -> Flags:
-    for members in _groups([same_id(one.student_id) for one in graded]):
+    for members in _groups([folded_id(one.student_id) for one in graded]):
         for index in members:
             yield index, f"The same student id as in {_others(graded, members, index)}."
 
@@ -333,21 +333,21 @@ def _shingles(text: str) -> frozenset[int]:
 
 def _other_name(graded: Sequence[Graded], key: AnswerKey | None) -> Flags:
     """The file's name is that of another student of the class."""
-    people = {same_id(one.student_id): one.student for one in graded if one.student_id.strip()}
-    people |= {same_id(a.student_id): a.name for a in (key.answers if key else ())}
+    people = {folded_id(one.student_id): one.student for one in graded if one.student_id.strip()}
+    people |= {folded_id(a.student_id): a.name for a in (key.answers if key else ())}
     names = {
-        parts: same_id(student_id)
+        parts: folded_id(student_id)
         for student_id, name in people.items()
         # one word is too short to be told from other words of a file name
         if len(parts := frozenset(_words(name))) > 1
     }
     for index, one in enumerate(graded):
-        own_id, own_words = same_id(one.student_id), frozenset(_words(one.student))
+        own_id, own_words = folded_id(one.student_id), frozenset(_words(one.student))
         # the key's spelling, where a spreadsheet took away leading zeros
         given = key.of_student(one.student_id) if key else None
-        own_ids = {own_id} | ({same_id(given.student_id)} if given else set())
+        own_ids = {own_id} | ({folded_id(given.student_id)} if given else set())
         stem = PurePosixPath(one.submission.replace("\\", "/")).stem
-        words = frozenset(_words(one.submission.removesuffix(".pdf"))) | {same_id(stem)}
+        words = frozenset(_words(one.submission.removesuffix(".pdf"))) | {folded_id(stem)}
         says_own = bool(own_ids & words) or (own_words and own_words <= words)
         if says_own or not (own_id or own_words):
             continue
@@ -367,7 +367,7 @@ def _looks_like(stem: str, student_id: str) -> bool:
 
 def _words(text: str) -> list[str]:
     """Words of a name or a file's name; ids with signs in them stay whole as well."""
-    plain = same_id(text)
+    plain = folded_id(text)
     parts = (*re.findall(r"[^\W_]+", plain), *re.split(r"[\s_/(),]+", plain))
     return [part for part in parts if part]
 
@@ -385,7 +385,7 @@ def _groups(values: Sequence[str]) -> list[list[int]]:
 
 
 def _who(one: Graded) -> str:
-    return same_id(one.student_id) or same_id(one.student) or one.submission
+    return folded_id(one.student_id) or folded_id(one.student) or one.submission
 
 
 def _name(one: Graded) -> str:

@@ -94,7 +94,7 @@ class Outcome:
     @property
     def graded(self) -> tuple[Graded, ...]:
         """Every file that was handed in, those that count first, in the order of the entries."""
-        return tuple(one for one in _all_of(self.entries))
+        return tuple(one for entry in self.entries for one in entry.files)
 
 
 def grade(
@@ -191,14 +191,6 @@ def _moodle_times(course: Course, register: Register | None) -> dict[int, dateti
             if time is not None and place is not None:
                 times[place] = time
     return times
-
-
-def _all_of(entries: Sequence[Entry]) -> list[Graded]:
-    return [
-        one
-        for entry in entries
-        for one in (*([entry.counting] if entry.counting else []), *entry.others)
-    ]
 
 
 def _flagged(entries: Sequence[Entry], key: AnswerKey | None) -> tuple[Entry, ...]:

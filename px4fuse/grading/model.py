@@ -323,6 +323,11 @@ class Entry:
     pseudonym: str = ""
 
     @property
+    def files(self) -> tuple[Graded, ...]:
+        """All attempts, the one that counts first."""
+        return (*([self.counting] if self.counting else []), *self.others)
+
+    @property
     def called(self) -> str:
         """What the class page calls the student."""
         return self.pseudonym or self.student or self.student_id or "no name"

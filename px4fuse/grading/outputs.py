@@ -17,7 +17,7 @@ from px4fuse.assignment.roster import RESERVED
 from px4fuse.grading import exports, submissions
 from px4fuse.grading.anonymous import hidden_words
 from px4fuse.grading.class_page import html_text
-from px4fuse.grading.class_table import csv_text, neutral_id
+from px4fuse.grading.class_table import csv_text
 from px4fuse.grading.gradescope import results
 from px4fuse.grading.model import Entry, Graded, Submission
 from px4fuse.grading.overrides import NAME, TEMPLATE
@@ -27,7 +27,7 @@ from px4fuse.grading.returned import returned_text
 from px4fuse.grading.roster import Register
 from px4fuse.grading.sheet import Sheet, read_sheet
 from px4fuse.grading.sheets import draw_sheets
-from px4fuse.spreadsheet import neutral
+from px4fuse.spreadsheet import neutral, neutral_id
 from px4fuse.verification.model import Refused
 from px4fuse.writing import write_all
 
@@ -109,14 +109,10 @@ def write_class(
     contents |= {output / GRADES / name: content for name, content in grades.items()}
     write_all(contents)
     folders = [output / FEEDBACK, output / "gradescope"]
-    if any(one.redrawn_name for entry in pictured for one in _files(entry)):
+    if any(one.redrawn_name for entry in pictured for one in entry.files):
         folders = [output / REPORTS, output / SHEETS, *folders]
     written = (table, page, *folders, *([output / GRADES] if grades else []), said)
     return written, (*notes, *_left_over(output, names))
-
-
-def _files(entry: Entry) -> tuple[Graded, ...]:
-    return (*([entry.counting] if entry.counting else []), *entry.others)
 
 
 def _with_files(entry: Entry, name: str, made: Class, output: Path, records: Path) -> Entry:

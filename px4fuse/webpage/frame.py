@@ -166,6 +166,13 @@ def card(title: str, *content: str) -> str:
     return f'<section class="card"><h2>{escaped(title)}</h2>{"".join(content)}</section>'
 
 
+def summary(entries: Sequence[tuple[str, str]], *content: str) -> str:
+    """The box on top: names with their values, which are HTML, and what else stands in it."""
+    listed = "".join(f"<div><dt>{name}</dt><dd>{value}</dd></div>" for name, value in entries)
+    inside = f"<dl>{listed}</dl>{''.join(content)}"
+    return f'<section class="card summary" aria-label="Summary">{inside}</section>'
+
+
 def note(text: str) -> str:
     """A small grey paragraph."""
     return f'<p class="note">{escaped(text)}</p>'

@@ -1,0 +1,63 @@
+"""What ``px4fuse batch`` prints when it is done."""
+
+from __future__ import annotations
+
+from rich.console import Console
+from rich.text import Text
+
+from px4fuse.fleet.rows import BETWEEN_FINDINGS, FAILED
+from px4fuse.fleet.run import Fleet
+from px4fuse.plain import factor_words
+from px4fuse.report.screen import plain_table, print_file, say
+
+# Reasons why logs are not compared, findings and what is worse
+SHOWN = 8
+
+
+def print_fleet(console: Console, fleet: Fleet) -> None:
+    """Print what could not be compared, both filters by axis, findings and what is worse."""
+    logs = fleet.table.drop_duplicates("log")
+    alone = logs[logs["axis"] == ""]
+    causes = alone.groupby(["status", "reason", "remedy"], sort=False, as_index=False).agg(
+        logs=("log", "count"), one=("log", "first")
+    )
+    most = causes.sort_values("logs", ascending=False, kind="stable")
+    for cause in most.head(SHOWN).itertuples():
+        which = cause.one if cause.logs == 1 else f"{cause.logs} logs, one is {cause.one}"
+        text = f"{which!s}: {cause.status}: {cause.reason}. {cause.remedy}".rstrip()
+        say(console, Text(text, "red" if cause.status == FAILED else "yellow"))
+    if len(most) > SHOWN:
+        say(console, f"{len(most) - SHOWN} more reasons are in fleet.html.")
+    table = plain_table(
+        ("axis", "left"),
+        *(
+            (f"{whose}\n{what}", "right")
+            for whose in ("ours", "EKF2")
+            for what in ("logs", "factor")
+        ),
+    )
+    for axis, rows in fleet.table[fleet.table["axis"] != ""].groupby("axis", sort=False):
+        cells = []
+        for factors in (rows["kf_factor"].dropna(), rows["ekf2_factor"].dropna()):
+            median = factor_words(float(factors.median())) if len(factors) else "–"
+            cells += [f"{len(factors)}", median]
+        table.add_row(str(axis), *cells)
+    if table.row_count:
+        console.print(table)
+        say(console, Text("factor: median of how many times S is overstated (above 1)", "dim"))
+    found = logs["findings"].str.split(BETWEEN_FINDINGS).explode()
+    for finding, count in found[found != ""].value_counts().head(SHOWN).items():
+        say(console, f"{count} × {finding}")
+    worse = fleet.table[fleet.table["change"] != ""]
+    for row in worse.head(SHOWN).itertuples():
+        say(console, Text(f"worse: {row.log} {row.axis}: {row.change}", "red"))
+    if len(worse) > SHOWN:
+        say(console, f"and {len(worse) - SHOWN} more in the column change")
+    if fleet.against:
+        say(console, fleet.against)
+    counts = logs["status"].value_counts()
+    said = ", ".join(f"{count} {status}" for status, count in counts.items())
+    again = " The same command tries those that failed again." if FAILED in counts else ""
+    say(console, f"{len(logs)} logs: {said}; {fleet.reused} as before.{again}")
+    for path in fleet.written:
+        print_file(console, "Wrote", path)

@@ -1,0 +1,26 @@
+"""Jobs for workers, most of which go wrong; importable where nothing else of the tests is."""
+
+from __future__ import annotations
+
+import os
+import time
+from typing import Any
+
+
+def act(job: tuple[str, Any]) -> Any:
+    """What a job says."""
+    what, value = job
+    match what:
+        case "square":
+            return value * value
+        case "exit":
+            os._exit(value)
+        case "hang":
+            time.sleep(600)
+        case "raise":
+            raise ValueError(value)
+        case "process":
+            return os.getpid()
+        case "variable":
+            return os.environ.get(value)
+    return None
