@@ -30,7 +30,7 @@ from px4fuse.ekf2.replay import Ekf2Replay
 from px4fuse.ekf2.whatif import WhatIf, sweep_values, what_if
 from px4fuse.errors import LogError, MissingDataError, SettingsError
 from px4fuse.filter.causes import AFTER_STEP_S, Explained, explained
-from px4fuse.filter.clock import ClockOffset, estimate_clock_offset
+from px4fuse.filter.clock import SURE_SIGMAS, ClockOffset, estimate_clock_offset
 from px4fuse.filter.fitting import Noises
 from px4fuse.filter.heading import HeadingError, heading_error
 from px4fuse.filter.kalman import Settings
@@ -60,8 +60,6 @@ MIN_CLOCK_IMU_HZ = 1.0 / MAX_IMU_INTERVAL_S
 MIN_TELEMETRY_IMU_HZ = 200.0
 CLOCK_RATE_MARGIN = 0.98
 TELEMETRY_IMU = ("HIGHRES_IMU", "SCALED_IMU", "SCALED_IMU2", "SCALED_IMU3")
-# An offset of the clock so far from zero is taken out before anything else is looked for
-SURE_SIGMAS = 3.0
 
 Progress = Callable[[str], None]
 Tuning = Mapping[str, AxisTuning | Unavailable]

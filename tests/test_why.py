@@ -119,6 +119,9 @@ def test_a_clock_that_is_wrong_for_both_is_said_first(sample: Analysis) -> None:
     assert shared.sentences[0].startswith("The source's stamps are late by 0.25 s for both filters")
     early = again(sample, comparison, clock=offset(sample.clock, 0.25))
     assert "early by 0.25 s" in early.sentences[0]
+    # within its own uncertainty of zero
+    unsure = replace(offset(sample.clock, 0.05), sigma_s=0.023)
+    assert "early" not in again(sample, comparison, clock=unsure).sentences[0]
     # put right in ours: no longer shared
     ours = compare(sample.comparison.flight, Settings(clock_offset_s=-0.25), axes=("aisle",))
     for given in (offset(sample.clock, 0.0), replace(offset(sample.clock, -0.25))):

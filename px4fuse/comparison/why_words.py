@@ -23,7 +23,7 @@ from px4fuse.ekf2.walk import (
     Step,
     Walk,
 )
-from px4fuse.filter.clock import ClockOffset
+from px4fuse.filter.clock import SURE_SIGMAS, ClockOffset
 from px4fuse.filter.signals import AISLE
 from px4fuse.flight import Unavailable
 
@@ -225,7 +225,9 @@ def _stamps(facts: Facts) -> str:
     words = f"EKF2 takes a position to be {delay:g} ms older than its stamp (EKF2_EV_DELAY), ours "
     words += f"{0.0 - own * 1e3:.0f} ms"
     if isinstance(facts.clock, ClockOffset) and facts.clock.determinable:
-        words += f", and the data ask for {-(own + facts.clock.offset_s) * 1e3:.0f} ms"
+        low, high = (-(own + end) * 1e3 for end in facts.clock.interval_s[::-1])
+        asked = -(own + facts.clock.offset_s) * 1e3
+        words += f", and the data ask for {asked:.0f} ms (95 % {low:.0f} to {high:.0f})"
     return words
 
 
@@ -319,7 +321,8 @@ def _clock(facts: Facts) -> list[str]:
     own = facts.comparison.settings.clock_offset_s
     delay_s = facts.model.inputs.settings["EKF2_EV_DELAY"] * 1e-3
     both = own + clock.offset_s
-    if min(abs(clock.offset_s), abs(both + delay_s)) < CLOCK_S or abs(own + delay_s) > CLOCK_S:
+    known_s = max(CLOCK_S, SURE_SIGMAS * clock.sigma_s)
+    if min(abs(clock.offset_s), abs(both + delay_s)) < known_s or abs(own + delay_s) > CLOCK_S:
         return []
     return [
         f"{STAMPS_WRONG} {'late' if both < 0 else 'early'} by {abs(both):.2f} s for both "

@@ -49,6 +49,8 @@ MAX_HALF_INTERVAL_S = 0.15
 MAX_PART_SIGMA_S = 0.15
 # Parts further apart than chance would put them (two-sided)
 CHANGE_P = 0.005
+# An offset nearer to zero may be chance
+SURE_SIGMAS = 3.0
 # Flights simulated for the scatter that the IMU's noise adds
 REPLICATES = 96
 # Of these so many are weighed together: whitened they are twice as long

@@ -16,7 +16,7 @@ from px4fuse.comparison.remedy import (
     replayed,
     settings_words,
 )
-from px4fuse.filter.clock import CHANGE_P, ClockOffset
+from px4fuse.filter.clock import CHANGE_P, SURE_SIGMAS, ClockOffset
 from px4fuse.findings.model import Detector, Finding, Found, Threshold
 from px4fuse.findings.source_smoothed import low_pass
 from px4fuse.findings.source_stamps_of_arrival import stamps_of_arrival_end_s
@@ -24,7 +24,7 @@ from px4fuse.flight import Unavailable
 
 CLOCK_OFFSET = Threshold(0.03, "s", "at 1 m/s a third of a good UWB's noise")
 CLOCK_OFFSET_ERROR = Threshold(0.10, "s", "at 1 m/s a good UWB's noise")
-CLOCK_SIGMAS = Threshold(3.0, "standard deviations", "0.3 % of clean flights lie beyond")
+CLOCK_SIGMAS = Threshold(SURE_SIGMAS, "standard deviations", "0.3 % of clean flights lie beyond")
 
 
 def _for_ekf2(analysis: Analysis, clock: ClockOffset) -> str:

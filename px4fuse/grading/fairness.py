@@ -62,7 +62,7 @@ from px4fuse.verification.model import Report, Verdict
 
 TABLE = "fairness.csv"
 SECRET = b"px4fuse fairness"
-FLIGHTS = 150
+FLIGHTS = 300
 # Shares of the points: what the ideal student must have at least, the others at most
 BOUNDS = {"ideal": 0.95, "default": 0.50, "guesser": 0.30}
 VERIFIED = Verdict("verified", ("taken for verified",), with_log=True, page_status="same")
