@@ -49,6 +49,15 @@ settings.register_profile(
 settings.load_profile("steady")
 
 
+def pytest_runtest_teardown(item: pytest.Item, nextitem: pytest.Item | None) -> None:
+    """Forget what a file's functions have cached once its tests are done: analyses are large."""
+    module = getattr(item, "module", None)
+    if module is not None and getattr(nextitem, "module", None) is not module:
+        for value in vars(module).values():
+            if getattr(value, "__module__", None) == module.__name__:
+                getattr(value, "cache_clear", lambda: None)()
+
+
 @pytest.fixture(scope="session")
 def sample_log() -> Path:
     """The sample flight that ships with the project."""
@@ -86,7 +95,7 @@ def no_drawing(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 # Of the unchanged program: it is there before any test patches it
-_analysed = lru_cache(maxsize=6)(analysis.run)
+_analysed = lru_cache(maxsize=2)(analysis.run)
 
 
 @pytest.fixture
