@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import pickle
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -12,7 +13,7 @@ from conftest import REPOSITORY
 from pypdf import PdfReader, PdfWriter
 
 from px4fuse.grading import grade as grading
-from px4fuse.grading import records
+from px4fuse.grading import records, sheets, workers
 from px4fuse.grading.model import Entry, Graded, Item
 from px4fuse.verification.model import Verdict
 from px4fuse.verification.rerun import log_sha256
@@ -57,13 +58,27 @@ def at_once(monkeypatch) -> list[str]:
         asked.append(report.results.student.id)
         return VERIFIED if log_sha256(report.results) in logs else verify(report, logs)
 
-    def in_turn(function, jobs, *, on_done, **_):
-        for index, job in enumerate(jobs):
-            on_done(index, function(job))
-
     monkeypatch.setattr(records, "verify", believed)
-    monkeypatch.setattr(grading, "run_bounded", in_turn)
+    in_this_process(monkeypatch)
     return asked
+
+
+def in_this_process(monkeypatch) -> None:
+    """Do without the processes that keep what strangers wrote within bounds: each takes seconds.
+
+    What goes to them and what comes back is pickled all the same.
+    """
+
+    def in_turn(function, jobs, *, on_done, **_):
+        found = []
+        for index, job in enumerate(jobs):
+            function_, job_ = pickle.loads(pickle.dumps((function, job)))
+            found.append(pickle.loads(pickle.dumps(function_(job_))))
+            on_done(index, found[-1])
+        return found
+
+    for module in (grading, sheets, workers):
+        monkeypatch.setattr(module, "run_bounded", in_turn)
 
 
 def zipped(path: Path, entries: Mapping[str, bytes], date=(2026, 11, 20, 12, 0, 0)) -> Path:

@@ -10,15 +10,23 @@ Keep what it finds as an ``@example`` of the test.
 
 from __future__ import annotations
 
+import io
 import signal
+from collections.abc import Callable
+from functools import lru_cache
 from pathlib import Path
 
 import pytest
 from browser import browser  # noqa: F401 - a fixture
 from hypothesis import HealthCheck, settings
+from msgspec.structs import replace
+from pypdf import PdfWriter
 
+from px4fuse import analysis
 from px4fuse.flight import Flight
 from px4fuse.readers import read_log
+from px4fuse.report import pdf
+from px4fuse.request import ComparisonRequest
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 SHARED_LOGS = REPOSITORY.parent / "shared" / "logs"
@@ -41,6 +49,15 @@ settings.register_profile(
 settings.load_profile("steady")
 
 
+def pytest_runtest_teardown(item: pytest.Item, nextitem: pytest.Item | None) -> None:
+    """Forget what a file's functions have cached once its tests are done: analyses are large."""
+    module = getattr(item, "module", None)
+    if module is not None and getattr(nextitem, "module", None) is not module:
+        for value in vars(module).values():
+            if getattr(value, "__module__", None) == module.__name__:
+                getattr(value, "cache_clear", lambda: None)()
+
+
 @pytest.fixture(scope="session")
 def sample_log() -> Path:
     """The sample flight that ships with the project."""
@@ -59,3 +76,40 @@ def shared_logs() -> Path:
     if not SHARED_LOGS.is_dir():
         pytest.skip("the further flight logs (../shared/logs) are not beside the repository")
     return SHARED_LOGS
+
+
+def page_of(_: object, text: str) -> bytes:
+    """An empty page with results attached."""
+    writer = PdfWriter()
+    writer.add_blank_page(100, 100)
+    writer.add_attachment(pdf.RESULTS_NAME, text.encode())
+    out = io.BytesIO()
+    writer.write(out)
+    return out.getvalue()
+
+
+@pytest.fixture
+def no_drawing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pages take most of the time; for tests that look at none of them."""
+    monkeypatch.setattr(pdf, "render", page_of)
+
+
+# Of the unchanged program: it is there before any test patches it
+_analysed = lru_cache(maxsize=2)(analysis.run)
+
+
+@pytest.fixture
+def analysed_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An analysis of a sample log that was made before serves again; for tests of what follows."""
+
+    def run(
+        request: ComparisonRequest, progress: Callable[[str], None] = lambda _: None
+    ) -> analysis.Analysis:
+        del progress
+        log = Path(request.log).resolve()  # verification reads it by a link
+        assert log.is_relative_to(REPOSITORY), "another log may change"
+        assert log.name == Path(request.log).name
+        assert request.mavlink is request.position is None
+        return _analysed(replace(request, log=str(log)))
+
+    monkeypatch.setattr(analysis, "run", run)

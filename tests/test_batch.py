@@ -23,7 +23,7 @@ import px4fuse
 from px4fuse.cli import cli
 from px4fuse.cli.outputs import terminal
 from px4fuse.errors import OutputError, SettingsError
-from px4fuse.fleet import job, run, store
+from px4fuse.fleet import engine, job, run, store
 from px4fuse.fleet.engine import connected
 from px4fuse.fleet.job import Job
 from px4fuse.fleet.logs import find_logs
@@ -201,9 +201,10 @@ def test_interrupted_and_resumed_it_is_the_same_table(client, flights, undisturb
 
 
 def test_ctrl_c_at_a_terminal_keeps_what_is_done_and_says_so_on_one_line(
-    flights, undisturbed, tmp_path
+    client, flights, undisturbed, tmp_path
 ):
     arguments = [sys.executable, "-m", "px4fuse", "batch", flights, "-o", tmp_path]
+    arguments += ["--workers", "1"]
     process = subprocess.Popen(
         arguments, stderr=subprocess.PIPE, text=True, env=environment(), start_new_session=True
     )
@@ -215,10 +216,10 @@ def test_ctrl_c_at_a_terminal_keeps_what_is_done_and_says_so_on_one_line(
     assert process.returncode == 130
     assert said.startswith("px4fuse: interrupted, what is done is kept in")
     assert said.count("\n") == 1
-    again = subprocess.run(arguments, capture_output=True, text=True, env=environment(), check=True)
-    assert "4 logs: 4 done" in again.stdout
-    assert "0 as before" not in again.stdout
-    # the session's own folder is the current one, so the paths differ as typed
+    again = command(flights, "-o", tmp_path)
+    assert again.exit_code == 0, again.output
+    assert "4 logs: 4 done" in again.output
+    assert "0 as before" not in again.output
     assert_same(pd.read_parquet(tmp_path / "fleet.parquet"), undisturbed)
 
 
@@ -231,11 +232,18 @@ def test_a_log_that_hangs_or_crashes_costs_that_log(client, flights, tmp_path, m
     logs.mkdir()
     for seed, name in enumerate(("hang", "crash", "well"), 1):
         (logs / f"{name}.ulg").write_bytes(tiny_log(seed))
-    table = px4fuse.batch(logs, timeout_s=20.0).set_index("name")
+    clock = batch_tools.Clock()
+    monkeypatch.setattr(engine, "time", clock)
+
+    def wait_no_longer(what: str, done: int, of: int) -> None:
+        if what.startswith("comparing,") and done == 2:
+            clock.ahead_s = 60.0
+
+    table = px4fuse.batch(logs, timeout_s=60.0, progress=wait_no_longer).set_index("name")
     assert table.loc["well.ulg", "status"].tolist() == ["done"] * 4
     hang, crash = table.loc["hang.ulg"], table.loc["crash.ulg"]
     assert (hang["status"], crash["status"]) == ("failed", "failed")
-    assert hang["reason"] == "it took longer than 20 s and was ended"
+    assert hang["reason"] == "it took longer than 60 s and was ended"
     assert hang["remedy"] == "Allow more with --timeout."
     assert "ended 3 times" in crash["reason"]
     client.wait_for_workers(2, timeout=60)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
@@ -13,6 +14,7 @@ from click.testing import CliRunner
 
 from px4fuse.cli import cli
 from px4fuse.errors import SettingsError
+from px4fuse.fleet.engine import connected
 from px4fuse.fleet.junit import junit
 from px4fuse.fleet.regressions import MIN_FLIGHTS, marked, read_baseline
 from px4fuse.fleet.rows import csv_bytes, table_of
@@ -233,9 +235,17 @@ def test_names_that_xml_cannot_hold_are_written_without_what_it_cannot():
     assert case[0].attrib["message"] == "no"
 
 
+@pytest.fixture
+def worker() -> Iterator[None]:
+    """One for all commands of a test: they take the session's own."""
+    with connected(workers=1):
+        yield
+
+
+@pytest.mark.usefixtures("worker")
 def test_the_command_marks_writes_and_fails(sample_log, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    common = ["batch", str(sample_log), "--workers", "1", "--axis", "north"]
+    common = ["batch", str(sample_log), "--axis", "north"]
     first = CliRunner().invoke(cli, [*common, "-o", "before"])
     assert first.exit_code == 0, first.output
     options = ["--baseline", "before/fleet.parquet", "--junit", "j.xml", "--fail-on", "worse"]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pandas as pd
 import pytest
 from scipy.stats import binomtest
@@ -19,6 +21,12 @@ TABLE = fairness()
 MEANS = summary(TABLE)
 # An aisle and a loop
 AGAIN = ("s0", "s6")
+
+
+@pytest.fixture(scope="module")
+def kept(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where analyses that three students ask for are kept."""
+    return tmp_path_factory.mktemp("kept")
 
 
 def test_every_mistake_and_size_was_measured() -> None:
@@ -49,9 +57,9 @@ def test_what_was_drawn_is_found() -> None:
 
 
 @pytest.mark.parametrize("student", AGAIN)
-def test_flights_give_again_what_the_table_has(student: str) -> None:
+def test_flights_give_again_what_the_table_has(student: str, kept: Path) -> None:
     (row,) = TABLE[TABLE["student"] == student].to_dict("records")
-    again = measured(flown(int(student[1:])), read_rubric(None))
+    again = measured(flown(int(student[1:]), kept), read_rubric(None))
     assert again == pytest.approx(row, abs=1e-3)
 
 
@@ -81,8 +89,8 @@ def test_there_are_words_for_every_mistake() -> None:
     assert "213ms" in sentence("clock-offset=-213ms", 0)
 
 
-def test_the_ideal_student_sets_what_the_report_asks_for() -> None:
-    one = flown(0)
+def test_the_ideal_student_sets_what_the_report_asks_for(kept: Path) -> None:
+    one = flown(0, kept)
     ((first, _),) = made.by_default(one)
     (report, notes), (_, other) = made.ideal(one)
     assert isinstance(first, ComparisonResults)
@@ -104,8 +112,8 @@ def test_what_follows_from_a_mistake_may_be_said_and_what_causes_it_may_not() ->
     assert "source_outliers" not in entailed({"ekf2_rejecting"})
 
 
-def test_a_subject_with_a_size_is_a_claim_where_nothing_right_is_named() -> None:
-    one, rubric = flown(6), read_rubric(None)
+def test_a_subject_with_a_size_is_a_claim_where_nothing_right_is_named(kept: Path) -> None:
+    one, rubric = flown(6, kept), read_rubric(None)
     assert one.drawn.findings == ("false_loop_closure",)
     ((report, _),) = made.by_default(one)
     wrong = guessed(report, ["clock-offset=247ms"], 0)

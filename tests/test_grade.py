@@ -11,6 +11,7 @@ import zipfile
 from pathlib import Path
 
 import pytest
+from class_tools import in_this_process
 from click.testing import CliRunner
 from conftest import REPOSITORY
 from pypdf import PdfReader, PdfWriter
@@ -32,6 +33,11 @@ UNKNOWN = Verdict("cannot verify", (), with_log=False)
 def rows(output: Path) -> list[dict[str, str]]:
     text = (output / "class.csv").read_text(encoding="utf-8-sig")
     return list(csv.DictReader(io.StringIO(text)))
+
+
+@pytest.fixture
+def at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    in_this_process(monkeypatch)
 
 
 @pytest.fixture
@@ -77,6 +83,7 @@ def test_everything_that_was_handed_in_stands_in_the_table(handed_in, tmp_path) 
         assert found["score"] >= 0.0
 
 
+@pytest.mark.usefixtures("at_once", "analysed_once")
 def test_a_report_with_its_log_is_verified_and_a_changed_one_is_not(tmp_path) -> None:
     folder = tmp_path / "in"
     folder.mkdir()
@@ -119,6 +126,7 @@ def test_a_report_with_its_log_is_verified_and_a_changed_one_is_not(tmp_path) ->
     assert again.graded == outcome.graded
 
 
+@pytest.mark.usefixtures("at_once")
 def test_only_what_changed_is_done_again(handed_in, tmp_path) -> None:
     output = tmp_path / "class"
     rubric = read_rubric(None)
@@ -134,6 +142,7 @@ def test_only_what_changed_is_done_again(handed_in, tmp_path) -> None:
     assert grade([handed_in], [], rubric, output, processes=2).reused == 5
 
 
+@pytest.mark.usefixtures("at_once")
 def test_another_rubric_scores_anew_and_verifies_nothing(handed_in, tmp_path) -> None:
     output = tmp_path / "class"
     rubric = read_rubric(None)
@@ -148,6 +157,7 @@ def test_another_rubric_scores_anew_and_verifies_nothing(handed_in, tmp_path) ->
     assert max(one.points for one in after.graded) > 0.0
 
 
+@pytest.mark.usefixtures("at_once", "analysed_once")
 def test_another_log_at_hand_verifies_again(tmp_path) -> None:
     (tmp_path / "in").mkdir()
     shutil.copy(REPORT, tmp_path / "in" / "a.pdf")
@@ -160,6 +170,7 @@ def test_another_log_at_hand_verifies_again(tmp_path) -> None:
     ]  # fmt: skip
 
 
+@pytest.mark.usefixtures("at_once")
 def test_a_log_that_was_handed_out_and_is_not_at_hand_costs_nobody_everything(tmp_path) -> None:
     (tmp_path / "in").mkdir()
     shutil.copy(REPORT, tmp_path / "in")
@@ -177,6 +188,7 @@ def test_a_log_that_was_handed_out_and_is_not_at_hand_costs_nobody_everything(tm
         assert "aisle_uwb.ulg" in one.pending
 
 
+@pytest.mark.usefixtures("at_once")
 def test_reports_of_one_name_in_two_folders_are_kept_apart(tmp_path) -> None:
     turned = PdfWriter(clone_from=io.BytesIO(REPORT.read_bytes()))
     turned.pages[0].rotate(90)
@@ -192,6 +204,7 @@ def test_reports_of_one_name_in_two_folders_are_kept_apart(tmp_path) -> None:
     assert grade([tmp_path / "in"], [], read_rubric(None), output, processes=2).reused == 2
 
 
+@pytest.mark.usefixtures("at_once")
 def test_results_of_another_version_are_refused_whatever_they_hold(tmp_path) -> None:
     pdf = REPORT.read_bytes()
     schema = {"name": "px4fuse-results", "version": "9.9"}
@@ -211,6 +224,7 @@ def test_results_of_another_version_are_refused_whatever_they_hold(tmp_path) -> 
         assert "follows version 9.9 of the results' schema" in one.verdict.reasons[0]
 
 
+@pytest.mark.usefixtures("at_once")
 def test_what_an_earlier_run_left_is_told(tmp_path) -> None:
     (tmp_path / "in").mkdir()
     for name in ("old.pdf", "new.pdf"):
@@ -252,6 +266,7 @@ def test_an_interrupted_run_says_that_it_can_go_on(tmp_path, monkeypatch) -> Non
     assert "goes on from there" in result.output
 
 
+@pytest.mark.usefixtures("at_once")
 def test_a_damaged_record_is_made_again(handed_in, tmp_path) -> None:
     output = tmp_path / "class"
     rubric = read_rubric(None)

@@ -448,15 +448,17 @@ def test_every_log_is_described_or_refused_in_one_line(shared_logs, monkeypatch,
     paths = sorted([*shared_logs.glob("real/*.ulg"), *shared_logs.glob("simulated/*.ulg")])
     assert len(paths) > 30
     for path in paths:
+        flight = read_log(path)  # once for all
+        monkeypatch.setattr("px4fuse.analysis.read_log", lambda _, flight=flight, **__: flight)
         code, out, err = run_main(monkeypatch, capsys, "info", path)
         assert (code, err) == (0, ""), path.name  # all of these are ULogs that hold data
         assert widest(out) <= WIDTH, path.name
-        inventory = take_inventory(read_log(path))
+        inventory = take_inventory(flight)
         strict(json.dumps(to_plain(inventory)))
         assert len(inventory.abilities) == 6, path.name
         assert all(a.reason for a in inventory.abilities), path.name
         try:
-            choose_source(read_log(path))
+            choose_source(flight)
         except Px4FuseError:
             assert not ability(inventory, "compare").possible, path.name
             assert any("VISION_POSITION" in a.remedy for a in inventory.advice), path.name

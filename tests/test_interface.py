@@ -117,6 +117,7 @@ def test_importing_is_instant():
 # -- compare and find ------------------------------------------------------------------------------
 
 
+@pytest.mark.usefixtures("no_drawing")
 def test_findings_are_those_of_the_command_line(sample_log, analysis, tmp_path):
     command = ["compare", str(sample_log), "--sigma-z", "0.2", "--json", "-"]
     done = CliRunner().invoke(cli, [*command, "-o", str(tmp_path / "r.pdf")])

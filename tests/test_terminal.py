@@ -14,11 +14,11 @@ from pathlib import Path
 import pypdf
 import pytest
 from click.testing import CliRunner, Result
+from conftest import page_of
 from msgspec.structs import replace
 from rich.console import Console
 from test_cli import run_main
 
-import px4fuse.report.pdf
 from px4fuse.analysis import run as analyse
 from px4fuse.analysis import run_loop, run_preparation, run_what_if, tuned
 from px4fuse.cli import cli, compare, loop, tune, whatif
@@ -56,22 +56,6 @@ def run(*words: str | Path, width: int | None = None) -> Result:
 def commands(text: str) -> list[str]:
     """The commands that are printed, as whoever copies them does."""
     return re.findall(r"^.{9}(px4fuse .*)$", text, re.MULTILINE)
-
-
-def page_of(_: object, text: str) -> bytes:
-    """An empty page with results attached."""
-    writer = pypdf.PdfWriter()
-    writer.add_blank_page(100, 100)
-    writer.add_attachment("results.json", text.encode())
-    out = io.BytesIO()
-    writer.write(out)
-    return out.getvalue()
-
-
-@pytest.fixture
-def no_drawing(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Pages take most of the time, and none of them is looked at."""
-    monkeypatch.setattr(px4fuse.report.pdf, "render", page_of)
 
 
 @pytest.fixture(scope="module")

@@ -566,7 +566,7 @@ def test_help_of_both_commands() -> None:
 
 
 def test_compare_reports_the_loop_of_the_sample_flight(tmp_path) -> None:
-    result = run("compare", LOG, "-o", tmp_path / "r.pdf")
+    result = run("compare", LOG, "--axis", "down", "-o", tmp_path / "r.pdf")
     assert result.exit_code == 0, result.output
     found = json.loads((tmp_path / "r.json").read_text(encoding="utf-8"))
     jsonschema.validate(found, schema())

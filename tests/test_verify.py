@@ -15,6 +15,7 @@ from typing import Any
 
 import msgspec
 import pytest
+from class_tools import in_this_process
 from click.testing import CliRunner
 from forgery import Anatomy, Numbers, numbers_of, taken_apart
 from pypdf import PdfReader, PdfWriter
@@ -886,7 +887,10 @@ def run(*words: str) -> tuple[int, str]:
     return outcome.exit_code, outcome.output
 
 
-def test_the_command_says_what_it_found(tmp_path: Path, aisle: Base) -> None:
+def test_the_command_says_what_it_found(
+    tmp_path: Path, aisle: Base, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    in_this_process(monkeypatch)  # the next one takes one of its own
     target = tmp_path / "verdict.json"
     code, output = run(str(SHIPPED), str(LOOP_LOG), "--json", str(target))
     assert code == 1
