@@ -384,9 +384,7 @@ def _file(path: str) -> str:
     return f"./{path}" if path.startswith("-") else path
 
 
-def _all_options(
-    request: Request | EvaluationRequest,
-) -> Iterator[tuple[str, str | None]]:
+def _all_options(request: Request | EvaluationRequest) -> Iterator[tuple[str, str | None]]:
     """Options with their values, None for a flag."""
     if isinstance(request, EvaluationRequest):
         yield from _options(request, EVALUATION_OPTIONS)

@@ -67,7 +67,6 @@ if TYPE_CHECKING:
 @click.option(
     "--jobs",
     type=click.IntRange(1, 256),
-    default=None,
     metavar="N",
     help="How many reports at once.  [default: one per core]",
 )

@@ -16,13 +16,7 @@ from px4fuse.cli.inputs import (
     read_person,
     system_option,
 )
-from px4fuse.cli.outputs import (
-    progress,
-    report_paths,
-    spare_inputs,
-    terminal,
-    write_outputs,
-)
+from px4fuse.cli.outputs import progress, report_paths, spare_inputs, terminal, write_outputs
 from px4fuse.cli.quantity import Quantity
 from px4fuse.errors import SettingsError
 from px4fuse.reading import shown
@@ -80,23 +74,16 @@ class FrameType(click.Choice[str]):
     "--from",
     "start_s",
     type=Quantity("s", 20.0),
-    default=None,
     metavar="S",
     help="Start of the loop: seconds from the first data, or a trajectory's own stamps.  "
     "[default: take-off]",
 )
 @click.option(
-    "--to",
-    "end_s",
-    type=Quantity("s", 60.0),
-    default=None,
-    metavar="S",
-    help="End.  [default: landing]",
+    "--to", "end_s", type=Quantity("s", 60.0), metavar="S", help="End.  [default: landing]"
 )
 @click.option(
     "--landed-at",
     type=LandingType(),
-    default=None,
     metavar="FORWARD,RIGHT[,DEG]",
     help="Where it really landed, by tape from the place of take-off: m along its nose there, m to "
     "the right, and degrees it was turned clockwise.  [default: the log's ground truth, else 0,0]",
@@ -136,14 +123,12 @@ class FrameType(click.Choice[str]):
     "--key-frames",
     "key_frames_m",
     type=Quantity("m", 0.2),
-    default=None,
     metavar="M",
     help="Distance between key frames.  [default: a fiftieth of the extent, 0.02 to 0.5]",
 )
 @click.option(
     "--frame",
     type=FrameType(get_args(FrameName)),
-    default=None,
     help="Axes of a trajectory file.  [default: recognised]",
 )
 @click.option(

@@ -11,9 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 from click.core import ParameterSource
 
-from px4fuse.cli.inputs import (
-    path_option,
-)
+from px4fuse.cli.inputs import path_option
 from px4fuse.cli.outputs import progress, terminal, write_outputs
 from px4fuse.cli.quantity import Quantity
 from px4fuse.errors import OutputError, SettingsError
@@ -87,7 +85,6 @@ class WithMistakes(click.Command):
 )
 @click.option(
     "--secret",
-    default=None,
     metavar="TEXT",
     help="The secret itself; others on this computer may see what you type.",
 )
@@ -95,7 +92,6 @@ class WithMistakes(click.Command):
     "--mistakes",
     "count",
     type=int,
-    default=None,
     metavar="N",
     help="How many mistakes each assigned flight has.  [default: drawn: none, one or two]",
 )
@@ -137,18 +133,10 @@ class WithMistakes(click.Command):
 @click.option("--no-truth", is_flag=True, help="Leave the ground truth out of the log.")
 @click.option("--no-ekf2", is_flag=True, help="Fly without EKF2, which is faster.")
 @click.option(
-    "--passes",
-    type=int,
-    default=None,
-    metavar="N",
-    help="Passes of the aisle [6], or laps of the loop [1].",
+    "--passes", type=int, metavar="N", help="Passes of the aisle [6], or laps of the loop [1]."
 )
 @_scenario_option(
-    "--length",
-    "length_m",
-    "m",
-    metavar="M",
-    help="Of the aisle, or of a side of the square.",
+    "--length", "length_m", "m", metavar="M", help="Of the aisle, or of a side of the square."
 )
 @_scenario_option("--speed", "speed_m_s", "m/s", metavar="M/S")
 @_scenario_option(
@@ -161,7 +149,6 @@ class WithMistakes(click.Command):
 @click.option(
     "--yaw",
     type=click.Choice(YAWS),
-    default=None,
     help="Whether the nose stays or follows the flight.  [default: fixed; follow in a loop]",
 )
 @_scenario_option(

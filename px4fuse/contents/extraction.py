@@ -138,10 +138,6 @@ _CLOCKS = (
 def tables(flight: Flight) -> Mapping[str, pd.DataFrame]:
     """Everything in a flight as tidy tables: one row per sample, one documented unit per column.
 
-    Parameters
-    ----------
-    flight : Flight
-
     Returns
     -------
     mapping from table name to DataFrame
@@ -280,10 +276,7 @@ def _ekf2(flight: Flight, ekf2: Ekf2) -> Iterator[_Table]:
 
 
 def _series(
-    flight: Flight,
-    name: str,
-    data: pd.DataFrame | Unavailable,
-    columns: tuple[_Column, ...],
+    flight: Flight, name: str, data: pd.DataFrame | Unavailable, columns: tuple[_Column, ...]
 ) -> Iterator[_Table]:
     """A time series that is named as its stream; nothing where it is unavailable."""
     if isinstance(data, pd.DataFrame):

@@ -216,10 +216,6 @@ def take_inventory(flight: Flight) -> Inventory:
     ----------
     flight : Flight
         Any: also one of which every part is unavailable.
-
-    Returns
-    -------
-    Inventory
     """
     plan = _plan(flight)
     return Inventory(

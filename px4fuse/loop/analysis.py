@@ -12,13 +12,7 @@ from px4fuse.filter.signals import Segment
 from px4fuse.flight import EXTERNAL_VISION_RUNGS, Flight, Truth, Unavailable
 from px4fuse.loop.loop import Loop, close_loop
 from px4fuse.loop.odometry import Closure, OdometryNoise
-from px4fuse.loop.part import (
-    KnownEnd,
-    chosen_part,
-    measured_end,
-    part_of_flight,
-    true_end,
-)
+from px4fuse.loop.part import KnownEnd, chosen_part, measured_end, part_of_flight, true_end
 from px4fuse.loop.sources import Source
 from px4fuse.loop.tracks import odometry_of, trajectory_of
 from px4fuse.request import GivenClosure

@@ -149,10 +149,7 @@ def heading_change_rad(rotation: Rotation) -> float:
 
 
 def correct_by_distance(
-    trajectory: Trajectory,
-    cumulative_m: Array,
-    misclosure_m: Array,
-    misclosure_heading_rad: float,
+    trajectory: Trajectory, cumulative_m: Array, misclosure_m: Array, misclosure_heading_rad: float
 ) -> Trajectory:
     """Distribute a misclosure of position and heading by distance.
 

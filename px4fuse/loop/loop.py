@@ -527,11 +527,7 @@ def _scored(
         if offsets is not None:
             known = offsets.get(reference.name, known)
         try:
-            scores[reference.name] = evaluate(
-                correction.trajectory,
-                reference,
-                time_offset_s=known,
-            )
+            scores[reference.name] = evaluate(correction.trajectory, reference, time_offset_s=known)
         except Px4FuseError as error:
             scores[reference.name] = Unavailable(
                 f"score against {reference.name}", str(error), "Give another --reference."

@@ -151,10 +151,7 @@ class Closure:
 
 
 def pose_graph(
-    path: Trajectory,
-    nodes: IntArray,
-    closures: tuple[Closure, ...],
-    noise: OdometryNoise,
+    path: Trajectory, nodes: IntArray, closures: tuple[Closure, ...], noise: OdometryNoise
 ) -> tuple[PoseGraph, str]:
     """Pose graph of a path: an edge from node to node by odometry, and one per closure.
 

@@ -43,10 +43,6 @@ def join(flight: Flight, other: Flight) -> Flight:
     other : Flight
         Gives what ``flight`` lacks, and all its position tracks.
 
-    Returns
-    -------
-    Flight
-
     Raises
     ------
     MissingDataError

@@ -207,11 +207,7 @@ def _check_match(match: Match) -> None:
 
 
 def _mend_resets(
-    flight: Flight,
-    samples: pd.DataFrame,
-    match: Match,
-    yaw_rad: float | None,
-    lag_s: float | None,
+    flight: Flight, samples: pd.DataFrame, match: Match, yaw_rad: float | None, lag_s: float | None
 ) -> Match:
     """Fit again to EKF2 with its resets treated as everything else in px4fuse treats them."""
     if isinstance(flight.ekf2, Unavailable) or not flight.ekf2.resets:
@@ -228,11 +224,7 @@ def _mend_resets(
 
 
 def _best_fit(
-    samples: pd.DataFrame,
-    frame: str,
-    reference: Track,
-    yaw_rad: float | None,
-    lag_s: float | None,
+    samples: pd.DataFrame, frame: str, reference: Track, yaw_rad: float | None, lag_s: float | None
 ) -> Fit:
     """Find the lag, unless it is given, then fit."""
     file = file_track(samples, frame)

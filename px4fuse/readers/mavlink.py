@@ -122,11 +122,7 @@ def _read_imu(recording: Recording, remedies: Remedies) -> pd.DataFrame | Unavai
     if len(rows) < 2:
         raw = len(recording.rows("RAW_IMU"))
         refused = f"; {raw} RAW_IMU were refused, since raw counts have no unit" if raw else ""
-        return Unavailable(
-            "IMU",
-            f"no HIGHRES_IMU or SCALED_IMU{refused}",
-            remedies.imu,
-        )
+        return Unavailable("IMU", f"no HIGHRES_IMU or SCALED_IMU{refused}", remedies.imu)
     table = recording.frames.table(source.message, rows)
     if "id" in (table.dtype.names or ()):
         busiest = table["id"] == np.bincount(table["id"]).argmax()
@@ -172,9 +168,7 @@ def _read_attitude(recording: Recording, remedies: Remedies) -> pd.DataFrame | U
     attitude = recording.frame(message, boot_s, QUATERNION_COLUMNS, quaternion[good])
     if len(attitude) < 2:
         return Unavailable(
-            "attitude",
-            f"no usable {', '.join(ATTITUDE[:-1])} or {ATTITUDE[-1]}",
-            remedies.attitude,
+            "attitude", f"no usable {', '.join(ATTITUDE[:-1])} or {ATTITUDE[-1]}", remedies.attitude
         )
     recording.came_from("attitude", BOOT_CLOCK, message)
     return attitude
@@ -188,11 +182,7 @@ def _read_airborne(
     table = recording.frames.table("EXTENDED_SYS_STATE", rows)
     known = table["landed_state"] > 0
     if not np.any(known):
-        return Unavailable(
-            "land detector",
-            "no usable EXTENDED_SYS_STATE",
-            remedies.landed,
-        )
+        return Unavailable("land detector", "no usable EXTENDED_SYS_STATE", remedies.landed)
     recording.came_from("airborne", RECEIPT_CLOCK, "EXTENDED_SYS_STATE")
     time_s = recording.receipt_boot_s(rows[known]) - recording.zero_s
     landed = pd.Series(table["landed_state"][known] == LANDED, index=time_s)

@@ -175,10 +175,6 @@ def map_clock(
         From boot clock to UNIX time by the autopilot's SYSTEM_TIME.
     has_receipt : bool
         Whether the recording has times of receipt, or only an order.
-
-    Returns
-    -------
-    Mapped
     """
     receipt = "receive time" if has_receipt else "position in the stream"
     boot_at_receipt = boot_of_receipt.at(received_s)

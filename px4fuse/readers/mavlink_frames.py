@@ -190,10 +190,6 @@ def read_frames(path: Path) -> Frames:
     path : Path
         A ``.tlog`` with time stamps, or a raw stream of MAVLink 1 and 2.
 
-    Returns
-    -------
-    Frames
-
     Raises
     ------
     LogError
@@ -316,12 +312,7 @@ def _candidates(
     end = crc_end + CHECKSUM
     end[second] += SIGNATURE * (source[at + 2] & SIGNED).astype(np.int64)
     known &= end <= len(source)
-    return (
-        start[known],
-        end[known],
-        crc_end[known],
-        _crc_extra()[number[known]].astype(np.uint16),
-    )
+    return (start[known], end[known], crc_end[known], _crc_extra()[number[known]].astype(np.uint16))
 
 
 def _among(values: Integers, increasing: Integers) -> BoolArray:

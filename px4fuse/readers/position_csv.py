@@ -129,10 +129,6 @@ def read_position_csv(
     length_unit : {"m", "cm", "mm"}, optional
         Unit of positions and sigmas, whatever their names say.
 
-    Returns
-    -------
-    PositionFile
-
     Raises
     ------
     LogError

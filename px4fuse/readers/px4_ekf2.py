@@ -157,10 +157,7 @@ def _primary_instances(topics: Topics) -> Instances:
 
 
 def of_primary(
-    topics: Topics,
-    topic: str,
-    instances: Instances,
-    read: Callable[[int], pd.DataFrame],
+    topics: Topics, topic: str, instances: Instances, read: Callable[[int], pd.DataFrame]
 ) -> pd.DataFrame:
     """Rows of each instance of a topic from the times in which that instance was primary."""
     available = topics.instances(topic)
@@ -316,10 +313,7 @@ def step_at(steps: pd.Series, times: pd.Index) -> pd.Series:
 
 
 def _read_innovations(
-    topics: Topics,
-    instances: Instances,
-    fusing: pd.DataFrame | Unavailable,
-    notes: list[str],
+    topics: Topics, instances: Instances, fusing: pd.DataFrame | Unavailable, notes: list[str]
 ) -> tuple[Mapping[AxisName, pd.DataFrame | Unavailable], tuple[str, ...]]:
     """Innovations per axis, from the aid-source topics or else from the older three topics."""
     found: dict[AxisName, pd.DataFrame | Unavailable] = {}

@@ -238,9 +238,7 @@ def _reconstruct(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack | Un
 
 
 def project(
-    latitude_deg: Array,
-    longitude_deg: Array,
-    origin: tuple[float, float],
+    latitude_deg: Array, longitude_deg: Array, origin: tuple[float, float]
 ) -> tuple[Array, Array]:
     """North and east (m) of an origin by the azimuthal equidistant projection that PX4 uses.
 

@@ -282,19 +282,13 @@ TRACKS = (
         "vehicle_visual_odometry",
         2,
         "external vision position as PX4 received it",
-        (
-            *_odometry("vehicle_visual_odometry"),
-            Layout("vehicle_vision_position", _XYZ, "v1.8"),
-        ),
+        (*_odometry("vehicle_visual_odometry"), Layout("vehicle_vision_position", _XYZ, "v1.8")),
     ),
     TrackSource(
         "vehicle_mocap_odometry",
         3,
         "motion capture, which EKF2 never fuses",
-        (
-            *_odometry("vehicle_mocap_odometry"),
-            Layout("att_pos_mocap", _XYZ, "v1.8"),
-        ),
+        (*_odometry("vehicle_mocap_odometry"), Layout("att_pos_mocap", _XYZ, "v1.8")),
     ),
     TrackSource(
         "estimator_visual_odometry_aligned",

@@ -52,14 +52,6 @@ UTC_RANGE_S = (1_234_567_890.0, 4_102_444_800.0)
 def read_ulog(path: Path) -> Flight:
     """Read a PX4 ULog.
 
-    Parameters
-    ----------
-    path : Path
-
-    Returns
-    -------
-    Flight
-
     Raises
     ------
     LogError
@@ -69,12 +61,7 @@ def read_ulog(path: Path) -> Flight:
 
 
 def to_flight(topics: Topics) -> Flight:
-    """Make a flight of the topics of a log.
-
-    Parameters
-    ----------
-    topics : Topics
-    """
+    """Make a flight of the topics of a log."""
     imu = _read_imu(topics)
     attitude = _read_attitude(topics)
     ekf2 = read_ekf2(topics)

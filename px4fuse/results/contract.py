@@ -242,12 +242,7 @@ KINDS: dict[str, type[Results]] = {
 
 
 def schema() -> dict[str, Any]:
-    """JSON Schema (draft 2020-12) of everything that is written as results.
-
-    Returns
-    -------
-    dict
-    """
+    """JSON Schema (draft 2020-12) of everything that is written as results."""
     kinds: dict[type, None] = dict.fromkeys(KINDS.values())
     components: dict[str, Any] = {}
 

@@ -32,14 +32,7 @@ from px4fuse.ekf2.output_predictor import follow_attitude, publish
 from px4fuse.ekf2.parameters import PARAMETERS as MODEL_PARAMETERS
 from px4fuse.ekf2.parameters import settings_in_force
 from px4fuse.ekf2.recursion import EAST, HEADING, NORTH, Variant
-from px4fuse.ekf2.rotation import (
-    conjugate,
-    from_vector,
-    multiply,
-    running_product,
-    skew,
-    to_vector,
-)
+from px4fuse.ekf2.rotation import conjugate, from_vector, multiply, running_product, skew, to_vector
 from px4fuse.ekf2.stretches import Stretch, down_sampled, step_ends
 from px4fuse.ekf2.vision import Vision
 from px4fuse.simulation import sensors

@@ -233,11 +233,7 @@ def attitude(state: State) -> Attitude:
     y = n / n_size[:, None]
     # x = y × z
     x = np.stack(
-        [
-            y[:, 1] * zz - y[:, 2] * zy,
-            y[:, 2] * zx - y[:, 0] * zz,
-            y[:, 0] * zy - y[:, 1] * zx,
-        ],
+        [y[:, 1] * zz - y[:, 2] * zy, y[:, 2] * zx - y[:, 0] * zz, y[:, 0] * zy - y[:, 1] * zx],
         axis=1,
     )
     # from dR/dt = R [ω]×

@@ -141,10 +141,6 @@ def evaluate(
     relative_tolerance : float
         By which a pair may be longer or shorter than its delta, where all pairs are used.
 
-    Returns
-    -------
-    Evaluation
-
     Raises
     ------
     TrajectoryError

@@ -217,10 +217,6 @@ def composed(graph: PoseGraph) -> PoseGraph:
     Takes the edges between successive poses where they lead from the first pose to the last, and
     the shortest ways through all edges otherwise.
 
-    Parameters
-    ----------
-    graph : PoseGraph
-
     Raises
     ------
     TrajectoryError
