@@ -26,8 +26,8 @@ from px4fuse.flight import (
     PositionTrack,
     Truth,
     Unavailable,
-    finite_rows,
 )
+from px4fuse.readers.parts import finite_rows
 from px4fuse.trajectory.model import MIN_POSES, Frame, Kind, Trajectory
 
 Part = Literal["vio", "ekf2", "kf", "truth"]

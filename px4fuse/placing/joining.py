@@ -16,13 +16,13 @@ from px4fuse.flight import (
     Flight,
     FlightMode,
     FusionRecord,
-    InputFile,
     PositionTrack,
     Reset,
     Truth,
     Unavailable,
-    missing_parts,
 )
+from px4fuse.readers.parts import missing_parts
+from px4fuse.recording import InputFile
 
 # Both recordings must hold this much of the same time
 MIN_OVERLAP_S = 2.0

@@ -19,12 +19,7 @@ from px4fuse.flight import (
     SPECIFIC_FORCE_COLUMNS,
     Flight,
     FlightMode,
-    LogInfo,
     Unavailable,
-    Unused,
-    missing_parts,
-    stretches_of_flight,
-    stretches_of_modes,
 )
 from px4fuse.readers.mavlink_clocks import UNIX_FROM_S
 from px4fuse.readers.mavlink_ekf2 import MIN_NORM, read_ekf2
@@ -55,8 +50,10 @@ from px4fuse.readers.mavlink_recording import (
     unix_of_boot,
     vector,
 )
+from px4fuse.readers.parts import missing_parts, stretches_of_flight, stretches_of_modes
 from px4fuse.readers.px4_topics import PARAMETERS
 from px4fuse.readers.ulog_topics import dropped_note
+from px4fuse.recording import LogInfo, Unused
 
 # MAV_PARAM_TYPE: below, an integer
 PARAMETER_REAL = 9

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.stats import theilslopes
 
 from px4fuse.arrays import Array
-from px4fuse.flight import ClockMap
+from px4fuse.recording import ClockMap
 
 # Stamps within this of the boot clock at their receipt are taken to be on the boot clock
 SAME_CLOCK_S = 10.0

@@ -19,7 +19,6 @@ from px4fuse.flight import (
     PositionTrack,
     Truth,
     Unavailable,
-    orientation_of,
 )
 from px4fuse.readers.mavlink_clocks import Mapped
 from px4fuse.readers.mavlink_ekf2 import odometry
@@ -33,6 +32,7 @@ from px4fuse.readers.mavlink_messages import (
     Remedies,
 )
 from px4fuse.readers.mavlink_recording import RECEIPT_CLOCK, Address, Recording, senders_of, vector
+from px4fuse.readers.parts import orientation_of
 from px4fuse.readers.px4_positions import (
     MIN_TRACK_SAMPLES,
     captured_truth,

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from px4fuse.arrays import Array, IntArray
 from px4fuse.errors import SettingsError
-from px4fuse.flight import ClockMap, Sender, Stream
 from px4fuse.readers.mavlink_clocks import (
     OTHER_SPEED,
     UNIX_FROM_S,
@@ -34,6 +33,7 @@ from px4fuse.readers.mavlink_messages import (
     VEHICLE_TYPES,
 )
 from px4fuse.readers.ulog_topics import increasing
+from px4fuse.recording import ClockMap, Sender, Stream
 
 # MAVLink system and component
 Address = tuple[int, int]

@@ -16,10 +16,10 @@ from px4fuse.flight import (
     SPECIFIC_FORCE_COLUMNS,
     Flight,
     FlightMode,
-    Stream,
     Truth,
     Unavailable,
-    Unused,
+)
+from px4fuse.readers.parts import (
     finite_rows,
     missing_parts,
     stretches_of_flight,
@@ -44,6 +44,7 @@ from px4fuse.readers.ulog_topics import (
     increasing,
     read_topics,
 )
+from px4fuse.recording import Stream, Unused
 
 # A receiver's UTC outside these is none: PX4's own GPS_EPOCH_SECS (gps_helper.h), and 2100
 UTC_RANGE_S = (1_234_567_890.0, 4_102_444_800.0)

@@ -25,9 +25,9 @@ from pyulog.exceptions import ULogException
 
 from px4fuse.arrays import IntArray
 from px4fuse.errors import LogError
-from px4fuse.flight import Dropout, LogInfo
 from px4fuse.readers.px4_topics import IMU, PARAMETERS, Layout, topics
 from px4fuse.reading import read_log_bytes, shown
+from px4fuse.recording import Dropout, LogInfo
 
 _MICROSECOND = 1e-6
 # A measurement time stamp further than this from its publication is not on the boot clock
@@ -160,6 +160,14 @@ def measurement_time_us(table: dict[str, NDArray[Any]]) -> NDArray[np.int64]:
     if np.count_nonzero(plausible) * 2 < len(plausible):
         return published
     return np.where(plausible, sampled, published)
+
+
+def states_and_covariances(table: Mapping[str, NDArray[Any]]) -> tuple[int, int]:
+    """How many of either a topic with EKF2's state vector has."""
+    states, covariances = (
+        sum(column.startswith(f"{name}[") for column in table) for name in ("states", "covariances")
+    )
+    return states, covariances
 
 
 def increasing(time_us: NDArray[np.int64]) -> IntArray:
