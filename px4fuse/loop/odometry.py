@@ -11,7 +11,7 @@ from px4fuse.arrays import Array, IntArray
 from px4fuse.errors import SettingsError
 from px4fuse.loop.closure import DOWN, heading_change_rad
 from px4fuse.trajectory.graph import lie
-from px4fuse.trajectory.graph.pose_graph import PoseGraph
+from px4fuse.trajectory.graph.model import PoseGraph
 from px4fuse.trajectory.model import Trajectory, cumulative_distance
 
 # The reported variances of an odometry tell its drift only where they grow along the path

@@ -11,7 +11,8 @@ from px4fuse.arrays import Array, IntArray
 from px4fuse.errors import TrajectoryError
 from px4fuse.readers.text_table import is_number, quote, text_of
 from px4fuse.reading import read_whole, shown
-from px4fuse.trajectory.graph.pose_graph import FROM_FILE, PoseGraph, initialise
+from px4fuse.trajectory.graph.initialisation import initialise
+from px4fuse.trajectory.graph.model import FROM_FILE, PoseGraph
 
 MAX_FILE_BYTES = 500_000_000
 # Tag: dimension, vertices that it names, numbers that follow them

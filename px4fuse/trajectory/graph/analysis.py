@@ -9,7 +9,9 @@ import numpy as np
 
 from px4fuse.errors import TrajectoryError
 from px4fuse.flight import Unavailable
-from px4fuse.trajectory.graph.pose_graph import GateResult, PoseGraph, Solution, gate, solve
+from px4fuse.trajectory.graph.covariance import GateResult, gate
+from px4fuse.trajectory.graph.model import PoseGraph
+from px4fuse.trajectory.graph.solver import Solution, solve
 
 MANY_CLOSURES = 1000
 # Chance that the gate rejects a closure that is true
