@@ -85,10 +85,8 @@ def read_whole(
 
     Parameters
     ----------
-    path : Path
     refuse : type
         Error to raise.
-    limit_bytes : int
     name : str, optional
         For messages; by default as :func:`shown` shows it.
     smaller : str

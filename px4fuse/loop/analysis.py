@@ -42,7 +42,6 @@ def analyse(
 
     Parameters
     ----------
-    source : Source
     start_s, end_s : float, optional
         Override take-off and landing.
     landed_at : tuple of forward_m, right_m and heading change (degrees or None), optional
@@ -58,7 +57,6 @@ def analyse(
         Scored against, besides the truth in the log.
     spacing_m : float, optional
         Between key frames.
-    progress : callable
 
     Raises
     ------

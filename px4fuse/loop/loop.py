@@ -179,7 +179,6 @@ def close_loop(
 
     Parameters
     ----------
-    trajectory : Trajectory
     segment : Segment, optional
         Part to take, in the trajectory's own time; by default all of it.
     known_end : KnownEnd, optional

@@ -64,7 +64,6 @@ def odometry_variances(
 
     Parameters
     ----------
-    path : Trajectory
     nodes : ndarray of int, shape (k,)
         Poses that become nodes of the graph.
     noise : OdometryNoise
@@ -162,7 +161,6 @@ def pose_graph(
     nodes : ndarray of int, shape (k,)
         Must hold the poses nearest to the times of the closures.
     closures : tuple of Closure
-    noise : OdometryNoise
 
     Returns
     -------

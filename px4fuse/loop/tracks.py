@@ -55,7 +55,6 @@ def trajectory_of(flight: Flight, part: Part, settings: Settings | None = None) 
 
     Parameters
     ----------
-    flight : Flight
     part : {"vio", "ekf2", "kf", "truth"}
         "kf" is our filter, along north, east and down, with the autopilot's attitude.
     settings : Settings, optional

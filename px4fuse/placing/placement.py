@@ -43,8 +43,6 @@ def place(
 
     Parameters
     ----------
-    flight : Flight
-    file : PositionFile
     frame : {"ned", "enu", "nwu"}, optional
         What the file's x, y, z are; by default what its column names say, or else what fits.
     yaw_deg : float or "auto", optional

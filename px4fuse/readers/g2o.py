@@ -72,7 +72,6 @@ def parse_g2o(text: str, name: str) -> PoseGraph:
 
     Parameters
     ----------
-    text : str
     name : str
         Of the file, for messages.
 

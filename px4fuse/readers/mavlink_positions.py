@@ -53,10 +53,8 @@ def read_positions(
 
     Parameters
     ----------
-    recording : Recording
     mapped : mapping from address to Mapped
         Clock of every sender.
-    remedies : Remedies
     """
     found: list[PositionTrack | Unavailable] = []
     for source in POSITION_INPUTS:

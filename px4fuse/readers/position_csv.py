@@ -214,12 +214,6 @@ def _count(rows: int) -> str:
     return "1 row was" if rows == 1 else f"{rows} rows were"
 
 
-# -- the file --------------------------------------------------------------------------------------
-
-
-# -- which columns ---------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class _Choice:
     """Columns to read, by index."""
@@ -336,9 +330,6 @@ def _choose_time(table: Table, meanings: list[Meaning]) -> tuple[int, int | None
     return first, None, table.label(first) + words
 
 
-# -- the rows --------------------------------------------------------------------------------------
-
-
 def _convert(texts: Any, is_iso: bool, errors: Literal["raise", "coerce"]) -> Any:
     """Times, or numbers, of texts."""
     if is_iso:
@@ -419,9 +410,6 @@ def _is_cut(fields: list[str], head: list[list[str]]) -> bool:
         return len(text.partition(".")[2] if has_point else text)
 
     return digits(fields[-1]) < min(map(digits, texts))
-
-
-# -- units -----------------------------------------------------------------------------------------
 
 
 def _time_unit(ticks: Any, choice: _Choice, option: str | None) -> tuple[str, str]:

@@ -47,7 +47,6 @@ def read_record(topics: Topics, step_s: float, instances: Instances) -> FusionRe
 
     Parameters
     ----------
-    topics : Topics
     step_s : float
         Time between two predictions, for releases that keep biases per prediction.
     instances : tuple of (float, int)

@@ -47,7 +47,6 @@ def read_innovations(
 
     Parameters
     ----------
-    topics : Topics
     instances : tuple of (float, int)
     fusing : DataFrame or Unavailable
         As :class:`~px4fuse.flight.Ekf2` has it.

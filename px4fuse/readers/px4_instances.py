@@ -45,7 +45,6 @@ def of_primary(
 
     Parameters
     ----------
-    topics : Topics
     layout : Layout
         One that :meth:`Topics.find` returned.
     instances : tuple of (float, int)

@@ -172,9 +172,6 @@ def tum_text(trajectory: Trajectory) -> str:
     return "# timestamp tx ty tz qx qy qz qw\n" + "\n".join(rows) + "\n"
 
 
-# -- the file --------------------------------------------------------------------------------------
-
-
 def _text(name: str, content: bytes) -> str:
     """Text with line feeds between lines."""
     text = text_of(content)
@@ -201,9 +198,6 @@ def _fields(line: str, layout: _Layout | None = None) -> list[str]:
 
 def _numeric(fields: list[str]) -> bool:
     return all(map(is_number, fields))
-
-
-# -- which format ----------------------------------------------------------------------------------
 
 
 def _recognise(file: _File) -> _Layout:
@@ -272,9 +266,6 @@ def _layout(file: _File, first: list[str], separator: str | None, header: list[s
         "quaternion's w is not known. Add the line "
         "'#timestamp, p_x, p_y, p_z, q_w, q_x, q_y, q_z' with the columns in their order."
     )
-
-
-# -- the numbers -----------------------------------------------------------------------------------
 
 
 def _parse(file: _File, layout: _Layout, rows: list[str]) -> tuple[list[str], Array]:
@@ -391,9 +382,6 @@ def _rotation(quaternion: Array, w_first: bool) -> Rotation:
     norms = np.linalg.norm(quaternion, axis=1, keepdims=True)
     norms[np.abs(norms - 1.0) < UNIT_NORM] = 1.0
     return Rotation(quaternion / norms, normalize=False)
-
-
-# -- what it is ------------------------------------------------------------------------------------
 
 
 def _kind(

@@ -83,14 +83,13 @@ class Topics:
         """Instances of a topic that hold data, in order."""
         return sorted(instance for name, instance in self.tables if name == topic)
 
-    def find(self, layouts: tuple[Layout, ...], instance: int | None = None) -> Layout | None:
+    def find(self, layouts: tuple[Layout, ...]) -> Layout | None:
         """First layout that this log holds, or None."""
         for layout in layouts:
-            for name, number in self.tables:
-                if name == layout.topic and instance in (None, number):
-                    table = self.tables[name, number]
-                    if all(column in table for column in layout.columns.values()):
-                        return layout
+            for (name, _), table in self.tables.items():
+                wanted = layout.columns.values()
+                if name == layout.topic and all(column in table for column in wanted):
+                    return layout
         return None
 
     def frame(self, layout: Layout, instance: int = 0, *, step: bool = False) -> pd.DataFrame:

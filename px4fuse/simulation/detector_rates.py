@@ -181,7 +181,6 @@ def found(seed: int, condition: Condition | None = None) -> tuple[str, ...]:
 
     Parameters
     ----------
-    seed : int
     condition : Condition, optional
         None for a clean flight of the usual scenario.
     """

@@ -87,8 +87,6 @@ def fly(
 
     Parameters
     ----------
-    scenario : Scenario
-    motion : Motion
     imu, source : Topic
         As EKF2 received them, whatever of them is logged.
     flown : mapping

@@ -74,7 +74,6 @@ def associate(
 
     Parameters
     ----------
-    estimate, reference : Trajectory
     method : {"interpolate", "nearest"}
         "interpolate" puts the reference at the estimate's times, position linearly and rotation by
         slerp. "nearest" pairs the poses of the one that has fewer with the nearest of the other,

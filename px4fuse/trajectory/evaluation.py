@@ -124,7 +124,6 @@ def evaluate(
 
     Parameters
     ----------
-    estimate, reference : Trajectory
     alignment : {"none", "yaw", "se3", "sim3"}, optional
         By default what the two are decides, see :func:`choose_alignment`.
     association : {"interpolate", "nearest"}
@@ -136,7 +135,6 @@ def evaluate(
         overlap.
     rpe_deltas : sequence of Delta, optional
         By default some distances and times that suit the flight.
-    all_pairs : bool
     pairs_from : {"estimate", "reference"}
     relative_tolerance : float
         By which a pair may be longer or shorter than its delta, where all pairs are used.
@@ -215,9 +213,6 @@ def evaluate(
         notes=notes,
         warnings=(*warnings, *offset_warnings, *_doubts(matched, alignment)),
     )
-
-
-# -- before the scores -----------------------------------------------------------------------------
 
 
 def choose_alignment(estimate: Trajectory, reference: Trajectory) -> tuple[AlignmentKind, str]:

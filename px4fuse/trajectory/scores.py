@@ -287,9 +287,6 @@ def rotations_of(
     )
 
 
-# -- intervals -------------------------------------------------------------------------------------
-
-
 def rmse_interval(
     errors: Array, what: str, *, min_block: int = 1, seed: int = SEED, resamples: int = RESAMPLES
 ) -> Interval | Unavailable:
@@ -307,7 +304,6 @@ def rmse_interval(
         Of which score, for the reason where there is none.
     min_block : int
         Errors of pairs that overlap are correlated over so many.
-    seed, resamples : int
 
     Returns
     -------

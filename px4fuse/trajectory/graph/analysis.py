@@ -55,8 +55,6 @@ def analyse_graph(
 
     Parameters
     ----------
-    graph : PoseGraph
-    progress : callable
     robust : bool, optional
         Whether to solve it robustly too; by default up to 1000 closures, since it takes minutes
         for more.

@@ -100,7 +100,6 @@ def residuals(graph: PoseGraph, poses: Array | None = None) -> Array:
 
     Parameters
     ----------
-    graph : PoseGraph
     poses : ndarray, shape (n, 3) or (n, 7), optional
         Instead of the graph's own.
 
@@ -118,7 +117,6 @@ def chi_square(graph: PoseGraph, residual: Array) -> Array:
 
     Parameters
     ----------
-    graph : PoseGraph
     residual : ndarray, shape (m, 3) or (m, 6)
         From :func:`residuals`.
 
@@ -135,7 +133,6 @@ def cost(graph: PoseGraph, poses: Array | None = None) -> float:
 
     Parameters
     ----------
-    graph : PoseGraph
     poses : ndarray, shape (n, 3) or (n, 7), optional
         Instead of the graph's own.
     """
@@ -189,7 +186,6 @@ def require_connected(graph: PoseGraph, used: BoolArray, what: str) -> None:
 
     Parameters
     ----------
-    graph : PoseGraph
     used : ndarray of bool, shape (m,)
         The edges that may hold it together.
     what : str
@@ -255,7 +251,6 @@ def odometry_chain(graph: PoseGraph, edges: IntArray | None = None) -> IntArray:
 
     Parameters
     ----------
-    graph : PoseGraph
     edges : ndarray of int, optional
         Those that may be used; all by default. The first one between two poses is taken.
 
@@ -278,7 +273,6 @@ def odometry_steps(graph: PoseGraph, chain: IntArray) -> Array:
 
     Parameters
     ----------
-    graph : PoseGraph
     chain : ndarray of int, shape (k,)
         Edges between successive poses, in order.
 

@@ -119,7 +119,6 @@ def solve(
 
     Parameters
     ----------
-    graph : PoseGraph
     robust : {"none", "dcs", "gnc"}
     loops : ndarray of bool, shape (m,), optional
         Edges that may be false; all others keep the weight 1. By default those that do not join
