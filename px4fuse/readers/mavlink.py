@@ -42,13 +42,15 @@ from px4fuse.readers.mavlink_recording import (
     BOOT_CLOCK,
     RECEIPT_CLOCK,
     Recording,
+    settle_clocks,
+    unix_of_boot,
+    vector,
+)
+from px4fuse.readers.mavlink_senders import (
     choose_autopilot,
     clock_maps,
     describe_senders,
     map_senders,
-    settle_clocks,
-    unix_of_boot,
-    vector,
 )
 from px4fuse.readers.parts import missing_parts, stretches_of_flight, stretches_of_modes
 from px4fuse.readers.px4_topics import PARAMETERS

@@ -31,7 +31,8 @@ from px4fuse.readers.mavlink_messages import (
     PositionInput,
     Remedies,
 )
-from px4fuse.readers.mavlink_recording import RECEIPT_CLOCK, Address, Recording, senders_of, vector
+from px4fuse.readers.mavlink_recording import RECEIPT_CLOCK, Address, Recording, vector
+from px4fuse.readers.mavlink_senders import senders_of
 from px4fuse.readers.parts import orientation_of
 from px4fuse.readers.px4_positions import (
     MIN_TRACK_SAMPLES,

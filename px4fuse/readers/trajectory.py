@@ -12,7 +12,7 @@ import hashlib
 import math
 import re
 from dataclasses import dataclass
-from decimal import Decimal, InvalidOperation
+from decimal import Decimal
 from pathlib import Path
 
 import numpy as np
@@ -330,7 +330,7 @@ def _seconds(file: _File, stamps: list[str]) -> tuple[Array, str]:
         # on a clock of its own only ORB-SLAM3's nanoseconds are known to occur
         is_known = first >= UNIX_START_S or unit == "nanoseconds"
         if is_known and last < UNIX_END_S and MIN_INTERVAL_S <= step / per_second <= MAX_INTERVAL_S:
-            ticks = np.array([_integer(stamp) for stamp in stamps], dtype=np.int64)
+            ticks = np.array([int(Decimal(stamp.strip())) for stamp in stamps], dtype=np.int64)
             return seconds_of(
                 ticks, per_second
             ), f"Its stamps are {unit} and were divided by {per_second:.0e}."
@@ -338,16 +338,6 @@ def _seconds(file: _File, stamps: list[str]) -> tuple[Array, str]:
         f"{file.name}: its stamps are {step:.3g} apart (median), which is not an interval of "
         "frames in seconds or nanoseconds. Give stamps in seconds."
     )
-
-
-def _integer(stamp: str) -> int:
-    whole, _, fraction = stamp.strip().partition(".")
-    if "e" not in (whole + fraction).casefold():
-        return int(whole)
-    try:
-        return int(Decimal(stamp.strip()))
-    except (InvalidOperation, ValueError):
-        return int(float(stamp))
 
 
 def _increasing(file: _File, time: Array, values: Array) -> tuple[Array, Array, str]:
