@@ -88,11 +88,8 @@ def by_distance(
     if judged and not judged[0].gate.accepted:
         refused = _refused("correction by distance", judged[0])
         return refused, refused
-    plain = replace(
-        path,
-        position_m=distribute_by_distance(path.position_m, misclosure_m, distance),
-        position_variance_m2=None,
-        rotation_variance_rad2=None,
+    plain = path.moved(
+        distribute_by_distance(path.position_m, misclosure_m, distance), path.rotation
     )
     turned = 0.0 if isinstance(heading, Unavailable) else float(np.radians(heading))
     corrected = correct_by_distance(path, distance, misclosure_m, turned)
@@ -203,12 +200,9 @@ def _carried(path: Trajectory, nodes: IntArray, before: Array, after: Array) -> 
         for node in (left, left + 1)
     ]
     weight = np.clip(share, 0.0, 1.0)[:, np.newaxis]
-    return replace(
-        path,
-        position_m=(1.0 - weight) * moved[0] + weight * moved[1],
-        rotation=Slerp(time[nodes], turn)(time) * path.rotation,
-        position_variance_m2=None,
-        rotation_variance_rad2=None,
+    return path.moved(
+        (1.0 - weight) * moved[0] + weight * moved[1],
+        Slerp(time[nodes], turn)(time) * path.rotation,
     )
 
 

@@ -11,7 +11,6 @@ from types import MappingProxyType
 
 import numpy as np
 import pandas as pd
-from scipy.spatial.transform import Rotation
 
 from px4fuse.flight import (
     ANGULAR_RATE_COLUMNS,
@@ -42,6 +41,7 @@ from px4fuse.readers.mavlink_recording import (
     BOOT_CLOCK,
     RECEIPT_CLOCK,
     Recording,
+    quaternions_of_angles,
     settle_clocks,
     unix_of_boot,
     vector,
@@ -153,10 +153,7 @@ def _read_attitude(recording: Recording, remedies: Remedies) -> pd.DataFrame | U
     message, rows = max(found, key=lambda pair: len(pair[1]))
     table = recording.frames.table(message, rows)
     if message == "ATTITUDE":
-        angles = vector(table, "yaw", "pitch", "roll")
-        usable = np.isfinite(angles).all(axis=1)
-        rows, table = rows[usable], table[usable]
-        quaternion = Rotation.from_euler("ZYX", angles[usable]).as_quat(scalar_first=True)
+        quaternion = quaternions_of_angles(table)
     elif message == "ODOMETRY":
         quaternion = table["q"].astype(np.float64)
     else:

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from px4fuse.arrays import Array, IntArray
 from px4fuse.flight import (
@@ -31,7 +30,13 @@ from px4fuse.readers.mavlink_messages import (
     PositionInput,
     Remedies,
 )
-from px4fuse.readers.mavlink_recording import RECEIPT_CLOCK, Address, Recording, vector
+from px4fuse.readers.mavlink_recording import (
+    RECEIPT_CLOCK,
+    Address,
+    Recording,
+    quaternions_of_angles,
+    vector,
+)
 from px4fuse.readers.mavlink_senders import senders_of
 from px4fuse.readers.parts import orientation_of
 from px4fuse.readers.px4_positions import (
@@ -162,13 +167,7 @@ def _orientation(source: PositionInput, table: NDArray[Any], frame: str) -> tupl
     variance = covariance[:, ROTATION_DIAGONAL].astype(np.float64)
     if source.message != "VISION_POSITION_ESTIMATE":
         return table["q"].astype(np.float64), variance
-    angles = vector(table, "yaw", "pitch", "roll")
-    known = np.isfinite(angles).all(axis=1)
-    quaternion = nothing[0]
-    if known.any():
-        turned = Rotation.from_euler("ZYX", angles[known])
-        quaternion[known] = turned.as_quat(scalar_first=True)
-    return quaternion, variance
+    return quaternions_of_angles(table), variance
 
 
 def read_truth(

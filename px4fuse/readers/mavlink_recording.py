@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from px4fuse.arrays import Array, IntArray
 from px4fuse.readers.mavlink_clocks import (
@@ -147,6 +148,16 @@ class Recording:
 def vector(table: NDArray[Any], *fields: str, scale: float = 1.0) -> Array:
     """Fields of a table as columns of float64, shape (n, number of fields)."""
     return np.column_stack([table[name].astype(np.float64) * scale for name in fields])
+
+
+def quaternions_of_angles(table: NDArray[Any]) -> Array:
+    """Fields roll, pitch and yaw (rad) as w, x, y, z, shape (n, 4); NaN where not finite."""
+    angles = vector(table, "yaw", "pitch", "roll")
+    known = np.isfinite(angles).all(axis=1)
+    quaternion = np.full((len(table), 4), np.nan)
+    if known.any():
+        quaternion[known] = Rotation.from_euler("ZYX", angles[known]).as_quat(scalar_first=True)
+    return quaternion
 
 
 def _boot_stamps(frames: Frames, address: Address) -> tuple[IntArray, Array]:

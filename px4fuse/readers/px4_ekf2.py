@@ -64,12 +64,11 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
             f"SYS_MC_EST_GROUP is {parameters['SYS_MC_EST_GROUP']:.0f}: another estimator ran",
             "Set SYS_MC_EST_GROUP to 2.",
         )
-    layout = topics.find(LOCAL_POSITION)
-    if layout is None:
+    local = topics.read(LOCAL_POSITION)
+    if local is None:
         return Unavailable(
             "EKF2", "no topic vehicle_local_position", "Record with SDLOG_PROFILE bit 0 (default)."
         )
-    local = topics.frame(layout)
     state = local[STATE_COLUMNS].dropna()
     if state.empty:
         return Unavailable(
@@ -168,12 +167,10 @@ def target_step_s(topics: Topics) -> float:
 def _step_s(topics: Topics) -> float:
     """Time between two predictions: EKF2 gathers whole IMU samples (ImuDownSampler.cpp)."""
     target = target_step_s(topics)
-    layout = topics.find(IMU)
-    if layout is None:
+    imu = topics.read(IMU)
+    if imu is None or len(imu) < 2:
         return target
-    intervals = np.diff(topics.frame(layout).index.to_numpy())
-    if not len(intervals):
-        return target
+    intervals = np.diff(imu.index.to_numpy())
     interval = float(np.median(intervals))
     return samples_per_step(target, interval) * interval if interval < target else target
 

@@ -21,10 +21,10 @@ NO_SELECTOR: Instances = ((-np.inf, 0),)
 
 def primary_instances(topics: Topics) -> Instances:
     """Primary EKF2 instance from each time on; instance 0 where there is no selector."""
-    layout = topics.find(SELECTOR)
-    if layout is None:
+    status = topics.read(SELECTOR, step=True)
+    if status is None:
         return NO_SELECTOR
-    selected = topics.frame(layout, step=True)["instance"]
+    selected = status["instance"]
     selected = selected[selected < 255]  # 255: none selected yet
     if selected.empty:
         return NO_SELECTOR

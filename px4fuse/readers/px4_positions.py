@@ -259,12 +259,9 @@ def project(
 
 def _local_origin(topics: Topics) -> tuple[float, float, float] | None:
     """EKF2's geographic origin (degrees, degrees, m), where it had one."""
-    layout = topics.find(LOCAL_POSITION)
-    if layout is None:
-        return None
-    local = topics.frame(layout)
+    local = topics.read(LOCAL_POSITION)
     columns = ["ref_lat", "ref_lon", "ref_alt"]
-    if not set(columns) <= set(local.columns):
+    if local is None or not set(columns) <= set(local.columns):
         return None
     origin = finite_rows(local[columns], columns)
     origin = origin[origin["ref_lat"] != 0]
@@ -342,10 +339,8 @@ def read_truth(topics: Topics, positions: tuple[PositionTrack, ...]) -> Truth | 
 
 
 def _true_attitude(topics: Topics) -> pd.DataFrame | None:
-    layout = topics.find(TRUTH_ATTITUDE)
-    if layout is None:
-        return None
-    attitude = orientation_of(topics.frame(layout))
+    logged = topics.read(TRUTH_ATTITUDE)
+    attitude = None if logged is None else orientation_of(logged)
     return None if attitude is None else attitude[QUATERNION_COLUMNS]
 
 

@@ -127,6 +127,11 @@ class Topics:
             return frame
         return self.window(frame)
 
+    def read(self, layouts: tuple[Layout, ...], *, step: bool = False) -> pd.DataFrame | None:
+        """:meth:`frame` of the first layout that this log holds; None where it holds none."""
+        layout = self.find(layouts)
+        return None if layout is None else self.frame(layout, step=step)
+
     def clock(self, topic: str) -> str:
         """Which moment the times of a topic's samples are."""
         measured = any(

@@ -65,10 +65,6 @@ def cross(a: Array, b: Array) -> Array:
 def rotation_matrix(pose: Array) -> Array:
     """Rotation of poses as a matrix.
 
-    Parameters
-    ----------
-    pose : ndarray, shape (..., 3) or (..., 7)
-
     Returns
     -------
     ndarray, shape (..., 2, 2) or (..., 3, 3)
@@ -119,22 +115,12 @@ def compose(a: Array, b: Array) -> Array:
 
 
 def inverse(pose: Array) -> Array:
-    """Poses that undo poses.
-
-    Parameters
-    ----------
-    pose : ndarray, shape (..., 3) or (..., 7)
-    """
+    """Poses that undo poses."""
     return between(pose, identity(pose.shape[-1]))
 
 
 def between(a: Array, b: Array) -> Array:
-    """Poses b as seen from a: the inverse of a, composed with b.
-
-    Parameters
-    ----------
-    a, b : ndarray, shape (..., 3) or (..., 7)
-    """
+    """Poses b as seen from a: the inverse of a, composed with b."""
     made = np.empty(np.broadcast_shapes(a.shape, b.shape))
     if a.shape[-1] == 3:
         c, s = np.cos(a[..., 2]), np.sin(a[..., 2])
@@ -149,16 +135,7 @@ def between(a: Array, b: Array) -> Array:
 
 
 def exp(tangent: Array) -> Array:
-    """Poses that a constant twist reaches in unit time (Barfoot 2017, 7.35; Sola 2018, 156).
-
-    Parameters
-    ----------
-    tangent : ndarray, shape (..., 3) or (..., 6)
-
-    Returns
-    -------
-    ndarray, shape (..., 3) or (..., 7)
-    """
+    """Poses that a constant twist reaches in unit time (Barfoot 2017, 7.35; Sola 2018, 156)."""
     if tangent.shape[-1] == 3:
         theta = tangent[..., 2]
         x, y = tangent[..., 0], tangent[..., 1]
@@ -181,10 +158,6 @@ def log(pose: Array) -> Array:
     ----------
     pose : ndarray, shape (..., 3) or (..., 7)
         Quaternions normalised; q and -q are the same rotation.
-
-    Returns
-    -------
-    ndarray, shape (..., 3) or (..., 6)
     """
     if pose.shape[-1] == 3:
         theta = wrap(pose[..., 2])
@@ -209,10 +182,6 @@ def log(pose: Array) -> Array:
 def adjoint(pose: Array) -> Array:
     """Adjoints: ``X exp(xi) = exp(adjoint(X) xi) X`` (Barfoot 2017, 7.45; Sola 2018, 159).
 
-    Parameters
-    ----------
-    pose : ndarray, shape (..., 3) or (..., 7)
-
     Returns
     -------
     ndarray, shape (..., 3, 3) or (..., 6, 6)
@@ -231,7 +200,7 @@ def adjoint(pose: Array) -> Array:
 
 
 def right_jacobian_inverse(tangent: Array) -> Array:
-    """Inverse of :func:`right_jacobian`: how log(X) changes as X is moved in its own axes.
+    """Inverse of the right Jacobian: how log(X) changes as X is moved in its own axes.
 
     Parameters
     ----------
