@@ -72,7 +72,6 @@ LOGS should be URLs (s3://, gs://), whose package (s3fs, gcsfs) is in the image 
     "timeout_s",
     type=click.FloatRange(min=1.0),
     default=TIMEOUT_S,
-    show_default=True,
     metavar="SECONDS",
     help="Time for one log; what takes longer is ended.",
 )

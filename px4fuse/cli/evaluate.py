@@ -65,7 +65,6 @@ class DeltaType(click.ParamType["Delta"]):
     "--association",
     type=click.Choice(["interpolate", "nearest"]),
     default="interpolate",
-    show_default=True,
     help="Interpolate the reference, or take its nearest pose (as evo does).",
 )
 @click.option(
@@ -80,7 +79,6 @@ class DeltaType(click.ParamType["Delta"]):
     "--time-offset",
     "time_offset_s",
     type=Quantity("s", auto=True),
-    metavar="S|auto",
     help="Added to the estimate's stamps; auto finds it from the motion.  [default: auto where the "
     "two do not overlap]",
 )

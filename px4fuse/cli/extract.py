@@ -38,7 +38,6 @@ MAX_DESCRIPTION_BYTES = 50_000_000
     "kind",
     type=click.Choice(FORMATS),
     default="csv",
-    show_default=True,
     help='Of the tables; Parquet needs pip install "px4fuse[parquet]".',
 )
 @recording_options

@@ -53,8 +53,6 @@ _ANALYSIS = _together(
         "sigma_a_m_s2",
         type=Quantity("m/s²", 0.5),
         default=0.5,
-        show_default=True,
-        metavar="M/S²",
         help="Process noise SIGMA_A, 0.0001 to 100.",
     ),
     click.option(
@@ -62,8 +60,6 @@ _ANALYSIS = _together(
         "sigma_z_m",
         type=Quantity("m"),
         default=0.10,
-        show_default=True,
-        metavar="M",
         help="Measurement noise SIGMA_Z, 0.0001 to 100.",
     ),
     click.option(
@@ -71,8 +67,6 @@ _ANALYSIS = _together(
         "dt_s",
         type=Quantity("s"),
         default=0.1,
-        show_default=True,
-        metavar="S",
         help="Prediction step DT, 0.001 to 1; Q is proportional to it.",
     ),
     click.option(
@@ -91,19 +85,15 @@ _ANALYSIS = _together(
         "--heading",
         "heading_deg",
         type=Quantity("°", 30.0),
-        metavar="DEG",
         help="Heading of the aisle, clockwise from north.  [default: from the track]",
     ),
     click.option(
         "--start",
         "start_s",
         type=Quantity("s", 20.0),
-        metavar="S",
         help="Start, seconds from the first data.  [default: take-off]",
     ),
-    click.option(
-        "--end", "end_s", type=Quantity("s", 60.0), metavar="S", help="End.  [default: touch-down]"
-    ),
+    click.option("--end", "end_s", type=Quantity("s", 60.0), help="End.  [default: touch-down]"),
     click.option(
         "--position-source",
         metavar="NAME",
@@ -155,7 +145,6 @@ _POSITION = _together(
     click.option(
         "--position-yaw",
         type=Quantity("°", 30.0, auto=True),
-        metavar="DEG|auto",
         help="Turn it clockwise, seen from above; auto finds yaw and origin.  [default: 0]",
     ),
     click.option(
@@ -187,7 +176,6 @@ clock_offset_option = click.option(
     "--clock-offset",
     "clock_offset_s",
     type=Quantity("s", auto=True),
-    metavar="S|auto",
     help="Added to the position source's time stamps; auto estimates it.  [default: 0; auto with "
     "--position]",
 )
@@ -199,10 +187,8 @@ json_option = path_option(
 )
 #: Whose report it is
 person_options = _together(
-    click.option("--student", default="", metavar="NAME", help="Name on the report."),
-    click.option(
-        "--id", "student_id", default="", metavar="ID", help="Student number on the report."
-    ),
+    click.option("--student", metavar="NAME", help="Name on the report."),
+    click.option("--id", "student_id", metavar="ID", help="Student number on the report."),
     path_option("--notes", metavar="FILE.md", help="Your own words, printed in the report."),
 )
 #: Of commands whose results stand beside a report
@@ -276,7 +262,7 @@ def read_person(given: dict[str, Any]) -> Student:
     """
     from px4fuse.results.model import Student
 
-    name, number = given.pop("student"), given.pop("student_id")
+    name, number = given.pop("student") or "", given.pop("student_id") or ""
     person = Student(encodable(name), encodable(number), _read_notes(given.pop("notes")))
     _tell_fonts(person.name + person.id + person.notes)
     return person

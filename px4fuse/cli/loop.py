@@ -74,13 +74,10 @@ class FrameType(click.Choice[str]):
     "--from",
     "start_s",
     type=Quantity("s", 20.0),
-    metavar="S",
     help="Start of the loop: seconds from the first data, or a trajectory's own stamps.  "
     "[default: take-off]",
 )
-@click.option(
-    "--to", "end_s", type=Quantity("s", 60.0), metavar="S", help="End.  [default: landing]"
-)
+@click.option("--to", "end_s", type=Quantity("s", 60.0), help="End.  [default: landing]")
 @click.option(
     "--landed-at",
     type=LandingType(),
@@ -106,8 +103,6 @@ class FrameType(click.Choice[str]):
     "position_drift_m",
     type=Quantity("m", 1.0),
     default=1.0,
-    show_default=True,
-    metavar="M",
     help="Standard deviation of the odometry's position after 100 m.",
 )
 @click.option(
@@ -115,15 +110,12 @@ class FrameType(click.Choice[str]):
     "heading_drift_deg",
     type=Quantity("°", 3.0),
     default=3.0,
-    show_default=True,
-    metavar="DEG",
     help="Standard deviation of its heading after 100 m.",
 )
 @click.option(
     "--key-frames",
     "key_frames_m",
     type=Quantity("m", 0.2),
-    metavar="M",
     help="Distance between key frames.  [default: a fiftieth of the extent, 0.02 to 0.5]",
 )
 @click.option(

@@ -72,6 +72,12 @@ class Quantity(click.ParamType["float | str"]):
     ) -> None:
         self.unit, self.example, self.auto, self.between = unit, example, auto, between
 
+    def get_metavar(self, param: click.Parameter, ctx: click.Context | None = None) -> str:
+        """Its unit, as the help shows what to type."""
+        del param, ctx
+        unit = "DEG" if self.unit == "°" else self.unit.upper()
+        return f"{unit}|auto" if self.auto else unit
+
     def convert(
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
     ) -> float | str:

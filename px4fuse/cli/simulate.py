@@ -42,7 +42,7 @@ def _scenario_option(
     default = getattr(_DEFAULT, field)
     between = (0.0, 360.0) if unit == "°" else None
     kind = float if unit is None else Quantity(unit, default, between=between)
-    return click.option(name, field, type=kind, default=default, show_default=True, **details)
+    return click.option(name, field, type=kind, default=default, **details)
 
 
 class WithMistakes(click.Command):
@@ -104,7 +104,6 @@ class WithMistakes(click.Command):
     "--kind",
     type=click.Choice((*KINDS, MIXED)),
     default=_DEFAULT.kind,
-    show_default=True,
     help="Passes along an aisle with UWB, or laps around a square with drifting VIO. With "
     "--assignment mixed: a loop for a third of the class, the aisle for the others.",
 )
@@ -112,7 +111,6 @@ class WithMistakes(click.Command):
     "--seed",
     type=int,
     default=_DEFAULT.seed,
-    show_default=True,
     metavar="N",
     help="A number per student gives everyone a flight of their own; the same number the same.",
 )
@@ -135,16 +133,10 @@ class WithMistakes(click.Command):
 @click.option(
     "--passes", type=int, metavar="N", help="Passes of the aisle [6], or laps of the loop [1]."
 )
+@_scenario_option("--length", "length_m", "m", help="Of the aisle, or of a side of the square.")
+@_scenario_option("--speed", "speed_m_s", "m/s")
 @_scenario_option(
-    "--length", "length_m", "m", metavar="M", help="Of the aisle, or of a side of the square."
-)
-@_scenario_option("--speed", "speed_m_s", "m/s", metavar="M/S")
-@_scenario_option(
-    "--heading",
-    "heading_deg",
-    "°",
-    metavar="DEG",
-    help="Of the aisle or of the first side, clockwise from north.",
+    "--heading", "heading_deg", "°", help="Of the aisle or of the first side, clockwise from north."
 )
 @click.option(
     "--yaw",
@@ -152,25 +144,19 @@ class WithMistakes(click.Command):
     help="Whether the nose stays or follows the flight.  [default: fixed; follow in a loop]",
 )
 @_scenario_option(
-    "--sigma-uwb",
-    "sigma_uwb_m",
-    "m",
-    metavar="M",
-    help="White noise of the UWB, per axis: the true SIGMA_Z.",
+    "--sigma-uwb", "sigma_uwb_m", "m", help="White noise of the UWB, per axis: the true SIGMA_Z."
 )
-@_scenario_option("--uwb-rate", "uwb_rate_hz", "Hz", metavar="HZ")
+@_scenario_option("--uwb-rate", "uwb_rate_hz", "Hz")
 @_scenario_option(
     "--sigma-a",
     "sigma_a_m_s2",
     "m/s²",
-    metavar="M/S²",
     help="White noise of the accelerometer's mean over 0.1 s: the true SIGMA_A.",
 )
 @_scenario_option(
     "--accel-bias-sigma",
     "accel_bias_sigma_m_s2",
     "m/s²",
-    metavar="M/S²",
     help="Width from which the accelerometer's constant bias is drawn.",
 )
 @_scenario_option(
