@@ -156,9 +156,8 @@ def observed_directions(information: Array) -> tuple[Array, Array]:
     variance : ndarray, shape (k,)
         ``information == directions @ diag(1 / variance) @ directions.T``.
     """
-    scale = np.sqrt(np.clip(np.diag(information), 0.0, None))
-    inverse_scale = np.divide(1.0, scale, out=np.zeros_like(scale), where=scale > 0.0)
-    values, vectors = np.linalg.eigh(information * np.outer(inverse_scale, inverse_scale))
+    scale, scaled = _scaled(information)
+    values, vectors = np.linalg.eigh(scaled)
     seen = values > OBSERVED
     return scale[:, None] * vectors[:, seen], 1.0 / values[seen]
 
@@ -174,11 +173,15 @@ def ranks(information: Array) -> IntArray:
     -------
     ndarray of int, shape (m,)
     """
-    scale = np.sqrt(np.clip(np.diagonal(information, axis1=1, axis2=2), 0.0, None))
-    inverse_scale = np.divide(1.0, scale, out=np.zeros_like(scale), where=scale > 0.0)
-    scaled = information * inverse_scale[:, :, None] * inverse_scale[:, None, :]
-    made: IntArray = np.sum(np.linalg.eigvalsh(scaled) > OBSERVED, axis=1)
+    made: IntArray = np.sum(np.linalg.eigvalsh(_scaled(information)[1]) > OBSERVED, axis=1)
     return made
+
+
+def _scaled(information: Array) -> tuple[Array, Array]:
+    """Roots of the diagonals of matrices, and the matrices divided by them; what is 0 stays 0."""
+    scale = np.sqrt(np.clip(np.diagonal(information, axis1=-2, axis2=-1), 0.0, None))
+    inverse = np.divide(1.0, scale, out=np.zeros_like(scale), where=scale > 0.0)
+    return scale, information * (inverse[..., :, None] * inverse[..., None, :])
 
 
 def require_connected(graph: PoseGraph, used: BoolArray, what: str) -> None:
