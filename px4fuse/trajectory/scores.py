@@ -221,7 +221,6 @@ def relative_error(
     *,
     all_pairs: bool = True,
     pairs_from: Side = "reference",
-    relative_tolerance: float = RELATIVE_TOLERANCE,
 ) -> RelativeError:
     """RPE over one delta: E = (Q_i⁻¹ Q_j)⁻¹ (P_i⁻¹ P_j), Sturm (2012), eq. 1.
 
@@ -236,13 +235,7 @@ def relative_error(
         Whose path and times the delta is measured in.
     """
     source = reference if pairs_from == "reference" else aligned
-    start, end = pairs(
-        source.position_m,
-        source.time_s,
-        delta,
-        all_pairs=all_pairs,
-        relative_tolerance=relative_tolerance,
-    )
+    start, end = pairs(source.position_m, source.time_s, delta, all_pairs=all_pairs)
     what = f"RPE over {delta}"
     both = rotations_of(aligned, reference, what)
     if not isinstance(both, Unavailable) and not len(start):
@@ -287,9 +280,7 @@ def rotations_of(
     )
 
 
-def rmse_interval(
-    errors: Array, what: str, *, min_block: int = 1, seed: int = SEED, resamples: int = RESAMPLES
-) -> Interval | Unavailable:
+def rmse_interval(errors: Array, what: str, *, min_block: int = 1) -> Interval | Unavailable:
     """95 % interval of the RMSE of correlated errors: circular block bootstrap.
 
     Politis & Romano (1992), blocks of three integrated autocorrelation times of the squared errors.
@@ -323,7 +314,7 @@ def rmse_interval(
     sums = np.concatenate(([0.0], np.cumsum(np.concatenate((squares, squares[: length - 1])))))
     block_means = (sums[length:] - sums[:-length]) / length  # one for each start, round the end
     blocks = n / length
-    drawn = np.random.default_rng(seed).integers(0, n, (resamples, round(blocks)))
+    drawn = np.random.default_rng(SEED).integers(0, n, (RESAMPLES, round(blocks)))
     means = block_means[drawn].mean(axis=1)
     quantile = float(stdtrit(blocks - 1.0, 0.5 + LEVEL / 2.0))
     tail = float(ndtr(-quantile * np.sqrt(blocks / (blocks - 1.0))))
