@@ -240,8 +240,7 @@ def _part(
     stream = flight.streams.get(key)
     topics = () if stream is None else stream.topics
     if isinstance(data, pd.DataFrame):
-        limit_s = _gap_limit(data) if key != "imu" else _imu_gap_limit(data)
-        counted = _counted(data, limit_s)
+        counted = _counted(data, _gap_limit(data, of_imu=key == "imu"))
     else:
         counted = {"start_s": data[0][0], "end_s": data[-1][1]} if data else {}
     return Source(
@@ -272,13 +271,9 @@ def _counted(frame: pd.DataFrame, limit_s: float | None) -> dict[str, Any]:
     return counted
 
 
-def _gap_limit(frame: pd.DataFrame) -> float | None:
+def _gap_limit(frame: pd.DataFrame, *, of_imu: bool = False) -> float | None:
     if len(frame) < 2:
         return None
+    if of_imu:
+        return max(IMU_GAP_S, IMU_GAP_INTERVALS * float(np.median(np.diff(frame.index.to_numpy()))))
     return max(GAP.value, GAP_INTERVALS.value / sample_rate(frame))
-
-
-def _imu_gap_limit(frame: pd.DataFrame) -> float | None:
-    if len(frame) < 2:
-        return None
-    return max(IMU_GAP_S, IMU_GAP_INTERVALS * float(np.median(np.diff(frame.index.to_numpy()))))

@@ -56,7 +56,7 @@ def analyse(
     reference : Trajectory, optional
         Scored against, besides the truth in the log.
     spacing_m : float, optional
-        Between key frames.
+        Between key frames; by default a fiftieth of the extent, 0.02 to 0.5 m.
 
     Raises
     ------

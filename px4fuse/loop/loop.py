@@ -186,18 +186,13 @@ def close_loop(
         the odometry has it within 15° of that.
     came_back : bool
         False where only the closures given are to be used.
-    closures : tuple of Closure
-        Further ones.
-    noise : OdometryNoise, optional
+    closures, noise, spacing_m, progress
+        As :func:`px4fuse.loop.analysis.analyse` takes them, times in the trajectory's own.
     references : tuple of Trajectory
         What the paths are scored against: the truth, or a SLAM system's trajectory.
-    spacing_m : float, optional
-        Between key frames; by default a fiftieth of the extent, 0.02 to 0.5 m.
     at_rest : bool
         Whether the vehicle stands before the part and after it, so that its poses there may be
         averaged.
-    progress : callable
-        Told what is being done.
 
     Raises
     ------

@@ -137,13 +137,17 @@ def _trajectory(
         if inside.sum() >= MIN_POSES:
             position = position[inside]
             variance = None if variance is None else variance[inside]
-            rotation = _slerp(orientation, position.index.to_numpy())
-            rotation_variance = _at(orientation, position.index.to_numpy())
+            times = position.index.to_numpy()
+            quaternions = orientation[QUATERNION_COLUMNS].to_numpy(copy=True)
+            known = Rotation.from_quat(quaternions, scalar_first=True)
+            rotation = Slerp(orientation.index.to_numpy(), known)(times)
+            rotation_variance = _at(orientation, times)
     if len(position) < MIN_POSES:
         raise MissingDataError(
             f"{flight.log.name}:{part}: {len(position)} poses are too few (at least {MIN_POSES})."
         )
-    known = variance is not None and not variance.isna().to_numpy().any()
+    if variance is not None and variance.isna().to_numpy().any():
+        variance = None
     return Trajectory(
         name=f"{flight.log.name}:{part}",
         kind=part,
@@ -152,20 +156,12 @@ def _trajectory(
         rotation=rotation,
         frame=frame,
         unix_offset_s=flight.log.start_unix_s,
-        position_variance_m2=variance.to_numpy(np.float64) if known and variance is not None
-        else None,
+        position_variance_m2=None if variance is None else variance.to_numpy(np.float64),
         rotation_variance_rad2=rotation_variance,
         sha256=flight.log.sha256,
         size_bytes=flight.log.size_bytes,
         notes=notes,
-    )  # fmt: skip
-
-
-def _slerp(orientation: pd.DataFrame, times: Array) -> Rotation:
-    quaternions = orientation[QUATERNION_COLUMNS].to_numpy(copy=True)
-    rotations = Rotation.from_quat(quaternions, scalar_first=True)
-    turned: Rotation = Slerp(orientation.index.to_numpy(), rotations)(times)
-    return turned
+    )
 
 
 def _at(orientation: pd.DataFrame, times: Array) -> Array | None:

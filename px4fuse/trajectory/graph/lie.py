@@ -128,7 +128,7 @@ def between(a: Array, b: Array) -> Array:
         made[..., 0], made[..., 1] = c * x + s * y, c * y - s * x
         made[..., 2] = b[..., 2] - a[..., 2]
         return made
-    back = _conjugate(a[..., 3:])
+    back = a[..., 3:] * np.array([-1.0, -1.0, -1.0, 1.0])
     made[..., :3] = _rotate(back, b[..., :3] - a[..., :3])
     made[..., 3:] = _multiply(back, b[..., 3:])
     return made
@@ -139,7 +139,7 @@ def exp(tangent: Array) -> Array:
     if tangent.shape[-1] == 3:
         theta = tangent[..., 2]
         x, y = tangent[..., 0], tangent[..., 1]
-        s, c = np.sinc(theta / np.pi), _versine(theta)
+        s, c = np.sinc(theta / np.pi), theta * _a(theta)
         return np.stack([s * x - c * y, c * x + s * y, theta], axis=-1)
     rho, phi = tangent[..., :3], tangent[..., 3:]
     theta = np.linalg.norm(phi, axis=-1)[..., None]
@@ -281,11 +281,6 @@ def _plane_column(tangent: Array) -> Array:
     return np.stack([even * x - odd * y, odd * x + even * y], axis=-1)
 
 
-def _conjugate(quaternion: Array) -> Array:
-    made: Array = quaternion * np.array([-1.0, -1.0, -1.0, 1.0])
-    return made
-
-
 def _rotate(quaternion: Array, vector: Array) -> Array:
     axis = quaternion[..., :3]
     twice = 2.0 * cross(axis, vector)
@@ -299,11 +294,6 @@ def _multiply(a: Array, b: Array) -> Array:
     made[..., :3] = s * v + t * u + cross(u, v)
     made[..., 3] = a[..., 3] * b[..., 3] - np.sum(u * v, axis=-1)
     return made
-
-
-def _versine(theta: Array) -> Array:
-    """(1 - cos theta) / theta, which has the sign of theta."""
-    return theta * _a(theta)
 
 
 def _a(theta: Array) -> Array:
