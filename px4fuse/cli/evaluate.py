@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from px4fuse.cli.inputs import max_size_option, path_option, system_option
-from px4fuse.cli.outputs import free_report, progress, report_paths, terminal, write_outputs
+from px4fuse.cli.outputs import finish, free_report, progress, report_paths
 from px4fuse.cli.quantity import Quantity
 from px4fuse.errors import OutputError, SettingsError
 from px4fuse.request import EVALUATION_OPTIONS, EvaluationRequest, command_line, settings_name
@@ -178,15 +178,7 @@ def evaluate(
     for path in (beside, json_path):
         if path is not None:
             contents[path] = text.encode()
-    write_outputs(contents)
-    if alone:
-        return
-    from px4fuse.report.screen import print_file
-
-    console = terminal()
-    print_evaluation(console, found)
-    for path in contents:
-        print_file(console, "Wrote", path)
+    finish(contents, lambda console: print_evaluation(console, found), alone=alone)
 
 
 def _default(estimate: Path, reference: Path, settings: str, mine: EvaluationResults) -> Path:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
@@ -16,7 +15,7 @@ from px4fuse.cli.inputs import (
     read_person,
     system_option,
 )
-from px4fuse.cli.outputs import progress, report_paths, spare_inputs, terminal, write_outputs
+from px4fuse.cli.outputs import finish, progress, report_paths, spare_inputs
 from px4fuse.cli.quantity import Quantity
 from px4fuse.errors import SettingsError
 from px4fuse.reading import shown
@@ -24,9 +23,6 @@ from px4fuse.request import FrameName, Landing
 from px4fuse.writing import STANDARD_OUTPUT
 
 if TYPE_CHECKING:
-    from msgspec import Struct
-    from rich.console import Console
-
     from px4fuse.loop.loop import Loop
     from px4fuse.request import LoopRequest
 
@@ -166,7 +162,8 @@ def loop(
         return
     request = loop_request(source, given)
     _spare(tum, g2o, *((json_path,) if output is None else report_paths(output, json_path)))
-    with progress(json_path == STANDARD_OUTPUT, STEPS) as step:
+    alone = json_path == STANDARD_OUTPUT
+    with progress(alone, STEPS) as step:
         found = run_loop(request, step)
         findings = find_loop(found)
         command = command_line(request)
@@ -180,10 +177,9 @@ def loop(
             text = to_json(results)
             document = LoopDocument(found, findings, person, command)
             contents |= {pdf: render(document, text), beside: text.encode()}
-            json_path = json_path if json_path == STANDARD_OUTPUT else None
-    _finish(
-        results, json_path, contents, lambda console: print_loop(console, found, findings, request)
-    )
+    if json_path is not None and (alone or output is None):
+        contents[json_path] = to_json(results).encode()
+    finish(contents, lambda console: print_loop(console, found, findings, request), alone=alone)
 
 
 def loop_request(source: Path, given: dict[str, Any]) -> LoopRequest:
@@ -238,6 +234,7 @@ def _solve(source: Path, json_path: Path | None, g2o: Path | None, robust: bool 
     from px4fuse.report.loop_terminal import print_graph
     from px4fuse.request import LoopRequest, command_line
     from px4fuse.results.build_trajectories import graph_results
+    from px4fuse.results.contract import to_json
     from px4fuse.trajectory.graph.analysis import analyse_graph
 
     path, part = split_part(str(source))
@@ -252,32 +249,13 @@ def _solve(source: Path, json_path: Path | None, g2o: Path | None, robust: bool 
                 "pose graph. With one, give only --g2o FILE and --json FILE."
             )
     _spare(json_path, g2o)
-    with progress(json_path == STANDARD_OUTPUT) as step:
+    alone = json_path == STANDARD_OUTPUT
+    with progress(alone) as step:
         step(f"reading {shown(source)}")
         solved = analyse_graph(read_g2o(path), step, robust=robust)
     command = command_line(LoopRequest(source=str(source))) + (" --robust" if robust else "")
     results = graph_results(shown(source), solved, command)
     contents = {} if g2o is None else {g2o: g2o_text(solved.graph).encode()}
-    _finish(results, json_path, contents, lambda to: print_graph(to, shown(source), solved))
-
-
-def _finish(
-    results: Struct,
-    json_path: Path | None,
-    contents: dict[Path, bytes],
-    show: Callable[[Console], None],
-) -> None:
-    """Write all outputs or none; print the results alone, or what was found and written."""
-    from px4fuse.report.screen import print_file
-    from px4fuse.results.contract import to_json
-
     if json_path is not None:
-        contents = {**contents, json_path: to_json(results).encode()}
-    if contents:
-        write_outputs(contents)
-    if json_path == STANDARD_OUTPUT:
-        return
-    console = terminal()
-    show(console)
-    for path in contents:
-        print_file(console, "Wrote", path)
+        contents[json_path] = to_json(results).encode()
+    finish(contents, lambda to: print_graph(to, shown(source), solved), alone=alone)

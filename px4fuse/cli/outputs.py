@@ -85,20 +85,15 @@ def progress(quiet: bool = False, steps: Sequence[str] = ()) -> Iterator[Step]:
         TimeRemainingColumn,
     )
 
-    def silent(what: str, done: int = 0, of: int | None = None) -> None:
-        del what, done, of
-
     console = Console(stderr=True)
-    if not console.is_terminal or quiet:
-        yield silent
-        return
     columns = (
         SpinnerColumn(), TextColumn("{task.description}", markup=False), BarColumn(),
         TextColumn("{task.fields[count]}"), TimeElapsedColumn(),
         # of work that is counted; steps are not equally long
         *(() if steps else (TextColumn("of which left"), TimeRemainingColumn())),
     )  # fmt: skip
-    with Progress(*columns, console=console, transient=True) as bar:
+    hidden = quiet or not console.is_terminal
+    with Progress(*columns, console=console, transient=True, disable=hidden) as bar:
         task = bar.add_task("starting", total=len(steps) or None, count="")
         at = 0
 
@@ -229,6 +224,22 @@ def spare_inputs(targets: Iterable[Path]) -> None:
                     f"{target}: is what this command reads; it was not overwritten. Give another "
                     "name for the output."
                 )
+
+
+def finish(contents: Mapping[Path, bytes], show: Callable[[Console], None], *, alone: bool) -> None:
+    """Write all outputs or none; then tell people what was found and written.
+
+    Nothing is told where the results have standard output ``alone``.
+    """
+    from px4fuse.report.screen import print_file
+
+    if contents:
+        write_outputs(contents)
+    if not alone:
+        console = terminal()
+        show(console)
+        for path in contents:
+            print_file(console, "Wrote", path)
 
 
 def terminal() -> Console:

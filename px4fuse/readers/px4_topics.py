@@ -43,8 +43,8 @@ class Layout:
     optional: Mapping[str, str] = field(default_factory=dict)
 
 
-def _vector(names: list[str], px4_field: str, first: int = 0) -> dict[str, str]:
-    return {name: f"{px4_field}[{first + i}]" for i, name in enumerate(names)}
+def _vector(names: list[str], px4_field: str) -> dict[str, str]:
+    return {name: f"{px4_field}[{i}]" for i, name in enumerate(names)}
 
 
 _XYZ = dict(zip(POSITION_COLUMNS, "xyz", strict=True))
