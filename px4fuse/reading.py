@@ -92,7 +92,7 @@ def read_whole(
     smaller : str
         What to do where it is too large.
     again : str, optional
-        What to do where it is empty; without it an empty file is welcome.
+        What to do where it is empty; without it an empty file is read as it is.
 
     Raises
     ------

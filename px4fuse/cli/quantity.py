@@ -30,7 +30,7 @@ _TYPED = re.compile(r"([-+]?[\d.,]+(?:e[-+]?\d+)?)\s*(\S*)", re.IGNORECASE)
 
 
 def in_unit(typed: str, unit: str) -> float | None:
-    """What a number with a unit or with a comma is in one of ours; None where it is none.
+    """A number typed with a unit or a comma, in one of our units; None where it is not one.
 
     >>> in_unit("10cm", "m"), in_unit("0,5", "s"), in_unit("10 apples", "m")
     (0.1, 0.5, None)

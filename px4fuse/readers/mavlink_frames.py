@@ -262,8 +262,8 @@ def _scan(content: bytes) -> tuple[Integers, Integers]:
 def _without_overlap(start: Integers, end: Integers, stamp: int) -> tuple[Integers, Integers]:
     """Frames that do not overlap; those that touch a neighbour go before those that do not.
 
-    One frame may lie in another one's payload (a tunnel), and chance makes a few of bytes that
-    are none, which must not hide the true ones below them.
+    One frame may lie in another one's payload (a tunnel), and by chance a few other bytes look
+    like frames, which must not hide the true ones below them.
     """
     if not np.any(start[1:] < end[:-1]):
         return start, end

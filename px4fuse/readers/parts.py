@@ -64,14 +64,14 @@ def finite_rows(samples: pd.DataFrame, columns: list[str]) -> pd.DataFrame:
 
 
 def orientation_of(samples: pd.DataFrame) -> pd.DataFrame | None:
-    """Orientations in a frame of samples; None where there are none, or only one and the same.
+    """Orientations in a frame of samples; None where there are none, or all are the same.
 
     Parameters
     ----------
     samples : DataFrame
         With the columns ``w, x, y, z`` where the sender gave quaternions, and perhaps
-        ``forward_rad2, right_rad2, down_rad2``. A quaternion of norm 0 is none, and so is a
-        variance of 0 (``EKF2.cpp``).
+        ``forward_rad2, right_rad2, down_rad2``. A quaternion of norm 0 and a variance of 0
+        mean "not given" (``EKF2.cpp``).
     """
     if not set(QUATERNION_COLUMNS) <= set(samples.columns):
         return None

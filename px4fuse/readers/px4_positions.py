@@ -56,7 +56,7 @@ AUTOPILOT_CLOCK = "autopilot boot clock (as PX4 mapped the sender's stamp)"
 def read_positions(
     topics: Topics, ekf2: Ekf2 | Unavailable
 ) -> tuple[tuple[PositionTrack, ...], tuple[Unavailable, ...]]:
-    """Every external position track found, best rung first, and what was looked for in vain."""
+    """Every external position track found, best rung first, and what was looked for and not found."""
     instances = NO_SELECTOR if isinstance(ekf2, Unavailable) else ekf2.instances
     candidates = [_read_logged(topics, source, instances) for source in TRACKS]
     candidates.append(_read_aid_observation(topics, instances))
@@ -87,7 +87,7 @@ def _unavailable(name: str, reason: str) -> Unavailable:
 def clean_positions(samples: pd.DataFrame, axes: list[str]) -> pd.DataFrame:
     """Positions and variances, without the rows that lack one of ``axes``.
 
-    A variance of 0 is none, as PX4 reads it (``EKF2.cpp``); it becomes NaN.
+    A variance of 0 becomes NaN: PX4 reads it as not given (``EKF2.cpp``).
     """
     found = finite_rows(samples.reindex(columns=POSITION_COLUMNS + POSITION_VARIANCE_COLUMNS), axes)
     given = found[POSITION_VARIANCE_COLUMNS]
@@ -95,7 +95,7 @@ def clean_positions(samples: pd.DataFrame, axes: list[str]) -> pd.DataFrame:
 
 
 def _finished(track: PositionTrack, axes: list[str]) -> PositionTrack | Unavailable:
-    """Drop samples without a position; a track that is too short is none."""
+    """Drop samples without a position, and the track where it is then too short."""
     samples = clean_positions(track.samples, axes)
     if len(samples) < MIN_TRACK_SAMPLES:
         return _unavailable(track.name, f"{len(samples)} finite samples are too few")

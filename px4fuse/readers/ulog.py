@@ -46,7 +46,7 @@ from px4fuse.readers.ulog_topics import (
 )
 from px4fuse.recording import Stream, Unused
 
-# A receiver's UTC outside these is none: PX4's own GPS_EPOCH_SECS (gps_helper.h), and 2100
+# A receiver's UTC outside these is not valid: PX4's own GPS_EPOCH_SECS (gps_helper.h), and 2100
 UTC_RANGE_S = (1_234_567_890.0, 4_102_444_800.0)
 
 

@@ -228,7 +228,7 @@ def read_topics(path: Path) -> Topics:
     name, content = shown(path), read_log_bytes(path)
     chatter = io.StringIO()
     try:
-        with contextlib.redirect_stdout(chatter):  # pyulog prints what it stumbles over
+        with contextlib.redirect_stdout(chatter):  # pyulog prints its warnings
             ulog = ULog(_handle(content), message_name_filter_list=topics())
             tables = _tables(ulog)
             # a log of other topics can still be placed in time, by all that it holds
@@ -329,7 +329,7 @@ def _listed(names: list[str]) -> str:
 
 
 def _text(info: dict[str, Any], key: str, otherwise: str) -> str:
-    """One of the log's own words about itself, without what a terminal would obey."""
+    """A text from the log, without a terminal's control characters."""
     text = str(info.get(key, otherwise))
     return "".join(c for c in text if c.isprintable()) or otherwise
 

@@ -173,7 +173,7 @@ def _standing(
 ) -> tuple[Array, Array]:
     """State and covariance when the log begins: PX4's initial ones, told that it stands still.
 
-    Standing still, specific force is -g and rotation is nought, up to the biases; the first levels
+    Standing still, specific force is -g and rotation is zero, up to the biases; the first levels
     the attitude and ties tilt to accelerometer bias.
     """
     H = np.zeros((9, STATES))

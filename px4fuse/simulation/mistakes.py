@@ -83,7 +83,7 @@ class Mistake:
     Attributes
     ----------
     arguments : tuple of Argument
-        The first is the mistake's size, the others may be left out; none for a mere yes.
+        The first is the mistake's size, the others may be left out; empty for a switch.
     default : float
         Size where none is given.
     help : str

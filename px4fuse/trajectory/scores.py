@@ -1,6 +1,6 @@
 """What the scores of a trajectory are made of: statistics, pairs of poses, RPE, intervals.
 
-Errors are correlated from pose to pose, hence intervals by a bootstrap over blocks.
+Errors are correlated from pose to pose, so intervals are by a bootstrap over blocks.
 """
 
 from __future__ import annotations

@@ -62,7 +62,7 @@ def analyse_graph(
     Raises
     ------
     TrajectoryError
-        The graph does not hang together.
+        The graph is not connected.
     """
     closures = ~graph.successive
     progress(f"solving: {SOLUTIONS['all']}")
