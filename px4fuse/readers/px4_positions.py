@@ -56,7 +56,7 @@ AUTOPILOT_CLOCK = "autopilot boot clock (as PX4 mapped the sender's stamp)"
 def read_positions(
     topics: Topics, ekf2: Ekf2 | Unavailable
 ) -> tuple[tuple[PositionTrack, ...], tuple[Unavailable, ...]]:
-    """Every external position track found, best rung first, and what was looked for and not found."""
+    """Every external position track, best rung first, and what was looked for and not found."""
     instances = NO_SELECTOR if isinstance(ekf2, Unavailable) else ekf2.instances
     candidates = [_read_logged(topics, source, instances) for source in TRACKS]
     candidates.append(_read_aid_observation(topics, instances))

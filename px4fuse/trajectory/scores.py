@@ -280,7 +280,9 @@ def rotations_of(
     )
 
 
-def rmse_interval(errors: Array, what: str, *, min_block: int = 1) -> Interval | Unavailable:
+def rmse_interval(
+    errors: Array, what: str, *, min_block: int = 1, resamples: int = RESAMPLES
+) -> Interval | Unavailable:
     """95 % interval of the RMSE of correlated errors: circular block bootstrap.
 
     Politis & Romano (1992), blocks of three integrated autocorrelation times of the squared errors.
@@ -314,7 +316,7 @@ def rmse_interval(errors: Array, what: str, *, min_block: int = 1) -> Interval |
     sums = np.concatenate(([0.0], np.cumsum(np.concatenate((squares, squares[: length - 1])))))
     block_means = (sums[length:] - sums[:-length]) / length  # one for each start, round the end
     blocks = n / length
-    drawn = np.random.default_rng(SEED).integers(0, n, (RESAMPLES, round(blocks)))
+    drawn = np.random.default_rng(SEED).integers(0, n, (resamples, round(blocks)))
     means = block_means[drawn].mean(axis=1)
     quantile = float(stdtrit(blocks - 1.0, 0.5 + LEVEL / 2.0))
     tail = float(ndtr(-quantile * np.sqrt(blocks / (blocks - 1.0))))
