@@ -85,15 +85,20 @@ def progress(quiet: bool = False, steps: Sequence[str] = ()) -> Iterator[Step]:
         TimeRemainingColumn,
     )
 
+    def silent(what: str, done: int = 0, of: int | None = None) -> None:
+        del what, done, of
+
     console = Console(stderr=True)
+    if not console.is_terminal or quiet:  # where rich before 14 would print an empty line
+        yield silent
+        return
     columns = (
         SpinnerColumn(), TextColumn("{task.description}", markup=False), BarColumn(),
         TextColumn("{task.fields[count]}"), TimeElapsedColumn(),
         # of work that is counted; steps are not equally long
         *(() if steps else (TextColumn("of which left"), TimeRemainingColumn())),
     )  # fmt: skip
-    hidden = quiet or not console.is_terminal
-    with Progress(*columns, console=console, transient=True, disable=hidden) as bar:
+    with Progress(*columns, console=console, transient=True) as bar:
         task = bar.add_task("starting", total=len(steps) or None, count="")
         at = 0
 
