@@ -89,7 +89,7 @@ def progress(quiet: bool = False, steps: Sequence[str] = ()) -> Iterator[Step]:
         del what, done, of
 
     console = Console(stderr=True)
-    if not console.is_terminal or quiet:  # where rich before 14 would print an empty line
+    if not console.is_terminal or quiet:  # an older rich ends a disabled bar with an empty line
         yield silent
         return
     columns = (
