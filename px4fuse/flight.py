@@ -1,10 +1,10 @@
 """The data model: what every reader makes and everything else takes.
 
-Times are float seconds on the autopilot's boot clock, counted from the first sample of data
-(:attr:`LogInfo.boot_time_s` is that sample's own boot time), and they are times of *measurement*,
-not of publication. Vectors are NED (north, east, down) in m, m/s and m/s², or body FRD (forward,
-right, down) where said. Time series are pandas frames whose index is time in seconds, named
-``time_s``; every column's unit stands in its name or in the field's description.
+Times are float seconds on the autopilot's boot clock, counted from the first sample of data (whose
+own boot time is ``boot_time_s`` of the log), and they are times of *measurement*, not of
+publication. Vectors are NED (north, east, down) in m, m/s and m/s², or body FRD (forward, right,
+down) where said. Time series are pandas frames whose index is time in seconds, named ``time_s``;
+every column's unit stands in its name or in the field's description.
 
 What was looked for and not found is an :class:`Unavailable`; it travels to the report and is never
 replaced by zero, an empty plot or a "pass".
@@ -16,11 +16,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
-import numpy as np
 import pandas as pd
 
-from px4fuse.arrays import BoolArray
 from px4fuse.display import Shown, brief
+from px4fuse.recording import ClockMap, InputFile, LogInfo, Stream, Unused
 
 AxisName = Literal["north", "east", "down"]
 # Below this share of intervals near the median, samples come in bursts
@@ -79,121 +78,12 @@ class Unavailable:
 
 
 @dataclass(frozen=True)
-class Dropout:
-    """A stretch that the logger lost: start and length in seconds."""
-
-    start_s: float
-    duration_s: float
-
-
-@dataclass(frozen=True)
 class FlightMode:
     """A stretch (s) in one flight mode, by the name that PX4's users know."""
 
     start_s: float
     end_s: float
     name: str
-
-
-@dataclass(frozen=True)
-class Sender:
-    """One MAVLink sender that a recording heard.
-
-    Attributes
-    ----------
-    system, component : int
-        MAVLink ids.
-    description : str
-        What it says it is ("PX4 quadrotor", "companion computer").
-    messages : int
-        Messages with a good checksum.
-    lost_share : float or None
-        Share of its messages that the recording lacks, by the sequence numbers; None where it
-        does not count them.
-    chosen : bool
-        Whether it is the autopilot that the flight was read from.
-    """
-
-    system: int
-    component: int
-    description: str
-    messages: int
-    lost_share: float | None
-    chosen: bool
-
-
-@dataclass(frozen=True)
-class ClockMap:
-    """How one clock was mapped to the autopilot's boot clock.
-
-    boot = stamp + offset + drift · (stamp - middle of the stamps)
-
-    Attributes
-    ----------
-    clock : str
-        Which clock ("UNIX time of system 1, component 197").
-    method : str
-        "TIMESYNC", "SYSTEM_TIME", "receive time" or "position in the stream".
-    pairs : int
-        Pairs of readings that it rests on.
-    offset_s : float
-        Boot clock minus this clock, at the middle of the pairs.
-    drift_ppm : float
-        How much faster the boot clock runs (parts per million).
-    jitter_s : float
-        Standard deviation of the pairs about the fitted line (1.4826 · median absolute deviation).
-    note : str
-        What to keep in mind; may be empty.
-    distinct_stamps : int or None
-        How many values the stamps take where those do not tell the time.
-    """
-
-    clock: str
-    method: str
-    pairs: int
-    offset_s: float
-    drift_ppm: float
-    jitter_s: float
-    note: str = ""
-    distinct_stamps: int | None = None
-
-
-@dataclass(frozen=True)
-class Stream:
-    """Where one part of a flight was read from.
-
-    Attributes
-    ----------
-    topics : tuple of str
-        PX4 topics or MAVLink messages.
-    clock : str
-        Which clock its time stamps were given on.
-    log : str
-        Name of the file.
-    """
-
-    topics: tuple[str, ...]
-    clock: str
-    log: str
-
-
-@dataclass(frozen=True)
-class Unused:
-    """Something in the log that bears on position but that px4fuse does not use, and why."""
-
-    name: str
-    count: int
-    reason: str
-
-
-@dataclass(frozen=True)
-class InputFile:
-    """A file that was read beside the log: name without its folder, hash, size, and its part."""
-
-    name: str
-    sha256: str
-    size_bytes: int
-    role: str
 
 
 @dataclass(frozen=True)
@@ -241,70 +131,6 @@ class Alignment:
     correlation: float | None
     residual_rms_m: float | None
     warnings: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True)
-class LogInfo:
-    """What the log is.
-
-    Attributes
-    ----------
-    name : str
-        File name without its folder.
-    sha256 : str
-        Of the file's bytes.
-    size_bytes : int
-    format : str
-        "ULog", "MAVLink tlog" (with time of receipt) or "MAVLink stream" (without).
-    firmware : str
-        For example "PX4 v1.16.1"; "unknown" where the log does not say.
-    firmware_hash : str
-        Git hash, or "unknown".
-    hardware : str
-    boot_time_s : float
-        Boot clock (s) of time zero, the first sample of data.
-    duration_s : float
-        Span of the data, not of the file: some logs carry one stale message hours away. In a ULog
-        of the IMU (or else of the densest topic), in MAVLink of what carries the boot clock.
-    dropouts : tuple of Dropout
-        As the logger itself reported them.
-    parameters : mapping
-        Parameters that bear on fusion and logging, by PX4 name, as they were at the log's start.
-    notes : tuple of str
-        What the reader had to do: corruption passed over, samples with impossible time stamps.
-    autopilot : str
-        "PX4", "ArduPilot", or what the log says.
-    start_unix_s : float or None
-        UNIX time of time zero, by whichever clock the log has it from; None where it has none.
-    senders : tuple of Sender
-        Of a MAVLink recording, most messages first.
-    vehicle : str
-        Identifier of the flight controller, hexadecimal; empty where the log has none.
-    """
-
-    name: str
-    sha256: str
-    size_bytes: int
-    format: str
-    firmware: str
-    firmware_hash: str
-    hardware: str
-    boot_time_s: float
-    duration_s: float
-    dropouts: tuple[Dropout, ...] = ()
-    parameters: Mapping[str, float] = field(default_factory=dict)
-    notes: tuple[str, ...] = ()
-    autopilot: str = "PX4"
-    start_unix_s: float | None = None
-    senders: tuple[Sender, ...] = ()
-    vehicle: str = ""
-
-    __repr__ = brief
-
-    @property
-    def has_ulog(self) -> bool:
-        """Whether its autopilot writes a ULog: ArduPilot writes DataFlash, which is not read."""
-        return self.autopilot != "ArduPilot"
 
 
 @dataclass(frozen=True)
@@ -563,79 +389,6 @@ class Flight(Shown):
     unused: tuple[Unused, ...] = ()
     inputs: tuple[InputFile, ...] = ()
     modes: tuple[FlightMode, ...] | Unavailable = MODES_NOT_LOGGED
-
-
-def missing_parts(
-    imu: pd.DataFrame | Unavailable,
-    attitude: pd.DataFrame | Unavailable,
-    ekf2: Ekf2 | Unavailable,
-    truth: Truth | Unavailable,
-) -> tuple[Unavailable, ...]:
-    """Parts of a flight that its log lacks, those of EKF2 included."""
-    parts: list[object] = [imu, attitude, ekf2, truth]
-    if isinstance(ekf2, Ekf2):
-        parts += [ekf2.variance, *ekf2.innovations.values(), ekf2.fusing]
-    return tuple(part for part in parts if isinstance(part, Unavailable))
-
-
-def stretches_of_flight(landed: pd.Series, duration_s: float) -> tuple[tuple[float, float], ...]:
-    """Stretches (s) in which a step function of time says "not landed" (0 or False)."""
-    changes = landed[landed.ne(landed.shift())]
-    ends = [*changes.index[1:], duration_s]
-    return tuple(
-        (max(float(start), 0.0), float(end))
-        for start, end, value in zip(changes.index, ends, changes, strict=True)
-        if not value and end > max(start, 0.0)
-    )
-
-
-def stretches_of_modes(names: pd.Series, end_s: float) -> tuple[FlightMode, ...]:
-    """Stretches (s) of a step function of time whose values are names of flight modes."""
-    changes = names[names.ne(names.shift())]
-    starts = np.maximum.accumulate(np.maximum(changes.index.to_numpy(), 0.0))
-    return tuple(
-        FlightMode(float(start), float(end), name)
-        for start, end, name in zip(starts, [*starts[1:], end_s], changes, strict=True)
-        if end > start
-    )
-
-
-# No position, velocity, acceleration or angle of a flight in SI units comes near it
-DAMAGED = 1e9
-
-
-def finite_rows(samples: pd.DataFrame, columns: list[str]) -> pd.DataFrame:
-    """Rows of a frame in which all of some float columns are finite, and none is beyond physics.
-
-    A value of 1e30 is damage as much as NaN is, and its square would soon be infinite.
-    """
-    possible: BoolArray = (np.abs(samples[columns].to_numpy()) < DAMAGED).all(axis=1)
-    return samples[possible]
-
-
-def orientation_of(samples: pd.DataFrame) -> pd.DataFrame | None:
-    """Orientations in a frame of samples; None where there are none, or only one and the same.
-
-    Parameters
-    ----------
-    samples : DataFrame
-        With the columns ``w, x, y, z`` where the sender gave quaternions, and perhaps
-        ``forward_rad2, right_rad2, down_rad2``. A quaternion of norm 0 is none, and so is a
-        variance of 0 (``EKF2.cpp``).
-    """
-    if not set(QUATERNION_COLUMNS) <= set(samples.columns):
-        return None
-    found = finite_rows(
-        samples.reindex(columns=QUATERNION_COLUMNS + ROTATION_VARIANCE_COLUMNS), QUATERNION_COLUMNS
-    )
-    norm = np.linalg.norm(found[QUATERNION_COLUMNS].to_numpy(), axis=1)
-    found = found[norm > 0.5]
-    quaternions = found[QUATERNION_COLUMNS]
-    if len(found) < 2 or (quaternions == quaternions.iloc[0]).to_numpy().all():
-        return None
-    variances = found[ROTATION_VARIANCE_COLUMNS]
-    oriented: pd.DataFrame = found.assign(**variances.where(variances > 0))
-    return oriented
 
 
 def sample_rate(samples: pd.DataFrame) -> float:

@@ -85,16 +85,14 @@ def read_whole(
 
     Parameters
     ----------
-    path : Path
     refuse : type
         Error to raise.
-    limit_bytes : int
     name : str, optional
         For messages; by default as :func:`shown` shows it.
     smaller : str
         What to do where it is too large.
     again : str, optional
-        What to do where it is empty; without it an empty file is welcome.
+        What to do where it is empty; without it an empty file is read as it is.
 
     Raises
     ------
@@ -140,13 +138,12 @@ def read_text(
     *,
     name: str = "",
     smaller: str = "Cut it",
-    again: str | None = None,
 ) -> str:
     """Text of a regular file in UTF-8, or in UTF-16 as a Windows shell writes it.
 
     Parameters
     ----------
-    path, refuse, limit_bytes, name, smaller, again
+    path, refuse, limit_bytes, name, smaller
         As :func:`read_whole` takes them.
 
     Raises
@@ -155,7 +152,7 @@ def read_text(
         Of type ``refuse``.
     """
     name = name or shown(path)
-    content = read_whole(path, refuse, limit_bytes, name=name, smaller=smaller, again=again)
+    content = read_whole(path, refuse, limit_bytes, name=name, smaller=smaller)
     is_utf16 = content.startswith((b"\xff\xfe", b"\xfe\xff"))
     try:
         return content.decode("utf-16" if is_utf16 else "utf-8-sig")

@@ -12,7 +12,7 @@ import shlex
 import subprocess
 from collections.abc import Iterator, Mapping
 from pathlib import PurePath
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 import msgspec
 
@@ -48,14 +48,24 @@ class PositionFile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     length_unit: Literal["m", "cm", "mm"] | None = None
 
 
-class ComparisonRequest(
-    msgspec.Struct,
-    frozen=True,
-    kw_only=True,
-    forbid_unknown_fields=True,
-    tag_field="command",
-    tag="compare",
-):
+# Fields of a request that are paths
+_PATHS = ("log", "mavlink", "source", "estimate", "reference")
+
+
+class _Asked(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What all requests share."""
+
+    def recorded(self) -> Self:
+        """The same with the names of files alone, as results record it."""
+        paths = {name: getattr(self, name, None) for name in _PATHS}
+        changes: dict[str, Any] = {n: _name(path) for n, path in paths.items() if path is not None}
+        position = getattr(self, "position", None)
+        if position is not None:
+            changes["position"] = msgspec.structs.replace(position, path=_name(position.path))
+        return msgspec.structs.replace(self, **changes)
+
+
+class ComparisonRequest(_Asked, frozen=True, kw_only=True, tag_field="command", tag="compare"):
     """A flight to compare with EKF2, as ``compare``, ``tune`` and ``sync`` take it.
 
     Attributes
@@ -98,18 +108,6 @@ class ComparisonRequest(
     end_s: float | None = None
     clock_offset_s: float | Literal["auto"] | None = None
 
-    def recorded(self) -> ComparisonRequest:
-        """The same with the names of files alone, as results record it."""
-        position = self.position
-        return msgspec.structs.replace(
-            self,
-            log=_name(self.log),
-            mavlink=None if self.mavlink is None else _name(self.mavlink),
-            position=None
-            if position is None
-            else msgspec.structs.replace(position, path=_name(position.path)),
-        )
-
 
 class Landing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Where it landed from where it took off, and how far it was turned there.
@@ -135,14 +133,7 @@ class GivenClosure(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     sigma_m: float = 0.10
 
 
-class LoopRequest(
-    msgspec.Struct,
-    frozen=True,
-    kw_only=True,
-    forbid_unknown_fields=True,
-    tag_field="command",
-    tag="loop",
-):
+class LoopRequest(_Asked, frozen=True, kw_only=True, tag_field="command", tag="loop"):
     """A loop to measure and correct, as ``loop`` takes it.
 
     Attributes
@@ -180,14 +171,6 @@ class LoopRequest(
     heading_drift_deg: float = 3.0
     key_frames_m: float | None = None
 
-    def recorded(self) -> LoopRequest:
-        """The same with the names of files alone, as results record it."""
-        return msgspec.structs.replace(
-            self,
-            source=_name(self.source),
-            reference=None if self.reference is None else _name(self.reference),
-        )
-
 
 class Sweep(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Values of one parameter, both ends included; equal ratios above zero, else equal steps."""
@@ -198,14 +181,7 @@ class Sweep(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     count: int = 9
 
 
-class WhatIfRequest(
-    msgspec.Struct,
-    frozen=True,
-    kw_only=True,
-    forbid_unknown_fields=True,
-    tag_field="command",
-    tag="whatif",
-):
+class WhatIfRequest(_Asked, frozen=True, kw_only=True, tag_field="command", tag="whatif"):
     """A flight whose EKF2 is replayed with other parameters, as ``whatif`` takes it.
 
     Attributes
@@ -228,13 +204,8 @@ class WhatIfRequest(
     changes: dict[str, float] = {}
     sweep: Sweep | None = None
 
-    def recorded(self) -> WhatIfRequest:
-        """The same with the names of files alone, as results record it."""
-        mavlink = None if self.mavlink is None else _name(self.mavlink)
-        return msgspec.structs.replace(self, log=_name(self.log), mavlink=mavlink)
 
-
-class EvaluationRequest(msgspec.Struct, frozen=True, kw_only=True):
+class EvaluationRequest(_Asked, frozen=True, kw_only=True):
     """Two trajectories to score, as ``evaluate`` takes them.
 
     Attributes
@@ -259,12 +230,6 @@ class EvaluationRequest(msgspec.Struct, frozen=True, kw_only=True):
     rpe: tuple[str, ...] = ()
     consecutive: bool = False
     system: System | None = None
-
-    def recorded(self) -> EvaluationRequest:
-        """The same with the names of files alone."""
-        return msgspec.structs.replace(
-            self, estimate=_name(self.estimate), reference=_name(self.reference)
-        )
 
 
 Request = ComparisonRequest | LoopRequest | WhatIfRequest
@@ -384,9 +349,7 @@ def _file(path: str) -> str:
     return f"./{path}" if path.startswith("-") else path
 
 
-def _all_options(
-    request: Request | EvaluationRequest,
-) -> Iterator[tuple[str, str | None]]:
+def _all_options(request: Request | EvaluationRequest) -> Iterator[tuple[str, str | None]]:
     """Options with their values, None for a flag."""
     if isinstance(request, EvaluationRequest):
         yield from _options(request, EVALUATION_OPTIONS)

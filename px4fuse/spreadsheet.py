@@ -1,4 +1,4 @@
-"""Text of strangers in tables for spreadsheets, in which none of it comes to life."""
+"""Text of strangers in tables for spreadsheets, where none of it is run as a formula."""
 
 from __future__ import annotations
 

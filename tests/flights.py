@@ -30,15 +30,14 @@ from px4fuse.flight import (
     SPECIFIC_FORCE_COLUMNS,
     VELOCITY_COLUMNS,
     VELOCITY_VARIANCE_COLUMNS,
-    Dropout,
     Ekf2,
     Flight,
-    LogInfo,
     PositionTrack,
     Reset,
     Truth,
     Unavailable,
 )
+from px4fuse.recording import Dropout, LogInfo
 
 Span = tuple[float, float]
 

@@ -15,7 +15,8 @@ from pypdf import PdfReader
 
 from px4fuse.comparison.comparison import Comparison, compare
 from px4fuse.findings import Finding, find
-from px4fuse.flight import Dropout, Flight, FlightMode, Reset, Unavailable
+from px4fuse.flight import Flight, FlightMode, Reset, Unavailable
+from px4fuse.recording import Dropout
 from px4fuse.report import cover, flight, innovations, marks, other_axes
 from px4fuse.report.document import Document
 from px4fuse.report.pdf import render

@@ -12,17 +12,12 @@ from flights import Estimator, Uwb, aisle_flight
 
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.events import happened, source_gaps
-from px4fuse.flight import (
-    Dropout,
-    Flight,
-    FlightMode,
-    Reset,
-    Unavailable,
-    stretches_of_modes,
-)
+from px4fuse.flight import Flight, FlightMode, Reset, Unavailable
 from px4fuse.placing.joining import join
 from px4fuse.readers import read_log
+from px4fuse.readers.parts import stretches_of_modes
 from px4fuse.readers.px4_topics import NAV_STATES
+from px4fuse.recording import Dropout
 
 MODES = (FlightMode(0.0, 40.0, "Offboard"), FlightMode(40.0, 90.0, "Land"))
 

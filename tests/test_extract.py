@@ -21,16 +21,9 @@ from px4fuse.comparison.comparison import compare
 from px4fuse.contents import extraction
 from px4fuse.filter.kalman import Settings, state_at
 from px4fuse.filter.signals import ned_acceleration
-from px4fuse.flight import (
-    QUATERNION_COLUMNS,
-    ClockMap,
-    Dropout,
-    Flight,
-    InputFile,
-    Reset,
-    Unavailable,
-)
+from px4fuse.flight import QUATERNION_COLUMNS, Flight, Reset, Unavailable
 from px4fuse.readers import read_log
+from px4fuse.recording import ClockMap, Dropout, InputFile
 
 # As it stands in the README: the lesson's Example 1 on one's own flight
 README = (Path(__file__).parent.parent / "README.md").read_text(encoding="utf-8")

@@ -31,8 +31,6 @@ from px4fuse.flight import (
     QUATERNION_COLUMNS,
     SPECIFIC_FORCE_COLUMNS,
     Alignment,
-    ClockMap,
-    Dropout,
     Ekf2,
     Flight,
     Reset,
@@ -40,6 +38,7 @@ from px4fuse.flight import (
     Unavailable,
 )
 from px4fuse.readers import read_log
+from px4fuse.recording import ClockMap, Dropout
 
 ALIGNED = "estimator_visual_odometry_aligned"
 NO_VISION = {"EKF2_EVP_NOISE": 0.1, "SDLOG_PROFILE": 1.0}

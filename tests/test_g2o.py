@@ -16,7 +16,7 @@ from test_cli import run_main
 from px4fuse.errors import TrajectoryError
 from px4fuse.readers.g2o import g2o_text, parse_g2o, read_g2o
 from px4fuse.trajectory.graph import lie
-from px4fuse.trajectory.graph.pose_graph import FROM_FILE, PoseGraph
+from px4fuse.trajectory.graph.model import FROM_FILE, PoseGraph
 
 UNIT_2 = "1 0 0 1 0 1"
 UNIT_3 = "1 0 0 0 0 0 1 0 0 0 0 1 0 0 0 1 0 0 1 0 1"

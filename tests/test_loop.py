@@ -17,14 +17,8 @@ from px4fuse.findings import find_loop
 from px4fuse.flight import Unavailable
 from px4fuse.lesson import ODOMETRY_M
 from px4fuse.loop.analysis import analyse, loop_in
-from px4fuse.loop.loop import (
-    BY_DISTANCE,
-    PLAIN,
-    SINGLE_LOOP,
-    Correction,
-    Loop,
-    close_loop,
-)
+from px4fuse.loop.corrections import BY_DISTANCE, PLAIN, SINGLE_LOOP, Correction
+from px4fuse.loop.loop import Loop, close_loop
 from px4fuse.loop.odometry import Closure, OdometryNoise, odometry_variances
 from px4fuse.loop.sources import Source, read_source, split_part
 from px4fuse.readers.closures import parse_closure, read_closures

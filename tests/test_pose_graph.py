@@ -16,19 +16,18 @@ from scipy.stats import chi2, kstest
 from px4fuse.errors import TrajectoryError
 from px4fuse.readers.g2o import parse_g2o, read_g2o
 from px4fuse.trajectory.graph import lie
-from px4fuse.trajectory.graph.initialisation import _chordal
-from px4fuse.trajectory.graph.pose_graph import (
+from px4fuse.trajectory.graph.covariance import gate
+from px4fuse.trajectory.graph.initialisation import _chordal, initialise
+from px4fuse.trajectory.graph.model import (
     FROM_CHORDAL,
     FROM_ODOMETRY,
     PoseGraph,
     chi_square,
     composed,
     cost,
-    gate,
-    initialise,
     residuals,
-    solve,
 )
+from px4fuse.trajectory.graph.solver import solve
 
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "pose_graphs"
 TANGENT = {2: 3, 3: 6}

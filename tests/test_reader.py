@@ -42,7 +42,7 @@ from px4fuse.flight import (
     Unavailable,
 )
 from px4fuse.readers import read_log
-from px4fuse.readers.px4_ekf2 import JOIN_TOLERANCE_S
+from px4fuse.readers.px4_innovations import JOIN_TOLERANCE_S
 
 HALF_PERIOD_S = 0.005  # of EKF2's update, EKF2_PREDICT_US 10,000
 HOUR_US = 3_600_000_000

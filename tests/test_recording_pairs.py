@@ -15,8 +15,9 @@ from px4fuse.comparison.comparison import compare
 from px4fuse.filter.clock import ClockOffset
 from px4fuse.filter.tuning import AxisTuning
 from px4fuse.findings import find
-from px4fuse.flight import Flight, Stream, Unavailable
+from px4fuse.flight import Flight, Unavailable
 from px4fuse.readers import read_log
+from px4fuse.recording import Stream
 
 SAMPLE = "aisle_uwb"
 # Of v1.16.1_aisle_clock_nosync the ULog has times of arrival where the recording has the sender's

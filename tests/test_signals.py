@@ -36,11 +36,11 @@ from px4fuse.flight import (
     VELOCITY_COLUMNS,
     Ekf2,
     Flight,
-    LogInfo,
     PositionTrack,
     Reset,
     Unavailable,
 )
+from px4fuse.recording import LogInfo
 
 GRAVITY = 9.80665
 NORTH = np.array([1.0, 0.0, 0.0])

@@ -14,7 +14,8 @@ from px4fuse.filter.kalman import Settings
 from px4fuse.findings import find
 from px4fuse.findings.model import Finding, moments, off_spans
 from px4fuse.findings.story import MOST_SENTENCES, story
-from px4fuse.flight import Dropout, Reset, Unavailable
+from px4fuse.flight import Reset, Unavailable
+from px4fuse.recording import Dropout
 
 ALONG_DEG = 30.0
 

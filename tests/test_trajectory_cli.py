@@ -21,7 +21,7 @@ from test_lesson import EXAMPLE_2
 from test_outputs import contents
 
 from px4fuse.cli import cli
-from px4fuse.loop.loop import BY_DISTANCE, PLAIN
+from px4fuse.loop.corrections import BY_DISTANCE, PLAIN
 from px4fuse.results.contract import schema
 
 LOG = REPOSITORY / "sample_logs" / "loop_vio.ulg"

@@ -72,26 +72,22 @@ LOGS should be URLs (s3://, gs://), whose package (s3fs, gcsfs) is in the image 
     "timeout_s",
     type=click.FloatRange(min=1.0),
     default=TIMEOUT_S,
-    show_default=True,
     metavar="SECONDS",
     help="Time for one log; what takes longer is ended.",
 )
 @click.option(
     "--workers",
     type=click.IntRange(1, 1024),
-    default=None,
     metavar="N",
     help="How many logs at once on this computer.  [default: one per core]",
 )
 @click.option(
     "--memory",
-    default=None,
     metavar="SIZE",
     help="Memory for each, as 2GB.  [default: an equal share of this computer's]",
 )
 @click.option(
     "--scheduler",
-    default=None,
     metavar="ADDRESS",
     help="Dask scheduler that runs already, as tcp://host:8786; slurm or kubernetes prints how to "
     "start one.",
@@ -111,7 +107,6 @@ LOGS should be URLs (s3://, gs://), whose package (s3fs, gcsfs) is in the image 
 @click.option(
     "--fail-on",
     type=click.Choice((FAILED, WORSE, *SEVERITIES)),
-    default=None,
     help="Exit with 1 if a log has failed, is worse than the baseline (or has failed), or there is "
     "a finding of at least this severity.",
 )

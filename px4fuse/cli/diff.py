@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from px4fuse.cli.inputs import max_size_option, path_option
+from px4fuse.cli.inputs import max_size_option, path_option, results_option
 from px4fuse.cli.outputs import free_report, progress, report_paths, terminal, write_outputs
 from px4fuse.writing import STANDARD_OUTPUT
 
@@ -29,22 +29,12 @@ MAX_NAME_BYTES = 90
 @click.argument("b", type=click.Path(path_type=Path))
 @max_size_option
 @path_option(
-    "-o",
-    "--output",
-    metavar="FILE.pdf",
-    help="The report.  [default: reports/A_to_B.pdf]",
+    "-o", "--output", metavar="FILE.pdf", help="The report.  [default: reports/A_to_B.pdf]"
 )
-@path_option(
-    "--json",
-    "json_path",
-    metavar="FILE",
-    help="The results; - prints them alone on standard output, and without -o writes no report.  "
-    "[default: beside the PDF]",
-)
+@results_option
 @click.option(
     "--fail-on",
     type=click.Choice(["worse"]),
-    default=None,
     help="Exit with 1 if a number is significantly worse in B, or B has a new error.",
 )
 def diff(

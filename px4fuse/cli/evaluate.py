@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import re
 from pathlib import Path
@@ -9,21 +10,11 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from px4fuse.cli.inputs import (
-    max_size_option,
-    path_option,
-    system_option,
-)
-from px4fuse.cli.outputs import (
-    free_report,
-    progress,
-    report_paths,
-    terminal,
-    write_outputs,
-)
+from px4fuse.cli.inputs import max_size_option, path_option, system_option
+from px4fuse.cli.outputs import finish, free_report, progress, report_paths
 from px4fuse.cli.quantity import Quantity
 from px4fuse.errors import OutputError, SettingsError
-from px4fuse.request import AUTO, EvaluationRequest, command_line, settings_name
+from px4fuse.request import EVALUATION_OPTIONS, EvaluationRequest, command_line, settings_name
 from px4fuse.writing import STANDARD_OUTPUT
 
 if TYPE_CHECKING:
@@ -67,7 +58,6 @@ class DeltaType(click.ParamType["Delta"]):
 @click.option(
     "--alignment",
     type=click.Choice(["none", "yaw", "se3", "sim3"]),
-    default=None,
     help="What is fitted before comparing.  [default: yaw for VIO, EKF2 and our filter; se3 for "
     "SLAM; sim3 for monocular SLAM]",
 )
@@ -75,22 +65,20 @@ class DeltaType(click.ParamType["Delta"]):
     "--association",
     type=click.Choice(["interpolate", "nearest"]),
     default="interpolate",
-    show_default=True,
     help="Interpolate the reference, or take its nearest pose (as evo does).",
 )
 @click.option(
     "--max-gap",
+    "max_gap_s",
     type=click.FloatRange(min=0.0, min_open=True),
-    default=None,
     metavar="S",
     help="Longest gap of the reference to interpolate across; for nearest the largest difference "
     "in time.  [default: from its rate; 0.01 for nearest]",
 )
 @click.option(
     "--time-offset",
+    "time_offset_s",
     type=Quantity("s", auto=True),
-    default=None,
-    metavar="S|auto",
     help="Added to the estimate's stamps; auto finds it from the motion.  [default: auto where the "
     "two do not overlap]",
 )
@@ -127,16 +115,11 @@ class DeltaType(click.ParamType["Delta"]):
 def evaluate(
     estimate: Path,
     reference: Path,
-    alignment: str | None,
-    association: str,
-    max_gap: float | None,
-    time_offset: float | str | None,
-    rpe: tuple[Any, ...],
-    consecutive: bool,
-    system: int | None,
+    rpe: tuple[Delta, ...],
     output: Path | None,
     picture: Path | None,
     json_path: Path | None,
+    **given: Any,
 ) -> None:
     """Score a trajectory against a reference: ATE and RPE, with intervals.
 
@@ -151,37 +134,30 @@ def evaluate(
     from px4fuse.results.contract import to_json
     from px4fuse.trajectory.evaluation import evaluate as score
 
-    for option, value in (("--max-gap", max_gap), ("--time-offset", time_offset)):
-        if isinstance(value, float) and not abs(value) < float("inf"):
-            raise SettingsError(f"{option} {value:g} is not a finite number.")
+    for name in ("max_gap_s", "time_offset_s"):
+        if isinstance(given[name], float) and not math.isfinite(given[name]):
+            option = EVALUATION_OPTIONS[name]
+            raise SettingsError(f"{option} {given[name]:g} is not a finite number.")
     request = EvaluationRequest(
-        estimate=str(estimate),
-        reference=str(reference),
-        alignment=alignment,
-        association=association,
-        max_gap_s=max_gap,
-        time_offset_s=time_offset,
-        rpe=tuple(map(str, rpe)),
-        consecutive=consecutive,
-        system=system,
+        estimate=str(estimate), reference=str(reference), rpe=tuple(map(str, rpe)), **given
     )
     alone = json_path == STANDARD_OUTPUT
     _targets(output, picture, json_path)  # before the work, not after it
     contents: dict[Path, bytes] = {}
     with progress(alone, STEPS) as step:
         step("reading")
-        first = read_source(str(estimate), system=system)
-        second = read_source(str(reference), default="truth", system=system)
+        first = read_source(request.estimate, system=request.system)
+        second = read_source(request.reference, default="truth", system=request.system)
         step("scoring")
         found = score(
             first.trajectory,
             second.trajectory,
-            alignment=alignment,  # type: ignore[arg-type]
-            association=association,  # type: ignore[arg-type]
-            max_gap_s=max_gap,
-            time_offset_s=AUTO if isinstance(time_offset, str) else time_offset,
+            alignment=given["alignment"],
+            association=given["association"],
+            max_gap_s=request.max_gap_s,
+            time_offset_s=given["time_offset_s"],
             rpe_deltas=rpe or None,
-            all_pairs=not consecutive,
+            all_pairs=not request.consecutive,
         )
         results = evaluation_results(found, command_line(request))
         text = to_json(results)
@@ -202,15 +178,7 @@ def evaluate(
     for path in (beside, json_path):
         if path is not None:
             contents[path] = text.encode()
-    write_outputs(contents)
-    if alone:
-        return
-    from px4fuse.report.screen import print_file
-
-    console = terminal()
-    print_evaluation(console, found)
-    for path in contents:
-        print_file(console, "Wrote", path)
+    finish(contents, lambda console: print_evaluation(console, found), alone=alone)
 
 
 def _default(estimate: Path, reference: Path, settings: str, mine: EvaluationResults) -> Path:

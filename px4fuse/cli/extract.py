@@ -10,14 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from px4fuse.cli.inputs import (
-    comparison_request,
-    path_option,
-    recording_options,
-)
-from px4fuse.cli.outputs import (
-    write_outputs,
-)
+from px4fuse.cli.inputs import comparison_request, path_option, recording_options
+from px4fuse.cli.outputs import write_outputs
 from px4fuse.errors import OutputError
 from px4fuse.reading import read_text
 
@@ -44,16 +38,10 @@ MAX_DESCRIPTION_BYTES = 50_000_000
     "kind",
     type=click.Choice(FORMATS),
     default="csv",
-    show_default=True,
     help='Of the tables; Parquet needs pip install "px4fuse[parquet]".',
 )
 @recording_options
-def extract(
-    log: Path,
-    folder: Path,
-    kind: str,
-    **given: Any,
-) -> None:
+def extract(log: Path, folder: Path, kind: str, **given: Any) -> None:
     """Write everything that a log holds as tidy tables, one file each.
 
     With data_dictionary.csv, which says the unit, frame, meaning, source topic and clock of every

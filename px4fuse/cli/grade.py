@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 @max_size_option
 @path_option("--key", metavar="FILE.json", help="Answer key of px4fuse simulate --assignment.")
 @path_option("-o", "--output", metavar="DIR", help="Folder for the class table and the feedback.")
-@click.option("--title", default="Class", show_default=True, help="Of the class page.")
+@click.option("--title", default="Class", help="Of the class page.")
 @path_option(
     "--roster", metavar="FILE.csv", help="Everyone in the class.  [default: those of --key]"
 )
@@ -39,7 +39,6 @@ if TYPE_CHECKING:
     "--attempt",
     type=click.Choice(["latest", "best", "first"]),
     default="latest",
-    show_default=True,
     help="Which of a student's files counts.",
 )
 @click.option(
@@ -60,14 +59,13 @@ if TYPE_CHECKING:
     help="Moodle's grading worksheet, Canvas's gradebook or Blackboard's grades as exported: a "
     "copy with the grades filled in is written. May be repeated.",
 )
-@click.option("--column", default="", metavar="TITLE", help="Of the worksheets, for the grade.")
+@click.option("--column", metavar="TITLE", help="Of the worksheets, for the grade.")
 @click.option(
     "--anonymous", is_flag=True, help="The class page shows pseudonyms; names.csv says whose."
 )
 @click.option(
     "--jobs",
     type=click.IntRange(1, 256),
-    default=None,
     metavar="N",
     help="How many reports at once.  [default: one per core]",
 )
@@ -92,7 +90,7 @@ def grade(
     due: str | None,
     late: str | None,
     worksheet: tuple[Path, ...],
-    column: str,
+    column: str | None,
     anonymous: bool,
     jobs: int | None,
     write_rubric: Path | None,
@@ -154,7 +152,7 @@ def grade(
     course = Course(
         None if roster is None else people_of_sheet(read_sheet(roster)),
         tuple(map(read_sheet, worksheet)),
-        column,
+        column or "",
         Term(attempt, due_time(due) if due else None, rule),
         anonymous,
     )

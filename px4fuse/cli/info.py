@@ -7,16 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from px4fuse.cli.inputs import (
-    comparison_request,
-    json_option,
-    recording_options,
-)
-from px4fuse.cli.outputs import (
-    progress,
-    terminal,
-    write_json,
-)
+from px4fuse.cli.inputs import comparison_request, json_option, recording_options
+from px4fuse.cli.outputs import progress, terminal, write_json
 from px4fuse.writing import STANDARD_OUTPUT
 
 if TYPE_CHECKING:
@@ -34,11 +26,7 @@ REPLAY_PPM = 10_000.0
 @click.argument("log", type=click.Path(path_type=Path))
 @json_option
 @recording_options
-def info(
-    log: Path,
-    json_path: Path | None,
-    **given: Any,
-) -> None:
+def info(log: Path, json_path: Path | None, **given: Any) -> None:
     """Say what is in a log, what px4fuse can do with it, and what to log next time."""
     from px4fuse.analysis import read_flight
     from px4fuse.contents.inventory import take_inventory, to_plain

@@ -31,16 +31,28 @@ class ColumnNames(click.ParamType["tuple[str, ...]"]):
         return tuple(value.split(",")) if isinstance(value, str) else value
 
 
+Option = Callable[[Callable[..., None]], Callable[..., None]]
+
+
+def _together(*options: Option) -> Option:
+    """Several options as one, in the order in which the help lists them."""
+
+    def add(command: Callable[..., None]) -> Callable[..., None]:
+        for option in reversed(options):
+            command = option(command)
+        return command
+
+    return add
+
+
 # An option that names a file or folder
 path_option = partial(click.option, type=click.Path(path_type=Path))
-_ANALYSIS = (
+_ANALYSIS = _together(
     click.option(
         "--sigma-a",
         "sigma_a_m_s2",
         type=Quantity("m/s²", 0.5),
         default=0.5,
-        show_default=True,
-        metavar="M/S²",
         help="Process noise SIGMA_A, 0.0001 to 100.",
     ),
     click.option(
@@ -48,8 +60,6 @@ _ANALYSIS = (
         "sigma_z_m",
         type=Quantity("m"),
         default=0.10,
-        show_default=True,
-        metavar="M",
         help="Measurement noise SIGMA_Z, 0.0001 to 100.",
     ),
     click.option(
@@ -57,14 +67,11 @@ _ANALYSIS = (
         "dt_s",
         type=Quantity("s"),
         default=0.1,
-        show_default=True,
-        metavar="S",
         help="Prediction step DT, 0.001 to 1; Q is proportional to it.",
     ),
     click.option(
         "--input",
         type=click.Choice(get_args(InputName)),
-        default=None,
         help="Acceleration from the IMU, or constant velocity.  [default: imu where logged]",
     ),
     click.option(
@@ -78,29 +85,17 @@ _ANALYSIS = (
         "--heading",
         "heading_deg",
         type=Quantity("°", 30.0),
-        default=None,
-        metavar="DEG",
         help="Heading of the aisle, clockwise from north.  [default: from the track]",
     ),
     click.option(
         "--start",
         "start_s",
         type=Quantity("s", 20.0),
-        default=None,
-        metavar="S",
         help="Start, seconds from the first data.  [default: take-off]",
     ),
-    click.option(
-        "--end",
-        "end_s",
-        type=Quantity("s", 60.0),
-        default=None,
-        metavar="S",
-        help="End.  [default: touch-down]",
-    ),
+    click.option("--end", "end_s", type=Quantity("s", 60.0), help="End.  [default: touch-down]"),
     click.option(
         "--position-source",
-        default=None,
         metavar="NAME",
         help="Position source, for example vehicle_gps_position.  [default: the best logged]",
     ),
@@ -108,7 +103,6 @@ _ANALYSIS = (
 system_option = click.option(
     "--system",
     type=click.IntRange(0, 255),
-    default=None,
     metavar="ID",
     help="MAVLink system id of the vehicle.  [default: the one with the most data]",
 )
@@ -124,13 +118,12 @@ def _allow_size(ctx: click.Context, _: click.Parameter, megabytes: int | None) -
 max_size_option = click.option(
     "--max-size",
     type=click.IntRange(min=1),
-    default=None,
     expose_value=False,
     callback=_allow_size,
     metavar="MB",
     help=f"Largest log that is read.  [default: {max_log_bytes.get() // 1_000_000}]",
 )
-_RECORDINGS = (
+_RECORDINGS = _together(
     path_option(
         "--mavlink",
         metavar="FILE.tlog",
@@ -138,7 +131,7 @@ _RECORDINGS = (
     ),
     system_option,
 )
-_POSITION = (
+_POSITION = _together(
     path_option(
         "--position",
         metavar="FILE.csv",
@@ -147,33 +140,27 @@ _POSITION = (
     click.option(
         "--position-frame",
         type=click.Choice(["ned", "enu", "nwu"]),
-        default=None,
         help="What its x, y, z are.  [default: from its column names, or what fits EKF2]",
     ),
     click.option(
         "--position-yaw",
         type=Quantity("°", 30.0, auto=True),
-        default=None,
-        metavar="DEG|auto",
         help="Turn it clockwise, seen from above; auto finds yaw and origin.  [default: 0]",
     ),
     click.option(
         "--position-columns",
         type=ColumnNames(),
-        default=None,
         metavar="TIME,X,Y,Z[,SIGMA]",
         help="Names or numbers of its columns.  [default: by their names]",
     ),
     click.option(
         "--position-time-unit",
         type=click.Choice(["s", "ms", "us", "ns"]),
-        default=None,
         help="Unit of its time.  [default: detected]",
     ),
     click.option(
         "--position-unit",
         type=click.Choice(["m", "cm", "mm"]),
-        default=None,
         help="Unit of its x, y, z.  [default: detected]",
     ),
 )
@@ -189,8 +176,6 @@ clock_offset_option = click.option(
     "--clock-offset",
     "clock_offset_s",
     type=Quantity("s", auto=True),
-    default=None,
-    metavar="S|auto",
     help="Added to the position source's time stamps; auto estimates it.  [default: 0; auto with "
     "--position]",
 )
@@ -200,14 +185,22 @@ json_option = path_option(
     metavar="FILE",
     help="Write it as JSON; - prints that alone on standard output.",
 )
-_PERSON = (
-    click.option("--student", default="", metavar="NAME", help="Name on the report."),
-    click.option(
-        "--id", "student_id", default="", metavar="ID", help="Student number on the report."
-    ),
+#: Whose report it is
+person_options = _together(
+    click.option("--student", metavar="NAME", help="Name on the report."),
+    click.option("--id", "student_id", metavar="ID", help="Student number on the report."),
     path_option("--notes", metavar="FILE.md", help="Your own words, printed in the report."),
 )
-_REPORT = (
+#: Of commands whose results stand beside a report
+results_option = path_option(
+    "--json",
+    "json_path",
+    metavar="FILE",
+    help="The results; - prints them alone on standard output, and without -o writes no report.  "
+    "[default: beside the PDF]",
+)
+#: Of every command that makes a report: the PDF and its results
+report_options = _together(
     path_option(
         "-o",
         "--output",
@@ -215,57 +208,18 @@ _REPORT = (
         help="The report.  [default: reports/LOG.pdf, settings that are not at their defaults in "
         "its name]",
     ),
-    path_option(
-        "--json",
-        "json_path",
-        metavar="FILE",
-        help="The results; - prints them alone on standard output, and without -o writes no "
-        "report.  [default: beside the PDF]",
-    ),
+    results_option,
 )
 
 
-def recording_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Add the options that say which recordings of the flight are read, and how."""
-    for option in reversed((*_RECORDINGS, *_POSITION, clock_offset_option, max_size_option)):
-        command = option(command)
-    return command
-
-
-def flight_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Add the options of commands that read a flight as it was recorded."""
-    for option in reversed((*_RECORDINGS, max_size_option)):
-        command = option(command)
-    return command
-
-
-def analysis_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Add the options of every command that runs the filter: settings, segment and recordings."""
-    command = recording_options(command)
-    for option in reversed(_ANALYSIS):
-        command = option(command)
-    return command
-
-
-def settings_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Add the options of an analysis that hold for many logs: no other files of one flight."""
-    for option in reversed((*_ANALYSIS, system_option, clock_offset_option, max_size_option)):
-        command = option(command)
-    return command
-
-
-def person_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Add the options that say whose report it is."""
-    for option in reversed(_PERSON):
-        command = option(command)
-    return command
-
-
-def report_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Add the options of every command that makes a report: the PDF and its results."""
-    for option in reversed(_REPORT):
-        command = option(command)
-    return command
+#: Which recordings of the flight are read, and how
+recording_options = _together(_RECORDINGS, _POSITION, clock_offset_option, max_size_option)
+#: Of commands that read a flight as it was recorded
+flight_options = _together(_RECORDINGS, max_size_option)
+#: Of every command that runs the filter: settings, segment and recordings
+analysis_options = _together(_ANALYSIS, recording_options)
+#: Of an analysis that hold for many logs: no other files of one flight
+settings_options = _together(_ANALYSIS, system_option, clock_offset_option, max_size_option)
 
 
 def comparison_request(log: Path, given: dict[str, Any]) -> ComparisonRequest:
@@ -281,10 +235,7 @@ def comparison_request(log: Path, given: dict[str, Any]) -> ComparisonRequest:
     position = _position_file(given)
     mavlink = given.pop("mavlink")
     return ComparisonRequest(
-        log=str(log),
-        mavlink=None if mavlink is None else str(mavlink),
-        position=position,
-        **given,
+        log=str(log), mavlink=None if mavlink is None else str(mavlink), position=position, **given
     )
 
 
@@ -311,7 +262,7 @@ def read_person(given: dict[str, Any]) -> Student:
     """
     from px4fuse.results.model import Student
 
-    name, number = given.pop("student"), given.pop("student_id")
+    name, number = given.pop("student") or "", given.pop("student_id") or ""
     person = Student(encodable(name), encodable(number), _read_notes(given.pop("notes")))
     _tell_fonts(person.name + person.id + person.notes)
     return person

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
@@ -16,13 +15,7 @@ from px4fuse.cli.inputs import (
     read_person,
     system_option,
 )
-from px4fuse.cli.outputs import (
-    progress,
-    report_paths,
-    spare_inputs,
-    terminal,
-    write_outputs,
-)
+from px4fuse.cli.outputs import finish, progress, report_paths, spare_inputs
 from px4fuse.cli.quantity import Quantity
 from px4fuse.errors import SettingsError
 from px4fuse.reading import shown
@@ -30,9 +23,6 @@ from px4fuse.request import FrameName, Landing
 from px4fuse.writing import STANDARD_OUTPUT
 
 if TYPE_CHECKING:
-    from msgspec import Struct
-    from rich.console import Console
-
     from px4fuse.loop.loop import Loop
     from px4fuse.request import LoopRequest
 
@@ -80,23 +70,13 @@ class FrameType(click.Choice[str]):
     "--from",
     "start_s",
     type=Quantity("s", 20.0),
-    default=None,
-    metavar="S",
     help="Start of the loop: seconds from the first data, or a trajectory's own stamps.  "
     "[default: take-off]",
 )
-@click.option(
-    "--to",
-    "end_s",
-    type=Quantity("s", 60.0),
-    default=None,
-    metavar="S",
-    help="End.  [default: landing]",
-)
+@click.option("--to", "end_s", type=Quantity("s", 60.0), help="End.  [default: landing]")
 @click.option(
     "--landed-at",
     type=LandingType(),
-    default=None,
     metavar="FORWARD,RIGHT[,DEG]",
     help="Where it really landed, by tape from the place of take-off: m along its nose there, m to "
     "the right, and degrees it was turned clockwise.  [default: the log's ground truth, else 0,0]",
@@ -119,8 +99,6 @@ class FrameType(click.Choice[str]):
     "position_drift_m",
     type=Quantity("m", 1.0),
     default=1.0,
-    show_default=True,
-    metavar="M",
     help="Standard deviation of the odometry's position after 100 m.",
 )
 @click.option(
@@ -128,22 +106,17 @@ class FrameType(click.Choice[str]):
     "heading_drift_deg",
     type=Quantity("°", 3.0),
     default=3.0,
-    show_default=True,
-    metavar="DEG",
     help="Standard deviation of its heading after 100 m.",
 )
 @click.option(
     "--key-frames",
     "key_frames_m",
     type=Quantity("m", 0.2),
-    default=None,
-    metavar="M",
     help="Distance between key frames.  [default: a fiftieth of the extent, 0.02 to 0.5]",
 )
 @click.option(
     "--frame",
     type=FrameType(get_args(FrameName)),
-    default=None,
     help="Axes of a trajectory file.  [default: recognised]",
 )
 @click.option(
@@ -189,7 +162,8 @@ def loop(
         return
     request = loop_request(source, given)
     _spare(tum, g2o, *((json_path,) if output is None else report_paths(output, json_path)))
-    with progress(json_path == STANDARD_OUTPUT, STEPS) as step:
+    alone = json_path == STANDARD_OUTPUT
+    with progress(alone, STEPS) as step:
         found = run_loop(request, step)
         findings = find_loop(found)
         command = command_line(request)
@@ -203,10 +177,9 @@ def loop(
             text = to_json(results)
             document = LoopDocument(found, findings, person, command)
             contents |= {pdf: render(document, text), beside: text.encode()}
-            json_path = json_path if json_path == STANDARD_OUTPUT else None
-    _finish(
-        results, json_path, contents, lambda console: print_loop(console, found, findings, request)
-    )
+    if json_path is not None and (alone or output is None):
+        contents[json_path] = to_json(results).encode()
+    finish(contents, lambda console: print_loop(console, found, findings, request), alone=alone)
 
 
 def loop_request(source: Path, given: dict[str, Any]) -> LoopRequest:
@@ -261,6 +234,7 @@ def _solve(source: Path, json_path: Path | None, g2o: Path | None, robust: bool 
     from px4fuse.report.loop_terminal import print_graph
     from px4fuse.request import LoopRequest, command_line
     from px4fuse.results.build_trajectories import graph_results
+    from px4fuse.results.contract import to_json
     from px4fuse.trajectory.graph.analysis import analyse_graph
 
     path, part = split_part(str(source))
@@ -275,32 +249,13 @@ def _solve(source: Path, json_path: Path | None, g2o: Path | None, robust: bool 
                 "pose graph. With one, give only --g2o FILE and --json FILE."
             )
     _spare(json_path, g2o)
-    with progress(json_path == STANDARD_OUTPUT) as step:
+    alone = json_path == STANDARD_OUTPUT
+    with progress(alone) as step:
         step(f"reading {shown(source)}")
         solved = analyse_graph(read_g2o(path), step, robust=robust)
     command = command_line(LoopRequest(source=str(source))) + (" --robust" if robust else "")
     results = graph_results(shown(source), solved, command)
     contents = {} if g2o is None else {g2o: g2o_text(solved.graph).encode()}
-    _finish(results, json_path, contents, lambda to: print_graph(to, shown(source), solved))
-
-
-def _finish(
-    results: Struct,
-    json_path: Path | None,
-    contents: dict[Path, bytes],
-    show: Callable[[Console], None],
-) -> None:
-    """Write all outputs or none; print the results alone, or what was found and written."""
-    from px4fuse.report.screen import print_file
-    from px4fuse.results.contract import to_json
-
     if json_path is not None:
-        contents = {**contents, json_path: to_json(results).encode()}
-    if contents:
-        write_outputs(contents)
-    if json_path == STANDARD_OUTPUT:
-        return
-    console = terminal()
-    show(console)
-    for path in contents:
-        print_file(console, "Wrote", path)
+        contents[json_path] = to_json(results).encode()
+    finish(contents, lambda to: print_graph(to, shown(source), solved), alone=alone)

@@ -89,7 +89,7 @@ def progress(quiet: bool = False, steps: Sequence[str] = ()) -> Iterator[Step]:
         del what, done, of
 
     console = Console(stderr=True)
-    if not console.is_terminal or quiet:
+    if not console.is_terminal or quiet:  # an older rich ends a disabled bar with an empty line
         yield silent
         return
     columns = (
@@ -229,6 +229,22 @@ def spare_inputs(targets: Iterable[Path]) -> None:
                     f"{target}: is what this command reads; it was not overwritten. Give another "
                     "name for the output."
                 )
+
+
+def finish(contents: Mapping[Path, bytes], show: Callable[[Console], None], *, alone: bool) -> None:
+    """Write all outputs or none; then tell people what was found and written.
+
+    Nothing is told where the results have standard output ``alone``.
+    """
+    from px4fuse.report.screen import print_file
+
+    if contents:
+        write_outputs(contents)
+    if not alone:
+        console = terminal()
+        show(console)
+        for path in contents:
+            print_file(console, "Wrote", path)
 
 
 def terminal() -> Console:

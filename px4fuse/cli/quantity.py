@@ -30,7 +30,7 @@ _TYPED = re.compile(r"([-+]?[\d.,]+(?:e[-+]?\d+)?)\s*(\S*)", re.IGNORECASE)
 
 
 def in_unit(typed: str, unit: str) -> float | None:
-    """What a number with a unit or with a comma is in one of ours; None where it is none.
+    """A number typed with a unit or a comma, in one of our units; None where it is not one.
 
     >>> in_unit("10cm", "m"), in_unit("0,5", "s"), in_unit("10 apples", "m")
     (0.1, 0.5, None)
@@ -71,6 +71,12 @@ class Quantity(click.ParamType["float | str"]):
         between: tuple[float, float] | None = None,
     ) -> None:
         self.unit, self.example, self.auto, self.between = unit, example, auto, between
+
+    def get_metavar(self, param: click.Parameter, ctx: click.Context | None = None) -> str:
+        """Its unit, as the help shows what to type."""
+        del param, ctx
+        unit = "DEG" if self.unit == "°" else self.unit.upper()
+        return f"{unit}|auto" if self.auto else unit
 
     def convert(
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None

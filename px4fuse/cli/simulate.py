@@ -11,9 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 from click.core import ParameterSource
 
-from px4fuse.cli.inputs import (
-    path_option,
-)
+from px4fuse.cli.inputs import path_option
 from px4fuse.cli.outputs import progress, terminal, write_outputs
 from px4fuse.cli.quantity import Quantity
 from px4fuse.errors import OutputError, SettingsError
@@ -44,7 +42,7 @@ def _scenario_option(
     default = getattr(_DEFAULT, field)
     between = (0.0, 360.0) if unit == "°" else None
     kind = float if unit is None else Quantity(unit, default, between=between)
-    return click.option(name, field, type=kind, default=default, show_default=True, **details)
+    return click.option(name, field, type=kind, default=default, **details)
 
 
 class WithMistakes(click.Command):
@@ -87,7 +85,6 @@ class WithMistakes(click.Command):
 )
 @click.option(
     "--secret",
-    default=None,
     metavar="TEXT",
     help="The secret itself; others on this computer may see what you type.",
 )
@@ -95,7 +92,6 @@ class WithMistakes(click.Command):
     "--mistakes",
     "count",
     type=int,
-    default=None,
     metavar="N",
     help="How many mistakes each assigned flight has.  [default: drawn: none, one or two]",
 )
@@ -108,7 +104,6 @@ class WithMistakes(click.Command):
     "--kind",
     type=click.Choice((*KINDS, MIXED)),
     default=_DEFAULT.kind,
-    show_default=True,
     help="Passes along an aisle with UWB, or laps around a square with drifting VIO. With "
     "--assignment mixed: a loop for a third of the class, the aisle for the others.",
 )
@@ -116,7 +111,6 @@ class WithMistakes(click.Command):
     "--seed",
     type=int,
     default=_DEFAULT.seed,
-    show_default=True,
     metavar="N",
     help="A number per student gives everyone a flight of their own; the same number the same.",
 )
@@ -137,53 +131,32 @@ class WithMistakes(click.Command):
 @click.option("--no-truth", is_flag=True, help="Leave the ground truth out of the log.")
 @click.option("--no-ekf2", is_flag=True, help="Fly without EKF2, which is faster.")
 @click.option(
-    "--passes",
-    type=int,
-    default=None,
-    metavar="N",
-    help="Passes of the aisle [6], or laps of the loop [1].",
+    "--passes", type=int, metavar="N", help="Passes of the aisle [6], or laps of the loop [1]."
 )
+@_scenario_option("--length", "length_m", "m", help="Of the aisle, or of a side of the square.")
+@_scenario_option("--speed", "speed_m_s", "m/s")
 @_scenario_option(
-    "--length",
-    "length_m",
-    "m",
-    metavar="M",
-    help="Of the aisle, or of a side of the square.",
-)
-@_scenario_option("--speed", "speed_m_s", "m/s", metavar="M/S")
-@_scenario_option(
-    "--heading",
-    "heading_deg",
-    "°",
-    metavar="DEG",
-    help="Of the aisle or of the first side, clockwise from north.",
+    "--heading", "heading_deg", "°", help="Of the aisle or of the first side, clockwise from north."
 )
 @click.option(
     "--yaw",
     type=click.Choice(YAWS),
-    default=None,
     help="Whether the nose stays or follows the flight.  [default: fixed; follow in a loop]",
 )
 @_scenario_option(
-    "--sigma-uwb",
-    "sigma_uwb_m",
-    "m",
-    metavar="M",
-    help="White noise of the UWB, per axis: the true SIGMA_Z.",
+    "--sigma-uwb", "sigma_uwb_m", "m", help="White noise of the UWB, per axis: the true SIGMA_Z."
 )
-@_scenario_option("--uwb-rate", "uwb_rate_hz", "Hz", metavar="HZ")
+@_scenario_option("--uwb-rate", "uwb_rate_hz", "Hz")
 @_scenario_option(
     "--sigma-a",
     "sigma_a_m_s2",
     "m/s²",
-    metavar="M/S²",
     help="White noise of the accelerometer's mean over 0.1 s: the true SIGMA_A.",
 )
 @_scenario_option(
     "--accel-bias-sigma",
     "accel_bias_sigma_m_s2",
     "m/s²",
-    metavar="M/S²",
     help="Width from which the accelerometer's constant bias is drawn.",
 )
 @_scenario_option(

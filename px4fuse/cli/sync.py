@@ -7,16 +7,8 @@ from typing import Any
 
 import click
 
-from px4fuse.cli.inputs import (
-    analysis_options,
-    comparison_request,
-    json_option,
-)
-from px4fuse.cli.outputs import (
-    progress,
-    terminal,
-    write_json,
-)
+from px4fuse.cli.inputs import analysis_options, comparison_request, json_option
+from px4fuse.cli.outputs import progress, terminal, write_json
 from px4fuse.writing import STANDARD_OUTPUT
 
 STEPS = ("reading", "tuning", "clock offset", "changes of the clock")

@@ -7,16 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from px4fuse.cli.inputs import (
-    analysis_options,
-    comparison_request,
-    json_option,
-)
-from px4fuse.cli.outputs import (
-    progress,
-    terminal,
-    write_json,
-)
+from px4fuse.cli.inputs import analysis_options, comparison_request, json_option
+from px4fuse.cli.outputs import progress, terminal, write_json
 from px4fuse.writing import STANDARD_OUTPUT
 
 if TYPE_CHECKING:

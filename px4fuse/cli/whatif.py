@@ -32,10 +32,7 @@ STEPS = (
     help="Parameter to change, in PX4's unit; may be repeated.  [default: what the data ask for]",
 )
 @click.option(
-    "--sweep",
-    default=None,
-    metavar="NAME=LOW:HIGH[:COUNT]",
-    help="Parameter to change over several values.",
+    "--sweep", metavar="NAME=LOW:HIGH[:COUNT]", help="Parameter to change over several values."
 )
 @flight_options
 @path_option("-o", "--output", metavar="FILE.pdf", help="Write it as a PDF page.")

@@ -138,10 +138,6 @@ _CLOCKS = (
 def tables(flight: Flight) -> Mapping[str, pd.DataFrame]:
     """Everything in a flight as tidy tables: one row per sample, one documented unit per column.
 
-    Parameters
-    ----------
-    flight : Flight
-
     Returns
     -------
     mapping from table name to DataFrame
@@ -227,8 +223,8 @@ def _tables(flight: Flight) -> Iterator[_Table]:
     acceleration = ned_acceleration(flight)
     if isinstance(acceleration, pd.DataFrame):
         data = acceleration.set_axis(ACCELERATION_COLUMNS, axis=1)
-        topics = (*_topics(flight, "imu"), *_topics(flight, "attitude"))
-        yield _timed("acceleration_ned", _ACCELERATION, data, topics, _clock(flight, "imu"))
+        (imu, clock), (attitude, _) = _origin(flight, "imu"), _origin(flight, "attitude")
+        yield _timed("acceleration_ned", _ACCELERATION, data, (*imu, *attitude), clock)
     for name, track in _named_tracks(flight):
         yield _position(name, track)
     if isinstance(flight.ekf2, Ekf2):
@@ -238,7 +234,7 @@ def _tables(flight: Flight) -> Iterator[_Table]:
     if not isinstance(flight.airborne, Unavailable):
         spans = pd.DataFrame(list(flight.airborne), columns=["time_s", "end_s"], dtype=np.float64)
         yield _Table("airborne", (_TIME, *_AIRBORNE), spans,
-                     _topics(flight, "airborne"), _clock(flight, "airborne"))  # fmt: skip
+                     *_origin(flight, "airborne"))  # fmt: skip
     if flight.log.dropouts:
         rows = [(dropout.start_s, dropout.duration_s) for dropout in flight.log.dropouts]
         lost = pd.DataFrame(rows, columns=["time_s", "duration_s"], dtype=np.float64)
@@ -264,7 +260,7 @@ def _ekf2(flight: Flight, ekf2: Ekf2) -> Iterator[_Table]:
         tidy = pd.concat(frames).sort_index(kind="stable")
         yield from _series(flight, "ekf2_innovations", tidy, _INNOVATIONS)
     yield from _series(flight, "ekf2_fusing", ekf2.fusing, _FUSING)
-    topics, clock = _topics(flight, "ekf2_state"), _clock(flight, "ekf2_state")
+    topics, clock = _origin(flight, "ekf2_state")
     resets = pd.DataFrame(
         [(reset.time_s, reset.quantity, *reset.delta) for reset in ekf2.resets],
         columns=["time_s", *(column.name for column in _RESETS)],
@@ -280,14 +276,11 @@ def _ekf2(flight: Flight, ekf2: Ekf2) -> Iterator[_Table]:
 
 
 def _series(
-    flight: Flight,
-    name: str,
-    data: pd.DataFrame | Unavailable,
-    columns: tuple[_Column, ...],
+    flight: Flight, name: str, data: pd.DataFrame | Unavailable, columns: tuple[_Column, ...]
 ) -> Iterator[_Table]:
     """A time series that is named as its stream; nothing where it is unavailable."""
     if isinstance(data, pd.DataFrame):
-        yield _timed(name, columns, data, _topics(flight, name), _clock(flight, name))
+        yield _timed(name, columns, data, *_origin(flight, name))
 
 
 def _timed(
@@ -323,11 +316,7 @@ def _position(name: str, track: PositionTrack) -> _Table:
     return _timed(name, columns, track.samples, track.topics, track.clock)
 
 
-def _topics(flight: Flight, part: str) -> tuple[str, ...]:
+def _origin(flight: Flight, part: str) -> tuple[tuple[str, ...], str]:
+    """Topics and clock that a part was read from."""
     stream = flight.streams.get(part)
-    return () if stream is None else stream.topics
-
-
-def _clock(flight: Flight, part: str) -> str:
-    stream = flight.streams.get(part)
-    return "" if stream is None else stream.clock
+    return ((), "") if stream is None else (stream.topics, stream.clock)

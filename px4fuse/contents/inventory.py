@@ -10,68 +10,32 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from px4fuse.comparison.preparation import NOT_ITS_OWN_TRUTH
-from px4fuse.comparison.projection import (
-    MIN_COMMON_SAMPLES,
-    project_innovations,
-    project_state,
-    project_truth,
-    project_variance,
+from px4fuse.contents.outlook import (
+    PART_NAMES,
+    Ability,
+    Advice,
+    Plan,
+    abilities,
+    advice,
+    most_innovations,
 )
 from px4fuse.errors import MissingDataError, Px4FuseError
-from px4fuse.filter.consistency import MIN_INNOVATIONS
 from px4fuse.filter.signals import (
     IMU_GAP_INTERVALS,
     IMU_GAP_S,
-    Axis,
     Segment,
     choose_segment,
     choose_source,
     make_axes,
-    ned_acceleration,
-    within,
 )
-from px4fuse.findings.ekf2_innovations_decimated import MIN_INNOVATION_SHARE
-from px4fuse.findings.ekf2_not_fusing import EV_START_INTERVAL
-from px4fuse.findings.imu_gap import IMU_GAP_TOTAL
-from px4fuse.findings.logging_rate_low import MIN_ATTITUDE_RATE, MIN_IMU_RATE, too_slow
 from px4fuse.findings.source_gap import GAP, GAP_INTERVALS
-from px4fuse.findings.source_not_logged import VISION_PROFILE_BIT
-from px4fuse.flight import (
-    VELOCITY_COLUMNS,
-    ClockMap,
-    Ekf2,
-    Flight,
-    InputFile,
-    LogInfo,
-    PositionTrack,
-    Unavailable,
-    Unused,
-    sample_rate,
-)
+from px4fuse.flight import Ekf2, Flight, Unavailable, sample_rate
 from px4fuse.plain import plain
+from px4fuse.recording import ClockMap, InputFile, LogInfo, Unused
 from px4fuse.request import with_options
 
 SCHEMA_NAME = "px4fuse-info"
 SCHEMA_VERSION = "1.0"
-# How a part is named for a person, by its name in Flight.streams
-PART_NAMES = {
-    "imu": "IMU",
-    "attitude": "attitude",
-    "ekf2_state": "EKF2 state",
-    "ekf2_variance": "EKF2 variance",
-    "ekf2_innovations": "innovations",
-    "ekf2_fusing": "fusion flags",
-    "truth": "truth",
-    "airborne": "land detector",
-}
-# The rung of the position as PX4 received it, and the last that was logged as it arrived
-AS_RECEIVED = "position source vehicle_visual_odometry"
-LAST_LOGGED_RUNG = 3
-RECEIVED_RUNG = 2
-# EKF2 starts on external vision only where samples are closer than EV_START_INTERVAL; with jitter a
-# source needs this much more than that rate to be fused without luck
-EV_RATE_MARGIN = 1.25
 
 
 @dataclass(frozen=True)
@@ -138,23 +102,6 @@ class Source:
 
 
 @dataclass(frozen=True)
-class Ability:
-    """One thing that px4fuse can or cannot do with the log, and with what or why not."""
-
-    name: str
-    possible: bool
-    reason: str
-
-
-@dataclass(frozen=True)
-class Advice:
-    """What to do before the next flight, and for what."""
-
-    remedy: str
-    improves: tuple[str, ...]
-
-
-@dataclass(frozen=True)
 class Inventory:
     """What ``px4fuse info`` says.
 
@@ -198,17 +145,6 @@ class Inventory:
     notes: tuple[str, ...]
 
 
-@dataclass(frozen=True)
-class _Plan:
-    """How far compare would get: its source, segment and first axes, or why not."""
-
-    track: PositionTrack | None
-    segment: Segment | None
-    axes: tuple[Axis, ...]
-    reason: str
-    remedy: str
-
-
 def take_inventory(flight: Flight) -> Inventory:
     """Take stock of a flight.
 
@@ -216,10 +152,6 @@ def take_inventory(flight: Flight) -> Inventory:
     ----------
     flight : Flight
         Any: also one of which every part is unavailable.
-
-    Returns
-    -------
-    Inventory
     """
     plan = _plan(flight)
     return Inventory(
@@ -230,8 +162,8 @@ def take_inventory(flight: Flight) -> Inventory:
         source_reason=plan.reason,
         segment=plan.segment,
         clocks=flight.clocks,
-        abilities=tuple(_abilities(flight, plan)),
-        advice=_merged(_advice(flight, plan)),
+        abilities=tuple(abilities(flight, plan)),
+        advice=advice(flight, plan),
         missing=flight.missing,
         unused=flight.unused,
         inputs=flight.inputs,
@@ -258,22 +190,22 @@ def _utc(unix_s: float | None) -> str | None:
         return None
 
 
-def _plan(flight: Flight) -> _Plan:
+def _plan(flight: Flight) -> Plan:
     track = segment = None
     reason = remedy = ""
     try:
         track, reason = choose_source(flight)
         segment = choose_segment(flight, track)
-        return _Plan(track, segment, make_axes(flight, track, segment), reason, "")
+        return Plan(track, segment, make_axes(flight, track, segment), reason, "")
     except Px4FuseError as error:
         text = with_options(str(error)).removeprefix(f"{flight.log.name}: ")
         reason, _, remedy = text.partition(". ")
         if not isinstance(error, MissingDataError):
             remedy = "Record more of the flight: the logger from arming on (SDLOG_MODE 0)."
-    return _Plan(track, None, (), reason.removesuffix("."), remedy)
+    return Plan(track, None, (), reason.removesuffix("."), remedy)
 
 
-def _sources(flight: Flight, plan: _Plan) -> Iterator[Source]:
+def _sources(flight: Flight, plan: Plan) -> Iterator[Source]:
     ekf2 = flight.ekf2
     yield _part(flight, "imu", flight.imu)
     yield _part(flight, "attitude", flight.attitude)
@@ -293,19 +225,11 @@ def _sources(flight: Flight, plan: _Plan) -> Iterator[Source]:
     yield _part(flight, "ekf2_state", ekf2 if isinstance(ekf2, Unavailable) else ekf2.state)
     if isinstance(ekf2, Ekf2):
         yield _part(flight, "ekf2_variance", ekf2.variance)
-        yield _part(flight, "ekf2_innovations", _most_innovations(ekf2))
+        yield _part(flight, "ekf2_innovations", most_innovations(ekf2))
         yield _part(flight, "ekf2_fusing", ekf2.fusing)
     truth = flight.truth
     yield _part(flight, "truth", truth if isinstance(truth, Unavailable) else truth.samples)
     yield _part(flight, "airborne", flight.airborne)
-
-
-def _most_innovations(ekf2: Ekf2) -> pd.DataFrame | Unavailable:
-    """Innovations of the axis that has most of them."""
-    frames = [frame for frame in ekf2.innovations.values() if isinstance(frame, pd.DataFrame)]
-    if frames:
-        return max(frames, key=len)
-    return next(part for part in ekf2.innovations.values() if isinstance(part, Unavailable))
 
 
 def _part(
@@ -316,8 +240,7 @@ def _part(
     stream = flight.streams.get(key)
     topics = () if stream is None else stream.topics
     if isinstance(data, pd.DataFrame):
-        limit_s = _gap_limit(data) if key != "imu" else _imu_gap_limit(data)
-        counted = _counted(data, limit_s)
+        counted = _counted(data, _gap_limit(data, of_imu=key == "imu"))
     else:
         counted = {"start_s": data[0][0], "end_s": data[-1][1]} if data else {}
     return Source(
@@ -348,208 +271,9 @@ def _counted(frame: pd.DataFrame, limit_s: float | None) -> dict[str, Any]:
     return counted
 
 
-def _gap_limit(frame: pd.DataFrame) -> float | None:
+def _gap_limit(frame: pd.DataFrame, *, of_imu: bool = False) -> float | None:
     if len(frame) < 2:
         return None
+    if of_imu:
+        return max(IMU_GAP_S, IMU_GAP_INTERVALS * float(np.median(np.diff(frame.index.to_numpy()))))
     return max(GAP.value, GAP_INTERVALS.value / sample_rate(frame))
-
-
-def _imu_gap_limit(frame: pd.DataFrame) -> float | None:
-    if len(frame) < 2:
-        return None
-    return max(IMU_GAP_S, IMU_GAP_INTERVALS * float(np.median(np.diff(frame.index.to_numpy()))))
-
-
-def _abilities(flight: Flight, plan: _Plan) -> Iterator[Ability]:
-    """What compare would do, asked of the functions that compare uses."""
-    track, segment = plan.track, plan.segment
-    if track is None or segment is None:
-        yield Ability("compare", False, plan.reason)
-    else:
-        count = len(within(track.samples, segment))
-        yield Ability(
-            "compare",
-            True,
-            f"our filter on {track.name}, {count} samples, {segment.start_s:.1f} s to "
-            f"{segment.end_s:.1f} s",
-        )
-    acceleration = plan.axes[0].acceleration if plan.axes else ned_acceleration(flight)
-    if isinstance(acceleration, Unavailable):
-        yield Ability("acceleration", False, f"{acceleration.reason}; velocity is held constant")
-    elif slow := list(_too_slow(flight)):
-        rates = " and ".join(
-            f"{PART_NAMES[key]} at {_hertz(rate)} Hz ({needed:g} Hz are needed)"
-            for key, rate, needed in slow
-        )
-        taken = "" if segment is None else "; compare takes it all the same"
-        yield Ability("acceleration", False, f"{rates}: motion between samples is lost{taken}")
-    else:
-        yield Ability("acceleration", True, "IMU turned into NED by the attitude, gravity removed")
-    yield from _ekf2_abilities(flight, plan)
-    yield _truth_ability(flight, plan)
-
-
-def _too_slow(flight: Flight) -> Iterator[tuple[str, float, float]]:
-    """Part, its rate and the rate that the acceleration needs, where it falls short of that."""
-    for key, part, needed in (
-        ("imu", flight.imu, MIN_IMU_RATE),
-        ("attitude", flight.attitude, MIN_ATTITUDE_RATE),
-    ):
-        if isinstance(part, pd.DataFrame) and too_slow(part, needed):
-            yield key, sample_rate(part), needed.value
-
-
-def _hertz(rate: float) -> str:
-    return f"{rate:.{1 if rate < 10 else 0}f}"
-
-
-def _ekf2_abilities(flight: Flight, plan: _Plan) -> Iterator[Ability]:
-    names = ("EKF2 states", "EKF2 variances", "EKF2 innovations")
-    ekf2 = flight.ekf2
-    if isinstance(ekf2, Unavailable):
-        for name in names:
-            yield Ability(name, False, ekf2.reason)
-        return
-    if plan.track is None or plan.segment is None:
-        for name, part in zip(
-            names, (ekf2.state, ekf2.variance, _most_innovations(ekf2)), strict=True
-        ):
-            reason = part.reason if isinstance(part, Unavailable) else "no position to compare on"
-            yield Ability(name, False, reason)
-        return
-    axis, segment = plan.axes[0], plan.segment
-    state = project_state(ekf2.state, axis, segment)
-    enough = len(state) >= MIN_COMMON_SAMPLES
-    yield Ability(names[0], enough, f"{len(state)} samples of position and velocity")
-    variance = project_variance(ekf2, axis, segment)
-    if isinstance(variance, Unavailable):
-        yield Ability(names[1], False, variance.reason)
-    else:
-        yield Ability(names[1], True, f"{len(variance)} samples")
-    found = {
-        axis.name: project_innovations(flight, ekf2, plan.track, axis, segment)
-        for axis in plan.axes
-    }
-    counts = {name: len(f) for name, f in found.items() if isinstance(f, pd.DataFrame)}
-    if not counts:
-        reason = next(part.reason for part in found.values() if isinstance(part, Unavailable))
-        yield Ability(names[2], False, reason)
-    elif max(counts.values()) < MIN_INNOVATIONS:
-        most = max(counts.values())
-        yield Ability(names[2], False, f"{most} are too few for a statement")
-    else:
-        said = ", ".join(f"{name} {count}" for name, count in counts.items())
-        yield Ability(names[2], True, f"two-sided consistency: {said}")
-
-
-def _truth_ability(flight: Flight, plan: _Plan) -> Ability:
-    truth = flight.truth
-    if isinstance(truth, Unavailable):
-        return Ability("truth", False, truth.reason)
-    if plan.track is None or plan.segment is None:
-        return Ability("truth", False, "no position to compare on")
-    if plan.track.name == truth.name:
-        return Ability("truth", False, NOT_ITS_OWN_TRUTH.reason)
-    projected = project_truth(truth, plan.axes[0], plan.segment)
-    if isinstance(projected, Unavailable):
-        return Ability("truth", False, projected.reason)
-    has_velocity = bool(truth.samples[VELOCITY_COLUMNS].notna().any(axis=None))
-    what = "position and velocity" if has_velocity else "position only"
-    return Ability("truth", True, f"RMSE and NEES of {what} against {truth.name}")
-
-
-def _advice(flight: Flight, plan: _Plan) -> Iterator[Advice]:
-    """Remedies, most important first."""
-    log, track, ekf2 = flight.log, plan.track, flight.ekf2
-    if any("damaged" in note for note in log.notes):
-        remedy = (
-            "Record where the link loses no bytes: by cable, or on the companion."
-            if log.format.startswith("MAVLink")
-            else "Copy the log from the SD card again; if it stays damaged, replace the card."
-        )
-        yield Advice(remedy, ("everything",))
-    if plan.remedy:
-        yield Advice(f"{plan.remedy[0].upper()}{plan.remedy[1:]}", ("position",))
-    elif track is not None:
-        yield from _position_advice(flight, track)
-    yield from _rate_advice(flight)
-    if isinstance(ekf2, Unavailable):
-        yield Advice(ekf2.remedy, ("EKF2",))
-    elif log.has_ulog:  # no other autopilot could have recorded more of its estimator
-        if track is not None:  # without a position, EKF2 had nothing to fuse
-            yield from _innovation_advice(ekf2, track)
-        for key, part in (("ekf2_variance", ekf2.variance), ("ekf2_fusing", ekf2.fusing)):
-            if isinstance(part, Unavailable):
-                yield Advice(part.remedy, (PART_NAMES[key],))
-    lost_s = sum(dropout.duration_s for dropout in log.dropouts)
-    if lost_s > IMU_GAP_TOTAL.value:
-        yield Advice("Use a faster SD card, or log less (SDLOG_PROFILE).", ("dropouts",))
-    for key, last in (("airborne", flight.airborne), ("truth", flight.truth)):
-        if isinstance(last, Unavailable) and (key == "airborne" or log.has_ulog):
-            yield Advice(last.remedy, (PART_NAMES[key],))
-
-
-def _position_advice(flight: Flight, track: PositionTrack) -> Iterator[Advice]:
-    missing = next((part for part in flight.missing if part.what == AS_RECEIVED), None)
-    profile = int(flight.log.parameters.get("SDLOG_PROFILE", 1))
-    if track.rung > LAST_LOGGED_RUNG and missing is not None:
-        remedy = (
-            missing.remedy
-            if profile & VISION_PROFILE_BIT
-            else f"Set SDLOG_PROFILE to {profile | VISION_PROFILE_BIT} (it is {profile}): bit 7 "
-            "logs the position as it arrives, vehicle_visual_odometry."
-        )
-        yield Advice(remedy, ("position",))
-    ekf2 = flight.ekf2
-    fused = isinstance(ekf2, Ekf2) and isinstance(ekf2.innovations["north"], pd.DataFrame)
-    slow = track.rate_hz < EV_RATE_MARGIN / EV_START_INTERVAL.value
-    if fused and slow and track.rung == RECEIVED_RUNG:
-        yield Advice(
-            "Send the position at 10 Hz: EKF2 (v1.14 and later) starts to fuse only samples less "
-            f"than {EV_START_INTERVAL.value:g} s apart.",
-            ("EKF2",),
-        )
-
-
-def _rate_advice(flight: Flight) -> Iterator[Advice]:
-    for key, part in (("imu", flight.imu), ("attitude", flight.attitude)):
-        if isinstance(part, Unavailable):
-            yield Advice(part.remedy, (PART_NAMES[key],))
-    for key, rate, needed in _too_slow(flight):
-        if key in flight.streams:
-            topic = flight.streams[key].topics[0]
-            how = (
-                f'put the line "{topic} 0" into etc/logging/logger_topics.txt on the SD card'
-                if flight.log.format == "ULog"
-                else f"request {topic} at a higher rate (MAV_CMD_SET_MESSAGE_INTERVAL)"
-            )
-            yield Advice(
-                f"{rate:.1f} Hz is below the {needed:g} Hz that the acceleration needs: {how}.",
-                (PART_NAMES[key],),
-            )
-
-
-def _innovation_advice(ekf2: Ekf2, track: PositionTrack) -> Iterator[Advice]:
-    innovations, height = ekf2.innovations["north"], ekf2.innovations["down"]
-    if isinstance(innovations, Unavailable):
-        yield Advice(innovations.remedy, (PART_NAMES["ekf2_innovations"],))
-        return
-    measured = track.samples.loc[innovations.index[0] : innovations.index[-1]]
-    decimated = len(innovations) < MIN_INNOVATION_SHARE.value * len(measured)
-    if decimated and not track.reconstructed and ekf2.innovation_topics:
-        yield Advice(
-            f'Put the line "{ekf2.innovation_topics[0]} 0" into etc/logging/logger_topics.txt on '
-            f"the SD card: the log holds {len(innovations)} EKF2 innovations for "
-            f"{len(measured)} measurements.",
-            (PART_NAMES["ekf2_innovations"],),
-        )
-    if isinstance(height, Unavailable):
-        yield Advice(height.remedy, ("innovations of height",))
-
-
-def _merged(advice: Iterator[Advice]) -> tuple[Advice, ...]:
-    """Each remedy once, with all that it improves."""
-    improves: dict[str, dict[str, None]] = {}
-    for single in advice:
-        improves.setdefault(single.remedy, {}).update(dict.fromkeys(single.improves))
-    return tuple(Advice(remedy, tuple(parts)) for remedy, parts in improves.items())

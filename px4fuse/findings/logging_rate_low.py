@@ -6,7 +6,8 @@ import pandas as pd
 
 from px4fuse.analysis import Analysis
 from px4fuse.findings.model import Detector, Finding, Found, Threshold
-from px4fuse.flight import LogInfo, sample_rate
+from px4fuse.flight import sample_rate
+from px4fuse.recording import LogInfo
 
 MIN_IMU_RATE = Threshold(
     50.0, "Hz", "5 IMU samples per DT of 0.1 s and 10 with margin for aliasing"

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from px4fuse.findings.model import Detector, Finding, Found, Threshold
-from px4fuse.loop.loop import Judged, Loop
+from px4fuse.loop.corrections import Judged
+from px4fuse.loop.loop import Loop
 from px4fuse.trajectory.graph.analysis import GATE_ALPHA
 
 MOST = Threshold(0.5, "share", "of several closures, more are true than false")

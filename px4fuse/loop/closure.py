@@ -48,16 +48,11 @@ def upright(trajectory: Trajectory) -> Trajectory:
         return trajectory
     rows, frame, note = _TO_Z_DOWN[trajectory.frame]
     turn = np.array(rows)
-    rotation = trajectory.rotation
-    if rotation is not None:
-        rotation = Rotation.from_matrix(turn) * rotation
-        if trajectory.frame == "camera":
-            rotation = rotation * Rotation.from_matrix(turn).inv()
     variance = trajectory.position_variance_m2
     return replace(
         trajectory,
         position_m=trajectory.position_m @ turn.T,
-        rotation=rotation,
+        rotation=_turned(trajectory, Rotation.from_matrix(turn), trajectory.frame),
         frame=frame,
         position_variance_m2=None if variance is None else variance @ np.abs(turn).T,
         notes=(*trajectory.notes, note),
@@ -69,18 +64,21 @@ def in_frame(trajectory: Trajectory, frame: Frame) -> Trajectory:
     if frame not in _TO_Z_DOWN or trajectory.frame not in ("NED", "FRD"):
         return trajectory
     back = Rotation.from_matrix(np.array(_TO_Z_DOWN[frame][0])).inv()
-    rotation = trajectory.rotation
-    if rotation is not None:
-        rotation = back * rotation
-        if frame == "camera":
-            rotation = rotation * back.inv()
     return replace(
         trajectory,
         position_m=back.apply(trajectory.position_m),
-        rotation=rotation,
+        rotation=_turned(trajectory, back, frame),
         frame=frame,
         position_variance_m2=None,
     )
+
+
+def _turned(trajectory: Trajectory, turn: Rotation, frame: Frame) -> Rotation | None:
+    """Orientations in a frame turned from or to ``frame``; a camera's axes turn with it."""
+    if trajectory.rotation is None:
+        return None
+    turned = turn * trajectory.rotation
+    return turned * turn.inv() if frame == "camera" else turned
 
 
 def key_frame_spacing_m(position_m: Array) -> float:
@@ -149,10 +147,7 @@ def heading_change_rad(rotation: Rotation) -> float:
 
 
 def correct_by_distance(
-    trajectory: Trajectory,
-    cumulative_m: Array,
-    misclosure_m: Array,
-    misclosure_heading_rad: float,
+    trajectory: Trajectory, cumulative_m: Array, misclosure_m: Array, misclosure_heading_rad: float
 ) -> Trajectory:
     """Distribute a misclosure of position and heading by distance.
 
@@ -182,10 +177,7 @@ def correct_by_distance(
     turned = position[0] + np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
     left = turned[-1] - (position[-1] - misclosure_m)
     rotation = trajectory.rotation
-    return replace(
-        trajectory,
-        position_m=distribute_by_distance(turned, left, cumulative_m),
-        rotation=None if rotation is None else turn * rotation,
-        position_variance_m2=None,
-        rotation_variance_rad2=None,
+    return trajectory.moved(
+        distribute_by_distance(turned, left, cumulative_m),
+        None if rotation is None else turn * rotation,
     )

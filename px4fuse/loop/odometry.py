@@ -11,7 +11,7 @@ from px4fuse.arrays import Array, IntArray
 from px4fuse.errors import SettingsError
 from px4fuse.loop.closure import DOWN, heading_change_rad
 from px4fuse.trajectory.graph import lie
-from px4fuse.trajectory.graph.pose_graph import PoseGraph
+from px4fuse.trajectory.graph.model import PoseGraph
 from px4fuse.trajectory.model import Trajectory, cumulative_distance
 
 # The reported variances of an odometry tell its drift only where they grow along the path
@@ -64,7 +64,6 @@ def odometry_variances(
 
     Parameters
     ----------
-    path : Trajectory
     nodes : ndarray of int, shape (k,)
         Poses that become nodes of the graph.
     noise : OdometryNoise
@@ -151,10 +150,7 @@ class Closure:
 
 
 def pose_graph(
-    path: Trajectory,
-    nodes: IntArray,
-    closures: tuple[Closure, ...],
-    noise: OdometryNoise,
+    path: Trajectory, nodes: IntArray, closures: tuple[Closure, ...], noise: OdometryNoise
 ) -> tuple[PoseGraph, str]:
     """Pose graph of a path: an edge from node to node by odometry, and one per closure.
 
@@ -165,7 +161,6 @@ def pose_graph(
     nodes : ndarray of int, shape (k,)
         Must hold the poses nearest to the times of the closures.
     closures : tuple of Closure
-    noise : OdometryNoise
 
     Returns
     -------

@@ -103,7 +103,6 @@ def part_of_flight(
 
     Parameters
     ----------
-    flight : Flight
     trajectory : Trajectory
         One of its tracks.
     start_s, end_s : float or None
@@ -179,9 +178,6 @@ def measured_end(
 
     Parameters
     ----------
-    trajectory : Trajectory
-    segment : Segment
-    at_rest : bool
     forward_m, right_m : float
         Along its nose at take-off, and to the right of it.
     heading_change_deg : float or None

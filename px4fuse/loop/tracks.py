@@ -12,7 +12,6 @@ from px4fuse.arrays import Array
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.projection import continuous_state
 from px4fuse.errors import MissingDataError
-from px4fuse.filter.kalman import Settings
 from px4fuse.filter.signals import Segment
 from px4fuse.flight import (
     AXIS_NAMES,
@@ -26,8 +25,8 @@ from px4fuse.flight import (
     PositionTrack,
     Truth,
     Unavailable,
-    finite_rows,
 )
+from px4fuse.readers.parts import finite_rows
 from px4fuse.trajectory.model import MIN_POSES, Frame, Kind, Trajectory
 
 Part = Literal["vio", "ekf2", "kf", "truth"]
@@ -50,7 +49,7 @@ def odometry_of(flight: Flight) -> PositionTrack | Unavailable:
     )
 
 
-def trajectory_of(flight: Flight, part: Part, settings: Settings | None = None) -> Trajectory:
+def trajectory_of(flight: Flight, part: Part) -> Trajectory:
     """One part of a flight as a trajectory.
 
     Parameters
@@ -58,36 +57,28 @@ def trajectory_of(flight: Flight, part: Part, settings: Settings | None = None) 
     flight : Flight
     part : {"vio", "ekf2", "kf", "truth"}
         "kf" is our filter, along north, east and down, with the autopilot's attitude.
-    settings : Settings, optional
-        Of our filter.
 
     Raises
     ------
     MissingDataError
         The log lacks it; the text says what would have logged it.
     """
-    if part == "vio":
-        track = odometry_of(flight)
-        if isinstance(track, Unavailable):
-            raise _missing(flight, part, track)
-        frame: Frame = track.frame if track.frame in ("NED", "FRD") else "FRD"  # type: ignore[assignment]
-        return _odometry(flight, track, frame)
-    if part == "truth":
-        if isinstance(flight.truth, Unavailable):
-            raise _missing(flight, part, flight.truth)
-        return _truth(flight, flight.truth)
-    if part == "ekf2":
-        if isinstance(flight.ekf2, Unavailable):
-            raise _missing(flight, part, flight.ekf2)
-        return _ekf2(flight, flight.ekf2)
-    return _ours(flight, settings)
+    if part == "kf":
+        return _ours(flight)
+    found = {"vio": odometry_of(flight), "truth": flight.truth, "ekf2": flight.ekf2}[part]
+    if isinstance(found, PositionTrack):
+        return _odometry(flight, found)
+    if isinstance(found, Ekf2):
+        return _ekf2(flight, found)
+    if isinstance(found, Truth):
+        samples = finite_rows(found.samples, POSITION_COLUMNS)[POSITION_COLUMNS]
+        return _trajectory(flight, part, samples, found.attitude, "NED", None, (found.name,))
+    raise MissingDataError(f"{flight.log.name}:{part}: {found.reason}. {found.remedy}")
 
 
-def _missing(flight: Flight, part: Part, reason: Unavailable) -> MissingDataError:
-    return MissingDataError(f"{flight.log.name}:{part}: {reason.reason}. {reason.remedy}")
-
-
-def _odometry(flight: Flight, track: PositionTrack, frame: Frame) -> Trajectory:
+def _odometry(flight: Flight, track: PositionTrack) -> Trajectory:
+    # where the log does not say, x is taken to be forward at the start
+    frame: Frame = "NED" if track.frame == "NED" else "FRD"
     samples = finite_rows(track.samples, POSITION_COLUMNS)
     return _trajectory(
         flight,
@@ -98,11 +89,6 @@ def _odometry(flight: Flight, track: PositionTrack, frame: Frame) -> Trajectory:
         samples[POSITION_VARIANCE_COLUMNS],
         (f"{track.name}: {track.description}",),
     )
-
-
-def _truth(flight: Flight, truth: Truth) -> Trajectory:
-    samples = finite_rows(truth.samples, POSITION_COLUMNS)[POSITION_COLUMNS]
-    return _trajectory(flight, "truth", samples, truth.attitude, "NED", None, (truth.name,))
 
 
 def _ekf2(flight: Flight, ekf2: Ekf2) -> Trajectory:
@@ -116,8 +102,8 @@ def _ekf2(flight: Flight, ekf2: Ekf2) -> Trajectory:
     return _trajectory(flight, "ekf2", state[POSITION_COLUMNS], attitude, "NED", None, notes)
 
 
-def _ours(flight: Flight, settings: Settings | None) -> Trajectory:
-    compared = compare(flight, settings, axes=AXIS_NAMES)
+def _ours(flight: Flight) -> Trajectory:
+    compared = compare(flight, axes=AXIS_NAMES)
     position = pd.DataFrame(
         {
             column: result.replay.steps["position_m"]
@@ -151,13 +137,17 @@ def _trajectory(
         if inside.sum() >= MIN_POSES:
             position = position[inside]
             variance = None if variance is None else variance[inside]
-            rotation = _slerp(orientation, position.index.to_numpy())
-            rotation_variance = _at(orientation, position.index.to_numpy())
+            times = position.index.to_numpy()
+            quaternions = orientation[QUATERNION_COLUMNS].to_numpy(copy=True)
+            known = Rotation.from_quat(quaternions, scalar_first=True)
+            rotation = Slerp(orientation.index.to_numpy(), known)(times)
+            rotation_variance = _at(orientation, times)
     if len(position) < MIN_POSES:
         raise MissingDataError(
             f"{flight.log.name}:{part}: {len(position)} poses are too few (at least {MIN_POSES})."
         )
-    known = variance is not None and not variance.isna().to_numpy().any()
+    if variance is not None and variance.isna().to_numpy().any():
+        variance = None
     return Trajectory(
         name=f"{flight.log.name}:{part}",
         kind=part,
@@ -166,20 +156,12 @@ def _trajectory(
         rotation=rotation,
         frame=frame,
         unix_offset_s=flight.log.start_unix_s,
-        position_variance_m2=variance.to_numpy(np.float64) if known and variance is not None
-        else None,
+        position_variance_m2=None if variance is None else variance.to_numpy(np.float64),
         rotation_variance_rad2=rotation_variance,
         sha256=flight.log.sha256,
         size_bytes=flight.log.size_bytes,
         notes=notes,
-    )  # fmt: skip
-
-
-def _slerp(orientation: pd.DataFrame, times: Array) -> Rotation:
-    quaternions = orientation[QUATERNION_COLUMNS].to_numpy(copy=True)
-    rotations = Rotation.from_quat(quaternions, scalar_first=True)
-    turned: Rotation = Slerp(orientation.index.to_numpy(), rotations)(times)
-    return turned
+    )
 
 
 def _at(orientation: pd.DataFrame, times: Array) -> Array | None:

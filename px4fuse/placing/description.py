@@ -10,13 +10,7 @@ import pandas as pd
 
 from px4fuse.flight import Alignment, Flight, Unavailable
 from px4fuse.placing.fitting import MIN_CONCORDANCE, capped_rms
-from px4fuse.placing.matching import (
-    GOOD_CONCORDANCE,
-    Match,
-    is_sound,
-    is_turned,
-    residual_words,
-)
+from px4fuse.placing.matching import GOOD_CONCORDANCE, Match, is_sound, is_turned, residual_words
 from px4fuse.placing.tracks import (
     EKF2_POSITION,
     IMU,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import TypeVar
 
 import numpy as np
 import pandas as pd
@@ -16,14 +17,15 @@ from px4fuse.flight import (
     Flight,
     FlightMode,
     FusionRecord,
-    InputFile,
     PositionTrack,
     Reset,
     Truth,
     Unavailable,
-    missing_parts,
 )
+from px4fuse.readers.parts import missing_parts
+from px4fuse.recording import InputFile
 
+Table = TypeVar("Table", pd.DataFrame, pd.Series)
 # Both recordings must hold this much of the same time
 MIN_OVERLAP_S = 2.0
 # EKF2's position is sent as it is logged: what is left is interpolation between samples
@@ -42,10 +44,6 @@ def join(flight: Flight, other: Flight) -> Flight:
         Keeps its time zero and everything that it has.
     other : Flight
         Gives what ``flight`` lacks, and all its position tracks.
-
-    Returns
-    -------
-    Flight
 
     Raises
     ------
@@ -116,7 +114,7 @@ def _span(flight: Flight) -> str:
     return f"{start:.1f} s to {start + flight.log.duration_s:.1f} s"
 
 
-def _later(frame: pd.DataFrame, shift_s: float) -> pd.DataFrame:
+def _later(frame: Table, shift_s: float) -> Table:
     return frame.set_axis(pd.Index(frame.index.to_numpy() + shift_s, name="time_s"))
 
 
@@ -172,11 +170,10 @@ def _shifted(flight: Flight, shift_s: float) -> Flight:
 def _later_record(record: FusionRecord | Unavailable, shift_s: float) -> FusionRecord | Unavailable:
     if isinstance(record, Unavailable):
         return record
-    age_s = record.vision_age_s
     return replace(
         record,
         delayed=_later(record.delayed, shift_s),
-        vision_age_s=age_s.set_axis(pd.Index(age_s.index.to_numpy() + shift_s, name="time_s")),
+        vision_age_s=_later(record.vision_age_s, shift_s),
     )
 
 

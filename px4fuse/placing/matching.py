@@ -109,7 +109,7 @@ def find_match(
             _check_match(match)
             if match.reference.name == IMU:
                 return match
-            return _mend_resets(flight, samples, match, yaw_rad, lag_s)
+            return _fitted_across_resets(flight, samples, match, yaw_rad, lag_s)
         except NoMatchError as error:
             if error.remedy and sought:
                 raise
@@ -172,7 +172,7 @@ def is_sound(fit: Fit, reference: str) -> bool:
 
 
 def _check_match(match: Match) -> None:
-    """Refuse a match that is none, or is not the only one.
+    """Refuse a match that is poor, or is not the only one.
 
     Raises
     ------
@@ -206,12 +206,8 @@ def _check_match(match: Match) -> None:
             )
 
 
-def _mend_resets(
-    flight: Flight,
-    samples: pd.DataFrame,
-    match: Match,
-    yaw_rad: float | None,
-    lag_s: float | None,
+def _fitted_across_resets(
+    flight: Flight, samples: pd.DataFrame, match: Match, yaw_rad: float | None, lag_s: float | None
 ) -> Match:
     """Fit again to EKF2 with its resets treated as everything else in px4fuse treats them."""
     if isinstance(flight.ekf2, Unavailable) or not flight.ekf2.resets:
@@ -228,11 +224,7 @@ def _mend_resets(
 
 
 def _best_fit(
-    samples: pd.DataFrame,
-    frame: str,
-    reference: Track,
-    yaw_rad: float | None,
-    lag_s: float | None,
+    samples: pd.DataFrame, frame: str, reference: Track, yaw_rad: float | None, lag_s: float | None
 ) -> Fit:
     """Find the lag, unless it is given, then fit."""
     file = file_track(samples, frame)

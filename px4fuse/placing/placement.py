@@ -18,10 +18,12 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from px4fuse.errors import MissingDataError, SettingsError
-from px4fuse.flight import Flight, InputFile, PositionTrack, finite_rows
+from px4fuse.flight import Flight, PositionTrack
 from px4fuse.placing.description import describe
 from px4fuse.placing.matching import find_match
 from px4fuse.placing.tracks import EKF2_POSITION, FRAMES, IMU, MIN_SAMPLES, NoMatchError
+from px4fuse.readers.parts import finite_rows
+from px4fuse.recording import InputFile
 
 if TYPE_CHECKING:
     from px4fuse.readers.position_csv import PositionFile
@@ -41,8 +43,6 @@ def place(
 
     Parameters
     ----------
-    flight : Flight
-    file : PositionFile
     frame : {"ned", "enu", "nwu"}, optional
         What the file's x, y, z are; by default what its column names say, or else what fits.
     yaw_deg : float or "auto", optional

@@ -20,8 +20,8 @@ from px4fuse.flight import (
     Flight,
     PositionTrack,
     Unavailable,
-    finite_rows,
 )
+from px4fuse.readers.parts import finite_rows
 from px4fuse.trajectory.offset import STEP_S
 
 # Which of x, y, z is north, east, down, and with which sign

@@ -24,10 +24,6 @@ def read_log(path: str | Path, *, system: int | None = None) -> Flight:
     system : int, optional
         MAVLink system id of the vehicle; by default the autopilot with the most messages.
 
-    Returns
-    -------
-    Flight
-
     Raises
     ------
     LogError

@@ -41,7 +41,7 @@ def read_closures(path: Path) -> tuple[GivenClosure, ...]:
     Raises
     ------
     TrajectoryError
-        The file cannot be read, holds no closure, or a line is none.
+        The file cannot be read, holds no closure, or has a line that is not one.
     """
     name = shown(path)
     text = text_of(read_whole(path, TrajectoryError, MAX_FILE_BYTES))

@@ -11,7 +11,8 @@ from px4fuse.arrays import Array, IntArray
 from px4fuse.errors import TrajectoryError
 from px4fuse.readers.text_table import is_number, quote, text_of
 from px4fuse.reading import read_whole, shown
-from px4fuse.trajectory.graph.pose_graph import FROM_FILE, PoseGraph, initialise
+from px4fuse.trajectory.graph.initialisation import initialise
+from px4fuse.trajectory.graph.model import FROM_FILE, PoseGraph
 
 MAX_FILE_BYTES = 500_000_000
 # Tag: dimension, vertices that it names, numbers that follow them
@@ -50,10 +51,6 @@ def read_g2o(path: str | Path) -> PoseGraph:
     their numbers. One FIX is accepted and changes nothing but the frame: the first pose is what is
     held here. Where the file has no vertices, poses are made from the edges.
 
-    Parameters
-    ----------
-    path : str or Path
-
     Raises
     ------
     TrajectoryError
@@ -75,7 +72,6 @@ def parse_g2o(text: str, name: str) -> PoseGraph:
 
     Parameters
     ----------
-    text : str
     name : str
         Of the file, for messages.
 
@@ -104,10 +100,6 @@ def parse_g2o(text: str, name: str) -> PoseGraph:
 
 def g2o_text(graph: PoseGraph) -> str:
     """A pose graph in g2o's format, which :func:`read_g2o` turns into the same numbers.
-
-    Parameters
-    ----------
-    graph : PoseGraph
 
     Returns
     -------
@@ -168,11 +160,7 @@ def _split(text: str, name: str) -> tuple[dict[str, _Lines], list[tuple[int, int
 
 
 def _graph(
-    name: str,
-    dimension: int,
-    vertices: _Lines,
-    edges: _Lines,
-    fixed: list[tuple[int, int]],
+    name: str, dimension: int, vertices: _Lines, edges: _Lines, fixed: list[tuple[int, int]]
 ) -> PoseGraph:
     width = 3 if dimension == 2 else 7
     numbers = np.array(edges.numbers)

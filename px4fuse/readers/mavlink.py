@@ -11,7 +11,6 @@ from types import MappingProxyType
 
 import numpy as np
 import pandas as pd
-from scipy.spatial.transform import Rotation
 
 from px4fuse.flight import (
     ANGULAR_RATE_COLUMNS,
@@ -19,12 +18,7 @@ from px4fuse.flight import (
     SPECIFIC_FORCE_COLUMNS,
     Flight,
     FlightMode,
-    LogInfo,
     Unavailable,
-    Unused,
-    missing_parts,
-    stretches_of_flight,
-    stretches_of_modes,
 )
 from px4fuse.readers.mavlink_clocks import UNIX_FROM_S
 from px4fuse.readers.mavlink_ekf2 import MIN_NORM, read_ekf2
@@ -47,16 +41,21 @@ from px4fuse.readers.mavlink_recording import (
     BOOT_CLOCK,
     RECEIPT_CLOCK,
     Recording,
-    choose_autopilot,
-    clock_maps,
-    describe_senders,
-    map_senders,
+    quaternions_of_angles,
     settle_clocks,
     unix_of_boot,
     vector,
 )
+from px4fuse.readers.mavlink_senders import (
+    choose_autopilot,
+    clock_maps,
+    describe_senders,
+    map_senders,
+)
+from px4fuse.readers.parts import missing_parts, stretches_of_flight, stretches_of_modes
 from px4fuse.readers.px4_topics import PARAMETERS
 from px4fuse.readers.ulog_topics import dropped_note
+from px4fuse.recording import LogInfo, Unused
 
 # MAV_PARAM_TYPE: below, an integer
 PARAMETER_REAL = 9
@@ -122,11 +121,7 @@ def _read_imu(recording: Recording, remedies: Remedies) -> pd.DataFrame | Unavai
     if len(rows) < 2:
         raw = len(recording.rows("RAW_IMU"))
         refused = f"; {raw} RAW_IMU were refused, since raw counts have no unit" if raw else ""
-        return Unavailable(
-            "IMU",
-            f"no HIGHRES_IMU or SCALED_IMU{refused}",
-            remedies.imu,
-        )
+        return Unavailable("IMU", f"no HIGHRES_IMU or SCALED_IMU{refused}", remedies.imu)
     table = recording.frames.table(source.message, rows)
     if "id" in (table.dtype.names or ()):
         busiest = table["id"] == np.bincount(table["id"]).argmax()
@@ -158,10 +153,7 @@ def _read_attitude(recording: Recording, remedies: Remedies) -> pd.DataFrame | U
     message, rows = max(found, key=lambda pair: len(pair[1]))
     table = recording.frames.table(message, rows)
     if message == "ATTITUDE":
-        angles = vector(table, "yaw", "pitch", "roll")
-        usable = np.isfinite(angles).all(axis=1)
-        rows, table = rows[usable], table[usable]
-        quaternion = Rotation.from_euler("ZYX", angles[usable]).as_quat(scalar_first=True)
+        quaternion = quaternions_of_angles(table)
     elif message == "ODOMETRY":
         quaternion = table["q"].astype(np.float64)
     else:
@@ -172,9 +164,7 @@ def _read_attitude(recording: Recording, remedies: Remedies) -> pd.DataFrame | U
     attitude = recording.frame(message, boot_s, QUATERNION_COLUMNS, quaternion[good])
     if len(attitude) < 2:
         return Unavailable(
-            "attitude",
-            f"no usable {', '.join(ATTITUDE[:-1])} or {ATTITUDE[-1]}",
-            remedies.attitude,
+            "attitude", f"no usable {', '.join(ATTITUDE[:-1])} or {ATTITUDE[-1]}", remedies.attitude
         )
     recording.came_from("attitude", BOOT_CLOCK, message)
     return attitude
@@ -188,11 +178,7 @@ def _read_airborne(
     table = recording.frames.table("EXTENDED_SYS_STATE", rows)
     known = table["landed_state"] > 0
     if not np.any(known):
-        return Unavailable(
-            "land detector",
-            "no usable EXTENDED_SYS_STATE",
-            remedies.landed,
-        )
+        return Unavailable("land detector", "no usable EXTENDED_SYS_STATE", remedies.landed)
     recording.came_from("airborne", RECEIPT_CLOCK, "EXTENDED_SYS_STATE")
     time_s = recording.receipt_boot_s(rows[known]) - recording.zero_s
     landed = pd.Series(table["landed_state"][known] == LANDED, index=time_s)

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.stats import theilslopes
 
 from px4fuse.arrays import Array
-from px4fuse.flight import ClockMap
+from px4fuse.recording import ClockMap
 
 # Stamps within this of the boot clock at their receipt are taken to be on the boot clock
 SAME_CLOCK_S = 10.0
@@ -175,10 +175,6 @@ def map_clock(
         From boot clock to UNIX time by the autopilot's SYSTEM_TIME.
     has_receipt : bool
         Whether the recording has times of receipt, or only an order.
-
-    Returns
-    -------
-    Mapped
     """
     receipt = "receive time" if has_receipt else "position in the stream"
     boot_at_receipt = boot_of_receipt.at(received_s)
@@ -205,17 +201,14 @@ def map_clock(
         return Mapped(line, ClockMap(name, "boot clock", len(stamp_s), 0.0, 0.0, 0.0, note))
     kind = "UNIX time" if float(np.median(stamp_s)) > UNIX_FROM_S else "own clock"
     clock = f"{kind} of {name}"
-    candidates: list[tuple[str, Line, str]] = []
-    if synchronised is not None:
-        candidates.append(("TIMESYNC", synchronised, ""))
+    known = [] if synchronised is None else [("TIMESYNC", synchronised, "")]
     if kind == "UNIX time" and unix_of_boot is not None:
-        candidates.append(
-            (
-                "SYSTEM_TIME",
-                unix_of_boot.inverse(),
-                "assumes that sender and autopilot agree on UNIX time",
-            )
-        )
+        assumed = "assumes that sender and autopilot agree on UNIX time"
+        known.append(("SYSTEM_TIME", unix_of_boot.inverse(), assumed))
+    for method, line, note in known:
+        # a map that puts messages long before or after their receipt is of another clock
+        if abs(float(np.median(line.at(stamp_s) - boot_at_receipt))) <= SAME_CLOCK_S:
+            return Mapped(line, _statement(clock, method, line, stamp_s, note))
     late = least_delay(stamp_s, received_s)
     by_receipt = Line(
         late.x0,
@@ -224,19 +217,8 @@ def map_clock(
         late.jitter,
         late.pairs,
     )
-    candidates.append(
-        (
-            receipt,
-            by_receipt,
-            "no usable TIMESYNC or SYSTEM_TIME; late by the least delay of the link",
-        )
-    )
-    for method, line, note in candidates:
-        distance = float(np.median(line.at(stamp_s) - boot_at_receipt))
-        # a map that puts messages long before or after their receipt is of another clock
-        if method == receipt or abs(distance) <= SAME_CLOCK_S:
-            return Mapped(line, _statement(clock, method, line, stamp_s, note))
-    raise AssertionError("the last candidate is always taken")
+    note = "no usable TIMESYNC or SYSTEM_TIME; late by the least delay of the link"
+    return Mapped(by_receipt, _statement(clock, receipt, by_receipt, stamp_s, note))
 
 
 def _by_exchange(exchanges: Exchanges) -> Line | None:
@@ -249,8 +231,6 @@ def _by_exchange(exchanges: Exchanges) -> Line | None:
         lines.append(least_delay(exchanges.asked_s, exchanges.answered_s))
     if not lines:
         return None
-    if len(lines) == 1:
-        return lines[0]
     x0 = lines[0].x0
     return Line(
         x0,

@@ -27,7 +27,8 @@ from px4fuse.readers.mavlink_messages import (
     remedies_of,
 )
 from px4fuse.readers.mavlink_recording import BOOT_CLOCK, Recording, vector
-from px4fuse.readers.px4_ekf2 import DEFAULT_GATE, NO_SELECTOR
+from px4fuse.readers.px4_ekf2 import DEFAULT_GATE
+from px4fuse.readers.px4_instances import NO_SELECTOR
 
 VARIANCE_COLUMNS = POSITION_VARIANCE_COLUMNS + VELOCITY_VARIANCE_COLUMNS
 COVARIANT_POSITION = "LOCAL_POSITION_NED_COV"

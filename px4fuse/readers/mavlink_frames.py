@@ -190,10 +190,6 @@ def read_frames(path: Path) -> Frames:
     path : Path
         A ``.tlog`` with time stamps, or a raw stream of MAVLink 1 and 2.
 
-    Returns
-    -------
-    Frames
-
     Raises
     ------
     LogError
@@ -266,8 +262,8 @@ def _scan(content: bytes) -> tuple[Integers, Integers]:
 def _without_overlap(start: Integers, end: Integers, stamp: int) -> tuple[Integers, Integers]:
     """Frames that do not overlap; those that touch a neighbour go before those that do not.
 
-    One frame may lie in another one's payload (a tunnel), and chance makes a few of bytes that
-    are none, which must not hide the true ones below them.
+    One frame may lie in another one's payload (a tunnel), and by chance a few other bytes look
+    like frames, which must not hide the true ones below them.
     """
     if not np.any(start[1:] < end[:-1]):
         return start, end
@@ -316,12 +312,7 @@ def _candidates(
     end = crc_end + CHECKSUM
     end[second] += SIGNATURE * (source[at + 2] & SIGNED).astype(np.int64)
     known &= end <= len(source)
-    return (
-        start[known],
-        end[known],
-        crc_end[known],
-        _crc_extra()[number[known]].astype(np.uint16),
-    )
+    return (start[known], end[known], crc_end[known], _crc_extra()[number[known]].astype(np.uint16))
 
 
 def _among(values: Integers, increasing: Integers) -> BoolArray:

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from px4fuse.arrays import Array, IntArray
 from px4fuse.flight import (
@@ -19,7 +18,6 @@ from px4fuse.flight import (
     PositionTrack,
     Truth,
     Unavailable,
-    orientation_of,
 )
 from px4fuse.readers.mavlink_clocks import Mapped
 from px4fuse.readers.mavlink_ekf2 import odometry
@@ -32,7 +30,15 @@ from px4fuse.readers.mavlink_messages import (
     PositionInput,
     Remedies,
 )
-from px4fuse.readers.mavlink_recording import RECEIPT_CLOCK, Address, Recording, senders_of, vector
+from px4fuse.readers.mavlink_recording import (
+    RECEIPT_CLOCK,
+    Address,
+    Recording,
+    quaternions_of_angles,
+    vector,
+)
+from px4fuse.readers.mavlink_senders import senders_of
+from px4fuse.readers.parts import orientation_of
 from px4fuse.readers.px4_positions import (
     MIN_TRACK_SAMPLES,
     captured_truth,
@@ -53,10 +59,8 @@ def read_positions(
 
     Parameters
     ----------
-    recording : Recording
     mapped : mapping from address to Mapped
         Clock of every sender.
-    remedies : Remedies
     """
     found: list[PositionTrack | Unavailable] = []
     for source in POSITION_INPUTS:
@@ -163,13 +167,7 @@ def _orientation(source: PositionInput, table: NDArray[Any], frame: str) -> tupl
     variance = covariance[:, ROTATION_DIAGONAL].astype(np.float64)
     if source.message != "VISION_POSITION_ESTIMATE":
         return table["q"].astype(np.float64), variance
-    angles = vector(table, "yaw", "pitch", "roll")
-    known = np.isfinite(angles).all(axis=1)
-    quaternion = nothing[0]
-    if known.any():
-        turned = Rotation.from_euler("ZYX", angles[known])
-        quaternion[known] = turned.as_quat(scalar_first=True)
-    return quaternion, variance
+    return quaternions_of_angles(table), variance
 
 
 def read_truth(
@@ -189,23 +187,23 @@ def read_truth(
         rows = recording.rows(message)
         if len(rows) < MIN_TRACK_SAMPLES:
             continue
-        latitude, longitude, height, velocity = read(recording.frames.table(message, rows))
+        latitude, longitude, height, velocity, attitude = read(
+            recording.frames.table(message, rows)
+        )
         if not np.any(velocity):  # not sent: a vehicle that never moves has no use for truth
             velocity = np.full_like(velocity, np.nan)
         north, east = project(latitude, longitude, (float(latitude[0]), float(longitude[0])))
-        values = np.column_stack(
-            [north, east, height[0] - height, velocity, _true_attitude(message, rows, recording)]
-        )
+        values = np.column_stack([north, east, height[0] - height, velocity, attitude])
         samples = recording.frame(
             message, recording.receipt_boot_s(rows), STATE_COLUMNS + QUATERNION_COLUMNS, values
         ).dropna(subset=POSITION_COLUMNS[:2])
         if len(samples):
             recording.came_from("truth", RECEIPT_CLOCK, message)
-            attitude = orientation_of(samples)
+            turns = orientation_of(samples)
             return Truth(
                 message,
                 samples[STATE_COLUMNS],
-                None if attitude is None else attitude[QUATERNION_COLUMNS],
+                None if turns is None else turns[QUATERNION_COLUMNS],
             )
     captured = motion_capture(positions, "ATT_POS_MOCAP")
     if captured is None:
@@ -218,35 +216,30 @@ def read_truth(
     return captured_truth(captured)
 
 
-def _true_attitude(message: str, rows: IntArray, recording: Recording) -> Array:
-    """Quaternion w, x, y, z of the simulated vehicle, shape (n, 4); NaN where there is none."""
-    table = recording.frames.table(message, rows)
-    if message == "HIL_STATE_QUATERNION":
-        return table["attitude_quaternion"].astype(np.float64)
-    if message == "SIM_STATE":
-        return vector(table, "q1", "q2", "q3", "q4")
-    return np.full((len(table), 4), np.nan)
+def _hil_state(table: NDArray[Any]) -> tuple[Array, Array, Array, Array, Array]:
+    """Latitude, longitude (degrees), height (m), NED velocity (m/s) and quaternion w, x, y, z.
 
-
-def _hil_state(table: NDArray[Any]) -> tuple[Array, Array, Array, Array]:
-    """Latitude and longitude (degrees), height (m) and NED velocity (m/s), shape (n, 3)."""
+    Of shapes (n,), (n,), (n,), (n, 3) and (n, 4); NaN where there is none.
+    """
     return (
         table["lat"] * 1e-7,
         table["lon"] * 1e-7,
         table["alt"] * 1e-3,
         vector(table, "vx", "vy", "vz", scale=1e-2),
+        table["attitude_quaternion"].astype(np.float64),
     )
 
 
-def _sim_state(table: NDArray[Any]) -> tuple[Array, Array, Array, Array]:
+def _sim_state(table: NDArray[Any]) -> tuple[Array, Array, Array, Array, Array]:
     """As :func:`_hil_state`; latitude as integer where the sender has that extension."""
     fine = bool(np.any(table["lat_int"]))
     latitude = table["lat_int"] * 1e-7 if fine else table["lat"].astype(np.float64)
     longitude = table["lon_int"] * 1e-7 if fine else table["lon"].astype(np.float64)
-    return latitude, longitude, table["alt"].astype(np.float64), vector(table, "vn", "ve", "vd")
+    velocity, attitude = vector(table, "vn", "ve", "vd"), vector(table, "q1", "q2", "q3", "q4")
+    return latitude, longitude, table["alt"].astype(np.float64), velocity, attitude
 
 
-def _simstate(table: NDArray[Any]) -> tuple[Array, Array, Array, Array]:
+def _simstate(table: NDArray[Any]) -> tuple[Array, Array, Array, Array, Array]:
     """As :func:`_hil_state`; ArduPilot's has no height and no velocity."""
-    nothing = np.full(len(table), np.nan)
-    return table["lat"] * 1e-7, table["lng"] * 1e-7, nothing, np.full((len(table), 3), np.nan)
+    nothing = np.full((len(table), 4), np.nan)
+    return table["lat"] * 1e-7, table["lng"] * 1e-7, nothing[:, 0], nothing[:, :3], nothing

@@ -37,7 +37,7 @@ def plain_text(name: str, content: bytes) -> str:
             f"{name}: a binary file, not a text table. Give the CSV file of the UWB system; a "
             "flight log is read without `position`."
         )
-    if '"' in text:  # what looks like a separator is none within a quoted field: "1,5"
+    if '"' in text:  # within quotes, as in "1,5", there are no separators
         quoted = re.compile(r'(?<![^,;\t\n ])"([^"\n]*)"(?![^,;\t\n ])')
         text = quoted.sub(lambda field: re.sub("[,;\t]", ".", field[1]), text)
     return re.sub("(?<! ) +([,;\t\n])", r"\1", text) if " " in text else text

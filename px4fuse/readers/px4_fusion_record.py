@@ -6,14 +6,12 @@ Sources: PX4-Autopilot ``EKF2.cpp`` (PublishStates), ``EKF/common.h`` (order of 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from functools import partial
-from typing import Protocol
+from collections.abc import Mapping
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
+from px4fuse.arrays import Array
 from px4fuse.flight import (
     DELAYED_STATE_COLUMNS,
     DELAYED_VARIANCE_COLUMNS,
@@ -22,8 +20,9 @@ from px4fuse.flight import (
     FusionRecord,
     Unavailable,
 )
+from px4fuse.readers.px4_instances import Instances, of_primary
 from px4fuse.readers.px4_topics import BIAS_PER_STEP, COVARIANCE_OFFSETS, Layout
-from px4fuse.readers.ulog_topics import Topics, measurement_time_us
+from px4fuse.readers.ulog_topics import Topics, measurement_time_us, states_and_covariances
 
 TOPIC = "estimator_states"
 VISION = "vehicle_visual_odometry"
@@ -42,41 +41,25 @@ _AIDING_FLAGS: Mapping[str, str] = {
 # estimator_status.control_mode_flags, where the topic above is missing
 _AIDING_BITS: Mapping[str, int] = {"GPS": 2, "optical flow": 3, "vision velocity": 24}
 
-Array = NDArray[np.float64]
 
-
-class Primary(Protocol):
-    """Reads a topic from the instance of EKF2 that was primary at each time."""
-
-    def __call__(self, topic: str, *, read: Callable[[int], pd.DataFrame]) -> pd.DataFrame:
-        """Rows of the primary instance."""
-        ...
-
-
-def read_record(topics: Topics, step_s: float, primary: Primary) -> FusionRecord | Unavailable:
+def read_record(topics: Topics, step_s: float, instances: Instances) -> FusionRecord | Unavailable:
     """What the log tells of the inside of EKF2's filter.
 
     Parameters
     ----------
-    topics : Topics
     step_s : float
         Time between two predictions, for releases that keep biases per prediction.
-    primary : callable
-        ``primary(topic, read=...)`` gives the rows of the primary instance.
+    instances : tuple of (float, int)
+        Primary instance of EKF2 from each time on.
     """
-    instances = topics.instances(TOPIC)
-    if not instances:
+    available = topics.instances(TOPIC)
+    if not available:
         return RECORD_NOT_LOGGED
-    table = topics.tables[TOPIC, instances[0]]
-    length = (
-        sum(name.startswith("states[") for name in table),
-        sum(name.startswith("covariances[") for name in table),
-    )
+    length = states_and_covariances(topics.tables[TOPIC, available[0]])
     if length not in COVARIANCE_OFFSETS:
         return RECORD_NOT_LOGGED
     per_step = length in BIAS_PER_STEP
-    read = partial(topics.frame, _layout(COVARIANCE_OFFSETS[length][0]))
-    raw = primary(TOPIC, read=read).dropna()
+    raw = of_primary(topics, _layout(COVARIANCE_OFFSETS[length][0]), instances).dropna()
     norm = np.linalg.norm(raw[[f"state_{i}" for i in range(4)]].to_numpy(), axis=1)
     raw = raw[np.abs(norm - 1.0) < 0.01]
     if raw.empty:

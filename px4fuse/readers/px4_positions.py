@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 import pandas as pd
@@ -17,15 +16,14 @@ from px4fuse.flight import (
     QUATERNION_COLUMNS,
     STATE_COLUMNS,
     VELOCITY_COLUMNS,
-    ClockMap,
     Ekf2,
     PositionTrack,
     Truth,
     Unavailable,
-    finite_rows,
-    orientation_of,
 )
-from px4fuse.readers.px4_ekf2 import NO_SELECTOR, Instances, of_primary
+from px4fuse.readers.parts import finite_rows, orientation_of
+from px4fuse.readers.px4_ekf2 import target_step_s
+from px4fuse.readers.px4_instances import NO_SELECTOR, Instances, of_primary
 from px4fuse.readers.px4_topics import (
     AID_OBSERVATION_HORIZONTAL,
     AID_OBSERVATION_VERTICAL,
@@ -39,9 +37,9 @@ from px4fuse.readers.px4_topics import (
     TrackSource,
 )
 from px4fuse.readers.ulog_topics import Topics
+from px4fuse.recording import ClockMap
 
 MIN_TRACK_SAMPLES = 3
-DEFAULT_PREDICT_US = 10_000.0  # EKF2_PREDICT_US, ekf2_params.c
 EARTH_RADIUS_M = 6_371_000.0  # PX4's CONSTANTS_RADIUS_OF_EARTH, src/lib/geo/geo.h
 GPS_3D_FIX = 3
 # Samples that are published within this of their measurement have no measured time of their own
@@ -58,7 +56,7 @@ AUTOPILOT_CLOCK = "autopilot boot clock (as PX4 mapped the sender's stamp)"
 def read_positions(
     topics: Topics, ekf2: Ekf2 | Unavailable
 ) -> tuple[tuple[PositionTrack, ...], tuple[Unavailable, ...]]:
-    """Every external position track found, best rung first, and what was looked for in vain."""
+    """Every external position track, best rung first, and what was looked for and not found."""
     instances = NO_SELECTOR if isinstance(ekf2, Unavailable) else ekf2.instances
     candidates = [_read_logged(topics, source, instances) for source in TRACKS]
     candidates.append(_read_aid_observation(topics, instances))
@@ -89,7 +87,7 @@ def _unavailable(name: str, reason: str) -> Unavailable:
 def clean_positions(samples: pd.DataFrame, axes: list[str]) -> pd.DataFrame:
     """Positions and variances, without the rows that lack one of ``axes``.
 
-    A variance of 0 is none, as PX4 reads it (``EKF2.cpp``); it becomes NaN.
+    A variance of 0 becomes NaN: PX4 reads it as not given (``EKF2.cpp``).
     """
     found = finite_rows(samples.reindex(columns=POSITION_COLUMNS + POSITION_VARIANCE_COLUMNS), axes)
     given = found[POSITION_VARIANCE_COLUMNS]
@@ -97,7 +95,7 @@ def clean_positions(samples: pd.DataFrame, axes: list[str]) -> pd.DataFrame:
 
 
 def _finished(track: PositionTrack, axes: list[str]) -> PositionTrack | Unavailable:
-    """Drop samples without a position; a track that is too short is none."""
+    """Drop samples without a position, and the track where it is then too short."""
     samples = clean_positions(track.samples, axes)
     if len(samples) < MIN_TRACK_SAMPLES:
         return _unavailable(track.name, f"{len(samples)} finite samples are too few")
@@ -112,7 +110,7 @@ def _read_logged(
         return _unavailable(source.name, f"no topic {source.name} in the log")
     if not layout.topic.startswith("estimator_"):  # only EKF2's own topics have its instances
         instances = NO_SELECTOR
-    samples = of_primary(topics, layout.topic, instances, partial(topics.frame, layout))
+    samples = of_primary(topics, layout, instances)
     frame = "unknown"
     for field, names in FRAMES.items():
         if field in samples and len(samples):
@@ -150,18 +148,17 @@ def _read_aid_observation(topics: Topics, instances: Instances) -> PositionTrack
     layout = topics.find(AID_OBSERVATION_HORIZONTAL)
     if layout is None:
         return _unavailable(AID_SOURCE, f"no topic {AID_SOURCE} in the log")
-    samples = of_primary(topics, layout.topic, instances, partial(topics.frame, layout))
+    samples = of_primary(topics, layout, instances)
     used = [layout.topic]
     notes: tuple[str, ...] = ()
     vertical = topics.find(AID_OBSERVATION_VERTICAL)
     if vertical is not None:
-        height = of_primary(topics, vertical.topic, instances, partial(topics.frame, vertical))
+        height = of_primary(topics, vertical, instances)
         samples, notes = _with_height(samples, height)
         used.append(vertical.topic)
     # EKF2 stamps its buffer entries earlier than the sender did: by EKF2_EV_DELAY and by half its
     # update period (estimator_interface.cpp)
-    half_period_s = topics.log.parameters.get("EKF2_PREDICT_US", DEFAULT_PREDICT_US) * 0.5e-6
-    lead_s = _delay_s(topics) + half_period_s
+    lead_s = _delay_s(topics) + 0.5 * target_step_s(topics)
     samples.index = pd.Index(samples.index.to_numpy() + lead_s, name="time_s")
     return _finished(
         PositionTrack(
@@ -238,9 +235,7 @@ def _reconstruct(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack | Un
 
 
 def project(
-    latitude_deg: Array,
-    longitude_deg: Array,
-    origin: tuple[float, float],
+    latitude_deg: Array, longitude_deg: Array, origin: tuple[float, float]
 ) -> tuple[Array, Array]:
     """North and east (m) of an origin by the azimuthal equidistant projection that PX4 uses.
 
@@ -264,12 +259,9 @@ def project(
 
 def _local_origin(topics: Topics) -> tuple[float, float, float] | None:
     """EKF2's geographic origin (degrees, degrees, m), where it had one."""
-    layout = topics.find(LOCAL_POSITION)
-    if layout is None:
-        return None
-    local = topics.frame(layout)
+    local = topics.read(LOCAL_POSITION)
     columns = ["ref_lat", "ref_lon", "ref_alt"]
-    if not set(columns) <= set(local.columns):
+    if local is None or not set(columns) <= set(local.columns):
         return None
     origin = finite_rows(local[columns], columns)
     origin = origin[origin["ref_lat"] != 0]
@@ -277,6 +269,20 @@ def _local_origin(topics: Topics) -> tuple[float, float, float] | None:
         return None
     latitude, longitude, altitude = origin.iloc[-1]
     return float(latitude), float(longitude), float(altitude)
+
+
+def _projected(topics: Topics, geo: pd.DataFrame) -> pd.DataFrame:
+    """Latitude, longitude and altitude as north, east, down (m).
+
+    About EKF2's origin, or where it had none about their own first sample.
+    """
+    columns = ["latitude_deg", "longitude_deg", "altitude_m"]
+    latitude, longitude, altitude = geo[columns].to_numpy().T
+    origin = _local_origin(topics) or (latitude[0], longitude[0], altitude[0])
+    north, east = project(latitude, longitude, origin[:2])
+    return pd.DataFrame(
+        {"north_m": north, "east_m": east, "down_m": origin[2] - altitude}, index=geo.index
+    )
 
 
 def _read_gps(topics: Topics) -> PositionTrack | Unavailable:
@@ -292,18 +298,7 @@ def _read_gps(topics: Topics) -> PositionTrack | Unavailable:
         gps = gps[gps["fix_type"] >= GPS_3D_FIX]
     if gps.empty:
         return _unavailable(GPS_SOURCE, "the receiver never had a 3D fix")
-    origin = _local_origin(topics) or (
-        float(gps["latitude_deg"].iloc[0]),
-        float(gps["longitude_deg"].iloc[0]),
-        float(gps["altitude_m"].iloc[0]),
-    )
-    north, east = project(
-        gps["latitude_deg"].to_numpy(), gps["longitude_deg"].to_numpy(), origin[:2]
-    )
-    samples = pd.DataFrame(
-        {"north_m": north, "east_m": east, "down_m": origin[2] - gps["altitude_m"].to_numpy()},
-        index=gps.index,
-    )
+    samples = _projected(topics, gps)
     if {"eph_m", "epv_m"} <= set(gps.columns):
         samples["north_m2"] = samples["east_m2"] = gps["eph_m"].to_numpy() ** 2 / 2.0
         samples["down_m2"] = gps["epv_m"].to_numpy() ** 2
@@ -318,8 +313,8 @@ def _read_gps(topics: Topics) -> PositionTrack | Unavailable:
 def read_truth(topics: Topics, positions: tuple[PositionTrack, ...]) -> Truth | Unavailable:
     """Simulation ground truth, or motion capture where another track feeds EKF2.
 
-    Ground truth that has only latitude and longitude (v1.13 and older) is projected about EKF2's
-    origin, or where EKF2 had none about its own first sample, the simulation's home.
+    Some has only latitude and longitude (v1.13 and older); its own first sample is the simulation's
+    home.
     """
     layout = topics.find(TRUTH_LOCAL)
     if layout is not None:
@@ -330,22 +325,8 @@ def read_truth(topics: Topics, positions: tuple[PositionTrack, ...]) -> Truth | 
     if layout is not None:
         geo = finite_rows(topics.frame(layout), ["latitude_deg", "longitude_deg"])
         if len(geo):
-            origin = _local_origin(topics) or (
-                float(geo["latitude_deg"].iloc[0]),
-                float(geo["longitude_deg"].iloc[0]),
-                float(geo["altitude_m"].iloc[0]),
-            )
-            north, east = project(
-                geo["latitude_deg"].to_numpy(), geo["longitude_deg"].to_numpy(), origin[:2]
-            )
-            samples = pd.DataFrame(
-                {
-                    "north_m": north,
-                    "east_m": east,
-                    "down_m": origin[2] - geo["altitude_m"].to_numpy(),
-                },
-                index=geo.index,
-            ).join(geo.reindex(columns=VELOCITY_COLUMNS))
+            velocity = geo.reindex(columns=VELOCITY_COLUMNS)
+            samples = _projected(topics, geo).join(velocity)
             return Truth(layout.topic, samples, _true_attitude(topics))
     captured = motion_capture(positions, "vehicle_mocap_odometry", "att_pos_mocap")
     if captured is None:
@@ -358,10 +339,8 @@ def read_truth(topics: Topics, positions: tuple[PositionTrack, ...]) -> Truth | 
 
 
 def _true_attitude(topics: Topics) -> pd.DataFrame | None:
-    layout = topics.find(TRUTH_ATTITUDE)
-    if layout is None:
-        return None
-    attitude = orientation_of(topics.frame(layout))
+    logged = topics.read(TRUTH_ATTITUDE)
+    attitude = None if logged is None else orientation_of(logged)
     return None if attitude is None else attitude[QUATERNION_COLUMNS]
 
 

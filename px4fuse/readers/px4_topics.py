@@ -10,6 +10,17 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from px4fuse.flight import (
+    ANGULAR_RATE_COLUMNS,
+    AXIS_NAMES,
+    POSITION_COLUMNS,
+    POSITION_VARIANCE_COLUMNS,
+    QUATERNION_COLUMNS,
+    ROTATION_VARIANCE_COLUMNS,
+    SPECIFIC_FORCE_COLUMNS,
+    VELOCITY_COLUMNS,
+)
+
 
 @dataclass(frozen=True)
 class Layout:
@@ -32,61 +43,51 @@ class Layout:
     optional: Mapping[str, str] = field(default_factory=dict)
 
 
-def _vector(names: list[str], px4_field: str, first: int = 0) -> dict[str, str]:
-    return {name: f"{px4_field}[{first + i}]" for i, name in enumerate(names)}
+def _vector(names: list[str], px4_field: str) -> dict[str, str]:
+    return {name: f"{px4_field}[{i}]" for i, name in enumerate(names)}
 
 
-_POSITION = ["north_m", "east_m", "down_m"]
-_VARIANCE = ["north_m2", "east_m2", "down_m2"]
-_VELOCITY = ["north_m_s", "east_m_s", "down_m_s"]
-_FORCE = ["forward_m_s2", "right_m_s2", "down_m_s2"]
-_RATE = ["forward_rad_s", "right_rad_s", "down_rad_s"]
-_QUATERNION = ["w", "x", "y", "z"]
-_XYZ = dict(zip(_POSITION, "xyz", strict=True))
-# pose_covariance is the row-major upper triangle of a 6×6 matrix: diagonal at 0, 6, 11
+_XYZ = dict(zip(POSITION_COLUMNS, "xyz", strict=True))
+_POSITION_AND_VELOCITY = _XYZ | dict(zip(VELOCITY_COLUMNS, ("vx", "vy", "vz"), strict=True))
+# pose_covariance is the row-major upper triangle of a 6×6 matrix, rotations last
 _POSE_DIAGONAL = {
-    "north_m2": "pose_covariance[0]",
-    "east_m2": "pose_covariance[6]",
-    "down_m2": "pose_covariance[11]",
+    name: f"pose_covariance[{at}]"
+    for name, at in zip(POSITION_VARIANCE_COLUMNS, (0, 6, 11), strict=True)
 }
-_ROTATION_VARIANCE = ["forward_rad2", "right_rad2", "down_rad2"]
-# the same triangle's rotations, at 15, 18, 20
 _ROTATION_DIAGONAL = {
-    "forward_rad2": "pose_covariance[15]",
-    "right_rad2": "pose_covariance[18]",
-    "down_rad2": "pose_covariance[20]",
+    name: f"pose_covariance[{at}]"
+    for name, at in zip(ROTATION_VARIANCE_COLUMNS, (15, 18, 20), strict=True)
 }
 
 IMU = (
     Layout(
         "sensor_combined",
-        _vector(_FORCE, "accelerometer_m_s2") | _vector(_RATE, "gyro_rad"),
+        _vector(SPECIFIC_FORCE_COLUMNS, "accelerometer_m_s2")
+        | _vector(ANGULAR_RATE_COLUMNS, "gyro_rad"),
         "v1.8",
         {"accelerometer_offset_us": "accelerometer_timestamp_relative"},
     ),
 )
 
-ATTITUDE = (Layout("vehicle_attitude", _vector(_QUATERNION, "q"), "v1.8"),)
+ATTITUDE = (Layout("vehicle_attitude", _vector(QUATERNION_COLUMNS, "q"), "v1.8"),)
 
 LOCAL_POSITION = (
     Layout(
         "vehicle_local_position",
-        _XYZ | dict(zip(_VELOCITY, ["vx", "vy", "vz"], strict=True)),
+        _POSITION_AND_VELOCITY,
         "v1.8",
         {
-            "xy_reset_counter": "xy_reset_counter",
-            "z_reset_counter": "z_reset_counter",
-            "vxy_reset_counter": "vxy_reset_counter",
-            "vz_reset_counter": "vz_reset_counter",
+            **{
+                f"{moved}_reset_counter": f"{moved}_reset_counter"
+                for moved in ("xy", "z", "vxy", "vz")
+            },
             "delta_north_m": "delta_xy[0]",
             "delta_east_m": "delta_xy[1]",
             "delta_down_m": "delta_z",
             "delta_north_m_s": "delta_vxy[0]",
             "delta_east_m_s": "delta_vxy[1]",
             "delta_down_m_s": "delta_vz",
-            "ref_lat": "ref_lat",
-            "ref_lon": "ref_lon",
-            "ref_alt": "ref_alt",
+            **{name: name for name in ("ref_lat", "ref_lon", "ref_alt")},
         },
     ),
 )
@@ -108,7 +109,9 @@ COVARIANCE_OFFSETS: Mapping[tuple[int, int], tuple[int, int]] = {
 }
 
 # EKF2's accelerometer bias in m/s², whatever the generation of the state vector
-SENSOR_BIAS = (Layout("estimator_sensor_bias", _vector(_FORCE, "accel_bias"), "v1.11"),)
+SENSOR_BIAS = (
+    Layout("estimator_sensor_bias", _vector(SPECIFIC_FORCE_COLUMNS, "accel_bias"), "v1.11"),
+)
 ACCELEROMETER_BIAS_STATE = 13
 # States of the quaternion filter (24 covariances or 28) are velocity increments per prediction
 BIAS_PER_STEP: frozenset[tuple[int, int]] = frozenset({(24, 24), (32, 28)})
@@ -178,8 +181,8 @@ INNOVATIONS = (
         "ekf2_innovations",
         "ekf2_innovations",
         "",
-        {axis: f"vel_pos_innov[{3 + i}]" for i, axis in enumerate(("north", "east", "down"))},
-        {axis: f"vel_pos_innov_var[{3 + i}]" for i, axis in enumerate(("north", "east", "down"))},
+        {axis: f"vel_pos_innov[{3 + i}]" for i, axis in enumerate(AXIS_NAMES)},
+        {axis: f"vel_pos_innov_var[{3 + i}]" for i, axis in enumerate(AXIS_NAMES)},
         {},
         "v1.8 to v1.10",
     ),
@@ -198,13 +201,7 @@ NAV_STATES: Mapping[int, str] = {
     **{22 + number: f"External {number}" for number in range(1, 9)},
 }  # fmt: skip
 
-TRUTH_LOCAL = (
-    Layout(
-        "vehicle_local_position_groundtruth",
-        _XYZ | dict(zip(_VELOCITY, ["vx", "vy", "vz"], strict=True)),
-        "simulation",
-    ),
-)
+TRUTH_LOCAL = (Layout("vehicle_local_position_groundtruth", _POSITION_AND_VELOCITY, "simulation"),)
 TRUTH_GLOBAL = (
     Layout(
         "vehicle_global_position_groundtruth",
@@ -213,7 +210,9 @@ TRUTH_GLOBAL = (
         {"north_m_s": "vel_n", "east_m_s": "vel_e", "down_m_s": "vel_d"},
     ),
 )
-TRUTH_ATTITUDE = (Layout("vehicle_attitude_groundtruth", _vector(_QUATERNION, "q"), "simulation"),)
+TRUTH_ATTITUDE = (
+    Layout("vehicle_attitude_groundtruth", _vector(QUATERNION_COLUMNS, "q"), "simulation"),
+)
 
 _GPS_OPTIONAL = {
     "eph_m": "eph", "epv_m": "epv", "fix_type": "fix_type", "utc_us": "time_utc_usec",
@@ -248,8 +247,6 @@ class TrackSource:
     layouts: tuple[Layout, ...]
 
 
-_FRAME_NEW = {"pose_frame": "pose_frame"}
-_FRAME_OLD = {"local_frame": "local_frame"}
 # msg/VehicleOdometry.msg: LOCAL_FRAME_* up to v1.13, POSE_FRAME_* since v1.14
 FRAMES: Mapping[str, Mapping[int, str]] = {
     "pose_frame": {0: "unknown", 1: "NED", 2: "FRD"},
@@ -257,23 +254,23 @@ FRAMES: Mapping[str, Mapping[int, str]] = {
 }
 
 
+def _odometry_until_v1_13(topic: str, since: str) -> Layout:
+    optional = _POSE_DIAGONAL | _vector(QUATERNION_COLUMNS, "q") | _ROTATION_DIAGONAL
+    return Layout(topic, _XYZ, f"{since} to v1.13", optional | {"local_frame": "local_frame"})
+
+
 def _odometry(topic: str) -> tuple[Layout, ...]:
     return (
         Layout(
             topic,
-            _vector(_POSITION, "position"),
+            _vector(POSITION_COLUMNS, "position"),
             "v1.14",
-            _vector(_VARIANCE, "position_variance")
-            | _FRAME_NEW
-            | _vector(_QUATERNION, "q")
-            | _vector(_ROTATION_VARIANCE, "orientation_variance"),
+            _vector(POSITION_VARIANCE_COLUMNS, "position_variance")
+            | {"pose_frame": "pose_frame"}
+            | _vector(QUATERNION_COLUMNS, "q")
+            | _vector(ROTATION_VARIANCE_COLUMNS, "orientation_variance"),
         ),
-        Layout(
-            topic,
-            _XYZ,
-            "v1.9 to v1.13",
-            _POSE_DIAGONAL | _FRAME_OLD | _vector(_QUATERNION, "q") | _ROTATION_DIAGONAL,
-        ),
+        _odometry_until_v1_13(topic, "v1.9"),
     )
 
 
@@ -282,31 +279,20 @@ TRACKS = (
         "vehicle_visual_odometry",
         2,
         "external vision position as PX4 received it",
-        (
-            *_odometry("vehicle_visual_odometry"),
-            Layout("vehicle_vision_position", _XYZ, "v1.8"),
-        ),
+        (*_odometry("vehicle_visual_odometry"), Layout("vehicle_vision_position", _XYZ, "v1.8")),
     ),
     TrackSource(
         "vehicle_mocap_odometry",
         3,
         "motion capture, which EKF2 never fuses",
-        (
-            *_odometry("vehicle_mocap_odometry"),
-            Layout("att_pos_mocap", _XYZ, "v1.8"),
-        ),
+        (*_odometry("vehicle_mocap_odometry"), Layout("att_pos_mocap", _XYZ, "v1.8")),
     ),
     TrackSource(
         "estimator_visual_odometry_aligned",
         4,
         "external vision rotated into EKF2's frame",
         (
-            Layout(
-                "estimator_visual_odometry_aligned",
-                _XYZ,
-                "v1.12 to v1.13",
-                _POSE_DIAGONAL | _FRAME_OLD | _vector(_QUATERNION, "q") | _ROTATION_DIAGONAL,
-            ),
+            _odometry_until_v1_13("estimator_visual_odometry_aligned", "v1.12"),
             Layout("vehicle_visual_odometry_aligned", _XYZ, "v1.10 to v1.11", _POSE_DIAGONAL),
         ),
     ),
@@ -340,22 +326,10 @@ UNUSED: Mapping[str, str] = {
 # Parameters that bear on fusion and on what is logged, and the airframe; only these enter the
 # results
 PARAMETERS = (
-    "EKF2_AID_MASK",
-    "EKF2_EN",
-    "EKF2_EVP_GATE",
-    "EKF2_EVP_NOISE",
-    "EKF2_EV_CTRL",
-    "EKF2_EV_DELAY",
-    "EKF2_EV_NOISE_MD",
-    "EKF2_HGT_MODE",
-    "EKF2_HGT_REF",
-    "EKF2_ACC_NOISE",
-    "EKF2_PREDICT_US",
-    "EKF2_GPS_CTRL",
-    "SDLOG_PROFILE",
-    "SYS_AUTOSTART",
-    "SYS_MC_EST_GROUP",
-)
+    "EKF2_AID_MASK", "EKF2_EN", "EKF2_EVP_GATE", "EKF2_EVP_NOISE", "EKF2_EV_CTRL", "EKF2_EV_DELAY",
+    "EKF2_EV_NOISE_MD", "EKF2_HGT_MODE", "EKF2_HGT_REF", "EKF2_ACC_NOISE", "EKF2_PREDICT_US",
+    "EKF2_GPS_CTRL", "SDLOG_PROFILE", "SYS_AUTOSTART", "SYS_MC_EST_GROUP",
+)  # fmt: skip
 
 
 def topics() -> list[str]:

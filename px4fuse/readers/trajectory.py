@@ -12,7 +12,7 @@ import hashlib
 import math
 import re
 from dataclasses import dataclass
-from decimal import Decimal, InvalidOperation
+from decimal import Decimal
 from pathlib import Path
 
 import numpy as np
@@ -172,9 +172,6 @@ def tum_text(trajectory: Trajectory) -> str:
     return "# timestamp tx ty tz qx qy qz qw\n" + "\n".join(rows) + "\n"
 
 
-# -- the file --------------------------------------------------------------------------------------
-
-
 def _text(name: str, content: bytes) -> str:
     """Text with line feeds between lines."""
     text = text_of(content)
@@ -201,9 +198,6 @@ def _fields(line: str, layout: _Layout | None = None) -> list[str]:
 
 def _numeric(fields: list[str]) -> bool:
     return all(map(is_number, fields))
-
-
-# -- which format ----------------------------------------------------------------------------------
 
 
 def _recognise(file: _File) -> _Layout:
@@ -274,9 +268,6 @@ def _layout(file: _File, first: list[str], separator: str | None, header: list[s
     )
 
 
-# -- the numbers -----------------------------------------------------------------------------------
-
-
 def _parse(file: _File, layout: _Layout, rows: list[str]) -> tuple[list[str], Array]:
     """Stamps as text, and position and quaternion of each row, shape (n, 7)."""
     try:
@@ -339,7 +330,7 @@ def _seconds(file: _File, stamps: list[str]) -> tuple[Array, str]:
         # on a clock of its own only ORB-SLAM3's nanoseconds are known to occur
         is_known = first >= UNIX_START_S or unit == "nanoseconds"
         if is_known and last < UNIX_END_S and MIN_INTERVAL_S <= step / per_second <= MAX_INTERVAL_S:
-            ticks = np.array([_integer(stamp) for stamp in stamps], dtype=np.int64)
+            ticks = np.array([int(Decimal(stamp.strip())) for stamp in stamps], dtype=np.int64)
             return seconds_of(
                 ticks, per_second
             ), f"Its stamps are {unit} and were divided by {per_second:.0e}."
@@ -347,16 +338,6 @@ def _seconds(file: _File, stamps: list[str]) -> tuple[Array, str]:
         f"{file.name}: its stamps are {step:.3g} apart (median), which is not an interval of "
         "frames in seconds or nanoseconds. Give stamps in seconds."
     )
-
-
-def _integer(stamp: str) -> int:
-    whole, _, fraction = stamp.strip().partition(".")
-    if "e" not in (whole + fraction).casefold():
-        return int(whole)
-    try:
-        return int(Decimal(stamp.strip()))
-    except (InvalidOperation, ValueError):
-        return int(float(stamp))
 
 
 def _increasing(file: _File, time: Array, values: Array) -> tuple[Array, Array, str]:
@@ -391,9 +372,6 @@ def _rotation(quaternion: Array, w_first: bool) -> Rotation:
     norms = np.linalg.norm(quaternion, axis=1, keepdims=True)
     norms[np.abs(norms - 1.0) < UNIT_NORM] = 1.0
     return Rotation(quaternion / norms, normalize=False)
-
-
-# -- what it is ------------------------------------------------------------------------------------
 
 
 def _kind(

@@ -16,10 +16,10 @@ from px4fuse.flight import (
     SPECIFIC_FORCE_COLUMNS,
     Flight,
     FlightMode,
-    Stream,
     Truth,
     Unavailable,
-    Unused,
+)
+from px4fuse.readers.parts import (
     finite_rows,
     missing_parts,
     stretches_of_flight,
@@ -44,21 +44,14 @@ from px4fuse.readers.ulog_topics import (
     increasing,
     read_topics,
 )
+from px4fuse.recording import Stream, Unused
 
-# A receiver's UTC outside these is none: PX4's own GPS_EPOCH_SECS (gps_helper.h), and 2100
+# A receiver's UTC outside these is not valid: PX4's own GPS_EPOCH_SECS (gps_helper.h), and 2100
 UTC_RANGE_S = (1_234_567_890.0, 4_102_444_800.0)
 
 
 def read_ulog(path: Path) -> Flight:
     """Read a PX4 ULog.
-
-    Parameters
-    ----------
-    path : Path
-
-    Returns
-    -------
-    Flight
 
     Raises
     ------
@@ -69,12 +62,7 @@ def read_ulog(path: Path) -> Flight:
 
 
 def to_flight(topics: Topics) -> Flight:
-    """Make a flight of the topics of a log.
-
-    Parameters
-    ----------
-    topics : Topics
-    """
+    """Make a flight of the topics of a log."""
     imu = _read_imu(topics)
     attitude = _read_attitude(topics)
     ekf2 = read_ekf2(topics)
@@ -122,11 +110,8 @@ def _stream(topics: Topics, part: str, names: tuple[str, ...]) -> Stream:
 
 def _start_unix(topics: Topics) -> float | None:
     """UNIX time (s) of time zero by the GPS receiver, the median over its fixes."""
-    layout = topics.find(GPS)
-    if layout is None:
-        return None
-    gps = topics.frame(layout)
-    if "utc_us" not in gps:
+    gps = topics.read(GPS)
+    if gps is None or "utc_us" not in gps:
         return None
     utc_s = gps["utc_us"] * 1e-6
     known = utc_s.between(*UTC_RANGE_S)
@@ -136,12 +121,11 @@ def _start_unix(topics: Topics) -> float | None:
 
 
 def _read_imu(topics: Topics) -> pd.DataFrame | Unavailable:
-    layout = topics.find(IMU)
-    if layout is None:
+    imu = topics.read(IMU)
+    if imu is None:
         return Unavailable(
             "IMU", "no topic sensor_combined", "Record with SDLOG_PROFILE bit 0 (default)."
         )
-    imu = topics.frame(layout)
     if "accelerometer_offset_us" in imu:
         offset_us = imu.pop("accelerometer_offset_us")
         imu = imu[offset_us != ACCELEROMETER_OFFSET_INVALID_US]
@@ -160,12 +144,12 @@ def _read_imu(topics: Topics) -> pd.DataFrame | Unavailable:
 
 
 def _read_attitude(topics: Topics) -> pd.DataFrame | Unavailable:
-    layout = topics.find(ATTITUDE)
-    if layout is None:
+    attitude = topics.read(ATTITUDE)
+    if attitude is None:
         return Unavailable(
             "attitude", "no topic vehicle_attitude", "Record with SDLOG_PROFILE bit 0 (default)."
         )
-    attitude = topics.frame(layout)[QUATERNION_COLUMNS]
+    attitude = attitude[QUATERNION_COLUMNS]
     norm: Array = np.linalg.norm(attitude.to_numpy(), axis=1)
     attitude = attitude[np.isfinite(norm) & (norm > 0.5)]  # a zero quaternion is no attitude
     if len(attitude) < 2:
@@ -179,21 +163,20 @@ def _read_attitude(topics: Topics) -> pd.DataFrame | Unavailable:
 
 def _read_airborne(topics: Topics) -> tuple[tuple[float, float], ...] | Unavailable:
     """Stretches of flight by the land detector, each from take-off to touch-down."""
-    layout = topics.find(LAND_DETECTED)
-    landed = None if layout is None else topics.frame(layout, step=True)["landed"]
-    if landed is None or landed.empty:
+    detected = topics.read(LAND_DETECTED, step=True)
+    if detected is None or detected.empty:
         return Unavailable(
             "land detector",
             "no usable topic vehicle_land_detected",
             "Record with SDLOG_PROFILE bit 0 (default), or give --start and --end.",
         )
-    return stretches_of_flight(landed, topics.log.duration_s)
+    return stretches_of_flight(detected["landed"], topics.log.duration_s)
 
 
 def _read_modes(topics: Topics) -> tuple[FlightMode, ...] | Unavailable:
-    layout = topics.find(FLIGHT_MODE)
-    states = None if layout is None else topics.frame(layout, step=True)["nav_state"].dropna()
-    if states is None or states.empty:
+    status = topics.read(FLIGHT_MODE, step=True)
+    if status is None or status["nav_state"].isna().all():
         return MODES_NOT_LOGGED
+    states = status["nav_state"].dropna()
     names = states.map(lambda state: NAV_STATES.get(int(state), f"mode {state:.0f}"))
     return stretches_of_modes(names, topics.log.duration_s)

@@ -25,9 +25,9 @@ from pyulog.exceptions import ULogException
 
 from px4fuse.arrays import IntArray
 from px4fuse.errors import LogError
-from px4fuse.flight import Dropout, LogInfo
 from px4fuse.readers.px4_topics import IMU, PARAMETERS, Layout, topics
 from px4fuse.reading import read_log_bytes, shown
+from px4fuse.recording import Dropout, LogInfo
 
 _MICROSECOND = 1e-6
 # A measurement time stamp further than this from its publication is not on the boot clock
@@ -83,14 +83,13 @@ class Topics:
         """Instances of a topic that hold data, in order."""
         return sorted(instance for name, instance in self.tables if name == topic)
 
-    def find(self, layouts: tuple[Layout, ...], instance: int | None = None) -> Layout | None:
+    def find(self, layouts: tuple[Layout, ...]) -> Layout | None:
         """First layout that this log holds, or None."""
         for layout in layouts:
-            for name, number in self.tables:
-                if name == layout.topic and instance in (None, number):
-                    table = self.tables[name, number]
-                    if all(column in table for column in layout.columns.values()):
-                        return layout
+            for (name, _), table in self.tables.items():
+                wanted = layout.columns.values()
+                if name == layout.topic and all(column in table for column in wanted):
+                    return layout
         return None
 
     def frame(self, layout: Layout, instance: int = 0, *, step: bool = False) -> pd.DataFrame:
@@ -128,6 +127,11 @@ class Topics:
             return frame
         return self.window(frame)
 
+    def read(self, layouts: tuple[Layout, ...], *, step: bool = False) -> pd.DataFrame | None:
+        """:meth:`frame` of the first layout that this log holds; None where it holds none."""
+        layout = self.find(layouts)
+        return None if layout is None else self.frame(layout, step=step)
+
     def clock(self, topic: str) -> str:
         """Which moment the times of a topic's samples are."""
         measured = any(
@@ -160,6 +164,14 @@ def measurement_time_us(table: dict[str, NDArray[Any]]) -> NDArray[np.int64]:
     if np.count_nonzero(plausible) * 2 < len(plausible):
         return published
     return np.where(plausible, sampled, published)
+
+
+def states_and_covariances(table: Mapping[str, NDArray[Any]]) -> tuple[int, int]:
+    """How many of either a topic with EKF2's state vector has."""
+    states, covariances = (
+        sum(column.startswith(f"{name}[") for column in table) for name in ("states", "covariances")
+    )
+    return states, covariances
 
 
 def increasing(time_us: NDArray[np.int64]) -> IntArray:
@@ -216,7 +228,7 @@ def read_topics(path: Path) -> Topics:
     name, content = shown(path), read_log_bytes(path)
     chatter = io.StringIO()
     try:
-        with contextlib.redirect_stdout(chatter):  # pyulog prints what it stumbles over
+        with contextlib.redirect_stdout(chatter):  # pyulog prints its warnings
             ulog = ULog(_handle(content), message_name_filter_list=topics())
             tables = _tables(ulog)
             # a log of other topics can still be placed in time, by all that it holds
@@ -317,7 +329,7 @@ def _listed(names: list[str]) -> str:
 
 
 def _text(info: dict[str, Any], key: str, otherwise: str) -> str:
-    """One of the log's own words about itself, without what a terminal would obey."""
+    """A text from the log, without a terminal's control characters."""
     text = str(info.get(key, otherwise))
     return "".join(c for c in text if c.isprintable()) or otherwise
 

@@ -12,7 +12,8 @@ from matplotlib.figure import Figure
 from px4fuse.arrays import Array
 from px4fuse.findings import Finding
 from px4fuse.flight import Unavailable
-from px4fuse.loop.loop import BY_DISTANCE, PLAIN, UNCORRECTED, Correction, Loop
+from px4fuse.loop.corrections import BY_DISTANCE, PLAIN, UNCORRECTED, Correction
+from px4fuse.loop.loop import Loop
 from px4fuse.plain import p_words
 from px4fuse.report.cover import write_finding
 from px4fuse.report.document import Document, LoopDocument

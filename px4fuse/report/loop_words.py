@@ -8,7 +8,8 @@ from px4fuse.arrays import Array
 from px4fuse.filter.signals import Segment
 from px4fuse.flight import Unavailable
 from px4fuse.loop.analysis import SMALLEST_STAMP_S
-from px4fuse.loop.loop import SINGLE_LOOP, Correction, Judged, Loop
+from px4fuse.loop.corrections import SINGLE_LOOP, Correction, Judged
+from px4fuse.loop.loop import Loop
 from px4fuse.trajectory.evaluation import Evaluation
 from px4fuse.trajectory.graph.analysis import GATE_ALPHA
 from px4fuse.trajectory.model import AXES_OF_FRAME, Trajectory

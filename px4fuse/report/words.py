@@ -17,8 +17,9 @@ from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.findings import Finding
 from px4fuse.findings.source_clock import typed_offset_s
 from px4fuse.findings.variance import VARIANCE_FACTOR
-from px4fuse.flight import Alignment, ClockMap, Unavailable
+from px4fuse.flight import Alignment, Unavailable
 from px4fuse.plain import factor_words, number_words, p_words
+from px4fuse.recording import ClockMap
 
 # One update of EKF2 (EKF2_PREDICT_US)
 NEGLIGIBLE_OFFSET_S = 0.010

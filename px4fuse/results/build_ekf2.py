@@ -5,7 +5,7 @@ from __future__ import annotations
 from px4fuse.analysis import Counterfactual
 from px4fuse.comparison.why import Why
 from px4fuse.ekf2.replay import Agreement, Ekf2Replay
-from px4fuse.ekf2.whatif import AxisSummary, Summary
+from px4fuse.ekf2.whatif import Summary
 from px4fuse.flight import Unavailable
 from px4fuse.request import WhatIfRequest
 from px4fuse.results import ekf2 as made
@@ -81,28 +81,9 @@ def whatif_results(request: WhatIfRequest, made_of: Counterfactual, command: str
 
 def outcome(summary: Summary) -> made.Outcome:
     """One EKF2 of a what-if."""
-    axes = {name: _axis(axis) for name, axis in summary.axes.items()}
-    return copied(
-        made.Outcome,
-        summary,
-        changed=dict(summary.changed),
-        longest_without_fusion_s=_or_absent(summary.longest_without_fusion_s),
-        **axes,
-    )
-
-
-def _axis(axis: AxisSummary) -> made.AxisOutcome:
-    return copied(
-        made.AxisOutcome,
-        axis,
-        sigma_p_median_m=_or_absent(axis.sigma_p_median_m),
-        position_rmse_to_truth_m=_or_absent(axis.position_rmse_to_truth_m),
-    )
+    axes = {name: copied(made.AxisOutcome, axis) for name, axis in summary.axes.items()}
+    return copied(made.Outcome, summary, changed=dict(summary.changed), **axes)
 
 
 def _known(value: float | Unavailable) -> float | None:
     return None if isinstance(value, Unavailable) else value
-
-
-def _or_absent(value: float | Unavailable) -> float | Absent:
-    return absent(value) if isinstance(value, Unavailable) else value

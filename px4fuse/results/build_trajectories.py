@@ -10,7 +10,8 @@ import numpy as np
 from px4fuse.arrays import Array
 from px4fuse.findings import Finding
 from px4fuse.flight import Unavailable
-from px4fuse.loop.loop import Correction, Judged, Loop
+from px4fuse.loop.corrections import Correction, Judged
+from px4fuse.loop.loop import Loop
 from px4fuse.loop.part import KnownEnd
 from px4fuse.request import LoopRequest
 from px4fuse.results import trajectories as made

@@ -51,7 +51,15 @@ WHATIF = "px4fuse-whatif"
 CHANGES = "px4fuse-changes"
 
 
-class ComparisonResults(Base, frozen=True):
+class _OfFlight(Base, frozen=True):
+    schema: Schema
+    request: ComparisonRequest
+    log: Log
+    position_source: PositionSource
+    settings: ChosenSettings
+
+
+class ComparisonResults(_OfFlight, frozen=True):
     """Results of ``px4fuse compare``, attached to its report.
 
     Attributes
@@ -85,11 +93,6 @@ class ComparisonResults(Base, frozen=True):
     provenance : Provenance
     """
 
-    schema: Schema
-    request: ComparisonRequest
-    log: Log
-    position_source: PositionSource
-    settings: ChosenSettings
     axes: Annotated[dict[AxisName, Axis], Meta(min_length=1)]
     horizontal: Horizontal
     tuning: dict[str, Part[Tuned]]
@@ -106,26 +109,16 @@ class ComparisonResults(Base, frozen=True):
     provenance: Provenance
 
 
-class TuningResults(Base, frozen=True):
+class TuningResults(_OfFlight, frozen=True):
     """Results of ``px4fuse tune``: the noises that the data ask for, by axis."""
 
-    schema: Schema
-    request: ComparisonRequest
-    log: Log
-    position_source: PositionSource
-    settings: ChosenSettings
     tuning: dict[str, Part[Tuned]]
     provenance: Provenance
 
 
-class SyncResults(Base, frozen=True):
+class SyncResults(_OfFlight, frozen=True):
     """Results of ``px4fuse sync``: the clock offset of the position source."""
 
-    schema: Schema
-    request: ComparisonRequest
-    log: Log
-    position_source: PositionSource
-    settings: ChosenSettings
     clock: Part[Clock]
     provenance: Provenance
 
@@ -242,12 +235,7 @@ KINDS: dict[str, type[Results]] = {
 
 
 def schema() -> dict[str, Any]:
-    """JSON Schema (draft 2020-12) of everything that is written as results.
-
-    Returns
-    -------
-    dict
-    """
+    """JSON Schema (draft 2020-12) of everything that is written as results."""
     kinds: dict[type, None] = dict.fromkeys(KINDS.values())
     components: dict[str, Any] = {}
 

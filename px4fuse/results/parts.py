@@ -20,9 +20,12 @@ LIBRARIES = ("numpy", "scipy", "pandas", "pyulog", "pymavlink", "filterpy", "mat
 
 
 def copied(kind: type[S], source: object, /, **more: Any) -> S:
-    """A struct whose fields are those of the same names of ``source``, and ``more``."""
-    names = [name for name in kind.__struct_fields__ if hasattr(source, name)]
-    return kind(**{name: getattr(source, name) for name in names} | more)
+    """A struct whose fields are those of the same names of ``source``, and ``more``.
+
+    What is unavailable is absent.
+    """
+    same = {n: getattr(source, n) for n in kind.__struct_fields__ if hasattr(source, n)} | more
+    return kind(**{n: absent(v) if isinstance(v, Unavailable) else v for n, v in same.items()})
 
 
 def absent(part: Unavailable) -> Absent:

@@ -70,7 +70,7 @@ def one_line(text: str, length: int) -> str:
     >>> one_line("a\nb\t c", 4)
     'a b…'
     """
-    # whoever sends a million characters shall not have them all looked at
+    # of a million characters only as many are looked at as may count
     line = " ".join(cleaned(text[: 10 * length]).split())
     return line if len(line) <= length else line[: length - 1].rstrip() + "…"
 

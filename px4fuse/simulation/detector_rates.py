@@ -181,7 +181,6 @@ def found(seed: int, condition: Condition | None = None) -> tuple[str, ...]:
 
     Parameters
     ----------
-    seed : int
     condition : Condition, optional
         None for a clean flight of the usual scenario.
     """
@@ -209,8 +208,7 @@ def _fly(job: Job) -> list[tuple[str, ...]]:
         if condition.settings != first.settings:
             # the most likely noises and the clock's offset do not depend on the chosen ones
             compared = replace(
-                explained,
-                comparison=compare(flight, condition.settings, axes=("north", "east")),
+                explained, comparison=compare(flight, condition.settings, axes=("north", "east"))
             )
         ids = tuple(i for f in find(compared) for i in f.ids)
         named.append(_named(condition, (*ids, *(name for name in of_loop if name not in ids))))

@@ -32,14 +32,7 @@ from px4fuse.ekf2.output_predictor import follow_attitude, publish
 from px4fuse.ekf2.parameters import PARAMETERS as MODEL_PARAMETERS
 from px4fuse.ekf2.parameters import settings_in_force
 from px4fuse.ekf2.recursion import EAST, HEADING, NORTH, Variant
-from px4fuse.ekf2.rotation import (
-    conjugate,
-    from_vector,
-    multiply,
-    running_product,
-    skew,
-    to_vector,
-)
+from px4fuse.ekf2.rotation import conjugate, from_vector, multiply, running_product, skew, to_vector
 from px4fuse.ekf2.stretches import Stretch, down_sampled, step_ends
 from px4fuse.ekf2.vision import Vision
 from px4fuse.simulation import sensors
@@ -94,8 +87,6 @@ def fly(
 
     Parameters
     ----------
-    scenario : Scenario
-    motion : Motion
     imu, source : Topic
         As EKF2 received them, whatever of them is logged.
     flown : mapping
@@ -182,7 +173,7 @@ def _standing(
 ) -> tuple[Array, Array]:
     """State and covariance when the log begins: PX4's initial ones, told that it stands still.
 
-    Standing still, specific force is -g and rotation is nought, up to the biases; the first levels
+    Standing still, specific force is -g and rotation is zero, up to the biases; the first levels
     the attitude and ties tilt to accelerometer bias.
     """
     H = np.zeros((9, STATES))

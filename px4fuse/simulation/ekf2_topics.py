@@ -61,10 +61,8 @@ def ekf2_topics(
 
     Parameters
     ----------
-    inputs : Inputs
     done : StretchRun
         The model's run, of one variant in one stretch.
-    track : Track
     aid_source_hz : float
         To what estimator_aid_src_ev_pos is thinned; 0 leaves it.
     """

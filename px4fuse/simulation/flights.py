@@ -11,11 +11,12 @@ import numpy as np
 
 from px4fuse.ekf2.model import MODEL_NOTE
 from px4fuse.errors import SettingsError
-from px4fuse.flight import Flight, LogInfo
+from px4fuse.flight import Flight
 from px4fuse.plain import plain
 from px4fuse.readers import ulog
 from px4fuse.readers.px4_topics import IMU, PARAMETERS
 from px4fuse.readers.ulog_topics import NOTE_KEY, Topics
+from px4fuse.recording import LogInfo
 from px4fuse.simulation import ekf2, sensors
 from px4fuse.simulation.ekf2_topics import VEHICLE_AID_SOURCE_HZ
 from px4fuse.simulation.mistakes import MISTAKES, Mistakes, as_typed, made

@@ -30,52 +30,11 @@ _VALUE = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(\D.*)?")
 class Mistakes:
     """What goes wrong; the defaults are a flight without mistakes.
 
-    Attributes
-    ----------
-    clock_offset_s : float
-        The source's stamps are later than the measurement by this.
-    clock_drift_ppm : float
-        And by this share of the time since the first data.
-    clock_jump_s : float
-        Until TIMESYNC converges, 50 s after the first data, stamps are times of arrival, later
-        than the measurement by this.
-    nlos_percent, nlos_size_m : float
-        Share and mean size of the outliers, which come in bursts, each in one horizontal
-        direction.
-    dropout_s, dropout_at_s : float
-        The source is silent from ``dropout_at_s`` on, by default around the middle.
-    imu_dropout_s, imu_dropout_at_s : float
-        Likewise the IMU.
-    decimate_hz : float
-        The source is thinned to this rate; 0 leaves it.
-    r_scale : float
-        Factor from the true variance of the source to the one that it reports and that
-        EKF2_EVP_NOISE has.
-    yaw_deg : float
-        The source's frame is turned about the start, clockwise seen from above.
-    scale_percent : float
-        Its distances are too long by this.
-    jump_m, jump_at_s : float
-        From ``jump_at_s`` on (by default at two thirds) its positions are shifted along the aisle.
-    smoothed_s : float
-        Time constant of a low pass that the source applies to its positions.
-    accel_bias_m_s2 : float
-        Added to the accelerometer's forward axis.
-    vibration_m_s2 : float
-        White noise added to the accelerometer, as the standard deviation of its mean over 0.1 s.
-    imu_rate_hz : float
-        The IMU is logged at this rate only; 0 leaves it.
-    no_motion : bool
-        The vehicle hovers where it took off.
-    open_end_m : float
-        The loop ends this far before its start.
-    no_vvo : bool
-        The position source is not logged.
-    ekf2_noise_m, ekf2_delay_s, ekf2_gate : float
-        EKF2_EVP_NOISE, EKF2_EV_DELAY and EKF2_EVP_GATE as flown; a noise of 0 leaves it as the
-        source reports it.
-    ekf2_off : bool
-        EKF2_EV_CTRL is 0, so that EKF2 fuses no position.
+    :data:`MISTAKES` says what each is. Besides: outliers come in bursts, each in one horizontal
+    direction, and ``nlos_size_m`` is their mean size. A drop-out without a time lies around the
+    middle, a jump at two thirds. A rate of 0 leaves the rate as it is, an EKF2 noise of 0 what the
+    source reports. ``r_scale`` is a factor on the variance. A yaw is about the start, clockwise
+    seen from above. ``vibration_m_s2`` is the standard deviation of the noise's mean over 0.1 s.
     """
 
     clock_offset_s: float = 0.0
@@ -124,7 +83,7 @@ class Mistake:
     Attributes
     ----------
     arguments : tuple of Argument
-        The first is the mistake's size, the others may be left out; none for a mere yes.
+        The first is the mistake's size, the others may be left out; empty for a switch.
     default : float
         Size where none is given.
     help : str

@@ -17,6 +17,7 @@ from px4fuse.arrays import Array, IntArray
 from px4fuse.errors import SettingsError
 from px4fuse.simulation.mistakes import Mistakes
 from px4fuse.simulation.scenario import CORNER_S, START_STOP_S, Scenario
+from px4fuse.trajectory.graph.lie import cross
 
 # On the ground before take-off and after landing
 GROUND_S = 6.0
@@ -231,15 +232,7 @@ def attitude(state: State) -> Attitude:
     n_rate += state.yaw_rate_rad_s[:, None] * np.stack([-zz * c, -zz * s, zx * c + zy * s], axis=1)
     n_size = np.sqrt(np.einsum("ij,ij->i", n, n))
     y = n / n_size[:, None]
-    # x = y × z
-    x = np.stack(
-        [
-            y[:, 1] * zz - y[:, 2] * zy,
-            y[:, 2] * zx - y[:, 0] * zz,
-            y[:, 0] * zy - y[:, 1] * zx,
-        ],
-        axis=1,
-    )
+    x = cross(y, z)
     # from dR/dt = R [ω]×
     rate = np.stack(
         [

@@ -53,7 +53,7 @@ class Scenario:
     Attributes
     ----------
     kind : {"aisle", "loop"}
-        Passes to and fro along a straight line with UWB, or laps around a square with VIO.
+        Passes back and forth along a straight line with UWB, or laps around a square with VIO.
     passes : int
         Passes of the aisle, or laps of the loop.
     length_m : float

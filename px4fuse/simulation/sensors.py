@@ -35,20 +35,10 @@ LANDED_INTERVAL_US = 1_000_000
 POSE_FRAME_NED = 1  # msg/VehicleOdometry.msg
 
 
-class Stream(IntEnum):
-    """Streams of random numbers: a mistake in one sensor leaves the others' noise as it was."""
-
-    WANDER = 0
-    BIAS = 1
-    IMU = 2
-    ATTITUDE = 3
-    TIMING = 4
-    SOURCE = 5
-    DRIFT = 6
-    NLOS = 7
-    VIBRATION = 8
-    HEIGHT = 9
-    REST = 10
+# Streams of random numbers: a mistake in one sensor leaves the others' noise as it was
+Stream = IntEnum(
+    "Stream", "WANDER BIAS IMU ATTITUDE TIMING SOURCE DRIFT NLOS VIBRATION HEIGHT REST", start=0
+)
 
 
 def stream(scenario: Scenario, name: Stream) -> np.random.Generator:

@@ -74,7 +74,6 @@ def associate(
 
     Parameters
     ----------
-    estimate, reference : Trajectory
     method : {"interpolate", "nearest"}
         "interpolate" puts the reference at the estimate's times, position linearly and rotation by
         slerp. "nearest" pairs the poses of the one that has fewer with the nearest of the other,
@@ -142,14 +141,7 @@ def _at(trajectory: Trajectory, time_s: Array) -> Trajectory:
     rotation = trajectory.rotation
     if rotation is not None:
         rotation = Slerp(trajectory.time_s, rotation)(time_s)
-    return replace(
-        trajectory,
-        time_s=time_s,
-        position_m=positions_at(trajectory, time_s),
-        rotation=rotation,
-        position_variance_m2=None,
-        rotation_variance_rad2=None,
-    )
+    return replace(trajectory.moved(positions_at(trajectory, time_s), rotation), time_s=time_s)
 
 
 def positions_at(trajectory: Trajectory, time_s: Array) -> Array:

@@ -23,7 +23,6 @@ from px4fuse.trajectory.association import Association, Method, associate
 from px4fuse.trajectory.model import Trajectory, cumulative_distance
 from px4fuse.trajectory.offset import TimeOffset, clock_difference, estimate_time_offset
 from px4fuse.trajectory.scores import (
-    RELATIVE_TOLERANCE,
     Delta,
     Interval,
     RelativeError,
@@ -118,13 +117,11 @@ def evaluate(
     rpe_deltas: Sequence[Delta] | None = None,
     all_pairs: bool = True,
     pairs_from: Side = "reference",
-    relative_tolerance: float = RELATIVE_TOLERANCE,
 ) -> Evaluation:
     """Score an estimate against a reference.
 
     Parameters
     ----------
-    estimate, reference : Trajectory
     alignment : {"none", "yaw", "se3", "sim3"}, optional
         By default what the two are decides, see :func:`choose_alignment`.
     association : {"interpolate", "nearest"}
@@ -136,14 +133,7 @@ def evaluate(
         overlap.
     rpe_deltas : sequence of Delta, optional
         By default some distances and times that suit the flight.
-    all_pairs : bool
     pairs_from : {"estimate", "reference"}
-    relative_tolerance : float
-        By which a pair may be longer or shorter than its delta, where all pairs are used.
-
-    Returns
-    -------
-    Evaluation
 
     Raises
     ------
@@ -189,14 +179,7 @@ def evaluate(
     if rpe_deltas is None:
         rpe_deltas = default_deltas(distance, x.time_s)
     rpe = tuple(
-        relative_error(
-            aligned,
-            y,
-            delta,
-            all_pairs=all_pairs,
-            pairs_from=pairs_from,
-            relative_tolerance=relative_tolerance,
-        )
+        relative_error(aligned, y, delta, all_pairs=all_pairs, pairs_from=pairs_from)
         for delta in rpe_deltas
     )
     return Evaluation(
@@ -219,9 +202,6 @@ def evaluate(
         notes=notes,
         warnings=(*warnings, *offset_warnings, *_doubts(matched, alignment)),
     )
-
-
-# -- before the scores -----------------------------------------------------------------------------
 
 
 def choose_alignment(estimate: Trajectory, reference: Trajectory) -> tuple[AlignmentKind, str]:

@@ -92,6 +92,16 @@ class Trajectory(Shown):
             rotation_variance_rad2=_some(self.rotation_variance_rad2, chosen),
         )
 
+    def moved(self, position_m: Array, rotation: Rotation | None) -> Trajectory:
+        """The same poses elsewhere, of which no reported variance holds any longer."""
+        return replace(
+            self,
+            position_m=position_m,
+            rotation=rotation,
+            position_variance_m2=None,
+            rotation_variance_rad2=None,
+        )
+
 
 def _some(values: Array | None, chosen: slice | BoolArray | IntArray) -> Array | None:
     return None if values is None else values[chosen]

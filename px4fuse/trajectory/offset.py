@@ -87,10 +87,6 @@ def estimate_time_offset(estimate: Trajectory, reference: Trajectory) -> TimeOff
     is then minimised over the offset. The interval is that of the linearised least squares, with
     the score's variance over long runs (Newey & West 1987), as errors of poses are correlated.
 
-    Parameters
-    ----------
-    estimate, reference : Trajectory
-
     Returns
     -------
     TimeOffset

@@ -1,6 +1,6 @@
 """What the scores of a trajectory are made of: statistics, pairs of poses, RPE, intervals.
 
-Errors are correlated from pose to pose, hence intervals by a bootstrap over blocks.
+Errors are correlated from pose to pose, so intervals are by a bootstrap over blocks.
 """
 
 from __future__ import annotations
@@ -221,7 +221,6 @@ def relative_error(
     *,
     all_pairs: bool = True,
     pairs_from: Side = "reference",
-    relative_tolerance: float = RELATIVE_TOLERANCE,
 ) -> RelativeError:
     """RPE over one delta: E = (Q_i⁻¹ Q_j)⁻¹ (P_i⁻¹ P_j), Sturm (2012), eq. 1.
 
@@ -236,13 +235,7 @@ def relative_error(
         Whose path and times the delta is measured in.
     """
     source = reference if pairs_from == "reference" else aligned
-    start, end = pairs(
-        source.position_m,
-        source.time_s,
-        delta,
-        all_pairs=all_pairs,
-        relative_tolerance=relative_tolerance,
-    )
+    start, end = pairs(source.position_m, source.time_s, delta, all_pairs=all_pairs)
     what = f"RPE over {delta}"
     both = rotations_of(aligned, reference, what)
     if not isinstance(both, Unavailable) and not len(start):
@@ -287,11 +280,8 @@ def rotations_of(
     )
 
 
-# -- intervals -------------------------------------------------------------------------------------
-
-
 def rmse_interval(
-    errors: Array, what: str, *, min_block: int = 1, seed: int = SEED, resamples: int = RESAMPLES
+    errors: Array, what: str, *, min_block: int = 1, resamples: int = RESAMPLES
 ) -> Interval | Unavailable:
     """95 % interval of the RMSE of correlated errors: circular block bootstrap.
 
@@ -307,7 +297,6 @@ def rmse_interval(
         Of which score, for the reason where there is none.
     min_block : int
         Errors of pairs that overlap are correlated over so many.
-    seed, resamples : int
 
     Returns
     -------
@@ -327,7 +316,7 @@ def rmse_interval(
     sums = np.concatenate(([0.0], np.cumsum(np.concatenate((squares, squares[: length - 1])))))
     block_means = (sums[length:] - sums[:-length]) / length  # one for each start, round the end
     blocks = n / length
-    drawn = np.random.default_rng(seed).integers(0, n, (resamples, round(blocks)))
+    drawn = np.random.default_rng(SEED).integers(0, n, (resamples, round(blocks)))
     means = block_means[drawn].mean(axis=1)
     quantile = float(stdtrit(blocks - 1.0, 0.5 + LEVEL / 2.0))
     tail = float(ndtr(-quantile * np.sqrt(blocks / (blocks - 1.0))))

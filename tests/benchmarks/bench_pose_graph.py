@@ -33,7 +33,7 @@ def seconds(work: Callable[[], object]) -> float:
 def chain(poses: int):
     """Laps of 50 poses in space, a closure to the lap before every tenth pose."""
     from px4fuse.trajectory.graph import lie
-    from px4fuse.trajectory.graph.pose_graph import PoseGraph, composed
+    from px4fuse.trajectory.graph.model import PoseGraph, composed
 
     rng = np.random.default_rng(0)
     step = np.array([1.0, 0.0, 0.02, 0.0, 0.01, 2.0 * np.pi / 50])
@@ -52,7 +52,8 @@ def main() -> None:
     from test_pose_graph import gtsam_optimiser
 
     from px4fuse.readers.g2o import read_g2o
-    from px4fuse.trajectory.graph.pose_graph import cost, solve
+    from px4fuse.trajectory.graph.model import cost
+    from px4fuse.trajectory.graph.solver import solve
 
     runs = int(sys.argv[1]) if len(sys.argv) > 1 else 5
     for name in sys.argv[2:] or NAMED:

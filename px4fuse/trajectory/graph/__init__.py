@@ -1,1 +1,1 @@
-"""SE(2), SE(3) and pose graphs."""
+"""SE(2), SE(3) and pose graphs: optimisation, and closures that may be false."""

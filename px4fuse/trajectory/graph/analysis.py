@@ -9,7 +9,9 @@ import numpy as np
 
 from px4fuse.errors import TrajectoryError
 from px4fuse.flight import Unavailable
-from px4fuse.trajectory.graph.pose_graph import GateResult, PoseGraph, Solution, gate, solve
+from px4fuse.trajectory.graph.covariance import GateResult, gate
+from px4fuse.trajectory.graph.model import PoseGraph
+from px4fuse.trajectory.graph.solver import Solution, solve
 
 MANY_CLOSURES = 1000
 # Chance that the gate rejects a closure that is true
@@ -53,8 +55,6 @@ def analyse_graph(
 
     Parameters
     ----------
-    graph : PoseGraph
-    progress : callable
     robust : bool, optional
         Whether to solve it robustly too; by default up to 1000 closures, since it takes minutes
         for more.
@@ -62,7 +62,7 @@ def analyse_graph(
     Raises
     ------
     TrajectoryError
-        The graph does not hang together.
+        The graph is not connected.
     """
     closures = ~graph.successive
     progress(f"solving: {SOLUTIONS['all']}")

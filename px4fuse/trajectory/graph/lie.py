@@ -65,10 +65,6 @@ def cross(a: Array, b: Array) -> Array:
 def rotation_matrix(pose: Array) -> Array:
     """Rotation of poses as a matrix.
 
-    Parameters
-    ----------
-    pose : ndarray, shape (..., 3) or (..., 7)
-
     Returns
     -------
     ndarray, shape (..., 2, 2) or (..., 3, 3)
@@ -119,22 +115,12 @@ def compose(a: Array, b: Array) -> Array:
 
 
 def inverse(pose: Array) -> Array:
-    """Poses that undo poses.
-
-    Parameters
-    ----------
-    pose : ndarray, shape (..., 3) or (..., 7)
-    """
+    """Poses that undo poses."""
     return between(pose, identity(pose.shape[-1]))
 
 
 def between(a: Array, b: Array) -> Array:
-    """Poses b as seen from a: the inverse of a, composed with b.
-
-    Parameters
-    ----------
-    a, b : ndarray, shape (..., 3) or (..., 7)
-    """
+    """Poses b as seen from a: the inverse of a, composed with b."""
     made = np.empty(np.broadcast_shapes(a.shape, b.shape))
     if a.shape[-1] == 3:
         c, s = np.cos(a[..., 2]), np.sin(a[..., 2])
@@ -142,27 +128,18 @@ def between(a: Array, b: Array) -> Array:
         made[..., 0], made[..., 1] = c * x + s * y, c * y - s * x
         made[..., 2] = b[..., 2] - a[..., 2]
         return made
-    back = _conjugate(a[..., 3:])
+    back = a[..., 3:] * np.array([-1.0, -1.0, -1.0, 1.0])
     made[..., :3] = _rotate(back, b[..., :3] - a[..., :3])
     made[..., 3:] = _multiply(back, b[..., 3:])
     return made
 
 
 def exp(tangent: Array) -> Array:
-    """Poses that a constant twist reaches in unit time (Barfoot 2017, 7.35; Sola 2018, 156).
-
-    Parameters
-    ----------
-    tangent : ndarray, shape (..., 3) or (..., 6)
-
-    Returns
-    -------
-    ndarray, shape (..., 3) or (..., 7)
-    """
+    """Poses that a constant twist reaches in unit time (Barfoot 2017, 7.35; Sola 2018, 156)."""
     if tangent.shape[-1] == 3:
         theta = tangent[..., 2]
         x, y = tangent[..., 0], tangent[..., 1]
-        s, c = np.sinc(theta / np.pi), _versine(theta)
+        s, c = np.sinc(theta / np.pi), theta * _a(theta)
         return np.stack([s * x - c * y, c * x + s * y, theta], axis=-1)
     rho, phi = tangent[..., :3], tangent[..., 3:]
     theta = np.linalg.norm(phi, axis=-1)[..., None]
@@ -181,10 +158,6 @@ def log(pose: Array) -> Array:
     ----------
     pose : ndarray, shape (..., 3) or (..., 7)
         Quaternions normalised; q and -q are the same rotation.
-
-    Returns
-    -------
-    ndarray, shape (..., 3) or (..., 6)
     """
     if pose.shape[-1] == 3:
         theta = wrap(pose[..., 2])
@@ -209,10 +182,6 @@ def log(pose: Array) -> Array:
 def adjoint(pose: Array) -> Array:
     """Adjoints: ``X exp(xi) = exp(adjoint(X) xi) X`` (Barfoot 2017, 7.45; Sola 2018, 159).
 
-    Parameters
-    ----------
-    pose : ndarray, shape (..., 3) or (..., 7)
-
     Returns
     -------
     ndarray, shape (..., 3, 3) or (..., 6, 6)
@@ -231,7 +200,7 @@ def adjoint(pose: Array) -> Array:
 
 
 def right_jacobian_inverse(tangent: Array) -> Array:
-    """Inverse of :func:`right_jacobian`: how log(X) changes as X is moved in its own axes.
+    """Inverse of the right Jacobian: how log(X) changes as X is moved in its own axes.
 
     Parameters
     ----------
@@ -312,11 +281,6 @@ def _plane_column(tangent: Array) -> Array:
     return np.stack([even * x - odd * y, odd * x + even * y], axis=-1)
 
 
-def _conjugate(quaternion: Array) -> Array:
-    made: Array = quaternion * np.array([-1.0, -1.0, -1.0, 1.0])
-    return made
-
-
 def _rotate(quaternion: Array, vector: Array) -> Array:
     axis = quaternion[..., :3]
     twice = 2.0 * cross(axis, vector)
@@ -330,11 +294,6 @@ def _multiply(a: Array, b: Array) -> Array:
     made[..., :3] = s * v + t * u + cross(u, v)
     made[..., 3] = a[..., 3] * b[..., 3] - np.sum(u * v, axis=-1)
     return made
-
-
-def _versine(theta: Array) -> Array:
-    """(1 - cos theta) / theta, which has the sign of theta."""
-    return theta * _a(theta)
 
 
 def _a(theta: Array) -> Array:

@@ -100,7 +100,6 @@ def residuals(graph: PoseGraph, poses: Array | None = None) -> Array:
 
     Parameters
     ----------
-    graph : PoseGraph
     poses : ndarray, shape (n, 3) or (n, 7), optional
         Instead of the graph's own.
 
@@ -118,7 +117,6 @@ def chi_square(graph: PoseGraph, residual: Array) -> Array:
 
     Parameters
     ----------
-    graph : PoseGraph
     residual : ndarray, shape (m, 3) or (m, 6)
         From :func:`residuals`.
 
@@ -135,7 +133,6 @@ def cost(graph: PoseGraph, poses: Array | None = None) -> float:
 
     Parameters
     ----------
-    graph : PoseGraph
     poses : ndarray, shape (n, 3) or (n, 7), optional
         Instead of the graph's own.
     """
@@ -159,9 +156,8 @@ def observed_directions(information: Array) -> tuple[Array, Array]:
     variance : ndarray, shape (k,)
         ``information == directions @ diag(1 / variance) @ directions.T``.
     """
-    scale = np.sqrt(np.clip(np.diag(information), 0.0, None))
-    inverse_scale = np.divide(1.0, scale, out=np.zeros_like(scale), where=scale > 0.0)
-    values, vectors = np.linalg.eigh(information * np.outer(inverse_scale, inverse_scale))
+    scale, scaled = _scaled(information)
+    values, vectors = np.linalg.eigh(scaled)
     seen = values > OBSERVED
     return scale[:, None] * vectors[:, seen], 1.0 / values[seen]
 
@@ -177,11 +173,15 @@ def ranks(information: Array) -> IntArray:
     -------
     ndarray of int, shape (m,)
     """
-    scale = np.sqrt(np.clip(np.diagonal(information, axis1=1, axis2=2), 0.0, None))
-    inverse_scale = np.divide(1.0, scale, out=np.zeros_like(scale), where=scale > 0.0)
-    scaled = information * inverse_scale[:, :, None] * inverse_scale[:, None, :]
-    made: IntArray = np.sum(np.linalg.eigvalsh(scaled) > OBSERVED, axis=1)
+    made: IntArray = np.sum(np.linalg.eigvalsh(_scaled(information)[1]) > OBSERVED, axis=1)
     return made
+
+
+def _scaled(information: Array) -> tuple[Array, Array]:
+    """Roots of the diagonals of matrices, and the matrices divided by them; what is 0 stays 0."""
+    scale = np.sqrt(np.clip(np.diagonal(information, axis1=-2, axis2=-1), 0.0, None))
+    inverse = np.divide(1.0, scale, out=np.zeros_like(scale), where=scale > 0.0)
+    return scale, information * (inverse[..., :, None] * inverse[..., None, :])
 
 
 def require_connected(graph: PoseGraph, used: BoolArray, what: str) -> None:
@@ -189,7 +189,6 @@ def require_connected(graph: PoseGraph, used: BoolArray, what: str) -> None:
 
     Parameters
     ----------
-    graph : PoseGraph
     used : ndarray of bool, shape (m,)
         The edges that may hold it together.
     what : str
@@ -216,10 +215,6 @@ def composed(graph: PoseGraph) -> PoseGraph:
 
     Takes the edges between successive poses where they lead from the first pose to the last, and
     the shortest ways through all edges otherwise.
-
-    Parameters
-    ----------
-    graph : PoseGraph
 
     Raises
     ------
@@ -259,7 +254,6 @@ def odometry_chain(graph: PoseGraph, edges: IntArray | None = None) -> IntArray:
 
     Parameters
     ----------
-    graph : PoseGraph
     edges : ndarray of int, optional
         Those that may be used; all by default. The first one between two poses is taken.
 
@@ -282,7 +276,6 @@ def odometry_steps(graph: PoseGraph, chain: IntArray) -> Array:
 
     Parameters
     ----------
-    graph : PoseGraph
     chain : ndarray of int, shape (k,)
         Edges between successive poses, in order.
 

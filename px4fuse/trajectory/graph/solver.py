@@ -119,7 +119,6 @@ def solve(
 
     Parameters
     ----------
-    graph : PoseGraph
     robust : {"none", "dcs", "gnc"}
     loops : ndarray of bool, shape (m,), optional
         Edges that may be false; all others keep the weight 1. By default those that do not join
@@ -180,11 +179,7 @@ class _Problem:
         return _State(poses, relative, residual, weighted, np.sum(residual * weighted, axis=-1))
 
     def minimise(
-        self,
-        start: _State,
-        kernel: Kernel,
-        max_iterations: int,
-        tolerance: float = _TOLERANCE,
+        self, start: _State, kernel: Kernel, max_iterations: int, tolerance: float = _TOLERANCE
     ) -> _Run:
         """Walk down from some poses, as GTSAM's LevenbergMarquardtOptimizer does."""
         state, damping, iterations = start, _FIRST_DAMPING, 0
@@ -215,11 +210,7 @@ class _Problem:
         return _Run(state, cost, iterations, cost <= _TOLERANCE)
 
     def _step(
-        self,
-        state: _State,
-        matrix: sparse.csc_array[np.float64],
-        gradient: Array,
-        damping: float,
+        self, state: _State, matrix: sparse.csc_array[np.float64], gradient: Array, damping: float
     ) -> tuple[_State | None, float]:
         """Where a damped step leads, and how much it lowers the linearised cost."""
         step = self._system.solve(matrix, -gradient, damping)

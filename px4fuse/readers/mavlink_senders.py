@@ -1,0 +1,209 @@
+"""Senders of a MAVLink recording: which one is the autopilot, and whose clock is which."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from px4fuse.arrays import IntArray
+from px4fuse.errors import SettingsError
+from px4fuse.readers.mavlink_clocks import (
+    OTHER_SPEED,
+    Exchanges,
+    Line,
+    Mapped,
+    map_clock,
+    tells_time,
+)
+from px4fuse.readers.mavlink_frames import Frames
+from px4fuse.readers.mavlink_messages import (
+    AUTOPILOT_COMPONENT,
+    AUTOPILOTS,
+    GROUND_STATION,
+    NO_AUTOPILOT,
+    OWN_MESSAGES,
+    POSITION_INPUTS,
+    VEHICLE_TYPES,
+)
+from px4fuse.readers.mavlink_recording import RESTART_S, Address, Recording, unix_of_boot
+from px4fuse.recording import ClockMap, Sender
+
+# Senders beyond the busiest ones are not described, and their positions are not read
+MAX_SENDERS = 32
+# A sender that seems to lose more than this does not count its messages
+SEQUENCE_MEANS_NOTHING = 0.9
+# Stamps of one sender further apart than this are of two clocks
+OTHER_CLOCK_S = 1e5
+
+
+def _vehicles(frames: Frames) -> dict[Address, tuple[int, int]]:
+    """Type and autopilot that each sender gave in its first heartbeat."""
+    rows = frames.rows("HEARTBEAT")
+    beats = frames.table("HEARTBEAT", rows)
+    address = frames.system[rows].astype(np.int64) << 8 | frames.component[rows]
+    first = np.unique(address, return_index=True)[1]
+    return {
+        (int(number) >> 8, int(number) & 0xFF): (int(kind), int(autopilot))
+        for number, kind, autopilot in zip(
+            address[first], beats["type"][first], beats["autopilot"][first], strict=True
+        )
+    }
+
+
+def _counts(frames: Frames, rows: IntArray | slice = slice(None)) -> list[tuple[Address, int]]:
+    """Senders of frames and how many each sent, most first."""
+    address = frames.system[rows].astype(np.int64) << 8 | frames.component[rows]
+    numbers, counts = np.unique(address, return_counts=True)
+    most = np.argsort(-counts, kind="stable")
+    return [((int(numbers[i]) >> 8, int(numbers[i]) & 0xFF), int(counts[i])) for i in most]
+
+
+def _flies(kind: int, autopilot: int) -> bool:
+    return autopilot != NO_AUTOPILOT and kind != GROUND_STATION
+
+
+def choose_autopilot(frames: Frames, system: int | None) -> tuple[Address, str]:
+    """Address and name of the autopilot whose flight this is.
+
+    Raises
+    ------
+    SettingsError
+        No autopilot has the system id that was asked for.
+    """
+    counts = dict(_counts(frames))
+    vehicles = _vehicles(frames)
+    flying = [s for s in counts if s in vehicles and _flies(*vehicles[s])]
+    own = dict(_counts(frames, np.concatenate([frames.rows(name) for name in OWN_MESSAGES])))
+    # a companion may call itself an autopilot; one without a heartbeat is known by what it sends,
+    # or else by its component
+    candidates = [s for s in flying if s in own] or [s for s in own if s not in vehicles] or flying
+    candidates = candidates or [s for s in counts if s[1] == AUTOPILOT_COMPONENT]
+    # nor need it have been heard itself
+    candidates = candidates or [(s[0], AUTOPILOT_COMPONENT) for s in counts]
+    if system is not None:
+        candidates = [address for address in {*flying, *candidates} if address[0] == system]
+        if not candidates:
+            have = ", ".join(str(number) for number in sorted({s[0] for s in flying})) or "none"
+            raise SettingsError(
+                f"{frames.name}: `system` {system}: no autopilot has this system id; autopilots "
+                f"in the file: {have}."
+            )
+    best = max(candidates, key=lambda address: counts.get(address, 0))
+    name = AUTOPILOTS.get(vehicles[best][1]) if best in vehicles else None
+    return best, name or "unknown autopilot"
+
+
+def senders_of(recording: Recording, message: str) -> list[Address]:
+    """Senders of one message that may speak to this vehicle: not it, nor another vehicle's."""
+    frames = recording.frames
+    rows = frames.rows(message)
+    rows = rows[(rows >= recording.session.start) & (rows < recording.session.stop)]
+    own = (recording.system, recording.component)
+    others = {s[0] for s, seen in _vehicles(frames).items() if _flies(*seen)} - {recording.system}
+    heard = [s for s, _ in _counts(frames, rows) if s != own and s[0] not in others]
+    return heard[:MAX_SENDERS]
+
+
+def map_senders(recording: Recording) -> dict[Address, Mapped]:
+    """Clock of every sender of an external position."""
+    found = {s for source in POSITION_INPUTS for s in senders_of(recording, source.message)}
+    unix = unix_of_boot(recording)
+    return {sender: _map_sender(recording, sender, unix) for sender in sorted(found)}
+
+
+def _map_sender(recording: Recording, sender: Address, unix: Line | None) -> Mapped:
+    frames = recording.frames
+    stamps, received = [], []
+    for source in POSITION_INPUTS:
+        rows = recording.rows(source.message, sender)
+        stamps.append(frames.table(source.message, rows)[source.stamp] * 1e-6)
+        received.append(recording.received_s[rows])
+    about = float(np.median(np.concatenate(stamps)))
+    clock_runs = tells_time(np.concatenate(stamps))
+    rows = recording.rows("TIMESYNC", sender)
+    sync = frames.table("TIMESYNC", rows)
+    replied, asked = sync["tc1"] * 1e-9, sync["ts1"] * 1e-9
+    # the reply to somebody else's question carries another clock
+    replies = (replied != 0.0) & (np.abs(asked - recording.receipt_boot_s(rows)) <= RESTART_S)
+    # a question is stamped as it is sent: hardly delayed
+    questions = clock_runs & (replied == 0.0) & (np.abs(asked - about) < OTHER_CLOCK_S)
+    stamps.append(asked[questions])
+    received.append(recording.received_s[rows][questions])
+    own = frames.table("TIMESYNC", recording.rows("TIMESYNC"))
+    answered, question = own["tc1"] * 1e-9, own["ts1"] * 1e-9
+    answers = (answered != 0.0) & (np.abs(question - about) < OTHER_CLOCK_S)
+    answers &= ~np.isin(own["ts1"], _questions_of_others(recording, sender))
+    return map_clock(
+        f"system {sender[0]}, component {sender[1]}",
+        np.concatenate(stamps),
+        np.concatenate(received),
+        recording.boot_of_receipt,
+        Exchanges(replied[replies], asked[replies], question[answers], answered[answers]),
+        unix,
+        has_receipt=frames.received_us is not None,
+    )
+
+
+def _questions_of_others(recording: Recording, sender: Address) -> NDArray[np.int64]:
+    """``ts1`` of the TIMESYNC questions of everybody but one sender."""
+    frames = recording.frames
+    rows = frames.rows("TIMESYNC")
+    rows = rows[(frames.system[rows] != sender[0]) | (frames.component[rows] != sender[1])]
+    sync = frames.table("TIMESYNC", rows)
+    asked: NDArray[np.int64] = sync["ts1"][sync["tc1"] == 0]
+    return asked
+
+
+def clock_maps(recording: Recording, mapped: dict[Address, Mapped]) -> tuple[ClockMap, ...]:
+    """How the senders' clocks and the time of receipt were mapped to the boot clock."""
+    clocks = [sender.statement for sender in mapped.values()]
+    received_us, line = recording.frames.received_us, recording.boot_of_receipt
+    if received_us is not None and line.pairs:
+        clocks.append(
+            ClockMap(
+                "time of receipt (the recording computer's UNIX time)",
+                "receive time",
+                line.pairs,
+                line.y0 - line.x0 - float(received_us[0]) * 1e-6,
+                (line.slope - 1.0) * 1e6,
+                line.jitter,
+                "by the least delayed messages; used only to order messages and to map clocks"
+                if abs(line.slope - 1.0) < OTHER_SPEED
+                else "the recording did not run at the flight's own speed (a replay?)",
+            )
+        )
+    return tuple(clocks)
+
+
+def describe_senders(recording: Recording) -> tuple[Sender, ...]:
+    """Senders that the recording heard, most messages first."""
+    frames, vehicles = recording.frames, _vehicles(recording.frames)
+    described = []
+    for address, count in _counts(frames)[:MAX_SENDERS]:
+        word = "no heartbeat"
+        if address in vehicles:
+            kind, autopilot = vehicles[address]
+            word = VEHICLE_TYPES.get(kind, f"type {kind}")
+            if autopilot != NO_AUTOPILOT:
+                word = f"{AUTOPILOTS.get(autopilot, 'autopilot')} {word}"
+        chosen = address == (recording.system, recording.component)
+        described.append(Sender(*address, word, count, _lost_share(frames, address), chosen))
+    return tuple(described)
+
+
+def _lost_share(frames: Frames, address: Address) -> float | None:
+    """Share of a sender's messages that its sequence numbers say are not here.
+
+    MAVProxy keeps the link's number in the stamp, and every link has its own sequence; others
+    leave the clock's own bits there. The reading that misses fewer is the right one.
+    """
+    own = (frames.system == address[0]) & (frames.component == address[1])
+    sequence, link = frames.sequence[own].astype(np.int64), frames.link[own]
+    by_link = [sequence[link == number] for number in np.unique(link).tolist()]
+    lost = min(_missing(sequence), sum(_missing(part) for part in by_link))
+    share = lost / (lost + len(sequence))
+    return share if share < SEQUENCE_MEANS_NOTHING else None
+
+
+def _missing(sequence: NDArray[np.int64]) -> int:
+    return int(np.sum((np.diff(sequence) - 1) % 256))

@@ -1,0 +1,88 @@
+"""What readers of all formats make alike: usable rows, stretches of time, what is missing."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+
+from px4fuse.arrays import BoolArray
+from px4fuse.flight import (
+    QUATERNION_COLUMNS,
+    ROTATION_VARIANCE_COLUMNS,
+    Ekf2,
+    FlightMode,
+    Truth,
+    Unavailable,
+)
+
+# No position, velocity, acceleration or angle of a flight in SI units comes near it
+DAMAGED = 1e9
+
+
+def missing_parts(
+    imu: pd.DataFrame | Unavailable,
+    attitude: pd.DataFrame | Unavailable,
+    ekf2: Ekf2 | Unavailable,
+    truth: Truth | Unavailable,
+) -> tuple[Unavailable, ...]:
+    """Parts of a flight that its log lacks, those of EKF2 included."""
+    parts: list[object] = [imu, attitude, ekf2, truth]
+    if isinstance(ekf2, Ekf2):
+        parts += [ekf2.variance, *ekf2.innovations.values(), ekf2.fusing]
+    return tuple(part for part in parts if isinstance(part, Unavailable))
+
+
+def stretches_of_flight(landed: pd.Series, duration_s: float) -> tuple[tuple[float, float], ...]:
+    """Stretches (s) in which a step function of time says "not landed" (0 or False)."""
+    changes = landed[landed.ne(landed.shift())]
+    ends = [*changes.index[1:], duration_s]
+    return tuple(
+        (max(float(start), 0.0), float(end))
+        for start, end, value in zip(changes.index, ends, changes, strict=True)
+        if not value and end > max(start, 0.0)
+    )
+
+
+def stretches_of_modes(names: pd.Series, end_s: float) -> tuple[FlightMode, ...]:
+    """Stretches (s) of a step function of time whose values are names of flight modes."""
+    changes = names[names.ne(names.shift())]
+    starts = np.maximum.accumulate(np.maximum(changes.index.to_numpy(), 0.0))
+    return tuple(
+        FlightMode(float(start), float(end), name)
+        for start, end, name in zip(starts, [*starts[1:], end_s], changes, strict=True)
+        if end > start
+    )
+
+
+def finite_rows(samples: pd.DataFrame, columns: list[str]) -> pd.DataFrame:
+    """Rows of a frame in which all of some float columns are finite, and none is beyond physics.
+
+    A value of 1e30 is damage as much as NaN is, and its square would soon be infinite.
+    """
+    possible: BoolArray = (np.abs(samples[columns].to_numpy()) < DAMAGED).all(axis=1)
+    return samples[possible]
+
+
+def orientation_of(samples: pd.DataFrame) -> pd.DataFrame | None:
+    """Orientations in a frame of samples; None where there are none, or all are the same.
+
+    Parameters
+    ----------
+    samples : DataFrame
+        With the columns ``w, x, y, z`` where the sender gave quaternions, and perhaps
+        ``forward_rad2, right_rad2, down_rad2``. A quaternion of norm 0 and a variance of 0
+        mean "not given" (``EKF2.cpp``).
+    """
+    if not set(QUATERNION_COLUMNS) <= set(samples.columns):
+        return None
+    found = finite_rows(
+        samples.reindex(columns=QUATERNION_COLUMNS + ROTATION_VARIANCE_COLUMNS), QUATERNION_COLUMNS
+    )
+    norm = np.linalg.norm(found[QUATERNION_COLUMNS].to_numpy(), axis=1)
+    found = found[norm > 0.5]
+    quaternions = found[QUATERNION_COLUMNS]
+    if len(found) < 2 or (quaternions == quaternions.iloc[0]).to_numpy().all():
+        return None
+    variances = found[ROTATION_VARIANCE_COLUMNS]
+    oriented: pd.DataFrame = found.assign(**variances.where(variances > 0))
+    return oriented
