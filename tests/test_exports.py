@@ -10,12 +10,12 @@ from pathlib import Path
 import pytest
 from class_tools import entry, graded
 
+from px4fuse.assignment.sheet import read_sheet
 from px4fuse.errors import SettingsError
 from px4fuse.grading.exports import as_html, filled, grade_column, moodle_feedback, plain_grades
 from px4fuse.grading.model import Entry
 from px4fuse.grading.platforms import Origin
 from px4fuse.grading.roster import Person, Register, people_of_sheet
-from px4fuse.grading.sheet import read_sheet
 
 # As mod/assign/gradingtable.php of Moodle writes it
 MOODLE = (

@@ -32,6 +32,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from px4fuse.assignment.key import folded
+from px4fuse.assignment.sheet import Sheet
 from px4fuse.errors import SettingsError
 from px4fuse.grading.class_table import number
 from px4fuse.grading.model import Entry
@@ -40,7 +41,6 @@ from px4fuse.grading.roster import (
     Register,
     people_of_sheet,
 )
-from px4fuse.grading.sheet import Sheet
 from px4fuse.results.reading import one_line
 from px4fuse.spreadsheet import neutral, neutral_id
 

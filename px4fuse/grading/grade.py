@@ -11,6 +11,7 @@ from functools import partial
 from pathlib import Path
 
 from px4fuse.assignment.key import AnswerKey
+from px4fuse.assignment.sheet import Sheet
 from px4fuse.grading import submissions
 from px4fuse.grading.entries import Term, class_entries
 from px4fuse.grading.evidence import values_at
@@ -24,7 +25,6 @@ from px4fuse.grading.platforms import Origin, with_metadata
 from px4fuse.grading.records import Verified, verified
 from px4fuse.grading.roster import Person, Register, people_of_key, people_of_sheet
 from px4fuse.grading.scoring import assess, refused
-from px4fuse.grading.sheet import Sheet
 from px4fuse.grading.workers import Failed, run_bounded
 from px4fuse.reading import files_by_sha256, max_log_bytes
 from px4fuse.results.contract import Reported, to_plain

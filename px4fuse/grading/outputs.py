@@ -14,6 +14,7 @@ from importlib import metadata
 from pathlib import Path
 
 from px4fuse.assignment.roster import RESERVED
+from px4fuse.assignment.sheet import Sheet, read_sheet
 from px4fuse.grading import exports, submissions
 from px4fuse.grading.anonymous import hidden_words
 from px4fuse.grading.class_page import html_text
@@ -25,7 +26,6 @@ from px4fuse.grading.platforms import Origin, seen
 from px4fuse.grading.records import HANDED_IN, REDRAWN, file_of
 from px4fuse.grading.returned import returned_text
 from px4fuse.grading.roster import Register
-from px4fuse.grading.sheet import Sheet, read_sheet
 from px4fuse.grading.sheets import draw_sheets
 from px4fuse.spreadsheet import neutral, neutral_id
 from px4fuse.verification.model import Refused

@@ -7,10 +7,10 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
 from px4fuse.assignment.key import AnswerKey, folded
-from px4fuse.assignment.roster import FIRST_NAME_COLUMNS, LAST_NAME_COLUMNS, NAME_COLUMNS
+from px4fuse.assignment.roster import LAST_NAME_COLUMNS, MAX_NAME, NAME_COLUMNS, full_name
+from px4fuse.assignment.sheet import Sheet
 from px4fuse.errors import SettingsError
 from px4fuse.grading.platforms import Origin
-from px4fuse.grading.sheet import Sheet
 from px4fuse.results.reading import one_line
 
 # Column titles, letters and digits only, best first. The university's own id; Canvas's "ID",
@@ -21,7 +21,6 @@ ID_COLUMNS = (
 )  # fmt: skip
 LOGIN_COLUMNS = ("username", "login", "sisloginid", "loginid", "user", "benutzername")
 EMAIL_COLUMNS = ("emailaddress", "email", "mail", "emailadresse")
-MAX_NAME = 200
 # Of Canvas, above the students
 NOT_STUDENTS = ("pointspossible", "studenttest")
 
@@ -69,11 +68,7 @@ def people_of_sheet(sheet: Sheet) -> tuple[Person, ...]:
         )
     people = []
     for row in sheet.rows:
-        name = one_line(sheet.cell(row, NAME_COLUMNS), MAX_NAME) or " ".join(
-            part
-            for titles in (FIRST_NAME_COLUMNS, LAST_NAME_COLUMNS)
-            if (part := one_line(sheet.cell(row, titles), MAX_NAME))
-        )
+        name = full_name(sheet, row)
         if re.sub(r"\W", "", name.casefold()) in NOT_STUDENTS:
             continue
         email = one_line(sheet.cell(row, EMAIL_COLUMNS), MAX_NAME)
@@ -129,33 +124,37 @@ class Register:
 
     def place(self, other: Person) -> int | None:
         """Where somebody stands of whom another list knows: by number, id, email, login or name."""
-        looks: tuple[Callable[[], int | None], ...] = (
+        looks: tuple[Callable[[Person], bool], ...] = (
             *(
-                lambda platform=platform, said=said: self._of(
-                    lambda one: one.numbers.get(platform, ""), said
-                )
+                lambda one, at=platform, said=said: _same(one.numbers.get(at, ""), said)
                 for platform, said in other.numbers.items()
             ),
-            lambda: self._by_id(other.student_id),
-            lambda: self._of(lambda one: one.email, other.email),
-            lambda: self._of(lambda one: one.login, other.login),
-            lambda: self._by_name(other.name),
+            lambda one: _same(one.student_id, other.student_id),
+            lambda one: same_id(one.student_id, other.student_id),
+            lambda one: _same(one.email, other.email),
+            # Blackboard's user name and ILIAS's login are ids where the roster has no other
+            lambda one: _same(one.login or one.student_id, other.login),
+            lambda one: same_name(one.name, other.name),
         )
-        return next((at for look in looks if (at := look()) is not None), None)
+        for look in looks:
+            places = [place for place, one in enumerate(self.people) if look(one)]
+            if len(places) == 1:
+                return places[0]
+        return None
 
     def by_platform(self, origin: Origin) -> int | None:
         """Whose file it is by what the platform says, which no student can change."""
         if not origin.platform:
             return None
-        looks: tuple[Callable[[], int | None], ...] = (
-            lambda: self._of(lambda one: one.numbers.get(origin.platform, ""), origin.number),
-            lambda: self._by_id(origin.student_id),
-            lambda: self._of(lambda one: one.email, origin.email),
-            # Blackboard's user name and ILIAS's login are ids where the roster has no other
-            lambda: self._of(lambda one: one.login or one.student_id, origin.login),
-            lambda: self._by_name(origin.name),
+        return self.place(
+            Person(
+                origin.student_id,
+                origin.name,
+                origin.email,
+                origin.login,
+                {origin.platform: origin.number} if origin.number else {},
+            )
         )
-        return next((at for look in looks if (at := look()) is not None), None)
 
     def of_platform(self, origin: Origin) -> Person | None:
         """Whose file it is, as :meth:`by_platform`."""
@@ -164,24 +163,11 @@ class Register:
 
     def by_report(self, student_id: str, name: str) -> int | None:
         """Whose report it is by what stands in it: the id, else the name."""
-        found = self._by_id(student_id)
-        return self._by_name(name) if found is None else found
+        return self.place(Person(student_id, name))
 
-    def _by_id(self, student_id: str) -> int | None:
-        found = self._of(lambda one: one.student_id, student_id)
-        if found is None:
-            found = self._only(lambda one: same_id(one.student_id, student_id))
-        return found
 
-    def _by_name(self, name: str) -> int | None:
-        return self._only(lambda one: same_name(one.name, name))
-
-    def _of(self, known: Callable[[Person], str], said: str) -> int | None:
-        return self._only(lambda one: folded(known(one)) == folded(said) != "")
-
-    def _only(self, look: Callable[[Person], bool]) -> int | None:
-        places = [place for place, one in enumerate(self.people) if look(one)]
-        return places[0] if len(places) == 1 else None
+def _same(known: str, said: str) -> bool:
+    return folded(known) == folded(said) != ""
 
 
 def same_id(one: str, other: str) -> bool:

@@ -13,7 +13,7 @@ import io
 import re
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from px4fuse.errors import SettingsError
@@ -65,12 +65,6 @@ class Sheet:
         place = self.column(titles)
         return "" if place is None else row[place].strip()
 
-    def filled(self, row: int, column: int, text: str) -> Sheet:
-        """The table with another text in one cell."""
-        cells = list(self.rows[row])
-        cells[column] = text
-        return replace(self, rows=(*self.rows[:row], tuple(cells), *self.rows[row + 1 :]))
-
     def content(self) -> bytes:
         """The file again, in its own encoding, separator, quotes and line ends."""
         out = io.StringIO()
@@ -106,7 +100,7 @@ def read_sheet(path: Path) -> Sheet:
         It cannot be read, is no text, or has no header.
     """
     content = read_whole(
-        path, SettingsError, MAX_BYTES, name=str(path), smaller="Give a CSV file of one course"
+        path, SettingsError, MAX_BYTES, name=str(path), smaller="Give a CSV file of one class"
     )
     if content.startswith((b"PK\x03\x04", b"\xd0\xcf\x11\xe0")):
         raise SettingsError(f"{path}: a spreadsheet. Save it as CSV.")
