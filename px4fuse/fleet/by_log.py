@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import PurePosixPath
@@ -10,6 +9,7 @@ from typing import Any
 
 import pandas as pd
 
+from px4fuse.findings import named
 from px4fuse.fleet.rows import BETWEEN_FINDINGS
 
 # Columns that are the same for all axes of a log
@@ -25,7 +25,6 @@ NUMBERS = (
 )  # fmt: skip
 # What speaks for a log: along the aisle where that is known, else both horizontal axes
 MAIN = (("aisle",), ("north", "east"), ("down",))
-CAPITALS = ("ekf2", "imu", "px4", "ev", "sigma_z", "sigma_a")
 
 
 @dataclass(frozen=True)
@@ -77,19 +76,8 @@ class Log:
             tags["status:worse"] = "worse than in the baseline"
         for name in ("vehicle", "firmware"):
             tags[f"{name}:{self.texts[name]}"] = self.texts[name] or f"no {name} named"
-        tags |= {f"finding:{finding}": finding_words(finding) for finding in self.findings}
+        tags |= {f"finding:{finding}": named(finding) for finding in self.findings}
         return tags | {f"remedy:{remedy}": remedy or "no advice" for _, remedy in self.lacking}
-
-
-def finding_words(finding: str) -> str:
-    """The id of a finding as it is read.
-
-    >>> finding_words("ekf2_not_fusing"), finding_words("sigma_z_large")
-    ('EKF2 not fusing', 'SIGMA_Z large')
-    """
-    parts = re.split(rf"(?<![^_])({'|'.join(CAPITALS)})(?![^_])", finding)
-    told = (part.upper() if part in CAPITALS else part.replace("_", " ") for part in parts)
-    return "".join(told)
 
 
 def short_names(logs: Sequence[Log]) -> dict[str, str]:

@@ -8,7 +8,8 @@ from typing import Literal
 
 import pandas as pd
 
-from px4fuse.fleet.by_log import Log, finding_words, logs_of, short_names
+from px4fuse.findings import named
+from px4fuse.fleet.by_log import Log, logs_of, short_names
 from px4fuse.fleet.questions import above, overstated_words
 from px4fuse.plain import number_words
 from px4fuse.webpage.charts import Scale, around_one, linear_scale, log_scale
@@ -134,8 +135,8 @@ def html_text(table: pd.DataFrame, title: str, made_with: str) -> str:
 def _row(
     log: Log, names: Mapping[str, str], factor: Scale, sigma: Scale | None, clock: Scale | None
 ) -> Row:
-    named = [finding_words(finding) for finding in log.findings]
-    few = ", ".join(named[:2]) + (f" and {len(named) - 2} more" if len(named) > 2 else "")
+    said = [named(finding) for finding in log.findings]
+    few = ", ".join(said[:2]) + (f" and {len(said) - 2} more" if len(said) > 2 else "")
     folder = log.texts["log"].rpartition("/")[0]
     worse = "worse than before" if log.changes else ""
     cells = (
@@ -147,7 +148,7 @@ def _row(
         *(_factor(log.factors.get(whose), factor) for whose in ("kf", "ekf2")),
         _interval(log, "sigma_z", "m", sigma),
         _interval(log, "clock_offset", "s", clock),
-        figure(float(len(named)), below=few) if log.status != "failed" else Cell(),
+        figure(float(len(said)), below=few) if log.status != "failed" else Cell(),
         *(
             words(log.texts[name]) if kind == "text" else figure(log.numbers.get(name))
             for _, kind, name in MORE
@@ -180,7 +181,7 @@ def _details(log: Log) -> tuple[Part, ...]:
         listed("What to set", list(dict.fromkeys(remedy for _, remedy in log.lacking if remedy))),
         listed("Worse than in the baseline", log.changes, warn=True),
         listed("What happened", [line for line in log.texts["story"].splitlines() if line]),
-        listed("Findings", [f"{finding_words(one)} ({one})" for one in log.findings]),
+        listed("Findings", [f"{named(one)} ({one})" for one in log.findings]),
         _axes(log),
     )
 
@@ -236,11 +237,11 @@ def _flight(log: Log) -> list[tuple[str, str]]:
 def _filters(logs: Sequence[Log]) -> list[tuple[str, list[tuple[str, str]]]]:
     """What the logs have, most frequent first."""
     counts = Counter(tag for log in logs for tag in log.tags)
-    named = {tag: said for log in logs for tag, said in log.tags.items()}
+    words_of = {tag: said for log in logs for tag, said in log.tags.items()}
     filters = []
     for label, kind, every in FILTERS:
         options = [
-            (tag, f"{said if len(said := named[tag]) <= 60 else said[:59] + '…'} ({count})")
+            (tag, f"{said if len(said := words_of[tag]) <= 60 else said[:59] + '…'} ({count})")
             for tag, count in counts.most_common()
             if tag.startswith(f"{kind}:")
         ]

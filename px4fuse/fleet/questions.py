@@ -9,7 +9,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import pandas as pd
 
-from px4fuse.fleet.by_log import Log, finding_words
+from px4fuse.findings import named
+from px4fuse.fleet.by_log import Log
 from px4fuse.plain import factor_words
 from px4fuse.webpage.charts import Scale, axis, bar, grid, over_time, plot, spread
 from px4fuse.webpage.frame import card, note, opens, picks, summary
@@ -202,7 +203,7 @@ def _frequent(logs: Sequence[Log]) -> str:
     most = ordered[0][1]
     judged = sum(log.status != "failed" for log in logs)
     lines = "".join(
-        f"<li>{bar(count / most)}{picks(f'finding:{finding}', finding_words(finding))}"
+        f"<li>{bar(count / most)}{picks(f'finding:{finding}', named(finding))}"
         f'<span class="right">{count} ({count / judged:.0%})</span></li>'
         for finding, count in ordered[:MOST_FINDINGS]
     )

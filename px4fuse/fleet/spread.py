@@ -162,12 +162,6 @@ def rates(
     return rows
 
 
-def measured_rates() -> pd.DataFrame:
-    """The table that ships with the package."""
-    with files("px4fuse.fleet").joinpath(RATES_TABLE).open(encoding="utf-8") as file:
-        return pd.read_csv(file, keep_default_na=False)
-
-
 def _main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--flights", type=int, default=FLIGHTS)

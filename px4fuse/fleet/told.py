@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 
 from px4fuse.comparison.events import happened
+from px4fuse.findings import named
 from px4fuse.fleet.measures import BOOTSTRAP, CHI_SQUARE, LIKELIHOOD, WILSON, Number
 from px4fuse.fleet.sides import Side
 from px4fuse.fleet.significance import FALSE_DISCOVERY_RATE, LEAST_RATIO
@@ -135,9 +136,9 @@ def summary(found: ChangeResults) -> tuple[str, ...]:
     if first is not None:
         said.append(f"The first of them: {first.label}, {first.why}")
     for only_in, word in (("B", "New"), ("A", "Gone")):
-        ids = dict.fromkeys(f.id for f in found.findings if f.only_in == only_in)
-        if ids:
-            said.append(f"{word} findings: {', '.join(ids)}.")
+        those = dict.fromkeys(named(f.id) for f in found.findings if f.only_in == only_in)
+        if those:
+            said.append(f"{word} findings: {', '.join(those)}.")
     if found.texts:
         said.append(f"Not the same: {', '.join(text.what for text in found.texts)}.")
     return tuple(said)

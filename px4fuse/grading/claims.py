@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 
+from px4fuse.findings import named
 from px4fuse.findings.causes import CONSEQUENCES
-from px4fuse.grading.names import named
 from px4fuse.grading.notes import Mention
 
 # In the words of the rubric: what names a subject rather than a mistake

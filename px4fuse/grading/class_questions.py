@@ -7,7 +7,7 @@ from collections import defaultdict
 from collections.abc import Mapping, Sequence
 
 from px4fuse.grading.anonymous import Veil
-from px4fuse.grading.class_table import distinct, number
+from px4fuse.grading.class_table import item_points, number, settled_report
 from px4fuse.grading.model import Entry
 from px4fuse.webpage.charts import bar, bins, histogram
 from px4fuse.webpage.frame import card, note, opens, picks, summary
@@ -70,13 +70,11 @@ def _items(entries: Sequence[Entry], veil: Veil) -> str:
     points: dict[str, list[float]] = defaultdict(list)
     most: dict[str, float] = {}
     for entry in entries:
-        one = entry.counting
+        one = settled_report(entry)
         if one is None or one.pending:
             continue
-        for title, item in zip(distinct(i.title for i in one.items), one.items, strict=True):
-            said = entry.overrides.get(title)
-            value = item.points if said is None or said.points is None else said.points
-            points[title].append(value)
+        for title, item in zip(item_points(one), one.items, strict=True):
+            points[title].append(item.points)
             most[title] = max(item.of, most.get(title, 0.0))
     if not points:
         return ""

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from datetime import datetime
 from typing import Literal
 
-from px4fuse.grading.class_table import item_points
+from px4fuse.grading.class_table import item_points, settled_report
 from px4fuse.grading.lateness import LateRule, in_zone_of
 from px4fuse.grading.model import Entry, Graded, Override, Submission
 from px4fuse.grading.overrides import TOTAL, Overrides, matched
@@ -244,21 +244,11 @@ def _settled(entry: Entry, said: Mapping[str, Override], most: float) -> Entry:
     comment = "\n".join(
         said[name].comment for name in ("", TOTAL) if name in said and said[name].comment
     )
-    kept = {title: one for title, one in said.items() if title != ""}
-    graded = entry.counting
+    entry = replace(entry, overrides={title: one for title, one in said.items() if title})
+    settled = settled_report(entry)
     total = None
     if TOTAL in said and said[TOTAL].points is not None:
         total = said[TOTAL].points
-    elif graded is not None and graded.counted is not None:
-        points = item_points(graded)
-        for title, one in kept.items():
-            if title in points and one.points is not None:
-                points[title] = one.points
-        total = round(max(sum(points.values()) - entry.deduction, 0.0), 2)
-    return replace(
-        entry,
-        overrides=kept,
-        comment=comment,
-        total=total,
-        of=graded.of if graded is not None else most,
-    )
+    elif settled is not None and not settled.pending:
+        total = round(max(sum(one.points for one in settled.items) - entry.deduction, 0.0), 2)
+    return replace(entry, comment=comment, total=total, of=settled.of if settled else most)

@@ -16,12 +16,11 @@ from __future__ import annotations
 
 import argparse
 import hashlib
-import json
 import math
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
 from importlib import metadata
 from importlib.resources import files
@@ -63,8 +62,6 @@ from px4fuse.verification.model import Report, Verdict
 TABLE = "fairness.csv"
 SECRET = b"px4fuse fairness"
 FLIGHTS = 150
-# Shares of the points: what the ideal student must have at least, the others at most
-BOUNDS = {"ideal": 0.95, "default": 0.50, "guesser": 0.30}
 VERIFIED = Verdict("verified", ("taken for verified",), with_log=True, page_status="same")
 NONE = "none"
 # Of half the guesses, whose settings come to mind: the factor from the default is log-uniform
@@ -105,8 +102,8 @@ class Flown:
 
     def answer(self) -> Answer:
         """The key's."""
-        found = json.loads(self._kept("answer", lambda: json.dumps(asdict(self._answer()))))
-        return Answer(**{**found, **{n: tuple(found[n]) for n in ("mistakes", "findings")}})
+        made = self._kept("answer", lambda: msgspec.json.encode(self._answer()).decode())
+        return msgspec.json.decode(made, type=Answer)
 
     def report(self, request: Request) -> Reported:
         """Results of ``px4fuse compare`` or ``px4fuse loop``, without a student."""
@@ -276,7 +273,7 @@ def summary(table: pd.DataFrame) -> pd.DataFrame:
     Parameters
     ----------
     table : DataFrame
-        As :func:`fairness` gives it.
+        One row per flight, as in fairness.csv.
 
     Returns
     -------
@@ -311,12 +308,6 @@ def _size(choice: Choice | None, typed: str) -> str:
     if choice is None or choice.limit is None:
         return ""
     return "small" if choice.difficulty(typed) >= (EASIEST + HARDEST) / 2.0 else "plain"
-
-
-def fairness() -> pd.DataFrame:
-    """The table that ships with the package, one row per flight."""
-    with files("px4fuse.grading").joinpath(TABLE).open(encoding="utf-8") as file:
-        return pd.read_csv(file, keep_default_na=False)
 
 
 def _row(number: int, cache: Path | None) -> dict[str, object]:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 import re
-import unicodedata
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import combinations
@@ -25,6 +24,7 @@ from px4fuse.grading.folding import folded
 from px4fuse.grading.model import Graded
 from px4fuse.results.comparison import ASKED, HeldOut, Tuned
 from px4fuse.results.contract import ComparisonResults, LoopResults, Reported
+from px4fuse.results.reading import one_line
 
 # Letters and digits in a row by which two texts are compared, so that spaces do not count: of
 # five words, hardly ever the same by chance, and a changed word costs as many of thousands
@@ -226,7 +226,7 @@ def _other_assignment(graded: Sequence[Graded], key: AnswerKey | None) -> Flags:
             yield index, "The log is not one of those that were handed out with the assignment."
         elif own is None:
             said = (
-                f"the id {_short(one.student_id)} is not in the answer key"
+                f"the id {_line(one.student_id)} is not in the answer key"
                 if one.student_id
                 else "the report gives no id"
             )
@@ -266,8 +266,8 @@ def _other_version(graded: Sequence[Graded]) -> Flags:
     usual = counted.most_common(1)[0][0]
     for index, one in enumerate(graded):
         if one.version and one.version != usual:
-            others = f"most of the class with {_short(usual)}"
-            yield index, f"Made with px4fuse {_short(one.version)}, {others}."
+            others = f"most of the class with {_line(usual)}"
+            yield index, f"Made with px4fuse {_line(one.version)}, {others}."
 
 
 # ------------------------------------------------------------------ notes
@@ -354,11 +354,11 @@ def _other_name(graded: Sequence[Graded], key: AnswerKey | None) -> Flags:
         ids = sorted({student_id for student_id in people if student_id in words} - own_ids)
         others = sorted({of for parts, of in names.items() if parts <= words} - own_ids)
         if ids or others:
-            other = _short((ids or others)[0])
+            other = _line((ids or others)[0])
             yield index, f"The file's name is that of {other}, the report says {_name(one)}."
         elif own_id.isdecimal() and _looks_like(stem, own_id):
-            said = f"the report gives the id {_short(one.student_id)}"
-            yield index, f"The file is named {_short(stem)}, {said}."
+            said = f"the report gives the id {_line(one.student_id)}"
+            yield index, f"The file is named {_line(stem)}, {said}."
 
 
 def _looks_like(stem: str, student_id: str) -> bool:
@@ -391,21 +391,19 @@ def _who(one: Graded) -> str:
 def _name(one: Graded) -> str:
     """A student in a sentence."""
     parts = [part for part in (one.student.strip(), one.student_id.strip()) if part]
-    return _short(", ".join(parts) or one.submission)
+    return _line(", ".join(parts) or one.submission)
 
 
 def _others(graded: Sequence[Graded], members: Sequence[int], index: int) -> str:
     others = [other for other in members if other != index]
     named = "; ".join(
-        f"{_name(graded[other])} ({_short(graded[other].submission)})" for other in others[:SHOWN]
+        f"{_name(graded[other])} ({_line(graded[other].submission)})" for other in others[:SHOWN]
     )
     return f"{named} and {len(others) - SHOWN} more" if len(others) > SHOWN else named
 
 
-def _short(text: str) -> str:
-    kept = "".join(c if unicodedata.category(c)[0] != "C" else " " for c in text[:200])
-    line = " ".join(kept.split())
-    return line if len(line) <= 80 else line[:79] + "…"
+def _line(text: str) -> str:
+    return one_line(text, 80)
 
 
 def _digits(number: float) -> int:

@@ -240,7 +240,7 @@ def grade_all(
         nonlocal reused, done
         if isinstance(result, Failed):
             why = Refused(f"Grading it failed: {result.reason}", "Read it yourself.")
-            graded[index] = _refused(found[index], why, "", rubric, key)
+            graded[index] = replace(refused(rubric, key, why), submission=found[index].name)
         else:
             graded[index], recalled = result
             reused += recalled
@@ -284,12 +284,13 @@ def grade_one(
     submission = job.submission
     content = submissions.read(submission)
     if isinstance(content, Refused):
-        return _refused(submission, content, "", rubric, key), False
+        return replace(refused(rubric, key, content), submission=submission.name), False
     sha256 = hashlib.sha256(content).hexdigest()
     handed_out = frozenset(answer.sha256 for answer in key.answers) if key else frozenset()
     found, recalled = verified(records, content, logs, handed_out)
     if isinstance(found, Refused):
-        return _refused(submission, found, sha256, rubric, key), recalled
+        made = refused(rubric, key, found)
+        return replace(made, submission=submission.name, sha256=sha256), recalled
     return _scored(submission, found, sha256, job.owner_id, rubric, key), recalled
 
 
@@ -301,18 +302,12 @@ def _scored(
     rubric: Rubric,
     key: AnswerKey | None,
 ) -> Graded:
-    results, verdict = found.report.results, found.verdict
-    made = assess(found.report, verdict, rubric, key, owner_id)
-    return Graded(
+    results = found.report.results
+    made = assess(found.report, found.verdict, rubric, key, owner_id)
+    return replace(
+        made,
         submission=submission.name,
-        student=results.student.name,
-        student_id=results.student.id,
-        verdict=verdict,
-        items=made.items,
-        flags=(*_page_flags(verdict), *own_flags(results), *made.flags),
-        pending=made.pending,
-        to_read=made.to_read,
-        mistakes=made.mistakes,
+        flags=(*_page_flags(found.verdict), *own_flags(results), *made.flags),
         numbers=_numbers(results),
         sha256=sha256,
         log_sha256=log_sha256(results),
@@ -337,11 +332,3 @@ def _page_flags(verdict: Verdict) -> tuple[str, ...]:
 def _numbers(results: Reported) -> dict[str, float]:
     plain = to_plain(results)
     return {title: float(value) for title, path in NUMBERS for _, value in values_at(plain, path)}
-
-
-def _refused(
-    submission: Submission, why: Refused, sha256: str, rubric: Rubric, key: AnswerKey | None
-) -> Graded:
-    verdict = Verdict("cannot verify", (why.reason,), with_log=False)
-    made = refused(rubric, key, why)
-    return Graded(submission.name, "", "", verdict, made.items, pending=made.pending, sha256=sha256)

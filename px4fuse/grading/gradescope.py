@@ -14,7 +14,6 @@ import hashlib
 import io
 import json
 import re
-import unicodedata
 import zipfile
 from collections.abc import Mapping, Sequence
 from datetime import datetime
@@ -28,7 +27,7 @@ from px4fuse.errors import OutputError, SettingsError
 from px4fuse.grading.lateness import LateRule
 from px4fuse.grading.model import Entry
 from px4fuse.reading import read_text
-from px4fuse.results.reading import one_line
+from px4fuse.results.reading import cleaned, one_line
 
 VISIBLE = "after_due_date"
 MAX_METADATA = 5_000_000
@@ -92,7 +91,7 @@ def results(entry: Entry, text: str, seconds: float | None = None) -> dict[str, 
                 "number": str(len(tests) + 1),
                 "score": 0.0,
                 "max_score": 0.0,
-                "output": "\n".join(map(_plain, said)),
+                "output": "\n".join(map(cleaned, said)),
                 "output_format": "text",
                 "tags": ["px4fuse", "instructor"],
                 "visibility": "hidden",
@@ -109,10 +108,6 @@ def results(entry: Entry, text: str, seconds: float | None = None) -> dict[str, 
         "tests": tests,
     }
     return made if seconds is None else {**made, "execution_time": round(seconds, 2)}
-
-
-def _plain(text: str) -> str:
-    return "".join(c if unicodedata.category(c)[0] != "C" else " " for c in text)
 
 
 # ------------------------------------------------------------------ inside the autograder

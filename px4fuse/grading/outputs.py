@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 from importlib import metadata
 from pathlib import Path
 
-from px4fuse.assignment.roster import RESERVED
 from px4fuse.assignment.sheet import Sheet, read_sheet
 from px4fuse.grading import exports, submissions
 from px4fuse.grading.anonymous import hidden_words
@@ -21,6 +20,7 @@ from px4fuse.grading.class_page import html_text
 from px4fuse.grading.class_table import csv_text
 from px4fuse.grading.gradescope import results
 from px4fuse.grading.model import Entry, Graded, Submission
+from px4fuse.grading.names import distinct, file_names
 from px4fuse.grading.overrides import NAME, TEMPLATE
 from px4fuse.grading.platforms import Origin, seen
 from px4fuse.grading.records import HANDED_IN, REDRAWN, file_of
@@ -228,15 +228,10 @@ def _grades(made: Class, texts: Mapping[int, str]) -> tuple[dict[str, bytes], tu
     """Files that a learning platform imports, by name, and what could not be entered."""
     contents: dict[str, bytes] = {}
     notes: list[str] = []
-    for sheet in made.worksheets:
+    names = distinct((sheet.path.stem for sheet in made.worksheets), "{}-{}")
+    for sheet, name in zip(made.worksheets, names, strict=True):
         filled = exports.filled(sheet, made.entries, made.register, made.column, texts)
-        name = next(
-            name
-            for number in itertools.count(1)
-            if (name := f"{sheet.path.stem}{f'-{number}' if number > 1 else ''}{sheet.path.suffix}")
-            not in contents
-        )
-        contents[name] = filled.sheet.content()
+        contents[f"{name}{sheet.path.suffix}"] = filled.sheet.content()
         notes += filled.notes
     platforms = seen(made.origins.values())
     if "moodle" in platforms:
@@ -267,19 +262,3 @@ def _left_over(output: Path, names: Sequence[str]) -> tuple[str, ...]:
 
 def _stem(entry: Entry) -> str:
     return entry.student_id or (Path(entry.counting.submission).stem if entry.counting else "")
-
-
-def file_names(stems: Sequence[str]) -> list[str]:
-    """A name for each one's files, unique ignoring case: letters, digits, - and _ only."""
-    taken: set[str] = set()
-    names = []
-    for stem in stems:
-        safe = "".join(c if c.isascii() and (c.isalnum() or c in "-_") else "_" for c in stem)[:60]
-        if not safe or safe.casefold() in RESERVED:
-            safe = f"report_{safe}"
-        name, number = safe, 2
-        while name.lower() in taken:
-            name, number = f"{safe}-{number}", number + 1
-        taken.add(name.lower())
-        names.append(name)
-    return names
