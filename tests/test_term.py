@@ -15,8 +15,8 @@ from class_tools import Reports, at_once, zipped
 
 from px4fuse.assignment.key import Answer, AnswerKey
 from px4fuse.assignment.sheet import read_sheet
-from px4fuse.grading.entries import Term
-from px4fuse.grading.grade import Course, Outcome, grade
+from px4fuse.grading.entries import Course, Term
+from px4fuse.grading.grade import Outcome, grade
 from px4fuse.grading.lateness import due_time, late_rule
 from px4fuse.grading.model import Entry
 from px4fuse.grading.roster import people_of_sheet

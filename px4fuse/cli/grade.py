@@ -108,8 +108,7 @@ def grade(
     nothing in it is executed.
     """
     from px4fuse.assignment.sheet import read_sheet
-    from px4fuse.grading.entries import Term
-    from px4fuse.grading.grade import Course
+    from px4fuse.grading.entries import Course, Term
     from px4fuse.grading.grade import grade as grade_all
     from px4fuse.grading.lateness import due_time, late_rule
     from px4fuse.grading.roster import people_of_sheet

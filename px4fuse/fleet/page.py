@@ -126,7 +126,7 @@ def html_text(table: pd.DataFrame, title: str, made_with: str) -> str:
         ),
         rows=[_row(log, names, factor, sigma, clock) for log in logs],
         filters=_filters(logs),
-        groups=(("numbers", "More numbers", False),),
+        groups=(("numbers", "More numbers"),),
         placeholder="name, vehicle, firmware, finding",
         otherwise="All rows are in fleet.csv.",
     )

@@ -110,10 +110,7 @@ def html_text(entries: Sequence[Entry], title: str, made_with: str) -> str:
             for at, entry in enumerate(entries)
         ],
         filters=_filters(entries),
-        groups=(
-            ("items", "Points of each item", False),
-            ("numbers", "Numbers", False),
-        ),
+        groups=(("items", "Points of each item"), ("numbers", "Numbers")),
         placeholder="name, id, file, flag",
         otherwise="All rows are in class.csv.",
     )

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 from typing import Literal
 
+from px4fuse.assignment.sheet import Sheet
 from px4fuse.grading.class_table import item_points, settled_report
 from px4fuse.grading.lateness import LateRule, in_zone_of
 from px4fuse.grading.model import Entry, Graded, Override, Submission
@@ -39,6 +40,31 @@ class Term:
     due: datetime | None = None
     late: LateRule | None = None
     times: Mapping[int, datetime] | None = None
+
+
+@dataclass(frozen=True)
+class Course:
+    """What is known of a class besides what it handed in.
+
+    Attributes
+    ----------
+    roster : tuple of Person or None
+        Without one the students of the answer key, else those of the worksheets.
+    worksheets : tuple of Sheet
+        Tables of learning platforms, to be filled in.
+    column : str
+        Of the worksheets, for the grade; "" where there is only one.
+    term : Term
+        Which attempt counts, and what being late costs.
+    anonymous : bool
+        Whether the class page shows pseudonyms.
+    """
+
+    roster: tuple[Person, ...] | None = None
+    worksheets: tuple[Sheet, ...] = ()
+    column: str = ""
+    term: Term = field(default_factory=Term)
+    anonymous: bool = False
 
 
 @dataclass(frozen=True)

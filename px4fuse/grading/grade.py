@@ -5,15 +5,15 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from contextlib import closing
+from dataclasses import dataclass, replace
 from datetime import datetime
 from functools import partial
 from pathlib import Path
 
 from px4fuse.assignment.key import AnswerKey
-from px4fuse.assignment.sheet import Sheet
 from px4fuse.grading import submissions
-from px4fuse.grading.entries import Term, class_entries
+from px4fuse.grading.entries import Course, class_entries
 from px4fuse.grading.evidence import values_at
 from px4fuse.grading.exports import grade_column, kind_of
 from px4fuse.grading.flags import chosen_settings, class_flags, own_flags
@@ -23,7 +23,7 @@ from px4fuse.grading.outputs import Class, write_class
 from px4fuse.grading.overrides import NAME, read_overrides
 from px4fuse.grading.platforms import Origin, with_metadata
 from px4fuse.grading.records import Verified, verified
-from px4fuse.grading.roster import Person, Register, people_of_key, people_of_sheet
+from px4fuse.grading.roster import Register, people_of_key, people_of_sheet
 from px4fuse.grading.scoring import assess, refused
 from px4fuse.grading.workers import Failed, run_bounded
 from px4fuse.reading import files_by_sha256, max_log_bytes
@@ -44,31 +44,6 @@ NUMBERS = (
     ("position RMSE to truth, aisle (m)", "axes.aisle.truth.kf_position_rmse_m"),
     ("closure error (m)", "loop.closure_error_m"),
 )
-
-
-@dataclass(frozen=True)
-class Course:
-    """What is known of a class besides what it handed in.
-
-    Attributes
-    ----------
-    roster : tuple of Person or None
-        Without one the students of the answer key, else those of the worksheets.
-    worksheets : tuple of Sheet
-        Tables of learning platforms, to be filled in.
-    column : str
-        Of the worksheets, for the grade; "" where there is only one.
-    term : Term
-        Which attempt counts, and what being late costs.
-    anonymous : bool
-        Whether the class page shows pseudonyms.
-    """
-
-    roster: tuple[Person, ...] | None = None
-    worksheets: tuple[Sheet, ...] = ()
-    column: str = ""
-    term: Term = field(default_factory=Term)
-    anonymous: bool = False
 
 
 @dataclass(frozen=True)
@@ -154,8 +129,8 @@ def grade(
     entries, unknown = class_entries(graded, found, origins, register, term, overrides)
     entries = _flagged(entries, key)
     written, more = write_class(
-        Class(entries, register or Register([]), title, course.worksheets, course.column,
-              course.anonymous, {one.name: of for one, of in zip(found, origins, strict=True)},
+        Class(entries, register or Register([]), title, course,
+              {one.name: of for one, of in zip(found, origins, strict=True)},
               {one.name: one for one in found}),
         output,
         output / RECORDS,
@@ -230,24 +205,13 @@ def grade_all(
     """Verify, or recall, and score every file, each within bounds; and how many were recalled."""
     jobs = []
     for submission, origin in zip(found, origins, strict=True):
-        person = register.of_platform(origin) if register else None
-        jobs.append(Job(submission, person.student_id if person else ""))
-    graded: list[Graded | None] = [None] * len(found)
-    reused = done = 0
+        place = register.by_platform(origin) if register else None
+        owner = register.people[place].student_id if register and place is not None else ""
+        jobs.append(Job(submission, owner))
+    graded: dict[int, Graded] = {}
+    reused = 0
     progress(0, len(found))
-
-    def on_done(index: int, result: tuple[Graded, bool] | Failed) -> None:
-        nonlocal reused, done
-        if isinstance(result, Failed):
-            why = Refused(f"Grading it failed: {result.reason}", "Read it yourself.")
-            graded[index] = replace(refused(rubric, key, why), submission=found[index].name)
-        else:
-            graded[index], recalled = result
-            reused += recalled
-        done += 1
-        progress(done, len(found))
-
-    run_bounded(
+    work = run_bounded(
         partial(
             grade_one,
             logs=files_by_sha256(logs),
@@ -260,13 +224,20 @@ def grade_all(
         processes=min(processes or os.cpu_count() or 1, len(jobs)),
         timeout_s=TIMEOUT_S,
         memory_bytes=MEMORY_BYTES,
-        on_done=on_done,
-        keep=False,
     )
+    with closing(work):
+        for index, result in work:
+            if isinstance(result, Failed):
+                why = Refused(f"Grading it failed: {result.reason}", "Read it yourself.")
+                graded[index] = replace(refused(rubric, key, why), submission=found[index].name)
+            else:
+                graded[index], recalled = result
+                reused += recalled
+            progress(len(graded), len(found))
     named = [
         one if one.student or one.student_id or not origin.platform
         else replace(one, student=origin.name)
-        for one, origin in zip((one for one in graded if one is not None), origins, strict=True)
+        for one, origin in zip((graded[at] for at in range(len(found))), origins, strict=True)
     ]  # fmt: skip
     return tuple(named), reused
 

@@ -11,11 +11,9 @@ from __future__ import annotations
 
 import base64
 import hashlib
-import io
 import json
 import re
-import zipfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from datetime import datetime
 from importlib import metadata
 from importlib.resources import files
@@ -26,6 +24,7 @@ from typing import Any
 from px4fuse.errors import OutputError, SettingsError
 from px4fuse.grading.lateness import LateRule
 from px4fuse.grading.model import Entry
+from px4fuse.grading.zipping import zipped
 from px4fuse.reading import read_text
 from px4fuse.results.reading import cleaned, one_line
 
@@ -48,8 +47,6 @@ RUN = """#!/usr/bin/env bash
 exec /opt/px4fuse/bin/px4fuse grade --gradescope /autograder{options}
 """
 EXECUTABLE = ("setup.sh", "run_autograder")
-# Zip files know no earlier time; the same autograder is the same file
-TIME = (1980, 1, 1, 0, 0, 0)
 
 
 def results(entry: Entry, text: str, seconds: float | None = None) -> dict[str, Any]:
@@ -184,18 +181,7 @@ def autograder(
             contents[f"logs/{number}{path.suffix}"] = path.read_bytes()
         except OSError as error:
             raise OutputError(f"{path}: cannot be read ({error.strerror}).") from error
-    return _zip(contents)
-
-
-def _zip(contents: Mapping[str, bytes]) -> bytes:
-    out = io.BytesIO()
-    with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive:
-        for name, content in contents.items():
-            entry = zipfile.ZipInfo(name, TIME)
-            entry.compress_type = zipfile.ZIP_DEFLATED
-            entry.external_attr = (0o100755 if name in EXECUTABLE else 0o100644) << 16
-            archive.writestr(entry, content)
-    return out.getvalue()
+    return zipped(contents, EXECUTABLE)
 
 
 def _constraints() -> str:
@@ -230,7 +216,7 @@ def _wheel() -> tuple[str, bytes]:
         f"{name},sha256={_digest(content)},{len(content)}" for name, content in contents.items()
     ]
     record = "\n".join([*lines, f"{info}/RECORD,,"]) + "\n"
-    return f"px4fuse-{version}-py3-none-any.whl", _zip(
+    return f"px4fuse-{version}-py3-none-any.whl", zipped(
         contents | {f"{info}/RECORD": record.encode()}
     )
 

@@ -13,11 +13,12 @@ from dataclasses import dataclass, replace
 from importlib import metadata
 from pathlib import Path
 
-from px4fuse.assignment.sheet import Sheet, read_sheet
+from px4fuse.assignment.sheet import read_sheet
 from px4fuse.grading import exports, submissions
 from px4fuse.grading.anonymous import hidden_words
 from px4fuse.grading.class_page import html_text
 from px4fuse.grading.class_table import csv_text
+from px4fuse.grading.entries import Course
 from px4fuse.grading.gradescope import results
 from px4fuse.grading.model import Entry, Graded, Submission
 from px4fuse.grading.names import distinct, file_names
@@ -26,7 +27,7 @@ from px4fuse.grading.platforms import Origin, seen
 from px4fuse.grading.records import HANDED_IN, REDRAWN, file_of
 from px4fuse.grading.returned import returned_text
 from px4fuse.grading.roster import Register
-from px4fuse.grading.sheets import draw_sheets
+from px4fuse.grading.sheets import delete_others, draw_sheets
 from px4fuse.spreadsheet import neutral, neutral_id
 from px4fuse.verification.model import Refused
 from px4fuse.writing import write_all
@@ -52,10 +53,7 @@ class Class:
     register : Register
         Its people are those of the first entries.
     title : str
-    worksheets : tuple of Sheet
-    column : str
-        Of the worksheets, for the grade.
-    anonymous : bool
+    course : Course
     origins : mapping
         Name of a submission to where it came from.
     files : mapping
@@ -65,9 +63,7 @@ class Class:
     entries: tuple[Entry, ...]
     register: Register
     title: str
-    worksheets: tuple[Sheet, ...]
-    column: str
-    anonymous: bool
+    course: Course
     origins: Mapping[str, Origin]
     files: Mapping[str, Submission]
 
@@ -89,11 +85,11 @@ def write_class(
         _with_files(entry, name, made, output, records)
         for entry, name in zip(made.entries, names, strict=True)
     ]
-    pictured = _with_sheets(written_out, output, made.anonymous, processes)
+    pictured = _with_sheets(written_out, output, made.course.anonymous, processes)
     texts = {at: returned_text(entry, made.title) for at, entry in enumerate(made.entries)}
     table, page, said = output / "class.csv", output / "class.html", output / NAME
     contents = {table: csv_text(made.entries).encode()}
-    if made.anonymous:
+    if made.course.anonymous:
         pictured, listed = _pseudonyms(pictured, output / NAMES)
         contents[output / NAMES] = listed.encode()
     made_with = f"px4fuse {metadata.version('px4fuse')}"
@@ -108,6 +104,8 @@ def write_class(
     grades, notes = _grades(made, texts)
     contents |= {output / GRADES / name: content for name, content in grades.items()}
     write_all(contents)
+    drawn = {Path(name).name for entry in pictured for one in entry.files for name in one.sheets}
+    delete_others(output / SHEETS, drawn)
     folders = [output / FEEDBACK, output / "gradescope"]
     if any(one.redrawn_name for entry in pictured for one in entry.files):
         folders = [output / REPORTS, output / SHEETS, *folders]
@@ -228,9 +226,9 @@ def _grades(made: Class, texts: Mapping[int, str]) -> tuple[dict[str, bytes], tu
     """Files that a learning platform imports, by name, and what could not be entered."""
     contents: dict[str, bytes] = {}
     notes: list[str] = []
-    names = distinct((sheet.path.stem for sheet in made.worksheets), "{}-{}")
-    for sheet, name in zip(made.worksheets, names, strict=True):
-        filled = exports.filled(sheet, made.entries, made.register, made.column, texts)
+    names = distinct((sheet.path.stem for sheet in made.course.worksheets), "{}-{}")
+    for sheet, name in zip(made.course.worksheets, names, strict=True):
+        filled = exports.filled(sheet, made.entries, made.register, made.course.column, texts)
         contents[f"{name}{sheet.path.suffix}"] = filled.sheet.content()
         notes += filled.notes
     platforms = seen(made.origins.values())

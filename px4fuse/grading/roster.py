@@ -156,11 +156,6 @@ class Register:
             )
         )
 
-    def of_platform(self, origin: Origin) -> Person | None:
-        """Whose file it is, as :meth:`by_platform`."""
-        place = self.by_platform(origin)
-        return None if place is None else self.people[place]
-
     def by_report(self, student_id: str, name: str) -> int | None:
         """Whose report it is by what stands in it: the id, else the name."""
         return self.place(Person(student_id, name))

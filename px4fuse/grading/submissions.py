@@ -13,14 +13,16 @@ import struct
 import zipfile
 import zlib
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 from typing import IO
 
 from px4fuse.errors import SettingsError
 from px4fuse.grading.model import Submission
+from px4fuse.grading.names import distinct
 from px4fuse.grading.platforms import METADATA, Origin, gradescope_metadata
 from px4fuse.results.reading import cleaned, one_line
 from px4fuse.verification.intake import MAX_BYTES
@@ -34,7 +36,8 @@ MAX_TOTAL_BYTES = 4_000_000_000
 MAX_INNER_BYTES = 500_000_000
 # PDFs are compressed inside; what still shrinks a hundred times is empty
 MAX_RATIO = 100
-MAX_NAME = 200
+# Of a name, with room for the number of a second one of it
+MAX_NAME = 192
 # The year that stands where a program knew no time
 ZIP_EPOCH = 1980
 
@@ -88,7 +91,7 @@ def collect(paths: Sequence[Path]) -> tuple[tuple[Submission, ...], tuple[str, .
                 found.setdefault((file, ""), (name, None))
             elif name.lower().endswith(".zip"):
                 prefix = f"{name}/" if path.is_dir() else ""
-                for entry, inner, time in _entries_of_file(file, name, notes, others):
+                for entry, inner, time in _entries(partial(_outer, file), name, notes, others):
                     found.setdefault((file, entry), (prefix + inner, time))
             else:
                 others[_kind(name)] += 1
@@ -100,7 +103,7 @@ def collect(paths: Sequence[Path]) -> tuple[tuple[Submission, ...], tuple[str, .
         why = f" {' '.join(notes)}" if notes else ""
         raise SettingsError(one_line(f"No PDF was found in what was given.{why}", 500))
     order = sorted(found.items(), key=lambda item: (item[1][0].casefold(), item[1][0], item[0]))
-    names = _unique(_shown(name) for _, (name, _) in order)
+    names = distinct(_shown(name) for _, (name, _) in order)
     made = (
         Submission(*where, name, time)
         for (where, (_, time)), name in zip(order, names, strict=True)
@@ -247,54 +250,53 @@ def _kind(name: str) -> str:
     return suffix if re.fullmatch(r"\.[a-z0-9]{1,8}", suffix) else "without a known suffix"
 
 
-def _entries_of_file(
-    file: Path, name: str, notes: list[str], others: Counter[str]
+def _entries(
+    opened: Callable[[], IO[bytes]],
+    name: str,
+    notes: list[str],
+    others: Counter[str],
+    is_inner: bool = False,
 ) -> Iterator[Found]:
-    """PDFs in a zip file."""
+    """PDFs in a zip file, and in the zip files in it, with the time of the outer entry."""
     shown = _shown(name)
     try:
-        with file.open("rb") as stream, _archive(stream) as archive:
+        with opened() as stream, _archive(stream) as archive:
             inner_left = MAX_INNER_BYTES
             for entry, label in _listed(archive, shown, notes):
+                # the student set the clock of what is in an inner zip file
+                time = _time(entry)
                 if label.lower().endswith(".pdf"):
-                    yield entry, label, _time(archive.getinfo(entry))
-                elif label.lower().endswith(".zip"):
-                    inner_left -= archive.getinfo(entry).file_size
+                    yield entry.filename, label, time
+                elif not label.lower().endswith(".zip"):
+                    others[_kind(label)] += 1
+                elif is_inner:
+                    notes.append(f"{shown}: a zip file in it was passed over: too deep.")
+                else:
+                    inner_left -= entry.file_size
                     if inner_left < 0:
                         notes.append(
                             f"{shown}: it holds too many zip files; the rest of it was passed over."
                         )
                         return
-                    yield from _entries_inside(archive, entry, label, notes, others)
-                else:
-                    others[_kind(label)] += 1
+                    content = partial(_inner, archive, entry.filename)
+                    for inside, inner_label, _ in _entries(content, label, notes, others, True):
+                        yield f"{entry.filename}{_INSIDE}{inside}", f"{label}/{inner_label}", time
     except (_EntryError, MemoryError, *_DAMAGED) as error:
         why = str(error) if isinstance(error, _EntryError) else "not a zip file, or damaged."
         notes.append(f"{shown}: passed over: {why}")
 
 
-def _entries_inside(
-    archive: zipfile.ZipFile, entry: str, label: str, notes: list[str], others: Counter[str]
-) -> Iterator[Found]:
-    """PDFs in a zip file in a zip file, with the time of the outer one."""
-    shown = _shown(label)
-    # the student set the clock of what is in the inner one
-    time = _time(archive.getinfo(entry))
-    try:
-        with _archive(io.BytesIO(_unpacked(archive, entry))) as inner:
-            for inner_entry, inner_label in _listed(inner, shown, notes):
-                if inner_label.lower().endswith(".pdf"):
-                    yield f"{entry}{_INSIDE}{inner_entry}", f"{label}/{inner_label}", time
-                elif inner_label.lower().endswith(".zip"):
-                    notes.append(f"{shown}: a zip file in it was passed over: too deep.")
-                else:
-                    others[_kind(inner_label)] += 1
-    except (_EntryError, MemoryError, *_DAMAGED) as error:
-        why = str(error) if isinstance(error, _EntryError) else "not a zip file, or damaged."
-        notes.append(f"{shown}: passed over: {why}")
+def _outer(file: Path) -> IO[bytes]:
+    return file.open("rb")
 
 
-def _listed(archive: zipfile.ZipFile, shown: str, notes: list[str]) -> Iterator[tuple[str, str]]:
+def _inner(archive: zipfile.ZipFile, name: str) -> IO[bytes]:
+    return io.BytesIO(_unpacked(archive, name))
+
+
+def _listed(
+    archive: zipfile.ZipFile, shown: str, notes: list[str]
+) -> Iterator[tuple[zipfile.ZipInfo, str]]:
     """Entries of a zip file that are files and not hidden, with their names for people."""
     entries = [entry for entry in archive.infolist() if not entry.is_dir()]
     # the declared size is the most that zipfile unpacks of an entry, so a lie makes it smaller
@@ -309,7 +311,7 @@ def _listed(archive: zipfile.ZipFile, shown: str, notes: list[str]) -> Iterator[
     for entry in last.values():
         label = _label(entry)
         if not any(map(_hidden, label.split("/"))):
-            yield entry.filename, label
+            yield entry, label
 
 
 def _time(entry: zipfile.ZipInfo) -> datetime | None:
@@ -371,16 +373,3 @@ def _shown(name: str) -> str:
     if len(line) > MAX_NAME:
         line = f"{line[: MAX_NAME // 2]}…{line[-(MAX_NAME - MAX_NAME // 2 - 1) :]}"
     return line or "nameless"
-
-
-def _unique(names: Iterable[str]) -> Iterator[str]:
-    taken: set[str] = set()
-    used: Counter[str] = Counter()
-    for name in names:
-        made = name
-        while made.casefold() in taken:
-            used[name.casefold()] += 1
-            ending = f" ({used[name.casefold()] + 1})"
-            made = f"{name[: MAX_NAME - len(ending)]}{ending}"
-        taken.add(made.casefold())
-        yield made

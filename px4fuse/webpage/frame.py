@@ -67,9 +67,9 @@ class Cell:
     picture: tuple[float, ...] = ()
 
 
-def words(text: str, below: str = "", look: str = "") -> Cell:
+def words(text: str, below: str = "") -> Cell:
     """A cell that is sorted by its text."""
-    return Cell(text, text or None, below, look)
+    return Cell(text, text or None, below)
 
 
 def figure(
@@ -207,7 +207,7 @@ def page(
     columns: Sequence[Column],
     rows: Sequence[Row],
     filters: Sequence[tuple[str, Sequence[tuple[str, str]]]],
-    groups: Sequence[tuple[str, str, bool]] = (),
+    groups: Sequence[tuple[str, str]] = (),
     placeholder: str,
     otherwise: str,
 ) -> str:
@@ -224,8 +224,8 @@ def page(
     rows : sequence of Row
     filters : sequence of (label, ((tag, words), ...))
         Rows that have the chosen tag are shown.
-    groups : sequence of (group, label, ticked)
-        Boxes that show more columns; ticked holds on wide screens alone.
+    groups : sequence of (group, label)
+        Boxes that show more columns.
     placeholder : str
         What one may search for.
     otherwise : str
@@ -281,11 +281,9 @@ def _select(number: int, label: str, options: Sequence[tuple[str, str]]) -> str:
     )
 
 
-def _box(group: str, label: str, ticked: bool) -> str:
-    return (
-        f'<label><input type="checkbox" data-group="{escaped(group)}" autocomplete="off"'
-        f"{' data-ticked' * ticked}> {escaped(label)}</label>"
-    )
+def _box(group: str, label: str) -> str:
+    box = f'<input type="checkbox" data-group="{escaped(group)}" autocomplete="off">'
+    return f"<label>{box} {escaped(label)}</label>"
 
 
 def _compact(cell: Cell) -> list[Any]:
