@@ -72,7 +72,6 @@ class AnswerKey:
     ----------
     kind : str
         Of the flights.
-    answers : tuple of Answer
     secret : str
         From which the flights were drawn, where it was made up; else "".
     version : int

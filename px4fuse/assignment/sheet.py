@@ -31,7 +31,6 @@ class Sheet:
 
     Attributes
     ----------
-    path : Path
     head : tuple of str
         Titles of the columns.
     rows : tuple of tuple of str
@@ -40,7 +39,6 @@ class Sheet:
         Line of each row in the file, for messages.
     mark : bytes
         Byte order mark; empty without.
-    encoding, separator, line_end : str
     quoted : bool
         Whether every cell stands in quotes.
     """

@@ -136,12 +136,7 @@ def diff(a: str | Path, b: str | Path, *, progress: Progress = lambda _: None) -
 
 
 def changes(a: Side, b: Side) -> Changes:
-    """Hold two comparisons against each other.
-
-    Parameters
-    ----------
-    a, b : Side
-    """
+    """Hold two comparisons against each other."""
     paired = a.results.log.sha256 == b.results.log.sha256
     first, second = (numbers(side.results, side.analysis) for side in (a, b))
     both = {path: (first[path], second[path]) for path in first if path in second}

@@ -167,7 +167,6 @@ def outcomes(
         Of workers with one thread each, and a nanny.
     function : callable
         At the top level of a module.
-    jobs : iterable
     timeout_s : float
         For one job, once it runs.
 

@@ -90,10 +90,6 @@ def _identified(job: Job) -> str:
 def analyse(job: Job) -> Outcome:
     """Compare one log as ``px4fuse compare`` does.
 
-    Parameters
-    ----------
-    job : Job
-
     Returns
     -------
     Outcome

@@ -88,7 +88,6 @@ def html_text(table: pd.DataFrame, title: str, made_with: str) -> str:
     table : DataFrame
         A row per log and axis, with the columns of :data:`px4fuse.fleet.rows.COLUMNS`; a log that
         could not be read has one row without an axis.
-    title : str
     made_with : str
         Name and version of the program.
 

@@ -64,10 +64,6 @@ def rows_of(found: ComparisonResults) -> list[Row]:
     A factor says how many times S is overstated (above 1) or understated (below 1), as
     ``variance_factor`` in the results. SIGMA_Z and SIGMA_A are what the data ask for, north and
     east together. The clock offset is there where it is determinable.
-
-    Parameters
-    ----------
-    found : ComparisonResults
     """
     common = log_columns(found.log) | {
         "px4fuse": found.provenance.px4fuse,

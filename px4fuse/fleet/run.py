@@ -54,7 +54,6 @@ class Fleet:
         How many logs an earlier run has compared.
     severities : frozenset of str
         Of all findings.
-    written : tuple of Path
     against : str
         What the logs were held against; empty without a baseline.
     """
@@ -190,16 +189,12 @@ def run(
 
     Parameters
     ----------
-    logs : sequence of FoundLog
     output : Path
         Folder.
     request : ComparisonRequest
         Its settings count for every log.
-    client : Client
-    reports : bool
     timeout_s : float
         For one log.
-    baseline : DataFrame, optional
     progress : callable
         As :func:`batch`.
 

@@ -66,7 +66,6 @@ def contrast(a: Number, b: Number, spread: float = 0.0) -> Contrast | None:
 
     Parameters
     ----------
-    a, b : Number
     spread : float
         Standard deviation, on their scale, by which one number of two flights with the same
         equipment varies beyond its own interval.

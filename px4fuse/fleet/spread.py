@@ -69,13 +69,7 @@ CHANGES = (
 
 
 def fly(change: Change, seed: int) -> tuple[Told, Told]:
-    """Numbers of one simulated flight: with the log at hand, and from its results alone.
-
-    Parameters
-    ----------
-    change : Change
-    seed : int
-    """
+    """Numbers of one simulated flight: with the log at hand, and from its results alone."""
     scenario = Scenario(passes=change.passes, sigma_uwb_m=change.sigma_uwb_m, seed=seed)
     flight = simulate_flight(scenario, parse(change.mistakes))
     analysis = explain(compare(flight, SETTINGS))

@@ -53,7 +53,6 @@ def run_autograder(folder: Path, late: LateRule | None) -> None:
     ----------
     folder : Path
         ``/autograder``, with ``source``, ``submission`` and ``submission_metadata.json``.
-    late : LateRule, optional
 
     Raises
     ------

@@ -65,7 +65,6 @@ def html_text(entries: Sequence[Entry], title: str, made_with: str) -> str:
     ----------
     entries : sequence of Entry
         One per student. Where they have pseudonyms, no name, id or file's name is on the page.
-    title : str
     made_with : str
         Name and version of the program.
 

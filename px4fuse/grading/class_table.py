@@ -25,10 +25,6 @@ def csv_text(entries: Sequence[Entry]) -> str:
 
     Points of the items are those that count, the instructor's where there are some.
 
-    Parameters
-    ----------
-    entries : sequence of Entry
-
     Returns
     -------
     str

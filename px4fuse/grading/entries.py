@@ -31,7 +31,6 @@ class Term:
         Which one counts of several.
     due : datetime or None
         With a time zone.
-    late : LateRule or None
     times : mapping
         Index of a person in the register to when Moodle says that the work was handed in.
     """
@@ -114,9 +113,6 @@ def class_entries(
     ----------
     graded, submissions, origins : sequences
         Of every file, in one order.
-    register : Register, optional
-    term : Term
-    overrides : mapping
 
     Returns
     -------

@@ -76,7 +76,6 @@ def grade_column(sheet: Sheet, wanted: str) -> int:
 
     Parameters
     ----------
-    sheet : Sheet
     wanted : str
         Title of the column, without the platform's number; "" where there is only one.
 
@@ -121,10 +120,8 @@ def filled(
 
     Parameters
     ----------
-    sheet : Sheet
     entries : sequence of Entry
         The first ones of the people in ``register``, in its order.
-    register : Register
     column : str
         As :func:`grade_column` takes it.
     feedback : mapping
@@ -215,10 +212,8 @@ def moodle_feedback(
 
     Parameters
     ----------
-    entries : sequence of Entry
     origins : mapping
         Name of a submission to where it came from.
-    feedback : mapping
     """
     files = {}
     for at, entry in enumerate(entries):

@@ -86,7 +86,6 @@ class Flown:
     ----------
     number : int
         Of the student.
-    drawn : Drawn
     cache : Path or None
         Folder of analyses that were made before.
     """

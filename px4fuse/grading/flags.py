@@ -166,7 +166,6 @@ def class_flags(
 
     Parameters
     ----------
-    graded : sequence of Graded
     key : AnswerKey, optional
         Tells whose log is whose.
 

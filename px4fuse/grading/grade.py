@@ -58,7 +58,6 @@ class Outcome:
         What was passed over.
     reused : int
         How many reports were not verified again, since nothing of theirs has changed.
-    written : tuple of Path
     """
 
     entries: tuple[Entry, ...]
@@ -92,14 +91,12 @@ def grade(
         PDFs, folders and zip files.
     logs : sequence of Path
         Flight logs and folders of them; a report names its log by SHA-256.
-    rubric : Rubric
     output : Path
         Folder for the class table (``class.csv``, ``class.html``), the redrawn ``reports/``,
         ``feedback/``, ``gradescope/``, ``grades/`` for learning platforms, and the records that
         make a second run quick. Its ``overrides.csv`` is read.
     key : AnswerKey, optional
         Which mistakes each student's flight has.
-    course : Course, optional
     title : str
         Of the class page.
     processes : int, optional

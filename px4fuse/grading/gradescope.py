@@ -54,7 +54,6 @@ def results(entry: Entry, text: str, seconds: float | None = None) -> dict[str, 
 
     Parameters
     ----------
-    entry : Entry
     text : str
         What the student reads about all of it.
     seconds : float, optional
@@ -162,7 +161,6 @@ def autograder(
         As TOML.
     key : str, optional
         As JSON.
-    late : LateRule, optional
     python : str
         Its version: "3.12".
     """

@@ -37,7 +37,6 @@ class LateRule:
     ----------
     share : float
         Of the most points, for every started unit.
-    unit_s : float
     most : float
         Share that is never exceeded.
     text : str

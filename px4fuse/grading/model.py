@@ -22,14 +22,12 @@ class Parameter:
 
     Attributes
     ----------
-    kind : {"number", "whole", "flag", "text", "texts"}
     default : object
         Where it is left out; None says that there is none, which leaves that part out.
     low, high : float
         Limits of a number, or of each.
     choices : tuple of str
         What a text may be; empty for anything.
-    required : bool
     """
 
     kind: Kind
@@ -46,7 +44,6 @@ class RubricItem:
 
     Attributes
     ----------
-    title : str
     points : float
         The most that it gives.
     check : str
@@ -114,18 +111,15 @@ class Rubric:
 
     Attributes
     ----------
-    title : str
     unverified : {"pending", "zero"}
         What becomes of the points of a report that cannot be verified.
     others_log : {"pending", "zero", "count"}
         What becomes of those of a report on a log that was not given to the student.
     pages : {"count", "pending", "zero"}
         What becomes of those of a verified report whose pages look otherwise.
-    items : tuple of RubricItem
     words : dict
         Finding id to words by which notes may name it, and what says or changes something about
         them: see rubric.toml.
-    notes : Reading
     """
 
     title: str

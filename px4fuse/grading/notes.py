@@ -65,8 +65,6 @@ class Sentence:
 
     Attributes
     ----------
-    text : str
-    words : tuple of str
     clause : tuple of int
         Which part between commas, colons and brackets each word is in.
     """
@@ -87,10 +85,8 @@ class Mention:
 
     Attributes
     ----------
-    stance : {"claimed", "open", "denied"}
     phrase : str
         By which it was found.
-    passage : str
     """
 
     stance: Stance
@@ -237,7 +233,6 @@ def read_notes(
     ----------
     text : str
         Markdown. What a page does not show (comments, addresses' titles) is not read.
-    words : Words
     rules : Reading
         What makes a text of sentences, from the rubric.
     ids : collection of str

@@ -49,11 +49,8 @@ class Class:
 
     Attributes
     ----------
-    entries : tuple of Entry
     register : Register
         Its people are those of the first entries.
-    title : str
-    course : Course
     origins : mapping
         Name of a submission to where it came from.
     files : mapping

@@ -79,8 +79,6 @@ def matched(
 
     Parameters
     ----------
-    overrides : mapping
-    entries : sequence of Entry
     items : sequence of sequence of str
         Titles of the items of each entry.
 

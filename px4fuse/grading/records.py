@@ -43,7 +43,6 @@ class Verified:
     ----------
     report : Report
         Without its bytes; its pages are those of the redrawn report, as far as there is one.
-    verdict : Verdict
     page : int
         Which page the pictures show, counted from 1.
     """
@@ -79,7 +78,6 @@ def verified(
 
     Parameters
     ----------
-    records : Path
     pdf : bytes
         Anything.
     logs : mapping

@@ -53,7 +53,6 @@ def draw_sheets(
     ----------
     reports : mapping
         Key to the redrawn PDF, and the words that its pictures must not show.
-    folder : Path
     processes : int, optional
         By default as many as there are cores.
 

@@ -93,7 +93,6 @@ def run_bounded(
     ----------
     function : callable
         At the top level of a module; pickled, as are jobs and results.
-    jobs : sequence
     processes : int
         At once.
     timeout_s : float

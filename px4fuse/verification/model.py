@@ -22,8 +22,6 @@ class Report:
     ----------
     sha256 : str
         Of the PDF.
-    size_bytes : int
-    seal : {"intact", "broken", "missing"}
     results : ComparisonResults or LoopResults
         The attached results.
     pages : tuple of str
@@ -102,7 +100,6 @@ class Verdict:
         Sentences: what differs, or why nothing can be said; for "verified" what was checked.
     with_log : bool
         Whether the analysis was run again on the log.
-    differences : tuple of Difference
     page_status : {"same", "differ", "not compared"}
         Whether the pages that were handed in look like the redrawn ones.
     pages : tuple of PageDifference

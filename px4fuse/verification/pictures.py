@@ -90,12 +90,10 @@ def page_pictures(
 
     Parameters
     ----------
-    pdf : bytes
     hide : sequence of str
         Words that must not be read in the pictures: they are covered, and so is the head of each
         page. Where none of them is found on the first page, nothing is drawn: the words are there
         in letters that cannot be searched.
-    width_px : int
 
     Returns
     -------

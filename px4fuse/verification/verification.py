@@ -92,7 +92,6 @@ def verify(
 
     Parameters
     ----------
-    report : Report
     logs : sequence of Path, or mapping of str to Path
         Logs and other recordings, or folders of such; or files by their SHA-256, where many
         reports share them.
@@ -210,7 +209,6 @@ def compare_results(recorded: Mapping[str, Any], recomputed: Mapping[str, Any]) 
     ----------
     recorded : mapping
         A stranger's; followed only as far as the other one goes.
-    recomputed : mapping
     """
     command = str(recomputed["provenance"]["command"])
     # everything rests on an offset or placement that was estimated

@@ -24,13 +24,7 @@ STRETCHES = 60
 
 @dataclass(frozen=True)
 class Scale:
-    """An axis, linear or logarithmic.
-
-    Attributes
-    ----------
-    low, high : float
-    log : bool
-    """
+    """An axis, linear or logarithmic."""
 
     low: float
     high: float
@@ -171,7 +165,6 @@ def over_time(
 
     Parameters
     ----------
-    times : Series of timestamps
     values : DataFrame
         Columns value, low, high; the last two may be absent numbers.
     span : (Timestamp, Timestamp)

@@ -25,7 +25,6 @@ class Column:
 
     Attributes
     ----------
-    title : str
     kind : {"text", "line", "number", "rank"}
         How it is sorted; a line is text that stays in one, a rank is text sorted by a number.
     group : str
@@ -49,7 +48,6 @@ class Cell:
 
     Attributes
     ----------
-    text : str
     value : float, str or None
         By which it is sorted; None comes last both ways.
     below : str
@@ -215,13 +213,10 @@ def page(
 
     Parameters
     ----------
-    title, subtitle : str
     above : str
         HTML for above the table, of text made safe with :func:`~px4fuse.webpage.safe.escaped`.
     noun : (str, str)
         What a row is, one and many.
-    columns : sequence of Column
-    rows : sequence of Row
     filters : sequence of (label, ((tag, words), ...))
         Rows that have the chosen tag are shown.
     groups : sequence of (group, label)
