@@ -13,7 +13,6 @@ from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 import pandas as pd
@@ -25,9 +24,9 @@ from px4fuse.fleet.measures import Aim, Scale
 from px4fuse.fleet.rows import COLUMNS, DONE, FAILED
 from px4fuse.fleet.significance import (
     FALSE_DISCOVERY_RATE,
-    LEAST_DIFFERENCE,
-    LEAST_RATIO,
     corrected,
+    farther,
+    least_difference,
 )
 from px4fuse.plain import number_words
 from px4fuse.reading import size_of
@@ -35,7 +34,6 @@ from px4fuse.reading import size_of
 #: A vehicle's flights tell a range from so many on
 MIN_FLIGHTS = 5
 BETWEEN_CHANGES = "; "
-Number = TypeVar("Number", float, Array)
 
 
 @dataclass(frozen=True)
@@ -61,14 +59,7 @@ class _Column:
 
     @property
     def least(self) -> float:
-        """A smaller difference is none."""
-        if self.scale == "ratio":
-            return float(np.log1p(LEAST_RATIO))
-        return LEAST_DIFFERENCE[self.unit]
-
-    def farther(self, now: Number, before: Number) -> Number:
-        """By how much numbers are farther from what is best."""
-        return now - before if self.aim == "low" else abs(now) - abs(before)
+        return least_difference(self.scale, self.unit)
 
 
 _TRUTH = "ekf2_position_rmse_to_truth_m"
@@ -191,9 +182,10 @@ def marked(table: pd.DataFrame, baseline: pd.DataFrame) -> Marked:
         # where a truth judges both, how far they are apart is neither good nor bad
         judged = ~has_truth if name == _APART else np.ones(len(table), dtype=bool)
         now, was = column.scaled(table[name]), column.scaled(latest[name].reindex(of_log))
-        for at in np.flatnonzero(judged & is_same & (column.farther(now, was) >= column.least)):
-            said = f"{column.label} {column.words(now[at])}, was {column.words(was[at])}"
-            worse[int(at)].append(said)
+        for at in np.flatnonzero(judged & is_same):
+            if farther(column.aim, now[at], was[at]) >= column.least:
+                said = f"{column.label} {column.words(now[at])}, was {column.words(was[at])}"
+                worse[int(at)].append(said)
         flights = known[_VEHICLE].assign(value=column.scaled(known[name])).groupby(_VEHICLE)
         found = flights["value"].agg(["count", "mean", "std"]).reindex(of_vehicle)
         n, mean, std = found.fillna(0.0).to_numpy().T
@@ -204,7 +196,7 @@ def marked(table: pd.DataFrame, baseline: pd.DataFrame) -> Marked:
             for at in np.flatnonzero(tested)
         ]
     for test, q in zip(tests, corrected(_p(tests)), strict=True):
-        if q < FALSE_DISCOVERY_RATE and test.column.farther(test.now, test.mean) > 0.0:
+        if q < FALSE_DISCOVERY_RATE and farther(test.column.aim, test.now, test.mean) > 0.0:
             worse[test.at].append(test.words)
     change = [BETWEEN_CHANGES.join(worse.get(at, ())) for at in range(len(table))]
     same, by_vehicle = (table["log"][rows].nunique() for rows in (is_same, held))

@@ -56,7 +56,6 @@ class Filled:
     """A table as a platform takes it, and what could not be entered: sentences."""
 
     sheet: Sheet
-    entered: int
     notes: tuple[str, ...]
 
 
@@ -137,7 +136,7 @@ def filled(
     kind = kind_of(sheet)
     cells = [list(row) for row in sheet.rows]
     comma = any(re.fullmatch(r"\d+,\d+", cell.strip()) for row in cells for cell in row)
-    notes, entered, seen = [], 0, set()
+    notes, seen = [], set()
     for row in cells:
         at = _place(sheet, row, register)
         if at is None:
@@ -154,7 +153,6 @@ def filled(
             )
         said = number(entry.total)
         row[place] = said.replace(".", ",") if comma and kind == "moodle" else said
-        entered += 1
         if comments is not None and comments != place and at in feedback:
             row[comments] = as_html(feedback[at]) if kind != "other" else neutral(feedback[at])
             if formats is not None:
@@ -166,7 +164,7 @@ def filled(
             f"{sheet.path.name}: it has no row for {', '.join(left[:4])}"
             + (f" and {len(left) - 4} more." if len(left) > 4 else ".")
         )
-    return Filled(replace(sheet, rows=tuple(map(tuple, cells))), entered, tuple(notes))
+    return Filled(replace(sheet, rows=tuple(map(tuple, cells))), tuple(notes))
 
 
 def _place(sheet: Sheet, row: Sequence[str], register: Register) -> int | None:

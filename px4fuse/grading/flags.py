@@ -176,11 +176,8 @@ def class_flags(
     """
     found: dict[int, list[str]] = defaultdict(list)
     looks = (
-        _same_report(graded),
-        _same_id(graded),
-        _same_log(graded),
+        _same(graded),
         _other_assignment(graded, key),
-        _same_settings(graded),
         _other_version(graded),
         _copied_notes(graded),
         _other_name(graded, key),
@@ -194,24 +191,23 @@ def class_flags(
 Flags = Iterator[tuple[int, str]]
 
 
-def _same_report(graded: Sequence[Graded]) -> Flags:
-    for members in _groups([one.sha256 for one in graded]):
-        for index in members:
-            yield index, f"The same file as {_others(graded, members, index)}."
-
-
-def _same_id(graded: Sequence[Graded]) -> Flags:
-    for members in _groups([folded_id(one.student_id) for one in graded]):
-        for index in members:
-            yield index, f"The same student id as in {_others(graded, members, index)}."
-
-
-def _same_log(graded: Sequence[Graded]) -> Flags:
-    """Identical logs of different students; one student may hand in two reports on one log."""
-    for members in _groups([one.log_sha256 for one in graded]):
-        if len({_who(graded[index]) for index in members}) > 1:
-            for index in members:
-                yield index, f"The same log as {_others(graded, members, index)}."
+def _same(graded: Sequence[Graded]) -> Flags:
+    # one student may hand in two reports on one log, with one choice of settings
+    looks = (
+        ("The same file as {}.", [one.sha256 for one in graded], False),
+        ("The same student id as in {}.", [folded_id(one.student_id) for one in graded], False),
+        ("The same log as {}.", [one.log_sha256 for one in graded], True),
+        ("The same settings to the last digit as {}: {}.", [one.settings for one in graded], True),
+    )
+    for said, values, of_different in looks:
+        where: dict[str, list[int]] = defaultdict(list)
+        for index, value in enumerate(values):
+            where[value].append(index)
+        for value, members in where.items():
+            students = {_who(graded[index]) for index in members}
+            if value and len(students if of_different else members) > 1:
+                for index in members:
+                    yield index, said.format(_others(graded, members, index), value)
 
 
 def _other_assignment(graded: Sequence[Graded], key: AnswerKey | None) -> Flags:
@@ -224,23 +220,11 @@ def _other_assignment(graded: Sequence[Graded], key: AnswerKey | None) -> Flags:
         if given is None:
             yield index, "The log is not one of those that were handed out with the assignment."
         elif own is None:
-            said = (
-                f"the id {_line(one.student_id)} is not in the answer key"
-                if one.student_id
-                else "the report gives no id"
-            )
+            absent = f"the id {_line(one.student_id)} is not in the answer key"
+            said = absent if one.student_id else "the report gives no id"
             yield index, f"The log was given to {given.student_id}; {said}."
         elif own.sha256 != one.log_sha256:
             yield index, f"The log was given to another student, {given.student_id}."
-
-
-def _same_settings(graded: Sequence[Graded]) -> Flags:
-    for members in _groups([one.settings for one in graded]):
-        if len({_who(graded[index]) for index in members}) > 1:
-            for index in members:
-                others = _others(graded, members, index)
-                same = graded[index].settings
-                yield index, f"The same settings to the last digit as {others}: {same}."
 
 
 def chosen_settings(results: Reported) -> str:
@@ -263,9 +247,9 @@ def _other_version(graded: Sequence[Graded]) -> Flags:
     if len(counted) < 2:
         return
     usual = counted.most_common(1)[0][0]
+    others = f"most of the class with {_line(usual)}"
     for index, one in enumerate(graded):
         if one.version and one.version != usual:
-            others = f"most of the class with {_line(usual)}"
             yield index, f"Made with px4fuse {_line(one.version)}, {others}."
 
 
@@ -304,11 +288,8 @@ def _copied_notes(graded: Sequence[Graded]) -> Flags:
         alike[second].append((share, first))
     for index, others in sorted(alike.items()):
         others.sort(reverse=True)
-        named = ", ".join(
-            f"{_name(graded[other])} ({share:.0%} of both)" for share, other in others[:SHOWN]
-        )
-        more = f" and {len(others) - SHOWN} more" if len(others) > SHOWN else ""
-        yield index, f"The notes share whole passages with those of {named}{more}."
+        named = [f"{_name(graded[other])} ({share:.0%} of both)" for share, other in others]
+        yield index, f"The notes share whole passages with those of {_listed(named, ', ')}."
 
 
 def _shingles(text: str) -> frozenset[int]:
@@ -374,15 +355,6 @@ def _words(text: str) -> list[str]:
 # ------------------------------------------------------------------ helpers
 
 
-def _groups(values: Sequence[str]) -> list[list[int]]:
-    """Indices of those that have the same value, where it is not empty."""
-    where: dict[str, list[int]] = defaultdict(list)
-    for index, value in enumerate(values):
-        if value:
-            where[value].append(index)
-    return [members for members in where.values() if len(members) > 1]
-
-
 def _who(one: Graded) -> str:
     return folded_id(one.student_id) or folded_id(one.student) or one.submission
 
@@ -394,11 +366,13 @@ def _name(one: Graded) -> str:
 
 
 def _others(graded: Sequence[Graded], members: Sequence[int], index: int) -> str:
-    others = [other for other in members if other != index]
-    named = "; ".join(
-        f"{_name(graded[other])} ({_line(graded[other].submission)})" for other in others[:SHOWN]
-    )
-    return f"{named} and {len(others) - SHOWN} more" if len(others) > SHOWN else named
+    others = [graded[other] for other in members if other != index]
+    return _listed([f"{_name(one)} ({_line(one.submission)})" for one in others], "; ")
+
+
+def _listed(texts: Sequence[str], between: str) -> str:
+    more = f" and {len(texts) - SHOWN} more" if len(texts) > SHOWN else ""
+    return between.join(texts[:SHOWN]) + more
 
 
 def _line(text: str) -> str:

@@ -205,10 +205,8 @@ class Graded:
         Where pictures of the redrawn pages stand, relative to the class page.
     handed_in_name : str
         Where the PDF stands that was handed in, relative to the class page; "" without.
-    redrawn : bytes
-        The report drawn again from the log, as a PDF; empty without.
     redrawn_name : str
-        Where that stands, relative to the class page; "" without.
+        Where the redrawn report stands, relative to the class page; "" without.
     """
 
     submission: str
@@ -228,7 +226,6 @@ class Graded:
     mistakes: Mapping[str, bool] = field(default_factory=dict)
     handed_in: bytes = field(default=b"", repr=False)
     page: int = 1
-    redrawn: bytes = field(default=b"", repr=False)
     redrawn_name: str = ""
     sheets: tuple[str, ...] = ()
     handed_in_name: str = ""

@@ -81,16 +81,9 @@ class Sentence:
 
 @dataclass(frozen=True)
 class Mention:
-    """How the notes speak of something.
-
-    Attributes
-    ----------
-    phrase : str
-        By which it was found.
-    """
+    """How the notes speak of something."""
 
     stance: Stance
-    phrase: str
     passage: str
 
 
@@ -155,7 +148,7 @@ class Notes:
         for number in sorted(set.intersection(*where)):
             sentence = self.sentences[number]
             for stance in self._stances(sentence, stems):
-                yield Mention(stance, phrase, sentence.text)
+                yield Mention(stance, sentence.text)
 
     @cached_property
     def _index(self) -> dict[str, set[int]]:
