@@ -11,7 +11,7 @@ import pandas as pd
 from px4fuse.findings import named
 from px4fuse.fleet.by_log import Log, logs_of, short_names
 from px4fuse.fleet.questions import above, overstated_words
-from px4fuse.plain import number_words
+from px4fuse.plain import few_words, number_words
 from px4fuse.webpage.charts import Scale, around_one, linear_scale, log_scale
 from px4fuse.webpage.frame import (
     Cell,
@@ -135,7 +135,6 @@ def _row(
     log: Log, names: Mapping[str, str], factor: Scale, sigma: Scale | None, clock: Scale | None
 ) -> Row:
     said = [named(finding) for finding in log.findings]
-    few = ", ".join(said[:2]) + (f" and {len(said) - 2} more" if len(said) > 2 else "")
     folder = log.texts["log"].rpartition("/")[0]
     worse = "worse than before" if log.changes else ""
     cells = (
@@ -147,7 +146,7 @@ def _row(
         *(_factor(log.factors.get(whose), factor) for whose in ("kf", "ekf2")),
         _interval(log, "sigma_z", "m", sigma),
         _interval(log, "clock_offset", "s", clock),
-        figure(float(len(said)), below=few) if log.status != "failed" else Cell(),
+        figure(float(len(said)), below=few_words(said, 2)) if log.status != "failed" else Cell(),
         *(
             words(log.texts[name]) if kind == "text" else figure(log.numbers.get(name))
             for _, kind, name in MORE
@@ -169,9 +168,6 @@ def _interval(log: Log, name: str, unit: str, scale: Scale | None) -> Cell:
         return figure(value)
     ends = (value if low is None else low, value, value if high is None else high)
     return figure(value, f"{value:.3g}", tuple(scale.share(end) for end in ends))
-
-
-# ------------------------------------------------------------------ what a row unfolds to
 
 
 def _details(log: Log) -> tuple[Part, ...]:
@@ -228,9 +224,6 @@ def _flight(log: Log) -> list[tuple[str, str]]:
         if name in log.numbers
     ]
     return [*((said, log.texts[name]) for said, name in FACTS), *numbers]
-
-
-# ------------------------------------------------------------------ filters
 
 
 def _filters(logs: Sequence[Log]) -> list[tuple[str, list[tuple[str, str]]]]:

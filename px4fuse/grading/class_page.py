@@ -132,9 +132,6 @@ def _copied(entries: Sequence[Entry]) -> dict[int, list[Copied]]:
     return {at: sorted(others, key=lambda o: (-o[0], o[1])) for at, others in found.items()}
 
 
-# ------------------------------------------------------------------ rows
-
-
 def status_of(entry: Entry) -> str:
     """That of the counting report."""
     return entry.counting.status if entry.counting else MISSING
@@ -225,9 +222,6 @@ def late_words(entry: Entry) -> str:
         if entry.late_s >= (2.0 if unit == "days" else 1.0) * size:
             return f"{entry.late_s / size:.0f} {unit} late"
     return f"{math.ceil(entry.late_s / 60.0)} min late"
-
-
-# ------------------------------------------------------------------ what a row unfolds to
 
 
 def _details(entry: Entry, veil: Veil, alike: tuple[Part, ...]) -> tuple[Part, ...]:

@@ -182,9 +182,6 @@ def _named(graded: Sequence[Graded], origins: Sequence[Origin]) -> list[Person]:
     return register.people
 
 
-# ------------------------------------------------------------------ attempts
-
-
 def _try(
     graded: Graded,
     submission: Submission,
@@ -256,9 +253,6 @@ def _first(able: Sequence[_Try]) -> _Try:
     """The best file of the first submission."""
     earliest = able[0].order[:2]
     return [one for one in able if one.order[:2] == earliest][-1]
-
-
-# ------------------------------------------------------------------ points
 
 
 def _settled(entry: Entry, said: Mapping[str, Override], most: float) -> Entry:

@@ -16,6 +16,7 @@ from px4fuse.grading.claims import TOPICS, Claims, claims_of, entailed, family
 from px4fuse.grading.folding import folded
 from px4fuse.grading.model import Rubric
 from px4fuse.grading.notes import WORD, Mention, Notes, Words, read_notes
+from px4fuse.plain import few_words
 from px4fuse.results.contract import ComparisonResults, LoopResults, Reported, to_plain
 from px4fuse.results.model import Absent
 from px4fuse.results.reading import one_line
@@ -249,8 +250,7 @@ def why_not_horizontal(evidence: Evidence) -> str:
 
 def list_words(names: Sequence[str]) -> str:
     """Names with commas between them, the first few."""
-    shown = ", ".join(names[:NAMED])
-    return f"{shown} and {len(names) - NAMED} more" if len(names) > NAMED else shown
+    return few_words(names, NAMED)
 
 
 def reason_of(verdict: Verdict) -> str:

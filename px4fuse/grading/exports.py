@@ -38,6 +38,7 @@ from px4fuse.grading.model import Entry
 from px4fuse.grading.platforms import Origin
 from px4fuse.grading.roster import Register, people_of_sheet
 from px4fuse.grading.zipping import zipped
+from px4fuse.plain import few_words
 from px4fuse.results.reading import one_line
 from px4fuse.spreadsheet import neutral, neutral_id
 
@@ -160,10 +161,7 @@ def filled(
     left = [_who(entries[at]) for at in range(len(register.people))
             if at not in seen and entries[at].total is not None]  # fmt: skip
     if left:
-        notes.append(
-            f"{sheet.path.name}: it has no row for {', '.join(left[:4])}"
-            + (f" and {len(left) - 4} more." if len(left) > 4 else ".")
-        )
+        notes.append(f"{sheet.path.name}: it has no row for {few_words(left, 4)}.")
     return Filled(replace(sheet, rows=tuple(map(tuple, cells))), tuple(notes))
 
 
@@ -198,9 +196,6 @@ def as_html(text: str) -> str:
     """
     lines = html.escape(text, quote=False).rstrip("\n").split("\n")
     return "<br>".join(re.sub(r"^ +", lambda m: "&nbsp;" * len(m[0]), line) for line in lines)
-
-
-# ------------------------------------------------------------------ without a table of theirs
 
 
 def moodle_feedback(

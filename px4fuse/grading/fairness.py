@@ -75,9 +75,6 @@ Request = ComparisonRequest | LoopRequest
 HandIns = tuple[tuple[Reported, str], ...]
 
 
-# ------------------------------------------------------------------ flights and reports
-
-
 @dataclass(frozen=True)
 class Flown:
     """One assigned flight, analysed on demand.
@@ -143,9 +140,6 @@ def _results(flight: Flight, request: Request) -> Reported:
         return loop_results(request, loop, find_loop(loop), Student(), command)
     analysis = run(request, flight=flight)
     return comparison_results(request, analysis, find(analysis), Student(), command)
-
-
-# ------------------------------------------------------------------ students
 
 
 def by_default(one: Flown) -> HandIns:
@@ -223,9 +217,6 @@ STUDENTS: Mapping[str, Callable[[Flown], HandIns]] = {
     "default": by_default,
     "guesser": guesser,
 }
-
-
-# ------------------------------------------------------------------ points
 
 
 def earned(one: Flown, results: Reported, notes: str, rubric: Rubric) -> Graded:

@@ -22,6 +22,7 @@ from px4fuse.filter.kalman import Settings
 from px4fuse.filter.tuning import HORIZONTAL
 from px4fuse.grading.folding import folded
 from px4fuse.grading.model import Graded
+from px4fuse.plain import few_words
 from px4fuse.results.comparison import ASKED, HeldOut, Tuned
 from px4fuse.results.contract import ComparisonResults, LoopResults, Reported
 from px4fuse.results.reading import one_line
@@ -57,9 +58,6 @@ SIGMA_FAR_OFF = 2.0
 # What a student chooses; the rest of the settings follows from the log
 CHOSEN = ("sigma_a_m_s2", "sigma_z_m", "dt_s", "input", "clock_offset_s")
 SHOWN = 4
-
-
-# ------------------------------------------------------------------ one report
 
 
 def own_flags(results: Reported) -> tuple[str, ...]:
@@ -156,9 +154,6 @@ def _left_out(results: ComparisonResults) -> Iterator[str]:
         yield "The IMU was not used (--input zero)."
 
 
-# ------------------------------------------------------------------ a class
-
-
 def class_flags(
     graded: Sequence[Graded], key: AnswerKey | None = None
 ) -> Mapping[int, tuple[str, ...]]:
@@ -253,9 +248,6 @@ def _other_version(graded: Sequence[Graded]) -> Flags:
             yield index, f"Made with px4fuse {_line(one.version)}, {others}."
 
 
-# ------------------------------------------------------------------ notes
-
-
 def copied_notes(graded: Sequence[Graded]) -> list[tuple[float, int, int]]:
     """Pairs whose notes share passages: which share of both, and their places."""
     shingles = [_shingles(one.notes) for one in graded]
@@ -289,7 +281,7 @@ def _copied_notes(graded: Sequence[Graded]) -> Flags:
     for index, others in sorted(alike.items()):
         others.sort(reverse=True)
         named = [f"{_name(graded[other])} ({share:.0%} of both)" for share, other in others]
-        yield index, f"The notes share whole passages with those of {_listed(named, ', ')}."
+        yield index, f"The notes share whole passages with those of {few_words(named, SHOWN)}."
 
 
 def _shingles(text: str) -> frozenset[int]:
@@ -306,9 +298,6 @@ def _shingles(text: str) -> frozenset[int]:
     powers = np.cumprod(np.full(SHINGLE_LETTERS, MULTIPLIER, np.uint64))
     hashes = sliding_window_view(codes, SHINGLE_LETTERS) @ powers >> np.uint64(20)
     return frozenset(hashes[hashes % KEPT == 0].tolist())
-
-
-# ------------------------------------------------------------------ names
 
 
 def _other_name(graded: Sequence[Graded], key: AnswerKey | None) -> Flags:
@@ -352,9 +341,6 @@ def _words(text: str) -> list[str]:
     return [part for part in parts if part]
 
 
-# ------------------------------------------------------------------ helpers
-
-
 def _who(one: Graded) -> str:
     return folded_id(one.student_id) or folded_id(one.student) or one.submission
 
@@ -367,12 +353,7 @@ def _name(one: Graded) -> str:
 
 def _others(graded: Sequence[Graded], members: Sequence[int], index: int) -> str:
     others = [graded[other] for other in members if other != index]
-    return _listed([f"{_name(one)} ({_line(one.submission)})" for one in others], "; ")
-
-
-def _listed(texts: Sequence[str], between: str) -> str:
-    more = f" and {len(texts) - SHOWN} more" if len(texts) > SHOWN else ""
-    return between.join(texts[:SHOWN]) + more
+    return few_words([f"{_name(one)} ({_line(one.submission)})" for one in others], SHOWN, "; ")
 
 
 def _line(text: str) -> str:

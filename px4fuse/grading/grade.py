@@ -177,9 +177,6 @@ def _flagged(entries: Sequence[Entry], key: AnswerKey | None) -> tuple[Entry, ..
     return tuple(made)
 
 
-# ------------------------------------------------------------------ the reports
-
-
 @dataclass(frozen=True)
 class Job:
     """One file, and whose it is where the platform says it."""

@@ -106,9 +106,6 @@ def results(entry: Entry, text: str, seconds: float | None = None) -> dict[str, 
     return made if seconds is None else {**made, "execution_time": round(seconds, 2)}
 
 
-# ------------------------------------------------------------------ inside the autograder
-
-
 def submission_metadata(folder: Path) -> tuple[str, str, datetime | None, datetime | None]:
     """Who handed in what ``submission_metadata.json`` is about, when, and when it was due.
 
@@ -140,9 +137,6 @@ def submission_metadata(folder: Path) -> tuple[str, str, datetime | None, dateti
         )
     except (ValueError, TypeError, AttributeError, RecursionError) as error:
         raise SettingsError(f"{path.name}: not what Gradescope writes.") from error
-
-
-# ------------------------------------------------------------------ the autograder
 
 
 def autograder(

@@ -28,6 +28,7 @@ from px4fuse.grading.records import HANDED_IN, REDRAWN, file_of
 from px4fuse.grading.returned import returned_text
 from px4fuse.grading.roster import Register
 from px4fuse.grading.sheets import delete_others, draw_sheets
+from px4fuse.plain import few_words
 from px4fuse.spreadsheet import neutral, neutral_id
 from px4fuse.verification.model import Refused
 from px4fuse.writing import write_all
@@ -216,9 +217,6 @@ def _submission(entry: Entry) -> str:
     return entry.counting.submission if entry.counting else ""
 
 
-# ------------------------------------------------------------------ for learning platforms
-
-
 def _grades(made: Class, texts: Mapping[int, str]) -> tuple[dict[str, bytes], tuple[str, ...]]:
     """Files that a learning platform imports, by name, and what could not be entered."""
     contents: dict[str, bytes] = {}
@@ -240,18 +238,14 @@ def _grades(made: Class, texts: Mapping[int, str]) -> tuple[dict[str, bytes], tu
     return contents, tuple(notes)
 
 
-# ------------------------------------------------------------------ names
-
-
 def _left_over(output: Path, names: Sequence[str]) -> tuple[str, ...]:
     """What an earlier run wrote for others: never taken away, but told."""
     others = sorted(p.stem for p in (output / FEEDBACK).glob("*.txt") if p.stem not in names)
     if not others:
         return ()
-    shown = ", ".join(others[:4]) + (", ..." if len(others) > 4 else "")
     return (
         f"feedback and gradescope also hold {len(others)} of an earlier run, which are not among "
-        f"these submissions: {shown}. Delete them if they are out of date.",
+        f"these submissions: {few_words(others, 4)}. Delete them if they are out of date.",
     )
 
 

@@ -103,9 +103,6 @@ CHECKS: Mapping[str, Check] = {
 }
 
 
-# ------------------------------------------------------------------ points
-
-
 def assess(
     report: Report,
     verdict: Verdict,

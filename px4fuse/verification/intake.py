@@ -238,8 +238,8 @@ def _open(pdf: bytes) -> pypdf.PdfReader:
 def _check_page_count(reader: pypdf.PdfReader) -> None:
     try:
         count = len(reader.pages)
-    except LimitReachedError as error:
-        raise ResultsError(f"more than {MAX_PAGES} pages.") from error
+    except LimitReachedError:
+        count = MAX_PAGES + 1
     if count > MAX_PAGES:
         raise ResultsError(f"more than {MAX_PAGES} pages.")
     if count == 0:

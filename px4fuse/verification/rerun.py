@@ -92,9 +92,6 @@ def recompute(results: Reported, logs: Mapping[str, Path]) -> Recomputed | Refus
         return Refused(f"the analysis cannot be repeated ({type(error).__name__})", ASK)
 
 
-# -- files -----------------------------------------------------------------------------------------
-
-
 def _place(
     logs: Mapping[str, Path], within: Path, recorded: str, sha256: str | None, what: str
 ) -> Path:
@@ -139,9 +136,6 @@ def split_part(source: str) -> tuple[str, str]:
 
     name, colon, tail = source.rpartition(":")
     return (name, f":{tail}") if colon and tail in PARTS else (source, "")
-
-
-# -- the two kinds of report -----------------------------------------------------------------------
 
 
 def _compared(handed_in: ComparisonResults, place: _Place, versions: Provenance) -> Recomputed:

@@ -146,9 +146,6 @@ def _log_name(results: Reported) -> str:
     return one_line(name, 80) or "its log"
 
 
-# -- with the log ----------------------------------------------------------------------------------
-
-
 def _with_log(report: Report, again: Recomputed) -> Verdict:
     redrawn = again.draw()
     if redrawn == report.pdf:
@@ -199,9 +196,6 @@ def _other_machine(theirs: Provenance, ours: Provenance) -> tuple[str, ...]:
     return (one_line(made, 400),) if others else ()
 
 
-# -- numbers ---------------------------------------------------------------------------------------
-
-
 def compare_results(recorded: Mapping[str, Any], recomputed: Mapping[str, Any]) -> Numbers:
     """Compare every value of two results.
 
@@ -238,11 +232,8 @@ def compare_results(recorded: Mapping[str, Any], recomputed: Mapping[str, Any]) 
     return Numbers(found, len(wrong), tuple(pairs), len(leaves))
 
 
-class _Absent:
-    """Stands where there is nothing."""
-
-
-_ABSENT = _Absent()
+# Stands where there is nothing
+_ABSENT = object()
 
 
 def _leaves(path: str, theirs: Any, ours: Any) -> Iterator[tuple[str, Any, Any]]:
@@ -334,7 +325,7 @@ def _decimals(number: str) -> int:
 
 def _shown(value: Any) -> str:
     """A value on one line."""
-    if isinstance(value, _Absent):
+    if value is _ABSENT:
         return "absent"
     if isinstance(value, Mapping):
         return f"an object with {len(value)} entries"

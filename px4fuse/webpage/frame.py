@@ -164,6 +164,17 @@ def card(title: str, *content: str) -> str:
     return f'<section class="card"><h2>{escaped(title)}</h2>{"".join(content)}</section>'
 
 
+def ranking(title: str, said: str, lines: Sequence[str], most: int, rest: str = "") -> str:
+    """A box with a list, its first lines; ``said`` and ``rest`` stand before and behind it."""
+    more = len(lines) - most
+    return card(
+        title,
+        note(said) if said else "",
+        f'<ol class="ranks">{"".join(lines[:most])}</ol>',
+        note(f"And {more} more{rest}.") if more > 0 else "",
+    )
+
+
 def summary(entries: Sequence[tuple[str, str]], *content: str) -> str:
     """The box on top: names with their values, which are HTML, and what else stands in it."""
     listed = "".join(f"<div><dt>{name}</dt><dd>{value}</dd></div>" for name, value in entries)
