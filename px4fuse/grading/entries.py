@@ -124,7 +124,9 @@ def class_entries(
     owners: dict[int, list[int]] = defaultdict(list)
     nobody: list[int] = []
     for index, (one, origin) in enumerate(zip(graded, origins, strict=True)):
-        place = owner(one, origin, everyone)
+        place = everyone.by_platform(origin)
+        if place is None:
+            place = everyone.by_report(one.student_id, one.student)
         (nobody if place is None else owners[place]).append(index)
 
     def tries(members: Sequence[int], place: int | None = None) -> list[_Try]:
@@ -147,14 +149,6 @@ def class_entries(
     most = max((one.of for one in graded), default=0.0)
     settled = (_settled(one, words, most) for one, words in zip(made, said, strict=True))
     return tuple(settled), notes
-
-
-def owner(graded: Graded, origin: Origin, register: Register) -> int | None:
-    """Place of whose file it is."""
-    place = register.by_platform(origin)
-    if place is None:
-        place = register.by_report(graded.student_id, graded.student)
-    return place
 
 
 def _named(graded: Sequence[Graded], origins: Sequence[Origin]) -> list[Person]:
@@ -225,9 +219,11 @@ def _entry(person: Person, tries: Sequence[_Try], term: Term) -> Entry:
     ordered = sorted(tries, key=lambda one: one.order)
     # what is no report counts only where nothing else is there
     able = [one for one in ordered if one.read] or ordered
+    # several files of one submission: the best
+    of_first = [one for one in able if one.order[:2] == able[0].order[:2]]
     chosen = {
         "latest": able[-1],
-        "first": _first(able),
+        "first": of_first[-1],
         "best": max(able, key=lambda one: (one.worth, one.order)),
     }[term.attempt]
     remarks = list(chosen.remarks)
@@ -247,12 +243,6 @@ def _entry(person: Person, tries: Sequence[_Try], term: Term) -> Entry:
         email=person.email,
         remarks=tuple(remarks),
     )
-
-
-def _first(able: Sequence[_Try]) -> _Try:
-    """The best file of the first submission."""
-    earliest = able[0].order[:2]
-    return [one for one in able if one.order[:2] == earliest][-1]
 
 
 def _settled(entry: Entry, said: Mapping[str, Override], most: float) -> Entry:

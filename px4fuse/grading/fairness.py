@@ -18,7 +18,7 @@ import argparse
 import hashlib
 import math
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import partial
@@ -44,7 +44,7 @@ from px4fuse.grading import fairness_notes
 from px4fuse.grading.fairness_notes import WORDINGS
 from px4fuse.grading.model import Graded, Rubric
 from px4fuse.grading.rubric import read_rubric
-from px4fuse.grading.scoring import score
+from px4fuse.grading.scoring import assess
 from px4fuse.loop.analysis import analyse
 from px4fuse.loop.sources import Source
 from px4fuse.loop.tracks import trajectory_of
@@ -53,7 +53,7 @@ from px4fuse.results.build import results as comparison_results
 from px4fuse.results.build_trajectories import loop_results
 from px4fuse.results.comparison import ASKED, Tuned
 from px4fuse.results.contract import ComparisonResults, Reported, to_json
-from px4fuse.results.model import FoundMistake, Student
+from px4fuse.results.model import Student
 from px4fuse.results.reading import read_results
 from px4fuse.simulation.flights import simulate, to_flight
 from px4fuse.simulation.mistakes import parse
@@ -227,8 +227,7 @@ def earned(one: Flown, results: Reported, notes: str, rubric: Rubric) -> Graded:
     pages = {page for item in rubric.items for page in item.parameters.get("pages", ())}
     results = msgspec.structs.replace(results, student=student)
     report = Report("", 0, "intact", results, (" ".join(sorted(pages)),), b"")
-    made = score(report, VERIFIED, rubric, AnswerKey("mixed", (answer,)))
-    return Graded(answer.file, answer.name, answer.student_id, VERIFIED, made)
+    return assess(report, VERIFIED, rubric, AnswerKey("mixed", (answer,)))
 
 
 def measured(one: Flown, rubric: Rubric) -> dict[str, object]:
@@ -237,7 +236,7 @@ def measured(one: Flown, rubric: Rubric) -> dict[str, object]:
     ``missed``: what the key names and the report as the command makes it does not list.
     """
     answer = one.answer()
-    found = {i for top in by_default(one)[0][0].findings for i in (top.id, *_ids(top.consequences))}
+    found = {i for top in by_default(one)[0][0].findings for i in top.ids}
     row: dict[str, object] = {
         "student": answer.student_id,
         "kind": one.drawn.scenario.kind,
@@ -249,12 +248,6 @@ def measured(one: Flown, rubric: Rubric) -> dict[str, object]:
         made = [earned(one, *each, rubric) for each in hand_in(one)]
         row[who] = round(fmean(each.points / each.of for each in made), 4)
     return row
-
-
-def _ids(findings: Sequence[FoundMistake]) -> Iterator[str]:
-    for one in findings:
-        yield one.id
-        yield from _ids(one.consequences)
 
 
 def summary(table: pd.DataFrame) -> pd.DataFrame:

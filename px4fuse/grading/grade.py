@@ -22,7 +22,7 @@ from px4fuse.grading.model import Entry, Graded, Rubric, Submission
 from px4fuse.grading.outputs import Class, write_class
 from px4fuse.grading.overrides import NAME, read_overrides
 from px4fuse.grading.platforms import Origin, with_metadata
-from px4fuse.grading.records import Verified, verified
+from px4fuse.grading.records import verified
 from px4fuse.grading.roster import Register, people_of_key, people_of_sheet
 from px4fuse.grading.scoring import assess, refused
 from px4fuse.grading.workers import Failed, run_bounded
@@ -256,20 +256,9 @@ def grade_one(
     if isinstance(found, Refused):
         made = refused(rubric, key, found)
         return replace(made, submission=submission.name, sha256=sha256), recalled
-    return _scored(submission, found, sha256, job.owner_id, rubric, key), recalled
-
-
-def _scored(
-    submission: Submission,
-    found: Verified,
-    sha256: str,
-    owner_id: str,
-    rubric: Rubric,
-    key: AnswerKey | None,
-) -> Graded:
     results = found.report.results
-    made = assess(found.report, found.verdict, rubric, key, owner_id)
-    return replace(
+    made = assess(found.report, found.verdict, rubric, key, job.owner_id)
+    whole = replace(
         made,
         submission=submission.name,
         flags=(*_page_flags(found.verdict), *own_flags(results), *made.flags),
@@ -281,6 +270,7 @@ def _scored(
         notes=results.student.notes,
         page=found.page,
     )
+    return whole, recalled
 
 
 def _page_flags(verdict: Verdict) -> tuple[str, ...]:

@@ -61,38 +61,29 @@ def results(entry: Entry, text: str, seconds: float | None = None) -> dict[str, 
     """
     graded = entry.counting
     tests: list[dict[str, Any]] = []
-    for number, item in enumerate(graded.items if graded else (), start=1):
-        tests.append(
-            {
-                "name": one_line(item.title, 200),
-                "name_format": "text",
-                "number": str(number),
-                "status": "passed" if item.points >= item.of else "failed",
-                "score": item.points,
-                "max_score": item.of,
-                "output": item.comment,
-                "output_format": "text",
-                "tags": ["px4fuse", graded.status if graded else "missing"],
-                "visibility": VISIBLE,
-            }
+
+    def add(name: str, score: float, of: float, output: str, **more: object) -> None:
+        texts = {"name": name, "name_format": "text", "output": output, "output_format": "text"}
+        numbers = {"number": str(len(tests) + 1), "score": score, "max_score": of}
+        tests.append({**texts, **numbers, **more})
+
+    for item in graded.items if graded else ():
+        add(
+            one_line(item.title, 200),
+            item.points,
+            item.of,
+            item.comment,
+            status="passed" if item.points >= item.of else "failed",
+            tags=["px4fuse", graded.status if graded else "missing"],
+            visibility=VISIBLE,
         )
     said = (*entry.remarks, *(graded.flags if graded else ()))
     if graded and graded.pending:
         said = (f"Pending: {graded.pending}", *said)
     if said:
-        tests.append(
-            {
-                "name": "For the instructor",
-                "name_format": "text",
-                "number": str(len(tests) + 1),
-                "score": 0.0,
-                "max_score": 0.0,
-                "output": "\n".join(map(cleaned, said)),
-                "output_format": "text",
-                "tags": ["px4fuse", "instructor"],
-                "visibility": "hidden",
-            }
-        )
+        text_for = "\n".join(map(cleaned, said))
+        tags = ["px4fuse", "instructor"]
+        add("For the instructor", 0.0, 0.0, text_for, tags=tags, visibility="hidden")
     made: dict[str, Any] = {
         "score": entry.total or 0.0,
         "output": text,

@@ -63,33 +63,7 @@ class RubricItem:
 
 @dataclass(frozen=True)
 class Reading:
-    """From when on notes are a text of one's own; shares are of words.
-
-    Attributes
-    ----------
-    judged_from : float
-        Words below which nothing can be said.
-    shortest, longest : float
-        Words of a sentence.
-    in_sentences : float
-        Least share that is in sentences.
-    ids : float
-        Most that may be ids of findings, of a sentence and of all.
-    quoted : float
-        Most that may be in sentences of px4fuse.
-    packed : float
-        Least size, packed by zlib, against the text: what repeats itself packs well.
-    common : float
-        Least share of the five commonest words.
-    commonest : float
-        Most that one word may have.
-    terms : float
-        Most that may be words by which the rubric names mistakes.
-    about : float
-        Least share in sentences that hold a number or a word of the field.
-    most_named : float
-        Kinds of mistakes; who names more is guessing.
-    """
+    """From when on notes are a text of one's own: [notes] in rubric.toml explains each."""
 
     judged_from: float = 20
     shortest: float = 3
