@@ -141,14 +141,14 @@ class Item:
 
 @dataclass(frozen=True)
 class Graded:
-    """One submission, graded.
+    """One submission, graded; texts and bytes are empty where there is nothing to say.
 
     Attributes
     ----------
     submission : str
         :attr:`Submission.name`.
     student, student_id : str
-        As the report says; "" where it does not.
+        As the report says.
     verdict : Verdict
         "cannot verify" with the reason for what is no report.
     items : tuple of Item
@@ -156,13 +156,13 @@ class Graded:
     flags : tuple of str
         What an instructor should look at: sentences.
     pending : str
-        One sentence: what the instructor can do so that the points count; "" where they count.
+        One sentence: what the instructor can do so that the points count.
     to_read : tuple of (str, str)
         What no rule can judge: why, and the passage of the notes.
     numbers : mapping
-        A few for the class table, by column title; absent ones are left out.
+        A few for the class table, by column title.
     sha256, log_sha256, version : str
-        Of the PDF, of the log it is about, and of px4fuse; "" where unknown.
+        Of the PDF, of the log it is about, and of px4fuse.
     settings : str
         Those chosen, to the last digit, for comparison between students; "" for usual ones.
     notes : str
@@ -172,15 +172,12 @@ class Graded:
         name it.
     handed_in : bytes
         PNG of a page as it was handed in: the cover where nothing could be redrawn, else the one
-        that differs most; empty without.
+        that differs most.
     page : int
         Which page that is, counted from 1.
-    sheets : tuple of str
-        Where pictures of the redrawn pages stand, relative to the class page.
-    handed_in_name : str
-        Where the PDF stands that was handed in, relative to the class page; "" without.
-    redrawn_name : str
-        Where the redrawn report stands, relative to the class page; "" without.
+    sheets, handed_in_name, redrawn_name : tuple of str, str, str
+        Where pictures of the redrawn pages, the PDF that was handed in and the redrawn one stand,
+        relative to the class page.
     """
 
     submission: str

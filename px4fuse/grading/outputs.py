@@ -19,13 +19,13 @@ from px4fuse.grading.anonymous import hidden_words
 from px4fuse.grading.class_page import html_text
 from px4fuse.grading.class_table import csv_text
 from px4fuse.grading.entries import Course
+from px4fuse.grading.feedback import returned_text
 from px4fuse.grading.gradescope import results
 from px4fuse.grading.model import Entry, Graded, Submission
 from px4fuse.grading.names import distinct, file_names
 from px4fuse.grading.overrides import NAME, TEMPLATE
 from px4fuse.grading.platforms import Origin, seen
 from px4fuse.grading.records import HANDED_IN, REDRAWN, file_of
-from px4fuse.grading.returned import returned_text
 from px4fuse.grading.roster import Register
 from px4fuse.grading.sheets import delete_others, draw_sheets
 from px4fuse.plain import few_words
