@@ -10,6 +10,7 @@ import math
 import re
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
+from decimal import Decimal
 from itertools import combinations
 from pathlib import PurePosixPath
 
@@ -362,7 +363,4 @@ def _line(text: str) -> str:
 
 def _digits(number: float) -> int:
     """Significant digits of a number as typed."""
-    mantissa = repr(abs(number)).partition("e")[0]
-    whole, _, part = mantissa.partition(".")
-    digits = (whole + ("" if part == "0" else part)).lstrip("0")
-    return len(digits.rstrip("0") if part in ("", "0") else digits)
+    return len(Decimal(repr(abs(number))).normalize().as_tuple().digits) if number else 0

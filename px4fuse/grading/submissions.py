@@ -44,6 +44,7 @@ ZIP_EPOCH = 1980
 # Entry as Submission keeps it, its name for people, and when it was changed
 Found = tuple[str, str, datetime | None]
 
+_TOO_LARGE = f"larger than {MAX_BYTES // 1_000_000} MB; reports are below 2 MB."
 # Between a zip file's entry and the entry of the zip file in it; no name can hold it
 _INSIDE = "\0"
 _ENCRYPTED = 1
@@ -119,7 +120,7 @@ def read(submission: Submission) -> bytes | Refused:
         if not submission.entry:
             with submission.file.open("rb") as file:
                 content = file.read(MAX_BYTES + 1)
-            return content if len(content) <= MAX_BYTES else _refused(submission, _too_large())
+            return content if len(content) <= MAX_BYTES else _refused(submission, _TOO_LARGE)
         outer, _, inner = submission.entry.partition(_INSIDE)
         with submission.file.open("rb") as file, _archive(file) as archive:
             content = _unpacked(archive, outer)
@@ -346,18 +347,14 @@ def _unpacked(archive: zipfile.ZipFile, name: str) -> bytes:
     if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
         raise _EntryError("packed in its zip file by a method that is not read.")
     if entry.file_size > MAX_BYTES:
-        raise _EntryError(_too_large())
+        raise _EntryError(_TOO_LARGE)
     if entry.file_size > 1_000_000 and entry.file_size > MAX_RATIO * entry.compress_size:
         raise _EntryError(f"it shrinks more than {MAX_RATIO} times in its zip file: no report.")
     with archive.open(entry) as stream:
         content = stream.read(MAX_BYTES + 1)
     if len(content) > MAX_BYTES:
-        raise _EntryError(_too_large())
+        raise _EntryError(_TOO_LARGE)
     return content
-
-
-def _too_large() -> str:
-    return f"larger than {MAX_BYTES // 1_000_000} MB; reports are below 2 MB."
 
 
 def _refused(submission: Submission, reason: str) -> Refused:

@@ -48,7 +48,7 @@ SQUARE_PX = 8
 DISTANCE = 0.07
 # A page that another program wrote may be rounded to whole points
 SIZE_PX = 2
-MAX_PAGE_TEXT = 1_000_000
+MAX_PAGES, MAX_PAGE_TEXT = 100, 1_000_000
 
 NumbersAlike = Callable[[str, str], bool]
 
@@ -104,11 +104,11 @@ def looks(pdf: bytes, most: int = 1000) -> tuple[Look | Unavailable, ...]:
         return tuple(_look(document, page) for page in range(min(len(document), most)))
 
 
-def page_texts(pdf: bytes, most: int = 100) -> tuple[str, ...]:
+def page_texts(pdf: bytes) -> tuple[str, ...]:
     """Text of each page; none without pypdfium2 or where the file cannot be read."""
     try:
         with opened(pdf) as document:
-            return tuple(_text(document[page]) for page in range(min(len(document), most)))
+            return tuple(_text(document[page]) for page in range(min(len(document), MAX_PAGES)))
     except FAILURES:
         return ()
 

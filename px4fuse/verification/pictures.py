@@ -14,6 +14,8 @@ from PIL import Image, ImageDraw
 from px4fuse.flight import Unavailable
 from px4fuse.results.reading import one_line
 
+# Less where a page is very long, or its picture does not fit into MAX_BYTES
+WIDTH_PX = 700
 # Enough to keep our blue, EKF2's orange and the severities apart, with smooth letters
 COLOURS = 16
 # A page of text and lines at 700 pixels takes 15 to 55 kB; a photograph is made smaller
@@ -36,17 +38,9 @@ FAILURES = (
 
 
 def key_page(pages: Sequence[str]) -> int:
-    """Which page to show of a report: its cover, also where a student put pages before it.
+    """Which page to show of a report, counted from 0, by the text of each.
 
-    Parameters
-    ----------
-    pages : sequence of str
-        Text of each page.
-
-    Returns
-    -------
-    int
-        Counted from 0.
+    That is its cover, also where a student put pages before it.
     """
     for page, text in enumerate(pages):
         if any(line.strip() in COVERS for line in text.splitlines()):
@@ -54,7 +48,7 @@ def key_page(pages: Sequence[str]) -> int:
     return 0
 
 
-def picture(pdf: bytes, page: int, width_px: int = 700) -> bytes | Unavailable:
+def picture(pdf: bytes, page: int) -> bytes | Unavailable:
     """Draw one page of a PDF.
 
     Needs pypdfium2. Nothing in the PDF is executed, and the picture's size is bounded whatever the
@@ -66,8 +60,6 @@ def picture(pdf: bytes, page: int, width_px: int = 700) -> bytes | Unavailable:
         May be anything.
     page : int
         Counted from 0.
-    width_px : int
-        Less where the page is very long, or does not fit into :data:`MAX_BYTES`.
 
     Returns
     -------
@@ -78,14 +70,12 @@ def picture(pdf: bytes, page: int, width_px: int = 700) -> bytes | Unavailable:
         with opened(pdf) as document:
             if not 0 <= page < len(document):
                 raise ValueError(f"there is no page {page + 1}")
-            return _small_png(rendered(document[page], width_px))
+            return _small_png(rendered(document[page], WIDTH_PX))
     except FAILURES as error:
         return undrawn(error)
 
 
-def page_pictures(
-    pdf: bytes, hide: Sequence[str] = (), width_px: int = 700
-) -> tuple[bytes, ...] | Unavailable:
+def page_pictures(pdf: bytes, hide: Sequence[str] = ()) -> tuple[bytes, ...] | Unavailable:
     """Draw every page of a report that px4fuse drew.
 
     Parameters
@@ -105,7 +95,7 @@ def page_pictures(
         with opened(pdf) as document:
             for number in range(len(document)):
                 sheet = document[number]
-                image = rendered(sheet, width_px)
+                image = rendered(sheet, WIDTH_PX)
                 if hide and not _cover(image, sheet, hide) and not number:
                     raise ValueError("a name on its first page cannot be found to cover it")
                 made.append(_small_png(image))

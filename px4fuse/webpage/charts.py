@@ -116,11 +116,11 @@ def plot(height: int, told: str, marks: Sequence[str]) -> str:
     return f'<svg class="plot" height="{height}" {said}>{"".join(marks)}</svg>'
 
 
-def bar(share: float, width: int = 96) -> str:
-    """A bar of a list: part of its full width."""
-    part = max(width * min(max(share, 0.0), 1.0), 1.0)
+def bar(share: float) -> str:
+    """A bar of a list: part of its full width, in pixels."""
+    part = max(96.0 * min(max(share, 0.0), 1.0), 1.0)
     drawn = f'<rect width="{part:.0f}" height="8"/>'
-    return f'<svg width="{width}" height="8" aria-hidden="true">{drawn}</svg>'
+    return f'<svg width="96" height="8" aria-hidden="true">{drawn}</svg>'
 
 
 def axis(scale: Scale) -> str:
