@@ -170,8 +170,8 @@ class Drawn:
     def difficulty(self) -> float:
         """That of the hardest mistake.
 
-        Only who has looked for the smallest can say that there is none: such a flight is among the
-        hardest.
+        Only a student who has looked for the smallest can say that there is none: such a flight is
+        among the hardest.
         """
         each = [one.difficulty(text) for one, text in zip(self.chosen, self.typed, strict=True)]
         return max(each, default=HARDEST)

@@ -95,7 +95,7 @@ def read_sheet(path: Path) -> Sheet:
     Raises
     ------
     SettingsError
-        It cannot be read, is no text, or has no header.
+        It cannot be read, is not text, or has no header.
     """
     content = read_whole(
         path, SettingsError, MAX_BYTES, name=str(path), smaller="Give a CSV file of one class"

@@ -182,7 +182,7 @@ def _held(value: Any) -> Any:
 
 
 def csv_bytes(table: pd.DataFrame) -> bytes:
-    """The table for Excel and LibreOffice, in which no text of a log comes to life as a formula."""
+    """The table for Excel and LibreOffice, in which no text of a log acts as a formula."""
     texts = {name: table[name].map(neutral) for name, kind in COLUMNS.items() if kind == "str"}
     text = table.assign(**texts).to_csv(index=False, lineterminator="\r\n", float_format="%.10g")
     return ("\ufeff" + text).encode()

@@ -18,7 +18,7 @@ from px4fuse.fleet.measures import Z95, Aim, Bounds, Number, Scale
 #: Of what is called significant, this share is expected to be chance
 FALSE_DISCOVERY_RATE = 0.05
 SPREAD_TABLE = "spread.csv"
-# Between two settings of one flight a smaller difference is none: of a ratio, and by unit
+# Two settings of one flight that differ by less are the same: of a ratio, and by unit
 LEAST_RATIO = 0.01
 LEAST_DIFFERENCE = {"": 0.001, "m": 0.001, "s": 0.001, "°": 0.1}
 
@@ -115,7 +115,7 @@ def corrected(p: Sequence[float]) -> list[float]:
 
 
 def least_difference(scale: Scale, unit: str) -> float:
-    """A smaller difference of two numbers of one flight is none, on their scale."""
+    """Two numbers of one flight that differ by less are the same, on their scale."""
     return math.log1p(LEAST_RATIO) if scale == "ratio" else LEAST_DIFFERENCE[unit]
 
 

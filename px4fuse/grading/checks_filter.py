@@ -48,7 +48,7 @@ def _tuned(evidence: Evidence, axis: str, name: str, factor: float) -> tuple[flo
         return 0.0, f"Your report has no interval for {label}{why}"
     low, high = interval
     above = chosen / high if high > 0.0 else math.inf
-    # small innovations are no reason to trust a source that drifts
+    # small innovations do not make a drifting source trustworthy
     off = max(1.0 if chosen > high and drifts(evidence) else above, low / chosen, 1.0)
     said = f"your {label} {chosen:.3g} {unit} is"
     wanted = f"what the data ask for ({low:.3g} to {high:.3g} {unit})"
@@ -78,7 +78,7 @@ def consistent(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float, str
         verdict, factor = judged.verdict, judged.variance_factor
         off = max(factor, 1.0 / factor)
         good = verdict == "consistent"
-        # small innovations are no reason to trust a source that drifts
+        # small innovations do not make a drifting source trustworthy
         excused = "overstated" in verdict and drifts(evidence)
         gone = given["factor"] <= off or given["factor"] <= 1.0
         # no noise explains outliers, and none should be made to

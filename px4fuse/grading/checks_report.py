@@ -20,7 +20,7 @@ from px4fuse.results.contract import LoopResults
 from px4fuse.verification.model import Verdict
 from px4fuse.verification.verification import NO_LOG
 
-# Findings about a recording that are no question to whoever was handed the log
+# Findings about a recording, for which a student who was given the log cannot be asked
 NOT_ASKED = frozenset(("log_damaged", "samples_dropped", "source_samples_lost"))
 # What places in the results are called that the default rubric asks for
 PARTS: Mapping[str, str] = {
@@ -148,7 +148,7 @@ def findings(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float, str]:
             if named
             else f"Your report has {left}; say in your notes what you looked at to be sure."
         )
-    # whoever names what a cause brings with it has seen it too
+    # a student who names the effect of a cause has seen it too
     missing = [name for name, one in asked.items() if not any(map(evidence.names, one.ids))]
     wrong = evidence.charged
     share = 1.0 - (len(missing) + len(wrong)) / max(len(asked), 1)

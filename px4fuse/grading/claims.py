@@ -30,13 +30,13 @@ class Claims:
     right : frozenset of str
         Findings that are there and claimed plainly.
     unsure : mapping of str to str
-        Findings that are there and touched upon, with the passage.
+        Findings that are there and mentioned, with the passage.
     open : mapping of str to str
         Findings that are there, with a passage that may claim or deny them.
     wrong : mapping of str to str
         Findings that are not there and are claimed plainly, with the passage: one per kind.
     unsure_wrong : mapping of str to str
-        Findings that are not there and touched upon, with the passage.
+        Findings that are not there and mentioned, with the passage.
     """
 
     right: frozenset[str]
@@ -105,7 +105,7 @@ def claims_of(
 
 
 def entailed(findings: Collection[str]) -> frozenset[str]:
-    """Findings with what they bring with them, as far as that is no mistake of its own."""
+    """Findings with what they bring with them, as far as that is not a mistake of its own."""
     brought: frozenset[str] = frozenset().union(
         *(_reached(start, _followers) for start in findings)
     )

@@ -1,6 +1,6 @@
 """A class as one web page: a student per row, and on top what an instructor asks.
 
-Nothing that a student wrote comes to life: see :mod:`px4fuse.webpage`. Pictures of redrawn pages
+Nothing that a student wrote can act: see :mod:`px4fuse.webpage`. Pictures of redrawn pages
 and PDFs stand in folders beside the page and are loaded as they are unfolded.
 """
 

@@ -163,5 +163,5 @@ def _pairs(entries: Sequence[Entry], copied: Mapping[int, Sequence[Copied]]) -> 
         f"<span class='right'>{-share:.0%} of both</span></li>"
         for share, at, other in found
     ]
-    said = "Open one of both to read them side by side. Alike is no proof of copying."
+    said = "Open one of the two to read them side by side. Alike does not mean copied."
     return ranking("Notes that share passages", said, lines, MOST_PAIRS, " pairs")

@@ -1,4 +1,4 @@
-"""A class as a table for spreadsheets, in which nothing that a student wrote comes to life."""
+"""A class as a table for spreadsheets, in which nothing that a student wrote can act."""
 
 from __future__ import annotations
 

@@ -217,7 +217,7 @@ def _entry(person: Person, tries: Sequence[_Try], term: Term) -> Entry:
     if not tries:
         return Entry(person.name, person.student_id, None, email=person.email)
     ordered = sorted(tries, key=lambda one: one.order)
-    # what is no report counts only where nothing else is there
+    # what is not a report counts only where there is nothing else
     able = [one for one in ordered if one.read] or ordered
     # several files of one submission: the best
     of_first = [one for one in able if one.order[:2] == able[0].order[:2]]

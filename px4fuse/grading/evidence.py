@@ -265,7 +265,7 @@ def joined(reasons: Sequence[str]) -> str:
 
 
 def drifts(evidence: Evidence) -> bool:
-    """Whether the report says that its innovations are no measure of the error."""
+    """Whether the report says that its innovations do not measure the error."""
     return evidence.has("source_may_drift") or evidence.has("errors_larger_than_claimed")
 
 

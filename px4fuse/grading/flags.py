@@ -1,7 +1,7 @@
 """What an instructor should look at: sentences, never points.
 
-A flag is no proof. Two students may fly one flight together, and advice that px4fuse prints leads
-everyone to the same number.
+A flag is not a proof. Two students may fly one flight together, and advice that px4fuse prints
+leads everyone to the same number.
 """
 
 from __future__ import annotations
@@ -253,7 +253,7 @@ def copied_notes(graded: Sequence[Graded]) -> list[tuple[float, int, int]]:
     """Pairs whose notes share passages: which share of both, and their places."""
     shingles = [_shingles(one.notes) for one in graded]
     counted = Counter(part for parts in shingles for part in parts)
-    # one that hands in twice does not make a template
+    # a student who hands in twice does not make a template
     if len(graded) >= TEMPLATE_CLASS:
         common = {p for p, count in counted.items() if count > TEMPLATE_SHARE * len(graded)}
         shingles = [parts - common for parts in shingles]

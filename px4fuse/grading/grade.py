@@ -32,7 +32,7 @@ from px4fuse.verification.model import Refused, Verdict
 from px4fuse.verification.rerun import log_sha256
 
 RECORDS = "records"
-# Of one report: a flight of ten minutes takes about one; what takes longer is no report
+# Of one report: a flight of ten minutes takes about one; what takes longer is not a report
 TIMEOUT_S = 300.0
 MEMORY_BYTES = 4_000_000_000
 # For the class table: column title, and where in the results

@@ -150,7 +150,7 @@ class Graded:
     student, student_id : str
         As the report says.
     verdict : Verdict
-        "cannot verify" with the reason for what is no report.
+        "cannot verify" with the reason for what is not a report.
     items : tuple of Item
         In the rubric's order.
     flags : tuple of str
@@ -249,7 +249,7 @@ class Entry:
     handed_in : str
         When the counting one was handed in, as the platform says; "" where unknown.
     late_s : float or None
-        After the due time (s), 0 in time; None where one of both is unknown.
+        After the due time (s), 0 in time; None where one of the two is unknown.
     deduction : float
         Points taken off for being late, from the sum over the items.
     overrides : mapping

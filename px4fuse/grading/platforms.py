@@ -37,7 +37,7 @@ PLATFORMS = {
         r"[^/]*_(?P<login>[^/_]+)_attempt_(?P<time>\d{4}-\d\d-\d\d-\d\d-\d\d-\d\d)(?:_[^/]*|\.[^/.]+)$"
     ),
     "gradescope": re.compile(r"submission_(?P<number>\d+)(?:/|\.pdf$)"),
-    # a login has a letter, and a user's number is no year: "flight_lab_reports_2026/" is a folder
+    # a login has a letter, and a number is not a year: "flight_lab_reports_2026/" is a folder
     "ilias": re.compile(
         r"(?P<last>[^\W\d_][^/_]*)_(?P<first>[^\W\d_][^/_]*)_(?P<login>[^/]*[^\W\d_][^/]*)"
         r"_(?P<number>(?!(?:19|20)\d\d/)\d+)/(?P<late>Late Submission - )?"
@@ -54,7 +54,7 @@ class Origin:
     Attributes
     ----------
     platform : str
-        One of :data:`PLATFORMS`; "" where the name is nobody's.
+        One of :data:`PLATFORMS`; "" where the name is of no platform.
     number : str
         The platform's own: Moodle's participant, Canvas's and ILIAS's user, Gradescope's
         submission. Never the university's.

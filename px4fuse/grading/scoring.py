@@ -223,7 +223,7 @@ def _to_read(evidence: Evidence) -> Iterator[tuple[str, str]]:
 
 
 def refused(rubric: Rubric, key: AnswerKey | None, why: Refused) -> Graded:
-    """No points for what is no report, so that it stands in the table with the others."""
+    """No points for what is not a report, so that it stands in the table with the others."""
     comment = f"No points, since the file could not be read as a report: {text_of(why.reason)}"
     items = (
         Item(item.title, 0.0, item.points, comment)

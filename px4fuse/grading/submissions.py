@@ -229,7 +229,7 @@ def _files(path: Path, notes: list[str]) -> Iterator[tuple[Path, str]]:
             if _hidden(file):
                 continue
             resolved = whole.resolve()
-            # a named pipe would keep us waiting for ever
+            # a named pipe would keep us waiting forever
             if not resolved.is_relative_to(root) or not resolved.is_file():
                 outside += 1
                 continue
@@ -246,7 +246,7 @@ def _hidden(name: str) -> bool:
 
 
 def _kind(name: str) -> str:
-    """What to call a file that is no PDF."""
+    """What to call a file that is not a PDF."""
     suffix = Path(name).suffix.lower()
     return suffix if re.fullmatch(r"\.[a-z0-9]{1,8}", suffix) else "without a known suffix"
 

@@ -1,8 +1,8 @@
-"""Work on what strangers wrote, in processes that may hang, crash or eat memory.
+"""Work on what strangers wrote, in processes that may hang, crash or take all memory.
 
 Neither pool of the standard library can do this. ``concurrent.futures`` cannot end one running
 job: a worker that is killed breaks the whole pool (BrokenProcessPool). ``multiprocessing.Pool``
-waits for ever for the result of a worker that died. So: one pipe per process, and a clock.
+waits forever for the result of a worker that died. So: one pipe per process, and a clock.
 """
 
 from __future__ import annotations
@@ -203,7 +203,7 @@ def _serve(pipe: Connection, function: Callable[[Any], Any], memory_bytes: int |
             answer = (True, function(job))
             message = pickle.dumps(answer, pickle.HIGHEST_PROTOCOL)
         except MemoryError:
-            # what is left of the heap is no place for the next job
+            # the next job would not find enough memory either
             answer = (False, Failed("it needed more memory than one file may take."))
             message = pickle.dumps(answer)
         except Px4FuseError as error:

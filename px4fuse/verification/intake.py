@@ -186,7 +186,7 @@ def _check_streams(pdf: bytes) -> None:
     """Inflate every stream into nothing, so that no bomb reaches pypdf."""
     left = MAX_DOCUMENT_BYTES
     for match in _STREAM.finditer(pdf):
-        # `stream` may stand anywhere, also inside a stream; each try costs from the same purse
+        # `stream` may stand anywhere, also inside a stream; each try counts towards the same limit
         spent = _inflated_bytes(pdf, match.end(), min(left, MAX_CONTENT_BYTES))
         left -= spent
         if spent > MAX_CONTENT_BYTES or left < 0:

@@ -43,7 +43,7 @@ from px4fuse.verification.pictures import FAILURES, opened, rendered, undrawn
 
 # Side of the square over which differences are averaged: about two digits, at a pixel per point
 SQUARE_PX = 8
-# Largest mean difference of grey (0 to 1) over such a square that is no difference. Between what
+# Largest mean difference of grey (0 to 1) over such a square that does not count. Between what
 # harmless re-saves make (0.07 at the most) and what is seen as another page (from 0.11); see above
 DISTANCE = 0.07
 # A page that another program wrote may be rounded to whole points
@@ -84,7 +84,7 @@ def compare_pages(
         ours = looks(redrawn)
     except FAILURES as error:
         return undrawn(error)
-    # whoever hands in a thousand pages shall not have them all drawn
+    # of a thousand pages that are handed in, not all are drawn
     try:
         theirs = looks(submitted, len(ours) + 1)
     except FAILURES as error:

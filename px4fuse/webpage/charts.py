@@ -128,7 +128,7 @@ def axis(scale: Scale) -> str:
     marks = []
     for place, tick in enumerate(scale.ticks):
         at = 100.0 * scale.share(tick)
-        # a phone has room for every second one
+        # a phone has room for half of them
         said = _text(at, 11.0, f"{tick:g}", "wide-only" if place % 2 else "")
         marks += [said, _line(at, at, 15.0, 18.0, "grid")]
     return plot(18, "", marks)
