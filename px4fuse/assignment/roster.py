@@ -16,12 +16,14 @@ MAX_NAME = 200
 # A file system takes 255 bytes, and a character up to 4
 MAX_STEM = 48
 RESERVED = {"con", "prn", "aux", "nul"} | {f"{n}{i}" for n in ("com", "lpt") for i in range(10)}
-# Column titles, letters only, best first: those of Moodle, Canvas, Blackboard, Brightspace, ILIAS
+# Column titles, letters and digits only, best first. The university's own id; Canvas's "ID",
+# Moodle's "Identifier" and ILIAS's "User ID" are the platform's and stand below
 ID_COLUMNS = (
     "studentid", "studentnumber", "studentno", "idnumber", "matriculationnumber", "matriculation",
-    "matrikelnummer", "orgdefinedid", "sisuserid", "sid", "id", "number", "userid", "username",
-    "user", "login", "loginid", "sisloginid", "emailaddress", "email", "mail",
+    "matrikelnummer", "matrikelnr", "orgdefinedid", "sisuserid", "sid", "id", "number",
 )  # fmt: skip
+LOGIN_COLUMNS = ("username", "login", "sisloginid", "loginid", "user", "benutzername")
+EMAIL_COLUMNS = ("emailaddress", "email", "mail", "emailadresse")
 NAME_COLUMNS = ("name", "fullname", "studentname", "displayname", "student")
 FIRST_NAME_COLUMNS = ("firstname", "givenname", "forename", "vorname")
 LAST_NAME_COLUMNS = ("lastname", "surname", "familyname", "nachname")
@@ -54,7 +56,8 @@ def read_roster(path: Path) -> tuple[Student, ...]:
     """
     sheet = read_sheet(path)
     # platforms export columns that nobody filled in
-    listed = [title for title in ID_COLUMNS if sheet.column((title,)) is not None]
+    every = (*ID_COLUMNS, "userid", *LOGIN_COLUMNS, *EMAIL_COLUMNS)
+    listed = [title for title in every if sheet.column((title,)) is not None]
     filled = [one for one in listed if any(sheet.cell(row, (one,)) for row in sheet.rows)]
     if not listed:
         raise SettingsError(

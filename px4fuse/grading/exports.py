@@ -36,7 +36,7 @@ from px4fuse.errors import SettingsError
 from px4fuse.grading.class_table import number
 from px4fuse.grading.model import Entry
 from px4fuse.grading.platforms import Origin
-from px4fuse.grading.roster import Register, people_of_sheet
+from px4fuse.grading.roster import Register, person_of_row
 from px4fuse.grading.zipping import zipped
 from px4fuse.plain import few_words
 from px4fuse.results.reading import one_line
@@ -139,7 +139,8 @@ def filled(
     comma = any(re.fullmatch(r"\d+,\d+", cell.strip()) for row in cells for cell in row)
     notes, seen = [], set()
     for row in cells:
-        at = _place(sheet, row, register)
+        person = person_of_row(sheet, row)
+        at = register.place(person) if person else None
         if at is None:
             continue
         seen.add(at)
@@ -163,11 +164,6 @@ def filled(
     if left:
         notes.append(f"{sheet.path.name}: it has no row for {few_words(left, 4)}.")
     return Filled(replace(sheet, rows=tuple(map(tuple, cells))), tuple(notes))
-
-
-def _place(sheet: Sheet, row: Sequence[str], register: Register) -> int | None:
-    people = people_of_sheet(replace(sheet, rows=(tuple(row),), numbers=sheet.numbers[:1]))
-    return register.place(people[0]) if people else None
 
 
 def _most(sheet: Sheet, row: Sequence[str], place: int) -> float | None:

@@ -23,7 +23,7 @@ from px4fuse.grading.outputs import Class, write_class
 from px4fuse.grading.overrides import NAME, read_overrides
 from px4fuse.grading.platforms import Origin, with_metadata
 from px4fuse.grading.records import verified
-from px4fuse.grading.roster import Register, people_of_key, people_of_sheet
+from px4fuse.grading.roster import Register, people_of_key, people_of_sheet, person_of_row
 from px4fuse.grading.scoring import assess, refused
 from px4fuse.grading.workers import Failed, run_bounded
 from px4fuse.reading import files_by_sha256, max_log_bytes
@@ -158,7 +158,7 @@ def _moodle_times(course: Course, register: Register | None) -> dict[int, dateti
             continue
         for row in sheet.rows:
             time = moodle_time(sheet.cell(row, ("lastmodifiedsubmission",)))
-            (person,) = people_of_sheet(replace(sheet, rows=(row,))) or (None,)
+            person = person_of_row(sheet, row)
             place = register.place(person) if person else None
             if time is not None and place is not None:
                 times[place] = time

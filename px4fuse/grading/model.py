@@ -117,7 +117,7 @@ class Submission:
         Name of the entry in the zip file, as it stands there; "" for a file.
     name : str
         For people: without folders of this machine, control characters or more than 200
-        characters. Unique within a run.
+        characters, a number behind it not counted. Unique within a run.
     time : datetime or None
         Of the entry in the zip file, in an unknown time zone: when the platform took it, or when
         it packed the zip file.

@@ -7,20 +7,20 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
 from px4fuse.assignment.key import AnswerKey, folded
-from px4fuse.assignment.roster import LAST_NAME_COLUMNS, MAX_NAME, NAME_COLUMNS, full_name
+from px4fuse.assignment.roster import (
+    EMAIL_COLUMNS,
+    ID_COLUMNS,
+    LAST_NAME_COLUMNS,
+    LOGIN_COLUMNS,
+    MAX_NAME,
+    NAME_COLUMNS,
+    full_name,
+)
 from px4fuse.assignment.sheet import Sheet
 from px4fuse.errors import SettingsError
 from px4fuse.grading.platforms import Origin
 from px4fuse.results.reading import one_line
 
-# Column titles, letters and digits only, best first. The university's own id; Canvas's "ID",
-# Moodle's "Identifier" and ILIAS's "User ID" are the platform's and stand below
-ID_COLUMNS = (
-    "studentid", "studentnumber", "studentno", "idnumber", "matriculationnumber", "matriculation",
-    "matrikelnummer", "matrikelnr", "orgdefinedid", "sisuserid", "sid", "id", "number",
-)  # fmt: skip
-LOGIN_COLUMNS = ("username", "login", "sisloginid", "loginid", "user", "benutzername")
-EMAIL_COLUMNS = ("emailaddress", "email", "mail", "emailadresse")
 # Of Canvas, above the students
 NOT_STUDENTS = ("pointspossible", "studenttest")
 
@@ -58,34 +58,14 @@ def people_of_sheet(sheet: Sheet) -> tuple[Person, ...]:
     SettingsError
         No column tells who somebody is, or two rows have the same id.
     """
-    canvas = sheet.column(("sisuserid", "sisloginid")) is not None
-    ids = tuple(name for name in ID_COLUMNS if not (canvas and name == "id"))
+    _, ids = _ids(sheet)
     known = (ids, LOGIN_COLUMNS, EMAIL_COLUMNS, NAME_COLUMNS, LAST_NAME_COLUMNS)
     if not any(sheet.column(titles) is not None for titles in known):
         raise SettingsError(
             f"{sheet.path}: no column tells who a student is. Give one a title such as id, email "
             "or name."
         )
-    people = []
-    for row in sheet.rows:
-        name = full_name(sheet, row)
-        if re.sub(r"\W", "", name.casefold()) in NOT_STUDENTS:
-            continue
-        email = one_line(sheet.cell(row, EMAIL_COLUMNS), MAX_NAME)
-        login = one_line(sheet.cell(row, LOGIN_COLUMNS), MAX_NAME)
-        numbers = {}
-        if participant := re.search(r"\d+$", sheet.cell(row, ("identifier",))):
-            numbers["moodle"] = participant[0]
-        if canvas and (user := sheet.cell(row, ("id",))):
-            numbers["canvas"] = user
-        student_id = one_line(sheet.cell(row, ids), MAX_NAME) or login or email
-        if student_id or name or numbers:
-            people.append(Person(student_id, name, email, login, numbers))
-    _check_unique(sheet, people)
-    return tuple(people)
-
-
-def _check_unique(sheet: Sheet, people: Sequence[Person]) -> None:
+    people = [one for row in sheet.rows if (one := person_of_row(sheet, row))]
     seen: set[str] = set()
     for person in people:
         wanted = folded(person.student_id)
@@ -95,6 +75,31 @@ def _check_unique(sheet: Sheet, people: Sequence[Person]) -> None:
                 "every student one of its own."
             )
         seen.add(wanted)
+    return tuple(people)
+
+
+def person_of_row(sheet: Sheet, row: Sequence[str]) -> Person | None:
+    """Whom a row of such a table is about; None for a row that is about nobody."""
+    canvas, ids = _ids(sheet)
+    name = full_name(sheet, row)
+    if re.sub(r"\W", "", name.casefold()) in NOT_STUDENTS:
+        return None
+    email = one_line(sheet.cell(row, EMAIL_COLUMNS), MAX_NAME)
+    login = one_line(sheet.cell(row, LOGIN_COLUMNS), MAX_NAME)
+    numbers = {}
+    if participant := re.search(r"\d+$", sheet.cell(row, ("identifier",))):
+        numbers["moodle"] = participant[0]
+    if canvas and (user := sheet.cell(row, ("id",))):
+        numbers["canvas"] = user
+    student_id = one_line(sheet.cell(row, ids), MAX_NAME) or login or email
+    found = Person(student_id, name, email, login, numbers)
+    return found if student_id or name or numbers else None
+
+
+def _ids(sheet: Sheet) -> tuple[bool, list[str]]:
+    """Whether a table is Canvas's, and titles of the university's ids."""
+    canvas = sheet.column(("sisuserid", "sisloginid")) is not None
+    return canvas, [name for name in ID_COLUMNS if not (canvas and name == "id")]
 
 
 def people_of_key(key: AnswerKey) -> tuple[Person, ...]:

@@ -36,8 +36,7 @@ MAX_TOTAL_BYTES = 4_000_000_000
 MAX_INNER_BYTES = 500_000_000
 # PDFs are compressed inside; what still shrinks a hundred times is empty
 MAX_RATIO = 100
-# Of a name, with room for the number of a second one of it
-MAX_NAME = 192
+MAX_NAME = 200
 # The year that stands where a program knew no time
 ZIP_EPOCH = 1980
 
