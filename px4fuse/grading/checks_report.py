@@ -9,7 +9,6 @@ from px4fuse.grading.claims import in_words
 from px4fuse.grading.evidence import (
     Evidence,
     also_named,
-    is_number,
     list_words,
     reason_of,
     text_of,
@@ -18,7 +17,7 @@ from px4fuse.grading.evidence import (
 )
 from px4fuse.results.contract import LoopResults
 from px4fuse.verification.model import Verdict
-from px4fuse.verification.verification import NO_LOG
+from px4fuse.verification.verification import NO_LOG, is_number
 
 # Findings about a recording, for which a student who was given the log cannot be asked
 NOT_ASKED = frozenset(("log_damaged", "samples_dropped", "source_samples_lost"))

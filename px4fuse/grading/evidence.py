@@ -214,11 +214,6 @@ def values_at(results: Mapping[str, Any], path: str) -> Iterator[tuple[str, Any]
     yield from ((name.removeprefix("."), value) for name, value in found)
 
 
-def is_number(value: object) -> bool:
-    """Whether a value is a number, and no flag."""
-    return isinstance(value, int | float) and not isinstance(value, bool)
-
-
 def text_of(value: str) -> str:
     """One line of text, without control characters and not too long to be quoted."""
     return one_line(value, MAX_QUOTE)

@@ -256,19 +256,20 @@ def grade_one(
     if isinstance(found, Refused):
         made = refused(rubric, key, found)
         return replace(made, submission=submission.name, sha256=sha256), recalled
-    results = found.report.results
-    made = assess(found.report, found.verdict, rubric, key, job.owner_id)
+    report, verdict, page = found
+    results = report.results
+    made = assess(report, verdict, rubric, key, job.owner_id)
     whole = replace(
         made,
         submission=submission.name,
-        flags=(*_page_flags(found.verdict), *own_flags(results), *made.flags),
+        flags=(*_page_flags(verdict), *own_flags(results), *made.flags),
         numbers=_numbers(results),
         sha256=sha256,
         log_sha256=log_sha256(results),
         version=results.provenance.px4fuse,
         settings=chosen_settings(results),
         notes=results.student.notes,
-        page=found.page,
+        page=page,
     )
     return whole, recalled
 

@@ -35,21 +35,9 @@ THE_FILE = "The file"
 _SHA256 = re.compile(rb'"([0-9a-f]{64})"')
 
 
-@dataclass(frozen=True)
-class Verified:
-    """A report as it was found to be; pictures and the redrawn PDF stay in their files.
-
-    Attributes
-    ----------
-    report : Report
-        Without its bytes; its pages are those of the redrawn report, as far as there is one.
-    page : int
-        Which page the pictures show, counted from 1.
-    """
-
-    report: Report
-    verdict: Verdict
-    page: int
+# A report without its bytes, with the pages of the redrawn one as far as there is one; what was
+# found; and which page the pictures show, counted from 1
+Verified = tuple[Report, Verdict, int]
 
 
 @dataclass(frozen=True)
@@ -115,7 +103,7 @@ def verified(
         REDRAWN: verdict.redrawn,
     }
     _keep(records, sha256, kept, parts)
-    return Verified(replace(seen, pdf=b""), unread, page), False
+    return (replace(seen, pdf=b""), unread, page), False
 
 
 def _is_gap(results: Reported, logs: Mapping[str, Path], handed_out: frozenset[str]) -> bool:
@@ -171,4 +159,4 @@ def _recalled(
     files = {name: name in logs for name in _named(data)}
     if kept.files != files or kept.gap != _is_gap(results, logs, handed_out):
         return None
-    return Verified(Report(sha256, 0, kept.seal, results, kept.pages, b""), kept.verdict, kept.page)
+    return Report(sha256, 0, kept.seal, results, kept.pages, b""), kept.verdict, kept.page

@@ -215,7 +215,7 @@ def compare_results(recorded: Mapping[str, Any], recomputed: Mapping[str, Any]) 
     wrong: dict[str, tuple[Any, Any]] = {}
     pairs: list[tuple[float, float]] = []
     for path, theirs, ours in leaves:
-        if _is_number(theirs) and _is_number(ours):
+        if is_number(theirs) and is_number(ours):
             wide = everywhere or path.startswith(ESTIMATES)
             if not _near(path, theirs, ours, wide):
                 wrong[path] = theirs, ours
@@ -223,7 +223,7 @@ def compare_results(recorded: Mapping[str, Any], recomputed: Mapping[str, Any]) 
                 pairs.append((float(theirs), float(ours)))
     rounded = _rounding(pairs)
     for path, theirs, ours in leaves:
-        if not (_is_number(theirs) and _is_number(ours)) and not _same(theirs, ours, rounded):
+        if not (is_number(theirs) and is_number(ours)) and not _same(theirs, ours, rounded):
             wrong[path] = theirs, ours
     found = tuple(
         Difference(one_line(path, SHOWN_TEXT), _shown(theirs), _shown(ours))
@@ -253,7 +253,8 @@ def _leaves(path: str, theirs: Any, ours: Any) -> Iterator[tuple[str, Any, Any]]
         yield path, theirs, ours
 
 
-def _is_number(value: Any) -> bool:
+def is_number(value: object) -> bool:
+    """Whether a value is a number, and not a flag."""
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
