@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from decimal import Decimal
 from typing import Any
@@ -45,6 +45,16 @@ def factor_words(factor: float) -> str:
     ['1.18', '9.9', '61', '390', '3,400', '5,100,000']
     """
     return number_words(factor, 3 if factor < 2.0 else 2)
+
+
+def few_words(names: Sequence[str], most: int, between: str = ", ") -> str:
+    """The first few of several names, and how many more there are.
+
+    >>> few_words("abcd", 2), few_words("ab", 2)
+    ('a, b and 2 more', 'a, b')
+    """
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return between.join(names[:most]) + more
 
 
 def p_words(p: float) -> str:

@@ -11,11 +11,11 @@ from class_tools import graded
 
 from px4fuse.errors import SettingsError
 from px4fuse.grading.entries import Term, class_entries
+from px4fuse.grading.feedback import returned_text
 from px4fuse.grading.lateness import due_time, late_rule
 from px4fuse.grading.model import Override, Submission
 from px4fuse.grading.overrides import read_overrides
 from px4fuse.grading.platforms import origin_of
-from px4fuse.grading.returned import returned_text
 from px4fuse.grading.roster import Person, Register
 from px4fuse.verification.model import Verdict
 

@@ -51,7 +51,7 @@ def test_a_log_is_one_row_with_its_axes_inside() -> None:
     inside = parts(row)
     assert inside["What happened"][2] == STORY.splitlines()
     assert inside["Axes"][2] == ["", "north", "east", "down"]
-    assert inside["Findings"][2][0] == "source gap (source_gap)"
+    assert inside["Findings"][2][0] == "a time without positions (source_gap)"
     assert [to for _, to in inside["Files"][2]] == [
         "reports/flight%200000.pdf", "results/flight%200000.json",
     ]  # fmt: skip

@@ -20,7 +20,7 @@ from px4fuse.assignment.key import Answer, AnswerKey
 from px4fuse.cli import cli
 from px4fuse.grading.grade import Outcome, grade
 from px4fuse.grading.model import Entry, Graded
-from px4fuse.grading.outputs import file_names
+from px4fuse.grading.names import file_names
 from px4fuse.grading.rubric import read_rubric, rubric_text
 from px4fuse.reading import files_by_sha256
 from px4fuse.verification.model import Verdict

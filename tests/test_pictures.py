@@ -17,7 +17,7 @@ from PIL import Image
 from pypdf import PdfReader, PdfWriter
 
 from px4fuse.flight import Unavailable
-from px4fuse.grading.sheets import draw_sheets
+from px4fuse.grading.sheets import delete_others, draw_sheets
 from px4fuse.verification.pictures import (
     COVER,
     MAX_BYTES,
@@ -204,7 +204,7 @@ def test_pages_are_drawn_once_and_named_by_what_they_show(tmp_path: Path) -> Non
     assert {name: len(files) for name, files in made.items()} == {
         "a": len(PdfReader(REPORT).pages), "b": 1,
     }  # fmt: skip
-    first = {path: path.stat().st_mtime_ns for path in folder.iterdir()}
+    first = {path: path.stat().st_mtime_ns for path in folder.glob("*.png")}
     assert {path.name for path in first} == {file for files in made.values() for file in files}
     assert (folder / made["a"][0]).read_bytes() == picture(REPORT.read_bytes(), 0)
     # one that is not whole is drawn again, the others are not
@@ -215,3 +215,22 @@ def test_pages_are_drawn_once_and_named_by_what_they_show(tmp_path: Path) -> Non
     hidden = draw_sheets({"b": (tmp_path / "b.pdf", ("Ada",))}, folder, processes=1)
     assert hidden["b"] != made["b"]
     assert not any("ada" in file.casefold() for files in hidden.values() for file in files)
+
+
+def test_only_what_was_drawn_here_is_deleted(tmp_path: Path) -> None:
+    folder = tmp_path / "pages"
+    for name in "ab":
+        (tmp_path / f"{name}.pdf").write_bytes(written((0.9, f"by {name}")))
+    both = {name: (tmp_path / f"{name}.pdf", ()) for name in "ab"}
+    (old,), (new,) = draw_sheets(both, folder, processes=1).values()
+    # as an instructor, or an earlier version without a list, may have put it there
+    strange = folder / f"{'0' * 16}-001-of-001.png"
+    strange.write_bytes(b"mine")
+    delete_others(folder, [new])
+    assert {path.name for path in folder.glob("*.png")} == {new, strange.name}
+    draw_sheets(both, folder, processes=1)
+    delete_others(folder, [old, new])
+    delete_others(folder, ())
+    assert [path.name for path in folder.glob("*.png")] == [strange.name]
+    delete_others(tmp_path / "none", ())
+    assert not (tmp_path / "none").exists()

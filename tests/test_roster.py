@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
+from px4fuse.assignment.sheet import read_sheet
 from px4fuse.errors import SettingsError
 from px4fuse.grading.platforms import Origin
 from px4fuse.grading.roster import Person, Register, people_of_sheet
-from px4fuse.grading.sheet import read_sheet
 
 MOODLE = (
     'Identifier,"Full name","ID number","Email address",Status,Grade,"Maximum Grade"\r\n'

@@ -14,13 +14,13 @@ import pytest
 from class_tools import Reports, at_once, zipped
 
 from px4fuse.assignment.key import Answer, AnswerKey
-from px4fuse.grading.entries import Term
-from px4fuse.grading.grade import Course, Outcome, grade
+from px4fuse.assignment.sheet import read_sheet
+from px4fuse.grading.entries import Course, Term
+from px4fuse.grading.grade import Outcome, grade
 from px4fuse.grading.lateness import due_time, late_rule
 from px4fuse.grading.model import Entry
 from px4fuse.grading.roster import people_of_sheet
 from px4fuse.grading.rubric import read_rubric, rubric_text
-from px4fuse.grading.sheet import read_sheet
 
 STUDENTS = range(1, 41)
 MOODLE, CANVAS, BLACKBOARD = range(1, 16), range(16, 28), range(28, 39)  # 39 and 40 hand in nothing

@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+from contextlib import closing
 
 import bad_jobs
 import pytest
@@ -45,19 +46,13 @@ def act(job):
     return bad_jobs.act(job)
 
 
-def run(jobs, processes=2, timeout_s=60.0, memory_bytes=None, **options):
-    heard = []
-    results = run_bounded(
-        act,
-        jobs,
-        processes=processes,
-        timeout_s=timeout_s,
-        memory_bytes=memory_bytes,
-        on_done=lambda index, result: heard.append((index, result)),
-        **options,
+def run(jobs, processes=2, timeout_s=60.0, memory_bytes=None):
+    heard = list(
+        run_bounded(act, jobs, processes=processes, timeout_s=timeout_s, memory_bytes=memory_bytes)
     )
     assert not multiprocessing.active_children()
-    return results, heard
+    assert [index for index, _ in sorted(heard, key=lambda one: one[0])] == [*range(len(jobs))]
+    return [result for _, result in sorted(heard, key=lambda one: one[0])], heard
 
 
 def test_fifty_jobs_in_their_order():
@@ -67,11 +62,8 @@ def test_fifty_jobs_in_their_order():
     assert sorted(heard) == list(enumerate(results))
 
 
-def test_results_need_not_be_kept():
-    results, heard = run([("square", 3)], keep=False)
-    assert results == []
-    assert heard == [(0, 9)]
-    assert run([])[0] == []
+def test_no_jobs_have_no_results():
+    assert run([]) == ([], [])
 
 
 def test_one_bad_job_is_lost_alone():
@@ -133,19 +125,10 @@ def test_a_function_that_cannot_be_loaded_fails_and_ends(monkeypatch):
     assert all(isinstance(each, Failed) and "before it began" in each.reason for each in results)
 
 
-def test_an_error_of_the_listener_ends_all():
-    def listen(index, result):
-        raise KeyError(index)
-
-    with pytest.raises(KeyError):
-        run_bounded(
-            act,
-            [("square", 1), ("hang", 0)],
-            processes=2,
-            timeout_s=60,
-            memory_bytes=None,
-            on_done=listen,
-        )
+def test_who_stops_listening_ends_all():
+    jobs = [("square", 1), ("hang", 0)]
+    with closing(run_bounded(act, jobs, processes=2, timeout_s=60, memory_bytes=None)) as work:
+        assert next(work) == (0, 1)
     assert not multiprocessing.active_children()
 
 
@@ -155,12 +138,10 @@ sys.path.insert(0, {tests!r})
 from px4fuse.grading.workers import run_bounded
 from test_workers import act
 
-def heard(index, result):
-    print(result, flush=True)
-
 if __name__ == "__main__":
-    run_bounded(act, [("process", 0), ("hang", 0)], processes=1, timeout_s=500,
-                memory_bytes=None, on_done=heard)
+    for _, result in run_bounded(act, [("process", 0), ("hang", 0)], processes=1, timeout_s=500,
+                                 memory_bytes=None):
+        print(result, flush=True)
 """
 
 

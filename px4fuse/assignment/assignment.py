@@ -101,11 +101,8 @@ def assign(
 
     Parameters
     ----------
-    students : sequence of Student
-    folder, key_file : Path
     secret : bytes or None
         None takes that of the key that is there already, or makes one up.
-    kind : {"aisle", "loop", "mixed"}
     count : int, optional
         Mistakes per flight; None draws it.
     truth : bool

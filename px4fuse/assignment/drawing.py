@@ -73,7 +73,6 @@ class Choice:
         As it is typed.
     less_is_plainer : bool
         Whether a smaller number is the larger mistake.
-    either_sign : bool
     at_s : (float, float) or None
         When it begins, where that can be said.
     hides : tuple of str
@@ -159,8 +158,6 @@ class Drawn:
 
     Attributes
     ----------
-    scenario : Scenario
-    chosen : tuple of Choice
     typed : tuple of str
         The mistakes as typed, in the same order.
     """
@@ -173,8 +170,8 @@ class Drawn:
     def difficulty(self) -> float:
         """That of the hardest mistake.
 
-        Only who has looked for the smallest can say that there is none: such a flight is among the
-        hardest.
+        Only a student who has looked for the smallest can say that there is none: such a flight is
+        among the hardest.
         """
         each = [one.difficulty(text) for one, text in zip(self.chosen, self.typed, strict=True)]
         return max(each, default=HARDEST)
@@ -199,8 +196,6 @@ def draw(
 
     Parameters
     ----------
-    secret : bytes
-    student_id : str
     kind : {"aisle", "loop", "mixed"}
         "mixed" draws which of the two.
     count : int, optional

@@ -105,13 +105,12 @@ def grade(
     a new rubric takes seconds. What students hand in is read within bounds of time and memory, and
     nothing in it is executed.
     """
-    from px4fuse.grading.entries import Term
-    from px4fuse.grading.grade import Course
+    from px4fuse.assignment.sheet import read_sheet
+    from px4fuse.grading.entries import Course, Term
     from px4fuse.grading.grade import grade as grade_all
     from px4fuse.grading.lateness import due_time, late_rule
     from px4fuse.grading.roster import people_of_sheet
     from px4fuse.grading.rubric import read_rubric, rubric_text
-    from px4fuse.grading.sheet import read_sheet
 
     if write_rubric is not None:
         _write_new(write_rubric, rubric_text().encode())

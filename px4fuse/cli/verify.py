@@ -67,13 +67,9 @@ def verify(
         if logs and not files:
             raise LogError("there is no file in what was given as LOG.")
         step("running the analysis again")
-        (verdict,) = run_bounded(
-            partial(verify_report, logs=files),
-            [read],
-            processes=1,
-            timeout_s=TIMEOUT_S,
-            memory_bytes=MEMORY_BYTES,
-            on_done=lambda *_: None,
+        work = partial(verify_report, logs=files)
+        ((_, verdict),) = run_bounded(
+            work, [read], processes=1, timeout_s=TIMEOUT_S, memory_bytes=MEMORY_BYTES
         )
     if isinstance(verdict, Failed):
         raise LogError(f"{shown(report)}: cannot be verified: {verdict.reason}")

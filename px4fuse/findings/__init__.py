@@ -71,6 +71,7 @@ __all__ = [
     "Severity",
     "find",
     "find_loop",
+    "named",
     "names",
     "phrases",
 ]
@@ -105,6 +106,15 @@ def phrases() -> dict[str, tuple[str, ...]]:
 def names() -> dict[str, str]:
     """What each finding is called within a sentence: a student reads words, never ids."""
     return {name: said for detector in DETECTORS for name, said in detector.names.items()}
+
+
+def named(finding: str) -> str:
+    """A finding as part of a sentence; one that this version does not know by its id.
+
+    >>> named("source_gap"), named("of_a_later_version")
+    ('a time without positions', 'of a later version')
+    """
+    return names().get(finding, finding.replace("_", " "))
 
 
 def _find(detectors: Iterable[Detector[Subject]], subject: Subject) -> tuple[Finding, ...]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import PurePosixPath
@@ -10,22 +9,11 @@ from typing import Any
 
 import pandas as pd
 
-from px4fuse.fleet.rows import BETWEEN_FINDINGS
+from px4fuse.findings import named
+from px4fuse.fleet.rows import BETWEEN_FINDINGS, COLUMNS
 
-# Columns that are the same for all axes of a log
-TEXTS = (
-    "log", "name", "log_sha256", "px4fuse", "settings", "vehicle", "firmware", "firmware_hash",
-    "airframe", "hardware", "date", "source", "story", "findings", "results", "report",
-)  # fmt: skip
-NUMBERS = (
-    "duration_s", "source_rate_hz", "position_rmse_m",
-    "sigma_z_m", "sigma_z_low_m", "sigma_z_high_m",
-    "sigma_a_m_s2", "sigma_a_low_m_s2", "sigma_a_high_m_s2",
-    "clock_offset_s", "clock_offset_low_s", "clock_offset_high_s",
-)  # fmt: skip
 # What speaks for a log: along the aisle where that is known, else both horizontal axes
 MAIN = (("aisle",), ("north", "east"), ("down",))
-CAPITALS = ("ekf2", "imu", "px4", "ev", "sigma_z", "sigma_a")
 
 
 @dataclass(frozen=True)
@@ -35,9 +23,9 @@ class Log:
     Attributes
     ----------
     texts : mapping
-        :data:`TEXTS`, "" where absent.
+        Of all columns of texts, from the first axis that has one; "" where absent.
     numbers : mapping
-        Of :data:`NUMBERS` those that are there, from the first main axis that has them.
+        Of columns of numbers those that are there, from the first main axis that has them.
     factors : mapping
         "kf" and "ekf2": how many times S is overstated, below 1 understated; 1 over the mean NIS
         of all updates of the main axes.
@@ -77,19 +65,8 @@ class Log:
             tags["status:worse"] = "worse than in the baseline"
         for name in ("vehicle", "firmware"):
             tags[f"{name}:{self.texts[name]}"] = self.texts[name] or f"no {name} named"
-        tags |= {f"finding:{finding}": finding_words(finding) for finding in self.findings}
+        tags |= {f"finding:{finding}": named(finding) for finding in self.findings}
         return tags | {f"remedy:{remedy}": remedy or "no advice" for _, remedy in self.lacking}
-
-
-def finding_words(finding: str) -> str:
-    """The id of a finding as it is read.
-
-    >>> finding_words("ekf2_not_fusing"), finding_words("sigma_z_large")
-    ('EKF2 not fusing', 'SIGMA_Z large')
-    """
-    parts = re.split(rf"(?<![^_])({'|'.join(CAPITALS)})(?![^_])", finding)
-    told = (part.upper() if part in CAPITALS else part.replace("_", " ") for part in parts)
-    return "".join(told)
 
 
 def short_names(logs: Sequence[Log]) -> dict[str, str]:
@@ -121,10 +98,10 @@ def _log(rows: Sequence[Mapping[str, Any]]) -> Log:
     statuses = [str(row["status"]) for row in (*main, *rows)]
     lacking = [(str(row.get("reason", "")), str(row.get("remedy", ""))) for row in rows]
     return Log(
-        texts={name: str(_first(rows, name) or "") for name in TEXTS},
+        texts={name: str(_first(rows, name) or "") for name in COLUMNS if COLUMNS[name] == "str"},
         numbers={
-            name: float(value) for name in NUMBERS
-            if (value := _first((*main, *rows), name)) is not None
+            name: float(value) for name, kind in COLUMNS.items()
+            if kind == "float64" and (value := _first((*main, *rows), name)) is not None
         },
         factors={
             whose: factor for whose in ("kf", "ekf2")

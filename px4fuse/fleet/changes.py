@@ -22,7 +22,7 @@ from px4fuse.fleet.significance import (
     Contrast,
     contrast,
     corrected,
-    differs,
+    least_difference,
     spreads,
 )
 from px4fuse.results.changes import (
@@ -136,12 +136,7 @@ def diff(a: str | Path, b: str | Path, *, progress: Progress = lambda _: None) -
 
 
 def changes(a: Side, b: Side) -> Changes:
-    """Hold two comparisons against each other.
-
-    Parameters
-    ----------
-    a, b : Side
-    """
+    """Hold two comparisons against each other."""
     paired = a.results.log.sha256 == b.results.log.sha256
     first, second = (numbers(side.results, side.analysis) for side in (a, b))
     both = {path: (first[path], second[path]) for path in first if path in second}
@@ -210,7 +205,8 @@ def _change(
     status: Status = "not tested"
     judgement: Judgement = ""
     if paired:
-        moved = a.value != b.value if found is None else differs(found.delta, a)
+        least = least_difference(a.scale, a.unit)
+        moved = a.value != b.value if found is None else abs(found.delta) >= least
         status = "differs" if moved else "same"
     elif q is not None:
         status = "significant" if q < FALSE_DISCOVERY_RATE else "within chance"

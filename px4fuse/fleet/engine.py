@@ -1,4 +1,4 @@
-"""Jobs on a Dask cluster: what hangs, crashes or eats memory is lost alone."""
+"""Jobs on a Dask cluster: what hangs, crashes or takes all memory is lost alone."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Job = TypeVar("Job")
 Result = TypeVar("Result")
 
 CONNECT_S = 15.0
-# A cluster's machines may come one by one; none for so long is none
+# A cluster's machines may come one by one; after so long without any, none will come
 WORKERS_S = 120.0
 # Until a worker that hangs is killed and, on most machines, has begun again
 RESTART_S = 15.0
@@ -36,7 +36,7 @@ _CONFIG = {
     "distributed.worker.memory.target": False,
     "distributed.worker.memory.spill": False,
     "distributed.worker.memory.pause": False,
-    # a worker shall not import a module that lies in the folder of the logs
+    # a worker must not import a module that lies in the folder of the logs
     "distributed.nanny.pre-spawn-environ.PYTHONSAFEPATH": 1,
     # Dask has memory given back at every chance, which costs a comparison a tenth of its time
     "distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_": None,
@@ -167,7 +167,6 @@ def outcomes(
         Of workers with one thread each, and a nanny.
     function : callable
         At the top level of a module.
-    jobs : iterable
     timeout_s : float
         For one job, once it runs.
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import re
 import signal
-from contextvars import copy_context
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import msgspec
 
@@ -17,9 +17,6 @@ from px4fuse.fleet.logs import CHANGED, local_file
 from px4fuse.fleet.rows import FAILED, NOT_JUDGED, Row, log_columns, rows_of
 from px4fuse.reading import files_by_sha256, max_log_bytes
 from px4fuse.request import ComparisonRequest, command_line, with_options
-
-if TYPE_CHECKING:
-    from px4fuse.flight import Flight
 
 
 @dataclass(frozen=True)
@@ -78,21 +75,12 @@ def identify(job: Job) -> str:
     LogError
         It cannot be read.
     """
-    return copy_context().run(_identified, job)
-
-
-def _identified(job: Job) -> str:
-    max_log_bytes.set(job.max_bytes)
-    with local_file(job.address) as path:
+    with _limited(job), local_file(job.address) as path:
         return _sha256(path)
 
 
 def analyse(job: Job) -> Outcome:
     """Compare one log as ``px4fuse compare`` does.
-
-    Parameters
-    ----------
-    job : Job
 
     Returns
     -------
@@ -107,14 +95,9 @@ def analyse(job: Job) -> Outcome:
     version = metadata.version("px4fuse")
     if version != job.px4fuse:
         raise SettingsError(f"a worker has px4fuse {version}, not {job.px4fuse}.")
-    return copy_context().run(_analysed, job)
-
-
-def _analysed(job: Job) -> Outcome:
-    max_log_bytes.set(job.max_bytes)
     sha256 = job.sha256
     try:
-        with local_file(job.address) as path:
+        with _limited(job), local_file(job.address) as path:
             sha256 = _sha256(path)
             if job.sha256 not in ("", sha256):
                 raise LogError(CHANGED)
@@ -126,6 +109,15 @@ def _analysed(job: Job) -> Outcome:
         return Outcome((refused(str(error), FAILED) | {"log_sha256": sha256},))
 
 
+@contextmanager
+def _limited(job: Job) -> Iterator[None]:
+    before = max_log_bytes.set(job.max_bytes)
+    try:
+        yield
+    finally:
+        max_log_bytes.reset(before)
+
+
 def refused(text: str, status: str) -> Row:
     """The row of a log from the line of an error: what is wrong, and then what to do."""
     reason, _, remedy = with_options(text).partition(". ")
@@ -133,42 +125,32 @@ def refused(text: str, status: str) -> Row:
 
 
 def _compared(job: Job, path: Path, sha256: str) -> Outcome:
-    from px4fuse.analysis import read_flight  # noqa: PLC0415 - only workers need all of it
+    # only workers need all of it
+    from px4fuse.analysis import read_flight, run  # noqa: PLC0415
+    from px4fuse.findings import find  # noqa: PLC0415
+    from px4fuse.results.build import results  # noqa: PLC0415
+    from px4fuse.results.contract import to_json  # noqa: PLC0415
+    from px4fuse.results.model import Student  # noqa: PLC0415
+    from px4fuse.results.parts import log_part  # noqa: PLC0415
 
     request = msgspec.structs.replace(job.request, log=str(path))
     known: Row = {"name": path.name, "log_sha256": sha256}
     try:
         flight = read_flight(request)
-        known |= _columns(flight)
-        return _explained(job, request, flight)
+        known |= log_columns(log_part(flight))
+        analysis, command = run(request, flight=flight), command_line(request)
+        findings = find(analysis)
+        found = results(request, analysis, findings, Student(), command)
+        text, report = to_json(found), b""
+        if job.reports:
+            from px4fuse.report.document import Document  # noqa: PLC0415
+            from px4fuse.report.pdf import render  # noqa: PLC0415
+
+            report = render(Document(analysis, findings, Student(), command), text)
     except Px4FuseError as error:
         status = NOT_JUDGED if isinstance(error, MissingDataError) else FAILED
         text = str(error).removeprefix(f"{path.name}: ")
         return Outcome((known | refused(text, status),))
-
-
-def _columns(flight: Flight) -> Row:
-    from px4fuse.results.parts import log_part  # noqa: PLC0415
-
-    return log_columns(log_part(flight))
-
-
-def _explained(job: Job, request: ComparisonRequest, flight: Flight) -> Outcome:
-    from px4fuse.analysis import run  # noqa: PLC0415
-    from px4fuse.findings import find  # noqa: PLC0415
-    from px4fuse.results.build import results  # noqa: PLC0415
-    from px4fuse.results.contract import to_json  # noqa: PLC0415
-    from px4fuse.results.model import Student  # noqa: PLC0415
-
-    analysis, command = run(request, flight=flight), command_line(request)
-    findings = find(analysis)
-    found = results(request, analysis, findings, Student(), command)
-    text, report = to_json(found), b""
-    if job.reports:
-        from px4fuse.report.document import Document  # noqa: PLC0415
-        from px4fuse.report.pdf import render  # noqa: PLC0415
-
-        report = render(Document(analysis, findings, Student(), command), text)
     severities = tuple(finding.severity for finding in findings)
     return Outcome(tuple(rows_of(found)), severities, text.encode(), report)
 

@@ -52,8 +52,6 @@ class Number:
 
     Attributes
     ----------
-    label, unit : str
-    value : float
     interval : (float, float) or None
         95 %; None where there is none.
     aim : {"low", "one", "zero", ""}
@@ -119,7 +117,6 @@ def numbers(results: ComparisonResults, analysis: Analysis | None = None) -> dic
 
     Parameters
     ----------
-    results : ComparisonResults
     analysis : Analysis, optional
         What they were made from, for the intervals that only the log can give.
     """

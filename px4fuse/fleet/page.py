@@ -8,9 +8,10 @@ from typing import Literal
 
 import pandas as pd
 
-from px4fuse.fleet.by_log import Log, finding_words, logs_of, short_names
+from px4fuse.findings import named
+from px4fuse.fleet.by_log import Log, logs_of, short_names
 from px4fuse.fleet.questions import above, overstated_words
-from px4fuse.plain import number_words
+from px4fuse.plain import few_words, number_words
 from px4fuse.webpage.charts import Scale, around_one, linear_scale, log_scale
 from px4fuse.webpage.frame import (
     Cell,
@@ -87,7 +88,6 @@ def html_text(table: pd.DataFrame, title: str, made_with: str) -> str:
     table : DataFrame
         A row per log and axis, with the columns of :data:`px4fuse.fleet.rows.COLUMNS`; a log that
         could not be read has one row without an axis.
-    title : str
     made_with : str
         Name and version of the program.
 
@@ -125,7 +125,7 @@ def html_text(table: pd.DataFrame, title: str, made_with: str) -> str:
         ),
         rows=[_row(log, names, factor, sigma, clock) for log in logs],
         filters=_filters(logs),
-        groups=(("numbers", "More numbers", False),),
+        groups=(("numbers", "More numbers"),),
         placeholder="name, vehicle, firmware, finding",
         otherwise="All rows are in fleet.csv.",
     )
@@ -134,8 +134,7 @@ def html_text(table: pd.DataFrame, title: str, made_with: str) -> str:
 def _row(
     log: Log, names: Mapping[str, str], factor: Scale, sigma: Scale | None, clock: Scale | None
 ) -> Row:
-    named = [finding_words(finding) for finding in log.findings]
-    few = ", ".join(named[:2]) + (f" and {len(named) - 2} more" if len(named) > 2 else "")
+    said = [named(finding) for finding in log.findings]
     folder = log.texts["log"].rpartition("/")[0]
     worse = "worse than before" if log.changes else ""
     cells = (
@@ -147,7 +146,7 @@ def _row(
         *(_factor(log.factors.get(whose), factor) for whose in ("kf", "ekf2")),
         _interval(log, "sigma_z", "m", sigma),
         _interval(log, "clock_offset", "s", clock),
-        figure(float(len(named)), below=few) if log.status != "failed" else Cell(),
+        figure(float(len(said)), below=few_words(said, 2)) if log.status != "failed" else Cell(),
         *(
             words(log.texts[name]) if kind == "text" else figure(log.numbers.get(name))
             for _, kind, name in MORE
@@ -171,16 +170,13 @@ def _interval(log: Log, name: str, unit: str, scale: Scale | None) -> Cell:
     return figure(value, f"{value:.3g}", tuple(scale.share(end) for end in ends))
 
 
-# ------------------------------------------------------------------ what a row unfolds to
-
-
 def _details(log: Log) -> tuple[Part, ...]:
     return (
         listed("Not judged", [reason for reason, _ in log.lacking if reason], warn=True),
         listed("What to set", list(dict.fromkeys(remedy for _, remedy in log.lacking if remedy))),
         listed("Worse than in the baseline", log.changes, warn=True),
         listed("What happened", [line for line in log.texts["story"].splitlines() if line]),
-        listed("Findings", [f"{finding_words(one)} ({one})" for one in log.findings]),
+        listed("Findings", [f"{named(one)} ({one})" for one in log.findings]),
         _axes(log),
     )
 
@@ -230,17 +226,14 @@ def _flight(log: Log) -> list[tuple[str, str]]:
     return [*((said, log.texts[name]) for said, name in FACTS), *numbers]
 
 
-# ------------------------------------------------------------------ filters
-
-
 def _filters(logs: Sequence[Log]) -> list[tuple[str, list[tuple[str, str]]]]:
     """What the logs have, most frequent first."""
     counts = Counter(tag for log in logs for tag in log.tags)
-    named = {tag: said for log in logs for tag, said in log.tags.items()}
+    words_of = {tag: said for log in logs for tag, said in log.tags.items()}
     filters = []
     for label, kind, every in FILTERS:
         options = [
-            (tag, f"{said if len(said := named[tag]) <= 60 else said[:59] + '…'} ({count})")
+            (tag, f"{said if len(said := words_of[tag]) <= 60 else said[:59] + '…'} ({count})")
             for tag, count in counts.most_common()
             if tag.startswith(f"{kind}:")
         ]

@@ -9,10 +9,11 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import pandas as pd
 
-from px4fuse.fleet.by_log import Log, finding_words
+from px4fuse.findings import named
+from px4fuse.fleet.by_log import Log
 from px4fuse.plain import factor_words
 from px4fuse.webpage.charts import Scale, axis, bar, grid, over_time, plot, spread
-from px4fuse.webpage.frame import card, note, opens, picks, summary
+from px4fuse.webpage.frame import card, note, opens, picks, ranking, summary
 from px4fuse.webpage.safe import clean, escaped
 
 MOST_GROUPS = 10
@@ -74,9 +75,6 @@ def _summary(logs: Sequence[Log]) -> str:
     if worse:
         entries.append(("Worse than the baseline", f"{worse}"))
     return summary([(name, escaped(value)) for name, value in entries if value])
-
-
-# ------------------------------------------------------------------ honest, and since when
 
 
 def _honesty(logs: Sequence[Log], by: str, names: Mapping[str, str], scale: Scale) -> str:
@@ -190,9 +188,6 @@ def _dates(span: tuple[pd.Timestamp, pd.Timestamp]) -> str:
     )
 
 
-# ------------------------------------------------------------------ what was found, what is missing
-
-
 def _frequent(logs: Sequence[Log]) -> str:
     title = "Findings, most frequent first"
     counts = Counter(finding for log in logs for finding in set(log.findings))
@@ -201,18 +196,13 @@ def _frequent(logs: Sequence[Log]) -> str:
     ordered = sorted(counts.items(), key=lambda item: (-item[1], item[0]))
     most = ordered[0][1]
     judged = sum(log.status != "failed" for log in logs)
-    lines = "".join(
-        f"<li>{bar(count / most)}{picks(f'finding:{finding}', finding_words(finding))}"
+    lines = [
+        f"<li>{bar(count / most)}{picks(f'finding:{finding}', named(finding))}"
         f'<span class="right">{count} ({count / judged:.0%})</span></li>'
-        for finding, count in ordered[:MOST_FINDINGS]
-    )
-    more = len(ordered) - MOST_FINDINGS
-    return card(
-        title,
-        note(f"Of {judged} logs that were read; press one to see its logs."),
-        f'<ol class="ranks">{lines}</ol>',
-        note(f"And {more} others, under Finding below.") if more > 0 else "",
-    )
+        for finding, count in ordered
+    ]
+    said = f"Of {judged} logs that were read; press one to see its logs."
+    return ranking(title, said, lines, MOST_FINDINGS, ", under Finding below")
 
 
 def _worst(logs: Sequence[Log]) -> str:
@@ -235,11 +225,8 @@ def _worst(logs: Sequence[Log]) -> str:
             f"<li>{opens(index, log.name)}<span class='right'>{who} S is "
             f"{overstated_words(log.factors[whose])}</span></li>"
         )
-    return card(
-        title,
-        note("Those in which the variance S of one of the filters is farthest from right."),
-        f'<ol class="ranks">{"".join(lines)}</ol>',
-    )
+    said = "Those in which the variance S of one of the filters is farthest from right."
+    return ranking(title, said, lines, WORST)
 
 
 def _missing(logs: Sequence[Log]) -> str:
@@ -258,7 +245,7 @@ def _missing(logs: Sequence[Log]) -> str:
 
     ordered = sorted(groups.items(), key=rank)
     lines = []
-    for remedy, members in ordered[:MOST_REMEDIES]:
+    for remedy, members in ordered:
         reasons = Counter(reason for _, reason in members if reason)
         said = [clean(reason, 300) for reason, _ in reasons.most_common(MOST_REASONS)]
         rest = f" (and {len(reasons) - len(said)} more)" if len(reasons) > len(said) else ""
@@ -270,9 +257,4 @@ def _missing(logs: Sequence[Log]) -> str:
             f'<p dir="auto"><strong>{escaped(remedy or "No advice.")}</strong></p>'
             f'<p class="note" dir="auto">{escaped(" / ".join(said) + rest)}</p></li>'
         )
-    more = len(ordered) - MOST_REMEDIES
-    return card(
-        title,
-        f'<ol class="ranks">{"".join(lines)}</ol>',
-        note(f"And {more} more, under To set below.") if more > 0 else "",
-    )
+    return ranking(title, "", lines, MOST_REMEDIES, ", under To set below")

@@ -10,10 +10,8 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 import pandas as pd
@@ -25,9 +23,9 @@ from px4fuse.fleet.measures import Aim, Scale
 from px4fuse.fleet.rows import COLUMNS, DONE, FAILED
 from px4fuse.fleet.significance import (
     FALSE_DISCOVERY_RATE,
-    LEAST_DIFFERENCE,
-    LEAST_RATIO,
     corrected,
+    farther,
+    least_difference,
 )
 from px4fuse.plain import number_words
 from px4fuse.reading import size_of
@@ -35,7 +33,6 @@ from px4fuse.reading import size_of
 #: A vehicle's flights tell a range from so many on
 MIN_FLIGHTS = 5
 BETWEEN_CHANGES = "; "
-Number = TypeVar("Number", float, Array)
 
 
 @dataclass(frozen=True)
@@ -61,14 +58,7 @@ class _Column:
 
     @property
     def least(self) -> float:
-        """A smaller difference is none."""
-        if self.scale == "ratio":
-            return float(np.log1p(LEAST_RATIO))
-        return LEAST_DIFFERENCE[self.unit]
-
-    def farther(self, now: Number, before: Number) -> Number:
-        """By how much numbers are farther from what is best."""
-        return now - before if self.aim == "low" else abs(now) - abs(before)
+        return least_difference(self.scale, self.unit)
 
 
 _TRUTH = "ekf2_position_rmse_to_truth_m"
@@ -86,33 +76,6 @@ _COLUMNS = {
 }
 # By what a flight is known, and the flights that it is held against
 _LOG, _VEHICLE = ["log_sha256", "axis"], ["vehicle", "settings", "axis"]
-
-
-@dataclass(frozen=True)
-class _Test:
-    """One number of a row against those of its vehicle's flights, on the column's scale."""
-
-    at: int
-    column: _Column
-    now: float
-    count: int
-    mean: float
-    std: float
-
-    @property
-    def sigma(self) -> float:
-        """Of the next flight's number."""
-        return max(self.std, self.column.least) * math.sqrt(1.0 + 1.0 / self.count)
-
-    @property
-    def words(self) -> str:
-        """The number and its range."""
-        half = float(stdtrit(self.count - 1, 0.975)) * self.sigma
-        now, low, high = map(self.column.words, (self.now, self.mean - half, self.mean + half))
-        return (
-            f"{self.column.label} {now}, {low} to {high} expected from {self.count} flights of "
-            "the vehicle"
-        )
 
 
 @dataclass(frozen=True)
@@ -183,7 +146,8 @@ def marked(table: pd.DataFrame, baseline: pd.DataFrame) -> Marked:
     others = done & ~is_same & table["vehicle"].ne("").to_numpy()
     has_truth = table[_TRUTH].notna().to_numpy()
     worse: dict[int, list[str]] = defaultdict(list)
-    tests: list[_Test] = []
+    tests: list[tuple[int, _Column, float, float, float, float]] = []
+    ps: list[float] = []
     held = np.zeros(len(table), dtype=bool)
     for at in np.flatnonzero(table["status"].eq(FAILED) & _was_done(table, known)):
         worse[int(at)].append("fails, and was compared before")
@@ -191,21 +155,29 @@ def marked(table: pd.DataFrame, baseline: pd.DataFrame) -> Marked:
         # where a truth judges both, how far they are apart is neither good nor bad
         judged = ~has_truth if name == _APART else np.ones(len(table), dtype=bool)
         now, was = column.scaled(table[name]), column.scaled(latest[name].reindex(of_log))
-        for at in np.flatnonzero(judged & is_same & (column.farther(now, was) >= column.least)):
-            said = f"{column.label} {column.words(now[at])}, was {column.words(was[at])}"
-            worse[int(at)].append(said)
+        for at in np.flatnonzero(judged & is_same):
+            if farther(column.aim, now[at], was[at]) >= column.least:
+                said = f"{column.label} {column.words(now[at])}, was {column.words(was[at])}"
+                worse[int(at)].append(said)
         flights = known[_VEHICLE].assign(value=column.scaled(known[name])).groupby(_VEHICLE)
         found = flights["value"].agg(["count", "mean", "std"]).reindex(of_vehicle)
         n, mean, std = found.fillna(0.0).to_numpy().T
         tested = judged & others & (n >= MIN_FLIGHTS) & np.isfinite(now)
         held |= tested
-        tests += [
-            _Test(int(at), column, float(now[at]), int(n[at]), float(mean[at]), float(std[at]))
-            for at in np.flatnonzero(tested)
-        ]
-    for test, q in zip(tests, corrected(_p(tests)), strict=True):
-        if q < FALSE_DISCOVERY_RATE and test.column.farther(test.now, test.mean) > 0.0:
-            worse[test.at].append(test.words)
+        # the next of n normal numbers lies about their mean as Student's t with n - 1 degrees of
+        # freedom, times s √(1 + 1/n)
+        for at in np.flatnonzero(tested):
+            sigma = max(std[at], column.least) * math.sqrt(1.0 + 1.0 / n[at])
+            tests.append((int(at), column, now[at], n[at], mean[at], sigma))
+            ps.append(float(2.0 * stdtr(n[at] - 1, -abs(now[at] - mean[at]) / sigma)))
+    for (row, column, value, count, usual, sigma), q in zip(tests, corrected(ps), strict=True):
+        if q < FALSE_DISCOVERY_RATE and farther(column.aim, value, usual) > 0.0:
+            half = float(stdtrit(count - 1, 0.975)) * sigma
+            said, low, high = map(column.words, (value, usual - half, usual + half))
+            worse[row].append(
+                f"{column.label} {said}, {low} to {high} expected from {count:.0f} flights of the "
+                "vehicle"
+            )
     change = [BETWEEN_CHANGES.join(worse.get(at, ())) for at in range(len(table))]
     same, by_vehicle = (table["log"][rows].nunique() for rows in (is_same, held))
     return Marked(
@@ -220,14 +192,3 @@ def _was_done(table: pd.DataFrame, known: pd.DataFrame) -> pd.Series:
     """Whether the baseline has a log, by its hash or, where there is none, its name."""
     hashes = table["log_sha256"]
     return hashes.isin(known["log_sha256"]) | (hashes.eq("") & table["log"].isin(known["log"]))
-
-
-def _p(tests: Sequence[_Test]) -> list[float]:
-    """Two-sided p-values of numbers among their vehicle's.
-
-    The next of n normal numbers lies about their mean as Student's t with n - 1 degrees of freedom,
-    times s √(1 + 1/n).
-    """
-    t = np.array([abs(test.now - test.mean) / test.sigma for test in tests])
-    freedom = np.array([test.count - 1 for test in tests])
-    return [float(p) for p in 2.0 * stdtr(freedom, -t)]

@@ -64,10 +64,6 @@ def rows_of(found: ComparisonResults) -> list[Row]:
     A factor says how many times S is overstated (above 1) or understated (below 1), as
     ``variance_factor`` in the results. SIGMA_Z and SIGMA_A are what the data ask for, north and
     east together. The clock offset is there where it is determinable.
-
-    Parameters
-    ----------
-    found : ComparisonResults
     """
     common = log_columns(found.log) | {
         "px4fuse": found.provenance.px4fuse,
@@ -186,7 +182,7 @@ def _held(value: Any) -> Any:
 
 
 def csv_bytes(table: pd.DataFrame) -> bytes:
-    """The table for Excel and LibreOffice, in which no text of a log comes to life as a formula."""
+    """The table for Excel and LibreOffice, in which no text of a log acts as a formula."""
     texts = {name: table[name].map(neutral) for name, kind in COLUMNS.items() if kind == "str"}
     text = table.assign(**texts).to_csv(index=False, lineterminator="\r\n", float_format="%.10g")
     return ("\ufeff" + text).encode()

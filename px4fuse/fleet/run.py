@@ -38,10 +38,6 @@ _GOES_ON = "What is done is kept: the same command goes on from there."
 Progress = Callable[[str, int, int], None]
 
 
-def _silent(what: str, done: int, of: int) -> None:
-    """Progress that nobody watches."""
-
-
 @dataclass(frozen=True)
 class Fleet:
     """What came of many logs.
@@ -54,7 +50,6 @@ class Fleet:
         How many logs an earlier run has compared.
     severities : frozenset of str
         Of all findings.
-    written : tuple of Path
     against : str
         What the logs were held against; empty without a baseline.
     """
@@ -89,7 +84,7 @@ def batch(
     scheduler: str | None = None,
     workers: int | None = None,
     memory: str = "auto",
-    progress: Progress = _silent,
+    progress: Progress = lambda what, done, of: None,
     **settings: Any,
 ) -> pd.DataFrame:
     """Compare many logs, on this computer or a Dask cluster.
@@ -181,7 +176,7 @@ def run(
     reports: bool = False,
     timeout_s: float = TIMEOUT_S,
     baseline: pd.DataFrame | None = None,
-    progress: Progress = _silent,
+    progress: Progress = lambda what, done, of: None,
 ) -> Fleet:
     """Compare logs on a cluster, and write rows, results and the table into a folder.
 
@@ -190,16 +185,12 @@ def run(
 
     Parameters
     ----------
-    logs : sequence of FoundLog
     output : Path
         Folder.
     request : ComparisonRequest
         Its settings count for every log.
-    client : Client
-    reports : bool
     timeout_s : float
         For one log.
-    baseline : DataFrame, optional
     progress : callable
         As :func:`batch`.
 

@@ -41,8 +41,6 @@ class Side:
     ----------
     given : str
         Name of the file.
-    kind : {"log", "report", "results"}
-    results : ComparisonResults
     analysis : Analysis or None
         Where the log is at hand.
     """

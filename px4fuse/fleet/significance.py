@@ -13,12 +13,12 @@ import pandas as pd
 from scipy.special import ndtr
 from scipy.stats import false_discovery_control
 
-from px4fuse.fleet.measures import Z95, Bounds, Number
+from px4fuse.fleet.measures import Z95, Aim, Bounds, Number, Scale
 
 #: Of what is called significant, this share is expected to be chance
 FALSE_DISCOVERY_RATE = 0.05
 SPREAD_TABLE = "spread.csv"
-# Between two settings of one flight a smaller difference is none: of a ratio, and by unit
+# Two settings of one flight that differ by less are the same: of a ratio, and by unit
 LEAST_RATIO = 0.01
 LEAST_DIFFERENCE = {"": 0.001, "m": 0.001, "s": 0.001, "°": 0.1}
 
@@ -66,7 +66,6 @@ def contrast(a: Number, b: Number, spread: float = 0.0) -> Contrast | None:
 
     Parameters
     ----------
-    a, b : Number
     spread : float
         Standard deviation, on their scale, by which one number of two flights with the same
         equipment varies beyond its own interval.
@@ -81,14 +80,14 @@ def contrast(a: Number, b: Number, spread: float = 0.0) -> Contrast | None:
         return None
     x, y = (float(np.log(n.value)) if ratio else n.value for n in (a, b))
     delta = y - x
-    distance = {"low": delta, "one": abs(y) - abs(x), "zero": abs(y) - abs(x), "": 0.0}
+    nearer = farther(a.aim, y, x)
     reach_a, reach_b = (_reach(n, at, spread) for n, at in ((a, x), (b, y)))
     if reach_a is None or reach_b is None:
-        return Contrast(delta, None, None, distance[a.aim])
+        return Contrast(delta, None, None, nearer)
     below = float(np.hypot(reach_b[0], reach_a[1]))
     above = float(np.hypot(reach_b[1], reach_a[0]))
     half = below if delta > 0.0 else above
-    return Contrast(delta, half, (delta - below, delta + above), distance[a.aim])
+    return Contrast(delta, half, (delta - below, delta + above), nearer)
 
 
 def _reach(number: Number, at: float, spread: float) -> Bounds | None:
@@ -115,11 +114,16 @@ def corrected(p: Sequence[float]) -> list[float]:
     return [float(q) for q in false_discovery_control(p)] if p else []
 
 
-def differs(delta: float, number: Number) -> bool:
-    """Whether two numbers of one flight differ by enough to be told."""
-    if number.scale == "ratio":
-        return abs(delta) >= math.log1p(LEAST_RATIO)
-    return abs(delta) >= LEAST_DIFFERENCE[number.unit]
+def least_difference(scale: Scale, unit: str) -> float:
+    """Two numbers of one flight that differ by less are the same, on their scale."""
+    return math.log1p(LEAST_RATIO) if scale == "ratio" else LEAST_DIFFERENCE[unit]
+
+
+def farther(aim: Aim, now: float, before: float) -> float:
+    """By how much a number is farther from what is best, on its scale; 0 where nothing is."""
+    if aim == "":
+        return 0.0
+    return now - before if aim == "low" else abs(now) - abs(before)
 
 
 @cache

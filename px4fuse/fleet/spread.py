@@ -69,13 +69,7 @@ CHANGES = (
 
 
 def fly(change: Change, seed: int) -> tuple[Told, Told]:
-    """Numbers of one simulated flight: with the log at hand, and from its results alone.
-
-    Parameters
-    ----------
-    change : Change
-    seed : int
-    """
+    """Numbers of one simulated flight: with the log at hand, and from its results alone."""
     scenario = Scenario(passes=change.passes, sigma_uwb_m=change.sigma_uwb_m, seed=seed)
     flight = simulate_flight(scenario, parse(change.mistakes))
     analysis = explain(compare(flight, SETTINGS))
@@ -160,12 +154,6 @@ def rates(
             }
         )
     return rows
-
-
-def measured_rates() -> pd.DataFrame:
-    """The table that ships with the package."""
-    with files("px4fuse.fleet").joinpath(RATES_TABLE).open(encoding="utf-8") as file:
-        return pd.read_csv(file, keep_default_na=False)
 
 
 def _main() -> None:

@@ -25,11 +25,6 @@ class Store:
     """Rows by the hash of their log, of one px4fuse and one set of settings.
 
     A row is there as a whole or not at all, whatever ends the run.
-
-    Attributes
-    ----------
-    connection : sqlite3.Connection
-    px4fuse, settings : str
     """
 
     connection: sqlite3.Connection

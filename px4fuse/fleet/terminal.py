@@ -5,6 +5,7 @@ from __future__ import annotations
 from rich.console import Console
 from rich.text import Text
 
+from px4fuse.findings import named
 from px4fuse.fleet.rows import BETWEEN_FINDINGS, FAILED
 from px4fuse.fleet.run import Fleet
 from px4fuse.plain import factor_words
@@ -47,7 +48,7 @@ def print_fleet(console: Console, fleet: Fleet) -> None:
         say(console, Text("factor: median of how many times S is overstated (above 1)", "dim"))
     found = logs["findings"].str.split(BETWEEN_FINDINGS).explode()
     for finding, count in found[found != ""].value_counts().head(SHOWN).items():
-        say(console, f"{count} × {finding}")
+        say(console, f"{count} × {named(str(finding))}")
     worse = fleet.table[fleet.table["change"] != ""]
     for row in worse.head(SHOWN).itertuples():
         say(console, Text(f"worse: {row.log} {row.axis}: {row.change}", "red"))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 
 from px4fuse.comparison.events import happened
+from px4fuse.findings import named
 from px4fuse.fleet.measures import BOOTSTRAP, CHI_SQUARE, LIKELIHOOD, WILSON, Number
 from px4fuse.fleet.sides import Side
 from px4fuse.fleet.significance import FALSE_DISCOVERY_RATE, LEAST_RATIO
@@ -45,12 +46,8 @@ def why(change: NumberChange, a: Number, b: Number) -> str:
         return f"{text}; {words} than chance ({chance_words(change)}; {methods})."
     if change.change is None:
         return f"{text}; no test where one is 0."
-    return f"{text}; not tested, {_lacking(a, b)}."
-
-
-def _lacking(a: Number, b: Number) -> str:
-    names = [name for name, number in (("A", a), ("B", b)) if number.interval is None]
-    return f"no interval for {' and '.join(names)}"
+    lacking = " and ".join(name for name, one in (("A", a), ("B", b)) if one.interval is None)
+    return f"{text}; not tested, no interval for {lacking}."
 
 
 def texts(a: Side, b: Side, *, paired: bool) -> Iterator[TextChange]:
@@ -135,9 +132,9 @@ def summary(found: ChangeResults) -> tuple[str, ...]:
     if first is not None:
         said.append(f"The first of them: {first.label}, {first.why}")
     for only_in, word in (("B", "New"), ("A", "Gone")):
-        ids = dict.fromkeys(f.id for f in found.findings if f.only_in == only_in)
-        if ids:
-            said.append(f"{word} findings: {', '.join(ids)}.")
+        those = dict.fromkeys(named(f.id) for f in found.findings if f.only_in == only_in)
+        if those:
+            said.append(f"{word} findings: {', '.join(those)}.")
     if found.texts:
         said.append(f"Not the same: {', '.join(text.what for text in found.texts)}.")
     return tuple(said)
@@ -174,14 +171,11 @@ def notes(a: Side, b: Side, *, paired: bool) -> Iterator[str]:
     else:
         if lacking:
             yield f"RMSE is not tested without the logs. Give {logs}."
-        if _filter_settings(a.results) != _filter_settings(b.results):
+        one, other = (side.results.settings for side in (a, b))
+        if any(getattr(one, name) != getattr(other, name) for name in _SETTINGS):
             yield (
                 "The filter's settings are not the same, so numbers of ours differ by them too, "
                 "not by the flights alone."
             )
     if lacking:
         yield f"Tracks and innovations are drawn from the logs. Give {logs}."
-
-
-def _filter_settings(found: ComparisonResults) -> tuple[object, ...]:
-    return tuple(getattr(found.settings, name) for name in _SETTINGS)

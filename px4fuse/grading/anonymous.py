@@ -16,7 +16,7 @@ NAME = "[name]"
 
 
 class Veil:
-    """What is put in place of names; nothing where nobody has a pseudonym.
+    """What replaces names; nothing where nobody has a pseudonym.
 
     A full name, an id and a file's name become the pseudonym, single words of names
     :data:`NAME`, also where they mean something else: too much is hidden rather than too little.

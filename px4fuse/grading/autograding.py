@@ -1,49 +1,141 @@
-"""The autograder that :mod:`px4fuse.grading.gradescope` describes: written here, run there."""
+"""The autograder that Gradescope runs: written here, run there; see px4fuse.grading.gradescope."""
 
 from __future__ import annotations
 
+import base64
+import hashlib
 import json
 import platform
+import re
 import tempfile
 import time
 from collections.abc import Sequence
 from dataclasses import replace
+from importlib import metadata
+from importlib.resources import files
+from importlib.resources.abc import Traversable
 from pathlib import Path
 
 from px4fuse.assignment.key import key_text, read_key
 from px4fuse.errors import SettingsError
 from px4fuse.grading.entries import Term, class_entries
+from px4fuse.grading.feedback import returned_text
 from px4fuse.grading.grade import grade_all
-from px4fuse.grading.gradescope import autograder, results, submission_metadata
+from px4fuse.grading.gradescope import results, submission_metadata
 from px4fuse.grading.lateness import LateRule
 from px4fuse.grading.model import Entry
 from px4fuse.grading.platforms import Origin
-from px4fuse.grading.returned import returned_text
 from px4fuse.grading.roster import Register, people_of_key
 from px4fuse.grading.rubric import read_rubric, rubric_text
 from px4fuse.grading.submissions import collect
-from px4fuse.reading import files_by_sha256
+from px4fuse.grading.zipping import zipped
+from px4fuse.reading import files_by_sha256, read_log_bytes
 from px4fuse.writing import write_all
+
+SETUP = """#!/usr/bin/env bash
+# Run once, when the autograder is uploaded: a Python of its own, with the versions of the machine
+# that wrote this, so that the numbers and pages are the same to the last digit.
+set -euo pipefail
+apt-get update
+apt-get install -y python3-venv
+python3 -m venv /opt/uv
+/opt/uv/bin/pip install uv
+/opt/uv/bin/uv venv --python {python} /opt/px4fuse
+/opt/uv/bin/uv pip install --python /opt/px4fuse/bin/python \\
+    --constraint /autograder/source/constraints.txt "/autograder/source/{wheel}[grade]"
+"""
+RUN = """#!/usr/bin/env bash
+# Run for every submission: its PDF is read within bounds, and nothing in it is executed.
+exec /opt/px4fuse/bin/px4fuse grade --gradescope /autograder{options}
+"""
+EXECUTABLE = ("setup.sh", "run_autograder")
 
 
 def autograder_zip(
     logs: Sequence[Path], rubric: Path | None, key: Path | None, late: LateRule | None
 ) -> bytes:
-    """The zip file to upload; see :func:`px4fuse.grading.gradescope.autograder`.
+    """The zip file to upload under "Configure Autograder", for an assignment of one PDF.
+
+    It holds px4fuse as it is installed here, the versions of what it needs, the logs, the rubric
+    and the answer key, which students never see: nothing of theirs is executed.
 
     Raises
     ------
     SettingsError
         No log was given, or rubric or key are not what they should be.
+    LogError
+        A log cannot be read.
     """
-    files = list(files_by_sha256(logs).values())
-    if not files:
+    paths = files_by_sha256(logs).values()
+    if not paths:
         raise SettingsError("--write-autograder: give the flight logs with --logs.")
     read_rubric(rubric)
-    said = rubric_text() if rubric is None else rubric.read_text(encoding="utf-8-sig")
-    answers = None if key is None else key_text(read_key(key))
+    text = rubric_text() if rubric is None else rubric.read_text(encoding="utf-8-sig")
     python = ".".join(platform.python_version_tuple()[:2])
-    return autograder(files, said, answers, late, python)
+    name, wheel = _wheel()
+    options = f' --late "{late.text}"' if late else ""
+    contents = {
+        "setup.sh": SETUP.format(wheel=name, python=python).encode(),
+        "run_autograder": RUN.format(options=options).encode(),
+        name: wheel,
+        "constraints.txt": _constraints().encode(),
+        "rubric.toml": text.encode(),
+        **({} if key is None else {"key.json": key_text(read_key(key)).encode()}),
+    }
+    for number, path in enumerate(paths):
+        contents[f"logs/{number}{path.suffix}"] = read_log_bytes(path)
+    return zipped(contents, EXECUTABLE)
+
+
+def _constraints() -> str:
+    """The versions of what px4fuse needs, as they are here: the last digits depend on them."""
+    lines = set()
+    for text in metadata.requires("px4fuse") or ():
+        name = re.match(r"[\w.-]+", text)
+        if name is None or "extra == 'test'" in text:
+            continue
+        try:
+            lines.add(f"{name[0]}=={metadata.version(name[0])}")
+        except metadata.PackageNotFoundError:  # an extra that is not installed here
+            continue
+    return "\n".join(sorted(lines)) + "\n"
+
+
+def _wheel() -> tuple[str, bytes]:
+    """px4fuse as it is installed here, as a wheel (PEP 427)."""
+    version = metadata.version("px4fuse")
+    info = f"px4fuse-{version}.dist-info"
+    contents = dict(_package("px4fuse", files("px4fuse")))
+    about = metadata.distribution("px4fuse").read_text("METADATA") or (
+        metadata.distribution("px4fuse").read_text("PKG-INFO") or ""
+    )
+    contents |= {
+        f"{info}/METADATA": about.encode(),
+        f"{info}/WHEEL": b"Wheel-Version: 1.0\nGenerator: px4fuse\nRoot-Is-Purelib: true\n"
+        b"Tag: py3-none-any\n",
+        f"{info}/entry_points.txt": b"[console_scripts]\npx4fuse = px4fuse.cli:main\n",
+    }
+    lines = [
+        f"{name},sha256={_digest(content)},{len(content)}" for name, content in contents.items()
+    ]
+    record = "\n".join([*lines, f"{info}/RECORD,,"]) + "\n"
+    return f"px4fuse-{version}-py3-none-any.whl", zipped(
+        contents | {f"{info}/RECORD": record.encode()}
+    )
+
+
+def _digest(content: bytes) -> str:
+    return base64.urlsafe_b64encode(hashlib.sha256(content).digest()).rstrip(b"=").decode()
+
+
+def _package(name: str, folder: Traversable) -> list[tuple[str, bytes]]:
+    found = []
+    for one in sorted(folder.iterdir(), key=lambda each: each.name):
+        if one.is_dir() and one.name != "__pycache__":
+            found += _package(f"{name}/{one.name}", one)
+        elif one.is_file() and not one.name.endswith(".pyc"):
+            found.append((f"{name}/{one.name}", one.read_bytes()))
+    return found
 
 
 def run_autograder(folder: Path, late: LateRule | None) -> None:
@@ -53,7 +145,6 @@ def run_autograder(folder: Path, late: LateRule | None) -> None:
     ----------
     folder : Path
         ``/autograder``, with ``source``, ``submission`` and ``submission_metadata.json``.
-    late : LateRule, optional
 
     Raises
     ------

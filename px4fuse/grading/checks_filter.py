@@ -48,7 +48,7 @@ def _tuned(evidence: Evidence, axis: str, name: str, factor: float) -> tuple[flo
         return 0.0, f"Your report has no interval for {label}{why}"
     low, high = interval
     above = chosen / high if high > 0.0 else math.inf
-    # small innovations are no reason to trust a source that drifts
+    # small innovations do not make a drifting source trustworthy
     off = max(1.0 if chosen > high and drifts(evidence) else above, low / chosen, 1.0)
     said = f"your {label} {chosen:.3g} {unit} is"
     wanted = f"what the data ask for ({low:.3g} to {high:.3g} {unit})"
@@ -78,31 +78,31 @@ def consistent(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float, str
         verdict, factor = judged.verdict, judged.variance_factor
         off = max(factor, 1.0 / factor)
         good = verdict == "consistent"
-        # small innovations are no reason to trust a source that drifts
+        # small innovations do not make a drifting source trustworthy
         excused = "overstated" in verdict and drifts(evidence)
         gone = given["factor"] <= off or given["factor"] <= 1.0
         # no noise explains outliers, and none should be made to
         outliers = "understated" in verdict and evidence.has("source_outliers")
         explained = outliers and evidence.claims_that("source_outliers")
         handed = not explained and _nothing_more(evidence)
-        shares.append(
-            1.0
-            if good or explained or excused or handed
-            else 0.0
-            if gone
-            else 1.0 - math.log(off) / math.log(given["factor"])
+        if good or explained or excused or handed:
+            shares.append(1.0)
+        else:
+            shares.append(0.0 if gone else 1.0 - math.log(off) / math.log(given["factor"]))
+        causes = (
+            (explained, ", because of outliers that no setting fixes, as your notes say"),
+            (outliers, ", because of outliers that no setting fixes; your notes should say so"),
+            (excused, ", as it may be against a source that may drift"),
+            (
+                handed,
+                ", because of what is wrong with the log that you were given, as your notes say",
+            ),
+            (
+                True,
+                ": look at what the tuning page asks for, and for what the model does not explain",
+            ),
         )
-        because = (
-            ", because of outliers that no setting fixes, as your notes say"
-            if explained
-            else ", because of outliers that no setting fixes; your notes should say so"
-            if outliers
-            else ", as it may be against a source that may drift"
-            if excused
-            else ", because of what is wrong with the log that you were given, as your notes say"
-            if handed
-            else ": look at what the tuning page asks for, and for what the model does not explain"
-        )
+        because = next(text for holds, text in causes if holds)
         said.append(
             f"{owner} is consistent ({axis})"
             if good

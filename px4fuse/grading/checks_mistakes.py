@@ -63,7 +63,7 @@ def _nothing_wrong(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float,
 
 
 def _applied(evidence: Evidence, answer: Answer) -> bool:
-    """Whether the clock offset was mended, so that it is no longer a finding."""
+    """Whether the clock offset was corrected, so that it is no longer a finding."""
     comparison = evidence.comparison
     applied = 0.0 if comparison is None else comparison.settings.clock_offset_s
     asked = answer.truth.get("clock_offset_to_add_s", 0.0)

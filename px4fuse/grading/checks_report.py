@@ -9,20 +9,29 @@ from px4fuse.grading.claims import in_words
 from px4fuse.grading.evidence import (
     Evidence,
     also_named,
-    is_number,
     list_words,
     reason_of,
     text_of,
     values_at,
     why_absent,
 )
-from px4fuse.grading.names import part
 from px4fuse.results.contract import LoopResults
 from px4fuse.verification.model import Verdict
-from px4fuse.verification.verification import NO_LOG
+from px4fuse.verification.verification import NO_LOG, is_number
 
-# Findings about a recording that are no question to whoever was handed the log
+# Findings about a recording, for which a student who was given the log cannot be asked
 NOT_ASKED = frozenset(("log_damaged", "samples_dropped", "source_samples_lost"))
+# What places in the results are called that the default rubric asks for
+PARTS: Mapping[str, str] = {
+    "axes.*.kf": "the consistency of the filter",
+    "clock": "the clock offset",
+    "loop.closure_error_m": "the closure error",
+    "loop.path_length_m": "the length of the path",
+    "loop.corrections": "the corrected paths",
+    "tuning": "the noises that the data ask for",
+    "tuning.horizontal.held_out.gain_nats": "what tuning would still gain",
+    "why": "why EKF2 differs",
+}
 
 
 def verified(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float, str]:
@@ -77,7 +86,7 @@ def sections(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float, str]:
     for path in given["results"]:
         there = [value for _, value in values_at(evidence.plain, path)]
         if not any(v for v in there if not (isinstance(v, dict) and set(v) == {"unavailable"})):
-            missing.append(f"{part(path)}{why_absent(evidence, path)}")
+            missing.append(f"{PARTS.get(path, path)}{why_absent(evidence, path)}")
     asked = len(given["pages"]) + len(given["results"])
     if not missing:
         return 1.0, f"Your report has all {asked} parts that were asked for."
@@ -138,7 +147,7 @@ def findings(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float, str]:
             if named
             else f"Your report has {left}; say in your notes what you looked at to be sure."
         )
-    # whoever names what a cause brings with it has seen it too
+    # a student who names the effect of a cause has seen it too
     missing = [name for name, one in asked.items() if not any(map(evidence.names, one.ids))]
     wrong = evidence.charged
     share = 1.0 - (len(missing) + len(wrong)) / max(len(asked), 1)
@@ -166,7 +175,8 @@ def number_between(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float,
     label = given["name"]
     if not found:
         why = next((why for path in given["path"] if (why := why_absent(evidence, path))), "")
-        return 0.0, f"Your report has no number for {label or part(given['path'][0])}{why}."
+        first = given["path"][0]
+        return 0.0, f"Your report has no number for {label or PARTS.get(first, first)}{why}."
     # of several the one that is worst counts
     name, number = min(found, key=lambda pair: _within(pair[1], given))
     share = _within(number, given)

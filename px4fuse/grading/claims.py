@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 
+from px4fuse.findings import named
 from px4fuse.findings.causes import CONSEQUENCES
-from px4fuse.grading.names import named
 from px4fuse.grading.notes import Mention
 
 # In the words of the rubric: what names a subject rather than a mistake
@@ -20,6 +20,18 @@ _BRINGS: Mapping[str, tuple[str, ...]] = {
 # Told with an offset of the clock where both are there, but never its effect
 _OF_ITS_OWN = frozenset(("source_stamps_of_arrival",))
 
+_CONSEQUENCES = {
+    cause: {one.partition(":")[0] for one in listed} for cause, listed in CONSEQUENCES.items()
+}
+_EFFECTS = {
+    cause: {*_CONSEQUENCES.get(cause, ()), *_BRINGS.get(cause, ())}
+    for cause in (*_CONSEQUENCES, *_BRINGS)
+}
+_CAUSES = {
+    effect: {cause for cause, listed in _CONSEQUENCES.items() if effect in listed}
+    for effect in set().union(*_CONSEQUENCES.values())
+}
+
 
 @dataclass(frozen=True)
 class Claims:
@@ -30,13 +42,13 @@ class Claims:
     right : frozenset of str
         Findings that are there and claimed plainly.
     unsure : mapping of str to str
-        Findings that are there and touched upon, with the passage.
+        Findings that are there and mentioned, with the passage.
     open : mapping of str to str
         Findings that are there, with a passage that may claim or deny them.
     wrong : mapping of str to str
         Findings that are not there and are claimed plainly, with the passage: one per kind.
     unsure_wrong : mapping of str to str
-        Findings that are not there and touched upon, with the passage.
+        Findings that are not there and mentioned, with the passage.
     """
 
     right: frozenset[str]
@@ -105,41 +117,22 @@ def claims_of(
 
 
 def entailed(findings: Collection[str]) -> frozenset[str]:
-    """Findings with what they bring with them, as far as that is no mistake of its own."""
-    brought: frozenset[str] = frozenset().union(
-        *(_reached(start, _followers) for start in findings)
-    )
-    return frozenset(findings) | (brought - _OF_ITS_OWN)
+    """Findings with what they bring with them, as far as that is not a mistake of its own."""
+    return frozenset(findings) | (_reached(findings, _EFFECTS) - _OF_ITS_OWN)
 
 
 def family(findings: Collection[str]) -> frozenset[str]:
     """Findings with what they bring with them and what brings them."""
-    found = set(findings)
-    for start in findings:
-        found |= _reached(start, _followers) | _reached(start, _causes)
-    return frozenset(found)
+    return _reached(findings, _EFFECTS) | _reached(findings, _CAUSES)
 
 
-def _reached(start: str, step: Callable[[str], Collection[str]]) -> set[str]:
-    found, left = {start}, [start]
+def _reached(starts: Collection[str], leads: Mapping[str, Collection[str]]) -> frozenset[str]:
+    found, left = set(starts), list(starts)
     while left:
-        for one in step(left.pop()):
-            if one not in found:
-                found.add(one)
-                left.append(one)
-    return found
-
-
-def _followers(finding: str) -> Collection[str]:
-    listed = (*CONSEQUENCES.get(finding, ()), *_BRINGS.get(finding, ()))
-    return {one.partition(":")[0] for one in listed}
-
-
-def _causes(finding: str) -> Collection[str]:
-    return {
-        cause for cause, listed in CONSEQUENCES.items()
-        if finding in {one.partition(":")[0] for one in listed}
-    }  # fmt: skip
+        new = set(leads.get(left.pop(), ())) - found
+        found |= new
+        left += new
+    return frozenset(found)
 
 
 def in_words(findings: Collection[str]) -> list[str]:

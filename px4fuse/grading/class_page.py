@@ -1,6 +1,6 @@
 """A class as one web page: a student per row, and on top what an instructor asks.
 
-Nothing that a student wrote comes to life: see :mod:`px4fuse.webpage`. Pictures of redrawn pages
+Nothing that a student wrote can act: see :mod:`px4fuse.webpage`. Pictures of redrawn pages
 and PDFs stand in folders beside the page and are loaded as they are unfolded.
 """
 
@@ -12,15 +12,13 @@ import posixpath
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import get_args
 
 from px4fuse.grading.anonymous import Veil
 from px4fuse.grading.class_questions import Copied, above
-from px4fuse.grading.class_table import distinct, item_points, number
+from px4fuse.grading.class_table import item_points, number, settled_report
 from px4fuse.grading.flags import copied_notes
 from px4fuse.grading.model import Entry, Graded, Override
 from px4fuse.grading.passages import shared_passages
-from px4fuse.verification.model import Status
 from px4fuse.webpage.frame import (
     Cell,
     Column,
@@ -40,23 +38,16 @@ from px4fuse.webpage.frame import (
 from px4fuse.webpage.safe import local_link
 
 MISSING = "nothing handed in"
-STATUSES: tuple[str, ...] = (*get_args(Status), "page differs", MISSING)
-LOOKS = {
-    "verified": "good",
-    "numbers differ": "bad",
-    "other log": "odd",
-    "cannot verify": "open",
-    "page differs": "odd",
-    MISSING: "open",
+# How each status looks, and its sign, from the best to what says nothing
+LOOKS: dict[str, tuple[str, str]] = {
+    "verified": ("good", "✓"),
+    "numbers differ": ("bad", "≠"),
+    "other log": ("odd", "⇄"),
+    "cannot verify": ("open", "?"),
+    "page differs": ("odd", "≠"),
+    MISSING: ("open", "–"),
 }
-SIGNS = {
-    "verified": "✓",
-    "numbers differ": "≠",
-    "other log": "⇄",
-    "cannot verify": "?",
-    "page differs": "≠",
-    MISSING: "–",
-}
+STATUSES = tuple(LOOKS)
 # Of one submission, on the page; all of it stands in the report
 MAX_DIFFERENCES = 50
 MAX_COPIES = 3
@@ -64,10 +55,7 @@ PNG = b"\x89PNG\r\n\x1a\n"
 # Reading time: words a minute of notes in a language that may be the reader's second, and of a page
 WORDS_PER_MINUTE = 200.0
 MINUTES_PER_PAGE = 0.5
-SHOWN = (
-    "verified", "numbers differ", "other log", "cannot verify", "page differs", MISSING, "pending",
-    "to read", "flagged", "late", "said by you",
-)  # fmt: skip
+SHOWN = (*STATUSES, "pending", "to read", "flagged", "late", "said by you")
 
 
 def html_text(entries: Sequence[Entry], title: str, made_with: str) -> str:
@@ -77,7 +65,6 @@ def html_text(entries: Sequence[Entry], title: str, made_with: str) -> str:
     ----------
     entries : sequence of Entry
         One per student. Where they have pseudonyms, no name, id or file's name is on the page.
-    title : str
     made_with : str
         Name and version of the program.
 
@@ -122,10 +109,7 @@ def html_text(entries: Sequence[Entry], title: str, made_with: str) -> str:
             for at, entry in enumerate(entries)
         ],
         filters=_filters(entries),
-        groups=(
-            ("items", "Points of each item", False),
-            ("numbers", "Numbers", False),
-        ),
+        groups=(("items", "Points of each item"), ("numbers", "Numbers")),
         placeholder="name, id, file, flag",
         otherwise="All rows are in class.csv.",
     )
@@ -146,9 +130,6 @@ def _copied(entries: Sequence[Entry]) -> dict[int, list[Copied]]:
         for mine, theirs in ((first, second), (second, first)):
             found.setdefault(places[mine], []).append((share, places[theirs]))
     return {at: sorted(others, key=lambda o: (-o[0], o[1])) for at, others in found.items()}
-
-
-# ------------------------------------------------------------------ rows
 
 
 def status_of(entry: Entry) -> str:
@@ -197,15 +178,16 @@ def _row(entry: Entry, layout: _Layout, veil: Veil, minutes: float, alike: tuple
     flags = [*entry.remarks, *(one.flags if one else ())]
     known = entry.pseudonym or entry.student
     file = one.submission[layout.shared :] if one and not entry.pseudonym else ""
-    points = overridden_points(entry)
+    settled = settled_report(entry)
+    points = item_points(settled) if settled else {}
+    look, sign = LOOKS[status]
+    few = f"{len(flags)} flag{'s' if len(flags) > 1 else ''}" if flags else ""
     cells = (
         Cell(entry.called, known or None, file),
         *[words("" if entry.pseudonym else entry.student_id)] * layout.named,
-        Cell(
-            f"{SIGNS[status]} {status}", float(STATUSES.index(status)), _few(flags), LOOKS[status]
-        ),
+        Cell(f"{sign} {status}", float(STATUSES.index(status)), few, look),
         _points(entry),
-        *[Cell(entry.handed_in, entry.handed_in or None, late_words(entry))] * layout.timed,
+        *[words(entry.handed_in, late_words(entry))] * layout.timed,
         figure(minutes or None, f"{math.ceil(minutes)}"),
         Cell("\n".join(map(veil.hide, flags)), float(len(flags)), "", "flags"),
         *(figure(points.get(title)) for title in layout.items),
@@ -213,10 +195,6 @@ def _row(entry: Entry, layout: _Layout, veil: Veil, minutes: float, alike: tuple
     )
     beside = _beside(entry, one, veil) if one else ()
     return Row(cells, tuple(_tags(entry)), _details(entry, veil, alike), beside)
-
-
-def _few(flags: Sequence[str]) -> str:
-    return f"{len(flags)} flag{'s' if len(flags) > 1 else ''}" if flags else ""
 
 
 def _points(entry: Entry) -> Cell:
@@ -232,13 +210,6 @@ def _points(entry: Entry) -> Cell:
     return Cell(text, entry.total, ", ".join(said), "", share)
 
 
-def overridden_points(entry: Entry) -> dict[str, float]:
-    """Points by item, as the instructor says where they do."""
-    points = item_points(entry.counting) if entry.counting else {}
-    said = {title: each.points for title, each in entry.overrides.items() if title in points}
-    return points | {title: value for title, value in said.items() if value is not None}
-
-
 def late_words(entry: Entry) -> str:
     """How late it came.
 
@@ -251,9 +222,6 @@ def late_words(entry: Entry) -> str:
         if entry.late_s >= (2.0 if unit == "days" else 1.0) * size:
             return f"{entry.late_s / size:.0f} {unit} late"
     return f"{math.ceil(entry.late_s / 60.0)} min late"
-
-
-# ------------------------------------------------------------------ what a row unfolds to
 
 
 def _details(entry: Entry, veil: Veil, alike: tuple[Part, ...]) -> tuple[Part, ...]:
@@ -336,7 +304,7 @@ def _facts(entry: Entry, one: Graded) -> list[tuple[str, str]]:
 
 def _item_table(entry: Entry, one: Graded, veil: Veil) -> Part:
     rows = []
-    for title, item in zip(distinct(item.title for item in one.items), one.items, strict=True):
+    for title, item in zip(item_points(one), one.items, strict=True):
         said = entry.overrides.get(title, Override())
         own = "" if said.points is None else f"You: {number(item.points)} → {number(said.points)}. "
         comment = f"{own}{said.comment} {item.comment}" if own or said.comment else item.comment

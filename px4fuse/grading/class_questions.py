@@ -7,10 +7,11 @@ from collections import defaultdict
 from collections.abc import Mapping, Sequence
 
 from px4fuse.grading.anonymous import Veil
-from px4fuse.grading.class_table import distinct, number
+from px4fuse.grading.class_table import item_points, number, settled_report
 from px4fuse.grading.model import Entry
+from px4fuse.plain import few_words
 from px4fuse.webpage.charts import bar, bins, histogram
-from px4fuse.webpage.frame import card, note, opens, picks, summary
+from px4fuse.webpage.frame import card, note, opens, picks, ranking, summary
 from px4fuse.webpage.safe import escaped
 
 # How alike the notes are, and the place of the other entry
@@ -70,13 +71,11 @@ def _items(entries: Sequence[Entry], veil: Veil) -> str:
     points: dict[str, list[float]] = defaultdict(list)
     most: dict[str, float] = {}
     for entry in entries:
-        one = entry.counting
+        one = settled_report(entry)
         if one is None or one.pending:
             continue
-        for title, item in zip(distinct(i.title for i in one.items), one.items, strict=True):
-            said = entry.overrides.get(title)
-            value = item.points if said is None or said.points is None else said.points
-            points[title].append(value)
+        for title, item in zip(item_points(one), one.items, strict=True):
+            points[title].append(item.points)
             most[title] = max(item.of, most.get(title, 0.0))
     if not points:
         return ""
@@ -117,18 +116,14 @@ def _mistakes(entries: Sequence[Entry]) -> str:
     ):
         named = sum(was for _, was in those)
         missed = [opens(at, entries[at].called) for at, was in those if not was]
-        more = f" and {len(missed) - MOST_NAMES} more" if len(missed) > MOST_NAMES else ""
-        by = f"<p>Not named by {', '.join(missed[:MOST_NAMES])}{more}.</p>" if missed else ""
+        by = f"<p>Not named by {few_words(missed, MOST_NAMES)}.</p>" if missed else ""
         said = picks(f"missed:{mistake}", mistake) if missed else f"<span>{escaped(mistake)}</span>"
         lines.append(
             f"<li>{bar(named / len(those))}{said}"
             f"<span class='right'>{named} of {len(those)} named it</span>{by}</li>"
         )
-    return card(
-        "Who missed which mistake",
-        note("Of the students whose flight has it, by the answer key; hardest first."),
-        f'<ol class="ranks">{"".join(lines)}</ol>',
-    )
+    said = "Of the students whose flight has it, by the answer key; hardest first."
+    return ranking("Who missed which mistake", said, lines, len(lines))
 
 
 def _to_judge(entries: Sequence[Entry]) -> str:
@@ -148,12 +143,8 @@ def _to_judge(entries: Sequence[Entry]) -> str:
             lines.append(f"<li>{opens(at, entry.called)}{said}</li>")
     if not lines:
         return ""
-    more = len(lines) - MOST_NAMES
-    return card(
-        "For you to judge",
-        f'<ol class="ranks">{"".join(lines[:MOST_NAMES])}</ol>',
-        note(f"And {more} more: choose “pending” or “to read” under Status.") if more > 0 else "",
-    )
+    rest = ": choose “pending” or “to read” under Status"
+    return ranking("For you to judge", "", lines, MOST_NAMES, rest)
 
 
 def _pairs(entries: Sequence[Entry], copied: Mapping[int, Sequence[Copied]]) -> str:
@@ -166,16 +157,11 @@ def _pairs(entries: Sequence[Entry], copied: Mapping[int, Sequence[Copied]]) -> 
     )
     if not found:
         return ""
-    lines = "".join(
+    lines = [
         f"<li><span>{opens(at, entries[at].called)} and "
         f"{opens(other, entries[other].called)}</span>"
         f"<span class='right'>{-share:.0%} of both</span></li>"
-        for share, at, other in found[:MOST_PAIRS]
-    )
-    more = len(found) - MOST_PAIRS
-    return card(
-        "Notes that share passages",
-        note("Open one of both to read them side by side. Alike is no proof of copying."),
-        f'<ol class="ranks">{lines}</ol>',
-        note(f"And {more} more pairs.") if more > 0 else "",
-    )
+        for share, at, other in found
+    ]
+    said = "Open one of the two to read them side by side. Alike does not mean copied."
+    return ranking("Notes that share passages", said, lines, MOST_PAIRS, " pairs")

@@ -1,14 +1,15 @@
-"""A class as a table for spreadsheets, in which nothing that a student wrote comes to life."""
+"""A class as a table for spreadsheets, in which nothing that a student wrote can act."""
 
 from __future__ import annotations
 
 import csv
 import io
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 from px4fuse.grading.model import Entry, Graded, Override
+from px4fuse.grading.names import distinct
 from px4fuse.spreadsheet import neutral, neutral_id
 
 FIRST = ("file", "student", "id", "status", "points", "pending points", "of", "deducted", "total")
@@ -23,10 +24,6 @@ def csv_text(entries: Sequence[Entry]) -> str:
     """Lay out a class as CSV, for Excel and LibreOffice.
 
     Points of the items are those that count, the instructor's where there are some.
-
-    Parameters
-    ----------
-    entries : sequence of Entry
 
     Returns
     -------
@@ -80,26 +77,8 @@ def settled_report(entry: Entry) -> Graded | None:
 
 def item_points(one: Graded) -> dict[str, float]:
     """Points by the title of the rubric's item; titles that come twice are numbered."""
-    points: dict[str, float] = {}
-    for title, item in zip(distinct(item.title for item in one.items), one.items, strict=True):
-        points[title] = item.points
-    return points
-
-
-def distinct(titles: Iterable[str]) -> list[str]:
-    """Titles with a number behind those that came before.
-
-    >>> distinct(["notes", "cover", "notes"])
-    ['notes', 'cover', 'notes (2)']
-    """
-    seen: list[str] = []
-    for title in titles:
-        name, count = title, 1
-        while name in seen:
-            count += 1
-            name = f"{title} ({count})"
-        seen.append(name)
-    return seen
+    titles = distinct(item.title for item in one.items)
+    return dict(zip(titles, (item.points for item in one.items), strict=True))
 
 
 def number(value: float | None) -> str:

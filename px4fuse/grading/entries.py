@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 from typing import Literal
 
-from px4fuse.grading.class_table import item_points
+from px4fuse.assignment.sheet import Sheet
+from px4fuse.grading.class_table import item_points, settled_report
 from px4fuse.grading.lateness import LateRule, in_zone_of
 from px4fuse.grading.model import Entry, Graded, Override, Submission
 from px4fuse.grading.overrides import TOTAL, Overrides, matched
@@ -30,7 +31,6 @@ class Term:
         Which one counts of several.
     due : datetime or None
         With a time zone.
-    late : LateRule or None
     times : mapping
         Index of a person in the register to when Moodle says that the work was handed in.
     """
@@ -39,6 +39,31 @@ class Term:
     due: datetime | None = None
     late: LateRule | None = None
     times: Mapping[int, datetime] | None = None
+
+
+@dataclass(frozen=True)
+class Course:
+    """What is known of a class besides what it handed in.
+
+    Attributes
+    ----------
+    roster : tuple of Person or None
+        Without one the students of the answer key, else those of the worksheets.
+    worksheets : tuple of Sheet
+        Tables of learning platforms, to be filled in.
+    column : str
+        Of the worksheets, for the grade; "" where there is only one.
+    term : Term
+        Which attempt counts, and what being late costs.
+    anonymous : bool
+        Whether the class page shows pseudonyms.
+    """
+
+    roster: tuple[Person, ...] | None = None
+    worksheets: tuple[Sheet, ...] = ()
+    column: str = ""
+    term: Term = field(default_factory=Term)
+    anonymous: bool = False
 
 
 @dataclass(frozen=True)
@@ -88,9 +113,6 @@ def class_entries(
     ----------
     graded, submissions, origins : sequences
         Of every file, in one order.
-    register : Register, optional
-    term : Term
-    overrides : mapping
 
     Returns
     -------
@@ -102,7 +124,9 @@ def class_entries(
     owners: dict[int, list[int]] = defaultdict(list)
     nobody: list[int] = []
     for index, (one, origin) in enumerate(zip(graded, origins, strict=True)):
-        place = owner(one, origin, everyone)
+        place = everyone.by_platform(origin)
+        if place is None:
+            place = everyone.by_report(one.student_id, one.student)
         (nobody if place is None else owners[place]).append(index)
 
     def tries(members: Sequence[int], place: int | None = None) -> list[_Try]:
@@ -125,14 +149,6 @@ def class_entries(
     most = max((one.of for one in graded), default=0.0)
     settled = (_settled(one, words, most) for one, words in zip(made, said, strict=True))
     return tuple(settled), notes
-
-
-def owner(graded: Graded, origin: Origin, register: Register) -> int | None:
-    """Place of whose file it is."""
-    place = register.by_platform(origin)
-    if place is None:
-        place = register.by_report(graded.student_id, graded.student)
-    return place
 
 
 def _named(graded: Sequence[Graded], origins: Sequence[Origin]) -> list[Person]:
@@ -158,9 +174,6 @@ def _named(graded: Sequence[Graded], origins: Sequence[Origin]) -> list[Person]:
         elif one.student_id and register.by_report(one.student_id, "") is None:
             register.people.append(Person(one.student_id, one_line(one.student, 200)))
     return register.people
-
-
-# ------------------------------------------------------------------ attempts
 
 
 def _try(
@@ -204,11 +217,13 @@ def _entry(person: Person, tries: Sequence[_Try], term: Term) -> Entry:
     if not tries:
         return Entry(person.name, person.student_id, None, email=person.email)
     ordered = sorted(tries, key=lambda one: one.order)
-    # what is no report counts only where nothing else is there
+    # what is not a report counts only where there is nothing else
     able = [one for one in ordered if one.read] or ordered
+    # several files of one submission: the best
+    of_first = [one for one in able if one.order[:2] == able[0].order[:2]]
     chosen = {
         "latest": able[-1],
-        "first": _first(able),
+        "first": of_first[-1],
         "best": max(able, key=lambda one: (one.worth, one.order)),
     }[term.attempt]
     remarks = list(chosen.remarks)
@@ -230,35 +245,16 @@ def _entry(person: Person, tries: Sequence[_Try], term: Term) -> Entry:
     )
 
 
-def _first(able: Sequence[_Try]) -> _Try:
-    """The best file of the first submission."""
-    earliest = able[0].order[:2]
-    return [one for one in able if one.order[:2] == earliest][-1]
-
-
-# ------------------------------------------------------------------ points
-
-
 def _settled(entry: Entry, said: Mapping[str, Override], most: float) -> Entry:
     """With the instructor's word, and the total that follows."""
     comment = "\n".join(
         said[name].comment for name in ("", TOTAL) if name in said and said[name].comment
     )
-    kept = {title: one for title, one in said.items() if title != ""}
-    graded = entry.counting
+    entry = replace(entry, overrides={title: one for title, one in said.items() if title})
+    settled = settled_report(entry)
     total = None
     if TOTAL in said and said[TOTAL].points is not None:
         total = said[TOTAL].points
-    elif graded is not None and graded.counted is not None:
-        points = item_points(graded)
-        for title, one in kept.items():
-            if title in points and one.points is not None:
-                points[title] = one.points
-        total = round(max(sum(points.values()) - entry.deduction, 0.0), 2)
-    return replace(
-        entry,
-        overrides=kept,
-        comment=comment,
-        total=total,
-        of=graded.of if graded is not None else most,
-    )
+    elif settled is not None and not settled.pending:
+        total = round(max(sum(one.points for one in settled.items) - entry.deduction, 0.0), 2)
+    return replace(entry, comment=comment, total=total, of=settled.of if settled else most)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import unicodedata
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -12,13 +11,15 @@ from typing import Any, Literal
 from px4fuse.assignment.drawing import POSSIBLE_FINDINGS
 from px4fuse.assignment.key import Answer, AnswerKey
 from px4fuse.filter.tuning import HORIZONTAL
+from px4fuse.findings import named
 from px4fuse.grading.claims import TOPICS, Claims, claims_of, entailed, family
 from px4fuse.grading.folding import folded
 from px4fuse.grading.model import Rubric
-from px4fuse.grading.names import named
 from px4fuse.grading.notes import WORD, Mention, Notes, Words, read_notes
+from px4fuse.plain import few_words
 from px4fuse.results.contract import ComparisonResults, LoopResults, Reported, to_plain
 from px4fuse.results.model import Absent
+from px4fuse.results.reading import one_line
 from px4fuse.verification.model import Report, Verdict
 from px4fuse.verification.rerun import log_sha256
 
@@ -213,16 +214,9 @@ def values_at(results: Mapping[str, Any], path: str) -> Iterator[tuple[str, Any]
     yield from ((name.removeprefix("."), value) for name, value in found)
 
 
-def is_number(value: object) -> bool:
-    """Whether a value is a number, and no flag."""
-    return isinstance(value, int | float) and not isinstance(value, bool)
-
-
 def text_of(value: str) -> str:
     """One line of text, without control characters and not too long to be quoted."""
-    kept = "".join(c if unicodedata.category(c)[0] != "C" else " " for c in value[: 4 * MAX_QUOTE])
-    line = " ".join(kept.split())
-    return line if len(line) <= MAX_QUOTE else line[: MAX_QUOTE - 1] + "…"
+    return one_line(value, MAX_QUOTE)
 
 
 def absence(part: object) -> str:
@@ -251,8 +245,7 @@ def why_not_horizontal(evidence: Evidence) -> str:
 
 def list_words(names: Sequence[str]) -> str:
     """Names with commas between them, the first few."""
-    shown = ", ".join(names[:NAMED])
-    return f"{shown} and {len(names) - NAMED} more" if len(names) > NAMED else shown
+    return few_words(names, NAMED)
 
 
 def reason_of(verdict: Verdict) -> str:
@@ -267,7 +260,7 @@ def joined(reasons: Sequence[str]) -> str:
 
 
 def drifts(evidence: Evidence) -> bool:
-    """Whether the report says that its innovations are no measure of the error."""
+    """Whether the report says that its innovations do not measure the error."""
     return evidence.has("source_may_drift") or evidence.has("errors_larger_than_claimed")
 
 
@@ -275,13 +268,10 @@ def also_named(wrong: Mapping[str, str]) -> str:
     """What notes wrongly claim, as the end of a sentence; empty without any."""
     if not wrong:
         return ""
-    passages = [f"{named(one)} (\u201c{_short(said)}\u201d)" for one, said in wrong.items()]
+    passages = [
+        f"{named(one)} (\u201c{one_line(said, MAX_PASSAGE)}\u201d)" for one, said in wrong.items()
+    ]
     return (
         f"; they also name {list_words(passages)}, which your log does not have: that costs as "
         "much as naming what it has earns"
     )
-
-
-def _short(passage: str) -> str:
-    line = text_of(passage)
-    return line if len(line) <= MAX_PASSAGE else line[: MAX_PASSAGE - 1] + "…"

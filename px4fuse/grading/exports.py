@@ -26,21 +26,19 @@ import csv
 import html
 import io
 import re
-import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
 from px4fuse.assignment.key import folded
+from px4fuse.assignment.sheet import Sheet
 from px4fuse.errors import SettingsError
 from px4fuse.grading.class_table import number
 from px4fuse.grading.model import Entry
 from px4fuse.grading.platforms import Origin
-from px4fuse.grading.roster import (
-    Register,
-    people_of_sheet,
-)
-from px4fuse.grading.sheet import Sheet
+from px4fuse.grading.roster import Register, person_of_row
+from px4fuse.grading.zipping import zipped
+from px4fuse.plain import few_words
 from px4fuse.results.reading import one_line
 from px4fuse.spreadsheet import neutral, neutral_id
 
@@ -48,12 +46,10 @@ Kind = Literal["moodle", "canvas", "blackboard", "other"]
 GRADE = ("grade", "bewertung", "points", "punkte", "mark", "note", "score")
 MAX_GRADE = ("maximumgrade", "hoechstebewertung", "höchstebewertung")
 COMMENTS = ("feedbackcomments", "feedbackalskommentar", "feedbacktolearner", "feedback", "comment")
-FORMAT = ("feedbackformat",)
 CANVAS = re.compile(r"^(?P<title>.*) \((?P<id>\d+)\)$")
 BLACKBOARD = re.compile(r"^(?P<title>.*) \[Total Pts: (?P<of>[^\]]*?)( \w+)?\] \|(?P<id>\d+)$")
 # Never written into: of Canvas, and what other platforms compute
 READ_ONLY = "(read only)"
-TIME = (1980, 1, 1, 0, 0, 0)
 
 
 @dataclass(frozen=True)
@@ -61,7 +57,6 @@ class Filled:
     """A table as a platform takes it, and what could not be entered: sentences."""
 
     sheet: Sheet
-    entered: int
     notes: tuple[str, ...]
 
 
@@ -81,7 +76,6 @@ def grade_column(sheet: Sheet, wanted: str) -> int:
 
     Parameters
     ----------
-    sheet : Sheet
     wanted : str
         Title of the column, without the platform's number; "" where there is only one.
 
@@ -96,19 +90,15 @@ def grade_column(sheet: Sheet, wanted: str) -> int:
         place = sheet.column(GRADE)
         found = {} if place is None else {place: sheet.head[place]}
     else:
-        found = {
-            at: _plain_title(title)
-            for at, title in enumerate(sheet.head)
-            if kind in ("moodle", "other")
-            or (CANVAS if kind == "canvas" else BLACKBOARD).match(title)
-            if not any(READ_ONLY in row[at] for row in sheet.rows[:3])
-        }
-        if wanted:
-            found = {
-                at: title
-                for at, title in found.items()
-                if folded(wanted) in (folded(title), folded(sheet.head[at]))
-            }
+        found = {}
+        pattern = {"canvas": CANVAS, "blackboard": BLACKBOARD}.get(kind)
+        for at, title in enumerate(sheet.head):
+            match = pattern.match(title) if pattern else None
+            plain = match["title"] if match else title
+            is_open = not any(READ_ONLY in row[at] for row in sheet.rows[:3])
+            asked = not wanted or folded(wanted) in (folded(plain), folded(title))
+            if is_open and asked and (match or not pattern):
+                found[at] = plain
     if len(found) == 1:
         return next(iter(found))
     others = ", ".join(one_line(title, 40) for title in (found.values() or sheet.head))
@@ -117,11 +107,6 @@ def grade_column(sheet: Sheet, wanted: str) -> int:
         + ("several columns for the grade" if found else "no column for the grade")
         + f". Name one with --column: {one_line(others, 300)}."
     )
-
-
-def _plain_title(title: str) -> str:
-    match = CANVAS.match(title) or BLACKBOARD.match(title)
-    return match["title"] if match else title
 
 
 def filled(
@@ -135,10 +120,8 @@ def filled(
 
     Parameters
     ----------
-    sheet : Sheet
     entries : sequence of Entry
         The first ones of the people in ``register``, in its order.
-    register : Register
     column : str
         As :func:`grade_column` takes it.
     feedback : mapping
@@ -149,17 +132,15 @@ def filled(
     SettingsError
         From :func:`grade_column`.
     """
-    place, comments, formats = (
-        grade_column(sheet, column),
-        sheet.column(COMMENTS),
-        sheet.column(FORMAT),
-    )
+    place = grade_column(sheet, column)
+    comments, formats = sheet.column(COMMENTS), sheet.column(("feedbackformat",))
     kind = kind_of(sheet)
     cells = [list(row) for row in sheet.rows]
     comma = any(re.fullmatch(r"\d+,\d+", cell.strip()) for row in cells for cell in row)
-    notes, entered, seen = [], 0, set()
+    notes, seen = [], set()
     for row in cells:
-        at = _place(sheet, row, register)
+        person = person_of_row(sheet, row)
+        at = register.place(person) if person else None
         if at is None:
             continue
         seen.add(at)
@@ -174,7 +155,6 @@ def filled(
             )
         said = number(entry.total)
         row[place] = said.replace(".", ",") if comma and kind == "moodle" else said
-        entered += 1
         if comments is not None and comments != place and at in feedback:
             row[comments] = as_html(feedback[at]) if kind != "other" else neutral(feedback[at])
             if formats is not None:
@@ -182,16 +162,8 @@ def filled(
     left = [_who(entries[at]) for at in range(len(register.people))
             if at not in seen and entries[at].total is not None]  # fmt: skip
     if left:
-        notes.append(
-            f"{sheet.path.name}: it has no row for {', '.join(left[:4])}"
-            + (f" and {len(left) - 4} more." if len(left) > 4 else ".")
-        )
-    return Filled(replace(sheet, rows=tuple(map(tuple, cells))), entered, tuple(notes))
-
-
-def _place(sheet: Sheet, row: Sequence[str], register: Register) -> int | None:
-    people = people_of_sheet(replace(sheet, rows=(tuple(row),), numbers=sheet.numbers[:1]))
-    return register.place(people[0]) if people else None
+        notes.append(f"{sheet.path.name}: it has no row for {few_words(left, 4)}.")
+    return Filled(replace(sheet, rows=tuple(map(tuple, cells))), tuple(notes))
 
 
 def _most(sheet: Sheet, row: Sequence[str], place: int) -> float | None:
@@ -222,9 +194,6 @@ def as_html(text: str) -> str:
     return "<br>".join(re.sub(r"^ +", lambda m: "&nbsp;" * len(m[0]), line) for line in lines)
 
 
-# ------------------------------------------------------------------ without a table of theirs
-
-
 def moodle_feedback(
     entries: Sequence[Entry], origins: Mapping[str, Origin], feedback: Mapping[int, str]
 ) -> bytes:
@@ -232,24 +201,24 @@ def moodle_feedback(
 
     Parameters
     ----------
-    entries : sequence of Entry
     origins : mapping
         Name of a submission to where it came from.
-    feedback : mapping
     """
-    out = io.BytesIO()
-    with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive:
-        for at, entry in enumerate(entries):
-            origin = origins.get(entry.counting.submission) if entry.counting else None
-            if origin is None or origin.platform != "moodle" or at not in feedback:
-                continue
+    files = {}
+    for at, entry in enumerate(entries):
+        origin = _origin(entry, origins, "moodle")
+        if origin is not None and at in feedback:
             # Moodle splits at _ and looks for the number in the second part
             name = re.sub(r'[_/\\:*?"<>|\x00-\x1f]+', " ", origin.name).strip() or "student"
             folder = f"{name}_{origin.number}_assignfeedback_file_"
-            entry_info = zipfile.ZipInfo(f"{folder}/feedback.txt", TIME)
-            entry_info.compress_type = zipfile.ZIP_DEFLATED
-            archive.writestr(entry_info, feedback[at].encode("utf-8-sig"))
-    return out.getvalue()
+            files[f"{folder}/feedback.txt"] = feedback[at].encode("utf-8-sig")
+    return zipped(files)
+
+
+def _origin(entry: Entry, origins: Mapping[str, Origin], platform: str) -> Origin | None:
+    """Where an entry's counting file came from, if from this platform."""
+    origin = origins.get(entry.counting.submission) if entry.counting else None
+    return origin if origin is not None and origin.platform == platform else None
 
 
 def plain_grades(
@@ -271,8 +240,8 @@ def plain_grades(
     writer = csv.writer(out, lineterminator="\r\n", quoting=csv.QUOTE_ALL)
     writer.writerow(map(neutral, head))
     for at, entry in enumerate(entries):
-        origin = origins.get(entry.counting.submission) if entry.counting else None
-        if origin is None or origin.platform != platform or entry.total is None:
+        origin = _origin(entry, origins, platform)
+        if origin is None or entry.total is None:
             continue
         login = register.people[at].login if at < len(register.people) else ""
         who: tuple[str, ...] = (login or origin.login, entry.student_id, entry.student)

@@ -16,12 +16,11 @@ from __future__ import annotations
 
 import argparse
 import hashlib
-import json
 import math
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
 from importlib import metadata
 from importlib.resources import files
@@ -45,7 +44,7 @@ from px4fuse.grading import fairness_notes
 from px4fuse.grading.fairness_notes import WORDINGS
 from px4fuse.grading.model import Graded, Rubric
 from px4fuse.grading.rubric import read_rubric
-from px4fuse.grading.scoring import score
+from px4fuse.grading.scoring import assess
 from px4fuse.loop.analysis import analyse
 from px4fuse.loop.sources import Source
 from px4fuse.loop.tracks import trajectory_of
@@ -54,7 +53,7 @@ from px4fuse.results.build import results as comparison_results
 from px4fuse.results.build_trajectories import loop_results
 from px4fuse.results.comparison import ASKED, Tuned
 from px4fuse.results.contract import ComparisonResults, Reported, to_json
-from px4fuse.results.model import FoundMistake, Student
+from px4fuse.results.model import Student
 from px4fuse.results.reading import read_results
 from px4fuse.simulation.flights import simulate, to_flight
 from px4fuse.simulation.mistakes import parse
@@ -63,8 +62,6 @@ from px4fuse.verification.model import Report, Verdict
 TABLE = "fairness.csv"
 SECRET = b"px4fuse fairness"
 FLIGHTS = 300
-# Shares of the points: what the ideal student must have at least, the others at most
-BOUNDS = {"ideal": 0.95, "default": 0.50, "guesser": 0.30}
 VERIFIED = Verdict("verified", ("taken for verified",), with_log=True, page_status="same")
 NONE = "none"
 # Of half the guesses, whose settings come to mind: the factor from the default is log-uniform
@@ -78,9 +75,6 @@ Request = ComparisonRequest | LoopRequest
 HandIns = tuple[tuple[Reported, str], ...]
 
 
-# ------------------------------------------------------------------ flights and reports
-
-
 @dataclass(frozen=True)
 class Flown:
     """One assigned flight, analysed on demand.
@@ -89,7 +83,6 @@ class Flown:
     ----------
     number : int
         Of the student.
-    drawn : Drawn
     cache : Path or None
         Folder of analyses that were made before.
     """
@@ -105,8 +98,8 @@ class Flown:
 
     def answer(self) -> Answer:
         """The key's."""
-        found = json.loads(self._kept("answer", lambda: json.dumps(asdict(self._answer()))))
-        return Answer(**{**found, **{n: tuple(found[n]) for n in ("mistakes", "findings")}})
+        made = self._kept("answer", lambda: msgspec.json.encode(self._answer()).decode())
+        return msgspec.json.decode(made, type=Answer)
 
     def report(self, request: Request) -> Reported:
         """Results of ``px4fuse compare`` or ``px4fuse loop``, without a student."""
@@ -147,9 +140,6 @@ def _results(flight: Flight, request: Request) -> Reported:
         return loop_results(request, loop, find_loop(loop), Student(), command)
     analysis = run(request, flight=flight)
     return comparison_results(request, analysis, find(analysis), Student(), command)
-
-
-# ------------------------------------------------------------------ students
 
 
 def by_default(one: Flown) -> HandIns:
@@ -229,9 +219,6 @@ STUDENTS: Mapping[str, Callable[[Flown], HandIns]] = {
 }
 
 
-# ------------------------------------------------------------------ points
-
-
 def earned(one: Flown, results: Reported, notes: str, rubric: Rubric) -> Graded:
     """What a report with its notes earns, part by part."""
     answer = one.answer()
@@ -240,8 +227,7 @@ def earned(one: Flown, results: Reported, notes: str, rubric: Rubric) -> Graded:
     pages = {page for item in rubric.items for page in item.parameters.get("pages", ())}
     results = msgspec.structs.replace(results, student=student)
     report = Report("", 0, "intact", results, (" ".join(sorted(pages)),), b"")
-    made = score(report, VERIFIED, rubric, AnswerKey("mixed", (answer,)))
-    return Graded(answer.file, answer.name, answer.student_id, VERIFIED, made)
+    return assess(report, VERIFIED, rubric, AnswerKey("mixed", (answer,)))
 
 
 def measured(one: Flown, rubric: Rubric) -> dict[str, object]:
@@ -250,7 +236,7 @@ def measured(one: Flown, rubric: Rubric) -> dict[str, object]:
     ``missed``: what the key names and the report as the command makes it does not list.
     """
     answer = one.answer()
-    found = {i for top in by_default(one)[0][0].findings for i in (top.id, *_ids(top.consequences))}
+    found = {i for top in by_default(one)[0][0].findings for i in top.ids}
     row: dict[str, object] = {
         "student": answer.student_id,
         "kind": one.drawn.scenario.kind,
@@ -264,19 +250,13 @@ def measured(one: Flown, rubric: Rubric) -> dict[str, object]:
     return row
 
 
-def _ids(findings: Sequence[FoundMistake]) -> Iterator[str]:
-    for one in findings:
-        yield one.id
-        yield from _ids(one.consequences)
-
-
 def summary(table: pd.DataFrame) -> pd.DataFrame:
     """Means by mistake and size.
 
     Parameters
     ----------
     table : DataFrame
-        As :func:`fairness` gives it.
+        One row per flight, as in fairness.csv.
 
     Returns
     -------
@@ -311,12 +291,6 @@ def _size(choice: Choice | None, typed: str) -> str:
     if choice is None or choice.limit is None:
         return ""
     return "small" if choice.difficulty(typed) >= (EASIEST + HARDEST) / 2.0 else "plain"
-
-
-def fairness() -> pd.DataFrame:
-    """The table that ships with the package, one row per flight."""
-    with files("px4fuse.grading").joinpath(TABLE).open(encoding="utf-8") as file:
-        return pd.read_csv(file, keep_default_na=False)
 
 
 def _row(number: int, cache: Path | None) -> dict[str, object]:

@@ -1,16 +1,16 @@
 """What an instructor should look at: sentences, never points.
 
-A flag is no proof. Two students may fly one flight together, and advice that px4fuse prints leads
-everyone to the same number.
+A flag is not a proof. Two students may fly one flight together, and advice that px4fuse prints
+leads everyone to the same number.
 """
 
 from __future__ import annotations
 
 import math
 import re
-import unicodedata
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
+from decimal import Decimal
 from itertools import combinations
 from pathlib import PurePosixPath
 
@@ -23,8 +23,10 @@ from px4fuse.filter.kalman import Settings
 from px4fuse.filter.tuning import HORIZONTAL
 from px4fuse.grading.folding import folded
 from px4fuse.grading.model import Graded
+from px4fuse.plain import few_words
 from px4fuse.results.comparison import ASKED, HeldOut, Tuned
 from px4fuse.results.contract import ComparisonResults, LoopResults, Reported
+from px4fuse.results.reading import one_line
 
 # Letters and digits in a row by which two texts are compared, so that spaces do not count: of
 # five words, hardly ever the same by chance, and a changed word costs as many of thousands
@@ -57,9 +59,6 @@ SIGMA_FAR_OFF = 2.0
 # What a student chooses; the rest of the settings follows from the log
 CHOSEN = ("sigma_a_m_s2", "sigma_z_m", "dt_s", "input", "clock_offset_s")
 SHOWN = 4
-
-
-# ------------------------------------------------------------------ one report
 
 
 def own_flags(results: Reported) -> tuple[str, ...]:
@@ -156,9 +155,6 @@ def _left_out(results: ComparisonResults) -> Iterator[str]:
         yield "The IMU was not used (--input zero)."
 
 
-# ------------------------------------------------------------------ a class
-
-
 def class_flags(
     graded: Sequence[Graded], key: AnswerKey | None = None
 ) -> Mapping[int, tuple[str, ...]]:
@@ -166,7 +162,6 @@ def class_flags(
 
     Parameters
     ----------
-    graded : sequence of Graded
     key : AnswerKey, optional
         Tells whose log is whose.
 
@@ -177,11 +172,8 @@ def class_flags(
     """
     found: dict[int, list[str]] = defaultdict(list)
     looks = (
-        _same_report(graded),
-        _same_id(graded),
-        _same_log(graded),
+        _same(graded),
         _other_assignment(graded, key),
-        _same_settings(graded),
         _other_version(graded),
         _copied_notes(graded),
         _other_name(graded, key),
@@ -195,24 +187,23 @@ def class_flags(
 Flags = Iterator[tuple[int, str]]
 
 
-def _same_report(graded: Sequence[Graded]) -> Flags:
-    for members in _groups([one.sha256 for one in graded]):
-        for index in members:
-            yield index, f"The same file as {_others(graded, members, index)}."
-
-
-def _same_id(graded: Sequence[Graded]) -> Flags:
-    for members in _groups([folded_id(one.student_id) for one in graded]):
-        for index in members:
-            yield index, f"The same student id as in {_others(graded, members, index)}."
-
-
-def _same_log(graded: Sequence[Graded]) -> Flags:
-    """Identical logs of different students; one student may hand in two reports on one log."""
-    for members in _groups([one.log_sha256 for one in graded]):
-        if len({_who(graded[index]) for index in members}) > 1:
-            for index in members:
-                yield index, f"The same log as {_others(graded, members, index)}."
+def _same(graded: Sequence[Graded]) -> Flags:
+    # one student may hand in two reports on one log, with one choice of settings
+    looks = (
+        ("The same file as {}.", [one.sha256 for one in graded], False),
+        ("The same student id as in {}.", [folded_id(one.student_id) for one in graded], False),
+        ("The same log as {}.", [one.log_sha256 for one in graded], True),
+        ("The same settings to the last digit as {}: {}.", [one.settings for one in graded], True),
+    )
+    for said, values, of_different in looks:
+        where: dict[str, list[int]] = defaultdict(list)
+        for index, value in enumerate(values):
+            where[value].append(index)
+        for value, members in where.items():
+            students = {_who(graded[index]) for index in members}
+            if value and len(students if of_different else members) > 1:
+                for index in members:
+                    yield index, said.format(_others(graded, members, index), value)
 
 
 def _other_assignment(graded: Sequence[Graded], key: AnswerKey | None) -> Flags:
@@ -225,23 +216,11 @@ def _other_assignment(graded: Sequence[Graded], key: AnswerKey | None) -> Flags:
         if given is None:
             yield index, "The log is not one of those that were handed out with the assignment."
         elif own is None:
-            said = (
-                f"the id {_short(one.student_id)} is not in the answer key"
-                if one.student_id
-                else "the report gives no id"
-            )
+            absent = f"the id {_line(one.student_id)} is not in the answer key"
+            said = absent if one.student_id else "the report gives no id"
             yield index, f"The log was given to {given.student_id}; {said}."
         elif own.sha256 != one.log_sha256:
             yield index, f"The log was given to another student, {given.student_id}."
-
-
-def _same_settings(graded: Sequence[Graded]) -> Flags:
-    for members in _groups([one.settings for one in graded]):
-        if len({_who(graded[index]) for index in members}) > 1:
-            for index in members:
-                others = _others(graded, members, index)
-                same = graded[index].settings
-                yield index, f"The same settings to the last digit as {others}: {same}."
 
 
 def chosen_settings(results: Reported) -> str:
@@ -264,20 +243,17 @@ def _other_version(graded: Sequence[Graded]) -> Flags:
     if len(counted) < 2:
         return
     usual = counted.most_common(1)[0][0]
+    others = f"most of the class with {_line(usual)}"
     for index, one in enumerate(graded):
         if one.version and one.version != usual:
-            others = f"most of the class with {_short(usual)}"
-            yield index, f"Made with px4fuse {_short(one.version)}, {others}."
-
-
-# ------------------------------------------------------------------ notes
+            yield index, f"Made with px4fuse {_line(one.version)}, {others}."
 
 
 def copied_notes(graded: Sequence[Graded]) -> list[tuple[float, int, int]]:
     """Pairs whose notes share passages: which share of both, and their places."""
     shingles = [_shingles(one.notes) for one in graded]
     counted = Counter(part for parts in shingles for part in parts)
-    # one that hands in twice does not make a template
+    # a student who hands in twice does not make a template
     if len(graded) >= TEMPLATE_CLASS:
         common = {p for p, count in counted.items() if count > TEMPLATE_SHARE * len(graded)}
         shingles = [parts - common for parts in shingles]
@@ -305,11 +281,8 @@ def _copied_notes(graded: Sequence[Graded]) -> Flags:
         alike[second].append((share, first))
     for index, others in sorted(alike.items()):
         others.sort(reverse=True)
-        named = ", ".join(
-            f"{_name(graded[other])} ({share:.0%} of both)" for share, other in others[:SHOWN]
-        )
-        more = f" and {len(others) - SHOWN} more" if len(others) > SHOWN else ""
-        yield index, f"The notes share whole passages with those of {named}{more}."
+        named = [f"{_name(graded[other])} ({share:.0%} of both)" for share, other in others]
+        yield index, f"The notes share whole passages with those of {few_words(named, SHOWN)}."
 
 
 def _shingles(text: str) -> frozenset[int]:
@@ -326,9 +299,6 @@ def _shingles(text: str) -> frozenset[int]:
     powers = np.cumprod(np.full(SHINGLE_LETTERS, MULTIPLIER, np.uint64))
     hashes = sliding_window_view(codes, SHINGLE_LETTERS) @ powers >> np.uint64(20)
     return frozenset(hashes[hashes % KEPT == 0].tolist())
-
-
-# ------------------------------------------------------------------ names
 
 
 def _other_name(graded: Sequence[Graded], key: AnswerKey | None) -> Flags:
@@ -354,11 +324,11 @@ def _other_name(graded: Sequence[Graded], key: AnswerKey | None) -> Flags:
         ids = sorted({student_id for student_id in people if student_id in words} - own_ids)
         others = sorted({of for parts, of in names.items() if parts <= words} - own_ids)
         if ids or others:
-            other = _short((ids or others)[0])
+            other = _line((ids or others)[0])
             yield index, f"The file's name is that of {other}, the report says {_name(one)}."
         elif own_id.isdecimal() and _looks_like(stem, own_id):
-            said = f"the report gives the id {_short(one.student_id)}"
-            yield index, f"The file is named {_short(stem)}, {said}."
+            said = f"the report gives the id {_line(one.student_id)}"
+            yield index, f"The file is named {_line(stem)}, {said}."
 
 
 def _looks_like(stem: str, student_id: str) -> bool:
@@ -372,18 +342,6 @@ def _words(text: str) -> list[str]:
     return [part for part in parts if part]
 
 
-# ------------------------------------------------------------------ helpers
-
-
-def _groups(values: Sequence[str]) -> list[list[int]]:
-    """Indices of those that have the same value, where it is not empty."""
-    where: dict[str, list[int]] = defaultdict(list)
-    for index, value in enumerate(values):
-        if value:
-            where[value].append(index)
-    return [members for members in where.values() if len(members) > 1]
-
-
 def _who(one: Graded) -> str:
     return folded_id(one.student_id) or folded_id(one.student) or one.submission
 
@@ -391,26 +349,18 @@ def _who(one: Graded) -> str:
 def _name(one: Graded) -> str:
     """A student in a sentence."""
     parts = [part for part in (one.student.strip(), one.student_id.strip()) if part]
-    return _short(", ".join(parts) or one.submission)
+    return _line(", ".join(parts) or one.submission)
 
 
 def _others(graded: Sequence[Graded], members: Sequence[int], index: int) -> str:
-    others = [other for other in members if other != index]
-    named = "; ".join(
-        f"{_name(graded[other])} ({_short(graded[other].submission)})" for other in others[:SHOWN]
-    )
-    return f"{named} and {len(others) - SHOWN} more" if len(others) > SHOWN else named
+    others = [graded[other] for other in members if other != index]
+    return few_words([f"{_name(one)} ({_line(one.submission)})" for one in others], SHOWN, "; ")
 
 
-def _short(text: str) -> str:
-    kept = "".join(c if unicodedata.category(c)[0] != "C" else " " for c in text[:200])
-    line = " ".join(kept.split())
-    return line if len(line) <= 80 else line[:79] + "…"
+def _line(text: str) -> str:
+    return one_line(text, 80)
 
 
 def _digits(number: float) -> int:
     """Significant digits of a number as typed."""
-    mantissa = repr(abs(number)).partition("e")[0]
-    whole, _, part = mantissa.partition(".")
-    digits = (whole + ("" if part == "0" else part)).lstrip("0")
-    return len(digits.rstrip("0") if part in ("", "0") else digits)
+    return len(Decimal(repr(abs(number))).normalize().as_tuple().digits) if number else 0

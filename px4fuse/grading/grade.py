@@ -5,14 +5,15 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from contextlib import closing
+from dataclasses import dataclass, replace
 from datetime import datetime
 from functools import partial
 from pathlib import Path
 
 from px4fuse.assignment.key import AnswerKey
 from px4fuse.grading import submissions
-from px4fuse.grading.entries import Term, class_entries
+from px4fuse.grading.entries import Course, class_entries
 from px4fuse.grading.evidence import values_at
 from px4fuse.grading.exports import grade_column, kind_of
 from px4fuse.grading.flags import chosen_settings, class_flags, own_flags
@@ -21,10 +22,9 @@ from px4fuse.grading.model import Entry, Graded, Rubric, Submission
 from px4fuse.grading.outputs import Class, write_class
 from px4fuse.grading.overrides import NAME, read_overrides
 from px4fuse.grading.platforms import Origin, with_metadata
-from px4fuse.grading.records import Verified, verified
-from px4fuse.grading.roster import Person, Register, people_of_key, people_of_sheet
+from px4fuse.grading.records import verified
+from px4fuse.grading.roster import Register, people_of_key, people_of_sheet, person_of_row
 from px4fuse.grading.scoring import assess, refused
-from px4fuse.grading.sheet import Sheet
 from px4fuse.grading.workers import Failed, run_bounded
 from px4fuse.reading import files_by_sha256, max_log_bytes
 from px4fuse.results.contract import Reported, to_plain
@@ -32,7 +32,7 @@ from px4fuse.verification.model import Refused, Verdict
 from px4fuse.verification.rerun import log_sha256
 
 RECORDS = "records"
-# Of one report: a flight of ten minutes takes about one; what takes longer is no report
+# Of one report: a flight of ten minutes takes about one; what takes longer is not a report
 TIMEOUT_S = 300.0
 MEMORY_BYTES = 4_000_000_000
 # For the class table: column title, and where in the results
@@ -47,31 +47,6 @@ NUMBERS = (
 
 
 @dataclass(frozen=True)
-class Course:
-    """What is known of a class besides what it handed in.
-
-    Attributes
-    ----------
-    roster : tuple of Person or None
-        Without one the students of the answer key, else those of the worksheets.
-    worksheets : tuple of Sheet
-        Tables of learning platforms, to be filled in.
-    column : str
-        Of the worksheets, for the grade; "" where there is only one.
-    term : Term
-        Which attempt counts, and what being late costs.
-    anonymous : bool
-        Whether the class page shows pseudonyms.
-    """
-
-    roster: tuple[Person, ...] | None = None
-    worksheets: tuple[Sheet, ...] = ()
-    column: str = ""
-    term: Term = field(default_factory=Term)
-    anonymous: bool = False
-
-
-@dataclass(frozen=True)
 class Outcome:
     """What grading a class gave.
 
@@ -83,7 +58,6 @@ class Outcome:
         What was passed over.
     reused : int
         How many reports were not verified again, since nothing of theirs has changed.
-    written : tuple of Path
     """
 
     entries: tuple[Entry, ...]
@@ -117,14 +91,12 @@ def grade(
         PDFs, folders and zip files.
     logs : sequence of Path
         Flight logs and folders of them; a report names its log by SHA-256.
-    rubric : Rubric
     output : Path
         Folder for the class table (``class.csv``, ``class.html``), the redrawn ``reports/``,
         ``feedback/``, ``gradescope/``, ``grades/`` for learning platforms, and the records that
         make a second run quick. Its ``overrides.csv`` is read.
     key : AnswerKey, optional
         Which mistakes each student's flight has.
-    course : Course, optional
     title : str
         Of the class page.
     processes : int, optional
@@ -154,8 +126,8 @@ def grade(
     entries, unknown = class_entries(graded, found, origins, register, term, overrides)
     entries = _flagged(entries, key)
     written, more = write_class(
-        Class(entries, register or Register([]), title, course.worksheets, course.column,
-              course.anonymous, {one.name: of for one, of in zip(found, origins, strict=True)},
+        Class(entries, register or Register([]), title, course,
+              {one.name: of for one, of in zip(found, origins, strict=True)},
               {one.name: one for one in found}),
         output,
         output / RECORDS,
@@ -186,7 +158,7 @@ def _moodle_times(course: Course, register: Register | None) -> dict[int, dateti
             continue
         for row in sheet.rows:
             time = moodle_time(sheet.cell(row, ("lastmodifiedsubmission",)))
-            (person,) = people_of_sheet(replace(sheet, rows=(row,))) or (None,)
+            person = person_of_row(sheet, row)
             place = register.place(person) if person else None
             if time is not None and place is not None:
                 times[place] = time
@@ -203,9 +175,6 @@ def _flagged(entries: Sequence[Entry], key: AnswerKey | None) -> tuple[Entry, ..
         whole = replace(one, flags=(*one.flags, *flags.get(index, ())))
         made[at] = replace(entries[at], counting=whole)
     return tuple(made)
-
-
-# ------------------------------------------------------------------ the reports
 
 
 @dataclass(frozen=True)
@@ -230,24 +199,13 @@ def grade_all(
     """Verify, or recall, and score every file, each within bounds; and how many were recalled."""
     jobs = []
     for submission, origin in zip(found, origins, strict=True):
-        person = register.of_platform(origin) if register else None
-        jobs.append(Job(submission, person.student_id if person else ""))
-    graded: list[Graded | None] = [None] * len(found)
-    reused = done = 0
+        place = register.by_platform(origin) if register else None
+        owner = register.people[place].student_id if register and place is not None else ""
+        jobs.append(Job(submission, owner))
+    graded: dict[int, Graded] = {}
+    reused = 0
     progress(0, len(found))
-
-    def on_done(index: int, result: tuple[Graded, bool] | Failed) -> None:
-        nonlocal reused, done
-        if isinstance(result, Failed):
-            why = Refused(f"Grading it failed: {result.reason}", "Read it yourself.")
-            graded[index] = _refused(found[index], why, "", rubric, key)
-        else:
-            graded[index], recalled = result
-            reused += recalled
-        done += 1
-        progress(done, len(found))
-
-    run_bounded(
+    work = run_bounded(
         partial(
             grade_one,
             logs=files_by_sha256(logs),
@@ -260,13 +218,20 @@ def grade_all(
         processes=min(processes or os.cpu_count() or 1, len(jobs)),
         timeout_s=TIMEOUT_S,
         memory_bytes=MEMORY_BYTES,
-        on_done=on_done,
-        keep=False,
     )
+    with closing(work):
+        for index, result in work:
+            if isinstance(result, Failed):
+                why = Refused(f"Grading it failed: {result.reason}", "Read it yourself.")
+                graded[index] = replace(refused(rubric, key, why), submission=found[index].name)
+            else:
+                graded[index], recalled = result
+                reused += recalled
+            progress(len(graded), len(found))
     named = [
         one if one.student or one.student_id or not origin.platform
         else replace(one, student=origin.name)
-        for one, origin in zip((one for one in graded if one is not None), origins, strict=True)
+        for one, origin in zip((graded[at] for at in range(len(found))), origins, strict=True)
     ]  # fmt: skip
     return tuple(named), reused
 
@@ -284,43 +249,29 @@ def grade_one(
     submission = job.submission
     content = submissions.read(submission)
     if isinstance(content, Refused):
-        return _refused(submission, content, "", rubric, key), False
+        return replace(refused(rubric, key, content), submission=submission.name), False
     sha256 = hashlib.sha256(content).hexdigest()
     handed_out = frozenset(answer.sha256 for answer in key.answers) if key else frozenset()
     found, recalled = verified(records, content, logs, handed_out)
     if isinstance(found, Refused):
-        return _refused(submission, found, sha256, rubric, key), recalled
-    return _scored(submission, found, sha256, job.owner_id, rubric, key), recalled
-
-
-def _scored(
-    submission: Submission,
-    found: Verified,
-    sha256: str,
-    owner_id: str,
-    rubric: Rubric,
-    key: AnswerKey | None,
-) -> Graded:
-    results, verdict = found.report.results, found.verdict
-    made = assess(found.report, verdict, rubric, key, owner_id)
-    return Graded(
+        made = refused(rubric, key, found)
+        return replace(made, submission=submission.name, sha256=sha256), recalled
+    report, verdict, page = found
+    results = report.results
+    made = assess(report, verdict, rubric, key, job.owner_id)
+    whole = replace(
+        made,
         submission=submission.name,
-        student=results.student.name,
-        student_id=results.student.id,
-        verdict=verdict,
-        items=made.items,
         flags=(*_page_flags(verdict), *own_flags(results), *made.flags),
-        pending=made.pending,
-        to_read=made.to_read,
-        mistakes=made.mistakes,
         numbers=_numbers(results),
         sha256=sha256,
         log_sha256=log_sha256(results),
         version=results.provenance.px4fuse,
         settings=chosen_settings(results),
         notes=results.student.notes,
-        page=found.page,
+        page=page,
     )
+    return whole, recalled
 
 
 def _page_flags(verdict: Verdict) -> tuple[str, ...]:
@@ -337,11 +288,3 @@ def _page_flags(verdict: Verdict) -> tuple[str, ...]:
 def _numbers(results: Reported) -> dict[str, float]:
     plain = to_plain(results)
     return {title: float(value) for title, path in NUMBERS for _, value in values_at(plain, path)}
-
-
-def _refused(
-    submission: Submission, why: Refused, sha256: str, rubric: Rubric, key: AnswerKey | None
-) -> Graded:
-    verdict = Verdict("cannot verify", (why.reason,), with_log=False)
-    made = refused(rubric, key, why)
-    return Graded(submission.name, "", "", verdict, made.items, pending=made.pending, sha256=sha256)

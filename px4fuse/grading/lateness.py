@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import re
 from dataclasses import dataclass
-from datetime import datetime, timedelta, tzinfo
+from datetime import datetime
 from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
 from px4fuse.errors import SettingsError
@@ -19,12 +19,10 @@ _RULE = re.compile(
     r"(?P<rate>\d+(?:\.\d+)?)\s*%\s*/\s*(?P<unit>day|hour)"
     r"(?:\s+up to\s+(?P<most>\d+(?:\.\d+)?)\s*%)?"
 )
-# What is left of the minute or day that is named
-_REST = {
-    "%Y-%m-%d %H:%M:%S": timedelta(0),
-    "%Y-%m-%d %H:%M": timedelta(seconds=59),
-    "%Y-%m-%d": timedelta(hours=23, minutes=59, seconds=59),
-}
+# Day, hour and minute, second, zone: of what is left out the end counts
+_DUE = re.compile(
+    r"(\d{4}-\d\d?-\d\d?)(?:[T ]+(\d\d?:\d\d)(:\d\d)?)?\s*(Z|[+-]\d\d:?\d\d|[A-Za-z]\S*)?"
+)
 # Moodle's strftimedaydatetime in English, with hours of twelve and of twenty-four
 _MOODLE_FORMATS = ("%A, %d %B %Y, %I:%M %p", "%A, %d %B %Y, %H:%M")
 
@@ -37,7 +35,6 @@ class LateRule:
     ----------
     share : float
         Of the most points, for every started unit.
-    unit_s : float
     most : float
         Share that is never exceeded.
     text : str
@@ -88,43 +85,23 @@ def due_time(text: str) -> datetime:
     SettingsError
         It is not such a time.
     """
-    words = text.strip().replace("T", " ", 1).split()
-    zone: tzinfo | None = None
-    if len(words) > 1 and (words[-1][:1].isalpha() or words[-1][:1] in "+-"):
-        zone = _zone(words.pop(), text)
-    elif offset := re.search(r"(?<=:\d\d)(Z|[+-]\d\d:?\d\d)$", words[-1] if words else ""):
-        words[-1] = words[-1].removesuffix(offset[0])
-        zone = _zone(offset[0], text)
-    for form, rest in _REST.items():
-        try:
-            found = datetime.strptime(" ".join(words), form)
-        except ValueError:
-            continue
-        found += rest
-        return found.replace(tzinfo=zone) if zone else found.astimezone()
-    raise SettingsError(
-        f"--due {text!r}: give a time such as '2026-11-20 23:59' or "
-        "'2026-11-20 23:59 Europe/Berlin'."
-    )
-
-
-def _zone(name: str, text: str) -> tzinfo:
-    if name == "Z":
-        name = "+00:00"
-    if name[0] in "+-":
-        try:
-            zone = datetime.strptime(name, "%z").tzinfo
-        except ValueError:
-            zone = None
-        if zone is not None:
-            return zone
+    match = _DUE.fullmatch(text.strip())
     try:
-        return ZoneInfo(name)
+        if match is None:
+            raise ValueError(text)
+        day, clock, seconds, zone = match.groups()
+        form = "%Y-%m-%d %H:%M:%S"
+        found = datetime.strptime(f"{day} {clock or '23:59'}{seconds or ':59'}", form)
+        if zone is None:
+            return found.astimezone()
+        offset = zone == "Z" or zone[0] in "+-"
+        known = datetime.strptime(zone, "%z").tzinfo if offset else ZoneInfo(zone)
     except (ZoneInfoNotFoundError, ValueError, OSError) as error:
         raise SettingsError(
-            f"--due {text!r}: there is no time zone {name!r}. Give one such as +01:00 or "
-            "Europe/Berlin."
+            f"--due {text!r}: give a time such as '2026-11-20 23:59', with or without a time zone "
+            "('+01:00' or 'Europe/Berlin') behind it."
         ) from error
+    return found.replace(tzinfo=known)
 
 
 def in_zone_of(time: datetime, due: datetime | None) -> datetime:

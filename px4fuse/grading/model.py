@@ -22,14 +22,12 @@ class Parameter:
 
     Attributes
     ----------
-    kind : {"number", "whole", "flag", "text", "texts"}
     default : object
         Where it is left out; None says that there is none, which leaves that part out.
     low, high : float
         Limits of a number, or of each.
     choices : tuple of str
         What a text may be; empty for anything.
-    required : bool
     """
 
     kind: Kind
@@ -46,7 +44,6 @@ class RubricItem:
 
     Attributes
     ----------
-    title : str
     points : float
         The most that it gives.
     check : str
@@ -66,33 +63,7 @@ class RubricItem:
 
 @dataclass(frozen=True)
 class Reading:
-    """From when on notes are a text of one's own; shares are of words.
-
-    Attributes
-    ----------
-    judged_from : float
-        Words below which nothing can be said.
-    shortest, longest : float
-        Words of a sentence.
-    in_sentences : float
-        Least share that is in sentences.
-    ids : float
-        Most that may be ids of findings, of a sentence and of all.
-    quoted : float
-        Most that may be in sentences of px4fuse.
-    packed : float
-        Least size, packed by zlib, against the text: what repeats itself packs well.
-    common : float
-        Least share of the five commonest words.
-    commonest : float
-        Most that one word may have.
-    terms : float
-        Most that may be words by which the rubric names mistakes.
-    about : float
-        Least share in sentences that hold a number or a word of the field.
-    most_named : float
-        Kinds of mistakes; who names more is guessing.
-    """
+    """From when on notes are a text of one's own: [notes] in rubric.toml explains each."""
 
     judged_from: float = 20
     shortest: float = 3
@@ -114,18 +85,15 @@ class Rubric:
 
     Attributes
     ----------
-    title : str
     unverified : {"pending", "zero"}
         What becomes of the points of a report that cannot be verified.
     others_log : {"pending", "zero", "count"}
         What becomes of those of a report on a log that was not given to the student.
     pages : {"count", "pending", "zero"}
         What becomes of those of a verified report whose pages look otherwise.
-    items : tuple of RubricItem
     words : dict
         Finding id to words by which notes may name it, and what says or changes something about
         them: see rubric.toml.
-    notes : Reading
     """
 
     title: str
@@ -149,7 +117,7 @@ class Submission:
         Name of the entry in the zip file, as it stands there; "" for a file.
     name : str
         For people: without folders of this machine, control characters or more than 200
-        characters. Unique within a run.
+        characters, a number behind it not counted. Unique within a run.
     time : datetime or None
         Of the entry in the zip file, in an unknown time zone: when the platform took it, or when
         it packed the zip file.
@@ -173,28 +141,28 @@ class Item:
 
 @dataclass(frozen=True)
 class Graded:
-    """One submission, graded.
+    """One submission, graded; texts and bytes are empty where there is nothing to say.
 
     Attributes
     ----------
     submission : str
         :attr:`Submission.name`.
     student, student_id : str
-        As the report says; "" where it does not.
+        As the report says.
     verdict : Verdict
-        "cannot verify" with the reason for what is no report.
+        "cannot verify" with the reason for what is not a report.
     items : tuple of Item
         In the rubric's order.
     flags : tuple of str
         What an instructor should look at: sentences.
     pending : str
-        One sentence: what the instructor can do so that the points count; "" where they count.
+        One sentence: what the instructor can do so that the points count.
     to_read : tuple of (str, str)
         What no rule can judge: why, and the passage of the notes.
     numbers : mapping
-        A few for the class table, by column title; absent ones are left out.
+        A few for the class table, by column title.
     sha256, log_sha256, version : str
-        Of the PDF, of the log it is about, and of px4fuse; "" where unknown.
+        Of the PDF, of the log it is about, and of px4fuse.
     settings : str
         Those chosen, to the last digit, for comparison between students; "" for usual ones.
     notes : str
@@ -204,17 +172,12 @@ class Graded:
         name it.
     handed_in : bytes
         PNG of a page as it was handed in: the cover where nothing could be redrawn, else the one
-        that differs most; empty without.
+        that differs most.
     page : int
         Which page that is, counted from 1.
-    sheets : tuple of str
-        Where pictures of the redrawn pages stand, relative to the class page.
-    handed_in_name : str
-        Where the PDF stands that was handed in, relative to the class page; "" without.
-    redrawn : bytes
-        The report drawn again from the log, as a PDF; empty without.
-    redrawn_name : str
-        Where that stands, relative to the class page; "" without.
+    sheets, handed_in_name, redrawn_name : tuple of str, str, str
+        Where pictures of the redrawn pages, the PDF that was handed in and the redrawn one stand,
+        relative to the class page.
     """
 
     submission: str
@@ -234,7 +197,6 @@ class Graded:
     mistakes: Mapping[str, bool] = field(default_factory=dict)
     handed_in: bytes = field(default=b"", repr=False)
     page: int = 1
-    redrawn: bytes = field(default=b"", repr=False)
     redrawn_name: str = ""
     sheets: tuple[str, ...] = ()
     handed_in_name: str = ""
@@ -287,7 +249,7 @@ class Entry:
     handed_in : str
         When the counting one was handed in, as the platform says; "" where unknown.
     late_s : float or None
-        After the due time (s), 0 in time; None where one of both is unknown.
+        After the due time (s), 0 in time; None where one of the two is unknown.
     deduction : float
         Points taken off for being late, from the sum over the items.
     overrides : mapping

@@ -1,33 +1,35 @@
-"""What findings and places in the results are called in a sentence."""
+"""Names that stay apart: of items, of submissions, of files."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Iterable
 
-from px4fuse.findings import names
-
-# Places in the results that the default rubric names
-PARTS: Mapping[str, str] = {
-    "axes.*.kf": "the consistency of the filter",
-    "clock": "the clock offset",
-    "loop.closure_error_m": "the closure error",
-    "loop.path_length_m": "the length of the path",
-    "loop.corrections": "the corrected paths",
-    "tuning": "the noises that the data ask for",
-    "tuning.horizontal.held_out.gain_nats": "what tuning would still gain",
-    "why": "why EKF2 differs",
-}
+from px4fuse.assignment.roster import RESERVED
 
 
-def part(path: str) -> str:
-    """A place in the results as part of a sentence."""
-    return PARTS.get(path, path)
+def distinct(names: Iterable[str], form: str = "{} ({})") -> list[str]:
+    """Names with a number behind those that came before, however they are capitalised.
 
-
-def named(finding: str) -> str:
-    """A finding as part of a sentence.
-
-    >>> named("source_gap"), named("of_a_later_version")
-    ('a time without positions', 'of a later version')
+    >>> distinct(["notes", "cover", "Notes"])
+    ['notes', 'cover', 'Notes (2)']
     """
-    return names().get(finding, finding.replace("_", " "))
+    made: dict[str, str] = {}
+    count: Counter[str] = Counter()
+    for name in names:
+        new, plain = name, name.casefold()
+        while new.casefold() in made:
+            count[plain] += 1
+            new = form.format(name, count[plain] + 1)
+        made[new.casefold()] = new
+    return list(made.values())
+
+
+def file_names(stems: Iterable[str]) -> list[str]:
+    """A name for each one's files, unique ignoring case: letters, digits, - and _ only."""
+    safe = (
+        "".join(c if c.isascii() and (c.isalnum() or c in "-_") else "_" for c in stem)[:60]
+        for stem in stems
+    )
+    usable = (f"report_{s}" if not s or s.casefold() in RESERVED else s for s in safe)
+    return distinct(usable, "{}-{}")

@@ -37,7 +37,7 @@ COMMONEST = 5
 MIN_PACKED_BYTES = 600
 # Words of so many letters ("late", "rate", "offset") stand in any text
 COMMON_LETTERS = 4, 6
-# From so many words with letters of other scripts in them that is no slip
+# So many words with letters of other scripts in them are not there by mistake
 MANY_DISGUISED = 3
 
 WORD = re.compile(r"\w+")
@@ -65,8 +65,6 @@ class Sentence:
 
     Attributes
     ----------
-    text : str
-    words : tuple of str
     clause : tuple of int
         Which part between commas, colons and brackets each word is in.
     """
@@ -83,18 +81,9 @@ class Sentence:
 
 @dataclass(frozen=True)
 class Mention:
-    """How the notes speak of something.
-
-    Attributes
-    ----------
-    stance : {"claimed", "open", "denied"}
-    phrase : str
-        By which it was found.
-    passage : str
-    """
+    """How the notes speak of something."""
 
     stance: Stance
-    phrase: str
     passage: str
 
 
@@ -107,7 +96,7 @@ class Notes:
     sentences : tuple of Sentence
         Of the student's own: whole, none twice, none that px4fuse wrote.
     problem : str
-        Why they are no notes: the end of a sentence that begins with "your notes"; "" for notes.
+        Why they do not count: the end of a sentence that begins with "your notes"; "" for notes.
     disguised : int
         Words with letters in them that only look like what they are taken for.
     quoted : int
@@ -159,7 +148,7 @@ class Notes:
         for number in sorted(set.intersection(*where)):
             sentence = self.sentences[number]
             for stance in self._stances(sentence, stems):
-                yield Mention(stance, phrase, sentence.text)
+                yield Mention(stance, sentence.text)
 
     @cached_property
     def _index(self) -> dict[str, set[int]]:
@@ -181,7 +170,7 @@ class Notes:
         ]
         for chosen in islice(product(*places), MAX_TRIES):
             if not self.words_of_rubric.negations.isdisjoint(stems):
-                # "not closed" is no two words of one sentence
+                # "not closed" is not any two words of one sentence
                 span = chosen[-1] - chosen[0]
                 apart = sentence.clause[chosen[0]] != sentence.clause[chosen[-1]]
                 if apart or span > len(stems) + 1 or list(chosen) != sorted(set(chosen)):
@@ -237,7 +226,6 @@ def read_notes(
     ----------
     text : str
         Markdown. What a page does not show (comments, addresses' titles) is not read.
-    words : Words
     rules : Reading
         What makes a text of sentences, from the rubric.
     ids : collection of str
@@ -273,7 +261,7 @@ def _problem(
     ids: Collection[str],
     terms: Collection[str],
 ) -> str:
-    """Why a text is no text of the student's about a flight; "" where no rule can say so."""
+    """Why a text is not the student's own about a flight; "" where no rule can say so."""
     words = [word for sentence in own for word in sentence.words]
     length, names = sum(map(_weight, words)), sum(word in ids for word in words)
     if length + notes.quoted < rules.judged_from:

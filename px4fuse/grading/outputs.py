@@ -13,20 +13,22 @@ from dataclasses import dataclass, replace
 from importlib import metadata
 from pathlib import Path
 
-from px4fuse.assignment.roster import RESERVED
+from px4fuse.assignment.sheet import read_sheet
 from px4fuse.grading import exports, submissions
 from px4fuse.grading.anonymous import hidden_words
 from px4fuse.grading.class_page import html_text
 from px4fuse.grading.class_table import csv_text
+from px4fuse.grading.entries import Course
+from px4fuse.grading.feedback import returned_text
 from px4fuse.grading.gradescope import results
 from px4fuse.grading.model import Entry, Graded, Submission
+from px4fuse.grading.names import distinct, file_names
 from px4fuse.grading.overrides import NAME, TEMPLATE
 from px4fuse.grading.platforms import Origin, seen
 from px4fuse.grading.records import HANDED_IN, REDRAWN, file_of
-from px4fuse.grading.returned import returned_text
 from px4fuse.grading.roster import Register
-from px4fuse.grading.sheet import Sheet, read_sheet
-from px4fuse.grading.sheets import draw_sheets
+from px4fuse.grading.sheets import delete_others, draw_sheets
+from px4fuse.plain import few_words
 from px4fuse.spreadsheet import neutral, neutral_id
 from px4fuse.verification.model import Refused
 from px4fuse.writing import write_all
@@ -48,14 +50,8 @@ class Class:
 
     Attributes
     ----------
-    entries : tuple of Entry
     register : Register
         Its people are those of the first entries.
-    title : str
-    worksheets : tuple of Sheet
-    column : str
-        Of the worksheets, for the grade.
-    anonymous : bool
     origins : mapping
         Name of a submission to where it came from.
     files : mapping
@@ -65,9 +61,7 @@ class Class:
     entries: tuple[Entry, ...]
     register: Register
     title: str
-    worksheets: tuple[Sheet, ...]
-    column: str
-    anonymous: bool
+    course: Course
     origins: Mapping[str, Origin]
     files: Mapping[str, Submission]
 
@@ -89,11 +83,11 @@ def write_class(
         _with_files(entry, name, made, output, records)
         for entry, name in zip(made.entries, names, strict=True)
     ]
-    pictured = _with_sheets(written_out, output, made.anonymous, processes)
+    pictured = _with_sheets(written_out, output, made.course.anonymous, processes)
     texts = {at: returned_text(entry, made.title) for at, entry in enumerate(made.entries)}
     table, page, said = output / "class.csv", output / "class.html", output / NAME
     contents = {table: csv_text(made.entries).encode()}
-    if made.anonymous:
+    if made.course.anonymous:
         pictured, listed = _pseudonyms(pictured, output / NAMES)
         contents[output / NAMES] = listed.encode()
     made_with = f"px4fuse {metadata.version('px4fuse')}"
@@ -108,6 +102,8 @@ def write_class(
     grades, notes = _grades(made, texts)
     contents |= {output / GRADES / name: content for name, content in grades.items()}
     write_all(contents)
+    drawn = {Path(name).name for entry in pictured for one in entry.files for name in one.sheets}
+    delete_others(output / SHEETS, drawn)
     folders = [output / FEEDBACK, output / "gradescope"]
     if any(one.redrawn_name for entry in pictured for one in entry.files):
         folders = [output / REPORTS, output / SHEETS, *folders]
@@ -221,22 +217,14 @@ def _submission(entry: Entry) -> str:
     return entry.counting.submission if entry.counting else ""
 
 
-# ------------------------------------------------------------------ for learning platforms
-
-
 def _grades(made: Class, texts: Mapping[int, str]) -> tuple[dict[str, bytes], tuple[str, ...]]:
     """Files that a learning platform imports, by name, and what could not be entered."""
     contents: dict[str, bytes] = {}
     notes: list[str] = []
-    for sheet in made.worksheets:
-        filled = exports.filled(sheet, made.entries, made.register, made.column, texts)
-        name = next(
-            name
-            for number in itertools.count(1)
-            if (name := f"{sheet.path.stem}{f'-{number}' if number > 1 else ''}{sheet.path.suffix}")
-            not in contents
-        )
-        contents[name] = filled.sheet.content()
+    names = distinct((sheet.path.stem for sheet in made.course.worksheets), "{}-{}")
+    for sheet, name in zip(made.course.worksheets, names, strict=True):
+        filled = exports.filled(sheet, made.entries, made.register, made.course.column, texts)
+        contents[f"{name}{sheet.path.suffix}"] = filled.sheet.content()
         notes += filled.notes
     platforms = seen(made.origins.values())
     if "moodle" in platforms:
@@ -250,36 +238,16 @@ def _grades(made: Class, texts: Mapping[int, str]) -> tuple[dict[str, bytes], tu
     return contents, tuple(notes)
 
 
-# ------------------------------------------------------------------ names
-
-
 def _left_over(output: Path, names: Sequence[str]) -> tuple[str, ...]:
     """What an earlier run wrote for others: never taken away, but told."""
     others = sorted(p.stem for p in (output / FEEDBACK).glob("*.txt") if p.stem not in names)
     if not others:
         return ()
-    shown = ", ".join(others[:4]) + (", ..." if len(others) > 4 else "")
     return (
         f"feedback and gradescope also hold {len(others)} of an earlier run, which are not among "
-        f"these submissions: {shown}. Delete them if they are out of date.",
+        f"these submissions: {few_words(others, 4)}. Delete them if they are out of date.",
     )
 
 
 def _stem(entry: Entry) -> str:
     return entry.student_id or (Path(entry.counting.submission).stem if entry.counting else "")
-
-
-def file_names(stems: Sequence[str]) -> list[str]:
-    """A name for each one's files, unique ignoring case: letters, digits, - and _ only."""
-    taken: set[str] = set()
-    names = []
-    for stem in stems:
-        safe = "".join(c if c.isascii() and (c.isalnum() or c in "-_") else "_" for c in stem)[:60]
-        if not safe or safe.casefold() in RESERVED:
-            safe = f"report_{safe}"
-        name, number = safe, 2
-        while name.lower() in taken:
-            name, number = f"{safe}-{number}", number + 1
-        taken.add(name.lower())
-        names.append(name)
-    return names

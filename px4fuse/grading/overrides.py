@@ -8,10 +8,10 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from px4fuse.assignment.key import folded
+from px4fuse.assignment.sheet import read_sheet
 from px4fuse.errors import SettingsError
 from px4fuse.grading.model import Entry, Override
 from px4fuse.grading.roster import same_id
-from px4fuse.grading.sheet import read_sheet
 from px4fuse.results.reading import cleaned, one_line
 
 NAME = "overrides.csv"
@@ -79,8 +79,6 @@ def matched(
 
     Parameters
     ----------
-    overrides : mapping
-    entries : sequence of Entry
     items : sequence of sequence of str
         Titles of the items of each entry.
 

@@ -24,25 +24,25 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 
-PLATFORMS = ("moodle", "canvas", "blackboard", "gradescope", "ilias")
 METADATA = "submission_metadata.yml"
-_MOODLE = re.compile(
-    r"(?P<name>[^/]+?)_(?P<number>\d+)_assignsubmission_[a-z]+(?P<rest>_?(?:/|$)|_[^/]*$)"
-)
-_CANVAS = re.compile(r"(?P<name>[^\W\d_][^/_]*)(?P<late>_LATE)?_(?P<number>\d+)_\d+_[^/]+(?:/|$)")
-_BLACKBOARD = re.compile(
-    r"[^/]*_(?P<login>[^/_]+)_attempt_(?P<time>\d{4}-\d\d-\d\d-\d\d-\d\d-\d\d)(?:_[^/]*|\.[^/.]+)$"
-)
-_GRADESCOPE = re.compile(r"submission_(?P<number>\d+)(?:/|\.pdf$)")
-# a login has a letter, and a user's number is no year: "flight_lab_reports_2026/" is a folder
-_ILIAS = re.compile(
-    r"(?P<last>[^\W\d_][^/_]*)_(?P<first>[^\W\d_][^/_]*)_(?P<login>[^/]*[^\W\d_][^/]*)"
-    r"_(?P<number>(?!(?:19|20)\d\d/)\d+)/(?P<late>Late Submission - )?"
-)
-_PATTERNS = (
-    ("moodle", _MOODLE), ("canvas", _CANVAS), ("blackboard", _BLACKBOARD),
-    ("gradescope", _GRADESCOPE), ("ilias", _ILIAS),
-)  # fmt: skip
+# By platform: how its exports name files
+PLATFORMS = {
+    "moodle": re.compile(
+        r"(?P<name>[^/]+?)_(?P<number>\d+)_assignsubmission_[a-z]+(?P<rest>_?(?:/|$)|_[^/]*$)"
+    ),
+    "canvas": re.compile(
+        r"(?P<name>[^\W\d_][^/_]*)(?P<late>_LATE)?_(?P<number>\d+)_\d+_[^/]+(?:/|$)"
+    ),
+    "blackboard": re.compile(
+        r"[^/]*_(?P<login>[^/_]+)_attempt_(?P<time>\d{4}-\d\d-\d\d-\d\d-\d\d-\d\d)(?:_[^/]*|\.[^/.]+)$"
+    ),
+    "gradescope": re.compile(r"submission_(?P<number>\d+)(?:/|\.pdf$)"),
+    # a login has a letter, and a number is not a year: "flight_lab_reports_2026/" is a folder
+    "ilias": re.compile(
+        r"(?P<last>[^\W\d_][^/_]*)_(?P<first>[^\W\d_][^/_]*)_(?P<login>[^/]*[^\W\d_][^/]*)"
+        r"_(?P<number>(?!(?:19|20)\d\d/)\d+)/(?P<late>Late Submission - )?"
+    ),
+}
 _BLACKBOARD_TIME = "%Y-%m-%d-%H-%M-%S"
 _MAX_METADATA = 20_000_000
 
@@ -54,7 +54,7 @@ class Origin:
     Attributes
     ----------
     platform : str
-        One of :data:`PLATFORMS`; "" where the name is nobody's.
+        One of :data:`PLATFORMS`; "" where the name is of no platform.
     number : str
         The platform's own: Moodle's participant, Canvas's and ILIAS's user, Gradescope's
         submission. Never the university's.
@@ -91,7 +91,7 @@ def origin_of(name: str) -> Origin:
     parts = name.split("/")
     for index in range(len(parts)):
         tail = "/".join(parts[index:])
-        for platform, pattern in _PATTERNS:
+        for platform, pattern in PLATFORMS.items():
             match = pattern.match(tail)
             found = match and _origin(platform, match.groupdict())
             if found:

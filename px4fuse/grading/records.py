@@ -8,21 +8,21 @@ request. Rubric, answer key, roster and overrides are not in it.
 from __future__ import annotations
 
 import hashlib
-import json
 import re
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cache
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+
+import msgspec
 
 from px4fuse.errors import ResultsError
 from px4fuse.flight import Unavailable
 from px4fuse.results.contract import ComparisonResults, LoopResults, Reported, to_json
 from px4fuse.results.reading import read_results
 from px4fuse.verification.intake import read_report
-from px4fuse.verification.model import Difference, PageDifference, Refused, Report, Verdict
+from px4fuse.verification.model import Refused, Report, Seal, Verdict
 from px4fuse.verification.pages import page_texts
 from px4fuse.verification.pictures import key_page, picture
 from px4fuse.verification.rerun import log_sha256
@@ -35,22 +35,23 @@ THE_FILE = "The file"
 _SHA256 = re.compile(rb'"([0-9a-f]{64})"')
 
 
+# A report without its bytes, with the pages of the redrawn one as far as there is one; what was
+# found; and which page the pictures show, counted from 1
+Verified = tuple[Report, Verdict, int]
+
+
 @dataclass(frozen=True)
-class Verified:
-    """A report as it was found to be; pictures and the redrawn PDF stay in their files.
+class _Kept:
+    """What a record says besides its other files; of a refused file only why."""
 
-    Attributes
-    ----------
-    report : Report
-        Without its bytes; its pages are those of the redrawn report, as far as there is one.
-    verdict : Verdict
-    page : int
-        Which page the pictures show, counted from 1.
-    """
-
-    report: Report
-    verdict: Verdict
-    page: int
+    made_with: dict[str, str]
+    refused: str = ""
+    files: dict[str, bool] = field(default_factory=dict)
+    gap: bool = False
+    verdict: Verdict | None = None
+    seal: Seal = "missing"
+    pages: tuple[str, ...] = ()
+    page: int = 1
 
 
 def file_of(records: Path, sha256: str, end: str = ".json") -> Path:
@@ -65,7 +66,6 @@ def verified(
 
     Parameters
     ----------
-    records : Path
     pdf : bytes
         Anything.
     logs : mapping
@@ -85,7 +85,7 @@ def verified(
         return found, True
     report = read_report(pdf, THE_FILE)
     if isinstance(report, Refused):
-        _keep(records, sha256, {"refused": report.reason, "files": {}, "gap": False}, {})
+        _keep(records, sha256, _Kept(_versions(), report.reason), {})
         return report, False
     gap = _is_gap(report.results, logs, handed_out)
     verdict = verify(report, {} if gap else logs)
@@ -94,21 +94,16 @@ def verified(
     page = _page_to_show(verdict, seen)
     handed_in = picture(pdf, page - 1) if verdict.pages or not verdict.redrawn else b""
     results = to_json(report.results).encode()
-    values = {
-        "files": {name: name in logs for name in _named(results)},
-        "gap": gap,
-        "verdict": asdict(replace(verdict, redrawn=b"")) | {"redrawn": ""},
-        "seal": report.seal,
-        "pages": seen.pages,
-        "page": page,
-    }
+    unread = replace(verdict, redrawn=b"")
+    files = {name: name in logs for name in _named(results)}
+    kept = _Kept(_versions(), "", files, gap, unread, report.seal, seen.pages, page)
     parts = {
         RESULTS: results,
         HANDED_IN: b"" if isinstance(handed_in, Unavailable) else handed_in,
         REDRAWN: verdict.redrawn,
     }
-    _keep(records, sha256, values, parts)
-    return Verified(replace(seen, pdf=b""), replace(verdict, redrawn=b""), page), False
+    _keep(records, sha256, kept, parts)
+    return (replace(seen, pdf=b""), unread, page), False
 
 
 def _is_gap(results: Reported, logs: Mapping[str, Path], handed_out: frozenset[str]) -> bool:
@@ -139,12 +134,9 @@ def _versions() -> dict[str, str]:
     return found
 
 
-def _keep(
-    records: Path, sha256: str, values: Mapping[str, Any], parts: Mapping[str, bytes]
-) -> None:
-    text = json.dumps({"made_with": _versions(), **values}, ensure_ascii=False, indent=1)
+def _keep(records: Path, sha256: str, kept: _Kept, parts: Mapping[str, bytes]) -> None:
     files = {file_of(records, sha256, end): content for end, content in parts.items()}
-    write_all({**files, file_of(records, sha256): text.encode()})
+    write_all({**files, file_of(records, sha256): msgspec.json.encode(kept)})
 
 
 def _recalled(
@@ -152,34 +144,19 @@ def _recalled(
 ) -> Verified | Refused | None:
     """What an earlier run found, if nothing that it rests on has changed."""
     try:
-        kept = json.loads(file_of(records, sha256).read_text(encoding="utf-8"))
-        if kept["made_with"] != _versions():
+        kept = msgspec.json.decode(file_of(records, sha256).read_bytes(), type=_Kept)
+        if kept.made_with != _versions():
             return None
-        if "refused" in kept:
-            return Refused(str(kept["refused"]))
+        if kept.verdict is None:
+            return Refused(kept.refused)
         data = file_of(records, sha256, RESULTS).read_bytes()
         results = read_results(data)
-        files = kept["files"]
-        if not isinstance(results, ComparisonResults | LoopResults) or files != {
-            name: name in logs for name in _named(data)
-        }:
-            return None
-        if kept["gap"] != _is_gap(results, logs, handed_out):
-            return None
-        report = Report(sha256, 0, kept["seal"], results, tuple(kept["pages"]), b"")
-        return Verified(report, _verdict_from(kept["verdict"]), int(kept["page"]))
     # none, or not one of ours: done again
-    except (OSError, ValueError, KeyError, TypeError, ResultsError):
+    except (OSError, msgspec.MsgspecError, ResultsError):
         return None
-
-
-def _verdict_from(values: Mapping[str, Any]) -> Verdict:
-    return Verdict(
-        **{
-            **values,
-            "redrawn": b"",
-            "reasons": tuple(values["reasons"]),
-            "differences": tuple(Difference(**one) for one in values["differences"]),
-            "pages": tuple(PageDifference(**one) for one in values["pages"]),
-        }
-    )
+    if not isinstance(results, ComparisonResults | LoopResults):
+        return None
+    files = {name: name in logs for name in _named(data)}
+    if kept.files != files or kept.gap != _is_gap(results, logs, handed_out):
+        return None
+    return Report(sha256, 0, kept.seal, results, kept.pages, b""), kept.verdict, kept.page

@@ -7,21 +7,20 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
 from px4fuse.assignment.key import AnswerKey, folded
-from px4fuse.assignment.roster import FIRST_NAME_COLUMNS, LAST_NAME_COLUMNS, NAME_COLUMNS
+from px4fuse.assignment.roster import (
+    EMAIL_COLUMNS,
+    ID_COLUMNS,
+    LAST_NAME_COLUMNS,
+    LOGIN_COLUMNS,
+    MAX_NAME,
+    NAME_COLUMNS,
+    full_name,
+)
+from px4fuse.assignment.sheet import Sheet
 from px4fuse.errors import SettingsError
 from px4fuse.grading.platforms import Origin
-from px4fuse.grading.sheet import Sheet
 from px4fuse.results.reading import one_line
 
-# Column titles, letters and digits only, best first. The university's own id; Canvas's "ID",
-# Moodle's "Identifier" and ILIAS's "User ID" are the platform's and stand below
-ID_COLUMNS = (
-    "studentid", "studentnumber", "studentno", "idnumber", "matriculationnumber", "matriculation",
-    "matrikelnummer", "matrikelnr", "orgdefinedid", "sisuserid", "sid", "id", "number",
-)  # fmt: skip
-LOGIN_COLUMNS = ("username", "login", "sisloginid", "loginid", "user", "benutzername")
-EMAIL_COLUMNS = ("emailaddress", "email", "mail", "emailadresse")
-MAX_NAME = 200
 # Of Canvas, above the students
 NOT_STUDENTS = ("pointspossible", "studenttest")
 
@@ -59,38 +58,14 @@ def people_of_sheet(sheet: Sheet) -> tuple[Person, ...]:
     SettingsError
         No column tells who somebody is, or two rows have the same id.
     """
-    canvas = sheet.column(("sisuserid", "sisloginid")) is not None
-    ids = tuple(name for name in ID_COLUMNS if not (canvas and name == "id"))
+    _, ids = _ids(sheet)
     known = (ids, LOGIN_COLUMNS, EMAIL_COLUMNS, NAME_COLUMNS, LAST_NAME_COLUMNS)
     if not any(sheet.column(titles) is not None for titles in known):
         raise SettingsError(
             f"{sheet.path}: no column tells who a student is. Give one a title such as id, email "
             "or name."
         )
-    people = []
-    for row in sheet.rows:
-        name = one_line(sheet.cell(row, NAME_COLUMNS), MAX_NAME) or " ".join(
-            part
-            for titles in (FIRST_NAME_COLUMNS, LAST_NAME_COLUMNS)
-            if (part := one_line(sheet.cell(row, titles), MAX_NAME))
-        )
-        if re.sub(r"\W", "", name.casefold()) in NOT_STUDENTS:
-            continue
-        email = one_line(sheet.cell(row, EMAIL_COLUMNS), MAX_NAME)
-        login = one_line(sheet.cell(row, LOGIN_COLUMNS), MAX_NAME)
-        numbers = {}
-        if participant := re.search(r"\d+$", sheet.cell(row, ("identifier",))):
-            numbers["moodle"] = participant[0]
-        if canvas and (user := sheet.cell(row, ("id",))):
-            numbers["canvas"] = user
-        student_id = one_line(sheet.cell(row, ids), MAX_NAME) or login or email
-        if student_id or name or numbers:
-            people.append(Person(student_id, name, email, login, numbers))
-    _check_unique(sheet, people)
-    return tuple(people)
-
-
-def _check_unique(sheet: Sheet, people: Sequence[Person]) -> None:
+    people = [one for row in sheet.rows if (one := person_of_row(sheet, row))]
     seen: set[str] = set()
     for person in people:
         wanted = folded(person.student_id)
@@ -100,6 +75,31 @@ def _check_unique(sheet: Sheet, people: Sequence[Person]) -> None:
                 "every student one of its own."
             )
         seen.add(wanted)
+    return tuple(people)
+
+
+def person_of_row(sheet: Sheet, row: Sequence[str]) -> Person | None:
+    """Whom a row of such a table is about; None for a row that is about nobody."""
+    canvas, ids = _ids(sheet)
+    name = full_name(sheet, row)
+    if re.sub(r"\W", "", name.casefold()) in NOT_STUDENTS:
+        return None
+    email = one_line(sheet.cell(row, EMAIL_COLUMNS), MAX_NAME)
+    login = one_line(sheet.cell(row, LOGIN_COLUMNS), MAX_NAME)
+    numbers = {}
+    if participant := re.search(r"\d+$", sheet.cell(row, ("identifier",))):
+        numbers["moodle"] = participant[0]
+    if canvas and (user := sheet.cell(row, ("id",))):
+        numbers["canvas"] = user
+    student_id = one_line(sheet.cell(row, ids), MAX_NAME) or login or email
+    found = Person(student_id, name, email, login, numbers)
+    return found if student_id or name or numbers else None
+
+
+def _ids(sheet: Sheet) -> tuple[bool, list[str]]:
+    """Whether a table is Canvas's, and titles of the university's ids."""
+    canvas = sheet.column(("sisuserid", "sisloginid")) is not None
+    return canvas, [name for name in ID_COLUMNS if not (canvas and name == "id")]
 
 
 def people_of_key(key: AnswerKey) -> tuple[Person, ...]:
@@ -129,59 +129,45 @@ class Register:
 
     def place(self, other: Person) -> int | None:
         """Where somebody stands of whom another list knows: by number, id, email, login or name."""
-        looks: tuple[Callable[[], int | None], ...] = (
+        looks: tuple[Callable[[Person], bool], ...] = (
             *(
-                lambda platform=platform, said=said: self._of(
-                    lambda one: one.numbers.get(platform, ""), said
-                )
+                lambda one, at=platform, said=said: _same(one.numbers.get(at, ""), said)
                 for platform, said in other.numbers.items()
             ),
-            lambda: self._by_id(other.student_id),
-            lambda: self._of(lambda one: one.email, other.email),
-            lambda: self._of(lambda one: one.login, other.login),
-            lambda: self._by_name(other.name),
+            lambda one: _same(one.student_id, other.student_id),
+            lambda one: same_id(one.student_id, other.student_id),
+            lambda one: _same(one.email, other.email),
+            # Blackboard's user name and ILIAS's login are ids where the roster has no other
+            lambda one: _same(one.login or one.student_id, other.login),
+            lambda one: same_name(one.name, other.name),
         )
-        return next((at for look in looks if (at := look()) is not None), None)
+        for look in looks:
+            places = [place for place, one in enumerate(self.people) if look(one)]
+            if len(places) == 1:
+                return places[0]
+        return None
 
     def by_platform(self, origin: Origin) -> int | None:
         """Whose file it is by what the platform says, which no student can change."""
         if not origin.platform:
             return None
-        looks: tuple[Callable[[], int | None], ...] = (
-            lambda: self._of(lambda one: one.numbers.get(origin.platform, ""), origin.number),
-            lambda: self._by_id(origin.student_id),
-            lambda: self._of(lambda one: one.email, origin.email),
-            # Blackboard's user name and ILIAS's login are ids where the roster has no other
-            lambda: self._of(lambda one: one.login or one.student_id, origin.login),
-            lambda: self._by_name(origin.name),
+        return self.place(
+            Person(
+                origin.student_id,
+                origin.name,
+                origin.email,
+                origin.login,
+                {origin.platform: origin.number} if origin.number else {},
+            )
         )
-        return next((at for look in looks if (at := look()) is not None), None)
-
-    def of_platform(self, origin: Origin) -> Person | None:
-        """Whose file it is, as :meth:`by_platform`."""
-        place = self.by_platform(origin)
-        return None if place is None else self.people[place]
 
     def by_report(self, student_id: str, name: str) -> int | None:
         """Whose report it is by what stands in it: the id, else the name."""
-        found = self._by_id(student_id)
-        return self._by_name(name) if found is None else found
+        return self.place(Person(student_id, name))
 
-    def _by_id(self, student_id: str) -> int | None:
-        found = self._of(lambda one: one.student_id, student_id)
-        if found is None:
-            found = self._only(lambda one: same_id(one.student_id, student_id))
-        return found
 
-    def _by_name(self, name: str) -> int | None:
-        return self._only(lambda one: same_name(one.name, name))
-
-    def _of(self, known: Callable[[Person], str], said: str) -> int | None:
-        return self._only(lambda one: folded(known(one)) == folded(said) != "")
-
-    def _only(self, look: Callable[[Person], bool]) -> int | None:
-        places = [place for place, one in enumerate(self.people) if look(one)]
-        return places[0] if len(places) == 1 else None
+def _same(known: str, said: str) -> bool:
+    return folded(known) == folded(said) != ""
 
 
 def same_id(one: str, other: str) -> bool:

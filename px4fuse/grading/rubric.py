@@ -77,7 +77,7 @@ def parse_rubric(text: str, where: str) -> Rubric:
     """Check the text of a rubric; ``where`` names it in errors."""
     try:
         given = tomllib.loads(text.replace("\r\n", "\n"))
-    # integers of a million digits are no TOMLDecodeError
+    # an integer of a million digits is a ValueError of another kind
     except (ValueError, RecursionError) as error:
         why = str(error).splitlines()[0] if isinstance(error, tomllib.TOMLDecodeError) else ""
         raise SettingsError(

@@ -7,15 +7,14 @@ no points and a comment, never an exception.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from px4fuse.assignment.key import AnswerKey
-from px4fuse.findings import SEVERITIES
+from px4fuse.findings import SEVERITIES, named
 from px4fuse.grading import checks_filter, checks_loop, checks_mistakes, checks_report
 from px4fuse.grading.checks_filter import SIGMAS
 from px4fuse.grading.evidence import Evidence, Scorer, reason_of, text_of
-from px4fuse.grading.model import Doubtful, Item, Parameter, Rubric, RubricItem
-from px4fuse.grading.names import named
+from px4fuse.grading.model import Doubtful, Graded, Item, Parameter, Rubric, RubricItem
 from px4fuse.grading.notes import MANY_DISGUISED
 from px4fuse.verification.model import Refused, Report, Verdict
 
@@ -104,45 +103,17 @@ CHECKS: Mapping[str, Check] = {
 }
 
 
-# ------------------------------------------------------------------ points
-
-
-@dataclass(frozen=True)
-class Assessment:
-    """What one report is worth, and what an instructor should know of it.
-
-    Attributes
-    ----------
-    items : tuple of Item
-        In the rubric's order.
-    pending : str
-        What the instructor can do so that the points count; "" where they do.
-    flags : tuple of str
-        What stands out: sentences.
-    to_read : tuple of (str, str)
-        What no rule can judge: why, and the passage of the notes.
-    mistakes : mapping
-        What the answer key says is wrong in the student's own flight, in words, and whether the
-        notes name it.
-    """
-
-    items: tuple[Item, ...]
-    pending: str = ""
-    flags: tuple[str, ...] = ()
-    to_read: tuple[tuple[str, str], ...] = ()
-    mistakes: Mapping[str, bool] = field(default_factory=dict)
-
-
 def assess(
     report: Report,
     verdict: Verdict,
     rubric: Rubric,
     key: AnswerKey | None,
     owner_id: str = "",
-) -> Assessment:
+) -> Graded:
     """Points for one report, whether they count, and what is left for the instructor.
 
-    Items for another kind of report are left out, and without an answer key those on mistakes.
+    Items for another kind of report are left out, and without an answer key those on mistakes. The
+    names of the file, and what :mod:`px4fuse.grading.grade` knows of it, are for the caller to add.
     ``owner_id`` is that of who handed it in, where a platform says so, whatever the report says.
     """
     evidence = Evidence(report, verdict, rubric, key, owner_id)
@@ -157,12 +128,16 @@ def assess(
         least = -1.0 if item.check in COSTLY else 0.0
         points = round(item.points * min(max(share, least), 1.0), 2)
         made.append(Item(item.title, points, item.points, comment[:1].upper() + comment[1:]))
-    return Assessment(
+    return Graded(
+        "",
+        report.results.student.name,
+        report.results.student.id,
+        verdict,
         tuple(made),
-        why if fate == "pending" else "",
-        (*_notes_flags(evidence), *checks_loop.contradictions(evidence)),
-        tuple(_to_read(evidence)),
-        _mistakes(evidence),
+        flags=(*_notes_flags(evidence), *checks_loop.contradictions(evidence)),
+        pending=why if fate == "pending" else "",
+        to_read=tuple(_to_read(evidence)),
+        mistakes=_mistakes(evidence),
     )
 
 
@@ -247,15 +222,16 @@ def _to_read(evidence: Evidence) -> Iterator[tuple[str, str]]:
     yield from ((f"{why}.", text_of(said)) for why, said in lines[:MOST_TO_READ])
 
 
-def refused(rubric: Rubric, key: AnswerKey | None, why: Refused) -> Assessment:
-    """No points for what is no report, so that it stands in the table with the others."""
+def refused(rubric: Rubric, key: AnswerKey | None, why: Refused) -> Graded:
+    """No points for what is not a report, so that it stands in the table with the others."""
     comment = f"No points, since the file could not be read as a report: {text_of(why.reason)}"
     items = (
         Item(item.title, 0.0, item.points, comment)
         for item in rubric.items
         if _applies(item, key, "compare")
     )
-    return Assessment(tuple(items), why.remedy)
+    verdict = Verdict("cannot verify", (why.reason,), with_log=False)
+    return Graded("", "", "", verdict, tuple(items), pending=why.remedy)
 
 
 def _applies(item: RubricItem, key: AnswerKey | None, kind: str) -> bool:

@@ -9,12 +9,14 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Collection, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
 from px4fuse.flight import Unavailable
-from px4fuse.grading.workers import Failed, run_bounded
+from px4fuse.grading.workers import run_bounded
 from px4fuse.verification.pictures import page_pictures
 from px4fuse.writing import write_all
 
@@ -22,6 +24,8 @@ TIMEOUT_S = 120.0
 MEMORY_BYTES = 4_000_000_000
 # What a picture looks like besides its report; a change draws all anew
 DRAWN_AS = "700 px, 16 colours"
+# Which reports this tool has drawn into a folder: pictures of no others are ever deleted
+LIST = "drawn.txt"
 
 
 @dataclass(frozen=True)
@@ -49,7 +53,6 @@ def draw_sheets(
     ----------
     reports : mapping
         Key to the redrawn PDF, and the words that its pictures must not show.
-    folder : Path
     processes : int, optional
         By default as many as there are cores.
 
@@ -67,29 +70,28 @@ def draw_sheets(
     stems = {key: job.stem for key, job in jobs.items()}
     made = {key: found for key, stem in stems.items() if (found := _drawn(folder, stem))}
     missing = [key for key in jobs if key not in made]
-
-    def done(index: int, count: int | Failed) -> None:
-        found = _drawn(folder, stems[missing[index]])
-        if found:
-            made[missing[index]] = found
-
-    run_bounded(
+    if jobs:
+        _list(folder, _listed(folder).union(stems.values()))
+    work = run_bounded(
         draw,
         [jobs[key] for key in missing],
         processes=min(processes or os.cpu_count() or 1, len(missing)),
         timeout_s=TIMEOUT_S,
         memory_bytes=MEMORY_BYTES,
-        on_done=done,
-        keep=False,
     )
+    with closing(work):
+        for index, _ in work:
+            key = missing[index]
+            if found := _drawn(folder, stems[key]):
+                made[key] = found
     return made
 
 
-def draw(job: Job) -> int:
-    """Write the pictures of one report; how many there are."""
+def draw(job: Job) -> None:
+    """Write the pictures of one report, if it can be drawn."""
     drawn = page_pictures(job.pdf.read_bytes(), job.hide)
     if isinstance(drawn, Unavailable):
-        return 0
+        return
     stem = job.stem
     write_all(
         {
@@ -97,7 +99,33 @@ def draw(job: Job) -> int:
             for number, picture in enumerate(drawn, start=1)
         }
     )
-    return len(drawn)
+
+
+def delete_others(folder: Path, names: Collection[str]) -> None:
+    """Delete what :func:`draw_sheets` drew into a folder, but for the files of these names.
+
+    Raises
+    ------
+    OutputError
+        The folder cannot be written.
+    """
+    kept = {name.partition("-")[0] for name in names}
+    listed = _listed(folder)
+    for stem in listed - kept:
+        for path in folder.glob(f"{stem}-*-of-*.png"):
+            path.unlink(missing_ok=True)
+    if not listed <= kept:
+        _list(folder, listed & kept)
+
+
+def _listed(folder: Path) -> set[str]:
+    path = folder / LIST
+    words = path.read_text(encoding="utf-8").split() if path.is_file() else []
+    return {word for word in words if re.fullmatch(r"[0-9a-f]{16}", word)}
+
+
+def _list(folder: Path, stems: Collection[str]) -> None:
+    write_all({folder / LIST: "".join(f"{stem}\n" for stem in sorted(stems)).encode()})
 
 
 def _drawn(folder: Path, stem: str) -> tuple[str, ...]:

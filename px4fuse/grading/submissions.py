@@ -13,14 +13,16 @@ import struct
 import zipfile
 import zlib
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 from typing import IO
 
 from px4fuse.errors import SettingsError
 from px4fuse.grading.model import Submission
+from px4fuse.grading.names import distinct
 from px4fuse.grading.platforms import METADATA, Origin, gradescope_metadata
 from px4fuse.results.reading import cleaned, one_line
 from px4fuse.verification.intake import MAX_BYTES
@@ -41,6 +43,7 @@ ZIP_EPOCH = 1980
 # Entry as Submission keeps it, its name for people, and when it was changed
 Found = tuple[str, str, datetime | None]
 
+_TOO_LARGE = f"larger than {MAX_BYTES // 1_000_000} MB; reports are below 2 MB."
 # Between a zip file's entry and the entry of the zip file in it; no name can hold it
 _INSIDE = "\0"
 _ENCRYPTED = 1
@@ -88,7 +91,7 @@ def collect(paths: Sequence[Path]) -> tuple[tuple[Submission, ...], tuple[str, .
                 found.setdefault((file, ""), (name, None))
             elif name.lower().endswith(".zip"):
                 prefix = f"{name}/" if path.is_dir() else ""
-                for entry, inner, time in _entries_of_file(file, name, notes, others):
+                for entry, inner, time in _entries(partial(_outer, file), name, notes, others):
                     found.setdefault((file, entry), (prefix + inner, time))
             else:
                 others[_kind(name)] += 1
@@ -100,7 +103,7 @@ def collect(paths: Sequence[Path]) -> tuple[tuple[Submission, ...], tuple[str, .
         why = f" {' '.join(notes)}" if notes else ""
         raise SettingsError(one_line(f"No PDF was found in what was given.{why}", 500))
     order = sorted(found.items(), key=lambda item: (item[1][0].casefold(), item[1][0], item[0]))
-    names = _unique(_shown(name) for _, (name, _) in order)
+    names = distinct(_shown(name) for _, (name, _) in order)
     made = (
         Submission(*where, name, time)
         for (where, (_, time)), name in zip(order, names, strict=True)
@@ -116,7 +119,7 @@ def read(submission: Submission) -> bytes | Refused:
         if not submission.entry:
             with submission.file.open("rb") as file:
                 content = file.read(MAX_BYTES + 1)
-            return content if len(content) <= MAX_BYTES else _refused(submission, _too_large())
+            return content if len(content) <= MAX_BYTES else _refused(submission, _TOO_LARGE)
         outer, _, inner = submission.entry.partition(_INSIDE)
         with submission.file.open("rb") as file, _archive(file) as archive:
             content = _unpacked(archive, outer)
@@ -225,7 +228,7 @@ def _files(path: Path, notes: list[str]) -> Iterator[tuple[Path, str]]:
             if _hidden(file):
                 continue
             resolved = whole.resolve()
-            # a named pipe would keep us waiting for ever
+            # a named pipe would keep us waiting forever
             if not resolved.is_relative_to(root) or not resolved.is_file():
                 outside += 1
                 continue
@@ -242,59 +245,58 @@ def _hidden(name: str) -> bool:
 
 
 def _kind(name: str) -> str:
-    """What to call a file that is no PDF."""
+    """What to call a file that is not a PDF."""
     suffix = Path(name).suffix.lower()
     return suffix if re.fullmatch(r"\.[a-z0-9]{1,8}", suffix) else "without a known suffix"
 
 
-def _entries_of_file(
-    file: Path, name: str, notes: list[str], others: Counter[str]
+def _entries(
+    opened: Callable[[], IO[bytes]],
+    name: str,
+    notes: list[str],
+    others: Counter[str],
+    is_inner: bool = False,
 ) -> Iterator[Found]:
-    """PDFs in a zip file."""
+    """PDFs in a zip file, and in the zip files in it, with the time of the outer entry."""
     shown = _shown(name)
     try:
-        with file.open("rb") as stream, _archive(stream) as archive:
+        with opened() as stream, _archive(stream) as archive:
             inner_left = MAX_INNER_BYTES
             for entry, label in _listed(archive, shown, notes):
+                # the student set the clock of what is in an inner zip file
+                time = _time(entry)
                 if label.lower().endswith(".pdf"):
-                    yield entry, label, _time(archive.getinfo(entry))
-                elif label.lower().endswith(".zip"):
-                    inner_left -= archive.getinfo(entry).file_size
+                    yield entry.filename, label, time
+                elif not label.lower().endswith(".zip"):
+                    others[_kind(label)] += 1
+                elif is_inner:
+                    notes.append(f"{shown}: a zip file in it was passed over: too deep.")
+                else:
+                    inner_left -= entry.file_size
                     if inner_left < 0:
                         notes.append(
                             f"{shown}: it holds too many zip files; the rest of it was passed over."
                         )
                         return
-                    yield from _entries_inside(archive, entry, label, notes, others)
-                else:
-                    others[_kind(label)] += 1
+                    content = partial(_inner, archive, entry.filename)
+                    for inside, inner_label, _ in _entries(content, label, notes, others, True):
+                        yield f"{entry.filename}{_INSIDE}{inside}", f"{label}/{inner_label}", time
     except (_EntryError, MemoryError, *_DAMAGED) as error:
         why = str(error) if isinstance(error, _EntryError) else "not a zip file, or damaged."
         notes.append(f"{shown}: passed over: {why}")
 
 
-def _entries_inside(
-    archive: zipfile.ZipFile, entry: str, label: str, notes: list[str], others: Counter[str]
-) -> Iterator[Found]:
-    """PDFs in a zip file in a zip file, with the time of the outer one."""
-    shown = _shown(label)
-    # the student set the clock of what is in the inner one
-    time = _time(archive.getinfo(entry))
-    try:
-        with _archive(io.BytesIO(_unpacked(archive, entry))) as inner:
-            for inner_entry, inner_label in _listed(inner, shown, notes):
-                if inner_label.lower().endswith(".pdf"):
-                    yield f"{entry}{_INSIDE}{inner_entry}", f"{label}/{inner_label}", time
-                elif inner_label.lower().endswith(".zip"):
-                    notes.append(f"{shown}: a zip file in it was passed over: too deep.")
-                else:
-                    others[_kind(inner_label)] += 1
-    except (_EntryError, MemoryError, *_DAMAGED) as error:
-        why = str(error) if isinstance(error, _EntryError) else "not a zip file, or damaged."
-        notes.append(f"{shown}: passed over: {why}")
+def _outer(file: Path) -> IO[bytes]:
+    return file.open("rb")
 
 
-def _listed(archive: zipfile.ZipFile, shown: str, notes: list[str]) -> Iterator[tuple[str, str]]:
+def _inner(archive: zipfile.ZipFile, name: str) -> IO[bytes]:
+    return io.BytesIO(_unpacked(archive, name))
+
+
+def _listed(
+    archive: zipfile.ZipFile, shown: str, notes: list[str]
+) -> Iterator[tuple[zipfile.ZipInfo, str]]:
     """Entries of a zip file that are files and not hidden, with their names for people."""
     entries = [entry for entry in archive.infolist() if not entry.is_dir()]
     # the declared size is the most that zipfile unpacks of an entry, so a lie makes it smaller
@@ -309,7 +311,7 @@ def _listed(archive: zipfile.ZipFile, shown: str, notes: list[str]) -> Iterator[
     for entry in last.values():
         label = _label(entry)
         if not any(map(_hidden, label.split("/"))):
-            yield entry.filename, label
+            yield entry, label
 
 
 def _time(entry: zipfile.ZipInfo) -> datetime | None:
@@ -344,18 +346,14 @@ def _unpacked(archive: zipfile.ZipFile, name: str) -> bytes:
     if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
         raise _EntryError("packed in its zip file by a method that is not read.")
     if entry.file_size > MAX_BYTES:
-        raise _EntryError(_too_large())
+        raise _EntryError(_TOO_LARGE)
     if entry.file_size > 1_000_000 and entry.file_size > MAX_RATIO * entry.compress_size:
         raise _EntryError(f"it shrinks more than {MAX_RATIO} times in its zip file: no report.")
     with archive.open(entry) as stream:
         content = stream.read(MAX_BYTES + 1)
     if len(content) > MAX_BYTES:
-        raise _EntryError(_too_large())
+        raise _EntryError(_TOO_LARGE)
     return content
-
-
-def _too_large() -> str:
-    return f"larger than {MAX_BYTES // 1_000_000} MB; reports are below 2 MB."
 
 
 def _refused(submission: Submission, reason: str) -> Refused:
@@ -371,16 +369,3 @@ def _shown(name: str) -> str:
     if len(line) > MAX_NAME:
         line = f"{line[: MAX_NAME // 2]}…{line[-(MAX_NAME - MAX_NAME // 2 - 1) :]}"
     return line or "nameless"
-
-
-def _unique(names: Iterable[str]) -> Iterator[str]:
-    taken: set[str] = set()
-    used: Counter[str] = Counter()
-    for name in names:
-        made = name
-        while made.casefold() in taken:
-            used[name.casefold()] += 1
-            ending = f" ({used[name.casefold()] + 1})"
-            made = f"{name[: MAX_NAME - len(ending)]}{ending}"
-        taken.add(made.casefold())
-        yield made

@@ -1,8 +1,8 @@
-"""Work on what strangers wrote, in processes that may hang, crash or eat memory.
+"""Work on what strangers wrote, in processes that may hang, crash or take all memory.
 
 Neither pool of the standard library can do this. ``concurrent.futures`` cannot end one running
 job: a worker that is killed breaks the whole pool (BrokenProcessPool). ``multiprocessing.Pool``
-waits for ever for the result of a worker that died. So: one pipe per process, and a clock.
+waits forever for the result of a worker that died. So: one pipe per process, and a clock.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import os
 import pickle
 import signal
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
@@ -53,7 +53,7 @@ class Failed:
 class _Worker:
     """A process, our end of its pipe, and the job it has."""
 
-    def __init__(self, function: Callable[[Any], Any], memory_bytes: int | None) -> None:
+    def __init__(self, function: Callable[[Any], Any], memory_bytes: int | None, job: int) -> None:
         # spawn: the same on Windows and macOS, and no copy of the parent's memory
         context = multiprocessing.get_context("spawn")
         self.pipe, theirs = context.Pipe()
@@ -64,7 +64,7 @@ class _Worker:
             self.process.start()
         theirs.close()  # so that the pipe ends when the process does
         self.ready = False
-        self.job: int | None = None
+        self.job = job
         self.jobs_done = 0
         self.sent = time.monotonic()
         self.deadline = time.monotonic() + START_S
@@ -83,19 +83,16 @@ def run_bounded(
     processes: int,
     timeout_s: float,
     memory_bytes: int | None,
-    on_done: Callable[[int, Result | Failed], object],
-    keep: bool = True,
-) -> list[Result | Failed]:
+) -> Generator[tuple[int, Result | Failed]]:
     """Call a function on every job, in processes of their own, each within bounds.
 
     A job whose process hangs, dies or takes too much memory is lost alone: its process is ended
-    and replaced. Whatever ends this function (an error, Ctrl-C) ends all processes.
+    and replaced. Whatever ends this generator (an error, Ctrl-C, its ``close``) ends all processes.
 
     Parameters
     ----------
     function : callable
         At the top level of a module; pickled, as are jobs and results.
-    jobs : sequence
     processes : int
         At once.
     timeout_s : float
@@ -104,28 +101,15 @@ def run_bounded(
         Address space of one process (RLIMIT_AS), libraries included, which take about 0.6 GB of it;
         None for no limit. Without effect on Windows, which has no such limit, and on macOS, which
         does not enforce it.
-    on_done : callable
-        Called here with the index of a job and its result, in the order in which they finish.
-    keep : bool
-        False: results go to ``on_done`` only, and the memory taken here does not grow with them.
 
-    Returns
-    -------
-    list
-        Results in the order of the jobs, :class:`Failed` where there is none; empty without
-        ``keep``.
+    Yields
+    ------
+    (int, object)
+        Index of a job and its result, :class:`Failed` where there is none, in the order in which
+        they finish.
     """
-    results: dict[int, Result | Failed] = {}
     waiting = list(range(len(jobs)))[::-1]
     workers: list[_Worker] = []
-
-    def done(worker: _Worker, result: Any) -> None:
-        index, worker.job = worker.job, None
-        worker.jobs_done += time.monotonic() - worker.sent >= QUICK_S
-        if index is not None:
-            if keep:
-                results[index] = result
-            on_done(index, result)
 
     def drop(worker: _Worker) -> None:
         workers.remove(worker)
@@ -134,9 +118,8 @@ def run_bounded(
     try:
         while waiting or workers:
             while waiting and len(workers) < max(1, processes):
-                workers.append(_Worker(function, memory_bytes))
                 # given now, sent when the process is ready: a start that fails costs one job
-                workers[-1].job = waiting.pop()
+                workers.append(_Worker(function, memory_bytes, waiting.pop()))
             answered = _wait_for_any(workers)
             for worker in list(workers):
                 if worker.pipe in answered:
@@ -144,7 +127,8 @@ def run_bounded(
                     if sound and not worker.ready:
                         worker.ready = True
                     else:
-                        done(worker, result)
+                        yield worker.job, result
+                        worker.jobs_done += time.monotonic() - worker.sent >= QUICK_S
                         if not sound or worker.jobs_done >= JOBS_PER_WORKER or not waiting:
                             drop(worker)
                             continue
@@ -153,12 +137,12 @@ def run_bounded(
                     _send(worker, jobs)
                 elif time.monotonic() >= worker.deadline:
                     limit = timeout_s if worker.ready else START_S
-                    done(worker, Failed(f"it took longer than {limit:g} s and was ended."))
+                    failed = Failed(f"it took longer than {limit:g} s and was ended.")
                     drop(worker)
+                    yield worker.job, failed
     finally:
         for worker in workers:
             worker.end()
-    return [results[index] for index in range(len(jobs))] if keep else []
 
 
 def _wait_for_any(workers: list[_Worker]) -> list[Any]:
@@ -168,7 +152,6 @@ def _wait_for_any(workers: list[_Worker]) -> list[Any]:
 
 
 def _send(worker: _Worker, jobs: Sequence[Any]) -> None:
-    assert worker.job is not None
     worker.sent = time.monotonic()
     # a process that died in between shows at the next look at its pipe
     with suppress(BrokenPipeError, ConnectionResetError):
@@ -220,7 +203,7 @@ def _serve(pipe: Connection, function: Callable[[Any], Any], memory_bytes: int |
             answer = (True, function(job))
             message = pickle.dumps(answer, pickle.HIGHEST_PROTOCOL)
         except MemoryError:
-            # what is left of the heap is no place for the next job
+            # the next job would not find enough memory either
             answer = (False, Failed("it needed more memory than one file may take."))
             message = pickle.dumps(answer)
         except Px4FuseError as error:

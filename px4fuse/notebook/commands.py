@@ -36,10 +36,6 @@ Pathlike = str | Path
 Progress = Callable[[str], None]
 
 
-def _silent(_: str) -> None:
-    """Progress that nobody watches."""
-
-
 def compare(
     log: Pathlike | Flight,
     settings: Settings | None = None,
@@ -57,7 +53,7 @@ def compare(
     position: Pathlike | PositionFile | None = None,
     mavlink: Pathlike | None = None,
     system: int | None = None,
-    progress: Progress = _silent,
+    progress: Progress = lambda _: None,
 ) -> Analysis:
     """Compare a flight's EKF2 with the two-state filter, and explain it, as the command line does.
 
@@ -172,7 +168,7 @@ def close_loop(
     heading_drift_deg: float = 3.0,
     key_frames_m: float | None = None,
     frame: FrameName | None = None,
-    progress: Progress = _silent,
+    progress: Progress = lambda _: None,
 ) -> Loop:
     """Measure how far a loop fails to close, and correct its path.
 

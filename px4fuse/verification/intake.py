@@ -23,12 +23,7 @@ from typing import Any
 
 import pypdf
 from pypdf.errors import LimitReachedError
-from pypdf.generic import (
-    ArrayObject,
-    DictionaryObject,
-    IndirectObject,
-    StreamObject,
-)
+from pypdf.generic import ArrayObject, DictionaryObject, IndirectObject, StreamObject
 
 from px4fuse.errors import ResultsError
 from px4fuse.report.pdf import RESULTS_NAME
@@ -102,10 +97,6 @@ _FILTERS = frozenset(("/FlateDecode", "/DCTDecode"))
 _STREAM = re.compile(rb"(?<!end)stream *\r?\n?")
 
 
-class _RefusedError(Exception):
-    """The reason why a file is no report, on its way to :func:`read_report`."""
-
-
 @dataclass
 class _Contents:
     """What the walk over a document met."""
@@ -136,8 +127,6 @@ def read_report(pdf: bytes, name: str) -> Report | Refused:
             return _read(pdf)
     except ResultsError as refusal:
         reason, remedy = str(refusal), refusal.remedy
-    except _RefusedError as refusal:
-        reason = str(refusal)
     except (LimitReachedError, RecursionError, MemoryError):
         reason = _COSTLY
     # pypdf names no closed set of exceptions for what is broken in a file
@@ -160,7 +149,7 @@ def _quiet_pypdf() -> Iterator[None]:
 
 def _read(pdf: bytes) -> Report:
     if not hasattr(pypdf, "apply_configuration"):
-        raise _RefusedError(_INSTALL)
+        raise ResultsError(_INSTALL)
     _check_file(pdf)
     _check_streams(pdf)
     known = {setting.name for setting in fields(pypdf.Configuration)}
@@ -170,7 +159,7 @@ def _read(pdf: bytes) -> Report:
         _check_page_count(reader)
         contents = _walk(reader)
         if contents.found:
-            raise _RefusedError(f"it contains {', '.join(sorted(contents.found))}; no report does.")
+            raise ResultsError(f"it contains {', '.join(sorted(contents.found))}; no report does.")
         results = _results(_attachment(contents))
     return Report(
         sha256=hashlib.sha256(pdf).hexdigest(),
@@ -184,24 +173,24 @@ def _read(pdf: bytes) -> Report:
 
 def _check_file(pdf: bytes) -> None:
     if len(pdf) > MAX_BYTES:
-        raise _RefusedError(f"larger than {MAX_BYTES // 1_000_000} MB; reports are below 2 MB.")
+        raise ResultsError(f"larger than {MAX_BYTES // 1_000_000} MB; reports are below 2 MB.")
     if not pdf:
-        raise _RefusedError("an empty file.")
+        raise ResultsError("an empty file.")
     if not pdf.startswith(b"%PDF-"):
-        raise _RefusedError("not a PDF.")
+        raise ResultsError("not a PDF.")
     if b"%%EOF" not in pdf[-2048:]:
-        raise _RefusedError("cut off: the end of the PDF is missing. Hand it in again.")
+        raise ResultsError("cut off: the end of the PDF is missing. Hand it in again.")
 
 
 def _check_streams(pdf: bytes) -> None:
     """Inflate every stream into nothing, so that no bomb reaches pypdf."""
     left = MAX_DOCUMENT_BYTES
     for match in _STREAM.finditer(pdf):
-        # `stream` may stand anywhere, also inside a stream; each try costs from the same purse
+        # `stream` may stand anywhere, also inside a stream; each try counts towards the same limit
         spent = _inflated_bytes(pdf, match.end(), min(left, MAX_CONTENT_BYTES))
         left -= spent
         if spent > MAX_CONTENT_BYTES or left < 0:
-            raise _RefusedError("a compressed part of it expands to more than a report can hold.")
+            raise ResultsError("a compressed part of it expands to more than a report can hold.")
 
 
 def _inflated_bytes(pdf: bytes, start: int, limit: int) -> int:
@@ -239,22 +228,22 @@ def _open(pdf: bytes) -> pypdf.PdfReader:
         raise
     except Exception as error:
         if b"/Encrypt" in pdf:
-            raise _RefusedError("encrypted, or damaged. Hand in the file px4fuse wrote.") from error
+            raise ResultsError("encrypted, or damaged. Hand in the file px4fuse wrote.") from error
         raise
     if encrypted:
-        raise _RefusedError("encrypted. Hand in the file that px4fuse wrote.")
+        raise ResultsError("encrypted. Hand in the file that px4fuse wrote.")
     return reader
 
 
 def _check_page_count(reader: pypdf.PdfReader) -> None:
     try:
         count = len(reader.pages)
-    except LimitReachedError as error:
-        raise _RefusedError(f"more than {MAX_PAGES} pages.") from error
+    except LimitReachedError:
+        count = MAX_PAGES + 1
     if count > MAX_PAGES:
-        raise _RefusedError(f"more than {MAX_PAGES} pages.")
+        raise ResultsError(f"more than {MAX_PAGES} pages.")
     if count == 0:
-        raise _RefusedError("a PDF without pages.")
+        raise ResultsError("a PDF without pages.")
 
 
 def _walk(reader: pypdf.PdfReader) -> _Contents:
@@ -274,11 +263,11 @@ def _walk(reader: pypdf.PdfReader) -> _Contents:
             listed = _is_listed(reader, *key)
             missing += not listed
             if len(seen) > MAX_OBJECTS or missing > MAX_MISSING:
-                raise _RefusedError(_COSTLY)
+                raise ResultsError(_COSTLY)
             # ISO 32000-1, 7.3.10: a reference to an object that is not there is null
             value = value.get_object() if listed else None
         if values > MAX_VALUES:
-            raise _RefusedError(_COSTLY)
+            raise ResultsError(_COSTLY)
         if isinstance(value, DictionaryObject):
             _look_at(value, contents)
             left.extend(value.raw_get(key) for key in value)
@@ -329,7 +318,7 @@ def _name(value: object) -> str | None:
 def _attachment(contents: _Contents) -> bytes:
     """Bytes of the one attached file; its name is compared and used for nothing else."""
     if not contents.files and not contents.embedded:
-        raise _RefusedError(
+        raise ResultsError(
             f"no {RESULTS_NAME} is attached: not a report of px4fuse, or one that was printed to "
             "PDF, which leaves the results out. Hand in the original file that px4fuse wrote."
         )
@@ -337,7 +326,7 @@ def _attachment(contents: _Contents) -> bytes:
         id(stream): stream for stream in contents.embedded
     }
     if len(contents.files) != 1 or len(streams) != 1:
-        raise _RefusedError(
+        raise ResultsError(
             "more than one file is attached, or none that can be read: hand in one report per PDF."
         )
     names = {
@@ -347,16 +336,16 @@ def _attachment(contents: _Contents) -> bytes:
     }
     if names != {RESULTS_NAME}:
         shown = one_line(" / ".join(sorted(names)), 80)
-        raise _RefusedError(f"the attached file is called {shown!r}, not {RESULTS_NAME!r}.")
+        raise ResultsError(f"the attached file is called {shown!r}, not {RESULTS_NAME!r}.")
     (stream,) = streams.values()
     too_large = f"{RESULTS_NAME} in it is larger than {MAX_ATTACHMENT_BYTES // 1_000_000} MB."
     try:
         with pypdf.apply_configuration(zlib_maximum_output_length=MAX_ATTACHMENT_BYTES):
             data = bytes(stream.get_data())
     except LimitReachedError as error:
-        raise _RefusedError(too_large) from error
+        raise ResultsError(too_large) from error
     if len(data) > MAX_ATTACHMENT_BYTES:
-        raise _RefusedError(too_large)
+        raise ResultsError(too_large)
     return data
 
 
@@ -370,5 +359,5 @@ def _results(data: bytes) -> Reported:
     where = f"{RESULTS_NAME} in it"
     results = read_results(data, where)
     if not isinstance(results, ComparisonResults | LoopResults):
-        raise _RefusedError(f"{where} holds no results of a report.")
+        raise ResultsError(f"{where} holds no results of a report.")
     return results

@@ -9,7 +9,7 @@ from px4fuse.results.contract import Reported
 
 # Whether the file is, to the byte, as px4fuse wrote it
 Seal = Literal["intact", "broken", "missing"]
-# Of the numbers; how the pages look is told apart from it
+# Of the numbers; how the pages look is a result of its own
 Status = Literal["verified", "numbers differ", "other log", "cannot verify"]
 PageStatus = Literal["same", "differ", "not compared"]
 
@@ -22,8 +22,6 @@ class Report:
     ----------
     sha256 : str
         Of the PDF.
-    size_bytes : int
-    seal : {"intact", "broken", "missing"}
     results : ComparisonResults or LoopResults
         The attached results.
     pages : tuple of str
@@ -102,7 +100,6 @@ class Verdict:
         Sentences: what differs, or why nothing can be said; for "verified" what was checked.
     with_log : bool
         Whether the analysis was run again on the log.
-    differences : tuple of Difference
     page_status : {"same", "differ", "not compared"}
         Whether the pages that were handed in look like the redrawn ones.
     pages : tuple of PageDifference

@@ -29,6 +29,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from difflib import SequenceMatcher
+from itertools import zip_longest
 from typing import Any
 
 import numpy as np
@@ -38,16 +39,16 @@ from scipy.ndimage import uniform_filter
 from px4fuse.flight import Unavailable
 from px4fuse.results.reading import cleaned, one_line
 from px4fuse.verification.model import PageDifference
-from px4fuse.verification.pictures import FAILURES, pdfium, rendered
+from px4fuse.verification.pictures import FAILURES, opened, rendered, undrawn
 
 # Side of the square over which differences are averaged: about two digits, at a pixel per point
 SQUARE_PX = 8
-# Largest mean difference of grey (0 to 1) over such a square that is no difference. Between what
+# Largest mean difference of grey (0 to 1) over such a square that does not count. Between what
 # harmless re-saves make (0.07 at the most) and what is seen as another page (from 0.11); see above
 DISTANCE = 0.07
 # A page that another program wrote may be rounded to whole points
 SIZE_PX = 2
-MAX_PAGE_TEXT = 1_000_000
+MAX_PAGES, MAX_PAGE_TEXT = 100, 1_000_000
 
 NumbersAlike = Callable[[str, str], bool]
 
@@ -79,46 +80,37 @@ def compare_pages(
     tuple of PageDifference, or Unavailable
         In the order of the pages; empty where all look the same. Unavailable without pypdfium2.
     """
-    ours = looks(redrawn)
-    if isinstance(ours, Unavailable):
-        return ours
-    # whoever hands in a thousand pages shall not have them all drawn
-    theirs = looks(submitted, len(ours) + 1)
-    if isinstance(theirs, Unavailable):
-        return (PageDifference(1, theirs.reason, 0, 1.0),)
+    try:
+        ours = looks(redrawn)
+    except FAILURES as error:
+        return undrawn(error)
+    # of a thousand pages that are handed in, not all are drawn
+    try:
+        theirs = looks(submitted, len(ours) + 1)
+    except FAILURES as error:
+        return (PageDifference(1, undrawn(error).reason, 0, 1.0),)
     return tuple(_differences(theirs, ours, words_alike))
 
 
-def looks(pdf: bytes, most: int = 1000) -> tuple[Look | Unavailable, ...] | Unavailable:
-    """What is seen of the first pages of a PDF; Unavailable stands for what cannot be drawn."""
-    library = pdfium()
-    if isinstance(library, Unavailable):
-        return library
-    try:
-        document = library.PdfDocument(pdf)
-    except FAILURES as error:
-        return Unavailable("pages", f"they cannot be drawn ({one_line(str(error), 80)})", "")
-    try:
+def looks(pdf: bytes, most: int = 1000) -> tuple[Look | Unavailable, ...]:
+    """What is seen of the first pages of a PDF; Unavailable stands for what cannot be drawn.
+
+    Raises
+    ------
+    one of FAILURES
+        The file cannot be read, or pypdfium2 is not installed.
+    """
+    with opened(pdf) as document:
         return tuple(_look(document, page) for page in range(min(len(document), most)))
-    finally:
-        document.close()
 
 
-def page_texts(pdf: bytes, most: int = 100) -> tuple[str, ...]:
+def page_texts(pdf: bytes) -> tuple[str, ...]:
     """Text of each page; none without pypdfium2 or where the file cannot be read."""
-    library = pdfium()
-    if isinstance(library, Unavailable):
-        return ()
     try:
-        document = library.PdfDocument(pdf)
+        with opened(pdf) as document:
+            return tuple(_text(document[page]) for page in range(min(len(document), MAX_PAGES)))
     except FAILURES:
         return ()
-    try:
-        return tuple(_text(document[page]) for page in range(min(len(document), most)))
-    except FAILURES:
-        return ()
-    finally:
-        document.close()
 
 
 def _look(document: Any, page: int) -> Look | Unavailable:
@@ -128,7 +120,7 @@ def _look(document: Any, page: int) -> Look | Unavailable:
         grey = np.asarray(rendered(sheet, sheet.get_size()[0]).convert("L"), dtype=np.float32)
         return Look(tuple(_text(sheet).split()), grey / 255.0)
     except FAILURES as error:
-        return Unavailable("page", f"it cannot be drawn ({one_line(str(error), 80)})", "")
+        return undrawn(error)
 
 
 def _text(sheet: Any) -> str:
@@ -139,25 +131,24 @@ def _text(sheet: Any) -> str:
 def _differences(
     theirs: Sequence[Look | Unavailable], ours: Sequence[Look | Unavailable], alike: NumbersAlike
 ) -> Iterator[PageDifference]:
-    for number in range(1, max(len(theirs), len(ours)) + 1):
-        if number > len(theirs):
-            yield PageDifference(number, "it is missing", 0, 1.0)
+    for number, (found, expected) in enumerate(zip_longest(theirs, ours), start=1):
+        if found is None or expected is None:
+            what = "it is missing" if found is None else f"px4fuse draws only {len(ours)} pages"
+            yield PageDifference(number, what, 0, 1.0)
             continue
-        if number > len(ours):
-            yield PageDifference(number, f"px4fuse draws only {len(ours)} pages", 0, 1.0)
+        if isinstance(found, Unavailable):
+            yield PageDifference(number, found.reason, 0, 1.0)
             continue
-        found, expected = theirs[number - 1], ours[number - 1]
-        if isinstance(found, Unavailable) or isinstance(expected, Unavailable):
-            why = found if isinstance(found, Unavailable) else expected
-            yield PageDifference(number, getattr(why, "reason", ""), 0, 1.0)
+        if isinstance(expected, Unavailable):
+            yield PageDifference(number, expected.reason, 0, 1.0)
             continue
         words = list(_other_words(found.words, expected.words, alike))
         apart = _distance(found.grey, expected.grey)
         said = []
         if words:
             one, other = (one_line(text, 60) or "nothing" for text in words[0])
-            said.append(f"{len(words)} places in its text, first {one!r} where px4fuse prints "
-                        f"{other!r}")  # fmt: skip
+            places = f"{len(words)} places in its text"
+            said.append(f"{places}, first {one!r} where px4fuse prints {other!r}")
         if apart > DISTANCE:
             said.append(f"its picture, by {apart:.2f} of 1 (up to {DISTANCE:g} is no difference)")
         if said:

@@ -5,13 +5,17 @@ from __future__ import annotations
 import importlib
 import io
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 from PIL import Image, ImageDraw
 
 from px4fuse.flight import Unavailable
+from px4fuse.results.reading import one_line
 
+# Less where a page is very long, or its picture does not fit into MAX_BYTES
+WIDTH_PX = 700
 # Enough to keep our blue, EKF2's orange and the severities apart, with smooth letters
 COLOURS = 16
 # A page of text and lines at 700 pixels takes 15 to 55 kB; a photograph is made smaller
@@ -29,22 +33,14 @@ COVER = (190, 190, 190)
 # PDFium's own errors are RuntimeErrors; the others come from ctypes and Pillow
 FAILURES = (
     RuntimeError, ValueError, TypeError, ArithmeticError, LookupError, AssertionError, OSError,
-    MemoryError,
+    MemoryError, ImportError,
 )  # fmt: skip
 
 
 def key_page(pages: Sequence[str]) -> int:
-    """Which page to show of a report: its cover, also where a student put pages before it.
+    """Which page to show of a report, counted from 0, by the text of each.
 
-    Parameters
-    ----------
-    pages : sequence of str
-        Text of each page.
-
-    Returns
-    -------
-    int
-        Counted from 0.
+    That is its cover, also where a student put pages before it.
     """
     for page, text in enumerate(pages):
         if any(line.strip() in COVERS for line in text.splitlines()):
@@ -52,7 +48,7 @@ def key_page(pages: Sequence[str]) -> int:
     return 0
 
 
-def picture(pdf: bytes, page: int, width_px: int = 700) -> bytes | Unavailable:
+def picture(pdf: bytes, page: int) -> bytes | Unavailable:
     """Draw one page of a PDF.
 
     Needs pypdfium2. Nothing in the PDF is executed, and the picture's size is bounded whatever the
@@ -64,66 +60,48 @@ def picture(pdf: bytes, page: int, width_px: int = 700) -> bytes | Unavailable:
         May be anything.
     page : int
         Counted from 0.
-    width_px : int
-        Less where the page is very long, or does not fit into :data:`MAX_BYTES`.
 
     Returns
     -------
     bytes or Unavailable
         A PNG of at most :data:`MAX_BYTES`.
     """
-    library = pdfium()
-    if isinstance(library, Unavailable):
-        return library
     try:
-        document = library.PdfDocument(pdf)
-        try:
+        with opened(pdf) as document:
             if not 0 <= page < len(document):
                 raise ValueError(f"there is no page {page + 1}")
-            return _small_png(rendered(document[page], width_px))
-        finally:
-            document.close()
+            return _small_png(rendered(document[page], WIDTH_PX))
     except FAILURES as error:
-        return Unavailable(WHAT, f"it cannot be drawn ({error})", "Open the PDF itself.")
+        return undrawn(error)
 
 
-def page_pictures(
-    pdf: bytes, hide: Sequence[str] = (), width_px: int = 700
-) -> tuple[bytes, ...] | Unavailable:
+def page_pictures(pdf: bytes, hide: Sequence[str] = ()) -> tuple[bytes, ...] | Unavailable:
     """Draw every page of a report that px4fuse drew.
 
     Parameters
     ----------
-    pdf : bytes
     hide : sequence of str
         Words that must not be read in the pictures: they are covered, and so is the head of each
         page. Where none of them is found on the first page, nothing is drawn: the words are there
         in letters that cannot be searched.
-    width_px : int
 
     Returns
     -------
     tuple of bytes or Unavailable
         A PNG per page.
     """
-    library = pdfium()
-    if isinstance(library, Unavailable):
-        return library
+    made = []
     try:
-        document = library.PdfDocument(pdf)
-        try:
-            made = []
+        with opened(pdf) as document:
             for number in range(len(document)):
                 sheet = document[number]
-                image = rendered(sheet, width_px)
+                image = rendered(sheet, WIDTH_PX)
                 if hide and not _cover(image, sheet, hide) and not number:
                     raise ValueError("a name on its first page cannot be found to cover it")
                 made.append(_small_png(image))
-            return tuple(made)
-        finally:
-            document.close()
     except FAILURES as error:
-        return Unavailable(WHAT, f"it cannot be drawn ({error})", "Open the PDF itself.")
+        return undrawn(error)
+    return tuple(made)
 
 
 def _cover(image: Image.Image, sheet: Any, hide: Sequence[str]) -> int:
@@ -145,14 +123,29 @@ def _cover(image: Image.Image, sheet: Any, hide: Sequence[str]) -> int:
     return found
 
 
-def pdfium() -> Any:
-    """The module pypdfium2, or Unavailable."""
+@contextmanager
+def opened(pdf: bytes) -> Iterator[Any]:
+    """A document of pypdfium2.
+
+    Raises
+    ------
+    one of FAILURES
+        It cannot be read, or pypdfium2 is not installed (ImportError).
+    """
+    document = importlib.import_module("pypdfium2").PdfDocument(pdf)
     try:
-        return importlib.import_module("pypdfium2")
-    except (ImportError, OSError):
-        return Unavailable(
-            WHAT, "pypdfium2 is not installed", 'Install it: pip install "px4fuse[grade]".'
-        )
+        yield document
+    finally:
+        document.close()
+
+
+def undrawn(error: BaseException) -> Unavailable:
+    """What stands for a page or file that raised one of FAILURES."""
+    if isinstance(error, ImportError):
+        install = 'Install it: pip install "px4fuse[grade]".'
+        return Unavailable(WHAT, "pypdfium2 is not installed", install)
+    reason = f"it cannot be drawn ({one_line(str(error), 80)})"
+    return Unavailable(WHAT, reason, "Open the PDF itself.")
 
 
 def rendered(sheet: Any, width_px: float) -> Image.Image:

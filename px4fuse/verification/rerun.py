@@ -19,7 +19,7 @@ from pathlib import Path
 
 from msgspec.structs import replace
 
-from px4fuse.errors import Px4FuseError, SettingsError
+from px4fuse.errors import Px4FuseError, ResultsError, SettingsError
 from px4fuse.report.document import Document, LoopDocument
 from px4fuse.request import command_line
 from px4fuse.results.contract import ComparisonResults, LoopResults, Reported, to_json
@@ -30,6 +30,7 @@ from px4fuse.verification.model import Refused
 MAX_NAME_BYTES = 240
 ASK = "Ask how the report was made, and for the log and all files that it was made from."
 NOT_OURS = "the recorded request is not one that px4fuse can have made"
+_Place = Callable[[str, str | None, str], Path]
 # What Windows does not take in a name, or takes for something else than a file
 _WINDOWS = re.compile(r'[<>:"|?*]|^(?:con|prn|aux|nul|com\d|lpt\d)(?:\.|$)|[. ]$', re.IGNORECASE)
 
@@ -48,14 +49,6 @@ class Recomputed:
 
     results: Reported
     draw: Callable[[], bytes]
-
-
-class _RefusedError(Exception):
-    """The analysis cannot be repeated: why, and what helps."""
-
-    def __init__(self, reason: str, remedy: str) -> None:
-        super().__init__(reason)
-        self.remedy = remedy
 
 
 def log_sha256(results: Reported) -> str:
@@ -79,15 +72,19 @@ def recompute(results: Reported, logs: Mapping[str, Path]) -> Recomputed | Refus
         Refused where the command is not px4fuse's, a file is missing, or the analysis fails.
     """
     try:
-        versions = _versions(results)
+        from px4fuse.results.parts import LIBRARIES  # noqa: PLC0415
+
+        versions = results.provenance
+        if tuple(versions.libraries) != LIBRARIES:
+            raise ResultsError("the results do not say which libraries they were made with", ASK)
         with tempfile.TemporaryDirectory(prefix="px4fuse-") as folder:
-            files = _Files(logs, Path(folder))
+            place = partial(_place, logs, Path(folder))
             if isinstance(results, LoopResults):
-                return _looped(results, files, versions)
-            return _compared(results, files, versions)
+                return _looped(results, place, versions)
+            return _compared(results, place, versions)
     except SettingsError as error:  # no run with these settings can have made a report
         return Refused(f"{NOT_OURS}: {error}", ASK)
-    except _RefusedError as error:
+    except ResultsError as error:
         return Refused(str(error), error.remedy)
     except Px4FuseError as error:
         return Refused(str(error), ASK)
@@ -95,57 +92,37 @@ def recompute(results: Reported, logs: Mapping[str, Path]) -> Recomputed | Refus
         return Refused(f"the analysis cannot be repeated ({type(error).__name__})", ASK)
 
 
-# -- what was recorded -----------------------------------------------------------------------------
-
-
-def _versions(results: Reported) -> Provenance:
-    """Versions to print on the page that says what the report was made with."""
-    from px4fuse.results.parts import LIBRARIES  # noqa: PLC0415
-
-    if tuple(results.provenance.libraries) != LIBRARIES:
-        raise _RefusedError("the results do not say which libraries they were made with", ASK)
-    return results.provenance
-
-
-# -- files -----------------------------------------------------------------------------------------
-
-
-class _Files:
-    """Puts the files of an analysis where it finds them, under the names that were recorded.
+def _place(
+    logs: Mapping[str, Path], within: Path, recorded: str, sha256: str | None, what: str
+) -> Path:
+    """A file with this content where the analysis finds it, under the recorded name.
 
     Names are printed in the report. They are those of links in a folder of this run alone, and
     only where they are plain names.
     """
-
-    def __init__(self, logs: Mapping[str, Path], folder: Path) -> None:
-        self.logs = logs
-        self._folder = folder
-
-    def place(self, recorded: str, sha256: str | None, what: str) -> Path:
-        """A file with this content and the recorded name."""
-        path = None if sha256 is None else self.logs.get(sha256)
-        if path is None:
-            raise _RefusedError(
-                f"none of the files given has the SHA-256 of {what}",
-                f"Add {one_line(recorded, 80)} to --logs.",
-            )
-        name = recorded
-        plain = name == Path(name).name and "\\" not in name and name.isprintable()
-        if not plain or len(name.encode(errors="replace")) > MAX_NAME_BYTES:
-            raise _RefusedError(f"{NOT_OURS}: a file name in it is not a plain name", ASK)
-        if os.name == "nt" and _WINDOWS.search(name):
-            raise _RefusedError(
-                "a recorded file name is not valid on Windows",
-                "Verify it on Linux or macOS.",
-            )
-        # each in a folder of its own: two may have one name
-        folder = Path(tempfile.mkdtemp(dir=self._folder))
-        target = folder / name
-        try:
-            target.symlink_to(path.resolve())
-        except OSError:  # on Windows for administrators only
-            shutil.copyfile(path, target)
-        return target
+    path = None if sha256 is None else logs.get(sha256)
+    if path is None:
+        raise ResultsError(
+            f"none of the files given has the SHA-256 of {what}",
+            f"Add {one_line(recorded, 80)} to --logs.",
+        )
+    name = recorded
+    plain = name == Path(name).name and "\\" not in name and name.isprintable()
+    if not plain or len(name.encode(errors="replace")) > MAX_NAME_BYTES:
+        raise ResultsError(f"{NOT_OURS}: a file name in it is not a plain name", ASK)
+    if os.name == "nt" and _WINDOWS.search(name):
+        raise ResultsError(
+            "a recorded file name is not valid on Windows",
+            "Verify it on Linux or macOS.",
+        )
+    # each in a folder of its own: two may have one name
+    folder = Path(tempfile.mkdtemp(dir=within))
+    target = folder / name
+    try:
+        target.symlink_to(path.resolve())
+    except OSError:  # on Windows for administrators only
+        shutil.copyfile(path, target)
+    return target
 
 
 def _joined(results: ComparisonResults, role: str) -> str | None:
@@ -161,25 +138,22 @@ def split_part(source: str) -> tuple[str, str]:
     return (name, f":{tail}") if colon and tail in PARTS else (source, "")
 
 
-# -- the two kinds of report -----------------------------------------------------------------------
-
-
-def _compared(handed_in: ComparisonResults, files: _Files, versions: Provenance) -> Recomputed:
+def _compared(handed_in: ComparisonResults, place: _Place, versions: Provenance) -> Recomputed:
     from px4fuse.analysis import run  # noqa: PLC0415
     from px4fuse.findings import find  # noqa: PLC0415
     from px4fuse.results.build import results  # noqa: PLC0415
 
     recorded = request = handed_in.request
     person = handed_in.student
-    log = files.place(request.log, handed_in.log.sha256, "the log")
+    log = place(request.log, handed_in.log.sha256, "the log")
     request = replace(request, log=str(log))
     if request.mavlink is not None:
         sha256 = _joined(handed_in, "mavlink")
-        placed = files.place(request.mavlink, sha256, "--mavlink")
+        placed = place(request.mavlink, sha256, "--mavlink")
         request = replace(request, mavlink=str(placed))
     if request.position is not None:
         sha256 = _joined(handed_in, "position")
-        placed = files.place(request.position.path, sha256, "--position")
+        placed = place(request.position.path, sha256, "--position")
         request = replace(request, position=replace(request.position, path=str(placed)))
     analysis = run(request)
     document = Document(analysis, find(analysis), person, command_line(recorded))
@@ -187,7 +161,7 @@ def _compared(handed_in: ComparisonResults, files: _Files, versions: Provenance)
     return Recomputed(found, partial(_drawn, document, to_json(found), versions))
 
 
-def _looped(handed_in: LoopResults, files: _Files, versions: Provenance) -> Recomputed:
+def _looped(handed_in: LoopResults, place: _Place, versions: Provenance) -> Recomputed:
     from px4fuse.analysis import run_loop  # noqa: PLC0415
     from px4fuse.findings import find_loop  # noqa: PLC0415
     from px4fuse.results.build_trajectories import loop_results  # noqa: PLC0415
@@ -195,12 +169,12 @@ def _looped(handed_in: LoopResults, files: _Files, versions: Provenance) -> Reco
     recorded = request = handed_in.request
     person = handed_in.student
     path, part = split_part(request.source)
-    source = files.place(path, handed_in.track.sha256, "the log")
+    source = place(path, handed_in.track.sha256, "the log")
     request = replace(request, source=f"{source}{part}")
     if request.reference is not None:
         path, part = split_part(request.reference)
         sha256 = handed_in.references[-1].sha256 if handed_in.references else None
-        placed = files.place(path, sha256, "--reference")
+        placed = place(path, sha256, "--reference")
         request = replace(request, reference=f"{placed}{part}")
     found = run_loop(request)
     document = LoopDocument(found, find_loop(found), person, command_line(recorded))

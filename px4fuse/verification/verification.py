@@ -92,7 +92,6 @@ def verify(
 
     Parameters
     ----------
-    report : Report
     logs : sequence of Path, or mapping of str to Path
         Logs and other recordings, or folders of such; or files by their SHA-256, where many
         reports share them.
@@ -147,9 +146,6 @@ def _log_name(results: Reported) -> str:
     return one_line(name, 80) or "its log"
 
 
-# -- with the log ----------------------------------------------------------------------------------
-
-
 def _with_log(report: Report, again: Recomputed) -> Verdict:
     redrawn = again.draw()
     if redrawn == report.pdf:
@@ -200,9 +196,6 @@ def _other_machine(theirs: Provenance, ours: Provenance) -> tuple[str, ...]:
     return (one_line(made, 400),) if others else ()
 
 
-# -- numbers ---------------------------------------------------------------------------------------
-
-
 def compare_results(recorded: Mapping[str, Any], recomputed: Mapping[str, Any]) -> Numbers:
     """Compare every value of two results.
 
@@ -210,7 +203,6 @@ def compare_results(recorded: Mapping[str, Any], recomputed: Mapping[str, Any]) 
     ----------
     recorded : mapping
         A stranger's; followed only as far as the other one goes.
-    recomputed : mapping
     """
     command = str(recomputed["provenance"]["command"])
     # everything rests on an offset or placement that was estimated
@@ -223,7 +215,7 @@ def compare_results(recorded: Mapping[str, Any], recomputed: Mapping[str, Any]) 
     wrong: dict[str, tuple[Any, Any]] = {}
     pairs: list[tuple[float, float]] = []
     for path, theirs, ours in leaves:
-        if _is_number(theirs) and _is_number(ours):
+        if is_number(theirs) and is_number(ours):
             wide = everywhere or path.startswith(ESTIMATES)
             if not _near(path, theirs, ours, wide):
                 wrong[path] = theirs, ours
@@ -231,7 +223,7 @@ def compare_results(recorded: Mapping[str, Any], recomputed: Mapping[str, Any]) 
                 pairs.append((float(theirs), float(ours)))
     rounded = _rounding(pairs)
     for path, theirs, ours in leaves:
-        if not (_is_number(theirs) and _is_number(ours)) and not _same(theirs, ours, rounded):
+        if not (is_number(theirs) and is_number(ours)) and not _same(theirs, ours, rounded):
             wrong[path] = theirs, ours
     found = tuple(
         Difference(one_line(path, SHOWN_TEXT), _shown(theirs), _shown(ours))
@@ -240,11 +232,8 @@ def compare_results(recorded: Mapping[str, Any], recomputed: Mapping[str, Any]) 
     return Numbers(found, len(wrong), tuple(pairs), len(leaves))
 
 
-class _Absent:
-    """Stands where there is nothing."""
-
-
-_ABSENT = _Absent()
+# Stands where there is nothing
+_ABSENT = object()
 
 
 def _leaves(path: str, theirs: Any, ours: Any) -> Iterator[tuple[str, Any, Any]]:
@@ -264,7 +253,8 @@ def _leaves(path: str, theirs: Any, ours: Any) -> Iterator[tuple[str, Any, Any]]
         yield path, theirs, ours
 
 
-def _is_number(value: Any) -> bool:
+def is_number(value: object) -> bool:
+    """Whether a value is a number, and not a flag."""
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
@@ -336,7 +326,7 @@ def _decimals(number: str) -> int:
 
 def _shown(value: Any) -> str:
     """A value on one line."""
-    if isinstance(value, _Absent):
+    if value is _ABSENT:
         return "absent"
     if isinstance(value, Mapping):
         return f"an object with {len(value)} entries"

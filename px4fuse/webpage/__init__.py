@@ -1,6 +1,6 @@
 """Web pages in one file: what makes text from logs and students inert, the table, the charts.
 
-Nothing from data comes to life: it is JSON in which an HTML parser finds nothing, which the page's
+Nothing from data can act: it is JSON in which an HTML parser finds nothing, which the page's
 one script puts into the page as text, and that script is allowed by its hash. Nothing is loaded
 from a network.
 """

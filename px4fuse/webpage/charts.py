@@ -24,13 +24,7 @@ STRETCHES = 60
 
 @dataclass(frozen=True)
 class Scale:
-    """An axis, linear or logarithmic.
-
-    Attributes
-    ----------
-    low, high : float
-    log : bool
-    """
+    """An axis, linear or logarithmic."""
 
     low: float
     high: float
@@ -122,11 +116,11 @@ def plot(height: int, told: str, marks: Sequence[str]) -> str:
     return f'<svg class="plot" height="{height}" {said}>{"".join(marks)}</svg>'
 
 
-def bar(share: float, width: int = 96) -> str:
-    """A bar of a list: part of its full width."""
-    part = max(width * min(max(share, 0.0), 1.0), 1.0)
+def bar(share: float) -> str:
+    """A bar of a list: part of its full width, in pixels."""
+    part = max(96.0 * min(max(share, 0.0), 1.0), 1.0)
     drawn = f'<rect width="{part:.0f}" height="8"/>'
-    return f'<svg width="{width}" height="8" aria-hidden="true">{drawn}</svg>'
+    return f'<svg width="96" height="8" aria-hidden="true">{drawn}</svg>'
 
 
 def axis(scale: Scale) -> str:
@@ -134,7 +128,7 @@ def axis(scale: Scale) -> str:
     marks = []
     for place, tick in enumerate(scale.ticks):
         at = 100.0 * scale.share(tick)
-        # a phone has room for every second one
+        # a phone has room for half of them
         said = _text(at, 11.0, f"{tick:g}", "wide-only" if place % 2 else "")
         marks += [said, _line(at, at, 15.0, 18.0, "grid")]
     return plot(18, "", marks)
@@ -171,7 +165,6 @@ def over_time(
 
     Parameters
     ----------
-    times : Series of timestamps
     values : DataFrame
         Columns value, low, high; the last two may be absent numbers.
     span : (Timestamp, Timestamp)

@@ -333,7 +333,7 @@
   at("on").addEventListener("click", () => turn(first + size));
   for (const select of selects) select.addEventListener("change", filter);
   for (const box of boxes) {
-    box.checked = box.hasAttribute("data-ticked") && window.innerWidth >= 1200;
+    box.checked = false;
     box.addEventListener("change", groups);
   }
   for (const button of tagged) {

@@ -25,7 +25,6 @@ class Column:
 
     Attributes
     ----------
-    title : str
     kind : {"text", "line", "number", "rank"}
         How it is sorted; a line is text that stays in one, a rank is text sorted by a number.
     group : str
@@ -49,7 +48,6 @@ class Cell:
 
     Attributes
     ----------
-    text : str
     value : float, str or None
         By which it is sorted; None comes last both ways.
     below : str
@@ -67,9 +65,9 @@ class Cell:
     picture: tuple[float, ...] = ()
 
 
-def words(text: str, below: str = "", look: str = "") -> Cell:
+def words(text: str, below: str = "") -> Cell:
     """A cell that is sorted by its text."""
-    return Cell(text, text or None, below, look)
+    return Cell(text, text or None, below)
 
 
 def figure(
@@ -166,6 +164,17 @@ def card(title: str, *content: str) -> str:
     return f'<section class="card"><h2>{escaped(title)}</h2>{"".join(content)}</section>'
 
 
+def ranking(title: str, said: str, lines: Sequence[str], most: int, rest: str = "") -> str:
+    """A box with a list, its first lines; ``said`` and ``rest`` stand before and behind it."""
+    more = len(lines) - most
+    return card(
+        title,
+        note(said) if said else "",
+        f'<ol class="ranks">{"".join(lines[:most])}</ol>',
+        note(f"And {more} more{rest}.") if more > 0 else "",
+    )
+
+
 def summary(entries: Sequence[tuple[str, str]], *content: str) -> str:
     """The box on top: names with their values, which are HTML, and what else stands in it."""
     listed = "".join(f"<div><dt>{name}</dt><dd>{value}</dd></div>" for name, value in entries)
@@ -207,7 +216,7 @@ def page(
     columns: Sequence[Column],
     rows: Sequence[Row],
     filters: Sequence[tuple[str, Sequence[tuple[str, str]]]],
-    groups: Sequence[tuple[str, str, bool]] = (),
+    groups: Sequence[tuple[str, str]] = (),
     placeholder: str,
     otherwise: str,
 ) -> str:
@@ -215,17 +224,14 @@ def page(
 
     Parameters
     ----------
-    title, subtitle : str
     above : str
         HTML for above the table, of text made safe with :func:`~px4fuse.webpage.safe.escaped`.
     noun : (str, str)
         What a row is, one and many.
-    columns : sequence of Column
-    rows : sequence of Row
     filters : sequence of (label, ((tag, words), ...))
         Rows that have the chosen tag are shown.
-    groups : sequence of (group, label, ticked)
-        Boxes that show more columns; ticked holds on wide screens alone.
+    groups : sequence of (group, label)
+        Boxes that show more columns.
     placeholder : str
         What one may search for.
     otherwise : str
@@ -281,11 +287,9 @@ def _select(number: int, label: str, options: Sequence[tuple[str, str]]) -> str:
     )
 
 
-def _box(group: str, label: str, ticked: bool) -> str:
-    return (
-        f'<label><input type="checkbox" data-group="{escaped(group)}" autocomplete="off"'
-        f"{' data-ticked' * ticked}> {escaped(label)}</label>"
-    )
+def _box(group: str, label: str) -> str:
+    box = f'<input type="checkbox" data-group="{escaped(group)}" autocomplete="off">'
+    return f"<label>{box} {escaped(label)}</label>"
 
 
 def _compact(cell: Cell) -> list[Any]:

@@ -13,7 +13,7 @@ import io
 import re
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from px4fuse.errors import SettingsError
@@ -31,7 +31,6 @@ class Sheet:
 
     Attributes
     ----------
-    path : Path
     head : tuple of str
         Titles of the columns.
     rows : tuple of tuple of str
@@ -40,7 +39,6 @@ class Sheet:
         Line of each row in the file, for messages.
     mark : bytes
         Byte order mark; empty without.
-    encoding, separator, line_end : str
     quoted : bool
         Whether every cell stands in quotes.
     """
@@ -64,12 +62,6 @@ class Sheet:
         """What stands in a row under the first of these titles; "" where there is none."""
         place = self.column(titles)
         return "" if place is None else row[place].strip()
-
-    def filled(self, row: int, column: int, text: str) -> Sheet:
-        """The table with another text in one cell."""
-        cells = list(self.rows[row])
-        cells[column] = text
-        return replace(self, rows=(*self.rows[:row], tuple(cells), *self.rows[row + 1 :]))
 
     def content(self) -> bytes:
         """The file again, in its own encoding, separator, quotes and line ends."""
@@ -103,10 +95,10 @@ def read_sheet(path: Path) -> Sheet:
     Raises
     ------
     SettingsError
-        It cannot be read, is no text, or has no header.
+        It cannot be read, is not text, or has no header.
     """
     content = read_whole(
-        path, SettingsError, MAX_BYTES, name=str(path), smaller="Give a CSV file of one course"
+        path, SettingsError, MAX_BYTES, name=str(path), smaller="Give a CSV file of one class"
     )
     if content.startswith((b"PK\x03\x04", b"\xd0\xcf\x11\xe0")):
         raise SettingsError(f"{path}: a spreadsheet. Save it as CSV.")
