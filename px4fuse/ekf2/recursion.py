@@ -357,11 +357,7 @@ def with_correlation(inputs: Inputs, stretch: Stretch, legs: Legs) -> Stretch:
     count = int(np.searchsorted(stretch.time_s[legs.end], stretch.time_s[0] + CORRELATING_S))
     first = replace(
         legs,
-        **{
-            field.name: getattr(legs, field.name)[:count]
-            for field in fields(legs)
-            if field.name != "within"
-        },
+        **{field.name: getattr(legs, field.name)[:count] for field in fields(legs)},
     )
     done = run(inputs, stretch, [first], np.zeros(1, np.intp), [Variant(inputs.settings)])
     # a bias that EKF2 does not learn has no variance

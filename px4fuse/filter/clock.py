@@ -30,9 +30,10 @@ from px4fuse.filter.fitting import (
     Part,
     arguments,
     most_likely,
-    of_ratios,
+    over_sigma_z,
 )
 from px4fuse.filter.kalman import Settings
+from px4fuse.filter.lanes import gains, lanes_of_paths
 from px4fuse.filter.likelihood import PROFILE_DROP, parabola_vertex, profile_interval
 from px4fuse.filter.marginal import Fitted, Positions, centred, paired_products
 from px4fuse.filter.motion import CONSTANT_SIGMA, SEARCH_S, Made, Motion, motion
@@ -147,10 +148,13 @@ class _Problem:
         """Fit at some offsets, a few at a time: their signals are long."""
         count = len(self.motion.time_s)
         each = max(1, BLOCK // (count * len(self.directions) * (1 + len(CONSTANT_SIGMA))))
-        made = [
-            of_ratios(self.part(offset_s[at : at + each]), ratios, walk, np.ones(count), sigma_z_m)
+        positions, variance = over_sigma_z(self.positions, walk, np.ones(count), sigma_z_m)
+        steps = gains(positions, ratios, variance)
+        paths = (
+            self.motion.paths(self.directions, offset_s[at : at + each])
             for at in range(0, len(offset_s), each)
-        ]
+        )
+        made = [lanes_of_paths(self.positions, path).fit(steps) for path in paths]
         return [
             replace(of_one[0], gram=np.concatenate([part.gram for part in of_one], axis=1))
             for of_one in zip(*made, strict=True)

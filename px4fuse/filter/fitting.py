@@ -19,7 +19,7 @@ from scipy.special import comb, expit, gammaincinv
 
 from px4fuse.arrays import Array
 from px4fuse.filter.chain import Chain
-from px4fuse.filter.lanes import Lanes, lanes
+from px4fuse.filter.lanes import Lanes, gains, lanes
 from px4fuse.filter.likelihood import PROFILE_DROP, Preintegrated
 from px4fuse.filter.marginal import Fitted, Positions, centred, fit, squares
 from px4fuse.filter.model import INITIAL_COVARIANCE
@@ -169,18 +169,31 @@ def of_ratios(
     weight : ndarray, shape (m,)
     sigma_z_m : float
     """
-    positions = part.positions
+    positions, variance = over_sigma_z(part.positions, walk, weight, sigma_z_m)
+    if part.lanes is not None:
+        return part.lanes.fit(gains(positions, ratios, variance))
+    legs = part.delta_position_m, part.delta_velocity_m_s
+    return [fit(positions, *legs, ratio, variance) for ratio in ratios]
+
+
+def over_sigma_z(
+    positions: Positions, walk: float, weight: Array, sigma_z_m: float
+) -> tuple[Positions, Array]:
+    """Positions and variances over SIGMA_Z; what is fixed is taken at a SIGMA_Z.
+
+    Parameters
+    ----------
+    positions : Positions
+    walk, weight, sigma_z_m
+        As :func:`of_ratios` takes them.
+    """
     chain = positions.chain
     fixed = chain.noise_fixed / sigma_z_m**2
     chain = replace(chain, noise_fixed=fixed + np.outer(chain.length_s * walk**2, [1.0, 0.0, 0.0]))
     positions = replace(positions, chain=chain, initial=positions.initial * sigma_z_m**2)
     # the filter's start is not measured
     extra = np.ones(len(positions.measurement_m) - len(weight))
-    variance = 1.0 / np.concatenate([extra, weight])
-    if part.lanes is not None:
-        return replace(part.lanes, positions=positions).fit(ratios, variance)
-    legs = part.delta_position_m, part.delta_velocity_m_s
-    return [fit(positions, *legs, ratio, variance) for ratio in ratios]
+    return positions, 1.0 / np.concatenate([extra, weight])
 
 
 @dataclass(frozen=True)

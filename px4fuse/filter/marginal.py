@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -45,6 +46,12 @@ class Positions:
     start: IntArray
     initial: Array
     constant_sigma: Array
+
+    @cached_property
+    def smooth(self) -> tuple[tuple[list[int], Factor, int], ...]:
+        """Factors for a smooth path through the positions, each with the axes that it serves."""
+        variance = np.full(len(self.measurement_m), PATH_NOISES[1] ** 2)
+        return tuple(_factors(self, PATH_NOISES[0], variance))
 
 
 @dataclass(frozen=True)
@@ -213,8 +220,7 @@ def centred(
     chain = positions.chain
     count = delta_position_m.shape[-1]
     of_leg = chain.end - 1 if count == len(chain.end) else slice(None)
-    variance = np.full(len(measured), PATH_NOISES[1] ** 2)
-    for axes, factor, _ in _factors(positions, PATH_NOISES[0], variance):
+    for axes, factor, _ in positions.smooth:
         dp, dv = (part[axes, 0, 0] for part in (delta_position_m, delta_velocity_m_s))
         state = factor.solve(Columns(np.nan_to_num(measured[:, axes].T), dp, dv))
         state[:, positions.start] = 0.0
