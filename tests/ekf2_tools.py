@@ -6,7 +6,7 @@ import numpy as np
 
 from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.legs import GRAVITY_M_S2
-from px4fuse.ekf2.rotation import skew
+from px4fuse.trajectory.rotation import skew
 from px4fuse.ekf2.stretches import Stretch
 
 EYE = np.eye(15)

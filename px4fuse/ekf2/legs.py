@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from px4fuse.display import brief
 from px4fuse.ekf2.inputs import Inputs
-from px4fuse.ekf2.rotation import skew
+from px4fuse.trajectory.rotation import skew
 from px4fuse.ekf2.stretches import Stretch
 
 Array = NDArray[np.float64]

@@ -13,7 +13,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from px4fuse.display import brief
-from px4fuse.ekf2.rotation import (
+from px4fuse.trajectory.rotation import (
     conjugate,
     from_vector,
     interpolate,

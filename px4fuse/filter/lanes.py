@@ -68,10 +68,10 @@ class Lanes:
         gains : Gains
             Of these positions.
         """
-        gram = sum(self._gram(axes, *each, gains.length_s) for axes, *each in gains.groups)
+        grams = [self._gram(*group, gains.length_s) for group in gains.groups]
         return [
             Fitted(one, float(log), gains.freedom, gains.constant_sigma)
-            for one, log in zip(np.asarray(gram), gains.log_determinant, strict=True)
+            for one, log in zip(np.sum(grams, axis=0), gains.log_determinant, strict=True)
         ]
 
     def _gram(self, axes: list[int], k0: Array, k1: Array, weight: Array, length: Array) -> Array:

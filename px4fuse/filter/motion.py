@@ -26,7 +26,7 @@ from px4fuse.filter.marginal import Positions
 from px4fuse.filter.model import noise_of_many_steps
 from px4fuse.filter.signals import imu_gaps
 from px4fuse.flight import ANGULAR_RATE_COLUMNS, QUATERNION_COLUMNS, SPECIFIC_FORCE_COLUMNS
-from px4fuse.trajectory.graph import lie
+from px4fuse.trajectory.rotation import from_vector, matrix, multiply, running_product
 
 # Standard deviations of the constants, wide for consumer sensors: tilt and heading (rad), gyro
 # (rad/s) and accelerometer (m/s²), scale of the positions (1)
@@ -265,8 +265,7 @@ def _signals(imu: pd.DataFrame, attitude: pd.DataFrame, span: tuple[float, float
     turn = _integrate_gyros(edges, angle, attitude)
     # of each step, in its middle
     mean = np.diff(force, axis=0) / STEP_S
-    half = turn[:-1] * Rotation.from_rotvec(np.diff(angle, axis=0) / 2.0)
-    body_to_ned = half.as_matrix()
+    body_to_ned = matrix(multiply(turn[:-1], from_vector(np.diff(angle, axis=0) / 2.0)))
     specific = np.einsum("nij,nj->ni", body_to_ned, mean)
     table = np.zeros((len(mean), 3, 3, len(CONSTANT_SIGMA)))
     position, velocity, value = np.moveaxis(table, 1, 0)
@@ -287,14 +286,13 @@ def _signals(imu: pd.DataFrame, attitude: pd.DataFrame, span: tuple[float, float
     return Signals(edges[:-1], table)
 
 
-def _integrate_gyros(edges: Array, angle: Array, attitude: pd.DataFrame) -> Rotation:
-    """Attitude (body to NED) from the logged one at the start and the gyros alone."""
-    steps = np.zeros((len(edges) - 1, 7))  # poses that only turn
-    steps[:, 3:] = Rotation.from_rotvec(np.diff(angle, axis=0)).as_quat()
+def _integrate_gyros(edges: Array, angle: Array, attitude: pd.DataFrame) -> Array:
+    """Attitude (body to NED, w first) from the logged one at the start and the gyros alone."""
     known = attitude.index.to_numpy()
     near = slice(*np.clip(np.searchsorted(known, edges[0]) + np.array([-2, 3]), 0, len(known)))
-    logged = Rotation.from_quat(
-        attitude[QUATERNION_COLUMNS].to_numpy(copy=True)[near], scalar_first=True
-    )
-    start = Slerp(known[near], logged)(np.clip(edges[0], known[near][0], known[near][-1]))
-    return start * Rotation.from_quat(lie.chain(steps)[:, 3:])
+    logged = attitude.iloc[near][QUATERNION_COLUMNS].to_numpy(copy=True)
+    at_start = np.clip(edges[0], known[near][0], known[near][-1])
+    slerp = Slerp(known[near], Rotation.from_quat(logged, scalar_first=True))
+    start = slerp(at_start).as_quat(scalar_first=True)
+    turned = running_product(from_vector(np.diff(angle, axis=0)))
+    return np.vstack([start, multiply(start, turned)])

@@ -32,7 +32,7 @@ from px4fuse.ekf2.output_predictor import follow_attitude, publish
 from px4fuse.ekf2.parameters import PARAMETERS as MODEL_PARAMETERS
 from px4fuse.ekf2.parameters import settings_in_force
 from px4fuse.ekf2.recursion import EAST, HEADING, NORTH, Variant
-from px4fuse.ekf2.rotation import (
+from px4fuse.trajectory.rotation import (
     conjugate,
     from_vector,
     multiply,
