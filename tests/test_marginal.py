@@ -287,7 +287,7 @@ def test_constants_and_squares_are_those_of_the_conditional_distribution() -> No
         given = arguments(part, noises, np.ones(COUNT))
         constants, expected = joint_estimate(part, noises)
         np.testing.assert_allclose(fit(*given).constants()[0][:, 0], constants, rtol=1e-4)
-        square, count = squares(*given)
+        square, count = squares(*given, fit(*given).constants()[0][:, 0])
         np.testing.assert_allclose(square, expected, rtol=1e-4, atol=1e-9)
         np.testing.assert_array_equal(count, np.isfinite(part.positions.measurement_m).sum(axis=1))
 
@@ -301,7 +301,7 @@ def test_paired_products_are_under_the_covariance_with_the_constants() -> None:
         Columns(signal[..., [at]].transpose(1, 2, 0), nothing, nothing) for at in (0, 1)
     )
     given = arguments(part, noises, np.ones(COUNT))
-    ours = paired_products(*given, first, second)
+    ours = paired_products(*given, [(first, second), (second, second)])
     variance = np.full(COUNT, noises.sigma_z_m**2)
     for stretch in range(2):
         made = [stretch_normal(part, noises, variance, stretch, axis, 0) for axis in range(3)]
@@ -313,7 +313,7 @@ def test_paired_products_are_under_the_covariance_with_the_constants() -> None:
             block = slice(size[axis], size[axis + 1])
             covariance[block, block] += made[axis][2]
         expected = picked.T @ np.linalg.solve(covariance, picked)
-        np.testing.assert_allclose(ours[stretch], expected[0, 1], rtol=1e-4, atol=1e-4)
+        np.testing.assert_allclose(ours[stretch], expected[1], rtol=1e-4, atol=1e-4)
 
 
 def test_side_by_side_stretches_are_those_of_the_factorisation() -> None:

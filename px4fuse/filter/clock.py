@@ -338,13 +338,13 @@ def _scatter(problem: _Problem, offset: float, noises: Noises, information: floa
         dp += walk * rng.standard_normal(dp.shape)
     given = arguments(part, noises, np.ones(count))
     still = np.broadcast_to(0.0, (axes, REPLICATES_AT_ONCE, len(q00)))
-    scores = []
+    pairs = []
     for first in range(0, REPLICATES, REPLICATES_AT_ONCE):
         some = slice(first, first + REPLICATES_AT_ONCE)
         moved = Columns(*(np.transpose(each[..., some], (1, 2, 0)) for each in (error, dp, dv)))
         sped = Columns(np.transpose(speed[..., some], (1, 2, 0)), still, still)
-        scores.append(paired_products(*given, moved, sped).sum(axis=0))
-    score = np.concatenate(scores)
+        pairs.append((moved, sped))
+    score = paired_products(*given, pairs).sum(axis=0)
     return 1.0 + float(np.var(score)) / information
 
 
