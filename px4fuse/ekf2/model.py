@@ -317,7 +317,6 @@ def delayed_states(part: StretchRun, at: int) -> tuple[Array, Array]:
     leg = np.searchsorted(legs.end, np.arange(count), side="right")
     first = np.searchsorted(leg, leg)
     state = np.concatenate([kept[:1], kept[leg]])
-    begin = state[1:].copy()
 
     def grown(each: Array) -> Array:
         """Sum of what each step adds, from the beginning of its leg on."""
@@ -327,16 +326,16 @@ def delayed_states(part: StretchRun, at: int) -> tuple[Array, Array]:
     def before(after: Array, rows: slice) -> Array:
         """What there was before each step."""
         shifted = np.concatenate([after[:1], after[:-1]])
-        return np.where((first == np.arange(count))[:, None], begin[:, rows], shifted)
+        return np.where((first == np.arange(count))[:, None], kept[leg, rows], shifted)
 
     # the equations of the legs, for this state alone
-    turned = -np.einsum("nij,nj->ni", rotation, begin[:, GYRO_BIAS]) * dt
+    turned = -np.einsum("nij,nj->ni", rotation, state[1:, GYRO_BIAS]) * dt
     if variant.attitude:
         turned -= stretch.correction_rad
     state[1:, THETA] += grown(turned)
     force = np.einsum("nij,nj->ni", rotation, stretch.force_m_s2)
     gained = np.cross(before(state[1:, THETA], THETA), force) + force + GRAVITY_M_S2
-    gained -= np.einsum("nij,nj->ni", rotation, begin[:, ACCELEROMETER_BIAS])
+    gained -= np.einsum("nij,nj->ni", rotation, state[1:, ACCELEROMETER_BIAS])
     state[1:, VELOCITY] += grown(gained * dt)
     speed = state[1:, VELOCITY]
     state[1:, POSITION] += grown(0.5 * dt * (before(speed, VELOCITY) + speed))
