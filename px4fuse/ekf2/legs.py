@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 
 from px4fuse.display import brief
 from px4fuse.ekf2.inputs import Inputs
-from px4fuse.trajectory.rotation import skew
 from px4fuse.ekf2.stretches import Stretch
+from px4fuse.trajectory.rotation import skew
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]

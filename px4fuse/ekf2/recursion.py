@@ -285,9 +285,7 @@ class _Fusion:
     left: NDArray[np.intp]
 
 
-def _stacked(
-    legs: Sequence[Legs], first: int, pick: NDArray[np.intp] | slice
-) -> Iterator[Array]:
+def _stacked(legs: Sequence[Legs], first: int, pick: NDArray[np.intp] | slice) -> Iterator[Array]:
     """What each of some events does to state and covariance, shape (events, S, ...)."""
     some = slice(first, first + TOGETHER)
     for name in ("transition", "turn", "drive", "gyro_noise", "accelerometer_noise"):
