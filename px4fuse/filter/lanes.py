@@ -88,7 +88,7 @@ class Lanes:
             np.subtract(now, position, out=row)
             position += np.multiply(row, k0[step], out=scratch)
             velocity += np.multiply(row, k1[step], out=scratch)
-            row *= weight[step]
+            np.multiply(row, weight[step], out=row)
         by_axis = out.transpose(1, 2, 4, 3, 0, 5).swapaxes(-1, -2)
         return np.asarray((by_axis @ by_axis.swapaxes(-1, -2)).sum(axis=3))
 
