@@ -316,7 +316,8 @@ def run_preparation(
     first = prepared(settings)
     if asked != AUTO or request.position is not None:
         return first
-    found = clock_offset(first, tuned_horizontally(first), progress)
+    made: Made = {}
+    found = clock_offset(first, tuned_horizontally(first, made), progress, made)
     if isinstance(found, Unavailable) or not found.determinable:
         raise MissingDataError(
             f"{read.log.name}: `clock_offset_s` auto: not determinable: {found.reason}. "
@@ -429,8 +430,9 @@ def run_what_if(
             if asked:
                 raise
         else:
-            tuning = tuned_horizontally(compared)
-            clock = clock_offset(compared, tuning, progress)
+            made: Made = {}
+            tuning = tuned_horizontally(compared, made)
+            clock = clock_offset(compared, tuning, progress, made)
             why = why_ekf2_differs(compared, model, tuning, clock)
             if asked:
                 changes = asked_of_ekf2(compared, model, tuning, clock)
@@ -483,9 +485,9 @@ def explain(comparison: Comparison, progress: Progress = _silent) -> Analysis:
     return Analysis(comparison, tuning, clock, model, why, loop, heading)
 
 
-def tuned_horizontally(comparison: Comparison | Prepared) -> Tuning:
-    """The horizontal noises alone, which is what the clock estimate needs."""
-    return tuned(comparison, (HORIZONTAL,))
+def tuned_horizontally(comparison: Comparison | Prepared, made: Made | None = None) -> Tuning:
+    """The horizontal noises alone, which is what the clock estimate needs; ``made`` as there."""
+    return tuned(comparison, (HORIZONTAL,), made=made)
 
 
 def tuned(

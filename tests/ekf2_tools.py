@@ -6,8 +6,8 @@ import numpy as np
 
 from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.legs import GRAVITY_M_S2
-from px4fuse.ekf2.rotation import skew
 from px4fuse.ekf2.stretches import Stretch
+from px4fuse.trajectory.rotation import skew
 
 EYE = np.eye(15)
 

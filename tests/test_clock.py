@@ -162,20 +162,20 @@ def test_a_level_vehicle_at_rest_accelerates_in_no_direction() -> None:
     signals = _signals(
         imu_table(time, still - GRAVITY, still), attitude_table(time, level), (1.0, 9.0)
     )
-    assert signals.value.shape == (3, len(CONSTANT_SIGMA), len(signals.time_s))
-    for part in (signals.value, signals.velocity, signals.position):
-        np.testing.assert_allclose(part[:, 0], 0.0, atol=1e-10)
+    assert signals.table.shape == (len(signals.time_s), 3, 3, len(CONSTANT_SIGMA))
+    np.testing.assert_allclose(signals.table[..., 0], 0.0, atol=1e-10)
+    value = signals.table[:, 2]
     # tilt θ about north and east moves it sideways by θ × f, f = [0, 0, -g]; heading does not
     g = GRAVITY[2]
     np.testing.assert_allclose(
-        signals.value[:, 1:4],
-        np.multiply.outer([[0, -g, 0], [g, 0, 0], [0, 0, 0]], np.ones(len(signals.time_s))),
+        value[:, :, 1:4],
+        np.tile([[0, -g, 0], [g, 0, 0], [0, 0, 0]], (len(signals.time_s), 1, 1)),
         atol=1e-12,
     )
     # an accelerometer bias b adds -R b
     np.testing.assert_allclose(
-        signals.value[:, 7:10],
-        np.multiply.outer(-level[0].as_matrix(), np.ones(len(signals.time_s))),
+        value[:, :, 7:10],
+        np.tile(-level[0].as_matrix(), (len(signals.time_s), 1, 1)),
         atol=1e-12,
     )
 
@@ -189,11 +189,11 @@ def test_a_gyro_bias_tilts_a_level_vehicle_ever_further() -> None:
         imu_table(time, still - GRAVITY, still), attitude_table(time, level), (1.0, 9.0)
     )
     t = signals.time_s - signals.time_s[0]
-    by_bias = np.zeros((3, len(t)))
+    by_bias = np.zeros((len(t), 3))
     # (-t, 0, 0) × (0, 0, -g), in the middle of each step
-    by_bias[1] = -GRAVITY[2] * (t + STEP_S / 2.0)
-    np.testing.assert_allclose(signals.value[:, 4], by_bias, atol=1e-9)
-    np.testing.assert_allclose(signals.velocity[1, 4], -GRAVITY[2] * t**2 / 2.0, atol=1e-9)
+    by_bias[:, 1] = -GRAVITY[2] * (t + STEP_S / 2.0)
+    np.testing.assert_allclose(signals.table[:, 2, :, 4], by_bias, atol=1e-9)
+    np.testing.assert_allclose(signals.table[:, 1, 1, 4], -GRAVITY[2] * t**2 / 2.0, atol=1e-9)
 
 
 def test_a_constant_turn_goes_round_in_a_circle() -> None:
@@ -209,8 +209,8 @@ def test_a_constant_turn_goes_round_in_a_circle() -> None:
     signals = _signals(imu_table(time, force, rate), known, (0.5, 19.0))
     t = signals.time_s
     middle = omega * (t + STEP_S / 2.0)
-    circle = sideways * np.stack([-np.sin(middle), np.cos(middle), 0.0 * t])
-    np.testing.assert_allclose(signals.value[:, 0], circle, atol=2e-5)
+    circle = sideways * np.stack([-np.sin(middle), np.cos(middle), 0.0 * t], 1)
+    np.testing.assert_allclose(signals.table[:, 2, :, 0], circle, atol=2e-5)
     radius = sideways / omega**2
     start = t[0]
     speed = (
@@ -221,7 +221,7 @@ def test_a_constant_turn_goes_round_in_a_circle() -> None:
             1,
         )
     )
-    np.testing.assert_allclose(signals.velocity[:2, 0], speed.T, atol=1e-4)
+    np.testing.assert_allclose(signals.table[:, 1, :2, 0], speed, atol=1e-4)
 
 
 def test_at_any_time_the_signals_give_the_way_of_constant_acceleration() -> None:
@@ -231,10 +231,11 @@ def test_at_any_time_the_signals_give_the_way_of_constant_acceleration() -> None
     level = heading(np.zeros(len(time)))
     signals = _signals(imu_table(time, force, still), attitude_table(time, level), (0.0, 9.9))
     at = np.array([[0.5, 0.733, 4.0, 9.0], [0.617, 0.85, 4.117, 9.117]])
-    speed, way = signals.at(at)
-    since, felt = at - signals.time_s[0], np.array([1.5, 0.0, -0.5])[:, None, None]
-    np.testing.assert_allclose(speed[:, 0], since * felt, atol=1e-9)
-    np.testing.assert_allclose(way[:, 0], since**2 / 2.0 * felt, atol=1e-9)
+    way, speed, value = signals.at(at)
+    since, felt = (at - signals.time_s[0])[..., None], np.array([1.5, 0.0, -0.5])
+    np.testing.assert_allclose(value[..., 0], np.broadcast_to(felt, (2, 4, 3)), atol=1e-9)
+    np.testing.assert_allclose(speed[..., 0], since * felt, atol=1e-9)
+    np.testing.assert_allclose(way[..., 0], since**2 / 2.0 * felt, atol=1e-9)
 
 
 def test_legs_are_the_way_beyond_what_the_velocity_makes() -> None:

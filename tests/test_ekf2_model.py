@@ -13,7 +13,14 @@ from scipy.spatial.transform import Rotation
 
 from px4fuse.ekf2.inputs import Inputs, prepare
 from px4fuse.ekf2.legs import FUSE, START, Legs, Timing, make_legs
-from px4fuse.ekf2.model import Model, open_model, replay_ekf2, replay_settings
+from px4fuse.ekf2.model import (
+    Model,
+    delayed_states,
+    open_model,
+    replay_ekf2,
+    replay_settings,
+    run_variants,
+)
 from px4fuse.ekf2.recursion import Variant, run
 from px4fuse.ekf2.replay import HORIZONTAL, Ekf2Replay
 from px4fuse.ekf2.stretches import step_ends
@@ -90,6 +97,27 @@ def test_a_leg_is_the_product_of_its_steps(model: Model, legs: Legs) -> None:
         part = slice(0, 9)
         scale = np.sqrt(np.outer(np.diag(Q), np.diag(Q)))[part, part]
         assert np.max(np.abs(noise[leg] - Q)[part, part] / scale) < 0.03
+
+
+@pytest.mark.parametrize("attitude", [True, False])
+def test_within_a_leg_a_state_follows_from_its_beginning(model: Model, attitude: bool) -> None:
+    """Without attitude as a state, the nominal one is not corrected either."""
+    variant = Variant(model.inputs.settings, attitude=attitude)
+    timing = variant.timing(model.inputs)
+    (part,) = run_variants(model.inputs, [variant], {timing: model.legs})
+    kept = np.random.default_rng(4).normal(0.0, 0.05, part.run.state.shape)
+    part = replace(part, run=replace(part.run, state=kept))
+    state, _ = delayed_states(part, 0)
+    stretch, ends = part.stretch, part.legs[0].end
+    if not attitude:
+        stretch = replace(stretch, correction_rad=np.zeros_like(stretch.correction_rad))
+    np.testing.assert_array_equal(state[ends], kept[1:, 0])
+    for leg in (0, 1, 57, 300, len(ends)):  # after the last event comes one more
+        x = kept[leg, 0]
+        first, last = np.concatenate([[0], ends, [len(stretch.step_s)]])[[leg, leg + 1]]
+        for k in range(first, last - 1):
+            x = step_state(stretch, k, x)
+            np.testing.assert_allclose(state[k + 1], x, rtol=0.0, atol=1e-10)
 
 
 def test_the_recursion_is_the_plain_filter(model: Model, legs: Legs) -> None:

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from px4fuse.ekf2.output_predictor import follow_attitude, publish
-from px4fuse.ekf2.rotation import (
+from px4fuse.trajectory.rotation import (
     from_vector,
     interpolate,
     matrix,

@@ -33,9 +33,11 @@ from px4fuse.filter.fitting import (
     widened_by_outliers,
 )
 from px4fuse.filter.kalman import Settings
+from px4fuse.filter.lanes import gains, lanes_of_paths
 from px4fuse.filter.likelihood import PROFILE_DROP, innovations, preintegrate, total_over_grid
 from px4fuse.filter.marginal import (
     Positions,
+    centred,
     fit,
     paired_products,
     squares,
@@ -285,7 +287,7 @@ def test_constants_and_squares_are_those_of_the_conditional_distribution() -> No
         given = arguments(part, noises, np.ones(COUNT))
         constants, expected = joint_estimate(part, noises)
         np.testing.assert_allclose(fit(*given).constants()[0][:, 0], constants, rtol=1e-4)
-        square, count = squares(*given)
+        square, count = squares(*given, fit(*given).constants()[0][:, 0])
         np.testing.assert_allclose(square, expected, rtol=1e-4, atol=1e-9)
         np.testing.assert_array_equal(count, np.isfinite(part.positions.measurement_m).sum(axis=1))
 
@@ -299,7 +301,7 @@ def test_paired_products_are_under_the_covariance_with_the_constants() -> None:
         Columns(signal[..., [at]].transpose(1, 2, 0), nothing, nothing) for at in (0, 1)
     )
     given = arguments(part, noises, np.ones(COUNT))
-    ours = paired_products(*given, first, second)
+    ours = paired_products(*given, [(first, second), (second, second)])
     variance = np.full(COUNT, noises.sigma_z_m**2)
     for stretch in range(2):
         made = [stretch_normal(part, noises, variance, stretch, axis, 0) for axis in range(3)]
@@ -311,7 +313,7 @@ def test_paired_products_are_under_the_covariance_with_the_constants() -> None:
             block = slice(size[axis], size[axis + 1])
             covariance[block, block] += made[axis][2]
         expected = picked.T @ np.linalg.solve(covariance, picked)
-        np.testing.assert_allclose(ours[stretch], expected[0, 1], rtol=1e-4, atol=1e-4)
+        np.testing.assert_allclose(ours[stretch], expected[1], rtol=1e-4, atol=1e-4)
 
 
 def test_side_by_side_stretches_are_those_of_the_factorisation() -> None:
@@ -321,7 +323,7 @@ def test_side_by_side_stretches_are_those_of_the_factorisation() -> None:
     assert part.lanes is not None
     given = [arguments(part, noises, weight) for noises in SOME_NOISES]
     ours = [
-        replace(part.lanes, positions=positions).fit([sigma_a], variance)[0]
+        part.lanes.fit(gains(positions, [sigma_a], variance))[0]
         for positions, _, _, sigma_a, variance in given
     ]
     expected = [fit(*each) for each in given]
@@ -334,9 +336,32 @@ def test_side_by_side_stretches_are_those_of_the_factorisation() -> None:
     )
     # several ratios at once are each by itself
     positions, _, _, _, variance = given[0]
-    together = replace(part.lanes, positions=positions).fit([0.5, 2.0], variance)
+    together = part.lanes.fit(gains(positions, [0.5, 2.0], variance))
     np.testing.assert_allclose(together[0].gram, ours[0].gram, rtol=1e-9)
     np.testing.assert_allclose(together[1].gram, ours[2].gram, rtol=1e-9)
+
+
+def test_where_the_input_leads_says_the_same_as_its_legs() -> None:
+    """Positions about a smooth path, whose scale is the last constant, at all offsets."""
+    part = constants_part()
+    positions, chain = part.positions, part.positions.chain
+    dp, dv = part.delta_position_m.copy(), part.delta_velocity_m_s.copy()
+    dp[:, :, -1] = dv[:, :, -1] = 0.0
+    path, speed = np.zeros((2, COUNT, *dp.shape[:-1]))
+    for leg, (end, length) in enumerate(zip(chain.end, chain.length_s, strict=True)):
+        path[end] = path[end - 1] + length * speed[end - 1] + dp[..., leg]
+        speed[end] = speed[end - 1] + dv[..., leg]
+    variance = np.full(COUNT, 0.3)
+    of_legs = Part(*centred(positions, dp, dv, scaled=True)).lanes
+    assert of_legs is not None
+    for fits in zip(
+        of_legs.fit(gains(positions, [0.5, 2.0], variance)),
+        lanes_of_paths(positions, path[..., :-1]).fit(gains(positions, [0.5, 2.0], variance)),
+        strict=True,
+    ):
+        expected, ours = fits
+        assert np.ptp(expected.gram[..., -1, -1]) > 1.0
+        np.testing.assert_allclose(ours.gram, expected.gram, rtol=1e-7, atol=1e-7)
 
 
 def test_a_start_that_is_known_is_not_laid_side_by_side() -> None:

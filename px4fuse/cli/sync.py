@@ -25,6 +25,7 @@ def sync(log: Path, json_path: Path | None, **given: Any) -> None:
     or a MAVLink recording.
     """
     from px4fuse.analysis import clock_offset, run_preparation, tuned_horizontally
+    from px4fuse.filter.motion import Made
     from px4fuse.report.terminal import print_advice
     from px4fuse.report.words import clock_advice
     from px4fuse.request import command_line
@@ -34,7 +35,8 @@ def sync(log: Path, json_path: Path | None, **given: Any) -> None:
     with progress(json_path == STANDARD_OUTPUT, STEPS) as step:
         compared = run_preparation(request, step)
         step("tuning")
-        found = clock_offset(compared, tuned_horizontally(compared), step)
+        made: Made = {}  # both need the same signals of the IMU
+        found = clock_offset(compared, tuned_horizontally(compared, made), step, made)
     if write_json(sync_results(request, compared, found, command_line(request, "sync")), json_path):
         return
     print_advice(terminal(), clock_advice(compared, found), request)

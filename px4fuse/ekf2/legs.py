@@ -16,15 +16,14 @@ errors of gyro bias b_g and accelerometer bias b_a. Equations as in PX4-Autopilo
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from px4fuse.display import brief
 from px4fuse.ekf2.inputs import Inputs
-from px4fuse.ekf2.rotation import skew
 from px4fuse.ekf2.stretches import Stretch
+from px4fuse.trajectory.rotation import skew
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -48,39 +47,6 @@ IDLE, FUSE, START = 0, 1, 2
 # beginning, the correction of the nominal attitude, and gravity with the specific force
 CAUSES = 11
 TURN, INPUT = 9, 10
-
-
-@dataclass(frozen=True)
-class Transitions:
-    """From the beginning of its leg to each step's end.
-
-    Attributes
-    ----------
-    step : ndarray of int, shape (n,)
-        Which step each row below is of: they are long, and stay as they were made.
-    elapsed_s : ndarray, shape (n,)
-    attitude, velocity, position : ndarray, shape (n, 3, 11)
-        What the causes have done to each.
-    """
-
-    step: Indices
-    elapsed_s: Array
-    attitude: Array
-    velocity: Array
-    position: Array
-
-    __repr__ = brief
-
-    def rows(self, step: Indices) -> Indices:
-        """Rows of some steps."""
-        place = np.empty(len(self.step), dtype=np.intp)
-        place[self.step] = np.arange(len(self.step))
-        return place[step]
-
-    def rounded(self) -> Transitions:
-        """In half of the memory: within a leg less than a metre, to a tenth of a micrometre."""
-        parts: list[Any] = [self.attitude, self.velocity, self.position]
-        return Transitions(self.step, self.elapsed_s, *(p.astype(np.float32) for p in parts))
 
 
 @dataclass(frozen=True)
@@ -127,7 +93,6 @@ class Legs(_Events):
     gyro_noise, accelerometer_noise : ndarray, shape (E, 9, 9)
         Covariance of attitude, velocity and position added for unit noise.
     steps : ndarray, shape (E,)
-    within : Transitions
     """
 
     transition: Array
@@ -136,7 +101,6 @@ class Legs(_Events):
     gyro_noise: Array
     accelerometer_noise: Array
     steps: Array
-    within: Transitions
 
     __repr__ = brief
 
@@ -157,24 +121,19 @@ def make_legs(inputs: Inputs, stretch: Stretch, timing: Timing) -> Legs:
     events = _events(inputs, stretch, timing)
     end = events.end
     start = np.concatenate([[0], end[:-1]])
-    within = _transitions(stretch, start, end)
-    last = np.maximum(end - 1, 0)
     count = len(end)
     transition = np.tile(np.eye(STATES), (count, 1, 1))
     turn, drive = np.zeros((count, STATES)), np.zeros((count, STATES))
-    moved = end > start
-    at = within.rows(last[moved])
-    for rows, part in (
-        (THETA, within.attitude),
-        (VELOCITY, within.velocity),
-        (POSITION, within.position),
+    for rows, part in zip(
+        (THETA, VELOCITY, POSITION), _transitions(stretch, start, end), strict=True
     ):
-        transition[moved, rows, THETA] = part[at, :, 0:3]
-        transition[moved, rows, GYRO_BIAS] = part[at, :, 3:6]
-        transition[moved, rows, ACCELEROMETER_BIAS] = part[at, :, 6:9]
-        turn[moved, rows] = part[at, :, TURN]
-        drive[moved, rows] = part[at, :, INPUT]
-    transition[moved, POSITION, VELOCITY] = within.elapsed_s[at, None, None] * np.eye(3)
+        transition[:, rows, THETA] = part[:, :, 0:3]
+        transition[:, rows, GYRO_BIAS] = part[:, :, 3:6]
+        transition[:, rows, ACCELEROMETER_BIAS] = part[:, :, 6:9]
+        turn[:, rows] = part[:, :, TURN]
+        drive[:, rows] = part[:, :, INPUT]
+    elapsed = np.concatenate([[0.0], np.cumsum(stretch.step_s)])
+    transition[:, POSITION, VELOCITY] = (elapsed[end] - elapsed[start])[:, None, None] * np.eye(3)
     gyro, accelerometer = _noises(
         (end - start).astype(np.float64),
         stretch.time_s[end] - stretch.time_s[start],
@@ -188,7 +147,6 @@ def make_legs(inputs: Inputs, stretch: Stretch, timing: Timing) -> Legs:
         gyro_noise=gyro,
         accelerometer_noise=accelerometer,
         steps=(end - start).astype(np.float64),
-        within=within.rounded(),
     )
 
 
@@ -265,37 +223,32 @@ def _actions(
     return action, startable
 
 
-def _transitions(stretch: Stretch, start: Indices, end: Indices) -> Transitions:
-    """One step of every leg at a time, from its first on."""
-    n = len(stretch.step_s)
-    first = np.append(start, end[-1] if len(end) else 0)  # after the last event comes one more leg
-    length = np.append(end, n) - first
+def _transitions(stretch: Stretch, start: Indices, end: Indices) -> tuple[Array, Array, Array]:
+    """What the causes have done to attitude, velocity and position at the end of each leg.
+
+    Each of shape (E, 3, 11). One step of every leg at a time, from its first on.
+    """
+    length = end - start
     # the first steps of all legs, then their second ones and so on, longer legs before shorter ones
     longest_first = np.argsort(-length, kind="stable")
-    active = np.searchsorted(-length[longest_first], -np.arange(int(length.max())), side="left")
-    order = np.concatenate([first[longest_first[:count]] + at for at, count in enumerate(active)])
-    dt = stretch.step_s[order][:, None, None]
-    force = np.einsum("nij,nj->ni", stretch.rotation[1:], stretch.force_m_s2)[order]
-    tilt = -skew(force) * dt  # ∂v/∂δθ of a step
-    turned = -stretch.rotation[1:][order] * dt  # ∂δθ/∂b_g and ∂v/∂b_a of a step
-    attitude, velocity, position = np.zeros((3, n, 3, CAUSES))
-    attitude[:, :, 3:6] = turned
-    attitude[:, :, TURN] = -stretch.correction_rad[order]
-    velocity[:, :, 6:9] = turned
-    velocity[:, :, INPUT] = (force + GRAVITY_M_S2) * dt[:, :, 0]
-    elapsed = stretch.step_s[order]
-    low, high = 0, int(active[0])
-    attitude[:high, :, 0:3] = np.eye(3)
-    velocity[:high, :, 0:3] = tilt[:high]
-    position[:high] = 0.5 * dt[:high] * velocity[:high]
-    for count in active[1:].tolist():
-        was, now = slice(low, low + count), slice(high, high + count)
-        velocity[now] += velocity[was] + tilt[now] @ attitude[was]
-        position[now] = position[was] + 0.5 * dt[now] * (velocity[was] + velocity[now])
-        attitude[now] += attitude[was]
-        elapsed[now] += elapsed[was]
-        low, high = high, high + count
-    return Transitions(order, elapsed, attitude, velocity, position)
+    first = start[longest_first]
+    attitude, velocity, position = made = np.zeros((3, len(end), 3, CAUSES))
+    attitude[:, :, 0:3] = np.eye(3)
+    force_m_s2 = np.einsum("nij,nj->ni", stretch.rotation[1:], stretch.force_m_s2)
+    steps = np.arange(int(length.max(initial=0)))
+    for at, count in zip(steps, np.searchsorted(-length[longest_first], -steps), strict=True):
+        step, some = first[:count] + at, slice(count)
+        dt, force = stretch.step_s[step][:, None, None], force_m_s2[step]
+        turned = -stretch.rotation[1:][step] * dt  # ∂δθ/∂b_g and ∂v/∂b_a of a step
+        position[some] += 0.5 * dt * velocity[some]
+        velocity[some] += (-skew(force) * dt) @ attitude[some]  # by ∂v/∂δθ of the step
+        velocity[some, :, 6:9] += turned
+        velocity[some, :, INPUT] += (force + GRAVITY_M_S2) * dt[:, :, 0]
+        position[some] += 0.5 * dt * velocity[some]
+        attitude[some, :, 3:6] += turned
+        attitude[some, :, TURN] -= stretch.correction_rad[step]
+    made[:, longest_first] = made.copy()
+    return attitude, velocity, position
 
 
 def _noises(steps: Array, duration_s: Array, tilt: Array) -> tuple[Array, Array]:

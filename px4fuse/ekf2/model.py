@@ -19,12 +19,11 @@ from px4fuse.display import brief
 from px4fuse.ekf2.agreement import REJECTING_SHARE, agreement_with_log, with_obedient
 from px4fuse.ekf2.inputs import Inputs, prepare
 from px4fuse.ekf2.legs import (
-    CAUSES,
+    ACCELEROMETER_BIAS,
     GRAVITY_M_S2,
-    INPUT,
+    GYRO_BIAS,
     POSITION,
     THETA,
-    TURN,
     VELOCITY,
     Legs,
     Timing,
@@ -313,21 +312,33 @@ def delayed_states(part: StretchRun, at: int) -> tuple[Array, Array]:
     reset_m : ndarray, shape (n + 1, 3)
     """
     legs, variant = part.legs[part.which[at]], part.variants[at]
-    count, w = len(part.stretch.step_s), legs.within
-    kept = part.run.state[:, at]
+    stretch, kept = part.stretch, part.run.state[:, at]
+    count, rotation, dt = len(stretch.step_s), stretch.rotation[1:], stretch.step_s[:, None]
     leg = np.searchsorted(legs.end, np.arange(count), side="right")
-    causes = np.empty((len(kept), CAUSES))
-    causes[:, 0:3], causes[:, 3:9] = kept[:, THETA], kept[:, 9:15]
-    causes[:, TURN] = 1.0 if variant.attitude else 0.0
-    causes[:, INPUT] = 1.0
+    first = np.searchsorted(leg, leg)
     state = np.concatenate([kept[:1], kept[leg]])
-    # the rows of w are in an order of their own
-    leg, rows = leg[w.step], 1 + w.step
-    of_cause = causes[leg]
-    state[rows, THETA] = np.einsum("nij,nj->ni", w.attitude, of_cause)
-    state[rows, VELOCITY] += np.einsum("nij,nj->ni", w.velocity, of_cause)
-    state[rows, POSITION] += w.elapsed_s[:, None] * kept[leg, VELOCITY]
-    state[rows, POSITION] += np.einsum("nij,nj->ni", w.position, of_cause)
+
+    def grown(each: Array) -> Array:
+        """Sum of what each step adds, from the beginning of its leg on."""
+        total = np.cumsum(each, axis=0)
+        return np.asarray(total - (total - each)[first])
+
+    def before(after: Array, rows: slice) -> Array:
+        """What there was before each step."""
+        shifted = np.concatenate([after[:1], after[:-1]])
+        return np.where((first == np.arange(count))[:, None], kept[leg, rows], shifted)
+
+    # the equations of the legs, for this state alone
+    turned = -np.einsum("nij,nj->ni", rotation, state[1:, GYRO_BIAS]) * dt
+    if variant.attitude:
+        turned -= stretch.correction_rad
+    state[1:, THETA] += grown(turned)
+    force = np.einsum("nij,nj->ni", rotation, stretch.force_m_s2)
+    gained = np.cross(before(state[1:, THETA], THETA), force) + force + GRAVITY_M_S2
+    gained -= np.einsum("nij,nj->ni", rotation, state[1:, ACCELEROMETER_BIAS])
+    state[1:, VELOCITY] += grown(gained * dt)
+    speed = state[1:, VELOCITY]
+    state[1:, POSITION] += grown(0.5 * dt * (before(speed, VELOCITY) + speed))
     state[legs.end] = kept[1:]
     reset = np.zeros((count + 1, 3))
     for e in np.flatnonzero(part.run.reset[:, at]):

@@ -7,7 +7,7 @@ and ``EKF/vel_pos_fusion.cpp`` (gate, fusion), ``ev_pos_control.cpp`` (noise, re
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -46,11 +46,11 @@ MAX_BIAS_SD = 0.1 * 9.80665
 BIAS_RATIO = 0.01
 HEADING, NORTH, EAST, DOWN = 2, 6, 7, 8
 MEASURED = np.array([HEADING, DOWN, NORTH, EAST])
-OWN = np.array([HEADING, DOWN])
-HORIZONTAL = np.array([NORTH, EAST])
-BIASES = np.arange(9, 15)
+# Slices are views, where indices would be copies
+OWN = slice(HEADING, DOWN + 1, DOWN - HEADING)
+HORIZONTAL = slice(NORTH, EAST + 1)
+BIASES = slice(9, 15)
 FORCE_BIAS = np.arange(12, 15)
-EYE = np.eye(4)
 
 
 @dataclass(frozen=True)
@@ -175,6 +175,7 @@ def run(  # noqa: PLR0915 (one recursion, read from top to bottom)
     fusion = _Fusion(
         np.full(size, stretch.time_s[0]), np.zeros(size, bool), np.full(size, inputs.rules.resets)
     )
+    last_s = fusion.last_s
     out = Run(
         np.full((events, size, 2), np.nan),
         np.full((events, size, 2), np.nan),
@@ -192,19 +193,25 @@ def run(  # noqa: PLR0915 (one recursion, read from top to bottom)
     for e in range(events):
         within = e % TOGETHER
         if not within:  # legs are long: a few at a time
-            transition, turn, drive, gyro_noise, force_noise = _stacked(legs, e)
-        phi = transition[within][pick]
+            some = slice(e, e + TOGETHER)
+            transition, turn, drive, gyro_noise, force_noise = _stacked(legs, e, pick)
+            pushed = drive + turns * turn
+            added = gyro2 * gyro_noise + force2 * force_noise
+            drifted = drift * steps[some][:, pick]
+            own_now, own_spread = own[some][:, pick], own_variance[some][:, pick]
+            heading = np.where(attitude, own_now[:, :, 0], 0.0)
+        phi = transition[within]
         # x = Φx + u, P = ΦPΦ' + Q
-        x = (phi @ x[:, :, None])[:, :, 0] + drive[within][pick] + turns * turn[within][pick]
+        x = (phi @ x[:, :, None])[:, :, 0] + pushed[within]
         P = phi @ P @ np.swapaxes(phi, 1, 2)
-        P[:, :MOVED, :MOVED] += gyro2 * gyro_noise[within][pick]
-        P[:, :MOVED, :MOVED] += force2 * force_noise[within][pick]
-        spread = P[:, BIASES, BIASES]
-        P[:, BIASES, BIASES] = spread + (spread < drift_limit) * drift * steps[e][pick]
+        P[:, :MOVED, :MOVED] += added[within]
+        spread = P.reshape(size, -1)[:, :: STATES + 1]  # its diagonal, not a copy
+        biased = spread[:, BIASES]
+        biased += (biased < drift_limit) * drifted[within]
         if floor is not None:
             _limit_bias(P, floor, biases)
-        innovation[:, :2] = own[e][pick] - x[:, OWN]
-        R[:, :2] = _down_to(P[:, OWN, OWN], own_variance[e][pick])
+        np.subtract(own_now[within], x[:, OWN], out=innovation[:, :2])
+        R[:, :2] = _down_to(spread[:, OWN], own_spread[within])
         innovation[:, 2:] = 0.0
         R[:, 2:] = NOT_TAKEN
         restart = None
@@ -213,16 +220,17 @@ def run(  # noqa: PLR0915 (one recursion, read from top to bottom)
         if sampled[e]:
             active = schedule.action[e] > IDLE
             nu = measured[e, :, :2] - x[:, HORIZONTAL]
-            S = P[:, HORIZONTAL, HORIZONTAL] + noise[e, :, :2]
+            S = spread[:, HORIZONTAL] + noise[e, :, :2]
             outside = (nu * nu > gate2 * S).any(axis=1)
             out.innovation_m[e] = np.where(active[:, None], nu, np.nan)
             out.variance_m2[e] = np.where(active[:, None], S, np.nan)
             innovation[:, 2:] = nu
-            if quiet[e] and not (outside.any() or stopped):
+            if quiet[e] and not (stopped or outside.any()):
                 last_s, out.fused[e], R[:, 2:] = schedule.time_s[e], True, noise[e, :, :2]
-                fusion = replace(fusion, last_s=last_s)
             else:
+                fusion = replace(fusion, last_s=last_s)
                 beyond, taken, restart, fusion = _decide(inputs.rules, schedule, e, outside, fusion)
+                last_s = fusion.last_s
                 out.rejected[e], out.fused[e], out.reset[e] = beyond, taken, restart
                 R[taken, 2:] = noise[e, taken, :2]
                 stopped = bool(fusion.stopped.any())
@@ -230,10 +238,12 @@ def run(  # noqa: PLR0915 (one recursion, read from top to bottom)
                 innovation[:, 1] = measured[e, :, 2] - x[:, DOWN]
                 R[:, 1] = np.where(active, noise[e, :, 2], NOT_TAKEN)
         # K = PH'(HPH' + R)⁻¹, x = x + Kν, P = P - KHP
-        HP = P[:, MEASURED, :]
-        K = np.swapaxes(HP, 1, 2) @ np.linalg.inv(HP[:, :, MEASURED] + R[:, :, None] * EYE)
+        HP = np.take(P, MEASURED, axis=1)
+        HPH = np.take(HP, MEASURED, axis=2)
+        HPH.reshape(size, -1)[:, :: len(MEASURED) + 1] += R
+        K = np.swapaxes(HP, 1, 2) @ np.linalg.inv(HPH)
         x = x + (K @ innovation[:, :, None])[:, :, 0]
-        x[:, HEADING] = np.where(attitude, own[e][pick][:, 0], 0.0)
+        x[:, HEADING] = heading[within]
         P = P - K @ HP
         P = 0.5 * (P + np.swapaxes(P, 1, 2))
         if restart is not None and restart.any():
@@ -275,11 +285,11 @@ class _Fusion:
     left: NDArray[np.intp]
 
 
-def _stacked(legs: Sequence[Legs], first: int) -> list[Array]:
-    """What each of some events does to state and covariance, shape (events, legs, ...)."""
+def _stacked(legs: Sequence[Legs], first: int, pick: NDArray[np.intp] | slice) -> Iterator[Array]:
+    """What each of some events does to state and covariance, shape (events, S, ...)."""
     some = slice(first, first + TOGETHER)
-    names = "transition", "turn", "drive", "gyro_noise", "accelerometer_noise"
-    return [np.stack([getattr(leg, name)[some] for leg in legs], axis=1) for name in names]
+    for name in ("transition", "turn", "drive", "gyro_noise", "accelerometer_noise"):
+        yield np.stack([getattr(leg, name)[some] for leg in legs], axis=1)[:, pick]
 
 
 def _schedule(
@@ -357,11 +367,7 @@ def with_correlation(inputs: Inputs, stretch: Stretch, legs: Legs) -> Stretch:
     count = int(np.searchsorted(stretch.time_s[legs.end], stretch.time_s[0] + CORRELATING_S))
     first = replace(
         legs,
-        **{
-            field.name: getattr(legs, field.name)[:count]
-            for field in fields(legs)
-            if field.name != "within"
-        },
+        **{field.name: getattr(legs, field.name)[:count] for field in fields(legs)},
     )
     done = run(inputs, stretch, [first], np.zeros(1, np.intp), [Variant(inputs.settings)])
     # a bias that EKF2 does not learn has no variance
@@ -371,7 +377,7 @@ def with_correlation(inputs: Inputs, stretch: Stretch, legs: Legs) -> Stretch:
 
 def _keep(out: Run, at: int, x: Array, P: Array) -> None:
     out.state[at] = x
-    out.variance[at] = np.diagonal(P, axis1=1, axis2=2)
+    out.variance[at] = P.reshape(len(P), -1)[:, :: STATES + 1]
 
 
 def _start(stretch: Stretch, biases: Flags, attitude: Flags) -> tuple[Array, Array]:
@@ -395,10 +401,8 @@ def _down_to(variance: Array, target: Array) -> Array:
     measurements, so that their variances become the logged ones.
     """
     surplus = variance - target
-    noise: Array = np.where(
-        surplus > 0.0, variance * target / np.where(surplus > 0.0, surplus, 1.0), NOT_TAKEN
-    )
-    return noise
+    noise = np.full(surplus.shape, NOT_TAKEN)
+    return np.divide(variance * target, surplus, out=noise, where=surplus > 0.0)
 
 
 def _limit_bias(P: Array, floor: float, biases: Flags) -> None:

@@ -13,15 +13,6 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from px4fuse.display import brief
-from px4fuse.ekf2.rotation import (
-    conjugate,
-    from_vector,
-    interpolate,
-    matrix,
-    multiply,
-    running_product,
-    to_vector,
-)
 from px4fuse.ekf2.vision import Vision
 from px4fuse.flight import (
     ACCELEROMETER_BIAS_COLUMNS,
@@ -38,6 +29,15 @@ from px4fuse.flight import (
     Unavailable,
 )
 from px4fuse.readers.px4_ekf2 import samples_per_step
+from px4fuse.trajectory.rotation import (
+    conjugate,
+    from_vector,
+    interpolate,
+    matrix,
+    multiply,
+    running_product,
+    to_vector,
+)
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]

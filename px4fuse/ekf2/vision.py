@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from px4fuse.display import brief
 from px4fuse.ekf2.parameters import fuses_by_mask, settings_in_force
-from px4fuse.ekf2.rotation import conjugate, interpolate, matrix, multiply
 from px4fuse.flight import (
     POSITION_COLUMNS,
     POSITION_VARIANCE_COLUMNS,
@@ -25,6 +24,7 @@ from px4fuse.flight import (
     PositionTrack,
     Unavailable,
 )
+from px4fuse.trajectory.rotation import conjugate, interpolate, matrix, multiply
 
 Array = NDArray[np.float64]
 

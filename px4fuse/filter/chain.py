@@ -12,6 +12,7 @@ factorisation does not depend on them.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.linalg import lapack
@@ -46,6 +47,17 @@ class Chain:
     noise_unit: Array
     noise_fixed: Array
 
+    @cached_property
+    def by_element(self) -> tuple[Array, Array]:
+        """Both noises, an element after the other, shape (3, n)."""
+        return np.ascontiguousarray(self.noise_unit.T), np.ascontiguousarray(self.noise_fixed.T)
+
+    @cached_property
+    def before(self) -> IntArray | slice:
+        """State at which each leg starts; a slice where each state but the last starts one."""
+        whole = len(self.end) and self.end[-1] == len(self.end)
+        return slice(len(self.end)) if whole else self.end - 1
+
 
 @dataclass(frozen=True)
 class Columns:
@@ -71,7 +83,7 @@ class Factor:
         0 where there is none.
     length_s : ndarray, shape (m - 1,)
         Between any two states; 0 where a stretch begins.
-    inverse : ndarray, shape (m - 1, 3)
+    inverse : ndarray, shape (3, m - 1)
         Q⁻¹ by elements 00, 01, 11; zero where a stretch begins.
     root : ndarray, shape (m - 1,)
         1/√Q₁₁, as Q⁻¹ has it but for rounding; zero where a stretch begins.
@@ -107,7 +119,7 @@ class Factor:
         explained : ndarray, shape (..., 2m)
         """
         dp, dv = self._everywhere(columns)
-        i00, i01, _ = self.inverse.T
+        i00, i01, _ = self.inverse
         # Q⁻¹ = UᵀU; where a stretch begins it is zero
         u00 = np.sqrt(i00)
         u01 = np.divide(i01, u00, out=np.zeros_like(i01), where=u00 > 0.0)
@@ -125,9 +137,17 @@ class Factor:
         state, _ = lapack.dpbtrs(self.lower, right.T, lower=1, overwrite_b=1)
         return np.asarray(state.T.reshape(*dp.shape[:-1], -1, 2))
 
+    def follow(self, measured_m: Array) -> Array:
+        """Most likely positions where nothing but noise moves them, of shape (..., m) as given."""
+        right = np.zeros((*measured_m.shape, 2))
+        right[..., 0] = self.precision[:, 0] * measured_m
+        right = right.reshape(-1, right.shape[-2] * 2)
+        state, _ = lapack.dpbtrs(self.lower, right.T, lower=1, overwrite_b=1)
+        return np.asarray(state.T[:, ::2].reshape(measured_m.shape))
+
     def _right(self, measured: Array, dp: Array, dv: Array) -> Array:
         """The right side of the normal equations, shape (columns, 2m)."""
-        i00, i01, i11 = self.inverse.T
+        i00, i01, i11 = self.inverse
         right = np.zeros((*dp.shape[:-1], len(self.precision), 2))
         right[..., 0] = self.precision[:, 0] * measured
         g0, g1 = i00 * dp + i01 * dv, i01 * dp + i11 * dv
@@ -141,10 +161,10 @@ class Factor:
     def _everywhere(self, columns: Columns) -> tuple[Array, Array]:
         """Legs between any two states, whatever where a stretch begins."""
         dp, dv = columns.delta_position_m, columns.delta_velocity_m_s
-        if dp.shape[-1] == len(self.inverse):
+        if dp.shape[-1] == len(self.length_s):
             return dp, dv
-        made = np.zeros((2, *dp.shape[:-1], len(self.inverse)))
-        made[0][..., self.chain.end - 1], made[1][..., self.chain.end - 1] = dp, dv
+        made = np.zeros((2, *dp.shape[:-1], len(self.length_s)))
+        made[0][..., self.chain.before], made[1][..., self.chain.before] = dp, dv
         return made[0], made[1]
 
     def position_variance(self) -> Array:
@@ -187,33 +207,37 @@ def factorise(chain: Chain, sigma_a_m_s2: float, precision: Array) -> Factor:
     """
     if precision.ndim == 1:
         precision = np.stack([precision, np.zeros_like(precision)], 1)
-    q00, q01, q11 = (sigma_a_m_s2**2 * chain.noise_unit + chain.noise_fixed).T
-    measured = precision[:, 0]
+    unit, fixed = chain.by_element
+    q00, q01, q11 = sigma_a_m_s2**2 * unit + fixed
+    measured = np.ascontiguousarray(precision[:, 0])
     least = LEAST_SHARE**2 * (1.0 / np.median(measured[measured > 0.0]) + q00)
     # of a single step Q has no inverse but for that, which rounding would hide
-    own = q00 * q11 - q01**2
-    determinant = np.where(own > SINGULAR * q00 * q11, own, 0.0) + least * q11
-    q00 = q00 + least
-    count = len(precision)
-    inverse, root, dt = np.zeros((count - 1, 3)), np.zeros(count - 1), np.zeros(count - 1)
-    inverse[chain.end - 1] = np.stack([q11, -q01, q00], 1) / determinant[:, None]
-    root[chain.end - 1] = 1.0 / np.sqrt(q11)
-    dt[chain.end - 1] = chain.length_s
-    i00, i01, i11 = inverse.T
-    bands = np.zeros((4, 2 * count))
-    # A = Σ precision + [-F I]ᵀ Q⁻¹ [-F I]
-    position, velocity, cross = precision[:, 0].copy(), precision[:, 1].copy(), np.zeros(count)
-    position[1:] += i00
-    cross[1:] += i01
-    velocity[1:] += i11
-    position[:-1] += i00
-    cross[:-1] += i00 * dt + i01
-    velocity[:-1] += i00 * dt**2 + 2.0 * i01 * dt + i11
-    bands[0, 0::2], bands[0, 1::2], bands[1, 0::2] = position, velocity, cross
-    bands[2, 0:-2:2] = -i00
-    bands[1, 1:-2:2] = -(i00 * dt + i01)
-    bands[3, 0:-2:2] = -i01
-    bands[2, 1:-2:2] = -(i01 * dt + i11)
+    product = q00 * q11
+    own = product - q01**2
+    determinant = np.where(own > SINGULAR * product, own, 0.0) + least * q11
+    count, before = len(precision), chain.before
+    inverse, (root, dt) = np.zeros((3, count - 1)), np.zeros((2, count - 1))
+    inverse[0, before] = q11 / determinant
+    inverse[1, before] = -q01 / determinant
+    inverse[2, before] = (q00 + least) / determinant
+    root[before] = 1.0 / np.sqrt(q11)
+    dt[before] = chain.length_s
+    i00, i01, i11 = inverse
+    slope = i00 * dt
+    cross = slope + i01
+    # A = Σ precision + [-F I]ᵀ Q⁻¹ [-F I]; by columns, as LAPACK keeps bands
+    columns = np.zeros((count, 2, 4))
+    position, velocity = columns[:, 0], columns[:, 1]
+    position[:, 0], velocity[:, 0] = measured, precision[:, 1]
+    position[1:, 0] += i00
+    position[1:, 1] = i01
+    velocity[1:, 0] += i11
+    position[:-1, 0] += i00
+    position[:-1, 1] += cross
+    velocity[:-1, 0] += (cross + i01) * dt + i11
+    position[:-1, 2], position[:-1, 3] = -i00, -i01
+    velocity[:-1, 1], velocity[:-1, 2] = -cross, -(i01 * dt + i11)
+    bands = columns.reshape(-1, 4).T
     lower, broken = lapack.dpbtrf(bands, lower=1)
     if broken:
         raise np.linalg.LinAlgError("a stretch has too few measurements")

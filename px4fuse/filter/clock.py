@@ -30,9 +30,10 @@ from px4fuse.filter.fitting import (
     Part,
     arguments,
     most_likely,
-    of_ratios,
+    over_sigma_z,
 )
 from px4fuse.filter.kalman import Settings
+from px4fuse.filter.lanes import gains, lanes_of_paths
 from px4fuse.filter.likelihood import PROFILE_DROP, parabola_vertex, profile_interval
 from px4fuse.filter.marginal import Fitted, Positions, centred, paired_products
 from px4fuse.filter.motion import CONSTANT_SIGMA, SEARCH_S, Made, Motion, motion
@@ -149,10 +150,13 @@ class _Problem:
         """Fit at some offsets, a few at a time: their signals are long."""
         count = len(self.motion.time_s)
         each = max(1, BLOCK // (count * len(self.directions) * (1 + len(CONSTANT_SIGMA))))
-        made = [
-            of_ratios(self.part(offset_s[at : at + each]), ratios, walk, np.ones(count), sigma_z_m)
+        positions, variance = over_sigma_z(self.positions, walk, np.ones(count), sigma_z_m)
+        steps = gains(positions, ratios, variance)
+        paths = (
+            self.motion.paths(self.directions, offset_s[at : at + each])
             for at in range(0, len(offset_s), each)
-        ]
+        )
+        made = [lanes_of_paths(self.positions, path).fit(steps) for path in paths]
         return [
             replace(of_one[0], gram=np.concatenate([part.gram for part in of_one], axis=1))
             for of_one in zip(*made, strict=True)
@@ -336,13 +340,13 @@ def _scatter(problem: _Problem, offset: float, noises: Noises, information: floa
         dp += walk * rng.standard_normal(dp.shape)
     given = arguments(part, noises, np.ones(count))
     still = np.broadcast_to(0.0, (axes, REPLICATES_AT_ONCE, len(q00)))
-    scores = []
+    pairs = []
     for first in range(0, REPLICATES, REPLICATES_AT_ONCE):
         some = slice(first, first + REPLICATES_AT_ONCE)
         moved = Columns(*(np.transpose(each[..., some], (1, 2, 0)) for each in (error, dp, dv)))
         sped = Columns(np.transpose(speed[..., some], (1, 2, 0)), still, still)
-        scores.append(paired_products(*given, moved, sped).sum(axis=0))
-    score = np.concatenate(scores)
+        pairs.append((moved, sped))
+    score = paired_products(*given, pairs).sum(axis=0)
     return 1.0 + float(np.var(score)) / information
 
 

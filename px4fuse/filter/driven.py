@@ -45,19 +45,19 @@ def driven(
     """
     count, width = delta_position_m.shape
     k0, k1 = gain.T
-    bands = np.zeros((4, 2 * count))
+    bands = np.zeros((4, 2 * count + 2))
     # p = (1 - K₀)(p + dt v + Δp) + K₀ z,  v = v + Δv + K₁(z - (p + dt v + Δp))
-    bands[2, 0:-2:2] = k0[1:] - 1.0
-    bands[1, 1:-1:2] = (k0[1:] - 1.0) * length_s[1:]
-    bands[3, 0:-2:2] = k1[1:]
-    bands[2, 1:-1:2] = k1[1:] * length_s[1:] - 1.0
-    pushed = delta_position_m.copy()
-    pushed[0] += start[0] + length_s[0] * start[1]
-    right = np.empty((width, count, 2))
-    right[..., 0] = ((1.0 - k0[:, None]) * pushed + k0[:, None] * measured_m).T
-    right[..., 1] = (delta_velocity_m_s + k1[:, None] * (measured_m - pushed)).T
-    right[:, 0, 1] += start[1]
+    bands[2, 0:-2:2] = k0 - 1.0
+    bands[1, 1:-1:2] = (k0 - 1.0) * length_s
+    bands[3, 0:-2:2] = k1
+    bands[2, 1:-1:2] = k1 * length_s - 1.0
+    # time last, as LAPACK takes them
+    pushed, measured = (np.ascontiguousarray(each.T) for each in (delta_position_m, measured_m))
+    right = np.empty((width, count + 1, 2))
+    right[:, 0] = start.T
+    right[:, 1:, 0] = pushed + k0 * (measured - pushed)
+    right[:, 1:, 1] = delta_velocity_m_s.T + k1 * (measured - pushed)
     after, _ = lapack.dtbtrs(bands, right.reshape(width, -1).T, uplo="L", diag="U", overwrite_b=1)
-    state = np.concatenate([start[None], after.reshape(count, 2, width)])
-    prior = state[:-1, 0] + length_s[:, None] * state[:-1, 1] + delta_position_m
-    return prior, state
+    state = after.T.reshape(width, count + 1, 2)
+    prior = state[:, :-1, 0] + length_s * state[:, :-1, 1] + pushed
+    return prior.T, np.moveaxis(state, 0, -1)

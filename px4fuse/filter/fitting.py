@@ -19,7 +19,7 @@ from scipy.special import comb, expit, gammaincinv
 
 from px4fuse.arrays import Array
 from px4fuse.filter.chain import Chain
-from px4fuse.filter.lanes import Lanes, lanes
+from px4fuse.filter.lanes import Lanes, gains, lanes
 from px4fuse.filter.likelihood import PROFILE_DROP, Preintegrated
 from px4fuse.filter.marginal import Fitted, Positions, centred, fit, squares
 from px4fuse.filter.model import INITIAL_COVARIANCE
@@ -107,6 +107,7 @@ class Likelihood:
         self.tabulated = not any(part.positions.chain.noise_fixed.any() for part in parts)
         self.nodes, self.step = ROUGH_NODES if rough else NODES
         self._fits: dict[int, tuple[Fitted, ...]] = {}
+        self._rows: dict[tuple[int, int], Array] = {}
         self._values: dict[tuple[int, int], Array] = {}
 
     def __call__(self, noises: Noises) -> float:
@@ -131,12 +132,11 @@ class Likelihood:
         fits = [of_ratios(part, ratios, 0.0, self.weight, self.sigma_z_m) for part in self.parts]
         self._fits |= dict(zip(new, zip(*fits, strict=True), strict=True))
         scales = np.exp(self.step * (of_z + np.arange(self.nodes)))
-        return np.array(
-            [
-                np.sum([fitted.totals(scales)[:, 0] for fitted in self._fits[row]], axis=0)
-                for row in rows
-            ]
-        )
+        for row in rows:
+            if (row, of_z) not in self._rows:
+                totals = [fitted.totals(scales)[:, 0] for fitted in self._fits[row]]
+                self._rows[row, of_z] = np.sum(totals, axis=0)
+        return np.array([self._rows[row, of_z] for row in rows])
 
 
 @cache
@@ -169,18 +169,31 @@ def of_ratios(
     weight : ndarray, shape (m,)
     sigma_z_m : float
     """
-    positions = part.positions
+    positions, variance = over_sigma_z(part.positions, walk, weight, sigma_z_m)
+    if part.lanes is not None:
+        return part.lanes.fit(gains(positions, ratios, variance))
+    legs = part.delta_position_m, part.delta_velocity_m_s
+    return [fit(positions, *legs, ratio, variance) for ratio in ratios]
+
+
+def over_sigma_z(
+    positions: Positions, walk: float, weight: Array, sigma_z_m: float
+) -> tuple[Positions, Array]:
+    """Positions and variances over SIGMA_Z; what is fixed is taken at a SIGMA_Z.
+
+    Parameters
+    ----------
+    positions : Positions
+    walk, weight, sigma_z_m
+        As :func:`of_ratios` takes them.
+    """
     chain = positions.chain
     fixed = chain.noise_fixed / sigma_z_m**2
     chain = replace(chain, noise_fixed=fixed + np.outer(chain.length_s * walk**2, [1.0, 0.0, 0.0]))
     positions = replace(positions, chain=chain, initial=positions.initial * sigma_z_m**2)
     # the filter's start is not measured
     extra = np.ones(len(positions.measurement_m) - len(weight))
-    variance = 1.0 / np.concatenate([extra, weight])
-    if part.lanes is not None:
-        return replace(part.lanes, positions=positions).fit(ratios, variance)
-    legs = part.delta_position_m, part.delta_velocity_m_s
-    return [fit(positions, *legs, ratio, variance) for ratio in ratios]
+    return positions, 1.0 / np.concatenate([extra, weight])
 
 
 @dataclass(frozen=True)
@@ -309,7 +322,13 @@ def most_likely(
 
 
 def _squares(parts: Sequence[Part], noises: Noises, weight: Array) -> tuple[Array, Array]:
-    found = [squares(*arguments(part, noises, weight)) for part in parts]
+    found = [
+        squares(
+            *arguments(part, noises, weight),
+            fitted(part, noises, weight).constants()[0][:, 0],
+        )
+        for part in parts
+    ]
     size = len(weight)
     return (
         np.sum([square[-size:] for square, _ in found], axis=0),
@@ -363,16 +382,18 @@ def widened_by_outliers(square: Array, count: Array, outlier: Array, width: floa
 def _maximise(likelihood: Likelihood, start: Noises, steps: int = MAX_STEPS) -> Noises:
     values = [start.sigma_a_m_s2, start.sigma_z_m, *([start.walk_m] if start.walk_m else [])]
     bounds = np.log([SIGMA_A_SEARCH_M_S2, SIGMA_Z_SEARCH_M, WALK_SEARCH_M][: len(values)])
+    count = len(likelihood.weight)
 
     def score(logs: Array) -> float:
-        return likelihood(Noises(*np.exp(logs).tolist()))
+        # of each measurement: the first step is as long as the slope, at most 1
+        return likelihood(Noises(*np.exp(logs).tolist())) / count
 
     found = minimize(
         score,
         np.clip(np.log(values), *bounds.T),
         method="L-BFGS-B",
         bounds=bounds.tolist(),
-        options={"eps": SLOPE_STEP, "ftol": 1e-8, "maxiter": steps},
+        options={"eps": SLOPE_STEP, "ftol": 1e-10, "gtol": 1e-8, "maxiter": steps},
     )
     return Noises(*np.exp(found.x).tolist())
 

@@ -6,8 +6,9 @@ marginalised by the Schur complement of their products.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -45,6 +46,12 @@ class Positions:
     start: IntArray
     initial: Array
     constant_sigma: Array
+
+    @cached_property
+    def smooth(self) -> tuple[tuple[list[int], Factor, int], ...]:
+        """Factors for a smooth path through the positions, each with the axes that it serves."""
+        variance = np.full(len(self.measurement_m), PATH_NOISES[1] ** 2)
+        return tuple(_factors(self, PATH_NOISES[0], variance))
 
 
 @dataclass(frozen=True)
@@ -213,8 +220,7 @@ def centred(
     chain = positions.chain
     count = delta_position_m.shape[-1]
     of_leg = chain.end - 1 if count == len(chain.end) else slice(None)
-    variance = np.full(len(measured), PATH_NOISES[1] ** 2)
-    for axes, factor, _ in _factors(positions, PATH_NOISES[0], variance):
+    for axes, factor, _ in positions.smooth:
         dp, dv = (part[axes, 0, 0] for part in (delta_position_m, delta_velocity_m_s))
         state = factor.solve(Columns(np.nan_to_num(measured[:, axes].T), dp, dv))
         state[:, positions.start] = 0.0
@@ -235,6 +241,7 @@ def squares(
     delta_velocity_m_s: Array,
     sigma_a_m_s2: float,
     variance_m2: Array,
+    constants: Array,
 ) -> tuple[Array, Array]:
     """Expected square of each measurement's error given all data, summed over its axes.
 
@@ -244,6 +251,8 @@ def squares(
     delta_position_m, delta_velocity_m_s : ndarray, shape (a, 1, 1 + c, n)
     sigma_a_m_s2 : float
     variance_m2 : ndarray, shape (m,)
+    constants : ndarray, shape (s, c)
+        Most likely ones.
 
     Returns
     -------
@@ -251,8 +260,6 @@ def squares(
     count : ndarray, shape (m,)
         Axes that were measured.
     """
-    arguments = positions, delta_position_m, delta_velocity_m_s, sigma_a_m_s2, variance_m2
-    constants = fit(*arguments).constants()[0][:, 0]
     weight = np.concatenate([np.ones((len(constants), 1)), constants], axis=1)
     # of each leg, by the stretch in which it ends
     end = np.arange(1, len(variance_m2))
@@ -280,8 +287,7 @@ def paired_products(
     delta_velocity_m_s: Array,
     sigma_a_m_s2: float,
     variance_m2: Array,
-    first: Columns,
-    second: Columns,
+    pairs: Sequence[tuple[Columns, Columns]],
 ) -> Array:
     """Products of pairs of other signals by stretch, with the constants' signals taken out.
 
@@ -292,21 +298,23 @@ def paired_products(
     delta_position_m, delta_velocity_m_s : ndarray, shape (a, 1, 1 + c, n)
     sigma_a_m_s2 : float
     variance_m2 : ndarray, shape (m,)
-    first, second : Columns
-        Signals of shape (a, k, ...).
+    pairs : sequence
+        Signals of shape (a, k, ...), a few at a time: whitened they are twice as long.
 
     Returns
     -------
-    ndarray, shape (s, k)
+    ndarray, shape (s, k of all)
     """
-    states = len(variance_m2)
-    made = np.zeros((len(positions.start), first.measurement_m.shape[1]))
+    states, stretches = len(variance_m2), list(_stretches(positions))
+    first = np.cumsum([0, *(one.measurement_m.shape[1] for one, _ in pairs)])
+    made = np.zeros((len(stretches), first[-1]))
     constants = len(positions.constant_sigma)
     cross = np.zeros((2, *made.shape, constants))
     information = np.zeros((len(made), constants, constants)) + np.diag(
         positions.constant_sigma**-2.0
     )
     for axes, factor, _ in _factors(positions, sigma_a_m_s2, variance_m2):
+        root = np.sqrt(factor.precision[:, 0])
         for axis in axes:  # one at a time: they are long
             of_constants = factor.whiten(
                 Columns(
@@ -315,36 +323,36 @@ def paired_products(
                     delta_velocity_m_s[axis, 0, 1:],
                 )
             )
-            pair = [
-                (
-                    np.sqrt(factor.precision[:, 0]) * each.measurement_m[axis],
-                    *factor.whiten(
+            for at, stretch in enumerate(stretches):
+                rows, explained = _part_of(of_constants, stretch)
+                information[at] += rows @ rows.T - explained @ explained.T
+            for begin, end, pair in zip(first, first[1:], pairs, strict=False):
+                white = [
+                    factor.whiten(
                         Columns(
                             each.measurement_m[axis],
                             each.delta_position_m[axis],
                             each.delta_velocity_m_s[axis],
                         )
-                    ),
-                )
-                for each in (first, second)
-            ]
-            for at, (begin, end) in enumerate(_stretches(positions)):
-                parts = [
-                    (
-                        white[:, begin:end],
-                        rows[:, 2 * begin : 2 * end - 2],
-                        explained[:, 2 * begin : 2 * end],
                     )
-                    for white, rows, explained in pair
+                    for each in pair
                 ]
-                rows, explained = (
-                    of_constants[0][:, 2 * begin : 2 * end - 2],
-                    of_constants[1][:, 2 * begin : 2 * end],
-                )
-                by_part = [np.einsum("kr,kr->k", *both) for both in zip(*parts, strict=True)]
-                made[at] += by_part[0] + by_part[1] - by_part[2]
-                for which, (_, own, less) in enumerate(parts):
-                    cross[which, at] += own @ rows.T - less @ explained.T
-                information[at] += rows @ rows.T - explained @ explained.T
+                measured = [root * each.measurement_m[axis] for each in pair]
+                for at, stretch in enumerate(stretches):
+                    here = slice(*stretch)
+                    parts = [_part_of(each, stretch) for each in white]
+                    by_part = np.einsum("kr,kr->k", *(each[:, here] for each in measured))
+                    for sign, both in zip((1.0, -1.0), zip(*parts, strict=True), strict=True):
+                        by_part += sign * np.einsum("kr,kr->k", *both)
+                    made[at, begin:end] += by_part
+                    rows, explained = _part_of(of_constants, stretch)
+                    for which, (own, less) in enumerate(parts):
+                        cross[which, at, begin:end] += own @ rows.T - less @ explained.T
     taken = np.linalg.solve(information, np.swapaxes(cross[1], 1, 2))
     return np.asarray(made - np.einsum("skc,sck->sk", cross[0], taken))
+
+
+def _part_of(white: tuple[Array, Array], stretch: tuple[int, int]) -> tuple[Array, Array]:
+    """Rows and what the states explain of one stretch."""
+    begin, end = stretch
+    return white[0][:, 2 * begin : 2 * end - 2], white[1][:, 2 * begin : 2 * end]

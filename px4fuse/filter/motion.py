@@ -23,10 +23,10 @@ from scipy.spatial.transform import Rotation, Slerp
 from px4fuse.arrays import Array, IntArray, cumulative_integral
 from px4fuse.filter.chain import Chain
 from px4fuse.filter.marginal import Positions
-from px4fuse.filter.model import move, noise_of_many_steps
+from px4fuse.filter.model import noise_of_many_steps
 from px4fuse.filter.signals import imu_gaps
 from px4fuse.flight import ANGULAR_RATE_COLUMNS, QUATERNION_COLUMNS, SPECIFIC_FORCE_COLUMNS
-from px4fuse.trajectory.graph import lie
+from px4fuse.trajectory.rotation import from_vector, matrix, multiply, running_product
 
 # Standard deviations of the constants, wide for consumer sensors: tilt and heading (rad), gyro
 # (rad/s) and accelerometer (m/s²), scale of the positions (1)
@@ -51,26 +51,24 @@ MAX_IMU_INTERVAL_S = 0.025
 class Signals:
     """Acceleration of one stretch and of each constant, and their integrals.
 
-    ``value``, ``velocity`` and ``position`` have shape (3, constants, n): the acceleration with all
-    constants zero, then what each constant but the scale adds. Each value holds from its time to
-    the next.
+    ``table`` has shape (n, 3, 3, constants): position, velocity and acceleration along each axis,
+    with all constants zero, then what each constant but the scale adds. Each acceleration holds
+    from its time to the next.
     """
 
     time_s: Array
-    value: Array
-    velocity: Array
-    position: Array
+    table: Array
 
-    def at(self, time_s: Array, axes: slice = slice(None)) -> tuple[Array, Array]:
-        """Integrals at other times: velocity and position, shape (axes, constants, ...)."""
+    def at(self, time_s: Array, axes: slice = slice(None)) -> tuple[Array, Array, Array]:
+        """Position, velocity and acceleration at other times, shape (..., axes, constants)."""
         last = len(self.time_s) - 1
         at = np.clip(np.searchsorted(self.time_s, time_s, side="right") - 1, 0, last)
-        ahead = time_s - self.time_s[at]
-        position, velocity, value = (
-            np.take(part[axes], at, axis=-1) for part in (self.position, self.velocity, self.value)
-        )
-        position, velocity = move(position, velocity, value, ahead)
-        return velocity, position
+        ahead = (time_s - self.time_s[at])[..., None, None]
+        rows = np.moveaxis(self.table[at, :, axes], -3, 0)
+        position, velocity, value = rows
+        position += ahead * (velocity + (0.5 * ahead) * value)
+        velocity += ahead * value
+        return position, velocity, value
 
 
 @dataclass(frozen=True)
@@ -150,27 +148,53 @@ class Motion:
         delta_position_m, delta_velocity_m_s : ndarray, shape (a, T, 1 + constants, m - 1)
             Zero where a stretch begins, and for the scale.
         """
+        width = 1 + len(CONSTANT_SIGMA)
+        dp, dv = np.zeros((2, len(self.time_s) - 1, len(directions), len(offset_s), width))
+        for at, begin, end, position, velocity in self._moved(directions, offset_s):
+            step = np.diff(self.time_s[begin:end])[:, None, None]
+            leg = np.s_[begin : end - 1, :, at, :-1]
+            np.subtract(velocity[1:], velocity[:-1], out=dv[leg])
+            way = dp[leg]
+            np.subtract(position[1:], position[:-1], out=way)
+            way -= velocity[:-1] * step
+        return np.moveaxis(dp, 0, -1), np.moveaxis(dv, 0, -1)
+
+    def paths(self, directions: Array, offset_s: Array) -> Array:
+        """Where the acceleration leads from rest at the start of each stretch.
+
+        Parameters
+        ----------
+        directions, offset_s : ndarray
+            As :meth:`legs` takes them.
+
+        Returns
+        -------
+        ndarray, shape (m, a, T, constants)
+            What is known where all constants are zero, then what each but the scale adds.
+        """
+        made = np.empty((len(self.time_s), len(directions), len(offset_s), len(CONSTANT_SIGMA)))
+        for at, begin, end, position, velocity in self._moved(directions, offset_s):
+            since = (self.time_s[begin:end] - self.time_s[begin])[:, None, None]
+            way = made[begin:end, :, at]
+            np.subtract(position, position[0], out=way)
+            way -= velocity[0] * since
+        return made
+
+    def _moved(
+        self, directions: Array, offset_s: Array
+    ) -> Iterator[tuple[int, int, int, Array, Array]]:
+        """Which offset, first measurement and end of each stretch, its position and velocity."""
         # most directions are axes themselves
         used = np.flatnonzero(np.any(directions, axis=0))
         axes = slice(int(used[0]), int(used[-1]) + 1)  # a view of the signals
         own = directions[:, axes]
         turned = None if np.array_equal(own, np.eye(own.shape[1])) else own
-        width = 1 + len(CONSTANT_SIGMA)
-        dp, dv = np.zeros((2, len(directions), len(offset_s), width, len(self.time_s) - 1))
         for begin, end, signals in self._stretches():
-            step = np.diff(self.time_s[begin:end])
             for at, offset in enumerate(offset_s.tolist()):
-                velocity, position = signals.at(self.time_s[begin:end] + offset, axes)
+                position, velocity, _ = signals.at(self.time_s[begin:end] + offset, axes)
                 if turned is not None:
-                    velocity, position = (
-                        np.tensordot(turned, part, 1) for part in (velocity, position)
-                    )
-                leg = np.s_[:, at, :-1, begin : end - 1]
-                np.subtract(velocity[..., 1:], velocity[..., :-1], out=dv[leg])
-                way = dp[leg]
-                np.subtract(position[..., 1:], position[..., :-1], out=way)
-                way -= velocity[..., :-1] * step
-        return dp, dv
+                    position, velocity = turned @ position, turned @ velocity
+                yield at, begin, end, position, velocity
 
     def _stretches(self) -> Iterator[tuple[int, int, Signals]]:
         return zip(self.edges[:-1].tolist(), self.edges[1:].tolist(), self.signals, strict=True)
@@ -241,36 +265,34 @@ def _signals(imu: pd.DataFrame, attitude: pd.DataFrame, span: tuple[float, float
     turn = _integrate_gyros(edges, angle, attitude)
     # of each step, in its middle
     mean = np.diff(force, axis=0) / STEP_S
-    half = turn[:-1] * Rotation.from_rotvec(np.diff(angle, axis=0) / 2.0)
-    body_to_ned = half.as_matrix()
-    specific = np.einsum("nij,nj->in", body_to_ned, mean)
-    value = np.empty((3, len(CONSTANT_SIGMA), len(mean)))
-    value[:, 0] = specific
-    value[2, 0] += constants.g
+    body_to_ned = matrix(multiply(turn[:-1], from_vector(np.diff(angle, axis=0) / 2.0)))
+    specific = np.einsum("nij,nj->ni", body_to_ned, mean)
+    table = np.zeros((len(mean), 3, 3, len(CONSTANT_SIGMA)))
+    position, velocity, value = np.moveaxis(table, 1, 0)
+    value[:, :, 0] = specific
+    value[:, 2, 0] += constants.g
     # a small rotation θ of the attitude adds θ × f; a gyro bias b turns it by -∫ R b dt
-    by_axis = np.moveaxis(body_to_ned, 0, -1)
-    turned = -STEP_S * (np.cumsum(by_axis, axis=-1) - by_axis / 2.0)
+    turned = -STEP_S * (np.cumsum(body_to_ned, axis=0) - body_to_ned / 2.0)
     for axis in range(3):
         after, last = (axis + 1) % 3, (axis + 2) % 3
-        value[axis, 1 + axis] = 0.0
-        value[after, 1 + axis], value[last, 1 + axis] = -specific[last], specific[after]
-        value[axis, 4:7] = turned[after] * specific[last] - turned[last] * specific[after]
-    value[:, 7:10] = -by_axis
-    velocity, position = np.zeros((2, *value.shape))
-    np.cumsum(value[..., :-1] * STEP_S, axis=-1, out=velocity[..., 1:])
-    step = velocity[..., :-1] + value[..., :-1] * (STEP_S / 2.0)
-    np.cumsum(step * STEP_S, axis=-1, out=position[..., 1:])
-    return Signals(edges[:-1], value, velocity, position)
+        value[:, after, 1 + axis] = -specific[:, last]
+        value[:, last, 1 + axis] = specific[:, after]
+        value[:, axis, 4:7] = turned[:, after] * specific[:, [last]]
+        value[:, axis, 4:7] -= turned[:, last] * specific[:, [after]]
+    value[:, :, 7:10] = -body_to_ned
+    np.cumsum(value[:-1] * STEP_S, axis=0, out=velocity[1:])
+    step = velocity[:-1] + value[:-1] * (STEP_S / 2.0)
+    np.cumsum(step * STEP_S, axis=0, out=position[1:])
+    return Signals(edges[:-1], table)
 
 
-def _integrate_gyros(edges: Array, angle: Array, attitude: pd.DataFrame) -> Rotation:
-    """Attitude (body to NED) from the logged one at the start and the gyros alone."""
-    steps = np.zeros((len(edges) - 1, 7))  # poses that only turn
-    steps[:, 3:] = Rotation.from_rotvec(np.diff(angle, axis=0)).as_quat()
+def _integrate_gyros(edges: Array, angle: Array, attitude: pd.DataFrame) -> Array:
+    """Attitude (body to NED, w first) from the logged one at the start and the gyros alone."""
     known = attitude.index.to_numpy()
     near = slice(*np.clip(np.searchsorted(known, edges[0]) + np.array([-2, 3]), 0, len(known)))
-    logged = Rotation.from_quat(
-        attitude[QUATERNION_COLUMNS].to_numpy(copy=True)[near], scalar_first=True
-    )
-    start = Slerp(known[near], logged)(np.clip(edges[0], known[near][0], known[near][-1]))
-    return start * Rotation.from_quat(lie.chain(steps)[:, 3:])
+    logged = attitude.iloc[near][QUATERNION_COLUMNS].to_numpy(copy=True)
+    at_start = np.clip(edges[0], known[near][0], known[near][-1])
+    slerp = Slerp(known[near], Rotation.from_quat(logged, scalar_first=True))
+    start = slerp(at_start).as_quat(scalar_first=True)
+    turned = running_product(from_vector(np.diff(angle, axis=0)))
+    return np.vstack([start, multiply(start, turned)])

@@ -45,7 +45,7 @@ MAP_SIGMAS = 4.5
 MIN_MEASUREMENTS = 30
 MAX_OUTLIER_SHARE = 0.3
 # The clock offset is a nuisance here: a rough one is enough
-OFFSET_POINTS = 25
+OFFSET_POINTS, OFFSET_BLOCKS = 25, 5
 COARSE_MEASUREMENTS = 2000
 SIGMA_A_FACTORS = (0.1, 0.3, 1.0)
 FIRST_WALK_M = 0.02
@@ -292,16 +292,15 @@ def _with_biases(
     start = replace(alone.noises, walk_m=FIRST_WALK_M if drifts else 0.0)
     offsets = np.linspace(-SEARCH_S, SEARCH_S, OFFSET_POINTS)
     some = moved.thinned(COARSE_MEASUREMENTS) or moved
-    part = Part(
-        some.positions(measured, settings.dt_s),
-        *some.legs(directions, offsets),
-    )
     levels = [
         replace(start, sigma_a_m_s2=start.sigma_a_m_s2 * factor) for factor in SIGMA_A_FACTORS
     ]
     of_some = weight[np.isin(moved.row, some.row)]
-    scores = [fitted(part, noises, of_some).total() for noises in levels]
-    level, at = np.unravel_index(np.argmin(scores), np.shape(scores))
+    known, scores = some.positions(measured, settings.dt_s), []
+    for few in np.array_split(offsets, OFFSET_BLOCKS):  # their signals are long
+        part = Part(known, *some.legs(directions, few))
+        scores.append([fitted(part, noises, of_some).total() for noises in levels])
+    level, at = np.unravel_index(np.argmin(np.hstack(scores)), (len(levels), len(offsets)))
     positions = moved.positions(measured, settings.dt_s)
     legs = moved.legs(directions, offsets[[at]])
     parts = [Part(*centred(positions, *legs, scaled=True))]

@@ -32,7 +32,6 @@ from px4fuse.ekf2.output_predictor import follow_attitude, publish
 from px4fuse.ekf2.parameters import PARAMETERS as MODEL_PARAMETERS
 from px4fuse.ekf2.parameters import settings_in_force
 from px4fuse.ekf2.recursion import EAST, HEADING, NORTH, Variant
-from px4fuse.ekf2.rotation import conjugate, from_vector, multiply, running_product, skew, to_vector
 from px4fuse.ekf2.stretches import Stretch, down_sampled, step_ends
 from px4fuse.ekf2.vision import Vision
 from px4fuse.simulation import sensors
@@ -41,6 +40,14 @@ from px4fuse.simulation.mistakes import Mistakes
 from px4fuse.simulation.motion import Motion, Sines, attitude
 from px4fuse.simulation.scenario import Scenario
 from px4fuse.simulation.ulog_writer import Topic
+from px4fuse.trajectory.rotation import (
+    conjugate,
+    from_vector,
+    multiply,
+    running_product,
+    skew,
+    to_vector,
+)
 
 PREDICT_US = 10_000  # EKF2_PREDICT_US
 # v1.14 to main: EV_MAX_INTERVAL (ev_control.cpp), reset_timeout_max (common.h)

@@ -17,7 +17,8 @@ from pathlib import Path
 from measured import Measured, measured
 
 MINUTES = (2, 10, 23, 60)
-PASSES_PER_MINUTE = 96 / 23
+# Of one pass along an aisle of 12 m, at 1 m/s and with its start and stop; simulate has a limit
+PASS_S, LENGTH_M, MOST_PASSES = 60 * 23 / 96, 12.0, 100
 READ = "import sys; from pyulog import ULog; ULog(sys.argv[1], sys.argv[2].split(','))"
 
 
@@ -29,8 +30,10 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         for minutes in [int(word) for word in sys.argv[1:]] or MINUTES:
             log = Path(folder) / f"{minutes}.ulg"
-            passes = max(1, round(minutes * PASSES_PER_MINUTE))
-            measured([*px4fuse, "simulate", "--passes", str(passes), "-o", str(log)])
+            passes = min(max(1, round(60 * minutes / PASS_S)), MOST_PASSES)
+            length = LENGTH_M + max(0.0, 60 * minutes / passes - PASS_S)
+            flight = ["--passes", str(passes), "--length", f"{length:g}", "-o", str(log)]
+            measured([*px4fuse, "simulate", *flight])
             commands = {
                 "compare": ["compare", str(log), "-o", str(Path(folder) / "report.pdf")],
                 "tune": ["tune", str(log)],
