@@ -457,9 +457,8 @@ def test_positions_that_the_logger_thinned(rate_hz: float, name: str, decimated:
     for rung, tracks in ((2, ()), (3, ()), (7, ()), (4, (SimpleNamespace(rung=2),))):
         one = analysis(source=source(name=name, rung=rung), flight={"positions": tracks})
         assert named(source_not_logged, one) == {}
-    assert "(it is not in this log)" in list(
-        source_not_logged.DETECTOR.detect(analysis(source=source(name=name, rung=4)))
-    )[0].message  # fmt: skip
+    first = next(source_not_logged.DETECTOR.detect(analysis(source=source(name=name, rung=4))))
+    assert "(it is not in this log)" in first.message
 
 
 @pytest.mark.parametrize(
