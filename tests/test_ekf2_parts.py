@@ -508,7 +508,7 @@ def test_fusion_starts_on_the_second_of_two_samples_and_stops_in_silence() -> No
     assert acting([10.1, 10.5, 10.6]) == [FUSE, FUSE, FUSE]
     assert acting([10.1, 10.53, 10.6]) == [FUSE, IDLE, START]
     old = replace(RULES, start_interval_s=math.inf, stop_s=7.0)
-    assert acting([10.1, 13.0], fusing=False, rules=old) == [START, FUSE]
+    assert acting([10.1, 12.0, 14.9], fusing=False, rules=old) == [IDLE, START, FUSE]
 
 
 def events(
