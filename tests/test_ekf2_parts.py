@@ -28,20 +28,47 @@ from px4fuse.ekf2.agreement import (
     with_obedient,
 )
 from px4fuse.ekf2.inputs import Inputs, Rules, prepare
-from px4fuse.ekf2.legs import FUSE, IDLE, START, Timing, _actions, _events, _noises
+from px4fuse.ekf2.legs import (
+    FUSE,
+    GRAVITY_M_S2,
+    IDLE,
+    START,
+    Timing,
+    _actions,
+    _events,
+    _noises,
+    make_legs,
+)
 from px4fuse.ekf2.model import Model, replay_settings
 from px4fuse.ekf2.parameters import PARAMETERS, check, fuses_by_mask, settings_in_force
-from px4fuse.ekf2.recursion import Variant, _decide, _down_to, _drift, _Fusion, _limit_bias
+from px4fuse.ekf2.recursion import (
+    Run,
+    Variant,
+    _decide,
+    _down_to,
+    _drift,
+    _Fusion,
+    _limit_bias,
+    run,
+)
 from px4fuse.ekf2.recursion import _measurements as measurements
 from px4fuse.ekf2.replay import Agreement, AxisAgreement, Ekf2Replay
 from px4fuse.ekf2.rotation import (
     from_vector,
     interpolate,
+    matrix,
     multiply,
     running_product,
     to_vector,
 )
-from px4fuse.ekf2.stretches import Stretch, _counted, down_sampled, find_stretches, predict_s
+from px4fuse.ekf2.stretches import (
+    Stretch,
+    _counted,
+    _stretch,
+    down_sampled,
+    find_stretches,
+    predict_s,
+)
 from px4fuse.ekf2.stretches import step_ends as ends_of
 from px4fuse.ekf2.vision import Vision, _decisions, _source, read_vision
 from px4fuse.ekf2.walk import AxisWalk, Line, Student, _coast, _variants
@@ -57,10 +84,16 @@ from px4fuse.ekf2.whatif import (
 )
 from px4fuse.errors import SettingsError
 from px4fuse.flight import (
+    ACCELEROMETER_BIAS_COLUMNS,
+    ANGULAR_RATE_COLUMNS,
+    DELAYED_VARIANCE_COLUMNS,
+    GYRO_BIAS_COLUMNS,
     POSITION_COLUMNS,
     POSITION_VARIANCE_COLUMNS,
     QUATERNION_COLUMNS,
+    SPECIFIC_FORCE_COLUMNS,
     STATE_COLUMNS,
+    VELOCITY_COLUMNS,
     Ekf2,
     Flight,
     FusionRecord,
@@ -124,8 +157,8 @@ def test_a_sweep_has_2_to_200_values() -> None:
 
 def test_a_rotation_that_hardly_turns_keeps_its_size() -> None:
     tiny = np.array([1.0, 2e-13, -4e-13, 6e-13])
-    assert to_vector(tiny) == pytest.approx([4e-13, -8e-13, 12e-13], rel=1e-9)
-    assert to_vector(-tiny) == pytest.approx([4e-13, -8e-13, 12e-13], rel=1e-9)
+    for sign in (1.0, -1.0):
+        np.testing.assert_allclose(to_vector(sign * tiny), [4e-13, -8e-13, 12e-13])
     vectors = np.random.default_rng(1).uniform(-1.5, 1.5, (20, 3))
     np.testing.assert_allclose(to_vector(from_vector(vectors)), vectors, atol=1e-12)
 
@@ -530,6 +563,7 @@ def test_a_sample_is_fused_at_the_end_of_the_step_of_its_measurement() -> None:
     assert not found.usable[~seen].any()
     assert found.action.tolist() == [FUSE, FUSE, IDLE, IDLE, IDLE]
     assert events([10.2, 10.305], delay_s=0.05).end[:2].tolist() == [15, 25]
+    assert events([10.505]).sample[:3].tolist() == [-1, -1, 0]
     # in the first step, and before it
     assert events([10.01]).usable[0]
     assert events([10.01]).end[0] == 1
@@ -685,6 +719,66 @@ def test_a_release_without_delay_max_has_none() -> None:
     assert replay_settings(model, []) == ()
 
 
+def at_rest(measured_m: list[float], **settings: float) -> tuple[Run, Inputs]:
+    """A level vehicle that stands still at the origin, seen at 10 Hz at these places north."""
+    count = 10 * (len(measured_m) + 1)
+    flat = np.zeros((count, 3))
+    stretch = Stretch(
+        time_s=10.0 + 0.01 * np.arange(count + 1), step_s=np.full(count, 0.01),
+        rotation=np.tile(np.eye(3), (count + 1, 1, 1)), correction_rad=flat,
+        force_m_s2=flat - GRAVITY_M_S2, gyro_bias_rad_s=np.zeros(3),
+        accelerometer_bias_m_s2=np.zeros(3), state=np.zeros(15), variance=np.full(15, 1e-4),
+        down_m=np.zeros(count + 1), heading_variance_rad2=np.full(count + 1, 1e-4),
+        down_variance_m2=np.full(count + 1, 4e-4), attitude_error_rad=np.zeros((count + 1, 3)),
+        correlation=np.eye(15),
+    )  # fmt: skip
+    stamp = 10.105 + 0.1 * np.arange(len(measured_m))
+    north = np.array(measured_m)
+    vision = Vision(
+        stamp, np.full(len(stamp), -np.inf), np.column_stack([north, 0.0 * north, 0.0 * north]),
+        np.zeros((len(stamp), 3)), np.full(len(stamp), np.nan), np.zeros(len(stamp), bool), "uwb",
+    )  # fmt: skip
+    inputs = Inputs(
+        settings_in_force(settings), (stretch,), vision, RULES, 0.01, 0.1, 0.01,
+        vision_height=False, imu_offset_m=np.zeros(3),
+    )  # fmt: skip
+    legs = make_legs(inputs, stretch, Timing(0.0, 0.1))
+    done = run(inputs, stretch, [legs], np.zeros(1, np.intp), [Variant(inputs.settings)])
+    return done, inputs
+
+
+def test_a_vehicle_at_rest_stays_and_its_variance_is_the_kalman_filters() -> None:
+    done, _ = at_rest([0.0] * 20)
+    np.testing.assert_allclose(done.state, 0.0, atol=1e-9)
+    assert done.fused.all()
+    np.testing.assert_allclose(done.noise_m2, 0.01)
+    # P after = P R / (P + R), each of north and east alone
+    before, after = done.variance_m2[0, 0] - 0.01, done.variance[1, 0, 6:8]
+    np.testing.assert_allclose(after, before * 0.01 / (before + 0.01), rtol=1e-3)
+    # the first 0.1 s: position 1e-4 and velocity 1e-4 over it, and what tilt and noise add
+    assert before[0] == pytest.approx(1e-4 + 1e-4 * 0.1**2, rel=0.05)
+    # heading and height have the variances of EKF2's own
+    np.testing.assert_allclose(done.variance[1:, 0, 2], 1e-4, rtol=0.01)
+    assert done.variance[-1, 0, 8] == pytest.approx(4e-4, rel=0.01)
+
+
+def test_a_step_of_the_source_is_rejected_for_a_second_and_then_reset_to() -> None:
+    done, _ = at_rest([0.0] * 5 + [3.0] * 15)
+    rejected, reset, fused = done.rejected[:, 0], done.reset[:, 0], done.fused[:, 0]
+    assert np.flatnonzero(rejected).tolist() == list(range(5, 16))
+    assert np.flatnonzero(reset).tolist() == [15]
+    assert np.flatnonzero(fused).tolist() == [*range(5), *range(16, 20)]
+    np.testing.assert_allclose(done.innovation_m[5, 0], [3.0, 0.0], atol=1e-3)
+    np.testing.assert_allclose(done.state[16, 0, 6:8], [3.0, 0.0], atol=1e-9)
+    np.testing.assert_allclose(done.state[15, 0, 6:8], [0.0, 0.0], atol=1e-3)
+    np.testing.assert_allclose(done.variance[16, 0, 6:8], 0.01)
+    # nothing else is touched
+    np.testing.assert_allclose(done.variance[16, 0, 8], done.variance[15, 0, 8], rtol=0.01)
+    assert (done.variance[16, 0, 3:6] > done.variance[15, 0, 3:6]).all()
+    wide, _ = at_rest([0.0] * 5 + [3.0] * 15, EKF2_EVP_GATE=100.0)
+    assert wide.fused.all()
+
+
 # ---------------------------------------------------------------- walk and what-if
 
 
@@ -801,6 +895,60 @@ def test_what_is_left_is_a_share_of_all() -> None:
     assert along == pytest.approx([3.8])
 
 
+# ---------------------------------------------------------------- what a stretch is made of
+
+
+def test_a_stretch_of_a_vehicle_that_turns() -> None:
+    """0.5 rad/s about the vertical; the gyro reads 0.01 rad/s too much, EKF2 knows."""
+    time = 10.0 + 0.005 * np.arange(401)
+    imu = pd.DataFrame(0.0, index=time, columns=ANGULAR_RATE_COLUMNS + SPECIFIC_FORCE_COLUMNS)
+    imu[ANGULAR_RATE_COLUMNS[2]] = 0.51
+    imu[SPECIFIC_FORCE_COLUMNS] = [1.0, 0.2, -9.8]
+
+    def facing(at: Any, error: Any = 0.0) -> np.ndarray:
+        angle = 0.5 * (np.asarray(at) - 10.5) + error
+        return np.column_stack([np.cos(angle / 2), 0 * angle, 0 * angle, np.sin(angle / 2)])
+
+    attitude = pd.DataFrame(facing(time[::4]), index=time[::4], columns=QUATERNION_COLUMNS)
+    states = 10.0 + 0.1 * np.arange(21)
+    delayed = pd.DataFrame(
+        facing(states, 0.01 * np.arange(21)), index=states, columns=QUATERNION_COLUMNS
+    )
+    delayed = delayed.assign(**dict.fromkeys(VELOCITY_COLUMNS, 2.0), **{
+        **dict.fromkeys(POSITION_COLUMNS, np.nan), **dict.fromkeys(GYRO_BIAS_COLUMNS, 0.0),
+        **dict.fromkeys(ACCELEROMETER_BIAS_COLUMNS, 0.2), GYRO_BIAS_COLUMNS[2]: 0.01,
+        **{name: 1.0 + n for n, name in enumerate(DELAYED_VARIANCE_COLUMNS)},
+    })  # fmt: skip
+    delayed["attitude_down_rad2"] = states
+    state = pd.DataFrame(7.0, index=time, columns=STATE_COLUMNS).assign(down_m=time)
+    record = made(FusionRecord, delayed=delayed, parameters={})
+    found = _stretch(imu, attitude, made(Ekf2, state=state), record, 5, 11.5)
+    steps = 10.5 + 0.01 * np.arange(101)
+    np.testing.assert_allclose(found.time_s, steps, atol=1e-9)
+    np.testing.assert_allclose(found.step_s, 0.01, atol=1e-9)
+    turned = matrix(facing(steps))
+    np.testing.assert_allclose(found.rotation, turned, atol=1e-6)
+    np.testing.assert_allclose(found.correction_rad, 0.0, atol=1e-6)
+    # in the frame at the end of the step, without its bias
+    np.testing.assert_allclose(found.force_m_s2, [[0.8, 0.0, -10.0]] * 100, atol=5e-3)
+    np.testing.assert_allclose(found.state[:3], [0.0, 0.0, 0.05], atol=1e-6)
+    np.testing.assert_allclose(found.state[3:9], [2.0, 2.0, 2.0, 7.0, 7.0, 10.5])
+    np.testing.assert_allclose(found.state[9:], 0.0)
+    expected = np.arange(1.0, 16.0)
+    expected[DELAYED_VARIANCE_COLUMNS.index("attitude_down_rad2")] = 10.5
+    np.testing.assert_allclose(found.variance, expected)
+    np.testing.assert_allclose(found.heading_variance_rad2, steps)
+    np.testing.assert_allclose(found.down_m, steps)
+    np.testing.assert_allclose(
+        found.attitude_error_rad[:, 2], 0.05 + 0.1 * (steps - 10.5), atol=1e-6
+    )
+    assert found.gyro_bias_rad_s.tolist() == [0.0, 0.0, 0.01]
+    assert found.fusing
+    delayed[POSITION_COLUMNS] = 3.0
+    own = _stretch(imu, attitude, made(Ekf2, state=state), record, 5, 11.5)
+    np.testing.assert_allclose(own.state[6:9], [3.0, 3.0, 10.5])
+
+
 # ---------------------------------------------------------------- where a stretch begins
 
 
@@ -842,6 +990,8 @@ def test_where_a_stretch_begins_and_ends(monkeypatch: pytest.MonkeyPatch) -> Non
     assert stretches(monkeypatch, airborne=((70.0, 90.0),)) == [(1.0, 59.99)]
     # gaps of vision beyond 2 s, and of the IMU beyond 0.05 s, part the flight
     assert len(stretches(monkeypatch, vision=without(vision, 30.0, 31.9))) == 1
+    exactly = without(np.arange(0.0, 60.0, 0.125), 30.0, 32.0)
+    assert len(stretches(monkeypatch, vision=exactly)) == 1
     parted = stretches(monkeypatch, vision=without(vision, 30.0, 32.2))
     assert parted == [(1.0, 30.0), (33.5, 59.99)]
     assert len(stretches(monkeypatch, imu=without(imu, 30.0, 30.04))) == 1
