@@ -157,10 +157,11 @@ def test_without_horizontal_noises_those_of_the_first_axis_count() -> None:
 
 
 def following(gain: float, *, growth: float = 0.05, **parts: Any) -> Any:
-    """A filter that follows with this gain from its first half on, 4 updates a second."""
+    """A filter whose median gain is this one in its second half; 4 updates a second."""
     index = 10.0 + 0.25 * np.arange(40)
     updates = pd.DataFrame({"gain_position": gain, "prior_position_variance_m2": 1.0}, index=index)
     updates.iloc[:19] = [0.9, 9.0]
+    updates["gain_position"] *= [1.0] * 20 + [0.5] * 9 + [1.0] * 2 + [2.0] * 9
     after = np.full(40, 1.0 / (1.0 + growth))
     after[20] = 1e-9  # one of them is an outlier
     between = pd.Series(7.0, index=index[:-1] + 0.1)

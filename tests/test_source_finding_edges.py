@@ -404,8 +404,12 @@ def test_a_clock_offset_that_changes(p: float | None, there: bool) -> None:
 def test_a_clock_offset_that_the_truth_contradicts_is_not_told(
     monkeypatch: pytest.MonkeyPatch, after_m: float, there: bool
 ) -> None:
-    monkeypatch.setattr(source_clock, "filter_errors_m", lambda *_: (1.0, after_m))
-    found = list(source_clock.DETECTOR.detect(analysis(clock=late(0.1))))
+    def errors_m(_: Any, shifted: Settings) -> tuple[float, float]:
+        assert shifted.clock_offset_s == 0.123  # as it is typed
+        return 1.0, after_m
+
+    monkeypatch.setattr(source_clock, "filter_errors_m", errors_m)
+    found = list(source_clock.DETECTOR.detect(analysis(clock=late(0.12345))))
     assert bool(found) is there
     if there:
         assert f"position error 1.000 → {after_m:.3f} m (replayed)" in found[0].remedy
