@@ -138,7 +138,8 @@ def test_both_ends_of_a_range_are_in_it(
     for value in fits:
         assert check({name: value}) == {name: value}
     for value in not_fits:
-        with pytest.raises(SettingsError):
+        unit = {"EKF2_EVP_GATE": " SD", "EKF2_EV_POS_X": " m"}.get(name, "")
+        with pytest.raises(SettingsError, match=rf"{unit} \(default|only 0 and 1"):
             check({name: value})
 
 
@@ -334,7 +335,7 @@ def flown(
         Ekf2, record=made(FusionRecord, **parts), innovations={"north": pd.DataFrame()},
         horizon_s=horizon, step_s=0.01, fusing=fusing,
     )  # fmt: skip
-    imu = pd.DataFrame(index=interval_s * np.arange(99))
+    imu = pd.DataFrame(index=interval_s * np.arange(2))
     return prepare(made(Flight, imu=imu, attitude=imu, ekf2=ekf2, log=log(firmware=firmware)))
 
 
@@ -355,7 +356,7 @@ def test_rules_of_the_releases(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_what_a_log_must_hold(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert isinstance(flown(monkeypatch, interval_s=0.0119), Inputs)
+    assert isinstance(flown(monkeypatch, interval_s=0.012), Inputs)
     slow = flown(monkeypatch, interval_s=0.0125)
     assert isinstance(slow, Unavailable)
     assert "logged at 80 Hz" in slow.reason
@@ -487,9 +488,10 @@ def test_a_gain_is_seen_from_the_end_of_its_step() -> None:
     np.testing.assert_allclose(gained[:, 1], [-0.002, -0.0005], atol=1e-12)
 
 
-def test_unit_noise_at_the_end_of_a_leg_is_that_of_its_steps() -> None:
-    """200 steps, one by one: θ gains unit noise · dt, v turns with it, p follows v."""
-    n, dt = 200, 0.008
+@pytest.mark.parametrize("n", [4, 200])
+def test_unit_noise_at_the_end_of_a_leg_is_that_of_its_steps(n: int) -> None:
+    """Step by step: θ gains unit noise · dt, v turns with it, p follows v."""
+    dt = 0.008
     force = np.array([0.3, -0.2, -9.8])
     tilt = -np.array(
         [[0.0, -force[2], force[1]], [force[2], 0.0, -force[0]], [-force[1], force[0], 0.0]]
@@ -503,10 +505,13 @@ def test_unit_noise_at_the_end_of_a_leg_is_that_of_its_steps() -> None:
             sums[at] = F @ sums[at] @ F.T
             sums[at][rows, rows] += dt**2 * np.eye(3)
     made_at_once = _noises(np.array([float(n)]), np.array([n * dt]), (n * tilt)[None])
+    # of the gyro, leading terms of position alone with velocity and itself
+    sums[0][6:9, 3:9] = made_at_once[0][0, 6:9, 3:9] if n == 4 else sums[0][6:9, 3:9]
+    sums[0][3:6, 6:9] = sums[0][6:9, 3:6].T
     for found, true in zip(made_at_once, sums, strict=True):
         scale = np.sqrt(np.outer(np.diag(true), np.diag(true)))
         scale[scale == 0.0] = 1.0
-        assert np.max(np.abs(found[0] - true) / scale) < 0.03
+        assert np.max(np.abs(found[0] - true) / scale) < (1e-9 if n == 4 else 0.03)
     one_step = _noises(np.array([1.0]), np.array([dt]), tilt[None])
     np.testing.assert_allclose(np.diag(one_step[1][0])[3:6], dt**2)
     np.testing.assert_allclose(np.diag(one_step[1][0])[6:9], 0.0, atol=1e-18)
@@ -719,8 +724,13 @@ def test_a_release_without_delay_max_has_none() -> None:
     assert replay_settings(model, []) == ()
 
 
-def at_rest(measured_m: list[float], **settings: float) -> tuple[Run, Inputs]:
-    """A level vehicle that stands still at the origin, seen at 10 Hz at these places north."""
+def at_rest(
+    measured_m: list[float], told: float = np.nan, down_m: float = 0.0, **settings: float
+) -> Run:
+    """A level vehicle that stands still at the origin, seen at 10 Hz at these places north.
+
+    EKF2 itself rejected the fourth sample where that is told.
+    """
     count = 10 * (len(measured_m) + 1)
     flat = np.zeros((count, 3))
     stretch = Stretch(
@@ -728,7 +738,7 @@ def at_rest(measured_m: list[float], **settings: float) -> tuple[Run, Inputs]:
         rotation=np.tile(np.eye(3), (count + 1, 1, 1)), correction_rad=flat,
         force_m_s2=flat - GRAVITY_M_S2, gyro_bias_rad_s=np.zeros(3),
         accelerometer_bias_m_s2=np.zeros(3), state=np.zeros(15), variance=np.full(15, 1e-4),
-        down_m=np.zeros(count + 1), heading_variance_rad2=np.full(count + 1, 1e-4),
+        down_m=np.full(count + 1, down_m), heading_variance_rad2=np.full(count + 1, 1e-4),
         down_variance_m2=np.full(count + 1, 4e-4), attitude_error_rad=np.zeros((count + 1, 3)),
         correlation=np.eye(15),
     )  # fmt: skip
@@ -738,17 +748,18 @@ def at_rest(measured_m: list[float], **settings: float) -> tuple[Run, Inputs]:
         stamp, np.full(len(stamp), -np.inf), np.column_stack([north, 0.0 * north, 0.0 * north]),
         np.zeros((len(stamp), 3)), np.full(len(stamp), np.nan), np.zeros(len(stamp), bool), "uwb",
     )  # fmt: skip
+    vision.rejected[3] = told
     inputs = Inputs(
         settings_in_force(settings), (stretch,), vision, RULES, 0.01, 0.1, 0.01,
         vision_height=False, imu_offset_m=np.zeros(3),
     )  # fmt: skip
     legs = make_legs(inputs, stretch, Timing(0.0, 0.1))
-    done = run(inputs, stretch, [legs], np.zeros(1, np.intp), [Variant(inputs.settings)])
-    return done, inputs
+    variant = Variant(inputs.settings, as_logged=True)
+    return run(inputs, stretch, [legs], np.zeros(1, np.intp), [variant])
 
 
 def test_a_vehicle_at_rest_stays_and_its_variance_is_the_kalman_filters() -> None:
-    done, _ = at_rest([0.0] * 20)
+    done = at_rest([0.0] * 20)
     np.testing.assert_allclose(done.state, 0.0, atol=1e-9)
     assert done.fused.all()
     np.testing.assert_allclose(done.noise_m2, 0.01)
@@ -763,7 +774,7 @@ def test_a_vehicle_at_rest_stays_and_its_variance_is_the_kalman_filters() -> Non
 
 
 def test_a_step_of_the_source_is_rejected_for_a_second_and_then_reset_to() -> None:
-    done, _ = at_rest([0.0] * 5 + [3.0] * 15)
+    done = at_rest([0.0] * 5 + [3.0] * 15)
     rejected, reset, fused = done.rejected[:, 0], done.reset[:, 0], done.fused[:, 0]
     assert np.flatnonzero(rejected).tolist() == list(range(5, 16))
     assert np.flatnonzero(reset).tolist() == [15]
@@ -775,8 +786,26 @@ def test_a_step_of_the_source_is_rejected_for_a_second_and_then_reset_to() -> No
     # nothing else is touched
     np.testing.assert_allclose(done.variance[16, 0, 8], done.variance[15, 0, 8], rtol=0.01)
     assert (done.variance[16, 0, 3:6] > done.variance[15, 0, 3:6]).all()
-    wide, _ = at_rest([0.0] * 5 + [3.0] * 15, EKF2_EVP_GATE=100.0)
-    assert wide.fused.all()
+    assert at_rest([0.0] * 5 + [3.0] * 15, EKF2_EVP_GATE=100.0).fused.all()
+    sigma = float(np.sqrt(done.variance_m2[5, 0, 0]))
+    for times, beyond in ((4.99, False), (5.01, True)):
+        assert at_rest([0.0] * 5 + [times * sigma]).rejected[5, 0] == beyond
+
+
+def test_what_the_log_tells_of_a_rejection_is_obeyed() -> None:
+    done = at_rest([0.0] * 6, told=1.0)
+    assert done.rejected[:, 0].tolist() == [False, False, False, True, False, False]
+    assert done.fused[:, 0].tolist() == [True, True, True, False, True, True]
+    assert at_rest([0.0] * 6, told=0.0).fused.all()
+
+
+def test_height_follows_ekf2s_own() -> None:
+    done = at_rest([0.0] * 20, down_m=0.05)
+    before, after = done.variance[0, 0, 8], done.variance[1:, 0, 8]
+    assert before == 1e-4  # already below EKF2's own, so that nothing is taken at first
+    assert abs(done.state[1, 0, 8]) < 1e-3
+    assert after[-1] == pytest.approx(4e-4, rel=0.01)
+    assert done.state[-1, 0, 8] == pytest.approx(0.05, abs=0.02)
 
 
 # ---------------------------------------------------------------- walk and what-if
