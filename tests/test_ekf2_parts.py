@@ -469,6 +469,7 @@ def test_a_step_ends_after_its_samples_or_when_it_is_long() -> None:
     assert _counted(np.array([0.004] * 5), 2, 0.008) == [2, 4]
     assert _counted(np.array([0.004, 0.009, 0.004, 0.004]), 2, 0.008) == [2, 4]
     assert _counted(np.array([0.009, 0.004, 0.004]), 2, 0.008) == [1, 3]
+    assert _counted(np.array([0.005] * 6), 3, 0.0155) == [3, 6]
     # by count only when more than half of the step has passed
     assert _counted(np.array([0.002, 0.002, 0.0021]), 2, 0.008) == [3]
     assert ends_of(np.full(9, 0.004), np.array([3]), 0.008).tolist() == [2, 3, 5, 7, 9]

@@ -38,6 +38,7 @@ from px4fuse.findings import (
     source_may_drift,
     variance,
 )
+from px4fuse.findings import story as telling
 from px4fuse.findings.model import Finding
 from px4fuse.findings.story import story
 from px4fuse.findings.variance import _is_default, _kf_remedy, _noise_helps, _outliers
@@ -551,3 +552,29 @@ def test_what_weighs_most_is_told_in_order() -> None:
         "The odometry fails to close its loop by 1.0 m after 200 m (0.5%)."
     )
     assert len(story(flight_of(along(1.0, 1.0, difference=NONE), loop=closing(None)), ())) == 1
+
+
+@pytest.mark.parametrize(
+    ("truth", "said"),
+    [
+        (NONE, "ours was 2.0 m and EKF2 1.0 m from the next position."),
+        (pd.DataFrame({"position_m": [1.0, 3.4]}, index=[50.0, 58.0]),
+         "ours was 40 cm and EKF2 60 cm from the truth."),
+    ],
+)  # fmt: skip
+def test_the_longest_silence_is_told_with_where_it_left_both(
+    monkeypatch: pytest.MonkeyPatch, truth: Any, said: str
+) -> None:
+    monkeypatch.setattr(telling, "state_at", lambda *_: (np.array([0.0, 3.0]), None))
+    ekf2 = pd.DataFrame({"position_m": [0.0, 4.0, 9.0]}, index=[20.0, 57.9, 58.1])
+    main = along(1.0, 1.0, difference=NONE, ekf2_state=ekf2, truth=truth, replay=None)
+    main.axis.measurement_time_s = np.array([20.0, 50.0, 58.0, 58.2])
+    main.axis.measurement_m = np.array([0.0, 0.0, 5.0, 9.0])
+    for spans, more in (
+        (((50.0, 58.0),), ""), (((20.0, 21.5), (50.0, 58.0)), " (the longest of 2 times)")
+    ):  # fmt: skip
+        gap = Finding("source_gap", "warning", "It was silent.", "Do.", spans_s=spans)
+        assert story(flight_of(main), (gap,))[1] == (
+            f"From 50 s to 58 s the source was silent{more}: both filters coasted on the IMU; at "
+            f"the end {said}"
+        )
