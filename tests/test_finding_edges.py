@@ -51,7 +51,14 @@ from px4fuse.findings import (
     source_not_logged,
 )
 from px4fuse.findings.causes import by_cause
-from px4fuse.findings.model import Finding, Threshold, moments, off_spans, step_share
+from px4fuse.findings.model import (
+    Finding,
+    Threshold,
+    moments,
+    off_spans,
+    sentence,
+    step_share,
+)
 from px4fuse.flight import Dropout, FusionRecord, Reset, Unavailable
 
 
@@ -88,6 +95,8 @@ def test_when_a_finding_shows() -> None:
     ):  # fmt: skip
         assert replace(finding, spans_s=spans).when == said
     assert moments([1.0]) == ((1.0, 1.0),)
+    assert sentence("track.csv is late") == "track.csv is late"
+    assert sentence("the file track.csv is late") == "The file track.csv is late"
 
 
 def test_the_share_of_a_step_function_counts_its_first_value_before_it_begins() -> None:
@@ -446,12 +455,12 @@ def test_positions_that_the_logger_thinned(rate_hz: float, name: str, decimated:
     for rung in (4, 5, 6):
         one = analysis(
             source=source(name=name, rung=rung, rate_hz=rate_hz), missing=missing,
-            log=log(parameters={"SDLOG_PROFILE": 3.0}),
+            log=log(parameters={"SDLOG_PROFILE": 2.0}),
         )  # fmt: skip
         found = {f.id: f for f in source_not_logged.DETECTOR.detect(one)}
         assert ("source_decimated" in found) is decimated
         assert "as it arrived (it was off); " in found["source_not_logged"].message
-        assert all("SDLOG_PROFILE to 131 " in each.remedy for each in found.values())
+        assert all("SDLOG_PROFILE to 130 " in each.remedy for each in found.values())
         if decimated:
             limit = found["source_decimated"].evidence["logger_limit_hz"]
             assert f"own limit for it ({limit:g} Hz)" in found["source_decimated"].message
