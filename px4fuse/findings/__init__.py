@@ -2,8 +2,7 @@
 
 A file declares ids, thresholds with unit and source, the detector (condition, words, remedy), what
 the finding is called and the phrases by which notes name it, and the flights on which its rate is
-measured. A detector
-never prints and never guesses: what it cannot see it does not mention.
+measured. A detector never prints and never guesses: what it cannot see it does not mention.
 
 To add a finding: its file, its name below, its place in ``causes.py`` if it follows from another or
 brings others with it, its rows of ``rates.csv`` (``python -m px4fuse.simulation.detector_rates``).
@@ -131,7 +130,7 @@ def _in_flight(detector: Detector[Loop]) -> Detector[Analysis]:
     return Detector(detect, detector.phrases, detector.measured_on, names=detector.names)
 
 
-# Of one severity, the first comes first in a report (causes.py has the exceptions)
+# Within one severity, in the order in which a report tells them (exceptions in causes.py)
 LOOP_DETECTORS: tuple[Detector[Loop], ...] = (
     loop_closures.DETECTOR,
     loop_of_absolute_track.DETECTOR,

@@ -22,10 +22,9 @@ def _detect(analysis: Analysis) -> Found:
     yield Finding(
         "companion_not_synchronised",
         "warning",
-        f"The clock of the sender of {source.name} was never synchronised with the "
-        "autopilot's (TIMESYNC): EKF2 took the time at which a position arrived for "
-        "the time at which it was measured. "
-        f"{ours}.",
+        f"The clock of the sender of {source.name} was never synchronised with the autopilot's "
+        "(TIMESYNC): EKF2 took the time at which a position arrived for the time at which it was "
+        f"measured. {ours}.",
         "Let the companion answer TIMESYNC (MAVROS does by default; with pymavlink answer every "
         "request), and send the positions after 500 answers, 50 s at 10 Hz.",
         {"jitter_s": clock.jitter_s},

@@ -48,10 +48,10 @@ def _detect(analysis: Analysis) -> Found:
         return
     low_ms, high_ms = asked * 1e3
     found = (
-        f"the data ask for {best * 1e3:.0f} ms (95 % {low_ms:.0f} to {high_ms:.0f})"
+        f"the data ask for {round(best * 1e3)} ms (95 % {round(low_ms)} to {round(high_ms)})"
         if best >= 0.0
-        else f"the stamps are early by {-best * 1e3:.0f} ms (95 % {-high_ms:.0f} to {-low_ms:.0f}),"
-        " for which there is no delay"
+        else f"the stamps are early by {round(-best * 1e3)} ms (95 % {round(-high_ms)} to "
+        f"{round(-low_ms)}), for which there is no delay"
     )
     yield Finding(
         "ekf2_ev_delay_wrong",

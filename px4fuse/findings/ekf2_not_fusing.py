@@ -4,14 +4,7 @@ from __future__ import annotations
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.comparison import Comparison
-from px4fuse.findings.model import (
-    Detector,
-    Finding,
-    Found,
-    Threshold,
-    off_spans,
-    step_share,
-)
+from px4fuse.findings.model import Detector, Finding, Found, Threshold, off_spans, step_share
 from px4fuse.flight import EXTERNAL_VISION_RUNGS, Ekf2, FusionRecord, Unavailable
 
 FUSING_SHARE_ERROR = Threshold(
@@ -20,7 +13,6 @@ FUSING_SHARE_ERROR = Threshold(
 FUSING_SHARE_WARNING = Threshold(0.98, "of the segment", "one second in a flight of a minute")
 EV_START_INTERVAL = Threshold(0.2, "s", "EV_MAX_INTERVAL, PX4 v1.14 and later, ev_control.cpp")
 EV_STOP_INTERVAL = Threshold(0.4, "s", "two times EV_MAX_INTERVAL, ev_pos_control.cpp")
-
 MAX_LATE = Threshold(0.1, "s", "older than that by the horizon, no sample is fused: RingBuffer.h")
 
 
@@ -51,7 +43,8 @@ def _detect(analysis: Analysis) -> Found:
             "warning",
             f"EKF2 fused the source in only {share:.0%} of the segment; in between its track "
             "rests on its other sensors.",
-            "Look at the gaps and rejections below; EKF2 stops after 0.4 s without a sample.",
+            "Look at the gaps and rejections below; EKF2 (v1.14 and later) stops after "
+            f"{EV_STOP_INTERVAL.value:g} s without a sample.",
             evidence,
             spans_s=off_spans(ekf2.fusing["horizontal"], segment.start_s, segment.end_s),
         )

@@ -11,8 +11,6 @@ from px4fuse.flight import Ekf2, Unavailable
 
 REJECTED_SHARE_WARNING = Threshold(0.01, "of the innovations", "5 σ rejects 6e-7 when consistent")
 REJECTED_SHARE_ERROR = Threshold(0.20, "of the innovations", "one in five: R or the clock is wrong")
-
-
 IN_ORDER = (
     "First make EKF2_EVP_NOISE the source's own noise, then remove outliers (line of sight) and "
     "check the clock; widen EKF2_EVP_GATE last."

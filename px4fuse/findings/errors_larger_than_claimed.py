@@ -35,7 +35,7 @@ REMEDIES = {
     "LOG), or give the filter a second, absolute source.",
     "frame": "Turn and shift the source's frame into that of the truth before you judge a filter "
     "by it, and take no noise from these innovations.",
-    "ekf2": "Our filter errs less with the same source, so that it is EKF2's own: look at "
+    "ekf2": "Our filter errs less with the same source, so the error is EKF2's own: look at "
     "EKF2_EV_DELAY, at its heading, and at what else it fuses.",
     "shared": "Look for an error that source and filter share: the clock (px4fuse sync LOG), a "
     "source that smooths its positions, its scale, the survey of the anchors.",

@@ -32,8 +32,9 @@ def _detect(analysis: Analysis) -> Found:
 
 
 def _first_of(notes: list[str]) -> str:
-    more = f" (and {len(notes) - 1} more such notes)" if len(notes) > 1 else ""
-    return f"{sentence(notes[0])}{more}."
+    more = len(notes) - 1
+    others = f" (and {more} more such note{'s' if more > 1 else ''})" if more else ""
+    return f"{sentence(notes[0])}{others}."
 
 
 DETECTOR = Detector(

@@ -22,8 +22,8 @@ from px4fuse.findings.no_motion import MOTION_RANGE, motion_range_m
 from px4fuse.flight import Unavailable
 from px4fuse.plain import factor_words
 
-NOISE_OFF = Threshold(1.5, "times", "in standard deviation; below, hardly a line moves")
-NOISE_OFF_ERROR = Threshold(4.0, "times", "the gain is another one")
+NOISE_OFF = Threshold(1.5, "times", "in standard deviation; below, the tracks hardly change")
+NOISE_OFF_ERROR = Threshold(4.0, "times", "the gain is a different one")
 BEYOND = Threshold(1.5, "times the 95 % interval's reach", "0.3 % of clean flights lie beyond")
 # What a filter is run with where the source is better than its rate can show
 SMALLEST_SIGMA_Z = Threshold(0.005, "m", "what motion capture resolves in flight")
@@ -144,20 +144,16 @@ def _message(off: Off, tuned: AxisTuning) -> str:
 def _remedy(analysis: Analysis, tuned: AxisTuning, off: list[Off]) -> str:
     """What to type, as far as a replay with it holds what the likelihood promises."""
     comparison = analysis.comparison
-    values = {
-        each.label: max(float(f"{each.value:.3g}"), SMALLEST_SIGMA_Z.value)
-        if each.label == "SIGMA_Z" and each.found.value is None
-        else float(f"{each.value:.3g}")
-        for each in off
-    }
+    values = {each.label: float(f"{each.value:.3g}") for each in off}
+    if "SIGMA_Z" in values and tuned.sigma_z.value is None:
+        values["SIGMA_Z"] = max(values["SIGMA_Z"], SMALLEST_SIGMA_Z.value)
     changed = replace(
         comparison.settings,
         sigma_z_m=values.get("SIGMA_Z", comparison.settings.sigma_z_m),
         sigma_a_m_s2=values.get("SIGMA_A", comparison.settings.sigma_a_m_s2),
     )
     typed = " ".join(f"{each.option} {values[each.label]:g}" for each in off)
-    held = tuned.held_out
-    unseen = None if isinstance(held, Unavailable) else held.gain_nats
+    unseen = None if isinstance(tuned.held_out, Unavailable) else tuned.held_out.gain_nats
     return filter_words(comparison, changed, typed, unseen)
 
 

@@ -27,12 +27,13 @@ def _detect(analysis: Analysis) -> Found:
     wanted = "position source vehicle_visual_odometry"
     reasons = (part.reason for part in comparison.missing if part.what == wanted)
     why = next(reasons, "it is not in this log")
+    remedy = f"Set SDLOG_PROFILE to {profile | VISION_PROFILE_BIT} and fly again."
     yield Finding(
         "source_not_logged",
         "warning",
         f"The log lacks vehicle_visual_odometry, the position as it arrived ({why}); "
         f"{source.name} ({source.description}) stands in for it at {source.rate_hz:.1f} Hz.",
-        f"Set SDLOG_PROFILE to {profile | VISION_PROFILE_BIT} and fly again.",
+        remedy,
         {"rate_hz": source.rate_hz, "sdlog_profile": float(profile)},
     )
     for interval in LOGGER_INTERVALS_S.get(source.name, ()):
@@ -43,7 +44,7 @@ def _detect(analysis: Analysis) -> Found:
                 f"{source.name} is logged at {source.rate_hz:.1f} Hz, the logger's own limit for "
                 f"it ({1 / interval:g} Hz): the source may have run faster, the samples between "
                 "are lost.",
-                f"Set SDLOG_PROFILE to {profile | VISION_PROFILE_BIT} and fly again.",
+                remedy,
                 {"rate_hz": source.rate_hz, "logger_limit_hz": 1.0 / interval},
             )
 

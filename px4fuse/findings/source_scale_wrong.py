@@ -17,7 +17,7 @@ from px4fuse.findings.source_smoothed import low_pass
 from px4fuse.flight import sample_rate
 
 SCALE = Threshold(0.12, "of the distance", "flights of PX4's simulation are within 0.11")
-SCALE_ERROR = Threshold(0.15, "of the distance", "more than a metre in eight")
+SCALE_ERROR = Threshold(0.15, "of the distance", "a metre in seven")
 SCALE_SIGMAS = Threshold(3.0, "standard deviations", "0.3 % of clean flights lie beyond")
 
 

@@ -27,9 +27,8 @@ def _detect(analysis: Analysis) -> Found:
         yield Finding(
             "source_receipt_jitter",
             "warning",
-            f"The receipt of {source.name}, which stands in for its time stamps, "
-            f"jitters by {clock.jitter_s * 1e3:.0f} ms: at 1 m/s that is an error of "
-            f"{clock.jitter_s:.3f} m.",
+            f"The receipt of {source.name}, which stands in for its time stamps, jitters by "
+            f"{clock.jitter_s * 1e3:.0f} ms: at 1 m/s that is an error of {clock.jitter_s:.3f} m.",
             "Send the time of measurement in the message, and record close to the sender.",
             {"jitter_s": clock.jitter_s},
         )

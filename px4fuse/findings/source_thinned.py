@@ -23,6 +23,7 @@ LEAST = Threshold(0.1, "of the intervals", "single losses pass")
 # Of an interval from a whole multiple, root mean square: random ones have 0.29
 WHOLE = Threshold(0.06, "of the shorter interval", "a source's own jitter is 0.03")
 MOST_PARTS = 4
+STARTS_ONLY = f"EKF2 (v1.14 and later) starts only below {EV_START_INTERVAL.value:g} s apart."
 
 
 def _base(intervals: Array) -> tuple[float, Array] | None:
@@ -69,7 +70,7 @@ def _detect(analysis: Analysis) -> Found:
         "error" if slow else "warning",
         f"{source.name} comes at {rate:.2g} Hz, at whole multiples of {base:.3g} s: of a source of "
         f"{1.0 / base:.2g} Hz {lost:.0%} is missing, thinned on its way or lost."
-        + (" EKF2 (v1.14 and later) starts only below 0.2 s apart." if slow else ""),
+        + (f" {STARTS_ONLY}" if slow else ""),
         "Send every position: raise the rate of the stream at the sender (MAVROS, the bridge, "
         "the link), and do not limit it.",
         {"rate_hz": rate, "source_rate_hz": 1.0 / base, "lost_share": lost},

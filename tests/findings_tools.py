@@ -1,0 +1,138 @@
+"""Analyses that hold no more than a finding reads, so that the right answer is plain."""
+
+from __future__ import annotations
+
+from types import ModuleType, SimpleNamespace
+from typing import Any, TypeVar
+
+import numpy as np
+import pandas as pd
+
+from px4fuse.analysis import Analysis
+from px4fuse.filter.causes import Explained, Jump
+from px4fuse.filter.clock import ClockOffset, PartOffset
+from px4fuse.filter.hypotheses import Estimate
+from px4fuse.filter.kalman import Settings
+from px4fuse.filter.signals import Segment
+from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise
+from px4fuse.findings import Finding
+from px4fuse.flight import (
+    POSITION_COLUMNS,
+    POSITION_VARIANCE_COLUMNS,
+    Ekf2,
+    FusionRecord,
+    Unavailable,
+)
+
+T = TypeVar("T")
+
+NONE = Unavailable("it", "no topic for it", "Log it.")
+SEGMENT = Segment(10.0, 110.0, "")
+# A setting that nobody comes with
+CHOSEN = Settings(sigma_a_m_s2=1.0, sigma_z_m=1.0)
+
+
+def made(kind: type[T], **parts: Any) -> T:
+    """An instance that holds these parts alone: to read another one is an error."""
+    one = object.__new__(kind)
+    for name, value in parts.items():
+        object.__setattr__(one, name, value)
+    return one
+
+
+def log(**parts: Any) -> Any:
+    usual = {
+        "parameters": {}, "notes": (), "format": "ULog", "has_ulog": True, "autopilot": "PX4",
+        "dropouts": (),
+    }  # fmt: skip
+    return SimpleNamespace(**{**usual, **parts})
+
+
+def source(**parts: Any) -> Any:
+    usual = {
+        "name": "uwb", "description": "UWB", "rung": 2, "orientation": None, "frame": "NED",
+        "reconstructed": False, "clock_map": None, "alignment": None, "rate_hz": 5.0,
+    }  # fmt: skip
+    return SimpleNamespace(**{**usual, **parts})
+
+
+def positions(time_s: Any, north_m: Any = 0.0, variance_m2: float = np.nan) -> pd.DataFrame:
+    frame = pd.DataFrame(0.0, index=np.asarray(time_s, float), columns=POSITION_COLUMNS)
+    frame["north_m"] = north_m
+    return frame.assign(**dict.fromkeys(POSITION_VARIANCE_COLUMNS, variance_m2))
+
+
+def analysis(
+    *, ekf2: Any = NONE, log: Any = log(), source: Any = source(), axes: tuple[Any, ...] = (),  # noqa: B008
+    flight: dict[str, Any] | None = None, settings: Settings = CHOSEN, notes: tuple[str, ...] = (),
+    missing: tuple[Any, ...] = (), **parts: Any,
+) -> Analysis:  # fmt: skip
+    """What is not given is not there."""
+    if isinstance(ekf2, dict):
+        ekf2 = made(Ekf2, **ekf2)
+    flown = {"imu": NONE, "attitude": NONE, "positions": (), "streams": {}, **(flight or {})}
+    comparison = SimpleNamespace(
+        flight=SimpleNamespace(log=log, ekf2=ekf2, **flown), source=source, axes=axes,
+        segment=SEGMENT, settings=settings, notes=notes, missing=missing,
+    )  # fmt: skip
+    usual = dict.fromkeys(
+        ("clock", "ekf2_model", "loop", "heading", "explained", "smoothing"), NONE
+    )
+    return SimpleNamespace(  # type: ignore[return-value]
+        **{"comparison": comparison, "tuning": {}, "why": {}, **usual, **parts}
+    )
+
+
+def named(module: ModuleType, subject: Any) -> dict[str, str]:
+    return {finding.id: finding.severity for finding in module.DETECTOR.detect(subject)}
+
+
+def severity(module: ModuleType, subject: Any) -> str | None:
+    """Of the one finding; None where there is none."""
+    found = named(module, subject)
+    assert len(found) <= 1
+    return next(iter(found.values()), None)
+
+
+def only(module: ModuleType, subject: Any) -> Finding:
+    (finding,) = module.DETECTOR.detect(subject)
+    return finding
+
+
+def ages(arrival: int, later: int, latency_s: float = 0.05, wrong: int = 0) -> dict[str, Any]:
+    """Stamps of arrival, so many of them late, then true ones."""
+    age = [latency_s] * wrong + [0.0] * (arrival - wrong) + [latency_s] * later
+    series = pd.Series(age, index=20.0 + np.arange(len(age)))
+    return {"record": made(FusionRecord, vision_age_s=series)}
+
+
+def jump(*sizes: float, at_s: float = 50.0) -> Jump:
+    return Jump(at_s, tuple(Estimate(size, 0.01 * (n + 1)) for n, size in enumerate(sizes)), 99.0)
+
+
+def at_rate(rate_hz: float, start_s: float = 10.0, end_s: float = 110.0) -> pd.DataFrame:
+    return pd.DataFrame({"x": 0.0}, index=np.arange(start_s, end_s, 1.0 / rate_hz))
+
+
+def tuned(
+    sigma_z: Noise | None = None, sigma_a: Noise | None = None, **parts: Any
+) -> dict[str, Any]:
+    right = Noise(1.0, 0.9, 1.1)
+    usual = {"name": "horizontal", "before": NONE, "held_out": NONE, "outlier_time_s": np.array([])}
+    one = made(
+        AxisTuning, sigma_z=sigma_z or right, filter_sigma_a=sigma_a or right, **{**usual, **parts}
+    )
+    return {HORIZONTAL: one}
+
+
+def late(offset_s: float, sigma_s: float = 0.001, **parts: Any) -> ClockOffset:
+    halves = tuple(PartOffset(0.0, 1.0, at, 0.1) for at in (offset_s - 0.2, offset_s + 0.2))
+    usual = {
+        "interval_s": (offset_s - 0.01, offset_s + 0.02), "determinable": True, "change_p": None,
+        "parts": halves,
+    }  # fmt: skip
+    return made(ClockOffset, offset_s=offset_s, sigma_s=sigma_s, **{**usual, **parts})
+
+
+def with_bias(forward: float, sigma: float = 0.01, right: float = 0.0) -> Explained:
+    return made(Explained, forward_bias=Estimate(forward, sigma), right_bias=Estimate(right, 0.0))

@@ -1,0 +1,580 @@
+"""Findings about noises, closures and the story of a flight at the edges of their thresholds.
+
+The limits are written out here, so that one that is changed must be changed here as well.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from findings_tools import (
+    CHOSEN,
+    NONE,
+    analysis,
+    log,
+    made,
+    named,
+    only,
+    positions,
+    source,
+    tuned,
+)
+from test_finding_edges import against_truth, axis, hiding, severity, statement
+
+from px4fuse.comparison.comparison import Difference
+from px4fuse.comparison.why import Why
+from px4fuse.comparison.why_words import STAMPS_WRONG
+from px4fuse.filter.kalman import Settings
+from px4fuse.filter.tuning import HeldOut, Noise
+from px4fuse.findings import (
+    loop_closures,
+    process_noise_forgotten,
+    sigma,
+    source_may_drift,
+    variance,
+)
+from px4fuse.findings import story as telling
+from px4fuse.findings.model import Finding
+from px4fuse.findings.story import story
+from px4fuse.findings.variance import _is_default, _kf_remedy, _noise_helps, _outliers
+from px4fuse.loop.loop import Judged, Loop
+from px4fuse.plain import factor_words
+
+MOVING = source(samples=positions(np.arange(0.0, 120.0), np.arange(120.0)))
+HOVERING = source(samples=positions(np.arange(0.0, 120.0)))
+ODOMETRY = source(samples=MOVING.samples, orientation=object())
+RIGHT = Noise(1.0, 0.9, 1.1)
+SLOW = {"verdict": "variance understated", "lag1_autocorrelation": 0.31}
+
+
+@pytest.fixture(autouse=True)
+def no_replay(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a replay would be made with stands in its place."""
+
+    def words(_: Any, changed: Settings, typed: str, unseen_nats: float | None = None) -> str:
+        return f"[{typed}|{changed.sigma_z_m:g}|{changed.sigma_a_m_s2:g}|{unseen_nats}]."
+
+    for module in (sigma, variance, process_noise_forgotten):
+        monkeypatch.setattr(module, "filter_words", words)
+
+
+# ---------------------------------------------------------------- SIGMA_Z and SIGMA_A
+
+
+@pytest.mark.parametrize(
+    ("chosen", "asked", "expected"),
+    [
+        (1.5, Noise(1.0, 0.99, 1.01), ("warning", 1.5)), (1.49, Noise(1.0, 0.99, 1.01), None),
+        (3.99, RIGHT, ("warning", 3.99)), (4.0, RIGHT, ("error", 4.0)),
+        (0.25, RIGHT, ("error", 4.0)), (0.251, RIGHT, ("warning", 1.0 / 0.251)),
+        # beyond one and a half times the interval's reach, in ratios
+        (8.0, Noise(1.0, 0.25, 4.0), None), (8.1, Noise(1.0, 0.25, 4.0), ("error", 8.1)),
+        (0.125, Noise(1.0, 0.25, 4.0), None), (0.124, Noise(1.0, 0.25, 4.0), ("error", 8.1)),
+        # bounded from above, or not at all
+        (0.75, Noise(None, None, 0.5), ("warning", 1.5)), (0.4, Noise(None, None, 0.5), None),
+        (0.1, Noise(None, None, 0.5), None), (9.0, Noise(None, None, None), None),
+        (0.1, Noise(1.0, None, 2.0), None), (9.0, Noise(1.0, 0.5, None), None),
+    ],
+)  # fmt: skip
+def test_a_setting_that_is_off(chosen: float, asked: Noise, expected: Any) -> None:
+    off = sigma._off("SIGMA_Z", "--sigma-z", "m", chosen, asked)
+    assert (off and (off.severity, round(off.size, 1))) == (
+        expected and (expected[0], round(expected[1], 1))
+    )
+    if off is not None:
+        assert off.id == ("sigma_z_large" if chosen > 0.7 else "sigma_z_small")
+
+
+@pytest.mark.parametrize(("label", "default"), [("SIGMA_Z", 0.1), ("SIGMA_A", 0.5)])
+def test_a_setting_that_came_with_the_program_is_advice(label: str, default: float) -> None:
+    asked = Noise(default / 3.0, default / 3.1, default / 2.9)
+    for chosen, advice in ((default, True), (1.01 * default, False)):
+        off = sigma._off(label, "--x", "m", chosen, asked)
+        assert off is not None
+        assert off.is_advice is advice
+
+
+def test_both_settings_are_told_together_the_worse_one_first() -> None:
+    held = made(HeldOut, gain_nats=0.25)
+    noises = tuned(Noise(0.5, 0.45, 0.55), Noise(0.1, 0.09, 0.11), held_out=held)
+    finding = only(sigma, analysis(source=MOVING, tuning=noises))
+    assert finding.ids == ("sigma_a_large", "sigma_z_large")
+    assert finding.severity == "error"
+    remedy = "[--sigma-a 0.1 --sigma-z 0.5|0.5|0.1|0.25]."
+    assert finding.remedy == finding.consequences[0].remedy == remedy
+    assert finding.evidence["factor"] == pytest.approx(10.0)
+    assert "SIGMA_A 1 m/s² is 10 times too large" in finding.message
+    assert "(horizontal) ask for 0.1 m/s², 95 % 0.09 to 0.11. The variance grows too much" in (
+        finding.message
+    )
+    assert "The filter distrusts measurements" in finding.consequences[0].message
+    small = tuned(Noise(2.0, 1.9, 2.1), Noise(9.0, 8.9, 9.1), held_out=held)
+    finding = only(sigma, analysis(source=MOVING, tuning=small))
+    assert finding.ids == ("sigma_a_small", "sigma_z_small")
+    assert "The variance grows too little" in finding.message
+    assert "The filter mistakes the noise" in finding.consequences[0].message
+
+
+def test_a_noise_that_is_only_bounded_is_typed_as_no_less_than_5_mm() -> None:
+    bounded = tuned(Noise(None, None, 0.0021))
+    finding = only(sigma, analysis(source=MOVING, tuning=bounded))
+    assert finding.remedy == "[--sigma-z 0.005|0.005|1|None]."
+    assert "is at least 480 times too large" in finding.message
+    assert "ask for at most 0.0021 m. The" in finding.message
+    known = only(sigma, analysis(source=MOVING, tuning=tuned(Noise(0.00211, 0.002, 0.0022))))
+    assert known.remedy == "[--sigma-z 0.00211|0.00211|1|None]."
+
+
+@pytest.mark.parametrize(
+    ("parts", "expected"),
+    [
+        ({"source": MOVING}, ["sigma_a_large", "sigma_z_small"]),
+        ({"source": HOVERING}, ["sigma_z_small"]),  # hardly seen without motion
+        ({"source": ODOMETRY}, ["sigma_z_small"]),  # may be followed as closely as one likes
+        ({"source": MOVING, "axes": (hiding(),)}, ["sigma_z_small"]),
+        ({"source": ODOMETRY, "settings": Settings(1.0, 0.1)}, []),  # nor is that then advice
+        ({"source": MOVING, "axes": (hiding(),), "settings": Settings(1.0, 0.1)},
+         ["sigma_z_small"]),
+        ({"source": MOVING, "axes": (axis(ekf2=statement(), ekf2_truth=against_truth(9.0)),)},
+         ["sigma_a_large", "sigma_z_small"]),
+    ],
+)  # fmt: skip
+def test_where_innovations_tell_less(parts: dict[str, Any], expected: list[str]) -> None:
+    asked = 3.0 * (parts.get("settings") or CHOSEN).sigma_z_m
+    noises = tuned(Noise(asked, 0.9 * asked, 1.1 * asked), Noise(0.1, 0.09, 0.11))
+    found = list(sigma.DETECTOR.detect(analysis(tuning=noises, **parts)))
+    assert [name for finding in found for name in finding.ids] == expected
+
+
+def test_without_horizontal_noises_those_of_the_first_axis_count() -> None:
+    (asked,) = tuned(Noise(0.1, 0.09, 0.11), name="down").values()
+    assert "(down)" in only(sigma, analysis(source=MOVING, tuning={"down": asked})).message
+    assert named(sigma, analysis(source=MOVING)) == {}
+
+
+def following(gain: float, *, growth: float = 0.05, **parts: Any) -> Any:
+    """A filter whose median gain is this one in its second half; 4 updates a second."""
+    index = 10.0 + 0.25 * np.arange(40)
+    updates = pd.DataFrame({"gain_position": gain, "prior_position_variance_m2": 1.0}, index=index)
+    updates.iloc[:19] = [0.9, 9.0]
+    updates["gain_position"] *= [1.0] * 20 + [0.5] * 9 + [1.0] * 2 + [2.0] * 9
+    after = np.full(40, 1.0 / (1.0 + growth))
+    after[20] = 1e-9  # one of them is an outlier
+    between = pd.Series(7.0, index=index[:-1] + 0.1)
+    replay = SimpleNamespace(
+        updates=updates,
+        steps=pd.concat([pd.Series(after, index=index), between])
+        .sort_index()
+        .to_frame("position_variance_m2"),
+    )
+    return axis(kf=statement(4.0, **{**SLOW, **parts}), replay=replay)
+
+
+@pytest.mark.parametrize(
+    ("one", "expected"),
+    [
+        (following(0.1), "error"), (following(0.101), None),  # 2.5 s
+        (following(0.1, lag1_autocorrelation=0.3), "error"),
+        (following(0.1, lag1_autocorrelation=0.29), None),
+        (following(0.1, verdict="consistent"), None),
+        (axis(kf=SimpleNamespace(consistency=NONE), replay=SimpleNamespace(updates=None)), None),
+    ],
+)  # fmt: skip
+def test_a_process_noise_that_is_forgotten(one: Any, expected: str | None) -> None:
+    assert severity(process_noise_forgotten, analysis(axes=(one,))) == expected
+
+
+def test_a_forgotten_process_noise_is_told_with_how_slow_the_filter_is() -> None:
+    finding = only(process_noise_forgotten, analysis(axes=(following(0.05), following(0.01))))
+    assert finding.remedy == "Raise SIGMA_A."
+    assert "(5.0% in variance), the gain is 0.050, and the filter needs 5 s" in finding.message
+    assert finding.evidence["response_s"] == pytest.approx(5.0)
+    one = analysis(axes=(following(0.05),), tuning=tuned(None, Noise(2.3456, 2.0, 3.0)))
+    assert only(process_noise_forgotten, one).remedy == (
+        "Raise SIGMA_A. [--sigma-a 2.35|1|2.35|None]."
+    )
+    bounded = analysis(axes=(following(0.05),), tuning=tuned(None, Noise(None, None, 3.0)))
+    assert only(process_noise_forgotten, bounded).remedy == "Raise SIGMA_A."
+
+
+# ---------------------------------------------------------------- variances
+
+
+def kf(nis: float, name: str = "north", **parts: Any) -> Any:
+    verdict = "variance understated" if nis > 1.0 else "variance overstated"
+    return axis(name, kf=statement(nis, **{"verdict": verdict, **parts}))
+
+
+@pytest.mark.parametrize(
+    ("nis", "expected"),
+    [(1.5, "warning"), (1.49, None), (3.99, "warning"), (4.0, "error"), (0.25, "error"),
+     (0.251, "warning"), (0.67, None), (0.66, "warning")],
+)  # fmt: skip
+def test_a_variance_that_is_off(nis: float, expected: str | None) -> None:
+    assert severity(variance, analysis(axes=(kf(nis),))) == expected
+    assert severity(variance, analysis(axes=(kf(nis, verdict="consistent"),))) is None
+    if expected:
+        size, word = max(nis, 1.0 / nis), "under" if nis > 1.0 else "over"
+        message = only(variance, analysis(axes=(kf(nis),))).message
+        assert message.startswith(
+            f"Our innovation variance is {word}stated {factor_words(size)} times"
+        )
+        assert "consistent is 0.80 to 1.20; horizontal)" in message
+
+
+def test_one_finding_for_the_horizontal_axes_with_the_vertical_one_inside() -> None:
+    axes = (kf(2.0), kf(3.0, "east"), kf(9.0, "down"), kf(0.1, "aisle"))
+    found = list(variance.DETECTOR.detect(analysis(axes=axes)))
+    assert [finding.ids for finding in found] == [
+        ("kf_variance_overstated",), ("kf_variance_understated",) * 2,
+    ]  # fmt: skip
+    assert found[1].evidence["axis"] == "east"
+    assert "down" in found[1].consequences[0].message
+    assert found[1].consequences[0].message.endswith("vertical).")
+
+
+def test_of_what_is_overstated_a_source_that_drifts_or_the_truth_forbids_to_lower_it() -> None:
+    for nis, remedy, level in ((0.2, variance.AGAINST_DRIFT, "info"), (5.0, None, "error")):
+        finding = only(variance, analysis(axes=(kf(nis),), source=ODOMETRY))
+        assert (finding.remedy == variance.AGAINST_DRIFT) is (remedy is not None)
+        assert finding.severity == level
+    for owner, there in (("kf", True), ("ekf2", False)):
+        worse = {owner: statement(), f"{owner}_truth": against_truth(9.0)}
+        finding = only(variance, analysis(axes=(kf(0.2), axis("east", **worse))))
+        assert (finding.remedy == variance.AGAINST_TRUTH) is there
+        assert finding.evidence["cause"] == "elsewhere"
+
+
+@pytest.mark.parametrize(
+    ("settings", "default"),
+    [(Settings(), True), (Settings(sigma_z_m=0.11), False), (Settings(sigma_a_m_s2=0.51), False)],
+)
+def test_our_own_noises_are_the_programs(settings: Settings, default: bool) -> None:
+    assert _is_default(analysis(settings=settings).comparison, "kf", axis()) is default
+    found = only(variance, analysis(axes=(kf(5.0),), settings=settings))
+    assert found.severity == ("warning" if default else "error")
+
+
+def fused(noise_m: float, nis: float = 5.0, name: str = "north", **parts: Any) -> Any:
+    """EKF2 that used this noise."""
+    frame = pd.DataFrame({"observation_variance_m2": [9.0, noise_m**2, noise_m**2, 0.0]})
+    verdict = "variance understated" if nis > 1.0 else "variance overstated"
+    ekf2 = statement(nis, **{"verdict": verdict, **parts})
+    return axis(name, ekf2=ekf2, ekf2_innovations=frame)
+
+
+@pytest.mark.parametrize(
+    ("set_m", "used_m", "default"),
+    [(None, 0.1, True), (0.1, 0.1, True), (0.11, 0.1, False), (None, 0.124, True),
+     (None, 0.126, False), (None, 0.081, True), (None, 0.079, False)],
+)  # fmt: skip
+def test_ekf2s_noise_is_the_programs_unless_the_sender_chose_another(
+    set_m: float | None, used_m: float, default: bool
+) -> None:
+    parameters = {} if set_m is None else {"EKF2_EVP_NOISE": set_m}
+    one = analysis(log=log(parameters=parameters))
+    assert _is_default(one.comparison, "ekf2", fused(used_m)) is default
+
+
+@pytest.mark.parametrize(
+    ("noise", "used", "nis", "helps"),
+    [
+        (2.0, 1.0, 5.0, True), (0.5, 1.0, 5.0, False),
+        (0.5, 1.0, 0.2, True), (2.0, 1.0, 0.2, False),
+        (1.25, 1.0, 5.0, True), (1.249, 1.0, 5.0, False), (0.8, 1.0, 0.2, True),
+        (0.801, 1.0, 0.2, False),
+    ],
+)  # fmt: skip
+def test_which_noise_fixes_a_variance(noise: float, used: float, nis: float, helps: bool) -> None:
+    assert _noise_helps(noise, used, statement(nis).consistency) is helps
+
+
+@pytest.mark.parametrize(
+    ("nis", "outside", "of_source", "there"),
+    [(5.0, 0.0051, 6, True), (5.0, 0.005, 6, False), (0.2, 0.02, 6, False), (5.0, 0.02, 5, False)],
+)
+def test_outliers_explain_a_variance(
+    nis: float, outside: float, of_source: int, there: bool
+) -> None:
+    noises = tuned(outlier_time_s=np.zeros(of_source), count=1000)
+    one = statement(nis, outside_gate=outside).consistency
+    said = _outliers(analysis(tuning=noises), 0.123, one)
+    assert bool(said) is there
+    if there:
+        assert said.startswith("0.5% lie outside the gate while the bulk fits 0.12 m:")
+    assert bool(_outliers(analysis(), 0.123, one)) is (nis > 1.0 and outside > 0.005)
+
+
+@pytest.mark.parametrize(
+    ("one", "asked", "says", "cause"),
+    [
+        # more SIGMA_Z where S is too small, less where it is too large
+        (kf(5.0), Noise(2.0, 1.9, 2.1), "ask for SIGMA_Z 2 m. [--sigma-z 2|2|1|None].",
+         "measurement noise"),
+        (kf(0.2), Noise(0.25, 0.2, 0.3), "[--sigma-z 0.25|0.25|1|None].", "measurement noise"),
+        (kf(5.0), Noise(0.25, 0.2, 0.3), "It is not SIGMA_Z (the source's noise is 0.25 m)",
+         "elsewhere"),
+        (kf(5.0, outside_gate=0.1), Noise(0.25, 0.2, 0.3), "remove the outliers", "outliers"),
+        (kf(0.2), Noise(None, None, 0.0001),
+         "at most 0.001 m, below what this rate can show. [--sigma-z 0.005, and less SIGMA_A|",
+         "measurement noise"),
+        (kf(0.2), Noise(None, None, 0.02), "at most 0.02 m, below what this rate can show. "
+         "[--sigma-z 0.02, and less SIGMA_A|0.02|", "measurement noise"),
+        (kf(5.0), Noise(None, None, None), "No SIGMA_Z up to ", "elsewhere"),
+    ],
+)  # fmt: skip
+def test_what_our_variance_asks_for(one: Any, asked: Noise, says: str, cause: str) -> None:
+    noises = tuned(asked, outlier_time_s=np.zeros(9), count=10)
+    finding = only(variance, analysis(axes=(one,), tuning=noises))
+    assert says in finding.remedy
+    assert finding.evidence["cause"] == cause
+    if asked.high is not None:
+        bound = asked.value is None
+        assert finding.evidence["sigma_z_asked_m"] == (asked.high if bound else asked.value)
+        assert finding.evidence["sigma_z_asked_is_upper_bound"] == float(bound)
+
+
+@pytest.mark.parametrize(
+    ("nis", "lag1", "needed", "first"),
+    [(5.0, 0.31, 2.0, True), (5.0, 0.3, 2.0, False), (0.2, 0.31, 2.0, False),
+     (5.0, 0.31, 1.0, False), (5.0, 0.31, None, False)],
+)  # fmt: skip
+def test_a_filter_that_follows_too_slowly_needs_more_sigma_a_first(
+    nis: float, lag1: float, needed: float | None, first: bool
+) -> None:
+    noises = tuned(Noise(0.2, 0.1, 0.3), Noise(needed, 0.1, 9.0))
+    finding = only(variance, analysis(axes=(kf(nis, lag1_autocorrelation=lag1),), tuning=noises))
+    said = "(lag-1 correlation +0.31): raise SIGMA_A first. [--sigma-a 2|1|2|None]."
+    assert (said in finding.remedy) is first
+
+
+@pytest.mark.parametrize(
+    ("one", "asked", "parameters", "says"),
+    [
+        (fused(0.1), Noise(0.3, 0.2, 0.4), {},
+         "The source's noise is 0.3 m (√R was 0.1 m): set EKF2_EVP_NOISE to 0.3 m."),
+        (fused(0.1, name="down"), Noise(0.3, 0.2, 0.4), {}, "is of horizontal position."),
+        (fused(0.1), Noise(0.09, 0.08, 0.1), {}, "It is not EKF2_EVP_NOISE"),
+        # less noise where the sender reports more: its variances must not be used
+        (fused(0.3, 0.2), Noise(0.1, 0.09, 0.11), {"EKF2_EVP_NOISE": 0.1},
+         "R is what the sender reports (0.3 m), since that is more than EKF2_EVP_NOISE: correct it "
+         "there, or set EKF2_EV_NOISE_MD to 1 and EKF2_EVP_NOISE to 0.1 m."),
+        (fused(0.3, 0.2), Noise(0.1, 0.09, 0.11), {"EKF2_EVP_NOISE": 0.25},
+         "set EKF2_EVP_NOISE to 0.1 m."),
+        (fused(0.3, 0.2), Noise(0.1, 0.09, 0.11), {"EKF2_EVP_NOISE": 0.1, "EKF2_EV_NOISE_MD": 1.0},
+         "(√R was 0.3 m): set EKF2_EVP_NOISE to 0.1 m."),
+        (fused(0.1), Noise(0.3, 0.2, 0.4), {"EKF2_EVP_NOISE": 0.05},
+         "(√R was 0.1 m): set EKF2_EVP_NOISE to 0.3 m."),
+        # PX4's least, and of a bound the innovations' own size: 0.5 m of 0.3 and 0.4 m
+        (fused(0.3, 0.2), Noise(0.002, 0.001, 0.003), {}, "set EKF2_EVP_NOISE to 0.01 m."),
+        (fused(0.1), Noise(None, None, 0.2), {}, "noise is at most 0.5 m (√R was 0.1 m): set "),
+    ],
+)  # fmt: skip
+def test_what_ekf2s_variance_asks_for(
+    one: Any, asked: Noise, parameters: dict[str, float], says: str
+) -> None:
+    tuning = {**tuned(asked), "down": tuned(asked)["horizontal"]}
+    remedy = only(
+        variance, analysis(axes=(one,), log=log(parameters=parameters), tuning=tuning)
+    ).remedy
+    assert says.lower() in remedy.lower()
+
+
+def test_of_a_bound_the_noise_is_never_less_than_a_millimetre() -> None:
+    asked = variance.SourceNoise(1e-5, upper_bound=False)
+    said, cause = _kf_remedy(analysis(), asked, statement(0.2).consistency)
+    assert said.startswith("The data ask for SIGMA_Z 0.001 m. [--sigma-z 0.001|")
+    assert cause == "measurement noise"
+
+
+# ---------------------------------------------------------------- the loop
+
+
+def closure(
+    gnc: float | None = 1.0, *, accepted: bool = True, where: str = "landing", p: float = 0.5
+) -> Judged:
+    class At:
+        source, time_1_s, time_2_s = where, 10.0, 90.0
+
+        def __str__(self) -> str:
+            return "the closure"
+
+    gate = SimpleNamespace(accepted=accepted, p=p, d2=25.0, degrees_of_freedom=2)
+    return Judged(At(), 3.0, gate, {} if gnc is None else {"gnc": gnc})  # type: ignore[arg-type]
+
+
+def loop(*closures: Judged, assumed: bool = False) -> Loop:
+    class Made(Loop):
+        end_assumed = assumed
+
+    return made(Made, closures=closures)
+
+
+@pytest.mark.parametrize(
+    ("closures", "expected"),
+    [
+        ((closure(0.5),), []), ((closure(None),), []),
+        ((closure(0.49), closure()), ["loop_closure_doubtful"]),
+        ((closure(0.0), closure(0.0), closure()), ["loop_drift_understated"]),
+        ((closure(0.49),), ["loop_drift_understated"]),
+        ((closure(0.0, accepted=False), closure()), ["false_loop_closure"]),
+        ((closure(0.0, accepted=False),), ["loop_drift_understated", "false_loop_closure"]),
+    ],
+)  # fmt: skip
+def test_closures(closures: tuple[Judged, ...], expected: list[str]) -> None:
+    found = list(loop_closures.DETECTOR.detect(loop(*closures)))
+    assert [finding.id for finding in found] == expected
+    if expected == ["loop_drift_understated"]:
+        dropped = sum(judged.weights["gnc"] < 0.5 for judged in closures)
+        assert found[0].evidence == {"dropped": dropped, "closures": float(len(closures))}
+
+
+def test_a_false_closure_is_told_with_what_to_do() -> None:
+    for where, assumed, says, remedy in (
+        ("landing", True, "cannot have landed where it took off, as was assumed", "--open"),
+        ("landing", False, "the closure cannot be true", "--open"),
+        ("given", True, "the closure cannot be true", "Leave it out; it is not used."),
+    ):
+        false = loop(closure(accepted=False, where=where), assumed=assumed)
+        finding = only(loop_closures, false)
+        assert says in finding.message
+        assert remedy in finding.remedy
+        assert "misses it by 3.00 m" in finding.message
+        assert finding.evidence["time_2_s"] == 90.0
+
+
+# ---------------------------------------------------------------- drift and the story
+
+
+def closing(gap_m: float | None, length_m: float = 50.0) -> Loop:
+    class Made(Loop):
+        closure_error_m = gap_m
+        path_length_m = length_m
+
+    return made(Made)
+
+
+def test_what_may_drift_is_told_with_its_scatter_and_its_loop() -> None:
+    finding = only(source_may_drift, analysis(source=ODOMETRY))
+    assert finding.evidence == {"source": "uwb"}
+    assert "not where the vehicle was." in finding.message
+    for noise, bound, value in (
+        (Noise(0.02, 0.01, 0.03), "", 0.02), (Noise(None, None, 0.04), "at most ", 0.04)
+    ):  # fmt: skip
+        one = analysis(source=ODOMETRY, tuning=tuned(noise), loop=closing(1.25))
+        finding = only(source_may_drift, one)
+        assert f"it scatters by {bound}{value} m" in finding.message
+        assert finding.evidence["short_term_noise_m"] == value
+        assert "misses by 1.25 m after 50 m." in finding.message
+    assert named(source_may_drift, analysis(source=MOVING)) == {}
+    assert named(source_may_drift, analysis(source=ODOMETRY, axes=(hiding(),))) == {}
+    assert (
+        "misses"
+        not in only(source_may_drift, analysis(source=ODOMETRY, loop=closing(None))).message
+    )
+
+
+def flight_of(ours: Any, **parts: Any) -> Any:
+    one = analysis(axes=(ours,), **{"source": MOVING, **parts})
+    one.comparison.main = ours
+    return one
+
+
+def along(ekf2_nis: float, kf_nis: float, name: str = "aisle", **parts: Any) -> Any:
+    def judged(nis: float) -> Any:
+        return statement(nis, "consistent" if nis == 1.0 else "off")
+
+    frame = pd.DataFrame({"position_m": [0.0]}, index=[10.0])
+    return axis(name, ekf2=judged(ekf2_nis), kf=judged(kf_nis), **{"ekf2_state": frame, **parts})
+
+
+def test_without_truth_both_are_judged_by_their_innovations() -> None:
+    difference = made(Difference, position_rmse_m=0.05)
+    (said,) = story(flight_of(along(1.0, 1.0, difference=difference)), ())
+    assert said == (
+        "Along the aisle ours and EKF2 are 5 cm apart (RMS), and the log has no truth: by their "
+        "own innovations both are honest about it."
+    )
+    (said,) = story(flight_of(along(0.25, 4.0, difference=difference)), ())
+    assert said.endswith(
+        "by its own innovations EKF2 is 4 times too modest, our filter 4 times too sure of itself."
+    )
+    (said,) = story(flight_of(along(0.25, 4.0, difference=NONE), source=ODOMETRY), ())
+    assert "both were flown" in said
+    assert said.endswith("both follow uwb, which may drift.")
+
+
+def test_the_setting_that_is_further_off_is_blamed_and_only_for_what_it_does() -> None:
+    kinds = {"ekf2_truth": against_truth(1.0), "kf_truth": against_truth(1.0)}
+    for nis, noises, since in (
+        # S too large: what was chosen beyond its interval, the further the worse
+        (0.2, tuned(Noise(0.5, 0.4, 0.6), Noise(0.1, 0.05, 0.2)),
+         ", since SIGMA_A 1 is larger than the 0.1 m/s² that this flight asks for"),
+        (0.2, tuned(Noise(0.05, 0.04, 0.06), Noise(0.1, 0.05, 0.2)),
+         ", since SIGMA_Z 1 is larger than the 0.05 m that this flight asks for"),
+        (0.2, tuned(Noise(None, None, 0.5), RIGHT),
+         ", since SIGMA_Z 1 is larger than the 0.5 m that this flight asks for"),
+        (5.0, tuned(Noise(3.0, 2.0, 4.0), RIGHT),
+         ", since SIGMA_Z 1 is smaller than the 3 m that this flight asks for"),
+        *((nis, tuned(noise, RIGHT), "") for nis, noise in (
+            (5.0, Noise(0.5, 0.4, 0.6)), (0.2, Noise(3.0, 2.0, 4.0)), (5.0, Noise(3.0, None, 4.0)),
+            (5.0, Noise(3.0, 1.0, 4.0)), (0.2, Noise(0.5, 0.4, 1.0)), (1.0, Noise(3.0, 2.0, 4.0)),
+        )),
+        (0.2, {}, ""),
+    ):  # fmt: skip
+        one = flight_of(along(1.0, nis, **kinds), tuning=noises)
+        first, *_ = story(one, ())
+        assert (since in first) if since else ("since" not in first)
+        one = flight_of(along(1.0, nis, **kinds), tuning=noises, source=ODOMETRY)
+        assert "since" not in story(one, ())[0]
+
+
+def test_what_weighs_most_is_told_in_order() -> None:
+    def found(name: str, level: Any = "error", **parts: Any) -> Finding:
+        return Finding(name, level, f"It is {name}: so.", "Do.", **parts)
+
+    why = made(Why, sentences=(f"{STAMPS_WRONG} late.", "The rest is the noise; most at 4 s."))
+    one = flight_of(along(1.0, 1.0, difference=NONE), why={"aisle": why})
+    told = story(one, (found("ekf2_resets"), found("no_motion", "info"), found("imu_gap")))
+    assert told[1:] == ("It is imu_gap.", "The rest is the noise.")
+    spans = ((20.0, 30.0),)
+    told = story(one, (found("imu_gap", spans_s=spans),))
+    assert told[1] == "It is imu_gap (20.0 s to 30.0 s)."
+    dated = replace(found("imu_gap", spans_s=spans), message="It is lost at 20.0 s: so.")
+    assert story(one, (dated,))[1] == "It is lost at 20.0 s."
+    looped = flight_of(along(1.0, 1.0, difference=NONE), loop=closing(1.0, 200.0))
+    assert story(looped, ())[1] == (
+        "The odometry fails to close its loop by 1.0 m after 200 m (0.5%)."
+    )
+    assert len(story(flight_of(along(1.0, 1.0, difference=NONE), loop=closing(None)), ())) == 1
+
+
+@pytest.mark.parametrize(
+    ("truth", "said"),
+    [
+        (NONE, "ours was 2.0 m and EKF2 1.0 m from the next position."),
+        (pd.DataFrame({"position_m": [1.0, 3.4]}, index=[50.0, 58.0]),
+         "ours was 40 cm and EKF2 60 cm from the truth."),
+    ],
+)  # fmt: skip
+def test_the_longest_silence_is_told_with_where_it_left_both(
+    monkeypatch: pytest.MonkeyPatch, truth: Any, said: str
+) -> None:
+    monkeypatch.setattr(telling, "state_at", lambda *_: (np.array([0.0, 3.0]), None))
+    ekf2 = pd.DataFrame({"position_m": [0.0, 4.0, 9.0]}, index=[20.0, 57.9, 58.1])
+    main = along(1.0, 1.0, difference=NONE, ekf2_state=ekf2, truth=truth, replay=None)
+    main.axis.measurement_time_s = np.array([20.0, 50.0, 58.0, 58.2])
+    main.axis.measurement_m = np.array([0.0, 0.0, 5.0, 9.0])
+    for spans, more in (
+        (((50.0, 58.0),), ""), (((20.0, 21.5), (50.0, 58.0)), " (the longest of 2 times)")
+    ):  # fmt: skip
+        gap = Finding("source_gap", "warning", "It was silent.", "Do.", spans_s=spans)
+        assert story(flight_of(main), (gap,))[1] == (
+            f"From 50 s to 58 s the source was silent{more}: both filters coasted on the IMU; at "
+            f"the end {said}"
+        )
