@@ -76,6 +76,14 @@ def progress(quiet: bool = False, steps: Sequence[str] = ()) -> Iterator[Step]:
         the step before.
     """
     from rich.console import Console
+
+    def silent(what: str, done: int = 0, of: int | None = None) -> None:
+        del what, done, of
+
+    console = Console(stderr=True)
+    if not console.is_terminal or quiet:  # an older rich ends a disabled bar with an empty line
+        yield silent
+        return
     from rich.progress import (
         BarColumn,
         Progress,
@@ -85,13 +93,6 @@ def progress(quiet: bool = False, steps: Sequence[str] = ()) -> Iterator[Step]:
         TimeRemainingColumn,
     )
 
-    def silent(what: str, done: int = 0, of: int | None = None) -> None:
-        del what, done, of
-
-    console = Console(stderr=True)
-    if not console.is_terminal or quiet:  # an older rich ends a disabled bar with an empty line
-        yield silent
-        return
     columns = (
         SpinnerColumn(), TextColumn("{task.description}", markup=False), BarColumn(),
         TextColumn("{task.fields[count]}"), TimeElapsedColumn(),

@@ -12,10 +12,8 @@ import unicodedata
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import accumulate, zip_longest
+from typing import TYPE_CHECKING
 
-from markdown_it import MarkdownIt
-from markdown_it.rules_inline import StateInline
-from markdown_it.tree import SyntaxTreeNode
 from matplotlib.figure import Figure
 
 from px4fuse.report.document import Document, LoopDocument
@@ -33,6 +31,10 @@ from px4fuse.report.style import (
     text_width,
     wrap,
 )
+
+if TYPE_CHECKING:
+    from markdown_it.rules_inline import StateInline
+    from markdown_it.tree import SyntaxTreeNode
 
 BODY_SIZE = 8.5
 HEADING_SIZES = {"h1": 12.0, "h2": 10.8, "h3": 9.6}
@@ -168,6 +170,10 @@ def read(notes: str) -> Iterator[Line | Table]:
     >>> [line.text for line in read("# A *b*\n\n- $\\sigma_z^2$ is `R`\n\n![a map](m.png)")]
     ['A b', 'σ_z² is R', '[picture: a map]']
     """
+    # the parser costs a fiftieth of a second: not where there are no notes
+    from markdown_it import MarkdownIt  # noqa: PLC0415
+    from markdown_it.tree import SyntaxTreeNode  # noqa: PLC0415
+
     markdown = MarkdownIt("commonmark", {"html": True}).enable(["table", "strikethrough"])
     markdown.inline.ruler.before("escape", "maths", _maths)
     yield from _blocks(SyntaxTreeNode(markdown.parse(notes)), 0)
