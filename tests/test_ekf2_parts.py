@@ -14,6 +14,14 @@ import numpy as np
 import pandas as pd
 import pytest
 from findings_tools import NONE, log, made
+from px4fuse.ekf2.rotation import (
+    from_vector,
+    interpolate,
+    matrix,
+    multiply,
+    running_product,
+    to_vector,
+)
 from scipy.spatial.transform import Rotation
 
 from px4fuse.ekf2 import inputs as inputs_module
@@ -53,14 +61,6 @@ from px4fuse.ekf2.recursion import (
 )
 from px4fuse.ekf2.recursion import _measurements as measurements
 from px4fuse.ekf2.replay import Agreement, AxisAgreement, Ekf2Replay
-from px4fuse.ekf2.rotation import (
-    from_vector,
-    interpolate,
-    matrix,
-    multiply,
-    running_product,
-    to_vector,
-)
 from px4fuse.ekf2.stretches import (
     Stretch,
     _counted,

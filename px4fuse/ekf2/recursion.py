@@ -402,7 +402,8 @@ def _down_to(variance: Array, target: Array) -> Array:
     """
     surplus = variance - target
     noise = np.full(surplus.shape, NOT_TAKEN)
-    return np.divide(variance * target, surplus, out=noise, where=surplus > 0.0)
+    np.divide(variance * target, surplus, out=noise, where=surplus > 0.0)
+    return noise
 
 
 def _limit_bias(P: Array, floor: float, biases: Flags) -> None:
