@@ -14,7 +14,8 @@ Sources of the names:
 - Gradescope: "Exporting submissions", Help Center: ``submission_{number}``, and beside them
   ``submission_metadata.yml`` with names, ids (``:sid:``) and times.
 - ILIAS: multi-feedback of ``components/ILIAS/Exercise`` in its repository:
-  ``{last}_{first}_{login}_{user}/``, where a late file's name begins with "Late Submission - ".
+  ``{last}_{first}_{login}_{user}/``, where a late file's name begins with "Late Submission - " if
+  the instructor's language is English; in others only ``--due`` tells.
 """
 
 from __future__ import annotations
