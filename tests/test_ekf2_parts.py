@@ -14,14 +14,6 @@ import numpy as np
 import pandas as pd
 import pytest
 from findings_tools import NONE, log, made
-from px4fuse.ekf2.rotation import (
-    from_vector,
-    interpolate,
-    matrix,
-    multiply,
-    running_product,
-    to_vector,
-)
 from scipy.spatial.transform import Rotation
 
 from px4fuse.ekf2 import inputs as inputs_module
@@ -101,6 +93,14 @@ from px4fuse.flight import (
     Reset,
     Truth,
     Unavailable,
+)
+from px4fuse.trajectory.rotation import (
+    from_vector,
+    interpolate,
+    matrix,
+    multiply,
+    running_product,
+    to_vector,
 )
 
 ALIGNED = "estimator_visual_odometry_aligned"

@@ -59,7 +59,8 @@ from px4fuse.findings.model import (
     sentence,
     step_share,
 )
-from px4fuse.flight import Dropout, FusionRecord, Reset, Unavailable
+from px4fuse.flight import FusionRecord, Reset, Unavailable
+from px4fuse.recording import Dropout
 
 
 def steps(*pairs: tuple[float, float], column: str = "horizontal") -> dict[str, Any]:
