@@ -19,7 +19,7 @@ from scipy.special import comb, expit, gammaincinv
 
 from px4fuse.arrays import Array
 from px4fuse.filter.chain import Chain
-from px4fuse.filter.lanes import Lanes, gains, lanes
+from px4fuse.filter.lanes import MIN_LANES, Lanes, gains, lanes
 from px4fuse.filter.likelihood import PROFILE_DROP, Preintegrated
 from px4fuse.filter.marginal import Fitted, Positions, centred, fit, squares
 from px4fuse.filter.model import INITIAL_COVARIANCE
@@ -59,7 +59,7 @@ class Part:
 
     @cached_property
     def lanes(self) -> Lanes | None:
-        """The same, stretches side by side, where there are several."""
+        """The same, stretches side by side, where that can be done."""
         return lanes(self.positions, self.delta_position_m, self.delta_velocity_m_s)
 
 
@@ -170,9 +170,11 @@ def of_ratios(
     sigma_z_m : float
     """
     positions, variance = over_sigma_z(part.positions, walk, weight, sigma_z_m)
-    if part.lanes is not None:
-        return part.lanes.fit(gains(positions, ratios, variance))
     legs = part.delta_position_m, part.delta_velocity_m_s
+    axes, signals = legs[0].shape[:2]
+    many = len(ratios) * len(positions.start) * axes * signals >= MIN_LANES
+    if many and part.lanes is not None:
+        return part.lanes.fit(gains(positions, ratios, variance))
     return [fit(positions, *legs, ratio, variance) for ratio in ratios]
 
 

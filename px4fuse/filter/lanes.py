@@ -16,7 +16,9 @@ from px4fuse.arrays import Array, BoolArray, IntArray
 from px4fuse.filter.marginal import HELD, Fitted, Positions
 from px4fuse.filter.model import spread
 
-MIN_STRETCHES = 2
+# A step takes as long for few as for many: with fewer of them one factorisation after the other is
+# faster
+MIN_LANES = 32
 # Variance by which a measurement is not used (m²), small enough for its inverse to be a number
 UNUSED_M2 = 1e200
 
@@ -163,7 +165,7 @@ def _by_state(positions: Positions, of_leg: Array) -> Array:
 
 
 def lanes(positions: Positions, delta_position_m: Array, delta_velocity_m_s: Array) -> Lanes | None:
-    """Lay stretches side by side; None where a start is known or there are too few of them.
+    """Lay stretches side by side; None where a start is known.
 
     Parameters
     ----------
@@ -171,7 +173,7 @@ def lanes(positions: Positions, delta_position_m: Array, delta_velocity_m_s: Arr
     delta_position_m, delta_velocity_m_s : ndarray, shape (a, T, 1 + c, n)
         As :func:`px4fuse.filter.marginal.fit` takes them.
     """
-    if len(positions.start) < MIN_STRETCHES or positions.initial.max() > HELD:
+    if positions.initial.max() > HELD:
         return None
     chain, count = positions.chain, len(positions.measurement_m)
     state, _ = _side_by_side(positions)
