@@ -354,14 +354,15 @@ def test_where_the_input_leads_says_the_same_as_its_legs() -> None:
     variance = np.full(COUNT, 0.3)
     of_legs = Part(*centred(positions, dp, dv, scaled=True)).lanes
     assert of_legs is not None
-    for fits in zip(
-        of_legs.fit(gains(positions, [0.5, 2.0], variance)),
-        lanes_of_paths(positions, path[..., :-1]).fit(gains(positions, [0.5, 2.0], variance)),
-        strict=True,
-    ):
-        expected, ours = fits
+    steps = gains(positions, [0.5, 2.0], variance)
+    by_path = lanes_of_paths(positions, path[..., :-1]).fit(steps)
+    for expected, ours in zip(of_legs.fit(steps), by_path, strict=True):
         assert np.ptp(expected.gram[..., -1, -1]) > 1.0
         np.testing.assert_allclose(ours.gram, expected.gram, rtol=1e-7, atol=1e-7)
+    # what else is tried with an offset does not matter
+    alone = lanes_of_paths(positions, path[:, :, -1:, :-1]).fit(steps)
+    for ours, one in zip(by_path, alone, strict=True):
+        np.testing.assert_allclose(ours.gram[:, -1:], one.gram, rtol=1e-7, atol=1e-7)
 
 
 def test_a_start_that_is_known_is_not_laid_side_by_side() -> None:

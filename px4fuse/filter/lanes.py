@@ -209,12 +209,12 @@ def lanes_of_paths(positions: Positions, path_m: Array) -> Lanes:
     signal = np.empty((*path_m.shape[:-1], path_m.shape[-1] + 1))
     np.negative(path_m, out=signal[..., :-1])
     signal[..., 0] += measured
-    # of smooth motion through the positions, the same for all, see marginal.centred
+    # of smooth motion through the positions, see marginal.centred
     for axes, factor, _ in positions.smooth:
-        apart = np.ascontiguousarray(signal[:, :, 0, 0].T[axes])
+        apart = np.ascontiguousarray(np.moveaxis(signal[..., 0][:, axes], 0, -1))
         apart -= factor.follow(apart)
-        apart[:, positions.start] = 0.0
-        signal[..., -1][:, axes] = apart.T[:, :, None] - measured[:, axes]
+        apart[..., positions.start] = 0.0
+        signal[..., -1][:, axes] = np.moveaxis(apart, -1, 0) - measured[:, axes]
     state, _ = _side_by_side(positions)
     return Lanes(positions, signal[state])
 

@@ -221,17 +221,18 @@ def centred(
     count = delta_position_m.shape[-1]
     of_leg = chain.end - 1 if count == len(chain.end) else slice(None)
     for axes, factor, _ in positions.smooth:
-        dp, dv = (part[axes, 0, 0] for part in (delta_position_m, delta_velocity_m_s))
-        state = factor.solve(Columns(np.nan_to_num(measured[:, axes].T), dp, dv))
-        state[:, positions.start] = 0.0
+        dp, dv = (part[axes, :, 0] for part in (delta_position_m, delta_velocity_m_s))
+        state = factor.solve(Columns(np.nan_to_num(measured[:, axes].T)[:, None], dp, dv))
+        state[:, :, positions.start] = 0.0
         path, speed = state[..., 0], state[..., 1]
-        measured[:, axes] -= path.T
-        way = np.diff(path) - factor.length_s * speed[:, :-1]
-        for axis, p, v in zip(axes, way[:, of_leg], np.diff(speed)[:, of_leg], strict=True):
-            delta_position_m[axis, :, 0] -= p
-            delta_velocity_m_s[axis, :, 0] -= v
+        measured[:, axes] -= path[:, 0].T
+        way = (np.diff(path) - factor.length_s * speed[..., :-1])[..., of_leg]
+        turn = np.diff(speed)[..., of_leg]
+        # one path is taken out of all; a scale is of the path to which each input leads
+        for part, leads in ((delta_position_m, way), (delta_velocity_m_s, turn)):
+            part[axes, :, 0] -= leads[:, :1]
             if scaled:
-                delta_position_m[axis, :, -1], delta_velocity_m_s[axis, :, -1] = p, v
+                part[axes, :, -1] = leads
     return replace(positions, measurement_m=measured), delta_position_m, delta_velocity_m_s
 
 
