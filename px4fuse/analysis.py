@@ -159,8 +159,8 @@ class Analysis(Shown):
             if isinstance(tuned, AxisTuning) and axes.keys() >= set(group):
                 clock, offset_s = self.clock, 0.0
                 if isinstance(clock, ClockOffset) and clock.determinable:
-                    if abs(clock.offset_s) > SURE_SIGMAS * clock.sigma_s:
-                        offset_s = clock.offset_s
+                    sure = abs(clock.offset_s) > SURE_SIGMAS * clock.sigma_s
+                    offset_s = clock.offset_s if sure else 0.0
                 return tuple(axes[each] for each in group), tuned, offset_s
         return Unavailable(
             "causes beyond noise",

@@ -175,10 +175,6 @@ def compare(
     progress : callable
         Told the names of the axes as they start.
 
-    Returns
-    -------
-    Comparison
-
     Raises
     ------
     MissingDataError

@@ -13,11 +13,12 @@ from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.signals import AISLE
 from px4fuse.findings import Finding
 from px4fuse.flight import Unavailable
-from px4fuse.report.document import Document
+from px4fuse.report.document import Document, who
 from px4fuse.report.plan import plan
 from px4fuse.report.style import (
     BOTTOM,
     EKF2,
+    LABEL_WIDTH,
     LEFT,
     MUTED,
     OURS,
@@ -37,7 +38,6 @@ from px4fuse.report.words import (
     verdict_words,
 )
 
-LABEL_WIDTH = 0.085
 TEXT_X = LEFT + LABEL_WIDTH
 # Points before the map, and for the line that says that findings follow
 BEFORE_MAP, MORE = 14.0, 13.0
@@ -102,9 +102,8 @@ def _continued(findings: tuple[Finding, ...]) -> Iterator[Figure]:
 
 def _subtitle(document: Document) -> str:
     log = document.comparison.flight.log
-    who = ", ".join(part for part in (document.student.name, document.student.id) if part)
-    about = (who, log.name, f"{log.duration_s:.1f} s", f"{log.firmware}, {log.hardware}")
-    return " · ".join(part for part in about if part)
+    about = (log.name, f"{log.duration_s:.1f} s", f"{log.firmware}, {log.hardware}")
+    return " · ".join(filter(None, (who(document.student, ", "), *about)))
 
 
 def _verdict(figure: Figure, cursor: Cursor, document: Document) -> None:
@@ -201,39 +200,30 @@ def _cells(
     if isinstance(summary, Unavailable):
         return "not available", "", ""
     cells = statement_cells(summary.consistency)
-    return (
-        cells.words,
-        cells.nis,
-        error_cells(truth)[0],
-    )
+    return cells.words, cells.nis, error_cells(truth)[0]
 
 
 def facts(document: Document) -> list[tuple[str, str]]:
     """What was compared, in labels and sentences."""
-    comparison = document.comparison
-    log, source, segment = comparison.flight.log, comparison.source, comparison.segment
+    comparison, flight = document.comparison, document.comparison.flight
+    log, source, segment = flight.log, comparison.source, comparison.segment
     source_text = (
         f"{source.name}: {source.description}, {source.rate_hz:.1f} Hz, {source.frame}; "
         f"{comparison.source_reason}"
     )
     if any(part.what == "position source vehicle_visual_odometry" for part in comparison.missing):
         source_text += ". SDLOG_PROFILE 129 would have logged it as it arrived"
-    clock = ""
+    clock = "" if source.alignment is None else source.clock
     if source.clock_map is not None:
         clock = clock_words(source.clock_map)
-    elif source.alignment is not None:
-        clock = source.clock
-    aisle = next((axis.axis for axis in comparison.axes if axis.axis.name == AISLE), None)
+    aisle = next((line for line in comparison.lines if line.name == AISLE), None)
     listed = [
         ("Position", source_text),
         ("Clock", clock),
         ("Segment", f"{segment.start_s:.2f} s to {segment.end_s:.2f} s, {segment.reason}"),
         ("Our filter", settings_words(comparison.settings)),
         ("Aisle", "" if aisle is None else f"{aisle.heading_deg:.1f}° from north ({aisle.note})"),
-        (
-            "With",
-            ", ".join(f"{f.name}, SHA-256 {f.sha256[:12]}…" for f in comparison.flight.inputs),
-        ),
+        ("With", ", ".join(f"{f.name}, SHA-256 {f.sha256[:12]}…" for f in flight.inputs)),
         ("SHA-256", f"{log.sha256}, {log.size_bytes / 1e6:.2f} MB"),
     ]
     return [(label, text) for label, text in listed if text]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from importlib import metadata
 from typing import Any
@@ -50,7 +50,6 @@ from px4fuse.report.style import (
     empty,
     page,
     printable,
-    put,
     report_style,
     thin,
     wrap,
@@ -82,7 +81,6 @@ PANEL, TALL, BELOW, TITLE, LINE = 84.0, 190.0, 52.0, 16.0, 8.9
 # The least and the largest height of the maps with their words
 LEAST_MAPS, MOST_MAPS = 215.0, 480.0
 MOST_CURVES, MOST_BOXES = 3, 12
-TABLE_SIZE = 7.4
 TABLE_EDGES = (LEFT, 0.21, 0.30, 0.43, 0.51, 0.59, 0.67, 0.75, 0.82)
 TABLE_HEADS = (
     "error", "RMSE", "95 % interval", "mean", "median", "std", "max", "n", "rotation RMSE (°)",
@@ -164,7 +162,7 @@ def draw(document: EvaluationDocument) -> Iterator[Figure]:
         if cursor.y < BOTTOM + 0.03:
             yield figure
             figure, cursor = page("Trajectory error, continued")
-        _row(cursor, cells, head=cells is TABLE_HEADS)
+        cursor.row(TABLE_EDGES, cells, head=cells is TABLE_HEADS)
     cursor.skip(2)
     cursor.write(" ".join([*reasons(score), *score.notes]), size=7.0, colour=MUTED)
     cursor.skip(4)
@@ -205,17 +203,6 @@ def picture(score: Evaluation) -> bytes:
         software = f"px4fuse {metadata.version('px4fuse')}"
         figure.savefig(out, format="png", dpi=PICTURE_DPI, metadata={"Software": software})
     return out.getvalue()
-
-
-def _row(cursor: Cursor, cells: Sequence[str], *, head: bool) -> None:
-    """One row of the table of scores."""
-    cursor.y -= TABLE_SIZE * 1.45 / POINTS_PER_HEIGHT
-    for x, text in zip(TABLE_EDGES, cells, strict=True):
-        colour = MUTED if head else "black"
-        put(cursor.figure, x, cursor.y, text, size=TABLE_SIZE, color=colour)
-    if head:
-        cursor.skip(2.5)
-        cursor.rule()
 
 
 def _maps(figure: Figure, cursor: Cursor, score: Evaluation, points: float) -> None:

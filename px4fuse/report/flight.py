@@ -44,9 +44,8 @@ TALLEST = 200.0
 
 def draw(document: Document) -> Iterator[Figure]:
     """Draw one page."""
-    result, segment = document.comparison.main, document.comparison.segment
-    name = result.axis.name
-    along = the(name)
+    result = document.comparison.main
+    along = the(result.axis.name)
     figure, cursor = page(f"The flight along {along}")
     legend(figure, cursor, document)
     reference = error_reference(result)
@@ -66,7 +65,6 @@ def draw(document: Document) -> Iterator[Figure]:
         strip = place == 0 and bool(document.events.modes)
         axes = panel(cursor, title, say, height, above=12.0 if strip else 4.0)
         draw_panel(axes, result, MAX_POINTS)
-        axes.set_xlim(segment.start_s, segment.end_s)
         marks.draw(axes, document, strip=strip)
         if place < len(panels) - 1:
             bare_x(axes)

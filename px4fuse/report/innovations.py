@@ -58,10 +58,8 @@ INNOVATIONS, SIGMA_P, SIGMA_V, ZOOM = 140.0, 80.0, 60.0, 140.0
 
 def draw(document: Document) -> Iterator[Figure]:
     """Draw one page: innovations, σ_p and σ_v on one time axis, then the zooms."""
-    result, segment = document.comparison.main, document.comparison.segment
-    name = result.axis.name
-    along = the(name)
-    figure, cursor = page(f"Innovations and variances along {along}")
+    result = document.comparison.main
+    figure, cursor = page(f"Innovations and variances along {the(result.axis.name)}")
     strip = bool(document.events.modes)
     axes = panel(
         cursor,
@@ -71,7 +69,6 @@ def draw(document: Document) -> Iterator[Figure]:
         above=12.0 if strip else 4.0,
     )
     draw_innovations(axes, result, MAX_POINTS)
-    axes.set_xlim(segment.start_s, segment.end_s)
     marks.draw(axes, document, axis="", strip=strip)
     bare_x(axes)
     below(cursor, innovation_numbers(result, axes.get_ylim()[1]), points=4.0)
@@ -91,8 +88,7 @@ def draw(document: Document) -> Iterator[Figure]:
         ),
     ):
         axes = panel(cursor, title, say, height)
-        draw_sigma(axes, result, column, MAX_POINTS)
-        axes.set_xlim(segment.start_s, segment.end_s)
+        draw_sigma(axes, result, MAX_POINTS, column)
         marks.draw(axes, document)
         if column.startswith("position"):
             bare_x(axes)
@@ -262,7 +258,9 @@ def sigma_numbers(result: AxisComparison) -> str:
     return f"median: {_medians(result, 'sigma_p_median_m', 'm')}"
 
 
-def draw_sigma(axes: Axes, result: AxisComparison, column: str, limit: int) -> None:
+def draw_sigma(
+    axes: Axes, result: AxisComparison, limit: int, column: str = "position_variance_m2"
+) -> None:
     """σ of position or velocity of both filters, log scale."""
     steps = result.replay.steps
     axes.plot(*thin(steps.index.to_numpy(), np.sqrt(steps[column].to_numpy()), limit), **OURS_LINE)

@@ -33,6 +33,7 @@ from px4fuse.report.document import (
     EvaluationDocument,
     LoopDocument,
     WhatIfDocument,
+    who,
 )
 from px4fuse.report.seal import sealed
 from px4fuse.report.style import LEFT, MUTED, RIGHT, printable, put, report_style, shorten
@@ -108,12 +109,12 @@ def _running_lines(figure: Figure, document: Report, number: int, count: int) ->
     """Head and foot of a page: which log, whose, which version, which page."""
     name, sha256 = document.log
     style = {"size": 6.5, "color": MUTED}
-    who = " · ".join(part for part in (document.student.name, document.student.id) if part)
-    room = 330 if who else 500
+    student = who(document.student, " · ")
+    room = 330 if student else 500
     head = shorten(printable(f"px4fuse · {name} · SHA-256 {sha256[:12]}"), 6.5, room)
     put(figure, LEFT, 0.972, head, **style)
-    if who:
-        figure.text(RIGHT, 0.972, shorten(printable(who), 6.5, 170), ha="right", **style)  # type: ignore[arg-type]
+    if student:
+        figure.text(RIGHT, 0.972, shorten(printable(student), 6.5, 170), ha="right", **style)  # type: ignore[arg-type]
     version = metadata.version("px4fuse")
     put(figure, LEFT, 0.022, f"px4fuse {version}", **style)
     figure.text(RIGHT, 0.022, f"{number} / {count}", ha="right", **style)  # type: ignore[arg-type]

@@ -31,6 +31,8 @@ from px4fuse.report import fonts
 A4_INCHES = (8.27, 11.69)
 LEFT, RIGHT, TOP, BOTTOM = 0.085, 0.945, 0.95, 0.05
 PANEL_LEFT = LEFT + 0.04  # of axes: the numbers beside them stand in between
+LABEL_WIDTH = 0.085
+ROW_SIZE = 7.4
 POINTS_PER_WIDTH = A4_INCHES[0] * 72.0
 POINTS_PER_HEIGHT = A4_INCHES[1] * 72.0
 
@@ -281,6 +283,26 @@ class Cursor:
         lines = wrap(printable(text), size, (right - x) * POINTS_PER_WIDTH, weight)
         return len(lines) * size * spacing / POINTS_PER_HEIGHT
 
+    def labelled(self, label: str, text: str, *, size: float = 8.0, x: float = LEFT) -> None:
+        """Write a bold label, text beside it, and move below the text."""
+        top = self.y
+        self.write(label, size=size, weight="bold", x=x, right=x + LABEL_WIDTH)
+        self.y = top
+        self.write(text, size=size, x=x + LABEL_WIDTH)
+
+    def row(
+        self, edges: Sequence[float], cells: Sequence[str], *, head: bool = False,
+        colour: str = "black",
+    ) -> None:  # fmt: skip
+        """Write one row of a table, each cell cut at the next left edge; a line below a head."""
+        self.y -= ROW_SIZE * 1.45 / POINTS_PER_HEIGHT
+        for x, end, text in zip(edges, (*edges[1:], RIGHT), cells, strict=True):
+            cut = shorten(printable(text), ROW_SIZE, (end - x) * POINTS_PER_WIDTH - 4.0)
+            put(self.figure, x, self.y, cut, size=ROW_SIZE, color=MUTED if head else colour)
+        if head:
+            self.skip(2.5)
+            self.rule()
+
     def skip(self, points: float) -> None:
         """Leave a gap."""
         self.y -= points / POINTS_PER_HEIGHT
@@ -311,36 +333,6 @@ def appendix(title: str) -> str:
     'Appendix: notes by the student'
     """
     return f"Appendix: {title[0].lower()}{title[1:]}"
-
-
-def panels(
-    figure: Figure,
-    top: float,
-    bottom: float,
-    rows: int,
-    columns: int,
-    *,
-    widths: Sequence[float] | None = None,
-    hspace: float = 0.45,
-    wspace: float = 0.2,
-    left: float = LEFT,
-) -> list[list[Axes]]:
-    """Lay out a grid of axes between two heights of a page (fractions).
-
-    Rows share what their x axes mean, so only the last one has numbers on it.
-    """
-    grid = figure.add_gridspec(
-        rows, columns, left=left, right=RIGHT, top=top, bottom=bottom, hspace=hspace,
-        wspace=wspace, width_ratios=widths,
-    )  # fmt: skip
-    axes = [[figure.add_subplot(grid[r, c]) for c in range(columns)] for r in range(rows)]
-    for row in axes:
-        for single in row:
-            single.xaxis.set_major_locator(MaxNLocator(6))
-            single.yaxis.set_major_locator(MaxNLocator(4))
-            if row is not axes[-1]:
-                single.tick_params(axis="x", labelbottom=False, bottom=False)
-    return axes
 
 
 def panel(
