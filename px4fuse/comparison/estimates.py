@@ -128,14 +128,13 @@ def turned_frame(
     sigma_z_m = comparison.settings.sigma_z_m
     if isinstance(tuned, AxisTuning):
         sigma_z_m = size(tuned.sigma_z, sigma_z_m)
-    known = isinstance(clock, ClockOffset) and clock.determinable
     return heading_error(
         comparison.flight,
         comparison.source,
         comparison.segment,
         comparison.settings,
         sigma_z_m,
-        clock.offset_s if known and isinstance(clock, ClockOffset) else 0.0,
+        clock.offset_s if isinstance(clock, ClockOffset) and clock.determinable else 0.0,
     )
 
 

@@ -116,6 +116,7 @@ class EvaluationDocument:
     """
 
     score: Evaluation
+    command: ClassVar[str] = ""
     student: ClassVar[Student] = NOBODY
 
     @property

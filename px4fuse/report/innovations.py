@@ -27,7 +27,6 @@ from px4fuse.report.style import (
     EKF2_REJECTED,
     MAX_POINTS,
     MEASUREMENT,
-    MUTED,
     OURS,
     OURS_BAND,
     OURS_DOTS,
@@ -98,8 +97,7 @@ def draw(document: Document) -> Iterator[Figure]:
         cursor.skip(10)
     _zooms(cursor, document)
     for note in verdict_notes(document.comparison):
-        cursor.skip(2)
-        cursor.write(note, size=7, colour=MUTED, spacing=1.25)
+        below(cursor, note, points=2.0)
     yield figure
 
 
@@ -387,18 +385,13 @@ def _before_after(name: str, summary: FilterSummary) -> str:
 
 def start_words(result: AxisComparison) -> str:
     """What to see in the first seconds."""
-    initial = float(np.sqrt(result.replay.steps["position_variance_m2"].iloc[0]))
+    sigma = np.sqrt(result.replay.steps["position_variance_m2"])
+    first = f"From σ {sigma.iloc[0]:g} m (P₀)"
     steady = result.kf.sigma_p_after_update_m
-    if steady is None:
-        return f"From σ {initial:g} m (P₀) on."
-    time, sigma = result.replay.steps.index, np.sqrt(result.replay.steps["position_variance_m2"])
-    settled = time[(sigma < 1.2 * steady).to_numpy()]
-    if not len(settled):
-        return f"From σ {initial:g} m (P₀) on."
-    return (
-        f"From σ {initial:g} m (P₀) to its steady {steady:.2g} m within "
-        f"{settled[0] - time[0]:.1f} s."
-    )
+    settled = sigma.index[(sigma < 1.2 * (steady or 0.0)).to_numpy()]
+    if steady is None or not len(settled):
+        return f"{first} on."
+    return f"{first} to its steady {steady:.2g} m within {settled[0] - sigma.index[0]:.1f} s."
 
 
 def log_ticks(axes: Axes) -> None:

@@ -33,6 +33,7 @@ LEFT, RIGHT, TOP, BOTTOM = 0.085, 0.945, 0.95, 0.05
 PANEL_LEFT = LEFT + 0.04  # of axes: the numbers beside them stand in between
 LABEL_WIDTH = 0.085
 ROW_SIZE = 7.4
+SPACING = 1.32  # of lines, times the size
 POINTS_PER_WIDTH = A4_INCHES[0] * 72.0
 POINTS_PER_HEIGHT = A4_INCHES[1] * 72.0
 
@@ -246,7 +247,7 @@ class Cursor:
         colour: str = "black",
         x: float = LEFT,
         right: float = RIGHT,
-        spacing: float = 1.32,
+        spacing: float = SPACING,
     ) -> None:
         """Write wrapped text and move below it."""
         for line in wrap(printable(text), size, (right - x) * POINTS_PER_WIDTH, weight):
@@ -276,12 +277,11 @@ class Cursor:
         self.skip(count * size * 1.4)
 
     def height(
-        self, text: str, *, size: float = 8.0, weight: str = "normal", x: float = LEFT,
-        right: float = RIGHT, spacing: float = 1.32,
-    ) -> float:  # fmt: skip
+        self, text: str, *, size: float = 8.0, x: float = LEFT, right: float = RIGHT
+    ) -> float:
         """Height that :meth:`write` would take, as a fraction of the page."""
-        lines = wrap(printable(text), size, (right - x) * POINTS_PER_WIDTH, weight)
-        return len(lines) * size * spacing / POINTS_PER_HEIGHT
+        lines = wrap(printable(text), size, (right - x) * POINTS_PER_WIDTH)
+        return len(lines) * size * SPACING / POINTS_PER_HEIGHT
 
     def labelled(self, label: str, text: str, *, size: float = 8.0, x: float = LEFT) -> None:
         """Write a bold label, text beside it, and move below the text."""
@@ -389,10 +389,10 @@ def bare_x(axes: Axes) -> None:
     axes.tick_params(axis="x", labelbottom=False)
 
 
-def below(cursor: Cursor, text: str, *, size: float = 7.0, points: float = 1.0) -> None:
+def below(cursor: Cursor, text: str, *, points: float = 1.0) -> None:
     """Write numbers under an axes of the page's width."""
     cursor.skip(points)
-    cursor.write(text, size=size, colour=MUTED, spacing=1.25)
+    cursor.write(text, size=7.0, colour=MUTED, spacing=1.25)
 
 
 def caption(axes: Axes, text: str, *, size: float = 7.0) -> None:
@@ -400,12 +400,10 @@ def caption(axes: Axes, text: str, *, size: float = 7.0) -> None:
     box = axes.get_position()
     offset_points = 24.0 if axes.get_xlabel() else 5.0
     lines = wrap(printable(text), size, box.width * POINTS_PER_WIDTH)
-    figure = axes.get_figure()
-    if figure is not None:
-        figure.text(
-            box.x0, box.y0 - offset_points / POINTS_PER_HEIGHT, "\n".join(lines), size=size,
-            color=MUTED, va="top", linespacing=1.25,
-        )  # fmt: skip
+    axes.figure.text(
+        box.x0, box.y0 - offset_points / POINTS_PER_HEIGHT, "\n".join(lines), size=size,
+        color=MUTED, va="top", linespacing=1.25,
+    )  # fmt: skip
 
 
 def empty(axes: Axes, reason: str) -> None:
