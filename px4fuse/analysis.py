@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from px4fuse.arrays import Array
 from px4fuse.comparison.asked import asked_of_ekf2
 from px4fuse.comparison.comparison import AxisComparison, Comparison, compare, compare_prepared
 from px4fuse.comparison.drift import may_drift
@@ -115,17 +116,15 @@ class Analysis(Shown):
         found = self._horizontally()
         if isinstance(found, Unavailable):
             return found
-        axes, tuned, offset_s = found
+        axes, outlier_time_s, used = found
         comparison = self.comparison
         return explained(
             comparison.flight,
             axes,
             comparison.segment,
             comparison.settings,
-            sigma_a_m_s2=size(tuned.filter_sigma_a, comparison.settings.sigma_a_m_s2),
-            sigma_z_m=size(tuned.sigma_z, comparison.settings.sigma_z_m),
-            outlier_time_s=tuned.outlier_time_s,
-            clock_offset_s=offset_s,
+            outlier_time_s=outlier_time_s,
+            **used,
         )
 
     @cached_property
@@ -134,26 +133,19 @@ class Analysis(Shown):
         found = self._horizontally()
         if isinstance(found, Unavailable):
             return found
-        axes, tuned, offset_s = found
-        settings = self.comparison.settings
+        axes, left_out, used = found
         # the filter comes to a jump as slowly as a low pass would
-        time_s, left_out = axes[0].measurement_time_s, tuned.outlier_time_s
+        time_s = axes[0].measurement_time_s
         causes = self.explained
         for jump in causes.jumps if isinstance(causes, Explained) else ():
             near = (time_s >= jump.time_s) & (time_s < jump.time_s + AFTER_STEP_S)
             left_out = np.union1d(left_out, time_s[near])
-        return smoothing(
-            axes,
-            settings,
-            sigma_a_m_s2=size(tuned.filter_sigma_a, settings.sigma_a_m_s2),
-            sigma_z_m=size(tuned.sigma_z, settings.sigma_z_m),
-            outlier_time_s=left_out,
-            clock_offset_s=offset_s,
-        )
+        return smoothing(axes, self.comparison.settings, outlier_time_s=left_out, **used)
 
-    def _horizontally(self) -> tuple[tuple[Axis, ...], AxisTuning, float] | Unavailable:
-        """The horizontal axes, their noises, and a clock offset (s) that is beyond doubt."""
+    def _horizontally(self) -> tuple[tuple[Axis, ...], Array, dict[str, float]] | Unavailable:
+        """The horizontal axes, times of outliers, noises and a clock offset beyond doubt."""
         axes = {result.axis.name: result.axis for result in self.comparison.axes}
+        settings = self.comparison.settings
         for name, group in ((HORIZONTAL, ("north", "east")), (AISLE, (AISLE,))):
             tuned = self.tuning.get(name)
             if isinstance(tuned, AxisTuning) and axes.keys() >= set(group):
@@ -161,7 +153,12 @@ class Analysis(Shown):
                 if isinstance(clock, ClockOffset) and clock.determinable:
                     sure = abs(clock.offset_s) > SURE_SIGMAS * clock.sigma_s
                     offset_s = clock.offset_s if sure else 0.0
-                return tuple(axes[each] for each in group), tuned, offset_s
+                used = {
+                    "sigma_a_m_s2": size(tuned.filter_sigma_a, settings.sigma_a_m_s2),
+                    "sigma_z_m": size(tuned.sigma_z, settings.sigma_z_m),
+                    "clock_offset_s": offset_s,
+                }
+                return tuple(axes[each] for each in group), tuned.outlier_time_s, used
         return Unavailable(
             "causes beyond noise",
             "the noises of the horizontal axes are not known",

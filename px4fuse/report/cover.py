@@ -64,8 +64,8 @@ def draw(document: Document) -> Iterator[Figure]:
             cursor.skip(2)
             cursor.write(sentence, size=10.5)
     cursor.skip(12)
-    _verdict(figure, cursor, document)
-    _other_axes(figure, cursor, document)
+    _verdict(cursor, document)
+    _other_axes(cursor, document)
     cursor.skip(10)
     above = plan(document, facts(document))
     cursor.write("Findings", size=10.5, weight="bold")
@@ -84,7 +84,7 @@ def draw(document: Document) -> Iterator[Figure]:
         more = f"{len(rest)} of {len(document.findings)} findings: next page."
         cursor.write(more, x=TEXT_X, size=7.5, colour=MUTED)
     cursor.skip(BEFORE_MAP)
-    above.draw(figure, cursor)
+    above.draw(cursor)
     yield figure
     if rest:
         yield from _continued(rest)
@@ -106,7 +106,7 @@ def _subtitle(document: Document) -> str:
     return " · ".join(filter(None, (who(document.student, ", "), *about)))
 
 
-def _verdict(figure: Figure, cursor: Cursor, document: Document) -> None:
+def _verdict(cursor: Cursor, document: Document) -> None:
     """The main axis, large: each filter on its half of the page."""
     result = document.comparison.main
     along = the(result.axis.name)
@@ -155,7 +155,7 @@ def _large_numbers(summary: FilterSummary, truth: AgainstTruth | Unavailable) ->
     return words
 
 
-def _other_axes(figure: Figure, cursor: Cursor, document: Document) -> None:
+def _other_axes(cursor: Cursor, document: Document) -> None:
     """The axes beside the main one, a row each."""
     others = [axis for axis in document.comparison.axes if axis is not document.comparison.main]
     if not others:
@@ -165,12 +165,9 @@ def _other_axes(figure: Figure, cursor: Cursor, document: Document) -> None:
     names = ("variance", "mean NIS", to_truth)
     blank = ("",) * 3
     cursor.skip(5)
-    _row(
-        figure, cursor, ("", "our filter", "", "", "EKF2" if beside else "", "", "", ""),
-        [MUTED] * 8,
-    )  # fmt: skip
+    _row(cursor, ("", "our filter", "", "", "EKF2" if beside else "", "", "", ""), [MUTED] * 8)
     apart = "ours - EKF2 (m)" if beside else ""
-    _row(figure, cursor, ("axis", *names, *(names if beside else blank), apart), [MUTED] * 8)
+    _row(cursor, ("axis", *names, *(names if beside else blank), apart), [MUTED] * 8)
     cursor.skip(2.5)
     cursor.rule()
     colours = ["black", *[OURS] * 3, *[EKF2] * 3, "black"]
@@ -181,14 +178,14 @@ def _other_axes(figure: Figure, cursor: Cursor, document: Document) -> None:
             *(_cells(result.ekf2, result.ekf2_truth) if beside else blank),
             difference_cells(result.difference)[0],
         )
-        _row(figure, cursor, cells, colours)
+        _row(cursor, cells, colours)
 
 
-def _row(figure: Figure, cursor: Cursor, cells: Sequence[str], colours: Sequence[str]) -> None:
+def _row(cursor: Cursor, cells: Sequence[str], colours: Sequence[str]) -> None:
     cursor.y -= TABLE_SIZE * 1.4 / POINTS_PER_HEIGHT
     for (x, align), text, colour in zip(COLUMNS, cells, colours, strict=True):
         if text:
-            figure.text(
+            cursor.figure.text(
                 x, cursor.y, text, size=TABLE_SIZE, ha=align, va="baseline", color=colour,
                 weight="bold" if text.startswith(("over", "under")) else "normal",
             )  # fmt: skip

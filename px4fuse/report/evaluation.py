@@ -264,7 +264,7 @@ def _before(axes: Axes, score: Evaluation, view: View) -> None:
         (matched.reference, REFERENCE, "reference"),
         (matched.estimate, {"color": OURS, "lw": 1.2}, "estimate before alignment"),
     ):
-        _way(axes, view.of(track.position_m), score.time_s, label=label, **style)
+        way(axes, view.of(track.position_m), score.time_s, label=label, **style)
     _framed(axes, score, view)
 
 
@@ -281,7 +281,7 @@ def _path(axes: Axes, score: Evaluation, view: View, scale: Axes | None) -> None
     drawn = LineCollection(list(pieces), cmap=COLOURS, norm=norm, lw=3.0, capstyle="round")
     drawn.set_array(largest[unbroken])
     axes.add_collection(drawn)
-    _way(axes, view.of(score.reference_m), score.time_s, label="reference", **REFERENCE)
+    way(axes, view.of(score.reference_m), score.time_s, label="reference", **REFERENCE)
     start, worst = view.of(score.estimate_m)[[0, int(np.argmax(error))]]
     axes.plot(*start, "o", color="white", mec="black", ms=5, mew=1.0, label="start", zorder=5)
     axes.plot(*worst, "x", color="black", ms=7, mew=1.6, label="largest error", zorder=5)
@@ -432,7 +432,7 @@ def _line(axes: Axes, x: Array, y: Array, time_s: Array, **style: Any) -> None:
     axes.plot(np.insert(kept, after, np.nan), np.insert(values, after, np.nan), **style)
 
 
-def _way(axes: Axes, seen: Array, time_s: Array, **style: Any) -> None:
+def way(axes: Axes, seen: Array, time_s: Array, **style: Any) -> None:
     """A path on a map, shape (n, 2), thinned evenly; no gap in time is crossed."""
     gaps = _gaps(time_s)
     even = np.linspace(0, len(seen) - 1, min(len(seen), PIECES)).astype(np.intp)

@@ -10,7 +10,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from px4fuse.arrays import Array
 from px4fuse.findings import Finding
 from px4fuse.flight import Unavailable
 from px4fuse.loop.corrections import BY_DISTANCE, PLAIN, UNCORRECTED, Correction
@@ -18,6 +17,7 @@ from px4fuse.loop.loop import Loop
 from px4fuse.plain import capital, p_words
 from px4fuse.report.cover import write_finding
 from px4fuse.report.document import Document, LoopDocument
+from px4fuse.report.evaluation import way
 from px4fuse.report.loop_words import (
     ate_words,
     by_distance_words,
@@ -61,7 +61,6 @@ STYLES: Mapping[str, dict[str, Any]] = {
 }
 MAP_MIN_HEIGHT = 0.30
 MAP_POINTS = 2000
-GAP_STEPS = 10.0
 
 
 def draw(document: Document) -> Iterator[Figure]:
@@ -104,7 +103,7 @@ def draw_loop(
         yield figure
         figure, cursor = page(name("Loop closure: the map"))
     cursor.skip(10)
-    _map(figure, cursor, loop)
+    _map(cursor, loop)
     yield figure
     figure, cursor = page(
         name("Along the path"),
@@ -112,7 +111,7 @@ def draw_loop(
         "alignment. A correction that helps brings the error down along most of the path, not only "
         "at its end.",
     )
-    _along(figure, cursor, loop)
+    _along(cursor, loop)
     yield figure
     yield from _scores(loop, name)
 
@@ -144,15 +143,16 @@ def shown(loop: Loop) -> list[Correction]:
     return [part for part in loop.reported if part.name in STYLES]
 
 
-def _map(figure: Figure, cursor: Cursor, loop: Loop) -> None:
+def _map(cursor: Cursor, loop: Loop) -> None:
     bottom = BOTTOM + 0.075
+    figure = cursor.figure
     axes = figure.add_axes((LEFT + 0.03, bottom, RIGHT - LEFT - 0.03, cursor.y - 0.012 - bottom))
     path = loop.odometry.trajectory
     names = AXES_OF_FRAME[path.frame]
     axes.set_title("from above, in the odometry's frame")
     _reference(axes, loop)
     for part in shown(loop):
-        position = _thinned(part.trajectory.position_m)
+        position = part.trajectory.position_m[:: max(1, len(part.trajectory) // MAP_POINTS)]
         axes.plot(position[:, 1], position[:, 0], label=part.name, **STYLES[part.name])
     start, end = path.position_m[0], path.position_m[-1]
     axes.plot(start[1], start[0], "o", color="black", ms=5, label="start", zorder=5)
@@ -186,33 +186,21 @@ def _reference(axes: Axes, loop: Loop) -> None:
                 continue
             transform = score.transform
             back = transform.rotation.inv().apply(score.reference_m - transform.translation_m)
-            position = _thinned(_broken(back / transform.scale, score.time_s))
-            axes.plot(position[:, 1], position[:, 0], label=name, **TRUTH_LINE, zorder=4)
+            position = back / transform.scale
+            way(axes, position[:, (1, 0)], score.time_s, label=name, **TRUTH_LINE, zorder=4)
             return
 
 
-def _broken(position: Array, time_s: Array) -> Array:
-    """A path with breaks where its poses have a gap in time, so that no line crosses it."""
-    steps = np.diff(time_s)
-    gaps = np.flatnonzero(steps > GAP_STEPS * np.median(steps)) + 1
-    return np.insert(position, gaps, np.nan, axis=0)
-
-
-def _thinned(position: Array) -> Array:
-    step = max(1, len(position) // MAP_POINTS)
-    return position[::step]
-
-
-def _along(figure: Figure, cursor: Cursor, loop: Loop) -> None:
+def _along(cursor: Cursor, loop: Loop) -> None:
     scored = [name for name in (reference.name for reference in loop.references)
               if isinstance(loop.odometry.scores[name], Evaluation)]  # fmt: skip
     corrected = [part for part in shown(loop) if part is not loop.odometry]
     rows = 1 + bool(corrected) + len(scored)
-    grid = figure.add_gridspec(
+    grid = cursor.figure.add_gridspec(
         rows, 1, left=LEFT, right=RIGHT, top=cursor.y - 0.03,
         bottom=max(BOTTOM + 0.05, 0.72 - 0.22 * rows), hspace=0.38,
     )  # fmt: skip
-    height, *others = (figure.add_subplot(grid[row]) for row in range(rows))
+    height, *others = (cursor.figure.add_subplot(grid[row]) for row in range(rows))
     for axes in (height, *others):
         axes.xaxis.set_major_locator(MaxNLocator(6))
         axes.yaxis.set_major_locator(MaxNLocator(4))

@@ -43,12 +43,11 @@ def draw(document: Document) -> Iterator[Figure]:
         "The panels of the pages before for the axes that they leave out; lines, bands and marks "
         "are the same.",
     )
-    known = not isinstance(document.comparison.flight.truth, Unavailable)
     rows: tuple[Panel, ...] = (
         ("position (m)", flight.draw_position, flight.position_numbers),
         ("velocity (m/s)", flight.draw_velocity, flight.velocity_numbers),
         (
-            "position - truth (m)" if known else "ours - EKF2 (m)",
+            "position - truth (m)" if document.truth_known else "ours - EKF2 (m)",
             flight.draw_error,
             flight.error_numbers,
         ),

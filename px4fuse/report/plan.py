@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from px4fuse.arrays import Array
@@ -88,8 +87,9 @@ class Plan:
             return map_points / POINTS_PER_HEIGHT + facts
         return max(map_points / POINTS_PER_HEIGHT, HEAD / POINTS_PER_HEIGHT + facts)
 
-    def draw(self, figure: Figure, cursor: Cursor) -> None:
+    def draw(self, cursor: Cursor) -> None:
         """Draw it below the cursor."""
+        figure = cursor.figure
         cursor.write("From above", size=10.5, weight="bold")
         top = cursor.y - 6.0 / POINTS_PER_HEIGHT
         room = (top - BOTTOM) * POINTS_PER_HEIGHT - LABELS

@@ -352,4 +352,4 @@ def _table(cursor: Cursor, result: AxisComparison, run: States, chosen: Array) -
     )
     cursor.skip(3)
     edges = np.linspace(LEFT, RIGHT, len(columns) + 1)
-    cursor.columns(dict(zip(edges.tolist(), columns, strict=False)), size=7.6)
+    cursor.columns(dict(zip(edges.tolist(), columns, strict=False)))

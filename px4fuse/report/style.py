@@ -254,9 +254,7 @@ class Cursor:
             self.y -= size * spacing / POINTS_PER_HEIGHT
             put(self.figure, x, self.y, line, size=size, weight=weight, color=colour)
 
-    def columns(
-        self, columns: Mapping[float, tuple[str, Sequence[str]]], *, size: float = 7.6
-    ) -> None:
+    def columns(self, columns: Mapping[float, tuple[str, Sequence[str]]]) -> None:
         """Write a table and move below it.
 
         Parameters
@@ -264,7 +262,7 @@ class Cursor:
         columns : mapping from float to (str, sequence of str)
             Left edge (fraction of the page) to head and cells.
         """
-        count = max(len(cells) for _, cells in columns.values())
+        size, count = 7.6, max(len(cells) for _, cells in columns.values())
         self.skip(size * 1.35)
         for x, (head, cells) in columns.items():
             put(self.figure, x, self.y, printable(head), size=size, color=MUTED)
