@@ -59,16 +59,12 @@ def draw(document: Document) -> Iterator[Figure]:
     """Draw one page: innovations, σ_p and σ_v on one time axis, then the zooms."""
     result = document.comparison.main
     figure, cursor = page(f"Innovations and variances along {the(result.axis.name)}")
-    strip = bool(document.events.modes)
     axes = panel(
-        cursor,
-        "Innovation = measurement - prediction (m)",
-        innovation_words(result),
-        INNOVATIONS,
-        above=12.0 if strip else 4.0,
-    )
+        cursor, "Innovation = measurement - prediction (m)", innovation_words(result), INNOVATIONS,
+        above=12.0 if document.events.modes else 4.0,
+    )  # fmt: skip
     draw_innovations(axes, result, MAX_POINTS)
-    marks.draw(axes, document, axis="", strip=strip)
+    marks.draw(axes, document, axis="", strip=True)
     bare_x(axes)
     below(cursor, innovation_numbers(result, axes.get_ylim()[1]), points=4.0)
     cursor.skip(8)
@@ -289,8 +285,7 @@ def sigma_words(document: Document) -> str:
 
 
 def _largest(frame: pd.DataFrame, start_s: float, end_s: float) -> float:
-    inside = frame["position_variance_m2"][(frame.index >= start_s) & (frame.index <= end_s)]
-    return float(np.sqrt(inside.max()))
+    return float(np.sqrt(frame["position_variance_m2"].loc[start_s:end_s].max()))
 
 
 def _medians(result: AxisComparison, field: str, unit: str) -> str:
@@ -326,28 +321,16 @@ def zoom_window(result: AxisComparison, segment: Segment) -> Span:
     return start, min(start + length, segment.end_s)
 
 
-def sawtooth(result: AxisComparison) -> tuple[Array, Array]:
-    """Time and σ_p of our filter with both values at each update: just before and just after."""
-    steps, updates = result.replay.steps, result.replay.updates
-    time = np.concatenate([updates.index.to_numpy(), steps.index.to_numpy()])
-    variance = np.concatenate(
-        [
-            updates["prior_position_variance_m2"].to_numpy(),
-            steps["position_variance_m2"].to_numpy(),
-        ]
-    )
-    order = np.argsort(time, kind="stable")  # the prior stands first at equal times
-    return time[order], np.sqrt(variance[order])
-
-
 def _sawtooth(axes: Axes, result: AxisComparison, window: Span) -> None:
-    time, sigma = sawtooth(result)
-    shown = (time >= window[0]) & (time <= window[1])
-    axes.plot(time[shown], sigma[shown], color=OURS, lw=1.1, marker=".", ms=2.4, mew=0)
+    """σ_p with both values at each update, just before and just after."""
+    updates, steps = result.replay.updates, result.replay.steps
+    prior, after_each = updates["prior_position_variance_m2"], steps["position_variance_m2"]
+    # stable, so that the prior stands first at equal times
+    both = pd.concat([prior, after_each]).sort_index(kind="stable").loc[slice(*window)]
+    axes.plot(both.index, np.sqrt(both), color=OURS, lw=1.1, marker=".", ms=2.4, mew=0)
     frame = result.ekf2_innovations
     if isinstance(frame, pd.DataFrame):
-        cut = frame[(frame.index >= window[0]) & (frame.index <= window[1])]
-        cut = cut.dropna(subset=["prior_variance_m2"])
+        cut = frame.loc[slice(*window)].dropna(subset=["prior_variance_m2"])
         before = np.sqrt(cut["prior_variance_m2"].to_numpy())
         after = np.sqrt(cut["posterior_variance_m2"].to_numpy())
         at = cut.index.to_numpy()
@@ -355,8 +338,7 @@ def _sawtooth(axes: Axes, result: AxisComparison, window: Span) -> None:
         axes.plot(at, before, ls="none", marker="^", ms=3.6, mew=0.7, mfc="none", color=EKF2)
         axes.plot(at, after, ls="none", marker="v", ms=3.6, mew=0, color=EKF2)
     if isinstance(result.ekf2_variance, pd.DataFrame):
-        variance = result.ekf2_variance["position_variance_m2"]
-        variance = variance[(variance.index >= window[0]) & (variance.index <= window[1])]
+        variance = result.ekf2_variance["position_variance_m2"].loc[slice(*window)]
         axes.plot(variance.index.to_numpy(), np.sqrt(variance.to_numpy()), ls="none", marker="s",
                   ms=3.0, mew=0.7, mfc="white", color=EKF2)  # fmt: skip
     axes.set_xlim(*window)

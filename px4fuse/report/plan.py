@@ -12,7 +12,7 @@ from matplotlib.ticker import MaxNLocator
 
 from px4fuse.arrays import Array
 from px4fuse.comparison.comparison import Comparison
-from px4fuse.filter.signals import AISLE
+from px4fuse.filter.signals import AISLE, within
 from px4fuse.flight import Ekf2, Truth
 from px4fuse.report.document import Document
 from px4fuse.report.marks import LANDING, TAKE_OFF
@@ -138,7 +138,7 @@ def _tracks(comparison: Comparison) -> dict[str, Pair]:
     segment, flight = comparison.segment, comparison.flight
 
     def cut(frame: pd.DataFrame) -> Pair:
-        inside = frame[(frame.index >= segment.start_s) & (frame.index <= segment.end_s)]
+        inside = within(frame, segment)
         return inside["north_m"].to_numpy(), inside["east_m"].to_numpy()
 
     tracks = {"measurement": cut(comparison.source.samples)}

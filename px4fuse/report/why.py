@@ -158,13 +158,12 @@ def _axis(figure: Figure, cursor: Cursor, name: str, why: Why, document: Documen
             axes.set_yticklabels([])
     cursor.y -= height
     cursor.skip(36)
-    strip = bool(document.events.modes)
     axes = panel(
         cursor, "Position apart (m): ours - EKF2 (dark), and what the model leaves of it (light)",
-        _time_words(why), TIME_POINTS, above=12.0 if strip else 4.0,
+        _time_words(why), TIME_POINTS, above=12.0 if document.events.modes else 4.0,
     )  # fmt: skip
     _over_time(axes, why)
-    marks.draw(axes, document, axis=name, strip=strip)
+    marks.draw(axes, document, axis=name, strip=True)
     axes.set_xlabel(TIME_LABEL)
     cursor.skip(24)
 
