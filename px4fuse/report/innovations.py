@@ -284,8 +284,12 @@ def sigma_words(document: Document) -> str:
     return words
 
 
+def _cut(frame: pd.DataFrame, window: Span) -> pd.DataFrame:
+    return frame[(frame.index >= window[0]) & (frame.index <= window[1])]
+
+
 def _largest(frame: pd.DataFrame, start_s: float, end_s: float) -> float:
-    return float(np.sqrt(frame["position_variance_m2"].loc[start_s:end_s].max()))
+    return float(np.sqrt(_cut(frame, (start_s, end_s))["position_variance_m2"].max()))
 
 
 def _medians(result: AxisComparison, field: str, unit: str) -> str:
@@ -330,7 +334,7 @@ def _sawtooth(axes: Axes, result: AxisComparison, window: Span) -> None:
     axes.plot(both.index, np.sqrt(both), color=OURS, lw=1.1, marker=".", ms=2.4, mew=0)
     frame = result.ekf2_innovations
     if isinstance(frame, pd.DataFrame):
-        cut = frame.loc[slice(*window)].dropna(subset=["prior_variance_m2"])
+        cut = _cut(frame, window).dropna(subset=["prior_variance_m2"])
         before = np.sqrt(cut["prior_variance_m2"].to_numpy())
         after = np.sqrt(cut["posterior_variance_m2"].to_numpy())
         at = cut.index.to_numpy()
@@ -338,7 +342,7 @@ def _sawtooth(axes: Axes, result: AxisComparison, window: Span) -> None:
         axes.plot(at, before, ls="none", marker="^", ms=3.6, mew=0.7, mfc="none", color=EKF2)
         axes.plot(at, after, ls="none", marker="v", ms=3.6, mew=0, color=EKF2)
     if isinstance(result.ekf2_variance, pd.DataFrame):
-        variance = result.ekf2_variance["position_variance_m2"].loc[slice(*window)]
+        variance = _cut(result.ekf2_variance, window)["position_variance_m2"]
         axes.plot(variance.index.to_numpy(), np.sqrt(variance.to_numpy()), ls="none", marker="s",
                   ms=3.0, mew=0.7, mfc="white", color=EKF2)  # fmt: skip
     axes.set_xlim(*window)
