@@ -269,9 +269,10 @@ def _median_sigma(variance: pd.Series) -> float | None:
 def _ekf2_summary(
     ekf2: Ekf2, variance: pd.DataFrame | Unavailable, innovations: pd.DataFrame | Unavailable
 ) -> FilterSummary:
+    consistency: Consistency | Unavailable
+    before = after = sigma_p = sigma_v = None
     if isinstance(innovations, Unavailable):
-        consistency: Consistency | Unavailable = innovations
-        before = after = None
+        consistency = innovations
     else:
         consistency = assess(
             innovations["innovation_m"].to_numpy(),
@@ -280,7 +281,6 @@ def _ekf2_summary(
         )
         before = _median_sigma(innovations["prior_variance_m2"])
         after = _median_sigma(innovations["posterior_variance_m2"])
-    sigma_p = sigma_v = None
     if isinstance(variance, pd.DataFrame):
         sigma_p = _median_sigma(variance["position_variance_m2"])
         sigma_v = _median_sigma(variance["velocity_variance_m2_s2"])

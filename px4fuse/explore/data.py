@@ -14,7 +14,7 @@ from scipy import stats
 
 from px4fuse.analysis import Analysis
 from px4fuse.arrays import Array
-from px4fuse.comparison.comparison import AgainstTruth, AxisComparison, Comparison, FilterSummary
+from px4fuse.comparison.comparison import AgainstTruth, AxisComparison, Comparison
 from px4fuse.comparison.events import happened
 from px4fuse.explore.ekf2_grid import grid_data, judged_numbers
 from px4fuse.explore.packing import COARSE, Packer
@@ -214,13 +214,19 @@ def _ekf2(result: AxisComparison, packer: Packer) -> dict[str, Any] | str:
     if isinstance(result.ekf2_state, Unavailable):
         return result.ekf2_state.reason
     state = result.ekf2_state.dropna()
+    summary = result.ekf2 if isinstance(result.ekf2, Unavailable) else result.ekf2.consistency
     made: dict[str, Any] = {
         "state": _frame(state, ["position_m", "velocity_m_s"], packer),
         "variance": "",
         "innovations": "",
-        "summary": _summary(result.ekf2, result.ekf2_truth),
+        "summary": judged_numbers(summary),
         "r": None,
     }
+    if isinstance(result.ekf2_truth, AgainstTruth):
+        made["summary"] |= {
+            "truthP": result.ekf2_truth.position_rmse_m,
+            "truthV": result.ekf2_truth.velocity_rmse_m_s,
+        }
     if isinstance(result.ekf2_variance, pd.DataFrame):
         sigma = result.ekf2_variance.dropna().pow(0.5)
         made["variance"] = _frame(
@@ -258,20 +264,9 @@ def _frame(frame: pd.DataFrame, columns: list[str], packer: Packer) -> list[int]
     return [packer.add_times(frame.index.to_numpy()), *values]
 
 
-def _summary(
-    summary: FilterSummary | Unavailable, truth: AgainstTruth | Unavailable
-) -> dict[str, Any]:
-    """EKF2's column of the table."""
-    made = judged_numbers(summary if isinstance(summary, Unavailable) else summary.consistency)
-    if isinstance(truth, AgainstTruth):
-        made |= {"truthP": truth.position_rmse_m, "truthV": truth.velocity_rmse_m_s}
-    return made
-
-
 def _map_of(analysis: Analysis, name: str) -> str:
     """Which likelihood map tells of an axis: the joint one of the horizontal axes, or its own."""
-    joint = HORIZONTAL if name != "down" else "down"
-    return joint if joint in analysis.tuning else name
+    return HORIZONTAL if name != "down" and HORIZONTAL in analysis.tuning else name
 
 
 def _maps(analysis: Analysis) -> dict[str, Any]:

@@ -137,9 +137,7 @@ def _parts(cursor: Cursor, clock: ClockOffset, document: Document) -> None:
         )
     said.append("Band: 95 % interval of the whole flight.")
     axes = panel(cursor, "Offset of each part of the flight by itself (s)", " ".join(said), PARTS)
-    axes.axhspan(
-        applied + clock.interval_s[0], applied + clock.interval_s[1], color=OURS_BAND, lw=0
-    )
+    axes.axhspan(*(applied + end for end in clock.interval_s), color=OURS_BAND, lw=0)
     ends = np.array([(part.start_s, part.end_s) for part in clock.parts])
     axes.errorbar(
         ends.mean(axis=1), [applied + part.offset_s for part in clock.parts],

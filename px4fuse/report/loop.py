@@ -48,9 +48,7 @@ from px4fuse.report.style import (
 from px4fuse.trajectory.evaluation import Evaluation
 from px4fuse.trajectory.graph.analysis import SOLUTIONS
 from px4fuse.trajectory.model import AXES_OF_FRAME
-from px4fuse.trajectory.scores import Interval, Statistics
 
-Value = Statistics | Unavailable
 GREEN = "#3a7d5c"
 STYLES: Mapping[str, dict[str, Any]] = {
     UNCORRECTED: {"color": EKF2, "lw": 1.1, "ls": (0, (4, 1.6))},
@@ -310,16 +308,11 @@ def _relative(cursor: Cursor, loop: Loop, name: str) -> None:
     heads = ["path", "error over", "RMSE (m)", "95 % interval (m)", "rotation RMSE (°)", "n"]
     cursor.row(edges, heads, head=True)
     for part, score in good:
-        ate = score.ate
-        rows: list[tuple[str, Value, Interval | Unavailable, Value]] = [
-            ("ATE", ate.translation, ate.interval, ate.rotation)
-        ]
-        rows += [(f"RPE {e.delta}", e.translation, e.interval, e.rotation) for e in score.rpe]
-        for index, (label, moved, interval, turned) in enumerate(rows):
-            cells = [
-                part.name if index == 0 else "", label, *statistics_words(moved, interval, turned)
-            ]  # fmt: skip
-            cursor.row(edges, cells)
+        rows: list[tuple[str, AbsoluteError | RelativeError]]
+        rows = [("ATE", score.ate), *((f"RPE {e.delta}", e) for e in score.rpe)]
+        for index, (label, e) in enumerate(rows):
+            numbers = statistics_words(e.translation, e.interval, e.rotation)
+            cursor.row(edges, [part.name if index == 0 else "", label, *numbers])
         cursor.skip(2.5)
         cursor.rule("#dddddd")
     cursor.skip(4)
