@@ -45,9 +45,10 @@ from px4fuse.report.style import (
     page,
     thin,
 )
-from px4fuse.trajectory.evaluation import Evaluation
+from px4fuse.trajectory.evaluation import AbsoluteError, Evaluation
 from px4fuse.trajectory.graph.analysis import SOLUTIONS
 from px4fuse.trajectory.model import AXES_OF_FRAME
+from px4fuse.trajectory.scores import RelativeError
 
 GREEN = "#3a7d5c"
 STYLES: Mapping[str, dict[str, Any]] = {
