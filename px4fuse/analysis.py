@@ -5,7 +5,8 @@ Readers, placing, filter, comparison and what explains it are called from here, 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -13,14 +14,20 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from px4fuse.arrays import Array
 from px4fuse.comparison.asked import asked_of_ekf2
-from px4fuse.comparison.comparison import (
-    AxisComparison,
-    Comparison,
-    compare,
-    compare_prepared,
+from px4fuse.comparison.comparison import AxisComparison, Comparison, compare, compare_prepared
+from px4fuse.comparison.drift import may_drift
+from px4fuse.comparison.estimates import (
+    Progress,
+    Tuning,
+    clock_offset,
+    silent,
+    size,
+    tuned,
+    tuned_horizontally,
+    turned_frame,
 )
-from px4fuse.comparison.drift import may_drift, with_drift
 from px4fuse.comparison.preparation import Prepared, prepare
 from px4fuse.comparison.why import Why, why_ekf2_differs
 from px4fuse.display import Shown, brief
@@ -30,43 +37,23 @@ from px4fuse.ekf2.replay import Ekf2Replay
 from px4fuse.ekf2.whatif import WhatIf, sweep_values, what_if
 from px4fuse.errors import LogError, MissingDataError, SettingsError
 from px4fuse.filter.causes import AFTER_STEP_S, Explained, explained
-from px4fuse.filter.clock import SURE_SIGMAS, ClockOffset, estimate_clock_offset
-from px4fuse.filter.fitting import Noises
-from px4fuse.filter.heading import HeadingError, heading_error
+from px4fuse.filter.clock import SURE_SIGMAS, ClockOffset
+from px4fuse.filter.heading import HeadingError
 from px4fuse.filter.kalman import Settings
-from px4fuse.filter.motion import MAX_IMU_INTERVAL_S, Made
+from px4fuse.filter.motion import Made
 from px4fuse.filter.signals import AISLE, Axis
 from px4fuse.filter.smoothing import Smoothing, smoothing
-from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise, tune
+from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.flight import Flight, Unavailable
 from px4fuse.readers import read_log
 from px4fuse.reading import shown
-from px4fuse.request import (
-    AUTO,
-    ComparisonRequest,
-    LoopRequest,
-    PositionFile,
-    WhatIfRequest,
-)
+from px4fuse.request import AUTO, ComparisonRequest, LoopRequest, WhatIfRequest
 
 if TYPE_CHECKING:
     from px4fuse.loop.loop import Loop
 
 # Noises that the report states: those of a source once. Each axis by itself is for `px4fuse tune`
 REPORTED = (HORIZONTAL, "down")
-
-MIN_CLOCK_IMU_HZ = 1.0 / MAX_IMU_INTERVAL_S
-# vehicle_imu integrates at this rate (IMU_INTEG_RATE): slower telemetry leaves samples out
-MIN_TELEMETRY_IMU_HZ = 200.0
-CLOCK_RATE_MARGIN = 0.98
-TELEMETRY_IMU = ("HIGHRES_IMU", "SCALED_IMU", "SCALED_IMU2", "SCALED_IMU3")
-
-Progress = Callable[[str], None]
-Tuning = Mapping[str, AxisTuning | Unavailable]
-
-
-def _silent(_: str) -> None:
-    """Progress that nobody watches."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -129,17 +116,15 @@ class Analysis(Shown):
         found = self._horizontally()
         if isinstance(found, Unavailable):
             return found
-        axes, tuned, offset_s = found
+        axes, outlier_time_s, used = found
         comparison = self.comparison
         return explained(
             comparison.flight,
             axes,
             comparison.segment,
             comparison.settings,
-            sigma_a_m_s2=_size(tuned.filter_sigma_a, comparison.settings.sigma_a_m_s2),
-            sigma_z_m=_size(tuned.sigma_z, comparison.settings.sigma_z_m),
-            outlier_time_s=tuned.outlier_time_s,
-            clock_offset_s=offset_s,
+            outlier_time_s=outlier_time_s,
+            **used,
         )
 
     @cached_property
@@ -148,26 +133,19 @@ class Analysis(Shown):
         found = self._horizontally()
         if isinstance(found, Unavailable):
             return found
-        axes, tuned, offset_s = found
-        settings = self.comparison.settings
+        axes, left_out, used = found
         # the filter comes to a jump as slowly as a low pass would
-        time_s, left_out = axes[0].measurement_time_s, tuned.outlier_time_s
+        time_s = axes[0].measurement_time_s
         causes = self.explained
         for jump in causes.jumps if isinstance(causes, Explained) else ():
             near = (time_s >= jump.time_s) & (time_s < jump.time_s + AFTER_STEP_S)
             left_out = np.union1d(left_out, time_s[near])
-        return smoothing(
-            axes,
-            settings,
-            sigma_a_m_s2=_size(tuned.filter_sigma_a, settings.sigma_a_m_s2),
-            sigma_z_m=_size(tuned.sigma_z, settings.sigma_z_m),
-            outlier_time_s=left_out,
-            clock_offset_s=offset_s,
-        )
+        return smoothing(axes, self.comparison.settings, outlier_time_s=left_out, **used)
 
-    def _horizontally(self) -> tuple[tuple[Axis, ...], AxisTuning, float] | Unavailable:
-        """The horizontal axes, their noises, and a clock offset (s) that is beyond doubt."""
+    def _horizontally(self) -> tuple[tuple[Axis, ...], Array, dict[str, float]] | Unavailable:
+        """The horizontal axes, times of outliers, noises and a clock offset beyond doubt."""
         axes = {result.axis.name: result.axis for result in self.comparison.axes}
+        settings = self.comparison.settings
         for name, group in ((HORIZONTAL, ("north", "east")), (AISLE, (AISLE,))):
             tuned = self.tuning.get(name)
             if isinstance(tuned, AxisTuning) and axes.keys() >= set(group):
@@ -175,7 +153,12 @@ class Analysis(Shown):
                 if isinstance(clock, ClockOffset) and clock.determinable:
                     sure = abs(clock.offset_s) > SURE_SIGMAS * clock.sigma_s
                     offset_s = clock.offset_s if sure else 0.0
-                return tuple(axes[each] for each in group), tuned, offset_s
+                used = {
+                    "sigma_a_m_s2": size(tuned.filter_sigma_a, settings.sigma_a_m_s2),
+                    "sigma_z_m": size(tuned.sigma_z, settings.sigma_z_m),
+                    "clock_offset_s": offset_s,
+                }
+                return tuple(axes[each] for each in group), tuned.outlier_time_s, used
         return Unavailable(
             "causes beyond noise",
             "the noises of the horizontal axes are not known",
@@ -183,13 +166,8 @@ class Analysis(Shown):
         )
 
 
-def _size(noise: Noise, otherwise: float) -> float:
-    """Most likely value of a noise, or its bound, or what was set."""
-    return noise.value or noise.high or otherwise
-
-
 def run(
-    request: ComparisonRequest, progress: Progress = _silent, flight: Flight | None = None
+    request: ComparisonRequest, progress: Progress = silent, flight: Flight | None = None
 ) -> Analysis:
     """Read a flight, compare it with EKF2 and explain the comparison.
 
@@ -209,7 +187,7 @@ def run(
     return explain(run_comparison(request, progress, flight), progress)
 
 
-def read_flight(request: ComparisonRequest, progress: Progress = _silent) -> Flight:
+def read_flight(request: ComparisonRequest, progress: Progress = silent) -> Flight:
     """Read the recordings that a request names, and make them one flight.
 
     Raises
@@ -232,13 +210,9 @@ def read_flight(request: ComparisonRequest, progress: Progress = _silent) -> Fli
         from px4fuse.placing import join  # noqa: PLC0415
 
         flight = join(flight, other)
-    if request.position is None:
+    position, offset = request.position, request.clock_offset_s
+    if position is None:
         return flight
-    return _placed(flight, request.position, request.clock_offset_s)
-
-
-def _placed(flight: Flight, position: PositionFile, clock_offset: float | str | None) -> Flight:
-    """The flight with a position file, whose clock offset is found unless it is given."""
     # scipy.signal and scipy.ndimage cost a fifth of a second: only where a file is placed
     from px4fuse.placing import place  # noqa: PLC0415
     from px4fuse.readers.position_csv import read_position_csv  # noqa: PLC0415
@@ -254,34 +228,27 @@ def _placed(flight: Flight, position: PositionFile, clock_offset: float | str | 
         file,
         frame=position.frame,
         yaw_deg=position.yaw_deg,
-        clock_offset_s=None if isinstance(clock_offset, str) else clock_offset,
+        clock_offset_s=None if isinstance(offset, str) else offset,
     )
 
 
 def run_comparison(
-    request: ComparisonRequest, progress: Progress = _silent, flight: Flight | None = None
+    request: ComparisonRequest, progress: Progress = silent, flight: Flight | None = None
 ) -> Comparison:
     """Read a flight and compare it with EKF2, without what explains the comparison.
 
-    Raises
-    ------
-    LogError, MissingDataError, SettingsError
-        As :func:`run`.
+    Arguments and errors are those of :func:`run`.
     """
-    return compare_prepared(
-        run_preparation(request, progress, flight), lambda name: progress(f"filtering {name}")
-    )
+    prepared = run_preparation(request, progress, flight)
+    return compare_prepared(prepared, lambda name: progress(f"filtering {name}"))
 
 
 def run_preparation(
-    request: ComparisonRequest, progress: Progress = _silent, flight: Flight | None = None
+    request: ComparisonRequest, progress: Progress = silent, flight: Flight | None = None
 ) -> Prepared:
     """Read a flight and choose what is compared, which is all that tuning and clock need.
 
-    Raises
-    ------
-    LogError, MissingDataError, SettingsError
-        As :func:`run`.
+    Arguments and errors are those of :func:`run`.
     """
     asked = request.clock_offset_s
     settings = Settings(
@@ -292,13 +259,7 @@ def run_preparation(
         # that of a position file is spent on placing it
         clock_offset_s=asked if isinstance(asked, float) and request.position is None else 0.0,
     )
-    for name, value in (
-        ("start_s", request.start_s),
-        ("end_s", request.end_s),
-        ("clock_offset_s", asked),
-    ):
-        if isinstance(value, float) and not abs(value) < float("inf"):
-            raise SettingsError(f"`{name}` {value:g} is not a finite number.")
+    _check_finite(start_s=request.start_s, end_s=request.end_s, clock_offset_s=asked)
     read = flight or read_flight(request, progress)
 
     def prepared(settings: Settings) -> Prepared:
@@ -326,7 +287,13 @@ def run_preparation(
     return prepared(replace(settings, clock_offset_s=found.offset_s))
 
 
-def run_loop(request: LoopRequest, progress: Progress = _silent) -> Loop:
+def _check_finite(**values: float | str | None) -> None:
+    for name, value in values.items():
+        if isinstance(value, float) and not math.isfinite(value):
+            raise SettingsError(f"`{name}` {value:g} is not a finite number.")
+
+
+def run_loop(request: LoopRequest, progress: Progress = silent) -> Loop:
     """Read a flight or a trajectory, and measure and correct its loop.
 
     Raises
@@ -338,9 +305,7 @@ def run_loop(request: LoopRequest, progress: Progress = _silent) -> Loop:
     from px4fuse.loop.odometry import OdometryNoise  # noqa: PLC0415
     from px4fuse.loop.sources import read_source  # noqa: PLC0415
 
-    for name, value in (("start_s", request.start_s), ("end_s", request.end_s)):
-        if value is not None and not abs(value) < float("inf"):
-            raise SettingsError(f"`{name}` {value:g} is not a finite number.")
+    _check_finite(start_s=request.start_s, end_s=request.end_s)
     progress(f"reading {shown(Path(request.source))}")
     source = read_source(request.source, frame=request.frame, system=request.system)
     reference = None
@@ -391,17 +356,9 @@ class Counterfactual:
 
 
 def run_what_if(
-    request: WhatIfRequest, progress: Progress = _silent, flight: Flight | None = None
+    request: WhatIfRequest, progress: Progress = silent, flight: Flight | None = None
 ) -> Counterfactual:
-    """Read a flight and replay its EKF2 with other parameters.
-
-    Parameters
-    ----------
-    request : WhatIfRequest
-    progress : callable
-        Told what is being done.
-    flight : Flight, optional
-        What the request's recordings hold, where they have been read.
+    """Read a flight and replay its EKF2 with other parameters; arguments as of :func:`run`.
 
     Raises
     ------
@@ -459,7 +416,7 @@ def _not_told(compared: Comparison) -> str:
     return f"{name}: {why}. Say what to change: `changes` EKF2_EVP_NOISE=0.1."
 
 
-def explain(comparison: Comparison, progress: Progress = _silent) -> Analysis:
+def explain(comparison: Comparison, progress: Progress = silent) -> Analysis:
     """Add tuning, clock offset, why EKF2 differs and loop closure to a comparison.
 
     Parameters
@@ -468,8 +425,7 @@ def explain(comparison: Comparison, progress: Progress = _silent) -> Analysis:
     progress : callable
         Told what is being done.
     """
-    axes = tuple(result.axis for result in comparison.axes)
-    names = REPORTED if {"north", "east"} <= {axis.name for axis in axes} else None
+    names = REPORTED if {"north", "east"} <= {line.name for line in comparison.lines} else None
     made: Made = {}  # tuning and clock need the same signals of the IMU
     tuning = tuned(comparison, names, progress, made)
     clock = clock_offset(comparison, tuning, progress, made)
@@ -483,138 +439,3 @@ def explain(comparison: Comparison, progress: Progress = _silent) -> Analysis:
 
     loop = loop_in(comparison.flight, progress)
     return Analysis(comparison, tuning, clock, model, why, loop, heading)
-
-
-def tuned_horizontally(comparison: Comparison | Prepared, made: Made | None = None) -> Tuning:
-    """The horizontal noises alone, which is what the clock estimate needs; ``made`` as there."""
-    return tuned(comparison, (HORIZONTAL,), made=made)
-
-
-def tuned(
-    comparison: Comparison | Prepared,
-    names: tuple[str, ...] | None = None,
-    progress: Progress = _silent,
-    made: Made | None = None,
-) -> dict[str, AxisTuning | Unavailable]:
-    """Most likely noises of a comparison's axes; an IMU too slow to tell biases is left out.
-
-    Parameters
-    ----------
-    comparison : Comparison or Prepared
-    names : tuple of str, optional
-        Axis names and "horizontal"; by default all that there are.
-    progress : callable
-        Told what is being done.
-    made : dict, optional
-        As :func:`px4fuse.filter.motion.motion` has it.
-    """
-    flight = comparison.flight
-    slow = imu_too_slow_for_clocks(flight)
-    return tune(
-        comparison.lines,
-        comparison.settings,
-        names,
-        lambda name: progress(f"tuning {name}"),
-        flight if slow is None else replace(flight, imu=slow),
-        may_drift(flight, comparison.source),
-        made,
-    )
-
-
-def clock_offset(
-    comparison: Comparison | Prepared,
-    tuning: Tuning,
-    progress: Progress = _silent,
-    made: Made | None = None,
-) -> ClockOffset | Unavailable:
-    """What must still be added to the stamps of the source, beyond the offset that was set.
-
-    Parameters
-    ----------
-    comparison : Comparison or Prepared
-    tuning : mapping
-        Its measurement noise and outliers are used where it has them.
-    progress : callable
-        Told what is being done.
-    made : dict, optional
-        As :func:`px4fuse.filter.motion.motion` has it.
-    """
-    if slow := imu_too_slow_for_clocks(comparison.flight):
-        return slow
-    tuned = next(
-        (
-            found
-            for found in (tuning.get(HORIZONTAL), *tuning.values())
-            if isinstance(found, AxisTuning)
-        ),
-        None,
-    )
-    settings = comparison.settings
-    noises = Noises(settings.sigma_a_m_s2, settings.sigma_z_m)
-    found = estimate_clock_offset(
-        comparison.flight,
-        comparison.source,
-        comparison.segment,
-        comparison.settings,
-        noises if tuned is None else tuned.noises,
-        None if tuned is None else tuned.outlier_time_s,
-        progress,
-        made,
-    )
-    if isinstance(found, ClockOffset) and may_drift(comparison.flight, comparison.source):
-        return with_drift(found)
-    return found
-
-
-def turned_frame(
-    comparison: Comparison,
-    tuning: Tuning,
-    clock: ClockOffset | Unavailable,
-    progress: Progress = _silent,
-) -> HeadingError | Unavailable:
-    """Turn of the source's frame, with the noise and the clock offset that were found."""
-    progress("heading")
-    tuned = tuning.get(HORIZONTAL)
-    sigma_z_m = comparison.settings.sigma_z_m
-    if isinstance(tuned, AxisTuning):
-        sigma_z_m = _size(tuned.sigma_z, sigma_z_m)
-    known = isinstance(clock, ClockOffset) and clock.determinable
-    return heading_error(
-        comparison.flight,
-        comparison.source,
-        comparison.segment,
-        comparison.settings,
-        sigma_z_m,
-        clock.offset_s if known and isinstance(clock, ClockOffset) else 0.0,
-    )
-
-
-def imu_too_slow_for_clocks(flight: Flight) -> Unavailable | None:
-    """Why the IMU of a flight cannot tell a clock offset; None where it can.
-
-    A ULog's sample is the mean over its interval. A telemetry message is the newest of several
-    samples, and PX4 has taken EKF2's own bias out of it (``HIGHRES_IMU.hpp``), which follows the
-    very positions that are in question.
-    """
-    if isinstance(flight.imu, Unavailable) or len(flight.imu) < 2:
-        return None
-    stream = flight.streams.get("imu")
-    telemetry = stream is not None and stream.topics[0] in TELEMETRY_IMU
-    needed = MIN_TELEMETRY_IMU_HZ if telemetry else MIN_CLOCK_IMU_HZ
-    rate = 1.0 / float(np.median(np.diff(flight.imu.index.to_numpy())))
-    if rate >= CLOCK_RATE_MARGIN * needed:
-        return None
-    told = f"{rate:.{1 if rate < 10 else 0}f} Hz"
-    if not telemetry:
-        return Unavailable(
-            "clock offset",
-            f"the IMU was logged at {told}, at least {needed:g} Hz are needed",
-            'Put the line "sensor_combined 0" into etc/logging/logger_topics.txt on the SD card.',
-        )
-    remedy = "Give the ULog of the same flight as LOG, and this recording with --mavlink."
-    return Unavailable(
-        "clock offset",
-        f"the IMU came by telemetry at {told}, each sample picked out of several; at least "
-        f"{needed:g} Hz are needed",
-        remedy if flight.log.has_ulog else f"Have the IMU sent at {needed:g} Hz.",
-    )

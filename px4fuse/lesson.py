@@ -6,7 +6,6 @@ Source: UAT 366, module 2, "SLAM and sensor fusion", Examples 1 and 2.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -23,25 +22,6 @@ STEPS_PER_UPDATE = 5
 UWB_NOISE_M = (0.08, -0.12, 0.05, 0.10, -0.06, -0.09)
 # Corners of Example 2's path by odometry, m; it truly returns to the start.
 ODOMETRY_M = ((0.0, 0.0), (20.3, 0.2), (20.6, 20.4), (0.8, 20.9), (1.2, 0.8))
-
-
-@dataclass(frozen=True)
-class LessonUpdate:
-    """State after one UWB update of Example 1 (s, m, m/s)."""
-
-    time_s: float
-    true_position_m: float
-    position_m: float
-    velocity_m_s: float
-    sigma_p_m: float
-    sigma_v_m_s: float
-
-    def __str__(self) -> str:
-        return (
-            f"t {self.time_s:.1f} s: p {self.position_m:.2f} (true {self.true_position_m:.2f}), "
-            f"v {self.velocity_m_s:.2f}, sigma_p {self.sigma_p_m:.3f} m, "
-            f"sigma_v {self.sigma_v_m_s:.3f} m/s"
-        )
 
 
 def example_1() -> Replay:
@@ -61,18 +41,16 @@ def example_1() -> Replay:
     return replay(axis, settings, InitialState(time_s=0.0, position_m=0.0))
 
 
-def kalman_lines() -> Iterator[LessonUpdate]:
-    """Yield the six updates of Example 1; ``str`` of each is the lesson's line."""
+def kalman_lines() -> Iterator[str]:
+    """Yield the six lines of Example 1: the state after each UWB update."""
     run = example_1()
     for time, row in run.steps.loc[run.updates.index].iterrows():
         seconds = float(str(time))
-        yield LessonUpdate(
-            time_s=seconds,
-            true_position_m=TRUE_VELOCITY_M_S * seconds,
-            position_m=row["position_m"],
-            velocity_m_s=row["velocity_m_s"],
-            sigma_p_m=float(np.sqrt(row["position_variance_m2"])),
-            sigma_v_m_s=float(np.sqrt(row["velocity_variance_m2_s2"])),
+        yield (
+            f"t {seconds:.1f} s: p {row['position_m']:.2f} (true "
+            f"{TRUE_VELOCITY_M_S * seconds:.2f}), v {row['velocity_m_s']:.2f}, "
+            f"sigma_p {np.sqrt(row['position_variance_m2']):.3f} m, "
+            f"sigma_v {np.sqrt(row['velocity_variance_m2_s2']):.3f} m/s"
         )
 
 

@@ -47,6 +47,11 @@ def factor_words(factor: float) -> str:
     return number_words(factor, 3 if factor < 2.0 else 2)
 
 
+def capital(text: str) -> str:
+    """A text that begins with a capital letter; the rest of it stays as it is."""
+    return text[:1].upper() + text[1:]
+
+
 def few_words(names: Sequence[str], most: int, between: str = ", ") -> str:
     """The first few of several names, and how many more there are.
 

@@ -16,9 +16,9 @@ from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 from scipy.stats import binom, chi2
 
-from px4fuse.analysis import clock_offset, tuned_horizontally
 from px4fuse.arrays import Array
 from px4fuse.comparison.comparison import compare
+from px4fuse.comparison.estimates import clock_offset, tuned_horizontally
 from px4fuse.filter.clock import (
     CHANGE_P,
     MIN_MEASUREMENTS,

@@ -14,8 +14,9 @@ import pandas as pd
 import pytest
 from flights import aisle_flight, unavailable, unexplained
 
-from px4fuse.analysis import Analysis, tuned_horizontally
+from px4fuse.analysis import Analysis
 from px4fuse.comparison.comparison import compare
+from px4fuse.comparison.estimates import tuned_horizontally
 from px4fuse.filter import hypotheses
 from px4fuse.filter.causes import Explained, explained
 from px4fuse.filter.hypotheses import Fit, Signals, Whitened, fit, gains, respond

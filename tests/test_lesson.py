@@ -18,7 +18,7 @@ t 3.0 s: p 2.93 (true 3.00), v 0.92, sigma_p 0.081 m, sigma_v 0.136 m/s
 
 
 def test_example_1_prints_the_lessons_six_lines() -> None:
-    assert [str(update) for update in kalman_lines()] == EXAMPLE_1.splitlines()
+    assert list(kalman_lines()) == EXAMPLE_1.splitlines()
 
 
 def test_example_1_equals_the_lessons_own_loop_at_every_step() -> None:

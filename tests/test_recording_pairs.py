@@ -10,8 +10,9 @@ import pytest
 from conftest import REPOSITORY, SHARED_LOGS
 from flights import Imu, aisle_flight
 
-from px4fuse.analysis import Analysis, clock_offset, explain
+from px4fuse.analysis import Analysis, explain
 from px4fuse.comparison.comparison import compare
+from px4fuse.comparison.estimates import clock_offset
 from px4fuse.filter.clock import ClockOffset
 from px4fuse.filter.tuning import AxisTuning
 from px4fuse.findings import find

@@ -20,10 +20,11 @@ from rich.console import Console
 from test_cli import run_main
 
 from px4fuse.analysis import run as analyse
-from px4fuse.analysis import run_loop, run_preparation, run_what_if, tuned
+from px4fuse.analysis import run_loop, run_preparation, run_what_if
 from px4fuse.cli import cli, compare, loop, tune, whatif
 from px4fuse.cli.outputs import default_report, progress, terminal
 from px4fuse.cli.quantity import NAMES, in_unit
+from px4fuse.comparison.estimates import tuned
 from px4fuse.findings import find
 from px4fuse.report.commands import runnable
 from px4fuse.report.document import Document

@@ -15,8 +15,8 @@ def kalman() -> None:
     """Print Example 1: fusing the IMU with UWB on an aisle at 1 m/s."""
     from px4fuse.lesson import kalman_lines
 
-    for update in kalman_lines():
-        click.echo(str(update))
+    for line in kalman_lines():
+        click.echo(line)
 
 
 @lesson.command()

@@ -24,7 +24,8 @@ def sync(log: Path, json_path: Path | None, **given: Any) -> None:
     From the acceleration that the IMU felt; EKF2 and its attitude are not asked. LOG is a PX4 ULog
     or a MAVLink recording.
     """
-    from px4fuse.analysis import clock_offset, run_preparation, tuned_horizontally
+    from px4fuse.analysis import run_preparation
+    from px4fuse.comparison.estimates import clock_offset, tuned_horizontally
     from px4fuse.filter.motion import Made
     from px4fuse.report.terminal import print_advice
     from px4fuse.report.words import clock_advice

@@ -36,7 +36,7 @@ def tune(log: Path, json_path: Path | None, **given: Any) -> None:
     recording.
     """
     from px4fuse.analysis import run_preparation
-    from px4fuse.analysis import tuned as tuned_noises
+    from px4fuse.comparison.estimates import tuned as tuned_noises
     from px4fuse.request import command_line
     from px4fuse.results.build import tuning_results
 

@@ -22,11 +22,7 @@ from px4fuse.display import Shown
 from px4fuse.errors import MissingDataError
 from px4fuse.filter.consistency import Consistency, HorizontalNis, assess, assess_horizontal
 from px4fuse.filter.kalman import Replay, Settings, replay_all, state_at, variance_at
-from px4fuse.filter.signals import (
-    AISLE,
-    Axis,
-    Segment,
-)
+from px4fuse.filter.signals import AISLE, Axis, Segment
 from px4fuse.flight import Ekf2, Flight, PositionTrack, Unavailable
 
 
@@ -115,35 +111,19 @@ class AxisComparison(Shown):
 
 
 @dataclass(frozen=True, repr=False)
-class Comparison(Shown):
-    """The result of ``px4fuse compare``.
+class Comparison(Shown, Prepared):
+    """The result of ``px4fuse compare``: what it began with, and what the filters did.
 
     Attributes
     ----------
-    flight : Flight
-    source : PositionTrack
-    source_reason : str
-    segment : Segment
-    settings : Settings
-        As used: ``input`` is "zero" where the log has no acceleration.
     axes : tuple of AxisComparison
     horizontal_kf, horizontal_ekf2 : HorizontalNis or None
         North and east together, None unless both were analysed.
-    notes : tuple of str
-        Choices made on the way.
-    missing : tuple of Unavailable
     """
 
-    flight: Flight
-    source: PositionTrack
-    source_reason: str
-    segment: Segment
-    settings: Settings
     axes: tuple[AxisComparison, ...]
     horizontal_kf: HorizontalNis | None
     horizontal_ekf2: HorizontalNis | None
-    notes: tuple[str, ...]
-    missing: tuple[Unavailable, ...]
 
     def __getitem__(self, axis: str) -> AxisComparison:
         """Everything about one axis, by its name.
@@ -157,11 +137,6 @@ class Comparison(Shown):
         if axis not in names:
             raise MissingDataError(f"no axis {axis!r} here: {', '.join(names)}.")
         return names[axis]
-
-    @property
-    def lines(self) -> tuple[Axis, ...]:
-        """The axes alone."""
-        return tuple(result.axis for result in self.axes)
 
     @property
     def main(self) -> AxisComparison:
@@ -200,10 +175,6 @@ def compare(
     progress : callable
         Told the names of the axes as they start.
 
-    Returns
-    -------
-    Comparison
-
     Raises
     ------
     MissingDataError
@@ -235,16 +206,10 @@ def compare_prepared(
         for run in replay_all(prepared.lines, prepared.settings)
     ]
     return Comparison(
-        flight=flight,
-        source=track,
-        source_reason=prepared.source_reason,
-        segment=segment,
-        settings=prepared.settings,
+        **(vars(prepared) | {"notes": tuple(notes)}),
         axes=tuple(results),
         horizontal_kf=_horizontal(results, lambda axis: axis.replay.updates),
         horizontal_ekf2=_horizontal(results, lambda axis: axis.ekf2_innovations),
-        notes=tuple(notes),
-        missing=prepared.missing,
     )
 
 
@@ -304,9 +269,10 @@ def _median_sigma(variance: pd.Series) -> float | None:
 def _ekf2_summary(
     ekf2: Ekf2, variance: pd.DataFrame | Unavailable, innovations: pd.DataFrame | Unavailable
 ) -> FilterSummary:
+    consistency: Consistency | Unavailable
+    before = after = sigma_p = sigma_v = None
     if isinstance(innovations, Unavailable):
-        consistency: Consistency | Unavailable = innovations
-        before = after = None
+        consistency = innovations
     else:
         consistency = assess(
             innovations["innovation_m"].to_numpy(),
@@ -315,7 +281,6 @@ def _ekf2_summary(
         )
         before = _median_sigma(innovations["prior_variance_m2"])
         after = _median_sigma(innovations["posterior_variance_m2"])
-    sigma_p = sigma_v = None
     if isinstance(variance, pd.DataFrame):
         sigma_p = _median_sigma(variance["position_variance_m2"])
         sigma_v = _median_sigma(variance["velocity_variance_m2_s2"])

@@ -66,12 +66,7 @@ def source_gaps(time_s: Array, rate_hz: float) -> tuple[Span, ...]:
 
 
 def happened(comparison: Comparison) -> Events:
-    """Everything that is worth a mark on a time axis.
-
-    Parameters
-    ----------
-    comparison : Comparison
-    """
+    """Everything that is worth a mark on a time axis."""
     flight, segment = comparison.flight, comparison.segment
     low, high = segment.start_s, segment.end_s
 

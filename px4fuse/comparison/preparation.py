@@ -30,11 +30,16 @@ class Prepared:
 
     Attributes
     ----------
-    flight, source, source_reason, segment, settings, missing
-        As in :class:`Comparison`.
+    flight : Flight
+    source : PositionTrack
+    source_reason : str
+    segment : Segment
+    settings : Settings
+        As used: ``input`` is "zero" where the log has no acceleration.
     lines : tuple of Axis
     notes : tuple of str
-        Choices made so far.
+        Choices made on the way.
+    missing : tuple of Unavailable
     """
 
     flight: Flight

@@ -38,12 +38,6 @@ def continuous_state(
     through the rest of the flight. The measurements decide: the resets are undone where that
     brings the series clearly closer to them (median distance).
 
-    Parameters
-    ----------
-    ekf2 : Ekf2
-    track : PositionTrack
-    segment : Segment
-
     Returns
     -------
     state : DataFrame
@@ -55,7 +49,8 @@ def continuous_state(
     if not inside:
         return ekf2.state, ""
     state = ekf2.state.copy()
-    kept, undone = [], []
+    kept: list[str] = []
+    undone: list[str] = []
     groups = (
         ("horizontal position", "position", POSITION_COLUMNS[:2], [0, 1]),
         ("height", "position", POSITION_COLUMNS[2:], [2]),
@@ -67,20 +62,17 @@ def continuous_state(
         )
         times = np.array([r.time_s for r in inside])
         real = np.any(deltas != 0, axis=1)
-        count = int(np.count_nonzero(real))
-        if not count:
+        if not real.any():
             continue
-        if quantity == "velocity":  # a velocity has no frame origin to lose
-            kept.append(f"{count} of {label}")
-            continue
-        published = ekf2.state[columns]
-        candidate = _undo(published, times[real], deltas[real], track, segment, columns)
-        distance = _distance(published, track, segment, columns)
-        if _distance(candidate, track, segment, columns) < CLEARLY_CLOSER * distance:
-            state[columns] = candidate
-            undone.append(f"{count} of {label}")
-        else:
-            kept.append(f"{count} of {label}")
+        done = kept
+        if quantity == "position":  # a velocity has no frame origin to lose
+            published = ekf2.state[columns]
+            candidate = _undo(published, times[real], deltas[real], track, segment, columns)
+            distance = _distance(published, track, segment, columns)
+            if _distance(candidate, track, segment, columns) < CLEARLY_CLOSER * distance:
+                state[columns] = candidate
+                done = undone
+        done.append(f"{np.count_nonzero(real)} of {label}")
     said = []
     if undone:
         said.append(f"resets undone: {', '.join(undone)} (they change the frame)")
@@ -137,10 +129,9 @@ def project_variance(ekf2: Ekf2, axis: Axis, segment: Segment) -> pd.DataFrame |
     if cut.empty:
         return Unavailable("EKF2 variances", "no sample in the segment", "Analyse more of the log.")
     weights = axis.direction**2
-    position = along(cut, POSITION_VARIANCE_COLUMNS, weights)
     return pd.DataFrame(
         {
-            "position_variance_m2": position,
+            "position_variance_m2": along(cut, POSITION_VARIANCE_COLUMNS, weights),
             "velocity_variance_m2_s2": along(cut, VELOCITY_VARIANCE_COLUMNS, weights),
         },
         index=cut.index,

@@ -17,6 +17,7 @@ from px4fuse.ekf2.whatif import Summary, what_if
 from px4fuse.filter.kalman import Settings, replay_all
 from px4fuse.filter.signals import AISLE
 from px4fuse.flight import Unavailable
+from px4fuse.plain import capital
 
 # How a remedy to type is written; who prints it knows the log (px4fuse.report.commands)
 COMMAND = "px4fuse compare LOG"
@@ -113,10 +114,10 @@ def remedy_words(
     setting = f"{why}set {settings_words(changes)}"
     found = replayed(model, changes)
     if isinstance(found, Unavailable):
-        return f"{_capital(setting)}. {not_replayed(found)}"
+        return f"{capital(setting)}. {not_replayed(found)}"
     (effect,) = found
     if helps(effect.before, effect.after):
-        return f"{_capital(setting)}: {effect.words()}."
+        return f"{capital(setting)}: {effect.words()}."
     said = ", ".join(f"{name} {value:.3g}" for name, value in changes.items())
     return f"{otherwise} {said} is no remedy: {effect.words()}."
 
@@ -132,18 +133,11 @@ def filter_errors_m(comparison: Comparison, changed: Settings) -> tuple[float, f
     before = [result.kf_truth for result in results]
     if changed.clock_offset_s == comparison.settings.clock_offset_s:
         runs = replay_all(tuple(result.axis for result in results), changed)
-        after = [
-            kf_against_truth(
-                run,
-                result.truth,
-                (
-                    result.replay.steps
-                    if isinstance(result.ekf2_state, Unavailable)
-                    else result.ekf2_state
-                ).index.to_numpy(),
-            )
-            for result, run in zip(results, runs, strict=True)
-        ]
+        after = []
+        for result, run in zip(results, runs, strict=True):
+            state = result.ekf2_state
+            timed = result.replay.steps if isinstance(state, Unavailable) else state
+            after.append(kf_against_truth(run, result.truth, timed.index.to_numpy()))
     else:  # the measurements themselves are at other times
         again = compare(
             comparison.flight,
@@ -155,13 +149,13 @@ def filter_errors_m(comparison: Comparison, changed: Settings) -> tuple[float, f
             end_s=comparison.segment.end_s,
         )
         after = [result.kf_truth for result in again.axes]
-    sums = [0.0, 0.0]
-    for i, errors in enumerate((before, after)):
-        for error in errors:
-            if not isinstance(error, AgainstTruth):
-                return None
-            sums[i] += error.position_rmse_m**2
-    return math.sqrt(sums[0]), math.sqrt(sums[1])
+    first, second = (
+        [error.position_rmse_m for error in errors if isinstance(error, AgainstTruth)]
+        for errors in (before, after)
+    )
+    if min(len(first), len(second)) < len(results):
+        return None
+    return math.hypot(*first), math.hypot(*second)
 
 
 def filter_words(
@@ -243,7 +237,3 @@ def _std(summary: Summary) -> float:
 
 def _short(nis: float) -> str:
     return f"{nis:.0f}" if nis >= 9.95 else f"{nis:.1f}" if nis >= 0.095 else f"{nis:.2g}"
-
-
-def _capital(words: str) -> str:
-    return words[:1].upper() + words[1:]

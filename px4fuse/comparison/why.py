@@ -14,7 +14,7 @@ import pandas as pd
 from px4fuse.arrays import Array
 from px4fuse.comparison.asked import tuned_noise_m
 from px4fuse.comparison.comparison import AxisComparison, Comparison
-from px4fuse.comparison.why_words import Facts, sentences
+from px4fuse.comparison.why_words import Facts, Outside, sentences
 from px4fuse.display import Shown
 from px4fuse.ekf2.agreement import judged_from, settled
 from px4fuse.ekf2.model import Model
@@ -23,22 +23,6 @@ from px4fuse.filter.clock import ClockOffset
 from px4fuse.filter.kalman import state_at
 from px4fuse.filter.tuning import AxisTuning
 from px4fuse.flight import Ekf2, Unavailable
-
-
-@dataclass(frozen=True)
-class Outside:
-    """Where the walk does not lead: parts of the segment in which EKF2 started or did not fuse.
-
-    Attributes
-    ----------
-    maximum_m : float
-        How far both filters are apart there, at most.
-    at_s : float
-        When.
-    """
-
-    maximum_m: float
-    at_s: float
 
 
 @dataclass(frozen=True, repr=False)
@@ -121,9 +105,7 @@ def why_ekf2_differs(
             times_s=walked.times_s,
             spans=spans,
             outside=outside,
-            sentences=sentences(
-                name, axis, facts, None if outside is None else (outside.maximum_m, outside.at_s)
-            ),
+            sentences=sentences(name, axis, facts, outside),
         )
     return found
 

@@ -43,6 +43,22 @@ FAR_M, FAR_TIMES = 0.5, 3.0
 
 
 @dataclass(frozen=True)
+class Outside:
+    """Where the walk does not lead: parts of the segment in which EKF2 started or did not fuse.
+
+    Attributes
+    ----------
+    maximum_m : float
+        How far both filters are apart there, at most.
+    at_s : float
+        When.
+    """
+
+    maximum_m: float
+    at_s: float
+
+
+@dataclass(frozen=True)
 class Facts:
     """What the words are made of.
 
@@ -95,25 +111,12 @@ class _Part:
 
     @property
     def label(self) -> str:
-        return "the too small noise and the rejections" if len(self.names) > 1 else (
-            f"the {self.names[0]}"
-        )  # fmt: skip
+        joined = len(self.names) > 1
+        return "the too small noise and the rejections" if joined else f"the {self.names[0]}"
 
 
-def sentences(
-    name: str, axis: AxisWalk, facts: Facts, outside: tuple[float, float] | None
-) -> tuple[str, ...]:
-    """What makes EKF2 differ along one axis, the weightiest first.
-
-    Parameters
-    ----------
-    name : str
-        Of the axis.
-    axis : AxisWalk
-    facts : Facts
-    outside : (float, float) or None
-        How far both are apart at most where they were not walked (m), and when (s).
-    """
+def sentences(name: str, axis: AxisWalk, facts: Facts, outside: Outside | None) -> tuple[str, ...]:
+    """What makes EKF2 differ along the axis of a name, the weightiest first."""
     parts = _parts(axis, joined=facts.too_sure)
     if facts.too_sure:  # the cause comes first, even where its steps also bring the tracks nearer
         parts.sort(key=lambda part: len(part.names) == 1)
@@ -121,15 +124,15 @@ def sentences(
     said.append(_first(name, axis, parts[0], facts))
     others = [p for p in parts[1:] if p.square_m2 >= NOTABLE * axis.position_total_m2]
     if others:
-        said.append(_next(axis, others[0], facts))
+        share = _share(others[0], axis)
+        said.append(f"Then {others[0].label} ({share}): {_because(others[0], facts)}.")
     said.append(_velocity(axis, parts))
     said += _truth(axis, facts)
-    if outside is not None and outside[0] > max(
-        FAR_M, FAR_TIMES * float(np.max(np.abs(axis.apart_m)))
-    ):
+    far_m = max(FAR_M, FAR_TIMES * float(np.max(np.abs(axis.apart_m))))
+    if outside is not None and outside.maximum_m > far_m:
         said.append(
             f"Elsewhere in the flight, where EKF2 started or did not fuse the source, both are up "
-            f"to {outside[0]:.1f} m apart (at {outside[1]:.0f} s)."
+            f"to {outside.maximum_m:.1f} m apart (at {outside.at_s:.0f} s)."
         )
     return tuple(said)
 
@@ -160,12 +163,12 @@ def the(axis: str) -> str:
     return f"the {axis}" if axis == AISLE else axis
 
 
-def _share(square: float, total: float) -> str:
-    return f"{square / total:.0%} of the mean square"
+def _share(part: _Part, axis: AxisWalk) -> str:
+    return f"{part.square_m2 / axis.position_total_m2:.0%} of the mean square"
 
 
 def _first(name: str, axis: AxisWalk, part: _Part, facts: Facts) -> str:
-    share = _share(part.square_m2, axis.position_total_m2)
+    share = _share(part, axis)
     if facts.too_sure:
         return (
             "EKF2_EVP_NOISE is too small: EKF2 takes the source's noise to be "
@@ -180,15 +183,10 @@ def _first(name: str, axis: AxisWalk, part: _Part, facts: Facts) -> str:
     )
 
 
-def _next(axis: AxisWalk, part: _Part, facts: Facts) -> str:
-    share = _share(part.square_m2, axis.position_total_m2)
-    return f"Then {part.label} ({share}): {_because(part, facts)}."
-
-
 def _because(part: _Part, facts: Facts) -> str:
     """What EKF2 does there, what ours does, and when it mattered most."""
     words = BECAUSE[part.names[0]](facts)
-    if part.names[0] == GATE and facts.walked.coast is not None:
+    if part.names[0] == GATE:
         words += _coasted(facts)
     return (
         f"{words}; most at {part.at_s:.1f} s, where it moves the position by {part.moved_m:.2f} m"
@@ -241,9 +239,8 @@ def _noise(facts: Facts) -> str:
 def _process(facts: Facts) -> str:
     settings, inputs = facts.comparison.settings, facts.model.inputs
     same = inputs.settings["EKF2_ACC_NOISE"] * np.sqrt(inputs.step_s / settings.dt_s)
-    trust = "the IMU more, and each position less" if same < settings.sigma_a_m_s2 else (
-        "each position more"
-    )  # fmt: skip
+    less = same < settings.sigma_a_m_s2
+    trust = "the IMU more, and each position less" if less else "each position more"
     return (
         f"EKF2_ACC_NOISE {inputs.settings['EKF2_ACC_NOISE']:g} is a SIGMA_A of {same:.2g} m/s², "
         f"ours is {settings.sigma_a_m_s2:.2g}, so EKF2 trusts {trust}"

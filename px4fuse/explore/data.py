@@ -14,7 +14,7 @@ from scipy import stats
 
 from px4fuse.analysis import Analysis
 from px4fuse.arrays import Array
-from px4fuse.comparison.comparison import AgainstTruth, AxisComparison, Comparison, FilterSummary
+from px4fuse.comparison.comparison import AgainstTruth, AxisComparison, Comparison
 from px4fuse.comparison.events import happened
 from px4fuse.explore.ekf2_grid import grid_data, judged_numbers
 from px4fuse.explore.packing import COARSE, Packer
@@ -27,7 +27,7 @@ from px4fuse.filter.kalman import (
     Settings,
 )
 from px4fuse.filter.model import INITIAL_COVARIANCE
-from px4fuse.filter.signals import Acceleration, Axis, along, choose_source, imu_gaps, within
+from px4fuse.filter.signals import AISLE, Acceleration, Axis, along, choose_source, imu_gaps, within
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.findings.model import Finding
 from px4fuse.findings.story import story
@@ -95,13 +95,7 @@ def flight_data(
 
 
 def signals_of(comparison: Comparison, packer: Packer) -> dict[str, Any]:
-    """What the page's engine replays: measurements, IMU integrals, segment and start.
-
-    Parameters
-    ----------
-    comparison : Comparison
-    packer : Packer
-    """
+    """What the page's engine replays: measurements, IMU integrals, segment and start."""
     raw = raw_source(comparison)
     return {
         "segment": [comparison.segment.start_s, comparison.segment.end_s],
@@ -148,7 +142,7 @@ def _offset(request: ComparisonRequest, settings: Settings) -> dict[str, Any]:
 
 def _imu(comparison: Comparison, packer: Packer) -> dict[str, Any] | str:
     """Times, gaps and span of the acceleration; why not where there is none."""
-    acceleration = comparison.axes[0].axis.acceleration
+    acceleration = comparison.lines[0].acceleration
     if isinstance(acceleration, Unavailable):
         return acceleration.reason
     time = acceleration.time_s
@@ -220,13 +214,19 @@ def _ekf2(result: AxisComparison, packer: Packer) -> dict[str, Any] | str:
     if isinstance(result.ekf2_state, Unavailable):
         return result.ekf2_state.reason
     state = result.ekf2_state.dropna()
+    summary = result.ekf2 if isinstance(result.ekf2, Unavailable) else result.ekf2.consistency
     made: dict[str, Any] = {
         "state": _frame(state, ["position_m", "velocity_m_s"], packer),
         "variance": "",
         "innovations": "",
-        "summary": _summary(result.ekf2, result.ekf2_truth),
+        "summary": judged_numbers(summary),
         "r": None,
     }
+    if isinstance(result.ekf2_truth, AgainstTruth):
+        made["summary"] |= {
+            "truthP": result.ekf2_truth.position_rmse_m,
+            "truthV": result.ekf2_truth.velocity_rmse_m_s,
+        }
     if isinstance(result.ekf2_variance, pd.DataFrame):
         sigma = result.ekf2_variance.dropna().pow(0.5)
         made["variance"] = _frame(
@@ -264,20 +264,9 @@ def _frame(frame: pd.DataFrame, columns: list[str], packer: Packer) -> list[int]
     return [packer.add_times(frame.index.to_numpy()), *values]
 
 
-def _summary(
-    summary: FilterSummary | Unavailable, truth: AgainstTruth | Unavailable
-) -> dict[str, Any]:
-    """EKF2's column of the table."""
-    made = judged_numbers(summary if isinstance(summary, Unavailable) else summary.consistency)
-    if isinstance(truth, AgainstTruth):
-        made |= {"truthP": truth.position_rmse_m, "truthV": truth.velocity_rmse_m_s}
-    return made
-
-
 def _map_of(analysis: Analysis, name: str) -> str:
     """Which likelihood map tells of an axis: the joint one of the horizontal axes, or its own."""
-    joint = HORIZONTAL if name != "down" else "down"
-    return joint if joint in analysis.tuning else name
+    return HORIZONTAL if name != "down" and HORIZONTAL in analysis.tuning else name
 
 
 def _maps(analysis: Analysis) -> dict[str, Any]:
@@ -325,14 +314,11 @@ def _command(request: ComparisonRequest, comparison: Comparison) -> dict[str, An
     The segment and the aisle are found from the stamps, so that another clock offset would move
     them: then they are said.
     """
+    offset_s = None if request.position is None else request.clock_offset_s
     bare = msgspec.structs.replace(
-        request, sigma_a_m_s2=0.5, sigma_z_m=0.10, dt_s=0.1, input=None, clock_offset_s=None
+        request, sigma_a_m_s2=0.5, sigma_z_m=0.10, dt_s=0.1, input=None, clock_offset_s=offset_s
     )
-    if request.position is not None:
-        bare = msgspec.structs.replace(bare, clock_offset_s=request.clock_offset_s)
-    heading = next(
-        (result.axis.heading_deg for result in comparison.axes if result.axis.name == "aisle"), None
-    )
+    heading = next((line.heading_deg for line in comparison.lines if line.name == AISLE), None)
     held = msgspec.structs.replace(
         bare,
         start_s=comparison.segment.start_s,
@@ -343,9 +329,5 @@ def _command(request: ComparisonRequest, comparison: Comparison) -> dict[str, An
         "bare": command_line(bare),
         "held": command_line(held),
         "input": request.input,
-        "found": "zero" if isinstance(_first_acceleration(comparison), Unavailable) else "imu",
+        "found": "zero" if isinstance(comparison.lines[0].acceleration, Unavailable) else "imu",
     }
-
-
-def _first_acceleration(comparison: Comparison) -> Acceleration | Unavailable:
-    return comparison.axes[0].axis.acceleration

@@ -34,13 +34,7 @@ MILLIMETRES, TENTHS = 1e3, 1e4
 
 
 def grid_data(analysis: Analysis, packer: Packer) -> dict[str, Any] | str:
-    """Innovations, verdicts and rejections at every stop; why not where there are none.
-
-    Parameters
-    ----------
-    analysis : Analysis
-    packer : Packer
-    """
+    """Innovations, verdicts and rejections at every stop; why not where there are none."""
     model = analysis.ekf2_model
     if isinstance(model, Unavailable):
         return model.reason

@@ -16,8 +16,8 @@ from bokeh.models import (
 from bokeh.models.annotations import BoxAnnotation, Span
 from bokeh.plotting import figure
 
-from px4fuse.analysis import Tuning
 from px4fuse.arrays import Array
+from px4fuse.comparison.estimates import Tuning
 from px4fuse.explore.data import RUNNING
 from px4fuse.filter.consistency import nis_band
 from px4fuse.filter.tuning import AxisTuning

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.asked import delay_change
-from px4fuse.comparison.comparison import Comparison
 from px4fuse.comparison.preparation import Prepared
 from px4fuse.comparison.remedy import (
     COMMAND,
@@ -97,7 +96,7 @@ def _detect(analysis: Analysis) -> Found:
         )
 
 
-def typed_offset_s(comparison: Comparison | Prepared, clock: ClockOffset) -> float:
+def typed_offset_s(comparison: Prepared, clock: ClockOffset) -> float:
     """What to type as ``--clock-offset``: what was applied, with what is missing (s).
 
     That of a position file was spent on placing it, and is not in the settings.

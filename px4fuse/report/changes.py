@@ -198,14 +198,15 @@ def _drawn_tracks(tracks: tuple[Track, Track], since: str) -> Figure:
     top = cursor.y
     middle = (PANEL_LEFT + RIGHT) / 2
     drawn = False
-    for title, left, right, of in (
-        ("EKF2 from above", PANEL_LEFT, middle - 0.02, _ekf2_path),
-        ("Ours from above", middle + 0.05, RIGHT, _our_path),
-    ):
+    sides: tuple[tuple[str, float, float, Callable[[AxisComparison], Any]], ...] = (
+        ("EKF2 from above", PANEL_LEFT, middle - 0.02, lambda result: result.ekf2_state),
+        ("Ours from above", middle + 0.05, RIGHT, lambda result: result.replay.steps),
+    )
+    for title, left, right, of in sides:
         cursor.y = top
-        paths = [(track.name, path) for track in tracks if (path := of(track.analysis)) is not None]
-        say = "" if len(paths) == len(tracks) else "Not both have it."
-        axes = panel(cursor, title, say or "North is up.", MAP, left=left, right=right)
+        paths = [(t.name, path) for t in tracks if (path := _path(t.analysis, of)) is not None]
+        say = "North is up." if len(paths) == len(tracks) else "Not both have it."
+        axes = panel(cursor, title, say, MAP, left=left, right=right)
         for name, (north, east) in paths:
             every = max(1, len(north) // MAX_POINTS)
             axes.plot(east[::every], north[::every], **STYLES[name], label=name)
@@ -275,15 +276,12 @@ def _series(
 
 
 def _innovations(
-    cursor: Cursor,
-    tracks: Sequence[Track],
-    title: str,
-    of: Callable[[Track], Any],
+    cursor: Cursor, tracks: Sequence[Track], title: str, of: Callable[[Track], Any]
 ) -> None:
     top = cursor.y
     frames = [(track, frame) for track in tracks if isinstance(frame := of(track), pd.DataFrame)]
-    missing = [track.name for track in tracks if not isinstance(of(track), pd.DataFrame)]
     sigmas = {t.name: 2.0 * np.sqrt(f["innovation_variance_m2"].to_numpy()) for t, f in frames}
+    missing = [track.name for track in tracks if track.name not in sigmas]
     edge = EDGE * max((float(np.median(s)) for s in sigmas.values()), default=1.0)
     outside = [
         f"{track.name} {np.mean(np.abs(frame['innovation_m']) > sigmas[track.name]):.1%}"
@@ -356,9 +354,7 @@ def _error(track: Track) -> Series | None:
     state, truth = track.result.ekf2_state, track.result.truth
     if not isinstance(state, pd.DataFrame) or not isinstance(truth, pd.DataFrame):
         return None
-    true = np.interp(
-        state.index, truth.index, truth["position_m"], left=np.nan, right=np.nan
-    )  # fmt: skip
+    true = np.interp(state.index, truth.index, truth["position_m"], left=np.nan, right=np.nan)
     return _known(track.since(state.index), state["position_m"].to_numpy() - true)
 
 
@@ -368,37 +364,29 @@ def _known(time: Array, values: Array) -> Series | None:
 
 
 def _rms_words(tracks: Sequence[Track], of: Of) -> str:
-    said = [
-        f"{track.name} {number_words(float(np.sqrt(np.mean(found[1] ** 2))))} m"
-        for track in tracks
-        if (found := of(track)) is not None
-    ]
-    return f"Root mean square: {', '.join(said)}." if said else ""
+    return _said("Root mean square", tracks, of, lambda values: np.sqrt(np.mean(values**2)))
 
 
 def _median_words(tracks: Sequence[Track], of: Of) -> str:
+    return _said("Median", tracks, of, np.median)
+
+
+def _said(
+    head: str, tracks: Sequence[Track], of: Of, statistic: Callable[[Array], np.floating[Any]]
+) -> str:
+    """One number (m) of each series; nothing where there is none."""
     said = [
-        f"{track.name} {number_words(float(np.median(found[1])))} m"
+        f"{track.name} {number_words(float(statistic(found[1])))} m"
         for track in tracks
         if (found := of(track)) is not None
     ]
-    return f"Median: {', '.join(said)}." if said else ""
+    return f"{head}: {', '.join(said)}." if said else ""
 
 
-def _ekf2_path(analysis: Analysis) -> tuple[Array, Array] | None:
-    return _path(analysis, lambda result: result.ekf2_state)
-
-
-def _our_path(analysis: Analysis) -> tuple[Array, Array] | None:
-    return _path(analysis, lambda result: result.replay.steps)
-
-
-def _path(analysis: Analysis, of: Callable[[AxisComparison], Any]) -> tuple[Array, Array] | None:
+def _path(analysis: Analysis, of: Callable[[AxisComparison], Any]) -> Series | None:
     """North and east (m), where both were analysed."""
-    axes = {result.axis.name: of(result) for result in analysis.axes}
-    frames = [axes.get(name) for name in ("north", "east")]
-    north, east = (
-        frame["position_m"].to_numpy() if isinstance(frame, pd.DataFrame) else None
-        for frame in frames
-    )
-    return None if north is None or east is None else (north, east)
+    frames = {result.axis.name: of(result) for result in analysis.axes}
+    north, east = frames.get("north"), frames.get("east")
+    if not isinstance(north, pd.DataFrame) or not isinstance(east, pd.DataFrame):
+        return None
+    return north["position_m"].to_numpy(), east["position_m"].to_numpy()

@@ -13,7 +13,6 @@ from px4fuse.plain import p_words
 from px4fuse.report import marks
 from px4fuse.report.document import Document
 from px4fuse.report.style import (
-    LEFT,
     OURS,
     OURS_BAND,
     OURS_LINE,
@@ -33,7 +32,6 @@ MAX_DROP = 12.0
 REACH = 2.5
 # |z| of which CHANGE_P is the two-sided p-value
 DRIFT_SIGMAS = 2.81
-LABEL_WIDTH = 0.085
 
 
 def line(document: Document) -> str:
@@ -88,10 +86,7 @@ def draw(document: Document) -> Iterator[Figure]:
         "attitude is from the gyros alone, because EKF2's was corrected by these very positions.",
     )
     for text in clock_advice(document.comparison, clock):
-        top = cursor.y
-        cursor.write(text[:9].strip(), size=8.5, weight="bold", right=LEFT + LABEL_WIDTH)
-        cursor.y = top
-        cursor.write(text[9:], size=8.5, x=LEFT + LABEL_WIDTH)
+        cursor.labelled(text[:9].strip(), text[9:], size=8.5)
         cursor.skip(1)
     cursor.skip(14)
     applied = document.comparison.settings.clock_offset_s
@@ -130,8 +125,7 @@ def _curve(cursor: Cursor, clock: ClockOffset, applied: float) -> None:
 
 def _parts(cursor: Cursor, clock: ClockOffset, document: Document) -> None:
     """Offset of each part of the flight over time."""
-    comparison = document.comparison
-    applied, segment = comparison.settings.clock_offset_s, comparison.segment
+    applied = document.comparison.settings.clock_offset_s
     said = ["Too few parts to compare them."]
     if clock.change_p is not None:
         same = "The offset changes" if _changes(clock) else "One and the same offset fits"
@@ -143,16 +137,13 @@ def _parts(cursor: Cursor, clock: ClockOffset, document: Document) -> None:
         )
     said.append("Band: 95 % interval of the whole flight.")
     axes = panel(cursor, "Offset of each part of the flight by itself (s)", " ".join(said), PARTS)
-    axes.axhspan(
-        applied + clock.interval_s[0], applied + clock.interval_s[1], color=OURS_BAND, lw=0
-    )
+    axes.axhspan(*(applied + end for end in clock.interval_s), color=OURS_BAND, lw=0)
     ends = np.array([(part.start_s, part.end_s) for part in clock.parts])
     axes.errorbar(
         ends.mean(axis=1), [applied + part.offset_s for part in clock.parts],
         xerr=np.diff(ends, axis=1)[:, 0] / 2.0, yerr=[1.96 * part.sigma_s for part in clock.parts],
         fmt="o", color=OURS, ms=4, lw=1.0, capsize=2,
     )  # fmt: skip
-    axes.set_xlim(segment.start_s, segment.end_s)
     marks.draw(axes, document)
     axes.set_xlabel(TIME_LABEL)
     cursor.skip(30)

@@ -15,7 +15,7 @@ from px4fuse.comparison.comparison import AxisComparison, FilterSummary
 from px4fuse.comparison.why_words import the
 from px4fuse.filter.consistency import MIN_INNOVATIONS, Consistency, autocorrelation, nis_band
 from px4fuse.flight import Unavailable
-from px4fuse.plain import number_words, p_words
+from px4fuse.plain import capital, number_words, p_words
 from px4fuse.report import marks
 from px4fuse.report.document import Document
 from px4fuse.report.style import (
@@ -74,7 +74,6 @@ def draw(document: Document) -> Iterator[Figure]:
         top = cursor.y
         axes = panel(cursor, "Mean NIS so far, log scale", _nis_words(series), RUNNING)
         _running(axes, series)
-        axes.set_xlim(document.comparison.segment.start_s, document.comparison.segment.end_s)
         marks.draw(axes, document)
         legend_beside_title(axes, top)
         cursor.skip(36)
@@ -189,7 +188,7 @@ def _autocorrelation(axes: Axes, series: list[Series]) -> None:
 
 def _nis_words(series: list[Series]) -> str:
     return " ".join(
-        f"{_capital(one.name)} ends at {number_words(one.statement.nis_mean)} ("
+        f"{capital(one.name)} ends at {number_words(one.statement.nis_mean)} ("
         f"{one.statement.nis_band[0]:.2f} to {one.statement.nis_band[1]:.2f} is consistent): "
         f"{verdict_words(one.statement)}."
         for one in series
@@ -198,7 +197,7 @@ def _nis_words(series: list[Series]) -> str:
 
 def _shape_words(series: list[Series]) -> str:
     said = [
-        f"{_capital(one.name)}: {one.statement.outside_two_sigma:.1%} beyond 2√S, "
+        f"{capital(one.name)}: {one.statement.outside_two_sigma:.1%} beyond 2√S, "
         f"{_mean_words(one.statement)}."
         for one in series
     ]
@@ -223,12 +222,8 @@ def _white_words(series: list[Series]) -> str:
             reading = "it jumps after every measurement"
         else:
             reading = "not white"
-        said.append(f"{_capital(one.name)}: lag 1 {r:+.2f}, Ljung-Box {p_words(p)}: {reading}.")
+        said.append(f"{capital(one.name)}: lag 1 {r:+.2f}, Ljung-Box {p_words(p)}: {reading}.")
     return "\n".join(said)
-
-
-def _capital(text: str) -> str:
-    return text[0].upper() + text[1:]
 
 
 def _reason(result: AxisComparison) -> str:

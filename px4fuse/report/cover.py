@@ -13,11 +13,12 @@ from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.signals import AISLE
 from px4fuse.findings import Finding
 from px4fuse.flight import Unavailable
-from px4fuse.report.document import Document
+from px4fuse.report.document import Document, who
 from px4fuse.report.plan import plan
 from px4fuse.report.style import (
     BOTTOM,
     EKF2,
+    LABEL_WIDTH,
     LEFT,
     MUTED,
     OURS,
@@ -37,7 +38,6 @@ from px4fuse.report.words import (
     verdict_words,
 )
 
-LABEL_WIDTH = 0.085
 TEXT_X = LEFT + LABEL_WIDTH
 # Points before the map, and for the line that says that findings follow
 BEFORE_MAP, MORE = 14.0, 13.0
@@ -64,8 +64,8 @@ def draw(document: Document) -> Iterator[Figure]:
             cursor.skip(2)
             cursor.write(sentence, size=10.5)
     cursor.skip(12)
-    _verdict(figure, cursor, document)
-    _other_axes(figure, cursor, document)
+    _verdict(cursor, document)
+    _other_axes(cursor, document)
     cursor.skip(10)
     above = plan(document, facts(document))
     cursor.write("Findings", size=10.5, weight="bold")
@@ -84,7 +84,7 @@ def draw(document: Document) -> Iterator[Figure]:
         more = f"{len(rest)} of {len(document.findings)} findings: next page."
         cursor.write(more, x=TEXT_X, size=7.5, colour=MUTED)
     cursor.skip(BEFORE_MAP)
-    above.draw(figure, cursor)
+    above.draw(cursor)
     yield figure
     if rest:
         yield from _continued(rest)
@@ -102,12 +102,11 @@ def _continued(findings: tuple[Finding, ...]) -> Iterator[Figure]:
 
 def _subtitle(document: Document) -> str:
     log = document.comparison.flight.log
-    who = ", ".join(part for part in (document.student.name, document.student.id) if part)
-    about = (who, log.name, f"{log.duration_s:.1f} s", f"{log.firmware}, {log.hardware}")
-    return " · ".join(part for part in about if part)
+    about = (log.name, f"{log.duration_s:.1f} s", f"{log.firmware}, {log.hardware}")
+    return " · ".join(filter(None, (who(document.student, ", "), *about)))
 
 
-def _verdict(figure: Figure, cursor: Cursor, document: Document) -> None:
+def _verdict(cursor: Cursor, document: Document) -> None:
     """The main axis, large: each filter on its half of the page."""
     result = document.comparison.main
     along = the(result.axis.name)
@@ -156,7 +155,7 @@ def _large_numbers(summary: FilterSummary, truth: AgainstTruth | Unavailable) ->
     return words
 
 
-def _other_axes(figure: Figure, cursor: Cursor, document: Document) -> None:
+def _other_axes(cursor: Cursor, document: Document) -> None:
     """The axes beside the main one, a row each."""
     others = [axis for axis in document.comparison.axes if axis is not document.comparison.main]
     if not others:
@@ -166,12 +165,9 @@ def _other_axes(figure: Figure, cursor: Cursor, document: Document) -> None:
     names = ("variance", "mean NIS", to_truth)
     blank = ("",) * 3
     cursor.skip(5)
-    _row(
-        figure, cursor, ("", "our filter", "", "", "EKF2" if beside else "", "", "", ""),
-        [MUTED] * 8,
-    )  # fmt: skip
+    _row(cursor, ("", "our filter", "", "", "EKF2" if beside else "", "", "", ""), [MUTED] * 8)
     apart = "ours - EKF2 (m)" if beside else ""
-    _row(figure, cursor, ("axis", *names, *(names if beside else blank), apart), [MUTED] * 8)
+    _row(cursor, ("axis", *names, *(names if beside else blank), apart), [MUTED] * 8)
     cursor.skip(2.5)
     cursor.rule()
     colours = ["black", *[OURS] * 3, *[EKF2] * 3, "black"]
@@ -182,14 +178,14 @@ def _other_axes(figure: Figure, cursor: Cursor, document: Document) -> None:
             *(_cells(result.ekf2, result.ekf2_truth) if beside else blank),
             difference_cells(result.difference)[0],
         )
-        _row(figure, cursor, cells, colours)
+        _row(cursor, cells, colours)
 
 
-def _row(figure: Figure, cursor: Cursor, cells: Sequence[str], colours: Sequence[str]) -> None:
+def _row(cursor: Cursor, cells: Sequence[str], colours: Sequence[str]) -> None:
     cursor.y -= TABLE_SIZE * 1.4 / POINTS_PER_HEIGHT
     for (x, align), text, colour in zip(COLUMNS, cells, colours, strict=True):
         if text:
-            figure.text(
+            cursor.figure.text(
                 x, cursor.y, text, size=TABLE_SIZE, ha=align, va="baseline", color=colour,
                 weight="bold" if text.startswith(("over", "under")) else "normal",
             )  # fmt: skip
@@ -201,39 +197,30 @@ def _cells(
     if isinstance(summary, Unavailable):
         return "not available", "", ""
     cells = statement_cells(summary.consistency)
-    return (
-        cells.words,
-        cells.nis,
-        error_cells(truth)[0],
-    )
+    return cells.words, cells.nis, error_cells(truth)[0]
 
 
 def facts(document: Document) -> list[tuple[str, str]]:
     """What was compared, in labels and sentences."""
-    comparison = document.comparison
-    log, source, segment = comparison.flight.log, comparison.source, comparison.segment
+    comparison, flight = document.comparison, document.comparison.flight
+    log, source, segment = flight.log, comparison.source, comparison.segment
     source_text = (
         f"{source.name}: {source.description}, {source.rate_hz:.1f} Hz, {source.frame}; "
         f"{comparison.source_reason}"
     )
     if any(part.what == "position source vehicle_visual_odometry" for part in comparison.missing):
         source_text += ". SDLOG_PROFILE 129 would have logged it as it arrived"
-    clock = ""
+    clock = "" if source.alignment is None else source.clock
     if source.clock_map is not None:
         clock = clock_words(source.clock_map)
-    elif source.alignment is not None:
-        clock = source.clock
-    aisle = next((axis.axis for axis in comparison.axes if axis.axis.name == AISLE), None)
+    aisle = next((line for line in comparison.lines if line.name == AISLE), None)
     listed = [
         ("Position", source_text),
         ("Clock", clock),
         ("Segment", f"{segment.start_s:.2f} s to {segment.end_s:.2f} s, {segment.reason}"),
         ("Our filter", settings_words(comparison.settings)),
         ("Aisle", "" if aisle is None else f"{aisle.heading_deg:.1f}° from north ({aisle.note})"),
-        (
-            "With",
-            ", ".join(f"{f.name}, SHA-256 {f.sha256[:12]}…" for f in comparison.flight.inputs),
-        ),
+        ("With", ", ".join(f"{f.name}, SHA-256 {f.sha256[:12]}…" for f in flight.inputs)),
         ("SHA-256", f"{log.sha256}, {log.size_bytes / 1e6:.2f} MB"),
     ]
     return [(label, text) for label, text in listed if text]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import ClassVar
 
 from px4fuse.analysis import Analysis, Counterfactual
 from px4fuse.comparison.comparison import Comparison
@@ -15,6 +16,15 @@ from px4fuse.loop.loop import Loop
 from px4fuse.results.contract import ChangeResults
 from px4fuse.results.model import Provenance, Student
 from px4fuse.trajectory.evaluation import Evaluation
+
+
+def who(student: Student, between: str) -> str:
+    """Name and id, as far as they are given."""
+    return between.join(filter(None, (student.name, student.id)))
+
+
+# Whose the pages are that are not handed in
+NOBODY = Student()
 
 
 @dataclass(frozen=True)
@@ -83,11 +93,7 @@ class WhatIfDocument:
 
     made_of: Counterfactual
     command: str
-
-    @property
-    def student(self) -> Student:
-        """Nobody: what EKF2 would have done is not handed in."""
-        return Student()
+    student: ClassVar[Student] = NOBODY
 
     @property
     def log(self) -> tuple[str, str]:
@@ -110,11 +116,8 @@ class EvaluationDocument:
     """
 
     score: Evaluation
-
-    @property
-    def student(self) -> Student:
-        """Nobody: a score is handed in with the loop that it is about."""
-        return Student()
+    command: ClassVar[str] = ""
+    student: ClassVar[Student] = NOBODY
 
     @property
     def log(self) -> tuple[str, str]:
@@ -141,11 +144,7 @@ class ChangesDocument:
     results: ChangeResults
     a: Analysis | None
     b: Analysis | None
-
-    @property
-    def student(self) -> Student:
-        """Nobody: a difference is not handed in."""
-        return Student()
+    student: ClassVar[Student] = NOBODY
 
     @property
     def command(self) -> str:
@@ -199,5 +198,5 @@ class LoopDocument:
     @property
     def facts(self) -> tuple[tuple[str, str], ...]:
         """Whose report it is, and which file it is about."""
-        who = ", ".join(part for part in (self.student.name, self.student.id) if part)
-        return (*((("Student", who),) if who else ()), ("SHA-256", self.log[1]))
+        student = who(self.student, ", ")
+        return (*((("Student", student),) if student else ()), ("SHA-256", self.log[1]))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from importlib import metadata
 from typing import Any
@@ -50,7 +50,6 @@ from px4fuse.report.style import (
     empty,
     page,
     printable,
-    put,
     report_style,
     thin,
     wrap,
@@ -82,7 +81,6 @@ PANEL, TALL, BELOW, TITLE, LINE = 84.0, 190.0, 52.0, 16.0, 8.9
 # The least and the largest height of the maps with their words
 LEAST_MAPS, MOST_MAPS = 215.0, 480.0
 MOST_CURVES, MOST_BOXES = 3, 12
-TABLE_SIZE = 7.4
 TABLE_EDGES = (LEFT, 0.21, 0.30, 0.43, 0.51, 0.59, 0.67, 0.75, 0.82)
 TABLE_HEADS = (
     "error", "RMSE", "95 % interval", "mean", "median", "std", "max", "n", "rotation RMSE (°)",
@@ -164,7 +162,7 @@ def draw(document: EvaluationDocument) -> Iterator[Figure]:
         if cursor.y < BOTTOM + 0.03:
             yield figure
             figure, cursor = page("Trajectory error, continued")
-        _row(cursor, cells, head=cells is TABLE_HEADS)
+        cursor.row(TABLE_EDGES, cells, head=cells is TABLE_HEADS)
     cursor.skip(2)
     cursor.write(" ".join([*reasons(score), *score.notes]), size=7.0, colour=MUTED)
     cursor.skip(4)
@@ -205,17 +203,6 @@ def picture(score: Evaluation) -> bytes:
         software = f"px4fuse {metadata.version('px4fuse')}"
         figure.savefig(out, format="png", dpi=PICTURE_DPI, metadata={"Software": software})
     return out.getvalue()
-
-
-def _row(cursor: Cursor, cells: Sequence[str], *, head: bool) -> None:
-    """One row of the table of scores."""
-    cursor.y -= TABLE_SIZE * 1.45 / POINTS_PER_HEIGHT
-    for x, text in zip(TABLE_EDGES, cells, strict=True):
-        colour = MUTED if head else "black"
-        put(cursor.figure, x, cursor.y, text, size=TABLE_SIZE, color=colour)
-    if head:
-        cursor.skip(2.5)
-        cursor.rule()
 
 
 def _maps(figure: Figure, cursor: Cursor, score: Evaluation, points: float) -> None:
@@ -277,7 +264,7 @@ def _before(axes: Axes, score: Evaluation, view: View) -> None:
         (matched.reference, REFERENCE, "reference"),
         (matched.estimate, {"color": OURS, "lw": 1.2}, "estimate before alignment"),
     ):
-        _way(axes, view.of(track.position_m), score.time_s, label=label, **style)
+        way(axes, view.of(track.position_m), score.time_s, label=label, **style)
     _framed(axes, score, view)
 
 
@@ -294,7 +281,7 @@ def _path(axes: Axes, score: Evaluation, view: View, scale: Axes | None) -> None
     drawn = LineCollection(list(pieces), cmap=COLOURS, norm=norm, lw=3.0, capstyle="round")
     drawn.set_array(largest[unbroken])
     axes.add_collection(drawn)
-    _way(axes, view.of(score.reference_m), score.time_s, label="reference", **REFERENCE)
+    way(axes, view.of(score.reference_m), score.time_s, label="reference", **REFERENCE)
     start, worst = view.of(score.estimate_m)[[0, int(np.argmax(error))]]
     axes.plot(*start, "o", color="white", mec="black", ms=5, mew=1.0, label="start", zorder=5)
     axes.plot(*worst, "x", color="black", ms=7, mew=1.6, label="largest error", zorder=5)
@@ -445,7 +432,7 @@ def _line(axes: Axes, x: Array, y: Array, time_s: Array, **style: Any) -> None:
     axes.plot(np.insert(kept, after, np.nan), np.insert(values, after, np.nan), **style)
 
 
-def _way(axes: Axes, seen: Array, time_s: Array, **style: Any) -> None:
+def way(axes: Axes, seen: Array, time_s: Array, **style: Any) -> None:
     """A path on a map, shape (n, 2), thinned evenly; no gap in time is crossed."""
     gaps = _gaps(time_s)
     even = np.linspace(0, len(seen) - 1, min(len(seen), PIECES)).astype(np.intp)

@@ -10,7 +10,7 @@ from px4fuse.arrays import Array
 from px4fuse.flight import Unavailable
 from px4fuse.loop.analysis import SMALLEST_STAMP_S
 from px4fuse.report.loop_words import interval_words
-from px4fuse.trajectory.evaluation import Evaluation
+from px4fuse.trajectory.evaluation import AbsoluteError, Evaluation
 from px4fuse.trajectory.scores import RelativeError, Statistics
 
 # Above this share of the squared error the worst tenth of the poses is what there is to look at
@@ -52,13 +52,11 @@ def _aligned(score: Evaluation) -> str:
 
 def score_rows(score: Evaluation) -> list[list[str]]:
     """Of the ATE and every RPE: RMSE, interval, mean, median, std, max, n, and RMSE of rotation."""
-    ate = score.ate
-    rows = [["ATE (m)", *_cells(ate.translation, interval_words(ate.interval), ate.rotation)]]
-    rows += [
-        [f"RPE {e.delta} (m)", *_cells(e.translation, interval_words(e.interval), e.rotation)]
-        for e in score.rpe
+    named: list[tuple[str, AbsoluteError | RelativeError]]
+    named = [("ATE (m)", score.ate), *((f"RPE {e.delta} (m)", e) for e in score.rpe)]
+    return [
+        [name, *_cells(e.translation, interval_words(e.interval), e.rotation)] for name, e in named
     ]
-    return rows
 
 
 def _cells(

@@ -44,9 +44,8 @@ TALLEST = 200.0
 
 def draw(document: Document) -> Iterator[Figure]:
     """Draw one page."""
-    result, segment = document.comparison.main, document.comparison.segment
-    name = result.axis.name
-    along = the(name)
+    result = document.comparison.main
+    along = the(result.axis.name)
     figure, cursor = page(f"The flight along {along}")
     legend(figure, cursor, document)
     reference = error_reference(result)
@@ -55,7 +54,9 @@ def draw(document: Document) -> Iterator[Figure]:
         (f"Velocity along {along} (m/s)", velocity_words(result), draw_velocity, velocity_numbers),
     ]
     if not isinstance(reference, Unavailable):
-        panels.append((error_title(result), error_words(result), draw_error, error_numbers))
+        truth = reference is result.truth
+        title = "Error: position - truth (m)" if truth else "Difference: ours - EKF2 (m)"
+        panels.append((title, error_words(result), draw_error, error_numbers))
     reasons = [nothing_concluded(document)]
     if isinstance(reference, Unavailable):
         reasons.append(f"No error is drawn: {reference.reason}. {reference.remedy}")
@@ -66,7 +67,6 @@ def draw(document: Document) -> Iterator[Figure]:
         strip = place == 0 and bool(document.events.modes)
         axes = panel(cursor, title, say, height, above=12.0 if strip else 4.0)
         draw_panel(axes, result, MAX_POINTS)
-        axes.set_xlim(segment.start_s, segment.end_s)
         marks.draw(axes, document, strip=strip)
         if place < len(panels) - 1:
             bare_x(axes)
@@ -211,13 +211,6 @@ def _nearer(ours: float, theirs: float) -> str:
         return "Ours and EKF2 are equally near to the truth"
     first, second = ("Ours", "EKF2") if ours < theirs else ("EKF2", "ours")
     return f"{first} is {high / low:.2g} times nearer to the truth than {second}"
-
-
-def error_title(result: AxisComparison) -> str:
-    """Title of the panel of errors."""
-    if isinstance(result.truth, pd.DataFrame):
-        return "Error: position - truth (m)"
-    return "Difference: ours - EKF2 (m)"
 
 
 def error_words(result: AxisComparison) -> str:

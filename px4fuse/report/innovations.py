@@ -27,7 +27,6 @@ from px4fuse.report.style import (
     EKF2_REJECTED,
     MAX_POINTS,
     MEASUREMENT,
-    MUTED,
     OURS,
     OURS_BAND,
     OURS_DOTS,
@@ -58,21 +57,14 @@ INNOVATIONS, SIGMA_P, SIGMA_V, ZOOM = 140.0, 80.0, 60.0, 140.0
 
 def draw(document: Document) -> Iterator[Figure]:
     """Draw one page: innovations, σ_p and σ_v on one time axis, then the zooms."""
-    result, segment = document.comparison.main, document.comparison.segment
-    name = result.axis.name
-    along = the(name)
-    figure, cursor = page(f"Innovations and variances along {along}")
-    strip = bool(document.events.modes)
+    result = document.comparison.main
+    figure, cursor = page(f"Innovations and variances along {the(result.axis.name)}")
     axes = panel(
-        cursor,
-        "Innovation = measurement - prediction (m)",
-        innovation_words(result),
-        INNOVATIONS,
-        above=12.0 if strip else 4.0,
-    )
+        cursor, "Innovation = measurement - prediction (m)", innovation_words(result), INNOVATIONS,
+        above=12.0 if document.events.modes else 4.0,
+    )  # fmt: skip
     draw_innovations(axes, result, MAX_POINTS)
-    axes.set_xlim(segment.start_s, segment.end_s)
-    marks.draw(axes, document, axis="", strip=strip)
+    marks.draw(axes, document, axis="", strip=True)
     bare_x(axes)
     below(cursor, innovation_numbers(result, axes.get_ylim()[1]), points=4.0)
     cursor.skip(8)
@@ -91,8 +83,7 @@ def draw(document: Document) -> Iterator[Figure]:
         ),
     ):
         axes = panel(cursor, title, say, height)
-        draw_sigma(axes, result, column, MAX_POINTS)
-        axes.set_xlim(segment.start_s, segment.end_s)
+        draw_sigma(axes, result, MAX_POINTS, column)
         marks.draw(axes, document)
         if column.startswith("position"):
             bare_x(axes)
@@ -102,8 +93,7 @@ def draw(document: Document) -> Iterator[Figure]:
         cursor.skip(10)
     _zooms(cursor, document)
     for note in verdict_notes(document.comparison):
-        cursor.skip(2)
-        cursor.write(note, size=7, colour=MUTED, spacing=1.25)
+        below(cursor, note, points=2.0)
     yield figure
 
 
@@ -262,7 +252,9 @@ def sigma_numbers(result: AxisComparison) -> str:
     return f"median: {_medians(result, 'sigma_p_median_m', 'm')}"
 
 
-def draw_sigma(axes: Axes, result: AxisComparison, column: str, limit: int) -> None:
+def draw_sigma(
+    axes: Axes, result: AxisComparison, limit: int, column: str = "position_variance_m2"
+) -> None:
     """σ of position or velocity of both filters, log scale."""
     steps = result.replay.steps
     axes.plot(*thin(steps.index.to_numpy(), np.sqrt(steps[column].to_numpy()), limit), **OURS_LINE)
@@ -292,9 +284,12 @@ def sigma_words(document: Document) -> str:
     return words
 
 
+def _cut(frame: pd.DataFrame, window: Span) -> pd.DataFrame:
+    return frame[(frame.index >= window[0]) & (frame.index <= window[1])]
+
+
 def _largest(frame: pd.DataFrame, start_s: float, end_s: float) -> float:
-    inside = frame["position_variance_m2"][(frame.index >= start_s) & (frame.index <= end_s)]
-    return float(np.sqrt(inside.max()))
+    return float(np.sqrt(_cut(frame, (start_s, end_s))["position_variance_m2"].max()))
 
 
 def _medians(result: AxisComparison, field: str, unit: str) -> str:
@@ -330,28 +325,16 @@ def zoom_window(result: AxisComparison, segment: Segment) -> Span:
     return start, min(start + length, segment.end_s)
 
 
-def sawtooth(result: AxisComparison) -> tuple[Array, Array]:
-    """Time and σ_p of our filter with both values at each update: just before and just after."""
-    steps, updates = result.replay.steps, result.replay.updates
-    time = np.concatenate([updates.index.to_numpy(), steps.index.to_numpy()])
-    variance = np.concatenate(
-        [
-            updates["prior_position_variance_m2"].to_numpy(),
-            steps["position_variance_m2"].to_numpy(),
-        ]
-    )
-    order = np.argsort(time, kind="stable")  # the prior stands first at equal times
-    return time[order], np.sqrt(variance[order])
-
-
 def _sawtooth(axes: Axes, result: AxisComparison, window: Span) -> None:
-    time, sigma = sawtooth(result)
-    shown = (time >= window[0]) & (time <= window[1])
-    axes.plot(time[shown], sigma[shown], color=OURS, lw=1.1, marker=".", ms=2.4, mew=0)
+    """σ_p with both values at each update, just before and just after."""
+    updates, steps = result.replay.updates, result.replay.steps
+    prior, after_each = updates["prior_position_variance_m2"], steps["position_variance_m2"]
+    # stable, so that the prior stands first at equal times
+    both = pd.concat([prior, after_each]).sort_index(kind="stable").loc[slice(*window)]
+    axes.plot(both.index, np.sqrt(both), color=OURS, lw=1.1, marker=".", ms=2.4, mew=0)
     frame = result.ekf2_innovations
     if isinstance(frame, pd.DataFrame):
-        cut = frame[(frame.index >= window[0]) & (frame.index <= window[1])]
-        cut = cut.dropna(subset=["prior_variance_m2"])
+        cut = _cut(frame, window).dropna(subset=["prior_variance_m2"])
         before = np.sqrt(cut["prior_variance_m2"].to_numpy())
         after = np.sqrt(cut["posterior_variance_m2"].to_numpy())
         at = cut.index.to_numpy()
@@ -359,8 +342,7 @@ def _sawtooth(axes: Axes, result: AxisComparison, window: Span) -> None:
         axes.plot(at, before, ls="none", marker="^", ms=3.6, mew=0.7, mfc="none", color=EKF2)
         axes.plot(at, after, ls="none", marker="v", ms=3.6, mew=0, color=EKF2)
     if isinstance(result.ekf2_variance, pd.DataFrame):
-        variance = result.ekf2_variance["position_variance_m2"]
-        variance = variance[(variance.index >= window[0]) & (variance.index <= window[1])]
+        variance = _cut(result.ekf2_variance, window)["position_variance_m2"]
         axes.plot(variance.index.to_numpy(), np.sqrt(variance.to_numpy()), ls="none", marker="s",
                   ms=3.0, mew=0.7, mfc="white", color=EKF2)  # fmt: skip
     axes.set_xlim(*window)
@@ -389,18 +371,13 @@ def _before_after(name: str, summary: FilterSummary) -> str:
 
 def start_words(result: AxisComparison) -> str:
     """What to see in the first seconds."""
-    initial = float(np.sqrt(result.replay.steps["position_variance_m2"].iloc[0]))
+    sigma = np.sqrt(result.replay.steps["position_variance_m2"])
+    first = f"From σ {sigma.iloc[0]:g} m (P₀)"
     steady = result.kf.sigma_p_after_update_m
-    if steady is None:
-        return f"From σ {initial:g} m (P₀) on."
-    time, sigma = result.replay.steps.index, np.sqrt(result.replay.steps["position_variance_m2"])
-    settled = time[(sigma < 1.2 * steady).to_numpy()]
-    if not len(settled):
-        return f"From σ {initial:g} m (P₀) on."
-    return (
-        f"From σ {initial:g} m (P₀) to its steady {steady:.2g} m within "
-        f"{settled[0] - time[0]:.1f} s."
-    )
+    settled = sigma.index[(sigma < 1.2 * (steady or 0.0)).to_numpy()]
+    if steady is None or not len(settled):
+        return f"{first} on."
+    return f"{first} to its steady {steady:.2g} m within {settled[0] - sigma.index[0]:.1f} s."
 
 
 def log_ticks(axes: Axes) -> None:

@@ -8,15 +8,16 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
-from px4fuse.arrays import Array
 from px4fuse.findings import Finding
 from px4fuse.flight import Unavailable
 from px4fuse.loop.corrections import BY_DISTANCE, PLAIN, UNCORRECTED, Correction
 from px4fuse.loop.loop import Loop
-from px4fuse.plain import p_words
+from px4fuse.plain import capital, p_words
 from px4fuse.report.cover import write_finding
 from px4fuse.report.document import Document, LoopDocument
+from px4fuse.report.evaluation import way
 from px4fuse.report.loop_words import (
     ate_words,
     by_distance_words,
@@ -35,24 +36,20 @@ from px4fuse.report.style import (
     MUTED,
     OURS,
     POINTS_PER_HEIGHT,
-    POINTS_PER_WIDTH,
     RIGHT,
+    ROW_SIZE,
     TRUTH_LINE,
     Cursor,
     appendix,
     caption,
     page,
-    panels,
-    printable,
-    shorten,
     thin,
 )
-from px4fuse.trajectory.evaluation import Evaluation
+from px4fuse.trajectory.evaluation import AbsoluteError, Evaluation
 from px4fuse.trajectory.graph.analysis import SOLUTIONS
 from px4fuse.trajectory.model import AXES_OF_FRAME
-from px4fuse.trajectory.scores import Interval, Statistics
+from px4fuse.trajectory.scores import RelativeError
 
-Value = Statistics | Unavailable
 GREEN = "#3a7d5c"
 STYLES: Mapping[str, dict[str, Any]] = {
     UNCORRECTED: {"color": EKF2, "lw": 1.1, "ls": (0, (4, 1.6))},
@@ -63,9 +60,6 @@ STYLES: Mapping[str, dict[str, Any]] = {
 }
 MAP_MIN_HEIGHT = 0.30
 MAP_POINTS = 2000
-GAP_STEPS = 10.0
-TABLE_SIZE = 7.4
-LABEL_WIDTH = 0.085
 
 
 def draw(document: Document) -> Iterator[Figure]:
@@ -95,7 +89,7 @@ def draw_loop(
         "that is not true would warp the whole path, so that each one is tested before its use.",
     )
     for label, text in (*facts, *loop_lines(loop)):
-        _line(cursor, label, text)
+        cursor.labelled(label, text)
     for text in (by_distance_words(loop), redundancy_words(loop), *refusals(loop)):
         if text:
             cursor.skip(2)
@@ -103,12 +97,12 @@ def draw_loop(
     for finding in findings:
         write_finding(cursor, finding)
     cursor.skip(8)
-    _table(figure, cursor, loop)
+    _table(cursor, loop)
     if cursor.y - BOTTOM < MAP_MIN_HEIGHT:
         yield figure
         figure, cursor = page(name("Loop closure: the map"))
     cursor.skip(10)
-    _map(figure, cursor, loop)
+    _map(cursor, loop)
     yield figure
     figure, cursor = page(
         name("Along the path"),
@@ -116,57 +110,31 @@ def draw_loop(
         "alignment. A correction that helps brings the error down along most of the path, not only "
         "at its end.",
     )
-    _along(figure, cursor, loop)
+    _along(cursor, loop)
     yield figure
     yield from _scores(loop, name)
 
 
-def _line(cursor: Cursor, label: str, text: str) -> None:
-    top = cursor.y
-    cursor.write(label, weight="bold", right=LEFT + LABEL_WIDTH)
-    cursor.y = top
-    cursor.write(text, x=LEFT + LABEL_WIDTH)
-
-
-def _row(figure: Figure, cursor: Cursor, cells: list[tuple[float, str]], **style: Any) -> None:
-    """One row of a table: left edges and texts, each cut at the next edge."""
-    cursor.y -= TABLE_SIZE * 1.45 / POINTS_PER_HEIGHT
-    edges = [x for x, _ in cells] + [RIGHT]
-    for (x, text), following in zip(cells, edges[1:], strict=True):
-        width = (following - x) * POINTS_PER_WIDTH - 4.0
-        figure.text(
-            x, cursor.y, shorten(printable(text), TABLE_SIZE, width), size=TABLE_SIZE, **style
-        )
-
-
-def _table(figure: Figure, cursor: Cursor, loop: Loop) -> None:
+def _table(cursor: Cursor, loop: Loop) -> None:
     """Every path with how far it moved and its ATE against each reference."""
     references = [reference.name for reference in loop.references]
     edges = [LEFT, 0.30]
     edges += list(np.linspace(0.50, RIGHT, len(references) + 1)[:-1]) if references else []
     heads = ["path", "moved RMS / max (m)", *(f"ATE to {name} (m)" for name in references)]
-    _row(figure, cursor, list(zip(edges, heads, strict=True)), color=MUTED)
-    cursor.skip(2.5)
-    cursor.rule()
+    cursor.row(edges, heads, head=True)
     for part in loop.reported:
         scores = [ate_words(part.scores[name]) for name in references]
         cells = [part.name, moved_words(part), *scores]
-        _row(figure, cursor, list(zip(edges, cells, strict=True)))
+        cursor.row(edges, cells)
     cursor.skip(4)
-    if references:
-        cursor.write(
-            "ATE is the RMSE of position after alignment, in brackets its 95 % interval by block "
-            "bootstrap where the flight is long enough for one.",
-            size=7,
-            colour=MUTED,
-        )
-    else:
-        cursor.write(
-            "Neither ground truth nor a SLAM trajectory is given, so that no error of the path can "
-            "be stated; --reference FILE scores it.",
-            size=7,
-            colour=MUTED,
-        )
+    said = (
+        "ATE is the RMSE of position after alignment, in brackets its 95 % interval by block "
+        "bootstrap where the flight is long enough for one."
+        if references
+        else "Neither ground truth nor a SLAM trajectory is given, so that no error of the path "
+        "can be stated; --reference FILE scores it."
+    )
+    cursor.write(said, size=7, colour=MUTED)
 
 
 def shown(loop: Loop) -> list[Correction]:
@@ -174,15 +142,16 @@ def shown(loop: Loop) -> list[Correction]:
     return [part for part in loop.reported if part.name in STYLES]
 
 
-def _map(figure: Figure, cursor: Cursor, loop: Loop) -> None:
+def _map(cursor: Cursor, loop: Loop) -> None:
     bottom = BOTTOM + 0.075
+    figure = cursor.figure
     axes = figure.add_axes((LEFT + 0.03, bottom, RIGHT - LEFT - 0.03, cursor.y - 0.012 - bottom))
     path = loop.odometry.trajectory
     names = AXES_OF_FRAME[path.frame]
     axes.set_title("from above, in the odometry's frame")
     _reference(axes, loop)
     for part in shown(loop):
-        position = _thinned(part.trajectory.position_m)
+        position = part.trajectory.position_m[:: max(1, len(part.trajectory) // MAP_POINTS)]
         axes.plot(position[:, 1], position[:, 0], label=part.name, **STYLES[part.name])
     start, end = path.position_m[0], path.position_m[-1]
     axes.plot(start[1], start[0], "o", color="black", ms=5, label="start", zorder=5)
@@ -216,31 +185,26 @@ def _reference(axes: Axes, loop: Loop) -> None:
                 continue
             transform = score.transform
             back = transform.rotation.inv().apply(score.reference_m - transform.translation_m)
-            position = _thinned(_broken(back / transform.scale, score.time_s))
-            axes.plot(position[:, 1], position[:, 0], label=name, **TRUTH_LINE, zorder=4)
+            position = back / transform.scale
+            way(axes, position[:, (1, 0)], score.time_s, label=name, **TRUTH_LINE, zorder=4)
             return
 
 
-def _broken(position: Array, time_s: Array) -> Array:
-    """A path with breaks where its poses have a gap in time, so that no line crosses it."""
-    steps = np.diff(time_s)
-    gaps = np.flatnonzero(steps > GAP_STEPS * np.median(steps)) + 1
-    return np.insert(position, gaps, np.nan, axis=0)
-
-
-def _thinned(position: Array) -> Array:
-    step = max(1, len(position) // MAP_POINTS)
-    return position[::step]
-
-
-def _along(figure: Figure, cursor: Cursor, loop: Loop) -> None:
+def _along(cursor: Cursor, loop: Loop) -> None:
     scored = [name for name in (reference.name for reference in loop.references)
               if isinstance(loop.odometry.scores[name], Evaluation)]  # fmt: skip
     corrected = [part for part in shown(loop) if part is not loop.odometry]
     rows = 1 + bool(corrected) + len(scored)
-    grid = panels(figure, cursor.y - 0.03, max(BOTTOM + 0.05, 0.72 - 0.22 * rows), rows, 1,
-                  hspace=0.38)  # fmt: skip
-    height, *others = [row[0] for row in grid]
+    grid = cursor.figure.add_gridspec(
+        rows, 1, left=LEFT, right=RIGHT, top=cursor.y - 0.03,
+        bottom=max(BOTTOM + 0.05, 0.72 - 0.22 * rows), hspace=0.38,
+    )  # fmt: skip
+    height, *others = (cursor.figure.add_subplot(grid[row]) for row in range(rows))
+    for axes in (height, *others):
+        axes.xaxis.set_major_locator(MaxNLocator(6))
+        axes.yaxis.set_major_locator(MaxNLocator(4))
+        if axes is not (height, *others)[-1]:
+            axes.tick_params(axis="x", labelbottom=False, bottom=False)
     errors = others[bool(corrected) :]
     if corrected:
         _moved(others[0], loop, corrected)
@@ -302,9 +266,7 @@ def _scores(loop: Loop, name: Callable[[str], str]) -> Iterator[Figure]:
     cursor.skip(2)
     edges = [LEFT, 0.27, 0.38, 0.45, 0.49, 0.58, 0.72, 0.82]
     heads = ["same place at", "missed by (m)", "d²", "dof", "p", "gate", "DCS weight", "GNC weight"]
-    _row(figure, cursor, list(zip(edges, heads, strict=True)), color=MUTED)
-    cursor.skip(2.5)
-    cursor.rule()
+    cursor.row(edges, heads, head=True)
     for judged in loop.closures:
         if cursor.y < BOTTOM + 0.03:
             yield figure
@@ -319,22 +281,21 @@ def _scores(loop: Loop, name: Callable[[str], str]) -> Iterator[Figure]:
             f"{gate.degrees_of_freedom}", p_words(gate.p).removeprefix("p "),
             "accepted" if gate.accepted else "REJECTED", *weights,
         ]  # fmt: skip
-        _row(figure, cursor, list(zip(edges, cells, strict=True)),
-             color="black" if gate.accepted else "#a61b1b")  # fmt: skip
+        cursor.row(edges, cells, colour="black" if gate.accepted else "#a61b1b")
     if not loop.closures:
         cursor.write("None.")
     for reference in loop.references:
         rows = sum(1 + len(s.rpe) for p in loop.reported
                    if isinstance(s := p.scores[reference.name], Evaluation))  # fmt: skip
-        if cursor.y - 0.14 - rows * TABLE_SIZE * 1.45 / POINTS_PER_HEIGHT < BOTTOM:
+        if cursor.y - 0.14 - rows * ROW_SIZE * 1.45 / POINTS_PER_HEIGHT < BOTTOM:
             yield figure
             figure, cursor = page(name("Closures and scores, continued"))
         cursor.skip(12)
-        _relative(figure, cursor, loop, reference.name)
+        _relative(cursor, loop, reference.name)
     yield figure
 
 
-def _relative(figure: Figure, cursor: Cursor, loop: Loop, name: str) -> None:
+def _relative(cursor: Cursor, loop: Loop, name: str) -> None:
     cursor.write(f"Against {name}", size=10.5, weight="bold")
     cursor.skip(2)
     scores = [(part, part.scores[name]) for part in loop.reported]
@@ -346,23 +307,15 @@ def _relative(figure: Figure, cursor: Cursor, loop: Loop, name: str) -> None:
     first = good[0][1]
     edges = [LEFT, 0.27, 0.38, 0.50, 0.66, 0.80]
     heads = ["path", "error over", "RMSE (m)", "95 % interval (m)", "rotation RMSE (°)", "n"]
-    _row(figure, cursor, list(zip(edges, heads, strict=True)), color=MUTED)
-    cursor.skip(2.5)
-    cursor.rule()
+    cursor.row(edges, heads, head=True)
     for part, score in good:
-        ate = score.ate
-        rows: list[tuple[str, Value, Interval | Unavailable, Value]] = [
-            ("ATE", ate.translation, ate.interval, ate.rotation)
-        ]
-        rows += [(f"RPE {e.delta}", e.translation, e.interval, e.rotation) for e in score.rpe]
-        for index, (label, moved, interval, turned) in enumerate(rows):
-            cells = [
-                part.name if index == 0 else "", label, *statistics_words(moved, interval, turned)
-            ]  # fmt: skip
-            _row(figure, cursor, list(zip(edges, cells, strict=True)))
+        rows: list[tuple[str, AbsoluteError | RelativeError]]
+        rows = [("ATE", score.ate), *((f"RPE {e.delta}", e) for e in score.rpe)]
+        for index, (label, e) in enumerate(rows):
+            numbers = statistics_words(e.translation, e.interval, e.rotation)
+            cursor.row(edges, [part.name if index == 0 else "", label, *numbers])
         cursor.skip(2.5)
         cursor.rule("#dddddd")
     cursor.skip(4)
-    told = [score_words(first), *first.notes, *first.warnings]
-    for text in told:
-        cursor.write(text[:1].upper() + text[1:], size=7, colour=MUTED)
+    for text in (score_words(first), *first.notes, *first.warnings):
+        cursor.write(capital(text), size=7, colour=MUTED)

@@ -9,6 +9,7 @@ from rich.text import Text
 from px4fuse.findings import Finding
 from px4fuse.flight import Unavailable
 from px4fuse.loop.loop import Loop
+from px4fuse.report.evaluation_words import reasons
 from px4fuse.report.loop_words import (
     by_distance_words,
     closure_name,
@@ -108,11 +109,7 @@ def print_evaluation(console: Console, score: Evaluation) -> None:
         if isinstance(error.rotation, Statistics):
             _statistics(table, f"RPE {error.delta} (°)", error.rotation)
     console.print(table)
-    missing = [part for part in (ate.interval, ate.rotation) if isinstance(part, Unavailable)]
-    missing += [e.translation for e in score.rpe if isinstance(e.translation, Unavailable)]
-    for reason in dict.fromkeys(f"No {part.what}: {part.reason}." for part in missing):
-        say(console, Text(reason, "dim"))
-    for text in score.notes:
+    for text in (*reasons(score), *score.notes):
         say(console, Text(text, "dim"))
     for text in score.warnings:
         say(console, Text(text, "yellow"))

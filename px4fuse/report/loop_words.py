@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from px4fuse.arrays import Array
 from px4fuse.filter.signals import Segment
 from px4fuse.flight import Unavailable
 from px4fuse.loop.analysis import SMALLEST_STAMP_S
@@ -54,20 +53,15 @@ def closure_words(loop: Loop) -> str:
     error, misclosure = loop.closure_error_m, loop.misclosure_m
     if error is None or isinstance(misclosure, Unavailable):
         return f"path {loop.path_length_m:.1f} m; no closure error is stated: it did not come back"
+    named = zip(AXES_OF_FRAME[loop.odometry.trajectory.frame], misclosure, strict=True)
     text = (
         f"{error:.2f} m after {loop.path_length_m:.1f} m = {error / loop.path_length_m:.2%} "
-        f"({axes_words(loop.odometry.trajectory, misclosure)})"
+        f"({', '.join(f'{name} {part:+.2f} m' for name, part in named)})"
     )
     turned = loop.misclosure_heading_deg
     if isinstance(turned, Unavailable):
         return f"{text}; heading: not known, {turned.reason}"
     return f"{text}; heading {turned:+.1f}°"
-
-
-def axes_words(path: Trajectory, vector: Array) -> str:
-    """A vector with the names of its axes."""
-    names = AXES_OF_FRAME[path.frame]
-    return ", ".join(f"{name} {v:+.2f} m" for name, v in zip(names, vector, strict=True))
 
 
 def gate_words(judged: Judged) -> str:

@@ -35,7 +35,7 @@ STRIP_SIZE = 6.5
 
 
 def draw(axes: Axes, document: Document, *, axis: str | None = None, strip: bool = False) -> None:
-    """Mark what happened on a time axis, behind what is drawn there; its limits are left alone.
+    """Mark what happened on a time axis, behind what is drawn there; it spans the segment.
 
     Parameters
     ----------
@@ -49,6 +49,7 @@ def draw(axes: Axes, document: Document, *, axis: str | None = None, strip: bool
         Name the flight modes above the axes.
     """
     events, segment = document.events, document.comparison.segment
+    axes.set_xlim(segment.start_s, segment.end_s)
     modes = [(mode.start_s, mode.end_s) for mode in events.modes]
     for spans, style, order in (
         (modes[1::2], MODE, 0.1),

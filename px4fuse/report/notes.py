@@ -24,6 +24,7 @@ from px4fuse.report.style import (
     POINTS_PER_HEIGHT,
     POINTS_PER_WIDTH,
     RIGHT,
+    SPACING,
     appendix,
     page,
     printable,
@@ -41,7 +42,6 @@ HEADING_SIZES = {"h1": 12.0, "h2": 10.8, "h3": 9.6}
 INDENT = 0.022
 MOST_INDENTS = 8
 MARK_WIDTH = 0.016
-SPACING = 1.32
 TABLE_SIZE = 8.0
 COLUMN_GAP_POINTS = 10.0
 # $ opens before what is no space and closes after it, not before a digit: prices stay prices

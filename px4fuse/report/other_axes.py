@@ -43,17 +43,16 @@ def draw(document: Document) -> Iterator[Figure]:
         "The panels of the pages before for the axes that they leave out; lines, bands and marks "
         "are the same.",
     )
-    known = not isinstance(document.comparison.flight.truth, Unavailable)
     rows: tuple[Panel, ...] = (
         ("position (m)", flight.draw_position, flight.position_numbers),
         ("velocity (m/s)", flight.draw_velocity, flight.velocity_numbers),
         (
-            "position - truth (m)" if known else "ours - EKF2 (m)",
+            "position - truth (m)" if document.truth_known else "ours - EKF2 (m)",
             flight.draw_error,
             flight.error_numbers,
         ),
         ("innovation (m), ±2√S", innovations.draw_innovations, innovations.short_numbers),
-        ("σ of position (m), log scale", _sigma, innovations.sigma_numbers),
+        ("σ of position (m), log scale", innovations.draw_sigma, innovations.sigma_numbers),
     )
     if all(isinstance(flight.error_reference(axis), Unavailable) for axis in others):
         rows = tuple(row for row in rows if row[1] is not flight.draw_error)
@@ -84,21 +83,15 @@ def _panel(
     document: Document, *, last: bool,
 ) -> None:  # fmt: skip
     title, draw_panel, numbers = row
-    segment = document.comparison.segment
     axes = figure.add_axes(box, title=title)
     axes.xaxis.set_major_locator(MaxNLocator(4) if last else NullLocator())
     axes.yaxis.set_major_locator(MaxNLocator(3))
     draw_panel(axes, result, MAX_POINTS_NARROW)
-    axes.set_xlim(segment.start_s, segment.end_s)
     shown = "" if draw_panel is innovations.draw_innovations else result.axis.name
     marks.draw(axes, document, axis=shown)
     if last:
         axes.set_xlabel(TIME_LABEL)
     caption(axes, numbers(result), size=PANEL_SIZE)
-
-
-def _sigma(axes: Axes, result: AxisComparison, limit: int) -> None:
-    innovations.draw_sigma(axes, result, "position_variance_m2", limit)
 
 
 def _axis_words(result: AxisComparison) -> str:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from importlib import metadata
+from typing import Any
 
 from matplotlib.backends.backend_pdf import PdfPages
 from matplotlib.figure import Figure
@@ -33,26 +34,32 @@ from px4fuse.report.document import (
     EvaluationDocument,
     LoopDocument,
     WhatIfDocument,
+    who,
 )
 from px4fuse.report.seal import sealed
 from px4fuse.report.style import LEFT, MUTED, RIGHT, printable, put, report_style, shorten
 
 Report = Document | LoopDocument | WhatIfDocument | EvaluationDocument | ChangesDocument
 RESULTS_NAME = "results.json"
-PAGES = (
-    cover.draw,
-    flight.draw,
-    innovations.draw,
-    why.draw,
-    other_axes.draw,
-    consistency.draw,
-    sensitivity.draw,
-    clock.draw,
-    loop.draw,
-    notes.draw,
-    provenance.draw,
-)
-LOOP_PAGES = (loop.draw_report, notes.draw, provenance.draw_loop)
+PAGES: Mapping[type, tuple[Callable[[Any], Iterator[Figure]], ...]] = {
+    Document: (
+        cover.draw,
+        flight.draw,
+        innovations.draw,
+        why.draw,
+        other_axes.draw,
+        consistency.draw,
+        sensitivity.draw,
+        clock.draw,
+        loop.draw,
+        notes.draw,
+        provenance.draw,
+    ),
+    LoopDocument: (loop.draw_report, notes.draw, provenance.draw_loop),
+    WhatIfDocument: (whatif.draw,),
+    EvaluationDocument: (evaluation.draw,),
+    ChangesDocument: (changes.draw,),
+}
 
 
 def render(document: Report, results_json: str) -> bytes:
@@ -71,7 +78,7 @@ def render(document: Report, results_json: str) -> bytes:
     """
     drawn = io.BytesIO()
     with report_style(_outside(document)):
-        figures = list(_pages(document))
+        figures = [figure for draw in PAGES[type(document)] for figure in draw(document)]
         with PdfPages(
             drawn, metadata={"CreationDate": None, "Creator": None, "Producer": None}
         ) as pdf:
@@ -85,35 +92,19 @@ def render(document: Report, results_json: str) -> bytes:
 def _outside(document: Report) -> str:
     """What is not px4fuse's own words."""
     student = document.student
-    command = "" if isinstance(document, EvaluationDocument) else document.command
-    return "".join((document.title, student.name, student.id, student.notes, command))
-
-
-def _pages(document: Report) -> Iterator[Figure]:
-    if isinstance(document, LoopDocument):
-        for draw_loop in LOOP_PAGES:
-            yield from draw_loop(document)
-    elif isinstance(document, WhatIfDocument):
-        yield from whatif.draw(document)
-    elif isinstance(document, EvaluationDocument):
-        yield from evaluation.draw(document)
-    elif isinstance(document, ChangesDocument):
-        yield from changes.draw(document)
-    else:
-        for draw in PAGES:
-            yield from draw(document)
+    return "".join((document.title, student.name, student.id, student.notes, document.command))
 
 
 def _running_lines(figure: Figure, document: Report, number: int, count: int) -> None:
     """Head and foot of a page: which log, whose, which version, which page."""
     name, sha256 = document.log
     style = {"size": 6.5, "color": MUTED}
-    who = " · ".join(part for part in (document.student.name, document.student.id) if part)
-    room = 330 if who else 500
+    student = who(document.student, " · ")
+    room = 330 if student else 500
     head = shorten(printable(f"px4fuse · {name} · SHA-256 {sha256[:12]}"), 6.5, room)
     put(figure, LEFT, 0.972, head, **style)
-    if who:
-        figure.text(RIGHT, 0.972, shorten(printable(who), 6.5, 170), ha="right", **style)  # type: ignore[arg-type]
+    if student:
+        figure.text(RIGHT, 0.972, shorten(printable(student), 6.5, 170), ha="right", **style)  # type: ignore[arg-type]
     version = metadata.version("px4fuse")
     put(figure, LEFT, 0.022, f"px4fuse {version}", **style)
     figure.text(RIGHT, 0.022, f"{number} / {count}", ha="right", **style)  # type: ignore[arg-type]

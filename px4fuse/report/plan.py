@@ -8,18 +8,18 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from px4fuse.arrays import Array
 from px4fuse.comparison.comparison import Comparison
-from px4fuse.filter.signals import AISLE
+from px4fuse.filter.signals import AISLE, within
 from px4fuse.flight import Ekf2, Truth
 from px4fuse.report.document import Document
 from px4fuse.report.marks import LANDING, TAKE_OFF
 from px4fuse.report.style import (
     BOTTOM,
     EKF2_LINE,
+    LABEL_WIDTH,
     LEFT,
     MEASURED,
     MUTED,
@@ -40,7 +40,6 @@ LEAST_BESIDE, MOST_BESIDE = 122.0, 290.0
 WIDE = 0.43
 HEAD, LABELS = 22.0, 34.0  # points above the axes, and below them: ticks, label, a gap
 FACT_SIZE = 7.0
-FACT_WIDTH = 0.085
 BESIDE_X = PANEL_LEFT + WIDE + 0.03
 Pair = tuple[Array, Array]
 
@@ -88,8 +87,9 @@ class Plan:
             return map_points / POINTS_PER_HEIGHT + facts
         return max(map_points / POINTS_PER_HEIGHT, HEAD / POINTS_PER_HEIGHT + facts)
 
-    def draw(self, figure: Figure, cursor: Cursor) -> None:
+    def draw(self, cursor: Cursor) -> None:
         """Draw it below the cursor."""
+        figure = cursor.figure
         cursor.write("From above", size=10.5, weight="bold")
         top = cursor.y - 6.0 / POINTS_PER_HEIGHT
         room = (top - BOTTOM) * POINTS_PER_HEIGHT - LABELS
@@ -103,10 +103,10 @@ class Plan:
             handles, labels, loc="lower right", ncols=len(labels), borderaxespad=0.0,
             borderpad=0.0, bbox_to_anchor=(RIGHT, cursor.y), handlelength=1.8, columnspacing=1.2,
         )  # fmt: skip
-        if self.long:
-            _facts(Cursor(figure, bottom - LABELS / POINTS_PER_HEIGHT), self.facts, LEFT)
-        else:
-            _facts(Cursor(figure, top), self.facts, BESIDE_X)
+        below = bottom - LABELS / POINTS_PER_HEIGHT
+        beside = Cursor(figure, below if self.long else top)
+        for label, text in self.facts:
+            beside.labelled(label, text, size=FACT_SIZE, x=LEFT if self.long else BESIDE_X)
 
     def _height(self) -> float:
         """Of a map of the page's width, in points."""
@@ -116,7 +116,7 @@ class Plan:
 
     def _facts_height(self, cursor: Cursor, left: float) -> float:
         return sum(
-            cursor.height(text, size=FACT_SIZE, x=left + FACT_WIDTH) for _, text in self.facts
+            cursor.height(text, size=FACT_SIZE, x=left + LABEL_WIDTH) for _, text in self.facts
         )
 
 
@@ -138,7 +138,7 @@ def _tracks(comparison: Comparison) -> dict[str, Pair]:
     segment, flight = comparison.segment, comparison.flight
 
     def cut(frame: pd.DataFrame) -> Pair:
-        inside = frame[(frame.index >= segment.start_s) & (frame.index <= segment.end_s)]
+        inside = within(frame, segment)
         return inside["north_m"].to_numpy(), inside["east_m"].to_numpy()
 
     tracks = {"measurement": cut(comparison.source.samples)}
@@ -163,7 +163,7 @@ def _tracks(comparison: Comparison) -> dict[str, Pair]:
 
 def _view(comparison: Comparison, points: Array) -> tuple[View, float]:
     """Along the track where it is long and narrow, else with north up; how long against wide."""
-    aisle = next((a.axis for a in comparison.axes if a.axis.name == AISLE), None)
+    aisle = next((line for line in comparison.lines if line.name == AISLE), None)
     centred = points - points.mean(axis=0)
     if aisle is not None and aisle.heading_deg is not None:
         heading = np.deg2rad(aisle.heading_deg)
@@ -220,11 +220,3 @@ def _north(axes: Axes, view: View) -> None:
         arrowprops={"arrowstyle": "<-", "color": MUTED, "lw": 0.8, "shrinkA": 1, "shrinkB": 0},
         size=7, color=MUTED, ha="center", va="center",
     )  # fmt: skip
-
-
-def _facts(cursor: Cursor, facts: Sequence[tuple[str, str]], left: float) -> None:
-    for label, text in facts:
-        top = cursor.y
-        cursor.write(label, size=FACT_SIZE, weight="bold", x=left)
-        cursor.y = top
-        cursor.write(text, size=FACT_SIZE, x=left + FACT_WIDTH)

@@ -106,9 +106,9 @@ def draw(document: Document) -> Iterator[Figure]:
     for place, (title, pair) in enumerate(PAIRS):
         top = cursor.y
         axes = panel(cursor, title, _apart_words(run, pair), TRACK)
+        marks.draw(axes, document)
         _tracks(axes, result, run, pair, window)
         legend_beside_title(axes, top)
-        marks.draw(axes, document)
         if place < len(PAIRS) - 1:
             bare_x(axes)
             cursor.skip(8)
@@ -352,4 +352,4 @@ def _table(cursor: Cursor, result: AxisComparison, run: States, chosen: Array) -
     )
     cursor.skip(3)
     edges = np.linspace(LEFT, RIGHT, len(columns) + 1)
-    cursor.columns(dict(zip(edges.tolist(), columns, strict=False)), size=7.6)
+    cursor.columns(dict(zip(edges.tolist(), columns, strict=False)))

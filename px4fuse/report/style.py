@@ -31,6 +31,9 @@ from px4fuse.report import fonts
 A4_INCHES = (8.27, 11.69)
 LEFT, RIGHT, TOP, BOTTOM = 0.085, 0.945, 0.95, 0.05
 PANEL_LEFT = LEFT + 0.04  # of axes: the numbers beside them stand in between
+LABEL_WIDTH = 0.085
+ROW_SIZE = 7.4
+SPACING = 1.32  # of lines, times the size
 POINTS_PER_WIDTH = A4_INCHES[0] * 72.0
 POINTS_PER_HEIGHT = A4_INCHES[1] * 72.0
 
@@ -244,16 +247,14 @@ class Cursor:
         colour: str = "black",
         x: float = LEFT,
         right: float = RIGHT,
-        spacing: float = 1.32,
+        spacing: float = SPACING,
     ) -> None:
         """Write wrapped text and move below it."""
         for line in wrap(printable(text), size, (right - x) * POINTS_PER_WIDTH, weight):
             self.y -= size * spacing / POINTS_PER_HEIGHT
             put(self.figure, x, self.y, line, size=size, weight=weight, color=colour)
 
-    def columns(
-        self, columns: Mapping[float, tuple[str, Sequence[str]]], *, size: float = 7.6
-    ) -> None:
+    def columns(self, columns: Mapping[float, tuple[str, Sequence[str]]]) -> None:
         """Write a table and move below it.
 
         Parameters
@@ -261,7 +262,7 @@ class Cursor:
         columns : mapping from float to (str, sequence of str)
             Left edge (fraction of the page) to head and cells.
         """
-        count = max(len(cells) for _, cells in columns.values())
+        size, count = 7.6, max(len(cells) for _, cells in columns.values())
         self.skip(size * 1.35)
         for x, (head, cells) in columns.items():
             put(self.figure, x, self.y, printable(head), size=size, color=MUTED)
@@ -274,12 +275,31 @@ class Cursor:
         self.skip(count * size * 1.4)
 
     def height(
-        self, text: str, *, size: float = 8.0, weight: str = "normal", x: float = LEFT,
-        right: float = RIGHT, spacing: float = 1.32,
-    ) -> float:  # fmt: skip
+        self, text: str, *, size: float = 8.0, x: float = LEFT, right: float = RIGHT
+    ) -> float:
         """Height that :meth:`write` would take, as a fraction of the page."""
-        lines = wrap(printable(text), size, (right - x) * POINTS_PER_WIDTH, weight)
-        return len(lines) * size * spacing / POINTS_PER_HEIGHT
+        lines = wrap(printable(text), size, (right - x) * POINTS_PER_WIDTH)
+        return len(lines) * size * SPACING / POINTS_PER_HEIGHT
+
+    def labelled(self, label: str, text: str, *, size: float = 8.0, x: float = LEFT) -> None:
+        """Write a bold label, text beside it, and move below the text."""
+        top = self.y
+        self.write(label, size=size, weight="bold", x=x, right=x + LABEL_WIDTH)
+        self.y = top
+        self.write(text, size=size, x=x + LABEL_WIDTH)
+
+    def row(
+        self, edges: Sequence[float], cells: Sequence[str], *, head: bool = False,
+        colour: str = "black",
+    ) -> None:  # fmt: skip
+        """Write one row of a table, each cell cut at the next left edge; a line below a head."""
+        self.y -= ROW_SIZE * 1.45 / POINTS_PER_HEIGHT
+        for x, end, text in zip(edges, (*edges[1:], RIGHT), cells, strict=True):
+            cut = shorten(printable(text), ROW_SIZE, (end - x) * POINTS_PER_WIDTH - 4.0)
+            put(self.figure, x, self.y, cut, size=ROW_SIZE, color=MUTED if head else colour)
+        if head:
+            self.skip(2.5)
+            self.rule()
 
     def skip(self, points: float) -> None:
         """Leave a gap."""
@@ -311,36 +331,6 @@ def appendix(title: str) -> str:
     'Appendix: notes by the student'
     """
     return f"Appendix: {title[0].lower()}{title[1:]}"
-
-
-def panels(
-    figure: Figure,
-    top: float,
-    bottom: float,
-    rows: int,
-    columns: int,
-    *,
-    widths: Sequence[float] | None = None,
-    hspace: float = 0.45,
-    wspace: float = 0.2,
-    left: float = LEFT,
-) -> list[list[Axes]]:
-    """Lay out a grid of axes between two heights of a page (fractions).
-
-    Rows share what their x axes mean, so only the last one has numbers on it.
-    """
-    grid = figure.add_gridspec(
-        rows, columns, left=left, right=RIGHT, top=top, bottom=bottom, hspace=hspace,
-        wspace=wspace, width_ratios=widths,
-    )  # fmt: skip
-    axes = [[figure.add_subplot(grid[r, c]) for c in range(columns)] for r in range(rows)]
-    for row in axes:
-        for single in row:
-            single.xaxis.set_major_locator(MaxNLocator(6))
-            single.yaxis.set_major_locator(MaxNLocator(4))
-            if row is not axes[-1]:
-                single.tick_params(axis="x", labelbottom=False, bottom=False)
-    return axes
 
 
 def panel(
@@ -397,10 +387,10 @@ def bare_x(axes: Axes) -> None:
     axes.tick_params(axis="x", labelbottom=False)
 
 
-def below(cursor: Cursor, text: str, *, size: float = 7.0, points: float = 1.0) -> None:
+def below(cursor: Cursor, text: str, *, points: float = 1.0) -> None:
     """Write numbers under an axes of the page's width."""
     cursor.skip(points)
-    cursor.write(text, size=size, colour=MUTED, spacing=1.25)
+    cursor.write(text, size=7.0, colour=MUTED, spacing=1.25)
 
 
 def caption(axes: Axes, text: str, *, size: float = 7.0) -> None:
@@ -408,12 +398,10 @@ def caption(axes: Axes, text: str, *, size: float = 7.0) -> None:
     box = axes.get_position()
     offset_points = 24.0 if axes.get_xlabel() else 5.0
     lines = wrap(printable(text), size, box.width * POINTS_PER_WIDTH)
-    figure = axes.get_figure()
-    if figure is not None:
-        figure.text(
-            box.x0, box.y0 - offset_points / POINTS_PER_HEIGHT, "\n".join(lines), size=size,
-            color=MUTED, va="top", linespacing=1.25,
-        )  # fmt: skip
+    axes.figure.text(
+        box.x0, box.y0 - offset_points / POINTS_PER_HEIGHT, "\n".join(lines), size=size,
+        color=MUTED, va="top", linespacing=1.25,
+    )  # fmt: skip
 
 
 def empty(axes: Axes, reason: str) -> None:

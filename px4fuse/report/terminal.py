@@ -134,13 +134,12 @@ def print_finding(console: Console, finding: Finding, request: Request) -> None:
 
 def _table(document: Document) -> Table:
     comparison = document.comparison
-    truth = not isinstance(comparison.flight.truth, Unavailable)
     ekf2 = any(isinstance(result.difference, Difference) for result in comparison.axes)
     table = plain_table(
         ("axis", "left"), ("filter", "left"), ("mean\nNIS", "right"), ("95 %\nband", "right"),
         ("innovation\nvariance", "left"),
         *((("apart\n(m)", "right"), ("\n(m/s)", "right")) if ekf2 else ()),
-        *((("to truth\n(m)", "right"), ("\n(m/s)", "right")) if truth else ()),
+        *((("to truth\n(m)", "right"), ("\n(m/s)", "right")) if document.truth_known else ()),
     )  # fmt: skip
     main = comparison.main
     for result in (main, *(result for result in comparison.axes if result is not main)):
@@ -155,7 +154,7 @@ def _table(document: Document) -> Table:
                 Text(result.axis.name if ours else "", "bold"), owner, verdict.nis, verdict.band,
                 Text(verdict.words, _style(summary.consistency)),
                 *((difference_cells(result.difference) if ours else ("", "")) if ekf2 else ()),
-                *(error_cells(against) if truth else ()),
+                *(error_cells(against) if document.truth_known else ()),
             )  # fmt: skip
     return table
 

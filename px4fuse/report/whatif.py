@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator
@@ -170,7 +171,7 @@ def draw(document: WhatIfDocument) -> Iterator[Figure]:
     ):
         cursor.write(text, size=7.5, colour=MUTED)
     cursor.skip(10)
-    _table(figure, cursor, ["", *heads(made_of)], rows(made_of), FIRST_COLUMN)
+    _table(cursor, ["", *heads(made_of)], rows(made_of))
     cursor.skip(6)
     for line in reading(made_of):
         cursor.write(line, size=8.5)
@@ -181,17 +182,14 @@ def draw(document: WhatIfDocument) -> Iterator[Figure]:
         if cursor.y - needed < BOTTOM:
             yield figure
             figure, cursor = page(f"EKF2 over {swept(made_of)}")
-        _panels(figure, cursor, made_of)
+        _panels(cursor, made_of)
         if cursor.y - table > BOTTOM:
-            _table(figure, cursor, sweep_heads(made_of), sweep_rows(made_of), FIRST_COLUMN)
+            _table(cursor, sweep_heads(made_of), sweep_rows(made_of))
     yield figure
 
 
-def _table(
-    figure: Figure, cursor: Cursor, head: Sequence[str], body: list[list[str]], first: float
-) -> None:
-    width = (RIGHT - LEFT - first) / (len(head) - 1)
-    starts = [LEFT, *(LEFT + first + width * column for column in range(len(head) - 1))]
+def _table(cursor: Cursor, head: Sequence[str], body: list[list[str]]) -> None:
+    starts = [LEFT, *np.linspace(LEFT + FIRST_COLUMN, RIGHT, len(head))[:-1]]
     top, lowest = cursor.y, cursor.y
     for text, start, end in zip(head, starts, [*starts[1:], RIGHT], strict=True):
         cursor.y = top
@@ -203,10 +201,10 @@ def _table(
     for cells in body:
         cursor.y -= SIZE * 1.4 / POINTS_PER_HEIGHT
         for text, start in zip(cells, starts, strict=True):
-            put(figure, start, cursor.y, text, size=SIZE)
+            put(cursor.figure, start, cursor.y, text, size=SIZE)
 
 
-def _panels(figure: Figure, cursor: Cursor, made_of: Counterfactual) -> None:
+def _panels(cursor: Cursor, made_of: Counterfactual) -> None:
     """Mean NIS, share rejected, and error or σ_p over the values."""
     summaries, name = sweep_of(made_of), swept(made_of)
     values = [summary.changed[name] for summary in summaries]
@@ -224,9 +222,8 @@ def _panels(figure: Figure, cursor: Cursor, made_of: Counterfactual) -> None:
     cursor.skip(20)
     for title, of in panels:
         height = PANEL_POINTS / POINTS_PER_HEIGHT
-        axes = figure.add_axes(
-            (LEFT + 0.03, cursor.y - height, RIGHT - LEFT - 0.03, height), title=title
-        )
+        box = (LEFT + 0.03, cursor.y - height, RIGHT - LEFT - 0.03, height)
+        axes = cursor.figure.add_axes(box, title=title)
         _panel(axes, values, [[of(s, axis) for s in summaries] for axis in HORIZONTAL])
         if title == "rejected (%)":
             axes.set_ylim(0.0, max(1.0, axes.get_ylim()[1]))

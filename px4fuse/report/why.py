@@ -13,6 +13,7 @@ from px4fuse.comparison.why import Why
 from px4fuse.ekf2.replay import Agreement, Ekf2Replay
 from px4fuse.filter.signals import AISLE
 from px4fuse.flight import Unavailable
+from px4fuse.plain import capital
 from px4fuse.report import marks
 from px4fuse.report.document import Document
 from px4fuse.report.style import (
@@ -59,7 +60,7 @@ def draw(document: Document) -> Iterator[Figure]:
         cursor.skip(8)
         if isinstance(why, Unavailable):
             cursor.write(f"{name}: nothing is concluded", size=9.5, weight="bold")
-            cursor.write(f"{why.reason[:1].upper()}{why.reason[1:]}. {why.remedy}")
+            cursor.write(f"{capital(why.reason)}. {why.remedy}")
         else:
             _axis(figure, cursor, name, why, document)
     believed = _believed(document.analysis.ekf2_replay)
@@ -157,15 +158,12 @@ def _axis(figure: Figure, cursor: Cursor, name: str, why: Why, document: Documen
             axes.set_yticklabels([])
     cursor.y -= height
     cursor.skip(36)
-    strip = bool(document.events.modes)
     axes = panel(
         cursor, "Position apart (m): ours - EKF2 (dark), and what the model leaves of it (light)",
-        _time_words(why), TIME_POINTS, above=12.0 if strip else 4.0,
+        _time_words(why), TIME_POINTS, above=12.0 if document.events.modes else 4.0,
     )  # fmt: skip
     _over_time(axes, why)
-    segment = document.comparison.segment
-    axes.set_xlim(segment.start_s, segment.end_s)
-    marks.draw(axes, document, axis=name, strip=strip)
+    marks.draw(axes, document, axis=name, strip=True)
     axes.set_xlabel(TIME_LABEL)
     cursor.skip(24)
 
@@ -211,7 +209,7 @@ def _time_words(why: Why) -> str:
     start, length = why.coast.start_s, why.coast.duration_s
     return (
         f"{words}. EKF2's longest run of rejections, {start:.1f} s to {start + length:.1f} s, "
-        + ("is shaded.")
+        "is shaded."
     )
 
 

@@ -205,9 +205,7 @@ def alignment_words(alignment: Alignment) -> list[tuple[str, str]]:
     return lines
 
 
-def tuning_advice(
-    comparison: Comparison | Prepared, tuned: Mapping[str, AxisTuning | Unavailable]
-) -> list[str]:
+def tuning_advice(comparison: Prepared, tuned: Mapping[str, AxisTuning | Unavailable]) -> list[str]:
     """What follows from tuning: the command to run again, PX4's parameter, and cautions.
 
     Lines whose first nine columns are a label; ``px4fuse compare LOG`` as in
@@ -292,7 +290,7 @@ def noise_and_bias_words(found: AxisTuning) -> str:
     )
 
 
-def stamps_wrong(comparison: Comparison | Prepared, clock: ClockOffset) -> bool:
+def stamps_wrong(comparison: Prepared, clock: ClockOffset) -> bool:
     """Whether the stamps of the source are late or early beyond doubt, as they were recorded."""
     applied = comparison.settings.clock_offset_s
     low, high = clock.interval_s
@@ -300,7 +298,7 @@ def stamps_wrong(comparison: Comparison | Prepared, clock: ClockOffset) -> bool:
     return clock.determinable and not (low <= -applied <= high or negligible)
 
 
-def delay_wrong(comparison: Comparison | Prepared, clock: ClockOffset) -> bool:
+def delay_wrong(comparison: Prepared, clock: ClockOffset) -> bool:
     """Whether PX4's EKF2_EV_DELAY is known, and not what the data ask for."""
     delay = comparison.flight.log.parameters.get("EKF2_EV_DELAY")
     if delay is None or not clock.determinable:
@@ -310,7 +308,7 @@ def delay_wrong(comparison: Comparison | Prepared, clock: ClockOffset) -> bool:
     return not -(asked[1] + margin) <= delay * 1e-3 <= -(asked[0] - margin)
 
 
-def clock_advice(comparison: Comparison | Prepared, clock: ClockOffset | Unavailable) -> list[str]:
+def clock_advice(comparison: Prepared, clock: ClockOffset | Unavailable) -> list[str]:
     """What the clock estimate says, and what follows from it: lines as of tuning_advice."""
     if isinstance(clock, Unavailable):
         return [f"Offset   not determinable: {clock.reason}. {clock.remedy}"]

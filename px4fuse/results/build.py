@@ -9,7 +9,7 @@ from typing import Any, cast
 import pandas as pd
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.comparison import AgainstTruth, AxisComparison, Comparison, FilterSummary
+from px4fuse.comparison.comparison import AgainstTruth, AxisComparison, FilterSummary
 from px4fuse.comparison.preparation import Prepared
 from px4fuse.filter.clock import ClockOffset
 from px4fuse.filter.heading import HeadingError
@@ -112,7 +112,7 @@ def sync_results(
     )
 
 
-def _source(comparison: Comparison | Prepared) -> made.PositionSource:
+def _source(comparison: Prepared) -> made.PositionSource:
     source = comparison.source
     looked_for = [m for m in comparison.missing if m.what.startswith("position source ")]
     return copied(
@@ -128,7 +128,7 @@ def _source(comparison: Comparison | Prepared) -> made.PositionSource:
     )
 
 
-def _settings(comparison: Comparison | Prepared) -> made.ChosenSettings:
+def _settings(comparison: Prepared) -> made.ChosenSettings:
     settings = comparison.settings
     alignment = comparison.source.alignment
     placed_s = 0.0 if alignment is None else alignment.clock_offset_s

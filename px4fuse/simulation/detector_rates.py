@@ -23,8 +23,9 @@ from typing import Any
 import pandas as pd
 from scipy.stats import binomtest
 
-from px4fuse.analysis import Analysis, clock_offset, tuned_horizontally, turned_frame
+from px4fuse.analysis import Analysis
 from px4fuse.comparison.comparison import compare
+from px4fuse.comparison.estimates import clock_offset, tuned_horizontally, turned_frame
 from px4fuse.ekf2.model import open_model
 from px4fuse.filter.kalman import Settings
 from px4fuse.findings import DETECTORS, find, find_loop

@@ -16,8 +16,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from px4fuse.analysis import clock_offset, tuned_horizontally
 from px4fuse.comparison.comparison import compare
+from px4fuse.comparison.estimates import clock_offset, tuned_horizontally
 from px4fuse.filter.clock import CHANGE_P, ClockOffset
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise
 from px4fuse.findings.source_clock import CLOCK_OFFSET, CLOCK_SIGMAS
