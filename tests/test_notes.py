@@ -135,6 +135,10 @@ def test_ids_and_quotes():
     made = read(mixed, theirs=theirs)
     assert (made.problem, made.quoted) == ("", 18)
     assert made.words == read(ENGLISH).words
+    # what is cut into sentences where px4fuse has none is of px4fuse all the same
+    remedy = "Let EKF2 fuse the yaw of the source (EKF2_EV_CTRL bit 3; EKF2_AID_MASK bit 4)."
+    assert read(f"{ENGLISH}\n\n{remedy}", theirs=(remedy,)).sentences == read(ENGLISH).sentences
+    assert read(f"{ENGLISH} The mask was set to bit 4.", theirs=(remedy,)).words > made.words
 
 
 def test_what_a_page_does_not_show_is_not_read():

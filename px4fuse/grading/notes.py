@@ -238,7 +238,7 @@ def read_notes(
     drawn = list(_drawn(text[:MAX_NOTES]))
     every = [sentence for block in drawn for sentence in _sentences(block)]
     runs = {run for one in theirs for run in _runs(WORD.findall(folded(one)))}
-    own = [sentence for sentence in every if not _quoted(sentence, runs)]
+    own = _own(every, runs)
     kept: dict[tuple[str, ...], Sentence] = {}
     for sentence in own:
         if _whole(sentence, rules, ids):
@@ -348,13 +348,19 @@ def _runs(words: Sequence[str]) -> Iterator[tuple[str, ...]]:
         yield tuple(words[at : at + QUOTE_WORDS])
 
 
-def _quoted(sentence: Sentence, runs: Collection[tuple[str, ...]]) -> bool:
-    """Whether half of it or more is of px4fuse."""
+def _own(sentences: Sequence[Sentence], runs: Collection[tuple[str, ...]]) -> list[Sentence]:
+    """Those of which more than half is not of px4fuse; what it says may be cut into any sentences."""
+    words = [word for sentence in sentences for word in sentence.words]
     covered: set[int] = set()
-    for at, run in enumerate(_runs(sentence.words)):
+    for at, run in enumerate(_runs(words)):
         if run in runs:
             covered.update(range(at, at + QUOTE_WORDS))
-    return 2 * len(covered) >= len(sentence.words) > 0
+    end, own = 0, []
+    for sentence in sentences:
+        start, end = end, end + len(sentence.words)
+        if 2 * len(covered.intersection(range(start, end))) < len(sentence.words):
+            own.append(sentence)
+    return own
 
 
 @cache
