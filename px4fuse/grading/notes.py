@@ -349,7 +349,7 @@ def _runs(words: Sequence[str]) -> Iterator[tuple[str, ...]]:
 
 
 def _own(sentences: Sequence[Sentence], runs: Collection[tuple[str, ...]]) -> list[Sentence]:
-    """Those of which more than half is not of px4fuse, whose words may be cut into any sentences."""
+    """Those of which more than half is not of px4fuse, however its words are cut into sentences."""
     words = [word for sentence in sentences for word in sentence.words]
     covered: set[int] = set()
     for at, run in enumerate(_runs(words)):
