@@ -8,7 +8,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from px4fuse.ekf2.model import Model, open_model
+from px4fuse.ekf2 import walk as steps_of_the_walk
+from px4fuse.ekf2.model import Model, delayed_variants, open_model
 from px4fuse.ekf2.parameters import PARAMETERS, check, settings_in_force
 from px4fuse.ekf2.walk import OUTPUT, SAMPLES, STEPS, Line, Student, Walk, walk
 from px4fuse.ekf2.whatif import WhatIf, sweep, sweep_values, what_if
@@ -119,6 +120,14 @@ def test_defaults_are_the_releases() -> None:
     assert settings_in_force({"EKF2_EVP_NOISE": 0.2})["EKF2_EVP_NOISE"] == 0.2
 
 
+def stages(model: Model) -> dict[str, pd.DataFrame]:
+    """Track of the filter after each step."""
+    variants = steps_of_the_walk._variants(model, Student())
+    delayed, flown = delayed_variants(model, list(variants.values()))
+    tracks = (*delayed, flown.delayed, flown.published)
+    return dict(zip((*variants, OUTPUT), tracks, strict=True))
+
+
 def walked(result: Walk | Unavailable) -> Walk:
     assert isinstance(result, Walk)
     return result
@@ -150,7 +159,7 @@ def test_the_ends_of_the_walk_are_student_and_model_against_log(model: Model) ->
     made = walked(walk(model))
     assert isinstance(model.flight.ekf2, Ekf2)
     logged = model.flight.ekf2.state
-    student = made.tracks[SAMPLES]
+    tracks = stages(model)
     inside = (logged.index > model.flown.stretches[0][0] + 5.0) & (
         logged.index < model.flown.stretches[0][1]
     )
@@ -158,8 +167,8 @@ def test_the_ends_of_the_walk_are_student_and_model_against_log(model: Model) ->
     assert len(made.times_s) == pytest.approx(len(times), abs=2)
     for axis in ("north", "east"):
         for ours, name in (
-            (student, "position_total_m2"),
-            (made.tracks[OUTPUT], "position_left_m2"),
+            (tracks[SAMPLES], "position_total_m2"),
+            (tracks[OUTPUT], "position_left_m2"),
         ):
             there = np.interp(times, ours.index, ours[f"{axis}_m"])
             square = np.mean((there - logged.loc[times, f"{axis}_m"]) ** 2)
@@ -181,12 +190,8 @@ def test_the_walk_starts_where_the_student_is(model: Model) -> None:
 def test_a_track_of_ones_own_is_the_first_step(model: Model) -> None:
     plain = walked(walk(model))
     # a track of one's own: 0.4 m off, so that 0.16 m² more are to be explained by the first step
-    track = pd.DataFrame(
-        {
-            "position_m": plain.tracks[SAMPLES]["north_m"] + 0.4,
-            "velocity_m_s": plain.tracks[SAMPLES]["north_m_s"],
-        }
-    )
+    first = stages(model)[SAMPLES]
+    track = pd.DataFrame({"position_m": first["north_m"] + 0.4, "velocity_m_s": first["north_m_s"]})
     own = walked(walk(model, lines={"north": Line(1.0, 0.0, track)})).axes["north"]
     bias = np.mean(track["position_m"] - model.flown.published["north_m"])
     assert own.position_total_m2 > 0.8 * bias**2
@@ -209,10 +214,9 @@ def test_a_slanted_axis_is_the_projection(model: Model) -> None:
 
 
 def test_a_track_of_another_time_is_refused(model: Model) -> None:
-    track = walked(walk(model)).tracks[SAMPLES]
     elsewhere = pd.DataFrame(
         {"position_m": 0.0, "velocity_m_s": 0.0},
-        index=pd.Index(track.index.to_numpy() + 1e4, name="time_s"),
+        index=pd.Index(model.flown.delayed.index.to_numpy() + 1e4, name="time_s"),
     )
     result = walk(model, lines={"north": Line(1.0, 0.0, elsewhere)})
     assert isinstance(result, Unavailable)

@@ -104,7 +104,14 @@ def test_a_response_is_what_the_filter_itself_makes_of_a_signal() -> None:
 def test_a_fit_is_least_squares_with_the_prior_as_one_more_measurement() -> None:
     rng = np.random.default_rng(1)
     columns, data = rng.normal(size=(40, 2)), rng.normal(size=40)
-    made = fit(Whitened(data, columns, 0.0), np.array([np.inf, 0.5]))
+    # of two axes, of which the second has a column more
+    columns[:15, 1] = 0.0
+    parts = (data[:15], data[15:]), (columns[:15, :1], columns[15:])
+    white = Whitened(*parts, (np.array([0]), np.array([0, 1])), 0.0)
+    made = fit(white, np.array([np.inf, 0.5]))
+    np.testing.assert_allclose(
+        np.concatenate(white.rest(made.coefficients)), data - columns @ made.coefficients
+    )
     rows = np.vstack([columns, [0.0, 1.0 / 0.5]])
     expected, *_ = np.linalg.lstsq(rows, np.append(data, 0.0), rcond=None)
     np.testing.assert_allclose(made.coefficients, expected, rtol=1e-9)

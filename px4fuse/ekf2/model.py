@@ -8,7 +8,7 @@ be believed is measured on each log, see :mod:`px4fuse.ekf2.agreement`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -177,19 +177,19 @@ def replay_variants(
 
 def delayed_variants(
     model: Model, variants: Sequence[Variant]
-) -> tuple[list[pd.DataFrame], Ekf2Replay]:
-    """Tracks of the filters at their horizon, and all that the last one did.
+) -> tuple[Iterator[pd.DataFrame], Ekf2Replay]:
+    """Tracks of all but the last at their horizon, one at a time, and all that the last one did.
 
     What a filter publishes is as long again, and takes as long to make.
     """
     made = {Variant(model.inputs.settings).timing(model.inputs): model.legs}
     runs = run_variants(model.inputs, variants, made)
     last = _assemble(model.inputs, runs, len(variants) - 1, {})
-    tracks = [
+    tracks = (
         pd.concat([_delayed(part, delayed_states(part, at)[0]) for part in runs])
         for at in range(len(variants) - 1)
-    ]
-    return [*tracks, last.delayed], last
+    )
+    return tracks, last
 
 
 def _delayed(part: StretchRun, state: Array) -> pd.DataFrame:

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import chain, pairwise
 
 import numpy as np
 import pandas as pd
@@ -177,16 +177,21 @@ class Walk:
     axes : mapping from axis name to AxisWalk
     coast : Coast or None
         None where nothing was rejected.
-    tracks : mapping from stage to DataFrame
-        Position and velocity of the filter after each step, at the step ends of the replay.
     times_s : ndarray
         EKF2's own sample times that the means are over.
     """
 
     axes: Mapping[str, AxisWalk]
     coast: Coast | None
-    tracks: Mapping[str, pd.DataFrame]
     times_s: Array
+
+
+@dataclass(frozen=True)
+class _Stage:
+    """One stage along one axis, at the times of the walk."""
+
+    position_m: Array
+    velocity_m_s: Array
 
 
 def walk(
@@ -218,14 +223,12 @@ def walk(
     lines = lines or {"north": Line(1.0, 0.0), "east": Line(0.0, 1.0)}
     variants = _variants(model, student or Student())
     delayed, flown = delayed_variants(model, list(variants.values()))
-    tracks = dict(zip(variants, delayed, strict=True))
-    tracks[OUTPUT] = flown.published
     judged = judged_from(model.flown)
     times = ekf2.state.index.to_numpy()
     inside = settled(times, judged)
-    own = [line.track for line in lines.values() if line.track is not None]
-    for one in (*tracks.values(), *own):
-        inside &= len(one) > 0 and (times >= one.index[0]) & (times <= one.index[-1])
+    own = [line.track.index for line in lines.values() if line.track is not None]
+    for index in (flown.delayed.index, *own):  # all stages have the replay's times
+        inside &= len(index) > 0 and (times >= index[0]) & (times <= index[-1])
     times = times[inside]
     if not len(times):
         return Unavailable(
@@ -233,10 +236,21 @@ def walk(
             "the student's filter and the replay have no time in common",
             "Analyse the part of the flight in which EKF2 fused vision (--start, --end).",
         )
+    stages: dict[str, dict[str, _Stage]] = {name: {} for name in lines}
+    ungated = flown.delayed
+    # one at a time: each is as long as the flight
+    tracks = chain(delayed, (flown.delayed, flown.published))
+    for stage, track in zip((*variants, OUTPUT), tracks, strict=True):
+        for name, line in lines.items():
+            stages[name][stage] = _Stage(
+                line.along(track, POSITION_COLUMNS, times),
+                line.along(track, VELOCITY_COLUMNS, times),
+            )
+        if stage == ATTITUDE:
+            ungated = track
     return Walk(
-        axes={name: _axis(model, tracks, line, times) for name, line in lines.items()},
-        coast=_coast(flown, tracks[ATTITUDE], (times[0], times[-1]), judged),
-        tracks=tracks,
+        axes={name: _axis(model, stages[name], line, times) for name, line in lines.items()},
+        coast=_coast(flown, ungated, (times[0], times[-1]), judged),
         times_s=times,
     )
 
@@ -262,18 +276,23 @@ def _variants(model: Model, student: Student) -> dict[str, Variant]:
     }
 
 
-def _axis(model: Model, tracks: Mapping[str, pd.DataFrame], line: Line, times: Array) -> AxisWalk:
+def _axis(model: Model, stages: dict[str, _Stage], line: Line, times: Array) -> AxisWalk:
     ekf2 = model.flight.ekf2
     assert isinstance(ekf2, Ekf2)
-    position = {name: line.along(track, POSITION_COLUMNS, times) for name, track in tracks.items()}
-    speed = {name: line.along(track, VELOCITY_COLUMNS, times) for name, track in tracks.items()}
     own = line.track
-    position[STUDENT] = position[SAMPLES] if own is None else at_times(own, "position_m", times)
-    speed[STUDENT] = speed[SAMPLES] if own is None else at_times(own, "velocity_m_s", times)
+    stages = stages | {STUDENT: stages[SAMPLES]}
+    if own is not None:
+        stages[STUDENT] = _Stage(
+            at_times(own, "position_m", times), at_times(own, "velocity_m_s", times)
+        )
     logged = line.along(ekf2.state, POSITION_COLUMNS, times)
     logged_speed = line.along(ekf2.state, VELOCITY_COLUMNS, times)
+    position = {name: stage.position_m for name, stage in stages.items()}
     square = {name: float(np.mean((there - logged) ** 2)) for name, there in position.items()}
-    speed_square = {name: float(np.mean((v - logged_speed) ** 2)) for name, v in speed.items()}
+    speed_square = {
+        name: float(np.mean((stage.velocity_m_s - logged_speed) ** 2))
+        for name, stage in stages.items()
+    }
     steps = []
     for before, name in pairwise((STUDENT, *STEPS)):
         moved = np.abs(position[name] - position[before])

@@ -221,8 +221,7 @@ def _scan(lines: Lines, sigma_a: float, skip: BoolArray) -> list[float]:
     times = times[:: max(1, -(-len(times) // MAX_STEPS))]
     if not len(times):
         return []
-    rest = white.data - white.columns @ base.coefficients
-    rows = np.count_nonzero(~skip)
+    rest = white.rest(base.coefficients)
     together = same_gains(lines.legs)
     made = [
         gains(legs, sigma_a, lines.sigma_z_m, skip)
@@ -232,16 +231,16 @@ def _scan(lines: Lines, sigma_a: float, skip: BoolArray) -> list[float]:
     def explains(block: Array) -> Array:
         """χ² that a step at each of some times takes away."""
         candidates = steps(lines.time_s, block)
-        still = np.zeros_like(candidates)
+        still = np.broadcast_to(0.0, candidates.shape)
         signals = Signals(still, still, candidates, np.zeros(len(block)))
         chi_square = np.zeros(len(block))
         for at, legs in enumerate(lines.legs):
             if at == 0 or not together:
                 response = respond(legs, signals, *made[at])[~skip]
-            own = slice(at * rows, (at + 1) * rows)
-            mixed = white.columns[own].T @ response
-            size = np.sum(response**2, axis=0) - np.sum(mixed * (base.covariance @ mixed), axis=0)
-            chi_square += (rest[own] @ response) ** 2 / np.maximum(size, 1e-9)
+            mixed = white.columns[at].T @ response
+            covariance = base.covariance[np.ix_(white.which[at], white.which[at])]
+            size = np.sum(response**2, axis=0) - np.sum(mixed * (covariance @ mixed), axis=0)
+            chi_square += (rest[at] @ response) ** 2 / np.maximum(size, 1e-9)
         return chi_square
 
     blocks = np.array_split(times, -(-len(times) // STEPS_AT_ONCE))
@@ -271,9 +270,9 @@ def _judge(
     chi_square = float(size @ np.linalg.solve(covariance, size)) / max(found.spread, 1.0) ** 2
     if chi_square < chdtri(len(columns), chance):
         return None
-    rest = white.data - white.columns @ found.coefficients
-    near = np.tile(after[~later], len(lines.legs))
-    if np.mean(rest[near] ** 2) > STEP_NIS * max(found.spread, 1.0) ** 2:
+    near = after[~later]
+    rest = np.concatenate([own[near] for own in white.rest(found.coefficients)])
+    if np.mean(rest**2) > STEP_NIS * max(found.spread, 1.0) ** 2:
         return None
     # its size from all, now that it is known to be one
     whole = lines.fit(sigma_a, skip & ~after)

@@ -329,25 +329,26 @@ def _scatter(problem: _Problem, offset: float, noises: Noises, information: floa
     dv *= np.sqrt(q11 - q01**2 / q00)
     dp *= np.sqrt(q00)
     dv += q01 / q00 * dp
-    speed = np.zeros((count, axes, REPLICATES))
-    speed[chain.end] = dv
-    for begin, end in zip(problem.motion.edges, problem.motion.edges[1:], strict=False):
-        np.cumsum(speed[begin:end], axis=0, out=speed[begin:end])
-    error = rng.standard_normal(speed.shape)
+    error = rng.standard_normal((count, axes, REPLICATES))
     error *= noises.sigma_z_m
     if noises.walk_m:  # the source's own walk is in the residuals, but nothing the IMU measured
         walk = noises.walk_m * np.sqrt(chain.length_s)[:, None, None]
         dp += walk * rng.standard_normal(dp.shape)
     given = arguments(part, noises, np.ones(count))
     still = np.broadcast_to(0.0, (axes, REPLICATES_AT_ONCE, len(q00)))
-    pairs = []
-    for first in range(0, REPLICATES, REPLICATES_AT_ONCE):
-        some = slice(first, first + REPLICATES_AT_ONCE)
-        moved = Columns(*(np.transpose(each[..., some], (1, 2, 0)) for each in (error, dp, dv)))
-        sped = Columns(np.transpose(speed[..., some], (1, 2, 0)), still, still)
-        pairs.append((moved, sped))
-    score = paired_products(*given, pairs).sum(axis=0)
-    return 1.0 + float(np.var(score)) / information
+
+    def some(first: int) -> tuple[Columns, Columns]:
+        """Some of the errors, and of the noise of the velocity that goes with each."""
+        own = slice(first, first + REPLICATES_AT_ONCE)
+        moved = Columns(*(np.transpose(each[..., own], (1, 2, 0)) for each in (error, dp, dv)))
+        speed = np.zeros(moved.measurement_m.shape)
+        speed[..., chain.end] = moved.delta_velocity_m_s
+        for begin, end in zip(problem.motion.edges, problem.motion.edges[1:], strict=False):
+            np.cumsum(speed[..., begin:end], axis=-1, out=speed[..., begin:end])
+        return moved, Columns(speed, still, still)
+
+    score = paired_products(*given, map(some, range(0, REPLICATES, REPLICATES_AT_ONCE)))
+    return 1.0 + float(np.var(score.sum(axis=0))) / information
 
 
 def _vertex(grid: Array, profile: Array) -> tuple[float, float]:

@@ -15,7 +15,7 @@ in variables): what remains is weighed by the variance that it has at each scale
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import astuple, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -24,7 +24,7 @@ from scipy import constants
 from scipy.linalg import cho_factor, cho_solve
 from scipy.spatial.transform import Rotation
 
-from px4fuse.arrays import Array, BoolArray
+from px4fuse.arrays import Array, BoolArray, IntArray
 from px4fuse.filter.driven import driven
 from px4fuse.filter.kalman import Settings, Timeline, timeline
 from px4fuse.filter.likelihood import Preintegrated, moved, preintegrate, recursion
@@ -75,11 +75,31 @@ class Signals:
 
 @dataclass(frozen=True)
 class Whitened:
-    """Innovations over √S: data, shape (n,), columns, shape (n, k), and Σ ln S."""
+    """Innovations over √S of some axes, each of which most columns are not about.
 
-    data: Array
-    columns: Array
+    Attributes
+    ----------
+    data : tuple of ndarray, shape (n,)
+        Of each axis.
+    columns : tuple of ndarray, shape (n, k)
+        Those that are about it.
+    which : tuple of ndarray of int, shape (k,)
+        Which of all columns these are.
+    log_s : float
+        Σ ln S over all.
+    """
+
+    data: tuple[Array, ...]
+    columns: tuple[Array, ...]
+    which: tuple[IntArray, ...]
     log_s: float
+
+    def rest(self, coefficients: Array) -> list[Array]:
+        """What the columns, so many times each, leave of the data of each axis."""
+        return [
+            data - columns @ coefficients[which]
+            for data, columns, which in zip(self.data, self.columns, self.which, strict=True)
+        ]
 
 
 @dataclass(frozen=True)
@@ -152,21 +172,23 @@ def fit(white: Whitened, prior: Array) -> Fit:
     prior : ndarray, shape (k,)
         Standard deviation of each coefficient before the data, infinite where nothing is known.
     """
-    X, y = white.columns, white.data
-    information = X.T @ X + np.diag(prior**-2.0)
+    information, moment = np.diag(prior**-2.0), np.zeros(len(prior))
+    for y, X, which in zip(white.data, white.columns, white.which, strict=True):
+        information[np.ix_(which, which)] += X.T @ X
+        moment[which] += X.T @ y
     # a column that nothing excites (a turn in hover) must not stop the others
     information += 1e-12 * np.diag(np.diag(information)) + 1e-12 * np.eye(len(prior))
     factor = cho_factor(information)
     covariance = cho_solve(factor, np.eye(len(prior)))
-    coefficients = covariance @ (X.T @ y)
-    square = float(y @ y - coefficients @ (X.T @ y))
+    coefficients = covariance @ moment
+    square = float(sum(y @ y for y in white.data) - coefficients @ moment)
     log_determinant = float(np.sum(np.log(np.diag(factor[0]))))
     return Fit(
         coefficients,
         covariance,
         square,
         0.5 * (square + white.log_s) + log_determinant,
-        float(np.sqrt(max(square, 0.0) / max(len(y) - CONSTANTS, 1))),
+        float(np.sqrt(max(square, 0.0) / max(sum(map(len, white.data)) - CONSTANTS, 1))),
     )
 
 
@@ -180,6 +202,8 @@ class Lines:
         Of the measurements, as they were stamped.
     legs, signals : tuple of Preintegrated and of Signals
         Of each axis.
+    hats : Signals
+        Slow accelerations, the same for each axis, but with coefficients for each.
     prior : ndarray, shape (k,)
         Standard deviations of the columns' coefficients before the data.
     sigma_z_m : float
@@ -190,6 +214,7 @@ class Lines:
     time_s: Array
     legs: tuple[Preintegrated, ...]
     signals: tuple[Signals, ...]
+    hats: Signals
     prior: Array
     sigma_z_m: float
     steps: Array
@@ -205,46 +230,47 @@ class Lines:
 
     def whiten(self, sigma_a: float, skip: BoolArray, scale: float = 1.0) -> Whitened:
         """Whitened innovations with the acceleration (and its noise) scaled."""
-        data, columns, log_s = [], [], 0.0
         width, extra = len(self.prior), self.steps.shape[1]
-        own_hats = (width - CONSTANTS) // len(self.legs)
-        signals = [_with_measured(_scaled(each, scale), self.steps) for each in self.signals]
+        own_hats = len(self.hats.start_m)
+        signals = [_scaled(each, scale) for each in self.signals]
+        # the same for every axis
+        shared = _joined([self.hats, _measured(self.steps)])
+        data, columns, which, log_s = [], [], [], 0.0
         for at, (normalised, s) in enumerate(
-            respond_each(self.legs, signals, scale * sigma_a, self.sigma_z_m, skip)
+            respond_each(self.legs, signals, shared, scale * sigma_a, self.sigma_z_m, skip)
         ):
             own = normalised[~skip]
-            block = np.zeros((len(own), width + extra * len(self.legs)))
-            block[:, :CONSTANTS] = own[:, 1 : 1 + CONSTANTS]
-            first = CONSTANTS + own_hats * at
-            last = 1 + CONSTANTS + own_hats
-            block[:, first : first + own_hats] = own[:, 1 + CONSTANTS : last]
-            block[:, width + extra * at : width + extra * (at + 1)] = own[:, last:]
+            first, step = CONSTANTS + own_hats * at, width + extra * at
             data.append(own[:, 0])
-            columns.append(block)
+            columns.append(own[:, 1:])
+            which.append(np.r_[:CONSTANTS, first : first + own_hats, step : step + extra])
             log_s += float(np.sum(np.log(s[~skip])))
-        return Whitened(np.concatenate(data), np.vstack(columns), log_s)
+        return Whitened(tuple(data), tuple(columns), tuple(which), log_s)
 
 
 def respond_each(
     legs: Sequence[Preintegrated],
     signals: Sequence[Signals],
+    shared: Signals,
     sigma_a: float,
     sigma_z: float,
     skip: BoolArray,
 ) -> list[tuple[Array, Array]]:
-    """:func:`respond` of each axis; those with the same legs go through one filter together."""
+    """:func:`respond` of each axis to its own signals, then to those that all axes share.
+
+    Axes with the same legs go through one filter together.
+    """
     if not same_gains(legs):
         made = [gains(leg, sigma_a, sigma_z, skip) for leg in legs]
         return [
-            (respond(leg, each, *own), own[0])
+            (respond(leg, _joined([each, shared]), *own), own[0])
             for leg, each, own in zip(legs, signals, made, strict=True)
         ]
-    parts = [astuple(each) for each in signals]
-    joined = Signals(*(np.concatenate(part, axis=-1) for part in zip(*parts, strict=True)))
     s, gain = gains(legs[0], sigma_a, sigma_z, skip)
-    normalised = respond(legs[0], joined, s, gain)
-    widths = np.cumsum([len(each.start_m) for each in signals])[:-1]
-    return [(part, s) for part in np.split(normalised, widths, axis=1)]
+    normalised = respond(legs[0], _joined([*signals, shared]), s, gain)
+    widths = np.cumsum([len(each.start_m) for each in signals])
+    *own_parts, of_shared = np.split(normalised, widths, axis=1)
+    return [(np.hstack([own, of_shared]), s) for own in own_parts]
 
 
 def same_gains(legs: Sequence[Preintegrated]) -> bool:
@@ -267,14 +293,19 @@ def _scaled(signals: Signals, scale: float) -> Signals:
     )
 
 
-def _with_measured(signals: Signals, added: Array) -> Signals:
-    still = np.zeros_like(added)
+def _joined(signals: Sequence[Signals]) -> Signals:
     return Signals(
-        np.hstack([signals.position_m, still]),
-        np.hstack([signals.velocity_m_s, still]),
-        np.hstack([signals.measured_m, added]),
-        np.concatenate([signals.start_m, np.zeros(added.shape[1])]),
+        np.hstack([each.position_m for each in signals]),
+        np.hstack([each.velocity_m_s for each in signals]),
+        np.hstack([each.measured_m for each in signals]),
+        np.hstack([each.start_m for each in signals]),
     )
+
+
+def _measured(added: Array) -> Signals:
+    """Signals that only the measurements have."""
+    still = np.broadcast_to(0.0, added.shape)
+    return Signals(still, still, added, np.zeros(added.shape[1]))
 
 
 def too_few(count: int) -> Unavailable:
@@ -332,16 +363,25 @@ def lines_of(
     signals = []
     line = timeline(shifted[0], settings)
     ramps = [moved(line, _step_means(hat, line)) for hat in hats]
+    slow = [np.stack(part, axis=1) for part in zip(*ramps, strict=True)]
     for axis, own in zip(shifted, legs, strict=True):
         columns = [(own.delta_position_m, own.delta_velocity_m_s)]
         for frame in common:
             pushed = project_acceleration(frame, axis.direction, segment)
             columns.append(moved(line, _step_means(pushed, line)))
-        position, velocity = (np.stack(part, axis=1) for part in zip(*columns, *ramps, strict=True))
+        position, velocity = (np.stack(part, axis=1) for part in zip(*columns, strict=True))
         measured, start = np.zeros_like(position), np.zeros(position.shape[1])
         measured[:, 0], start[0] = own.measurement_m, own.initial.position_m
         signals.append(Signals(position, velocity, measured, start))
-    return Lines(time_s, legs, tuple(signals), prior, sigma_z, steps(time_s, []))
+    return Lines(
+        time_s,
+        legs,
+        tuple(signals),
+        Signals(slow[0], slow[1], np.zeros_like(slow[0]), np.zeros(len(hats))),
+        prior,
+        sigma_z,
+        steps(time_s, []),
+    )
 
 
 def _step_means(acceleration: Acceleration | Unavailable, line: Timeline) -> Array:

@@ -6,7 +6,7 @@ marginalised by the Schur complement of their products.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
@@ -288,7 +288,7 @@ def paired_products(
     delta_velocity_m_s: Array,
     sigma_a_m_s2: float,
     variance_m2: Array,
-    pairs: Sequence[tuple[Columns, Columns]],
+    pairs: Iterable[tuple[Columns, Columns]],
 ) -> Array:
     """Products of pairs of other signals by stretch, with the constants' signals taken out.
 
@@ -299,58 +299,58 @@ def paired_products(
     delta_position_m, delta_velocity_m_s : ndarray, shape (a, 1, 1 + c, n)
     sigma_a_m_s2 : float
     variance_m2 : ndarray, shape (m,)
-    pairs : sequence
-        Signals of shape (a, k, ...), a few at a time: whitened they are twice as long.
+    pairs : iterable
+        Signals of shape (a, k, ...), a few at a time: they are long.
 
     Returns
     -------
     ndarray, shape (s, k of all)
     """
     states, stretches = len(variance_m2), list(_stretches(positions))
-    first = np.cumsum([0, *(one.measurement_m.shape[1] for one, _ in pairs)])
-    made = np.zeros((len(stretches), first[-1]))
     constants = len(positions.constant_sigma)
-    cross = np.zeros((2, *made.shape, constants))
-    information = np.zeros((len(made), constants, constants)) + np.diag(
-        positions.constant_sigma**-2.0
-    )
+    information = np.tile(np.diag(positions.constant_sigma**-2.0), (len(stretches), 1, 1))
+    known: list[tuple[int, Factor, list[tuple[Array, Array]]]] = []
     for axes, factor, _ in _factors(positions, sigma_a_m_s2, variance_m2):
-        root = np.sqrt(factor.precision[:, 0])
-        for axis in axes:  # one at a time: they are long
-            of_constants = factor.whiten(
+        for axis in axes:
+            white = factor.whiten(
                 Columns(
                     np.zeros((constants, states)),
                     delta_position_m[axis, 0, 1:],
                     delta_velocity_m_s[axis, 0, 1:],
                 )
             )
-            for at, stretch in enumerate(stretches):
-                rows, explained = _part_of(of_constants, stretch)
-                information[at] += rows @ rows.T - explained @ explained.T
-            for begin, end, pair in zip(first, first[1:], pairs, strict=False):
-                white = [
-                    factor.whiten(
-                        Columns(
-                            each.measurement_m[axis],
-                            each.delta_position_m[axis],
-                            each.delta_velocity_m_s[axis],
-                        )
-                    )
-                    for each in pair
-                ]
-                measured = [root * each.measurement_m[axis] for each in pair]
-                for at, stretch in enumerate(stretches):
-                    here = slice(*stretch)
-                    parts = [_part_of(each, stretch) for each in white]
-                    by_part = np.einsum("kr,kr->k", *(each[:, here] for each in measured))
-                    for sign, both in zip((1.0, -1.0), zip(*parts, strict=True), strict=True):
-                        by_part += sign * np.einsum("kr,kr->k", *both)
-                    made[at, begin:end] += by_part
-                    rows, explained = _part_of(of_constants, stretch)
-                    for which, (own, less) in enumerate(parts):
-                        cross[which, at, begin:end] += own @ rows.T - less @ explained.T
-    taken = np.linalg.solve(information, np.swapaxes(cross[1], 1, 2))
-    return np.asarray(made - np.einsum("skc,sck->sk", cross[0], taken))
+            of_constants = [_part_of(white, stretch) for stretch in stretches]
+            known.append((axis, factor, of_constants))
+            information += [rows @ rows.T - less @ less.T for rows, less in of_constants]
+
+    def products(pair: tuple[Columns, Columns]) -> Array:
+        count = pair[0].measurement_m.shape[1]
+        made = np.zeros((len(stretches), count))
+        cross = np.zeros((2, *made.shape, constants))
+        for axis, factor, of_constants in known:
+            signals = [
+                Columns(each.measurement_m[axis], each.delta_position_m[axis],
+                        each.delta_velocity_m_s[axis])
+                for each in pair
+            ]  # fmt: skip
+            white = [factor.whiten(each) for each in signals]
+            root = np.sqrt(factor.precision[:, 0])
+            measured = [root * each.measurement_m for each in signals]
+            for at, (stretch, (rows, explained)) in enumerate(
+                zip(stretches, of_constants, strict=True)
+            ):
+                here = slice(*stretch)
+                parts = [_part_of(each, stretch) for each in white]
+                by_part = np.einsum("kr,kr->k", *(each[:, here] for each in measured))
+                for sign, both in zip((1.0, -1.0), zip(*parts, strict=True), strict=True):
+                    by_part += sign * np.einsum("kr,kr->k", *both)
+                made[at] += by_part
+                for which, (own, less) in enumerate(parts):
+                    cross[which, at] += own @ rows.T - less @ explained.T
+        taken = np.linalg.solve(information, np.swapaxes(cross[1], 1, 2))
+        return np.asarray(made - np.einsum("skc,sck->sk", cross[0], taken))
+
+    return np.concatenate([products(pair) for pair in pairs], axis=1)
 
 
 def _part_of(white: tuple[Array, Array], stretch: tuple[int, int]) -> tuple[Array, Array]:

@@ -66,8 +66,9 @@ class Acceleration:
         Gravity removed.
     integral_m_s : ndarray, shape (n,)
         Trapezoidal integral from the first sample, for averages over steps.
-    gap_integral_s : ndarray, shape (n,)
-        Seconds of gap passed since the first sample.
+    gap_time_s, gap_integral_s : ndarray, shape (g,)
+        Seconds of gap passed since the first sample, at both ends and where a gap begins or ends;
+        between them it is linear.
     rms_m_s2 : float
         Root mean square of the signal: how wrong the input may be inside a gap.
     """
@@ -75,6 +76,7 @@ class Acceleration:
     time_s: Array
     value_m_s2: Array
     integral_m_s: Array
+    gap_time_s: Array
     gap_integral_s: Array
     rms_m_s2: float
 
@@ -418,12 +420,16 @@ def project_acceleration(
         return Unavailable(
             "IMU", "no IMU sample in the analysed segment", "Choose --start and --end inside it."
         )
-    interval, is_gap = np.diff(time), imu_gaps(time)
+    is_gap = imu_gaps(time)
+    passed = np.concatenate([[0.0], np.cumsum(np.where(is_gap, np.diff(time), 0.0))])
+    before = np.flatnonzero(is_gap)
+    knots = np.union1d([0, len(time) - 1], [before, before + 1])
     return Acceleration(
         time_s=time,
         value_m_s2=value,
         integral_m_s=cumulative_integral(value, time),
-        gap_integral_s=np.concatenate([[0.0], np.cumsum(np.where(is_gap, interval, 0.0))]),
+        gap_time_s=time[knots],
+        gap_integral_s=passed[knots],
         rms_m_s2=float(np.sqrt(np.mean(value[inside] ** 2))),
     )
 
@@ -452,7 +458,7 @@ def step_means(acceleration: Acceleration, edges: ArrayLike) -> tuple[Array, Arr
     edges = np.asarray(edges, dtype=np.float64)
     length = np.diff(edges)
     velocity = np.interp(edges, acceleration.time_s, acceleration.integral_m_s)
-    gap = np.interp(edges, acceleration.time_s, acceleration.gap_integral_s)
+    gap = np.interp(edges, acceleration.gap_time_s, acceleration.gap_integral_s)
     covered = np.clip(edges, acceleration.time_s[0], acceleration.time_s[-1])
     outside = 1.0 - np.diff(covered) / length
     return np.diff(velocity) / length, np.clip(np.diff(gap) / length + outside, 0.0, 1.0)
