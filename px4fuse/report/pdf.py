@@ -85,6 +85,7 @@ def render(document: Report, results_json: str) -> bytes:
             for number, figure in enumerate(figures, start=1):
                 _running_lines(figure, document, number, len(figures))
                 _without_ligatures(figure)
+                _places_of_empty_labels(figure)
                 pdf.savefig(figure)
     return _attach(drawn.getvalue(), document, results_json)
 
@@ -120,6 +121,14 @@ def _without_ligatures(figure: Figure) -> None:
         texts += [*titles, axes.xaxis.label, axes.yaxis.label]
     for text in texts:
         text.set_fontfeatures(("-liga",))
+
+
+def _places_of_empty_labels(figure: Figure) -> None:
+    """Fix where labels without words stand: else the numbers beside are measured for each."""
+    for axes in figure.axes:
+        for axis in (axes.xaxis, axes.yaxis):
+            if not axis.get_label_text():
+                axis.set_label_coords(0.5, 0.5)
 
 
 def _attach(drawn: bytes, document: Report, results_json: str) -> bytes:
