@@ -116,6 +116,8 @@ class Comparison(Shown, Prepared):
 
     Attributes
     ----------
+    flight, source, source_reason, segment, settings, lines, notes, missing
+        As :class:`Prepared` has them; notes also of EKF2.
     axes : tuple of AxisComparison
     horizontal_kf, horizontal_ekf2 : HorizontalNis or None
         North and east together, None unless both were analysed.
@@ -206,7 +208,14 @@ def compare_prepared(
         for run in replay_all(prepared.lines, prepared.settings)
     ]
     return Comparison(
-        **(vars(prepared) | {"notes": tuple(notes)}),
+        flight=flight,
+        source=track,
+        source_reason=prepared.source_reason,
+        segment=segment,
+        settings=prepared.settings,
+        lines=prepared.lines,
+        notes=tuple(notes),
+        missing=prepared.missing,
         axes=tuple(results),
         horizontal_kf=_horizontal(results, lambda axis: axis.replay.updates),
         horizontal_ekf2=_horizontal(results, lambda axis: axis.ekf2_innovations),
