@@ -56,21 +56,20 @@ def test_a_gain_is_seen_from_the_end_of_its_step() -> None:
     np.testing.assert_allclose(gained[:, 1], [-0.002, -0.0005], atol=1e-12)
 
 
-def test_a_stretch_of_a_vehicle_that_turns() -> None:
+def facing(at: Any, error: Any = 0.0) -> np.ndarray:
+    angle = 0.5 * (np.asarray(at) - 10.5) + error
+    return np.column_stack([np.cos(angle / 2), 0 * angle, 0 * angle, np.sin(angle / 2)])
+
+
+def turning(states: np.ndarray) -> tuple[pd.DataFrame, pd.DataFrame, Ekf2, FusionRecord]:
     """0.5 rad/s about the vertical; the gyro reads 0.01 rad/s too much, EKF2 knows."""
     time = 10.0 + 0.005 * np.arange(401)
     imu = pd.DataFrame(0.0, index=time, columns=ANGULAR_RATE_COLUMNS + SPECIFIC_FORCE_COLUMNS)
     imu[ANGULAR_RATE_COLUMNS[2]] = 0.51
     imu[SPECIFIC_FORCE_COLUMNS] = [1.0, 0.2, -9.8]
-
-    def facing(at: Any, error: Any = 0.0) -> np.ndarray:
-        angle = 0.5 * (np.asarray(at) - 10.5) + error
-        return np.column_stack([np.cos(angle / 2), 0 * angle, 0 * angle, np.sin(angle / 2)])
-
     attitude = pd.DataFrame(facing(time[::4]), index=time[::4], columns=QUATERNION_COLUMNS)
-    states = 10.0 + 0.1 * np.arange(21)
     delayed = pd.DataFrame(
-        facing(states, 0.01 * np.arange(21)), index=states, columns=QUATERNION_COLUMNS
+        facing(states, 0.1 * (states - 10.0)), index=states, columns=QUATERNION_COLUMNS
     )
     delayed = delayed.assign(**dict.fromkeys(VELOCITY_COLUMNS, 2.0), **{
         **dict.fromkeys(POSITION_COLUMNS, np.nan), **dict.fromkeys(GYRO_BIAS_COLUMNS, 0.0),
@@ -80,7 +79,12 @@ def test_a_stretch_of_a_vehicle_that_turns() -> None:
     delayed["attitude_down_rad2"] = states
     state = pd.DataFrame(7.0, index=time, columns=STATE_COLUMNS).assign(down_m=time)
     record = made(FusionRecord, delayed=delayed, parameters={})
-    found = _stretch(imu, attitude, made(Ekf2, state=state), record, 5, 11.5)
+    return imu, attitude, made(Ekf2, state=state), record
+
+
+def test_a_stretch_of_a_vehicle_that_turns() -> None:
+    flown = turning(10.0 + 0.1 * np.arange(21))
+    found = _stretch(*flown, 5, 11.5)
     steps = 10.5 + 0.01 * np.arange(101)
     np.testing.assert_allclose(found.time_s, steps, atol=1e-9)
     np.testing.assert_allclose(found.step_s, 0.01, atol=1e-9)
@@ -102,9 +106,16 @@ def test_a_stretch_of_a_vehicle_that_turns() -> None:
     )
     assert found.gyro_bias_rad_s.tolist() == [0.0, 0.0, 0.01]
     assert found.fusing
-    delayed[POSITION_COLUMNS] = 3.0
-    own = _stretch(imu, attitude, made(Ekf2, state=state), record, 5, 11.5)
-    np.testing.assert_allclose(own.state[6:9], [3.0, 3.0, 10.5])
+    flown[3].delayed[POSITION_COLUMNS] = 3.0
+    np.testing.assert_allclose(_stretch(*flown, 5, 11.5).state[6:9], [3.0, 3.0, 10.5])
+
+
+def test_an_end_that_the_log_shows_sets_the_count_of_samples_again() -> None:
+    """States of 10.605 and 10.61 s, to half a microsecond; that of 10.705002 s is on no sample."""
+    shown = [10.5, 10.6050004, 10.6099996, 10.705002, 11.5]
+    found = _stretch(*turning(np.array(shown)), 0, 11.5)
+    steps = np.sort(np.append(10.5 + 0.01 * np.arange(101), 10.605))
+    np.testing.assert_allclose(found.time_s, steps, atol=1e-9)
 
 
 def stretches(monkeypatch: pytest.MonkeyPatch, **parts: Any) -> list[tuple[float, float]]:

@@ -176,10 +176,8 @@ def _stretch(
     to_row = int(np.searchsorted(time, end_s, side="right"))
     time = time[from_row:to_row]
     interval = np.diff(time)
-    known = np.searchsorted(time, record.delayed.index.to_numpy() - 1e-4)
-    known = known[(known < len(time)) & (known > 0)]
-    on_sample = np.isin(np.rint(time[known] * 1e6), np.rint(record.delayed.index * 1e6))
-    ends = step_ends(interval, known[on_sample], predict_s(record))
+    known = np.flatnonzero(np.isin(np.rint(time * 1e6), np.rint(record.delayed.index * 1e6)))
+    ends = step_ends(interval, known, predict_s(record))
     gyro_bias = start[GYRO_BIAS_COLUMNS].to_numpy(dtype=np.float64)
     accelerometer_bias = start[ACCELEROMETER_BIAS_COLUMNS].to_numpy(dtype=np.float64)
     rate = imu[ANGULAR_RATE_COLUMNS].to_numpy()[from_row + 1 : to_row] - gyro_bias
@@ -252,7 +250,7 @@ def step_ends(interval_s: Array, known: Indices, target_s: float) -> Indices:
     interval_s : ndarray, shape (n,)
         Of the IMU samples after the start.
     known : ndarray of int
-        Ends that are known, increasing, each above 0.
+        Ends that are known, increasing; the start may be among them.
     target_s : float
         EKF2_PREDICT_US.
 
