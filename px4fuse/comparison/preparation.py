@@ -76,10 +76,15 @@ def prepare(
 ) -> Prepared:
     """Choose the source, the segment and the axes, with the arguments of :func:`compare`.
 
+    Parameters
+    ----------
+    input_required : bool
+        Raise instead of falling back to ``input="zero"`` where the log has no acceleration.
+
     Raises
     ------
     MissingDataError, SettingsError
-        As :func:`compare`.
+        As :func:`compare`; no acceleration while ``input_required``.
     """
     settings = settings or Settings()
     track, reason = choose_source(flight, position_source)
