@@ -179,7 +179,7 @@ def at_rest(
     stretch = Stretch(
         time_s=10.0 + 0.01 * np.arange(count + 1), step_s=np.full(count, 0.01),
         rotation=np.tile(np.eye(3), (count + 1, 1, 1)), correction_rad=flat,
-        force_m_s2=flat - GRAVITY_M_S2, gyro_bias_rad_s=np.zeros(3),
+        force_m_s2=flat - GRAVITY_M_S2,
         accelerometer_bias_m_s2=np.zeros(3), state=np.zeros(15), variance=np.full(15, 1e-4),
         down_m=np.full(count + 1, down_m), heading_variance_rad2=np.full(count + 1, 1e-4),
         down_variance_m2=np.full(count + 1, 4e-4), attitude_error_rad=np.zeros((count + 1, 3)),

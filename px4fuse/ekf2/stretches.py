@@ -74,8 +74,8 @@ class Stretch:
         By how much the nominal attitude turns in each step beyond what the gyro measured.
     force_m_s2 : ndarray, shape (n, 3)
         Specific force of the body in each step, nominal bias removed, in the frame at its end.
-    gyro_bias_rad_s, accelerometer_bias_m_s2 : ndarray, shape (3,)
-        Nominal biases: the log's at the start.
+    accelerometer_bias_m_s2 : ndarray, shape (3,)
+        Nominal bias: the log's at the start.
     state : ndarray, shape (15,)
         At the start: attitude error, velocity, position, errors of both biases.
     variance : ndarray, shape (15,)
@@ -97,7 +97,6 @@ class Stretch:
     rotation: Array
     correction_rad: Array
     force_m_s2: Array
-    gyro_bias_rad_s: Array
     accelerometer_bias_m_s2: Array
     state: Array
     variance: Array
@@ -215,7 +214,6 @@ def _stretch(
         rotation=matrix(nominal),
         correction_rad=to_vector(multiply(extra[1:], conjugate(extra[:-1]))),
         force_m_s2=gain / step[:, None],
-        gyro_bias_rad_s=gyro_bias,
         accelerometer_bias_m_s2=accelerometer_bias,
         state=state,
         variance=start[DELAYED_VARIANCE_COLUMNS].to_numpy(dtype=np.float64),
