@@ -37,7 +37,7 @@ from px4fuse.ekf2.replay import Ekf2Replay
 from px4fuse.ekf2.whatif import WhatIf, sweep_values, what_if
 from px4fuse.errors import LogError, MissingDataError, SettingsError
 from px4fuse.filter.causes import AFTER_STEP_S, Explained, explained
-from px4fuse.filter.clock import SURE_SIGMAS, ClockOffset
+from px4fuse.filter.clock import ClockOffset
 from px4fuse.filter.heading import HeadingError
 from px4fuse.filter.kalman import Settings
 from px4fuse.filter.motion import Made
@@ -151,8 +151,7 @@ class Analysis(Shown):
             if isinstance(tuned, AxisTuning) and axes.keys() >= set(group):
                 clock, offset_s = self.clock, 0.0
                 if isinstance(clock, ClockOffset) and clock.determinable:
-                    sure = abs(clock.offset_s) > SURE_SIGMAS * clock.sigma_s
-                    offset_s = clock.offset_s if sure else 0.0
+                    offset_s = clock.offset_s if abs(clock.offset_s) > clock.chance_s else 0.0
                 used = {
                     "sigma_a_m_s2": size(tuned.filter_sigma_a, settings.sigma_a_m_s2),
                     "sigma_z_m": size(tuned.sigma_z, settings.sigma_z_m),

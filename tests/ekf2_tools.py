@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from px4fuse.ekf2.inputs import Inputs
+from px4fuse.ekf2.inputs import Inputs, Rules
 from px4fuse.ekf2.legs import GRAVITY_M_S2
 from px4fuse.ekf2.stretches import Stretch
 from px4fuse.trajectory.rotation import skew
 
 EYE = np.eye(15)
+# Of v1.16
+RULES = Rules(0.2, 0.4, 1.0, 5, None, False)
 
 
 def step_matrix(stretch: Stretch, k: int, *, trapezoid: bool = True) -> np.ndarray:

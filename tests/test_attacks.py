@@ -446,7 +446,7 @@ def looped(truth: Any, notes: str, request: dict[str, Any], loop: dict[str, Any]
     values = {f"request__{name}": value for name, value in request.items()}
     values |= {f"loop__{name}": value for name, value in loop.items()}
     results = decoded(changed(LOOP, student__notes=notes, student__id="s01", **values))
-    report = Report("0" * 64, 9, "intact", results, (), b"")
+    report = Report("0" * 64, "intact", results, (), b"")
     key = truth and AnswerKey("loop", (Answer("s01", "", "", LOOP["track"]["sha256"], *truth),))
     verdict = Verdict("verified", (), True, page_status="same")
     made = assess(report, verdict, read_rubric(None), key)

@@ -31,8 +31,9 @@ from ulog_tools import (
 )
 
 from px4fuse.cli import main
+from px4fuse.comparison.preparation import choose_segment, choose_source
 from px4fuse.errors import LogError, Px4FuseError
-from px4fuse.filter.signals import choose_segment, choose_source, make_axes
+from px4fuse.filter.signals import make_axes
 from px4fuse.flight import Flight, Unavailable
 from px4fuse.readers import ULOG_MAGIC, read_log
 

@@ -17,7 +17,9 @@ from px4fuse.comparison.comparison import (
     Difference,
     FilterSummary,
     compare,
+    compare_prepared,
 )
+from px4fuse.comparison.preparation import prepare
 from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.kalman import Settings, variance_at
@@ -276,7 +278,7 @@ class TestMadeFlight:
 
     def test_a_single_axis_has_the_same_numbers_alone(self, made: Comparison) -> None:
         told: list[str] = []
-        alone = compare(made.flight, axes=("east",), progress=told.append)
+        alone = compare_prepared(prepare(made.flight, axes=("east",)), told.append)
         assert told == ["east"]
         assert [result.axis.name for result in alone.axes] == ["east"]
         assert alone.horizontal_kf is None
@@ -326,7 +328,7 @@ class TestMissingParts:
         assert comparison.axes[0].axis.acceleration in comparison.missing
         assert consistency(comparison.axes[0].kf).count == 600
         with pytest.raises(SettingsError, match="`input` imu"):
-            compare(flight, input_required=True)
+            prepare(flight, input_required=True)
 
     def test_zero_input_asked_for_is_not_noted_as_missing(self, made: Comparison) -> None:
         comparison = compare(made.flight, Settings(input="zero"), axes=("north",))

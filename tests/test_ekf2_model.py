@@ -4,13 +4,17 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
 from ekf2_tools import plain_replay, step_matrix, step_noise, step_state
+from findings_tools import made
 from scipy.spatial.transform import Rotation
 
+from px4fuse.ekf2 import model as model_module
 from px4fuse.ekf2.inputs import Inputs, prepare
 from px4fuse.ekf2.legs import FUSE, START, Legs, Timing, make_legs
 from px4fuse.ekf2.model import (
@@ -23,7 +27,7 @@ from px4fuse.ekf2.model import (
 )
 from px4fuse.ekf2.recursion import Variant, run
 from px4fuse.ekf2.replay import HORIZONTAL, Ekf2Replay
-from px4fuse.ekf2.stretches import step_ends
+from px4fuse.ekf2.stretches import Stretch, step_ends
 from px4fuse.errors import SettingsError
 from px4fuse.flight import (
     POSITION_COLUMNS,
@@ -442,3 +446,37 @@ def test_a_bias_that_ekf2_does_not_learn_is_no_trouble(sample_flight: Flight) ->
     )
     assert np.isfinite(made.flown.published.to_numpy()).all()
     assert np.isfinite(made.flown.updates.to_numpy()).all()
+
+
+@pytest.mark.parametrize(("horizon_s", "lag"), [(0.0, 1), (0.024, 2), (0.026, 3), (9.0, 100)])
+def test_what_is_published_has_the_bias_of_the_horizon(
+    monkeypatch: pytest.MonkeyPatch, horizon_s: float, lag: int
+) -> None:
+    """The newest IMU samples are corrected by the bias that the filter has ``lag`` steps before."""
+    count = 80
+    state = np.zeros((count + 1, 15))
+    state[:, 12:15] = np.random.default_rng(3).normal(0.0, 0.1, (count + 1, 3))
+    stretch = made(
+        Stretch, time_s=0.01 * np.arange(count + 1), step_s=np.full(count, 0.01),
+        rotation=np.tile(np.eye(3), (count + 1, 1, 1)), force_m_s2=np.ones((count, 3)),
+    )  # fmt: skip
+    variant = SimpleNamespace(
+        timing=lambda _: Timing(0.0, horizon_s), attitude=False,
+        settings={"EKF2_TAU_VEL": 0.25, "EKF2_TAU_POS": 0.4},
+    )  # fmt: skip
+    taken = {}
+
+    def keep(**given: Any) -> tuple[np.ndarray, np.ndarray]:
+        taken.update(given)
+        return state[:, 3:6], state[:, 6:9]
+
+    monkeypatch.setattr(model_module, "delayed_states", lambda *_: (state, state[:, :3]))
+    monkeypatch.setattr(model_module, "_delayed", lambda *_: pd.DataFrame())
+    monkeypatch.setattr(model_module, "publish", keep)
+    part = SimpleNamespace(stretch=stretch, variants=[variant])
+    model_module._tracks(made(Inputs, step_s=0.01), part, 0)  # type: ignore[arg-type]
+    assert taken["lag"] == lag
+    gravity = np.array([0.0, 0.0, 9.80665])
+    for step in range(count):
+        bias = state[max(step + 1 - lag, 0), 12:15]
+        np.testing.assert_allclose(taken["gain_m_s"][step], (1.0 - bias + gravity) * 0.01)

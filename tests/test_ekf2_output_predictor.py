@@ -1,21 +1,11 @@
-"""EKF2's output predictor against its buffer, step by step, and rotations against SciPy."""
+"""EKF2's output predictor against its buffer, step by step."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from px4fuse.ekf2.output_predictor import follow_attitude, publish
-from px4fuse.trajectory.rotation import (
-    from_vector,
-    interpolate,
-    matrix,
-    multiply,
-    running_product,
-    skew,
-    to_vector,
-)
 
 STEP_S = 0.01
 
@@ -97,32 +87,3 @@ def test_the_published_attitude_follows_by_half_a_step_per_horizon() -> None:
         expected[k + 1] = expected[k] + share * behind
     assert made == pytest.approx(expected, abs=1e-12)
     assert made[-1] == pytest.approx(error[-1], rel=0.01)
-
-
-def test_rotations_are_scipys() -> None:
-    rng = np.random.default_rng(1)
-    turns = rng.normal(0.0, 0.7, (50, 3))
-    q = from_vector(turns)
-    theirs = Rotation.from_rotvec(turns)
-    assert matrix(q) == pytest.approx(theirs.as_matrix(), abs=1e-12)
-    assert to_vector(q) == pytest.approx(turns, abs=1e-12)
-    assert to_vector(-q) == pytest.approx(turns, abs=1e-12)
-    assert to_vector(from_vector(np.zeros((1, 3)))) == pytest.approx(np.zeros((1, 3)))
-    both = multiply(q[:25], q[25:])
-    assert matrix(both) == pytest.approx((theirs[:25] * theirs[25:]).as_matrix(), abs=1e-12)
-    v, u = rng.normal(size=(2, 3))
-    assert skew(v) @ u == pytest.approx(np.cross(v, u))
-    product = running_product(q)
-    known = q[0]
-    for at in range(1, 50):
-        known = multiply(known, q[at])
-    assert product[-1] == pytest.approx(known, abs=1e-12)
-    assert len(running_product(q[:1])) == 1
-
-
-def test_interpolation_does_not_mind_the_sign() -> None:
-    times = np.array([0.0, 1.0, 2.0])
-    known = from_vector(np.array([[0.0, 0.0, 0.10], [0.0, 0.0, 0.12], [0.0, 0.0, 0.14]]))
-    known[1] *= -1.0
-    found = to_vector(interpolate(np.array([0.5, 1.5]), times, known))
-    assert found[:, 2] == pytest.approx([0.11, 0.13], abs=1e-6)

@@ -2,19 +2,48 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
+from ekf2_tools import RULES
+from findings_tools import NONE, made
 
-from px4fuse.ekf2 import walk as steps_of_the_walk
+from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.model import Model, delayed_variants, open_model
 from px4fuse.ekf2.parameters import PARAMETERS, check, settings_in_force
-from px4fuse.ekf2.walk import OUTPUT, SAMPLES, STEPS, Line, Student, Walk, walk
-from px4fuse.ekf2.whatif import WhatIf, sweep, sweep_values, what_if
+from px4fuse.ekf2.replay import Ekf2Replay
+from px4fuse.ekf2.walk import (
+    OUTPUT,
+    SAMPLES,
+    STEPS,
+    AxisWalk,
+    Line,
+    Student,
+    Walk,
+    _coast,
+    _variants,
+    walk,
+)
+from px4fuse.ekf2.walk import _to_truth as walk_to_truth
+from px4fuse.ekf2.whatif import (
+    AxisSummary,
+    Summary,
+    WhatIf,
+    _longest,
+    _notes,
+    _sigma,
+    _to_truth,
+    sweep,
+    sweep_values,
+    what_if,
+)
 from px4fuse.errors import SettingsError
-from px4fuse.flight import Ekf2, Flight, Unavailable
+from px4fuse.flight import STATE_COLUMNS, Ekf2, Flight, Truth, Unavailable
 
 
 @pytest.fixture(scope="module")
@@ -122,7 +151,7 @@ def test_defaults_are_the_releases() -> None:
 
 def stages(model: Model) -> dict[str, pd.DataFrame]:
     """Track of the filter after each step."""
-    variants = steps_of_the_walk._variants(model, Student())
+    variants = _variants(model, Student())
     delayed, flown = delayed_variants(model, list(variants.values()))
     tracks = (*delayed, flown.delayed, flown.published)
     return dict(zip((*variants, OUTPUT), tracks, strict=True))
@@ -221,3 +250,119 @@ def test_a_track_of_another_time_is_refused(model: Model) -> None:
     result = walk(model, lines={"north": Line(1.0, 0.0, elsewhere)})
     assert isinstance(result, Unavailable)
     assert "no time in common" in result.reason
+
+
+# ---------------------------------------------------------------- on numbers whose answer is known
+
+
+def test_the_walk_changes_one_thing_after_the_other() -> None:
+    flown = {"EKF2_EVP_NOISE": 0.3, "EKF2_EV_NOISE_MD": 0.0, "EKF2_ACC_NOISE": 0.35}
+    model = made(Model, inputs=made(Inputs, settings=flown, step_s=0.01))
+    found = list(_variants(model, Student(0.5, 0.2, 0.16, -0.05)).values())
+    assert [one.settings["EKF2_ACC_NOISE"] for one in found] == pytest.approx(
+        [2.0] * 4 + [0.35] * 3
+    )
+    assert [one.settings["EKF2_EVP_NOISE"] for one in found] == [0.2] * 2 + [0.3] * 5
+    assert [one.settings["EKF2_EV_NOISE_MD"] for one in found] == [1.0] * 2 + [0.0] * 5
+    assert [one.biases for one in found] == [False] * 3 + [True] * 4
+    assert [one.attitude for one in found] == [False] * 5 + [True] * 2
+    assert [one.gated for one in found] == [False] * 6 + [True]
+    assert [one.as_logged for one in found] == [False] * 6 + [True]
+    assert [one.stamp_offset_s for one in found] == [-0.05] + [None] * 6
+
+
+def test_the_longest_run_of_rejections_is_told_with_how_far_it_led() -> None:
+    taken = 20.0 + np.arange(10.0)
+    updates = pd.DataFrame(
+        {"rejected": [0, 1, 0, 0, 1, 1, 1, 0, 1, 1], "fused_at_s": taken + 0.5}, index=taken
+    )
+    time = np.arange(20.0, 31.0, 0.5)
+    still = pd.DataFrame(0.0, index=time, columns=STATE_COLUMNS)
+    away = still.copy()
+    away.iloc[:, 0] = np.where(time == 26.5, 3.0, 0.0)
+    away.iloc[:, 1] = np.where(time == 26.5, -4.0, np.where(time < 24.0, 99.0, 0.0))
+    one = made(Ekf2Replay, updates=updates, delayed=away)
+    found = _coast(one, still, (0.0, 99.0), ((0.0, 99.0),))
+    assert found is not None
+    assert (found.start_s, found.samples, found.duration_s) == (24.5, 3, 3.0)
+    assert found.distance_m == pytest.approx(5.0)
+    # what is not judged, and what nobody rejected
+    early = _coast(one, still, (0.0, 22.0), ((0.0, 99.0),))
+    assert early is not None
+    assert (early.start_s, early.samples, early.duration_s) == (21.5, 1, 0.0)
+    assert _coast(one, still, (22.4, 24.4), ((0.0, 99.0),)) is None
+
+
+def truth_of(where: dict[str, float]) -> Truth:
+    frame = pd.DataFrame(0.0, index=[10.0, 20.0], columns=STATE_COLUMNS)
+    return made(Truth, samples=frame.assign(**where))
+
+
+def test_errors_to_the_truth_are_of_its_own_span() -> None:
+    times = np.array([9.0, 10.0, 15.0, 20.0, 21.0])
+    off = np.array([9.0, 3.0, 4.0, 5.0, 9.0])
+    flight = made(Flight, truth=truth_of({"north_m": 1.0, "east_m": 2.0}))
+    line = Line(0.6, 0.8)  # along which the truth is at 2.2 m
+    model = SimpleNamespace(flight=flight)
+    found = walk_to_truth(model, 2.2 + off, line, times)  # type: ignore[arg-type]
+    assert found == pytest.approx(math.sqrt(50.0 / 3.0))
+    later = walk_to_truth(model, off[:1], line, times[:1])  # type: ignore[arg-type]
+    assert isinstance(later, Unavailable)
+    published = pd.DataFrame({"east_m": 2.0 + off}, index=times)
+    assert _to_truth(flight, published, "east", times) == pytest.approx(math.sqrt(50.0 / 3.0))
+    assert isinstance(_to_truth(flight, published, "east", times[:1]), Unavailable)
+    assert isinstance(_to_truth(made(Flight, truth=NONE), published, "east", times), Unavailable)
+
+
+def test_the_longest_time_without_fusion_counts_both_ends() -> None:
+    judged = ((15.0, 30.0), (40.0, 60.0))
+    assert _longest(np.array([16.0, 29.0, 41.0, 59.0]), judged) == 18.0
+    assert _longest(np.array([40.0]), judged) == 25.0
+    assert _longest(np.array([16.0]), judged) == 44.0
+
+
+def test_the_stated_sigma_goes_from_after_one_sample_to_before_the_next() -> None:
+    """At the middle between them the variance is the mean of 0.01 after and 0.09 before."""
+    updates = pd.DataFrame(
+        {
+            "innovation_variance_east_m2": [0.05, 0.13], "observation_variance_east_m2": 0.04,
+            "position_variance_east_m2": [0.01, 0.02], "fused_at_s": [20.0, 22.0],
+        }
+    )  # fmt: skip
+    ekf2 = made(Ekf2, variance=pd.DataFrame(index=[21.0]))
+    one = made(Ekf2Replay, updates=updates)
+    assert _sigma(ekf2, one, "east", ((10.0, 30.0),)) == pytest.approx(math.sqrt(0.05))
+    assert _sigma(made(Ekf2, variance=NONE), one, "east", ((10.0, 30.0),)) is NONE
+
+
+def test_a_summary_joins_north_and_east() -> None:
+    def axis(nis: float, error: Any) -> AxisSummary:
+        return AxisSummary(nis, (0.9, 1.1), 0.1, 0.1, error)
+
+    one = Summary({}, {"north": axis(1.0, 0.3), "east": axis(3.0, 0.4)}, 9, 0.0, 0.1, 0)
+    assert one.nis_mean == 2.0
+    assert one.position_rmse_to_truth_m == pytest.approx(0.5)
+    lacking = replace(one, axes={"north": axis(1.0, 0.3), "east": axis(3.0, NONE)})
+    assert lacking.position_rmse_to_truth_m is NONE
+
+
+def test_samples_that_come_too_late_are_a_note() -> None:
+    for by_delay, remedy in ((False, ": raise EKF2_DELAY_MAX"), (True, "")):
+        rules = replace(RULES, horizon_by_delay=by_delay)
+        model = SimpleNamespace(inputs=SimpleNamespace(rules=rules))
+        one = SimpleNamespace(late=3, lost=2, updates=range(8), changed={"EKF2_EV_DELAY": 90.0})
+        (note,) = _notes(model, one)  # type: ignore[arg-type]
+        assert note == (
+            "EKF2_EV_DELAY=90: 5 of 10 samples would reach EKF2 after its fusion horizon has "
+            f"passed them (2 would never be fused){remedy}"
+        )
+        assert _notes(model, SimpleNamespace(late=0, lost=0)) == []  # type: ignore[arg-type]
+        one.late, one.changed = 0, {}
+        assert _notes(model, one)[0].startswith("as flown: 2 of 10 samples")  # type: ignore[arg-type]
+
+
+def test_what_is_left_is_a_share_of_all() -> None:
+    assert made(AxisWalk, position_left_m2=1.0, position_total_m2=4.0).position_left_share == 0.25
+    frame = pd.DataFrame({"north_m": [0.0, 2.0], "east_m": [4.0, 4.0]}, index=[0.0, 1.0])
+    along = Line(0.6, 0.8).along(frame, ["north_m", "east_m"], np.array([0.5]))
+    assert along == pytest.approx([3.8])

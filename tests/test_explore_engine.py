@@ -16,10 +16,11 @@ from explore_tools import ask
 from flights import Imu, Uwb, aisle_flight
 
 from px4fuse.comparison.comparison import Comparison, compare
+from px4fuse.comparison.preparation import shift_clock
 from px4fuse.explore.data import OFFSET_REACH_S, raw_source, signals_of
 from px4fuse.explore.packing import FINE, Packer
 from px4fuse.filter.kalman import Replay, Settings, replay, state_at
-from px4fuse.filter.signals import make_axes, shift_clock
+from px4fuse.filter.signals import make_axes
 from px4fuse.readers import read_log
 
 TRIES = 50

@@ -12,10 +12,10 @@ from flights import aisle_flight, unexplained
 from scipy.spatial.transform import Rotation
 
 from px4fuse.comparison.comparison import compare
+from px4fuse.comparison.preparation import choose_segment, choose_source
 from px4fuse.filter import heading
 from px4fuse.filter.heading import DRIFT_P, HeadingError, HeadingPart, heading_error
 from px4fuse.filter.kalman import Settings
-from px4fuse.filter.signals import choose_segment, choose_source
 from px4fuse.findings import Finding, source_frame_turned
 from px4fuse.flight import QUATERNION_COLUMNS, ROTATION_VARIANCE_COLUMNS, Flight, Unavailable
 from px4fuse.readers import read_log

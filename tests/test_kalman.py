@@ -14,6 +14,7 @@ from flights import line
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from px4fuse.comparison.preparation import choose_segment, choose_source
 from px4fuse.errors import SettingsError
 from px4fuse.filter.kalman import (
     InitialState,
@@ -24,7 +25,7 @@ from px4fuse.filter.kalman import (
     variance_at,
 )
 from px4fuse.filter.model import H, matrix, noise
-from px4fuse.filter.signals import Axis, choose_segment, choose_source, make_axes
+from px4fuse.filter.signals import Axis, make_axes
 from px4fuse.flight import Flight
 
 SAME_TIME_S = 5e-7

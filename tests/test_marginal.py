@@ -29,12 +29,17 @@ from px4fuse.filter.fitting import (
     filter_part,
     most_likely,
     negative_log_likelihood,
-    profile_end,
     widened_by_outliers,
 )
 from px4fuse.filter.kalman import Settings
 from px4fuse.filter.lanes import gains, lanes_of_paths
-from px4fuse.filter.likelihood import PROFILE_DROP, innovations, preintegrate, total_over_grid
+from px4fuse.filter.likelihood import (
+    PROFILE_DROP,
+    innovations,
+    preintegrate,
+    profile_end,
+    total_over_grid,
+)
 from px4fuse.filter.marginal import (
     Positions,
     centred,

@@ -31,8 +31,8 @@ from ulog_tools import (
 )
 
 from px4fuse.comparison.comparison import compare
+from px4fuse.comparison.preparation import choose_source
 from px4fuse.errors import MissingDataError
-from px4fuse.filter.signals import choose_source
 from px4fuse.flight import (
     POSITION_COLUMNS,
     POSITION_VARIANCE_COLUMNS,

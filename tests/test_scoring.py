@@ -36,7 +36,7 @@ NONE = {"unavailable": {"what": "it", "reason": "too few of them", "remedy": ""}
 
 
 def report(results=EXAMPLE, pages=PAGES):
-    return Report("0" * 64, 1000, "intact", decoded(results), tuple(pages), b"%PDF")
+    return Report("0" * 64, "intact", decoded(results), tuple(pages), b"%PDF")
 
 
 def checked(check, results=EXAMPLE, pages=PAGES, /, verdict=VERIFIED, key=None, **parameters):

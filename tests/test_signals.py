@@ -12,18 +12,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from px4fuse.comparison.preparation import LADDER, choose_segment, choose_source, shift_clock
 from px4fuse.comparison.projection import continuous_state
 from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.filter.signals import (
-    LADDER,
     Segment,
     aisle_heading,
-    choose_segment,
-    choose_source,
     make_axes,
     ned_acceleration,
     project_acceleration,
-    shift_clock,
     step_means,
 )
 from px4fuse.flight import (

@@ -116,6 +116,8 @@ class Comparison(Shown, Prepared):
 
     Attributes
     ----------
+    flight, source, source_reason, segment, settings, lines, notes, missing
+        As :class:`Prepared` has them; notes also of EKF2.
     axes : tuple of AxisComparison
     horizontal_kf, horizontal_ekf2 : HorizontalNis or None
         North and east together, None unless both were analysed.
@@ -153,8 +155,6 @@ def compare(
     position_source: str | None = None,
     start_s: float | None = None,
     end_s: float | None = None,
-    input_required: bool = False,
-    progress: Callable[[str], None] = lambda _: None,
 ) -> Comparison:
     """Replay a flight and compare it with EKF2 and, where there is one, with the truth.
 
@@ -170,23 +170,19 @@ def compare(
         Name of a track of the flight.
     start_s, end_s : float, optional
         Segment, seconds from the first data.
-    input_required : bool
-        Raise instead of falling back to ``input="zero"`` where the log has no acceleration.
-    progress : callable
-        Told the names of the axes as they start.
 
     Raises
     ------
     MissingDataError
         No position source, or no such axis.
     SettingsError
-        An empty segment, or no acceleration while ``input_required``.
+        An empty segment.
     """
     prepared = prepare(
         flight, settings, axes=axes, heading_deg=heading_deg, position_source=position_source,
-        start_s=start_s, end_s=end_s, input_required=input_required,
+        start_s=start_s, end_s=end_s,
     )  # fmt: skip
-    return compare_prepared(prepared, progress)
+    return compare_prepared(prepared)
 
 
 def compare_prepared(
@@ -206,7 +202,14 @@ def compare_prepared(
         for run in replay_all(prepared.lines, prepared.settings)
     ]
     return Comparison(
-        **(vars(prepared) | {"notes": tuple(notes)}),
+        flight=flight,
+        source=track,
+        source_reason=prepared.source_reason,
+        segment=segment,
+        settings=prepared.settings,
+        lines=prepared.lines,
+        notes=tuple(notes),
+        missing=prepared.missing,
         axes=tuple(results),
         horizontal_kf=_horizontal(results, lambda axis: axis.replay.updates),
         horizontal_ekf2=_horizontal(results, lambda axis: axis.ekf2_innovations),

@@ -4,19 +4,28 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import numpy as np
+import pandas as pd
+
 from px4fuse.display import brief
-from px4fuse.errors import SettingsError
+from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.filter.kalman import Settings
-from px4fuse.filter.signals import (
-    Axis,
-    Segment,
-    choose_segment,
-    choose_source,
-    make_axes,
-    shift_clock,
-)
+from px4fuse.filter.signals import MIN_MEASUREMENTS, Axis, Segment, make_axes
 from px4fuse.flight import Flight, PositionTrack, Truth, Unavailable
 
+# The GPS rung is taken only when asked for.
+LAST_AUTOMATIC_RUNG = 6
+# Rung of each name of the ladder short of GPS: PX4's topics, then MAVLink's messages
+LADDER = {
+    "vehicle_visual_odometry": 2,
+    "vehicle_mocap_odometry": 3,
+    "estimator_visual_odometry_aligned": 4,
+    "estimator_aid_src_ev_pos": 5,
+    "ekf2_state_plus_innovation": 6,
+    "VISION_POSITION_ESTIMATE": 2,
+    "ODOMETRY": 2,
+    "ATT_POS_MOCAP": 3,
+}
 NOT_ITS_OWN_TRUTH = Unavailable(
     "ground truth",
     "the position source is the only reference in the log, and it is what our filter was given",
@@ -67,10 +76,15 @@ def prepare(
 ) -> Prepared:
     """Choose the source, the segment and the axes, with the arguments of :func:`compare`.
 
+    Parameters
+    ----------
+    input_required : bool
+        Raise instead of falling back to ``input="zero"`` where the log has no acceleration.
+
     Raises
     ------
     MissingDataError, SettingsError
-        As :func:`compare`.
+        As :func:`compare`; no acceleration while ``input_required``.
     """
     settings = settings or Settings()
     track, reason = choose_source(flight, position_source)
@@ -90,3 +104,146 @@ def prepare(
         if acceleration not in missing:
             missing.append(acceleration)
     return Prepared(flight, track, reason, segment, settings, lines, tuple(notes), tuple(missing))
+
+
+def choose_source(flight: Flight, name: str | None = None) -> tuple[PositionTrack, str]:
+    """Choose the position source by the ladder, or by name.
+
+    Parameters
+    ----------
+    flight : Flight
+    name : str, optional
+        One of the track names; by default the best rung short of GPS.
+
+    Returns
+    -------
+    track : PositionTrack
+    reason : str
+        One sentence: why this one.
+
+    Raises
+    ------
+    MissingDataError
+        The log holds no (such) track; the text says what was looked for and what would log it.
+    """
+    have = ", ".join(track.name for track in flight.positions) or "none"
+    if name is not None:
+        for track in flight.positions:
+            if track.name == name:
+                return track, "chosen with --position-source"
+        looked = {missing.what.split()[-1]: missing for missing in flight.missing}
+        reason = looked[name].reason if name in looked else "no such source"
+        raise MissingDataError(
+            f"{flight.log.name}: position source {name}: {reason}. This log has: {have}."
+        )
+    for track in flight.positions:
+        if track.rung <= LAST_AUTOMATIC_RUNG:
+            return track, _ladder_reason(flight, track)
+    raise MissingDataError(_no_source(flight))
+
+
+def _no_source(flight: Flight) -> str:
+    damaged = "the file is damaged, and " if any("damaged" in n for n in flight.log.notes) else ""
+    if flight.log.format.startswith("MAVLink"):
+        return (
+            f"{flight.log.name}: {damaged}no external position was sent to the autopilot in this "
+            "recording (no VISION_POSITION_ESTIMATE, ODOMETRY or ATT_POS_MOCAP). Give the "
+            "positioning system's own file with `position`"
+            f"{', or the ULog' if flight.log.has_ulog else ''}."
+        )
+    gps = any(track.rung > LAST_AUTOMATIC_RUNG for track in flight.positions)
+    hint = (
+        "Only GPS is in it: give `position_source` vehicle_gps_position to use that, or s"
+        if gps
+        else "S"
+    )
+    return (
+        f"{flight.log.name}: {damaged}no external position in this log (no "
+        "vehicle_visual_odometry, motion capture or EKF2 innovations of external vision). "
+        f"{hint}et SDLOG_PROFILE to 129 and send the UWB position to PX4 as "
+        "VISION_POSITION_ESTIMATE, or give the UWB's own file with `position`."
+    )
+
+
+def _ladder_reason(flight: Flight, track: PositionTrack) -> str:
+    if track.rung == 1:
+        return "given with --position"
+    whence = f" (from {track.log})" if track.log and track.log != flight.log.name else ""
+    missing = [part.what.removeprefix("position source ") for part in flight.missing]
+    lacking = [name for name in missing if LADDER.get(name, LAST_AUTOMATIC_RUNG) < track.rung]
+    if not lacking:
+        return f"the best source: logged as it arrived{whence}"
+    return f"the best that this log has{whence}; no usable {', '.join(lacking)}"
+
+
+def shift_clock(track: PositionTrack, clock_offset_s: float) -> PositionTrack:
+    """The same track with ``clock_offset_s`` added to its time stamps."""
+    if clock_offset_s == 0.0:
+        return track
+
+    def later(frame: pd.DataFrame) -> pd.DataFrame:
+        return frame.set_axis(pd.Index(frame.index.to_numpy() + clock_offset_s, name="time_s"))
+
+    return replace(
+        track,
+        samples=later(track.samples),
+        orientation=None if track.orientation is None else later(track.orientation),
+    )
+
+
+def choose_segment(
+    flight: Flight,
+    track: PositionTrack,
+    start_s: float | None = None,
+    end_s: float | None = None,
+) -> Segment:
+    """Choose the part of the log to analyse: where the source runs and the vehicle flies.
+
+    Parameters
+    ----------
+    flight : Flight
+    track : PositionTrack
+    start_s, end_s : float, optional
+        Override either end (seconds from the first data).
+
+    Raises
+    ------
+    SettingsError
+        The chosen part is empty or holds fewer than three measurements.
+    """
+    source_start, source_end = float(track.samples.index[0]), float(track.samples.index[-1])
+    low, high = max(source_start, 0.0), min(source_end, flight.log.duration_s)
+    if isinstance(flight.airborne, Unavailable):
+        reason = "the whole span of the source: the log has no land detector"
+    elif not flight.airborne:
+        reason = "the whole span of the source: the vehicle never took off"
+    else:
+        take_off, touch_down = flight.airborne[0][0], flight.airborne[-1][1]
+        if max(low, take_off) < min(high, touch_down):
+            low, high = max(low, take_off), min(high, touch_down)
+            reason = "where the source runs and the vehicle flies"
+        else:
+            reason = "the whole span of the source: it does not run in flight"
+    if start_s is not None or end_s is not None:
+        low = low if start_s is None else start_s
+        high = high if end_s is None else end_s
+        given = [
+            text for text, value in (("--start", start_s), ("--end", end_s)) if value is not None
+        ]
+        reason = f"chosen with {' and '.join(given)}"
+        inside = max(low, 0.0), min(high, flight.log.duration_s)
+        if inside != (low, high) and inside[0] < inside[1]:
+            low, high = inside
+            reason += ", cut at the ends of the data"
+    if not low < high:
+        raise SettingsError(
+            f"{flight.log.name}: the segment from {low:.6g} s to {high:.6g} s is empty; the "
+            f"position source runs from {source_start:.2f} s to {source_end:.2f} s."
+        )
+    count = np.count_nonzero((track.samples.index >= low) & (track.samples.index <= high))
+    if count < MIN_MEASUREMENTS:
+        raise SettingsError(
+            f"{flight.log.name}: {count} measurements of {track.name} between {low:.2f} s and "
+            f"{high:.2f} s are too few (at least {MIN_MEASUREMENTS} are needed)."
+        )
+    return Segment(low, high, reason)

@@ -23,7 +23,7 @@ from px4fuse.ekf2.walk import (
     Step,
     Walk,
 )
-from px4fuse.filter.clock import SURE_SIGMAS, ClockOffset
+from px4fuse.filter.clock import ClockOffset
 from px4fuse.filter.signals import AISLE
 from px4fuse.flight import Unavailable
 
@@ -318,7 +318,7 @@ def _clock(facts: Facts) -> list[str]:
     own = facts.comparison.settings.clock_offset_s
     delay_s = facts.model.inputs.settings["EKF2_EV_DELAY"] * 1e-3
     both = own + clock.offset_s
-    known_s = max(CLOCK_S, SURE_SIGMAS * clock.sigma_s)
+    known_s = max(CLOCK_S, clock.chance_s)
     if min(abs(clock.offset_s), abs(both + delay_s)) < known_s or abs(own + delay_s) > CLOCK_S:
         return []
     return [

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from px4fuse.comparison.preparation import choose_segment, choose_source
 from px4fuse.contents.outlook import (
     PART_NAMES,
     Ability,
@@ -20,14 +21,7 @@ from px4fuse.contents.outlook import (
     most_innovations,
 )
 from px4fuse.errors import MissingDataError, Px4FuseError
-from px4fuse.filter.signals import (
-    IMU_GAP_INTERVALS,
-    IMU_GAP_S,
-    Segment,
-    choose_segment,
-    choose_source,
-    make_axes,
-)
+from px4fuse.filter.signals import IMU_GAP_INTERVALS, IMU_GAP_S, Segment, make_axes
 from px4fuse.findings.source_gap import GAP, GAP_INTERVALS
 from px4fuse.flight import Ekf2, Flight, Unavailable, sample_rate
 from px4fuse.plain import plain

@@ -29,7 +29,7 @@ from px4fuse.ekf2.legs import (
     Timing,
     make_legs,
 )
-from px4fuse.ekf2.output_predictor import follow_attitude, publish
+from px4fuse.ekf2.output_predictor import follow_attitude, later, publish
 from px4fuse.ekf2.parameters import check
 from px4fuse.ekf2.recursion import Run, Variant, run, with_correlation
 from px4fuse.ekf2.replay import UPDATE_COLUMNS, Agreement, Ekf2Replay
@@ -278,8 +278,7 @@ def _tracks(inputs: Inputs, part: StretchRun, at: int) -> tuple[pd.DataFrame, pd
     horizon_s = min(variant.timing(inputs).horizon_s, MAX_HORIZON_S)
     lag = max(round(horizon_s / inputs.step_s), 1)
     # the bias that the newest IMU samples are corrected with is the horizon's
-    bias = np.concatenate([np.repeat(state[:1, 12:15], lag, axis=0), state[:-lag, 12:15]])
-    force = stretch.force_m_s2 - bias[1 : len(stretch.step_s) + 1]
+    force = stretch.force_m_s2 - later(state[:, ACCELEROMETER_BIAS], lag)[1:]
     force = np.einsum("nij,nj->ni", stretch.rotation[1:], force)
     if variant.attitude:  # the published attitude followed that of EKF2 itself
         turned = follow_attitude(

@@ -62,7 +62,7 @@ def publish(
     steady = position_m - reset_m  # the buffer is moved along with a reset
     free = steady[0] + np.concatenate([zero, np.cumsum(moved, axis=0)])
     position = free + _followed(steady - free, lag, mean_step, tau_position_s)
-    return velocity, position + _later(reset_m, lag)
+    return velocity, position + later(reset_m, lag)
 
 
 def _followed(offset: Array, lag: int, step_s: float, tau_s: float) -> Array:
@@ -73,13 +73,13 @@ def _followed(offset: Array, lag: int, step_s: float, tau_s: float) -> Array:
     g = step_s / np.clip(tau_s, step_s, 10.0)
     h = INTEGRAL_SHARE * g**2
     start = offset[0]
-    late = _later(offset - start, lag)
+    late = later(offset - start, lag)
     corrected = _recursive(np.array([g + h, -g]), np.array([1.0, g + h - 2.0, 1.0 - g]), late)
     total: Array = corrected + start
     return total
 
 
-def _later(values: Array, lag: int) -> Array:
+def later(values: Array, lag: int) -> Array:
     """The same values ``lag`` steps later, the first one before them."""
     if lag == 0:
         return values

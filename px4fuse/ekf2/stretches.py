@@ -74,8 +74,8 @@ class Stretch:
         By how much the nominal attitude turns in each step beyond what the gyro measured.
     force_m_s2 : ndarray, shape (n, 3)
         Specific force of the body in each step, nominal bias removed, in the frame at its end.
-    gyro_bias_rad_s, accelerometer_bias_m_s2 : ndarray, shape (3,)
-        Nominal biases: the log's at the start.
+    accelerometer_bias_m_s2 : ndarray, shape (3,)
+        Nominal bias: the log's at the start.
     state : ndarray, shape (15,)
         At the start: attitude error, velocity, position, errors of both biases.
     variance : ndarray, shape (15,)
@@ -97,7 +97,6 @@ class Stretch:
     rotation: Array
     correction_rad: Array
     force_m_s2: Array
-    gyro_bias_rad_s: Array
     accelerometer_bias_m_s2: Array
     state: Array
     variance: Array
@@ -176,10 +175,8 @@ def _stretch(
     to_row = int(np.searchsorted(time, end_s, side="right"))
     time = time[from_row:to_row]
     interval = np.diff(time)
-    known = np.searchsorted(time, record.delayed.index.to_numpy() - 1e-4)
-    known = known[(known < len(time)) & (known > 0)]
-    on_sample = np.isin(np.rint(time[known] * 1e6), np.rint(record.delayed.index * 1e6))
-    ends = step_ends(interval, known[on_sample], predict_s(record))
+    known = np.flatnonzero(np.isin(np.rint(time * 1e6), np.rint(record.delayed.index * 1e6)))
+    ends = step_ends(interval, known, predict_s(record))
     gyro_bias = start[GYRO_BIAS_COLUMNS].to_numpy(dtype=np.float64)
     accelerometer_bias = start[ACCELEROMETER_BIAS_COLUMNS].to_numpy(dtype=np.float64)
     rate = imu[ANGULAR_RATE_COLUMNS].to_numpy()[from_row + 1 : to_row] - gyro_bias
@@ -217,7 +214,6 @@ def _stretch(
         rotation=matrix(nominal),
         correction_rad=to_vector(multiply(extra[1:], conjugate(extra[:-1]))),
         force_m_s2=gain / step[:, None],
-        gyro_bias_rad_s=gyro_bias,
         accelerometer_bias_m_s2=accelerometer_bias,
         state=state,
         variance=start[DELAYED_VARIANCE_COLUMNS].to_numpy(dtype=np.float64),
@@ -252,7 +248,7 @@ def step_ends(interval_s: Array, known: Indices, target_s: float) -> Indices:
     interval_s : ndarray, shape (n,)
         Of the IMU samples after the start.
     known : ndarray of int
-        Ends that are known, increasing, each above 0.
+        Ends that are known, increasing; the start may be among them.
     target_s : float
         EKF2_PREDICT_US.
 

@@ -16,6 +16,7 @@ from px4fuse.analysis import Analysis
 from px4fuse.arrays import Array
 from px4fuse.comparison.comparison import AgainstTruth, AxisComparison, Comparison
 from px4fuse.comparison.events import happened
+from px4fuse.comparison.preparation import choose_source
 from px4fuse.explore.ekf2_grid import grid_data, judged_numbers
 from px4fuse.explore.packing import COARSE, Packer
 from px4fuse.filter.consistency import CONFIDENCE, nis_band
@@ -27,7 +28,7 @@ from px4fuse.filter.kalman import (
     Settings,
 )
 from px4fuse.filter.model import INITIAL_COVARIANCE
-from px4fuse.filter.signals import AISLE, Acceleration, Axis, along, choose_source, imu_gaps, within
+from px4fuse.filter.signals import AISLE, Acceleration, Axis, along, imu_gaps, within
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.findings.model import Finding
 from px4fuse.findings.story import story

@@ -81,8 +81,6 @@ class Explained:
     jumps : tuple of Jump
     sigma_a_m_s2 : float
         White noise of the acceleration that is left.
-    count : int
-        Measurements that were used.
     """
 
     forward_bias: Estimate
@@ -90,7 +88,6 @@ class Explained:
     scale: Estimate
     jumps: tuple[Jump, ...]
     sigma_a_m_s2: float
-    count: int
 
     __repr__ = brief
 
@@ -147,7 +144,6 @@ def explained(
         _scale(lines, sigma_a, skip),
         jumps,
         sigma_a,
-        int(np.count_nonzero(~skip)),
     )
 
 

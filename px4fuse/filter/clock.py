@@ -50,7 +50,7 @@ MAX_HALF_INTERVAL_S = 0.15
 MAX_PART_SIGMA_S = 0.15
 # Parts further apart than chance would put them (two-sided)
 CHANGE_P = 0.005
-# An offset nearer to zero may be chance
+# Standard deviations beyond which an offset is not chance: 0.3 % of clean flights lie there
 SURE_SIGMAS = 3.0
 # Flights simulated for the scatter that the IMU's noise adds
 REPLICATES = 96
@@ -120,6 +120,11 @@ class ClockOffset(Shown):
     sigma_a_m_s2: float
     sigma_z_m: float
     count: int
+
+    @property
+    def chance_s(self) -> float:
+        """How far chance may take it from the truth: ``SURE_SIGMAS`` standard deviations (s)."""
+        return SURE_SIGMAS * self.sigma_s
 
 
 @dataclass(frozen=True)

@@ -8,19 +8,19 @@ and maximisation, one decision for all axes of a sample, with what *all* data sa
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from math import floor, log
 
 import numpy as np
-from scipy.optimize import brentq, minimize
+from scipy.optimize import minimize
 from scipy.special import comb, expit, gammaincinv
 
 from px4fuse.arrays import Array
 from px4fuse.filter.chain import Chain
 from px4fuse.filter.lanes import MIN_LANES, Lanes, gains, lanes
-from px4fuse.filter.likelihood import PROFILE_DROP, Preintegrated
+from px4fuse.filter.likelihood import Preintegrated
 from px4fuse.filter.marginal import Fitted, Positions, centred, fit, squares
 from px4fuse.filter.model import INITIAL_COVARIANCE
 
@@ -37,16 +37,12 @@ FIRST_SHARE, FIRST_WIDTH, MAX_SHARE = 0.005, 10.0, 0.4
 # SIGMA_Z is at most this many times what the median of the squares says
 BULK = 1.2
 SETTLED = 0.01
-# Steps of ln σ for slopes and bends
-SLOPE_STEP, BEND_STEP = 1e-4, 0.05
-# Of those: how far a parabola is followed at once, and how often
-FAR_STEPS, PARABOLAS = 6.0, 4
+# Step of ln σ for slopes
+SLOPE_STEP = 1e-4
 # Nodes about each place, and their distance in ln σ; while the outliers still change, few
 NODES, ROUGH_NODES = (10, 0.25), (6, 0.2)
 # Precision of a start that is known (1/m² and s²/m²): to a micrometre
 KNOWN = 1e12
-# ln σ at which the end of an interval is sought first
-FIRST_REACH = 0.05
 
 
 @dataclass(frozen=True)
@@ -398,60 +394,3 @@ def _maximise(likelihood: Likelihood, start: Noises, steps: int = MAX_STEPS) -> 
         options={"eps": SLOPE_STEP, "ftol": 1e-10, "gtol": 1e-8, "maxiter": steps},
     )
     return Noises(*np.exp(found.x).tolist())
-
-
-def profile_end(
-    score: Callable[[float, float], float],
-    best: tuple[float, float],
-    side: float,
-    bound: float,
-    widening: float = 1.0,
-) -> float | None:
-    """End of a 95 % profile-likelihood interval, None where it lies beyond a bound.
-
-    Parameters
-    ----------
-    score : callable
-        -ln p of ln of the parameter and ln of the other one, which is maximised out where there is
-        one.
-    best : (float, float)
-        Where it is least.
-    side : float
-        -1.0 for the low end, +1.0 for the high one.
-    bound : float
-        Of ln of the parameter.
-    widening : float
-        Of the variance, by what the score does not hold.
-    """
-    least, other, root = score(*best), best[1], float(np.sqrt(PROFILE_DROP * widening))
-
-    @cache  # where the other parameter is sought from depends on the call before
-    def excess(distance: float) -> float:
-        """How far √(drop), which is nearly a line, lies above that of the interval's end."""
-        nonlocal other
-        if distance == 0.0:
-            return -root
-        lowest, other = _lowest(lambda at: score(best[0] + side * distance, at), other)
-        return float(np.sqrt(max(lowest - least, 0.0)) - root)
-
-    reach = side * (bound - best[0])
-    far = min(FIRST_REACH, reach)
-    while excess(far) < 0.0:
-        if far == reach:
-            return None
-        far = min(2.0 * far, reach)
-    return float(best[0] + side * brentq(excess, 0.0, far, xtol=1e-3 * far))
-
-
-def _lowest(score: Callable[[float], float], near: float) -> tuple[float, float]:
-    """Least value of a score and where it is, by parabolas from near there."""
-    for _ in range(PARABOLAS):
-        left, middle, right = (score(near + k * BEND_STEP) for k in (-1.0, 0.0, 1.0))
-        if left == middle == right:  # there is no other parameter
-            return middle, near
-        bend = left - 2.0 * middle + right
-        step = 0.5 * (left - right) / bend if bend > 0.0 else np.sign(left - right) * FAR_STEPS
-        near += float(np.clip(step, -FAR_STEPS, FAR_STEPS)) * BEND_STEP
-        if bend > 0.0 and abs(step) <= 1.0:
-            return middle - 0.125 * (left - right) ** 2 / bend, near
-    return score(near), near

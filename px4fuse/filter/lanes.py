@@ -53,13 +53,11 @@ class Lanes:
 
     Attributes
     ----------
-    positions : Positions
     signal_m : ndarray, shape (l, s, a, T, 1 + c)
         What a filter with no input of its own takes for the measurements of each signal: those of
         the data less where the input alone leads, and for each constant what it adds to that.
     """
 
-    positions: Positions
     signal_m: Array
 
     def fit(self, gains: Gains) -> list[Fitted]:
@@ -191,7 +189,7 @@ def lanes(positions: Positions, delta_position_m: Array, delta_velocity_m_s: Arr
         velocity[step] += velocity[step - 1]
     np.negative(position, out=position)
     position[..., 0] += np.nan_to_num(positions.measurement_m)[state][..., None]
-    return Lanes(positions, position)
+    return Lanes(position)
 
 
 def lanes_of_paths(positions: Positions, path_m: Array) -> Lanes:
@@ -216,7 +214,7 @@ def lanes_of_paths(positions: Positions, path_m: Array) -> Lanes:
         apart[..., positions.start] = 0.0
         signal[..., -1][:, axes] = np.moveaxis(apart, -1, 0) - measured[:, axes]
     state, _ = _side_by_side(positions)
-    return Lanes(positions, signal[state])
+    return Lanes(signal[state])
 
 
 def _side_by_side(positions: Positions) -> tuple[IntArray, BoolArray]:

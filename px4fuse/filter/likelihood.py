@@ -7,12 +7,14 @@ Agrees with the filterpy replay to 1e-9 for SIGMA_A and SIGMA_Z from 1e-3.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.optimize import brentq
 from scipy.special import chdtri
 
 from px4fuse.arrays import Array, BoolArray, IntArray
@@ -22,6 +24,11 @@ from px4fuse.filter.signals import Axis
 
 # Half of the 95 % point of chi-square: the drop of log-likelihood that bounds an interval
 PROFILE_DROP = float(chdtri(1, 0.05)) / 2.0
+# ln σ at which the end of an interval is sought first
+FIRST_REACH = 0.05
+# Step of ln σ for bends; of those, how far a parabola is followed at once, and how often
+BEND_STEP = 0.05
+FAR_STEPS, PARABOLAS = 6.0, 4
 
 
 @dataclass(frozen=True)
@@ -306,3 +313,60 @@ def profile_interval(
         else:
             ends.append(None)
     return ends[0], ends[1]
+
+
+def profile_end(
+    score: Callable[[float, float], float],
+    best: tuple[float, float],
+    side: float,
+    bound: float,
+    widening: float = 1.0,
+) -> float | None:
+    """End of a 95 % profile-likelihood interval, None where it lies beyond a bound.
+
+    Parameters
+    ----------
+    score : callable
+        -ln p of ln of the parameter and ln of the other one, which is maximised out where there is
+        one.
+    best : (float, float)
+        Where it is least.
+    side : float
+        -1.0 for the low end, +1.0 for the high one.
+    bound : float
+        Of ln of the parameter.
+    widening : float
+        Of the variance, by what the score does not hold.
+    """
+    least, other, root = score(*best), best[1], float(np.sqrt(PROFILE_DROP * widening))
+
+    @cache  # where the other parameter is sought from depends on the call before
+    def excess(distance: float) -> float:
+        """How far √(drop), which is nearly a line, lies above that of the interval's end."""
+        nonlocal other
+        if distance == 0.0:
+            return -root
+        lowest, other = _lowest(lambda at: score(best[0] + side * distance, at), other)
+        return float(np.sqrt(max(lowest - least, 0.0)) - root)
+
+    reach = side * (bound - best[0])
+    far = min(FIRST_REACH, reach)
+    while excess(far) < 0.0:
+        if far == reach:
+            return None
+        far = min(2.0 * far, reach)
+    return float(best[0] + side * brentq(excess, 0.0, far, xtol=1e-3 * far))
+
+
+def _lowest(score: Callable[[float], float], near: float) -> tuple[float, float]:
+    """Least value of a score and where it is, by parabolas from near there."""
+    for _ in range(PARABOLAS):
+        left, middle, right = (score(near + k * BEND_STEP) for k in (-1.0, 0.0, 1.0))
+        if left == middle == right:  # there is no other parameter
+            return middle, near
+        bend = left - 2.0 * middle + right
+        step = 0.5 * (left - right) / bend if bend > 0.0 else np.sign(left - right) * FAR_STEPS
+        near += float(np.clip(step, -FAR_STEPS, FAR_STEPS)) * BEND_STEP
+        if bend > 0.0 and abs(step) <= 1.0:
+            return middle - 0.125 * (left - right) ** 2 / bend, near
+    return score(near), near

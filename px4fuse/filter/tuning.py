@@ -29,10 +29,15 @@ from px4fuse.filter.fitting import (
     filter_part,
     fitted,
     most_likely,
-    profile_end,
 )
 from px4fuse.filter.kalman import Settings
-from px4fuse.filter.likelihood import Preintegrated, innovations, preintegrate, total_over_grid
+from px4fuse.filter.likelihood import (
+    Preintegrated,
+    innovations,
+    preintegrate,
+    profile_end,
+    total_over_grid,
+)
 from px4fuse.filter.marginal import centred
 from px4fuse.filter.motion import SEARCH_S, Made, motion
 from px4fuse.filter.signals import Axis

@@ -10,7 +10,7 @@ from px4fuse.comparison.remedy import delay_helps, remedy_words
 from px4fuse.ekf2.parameters import PARAMETERS
 from px4fuse.filter.clock import ClockOffset
 from px4fuse.findings.model import Detector, Finding, Found, Threshold
-from px4fuse.findings.source_clock import CLOCK_OFFSET, CLOCK_SIGMAS
+from px4fuse.findings.source_clock import CLOCK_OFFSET
 from px4fuse.flight import Unavailable
 
 EKF2_UPDATE = Threshold(0.010, "s", "EKF2_PREDICT_US, EKF2's own step")
@@ -44,7 +44,7 @@ def _detect(analysis: Analysis) -> Found:
     asked = -applied - np.array([clock.interval_s[1], clock.interval_s[0]])
     best = -(applied + clock.offset_s)
     apart = abs(delay * 1e-3 - best)
-    if apart < max(CLOCK_SIGMAS.value * clock.sigma_s + EKF2_UPDATE.value, CLOCK_OFFSET.value):
+    if apart < max(clock.chance_s + EKF2_UPDATE.value, CLOCK_OFFSET.value):
         return
     low_ms, high_ms = asked * 1e3
     found = (

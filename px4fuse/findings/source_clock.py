@@ -15,7 +15,7 @@ from px4fuse.comparison.remedy import (
     replayed,
     settings_words,
 )
-from px4fuse.filter.clock import CHANGE_P, SURE_SIGMAS, ClockOffset
+from px4fuse.filter.clock import CHANGE_P, ClockOffset
 from px4fuse.findings.model import Detector, Finding, Found, Threshold
 from px4fuse.findings.source_smoothed import low_pass
 from px4fuse.findings.source_stamps_of_arrival import stamps_of_arrival_end_s
@@ -23,7 +23,6 @@ from px4fuse.flight import Unavailable
 
 CLOCK_OFFSET = Threshold(0.03, "s", "at 1 m/s a third of a good UWB's noise")
 CLOCK_OFFSET_ERROR = Threshold(0.10, "s", "at 1 m/s a good UWB's noise")
-CLOCK_SIGMAS = Threshold(SURE_SIGMAS, "standard deviations", "0.3 % of clean flights lie beyond")
 
 
 def _for_ekf2(analysis: Analysis, clock: ClockOffset) -> str:
@@ -72,10 +71,9 @@ def _detect(analysis: Analysis) -> Found:
             "change with --start, --end.",
             {**evidence, "change_p": clock.change_p or 0.0},
         )
-    sure = abs(clock.offset_s) > CLOCK_SIGMAS.value * clock.sigma_s
     # one offset cannot hold for stamps that are of arrival in a part of the flight only
     changes = changes or stamps_of_arrival_end_s(analysis) is not None
-    if sure and abs(clock.offset_s) > CLOCK_OFFSET.value and not changes:
+    if abs(clock.offset_s) > max(CLOCK_OFFSET.value, clock.chance_s) and not changes:
         remedy = f"{COMMAND} --clock-offset {typed_offset_s(comparison, clock):.3f}"
         shifted = replace(comparison.settings, clock_offset_s=round(applied + clock.offset_s, 3))
         errors = filter_errors_m(comparison, shifted)

@@ -10,7 +10,8 @@ import numpy as np
 
 from px4fuse.analysis import Analysis
 from px4fuse.arrays import Array
-from px4fuse.filter.signals import LADDER, within
+from px4fuse.comparison.preparation import LADDER
+from px4fuse.filter.signals import within
 from px4fuse.findings.ekf2_not_fusing import EV_START_INTERVAL
 from px4fuse.findings.model import Detector, Finding, Found, Threshold
 from px4fuse.findings.source_gap import GAP, GAP_INTERVALS

@@ -226,7 +226,7 @@ def earned(one: Flown, results: Reported, notes: str, rubric: Rubric) -> Graded:
     # the pages of a report that px4fuse drew
     pages = {page for item in rubric.items for page in item.parameters.get("pages", ())}
     results = msgspec.structs.replace(results, student=student)
-    report = Report("", 0, "intact", results, (" ".join(sorted(pages)),), b"")
+    report = Report("", "intact", results, (" ".join(sorted(pages)),), b"")
     return assess(report, VERIFIED, rubric, AnswerKey("mixed", (answer,)))
 
 

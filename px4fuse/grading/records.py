@@ -159,4 +159,4 @@ def _recalled(
     files = {name: name in logs for name in _named(data)}
     if kept.files != files or kept.gap != _is_gap(results, logs, handed_out):
         return None
-    return Report(sha256, 0, kept.seal, results, kept.pages, b""), kept.verdict, kept.page
+    return Report(sha256, kept.seal, results, kept.pages, b""), kept.verdict, kept.page

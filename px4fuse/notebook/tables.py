@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from textwrap import wrap
 from typing import Any
 
@@ -24,7 +24,6 @@ from px4fuse.flight import (
     QUATERNION_COLUMNS,
     Ekf2,
     Flight,
-    PositionTrack,
     Truth,
     Unavailable,
 )
@@ -64,16 +63,12 @@ def _(flight: Flight) -> str:
     flown = ""
     if not isinstance(airborne, Unavailable) and airborne:
         flown = f", in the air {airborne[0][0]:.1f} to {airborne[-1][1]:.1f} s"
-    has = [_track(track) for track in flight.positions] or ["no position source"]
+    has = [f"{track.name} at {track.rate_hz:.1f} Hz" for track in flight.positions]
+    has = has or ["no position source"]
     has += [EKF2] if isinstance(flight.ekf2, Ekf2) else ["no EKF2"]
     has += [f"truth {flight.truth.name}"] if isinstance(flight.truth, Truth) else []
-    return f"{log.name}: {log.format}, {log.firmware}, {log.duration_s:.1f} s{flown}\n" + "; ".join(
-        has
-    )
-
-
-def _track(track: PositionTrack) -> str:
-    return f"{track.name} at {track.rate_hz:.1f} Hz"
+    head = f"{log.name}: {log.format}, {log.firmware}, {log.duration_s:.1f} s{flown}"
+    return f"{head}\n{'; '.join(has)}"
 
 
 @frame.register
@@ -92,9 +87,7 @@ def _(flight: Flight) -> pd.DataFrame:
 # -- a comparison ----------------------------------------------------------------------------------
 
 
-def _filters(
-    result: AxisComparison,
-) -> tuple[tuple[str, FilterSummary | Unavailable, Any], tuple[str, Any, Any]]:
+def _filters(result: AxisComparison) -> tuple[tuple[str, Any, Any], ...]:
     return (OURS, result.kf, result.kf_truth), (EKF2, result.ekf2, result.ekf2_truth)
 
 
@@ -365,11 +358,10 @@ def _(loop: Loop) -> pd.DataFrame:
     rows = []
     for path in loop.reported:
         moved = {"path": path.name, "moved_max_m": float(path.moved_m.max())}
-        scores: Mapping[str, Evaluation | Unavailable] = path.scores
-        for name, score in scores.items():
+        for name, score in path.scores.items():
             ate = np.nan if isinstance(score, Unavailable) else score.ate.translation.rmse
             rows.append(moved | {"reference": name, "ate_rmse_m": ate})
-        if not scores:
+        if not path.scores:
             rows.append(moved | {"reference": None, "ate_rmse_m": np.nan})
     return pd.DataFrame(rows)
 

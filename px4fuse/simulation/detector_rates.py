@@ -14,7 +14,7 @@ import re
 import time
 from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from importlib.resources import files
 from pathlib import Path
 from types import MappingProxyType
@@ -167,7 +167,6 @@ class Job:
 
     seed: int
     conditions: tuple[Condition, ...]
-    weight: float = field(default=1.0, compare=False)
 
 
 def clean(scenario: str) -> Condition:
@@ -256,7 +255,7 @@ def jobs(
     return made
 
 
-def measure(flown: list[Job], processes: int | None = None) -> pd.DataFrame:
+def measure(flown: list[Job]) -> pd.DataFrame:
     """Fly every job, on all cores.
 
     Returns
@@ -266,7 +265,7 @@ def measure(flown: list[Job], processes: int | None = None) -> pd.DataFrame:
         that of false alarms), ``flights``, ``rate``, its 95 % interval ``low``, ``high`` (Clopper
         and Pearson 1934), and ``first``, the share in which that finding came first.
     """
-    processes = processes or os.cpu_count() or 1
+    processes = os.cpu_count() or 1
     with ProcessPoolExecutor(processes) as pool:
         # one of each kind tells how long all will take
         kinds = {job.conditions[0].scenario: job for job in flown}

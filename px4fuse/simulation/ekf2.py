@@ -159,7 +159,6 @@ def _stretch(
             rotation=rotation,
             correction_rad=to_vector(multiply(beyond[1:], conjugate(beyond[:-1]))),
             force_m_s2=gain / np.diff(time)[:, None],
-            gyro_bias_rad_s=np.zeros(3),
             accelerometer_bias_m_s2=np.zeros(3),
             state=state,
             variance=variance,

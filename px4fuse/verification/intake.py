@@ -163,7 +163,6 @@ def _read(pdf: bytes) -> Report:
         results = _results(_attachment(contents))
     return Report(
         sha256=hashlib.sha256(pdf).hexdigest(),
-        size_bytes=len(pdf),
         seal=seal_of(pdf),
         results=results,
         pages=(),

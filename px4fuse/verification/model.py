@@ -31,7 +31,6 @@ class Report:
     """
 
     sha256: str
-    size_bytes: int
     seal: Seal
     results: Reported
     pages: tuple[str, ...]

@@ -1,0 +1,165 @@
+"""When a replay is believed: what it is compared by, and the limits.
+
+The limits are written out here, so that one that is changed must be changed here as well.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from findings_tools import NONE, made
+
+from px4fuse.ekf2.agreement import (
+    _axis,
+    _verdict,
+    agreement_with_log,
+    judged_from,
+    logged_innovations,
+    match,
+    settled,
+    with_obedient,
+)
+from px4fuse.ekf2.replay import Agreement, AxisAgreement
+from px4fuse.flight import STATE_COLUMNS, Ekf2, Unavailable
+
+AID = ("estimator_aid_src_ev_pos",)
+
+
+def replayed(fused_at: list[float], taken: list[float] | None = None) -> Any:
+    index = pd.Index(fused_at if taken is None else taken)
+    return SimpleNamespace(updates=pd.DataFrame({"fused_at_s": fused_at}, index=index))
+
+
+def test_a_logged_innovation_belongs_to_the_sample_of_its_time() -> None:
+    replay, logged = replayed([9.0, 9.0, 9.0], [1.0, 1.1, 1.2]), {"innovation_topics": AID}
+    times = np.array([0.9, 0.9941, 1.0, 1.1059, 1.1061, 1.2, 1.3])
+    assert match(replay, made(Ekf2, **logged), times).tolist() == [-1, 0, 0, 1, -1, 2, -1]
+
+
+def test_an_older_topic_repeats_the_last_fusion_for_half_a_second() -> None:
+    ekf2 = made(Ekf2, innovation_topics=("ekf2_innovations",))
+    times = np.array([0.9998, 0.99995, 1.0, 1.5, 1.5001, 2.0, 2.4])
+    found = match(replayed([1.0, 2.0], [0.8, 1.8]), ekf2, times)
+    assert found.tolist() == [-1, 0, 0, 0, -1, 1, 1]
+
+
+def test_the_first_five_seconds_of_each_stretch_are_not_judged() -> None:
+    judged = judged_from(SimpleNamespace(stretches=((10.0, 30.0), (40.0, 60.0))))  # type: ignore[arg-type]
+    assert judged == ((15.0, 30.0), (45.0, 60.0))
+    times = np.array([15.0, 15.1, 29.9, 30.0, 45.0, 50.0, 60.0])
+    assert settled(times, judged).tolist() == [False, True, True, False, False, True, False]
+
+
+def agreeing(correlation: float = 1.0, s: float = 1.0, nis: float = 1.0) -> AxisAgreement:
+    return AxisAgreement(correlation, 0.0, s, s, s, 1.0, nis, 0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("axis", "logged", "replayed_share", "good", "says"),
+    [
+        (agreeing(s=1.049), 0.0, 0.0, True, "correlate by 1.0000 or better"),
+        (agreeing(s=1.051), 0.0, 0.0, False, "is 1.05 of the logged one"),
+        (agreeing(s=0.949), 0.0, 0.0, False, "is 0.95 of the logged one"),
+        (agreeing(0.95), 0.0, 0.0, True, "correlate by 0.9500"),
+        (agreeing(0.949), 0.0, 0.09, False, "correlate by 0.95 only"),
+        # where much is rejected, shares and NIS decide
+        (agreeing(0.5), 0.1, 0.06, True, "6.0% of the samples are rejected, 10.0% in the log"),
+        (agreeing(0.5), 0.06, 0.1, True, "single samples part"),
+        (agreeing(0.5), 0.25, 0.19, False, "are allowed"),
+        (agreeing(0.5), 0.125, 0.1875, False, "are allowed"),
+        (agreeing(0.5, nis=1.25), 0.1, 0.1, True, "mean NIS differs by 25%"),
+        (agreeing(0.5, nis=1.26), 0.1, 0.1, False, "mean NIS differs by 26%"),
+        (agreeing(0.5, nis=0.74), 0.1, 0.1, False, "mean NIS differs by 26%"),
+    ],
+)  # fmt: skip
+def test_when_a_replay_is_believed(
+    axis: AxisAgreement, logged: float, replayed_share: float, good: bool, says: str
+) -> None:
+    for axes in ({"north": axis, "east": agreeing()}, {"north": agreeing(), "east": axis}):
+        found, reason = _verdict(axes, logged, replayed_share)
+        assert found is good
+        assert says in reason
+
+
+@pytest.mark.parametrize(("correlation", "good"), [(0.95, True), (0.949, False)])
+def test_a_replay_that_rejects_what_ekf2_rejected_must_agree(
+    correlation: float, good: bool
+) -> None:
+    one = Agreement({"north": agreeing(0.5)}, 50, 0.2, 0.2, 0.9, True, "so far")
+    axes = {"north": agreeing(), "east": agreeing(correlation)}
+    found = with_obedient(one, replace(one, axes=axes))
+    assert found.good is good
+    assert f"the innovations correlate by {correlation:.3f}" in found.reason
+    assert found.reason.startswith("so far; ") is good
+
+
+def test_what_an_axis_is_compared_by() -> None:
+    s_log = np.full(101, 4.0)
+    s = np.linspace(4.0, 8.0, 101)
+    nu_log = np.tile([2.0, -2.0], 51)[:101]
+    frame = {"innovation_east_m": nu_log, "innovation_variance_east_m2": s_log}
+    model = pd.DataFrame({"innovation_east_m": nu_log + 0.5, "innovation_variance_east_m2": s})
+    index = pd.Index([16.0, 17.0, 99.0])
+    still = pd.DataFrame(0.0, index=index, columns=STATE_COLUMNS)
+    off = still.assign(**{STATE_COLUMNS[1]: [3.0, 4.0, 50.0], STATE_COLUMNS[4]: 0.25})
+    replay = SimpleNamespace(published=off, stretches=((10.0, 20.0),))
+    found = _axis("east", pd.DataFrame(frame), model, made(Ekf2, state=still), replay)  # type: ignore[arg-type]
+    assert found.innovation_correlation == pytest.approx(1.0)
+    assert found.innovation_rms_difference_m == pytest.approx(0.5)
+    assert (found.s_ratio_p5, found.s_ratio_median, found.s_ratio_p95) == pytest.approx(
+        (1.05, 1.5, 1.95)
+    )
+    assert found.nis_mean_logged == pytest.approx(1.0)
+    assert found.nis_mean_replayed == pytest.approx(np.mean((nu_log + 0.5) ** 2 / s))
+    assert found.position_rms_difference_m == pytest.approx(math.sqrt(12.5))
+    assert found.velocity_rms_difference_m_s == pytest.approx(0.25)
+
+
+def compared(count: int, *, varying: bool = True) -> Agreement | Unavailable:
+    """A log and a replay of itself, judged on this many samples."""
+    time = 10.0 + np.arange(count + 5.0)
+    rng = np.random.default_rng(2)
+    nu = rng.normal(0.0, 0.1, len(time)) if varying else np.full(len(time), 0.1)
+    frame = pd.DataFrame(
+        {"innovation_m": nu, "innovation_variance_m2": 0.01, "rejected": 0.0}, index=time
+    )
+    frame.loc[frame.index[-2:], "rejected"] = 1.0
+    state = pd.DataFrame(0.0, index=time, columns=STATE_COLUMNS)
+    ekf2 = made(
+        Ekf2, innovations={"north": frame, "east": frame}, innovation_topics=AID, state=state
+    )
+    updates = pd.DataFrame({"rejected": 0.0, "fused_at_s": time}, index=time)
+    for axis in ("north", "east"):
+        updates[f"innovation_{axis}_m"] = nu
+        updates[f"innovation_variance_{axis}_m2"] = 0.01
+    updates.loc[updates.index[-1], "rejected"] = 1.0
+    replay = SimpleNamespace(updates=updates, published=state, stretches=((9.5, 999.0),))
+    return agreement_with_log(SimpleNamespace(ekf2=ekf2), replay)  # type: ignore[arg-type]
+
+
+def test_twenty_innovations_are_enough_to_compare() -> None:
+    found = compared(20)
+    assert isinstance(found, Agreement)
+    assert found.samples == 20
+    assert found.good
+    shares = found.rejected_share_logged, found.rejected_share_replayed, found.same_share
+    assert shares == pytest.approx((0.1, 0.05, 0.95))
+    assert isinstance(few := compared(19), Unavailable)
+    assert "19 logged innovations to compare with are too few (at least 20)" in few.reason
+    assert isinstance(same := compared(20, varying=False), Unavailable)
+    assert "do not vary" in same.reason
+
+
+def test_without_innovations_there_is_nothing_to_compare() -> None:
+    frame = pd.DataFrame({"innovation_m": [0.1], "innovation_variance_m2": 0.1, "rejected": 0.0})
+    ekf2 = made(Ekf2, innovations={"north": frame, "east": NONE}, innovation_topics=AID)
+    assert logged_innovations(ekf2).empty
+    unknown = frame.assign(rejected=np.nan)
+    ekf2 = made(Ekf2, innovations={"north": frame, "east": unknown}, innovation_topics=AID)
+    assert logged_innovations(ekf2).empty

@@ -1,0 +1,251 @@
+"""The recursion of the model of EKF2 on numbers whose answer is known, and at its limits.
+
+The limits are written out here, so that one that is changed must be changed here as well.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from ekf2_tools import RULES
+from findings_tools import log, made
+from scipy.spatial.transform import Rotation
+
+from px4fuse.ekf2.inputs import Inputs
+from px4fuse.ekf2.legs import FUSE, GRAVITY_M_S2, IDLE, START, Timing, make_legs
+from px4fuse.ekf2.model import Model, replay_settings
+from px4fuse.ekf2.parameters import settings_in_force
+from px4fuse.ekf2.recursion import (
+    Run,
+    Variant,
+    _decide,
+    _down_to,
+    _drift,
+    _Fusion,
+    _limit_bias,
+    run,
+)
+from px4fuse.ekf2.recursion import _measurements as measurements
+from px4fuse.ekf2.stretches import Stretch
+from px4fuse.ekf2.vision import Vision
+from px4fuse.errors import SettingsError
+
+
+def test_a_variance_is_brought_down_to_its_target() -> None:
+    variance, target = np.array([0.5, 4.0, 0.1]), np.array([0.2, 3.5, 0.2])
+    noise = _down_to(variance, target)
+    np.testing.assert_allclose(variance[:2] * noise[:2] / (variance + noise)[:2], target[:2])
+    assert noise[2] == 1e9
+
+
+def test_biases_gain_variance_per_step_up_to_the_noise() -> None:
+    knob = {
+        f"EKF2_{name}_NOISE": np.array([value])
+        for name, value in (("GYR", 0.015), ("ACC", 0.35), ("GYR_B", 0.001), ("ACC_B", 0.003))
+    }
+    inputs, yes, no = made(Inputs, step_s=0.01), np.array([True]), np.array([False])
+    drift, limit = _drift(inputs, knob, yes, yes)
+    np.testing.assert_allclose(drift, [[1e-10] * 3 + [9e-10] * 3])
+    np.testing.assert_allclose(limit, [[0.015**2] * 3 + [0.35**2] * 3])
+    np.testing.assert_allclose(_drift(inputs, knob, no, yes)[0], [[1e-10] * 3 + [0.0] * 3])
+    np.testing.assert_allclose(_drift(inputs, knob, yes, no)[0], [[0.0] * 3 + [9e-10] * 3])
+
+
+def test_the_variance_of_a_bias_stays_within_px4s_limits() -> None:
+    P = np.zeros((2, 15, 15))
+    for each in P:
+        np.fill_diagonal(each[12:, 12:], [4.0, 1e-3, 0.1])
+    _limit_bias(P, 5e-4, np.array([True, False]))
+    # 0.1 g at most, a ratio of 100 between the axes at least
+    np.testing.assert_allclose(np.diag(P[0])[12:], [0.980665**2, 0.04, 0.1])
+    np.testing.assert_allclose(np.diag(P[1])[12:], [4.0, 1e-3, 0.1])
+    np.fill_diagonal(P[0][12:, 12:], [1e-3, 1e-5, 1e-3])
+    _limit_bias(P, 5e-4, np.array([True, False]))
+    np.testing.assert_allclose(np.diag(P[0])[12:], [1e-3, 5e-4, 1e-3])
+
+
+def test_what_counts_as_measurement_and_noise() -> None:
+    vision = made(
+        Vision, position_m=np.array([[1.0, 2.0, 3.0]]), variance_m2=np.array([[0.04, 0.0001, 0.0]])
+    )
+    turned = Rotation.from_euler("z", 90.0, degrees=True).as_matrix()
+    stretch = made(Stretch, rotation=np.array([np.eye(3), turned]))
+    legs = [SimpleNamespace(sample=np.array([0]), end=np.array([1]))]
+    knob = {
+        "EKF2_EVP_NOISE": np.array([0.1, 0.001]), "EKF2_EV_NOISE_MD": np.array([0.0, 1.0]),
+        "EKF2_EV_POS_X": np.array([0.0, 0.3]), "EKF2_EV_POS_Y": np.zeros(2),
+        "EKF2_EV_POS_Z": np.zeros(2),
+    }  # fmt: skip
+    inputs = made(Inputs, vision=vision, imu_offset_m=np.zeros(3))
+    which = np.zeros(2, np.intp)
+    position, noise = measurements(inputs, stretch, legs, which, knob)  # type: ignore[arg-type]
+    # 0.3 m ahead of a body that faces east: the body is west of the sensor
+    np.testing.assert_allclose(position[0], [[1.0, 2.0, 3.0], [1.0, 1.7, 3.0]], atol=1e-12)
+    # what is reported, EKF2_EVP_NOISE at least; or that alone, 1 cm at least
+    np.testing.assert_allclose(noise[0], [[0.04, 0.01, 0.01], [1e-4, 1e-4, 1e-4]])
+
+
+def deciding(
+    *, action: int = FUSE, startable: bool = False, gated: bool = True, obeys: bool = False,
+    told: float = np.nan, told_reset: bool = False, outside: bool = True, silent_s: float = 0.5,
+    stopped: bool = False, left: int = 5,
+) -> tuple[bool, bool, bool, float, bool, int]:  # fmt: skip
+    """What is rejected, taken and reset at 10 s; then last fusion, whether stopped, resets left."""
+    schedule = SimpleNamespace(
+        action=np.array([[action]]), startable=np.array([[startable]]), time_s=np.array([[10.0]]),
+        gated=np.array([gated]), obeys=np.array([obeys]), told=np.array([told]),
+        told_reset=np.array([told_reset]),
+    )  # fmt: skip
+    before = _Fusion(np.array([10.0 - silent_s]), np.array([stopped]), np.array([left]))
+    rejected, taken, reset, after = _decide(RULES, schedule, 0, np.array([outside]), before)  # type: ignore[arg-type]
+    last, stop, rest = after.last_s[0], after.stopped[0], after.left[0]
+    return bool(rejected[0]), bool(taken[0]), bool(reset[0]), float(last), bool(stop), int(rest)
+
+
+@pytest.mark.parametrize(
+    ("case", "expected"),
+    [
+        ({"outside": False}, (False, True, False, 10.0, False, 5)),
+        ({}, (True, False, False, 9.5, False, 5)),
+        ({"silent_s": 1.0}, (True, False, False, 9.0, False, 5)),
+        ({"silent_s": 1.5}, (True, False, True, 10.0, False, 4)),
+        ({"silent_s": 1.5, "left": 1}, (True, False, True, 10.0, False, 0)),
+        ({"silent_s": 1.5, "left": 0}, (True, False, False, 8.5, True, 0)),
+        ({"gated": False}, (False, True, False, 10.0, False, 5)),
+        ({"action": START, "left": 2}, (False, False, True, 10.0, False, 5)),
+        ({"stopped": True, "outside": False}, (False, False, False, 9.5, True, 5)),
+        ({"stopped": True, "startable": True, "left": 0}, (True, False, True, 10.0, False, 5)),
+        ({"action": IDLE}, (False, False, False, 9.5, False, 5)),
+        # as the log tells
+        ({"obeys": True, "told": 0.0}, (False, True, False, 10.0, False, 5)),
+        ({"obeys": True, "told": 1.0, "outside": False}, (True, False, False, 9.5, False, 5)),
+        ({"obeys": True, "told": 1.0, "silent_s": 9.0, "left": 0},
+         (True, False, False, 1.0, False, 0)),
+        ({"obeys": True, "told": 1.0, "told_reset": True}, (True, False, True, 10.0, False, 5)),
+        ({"obeys": True}, (True, False, False, 9.5, False, 5)),
+        ({"told": 0.0}, (True, False, False, 9.5, False, 5)),
+    ],
+)  # fmt: skip
+def test_what_is_decided_of_a_sample(case: dict[str, Any], expected: tuple[Any, ...]) -> None:
+    assert deciding(**case) == expected
+
+
+@pytest.mark.parametrize(
+    ("settings", "by_delay", "timing"),
+    [
+        ({"EKF2_EV_DELAY": 50.0}, False, Timing(0.05, 0.12)),
+        ({"EKF2_DELAY_MAX": 300.0}, False, Timing(0.0, 0.29)),
+        ({"EKF2_DELAY_MAX": 301.0}, False, Timing(0.0, 0.3)),
+        ({"EKF2_DELAY_MAX": 0.0}, False, Timing(0.0, 0.01)),
+        ({"EKF2_EV_DELAY": 50.0}, True, Timing(0.05, 0.12)),
+        ({"EKF2_EV_DELAY": 200.0}, True, Timing(0.2, 0.19)),
+    ],
+)
+def test_the_horizon_is_the_length_of_the_buffer(
+    settings: dict[str, float], by_delay: bool, timing: Timing
+) -> None:
+    usual = {"EKF2_EV_DELAY": 0.0, "EKF2_DELAY_MAX": 200.0}
+    rules = replace(RULES, horizon_by_delay=by_delay)
+    inputs = made(Inputs, rules=rules, settings=usual, horizon_s=0.12, step_s=0.01, predict_s=0.01)
+    found = Variant({**usual, **settings}).timing(inputs)
+    assert (found.delay_s, found.horizon_s) == pytest.approx((timing.delay_s, timing.horizon_s))
+    shifted = Variant(usual, stamp_offset_s=0.03).timing(inputs)
+    assert (shifted.delay_s, shifted.horizon_s) == pytest.approx((-0.035, math.inf))
+
+
+def test_a_release_without_delay_max_has_none() -> None:
+    rules = replace(RULES, horizon_by_delay=True)
+    inputs, flight = made(Inputs, rules=rules), SimpleNamespace(log=log(firmware="PX4 v1.14"))
+    model = made(Model, inputs=inputs, flight=flight)
+    with pytest.raises(SettingsError, match=r"PX4 v1\.14 has no such parameter"):
+        replay_settings(model, [{"EKF2_DELAY_MAX": 100.0}])
+    assert replay_settings(model, []) == ()
+
+
+def at_rest(
+    measured_m: list[float], told: float = np.nan, down_m: float = 0.0, **settings: float
+) -> Run:
+    """A level vehicle that stands still at the origin, seen at 10 Hz at these places north.
+
+    EKF2 itself rejected the fourth sample where that is told.
+    """
+    count = 10 * (len(measured_m) + 1)
+    flat = np.zeros((count, 3))
+    stretch = Stretch(
+        time_s=10.0 + 0.01 * np.arange(count + 1), step_s=np.full(count, 0.01),
+        rotation=np.tile(np.eye(3), (count + 1, 1, 1)), correction_rad=flat,
+        force_m_s2=flat - GRAVITY_M_S2,
+        accelerometer_bias_m_s2=np.zeros(3), state=np.zeros(15), variance=np.full(15, 1e-4),
+        down_m=np.full(count + 1, down_m), heading_variance_rad2=np.full(count + 1, 1e-4),
+        down_variance_m2=np.full(count + 1, 4e-4), attitude_error_rad=np.zeros((count + 1, 3)),
+        correlation=np.eye(15),
+    )  # fmt: skip
+    stamp = 10.105 + 0.1 * np.arange(len(measured_m))
+    north = np.array(measured_m)
+    vision = Vision(
+        stamp, np.full(len(stamp), -np.inf), np.column_stack([north, 0.0 * north, 0.0 * north]),
+        np.zeros((len(stamp), 3)), np.full(len(stamp), np.nan), np.zeros(len(stamp), bool), "uwb",
+    )  # fmt: skip
+    vision.rejected[3] = told
+    inputs = Inputs(
+        settings_in_force(settings), (stretch,), vision, RULES, 0.01, 0.1, 0.01,
+        vision_height=False, imu_offset_m=np.zeros(3),
+    )  # fmt: skip
+    legs = make_legs(inputs, stretch, Timing(0.0, 0.1))
+    variant = Variant(inputs.settings, as_logged=True)
+    return run(inputs, stretch, [legs], np.zeros(1, np.intp), [variant])
+
+
+def test_a_vehicle_at_rest_stays_and_its_variance_is_the_kalman_filters() -> None:
+    done = at_rest([0.0] * 20)
+    np.testing.assert_allclose(done.state, 0.0, atol=1e-9)
+    assert done.fused.all()
+    np.testing.assert_allclose(done.noise_m2, 0.01)
+    # P after = P R / (P + R), each of north and east alone
+    before, after = done.variance_m2[0, 0] - 0.01, done.variance[1, 0, 6:8]
+    np.testing.assert_allclose(after, before * 0.01 / (before + 0.01), rtol=1e-3)
+    # the first 0.1 s: position 1e-4 and velocity 1e-4 over it, and what tilt and noise add
+    assert before[0] == pytest.approx(1e-4 + 1e-4 * 0.1**2, rel=0.05)
+    # heading and height have the variances of EKF2's own
+    np.testing.assert_allclose(done.variance[1:, 0, 2], 1e-4, rtol=0.01)
+    assert done.variance[-1, 0, 8] == pytest.approx(4e-4, rel=0.01)
+
+
+def test_a_step_of_the_source_is_rejected_for_a_second_and_then_reset_to() -> None:
+    done = at_rest([0.0] * 5 + [3.0] * 15)
+    rejected, reset, fused = done.rejected[:, 0], done.reset[:, 0], done.fused[:, 0]
+    assert np.flatnonzero(rejected).tolist() == list(range(5, 16))
+    assert np.flatnonzero(reset).tolist() == [15]
+    assert np.flatnonzero(fused).tolist() == [*range(5), *range(16, 20)]
+    np.testing.assert_allclose(done.innovation_m[5, 0], [3.0, 0.0], atol=1e-3)
+    np.testing.assert_allclose(done.state[16, 0, 6:8], [3.0, 0.0], atol=1e-9)
+    np.testing.assert_allclose(done.state[15, 0, 6:8], [0.0, 0.0], atol=1e-3)
+    np.testing.assert_allclose(done.variance[16, 0, 6:8], 0.01)
+    # nothing else is touched
+    np.testing.assert_allclose(done.variance[16, 0, 8], done.variance[15, 0, 8], rtol=0.01)
+    assert (done.variance[16, 0, 3:6] > done.variance[15, 0, 3:6]).all()
+    assert at_rest([0.0] * 5 + [3.0] * 15, EKF2_EVP_GATE=100.0).fused.all()
+    sigma = float(np.sqrt(done.variance_m2[5, 0, 0]))
+    for times, beyond in ((4.99, False), (5.01, True)):
+        assert at_rest([0.0] * 5 + [times * sigma]).rejected[5, 0] == beyond
+
+
+def test_what_the_log_tells_of_a_rejection_is_obeyed() -> None:
+    done = at_rest([0.0] * 6, told=1.0)
+    assert done.rejected[:, 0].tolist() == [False, False, False, True, False, False]
+    assert done.fused[:, 0].tolist() == [True, True, True, False, True, True]
+    assert at_rest([0.0] * 6, told=0.0).fused.all()
+
+
+def test_height_follows_ekf2s_own() -> None:
+    done = at_rest([0.0] * 20, down_m=0.05)
+    before, after = done.variance[0, 0, 8], done.variance[1:, 0, 8]
+    assert before == 1e-4  # already below EKF2's own, so that nothing is taken at first
+    assert abs(done.state[1, 0, 8]) < 1e-3
+    assert after[-1] == pytest.approx(4e-4, rel=0.01)
+    assert done.state[-1, 0, 8] == pytest.approx(0.05, abs=0.02)

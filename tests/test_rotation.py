@@ -1,0 +1,73 @@
+"""Rotations as quaternions, against closed forms and SciPy."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from px4fuse.trajectory.rotation import (
+    from_vector,
+    interpolate,
+    matrix,
+    multiply,
+    running_product,
+    skew,
+    to_vector,
+)
+
+
+def test_a_rotation_that_hardly_turns_keeps_its_size() -> None:
+    tiny = np.array([1.0, 2e-14, -4e-14, 6e-14])
+    for sign in (1.0, -1.0):
+        np.testing.assert_allclose(to_vector(sign * tiny), [4e-14, -8e-14, 12e-14])
+    vectors = np.random.default_rng(1).uniform(-1.5, 1.5, (20, 3))
+    np.testing.assert_allclose(to_vector(from_vector(vectors)), vectors, atol=1e-12)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 8, 9, 10])
+def test_a_running_product_is_the_product(count: int) -> None:
+    turns = from_vector(np.random.default_rng(count).normal(0.0, 1.0, (count, 3)))
+    product, one = running_product(turns), np.array([1.0, 0.0, 0.0, 0.0])
+    for row, turn in zip(product, turns, strict=True):
+        one = multiply(one, turn)
+        np.testing.assert_allclose(row, one, atol=1e-12)
+
+
+def test_between_two_quaternions_lies_their_middle() -> None:
+    known = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, -1.0], [-1.0, 0.0, 0.0, 0.0]])
+    middle = interpolate(np.array([0.5, 1.5]), np.arange(3.0), known)
+    half = math.sqrt(0.5)
+    np.testing.assert_allclose(np.abs(middle), [[half, 0.0, 0.0, half]] * 2)
+    assert np.linalg.norm(middle, axis=1) == pytest.approx(1.0)
+
+
+def test_rotations_are_scipys() -> None:
+    rng = np.random.default_rng(1)
+    turns = rng.normal(0.0, 0.7, (50, 3))
+    q = from_vector(turns)
+    theirs = Rotation.from_rotvec(turns)
+    assert matrix(q) == pytest.approx(theirs.as_matrix(), abs=1e-12)
+    assert to_vector(q) == pytest.approx(turns, abs=1e-12)
+    assert to_vector(-q) == pytest.approx(turns, abs=1e-12)
+    assert to_vector(from_vector(np.zeros((1, 3)))) == pytest.approx(np.zeros((1, 3)))
+    both = multiply(q[:25], q[25:])
+    assert matrix(both) == pytest.approx((theirs[:25] * theirs[25:]).as_matrix(), abs=1e-12)
+    v, u = rng.normal(size=(2, 3))
+    assert skew(v) @ u == pytest.approx(np.cross(v, u))
+    product = running_product(q)
+    known = q[0]
+    for at in range(1, 50):
+        known = multiply(known, q[at])
+    assert product[-1] == pytest.approx(known, abs=1e-12)
+    assert len(running_product(q[:1])) == 1
+
+
+def test_interpolation_does_not_mind_the_sign() -> None:
+    times = np.array([0.0, 1.0, 2.0])
+    known = from_vector(np.array([[0.0, 0.0, 0.10], [0.0, 0.0, 0.12], [0.0, 0.0, 0.14]]))
+    known[1] *= -1.0
+    found = to_vector(interpolate(np.array([0.5, 1.5]), times, known))
+    assert found[:, 2] == pytest.approx([0.11, 0.13], abs=1e-6)
