@@ -315,7 +315,7 @@ def delayed_states(part: StretchRun, at: int) -> tuple[Array, Array]:
     count, rotation, dt = len(stretch.step_s), stretch.rotation[1:], stretch.step_s[:, None]
     leg = np.searchsorted(legs.end, np.arange(count), side="right")
     first = np.searchsorted(leg, leg)
-    state = np.concatenate([kept[:1], kept[leg]])
+    state = kept[np.concatenate([[0], leg])]
 
     def grown(each: Array) -> Array:
         """Sum of what each step adds, from the beginning of its leg on."""

@@ -4,7 +4,7 @@ The flights are simulated. The floor is what pyulog needs for the same topics: i
 each, so that the ratio holds on a machine whose speed drifts. Nothing here can fail: run it, read
 it. Linux and macOS.
 
-    python tests/benchmarks/bench_long.py [MINUTES ...]
+    python tests/benchmarks/bench_long.py [MINUTES ...]   # of 2, 10, 23, 27, 60
 """
 
 from __future__ import annotations
@@ -16,9 +16,8 @@ from pathlib import Path
 
 from measured import Measured, measured
 
-MINUTES = (2, 10, 23, 60)
-# Of one pass along an aisle of 12 m, at 1 m/s and with its start and stop; simulate has a limit
-PASS_S, LENGTH_M, MOST_PASSES = 60 * 23 / 96, 12.0, 100
+# Passes of an aisle so long (m), by minutes; 60 minutes are the longest flight that is simulated
+FLIGHTS = {2: (6, 12), 10: (35, 12), 23: (82, 12), 27: (96, 12), 60: (100, 31)}
 READ = "import sys; from pyulog import ULog; ULog(sys.argv[1], sys.argv[2].split(','))"
 
 
@@ -28,11 +27,10 @@ def main() -> None:
     px4fuse = [sys.executable, "-m", "px4fuse"]
     found: dict[str, list[tuple[float, Measured]]] = {}
     with tempfile.TemporaryDirectory() as folder:
-        for minutes in [int(word) for word in sys.argv[1:]] or MINUTES:
+        for minutes in [int(word) for word in sys.argv[1:]] or FLIGHTS:
             log = Path(folder) / f"{minutes}.ulg"
-            passes = min(max(1, round(60 * minutes / PASS_S)), MOST_PASSES)
-            length = LENGTH_M + max(0.0, 60 * minutes / passes - PASS_S)
-            flight = ["--passes", str(passes), "--length", f"{length:g}", "-o", str(log)]
+            passes, length = FLIGHTS[minutes]
+            flight = ["--passes", str(passes), "--length", str(length), "-o", str(log)]
             measured([*px4fuse, "simulate", *flight])
             commands = {
                 "compare": ["compare", str(log), "-o", str(Path(folder) / "report.pdf")],
