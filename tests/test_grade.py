@@ -77,6 +77,7 @@ def test_everything_that_was_handed_in_stands_in_the_table(handed_in, tmp_path) 
     assert not any(row["file"].startswith(("=", "+", "-", "@")) for row in table)
     page = (output / "class.html").read_text(encoding="utf-8")
     assert "<img src=x" not in page
+    assert "<title>Lab: fusion and loop closure</title>" in page  # the rubric's
     assert len(list((output / "feedback").glob("*.txt"))) == 6
     for results in (output / "gradescope").rglob("results.json"):
         found = json.loads(results.read_text(encoding="utf-8"))
@@ -131,8 +132,9 @@ def test_only_what_changed_is_done_again(handed_in, tmp_path) -> None:
     output = tmp_path / "class"
     rubric = read_rubric(None)
     grade([handed_in], [], rubric, output, processes=2)
-    same = grade([handed_in], [], rubric, output, processes=2)
+    same = grade([handed_in], [], rubric, output, processes=2, title="Lab 4")
     assert same.reused == 6
+    assert b"<title>Lab 4</title>" in (output / "class.html").read_bytes()
     html = (output / "class.html").read_bytes()
     # what is known is known by its content, under any name
     (handed_in / "essay.pdf").write_bytes(REPORT.read_bytes())

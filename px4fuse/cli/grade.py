@@ -31,7 +31,9 @@ if TYPE_CHECKING:
 @max_size_option
 @path_option("--key", metavar="FILE.json", help="Answer key of px4fuse simulate --assignment.")
 @path_option("-o", "--output", metavar="DIR", help="Folder for the class table and the feedback.")
-@click.option("--title", default="Class", help="Of the class page.")
+@click.option(
+    "--title", default="", show_default=False, help="Of the class page.  [default: the rubric's]"
+)
 @path_option(
     "--roster", metavar="FILE.csv", help="Everyone in the class.  [default: those of --key]"
 )

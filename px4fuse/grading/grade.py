@@ -79,7 +79,7 @@ def grade(
     *,
     key: AnswerKey | None = None,
     course: Course | None = None,
-    title: str = "Class",
+    title: str = "",
     processes: int | None = None,
     progress: Callable[[int, int], None] = lambda done, of: None,
 ) -> Outcome:
@@ -98,7 +98,7 @@ def grade(
     key : AnswerKey, optional
         Which mistakes each student's flight has.
     title : str
-        Of the class page.
+        Of the class page; by default the rubric's.
     processes : int, optional
         By default as many as there are cores.
     progress : callable
@@ -126,7 +126,7 @@ def grade(
     entries, unknown = class_entries(graded, found, origins, register, term, overrides)
     entries = _flagged(entries, key)
     written, more = write_class(
-        Class(entries, register or Register([]), title, course,
+        Class(entries, register or Register([]), title or rubric.title or "Class", course,
               {one.name: of for one, of in zip(found, origins, strict=True)},
               {one.name: one for one in found}),
         output,
