@@ -111,6 +111,19 @@ def no_drawing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pdf, "render", page_of)
 
 
+@pytest.fixture
+def drawn_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same results are drawn once; for tests of what follows."""
+    render, drawn = pdf.render, dict[str, bytes]()
+
+    def from_memory(document: pdf.Report, text: str) -> bytes:
+        if text not in drawn:
+            drawn[text] = render(document, text)
+        return drawn[text]
+
+    monkeypatch.setattr(pdf, "render", from_memory)
+
+
 # Of the unchanged program: it is there before any test patches it
 _analysed = lru_cache(maxsize=2)(analysis.run)
 

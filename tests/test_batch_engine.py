@@ -68,10 +68,14 @@ def test_workers_that_cannot_be_ended_are_refused():
 
 
 def test_a_scheduler_that_does_not_answer_is_one_line(monkeypatch):
+    from distributed import default_client
+
     monkeypatch.setattr(engine, "CONNECT_S", 0.5)
     for address in ("tcp://127.0.0.1:1", "nonsense://x", ""):
         with pytest.raises(SettingsError, match="no Dask scheduler answers"), connected(address):
             pass
+    with pytest.raises(ValueError, match="No clients found"):  # the next batch has its own
+        default_client()
 
 
 def test_without_dask_the_extra_is_named(monkeypatch, sample_log):
