@@ -50,24 +50,29 @@ settings.register_profile(
 settings.load_profile("steady")
 
 
+# Objects made since garbage was last looked for; a report that is drawn makes a hundred thousand
+MANY_OBJECTS = 200_000
+
+
 def pytest_configure() -> None:
-    """Collect the tests without looking for garbage, of which there is none."""
+    """Look for garbage between tests only, as collecting them makes none."""
     gc.disable()
 
 
 def pytest_collection_finish() -> None:
-    """Leave what was imported and collected out of every later search for garbage.
-
-    Python searches all there is only once as much is new as a quarter of what it has: with half a
-    million objects, the arrays of finished figures would wait for hundreds of tests.
-    """
+    """Leave what was imported and collected out of every search for garbage."""
     gc.collect()
     gc.freeze()
-    gc.enable()
 
 
 def pytest_runtest_teardown(item: pytest.Item, nextitem: pytest.Item | None) -> None:
-    """Forget what a file's functions have cached once its tests are done: analyses are large."""
+    """Forget what a file's functions have cached once its tests are done: analyses are large.
+
+    Commands turn the search for garbage off for their process, which is that of all tests here.
+    """
+    gc.disable()  # `px4fuse batch` turns it on
+    if gc.get_count()[0] > MANY_OBJECTS:
+        gc.collect()
     module = getattr(item, "module", None)
     if module is not None and getattr(nextitem, "module", None) is not module:
         for value in vars(module).values():
