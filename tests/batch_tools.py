@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
-import re
 import subprocess
 import sys
 import time
@@ -47,7 +47,9 @@ def act(work):
     what, value = work
     match what:
         case "hold the interpreter":
-            re.match(r"(a+)+b", "a" * 60)
+            windows = sys.platform == "win32"
+            library = ctypes.PyDLL("kernel32" if windows else None)  # which keeps the lock
+            library.Sleep(600_000) if windows else library.sleep(600)
         case "hog":
             return len(bytearray(os.urandom(1_000_000)) * value)
     return bad_jobs.act(work)

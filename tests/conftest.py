@@ -10,6 +10,7 @@ Keep what it finds as an ``@example`` of the test.
 
 from __future__ import annotations
 
+import gc
 import io
 import signal
 from collections.abc import Callable
@@ -49,8 +50,29 @@ settings.register_profile(
 settings.load_profile("steady")
 
 
+# Objects made since garbage was last looked for; a report that is drawn makes a hundred thousand
+MANY_OBJECTS = 200_000
+
+
+def pytest_configure() -> None:
+    """Look for garbage between tests only, as collecting them makes none."""
+    gc.disable()
+
+
+def pytest_collection_finish() -> None:
+    """Leave what was imported and collected out of every search for garbage."""
+    gc.collect()
+    gc.freeze()
+
+
 def pytest_runtest_teardown(item: pytest.Item, nextitem: pytest.Item | None) -> None:
-    """Forget what a file's functions have cached once its tests are done: analyses are large."""
+    """Forget what a file's functions have cached once its tests are done: analyses are large.
+
+    Commands turn the search for garbage off for their process, which is that of all tests here.
+    """
+    gc.disable()  # `px4fuse batch` turns it on
+    if gc.get_count()[0] > MANY_OBJECTS:
+        gc.collect()
     module = getattr(item, "module", None)
     if module is not None and getattr(nextitem, "module", None) is not module:
         for value in vars(module).values():
@@ -92,6 +114,19 @@ def page_of(_: object, text: str) -> bytes:
 def no_drawing(monkeypatch: pytest.MonkeyPatch) -> None:
     """Pages take most of the time; for tests that look at none of them."""
     monkeypatch.setattr(pdf, "render", page_of)
+
+
+@pytest.fixture
+def drawn_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same results are drawn once; for tests of what follows."""
+    render, drawn = pdf.render, dict[str, bytes]()
+
+    def from_memory(document: pdf.Report, text: str) -> bytes:
+        if text not in drawn:
+            drawn[text] = render(document, text)
+        return drawn[text]
+
+    monkeypatch.setattr(pdf, "render", from_memory)
 
 
 # Of the unchanged program: it is there before any test patches it

@@ -12,6 +12,7 @@ import os
 from collections import defaultdict
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -231,8 +232,7 @@ class Aisle:
 
     def path(self, boot_s: float) -> tuple[Array, Array, Array]:
         """Position, velocity and acceleration, NED."""
-        p, v, a = motion(np.array([boot_s - self.start_s]), HEADING_DEG, LENGTH_M)
-        return p[0], v[0], a[0]
+        return _path(boot_s - self.start_s)
 
     def landed(self, boot_s: float) -> int:
         """On the ground in the first and the last quarter."""
@@ -261,6 +261,14 @@ class Aisle:
         name = "usec" if self.uwb == "VISION_POSITION_ESTIMATE" else "time_usec"
         assert self.uwb is not None
         return message(self.uwb, covariance=triangle(POSE_VARIANCE), **{name: at}, **xyz(here))
+
+
+@lru_cache(maxsize=100_000)  # most flights send at the same times
+def _path(time_s: float) -> tuple[Array, Array, Array]:
+    p, v, a = motion(np.array([time_s]), HEADING_DEG, LENGTH_M)
+    for each in (p, v, a):
+        each.flags.writeable = False
+    return p[0], v[0], a[0]
 
 
 def ms(seconds: float) -> int:

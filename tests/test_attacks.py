@@ -16,6 +16,7 @@ from typing import Any
 
 import pytest
 from click.testing import CliRunner
+from conftest import page_of
 from notes_samples import FILLER
 from results_tools import LOOP, changed, decoded
 from test_verify import Base, base, read_again, report_of
@@ -26,6 +27,7 @@ from px4fuse.cli import cli
 from px4fuse.grading.model import Graded, Rubric
 from px4fuse.grading.rubric import read_rubric
 from px4fuse.grading.scoring import assess, refused
+from px4fuse.report import pdf as pdf_module
 from px4fuse.simulation import flights
 from px4fuse.simulation.mistakes import parse
 from px4fuse.simulation.scenario import Scenario
@@ -92,7 +94,9 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Flight:
     log.write_bytes(flights.to_ulog(flights.simulate(scenario, parse(MISTAKES))))
     notes.write_text(HONEST, encoding="utf-8")
     words = ["compare", str(log), "-o", str(pdf), "--student", "Ada", "--id", "s01"]
-    outcome = CliRunner().invoke(cli, [*words, "--notes", str(notes)], standalone_mode=False)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(pdf_module, "render", page_of)  # drawn below, from its results
+        outcome = CliRunner().invoke(cli, [*words, "--notes", str(notes)], standalone_mode=False)
     assert outcome.exception is None, outcome.output
     honest = base(pdf.read_bytes(), log)
     (sha256,) = honest.files
@@ -368,8 +372,12 @@ FILES: dict[str, tuple[Change, str, str]] = {
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_files(flight: Flight, honest: Graded, rubric: Rubric, name: str) -> None:
+def test_files(
+    flight: Flight, honest: Graded, rubric: Rubric, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     change, status, pending = FILES[name]
+    if status == "numbers differ":  # whatever the pages look like
+        monkeypatch.setattr(pdf_module, "render", page_of)
     results = copy.deepcopy(flight.honest.results)
     change(results)
     pdf = flight.honest.with_results(results).sealed()

@@ -408,7 +408,7 @@ def test_a_scheduler_and_two_workers_that_run_already(flights, undisturbed, tmp_
 
     with started(*scheduler, says="Scheduler at:", log=tmp_path / "scheduler") as line:
         address = line.split()[-1]
-        with worker("first"), worker("second"):
+        with worker("both", "--nworkers", "2"):
             arguments = [str(flights), "-o", str(tmp_path / "out"), "--scheduler", address]
             result = command(*arguments, "--fail-on", "failed")
             assert result.exit_code == 0, result.output

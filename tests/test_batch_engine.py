@@ -14,7 +14,7 @@ from px4fuse.fleet.engine import Failed, connected, outcomes
 
 
 def test_each_bad_job_is_lost_alone_and_its_worker_begins_again(subtests, monkeypatch):
-    """What sleeps or exits is among the logs of test_batch.py."""
+    """What sleeps or exits is among the logs of test_batch.py, and what is tried again there."""
     jobs = [
         ("square", 3), ("square", 4), ("hold the interpreter", 0), ("hog", 4_000),
         ("raise", "no number"), ("square", 5), ("process", 0), ("square", 6),
@@ -22,6 +22,7 @@ def test_each_bad_job_is_lost_alone_and_its_worker_begins_again(subtests, monkey
     ]  # fmt: skip
     clock = Clock()
     monkeypatch.setattr(engine, "time", clock)
+    monkeypatch.setitem(engine._CONFIG, "distributed.scheduler.allowed-failures", 1)
     found = {}
     with connected(workers=2, memory="1GB") as client:
         for work, result in outcomes(client, act, jobs, timeout_s=60.0):
@@ -37,7 +38,7 @@ def test_each_bad_job_is_lost_alone_and_its_worker_begins_again(subtests, monkey
         ("square", 6): 36,
         ("variable", "OMP_NUM_THREADS"): "1",
         ("hold the interpreter", 0): "longer than 60 s",
-        ("hog", 4_000): "ended 3 times: it crashed, or needed more memory",
+        ("hog", 4_000): "ended 2 times: it crashed, or needed more memory",
         ("raise", "no number"): "ValueError: no number",
     }.items():
         with subtests.test(work=work):
@@ -67,10 +68,14 @@ def test_workers_that_cannot_be_ended_are_refused():
 
 
 def test_a_scheduler_that_does_not_answer_is_one_line(monkeypatch):
+    from distributed import default_client
+
     monkeypatch.setattr(engine, "CONNECT_S", 0.5)
     for address in ("tcp://127.0.0.1:1", "nonsense://x", ""):
         with pytest.raises(SettingsError, match="no Dask scheduler answers"), connected(address):
             pass
+    with pytest.raises(ValueError, match="No clients found"):  # the next batch has its own
+        default_client()
 
 
 def test_without_dask_the_extra_is_named(monkeypatch, sample_log):

@@ -84,7 +84,7 @@ def test_everything_that_was_handed_in_stands_in_the_table(handed_in, tmp_path) 
         assert found["score"] >= 0.0
 
 
-@pytest.mark.usefixtures("at_once", "analysed_once")
+@pytest.mark.usefixtures("at_once", "analysed_once", "drawn_once")
 def test_a_report_with_its_log_is_verified_and_a_changed_one_is_not(tmp_path) -> None:
     folder = tmp_path / "in"
     folder.mkdir()

@@ -12,6 +12,7 @@ from click.testing import CliRunner
 from matplotlib import pyplot
 
 from px4fuse.cli import COMMANDS, cli
+from px4fuse.fleet.engine import connected
 
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -26,6 +27,12 @@ LINES = [
     for line in lines
     if line.startswith("px4fuse ") and "|" not in line
 ]
+# Their report is that of test_cli.py, and of test_verify.py
+DRAWN_ELSEWHERE = [
+    line
+    for line in LINES
+    if line == "px4fuse compare sample_logs/aisle_uwb.ulg" or " --position " in line
+]
 
 
 @pytest.fixture
@@ -38,9 +45,19 @@ def at_root(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
 
 
+@pytest.fixture(scope="module")
+def workers():
+    """Of the session, so that a batch begins none of its own, as another test's does."""
+    with connected(workers=2, memory="2GB"):
+        yield
+
+
 @pytest.mark.parametrize("line", LINES)
-def test_command_runs(at_root, line):
+def test_command_runs(at_root, line, request):
+    if line in DRAWN_ELSEWHERE:
+        request.getfixturevalue("no_drawing")
     if line.startswith("px4fuse batch"):  # the sample logs themselves are in the other lines
+        request.getfixturevalue("workers")
         for number, log in enumerate(sorted(Path("sample_logs").glob("*.ulg"))):
             log.write_bytes(tiny_log(number))
         Path("sample_logs/aisle_uwb.tlog").unlink()

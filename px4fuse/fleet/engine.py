@@ -91,13 +91,14 @@ def connected(
         raise SettingsError(f"`memory` {memory}: not a size. Give one like 2GB.") from error
     if scheduler is not None:
         try:
-            client = Client(scheduler, timeout=CONNECT_S)
+            # one that fails must not become the session's own
+            client = Client(scheduler, timeout=CONNECT_S, set_as_default=False)
         except (OSError, ValueError) as error:
             raise SettingsError(
                 f"`scheduler` {scheduler}: no Dask scheduler answers there "
                 f"({one_line(str(error), 120)}). Start one with: dask scheduler"
             ) from error
-        with client:
+        with client, client.as_current():
             _check(client, scheduler)
             yield client
         return

@@ -42,12 +42,8 @@ def _vehicles(frames: Frames) -> dict[Address, tuple[int, int]]:
     beats = frames.table("HEARTBEAT", rows)
     address = frames.system[rows].astype(np.int64) << 8 | frames.component[rows]
     first = np.unique(address, return_index=True)[1]
-    return {
-        (int(number) >> 8, int(number) & 0xFF): (int(kind), int(autopilot))
-        for number, kind, autopilot in zip(
-            address[first], beats["type"][first], beats["autopilot"][first], strict=True
-        )
-    }
+    given = zip(beats["type"][first].tolist(), beats["autopilot"][first].tolist(), strict=True)
+    return dict(zip(_addresses(address[first]), given, strict=True))
 
 
 def _counts(frames: Frames, rows: IntArray | slice = slice(None)) -> list[tuple[Address, int]]:
@@ -55,7 +51,11 @@ def _counts(frames: Frames, rows: IntArray | slice = slice(None)) -> list[tuple[
     address = frames.system[rows].astype(np.int64) << 8 | frames.component[rows]
     numbers, counts = np.unique(address, return_counts=True)
     most = np.argsort(-counts, kind="stable")
-    return [((int(numbers[i]) >> 8, int(numbers[i]) & 0xFF), int(counts[i])) for i in most]
+    return list(zip(_addresses(numbers[most]), counts[most].tolist(), strict=True))
+
+
+def _addresses(numbers: IntArray) -> list[Address]:
+    return list(zip((numbers >> 8).tolist(), (numbers & 0xFF).tolist(), strict=True))
 
 
 def _flies(kind: int, autopilot: int) -> bool:
