@@ -48,6 +48,8 @@ MAX_TURN_RATE_DEG_S = 10.0
 LEAST_SIGMA_DEG = 0.5
 MAX_ATTITUDE_INTERVAL_S = 0.11
 LINEARISATIONS = 3
+# About a turn so near the last run is as good as about the right one
+SMALL_TURN_RAD = 0.01
 STATE_COUNT = 7
 TURN = 6
 CROSSED = np.array([[1.0, -1.0], [-1.0, 1.0]])
@@ -242,18 +244,18 @@ def _by_positions(
     grid = np.array(list(product(TURN_WALKS, BIAS_WALKS, SIGMA_AS)))
     still = grid[grid[:, 0] == 0.0]
 
-    def likelihood(turn: float, noises: Array) -> tuple[Array, Array]:
-        log_p, _, states, _ = _filter(legs, measured, turn, noises, sigma_z, dt_s)
-        return log_p, states[:, TURN]
-
     turn = 0.0
     for _ in range(LINEARISATIONS):
-        log_p, found = likelihood(turn, still)
-        turn += float(found[np.argmax(log_p)])
+        run = _filter(legs, measured, turn, still, sigma_z, dt_s)
+        step = float(run.last[np.argmax(run.log_p), TURN])
+        turn += step
+        if abs(step) < SMALL_TURN_RAD:
+            break
     turn = float(np.angle(np.exp(1j * turn)))
-    log_p, _ = likelihood(turn, grid)
-    ratio = 2.0 * (log_p.max() - log_p[grid[:, 0] == 0.0].max())
-    smoothed, sigma = _smooth(legs, measured, turn, grid[[np.argmax(log_p)]], sigma_z, dt_s)
+    run = _filter(legs, measured, turn, grid, sigma_z, dt_s)
+    best = int(np.argmax(run.log_p))
+    ratio = 2.0 * (run.log_p[best] - run.log_p[grid[:, 0] == 0.0].max())
+    smoothed, sigma = _smooth(run, measured, best)
     # at the end of its range a walk is half of the time none
     p = 0.5 * float(chdtrc(1, ratio)) if ratio > 0.0 else 1.0
     return HeadingError(_parts(time, turn + smoothed, sigma), p, "positions")
@@ -315,19 +317,34 @@ def _start(measured: Array, count: int) -> tuple[Array, Array]:
     return x, np.broadcast_to(np.diag(sigmas**2), (count, STATE_COUNT, STATE_COUNT)).copy()
 
 
-Step = tuple[Array, Array, Array, Array, Array]
+@dataclass(frozen=True)
+class _Run:
+    """What k filters with other noises made of the measurements.
+
+    Attributes
+    ----------
+    log_p : ndarray, shape (k,)
+        With the best scale of all noises.
+    scale : ndarray, shape (k,)
+        That scale, of their variances.
+    last : ndarray, shape (k, 7)
+        The last state.
+    steps : list
+        Of every step F, prior states and covariances, and posterior ones.
+    """
+
+    log_p: Array
+    scale: Array
+    last: Array
+    steps: list[tuple[Array, Array, Array, Array, Array]]
 
 
 def _filter(
     legs: _Legs, measured: Array, turn: float, noises: Array, sigma_z: float, dt_s: float
-) -> tuple[Array, Array, Array, list[Step]]:
-    """Log-likelihood of each setting with the best scale of all noises, that scale, the last state.
-
-    Also every step's F, prior state and covariance, and posterior ones.
-    """
+) -> _Run:
     x, P = _start(measured, len(noises))
     square, log_s = np.zeros(len(noises)), np.zeros(len(noises))
-    steps: list[Step] = []
+    steps = []
     R = sigma_z**2 * np.eye(2)
     each = zip(*_transitions(legs, turn), _noise(legs, noises, dt_s), strict=True)
     for k, (F, push, Q) in enumerate(each):
@@ -348,22 +365,20 @@ def _filter(
         steps.append((F, *prior, x, P))
     count = 2 * len(legs.dt_s)
     scale = square / count
-    return -0.5 * (count * np.log(scale) + log_s), scale, x, steps
+    return _Run(-0.5 * (count * np.log(scale) + log_s), scale, x, steps)
 
 
-def _smooth(
-    legs: _Legs, measured: Array, turn: float, noises: Array, sigma_z: float, dt_s: float
-) -> tuple[Array, Array]:
+def _smooth(run: _Run, measured: Array, which: int) -> tuple[Array, Array]:
     """Turn at every measurement by all of them, and its standard deviation (Rauch et al. 1965)."""
-    _, scale, _, steps = _filter(legs, measured, turn, noises, sigma_z, dt_s)
     x, P = _start(measured, 1)
-    before = [(x[0], P[0]), *((step[3][0], step[4][0]) for step in steps)]
+    before = [(x[0], P[0]), *((step[3][which], step[4][which]) for step in run.steps)]
     state, covariance = before[-1]
     turns, variances = [state[TURN]], [covariance[TURN, TURN]]
-    for (x_k, P_k), (F, prior, spread, _, _) in zip(before[-2::-1], steps[::-1], strict=True):
-        gain = np.linalg.solve(spread[0], F @ P_k).T
-        state = x_k + gain @ (state - prior[0])
-        covariance = P_k + gain @ (covariance - spread[0]) @ gain.T
+    for (x_k, P_k), (F, prior, spread, _, _) in zip(before[-2::-1], run.steps[::-1], strict=True):
+        gain = np.linalg.solve(spread[which], F @ P_k).T
+        state = x_k + gain @ (state - prior[which])
+        covariance = P_k + gain @ (covariance - spread[which]) @ gain.T
         turns.append(state[TURN])
         variances.append(covariance[TURN, TURN])
-    return np.array(turns[::-1]), np.sqrt(scale[0] * np.maximum(np.array(variances[::-1]), 0.0))
+    variance = run.scale[which] * np.maximum(np.array(variances[::-1]), 0.0)
+    return np.array(turns[::-1]), np.sqrt(variance)
