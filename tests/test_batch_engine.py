@@ -50,6 +50,23 @@ def test_each_bad_job_is_lost_alone_and_its_worker_begins_again(subtests, monkey
     assert set(found) == {("process", 0)}
 
 
+def test_a_result_that_does_not_come_is_asked_for_again(monkeypatch):
+    """Its worker has begun another job and is busy: the scheduler is there all the same."""
+    fetched, asked = engine._result, []
+
+    def late(future, *given):
+        asked.append(future.key)
+        if len(asked) == 1:
+            raise TimeoutError("timed out after 10 s.")
+        return fetched(future, *given)
+
+    monkeypatch.setattr(engine, "_result", late)
+    with connected(workers=1, memory="1GB") as client:
+        found = dict(outcomes(client, act, [("square", 3), ("square", 4)], timeout_s=60.0))
+    assert found == {("square", 3): 9, ("square", 4): 16}
+    assert len(asked) == 3
+
+
 def test_workers_that_cannot_be_ended_are_refused():
     from distributed import Client
 

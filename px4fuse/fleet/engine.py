@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from importlib import metadata
 from itertools import islice
@@ -27,6 +27,8 @@ WORKERS_S = 120.0
 RESTART_S = 15.0
 # How often the clocks of running jobs are looked at
 TICK_S = 1.0
+# For one result to come from its worker, before the others are looked at
+FETCH_S = 10.0
 _CONFIG = {
     # whose worker died is tried twice more: another log, or another program, may have ended it
     "distributed.scheduler.allowed-failures": 2,
@@ -196,8 +198,8 @@ def outcomes(
                 done = wait(list(running), timeout=TICK_S, return_when="FIRST_COMPLETED").done
             except TimeoutError:
                 done = set()
-            for future in done:
-                yield running.pop(future), _result(future, timeout_s)
+            for future, found in _fetched(done):
+                yield running.pop(future), found
             done.clear()
             if time.monotonic() - looked_s >= TICK_S:
                 looked_s = time.monotonic()
@@ -243,11 +245,24 @@ def _late(
     return late
 
 
-def _result(future: Future[Any], timeout_s: float) -> Any:
+def _fetched(futures: Iterable[Future[Any]]) -> list[tuple[Future[Any], Any]]:
+    """What comes of finished jobs, but for those whose worker does not answer.
+
+    It has begun another job that does not let it: the result is asked for again, and the job done
+    again once the worker is ended.
+    """
+    made = []
+    for future in futures:
+        with suppress(TimeoutError):
+            made.append((future, _result(future)))
+    return made
+
+
+def _result(future: Future[Any]) -> Any:
     from distributed import KilledWorker  # noqa: PLC0415
 
     if future.status == "finished":
-        return future.result(timeout=timeout_s)
+        return future.result(timeout=FETCH_S)
     error = future.exception()
     if isinstance(error, KilledWorker):
         return Failed(
