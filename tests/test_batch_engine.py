@@ -22,7 +22,7 @@ def test_each_bad_job_is_lost_alone_and_its_worker_begins_again(subtests, monkey
     ]  # fmt: skip
     clock = Clock()
     monkeypatch.setattr(engine, "time", clock)
-    monkeypatch.setitem(engine._CONFIG, "distributed.scheduler.allowed-failures", 1)
+    monkeypatch.setattr(engine, "ENDS", 2)
     found = {}
     with connected(workers=2, memory="1GB") as client:
         for work, result in outcomes(client, act, jobs, timeout_s=60.0):
@@ -65,6 +65,23 @@ def test_a_result_that_does_not_come_is_asked_for_again(monkeypatch):
         found = dict(outcomes(client, act, [("square", 3), ("square", 4)], timeout_s=60.0))
     assert found == {("square", 3): 9, ("square", 4): 16}
     assert len(asked) == 3
+
+
+def test_a_result_that_is_lost_before_it_comes_counts_as_an_ended_worker():
+    """It was finished; its worker ended, and so did the one that did the job again."""
+    from distributed import KilledWorker
+
+    class Lost:
+        status = "finished"
+
+        def result(self, timeout):
+            self.status = "error"
+            raise self.exception()
+
+        def exception(self):
+            return KilledWorker("job", None, 0)
+
+    assert engine._result(Lost()) == engine._Ended(1)
 
 
 def test_workers_that_cannot_be_ended_are_refused():

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Generator, Iterable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import metadata
-from itertools import islice
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from px4fuse.errors import Px4FuseError, SettingsError
@@ -29,9 +28,11 @@ RESTART_S = 15.0
 TICK_S = 1.0
 # For one result to come from its worker, before the others are looked at
 FETCH_S = 10.0
+# Of the workers that had a job: another log, or another program, may have ended one or two
+ENDS = 3
 _CONFIG = {
-    # whose worker died is tried twice more: another log, or another program, may have ended it
-    "distributed.scheduler.allowed-failures": 2,
+    # one whose worker ended is handed out anew here: Dask may put it behind a job that hangs
+    "distributed.scheduler.allowed-failures": 0,
     # after this a worker that is just then being restarted, for the second time, is given up
     "distributed.deploy.lost-worker-timeout": "24 hours",
     # results are small, so all memory is the log's: nothing to spill, and a pause would not help
@@ -57,6 +58,13 @@ class Failed:
     """
 
     line: str
+
+
+@dataclass(frozen=True)
+class _Ended:
+    """Stands for the result of a job whose worker ended so often."""
+
+    times: int
 
 
 @contextmanager
@@ -152,6 +160,15 @@ def _check(client: Client, address: str) -> None:
             )
 
 
+@dataclass(frozen=True)
+class _Run:
+    """A job that is handed out: to which worker, and how many have ended with it before."""
+
+    job: Any
+    address: str | None
+    ends: int
+
+
 def outcomes(
     client: Client,
     function: Callable[[Job], Result],
@@ -161,8 +178,8 @@ def outcomes(
 ) -> Generator[tuple[Job, Result | Failed]]:
     """Call a function on every job on a cluster, and give what comes of each as it comes.
 
-    No more jobs are handed out than there are workers, so that none waits behind one that is
-    ended; and nothing of a finished one is kept.
+    A worker has one job at a time, and no other before its result is here: none waits behind one
+    that hangs, or is ended with it. Nothing of a finished job is kept.
 
     Parameters
     ----------
@@ -180,26 +197,32 @@ def outcomes(
     """
     from distributed import CancelledError, wait  # noqa: PLC0415
 
-    waiting = iter(jobs)
-    running: dict[Future[Any], Job] = {}
+    waiting = ((job, 0) for job in jobs)
+    again: list[tuple[Job, int]] = []
+    running: dict[Future[Any], _Run] = {}
     begun: dict[str, tuple[str, float]] = {}
     seen_s = looked_s = time.monotonic()
     try:
         while True:
-            workers = len(client.nthreads())
-            seen_s = time.monotonic() if workers else seen_s
+            processing = client.processing()
+            seen_s = time.monotonic() if processing else seen_s
             if time.monotonic() - seen_s > WORKERS_S:
                 raise Px4FuseError("the cluster has lost all its workers.")
-            for job in islice(waiting, max(max(1, workers) - len(running), 0)):
-                running[client.submit(function, job, pure=False)] = job
+            for address in _free(processing, running):
+                if (work := again.pop() if again else next(waiting, None)) is None:
+                    break
+                job, ends = work
+                future = client.submit(
+                    function, job, pure=False, workers=address, allow_other_workers=bool(address)
+                )
+                running[future] = _Run(job, address, ends)
             if not running:
                 return
             try:
                 done = wait(list(running), timeout=TICK_S, return_when="FIRST_COMPLETED").done
             except TimeoutError:
                 done = set()
-            for future, found in _fetched(done):
-                yield running.pop(future), found
+            yield from _fetched(done, running, again)
             done.clear()
             if time.monotonic() - looked_s >= TICK_S:
                 looked_s = time.monotonic()
@@ -211,7 +234,7 @@ def outcomes(
                     client.restart_workers(late, timeout=RESTART_S, raise_for_error=False)
                 for future in ended:
                     yield (
-                        running.pop(future),
+                        running.pop(future).job,
                         Failed(
                             f"it took longer than {timeout_s:g} s and was ended. Allow more with "
                             "--timeout."
@@ -224,52 +247,87 @@ def outcomes(
             client.cancel(list(running))
 
 
+def _free(
+    processing: Mapping[str, Collection[Any]], running: Mapping[Future[Any], _Run]
+) -> list[str | None]:
+    """Workers without a job of ours, nor a result that is not here yet; the idlest first.
+
+    Where nothing runs and there is no worker, none: one job is handed out that waits for one.
+    """
+    known = {str(future.key) for future in running}
+    given = {run.address for run in running.values()}
+    free = [
+        address
+        for address, keys in processing.items()
+        if address not in given and known.isdisjoint(map(str, keys))
+    ]
+    free.sort(key=lambda address: len(processing[address]))
+    return [*free] if free or running else [None]
+
+
 def _late(
     client: Client,
-    running: Iterable[Future[Any]],
+    running: Mapping[Future[Any], _Run],
     begun: dict[str, tuple[str, float]],
     latest_s: float,
 ) -> list[str]:
     """Workers whose job began before a time; keeps account of what each began, and when."""
-    known = {str(future.key) for future in running}
+    given = {str(future.key): run.address for future, run in running.items()}
     late = []
     for address, keys in client.processing().items():
-        ours = [key for key in map(str, keys) if key in known]  # as they were handed out
+        ours = [key for key in map(str, keys) if key in given]
         if not ours:
             begun.pop(address, None)
             continue
         if begun.get(address, ("", 0.0))[0] not in ours:
-            begun[address] = (ours[0], time.monotonic())
+            # a scheduler that tries again by itself may put one behind that which was given here
+            first = max(ours, key=lambda key: given[key] == address)
+            begun[address] = (first, time.monotonic())
         if begun[address][1] < latest_s:
             late.append(address)
     return late
 
 
-def _fetched(futures: Iterable[Future[Any]]) -> list[tuple[Future[Any], Any]]:
-    """What comes of finished jobs, but for those whose worker does not answer.
+def _fetched(
+    done: Iterable[Future[Any]], running: dict[Future[Any], _Run], again: list[tuple[Any, int]]
+) -> Iterator[tuple[Any, Any]]:
+    """What comes of finished jobs; one whose worker ended is put among those to do again.
 
-    It has begun another job that does not let it: the result is asked for again, and the job done
-    again once the worker is ended.
+    A worker that does not answer has begun work of others that does not let it: it is asked again.
     """
-    made = []
-    for future in futures:
-        with suppress(TimeoutError):
-            made.append((future, _result(future)))
-    return made
+    for future in done:
+        try:
+            found = _result(future)
+        except TimeoutError:
+            continue
+        run = running.pop(future)
+        if not isinstance(found, _Ended):
+            yield run.job, found
+        elif (ends := run.ends + found.times) < ENDS:
+            again.append((run.job, ends))
+        else:
+            yield (
+                run.job,
+                Failed(
+                    f"the process that read it ended {ends} times: it crashed, or needed more "
+                    "memory than it may take. Give each more with --memory, or look at this log "
+                    "with px4fuse compare."
+                ),
+            )
 
 
 def _result(future: Future[Any]) -> Any:
     from distributed import KilledWorker  # noqa: PLC0415
 
-    if future.status == "finished":
-        return future.result(timeout=FETCH_S)
+    if not _failed(future):
+        try:
+            return future.result(timeout=FETCH_S)
+        except Exception:
+            if not _failed(future):  # else its worker ended, and it was done again
+                raise
     error = future.exception()
     if isinstance(error, KilledWorker):
-        return Failed(
-            f"the process that read it ended {error.allowed_failures + 1} times: it crashed, or "
-            "needed more memory than it may take. Give each more with --memory, or look at this "
-            "log with px4fuse compare."
-        )
+        return _Ended(error.allowed_failures + 1)
     if isinstance(error, MemoryError):
         return Failed("it needs more memory than there is. Use fewer --workers.")
     if isinstance(error, Px4FuseError):
@@ -277,3 +335,7 @@ def _result(future: Future[Any]) -> Any:
     return Failed(
         f"{type(error).__name__}: {one_line(str(error), 300)}. Look at it with px4fuse compare."
     )
+
+
+def _failed(future: Future[Any]) -> bool:
+    return future.status == "error"
