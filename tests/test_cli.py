@@ -35,7 +35,7 @@ def made(tmp_path_factory, sample_log) -> tuple[Path, Result]:
     notes.write_text(
         "# What I saw\n\nCosts $5 and $x^2$ or \\frac{1}{2}; **bold**, _under_, <b>tag</b>.\n"
         "- a bullet\n1. numbered\n" + "word" * 300 + "\n\nสวัสดี 你好 \N{GRINNING FACE}\n"
-        "line " * 4000,
+        "line " * 1500,
         encoding="utf-8",
     )
     result = run(

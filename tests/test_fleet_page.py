@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from browser import Browser, Elements
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_up_fleet import DAMAGED, NOT_LOGGED, STORY, VEHICLES, made_up
 
@@ -137,6 +137,7 @@ def hostile_table(word: str, count: int = 2) -> pd.DataFrame:
     return table.assign(**dict.fromkeys(TEXTS, word), findings=f"{word};x", log=logs)
 
 
+@settings(max_examples=40)
 @given(text=st.text(max_size=40) | st.sampled_from(HOSTILE))
 def test_text_makes_no_elements(text: str) -> None:
     def shape(word: str) -> list[tuple[str, list[str]]]:

@@ -565,6 +565,7 @@ def test_help_of_both_commands() -> None:
         assert "Usage:" in result.output
 
 
+@pytest.mark.usefixtures("no_drawing")
 def test_compare_reports_the_loop_of_the_sample_flight(tmp_path) -> None:
     result = run("compare", LOG, "--axis", "down", "-o", tmp_path / "r.pdf")
     assert result.exit_code == 0, result.output

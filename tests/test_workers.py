@@ -95,9 +95,9 @@ def test_one_bad_job_is_lost_alone():
 
 
 def test_what_hangs_is_ended():
-    results, _ = run([("hang", 0), ("square", 2), ("spin", 0), ("square", 3)], timeout_s=5.0)
+    results, _ = run([("hang", 0), ("square", 2), ("spin", 0), ("square", 3)], timeout_s=3.0)
     assert results[1::2] == [4, 9]
-    late = Failed("it took longer than 5 s and was ended.")
+    late = Failed("it took longer than 3 s and was ended.")
     assert results[0::2] == [late, late]
 
 
