@@ -113,13 +113,18 @@ class Browser:
 
     def open(self, path: Path, *, scripts: bool = True, width: int = 1400) -> None:
         self.call("Emulation.setScriptExecutionDisabled", value=not scripts)
-        self.resize(width, 900)
+        self._measure(width, 900)
         self.events.clear()
         self.call("Page.navigate", url=path.as_uri())
         while not any(event["method"] == "Page.loadEventFired" for event in self.events):
             self.events.append(self._next())
 
     def resize(self, width: int, height: int, scale: float = 1.0) -> None:
+        """Until the page is laid out anew: a small screen is first shown a page that is wider."""
+        self._measure(width, height, scale)
+        self.ask_later("new Promise((done) => requestAnimationFrame(() => setTimeout(done)))")
+
+    def _measure(self, width: int, height: int, scale: float = 1.0) -> None:
         self.call(
             "Emulation.setDeviceMetricsOverride", width=width, height=height,
             deviceScaleFactor=scale, mobile=width < 600,
