@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import gc
 import io
+import os
 import signal
 from collections.abc import Callable
 from functools import lru_cache
@@ -28,6 +29,7 @@ from px4fuse.flight import Flight
 from px4fuse.readers import read_log
 from px4fuse.report import pdf
 from px4fuse.request import ComparisonRequest
+from px4fuse.threads import ONE_THREAD
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 SHARED_LOGS = REPOSITORY.parent / "shared" / "logs"
@@ -55,8 +57,12 @@ MANY_OBJECTS = 200_000
 
 
 def pytest_configure() -> None:
-    """Look for garbage between tests only, as collecting them makes none."""
+    """Look for garbage between tests only, as collecting them makes none.
+
+    The processes of the tests, which are begun after this, do linear algebra as commands do.
+    """
     gc.disable()
+    os.environ.update(ONE_THREAD)
 
 
 def pytest_collection_finish() -> None:

@@ -1,6 +1,7 @@
 """The command line as a student types it: outputs, one clear line for bad input, exit codes."""
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -25,6 +26,15 @@ def run_main(monkeypatch, capsys, *arguments: str | Path) -> tuple[int, str, str
         main()
     out, err = capsys.readouterr()
     return int(stopped.value.code or 0), out, err
+
+
+def test_linear_algebra_has_one_thread_unless_said(monkeypatch, capsys):
+    """More of them only wait for each other: twice the CPU time of `tune`, in the same time."""
+    environment = {"OPENBLAS_NUM_THREADS": "3"}
+    monkeypatch.setattr(os, "environ", environment)
+    assert run_main(monkeypatch, capsys, "--version")[0] == 0
+    assert environment["OMP_NUM_THREADS"] == environment["VECLIB_MAXIMUM_THREADS"] == "1"
+    assert environment["OPENBLAS_NUM_THREADS"] == "3"
 
 
 @pytest.fixture(scope="module")

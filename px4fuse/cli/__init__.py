@@ -13,6 +13,7 @@ import click
 
 from px4fuse.cli.outputs import Interrupted, written_so_far
 from px4fuse.errors import OutputError, Px4FuseError, on_one_line
+from px4fuse.threads import ONE_THREAD
 from px4fuse.writing import STOPPING
 
 # Command name to module and one-line help: --help must not import what the commands need.
@@ -110,6 +111,8 @@ def main() -> None:
     # one short job per process: looking for garbage while importing and drawing costs a tenth
     gc.disable()
     atexit.register(gc.freeze)  # and while everything is thrown away, as much again
+    for name, one in ONE_THREAD.items():  # commands load the libraries later
+        os.environ.setdefault(name, one)
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):  # σ and ν on a Windows console with a legacy code page
             stream.reconfigure(errors="replace")

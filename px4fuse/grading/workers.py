@@ -19,6 +19,7 @@ from multiprocessing.connection import Connection, wait
 from typing import Any, TypeVar
 
 from px4fuse.errors import Px4FuseError
+from px4fuse.threads import ONE_THREAD
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
@@ -29,17 +30,12 @@ JOBS_PER_WORKER = 40
 QUICK_S = 0.5
 # Until a new process has imported what the function needs, on a slow and busy machine
 START_S = 180.0
-# Read by an interpreter and by libraries as they start, before any code of ours runs
+# Read by an interpreter as it starts, before any code of ours runs
 _ENVIRONMENT = {
     # a spawned interpreter looks for modules in the current folder first; who grades there would
     # run a functools.py that was handed in
     "PYTHONSAFEPATH": "1",
-    # the processes are the parallel part
-    "OMP_NUM_THREADS": "1",
-    "OPENBLAS_NUM_THREADS": "1",
-    "MKL_NUM_THREADS": "1",
-    "NUMEXPR_NUM_THREADS": "1",
-    "VECLIB_MAXIMUM_THREADS": "1",
+    **ONE_THREAD,
 }
 
 
