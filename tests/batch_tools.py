@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import ctypes
+import hashlib
 import os
+import pickle
 import subprocess
 import sys
 import time
@@ -60,7 +62,30 @@ def analyse(work: job.Job) -> job.Outcome:
     name = Path(work.address).stem
     if name in ("hang", "crash"):
         act(("hang", 0) if name == "hang" else ("exit", 3))
+    return analyse_once(work)
+
+
+# Where what was found in a log is kept, for the tests of what surrounds that
+MEMORY = "PX4FUSE_TESTS_MEMORY"
+
+
+def analyse_once(work: job.Job) -> job.Outcome:
+    """As the worker does, but what was found in the same log before serves again."""
+    job._compared = _remembered
     return job.analyse(work)
+
+
+_compared = job._compared
+
+
+def _remembered(work: job.Job, path: Path, sha256: str) -> job.Outcome:
+    known = repr((path.name, sha256, work.request, work.reports))
+    kept = Path(os.environ[MEMORY]) / hashlib.sha256(known.encode()).hexdigest()
+    if not kept.is_file():
+        outcome = _compared(work, path, sha256)
+        kept.with_suffix(f".{os.getpid()}").write_bytes(pickle.dumps(outcome))
+        kept.with_suffix(f".{os.getpid()}").replace(kept)
+    return pickle.loads(kept.read_bytes())
 
 
 def environment(**more: str) -> dict[str, str]:

@@ -36,10 +36,18 @@ from px4fuse.results.reading import read_results
 
 
 @pytest.fixture(scope="module")
-def client() -> Iterator[Any]:
+def client(tmp_path_factory) -> Iterator[Any]:
     """Two workers; they are the session's own, which px4fuse.batch uses."""
-    with connected(workers=2, memory="2GB") as client:
-        yield client
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv(batch_tools.MEMORY, str(tmp_path_factory.mktemp("memory")))
+        with connected(workers=2, memory="2GB") as client:
+            yield client
+
+
+@pytest.fixture
+def analysed_once(monkeypatch) -> None:
+    """For tests of what surrounds an analysis."""
+    monkeypatch.setattr(run, "analyse", batch_tools.analyse_once)
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +57,9 @@ def flights(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def undisturbed(client, flights, tmp_path_factory) -> pd.DataFrame:
-    return px4fuse.batch(flights, tmp_path_factory.mktemp("undisturbed"))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(run, "analyse", batch_tools.analyse_once)
+        return px4fuse.batch(flights, tmp_path_factory.mktemp("undisturbed"))
 
 
 def assert_same(table: pd.DataFrame, expected: pd.DataFrame) -> None:
@@ -148,6 +158,7 @@ def test_logs_without_a_position_are_not_judged_but_known(shared_logs, client):
 # ------------------------------------------------------------------ resuming
 
 
+@pytest.mark.usefixtures("analysed_once")
 def test_a_second_run_does_only_what_is_new(client, flights, tmp_path):
     logs, output = tmp_path / "logs", tmp_path / "out"
     shutil.copytree(flights, logs)
@@ -188,6 +199,7 @@ def test_a_killed_worker_costs_nothing(client, flights, undisturbed, tmp_path):
     client.wait_for_workers(2, timeout=60)
 
 
+@pytest.mark.usefixtures("analysed_once")
 def test_interrupted_and_resumed_it_is_the_same_table(client, flights, undisturbed, tmp_path):
     def interrupt(what: str, done: int, of: int) -> None:
         if what.startswith("comparing,"):

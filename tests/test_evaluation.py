@@ -573,14 +573,14 @@ def test_an_offset_between_clocks_is_recovered(offset_s: float, rate_hz: float) 
 def test_the_interval_of_an_offset_holds_it() -> None:
     reference, held = flight(40.0, 100.0), 0
     random = np.random.default_rng(8)
-    for _ in range(40):
+    for _ in range(25):
         estimate = flight(40.0, 10.0)
         noise = lfilter([0.05], [1.0, -0.9], random.normal(size=(len(estimate), 3)), axis=0)
         estimate = replace(estimate, position_m=estimate.position_m + noise)
         got = estimate_time_offset(estimate, reference)
         assert got.interval_s is not None
         held += got.interval_s[0] <= 0.0 <= got.interval_s[1]
-    assert held >= 35
+    assert held >= 22
 
 
 def test_clocks_that_are_set_are_the_start() -> None:

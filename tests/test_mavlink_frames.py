@@ -519,7 +519,7 @@ def test_shortest_frames_of_random_senders_cost_a_bounded_amount_each(tmp_path, 
     path = tmp_path / "hostile.raw"
     path.write_bytes(short_frames(np.random.default_rng(1), 10_000, ids, v1=v1))
     read_log(path)  # tables that are made once
-    content = short_frames(np.random.default_rng(1), 300_000, ids, v1=v1)
+    content = short_frames(np.random.default_rng(1), 150_000, ids, v1=v1)
     path.write_bytes(content)
     tracemalloc.start()
     flight = read_log(path)

@@ -518,7 +518,7 @@ def test_gate_is_uniform_for_true_closures(
     edge = len(graph.first) - 1
     if information is not None:
         graph.information[edge] = information
-    found = [gate(simulated(graph, seed), [edge])[0] for seed in range(500)]
+    found = [gate(simulated(graph, seed), [edge])[0] for seed in range(300)]
     assert {each.degrees_of_freedom for each in found} == {freedom}
     assert kstest([each.p for each in found], "uniform").pvalue > 0.01
     assert np.mean([each.accepted for each in found]) > 0.995

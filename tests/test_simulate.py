@@ -625,7 +625,7 @@ def nis(scenario, names=("north", "east", "down")):
 
 def test_clean_flights_are_consistent_at_their_true_noises():
     inside = []
-    for seed in range(20):
+    for seed in range(14):
         values, (low, high) = nis(Scenario(seed=seed, passes=4))
         inside += [low < value < high for value in values]
     assert np.mean(inside) > 0.75
@@ -634,7 +634,7 @@ def test_clean_flights_are_consistent_at_their_true_noises():
 def test_ideal_flights_are_consistent_as_often_as_chance_has_it():
     values = []
     inside = []
-    for seed in range(20):
+    for seed in range(14):
         found, (low, high) = nis(Scenario(seed=seed, passes=4, **IDEAL))
         values += found
         inside += [low < value < high for value in found]
