@@ -67,6 +67,16 @@ def test_a_result_that_does_not_come_is_asked_for_again(monkeypatch):
     assert len(asked) == 3
 
 
+def test_a_job_that_was_given_to_a_worker_that_had_ended_is_given_to_another(monkeypatch):
+    """Its end was not known yet."""
+    free, gone = engine._free, ["tcp://127.0.0.1:9"]
+    monkeypatch.setattr(engine, "TICK_S", 0.1)
+    monkeypatch.setattr(engine, "_free", lambda *known: [gone.pop()] if gone else free(*known))
+    with connected(workers=1, memory="1GB") as client:
+        found = dict(outcomes(client, act, [("square", 3), ("square", 4)], timeout_s=60.0))
+    assert found == {("square", 3): 9, ("square", 4): 16}
+
+
 def test_a_result_that_is_lost_before_it_comes_counts_as_an_ended_worker():
     """It was finished; its worker ended, and so did the one that did the job again."""
     from distributed import KilledWorker

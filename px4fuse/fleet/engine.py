@@ -201,6 +201,7 @@ def outcomes(
     again: list[tuple[Job, int]] = []
     running: dict[Future[Any], _Run] = {}
     begun: dict[str, tuple[str, float]] = {}
+    alone: set[Future[Any]] = set()
     seen_s = looked_s = time.monotonic()
     try:
         while True:
@@ -222,11 +223,17 @@ def outcomes(
                 done = wait(list(running), timeout=TICK_S, return_when="FIRST_COMPLETED").done
             except TimeoutError:
                 done = set()
-            yield from _fetched(done, running, again)
+            yield from _answers(_fetched(done), running, again)
             done.clear()
             if time.monotonic() - looked_s >= TICK_S:
                 looked_s = time.monotonic()
-                late = _late(client, running, begun, looked_s - timeout_s)
+                processing = client.processing()
+                # what is said of a job may still be on its way: it is looked for twice
+                before, alone = alone, _without_worker(processing, running)
+                lost = alone & before
+                client.cancel(list(lost))
+                yield from _answers(((future, _Ended(1)) for future in lost), running, again)
+                late = _late(processing, running, begun, looked_s - timeout_s)
                 keys = {begun.pop(address)[0] for address in late}
                 ended = [future for future in running if str(future.key) in keys]
                 if ended:
@@ -265,8 +272,25 @@ def _free(
     return [*free] if free or running else [None]
 
 
+def _without_worker(
+    processing: Mapping[str, Collection[Any]], running: Mapping[Future[Any], _Run]
+) -> set[Future[Any]]:
+    """Jobs that no worker has, since the one that they were given has ended.
+
+    Dask leaves one that was handed out just when no worker was there without one for ever.
+    """
+    held = {str(key) for keys in processing.values() for key in keys}
+    return {
+        future
+        for future, run in running.items()
+        if run.address not in (None, *processing)
+        and str(future.key) not in held
+        and future.status not in ("finished", "error")
+    }
+
+
 def _late(
-    client: Client,
+    processing: Mapping[str, Collection[Any]],
     running: Mapping[Future[Any], _Run],
     begun: dict[str, tuple[str, float]],
     latest_s: float,
@@ -274,13 +298,13 @@ def _late(
     """Workers whose job began before a time; keeps account of what each began, and when."""
     given = {str(future.key): run.address for future, run in running.items()}
     late = []
-    for address, keys in client.processing().items():
+    for address, keys in processing.items():
         ours = [key for key in map(str, keys) if key in given]
         if not ours:
             begun.pop(address, None)
             continue
         if begun.get(address, ("", 0.0))[0] not in ours:
-            # a scheduler that tries again by itself may put one behind that which was given here
+            # Dask may put one whose result was lost behind that which was given here
             first = max(ours, key=lambda key: given[key] == address)
             begun[address] = (first, time.monotonic())
         if begun[address][1] < latest_s:
@@ -288,10 +312,8 @@ def _late(
     return late
 
 
-def _fetched(
-    done: Iterable[Future[Any]], running: dict[Future[Any], _Run], again: list[tuple[Any, int]]
-) -> Iterator[tuple[Any, Any]]:
-    """What comes of finished jobs; one whose worker ended is put among those to do again.
+def _fetched(done: Iterable[Future[Any]]) -> Iterator[tuple[Future[Any], Any]]:
+    """What comes of finished jobs.
 
     A worker that does not answer has begun work of others that does not let it: it is asked again.
     """
@@ -300,10 +322,20 @@ def _fetched(
             found = _result(future)
         except TimeoutError:
             continue
+        yield future, found
+
+
+def _answers(
+    found: Iterable[tuple[Future[Any], Any]],
+    running: dict[Future[Any], _Run],
+    again: list[tuple[Any, int]],
+) -> Iterator[tuple[Any, Any]]:
+    """Results of jobs; one whose worker ended is put among those to do again."""
+    for future, result in found:
         run = running.pop(future)
-        if not isinstance(found, _Ended):
-            yield run.job, found
-        elif (ends := run.ends + found.times) < ENDS:
+        if not isinstance(result, _Ended):
+            yield run.job, result
+        elif (ends := run.ends + result.times) < ENDS:
             again.append((run.job, ends))
         else:
             yield (
