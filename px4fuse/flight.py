@@ -344,7 +344,7 @@ MODES_NOT_LOGGED = Unavailable(
 )
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, repr=False, eq=False)
 class Flight(Shown):
     """One recorded flight.
 

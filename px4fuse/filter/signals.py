@@ -6,6 +6,7 @@ NED acceleration = R(q) · specific force + [0, 0, g] (Groves 2013, eq. 5.52 wit
 from __future__ import annotations
 
 from dataclasses import dataclass
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import pandas as pd
@@ -105,12 +106,21 @@ def ned_acceleration(flight: Flight) -> pd.DataFrame | Unavailable:
     """Acceleration in NED with gravity removed, at the IMU's own times.
 
     The attitude is interpolated on the sphere (slerp, Shoemake 1985), since default logs hold it
-    at a tenth of the IMU's rate.
+    at a tenth of the IMU's rate. It is made once for a flight, as long as that is there.
 
     Returns
     -------
     DataFrame, shape (n, 3), m/s², or Unavailable
     """
+    if flight not in _MADE:
+        _MADE[flight] = _ned_acceleration(flight)
+    return _MADE[flight]
+
+
+_MADE: WeakKeyDictionary[Flight, pd.DataFrame | Unavailable] = WeakKeyDictionary()
+
+
+def _ned_acceleration(flight: Flight) -> pd.DataFrame | Unavailable:
     if isinstance(flight.imu, Unavailable):
         return flight.imu
     if isinstance(flight.attitude, Unavailable):
