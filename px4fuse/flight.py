@@ -344,6 +344,7 @@ MODES_NOT_LOGGED = Unavailable(
 )
 
 
+# equal to itself only: what is made of it is kept by it
 @dataclass(frozen=True, repr=False, eq=False)
 class Flight(Shown):
     """One recorded flight.

@@ -45,7 +45,7 @@ def client(tmp_path_factory) -> Iterator[Any]:
 
 
 @pytest.fixture
-def analysed_once(monkeypatch) -> None:
+def remembered(monkeypatch) -> None:
     """For tests of what surrounds an analysis."""
     monkeypatch.setattr(run, "analyse", batch_tools.analyse_once)
 
@@ -158,7 +158,7 @@ def test_logs_without_a_position_are_not_judged_but_known(shared_logs, client):
 # ------------------------------------------------------------------ resuming
 
 
-@pytest.mark.usefixtures("analysed_once")
+@pytest.mark.usefixtures("remembered")
 def test_a_second_run_does_only_what_is_new(client, flights, tmp_path):
     logs, output = tmp_path / "logs", tmp_path / "out"
     shutil.copytree(flights, logs)
@@ -199,7 +199,7 @@ def test_a_killed_worker_costs_nothing(client, flights, undisturbed, tmp_path):
     client.wait_for_workers(2, timeout=60)
 
 
-@pytest.mark.usefixtures("analysed_once")
+@pytest.mark.usefixtures("remembered")
 def test_interrupted_and_resumed_it_is_the_same_table(client, flights, undisturbed, tmp_path):
     def interrupt(what: str, done: int, of: int) -> None:
         if what.startswith("comparing,"):

@@ -31,8 +31,7 @@ LINES = [
 DRAWN_ELSEWHERE = [
     line
     for line in LINES
-    if line == "px4fuse compare sample_logs/aisle_uwb.ulg"
-    or any(option in line for option in (" --position ", " --mavlink ", " --sigma-a 0.001"))
+    if line == "px4fuse compare sample_logs/aisle_uwb.ulg" or " --position " in line
 ]
 
 
@@ -67,13 +66,13 @@ def test_command_runs(at_root, line, request):
 
 
 def test_the_instructors_four_commands_run_in_order(at_root):
-    Path("roster.csv").write_text("id,name\n1001,Ada Lovelace\n")
+    Path("roster.csv").write_text("id,name\n1001,Ada Lovelace\n1002,Grace Hopper\n")
     Path("notes.md").write_text("# What I found\n\nThe stamps are late.\n")
     assert len(JOURNEY) == 4
     for line in JOURNEY:
         result = CliRunner().invoke(cli, shlex.split(line)[1:])
         assert result.exit_code == 0, (line, result.output)
-    assert {path.name for path in Path("flights").iterdir()} == {"1001.ulg"}
+    assert {path.name for path in Path("flights").iterdir()} == {"1001.ulg", "1002.ulg"}
     assert "verified" in result.output
     table = Path("class/class.csv").read_text(encoding="utf-8-sig")
     assert "Ada Lovelace,1001,verified" in table

@@ -125,8 +125,7 @@ def test_results_of_every_kind_validate_and_render(sample_flight, options):
     made = document(sample_flight, **options)
     text = to_json(results(made))
     assert_valid(text)
-    if options.keys().isdisjoint({"heading_deg", "position_source"}):  # drawn as any other
-        assert render(made, text).startswith(b"%PDF-")
+    assert render(made, text).startswith(b"%PDF-")
 
 
 def test_nothing_that_could_not_be_computed_is_zero(sample_flight):
