@@ -112,7 +112,7 @@ def test_within_a_leg_a_state_follows_from_its_beginning(model: Model, attitude:
     kept = np.random.default_rng(4).normal(0.0, 0.05, part.run.state.shape)
     part = replace(part, run=replace(part.run, state=kept))
     state, _ = delayed_states(part, 0)
-    stretch, ends = part.stretch, part.legs[0].end
+    stretch, ends = part.stretch, part.events[0].end
     if not attitude:
         stretch = replace(stretch, correction_rad=np.zeros_like(stretch.correction_rad))
     np.testing.assert_array_equal(state[ends], kept[1:, 0])

@@ -15,7 +15,7 @@ errors of gyro bias b_g and accelerometer bias b_a. Equations as in PX4-Autopilo
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,7 +50,7 @@ TURN, INPUT = 9, 10
 
 
 @dataclass(frozen=True)
-class _Events:
+class Events:
     """The events of one stretch, E of them.
 
     Attributes
@@ -82,7 +82,7 @@ class _Events:
 
 
 @dataclass(frozen=True)
-class Legs(_Events):
+class Legs(Events):
     """Legs of one stretch, each ending in an event.
 
     Attributes
@@ -103,6 +103,11 @@ class Legs(_Events):
     steps: Array
 
     __repr__ = brief
+
+    @property
+    def events(self) -> Events:
+        """Without the legs, which are large."""
+        return Events(*(getattr(self, each.name) for each in fields(Events)))
 
 
 @dataclass(frozen=True)
@@ -150,7 +155,7 @@ def make_legs(inputs: Inputs, stretch: Stretch, timing: Timing) -> Legs:
     )
 
 
-def _events(inputs: Inputs, stretch: Stretch, timing: Timing) -> _Events:
+def _events(inputs: Inputs, stretch: Stretch, timing: Timing) -> Events:
     vision = inputs.vision
     first = int(np.searchsorted(vision.stamp_s, stretch.time_s[0]))
     beyond = int(np.searchsorted(vision.stamp_s, stretch.time_s[-1]))
@@ -191,7 +196,7 @@ def _events(inputs: Inputs, stretch: Stretch, timing: Timing) -> _Events:
         spread[place] = part
     time = stretch.time_s[ends].copy()
     time[place] = taken
-    return _Events(ends, samples, actions, usables, startables, lates, losts, time)
+    return Events(ends, samples, actions, usables, startables, lates, losts, time)
 
 
 def _actions(

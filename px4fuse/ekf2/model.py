@@ -25,6 +25,7 @@ from px4fuse.ekf2.legs import (
     POSITION,
     THETA,
     VELOCITY,
+    Events,
     Legs,
     Timing,
     make_legs,
@@ -199,10 +200,10 @@ def _delayed(part: StretchRun, state: Array) -> pd.DataFrame:
 
 @dataclass(frozen=True)
 class StretchRun:
-    """One stretch with its legs by delay, and what the variants did in it."""
+    """One stretch with its events by delay, and what the variants did in it."""
 
     stretch: Stretch
-    legs: tuple[Legs, ...]
+    events: tuple[Events, ...]
     which: NDArray[np.intp]
     run: Run
     variants: tuple[Variant, ...]
@@ -222,7 +223,8 @@ def run_variants(
             for timing in distinct
         )
         done = run(inputs, stretch, legs, which, variants)
-        runs.append(StretchRun(stretch, legs, which, done, tuple(variants)))
+        events = tuple(each.events for each in legs)
+        runs.append(StretchRun(stretch, events, which, done, tuple(variants)))
     return runs
 
 
@@ -245,13 +247,13 @@ def _assemble(
             (float(part.stretch.time_s[0]), float(part.stretch.time_s[-1])) for part in runs
         ),
         source=inputs.vision.source,
-        late=sum(int(part.legs[part.which[at]].late.sum()) for part in runs),
-        lost=sum(int(part.legs[part.which[at]].lost.sum()) for part in runs),
+        late=sum(int(part.events[part.which[at]].late.sum()) for part in runs),
+        lost=sum(int(part.events[part.which[at]].lost.sum()) for part in runs),
     )
 
 
 def _updates(part: StretchRun, at: int) -> pd.DataFrame:
-    legs, done = part.legs[part.which[at]], part.run
+    events, done = part.events[part.which[at]], part.run
     seen = np.flatnonzero(np.isfinite(done.innovation_m[:, at, 0]))
     after = done.variance[seen + 1, at]
     values = np.column_stack(
@@ -264,10 +266,10 @@ def _updates(part: StretchRun, at: int) -> pd.DataFrame:
             after[:, HORIZONTAL_POSITION],
             after[:, HORIZONTAL_VELOCITY],
             done.noise_m2[seen, at],
-            part.stretch.time_s[legs.end[seen]],
+            part.stretch.time_s[events.end[seen]],
         ]
     )
-    index = pd.Index(legs.time_s[seen], name="time_s")
+    index = pd.Index(events.time_s[seen], name="time_s")
     return pd.DataFrame(values, index=index, columns=UPDATE_COLUMNS)
 
 
@@ -310,10 +312,10 @@ def delayed_states(part: StretchRun, at: int) -> tuple[Array, Array]:
     state : ndarray, shape (n + 1, 15)
     reset_m : ndarray, shape (n + 1, 3)
     """
-    legs, variant = part.legs[part.which[at]], part.variants[at]
+    events, variant = part.events[part.which[at]], part.variants[at]
     stretch, kept = part.stretch, part.run.state[:, at]
     count, rotation, dt = len(stretch.step_s), stretch.rotation[1:], stretch.step_s[:, None]
-    leg = np.searchsorted(legs.end, np.arange(count), side="right")
+    leg = np.searchsorted(events.end, np.arange(count), side="right")
     first = np.searchsorted(leg, leg)
     state = kept[np.concatenate([[0], leg])]
 
@@ -338,9 +340,9 @@ def delayed_states(part: StretchRun, at: int) -> tuple[Array, Array]:
     state[1:, VELOCITY] += grown(gained * dt)
     speed = state[1:, VELOCITY]
     state[1:, POSITION] += grown(0.5 * dt * (before(speed, VELOCITY) + speed))
-    state[legs.end] = kept[1:]
+    state[events.end] = kept[1:]
     reset = np.zeros((count + 1, 3))
     for e in np.flatnonzero(part.run.reset[:, at]):
         # measured position minus the state before: the innovation itself
-        reset[legs.end[e] :, :2] += part.run.innovation_m[e, at]
+        reset[events.end[e] :, :2] += part.run.innovation_m[e, at]
     return state, reset

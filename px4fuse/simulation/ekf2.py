@@ -263,11 +263,11 @@ def _held(done: StretchRun, state: Array) -> tuple[list[tuple[int, Array]], Bool
 
     EKF2 then fuses a position of its own making. The model has none: ``state`` is held in place.
     """
-    legs, run, time = done.legs[0], done.run, done.stretch.time_s
+    events, run, time = done.events[0], done.run, done.stretch.time_s
     horizontal = slice(NORTH, EAST + 1)
     used = np.flatnonzero(run.fused[:, 0] | run.reset[:, 0])
     last = np.zeros(len(time))
-    last[legs.end[used]] = time[legs.end[used]]
+    last[events.end[used]] = time[events.end[used]]
     aided = time - np.maximum.accumulate(last) <= NO_AIDING_S
     first = np.flatnonzero(np.diff(aided.astype(int)) == -1) + 1
     beyond = np.flatnonzero(np.diff(aided.astype(int)) == 1) + 1
@@ -276,7 +276,7 @@ def _held(done: StretchRun, state: Array) -> tuple[list[tuple[int, Array]], Bool
         state[start:end, VELOCITY.start : VELOCITY.start + 2] = 0.0
     resets = []
     for event in np.flatnonzero(run.reset[:, 0]):
-        step = int(legs.end[event])
+        step = int(events.end[event])
         jump = run.innovation_m[event, 0]
         if not aided[step - 1]:
             jump = state[step, horizontal] - state[step - 1, horizontal]

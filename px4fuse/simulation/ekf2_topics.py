@@ -105,7 +105,7 @@ def _local_position(track: Track) -> Topic:
 
 def _states(done: StretchRun, track: Track) -> Topic:
     """estimator_states of v1.16: 25 states with 24 covariances, positions as 0."""
-    end = done.legs[0].end
+    end = done.events[0].end
     events = np.flatnonzero(np.diff(end, prepend=0) > 0)
     events = events[end[events] < len(track.time_us) - track.lag]
     events = events[sensors.thinned(sensors.seconds(track.time_us[end[events]]), STATES_HZ)]
@@ -129,14 +129,14 @@ def _states(done: StretchRun, track: Track) -> Topic:
 
 def _aid_source(inputs: Inputs, done: StretchRun, track: Track, rate_hz: float) -> Topic:
     """estimator_aid_src_ev_pos: a message for every sample that came in time."""
-    legs, run = done.legs[0], done.run
-    seen = np.flatnonzero(legs.usable & (legs.end < len(track.time_us) - track.lag))
-    seen = seen[sensors.thinned(sensors.seconds(track.time_us[legs.end[seen]]), rate_hz)]
-    rows = legs.end[seen]
+    events, run = done.events[0], done.run
+    seen = np.flatnonzero(events.usable & (events.end < len(track.time_us) - track.lag))
+    seen = seen[sensors.thinned(sensors.seconds(track.time_us[events.end[seen]]), rate_hz)]
+    rows = events.end[seen]
     horizontal = slice(NORTH, EAST + 1)
     innovation, variance = run.innovation_m[seen, 0], run.variance_m2[seen, 0]
     noise = run.noise_m2[seen, 0]
-    measured = inputs.vision.position_m[legs.sample[seen], :2]
+    measured = inputs.vision.position_m[events.sample[seen], :2]
     idle = np.isnan(innovation[:, 0])
     # while it is not fused, against the state that there is
     innovation = np.where(
@@ -146,7 +146,7 @@ def _aid_source(inputs: Inputs, done: StretchRun, track: Track, rate_hz: float) 
     gate = max(inputs.settings["EKF2_EVP_GATE"], 1.0)
     used = np.where(run.fused[seen, 0] | run.reset[seen, 0], track.time_us[rows], -1)
     last = np.maximum.accumulate(used)
-    taken_us = np.rint(legs.time_s[seen] * 1e6).astype(np.int64)
+    taken_us = np.rint(events.time_s[seen] * 1e6).astype(np.int64)
     later_us = track.time_us[rows] + _horizon_us(track, rows) - taken_us
     return Topic(
         "estimator_aid_src_ev_pos",
@@ -166,11 +166,11 @@ def _aid_source(inputs: Inputs, done: StretchRun, track: Track, rate_hz: float) 
 
 def _flags(inputs: Inputs, done: StretchRun, track: Track) -> Topic:
     """estimator_status_flags: once a second, and when fusion of vision starts or stops."""
-    legs, run, time = done.legs[0], done.run, done.stretch.time_s
+    events, run, time = done.events[0], done.run, done.stretch.time_s
     tried = np.flatnonzero(run.fused[:, 0] | run.rejected[:, 0] | run.reset[:, 0])
     on = np.zeros(len(time), np.bool_)
-    stops = np.append(time[legs.end[tried]], np.inf)[1:]
-    for step, stop in zip(legs.end[tried].tolist(), stops.tolist(), strict=True):
+    stops = np.append(time[events.end[tried]], np.inf)[1:]
+    for step, stop in zip(events.end[tried].tolist(), stops.tolist(), strict=True):
         until = time[step] + inputs.rules.stop_s
         on[step : int(np.searchsorted(time, min(stop, until)))] = True
     changed = np.diff(on.astype(int), prepend=0) != 0
