@@ -17,14 +17,15 @@ from unittest import mock
 import bad_jobs
 
 from px4fuse.fleet import job
-from px4fuse.simulation.flights import simulate, to_ulog
-from px4fuse.simulation.scenario import Scenario
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 
 
 def tiny_log(seed: int, **options: object) -> bytes:
     """A simulated flight of a quarter of a minute, compared within a second."""
+    from px4fuse.simulation.flights import simulate, to_ulog  # workers import this file
+    from px4fuse.simulation.scenario import Scenario
+
     return to_ulog(simulate(Scenario(seed=seed, passes=1, length_m=6.0, ekf2=False, **options)))
 
 

@@ -14,8 +14,8 @@ import gc
 import io
 import os
 import signal
-from collections.abc import Callable
-from functools import lru_cache
+from collections.abc import Callable, Iterator
+from hashlib import sha256
 from pathlib import Path
 
 import pytest
@@ -24,8 +24,11 @@ from hypothesis import HealthCheck, settings
 from msgspec.structs import replace
 from pypdf import PdfWriter
 
+import px4fuse
 from px4fuse import analysis
+from px4fuse.fleet import sides
 from px4fuse.flight import Flight
+from px4fuse.notebook import commands
 from px4fuse.readers import read_log
 from px4fuse.report import pdf
 from px4fuse.request import ComparisonRequest
@@ -136,21 +139,46 @@ def drawn_once(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 # Of the unchanged program: it is there before any test patches it
-_analysed = lru_cache(maxsize=2)(analysis.run)
+_run = px4fuse.run
+_analyses: dict[tuple[str | bytes, ...], analysis.Analysis] = {}
+MOST_ANALYSES = 10
+
+
+def _remembered(
+    request: ComparisonRequest,
+    progress: Callable[[str], None] = lambda _: None,
+    flight: Flight | None = None,
+) -> analysis.Analysis:
+    position = request.position
+    paths = [request.log, request.mavlink, None if position is None else position.path]
+    files = [Path(path) for path in paths if path is not None]
+    if flight is not None or any(not file.is_file() for file in files):
+        return _run(request, progress, flight)
+    # where they lie is not part of an analysis: verification reads them by links
+    named = replace(
+        request,
+        log=Path(request.log).name,
+        mavlink=request.mavlink and Path(request.mavlink).name,
+        position=position and replace(position, path=Path(position.path).name),
+    )
+    known = (repr(named), *(sha256(file.read_bytes()).digest() for file in files))
+    if known not in _analyses:
+        _analyses[known] = _run(request, progress)
+        if len(_analyses) > MOST_ANALYSES:
+            del _analyses[next(iter(_analyses))]
+    return _analyses[known]
+
+
+@pytest.fixture(scope="module")
+def analysed_once() -> Iterator[None]:
+    """The same request on the same files is analysed once; for tests that patch nothing of it."""
+    with pytest.MonkeyPatch.context() as patch:
+        for place in (analysis, commands, sides):
+            patch.setattr(place, "run", _remembered)
+        yield
 
 
 @pytest.fixture
-def analysed_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """An analysis of a sample log that was made before serves again; for tests of what follows."""
-
-    def run(
-        request: ComparisonRequest, progress: Callable[[str], None] = lambda _: None
-    ) -> analysis.Analysis:
-        del progress
-        log = Path(request.log).resolve()  # verification reads it by a link
-        assert log.is_relative_to(REPOSITORY), "another log may change"
-        assert log.name == Path(request.log).name
-        assert request.mavlink is request.position is None
-        return _analysed(replace(request, log=str(log)))
-
-    monkeypatch.setattr(analysis, "run", run)
+def analysed_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    """For tests of the analysis among others of what follows it."""
+    monkeypatch.setattr(analysis, "run", _run)

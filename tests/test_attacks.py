@@ -34,6 +34,8 @@ from px4fuse.simulation.scenario import Scenario
 from px4fuse.verification.intake import read_report
 from px4fuse.verification.model import Refused, Report, Verdict
 
+pytestmark = pytest.mark.usefixtures("analysed_once")
+
 MISTAKES = ("nlos=3%", "dropout=5s,30s")
 HONEST = """
 I compared my filter with EKF2 on four passes of the aisle. The innovations leave their band

@@ -14,6 +14,8 @@ from click.testing import CliRunner, Result
 from px4fuse.cli import cli, main
 from px4fuse.results.contract import schema
 
+pytestmark = pytest.mark.usefixtures("analysed_once")
+
 
 def run(*arguments: str | Path) -> Result:
     return CliRunner().invoke(cli, [str(argument) for argument in arguments])
@@ -87,6 +89,7 @@ def test_command_line_in_the_report_names_no_folder_and_no_person(made):
     assert results["settings"]["sigma_z_m"] == 0.12
 
 
+@pytest.mark.usefixtures("analysed_anew")
 def test_same_input_gives_the_same_bytes_and_fail_on_another_exit_code(tmp_path, sample_log):
     for name, severity, code in (("a", "info", 1), ("b", "error", 0)):
         command = ["compare", sample_log, "--axis", "north", "-o", tmp_path / f"{name}.pdf"]

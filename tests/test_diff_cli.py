@@ -20,6 +20,8 @@ from px4fuse.errors import Px4FuseError
 from px4fuse.report import pdf
 from px4fuse.results.contract import schema
 
+pytestmark = pytest.mark.usefixtures("analysed_once")
+
 SAMPLE = REPOSITORY / "sample_logs" / "aisle_uwb.ulg"
 REPORTS = REPOSITORY / "reports"
 

@@ -34,6 +34,8 @@ from px4fuse.findings import find
 from px4fuse.flight import Flight, Unavailable
 from px4fuse.request import ComparisonRequest
 
+pytestmark = pytest.mark.usefixtures("analysed_once")
+
 MARKUP = '<img src=x onerror="window.alive=1"></script><script>window.alive=2</script>\u202e'
 NOTHING = Unavailable("it", "not asked for", "")
 TABLE = """Object.fromEntries([...document.querySelectorAll('#tables tbody tr')].map((row) =>

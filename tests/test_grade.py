@@ -25,6 +25,8 @@ from px4fuse.grading.rubric import read_rubric, rubric_text
 from px4fuse.reading import files_by_sha256
 from px4fuse.verification.model import Verdict
 
+pytestmark = pytest.mark.usefixtures("analysed_once")
+
 REPORT = REPOSITORY / "reports" / "aisle_uwb.pdf"
 LOG = REPOSITORY / "sample_logs" / "aisle_uwb.ulg"
 UNKNOWN = Verdict("cannot verify", (), with_log=False)
@@ -84,7 +86,7 @@ def test_everything_that_was_handed_in_stands_in_the_table(handed_in, tmp_path) 
         assert found["score"] >= 0.0
 
 
-@pytest.mark.usefixtures("at_once", "analysed_once", "drawn_once")
+@pytest.mark.usefixtures("at_once", "drawn_once")
 def test_a_report_with_its_log_is_verified_and_a_changed_one_is_not(tmp_path) -> None:
     folder = tmp_path / "in"
     folder.mkdir()
@@ -159,7 +161,7 @@ def test_another_rubric_scores_anew_and_verifies_nothing(handed_in, tmp_path) ->
     assert max(one.points for one in after.graded) > 0.0
 
 
-@pytest.mark.usefixtures("at_once", "analysed_once")
+@pytest.mark.usefixtures("at_once")
 def test_another_log_at_hand_verifies_again(tmp_path) -> None:
     (tmp_path / "in").mkdir()
     shutil.copy(REPORT, tmp_path / "in" / "a.pdf")

@@ -28,6 +28,8 @@ from px4fuse.results.contract import ComparisonResults
 from px4fuse.results.model import Student
 from px4fuse.results.reading import read_results
 
+pytestmark = pytest.mark.usefixtures("analysed_once")
+
 # A terminal's width and a half; results that hold several others have a line for each
 LINE = 200
 

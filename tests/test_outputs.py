@@ -18,6 +18,8 @@ from px4fuse.errors import MissingDataError
 from px4fuse.report import fonts
 from px4fuse.request import ComparisonRequest
 
+pytestmark = pytest.mark.usefixtures("analysed_once")
+
 SECONDS = 20.0
 
 

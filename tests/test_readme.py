@@ -7,12 +7,15 @@ from pathlib import Path
 
 import matplotlib as mpl
 import pytest
-from batch_tools import tiny_log
+from batch_tools import tiny_logs
+from class_tools import in_this_process
 from click.testing import CliRunner
 from matplotlib import pyplot
 
 from px4fuse.cli import COMMANDS, cli
 from px4fuse.fleet.engine import connected
+
+pytestmark = pytest.mark.usefixtures("analysed_once")
 
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -48,7 +51,7 @@ def at_root(tmp_path, monkeypatch):
 @pytest.fixture(scope="module")
 def workers():
     """Of the session, so that a batch begins none of its own, as another test's does."""
-    with connected(workers=2, memory="2GB"):
+    with connected(workers=1, memory="2GB"):
         yield
 
 
@@ -58,14 +61,14 @@ def test_command_runs(at_root, line, request):
         request.getfixturevalue("no_drawing")
     if line.startswith("px4fuse batch"):  # the sample logs themselves are in the other lines
         request.getfixturevalue("workers")
-        for number, log in enumerate(sorted(Path("sample_logs").glob("*.ulg"))):
-            log.write_bytes(tiny_log(number))
-        Path("sample_logs/aisle_uwb.tlog").unlink()
+        shutil.rmtree("sample_logs")
+        tiny_logs(Path("sample_logs"), 1)
     result = CliRunner().invoke(cli, shlex.split(line, comments=True)[1:])
     assert result.exit_code == 0, result.output
 
 
-def test_the_instructors_four_commands_run_in_order(at_root):
+def test_the_instructors_four_commands_run_in_order(at_root, monkeypatch):
+    in_this_process(monkeypatch)
     Path("roster.csv").write_text("id,name\n1001,Ada Lovelace\n1002,Grace Hopper\n")
     Path("notes.md").write_text("# What I found\n\nThe stamps are late.\n")
     assert len(JOURNEY) == 4

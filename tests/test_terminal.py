@@ -46,6 +46,8 @@ from px4fuse.simulation import flights
 from px4fuse.simulation.mistakes import parse
 from px4fuse.simulation.scenario import Scenario
 
+pytestmark = pytest.mark.usefixtures("analysed_once")
+
 WIDTH = 80
 
 

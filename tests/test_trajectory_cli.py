@@ -24,6 +24,8 @@ from px4fuse.cli import cli
 from px4fuse.loop.corrections import BY_DISTANCE, PLAIN
 from px4fuse.results.contract import schema
 
+pytestmark = pytest.mark.usefixtures("analysed_once")
+
 LOG = REPOSITORY / "sample_logs" / "loop_vio.ulg"
 SLAM = REPOSITORY / "sample_logs" / "loop_slam.tum"
 TRUTH = "loop_vio.ulg:truth"

@@ -34,7 +34,7 @@ from px4fuse.reading import files_by_sha256
 from px4fuse.report.seal import seal_of
 from px4fuse.results.contract import ComparisonResults, LoopResults, Reported, to_json, to_plain
 from px4fuse.results.reading import read_results
-from px4fuse.verification import pages, rerun
+from px4fuse.verification import pages, rerun, verification
 from px4fuse.verification.intake import read_report
 from px4fuse.verification.model import Refused, Report, Verdict
 from px4fuse.verification.rerun import Recomputed
@@ -47,6 +47,8 @@ from px4fuse.verification.verification import (
     compare_results,
     verify,
 )
+
+pytestmark = pytest.mark.usefixtures("analysed_once")
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 LOG = REPOSITORY / "sample_logs" / "aisle_uwb.ulg"
@@ -434,8 +436,9 @@ STRUCTURE |= {f"request: {name}": one for name, one in REQUESTS.items()}
 
 
 @pytest.mark.parametrize("name", STRUCTURE)
-def test_changed_results(aisle: Base, name: str) -> None:
+def test_changed_results(aisle: Base, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     change, expected = STRUCTURE[name]
+    monkeypatch.setattr(verification, "compare_pages", lambda *_: ())  # they are as drawn
     results = copy.deepcopy(aisle.results)
     change(results)
     verdict = aisle.verified(aisle.with_results(results).sealed())
@@ -523,12 +526,12 @@ UNSEEN = {"a comment", "an inline image", "the end cut off", "a point of a line 
           "another point of a line moved", "a colour"}  # fmt: skip
 
 
-# Every page in two ways, and each of the others on two pages
+# Every page in two ways, and each of the others on one page
 DRAWN = [
     (page, name)
     for place, name in enumerate(DRAWING)
     for page in range(1, PAGES + 1)
-    if name in ("another digit", "a white rectangle") or (page + place) % 4 == 0
+    if name in ("another digit", "a white rectangle") or (page + place) % PAGES == 0
 ]
 
 
