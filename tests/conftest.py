@@ -44,6 +44,7 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 # No limit on time: a slow machine must not fail
 settings.register_profile(
     "steady",
+    max_examples=50,  # they are the same each time
     deadline=None,
     suppress_health_check=[HealthCheck.too_slow],
     derandomize=True,
