@@ -57,7 +57,7 @@ settings.load_profile("steady")
 
 
 # Objects made since garbage was last looked for; a report that is drawn makes a hundred thousand
-MANY_OBJECTS = 200_000
+MANY_OBJECTS = 500_000
 
 
 def pytest_configure() -> None:

@@ -38,7 +38,7 @@ from px4fuse.flight import Flight, Unavailable
 from px4fuse.readers import ULOG_MAGIC, read_log
 
 # no shrinking: a hang would be waited for again and again
-damaged = settings(phases=[Phase.explicit, Phase.generate], max_examples=80)
+damaged = settings(phases=[Phase.explicit, Phase.generate], max_examples=50)
 
 
 def outcome(path: Path) -> Flight | Px4FuseError:

@@ -10,6 +10,7 @@ from xml.etree import ElementTree as ET
 import numpy as np
 import pandas as pd
 import pytest
+from batch_tools import tiny_logs
 from click.testing import CliRunner
 
 from px4fuse.cli import cli
@@ -243,9 +244,10 @@ def worker() -> Iterator[None]:
 
 
 @pytest.mark.usefixtures("worker")
-def test_the_command_marks_writes_and_fails(sample_log, tmp_path, monkeypatch):
+def test_the_command_marks_writes_and_fails(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    common = ["batch", str(sample_log), "--axis", "north"]
+    tiny_logs(tmp_path / "logs", 1)
+    common = ["batch", "logs", "--axis", "north"]
     first = CliRunner().invoke(cli, [*common, "-o", "before"])
     assert first.exit_code == 0, first.output
     options = ["--baseline", "before/fleet.parquet", "--junit", "j.xml", "--fail-on", "worse"]

@@ -161,7 +161,7 @@ def test_another_rubric_scores_anew_and_verifies_nothing(handed_in, tmp_path) ->
     assert max(one.points for one in after.graded) > 0.0
 
 
-@pytest.mark.usefixtures("at_once")
+@pytest.mark.usefixtures("at_once", "drawn_once")
 def test_another_log_at_hand_verifies_again(tmp_path) -> None:
     (tmp_path / "in").mkdir()
     shutil.copy(REPORT, tmp_path / "in" / "a.pdf")

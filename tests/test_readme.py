@@ -67,6 +67,7 @@ def test_command_runs(at_root, line, request):
     assert result.exit_code == 0, result.output
 
 
+@pytest.mark.usefixtures("drawn_once")
 def test_the_instructors_four_commands_run_in_order(at_root, monkeypatch):
     in_this_process(monkeypatch)
     Path("roster.csv").write_text("id,name\n1001,Ada Lovelace\n1002,Grace Hopper\n")

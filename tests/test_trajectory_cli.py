@@ -267,6 +267,7 @@ def test_evaluate_writes_page_picture_and_results(desk, tmp_path, monkeypatch) -
     assert contents(tmp_path) == before
 
 
+@pytest.mark.usefixtures("no_drawing")
 def test_evaluate_with_other_settings_or_files_writes_over_no_page(
     desk, tmp_path, monkeypatch
 ) -> None:
@@ -285,6 +286,7 @@ def test_evaluate_with_other_settings_or_files_writes_over_no_page(
         assert written == set(names[:count])
 
 
+@pytest.mark.usefixtures("no_drawing")
 @pytest.mark.parametrize(
     ("options", "written"),
     [

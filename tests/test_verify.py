@@ -857,6 +857,7 @@ def test_the_name_of_the_log_does_not_matter(aisle: Base, tmp_path: Path) -> Non
     assert verify(report_of(aisle.pdf), [wrong]).status == "other log"
 
 
+@pytest.mark.usefixtures("drawn_once")
 def test_a_joined_recording_is_found_by_its_content(tmp_path: Path) -> None:
     """And what it is called here does not show."""
     source = REPOSITORY / "sample_logs"
