@@ -126,15 +126,22 @@ def no_drawing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pdf, "render", page_of)
 
 
+# The last ones of a process are kept
+MOST_ANALYSES = 10
+_drawn: dict[str, bytes] = {}
+
+
 @pytest.fixture
 def drawn_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """The same results are drawn once; for tests of what follows."""
-    render, drawn = pdf.render, dict[str, bytes]()
+    render = pdf.render
 
     def from_memory(document: pdf.Report, text: str) -> bytes:
-        if text not in drawn:
-            drawn[text] = render(document, text)
-        return drawn[text]
+        if text not in _drawn:
+            _drawn[text] = render(document, text)
+            if len(_drawn) > MOST_ANALYSES:
+                del _drawn[next(iter(_drawn))]
+        return _drawn[text]
 
     monkeypatch.setattr(pdf, "render", from_memory)
 
@@ -142,7 +149,6 @@ def drawn_once(monkeypatch: pytest.MonkeyPatch) -> None:
 # Of the unchanged program: it is there before any test patches it
 _run = px4fuse.run
 _analyses: dict[tuple[str | bytes, ...], analysis.Analysis] = {}
-MOST_ANALYSES = 10
 
 
 def _remembered(

@@ -14,7 +14,10 @@ from test_bad_logs import patience
 from test_cli import run_main
 
 from px4fuse.errors import LogError, Px4FuseError
+from px4fuse.grading import workers
 from px4fuse.reading import max_log_bytes, read_text, read_whole, shown
+from px4fuse.verification.model import Verdict
+from px4fuse.verification.rerun import log_sha256
 
 SAMPLES = REPOSITORY / "sample_logs"
 posix = pytest.mark.skipif(os.name == "nt", reason="devices, pipes and sockets are those of POSIX")
@@ -120,11 +123,20 @@ def test_a_graph_of_ten_gigabytes_is_refused_at_once(desk, monkeypatch, capsys) 
 def test_special_and_huge_files_in_a_folder_of_logs_are_passed_over(
     desk, monkeypatch, capsys
 ) -> None:
+    found = []
+
+    def believed(work, reports, **_):
+        (report,) = reports
+        found.append(work.keywords["logs"][log_sha256(report.results)])
+        yield 0, Verdict("verified", (), with_log=True, page_status="same")
+
+    monkeypatch.setattr(workers, "run_bounded", believed)
     monkeypatch.chdir(desk)
     with patience():
         code, out, err = run_main(monkeypatch, capsys, "verify", "r.pdf", ".")
     assert (code, err) == (0, "")
-    assert "r.pdf: verified" in out  # by the log beside them
+    assert "r.pdf: verified" in out
+    assert found == [Path("l.ulg")]  # the log beside them
 
 
 # --- the limit, and its option ---

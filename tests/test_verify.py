@@ -435,6 +435,7 @@ REQUESTS: dict[str, tuple[Change, str]] = {
 STRUCTURE |= {f"request: {name}": one for name, one in REQUESTS.items()}
 
 
+@pytest.mark.usefixtures("no_drawing")
 @pytest.mark.parametrize("name", STRUCTURE)
 def test_changed_results(aisle: Base, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     change, expected = STRUCTURE[name]

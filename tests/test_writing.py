@@ -234,8 +234,7 @@ def test_who_is_stopped_after_writing_says_what_is_there(desk, monkeypatch, caps
 @full
 def test_results_that_cannot_be_printed_leave_no_files(desk) -> None:
     with Path("/dev/full").open("wb") as device:
-        process = start(desk, "compare", "l.ulg", "--axis", "north", "-o", "c.pdf", "--json", "-",
-                        stdout=device)  # fmt: skip
+        process = start(desk, *LOOP, "--json", "-", stdout=device)
         err = process.communicate()[1].decode()
     assert process.returncode == 2
     assert err.startswith("px4fuse: standard output: cannot be written (No space left on device)")

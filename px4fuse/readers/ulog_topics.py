@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from pyulog import ULog
 from pyulog.exceptions import ULogException
 
-from px4fuse.arrays import IntArray
+from px4fuse.arrays import Array, IntArray
 from px4fuse.errors import LogError
 from px4fuse.readers.px4_topics import IMU, PARAMETERS, Layout, topics
 from px4fuse.reading import read_log_bytes, shown
@@ -119,13 +119,10 @@ class Topics:
             self.dropped[layout.topic, instance] = len(time_us) - len(keep)
         with np.errstate(invalid="ignore"):  # damaged bytes can be signalling NaNs
             frame = pd.DataFrame(
-                {ours: table[px4][keep].astype(np.float64) for ours, px4 in columns.items()},
+                {ours: _usable(table[px4][keep]) for ours, px4 in columns.items()},
                 index=pd.Index((time_us[keep] - self.zero_us) * _MICROSECOND, name="time_s"),
             )
-        frame = frame.where(np.isfinite(frame))  # an infinite value is as unusable as NaN
-        if step:
-            return frame
-        return self.window(frame)
+        return frame if step else self.window(frame)
 
     def read(self, layouts: tuple[Layout, ...], *, step: bool = False) -> pd.DataFrame | None:
         """:meth:`frame` of the first layout that this log holds; None where it holds none."""
@@ -164,6 +161,13 @@ def measurement_time_us(table: dict[str, NDArray[Any]]) -> NDArray[np.int64]:
     if np.count_nonzero(plausible) * 2 < len(plausible):
         return published
     return np.where(plausible, sampled, published)
+
+
+def _usable(values: NDArray[Any]) -> Array:
+    """As float64; an infinite value is as unusable as NaN."""
+    usable: Array = values.astype(np.float64)
+    usable[np.isinf(usable)] = np.nan
+    return usable
 
 
 def states_and_covariances(table: Mapping[str, NDArray[Any]]) -> tuple[int, int]:
