@@ -429,7 +429,7 @@ def test_a_scheduler_and_two_workers_that_run_already(flights, undisturbed, tmp_
             table = pd.read_parquet(tmp_path / "out" / "fleet.parquet")
             assert_same(table, undisturbed)
             path = f"{tmp_path}{os.pathsep}{batch_tools.REPOSITORY}"
-            with worker("third", "--no-nanny", PYTHONPATH=path):
+            with worker("third", PYTHONPATH=path):
                 result = command(*arguments)
                 assert "has px4fuse 9.9, and this is" in str(result.exception)
 

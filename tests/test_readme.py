@@ -49,10 +49,9 @@ def workers():
         yield
 
 
+@pytest.mark.usefixtures("no_drawing")  # tests of their own draw each kind of report
 @pytest.mark.parametrize("line", LINES)
 def test_command_runs(at_root, line, request):
-    if line.startswith("px4fuse compare"):  # such reports are drawn in test_cli.py, test_results.py
-        request.getfixturevalue("no_drawing")
     if line.startswith("px4fuse batch"):  # the sample logs themselves are in the other lines
         request.getfixturevalue("workers")
         shutil.rmtree("sample_logs")
