@@ -116,9 +116,10 @@ def document_json(
             "plan": _plan(number),
             "step": _step(number),
         }
-        for name, plot in plots.items():
-            document.add_root(plot)
-            places[plot.id] = f"{name}-{number}"
+        places |= {plot.id: f"{name}-{number}" for name, plot in plots.items()}
+        with document.models.freeze():  # what belongs to the roots is looked for once
+            for plot in plots.values():
+                document.add_root(plot)
     return document.to_json(deferred=False), places
 
 
