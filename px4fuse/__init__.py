@@ -2,7 +2,7 @@
 
 >>> import px4fuse
 >>> analysis = px4fuse.compare("sample_logs/aisle_uwb.ulg", sigma_z_m=0.1)
->>> [axis.axis.name for axis in analysis.axes]
+>>> [axis.axis.name for axis in analysis.axes.values()]
 ['north', 'east', 'down', 'aisle']
 """
 
@@ -52,7 +52,7 @@ _HOMES = {
     "AxisTuning": "filter.tuning",
     "Changes": "fleet.changes",
     "ClockOffset": "filter.clock",
-    "Comparison": "comparison.comparison",
+    "Comparison": "comparison.model",
     "ComparisonRequest": "request",
     "Consistency": "filter.consistency",
     "Evaluation": "trajectory.evaluation",

@@ -7,8 +7,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from px4fuse.comparison.comparison import Comparison
 from px4fuse.comparison.drift import may_drift
+from px4fuse.comparison.model import Comparison
 from px4fuse.ekf2.model import Model
 from px4fuse.ekf2.parameters import PARAMETERS
 from px4fuse.filter.clock import ClockOffset

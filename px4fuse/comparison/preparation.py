@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
 
-from px4fuse.display import brief
+from px4fuse.comparison.model import Comparison
 from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.filter.kalman import Settings
-from px4fuse.filter.signals import MIN_MEASUREMENTS, Axis, Segment, make_axes
+from px4fuse.filter.signals import MIN_MEASUREMENTS, Segment, make_axes
 from px4fuse.flight import Flight, PositionTrack, Truth, Unavailable
 
 # The GPS rung is taken only when asked for.
@@ -33,36 +33,6 @@ NOT_ITS_OWN_TRUTH = Unavailable(
 )
 
 
-@dataclass(frozen=True)
-class Prepared:
-    """What a comparison begins with: everything but the filter's run.
-
-    Attributes
-    ----------
-    flight : Flight
-    source : PositionTrack
-    source_reason : str
-    segment : Segment
-    settings : Settings
-        As used: ``input`` is "zero" where the log has no acceleration.
-    lines : tuple of Axis
-    notes : tuple of str
-        Choices made on the way.
-    missing : tuple of Unavailable
-    """
-
-    flight: Flight
-    source: PositionTrack
-    source_reason: str
-    segment: Segment
-    settings: Settings
-    lines: tuple[Axis, ...]
-    notes: tuple[str, ...]
-    missing: tuple[Unavailable, ...]
-
-    __repr__ = brief
-
-
 def prepare(
     flight: Flight,
     settings: Settings | None = None,
@@ -73,7 +43,7 @@ def prepare(
     start_s: float | None = None,
     end_s: float | None = None,
     input_required: bool = False,
-) -> Prepared:
+) -> Comparison:
     """Choose the source, the segment and the axes, with the arguments of :func:`compare`.
 
     Parameters
@@ -103,7 +73,7 @@ def prepare(
         notes.append(f"no acceleration input ({acceleration.reason}): constant velocity was used")
         if acceleration not in missing:
             missing.append(acceleration)
-    return Prepared(flight, track, reason, segment, settings, lines, tuple(notes), tuple(missing))
+    return Comparison(flight, track, reason, segment, settings, lines, tuple(notes), tuple(missing))
 
 
 def choose_source(flight: Flight, name: str | None = None) -> tuple[PositionTrack, str]:

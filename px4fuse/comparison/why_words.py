@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from px4fuse.comparison.asked import noise_used_m
-from px4fuse.comparison.comparison import Comparison
+from px4fuse.comparison.model import Comparison
 from px4fuse.ekf2.model import Model
 from px4fuse.ekf2.walk import (
     ATTITUDE,
@@ -26,6 +26,7 @@ from px4fuse.ekf2.walk import (
 from px4fuse.filter.clock import ClockOffset
 from px4fuse.filter.signals import AISLE
 from px4fuse.flight import Unavailable
+from px4fuse.record import NotNegative, Record
 
 # A noise this many times below what the data ask for is too small: as of EKF2's findings
 TOO_SMALL = 1.25
@@ -42,8 +43,7 @@ NOTABLE = 0.05
 FAR_M, FAR_TIMES = 0.5, 3.0
 
 
-@dataclass(frozen=True)
-class Outside:
+class Outside(Record, frozen=True):
     """Where the walk does not lead: parts of the segment in which EKF2 started or did not fuse.
 
     Attributes
@@ -54,7 +54,7 @@ class Outside:
         When.
     """
 
-    maximum_m: float
+    maximum_m: NotNegative
     at_s: float
 
 
@@ -122,7 +122,7 @@ def sentences(name: str, axis: AxisWalk, facts: Facts, outside: Outside | None) 
         parts.sort(key=lambda part: len(part.names) == 1)
     said = _clock(facts)
     said.append(_first(name, axis, parts[0], facts))
-    others = [p for p in parts[1:] if p.square_m2 >= NOTABLE * axis.position_total_m2]
+    others = [p for p in parts[1:] if p.square_m2 >= NOTABLE * axis.position_mean_square_m2]
     if others:
         share = _share(others[0], axis)
         said.append(f"Then {others[0].label} ({share}): {_because(others[0], facts)}.")
@@ -164,7 +164,7 @@ def the(axis: str) -> str:
 
 
 def _share(part: _Part, axis: AxisWalk) -> str:
-    return f"{part.square_m2 / axis.position_total_m2:.0%} of the mean square"
+    return f"{part.square_m2 / axis.position_mean_square_m2:.0%} of the mean square"
 
 
 def _first(name: str, axis: AxisWalk, part: _Part, facts: Facts) -> str:
@@ -272,21 +272,21 @@ BECAUSE: Mapping[str, Callable[[Facts], str]] = {
 
 
 def _velocity(axis: AxisWalk, parts: list[_Part]) -> str:
-    total = axis.velocity_total_m2_s2
+    total = axis.velocity_mean_square_m2_s2
     first = max(parts, key=lambda part: part.speed_square_m2_s2)
     share = first.speed_square_m2_s2 / total
     # more than all of it makes good what an earlier step did: no cause by itself
     mostly = f", in velocity mostly by {first.label} ({share:.0%})" if share <= 1.0 else ""
-    position = axis.position_total_m2
+    position = axis.position_mean_square_m2
     return (
         f"Where EKF2 was replayed they are {np.sqrt(position):.3f} m and {np.sqrt(total):.3f} m/s "
-        f"rms apart{mostly}; the model leaves {axis.position_left_m2 / position:.1%} of that in "
-        f"position and {axis.velocity_left_m2_s2 / total:.1%} in velocity unexplained."
+        f"rms apart{mostly}; the model leaves {axis.position_left_mean_square_m2 / position:.1%} of that in "
+        f"position and {axis.velocity_left_mean_square_m2_s2 / total:.1%} in velocity unexplained."
     )
 
 
 def _truth(axis: AxisWalk, facts: Facts) -> list[str]:
-    ours, ekf2 = axis.student_rmse_to_truth_m, axis.logged_rmse_to_truth_m
+    ours, ekf2 = (axis.position_rmse_to_truth_m[name] for name in ("kf", "ekf2"))
     if isinstance(ours, Unavailable) or isinstance(ekf2, Unavailable):
         return []
     if abs(ours - ekf2) <= EQUALLY_CLOSE * max(ours, ekf2):

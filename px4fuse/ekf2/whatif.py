@@ -27,6 +27,7 @@ from px4fuse.flight import (
     Truth,
     Unavailable,
 )
+from px4fuse.record import Count, NotNegative, Record, Share
 
 Array = NDArray[np.float64]
 
@@ -42,8 +43,7 @@ SWEEP_VALUES = 9
 MAX_SWEEP_VALUES = 200
 
 
-@dataclass(frozen=True)
-class AxisSummary:
+class AxisSummary(Record, frozen=True):
     """One axis of one EKF2.
 
     Attributes
@@ -59,22 +59,21 @@ class AxisSummary:
         Of what it publishes.
     """
 
-    nis_mean: float
-    nis_band: tuple[float, float]
-    innovation_std_m: float
-    sigma_p_median_m: float | Unavailable
-    position_rmse_to_truth_m: float | Unavailable
+    nis_mean: NotNegative
+    nis_band: tuple[NotNegative, NotNegative]
+    innovation_std_m: NotNegative
+    sigma_p_median_m: NotNegative | Unavailable
+    position_rmse_to_truth_m: NotNegative | Unavailable
 
 
-@dataclass(frozen=True)
-class Summary:
+class Summary(Record, frozen=True):
     """One EKF2: as logged, as replayed, or with other parameters.
 
     Attributes
     ----------
     changed : mapping
         Parameters that differ from those flown.
-    axes : mapping from "north" and "east" to AxisSummary
+    north, east : AxisSummary
     samples : int
     rejected_share : float
     longest_without_fusion_s : float or Unavailable
@@ -85,13 +84,19 @@ class Summary:
     """
 
     changed: Mapping[str, float]
-    axes: Mapping[str, AxisSummary]
-    samples: int
-    rejected_share: float
-    longest_without_fusion_s: float | Unavailable
-    resets: int
-    late: int = 0
-    lost: int = 0
+    north: AxisSummary
+    east: AxisSummary
+    samples: Count
+    rejected_share: Share
+    longest_without_fusion_s: NotNegative | Unavailable
+    resets: Count
+    late: Count = 0
+    lost: Count = 0
+
+    @property
+    def axes(self) -> dict[str, AxisSummary]:
+        """By axis."""
+        return {"north": self.north, "east": self.east}
 
     @property
     def nis_mean(self) -> float:
@@ -214,7 +219,7 @@ def _of_replay(
     fused = used["fused_at_s"][(used["fused"] > 0) | (used["reset"] > 0)]
     return Summary(
         changed=replay.changed,
-        axes={
+        **{
             axis: _axis(
                 used[f"innovation_{axis}_m"].to_numpy(),
                 used[f"innovation_variance_{axis}_m2"].to_numpy(),
@@ -256,7 +261,7 @@ def _of_log(flight: Flight, replay: Ekf2Replay, judged: tuple[tuple[float, float
         longest = _longest(np.concatenate([fused, at[settled(at, judged)]]), judged)
     return Summary(
         changed={},
-        axes={
+        **{
             axis: _axis(
                 used[f"innovation_{axis}_m"].to_numpy(),
                 used[f"innovation_variance_{axis}_m2"].to_numpy(),

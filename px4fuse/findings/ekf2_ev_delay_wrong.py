@@ -33,7 +33,7 @@ def delay_remedy(analysis: Analysis, delay_ms: float, flown_ms: float) -> str:
 
 
 def _detect(analysis: Analysis) -> Found:
-    comparison = analysis.comparison
+    comparison = analysis
     clock = analysis.clock
     delay = comparison.flight.log.parameters.get("EKF2_EV_DELAY")
     if not isinstance(clock, ClockOffset) or comparison.source.reconstructed:

@@ -67,7 +67,7 @@ def _detect(analysis: Analysis) -> Found:
     tuned = next((tuned for tuned in tunings if isinstance(tuned, AxisTuning)), None)
     if tuned is None:
         return
-    comparison = analysis.comparison
+    comparison = analysis
     settings = comparison.settings
     off = [
         each
@@ -143,7 +143,7 @@ def _message(off: Off, tuned: AxisTuning) -> str:
 
 def _remedy(analysis: Analysis, tuned: AxisTuning, off: list[Off]) -> str:
     """What to type, as far as a replay with it holds what the likelihood promises."""
-    comparison = analysis.comparison
+    comparison = analysis
     values = {each.label: float(f"{each.value:.3g}") for each in off}
     if "SIGMA_Z" in values and tuned.sigma_z.value is None:
         values["SIGMA_Z"] = max(values["SIGMA_Z"], SMALLEST_SIGMA_Z.value)

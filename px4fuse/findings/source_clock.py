@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.asked import delay_change
-from px4fuse.comparison.preparation import Prepared
+from px4fuse.comparison.model import Comparison
 from px4fuse.comparison.remedy import (
     COMMAND,
     WORSE_FILTER_ERROR,
@@ -27,7 +27,7 @@ CLOCK_OFFSET_ERROR = Threshold(0.10, "s", "at 1 m/s a good UWB's noise")
 
 def _for_ekf2(analysis: Analysis, clock: ClockOffset) -> str:
     """What putting EKF2's delay right would do, where a replay confirms it."""
-    model, comparison = analysis.ekf2_model, analysis.comparison
+    model, comparison = analysis.ekf2_model, analysis
     if isinstance(model, Unavailable) or comparison.source.name != model.inputs.vision.source:
         return ""
     late_ms = -1e3 * (comparison.settings.clock_offset_s + clock.offset_s)
@@ -42,7 +42,7 @@ def _for_ekf2(analysis: Analysis, clock: ClockOffset) -> str:
 
 
 def _detect(analysis: Analysis) -> Found:
-    comparison = analysis.comparison
+    comparison = analysis
     clock = analysis.clock
     # what was derived from EKF2's own output has EKF2's stamps, not the source's
     reconstructed = comparison.source.reconstructed
@@ -94,7 +94,7 @@ def _detect(analysis: Analysis) -> Found:
         )
 
 
-def typed_offset_s(comparison: Prepared, clock: ClockOffset) -> float:
+def typed_offset_s(comparison: Comparison, clock: ClockOffset) -> float:
     """What to type as ``--clock-offset``: what was applied, with what is missing (s).
 
     That of a position file was spent on placing it, and is not in the settings.

@@ -18,7 +18,7 @@ LOGGER_INTERVALS_S = {
 
 
 def _detect(analysis: Analysis) -> Found:
-    comparison = analysis.comparison
+    comparison = analysis
     source = comparison.source
     logged = any(track.rung == 2 for track in comparison.flight.positions)
     if source.rung not in (4, 5, 6) or logged:

@@ -21,7 +21,7 @@ from scipy.stats import binomtest, chi2
 
 from px4fuse.analysis import Analysis
 from px4fuse.arrays import Array
-from px4fuse.comparison.comparison import AxisComparison
+from px4fuse.comparison.model import AxisComparison
 from px4fuse.filter.kalman import state_at
 from px4fuse.filter.signals import AISLE
 from px4fuse.flight import Unavailable

@@ -90,7 +90,7 @@ def _parameters(found: ComparisonResults) -> Mapping[str, float]:
 def _modes(side: Side) -> str:
     """Flight modes in the order in which they were first flown."""
     assert side.analysis is not None
-    modes = happened(side.analysis.comparison).modes
+    modes = happened(side.analysis).modes
     return ", ".join(dict.fromkeys(mode.name for mode in modes)) or ABSENT
 
 

@@ -104,7 +104,7 @@ def join(flight: Flight, other: Flight) -> Flight:
         unused=(*flight.unused, *other.unused),
         inputs=(
             *flight.inputs,
-            InputFile(other.log.name, other.log.sha256, other.log.size_bytes, "mavlink"),
+            InputFile(other.log.name, other.log.sha256, other.log.bytes, "mavlink"),
         ),
     )
 

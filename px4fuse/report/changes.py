@@ -14,8 +14,8 @@ from matplotlib.ticker import MaxNLocator
 
 from px4fuse.analysis import Analysis
 from px4fuse.arrays import Array
-from px4fuse.comparison.comparison import AxisComparison
 from px4fuse.comparison.events import happened
+from px4fuse.comparison.model import AxisComparison
 from px4fuse.comparison.why_words import the
 from px4fuse.filter.kalman import state_at
 from px4fuse.filter.signals import AISLE
@@ -177,7 +177,7 @@ def _row(cursor: Cursor, cells: Sequence[str], *, is_head: bool) -> None:
 
 def _tracks(a: Analysis, b: Analysis, axis: str) -> tuple[tuple[Track, Track], str]:
     """Both on one axis, and what their times count from."""
-    took_off = [happened(analysis.comparison).take_off_s for analysis in (a, b)]
+    took_off = [happened(analysis).take_off_s for analysis in (a, b)]
     zeros = [times[0] for times in took_off if times]
     since = "take-off"
     if len(zeros) < len(took_off):
@@ -308,7 +308,7 @@ def _innovations(
 
 def _finish(cursor: Cursor, axes: Axes, tracks: Sequence[Track], since: str) -> None:
     """Common limits in time, whose numbers stand at the last panel alone."""
-    segments = [(track.analysis.comparison.segment, track.zero_s) for track in tracks]
+    segments = [(track.analysis.segment, track.zero_s) for track in tracks]
     axes.set_xlim(
         min(segment.start_s - zero for segment, zero in segments),
         max(segment.end_s - zero for segment, zero in segments),

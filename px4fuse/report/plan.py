@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
 from px4fuse.arrays import Array
-from px4fuse.comparison.comparison import Comparison
+from px4fuse.comparison.model import Comparison
 from px4fuse.filter.signals import AISLE, within
 from px4fuse.flight import Ekf2, Truth
 from px4fuse.report.document import Document

@@ -58,7 +58,7 @@ def draw(document: Document) -> Iterator[Figure]:
         (
             "The log",
             [
-                ("file", f"{log.name}, {log.size_bytes} bytes, {log.format}"),
+                ("file", f"{log.name}, {log.bytes} bytes, {log.format}"),
                 ("SHA-256", log.sha256),
                 *(
                     (f.role, f"{f.name}, {f.size_bytes} bytes, SHA-256 {f.sha256}")

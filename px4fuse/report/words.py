@@ -7,9 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from px4fuse.comparison.comparison import AgainstTruth, Comparison, Difference
 from px4fuse.comparison.drift import may_drift
-from px4fuse.comparison.preparation import Prepared
+from px4fuse.comparison.model import AgainstTruth, Comparison, Difference
 from px4fuse.filter.clock import CHANGE_P, ClockOffset
 from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.kalman import Settings
@@ -93,10 +92,10 @@ def verdict_notes(comparison: Comparison) -> list[str]:
     verdicts; innovations of the right size that are not white.
     """
     stated = [
-        (result.axis.name, owner, summary.consistency)
-        for result in comparison.axes
-        for owner, summary in (("ours", result.kf), ("EKF2", result.ekf2))
-        if not isinstance(summary, Unavailable) and isinstance(summary.consistency, Consistency)
+        (result.axis.name, owner, statement)
+        for result in comparison.axes.values()
+        for owner, statement in (("ours", result.filters["kf"]), ("EKF2", result.filters["ekf2"]))
+        if isinstance(statement, Consistency)
     ]
     notes = []
     if may_drift(comparison.flight, comparison.source):
@@ -205,7 +204,9 @@ def alignment_words(alignment: Alignment) -> list[tuple[str, str]]:
     return lines
 
 
-def tuning_advice(comparison: Prepared, tuned: Mapping[str, AxisTuning | Unavailable]) -> list[str]:
+def tuning_advice(
+    comparison: Comparison, tuned: Mapping[str, AxisTuning | Unavailable]
+) -> list[str]:
     """What follows from tuning: the command to run again, PX4's parameter, and cautions.
 
     Lines whose first nine columns are a label; ``px4fuse compare LOG`` as in
@@ -290,7 +291,7 @@ def noise_and_bias_words(found: AxisTuning) -> str:
     )
 
 
-def stamps_wrong(comparison: Prepared, clock: ClockOffset) -> bool:
+def stamps_wrong(comparison: Comparison, clock: ClockOffset) -> bool:
     """Whether the stamps of the source are late or early beyond doubt, as they were recorded."""
     applied = comparison.settings.clock_offset_s
     low, high = clock.interval_s
@@ -298,7 +299,7 @@ def stamps_wrong(comparison: Prepared, clock: ClockOffset) -> bool:
     return clock.determinable and not (low <= -applied <= high or negligible)
 
 
-def delay_wrong(comparison: Prepared, clock: ClockOffset) -> bool:
+def delay_wrong(comparison: Comparison, clock: ClockOffset) -> bool:
     """Whether PX4's EKF2_EV_DELAY is known, and not what the data ask for."""
     delay = comparison.flight.log.parameters.get("EKF2_EV_DELAY")
     if delay is None or not clock.determinable:
@@ -308,7 +309,7 @@ def delay_wrong(comparison: Prepared, clock: ClockOffset) -> bool:
     return not -(asked[1] + margin) <= delay * 1e-3 <= -(asked[0] - margin)
 
 
-def clock_advice(comparison: Prepared, clock: ClockOffset | Unavailable) -> list[str]:
+def clock_advice(comparison: Comparison, clock: ClockOffset | Unavailable) -> list[str]:
     """What the clock estimate says, and what follows from it: lines as of tuning_advice."""
     if isinstance(clock, Unavailable):
         return [f"Offset   not determinable: {clock.reason}. {clock.remedy}"]
