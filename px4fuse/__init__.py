@@ -2,7 +2,7 @@
 
 >>> import px4fuse
 >>> analysis = px4fuse.compare("sample_logs/aisle_uwb.ulg", sigma_z_m=0.1)
->>> [axis.axis.name for axis in analysis.axes]
+>>> [axis.axis.name for axis in analysis.axes.values()]
 ['north', 'east', 'down', 'aisle']
 """
 
@@ -13,7 +13,7 @@ if _typing.TYPE_CHECKING:
     from px4fuse.analysis import Analysis as Analysis
     from px4fuse.analysis import explain as explain
     from px4fuse.analysis import run as run
-    from px4fuse.comparison.comparison import Comparison as Comparison
+    from px4fuse.comparison.model import Comparison as Comparison
     from px4fuse.ekf2.model import Model as Model
     from px4fuse.ekf2.model import open_model as open_model
     from px4fuse.ekf2.model import replay_ekf2 as replay_ekf2
@@ -52,7 +52,7 @@ _HOMES = {
     "AxisTuning": "filter.tuning",
     "Changes": "fleet.changes",
     "ClockOffset": "filter.clock",
-    "Comparison": "comparison.comparison",
+    "Comparison": "comparison.model",
     "ComparisonRequest": "request",
     "Consistency": "filter.consistency",
     "Evaluation": "trajectory.evaluation",

@@ -16,7 +16,7 @@ import numpy as np
 
 from px4fuse.arrays import Array
 from px4fuse.comparison.asked import asked_of_ekf2
-from px4fuse.comparison.comparison import AxisComparison, Comparison, compare, compare_prepared
+from px4fuse.comparison.comparison import compare, compare_prepared
 from px4fuse.comparison.drift import may_drift
 from px4fuse.comparison.estimates import (
     Progress,
@@ -28,9 +28,10 @@ from px4fuse.comparison.estimates import (
     tuned_horizontally,
     turned_frame,
 )
-from px4fuse.comparison.preparation import Prepared, prepare
+from px4fuse.comparison.model import Comparison
+from px4fuse.comparison.preparation import prepare
 from px4fuse.comparison.why import Why, why_ekf2_differs
-from px4fuse.display import Shown, brief
+from px4fuse.display import brief
 from px4fuse.ekf2.model import Model, open_model
 from px4fuse.ekf2.parameters import check
 from px4fuse.ekf2.replay import Ekf2Replay
@@ -56,17 +57,17 @@ if TYPE_CHECKING:
 REPORTED = (HORIZONTAL, "down")
 
 
-@dataclass(frozen=True, repr=False)
-class Analysis(Shown):
+@dataclass(frozen=True, repr=False, kw_only=True)
+class Analysis(Comparison):
     """A comparison and what explains it.
 
     Attributes
     ----------
-    comparison : Comparison
+    flight, source, source_reason, segment, settings, lines, notes, missing, axes, horizontal
+        As :class:`~px4fuse.comparison.model.Comparison` has them.
     tuning : mapping from axis name, or "horizontal", to AxisTuning or Unavailable
         The noises that the data ask for.
     clock : ClockOffset or Unavailable
-        What must still be added to the source's stamps.
     ekf2_model : Model or Unavailable
         EKF2 made ready for replays; whether they can be believed is in its agreement.
     why : mapping from axis name to Why or Unavailable
@@ -77,32 +78,12 @@ class Analysis(Shown):
         How the source's frame is turned against the vehicle's heading.
     """
 
-    comparison: Comparison
     tuning: Tuning
     clock: ClockOffset | Unavailable
     ekf2_model: Model | Unavailable
     why: Mapping[str, Why | Unavailable]
     loop: Loop | Unavailable
     heading: HeadingError | Unavailable
-
-    @property
-    def flight(self) -> Flight:
-        """What was compared."""
-        return self.comparison.flight
-
-    @property
-    def settings(self) -> Settings:
-        """The filter's, as used."""
-        return self.comparison.settings
-
-    @property
-    def axes(self) -> tuple[AxisComparison, ...]:
-        """Everything about each axis."""
-        return self.comparison.axes
-
-    def __getitem__(self, axis: str) -> AxisComparison:
-        """Everything about one axis, by its name."""
-        return self.comparison[axis]
 
     @property
     def ekf2_replay(self) -> Ekf2Replay | Unavailable:
@@ -117,12 +98,11 @@ class Analysis(Shown):
         if isinstance(found, Unavailable):
             return found
         axes, outlier_time_s, used = found
-        comparison = self.comparison
         return explained(
-            comparison.flight,
+            self.flight,
             axes,
-            comparison.segment,
-            comparison.settings,
+            self.segment,
+            self.settings,
             outlier_time_s=outlier_time_s,
             **used,
         )
@@ -140,18 +120,19 @@ class Analysis(Shown):
         for jump in causes.jumps if isinstance(causes, Explained) else ():
             near = (time_s >= jump.time_s) & (time_s < jump.time_s + AFTER_STEP_S)
             left_out = np.union1d(left_out, time_s[near])
-        return smoothing(axes, self.comparison.settings, outlier_time_s=left_out, **used)
+        return smoothing(axes, self.settings, outlier_time_s=left_out, **used)
 
     def _horizontally(self) -> tuple[tuple[Axis, ...], Array, dict[str, float]] | Unavailable:
         """The horizontal axes, times of outliers, noises and a clock offset beyond doubt."""
-        axes = {result.axis.name: result.axis for result in self.comparison.axes}
-        settings = self.comparison.settings
+        axes = {name: result.axis for name, result in self.axes.items()}
+        settings = self.settings
         for name, group in ((HORIZONTAL, ("north", "east")), (AISLE, (AISLE,))):
             tuned = self.tuning.get(name)
             if isinstance(tuned, AxisTuning) and axes.keys() >= set(group):
                 clock, offset_s = self.clock, 0.0
                 if isinstance(clock, ClockOffset) and clock.determinable:
-                    offset_s = clock.offset_s if abs(clock.offset_s) > clock.chance_s else 0.0
+                    remaining_s = clock.remaining_s
+                    offset_s = remaining_s if abs(remaining_s) > clock.chance_s else 0.0
                 used = {
                     "sigma_a_m_s2": size(tuned.filter_sigma_a, settings.sigma_a_m_s2),
                     "sigma_z_m": size(tuned.sigma_z, settings.sigma_z_m),
@@ -244,7 +225,7 @@ def run_comparison(
 
 def run_preparation(
     request: ComparisonRequest, progress: Progress = silent, flight: Flight | None = None
-) -> Prepared:
+) -> Comparison:
     """Read a flight and choose what is compared, which is all that tuning and clock need.
 
     Arguments and errors are those of :func:`run`.
@@ -261,7 +242,7 @@ def run_preparation(
     _check_finite(start_s=request.start_s, end_s=request.end_s, clock_offset_s=asked)
     read = flight or read_flight(request, progress)
 
-    def prepared(settings: Settings) -> Prepared:
+    def prepared(settings: Settings) -> Comparison:
         return prepare(
             read,
             settings,
@@ -437,4 +418,12 @@ def explain(comparison: Comparison, progress: Progress = silent) -> Analysis:
     from px4fuse.loop.analysis import loop_in  # noqa: PLC0415 (tune and sync have none)
 
     loop = loop_in(comparison.flight, progress)
-    return Analysis(comparison, tuning, clock, model, why, loop, heading)
+    return Analysis(
+        **vars(comparison),
+        tuning=tuning,
+        clock=clock,
+        ekf2_model=model,
+        why=why,
+        loop=loop,
+        heading=heading,
+    )

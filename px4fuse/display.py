@@ -7,7 +7,6 @@ they have in common.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import fields
 from functools import singledispatch
 from html import escape
 from typing import TYPE_CHECKING, Any
@@ -18,15 +17,16 @@ if TYPE_CHECKING:
 MAX_TEXT, MAX_ROWS = 60, 12
 
 
-def brief(result: object) -> str:
-    """A dataclass on one line, its tables and arrays by their shapes.
+def brief(result: Any) -> str:
+    """A record on one line, its tables and arrays by their shapes.
 
     >>> import pandas as pd
     >>> from px4fuse.flight import Truth
     >>> brief(Truth("mocap", pd.DataFrame({"north_m": [0.0, 1.0]})))
     "Truth(name='mocap', samples=<2 × 1>)"
     """
-    values = ((field.name, getattr(result, field.name)) for field in fields(result))  # type: ignore[arg-type]
+    names = getattr(result, "__struct_fields__", None) or result.__dataclass_fields__
+    values = ((name, getattr(result, name)) for name in names)
     said = ", ".join(f"{name}={_short(value)}" for name, value in values if value is not None)
     return f"{type(result).__name__}({said})"
 
@@ -75,6 +75,8 @@ def as_html(text: str, table: pd.DataFrame) -> str:
 
 class Shown:
     """A result that shows itself: as text, as a table, as a picture."""
+
+    __slots__ = ()
 
     def __repr__(self) -> str:
         return words(self)

@@ -19,6 +19,8 @@ from typing import Literal
 import pandas as pd
 
 from px4fuse.display import Shown, brief
+from px4fuse.record import NotNegative, Record, Vector
+from px4fuse.record import Unavailable as Unavailable  # noqa: PLC0414 - for everybody
 from px4fuse.recording import ClockMap, InputFile, LogInfo, Stream, Unused
 
 AxisName = Literal["north", "east", "down"]
@@ -56,28 +58,6 @@ DELAYED_VARIANCE_COLUMNS = [
 
 
 @dataclass(frozen=True)
-class Unavailable:
-    """Something that was looked for and not found.
-
-    Attributes
-    ----------
-    what : str
-        What is missing, as a noun phrase ("EKF2 innovations").
-    reason : str
-        Why, in terms of the log ("no topic vehicle_attitude").
-    remedy : str
-        What would have logged it, or what to do instead.
-    """
-
-    what: str
-    reason: str
-    remedy: str
-
-    def __str__(self) -> str:
-        return f"{self.what}: {self.reason}. {self.remedy}"
-
-
-@dataclass(frozen=True)
 class FlightMode:
     """A stretch (s) in one flight mode, by the name that PX4's users know."""
 
@@ -86,8 +66,7 @@ class FlightMode:
     name: str
 
 
-@dataclass(frozen=True)
-class Alignment:
+class Alignment(Record, frozen=True, kw_only=True):
     """How an external position file was placed into the flight.
 
     A position p of the file becomes origin + Rz(yaw) · C · p, where C turns its frame into NED.
@@ -121,16 +100,16 @@ class Alignment:
     frame: str
     frame_reason: str
     yaw_deg: float
-    yaw_sigma_deg: float | None
+    yaw_sigma_deg: NotNegative | None = None
     yaw_reason: str
-    origin_m: tuple[float, float, float]
+    origin_m: Vector
     clock_offset_s: float
-    clock_offset_sigma_s: float | None
+    clock_offset_sigma_s: NotNegative | None = None
     clock_reason: str
     reference: str
-    correlation: float | None
-    residual_rms_m: float | None
-    warnings: tuple[str, ...] = ()
+    correlation: float | None = None
+    residual_rms_m: NotNegative | None = None
+    warnings: tuple[str, ...]
 
 
 @dataclass(frozen=True)

@@ -3,21 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from typing import Literal
 
 from px4fuse.display import brief
+from px4fuse.record import Count, NotNegative, Record, Sha256, Share
 
 
-@dataclass(frozen=True)
-class Dropout:
+class Dropout(Record, frozen=True):
     """A stretch that the logger lost: start and length in seconds."""
 
     start_s: float
-    duration_s: float
+    duration_s: NotNegative
 
 
-@dataclass(frozen=True)
-class Sender:
+class Sender(Record, frozen=True):
     """One MAVLink sender that a recording heard.
 
     Attributes
@@ -38,13 +38,12 @@ class Sender:
     system: int
     component: int
     description: str
-    messages: int
-    lost_share: float | None
+    messages: Count
+    lost_share: Share | None
     chosen: bool
 
 
-@dataclass(frozen=True)
-class ClockMap:
+class ClockMap(Record, frozen=True):
     """How one clock was mapped to the autopilot's boot clock.
 
     boot = stamp + offset + drift · (stamp - middle of the stamps)
@@ -54,7 +53,8 @@ class ClockMap:
     clock : str
         Which clock ("UNIX time of system 1, component 197").
     method : str
-        "TIMESYNC", "SYSTEM_TIME", "receive time" or "position in the stream".
+        "boot clock", "TIMESYNC", "SYSTEM_TIME", "receive time", "arrival time" or "position in the
+        stream".
     pairs : int
         Pairs of readings that it rests on.
     offset_s : float
@@ -71,12 +71,12 @@ class ClockMap:
 
     clock: str
     method: str
-    pairs: int
+    pairs: Count
     offset_s: float
     drift_ppm: float
-    jitter_s: float
+    jitter_s: NotNegative
     note: str = ""
-    distinct_stamps: int | None = None
+    distinct_stamps: Count | None = None
 
 
 @dataclass(frozen=True)
@@ -107,18 +107,16 @@ class Unused:
     reason: str
 
 
-@dataclass(frozen=True)
-class InputFile:
+class InputFile(Record, frozen=True):
     """A file that was read beside the log: name without its folder, hash, size, and its part."""
 
     name: str
-    sha256: str
-    size_bytes: int
-    role: str
+    sha256: Sha256
+    bytes: Count
+    role: Literal["mavlink", "position"]
 
 
-@dataclass(frozen=True)
-class LogInfo:
+class LogInfo(Record, frozen=True, omit_defaults=False):
     """What the log is.
 
     Attributes
@@ -127,7 +125,7 @@ class LogInfo:
         File name without its folder.
     sha256 : str
         Of the file's bytes.
-    size_bytes : int
+    bytes : int
     format : str
         "ULog", "MAVLink tlog" (with time of receipt) or "MAVLink stream" (without).
     firmware : str
@@ -157,16 +155,16 @@ class LogInfo:
     """
 
     name: str
-    sha256: str
-    size_bytes: int
-    format: str
+    sha256: Sha256
+    bytes: Count
+    format: Literal["ULog", "MAVLink tlog", "MAVLink stream"]
     firmware: str
     firmware_hash: str
     hardware: str
     boot_time_s: float
-    duration_s: float
+    duration_s: NotNegative
     dropouts: tuple[Dropout, ...] = ()
-    parameters: Mapping[str, float] = field(default_factory=dict)
+    parameters: Mapping[str, int | float] = {}
     notes: tuple[str, ...] = ()
     autopilot: str = "PX4"
     start_unix_s: float | None = None

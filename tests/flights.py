@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from px4fuse.analysis import Analysis
 from px4fuse.arrays import Array
-from px4fuse.comparison.comparison import Comparison
+from px4fuse.comparison.model import Comparison
 from px4fuse.filter.signals import Axis, Segment, project_acceleration
 from px4fuse.filter.tuning import HORIZONTAL, tune
 from px4fuse.flight import (
@@ -335,6 +335,6 @@ def unexplained(comparison: Comparison) -> Analysis:
 
 def with_noises(comparison: Comparison) -> Analysis:
     """Make an analysis that knows the noises that the two-state filter asks for, and no more."""
-    axes = tuple(result.axis for result in comparison.axes)
+    axes = tuple(result.axis for result in comparison.axes.values())
     tuning = tune(axes, comparison.settings, (HORIZONTAL, "down"))
     return replace(unexplained(comparison), tuning=tuning)

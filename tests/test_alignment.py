@@ -356,7 +356,7 @@ def test_the_flight_gets_the_track_the_file_and_what_its_reader_said(flight: Fli
         {"name": "uwb.csv", "sha256": "f" * 64, "size_bytes": 1234, "role": "position"}
     ]
     assert result.log.notes == ("uwb.csv: time: column 1", "uwb.csv: two rows dropped")
-    assert result.ekf2 is flight.ekf2
+    assert result.filters["ekf2"] is flight.ekf2
     assert flight.inputs == ()
 
 

@@ -89,8 +89,10 @@ def test_every_log_is_in_the_table_with_its_numbers_or_its_line(client, tmp_path
     assert list(table["name"]) == sorted(table["name"])
     analysis = px4fuse.compare(logs / "f1.ulg")
     first = of["f1.ulg"]
-    assert list(first["axis"]) == [axis.axis.name for axis in analysis.axes]
-    assert list(first["kf_nis_mean"]) == [axis.kf.consistency.nis_mean for axis in analysis.axes]
+    assert list(first["axis"]) == [axis.axis.name for axis in analysis.axes.values()]
+    assert list(first["kf_nis_mean"]) == [
+        axis.filters["kf"].nis_mean for axis in analysis.axes.values()
+    ]
     assert list(first["kf_factor"] * first["kf_nis_mean"]) == pytest.approx([1.0] * 4)
     tuned = analysis.tuning["horizontal"].sigma_z
     assert first.loc[0, ["sigma_z_m", "sigma_z_low_m", "sigma_z_high_m"]].tolist() == [
@@ -389,7 +391,7 @@ def test_logs_are_found_in_folders_globs_and_urls(tmp_path, monkeypatch):
     # each once, however it is given; a file that is named may be called anything
     again = find_logs(["logs/*.ulg", str(tmp_path / "logs/b.ulg"), "logs/d[1].ulg", "named"])
     assert [log.name for log in again] == ["b.ulg", "d[1].ulg", "named"]
-    assert {log.size_bytes for log in again} == {5}
+    assert {log.bytes for log in again} == {5}
     memory = fsspec.filesystem("memory")
     memory.pipe("/fleet/x.ulg", tiny_log(3))
     (log,) = find_logs(["memory://fleet"])

@@ -9,7 +9,8 @@ from flights import Estimator, aisle_flight, unexplained
 from results_tools import changed, decoded, finding
 from test_scoring import checked
 
-from px4fuse.comparison.comparison import Comparison, compare
+from px4fuse.comparison.comparison import compare
+from px4fuse.comparison.model import Comparison
 from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.kalman import Settings
 from px4fuse.filter.tuning import Noise
@@ -134,7 +135,7 @@ def test_verdicts_that_could_be_misread_have_a_sentence(comparison: Comparison) 
 
 
 def test_what_is_consistent_and_white_needs_no_words(comparison: Comparison) -> None:
-    (east,) = [result for result in comparison.axes if result.axis.name == "east"]
+    (east,) = [result for result in comparison.axes.values() if result.axis.name == "east"]
     assert isinstance(east.kf.consistency, Consistency)
     fine = replace(east.kf, consistency=replace(east.kf.consistency, ljung_box_p=0.5))
     assert verdict_notes(replace(comparison, axes=(replace(east, kf=fine),))) == []

@@ -11,14 +11,8 @@ import pytest
 from flights import Estimator, Imu, Uwb, aisle_flight, unavailable
 
 from px4fuse.arrays import Array
-from px4fuse.comparison.comparison import (
-    AxisComparison,
-    Comparison,
-    Difference,
-    FilterSummary,
-    compare,
-    compare_prepared,
-)
+from px4fuse.comparison.comparison import compare, compare_prepared
+from px4fuse.comparison.model import AxisComparison, Comparison, Difference, FilterSummary
 from px4fuse.comparison.preparation import prepare
 from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.filter.consistency import Consistency
@@ -46,7 +40,7 @@ def made() -> Comparison:
 
 
 def along(comparison: Comparison, name: str) -> AxisComparison:
-    return next(result for result in comparison.axes if result.axis.name == name)
+    return next(result for result in comparison.axes.values() if result.axis.name == name)
 
 
 def consistency(summary: FilterSummary | Unavailable) -> Consistency:
@@ -103,15 +97,15 @@ class TestSample:
     def test_both_filters_are_near_consistent_horizontally(self, sample: Comparison) -> None:
         for name in ("north", "east"):
             result = along(sample, name)
-            assert 0.75 < consistency(result.kf).nis_mean < 1.15
-            assert 0.75 < consistency(result.ekf2).nis_mean < 1.15
+            assert 0.75 < consistency(result.filters["kf"]).nis_mean < 1.15
+            assert 0.75 < consistency(result.filters["ekf2"]).nis_mean < 1.15
 
     def test_both_filters_are_close_to_the_truth(self, sample: Comparison) -> None:
         for name in ("north", "east"):
             result = along(sample, name)
-            assert result.kf_truth.position_rmse_m < 0.08
-            assert result.ekf2_truth.position_rmse_m < 0.08
-            assert result.kf_truth.velocity_rmse_m_s < 0.12
+            assert result.filters["kf"].truth.position_rmse_m < 0.08
+            assert result.filters["ekf2"].truth.position_rmse_m < 0.08
+            assert result.filters["kf"].truth.velocity_rmse_m_s < 0.12
 
     def test_nis_equals_the_mean_of_squared_normalised_innovations(
         self, sample: Comparison, sample_flight: Flight
@@ -121,7 +115,7 @@ class TestSample:
             result = along(sample, name)
             ours = result.replay.updates
             logged = sample_flight.ekf2.innovations[name].loc[segment.start_s : segment.end_s]
-            for summary, frame in ((result.kf, ours), (result.ekf2, logged)):
+            for summary, frame in ((result.filters["kf"], ours), (result.filters["ekf2"], logged)):
                 nis = frame["innovation_m"] ** 2 / frame["innovation_variance_m2"]
                 assert consistency(summary).count == len(frame)
                 assert consistency(summary).nis_mean == pytest.approx(nis.mean(), rel=1e-12)
@@ -135,7 +129,7 @@ class TestSample:
         for name in ("north", "east"):
             result = along(sample, name)
             nis = result.ekf2_innovations["test_ratio"].mean() * 5.0**2
-            assert consistency(result.ekf2).nis_mean == pytest.approx(nis, rel=1e-4)
+            assert consistency(result.filters["ekf2"]).nis_mean == pytest.approx(nis, rel=1e-4)
 
     def test_horizontal_nis_is_the_mean_of_north_and_east(self, sample: Comparison) -> None:
         for who, joint in (("kf", sample.horizontal_kf), ("ekf2", sample.horizontal_ekf2)):
@@ -170,10 +164,13 @@ class TestSample:
             truth = sample_flight.truth.samples
             ep = p - np.interp(times, truth.index, truth[f"{name}_m"])
             ev = v - np.interp(times, truth.index, truth[f"{name}_m_s"])
-            assert result.kf_truth.position_rmse_m == pytest.approx(rms(ep))
-            assert result.kf_truth.velocity_rmse_m_s == pytest.approx(rms(ev))
+            assert result.filters["kf"].truth.position_rmse_m == pytest.approx(rms(ep))
+            assert result.filters["kf"].truth.velocity_rmse_m_s == pytest.approx(rms(ev))
             nees = np.mean(ep**2 / pp), np.mean(ev**2 / vv)
-            stated = result.kf_truth.nees_position_mean, result.kf_truth.nees_velocity_mean
+            stated = (
+                result.filters["kf"].truth.nees_position_mean,
+                result.filters["kf"].truth.nees_velocity_mean,
+            )
             assert stated == pytest.approx(nees, rel=1e-9)
 
 
@@ -194,8 +191,8 @@ class TestMadeFlight:
     ) -> None:
         assert made.horizontal_kf.verdict == "consistent"
         for result in made.axes:
-            assert result.kf_truth.nees_position_mean == pytest.approx(1.0, abs=0.3)
-            assert result.kf_truth.nees_velocity_mean == pytest.approx(1.0, abs=0.3)
+            assert result.filters["kf"].truth.nees_position_mean == pytest.approx(1.0, abs=0.3)
+            assert result.filters["kf"].truth.nees_velocity_mean == pytest.approx(1.0, abs=0.3)
 
     @pytest.mark.parametrize("nis", [0.01, 1.0, 20.0])
     def test_ekf2s_variance_factor_is_the_one_injected(self, nis: float) -> None:
@@ -204,24 +201,24 @@ class TestMadeFlight:
 
     def test_ekf2s_errors_and_variances_are_those_injected(self, made: Comparison) -> None:
         for result in made.axes:
-            truth = result.ekf2_truth
+            truth = result.filters["ekf2"].truth
             assert truth.position_rmse_m == pytest.approx(0.05, rel=0.06)
             assert truth.velocity_rmse_m_s == pytest.approx(0.04, rel=0.06)
             assert truth.nees_position_mean == pytest.approx(1.0, abs=0.35)
             assert truth.nees_velocity_mean == pytest.approx(1.0, abs=0.35)
-            assert result.ekf2.sigma_p_median_m == pytest.approx(0.05)
-            assert result.ekf2.sigma_v_median_m_s == pytest.approx(0.04)
+            assert result.filters["ekf2"].sigma_p_median_m == pytest.approx(0.05)
+            assert result.filters["ekf2"].sigma_v_median_m_s == pytest.approx(0.04)
 
     def test_ekf2s_sigma_around_an_update_follows_from_s_and_r(self, made: Comparison) -> None:
         """P⁻ = S - R and P⁺ = P⁻R/S, with P⁻ = (0.06 m)² and R = (0.10 m)²."""
         for result in made.axes:
-            assert result.ekf2.sigma_p_before_update_m == pytest.approx(0.06)
+            assert result.filters["ekf2"].sigma_p_before_update_m == pytest.approx(0.06)
             after = 0.06 * 0.10 / np.hypot(0.06, 0.10)
-            assert result.ekf2.sigma_p_after_update_m == pytest.approx(after)
+            assert result.filters["ekf2"].sigma_p_after_update_m == pytest.approx(after)
 
     def test_our_sigma_shrinks_with_each_update(self, made: Comparison) -> None:
         for result in made.axes:
-            kf = result.kf
+            kf = result.filters["kf"]
             prior = result.replay.updates["prior_position_variance_m2"]
             assert kf.sigma_p_before_update_m == pytest.approx(np.sqrt(prior.median()))
             assert kf.sigma_p_after_update_m < kf.sigma_p_median_m < kf.sigma_p_before_update_m
@@ -270,9 +267,12 @@ class TestMadeFlight:
         aisle = compare(made.flight, axes=("aisle",), heading_deg=heading).axes[0]
         same = along(made, name)
         assert vars(aisle.difference) == pytest.approx(vars(same.difference))
-        assert vars(aisle.kf_truth) == pytest.approx(vars(same.kf_truth))
-        assert vars(aisle.ekf2_truth) == pytest.approx(vars(same.ekf2_truth))
-        for ours, theirs in ((aisle.kf, same.kf), (aisle.ekf2, same.ekf2)):
+        assert vars(aisle.filters["kf"].truth) == pytest.approx(vars(same.filters["kf"].truth))
+        assert vars(aisle.filters["ekf2"].truth) == pytest.approx(vars(same.filters["ekf2"].truth))
+        for ours, theirs in (
+            (aisle.filters["kf"], same.filters["kf"]),
+            (aisle.filters["ekf2"], same.filters["ekf2"]),
+        ):
             assert consistency(ours).nis_mean == pytest.approx(consistency(theirs).nis_mean)
             assert ours.sigma_p_after_update_m == pytest.approx(theirs.sigma_p_after_update_m)
 
@@ -309,12 +309,12 @@ class TestMissingParts:
         comparison = compare(aisle_flight(ekf2=None))
         assert comparison.horizontal_kf.verdict == "consistent"
         assert comparison.horizontal_ekf2 is None
-        for result in comparison.axes:
-            assert consistency(result.kf).count == 600
-            assert result.kf_truth.position_rmse_m < 0.09
+        for result in comparison.axes.values():
+            assert consistency(result.filters["kf"]).count == 600
+            assert result.filters["kf"].truth.position_rmse_m < 0.09
             for part in ("ekf2", "ekf2_state", "ekf2_variance", "ekf2_innovations"):
                 assert getattr(result, part) == comparison.flight.ekf2
-            assert result.difference == result.ekf2_truth == comparison.flight.ekf2
+            assert result.difference == result.filters["ekf2"].truth == comparison.flight.ekf2
 
     @pytest.mark.parametrize("left_out", ["imu", "attitude_hz"])
     def test_without_acceleration_constant_velocity_stands_in_and_is_noted(
@@ -324,9 +324,9 @@ class TestMissingParts:
         comparison = compare(flight, Settings(sigma_z_m=0.2))
         assert comparison.settings == Settings(sigma_z_m=0.2, input="zero")
         assert any("constant velocity was used" in note for note in comparison.notes)
-        assert isinstance(comparison.axes[0].axis.acceleration, Unavailable)
-        assert comparison.axes[0].axis.acceleration in comparison.missing
-        assert consistency(comparison.axes[0].kf).count == 600
+        assert isinstance(comparison.lines[0].acceleration, Unavailable)
+        assert comparison.lines[0].acceleration in comparison.missing
+        assert consistency(next(iter(comparison.axes.values())).kf).count == 600
         with pytest.raises(SettingsError, match="`input` imu"):
             prepare(flight, input_required=True)
 
@@ -334,35 +334,38 @@ class TestMissingParts:
         comparison = compare(made.flight, Settings(input="zero"), axes=("north",))
         assert comparison.notes == ()
         assert comparison.missing == ()
-        assert np.all(comparison.axes[0].replay.steps["acceleration_m_s2"] == 0.0)
+        assert np.all(next(iter(comparison.axes.values())).replay.steps["acceleration_m_s2"] == 0.0)
 
     def test_without_truth_nothing_is_said_about_it(self) -> None:
         for result in compare(aisle_flight(truth=False)).axes:
-            assert isinstance(result.kf_truth, Unavailable)
-            assert isinstance(result.ekf2_truth, Unavailable)
+            assert isinstance(result.filters["kf"].truth, Unavailable)
+            assert isinstance(result.filters["ekf2"].truth, Unavailable)
             assert isinstance(result.difference, Difference)
 
     def test_without_variances_there_is_no_nees_but_an_rmse(self) -> None:
         for result in compare(aisle_flight(ekf2=Estimator(variance_logged=False))).axes:
             assert isinstance(result.ekf2_variance, Unavailable)
-            assert result.ekf2.sigma_p_median_m is None
-            assert result.ekf2_truth.nees_position_mean is None
-            assert result.ekf2_truth.position_rmse_m == pytest.approx(0.05, rel=0.06)
+            assert result.filters["ekf2"].sigma_p_median_m is None
+            assert result.filters["ekf2"].truth.nees_position_mean is None
+            assert result.filters["ekf2"].truth.position_rmse_m == pytest.approx(0.05, rel=0.06)
 
     def test_without_true_velocity_there_is_no_velocity_error(self, made: Comparison) -> None:
         samples = made.flight.truth.samples.assign(north_m_s=np.nan, east_m_s=np.nan)
         flight = replace(made.flight, truth=Truth("positions only", samples))
         result = compare(flight, axes=("north",)).axes[0]
-        assert result.kf_truth.velocity_rmse_m_s is None
-        assert result.kf_truth.nees_velocity_mean is None
-        assert result.kf_truth.position_rmse_m == along(made, "north").kf_truth.position_rmse_m
+        assert result.filters["kf"].truth.velocity_rmse_m_s is None
+        assert result.filters["kf"].truth.nees_velocity_mean is None
+        assert (
+            result.filters["kf"].truth.position_rmse_m
+            == along(made, "north").kf_truth.position_rmse_m
+        )
 
     def test_without_innovations_there_is_no_verdict_on_ekf2(self) -> None:
         comparison = compare(aisle_flight(ekf2=Estimator(innovations_logged=False)))
         assert comparison.horizontal_ekf2 is None
-        for result in comparison.axes:
-            assert isinstance(result.ekf2.consistency, Unavailable)
-            assert result.ekf2.sigma_p_before_update_m is None
+        for result in comparison.axes.values():
+            assert isinstance(result.filters["ekf2"], Unavailable)
+            assert result.filters["ekf2"].sigma_p_before_update_m is None
             assert isinstance(result.difference, Difference)
 
     @pytest.mark.parametrize(
@@ -387,22 +390,22 @@ class TestMissingParts:
     def test_unknown_measurement_noise_leaves_only_its_sigmas_open(self) -> None:
         flight = aisle_flight(parameters={}, ekf2=Estimator(noise_logged=False))
         result = compare(flight, axes=("north",)).axes[0]
-        assert result.ekf2.sigma_p_before_update_m is None
-        assert result.ekf2.sigma_p_after_update_m is None
-        assert consistency(result.ekf2).nis_mean == pytest.approx(1.0, abs=0.2)
+        assert result.filters["ekf2"].sigma_p_before_update_m is None
+        assert result.filters["ekf2"].sigma_p_after_update_m is None
+        assert consistency(result.filters["ekf2"]).nis_mean == pytest.approx(1.0, abs=0.2)
 
     def test_a_flight_too_short_for_statistics_says_so(self) -> None:
         comparison = compare(aisle_flight(duration_s=1.0))
-        for result in comparison.axes:
-            assert isinstance(result.kf.consistency, Unavailable)
-            assert isinstance(result.ekf2.consistency, Unavailable)
+        for result in comparison.axes.values():
+            assert isinstance(result.filters["kf"], Unavailable)
+            assert isinstance(result.filters["ekf2"], Unavailable)
         assert comparison.horizontal_kf is None
 
     def test_truth_for_part_of_the_flight_counts_that_part(self, made: Comparison) -> None:
         samples = made.flight.truth.samples.loc[40:50]
         flight = replace(made.flight, truth=Truth("ten seconds", samples))
         result = compare(flight, axes=("north",)).axes[0]
-        assert result.kf_truth.count == result.ekf2_truth.count == 101
+        assert result.filters["kf"].truth.count == result.filters["ekf2"].truth.count == 101
 
     def test_truth_between_two_variances_has_an_rmse_but_no_nees(self, made: Comparison) -> None:
         """EKF2's variances come once a second: none may fall where the truth is."""
@@ -416,8 +419,8 @@ class TestMissingParts:
     def test_ekf2s_innovations_are_not_put_beside_a_source_that_it_did_not_fuse(self) -> None:
         comparison = compare(aisle_flight(uwb=Uwb(name="vehicle_mocap_odometry", rung=3)))
         assert comparison.horizontal_ekf2 is None
-        for result in comparison.axes:
-            assert isinstance(result.ekf2.consistency, Unavailable)
+        for result in comparison.axes.values():
+            assert isinstance(result.filters["ekf2"], Unavailable)
             assert isinstance(result.difference, Difference)
 
     def test_horizontal_nis_uses_only_the_updates_that_both_axes_have(self) -> None:
@@ -439,7 +442,7 @@ class TestRobustness:
         reset = Reset(60.0, "position", (5.0, -3.0, 0.0))
         comparison = compare(aisle_flight(ekf2=Estimator(resets=(reset,))))
         assert any("resets undone: 1 of horizontal position" in note for note in comparison.notes)
-        for result, same in zip(comparison.axes, made.axes, strict=True):
+        for result, same in zip(comparison.axes.values(), made.axes, strict=True):
             assert vars(result.difference) == pytest.approx(vars(same.difference))
 
     def test_compare_does_not_change_the_flight(self) -> None:
@@ -460,7 +463,7 @@ class TestRobustness:
 
     def test_an_imu_gap_is_counted(self) -> None:
         comparison = compare(aisle_flight(imu=Imu(gap_s=(40.0, 42.0))))
-        for result in comparison.axes:
+        for result in comparison.axes.values():
             assert result.replay.input_gap_s == pytest.approx(2.0, abs=1e-6)
 
     def test_frames_of_one_block_serve_as_well_as_frames_of_columns(self, made: Comparison) -> None:

@@ -13,7 +13,8 @@ from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 from pypdf import PdfReader
 
-from px4fuse.comparison.comparison import Comparison, compare
+from px4fuse.comparison.comparison import compare
+from px4fuse.comparison.model import Comparison
 from px4fuse.findings import Finding, find
 from px4fuse.flight import Flight, FlightMode, Reset, Unavailable
 from px4fuse.recording import Dropout

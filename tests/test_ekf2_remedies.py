@@ -10,7 +10,8 @@ from flights import Estimator, aisle_flight
 
 from px4fuse.analysis import Analysis, explain
 from px4fuse.comparison.asked import asked_of_ekf2, delay_change, noise_change, noise_used_m
-from px4fuse.comparison.comparison import Comparison, compare
+from px4fuse.comparison.comparison import compare
+from px4fuse.comparison.model import Comparison
 from px4fuse.comparison.remedy import (
     Effect,
     delay_helps,
@@ -173,7 +174,7 @@ def test_a_delay_that_the_replay_refutes_is_not_proposed(sample: Analysis) -> No
 
 
 def test_a_delay_that_the_replay_confirms_is(sample: Analysis) -> None:
-    flight = sample.comparison.flight
+    flight = sample.flight
     parameters = {**flight.log.parameters, "EKF2_EV_DELAY": 150.0}
     wrong = replace(flight, log=replace(flight.log, parameters=parameters))
     late = flown_with(offset(sample, 0.0), EKF2_EV_DELAY=150.0)
@@ -194,7 +195,7 @@ def test_what_px4_cannot_set_is_not_proposed(sample: Analysis, offset_s: float, 
 def rejecting(comparison: Comparison) -> Comparison:
     """The same, had EKF2's gate rejected every other sample."""
     axes = []
-    for axis in comparison.axes:
+    for axis in comparison.axes.values():
         frame = axis.ekf2_innovations.copy()
         frame.iloc[::2, frame.columns.get_loc("rejected")] = 1.0
         axes.append(replace(axis, ekf2_innovations=frame))
@@ -202,7 +203,7 @@ def rejecting(comparison: Comparison) -> Comparison:
 
 
 def test_rejections_are_ended_by_the_noise_that_the_data_ask_for(sample: Analysis) -> None:
-    north = rejecting(replace(sample.comparison, axes=sample.comparison.axes[:1]))
+    north = rejecting(replace(sample.comparison, axes=sample.axes[:1]))
     sure = flown_with(replace(sample, comparison=north), EKF2_EVP_NOISE=0.03)
     remedy = only(ekf2_rejecting, sure).remedy
     assert remedy.startswith("Set EKF2_EVP_NOISE to 0.098 m: rejected")

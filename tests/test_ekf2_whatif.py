@@ -169,9 +169,11 @@ def test_the_bars_add_up_and_little_is_left(model: Model) -> None:
         assert tuple(step.name for step in axis.steps) == STEPS
         position = sum(step.position_mean_square_m2 for step in axis.steps)
         velocity = sum(step.velocity_mean_square_m2_s2 for step in axis.steps)
-        assert position + axis.position_left_m2 == pytest.approx(axis.position_total_m2, abs=1e-12)
-        assert velocity + axis.velocity_left_m2_s2 == pytest.approx(
-            axis.velocity_total_m2_s2, abs=1e-12
+        assert position + axis.position_left_mean_square_m2 == pytest.approx(
+            axis.position_mean_square_m2, abs=1e-12
+        )
+        assert velocity + axis.velocity_left_mean_square_m2_s2 == pytest.approx(
+            axis.velocity_mean_square_m2_s2, abs=1e-12
         )
         assert axis.position_left_share < 0.03
         by_name = {step.name: step for step in axis.steps}
@@ -196,8 +198,8 @@ def test_the_ends_of_the_walk_are_student_and_model_against_log(model: Model) ->
     assert len(made.times_s) == pytest.approx(len(times), abs=2)
     for axis in ("north", "east"):
         for ours, name in (
-            (tracks[SAMPLES], "position_total_m2"),
-            (tracks[OUTPUT], "position_left_m2"),
+            (tracks[SAMPLES], "position_mean_square_m2"),
+            (tracks[OUTPUT], "position_left_mean_square_m2"),
         ):
             there = np.interp(times, ours.index, ours[f"{axis}_m"])
             square = np.mean((there - logged.loc[times, f"{axis}_m"]) ** 2)
@@ -208,8 +210,12 @@ def test_the_walk_starts_where_the_student_is(model: Model) -> None:
     plain = walked(walk(model))
     noisy = walked(walk(model, Student(sigma_z_m=0.5)))
     north = plain.axes["north"], noisy.axes["north"]
-    assert north[1].position_total_m2 != pytest.approx(north[0].position_total_m2, rel=0.05)
-    assert north[1].position_left_m2 == pytest.approx(north[0].position_left_m2, rel=1e-9)
+    assert north[1].position_mean_square_m2 != pytest.approx(
+        north[0].position_mean_square_m2, rel=0.05
+    )
+    assert north[1].position_left_mean_square_m2 == pytest.approx(
+        north[0].position_left_mean_square_m2, rel=1e-9
+    )
     assert abs(noisy.axes["north"].steps[2].position_mean_square_m2) > 1e-5
     late = walked(walk(model, Student(clock_offset_s=-0.3)))
     assert late.axes["north"].steps[0].position_moved_m == 0.0
@@ -223,9 +229,10 @@ def test_a_track_of_ones_own_is_the_first_step(model: Model) -> None:
     track = pd.DataFrame({"position_m": first["north_m"] + 0.4, "velocity_m_s": first["north_m_s"]})
     own = walked(walk(model, lines={"north": Line(1.0, 0.0, track)})).axes["north"]
     bias = np.mean(track["position_m"] - model.flown.published["north_m"])
-    assert own.position_total_m2 > 0.8 * bias**2
-    assert own.position_total_m2 == pytest.approx(
-        own.position_left_m2 + sum(step.position_mean_square_m2 for step in own.steps), abs=1e-12
+    assert own.position_mean_square_m2 > 0.8 * bias**2
+    assert own.position_mean_square_m2 == pytest.approx(
+        own.position_left_mean_square_m2 + sum(step.position_mean_square_m2 for step in own.steps),
+        abs=1e-12,
     )
     assert own.steps[0].position_moved_m == pytest.approx(0.4, abs=1e-6)
     for ours, theirs in zip(own.steps[1:], plain.axes["north"].steps[1:], strict=True):
@@ -236,10 +243,16 @@ def test_a_slanted_axis_is_the_projection(model: Model) -> None:
     half = np.sqrt(0.5)
     made = walked(walk(model, lines={"aisle": Line(half, half), "across": Line(half, -half)})).axes
     plain = walked(walk(model)).axes
-    for name in ("position_total_m2", "position_left_m2", "velocity_total_m2_s2"):
+    for name in (
+        "position_mean_square_m2",
+        "position_left_mean_square_m2",
+        "velocity_mean_square_m2_s2",
+    ):
         sums = [sum(getattr(axis, name) for axis in axes.values()) for axes in (made, plain)]
         assert sums[0] == pytest.approx(sums[1], rel=1e-9)  # turning keeps the squares
-    assert made["aisle"].position_total_m2 != pytest.approx(plain["north"].position_total_m2)
+    assert made["aisle"].position_mean_square_m2 != pytest.approx(
+        plain["north"].position_mean_square_m2
+    )
 
 
 def test_a_track_of_another_time_is_refused(model: Model) -> None:
@@ -362,7 +375,12 @@ def test_samples_that_come_too_late_are_a_note() -> None:
 
 
 def test_what_is_left_is_a_share_of_all() -> None:
-    assert made(AxisWalk, position_left_m2=1.0, position_total_m2=4.0).position_left_share == 0.25
+    assert (
+        made(
+            AxisWalk, position_left_mean_square_m2=1.0, position_mean_square_m2=4.0
+        ).position_left_share
+        == 0.25
+    )
     frame = pd.DataFrame({"north_m": [0.0, 2.0], "east_m": [4.0, 4.0]}, index=[0.0, 1.0])
     along = Line(0.6, 0.8).along(frame, ["north_m", "east_m"], np.array([0.5]))
     assert along == pytest.approx([3.8])

@@ -85,7 +85,7 @@ def test_all_that_happened_is_listed_and_cut_to_the_segment() -> None:
 def test_rejections_are_of_each_axis() -> None:
     comparison = compare(aisle_flight(ekf2=Estimator(rejected_share=0.2)))
     found = happened(comparison)
-    for result in comparison.axes:
+    for result in comparison.axes.values():
         frame = result.ekf2_innovations
         assert list(found.rejected_s[result.axis.name]) == list(frame.index[frame["rejected"] > 0])
     assert len(found.rejected_s["aisle"]) > 50

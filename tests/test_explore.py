@@ -23,7 +23,8 @@ from px4fuse.analysis import Analysis, run, run_comparison
 from px4fuse.cli import cli
 from px4fuse.cli.compare import compare as compare_command
 from px4fuse.cli.inputs import comparison_request, read_person
-from px4fuse.comparison.comparison import AxisComparison, compare
+from px4fuse.comparison.comparison import compare
+from px4fuse.comparison.model import AxisComparison
 from px4fuse.ekf2.model import replay_settings
 from px4fuse.ekf2.whatif import what_if
 from px4fuse.explore.page import html_text
@@ -67,7 +68,7 @@ def bare(flight: Flight) -> Analysis:
 
 
 def page_of(analysis: Analysis, file: Path) -> Path:
-    request = ComparisonRequest(log=analysis.comparison.flight.log.name)
+    request = ComparisonRequest(log=analysis.flight.log.name)
     file.write_bytes(html_text([(analysis, (), request)]).encode())
     return file
 
@@ -161,10 +162,14 @@ def cells(result: AxisComparison) -> dict[str, list[str]]:
 
     names = ["Mean NIS (1 is consistent)", "95 % band of it", "Outside ±2√S (5 % is right)",
              "Lag-1 correlation of ν", "Measurements"]  # fmt: skip
-    assert not isinstance(result.ekf2, Unavailable)
-    both = zip(statement(result.kf.consistency), statement(result.ekf2.consistency), strict=True)
+    assert not isinstance(result.filters["ekf2"], Unavailable)
+    both = zip(statement(result.filters["kf"]), statement(result.filters["ekf2"]), strict=True)
     told = {name: list(pair) for name, pair in zip(names, both, strict=True)}
-    difference, ours, theirs = result.difference, result.kf_truth, result.ekf2_truth
+    difference, ours, theirs = (
+        result.difference,
+        result.filters["kf"].truth,
+        result.filters["ekf2"].truth,
+    )
     assert not isinstance(difference, Unavailable)
     assert not isinstance(ours, Unavailable)
     assert not isinstance(theirs, Unavailable)
@@ -203,7 +208,7 @@ def test_dragging_gives_what_the_command_on_the_page_gives(
     assert (request.start_s, request.end_s) == pytest.approx((segment.start_s, segment.end_s))
     assert request.heading_deg == pytest.approx(made[1].comparison.main.axis.heading_deg)
     comparison = run_comparison(request)
-    north = next(result for result in comparison.axes if result.axis.name == "north")
+    north = next(result for result in comparison.axes.values() if result.axis.name == "north")
     shown = page.ask(TABLE)
     assert shown != before
     told = cells(north)
@@ -439,8 +444,8 @@ def test_two_flights_stand_on_the_same_axes(browser: Browser, tmp_path: Path) ->
     assert ranges[0][0] == 0.0
     z = float(browser.ask("document.getElementById('sigma-z-value').value"))
     for number, analysis in enumerate(pair):
-        comparison = compare(analysis.comparison.flight, Settings(sigma_z_m=z))
-        statement = comparison.main.kf.consistency
+        comparison = compare(analysis.flight, Settings(sigma_z_m=z))
+        statement = comparison.main.filters["kf"]
         assert isinstance(statement, Consistency)
         shown = browser.ask(TABLE.replace("#tables", f"#table-{number}"))
         assert shown["Mean NIS (1 is consistent)"][0] == f"{statement.nis_mean:.2f}"

@@ -15,7 +15,8 @@ from browser import Browser
 from explore_tools import ask
 from flights import Imu, Uwb, aisle_flight
 
-from px4fuse.comparison.comparison import Comparison, compare
+from px4fuse.comparison.comparison import compare
+from px4fuse.comparison.model import Comparison
 from px4fuse.comparison.preparation import shift_clock
 from px4fuse.explore.data import OFFSET_REACH_S, raw_source, signals_of
 from px4fuse.explore.packing import FINE, Packer
@@ -110,7 +111,8 @@ def test_the_page_replays_as_python_does(engine: Browser, sample_log: Path, name
     rng = np.random.default_rng(len(name))
     imu = comparison.settings.input == "imu"
     tries = [
-        (int(rng.integers(len(comparison.axes))), some_settings(rng, imu)) for _ in range(TRIES)
+        (int(rng.integers(len(comparison.axes.values()))), some_settings(rng, imu))
+        for _ in range(TRIES)
     ]
     gaps = 0
     for (at, settings), made in zip(tries, in_browser(engine, comparison, tries), strict=True):

@@ -25,7 +25,7 @@ from findings_tools import (
     source,
 )
 
-from px4fuse.comparison.comparison import AgainstTruth
+from px4fuse.comparison.model import AgainstTruth
 from px4fuse.comparison.remedy import Effect
 from px4fuse.ekf2.model import Model
 from px4fuse.filter.consistency import Consistency
@@ -480,7 +480,7 @@ def test_a_silent_source(rate_hz: float, least_s: float) -> None:
     for gap_s, there in ((least_s, False), (least_s + 0.25, True)):
         time = np.concatenate([np.arange(10.0, 20.5, 0.5), [20.0 + gap_s, 20.5 + gap_s]])
         one = analysis(axes=(axis(),), source=source(rate_hz=rate_hz))
-        one.comparison.axes[0].axis.measurement_time_s = time
+        one.comparison.lines[0].measurement_time_s = time
         assert bool(named(source_gap, one)) is there
         if there:
             finding = only(source_gap, one)

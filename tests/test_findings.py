@@ -21,7 +21,8 @@ from test_loop import NAMED_HERE as NAMED_IN_LOOPS
 from test_noise_findings import NAMED_HERE
 
 from px4fuse import findings as package
-from px4fuse.comparison.comparison import Comparison, compare
+from px4fuse.comparison.comparison import compare
+from px4fuse.comparison.model import Comparison
 from px4fuse.ekf2.model import MODEL_NOTE
 from px4fuse.filter.consistency import MIN_INNOVATIONS
 from px4fuse.filter.kalman import Settings
@@ -562,7 +563,7 @@ def test_a_flight_of_a_moment_does_not_break_a_detector(fault: Fault, duration_s
         uwb = replace(uwb, rate_hz=10.0)  # of which one in ten is lost
         short["uwb"] = uwb
     comparison = compare(fault.fly(**short), Settings(**fault.settings))
-    few = len(comparison.axes[0].replay.updates) < MIN_INNOVATIONS
+    few = len(next(iter(comparison.axes.values())).replay.updates) < MIN_INNOVATIONS
     assert ("too_few_innovations" in ids(found(comparison))) == few
 
 
@@ -647,7 +648,7 @@ def test_process_noise_is_not_called_forgotten_where_it_is_the_lessons() -> None
 
 def test_a_small_process_noise_that_still_lets_the_variance_grow_is_not_called_forgotten() -> None:
     comparison = compare(aisle_flight(), Settings(sigma_a_m_s2=0.02))
-    assert comparison.axes[0].replay.updates["gain_position"].iloc[-1] > 0.05
+    assert next(iter(comparison.axes.values())).replay.updates["gain_position"].iloc[-1] > 0.05
     assert "process_noise_forgotten" not in ids(found(comparison))
 
 

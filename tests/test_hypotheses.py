@@ -171,7 +171,7 @@ def test_a_scale_is_not_drawn_to_zero_by_the_noise_of_the_acceleration() -> None
         comparison = compare(flown, RIGHT, axes=("north", "east"))
         found = explained(
             comparison.flight,
-            tuple(result.axis for result in comparison.axes),
+            tuple(result.axis for result in comparison.axes.values()),
             comparison.segment,
             RIGHT,
             sigma_a_m_s2=0.2,
@@ -211,7 +211,7 @@ def test_other_mistakes_are_no_smoothing(mistake) -> None:
 
 def test_a_shift_of_the_stamps_that_explains_as_much_is_no_smoothing() -> None:
     late = flown("clock-offset=250ms")
-    axes = tuple(result.axis for result in late.comparison.axes)
+    axes = tuple(result.axis for result in late.comparison.axes.values())
     given = {"sigma_a_m_s2": 0.27, "sigma_z_m": 0.10, "outlier_time_s": np.array([])}
     told = smoothing(axes, RIGHT, **given, clock_offset_s=-0.25)
     assert isinstance(told, Smoothing)

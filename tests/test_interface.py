@@ -57,7 +57,7 @@ def results(sample_log, analysis) -> dict[str, Shown]:
     evaluation = px4fuse.evaluate(f"{vio}:vio", slam)
     return {
         "Flight": analysis.flight,
-        "Comparison": analysis.comparison,
+        "Comparison": analysis,
         "Analysis": analysis,
         "AxisComparison": analysis["aisle"],
         "Consistency": analysis["aisle"].kf.consistency,
@@ -127,7 +127,7 @@ def test_findings_are_those_of_the_command_line(sample_log, analysis, tmp_path):
     found = px4fuse.find(analysis)
     assert [(f.id, f.message, f.remedy) for f in found] == typed
     assert "sigma_z" in " ".join(finding.id for finding in found)
-    assert px4fuse.find(analysis.comparison) == found
+    assert px4fuse.find(analysis) == found
 
 
 def test_a_flight_that_was_read_gives_the_same(sample_log, analysis):

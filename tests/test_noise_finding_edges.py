@@ -26,7 +26,7 @@ from findings_tools import (
 )
 from test_finding_edges import against_truth, axis, hiding, severity, statement
 
-from px4fuse.comparison.comparison import Difference
+from px4fuse.comparison.model import Difference
 from px4fuse.comparison.why import Why
 from px4fuse.comparison.why_words import STAMPS_WRONG
 from px4fuse.filter.kalman import Settings

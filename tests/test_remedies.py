@@ -11,7 +11,8 @@ import pytest
 
 from px4fuse.analysis import Analysis, explain
 from px4fuse.comparison.asked import asked_of_ekf2
-from px4fuse.comparison.comparison import AgainstTruth, Comparison, compare
+from px4fuse.comparison.comparison import compare
+from px4fuse.comparison.model import AgainstTruth, Comparison
 from px4fuse.comparison.remedy import filter_words
 from px4fuse.ekf2.model import Model
 from px4fuse.ekf2.whatif import what_if
@@ -41,7 +42,7 @@ def flown(scenario: Scenario, settings: Settings, *mistakes: str) -> Analysis:
 
 
 def errors_m(comparison: Comparison) -> float:
-    truths = [result.kf_truth for result in comparison.axes]
+    truths = [result.filters["kf"].truth for result in comparison.axes.values()]
     assert all(isinstance(truth, AgainstTruth) for truth in truths)
     return sum(truth.position_rmse_m**2 for truth in truths) ** 0.5  # type: ignore[union-attr]
 
@@ -85,7 +86,7 @@ def parameters(remedy: str) -> dict[str, float]:
 )
 def test_no_remedy_increases_the_error_to_the_truth(settings, mistakes) -> None:
     analysis = flown(AISLE, Settings(**settings), *mistakes)
-    comparison, model = analysis.comparison, analysis.ekf2_model
+    comparison, model = analysis, analysis.ekf2_model
     assert isinstance(model, Model)
     followed = 0
     for remedy in given(find(analysis)):
@@ -125,7 +126,7 @@ def test_on_a_loop_of_vio_the_truth_is_told_first_and_no_noise_is_lowered(seed, 
             assert "set EKF2_EVP_NOISE" not in one.remedy
             assert "--sigma-z" not in one.remedy
     assert isinstance(analysis.ekf2_model, Model)
-    asked = asked_of_ekf2(analysis.comparison, analysis.ekf2_model, analysis.tuning, analysis.clock)
+    asked = asked_of_ekf2(analysis, analysis.ekf2_model, analysis.tuning, analysis.clock)
     flown_with = analysis.ekf2_model.inputs.settings["EKF2_EVP_NOISE"]
     assert asked.get("EKF2_EVP_NOISE", flown_with) >= flown_with
 
@@ -157,7 +158,8 @@ def test_a_remedy_of_our_filter_that_the_truth_contradicts_is_not_given() -> Non
     assert worse.startswith("Leave it: --sigma-z 3 fits")
     truth = Unavailable("ground truth", "none", "")
     blind = replace(
-        comparison, axes=tuple(replace(a, truth=truth, kf_truth=truth) for a in comparison.axes)
+        comparison,
+        axes=tuple(replace(a, truth=truth, kf_truth=truth) for a in comparison.axes.values()),
     )
     typed = "px4fuse compare LOG --sigma-z 0.2."
     assert filter_words(blind, Settings(sigma_z_m=0.2), "--sigma-z 0.2", 0.1) == typed

@@ -650,7 +650,7 @@ def test_clean_flight_has_no_mistake(scenario):
     findings = find(unexplained(compared))
     drift = ["errors_larger_than_claimed"] if scenario.kind == "loop" else []
     assert [finding.id for finding in findings] == [*drift, "ekf2_is_a_model"]
-    for axis in compared.axes:
+    for axis in compared.axes.values():
         assert axis.kf_truth.position_rmse_m < (0.12 if scenario.kind == "aisle" else 0.7)
 
 

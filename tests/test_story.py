@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from flights import Estimator, Uwb, aisle_flight, motion, unexplained, with_noises
 
-from px4fuse.comparison.comparison import Comparison, compare
+from px4fuse.comparison.comparison import compare
+from px4fuse.comparison.model import Comparison
 from px4fuse.filter.kalman import Settings
 from px4fuse.findings import find
 from px4fuse.findings.model import Finding, moments, off_spans

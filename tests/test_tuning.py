@@ -241,7 +241,7 @@ def test_axes_are_named_and_pooled_only_where_they_share_their_times() -> None:
 
 def horizontal(flight: Flight, *, imu: bool = True, drifts: bool = False) -> AxisTuning:
     compared = compare(flight, SETTINGS)
-    axes = tuple(result.axis for result in compared.axes)
+    axes = tuple(result.axis for result in compared.axes.values())
     given = compared.flight if imu else None
     found = tune(axes, SETTINGS, (HORIZONTAL,), flight=given, drifts=drifts)[HORIZONTAL]
     assert isinstance(found, AxisTuning)
@@ -315,7 +315,7 @@ def truth_of(log: Path) -> tuple[Array, NDArray[np.bool_]]:
 @pytest.mark.parametrize("name", WITH_VISION)
 def test_the_noise_injected_is_found_in_simulated_flights(shared_logs, name: str) -> None:
     compared = compare(read_log(shared_logs / "simulated" / f"{name}.ulg"))
-    axes = tuple(result.axis for result in compared.axes)
+    axes = tuple(result.axis for result in compared.axes.values())
     found = tune(axes, compared.settings, (HORIZONTAL,), flight=compared.flight)[HORIZONTAL]
     assert found.sigma_z.value == pytest.approx(0.10, rel=0.10)
     assert found.sigma_z.low <= 0.10 <= found.sigma_z.high
@@ -325,7 +325,7 @@ def test_the_noise_injected_is_found_in_simulated_flights(shared_logs, name: str
 def test_nlos_is_found(shared_logs) -> None:
     log = shared_logs / "simulated" / "v1.16.1_aisle_nlos.ulg"
     compared = compare(read_log(log))
-    axes = tuple(result.axis for result in compared.axes)
+    axes = tuple(result.axis for result in compared.axes.values())
     found = tune(axes, compared.settings, (HORIZONTAL,), flight=compared.flight)[HORIZONTAL]
     time, outlier = truth_of(log)
     segment = compared.segment
@@ -344,7 +344,7 @@ def test_motion_capture_bounds_the_noise(shared_logs) -> None:
     assert len(logs) >= 3
     for log in logs:
         compared = compare(read_log(log))
-        axes = tuple(result.axis for result in compared.axes)
+        axes = tuple(result.axis for result in compared.axes.values())
         found = tune(axes, compared.settings, (HORIZONTAL,), flight=compared.flight)[HORIZONTAL]
         assert found.sigma_z.value is None, log.name
         assert found.sigma_z.high < 0.03, log.name

@@ -150,7 +150,7 @@ def test_time_zero_is_the_first_imu_sample(tmp_path):
     topics = read_topics(path)
     assert topics.log.boot_time_s == pytest.approx(5.0)
     assert topics.log.duration_s == pytest.approx(9.99)
-    assert topics.log.size_bytes == path.stat().st_size
+    assert topics.log.bytes == path.stat().st_size
     assert topics.log.firmware == "PX4 v1.16.0"
     assert topics.log.firmware_hash == "0123456789abcdef"
     assert topics.log.parameters == {

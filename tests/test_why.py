@@ -9,7 +9,8 @@ import pytest
 from flights import unexplained
 
 from px4fuse.analysis import Analysis, explain
-from px4fuse.comparison.comparison import Comparison, compare
+from px4fuse.comparison.comparison import compare
+from px4fuse.comparison.model import Comparison
 from px4fuse.comparison.why import Why, why_ekf2_differs
 from px4fuse.comparison.why_words import STAMPS_WRONG
 from px4fuse.ekf2.model import Model
@@ -59,41 +60,45 @@ def test_all_horizontal_axes_are_walked_and_add_up(sample: Analysis) -> None:
         assert tuple(step.name for step in axis.steps) == STEPS
         position = sum(step.position_mean_square_m2 for step in axis.steps)
         velocity = sum(step.velocity_mean_square_m2_s2 for step in axis.steps)
-        assert position + axis.position_left_m2 == pytest.approx(axis.position_total_m2, abs=1e-12)
-        assert velocity + axis.velocity_left_m2_s2 == pytest.approx(axis.velocity_total_m2_s2)
+        assert position + axis.position_left_mean_square_m2 == pytest.approx(
+            axis.position_mean_square_m2, abs=1e-12
+        )
+        assert velocity + axis.velocity_left_mean_square_m2_s2 == pytest.approx(
+            axis.velocity_mean_square_m2_s2
+        )
         assert axis.position_left_share < 0.03
 
 
 def test_the_whole_is_our_filter_against_what_ekf2_published(sample: Analysis) -> None:
     why = of(sample)
-    result = next(r for r in sample.comparison.axes if r.axis.name == "aisle")
+    result = next(r for r in sample.axes if r.axis.name == "aisle")
     ours, speed = state_at(result.replay, why.times_s)
     logged = result.ekf2_state.loc[why.times_s]
     apart = ours - logged["position_m"].to_numpy()
-    np.testing.assert_allclose(why.axis.apart_m, apart, atol=1e-9)
-    assert why.axis.position_total_m2 == pytest.approx(np.mean(apart**2))
+    np.testing.assert_allclose(why.apart_m, apart, atol=1e-9)
+    assert why.position_mean_square_m2 == pytest.approx(np.mean(apart**2))
     v = speed - logged["velocity_m_s"].to_numpy()
-    assert why.axis.velocity_total_m2_s2 == pytest.approx(np.mean(v**2))
-    assert np.mean(why.axis.left_m**2) == pytest.approx(why.axis.position_left_m2)
+    assert why.velocity_mean_square_m2_s2 == pytest.approx(np.mean(v**2))
+    assert np.mean(why.left_m**2) == pytest.approx(why.position_left_mean_square_m2)
 
 
 def test_the_words_name_the_largest_steps_with_numbers_and_moments(sample: Analysis) -> None:
     why = of(sample)
-    first, second = sorted(why.axis.steps, key=lambda step: -step.position_mean_square_m2)[:2]
+    first, second = sorted(why.steps, key=lambda step: -step.position_mean_square_m2)[:2]
     for sentence, step in zip(why.sentences[:2], (first, second), strict=True):
         assert step.name in sentence
-        assert f"{step.position_mean_square_m2 / why.axis.position_total_m2:.0%}" in sentence
+        assert f"{step.position_mean_square_m2 / why.position_mean_square_m2:.0%}" in sentence
         assert f"at {step.moved_at_s:.1f} s" in sentence
         assert f"{step.position_moved_m:.2f} m" in sentence
     assert "EKF2_EVP_NOISE" not in " ".join(why.sentences)
     said = " ".join(why.sentences)
-    assert f"equally close, {why.axis.student_rmse_to_truth_m:.3f} m (ours)" in said
+    assert f"equally close, {why.student_rmse_to_truth_m:.3f} m (ours)" in said
     assert "m/s rms apart" in said
     assert "late" not in said
 
 
 def test_settings_of_ours_are_in_the_steps_that_they_make(sample: Analysis) -> None:
-    flight = sample.comparison.flight
+    flight = sample.flight
     plain = of(sample).axis
     zero = again(sample, compare(flight, Settings(input="zero"), axes=("aisle",)))
     assert zero.axis.steps[0].name == SAMPLES
@@ -105,7 +110,9 @@ def test_settings_of_ours_are_in_the_steps_that_they_make(sample: Analysis) -> N
     assert "stamps and delay" in late.sentences[0]
     assert "ours 300 ms" in late.sentences[0]
     for other in (zero, small, late):
-        assert other.axis.position_left_m2 == pytest.approx(plain.position_left_m2, rel=0.02)
+        assert other.axis.position_left_mean_square_m2 == pytest.approx(
+            plain.position_left_mean_square_m2, rel=0.02
+        )
 
 
 def offset(clock: object, offset_s: float) -> ClockOffset:
@@ -114,7 +121,7 @@ def offset(clock: object, offset_s: float) -> ClockOffset:
 
 
 def test_a_clock_that_is_wrong_for_both_is_said_first(sample: Analysis) -> None:
-    comparison = compare(sample.comparison.flight, axes=("aisle",))
+    comparison = compare(sample.flight, axes=("aisle",))
     shared = again(sample, comparison, clock=offset(sample.clock, -0.25))
     assert shared.sentences[0].startswith("The source's stamps are late by 0.25 s for both filters")
     early = again(sample, comparison, clock=offset(sample.clock, 0.25))
@@ -123,14 +130,14 @@ def test_a_clock_that_is_wrong_for_both_is_said_first(sample: Analysis) -> None:
     unsure = replace(offset(sample.clock, 0.05), sigma_s=0.023)
     assert "early" not in again(sample, comparison, clock=unsure).sentences[0]
     # put right in ours: no longer shared
-    ours = compare(sample.comparison.flight, Settings(clock_offset_s=-0.25), axes=("aisle",))
+    ours = compare(sample.flight, Settings(clock_offset_s=-0.25), axes=("aisle",))
     for given in (offset(sample.clock, 0.0), replace(offset(sample.clock, -0.25))):
         said = again(sample, ours, clock=given).sentences
         assert "for both filters" not in " ".join(said)
 
 
 def test_only_what_was_analysed_is_walked(sample: Analysis) -> None:
-    part = compare(sample.comparison.flight, axes=("aisle",), start_s=30.0, end_s=60.0)
+    part = compare(sample.flight, axes=("aisle",), start_s=30.0, end_s=60.0)
     why = again(sample, part)
     assert why.spans[0][0] == pytest.approx(30.0, abs=0.2)
     assert why.spans[0][1] == pytest.approx(60.0, abs=0.3)
@@ -139,7 +146,7 @@ def test_only_what_was_analysed_is_walked(sample: Analysis) -> None:
 
 
 def test_without_a_horizontal_axis_or_a_model_the_reason_stands(sample: Analysis) -> None:
-    down = compare(sample.comparison.flight, axes=("down",))
+    down = compare(sample.flight, axes=("down",))
     found = why_ekf2_differs(down, sample.ekf2_model, {}, sample.clock)["down"]
     assert "horizontal" in found.reason
     none = Unavailable("EKF2 replay", "no IMU", "Record it.")
@@ -171,7 +178,10 @@ def test_the_page_shows_words_bars_and_agreement(sample: Analysis) -> None:
     for sentence in of(sample).sentences:
         assert " ".join(sentence.split()[:6]) in said
     position, velocity, over_time = page.axes
-    for axes, total in ((position, "position_total_m2"), (velocity, "velocity_total_m2_s2")):
+    for axes, total in (
+        (position, "position_mean_square_m2"),
+        (velocity, "velocity_mean_square_m2_s2"),
+    ):
         whole, *steps, left = axes.patches
         assert whole.get_width() == 100.0
         assert len(steps) == len(STEPS)
@@ -252,7 +262,7 @@ class TestFlownFlights:
         assert f"{why.coast.samples} samples in a row and coasted" in why.sentences[0]
         assert "the rejections that follow from it are" in why.sentences[0]
         assert any("through its too small noise and the rejections" in s for s in why.sentences)
-        assert why.axis.position_left_share < 0.03
+        assert why.position_left_share < 0.03
 
     def test_outliers_are_of_the_gate_and_no_noise_is_blamed(self, shared_logs) -> None:
         _, why = self.of(shared_logs, "v1.16.1_aisle_nlos")
@@ -265,9 +275,9 @@ class TestFlownFlights:
     def test_on_a_late_clock_no_delay_is_blamed(self, shared_logs) -> None:
         _, why = self.of(shared_logs, "v1.16.1_aisle_clock_late")
         assert why.sentences[0].startswith("The source's stamps are late by 0.26 s for both")
-        by_name = {step.name: step for step in why.axis.steps}
+        by_name = {step.name: step for step in why.steps}
         stamps = by_name["stamps and delay"]
-        assert abs(stamps.position_mean_square_m2) < 0.05 * why.axis.position_total_m2
+        assert abs(stamps.position_mean_square_m2) < 0.05 * why.position_mean_square_m2
         assert by_name["measurement noise"].position_moved_m < 1e-6
 
     def test_a_delay_at_its_old_default_is_the_largest_step(self, shared_logs) -> None:

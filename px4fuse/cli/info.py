@@ -82,7 +82,7 @@ def _print(console: Console, inventory: Inventory, request: ComparisonRequest) -
 
 def _facts(inventory: Inventory) -> list[tuple[str, str]]:
     log = inventory.log
-    size = f"{log.size_bytes / 1e6:.1f} MB" if log.size_bytes >= 1e5 else f"{log.size_bytes} bytes"
+    size = f"{log.bytes / 1e6:.1f} MB" if log.bytes >= 1e5 else f"{log.bytes} bytes"
     version = log.firmware if log.firmware != "unknown" else f"{log.autopilot}, version unknown"
     git = "" if log.firmware_hash == "unknown" else f" (git {log.firmware_hash[:8]})"
     hardware = "hardware unknown" if log.hardware == "unknown" else log.hardware

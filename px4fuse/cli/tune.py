@@ -14,7 +14,7 @@ from px4fuse.writing import STANDARD_OUTPUT
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from px4fuse.comparison.preparation import Prepared
+    from px4fuse.comparison.model import Comparison
     from px4fuse.filter.tuning import AxisTuning, Noise
     from px4fuse.flight import Unavailable
     from px4fuse.request import ComparisonRequest
@@ -53,7 +53,7 @@ def tune(log: Path, json_path: Path | None, **given: Any) -> None:
 
 def _print(
     console: Console,
-    compared: Prepared,
+    compared: Comparison,
     tuned: dict[str, AxisTuning | Unavailable],
     request: ComparisonRequest,
 ) -> None:

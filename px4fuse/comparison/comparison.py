@@ -2,14 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pandas as pd
+from msgspec import structs
 
 from px4fuse.arrays import Array
-from px4fuse.comparison.preparation import Prepared, prepare
+from px4fuse.comparison.model import (
+    AgainstTruth,
+    AxisComparison,
+    Comparison,
+    Difference,
+    FilterName,
+    FilterSummary,
+    UnjudgedFilter,
+    Updates,
+)
+from px4fuse.comparison.preparation import prepare
 from px4fuse.comparison.projection import (
     MIN_COMMON_SAMPLES,
     continuous_state,
@@ -18,132 +30,10 @@ from px4fuse.comparison.projection import (
     project_truth,
     project_variance,
 )
-from px4fuse.display import Shown
-from px4fuse.errors import MissingDataError
-from px4fuse.filter.consistency import Consistency, HorizontalNis, assess, assess_horizontal
+from px4fuse.filter.consistency import GATE_SIGMA, HorizontalNis, assess, assess_horizontal
 from px4fuse.filter.kalman import Replay, Settings, replay_all, state_at, variance_at
-from px4fuse.filter.signals import AISLE, Axis, Segment
-from px4fuse.flight import Ekf2, Flight, PositionTrack, Unavailable
-
-
-@dataclass(frozen=True)
-class FilterSummary:
-    """What one filter did along one axis.
-
-    Attributes
-    ----------
-    consistency : Consistency or Unavailable
-    sigma_p_median_m, sigma_v_median_m_s : float or None
-        Median standard deviations over the segment; None where not logged.
-    sigma_p_before_update_m, sigma_p_after_update_m : float or None
-        Medians just before and just after an update. For EKF2 from S and R: P⁻ = S - R,
-        P⁺ = P⁻R/S.
-    """
-
-    consistency: Consistency | Unavailable
-    sigma_p_median_m: float | None
-    sigma_v_median_m_s: float | None
-    sigma_p_before_update_m: float | None
-    sigma_p_after_update_m: float | None
-
-
-@dataclass(frozen=True)
-class Difference:
-    """Ours minus EKF2, at EKF2's own sample times."""
-
-    count: int
-    position_rmse_m: float
-    position_mean_m: float
-    position_maximum_m: float
-    velocity_rmse_m_s: float
-    velocity_mean_m_s: float
-    velocity_maximum_m_s: float
-
-
-@dataclass(frozen=True)
-class AgainstTruth:
-    """One filter against ground truth.
-
-    NEES is per component (1 is consistent); it is strongly autocorrelated within one flight, so
-    no band is stated. None where the variance or the true velocity is not logged.
-    """
-
-    count: int
-    position_rmse_m: float
-    velocity_rmse_m_s: float | None
-    nees_position_mean: float | None
-    nees_velocity_mean: float | None
-
-
-@dataclass(frozen=True, repr=False)
-class AxisComparison(Shown):
-    """Everything about one axis.
-
-    Attributes
-    ----------
-    axis : Axis
-    replay : Replay
-    kf, ekf2 : FilterSummary (ekf2 may be Unavailable)
-    ekf2_state : DataFrame or Unavailable
-        ``position_m, velocity_m_s`` in the segment, resets treated as the comparison says.
-    ekf2_variance : DataFrame or Unavailable
-        ``position_variance_m2, velocity_variance_m2_s2`` in the segment.
-    ekf2_innovations : DataFrame or Unavailable
-        Columns as :attr:`Ekf2.innovations`, in the segment, plus ``prior_variance_m2`` and
-        ``posterior_variance_m2`` (P⁻ = S - R and P⁺ = P⁻R/S, NaN where R is unknown).
-    difference : Difference or Unavailable
-    kf_truth, ekf2_truth : AgainstTruth or Unavailable
-    truth : DataFrame or Unavailable
-        ``position_m, velocity_m_s`` in the segment.
-    """
-
-    axis: Axis
-    replay: Replay
-    kf: FilterSummary
-    ekf2: FilterSummary | Unavailable
-    ekf2_state: pd.DataFrame | Unavailable
-    ekf2_variance: pd.DataFrame | Unavailable
-    ekf2_innovations: pd.DataFrame | Unavailable
-    difference: Difference | Unavailable
-    kf_truth: AgainstTruth | Unavailable
-    ekf2_truth: AgainstTruth | Unavailable
-    truth: pd.DataFrame | Unavailable
-
-
-@dataclass(frozen=True, repr=False)
-class Comparison(Shown, Prepared):
-    """The result of ``px4fuse compare``: what it began with, and what the filters did.
-
-    Attributes
-    ----------
-    flight, source, source_reason, segment, settings, lines, notes, missing
-        As :class:`Prepared` has them; notes also of EKF2.
-    axes : tuple of AxisComparison
-    horizontal_kf, horizontal_ekf2 : HorizontalNis or None
-        North and east together, None unless both were analysed.
-    """
-
-    axes: tuple[AxisComparison, ...]
-    horizontal_kf: HorizontalNis | None
-    horizontal_ekf2: HorizontalNis | None
-
-    def __getitem__(self, axis: str) -> AxisComparison:
-        """Everything about one axis, by its name.
-
-        Raises
-        ------
-        MissingDataError
-            It was not analysed.
-        """
-        names = {result.axis.name: result for result in self.axes}
-        if axis not in names:
-            raise MissingDataError(f"no axis {axis!r} here: {', '.join(names)}.")
-        return names[axis]
-
-    @property
-    def main(self) -> AxisComparison:
-        """The axis of the lab: the aisle, else the first."""
-        return next((axis for axis in self.axes if axis.axis.name == AISLE), self.axes[0])
+from px4fuse.filter.signals import Segment
+from px4fuse.flight import Ekf2, Flight, PositionTrack, Unavailable, sample_rate
 
 
 def compare(
@@ -186,7 +76,7 @@ def compare(
 
 
 def compare_prepared(
-    prepared: Prepared, progress: Callable[[str], None] = lambda _: None
+    prepared: Comparison, progress: Callable[[str], None] = lambda _: None
 ) -> Comparison:
     """:func:`compare`, with what it begins with made."""
     flight, track, segment = prepared.flight, prepared.source, prepared.segment
@@ -197,23 +87,16 @@ def compare_prepared(
         notes += ekf2.notes
         ekf2 = replace(ekf2, state=state)
     progress(", ".join(line.name for line in prepared.lines))
-    results = [
-        _compare_axis(flight, ekf2, track, segment, run)
+    axes = {
+        run.axis.name: _compare_axis(flight, ekf2, track, segment, run)
         for run in replay_all(prepared.lines, prepared.settings)
-    ]
-    return Comparison(
-        flight=flight,
-        source=track,
-        source_reason=prepared.source_reason,
-        segment=segment,
-        settings=prepared.settings,
-        lines=prepared.lines,
-        notes=tuple(notes),
-        missing=prepared.missing,
-        axes=tuple(results),
-        horizontal_kf=_horizontal(results, lambda axis: axis.replay.updates),
-        horizontal_ekf2=_horizontal(results, lambda axis: axis.ekf2_innovations),
-    )
+    }
+    both: dict[FilterName, HorizontalNis | None] = {
+        "kf": _horizontal({name: axis.replay.updates for name, axis in axes.items()}),
+        "ekf2": _horizontal({name: axis.ekf2_innovations for name, axis in axes.items()}),
+    }
+    horizontal = {name: nis for name, nis in both.items() if nis is not None}
+    return replace(prepared, notes=tuple(notes), axes=axes, horizontal=horizontal)
 
 
 def _compare_axis(
@@ -224,76 +107,107 @@ def _compare_axis(
     run: Replay,
 ) -> AxisComparison:
     """Everything about one axis; ``ekf2`` is the flight's, its resets treated."""
-    axis = run.axis
+    axis, updates = run.axis, run.updates
     truth = project_truth(flight.truth, axis, segment)
-    kf = FilterSummary(
-        consistency=assess(
-            run.updates["innovation_m"].to_numpy(),
-            run.updates["innovation_variance_m2"].to_numpy(),
-        ),
-        sigma_p_median_m=_median_sigma(run.steps["position_variance_m2"]),
-        sigma_v_median_m_s=_median_sigma(run.steps["velocity_variance_m2_s2"]),
-        sigma_p_before_update_m=_median_sigma(run.updates["prior_position_variance_m2"]),
-        sigma_p_after_update_m=_median_sigma(
-            run.steps["position_variance_m2"].reindex(run.updates.index)
-        ),
-    )
+    state: pd.DataFrame | Unavailable
+    variance: pd.DataFrame | Unavailable
+    innovations: pd.DataFrame | Unavailable
+    difference: Difference | Unavailable
     if isinstance(ekf2, Unavailable):
-        times = run.steps.index.to_numpy()
-        return AxisComparison(
-            axis=axis, replay=run, kf=kf, ekf2=ekf2, ekf2_state=ekf2, ekf2_variance=ekf2,
-            ekf2_innovations=ekf2, difference=ekf2,
-            kf_truth=kf_against_truth(run, truth, times), ekf2_truth=ekf2, truth=truth,
-        )  # fmt: skip
-    ekf2_state = project_state(ekf2.state, axis, segment)
-    ekf2_variance = project_variance(ekf2, axis, segment)
-    ekf2_innovations = project_innovations(flight, ekf2, track, axis, segment)
-    times = ekf2_state.index.to_numpy()
+        state = variance = innovations = difference = ekf2
+        times, gate = run.steps.index.to_numpy(), GATE_SIGMA
+    else:
+        state = project_state(ekf2.state, axis, segment)
+        variance = project_variance(ekf2, axis, segment)
+        innovations = project_innovations(flight, ekf2, track, axis, segment)
+        difference = _difference(run, state)
+        times, gate = state.index.to_numpy(), ekf2.gate
+    north, east, down = axis.direction.tolist()
     return AxisComparison(
+        heading_deg=axis.heading_deg,
+        direction=(north, east, down),
+        note=axis.note,
+        updates=Updates(
+            count=len(updates),
+            first_s=float(updates.index[0]),
+            last_s=float(updates.index[-1]),
+            rate_hz=sample_rate(updates) if len(updates) > 1 else None,
+            input_gap_s=run.input_gap_s,
+        ),
+        filters={
+            "kf": _summary(
+                updates,
+                run.steps,
+                updates["prior_position_variance_m2"],
+                run.steps["position_variance_m2"].reindex(updates.index),
+                kf_against_truth(run, truth, times),
+            ),
+            "ekf2": _of_ekf2(
+                variance, innovations, _ekf2_against_truth(state, variance, truth), gate
+            ),
+        },
+        difference=difference,
+        rejected_share=_rejected_share(innovations),
         axis=axis,
         replay=run,
-        kf=kf,
-        ekf2=_ekf2_summary(ekf2, ekf2_variance, ekf2_innovations),
-        ekf2_state=ekf2_state,
-        ekf2_variance=ekf2_variance,
-        ekf2_innovations=ekf2_innovations,
-        difference=_difference(run, ekf2_state),
-        kf_truth=kf_against_truth(run, truth, times),
-        ekf2_truth=_ekf2_against_truth(ekf2_state, ekf2_variance, truth),
+        ekf2_state=state,
+        ekf2_variance=variance,
+        ekf2_innovations=innovations,
         truth=truth,
     )
 
 
-def _median_sigma(variance: pd.Series) -> float | None:
-    variance = variance.dropna()
-    return float(np.sqrt(variance.median())) if len(variance) else None
+def _of_ekf2(
+    variance: pd.DataFrame | Unavailable,
+    innovations: pd.DataFrame | Unavailable,
+    truth: AgainstTruth | Unavailable,
+    gate: float,
+) -> FilterSummary | UnjudgedFilter:
+    before = after = None
+    if isinstance(innovations, pd.DataFrame):
+        before, after = innovations["prior_variance_m2"], innovations["posterior_variance_m2"]
+    return _summary(innovations, variance, before, after, truth, gate)
 
 
-def _ekf2_summary(
-    ekf2: Ekf2, variance: pd.DataFrame | Unavailable, innovations: pd.DataFrame | Unavailable
-) -> FilterSummary:
-    consistency: Consistency | Unavailable
-    before = after = sigma_p = sigma_v = None
-    if isinstance(innovations, Unavailable):
-        consistency = innovations
-    else:
-        consistency = assess(
-            innovations["innovation_m"].to_numpy(),
-            innovations["innovation_variance_m2"].to_numpy(),
-            ekf2.gate,
-        )
-        before = _median_sigma(innovations["prior_variance_m2"])
-        after = _median_sigma(innovations["posterior_variance_m2"])
+def _summary(
+    innovations: pd.DataFrame | Unavailable,
+    variance: pd.DataFrame | Unavailable,
+    before: pd.Series | None,
+    after: pd.Series | None,
+    truth: AgainstTruth | Unavailable,
+    gate: float = GATE_SIGMA,
+) -> FilterSummary | UnjudgedFilter:
+    """What a filter did, from its innovations, its variances, and those around each update."""
+    position = velocity = None
     if isinstance(variance, pd.DataFrame):
-        sigma_p = _median_sigma(variance["position_variance_m2"])
-        sigma_v = _median_sigma(variance["velocity_variance_m2_s2"])
-    return FilterSummary(
-        consistency=consistency,
-        sigma_p_median_m=sigma_p,
-        sigma_v_median_m_s=sigma_v,
-        sigma_p_before_update_m=before,
-        sigma_p_after_update_m=after,
-    )
+        position, velocity = variance["position_variance_m2"], variance["velocity_variance_m2_s2"]
+    more: dict[str, Any] = {
+        "sigma_p_median_m": _median_sigma(position),
+        "sigma_v_median_m_s": _median_sigma(velocity),
+        "sigma_p_before_update_m": _median_sigma(before),
+        "sigma_p_after_update_m": _median_sigma(after),
+        "truth": truth,
+    }
+    if isinstance(innovations, Unavailable):
+        return UnjudgedFilter(**structs.asdict(innovations), **more)
+    nu, s = innovations["innovation_m"], innovations["innovation_variance_m2"]
+    statement = assess(nu.to_numpy(), s.to_numpy(), gate)
+    if isinstance(statement, Unavailable):
+        return UnjudgedFilter(**structs.asdict(statement), **more)
+    return FilterSummary(**structs.asdict(statement), **more)
+
+
+def _rejected_share(innovations: pd.DataFrame | Unavailable) -> float | None:
+    if isinstance(innovations, Unavailable):
+        return None
+    known = innovations["rejected"].dropna()
+    return float(known.mean()) if len(known) else None
+
+
+def _median_sigma(variance: pd.Series | None) -> float | None:
+    if variance is None or (known := variance.dropna()).empty:
+        return None
+    return float(np.sqrt(known.median()))
 
 
 def _difference(run: Replay, ekf2_state: pd.DataFrame) -> Difference | Unavailable:
@@ -333,8 +247,12 @@ def kf_against_truth(
 
 
 def _ekf2_against_truth(
-    state: pd.DataFrame, variance: pd.DataFrame | Unavailable, truth: pd.DataFrame | Unavailable
+    state: pd.DataFrame | Unavailable,
+    variance: pd.DataFrame | Unavailable,
+    truth: pd.DataFrame | Unavailable,
 ) -> AgainstTruth | Unavailable:
+    if isinstance(state, Unavailable):
+        return state
     if isinstance(truth, Unavailable):
         return truth
     columns = state["position_m"].to_numpy(), state["velocity_m_s"].to_numpy()
@@ -390,16 +308,12 @@ def _against_truth(
     )
 
 
-def _horizontal(
-    results: list[AxisComparison], frame_of: Callable[[AxisComparison], pd.DataFrame | Unavailable]
-) -> HorizontalNis | None:
-    frames = {}
-    for result in results:
-        frame = frame_of(result)
-        if isinstance(frame, pd.DataFrame):
-            frames[result.axis.name] = frame[["innovation_m", "innovation_variance_m2"]]
-    if not {"north", "east"} <= frames.keys():
+def _horizontal(frames: Mapping[str, pd.DataFrame | Unavailable]) -> HorizontalNis | None:
+    columns = ["innovation_m", "innovation_variance_m2"]
+    pair = [frame[columns] for name in ("north", "east")
+            if isinstance(frame := frames.get(name), pd.DataFrame)]  # fmt: skip
+    if len(pair) < 2:
         return None
     # only updates that both axes have, at the very same times
-    both = pd.concat([frames["north"], frames["east"]], axis=1, join="inner").to_numpy().T
+    both = pd.concat(pair, axis=1, join="inner").to_numpy().T
     return assess_horizontal((both[0], both[1]), (both[2], both[3]))

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from px4fuse.comparison.drift import may_drift, with_drift
-from px4fuse.comparison.preparation import Prepared
+from px4fuse.comparison.model import Comparison
 from px4fuse.filter.clock import ClockOffset, estimate_clock_offset
 from px4fuse.filter.fitting import Noises
 from px4fuse.filter.heading import HeadingError, heading_error
@@ -35,13 +35,13 @@ def size(noise: Noise, otherwise: float) -> float:
     return noise.value or noise.high or otherwise
 
 
-def tuned_horizontally(comparison: Prepared, made: Made | None = None) -> Tuning:
+def tuned_horizontally(comparison: Comparison, made: Made | None = None) -> Tuning:
     """The horizontal noises alone, which is what the clock estimate needs; ``made`` as there."""
     return tuned(comparison, (HORIZONTAL,), made=made)
 
 
 def tuned(
-    comparison: Prepared,
+    comparison: Comparison,
     names: tuple[str, ...] | None = None,
     progress: Progress = silent,
     made: Made | None = None,
@@ -50,7 +50,7 @@ def tuned(
 
     Parameters
     ----------
-    comparison : Prepared
+    comparison : Comparison
     names : tuple of str, optional
         Axis names and "horizontal"; by default all that there are.
     progress : callable
@@ -72,7 +72,7 @@ def tuned(
 
 
 def clock_offset(
-    comparison: Prepared,
+    comparison: Comparison,
     tuning: Tuning,
     progress: Progress = silent,
     made: Made | None = None,
@@ -81,7 +81,7 @@ def clock_offset(
 
     Parameters
     ----------
-    comparison : Prepared
+    comparison : Comparison
     tuning : mapping
         Its measurement noise and outliers are used where it has them.
     progress : callable
@@ -117,7 +117,7 @@ def clock_offset(
 
 
 def turned_frame(
-    comparison: Prepared,
+    comparison: Comparison,
     tuning: Tuning,
     clock: ClockOffset | Unavailable,
     progress: Progress = silent,
@@ -134,7 +134,7 @@ def turned_frame(
         comparison.segment,
         comparison.settings,
         sigma_z_m,
-        clock.offset_s if isinstance(clock, ClockOffset) and clock.determinable else 0.0,
+        clock.remaining_s if isinstance(clock, ClockOffset) and clock.determinable else 0.0,
     )
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.arrays import Array
-from px4fuse.comparison.comparison import Comparison
+from px4fuse.comparison.model import Comparison
 from px4fuse.flight import Ekf2, FlightMode, Unavailable
 
 # A source is silent where it leaves out this long, and so many of its intervals: jitter and single
@@ -80,7 +80,7 @@ def happened(comparison: Comparison) -> Events:
     modes = () if isinstance(flight.modes, Unavailable) else flight.modes
     resets = flight.ekf2.resets if isinstance(flight.ekf2, Ekf2) else ()
     return Events(
-        gaps=source_gaps(comparison.axes[0].axis.measurement_time_s, comparison.source.rate_hz),
+        gaps=source_gaps(comparison.lines[0].measurement_time_s, comparison.source.rate_hz),
         dropouts=inside(
             (lost.start_s, lost.start_s + lost.duration_s) for lost in flight.log.dropouts
         ),
@@ -95,7 +95,7 @@ def happened(comparison: Comparison) -> Events:
         resets_s=tuple(sorted({reset.time_s for reset in resets if low <= reset.time_s <= high})),
         rejected_s={
             result.axis.name: frame.index[frame["rejected"] > 0].to_numpy()
-            for result in comparison.axes
+            for result in comparison.axes.values()
             if isinstance(frame := result.ekf2_innovations, pd.DataFrame)
         },
     )

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
 
-from px4fuse.display import brief
+from px4fuse.comparison.model import Comparison
 from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.filter.kalman import Settings
-from px4fuse.filter.signals import MIN_MEASUREMENTS, Axis, Segment, make_axes
+from px4fuse.filter.signals import MIN_MEASUREMENTS, Segment, make_axes
 from px4fuse.flight import Flight, PositionTrack, Truth, Unavailable
 
 # The GPS rung is taken only when asked for.
@@ -33,36 +33,6 @@ NOT_ITS_OWN_TRUTH = Unavailable(
 )
 
 
-@dataclass(frozen=True)
-class Prepared:
-    """What a comparison begins with: everything but the filter's run.
-
-    Attributes
-    ----------
-    flight : Flight
-    source : PositionTrack
-    source_reason : str
-    segment : Segment
-    settings : Settings
-        As used: ``input`` is "zero" where the log has no acceleration.
-    lines : tuple of Axis
-    notes : tuple of str
-        Choices made on the way.
-    missing : tuple of Unavailable
-    """
-
-    flight: Flight
-    source: PositionTrack
-    source_reason: str
-    segment: Segment
-    settings: Settings
-    lines: tuple[Axis, ...]
-    notes: tuple[str, ...]
-    missing: tuple[Unavailable, ...]
-
-    __repr__ = brief
-
-
 def prepare(
     flight: Flight,
     settings: Settings | None = None,
@@ -73,7 +43,7 @@ def prepare(
     start_s: float | None = None,
     end_s: float | None = None,
     input_required: bool = False,
-) -> Prepared:
+) -> Comparison:
     """Choose the source, the segment and the axes, with the arguments of :func:`compare`.
 
     Parameters
@@ -103,7 +73,7 @@ def prepare(
         notes.append(f"no acceleration input ({acceleration.reason}): constant velocity was used")
         if acceleration not in missing:
             missing.append(acceleration)
-    return Prepared(flight, track, reason, segment, settings, lines, tuple(notes), tuple(missing))
+    return Comparison(flight, track, reason, segment, settings, lines, tuple(notes), tuple(missing))
 
 
 def choose_source(flight: Flight, name: str | None = None) -> tuple[PositionTrack, str]:
@@ -131,7 +101,7 @@ def choose_source(flight: Flight, name: str | None = None) -> tuple[PositionTrac
         for track in flight.positions:
             if track.name == name:
                 return track, "chosen with --position-source"
-        looked = {missing.what.split()[-1]: missing for missing in flight.missing}
+        looked = {missing.source: missing for missing in flight.missing}
         reason = looked[name].reason if name in looked else "no such source"
         raise MissingDataError(
             f"{flight.log.name}: position source {name}: {reason}. This log has: {have}."
@@ -169,8 +139,11 @@ def _ladder_reason(flight: Flight, track: PositionTrack) -> str:
     if track.rung == 1:
         return "given with --position"
     whence = f" (from {track.log})" if track.log and track.log != flight.log.name else ""
-    missing = [part.what.removeprefix("position source ") for part in flight.missing]
-    lacking = [name for name in missing if LADDER.get(name, LAST_AUTOMATIC_RUNG) < track.rung]
+    lacking = [
+        part.source
+        for part in flight.missing
+        if LADDER.get(part.source, LAST_AUTOMATIC_RUNG) < track.rung
+    ]
     if not lacking:
         return f"the best source: logged as it arrived{whence}"
     return f"the best that this log has{whence}; no usable {', '.join(lacking)}"

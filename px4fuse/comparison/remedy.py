@@ -10,7 +10,8 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from px4fuse.comparison.comparison import AgainstTruth, Comparison, compare, kf_against_truth
+from px4fuse.comparison.comparison import compare, kf_against_truth
+from px4fuse.comparison.model import AgainstTruth, Comparison
 from px4fuse.ekf2.model import Model
 from px4fuse.ekf2.parameters import PARAMETERS
 from px4fuse.ekf2.whatif import Summary, what_if
@@ -128,9 +129,9 @@ def filter_errors_m(comparison: Comparison, changed: Settings) -> tuple[float, f
     Root of the sum of the mean squares of all axes but the aisle, which is made of the others.
     None without a truth.
     """
-    names = {result.axis.name for result in comparison.axes}
-    results = [r for r in comparison.axes if r.axis.name != AISLE or names == {AISLE}]
-    before = [result.kf_truth for result in results]
+    names = set(comparison.axes)
+    results = [r for r in comparison.axes.values() if r.axis.name != AISLE or names == {AISLE}]
+    before = [result.filters["kf"].truth for result in results]
     if changed.clock_offset_s == comparison.settings.clock_offset_s:
         runs = replay_all(tuple(result.axis for result in results), changed)
         after = []
@@ -148,7 +149,7 @@ def filter_errors_m(comparison: Comparison, changed: Settings) -> tuple[float, f
             start_s=comparison.segment.start_s,
             end_s=comparison.segment.end_s,
         )
-        after = [result.kf_truth for result in again.axes]
+        after = [result.filters["kf"].truth for result in again.axes.values()]
     first, second = (
         [error.position_rmse_m for error in errors if isinstance(error, AgainstTruth)]
         for errors in (before, after)

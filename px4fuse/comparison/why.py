@@ -6,49 +6,59 @@ The steps are those of :mod:`px4fuse.ekf2.walk`, from our filter as it was set t
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
+from msgspec import structs
 
 from px4fuse.arrays import Array
 from px4fuse.comparison.asked import tuned_noise_m
-from px4fuse.comparison.comparison import AxisComparison, Comparison
+from px4fuse.comparison.model import AxisComparison, Comparison
 from px4fuse.comparison.why_words import Facts, Outside, sentences
 from px4fuse.display import Shown
 from px4fuse.ekf2.agreement import judged_from, settled
 from px4fuse.ekf2.model import Model
-from px4fuse.ekf2.walk import WHAT, AxisWalk, Coast, Line, Student, walk
+from px4fuse.ekf2.walk import WHAT, Coast, Line, OurFilter, Walked, walk
 from px4fuse.filter.clock import ClockOffset
 from px4fuse.filter.kalman import state_at
 from px4fuse.filter.tuning import AxisTuning
 from px4fuse.flight import Ekf2, Unavailable
+from px4fuse.record import Span
 
 
-@dataclass(frozen=True, repr=False)
-class Why(Shown):
+class WhySteps(Walked, frozen=True, kw_only=True):
     """Why EKF2 differs, along one axis.
 
     Attributes
     ----------
-    axis : AxisWalk
+    spans_s : tuple of (float, float)
+        Parts of the flight that the means are over.
     coast : Coast or None
-    times_s : ndarray
-        EKF2's own sample times that the means are over.
-    spans : tuple of (float, float)
-        Parts of the flight that these are of.
     outside : Outside or None
         None where the walk covers the segment.
     sentences : tuple of str
         What made the difference, in the order of their weight.
     """
 
-    axis: AxisWalk
-    coast: Coast | None
-    times_s: Array
-    spans: tuple[tuple[float, float], ...]
-    outside: Outside | None
+    spans_s: tuple[Span, ...]
+    coast: Coast | None = None
+    outside: Outside | None = None
     sentences: tuple[str, ...]
+
+
+class Why(Shown, WhySteps, frozen=True, kw_only=True, eq=False):
+    """:class:`WhySteps`, with the tracks.
+
+    Attributes
+    ----------
+    times_s, apart_m, left_m : ndarray
+        EKF2's own sample times, and how far our filter and the model are from EKF2's position.
+    """
+
+    written_as = WhySteps
+    times_s: Array
+    apart_m: Array
+    left_m: Array
 
 
 def why_ekf2_differs(
@@ -74,7 +84,7 @@ def why_ekf2_differs(
     mapping from axis name to Why or Unavailable
         Of down only where nothing else was compared: the model is of horizontal position.
     """
-    results = {r.axis.name: r for r in comparison.axes if r.axis.name != "down"}
+    results = {r.axis.name: r for r in comparison.axes.values() if r.axis.name != "down"}
     if not results:
         reason = "the model of EKF2 is of horizontal position"
         return {"down": Unavailable(WHAT, reason, "Analyse a horizontal axis too (--axis).")}
@@ -82,7 +92,7 @@ def why_ekf2_differs(
         return {name: Unavailable(WHAT, model.reason, model.remedy) for name in results}
     same_source = comparison.source.name == model.inputs.vision.source
     settings = comparison.settings
-    student = Student(
+    student = OurFilter(
         sigma_a_m_s2=settings.sigma_a_m_s2,
         sigma_z_m=settings.sigma_z_m,
         dt_s=settings.dt_s,
@@ -100,10 +110,10 @@ def why_ekf2_differs(
     for name, axis in walked.axes.items():
         outside = _outside(results[name], spans)
         found[name] = Why(
-            axis=axis,
+            **structs.asdict(axis),
             coast=walked.coast,
             times_s=walked.times_s,
-            spans=spans,
+            spans_s=spans,
             outside=outside,
             sentences=sentences(name, axis, facts, outside),
         )

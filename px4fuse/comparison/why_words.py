@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from px4fuse.comparison.asked import noise_used_m
-from px4fuse.comparison.comparison import Comparison
+from px4fuse.comparison.model import Comparison
 from px4fuse.ekf2.model import Model
 from px4fuse.ekf2.walk import (
     ATTITUDE,
@@ -26,6 +26,7 @@ from px4fuse.ekf2.walk import (
 from px4fuse.filter.clock import ClockOffset
 from px4fuse.filter.signals import AISLE
 from px4fuse.flight import Unavailable
+from px4fuse.record import NotNegative, Record
 
 # A noise this many times below what the data ask for is too small: as of EKF2's findings
 TOO_SMALL = 1.25
@@ -42,8 +43,7 @@ NOTABLE = 0.05
 FAR_M, FAR_TIMES = 0.5, 3.0
 
 
-@dataclass(frozen=True)
-class Outside:
+class Outside(Record, frozen=True):
     """Where the walk does not lead: parts of the segment in which EKF2 started or did not fuse.
 
     Attributes
@@ -54,7 +54,7 @@ class Outside:
         When.
     """
 
-    maximum_m: float
+    maximum_m: NotNegative
     at_s: float
 
 
@@ -122,7 +122,7 @@ def sentences(name: str, axis: AxisWalk, facts: Facts, outside: Outside | None) 
         parts.sort(key=lambda part: len(part.names) == 1)
     said = _clock(facts)
     said.append(_first(name, axis, parts[0], facts))
-    others = [p for p in parts[1:] if p.square_m2 >= NOTABLE * axis.position_total_m2]
+    others = [p for p in parts[1:] if p.square_m2 >= NOTABLE * axis.position_mean_square_m2]
     if others:
         share = _share(others[0], axis)
         said.append(f"Then {others[0].label} ({share}): {_because(others[0], facts)}.")
@@ -164,7 +164,7 @@ def the(axis: str) -> str:
 
 
 def _share(part: _Part, axis: AxisWalk) -> str:
-    return f"{part.square_m2 / axis.position_total_m2:.0%} of the mean square"
+    return f"{part.square_m2 / axis.position_mean_square_m2:.0%} of the mean square"
 
 
 def _first(name: str, axis: AxisWalk, part: _Part, facts: Facts) -> str:
@@ -223,8 +223,8 @@ def _stamps(facts: Facts) -> str:
     words = f"EKF2 takes a position to be {delay:g} ms older than its stamp (EKF2_EV_DELAY), ours "
     words += f"{0.0 - own * 1e3:.0f} ms"
     if isinstance(facts.clock, ClockOffset) and facts.clock.determinable:
-        low, high = (-(own + end) * 1e3 for end in facts.clock.interval_s[::-1])
-        asked = -(own + facts.clock.offset_s) * 1e3
+        low, high = (-end * 1e3 for end in facts.clock.interval_s[::-1])
+        asked = -facts.clock.offset_s * 1e3
         words += f", and the data ask for {asked:.0f} ms (95 % {low:.0f} to {high:.0f})"
     return words
 
@@ -272,21 +272,23 @@ BECAUSE: Mapping[str, Callable[[Facts], str]] = {
 
 
 def _velocity(axis: AxisWalk, parts: list[_Part]) -> str:
-    total = axis.velocity_total_m2_s2
+    total = axis.velocity_mean_square_m2_s2
     first = max(parts, key=lambda part: part.speed_square_m2_s2)
     share = first.speed_square_m2_s2 / total
     # more than all of it makes good what an earlier step did: no cause by itself
     mostly = f", in velocity mostly by {first.label} ({share:.0%})" if share <= 1.0 else ""
-    position = axis.position_total_m2
+    position = axis.position_mean_square_m2
     return (
         f"Where EKF2 was replayed they are {np.sqrt(position):.3f} m and {np.sqrt(total):.3f} m/s "
-        f"rms apart{mostly}; the model leaves {axis.position_left_m2 / position:.1%} of that in "
-        f"position and {axis.velocity_left_m2_s2 / total:.1%} in velocity unexplained."
+        f"rms apart{mostly}; "
+        f"the model leaves {axis.position_left_mean_square_m2 / position:.1%} "
+        f"of that in position and {axis.velocity_left_mean_square_m2_s2 / total:.1%} in velocity "
+        "unexplained."
     )
 
 
 def _truth(axis: AxisWalk, facts: Facts) -> list[str]:
-    ours, ekf2 = axis.student_rmse_to_truth_m, axis.logged_rmse_to_truth_m
+    ours, ekf2 = (axis.position_rmse_to_truth_m[name] for name in ("kf", "ekf2"))
     if isinstance(ours, Unavailable) or isinstance(ekf2, Unavailable):
         return []
     if abs(ours - ekf2) <= EQUALLY_CLOSE * max(ours, ekf2):
@@ -317,9 +319,9 @@ def _clock(facts: Facts) -> list[str]:
         return []
     own = facts.comparison.settings.clock_offset_s
     delay_s = facts.model.inputs.settings["EKF2_EV_DELAY"] * 1e-3
-    both = own + clock.offset_s
+    both = clock.offset_s
     known_s = max(CLOCK_S, clock.chance_s)
-    if min(abs(clock.offset_s), abs(both + delay_s)) < known_s or abs(own + delay_s) > CLOCK_S:
+    if min(abs(clock.remaining_s), abs(both + delay_s)) < known_s or abs(own + delay_s) > CLOCK_S:
         return []
     return [
         f"{STAMPS_WRONG} {'late' if both < 0 else 'early'} by {abs(both):.2f} s for both "

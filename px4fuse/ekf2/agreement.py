@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pandas as pd
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from px4fuse.ekf2.replay import HORIZONTAL, Agreement, AxisAgreement, Ekf2Replay
@@ -67,9 +66,20 @@ def agreement_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavai
     by_model = model["rejected"].to_numpy() > 0
     shares = float(by_log.mean()), float(by_model.mean())
     good, reason = _verdict(axes, *shares)
+    north, east = (axes[axis] for axis in HORIZONTAL)
+    apart_m = np.hypot(north.position_rms_difference_m, east.position_rms_difference_m)
     return Agreement(
-        axes, len(log), *shares, float(np.mean(by_log == by_model)), good, reason
-    )  # fmt: skip
+        north=north,
+        east=east,
+        ev_pos=dict(axes),
+        samples=len(log),
+        rejected_share_logged=shares[0],
+        rejected_share_replayed=shares[1],
+        decisions_same=float(np.mean(by_log == by_model)),
+        published_rms_difference_m=float(apart_m),
+        good=good,
+        reason=reason,
+    )
 
 
 def logged_innovations(ekf2: Ekf2) -> pd.DataFrame:
@@ -87,7 +97,7 @@ def logged_innovations(ekf2: Ekf2) -> pd.DataFrame:
 
 def judged_from(replay: Ekf2Replay) -> tuple[tuple[float, float], ...]:
     """Parts of the replay that are judged: each stretch without its beginning."""
-    return tuple((start + SETTLING_S, end) for start, end in replay.stretches)
+    return tuple((start + SETTLING_S, end) for start, end in replay.stretches_s)
 
 
 def settled(times: Array, judged: tuple[tuple[float, float], ...]) -> NDArray[np.bool_]:
@@ -121,7 +131,7 @@ def _axis(
     at = HORIZONTAL.index(axis)
     return AxisAgreement(
         innovation_correlation=float(np.corrcoef(nu, nu_log)[0, 1]),
-        innovation_rms_difference_m=_rms(nu - nu_log),
+        innovation_rms_difference=_rms(nu - nu_log),
         s_ratio_median=float(middle),
         s_ratio_p5=float(low),
         s_ratio_p95=float(high),

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
+from msgspec import structs
 from numpy.typing import NDArray
 
 from px4fuse.display import brief
@@ -131,7 +132,7 @@ def open_model(flight: Flight) -> Model | Unavailable:
         obeyed = agreement_with_log(flight, obedient)
         if isinstance(obeyed, Agreement):
             agreement = with_obedient(agreement, obeyed)
-    return Model(flight, inputs, legs, replace(flown, agreement=agreement), agreement)
+    return Model(flight, inputs, legs, structs.replace(flown, agreement=agreement), agreement)
 
 
 def replay_settings(
@@ -161,7 +162,7 @@ def replay_settings(
     flown = model.inputs.settings
     variants = [Variant({**flown, **change}) for change in changes]
     return tuple(
-        replace(replay, agreement=model.agreement)
+        structs.replace(replay, agreement=model.agreement)
         for replay in replay_variants(model, variants, changes)
     )
 
@@ -243,7 +244,7 @@ def _assemble(
         updates=pd.concat(updates),
         delayed=pd.concat(delayed),
         published=pd.concat(published),
-        stretches=tuple(
+        stretches_s=tuple(
             (float(part.stretch.time_s[0]), float(part.stretch.time_s[-1])) for part in runs
         ),
         source=inputs.vision.source,

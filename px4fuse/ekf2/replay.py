@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import pandas as pd
 
 from px4fuse.display import brief
 from px4fuse.flight import AxisName
+from px4fuse.record import Correlation, Count, NotNegative, Positive, Record, Share, Span
 
 HORIZONTAL: tuple[AxisName, AxisName] = ("north", "east")
 UPDATE_COLUMNS = [
@@ -19,14 +19,14 @@ UPDATE_COLUMNS = [
 ]  # fmt: skip
 
 
-@dataclass(frozen=True)
-class AxisAgreement:
+class AxisAgreement(Record, frozen=True, kw_only=True):
     """Replay as flown against log, along north or east.
 
     Attributes
     ----------
     innovation_correlation : float
-    innovation_rms_difference_m : float
+    innovation_rms_difference : float
+        In the aid's unit: m for a position.
     s_ratio_median, s_ratio_p5, s_ratio_p95 : float
         Replayed over logged innovation variance.
     nis_mean_logged, nis_mean_replayed : float
@@ -34,56 +34,90 @@ class AxisAgreement:
         Of what is published.
     """
 
-    innovation_correlation: float
-    innovation_rms_difference_m: float
-    s_ratio_median: float
-    s_ratio_p5: float
-    s_ratio_p95: float
-    nis_mean_logged: float
-    nis_mean_replayed: float
-    position_rms_difference_m: float
-    velocity_rms_difference_m_s: float
+    innovation_correlation: Correlation
+    innovation_rms_difference: NotNegative
+    s_ratio_median: Positive
+    s_ratio_p5: Positive
+    s_ratio_p95: Positive
+    nis_mean_logged: NotNegative
+    nis_mean_replayed: NotNegative
+    position_rms_difference_m: NotNegative
+    velocity_rms_difference_m_s: NotNegative
 
 
-@dataclass(frozen=True)
-class Agreement:
+class Agreement(Record, frozen=True, kw_only=True):
     """How well the replay as flown agrees with what EKF2 logged.
 
     Attributes
     ----------
-    axes : mapping from "north" and "east" to AxisAgreement
+    north, east : AxisAgreement
+        Of external vision's position.
+    ev_pos : mapping from "north" and "east" to AxisAgreement
+        The same by the name of the aid.
     samples : int
         Logged innovations compared, all but those of each stretch's first seconds
         (:data:`~px4fuse.ekf2.stretches.SETTLING_S`).
     rejected_share_logged, rejected_share_replayed : float
         Of those.
-    same_share : float
-        Of those that both reject or both do not.
+    decisions_same : float
+        Share of those that both reject or both do not.
+    published_rms_difference_m : float
+        Of the horizontal position that is published, replay minus log.
     good : bool
         Whether anything may be concluded from a replay of this log.
     reason : str
         One sentence: why, or why not.
     """
 
-    axes: Mapping[str, AxisAgreement]
-    samples: int
-    rejected_share_logged: float
-    rejected_share_replayed: float
-    same_share: float
+    north: AxisAgreement
+    east: AxisAgreement
+    ev_pos: Mapping[str, AxisAgreement]
+    samples: Count
+    rejected_share_logged: Share
+    rejected_share_replayed: Share
+    decisions_same: Share
+    published_rms_difference_m: NotNegative
     good: bool
     reason: str
 
+    @property
+    def axes(self) -> dict[str, AxisAgreement]:
+        """By axis."""
+        return {"north": self.north, "east": self.east}
 
-@dataclass(frozen=True)
-class Ekf2Replay:
+
+class Replayed(Record, frozen=True, kw_only=True, omit_defaults=False):
+    """EKF2 replayed from the log.
+
+    Attributes
+    ----------
+    source : str
+        Position track that it was fed with.
+    stretches_s : tuple of (float, float)
+        Parts of the flight that were replayed, each started from the log.
+    settings : mapping
+        All parameters of the model in force, by PX4 name, in PX4's units.
+    late, lost : int
+        Vision samples that arrived after the horizon had passed them: fused late, and never.
+    agreement : Agreement or None
+        Of the replay as flown with the log; None only while that is being made.
+    """
+
+    source: str
+    stretches_s: tuple[Span, ...]
+    settings: Mapping[str, float]
+    late: Count = 0
+    lost: Count = 0
+    agreement: Agreement | None = None
+
+
+class Ekf2Replay(Replayed, frozen=True, kw_only=True, eq=False):
     """EKF2 as the model replays it with one setting.
 
     Attributes
     ----------
-    settings : mapping
-        All parameters of the model in force, by PX4 name, in PX4's units.
     changed : mapping
-        Those that differ from the log's on request.
+        Parameters that differ from the log's on request.
     updates : DataFrame, shape (m, 14)
         Per vision sample, by the time of measurement as EKF2 takes it (stamp - delay - half a
         step): innovation (measurement minus state) and its variance S, north and east; 1 or 0
@@ -93,25 +127,12 @@ class Ekf2Replay:
         Position and velocity at the fusion horizon at the end of each step (m, m/s, NED).
     published : DataFrame, shape (n, 6)
         What EKF2 publishes then, by its output predictor.
-    stretches : tuple of (float, float)
-        Parts of the flight that were replayed, each started from the log.
-    source : str
-        Position track that it was fed with.
-    late, lost : int
-        Vision samples that arrived after the horizon had passed them: fused late, and never.
-    agreement : Agreement or None
-        Of the replay as flown with the log; None only while that is being made.
     """
 
-    settings: Mapping[str, float]
+    written_as = Replayed
     changed: Mapping[str, float]
     updates: pd.DataFrame
     delayed: pd.DataFrame
     published: pd.DataFrame
-    stretches: tuple[tuple[float, float], ...]
-    source: str
-    late: int = 0
-    lost: int = 0
-    agreement: Agreement | None = None
 
     __repr__ = brief

@@ -28,6 +28,7 @@ from px4fuse.ekf2.model import Model, delayed_variants
 from px4fuse.ekf2.recursion import Variant
 from px4fuse.ekf2.replay import Ekf2Replay
 from px4fuse.flight import POSITION_COLUMNS, VELOCITY_COLUMNS, Ekf2, Truth, Unavailable
+from px4fuse.record import Count, NotNegative, Record
 
 Array = NDArray[np.float64]
 
@@ -47,7 +48,7 @@ STEPS = (SAMPLES, STAMPS, NOISE, BIASES, PROCESS, ATTITUDE, GATE, OUTPUT)
 
 
 @dataclass(frozen=True)
-class Student:
+class OurFilter:
     """Settings of the student's two-state filter.
 
     Attributes
@@ -86,8 +87,7 @@ class Line:
         return self.north * north + self.east * east
 
 
-@dataclass(frozen=True)
-class Step:
+class Step(Record, frozen=True, kw_only=True):
     """One change on the way.
 
     Attributes
@@ -100,55 +100,65 @@ class Step:
         How far it moves the position at most, along this axis.
     moved_at_s : float
         When.
-    position_rmse_to_truth_m : float or Unavailable
-        Of the track after it.
+    position_rmse_to_truth_m : float or None
+        Of the track after it; None without truth.
     """
 
     name: str
     position_mean_square_m2: float
     velocity_mean_square_m2_s2: float
-    position_moved_m: float
+    position_moved_m: NotNegative
     moved_at_s: float
-    position_rmse_to_truth_m: float | Unavailable
+    position_rmse_to_truth_m: NotNegative | None = None
 
 
-@dataclass(frozen=True)
-class AxisWalk:
-    """The way along one axis: ``total = sum of the steps + left``, in mean square.
+class Walked(Record, frozen=True, kw_only=True):
+    """The way along one axis: the whole is the sum of the steps and what is left, in mean square.
 
     Attributes
     ----------
+    count : int
+        EKF2's own samples that the means are over.
+    position_mean_square_m2, velocity_mean_square_m2_s2 : float
+        Difference of the student's filter to the logged EKF2.
     steps : tuple of Step
-    position_total_m2, velocity_total_m2_s2 : float
-        Mean square difference of the student's filter to the logged EKF2.
-    position_left_m2, velocity_left_m2_s2 : float
-        Of the model to the logged EKF2.
-    student_rmse_to_truth_m, logged_rmse_to_truth_m : float or Unavailable
+    position_left_mean_square_m2, velocity_left_mean_square_m2_s2 : float
+        Difference of the model to the logged EKF2.
+    position_rmse_to_truth_m : mapping from "kf" and "ekf2" to float or Unavailable
+    """
+
+    count: Count
+    position_mean_square_m2: NotNegative
+    velocity_mean_square_m2_s2: NotNegative
+    steps: tuple[Step, ...]
+    position_left_mean_square_m2: NotNegative
+    velocity_left_mean_square_m2_s2: NotNegative
+    position_rmse_to_truth_m: Mapping[str, NotNegative | Unavailable]
+
+    @property
+    def position_left_share(self) -> float:
+        """What is left of the mean square, as a share of all of it."""
+        return self.position_left_mean_square_m2 / self.position_mean_square_m2
+
+
+class AxisWalk(Walked, frozen=True, kw_only=True, eq=False):
+    """:class:`Walked`, with the tracks.
+
+    Attributes
+    ----------
     apart_m, left_m : ndarray
         Position of the student's filter, and of the model, minus that of the logged EKF2, at the
         times of the walk.
     """
 
-    steps: tuple[Step, ...]
-    position_total_m2: float
-    velocity_total_m2_s2: float
-    position_left_m2: float
-    velocity_left_m2_s2: float
-    student_rmse_to_truth_m: float | Unavailable
-    logged_rmse_to_truth_m: float | Unavailable
+    written_as = Walked
     apart_m: Array
     left_m: Array
 
     __repr__ = brief
 
-    @property
-    def position_left_share(self) -> float:
-        """What is left of the mean square, as a share of all of it."""
-        return self.position_left_m2 / self.position_total_m2
 
-
-@dataclass(frozen=True)
-class Coast:
+class Coast(Record, frozen=True, kw_only=True):
     """The longest run of rejected samples in flight.
 
     Attributes
@@ -163,9 +173,9 @@ class Coast:
     """
 
     start_s: float
-    samples: int
-    duration_s: float
-    distance_m: float
+    samples: Count
+    duration_s: NotNegative
+    distance_m: NotNegative
 
 
 @dataclass(frozen=True)
@@ -195,14 +205,14 @@ class _Stage:
 
 
 def walk(
-    model: Model, student: Student | None = None, lines: Mapping[str, Line] | None = None
+    model: Model, student: OurFilter | None = None, lines: Mapping[str, Line] | None = None
 ) -> Walk | Unavailable:
     """Walk from the student's filter to the logged EKF2.
 
     Parameters
     ----------
     model : Model
-    student : Student, optional
+    student : OurFilter, optional
         By default the lesson's settings.
     lines : mapping from axis name to Line, optional
         By default north and east, without tracks.
@@ -221,7 +231,7 @@ def walk(
     ekf2 = model.flight.ekf2
     assert isinstance(ekf2, Ekf2)
     lines = lines or {"north": Line(1.0, 0.0), "east": Line(0.0, 1.0)}
-    variants = _variants(model, student or Student())
+    variants = _variants(model, student or OurFilter())
     delayed, flown = delayed_variants(model, list(variants.values()))
     judged = judged_from(model.flown)
     times = ekf2.state.index.to_numpy()
@@ -255,7 +265,7 @@ def walk(
     )
 
 
-def _variants(model: Model, student: Student) -> dict[str, Variant]:
+def _variants(model: Model, student: OurFilter) -> dict[str, Variant]:
     """The filter after each step but the last; from one to the next, one thing changes."""
     inputs, flown = model.inputs, model.inputs.settings
     force = float(student.sigma_a_m_s2 * np.sqrt(student.dt_s / inputs.step_s))
@@ -297,6 +307,7 @@ def _axis(model: Model, stages: dict[str, _Stage], line: Line, times: Array) -> 
     for before, name in pairwise((STUDENT, *STEPS)):
         moved = np.abs(position[name] - position[before])
         most = int(np.argmax(moved))
+        error = _to_truth(model, position[name], line, times)
         steps.append(
             Step(
                 name=name,
@@ -304,17 +315,20 @@ def _axis(model: Model, stages: dict[str, _Stage], line: Line, times: Array) -> 
                 velocity_mean_square_m2_s2=speed_square[before] - speed_square[name],
                 position_moved_m=float(moved[most]),
                 moved_at_s=float(times[most]),
-                position_rmse_to_truth_m=_to_truth(model, position[name], line, times),
+                position_rmse_to_truth_m=None if isinstance(error, Unavailable) else error,
             )
         )
     return AxisWalk(
+        count=len(times),
+        position_mean_square_m2=square[STUDENT],
+        velocity_mean_square_m2_s2=speed_square[STUDENT],
         steps=tuple(steps),
-        position_total_m2=square[STUDENT],
-        velocity_total_m2_s2=speed_square[STUDENT],
-        position_left_m2=square[OUTPUT],
-        velocity_left_m2_s2=speed_square[OUTPUT],
-        student_rmse_to_truth_m=_to_truth(model, position[STUDENT], line, times),
-        logged_rmse_to_truth_m=_to_truth(model, logged, line, times),
+        position_left_mean_square_m2=square[OUTPUT],
+        velocity_left_mean_square_m2_s2=speed_square[OUTPUT],
+        position_rmse_to_truth_m={
+            "kf": _to_truth(model, position[STUDENT], line, times),
+            "ekf2": _to_truth(model, logged, line, times),
+        },
         apart_m=position[STUDENT] - logged,
         left_m=position[OUTPUT] - logged,
     )

@@ -27,6 +27,7 @@ from px4fuse.flight import (
     Truth,
     Unavailable,
 )
+from px4fuse.record import Count, NotNegative, Record, Share
 
 Array = NDArray[np.float64]
 
@@ -42,8 +43,7 @@ SWEEP_VALUES = 9
 MAX_SWEEP_VALUES = 200
 
 
-@dataclass(frozen=True)
-class AxisSummary:
+class AxisSummary(Record, frozen=True):
     """One axis of one EKF2.
 
     Attributes
@@ -59,22 +59,21 @@ class AxisSummary:
         Of what it publishes.
     """
 
-    nis_mean: float
-    nis_band: tuple[float, float]
-    innovation_std_m: float
-    sigma_p_median_m: float | Unavailable
-    position_rmse_to_truth_m: float | Unavailable
+    nis_mean: NotNegative
+    nis_band: tuple[NotNegative, NotNegative]
+    innovation_std_m: NotNegative
+    sigma_p_median_m: NotNegative | Unavailable
+    position_rmse_to_truth_m: NotNegative | Unavailable
 
 
-@dataclass(frozen=True)
-class Summary:
+class Summary(Record, frozen=True, omit_defaults=False):
     """One EKF2: as logged, as replayed, or with other parameters.
 
     Attributes
     ----------
     changed : mapping
         Parameters that differ from those flown.
-    axes : mapping from "north" and "east" to AxisSummary
+    north, east : AxisSummary
     samples : int
     rejected_share : float
     longest_without_fusion_s : float or Unavailable
@@ -85,13 +84,19 @@ class Summary:
     """
 
     changed: Mapping[str, float]
-    axes: Mapping[str, AxisSummary]
-    samples: int
-    rejected_share: float
-    longest_without_fusion_s: float | Unavailable
-    resets: int
-    late: int = 0
-    lost: int = 0
+    north: AxisSummary
+    east: AxisSummary
+    samples: Count
+    rejected_share: Share
+    longest_without_fusion_s: NotNegative | Unavailable
+    resets: Count
+    late: Count = 0
+    lost: Count = 0
+
+    @property
+    def axes(self) -> dict[str, AxisSummary]:
+        """By axis."""
+        return {"north": self.north, "east": self.east}
 
     @property
     def nis_mean(self) -> float:
@@ -212,17 +217,19 @@ def _of_replay(
     used = every[settled(every.index.to_numpy(), judged)]
     times = _judged_times(flight.ekf2.state, judged)
     fused = used["fused_at_s"][(used["fused"] > 0) | (used["reset"] > 0)]
+    axes = {
+        axis: _axis(
+            used[f"innovation_{axis}_m"].to_numpy(),
+            used[f"innovation_variance_{axis}_m2"].to_numpy(),
+            _sigma(flight.ekf2, replay, axis, judged),
+            _to_truth(flight, replay.published, axis, times),
+        )
+        for axis in HORIZONTAL
+    }
     return Summary(
         changed=replay.changed,
-        axes={
-            axis: _axis(
-                used[f"innovation_{axis}_m"].to_numpy(),
-                used[f"innovation_variance_{axis}_m2"].to_numpy(),
-                _sigma(flight.ekf2, replay, axis, judged),
-                _to_truth(flight, replay.published, axis, times),
-            )
-            for axis in HORIZONTAL
-        },
+        north=axes["north"],
+        east=axes["east"],
         samples=len(used),
         rejected_share=float(used["rejected"].mean()),
         longest_without_fusion_s=_longest(fused.to_numpy(), judged),
@@ -254,17 +261,19 @@ def _of_log(flight: Flight, replay: Ekf2Replay, judged: tuple[tuple[float, float
     if len(used) > COMPLETE_SHARE * replayed:
         fused = used.index[used["rejected"] == 0].to_numpy()
         longest = _longest(np.concatenate([fused, at[settled(at, judged)]]), judged)
+    axes = {
+        axis: _axis(
+            used[f"innovation_{axis}_m"].to_numpy(),
+            used[f"innovation_variance_{axis}_m2"].to_numpy(),
+            _logged_sigma(ekf2, axis, judged),
+            _to_truth(flight, ekf2.state, axis, times),
+        )
+        for axis in HORIZONTAL
+    }
     return Summary(
         changed={},
-        axes={
-            axis: _axis(
-                used[f"innovation_{axis}_m"].to_numpy(),
-                used[f"innovation_variance_{axis}_m2"].to_numpy(),
-                _logged_sigma(ekf2, axis, judged),
-                _to_truth(flight, ekf2.state, axis, times),
-            )
-            for axis in HORIZONTAL
-        },
+        north=axes["north"],
+        east=axes["east"],
         samples=len(used),
         rejected_share=float(used["rejected"].mean()),
         longest_without_fusion_s=longest,

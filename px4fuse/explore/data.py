@@ -14,8 +14,8 @@ from scipy import stats
 
 from px4fuse.analysis import Analysis
 from px4fuse.arrays import Array
-from px4fuse.comparison.comparison import AgainstTruth, AxisComparison, Comparison
 from px4fuse.comparison.events import happened
+from px4fuse.comparison.model import AgainstTruth, AxisComparison, Comparison
 from px4fuse.comparison.preparation import choose_source
 from px4fuse.explore.ekf2_grid import grid_data, judged_numbers
 from px4fuse.explore.packing import COARSE, Packer
@@ -63,7 +63,7 @@ def flight_data(
     beside : bool
         Whether it stands beside another flight: then times are from the start of its segment.
     """
-    comparison = analysis.comparison
+    comparison = analysis
     signals = signals_of(comparison, packer)
     settings, segment = comparison.settings, comparison.segment
     events = happened(comparison)
@@ -77,7 +77,7 @@ def flight_data(
         **signals,
         "axes": [
             own | _others(analysis, result, packer)
-            for own, result in zip(signals["axes"], comparison.axes, strict=True)
+            for own, result in zip(signals["axes"], comparison.axes.values(), strict=True)
         ],
         "maps": _maps(analysis),
         "grid": "only for one log" if beside else grid_data(analysis, packer),
@@ -102,7 +102,7 @@ def signals_of(comparison: Comparison, packer: Packer) -> dict[str, Any]:
         "segment": [comparison.segment.start_s, comparison.segment.end_s],
         "start": list(INITIAL_COVARIANCE),
         "imu": _imu(comparison, packer),
-        "axes": [_signals(comparison, result.axis, raw, packer) for result in comparison.axes],
+        "axes": [_signals(comparison, line, raw, packer) for line in comparison.lines],
     }
 
 
@@ -215,18 +215,18 @@ def _ekf2(result: AxisComparison, packer: Packer) -> dict[str, Any] | str:
     if isinstance(result.ekf2_state, Unavailable):
         return result.ekf2_state.reason
     state = result.ekf2_state.dropna()
-    summary = result.ekf2 if isinstance(result.ekf2, Unavailable) else result.ekf2.consistency
+    judged = result.filters["ekf2"]
     made: dict[str, Any] = {
         "state": _frame(state, ["position_m", "velocity_m_s"], packer),
         "variance": "",
         "innovations": "",
-        "summary": judged_numbers(summary),
+        "summary": judged_numbers(judged),
         "r": None,
     }
-    if isinstance(result.ekf2_truth, AgainstTruth):
+    if isinstance(judged.truth, AgainstTruth):
         made["summary"] |= {
-            "truthP": result.ekf2_truth.position_rmse_m,
-            "truthV": result.ekf2_truth.velocity_rmse_m_s,
+            "truthP": judged.truth.position_rmse_m,
+            "truthV": judged.truth.velocity_rmse_m_s,
         }
     if isinstance(result.ekf2_variance, pd.DataFrame):
         sigma = result.ekf2_variance.dropna().pow(0.5)

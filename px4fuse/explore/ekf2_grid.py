@@ -44,13 +44,13 @@ def grid_data(analysis: Analysis, packer: Packer) -> dict[str, Any] | str:
     settings = [
         dict(zip(stops, values, strict=True)) for values in itertools.product(*stops.values())
     ]
-    segment = analysis.comparison.segment
+    segment = analysis.segment
     replays = replay_settings(model, settings)
     count = sum(len(within(replay.updates, segment)) for replay in replays)
     every = -(-count // MOST_DRAWN) if count else 1
     directions = {
         result.axis.name: result.axis.direction
-        for result in analysis.comparison.axes
+        for result in analysis.axes.values()
         if result.axis.direction[2] == 0.0
     }
     flown = model.inputs.settings
@@ -99,7 +99,7 @@ def _case(
     """One stop: north and east as drawn, and the numbers of each horizontal axis."""
     judged = judged_from(model.flown)
     used = replay.updates[settled(replay.updates.index.to_numpy(), judged)]
-    shown = within(replay.updates, analysis.comparison.segment)
+    shown = within(replay.updates, analysis.segment)
     drawn = shown.iloc[::every]
     return {
         "time": packer.add_times(np.round(drawn.index.to_numpy(), 6)),
@@ -158,7 +158,7 @@ def _numbers(
     judged: tuple[tuple[float, float], ...],
 ) -> dict[str, Any]:
     """EKF2's column of the table at this stop."""
-    flight = analysis.comparison.flight
+    flight = analysis.flight
     made = judged_numbers(assess(*_along(used, direction)))
     if isinstance(flight.truth, Truth) and isinstance(flight.ekf2, Ekf2):
         truth = flight.truth.samples.dropna(subset=POSITION_COLUMNS[:2])

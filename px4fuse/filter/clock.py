@@ -39,6 +39,7 @@ from px4fuse.filter.marginal import Fitted, Positions, centred, paired_products
 from px4fuse.filter.motion import CONSTANT_SIGMA, SEARCH_S, Made, Motion, motion
 from px4fuse.filter.signals import Segment, within
 from px4fuse.flight import POSITION_COLUMNS, Flight, PositionTrack, Unavailable
+from px4fuse.record import Count, NotNegative, Record, Share, Span
 
 COARSE_POINTS, FINE_POINTS, CURVE_POINTS = 25, 11, 121
 # Enough to find the offset roughly
@@ -62,19 +63,17 @@ BLOCK = 2**18
 NOISE_STEP = 0.1
 
 
-@dataclass(frozen=True)
-class PartOffset:
+class PartOffset(Record, frozen=True):
     """Offset of one part of the flight: start, end, offset and its standard deviation, all s."""
 
     start_s: float
     end_s: float
     offset_s: float
-    sigma_s: float
+    sigma_s: NotNegative
 
 
-@dataclass(frozen=True, repr=False)
-class ClockOffset(Shown):
-    """What must be added to the position source's stamps.
+class Clock(Record, frozen=True, kw_only=True):
+    """What must be added to the position source's own stamps, what was applied included.
 
     Attributes
     ----------
@@ -84,14 +83,12 @@ class ClockOffset(Shown):
         95 % profile-likelihood interval, widened by the IMU's noise.
     sigma_s : float
         Standard deviation by the curvature at the maximum, widened likewise.
+    applied_s : float
+        What was added to the stamps before this was found.
     determinable : bool
         Whether the interval is narrow enough, and closed, to say anything.
     reason : str
         Why not, where it is not; else empty.
-    curve_s, curve_drop : ndarray, shape (n,)
-        Offsets, and how far each lies below the greatest log-likelihood.
-    interval_drop : float
-        How far below it the interval reaches: more than chi-square says, by the IMU's noise.
     parts : tuple of PartOffset
         Offsets of consecutive parts.
     drift_ppm, drift_sigma_ppm : float or None
@@ -99,32 +96,52 @@ class ClockOffset(Shown):
     change_p : float or None
         p-value of "all parts have the same offset", by the likelihood ratio; None with fewer than
         two parts.
-    sigma_a_m_s2, sigma_z_m : float
-        Noises at the maximum.
     count : int
         Measurements.
     """
 
     offset_s: float
-    interval_s: tuple[float, float]
-    sigma_s: float
+    interval_s: Span
+    sigma_s: NotNegative
+    applied_s: float
     determinable: bool
-    reason: str
-    curve_s: Array
-    curve_drop: Array
-    interval_drop: float
+    reason: str = ""
+    drift_ppm: float | None = None
+    drift_sigma_ppm: NotNegative | None = None
+    change_p: Share | None = None
     parts: tuple[PartOffset, ...]
-    drift_ppm: float | None
-    drift_sigma_ppm: float | None
-    change_p: float | None
-    sigma_a_m_s2: float
-    sigma_z_m: float
-    count: int
+    count: Count
+
+    @property
+    def remaining_s(self) -> float:
+        """What must still be added, beyond what was applied (s)."""
+        return self.offset_s - self.applied_s
 
     @property
     def chance_s(self) -> float:
         """How far chance may take it from the truth: ``SURE_SIGMAS`` standard deviations (s)."""
         return SURE_SIGMAS * self.sigma_s
+
+
+class ClockOffset(Shown, Clock, frozen=True, kw_only=True, eq=False):
+    """:class:`Clock`, with the likelihood that it was found from.
+
+    Attributes
+    ----------
+    curve_s, curve_drop : ndarray, shape (n,)
+        Offsets, and how far each lies below the greatest log-likelihood.
+    interval_drop : float
+        How far below it the interval reaches: more than chi-square says, by the IMU's noise.
+    sigma_a_m_s2, sigma_z_m : float
+        Noises at the maximum.
+    """
+
+    written_as = Clock
+    curve_s: Array
+    curve_drop: Array
+    interval_drop: float
+    sigma_a_m_s2: float
+    sigma_z_m: float
 
 
 @dataclass(frozen=True)
@@ -256,16 +273,21 @@ def estimate_clock_offset(
         progress("changes of the clock")
         parts, change_p = _parts(problem, offset, noises, factor)
     drift, drift_sigma = _drift(parts)
+    applied = settings.clock_offset_s
     return ClockOffset(
-        offset_s=offset,
-        interval_s=interval,
+        offset_s=applied + offset,
+        interval_s=(applied + interval[0], applied + interval[1]),
+        applied_s=applied,
         sigma_s=float(np.hypot(sigma * np.sqrt(factor), resolution)),
         determinable=not reason,
         reason=reason,
-        curve_s=curve,
+        curve_s=applied + curve,
         curve_drop=profile - profile.min(),
         interval_drop=PROFILE_DROP * factor,
-        parts=parts,
+        parts=tuple(
+            PartOffset(part.start_s, part.end_s, applied + part.offset_s, part.sigma_s)
+            for part in parts
+        ),
         drift_ppm=drift,
         drift_sigma_ppm=drift_sigma,
         change_p=change_p,

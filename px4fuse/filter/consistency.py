@@ -6,7 +6,6 @@ Navigation, section 5.4; Ljung and Box (1978), Biometrika 65(2).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -14,7 +13,15 @@ from scipy.special import chdtrc, gammaincinv, stdtr
 
 from px4fuse.arrays import Array
 from px4fuse.display import Shown
-from px4fuse.flight import Unavailable
+from px4fuse.record import (
+    Correlation,
+    Count,
+    NotNegative,
+    Positive,
+    Record,
+    Share,
+    Unavailable,
+)
 
 Verdict = Literal["consistent", "variance overstated", "variance understated"]
 
@@ -25,8 +32,7 @@ LJUNG_BOX_LAGS = 10
 GATE_SIGMA = 5.0  # EKF2_EVP_GATE's default, used where no gate is in force
 
 
-@dataclass(frozen=True, repr=False)
-class Consistency(Shown):
+class Consistency(Shown, Record, frozen=True, kw_only=True):
     """Whether a filter's innovations are what its own variances say.
 
     Attributes
@@ -40,8 +46,8 @@ class Consistency(Shown):
         Mean of ν²/S; 1 is consistent.
     nis_band : (float, float)
         Two-sided 95 % chi-square band of that mean, for white innovations.
-    variance_factor : float
-        By how much S is overstated (above 1) or understated (below 1): 1/nis_mean.
+    sigma_factor : float
+        Claimed over shown standard deviation, 1/√nis_mean: above 1 √S is too large.
     verdict : str
     outside_two_sigma : float
         Fraction outside ±2√S; 0.046 is expected.
@@ -56,21 +62,26 @@ class Consistency(Shown):
     ljung_box_lags : int
     """
 
-    count: int
+    count: Count
     innovation_mean_m: float
-    innovation_std_m: float
-    sqrt_s_median_m: float
-    nis_mean: float
-    nis_band: tuple[float, float]
-    variance_factor: float
+    innovation_std_m: NotNegative
+    sqrt_s_median_m: Positive
+    nis_mean: Positive
+    nis_band: tuple[NotNegative, NotNegative]
+    sigma_factor: Positive
     verdict: Verdict
-    outside_two_sigma: float
-    outside_gate: float
+    outside_two_sigma: Share
+    outside_gate: Share
     bias_t: float
-    bias_p: float
-    lag1_autocorrelation: float
-    ljung_box_p: float
-    ljung_box_lags: int
+    bias_p: Share
+    lag1_autocorrelation: Correlation
+    ljung_box_p: Share
+    ljung_box_lags: Count
+
+    @property
+    def variance_factor(self) -> float:
+        """How many times S is overstated (above 1) or understated (below 1)."""
+        return 1.0 / self.nis_mean
 
 
 def nis_band(count: int, dimensions: int = 1) -> tuple[float, float]:
@@ -150,7 +161,7 @@ def assess(
         sqrt_s_median_m=float(np.median(np.sqrt(s))),
         nis_mean=nis_mean,
         nis_band=band,
-        variance_factor=1.0 / nis_mean,
+        sigma_factor=float(np.sqrt(1.0 / nis_mean)),
         verdict=verdict_of(nis_mean, band),
         outside_two_sigma=float(np.mean(np.abs(normalised) > 2.0)),
         outside_gate=float(np.mean(np.abs(normalised) > gate)),
@@ -162,18 +173,22 @@ def assess(
     )
 
 
-@dataclass(frozen=True)
-class HorizontalNis:
+class HorizontalNis(Record, frozen=True):
     """NIS of north and east together, two degrees of freedom, divided by two.
 
     EKF2 logs no covariance between the two, so their correlation is left out for both filters.
     """
 
-    count: int
-    nis_mean: float
-    nis_band: tuple[float, float]
-    variance_factor: float
+    count: Count
+    nis_mean: Positive
+    nis_band: tuple[NotNegative, NotNegative]
+    sigma_factor: Positive
     verdict: Verdict
+
+    @property
+    def variance_factor(self) -> float:
+        """How many times S is overstated (above 1) or understated (below 1)."""
+        return 1.0 / self.nis_mean
 
 
 def assess_horizontal(
@@ -200,4 +215,4 @@ def assess_horizontal(
     if mean == 0.0:
         return None
     band = nis_band(count, 2)
-    return HorizontalNis(count, mean, band, 1.0 / mean, verdict_of(mean, band))
+    return HorizontalNis(count, mean, band, float(np.sqrt(1.0 / mean)), verdict_of(mean, band))

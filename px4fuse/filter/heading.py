@@ -11,12 +11,13 @@ Whether it walks is told by the likelihood ratio.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import product
 from typing import Literal
 
 import numpy as np
 import pandas as pd
+from msgspec import structs
 from scipy.spatial.transform import Rotation
 from scipy.special import chdtrc
 
@@ -32,6 +33,7 @@ from px4fuse.flight import (
     PositionTrack,
     Unavailable,
 )
+from px4fuse.record import NotNegative, Record, Share
 
 PART_S = 2.0
 MIN_PARTS = 3
@@ -63,22 +65,26 @@ BIAS_WALKS = np.array([0.003, 0.03])
 SIGMA_AS = np.array([0.03, 0.1, 0.3, 1.0])
 
 
-@dataclass(frozen=True)
-class HeadingPart:
+class HeadingPart(Record, frozen=True):
     """Turn of one part of the flight: start and end (s), turn and its standard deviation."""
 
     start_s: float
     end_s: float
     heading_error_deg: float
-    sigma_deg: float
+    sigma_deg: NotNegative
 
 
-@dataclass(frozen=True)
-class HeadingError:
+class HeadingError(Record, frozen=True):
     """By how much the source's frame is turned against the logged attitude, over the flight.
 
     Attributes
     ----------
+    turn_deg : float
+        Mean over the flight.
+    sigma_deg : float
+        Standard deviation of the mean: what the parts have in common is not averaged out.
+    drifts : bool
+        Whether the turn changes beyond chance, and by enough to matter.
     parts : tuple of HeadingPart
         Consecutive, clockwise seen from above; what the frame and the attitude have in common all
         along is in each.
@@ -88,8 +94,11 @@ class HeadingError:
         What it was found with.
     """
 
+    turn_deg: float
+    sigma_deg: NotNegative
+    drifts: bool
     parts: tuple[HeadingPart, ...]
-    drift_p: float
+    drift_p: Share
     by: Literal["orientation", "positions"]
 
     @property
@@ -99,22 +108,20 @@ class HeadingError:
         first, last = sorted((int(np.argmin(turns)), int(np.argmax(turns))))
         return self.parts[first], self.parts[last]
 
-    @property
-    def drifts(self) -> bool:
-        """Whether the turn changes beyond chance, and by enough to matter."""
-        first, last = self.ends
-        change = abs(last.heading_error_deg - first.heading_error_deg)
-        return self.drift_p < DRIFT_P and change >= MIN_DRIFT_DEG
 
-    @property
-    def turn_deg(self) -> float:
-        """Mean over the flight."""
-        return float(np.mean([part.heading_error_deg for part in self.parts]))
-
-    @property
-    def sigma_deg(self) -> float:
-        """Standard deviation of the mean: what the parts have in common is not averaged out."""
-        return float(np.mean([part.sigma_deg for part in self.parts]))
+def turned(
+    parts: tuple[HeadingPart, ...], drift_p: float, by: Literal["orientation", "positions"]
+) -> HeadingError:
+    """What the parts of a flight say together."""
+    turns = [part.heading_error_deg for part in parts]
+    return HeadingError(
+        turn_deg=float(np.mean(turns)),
+        sigma_deg=float(np.mean([part.sigma_deg for part in parts])),
+        drifts=drift_p < DRIFT_P and max(turns) - min(turns) >= MIN_DRIFT_DEG,
+        parts=parts,
+        drift_p=drift_p,
+        by=by,
+    )
 
 
 def heading_error(
@@ -169,7 +176,7 @@ def heading_error(
     samples = samples.iloc[:: int(np.ceil(len(samples) / MAX_MEASUREMENTS))]
     found = _by_positions(acceleration, samples, settings.dt_s, sigma_z_m)
     # how the source's own axes lie in the vehicle is not known, but that they do not turn is
-    return found if compared is None else replace(found, drift_p=1.0)
+    return found if compared is None else structs.replace(found, drift_p=1.0, drifts=False)
 
 
 def _parts(time: Array, turn: Array, sigma: Array) -> tuple[HeadingPart, ...]:
@@ -221,7 +228,7 @@ def _by_orientation(
         return None
     found = np.array([part.heading_error_deg for part in parts])
     square = np.sum((found - found.mean()) ** 2) / np.degrees(sigma[0]) ** 2
-    return HeadingError(parts, float(chdtrc(len(parts) - 1, square)), "orientation")
+    return turned(parts, float(chdtrc(len(parts) - 1, square)), "orientation")
 
 
 @dataclass(frozen=True)
@@ -258,7 +265,7 @@ def _by_positions(
     smoothed, sigma = _smooth(run, measured, best)
     # at the end of its range a walk is half of the time none
     p = 0.5 * float(chdtrc(1, ratio)) if ratio > 0.0 else 1.0
-    return HeadingError(_parts(time, turn + smoothed, sigma), p, "positions")
+    return turned(_parts(time, turn + smoothed, sigma), p, "positions")
 
 
 def _legs(acceleration: pd.DataFrame, time: Array) -> _Legs:

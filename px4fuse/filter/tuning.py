@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from itertools import product
+from typing import Any
 
 import numpy as np
 from scipy.optimize import minimize_scalar
@@ -42,8 +43,10 @@ from px4fuse.filter.marginal import centred
 from px4fuse.filter.motion import SEARCH_S, Made, motion
 from px4fuse.filter.signals import Axis
 from px4fuse.flight import Flight, Unavailable
+from px4fuse.record import Count, Maybe, NotNegative, Record
 
 HORIZONTAL = "horizontal"
+NoiseInterval = tuple[NotNegative, NotNegative | None]
 GRID = 40
 # The map reaches as many standard deviations to either side
 MAP_SIGMAS = 4.5
@@ -58,8 +61,7 @@ FIRST_WALK_M = 0.02
 AT_END = 1.001
 
 
-@dataclass(frozen=True)
-class Noise:
+class Noise(Record, frozen=True):
     """One noise parameter as the data have it.
 
     Attributes
@@ -75,6 +77,18 @@ class Noise:
     low: float | None
     high: float | None
 
+    @classmethod
+    def of(cls, value: float | None, interval: NoiseInterval | None) -> Noise:
+        """As :class:`Tuned` writes it."""
+        low, high = interval or (0.0, None)
+        return cls(value, low or None, high)
+
+    def named(self, name: str) -> dict[str, Any]:
+        """As :class:`Tuned` writes it: value and interval under a name."""
+        known = self.low is not None or self.high is not None
+        interval = (self.low or 0.0, self.high) if known else None
+        return {name: self.value, f"{name}_interval": interval}
+
 
 @dataclass(frozen=True)
 class LikelihoodMap:
@@ -87,8 +101,7 @@ class LikelihoodMap:
     __repr__ = brief
 
 
-@dataclass(frozen=True)
-class HeldOut:
+class HeldOut(Record, frozen=True):
     """Settings found on the first half, scored on the second.
 
     Attributes
@@ -102,22 +115,24 @@ class HeldOut:
         positive where tuning helps on data that it has not seen.
     """
 
-    sigma_a_m_s2: float
-    sigma_z_m: float
-    count: int
+    sigma_a_m_s2: NotNegative
+    sigma_z_m: NotNegative
+    count: Count
     gain_nats: float
 
 
-@dataclass(frozen=True, repr=False)
-class AxisTuning(Shown):
-    """The noises of one axis, or of the horizontal axes together.
+class Tuned(Record, frozen=True, kw_only=True):
+    """The noises of one axis, or of the horizontal axes together, with 95 % intervals.
+
+    A value is None where the likelihood has its maximum at an end of the search: then the interval
+    is the bound. Its lower end is 0 where the noise may be zero, its upper end None where nothing
+    bounds it.
 
     Attributes
     ----------
-    name : str
-    sigma_a, sigma_z : Noise
-        m/s² and m: what is noise, biases and tilt taken out where the IMU tells them.
-    filter_sigma_a : Noise
+    sigma_a_m_s2, sigma_z_m : float or None
+        What is noise, biases and tilt taken out where the IMU tells them.
+    filter_sigma_a_m_s2 : float or None
         SIGMA_A that the two-state filter needs at this SIGMA_Z, since it has no states for biases.
     gain_nats : float
         Log-likelihood per measurement of the two-state filter with ``filter_sigma_a`` and
@@ -125,32 +140,61 @@ class AxisTuning(Shown):
     before, after : Consistency or Unavailable
         Of the chosen settings and of these, outliers left out; of the first axis where there are
         several.
-    outlier_time_s : ndarray, shape (k,)
-        Measurements that are more likely outliers than not.
-    count : int
-        Measurements, outliers included.
+    count, outliers : int
+        Measurements, and those that are more likely outliers than not.
     held_out : HeldOut or Unavailable
-    noises : Noises
-        The most likely ones, with the random walk of a source that may wander.
     biases_fitted : bool
         Whether biases and tilt were taken out; where the IMU is too slow for that, SIGMA_A of the
         filter bounds the noise.
+    """
+
+    sigma_a_m_s2: NotNegative | None = None
+    sigma_a_m_s2_interval: NoiseInterval | None = None
+    filter_sigma_a_m_s2: NotNegative | None = None
+    filter_sigma_a_m_s2_interval: NoiseInterval | None = None
+    sigma_z_m: NotNegative | None = None
+    sigma_z_m_interval: NoiseInterval | None = None
+    gain_nats: float
+    before: Maybe[Consistency]
+    after: Maybe[Consistency]
+    count: Count
+    outliers: Count
+    held_out: Maybe[HeldOut]
+    biases_fitted: bool
+
+    @property
+    def sigma_a(self) -> Noise:
+        """SIGMA_A of the noise alone, m/s²."""
+        return Noise.of(self.sigma_a_m_s2, self.sigma_a_m_s2_interval)
+
+    @property
+    def filter_sigma_a(self) -> Noise:
+        """SIGMA_A that the filter needs, m/s²."""
+        return Noise.of(self.filter_sigma_a_m_s2, self.filter_sigma_a_m_s2_interval)
+
+    @property
+    def sigma_z(self) -> Noise:
+        """SIGMA_Z, m."""
+        return Noise.of(self.sigma_z_m, self.sigma_z_m_interval)
+
+
+class AxisTuning(Shown, Tuned, frozen=True, kw_only=True, eq=False, dict=True):
+    """:class:`Tuned`, with what it was found from.
+
+    Attributes
+    ----------
+    name : str
+    outlier_time_s : ndarray, shape (k,)
+    noises : Noises
+        The most likely ones, with the random walk of a source that may wander.
     make_map : callable
         Makes :attr:`map`, which takes as long as a fit and is seldom looked at.
     """
 
+    written_as = Tuned
     name: str
-    sigma_a: Noise
-    sigma_z: Noise
-    filter_sigma_a: Noise
-    gain_nats: float
-    before: Consistency | Unavailable
-    after: Consistency | Unavailable
     outlier_time_s: Array
-    count: int
-    held_out: HeldOut | Unavailable
     noises: Noises
-    biases_fitted: bool
     make_map: Callable[[], LikelihoodMap]
 
     @cached_property
@@ -258,14 +302,15 @@ def tune_axes(
     gain = alone.score(chosen) - alone.score(after)
     return AxisTuning(
         name=name,
-        sigma_a=sigma_a,
-        sigma_z=sigma_z,
-        filter_sigma_a=needed,
+        **sigma_a.named("sigma_a_m_s2"),
+        **sigma_z.named("sigma_z_m"),
+        **needed.named("filter_sigma_a_m_s2"),
         gain_nats=gain / count,
         before=_assess(legs[0], chosen, skip),
         after=_assess(legs[0], after, skip),
         outlier_time_s=axes[0].measurement_time_s[-count:][skip],
         count=count,
+        outliers=int(np.count_nonzero(skip)),
         held_out=_hold_out(name, legs, chosen, alone),
         noises=best.noises,
         biases_fitted=found is not None,

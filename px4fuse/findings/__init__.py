@@ -14,7 +14,7 @@ from collections.abc import Iterable
 from functools import cache
 
 from px4fuse.analysis import Analysis, explain
-from px4fuse.comparison.comparison import Comparison
+from px4fuse.comparison.model import Comparison
 from px4fuse.findings import (
     accelerometer_bias,
     autopilot_restarted,
@@ -84,7 +84,7 @@ def find(subject: Analysis | Comparison) -> tuple[Finding, ...]:
     subject : Analysis or Comparison
         A comparison is explained first, which takes some seconds.
     """
-    return _find(DETECTORS, explain(subject) if isinstance(subject, Comparison) else subject)
+    return _find(DETECTORS, subject if isinstance(subject, Analysis) else explain(subject))
 
 
 def find_loop(loop: Loop) -> tuple[Finding, ...]:

@@ -23,10 +23,10 @@ TILT_DEG_PER_BIAS = float(np.degrees(1.0 / 9.80665))
 
 def _ekf2_bias(analysis: Analysis) -> list[float] | None:
     """Median of what EKF2 subtracts, forward, right and down (m/s²)."""
-    ekf2 = analysis.comparison.flight.ekf2
+    ekf2 = analysis.flight.ekf2
     if not isinstance(ekf2, Ekf2) or not isinstance(ekf2.accelerometer_bias, pd.DataFrame):
         return None
-    inside = within(ekf2.accelerometer_bias, analysis.comparison.segment)
+    inside = within(ekf2.accelerometer_bias, analysis.segment)
     if inside.empty:
         return None
     return [float(inside[column].median()) for column in SPECIFIC_FORCE_COLUMNS]

@@ -10,7 +10,7 @@ MAPPED_BY_RECEIPT = ("receive time", "position in the stream", "arrival time")
 
 
 def _detect(analysis: Analysis) -> Found:
-    source = analysis.comparison.source
+    source = analysis.source
     clock = source.clock_map
     if clock is None or clock.distinct_stamps is not None or clock.method not in MAPPED_BY_RECEIPT:
         return

@@ -33,16 +33,15 @@ def delay_remedy(analysis: Analysis, delay_ms: float, flown_ms: float) -> str:
 
 
 def _detect(analysis: Analysis) -> Found:
-    comparison = analysis.comparison
+    comparison = analysis
     clock = analysis.clock
     delay = comparison.flight.log.parameters.get("EKF2_EV_DELAY")
     if not isinstance(clock, ClockOffset) or comparison.source.reconstructed:
         return
     if not clock.determinable or delay is None:
         return
-    applied = comparison.settings.clock_offset_s
-    asked = -applied - np.array([clock.interval_s[1], clock.interval_s[0]])
-    best = -(applied + clock.offset_s)
+    asked = -np.array([clock.interval_s[1], clock.interval_s[0]])
+    best = -clock.offset_s
     apart = abs(delay * 1e-3 - best)
     if apart < max(clock.chance_s + EKF2_UPDATE.value, CLOCK_OFFSET.value):
         return

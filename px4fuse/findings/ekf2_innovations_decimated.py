@@ -14,13 +14,13 @@ MIN_INNOVATION_SHARE = Threshold(
 
 
 def _detect(analysis: Analysis) -> Found:
-    comparison = analysis.comparison
+    comparison = analysis
     ekf2 = comparison.flight.ekf2
-    per_axis = (result.ekf2_innovations for result in comparison.axes)
+    per_axis = (result.ekf2_innovations for result in comparison.axes.values())
     innovations = next((frame for frame in per_axis if isinstance(frame, pd.DataFrame)), None)
     if innovations is None or comparison.source.reconstructed or not isinstance(ekf2, Ekf2):
         return
-    count = len(comparison.axes[0].replay.updates)
+    count = len(next(iter(comparison.axes.values())).replay.updates)
     share = len(innovations) / count
     if share < MIN_INNOVATION_SHARE.value:
         yield Finding(

@@ -8,7 +8,7 @@ from px4fuse.flight import Unavailable
 
 
 def _detect(analysis: Analysis) -> Found:
-    ekf2, segment = analysis.comparison.flight.ekf2, analysis.comparison.segment
+    ekf2, segment = analysis.flight.ekf2, analysis.segment
     if isinstance(ekf2, Unavailable):
         return
     switches = [time for time, _ in ekf2.instances if segment.start_s < time <= segment.end_s]

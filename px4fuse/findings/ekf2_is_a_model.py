@@ -8,7 +8,7 @@ from px4fuse.findings.model import Detector, Finding, Found
 
 
 def _detect(analysis: Analysis) -> Found:
-    if MODEL_NOTE in analysis.comparison.flight.log.notes:
+    if MODEL_NOTE in analysis.flight.log.notes:
         yield Finding(
             "ekf2_is_a_model",
             "info",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.comparison import Comparison
+from px4fuse.comparison.model import Comparison
 from px4fuse.findings.model import Detector, Finding, Found, Threshold, off_spans, step_share
 from px4fuse.flight import EXTERNAL_VISION_RUNGS, Ekf2, FusionRecord, Unavailable
 
@@ -17,7 +17,7 @@ MAX_LATE = Threshold(0.1, "s", "older than that by the horizon, no sample is fus
 
 
 def _detect(analysis: Analysis) -> Found:
-    comparison = analysis.comparison
+    comparison = analysis
     ekf2, segment = comparison.flight.ekf2, comparison.segment
     if isinstance(ekf2, Unavailable) or isinstance(ekf2.fusing, Unavailable):
         return

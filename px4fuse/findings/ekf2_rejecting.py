@@ -23,7 +23,7 @@ def _remedy(analysis: Analysis) -> str:
     model = analysis.ekf2_model
     if isinstance(model, Unavailable):
         return f"{IN_ORDER} {not_replayed(model)}"
-    wanted = asked_of_ekf2(analysis.comparison, model, analysis.tuning, analysis.clock)
+    wanted = asked_of_ekf2(analysis, model, analysis.tuning, analysis.clock)
     flown = model.inputs.settings
     asked = {name: value for name, value in wanted.items() if value != flown[name]}
     delay = {name: value for name, value in asked.items() if "DELAY" in name}
@@ -56,12 +56,12 @@ def _remedy(analysis: Analysis) -> str:
 
 
 def _detect(analysis: Analysis) -> Found:
-    comparison = analysis.comparison
+    comparison = analysis
     ekf2 = comparison.flight.ekf2
     gate = ekf2.gate if isinstance(ekf2, Ekf2) else float("nan")
     # a rejection is of the horizontal vector, so one horizontal axis speaks for all
-    horizontal = [r for r in comparison.axes if r.axis.name != "down"][:1]
-    for result in (*horizontal, *(r for r in comparison.axes if r.axis.name == "down")):
+    horizontal = [r for r in comparison.axes.values() if r.axis.name != "down"][:1]
+    for result in (*horizontal, *(r for r in comparison.axes.values() if r.axis.name == "down")):
         frame = result.ekf2_innovations
         if isinstance(frame, Unavailable):
             continue

@@ -10,7 +10,7 @@ from px4fuse.flight import Unavailable
 
 
 def _detect(analysis: Analysis) -> Found:
-    comparison = analysis.comparison
+    comparison = analysis
     ekf2, segment = comparison.flight.ekf2, comparison.segment
     if isinstance(ekf2, Unavailable):
         return

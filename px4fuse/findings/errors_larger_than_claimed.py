@@ -14,8 +14,8 @@ import pandas as pd
 
 from px4fuse.analysis import Analysis
 from px4fuse.arrays import Array
-from px4fuse.comparison.comparison import AgainstTruth, AxisComparison, Comparison
 from px4fuse.comparison.drift import may_drift
+from px4fuse.comparison.model import AgainstTruth, AxisComparison, Comparison
 from px4fuse.errors import TrajectoryError
 from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.kalman import state_at
@@ -56,15 +56,13 @@ class Hidden:
 def hidden_errors(comparison: Comparison) -> list[Hidden]:
     """Where the error is larger than claimed and no innovation says so, the worst first."""
     found = []
-    for result in comparison.axes:
-        for owner, summary, truth in (
-            ("kf", result.kf, result.kf_truth),
-            ("ekf2", result.ekf2, result.ekf2_truth),
-        ):
-            if isinstance(summary, Unavailable) or not isinstance(truth, AgainstTruth):
+    for result in comparison.axes.values():
+        for owner, statement in result.filters.items():
+            truth = statement.truth
+            if isinstance(statement, Unavailable) or isinstance(truth, Unavailable):
                 continue
-            statement, nees = summary.consistency, truth.nees_position_mean
-            if nees is None or isinstance(statement, Unavailable) or nees < NEES_LARGE.value:
+            nees = truth.nees_position_mean
+            if nees is None or nees < NEES_LARGE.value:
                 continue
             if statement.nis_mean < CONTENT.value:
                 found.append(Hidden(owner, result, statement, truth, nees))
@@ -72,7 +70,7 @@ def hidden_errors(comparison: Comparison) -> list[Hidden]:
 
 
 def _detect(analysis: Analysis) -> Found:
-    comparison = analysis.comparison
+    comparison = analysis
     hidden = hidden_errors(comparison)
     if not hidden:
         return
@@ -122,7 +120,7 @@ def _detect(analysis: Analysis) -> Found:
 
 def _after_turning(comparison: Comparison, owner: str) -> tuple[float, float] | None:
     """Horizontal RMSE (m) to the truth, and what of it the best shift and turn leave."""
-    axes = {result.axis.name: result for result in comparison.axes}
+    axes = comparison.axes
     if not {"north", "east"} <= axes.keys():
         return None
     north, east = axes["north"], axes["east"]

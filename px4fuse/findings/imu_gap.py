@@ -15,8 +15,8 @@ IMU_GAP_TOTAL = Threshold(0.2, "s", "two prediction steps")
 
 
 def _detect(analysis: Analysis) -> Found:
-    comparison = analysis.comparison
-    gap_s = comparison.axes[0].replay.input_gap_s
+    comparison = analysis
+    gap_s = next(iter(comparison.axes.values())).replay.input_gap_s
     imu = comparison.flight.imu
     interval_s = 1.0 / sample_rate(imu) if isinstance(imu, pd.DataFrame) else 0.0
     remedy = (

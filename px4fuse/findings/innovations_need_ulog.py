@@ -10,7 +10,7 @@ from px4fuse.flight import Ekf2
 
 
 def _detect(analysis: Analysis) -> Found:
-    flight = analysis.comparison.flight
+    flight = analysis.flight
     if not flight.log.format.startswith("MAVLink") or not isinstance(flight.ekf2, Ekf2):
         return
     variances = isinstance(flight.ekf2.variance, pd.DataFrame)

@@ -7,7 +7,7 @@ from px4fuse.findings.model import Detector, Finding, Found, sentence
 
 
 def _detect(analysis: Analysis) -> Found:
-    log = analysis.comparison.flight.log
+    log = analysis.flight.log
     damage = [note for note in log.notes if "damaged" in note]
     dropped = [note for note in log.notes if " dropped: " in note]
     if damage:

@@ -7,9 +7,9 @@ from px4fuse.findings.model import Detector, Finding, Found, times
 
 
 def _detect(analysis: Analysis) -> Found:
-    segment = analysis.comparison.segment
+    segment = analysis.segment
     lost = [
-        d for d in analysis.comparison.flight.log.dropouts
+        d for d in analysis.flight.log.dropouts
         if d.start_s <= segment.end_s and d.start_s + d.duration_s >= segment.start_s
     ]  # fmt: skip
     if lost:

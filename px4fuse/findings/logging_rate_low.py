@@ -22,7 +22,7 @@ def too_slow(samples: pd.DataFrame, needed: Threshold) -> bool:
 
 
 def _detect(analysis: Analysis) -> Found:
-    flight = analysis.comparison.flight
+    flight = analysis.flight
     for part, name, default, threshold in (
         (flight.imu, "imu", "sensor_combined", MIN_IMU_RATE),
         (flight.attitude, "attitude", "vehicle_attitude", MIN_ATTITUDE_RATE),

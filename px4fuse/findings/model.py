@@ -5,18 +5,21 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Generic, Literal, TypeVar
+from typing import Annotated, Generic, Literal, TypeVar
 
+import msgspec
 import numpy as np
 import pandas as pd
+from msgspec import Meta
+
+from px4fuse.record import Record, Span
 
 Subject = TypeVar("Subject")
 Severity = Literal["error", "warning", "info"]
 SEVERITIES: tuple[Severity, Severity, Severity] = ("error", "warning", "info")
 
 
-@dataclass(frozen=True)
-class Finding:
+class Finding(Record, frozen=True, omit_defaults=False):
     """One named mistake or condition.
 
     Attributes
@@ -38,13 +41,13 @@ class Finding:
         From when to when it shows, seconds from the first data; empty where that is throughout.
     """
 
-    id: str
+    id: Annotated[str, Meta(pattern="^[a-z0-9_]+$")]
     severity: Severity
     message: str
     remedy: str
-    evidence: dict[str, float | str] = field(default_factory=dict)
+    evidence: Mapping[str, int | float | str] = msgspec.field(default_factory=dict)
     consequences: tuple[Finding, ...] = ()
-    spans_s: tuple[tuple[float, float], ...] = ()
+    spans_s: tuple[Span, ...] = ()
 
     @property
     def when(self) -> str:

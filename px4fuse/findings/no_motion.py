@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.comparison import Comparison
+from px4fuse.comparison.model import Comparison
 from px4fuse.filter.signals import within
 from px4fuse.findings.model import Detector, Finding, Found, Threshold
 from px4fuse.flight import POSITION_COLUMNS
@@ -21,7 +21,7 @@ def motion_range_m(comparison: Comparison) -> float:
 
 
 def _detect(analysis: Analysis) -> Found:
-    extent = motion_range_m(analysis.comparison)
+    extent = motion_range_m(analysis)
     if extent < MOTION_RANGE.value:
         yield Finding(
             "no_motion",

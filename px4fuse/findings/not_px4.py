@@ -8,7 +8,7 @@ from px4fuse.flight import Ekf2
 
 
 def _detect(analysis: Analysis) -> Found:
-    flight = analysis.comparison.flight
+    flight = analysis.flight
     autopilot = flight.log.autopilot
     if autopilot == "PX4" or not isinstance(flight.ekf2, Ekf2):
         return

@@ -7,7 +7,7 @@ from px4fuse.findings.model import Detector, Finding, Found, sentence
 
 
 def _detect(analysis: Analysis) -> Found:
-    source = analysis.comparison.source
+    source = analysis.source
     alignment = source.alignment
     if alignment is None:
         return

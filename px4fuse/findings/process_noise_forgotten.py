@@ -19,9 +19,9 @@ RESPONSE_TIME = Threshold(2.5, "s", "five times the lesson's; a vehicle turns ar
 
 
 def _detect(analysis: Analysis) -> Found:
-    comparison = analysis.comparison
-    for result in comparison.axes:
-        updates, statement = result.replay.updates, result.kf.consistency
+    comparison = analysis
+    for result in comparison.axes.values():
+        updates, statement = result.replay.updates, result.filters["kf"]
         if isinstance(statement, Unavailable) or statement.verdict != "variance understated":
             continue
         if statement.lag1_autocorrelation < LAG1_SLOW.value:

@@ -7,7 +7,7 @@ from px4fuse.findings.model import Detector, Finding, Found, sentence
 
 
 def _detect(analysis: Analysis) -> Found:
-    for note in analysis.comparison.flight.log.notes:
+    for note in analysis.flight.log.notes:
         if "time of receipt went back" in note:
             yield Finding(
                 "receipt_out_of_order",

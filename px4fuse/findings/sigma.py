@@ -11,6 +11,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+from msgspec import structs
+
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.drift import may_drift
 from px4fuse.comparison.remedy import filter_words
@@ -67,7 +69,7 @@ def _detect(analysis: Analysis) -> Found:
     tuned = next((tuned for tuned in tunings if isinstance(tuned, AxisTuning)), None)
     if tuned is None:
         return
-    comparison = analysis.comparison
+    comparison = analysis
     settings = comparison.settings
     off = [
         each
@@ -105,7 +107,7 @@ def _detect(analysis: Analysis) -> Found:
         )
         for each in off
     ]
-    yield replace(found[0], consequences=tuple(found[1:]))
+    yield structs.replace(found[0], consequences=tuple(found[1:]))
 
 
 def _off(label: str, option: str, unit: str, chosen: float, found: Noise) -> Off | None:
@@ -143,7 +145,7 @@ def _message(off: Off, tuned: AxisTuning) -> str:
 
 def _remedy(analysis: Analysis, tuned: AxisTuning, off: list[Off]) -> str:
     """What to type, as far as a replay with it holds what the likelihood promises."""
-    comparison = analysis.comparison
+    comparison = analysis
     values = {each.label: float(f"{each.value:.3g}") for each in off}
     if "SIGMA_Z" in values and tuned.sigma_z.value is None:
         values["SIGMA_Z"] = max(values["SIGMA_Z"], SMALLEST_SIGMA_Z.value)

@@ -12,7 +12,7 @@ READ = "Read 'north' as the source's x axis"
 
 
 def _detect(analysis: Analysis) -> Found:
-    comparison = analysis.comparison
+    comparison = analysis
     if comparison.source.frame != "FRD":
         return
     ekf2, segment = comparison.flight.ekf2, comparison.segment

@@ -17,10 +17,10 @@ FUSE_YAW = "EKF2 fuse the source's yaw (EKF2_EV_CTRL bit 3; EKF2_AID_MASK bit 4 
 
 
 def _detect(analysis: Analysis) -> Found:
-    source, heading = analysis.comparison.source, analysis.heading
+    source, heading = analysis.source, analysis.heading
     if isinstance(heading, Unavailable) or source.reconstructed:
         return
-    is_px4 = analysis.comparison.flight.log.has_ulog
+    is_px4 = analysis.flight.log.has_ulog
     remedy = CALIBRATE + (FUSE_YAW if is_px4 else "the autopilot fuse the source's yaw.")
     if heading.drifts:
         yield _drifting(source.name, heading, remedy)

@@ -11,9 +11,9 @@ GAP_INTERVALS = Threshold(events.GAP_INTERVALS, "median intervals", "jitter and 
 
 
 def _detect(analysis: Analysis) -> Found:
-    comparison = analysis.comparison
+    comparison = analysis
     rate_hz = comparison.source.rate_hz
-    gaps = events.source_gaps(comparison.axes[0].axis.measurement_time_s, rate_hz)
+    gaps = events.source_gaps(comparison.lines[0].measurement_time_s, rate_hz)
     if gaps:
         at, until = max(gaps, key=lambda gap: gap[1] - gap[0])
         yield Finding(

@@ -26,7 +26,7 @@ def _detect(analysis: Analysis) -> Found:
     yield Finding(
         "source_jumps",
         "error" if largest.size_m >= JUMP_ERROR.value else "warning",
-        f"{analysis.comparison.source.name} jumps {times(len(jumps))} and stays there, by "
+        f"{analysis.source.name} jumps {times(len(jumps))} and stays there, by "
         f"{largest.size_m:.2f} m (± {1.96 * sigma:.2f}) at {largest.time_s:.1f} s, while the IMU "
         "measures no such motion: a false match, another set of anchors or an origin that was "
         "set again. After it both filters are wrong by that, and consistent.",

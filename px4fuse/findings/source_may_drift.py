@@ -11,7 +11,7 @@ from px4fuse.loop.loop import Loop
 
 
 def _detect(analysis: Analysis) -> Found:
-    comparison = analysis.comparison
+    comparison = analysis
     if not may_drift(comparison.flight, comparison.source) or hidden_errors(comparison):
         return
     evidence: dict[str, float | str] = {"source": comparison.source.name}

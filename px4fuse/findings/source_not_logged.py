@@ -18,14 +18,14 @@ LOGGER_INTERVALS_S = {
 
 
 def _detect(analysis: Analysis) -> Found:
-    comparison = analysis.comparison
+    comparison = analysis
     source = comparison.source
     logged = any(track.rung == 2 for track in comparison.flight.positions)
     if source.rung not in (4, 5, 6) or logged:
         return
     profile = int(comparison.flight.log.parameters.get("SDLOG_PROFILE", 1))
-    wanted = "position source vehicle_visual_odometry"
-    reasons = (part.reason for part in comparison.missing if part.what == wanted)
+    wanted = "vehicle_visual_odometry"
+    reasons = (part.reason for part in comparison.missing if part.source == wanted)
     why = next(reasons, "it is not in this log")
     remedy = f"Set SDLOG_PROFILE to {profile | VISION_PROFILE_BIT} and fly again."
     yield Finding(

@@ -13,10 +13,10 @@ LOST_SHARE = Threshold(0.02, "of the source's samples", "seen: 0 to 0.3 %, and 8
 
 
 def _detect(analysis: Analysis) -> Found:
-    source = analysis.comparison.source
+    source = analysis.source
     if source.clock_map is None or source.clock_map.method == "arrival time":
         return
-    intervals = np.diff(within(source.samples, analysis.comparison.segment).index.to_numpy())
+    intervals = np.diff(within(source.samples, analysis.segment).index.to_numpy())
     if len(intervals) < 2 or source.clock_map.distinct_stamps is not None:
         return
     typical = float(np.median(intervals))
@@ -32,7 +32,7 @@ def _detect(analysis: Analysis) -> Found:
             "Record on the companion, or on a link that does not lose messages"
             + (
                 "; the ULog has what arrived (SDLOG_PROFILE 129)."
-                if analysis.comparison.flight.log.has_ulog
+                if analysis.flight.log.has_ulog
                 else "."
             ),
             {"lost": float(lost), "lost_share": share},

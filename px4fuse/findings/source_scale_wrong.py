@@ -22,7 +22,7 @@ SCALE_SIGMAS = Threshold(3.0, "standard deviations", "0.3 % of clean flights lie
 
 
 def _detect(analysis: Analysis) -> Found:
-    comparison = analysis.comparison
+    comparison = analysis
     imu = comparison.flight.imu
     # motion that the IMU misses would pass for positions that are too long
     if not isinstance(imu, pd.DataFrame) or sample_rate(imu) < RATE_MARGIN * MIN_IMU_RATE.value:

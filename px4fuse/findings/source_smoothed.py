@@ -13,7 +13,7 @@ SMOOTHING_LAG_ERROR = Threshold(0.10, "s", "at 1 m/s a good UWB's noise")
 
 def low_pass(analysis: Analysis) -> Smoothing | None:
     """The low pass in the source, None where there is none or it cannot be told."""
-    source = analysis.comparison.source
+    source = analysis.source
     # the error of odometry drifts, which makes that of successive positions agree as well; what
     # was made of EKF2's own output has EKF2's filter in it
     if source.orientation is not None or source.reconstructed:
@@ -27,7 +27,7 @@ def low_pass(analysis: Analysis) -> Smoothing | None:
 
 
 def _detect(analysis: Analysis) -> Found:
-    found, source = low_pass(analysis), analysis.comparison.source
+    found, source = low_pass(analysis), analysis.source
     if found is None:
         return
     yield Finding(

@@ -9,7 +9,7 @@ RECEIPT_JITTER = Threshold(0.010, "s", "1 cm at 1 m/s, a tenth of a good UWB's n
 
 
 def _detect(analysis: Analysis) -> Found:
-    source = analysis.comparison.source
+    source = analysis.source
     clock = source.clock_map
     if clock is None or clock.distinct_stamps is None:
         return

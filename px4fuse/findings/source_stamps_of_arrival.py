@@ -21,7 +21,7 @@ PURE = Threshold(0.95, "of the samples of each part", "a late message now and th
 
 
 def _detect(analysis: Analysis) -> Found:
-    comparison = analysis.comparison
+    comparison = analysis
     ekf2, source = comparison.flight.ekf2, comparison.source
     record = ekf2.record if isinstance(ekf2, Ekf2) else None
     if not isinstance(record, FusionRecord) or source.reconstructed or source.clock_map is not None:

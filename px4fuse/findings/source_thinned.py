@@ -44,11 +44,11 @@ def _base(intervals: Array) -> tuple[float, Array] | None:
 
 
 def _detect(analysis: Analysis) -> Found:
-    source = analysis.comparison.source
+    source = analysis.source
     # stamps that were made, or a rate that is the logger's (source_not_logged says so)
     if source.clock_map is not None or source.rung >= LADDER["estimator_visual_odometry_aligned"]:
         return
-    intervals = np.diff(within(source.samples, analysis.comparison.segment).index.to_numpy())
+    intervals = np.diff(within(source.samples, analysis.segment).index.to_numpy())
     if len(intervals) < MIN_INTERVALS:
         return
     typical = float(np.median(intervals))

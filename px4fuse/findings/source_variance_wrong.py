@@ -17,7 +17,7 @@ REPORTED_ERROR = Threshold(3.0, "times", "in variance: beyond what EKF2's NIS be
 
 
 def _detect(analysis: Analysis) -> Found:
-    comparison = analysis.comparison
+    comparison = analysis
     source, tuned = comparison.source, analysis.tuning.get(HORIZONTAL)
     # odometry reports how far it has drifted, or its noise: it cannot be told which
     if source.orientation is not None or source.reconstructed or not isinstance(tuned, AxisTuning):

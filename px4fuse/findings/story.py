@@ -13,13 +13,14 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.comparison import (
+from px4fuse.comparison.drift import may_drift
+from px4fuse.comparison.model import (
     AgainstTruth,
     AxisComparison,
     Comparison,
     Difference,
+    FilterName,
 )
-from px4fuse.comparison.drift import may_drift
 from px4fuse.comparison.why import Why
 from px4fuse.comparison.why_words import STAMPS_WRONG, the
 from px4fuse.filter.kalman import Settings, state_at
@@ -68,20 +69,21 @@ def story(analysis: Analysis, findings: tuple[Finding, ...]) -> tuple[str, ...]:
 
 def _verdict(analysis: Analysis) -> str:
     """How far off both filters were, and whether they knew it."""
-    comparison = analysis.comparison
+    comparison = analysis
     result = comparison.main
     along, since = f"Along {the(result.axis.name)}", _since(analysis, result)
-    ours = _knows(comparison, "kf", result)
+    ours, ours_truth = _knows(comparison, "kf", result), result.filters["kf"].truth
     if isinstance(result.ekf2_state, Unavailable):
         return (
-            f"{along} our filter was {_error(result.kf_truth)}{ours}{since}; there is no EKF2 "
+            f"{along} our filter was {_error(ours_truth)}{ours}{since}; there is no EKF2 "
             f"beside it: {result.ekf2_state.reason}."
         )
     ekf2 = _knows(comparison, "ekf2", result)
-    if isinstance(result.ekf2_truth, AgainstTruth) and isinstance(result.kf_truth, AgainstTruth):
+    ekf2_truth = result.filters["ekf2"].truth
+    if isinstance(ekf2_truth, AgainstTruth) and isinstance(ours_truth, AgainstTruth):
         return (
-            f"{along} EKF2 was {_error(result.ekf2_truth)}{ekf2}; our filter was "
-            f"{_error(result.kf_truth)}{ours}{since}."
+            f"{along} EKF2 was {_error(ekf2_truth)}{ekf2}; our filter was "
+            f"{_error(ours_truth)}{ours}{since}."
         )
     apart = "both were flown"
     if isinstance(result.difference, Difference):
@@ -102,15 +104,14 @@ def _error(truth: AgainstTruth | Unavailable) -> str:
     return f"{length_words(truth.position_rmse_m)} from the truth (RMS) and "
 
 
-def _knows(comparison: Comparison, owner: str, result: AxisComparison) -> str:
+def _knows(comparison: Comparison, owner: FilterName, result: AxisComparison) -> str:
     """Whether a filter's variance is what its innovations, and the truth, show."""
     name = result.axis.name
     for hidden in hidden_errors(comparison):
         if hidden.owner == owner and hidden.result.axis.name == name:
             claimed = hidden.truth.position_rmse_m / np.sqrt(hidden.nees)
             return f"claimed {length_words(float(claimed))}"
-    summary = result.kf if owner == "kf" else result.ekf2
-    statement = summary if isinstance(summary, Unavailable) else summary.consistency
+    statement = result.filters[owner]
     if isinstance(statement, Unavailable):
         return "cannot be judged by innovations, since the log has none or too few"
     factor = statement.variance_factor
@@ -123,7 +124,7 @@ def _knows(comparison: Comparison, owner: str, result: AxisComparison) -> str:
 
 def _since(analysis: Analysis, result: AxisComparison) -> str:
     """The setting that makes our variance too large or too small, where the data say so."""
-    comparison, statement = analysis.comparison, result.kf.consistency
+    comparison, statement = analysis, result.filters["kf"]
     if isinstance(statement, Unavailable) or statement.verdict == "consistent":
         return ""
     if may_drift(comparison.flight, comparison.source):
@@ -161,12 +162,12 @@ def _beyond(noise: Noise, chosen: float, *, over: bool) -> float | None:
 
 def _causes(analysis: Analysis, findings: list[Finding]) -> Iterator[str]:
     """The findings that weigh most, a sentence each."""
-    told = TOLD_FIRST | (SETTINGS if _since(analysis, analysis.comparison.main) else frozenset())
+    told = TOLD_FIRST | (SETTINGS if _since(analysis, analysis.main) else frozenset())
     for finding in findings:
         if finding.severity == "info" or finding.id in told:
             continue
         if finding.id == "source_gap":
-            yield _gap(analysis.comparison, finding)
+            yield _gap(analysis, finding)
             continue
         headline = finding.headline
         dated = any(f"{time:.1f} s" in headline for span in finding.spans_s for time in span)
@@ -207,7 +208,7 @@ def _differences(analysis: Analysis) -> Iterator[str]:
             f"The odometry fails to close its loop by {length_words(gap)} after "
             f"{length_words(length)} ({gap / length:.1%})."
         )
-    why = analysis.why.get(analysis.comparison.main.axis.name)
+    why = analysis.why.get(analysis.main.axis.name)
     if isinstance(why, Why):
         # wrong stamps are a finding of their own
         first = next(each for each in why.sentences if not each.startswith(STAMPS_WRONG))

@@ -8,7 +8,7 @@ from px4fuse.flight import Unavailable
 
 
 def _detect(analysis: Analysis) -> Found:
-    comparison = analysis.comparison
+    comparison = analysis
     ekf2 = comparison.flight.ekf2
     if isinstance(ekf2, Unavailable):
         yield Finding(
@@ -17,7 +17,7 @@ def _detect(analysis: Analysis) -> Found:
             f"Nothing to compare with: {ekf2.reason}. The report holds our filter alone.",
             ekf2.remedy,
         )
-    acceleration = comparison.axes[0].axis.acceleration
+    acceleration = comparison.lines[0].acceleration
     if isinstance(acceleration, Unavailable):
         yield Finding(
             "input_unavailable",
@@ -26,13 +26,14 @@ def _detect(analysis: Analysis) -> Found:
             "our filter assumes constant velocity.",
             acceleration.remedy,
         )
-    for result in comparison.axes:
-        if isinstance(result.kf.consistency, Unavailable):
+    for result in comparison.axes.values():
+        ours = result.filters["kf"]
+        if isinstance(ours, Unavailable):
             yield Finding(
                 "too_few_innovations",
                 "warning",
-                f"No statement on consistency: {result.kf.consistency.reason}.",
-                result.kf.consistency.remedy,
+                f"No statement on consistency: {ours.reason}.",
+                ours.remedy,
                 {"count": float(len(result.replay.updates))},
             )
             return

@@ -5,10 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from msgspec import structs
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.comparison import AxisComparison, Comparison
 from px4fuse.comparison.drift import may_drift
+from px4fuse.comparison.model import FILTERS, AxisComparison, Comparison
 from px4fuse.comparison.remedy import (
     filter_words,
     noise_helps,
@@ -55,13 +56,12 @@ Member = tuple[AxisComparison, Consistency]
 
 
 def _detect(analysis: Analysis) -> Found:
-    for owner in ("kf", "ekf2"):
+    for owner in FILTERS:
         named: list[Member] = []
-        for result in analysis.comparison.axes:
-            summary = result.kf if owner == "kf" else result.ekf2
-            if isinstance(summary, Unavailable) or isinstance(summary.consistency, Unavailable):
+        for result in analysis.axes.values():
+            statement = result.filters[owner]
+            if isinstance(statement, Unavailable):
                 continue
-            statement = summary.consistency
             factor = max(statement.variance_factor, 1.0 / statement.variance_factor)
             if statement.verdict != "consistent" and factor >= VARIANCE_FACTOR.value:
                 named.append((result, statement))
@@ -81,7 +81,7 @@ def _detect(analysis: Analysis) -> Found:
                 )
             ]
             if groups:  # one noise for all axes: the vertical axis tells no other cause
-                yield replace(groups[0], consequences=tuple(groups[1:]))
+                yield structs.replace(groups[0], consequences=tuple(groups[1:]))
 
 
 def _variance_finding(analysis: Analysis, owner: str, group: str, members: list[Member]) -> Finding:
@@ -91,7 +91,7 @@ def _variance_finding(analysis: Analysis, owner: str, group: str, members: list[
     factor = statement.variance_factor if over else 1.0 / statement.variance_factor
     name = "Our" if owner == "kf" else "EKF2's"
     low, high = statement.nis_band
-    comparison = analysis.comparison
+    comparison = analysis
     severity: Severity = "error" if factor >= VARIANCE_FACTOR_ERROR.value else "warning"
     if _is_default(comparison, owner, result):
         severity = lowered(severity)
@@ -170,7 +170,7 @@ def _noise_remedy(
 
     It is a property of the source, so our estimate of it serves EKF2 as well.
     """
-    comparison = analysis.comparison
+    comparison = analysis
     asked, settings = _asked(analysis, result), comparison.settings
     lag1 = statement.lag1_autocorrelation
     tuned = tuned_for(analysis, result.axis.name)
@@ -199,7 +199,7 @@ def _noise_remedy(
 
 
 def _kf_remedy(analysis: Analysis, asked: SourceNoise, statement: Consistency) -> tuple[str, str]:
-    comparison = analysis.comparison
+    comparison = analysis
     settings = comparison.settings
     noise = max(asked.sigma_z_m, SMALLEST_NOISE.value)
     if asked.upper_bound:
@@ -226,7 +226,7 @@ def _kf_remedy(analysis: Analysis, asked: SourceNoise, statement: Consistency) -
 def _ekf2_remedy(
     analysis: Analysis, result: AxisComparison, asked: SourceNoise, statement: Consistency
 ) -> tuple[str, str]:
-    parameters = analysis.comparison.flight.log.parameters
+    parameters = analysis.flight.log.parameters
     used, set_noise = _ekf2_noise(result), parameters.get("EKF2_EVP_NOISE", np.nan)
     noise = asked.sigma_z_m
     if asked.upper_bound:  # EKF2's own innovations bound it too, and less tightly

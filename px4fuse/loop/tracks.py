@@ -107,7 +107,7 @@ def _ours(flight: Flight) -> Trajectory:
     position = pd.DataFrame(
         {
             column: result.replay.steps["position_m"]
-            for column, result in zip(POSITION_COLUMNS, compared.axes, strict=True)
+            for column, result in zip(POSITION_COLUMNS, compared.axes.values(), strict=True)
         }
     ).dropna()
     attitude = None if isinstance(flight.attitude, Unavailable) else flight.attitude
@@ -159,7 +159,7 @@ def _trajectory(
         position_variance_m2=None if variance is None else variance.to_numpy(np.float64),
         rotation_variance_rad2=rotation_variance,
         sha256=flight.log.sha256,
-        size_bytes=flight.log.size_bytes,
+        size_bytes=flight.log.bytes,
         notes=notes,
     )
 

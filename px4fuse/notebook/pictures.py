@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 
 from px4fuse.analysis import Analysis
 from px4fuse.arrays import Array
-from px4fuse.comparison.comparison import AxisComparison, Comparison
+from px4fuse.comparison.model import AxisComparison, Comparison
 from px4fuse.comparison.why import Why
 from px4fuse.display import frame
 from px4fuse.ekf2.whatif import WhatIf
@@ -97,7 +97,7 @@ def axis_comparison(result: AxisComparison, ax: Any = None) -> Any:
 
 def comparison(result: Comparison | Analysis, axis: str | None = None, ax: Any = None) -> Any:
     """One axis, by default the aisle where there is one."""
-    whole = result.comparison if isinstance(result, Analysis) else result
+    whole = result
     return axis_comparison(whole.main if axis is None else whole[axis], ax)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.comparison import AxisComparison, Comparison, FilterSummary
+from px4fuse.comparison.model import FILTERS, AxisComparison, Comparison
 from px4fuse.comparison.why import Why
 from px4fuse.display import frame, words
 from px4fuse.ekf2.whatif import Summary, WhatIf
@@ -87,20 +87,20 @@ def _(flight: Flight) -> pd.DataFrame:
 # -- a comparison ----------------------------------------------------------------------------------
 
 
-def _filters(result: AxisComparison) -> tuple[tuple[str, Any, Any], ...]:
-    return (OURS, result.kf, result.kf_truth), (EKF2, result.ekf2, result.ekf2_truth)
+def _filters(result: AxisComparison) -> tuple[tuple[str, Any], ...]:
+    return tuple(zip((OURS, EKF2), (result.filters[name] for name in FILTERS), strict=True))
 
 
 @words.register
 def _(result: AxisComparison) -> str:
     parts = []
-    for name, summary, truth in _filters(result):
-        if isinstance(summary, Unavailable):
+    for name, summary in _filters(result):
+        if name == EKF2 and isinstance(result.ekf2_state, Unavailable):
             parts.append(f"no {name}")
             continue
-        said = _nis(summary.consistency)
-        if not isinstance(truth, Unavailable):
-            said += f", {truth.position_rmse_m:.3g} m RMS from the truth"
+        said = _nis(summary)
+        if not isinstance(summary.truth, Unavailable):
+            said += f", {summary.truth.position_rmse_m:.3g} m RMS from the truth"
         parts.append(f"{name} {said}")
     return f"{result.axis.name}: {'; '.join(parts)}"
 
@@ -128,7 +128,7 @@ def _(comparison: Comparison) -> str:
         [
             f"{comparison.flight.log.name}, {segment.start_s:.1f} to {segment.end_s:.1f} s, "
             f"{comparison.source.name}; {settings_words(comparison.settings)}",
-            *map(words, comparison.axes),
+            *map(words, comparison.axes.values()),
         ]
     )
 
@@ -172,11 +172,12 @@ def _(statement: Consistency) -> pd.DataFrame:
 def _(comparison: Comparison) -> pd.DataFrame:
     """A row per axis and filter."""
     rows = []
-    for result in comparison.axes:
-        for name, summary, truth in _filters(result):
+    for result in comparison.axes.values():
+        for name, summary in _filters(result):
+            truth = summary.truth
             row: dict[str, Any] = {"axis": result.axis.name, "filter": name}
-            if isinstance(summary, FilterSummary):
-                row |= _consistency_row(summary.consistency)
+            if name == OURS or not isinstance(result.ekf2_state, Unavailable):
+                row |= _consistency_row(summary)
                 row |= {
                     "sigma_p_median_m": number(summary.sigma_p_median_m),
                     "sigma_v_median_m_s": number(summary.sigma_v_median_m_s),
@@ -193,7 +194,7 @@ def _(comparison: Comparison) -> pd.DataFrame:
 
 @frame.register
 def _(analysis: Analysis) -> pd.DataFrame:
-    return frame(analysis.comparison)
+    return frame.dispatch(Comparison)(analysis)
 
 
 @frame.register
@@ -229,28 +230,26 @@ def _at(series: pd.Series, times: pd.Index) -> Any:
 
 @words.register
 def _(why: Why) -> str:
-    walk = why.axis
-    heaviest = sorted(walk.steps, key=lambda step: -abs(step.position_mean_square_m2))[:2]
+    heaviest = sorted(why.steps, key=lambda step: -abs(step.position_mean_square_m2))[:2]
     said = " and ".join(
-        f"{step.name} ({step.position_mean_square_m2 / walk.position_total_m2:.0%})"
+        f"{step.name} ({step.position_mean_square_m2 / why.position_mean_square_m2:.0%})"
         for step in heaviest
     )
-    apart = walk.position_total_m2**0.5
+    apart = why.position_mean_square_m2**0.5
     return (
         f"{OURS} and EKF2 are {apart:.3g} m RMS apart, mostly by {said} of the mean square; "
-        f"{walk.position_left_share:.1%} is left unexplained"
+        f"{why.position_left_share:.1%} is left unexplained"
     )
 
 
 @frame.register
 def _(why: Why) -> pd.DataFrame:
     """What each step brings our filter nearer to EKF2, in mean square."""
-    walk = why.axis
     rows = [
         (step.name, step.position_mean_square_m2, step.velocity_mean_square_m2_s2)
-        for step in walk.steps
+        for step in why.steps
     ]
-    rows += [("left", walk.position_left_m2, walk.velocity_left_m2_s2)]
+    rows += [("left", why.position_left_mean_square_m2, why.velocity_left_mean_square_m2_s2)]
     columns = ["step", "position_mean_square_m2", "velocity_mean_square_m2_s2"]
     return pd.DataFrame(rows, columns=columns)
 

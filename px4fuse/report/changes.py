@@ -14,8 +14,8 @@ from matplotlib.ticker import MaxNLocator
 
 from px4fuse.analysis import Analysis
 from px4fuse.arrays import Array
-from px4fuse.comparison.comparison import AxisComparison
 from px4fuse.comparison.events import happened
+from px4fuse.comparison.model import AxisComparison
 from px4fuse.comparison.why_words import the
 from px4fuse.filter.kalman import state_at
 from px4fuse.filter.signals import AISLE
@@ -92,7 +92,7 @@ def draw(document: ChangesDocument) -> Iterator[Figure]:
     a, b = document.a, document.b
     if a is None or b is None:
         return
-    named = [{result.axis.name for result in analysis.axes} for analysis in (a, b)]
+    named = [set(analysis.axes) for analysis in (a, b)]
     common = [n for n in (AISLE, "north", "east", "down") if all(n in names for names in named)]
     if not common:
         return
@@ -177,7 +177,7 @@ def _row(cursor: Cursor, cells: Sequence[str], *, is_head: bool) -> None:
 
 def _tracks(a: Analysis, b: Analysis, axis: str) -> tuple[tuple[Track, Track], str]:
     """Both on one axis, and what their times count from."""
-    took_off = [happened(analysis.comparison).take_off_s for analysis in (a, b)]
+    took_off = [happened(analysis).take_off_s for analysis in (a, b)]
     zeros = [times[0] for times in took_off if times]
     since = "take-off"
     if len(zeros) < len(took_off):
@@ -308,7 +308,7 @@ def _innovations(
 
 def _finish(cursor: Cursor, axes: Axes, tracks: Sequence[Track], since: str) -> None:
     """Common limits in time, whose numbers stand at the last panel alone."""
-    segments = [(track.analysis.comparison.segment, track.zero_s) for track in tracks]
+    segments = [(track.analysis.segment, track.zero_s) for track in tracks]
     axes.set_xlim(
         min(segment.start_s - zero for segment, zero in segments),
         max(segment.end_s - zero for segment, zero in segments),
@@ -385,7 +385,7 @@ def _said(
 
 def _path(analysis: Analysis, of: Callable[[AxisComparison], Any]) -> Series | None:
     """North and east (m), where both were analysed."""
-    frames = {result.axis.name: of(result) for result in analysis.axes}
+    frames = {name: of(result) for name, result in analysis.axes.items()}
     north, east = frames.get("north"), frames.get("east")
     if not isinstance(north, pd.DataFrame) or not isinstance(east, pd.DataFrame):
         return None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from px4fuse.arrays import Array
-from px4fuse.comparison.comparison import AxisComparison, FilterSummary
+from px4fuse.comparison.model import AxisComparison
 from px4fuse.comparison.why_words import the
 from px4fuse.filter.consistency import MIN_INNOVATIONS, Consistency, autocorrelation, nis_band
 from px4fuse.flight import Unavailable
@@ -92,7 +92,7 @@ def draw(document: Document) -> Iterator[Figure]:
     else:
         cursor.write(f"Along {along}: {_reason(result)}.")
         cursor.skip(8)
-    _table(cursor, document.comparison.axes)
+    _table(cursor, document.comparison.axes.values())
     yield figure
 
 
@@ -100,19 +100,18 @@ def _series(result: AxisComparison) -> list[Series]:
     """Of each filter that has enough innovations."""
     series = []
     for name, colour, frame, summary in (
-        ("ours", OURS, result.replay.updates, result.kf),
-        ("EKF2", EKF2, result.ekf2_innovations, result.ekf2),
+        ("ours", OURS, result.replay.updates, result.filters["kf"]),
+        ("EKF2", EKF2, result.ekf2_innovations, result.filters["ekf2"]),
     ):
         if (
             isinstance(frame, pd.DataFrame)
             and len(frame) >= MIN_INNOVATIONS
-            and isinstance(summary, FilterSummary)
-            and isinstance(summary.consistency, Consistency)
+            and isinstance(summary, Consistency)
         ):
             values = frame["innovation_m"] / np.sqrt(frame["innovation_variance_m2"])
             known = values[np.isfinite(values)]
             time = known.index.to_numpy(dtype=np.float64)
-            series.append(Series(name, colour, time, known.to_numpy(), summary.consistency))
+            series.append(Series(name, colour, time, known.to_numpy(), summary))
     return series
 
 
@@ -227,19 +226,18 @@ def _white_words(series: list[Series]) -> str:
 
 
 def _reason(result: AxisComparison) -> str:
-    statement = result.kf.consistency
+    statement = result.filters["kf"]
     return statement.reason if isinstance(statement, Unavailable) else "too few innovations"
 
 
-def _table(cursor: Cursor, axes: tuple[AxisComparison, ...]) -> None:
+def _table(cursor: Cursor, axes: Iterable[AxisComparison]) -> None:
     """Every axis and filter with its numbers."""
     heads = ("axis", "filter", "n", "mean NIS", "95 % band", "innovation variance", "beyond 2√S",
              "t of mean", "lag 1", "Ljung-Box")  # fmt: skip
     rows = []
     for result in axes:
-        for owner, summary in (("ours", result.kf), ("EKF2", result.ekf2)):
+        for owner, statement in (("ours", result.filters["kf"]), ("EKF2", result.filters["ekf2"])):
             axis = result.axis.name if owner == "ours" else ""
-            statement = summary if isinstance(summary, Unavailable) else summary.consistency
             if isinstance(statement, Unavailable):
                 rows.append((axis, owner, *[""] * 3, "not available", *[""] * 4))
                 continue

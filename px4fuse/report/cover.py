@@ -7,7 +7,13 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from matplotlib.figure import Figure
 
-from px4fuse.comparison.comparison import AgainstTruth, Difference, FilterSummary
+from px4fuse.comparison.model import (
+    AgainstTruth,
+    Difference,
+    FilterName,
+    FilterSummary,
+    UnjudgedFilter,
+)
 from px4fuse.comparison.why_words import the
 from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.signals import AISLE
@@ -112,19 +118,21 @@ def _verdict(cursor: Cursor, document: Document) -> None:
     along = the(result.axis.name)
     top = cursor.y
     ends = []
-    for label, summary, truth, colour, left, right in (
-        (f"Along {along} our filter's variance is", result.kf, result.kf_truth, OURS, LEFT, SECOND),
-        (f"Along {along} EKF2's variance is", result.ekf2, result.ekf2_truth, EKF2, SECOND, RIGHT),
-    ):
-        if isinstance(summary, Unavailable):
+    places: tuple[tuple[str, FilterName, str, float, float], ...] = (
+        ("our filter's", "kf", OURS, LEFT, SECOND),
+        ("EKF2's", "ekf2", EKF2, SECOND, RIGHT),
+    )
+    for owner, name, colour, left, right in places:
+        if name == "ekf2" and isinstance(result.ekf2_state, Unavailable):
             continue
         cursor.y = top
-        statement = summary.consistency
+        statement = result.filters[name]
+        label = f"Along {along} {owner} variance is"
         shade = colour if isinstance(statement, Consistency) else MUTED
         cursor.write(label, size=8.0, x=left, right=right)
         cursor.write(verdict_words(statement), size=16.0, weight="bold", colour=shade, x=left)
         cursor.skip(2)
-        cursor.write(_large_numbers(summary, truth), size=8.0, x=left, right=right - 0.02)
+        cursor.write(_large_numbers(statement), size=8.0, x=left, right=right - 0.02)
         ends.append(cursor.y)
     cursor.y = min(ends)
     cursor.skip(2)
@@ -136,32 +144,33 @@ def _verdict(cursor: Cursor, document: Document) -> None:
             + ("" if document.truth_known else " The log has no truth to say who is right."),
             size=8.0,
         )
-    elif isinstance(result.ekf2, Unavailable):
-        cursor.write(f"There is no EKF2 to compare with: {result.ekf2.reason}.", size=8.0)
+    elif isinstance(result.ekf2_state, Unavailable):
+        cursor.write(f"There is no EKF2 to compare with: {result.ekf2_state.reason}.", size=8.0)
     cursor.skip(2)
     cursor.write(EXPLANATION, size=7.0, colour=MUTED)
 
 
-def _large_numbers(summary: FilterSummary, truth: AgainstTruth | Unavailable) -> str:
-    statement = summary.consistency
-    if isinstance(statement, Consistency):
+def _large_numbers(statement: FilterSummary | UnjudgedFilter) -> str:
+    if isinstance(statement, FilterSummary):
         cells = statement_cells(statement)
         words = f"Mean NIS {cells.nis}, band {cells.band}, from {statement.count} innovations."
     else:
         words = f"{statement.reason}."
-    if isinstance(truth, AgainstTruth):
-        position, velocity = error_cells(truth)
+    if isinstance(statement.truth, AgainstTruth):
+        position, velocity = error_cells(statement.truth)
         words += f" {position} m{f' and {velocity} m/s' if velocity else ''} RMS from the truth."
     return words
 
 
 def _other_axes(cursor: Cursor, document: Document) -> None:
     """The axes beside the main one, a row each."""
-    others = [axis for axis in document.comparison.axes if axis is not document.comparison.main]
+    others = [
+        axis for axis in document.analysis.axes.values() if axis is not document.analysis.main
+    ]
     if not others:
         return
     to_truth = "to truth (m)" if document.truth_known else ""
-    beside = not isinstance(document.comparison.main.ekf2, Unavailable)
+    beside = not isinstance(document.comparison.main.ekf2_state, Unavailable)
     names = ("variance", "mean NIS", to_truth)
     blank = ("",) * 3
     cursor.skip(5)
@@ -174,8 +183,8 @@ def _other_axes(cursor: Cursor, document: Document) -> None:
     for result in others:
         cells = (
             result.axis.name,
-            *_cells(result.kf, result.kf_truth),
-            *(_cells(result.ekf2, result.ekf2_truth) if beside else blank),
+            *_cells(result.filters["kf"]),
+            *(_cells(result.filters["ekf2"]) if beside else blank),
             difference_cells(result.difference)[0],
         )
         _row(cursor, cells, colours)
@@ -191,13 +200,9 @@ def _row(cursor: Cursor, cells: Sequence[str], colours: Sequence[str]) -> None:
             )  # fmt: skip
 
 
-def _cells(
-    summary: FilterSummary | Unavailable, truth: AgainstTruth | Unavailable
-) -> tuple[str, str, str]:
-    if isinstance(summary, Unavailable):
-        return "not available", "", ""
-    cells = statement_cells(summary.consistency)
-    return cells.words, cells.nis, error_cells(truth)[0]
+def _cells(statement: FilterSummary | UnjudgedFilter) -> tuple[str, str, str]:
+    cells = statement_cells(statement)
+    return cells.words, cells.nis, error_cells(statement.truth)[0]
 
 
 def facts(document: Document) -> list[tuple[str, str]]:
@@ -208,7 +213,7 @@ def facts(document: Document) -> list[tuple[str, str]]:
         f"{source.name}: {source.description}, {source.rate_hz:.1f} Hz, {source.frame}; "
         f"{comparison.source_reason}"
     )
-    if any(part.what == "position source vehicle_visual_odometry" for part in comparison.missing):
+    if any(part.source == "vehicle_visual_odometry" for part in comparison.missing):
         source_text += ". SDLOG_PROFILE 129 would have logged it as it arrived"
     clock = "" if source.alignment is None else source.clock
     if source.clock_map is not None:
@@ -221,7 +226,7 @@ def facts(document: Document) -> list[tuple[str, str]]:
         ("Our filter", settings_words(comparison.settings)),
         ("Aisle", "" if aisle is None else f"{aisle.heading_deg:.1f}° from north ({aisle.note})"),
         ("With", ", ".join(f"{f.name}, SHA-256 {f.sha256[:12]}…" for f in flight.inputs)),
-        ("SHA-256", f"{log.sha256}, {log.size_bytes / 1e6:.2f} MB"),
+        ("SHA-256", f"{log.sha256}, {log.bytes / 1e6:.2f} MB"),
     ]
     return [(label, text) for label, text in listed if text]
 

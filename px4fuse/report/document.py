@@ -7,8 +7,8 @@ from functools import cached_property
 from typing import ClassVar
 
 from px4fuse.analysis import Analysis, Counterfactual
-from px4fuse.comparison.comparison import Comparison
 from px4fuse.comparison.events import Events, happened
+from px4fuse.comparison.model import Comparison
 from px4fuse.findings import Finding
 from px4fuse.findings.story import story
 from px4fuse.flight import Unavailable
@@ -52,7 +52,7 @@ class Document:
     @property
     def comparison(self) -> Comparison:
         """The comparison itself, without what explains it."""
-        return self.analysis.comparison
+        return self.analysis
 
     @cached_property
     def story(self) -> tuple[str, ...]:

@@ -12,7 +12,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from px4fuse.arrays import Array
-from px4fuse.comparison.comparison import AgainstTruth, AxisComparison, Difference
+from px4fuse.comparison.model import FILTERS, AgainstTruth, AxisComparison, Difference
 from px4fuse.comparison.why_words import the
 from px4fuse.flight import Unavailable
 from px4fuse.report import marks
@@ -193,7 +193,7 @@ def _farthest(result: AxisComparison) -> tuple[float, float] | None:
 def velocity_words(result: AxisComparison) -> str:
     """What to see in the velocities."""
     words = "Never measured: each filter infers it from positions and IMU"
-    ours, theirs = result.kf_truth, result.ekf2_truth
+    ours, theirs = result.filters["kf"].truth, result.filters["ekf2"].truth
     if not isinstance(ours, AgainstTruth) or ours.velocity_rmse_m_s is None:
         return f"{words}."
     if not isinstance(theirs, AgainstTruth) or theirs.velocity_rmse_m_s is None:
@@ -218,10 +218,9 @@ def error_words(result: AxisComparison) -> str:
     share = inside_share(result)
     if isinstance(result.truth, pd.DataFrame):
         words = f"{share:.0%} of our error lies in our own ±2σ (blue), where 95% should"
-        if isinstance(result.kf_truth, AgainstTruth) and isinstance(
-            result.ekf2_truth, AgainstTruth
-        ):
-            nearer = _nearer(result.kf_truth.position_rmse_m, result.ekf2_truth.position_rmse_m)
+        ours, theirs = (result.filters[name].truth for name in FILTERS)
+        if isinstance(ours, AgainstTruth) and isinstance(theirs, AgainstTruth):
+            nearer = _nearer(ours.position_rmse_m, theirs.position_rmse_m)
             words = f"{nearer}. {words}"
         return f"{words}."
     return (
@@ -255,7 +254,9 @@ def velocity_numbers(result: AxisComparison) -> str:
     """Numbers of the velocities."""
     words = [
         f"{name} {part.velocity_rmse_m_s:.3f}"
-        for name, part in (("ours", result.kf_truth), ("EKF2", result.ekf2_truth))
+        for name, part in zip(
+            ("ours", "EKF2"), (result.filters[name].truth for name in FILTERS), strict=True
+        )
         if isinstance(part, AgainstTruth) and part.velocity_rmse_m_s is not None
     ]
     text = f"RMS to truth (m/s): {', '.join(words)}" if words else ""
@@ -269,7 +270,9 @@ def error_numbers(result: AxisComparison) -> str:
     """Numbers of the errors."""
     words = [
         f"{name} {part.position_rmse_m:.3f}"
-        for name, part in (("ours", result.kf_truth), ("EKF2", result.ekf2_truth))
+        for name, part in zip(
+            ("ours", "EKF2"), (result.filters[name].truth for name in FILTERS), strict=True
+        )
         if isinstance(part, AgainstTruth)
     ]
     return f"RMS to truth (m): {', '.join(words)}" if words else position_numbers(result)

@@ -12,8 +12,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
 from px4fuse.arrays import Array
-from px4fuse.comparison.comparison import AxisComparison, FilterSummary
 from px4fuse.comparison.events import Span
+from px4fuse.comparison.model import AxisComparison, FilterSummary, UnjudgedFilter
 from px4fuse.comparison.why_words import the
 from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.signals import Segment
@@ -191,22 +191,21 @@ def _at_edge(axes: Axes, time: Array, nu: Array, limit: float, style: dict[str, 
 
 def innovation_words(result: AxisComparison) -> str:
     """What to see in the innovations."""
-    words = [_outside_words("Ours", result.kf)]
-    if isinstance(result.ekf2, Unavailable):
-        words.append(f"EKF2: {result.ekf2.reason}")
+    words = [_outside_words("Ours", result.filters["kf"])]
+    if isinstance(result.ekf2_state, Unavailable):
+        words.append(f"EKF2: {result.ekf2_state.reason}")
     elif isinstance(result.ekf2_innovations, Unavailable):
         words.append(f"EKF2: {result.ekf2_innovations.reason}")
     else:
-        words.append(_outside_words("EKF2", result.ekf2))
+        words.append(_outside_words("EKF2", result.filters["ekf2"]))
         count = int((result.ekf2_innovations["rejected"] > 0).sum())
         if count:
             words.append(f"It rejected {count} of them (hollow)")
     return ". ".join(words) + "."
 
 
-def _outside_words(name: str, summary: FilterSummary) -> str:
-    statement = summary.consistency
-    if not isinstance(statement, Consistency):
+def _outside_words(name: str, statement: Consistency | Unavailable) -> str:
+    if isinstance(statement, Unavailable):
         return f"{name}: {statement.reason}"
     return (
         f"{name}: {statement.outside_two_sigma:.1%} of {statement.count} outside its own ±2√S, "
@@ -216,17 +215,16 @@ def _outside_words(name: str, summary: FilterSummary) -> str:
 
 def innovation_numbers(result: AxisComparison, limit: float) -> str:
     """Numbers of the innovations, and how many lie beyond the axes."""
-    words = [_numbers("ours", result.kf, result.replay.updates, limit)]
-    if isinstance(result.ekf2, FilterSummary):
-        words.append(_numbers("EKF2", result.ekf2, result.ekf2_innovations, limit))
+    words = [_numbers("ours", result.filters["kf"], result.replay.updates, limit)]
+    if not isinstance(result.ekf2_state, Unavailable):
+        words.append(_numbers("EKF2", result.filters["ekf2"], result.ekf2_innovations, limit))
     return "; ".join(filter(None, words))
 
 
 def _numbers(
-    name: str, summary: FilterSummary, frame: pd.DataFrame | Unavailable, limit: float
+    name: str, statement: Consistency | Unavailable, frame: pd.DataFrame | Unavailable, limit: float
 ) -> str:
-    statement = summary.consistency
-    if not isinstance(statement, Consistency) or isinstance(frame, Unavailable):
+    if isinstance(statement, Unavailable) or isinstance(frame, Unavailable):
         return ""
     beyond = int((frame["innovation_m"].abs() > limit).sum())
     return (
@@ -240,10 +238,10 @@ def short_numbers(result: AxisComparison) -> str:
     """Verdict and share outside ±2√S of both filters, a line each."""
     return "\n".join(
         f"{name}: {statement.outside_two_sigma:.1%} outside, {verdict_words(statement)}"
-        if isinstance(statement := summary.consistency, Consistency)
+        if isinstance(statement, Consistency)
         else f"{name}: not available"
-        for name, summary in (("ours", result.kf), ("EKF2", result.ekf2))
-        if isinstance(summary, FilterSummary)
+        for name, statement in (("ours", result.filters["kf"]), ("EKF2", result.filters["ekf2"]))
+        if name == "ours" or not isinstance(result.ekf2_state, Unavailable)
     )
 
 
@@ -293,9 +291,9 @@ def _largest(frame: pd.DataFrame, start_s: float, end_s: float) -> float:
 
 
 def _medians(result: AxisComparison, field: str, unit: str) -> str:
-    filters = [("ours", result.kf)]
-    if isinstance(result.ekf2, FilterSummary):
-        filters.append(("EKF2", result.ekf2))
+    filters = [("ours", result.filters["kf"])]
+    if not isinstance(result.ekf2_state, Unavailable):
+        filters.append(("EKF2", result.filters["ekf2"]))
     values = [(name, getattr(summary, field)) for name, summary in filters]
     return ", ".join(
         f"{name} not logged" if value is None else f"{name} {value:.3f} {unit}"
@@ -351,17 +349,18 @@ def _sawtooth(axes: Axes, result: AxisComparison, window: Span) -> None:
 def zoom_words(result: AxisComparison) -> str:
     """What to see in the zoom."""
     words = []
-    if result.kf.sigma_p_before_update_m is not None:
+    ours = result.filters["kf"]
+    if ours.sigma_p_before_update_m is not None:
         words.append(
             f"Without measurement σ grows, by SIGMA_A {result.replay.settings.sigma_a_m_s2:g} m/s² "
-            f"(predict); each measurement shrinks it ({_before_after('ours', result.kf)})"
+            f"(predict); each measurement shrinks it ({_before_after('ours', ours)})"
         )
-    if isinstance(result.ekf2, FilterSummary):
-        words.append(_before_after("EKF2", result.ekf2))
+    if not isinstance(result.ekf2_state, Unavailable):
+        words.append(_before_after("EKF2", result.filters["ekf2"]))
     return "; ".join(words) + "."
 
 
-def _before_after(name: str, summary: FilterSummary) -> str:
+def _before_after(name: str, summary: FilterSummary | UnjudgedFilter) -> str:
     before, after = summary.sigma_p_before_update_m, summary.sigma_p_after_update_m
     if before is None or after is None:
         return f"{name}: S or R not logged, so no before and after"
@@ -373,7 +372,7 @@ def start_words(result: AxisComparison) -> str:
     """What to see in the first seconds."""
     sigma = np.sqrt(result.replay.steps["position_variance_m2"])
     first = f"From σ {sigma.iloc[0]:g} m (P₀)"
-    steady = result.kf.sigma_p_after_update_m
+    steady = result.filters["kf"].sigma_p_after_update_m
     settled = sigma.index[(sigma < 1.2 * (steady or 0.0)).to_numpy()]
     if steady is None or not len(settled):
         return f"{first} on."

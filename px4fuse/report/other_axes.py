@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, NullLocator
 
-from px4fuse.comparison.comparison import AxisComparison, Difference, FilterSummary
+from px4fuse.comparison.model import FILTERS, AxisComparison, Difference
 from px4fuse.flight import Unavailable
 from px4fuse.report import flight, innovations, marks
 from px4fuse.report.document import Document
@@ -35,7 +35,9 @@ Panel = tuple[str, Callable[[Axes, AxisComparison, int], None], Callable[[AxisCo
 
 def draw(document: Document) -> Iterator[Figure]:
     """Draw one page; none where there is but one axis."""
-    others = [axis for axis in document.comparison.axes if axis is not document.comparison.main]
+    others = [
+        axis for axis in document.analysis.axes.values() if axis is not document.analysis.main
+    ]
     if not others:
         return
     figure, cursor = page(
@@ -96,9 +98,10 @@ def _panel(
 
 def _axis_words(result: AxisComparison) -> str:
     """What to see in one column."""
-    words = [f"innovation variance: ours {verdict_words(result.kf.consistency)}"]
-    if isinstance(result.ekf2, FilterSummary):
-        words.append(f"EKF2 {verdict_words(result.ekf2.consistency)}")
+    ours, ekf2 = (result.filters[name] for name in FILTERS)
+    words = [f"innovation variance: ours {verdict_words(ours)}"]
+    if not isinstance(result.ekf2_state, Unavailable):
+        words.append(f"EKF2 {verdict_words(ekf2)}")
     text = ", ".join(words)
     if isinstance(result.difference, Difference):
         text += f"; {result.difference.position_rmse_m:.3f} m RMS apart"

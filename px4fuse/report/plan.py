@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
 from px4fuse.arrays import Array
-from px4fuse.comparison.comparison import Comparison
+from px4fuse.comparison.model import Comparison
 from px4fuse.filter.signals import AISLE, within
 from px4fuse.flight import Ekf2, Truth
 from px4fuse.report.document import Document
@@ -144,7 +144,7 @@ def _tracks(comparison: Comparison) -> dict[str, Pair]:
     tracks = {"measurement": cut(comparison.source.samples)}
     if isinstance(flight.truth, Truth):
         tracks["truth"] = cut(flight.truth.samples)
-    both = {result.axis.name: result for result in comparison.axes}
+    both = comparison.axes
     if {"north", "east"} <= both.keys():
         north, east = both["north"], both["east"]
         if isinstance(north.ekf2_state, pd.DataFrame) and isinstance(east.ekf2_state, pd.DataFrame):

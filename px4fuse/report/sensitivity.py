@@ -12,8 +12,8 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import FixedLocator, NullFormatter, NullLocator
 
 from px4fuse.arrays import Array
-from px4fuse.comparison.comparison import AxisComparison
 from px4fuse.comparison.events import Span
+from px4fuse.comparison.model import AxisComparison
 from px4fuse.filter.fitting import FIRST_WIDTH
 from px4fuse.filter.likelihood import States, preintegrate, states, total_over_grid
 from px4fuse.filter.signals import AISLE
@@ -214,7 +214,7 @@ def _drop(document: Document, name: str, found: AxisTuning, a: Array, z: Array) 
     """Ln of how much less likely each pair is than the best of them, shape (n, m)."""
     comparison = document.comparison
     axes = [
-        one.axis for one in comparison.axes
+        one.axis for one in comparison.axes.values()
         if one.axis.name == name or (name == HORIZONTAL and one.axis.name in ("north", "east"))
     ]  # fmt: skip
     legs = [preintegrate(axis, comparison.settings) for axis in axes]

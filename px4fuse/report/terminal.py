@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from px4fuse.comparison.comparison import Difference
+from px4fuse.comparison.model import Difference
 from px4fuse.comparison.why import Why
 from px4fuse.filter.consistency import Consistency
 from px4fuse.findings import Finding, Severity
@@ -134,7 +134,7 @@ def print_finding(console: Console, finding: Finding, request: Request) -> None:
 
 def _table(document: Document) -> Table:
     comparison = document.comparison
-    ekf2 = any(isinstance(result.difference, Difference) for result in comparison.axes)
+    ekf2 = any(isinstance(result.difference, Difference) for result in comparison.axes.values())
     table = plain_table(
         ("axis", "left"), ("filter", "left"), ("mean\nNIS", "right"), ("95 %\nband", "right"),
         ("innovation\nvariance", "left"),
@@ -142,19 +142,17 @@ def _table(document: Document) -> Table:
         *((("to truth\n(m)", "right"), ("\n(m/s)", "right")) if document.truth_known else ()),
     )  # fmt: skip
     main = comparison.main
-    for result in (main, *(result for result in comparison.axes if result is not main)):
-        for owner, summary, against in (
-            ("ours", result.kf, result.kf_truth), ("EKF2", result.ekf2, result.ekf2_truth),
-        ):  # fmt: skip
-            if isinstance(summary, Unavailable):
+    for result in (main, *(result for result in comparison.axes.values() if result is not main)):
+        for name, statement in result.filters.items():
+            ours = name == "kf"
+            if not ours and isinstance(result.ekf2_state, Unavailable):
                 continue
-            ours = owner == "ours"
-            verdict = statement_cells(summary.consistency)
+            verdict = statement_cells(statement)
             table.add_row(
-                Text(result.axis.name if ours else "", "bold"), owner, verdict.nis, verdict.band,
-                Text(verdict.words, _style(summary.consistency)),
+                Text(result.axis.name if ours else "", "bold"), "ours" if ours else "EKF2",
+                verdict.nis, verdict.band, Text(verdict.words, _style(statement)),
                 *((difference_cells(result.difference) if ours else ("", "")) if ekf2 else ()),
-                *(error_cells(against) if document.truth_known else ()),
+                *(error_cells(statement.truth) if document.truth_known else ()),
             )  # fmt: skip
     return table
 

@@ -118,35 +118,35 @@ def _height(cursor: Cursor, why: Why | Unavailable) -> float:
     if isinstance(why, Unavailable):
         return cursor.height(f"{why.reason}. {why.remedy}") + 24.0 / POINTS_PER_HEIGHT
     words = sum(cursor.height(sentence, size=8.5) for sentence in why.sentences)
-    points = 24.0 + 2.0 * len(why.sentences) + ROW_POINTS * (len(why.axis.steps) + 2) + 30.0
+    points = 24.0 + 2.0 * len(why.sentences) + ROW_POINTS * (len(why.steps) + 2) + 30.0
     return words + (points + TIME_POINTS + 100.0) / POINTS_PER_HEIGHT
 
 
 def _axis(figure: Figure, cursor: Cursor, name: str, why: Why, document: Document) -> None:
-    spans = ", ".join(f"{start:.0f} to {end:.0f} s" for start, end in why.spans)
+    spans = ", ".join(f"{start:.0f} to {end:.0f} s" for start, end in why.spans_s)
     cursor.write(f"{name}, {spans}", size=9.5, weight="bold")
     cursor.skip(2)
     for sentence in why.sentences:
         cursor.write(sentence, size=8.5)
         cursor.skip(2)
     cursor.skip(18)
-    axis = why.axis
+    axis = why
     names = [step.name for step in axis.steps]
     width = (RIGHT - LEFT - LABELS - GAP) / 2.0
     height = ROW_POINTS * (len(names) + 2) / POINTS_PER_HEIGHT
     for column, (title, total, steps, left) in enumerate(
         (
             (
-                f"position, {np.sqrt(axis.position_total_m2):.3f} m rms",
-                axis.position_total_m2,
+                f"position, {np.sqrt(axis.position_mean_square_m2):.3f} m rms",
+                axis.position_mean_square_m2,
                 [step.position_mean_square_m2 for step in axis.steps],
-                axis.position_left_m2,
+                axis.position_left_mean_square_m2,
             ),
             (
-                f"velocity, {np.sqrt(axis.velocity_total_m2_s2):.3f} m/s rms",
-                axis.velocity_total_m2_s2,
+                f"velocity, {np.sqrt(axis.velocity_mean_square_m2_s2):.3f} m/s rms",
+                axis.velocity_mean_square_m2_s2,
                 [step.velocity_mean_square_m2_s2 for step in axis.steps],
-                axis.velocity_left_m2_s2,
+                axis.velocity_left_mean_square_m2_s2,
             ),
         )
     ):
@@ -198,11 +198,11 @@ def _percent(number: float) -> str:
 
 def _time_words(why: Why) -> str:
     """What to see along the flight."""
-    farthest = int(np.argmax(np.abs(why.axis.apart_m)))
+    farthest = int(np.argmax(np.abs(why.apart_m)))
     words = (
         f"Farthest apart at {why.times_s[farthest]:.1f} s, "
-        f"{abs(why.axis.apart_m[farthest]):.2g} m; the model leaves "
-        f"{np.sqrt(np.mean(why.axis.left_m**2)):.2g} m RMS"
+        f"{abs(why.apart_m[farthest]):.2g} m; the model leaves "
+        f"{np.sqrt(np.mean(why.left_m**2)):.2g} m RMS"
     )
     if why.coast is None:
         return f"{words}."
@@ -215,11 +215,11 @@ def _time_words(why: Why) -> str:
 
 def _over_time(axes: Axes, why: Why) -> None:
     """Where along the flight both differ, and what the model leaves of it."""
-    for start, end in why.spans:
+    for start, end in why.spans_s:
         inside = (why.times_s > start) & (why.times_s < end)
         time = why.times_s[inside]
-        axes.plot(*thin(time, why.axis.apart_m[inside]), **OURS_LINE)
-        axes.plot(*thin(time, why.axis.left_m[inside]), color=EKF2, lw=0.8)
+        axes.plot(*thin(time, why.apart_m[inside]), **OURS_LINE)
+        axes.plot(*thin(time, why.left_m[inside]), color=EKF2, lw=0.8)
     if why.coast is not None:
         start = why.coast.start_s
         axes.axvspan(start, start + why.coast.duration_s, color=EKF2_BAND, lw=0, zorder=0.5)

@@ -16,12 +16,10 @@ from px4fuse.loop.part import KnownEnd
 from px4fuse.request import LoopRequest
 from px4fuse.results import trajectories as made
 from px4fuse.results.contract import LOOP, EvaluationResults, GraphResults, LoopResults
-from px4fuse.results.model import Absent, Student
+from px4fuse.results.model import Student
 from px4fuse.results.parts import (
-    absent,
+    S,
     copied,
-    copied_or_absent,
-    found_mistakes,
     provenance,
     schema_of,
 )
@@ -41,7 +39,7 @@ def loop_results(
         track=_track(loop.odometry.trajectory),
         references=tuple(_track(reference) for reference in loop.references),
         loop=_loop(loop),
-        findings=found_mistakes(findings),
+        findings=findings,
         student=student,
         provenance=provenance(command),
     )
@@ -69,7 +67,7 @@ def graph_results(name: str, solved: SolvedGraph, command: str) -> GraphResults:
             poses=len(graph),
             edges=len(graph.first),
             initialised=graph.initialised,
-            gates=absent(gates)
+            gates=gates
             if isinstance(gates, Unavailable)
             else tuple(
                 copied(
@@ -94,17 +92,17 @@ def graph_results(name: str, solved: SolvedGraph, command: str) -> GraphResults:
     )
 
 
-def loop_part(loop: Loop | Unavailable) -> made.Loop | Absent:
+def loop_part(loop: Loop | Unavailable) -> made.LoopPart | Unavailable:
     """A loop and its corrections, or why there is none."""
-    return absent(loop) if isinstance(loop, Unavailable) else _loop(loop)
+    return loop if isinstance(loop, Unavailable) else _loop(loop)
 
 
-def _loop(loop: Loop) -> made.Loop:
+def _loop(loop: Loop) -> made.LoopPart:
     path = loop.odometry.trajectory
     error = loop.closure_error_m
     misclosure, turned = loop.misclosure_m, loop.misclosure_heading_deg
     return copied(
-        made.Loop,
+        made.LoopPart,
         loop,
         track=path.name,
         kind=path.kind,
@@ -121,7 +119,7 @@ def _loop(loop: Loop) -> made.Loop:
         closure_error_axes_m=None
         if isinstance(misclosure, Unavailable)
         else _axes(path, misclosure),
-        heading_error_deg=absent(turned) if isinstance(turned, Unavailable) else turned,
+        heading_error_deg=turned,
         odometry_noise=copied(made.OdometryNoise, loop.noise),
         closures=tuple(_closure(judged) for judged in loop.closures),
         corrections=made.Corrections(
@@ -159,8 +157,8 @@ def _score(score: Evaluation) -> made.Score:
         time_offset=copied(made.TimeOffset, score.time_offset),
         ate=made.AbsoluteError(
             translation_m=copied(made.Statistics, score.ate.translation),
-            interval_m=copied_or_absent(made.RmseInterval, score.ate.interval),
-            rotation_deg=copied_or_absent(made.Statistics, score.ate.rotation),
+            interval_m=_copied(made.RmseInterval, score.ate.interval),
+            rotation_deg=_copied(made.Statistics, score.ate.rotation),
         ),
         rpe=tuple(_relative(one) for one in score.rpe),
     )
@@ -172,9 +170,9 @@ def _relative(error: RelativeError) -> made.RelativeError:
         error,
         delta=error.delta.value,
         unit=error.delta.unit,
-        translation_m=copied_or_absent(made.Statistics, error.translation),
-        interval_m=copied_or_absent(made.RmseInterval, error.interval),
-        rotation_deg=copied_or_absent(made.Statistics, error.rotation),
+        translation_m=_copied(made.Statistics, error.translation),
+        interval_m=_copied(made.RmseInterval, error.interval),
+        rotation_deg=_copied(made.Statistics, error.rotation),
     )
 
 
@@ -183,9 +181,9 @@ def _axes(path: Trajectory, vector: Array) -> dict[str, float]:
     return {name: float(value) for name, value in zip(names, vector, strict=True)}
 
 
-def _end(path: Trajectory, end: KnownEnd | Unavailable) -> made.KnownEnd | Absent:
+def _end(path: Trajectory, end: KnownEnd | Unavailable) -> made.KnownEnd | Unavailable:
     if isinstance(end, Unavailable):
-        return absent(end)
+        return end
     return copied(
         made.KnownEnd,
         end,
@@ -201,9 +199,9 @@ def _closure(judged: Judged) -> made.Closure:
     return copied(made.Closure, judged.closure, distance_m=judged.distance_m, **gate, **more)
 
 
-def _correction(correction: Correction | Unavailable) -> made.Correction | Absent:
+def _correction(correction: Correction | Unavailable) -> made.Correction | Unavailable:
     if isinstance(correction, Unavailable):
-        return absent(correction)
+        return correction
     solution = correction.solution
     return copied(
         made.Correction,
@@ -212,7 +210,11 @@ def _correction(correction: Correction | Unavailable) -> made.Correction | Absen
         moved_rms_m=float(np.sqrt(np.mean(correction.moved_m**2))),
         cost_initial=None if solution is None else solution.initial_cost,
         scores={
-            name: absent(one) if isinstance(one, Unavailable) else _score(one)
+            name: one if isinstance(one, Unavailable) else _score(one)
             for name, one in correction.scores.items()
         },
     )
+
+
+def _copied(kind: type[S], part: object) -> S | Unavailable:
+    return part if isinstance(part, Unavailable) else copied(kind, part)

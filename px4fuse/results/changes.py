@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from typing import Literal
 
-from px4fuse.results.model import Base, Count, Interval, Sha256, Share, Version
+from px4fuse.record import Count, Record, Sha256, Share, Span
+from px4fuse.results.model import Version
 
 Status = Literal["significant", "within chance", "not tested", "differs", "same"]
 Which = Literal["A", "B"]
 Judgement = Literal["better", "worse", "changed", ""]
 
 
-class Compared(Base, frozen=True, kw_only=True):
+class Compared(Record, frozen=True, kw_only=True):
     """One of the two: what was given, and the flight that it is of."""
 
     given: str
@@ -21,13 +22,13 @@ class Compared(Base, frozen=True, kw_only=True):
     px4fuse: Version
 
 
-class NumberChange(Base, frozen=True, kw_only=True):
+class NumberChange(Record, frozen=True, kw_only=True):
     """One number of both.
 
     Attributes
     ----------
     path : str
-        Where it stands in the results of both: ``axes.aisle.ekf2.nis_mean``.
+        Where it stands in the results of both: ``axes.aisle.filters.ekf2.nis_mean``.
     label, unit : str
     a, b : float
     a_interval, b_interval : (float, float)
@@ -54,11 +55,11 @@ class NumberChange(Base, frozen=True, kw_only=True):
     unit: str
     a: float
     b: float
-    a_interval: Interval | None = None
-    b_interval: Interval | None = None
+    a_interval: Span | None = None
+    b_interval: Span | None = None
     scale: Literal["ratio", "difference"]
     change: float | None = None
-    change_interval: Interval | None = None
+    change_interval: Span | None = None
     p: Share | None = None
     q: Share | None = None
     status: Status
@@ -66,7 +67,7 @@ class NumberChange(Base, frozen=True, kw_only=True):
     why: str
 
 
-class TextChange(Base, frozen=True):
+class TextChange(Record, frozen=True):
     """A setting, a parameter of PX4 or a fact about the flight that is not the same."""
 
     kind: Literal["setting", "parameter", "flight"]
@@ -75,7 +76,7 @@ class TextChange(Base, frozen=True):
     b: str
 
 
-class FindingChange(Base, frozen=True):
+class FindingChange(Record, frozen=True):
     """A finding that only one of the two has."""
 
     id: str
@@ -84,7 +85,7 @@ class FindingChange(Base, frozen=True):
     only_in: Which
 
 
-class OneSided(Base, frozen=True):
+class OneSided(Record, frozen=True):
     """A number that only one of the two has."""
 
     path: str
@@ -92,7 +93,7 @@ class OneSided(Base, frozen=True):
     only_in: Which
 
 
-class Counts(Base, frozen=True):
+class Counts(Record, frozen=True):
     """How many numbers are compared, tested, changed (significantly, or at all) and judged."""
 
     compared: Count

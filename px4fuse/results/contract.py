@@ -7,11 +7,22 @@ raises the minor one.
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
 import msgspec
 from msgspec import Meta
 
+from px4fuse.comparison.model import AxisResult, FilterName
+from px4fuse.comparison.why import WhySteps
+from px4fuse.ekf2.replay import Agreement, Replayed
+from px4fuse.ekf2.whatif import Summary
+from px4fuse.filter.clock import Clock
+from px4fuse.filter.consistency import HorizontalNis
+from px4fuse.filter.heading import HeadingError
+from px4fuse.filter.tuning import Tuned
+from px4fuse.findings import Finding
+from px4fuse.record import Maybe, Record, Span, Unavailable
 from px4fuse.request import AxisName, ComparisonRequest, LoopRequest, WhatIfRequest
 from px4fuse.results.changes import (
     Compared,
@@ -21,41 +32,22 @@ from px4fuse.results.changes import (
     OneSided,
     TextChange,
 )
-from px4fuse.results.comparison import (
-    Axis,
-    ChosenSettings,
-    Clock,
-    Heading,
-    Horizontal,
-    Log,
-    PositionSource,
-    Tuned,
-)
-from px4fuse.results.ekf2 import Agreement, Ekf2Replay, Outcome, Why
-from px4fuse.results.model import (
-    Base,
-    FoundMistake,
-    Interval,
-    Missing,
-    Part,
-    Provenance,
-    Schema,
-    Student,
-)
-from px4fuse.results.trajectories import Graph, Loop, Score, Track
+from px4fuse.results.comparison import ChosenSettings, Log, PositionSource
+from px4fuse.results.model import Provenance, Schema, Student
+from px4fuse.results.trajectories import Graph, LoopPart, Score, Track
 
-VERSION: Literal["2.0"] = "2.0"
+VERSION: Literal["3.0"] = "3.0"
 COMPARISON = "px4fuse-results"
 LOOP = "px4fuse-loop"
 WHATIF = "px4fuse-whatif"
 CHANGES = "px4fuse-changes"
 
 
-class _OfFlight(Base, frozen=True):
+class _OfFlight(Record, frozen=True):
     schema: Schema
     request: ComparisonRequest
     log: Log
-    position_source: PositionSource
+    source: PositionSource
     settings: ChosenSettings
 
 
@@ -68,43 +60,43 @@ class ComparisonResults(_OfFlight, frozen=True):
     request : ComparisonRequest
         What was analysed and how.
     log : Log
-    position_source : PositionSource
+    source : PositionSource
     settings : ChosenSettings
-    axes : mapping of axis name to Axis
-    horizontal : Horizontal
+    axes : mapping of axis name to AxisResult
+    horizontal : mapping of "kf" and "ekf2" to HorizontalNis
     tuning : mapping of axis name, or "horizontal" for north and east together, to Tuned
     clock : Clock
-    heading : Heading
+    heading : HeadingError
         How the source's frame is turned against the vehicle's heading.
-    ekf2_replay : Ekf2Replay
+    ekf2_replay : Replayed
         EKF2 replayed from the log, and how well that agrees with what was logged.
-    why : mapping of axis name to Why
+    why : mapping of axis name to WhySteps
         Why EKF2 differs.
-    loop : Loop
+    loop : LoopPart
     story : tuple of str
         What happened, in up to three sentences.
-    findings : tuple of FoundMistake
+    findings : tuple of Finding
         One per cause, most severe first, what the recording lacks before noises.
     notes : tuple of str
         Choices made on the way.
-    missing : tuple of Missing
+    missing : tuple of Unavailable
         What was looked for and not found.
     student : Student
     provenance : Provenance
     """
 
-    axes: Annotated[dict[AxisName, Axis], Meta(min_length=1)]
-    horizontal: Horizontal
-    tuning: dict[str, Part[Tuned]]
-    clock: Part[Clock]
-    heading: Part[Heading]
-    ekf2_replay: Part[Ekf2Replay]
-    why: dict[str, Part[Why]]
-    loop: Part[Loop]
+    axes: Annotated[dict[AxisName, AxisResult], Meta(min_length=1)]
+    horizontal: dict[FilterName, HorizontalNis]
+    tuning: dict[str, Maybe[Tuned]]
+    clock: Maybe[Clock]
+    heading: Maybe[HeadingError]
+    ekf2_replay: Maybe[Replayed]
+    why: dict[str, Maybe[WhySteps]]
+    loop: Maybe[LoopPart]
     story: tuple[str, ...]
-    findings: tuple[FoundMistake, ...]
+    findings: tuple[Finding, ...]
     notes: tuple[str, ...]
-    missing: tuple[Missing, ...]
+    missing: tuple[Unavailable, ...]
     student: Student
     provenance: Provenance
 
@@ -112,31 +104,31 @@ class ComparisonResults(_OfFlight, frozen=True):
 class TuningResults(_OfFlight, frozen=True):
     """Results of ``px4fuse tune``: the noises that the data ask for, by axis."""
 
-    tuning: dict[str, Part[Tuned]]
+    tuning: dict[str, Maybe[Tuned]]
     provenance: Provenance
 
 
 class SyncResults(_OfFlight, frozen=True):
     """Results of ``px4fuse sync``: the clock offset of the position source."""
 
-    clock: Part[Clock]
+    clock: Maybe[Clock]
     provenance: Provenance
 
 
-class LoopResults(Base, frozen=True):
+class LoopResults(Record, frozen=True):
     """Results of ``px4fuse loop`` on a flight or a trajectory, attached to its report."""
 
     schema: Schema
     request: LoopRequest
     track: Track
     references: tuple[Track, ...]
-    loop: Loop
-    findings: tuple[FoundMistake, ...]
+    loop: LoopPart
+    findings: tuple[Finding, ...]
     student: Student
     provenance: Provenance
 
 
-class GraphResults(Base, frozen=True):
+class GraphResults(Record, frozen=True):
     """Results of ``px4fuse loop`` on a pose graph."""
 
     schema: Schema
@@ -153,7 +145,7 @@ class EvaluationResults(Score, frozen=True, kw_only=True):
     provenance: Provenance
 
 
-class WhatIfResults(Base, frozen=True, kw_only=True):
+class WhatIfResults(Record, frozen=True, kw_only=True):
     """Results of ``px4fuse whatif``: EKF2 as logged, as replayed, and with other parameters.
 
     All are judged over the times ``judged_s``. ``asked`` says that the changes of ``whatif`` are
@@ -164,17 +156,17 @@ class WhatIfResults(Base, frozen=True, kw_only=True):
     request: WhatIfRequest
     log: Log
     agreement: Agreement
-    judged_s: tuple[Interval, ...]
+    judged_s: tuple[Span, ...]
     asked: bool
-    logged: Outcome
-    replayed: Outcome
-    whatif: Outcome | None = None
-    sweep: tuple[Outcome, ...] = ()
+    logged: Summary
+    replayed: Summary
+    whatif: Summary | None = None
+    sweep: tuple[Summary, ...] = ()
     notes: tuple[str, ...]
     provenance: Provenance
 
 
-class ChangeResults(Base, frozen=True, kw_only=True):
+class ChangeResults(Record, frozen=True, kw_only=True):
     """Results of ``px4fuse diff``: what changed from A to B.
 
     Attributes
@@ -266,18 +258,20 @@ def schema() -> dict[str, Any]:
 
 def to_plain(results: msgspec.Struct) -> dict[str, Any]:
     """Results as dicts, lists and numbers, by the names that they have in JSON."""
-    found: dict[str, Any] = msgspec.to_builtins(results, enc_hook=_plain_number)
+    found: dict[str, Any] = msgspec.to_builtins(results, enc_hook=_plain)
     return found
 
 
-def _plain_number(value: Any) -> float:
-    """A number of numpy's as Python's own.
+def _plain(value: Any) -> float | dict[str, Any]:
+    """A number of numpy's as Python's own, any mapping as a dict.
 
     Raises
     ------
     NotImplementedError
-        It is not a number.
+        It is neither.
     """
+    if isinstance(value, Mapping):
+        return dict(value)
     if isinstance(value, float):
         return float(value)
     raise NotImplementedError(f"results cannot hold a {type(value).__name__}")

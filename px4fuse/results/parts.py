@@ -1,4 +1,4 @@
-"""What every builder of results uses: fields of the same names, absent parts, provenance."""
+"""Parts that the results of several commands have in common, from what was computed."""
 
 from __future__ import annotations
 
@@ -8,11 +8,10 @@ from typing import Any, TypeVar
 
 import msgspec
 
-from px4fuse.findings import Finding
-from px4fuse.flight import Flight, Unavailable
-from px4fuse.results.comparison import ClockMap, Dropout, JoinedFile, Log
+from px4fuse.flight import Flight
+from px4fuse.results.comparison import Log
 from px4fuse.results.contract import VERSION
-from px4fuse.results.model import Absent, FoundMistake, Missing, Provenance, Schema
+from px4fuse.results.model import Provenance, Schema
 
 S = TypeVar("S", bound=msgspec.Struct)
 # The libraries on whose arithmetic the numbers rest
@@ -20,43 +19,14 @@ LIBRARIES = ("numpy", "scipy", "pandas", "pyulog", "pymavlink", "filterpy", "mat
 
 
 def copied(kind: type[S], source: object, /, **more: Any) -> S:
-    """A struct whose fields are those of the same names of ``source``, and ``more``.
-
-    What is unavailable is absent.
-    """
-    same = {n: getattr(source, n) for n in kind.__struct_fields__ if hasattr(source, n)} | more
-    return kind(**{n: absent(v) if isinstance(v, Unavailable) else v for n, v in same.items()})
-
-
-def absent(part: Unavailable) -> Absent:
-    """What stands where a number could not be computed."""
-    return Absent(copied(Missing, part))
-
-
-def copied_or_absent(kind: type[S], part: object) -> S | Absent:
-    """As :func:`copied`, or why there is nothing to copy."""
-    return absent(part) if isinstance(part, Unavailable) else copied(kind, part)
-
-
-def found_mistakes(findings: tuple[Finding, ...]) -> tuple[FoundMistake, ...]:
-    """Findings as results hold them."""
-    return tuple(
-        copied(FoundMistake, finding, consequences=found_mistakes(finding.consequences))
-        for finding in findings
-    )
+    """A struct whose fields are those of the same names of ``source``, and ``more``."""
+    same = {n: getattr(source, n) for n in kind.__struct_fields__ if hasattr(source, n)}
+    return kind(**(same | more))
 
 
 def log_part(flight: Flight) -> Log:
     """The log of a flight and what was joined with it."""
-    log = flight.log
-    return copied(
-        Log,
-        log,
-        dropouts=tuple(copied(Dropout, dropout) for dropout in log.dropouts),
-        parameters=dict(log.parameters),
-        joined=tuple(copied(JoinedFile, file) for file in flight.inputs),
-        clocks=tuple(copied(ClockMap, clock) for clock in flight.clocks),
-    )
+    return Log(**msgspec.structs.asdict(flight.log), joined=flight.inputs, clocks=flight.clocks)
 
 
 def schema_of(name: str) -> Schema:

@@ -11,8 +11,8 @@ from typing import Any
 import msgspec
 
 from px4fuse.errors import ResultsError
+from px4fuse.record import choose
 from px4fuse.results.contract import KINDS, VERSION, Results
-from px4fuse.results.model import choose
 
 MAX_BYTES = 5_000_000
 MAX_DEPTH = 64

@@ -9,14 +9,14 @@ from typing import Annotated, Literal
 
 from msgspec import Meta
 
-from px4fuse.results.model import Absent, Base, Count, Interval, NotNegative, Part, Share, Vector
+from px4fuse.record import Count, Maybe, NotNegative, Record, Share, Span, Unavailable, Vector
 
 Frame = Literal["NED", "FRD", "ENU", "camera", "unknown"]
 Kind = Literal["vio", "ekf2", "kf", "truth", "slam", "unknown"]
 AxisLengths = Annotated[dict[str, float], Meta(min_length=3, max_length=3)]
 
 
-class Track(Base, frozen=True):
+class Track(Record, frozen=True):
     """A trajectory and the file that it was read from."""
 
     name: str
@@ -31,7 +31,7 @@ class Track(Base, frozen=True):
     notes: tuple[str, ...]
 
 
-class Transform(Base, frozen=True):
+class Transform(Record, frozen=True):
     """What brings the estimate onto the reference: x ↦ scale · R x + t."""
 
     quaternion_wxyz: tuple[float, float, float, float]
@@ -40,7 +40,7 @@ class Transform(Base, frozen=True):
     degrees_of_freedom: Count
 
 
-class Association(Base, frozen=True):
+class Association(Record, frozen=True):
     """How poses were paired by time, and how many were left out."""
 
     method: Literal["interpolate", "nearest"]
@@ -52,16 +52,16 @@ class Association(Base, frozen=True):
     coverage_reference: float
 
 
-class TimeOffset(Base, frozen=True, kw_only=True):
+class TimeOffset(Record, frozen=True, kw_only=True):
     """What was added to the estimate's stamps, with its interval where it was estimated."""
 
     offset_s: float | None = None
-    interval_s: Interval | None = None
+    interval_s: Span | None = None
     determinable: bool
     reason: str
 
 
-class Statistics(Base, frozen=True):
+class Statistics(Record, frozen=True):
     """Of errors, in the unit that the name of the field says."""
 
     count: Count
@@ -73,7 +73,7 @@ class Statistics(Base, frozen=True):
     max: float
 
 
-class RmseInterval(Base, frozen=True):
+class RmseInterval(Record, frozen=True):
     """95 % interval of the RMSE, by block bootstrap."""
 
     low: float
@@ -82,27 +82,27 @@ class RmseInterval(Base, frozen=True):
     blocks: float
 
 
-class AbsoluteError(Base, frozen=True):
+class AbsoluteError(Record, frozen=True):
     """ATE: of position (m), with its interval, and of orientation (degrees)."""
 
     translation_m: Statistics
-    interval_m: Part[RmseInterval]
-    rotation_deg: Part[Statistics]
+    interval_m: Maybe[RmseInterval]
+    rotation_deg: Maybe[Statistics]
 
 
-class RelativeError(Base, frozen=True):
+class RelativeError(Record, frozen=True):
     """RPE over pairs that are ``delta`` apart."""
 
     delta: float
     unit: Literal["frames", "m", "s"]
     all_pairs: bool
     pairs_from: Literal["estimate", "reference"]
-    translation_m: Part[Statistics]
-    interval_m: Part[RmseInterval]
-    rotation_deg: Part[Statistics]
+    translation_m: Maybe[Statistics]
+    interval_m: Maybe[RmseInterval]
+    rotation_deg: Maybe[Statistics]
 
 
-class Score(Base, frozen=True, kw_only=True):
+class Score(Record, frozen=True, kw_only=True):
     """ATE and RPE (Sturm et al. 2012) of a path against a reference."""
 
     alignment: Literal["none", "yaw", "se3", "sim3"]
@@ -116,7 +116,7 @@ class Score(Base, frozen=True, kw_only=True):
     warnings: tuple[str, ...]
 
 
-class KnownEnd(Base, frozen=True, kw_only=True):
+class KnownEnd(Record, frozen=True, kw_only=True):
     """Where the vehicle really ended, seen from its start."""
 
     displacement_m: AxisLengths
@@ -127,7 +127,7 @@ class KnownEnd(Base, frozen=True, kw_only=True):
     assumed: bool
 
 
-class OdometryNoise(Base, frozen=True):
+class OdometryNoise(Record, frozen=True):
     """Drift of the odometry in 100 m and by time (1 σ)."""
 
     position_m: NotNegative
@@ -137,7 +137,7 @@ class OdometryNoise(Base, frozen=True):
     tilt_share: NotNegative
 
 
-class Closure(Base, frozen=True):
+class Closure(Record, frozen=True):
     """Two times at one place, what the gate says of it, and its weights in robust solutions."""
 
     time_1_s: float
@@ -153,7 +153,7 @@ class Closure(Base, frozen=True):
     weight_gnc: float | None = None
 
 
-class Correction(Base, frozen=True, kw_only=True):
+class Correction(Record, frozen=True, kw_only=True):
     """A path, how far it was moved, and its scores by reference."""
 
     moved_max_m: NotNegative
@@ -162,26 +162,26 @@ class Correction(Base, frozen=True, kw_only=True):
     cost: NotNegative | None = None
     iterations: Count | None = None
     converged: bool | None = None
-    scores: dict[str, Part[Score]]
+    scores: dict[str, Maybe[Score]]
 
 
-class Corrections(Base, frozen=True):
+class Corrections(Record, frozen=True):
     """The path as it is, and by every way to correct it.
 
     ``by_distance_plain`` moves positions alone, as the lesson's Example 2; ``by_distance`` turns
     headings too, where it is known how far they are off.
     """
 
-    uncorrected: Part[Correction]
-    by_distance_plain: Part[Correction]
-    by_distance: Part[Correction]
-    pose_graph_all: Part[Correction]
-    pose_graph_gated: Part[Correction]
-    pose_graph_dcs: Part[Correction]
-    pose_graph_gnc: Part[Correction]
+    uncorrected: Maybe[Correction]
+    by_distance_plain: Maybe[Correction]
+    by_distance: Maybe[Correction]
+    pose_graph_all: Maybe[Correction]
+    pose_graph_gated: Maybe[Correction]
+    pose_graph_dcs: Maybe[Correction]
+    pose_graph_gnc: Maybe[Correction]
 
 
-class Loop(Base, frozen=True, kw_only=True):
+class LoopPart(Record, frozen=True, kw_only=True):
     """A path that truly returns.
 
     ``closure_error_m`` is how far its end is from where the vehicle really ended;
@@ -201,11 +201,11 @@ class Loop(Base, frozen=True, kw_only=True):
     path_length_m: NotNegative
     end_from_start_m: AxisLengths
     heading_change_deg: float | None = None
-    known_end: Part[KnownEnd]
+    known_end: Maybe[KnownEnd]
     closure_error_m: NotNegative | None = None
     closure_percent: NotNegative | None = None
     closure_error_axes_m: AxisLengths | None = None
-    heading_error_deg: float | Absent
+    heading_error_deg: float | Unavailable
     absolute: bool
     odometry_noise: OdometryNoise
     closures: tuple[Closure, ...]
@@ -213,7 +213,7 @@ class Loop(Base, frozen=True, kw_only=True):
     notes: tuple[str, ...]
 
 
-class GraphGate(Base, frozen=True):
+class GraphGate(Record, frozen=True):
     """What the gate says of one closure, by the vertex numbers of the file."""
 
     first: int
@@ -224,7 +224,7 @@ class GraphGate(Base, frozen=True):
     accepted: bool
 
 
-class GraphSolution(Base, frozen=True):
+class GraphSolution(Record, frozen=True):
     """One solution of a pose graph; ``dropped`` counts edges of weight below a half."""
 
     cost_initial: NotNegative
@@ -234,7 +234,7 @@ class GraphSolution(Base, frozen=True):
     dropped: Count
 
 
-class Graph(Base, frozen=True):
+class Graph(Record, frozen=True):
     """A pose graph from a file, its closures and its solutions."""
 
     name: str
@@ -242,5 +242,5 @@ class Graph(Base, frozen=True):
     poses: Count
     edges: Count
     initialised: str
-    gates: tuple[GraphGate, ...] | Absent
+    gates: tuple[GraphGate, ...] | Unavailable
     solutions: dict[str, GraphSolution]

@@ -100,12 +100,12 @@ def waterfalls(models: dict[str, Model]) -> dict[str, float]:
         found = walk(model)
         assert isinstance(found, Walk), found
         axes = found.axes.values()
-        total = sum(axis.position_total_m2 for axis in axes)
+        total = sum(axis.position_mean_square_m2 for axis in axes)
         bars = [
             sum(axis.steps[at].position_mean_square_m2 for axis in axes) / total
             for at in range(len(STEPS))
         ]
-        left = sum(axis.position_left_m2 for axis in axes) / total
+        left = sum(axis.position_left_mean_square_m2 for axis in axes) / total
         print(f"{name} | {np.sqrt(total):.3f} | " + " | ".join(f"{b:.1%}" for b in bars), end="")
         print(f" | {left:.1%}")
         assert abs(sum(bars) + left - 1.0) < 1e-9, name
