@@ -10,6 +10,7 @@ from collections import Counter
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from detector_rates import rates
 
 import px4fuse
 from px4fuse.analysis import explain
@@ -25,7 +26,6 @@ from px4fuse.findings import find, find_loop
 from px4fuse.loop.analysis import analyse
 from px4fuse.loop.sources import Source
 from px4fuse.loop.tracks import trajectory_of
-from px4fuse.simulation.detector_rates import rates
 from px4fuse.simulation.mistakes import parse
 
 SECRET = b"a secret for tests"
@@ -113,7 +113,7 @@ class TestDraw:
         assert {name for name, positive in signs if not positive} == both
 
     def test_limits_are_the_smallest_sizes_that_are_found(self):
-        """findings/rates.csv: at the limit and beyond in 19 flights of 20, below in fewer."""
+        """tests/studies/rates.csv: at the limit and beyond in 19 flights of 20, below in fewer."""
         table = rates()
         for choice in (choice for kind in CHOICES.values() for choice in kind):
             plain = re.compile(rf"--mistake {choice.mistake}(=([\d.]+)\D*)?$")

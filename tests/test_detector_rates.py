@@ -6,8 +6,7 @@ from dataclasses import replace
 
 import pandas as pd
 import pytest
-
-from px4fuse.simulation.detector_rates import (
+from detector_rates import (
     CLEAN,
     CONDITIONS,
     DEFAULT,
@@ -23,6 +22,7 @@ from px4fuse.simulation.detector_rates import (
     jobs,
     rates,
 )
+
 from px4fuse.simulation.scenario import Scenario
 
 TABLE = rates()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -14,12 +13,12 @@ from results_tools import EXAMPLE
 from scipy.signal import lfilter
 from scipy.special import ndtr
 from scipy.stats import f as fisher
+from spread import NOTHING, RATES_TABLE, SETTINGS, rates, spread
 
 from px4fuse.analysis import explain
 from px4fuse.comparison.comparison import compare
 from px4fuse.filter.consistency import assess
 from px4fuse.findings import find
-from px4fuse.fleet import significance
 from px4fuse.fleet.changes import Changes, changes, number_changes
 from px4fuse.fleet.measures import (
     BOOTSTRAP,
@@ -33,7 +32,6 @@ from px4fuse.fleet.measures import (
 )
 from px4fuse.fleet.sides import Side
 from px4fuse.fleet.significance import contrast, corrected, spreads
-from px4fuse.fleet.spread import NOTHING, RATES_TABLE, SETTINGS, rates, spread
 from px4fuse.request import ComparisonRequest
 from px4fuse.results.build import results
 from px4fuse.results.comparison import Filter
@@ -354,7 +352,7 @@ def test_rates_count_pairs_with_any_significant_change():
 
 
 def test_measured_rates_are_as_the_readme_says():
-    table = pd.read_csv(Path(significance.__file__).with_name(RATES_TABLE))
+    table = pd.read_csv(RATES_TABLE)
     table = table.set_index(["change", "given"])
     none = table.loc[NOTHING.words]
     assert (none["low"] <= 0.05).all()

@@ -4,22 +4,22 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import fairness as made
 import pandas as pd
 import pytest
+from fairness import NONE, STUDENTS, flown, measured, summary
+from fairness_notes import SENTENCES, guessed, sentence
 from scipy.stats import binomtest
 
 from px4fuse.assignment.drawing import CHOICES
-from px4fuse.grading import fairness as made
 from px4fuse.grading.claims import entailed
-from px4fuse.grading.fairness import NONE, STUDENTS, flown, measured, summary
-from px4fuse.grading.fairness_notes import SENTENCES, guessed, sentence
 from px4fuse.grading.rubric import read_rubric
 from px4fuse.results.comparison import Tuned
 from px4fuse.results.contract import ComparisonResults
 
 # Shares of the points: what the ideal student must have at least, the others at most
 BOUNDS = {"ideal": 0.95, "default": 0.50, "guesser": 0.30}
-TABLE = pd.read_csv(Path(made.__file__).with_name(made.TABLE), keep_default_na=False)
+TABLE = pd.read_csv(made.TABLE, keep_default_na=False)
 MEANS = summary(TABLE)
 # An aisle and a loop
 AGAIN = ("s0", "s6")

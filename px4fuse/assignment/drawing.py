@@ -67,8 +67,8 @@ class Choice:
     group : str
         Of two of the same group, one would hide the other.
     limit : float or None
-        The smallest size, in ``unit``, from which on findings/rates.csv has the finding in 19 of
-        20 flights; None for a mistake without a size.
+        The smallest size, in ``unit``, from which on it is found in 19 of
+        20 flights (tests/studies/rates.csv); None for a mistake without a size.
     unit : str
         As it is typed.
     less_is_plainer : bool

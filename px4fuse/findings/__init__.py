@@ -5,7 +5,7 @@ the finding is called and the phrases by which notes name it, and the flights on
 measured. A detector never prints and never guesses: what it cannot see it does not mention.
 
 To add a finding: its file, its name below, its place in ``causes.py`` if it follows from another or
-brings others with it, its rows of ``rates.csv`` (``python -m px4fuse.simulation.detector_rates``).
+brings others with it, its rows of ``tests/studies/rates.csv``.
 """
 
 from __future__ import annotations

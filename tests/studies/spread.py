@@ -1,8 +1,8 @@
 """How much flights of one vehicle differ, and how often ``diff`` is right, on simulated flights.
 
-``python -m px4fuse.fleet.spread`` measures both again and rewrites ``spread.csv`` and
-``change_rates.csv``, which ship with the package. ``--flights`` and ``--pairs`` give other numbers
-of flights, ``--print`` writes nothing.
+``python tests/studies/spread.py`` measures both again and rewrites ``spread.csv``, which ships with
+the package, and ``change_rates.csv`` beside this file. ``--flights`` and ``--pairs`` give other
+numbers of flights.
 
 An interval says how well one flight tells its number. Two flights of the same vehicle differ by
 more: each has biases and an attitude error of its own. The part beyond the intervals is the spread,
@@ -37,9 +37,9 @@ from px4fuse.simulation.flights import simulate_flight
 from px4fuse.simulation.mistakes import parse
 from px4fuse.simulation.scenario import Scenario
 
-RATES_TABLE = "change_rates.csv"
+RATES_TABLE = Path(__file__).with_name("change_rates.csv")
 FLIGHTS, PAIRS = 60, 40
-# What such flights ask for, as in px4fuse.simulation.detector_rates
+# What such flights ask for, as in detector_rates.py
 SETTINGS = Settings(0.27, 0.10)
 # Seeds of the flights that the spread is measured on, that pairs are of, and that are changed
 SPREAD_SEED, PAIR_SEED, CHANGED_SEED = 0, 20_000, 30_000
@@ -162,14 +162,14 @@ def _main() -> None:
     parser.add_argument("--pairs", type=int, default=PAIRS)
     parser.add_argument("--rates-only", action="store_true", help="with the spread that is there")
     given = parser.parse_args()
-    here = Path(str(files("px4fuse.fleet")))
     with ProcessPoolExecutor() as pool:
         if not given.rates_only:
             seeds = range(SPREAD_SEED, SPREAD_SEED + given.flights)
             flown = pool.map(fly, [NOTHING] * given.flights, seeds)
             table = spread(with_log for with_log, _ in flown)
-            table.to_csv(here / SPREAD_TABLE, index=False, lineterminator="\n")
-            print(table.to_string(index=False), flush=True)  # noqa: T201 - asked for
+            target = Path(str(files("px4fuse.fleet").joinpath(SPREAD_TABLE)))
+            table.to_csv(target, index=False, lineterminator="\n")
+            print(table.to_string(index=False), flush=True)
         count = given.pairs
         first = list(pool.map(fly, [NOTHING] * count, range(PAIR_SEED, PAIR_SEED + count)))
         rows = []
@@ -177,8 +177,8 @@ def _main() -> None:
             seeds = range(CHANGED_SEED, CHANGED_SEED + count)
             other = list(pool.map(fly, [change] * count, seeds))
             rows += [{"change": change.words} | row for row in rates(first, other)]
-            print(rows[-2:], flush=True)  # noqa: T201 - asked for
-    pd.DataFrame(rows).to_csv(here / RATES_TABLE, index=False, lineterminator="\n")
+            print(rows[-2:], flush=True)
+    pd.DataFrame(rows).to_csv(RATES_TABLE, index=False, lineterminator="\n")
 
 
 if __name__ == "__main__":

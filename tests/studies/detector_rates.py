@@ -1,7 +1,7 @@
 """False-alarm rates and power of the detectors, measured on simulated flights.
 
-``python -m px4fuse.simulation.detector_rates`` measures them again and rewrites
-``findings/rates.csv``, which ships with the package; it says how long it will take. ``--clean`` and
+``python tests/studies/detector_rates.py`` measures them again and rewrites ``rates.csv`` beside it;
+it says how long it will take. ``--clean`` and
 ``--faulty`` give other numbers of flights, ``--only TEXT`` prints the rows of the scenarios and
 findings whose name holds it, and writes nothing.
 """
@@ -15,7 +15,6 @@ import time
 from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
-from importlib.resources import files
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -37,7 +36,7 @@ from px4fuse.simulation.flights import simulate_flight
 from px4fuse.simulation.mistakes import parse
 from px4fuse.simulation.scenario import Scenario
 
-TABLE = "rates.csv"
+TABLE = Path(__file__).with_name("rates.csv")
 CLEAN = "none"
 CLEAN_FLIGHTS, FAULTY_FLIGHTS = 50, 20
 # Faulty flights have other seeds than clean ones
@@ -278,7 +277,7 @@ def measure(flown: list[Job]) -> pd.DataFrame:
         kinds = {job.conditions[0].scenario: job for job in flown}
         started = dict(zip(kinds, pool.map(_seconds, kinds.values()), strict=True))
         total = sum(started[job.conditions[0].scenario] for job in flown) / processes
-        print(f"{len(flown)} flights, about {total / 60.0:.0f} min", flush=True)  # noqa: T201 - said to who waits
+        print(f"{len(flown)} flights, about {total / 60.0:.0f} min", flush=True)
         results = list(pool.map(_fly, flown, chunksize=2))
     return pd.DataFrame(_rows(flown, results))
 
@@ -322,9 +321,8 @@ def _row(name: str, scenario: str, condition: str, own: list[tuple[str, ...]]) -
 
 
 def rates() -> pd.DataFrame:
-    """The table that ships with the package."""
-    with files("px4fuse.findings").joinpath(TABLE).open(encoding="utf-8") as file:
-        return pd.read_csv(file, keep_default_na=False)
+    """The table as it was measured last."""
+    return pd.read_csv(TABLE, keep_default_na=False)
 
 
 def _main() -> None:
@@ -338,10 +336,9 @@ def _main() -> None:
     table = measure(jobs(given.clean, given.faulty, scenarios, conditions))
     if given.only:
         shown = table[(table["condition"] != CLEAN) | (table["rate"] > 0.0)]
-        print(shown.to_string(index=False))  # noqa: T201 - asked for
+        print(shown.to_string(index=False))
         return
-    target = Path(str(files("px4fuse.findings").joinpath(TABLE)))
-    table.to_csv(target, index=False, lineterminator="\n")
+    table.to_csv(TABLE, index=False, lineterminator="\n")
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """What three students would earn on assigned flights: one ideal, one who does nothing, one guesser.
 
-``python -m px4fuse.grading.fairness`` flies assignments, hands in what the three would, and writes
-``fairness.csv``, which ships with the package: one row per flight. ``--students`` gives another
+``python tests/studies/fairness.py`` flies assignments, hands in what the three would, and writes
+``fairness.csv`` beside this file: one row per flight. ``--students`` gives another
 number of flights, ``--only TEXT`` takes those whose mistakes hold it and writes nothing, and
 ``--cache DIR`` keeps analyses, so that another rubric is measured in seconds; delete it when the
 analysis changes.
@@ -23,14 +23,15 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from importlib import metadata
-from importlib.resources import files
 from pathlib import Path
 from statistics import fmean
 from typing import cast
 
+import fairness_notes
 import msgspec
 import numpy as np
 import pandas as pd
+from fairness_notes import WORDINGS
 
 from px4fuse.analysis import run
 from px4fuse.assignment.assignment import answer_to
@@ -40,8 +41,6 @@ from px4fuse.assignment.roster import Student as Assigned
 from px4fuse.filter.tuning import HORIZONTAL, Tuned
 from px4fuse.findings import find, find_loop
 from px4fuse.flight import Flight
-from px4fuse.grading import fairness_notes
-from px4fuse.grading.fairness_notes import WORDINGS
 from px4fuse.grading.model import Graded, Rubric
 from px4fuse.grading.rubric import read_rubric
 from px4fuse.grading.scoring import assess
@@ -59,7 +58,7 @@ from px4fuse.simulation.flights import simulate, to_flight
 from px4fuse.simulation.mistakes import parse
 from px4fuse.verification.model import Report, Verdict
 
-TABLE = "fairness.csv"
+TABLE = Path(__file__).with_name("fairness.csv")
 SECRET = b"px4fuse fairness"
 FLIGHTS = 300
 VERIFIED = Verdict("verified", ("taken for verified",), with_log=True, page_status="same")
@@ -312,11 +311,10 @@ def _main() -> None:
     ]
     with ProcessPoolExecutor(given.processes) as pool:
         table = pd.DataFrame(pool.map(partial(_row, cache=given.cache), numbers))
-    print(summary(table).to_string(index=False))  # noqa: T201 - asked for
+    print(summary(table).to_string(index=False))
     if given.only or given.students != FLIGHTS:
         return
-    target = Path(str(files("px4fuse.grading").joinpath(TABLE)))
-    table.to_csv(target, index=False, lineterminator="\n")
+    table.to_csv(TABLE, index=False, lineterminator="\n")
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """How often the 95 % intervals of SIGMA_Z, SIGMA_A and the clock offset cover the truth.
 
-``python tests/benchmarks/bench_intervals.py [FLIGHTS]`` flies every scenario of the detectors'
+``python tests/studies/intervals.py [FLIGHTS]`` flies every scenario of the detectors'
 rates, and the usual one with outliers, with as many seeds (by default 50), and prints a line for
 each: coverage, bias of SIGMA_Z and of the offset with the standard error of its mean, how much the
 offset scatters against its stated sigma, and false clock findings. Nothing is asserted.
@@ -15,13 +15,13 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 
 import numpy as np
+from detector_rates import DEFAULT, SCENARIOS, clean
 
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.estimates import clock_offset, tuned_horizontally
 from px4fuse.filter.clock import CHANGE_P, ClockOffset
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise
 from px4fuse.findings.source_clock import CLOCK_OFFSET
-from px4fuse.simulation.detector_rates import DEFAULT, SCENARIOS, clean
 from px4fuse.simulation.flights import simulate_flight
 from px4fuse.simulation.mistakes import parse
 
