@@ -21,7 +21,7 @@ TOLERANCE = 1e-9
 # From keys of schema 2.0 to keys of 3.0, in this order
 RENAMED = (
     (r"^position_source\b", "source"),
-    (r"\bsize_bytes$", "bytes"),
+    (r"^log\b(.*)\bsize_bytes$", r"log\1bytes"),
     (r"^(axes\.\w+)\.(kf|ekf2)\b", r"\1.filters.\2"),
     (r"^(axes\.\w+)\.truth\.(kf|ekf2)_", r"\1.filters.\2.truth."),
     (r"^(why\.\w+)\.(kf|ekf2)_position_rmse_to_truth_m$", r"\1.position_rmse_to_truth_m.\2"),
