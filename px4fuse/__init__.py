@@ -13,7 +13,7 @@ if _typing.TYPE_CHECKING:
     from px4fuse.analysis import Analysis as Analysis
     from px4fuse.analysis import explain as explain
     from px4fuse.analysis import run as run
-    from px4fuse.comparison.comparison import Comparison as Comparison
+    from px4fuse.comparison.model import Comparison as Comparison
     from px4fuse.ekf2.model import Model as Model
     from px4fuse.ekf2.model import open_model as open_model
     from px4fuse.ekf2.model import replay_ekf2 as replay_ekf2

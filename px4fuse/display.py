@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 MAX_TEXT, MAX_ROWS = 60, 12
 
 
-def brief(result: object) -> str:
+def brief(result: Any) -> str:
     """A record on one line, its tables and arrays by their shapes.
 
     >>> import pandas as pd

@@ -97,7 +97,7 @@ class Alignment(Record, frozen=True, kw_only=True):
         What is poorly determined, each a sentence.
     """
 
-    frame: Literal["ned", "enu", "nwu"]
+    frame: str
     frame_reason: str
     yaw_deg: float
     yaw_sigma_deg: NotNegative | None = None

@@ -9,15 +9,6 @@ from typing import Literal
 from px4fuse.display import brief
 from px4fuse.record import Count, NotNegative, Record, Sha256, Share
 
-ClockMethod = Literal[
-    "boot clock",
-    "TIMESYNC",
-    "SYSTEM_TIME",
-    "receive time",
-    "arrival time",
-    "position in the stream",
-]
-
 
 class Dropout(Record, frozen=True):
     """A stretch that the logger lost: start and length in seconds."""
@@ -61,7 +52,9 @@ class ClockMap(Record, frozen=True):
     ----------
     clock : str
         Which clock ("UNIX time of system 1, component 197").
-    method : ClockMethod
+    method : str
+        "boot clock", "TIMESYNC", "SYSTEM_TIME", "receive time", "arrival time" or "position in the
+        stream".
     pairs : int
         Pairs of readings that it rests on.
     offset_s : float
@@ -77,7 +70,7 @@ class ClockMap(Record, frozen=True):
     """
 
     clock: str
-    method: ClockMethod
+    method: str
     pairs: Count
     offset_s: float
     drift_ppm: float
@@ -123,7 +116,7 @@ class InputFile(Record, frozen=True):
     role: Literal["mavlink", "position"]
 
 
-class LogInfo(Record, frozen=True):
+class LogInfo(Record, frozen=True, omit_defaults=False):
     """What the log is.
 
     Attributes

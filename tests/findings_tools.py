@@ -5,6 +5,7 @@ from __future__ import annotations
 from types import ModuleType, SimpleNamespace
 from typing import Any, TypeVar
 
+import msgspec
 import numpy as np
 import pandas as pd
 
@@ -36,7 +37,9 @@ def made(kind: type[T], **parts: Any) -> T:
     """An instance that holds these parts alone: to read another one is an error."""
     one = object.__new__(kind)
     for name, value in parts.items():
-        object.__setattr__(one, name, value)
+        msgspec.structs.force_setattr(one, name, value) if isinstance(one, msgspec.Struct) else (
+            object.__setattr__(one, name, value)
+        )
     return one
 
 
@@ -71,16 +74,15 @@ def analysis(
     if isinstance(ekf2, dict):
         ekf2 = made(Ekf2, **ekf2)
     flown = {"imu": NONE, "attitude": NONE, "positions": (), "streams": {}, **(flight or {})}
-    comparison = SimpleNamespace(
-        flight=SimpleNamespace(log=log, ekf2=ekf2, **flown), source=source, axes=axes,
-        segment=SEGMENT, settings=settings, notes=notes, missing=missing,
-    )  # fmt: skip
     usual = dict.fromkeys(
         ("clock", "ekf2_model", "loop", "heading", "explained", "smoothing"), NONE
     )
+    by_name = {axis.axis.name: axis for axis in axes}
     return SimpleNamespace(  # type: ignore[return-value]
-        **{"comparison": comparison, "tuning": {}, "why": {}, **usual, **parts}
-    )
+        flight=SimpleNamespace(log=log, ekf2=ekf2, **flown), source=source, axes=by_name,
+        lines=tuple(axis.axis for axis in axes), segment=SEGMENT, settings=settings, notes=notes,
+        missing=missing, **{"tuning": {}, "why": {}, **usual, **parts},
+    )  # fmt: skip
 
 
 def named(module: ModuleType, subject: Any) -> dict[str, str]:
@@ -119,9 +121,8 @@ def tuned(
 ) -> dict[str, Any]:
     right = Noise(1.0, 0.9, 1.1)
     usual = {"name": "horizontal", "before": NONE, "held_out": NONE, "outlier_time_s": np.array([])}
-    one = made(
-        AxisTuning, sigma_z=sigma_z or right, filter_sigma_a=sigma_a or right, **{**usual, **parts}
-    )
+    noises = (sigma_z or right).named("sigma_z_m") | (sigma_a or right).named("filter_sigma_a_m_s2")
+    one = made(AxisTuning, **noises, **{**usual, **parts})
     return {HORIZONTAL: one}
 
 
@@ -131,7 +132,9 @@ def late(offset_s: float, sigma_s: float = 0.001, **parts: Any) -> ClockOffset:
         "interval_s": (offset_s - 0.01, offset_s + 0.02), "determinable": True, "change_p": None,
         "parts": halves,
     }  # fmt: skip
-    return made(ClockOffset, offset_s=offset_s, sigma_s=sigma_s, **{**usual, **parts})
+    return made(
+        ClockOffset, offset_s=offset_s, applied_s=0.0, sigma_s=sigma_s, **{**usual, **parts}
+    )
 
 
 def with_bias(forward: float, sigma: float = 0.01, right: float = 0.0) -> Explained:

@@ -90,7 +90,9 @@ def test_every_log_is_in_the_table_with_its_numbers_or_its_line(client, tmp_path
     analysis = px4fuse.compare(logs / "f1.ulg")
     first = of["f1.ulg"]
     assert list(first["axis"]) == [axis.axis.name for axis in analysis.axes.values()]
-    assert list(first["kf_nis_mean"]) == [axis.filters["kf"].nis_mean for axis in analysis.axes.values()]
+    assert list(first["kf_nis_mean"]) == [
+        axis.filters["kf"].nis_mean for axis in analysis.axes.values()
+    ]
     assert list(first["kf_factor"] * first["kf_nis_mean"]) == pytest.approx([1.0] * 4)
     tuned = analysis.tuning["horizontal"].sigma_z
     assert first.loc[0, ["sigma_z_m", "sigma_z_low_m", "sigma_z_high_m"]].tolist() == [

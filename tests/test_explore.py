@@ -165,7 +165,11 @@ def cells(result: AxisComparison) -> dict[str, list[str]]:
     assert not isinstance(result.filters["ekf2"], Unavailable)
     both = zip(statement(result.filters["kf"]), statement(result.filters["ekf2"]), strict=True)
     told = {name: list(pair) for name, pair in zip(names, both, strict=True)}
-    difference, ours, theirs = result.difference, result.filters["kf"].truth, result.filters["ekf2"].truth
+    difference, ours, theirs = (
+        result.difference,
+        result.filters["kf"].truth,
+        result.filters["ekf2"].truth,
+    )
     assert not isinstance(difference, Unavailable)
     assert not isinstance(ours, Unavailable)
     assert not isinstance(theirs, Unavailable)

@@ -158,7 +158,8 @@ def test_a_remedy_of_our_filter_that_the_truth_contradicts_is_not_given() -> Non
     assert worse.startswith("Leave it: --sigma-z 3 fits")
     truth = Unavailable("ground truth", "none", "")
     blind = replace(
-        comparison, axes=tuple(replace(a, truth=truth, kf_truth=truth) for a in comparison.axes.values())
+        comparison,
+        axes=tuple(replace(a, truth=truth, kf_truth=truth) for a in comparison.axes.values()),
     )
     typed = "px4fuse compare LOG --sigma-z 0.2."
     assert filter_words(blind, Settings(sigma_z_m=0.2), "--sigma-z 0.2", 0.1) == typed

@@ -21,7 +21,7 @@ from px4fuse.report.document import WhatIfDocument
 from px4fuse.report.pdf import render
 from px4fuse.report.whatif import heads, reading, rows, sweep_heads, sweep_rows
 from px4fuse.request import Sweep, WhatIfRequest, command_line
-from px4fuse.results.build_ekf2 import whatif_results
+from px4fuse.results.build import whatif_results
 from px4fuse.results.contract import WhatIfResults, schema, to_json
 from px4fuse.results.reading import read_results
 

@@ -54,7 +54,7 @@ def whatif(
     """
     from px4fuse.analysis import run_what_if
     from px4fuse.request import WhatIfRequest, command_line
-    from px4fuse.results.build_ekf2 import whatif_results
+    from px4fuse.results.build import whatif_results
     from px4fuse.results.contract import to_json
 
     if output is not None and output.suffix.lower() != ".pdf":

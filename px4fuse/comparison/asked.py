@@ -56,11 +56,10 @@ def asked_of_ekf2(
     if noise_m is not None and not (trusted and may_drift(comparison.flight, source)):
         changes |= noise_change(model, noise_m)
     if isinstance(clock, ClockOffset) and clock.determinable:
-        applied = comparison.settings.clock_offset_s
         flown = model.inputs.settings["EKF2_EV_DELAY"]
-        high, low = (-1e3 * (applied + end) for end in clock.interval_s)
+        high, low = (-1e3 * end for end in clock.interval_s)
         if not low - UPDATE_MS <= flown <= high + UPDATE_MS:
-            changes |= delay_change(model, -1e3 * (applied + clock.offset_s))
+            changes |= delay_change(model, -1e3 * clock.offset_s)
     return changes
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -109,9 +110,11 @@ def _compare_axis(
     axis, updates = run.axis, run.updates
     truth = project_truth(flight.truth, axis, segment)
     state: pd.DataFrame | Unavailable
+    variance: pd.DataFrame | Unavailable
+    innovations: pd.DataFrame | Unavailable
+    difference: Difference | Unavailable
     if isinstance(ekf2, Unavailable):
-        state = variance = innovations = ekf2
-        difference: Difference | Unavailable = ekf2
+        state = variance = innovations = difference = ekf2
         times, gate = run.steps.index.to_numpy(), GATE_SIGMA
     else:
         state = project_state(ekf2.state, axis, segment)
@@ -160,15 +163,10 @@ def _of_ekf2(
     truth: AgainstTruth | Unavailable,
     gate: float,
 ) -> FilterSummary | UnjudgedFilter:
-    known = isinstance(innovations, pd.DataFrame)
-    return _summary(
-        innovations,
-        variance,
-        innovations["prior_variance_m2"] if known else None,
-        innovations["posterior_variance_m2"] if known else None,
-        truth,
-        gate,
-    )
+    before = after = None
+    if isinstance(innovations, pd.DataFrame):
+        before, after = innovations["prior_variance_m2"], innovations["posterior_variance_m2"]
+    return _summary(innovations, variance, before, after, truth, gate)
 
 
 def _summary(
@@ -180,22 +178,23 @@ def _summary(
     gate: float = GATE_SIGMA,
 ) -> FilterSummary | UnjudgedFilter:
     """What a filter did, from its innovations, its variances, and those around each update."""
-    logged = isinstance(variance, pd.DataFrame)
-    sigma = {
-        "sigma_p_median_m": _median_sigma(variance["position_variance_m2"] if logged else None),
-        "sigma_v_median_m_s": _median_sigma(
-            variance["velocity_variance_m2_s2"] if logged else None
-        ),
+    position = velocity = None
+    if isinstance(variance, pd.DataFrame):
+        position, velocity = variance["position_variance_m2"], variance["velocity_variance_m2_s2"]
+    more: dict[str, Any] = {
+        "sigma_p_median_m": _median_sigma(position),
+        "sigma_v_median_m_s": _median_sigma(velocity),
         "sigma_p_before_update_m": _median_sigma(before),
         "sigma_p_after_update_m": _median_sigma(after),
+        "truth": truth,
     }
     if isinstance(innovations, Unavailable):
-        statement = innovations
-    else:
-        nu, s = innovations["innovation_m"], innovations["innovation_variance_m2"]
-        statement = assess(nu.to_numpy(), s.to_numpy(), gate)
-    kind = UnjudgedFilter if isinstance(statement, Unavailable) else FilterSummary
-    return kind(**structs.asdict(statement), **sigma, truth=truth)
+        return UnjudgedFilter(**structs.asdict(innovations), **more)
+    nu, s = innovations["innovation_m"], innovations["innovation_variance_m2"]
+    statement = assess(nu.to_numpy(), s.to_numpy(), gate)
+    if isinstance(statement, Unavailable):
+        return UnjudgedFilter(**structs.asdict(statement), **more)
+    return FilterSummary(**structs.asdict(statement), **more)
 
 
 def _rejected_share(innovations: pd.DataFrame | Unavailable) -> float | None:
@@ -206,8 +205,9 @@ def _rejected_share(innovations: pd.DataFrame | Unavailable) -> float | None:
 
 
 def _median_sigma(variance: pd.Series | None) -> float | None:
-    known = [] if variance is None else variance.dropna()
-    return float(np.sqrt(known.median())) if len(known) else None
+    if variance is None or (known := variance.dropna()).empty:
+        return None
+    return float(np.sqrt(known.median()))
 
 
 def _difference(run: Replay, ekf2_state: pd.DataFrame) -> Difference | Unavailable:

@@ -9,9 +9,8 @@ estimate.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
+from msgspec.structs import replace
 from scipy.special import stdtr
 
 from px4fuse.arrays import Array

@@ -134,7 +134,7 @@ def turned_frame(
         comparison.segment,
         comparison.settings,
         sigma_z_m,
-        clock.offset_s if isinstance(clock, ClockOffset) and clock.determinable else 0.0,
+        clock.remaining_s if isinstance(clock, ClockOffset) and clock.determinable else 0.0,
     )
 
 

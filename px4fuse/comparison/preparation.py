@@ -101,7 +101,7 @@ def choose_source(flight: Flight, name: str | None = None) -> tuple[PositionTrac
         for track in flight.positions:
             if track.name == name:
                 return track, "chosen with --position-source"
-        looked = {missing.what.split()[-1]: missing for missing in flight.missing}
+        looked = {missing.source: missing for missing in flight.missing}
         reason = looked[name].reason if name in looked else "no such source"
         raise MissingDataError(
             f"{flight.log.name}: position source {name}: {reason}. This log has: {have}."
@@ -139,8 +139,11 @@ def _ladder_reason(flight: Flight, track: PositionTrack) -> str:
     if track.rung == 1:
         return "given with --position"
     whence = f" (from {track.log})" if track.log and track.log != flight.log.name else ""
-    missing = [part.what.removeprefix("position source ") for part in flight.missing]
-    lacking = [name for name in missing if LADDER.get(name, LAST_AUTOMATIC_RUNG) < track.rung]
+    lacking = [
+        part.source
+        for part in flight.missing
+        if LADDER.get(part.source, LAST_AUTOMATIC_RUNG) < track.rung
+    ]
     if not lacking:
         return f"the best source: logged as it arrived{whence}"
     return f"the best that this log has{whence}; no usable {', '.join(lacking)}"

@@ -129,7 +129,7 @@ def filter_errors_m(comparison: Comparison, changed: Settings) -> tuple[float, f
     Root of the sum of the mean squares of all axes but the aisle, which is made of the others.
     None without a truth.
     """
-    names = {result.axis.name for result in comparison.axes}
+    names = set(comparison.axes)
     results = [r for r in comparison.axes.values() if r.axis.name != AISLE or names == {AISLE}]
     before = [result.filters["kf"].truth for result in results]
     if changed.clock_offset_s == comparison.settings.clock_offset_s:

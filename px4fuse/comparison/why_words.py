@@ -223,8 +223,8 @@ def _stamps(facts: Facts) -> str:
     words = f"EKF2 takes a position to be {delay:g} ms older than its stamp (EKF2_EV_DELAY), ours "
     words += f"{0.0 - own * 1e3:.0f} ms"
     if isinstance(facts.clock, ClockOffset) and facts.clock.determinable:
-        low, high = (-(own + end) * 1e3 for end in facts.clock.interval_s[::-1])
-        asked = -(own + facts.clock.offset_s) * 1e3
+        low, high = (-end * 1e3 for end in facts.clock.interval_s[::-1])
+        asked = -facts.clock.offset_s * 1e3
         words += f", and the data ask for {asked:.0f} ms (95 % {low:.0f} to {high:.0f})"
     return words
 
@@ -280,8 +280,10 @@ def _velocity(axis: AxisWalk, parts: list[_Part]) -> str:
     position = axis.position_mean_square_m2
     return (
         f"Where EKF2 was replayed they are {np.sqrt(position):.3f} m and {np.sqrt(total):.3f} m/s "
-        f"rms apart{mostly}; the model leaves {axis.position_left_mean_square_m2 / position:.1%} of that in "
-        f"position and {axis.velocity_left_mean_square_m2_s2 / total:.1%} in velocity unexplained."
+        f"rms apart{mostly}; "
+        f"the model leaves {axis.position_left_mean_square_m2 / position:.1%} "
+        f"of that in position and {axis.velocity_left_mean_square_m2_s2 / total:.1%} in velocity "
+        "unexplained."
     )
 
 
@@ -317,9 +319,9 @@ def _clock(facts: Facts) -> list[str]:
         return []
     own = facts.comparison.settings.clock_offset_s
     delay_s = facts.model.inputs.settings["EKF2_EV_DELAY"] * 1e-3
-    both = own + clock.offset_s
+    both = clock.offset_s
     known_s = max(CLOCK_S, clock.chance_s)
-    if min(abs(clock.offset_s), abs(both + delay_s)) < known_s or abs(own + delay_s) > CLOCK_S:
+    if min(abs(clock.remaining_s), abs(both + delay_s)) < known_s or abs(own + delay_s) > CLOCK_S:
         return []
     return [
         f"{STAMPS_WRONG} {'late' if both < 0 else 'early'} by {abs(both):.2f} s for both "

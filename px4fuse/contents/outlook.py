@@ -36,7 +36,7 @@ PART_NAMES = {
     "airborne": "land detector",
 }
 # The rung of the position as PX4 received it, and the last that was logged as it arrived
-AS_RECEIVED = "position source vehicle_visual_odometry"
+AS_RECEIVED = "vehicle_visual_odometry"
 LAST_LOGGED_RUNG = 3
 RECEIVED_RUNG = 2
 # EKF2 starts on external vision only where samples are closer than EV_START_INTERVAL; with jitter a
@@ -209,7 +209,7 @@ def _advice(flight: Flight, plan: Plan) -> Iterator[Advice]:
 
 
 def _position_advice(flight: Flight, track: PositionTrack) -> Iterator[Advice]:
-    missing = next((part for part in flight.missing if part.what == AS_RECEIVED), None)
+    missing = next((part for part in flight.missing if part.source == AS_RECEIVED), None)
     profile = int(flight.log.parameters.get("SDLOG_PROFILE", 1))
     if track.rung > LAST_LOGGED_RUNG and missing is not None:
         remedy = (

@@ -66,15 +66,17 @@ def agreement_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavai
     by_model = model["rejected"].to_numpy() > 0
     shares = float(by_log.mean()), float(by_model.mean())
     good, reason = _verdict(axes, *shares)
-    apart = [axis.position_rms_difference_m for axis in axes.values()]
+    north, east = (axes[axis] for axis in HORIZONTAL)
+    apart_m = np.hypot(north.position_rms_difference_m, east.position_rms_difference_m)
     return Agreement(
-        **axes,
-        ev_pos=axes,
+        north=north,
+        east=east,
+        ev_pos=dict(axes),
         samples=len(log),
         rejected_share_logged=shares[0],
         rejected_share_replayed=shares[1],
         decisions_same=float(np.mean(by_log == by_model)),
-        published_rms_difference_m=float(np.hypot(*apart)),
+        published_rms_difference_m=float(apart_m),
         good=good,
         reason=reason,
     )

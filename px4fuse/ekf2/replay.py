@@ -86,7 +86,7 @@ class Agreement(Record, frozen=True, kw_only=True):
         return {"north": self.north, "east": self.east}
 
 
-class Replayed(Record, frozen=True, kw_only=True):
+class Replayed(Record, frozen=True, kw_only=True, omit_defaults=False):
     """EKF2 replayed from the log.
 
     Attributes

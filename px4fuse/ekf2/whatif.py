@@ -66,7 +66,7 @@ class AxisSummary(Record, frozen=True):
     position_rmse_to_truth_m: NotNegative | Unavailable
 
 
-class Summary(Record, frozen=True):
+class Summary(Record, frozen=True, omit_defaults=False):
     """One EKF2: as logged, as replayed, or with other parameters.
 
     Attributes
@@ -217,17 +217,19 @@ def _of_replay(
     used = every[settled(every.index.to_numpy(), judged)]
     times = _judged_times(flight.ekf2.state, judged)
     fused = used["fused_at_s"][(used["fused"] > 0) | (used["reset"] > 0)]
+    axes = {
+        axis: _axis(
+            used[f"innovation_{axis}_m"].to_numpy(),
+            used[f"innovation_variance_{axis}_m2"].to_numpy(),
+            _sigma(flight.ekf2, replay, axis, judged),
+            _to_truth(flight, replay.published, axis, times),
+        )
+        for axis in HORIZONTAL
+    }
     return Summary(
         changed=replay.changed,
-        **{
-            axis: _axis(
-                used[f"innovation_{axis}_m"].to_numpy(),
-                used[f"innovation_variance_{axis}_m2"].to_numpy(),
-                _sigma(flight.ekf2, replay, axis, judged),
-                _to_truth(flight, replay.published, axis, times),
-            )
-            for axis in HORIZONTAL
-        },
+        north=axes["north"],
+        east=axes["east"],
         samples=len(used),
         rejected_share=float(used["rejected"].mean()),
         longest_without_fusion_s=_longest(fused.to_numpy(), judged),
@@ -259,17 +261,19 @@ def _of_log(flight: Flight, replay: Ekf2Replay, judged: tuple[tuple[float, float
     if len(used) > COMPLETE_SHARE * replayed:
         fused = used.index[used["rejected"] == 0].to_numpy()
         longest = _longest(np.concatenate([fused, at[settled(at, judged)]]), judged)
+    axes = {
+        axis: _axis(
+            used[f"innovation_{axis}_m"].to_numpy(),
+            used[f"innovation_variance_{axis}_m2"].to_numpy(),
+            _logged_sigma(ekf2, axis, judged),
+            _to_truth(flight, ekf2.state, axis, times),
+        )
+        for axis in HORIZONTAL
+    }
     return Summary(
         changed={},
-        **{
-            axis: _axis(
-                used[f"innovation_{axis}_m"].to_numpy(),
-                used[f"innovation_variance_{axis}_m2"].to_numpy(),
-                _logged_sigma(ekf2, axis, judged),
-                _to_truth(flight, ekf2.state, axis, times),
-            )
-            for axis in HORIZONTAL
-        },
+        north=axes["north"],
+        east=axes["east"],
         samples=len(used),
         rejected_share=float(used["rejected"].mean()),
         longest_without_fusion_s=longest,

@@ -11,12 +11,13 @@ Whether it walks is told by the likelihood ratio.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import product
 from typing import Literal
 
 import numpy as np
 import pandas as pd
+from msgspec import structs
 from scipy.spatial.transform import Rotation
 from scipy.special import chdtrc
 
@@ -175,7 +176,7 @@ def heading_error(
     samples = samples.iloc[:: int(np.ceil(len(samples) / MAX_MEASUREMENTS))]
     found = _by_positions(acceleration, samples, settings.dt_s, sigma_z_m)
     # how the source's own axes lie in the vehicle is not known, but that they do not turn is
-    return found if compared is None else replace(found, drift_p=1.0)
+    return found if compared is None else structs.replace(found, drift_p=1.0, drifts=False)
 
 
 def _parts(time: Array, turn: Array, sigma: Array) -> tuple[HeadingPart, ...]:

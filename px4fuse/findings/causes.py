@@ -8,7 +8,8 @@ there.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import replace
+
+from msgspec.structs import replace
 
 from px4fuse.findings.model import SEVERITIES, Finding
 

@@ -40,9 +40,8 @@ def _detect(analysis: Analysis) -> Found:
         return
     if not clock.determinable or delay is None:
         return
-    applied = comparison.settings.clock_offset_s
-    asked = -applied - np.array([clock.interval_s[1], clock.interval_s[0]])
-    best = -(applied + clock.offset_s)
+    asked = -np.array([clock.interval_s[1], clock.interval_s[0]])
+    best = -clock.offset_s
     apart = abs(delay * 1e-3 - best)
     if apart < max(clock.chance_s + EKF2_UPDATE.value, CLOCK_OFFSET.value):
         return

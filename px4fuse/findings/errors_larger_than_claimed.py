@@ -120,7 +120,7 @@ def _detect(analysis: Analysis) -> Found:
 
 def _after_turning(comparison: Comparison, owner: str) -> tuple[float, float] | None:
     """Horizontal RMSE (m) to the truth, and what of it the best shift and turn leave."""
-    axes = {result.axis.name: result for result in comparison.axes}
+    axes = comparison.axes
     if not {"north", "east"} <= axes.keys():
         return None
     north, east = axes["north"], axes["east"]

@@ -11,6 +11,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+from msgspec import structs
+
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.drift import may_drift
 from px4fuse.comparison.remedy import filter_words
@@ -105,7 +107,7 @@ def _detect(analysis: Analysis) -> Found:
         )
         for each in off
     ]
-    yield replace(found[0], consequences=tuple(found[1:]))
+    yield structs.replace(found[0], consequences=tuple(found[1:]))
 
 
 def _off(label: str, option: str, unit: str, chosen: float, found: Noise) -> Off | None:

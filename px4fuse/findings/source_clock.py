@@ -30,7 +30,7 @@ def _for_ekf2(analysis: Analysis, clock: ClockOffset) -> str:
     model, comparison = analysis.ekf2_model, analysis
     if isinstance(model, Unavailable) or comparison.source.name != model.inputs.vision.source:
         return ""
-    late_ms = -1e3 * (comparison.settings.clock_offset_s + clock.offset_s)
+    late_ms = -1e3 * clock.offset_s
     changes = delay_change(model, late_ms)
     found = replayed(model, changes) if changes else None
     if found is None or isinstance(found, Unavailable):
@@ -50,12 +50,11 @@ def _detect(analysis: Analysis) -> Found:
         return
     if low_pass(analysis) is not None:  # which lags behind the motion by itself
         return
-    applied = comparison.settings.clock_offset_s
     low, high = clock.interval_s
     evidence: dict[str, float | str] = {
-        "offset_s": applied + clock.offset_s,
-        "interval_low_s": applied + low,
-        "interval_high_s": applied + high,
+        "offset_s": clock.offset_s,
+        "interval_low_s": low,
+        "interval_high_s": high,
     }
     changes = clock.change_p is not None and clock.change_p < CHANGE_P
     if changes:
@@ -64,8 +63,8 @@ def _detect(analysis: Analysis) -> Found:
             "source_clock_changes",
             "error",
             f"The clock offset of {comparison.source.name} is not the same throughout (p "
-            f"{clock.change_p:.1g}): {applied + first.offset_s:+.2f} s at the beginning, "
-            f"{applied + last.offset_s:+.2f} s at the end. PX4 takes the time of arrival until "
+            f"{clock.change_p:.1g}): {first.offset_s:+.2f} s at the beginning, "
+            f"{last.offset_s:+.2f} s at the end. PX4 takes the time of arrival until "
             "500 TIMESYNC answers have come.",
             "Let the clocks synchronise for a minute before take-off; analyse one side of the "
             "change with --start, --end.",
@@ -73,22 +72,23 @@ def _detect(analysis: Analysis) -> Found:
         )
     # one offset cannot hold for stamps that are of arrival in a part of the flight only
     changes = changes or stamps_of_arrival_end_s(analysis) is not None
-    if abs(clock.offset_s) > max(CLOCK_OFFSET.value, clock.chance_s) and not changes:
+    if abs(clock.remaining_s) > max(CLOCK_OFFSET.value, clock.chance_s) and not changes:
         remedy = f"{COMMAND} --clock-offset {typed_offset_s(comparison, clock):.3f}"
-        shifted = replace(comparison.settings, clock_offset_s=round(applied + clock.offset_s, 3))
+        shifted = replace(comparison.settings, clock_offset_s=round(clock.offset_s, 3))
         errors = filter_errors_m(comparison, shifted)
         if errors is not None:
             if errors[1] > WORSE_FILTER_ERROR * errors[0]:
                 return  # the truth knows better
             remedy += f": position error {errors[0]:.3f} → {errors[1]:.3f} m (replayed)"
-        ends = (-high, -low) if clock.offset_s < 0 else (low, high)
+        low, high = low - clock.applied_s, high - clock.applied_s
+        ends = (-high, -low) if clock.remaining_s < 0 else (low, high)
         yield Finding(
             "source_clock_offset",
-            "error" if abs(clock.offset_s) > CLOCK_OFFSET_ERROR.value else "warning",
+            "error" if abs(clock.remaining_s) > CLOCK_OFFSET_ERROR.value else "warning",
             f"The stamps of {comparison.source.name} are "
-            f"{'late' if clock.offset_s < 0 else 'early'} by {abs(clock.offset_s):.3f} s against "
-            f"the IMU (95 % {ends[0]:.3f} to {ends[1]:.3f} s): at 1 m/s that is an error of "
-            f"{abs(clock.offset_s):.2f} m, which neither filter's innovations show.",
+            f"{'late' if clock.remaining_s < 0 else 'early'} by {abs(clock.remaining_s):.3f} s "
+            f"against the IMU (95 % {ends[0]:.3f} to {ends[1]:.3f} s): at 1 m/s that is an error "
+            f"of {abs(clock.remaining_s):.2f} m, which neither filter's innovations show.",
             f"{remedy}{_for_ekf2(analysis, clock)}.",
             evidence,
         )
@@ -100,8 +100,7 @@ def typed_offset_s(comparison: Comparison, clock: ClockOffset) -> float:
     That of a position file was spent on placing it, and is not in the settings.
     """
     placed = comparison.source.alignment
-    applied = comparison.settings.clock_offset_s if placed is None else placed.clock_offset_s
-    return applied + clock.offset_s
+    return clock.offset_s if placed is None else placed.clock_offset_s + clock.remaining_s
 
 
 DETECTOR = Detector(

@@ -24,8 +24,8 @@ def _detect(analysis: Analysis) -> Found:
     if source.rung not in (4, 5, 6) or logged:
         return
     profile = int(comparison.flight.log.parameters.get("SDLOG_PROFILE", 1))
-    wanted = "position source vehicle_visual_odometry"
-    reasons = (part.reason for part in comparison.missing if part.what == wanted)
+    wanted = "vehicle_visual_odometry"
+    reasons = (part.reason for part in comparison.missing if part.source == wanted)
     why = next(reasons, "it is not in this log")
     remedy = f"Set SDLOG_PROFILE to {profile | VISION_PROFILE_BIT} and fly again."
     yield Finding(

@@ -14,7 +14,13 @@ import pandas as pd
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.drift import may_drift
-from px4fuse.comparison.model import AgainstTruth, AxisComparison, Comparison, Difference
+from px4fuse.comparison.model import (
+    AgainstTruth,
+    AxisComparison,
+    Comparison,
+    Difference,
+    FilterName,
+)
 from px4fuse.comparison.why import Why
 from px4fuse.comparison.why_words import STAMPS_WRONG, the
 from px4fuse.filter.kalman import Settings, state_at

@@ -5,10 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from msgspec import structs
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.drift import may_drift
-from px4fuse.comparison.model import AxisComparison, Comparison
+from px4fuse.comparison.model import FILTERS, AxisComparison, Comparison
 from px4fuse.comparison.remedy import (
     filter_words,
     noise_helps,
@@ -80,7 +81,7 @@ def _detect(analysis: Analysis) -> Found:
                 )
             ]
             if groups:  # one noise for all axes: the vertical axis tells no other cause
-                yield replace(groups[0], consequences=tuple(groups[1:]))
+                yield structs.replace(groups[0], consequences=tuple(groups[1:]))
 
 
 def _variance_finding(analysis: Analysis, owner: str, group: str, members: list[Member]) -> Finding:

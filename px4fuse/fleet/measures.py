@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import reduce
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
@@ -21,13 +21,13 @@ from scipy.stats import binomtest, chi2
 
 from px4fuse.analysis import Analysis
 from px4fuse.arrays import Array
-from px4fuse.comparison.model import AxisComparison
+from px4fuse.comparison.model import FILTERS, AxisComparison, FilterSummary
+from px4fuse.filter.clock import Clock
+from px4fuse.filter.heading import HeadingError
 from px4fuse.filter.kalman import state_at
 from px4fuse.filter.signals import AISLE
 from px4fuse.flight import Unavailable
-from px4fuse.results.comparison import Clock, Filter, Heading
 from px4fuse.results.contract import ComparisonResults
-from px4fuse.results.model import Absent
 from px4fuse.trajectory.scores import rmse_interval
 
 Aim = Literal["low", "one", "zero", ""]
@@ -61,7 +61,7 @@ class Number:
     method : str
         How the interval was found.
     kind : str
-        What it shares with the same number of other axes: ``axes.*.kf.nis_mean``.
+        What it shares with the same number of other axes: ``axes.*.filters.kf.nis_mean``.
     """
 
     label: str
@@ -91,9 +91,9 @@ def _of_filter(key: str, name: str) -> tuple[_Row, ...]:
         _Row(f"{key}.innovation_std_m", f"innovation std of {name}", "m", "low"),
         _Row(f"{key}.outside_gate", f"beyond the gate of {name}", "", "low",
              "difference"),
-        _Row(f"truth.{key}_position_rmse_m", f"error of {name}", "m", "low"),
-        _Row(f"truth.{key}_velocity_rmse_m_s", f"velocity error of {name}", "m/s", "low"),
-        _Row(f"truth.{key}_nees_position_mean", f"NEES of {name}", "", "one"),
+        _Row(f"{key}.truth.position_rmse_m", f"error of {name}", "m", "low"),
+        _Row(f"{key}.truth.velocity_rmse_m_s", f"velocity error of {name}", "m/s", "low"),
+        _Row(f"{key}.truth.nees_position_mean", f"NEES of {name}", "", "one"),
         _Row(f"{key}.innovation_mean_m", f"innovation mean of {name}", "m", "zero",
              "difference"),
         _Row(f"{key}.sigma_p_median_m", f"σ_p of {name}", "m", ""),
@@ -102,8 +102,8 @@ def _of_filter(key: str, name: str) -> tuple[_Row, ...]:
 
 
 _ROWS = (
-    *_of_filter("ekf2", "EKF2"),
-    *_of_filter("kf", "ours"),
+    *_of_filter("filters.ekf2", "EKF2"),
+    *_of_filter("filters.kf", "ours"),
     _Row("difference.position_rmse_m", "ours - EKF2", "m", "low"),
     _Row("difference.velocity_rmse_m_s", "ours - EKF2, velocity", "m/s", "low"),
 )
@@ -139,7 +139,7 @@ def _of_flight(results: ComparisonResults) -> Iterator[tuple[str, Number]]:
             "clock offset", "s", clock.offset_s, clock.interval_s, "zero",
             "difference", LIKELIHOOD, "clock.offset_s",
         )  # fmt: skip
-    if isinstance(heading, Heading) and not heading.drifts:
+    if isinstance(heading, HeadingError) and not heading.drifts:
         half = Z95 * heading.sigma_deg
         yield "heading.turn_deg", Number(
             "turn of the source's frame", "°", heading.turn_deg,
@@ -150,18 +150,17 @@ def _of_flight(results: ComparisonResults) -> Iterator[tuple[str, Number]]:
     level = next((name for name in ("north", "east", AISLE) if name in results.axes), "")
     for at, label in ((level, "horizontal"), ("down", "down")):
         axis = next((axis for name, axis in results.axes.items() if name == at), None)
-        if axis is None or axis.rejected_share is None or not isinstance(axis.ekf2, Filter):
+        ekf2 = None if axis is None else axis.filters["ekf2"]
+        if axis is None or axis.rejected_share is None or not isinstance(ekf2, FilterSummary):
             continue
-        interval = share_interval(
-            axis.rejected_share, axis.ekf2.count * independent_share(axis.ekf2)
-        )
+        interval = share_interval(axis.rejected_share, ekf2.count * independent_share(ekf2))
         yield f"axes.{at}.rejected_share", Number(
             f"rejected by EKF2, {label}", "", axis.rejected_share, interval, "low", "difference",
             WILSON, "axes.*.rejected_share",
         )  # fmt: skip
     plain: tuple[tuple[str, str, str, Aim], ...] = (
         ("loop.closure_error_m", "closure error of the loop", "m", "low"),
-        ("position_source.rate_hz", "rate of the source", "Hz", ""),
+        ("source.rate_hz", "rate of the source", "Hz", ""),
         ("log.duration_s", "duration of the log", "s", ""),
     )
     for path, label, unit, aim in plain:
@@ -171,7 +170,11 @@ def _of_flight(results: ComparisonResults) -> Iterator[tuple[str, Number]]:
 
 
 def _of_axes(results: ComparisonResults, analysis: Analysis | None) -> Iterator[tuple[str, Number]]:
-    known_truth = any(not isinstance(axis.truth, Absent) for axis in results.axes.values())
+    known_truth = any(
+        not isinstance(axis.filters[name].truth, Unavailable)
+        for axis in results.axes.values()
+        for name in FILTERS
+    )
     for name, axis in results.axes.items():
         series = {} if analysis is None else _series(analysis[name])
         for row in _ROWS:
@@ -189,17 +192,21 @@ def _of_axes(results: ComparisonResults, analysis: Analysis | None) -> Iterator[
 
 def _at(found: object, path: str) -> float | None:
     """A number below a part of the results, None where there is none."""
-    value = reduce(lambda part, name: getattr(part, name, None), path.split("."), found)
+    value = reduce(_below, path.split("."), found)
     return float(value) if isinstance(value, int | float) else None
 
 
-def _at_filter(axis: object, path: str) -> Filter | None:
-    judged = getattr(axis, path.split(".", maxsplit=1)[0], None)
-    return judged if isinstance(judged, Filter) else None
+def _below(found: object, name: str) -> Any:
+    return found.get(name) if isinstance(found, Mapping) else getattr(found, name, None)
+
+
+def _at_filter(axis: object, path: str) -> FilterSummary | None:
+    judged = reduce(_below, path.split(".")[:2], axis)
+    return judged if isinstance(judged, FilterSummary) else None
 
 
 def interval_of(
-    path: str, value: float, judged: Filter | None, series: Mapping[str, Array]
+    path: str, value: float, judged: FilterSummary | None, series: Mapping[str, Array]
 ) -> tuple[Bounds | None, str]:
     """95 % interval of a number of an axis, and how it was found."""
     field = path.rsplit(".", maxsplit=1)[-1]
@@ -221,7 +228,7 @@ def interval_of(
     return None, ""
 
 
-def independent_share(judged: Filter) -> float:
+def independent_share(judged: FilterSummary) -> float:
     """Share of the innovations' squares that are as good as independent.
 
     With the autocorrelation r^k of a first-order process squares have r^2k, hence
@@ -231,7 +238,7 @@ def independent_share(judged: Filter) -> float:
     return (1.0 - squared) / (1.0 + squared)
 
 
-def _is_normal(judged: Filter, count: float) -> bool:
+def _is_normal(judged: FilterSummary, count: float) -> bool:
     """Whether the share outside ±2√S is that of normal innovations of this mean square."""
     expected = float(2.0 * ndtr(-2.0 / np.sqrt(judged.nis_mean)))
     sigma = np.sqrt(expected * (1.0 - expected) / count)
@@ -252,10 +259,10 @@ def _series(result: AxisComparison) -> dict[str, Array]:
     for name, frame in (("kf", result.replay.updates), ("ekf2", result.ekf2_innovations)):
         if isinstance(frame, pd.DataFrame):
             innovation = frame["innovation_m"].to_numpy()
-            found[f"{name}.nis_mean"] = innovation / np.sqrt(
+            found[f"filters.{name}.nis_mean"] = innovation / np.sqrt(
                 frame["innovation_variance_m2"].to_numpy()
             )
-            found[f"{name}.innovation_std_m"] = innovation - np.nanmean(innovation)
+            found[f"filters.{name}.innovation_std_m"] = innovation - np.nanmean(innovation)
     state = result.ekf2_state
     times = result.replay.steps.index if isinstance(state, Unavailable) else state.index
     ours = dict(zip(_ERRORS, state_at(result.replay, times.to_numpy()), strict=True))
@@ -266,7 +273,7 @@ def _series(result: AxisComparison) -> dict[str, Array]:
         if isinstance(truth := result.truth, Unavailable):
             continue
         true = np.interp(times, truth.index, truth[column], left=np.nan, right=np.nan)
-        found[f"truth.kf_{field}"] = ours[column] - true
+        found[f"filters.kf.truth.{field}"] = ours[column] - true
         if theirs is not None:
-            found[f"truth.ekf2_{field}"] = theirs - true
+            found[f"filters.ekf2.truth.{field}"] = theirs - true
     return {path: values[np.isfinite(values)] for path, values in found.items()}

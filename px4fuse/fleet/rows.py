@@ -8,20 +8,13 @@ from typing import Any
 
 import pandas as pd
 
-from px4fuse.results.comparison import (
-    ASKED,
-    AgainstTruth,
-    Axis,
-    Clock,
-    Difference,
-    Filter,
-    Log,
-    Tuned,
-    UnjudgedFilter,
-)
+from px4fuse.comparison.model import AgainstTruth, AxisResult, Difference, FilterSummary
+from px4fuse.ekf2.replay import AxisAgreement, Replayed
+from px4fuse.filter.clock import Clock
+from px4fuse.filter.tuning import Tuned
+from px4fuse.record import Unavailable
+from px4fuse.results.comparison import ASKED, Log
 from px4fuse.results.contract import ComparisonResults
-from px4fuse.results.ekf2 import AxisAgreement, Ekf2Replay
-from px4fuse.results.model import Absent
 from px4fuse.spreadsheet import neutral
 
 DONE, NOT_JUDGED, FAILED = "done", "not judged", "failed"
@@ -67,8 +60,8 @@ def rows_of(found: ComparisonResults) -> list[Row]:
     """
     common = log_columns(found.log) | {
         "px4fuse": found.provenance.px4fuse,
-        "source": found.position_source.name,
-        "source_rate_hz": found.position_source.rate_hz,
+        "source": found.source.name,
+        "source_rate_hz": found.source.rate_hz,
         "story": "\n".join(found.story),
         "findings": BETWEEN_FINDINGS.join(finding.id for finding in found.findings),
     }
@@ -105,17 +98,19 @@ def log_columns(log: Log) -> Row:
     }
 
 
-def _axis(axis: Axis) -> Row:
-    lacking = [one.unavailable for one in (axis.kf, axis.ekf2) if isinstance(one, UnjudgedFilter)]
+def _axis(axis: AxisResult) -> Row:
+    lacking = [one for one in axis.filters.values() if isinstance(one, Unavailable)]
     row: Row = {
-        "status": DONE if isinstance(axis.kf, Filter) else NOT_JUDGED,
+        "status": DONE if isinstance(axis.filters["kf"], FilterSummary) else NOT_JUDGED,
         "reason": f"{lacking[0].what}: {lacking[0].reason}" if lacking else "",
         "remedy": lacking[0].remedy if lacking else "",
         "updates": axis.updates.count,
         "rejected_share": axis.rejected_share,
     }
-    for name, judged in (("kf", axis.kf), ("ekf2", axis.ekf2)):
-        if isinstance(judged, Filter):
+    for name, judged in axis.filters.items():
+        if isinstance(judged.truth, AgainstTruth):
+            row[f"{name}_position_rmse_to_truth_m"] = judged.truth.position_rmse_m
+        if isinstance(judged, FilterSummary):
             row |= {
                 f"{name}_nis_mean": judged.nis_mean,
                 f"{name}_factor": judged.variance_factor,
@@ -126,24 +121,16 @@ def _axis(axis: Axis) -> Row:
             "position_rmse_m": axis.difference.position_rmse_m,
             "velocity_rmse_m_s": axis.difference.velocity_rmse_m_s,
         }
-    if isinstance(axis.truth, AgainstTruth):
-        row |= {
-            "kf_position_rmse_to_truth_m": axis.truth.kf_position_rmse_m,
-            "ekf2_position_rmse_to_truth_m": axis.truth.ekf2_position_rmse_m,
-        }
     return row
 
 
-def _tuned(tuned: Tuned | Absent | None) -> Row:
+def _tuned(tuned: Tuned | Unavailable | None) -> Row:
     """What the filter's two settings should be; of a bound, the one end that is known."""
     row: Row = {}
     if isinstance(tuned, Tuned):
         for column, unit in (("sigma_z", "m"), ("sigma_a", "m_s2")):
             asked = ASKED[f"{column}_{unit}"]
-            low, high = getattr(tuned, f"{asked}_interval") or (
-                getattr(tuned, f"{asked}_lower_bound"),
-                getattr(tuned, f"{asked}_upper_bound"),
-            )
+            low, high = getattr(tuned, f"{asked}_interval") or (None, None)
             row |= {
                 f"{column}_{unit}": getattr(tuned, asked),
                 f"{column}_low_{unit}": low,
@@ -153,7 +140,7 @@ def _tuned(tuned: Tuned | Absent | None) -> Row:
 
 
 def _agreement(found: ComparisonResults, axis: str) -> Row:
-    if not isinstance(found.ekf2_replay, Ekf2Replay):
+    if not isinstance(found.ekf2_replay, Replayed):
         return {}
     agreement = getattr(found.ekf2_replay.agreement, axis, None)  # of north and east
     if not isinstance(agreement, AxisAgreement):

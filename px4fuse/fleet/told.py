@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 
 from px4fuse.comparison.events import happened
+from px4fuse.ekf2.replay import Replayed
 from px4fuse.findings import named
 from px4fuse.fleet.measures import BOOTSTRAP, CHI_SQUARE, LIKELIHOOD, WILSON, Number
 from px4fuse.fleet.sides import Side
@@ -12,7 +13,6 @@ from px4fuse.fleet.significance import FALSE_DISCOVERY_RATE, LEAST_RATIO
 from px4fuse.report.changes_words import chance_words, change_words, value_words
 from px4fuse.results.changes import FindingChange, NumberChange, TextChange, Which
 from px4fuse.results.contract import ChangeResults, ComparisonResults
-from px4fuse.results.ekf2 import Ekf2Replay
 
 _SETTINGS = {
     "sigma_a_m_s2": "SIGMA_A (m/s²)",
@@ -63,7 +63,7 @@ def texts(a: Side, b: Side, *, paired: bool) -> Iterator[TextChange]:
             yield TextChange("parameter", name, one, other)
     facts = [(label, getattr(first.log, n), getattr(second.log, n)) for n, label in _LOG.items()]
     facts += [
-        ("position source", first.position_source.name, second.position_source.name),
+        ("position source", first.source.name, second.source.name),
         ("px4fuse", first.provenance.px4fuse, second.provenance.px4fuse),
     ]
     if a.analysis is not None and b.analysis is not None:
@@ -82,7 +82,7 @@ def _plain(value: object) -> str:
 def _parameters(found: ComparisonResults) -> Mapping[str, float]:
     """Of PX4: those that the log has, and those that EKF2 was replayed with."""
     replay = found.ekf2_replay
-    return (replay.settings if isinstance(replay, Ekf2Replay) else {}) | {
+    return (dict(replay.settings) if isinstance(replay, Replayed) else {}) | {
         name: float(value) for name, value in found.log.parameters.items()
     }
 

@@ -6,10 +6,13 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from px4fuse.filter.tuning import HORIZONTAL
+from px4fuse.comparison.model import FilterName, FilterSummary
+from px4fuse.filter.clock import Clock
+from px4fuse.filter.consistency import HorizontalNis
+from px4fuse.filter.tuning import HORIZONTAL, Tuned
 from px4fuse.grading.evidence import Evidence, absence, drifts, text_of, why_not_horizontal
 from px4fuse.plain import factor_words
-from px4fuse.results.comparison import ASKED, Clock, Filter, HorizontalNis, Tuned
+from px4fuse.results.comparison import ASKED
 
 # Findings about stamps for which no single offset is right
 CHANGING = ("source_clock_changes", "source_stamps_of_arrival")
@@ -36,14 +39,11 @@ def _tuned(evidence: Evidence, axis: str, name: str, factor: float) -> tuple[flo
         return 0.0, f"Your report does not say which {label} you chose"
     chosen: float = getattr(comparison.settings, name)
     tuned = comparison.tuning.get(axis)
-    interval = bound = None
+    interval = None
     if isinstance(tuned, Tuned):
         asked = ASKED[name]
         interval = getattr(tuned, f"{asked}_interval")
-        bound = getattr(tuned, f"{asked}_upper_bound")
-    if interval is None and bound is not None:
-        interval = (0.0, bound)
-    if interval is None:
+    if interval is None or interval[1] is None:
         why = absence(tuned) or (why_not_horizontal(evidence) if axis == HORIZONTAL else "")
         return 0.0, f"Your report has no interval for {label}{why}"
     low, high = interval
@@ -125,16 +125,18 @@ def _nothing_more(evidence: Evidence) -> bool:
     )  # fmt: skip
 
 
-def _judged(evidence: Evidence, axis: str, which: str) -> tuple[Filter | HorizontalNis | None, str]:
+def _judged(
+    evidence: Evidence, axis: str, which: FilterName
+) -> tuple[FilterSummary | HorizontalNis | None, str]:
     """The consistency of a filter along an axis, or why there is none."""
     comparison = evidence.comparison
     if comparison is None:
         return None, ""
     if axis == HORIZONTAL:
-        return getattr(comparison.horizontal, which), why_not_horizontal(evidence)
+        return comparison.horizontal.get(which), why_not_horizontal(evidence)
     analysed = comparison.axes.get(axis)  # type: ignore[call-overload]
-    found = None if analysed is None else getattr(analysed, which)
-    return (found, "") if isinstance(found, Filter) else (None, absence(found))
+    found = None if analysed is None else analysed.filters.get(which)
+    return (found, "") if isinstance(found, FilterSummary) else (None, absence(found))
 
 
 def clock(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float, str]:

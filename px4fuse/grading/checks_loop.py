@@ -10,10 +10,10 @@ from scipy.stats import chi2
 
 from px4fuse.grading.evidence import Evidence, absence
 from px4fuse.plain import length_words, p_words
+from px4fuse.record import Unavailable
 from px4fuse.request import LoopRequest
 from px4fuse.results.contract import LoopResults
-from px4fuse.results.model import Absent
-from px4fuse.results.trajectories import Correction, Corrections, Loop, Score
+from px4fuse.results.trajectories import Correction, Corrections, LoopPart, Score
 from px4fuse.trajectory.graph.analysis import GATE_ALPHA
 
 OPEN = "false_loop_closure"
@@ -37,7 +37,7 @@ def contradictions(evidence: Evidence) -> tuple[str, ...]:
     return tuple(_contradictions(evidence, results.request, results.loop))
 
 
-def _contradictions(evidence: Evidence, request: LoopRequest, loop: Loop) -> Iterator[str]:
+def _contradictions(evidence: Evidence, request: LoopRequest, loop: LoopPart) -> Iterator[str]:
     landed, at = _landed_m(evidence), request.landed_at
     if landed is not None and at is not None:
         said = math.hypot(at.forward_m, at.right_m)
@@ -106,8 +106,8 @@ def loop(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float, str]:
     """The loop was measured, and the path corrected where that is right."""
     results, loop = evidence.results, evidence.results.loop
     opened = isinstance(results, LoopResults) and not results.request.came_back
-    if not isinstance(loop, Loop) or (loop.closure_error_m is None and not opened):
-        why = absence(loop.known_end if isinstance(loop, Loop) else loop)
+    if not isinstance(loop, LoopPart) or (loop.closure_error_m is None and not opened):
+        why = absence(loop.known_end if isinstance(loop, LoopPart) else loop)
         return 0.0, f"Your report measures no loop{why}."
     if loop.absolute:
         return 0.0, (
@@ -155,7 +155,7 @@ def _rejected(evidence: Evidence, measured: str) -> tuple[float, str]:
 def closure(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float, str]:
     """The closure error is one that the odometry's drift explains, or the end is rightly open."""
     results, loop = evidence.results, evidence.results.loop
-    if not isinstance(loop, Loop) or not isinstance(results, LoopResults):
+    if not isinstance(loop, LoopPart) or not isinstance(results, LoopResults):
         return 0.0, f"Your report measures no loop{absence(loop)}."
     wrong = contradictions(evidence)
     if wrong:
@@ -211,7 +211,7 @@ def _corrected(corrections: Corrections, without_reference: float) -> tuple[floa
     )
 
 
-def _ates(correction: Correction | Absent) -> dict[str, float]:
+def _ates(correction: Correction | Unavailable) -> dict[str, float]:
     """ATE (m) of a correction by the reference that it was scored against."""
     scores = correction.scores if isinstance(correction, Correction) else {}
     return {

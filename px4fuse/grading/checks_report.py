@@ -23,7 +23,7 @@ from px4fuse.verification.verification import NO_LOG, is_number
 NOT_ASKED = frozenset(("log_damaged", "samples_dropped", "source_samples_lost"))
 # What places in the results are called that the default rubric asks for
 PARTS: Mapping[str, str] = {
-    "axes.*.kf": "the consistency of the filter",
+    "axes.*.filters.kf": "the consistency of the filter",
     "clock": "the clock offset",
     "loop.closure_error_m": "the closure error",
     "loop.path_length_m": "the length of the path",
@@ -85,7 +85,11 @@ def sections(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float, str]:
     ]
     for path in given["results"]:
         there = [value for _, value in values_at(evidence.plain, path)]
-        if not any(v for v in there if not (isinstance(v, dict) and set(v) == {"unavailable"})):
+        if not any(
+            v
+            for v in there
+            if not (isinstance(v, dict) and {"what", "reason", "remedy"} <= v.keys())
+        ):
             missing.append(f"{PARTS.get(path, path)}{why_absent(evidence, path)}")
     asked = len(given["pages"]) + len(given["results"])
     if not missing:

@@ -17,8 +17,8 @@ from px4fuse.grading.folding import folded
 from px4fuse.grading.model import Rubric
 from px4fuse.grading.notes import WORD, Mention, Notes, Words, read_notes
 from px4fuse.plain import few_words
+from px4fuse.record import Unavailable
 from px4fuse.results.contract import ComparisonResults, LoopResults, Reported, to_plain
-from px4fuse.results.model import Absent
 from px4fuse.results.reading import one_line
 from px4fuse.verification.model import Report, Verdict
 from px4fuse.verification.rerun import log_sha256
@@ -221,8 +221,8 @@ def text_of(value: str) -> str:
 
 def absence(part: object) -> str:
     """Why a part is not there, in brackets; "" where it is, or nobody says."""
-    if isinstance(part, Absent):
-        return f" ({text_of(part.unavailable.reason).rstrip('.')})"
+    if isinstance(part, Unavailable):
+        return f" ({text_of(part.reason).rstrip('.')})"
     return ""
 
 
@@ -231,7 +231,7 @@ def why_absent(evidence: Evidence, path: str) -> str:
     steps = [match[0] for match in STEP.finditer(path)]
     for end in range(len(steps), 0, -1):
         above = ".".join(steps[:end])
-        for _, reason in values_at(evidence.plain, f"{above}.unavailable.reason"):
+        for _, reason in values_at(evidence.plain, f"{above}.reason"):
             return f" ({text_of(reason).rstrip('.')})"
     return why_not_horizontal(evidence) if HORIZONTAL in path else ""
 

@@ -20,11 +20,11 @@ from numpy.lib.stride_tricks import sliding_window_view
 from px4fuse.assignment.key import AnswerKey
 from px4fuse.assignment.key import folded as folded_id
 from px4fuse.filter.kalman import Settings
-from px4fuse.filter.tuning import HORIZONTAL
+from px4fuse.filter.tuning import HORIZONTAL, HeldOut, Tuned
 from px4fuse.grading.folding import folded
 from px4fuse.grading.model import Graded
 from px4fuse.plain import few_words
-from px4fuse.results.comparison import ASKED, HeldOut, Tuned
+from px4fuse.results.comparison import ASKED
 from px4fuse.results.contract import ComparisonResults, LoopResults, Reported
 from px4fuse.results.reading import one_line
 

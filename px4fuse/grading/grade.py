@@ -39,9 +39,9 @@ MEMORY_BYTES = 4_000_000_000
 NUMBERS = (
     ("SIGMA_A (m/s²)", "settings.sigma_a_m_s2"),
     ("SIGMA_Z (m)", "settings.sigma_z_m"),
-    ("mean NIS north", "axes.north.kf.nis_mean"),
-    ("mean NIS east", "axes.east.kf.nis_mean"),
-    ("position RMSE to truth, aisle (m)", "axes.aisle.truth.kf_position_rmse_m"),
+    ("mean NIS north", "axes.north.filters.kf.nis_mean"),
+    ("mean NIS east", "axes.east.filters.kf.nis_mean"),
+    ("position RMSE to truth, aisle (m)", "axes.aisle.filters.kf.truth.position_rmse_m"),
     ("closure error (m)", "loop.closure_error_m"),
 )
 

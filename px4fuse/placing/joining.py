@@ -7,6 +7,7 @@ from typing import TypeVar
 
 import numpy as np
 import pandas as pd
+from msgspec import structs
 from scipy.spatial.transform import Rotation
 
 from px4fuse.errors import MissingDataError
@@ -32,7 +33,6 @@ MIN_OVERLAP_S = 2.0
 MAX_POSITION_DIFFERENCE_M = 0.5
 MAX_ATTITUDE_DIFFERENCE_DEG = 10.0
 MIN_COMMON_SAMPLES = 5
-SOURCE = "position source "
 
 
 def join(flight: Flight, other: Flight) -> Flight:
@@ -86,7 +86,7 @@ def join(flight: Flight, other: Flight) -> Flight:
     lacking = missing_parts(joined.imu, joined.attitude, joined.ekf2, joined.truth)
     return replace(
         joined,
-        log=replace(
+        log=structs.replace(
             flight.log,
             notes=(
                 *flight.log.notes,
@@ -98,7 +98,7 @@ def join(flight: Flight, other: Flight) -> Flight:
             senders=flight.log.senders or other.log.senders,
         ),
         positions=tuple(sorted((*flight.positions, *moved.positions), key=lambda t: t.rung)),
-        missing=(*lacking, *(m for m in flight.missing if m.what.startswith(SOURCE))),
+        missing=(*lacking, *(part for part in flight.missing if part.source)),
         streams=streams,
         clocks=(*flight.clocks, *other.clocks),
         unused=(*flight.unused, *other.unused),

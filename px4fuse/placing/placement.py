@@ -16,6 +16,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
+from msgspec import structs
 
 from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.flight import Flight, PositionTrack
@@ -108,7 +109,7 @@ def place(
     said = tuple(f"{file.name}: {text}" for text in (*file.detected, *file.notes))
     return replace(
         flight,
-        log=replace(flight.log, notes=(*flight.log.notes, *said)),
+        log=structs.replace(flight.log, notes=(*flight.log.notes, *said)),
         positions=(track, *flight.positions),
         inputs=(
             *flight.inputs,

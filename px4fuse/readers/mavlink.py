@@ -239,7 +239,7 @@ def _describe(
     return LogInfo(
         name=frames.name,
         sha256=frames.sha256,
-        size_bytes=len(frames.content),
+        bytes=len(frames.content),
         format="MAVLink stream" if frames.received_us is None else "MAVLink tlog",
         firmware=firmware,
         firmware_hash=firmware_hash,

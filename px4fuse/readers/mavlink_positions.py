@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from msgspec import structs
 from numpy.typing import NDArray
 
 from px4fuse.arrays import Array, IntArray
@@ -72,7 +72,7 @@ def read_positions(
             for kind, part in _kinds(source, recording.frames.table(source.message, rows)):
                 track = _read_track(recording, kind, suffix, rows[part], mapped[sender])
                 found.append(
-                    replace(track, remedy=remedies.position)
+                    structs.replace(track, remedy=remedies.position)
                     if isinstance(track, Unavailable)
                     else track
                 )
@@ -82,6 +82,7 @@ def read_positions(
                     f"position source {source.message}",
                     f"no {source.message} to the autopilot in the recording",
                     remedies.position,
+                    source=source.message,
                 )
             )
     tracks = [part for part in found if isinstance(part, PositionTrack)]
@@ -130,7 +131,10 @@ def _read_track(
     samples = clean_positions(samples, POSITION_COLUMNS)
     if len(samples) < MIN_TRACK_SAMPLES:
         return Unavailable(
-            f"position source {name}", f"{len(samples)} finite samples are too few", ""
+            f"position source {name}",
+            f"{len(samples)} finite samples are too few",
+            "",
+            source=name,
         )
     statement = clock.statement
     mapping = (

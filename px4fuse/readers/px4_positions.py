@@ -81,7 +81,7 @@ def _unavailable(name: str, reason: str) -> Unavailable:
         RECONSTRUCTION: "Needs EKF2 innovations of external vision.",
         GPS_SOURCE: "Logged when a GPS receiver is connected.",
     }.get(name, "Logged by PX4 v1.10 to v1.13 when external vision is fused.")
-    return Unavailable(f"position source {name}", reason, remedy)
+    return Unavailable(f"position source {name}", reason, remedy, source=name)
 
 
 def clean_positions(samples: pd.DataFrame, axes: list[str]) -> pd.DataFrame:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
+from msgspec import structs
 
 from px4fuse.arrays import Array
 from px4fuse.flight import (
@@ -81,7 +81,7 @@ def to_flight(topics: Topics) -> Flight:
         "airborne": () if isinstance(airborne, Unavailable) else (LAND_DETECTED[0].topic,),
     }
     return Flight(
-        log=dataclasses.replace(
+        log=structs.replace(
             topics.log, notes=topics.log.notes + dropped, start_unix_s=_start_unix(topics)
         ),
         imu=imu,

@@ -257,7 +257,7 @@ def read_topics(path: Path) -> Topics:
     log = LogInfo(
         name=name,
         sha256=hashlib.sha256(content).hexdigest(),
-        size_bytes=len(content),
+        bytes=len(content),
         format="ULog",
         firmware=_firmware(ulog.msg_info_dict),
         firmware_hash=_text(ulog.msg_info_dict, "ver_sw", "unknown"),

@@ -60,7 +60,7 @@ def draw(document: Document) -> Iterator[Page]:
                 ("file", f"{log.name}, {log.bytes} bytes, {log.format}"),
                 ("SHA-256", log.sha256),
                 *(
-                    (f.role, f"{f.name}, {f.size_bytes} bytes, SHA-256 {f.sha256}")
+                    (f.role, f"{f.name}, {f.bytes} bytes, SHA-256 {f.sha256}")
                     for f in flight.inputs
                 ),
                 ("firmware", f"{log.firmware}, git {log.firmware_hash}"),
@@ -95,7 +95,7 @@ def draw(document: Document) -> Iterator[Page]:
         (
             "Looked for and not found",
             [
-                (part.what.removeprefix("position source "), f"{part.reason}. {part.remedy}")
+                (part.source or part.what, f"{part.reason}. {part.remedy}")
                 for part in comparison.missing
             ]
             or [("", "nothing is missing")],

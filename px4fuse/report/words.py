@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -129,7 +129,7 @@ def verdict_notes(comparison: Comparison) -> list[str]:
     return notes
 
 
-def _same_nis(stated: list[tuple[str, str, Consistency]]) -> Iterator[str]:
+def _same_nis(stated: Sequence[tuple[str, str, Consistency]]) -> Iterator[str]:
     """Two filters on one axis of which only the one with more samples is called wrong."""
     for axis, owner, wrong in stated:
         for other, fine in ((o, s) for a, o, s in stated if a == axis):
@@ -293,10 +293,9 @@ def noise_and_bias_words(found: AxisTuning) -> str:
 
 def stamps_wrong(comparison: Comparison, clock: ClockOffset) -> bool:
     """Whether the stamps of the source are late or early beyond doubt, as they were recorded."""
-    applied = comparison.settings.clock_offset_s
     low, high = clock.interval_s
-    negligible = abs(applied + clock.offset_s) < NEGLIGIBLE_OFFSET_S
-    return clock.determinable and not (low <= -applied <= high or negligible)
+    negligible = abs(clock.offset_s) < NEGLIGIBLE_OFFSET_S
+    return clock.determinable and not (low <= 0.0 <= high or negligible)
 
 
 def delay_wrong(comparison: Comparison, clock: ClockOffset) -> bool:
@@ -304,7 +303,7 @@ def delay_wrong(comparison: Comparison, clock: ClockOffset) -> bool:
     delay = comparison.flight.log.parameters.get("EKF2_EV_DELAY")
     if delay is None or not clock.determinable:
         return False
-    asked = comparison.settings.clock_offset_s + np.array(clock.interval_s)
+    asked = clock.interval_s
     margin = NEGLIGIBLE_OFFSET_S
     return not -(asked[1] + margin) <= delay * 1e-3 <= -(asked[0] - margin)
 
@@ -313,8 +312,7 @@ def clock_advice(comparison: Comparison, clock: ClockOffset | Unavailable) -> li
     """What the clock estimate says, and what follows from it: lines as of tuning_advice."""
     if isinstance(clock, Unavailable):
         return [f"Offset   not determinable: {clock.reason}. {clock.remedy}"]
-    applied = comparison.settings.clock_offset_s
-    offset, (low, high) = applied + clock.offset_s, clock.interval_s
+    offset, (low, high) = clock.offset_s, clock.interval_s
     log = comparison.flight.log
     lines = []
     if not clock.determinable:
@@ -322,7 +320,7 @@ def clock_advice(comparison: Comparison, clock: ClockOffset | Unavailable) -> li
         lines.append("Next     fly passes of 5 m or more with clear starts and stops.")
         return lines
     lines.append(
-        f"Offset   {offset:+.3f} s, 95 % {applied + low:+.3f} s to {applied + high:+.3f} s, to be "
+        f"Offset   {offset:+.3f} s, 95 % {low:+.3f} s to {high:+.3f} s, to be "
         "added to the stamps of the source"
     )
     side = "late" if offset < 0.0 else "early"
@@ -343,13 +341,11 @@ def clock_advice(comparison: Comparison, clock: ClockOffset | Unavailable) -> li
         else:
             lines.append(
                 f"PX4      EKF2_EV_DELAY is {delay:g} ms, the data ask for "
-                f"{max(-offset * 1e3, 0.0):.0f} ms ({max(-(applied + high) * 1e3, 0.0):.0f} to "
-                f"{max(-(applied + low) * 1e3, 0.0):.0f}); set it, or correct the sender's clock"
+                f"{max(-offset * 1e3, 0.0):.0f} ms ({max(-high * 1e3, 0.0):.0f} to "
+                f"{max(-low * 1e3, 0.0):.0f}); set it, or correct the sender's clock"
             )
     if clock.change_p is not None and clock.change_p < CHANGE_P:
-        parts = ", ".join(
-            f"{applied + p.offset_s:+.2f} s from {p.start_s:.0f} s" for p in clock.parts
-        )
+        parts = ", ".join(f"{p.offset_s:+.2f} s from {p.start_s:.0f} s" for p in clock.parts)
         lines.append(
             f"Changes  the offset is not the same throughout ({p_words(clock.change_p)}): {parts}"
         )

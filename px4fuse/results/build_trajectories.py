@@ -119,7 +119,7 @@ def _loop(loop: Loop) -> made.LoopPart:
         closure_error_axes_m=None
         if isinstance(misclosure, Unavailable)
         else _axes(path, misclosure),
-        heading_error_deg=turned if isinstance(turned, Unavailable) else turned,
+        heading_error_deg=turned,
         odometry_noise=copied(made.OdometryNoise, loop.noise),
         closures=tuple(_closure(judged) for judged in loop.closures),
         corrections=made.Corrections(

@@ -28,7 +28,7 @@ class NumberChange(Record, frozen=True, kw_only=True):
     Attributes
     ----------
     path : str
-        Where it stands in the results of both: ``axes.aisle.ekf2.nis_mean``.
+        Where it stands in the results of both: ``axes.aisle.filters.ekf2.nis_mean``.
     label, unit : str
     a, b : float
     a_interval, b_interval : (float, float)

@@ -7,6 +7,7 @@ raises the minor one.
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
 import msgspec
@@ -257,18 +258,20 @@ def schema() -> dict[str, Any]:
 
 def to_plain(results: msgspec.Struct) -> dict[str, Any]:
     """Results as dicts, lists and numbers, by the names that they have in JSON."""
-    found: dict[str, Any] = msgspec.to_builtins(results, enc_hook=_plain_number)
+    found: dict[str, Any] = msgspec.to_builtins(results, enc_hook=_plain)
     return found
 
 
-def _plain_number(value: Any) -> float:
-    """A number of numpy's as Python's own.
+def _plain(value: Any) -> float | dict[str, Any]:
+    """A number of numpy's as Python's own, any mapping as a dict.
 
     Raises
     ------
     NotImplementedError
-        It is not a number.
+        It is neither.
     """
+    if isinstance(value, Mapping):
+        return dict(value)
     if isinstance(value, float):
         return float(value)
     raise NotImplementedError(f"results cannot hold a {type(value).__name__}")

@@ -97,7 +97,7 @@ def simulate(scenario: Scenario, mistakes: Mistakes = NO_MISTAKES) -> Simulation
 def simulate_flight(scenario: Scenario, mistakes: Mistakes = NO_MISTAKES) -> Flight:
     """Fly a scenario and give what :func:`px4fuse.read_log` would read from its ULog.
 
-    Its ``log.sha256`` is of scenario and mistakes, since there is no file, and ``size_bytes`` 0.
+    Its ``log.sha256`` is of scenario and mistakes, since there is no file, and ``bytes`` 0.
     """
     return to_flight(simulate(scenario, mistakes))
 
@@ -126,7 +126,7 @@ def to_flight(simulation: Simulation, name: str = "simulation.ulg") -> Flight:
         log=LogInfo(
             name=name,
             sha256=hashlib.sha256(identity).hexdigest(),
-            size_bytes=0,
+            bytes=0,
             format="ULog",
             firmware="PX4 v1.16.0",
             firmware_hash="unknown",

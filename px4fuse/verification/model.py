@@ -55,7 +55,7 @@ class Difference:
     Attributes
     ----------
     path : str
-        Where it stands in the results: ``axes.north.kf.nis_mean``.
+        Where it stands in the results: ``axes.north.filters.kf.nis_mean``.
     recorded, recomputed : str
         "absent" where there is none.
     """

@@ -43,7 +43,7 @@ RELATIVE, ABSOLUTE = 1e-6, 1e-9
 ESTIMATE_RELATIVE, ESTIMATE_ABSOLUTE = 1e-3, 1e-5
 ESTIMATES = (
     "tuning", "clock", "ekf2_replay", "why", "findings", "loop.closures", "loop.corrections",
-    "position_source.alignment", "settings.clock_offset_s",
+    "source.alignment", "settings.clock_offset_s",
 )  # fmt: skip
 # How often a solver went round
 ITERATIONS, MORE_ITERATIONS = "iterations", 2

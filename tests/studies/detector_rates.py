@@ -206,9 +206,8 @@ def _fly(job: Job) -> list[tuple[str, ...]]:
         compared = explained
         if condition.settings != first.settings:
             # the most likely noises and the clock's offset do not depend on the chosen ones
-            compared = replace(
-                explained, comparison=compare(flight, condition.settings, axes=("north", "east"))
-            )
+            again = compare(flight, condition.settings, axes=("north", "east"))
+            compared = replace(explained, **vars(again))
         ids = tuple(i for f in find(compared) for i in f.ids)
         named.append(_named(condition, (*ids, *(name for name in of_loop if name not in ids))))
     return named
@@ -221,7 +220,15 @@ def _explain(flight: Flight, condition: Condition) -> Analysis:
     clock = clock_offset(comparison, tuning)
     model = open_model(flight) if condition.ekf2 else NOT_ASKED
     heading = turned_frame(comparison, tuning, clock)
-    return Analysis(comparison, tuning, clock, model, {}, loop_in(flight), heading)
+    return Analysis(
+        **vars(comparison),
+        tuning=tuning,
+        clock=clock,
+        ekf2_model=model,
+        why={},
+        loop=loop_in(flight),
+        heading=heading,
+    )
 
 
 def _named(condition: Condition, ids: Iterable[str]) -> tuple[str, ...]:

@@ -38,7 +38,7 @@ from px4fuse.assignment.assignment import answer_to
 from px4fuse.assignment.drawing import CHOICES, EASIEST, HARDEST, Choice, Drawn, draw
 from px4fuse.assignment.key import Answer, AnswerKey
 from px4fuse.assignment.roster import Student as Assigned
-from px4fuse.filter.tuning import HORIZONTAL
+from px4fuse.filter.tuning import HORIZONTAL, Tuned
 from px4fuse.findings import find, find_loop
 from px4fuse.flight import Flight
 from px4fuse.grading.model import Graded, Rubric
@@ -50,7 +50,7 @@ from px4fuse.loop.tracks import trajectory_of
 from px4fuse.request import ComparisonRequest, LoopRequest, command_line
 from px4fuse.results.build import results as comparison_results
 from px4fuse.results.build_trajectories import loop_results
-from px4fuse.results.comparison import ASKED, Tuned
+from px4fuse.results.comparison import ASKED
 from px4fuse.results.contract import ComparisonResults, Reported, to_json
 from px4fuse.results.model import Student
 from px4fuse.results.reading import read_results
@@ -182,10 +182,9 @@ def _advised(request: Request, report: Reported, leaves_open: bool) -> Request:
         changes["clock_offset_s"] = round(float(offset.evidence["offset_s"]), 3)
     tuned = report.tuning.get(HORIZONTAL) if isinstance(report, ComparisonResults) else None
     for name, asked in ASKED.items() if isinstance(tuned, Tuned) else ():
-        value, bound = getattr(tuned, asked), getattr(tuned, f"{asked}_upper_bound")
-        low, high = getattr(tuned, f"{asked}_interval") or (0.0, bound or math.inf)
-        if not low <= getattr(request, name) <= high:
-            changes[name] = float(f"{bound if value is None else value:.3g}")
+        value, (low, high) = getattr(tuned, asked), getattr(tuned, f"{asked}_interval")
+        if not low <= getattr(request, name) <= (high or math.inf):
+            changes[name] = float(f"{high if value is None else value:.3g}")
     return msgspec.structs.replace(request, **changes)
 
 

@@ -8,10 +8,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from px4fuse.assignment.drawing import Drawn
-from px4fuse.filter.tuning import HORIZONTAL
-from px4fuse.results.comparison import Filter, Tuned
+from px4fuse.comparison.model import FilterSummary
+from px4fuse.filter.tuning import HORIZONTAL, Tuned
+from px4fuse.findings.model import Finding
 from px4fuse.results.contract import ComparisonResults, LoopResults, Reported
-from px4fuse.results.model import FoundMistake
 
 WORDINGS = 2
 # By name of the mistake, with its size as {size}
@@ -140,7 +140,7 @@ def guessed(results: Reported, mistakes: Sequence[str], wording: int) -> str:
     return "\n\n".join(parts)
 
 
-def _explained(finding: FoundMistake) -> str:
+def _explained(finding: Finding) -> str:
     """What a student says of a finding besides the mistakes; else what the report says."""
     message, remedy = (
         text.split(". ")[0].rstrip(".") for text in (finding.message, finding.remedy)
@@ -165,9 +165,10 @@ def _compared(results: ComparisonResults) -> str:
             "and east together."
         )
     for name, axis in results.axes.items():
-        if isinstance(axis.kf, Filter):
+        ours = axis.filters["kf"]
+        if isinstance(ours, FilterSummary):
             said.append(
-                f"On the {name} axis the mean NIS of my filter is {axis.kf.nis_mean:.2f}, where 1 "
+                f"On the {name} axis the mean NIS of my filter is {ours.nis_mean:.2f}, where 1 "
                 "would be expected of innovations that are as large as the filter says."
             )
     said.append(
