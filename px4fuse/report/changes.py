@@ -50,7 +50,7 @@ SHARES = (7.5, 28.0, 7.5, 10.0, 25.0, 9.0)
 HEADS = ("", "number", "A", "B", "change, with its 95 % interval", "by chance?")
 # The axes of innovations reach so many of the larger median 2√S
 EDGE = 2.2
-MAP, PANEL, LEGEND = 190.0, 112.0, 14.0
+MAP, PANEL, LEGEND = 160.0, 95.0, 14.0
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ def draw(document: ChangesDocument) -> Iterator[Page]:
     a, b = document.a, document.b
     if a is None or b is None:
         return
-    named = [{result.axis.name for result in analysis.axes.values()} for analysis in (a, b)]
+    named = [set(analysis.axes) for analysis in (a, b)]
     common = [n for n in (AISLE, "north", "east", "down") if all(n in names for names in named)]
     if not common:
         return
@@ -328,7 +328,7 @@ def _said(
 
 def _path(analysis: Analysis, of: Callable[[AxisComparison], Any]) -> Series | None:
     """North and east (m), where both were analysed."""
-    frames = {result.axis.name: of(result) for result in analysis.axes.values()}
+    frames = {name: of(result) for name, result in analysis.axes.items()}
     north, east = frames.get("north"), frames.get("east")
     if not isinstance(north, pd.DataFrame) or not isinstance(east, pd.DataFrame):
         return None

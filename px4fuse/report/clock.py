@@ -27,15 +27,15 @@ DRIFT_SIGMAS = 2.81
 
 def line(document: Document) -> str:
     """What the clock estimate says, in one line."""
-    clock, applied = document.analysis.clock, document.comparison.settings.clock_offset_s
+    clock = document.analysis.clock
     if isinstance(clock, Unavailable):
         return f"not determinable: {clock.reason}. {clock.remedy}"
     if has_page(document):
         return "see its page"
     low, high = clock.interval_s
     return (
-        f"the stamps are right as far as this flight can tell: {applied + clock.offset_s:+.3f} s "
-        f"(95 % {applied + low:+.3f} to {applied + high:+.3f} s) would have to be added, from "
+        f"the stamps are right as far as this flight can tell: {clock.offset_s:+.3f} s "
+        f"(95 % {low:+.3f} to {high:+.3f} s) would have to be added, from "
         f"{clock.count} measurements"
     )
 
@@ -78,17 +78,15 @@ def draw(document: Document) -> Iterator[Page]:
     )
     for text in clock_advice(document.comparison, clock):
         page.labelled(text[:9].strip(), text[9:], size=8.5)
-    applied = document.comparison.settings.clock_offset_s
-    _curve(page, clock, applied)
+    _curve(page, clock)
     if len(clock.parts) > 1:
         _parts(page, clock, document)
     yield page
 
 
-def _curve(page: Page, clock: ClockOffset, applied: float) -> None:
+def _curve(page: Page, clock: ClockOffset) -> None:
     """Likelihood over the offset."""
-    low, high = (applied + end for end in clock.interval_s)
-    best = applied + clock.offset_s
+    (low, high), best, applied = clock.interval_s, clock.offset_s, clock.applied_s
     axes = page.panel(
         "ln of how much less likely each offset is than the best",
         f"Best at {best:+.3f} s; 95 % from {low:+.3f} to {high:+.3f} s, wider than the curve alone "
@@ -97,11 +95,11 @@ def _curve(page: Page, clock: ClockOffset, applied: float) -> None:
         above=14.0,
     )
     axes.axvspan(low, high, color=OURS_BAND, lw=0, label="95 % interval")
-    axes.plot(applied + clock.curve_s, clock.curve_drop, **OURS_LINE)
+    axes.plot(clock.curve_s, clock.curve_drop, **OURS_LINE)
     axes.axvline(applied, color="black", lw=0.8, ls="--", label="as analysed")
     axes.set_ylim(min(MAX_DROP, float(clock.curve_drop.max()) * 1.05), 0.0)
     reach = REACH * max(high - best, best - low)
-    ends = applied + clock.curve_s[0], applied + clock.curve_s[-1]
+    ends = clock.curve_s[0], clock.curve_s[-1]
     axes.set_xlim(
         min(max(best - reach, ends[0]), applied - 0.1 * reach),
         max(min(best + reach, ends[1]), applied + 0.1 * reach),
@@ -112,7 +110,6 @@ def _curve(page: Page, clock: ClockOffset, applied: float) -> None:
 
 def _parts(page: Page, clock: ClockOffset, document: Document) -> None:
     """Offset of each part of the flight over time."""
-    applied = document.comparison.settings.clock_offset_s
     said = ["Too few parts to compare them."]
     if clock.change_p is not None:
         same = "The offset changes" if _changes(clock) else "One and the same offset fits"
@@ -124,10 +121,10 @@ def _parts(page: Page, clock: ClockOffset, document: Document) -> None:
         )
     said.append("Band: 95 % interval of the whole flight.")
     axes = page.panel("Offset of each part of the flight by itself (s)", " ".join(said), PARTS)
-    axes.axhspan(*(applied + end for end in clock.interval_s), color=OURS_BAND, lw=0)
+    axes.axhspan(*clock.interval_s, color=OURS_BAND, lw=0)
     ends = np.array([(part.start_s, part.end_s) for part in clock.parts])
     axes.errorbar(
-        ends.mean(axis=1), [applied + part.offset_s for part in clock.parts],
+        ends.mean(axis=1), [part.offset_s for part in clock.parts],
         xerr=np.diff(ends, axis=1)[:, 0] / 2.0, yerr=[1.96 * part.sigma_s for part in clock.parts],
         fmt="o", color=OURS, ms=4, lw=1.0, capsize=2,
     )  # fmt: skip

@@ -4,7 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from px4fuse.comparison.model import AgainstTruth, Difference, FilterSummary, UnjudgedFilter
+from px4fuse.comparison.model import (
+    FILTERS,
+    AgainstTruth,
+    Difference,
+    FilterSummary,
+    UnjudgedFilter,
+)
 from px4fuse.comparison.why_words import the
 from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.signals import AISLE
@@ -109,7 +115,7 @@ def _other_axes(page: Page, document: Document) -> None:
     rows = []
     for result in others:
         row: list[Cell] = [result.axis.name]
-        for name, colour in (("kf", OURS), ("ekf2", EKF2))[: 1 + beside]:
+        for name, colour in zip(FILTERS[: 1 + beside], (OURS, EKF2), strict=False):
             row += [(cell, colour) for cell in _cells(result.filters[name])[: len(names)]]
         rows.append([*row, difference_cells(result.difference)[0]] if beside else row)
     page.table(head, rows)
@@ -128,7 +134,7 @@ def facts(document: Document) -> list[tuple[str, str]]:
         f"{source.name}: {source.description}, {source.rate_hz:.1f} Hz, {source.frame}; "
         f"{comparison.source_reason}"
     )
-    if any(part.what == "position source vehicle_visual_odometry" for part in comparison.missing):
+    if any(part.source == "vehicle_visual_odometry" for part in comparison.missing):
         source_text += ". SDLOG_PROFILE 129 would have logged it as it arrived"
     clock = "" if source.alignment is None else source.clock
     if source.clock_map is not None:

@@ -68,7 +68,7 @@ PIECES = 1200
 # Axes of errors reach at least this far: rounding is no error to look at
 LEAST_SCALE_M = 1e-3
 # In points: heights of a panel, of the maps and of a legend, and between the maps
-HEIGHT, MAPS, LEGEND, GAP = 84.0, 190.0, 14.0, 26.0
+HEIGHT, MAPS, GAP = 78.0, 150.0, 16.0
 MOST_CURVES, MOST_BOXES = 3, 12
 TABLE_HEADS = (
     "error", "RMSE", "95 % interval", "mean", "median", "std", "max", "n", "rotation RMSE (°)",
@@ -187,7 +187,7 @@ def _maps(page: Page, score: Evaluation) -> None:
     width = (WIDTH - GAP * (len(parts) - 1)) / len(parts)
     columns = [Page(width=width) for _ in parts]
     panels = [
-        column.panel(head, "", MAPS, above=LEGEND, left=34.0)
+        column.panel(head, "", MAPS, left=34.0, right=34.0 if column is columns[-1] else 4.0)
         for column, (head, _) in zip(columns, parts, strict=True)
     ]
     after = panels[int(is_aligned) :]
@@ -196,8 +196,10 @@ def _maps(page: Page, score: Evaluation) -> None:
         _path(axes, score, view, scale)
     if is_aligned:
         _before(panels[0], score, seen[0])
-    for axes in panels[: 1 + is_aligned]:
-        legend_above(axes, handlelength=1.4)
+    entries = dict(zip(*after[0].get_legend_handles_labels()[::-1], strict=True))
+    if is_aligned:
+        entries = dict(zip(*panels[0].get_legend_handles_labels()[::-1], strict=True)) | entries
+    page.legend(list(entries.values()))
     for column, (_, text) in zip(columns, parts, strict=True):
         column.numbers(text)
     page.beside(*columns, gap=GAP)
@@ -269,21 +271,21 @@ def _panels(page: Page, score: Evaluation) -> None:
     """APE over time and over distance; RPE over time and per delta."""
     zero = zero_s(score)
     left, right = halves()
-    axes = left.panel("APE over time (m)", "", HEIGHT, above=LEGEND)
+    axes = left.panel("APE over time (m)", "", HEIGHT)
     _absolute(axes, score, score.time_s - zero)
     axes.set_xlabel(_time_label(score))
-    legend_above(axes, handlelength=1.4)
+    page.legend(axes.get_legend_handles_labels()[0])
     left.numbers(time_words(score))
-    axes = right.panel("APE over distance (m)", "", HEIGHT, above=LEGEND)
+    axes = right.panel("APE over distance (m)", "", HEIGHT)
     _absolute(axes, score, score.distance_m)
     axes.set_xlabel("distance along the reference (m)")
     right.numbers(distance_words(score))
     page.beside(left, right)
     left, right = halves()
-    axes = left.panel("RPE over time (m)", "", HEIGHT, above=LEGEND)
+    axes = left.panel("RPE over time (m)", "", HEIGHT, above=14.0)
     if shown := _relative(axes, score):
         left.numbers(relative_words(shown, score.time_s, zero))
-    axes = right.panel("RPE per delta (m)", "", HEIGHT, above=LEGEND)
+    axes = right.panel("RPE per delta (m)", "", HEIGHT, above=14.0)
     _boxes(axes, score)
     if any(isinstance(error.translation, Statistics) for error in score.rpe):
         right.numbers(growth_words(score.rpe))

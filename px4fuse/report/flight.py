@@ -8,7 +8,6 @@ import numpy as np
 import pandas as pd
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
@@ -79,16 +78,7 @@ def legend(page: Page, document: Document) -> None:
         lines.append(Line2D([], [], **EKF2_LINE, label="EKF2"))
     if isinstance(result.truth, pd.DataFrame):
         lines.append(Line2D([], [], **TRUTH_LINE, label="truth"))
-    rows = [row for row in (lines, marks.handles(document)) if row]
-    figure = Figure(figsize=(page.width / 72.0, 13.0 * len(rows) / 72.0))
-    for place, entries in enumerate(rows):
-        figure.legend(
-            handles=entries, loc="upper left", ncols=len(entries), borderaxespad=0.0,
-            borderpad=0.0, bbox_to_anchor=(0.0, 1.0 - place / len(rows)), handlelength=2.0,
-            columnspacing=1.2,
-        )  # fmt: skip
-    named = ", ".join(str(artist.get_label()) for row in rows for artist in row)
-    page.drawing(figure, f"Legend of all panels: {named}")
+    page.legend(lines, marks.handles(document))
 
 
 def error_reference(result: AxisComparison) -> pd.DataFrame | Unavailable:

@@ -44,7 +44,7 @@ STYLES: Mapping[str, dict[str, Any]] = {
     SOLUTIONS["all"]: {"color": "#8d6a9f", "lw": 0.9, "ls": (0, (2, 1))},
 }
 MAP_POINTS = 2000
-MAP, HEIGHT, LEGEND = 290.0, 130.0, 30.0  # of the axes, and of a legend, in points
+MAP, HEIGHT, LEGEND = 290.0, 105.0, 30.0  # of the axes, and of a legend, in points
 
 
 def draw(document: Document) -> Iterator[Page]:
@@ -169,10 +169,10 @@ def _along(page: Page, loop: Loop) -> None:
     scored = [name for name in (reference.name for reference in loop.references)
               if isinstance(loop.odometry.scores[name], Evaluation)]  # fmt: skip
     corrected = [part for part in shown(loop) if part is not loop.odometry]
-    every = []
+    every: list[Axes] = []
 
     def panel(title: str) -> Axes:
-        axes = page.panel(title, "", HEIGHT, above=LEGEND)
+        axes = page.panel(title, "", HEIGHT, above=4.0 if every else 14.0)
         axes.xaxis.set_major_locator(MaxNLocator(6))
         axes.set_xlim(0.0, loop.path_length_m)
         every.append(axes)

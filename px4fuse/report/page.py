@@ -10,6 +10,7 @@ import io
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
@@ -90,7 +91,7 @@ class Page:
 
     def panel(
         self, title: str, say: str, height: float, *, above: float = 4.0, left: float = AXIS_LEFT,
-        right: float = 2.0, below: float = 0.0,
+        right: float = 8.0, below: float = 0.0,
     ) -> Axes:  # fmt: skip
         """Axes of the column's width below a title and the sentence that says what to see.
 
@@ -115,6 +116,19 @@ class Page:
     def drawing(self, figure: Figure, alt: str) -> None:
         """A figure as it is, with the sentence that a screen reader gets."""
         self.blocks.append({"kind": "drawing", "figure": figure, "alt": alt})
+
+    def legend(self, *rows: Sequence[Artist]) -> None:
+        """Legend of several panels, a line for each row of entries."""
+        kept = [row for row in rows if row]
+        figure = Figure(figsize=(self.width / 72.0, 13.0 * len(kept) / 72.0))
+        for place, entries in enumerate(kept):
+            figure.legend(
+                handles=entries, loc="upper left", ncols=len(entries), borderaxespad=0.0,
+                borderpad=0.0, bbox_to_anchor=(0.0, 1.0 - place / len(kept)), handlelength=2.0,
+                columnspacing=1.2,
+            )  # fmt: skip
+        named = ", ".join(str(artist.get_label()) for row in kept for artist in row)
+        self.drawing(figure, f"Legend: {named}")
 
     def numbers(self, text: str) -> None:
         """Write the numbers of the panel above in small letters."""

@@ -42,6 +42,7 @@ from px4fuse.report.document import (
     who,
 )
 from px4fuse.report.page import Page, data, printable
+from px4fuse.report.seal import sealed
 from px4fuse.report.style import report_style
 
 Report = Document | LoopDocument | WhatIfDocument | EvaluationDocument | ChangesDocument
@@ -95,14 +96,20 @@ def render(document: Report, results_json: str) -> bytes:
         {
             "title": document.title,
             "author": made_by,
-            "head": printable(f"px4fuse · {name} · SHA-256 {sha256[:12]}"),
-            "student": printable(who(student, " · ")),
+            "head": _shortened(f"px4fuse · {name} · SHA-256 {sha256[:12]}", 90),
+            "student": _shortened(who(student, " · "), 40),
             "foot": made_by,
             "fonts": families,
             "blocks": blocks,
             "results": results_json,
         }
     )
+
+
+def _shortened(text: str, most: int) -> str:
+    """One line of so many letters at most."""
+    line = " ".join(printable(text).split())
+    return line if len(line) <= most else f"{line[: most - 1]}…"
 
 
 def compiled(report: Mapping[str, Any], template: str | None = None) -> bytes:
@@ -128,7 +135,7 @@ def compiled(report: Mapping[str, Any], template: str | None = None) -> bytes:
         )
         made = compiler.compile(format="pdf", pdf_standards=STANDARDS)
     assert isinstance(made, bytes)
-    return made
+    return sealed(made)
 
 
 @cache

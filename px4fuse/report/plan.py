@@ -54,10 +54,10 @@ def plan(document: Document, facts: Sequence[tuple[str, str]]) -> Page:
     page.heading("From above", 10.5)
     drawn = page if ratio >= LONG else Page(width=WIDE)
     height = _height(view, tracks) if ratio >= LONG else BESIDE
-    _map(drawn.panel("", "", height, above=16.0), document, view, tracks)
+    _map(drawn.panel("", "", height, above=16.0, left=36.0), document, view, tracks)
     beside = page if ratio >= LONG else Page(width=WIDTH - WIDE - 14.0)
     for label, text in facts:
-        beside.labelled(label, text, size=7.0, above=-2.0)
+        beside.labelled(label, text, size=7.0, above=-0.5)
     if drawn is not page:
         page.beside(drawn, beside)
     return page

@@ -153,10 +153,10 @@ def _layout(heading: str, sections: list[Section]) -> Iterator[Page]:
         for label, text in entries:
             if label:
                 page.labelled(
-                    label, text, size=SIZE, width=INDENT, above=-2.0, colour=MUTED, bold=False
+                    label, text, size=SIZE, width=INDENT, above=-1.0, colour=MUTED, bold=False
                 )
             else:
-                page.write(text, size=SIZE, above=-2.0)
+                page.write(text, size=SIZE, above=0.0)
     yield page
 
 

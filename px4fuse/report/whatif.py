@@ -21,7 +21,7 @@ from px4fuse.report.style import EKF2_BAND, EKF2_LINE, MUTED, OURS_LINE
 from px4fuse.report.why import agreement_words
 
 SIZE = 8.0
-PANEL_POINTS = 120.0
+PANEL_POINTS = 80.0
 MAX_TICKS = 10
 WIDE = 5.0  # values that span more are drawn on a logarithmic scale
 

@@ -36,7 +36,7 @@ LEAD = (
 )
 ROW_POINTS = 12.0
 AROUND = 42.0  # points above and below the bars
-LABELS, GAP = 0.215, 0.04  # of the width: names of the steps, and between both
+LABELS, GAP = 0.25, 0.04  # of the width: names of the steps, and between both
 TIME_POINTS = 105.0
 
 
@@ -106,7 +106,7 @@ def _axis(page: Page, name: str, why: Why, document: Document) -> None:
     names = [step.name for step in why.steps]
     height = ROW_POINTS * (len(names) + 2) + AROUND
     figure = Figure(figsize=(page.width / 72.0, height / 72.0))
-    share = (1.0 - LABELS - GAP) / 2.0
+    share = (0.985 - LABELS - GAP) / 2.0
     for column, (what, unit, total, steps, left) in enumerate(
         (
             (
