@@ -22,8 +22,8 @@ if _typing.TYPE_CHECKING:
     from px4fuse.filter.clock import ClockOffset as ClockOffset
     from px4fuse.filter.consistency import Consistency as Consistency
     from px4fuse.filter.consistency import assess as assess
-    from px4fuse.filter.kalman import Settings as Settings
     from px4fuse.filter.kalman import replay as replay
+    from px4fuse.filter.settings import Settings as Settings
     from px4fuse.filter.tuning import AxisTuning as AxisTuning
     from px4fuse.filter.tuning import tune as tune
     from px4fuse.findings import Finding as Finding
@@ -63,7 +63,7 @@ _HOMES = {
     "Model": "ekf2.model",
     "PositionFile": "request",
     "Px4FuseError": "errors",
-    "Settings": "filter.kalman",
+    "Settings": "filter.settings",
     "Trajectory": "trajectory.model",
     "Unavailable": "flight",
     "WhatIf": "ekf2.whatif",

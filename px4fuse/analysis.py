@@ -40,8 +40,8 @@ from px4fuse.errors import LogError, MissingDataError, SettingsError
 from px4fuse.filter.causes import AFTER_STEP_S, Explained, explained
 from px4fuse.filter.clock import ClockOffset
 from px4fuse.filter.heading import HeadingError
-from px4fuse.filter.kalman import Settings
 from px4fuse.filter.motion import Made
+from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import AISLE, Axis
 from px4fuse.filter.smoothing import Smoothing, smoothing
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning

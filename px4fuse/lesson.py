@@ -9,7 +9,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from px4fuse.filter.kalman import InitialState, Replay, Settings, replay
+from px4fuse.filter.kalman import Replay, replay
+from px4fuse.filter.settings import InitialState, Settings
 from px4fuse.filter.signals import Axis
 from px4fuse.flight import Unavailable
 from px4fuse.loop.closure import distribute_by_distance

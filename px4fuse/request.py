@@ -80,7 +80,7 @@ class ComparisonRequest(_Asked, frozen=True, kw_only=True, tag_field="command", 
     position_source : str or None
         Name of a track of the flight; None for the best.
     sigma_a_m_s2, sigma_z_m, dt_s : float
-        As :class:`px4fuse.filter.kalman.Settings`.
+        As :class:`px4fuse.filter.settings.Settings`.
     input : {"imu", "zero"} or None
         None: the IMU where it is logged.
     axes : tuple of str

@@ -13,7 +13,7 @@ from px4fuse.analysis import Analysis
 from px4fuse.filter.causes import Explained, Jump
 from px4fuse.filter.clock import ClockOffset, PartOffset
 from px4fuse.filter.hypotheses import Estimate
-from px4fuse.filter.kalman import Settings
+from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Segment
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise
 from px4fuse.findings import Finding

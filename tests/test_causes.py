@@ -12,7 +12,7 @@ from test_scoring import checked
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.model import Comparison
 from px4fuse.filter.consistency import Consistency
-from px4fuse.filter.kalman import Settings
+from px4fuse.filter.settings import Settings
 from px4fuse.filter.tuning import Noise
 from px4fuse.findings import Finding, find, phrases
 from px4fuse.findings.causes import CONSEQUENCES, NOISES, RECORDING, by_cause

@@ -30,9 +30,9 @@ from px4fuse.filter.clock import (
     estimate_clock_offset,
 )
 from px4fuse.filter.fitting import Noises
-from px4fuse.filter.kalman import Settings
 from px4fuse.filter.likelihood import PROFILE_DROP, profile_interval
 from px4fuse.filter.motion import CONSTANT_SIGMA, START_PRECISION, STEP_S, _signals, motion
+from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Segment
 from px4fuse.flight import (
     ANGULAR_RATE_COLUMNS,

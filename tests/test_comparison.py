@@ -16,7 +16,8 @@ from px4fuse.comparison.model import AxisComparison, Comparison, Difference, Fil
 from px4fuse.comparison.preparation import prepare
 from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.filter.consistency import Consistency
-from px4fuse.filter.kalman import Settings, variance_at
+from px4fuse.filter.kalman import variance_at
+from px4fuse.filter.settings import Settings
 from px4fuse.flight import Ekf2, Flight, Reset, Truth, Unavailable
 from px4fuse.readers import read_log
 

@@ -29,7 +29,7 @@ from px4fuse.ekf2.model import replay_settings
 from px4fuse.ekf2.whatif import what_if
 from px4fuse.explore.page import html_text
 from px4fuse.filter.consistency import Consistency
-from px4fuse.filter.kalman import Settings
+from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import within
 from px4fuse.findings import find
 from px4fuse.flight import Flight, Unavailable

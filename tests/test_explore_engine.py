@@ -20,7 +20,8 @@ from px4fuse.comparison.model import Comparison
 from px4fuse.comparison.preparation import shift_clock
 from px4fuse.explore.data import OFFSET_REACH_S, raw_source, signals_of
 from px4fuse.explore.packing import FINE, Packer
-from px4fuse.filter.kalman import Replay, Settings, replay, state_at
+from px4fuse.filter.kalman import Replay, replay, state_at
+from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import make_axes
 from px4fuse.readers import read_log
 

@@ -25,7 +25,7 @@ from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.model import Comparison
 from px4fuse.ekf2.model import MODEL_NOTE
 from px4fuse.filter.consistency import MIN_INNOVATIONS
-from px4fuse.filter.kalman import Settings
+from px4fuse.filter.settings import Settings
 from px4fuse.findings import DETECTORS, SEVERITIES, Finding, find, phrases
 from px4fuse.flight import (
     AXIS_NAMES,

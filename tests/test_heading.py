@@ -15,7 +15,7 @@ from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.preparation import choose_segment, choose_source
 from px4fuse.filter import heading
 from px4fuse.filter.heading import DRIFT_P, HeadingError, HeadingPart, heading_error
-from px4fuse.filter.kalman import Settings
+from px4fuse.filter.settings import Settings
 from px4fuse.findings import Finding, source_frame_turned
 from px4fuse.flight import QUATERNION_COLUMNS, ROTATION_VARIANCE_COLUMNS, Flight, Unavailable
 from px4fuse.readers import read_log

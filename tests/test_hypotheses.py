@@ -20,8 +20,9 @@ from px4fuse.comparison.estimates import tuned_horizontally
 from px4fuse.filter import hypotheses
 from px4fuse.filter.causes import Explained, explained
 from px4fuse.filter.hypotheses import Fit, Signals, Whitened, fit, gains, respond
-from px4fuse.filter.kalman import Settings, replay
+from px4fuse.filter.kalman import replay
 from px4fuse.filter.likelihood import preintegrate
+from px4fuse.filter.settings import Settings
 from px4fuse.filter.smoothing import Smoothing, smoothing
 from px4fuse.findings import (
     Finding,

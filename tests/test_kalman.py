@@ -16,15 +16,9 @@ from hypothesis import strategies as st
 
 from px4fuse.comparison.preparation import choose_segment, choose_source
 from px4fuse.errors import SettingsError
-from px4fuse.filter.kalman import (
-    InitialState,
-    Replay,
-    Settings,
-    replay,
-    state_at,
-    variance_at,
-)
+from px4fuse.filter.kalman import Replay, replay, state_at, variance_at
 from px4fuse.filter.model import H, matrix, noise
+from px4fuse.filter.settings import InitialState, Settings
 from px4fuse.filter.signals import Axis, make_axes
 from px4fuse.flight import Flight
 

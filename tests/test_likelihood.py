@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.stats import norm
 from test_kalman import any_axis, any_settings, sample_axes
 
-from px4fuse.filter.kalman import Settings, replay
+from px4fuse.filter.kalman import replay
 from px4fuse.filter.likelihood import (
     innovations,
     parabola_vertex,
@@ -21,6 +21,7 @@ from px4fuse.filter.likelihood import (
     states,
     total_over_grid,
 )
+from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Axis
 from px4fuse.flight import Flight
 

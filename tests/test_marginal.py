@@ -31,7 +31,6 @@ from px4fuse.filter.fitting import (
     negative_log_likelihood,
     widened_by_outliers,
 )
-from px4fuse.filter.kalman import Settings
 from px4fuse.filter.lanes import gains, lanes_of_paths
 from px4fuse.filter.likelihood import (
     PROFILE_DROP,
@@ -48,6 +47,7 @@ from px4fuse.filter.marginal import (
     squares,
 )
 from px4fuse.filter.model import noise_of_many_steps
+from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Axis
 
 seeds = st.integers(0, 2**32 - 1)

@@ -50,7 +50,8 @@ from test_bad_logs import patience
 from px4fuse.comparison.comparison import compare
 from px4fuse.contents.inventory import take_inventory
 from px4fuse.errors import LogError, MissingDataError, Px4FuseError, SettingsError
-from px4fuse.filter.kalman import Settings, state_at
+from px4fuse.filter.kalman import state_at
+from px4fuse.filter.settings import Settings
 from px4fuse.findings import find
 from px4fuse.flight import (
     ANGULAR_RATE_COLUMNS,

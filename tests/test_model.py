@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from px4fuse.filter import model
-from px4fuse.filter.kalman import InitialState
 from px4fuse.filter.likelihood import Preintegrated, recursion
+from px4fuse.filter.settings import InitialState
 
 P = (0.5, -0.2, 0.7)
 

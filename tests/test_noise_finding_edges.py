@@ -29,7 +29,7 @@ from test_finding_edges import against_truth, axis, hiding, severity, statement
 from px4fuse.comparison.model import Difference
 from px4fuse.comparison.why import Why
 from px4fuse.comparison.why_words import STAMPS_WRONG
-from px4fuse.filter.kalman import Settings
+from px4fuse.filter.settings import Settings
 from px4fuse.filter.tuning import HeldOut, Noise
 from px4fuse.findings import (
     loop_closures,

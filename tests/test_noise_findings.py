@@ -12,7 +12,7 @@ from flights import unexplained
 from px4fuse.analysis import Analysis, explain
 from px4fuse.comparison.comparison import compare
 from px4fuse.filter.clock import ClockOffset
-from px4fuse.filter.kalman import Settings
+from px4fuse.filter.settings import Settings
 from px4fuse.findings import (
     Finding,
     ekf2_ev_delay_wrong,

@@ -16,7 +16,7 @@ from px4fuse.comparison.model import AgainstTruth, Comparison
 from px4fuse.comparison.remedy import filter_words
 from px4fuse.ekf2.model import Model
 from px4fuse.ekf2.whatif import what_if
-from px4fuse.filter.kalman import Settings
+from px4fuse.filter.settings import Settings
 from px4fuse.findings import Finding, find
 from px4fuse.flight import Unavailable
 from px4fuse.readers import read_log

@@ -18,8 +18,8 @@ from matplotlib import font_manager
 from pypdf import PdfReader
 
 from px4fuse.filter.clock import ClockOffset, PartOffset
-from px4fuse.filter.kalman import Settings
 from px4fuse.filter.likelihood import preintegrate, states
+from px4fuse.filter.settings import Settings
 from px4fuse.flight import Unavailable
 from px4fuse.report import clock, fonts, notes
 from px4fuse.report.document import Document

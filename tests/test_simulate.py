@@ -17,8 +17,8 @@ from px4fuse.cli import cli, main
 from px4fuse.comparison.comparison import compare
 from px4fuse.errors import SettingsError
 from px4fuse.filter.consistency import nis_band
-from px4fuse.filter.kalman import Settings
 from px4fuse.filter.likelihood import innovations, preintegrate
+from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Segment, make_axes, project_acceleration, step_means
 from px4fuse.findings import find
 from px4fuse.flight import POSITION_COLUMNS, Truth, Unavailable

@@ -19,7 +19,7 @@ from px4fuse.ekf2.replay import Agreement, Ekf2Replay
 from px4fuse.ekf2.whatif import WhatIf, what_if
 from px4fuse.errors import SettingsError
 from px4fuse.filter.consistency import nis_band
-from px4fuse.filter.kalman import Settings
+from px4fuse.filter.settings import Settings
 from px4fuse.findings import find
 from px4fuse.findings.ekf2_ev_delay_wrong import DETECTOR as DELAY
 from px4fuse.flight import Ekf2, Flight, FusionRecord, Truth, Unavailable

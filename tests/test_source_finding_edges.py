@@ -32,7 +32,7 @@ from findings_tools import (
 from px4fuse.ekf2.model import Model
 from px4fuse.filter.causes import Explained
 from px4fuse.filter.hypotheses import Estimate
-from px4fuse.filter.kalman import Settings
+from px4fuse.filter.settings import Settings
 from px4fuse.filter.smoothing import Smoothing
 from px4fuse.filter.tuning import Noise
 from px4fuse.findings import (

@@ -11,7 +11,7 @@ from flights import Estimator, Uwb, aisle_flight, motion, unexplained, with_nois
 
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.model import Comparison
-from px4fuse.filter.kalman import Settings
+from px4fuse.filter.settings import Settings
 from px4fuse.findings import find
 from px4fuse.findings.model import Finding, moments, off_spans
 from px4fuse.findings.story import MOST_SENTENCES, story

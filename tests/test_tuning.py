@@ -18,8 +18,8 @@ from test_clock import SETTINGS, made_flight
 from px4fuse.arrays import Array
 from px4fuse.comparison.comparison import compare
 from px4fuse.filter.consistency import Consistency
-from px4fuse.filter.kalman import Settings
 from px4fuse.filter.likelihood import PROFILE_DROP, innovations, preintegrate
+from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Axis
 from px4fuse.filter.tuning import (
     HORIZONTAL,

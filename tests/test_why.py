@@ -17,7 +17,8 @@ from px4fuse.comparison.why_words import STAMPS_WRONG
 from px4fuse.ekf2.model import Model
 from px4fuse.ekf2.walk import SAMPLES, STEPS
 from px4fuse.filter.clock import ClockOffset
-from px4fuse.filter.kalman import Settings, state_at
+from px4fuse.filter.kalman import state_at
+from px4fuse.filter.settings import Settings
 from px4fuse.findings.story import story
 from px4fuse.flight import Flight, Unavailable
 from px4fuse.readers import read_log

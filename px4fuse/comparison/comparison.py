@@ -31,7 +31,8 @@ from px4fuse.comparison.projection import (
     project_variance,
 )
 from px4fuse.filter.consistency import GATE_SIGMA, HorizontalNis, assess, assess_horizontal
-from px4fuse.filter.kalman import Replay, Settings, replay_all, state_at, variance_at
+from px4fuse.filter.kalman import Replay, replay, state_at, variance_at
+from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Segment
 from px4fuse.flight import Ekf2, Flight, PositionTrack, Unavailable, sample_rate
 
@@ -89,7 +90,7 @@ def compare_prepared(
     progress(", ".join(line.name for line in prepared.lines))
     axes = {
         run.axis.name: _compare_axis(flight, ekf2, track, segment, run)
-        for run in replay_all(prepared.lines, prepared.settings)
+        for run in (replay(line, prepared.settings) for line in prepared.lines)
     }
     both: dict[FilterName, HorizontalNis | None] = {
         "kf": _horizontal({name: axis.replay.updates for name, axis in axes.items()}),

@@ -11,7 +11,8 @@ import pandas as pd
 from px4fuse.display import Shown
 from px4fuse.errors import MissingDataError
 from px4fuse.filter.consistency import Consistency, HorizontalNis
-from px4fuse.filter.kalman import Replay, Settings
+from px4fuse.filter.kalman import Replay
+from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import AISLE, Axis, Segment
 from px4fuse.flight import Flight, PositionTrack
 from px4fuse.record import (

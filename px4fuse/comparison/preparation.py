@@ -9,7 +9,7 @@ import pandas as pd
 
 from px4fuse.comparison.model import Comparison
 from px4fuse.errors import MissingDataError, SettingsError
-from px4fuse.filter.kalman import Settings
+from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import MIN_MEASUREMENTS, Segment, make_axes
 from px4fuse.flight import Flight, PositionTrack, Truth, Unavailable
 

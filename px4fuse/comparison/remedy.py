@@ -15,7 +15,8 @@ from px4fuse.comparison.model import AgainstTruth, Comparison
 from px4fuse.ekf2.model import Model
 from px4fuse.ekf2.parameters import PARAMETERS
 from px4fuse.ekf2.whatif import Summary, what_if
-from px4fuse.filter.kalman import Settings, replay_all
+from px4fuse.filter.kalman import replay
+from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import AISLE
 from px4fuse.flight import Unavailable
 from px4fuse.plain import capital
@@ -133,7 +134,7 @@ def filter_errors_m(comparison: Comparison, changed: Settings) -> tuple[float, f
     results = [r for r in comparison.axes.values() if r.axis.name != AISLE or names == {AISLE}]
     before = [result.filters["kf"].truth for result in results]
     if changed.clock_offset_s == comparison.settings.clock_offset_s:
-        runs = replay_all(tuple(result.axis for result in results), changed)
+        runs = [replay(result.axis, changed) for result in results]
         after = []
         for result, run in zip(results, runs, strict=True):
             state = result.ekf2_state

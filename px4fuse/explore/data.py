@@ -20,14 +20,14 @@ from px4fuse.comparison.preparation import choose_source
 from px4fuse.explore.ekf2_grid import grid_data, judged_numbers
 from px4fuse.explore.packing import COARSE, Packer
 from px4fuse.filter.consistency import CONFIDENCE, nis_band
-from px4fuse.filter.kalman import (
+from px4fuse.filter.model import INITIAL_COVARIANCE
+from px4fuse.filter.settings import (
     CLOCK_OFFSET_RANGE_S,
     DT_RANGE_S,
     SIGMA_A_RANGE_M_S2,
     SIGMA_Z_RANGE_M,
     Settings,
 )
-from px4fuse.filter.model import INITIAL_COVARIANCE
 from px4fuse.filter.signals import AISLE, Acceleration, Axis, along, imu_gaps, within
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.findings.model import Finding

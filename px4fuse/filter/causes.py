@@ -28,8 +28,8 @@ from px4fuse.filter.hypotheses import (
     steps,
     too_few,
 )
-from px4fuse.filter.kalman import Settings
 from px4fuse.filter.likelihood import parabola_vertex
+from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Axis, Segment
 from px4fuse.flight import Flight, Unavailable
 

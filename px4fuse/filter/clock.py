@@ -32,11 +32,11 @@ from px4fuse.filter.fitting import (
     most_likely,
     over_sigma_z,
 )
-from px4fuse.filter.kalman import Settings
 from px4fuse.filter.lanes import gains, lanes_of_paths
 from px4fuse.filter.likelihood import PROFILE_DROP, parabola_vertex, profile_interval
 from px4fuse.filter.marginal import Fitted, Positions, centred, paired_products
 from px4fuse.filter.motion import CONSTANT_SIGMA, SEARCH_S, Made, Motion, motion
+from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Segment, within
 from px4fuse.flight import POSITION_COLUMNS, Flight, PositionTrack, Unavailable
 from px4fuse.record import Count, NotNegative, Record, Share, Span

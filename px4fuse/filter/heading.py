@@ -22,9 +22,9 @@ from scipy.spatial.transform import Rotation
 from scipy.special import chdtrc
 
 from px4fuse.arrays import Array, cumulative_integral
-from px4fuse.filter.kalman import Settings
 from px4fuse.filter.model import INITIAL_SIGMA_P_M, INITIAL_SIGMA_V_M_S, noise_of_many_steps
 from px4fuse.filter.motion import MAX_IMU_INTERVAL_S
+from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import IMU_GAP_S, Segment, ned_acceleration, within
 from px4fuse.flight import (
     POSITION_COLUMNS,

@@ -25,9 +25,9 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.spatial.transform import Rotation
 
 from px4fuse.arrays import Array, BoolArray, IntArray
-from px4fuse.filter.driven import driven
-from px4fuse.filter.kalman import Settings, Timeline, timeline
+from px4fuse.filter.banded import driven
 from px4fuse.filter.likelihood import Preintegrated, moved, preintegrate, recursion
+from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import (
     Acceleration,
     Axis,
@@ -36,6 +36,7 @@ from px4fuse.filter.signals import (
     project_acceleration,
     step_means,
 )
+from px4fuse.filter.steps import Timeline, timeline
 from px4fuse.flight import AXIS_NAMES, QUATERNION_COLUMNS, Flight, Unavailable
 
 MIN_MEASUREMENTS = 50

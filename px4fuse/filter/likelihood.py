@@ -18,9 +18,10 @@ from scipy.optimize import brentq
 from scipy.special import chdtri
 
 from px4fuse.arrays import Array, BoolArray, IntArray
-from px4fuse.filter.kalman import InitialState, Settings, Timeline, timeline
 from px4fuse.filter.model import INITIAL_COVARIANCE, Symmetric, move, noise, spread
+from px4fuse.filter.settings import InitialState, Settings
 from px4fuse.filter.signals import Axis
+from px4fuse.filter.steps import Timeline, timeline
 
 # Half of the 95 % point of chi-square: the drop of log-likelihood that bounds an interval
 PROFILE_DROP = float(chdtri(1, 0.05)) / 2.0

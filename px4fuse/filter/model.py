@@ -39,6 +39,16 @@ def matrix(covariance: Symmetric[float]) -> Array:
     return np.array([[p00, p01], [p01, p11]])
 
 
+def transition(dt_s: float) -> Array:
+    """F, shape (2, 2)."""
+    return np.array([[1.0, dt_s], [0.0, 1.0]])
+
+
+def input_matrix(dt_s: float) -> Array:
+    """B, shape (2, 1)."""
+    return np.array([[dt_s**2 / 2.0], [dt_s]])
+
+
 def noise(dt_s: T) -> Symmetric[T]:
     """Q(dt) over SIGMA_A² · DT, by element: what one step adds."""
     return dt_s**3 / 4.0, dt_s**2 / 2.0, dt_s

@@ -15,8 +15,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from px4fuse.arrays import Array, BoolArray
-from px4fuse.filter.kalman import Settings
 from px4fuse.filter.likelihood import innovations, preintegrate
+from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Axis
 from px4fuse.flight import Unavailable
 

@@ -31,7 +31,6 @@ from px4fuse.filter.fitting import (
     fitted,
     most_likely,
 )
-from px4fuse.filter.kalman import Settings
 from px4fuse.filter.likelihood import (
     Preintegrated,
     innovations,
@@ -41,6 +40,7 @@ from px4fuse.filter.likelihood import (
 )
 from px4fuse.filter.marginal import centred
 from px4fuse.filter.motion import SEARCH_S, Made, motion
+from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Axis
 from px4fuse.flight import Flight, Unavailable
 from px4fuse.record import Count, Maybe, NotNegative, Record

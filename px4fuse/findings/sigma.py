@@ -16,7 +16,7 @@ from msgspec import structs
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.drift import may_drift
 from px4fuse.comparison.remedy import filter_words
-from px4fuse.filter.kalman import Settings
+from px4fuse.filter.settings import Settings
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise
 from px4fuse.findings.errors_larger_than_claimed import hidden_errors
 from px4fuse.findings.model import Detector, Finding, Found, Severity, Threshold, lowered

@@ -23,7 +23,8 @@ from px4fuse.comparison.model import (
 )
 from px4fuse.comparison.why import Why
 from px4fuse.comparison.why_words import STAMPS_WRONG, the
-from px4fuse.filter.kalman import Settings, state_at
+from px4fuse.filter.kalman import state_at
+from px4fuse.filter.settings import Settings
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise
 from px4fuse.findings.errors_larger_than_claimed import hidden_errors
 from px4fuse.findings.model import Finding

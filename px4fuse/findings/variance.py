@@ -20,7 +20,7 @@ from px4fuse.comparison.remedy import (
 from px4fuse.ekf2.parameters import PARAMETERS
 from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.fitting import SIGMA_Z_SEARCH_M
-from px4fuse.filter.kalman import Settings
+from px4fuse.filter.settings import Settings
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.findings.causes import CAUSE, ELSEWHERE, NOISE, OUTLIERS
 from px4fuse.findings.errors_larger_than_claimed import hidden_errors

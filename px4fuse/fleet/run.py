@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import pandas as pd
 
 from px4fuse.errors import OutputError, Px4FuseError, SettingsError
-from px4fuse.filter.kalman import Settings
+from px4fuse.filter.settings import Settings
 from px4fuse.fleet import TIMEOUT_S
 from px4fuse.fleet.engine import Failed, connected, outcomes
 from px4fuse.fleet.job import Job, Outcome, analyse, file_stem, identify, refused

@@ -19,7 +19,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from px4fuse.assignment.key import AnswerKey
 from px4fuse.assignment.key import folded as folded_id
-from px4fuse.filter.kalman import Settings
+from px4fuse.filter.settings import Settings
 from px4fuse.filter.tuning import HORIZONTAL, HeldOut, Tuned
 from px4fuse.grading.folding import folded
 from px4fuse.grading.model import Graded

@@ -11,7 +11,7 @@ from px4fuse.ekf2 import whatif
 from px4fuse.ekf2.model import Model, open_model
 from px4fuse.ekf2.whatif import WhatIf
 from px4fuse.errors import MissingDataError, SettingsError
-from px4fuse.filter.kalman import Settings
+from px4fuse.filter.settings import Settings
 from px4fuse.flight import Flight, Unavailable
 from px4fuse.loop.analysis import analyse
 from px4fuse.loop.loop import Loop

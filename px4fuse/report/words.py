@@ -11,7 +11,7 @@ from px4fuse.comparison.drift import may_drift
 from px4fuse.comparison.model import AgainstTruth, Comparison, Difference
 from px4fuse.filter.clock import CHANGE_P, ClockOffset
 from px4fuse.filter.consistency import Consistency
-from px4fuse.filter.kalman import Settings
+from px4fuse.filter.settings import Settings
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.findings import Finding
 from px4fuse.findings.source_clock import typed_offset_s

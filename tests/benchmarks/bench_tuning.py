@@ -37,8 +37,9 @@ def main() -> None:
     import test_clock
 
     from px4fuse.comparison.comparison import compare
-    from px4fuse.filter.kalman import Settings, replay
+    from px4fuse.filter.kalman import replay
     from px4fuse.filter.likelihood import preintegrate, total_over_grid
+    from px4fuse.filter.settings import Settings
     from px4fuse.filter.tuning import HORIZONTAL, tune
     from px4fuse.readers import read_log
 

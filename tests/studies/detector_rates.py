@@ -26,7 +26,7 @@ from px4fuse.analysis import Analysis
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.estimates import clock_offset, tuned_horizontally, turned_frame
 from px4fuse.ekf2.model import open_model
-from px4fuse.filter.kalman import Settings
+from px4fuse.filter.settings import Settings
 from px4fuse.findings import DETECTORS, find, find_loop
 from px4fuse.flight import Flight, Unavailable
 from px4fuse.loop.analysis import analyse, loop_in

@@ -26,7 +26,7 @@ from scipy.stats import binomtest
 
 from px4fuse.analysis import explain
 from px4fuse.comparison.comparison import compare
-from px4fuse.filter.kalman import Settings
+from px4fuse.filter.settings import Settings
 from px4fuse.fleet.changes import number_changes
 from px4fuse.fleet.measures import Z95, Number, numbers
 from px4fuse.fleet.significance import SPREAD_TABLE

@@ -1,0 +1,70 @@
+"""What the user may turn: the settings of the filter, with their ranges."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import get_args
+
+from px4fuse.errors import SettingsError
+from px4fuse.request import InputName
+
+INPUT_NAMES: tuple[InputName, ...] = get_args(InputName)
+
+# Ranges outside which a setting is a slip of the keyboard, not a choice.
+SIGMA_A_RANGE_M_S2 = (1e-4, 100.0)
+SIGMA_Z_RANGE_M = (1e-4, 100.0)
+DT_RANGE_S = (1e-3, 1.0)
+CLOCK_OFFSET_RANGE_S = (-10.0, 10.0)
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What the user may turn.
+
+    Attributes
+    ----------
+    sigma_a_m_s2 : float
+        Process noise SIGMA_A, standard deviation of the acceleration input over one DT.
+    sigma_z_m : float
+        Measurement noise SIGMA_Z.
+    dt_s : float
+        Prediction grid DT.
+    input : {"imu", "zero"}
+        Acceleration measured by the IMU, or the lesson's constant-velocity case.
+    clock_offset_s : float
+        Added to the position source's time stamps.
+
+    Raises
+    ------
+    SettingsError
+        A value is outside its documented range, or not a number.
+    """
+
+    sigma_a_m_s2: float = 0.5
+    sigma_z_m: float = 0.10
+    dt_s: float = 0.1
+    input: InputName = "imu"
+    clock_offset_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name, value, (low, high), unit in (
+            ("sigma_a_m_s2", self.sigma_a_m_s2, SIGMA_A_RANGE_M_S2, "m/s²"),
+            ("sigma_z_m", self.sigma_z_m, SIGMA_Z_RANGE_M, "m"),
+            ("dt_s", self.dt_s, DT_RANGE_S, "s"),
+            ("clock_offset_s", self.clock_offset_s, CLOCK_OFFSET_RANGE_S, "s"),
+        ):
+            if not low <= value <= high:  # false for NaN too
+                raise SettingsError(
+                    f"`{name}` {value:g} is out of range: give {low:g} to {high:g} {unit}."
+                )
+        if self.input not in INPUT_NAMES:
+            raise SettingsError(f"`input` {self.input}: give {' or '.join(INPUT_NAMES)}.")
+
+
+@dataclass(frozen=True)
+class InitialState:
+    """Where the filter starts: time (s), position (m) and velocity (m/s), with the lesson's P₀."""
+
+    time_s: float
+    position_m: float
+    velocity_m_s: float = 0.0

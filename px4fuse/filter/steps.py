@@ -1,0 +1,85 @@
+"""The filter's steps: the DT grid, every measurement's own time, and the input of each step."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from px4fuse.arrays import Array, IntArray
+from px4fuse.errors import SettingsError
+from px4fuse.filter.settings import InitialState, Settings
+from px4fuse.filter.signals import Axis, step_means
+from px4fuse.flight import Unavailable
+
+# Two times closer than this are one step: stamps have a resolution of one microsecond.
+SAME_TIME_S = 5e-7
+
+
+@dataclass(frozen=True)
+class Timeline:
+    """The filter's steps: the DT grid and every measurement's own time.
+
+    Attributes
+    ----------
+    time_s : ndarray, shape (n,)
+        Strictly increasing; the first is the initial state's.
+    measurement : ndarray of int, shape (n,)
+        Index of the measurement at that time, -1 where there is none.
+    acceleration_m_s2 : ndarray, shape (n - 1,)
+        Input of each step.
+    input_variance_m2_s4 : ndarray, shape (n - 1,)
+        Added to SIGMA_A² where the IMU has a gap.
+    """
+
+    time_s: Array
+    measurement: IntArray
+    acceleration_m_s2: Array
+    input_variance_m2_s4: Array
+    input_gap_s: float
+
+
+def timeline(axis: Axis, settings: Settings, initial: InitialState | None = None) -> Timeline:
+    """Lay out the filter's steps.
+
+    Raises
+    ------
+    SettingsError
+        ``settings.input`` is "imu" and the axis has no acceleration, or no measurement follows
+        the start.
+    """
+    first = axis.measurement_time_s[0] if initial is None else initial.time_s
+    usable = axis.measurement_time_s > first + SAME_TIME_S
+    measured = axis.measurement_time_s[usable]
+    if not len(measured):
+        raise SettingsError(f"axis {axis.name}: no measurement after the start at {first:.2f} s.")
+    count = int(np.floor((measured[-1] - first) / settings.dt_s + 1e-9)) + 1
+    grid = first + settings.dt_s * np.arange(count)
+    # a grid time that coincides with a measurement gives way to the measurement's own stamp
+    nearest = measured[np.clip(np.searchsorted(measured, grid), 0, len(measured) - 1)]
+    before = measured[np.clip(np.searchsorted(measured, grid) - 1, 0, len(measured) - 1)]
+    distance = np.minimum(np.abs(nearest - grid), np.abs(before - grid))
+    time = np.union1d(grid[distance > SAME_TIME_S], measured)
+    if time[0] > first + SAME_TIME_S:
+        time = np.concatenate([[first], time])
+    measurement = np.full(len(time), -1, dtype=np.intp)
+    measurement[np.searchsorted(time, measured)] = np.flatnonzero(usable)
+    steps = len(time) - 1
+    if settings.input == "zero":
+        return Timeline(time, measurement, np.zeros(steps), np.zeros(steps), 0.0)
+    if isinstance(axis.acceleration, Unavailable):
+        raise SettingsError(f"`input` imu needs an acceleration. {axis.acceleration}")
+    mean, gap = step_means(axis.acceleration, time)
+    gap_s = gap * np.diff(time)
+    # Unknown acceleration persists through a gap: after T seconds it has moved the velocity by
+    # rms·T, not by the rms·√(DT·T) of white noise, so its variance is scaled by T/DT.
+    leg = np.searchsorted(np.flatnonzero(measurement >= 0), np.arange(1, len(time)))
+    gap_of_leg = np.bincount(leg, weights=gap_s)[leg]
+    persistence = np.maximum(gap_of_leg / settings.dt_s, 1.0)
+    return Timeline(
+        time,
+        measurement,
+        mean,
+        gap * persistence * axis.acceleration.rms_m_s2**2,
+        float(np.sum(gap_s)),
+    )
