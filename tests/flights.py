@@ -9,10 +9,11 @@ say, and innovations whose NIS is what the test wants.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
+from exchange import replace
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
@@ -131,7 +132,7 @@ def aisle_flight(
         log=LogInfo(
             name="aisle.ulg",
             sha256="0" * 64,
-            size_bytes=1,
+            bytes=1,
             format="ULog",
             firmware="PX4 v1.16.1",
             firmware_hash="unknown",
@@ -328,8 +329,9 @@ def random_walk(
 def unexplained(comparison: Comparison) -> Analysis:
     """Make an analysis that knows nothing but the comparison."""
     return Analysis(
-        comparison, {}, unavailable("clock offset"), unavailable("EKF2 replay"), {},
-        unavailable("loop closure"), unavailable("heading error"),
+        **vars(comparison), tuning={}, clock=unavailable("clock offset"),
+        ekf2_model=unavailable("EKF2 replay"), why={}, loop=unavailable("loop closure"),
+        heading=unavailable("heading error"),
     )  # fmt: skip
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ import flights
 import numpy as np
 import pandas as pd
 import pytest
+from exchange import replace
 from flights import Estimator, Imu, Span, Uwb, aisle_flight, table, unavailable
 from hypothesis import given, settings
 from hypothesis import strategies as st

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
 import pytest
+from exchange import replace
 from flights import aisle_flight, table, unavailable
 from numpy.typing import NDArray
 from scipy.integrate import cumulative_trapezoid

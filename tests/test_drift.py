@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
+from exchange import replace
 from flights import Estimator, Uwb, aisle_flight
 from test_findings import as_odometry
 
@@ -21,8 +20,10 @@ def clock(*offsets: float, sigma_s: float = 0.02, change_p: float | None = 1e-7)
     middle = float(np.mean(offsets))
     curve = np.array([0.0])
     return ClockOffset(
-        middle, (middle - 0.02, middle + 0.02), 0.01, True, "", curve, curve, 1.92, parts, 100.0,
-        50.0, change_p, 0.2, 0.01, 3000,
+        offset_s=middle, interval_s=(middle - 0.02, middle + 0.02), sigma_s=0.01, applied_s=0.0,
+        determinable=True, curve_s=curve, curve_drop=curve, interval_drop=1.92, parts=parts,
+        drift_ppm=100.0, drift_sigma_ppm=50.0, change_p=change_p, sigma_a_m_s2=0.2,
+        sigma_z_m=0.01, count=3000,
     )  # fmt: skip
 
 

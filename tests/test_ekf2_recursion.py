@@ -6,13 +6,13 @@ The limits are written out here, so that one that is changed must be changed her
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 from ekf2_tools import RULES
+from exchange import replace
 from findings_tools import log, made
 from scipy.spatial.transform import Rotation
 

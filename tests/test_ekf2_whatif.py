@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -11,6 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from ekf2_tools import RULES
+from exchange import replace
 from findings_tools import NONE, made
 
 from px4fuse.ekf2.inputs import Inputs
@@ -191,8 +191,8 @@ def test_the_ends_of_the_walk_are_student_and_model_against_log(model: Model) ->
     assert isinstance(model.flight.ekf2, Ekf2)
     logged = model.flight.ekf2.state
     tracks = stages(model)
-    inside = (logged.index > model.flown.stretches[0][0] + 5.0) & (
-        logged.index < model.flown.stretches[0][1]
+    inside = (logged.index > model.flown.stretches_s[0][0] + 5.0) & (
+        logged.index < model.flown.stretches_s[0][1]
     )
     times = logged.index[inside]
     assert len(made.times_s) == pytest.approx(len(times), abs=2)

@@ -5,13 +5,13 @@ from __future__ import annotations
 import io
 import itertools
 import re
-from dataclasses import replace
 from functools import cache
 from typing import Any
 
 import numpy as np
 import pytest
 from conftest import REPOSITORY
+from exchange import replace
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure

@@ -6,7 +6,7 @@ import math
 import pkgutil
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cache
 from importlib import import_module
 from pathlib import Path
@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from exchange import replace
 from flights import Estimator, Imu, Uwb, aisle_flight, unexplained, with_noises
 from test_hypotheses import NAMED_HERE as NAMED_AS_CAUSES
 from test_loop import NAMED_HERE as NAMED_IN_LOOPS

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pandas as pd
 import pytest
+from exchange import replace
 from flights import aisle_flight, unexplained
 from scipy.spatial.transform import Rotation
 
@@ -152,7 +152,7 @@ def named(heading: HeadingError, **track: object) -> dict[str, Finding]:
 
 def made(*turns_deg: float, drift_p: float) -> HeadingError:
     parts = [HeadingPart(2.0 * i, 2.0 * i + 2.0, turn, 1.0) for i, turn in enumerate(turns_deg)]
-    return HeadingError(tuple(parts), drift_p, "positions")
+    return heading.turned(tuple(parts), drift_p, "positions")
 
 
 def test_a_drifting_heading_is_named_with_its_ends_and_no_turn_is_offered():

@@ -14,11 +14,13 @@ import numpy as np
 import pandas as pd
 import pytest
 from click.testing import CliRunner
+from exchange import replace
 from matplotlib.axes import Axes
 from results_tools import SHIPPED
 
 import px4fuse
 from px4fuse.cli import cli
+from px4fuse.comparison.model import UnjudgedFilter
 from px4fuse.display import Shown
 from px4fuse.fleet.changes import changes
 from px4fuse.fleet.sides import Side
@@ -60,7 +62,7 @@ def results(sample_log, analysis) -> dict[str, Shown]:
         "Comparison": analysis,
         "Analysis": analysis,
         "AxisComparison": analysis["aisle"],
-        "Consistency": analysis["aisle"].kf.consistency,
+        "Consistency": analysis["aisle"].filters["kf"],
         "Why": analysis.why["aisle"],
         "AxisTuning": analysis.tuning["horizontal"],
         "ClockOffset": analysis.clock,
@@ -144,14 +146,14 @@ def test_arguments_do_what_the_options_do(sample_log, analysis):
     found = px4fuse.compare(flight, chosen, sigma_z_m=0.3, axes="aisle", heading_deg=30, end_s=60)
     assert [axis.axis.name for axis in found.axes] == ["aisle"]
     assert found["aisle"].axis.heading_deg == 30
-    assert found.comparison.segment.end_s == 60
-    expected = dataclasses.replace(chosen, sigma_z_m=0.3)
+    assert found.segment.end_s == 60
+    expected = replace(chosen, sigma_z_m=0.3)
     assert found.settings == expected
     assert px4fuse.compare(flight, axes=["down"], clock_offset_s=1).settings.clock_offset_s == 1.0
     assert px4fuse.compare(flight, axes=["down"], input="zero").settings.input == "zero"
     csv = sample_log.with_name("aisle_uwb_external.csv")
     placed = px4fuse.compare(sample_log, position=csv, axes=["down"])
-    assert placed.comparison.source.name == csv.name
+    assert placed.source.name == csv.name
 
 
 @pytest.mark.parametrize(
@@ -291,14 +293,14 @@ def test_tables_are_tidy_with_units(results, name):
 def test_tables_hold_the_results(results, analysis):
     table = results["Comparison"].to_frame().set_index(["axis", "filter"])
     assert (
-        table.loc[("aisle", "our filter"), "nis_mean"] == analysis["aisle"].kf.consistency.nis_mean
+        table.loc[("aisle", "our filter"), "nis_mean"] == analysis["aisle"].filters["kf"].nis_mean
     )
-    assert table.loc[("aisle", "EKF2"), "nis_mean"] == analysis["aisle"].ekf2.consistency.nis_mean
+    assert table.loc[("aisle", "EKF2"), "nis_mean"] == analysis["aisle"].filters["ekf2"].nis_mean
     assert np.isnan(table.loc[("down", "EKF2"), "nis_mean"])  # not fused, so not judged
     series = results["AxisComparison"].to_frame()
     error = (series["kf_position_m"] - series["truth_position_m"]).to_numpy()
     assert np.sqrt(np.nanmean(error[50:] ** 2)) == pytest.approx(
-        analysis["aisle"].kf_truth.position_rmse_m, rel=0.1
+        analysis["aisle"].filters["kf"].truth.position_rmse_m, rel=0.1
     )
     updates = analysis["aisle"].replay.updates
     innovations = series["kf_innovation_m"].dropna()
@@ -341,8 +343,8 @@ def test_notebooks_show_text_and_table(results, name):
 
 def test_names_of_files_are_no_markup(results):
     flight = results["Flight"]
-    log = dataclasses.replace(flight.log, name="<b>&.ulg")
-    html = dataclasses.replace(flight, log=log)._repr_html_()
+    log = replace(flight.log, name="<b>&.ulg")
+    html = replace(flight, log=log)._repr_html_()
     assert "&lt;b&gt;&amp;.ulg" in html
     assert "<b>" not in html
 
@@ -374,14 +376,15 @@ def test_what_has_no_picture_says_so(results):
 
 def test_a_flight_without_anything_shows_itself(analysis):
     nothing = px4fuse.Unavailable("it", "not logged", "Log it.")
-    empty = dataclasses.replace(
-        analysis.flight, positions=(), ekf2=nothing, truth=nothing, airborne=nothing
-    )
+    empty = replace(analysis.flight, positions=(), ekf2=nothing, truth=nothing, airborne=nothing)
     assert "no position source; no EKF2" in repr(empty)
     assert len(empty.to_frame()) == 0
-    without = dataclasses.replace(
-        analysis["aisle"], ekf2=nothing, ekf2_state=nothing, ekf2_variance=nothing,
-        ekf2_innovations=nothing, truth=nothing, kf_truth=nothing, ekf2_truth=nothing,
+    without = replace(
+        analysis["aisle"], ekf2_state=nothing, ekf2_variance=nothing, ekf2_innovations=nothing,
+        truth=nothing, filters={
+            "kf": replace(analysis["aisle"].filters["kf"], truth=nothing),
+            "ekf2": UnjudgedFilter("it", "not logged", "Log it.", truth=nothing),
+        },
     )  # fmt: skip
     assert "no EKF2" in repr(without)
     assert not any(column.startswith(("ekf2", "truth")) for column in without.to_frame())

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pandas as pd
 import pytest
+from exchange import replace
 from flights import aisle_flight
 from mavlink_tools import BOOT_S, Aisle, unix
 from ulog_tools import load

@@ -14,12 +14,12 @@ import json
 import os
 import re
 import struct
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
+from exchange import replace
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mavlink_tools import (

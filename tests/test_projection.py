@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pandas as pd
 import pytest
+from exchange import replace
 from flights import Estimator, Uwb, aisle_flight, table
 
 from px4fuse.comparison.projection import (

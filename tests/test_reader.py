@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 from itertools import pairwise
 
 import numpy as np
 import pytest
+from exchange import replace
 from ulog_tools import (
     AXES,
     EV_VARIANCE,
@@ -351,7 +351,7 @@ def test_positions_that_ekf2_kept_are_those_of_the_primary(read, name, generatio
     """Each instance turns external vision into its own frame; the second's is 1 m further north."""
     log = with_two_instances(generation, [(0.0, 0), (4.95, 1)])
     if generation == "v1.12":
-        log.add(dataclasses.replace(odometry(name, 10.0, 12), instance=1))
+        log.add(replace(odometry(name, 10.0, 12), instance=1))
     second = next(made for made in log.topics if (made.name, made.instance) == (name, 1))
     second.fields[field].reshape(50, -1)[:, 0] += 1.0
     track, _ = choose_source(read(log), name)
@@ -386,7 +386,7 @@ def test_resets_are_read_through_the_wrap_of_the_counter(read, before):
     fields["vz_reset_counter"][:80], fields["vz_reset_counter"][80:] = before, after
     fields["delta_vz"][80:] = -4.0
     resets = read(log).ekf2.resets
-    assert [dataclasses.replace(r, time_s=round(r.time_s, 6)) for r in resets] == [
+    assert [replace(r, time_s=round(r.time_s, 6)) for r in resets] == [
         Reset(4.0, "position", (1.5, -0.5, 0.0)),
         Reset(6.0, "position", (0.0, 0.0, 0.25)),
         Reset(7.0, "velocity", (0.125, 2.0, 0.0)),

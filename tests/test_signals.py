@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import dataclasses
 from itertools import pairwise
 
 import numpy as np
 import pandas as pd
 import pytest
+from exchange import replace
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -312,7 +312,7 @@ def test_a_clock_offset_moves_the_times_and_nothing_else(offset_s):
     moved = shift_clock(track, offset_s)
     np.testing.assert_allclose(moved.samples.index, before.index + offset_s, atol=1e-12)
     np.testing.assert_array_equal(moved.samples, before)
-    assert dataclasses.replace(moved, samples=track.samples) == track
+    assert replace(moved, samples=track.samples) == track
     pd.testing.assert_frame_equal(track.samples, before)
 
 
@@ -346,7 +346,7 @@ def straight(first_s, last_s):
 @pytest.mark.parametrize("rung", [1, 2, 6, 7])
 def test_gps_is_taken_only_when_asked_for(rung):
     """The rung below the last of the ladder."""
-    track = dataclasses.replace(straight(2.0, 18.0), name="source", rung=rung)
+    track = replace(straight(2.0, 18.0), name="source", rung=rung)
     flight = flight_of(track=track, duration_s=20.0)
     if rung <= 6:
         assert choose_source(flight)[0] is track
@@ -509,7 +509,7 @@ def test_a_reset_of_velocity_is_kept(delta):
 def test_a_reset_of_what_the_source_does_not_measure_is_kept():
     """A source without height cannot say that the frame changed."""
     track = noisy_track()
-    blind = dataclasses.replace(track, samples=track.samples.assign(down_m=np.nan))
+    blind = replace(track, samples=track.samples.assign(down_m=np.nan))
     offset = np.where(STATE_TIME[:, None] >= 8.0, [0.0, 0.0, 3.0], 0.0)
     ekf2 = ekf2_of(offset, [Reset(8.0, "position", (0.0, 0.0, 3.0))])
     assert "undone" in continuous_state(ekf2, track, WHOLE)[1]
@@ -541,9 +541,7 @@ def test_nothing_changes_its_input(sample_flight):
     segment = choose_segment(sample_flight, track)
     axes = make_axes(sample_flight, shift_clock(track, 0.1), segment)
     step_means(axes[0].acceleration, np.arange(10.0, 20.0, 0.1))
-    shifted = dataclasses.replace(
-        sample_flight.ekf2, resets=(Reset(60.0, "position", (1.0, 0.0, 0.0)),)
-    )
+    shifted = replace(sample_flight.ekf2, resets=(Reset(60.0, "position", (1.0, 0.0, 0.0)),))
     continuous_state(shifted, track, segment)
     for part, copy in zip(parts, before, strict=True):
         pd.testing.assert_frame_equal(part, copy)

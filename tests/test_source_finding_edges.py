@@ -377,7 +377,7 @@ def test_a_clock_offset(offset_s: float, sigma_s: float, expected: str | None) -
 @pytest.mark.usefixtures("no_truth")
 def test_a_clock_offset_is_told_with_what_was_applied() -> None:
     applied = Settings(sigma_a_m_s2=1.0, sigma_z_m=1.0, clock_offset_s=-0.05)
-    finding = only(source_clock, analysis(clock=late(-0.1), settings=applied))
+    finding = only(source_clock, analysis(clock=late(-0.1, applied_s=-0.05), settings=applied))
     assert "late by 0.100 s against the IMU (95 % 0.080 to 0.110 s)" in finding.message
     assert "an error of 0.10 m" in finding.message
     assert "--clock-offset -0.150." in finding.remedy
@@ -431,7 +431,11 @@ def test_what_a_clock_offset_asks_of_ekf2(monkeypatch: pytest.MonkeyPatch) -> No
     applied = Settings(sigma_a_m_s2=1.0, sigma_z_m=1.0, clock_offset_s=-0.05)
     for fed, helps in (("uwb", True), ("another", False)):
         inputs = SimpleNamespace(vision=SimpleNamespace(source=fed))
-        one = analysis(clock=late(-0.1), settings=applied, ekf2_model=made(Model, inputs=inputs))
+        one = analysis(
+            clock=late(-0.1, applied_s=-0.05),
+            settings=applied,
+            ekf2_model=made(Model, inputs=inputs),
+        )
         remedy = only(source_clock, one).remedy
         assert ("; for EKF2 set EKF2_EV_DELAY to 150 ms: it helps." in remedy) is helps
     assert asked == pytest.approx([150.0])
@@ -458,7 +462,10 @@ def test_a_wrong_delay(delay_ms: float, sigma_s: float, expected: str | None) ->
 def test_the_delay_that_the_data_ask_for_is_told_with_what_was_applied() -> None:
     applied = Settings(sigma_a_m_s2=1.0, sigma_z_m=1.0, clock_offset_s=-0.02)
     flown = log(parameters={"EKF2_EV_DELAY": 0.0})
-    finding = only(ekf2_ev_delay_wrong, analysis(log=flown, clock=late(-0.1), settings=applied))
+    finding = only(
+        ekf2_ev_delay_wrong,
+        analysis(log=flown, clock=late(-0.1, applied_s=-0.02), settings=applied),
+    )
     assert "the data ask for 120 ms (95 % 100 to 130)" in finding.message
     assert finding.remedy == "Set EKF2_EV_DELAY to 120 ms. Not replayed: no topic for it."
     assert finding.evidence["asked_ms"] == pytest.approx(120.0)
