@@ -61,7 +61,7 @@ def summary(
     nis: float, rejected: float = 0.0, error: float | Unavailable = 0.1, std: float = 0.1
 ) -> Summary:
     axis = AxisSummary(nis, (0.9, 1.1), std, 0.05, error)
-    return Summary({}, {"north": axis, "east": axis}, 600, rejected, 0.2, 0)
+    return Summary({}, axis, axis, 600, rejected, 0.2, 0)
 
 
 @pytest.mark.parametrize(
