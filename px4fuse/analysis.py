@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -419,7 +419,7 @@ def explain(comparison: Comparison, progress: Progress = silent) -> Analysis:
 
     loop = loop_in(comparison.flight, progress)
     return Analysis(
-        **vars(comparison),
+        **{each.name: getattr(comparison, each.name) for each in fields(Comparison)},
         tuning=tuning,
         clock=clock,
         ekf2_model=model,

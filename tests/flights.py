@@ -9,7 +9,7 @@ say, and innovations whose NIS is what the test wants.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 import pandas as pd
@@ -329,7 +329,7 @@ def random_walk(
 def unexplained(comparison: Comparison) -> Analysis:
     """Make an analysis that knows nothing but the comparison."""
     return Analysis(
-        **vars(comparison), tuning={}, clock=unavailable("clock offset"),
+        **{each.name: getattr(comparison, each.name) for each in fields(Comparison)}, tuning={}, clock=unavailable("clock offset"),
         ekf2_model=unavailable("EKF2 replay"), why={}, loop=unavailable("loop closure"),
         heading=unavailable("heading error"),
     )  # fmt: skip

@@ -284,7 +284,7 @@ def test_a_doubled_noise_of_the_source_is_the_first_that_is_told(clean, noisy):
     assert (first.path, first.judgement) == ("tuning.horizontal.sigma_z_m", "worse")
     assert first.change_interval[0] < 2.0 < first.change_interval[1]
     judged = significant(found)
-    assert judged["axes.aisle.truth.kf_position_rmse_m"] == "worse"
+    assert judged["axes.aisle.filters.kf.truth.position_rmse_m"] == "worse"
     assert "clock.offset_s" not in judged
     assert found.is_worse
     assert significant(changes(noisy, clean))["tuning.horizontal.sigma_z_m"] == "better"
@@ -297,7 +297,7 @@ def test_without_the_logs_errors_are_not_tested_and_it_is_said(clean, noisy):
     judged = significant(found)
     assert "tuning.horizontal.sigma_z_m" in judged
     assert "axes.aisle.filters.kf.nis_mean" in judged
-    errors = [c for c in found.results.numbers if c.path.endswith("truth.kf_position_rmse_m")]
+    errors = [c for c in found.results.numbers if c.path.endswith("kf.truth.position_rmse_m")]
     assert {c.status for c in errors} == {"not tested"}
     assert any("RMSE is not tested without the logs" in note for note in found.results.notes)
 

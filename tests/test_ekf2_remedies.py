@@ -204,10 +204,10 @@ def rejecting(comparison: Comparison) -> Comparison:
 
 def test_rejections_are_ended_by_the_noise_that_the_data_ask_for(sample: Analysis) -> None:
     north = rejecting(replace(sample, axes={"north": sample.axes["north"]}))
-    sure = flown_with(replace(sample, comparison=north), EKF2_EVP_NOISE=0.03)
+    sure = flown_with(replace(sample, axes=north.axes), EKF2_EVP_NOISE=0.03)
     remedy = only(ekf2_rejecting, sure).remedy
     assert remedy.startswith("Set EKF2_EVP_NOISE to 0.098 m: rejected")
-    right = only(ekf2_rejecting, replace(sample, comparison=north)).remedy
+    right = only(ekf2_rejecting, replace(sample, axes=north.axes)).remedy
     assert right.startswith("With what the data ask for (EKF2_EVP_NOISE to 0.098 m) the rejections")
     assert "Remove the outliers" in right
     assert "A wider EKF2_EVP_GATE is no remedy; at 10:" in right

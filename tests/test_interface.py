@@ -20,8 +20,9 @@ from results_tools import SHIPPED
 
 import px4fuse
 from px4fuse.cli import cli
-from px4fuse.comparison.model import UnjudgedFilter
+from px4fuse.comparison.model import Comparison, UnjudgedFilter
 from px4fuse.display import Shown
+from px4fuse.filter.consistency import Consistency
 from px4fuse.fleet.changes import changes
 from px4fuse.fleet.sides import Side
 from px4fuse.request import with_options
@@ -57,12 +58,18 @@ def results(sample_log, analysis) -> dict[str, Shown]:
     vio, slam = sample_log.with_name("loop_vio.ulg"), sample_log.with_name("loop_slam.tum")
     loop = px4fuse.close_loop(vio, reference=slam)
     evaluation = px4fuse.evaluate(f"{vio}:vio", slam)
+    names = [each.name for each in dataclasses.fields(Comparison)]
+    comparison = Comparison(**{name: getattr(analysis, name) for name in names})
+    ours = analysis["aisle"].filters["kf"]
+    consistency = Consistency(
+        **{name: getattr(ours, name) for name in Consistency.__struct_fields__}
+    )
     return {
         "Flight": analysis.flight,
-        "Comparison": analysis,
+        "Comparison": comparison,
         "Analysis": analysis,
         "AxisComparison": analysis["aisle"],
-        "Consistency": analysis["aisle"].filters["kf"],
+        "Consistency": consistency,
         "Why": analysis.why["aisle"],
         "AxisTuning": analysis.tuning["horizontal"],
         "ClockOffset": analysis.clock,
@@ -144,7 +151,7 @@ def test_arguments_do_what_the_options_do(sample_log, analysis):
     flight = analysis.flight
     chosen = px4fuse.Settings(sigma_a_m_s2=0.3, clock_offset_s=1.0)
     found = px4fuse.compare(flight, chosen, sigma_z_m=0.3, axes="aisle", heading_deg=30, end_s=60)
-    assert [axis.axis.name for axis in found.axes] == ["aisle"]
+    assert [axis.axis.name for axis in found.axes.values()] == ["aisle"]
     assert found["aisle"].axis.heading_deg == 30
     assert found.segment.end_s == 60
     expected = replace(chosen, sigma_z_m=0.3)

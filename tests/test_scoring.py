@@ -176,7 +176,7 @@ class TestTuning:
 
 
 class TestNumber:
-    PATH = "axes.north.truth.kf_position_rmse_m"
+    PATH = "axes.north.filters.kf.truth.position_rmse_m"
 
     def test_below_and_above(self):
         assert checked("number", path=self.PATH, at_most=0.15)[0] == 1.0

@@ -70,7 +70,7 @@ def test_all_horizontal_axes_are_walked_and_add_up(sample: Analysis) -> None:
 
 def test_the_whole_is_our_filter_against_what_ekf2_published(sample: Analysis) -> None:
     why = of(sample)
-    result = next(r for r in sample.axes if r.axis.name == "aisle")
+    result = next(r for r in sample.axes.values() if r.axis.name == "aisle")
     ours, speed = state_at(result.replay, why.times_s)
     logged = result.ekf2_state.loc[why.times_s]
     apart = ours - logged["position_m"].to_numpy()
@@ -109,7 +109,7 @@ def test_settings_of_ours_are_in_the_steps_that_they_make(sample: Analysis) -> N
     assert "stamps and delay" in late.sentences[0]
     assert "ours 300 ms" in late.sentences[0]
     for other in (zero, small, late):
-        assert other.axis.position_left_mean_square_m2 == pytest.approx(
+        assert other.position_left_mean_square_m2 == pytest.approx(
             plain.position_left_mean_square_m2, rel=0.02
         )
 
