@@ -328,8 +328,9 @@ def random_walk(
 
 def unexplained(comparison: Comparison) -> Analysis:
     """Make an analysis that knows nothing but the comparison."""
+    parts = {each.name: getattr(comparison, each.name) for each in fields(Comparison)}
     return Analysis(
-        **{each.name: getattr(comparison, each.name) for each in fields(Comparison)}, tuning={}, clock=unavailable("clock offset"),
+        **parts, tuning={}, clock=unavailable("clock offset"),
         ekf2_model=unavailable("EKF2 replay"), why={}, loop=unavailable("loop closure"),
         heading=unavailable("heading error"),
     )  # fmt: skip

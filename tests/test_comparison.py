@@ -13,7 +13,13 @@ from msgspec.structs import asdict
 
 from px4fuse.arrays import Array
 from px4fuse.comparison.comparison import compare, compare_prepared
-from px4fuse.comparison.model import AxisComparison, Comparison, Difference, FilterSummary
+from px4fuse.comparison.model import (
+    AxisComparison,
+    Comparison,
+    Difference,
+    FilterSummary,
+    UnjudgedFilter,
+)
 from px4fuse.comparison.preparation import prepare
 from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.filter.consistency import Consistency
@@ -143,7 +149,7 @@ class TestSample:
         start, end = sample.segment.start_s, sample.segment.end_s
         state = sample_flight.ekf2.state.loc[start:end]
         for name in ("north", "east"):
-            truth = along(sample, name).ekf2_truth
+            truth = sample[name].filters["ekf2"].truth
             position = true_errors(sample_flight, state, f"{name}_m")
             velocity = true_errors(sample_flight, state, f"{name}_m_s")
             assert truth.count == len(position)
@@ -448,7 +454,7 @@ class TestRobustness:
         reset = Reset(60.0, "position", (5.0, -3.0, 0.0))
         comparison = compare(aisle_flight(ekf2=Estimator(resets=(reset,))))
         assert any("resets undone: 1 of horizontal position" in note for note in comparison.notes)
-        for result, same in zip(comparison.axes.values(), made.axes, strict=True):
+        for result, same in zip(comparison.axes.values(), made.axes.values(), strict=True):
             assert asdict(result.difference) == pytest.approx(asdict(same.difference))
 
     def test_compare_does_not_change_the_flight(self) -> None:

@@ -139,8 +139,9 @@ def apart(flight: Flight, *, grows: bool) -> Flight:
 
 def placed(*warnings: str) -> Alignment:
     return Alignment(
-        frame="enu", frame_reason="given", yaw_deg=0.0, yaw_reason="given", origin_m=(0.0, 0.0, 0.0),
-        clock_offset_s=0.0, clock_reason="given", reference="", warnings=warnings,
+        frame="enu", frame_reason="given", yaw_deg=0.0, yaw_reason="given",
+        origin_m=(0.0, 0.0, 0.0), clock_offset_s=0.0, clock_reason="given",
+        reference="", warnings=warnings,
     )  # fmt: skip
 
 

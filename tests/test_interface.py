@@ -242,7 +242,7 @@ def test_only_arguments_are_translated():
 
 def test_everything_that_shows_itself_is_tested(results):
     assert list(results) == NAMES == [type(result).__name__ for result in results.values()]
-    assert {part.__name__ for part in Shown.__subclasses__()} == set(NAMES)
+    assert {part.__name__ for part in Shown.__subclasses__()} == set(NAMES) - {"Analysis"}
 
 
 @pytest.mark.parametrize("name", NAMES)

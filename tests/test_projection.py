@@ -177,8 +177,9 @@ def test_the_observation_noise_is_ekf2s_own_rule(
     aisle = axes_of(made)["aisle"]
     assert observation_variance(made, track, aisle, WHOLE) == pytest.approx(expected_m2)
     placed = Alignment(
-        frame="enu", frame_reason="given", yaw_deg=0.0, yaw_reason="given", origin_m=(0.0, 0.0, 0.0),
-        clock_offset_s=0.0, clock_reason="given", reference="", warnings=(),
+        frame="enu", frame_reason="given", yaw_deg=0.0, yaw_reason="given",
+        origin_m=(0.0, 0.0, 0.0), clock_offset_s=0.0, clock_reason="given",
+        reference="", warnings=(),
     )  # fmt: skip
     own_file = replace(track, alignment=placed)
     least = max(parameters["EKF2_EVP_NOISE"], 0.01) ** 2

@@ -220,7 +220,8 @@ def offset(**changes: Any) -> ClockOffset:
     parts = tuple(PartOffset(10.0 * i, 10.0 * i + 9.0, 0.0, 0.02) for i in range(3))
     return replace(
         ClockOffset(
-            applied_s=0.0, offset_s=0.005, interval_s=(-0.02, 0.03), sigma_s=0.012, determinable=True,
+            applied_s=0.0, offset_s=0.005, interval_s=(-0.02, 0.03), sigma_s=0.012,
+            determinable=True,
             curve_s=curve, curve_drop=curve**2 * 1e3, interval_drop=2.0, parts=parts,
             drift_ppm=100.0, drift_sigma_ppm=300.0, change_p=0.4, sigma_a_m_s2=0.1, sigma_z_m=0.1,
             count=200,
