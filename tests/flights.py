@@ -37,6 +37,7 @@ from px4fuse.flight import (
     Truth,
     Unavailable,
 )
+from px4fuse.origin import RECEIVED, Origin
 from px4fuse.recording import Dropout, LogInfo
 
 Span = tuple[float, float]
@@ -67,7 +68,7 @@ class Uwb:
     outlier_share: float = 0.0
     outlier_m: float = 3.0
     name: str = "vehicle_visual_odometry"
-    rung: int = 2
+    origin: Origin = RECEIVED
     frame: str = "NED"
 
 
@@ -211,7 +212,7 @@ def _track(rng: np.random.Generator, time: Array, uwb: Uwb, path) -> PositionTra
     position[rng.random(len(time)) < uwb.outlier_share, :2] += uwb.outlier_m
     return PositionTrack(
         name=uwb.name,
-        rung=uwb.rung,
+        origin=uwb.origin,
         description="synthetic UWB",
         samples=table(
             time,
@@ -220,7 +221,6 @@ def _track(rng: np.random.Generator, time: Array, uwb: Uwb, path) -> PositionTra
         ),
         frame=uwb.frame,
         clock="autopilot boot clock",
-        reconstructed=uwb.rung in (5, 6),
         topics=(uwb.name,),
     )
 
