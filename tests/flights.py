@@ -132,7 +132,7 @@ def aisle_flight(
         log=LogInfo(
             name="aisle.ulg",
             sha256="0" * 64,
-            size_bytes=1,
+            bytes=1,
             format="ULog",
             firmware="PX4 v1.16.1",
             firmware_hash="unknown",
