@@ -25,6 +25,7 @@ from px4fuse.flight import (
     FusionRecord,
     Unavailable,
 )
+from px4fuse.origin import RECEIVED
 
 T = TypeVar("T")
 
@@ -72,8 +73,9 @@ def log(**parts: Any) -> Any:
 
 def source(**parts: Any) -> Any:
     usual = {
-        "name": "uwb", "description": "UWB", "rung": 2, "orientation": None, "frame": "NED",
-        "reconstructed": False, "clock_map": None, "alignment": None, "rate_hz": 5.0,
+        "name": "uwb", "description": "UWB", "origin": RECEIVED, "orientation": None,
+        "frame": "NED",
+        "clock_map": None, "alignment": None, "rate_hz": 5.0,
     }  # fmt: skip
     return SimpleNamespace(**{**usual, **parts})
 

@@ -38,6 +38,7 @@ from px4fuse.flight import (
     Truth,
     Unavailable,
 )
+from px4fuse.origin import RECEIVED, Origin
 from px4fuse.recording import Dropout, LogInfo
 
 Span = tuple[float, float]
@@ -68,7 +69,7 @@ class Uwb:
     outlier_share: float = 0.0
     outlier_m: float = 3.0
     name: str = "vehicle_visual_odometry"
-    rung: int = 2
+    origin: Origin = RECEIVED
     frame: str = "NED"
 
 
@@ -212,7 +213,7 @@ def _track(rng: np.random.Generator, time: Array, uwb: Uwb, path) -> PositionTra
     position[rng.random(len(time)) < uwb.outlier_share, :2] += uwb.outlier_m
     return PositionTrack(
         name=uwb.name,
-        rung=uwb.rung,
+        origin=uwb.origin,
         description="synthetic UWB",
         samples=table(
             time,
@@ -221,7 +222,6 @@ def _track(rng: np.random.Generator, time: Array, uwb: Uwb, path) -> PositionTra
         ),
         frame=uwb.frame,
         clock="autopilot boot clock",
-        reconstructed=uwb.rung in (5, 6),
         topics=(uwb.name,),
     )
 

@@ -341,13 +341,13 @@ def test_the_flight_gets_the_track_the_file_and_what_its_reader_said(flight: Fli
     file = recorded(flight)
     result = place(flight, file)
     track, *others = result.positions
-    assert (track.name, track.rung, track.log, track.topics) == (
+    assert (track.name, track.origin, track.log, track.topics) == (
         "uwb.csv",
         1,
         "uwb.csv",
         ("uwb.csv",),
     )
-    assert (track.frame, track.reconstructed) == ("NED", False)
+    assert track.frame == "NED"
     assert track.description == "external position file, 601 samples, enu"
     assert track.clock.startswith("the file's own UNIX clock, -1795251250.")
     assert track.clock.endswith(" s to the boot clock, matched with EKF2 position")

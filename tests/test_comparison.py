@@ -25,6 +25,7 @@ from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.kalman import Settings, variance_at
 from px4fuse.flight import Ekf2, Flight, Reset, Truth, Unavailable
+from px4fuse.origin import MOTION_CAPTURE
 from px4fuse.readers import read_log
 
 # How many times EKF2 overstates its horizontal innovation variance in real motion-capture flights
@@ -429,7 +430,9 @@ class TestMissingParts:
         assert truth.nees_velocity_mean is None
 
     def test_ekf2s_innovations_are_not_put_beside_a_source_that_it_did_not_fuse(self) -> None:
-        comparison = compare(aisle_flight(uwb=Uwb(name="vehicle_mocap_odometry", rung=3)))
+        comparison = compare(
+            aisle_flight(uwb=Uwb(name="vehicle_mocap_odometry", origin=MOTION_CAPTURE))
+        )
         assert comparison.horizontal.get("ekf2") is None
         for result in comparison.axes.values():
             assert isinstance(result.filters["ekf2"], Unavailable)

@@ -37,6 +37,7 @@ from px4fuse.flight import (
     FusionRecord,
     Unavailable,
 )
+from px4fuse.origin import RECEIVED
 from px4fuse.placing.joining import join
 from px4fuse.readers import read_log
 
@@ -333,7 +334,7 @@ def test_a_log_that_cannot_carry_the_model_says_why(sample_flight: Flight) -> No
     assert "estimator_states" in unavailable(replace(sample_flight, ekf2=bare))
     slow = sample_flight.imu.iloc[::5]
     assert "53 Hz" in unavailable(replace(sample_flight, imu=slow))
-    copies = tuple(t for t in sample_flight.positions if t.rung > 2)
+    copies = tuple(t for t in sample_flight.positions if t.origin != RECEIVED)
     assert "estimator_aid_src_ev_pos holds one sample in 0.5" in unavailable(
         replace(sample_flight, positions=copies)
     )
@@ -375,7 +376,7 @@ def test_a_mavlink_recording_gives_the_samples_that_the_log_lacks(sample_flight:
     assert "estimator_states" in unavailable(recording)
     log = replace(
         sample_flight,
-        positions=tuple(t for t in sample_flight.positions if t.rung > 2),
+        positions=tuple(t for t in sample_flight.positions if t.origin != RECEIVED),
     )
     made = opened(join(log, recording))
     assert made.flown.source == "VISION_POSITION_ESTIMATE"

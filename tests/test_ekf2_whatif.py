@@ -15,7 +15,6 @@ from findings_tools import NONE, made
 
 from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.model import Model, delayed_variants, open_model
-from px4fuse.ekf2.parameters import PARAMETERS, check, settings_in_force
 from px4fuse.ekf2.replay import Ekf2Replay
 from px4fuse.ekf2.walk import (
     OUTPUT,
@@ -42,6 +41,7 @@ from px4fuse.ekf2.whatif import (
     sweep_values,
     what_if,
 )
+from px4fuse.ekf2_parameters import PARAMETERS, check, settings_in_force
 from px4fuse.errors import SettingsError
 from px4fuse.flight import STATE_COLUMNS, Ekf2, Flight, Truth, Unavailable
 

@@ -62,6 +62,7 @@ from px4fuse.findings.model import (
     step_share,
 )
 from px4fuse.flight import FusionRecord, Reset, Unavailable
+from px4fuse.origin import ALIGNED, GNSS, KEPT, MOTION_CAPTURE, REBUILT, RECEIVED
 from px4fuse.recording import Dropout
 
 STATED = Consistency.__struct_fields__
@@ -207,7 +208,7 @@ UNKNOWN = "the log does not show why"
         (never(parameters={"EKF2_AID_MASK": 9.0}), UNKNOWN, "EKF2_EV_CTRL"),
         (never(2.0), UNKNOWN, "EKF2_EV_CTRL"),  # such a release has no limit
         (never(2.0, parameters={"EKF2_EV_CTRL": 15.0}), "come every 0.50 s", "10 Hz"),
-        (never(2.0, parameters={"EKF2_EV_CTRL": 15.0}, reconstructed=True), UNKNOWN, "Check"),
+        (never(2.0, parameters={"EKF2_EV_CTRL": 15.0}, origin=KEPT), UNKNOWN, "Check"),
         (never(5.0, parameters={"EKF2_EV_CTRL": 15.0}), UNKNOWN, "Check"),
         (never(age_s=0.29), UNKNOWN, "Check"),
         (never(age_s=0.31), "arrive 0.31 s after their stamps, and EKF2 keeps no more than 0.20 s",
@@ -235,7 +236,9 @@ def test_without_a_horizon_no_sample_is_called_too_old() -> None:
      ("GPS", 0.0, None)],
 )  # fmt: skip
 def test_what_ekf2_never_fuses(name: str, first: float, expected: str | None) -> None:
-    one = analysis(ekf2=steps((0.0, first), (100.0, 0.0)), source=source(name=name, rung=3))
+    one = analysis(
+        ekf2=steps((0.0, first), (100.0, 0.0)), source=source(name=name, origin=MOTION_CAPTURE)
+    )
     assert severity(ekf2_not_fusing, one) == expected
 
 
@@ -471,9 +474,9 @@ def test_positions_that_the_logger_thinned(rate_hz: float, name: str, decimated:
         Unavailable("another", "no", "Do."),
         Unavailable(wanted, "it was off", "Do.", source="vehicle_visual_odometry"),
     )
-    for rung in (4, 5, 6):
+    for origin in (ALIGNED, KEPT, REBUILT):
         one = analysis(
-            source=source(name=name, rung=rung, rate_hz=rate_hz), missing=missing,
+            source=source(name=name, origin=origin, rate_hz=rate_hz), missing=missing,
             log=log(parameters={"SDLOG_PROFILE": 2.0}),
         )  # fmt: skip
         found = {f.id: f for f in source_not_logged.DETECTOR.detect(one)}
@@ -484,10 +487,15 @@ def test_positions_that_the_logger_thinned(rate_hz: float, name: str, decimated:
             limit = found["source_decimated"].evidence["logger_limit_hz"]
             assert f"own limit for it ({limit:g} Hz)" in found["source_decimated"].message
             assert rate_hz == pytest.approx(limit, rel=0.35)
-    for rung, tracks in ((2, ()), (3, ()), (7, ()), (4, (SimpleNamespace(rung=2),))):
-        one = analysis(source=source(name=name, rung=rung), flight={"positions": tracks})
+    for origin, tracks in (
+        (RECEIVED, ()), (MOTION_CAPTURE, ()), (GNSS, ()),
+        (ALIGNED, (SimpleNamespace(origin=RECEIVED),)),
+    ):  # fmt: skip
+        one = analysis(source=source(name=name, origin=origin), flight={"positions": tracks})
         assert named(source_not_logged, one) == {}
-    first = next(source_not_logged.DETECTOR.detect(analysis(source=source(name=name, rung=4))))
+    first = next(
+        source_not_logged.DETECTOR.detect(analysis(source=source(name=name, origin=ALIGNED)))
+    )
     assert "(it is not in this log)" in first.message
 
 
@@ -573,7 +581,7 @@ def turned(*degrees: float, sigma_deg: float = 1.0, p: float = 1.0) -> HeadingEr
 )  # fmt: skip
 def test_a_frame_that_is_turned(heading: HeadingError, expected: str | None) -> None:
     assert severity(source_frame_turned, analysis(heading=heading)) == expected
-    made_of_ekf2 = source(reconstructed=True)
+    made_of_ekf2 = source(origin=KEPT)
     assert severity(source_frame_turned, analysis(heading=heading, source=made_of_ekf2)) is None
 
 

@@ -18,6 +18,7 @@ from px4fuse.filter.heading import DRIFT_P, HeadingError, HeadingPart, heading_e
 from px4fuse.filter.kalman import Settings
 from px4fuse.findings import Finding, source_frame_turned
 from px4fuse.flight import QUATERNION_COLUMNS, ROTATION_VARIANCE_COLUMNS, Flight, Unavailable
+from px4fuse.origin import KEPT
 from px4fuse.readers import read_log
 from px4fuse.simulation.flights import simulate_flight
 from px4fuse.simulation.mistakes import parse
@@ -177,7 +178,7 @@ def test_what_ekf2_has_turned_already_is_not_turned_again():
     found = named(made(20.0, 21.0, 19.0, drift_p=0.5), name="estimator_visual_odometry_aligned")
     assert list(found) == ["ekf2_heading_wrong"]
     assert "--position-yaw" not in found["ekf2_heading_wrong"].remedy
-    assert named(made(20.0, 21.0, 19.0, drift_p=0.5), reconstructed=True) == {}
+    assert named(made(20.0, 21.0, 19.0, drift_p=0.5), origin=KEPT) == {}
 
 
 def test_changes_within_chance_or_too_small_to_matter_are_none():

@@ -24,6 +24,7 @@ from px4fuse.contents.outlook import Ability
 from px4fuse.errors import Px4FuseError
 from px4fuse.findings import find
 from px4fuse.flight import Flight, Unavailable
+from px4fuse.origin import GNSS
 from px4fuse.readers import read_log
 from px4fuse.recording import ClockMap, Dropout, Sender
 from px4fuse.request import ComparisonRequest
@@ -383,7 +384,7 @@ def test_gaps_are_counted_and_the_longest_is_given(tmp_path):
         aisle_flight(duration_s=20.0, ekf2=Estimator(innovations_logged=False)),
         aisle_flight(duration_s=20.0, ekf2=Estimator(fusing=None)),
         aisle_flight(duration_s=20.0, truth=False),
-        aisle_flight(duration_s=20.0, uwb=Uwb(name="vehicle_gps_position", rung=7)),
+        aisle_flight(duration_s=20.0, uwb=Uwb(name="vehicle_gps_position", origin=GNSS)),
         replace(aisle_flight(duration_s=20.0), positions=()),
     ],
 )

@@ -27,6 +27,7 @@ from px4fuse.flight import (
     Flight,
     Unavailable,
 )
+from px4fuse.origin import MOTION_CAPTURE
 
 WHOLE = Segment(0.0, 40.0, "")
 HEADING_DEG = 30.0
@@ -134,7 +135,7 @@ def test_the_aisle_needs_both_horizontal_axes(lacking: str) -> None:
 
 
 def test_innovations_are_of_external_vision_alone() -> None:
-    made = flight(uwb=Uwb(name="vehicle_mocap_odometry", rung=3))
+    made = flight(uwb=Uwb(name="vehicle_mocap_odometry", origin=MOTION_CAPTURE))
     got = project_innovations(made, made.ekf2, made.positions[0], axes_of(made)["north"], WHOLE)
     assert isinstance(got, Unavailable)
     assert "not to vehicle_mocap_odometry" in str(got)

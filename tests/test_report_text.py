@@ -7,17 +7,14 @@ import sys
 from types import SimpleNamespace
 from typing import Any
 
-import matplotlib as mpl
 import numpy as np
 import pytest
+import typst
 from exchange import replace
 from flights import random_walk
 from hypothesis import given
 from hypothesis import strategies as st
 from matplotlib import font_manager
-from matplotlib.backends.backend_pdf import PdfPages
-from matplotlib.figure import Figure
-from matplotlib.ft2font import LoadFlags
 from pypdf import PdfReader
 
 from px4fuse.filter.clock import ClockOffset, PartOffset
@@ -27,8 +24,9 @@ from px4fuse.flight import Unavailable
 from px4fuse.report import clock, fonts, notes
 from px4fuse.report.document import Document
 from px4fuse.report.notes import Line, Table, read
+from px4fuse.report.page import Page, data, printable
+from px4fuse.report.pdf import compiled
 from px4fuse.report.sensitivity import PAIRS, SETTINGS, WINDOW_S, _settled, _window
-from px4fuse.report.style import Cursor, printable, report_style, text_width, wrap
 from px4fuse.results.model import Student
 
 THAI, HAN, ARABIC = "สมชาย", "王小明", "محمد"
@@ -79,9 +77,8 @@ def test_a_font_of_the_machine_is_taken(monkeypatch: pytest.MonkeyPatch) -> None
 @pytest.mark.usefixtures("_fresh")
 def test_what_no_font_has_is_a_square_and_said(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fonts, "_others", lambda: ())
-    with report_style(THAI + HAN):
-        assert mpl.rcParams["font.family"] == [fonts.FONT]
-        assert printable(f"a {HAN} b") == "a □□□ b"
+    assert fonts.families(THAI + HAN) == [fonts.FONT]
+    assert printable(f"a {HAN}\x1b b") == "a □□□ b"
     monkeypatch.setattr(sys, "platform", "linux")
     assert "sudo apt install fonts-noto-core fonts-wqy-zenhei." in fonts.advice(THAI + HAN)
     assert "Thai and Chinese characters สมชาย王小明:" in fonts.advice(THAI + HAN)
@@ -102,23 +99,6 @@ def test_a_font_that_has_a_box_for_everything_is_none(monkeypatch: pytest.Monkey
     assert [name for name, _ in fonts._others()] == ["Noto Sans Thai", "An Alphabet Sans", "Zebra"]
 
 
-def test_arabic_is_joined_and_written_from_the_right() -> None:
-    """Shaped: the letters take other glyphs than alone, from the right to the left."""
-    font = font_manager.get_font(font_manager.findfont(fonts.FONT))
-    alone = [font.get_char_index(ord(letter)) for letter in ARABIC]
-    shaped = [item.glyph_index for item in font._layout(ARABIC, LoadFlags.NO_HINTING)]
-    assert len(shaped) == len(alone)
-    assert not set(shaped) & set(alone[:-1])
-
-
-def test_a_mark_is_not_parted_from_its_letter() -> None:
-    text = "e\N{COMBINING ACUTE ACCENT}" * 40
-    with report_style():
-        for line in wrap(text, 8.0, 60.0):
-            assert not line.startswith("\N{COMBINING ACUTE ACCENT}")
-            assert text_width(line, 8.0) <= 68.0
-
-
 def test_markdown_is_read() -> None:
     assert lines("# A *b* **c**\n\nd `e` ~~f~~ g\nh\n\n> i") == ["A b c", "d e f g h", "i"]
     assert lines("a  \nb") == ["a\nb"]
@@ -135,10 +115,10 @@ def test_lists_keep_their_marks_and_depth() -> None:
 
 
 def test_code_keeps_its_spaces_and_dollars() -> None:
-    assert lines("```\nif x:\n    $y$ <b>\n```") == ["if x:", "    $y$ <b>"]
-    with report_style():
-        assert wrap("    x = 1", 8.0, 500.0) == ["    x = 1"]
-        assert wrap("  aa bb", 8.0, text_width("  aa", 8.0) + 1.0) == ["  aa", "bb"]
+    code = [
+        line.replace("\N{NO-BREAK SPACE}", " ") for line in lines("```\nif x:\n    $y$ <b>\n```")
+    ]
+    assert code == ["if x:", "    $y$ <b>"]
 
 
 def test_a_table_is_a_table() -> None:
@@ -188,31 +168,48 @@ def document(student: Student) -> Document:
     return Document(SimpleNamespace(), (), student, "px4fuse compare x.ulg")  # type: ignore[arg-type]
 
 
+def set_by_typst(*pages: Page) -> list[str]:
+    """Text of each sheet of a PDF of these pages."""
+    blocks = [block for page in pages for block in data(page.blocks)]
+    report = {
+        "title": "t", "author": "a", "head": "", "student": "", "foot": "", "results": None,
+        "fonts": [fonts.FONT], "blocks": blocks,
+    }  # fmt: skip
+    return [sheet.extract_text() for sheet in PdfReader(io.BytesIO(compiled(report))).pages]
+
+
 def test_long_notes_run_over_pages_and_lose_nothing() -> None:
     words = [f"word{number}" for number in range(1500)]
     table = "| a | b |\n|---|---|\n" + "".join(f"| r{i} | {'cell ' * 30} |\n" for i in range(40))
-    out = io.BytesIO()
-    with report_style(), PdfPages(out) as pdf:
-        for figure in notes.draw(document(Student("", "", " ".join(words) + "\n\n" + table))):
-            pdf.savefig(figure)
-    pages = [page.extract_text() for page in PdfReader(out).pages]
-    assert len(pages) > 2
-    assert pages[0].startswith("Appendix: notes by the student")
-    text = " ".join(pages).split()
+    student = Student("", "", " ".join(words) + "\n\n" + table)
+    sheets = set_by_typst(*notes.draw(document(student)))
+    assert len(sheets) > 2
+    assert sheets[0].strip().startswith("Appendix: notes by the student")
+    text = " ".join(sheets).split()
     assert [word for word in text if word.startswith("word")] == words
     assert sum(word == "cell" for word in text) == 1200
     assert not list(notes.draw(document(Student("", "", " \n <!-- nothing --> \n"))))
 
 
-def test_a_table_of_columns_moves_the_cursor_below_itself() -> None:
-    with report_style():
-        figure = Figure()
-        cursor = Cursor(figure, 0.9)
-        cursor.columns({0.1: ("head", ["a", "", "c"]), 0.5: ("other", ["1", "2", "3"])})
-    heights = [text.get_position()[1] for text in figure.texts]
-    assert len(heights) == 7
-    assert max(heights) < 0.9
-    assert cursor.y <= min(heights)
+def test_what_a_student_writes_is_never_evaluated() -> None:
+    hostile = '#read("/etc/passwd") #sys.inputs $x$ = y *b* @ref <label> // c'
+    page = Page("Notes")
+    page.write(hostile)
+    page.table(["#panic()"], [[hostile]])
+    (sheet,) = set_by_typst(page)
+    assert " ".join(sheet.split()).count(hostile) == 2
+    assert "#panic()" in sheet
+
+
+@pytest.mark.parametrize(
+    "asked",
+    ['read("/etc/passwd")', 'read("../../../etc/passwd")', 'image("/etc/hostname")',
+     'image(bytes("<svg xmlns=\'http://www.w3.org/2000/svg\'><image href=\'/etc/hostname\' '
+     'width=\'1\' height=\'1\'/></svg>"), format: "svg")'],
+)  # fmt: skip
+def test_a_template_reaches_no_file(asked: str) -> None:
+    with pytest.raises(typst.TypstError):
+        compiled({"fonts": [fonts.FONT]}, f"#{asked}")
 
 
 def offset(**changes: Any) -> ClockOffset:

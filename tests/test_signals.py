@@ -12,7 +12,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from px4fuse.comparison.preparation import LADDER, choose_segment, choose_source, shift_clock
+from px4fuse.comparison.preparation import (
+    LOGGED_ORIGINS,
+    choose_segment,
+    choose_source,
+    shift_clock,
+)
 from px4fuse.comparison.projection import continuous_state
 from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.filter.signals import (
@@ -37,6 +42,7 @@ from px4fuse.flight import (
     Reset,
     Unavailable,
 )
+from px4fuse.origin import GNSS, ORIGINS, RECEIVED
 from px4fuse.recording import LogInfo
 
 GRAVITY = 9.80665
@@ -59,10 +65,10 @@ def attitude_of(time, rotations):
     return frame(time, rotations.as_quat(scalar_first=True), QUATERNION_COLUMNS)
 
 
-def track_of(time, positions, name="vehicle_visual_odometry", rung=2):
+def track_of(time, positions, name="vehicle_visual_odometry", origin=RECEIVED):
     values = np.hstack([positions, np.full((len(time), 3), np.nan)])
     samples = frame(time, values, POSITION_COLUMNS + POSITION_VARIANCE_COLUMNS)
-    return PositionTrack(name, rung, "", samples, "NED", "", False, (name,))
+    return PositionTrack(name, origin, "", samples, "NED", "", (name,))
 
 
 def flight_of(*, imu=ABSENT, attitude=ABSENT, track=None, duration_s=10.0, airborne=ABSENT):
@@ -343,12 +349,12 @@ def straight(first_s, last_s):
 # ---- position sources and the segment -----------------------------------------------------------
 
 
-@pytest.mark.parametrize("rung", [1, 2, 6, 7])
-def test_gps_is_taken_only_when_asked_for(rung):
-    """The rung below the last of the ladder."""
-    track = replace(straight(2.0, 18.0), name="source", rung=rung)
+@pytest.mark.parametrize("origin", ORIGINS)
+def test_gps_is_taken_only_when_asked_for(origin):
+    """It is the last in the order of preference."""
+    track = replace(straight(2.0, 18.0), name="source", origin=origin)
     flight = flight_of(track=track, duration_s=20.0)
-    if rung <= 6:
+    if origin != GNSS:
         assert choose_source(flight)[0] is track
     else:
         with pytest.raises(MissingDataError, match="`position_source`"):
@@ -356,16 +362,20 @@ def test_gps_is_taken_only_when_asked_for(rung):
     assert choose_source(flight, "source") == (track, "chosen with --position-source")
 
 
-def test_the_same_source_has_one_rung_whichever_way_it_was_recorded():
+def test_the_same_source_is_of_one_origin_whichever_way_it_was_recorded():
     """What is sent as VISION_POSITION_ESTIMATE is the topic vehicle_visual_odometry, and so on."""
-    by_rung = [
+    by_origin = [
         {"vehicle_visual_odometry", "VISION_POSITION_ESTIMATE", "ODOMETRY"},
         {"vehicle_mocap_odometry", "ATT_POS_MOCAP"},
         {"estimator_visual_odometry_aligned"},
         {"estimator_aid_src_ev_pos"},
         {"ekf2_state_plus_innovation"},
     ]
-    assert {name: rung for rung, names in enumerate(by_rung, 2) for name in names} == LADDER
+    assert {
+        name: origin
+        for origin, names in zip(ORIGINS[1:-1], by_origin, strict=True)
+        for name in names
+    } == {name: origin for name, origin in LOGGED_ORIGINS.items() if origin != GNSS}
 
 
 @pytest.mark.parametrize(("airborne", "expected"), [

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from exchange import replace
 from flights import unexplained
+from page_tools import axes_of, words
 
 from px4fuse.analysis import Analysis, explain
 from px4fuse.comparison.comparison import compare
@@ -20,7 +21,7 @@ from px4fuse.findings.story import story
 from px4fuse.flight import Flight, Unavailable
 from px4fuse.readers import read_log
 from px4fuse.report.document import Document
-from px4fuse.report.style import BOTTOM, report_style
+from px4fuse.report.style import report_style
 from px4fuse.report.why import draw, nothing_concluded
 from px4fuse.request import ComparisonRequest
 from px4fuse.results.build import results
@@ -163,20 +164,14 @@ def drawn(analysis: Analysis) -> list:
         return list(draw(document(analysis)))
 
 
-def texts(figure) -> str:
-    every = [text.get_text() for text in figure.texts]
-    every += [text.get_text() for axes in figure.axes for text in axes.texts]
-    return " ".join(every)
-
-
 def test_the_page_shows_words_bars_and_agreement(sample: Analysis) -> None:
     (page,) = drawn(sample)
-    said = texts(page)
+    said = words(page)
     assert "Why EKF2 differs" in said
     assert "0.9997 (north)" in said
     for sentence in of(sample).sentences:
         assert " ".join(sentence.split()[:6]) in said
-    position, velocity, over_time = page.axes
+    position, velocity, over_time = axes_of(page)
     for axes, total in (
         (position, "position_mean_square_m2"),
         (velocity, "velocity_mean_square_m2_s2"),
@@ -190,10 +185,6 @@ def test_the_page_shows_words_bars_and_agreement(sample: Analysis) -> None:
     ours, left = over_time.lines[:2]
     assert abs(ours.get_ydata()).max() == abs(of(sample).apart_m).max()
     assert abs(left.get_ydata()).max() == abs(of(sample).left_m).max()
-    by_height = sorted(page.texts, key=lambda text: text.get_position()[1])
-    for axes in page.axes:
-        box = axes.get_position()
-        assert not [t for t in by_height if box.y0 < t.get_position()[1] < box.y1]
 
 
 def test_doubtful_and_absent_replays_conclude_nothing(sample: Analysis) -> None:
@@ -214,15 +205,13 @@ def test_doubtful_and_absent_replays_conclude_nothing(sample: Analysis) -> None:
     assert not nothing_concluded(document(sample))
 
 
-def test_what_does_not_fit_on_a_page_begins_the_next(sample: Analysis) -> None:
-    long = Unavailable("why", "a sentence of some length, again " * 100, "None")
-    pages = drawn(replace(sample, why={"north": of(sample), "east": long}))
-    assert len(pages) == 2
-    assert "east: nothing is concluded" in texts(pages[1])
-    assert min(text.get_position()[1] for figure in pages for text in figure.texts) >= BOTTOM
-    both = drawn(replace(sample, why={name: of(sample, name) for name in ("north", "east")}))
-    lowest = min(axes.get_position().y0 for figure in both for axes in figure.axes)
-    assert lowest >= BOTTOM
+def test_every_axis_that_is_explained_has_its_panels(sample: Analysis) -> None:
+    absent = Unavailable("why", "a sentence of some length", "None")
+    (page,) = drawn(replace(sample, why={"north": of(sample), "east": absent}))
+    assert "east: nothing is concluded" in words(page)
+    assert len(axes_of(page)) == 3
+    (both,) = drawn(replace(sample, why={name: of(sample, name) for name in ("north", "east")}))
+    assert len(axes_of(both)) == 6
 
 
 def test_results_hold_the_steps_and_the_agreement(sample: Analysis) -> None:

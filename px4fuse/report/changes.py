@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from px4fuse.analysis import Analysis
@@ -30,25 +29,8 @@ from px4fuse.report.changes_words import (
 )
 from px4fuse.report.document import ChangesDocument
 from px4fuse.report.innovations import log_ticks
-from px4fuse.report.style import (
-    BOTTOM,
-    LEFT,
-    MAX_POINTS,
-    MUTED,
-    PANEL_LEFT,
-    POINTS_PER_HEIGHT,
-    POINTS_PER_WIDTH,
-    RIGHT,
-    SEVERITY_COLOURS,
-    Cursor,
-    bare_x,
-    legend_beside_title,
-    page,
-    panel,
-    printable,
-    shorten,
-    thin,
-)
+from px4fuse.report.page import Cell, Page, halves, legend_above
+from px4fuse.report.style import MAX_POINTS, MUTED, SEVERITY_COLOURS, bare_x, thin
 from px4fuse.results.changes import NumberChange
 from px4fuse.results.contract import ChangeResults
 
@@ -64,11 +46,11 @@ DOTS: dict[str, dict[str, Any]] = {
 }
 COLOURS = {"worse": SEVERITY_COLOURS["error"], "better": "#1f6b3a"}
 SIZE = 7.6
-EDGES = (LEFT, 0.16, 0.44, 0.515, 0.61, 0.86)
+SHARES = (7.5, 28.0, 7.5, 10.0, 25.0, 9.0)
 HEADS = ("", "number", "A", "B", "change, with its 95 % interval", "by chance?")
 # The axes of innovations reach so many of the larger median 2√S
 EDGE = 2.2
-MAP, PANEL = 190.0, 118.0
+MAP, PANEL, LEGEND = 160.0, 95.0, 14.0
 
 
 @dataclass(frozen=True)
@@ -86,9 +68,9 @@ class Track:
         return time
 
 
-def draw(document: ChangesDocument) -> Iterator[Figure]:
+def draw(document: ChangesDocument) -> Iterator[Page]:
     """Draw the summary, and where both logs are at hand what they show."""
-    yield from _numbers(document.results)
+    yield _numbers(document.results)
     a, b = document.a, document.b
     if a is None or b is None:
         return
@@ -104,72 +86,43 @@ def draw(document: ChangesDocument) -> Iterator[Figure]:
 # -- numbers ---------------------------------------------------------------------------------------
 
 
-def _numbers(results: ChangeResults) -> Iterator[Figure]:
-    figure, cursor = page("What changed from A to B")
+def _numbers(results: ChangeResults) -> Page:
+    page = Page("What changed from A to B")
     for text in results.summary[:1]:
-        cursor.write(text, size=10.0, weight="bold")
-        cursor.skip(2)
+        page.write(text, size=10.0, bold=True)
     for text in results.summary[1:]:
-        cursor.write(text, size=8.6)
-    cursor.skip(4)
+        page.write(text, size=8.6, above=2.0)
     for name, side in (("A", results.a), ("B", results.b)):
         kind = {"log": "its log", "report": "its report", "results": "its results"}[side.kind]
-        cursor.write(
+        page.write(
             f"{name}: {side.given}, {kind}; SHA-256 {side.log_sha256[:12]}, px4fuse {side.px4fuse}",
-            size=7.4,
-            colour=MUTED,
-        )
-    cursor.skip(6)
+            size=7.4, colour=MUTED,
+        )  # fmt: skip
     shown = told(results)
-    cells = [HEADS, *map(_cells, shown)] if shown else []
-    for at, row in enumerate(cells):
-        if cursor.y < BOTTOM + 0.03:
-            yield figure
-            figure, cursor = page("What changed from A to B, continued")
-        _row(cursor, row, is_head=at == 0)
-    cursor.skip(3)
-    lines = [(folded_words(results), MUTED)]
-    lines += [
-        (f"{text.kind.capitalize()}: {text.what}, {text.a} in A, {text.b} in B.", "black")
-        for text in results.texts
-    ]
-    lines += [
-        (f"{'New' if one.only_in == 'B' else 'Gone'} ({one.severity}): {one.message}",
-         SEVERITY_COLOURS[one.severity])
-        for one in results.findings
-    ]  # fmt: skip
-    lines += [(text, MUTED) for text in (*results.notes, *results.methods)]
-    for text, colour in lines:
-        if cursor.y - cursor.height(text, size=SIZE) < BOTTOM:
-            yield figure
-            figure, cursor = page("What changed from A to B, continued")
-        cursor.write(text, size=SIZE, colour=colour)
-        cursor.skip(2.5)
-    yield figure
+    if shown:
+        page.table(HEADS, [_cells(change) for change in shown], shares=SHARES, size=SIZE)
+    page.write(folded_words(results), size=SIZE, colour=MUTED, above=3.0)
+    for change in results.texts:
+        said = f"{change.kind.capitalize()}: {change.what}, {change.a} in A, {change.b} in B."
+        page.write(said, size=SIZE, above=1.0)
+    for one in results.findings:
+        said = f"{'New' if one.only_in == 'B' else 'Gone'} ({one.severity}): {one.message}"
+        page.write(said, size=SIZE, colour=SEVERITY_COLOURS[one.severity], above=1.0)
+    for text in (*results.notes, *results.methods):
+        page.write(text, size=SIZE, colour=MUTED, above=1.0)
+    return page
 
 
-def _cells(change: NumberChange) -> tuple[str, ...]:
-    return (
-        judgement_words(change),
+def _cells(change: NumberChange) -> list[Cell]:
+    judged = judgement_words(change)
+    return [
+        (judged, COLOURS.get(judged, "black")),
         change.label,
         value_words(change, change.a),
         value_words(change, change.b, unit=True),
         change_words(change),
         chance_words(change),
-    )
-
-
-def _row(cursor: Cursor, cells: Sequence[str], *, is_head: bool) -> None:
-    cursor.y -= SIZE * 1.5 / POINTS_PER_HEIGHT
-    plain = MUTED if is_head else "black"
-    for at, (x, end, text) in enumerate(zip(EDGES, (*EDGES[1:], RIGHT), cells, strict=True)):
-        cursor.figure.text(
-            x, cursor.y, shorten(printable(text), SIZE, (end - x) * POINTS_PER_WIDTH),
-            size=SIZE, color=COLOURS.get(text, plain), weight="normal" if at else "bold",
-        )  # fmt: skip
-    if is_head:
-        cursor.skip(2.5)
-        cursor.rule()
+    ]
 
 
 # -- pictures --------------------------------------------------------------------------------------
@@ -190,23 +143,18 @@ def _tracks(a: Analysis, b: Analysis, axis: str) -> tuple[tuple[Track, Track], s
     return (first, second), f"time since {since} (s)"
 
 
-def _drawn_tracks(tracks: tuple[Track, Track], since: str) -> Figure:
+def _drawn_tracks(tracks: tuple[Track, Track], since: str) -> Page:
     along = the(tracks[0].result.axis.name)
-    figure, cursor = page(
-        "Tracks of A and B", "A is dark and solid, B lighter and dashed, on common axes."
+    page = Page("Tracks of A and B", "A is dark and solid, B lighter and dashed, on common axes.")
+    columns = halves()
+    sides: tuple[tuple[str, Callable[[AxisComparison], Any]], ...] = (
+        ("EKF2 from above", lambda result: result.ekf2_state),
+        ("Ours from above", lambda result: result.replay.steps),
     )
-    top = cursor.y
-    middle = (PANEL_LEFT + RIGHT) / 2
-    drawn = False
-    sides: tuple[tuple[str, float, float, Callable[[AxisComparison], Any]], ...] = (
-        ("EKF2 from above", PANEL_LEFT, middle - 0.02, lambda result: result.ekf2_state),
-        ("Ours from above", middle + 0.05, RIGHT, lambda result: result.replay.steps),
-    )
-    for title, left, right, of in sides:
-        cursor.y = top
+    for column, (title, of) in zip(columns, sides, strict=True):
         paths = [(t.name, path) for t in tracks if (path := _path(t.analysis, of)) is not None]
         say = "North is up." if len(paths) == len(tracks) else "Not both have it."
-        axes = panel(cursor, title, say, MAP, left=left, right=right)
+        axes = column.panel(title, say, MAP, above=LEGEND, left=34.0)
         for name, (north, east) in paths:
             every = max(1, len(north) // MAX_POINTS)
             axes.plot(east[::every], north[::every], **STYLES[name], label=name)
@@ -214,23 +162,22 @@ def _drawn_tracks(tracks: tuple[Track, Track], since: str) -> Figure:
         axes.grid(visible=True, axis="both")
         axes.xaxis.set_major_locator(MaxNLocator(5))
         axes.set_xlabel("east (m)")
-        if not drawn and paths:
-            axes.set_ylabel("north (m)")
-            legend_beside_title(axes, top)
-            drawn = True
-    cursor.skip(34)
+        axes.set_ylabel("north (m)")
+        if paths:
+            legend_above(axes)
+    page.beside(*columns)
     _series(
-        cursor, tracks, since,
+        page, tracks, since,
         (f"Position along {along}, EKF2 (m)", "As EKF2 published it.", _ekf2_position),
         (f"Ours - EKF2 along {along} (m)", _rms_words(tracks, _apart), _apart),
         (f"Error of EKF2 along {along} (m)", _rms_words(tracks, _error), _error),
     )  # fmt: skip
-    return figure
+    return page
 
 
-def _drawn_innovations(tracks: tuple[Track, Track], since: str) -> Figure:
+def _drawn_innovations(tracks: tuple[Track, Track], since: str) -> Page:
     along = the(tracks[0].result.axis.name)
-    figure, cursor = page(
+    page = Page(
         f"Innovations and variances along {along}",
         "Dots: innovations; lines: ±2√S of A (solid) and B (dashed). About 95 % of the dots "
         "belong between their lines.",
@@ -239,15 +186,15 @@ def _drawn_innovations(tracks: tuple[Track, Track], since: str) -> Figure:
         ("Innovations of EKF2 (m)", lambda track: track.result.ekf2_innovations),
         ("Innovations of ours (m)", lambda track: track.result.replay.updates),
     ):
-        _innovations(cursor, tracks, title, of)
+        _innovations(page, tracks, title, of)
     _series(
-        cursor, tracks, since,
+        page, tracks, since,
         ("σ of position, EKF2 (m), log scale", _median_words(tracks, _ekf2_sigma), _ekf2_sigma),
         ("σ of position, ours, before each measurement (m), log scale",
          _median_words(tracks, _our_sigma), _our_sigma),
         log=True,
     )  # fmt: skip
-    return figure
+    return page
 
 
 Series = tuple[Array, Array]
@@ -255,7 +202,7 @@ Of = Callable[[Track], Series | None]
 
 
 def _series(
-    cursor: Cursor, tracks: Sequence[Track], since: str, *panels: tuple[str, str, Of],
+    page: Page, tracks: Sequence[Track], since: str, *panels: tuple[str, str, Of],
     log: bool = False,
 ) -> None:  # fmt: skip
     """One series of both per panel; what neither has is left out, the last says what times are."""
@@ -263,22 +210,20 @@ def _series(
              for title, say, of in panels]  # fmt: skip
     found = [panel for panel in found if panel[2]]
     for at, (title, say, drawn) in enumerate(found):
-        top = cursor.y
         only = f" Only {drawn[0][0].name} has it." if len(drawn) < len(tracks) else ""
-        axes = panel(cursor, title, say + only, PANEL)
+        axes = page.panel(title, say + only, PANEL, above=LEGEND)
         for track, made in drawn:
             axes.plot(*thin(*made), **STYLES[track.name], label=track.name)
         if log:
             axes.set_yscale("log")
             log_ticks(axes)
-        _finish(cursor, axes, tracks, since if at == len(found) - 1 else "")
-        legend_beside_title(axes, top)
+        _finish(axes, tracks, since if at == len(found) - 1 else "")
+        legend_above(axes)
 
 
 def _innovations(
-    cursor: Cursor, tracks: Sequence[Track], title: str, of: Callable[[Track], Any]
+    page: Page, tracks: Sequence[Track], title: str, of: Callable[[Track], Any]
 ) -> None:
-    top = cursor.y
     frames = [(track, frame) for track in tracks if isinstance(frame := of(track), pd.DataFrame)]
     sigmas = {t.name: 2.0 * np.sqrt(f["innovation_variance_m2"].to_numpy()) for t, f in frames}
     missing = [track.name for track in tracks if track.name not in sigmas]
@@ -291,7 +236,7 @@ def _innovations(
     say = f"Outside their own ±2√S: {', '.join(outside)}." if outside else ""
     say += f" {beyond} lie beyond the axis." if beyond else ""
     say += f" Not available in {' and '.join(missing)}." if missing else ""
-    axes = panel(cursor, title, say.strip(), PANEL)
+    axes = page.panel(title, say.strip(), PANEL, above=LEGEND)
     for track, frame in frames:
         time, nu = track.since(frame.index), frame["innovation_m"].to_numpy()
         for sign in (1.0, -1.0):
@@ -301,12 +246,12 @@ def _innovations(
         axes.plot(*thin(time[inside], nu[inside]), **DOTS[track.name], label=track.name)
     axes.axhline(0.0, color="black", lw=0.5)
     axes.set_ylim(-edge, edge)
-    _finish(cursor, axes, tracks, "")
+    _finish(axes, tracks, "")
     if frames:
-        legend_beside_title(axes, top, markerscale=2.0)
+        legend_above(axes, markerscale=2.0)
 
 
-def _finish(cursor: Cursor, axes: Axes, tracks: Sequence[Track], since: str) -> None:
+def _finish(axes: Axes, tracks: Sequence[Track], since: str) -> None:
     """Common limits in time, whose numbers stand at the last panel alone."""
     segments = [(track.analysis.segment, track.zero_s) for track in tracks]
     axes.set_xlim(
@@ -315,10 +260,8 @@ def _finish(cursor: Cursor, axes: Axes, tracks: Sequence[Track], since: str) -> 
     )
     if since:
         axes.set_xlabel(since)
-        cursor.skip(24)
     else:
         bare_x(axes)
-    cursor.skip(10)
 
 
 def _ekf2_position(track: Track) -> Series | None:

@@ -5,23 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from px4fuse.filter.clock import CHANGE_P, ClockOffset
 from px4fuse.flight import Unavailable
 from px4fuse.plain import p_words
 from px4fuse.report import marks
 from px4fuse.report.document import Document
-from px4fuse.report.style import (
-    OURS,
-    OURS_BAND,
-    OURS_LINE,
-    TIME_LABEL,
-    Cursor,
-    legend_beside_title,
-    page,
-    panel,
-)
+from px4fuse.report.page import Page, legend_above
+from px4fuse.report.style import OURS, OURS_BAND, OURS_LINE, TIME_LABEL
 from px4fuse.report.words import clock_advice, delay_wrong, stamps_wrong
 
 # Heights of the axes in points
@@ -73,12 +64,12 @@ def _drifts(clock: ClockOffset) -> bool:
     return abs(clock.drift_ppm) > DRIFT_SIGMAS * clock.drift_sigma_ppm
 
 
-def draw(document: Document) -> Iterator[Figure]:
+def draw(document: Document) -> Iterator[Page]:
     """Draw one page; none where a line says it all."""
     clock = document.analysis.clock
     if isinstance(clock, Unavailable) or not has_page(document):
         return
-    figure, cursor = page(
+    page = Page(
         "Appendix: the clock of the position source",
         "Late or early stamps hardly show in the innovations, since the filter follows. They show "
         "in when the positions answer to what the IMU felt. So the likelihood of the positions is "
@@ -86,25 +77,22 @@ def draw(document: Document) -> Iterator[Figure]:
         "attitude is from the gyros alone, because EKF2's was corrected by these very positions.",
     )
     for text in clock_advice(document.comparison, clock):
-        cursor.labelled(text[:9].strip(), text[9:], size=8.5)
-        cursor.skip(1)
-    cursor.skip(14)
-    _curve(cursor, clock)
+        page.labelled(text[:9].strip(), text[9:], size=8.5)
+    _curve(page, clock)
     if len(clock.parts) > 1:
-        _parts(cursor, clock, document)
-    yield figure
+        _parts(page, clock, document)
+    yield page
 
 
-def _curve(cursor: Cursor, clock: ClockOffset) -> None:
+def _curve(page: Page, clock: ClockOffset) -> None:
     """Likelihood over the offset."""
     (low, high), best, applied = clock.interval_s, clock.offset_s, clock.applied_s
-    top = cursor.y
-    axes = panel(
-        cursor,
+    axes = page.panel(
         "ln of how much less likely each offset is than the best",
         f"Best at {best:+.3f} s; 95 % from {low:+.3f} to {high:+.3f} s, wider than the curve alone "
         f"would say because the IMU's noise moves it too. From {clock.count} measurements.",
         CURVE,
+        above=14.0,
     )
     axes.axvspan(low, high, color=OURS_BAND, lw=0, label="95 % interval")
     axes.plot(clock.curve_s, clock.curve_drop, **OURS_LINE)
@@ -117,11 +105,10 @@ def _curve(cursor: Cursor, clock: ClockOffset) -> None:
         max(min(best + reach, ends[1]), applied + 0.1 * reach),
     )
     axes.set_xlabel("offset added to the source's stamps (s)")
-    legend_beside_title(axes, top)
-    cursor.skip(42)
+    legend_above(axes)
 
 
-def _parts(cursor: Cursor, clock: ClockOffset, document: Document) -> None:
+def _parts(page: Page, clock: ClockOffset, document: Document) -> None:
     """Offset of each part of the flight over time."""
     said = ["Too few parts to compare them."]
     if clock.change_p is not None:
@@ -133,7 +120,7 @@ def _parts(cursor: Cursor, clock: ClockOffset, document: Document) -> None:
             f"Drift {clock.drift_ppm:+,.0f} ± {1.96 * clock.drift_sigma_ppm:,.0f} ppm{sure}."
         )
     said.append("Band: 95 % interval of the whole flight.")
-    axes = panel(cursor, "Offset of each part of the flight by itself (s)", " ".join(said), PARTS)
+    axes = page.panel("Offset of each part of the flight by itself (s)", " ".join(said), PARTS)
     axes.axhspan(*clock.interval_s, color=OURS_BAND, lw=0)
     ends = np.array([(part.start_s, part.end_s) for part in clock.parts])
     axes.errorbar(
@@ -143,4 +130,3 @@ def _parts(cursor: Cursor, clock: ClockOffset, document: Document) -> None:
     )  # fmt: skip
     marks.draw(axes, document)
     axes.set_xlabel(TIME_LABEL)
-    cursor.skip(30)

@@ -8,7 +8,6 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from px4fuse.arrays import Array
 from px4fuse.comparison.model import AxisComparison
@@ -18,22 +17,8 @@ from px4fuse.flight import Unavailable
 from px4fuse.plain import capital, number_words, p_words
 from px4fuse.report import marks
 from px4fuse.report.document import Document
-from px4fuse.report.style import (
-    EKF2,
-    EKF2_LINE,
-    LEFT,
-    OURS,
-    OURS_BAND,
-    OURS_LINE,
-    RIGHT,
-    TIME_LABEL,
-    Cursor,
-    legend_beside_title,
-    level,
-    page,
-    panel,
-    thin,
-)
+from px4fuse.report.page import Page, halves, legend_above
+from px4fuse.report.style import EKF2, EKF2_LINE, OURS, OURS_BAND, OURS_LINE, TIME_LABEL, thin
 from px4fuse.report.words import verdict_words
 
 LAGS = 20
@@ -45,8 +30,7 @@ BEYOND_TWO_SIGMA = 0.0455
 # t of the mean, and p of "white", beyond which a word is said
 LARGE_T, SMALL_P = 2.0, 0.01
 # Heights of the axes in points
-RUNNING, BELOW = 150.0, 170.0
-MIDDLE = 0.50
+RUNNING, BELOW, LEGEND = 140.0, 150.0, 14.0
 
 
 class Series(NamedTuple):
@@ -59,11 +43,11 @@ class Series(NamedTuple):
     statement: Consistency
 
 
-def draw(document: Document) -> Iterator[Figure]:
+def draw(document: Document) -> Iterator[Page]:
     """Draw one page: the axis of the lab in three panels, all axes in a table."""
     result = document.comparison.main
     along = the(result.axis.name)
-    figure, cursor = page(
+    page = Page(
         "Appendix: consistency",
         "Innovations ν of a filter that knows its own variance S are as large as S says (NIS = "
         "ν²/S is 1 in the mean), normal about zero, and do not predict one another. Both filters "
@@ -71,29 +55,22 @@ def draw(document: Document) -> Iterator[Figure]:
     )
     series = _series(result)
     if series:
-        top = cursor.y
-        axes = panel(cursor, "Mean NIS so far, log scale", _nis_words(series), RUNNING)
+        axes = page.panel("Mean NIS so far, log scale", _nis_words(series), RUNNING, above=LEGEND)
         _running(axes, series)
         marks.draw(axes, document)
-        legend_beside_title(axes, top)
-        cursor.skip(36)
-        top, beside = cursor.y, Cursor(figure, cursor.y)
-        left = panel(cursor, "Size: ν / √S", _shape_words(series), BELOW, right=MIDDLE - 0.02)
-        right = panel(
-            beside, "Autocorrelation", _white_words(series), BELOW,
-            left=MIDDLE + 0.05,
-        )  # fmt: skip
-        cursor.y = level((left, right))
+        legend_above(axes)
+        first, second = halves()
+        left = first.panel("Size: ν / √S", _shape_words(series), BELOW, above=LEGEND, left=4.0)
+        right = second.panel("Autocorrelation", _white_words(series), BELOW, above=LEGEND)
         _histogram(left, series)
         _autocorrelation(right, series)
         for axes in (left, right):
-            legend_beside_title(axes, top, handlelength=1.4)
-        cursor.skip(40)
+            legend_above(axes, handlelength=1.4)
+        page.beside(first, second)
     else:
-        cursor.write(f"Along {along}: {_reason(result)}.")
-        cursor.skip(8)
-    _table(cursor, document.comparison.axes.values())
-    yield figure
+        page.write(f"Along {along}: {_reason(result)}.")
+    _table(page, document.comparison.axes.values())
+    yield page
 
 
 def _series(result: AxisComparison) -> list[Series]:
@@ -230,7 +207,7 @@ def _reason(result: AxisComparison) -> str:
     return statement.reason if isinstance(statement, Unavailable) else "too few innovations"
 
 
-def _table(cursor: Cursor, axes: Iterable[AxisComparison]) -> None:
+def _table(page: Page, axes: Iterable[AxisComparison]) -> None:
     """Every axis and filter with its numbers."""
     heads = ("axis", "filter", "n", "mean NIS", "95 % band", "innovation variance", "beyond 2√S",
              "t of mean", "lag 1", "Ljung-Box")  # fmt: skip
@@ -250,8 +227,5 @@ def _table(cursor: Cursor, axes: Iterable[AxisComparison]) -> None:
                     f"{statement.lag1_autocorrelation:+.2f}", p_words(statement.ljung_box_p),
                 )
             )  # fmt: skip
-    cursor.write("All axes", size=9.0, weight="bold")
-    widths = np.array([0.06, 0.055, 0.05, 0.085, 0.105, 0.155, 0.095, 0.085, 0.065, 0.085])
-    edges = LEFT + np.concatenate([[0.0], np.cumsum(widths)[:-1]]) * (RIGHT - LEFT) / widths.sum()
-    cells = list(zip(*rows, strict=True))
-    cursor.columns(dict(zip(edges.tolist(), zip(heads, cells, strict=True), strict=True)))
+    page.heading("All axes", above=12.0)
+    page.table(heads, rows, right=(2, 3, 6, 7, 8))

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-
-import numpy as np
-from matplotlib.figure import Figure
+from collections.abc import Iterator
 
 from px4fuse.comparison.model import (
+    FILTERS,
     AgainstTruth,
     Difference,
-    FilterName,
     FilterSummary,
     UnjudgedFilter,
 )
@@ -20,20 +17,9 @@ from px4fuse.filter.signals import AISLE
 from px4fuse.findings import Finding
 from px4fuse.flight import Unavailable
 from px4fuse.report.document import Document, who
+from px4fuse.report.page import Cell, Page, halves, words
 from px4fuse.report.plan import plan
-from px4fuse.report.style import (
-    BOTTOM,
-    EKF2,
-    LABEL_WIDTH,
-    LEFT,
-    MUTED,
-    OURS,
-    POINTS_PER_HEIGHT,
-    RIGHT,
-    SEVERITY_COLOURS,
-    Cursor,
-    page,
-)
+from px4fuse.report.style import EKF2, MUTED, OURS, SEVERITY_COLOURS
 from px4fuse.report.words import (
     clock_words,
     consequences_words,
@@ -44,66 +30,28 @@ from px4fuse.report.words import (
     verdict_words,
 )
 
-TEXT_X = LEFT + LABEL_WIDTH
-# Points before the map, and for the line that says that findings follow
-BEFORE_MAP, MORE = 14.0, 13.0
-SECOND = 0.5 * (LEFT + RIGHT)  # where the right half of the page begins
-TABLE_SIZE = 7.6
-# Right (numbers) or left (words) edges of the columns of the other axes, fractions of the page
-COLUMNS: tuple[tuple[float, str], ...] = (
-    (LEFT, "left"), (TEXT_X, "left"), (0.385, "right"), (0.47, "right"),
-    (0.515, "left"), (0.73, "right"), (0.815, "right"), (RIGHT, "right"),
-)  # fmt: skip
 EXPLANATION = (
     "Mean NIS is 1 where the innovations are as large as a filter's own variance says; below its "
     "95 % band the variance is overstated, above it understated."
 )
 
 
-def draw(document: Document) -> Iterator[Figure]:
-    """Draw the cover, and a further page where the findings need one."""
-    figure, cursor = page("Two-state Kalman filter against EKF2")
-    cursor.write(_subtitle(document), size=8.0, colour=MUTED)
-    if document.story:
-        cursor.skip(5)
-        for sentence in document.story:
-            cursor.skip(2)
-            cursor.write(sentence, size=10.5)
-    cursor.skip(12)
-    _verdict(cursor, document)
-    _other_axes(cursor, document)
-    cursor.skip(10)
-    above = plan(document, facts(document))
-    cursor.write("Findings", size=10.5, weight="bold")
+def draw(document: Document) -> Iterator[Page]:
+    """Draw the cover; findings that it has no room for go to the next page."""
+    page = Page("Two-state Kalman filter against EKF2")
+    page.foot(plan(document, facts(document)))
+    page.write(_subtitle(document), colour=MUTED, above=-4.0)
+    for sentence in document.story:
+        page.write(sentence, size=10.5, above=2.0)
+    page.skip(8.0)
+    _verdict(page, document)
+    _other_axes(page, document)
+    page.heading("Findings", 10.5, above=12.0)
     if not document.findings:
-        cursor.write("None: no detector has anything to say about this flight.")
-    room = cursor.y - BOTTOM - above.least(cursor) - BEFORE_MAP / POINTS_PER_HEIGHT
-    heights = np.cumsum([_finding_height(cursor, finding) for finding in document.findings])
-    fitting = int(np.searchsorted(heights, room))
-    if fitting < len(heights):
-        fitting = int(np.searchsorted(heights, room - MORE / POINTS_PER_HEIGHT))
-    for finding in document.findings[:fitting]:
-        write_finding(cursor, finding)
-    rest = document.findings[fitting:]
-    if rest:
-        cursor.skip(3)
-        more = f"{len(rest)} of {len(document.findings)} findings: next page."
-        cursor.write(more, x=TEXT_X, size=7.5, colour=MUTED)
-    cursor.skip(BEFORE_MAP)
-    above.draw(cursor)
-    yield figure
-    if rest:
-        yield from _continued(rest)
-
-
-def _continued(findings: tuple[Finding, ...]) -> Iterator[Figure]:
-    figure, cursor = page("Findings, continued")
-    for finding in findings:
-        if cursor.y - _finding_height(cursor, finding) < BOTTOM:
-            yield figure
-            figure, cursor = page("Findings, continued")
-        write_finding(cursor, finding)
-    yield figure
+        page.write("None: no detector has anything to say about this flight.")
+    for finding in document.findings:
+        write_finding(page, finding)
+    yield page
 
 
 def _subtitle(document: Document) -> str:
@@ -112,42 +60,33 @@ def _subtitle(document: Document) -> str:
     return " · ".join(filter(None, (who(document.student, ", "), *about)))
 
 
-def _verdict(cursor: Cursor, document: Document) -> None:
+def _verdict(page: Page, document: Document) -> None:
     """The main axis, large: each filter on its half of the page."""
     result = document.comparison.main
     along = the(result.axis.name)
-    top = cursor.y
-    ends = []
-    places: tuple[tuple[str, FilterName, str, float, float], ...] = (
-        ("our filter's", "kf", OURS, LEFT, SECOND),
-        ("EKF2's", "ekf2", EKF2, SECOND, RIGHT),
-    )
-    for owner, name, colour, left, right in places:
+    columns = []
+    for owner, name, colour in zip(("our filter's", "EKF2's"), FILTERS, (OURS, EKF2), strict=True):
         if name == "ekf2" and isinstance(result.ekf2_state, Unavailable):
             continue
-        cursor.y = top
         statement = result.filters[name]
-        label = f"Along {along} {owner} variance is"
         shade = colour if isinstance(statement, Consistency) else MUTED
-        cursor.write(label, size=8.0, x=left, right=right)
-        cursor.write(verdict_words(statement), size=16.0, weight="bold", colour=shade, x=left)
-        cursor.skip(2)
-        cursor.write(_large_numbers(statement), size=8.0, x=left, right=right - 0.02)
-        ends.append(cursor.y)
-    cursor.y = min(ends)
-    cursor.skip(2)
+        column, _ = halves()
+        column.write(f"Along {along} {owner} variance is")
+        column.write(verdict_words(statement), size=16.0, bold=True, colour=shade, above=1.0)
+        column.write(_large_numbers(statement), above=1.0)
+        columns.append(column)
+    page.beside(*columns)
     if isinstance(result.difference, Difference):
         part = result.difference
-        cursor.write(
+        page.write(
             f"Ours - EKF2: {' m and '.join(difference_cells(part))} m/s RMS, "
             f"at most {part.position_maximum_m:.2f} m."
             + ("" if document.truth_known else " The log has no truth to say who is right."),
-            size=8.0,
+            above=2.0,
         )
     elif isinstance(result.ekf2_state, Unavailable):
-        cursor.write(f"There is no EKF2 to compare with: {result.ekf2_state.reason}.", size=8.0)
-    cursor.skip(2)
-    cursor.write(EXPLANATION, size=7.0, colour=MUTED)
+        page.write(f"There is no EKF2 to compare with: {result.ekf2_state.reason}.", above=2.0)
+    page.write(EXPLANATION, size=7.0, colour=MUTED)
 
 
 def _large_numbers(statement: FilterSummary | UnjudgedFilter) -> str:
@@ -162,42 +101,24 @@ def _large_numbers(statement: FilterSummary | UnjudgedFilter) -> str:
     return words
 
 
-def _other_axes(cursor: Cursor, document: Document) -> None:
+def _other_axes(page: Page, document: Document) -> None:
     """The axes beside the main one, a row each."""
     others = [
         axis for axis in document.analysis.axes.values() if axis is not document.analysis.main
     ]
     if not others:
         return
-    to_truth = "to truth (m)" if document.truth_known else ""
     beside = not isinstance(document.comparison.main.ekf2_state, Unavailable)
-    names = ("variance", "mean NIS", to_truth)
-    blank = ("",) * 3
-    cursor.skip(5)
-    _row(cursor, ("", "our filter", "", "", "EKF2" if beside else "", "", "", ""), [MUTED] * 8)
-    apart = "ours - EKF2 (m)" if beside else ""
-    _row(cursor, ("axis", *names, *(names if beside else blank), apart), [MUTED] * 8)
-    cursor.skip(2.5)
-    cursor.rule()
-    colours = ["black", *[OURS] * 3, *[EKF2] * 3, "black"]
+    names = ["variance", "mean NIS", *(["to truth (m)"] if document.truth_known else [])]
+    head = ["axis", *(f"ours: {name}" for name in names)]
+    head += [*(f"EKF2: {name}" for name in names), "ours - EKF2 (m)"] if beside else []
+    rows = []
     for result in others:
-        cells = (
-            result.axis.name,
-            *_cells(result.filters["kf"]),
-            *(_cells(result.filters["ekf2"]) if beside else blank),
-            difference_cells(result.difference)[0],
-        )
-        _row(cursor, cells, colours)
-
-
-def _row(cursor: Cursor, cells: Sequence[str], colours: Sequence[str]) -> None:
-    cursor.y -= TABLE_SIZE * 1.4 / POINTS_PER_HEIGHT
-    for (x, align), text, colour in zip(COLUMNS, cells, colours, strict=True):
-        if text:
-            cursor.figure.text(
-                x, cursor.y, text, size=TABLE_SIZE, ha=align, va="baseline", color=colour,
-                weight="bold" if text.startswith(("over", "under")) else "normal",
-            )  # fmt: skip
+        row: list[Cell] = [result.axis.name]
+        for name, colour in zip(FILTERS[: 1 + beside], (OURS, EKF2), strict=False):
+            row += [(cell, colour) for cell in _cells(result.filters[name])[: len(names)]]
+        rows.append([*row, difference_cells(result.difference)[0]] if beside else row)
+    page.table(head, rows)
 
 
 def _cells(statement: FilterSummary | UnjudgedFilter) -> tuple[str, str, str]:
@@ -231,29 +152,12 @@ def facts(document: Document) -> list[tuple[str, str]]:
     return [(label, text) for label, text in listed if text]
 
 
-def _finding_height(cursor: Cursor, finding: Finding) -> float:
-    text = sum(cursor.height(part, x=TEXT_X, size=size) for part, size in _finding_parts(finding))
-    beside = cursor.height(finding.severity, size=7.5) + cursor.height(
-        finding.when, size=6.5, right=TEXT_X - 0.01
-    )
-    return max(text, beside) + 4.0 / POINTS_PER_HEIGHT
-
-
-def _finding_parts(finding: Finding) -> list[tuple[str, float]]:
-    parts = [(finding.message, 8.0), (finding.remedy, 7.5)]
-    return [*parts, (consequences_words(finding), 7.5)] if finding.consequences else parts
-
-
-def write_finding(cursor: Cursor, finding: Finding) -> None:
+def write_finding(page: Page, finding: Finding) -> None:
     """Write severity, when it shows, sentence and remedy."""
-    cursor.skip(4)
-    top = cursor.y
-    cursor.write(
-        finding.severity, size=7.5, weight="bold", colour=SEVERITY_COLOURS[finding.severity]
-    )
-    if finding.when:
-        cursor.write(finding.when, size=6.5, colour=MUTED, right=TEXT_X - 0.01)
-    beside, cursor.y = cursor.y, top
-    for text, size in _finding_parts(finding):
-        cursor.write(text, x=TEXT_X, size=size, colour="black" if size == 8.0 else MUTED)
-    cursor.y = min(cursor.y, beside)
+    said = [words(finding.message, 8.0), words(finding.remedy, 7.5, MUTED)]
+    if finding.consequences:
+        said.append(words(consequences_words(finding), 7.5, MUTED))
+    page.labelled(
+        f"{finding.severity}\n{finding.when}", size=7.0, beside=said, above=2.0,
+        colour=SEVERITY_COLOURS[finding.severity],
+    )  # fmt: skip

@@ -6,6 +6,7 @@ import io
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from importlib import metadata
+from textwrap import fill
 from typing import Any
 
 import matplotlib as mpl
@@ -33,26 +34,17 @@ from px4fuse.report.evaluation_words import (
     zero_s,
 )
 from px4fuse.report.loop_words import score_words, track_words
+from px4fuse.report.page import WIDTH, Page, halves, legend_above
 from px4fuse.report.style import (
-    BOTTOM,
     EKF2,
-    LEFT,
     MAX_POINTS_NARROW,
     MUTED,
     OURS,
-    POINTS_PER_HEIGHT,
-    POINTS_PER_WIDTH,
-    RIGHT,
     SEVERITY_COLOURS,
     TRUTH,
-    Cursor,
-    caption,
     empty,
-    page,
-    printable,
     report_style,
     thin,
-    wrap,
 )
 from px4fuse.trajectory.evaluation import Evaluation
 from px4fuse.trajectory.model import AXES_OF_FRAME, MIN_POSES, Frame
@@ -75,13 +67,9 @@ GAP_SHARE = 0.01
 PIECES = 1200
 # Axes of errors reach at least this far: rounding is no error to look at
 LEAST_SCALE_M = 1e-3
-# In points: heights of a panel, of one that has a page for itself, of the words below it, of a
-# title and of a line of words
-PANEL, TALL, BELOW, TITLE, LINE = 84.0, 190.0, 52.0, 16.0, 8.9
-# The least and the largest height of the maps with their words
-LEAST_MAPS, MOST_MAPS = 215.0, 480.0
+# In points: heights of a panel, of the maps and of a legend, and between the maps
+HEIGHT, MAPS, GAP = 78.0, 150.0, 16.0
 MOST_CURVES, MOST_BOXES = 3, 12
-TABLE_EDGES = (LEFT, 0.21, 0.30, 0.43, 0.51, 0.59, 0.67, 0.75, 0.82)
 TABLE_HEADS = (
     "error", "RMSE", "95 % interval", "mean", "median", "std", "max", "n", "rotation RMSE (°)",
 )  # fmt: skip
@@ -97,7 +85,7 @@ CURVES: tuple[dict[str, Any], ...] = (
     {"color": "#4f7fb5", "lw": 0.9, "ls": (0, (4, 1))},
     {"color": OURS, "lw": 1.1},
 )
-PICTURE_INCHES, PICTURE_DPI = (10.0, 5.4), 150
+PICTURE_INCHES, PICTURE_DPI, PICTURE_LETTERS = (10.0, 5.4), 150, 115
 
 
 def _darkening() -> Colormap:
@@ -140,52 +128,34 @@ def views(score: Evaluation) -> list[View]:
     return seen
 
 
-def draw(document: EvaluationDocument) -> Iterator[Figure]:
+def draw(document: EvaluationDocument) -> Iterator[Page]:
     """Draw the page, and another where the table of a run over many deltas fills the first."""
     score = document.score
-    figure, cursor = page(
+    page = Page(
         "Trajectory error",
         "APE: how far a pose is from the reference; over all poses, the ATE. RPE: how wrong a "
         "motion over a delta is.",
     )
-    cursor.write(summary(score), size=9.0, weight="bold")
-    cursor.skip(3)
+    page.write(summary(score), size=9.0, bold=True)
     for text in (
         f"Estimate {track_words(score.estimate)}. Reference {track_words(score.reference)}.",
         f"{score_words(score)}.".replace("alignment", "Alignment", 1),
     ):
-        cursor.write(text, size=7.2, colour=MUTED)
+        page.write(text, size=7.2, colour=MUTED, above=-1.0)
     for text in score.warnings:
-        cursor.write(text, size=8.0, weight="bold", colour=SEVERITY_COLOURS["warning"])
-    cursor.skip(6)
-    for cells in (TABLE_HEADS, *score_rows(score)):
-        if cursor.y < BOTTOM + 0.03:
-            yield figure
-            figure, cursor = page("Trajectory error, continued")
-        cursor.row(TABLE_EDGES, cells, head=cells is TABLE_HEADS)
-    cursor.skip(2)
-    cursor.write(" ".join([*reasons(score), *score.notes]), size=7.0, colour=MUTED)
-    cursor.skip(4)
-    panels = 2 * (TITLE + PANEL + BELOW) + TITLE
-    free = (cursor.y - BOTTOM) * POINTS_PER_HEIGHT
-    if free < LEAST_MAPS:
-        yield figure
-        figure, cursor = page("Trajectory error: where and when")
-        free = (cursor.y - BOTTOM) * POINTS_PER_HEIGHT
-    is_one_page = free - panels >= LEAST_MAPS
-    _maps(figure, cursor, score, min(free - panels if is_one_page else free, MOST_MAPS))
-    if not is_one_page:
-        yield figure
-        figure, cursor = page("Trajectory error: when")
-    _panels(figure, cursor, score, PANEL if is_one_page else TALL)
-    yield figure
+        page.write(text, bold=True, colour=SEVERITY_COLOURS["warning"])
+    page.table(TABLE_HEADS, score_rows(score))
+    page.numbers(" ".join([*reasons(score), *score.notes]))
+    _maps(page, score)
+    _panels(page, score)
+    yield page
 
 
 def picture(score: Evaluation) -> bytes:
     """The path by error, APE over time and RPE per delta, as PNG for a slide or a notebook."""
     with report_style():
         figure = Figure(figsize=PICTURE_INCHES)
-        title = "\n".join(wrap(printable(summary(score)), 9.5, PICTURE_INCHES[0] * 69, "bold"))
+        title = fill(summary(score), PICTURE_LETTERS)
         figure.text(0.015, 0.985, title, size=9.5, weight="bold", va="top")
         axes = figure.add_axes((0.06, 0.14, 0.40, 0.74), title="the path, by its error (APE)")
         scale = figure.add_axes((0.475, 0.14, 0.012, 0.74))
@@ -205,43 +175,34 @@ def picture(score: Evaluation) -> bytes:
     return out.getvalue()
 
 
-def _maps(figure: Figure, cursor: Cursor, score: Evaluation, points: float) -> None:
+def _maps(page: Page, score: Evaluation) -> None:
     """The two as they stand, and the aligned path by its error, from one or two sides."""
     seen = views(score)
     is_aligned = score.alignment != "none"
-    said = [*([before_words(score)] if is_aligned else []), after_words(score)]
-    said += [_side_words(score, side) for side in seen[1:]]
-    shares = [*([1.0] if is_aligned else []), *(1.5 for _ in seen)]
-    left, right, gap = LEFT + 0.02, RIGHT - 0.065, 0.055
-    width = (right - left - gap * (len(shares) - 1)) / sum(shares)
-    lines = max(
-        len(wrap(text, 7.0, width * share * POINTS_PER_WIDTH))
-        for text, share in zip(said, shares, strict=True)
-    )
-    words = 24.0 + LINE * lines
-    height = (points - TITLE - words - TITLE) / POINTS_PER_HEIGHT
-    cursor.skip(TITLE)
-    cursor.y -= height
-    places = []
-    for share in shares:
-        places.append(figure.add_axes((left, cursor.y, width * share, height)))
-        left += width * share + gap
-    scale = figure.add_axes((right + 0.012, cursor.y, 0.011, height))
-    title = "after alignment, by error" if is_aligned else "by error"
-    after = places[int(is_aligned) :]
-    for axes, view in zip(after, seen, strict=True):
-        axes.set_title(f"{title}, {view.title}")
-        _path(axes, score, view, scale if view is seen[0] else None)
-    handles, labels = after[0].get_legend_handles_labels()
+    title = "After alignment, by error" if is_aligned else "By error"
+    parts = [(f"{title}, {view.title}", _side_words(score, view)) for view in seen]
+    parts[0] = (parts[0][0], after_words(score))
     if is_aligned:
-        _before(places[0], score, seen[0])
-        first, names = places[0].get_legend_handles_labels()
-        handles, labels = [first[-1], *handles], [names[-1], *labels]
-    for axes, text in zip(places, said, strict=True):
-        caption(axes, text)
-    cursor.skip(words + TITLE)
-    figure.legend(handles, labels, loc="lower left", ncols=6, borderaxespad=0.0,
-                  bbox_to_anchor=(LEFT + 0.02, cursor.y))  # fmt: skip
+        parts.insert(0, ("Before alignment", before_words(score)))
+    width = (WIDTH - GAP * (len(parts) - 1)) / len(parts)
+    columns = [Page(width=width) for _ in parts]
+    panels = [
+        column.panel(head, "", MAPS, left=34.0, right=34.0 if column is columns[-1] else 4.0)
+        for column, (head, _) in zip(columns, parts, strict=True)
+    ]
+    after = panels[int(is_aligned) :]
+    for axes, view in zip(after, seen, strict=True):
+        scale = axes.inset_axes((1.02, 0.0, 0.03, 1.0)) if axes is after[-1] else None
+        _path(axes, score, view, scale)
+    if is_aligned:
+        _before(panels[0], score, seen[0])
+    entries = dict(zip(*after[0].get_legend_handles_labels()[::-1], strict=True))
+    if is_aligned:
+        entries = dict(zip(*panels[0].get_legend_handles_labels()[::-1], strict=True)) | entries
+    page.legend(list(entries.values()))
+    for column, (_, text) in zip(columns, parts, strict=True):
+        column.numbers(text)
+    page.beside(*columns, gap=GAP)
 
 
 def _side_words(score: Evaluation, side: View) -> str:
@@ -258,7 +219,6 @@ def _side_words(score: Evaluation, side: View) -> str:
 
 
 def _before(axes: Axes, score: Evaluation, view: View) -> None:
-    axes.set_title("before alignment")
     matched = score.association
     for track, style, label in (
         (matched.reference, REFERENCE, "reference"),
@@ -307,39 +267,29 @@ def _framed(axes: Axes, score: Evaluation, view: View) -> None:
         axes.invert_yaxis()
 
 
-def _panels(figure: Figure, cursor: Cursor, score: Evaluation, points: float) -> None:
+def _panels(page: Page, score: Evaluation) -> None:
     """APE over time and over distance; RPE over time and per delta."""
-    height, gap = points / POINTS_PER_HEIGHT, 0.06
-    width = (RIGHT - LEFT - 0.02 - gap) / 2
-    rows = []
-    cursor.skip(TITLE)  # for the legend of both panels on the APE
-    for _ in range(2):
-        cursor.skip(TITLE)
-        cursor.y -= height
-        rows.append(
-            [figure.add_axes((LEFT + 0.02 + k * (width + gap), cursor.y, width, height))
-             for k in range(2)]
-        )  # fmt: skip
-        cursor.skip(BELOW)
-    (over_time, over_distance), (relative, boxes) = rows
     zero = zero_s(score)
-    over_time.set_title("APE over time (m)")
-    _absolute(over_time, score, score.time_s - zero)
-    over_time.set_xlabel(_time_label(score))
-    caption(over_time, time_words(score))
-    over_distance.set_title("APE over distance (m)")
-    _absolute(over_distance, score, score.distance_m)
-    over_distance.set_xlabel("distance along the reference (m)")
-    caption(over_distance, distance_words(score))
-    handles, labels = over_time.get_legend_handles_labels()
-    above = over_time.get_position().y1 + TITLE / POINTS_PER_HEIGHT
-    figure.legend(handles, labels, loc="lower left", ncols=4, borderaxespad=0.0,
-                  bbox_to_anchor=(LEFT + 0.02, above))  # fmt: skip
-    _relative(relative, score)
-    boxes.set_title("RPE per delta (m)")
-    _boxes(boxes, score)
+    left, right = halves()
+    axes = left.panel("APE over time (m)", "", HEIGHT)
+    _absolute(axes, score, score.time_s - zero)
+    axes.set_xlabel(_time_label(score))
+    page.legend(axes.get_legend_handles_labels()[0])
+    left.numbers(time_words(score))
+    axes = right.panel("APE over distance (m)", "", HEIGHT)
+    _absolute(axes, score, score.distance_m)
+    axes.set_xlabel("distance along the reference (m)")
+    right.numbers(distance_words(score))
+    page.beside(left, right)
+    left, right = halves()
+    axes = left.panel("RPE over time (m)", "", HEIGHT, above=14.0)
+    if shown := _relative(axes, score):
+        left.numbers(relative_words(shown, score.time_s, zero))
+    axes = right.panel("RPE per delta (m)", "", HEIGHT, above=14.0)
+    _boxes(axes, score)
     if any(isinstance(error.translation, Statistics) for error in score.rpe):
-        caption(boxes, growth_words(score.rpe))
+        right.numbers(growth_words(score.rpe))
+    page.beside(left, right)
 
 
 def _absolute(axes: Axes, score: Evaluation, along: Array) -> None:
@@ -351,13 +301,12 @@ def _absolute(axes: Axes, score: Evaluation, along: Array) -> None:
     _from_zero(axes, along, float(score.position_error_m.max()))
 
 
-def _relative(axes: Axes, score: Evaluation) -> None:
-    """RPE over time, of the distances where there are any."""
-    axes.set_title("RPE over time (m)")
+def _relative(axes: Axes, score: Evaluation) -> list[RelativeError]:
+    """RPE over time, of the distances where there are any; returns what is shown."""
     known = [e for e in score.rpe if isinstance(e.translation, Statistics)]
     if not known:
         _none(axes, score)
-        return
+        return []
     unit = "m" if any(e.delta.unit == "m" for e in known) else known[0].delta.unit
     shown = [e for e in known if e.delta.unit == unit][-MOST_CURVES:]
     zero = zero_s(score)
@@ -365,10 +314,9 @@ def _relative(axes: Axes, score: Evaluation) -> None:
         ends = score.time_s[error.end]
         _line(axes, ends - zero, error.translation_error_m, ends, label=f"{error.delta}", **style)
     _from_zero(axes, score.time_s - zero, max(float(e.translation_error_m.max()) for e in shown))
-    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3, borderaxespad=0.1,
-                handlelength=1.8, columnspacing=1.0)  # fmt: skip
+    legend_above(axes, handlelength=1.8)
     axes.set_xlabel(_time_label(score))
-    caption(axes, relative_words(shown, score.time_s, zero))
+    return shown
 
 
 def _boxes(axes: Axes, score: Evaluation) -> None:

@@ -6,8 +6,8 @@ from collections.abc import Iterator
 
 import numpy as np
 import pandas as pd
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
@@ -17,37 +17,30 @@ from px4fuse.comparison.why_words import the
 from px4fuse.flight import Unavailable
 from px4fuse.report import marks
 from px4fuse.report.document import Document
+from px4fuse.report.page import Page
 from px4fuse.report.style import (
-    BOTTOM,
     EKF2_LINE,
-    LEFT,
     MAX_POINTS,
     MEASURED,
     OURS_BAND,
     OURS_LINE,
-    POINTS_PER_HEIGHT,
     TIME_LABEL,
     TRUTH_LINE,
-    Cursor,
     bare_x,
-    below,
-    page,
-    panel,
     thin,
 )
 from px4fuse.report.why import nothing_concluded
 
-# Titles, sentences, numbers and gaps of one panel, in points
-AROUND = 62.0
-TALLEST = 200.0
+# Of the axes, in points
+HEIGHT = 150.0
 
 
-def draw(document: Document) -> Iterator[Figure]:
+def draw(document: Document) -> Iterator[Page]:
     """Draw one page."""
     result = document.comparison.main
     along = the(result.axis.name)
-    figure, cursor = page(f"The flight along {along}")
-    legend(figure, cursor, document)
+    page = Page(f"The flight along {along}")
+    legend(page, document)
     reference = error_reference(result)
     panels = [
         (f"Position along {along} (m)", position_words(result), draw_position, position_numbers),
@@ -57,33 +50,26 @@ def draw(document: Document) -> Iterator[Figure]:
         truth = reference is result.truth
         title = "Error: position - truth (m)" if truth else "Difference: ours - EKF2 (m)"
         panels.append((title, error_words(result), draw_error, error_numbers))
-    reasons = [nothing_concluded(document)]
-    if isinstance(reference, Unavailable):
-        reasons.append(f"No error is drawn: {reference.reason}. {reference.remedy}")
-    foot = sum(cursor.height(reason) for reason in filter(None, reasons))
-    room = (cursor.y - foot - BOTTOM) * POINTS_PER_HEIGHT - 20.0
-    height = min(room / len(panels) - AROUND, TALLEST)
     for place, (title, say, draw_panel, numbers) in enumerate(panels):
         strip = place == 0 and bool(document.events.modes)
-        axes = panel(cursor, title, say, height, above=12.0 if strip else 4.0)
+        axes = page.panel(title, say, HEIGHT, above=12.0 if strip else 4.0)
         draw_panel(axes, result, MAX_POINTS)
         marks.draw(axes, document, strip=strip)
         if place < len(panels) - 1:
             bare_x(axes)
-            below(cursor, numbers(result), points=4.0)
         else:
             axes.set_xlabel(TIME_LABEL)
-            below(cursor, numbers(result), points=23.0)
-        cursor.skip(10)
-    for reason in filter(None, reasons):
-        cursor.write(reason)
-    yield figure
+        page.numbers(numbers(result))
+    page.write(nothing_concluded(document), above=6.0)
+    if isinstance(reference, Unavailable):
+        page.write(f"No error is drawn: {reference.reason}. {reference.remedy}", above=6.0)
+    yield page
 
 
-def legend(figure: Figure, cursor: Cursor, document: Document) -> None:
-    """Write the legend of lines and marks that holds for all pages; the cursor moves below it."""
+def legend(page: Page, document: Document) -> None:
+    """Write the legend of lines and marks that holds for all pages."""
     result = document.comparison.main
-    lines = [
+    lines: list[Artist] = [
         Line2D([], [], **{**MEASURED, "ms": 5.0}, label="measurement"),
         Line2D([], [], **OURS_LINE, label="ours"),
         Patch(facecolor=OURS_BAND, lw=0, label="ours ±2σ"),
@@ -92,15 +78,7 @@ def legend(figure: Figure, cursor: Cursor, document: Document) -> None:
         lines.append(Line2D([], [], **EKF2_LINE, label="EKF2"))
     if isinstance(result.truth, pd.DataFrame):
         lines.append(Line2D([], [], **TRUTH_LINE, label="truth"))
-    for entries in (lines, marks.handles(document)):
-        if entries:
-            figure.legend(
-                handles=entries, loc="upper left", ncols=len(entries), borderaxespad=0.0,
-                borderpad=0.0, bbox_to_anchor=(LEFT, cursor.y), handlelength=2.0,
-                columnspacing=1.2,
-            )  # fmt: skip
-            cursor.skip(13)
-    cursor.skip(4)
+    page.legend(lines, marks.handles(document))
 
 
 def error_reference(result: AxisComparison) -> pd.DataFrame | Unavailable:

@@ -1,7 +1,7 @@
 """Fonts for names and notes in every script: which of this machine draw a text, or what to install.
 
-Matplotlib shapes text with HarfBuzz from version 3.11, so that Arabic joins, Devanagari orders and
-Thai stacks as they should. What it needs is a font that has the characters.
+Typst shapes text, so that Arabic joins, Devanagari orders and Thai stacks as they should. What it
+needs is a font that has the characters.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 import sys
 import unicodedata
 from functools import cache
+from pathlib import Path
 
 from matplotlib import font_manager
 from matplotlib.font_manager import FontEntry, FontPath
@@ -50,6 +51,13 @@ def families(text: str) -> list[str]:
     """Fonts that draw a text, DejaVu Sans first."""
     found = [font_of(character) for character in _foreign(text)]
     return list(dict.fromkeys([FONT, *(name for name in found if name is not None)]))
+
+
+def folders(names: tuple[str, ...]) -> list[str]:
+    """Folders that hold the files of some fonts."""
+    paths = {name: path for name, path in _others() if name in names} if len(names) > 1 else {}
+    found = [font_manager.findfont(FONT), *paths.values()]
+    return list(dict.fromkeys(str(Path(str(path)).parent) for path in found))
 
 
 def missing(text: str) -> str:

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
 from px4fuse.arrays import Array
@@ -20,6 +19,7 @@ from px4fuse.filter.signals import Segment
 from px4fuse.flight import Unavailable
 from px4fuse.report import marks
 from px4fuse.report.document import Document
+from px4fuse.report.page import Page, halves
 from px4fuse.report.style import (
     EKF2,
     EKF2_DOTS,
@@ -32,11 +32,7 @@ from px4fuse.report.style import (
     OURS_DOTS,
     OURS_LINE,
     TIME_LABEL,
-    Cursor,
     bare_x,
-    below,
-    page,
-    panel,
     thin,
 )
 from px4fuse.report.words import verdict_notes, verdict_words
@@ -50,24 +46,23 @@ ZOOM_RANGE_S = (1.0, 12.0)
 # Of the updates that a zoom of its length can hold, it must hold this share
 ZOOM_FILLED = 0.8
 START_S = 5.0
-ZOOM_RIGHT, START_LEFT = 0.635, 0.715
+ZOOM_SHARE = 0.66  # of the page
 # Heights of the axes in points
-INNOVATIONS, SIGMA_P, SIGMA_V, ZOOM = 140.0, 80.0, 60.0, 140.0
+INNOVATIONS, SIGMA_P, SIGMA_V, ZOOM = 140.0, 80.0, 60.0, 125.0
 
 
-def draw(document: Document) -> Iterator[Figure]:
+def draw(document: Document) -> Iterator[Page]:
     """Draw one page: innovations, σ_p and σ_v on one time axis, then the zooms."""
     result = document.comparison.main
-    figure, cursor = page(f"Innovations and variances along {the(result.axis.name)}")
-    axes = panel(
-        cursor, "Innovation = measurement - prediction (m)", innovation_words(result), INNOVATIONS,
+    page = Page(f"Innovations and variances along {the(result.axis.name)}")
+    axes = page.panel(
+        "Innovation = measurement - prediction (m)", innovation_words(result), INNOVATIONS,
         above=12.0 if document.events.modes else 4.0,
     )  # fmt: skip
     draw_innovations(axes, result, MAX_POINTS)
     marks.draw(axes, document, axis="", strip=True)
     bare_x(axes)
-    below(cursor, innovation_numbers(result, axes.get_ylim()[1]), points=4.0)
-    cursor.skip(8)
+    page.numbers(innovation_numbers(result, axes.get_ylim()[1]))
     for title, say, height, column in (
         (
             "Standard deviation of position (m), log scale",
@@ -82,44 +77,31 @@ def draw(document: Document) -> Iterator[Figure]:
             "velocity_variance_m2_s2",
         ),
     ):
-        axes = panel(cursor, title, say, height)
+        axes = page.panel(title, say, height)
         draw_sigma(axes, result, MAX_POINTS, column)
         marks.draw(axes, document)
         if column.startswith("position"):
             bare_x(axes)
         else:
             axes.set_xlabel(TIME_LABEL)
-            cursor.skip(22)
-        cursor.skip(10)
-    _zooms(cursor, document)
+    _zooms(page, document)
     for note in verdict_notes(document.comparison):
-        below(cursor, note, points=2.0)
-    yield figure
+        page.numbers(note)
+    yield page
 
 
-def _zooms(cursor: Cursor, document: Document) -> None:
+def _zooms(page: Page, document: Document) -> None:
     """Two zooms beside one another: in flight, and from the start."""
     result, segment = document.comparison.main, document.comparison.segment
-    top = cursor.y
     window = zoom_window(result, segment)
-    start = panel(
-        cursor, "The first seconds, log scale", start_words(result), ZOOM, left=START_LEFT,
-        above=7.0,
-    )  # fmt: skip
-    bottom, cursor.y = cursor.y, top
-    axes = panel(
-        cursor,
+    left, right = halves(ZOOM_SHARE)
+    axes = left.panel(
         f"Standard deviation of position (m), {window[1] - window[0]:.1f} s of the flight",
         zoom_words(result),
         ZOOM,
-        right=ZOOM_RIGHT,
-        above=7.0,
     )
-    low = min(bottom, cursor.y)
-    for each in (axes, start):
-        box = each.get_position()
-        each.set_position((box.x0, low, box.width, box.y1 - low))
-    cursor.y = low
+    start = right.panel("The first seconds, log scale", start_words(result), ZOOM)
+    page.beside(left, right)
     _sawtooth(axes, result, window)
     first = float(result.replay.steps.index[0])
     _sawtooth(start, result, (first, min(first + START_S, segment.end_s)))
@@ -130,14 +112,13 @@ def _zooms(cursor: Cursor, document: Document) -> None:
     axes.vlines(inside, 0.0, 0.03, transform=axes.get_xaxis_transform(), color=MEASUREMENT, lw=1.2)
     axes.set_xlabel(TIME_LABEL)
     start.set_xlabel("time (s)")
-    cursor.skip(22)
     shown = []
     if isinstance(result.ekf2_innovations, pd.DataFrame):
         shown += ["triangle up just before an update", "down just after"]
     if isinstance(result.ekf2_variance, pd.DataFrame):
         shown.append("square as logged")
     ekf2 = f" EKF2: {', '.join(shown)}." if shown else ""
-    below(cursor, f"Line: our filter, predict and update; grey ticks: measurements.{ekf2}")
+    page.numbers(f"Line: our filter, predict and update; grey ticks: measurements.{ekf2}")
 
 
 def _limit(result: AxisComparison) -> float:

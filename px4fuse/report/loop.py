@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from px4fuse.findings import Finding
@@ -29,22 +28,8 @@ from px4fuse.report.loop_words import (
     score_words,
     statistics_words,
 )
-from px4fuse.report.style import (
-    BOTTOM,
-    EKF2,
-    LEFT,
-    MUTED,
-    OURS,
-    POINTS_PER_HEIGHT,
-    RIGHT,
-    ROW_SIZE,
-    TRUTH_LINE,
-    Cursor,
-    appendix,
-    caption,
-    page,
-    thin,
-)
+from px4fuse.report.page import AXIS_LABEL, TICKS, Cell, Page, appendix, legend_above
+from px4fuse.report.style import EKF2, MUTED, OURS, SEVERITY_COLOURS, TRUTH_LINE, bare_x, thin
 from px4fuse.trajectory.evaluation import AbsoluteError, Evaluation
 from px4fuse.trajectory.graph.analysis import SOLUTIONS
 from px4fuse.trajectory.model import AXES_OF_FRAME
@@ -58,18 +43,18 @@ STYLES: Mapping[str, dict[str, Any]] = {
     SOLUTIONS["gated"]: {"color": OURS, "lw": 1.2, "ls": "-"},
     SOLUTIONS["all"]: {"color": "#8d6a9f", "lw": 0.9, "ls": (0, (2, 1))},
 }
-MAP_MIN_HEIGHT = 0.30
 MAP_POINTS = 2000
+MAP, HEIGHT, LEGEND = 290.0, 105.0, 30.0  # of the axes, and of a legend, in points
 
 
-def draw(document: Document) -> Iterator[Figure]:
+def draw(document: Document) -> Iterator[Page]:
     """Draw the loop's pages; none where the flight holds no loop."""
     loop = document.analysis.loop
     if isinstance(loop, Loop):
         yield from draw_loop(loop, name=appendix)
 
 
-def draw_report(document: LoopDocument) -> Iterator[Figure]:
+def draw_report(document: LoopDocument) -> Iterator[Page]:
     """Draw the pages of a report on a loop alone, its findings on the first."""
     yield from draw_loop(document.loop, document.findings, document.facts)
 
@@ -79,9 +64,9 @@ def draw_loop(
     findings: tuple[Finding, ...] = (),
     facts: tuple[tuple[str, str], ...] = (),
     name: Callable[[str], str] = str,
-) -> Iterator[Figure]:
+) -> Iterator[Page]:
     """Draw the pages about one loop, their titles made by ``name``."""
-    figure, cursor = page(
+    page = Page(
         name("Loop closure"),
         "A path that truly returns must close; the gap is what the odometry drifted. Each "
         "correction spreads it over the path: by distance (positions only as in the lesson's "
@@ -89,52 +74,43 @@ def draw_loop(
         "that is not true would warp the whole path, so that each one is tested before its use.",
     )
     for label, text in (*facts, *loop_lines(loop)):
-        cursor.labelled(label, text)
+        page.labelled(label, text)
     for text in (by_distance_words(loop), redundancy_words(loop), *refusals(loop)):
-        if text:
-            cursor.skip(2)
-            cursor.write(text, colour=MUTED)
+        page.write(text, colour=MUTED, above=2.0)
     for finding in findings:
-        write_finding(cursor, finding)
-    cursor.skip(8)
-    _table(cursor, loop)
-    if cursor.y - BOTTOM < MAP_MIN_HEIGHT:
-        yield figure
-        figure, cursor = page(name("Loop closure: the map"))
-    cursor.skip(10)
-    _map(cursor, loop)
-    yield figure
-    figure, cursor = page(
+        write_finding(page, finding)
+    page.skip(6.0)
+    _table(page, loop)
+    _map(page, loop)
+    yield page
+    page = Page(
         name("Along the path"),
         "How far each correction moved each pose, and how far the path is from the reference after "
         "alignment. A correction that helps brings the error down along most of the path, not only "
         "at its end.",
     )
-    _along(cursor, loop)
-    yield figure
-    yield from _scores(loop, name)
+    _along(page, loop)
+    yield page
+    yield _scores(loop, name)
 
 
-def _table(cursor: Cursor, loop: Loop) -> None:
+def _table(page: Page, loop: Loop) -> None:
     """Every path with how far it moved and its ATE against each reference."""
     references = [reference.name for reference in loop.references]
-    edges = [LEFT, 0.30]
-    edges += list(np.linspace(0.50, RIGHT, len(references) + 1)[:-1]) if references else []
-    heads = ["path", "moved RMS / max (m)", *(f"ATE to {name} (m)" for name in references)]
-    cursor.row(edges, heads, head=True)
-    for part in loop.reported:
-        scores = [ate_words(part.scores[name]) for name in references]
-        cells = [part.name, moved_words(part), *scores]
-        cursor.row(edges, cells)
-    cursor.skip(4)
-    said = (
+    page.table(
+        ["path", "moved RMS / max (m)", *(f"ATE to {name} (m)" for name in references)],
+        [
+            [part.name, moved_words(part), *(ate_words(part.scores[name]) for name in references)]
+            for part in loop.reported
+        ],
+    )
+    page.numbers(
         "ATE is the RMSE of position after alignment, in brackets its 95 % interval by block "
         "bootstrap where the flight is long enough for one."
         if references
         else "Neither ground truth nor a SLAM trajectory is given, so that no error of the path "
         "can be stated; --reference FILE scores it."
     )
-    cursor.write(said, size=7, colour=MUTED)
 
 
 def shown(loop: Loop) -> list[Correction]:
@@ -142,13 +118,11 @@ def shown(loop: Loop) -> list[Correction]:
     return [part for part in loop.reported if part.name in STYLES]
 
 
-def _map(cursor: Cursor, loop: Loop) -> None:
-    bottom = BOTTOM + 0.075
-    figure = cursor.figure
-    axes = figure.add_axes((LEFT + 0.03, bottom, RIGHT - LEFT - 0.03, cursor.y - 0.012 - bottom))
+def _map(page: Page, loop: Loop) -> None:
+    title = "From above, in the odometry's frame"
+    axes = page.panel(title, "", MAP, left=36.0, below=LEGEND)
     path = loop.odometry.trajectory
     names = AXES_OF_FRAME[path.frame]
-    axes.set_title("from above, in the odometry's frame")
     _reference(axes, loop)
     for part in shown(loop):
         position = part.trajectory.position_m[:: max(1, len(part.trajectory) // MAP_POINTS)]
@@ -171,9 +145,10 @@ def _map(cursor: Cursor, loop: Loop) -> None:
     axes.grid(True, axis="both")
     axes.set_xlabel(f"{names[1]} (m)")
     axes.set_ylabel(f"{names[0]} (m)")
-    handles, labels = axes.get_legend_handles_labels()
-    figure.legend(handles, labels, loc="lower left", ncols=4, bbox_to_anchor=(LEFT, BOTTOM - 0.012),
-                  borderaxespad=0.0)  # fmt: skip
+    axes.legend(
+        loc="upper left", ncols=4, borderaxespad=0.0,
+        bbox_to_anchor=(0.0, -(TICKS + AXIS_LABEL + 2.0) / MAP),
+    )  # fmt: skip
 
 
 def _reference(axes: Axes, loop: Loop) -> None:
@@ -190,87 +165,73 @@ def _reference(axes: Axes, loop: Loop) -> None:
             return
 
 
-def _along(cursor: Cursor, loop: Loop) -> None:
+def _along(page: Page, loop: Loop) -> None:
     scored = [name for name in (reference.name for reference in loop.references)
               if isinstance(loop.odometry.scores[name], Evaluation)]  # fmt: skip
     corrected = [part for part in shown(loop) if part is not loop.odometry]
-    rows = 1 + bool(corrected) + len(scored)
-    grid = cursor.figure.add_gridspec(
-        rows, 1, left=LEFT, right=RIGHT, top=cursor.y - 0.03,
-        bottom=max(BOTTOM + 0.05, 0.72 - 0.22 * rows), hspace=0.38,
-    )  # fmt: skip
-    height, *others = (cursor.figure.add_subplot(grid[row]) for row in range(rows))
-    for axes in (height, *others):
+    every: list[Axes] = []
+
+    def panel(title: str) -> Axes:
+        axes = page.panel(title, "", HEIGHT, above=4.0 if every else 14.0)
         axes.xaxis.set_major_locator(MaxNLocator(6))
-        axes.yaxis.set_major_locator(MaxNLocator(4))
-        if axes is not (height, *others)[-1]:
-            axes.tick_params(axis="x", labelbottom=False, bottom=False)
-    errors = others[bool(corrected) :]
-    if corrected:
-        _moved(others[0], loop, corrected)
-    height.set_title(f"{AXES_OF_FRAME[loop.odometry.trajectory.frame][2]} (m)")
+        axes.set_xlim(0.0, loop.path_length_m)
+        every.append(axes)
+        return axes
+
+    axes = panel(f"{capital(AXES_OF_FRAME[loop.odometry.trajectory.frame][2])} (m)")
     for part in shown(loop):
-        height.plot(*thin(loop.distance_m, part.trajectory.position_m[:, 2]), label=part.name,
-                    **STYLES[part.name])  # fmt: skip
-    height.legend(loc="best", ncols=3)
-    for axes, name in zip(errors, scored, strict=True):
-        axes.set_title(f"distance to {name} after alignment (m)")
-        said = []
+        axes.plot(*thin(loop.distance_m, part.trajectory.position_m[:, 2]), label=part.name,
+                  **STYLES[part.name])  # fmt: skip
+    legend_above(axes)
+    if corrected:
+        axes = panel("How far each pose moved (m)")
+        for part in corrected:
+            axes.plot(*thin(loop.distance_m, part.moved_m), **STYLES[part.name])
+        _fit(axes, corrected)
+        page.numbers("; ".join(f"{p.name}: at most {p.moved_m.max():.2f} m" for p in corrected))
+    for name in scored:
+        axes = panel(f"Distance to {name} after alignment (m)")
+        said, drawn = [], []
         for part in shown(loop):
             score = part.scores[name]
             if not isinstance(score, Evaluation):
                 said.append(f"{part.name}: {score.reason}")
                 continue
             along = np.interp(score.time_s, part.trajectory.time_s, loop.distance_m)
-            axes.plot(*thin(along, score.position_error_m), label=part.name, **STYLES[part.name])
+            axes.plot(*thin(along, score.position_error_m), **STYLES[part.name])
+            drawn.append(part)
             said.append(f"{part.name}: RMSE {score.ate.translation.rmse:.3f} m, max "
                         f"{score.ate.translation.max:.3f} m")  # fmt: skip
-        _fit(axes)
-        if axes is errors[-1]:
-            axes.set_xlabel("distance along the path (m)")
-        caption(axes, "; ".join(said))
-    (height, *others)[-1].set_xlabel("distance along the path (m)")
-    for axes in (height, *others):
-        axes.set_xlim(0.0, loop.path_length_m)
+        _fit(axes, drawn)
+        page.numbers("; ".join(said))
+    for axes in every[:-1]:
+        bare_x(axes)
+    every[-1].set_xlabel("distance along the path (m)")
 
 
-def _moved(axes: Axes, loop: Loop, corrected: list[Correction]) -> None:
-    axes.set_title("how far each pose moved (m)")
-    for part in corrected:
-        axes.plot(*thin(loop.distance_m, part.moved_m), label=part.name, **STYLES[part.name])
-    _fit(axes)
-    caption(axes, "; ".join(f"{p.name}: at most {p.moved_m.max():.2f} m" for p in corrected))
-
-
-def _fit(axes: Axes) -> None:
+def _fit(axes: Axes, drawn: list[Correction]) -> None:
     """Scale to the paths that might be used: one that a false closure warps runs out of sight."""
     highest = [
         float(np.nanmax(line.get_ydata()))
-        for line in axes.get_lines()
-        if line.get_label() != SOLUTIONS["all"]
+        for line, part in zip(axes.get_lines(), drawn, strict=True)
+        if part.name != SOLUTIONS["all"]
     ]
     if highest:
         axes.set_ylim(0.0, 1.15 * max(*highest, 1e-3))
 
 
-def _scores(loop: Loop, name: Callable[[str], str]) -> Iterator[Figure]:
+def _scores(loop: Loop, name: Callable[[str], str]) -> Page:
     """Tables: every closure with its gate and weights, RPE, and how scores were made."""
-    figure, cursor = page(
+    page = Page(
         name("Closures and scores"),
         "d² is the squared misclosure against what drift and closure explain together; p is the "
         "chance of a larger one if the closure is true. Robust solving (dynamic covariance "
         "scaling, DCS; graduated non-convexity, GNC) weighs each closure by how well the others "
         "agree with it: 1 keeps it, 0 drops it.",
     )
-    cursor.write("Closures", size=10.5, weight="bold")
-    cursor.skip(2)
-    edges = [LEFT, 0.27, 0.38, 0.45, 0.49, 0.58, 0.72, 0.82]
-    heads = ["same place at", "missed by (m)", "d²", "dof", "p", "gate", "DCS weight", "GNC weight"]
-    cursor.row(edges, heads, head=True)
+    page.heading("Closures", 10.5)
+    rows: list[list[Cell]] = []
     for judged in loop.closures:
-        if cursor.y < BOTTOM + 0.03:
-            yield figure
-            figure, cursor = page(name("Closures and scores, continued"))
         gate = judged.gate
         weights = [
             f"{judged.weights[name]:.2f}" if name in judged.weights else "–"
@@ -281,41 +242,36 @@ def _scores(loop: Loop, name: Callable[[str], str]) -> Iterator[Figure]:
             f"{gate.degrees_of_freedom}", p_words(gate.p).removeprefix("p "),
             "accepted" if gate.accepted else "REJECTED", *weights,
         ]  # fmt: skip
-        cursor.row(edges, cells, colour="black" if gate.accepted else "#a61b1b")
-    if not loop.closures:
-        cursor.write("None.")
+        colour = "black" if gate.accepted else SEVERITY_COLOURS["error"]
+        rows.append([(cell, colour) for cell in cells])
+    if rows:
+        heads = ["same place at", "missed by (m)", "d²", "dof", "p", "gate", "DCS weight",
+                 "GNC weight"]  # fmt: skip
+        page.table(heads, rows)
+    else:
+        page.write("None.")
     for reference in loop.references:
-        rows = sum(1 + len(s.rpe) for p in loop.reported
-                   if isinstance(s := p.scores[reference.name], Evaluation))  # fmt: skip
-        if cursor.y - 0.14 - rows * ROW_SIZE * 1.45 / POINTS_PER_HEIGHT < BOTTOM:
-            yield figure
-            figure, cursor = page(name("Closures and scores, continued"))
-        cursor.skip(12)
-        _relative(cursor, loop, reference.name)
-    yield figure
+        _relative(page, loop, reference.name)
+    return page
 
 
-def _relative(cursor: Cursor, loop: Loop, name: str) -> None:
-    cursor.write(f"Against {name}", size=10.5, weight="bold")
-    cursor.skip(2)
+def _relative(page: Page, loop: Loop, name: str) -> None:
+    page.heading(f"Against {name}", 10.5, above=14.0)
     scores = [(part, part.scores[name]) for part in loop.reported]
     good = [(part, s) for part, s in scores if isinstance(s, Evaluation)]
     for reason in dict.fromkeys(s.reason for _, s in scores if isinstance(s, Unavailable)):
-        cursor.write(reason, size=7.5)
+        page.write(reason, size=7.5)
     if not good:
         return
-    first = good[0][1]
-    edges = [LEFT, 0.27, 0.38, 0.50, 0.66, 0.80]
-    heads = ["path", "error over", "RMSE (m)", "95 % interval (m)", "rotation RMSE (°)", "n"]
-    cursor.row(edges, heads, head=True)
+    rows: list[list[str]] = []
     for part, score in good:
-        rows: list[tuple[str, AbsoluteError | RelativeError]]
-        rows = [("ATE", score.ate), *((f"RPE {e.delta}", e) for e in score.rpe)]
-        for index, (label, e) in enumerate(rows):
+        errors: list[tuple[str, AbsoluteError | RelativeError]]
+        errors = [("ATE", score.ate), *((f"RPE {e.delta}", e) for e in score.rpe)]
+        for index, (label, e) in enumerate(errors):
             numbers = statistics_words(e.translation, e.interval, e.rotation)
-            cursor.row(edges, [part.name if index == 0 else "", label, *numbers])
-        cursor.skip(2.5)
-        cursor.rule("#dddddd")
-    cursor.skip(4)
+            rows.append([part.name if index == 0 else "", label, *numbers])
+    heads = ["path", "error over", "RMSE (m)", "95 % interval (m)", "rotation RMSE (°)", "n"]
+    page.table(heads, rows)
+    first = good[0][1]
     for text in (score_words(first), *first.notes, *first.warnings):
-        cursor.write(capital(text), size=7, colour=MUTED)
+        page.numbers(capital(text))

@@ -16,7 +16,7 @@ from px4fuse.arrays import Array
 from px4fuse.comparison.events import Span
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.report.document import Document
-from px4fuse.report.style import EKF2_REJECTED, MUTED, POINTS_PER_WIDTH, text_width
+from px4fuse.report.style import EKF2_REJECTED, MUTED
 
 # Bands differ in grey by hatch and depth; marks stand on lines at the foot of the axes, resets
 # hang from their top
@@ -31,7 +31,7 @@ LANDING: dict[str, Any] = {"color": "black", "marker": "v", "ms": 4.5, "mew": 0,
 REJECTED_LINE, OUTLIER_LINE, RESET_LINE = 0.025, 0.075, 0.92
 # Marks closer than this share of the segment fall on one another
 CLOSEST = 1.0 / 300.0
-STRIP_SIZE = 6.5
+STRIP_SIZE, STRIP_WIDTH = 6.5, 4.0  # of the letters, and of one of them, in points
 
 
 def draw(axes: Axes, document: Document, *, axis: str | None = None, strip: bool = False) -> None:
@@ -130,10 +130,10 @@ def _apart(times: Sequence[float] | Array, least_s: float) -> Array:
 def _strip(axes: Axes, document: Document) -> None:
     """Names of the flight modes above the axes, as far as each has room for its name."""
     low, high = axes.get_xlim()
-    width = axes.get_position().width * POINTS_PER_WIDTH
+    width = 72.0 * axes.bbox.width / axes.figure.dpi
     for mode in document.events.modes:
         start, end = max(mode.start_s, low), min(mode.end_s, high)
-        if (end - start) / (high - low) * width >= text_width(mode.name, STRIP_SIZE):
+        if (end - start) / (high - low) * width >= STRIP_WIDTH * len(mode.name):
             axes.text(
                 (start + end) / 2.0, 1.012, mode.name, transform=axes.get_xaxis_transform(),
                 ha="center", va="bottom", size=STRIP_SIZE, color=MUTED,

@@ -11,27 +11,11 @@ import re
 import unicodedata
 from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import accumulate, zip_longest
 from typing import TYPE_CHECKING
 
-from matplotlib.figure import Figure
-
 from px4fuse.report.document import Document, LoopDocument
-from px4fuse.report.style import (
-    BOTTOM,
-    LEFT,
-    MUTED,
-    POINTS_PER_HEIGHT,
-    POINTS_PER_WIDTH,
-    RIGHT,
-    SPACING,
-    appendix,
-    page,
-    printable,
-    put,
-    text_width,
-    wrap,
-)
+from px4fuse.report.page import Page, appendix
+from px4fuse.report.style import MUTED
 
 if TYPE_CHECKING:
     from markdown_it.rules_inline import StateInline
@@ -39,11 +23,9 @@ if TYPE_CHECKING:
 
 BODY_SIZE = 8.5
 HEADING_SIZES = {"h1": 12.0, "h2": 10.8, "h3": 9.6}
-INDENT = 0.022
+INDENT = 12.0  # points
 MOST_INDENTS = 8
-MARK_WIDTH = 0.016
 TABLE_SIZE = 8.0
-COLUMN_GAP_POINTS = 10.0
 # $ opens before what is no space and closes after it, not before a digit: prices stay prices
 MATHS = re.compile(r"\$\$(.+?)\$\$|\$(?!\s)((?:\\.|[^$\\])+?)(?<!\s)\$(?!\d)", re.DOTALL)
 COMMAND = re.compile(r"\\([A-Za-z]+|.)")
@@ -86,82 +68,27 @@ class Table:
     indents: int = 0
 
 
-@dataclass(frozen=True)
-class Row:
-    """What is written at one height: at each x (fraction of the page) one line or more."""
-
-    cells: tuple[tuple[float, tuple[str, ...]], ...]
-    like: Line
-    above: float = 0.0
-    ruled: bool = False
-
-
-def draw(document: Document | LoopDocument) -> Iterator[Figure]:
+def draw(document: Document | LoopDocument) -> Iterator[Page]:
     """Draw as many pages as the notes need; none without notes."""
     title = "Notes by the student"
     if isinstance(document, Document):
         title = appendix(title)
-    rows = [
-        row for block in read(document.student.notes)
-        for row in (_lines(block) if isinstance(block, Line) else _rows(block))
-    ]  # fmt: skip
-    if not rows:
+    blocks = list(read(document.student.notes))
+    if not blocks:
         return
-    figure, cursor = page(title)
-    for row in rows:
-        height = max(len(lines) for _, lines in row.cells) * row.like.size * SPACING
-        if cursor.y - (row.above + height + 3.0) / POINTS_PER_HEIGHT < BOTTOM:
-            yield figure
-            figure, cursor = page(f"{title}, continued")
+    page = Page(title)
+    for block in blocks:
+        if isinstance(block, Line):
+            page.note(
+                block.text, block.size, block.weight == "bold", block.colour,
+                indent=INDENT * min(block.indents, MOST_INDENTS), mark=block.mark,
+                above=block.above,
+            )  # fmt: skip
         else:
-            cursor.skip(row.above)
-        for x, lines in row.cells:
-            for number, text in enumerate(lines, start=1):
-                y = cursor.y - number * row.like.size * SPACING / POINTS_PER_HEIGHT
-                like = {"size": row.like.size, "weight": row.like.weight, "color": row.like.colour}
-                put(figure, x, y, text, **like)
-        cursor.skip(height)
-        if row.ruled:
-            cursor.skip(3.0)
-            cursor.rule()
-    yield figure
-
-
-def _left(indents: int) -> float:
-    return LEFT + INDENT * min(indents, MOST_INDENTS)
-
-
-def _lines(line: Line) -> Iterator[Row]:
-    """One row per line of a paragraph, so that it may run over a page's end."""
-    x = _left(line.indents)
-    lines = wrap(printable(line.text), line.size, (RIGHT - x) * POINTS_PER_WIDTH, line.weight)
-    for number, text in enumerate(lines):
-        mark = ((x - MARK_WIDTH, (line.mark,)),) if line.mark and not number else ()
-        yield Row((*mark, (x, (text,))), line, 0.0 if number else line.above)
-
-
-def _rows(table: Table) -> Iterator[Row]:
-    """Rows of a table; its columns are as wide as their words, or share what there is."""
-    body, head = Line("", TABLE_SIZE), Line("", TABLE_SIZE, "bold")
-    left = _left(table.indents)
-    natural = [
-        max(text_width(printable(cell), TABLE_SIZE, "bold") for cell in column) + COLUMN_GAP_POINTS
-        for column in zip_longest(*table.rows, fillvalue="")
-    ]
-    room = (RIGHT - left) * POINTS_PER_WIDTH
-    fair = room / len(natural)
-    wanted = sum(width for width in natural if width > fair)
-    rest = room - sum(width for width in natural if width <= fair)
-    shares = min(1.0, rest / wanted) if wanted else 1.0
-    widths = [width if width <= fair else width * shares for width in natural]
-    edges = list(accumulate((width / POINTS_PER_WIDTH for width in widths), initial=left))
-    for number, cells in enumerate(table.rows):
-        like = body if number else head
-        wrapped = [
-            (x, tuple(wrap(printable(cell), like.size, width - COLUMN_GAP_POINTS, like.weight)))
-            for x, cell, width in zip(edges, cells, widths, strict=False)
-        ]
-        yield Row(tuple(wrapped), like, 1.0 if number else 6.0, ruled=not number)
+            columns = max(map(len, block.rows))
+            head, *rows = ([*row, *[""] * (columns - len(row))] for row in block.rows)
+            page.table(head, rows, shares=[1.0] * columns, size=TABLE_SIZE)
+    yield page
 
 
 def read(notes: str) -> Iterator[Line | Table]:
@@ -191,7 +118,8 @@ def _blocks(node: SyntaxTreeNode, indents: int) -> Iterator[Line | Table]:
                 yield from _blocks(child, indents + 1)
             case "fence" | "code_block":
                 for number, text in enumerate(child.content.rstrip("\n").split("\n")):
-                    yield Line(text or " ", 7.5, colour=MUTED, indents=indents + 1,
+                    code = text.expandtabs(4).replace(" ", "\N{NO-BREAK SPACE}")
+                    yield Line(code or " ", 7.5, colour=MUTED, indents=indents + 1,
                                above=0.0 if number else 4.0)  # fmt: skip
             case "table":
                 rows = [row for part in child.children for row in part.children]

@@ -5,42 +5,29 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, NullLocator
 
 from px4fuse.comparison.model import FILTERS, AxisComparison, Difference
 from px4fuse.flight import Unavailable
 from px4fuse.report import flight, innovations, marks
 from px4fuse.report.document import Document
-from px4fuse.report.style import (
-    BOTTOM,
-    LEFT,
-    MAX_POINTS_NARROW,
-    POINTS_PER_HEIGHT,
-    RIGHT,
-    TIME_LABEL,
-    Cursor,
-    caption,
-    page,
-)
+from px4fuse.report.page import WIDTH, Page
+from px4fuse.report.style import MAX_POINTS_NARROW, MUTED, TIME_LABEL, bare_x
 from px4fuse.report.words import verdict_words
 
-GAP, INDENT = 0.045, 0.03
-# Points above a panel for its title and below it for its numbers
-HEAD, FOOT = 16.0, 24.0
-PANEL_SIZE = 6.6
+GAP, HEIGHT, PANEL_SIZE = 14.0, 72.0, 6.6
 # Title, how it is drawn, and its numbers
 Panel = tuple[str, Callable[[Axes, AxisComparison, int], None], Callable[[AxisComparison], str]]
 
 
-def draw(document: Document) -> Iterator[Figure]:
+def draw(document: Document) -> Iterator[Page]:
     """Draw one page; none where there is but one axis."""
     others = [
         axis for axis in document.analysis.axes.values() if axis is not document.analysis.main
     ]
     if not others:
         return
-    figure, cursor = page(
+    page = Page(
         "Appendix: other axes",
         "The panels of the pages before for the axes that they leave out; lines, bands and marks "
         "are the same.",
@@ -58,34 +45,25 @@ def draw(document: Document) -> Iterator[Figure]:
     )
     if all(isinstance(flight.error_reference(axis), Unavailable) for axis in others):
         rows = tuple(row for row in rows if row[1] is not flight.draw_error)
-    width = (RIGHT - LEFT - INDENT - 2 * GAP) / 3.0 if len(others) < 4 else 0.16
-    top = cursor.y
-    for column, result in enumerate(others):
-        head = Cursor(figure, cursor.y)
-        left = LEFT + column * (width + GAP)
-        head.write(result.axis.name, size=9.0, weight="bold", x=left, right=left + width + INDENT)
-        head.write(_axis_words(result), size=7.5, x=left, right=left + width + INDENT)
-        top = min(top, head.y - 4.0 / POINTS_PER_HEIGHT)
-    height = (top - BOTTOM - 20.0 / POINTS_PER_HEIGHT) / len(rows)
-    for column, result in enumerate(others):
-        left = LEFT + INDENT + column * (width + GAP)
-        for place, row in enumerate(rows):
-            box = (
-                left,
-                top - (place + 1) * height + FOOT / POINTS_PER_HEIGHT,
-                width,
-                height - (FOOT + HEAD) / POINTS_PER_HEIGHT,
-            )
-            _panel(figure, box, row, result, document, last=place == len(rows) - 1)
-    yield figure
+    width = (WIDTH - GAP * (len(others) - 1)) / max(len(others), 3)
+    columns = [Page(width=width) for _ in others]
+    for column, result in zip(columns, others, strict=True):
+        column.heading(result.axis.name)
+        column.write(_axis_words(result), size=7.5)
+    page.beside(*columns, gap=GAP)
+    for row in rows:
+        columns = [Page(width=width) for _ in others]
+        for column, result in zip(columns, others, strict=True):
+            _panel(column, row, result, document, last=row is rows[-1])
+        page.beside(*columns, gap=GAP)
+    yield page
 
 
 def _panel(
-    figure: Figure, box: tuple[float, float, float, float], row: Panel, result: AxisComparison,
-    document: Document, *, last: bool,
-) -> None:  # fmt: skip
+    column: Page, row: Panel, result: AxisComparison, document: Document, *, last: bool
+) -> None:
     title, draw_panel, numbers = row
-    axes = figure.add_axes(box, title=title)
+    axes = column.panel(title, "", HEIGHT)
     axes.xaxis.set_major_locator(MaxNLocator(4) if last else NullLocator())
     axes.yaxis.set_major_locator(MaxNLocator(3))
     draw_panel(axes, result, MAX_POINTS_NARROW)
@@ -93,7 +71,9 @@ def _panel(
     marks.draw(axes, document, axis=shown)
     if last:
         axes.set_xlabel(TIME_LABEL)
-    caption(axes, numbers(result), size=PANEL_SIZE)
+    else:
+        bare_x(axes)
+    column.write(numbers(result), size=PANEL_SIZE, colour=MUTED, above=-1.0)
 
 
 def _axis_words(result: AxisComparison) -> str:

@@ -1,16 +1,20 @@
-"""The PDF report: pages in order, page numbers, and the results attached inside."""
+"""The PDF of a report: its pages in order, set by Typst, with the results attached inside.
+
+PDF/A-3a and PDF/UA-1: for archives, and for screen readers. Typst sees the template and the data
+alone: its root is an empty folder, and it loads no font but those of :mod:`px4fuse.report.fonts`.
+"""
 
 from __future__ import annotations
 
-import io
+import json
 from collections.abc import Callable, Iterator, Mapping
+from functools import cache
 from importlib import metadata
+from importlib.resources import files
+from tempfile import TemporaryDirectory
 from typing import Any
 
-from matplotlib.backends.backend_pdf import PdfPages
-from matplotlib.figure import Figure
-from matplotlib.text import Text
-from pypdf import PdfWriter
+import typst
 
 from px4fuse.report import (
     changes,
@@ -19,6 +23,7 @@ from px4fuse.report import (
     cover,
     evaluation,
     flight,
+    fonts,
     innovations,
     loop,
     notes,
@@ -36,12 +41,14 @@ from px4fuse.report.document import (
     WhatIfDocument,
     who,
 )
+from px4fuse.report.page import Page, data, printable
 from px4fuse.report.seal import sealed
-from px4fuse.report.style import LEFT, MUTED, RIGHT, printable, put, report_style, shorten
+from px4fuse.report.style import report_style
 
 Report = Document | LoopDocument | WhatIfDocument | EvaluationDocument | ChangesDocument
 RESULTS_NAME = "results.json"
-PAGES: Mapping[type, tuple[Callable[[Any], Iterator[Figure]], ...]] = {
+STANDARDS: list[Any] = ["a-3a", "ua-1"]
+PAGES: Mapping[type, tuple[Callable[[Any], Iterator[Page]], ...]] = {
     Document: (
         cover.draw,
         flight.draw,
@@ -63,7 +70,7 @@ PAGES: Mapping[type, tuple[Callable[[Any], Iterator[Figure]], ...]] = {
 
 
 def render(document: Report, results_json: str) -> bytes:
-    """Draw the report.
+    """Set the report.
 
     Parameters
     ----------
@@ -76,68 +83,61 @@ def render(document: Report, results_json: str) -> bytes:
     bytes
         The same for the same input and the same versions: no dates, no random identifiers.
     """
-    drawn = io.BytesIO()
-    with report_style(_outside(document)):
-        figures = [figure for draw in PAGES[type(document)] for figure in draw(document)]
-        with PdfPages(
-            drawn, metadata={"CreationDate": None, "Creator": None, "Producer": None}
-        ) as pdf:
-            for number, figure in enumerate(figures, start=1):
-                _running_lines(figure, document, number, len(figures))
-                _without_ligatures(figure)
-                _places_of_empty_labels(figure)
-                pdf.savefig(figure)
-    return _attach(drawn.getvalue(), document, results_json)
-
-
-def _outside(document: Report) -> str:
-    """What is not px4fuse's own words."""
-    student = document.student
-    return "".join((document.title, student.name, student.id, student.notes, document.command))
-
-
-def _running_lines(figure: Figure, document: Report, number: int, count: int) -> None:
-    """Head and foot of a page: which log, whose, which version, which page."""
+    with report_style():
+        pages = [page for draw in PAGES[type(document)] for page in draw(document)]
+        blocks = [block for page in pages for block in data(page.blocks)]
     name, sha256 = document.log
-    style = {"size": 6.5, "color": MUTED}
-    student = who(document.student, " · ")
-    room = 330 if student else 500
-    head = shorten(printable(f"px4fuse · {name} · SHA-256 {sha256[:12]}"), 6.5, room)
-    put(figure, LEFT, 0.972, head, **style)
-    if student:
-        figure.text(RIGHT, 0.972, shorten(printable(student), 6.5, 170), ha="right", **style)  # type: ignore[arg-type]
-    version = metadata.version("px4fuse")
-    put(figure, LEFT, 0.022, f"px4fuse {version}", **style)
-    figure.text(RIGHT, 0.022, f"{number} / {count}", ha="right", **style)  # type: ignore[arg-type]
+    made_by = f"px4fuse {metadata.version('px4fuse')}"
+    student = document.student
+    families = fonts.families(
+        "".join((document.title, student.name, student.id, student.notes, document.command))
+    )
+    return compiled(
+        {
+            "title": document.title,
+            "author": made_by,
+            "head": _shortened(f"px4fuse · {name} · SHA-256 {sha256[:12]}", 90),
+            "student": _shortened(who(student, " · "), 40),
+            "foot": made_by,
+            "fonts": families,
+            "blocks": blocks,
+            "results": results_json,
+        }
+    )
 
 
-def _without_ligatures(figure: Figure) -> None:
-    """Draw "fi" as two letters: a ligature costs every font a second file in the PDF."""
-    texts = list(figure.texts)
-    legends = [*figure.legends, *(axes.get_legend() for axes in figure.axes)]
-    texts += [text for legend in legends if legend is not None for text in legend.get_texts()]
-    for axes in figure.axes:
-        titles = [child for child in axes.get_children() if isinstance(child, Text)]
-        texts += [*titles, axes.xaxis.label, axes.yaxis.label]
-    for text in texts:
-        text.set_fontfeatures(("-liga",))
+def _shortened(text: str, most: int) -> str:
+    """One line of so many letters at most."""
+    line = " ".join(printable(text).split())
+    return line if len(line) <= most else f"{line[: most - 1]}…"
 
 
-def _places_of_empty_labels(figure: Figure) -> None:
-    """Fix where labels without words stand: else the numbers beside are measured for each."""
-    for axes in figure.axes:
-        for axis in (axes.xaxis, axes.yaxis):
-            if not axis.get_label_text():
-                axis.set_label_coords(0.5, 0.5)
+def compiled(report: Mapping[str, Any], template: str | None = None) -> bytes:
+    """Data set by a template, by default ``report.typ``.
+
+    Raises
+    ------
+    typst.TypstError
+        The template is not right, or asks for a file.
+    """
+    with TemporaryDirectory() as empty:
+        compiler = typst.Compiler(
+            input=(_template() if template is None else template).encode(),
+            root=empty,
+            font_paths=typst.Fonts(
+                include_system_fonts=False,
+                include_embedded_fonts=False,
+                font_paths=fonts.folders(tuple(report["fonts"])),
+            ),
+            package_path=empty,
+            package_cache_path=empty,
+            sys_inputs={"data": json.dumps(report)},
+        )
+        made = compiler.compile(format="pdf", pdf_standards=STANDARDS)
+    assert isinstance(made, bytes)
+    return sealed(made)
 
 
-def _attach(drawn: bytes, document: Report, results_json: str) -> bytes:
-    writer = PdfWriter(clone_from=io.BytesIO(drawn))
-    writer.add_attachment(RESULTS_NAME, results_json.encode())
-    writer.metadata = {
-        "/Title": document.title,
-        "/Creator": f"px4fuse {metadata.version('px4fuse')}",
-    }
-    out = io.BytesIO()
-    writer.write(out)
-    return sealed(out.getvalue())
+@cache
+def _template() -> str:
+    return files("px4fuse.report").joinpath("report.typ").read_text(encoding="utf-8")

@@ -16,31 +16,12 @@ from px4fuse.filter.signals import AISLE, within
 from px4fuse.flight import Ekf2, Truth
 from px4fuse.report.document import Document
 from px4fuse.report.marks import LANDING, TAKE_OFF
-from px4fuse.report.style import (
-    BOTTOM,
-    EKF2_LINE,
-    LABEL_WIDTH,
-    LEFT,
-    MEASURED,
-    MUTED,
-    OURS_LINE,
-    PANEL_LEFT,
-    POINTS_PER_HEIGHT,
-    POINTS_PER_WIDTH,
-    RIGHT,
-    TRUTH_LINE,
-    Cursor,
-)
+from px4fuse.report.page import WIDTH, Page, legend_above
+from px4fuse.report.style import EKF2_LINE, MEASURED, MUTED, OURS_LINE, TRUTH_LINE
 
 # A track so many times longer than wide lies along the page, else north is up
 LONG = 2.2
-TALLEST, LOWEST = 150.0, 62.0  # points
-LEAST_BESIDE, MOST_BESIDE = 122.0, 290.0
-# Width of a map that has north up, fraction of the page
-WIDE = 0.43
-HEAD, LABELS = 22.0, 34.0  # points above the axes, and below them: ticks, label, a gap
-FACT_SIZE = 7.0
-BESIDE_X = PANEL_LEFT + WIDE + 0.03
+TALLEST, LOWEST, BESIDE, WIDE = 120.0, 56.0, 150.0, 256.0  # points
 Pair = tuple[Array, Array]
 
 
@@ -57,71 +38,10 @@ class View:
         return c * north + s * east, s * north - c * east
 
 
-@dataclass(frozen=True)
-class Plan:
-    """A map with the facts below or beside it, ready to be drawn.
+def plan(document: Document, facts: Sequence[tuple[str, str]]) -> Page:
+    """The map of a document's flight, with labelled sentences below or beside it.
 
-    Attributes
-    ----------
-    document : Document
-    tracks : mapping from name to arrays
-        North and east, m.
-    view : View
-    long : bool
-        Whether the map takes the page's width, with the facts below it.
-    facts : sequence of (str, str)
-        Labels and sentences.
-    """
-
-    document: Document
-    tracks: Mapping[str, Pair]
-    view: View
-    long: bool
-    facts: Sequence[tuple[str, str]]
-
-    def least(self, cursor: Cursor) -> float:
-        """Height on the page (fraction) that it needs."""
-        map_points = (self._height() if self.long else LEAST_BESIDE) + HEAD + LABELS
-        facts = self._facts_height(cursor, LEFT if self.long else BESIDE_X)
-        if self.long:
-            return map_points / POINTS_PER_HEIGHT + facts
-        return max(map_points / POINTS_PER_HEIGHT, HEAD / POINTS_PER_HEIGHT + facts)
-
-    def draw(self, cursor: Cursor) -> None:
-        """Draw it below the cursor."""
-        figure = cursor.figure
-        cursor.write("From above", size=10.5, weight="bold")
-        top = cursor.y - 6.0 / POINTS_PER_HEIGHT
-        room = (top - BOTTOM) * POINTS_PER_HEIGHT - LABELS
-        height = self._height() if self.long else min(room, MOST_BESIDE)
-        width = RIGHT - PANEL_LEFT if self.long else WIDE
-        bottom = top - height / POINTS_PER_HEIGHT
-        axes = figure.add_axes((PANEL_LEFT, bottom, width, height / POINTS_PER_HEIGHT))
-        _map(axes, self.document, self.view, self.tracks)
-        handles, labels = axes.get_legend_handles_labels()
-        figure.legend(
-            handles, labels, loc="lower right", ncols=len(labels), borderaxespad=0.0,
-            borderpad=0.0, bbox_to_anchor=(RIGHT, cursor.y), handlelength=1.8, columnspacing=1.2,
-        )  # fmt: skip
-        below = bottom - LABELS / POINTS_PER_HEIGHT
-        beside = Cursor(figure, below if self.long else top)
-        for label, text in self.facts:
-            beside.labelled(label, text, size=FACT_SIZE, x=LEFT if self.long else BESIDE_X)
-
-    def _height(self) -> float:
-        """Of a map of the page's width, in points."""
-        x, y = self.view(*self.tracks["measurement"])
-        scale = (RIGHT - PANEL_LEFT) * POINTS_PER_WIDTH / (1.1 * float(np.ptp(x)) + 1e-6)
-        return float(np.clip(1.3 * float(np.ptp(y)) * scale, LOWEST, TALLEST))
-
-    def _facts_height(self, cursor: Cursor, left: float) -> float:
-        return sum(
-            cursor.height(text, size=FACT_SIZE, x=left + LABEL_WIDTH) for _, text in self.facts
-        )
-
-
-def plan(document: Document, facts: Sequence[tuple[str, str]]) -> Plan:
-    """The map of a document's flight.
+    A long track lies along the page and takes its width, with the facts below it.
 
     Parameters
     ----------
@@ -130,7 +50,24 @@ def plan(document: Document, facts: Sequence[tuple[str, str]]) -> Plan:
     """
     tracks = _tracks(document.comparison)
     view, ratio = _view(document.comparison, np.column_stack(tracks["measurement"]))
-    return Plan(document, tracks, view, ratio >= LONG, facts)
+    page = Page()
+    page.heading("From above", 10.5)
+    drawn = page if ratio >= LONG else Page(width=WIDE)
+    height = _height(view, tracks) if ratio >= LONG else BESIDE
+    _map(drawn.panel("", "", height, above=16.0, left=36.0), document, view, tracks)
+    beside = page if ratio >= LONG else Page(width=WIDTH - WIDE - 14.0)
+    for label, text in facts:
+        beside.labelled(label, text, size=7.0, above=-0.5)
+    if drawn is not page:
+        page.beside(drawn, beside)
+    return page
+
+
+def _height(view: View, tracks: Mapping[str, Pair]) -> float:
+    """Of a map of the page's width, in points."""
+    x, y = view(*tracks["measurement"])
+    scale = WIDTH / (1.1 * float(np.ptp(x)) + 1e-6)
+    return float(np.clip(1.3 * float(np.ptp(y)) * scale, LOWEST, TALLEST))
 
 
 def _tracks(comparison: Comparison) -> dict[str, Pair]:
@@ -144,7 +81,7 @@ def _tracks(comparison: Comparison) -> dict[str, Pair]:
     tracks = {"measurement": cut(comparison.source.samples)}
     if isinstance(flight.truth, Truth):
         tracks["truth"] = cut(flight.truth.samples)
-    both = comparison.axes
+    both = {result.axis.name: result for result in comparison.axes.values()}
     if {"north", "east"} <= both.keys():
         north, east = both["north"], both["east"]
         if isinstance(north.ekf2_state, pd.DataFrame) and isinstance(east.ekf2_state, pd.DataFrame):
@@ -203,6 +140,7 @@ def _map(axes: Axes, document: Document, view: View, tracks: Mapping[str, Pair])
     axes.set_ylabel(view.labels[1])
     if view.heading != np.pi / 2.0:
         _north(axes, view)
+    legend_above(axes, handlelength=1.8)
 
 
 def _thinned(track: Pair, most: int = 2000) -> Pair:

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from matplotlib.figure import Figure
-
 from px4fuse.report import clock, fonts
 from px4fuse.report.document import Document, LoopDocument
-from px4fuse.report.style import BOTTOM, LEFT, MUTED, page
+from px4fuse.report.page import Page
+from px4fuse.report.style import MUTED
 from px4fuse.report.words import alignment_words, clock_words
 from px4fuse.results.parts import provenance
 
-INDENT = LEFT + 0.235
+INDENT, SIZE = 140.0, 7.5
 METHOD = (
     "State x = [position, velocity] per axis, F = [[1, dt], [0, 1]], B = [dt²/2, dt], H = [1, 0], "
     "R = SIGMA_Z², Q(dt) = SIGMA_A² · DT · [[dt³/4, dt²/2], [dt²/2, dt]]; predict on the DT grid "
@@ -48,7 +47,7 @@ LOOP_METHOD = (
 Section = tuple[str, list[tuple[str, str]]]
 
 
-def draw(document: Document) -> Iterator[Figure]:
+def draw(document: Document) -> Iterator[Page]:
     """Draw one page or more."""
     comparison = document.comparison
     flight, source = comparison.flight, comparison.source
@@ -68,7 +67,8 @@ def draw(document: Document) -> Iterator[Figure]:
                 ("time zero", f"{log.boot_time_s:.6f} s after boot, the first sample of data"),
                 (
                     "position source",
-                    f"{source.name} (rung {source.rung} of 7) from {', '.join(source.topics)}; "
+                    f"{source.name} ({source.origin.kind}, {source.origin.passage}) from "
+                    f"{', '.join(source.topics)}; "
                     f"clock: {source.clock}",
                 ),
                 (
@@ -106,7 +106,7 @@ def draw(document: Document) -> Iterator[Figure]:
     yield from _layout("Appendix: provenance", sections)
 
 
-def draw_loop(document: LoopDocument) -> Iterator[Figure]:
+def draw_loop(document: LoopDocument) -> Iterator[Page]:
     """Draw one page or more about a loop alone."""
     loop = document.loop
     files = [("track", loop.odometry.trajectory)]
@@ -146,35 +146,19 @@ def _made_with(document: Document | LoopDocument) -> Section:
     )
 
 
-def _layout(heading: str, sections: list[Section]) -> Iterator[Figure]:
-    figure, cursor = page(heading)
+def _layout(heading: str, sections: list[Section]) -> Iterator[Page]:
+    page = Page(heading)
     for title, entries in sections:
-        if not entries:
-            continue
-        cursor.skip(4)
-        needed = 0.03
-        for position, (label, text) in enumerate(entries):
-            x = INDENT if label else LEFT
-            height = max(
-                cursor.height(text, size=7.5, x=x),
-                cursor.height(label, size=7.5, right=INDENT - 0.01),
-            )
-            if cursor.y - height - (needed if position == 0 else 0.0) < BOTTOM:
-                yield figure
-                figure, cursor = page(f"{heading}, continued")
-            if position == 0:
-                cursor.write(title, size=9.5, weight="bold")
-                cursor.skip(1)
-            top = cursor.y
+        if entries:
+            page.heading(title, 9.5, above=9.0)
+        for label, text in entries:
             if label:
-                cursor.write(label, size=7.5, colour=MUTED, right=INDENT - 0.01)
-                label_end, cursor.y = cursor.y, top
+                page.labelled(
+                    label, text, size=SIZE, width=INDENT, above=-1.0, colour=MUTED, bold=False
+                )
             else:
-                label_end = top
-            cursor.write(text, size=7.5, x=x)
-            cursor.y = min(cursor.y, label_end)
-            cursor.skip(1)
-    yield figure
+                page.write(text, size=SIZE, above=0.0)
+    yield page
 
 
 def _fonts(document: Document | LoopDocument) -> list[tuple[str, str]]:

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from matplotlib.ticker import FixedLocator, NullFormatter, NullLocator
 
@@ -22,24 +21,8 @@ from px4fuse.flight import Unavailable
 from px4fuse.plain import factor_words, number_words
 from px4fuse.report import marks
 from px4fuse.report.document import Document
-from px4fuse.report.style import (
-    LEFT,
-    MUTED,
-    OURS,
-    OURS_BAND,
-    RIGHT,
-    TIME_LABEL,
-    TRUTH_LINE,
-    Cursor,
-    bare_x,
-    below,
-    empty,
-    legend_beside_title,
-    level,
-    page,
-    panel,
-    thin,
-)
+from px4fuse.report.page import Page, halves, legend_above
+from px4fuse.report.style import MUTED, OURS, OURS_BAND, TIME_LABEL, TRUTH_LINE, bare_x, empty, thin
 
 FACTOR = 4.0
 # The chosen pair, and what is done to SIGMA_A and SIGMA_Z: two of them share each other gain
@@ -68,8 +51,7 @@ LITTLE_APART = 0.1
 SAME_GAIN = 0.02
 WINDOW_S, WINDOW_STEP_S = 20.0, 0.5
 # Heights of the axes in points
-MAP, TRACK = 150.0, 88.0
-MIDDLE = 0.53
+MAP, TRACK, BESIDE, BELOW = 140.0, 85.0, 40.0, 26.0
 THICK: dict[str, Any] = {"color": OURS_BAND, "lw": 4.0, "ls": "-", "solid_capstyle": "butt"}
 THIN: dict[str, Any] = {"color": OURS, "lw": 1.0, "ls": (0, (4, 1.6))}
 CHOSEN: dict[str, Any] = {"color": "black", "marker": "X", "mec": "white", "mew": 0.8, "ms": 8.0,
@@ -79,13 +61,13 @@ OF_Z: dict[str, Any] = {"color": "black", "marker": "s", "ms": 8.0, "mew": 0.8, 
                         "ls": "none"}  # fmt: skip
 
 
-def draw(document: Document) -> Iterator[Figure]:
+def draw(document: Document) -> Iterator[Page]:
     """Draw one page; none where nothing was tuned, or the start is not forgotten."""
     result, settings = document.comparison.main, document.comparison.settings
     if not document.analysis.tuning or len(result.replay.updates) < MIN_MEASUREMENTS:
         return
     name = result.axis.name
-    figure, cursor = page(
+    page = Page(
         "Appendix: what the knobs do",
         "The filter's gain depends on SIGMA_A / SIGMA_Z alone. Their size does not move the track: "
         "it scales what the filter claims about it, σ and S, and so the NIS. NIS tells the size, "
@@ -96,37 +78,32 @@ def draw(document: Document) -> Iterator[Figure]:
     factors = np.array([(a, z) for _, a, z in SETTINGS] + [(f, 1.0) for f in CURVE]).T
     run = states(preintegrate(result.axis, settings), *(chosen[:, None] * factors))
     curve = _settled(run.gain)
-    beside = Cursor(figure, cursor.y)
-    level((_map(cursor, document), _gains(beside, ratio, curve)))
-    cursor.y = min(cursor.y, beside.y)
-    cursor.skip(60)
+    left, right = halves()
+    _map(left, document)
+    _gains(right, ratio, curve)
+    page.beside(left, right)
     window = _window(
         result, run.velocity_m_s[:, 0], [*document.events.gaps, *document.events.dropouts]
     )
     for place, (title, pair) in enumerate(PAIRS):
-        top = cursor.y
-        axes = panel(cursor, title, _apart_words(run, pair), TRACK)
+        axes = page.panel(title, _apart_words(run, pair), TRACK, above=14.0)
         marks.draw(axes, document)
         _tracks(axes, result, run, pair, window)
-        legend_beside_title(axes, top)
+        legend_above(axes)
         if place < len(PAIRS) - 1:
             bare_x(axes)
-            cursor.skip(8)
         else:
             axes.set_xlabel(TIME_LABEL)
-            cursor.skip(24)
     along = "the aisle" if name == AISLE else name
-    below(
-        cursor,
+    page.numbers(
         f"Velocity along {along} (m/s) over the {window[1] - window[0]:.0f} s with the most "
         "motion in which nothing is missing.",
     )
-    cursor.skip(10)
-    _table(cursor, result, run, chosen)
-    yield figure
+    _table(page, result, run, chosen)
+    yield page
 
 
-def _map(cursor: Cursor, document: Document) -> Axes:
+def _map(page: Page, document: Document) -> None:
     """Likelihood of every pair, with the lines on which the gain is the same."""
     tuning, settings = document.analysis.tuning, document.comparison.settings
     main = document.comparison.main.axis.name
@@ -134,10 +111,9 @@ def _map(cursor: Cursor, document: Document) -> Axes:
     found = tuning[name]
     title = f"How likely the innovations are ({name})"
     if isinstance(found, Unavailable):
-        axes = panel(cursor, title, "", MAP, right=MIDDLE - 0.03)
-        empty(axes, f"No map: {found.reason}.")
-        return axes
-    axes = panel(cursor, title, _map_words(found), MAP, right=MIDDLE - 0.03)
+        empty(page.panel(title, "", MAP), f"No map: {found.reason}.")
+        return
+    axes = page.panel(title, _map_words(found), MAP, left=BESIDE, below=BELOW)
     best = _point(found.filter_sigma_a), _point(found.sigma_z)
     grids, shown = [], []
     for value, asked, noise in (
@@ -181,7 +157,6 @@ def _map(cursor: Cursor, document: Document) -> Axes:
         handles=[*shades, *axes.get_legend_handles_labels()[0]], loc="upper left", ncols=4,
         bbox_to_anchor=(-0.1, -0.2), borderaxespad=0.0, handlelength=1.2, columnspacing=1.0,
     )  # fmt: skip
-    return axes
 
 
 def _map_words(found: AxisTuning) -> str:
@@ -239,7 +214,7 @@ def _round_ticks(axes: Axes) -> None:
         axis.set_minor_formatter(NullFormatter())
 
 
-def _gains(cursor: Cursor, ratio: float, gains: Array) -> Axes:
+def _gains(page: Page, ratio: float, gains: Array) -> None:
     """Settled gain over the ratio: a curve, on which both knobs stand."""
     at = [ratio * a / z for _, a, z in SETTINGS]
     say = (
@@ -249,7 +224,7 @@ def _gains(cursor: Cursor, ratio: float, gains: Array) -> Axes:
     )
     if np.allclose(gains[[1, 3]], gains[[2, 4]], atol=SAME_GAIN):
         say = f"{say[:-1]}: each square holds its circle."
-    axes = panel(cursor, "Gain of position, settled, over the ratio", say, MAP, left=MIDDLE + 0.04)
+    axes = page.panel("Gain of position, settled, over the ratio", say, MAP, below=BELOW)
     axes.plot(ratio * CURVE, gains[len(SETTINGS) :], color=MUTED, lw=1.0)
     axes.plot(np.array(at)[[1, 3]], gains[[1, 3]], **OF_A, label="SIGMA_A × or / 4")
     axes.plot(np.array(at)[[2, 4]], gains[[2, 4]], **OF_Z, label="SIGMA_Z / or × 4")
@@ -263,7 +238,6 @@ def _gains(cursor: Cursor, ratio: float, gains: Array) -> Axes:
     axes.set_xlabel("SIGMA_A / SIGMA_Z (1/s²)")
     axes.legend(loc="upper left", ncols=3, bbox_to_anchor=(-0.08, -0.2), borderaxespad=0.0,
                 handlelength=1.0, columnspacing=1.0)  # fmt: skip
-    return axes
 
 
 def _settled(values: Array) -> Array:
@@ -324,7 +298,7 @@ def _truth(result: AxisComparison) -> tuple[Array, Array] | None:
     return (known.index.to_numpy(), known.to_numpy()) if len(known) else None
 
 
-def _table(cursor: Cursor, result: AxisComparison, run: States, chosen: Array) -> None:
+def _table(page: Page, result: AxisComparison, run: States, chosen: Array) -> None:
     """What each setting claims, beside what it does: one text per column."""
     time = result.axis.measurement_time_s[-len(run.nis) :]
     half = slice(len(time) // 2, None)
@@ -344,12 +318,11 @@ def _table(cursor: Cursor, result: AxisComparison, run: States, chosen: Array) -
         error = run.velocity_m_s[half, :count] - np.interp(time[half], *truth)[:, None]
         rmse = np.sqrt(np.mean(error**2, axis=0))
         columns.append(("v RMSE (m/s)", [f"{value:.3f}" for value in rmse]))
-    cursor.write("One track, two claims", size=9.0, weight="bold")
-    cursor.write(
+    page.heading("One track, two claims", above=10.0)
+    page.write(
         f"With four times SIGMA_A σ_p is {factor_words(sigmas[1] / sigmas[2])} times what it is "
         f"with a quarter of SIGMA_Z, and the NIS {factor_words(nis[2] / nis[1])} times smaller, "
         "about the same track. Numbers over the second half of the flight."
     )
-    cursor.skip(3)
-    edges = np.linspace(LEFT, RIGHT, len(columns) + 1)
-    cursor.columns(dict(zip(edges.tolist(), columns, strict=False)))
+    heads = [head for head, _ in columns]
+    page.table(heads, list(zip(*(cells for _, cells in columns), strict=True)))

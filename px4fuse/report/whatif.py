@@ -3,39 +3,25 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 
-import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator
 
 from px4fuse.analysis import Counterfactual
 from px4fuse.ekf2.agreement import REJECTING_SHARE
-from px4fuse.ekf2.parameters import PARAMETERS
 from px4fuse.ekf2.replay import HORIZONTAL
 from px4fuse.ekf2.whatif import Summary
+from px4fuse.ekf2_parameters import PARAMETERS
 from px4fuse.flight import Unavailable
-from px4fuse.plain import number_words
+from px4fuse.plain import capital, number_words
 from px4fuse.report.document import WhatIfDocument
-from px4fuse.report.style import (
-    BOTTOM,
-    EKF2_BAND,
-    EKF2_LINE,
-    LEFT,
-    MUTED,
-    OURS_LINE,
-    POINTS_PER_HEIGHT,
-    RIGHT,
-    Cursor,
-    page,
-    put,
-)
+from px4fuse.report.page import Page
+from px4fuse.report.style import EKF2_BAND, EKF2_LINE, MUTED, OURS_LINE
 from px4fuse.report.why import agreement_words
 
 SIZE = 8.0
-FIRST_COLUMN = 0.20
-PANEL_POINTS = 120.0
+PANEL_POINTS = 80.0
 MAX_TICKS = 10
 WIDE = 5.0  # values that span more are drawn on a logarithmic scale
 
@@ -154,11 +140,11 @@ def _number(value: float | Unavailable, digits: int) -> str:
     return "n/a" if isinstance(value, Unavailable) else f"{value:.{digits}f}"
 
 
-def draw(document: WhatIfDocument) -> Iterator[Figure]:
+def draw(document: WhatIfDocument) -> Iterator[Page]:
     """Draw one page, and another where a sweep needs it."""
     made_of = document.made_of
     log, found = made_of.flight.log, made_of.whatif
-    figure, cursor = page(
+    page = Page(
         "EKF2 with other parameters",
         "EKF2 replayed from the log by px4fuse's model of it, which is not PX4's own code: as "
         "flown, and with other parameters. All columns are judged over the same times.",
@@ -169,42 +155,17 @@ def draw(document: WhatIfDocument) -> Iterator[Figure]:
         "Judged: " + ", ".join(f"{start:.1f} to {end:.1f} s" for start, end in found.judged),
         f"Replay against log: {agreement_words(found.agreement)}.",
     ):
-        cursor.write(text, size=7.5, colour=MUTED)
-    cursor.skip(10)
-    _table(cursor, ["", *heads(made_of)], rows(made_of))
-    cursor.skip(6)
+        page.write(text, size=7.5, colour=MUTED, above=-2.0)
+    page.table(["", *heads(made_of)], rows(made_of), size=SIZE)
     for line in reading(made_of):
-        cursor.write(line, size=8.5)
-        cursor.skip(2)
+        page.write(line, size=8.5, above=2.0)
     if sweep_of(made_of):
-        table = (len(sweep_of(made_of)) + 4) * SIZE * 1.4 / POINTS_PER_HEIGHT
-        needed = table + 3 * (PANEL_POINTS + 34.0) / POINTS_PER_HEIGHT
-        if cursor.y - needed < BOTTOM:
-            yield figure
-            figure, cursor = page(f"EKF2 over {swept(made_of)}")
-        _panels(cursor, made_of)
-        if cursor.y - table > BOTTOM:
-            _table(cursor, sweep_heads(made_of), sweep_rows(made_of))
-    yield figure
+        _panels(page, made_of)
+        page.table(sweep_heads(made_of), sweep_rows(made_of), size=SIZE)
+    yield page
 
 
-def _table(cursor: Cursor, head: Sequence[str], body: list[list[str]]) -> None:
-    starts = [LEFT, *np.linspace(LEFT + FIRST_COLUMN, RIGHT, len(head))[:-1]]
-    top, lowest = cursor.y, cursor.y
-    for text, start, end in zip(head, starts, [*starts[1:], RIGHT], strict=True):
-        cursor.y = top
-        cursor.write(text, size=SIZE, weight="bold", x=start, right=end - 0.01)
-        lowest = min(lowest, cursor.y)
-    cursor.y = lowest
-    cursor.skip(2.5)
-    cursor.rule()
-    for cells in body:
-        cursor.y -= SIZE * 1.4 / POINTS_PER_HEIGHT
-        for text, start in zip(cells, starts, strict=True):
-            put(cursor.figure, start, cursor.y, text, size=SIZE)
-
-
-def _panels(cursor: Cursor, made_of: Counterfactual) -> None:
+def _panels(page: Page, made_of: Counterfactual) -> None:
     """Mean NIS, share rejected, and error or σ_p over the values."""
     summaries, name = sweep_of(made_of), swept(made_of)
     values = [summary.changed[name] for summary in summaries]
@@ -219,11 +180,8 @@ def _panels(cursor: Cursor, made_of: Counterfactual) -> None:
     else:
         panels.append(("σ_p (m)", lambda s, axis: s.axes[axis].sigma_p_median_m))
     flown = made_of.whatif.replayed
-    cursor.skip(20)
     for title, of in panels:
-        height = PANEL_POINTS / POINTS_PER_HEIGHT
-        box = (LEFT + 0.03, cursor.y - height, RIGHT - LEFT - 0.03, height)
-        axes = cursor.figure.add_axes(box, title=title)
+        axes = page.panel(capital(title), "", PANEL_POINTS)
         _panel(axes, values, [[of(s, axis) for s in summaries] for axis in HORIZONTAL])
         if title == "rejected (%)":
             axes.set_ylim(0.0, max(1.0, axes.get_ylim()[1]))
@@ -237,8 +195,6 @@ def _panels(cursor: Cursor, made_of: Counterfactual) -> None:
             axes.legend(loc="upper right", ncols=2)
         if title == panels[-1][0]:
             axes.set_xlabel(f"{name} ({PARAMETERS[name].unit})" if PARAMETERS[name].unit else name)
-        cursor.y -= height
-        cursor.skip(34)
 
 
 def _panel(axes: Axes, values: list[float], lines: list[list[float | Unavailable]]) -> None:

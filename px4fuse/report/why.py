@@ -16,22 +16,15 @@ from px4fuse.flight import Unavailable
 from px4fuse.plain import capital
 from px4fuse.report import marks
 from px4fuse.report.document import Document
+from px4fuse.report.page import Page
 from px4fuse.report.style import (
-    BOTTOM,
     EKF2,
     EKF2_BAND,
-    LEFT,
     MUTED,
     OURS,
     OURS_BAND,
     OURS_LINE,
-    POINTS_PER_HEIGHT,
-    RIGHT,
     TIME_LABEL,
-    Cursor,
-    below,
-    page,
-    panel,
     thin,
 )
 
@@ -42,33 +35,25 @@ LEAD = (
     "square; hatched: farther away, which later steps make good). They add up to the whole."
 )
 ROW_POINTS = 12.0
-LABELS = 0.185  # of the page's width, for the names of the steps
-GAP = 0.035
+AROUND = 42.0  # points above and below the bars
+LABELS, GAP = 0.25, 0.04  # of the width: names of the steps, and between both
 TIME_POINTS = 105.0
 
 
-def draw(document: Document) -> Iterator[Figure]:
+def draw(document: Document) -> Iterator[Page]:
     """Draw as many pages as the axes need; none where nothing is concluded for any."""
     found = _walks(document)
     if not any(isinstance(why, Why) for why in found.values()):
         return
-    figure, cursor = page(TITLE, LEAD)
-    for place, (name, why) in enumerate(found.items()):
-        if place and cursor.y - _height(cursor, why) < BOTTOM:
-            yield figure
-            figure, cursor = page(f"{TITLE}, continued")
-        cursor.skip(8)
+    page = Page(TITLE, LEAD)
+    for name, why in found.items():
         if isinstance(why, Unavailable):
-            cursor.write(f"{name}: nothing is concluded", size=9.5, weight="bold")
-            cursor.write(f"{capital(why.reason)}. {why.remedy}")
+            page.heading(f"{name}: nothing is concluded", 9.5, above=10.0)
+            page.write(f"{capital(why.reason)}. {why.remedy}")
         else:
-            _axis(figure, cursor, name, why, document)
-    believed = _believed(document.analysis.ekf2_replay)
-    if cursor.y - cursor.height(believed, size=7.0) < BOTTOM:
-        yield figure
-        figure, cursor = page(f"{TITLE}, continued")
-    below(cursor, believed)
-    yield figure
+            _axis(page, name, why, document)
+    page.numbers(_believed(document.analysis.ekf2_replay))
+    yield page
 
 
 def _walks(document: Document) -> Mapping[str, Why | Unavailable]:
@@ -113,59 +98,47 @@ def agreement_words(agreement: Agreement) -> str:
     )
 
 
-def _height(cursor: Cursor, why: Why | Unavailable) -> float:
-    """Height that an axis takes, as a fraction of the page."""
-    if isinstance(why, Unavailable):
-        return cursor.height(f"{why.reason}. {why.remedy}") + 24.0 / POINTS_PER_HEIGHT
-    words = sum(cursor.height(sentence, size=8.5) for sentence in why.sentences)
-    points = 24.0 + 2.0 * len(why.sentences) + ROW_POINTS * (len(why.steps) + 2) + 30.0
-    return words + (points + TIME_POINTS + 100.0) / POINTS_PER_HEIGHT
-
-
-def _axis(figure: Figure, cursor: Cursor, name: str, why: Why, document: Document) -> None:
+def _axis(page: Page, name: str, why: Why, document: Document) -> None:
     spans = ", ".join(f"{start:.0f} to {end:.0f} s" for start, end in why.spans_s)
-    cursor.write(f"{name}, {spans}", size=9.5, weight="bold")
-    cursor.skip(2)
+    page.heading(f"{name}, {spans}", 9.5, above=10.0)
     for sentence in why.sentences:
-        cursor.write(sentence, size=8.5)
-        cursor.skip(2)
-    cursor.skip(18)
-    axis = why
-    names = [step.name for step in axis.steps]
-    width = (RIGHT - LEFT - LABELS - GAP) / 2.0
-    height = ROW_POINTS * (len(names) + 2) / POINTS_PER_HEIGHT
-    for column, (title, total, steps, left) in enumerate(
+        page.write(sentence, size=8.5, above=1.0)
+    names = [step.name for step in why.steps]
+    height = ROW_POINTS * (len(names) + 2) + AROUND
+    figure = Figure(figsize=(page.width / 72.0, height / 72.0))
+    share = (0.985 - LABELS - GAP) / 2.0
+    for column, (what, unit, total, steps, left) in enumerate(
         (
             (
-                f"position, {np.sqrt(axis.position_mean_square_m2):.3f} m rms",
-                axis.position_mean_square_m2,
-                [step.position_mean_square_m2 for step in axis.steps],
-                axis.position_left_mean_square_m2,
+                "position",
+                "m",
+                why.position_mean_square_m2,
+                [step.position_mean_square_m2 for step in why.steps],
+                why.position_left_mean_square_m2,
             ),
             (
-                f"velocity, {np.sqrt(axis.velocity_mean_square_m2_s2):.3f} m/s rms",
-                axis.velocity_mean_square_m2_s2,
-                [step.velocity_mean_square_m2_s2 for step in axis.steps],
-                axis.velocity_left_mean_square_m2_s2,
+                "velocity",
+                "m/s",
+                why.velocity_mean_square_m2_s2,
+                [step.velocity_mean_square_m2_s2 for step in why.steps],
+                why.velocity_left_mean_square_m2_s2,
             ),
         )
     ):
-        start = LEFT + LABELS + column * (width + GAP)
-        axes = figure.add_axes((start, cursor.y - height, width, height))
-        axes.set_title(title)
+        start = LABELS + column * (share + GAP)
+        axes = figure.add_axes((start, 26.0 / height, share, 1.0 - AROUND / height))
+        axes.set_title(f"{what}, {np.sqrt(total):.3f} {unit} rms")
         _waterfall(axes, names, total, steps, left)
         if column:
             axes.set_yticklabels([])
-    cursor.y -= height
-    cursor.skip(36)
-    axes = panel(
-        cursor, "Position apart (m): ours - EKF2 (dark), and what the model leaves of it (light)",
+    page.drawing(figure, f"What each step brings, in per cent: {', '.join(names)}")
+    axes = page.panel(
+        "Position apart (m): ours - EKF2 (dark), and what the model leaves of it (light)",
         _time_words(why), TIME_POINTS, above=12.0 if document.events.modes else 4.0,
     )  # fmt: skip
     _over_time(axes, why)
     marks.draw(axes, document, axis=name, strip=True)
     axes.set_xlabel(TIME_LABEL)
-    cursor.skip(24)
 
 
 def _waterfall(axes: Axes, names: list[str], total: float, steps: list[float], left: float) -> None:

@@ -185,9 +185,6 @@ def _looped(handed_in: LoopResults, place: _Place, versions: Provenance) -> Reco
 def _drawn(document: Document | LoopDocument, text: str, versions: Provenance) -> bytes:
     """Draw the report with the versions that were recorded."""
     from px4fuse.report.pdf import render  # noqa: PLC0415
-    from px4fuse.report.style import text_width  # noqa: PLC0415
 
     made = replace(versions, command=document.command)
-    drawn = render(replaced(document, made=made), text)
-    text_width.cache_clear()  # it holds every text of every report otherwise
-    return drawn
+    return render(replaced(document, made=made), text)
