@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,7 +17,6 @@ import numpy as np
 from px4fuse.arrays import Array
 from px4fuse.comparison.asked import asked_of_ekf2
 from px4fuse.comparison.comparison import compare, compare_prepared
-from px4fuse.comparison.drift import may_drift
 from px4fuse.comparison.estimates import (
     Progress,
     Tuning,
@@ -33,9 +32,9 @@ from px4fuse.comparison.preparation import prepare
 from px4fuse.comparison.why import Why, why_ekf2_differs
 from px4fuse.display import brief
 from px4fuse.ekf2.model import Model, open_model
-from px4fuse.ekf2.parameters import check
 from px4fuse.ekf2.replay import Ekf2Replay
 from px4fuse.ekf2.whatif import WhatIf, sweep_values, what_if
+from px4fuse.ekf2_parameters import check
 from px4fuse.errors import LogError, MissingDataError, SettingsError
 from px4fuse.filter.causes import AFTER_STEP_S, Explained, explained
 from px4fuse.filter.clock import ClockOffset
@@ -388,7 +387,7 @@ def run_what_if(
 def _not_told(compared: Comparison) -> str:
     name, source = compared.flight.log.name, compared.source
     why = "the data do not tell the noise and the delay of what EKF2 fused"
-    if may_drift(compared.flight, source):
+    if source.origin.may_drift:
         why = (
             f"{source.name} may drift, so that innovations do not tell its noise, and the delay is "
             "as the data ask for or not determinable"
@@ -419,7 +418,7 @@ def explain(comparison: Comparison, progress: Progress = silent) -> Analysis:
 
     loop = loop_in(comparison.flight, progress)
     return Analysis(
-        **vars(comparison),
+        **{each.name: getattr(comparison, each.name) for each in fields(Comparison)},
         tuning=tuning,
         clock=clock,
         ekf2_model=model,

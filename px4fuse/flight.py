@@ -12,13 +12,14 @@ replaced by zero, an empty plot or a "pass".
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
 import pandas as pd
 
 from px4fuse.display import Shown, brief
+from px4fuse.origin import Origin
 from px4fuse.record import NotNegative, Record, Vector
 from px4fuse.record import Unavailable as Unavailable  # noqa: PLC0414 - for everybody
 from px4fuse.recording import ClockMap, InputFile, LogInfo, Stream, Unused
@@ -26,10 +27,9 @@ from px4fuse.recording import ClockMap, InputFile, LogInfo, Stream, Unused
 AxisName = Literal["north", "east", "down"]
 # Below this share of intervals near the median, samples come in bursts
 BURST_SHARE = 0.8
+# Methods of a ClockMap that know no time of measurement
+ARRIVAL_METHODS = ("arrival time", "receive time", "position in the stream")
 AXIS_NAMES: tuple[AxisName, AxisName, AxisName] = ("north", "east", "down")
-# Rungs of the ladder of position sources that are external vision, which EKF2 can fuse; a file
-# given by hand is taken to be of the system that was sent to it
-EXTERNAL_VISION_RUNGS = (1, 2, 4, 5, 6)
 POSITION_COLUMNS = ["north_m", "east_m", "down_m"]
 VELOCITY_COLUMNS = ["north_m_s", "east_m_s", "down_m_s"]
 STATE_COLUMNS = POSITION_COLUMNS + VELOCITY_COLUMNS
@@ -120,9 +120,8 @@ class PositionTrack:
     ----------
     name : str
         The name that ``--position-source`` takes; the PX4 topic where there is one.
-    rung : int
-        Place in the ladder of sources (1 is a file given with ``--position``, 2 the best that a
-        log holds); see the README.
+    origin : Origin
+        Where it comes from and how it got here, with all that follows from it.
     description : str
         What it is, for a person.
     samples : DataFrame, shape (n, 6)
@@ -132,8 +131,6 @@ class PositionTrack:
         "NED", "FRD" (x is forward at start, not north) or "unknown".
     clock : str
         Which clock the time stamps are on.
-    reconstructed : bool
-        Whether it was derived from EKF2's own output instead of being logged as it arrived.
     topics : tuple of str
         The topics or messages that it was read from.
     log : str
@@ -152,12 +149,11 @@ class PositionTrack:
     """
 
     name: str
-    rung: int
+    origin: Origin
     description: str
     samples: pd.DataFrame
     frame: str
     clock: str
-    reconstructed: bool
     topics: tuple[str, ...]
     log: str = ""
     clock_map: ClockMap | None = None
@@ -171,6 +167,12 @@ class PositionTrack:
     def rate_hz(self) -> float:
         """Samples per second between gaps (NaN with fewer than two samples)."""
         return sample_rate(self.samples)
+
+    @property
+    def stamps(self) -> Literal["measurement", "arrival"]:
+        """What its time stamps tell: when the position was measured, or when it arrived."""
+        arrived = self.clock_map is not None and self.clock_map.method in ARRIVAL_METHODS
+        return "arrival" if arrived else "measurement"
 
 
 @dataclass(frozen=True)
@@ -336,7 +338,7 @@ class Flight(Shown):
     attitude : DataFrame or Unavailable
         Quaternion w, x, y, z that turns body FRD into NED.
     positions : tuple of PositionTrack
-        Every external position track found, best rung first.
+        Every external position track found, in order of preference.
     ekf2 : Ekf2 or Unavailable
     truth : Truth or Unavailable
     airborne : tuple of (float, float), or Unavailable
@@ -369,6 +371,11 @@ class Flight(Shown):
     unused: tuple[Unused, ...] = ()
     inputs: tuple[InputFile, ...] = ()
     modes: tuple[FlightMode, ...] | Unavailable = MODES_NOT_LOGGED
+
+
+def best_first(tracks: Iterable[PositionTrack]) -> tuple[PositionTrack, ...]:
+    """Position tracks in the order in which a comparison prefers them."""
+    return tuple(sorted(tracks, key=lambda track: track.origin.preference))
 
 
 def sample_rate(samples: pd.DataFrame) -> float:

@@ -20,8 +20,8 @@ from pathlib import Path
 
 import pytest
 from browser import browser  # noqa: F401 - a fixture
+from exchange import replace
 from hypothesis import HealthCheck, settings
-from msgspec.structs import replace
 from pypdf import PdfWriter
 
 import px4fuse

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from types import ModuleType, SimpleNamespace
 from typing import Any, TypeVar
 
@@ -24,6 +25,7 @@ from px4fuse.flight import (
     FusionRecord,
     Unavailable,
 )
+from px4fuse.origin import RECEIVED
 
 T = TypeVar("T")
 
@@ -35,12 +37,30 @@ CHOSEN = Settings(sigma_a_m_s2=1.0, sigma_z_m=1.0)
 
 def made(kind: type[T], **parts: Any) -> T:
     """An instance that holds these parts alone: to read another one is an error."""
+    if issubclass(kind, msgspec.Struct):
+        return StandIn(kind, parts)  # type: ignore[return-value]
     one = object.__new__(kind)
     for name, value in parts.items():
-        msgspec.structs.force_setattr(one, name, value) if isinstance(one, msgspec.Struct) else (
-            object.__setattr__(one, name, value)
-        )
+        object.__setattr__(one, name, value)
     return one
+
+
+class StandIn:
+    """What passes for a record that has some of its fields, and what follows from them."""
+
+    def __init__(self, kind: type, parts: dict[str, Any]) -> None:
+        self.__dict__.update(parts, _kind=kind)
+
+    @property  # type: ignore[misc]
+    def __class__(self) -> type:
+        kind: type = self.__dict__["_kind"]
+        return kind
+
+    def __getattr__(self, name: str) -> Any:
+        found = inspect.getattr_static(self.__dict__["_kind"], name)
+        if isinstance(found, property):
+            return found.fget(self)  # type: ignore[misc]
+        raise AttributeError(name)
 
 
 def log(**parts: Any) -> Any:
@@ -53,8 +73,9 @@ def log(**parts: Any) -> Any:
 
 def source(**parts: Any) -> Any:
     usual = {
-        "name": "uwb", "description": "UWB", "rung": 2, "orientation": None, "frame": "NED",
-        "reconstructed": False, "clock_map": None, "alignment": None, "rate_hz": 5.0,
+        "name": "uwb", "description": "UWB", "origin": RECEIVED, "orientation": None,
+        "frame": "NED",
+        "clock_map": None, "alignment": None, "rate_hz": 5.0,
     }  # fmt: skip
     return SimpleNamespace(**{**usual, **parts})
 
@@ -126,14 +147,17 @@ def tuned(
     return {HORIZONTAL: one}
 
 
-def late(offset_s: float, sigma_s: float = 0.001, **parts: Any) -> ClockOffset:
+def late(
+    remaining_s: float, sigma_s: float = 0.001, applied_s: float = 0.0, **parts: Any
+) -> ClockOffset:
+    offset_s = applied_s + remaining_s
     halves = tuple(PartOffset(0.0, 1.0, at, 0.1) for at in (offset_s - 0.2, offset_s + 0.2))
     usual = {
         "interval_s": (offset_s - 0.01, offset_s + 0.02), "determinable": True, "change_p": None,
         "parts": halves,
     }  # fmt: skip
     return made(
-        ClockOffset, offset_s=offset_s, applied_s=0.0, sigma_s=sigma_s, **{**usual, **parts}
+        ClockOffset, offset_s=offset_s, applied_s=applied_s, sigma_s=sigma_s, **{**usual, **parts}
     )
 
 

@@ -9,10 +9,11 @@ say, and innovations whose NIS is what the test wants.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields
 
 import numpy as np
 import pandas as pd
+from exchange import replace
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
@@ -37,6 +38,7 @@ from px4fuse.flight import (
     Truth,
     Unavailable,
 )
+from px4fuse.origin import RECEIVED, Origin
 from px4fuse.recording import Dropout, LogInfo
 
 Span = tuple[float, float]
@@ -67,7 +69,7 @@ class Uwb:
     outlier_share: float = 0.0
     outlier_m: float = 3.0
     name: str = "vehicle_visual_odometry"
-    rung: int = 2
+    origin: Origin = RECEIVED
     frame: str = "NED"
 
 
@@ -131,7 +133,7 @@ def aisle_flight(
         log=LogInfo(
             name="aisle.ulg",
             sha256="0" * 64,
-            size_bytes=1,
+            bytes=1,
             format="ULog",
             firmware="PX4 v1.16.1",
             firmware_hash="unknown",
@@ -211,7 +213,7 @@ def _track(rng: np.random.Generator, time: Array, uwb: Uwb, path) -> PositionTra
     position[rng.random(len(time)) < uwb.outlier_share, :2] += uwb.outlier_m
     return PositionTrack(
         name=uwb.name,
-        rung=uwb.rung,
+        origin=uwb.origin,
         description="synthetic UWB",
         samples=table(
             time,
@@ -220,7 +222,6 @@ def _track(rng: np.random.Generator, time: Array, uwb: Uwb, path) -> PositionTra
         ),
         frame=uwb.frame,
         clock="autopilot boot clock",
-        reconstructed=uwb.rung in (5, 6),
         topics=(uwb.name,),
     )
 
@@ -327,9 +328,11 @@ def random_walk(
 
 def unexplained(comparison: Comparison) -> Analysis:
     """Make an analysis that knows nothing but the comparison."""
+    parts = {each.name: getattr(comparison, each.name) for each in fields(Comparison)}
     return Analysis(
-        comparison, {}, unavailable("clock offset"), unavailable("EKF2 replay"), {},
-        unavailable("loop closure"), unavailable("heading error"),
+        **parts, tuning={}, clock=unavailable("clock offset"),
+        ekf2_model=unavailable("EKF2 replay"), why={}, loop=unavailable("loop closure"),
+        heading=unavailable("heading error"),
     )  # fmt: skip
 
 

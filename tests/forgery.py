@@ -6,8 +6,9 @@ import io
 import re
 import zlib
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
+from exchange import replace
 from pypdf import PdfReader
 from pypdf.generic import IndirectObject
 

@@ -5,17 +5,18 @@ import json
 from pathlib import Path
 from typing import Any
 
+from px4fuse.record import Unavailable
 from px4fuse.request import LoopRequest
 from px4fuse.results import trajectories as made
 from px4fuse.results.contract import LoopResults, Results, to_plain
-from px4fuse.results.model import Absent, Missing, Student
+from px4fuse.results.model import Student
 from px4fuse.results.parts import provenance, schema_of
 from px4fuse.results.reading import read_results
 
 SHIPPED = Path(__file__).parent.parent / "reports" / "aisle_uwb.json"
 EXAMPLE: dict[str, Any] = json.loads(SHIPPED.read_text(encoding="utf-8"))
 SHA256 = EXAMPLE["log"]["sha256"]
-NONE = Absent(Missing("it", "nobody asked", "Ask."))
+NONE = Unavailable("it", "nobody asked", "Ask.")
 
 
 def correction(rmse: float, moved_m: float) -> made.Correction:
@@ -43,7 +44,7 @@ LOOP = to_plain(
         request=LoopRequest(source="loop.ulg:vio"),
         track=made.Track("loop.ulg:vio", SHA256, 9, "vio", "NED", 9, 1.0, 95.0, True, ()),
         references=(),
-        loop=made.Loop(
+        loop=made.LoopPart(
             track="loop.ulg:vio",
             kind="vio",
             frame="NED",

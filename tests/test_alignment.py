@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ import flights
 import numpy as np
 import pandas as pd
 import pytest
+from exchange import replace
 from flights import Estimator, Imu, Span, Uwb, aisle_flight, table, unavailable
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -341,13 +341,13 @@ def test_the_flight_gets_the_track_the_file_and_what_its_reader_said(flight: Fli
     file = recorded(flight)
     result = place(flight, file)
     track, *others = result.positions
-    assert (track.name, track.rung, track.log, track.topics) == (
+    assert (track.name, track.origin, track.log, track.topics) == (
         "uwb.csv",
         1,
         "uwb.csv",
         ("uwb.csv",),
     )
-    assert (track.frame, track.reconstructed) == ("NED", False)
+    assert track.frame == "NED"
     assert track.description == "external position file, 601 samples, enu"
     assert track.clock.startswith("the file's own UNIX clock, -1795251250.")
     assert track.clock.endswith(" s to the boot clock, matched with EKF2 position")

@@ -11,12 +11,13 @@ import copy
 import random
 import re
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import pytest
 from click.testing import CliRunner
 from conftest import page_of
+from exchange import replace
 from notes_samples import FILLER
 from results_tools import LOOP, changed, decoded
 from test_verify import Base, base, read_again, report_of
@@ -326,7 +327,7 @@ def position(results: dict[str, Any]) -> None:
     results["request"]["position"] = {"path": "uwb.csv"}
     results["provenance"]["command"] += " --position uwb.csv"
     for axis in results["axes"].values():
-        axis["kf"]["nis_mean"], axis["kf"]["verdict"] = 1.0, "consistent"
+        axis["filters"]["kf"]["nis_mean"], axis["filters"]["kf"]["verdict"] = 1.0, "consistent"
     results["findings"] = []
 
 

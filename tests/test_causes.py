@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import pytest
+from exchange import replace
 from flights import Estimator, aisle_flight, unexplained
 from results_tools import changed, decoded, finding
 from test_scoring import checked
 
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.model import Comparison
-from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.tuning import Noise
 from px4fuse.findings import Finding, find, phrases
@@ -109,12 +107,12 @@ def test_notes_that_name_a_consequence_take_up_its_cause() -> None:
 
 def test_distrusting_a_source_that_may_drift_costs_no_points() -> None:
     """The data of the example ask for 0.0966 m."""
-    above = {"settings__sigma_z_m": 0.3, "axes__north__kf__verdict": "variance overstated"}
+    above = {"settings__sigma_z_m": 0.3, "axes__north__filters__kf__verdict": "variance overstated"}
     drift = changed(**above, findings=[finding("source_may_drift", "info")])
     asked = {"settings": ["sigma_z_m"]}
     assert checked("tuning", drift, **asked)[0] == 1.0
     assert checked("tuning", changed(**above, findings=[]), **asked)[0] == 0.0
-    far = {"axes__north__kf__variance_factor": 9.0, "axes__north__kf__nis_mean": 1.0 / 9.0}
+    far = {"axes__north__filters__kf__nis_mean": 1.0 / 9.0}
     for listed, share in (([finding("source_may_drift", "info")], 1.0), ([], 0.0)):
         results = changed(**above, **far, findings=listed)
         assert checked("consistent", results, axes=["north"])[0] == share
@@ -135,10 +133,10 @@ def test_verdicts_that_could_be_misread_have_a_sentence(comparison: Comparison) 
 
 
 def test_what_is_consistent_and_white_needs_no_words(comparison: Comparison) -> None:
-    (east,) = [result for result in comparison.axes.values() if result.axis.name == "east"]
-    assert isinstance(east.kf.consistency, Consistency)
-    fine = replace(east.kf, consistency=replace(east.kf.consistency, ljung_box_p=0.5))
-    assert verdict_notes(replace(comparison, axes=(replace(east, kf=fine),))) == []
+    east = comparison.axes["east"]
+    fine = replace(east.filters["kf"], ljung_box_p=0.5)
+    white = replace(east, filters={**east.filters, "kf": fine})
+    assert verdict_notes(replace(comparison, axes={"east": white})) == []
 
 
 def test_a_source_that_may_drift_is_said_to(comparison: Comparison) -> None:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import csv
-import dataclasses
 import io
 import math
 import unicodedata
 
 import pytest
+from exchange import replace
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -145,7 +145,7 @@ def test_late_overridden_pending_and_missing_ones_say_so() -> None:
     one = Graded("a.pdf", "A", "0042", Verdict("verified", (), True), items)
     said = {"cover": Override(0.5, "why")}
     late = entry(one, late_s=5400.0, deduction=0.4, total=1.1, overrides=said, comment="see me")
-    pending = entry(dataclasses.replace(one, pending="Run 0.1.1."), total=None)
+    pending = entry(replace(one, pending="Run 0.1.1."), total=None)
     missing = Entry("C", "-17", None, of=4.0)
     head, *rest = cells(csv_text([late, pending, missing]))
     rows = [dict(zip(head, row, strict=True)) for row in rest]

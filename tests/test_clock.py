@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
 import pytest
+from exchange import replace
 from flights import aisle_flight, table, unavailable
 from numpy.typing import NDArray
 from scipy.integrate import cumulative_trapezoid
@@ -554,7 +554,8 @@ def test_an_offset_that_was_set_is_not_found_again() -> None:
     flight, _ = made_flight(9, offset_s=-0.2)
     compared = compare(flight, replace(SETTINGS, clock_offset_s=-0.2))
     found = clock_offset(compared, tuned_horizontally(compared))
-    assert covers(found, 0.0)
+    assert covers(found, -0.2)
+    assert found.applied_s == -0.2
     words = clock_advice(compared, found)
     assert words[0].startswith("Offset   -0.")
 

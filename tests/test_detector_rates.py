@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import pandas as pd
 import pytest
 from detector_rates import (
@@ -22,6 +20,7 @@ from detector_rates import (
     jobs,
     rates,
 )
+from exchange import replace
 
 from px4fuse.simulation.scenario import Scenario
 

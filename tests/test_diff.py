@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 
 import numpy as np
 import pandas as pd
 import pytest
-from msgspec.structs import replace as exchange
+from exchange import replace
+from exchange import replace as exchange
 from results_tools import EXAMPLE
 from scipy.signal import lfilter
 from scipy.special import ndtr
@@ -17,7 +17,7 @@ from spread import NOTHING, RATES_TABLE, SETTINGS, rates, spread
 
 from px4fuse.analysis import explain
 from px4fuse.comparison.comparison import compare
-from px4fuse.filter.consistency import assess
+from px4fuse.filter.consistency import Consistency, assess
 from px4fuse.findings import find
 from px4fuse.fleet.changes import Changes, changes, number_changes
 from px4fuse.fleet.measures import (
@@ -34,10 +34,8 @@ from px4fuse.fleet.sides import Side
 from px4fuse.fleet.significance import contrast, corrected, spreads
 from px4fuse.request import ComparisonRequest
 from px4fuse.results.build import results
-from px4fuse.results.comparison import Filter
 from px4fuse.results.contract import to_json
 from px4fuse.results.model import Student
-from px4fuse.results.parts import copied
 from px4fuse.results.reading import read_results
 from px4fuse.simulation.flights import simulate_flight
 from px4fuse.simulation.mistakes import parse
@@ -104,10 +102,10 @@ def test_means_of_nis_are_compared_as_the_f_test_would(n, m, ratio):
     assert contrast(*sides).p == pytest.approx(exact, rel=0.25, abs=0.02)
 
 
-def white(nis_mean: float, count: int, lag1: float = 0.0) -> Filter:
+def white(nis_mean: float, count: int, lag1: float = 0.0) -> Consistency:
     """A filter with normal innovations of this mean square."""
     rng = np.random.default_rng(1)
-    made = copied(Filter, assess(rng.normal(size=count), np.ones(count)))
+    made = assess(rng.normal(size=count), np.ones(count))
     return exchange(
         made,
         nis_mean=nis_mean,
@@ -126,7 +124,7 @@ def test_correlated_innovations_count_for_as_many_as_areindependent_share():
     for _ in range(flights):
         steps = np.sqrt(1.0 - r * r) * rng.normal(size=2 * count)
         values = lfilter([1.0], [1.0, -r], steps)[count:]
-        judged = copied(Filter, assess(values, np.ones(count)))
+        judged = assess(values, np.ones(count))
         for name, lag in (("as they are", judged.lag1_autocorrelation), ("as if white", 0.0)):
             found, _ = interval_of(
                 "kf.nis_mean", judged.nis_mean, exchange(judged, lag1_autocorrelation=lag), {}
@@ -136,7 +134,7 @@ def test_correlated_innovations_count_for_as_many_as_areindependent_share():
     assert inside["as if white"] / flights < 0.88
 
 
-def _with_lag(judged: Filter, lag: float) -> Filter:
+def _with_lag(judged: Consistency, lag: float) -> Consistency:
     return exchange(judged, lag1_autocorrelation=lag)
 
 
@@ -148,7 +146,7 @@ def test_chi_square_is_not_used_for_innovations_with_outliers():
     rng = np.random.default_rng(3)
     values = rng.normal(size=500)
     values[::25] *= 12.0
-    judged = copied(Filter, assess(values, np.ones(500)))
+    judged = assess(values, np.ones(500))
     assert interval_of("kf.nis_mean", judged.nis_mean, judged, {}) == (None, "")
     # the log tells it all the same
     interval, method = interval_of("kf.nis_mean", judged.nis_mean, judged, {"kf.nis_mean": values})
@@ -221,15 +219,16 @@ def test_significant_changes_stand_first_and_causes_before_what_they_bring():
         return normal(0.0, 0.1), normal(by, 0.1)
 
     both = {
-        "axes.north.kf.nis_mean": moved(9.0),
-        "axes.east.kf.nis_mean": moved(0.05),
-        "axes.down.kf.nis_mean": moved(-9.0),
+        "axes.north.filters.kf.nis_mean": moved(9.0),
+        "axes.east.filters.kf.nis_mean": moved(0.05),
+        "axes.down.filters.kf.nis_mean": moved(-9.0),
         "tuning.horizontal.sigma_z_m": moved(2.0),
     }
     paths = [change.path for change in number_changes(both, paired=False)]
     assert paths == [
-        "tuning.horizontal.sigma_z_m", "axes.north.kf.nis_mean", "axes.down.kf.nis_mean",
-        "axes.east.kf.nis_mean",
+        "tuning.horizontal.sigma_z_m", "axes.north.filters.kf.nis_mean",
+        "axes.down.filters.kf.nis_mean",
+        "axes.east.filters.kf.nis_mean",
     ]  # fmt: skip
 
 
@@ -285,7 +284,7 @@ def test_a_doubled_noise_of_the_source_is_the_first_that_is_told(clean, noisy):
     assert (first.path, first.judgement) == ("tuning.horizontal.sigma_z_m", "worse")
     assert first.change_interval[0] < 2.0 < first.change_interval[1]
     judged = significant(found)
-    assert judged["axes.aisle.truth.kf_position_rmse_m"] == "worse"
+    assert judged["axes.aisle.filters.kf.truth.position_rmse_m"] == "worse"
     assert "clock.offset_s" not in judged
     assert found.is_worse
     assert significant(changes(noisy, clean))["tuning.horizontal.sigma_z_m"] == "better"
@@ -297,8 +296,8 @@ def test_without_the_logs_errors_are_not_tested_and_it_is_said(clean, noisy):
     found = changes(*(Side("r.json", "results", side.results) for side in (clean, noisy)))
     judged = significant(found)
     assert "tuning.horizontal.sigma_z_m" in judged
-    assert "axes.aisle.kf.nis_mean" in judged
-    errors = [c for c in found.results.numbers if c.path.endswith("truth.kf_position_rmse_m")]
+    assert "axes.aisle.filters.kf.nis_mean" in judged
+    errors = [c for c in found.results.numbers if c.path.endswith("kf.truth.position_rmse_m")]
     assert {c.status for c in errors} == {"not tested"}
     assert any("RMSE is not tested without the logs" in note for note in found.results.notes)
 
@@ -318,8 +317,8 @@ def test_late_stamps_are_the_first_that_is_told():
 
 def test_another_noise_of_ekf2_is_named_as_setting_and_in_its_nis(clean):
     found = changes(clean, flown("modest.ulg", 506, "ekf2-noise=0.3", with_log=False))
-    assert significant(found)["axes.aisle.ekf2.nis_mean"] == "worse"
-    assert "axes.aisle.kf.nis_mean" not in significant(found)
+    assert significant(found)["axes.aisle.filters.ekf2.nis_mean"] == "worse"
+    assert "axes.aisle.filters.kf.nis_mean" not in significant(found)
     (text,) = [t for t in found.results.texts if t.what == "EKF2_EVP_NOISE"]
     assert (text.kind, text.a, text.b) == ("parameter", "0.1", "0.3")
     assert "ekf2_variance_overstated" in {
@@ -376,8 +375,8 @@ def test_of_one_flight_nothing_is_left_to_chance(clean):
     found = results(request, analysis, (), Student(), "")
     changed = changes(clean, Side("other.json", "results", found)).results
     status = {change.path: change.status for change in changed.numbers}
-    assert status["axes.aisle.kf.nis_mean"] == "differs"
-    assert status["axes.aisle.ekf2.nis_mean"] == "same"
+    assert status["axes.aisle.filters.kf.nis_mean"] == "differs"
+    assert status["axes.aisle.filters.ekf2.nis_mean"] == "same"
     assert {change.q for change in changed.numbers} == {None}
     assert changed.paired
     assert any("no sampling between them" in note for note in changed.notes)
@@ -389,5 +388,5 @@ def test_what_one_side_lacks_is_listed(clean):
     whole, part = (read_results(json.dumps(found).encode()) for found in (EXAMPLE, down))
     found = changes(Side("a.json", "results", whole), Side("b.json", "results", part)).results
     assert {one.only_in for one in found.one_sided} == {"A"}
-    assert "axes.down.kf.nis_mean" in {one.path for one in found.one_sided}
+    assert "axes.down.filters.kf.nis_mean" in {one.path for one in found.one_sided}
     assert found.counts.changed == 0

@@ -67,10 +67,10 @@ def test_results_follow_the_schema(changed):
 
 def test_two_settings_of_one_flight_are_exact(changed):
     numbers = {number["path"]: number for number in changed["numbers"]}
-    nis = numbers["axes.aisle.kf.nis_mean"]
+    nis = numbers["axes.aisle.filters.kf.nis_mean"]
     assert (nis["status"], nis["judgement"]) == ("differs", "worse")
     assert "q" not in nis
-    assert numbers["axes.aisle.ekf2.nis_mean"]["status"] == "same"
+    assert numbers["axes.aisle.filters.ekf2.nis_mean"]["status"] == "same"
     assert changed["paired"]
     assert {"SIGMA_Z (m)"} == {text["what"] for text in changed["texts"]}
     assert changed["summary"][0].startswith("Both are of aisle_uwb.ulg:")

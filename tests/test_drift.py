@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
-from flights import Estimator, Uwb, aisle_flight
-from test_findings import as_odometry
+from exchange import replace
 
-from px4fuse.comparison.drift import may_drift, with_drift
+from px4fuse.comparison.drift import with_drift
 from px4fuse.filter.clock import ClockOffset, PartOffset
-from px4fuse.flight import Flight
+from px4fuse.origin import (
+    ALIGNED,
+    GIVEN_FILE,
+    GNSS,
+    KEPT,
+    MOTION_CAPTURE,
+    Origin,
+    with_orientation,
+)  # fmt: skip
 
 
 def clock(*offsets: float, sigma_s: float = 0.02, change_p: float | None = 1e-7) -> ClockOffset:
@@ -21,32 +26,22 @@ def clock(*offsets: float, sigma_s: float = 0.02, change_p: float | None = 1e-7)
     middle = float(np.mean(offsets))
     curve = np.array([0.0])
     return ClockOffset(
-        middle, (middle - 0.02, middle + 0.02), 0.01, True, "", curve, curve, 1.92, parts, 100.0,
-        50.0, change_p, 0.2, 0.01, 3000,
+        offset_s=middle, interval_s=(middle - 0.02, middle + 0.02), sigma_s=0.01, applied_s=0.0,
+        determinable=True, curve_s=curve, curve_drop=curve, interval_drop=1.92, parts=parts,
+        drift_ppm=100.0, drift_sigma_ppm=50.0, change_p=change_p, sigma_a_m_s2=0.2,
+        sigma_z_m=0.01, count=3000,
     )  # fmt: skip
 
 
-def of(flight: Flight) -> bool:
-    return may_drift(flight, flight.positions[0])
-
-
-def test_a_source_with_an_orientation_that_turns_may_drift() -> None:
-    assert not of(aisle_flight())
-    assert of(as_odometry(aisle_flight()))
-
-
-@pytest.mark.parametrize(("rung", "drifts"), [(1, False), (3, False), (7, False), (4, True)])
-def test_a_file_and_motion_capture_as_such_do_not(rung: int, drifts: bool) -> None:
-    assert of(as_odometry(aisle_flight(uwb=Uwb(rung=rung)))) is drifts
-
-
-@pytest.mark.parametrize("fusing_yaw", [0.0, 1.0])
-def test_what_ekf2_kept_of_a_source_drifts_where_ekf2_took_its_heading(fusing_yaw: float) -> None:
-    ekf2 = Estimator(fusing_yaw=fusing_yaw)
-    uwb = Uwb(name="estimator_aid_src_ev_pos", rung=5)
-    assert of(aisle_flight(uwb=uwb, ekf2=ekf2)) is bool(fusing_yaw)
-    # a source that was logged as it arrived says so itself
-    assert not of(aisle_flight(ekf2=ekf2))
+@pytest.mark.parametrize(
+    ("origin", "drifts"),
+    [(GIVEN_FILE, False), (MOTION_CAPTURE, False), (GNSS, False), (ALIGNED, True), (KEPT, True)],
+)
+def test_external_vision_with_an_orientation_that_turns_may_drift(
+    origin: Origin, drifts: bool
+) -> None:
+    assert with_orientation(origin, turns=True).may_drift is drifts
+    assert not with_orientation(origin, turns=False).may_drift
 
 
 def test_parts_that_scatter_widen_the_interval_and_are_no_change() -> None:

@@ -6,13 +6,13 @@ The limits are written out here, so that one that is changed must be changed her
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
+from exchange import replace
 from findings_tools import NONE, made
 
 from px4fuse.ekf2.agreement import (
@@ -50,14 +50,18 @@ def test_an_older_topic_repeats_the_last_fusion_for_half_a_second() -> None:
 
 
 def test_the_first_five_seconds_of_each_stretch_are_not_judged() -> None:
-    judged = judged_from(SimpleNamespace(stretches=((10.0, 30.0), (40.0, 60.0))))  # type: ignore[arg-type]
+    judged = judged_from(SimpleNamespace(stretches_s=((10.0, 30.0), (40.0, 60.0))))  # type: ignore[arg-type]
     assert judged == ((15.0, 30.0), (45.0, 60.0))
     times = np.array([15.0, 15.1, 29.9, 30.0, 45.0, 50.0, 60.0])
     assert settled(times, judged).tolist() == [False, True, True, False, False, True, False]
 
 
 def agreeing(correlation: float = 1.0, s: float = 1.0, nis: float = 1.0) -> AxisAgreement:
-    return AxisAgreement(correlation, 0.0, s, s, s, 1.0, nis, 0.0, 0.0)
+    return AxisAgreement(
+        innovation_correlation=correlation, innovation_rms_difference=0.0, s_ratio_median=s,
+        s_ratio_p5=s, s_ratio_p95=s, nis_mean_logged=1.0, nis_mean_replayed=nis,
+        position_rms_difference_m=0.0, velocity_rms_difference_m_s=0.0,
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize(
@@ -91,9 +95,13 @@ def test_when_a_replay_is_believed(
 def test_a_replay_that_rejects_what_ekf2_rejected_must_agree(
     correlation: float, good: bool
 ) -> None:
-    one = Agreement({"north": agreeing(0.5)}, 50, 0.2, 0.2, 0.9, True, "so far")
-    axes = {"north": agreeing(), "east": agreeing(correlation)}
-    found = with_obedient(one, replace(one, axes=axes))
+    one = Agreement(
+        north=agreeing(0.5), east=agreeing(0.5), ev_pos={}, samples=50, rejected_share_logged=0.2,
+        rejected_share_replayed=0.2, decisions_same=0.9, published_rms_difference_m=0.0,
+        good=True, reason="so far",
+    )  # fmt: skip
+    again = replace(one, north=agreeing(), east=agreeing(correlation))
+    found = with_obedient(one, again)
     assert found.good is good
     assert f"the innovations correlate by {correlation:.3f}" in found.reason
     assert found.reason.startswith("so far; ") is good
@@ -108,10 +116,10 @@ def test_what_an_axis_is_compared_by() -> None:
     index = pd.Index([16.0, 17.0, 99.0])
     still = pd.DataFrame(0.0, index=index, columns=STATE_COLUMNS)
     off = still.assign(**{STATE_COLUMNS[1]: [3.0, 4.0, 50.0], STATE_COLUMNS[4]: 0.25})
-    replay = SimpleNamespace(published=off, stretches=((10.0, 20.0),))
+    replay = SimpleNamespace(published=off, stretches_s=((10.0, 20.0),))
     found = _axis("east", pd.DataFrame(frame), model, made(Ekf2, state=still), replay)  # type: ignore[arg-type]
     assert found.innovation_correlation == pytest.approx(1.0)
-    assert found.innovation_rms_difference_m == pytest.approx(0.5)
+    assert found.innovation_rms_difference == pytest.approx(0.5)
     assert (found.s_ratio_p5, found.s_ratio_median, found.s_ratio_p95) == pytest.approx(
         (1.05, 1.5, 1.95)
     )
@@ -139,7 +147,7 @@ def compared(count: int, *, varying: bool = True) -> Agreement | Unavailable:
         updates[f"innovation_{axis}_m"] = nu
         updates[f"innovation_variance_{axis}_m2"] = 0.01
     updates.loc[updates.index[-1], "rejected"] = 1.0
-    replay = SimpleNamespace(updates=updates, published=state, stretches=((9.5, 999.0),))
+    replay = SimpleNamespace(updates=updates, published=state, stretches_s=((9.5, 999.0),))
     return agreement_with_log(SimpleNamespace(ekf2=ekf2), replay)  # type: ignore[arg-type]
 
 
@@ -148,7 +156,7 @@ def test_twenty_innovations_are_enough_to_compare() -> None:
     assert isinstance(found, Agreement)
     assert found.samples == 20
     assert found.good
-    shares = found.rejected_share_logged, found.rejected_share_replayed, found.same_share
+    shares = found.rejected_share_logged, found.rejected_share_replayed, found.decisions_same
     assert shares == pytest.approx((0.1, 0.05, 0.95))
     assert isinstance(few := compared(19), Unavailable)
     assert "19 logged innovations to compare with are too few (at least 20)" in few.reason

@@ -16,10 +16,10 @@ from scipy.spatial.transform import Rotation
 
 from px4fuse.ekf2 import inputs as inputs_module
 from px4fuse.ekf2.inputs import Inputs, Rules, prepare
-from px4fuse.ekf2.parameters import PARAMETERS, check, fuses_by_mask, settings_in_force
 from px4fuse.ekf2.stretches import Stretch
 from px4fuse.ekf2.vision import Vision, _decisions, _source, read_vision
 from px4fuse.ekf2.whatif import sweep_values
+from px4fuse.ekf2_parameters import PARAMETERS, check, fuses_by_mask, settings_in_force
 from px4fuse.errors import SettingsError
 from px4fuse.flight import (
     POSITION_COLUMNS,
@@ -32,8 +32,9 @@ from px4fuse.flight import (
     Reset,
     Unavailable,
 )
+from px4fuse.origin import ALIGNED, GIVEN_FILE, GNSS, KEPT, MOTION_CAPTURE, RECEIVED, Origin
 
-ALIGNED = "estimator_visual_odometry_aligned"
+ALIGNED_TOPIC = "estimator_visual_odometry_aligned"
 AID = ("estimator_aid_src_ev_pos",)
 
 
@@ -140,22 +141,25 @@ def test_what_a_log_must_hold(monkeypatch: pytest.MonkeyPatch) -> None:
     assert none.vision_height is False
 
 
-def track(name: str, rung: int, interval_s: float = 0.1, **parts: Any) -> PositionTrack:
+def track(name: str, origin: Origin, interval_s: float = 0.1, **parts: Any) -> PositionTrack:
     time = 10.0 + interval_s * np.arange(30)
     samples = pd.DataFrame(1.0, index=time, columns=POSITION_COLUMNS + POSITION_VARIANCE_COLUMNS)
     usual = {"frame": "NED", "orientation": None, "topics": (name,)}
-    return made(PositionTrack, name=name, rung=rung, samples=samples, **{**usual, **parts})
+    return made(PositionTrack, name=name, origin=origin, samples=samples, **{**usual, **parts})
 
 
 @pytest.mark.parametrize(
     ("tracks", "expected"),
     [
-        ([track("file", 1), track("vehicle_visual_odometry", 2)], "vehicle_visual_odometry"),
-        ([track("file", 1), track("gps", 7)], "file"), ([track("mocap", 3)], None),
+        ([track("file", GIVEN_FILE), track("vehicle_visual_odometry", RECEIVED)],
+         "vehicle_visual_odometry"),
+        ([track("file", GIVEN_FILE), track("gps", GNSS)], "file"),
+        ([track("mocap", MOTION_CAPTURE)], None),
         # copies that the logger did not thin: below 0.9 of its interval, and 4 Hz at least
-        ([track(ALIGNED, 4, 0.179)], ALIGNED), ([track(ALIGNED, 4, 0.181)], None),
-        ([track("estimator_aid_src_ev_pos", 5, 0.25)], "estimator_aid_src_ev_pos"),
-        ([track("estimator_aid_src_ev_pos", 5, 0.26)], None),
+        ([track(ALIGNED_TOPIC, ALIGNED, 0.179)], ALIGNED_TOPIC),
+        ([track(ALIGNED_TOPIC, ALIGNED, 0.181)], None),
+        ([track("estimator_aid_src_ev_pos", KEPT, 0.25)], "estimator_aid_src_ev_pos"),
+        ([track("estimator_aid_src_ev_pos", KEPT, 0.26)], None),
     ],
 )  # fmt: skip
 def test_the_track_that_ekf2_received_whole(
@@ -173,7 +177,7 @@ def test_a_frame_of_its_own_is_turned_with_its_variance() -> None:
         q = Rotation.from_euler("z", heading, degrees=True).as_quat(scalar_first=True)
         return pd.DataFrame([q] * 30, index=time, columns=QUATERNION_COLUMNS)
 
-    own = track("vehicle_visual_odometry", 2, frame="FRD", orientation=facing(0.0))
+    own = track("vehicle_visual_odometry", RECEIVED, frame="FRD", orientation=facing(0.0))
     own.samples[POSITION_COLUMNS] = [2.0, 0.5, -1.0]
     own.samples[POSITION_VARIANCE_COLUMNS] = [0.04, np.nan, 0.09]
     for parameters, yaw, turned in (
@@ -193,7 +197,7 @@ def test_a_frame_of_its_own_is_turned_with_its_variance() -> None:
         spread = [0.0, 0.04, 0.09] if turned else [0.04, 0.0, 0.09]
         np.testing.assert_allclose(found.variance_m2, [spread] * 30, atol=1e-12)
         np.testing.assert_allclose(found.arrival_s - time, np.linspace(0.05, 0.15, 30))
-    copy = track("estimator_aid_src_ev_pos", 5)
+    copy = track("estimator_aid_src_ev_pos", KEPT)
     found = read_vision(made(Flight, positions=(copy,)), ekf2, record, facing(90.0))
     assert isinstance(found, Vision)
     assert np.all(found.arrival_s == -np.inf)

@@ -6,12 +6,12 @@ The limits are written out here, so that one that is changed must be changed her
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 from ekf2_tools import RULES
+from exchange import replace
 from findings_tools import made
 
 from px4fuse.ekf2.inputs import Inputs, Rules

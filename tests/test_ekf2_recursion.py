@@ -6,20 +6,19 @@ The limits are written out here, so that one that is changed must be changed her
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 from ekf2_tools import RULES
+from exchange import replace
 from findings_tools import log, made
 from scipy.spatial.transform import Rotation
 
 from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.legs import FUSE, GRAVITY_M_S2, IDLE, START, Timing, make_legs
 from px4fuse.ekf2.model import Model, replay_settings
-from px4fuse.ekf2.parameters import settings_in_force
 from px4fuse.ekf2.recursion import (
     Run,
     Variant,
@@ -33,6 +32,7 @@ from px4fuse.ekf2.recursion import (
 from px4fuse.ekf2.recursion import _measurements as measurements
 from px4fuse.ekf2.stretches import Stretch
 from px4fuse.ekf2.vision import Vision
+from px4fuse.ekf2_parameters import settings_in_force
 from px4fuse.errors import SettingsError
 
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from exchange import replace
 from flights import Estimator, aisle_flight
 
 from px4fuse.analysis import Analysis, explain
@@ -61,7 +61,7 @@ def summary(
     nis: float, rejected: float = 0.0, error: float | Unavailable = 0.1, std: float = 0.1
 ) -> Summary:
     axis = AxisSummary(nis, (0.9, 1.1), std, 0.05, error)
-    return Summary({}, {"north": axis, "east": axis}, 600, rejected, 0.2, 0)
+    return Summary({}, axis, axis, 600, rejected, 0.2, 0)
 
 
 @pytest.mark.parametrize(
@@ -128,7 +128,7 @@ def test_confirmed_refused_and_not_replayed(sample: Analysis) -> None:
 
 
 def test_what_the_data_ask_for(sample: Analysis) -> None:
-    model, comparison = model_of(sample), sample.comparison
+    model, comparison = model_of(sample), sample
 
     def asked(analysis: Analysis) -> dict[str, float]:
         return asked_of_ekf2(comparison, model, analysis.tuning, analysis.clock)
@@ -178,7 +178,7 @@ def test_a_delay_that_the_replay_confirms_is(sample: Analysis) -> None:
     parameters = {**flight.log.parameters, "EKF2_EV_DELAY": 150.0}
     wrong = replace(flight, log=replace(flight.log, parameters=parameters))
     late = flown_with(offset(sample, 0.0), EKF2_EV_DELAY=150.0)
-    late = replace(late, comparison=replace(sample.comparison, flight=wrong))
+    late = replace(late, flight=wrong)
     remedy = only(ekf2_ev_delay_wrong, late).remedy
     assert remedy.startswith("Set EKF2_EV_DELAY to 0 ms: mean NIS")
     assert remedy.endswith("(replayed).")
@@ -203,11 +203,11 @@ def rejecting(comparison: Comparison) -> Comparison:
 
 
 def test_rejections_are_ended_by_the_noise_that_the_data_ask_for(sample: Analysis) -> None:
-    north = rejecting(replace(sample.comparison, axes=sample.axes[:1]))
-    sure = flown_with(replace(sample, comparison=north), EKF2_EVP_NOISE=0.03)
+    north = rejecting(replace(sample, axes={"north": sample.axes["north"]}))
+    sure = flown_with(replace(sample, axes=north.axes), EKF2_EVP_NOISE=0.03)
     remedy = only(ekf2_rejecting, sure).remedy
     assert remedy.startswith("Set EKF2_EVP_NOISE to 0.098 m: rejected")
-    right = only(ekf2_rejecting, replace(sample, comparison=north)).remedy
+    right = only(ekf2_rejecting, replace(sample, axes=north.axes)).remedy
     assert right.startswith("With what the data ask for (EKF2_EVP_NOISE to 0.098 m) the rejections")
     assert "Remove the outliers" in right
     assert "A wider EKF2_EVP_GATE is no remedy; at 10:" in right

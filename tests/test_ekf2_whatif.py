@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -11,11 +10,11 @@ import numpy as np
 import pandas as pd
 import pytest
 from ekf2_tools import RULES
+from exchange import replace
 from findings_tools import NONE, made
 
 from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.model import Model, delayed_variants, open_model
-from px4fuse.ekf2.parameters import PARAMETERS, check, settings_in_force
 from px4fuse.ekf2.replay import Ekf2Replay
 from px4fuse.ekf2.walk import (
     OUTPUT,
@@ -42,6 +41,7 @@ from px4fuse.ekf2.whatif import (
     sweep_values,
     what_if,
 )
+from px4fuse.ekf2_parameters import PARAMETERS, check, settings_in_force
 from px4fuse.errors import SettingsError
 from px4fuse.flight import STATE_COLUMNS, Ekf2, Flight, Truth, Unavailable
 
@@ -191,8 +191,8 @@ def test_the_ends_of_the_walk_are_student_and_model_against_log(model: Model) ->
     assert isinstance(model.flight.ekf2, Ekf2)
     logged = model.flight.ekf2.state
     tracks = stages(model)
-    inside = (logged.index > model.flown.stretches[0][0] + 5.0) & (
-        logged.index < model.flown.stretches[0][1]
+    inside = (logged.index > model.flown.stretches_s[0][0] + 5.0) & (
+        logged.index < model.flown.stretches_s[0][1]
     )
     times = logged.index[inside]
     assert len(made.times_s) == pytest.approx(len(times), abs=2)
@@ -352,7 +352,7 @@ def test_a_summary_joins_north_and_east() -> None:
     def axis(nis: float, error: Any) -> AxisSummary:
         return AxisSummary(nis, (0.9, 1.1), 0.1, 0.1, error)
 
-    one = Summary({}, {"north": axis(1.0, 0.3), "east": axis(3.0, 0.4)}, 9, 0.0, 0.1, 0)
+    one = Summary({}, axis(1.0, 0.3), axis(3.0, 0.4), 9, 0.0, 0.1, 0)
     assert one.nis_mean == 2.0
     assert one.position_rmse_to_truth_m == pytest.approx(0.5)
     lacking = replace(one, axes={"north": axis(1.0, 0.3), "east": axis(3.0, NONE)})

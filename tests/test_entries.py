@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 
 import pytest
 from class_tools import graded
+from exchange import replace
 
 from px4fuse.errors import SettingsError
 from px4fuse.grading.entries import Term, class_entries

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import REPOSITORY
+from exchange import replace
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import minimize

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import io
 import re
-from dataclasses import replace
 from functools import cache
 from typing import Any
 
 import numpy as np
 import pytest
 from conftest import REPOSITORY
+from exchange import replace
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from page_tools import every

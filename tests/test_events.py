@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
+from exchange import replace
 from flights import Estimator, Uwb, aisle_flight
 
 from px4fuse.comparison.comparison import compare

@@ -8,7 +8,6 @@ import json
 import re
 import shlex
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +15,7 @@ import numpy as np
 import pytest
 from browser import Browser, Elements
 from click.testing import CliRunner, Result
+from exchange import replace
 from explore_tools import ask, show
 from flights import Imu, aisle_flight
 
@@ -204,9 +204,9 @@ def test_dragging_gives_what_the_command_on_the_page_gives(
     assert isinstance(request.clock_offset_s, float)
     assert 0.03 < request.clock_offset_s < 0.09
     # what the stamps decide otherwise is held where it is
-    segment = made[1].comparison.segment
+    segment = made[1].segment
     assert (request.start_s, request.end_s) == pytest.approx((segment.start_s, segment.end_s))
-    assert request.heading_deg == pytest.approx(made[1].comparison.main.axis.heading_deg)
+    assert request.heading_deg == pytest.approx(made[1].main.axis.heading_deg)
     comparison = run_comparison(request)
     north = next(result for result in comparison.axes.values() if result.axis.name == "north")
     shown = page.ask(TABLE)
@@ -219,7 +219,7 @@ def test_dragging_gives_what_the_command_on_the_page_gives(
 def test_as_it_opens_it_says_what_the_report_says(
     page: Browser, made: tuple[Path, Analysis]
 ) -> None:
-    told = cells(made[1].comparison.main)
+    told = cells(made[1].main)
     shown = page.ask(TABLE)
     assert {name: shown[name] for name in told} == told
     assert page.ask("document.querySelector('#command-0').textContent") == (
@@ -240,7 +240,7 @@ def test_buttons_and_address(page: Browser, made: tuple[Path, Analysis]) -> None
     assert f"sigma-a={a:g}&sigma-z={z:g}" in address
     page.click("#ekf2-r")
     settle(page)
-    frame = made[1].comparison.main.ekf2_innovations
+    frame = made[1].main.ekf2_innovations
     assert not isinstance(frame, Unavailable)
     r = float(np.sqrt(frame["observation_variance_m2"].median()))
     assert float(page.ask("document.getElementById('sigma-z-value').value")) == pytest.approx(r)
@@ -271,7 +271,7 @@ def test_a_bad_address_or_number_is_refused_in_words(page: Browser) -> None:
 
 
 def test_steps_through_measurements(page: Browser, made: tuple[Path, Analysis]) -> None:
-    result = made[1].comparison.main
+    result = made[1].main
     updates, steps = result.replay.updates, result.replay.steps
     page.click("#next-0")
     page.click("#next-0")
@@ -349,7 +349,7 @@ def test_ekf2_at_a_stop_is_what_whatif_says(page: Browser, made: tuple[Path, Ana
         ".filter((row) => row === 'EKF2 rejected').length)",
     )
     (replay,) = replay_settings(model, [changes])
-    segment = made[1].comparison.segment
+    segment = made[1].segment
     assert counts == within(replay.updates, segment)["rejected"].sum()
     drawn = ask(page, "Explore.then((e) => Array.from(e.model('rejected-source-0').data.nu))")
     expected = within(replay.updates, segment)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import io
 import json
 import re
@@ -12,6 +11,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from click.testing import CliRunner, Result
+from exchange import replace
 from flights import Estimator, aisle_flight
 from test_cli import run_main
 from ulog_tools import Log, make_log, stamps, topic
@@ -59,7 +59,7 @@ def rich_flight() -> Flight:
         dropouts=(Dropout(3.0, 0.2),),
     )
     clock = ClockMap('UNIX time, "quoted"', "TIMESYNC", 512, -1.7e9 / 3, 2.5, 0.001, "a, note")
-    return dataclasses.replace(
+    return replace(
         flight, clocks=(clock,), inputs=(InputFile("uwb.csv", "00" * 32, 10, "position"),)
     )  # fmt: skip
 
@@ -247,9 +247,9 @@ def test_a_log_of_other_topics_has_no_tables(tmp_path):
 def test_table_names_are_file_names_on_every_system(sample_flight):
     track = sample_flight.positions[0]
     names = ["uwb log.csv", "UWB_LOG.csv", 'a/b\\c:d*?"<>|', "CON", "ünï", "x" * 300, "end. "]
-    flight = dataclasses.replace(
+    flight = replace(
         sample_flight,
-        positions=tuple(dataclasses.replace(track, name=name) for name in names),
+        positions=tuple(replace(track, name=name) for name in names),
     )
     tables = [name for name in extraction.tables(flight) if name.startswith("position_")]
     assert len(tables) == len(names)

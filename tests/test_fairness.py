@@ -12,9 +12,9 @@ from fairness_notes import SENTENCES, guessed, sentence
 from scipy.stats import binomtest
 
 from px4fuse.assignment.drawing import CHOICES
+from px4fuse.filter.tuning import Tuned
 from px4fuse.grading.claims import entailed
 from px4fuse.grading.rubric import read_rubric
-from px4fuse.results.comparison import Tuned
 from px4fuse.results.contract import ComparisonResults
 
 # Shares of the points: what the ideal student must have at least, the others at most

@@ -5,13 +5,13 @@ The limits are written out here, so that one that is changed must be changed her
 
 from __future__ import annotations
 
-from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
+from exchange import replace
 from findings_tools import (
     NONE,
     analysis,
@@ -24,12 +24,14 @@ from findings_tools import (
     severity,
     source,
 )
+from msgspec import structs
 
-from px4fuse.comparison.model import AgainstTruth
+from px4fuse.comparison.model import FILTERS, AgainstTruth, FilterSummary, UnjudgedFilter
 from px4fuse.comparison.remedy import Effect
 from px4fuse.ekf2.model import Model
 from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.heading import HeadingError, HeadingPart
+from px4fuse.filter.heading import turned as together
 from px4fuse.filter.signals import Segment
 from px4fuse.findings import (
     ekf2_innovations_decimated,
@@ -60,7 +62,10 @@ from px4fuse.findings.model import (
     step_share,
 )
 from px4fuse.flight import FusionRecord, Reset, Unavailable
+from px4fuse.origin import ALIGNED, GNSS, KEPT, MOTION_CAPTURE, REBUILT, RECEIVED
 from px4fuse.recording import Dropout
+
+STATED = Consistency.__struct_fields__
 
 
 def steps(*pairs: tuple[float, float], column: str = "horizontal") -> dict[str, Any]:
@@ -70,18 +75,27 @@ def steps(*pairs: tuple[float, float], column: str = "horizontal") -> dict[str, 
 
 
 def axis(name: str = "north", **parts: Any) -> Any:
-    usual = {"ekf2_innovations": NONE, "kf": NONE, "ekf2": NONE, "kf_truth": NONE,
-             "ekf2_truth": NONE, "truth": NONE, "ekf2_state": NONE}  # fmt: skip
-    return SimpleNamespace(axis=SimpleNamespace(name=name), **{**usual, **parts})
+    usual = {"ekf2_innovations": NONE, "truth": NONE, "ekf2_state": NONE}
+    filters = {
+        key: with_truth(parts.pop(key, NONE), parts.pop(f"{key}_truth", NONE)) for key in FILTERS
+    }
+    return SimpleNamespace(axis=SimpleNamespace(name=name), filters=filters, **usual | parts)
+
+
+def with_truth(one: Any, truth: Any) -> Any:
+    """A filter with its error; not judged where there is no statement."""
+    if one is NONE:
+        return UnjudgedFilter("it", "no topic for it", "Log it.", truth=truth)
+    known = {name: getattr(one, name) for name in STATED if hasattr(one, name)}
+    return made(FilterSummary, **known, truth=truth)
 
 
 def statement(nis: float = 1.0, verdict: str = "consistent", **parts: Any) -> Any:
     """A filter with this mean NIS."""
     usual = {"lag1_autocorrelation": 0.0, "outside_gate": 0.0, "innovation_std_m": 0.3,
              "innovation_mean_m": 0.4}  # fmt: skip
-    one = made(Consistency, nis_mean=nis, nis_band=(0.8, 1.2), variance_factor=1.0 / nis,
-               verdict=verdict, **{**usual, **parts})  # fmt: skip
-    return SimpleNamespace(consistency=one)
+    return made(Consistency, nis_mean=nis, nis_band=(0.8, 1.2), verdict=verdict,
+                **{**usual, **parts})  # fmt: skip
 
 
 # ---------------------------------------------------------------- words and times
@@ -194,7 +208,7 @@ UNKNOWN = "the log does not show why"
         (never(parameters={"EKF2_AID_MASK": 9.0}), UNKNOWN, "EKF2_EV_CTRL"),
         (never(2.0), UNKNOWN, "EKF2_EV_CTRL"),  # such a release has no limit
         (never(2.0, parameters={"EKF2_EV_CTRL": 15.0}), "come every 0.50 s", "10 Hz"),
-        (never(2.0, parameters={"EKF2_EV_CTRL": 15.0}, reconstructed=True), UNKNOWN, "Check"),
+        (never(2.0, parameters={"EKF2_EV_CTRL": 15.0}, origin=KEPT), UNKNOWN, "Check"),
         (never(5.0, parameters={"EKF2_EV_CTRL": 15.0}), UNKNOWN, "Check"),
         (never(age_s=0.29), UNKNOWN, "Check"),
         (never(age_s=0.31), "arrive 0.31 s after their stamps, and EKF2 keeps no more than 0.20 s",
@@ -212,7 +226,7 @@ def test_why_ekf2_does_not_fuse(one: Any, says: str, remedy: str) -> None:
 
 def test_without_a_horizon_no_sample_is_called_too_old() -> None:
     one = never(age_s=5.0)
-    object.__setattr__(one.comparison.flight.ekf2, "horizon_s", NONE)
+    object.__setattr__(one.flight.ekf2, "horizon_s", NONE)
     assert UNKNOWN in only(ekf2_not_fusing, one).message
 
 
@@ -222,7 +236,9 @@ def test_without_a_horizon_no_sample_is_called_too_old() -> None:
      ("GPS", 0.0, None)],
 )  # fmt: skip
 def test_what_ekf2_never_fuses(name: str, first: float, expected: str | None) -> None:
-    one = analysis(ekf2=steps((0.0, first), (100.0, 0.0)), source=source(name=name, rung=3))
+    one = analysis(
+        ekf2=steps((0.0, first), (100.0, 0.0)), source=source(name=name, origin=MOTION_CAPTURE)
+    )
     assert severity(ekf2_not_fusing, one) == expected
 
 
@@ -302,7 +318,7 @@ def test_what_ends_rejections_is_tried_in_order(
 
 
 def against_truth(nees: float, rmse_m: float = 0.4) -> AgainstTruth:
-    return AgainstTruth(100, rmse_m, None, nees, None)
+    return AgainstTruth(count=100, position_rmse_m=rmse_m, nees_position_mean=nees)
 
 
 def hiding(nis: float = 1.0, nees: float = 4.0, name: str = "north", **parts: Any) -> Any:
@@ -318,7 +334,9 @@ def hiding(nis: float = 1.0, nees: float = 4.0, name: str = "north", **parts: An
 def test_errors_that_innovations_hide(nis: float, nees: float, expected: str | None) -> None:
     one = analysis(axes=(hiding(nis, nees),))
     assert severity(errors_larger_than_claimed, one) == expected
-    unknown = axis(kf=statement(nis), kf_truth=replace(against_truth(1.0), nees_position_mean=None))
+    unknown = axis(
+        kf=statement(nis), kf_truth=structs.replace(against_truth(1.0), nees_position_mean=None)
+    )
     assert severity(errors_larger_than_claimed, analysis(axes=(unknown,))) is None
 
 
@@ -452,10 +470,13 @@ def test_a_recording_says_what_it_holds() -> None:
 )  # fmt: skip
 def test_positions_that_the_logger_thinned(rate_hz: float, name: str, decimated: bool) -> None:
     wanted = "position source vehicle_visual_odometry"
-    missing = (Unavailable("another", "no", "Do."), Unavailable(wanted, "it was off", "Do."))
-    for rung in (4, 5, 6):
+    missing = (
+        Unavailable("another", "no", "Do."),
+        Unavailable(wanted, "it was off", "Do.", source="vehicle_visual_odometry"),
+    )
+    for origin in (ALIGNED, KEPT, REBUILT):
         one = analysis(
-            source=source(name=name, rung=rung, rate_hz=rate_hz), missing=missing,
+            source=source(name=name, origin=origin, rate_hz=rate_hz), missing=missing,
             log=log(parameters={"SDLOG_PROFILE": 2.0}),
         )  # fmt: skip
         found = {f.id: f for f in source_not_logged.DETECTOR.detect(one)}
@@ -466,10 +487,15 @@ def test_positions_that_the_logger_thinned(rate_hz: float, name: str, decimated:
             limit = found["source_decimated"].evidence["logger_limit_hz"]
             assert f"own limit for it ({limit:g} Hz)" in found["source_decimated"].message
             assert rate_hz == pytest.approx(limit, rel=0.35)
-    for rung, tracks in ((2, ()), (3, ()), (7, ()), (4, (SimpleNamespace(rung=2),))):
-        one = analysis(source=source(name=name, rung=rung), flight={"positions": tracks})
+    for origin, tracks in (
+        (RECEIVED, ()), (MOTION_CAPTURE, ()), (GNSS, ()),
+        (ALIGNED, (SimpleNamespace(origin=RECEIVED),)),
+    ):  # fmt: skip
+        one = analysis(source=source(name=name, origin=origin), flight={"positions": tracks})
         assert named(source_not_logged, one) == {}
-    first = next(source_not_logged.DETECTOR.detect(analysis(source=source(name=name, rung=4))))
+    first = next(
+        source_not_logged.DETECTOR.detect(analysis(source=source(name=name, origin=ALIGNED)))
+    )
     assert "(it is not in this log)" in first.message
 
 
@@ -480,7 +506,7 @@ def test_a_silent_source(rate_hz: float, least_s: float) -> None:
     for gap_s, there in ((least_s, False), (least_s + 0.25, True)):
         time = np.concatenate([np.arange(10.0, 20.5, 0.5), [20.0 + gap_s, 20.5 + gap_s]])
         one = analysis(axes=(axis(),), source=source(rate_hz=rate_hz))
-        one.comparison.lines[0].measurement_time_s = time
+        one.lines[0].measurement_time_s = time
         assert bool(named(source_gap, one)) is there
         if there:
             finding = only(source_gap, one)
@@ -497,7 +523,7 @@ def test_the_range_of_the_motion_leaves_out_a_twentieth_at_either_end() -> None:
     moving = positions(10.0 + np.arange(100))
     moving["east_m"] = east
     outside = positions([5.0, 111.0], 99.0)
-    comparison = analysis(source=source(samples=pd.concat([moving, outside]))).comparison
+    comparison = analysis(source=source(samples=pd.concat([moving, outside])))
     assert no_motion.motion_range_m(comparison) == 2.0
 
 
@@ -541,7 +567,7 @@ def test_a_frame_that_is_not_north(until_s: float, expected: str) -> None:
 
 def turned(*degrees: float, sigma_deg: float = 1.0, p: float = 1.0) -> HeadingError:
     parts = (HeadingPart(10.0 * n, 10.0 * n + 10.0, d, sigma_deg) for n, d in enumerate(degrees))
-    return HeadingError(tuple(parts), p, "positions")
+    return together(tuple(parts), p, "positions")
 
 
 @pytest.mark.parametrize(
@@ -555,7 +581,7 @@ def turned(*degrees: float, sigma_deg: float = 1.0, p: float = 1.0) -> HeadingEr
 )  # fmt: skip
 def test_a_frame_that_is_turned(heading: HeadingError, expected: str | None) -> None:
     assert severity(source_frame_turned, analysis(heading=heading)) == expected
-    made_of_ekf2 = source(reconstructed=True)
+    made_of_ekf2 = source(origin=KEPT)
     assert severity(source_frame_turned, analysis(heading=heading, source=made_of_ekf2)) is None
 
 

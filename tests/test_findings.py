@@ -6,7 +6,7 @@ import math
 import pkgutil
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cache
 from importlib import import_module
 from pathlib import Path
@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from exchange import replace
 from flights import Estimator, Imu, Uwb, aisle_flight, unexplained, with_noises
 from test_hypotheses import NAMED_HERE as NAMED_AS_CAUSES
 from test_loop import NAMED_HERE as NAMED_IN_LOOPS
@@ -38,10 +39,11 @@ from px4fuse.flight import (
     Truth,
     Unavailable,
 )
+from px4fuse.origin import ALIGNED, KEPT, MOTION_CAPTURE
 from px4fuse.readers import read_log
 from px4fuse.recording import ClockMap, Dropout
 
-ALIGNED = "estimator_visual_odometry_aligned"
+ALIGNED_TOPIC = "estimator_visual_odometry_aligned"
 NO_VISION = {"EKF2_EVP_NOISE": 0.1, "SDLOG_PROFILE": 1.0}
 SIDESTEP = Reset(60.0, "position", (3.0, 0.0, 0.0))
 STEP_UP = Reset(60.0, "position", (0.0, 0.0, -0.4))
@@ -138,8 +140,9 @@ def apart(flight: Flight, *, grows: bool) -> Flight:
 
 def placed(*warnings: str) -> Alignment:
     return Alignment(
-        "enu", "given", 0.0, None, "given", (0.0, 0.0, 0.0), 0.0, None, "given", "", None, None,
-        warnings,
+        frame="enu", frame_reason="given", yaw_deg=0.0, yaw_reason="given",
+        origin_m=(0.0, 0.0, 0.0), clock_offset_s=0.0, clock_reason="given",
+        reference="", warnings=warnings,
     )  # fmt: skip
 
 
@@ -341,7 +344,7 @@ FAULTS = [
     Fault(
         "source_not_logged",
         "warning",
-        {"uwb": Uwb(name=ALIGNED, rung=4, rate_hz=4.0), "parameters": NO_VISION},
+        {"uwb": Uwb(name=ALIGNED_TOPIC, origin=ALIGNED, rate_hz=4.0), "parameters": NO_VISION},
         evidence={"rate_hz": about(4.0), "sdlog_profile": 1.0},
         says="The log lacks vehicle_visual_odometry, the position as it arrived",
         remedy="SDLOG_PROFILE to 129",
@@ -349,7 +352,7 @@ FAULTS = [
     Fault(
         "source_decimated",
         "warning",
-        {"uwb": Uwb(name="estimator_aid_src_ev_pos", rung=5, rate_hz=2.0)},
+        {"uwb": Uwb(name="estimator_aid_src_ev_pos", origin=KEPT, rate_hz=2.0)},
         evidence={"rate_hz": about(2.0), "logger_limit_hz": 2.0},
     ),
     Fault(
@@ -597,7 +600,8 @@ def test_motion_capture_is_called_not_fused_where_nothing_else_is(
 ) -> None:
     """EKF2 never takes it; with external vision beside it, it is an independent reference."""
     flight = aisle_flight(
-        ekf2=Estimator(fusing=((0.0, fusing),)), uwb=Uwb(name="vehicle_mocap_odometry", rung=3)
+        ekf2=Estimator(fusing=((0.0, fusing),)),
+        uwb=Uwb(name="vehicle_mocap_odometry", origin=MOTION_CAPTURE),
     )
     assert ("ekf2_not_fusing" in ids(found(compare(flight)))) is named
 
@@ -662,7 +666,7 @@ def test_a_variance_is_named_on_the_axis_where_it_is_worst() -> None:
 
 
 def test_innovations_are_not_called_decimated_where_the_source_is_made_of_them() -> None:
-    uwb = Uwb(name="estimator_aid_src_ev_pos", rung=5)
+    uwb = Uwb(name="estimator_aid_src_ev_pos", origin=KEPT)
     flight = aisle_flight(uwb=uwb, ekf2=Estimator(every=3))
     assert "ekf2_innovations_decimated" not in ids(found(compare(flight)))
 

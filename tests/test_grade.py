@@ -94,7 +94,7 @@ def test_a_report_with_its_log_is_verified_and_a_changed_one_is_not(tmp_path) ->
     changed = PdfWriter(clone_from=io.BytesIO(REPORT.read_bytes()))
     (name,) = PdfReader(io.BytesIO(REPORT.read_bytes())).attachments
     results = json.loads(PdfReader(io.BytesIO(REPORT.read_bytes())).attachments[name][0])
-    results["axes"]["north"]["kf"]["nis_mean"] = 1.0
+    results["axes"]["north"]["filters"]["kf"]["nis_mean"] = 1.0
     changed._root_object.pop("/Names", None)
     changed.add_attachment(name, json.dumps(results).encode())
     with (folder / "b.pdf").open("wb") as file:

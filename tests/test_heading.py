@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pandas as pd
 import pytest
+from exchange import replace
 from flights import aisle_flight, unexplained
 from scipy.spatial.transform import Rotation
 
@@ -18,6 +18,7 @@ from px4fuse.filter.heading import DRIFT_P, HeadingError, HeadingPart, heading_e
 from px4fuse.filter.settings import Settings
 from px4fuse.findings import Finding, source_frame_turned
 from px4fuse.flight import QUATERNION_COLUMNS, ROTATION_VARIANCE_COLUMNS, Flight, Unavailable
+from px4fuse.origin import KEPT
 from px4fuse.readers import read_log
 from px4fuse.simulation.flights import simulate_flight
 from px4fuse.simulation.mistakes import parse
@@ -152,7 +153,7 @@ def named(heading: HeadingError, **track: object) -> dict[str, Finding]:
 
 def made(*turns_deg: float, drift_p: float) -> HeadingError:
     parts = [HeadingPart(2.0 * i, 2.0 * i + 2.0, turn, 1.0) for i, turn in enumerate(turns_deg)]
-    return HeadingError(tuple(parts), drift_p, "positions")
+    return heading.turned(tuple(parts), drift_p, "positions")
 
 
 def test_a_drifting_heading_is_named_with_its_ends_and_no_turn_is_offered():
@@ -177,7 +178,7 @@ def test_what_ekf2_has_turned_already_is_not_turned_again():
     found = named(made(20.0, 21.0, 19.0, drift_p=0.5), name="estimator_visual_odometry_aligned")
     assert list(found) == ["ekf2_heading_wrong"]
     assert "--position-yaw" not in found["ekf2_heading_wrong"].remedy
-    assert named(made(20.0, 21.0, 19.0, drift_p=0.5), reconstructed=True) == {}
+    assert named(made(20.0, 21.0, 19.0, drift_p=0.5), origin=KEPT) == {}
 
 
 def test_changes_within_chance_or_too_small_to_matter_are_none():

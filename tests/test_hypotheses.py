@@ -6,12 +6,12 @@ Each detector on a clean flight, a faulty one, one without what it needs, and a 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pandas as pd
 import pytest
+from exchange import replace
 from flights import aisle_flight, unavailable, unexplained
 
 from px4fuse.analysis import Analysis
@@ -212,7 +212,7 @@ def test_other_mistakes_are_no_smoothing(mistake) -> None:
 
 def test_a_shift_of_the_stamps_that_explains_as_much_is_no_smoothing() -> None:
     late = flown("clock-offset=250ms")
-    axes = tuple(result.axis for result in late.comparison.axes.values())
+    axes = tuple(result.axis for result in late.axes.values())
     given = {"sigma_a_m_s2": 0.27, "sigma_z_m": 0.10, "outlier_time_s": np.array([])}
     told = smoothing(axes, RIGHT, **given, clock_offset_s=-0.25)
     assert isinstance(told, Smoothing)
@@ -241,7 +241,7 @@ def test_intervals_of_a_thinned_source_are_whole_multiples(intervals, named) -> 
     time = np.cumsum(steps)
     (track,) = flight().positions
     samples = track.samples.iloc[: len(time)].set_axis(pd.Index(time + 5.0, name="time_s"))
-    other = replace(flown().comparison, source=replace(track, samples=samples))
+    other = replace(flown(), source=replace(track, samples=samples))
     finding = list(source_thinned.DETECTOR.detect(replace(flown(), comparison=other)))
     assert bool(finding) is named
 
@@ -256,7 +256,7 @@ def with_ekf2(*mistakes: str) -> Analysis:
 
 def aged(change: Callable[[pd.Series], pd.Series]) -> list[Finding]:
     """What is said where the positions have other ages."""
-    comparison = with_ekf2().comparison
+    comparison = with_ekf2()
     ekf2 = comparison.flight.ekf2
     assert isinstance(ekf2, Ekf2)
     assert isinstance(ekf2.record, FusionRecord)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from exchange import replace
 from flights import Estimator, Uwb, aisle_flight
 from mavlink_tools import AUTOPILOT, UNIX_S, Aisle, Recorder, heartbeat
 from test_cli import run_main
@@ -24,6 +24,7 @@ from px4fuse.contents.outlook import Ability
 from px4fuse.errors import Px4FuseError
 from px4fuse.findings import find
 from px4fuse.flight import Flight, Unavailable
+from px4fuse.origin import GNSS
 from px4fuse.readers import read_log
 from px4fuse.recording import ClockMap, Dropout, Sender
 from px4fuse.request import ComparisonRequest
@@ -287,7 +288,7 @@ def test_one_message_is_neither_damage_nor_a_span(tmp_path):
 
 def test_a_replay_is_told_by_its_speed_and_not_in_millions_of_ppm(sample_flight, capsys):
     clock = ClockMap("time of receipt", "receive time", 9, -1.7e9, 26e6, 1.2, "a replay?")
-    replayed = take_inventory(dataclasses.replace(sample_flight, clocks=(clock,)))
+    replayed = take_inventory(replace(sample_flight, clocks=(clock,)))
     _print(terminal(), replayed, ComparisonRequest(log="x.tlog"))
     said = capsys.readouterr().out
     assert "27 times its speed" in said
@@ -383,8 +384,8 @@ def test_gaps_are_counted_and_the_longest_is_given(tmp_path):
         aisle_flight(duration_s=20.0, ekf2=Estimator(innovations_logged=False)),
         aisle_flight(duration_s=20.0, ekf2=Estimator(fusing=None)),
         aisle_flight(duration_s=20.0, truth=False),
-        aisle_flight(duration_s=20.0, uwb=Uwb(name="vehicle_gps_position", rung=7)),
-        dataclasses.replace(aisle_flight(duration_s=20.0), positions=()),
+        aisle_flight(duration_s=20.0, uwb=Uwb(name="vehicle_gps_position", origin=GNSS)),
+        replace(aisle_flight(duration_s=20.0), positions=()),
     ],
 )
 def test_abilities_follow_the_flight(flight: Flight):
@@ -409,7 +410,7 @@ def test_abilities_follow_the_flight(flight: Flight):
 
 
 def test_a_recording_names_its_senders_clocks_and_dropouts(monkeypatch, tmp_path, sample_flight):
-    log = dataclasses.replace(
+    log = replace(
         sample_flight.log,
         format="MAVLink tlog",
         senders=(Sender(1, 1, "PX4 quadrotor", 4321, 0.125, True),
@@ -418,7 +419,7 @@ def test_a_recording_names_its_senders_clocks_and_dropouts(monkeypatch, tmp_path
         start_unix_s=1_700_000_000.0,
     )  # fmt: skip
     clock = ClockMap("UNIX time of system 1, component 197", "TIMESYNC", 512, -1.7e9, 2.5, 0.001)
-    flight = dataclasses.replace(sample_flight, log=log, clocks=(clock,))
+    flight = replace(sample_flight, log=log, clocks=(clock,))
     monkeypatch.setattr("px4fuse.analysis.read_log", lambda _, **__: flight)
     text = info(tmp_path / "any.tlog")
     assert widest(text) <= WIDTH
@@ -428,8 +429,8 @@ def test_a_recording_names_its_senders_clocks_and_dropouts(monkeypatch, tmp_path
 
 
 def test_a_clock_beyond_the_calendar_is_no_date(sample_flight):
-    log = dataclasses.replace(sample_flight.log, start_unix_s=1e18)
-    assert take_inventory(dataclasses.replace(sample_flight, log=log)).start_utc is None
+    log = replace(sample_flight.log, start_unix_s=1e18)
+    assert take_inventory(replace(sample_flight, log=log)).start_utc is None
 
 
 # ---- every log --------------------------------------------------------------------------------

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pandas as pd
 import pytest
+from exchange import replace
 from flights import aisle_flight
 from mavlink_tools import BOOT_S, Aisle, unix
 from ulog_tools import load
@@ -103,8 +102,8 @@ def test_the_join_is_noted_with_how_well_both_agree(sample_flight, tlog_flight):
 
 def test_tracks_stand_in_the_order_of_the_ladder(sample_flight, tlog_flight):
     for joined in (join(sample_flight, tlog_flight), join(tlog_flight, sample_flight)):
-        rungs = [t.rung for t in joined.positions]
-        assert rungs == sorted(rungs)
+        places = [t.origin.preference for t in joined.positions]
+        assert places == sorted(places)
         names = {t.name for t in joined.positions}
         assert {"vehicle_visual_odometry", "VISION_POSITION_ESTIMATE"} <= names
 

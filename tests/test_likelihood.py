@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
+from exchange import replace
 from flights import line, random_walk
 from hypothesis import given, settings
 from numpy.typing import NDArray

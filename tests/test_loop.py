@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from conftest import REPOSITORY
+from exchange import replace
 from pyulog import ULog
 from scipy.spatial.transform import Rotation, Slerp
 from test_lesson import EXAMPLE_2

@@ -14,12 +14,12 @@ import json
 import os
 import re
 import struct
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
+from exchange import replace
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mavlink_tools import (
@@ -67,6 +67,7 @@ from px4fuse.flight import (
     Truth,
     Unavailable,
 )
+from px4fuse.origin import MOTION_CAPTURE, RECEIVED
 from px4fuse.readers import read_log
 from px4fuse.readers.mavlink_frames import read_frames
 
@@ -137,7 +138,9 @@ def test_the_made_flight_comes_back(read):
     assert flight.streams["imu"].topics == ("HIGHRES_IMU",)
     assert flight.streams["ekf2_state"].topics == ("ODOMETRY",)
     [track] = flight.positions
-    assert (track.name, track.rung, track.frame) == ("VISION_POSITION_ESTIMATE", 2, "NED")
+    assert (track.name, track.origin, track.frame) == (
+        "VISION_POSITION_ESTIMATE", RECEIVED, "NED",
+    )  # fmt: skip
     np.testing.assert_allclose(
         track.samples[POSITION_VARIANCE_COLUMNS], np.tile(POSE_VARIANCE, (200, 1)), rtol=1e-6
     )
@@ -317,15 +320,16 @@ def test_velocity_in_a_fixed_frame_is_turned(read, child, expected):
 
 
 @pytest.mark.parametrize(
-    ("estimator", "name", "rung"),
-    [(0, "ODOMETRY", 2), (1, "ODOMETRY_NAIVE", 2), (2, "ODOMETRY_VISION", 2),
-     (3, "ODOMETRY_VIO", 2), (6, "ODOMETRY_MOCAP", 3)],
+    ("estimator", "name", "origin"),
+    [(0, "ODOMETRY", RECEIVED), (1, "ODOMETRY_NAIVE", RECEIVED),
+     (2, "ODOMETRY_VISION", RECEIVED), (3, "ODOMETRY_VIO", RECEIVED),
+     (6, "ODOMETRY_MOCAP", MOTION_CAPTURE)],
 )  # fmt: skip
-def test_odometry_to_the_autopilot_is_a_position_by_its_estimator(read, estimator, name, rung):
+def test_odometry_to_the_autopilot_is_a_position_by_its_estimator(read, estimator, name, origin):
     """And EKF2's own ODOMETRY beside it stays EKF2's."""
     flight = read(Aisle(uwb="ODOMETRY", estimator=estimator, asks=True))
     [track] = flight.positions
-    assert (track.name, track.rung, track.topics) == (name, rung, ("ODOMETRY",))
+    assert (track.name, track.origin, track.topics) == (name, origin, ("ODOMETRY",))
     assert len(track.samples) == 200
     assert len(flight.ekf2.state) == 800
     given = track.samples[POSITION_VARIANCE_COLUMNS]
@@ -370,7 +374,7 @@ def test_motion_capture_is_truth_where_another_source_feeds_ekf2(read):
 def test_motion_capture_alone_is_a_position_and_no_truth(read):
     flight = read(Aisle(uwb="ATT_POS_MOCAP", asks=True))
     [track] = flight.positions
-    assert (track.name, track.rung) == ("ATT_POS_MOCAP", 3)
+    assert (track.name, track.origin) == ("ATT_POS_MOCAP", MOTION_CAPTURE)
     assert isinstance(flight.truth, Unavailable)
 
 

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import astuple, replace
+from dataclasses import astuple
 
 import numpy as np
 import pytest
+from exchange import replace
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from mavlink_tools import (

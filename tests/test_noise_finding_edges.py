@@ -5,13 +5,13 @@ The limits are written out here, so that one that is changed must be changed her
 
 from __future__ import annotations
 
-from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
+from exchange import replace
 from findings_tools import (
     CHOSEN,
     NONE,
@@ -182,7 +182,7 @@ def following(gain: float, *, growth: float = 0.05, **parts: Any) -> Any:
         (following(0.1, lag1_autocorrelation=0.3), "error"),
         (following(0.1, lag1_autocorrelation=0.29), None),
         (following(0.1, verdict="consistent"), None),
-        (axis(kf=SimpleNamespace(consistency=NONE), replay=SimpleNamespace(updates=None)), None),
+        (axis(kf=NONE, replay=SimpleNamespace(updates=None)), None),
     ],
 )  # fmt: skip
 def test_a_process_noise_that_is_forgotten(one: Any, expected: str | None) -> None:
@@ -190,7 +190,9 @@ def test_a_process_noise_that_is_forgotten(one: Any, expected: str | None) -> No
 
 
 def test_a_forgotten_process_noise_is_told_with_how_slow_the_filter_is() -> None:
-    finding = only(process_noise_forgotten, analysis(axes=(following(0.05), following(0.01))))
+    slower = following(0.01)
+    slower.axis.name = "east"
+    finding = only(process_noise_forgotten, analysis(axes=(following(0.05), slower)))
     assert finding.remedy == "Raise SIGMA_A."
     assert "(5.0% in variance), the gain is 0.050, and the filter needs 5 s" in finding.message
     assert finding.evidence["response_s"] == pytest.approx(5.0)
@@ -255,7 +257,7 @@ def test_of_what_is_overstated_a_source_that_drifts_or_the_truth_forbids_to_lowe
     [(Settings(), True), (Settings(sigma_z_m=0.11), False), (Settings(sigma_a_m_s2=0.51), False)],
 )
 def test_our_own_noises_are_the_programs(settings: Settings, default: bool) -> None:
-    assert _is_default(analysis(settings=settings).comparison, "kf", axis()) is default
+    assert _is_default(analysis(settings=settings), "kf", axis()) is default
     found = only(variance, analysis(axes=(kf(5.0),), settings=settings))
     assert found.severity == ("warning" if default else "error")
 
@@ -278,7 +280,7 @@ def test_ekf2s_noise_is_the_programs_unless_the_sender_chose_another(
 ) -> None:
     parameters = {} if set_m is None else {"EKF2_EVP_NOISE": set_m}
     one = analysis(log=log(parameters=parameters))
-    assert _is_default(one.comparison, "ekf2", fused(used_m)) is default
+    assert _is_default(one, "ekf2", fused(used_m)) is default
 
 
 @pytest.mark.parametrize(
@@ -291,7 +293,7 @@ def test_ekf2s_noise_is_the_programs_unless_the_sender_chose_another(
     ],
 )  # fmt: skip
 def test_which_noise_fixes_a_variance(noise: float, used: float, nis: float, helps: bool) -> None:
-    assert _noise_helps(noise, used, statement(nis).consistency) is helps
+    assert _noise_helps(noise, used, statement(nis)) is helps
 
 
 @pytest.mark.parametrize(
@@ -302,7 +304,7 @@ def test_outliers_explain_a_variance(
     nis: float, outside: float, of_source: int, there: bool
 ) -> None:
     noises = tuned(outlier_time_s=np.zeros(of_source), count=1000)
-    one = statement(nis, outside_gate=outside).consistency
+    one = statement(nis, outside_gate=outside)
     said = _outliers(analysis(tuning=noises), 0.123, one)
     assert bool(said) is there
     if there:
@@ -387,7 +389,7 @@ def test_what_ekf2s_variance_asks_for(
 
 def test_of_a_bound_the_noise_is_never_less_than_a_millimetre() -> None:
     asked = variance.SourceNoise(1e-5, upper_bound=False)
-    said, cause = _kf_remedy(analysis(), asked, statement(0.2).consistency)
+    said, cause = _kf_remedy(analysis(), asked, statement(0.2))
     assert said.startswith("The data ask for SIGMA_Z 0.001 m. [--sigma-z 0.001|")
     assert cause == "measurement noise"
 
@@ -481,7 +483,7 @@ def test_what_may_drift_is_told_with_its_scatter_and_its_loop() -> None:
 
 def flight_of(ours: Any, **parts: Any) -> Any:
     one = analysis(axes=(ours,), **{"source": MOVING, **parts})
-    one.comparison.main = ours
+    one.main = ours
     return one
 
 

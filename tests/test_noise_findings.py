@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
 import pytest
+from exchange import replace
 from flights import unexplained
 
 from px4fuse.analysis import Analysis, explain
@@ -88,7 +88,7 @@ def test_the_offset_that_is_stated_is_the_one_that_was_made() -> None:
 
 @pytest.mark.parametrize("mistake", ["clock-offset=120ms", "nlos=5%"])
 def test_what_was_not_explained_is_not_guessed(mistake) -> None:
-    assert found(unexplained(flown(RIGHT, mistake).comparison)) == {}
+    assert found(unexplained(flown(RIGHT, mistake))) == {}
 
 
 def test_a_flight_of_a_moment_says_nothing() -> None:

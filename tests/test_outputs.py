@@ -212,7 +212,7 @@ def test_auto_brings_late_stamps_to_the_truth(shared_logs, tmp_path, monkeypatch
                                 "--clock-offset", offset, "-o", out)  # fmt: skip
         assert (code, err) == (0, "")
         found = json.loads(out.with_suffix(".json").read_text(encoding="utf-8"))
-        rmse[offset] = found["axes"]["aisle"]["truth"]["kf_position_rmse_m"]
+        rmse[offset] = found["axes"]["aisle"]["filters"]["kf"]["truth"]["position_rmse_m"]
         if offset == "auto":
             assert found["settings"]["clock_offset_s"] == pytest.approx(-0.25, abs=0.05)
     assert rmse["auto"] < 0.1 < rmse["0"]
@@ -256,7 +256,7 @@ def test_position_files_that_do_not_fit_are_said_not_to(
         found = findings_of(monkeypatch, capsys, out, sample_log, "--position", file)
         fitted = json.loads(out.with_suffix(".json").read_text(encoding="utf-8"))
         assert not placement(found)
-    frame = fitted["position_source"]["alignment"]["frame"]
+    frame = fitted["source"]["alignment"]["frame"]
 
     for given in {"ned", "enu", "nwu"} - {frame}:
         with subtests.test("another frame", given=given):

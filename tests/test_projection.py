@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pandas as pd
 import pytest
+from exchange import replace
 from flights import Estimator, Uwb, aisle_flight, table
 
 from px4fuse.comparison.projection import (
@@ -27,6 +27,7 @@ from px4fuse.flight import (
     Flight,
     Unavailable,
 )
+from px4fuse.origin import MOTION_CAPTURE
 
 WHOLE = Segment(0.0, 40.0, "")
 HEADING_DEG = 30.0
@@ -134,7 +135,7 @@ def test_the_aisle_needs_both_horizontal_axes(lacking: str) -> None:
 
 
 def test_innovations_are_of_external_vision_alone() -> None:
-    made = flight(uwb=Uwb(name="vehicle_mocap_odometry", rung=3))
+    made = flight(uwb=Uwb(name="vehicle_mocap_odometry", origin=MOTION_CAPTURE))
     got = project_innovations(made, made.ekf2, made.positions[0], axes_of(made)["north"], WHOLE)
     assert isinstance(got, Unavailable)
     assert "not to vehicle_mocap_odometry" in str(got)
@@ -177,8 +178,10 @@ def test_the_observation_noise_is_ekf2s_own_rule(
     aisle = axes_of(made)["aisle"]
     assert observation_variance(made, track, aisle, WHOLE) == pytest.approx(expected_m2)
     placed = Alignment(
-        "enu", "given", 0.0, None, "given", (0.0, 0.0, 0.0), 0.0, None, "given", "", None, None, ()
-    )
+        frame="enu", frame_reason="given", yaw_deg=0.0, yaw_reason="given",
+        origin_m=(0.0, 0.0, 0.0), clock_offset_s=0.0, clock_reason="given",
+        reference="", warnings=(),
+    )  # fmt: skip
     own_file = replace(track, alignment=placed)
     least = max(parameters["EKF2_EVP_NOISE"], 0.01) ** 2
     assert observation_variance(made, own_file, aisle, WHOLE) == pytest.approx(least)

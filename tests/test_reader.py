@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 from itertools import pairwise
 
 import numpy as np
 import pytest
+from exchange import replace
 from ulog_tools import (
     AXES,
     EV_VARIANCE,
@@ -41,6 +41,7 @@ from px4fuse.flight import (
     Reset,
     Unavailable,
 )
+from px4fuse.origin import ALIGNED, GNSS, KEPT, MOTION_CAPTURE, REBUILT, RECEIVED
 from px4fuse.readers import read_log
 from px4fuse.readers.px4_innovations import JOIN_TOLERANCE_S
 
@@ -86,7 +87,7 @@ def later(log, by_us):
 @pytest.mark.parametrize("generation", GENERATIONS)
 def test_external_vision_is_read(read, generation):
     (track, *_) = read(make_log(generation)).positions
-    assert (track.name, track.rung, track.reconstructed) == ("vehicle_visual_odometry", 2, False)
+    assert (track.name, track.origin) == ("vehicle_visual_odometry", RECEIVED)
     expected = seconds_of(ev_stamps(10.0))
     np.testing.assert_allclose(times(track.samples), expected, atol=1e-9)
     np.testing.assert_allclose(
@@ -351,7 +352,7 @@ def test_positions_that_ekf2_kept_are_those_of_the_primary(read, name, generatio
     """Each instance turns external vision into its own frame; the second's is 1 m further north."""
     log = with_two_instances(generation, [(0.0, 0), (4.95, 1)])
     if generation == "v1.12":
-        log.add(dataclasses.replace(odometry(name, 10.0, 12), instance=1))
+        log.add(replace(odometry(name, 10.0, 12), instance=1))
     second = next(made for made in log.topics if (made.name, made.instance) == (name, 1))
     second.fields[field].reshape(50, -1)[:, 0] += 1.0
     track, _ = choose_source(read(log), name)
@@ -386,7 +387,7 @@ def test_resets_are_read_through_the_wrap_of_the_counter(read, before):
     fields["vz_reset_counter"][:80], fields["vz_reset_counter"][80:] = before, after
     fields["delta_vz"][80:] = -4.0
     resets = read(log).ekf2.resets
-    assert [dataclasses.replace(r, time_s=round(r.time_s, 6)) for r in resets] == [
+    assert [replace(r, time_s=round(r.time_s, 6)) for r in resets] == [
         Reset(4.0, "position", (1.5, -0.5, 0.0)),
         Reset(6.0, "position", (0.0, 0.0, 0.25)),
         Reset(7.0, "velocity", (0.125, 2.0, 0.0)),
@@ -516,37 +517,36 @@ def everything():
     return log.add(odometry("estimator_visual_odometry_aligned", 10.0, 12))
 
 
-LADDER = [
-    ("vehicle_visual_odometry", 2),
-    ("vehicle_mocap_odometry", 3),
-    ("estimator_visual_odometry_aligned", 4),
-    ("estimator_aid_src_ev_pos", 5),
-    ("ekf2_state_plus_innovation", 6),
-    ("vehicle_gps_position", 7),
+PREFERRED = [
+    ("vehicle_visual_odometry", RECEIVED),
+    ("vehicle_mocap_odometry", MOTION_CAPTURE),
+    ("estimator_visual_odometry_aligned", ALIGNED),
+    ("estimator_aid_src_ev_pos", KEPT),
+    ("ekf2_state_plus_innovation", REBUILT),
+    ("vehicle_gps_position", GNSS),
 ]
 
 
-def test_sources_stand_in_the_order_of_the_ladder(read):
+def test_sources_stand_in_order_of_preference(read):
     tracks = read(everything()).positions
-    assert [(track.name, track.rung) for track in tracks] == LADDER
-    assert [track.reconstructed for track in tracks] == [False, False, False, True, True, False]
+    assert [(track.name, track.origin) for track in tracks] == PREFERRED
 
 
 @pytest.mark.parametrize("taken", range(1, 4))
 def test_the_best_source_left_is_chosen_and_the_reason_names_the_others(read, taken):
-    log = everything().drop(*(name for name, _ in LADDER[:taken]))
+    log = everything().drop(*(name for name, _ in PREFERRED[:taken]))
     flight = read(log)
     track, reason = choose_source(flight)
-    assert track.name == LADDER[taken][0]
-    assert all(name in reason for name, _ in LADDER[:taken])
+    assert track.name == PREFERRED[taken][0]
+    assert all(name in reason for name, _ in PREFERRED[:taken])
 
 
 def test_the_best_source_of_all_needs_no_excuse(read):
     track, reason = choose_source(read(everything()))
-    assert (track.name, reason) == (LADDER[0][0], "the best source: logged as it arrived")
+    assert (track.name, reason) == (PREFERRED[0][0], "the best source: logged as it arrived")
 
 
-@pytest.mark.parametrize("name", [name for name, _ in LADDER])
+@pytest.mark.parametrize("name", [name for name, _ in PREFERRED])
 def test_any_source_can_be_asked_for(read, name):
     track, reason = choose_source(read(everything()), name)
     assert track.name == name
@@ -568,7 +568,7 @@ def test_gps_is_used_only_when_asked_for(read):
     flight = read(log.drop(*names).add(gps()))
     with pytest.raises(MissingDataError, match="`position_source` vehicle_gps_position"):
         choose_source(flight)
-    assert choose_source(flight, "vehicle_gps_position")[0].rung == 7
+    assert choose_source(flight, "vehicle_gps_position")[0].origin == GNSS
 
 
 def test_no_source_at_all_says_what_would_log_one(read):
@@ -613,7 +613,7 @@ def test_ekf2s_own_delay_is_added_back_to_its_observations(read, delay_ms):
     for name in ("estimator_aid_src_ev_pos", "estimator_aid_src_ev_hgt"):
         log[name]["timestamp_sample"] -= np.uint64((delay_ms * 1e-3 + HALF_PERIOD_S) * 1e6)
     track, _ = choose_source(read(log))
-    assert (track.name, track.rung) == ("estimator_aid_src_ev_pos", 5)
+    assert (track.name, track.origin) == ("estimator_aid_src_ev_pos", KEPT)
     expected = seconds_of(ev_stamps(10.0))
     np.testing.assert_allclose(times(track.samples), expected, atol=1e-9)
     np.testing.assert_allclose(
@@ -667,7 +667,7 @@ def test_state_plus_innovation_is_the_measurement(read, generation):
     if generation == "v1.12":
         log.drop("estimator_visual_odometry_aligned")
     track, _ = choose_source(read(log))
-    assert (track.name, track.rung, track.reconstructed) == ("ekf2_state_plus_innovation", 6, True)
+    assert (track.name, track.origin) == ("ekf2_state_plus_innovation", REBUILT)
     expected = position(times(track.samples)) + ev_error(times(track.samples))
     np.testing.assert_allclose(track.samples[POSITION_COLUMNS], expected, atol=1e-5)
     assert len(track.samples) >= len(ev_stamps(10.0)) - 1
@@ -833,7 +833,7 @@ def test_a_receiver_without_a_fix_gives_no_start(read):
 def test_the_sample_flight_is_complete(sample_flight):
     assert sample_flight.log.firmware == "PX4 v1.16.1"
     assert sample_flight.log.duration_s == pytest.approx(129.74, abs=0.01)
-    assert [track.rung for track in sample_flight.positions] == [2, 5, 6]
+    assert [t.origin for t in sample_flight.positions] == [RECEIVED, KEPT, REBUILT]
     assert sample_flight.positions[0].rate_hz == pytest.approx(5.0, abs=0.01)
     assert not isinstance(sample_flight.truth, Unavailable)
     assert len(sample_flight.airborne) == 1
@@ -877,7 +877,7 @@ def test_simulated_uwb_is_read_as_it_was_sent(shared_logs, name):
     track, _ = choose_source(flight)
     assert track.name == SIMULATED[name]
 
-    axes = slice(0, 2) if track.rung == 5 else slice(0, 3)  # EKF2 kept no height in these
+    axes = slice(0, 2) if track.origin == KEPT else slice(0, 3)  # EKF2 kept no height in these
     sent_z = np.array([sample["z"] for sample in sent["uwb"]])[:, axes]
     sent_s = np.array([sample["t_px4_us"] for sample in sent["uwb"]]) * 1e-6
     read_z = track.samples[POSITION_COLUMNS[axes]].to_numpy()
@@ -899,7 +899,7 @@ def test_simulated_uwb_is_read_as_it_was_sent(shared_logs, name):
     else:
         assert np.median(late) == pytest.approx(config["latency_ms"] * 1e-3, abs=0.02)
     inside = (sent_s > sent_s[match[0]]) & (sent_s < sent_s[match[-1]])
-    if track.rung == 2 and not config["dropouts"]:
+    if track.origin == RECEIVED and not config["dropouts"]:
         assert len(read_s) >= 0.98 * np.count_nonzero(inside)
 
 
@@ -978,7 +978,7 @@ def test_logs_of_other_estimators(shared_logs, name, reason):
 def test_vision_that_shows_only_in_innovations_is_rebuilt(shared_logs):
     flight = read_log(shared_logs / REAL.format("PX4_flight-review-rs_battery_brownout"))
     track, _ = choose_source(flight)
-    assert (track.rung, flight.ekf2.innovation_topics) == (6, ("estimator_innovations",))
+    assert (track.origin, flight.ekf2.innovation_topics) == (REBUILT, ("estimator_innovations",))
     assert (flight.ekf2.fusing[["horizontal", "vertical", "yaw"]].mean() > 0.9).all()
 
 

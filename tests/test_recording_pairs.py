@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
 import pytest
 from conftest import REPOSITORY, SHARED_LOGS
+from exchange import replace
 from flights import Imu, aisle_flight
 
 from px4fuse.analysis import Analysis, explain

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import re
-from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
 import pytest
+from exchange import replace
 
 from px4fuse.analysis import Analysis, explain
 from px4fuse.comparison.asked import asked_of_ekf2
@@ -153,13 +153,20 @@ def test_the_sample_loop_has_no_clock_change_and_no_smaller_noise(sample_log: Pa
 
 
 def test_a_remedy_of_our_filter_that_the_truth_contradicts_is_not_given() -> None:
-    comparison = flown(AISLE, Settings()).comparison
+    comparison = flown(AISLE, Settings())
     worse = filter_words(comparison, Settings(sigma_z_m=3.0), "--sigma-z 3")
     assert worse.startswith("Leave it: --sigma-z 3 fits")
     truth = Unavailable("ground truth", "none", "")
     blind = replace(
         comparison,
-        axes=tuple(replace(a, truth=truth, kf_truth=truth) for a in comparison.axes.values()),
+        axes={
+            name: replace(
+                a,
+                truth=truth,
+                filters={each: replace(one, truth=truth) for each, one in a.filters.items()},
+            )
+            for name, a in comparison.axes.items()
+        },
     )
     typed = "px4fuse compare LOG --sigma-z 0.2."
     assert filter_words(blind, Settings(sigma_z_m=0.2), "--sigma-z 0.2", 0.1) == typed

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import io
 import sys
-from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 import typst
+from exchange import replace
 from flights import random_walk
 from hypothesis import given
 from hypothesis import strategies as st
@@ -217,7 +217,8 @@ def offset(**changes: Any) -> ClockOffset:
     parts = tuple(PartOffset(10.0 * i, 10.0 * i + 9.0, 0.0, 0.02) for i in range(3))
     return replace(
         ClockOffset(
-            offset_s=0.005, interval_s=(-0.02, 0.03), sigma_s=0.012, determinable=True, reason="",
+            applied_s=0.0, offset_s=0.005, interval_s=(-0.02, 0.03), sigma_s=0.012,
+            determinable=True,
             curve_s=curve, curve_drop=curve**2 * 1e3, interval_drop=2.0, parts=parts,
             drift_ppm=100.0, drift_sigma_ppm=300.0, change_p=0.4, sigma_a_m_s2=0.1, sigma_z_m=0.1,
             count=200,

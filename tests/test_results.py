@@ -15,13 +15,14 @@ from results_tools import EXAMPLE, LOOP, changed, decoded
 
 import px4fuse
 from px4fuse.comparison.comparison import compare
+from px4fuse.comparison.model import UnjudgedFilter
 from px4fuse.errors import Px4FuseError, ResultsError
 from px4fuse.report.document import Document
 from px4fuse.report.pdf import render
 from px4fuse.request import ComparisonRequest
 from px4fuse.results import build
 from px4fuse.results.contract import KINDS, ComparisonResults, schema, to_json
-from px4fuse.results.model import Absent, Student
+from px4fuse.results.model import Student
 from px4fuse.results.reading import read_results
 
 ROOT = Path(__file__).parent.parent
@@ -132,9 +133,9 @@ def test_nothing_that_could_not_be_computed_is_zero(sample_flight):
     """One second of flight: no consistency statement, but its reason."""
     made = results(document(sample_flight, start_s=40.0, end_s=41.0))
     north = made.axes["north"]
-    assert isinstance(north.kf, Absent)
-    assert "too few" in north.kf.unavailable.reason
-    assert "nis_mean" not in to_json(north.kf)
+    assert isinstance(north.filters["kf"], UnjudgedFilter)
+    assert "too few" in north.filters["kf"].reason
+    assert "nis_mean" not in to_json(north.filters["kf"])
     assert_valid(to_json(made))
 
 
@@ -180,7 +181,7 @@ def test_no_number_is_written_that_is_none(sample_flight):
         (b"null", "no results of px4fuse"),
         (b"1", "no results of px4fuse"),
         (b'{"schema": {"name": "px4fuse-loop", "version": "1.0"}}', "follows version 1.0"),
-        (b'{"schema": {"name": "px4fuse-loop", "version": "2.0"}}', "missing required field"),
+        (b'{"schema": {"name": "px4fuse-loop", "version": "3.0"}}', "missing required field"),
     ],
     ids=range(27),
 )
@@ -206,9 +207,12 @@ def test_what_is_no_results(given, said):
         ({"log__sha256": "x"}, "matching regex"),
         ({"axes": {}}, "length >= 1"),
         ({"axes__up": EXAMPLE["axes"]["down"]}, "Invalid enum value 'up'"),
-        ({"axes__north__kf__nis_mean": "1"}, r"at `\$.nis_mean` - at `\$.axes\[...\].kf`"),
-        ({"clock__unavailable": {"what": "", "reason": "", "remedy": ""}}, "unknown field"),
-        ({"clock": {"unavailable": {"what": "", "reason": ""}}}, "missing required field"),
+        (
+            {"axes__north__filters__kf__nis_mean": "1"},
+            r"at `\$.nis_mean` - at `\$.axes\[...\].filters\[...\]`",
+        ),
+        ({"clock__nothing": ""}, "unknown field"),
+        ({"clock": {"what": "", "reason": ""}}, "missing required field"),
         ({"request__log": ...}, "missing required field `log`"),
         ({"request__command": "loop"}, "Invalid value 'loop'"),
         ({"provenance__px4fuse": "1 2"}, "matching regex"),

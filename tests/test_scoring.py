@@ -1,7 +1,6 @@
 """Points, comments, feedback and flags, on the example report with parts of it changed."""
 
 import copy
-import dataclasses
 import json
 import pickle
 import random
@@ -9,6 +8,7 @@ import re
 from pathlib import Path
 
 import pytest
+from exchange import replace
 from notes_samples import ENGLISH, HONEST
 from results_tools import EXAMPLE, LOOP, SHA256, changed, correction, decoded, finding
 
@@ -43,7 +43,7 @@ def checked(check, results=EXAMPLE, pages=PAGES, /, verdict=VERIFIED, key=None, 
     """Share of the points and comment of one check."""
     given = "\n".join(f"{name} = {json.dumps(value)}" for name, value in parameters.items())
     rubric = parse_rubric(f'[[item]]\ntitle = "T"\npoints = 1\ncheck = "{check}"\n{given}', "x")
-    rubric = dataclasses.replace(rubric, words=WORDS)
+    rubric = replace(rubric, words=WORDS)
     (item,) = score(report(results, pages), verdict, rubric, key)
     assert item.comment.endswith(".")
     assert "\n" not in item.comment
@@ -71,7 +71,7 @@ class TestVerified:
         text = " ".join(feedback(graded(verdict=verdict)).split())
         assert "was not at hand" in text
         assert "Make it again" not in text
-        other = dataclasses.replace(verdict, reasons=("made with another version",))
+        other = replace(verdict, reasons=("made with another version",))
         assert checked("verified", verdict=other)[0] == 0.0
 
     def test_other_verdicts_say_why(self):
@@ -95,7 +95,7 @@ class TestStudent:
 
 class TestSections:
     def test_pages_and_results(self):
-        parts = {"pages": ["innovations OF both"], "results": ["axes.*.kf", "clock"]}
+        parts = {"pages": ["innovations OF both"], "results": ["axes.*.filters.kf", "clock"]}
         assert checked("sections", **parts)[0] == 1.0
 
     def test_missing_ones_are_named_with_their_reason(self):
@@ -176,7 +176,7 @@ class TestTuning:
 
 
 class TestNumber:
-    PATH = "axes.north.truth.kf_position_rmse_m"
+    PATH = "axes.north.filters.kf.truth.position_rmse_m"
 
     def test_below_and_above(self):
         assert checked("number", path=self.PATH, at_most=0.15)[0] == 1.0
@@ -188,7 +188,7 @@ class TestNumber:
         assert checked("number", path=self.PATH, at_least=0.07, zero_at=0.06)[0] == 0.5
 
     def test_the_worst_of_several_counts(self):
-        points, comment = checked("number", path="axes.*.kf.nis_mean", at_least=0.82)
+        points, comment = checked("number", path="axes.*.filters.kf.nis_mean", at_least=0.82)
         assert points == 0.0
         assert "axes.north" in comment
 
@@ -203,15 +203,17 @@ class TestNumber:
 
     @pytest.mark.parametrize("path", [PATH, "log", "log.name", "log.dropouts", "nothing"])
     def test_what_is_no_number_gives_nothing(self, path):
-        results = changed(axes__north__truth__kf_position_rmse_m=...)
+        results = changed(axes__north__filters__kf__truth__position_rmse_m=...)
         points, comment = checked("number", results, path=path, at_most=1.0)
         assert points == 0.0
         assert "has no number for" in comment
 
     def test_why_there_is_no_number(self):
-        results = changed(axes__north__kf=NONE)
-        comment = checked("number", results, path="axes.north.kf.nis_mean", at_most=1.0)[1]
-        assert comment == "Your report has no number for axes.north.kf.nis_mean (too few of them)."
+        results = changed(axes__north__filters__kf=NONE)
+        comment = checked("number", results, path="axes.north.filters.kf.nis_mean", at_most=1.0)[1]
+        assert comment == (
+            "Your report has no number for axes.north.filters.kf.nis_mean (too few of them)."
+        )
 
 
 class TestConsistent:
@@ -221,7 +223,7 @@ class TestConsistent:
         points, comment = checked("consistent")
         assert 0.5 < points < 1.0
         assert "overstated by a factor of 1.13" in comment
-        assert checked("consistent", changed(horizontal__kf__variance_factor=0.5))[0] == 0.0
+        assert checked("consistent", changed(horizontal__kf__nis_mean=2.0))[0] == 0.0
         assert checked("consistent", filter="ekf2", axes=["horizontal", "east"])[0] == 1.0
 
     def test_absent(self):
@@ -233,7 +235,7 @@ class TestConsistent:
         outliers = finding("source_outliers", "error")
         understated = {
             "horizontal__kf__verdict": "variance understated",
-            "horizontal__kf__variance_factor": 5.0,
+            "horizontal__kf__nis_mean": 0.2,
             "findings": [outliers],
         }
         points, comment = checked("consistent", changed(**understated))
@@ -462,7 +464,7 @@ class TestScore:
         assert made.items[0].points == 0.0
         assert sum(item.points for item in made.items) > 30
         assert made.pending == "Add a.ulg to --logs."
-        zero = assess(report(), verdict, dataclasses.replace(rubric, unverified="zero"), None)
+        zero = assess(report(), verdict, replace(rubric, unverified="zero"), None)
         assert {item.points for item in zero.items} == {0.0}
         assert zero.pending == ""
 
@@ -477,7 +479,7 @@ class TestScore:
         made = assess(report(given), VERIFIED, rubric, key("source_gap"))
         assert said in made.pending
         for rule, counts, points in (("zero", True, False), ("count", True, True)):
-            rubric = dataclasses.replace(rubric, others_log=rule)
+            rubric = replace(rubric, others_log=rule)
             made = assess(report(given), VERIFIED, rubric, key("source_gap"))
             assert (made.pending == "") == counts
             assert any(item.points for item in made.items) == points
@@ -497,9 +499,9 @@ class TestScore:
         verdict = Verdict("verified", (), True, page_status="differ")
         rubric = read_rubric(None)
         assert assess(report(), verdict, rubric, None).pending == ""
-        waiting = assess(report(), verdict, dataclasses.replace(rubric, pages="pending"), None)
+        waiting = assess(report(), verdict, replace(rubric, pages="pending"), None)
         assert "redrawn" in waiting.pending
-        none = assess(report(), verdict, dataclasses.replace(rubric, pages="zero"), None)
+        none = assess(report(), verdict, replace(rubric, pages="zero"), None)
         assert {item.points for item in none.items} == {0.0}
 
     def test_refused_file_has_every_item_with_nothing(self):

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
-import dataclasses
 from itertools import pairwise
 
 import numpy as np
 import pandas as pd
 import pytest
+from exchange import replace
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from px4fuse.comparison.preparation import LADDER, choose_segment, choose_source, shift_clock
+from px4fuse.comparison.preparation import (
+    LOGGED_ORIGINS,
+    choose_segment,
+    choose_source,
+    shift_clock,
+)
 from px4fuse.comparison.projection import continuous_state
 from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.filter.signals import (
@@ -37,6 +42,7 @@ from px4fuse.flight import (
     Reset,
     Unavailable,
 )
+from px4fuse.origin import GNSS, ORIGINS, RECEIVED
 from px4fuse.recording import LogInfo
 
 GRAVITY = 9.80665
@@ -59,10 +65,10 @@ def attitude_of(time, rotations):
     return frame(time, rotations.as_quat(scalar_first=True), QUATERNION_COLUMNS)
 
 
-def track_of(time, positions, name="vehicle_visual_odometry", rung=2):
+def track_of(time, positions, name="vehicle_visual_odometry", origin=RECEIVED):
     values = np.hstack([positions, np.full((len(time), 3), np.nan)])
     samples = frame(time, values, POSITION_COLUMNS + POSITION_VARIANCE_COLUMNS)
-    return PositionTrack(name, rung, "", samples, "NED", "", False, (name,))
+    return PositionTrack(name, origin, "", samples, "NED", "", (name,))
 
 
 def flight_of(*, imu=ABSENT, attitude=ABSENT, track=None, duration_s=10.0, airborne=ABSENT):
@@ -312,7 +318,7 @@ def test_a_clock_offset_moves_the_times_and_nothing_else(offset_s):
     moved = shift_clock(track, offset_s)
     np.testing.assert_allclose(moved.samples.index, before.index + offset_s, atol=1e-12)
     np.testing.assert_array_equal(moved.samples, before)
-    assert dataclasses.replace(moved, samples=track.samples) == track
+    assert replace(moved, samples=track.samples) == track
     pd.testing.assert_frame_equal(track.samples, before)
 
 
@@ -343,12 +349,12 @@ def straight(first_s, last_s):
 # ---- position sources and the segment -----------------------------------------------------------
 
 
-@pytest.mark.parametrize("rung", [1, 2, 6, 7])
-def test_gps_is_taken_only_when_asked_for(rung):
-    """The rung below the last of the ladder."""
-    track = dataclasses.replace(straight(2.0, 18.0), name="source", rung=rung)
+@pytest.mark.parametrize("origin", ORIGINS)
+def test_gps_is_taken_only_when_asked_for(origin):
+    """It is the last in the order of preference."""
+    track = replace(straight(2.0, 18.0), name="source", origin=origin)
     flight = flight_of(track=track, duration_s=20.0)
-    if rung <= 6:
+    if origin != GNSS:
         assert choose_source(flight)[0] is track
     else:
         with pytest.raises(MissingDataError, match="`position_source`"):
@@ -356,16 +362,20 @@ def test_gps_is_taken_only_when_asked_for(rung):
     assert choose_source(flight, "source") == (track, "chosen with --position-source")
 
 
-def test_the_same_source_has_one_rung_whichever_way_it_was_recorded():
+def test_the_same_source_is_of_one_origin_whichever_way_it_was_recorded():
     """What is sent as VISION_POSITION_ESTIMATE is the topic vehicle_visual_odometry, and so on."""
-    by_rung = [
+    by_origin = [
         {"vehicle_visual_odometry", "VISION_POSITION_ESTIMATE", "ODOMETRY"},
         {"vehicle_mocap_odometry", "ATT_POS_MOCAP"},
         {"estimator_visual_odometry_aligned"},
         {"estimator_aid_src_ev_pos"},
         {"ekf2_state_plus_innovation"},
     ]
-    assert {name: rung for rung, names in enumerate(by_rung, 2) for name in names} == LADDER
+    assert {
+        name: origin
+        for origin, names in zip(ORIGINS[1:-1], by_origin, strict=True)
+        for name in names
+    } == {name: origin for name, origin in LOGGED_ORIGINS.items() if origin != GNSS}
 
 
 @pytest.mark.parametrize(("airborne", "expected"), [
@@ -509,7 +519,7 @@ def test_a_reset_of_velocity_is_kept(delta):
 def test_a_reset_of_what_the_source_does_not_measure_is_kept():
     """A source without height cannot say that the frame changed."""
     track = noisy_track()
-    blind = dataclasses.replace(track, samples=track.samples.assign(down_m=np.nan))
+    blind = replace(track, samples=track.samples.assign(down_m=np.nan))
     offset = np.where(STATE_TIME[:, None] >= 8.0, [0.0, 0.0, 3.0], 0.0)
     ekf2 = ekf2_of(offset, [Reset(8.0, "position", (0.0, 0.0, 3.0))])
     assert "undone" in continuous_state(ekf2, track, WHOLE)[1]
@@ -541,9 +551,7 @@ def test_nothing_changes_its_input(sample_flight):
     segment = choose_segment(sample_flight, track)
     axes = make_axes(sample_flight, shift_clock(track, 0.1), segment)
     step_means(axes[0].acceleration, np.arange(10.0, 20.0, 0.1))
-    shifted = dataclasses.replace(
-        sample_flight.ekf2, resets=(Reset(60.0, "position", (1.0, 0.0, 0.0)),)
-    )
+    shifted = replace(sample_flight.ekf2, resets=(Reset(60.0, "position", (1.0, 0.0, 0.0)),))
     continuous_state(shifted, track, segment)
     for part, copy in zip(parts, before, strict=True):
         pd.testing.assert_frame_equal(part, copy)

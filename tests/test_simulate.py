@@ -7,6 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from click.testing import CliRunner
+from exchange import replace
 from flights import unexplained
 from pyulog import ULog
 from scipy.integrate import cumulative_simpson
@@ -134,7 +135,7 @@ class TestMotion:
 
 
 def test_aisle_is_as_long_as_asked_and_ends_where_it_began():
-    motion = motion_of(dataclasses.replace(AISLE, wander_m=0.0))
+    motion = motion_of(replace(AISLE, wander_m=0.0))
     position = motion.at(np.linspace(0.0, motion.duration_s, 5001)).position_m
     along = position @ direction(30.0)
     assert along.max() == pytest.approx(12.0, abs=1e-9)
@@ -145,7 +146,7 @@ def test_aisle_is_as_long_as_asked_and_ends_where_it_began():
 
 @pytest.mark.parametrize(("left_out", "texts"), [(0.0, []), (2.5, ["open-end=2.5m"])])
 def test_loop_closes_but_for_what_is_left_out(left_out, texts):
-    scenario = dataclasses.replace(LOOP, passes=2)
+    scenario = replace(LOOP, passes=2)
     motion = motion_of(scenario, parse(texts))
     first, last = motion.at(np.array([0.0, motion.duration_s])).position_m
     # its last side points back along heading + 270 degrees
@@ -404,7 +405,7 @@ class TestMistakes:
             "ekf2_state_plus_innovation",
         }
         assert {round(track.rate_hz) for track in kept} == {2}
-        flight = to_flight(simulate(dataclasses.replace(AISLE, ekf2=False), parse(["no-vvo"])))
+        flight = to_flight(simulate(replace(AISLE, ekf2=False), parse(["no-vvo"])))
         assert flight.positions == ()
         assert flight.log.parameters["SDLOG_PROFILE"] == 1.0
         with pytest.raises(px4fuse.Px4FuseError, match="SDLOG_PROFILE"):
@@ -521,7 +522,7 @@ def test_what_does_not_fit_is_refused():
     [
         (AISLE, []),
         (LOOP, ["jump=1m"]),
-        (dataclasses.replace(AISLE, truth=False, passes=4), ["clock-jump=0.3", "nlos=5%"]),
+        (replace(AISLE, truth=False, passes=4), ["clock-jump=0.3", "nlos=5%"]),
         (AISLE, ["no-vvo", "imu-dropout=1s,0s"]),
     ],
     ids=["aisle", "loop", "clock-jump", "no-vvo"],
@@ -535,9 +536,7 @@ def test_reader_gives_the_flight_that_is_made_in_memory(scenario, texts, tmp_pat
         a, b = getattr(read, part.name), getattr(made_here, part.name)
         if part.name == "log":
             same = {"sha256": "", "size_bytes": 0}
-            a, b = (
-                dataclasses.replace(log, parameters=dict(log.parameters), **same) for log in (a, b)
-            )
+            a, b = (replace(log, parameters=dict(log.parameters), **same) for log in (a, b))
             assert a == b
         elif isinstance(a, pd.DataFrame):
             pd.testing.assert_frame_equal(a, b, check_exact=True)
@@ -552,9 +551,7 @@ def test_reader_gives_the_flight_that_is_made_in_memory(scenario, texts, tmp_pat
             for one, other in zip(a, b, strict=True):
                 pd.testing.assert_frame_equal(one.samples, other.samples, check_exact=True)
                 empty = pd.DataFrame()
-                assert repr(dataclasses.replace(one, samples=empty)) == repr(
-                    dataclasses.replace(other, samples=empty)
-                )
+                assert repr(replace(one, samples=empty)) == repr(replace(other, samples=empty))
         else:
             assert a == b, part.name
 
@@ -603,7 +600,7 @@ def test_log_does_not_give_the_mistakes_away():
 
 def test_log_without_truth_has_none(tmp_path):
     path = tmp_path / "flight.ulg"
-    path.write_bytes(to_ulog(simulate(dataclasses.replace(AISLE, truth=False))))
+    path.write_bytes(to_ulog(simulate(replace(AISLE, truth=False))))
     assert isinstance(px4fuse.read_log(path).truth, Unavailable)
     assert b"groundtruth" not in path.read_bytes()
 
@@ -651,7 +648,9 @@ def test_clean_flight_has_no_mistake(scenario):
     drift = ["errors_larger_than_claimed"] if scenario.kind == "loop" else []
     assert [finding.id for finding in findings] == [*drift, "ekf2_is_a_model"]
     for axis in compared.axes.values():
-        assert axis.kf_truth.position_rmse_m < (0.12 if scenario.kind == "aisle" else 0.7)
+        assert axis.filters["kf"].truth.position_rmse_m < (
+            0.12 if scenario.kind == "aisle" else 0.7
+        )
 
 
 @pytest.mark.parametrize(

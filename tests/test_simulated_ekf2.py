@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 from click.testing import CliRunner
+from exchange import replace
 from flights import unexplained
 
 from px4fuse.analysis import explain
@@ -87,7 +87,7 @@ def overconfident() -> Flight:
 def test_a_clean_flight_agrees_with_its_replay_from_the_log(clean: Flight) -> None:
     found = agreement(clean)
     assert found.good
-    assert found.same_share == 1.0
+    assert found.decisions_same == 1.0
     for axis in found.axes.values():
         assert axis.innovation_correlation > 0.999
         assert axis.s_ratio_median == pytest.approx(1.0, abs=0.01)
@@ -109,7 +109,7 @@ def test_a_clean_flight_agrees_with_its_replay_from_the_log(clean: Flight) -> No
 def test_flights_with_mistakes_agree_too(texts: tuple[str, ...], scenario: Scenario) -> None:
     found = agreement(flown(*texts, scenario=scenario))
     assert found.good
-    assert found.same_share > 0.99
+    assert found.decisions_same > 0.99
     for axis in found.axes.values():
         assert axis.innovation_correlation > 0.99
         assert axis.s_ratio_median == pytest.approx(1.0, abs=0.01)

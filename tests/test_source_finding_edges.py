@@ -51,6 +51,7 @@ from px4fuse.findings import (
     source_variance_wrong,
 )
 from px4fuse.flight import SPECIFIC_FORCE_COLUMNS
+from px4fuse.origin import ALIGNED, KEPT, MOTION_CAPTURE
 
 
 def bias_of_ekf2(*bias: float) -> dict[str, Any]:
@@ -147,7 +148,7 @@ def test_the_jitter_of_receipt_is_told_in_milliseconds_and_metres() -> None:
 def test_stamps_of_arrival(ekf2: dict[str, Any], expected: str | None) -> None:
     assert severity(source_stamps_of_arrival, analysis(ekf2=ekf2)) == expected
     assert severity(source_stamps_of_arrival, analysis(ekf2=ekf2, source=source(
-        reconstructed=True))) is None  # fmt: skip
+        origin=KEPT))) is None  # fmt: skip
 
 
 def test_stamps_of_arrival_end_at_the_first_true_one() -> None:
@@ -191,9 +192,9 @@ def test_thinned_positions_are_told_with_both_rates() -> None:
 
 
 def test_the_intervals_of_what_others_made_tell_nothing() -> None:
-    for parts in ({"clock_map": clock_map()}, {"rung": 4}):
+    for parts in ({"clock_map": clock_map()}, {"origin": ALIGNED}):
         assert severity(source_thinned, at_multiples([1, 2] * 30, **parts)) is None
-    assert severity(source_thinned, at_multiples([1, 2] * 30, rung=3)) is not None
+    assert severity(source_thinned, at_multiples([1, 2] * 30, origin=MOTION_CAPTURE)) is not None
 
 
 def test_the_interval_that_all_are_multiples_of_is_sought_within_its_jitter() -> None:
@@ -248,7 +249,7 @@ def test_a_gap_is_not_counted_as_single_lost_samples() -> None:
 def test_smoothing(gain: float, lag_s: float, expected: str | None) -> None:
     found = Smoothing(0.5, lag_s, gain, 0.1)
     assert severity(source_smoothed, analysis(smoothing=found)) == expected
-    for parts in ({"orientation": object()}, {"reconstructed": True}):
+    for parts in ({"orientation": object()}, {"origin": KEPT}):
         assert severity(source_smoothed, analysis(smoothing=found, source=source(**parts))) is None
 
 
@@ -368,7 +369,7 @@ def test_a_clock_offset(offset_s: float, sigma_s: float, expected: str | None) -
     for signed in (offset_s, -offset_s):
         assert severity(source_clock, analysis(clock=late(signed, sigma_s))) == expected
     for parts in ({"clock": late(0.2, determinable=False)},
-                  {"clock": late(0.2), "source": source(reconstructed=True)},
+                  {"clock": late(0.2), "source": source(origin=KEPT)},
                   {"clock": late(0.2), "smoothing": Smoothing(0.5, 0.2, 99.0, 0.1)},
                   {"clock": late(0.2), "ekf2": ages(20, 20)}):  # fmt: skip
         assert severity(source_clock, analysis(**parts)) is None
@@ -377,7 +378,7 @@ def test_a_clock_offset(offset_s: float, sigma_s: float, expected: str | None) -
 @pytest.mark.usefixtures("no_truth")
 def test_a_clock_offset_is_told_with_what_was_applied() -> None:
     applied = Settings(sigma_a_m_s2=1.0, sigma_z_m=1.0, clock_offset_s=-0.05)
-    finding = only(source_clock, analysis(clock=late(-0.1), settings=applied))
+    finding = only(source_clock, analysis(clock=late(-0.1, applied_s=-0.05), settings=applied))
     assert "late by 0.100 s against the IMU (95 % 0.080 to 0.110 s)" in finding.message
     assert "an error of 0.10 m" in finding.message
     assert "--clock-offset -0.150." in finding.remedy
@@ -431,7 +432,11 @@ def test_what_a_clock_offset_asks_of_ekf2(monkeypatch: pytest.MonkeyPatch) -> No
     applied = Settings(sigma_a_m_s2=1.0, sigma_z_m=1.0, clock_offset_s=-0.05)
     for fed, helps in (("uwb", True), ("another", False)):
         inputs = SimpleNamespace(vision=SimpleNamespace(source=fed))
-        one = analysis(clock=late(-0.1), settings=applied, ekf2_model=made(Model, inputs=inputs))
+        one = analysis(
+            clock=late(-0.1, applied_s=-0.05),
+            settings=applied,
+            ekf2_model=made(Model, inputs=inputs),
+        )
         remedy = only(source_clock, one).remedy
         assert ("; for EKF2 set EKF2_EV_DELAY to 150 ms: it helps." in remedy) is helps
     assert asked == pytest.approx([150.0])
@@ -450,7 +455,7 @@ def test_a_wrong_delay(delay_ms: float, sigma_s: float, expected: str | None) ->
     one = analysis(log=flown, clock=late(0.0, sigma_s))
     assert severity(ekf2_ev_delay_wrong, one) == expected
     for parts in ({"clock": late(0.0, determinable=False)}, {"log": log()},
-                  {"source": source(reconstructed=True)}):  # fmt: skip
+                  {"source": source(origin=KEPT)}):  # fmt: skip
         other = {"log": flown, "clock": late(0.0, sigma_s), **parts}
         assert severity(ekf2_ev_delay_wrong, analysis(**other)) is None
 
@@ -458,7 +463,10 @@ def test_a_wrong_delay(delay_ms: float, sigma_s: float, expected: str | None) ->
 def test_the_delay_that_the_data_ask_for_is_told_with_what_was_applied() -> None:
     applied = Settings(sigma_a_m_s2=1.0, sigma_z_m=1.0, clock_offset_s=-0.02)
     flown = log(parameters={"EKF2_EV_DELAY": 0.0})
-    finding = only(ekf2_ev_delay_wrong, analysis(log=flown, clock=late(-0.1), settings=applied))
+    finding = only(
+        ekf2_ev_delay_wrong,
+        analysis(log=flown, clock=late(-0.1, applied_s=-0.02), settings=applied),
+    )
     assert "the data ask for 120 ms (95 % 100 to 130)" in finding.message
     assert finding.remedy == "Set EKF2_EV_DELAY to 120 ms. Not replayed: no topic for it."
     assert finding.evidence["asked_ms"] == pytest.approx(120.0)

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import re
-from dataclasses import replace
 
 import numpy as np
 import pytest
+from exchange import replace
 from flights import Estimator, Uwb, aisle_flight, motion, unexplained, with_noises
 
 from px4fuse.comparison.comparison import compare

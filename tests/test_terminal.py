@@ -15,7 +15,7 @@ import pypdf
 import pytest
 from click.testing import CliRunner, Result
 from conftest import page_of
-from msgspec.structs import replace
+from exchange import replace
 from rich.console import Console
 from test_cli import run_main
 

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
+from exchange import replace
 from flights import line
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline

@@ -8,7 +8,7 @@ import io
 import json
 import re
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ import msgspec
 import pytest
 from class_tools import in_this_process
 from click.testing import CliRunner
+from exchange import replace
 from forgery import Anatomy, Numbers, numbers_of, taken_apart
 from pypdf import PdfReader, PdfWriter
 from pypdf.annotations import Link

@@ -14,8 +14,8 @@ from pypdf import PdfReader
 
 from px4fuse.analysis import Counterfactual, run_what_if
 from px4fuse.cli import cli
-from px4fuse.ekf2.parameters import PARAMETERS
 from px4fuse.ekf2.whatif import Summary
+from px4fuse.ekf2_parameters import PARAMETERS
 from px4fuse.errors import MissingDataError, Px4FuseError, SettingsError
 from px4fuse.report.document import WhatIfDocument
 from px4fuse.report.pdf import render

@@ -120,7 +120,7 @@ def _sweep(text: str) -> Sweep:
 
 
 def _number(typed: str, name: str, value: str) -> float:
-    from px4fuse.ekf2.parameters import PARAMETERS
+    from px4fuse.ekf2_parameters import PARAMETERS
 
     try:
         return float(value)

@@ -7,10 +7,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from px4fuse.comparison.drift import may_drift
 from px4fuse.comparison.model import Comparison
 from px4fuse.ekf2.model import Model
-from px4fuse.ekf2.parameters import PARAMETERS
+from px4fuse.ekf2_parameters import PARAMETERS
 from px4fuse.filter.clock import ClockOffset
 from px4fuse.filter.signals import AISLE
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
@@ -53,7 +52,7 @@ def asked_of_ekf2(
     changes: dict[str, float] = {}
     noise_m = tuned_noise_m(tuning)
     trusted = noise_m is not None and noise_m <= noise_used_m(model)
-    if noise_m is not None and not (trusted and may_drift(comparison.flight, source)):
+    if noise_m is not None and not (trusted and source.origin.may_drift):
         changes |= noise_change(model, noise_m)
     if isinstance(clock, ClockOffset) and clock.determinable:
         flown = model.inputs.settings["EKF2_EV_DELAY"]

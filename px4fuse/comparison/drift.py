@@ -3,7 +3,7 @@
 Innovations judge a filter against its source. An odometry is smooth over seconds and metres wrong
 after minutes: a filter that follows it closely has small innovations and a large error, so that no
 measurement noise follows from them, and the errors of scale and heading look like a clock that
-wanders. This is the one place that says which sources those are and what is left of their clock
+wanders. Which sources those are says ``Origin.may_drift``; this says what is left of their clock
 estimate.
 """
 
@@ -15,33 +15,11 @@ from scipy.special import stdtr
 
 from px4fuse.arrays import Array
 from px4fuse.filter.clock import MAX_HALF_INTERVAL_S, ClockOffset
-from px4fuse.flight import Flight, PositionTrack, Unavailable
 
-# Rungs of tracks that carry the sender's own orientation, if it sent one
-WITH_ORIENTATION_RUNGS = (2, 4)
-# Of tracks that are what EKF2 kept of the source
-KEPT_BY_EKF2_RUNGS = (5, 6)
 # A step of the clock that drift cannot imitate: at 1 m/s a good UWB's noise
 CHANGE_S = 0.10
 # On either side of a step, so that each shows its own scatter
 MIN_PARTS = 2
-
-
-def may_drift(flight: Flight, track: PositionTrack) -> bool:
-    """Whether a position source may be an odometry, whose error grows with the way.
-
-    External vision with an orientation that turns; where the log keeps only what EKF2 made of the
-    source, external vision from which EKF2 took a heading. A log does not tell odometry from
-    motion capture that is sent in the same messages, hence "may". What drifts in no case: a
-    positioning system without orientation (UWB), motion capture sent as such (ATT_POS_MOCAP or
-    ODOMETRY of that kind), GPS, and a positioning system's own file.
-    """
-    if track.rung in WITH_ORIENTATION_RUNGS:
-        return track.orientation is not None
-    ekf2 = flight.ekf2
-    if track.rung not in KEPT_BY_EKF2_RUNGS or isinstance(ekf2, Unavailable):
-        return False
-    return not isinstance(ekf2.fusing, Unavailable) and bool((ekf2.fusing["yaw"] > 0).any())
 
 
 def with_drift(clock: ClockOffset) -> ClockOffset:

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from px4fuse.comparison.drift import may_drift, with_drift
+from px4fuse.comparison.drift import with_drift
 from px4fuse.comparison.model import Comparison
 from px4fuse.filter.clock import ClockOffset, estimate_clock_offset
 from px4fuse.filter.fitting import Noises
@@ -66,7 +66,7 @@ def tuned(
         names,
         lambda name: progress(f"tuning {name}"),
         flight if slow is None else replace(flight, imu=slow),
-        may_drift(flight, comparison.source),
+        comparison.source.origin.may_drift,
         made,
     )
 
@@ -111,7 +111,7 @@ def clock_offset(
         progress,
         made,
     )
-    if isinstance(found, ClockOffset) and may_drift(comparison.flight, comparison.source):
+    if isinstance(found, ClockOffset) and comparison.source.origin.may_drift:
         return with_drift(found)
     return found
 

@@ -12,20 +12,12 @@ from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import MIN_MEASUREMENTS, Segment, make_axes
 from px4fuse.flight import Flight, PositionTrack, Truth, Unavailable
+from px4fuse.origin import GIVEN_FILE
+from px4fuse.readers.mavlink_messages import POSITION_INPUTS
+from px4fuse.readers.px4_topics import TOPIC_ORIGINS
 
-# The GPS rung is taken only when asked for.
-LAST_AUTOMATIC_RUNG = 6
-# Rung of each name of the ladder short of GPS: PX4's topics, then MAVLink's messages
-LADDER = {
-    "vehicle_visual_odometry": 2,
-    "vehicle_mocap_odometry": 3,
-    "estimator_visual_odometry_aligned": 4,
-    "estimator_aid_src_ev_pos": 5,
-    "ekf2_state_plus_innovation": 6,
-    "VISION_POSITION_ESTIMATE": 2,
-    "ODOMETRY": 2,
-    "ATT_POS_MOCAP": 3,
-}
+# Of the names under which logs have external positions, PX4's topics and MAVLink's messages
+LOGGED_ORIGINS = TOPIC_ORIGINS | {source.name: source.origin for source in POSITION_INPUTS}
 NOT_ITS_OWN_TRUTH = Unavailable(
     "ground truth",
     "the position source is the only reference in the log, and it is what our filter was given",
@@ -77,13 +69,13 @@ def prepare(
 
 
 def choose_source(flight: Flight, name: str | None = None) -> tuple[PositionTrack, str]:
-    """Choose the position source by the ladder, or by name.
+    """Choose the position source by preference, or by name.
 
     Parameters
     ----------
     flight : Flight
     name : str, optional
-        One of the track names; by default the best rung short of GPS.
+        One of the track names; by default the best one short of GPS.
 
     Returns
     -------
@@ -107,8 +99,8 @@ def choose_source(flight: Flight, name: str | None = None) -> tuple[PositionTrac
             f"{flight.log.name}: position source {name}: {reason}. This log has: {have}."
         )
     for track in flight.positions:
-        if track.rung <= LAST_AUTOMATIC_RUNG:
-            return track, _ladder_reason(flight, track)
+        if track.origin.automatic:
+            return track, _why_best(flight, track)
     raise MissingDataError(_no_source(flight))
 
 
@@ -121,7 +113,7 @@ def _no_source(flight: Flight) -> str:
             "positioning system's own file with `position`"
             f"{', or the ULog' if flight.log.has_ulog else ''}."
         )
-    gps = any(track.rung > LAST_AUTOMATIC_RUNG for track in flight.positions)
+    gps = any(not track.origin.automatic for track in flight.positions)
     hint = (
         "Only GPS is in it: give `position_source` vehicle_gps_position to use that, or s"
         if gps
@@ -135,14 +127,15 @@ def _no_source(flight: Flight) -> str:
     )
 
 
-def _ladder_reason(flight: Flight, track: PositionTrack) -> str:
-    if track.rung == 1:
+def _why_best(flight: Flight, track: PositionTrack) -> str:
+    if track.origin == GIVEN_FILE:
         return "given with --position"
     whence = f" (from {track.log})" if track.log and track.log != flight.log.name else ""
     lacking = [
         part.source
         for part in flight.missing
-        if LADDER.get(part.source, LAST_AUTOMATIC_RUNG) < track.rung
+        if part.source in LOGGED_ORIGINS
+        and LOGGED_ORIGINS[part.source].preference < track.origin.preference
     ]
     if not lacking:
         return f"the best source: logged as it arrived{whence}"

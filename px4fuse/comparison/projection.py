@@ -8,7 +8,6 @@ import pandas as pd
 from px4fuse.arrays import Array
 from px4fuse.filter.signals import AISLE, Axis, Segment, along, within
 from px4fuse.flight import (
-    EXTERNAL_VISION_RUNGS,
     POSITION_COLUMNS,
     POSITION_VARIANCE_COLUMNS,
     VELOCITY_COLUMNS,
@@ -146,7 +145,7 @@ def project_innovations(
     Columns as :attr:`Ekf2.innovations` plus ``prior_variance_m2`` (P⁻ = S - R) and
     ``posterior_variance_m2`` (P⁺ = P⁻R/S, or P⁻ where rejected), NaN where R is unknown.
     """
-    if track.rung not in EXTERNAL_VISION_RUNGS:
+    if not track.origin.is_vision:
         return Unavailable(
             "EKF2 innovations",
             f"those in the log belong to external vision, not to {track.name}",

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from px4fuse.comparison.comparison import compare, kf_against_truth
 from px4fuse.comparison.model import AgainstTruth, Comparison
 from px4fuse.ekf2.model import Model
-from px4fuse.ekf2.parameters import PARAMETERS
 from px4fuse.ekf2.whatif import Summary, what_if
+from px4fuse.ekf2_parameters import PARAMETERS
 from px4fuse.filter.kalman import replay
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import AISLE

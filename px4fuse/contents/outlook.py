@@ -23,6 +23,7 @@ from px4fuse.findings.imu_gap import IMU_GAP_TOTAL
 from px4fuse.findings.logging_rate_low import MIN_ATTITUDE_RATE, MIN_IMU_RATE, too_slow
 from px4fuse.findings.source_not_logged import VISION_PROFILE_BIT
 from px4fuse.flight import VELOCITY_COLUMNS, Ekf2, Flight, PositionTrack, Unavailable, sample_rate
+from px4fuse.origin import MOTION_CAPTURE, RECEIVED
 
 # How a part is named for a person, by its name in Flight.streams
 PART_NAMES = {
@@ -35,10 +36,8 @@ PART_NAMES = {
     "truth": "truth",
     "airborne": "land detector",
 }
-# The rung of the position as PX4 received it, and the last that was logged as it arrived
+# The position as PX4 received it
 AS_RECEIVED = "vehicle_visual_odometry"
-LAST_LOGGED_RUNG = 3
-RECEIVED_RUNG = 2
 # EKF2 starts on external vision only where samples are closer than EV_START_INTERVAL; with jitter a
 # source needs this much more than that rate to be fused without luck
 EV_RATE_MARGIN = 1.25
@@ -211,7 +210,7 @@ def _advice(flight: Flight, plan: Plan) -> Iterator[Advice]:
 def _position_advice(flight: Flight, track: PositionTrack) -> Iterator[Advice]:
     missing = next((part for part in flight.missing if part.source == AS_RECEIVED), None)
     profile = int(flight.log.parameters.get("SDLOG_PROFILE", 1))
-    if track.rung > LAST_LOGGED_RUNG and missing is not None:
+    if track.origin.preference > MOTION_CAPTURE.preference and missing is not None:
         remedy = (
             missing.remedy
             if profile & VISION_PROFILE_BIT
@@ -222,7 +221,7 @@ def _position_advice(flight: Flight, track: PositionTrack) -> Iterator[Advice]:
     ekf2 = flight.ekf2
     fused = isinstance(ekf2, Ekf2) and isinstance(ekf2.innovations["north"], pd.DataFrame)
     slow = track.rate_hz < EV_RATE_MARGIN / EV_START_INTERVAL.value
-    if fused and slow and track.rung == RECEIVED_RUNG:
+    if fused and slow and track.origin.preference == RECEIVED.preference:
         yield Advice(
             "Send the position at 10 Hz: EKF2 (v1.14 and later) starts to fuse only samples less "
             f"than {EV_START_INTERVAL.value:g} s apart.",
@@ -255,7 +254,7 @@ def _innovation_advice(ekf2: Ekf2, track: PositionTrack) -> Iterator[Advice]:
         return
     measured = track.samples.loc[innovations.index[0] : innovations.index[-1]]
     decimated = len(innovations) < MIN_INNOVATION_SHARE.value * len(measured)
-    if decimated and not track.reconstructed and ekf2.innovation_topics:
+    if decimated and not track.origin.reconstructed and ekf2.innovation_topics:
         yield Advice(
             f'Put the line "{ekf2.innovation_topics[0]} 0" into etc/logging/logger_topics.txt on '
             f"the SD card: the log holds {len(innovations)} EKF2 innovations for "

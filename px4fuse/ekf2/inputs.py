@@ -9,9 +9,9 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from px4fuse.display import brief
-from px4fuse.ekf2.parameters import fuses_by_mask, settings_in_force
 from px4fuse.ekf2.stretches import MIN_STRETCH_S, Stretch, find_stretches, predict_s
 from px4fuse.ekf2.vision import WHAT, Vision, read_vision
+from px4fuse.ekf2_parameters import fuses_by_mask, settings_in_force
 from px4fuse.flight import Ekf2, Flight, Unavailable
 
 Array = NDArray[np.float64]

@@ -32,10 +32,10 @@ from px4fuse.ekf2.legs import (
     make_legs,
 )
 from px4fuse.ekf2.output_predictor import follow_attitude, later, publish
-from px4fuse.ekf2.parameters import check
 from px4fuse.ekf2.recursion import Run, Variant, run, with_correlation
 from px4fuse.ekf2.replay import UPDATE_COLUMNS, Agreement, Ekf2Replay
 from px4fuse.ekf2.stretches import Stretch
+from px4fuse.ekf2_parameters import check
 from px4fuse.errors import SettingsError
 from px4fuse.flight import STATE_COLUMNS, Flight, Unavailable
 

@@ -13,7 +13,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from px4fuse.display import brief
-from px4fuse.ekf2.parameters import fuses_by_mask, settings_in_force
+from px4fuse.ekf2_parameters import fuses_by_mask, settings_in_force
 from px4fuse.flight import (
     POSITION_COLUMNS,
     POSITION_VARIANCE_COLUMNS,
@@ -24,6 +24,7 @@ from px4fuse.flight import (
     PositionTrack,
     Unavailable,
 )
+from px4fuse.origin import GIVEN_FILE
 from px4fuse.trajectory.rotation import conjugate, interpolate, matrix, multiply
 
 Array = NDArray[np.float64]
@@ -148,8 +149,8 @@ def _decisions(ekf2: Ekf2, record: FusionRecord, stamp: Array) -> tuple[Array, N
 def _source(flight: Flight) -> PositionTrack | Unavailable:
     """The track that EKF2 received, complete."""
     why = ["no vehicle_visual_odometry"]
-    for track in sorted(flight.positions, key=lambda t: (t.rung == 1, t.rung)):
-        if track.rung in (1, 2):
+    for track in sorted(flight.positions, key=lambda t: t.origin == GIVEN_FILE):
+        if track.origin.is_vision and track.origin.as_sent:
             return track
         if track.name in COPY_INTERVAL_S:
             interval = float(np.median(np.diff(track.samples.index.to_numpy())))

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from px4fuse.display import Shown
 from px4fuse.ekf2.agreement import at_times, judged_from, logged_innovations, settled
 from px4fuse.ekf2.model import Model, replay_settings
-from px4fuse.ekf2.parameters import check
 from px4fuse.ekf2.replay import HORIZONTAL, Agreement, Ekf2Replay
+from px4fuse.ekf2_parameters import check
 from px4fuse.errors import SettingsError
 from px4fuse.filter.consistency import nis_band
 from px4fuse.flight import (

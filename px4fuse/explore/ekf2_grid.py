@@ -17,8 +17,8 @@ from px4fuse.analysis import Analysis
 from px4fuse.arrays import Array, BoolArray
 from px4fuse.ekf2.agreement import at_times, judged_from, settled
 from px4fuse.ekf2.model import Model, replay_settings
-from px4fuse.ekf2.parameters import PARAMETERS
 from px4fuse.ekf2.replay import HORIZONTAL, Ekf2Replay
+from px4fuse.ekf2_parameters import PARAMETERS
 from px4fuse.explore.packing import Packer
 from px4fuse.filter.consistency import Consistency, assess
 from px4fuse.filter.signals import within

@@ -7,7 +7,7 @@ import numpy as np
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.asked import delay_change
 from px4fuse.comparison.remedy import delay_helps, remedy_words
-from px4fuse.ekf2.parameters import PARAMETERS
+from px4fuse.ekf2_parameters import PARAMETERS
 from px4fuse.filter.clock import ClockOffset
 from px4fuse.findings.model import Detector, Finding, Found, Threshold
 from px4fuse.findings.source_clock import CLOCK_OFFSET
@@ -36,7 +36,7 @@ def _detect(analysis: Analysis) -> Found:
     comparison = analysis
     clock = analysis.clock
     delay = comparison.flight.log.parameters.get("EKF2_EV_DELAY")
-    if not isinstance(clock, ClockOffset) or comparison.source.reconstructed:
+    if not isinstance(clock, ClockOffset) or comparison.source.origin.reconstructed:
         return
     if not clock.determinable or delay is None:
         return

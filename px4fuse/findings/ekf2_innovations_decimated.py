@@ -18,7 +18,7 @@ def _detect(analysis: Analysis) -> Found:
     ekf2 = comparison.flight.ekf2
     per_axis = (result.ekf2_innovations for result in comparison.axes.values())
     innovations = next((frame for frame in per_axis if isinstance(frame, pd.DataFrame)), None)
-    if innovations is None or comparison.source.reconstructed or not isinstance(ekf2, Ekf2):
+    if innovations is None or comparison.source.origin.reconstructed or not isinstance(ekf2, Ekf2):
         return
     count = len(next(iter(comparison.axes.values())).replay.updates)
     share = len(innovations) / count

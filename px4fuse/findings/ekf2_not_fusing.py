@@ -5,7 +5,7 @@ from __future__ import annotations
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import Comparison
 from px4fuse.findings.model import Detector, Finding, Found, Threshold, off_spans, step_share
-from px4fuse.flight import EXTERNAL_VISION_RUNGS, Ekf2, FusionRecord, Unavailable
+from px4fuse.flight import Ekf2, FusionRecord, Unavailable
 
 FUSING_SHARE_ERROR = Threshold(
     0.5, "of the segment", "below, EKF2's track is mostly not the source's"
@@ -22,7 +22,7 @@ def _detect(analysis: Analysis) -> Found:
     if isinstance(ekf2, Unavailable) or isinstance(ekf2.fusing, Unavailable):
         return
     share = step_share(ekf2.fusing["horizontal"], segment.start_s, segment.end_s)
-    if comparison.source.rung not in EXTERNAL_VISION_RUNGS:
+    if not comparison.source.origin.is_vision:
         if comparison.source.name == "vehicle_mocap_odometry" and share == 0.0:
             yield Finding(
                 "ekf2_not_fusing",
@@ -83,7 +83,7 @@ def _cause(comparison: Comparison, interval: float) -> tuple[str, str]:
             "EKF2_DELAY_MAX (v1.15 and later).",
         )
     # the rate of a reconstructed source is the logger's, not its own
-    own_rate = control is not None and not comparison.source.reconstructed
+    own_rate = control is not None and not comparison.source.origin.reconstructed
     if own_rate and interval > EV_START_INTERVAL.value:
         return (
             f"its samples come every {interval:.2f} s, and EKF2 (v1.14 and later) starts only when "

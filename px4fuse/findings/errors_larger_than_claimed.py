@@ -14,7 +14,6 @@ import pandas as pd
 
 from px4fuse.analysis import Analysis
 from px4fuse.arrays import Array
-from px4fuse.comparison.drift import may_drift
 from px4fuse.comparison.model import AgainstTruth, AxisComparison, Comparison
 from px4fuse.errors import TrajectoryError
 from px4fuse.filter.consistency import Consistency
@@ -75,7 +74,7 @@ def _detect(analysis: Analysis) -> Found:
     if not hidden:
         return
     worst = hidden[0]
-    drifts = may_drift(comparison.flight, comparison.source)
+    drifts = comparison.source.origin.may_drift
     evidence: dict[str, float | str] = {"axis": worst.result.axis.name, "filter": worst.owner}
     said = []
     for owner, name in FILTERS.items():

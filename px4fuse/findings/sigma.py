@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 from msgspec import structs
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.drift import may_drift
 from px4fuse.comparison.remedy import filter_words
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise
@@ -85,7 +84,7 @@ def _detect(analysis: Analysis) -> Found:
     # where a source may drift, or the truth shows it, innovations tell too little noise alone
     hidden = any(one.owner == "kf" for one in hidden_errors(comparison))
     # and a filter may follow such a source as closely as it likes
-    drifts = may_drift(comparison.flight, comparison.source)
+    drifts = comparison.source.origin.may_drift
     if hidden or drifts:
         off = [each for each in off if each.factor < 1.0 and not (drifts and each.is_advice)]
     if not off:

@@ -45,7 +45,7 @@ def _detect(analysis: Analysis) -> Found:
     comparison = analysis
     clock = analysis.clock
     # what was derived from EKF2's own output has EKF2's stamps, not the source's
-    reconstructed = comparison.source.reconstructed
+    reconstructed = comparison.source.origin.reconstructed
     if not isinstance(clock, ClockOffset) or not clock.determinable or reconstructed:
         return
     if low_pass(analysis) is not None:  # which lags behind the motion by itself

@@ -18,7 +18,7 @@ FUSE_YAW = "EKF2 fuse the source's yaw (EKF2_EV_CTRL bit 3; EKF2_AID_MASK bit 4 
 
 def _detect(analysis: Analysis) -> Found:
     source, heading = analysis.source, analysis.heading
-    if isinstance(heading, Unavailable) or source.reconstructed:
+    if isinstance(heading, Unavailable) or source.origin.reconstructed:
         return
     is_px4 = analysis.flight.log.has_ulog
     remedy = CALIBRATE + (FUSE_YAW if is_px4 else "the autopilot fuse the source's yaw.")

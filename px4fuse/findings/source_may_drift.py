@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.drift import may_drift
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.findings.errors_larger_than_claimed import hidden_errors
 from px4fuse.findings.model import Detector, Finding, Found
@@ -12,7 +11,7 @@ from px4fuse.loop.loop import Loop
 
 def _detect(analysis: Analysis) -> Found:
     comparison = analysis
-    if not may_drift(comparison.flight, comparison.source) or hidden_errors(comparison):
+    if not comparison.source.origin.may_drift or hidden_errors(comparison):
         return
     evidence: dict[str, float | str] = {"source": comparison.source.name}
     tuned = analysis.tuning.get(HORIZONTAL)

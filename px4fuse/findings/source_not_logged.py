@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from px4fuse.analysis import Analysis
 from px4fuse.findings.model import Detector, Finding, Found, Threshold
+from px4fuse.origin import RECEIVED
 
 VISION_PROFILE_BIT = 128  # SDLOG_PROFILE bit 7, logged_topics.cpp
 LOGGER_INTERVAL_TOLERANCE = Threshold(
@@ -20,8 +21,10 @@ LOGGER_INTERVALS_S = {
 def _detect(analysis: Analysis) -> Found:
     comparison = analysis
     source = comparison.source
-    logged = any(track.rung == 2 for track in comparison.flight.positions)
-    if source.rung not in (4, 5, 6) or logged:
+    logged = any(
+        track.origin.preference == RECEIVED.preference for track in comparison.flight.positions
+    )
+    if source.origin.as_sent or logged:
         return
     profile = int(comparison.flight.log.parameters.get("SDLOG_PROFILE", 1))
     wanted = "vehicle_visual_odometry"

@@ -28,7 +28,7 @@ def _detect(analysis: Analysis) -> Found:
     if not isinstance(imu, pd.DataFrame) or sample_rate(imu) < RATE_MARGIN * MIN_IMU_RATE.value:
         return
     # what odometry makes of a distance drifts, and is no constant
-    if comparison.source.orientation is not None or comparison.source.reconstructed:
+    if comparison.source.orientation is not None or comparison.source.origin.reconstructed:
         return
     found = analysis.explained
     if not isinstance(found, Explained):

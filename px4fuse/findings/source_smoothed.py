@@ -16,7 +16,7 @@ def low_pass(analysis: Analysis) -> Smoothing | None:
     source = analysis.source
     # the error of odometry drifts, which makes that of successive positions agree as well; what
     # was made of EKF2's own output has EKF2's filter in it
-    if source.orientation is not None or source.reconstructed:
+    if source.orientation is not None or source.origin.reconstructed:
         return None
     found = analysis.smoothing
     if not isinstance(found, Smoothing):

@@ -24,7 +24,11 @@ def _detect(analysis: Analysis) -> Found:
     comparison = analysis
     ekf2, source = comparison.flight.ekf2, comparison.source
     record = ekf2.record if isinstance(ekf2, Ekf2) else None
-    if not isinstance(record, FusionRecord) or source.reconstructed or source.clock_map is not None:
+    if (
+        not isinstance(record, FusionRecord)
+        or source.origin.reconstructed
+        or source.clock_map is not None
+    ):
         return
     segment = comparison.segment
     age = record.vision_age_s.loc[segment.start_s : segment.end_s]

@@ -10,11 +10,11 @@ import numpy as np
 
 from px4fuse.analysis import Analysis
 from px4fuse.arrays import Array
-from px4fuse.comparison.preparation import LADDER
 from px4fuse.filter.signals import within
 from px4fuse.findings.ekf2_not_fusing import EV_START_INTERVAL
 from px4fuse.findings.model import Detector, Finding, Found, Threshold
 from px4fuse.findings.source_gap import GAP, GAP_INTERVALS
+from px4fuse.origin import ALIGNED
 
 MIN_INTERVALS = 50
 THINNED_SHARE = Threshold(0.25, "of the source's samples", "more than a link loses")
@@ -46,7 +46,7 @@ def _base(intervals: Array) -> tuple[float, Array] | None:
 def _detect(analysis: Analysis) -> Found:
     source = analysis.source
     # stamps that were made, or a rate that is the logger's (source_not_logged says so)
-    if source.clock_map is not None or source.rung >= LADDER["estimator_visual_odometry_aligned"]:
+    if source.clock_map is not None or source.origin.preference >= ALIGNED.preference:
         return
     intervals = np.diff(within(source.samples, analysis.segment).index.to_numpy())
     if len(intervals) < MIN_INTERVALS:

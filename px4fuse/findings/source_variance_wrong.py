@@ -20,7 +20,11 @@ def _detect(analysis: Analysis) -> Found:
     comparison = analysis
     source, tuned = comparison.source, analysis.tuning.get(HORIZONTAL)
     # odometry reports how far it has drifted, or its noise: it cannot be told which
-    if source.orientation is not None or source.reconstructed or not isinstance(tuned, AxisTuning):
+    if (
+        source.orientation is not None
+        or source.origin.reconstructed
+        or not isinstance(tuned, AxisTuning)
+    ):
         return
     reported = within(source.samples, comparison.segment)[POSITION_VARIANCE_COLUMNS[:2]].dropna()
     noise = tuned.sigma_z

@@ -13,7 +13,6 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.drift import may_drift
 from px4fuse.comparison.model import (
     AgainstTruth,
     AxisComparison,
@@ -89,7 +88,7 @@ def _verdict(analysis: Analysis) -> str:
     apart = "both were flown"
     if isinstance(result.difference, Difference):
         apart = f"ours and EKF2 are {length_words(result.difference.position_rmse_m)} apart (RMS)"
-    if may_drift(comparison.flight, comparison.source):
+    if comparison.source.origin.may_drift:
         judged = f"both follow {comparison.source.name}, which may drift"
     elif ekf2 == ours and not since:
         judged = f"by their own innovations both are {ours}"
@@ -128,7 +127,7 @@ def _since(analysis: Analysis, result: AxisComparison) -> str:
     comparison, statement = analysis, result.filters["kf"]
     if isinstance(statement, Unavailable) or statement.verdict == "consistent":
         return ""
-    if may_drift(comparison.flight, comparison.source):
+    if comparison.source.origin.may_drift:
         return ""
     name = "down" if result.axis.name == "down" else HORIZONTAL
     tuned = analysis.tuning.get(name, analysis.tuning.get(result.axis.name))

@@ -8,7 +8,6 @@ import numpy as np
 from msgspec import structs
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.drift import may_drift
 from px4fuse.comparison.model import FILTERS, AxisComparison, Comparison
 from px4fuse.comparison.remedy import (
     filter_words,
@@ -17,7 +16,7 @@ from px4fuse.comparison.remedy import (
     remedy_words,
     settings_words,
 )
-from px4fuse.ekf2.parameters import PARAMETERS
+from px4fuse.ekf2_parameters import PARAMETERS
 from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.fitting import SIGMA_Z_SEARCH_M
 from px4fuse.filter.settings import Settings
@@ -95,7 +94,7 @@ def _variance_finding(analysis: Analysis, owner: str, group: str, members: list[
     severity: Severity = "error" if factor >= VARIANCE_FACTOR_ERROR.value else "warning"
     if _is_default(comparison, owner, result):
         severity = lowered(severity)
-    if over and may_drift(comparison.flight, comparison.source):
+    if over and comparison.source.origin.may_drift:
         severity, remedy, cause = "info", AGAINST_DRIFT, ELSEWHERE
     elif over and any(hidden.owner == owner for hidden in hidden_errors(comparison)):
         remedy, cause = AGAINST_TRUTH, ELSEWHERE

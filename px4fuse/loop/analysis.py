@@ -9,7 +9,7 @@ import numpy as np
 
 from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.filter.signals import Segment
-from px4fuse.flight import EXTERNAL_VISION_RUNGS, Flight, Truth, Unavailable
+from px4fuse.flight import Flight, Truth, Unavailable
 from px4fuse.loop.loop import Loop, close_loop
 from px4fuse.loop.odometry import Closure, OdometryNoise
 from px4fuse.loop.part import KnownEnd, chosen_part, measured_end, part_of_flight, true_end
@@ -109,7 +109,7 @@ def analyse(
 
 def _positioned(flight: Flight) -> bool:
     """Whether the flight was told its position, and no odometry."""
-    told = any(track.rung in EXTERNAL_VISION_RUNGS for track in flight.positions)
+    told = any(track.origin.is_vision for track in flight.positions)
     return told and isinstance(odometry_of(flight), Unavailable)
 
 

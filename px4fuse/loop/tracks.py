@@ -15,7 +15,6 @@ from px4fuse.errors import MissingDataError
 from px4fuse.filter.signals import Segment
 from px4fuse.flight import (
     AXIS_NAMES,
-    EXTERNAL_VISION_RUNGS,
     POSITION_COLUMNS,
     POSITION_VARIANCE_COLUMNS,
     QUATERNION_COLUMNS,
@@ -39,7 +38,7 @@ def odometry_of(flight: Flight) -> PositionTrack | Unavailable:
     A positioning system such as UWB sends no orientation, or always the same one.
     """
     for track in flight.positions:
-        if track.rung in EXTERNAL_VISION_RUNGS and track.orientation is not None:
+        if track.origin.is_vision and track.orientation is not None:
             return track
     have = ", ".join(track.name for track in flight.positions) or "none"
     return Unavailable(
@@ -93,7 +92,7 @@ def _odometry(flight: Flight, track: PositionTrack) -> Trajectory:
 
 def _ekf2(flight: Flight, ekf2: Ekf2) -> Trajectory:
     state, resets = ekf2.state, ""
-    source = next((t for t in flight.positions if t.rung in EXTERNAL_VISION_RUNGS), None)
+    source = next((t for t in flight.positions if t.origin.is_vision), None)
     if source is not None:
         whole = Segment(0.0, flight.log.duration_s, "the whole log")
         state, resets = continuous_state(ekf2, source, whole)

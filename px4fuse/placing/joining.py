@@ -22,6 +22,7 @@ from px4fuse.flight import (
     Reset,
     Truth,
     Unavailable,
+    best_first,
 )
 from px4fuse.readers.parts import missing_parts
 from px4fuse.recording import InputFile
@@ -97,7 +98,7 @@ def join(flight: Flight, other: Flight) -> Flight:
             start_unix_s=unix_s,
             senders=flight.log.senders or other.log.senders,
         ),
-        positions=tuple(sorted((*flight.positions, *moved.positions), key=lambda t: t.rung)),
+        positions=best_first((*flight.positions, *moved.positions)),
         missing=(*lacking, *(part for part in flight.missing if part.source)),
         streams=streams,
         clocks=(*flight.clocks, *other.clocks),

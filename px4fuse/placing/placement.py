@@ -20,6 +20,7 @@ from msgspec import structs
 
 from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.flight import Flight, PositionTrack
+from px4fuse.origin import GIVEN_FILE
 from px4fuse.placing.description import describe
 from px4fuse.placing.matching import find_match
 from px4fuse.placing.tracks import EKF2_POSITION, FRAMES, IMU, MIN_SAMPLES, NoMatchError
@@ -94,14 +95,13 @@ def place(
     how = f"matched with {alignment.reference}" if clock_offset_s is None else "as given"
     track = PositionTrack(
         name=file.name,
-        rung=1,
+        origin=GIVEN_FILE,
         description=f"external position file, {len(placed)} samples, {alignment.frame}"
         + (f" turned by {alignment.yaw_deg:.1f}°" if alignment.yaw_deg else ""),
         samples=placed,
         frame="NED",
         clock=f"the file's own {file.clock} clock, {alignment.clock_offset_s:+.3f} s to the boot "
         f"clock, {how}",
-        reconstructed=False,
         topics=(file.name,),
         log=file.name,
         alignment=alignment,

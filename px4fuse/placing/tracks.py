@@ -21,6 +21,7 @@ from px4fuse.flight import (
     PositionTrack,
     Unavailable,
 )
+from px4fuse.origin import GIVEN_FILE
 from px4fuse.readers.parts import finite_rows
 from px4fuse.trajectory.offset import STEP_S
 
@@ -204,6 +205,6 @@ def placed_samples(
 
 def continuous_track(ekf2: Ekf2, placed: pd.DataFrame) -> Track:
     """EKF2's track with its resets treated as the placed file has it."""
-    track = PositionTrack("", 1, "", placed, "NED", "", False, ())
+    track = PositionTrack("", GIVEN_FILE, "", placed, "NED", "", ())
     whole = Segment(float(placed.index[0]), float(placed.index[-1]), "")
     return _ekf2_track(continuous_state(ekf2, track, whole)[0])

@@ -12,6 +12,7 @@ from types import MappingProxyType
 import numpy as np
 import pandas as pd
 
+from px4fuse.ekf2_parameters import REPORTED
 from px4fuse.flight import (
     ANGULAR_RATE_COLUMNS,
     QUATERNION_COLUMNS,
@@ -53,7 +54,6 @@ from px4fuse.readers.mavlink_senders import (
     map_senders,
 )
 from px4fuse.readers.parts import missing_parts, stretches_of_flight, stretches_of_modes
-from px4fuse.readers.px4_topics import PARAMETERS
 from px4fuse.readers.ulog_topics import dropped_note
 from px4fuse.recording import LogInfo, Unused
 
@@ -209,7 +209,7 @@ def _read_parameters(recording: Recording, autopilot: str) -> MappingProxyType[s
     found: dict[str, float] = {}
     for name, value in zip(table["param_id"].tolist(), values.tolist(), strict=True):
         text = name.decode(errors="replace")
-        if text in PARAMETERS and np.isfinite(value):
+        if text in REPORTED and np.isfinite(value):
             found.setdefault(text, float(value))
     return MappingProxyType(found)
 

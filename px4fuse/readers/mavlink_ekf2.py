@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from px4fuse.arrays import Array
+from px4fuse.ekf2_parameters import EV_POS, settings_in_force
 from px4fuse.flight import (
     AXIS_NAMES,
     POSITION_VARIANCE_COLUMNS,
@@ -27,7 +28,6 @@ from px4fuse.readers.mavlink_messages import (
     remedies_of,
 )
 from px4fuse.readers.mavlink_recording import BOOT_CLOCK, Recording, vector
-from px4fuse.readers.px4_ekf2 import DEFAULT_GATE
 from px4fuse.readers.px4_instances import NO_SELECTOR
 
 VARIANCE_COLUMNS = POSITION_VARIANCE_COLUMNS + VELOCITY_VARIANCE_COLUMNS
@@ -95,7 +95,7 @@ def read_ekf2(
         ),
         resets=(),
         instances=NO_SELECTOR,
-        gate=parameters.get("EKF2_EVP_GATE", DEFAULT_GATE),
+        gate=settings_in_force(parameters)[EV_POS.gate],
         notes=tuple(notes),
         record=remedies.replay,
     )

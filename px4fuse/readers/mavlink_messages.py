@@ -14,6 +14,7 @@ from scipy import constants
 
 from px4fuse.arrays import Array
 from px4fuse.flight import RECORD_NOT_LOGGED, Unavailable
+from px4fuse.origin import MOTION_CAPTURE, RECEIVED, Origin
 
 AUTOPILOT_COMPONENT = 1  # MAV_COMP_ID_AUTOPILOT1
 NO_AUTOPILOT = 8  # MAV_AUTOPILOT_INVALID: a ground station, a camera, a companion computer
@@ -147,32 +148,34 @@ class PositionInput:
     name: str
     message: str
     stamp: str
-    rung: int
+    origin: Origin
     description: str
     drops_covariance: bool = False
 
 
-def _odometry(name: str, rung: int, description: str, drops: bool = False) -> PositionInput:
-    return PositionInput(name, "ODOMETRY", "time_usec", rung, description, drops)
+def _odometry(
+    name: str, description: str, drops: bool = False, origin: Origin = RECEIVED
+) -> PositionInput:
+    return PositionInput(name, "ODOMETRY", "time_usec", origin, description, drops)
 
 
 _MOCAP = "motion capture, which EKF2 never fuses"
 POSITION_INPUTS = (
     PositionInput(
-        "VISION_POSITION_ESTIMATE", "VISION_POSITION_ESTIMATE", "usec", 2,
+        "VISION_POSITION_ESTIMATE", "VISION_POSITION_ESTIMATE", "usec", RECEIVED,
         "external vision position as it was sent to the autopilot",
     ),
-    _odometry("ODOMETRY", 2, "external odometry as it was sent to the autopilot"),
-    PositionInput("ATT_POS_MOCAP", "ATT_POS_MOCAP", "time_usec", 3, _MOCAP),
+    _odometry("ODOMETRY", "external odometry as it was sent to the autopilot"),
+    PositionInput("ATT_POS_MOCAP", "ATT_POS_MOCAP", "time_usec", MOTION_CAPTURE, _MOCAP),
 )  # fmt: skip
 # ODOMETRY from outside the autopilot by MAV_ESTIMATOR_TYPE. The others are no measurement: PX4
 # refuses GPS, GPS_INS, LIDAR and AUTOPILOT as input; from the autopilot itself it is EKF2's output.
 ODOMETRY_INPUTS: Mapping[int, PositionInput] = {
-    0: _odometry("ODOMETRY", 2, "external odometry as it was sent to the autopilot"),
-    1: _odometry("ODOMETRY_NAIVE", 2, "external odometry, without covariance", True),
-    2: _odometry("ODOMETRY_VISION", 2, "visual odometry as it was sent to the autopilot"),
-    3: _odometry("ODOMETRY_VIO", 2, "visual-inertial odometry as it was sent to the autopilot"),
-    6: _odometry("ODOMETRY_MOCAP", 3, _MOCAP),
+    0: _odometry("ODOMETRY", "external odometry as it was sent to the autopilot"),
+    1: _odometry("ODOMETRY_NAIVE", "external odometry, without covariance", True),
+    2: _odometry("ODOMETRY_VISION", "visual odometry as it was sent to the autopilot"),
+    3: _odometry("ODOMETRY_VIO", "visual-inertial odometry as it was sent to the autopilot"),
+    6: _odometry("ODOMETRY_MOCAP", _MOCAP, origin=MOTION_CAPTURE),
 }
 
 

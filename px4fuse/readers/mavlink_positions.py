@@ -18,7 +18,9 @@ from px4fuse.flight import (
     PositionTrack,
     Truth,
     Unavailable,
+    best_first,
 )
+from px4fuse.origin import with_orientation
 from px4fuse.readers.mavlink_clocks import Mapped
 from px4fuse.readers.mavlink_ekf2 import odometry
 from px4fuse.readers.mavlink_messages import (
@@ -55,7 +57,7 @@ TRACK_COLUMNS = [
 def read_positions(
     recording: Recording, mapped: dict[Address, Mapped], remedies: Remedies
 ) -> tuple[tuple[PositionTrack, ...], tuple[Unavailable, ...]]:
-    """Every external position that was sent to the autopilot, best rung first.
+    """Every external position that was sent to the autopilot, the best first.
 
     Parameters
     ----------
@@ -87,7 +89,7 @@ def read_positions(
             )
     tracks = [part for part in found if isinstance(part, PositionTrack)]
     missing = tuple(part for part in found if isinstance(part, Unavailable))
-    return tuple(sorted(tracks, key=lambda track: track.rung)), missing
+    return best_first(tracks), missing
 
 
 def _kinds(source: PositionInput, table: NDArray[Any]) -> list[tuple[PositionInput, IntArray]]:
@@ -142,12 +144,11 @@ def _read_track(
     )
     return PositionTrack(
         name=name,
-        rung=source.rung,
+        origin=with_orientation(source.origin, turns=orientation is not None),
         description=source.description,
         samples=samples,
         frame=frame,
         clock=f"{statement.clock}{mapping}",
-        reconstructed=False,
         topics=(source.message,),
         log=recording.frames.name,
         clock_map=statement,

@@ -11,6 +11,7 @@ from typing import Literal
 import numpy as np
 import pandas as pd
 
+from px4fuse.ekf2_parameters import EV_POS, settings_in_force
 from px4fuse.flight import (
     BIAS_NOT_LOGGED,
     EKF2_STEP_S,
@@ -41,8 +42,6 @@ from px4fuse.readers.px4_topics import (
 )
 from px4fuse.readers.ulog_topics import Topics, measurement_time_us, states_and_covariances
 
-# EKF2_EVP_GATE has had this default in every release read (v1.9 to main)
-DEFAULT_GATE = 5.0
 _RESET_COUNTERS: tuple[
     tuple[Literal["position", "velocity"], str, tuple[str | None, str | None, str | None]], ...
 ] = (
@@ -77,7 +76,7 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
     instances = primary_instances(topics)
     notes: list[str] = []
     fusing = _read_fusing(topics, instances)
-    gate = parameters.get("EKF2_EVP_GATE", DEFAULT_GATE)
+    gate = settings_in_force(parameters)[EV_POS.gate]
     innovations, innovation_topics = read_innovations(topics, instances, fusing, gate, notes)
     step_s = _step_s(topics)
     return Ekf2(

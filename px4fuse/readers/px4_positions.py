@@ -1,4 +1,4 @@
-"""External position tracks of a ULog: the ladder of sources, best rung first."""
+"""External position tracks of a ULog: in order of preference."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.arrays import Array
+from px4fuse.ekf2_parameters import EV_POS
 from px4fuse.flight import (
     AXIS_NAMES,
-    EXTERNAL_VISION_RUNGS,
     POSITION_COLUMNS,
     POSITION_VARIANCE_COLUMNS,
     QUATERNION_COLUMNS,
@@ -20,7 +20,9 @@ from px4fuse.flight import (
     PositionTrack,
     Truth,
     Unavailable,
+    best_first,
 )
+from px4fuse.origin import GNSS, KEPT, REBUILT, Origin, with_orientation
 from px4fuse.readers.parts import finite_rows, orientation_of
 from px4fuse.readers.px4_ekf2 import target_step_s
 from px4fuse.readers.px4_instances import NO_SELECTOR, Instances, of_primary
@@ -29,7 +31,10 @@ from px4fuse.readers.px4_topics import (
     AID_OBSERVATION_VERTICAL,
     FRAMES,
     GPS,
+    GPS_POSITION,
+    KEPT_OBSERVATION,
     LOCAL_POSITION,
+    RECONSTRUCTION,
     TRACKS,
     TRUTH_ATTITUDE,
     TRUTH_GLOBAL,
@@ -47,19 +52,16 @@ SAME_TIME_US = 100
 ARRIVAL_SHARE = 0.9
 # Heights this far from a position may be joined to it: 2.5 cm at a climb of 0.5 m/s
 HEIGHT_TOLERANCE_S = 0.05
-AID_SOURCE = "estimator_aid_src_ev_pos"
-RECONSTRUCTION = "ekf2_state_plus_innovation"
-GPS_SOURCE = "vehicle_gps_position"
 AUTOPILOT_CLOCK = "autopilot boot clock (as PX4 mapped the sender's stamp)"
 
 
 def read_positions(
     topics: Topics, ekf2: Ekf2 | Unavailable
 ) -> tuple[tuple[PositionTrack, ...], tuple[Unavailable, ...]]:
-    """Every external position track, best rung first, and what was looked for and not found."""
+    """Every external position track, the best first, and what was looked for and not found."""
     instances = NO_SELECTOR if isinstance(ekf2, Unavailable) else ekf2.instances
     candidates = [_read_logged(topics, source, instances) for source in TRACKS]
-    candidates.append(_read_aid_observation(topics, instances))
+    candidates.append(_read_aid_observation(topics, instances, ekf2))
     candidates.append(_reconstruct(topics, ekf2))
     candidates.append(_read_gps(topics))
     tracks = tuple(
@@ -68,7 +70,7 @@ def read_positions(
         if isinstance(track, PositionTrack)
     )
     missing = tuple(track for track in candidates if isinstance(track, Unavailable))
-    return tuple(sorted(tracks, key=lambda track: track.rung)), missing
+    return best_first(tracks), missing
 
 
 def _unavailable(name: str, reason: str) -> Unavailable:
@@ -77,9 +79,9 @@ def _unavailable(name: str, reason: str) -> Unavailable:
             "Set SDLOG_PROFILE to 129 (default and vision) to log it as it arrives."
         ),
         "vehicle_mocap_odometry": "Logged when ATT_POS_MOCAP is sent to PX4.",
-        AID_SOURCE: "Logged by default since v1.16 when EKF2 runs on external vision.",
+        KEPT_OBSERVATION: "Logged by default since v1.16 when EKF2 runs on external vision.",
         RECONSTRUCTION: "Needs EKF2 innovations of external vision.",
-        GPS_SOURCE: "Logged when a GPS receiver is connected.",
+        GPS_POSITION: "Logged when a GPS receiver is connected.",
     }.get(name, "Logged by PX4 v1.10 to v1.13 when external vision is fused.")
     return Unavailable(f"position source {name}", reason, remedy, source=name)
 
@@ -117,11 +119,12 @@ def _read_logged(
             frame = names.get(int(samples[field].iloc[-1]), "unknown")
     if source.name == "estimator_visual_odometry_aligned":
         frame = "NED"  # rotated by EKF2 itself, whatever the field still says
+    orientation = orientation_of(samples)
     return _finished(
         PositionTrack(
-            source.name, source.rung, source.description, samples, frame, AUTOPILOT_CLOCK,
-            False, (layout.topic,), clock_map=_arrival(topics, layout.topic),
-            orientation=orientation_of(samples),
+            source.name, with_orientation(source.origin, turns=orientation is not None),
+            source.description, samples, frame, AUTOPILOT_CLOCK, (layout.topic,),
+            clock_map=_arrival(topics, layout.topic), orientation=orientation,
         ),
         POSITION_COLUMNS,
     )  # fmt: skip
@@ -144,10 +147,12 @@ def _arrival(topics: Topics, topic: str) -> ClockMap | None:
     )  # fmt: skip
 
 
-def _read_aid_observation(topics: Topics, instances: Instances) -> PositionTrack | Unavailable:
+def _read_aid_observation(
+    topics: Topics, instances: Instances, ekf2: Ekf2 | Unavailable
+) -> PositionTrack | Unavailable:
     layout = topics.find(AID_OBSERVATION_HORIZONTAL)
     if layout is None:
-        return _unavailable(AID_SOURCE, f"no topic {AID_SOURCE} in the log")
+        return _unavailable(KEPT_OBSERVATION, f"no topic {KEPT_OBSERVATION} in the log")
     samples = of_primary(topics, layout, instances)
     used = [layout.topic]
     notes: tuple[str, ...] = ()
@@ -156,17 +161,25 @@ def _read_aid_observation(topics: Topics, instances: Instances) -> PositionTrack
         height = of_primary(topics, vertical, instances)
         samples, notes = _with_height(samples, height)
         used.append(vertical.topic)
-    # EKF2 stamps its buffer entries earlier than the sender did: by EKF2_EV_DELAY and by half its
+    # EKF2 stamps its buffer entries earlier than the sender did: by its delay and by half its
     # update period (estimator_interface.cpp)
     lead_s = _delay_s(topics) + 0.5 * target_step_s(topics)
     samples.index = pd.Index(samples.index.to_numpy() + lead_s, name="time_s")
     return _finished(
         PositionTrack(
-            AID_SOURCE, 5, "the observations that EKF2 kept of external vision", samples, "NED",
-            AUTOPILOT_CLOCK, True, tuple(used), notes=notes,
+            KEPT_OBSERVATION, _kept(KEPT, ekf2),
+            "the observations that EKF2 kept of external vision", samples, "NED",
+            AUTOPILOT_CLOCK, tuple(used), notes=notes,
         ),
         POSITION_COLUMNS[:2],
     )  # fmt: skip
+
+
+def _kept(origin: Origin, ekf2: Ekf2 | Unavailable) -> Origin:
+    """Of what EKF2 kept, a source that EKF2 took a heading from counts as an odometry."""
+    fusing = ekf2.fusing if isinstance(ekf2, Ekf2) else ekf2
+    turns = isinstance(fusing, pd.DataFrame) and bool((fusing["yaw"] > 0).any())
+    return with_orientation(origin, turns=turns)
 
 
 def _with_height(
@@ -198,8 +211,8 @@ def _with_height(
 
 
 def _delay_s(topics: Topics) -> float:
-    """EKF2_EV_DELAY, by which EKF2 takes a sample to be older than its stamp."""
-    return topics.log.parameters.get("EKF2_EV_DELAY", 0.0) * 1e-3
+    """The delay by which EKF2 takes a sample to be older than its stamp."""
+    return topics.log.parameters.get(EV_POS.delay, 0.0) * 1e-3
 
 
 def _reconstruct(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack | Unavailable:
@@ -226,8 +239,8 @@ def _reconstruct(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack | Un
     samples.index = pd.Index(samples.index.to_numpy() + _delay_s(topics), name="time_s")
     return _finished(
         PositionTrack(
-            RECONSTRUCTION, 6, "EKF2's position plus its innovation", samples, "NED",
-            "EKF2's time plus EKF2_EV_DELAY; late by up to one interval of the source", True,
+            RECONSTRUCTION, _kept(REBUILT, ekf2), "EKF2's position plus its innovation", samples,
+            "NED", f"EKF2's time plus {EV_POS.delay}; late by up to one interval of the source",
             ("vehicle_local_position", *ekf2.innovation_topics), notes=notes,
         ),
         POSITION_COLUMNS[:2],
@@ -288,7 +301,7 @@ def _projected(topics: Topics, geo: pd.DataFrame) -> pd.DataFrame:
 def _read_gps(topics: Topics) -> PositionTrack | Unavailable:
     layout = topics.find(GPS)
     if layout is None:
-        return _unavailable(GPS_SOURCE, f"no topic {GPS_SOURCE} in the log")
+        return _unavailable(GPS_POSITION, f"no topic {GPS_POSITION} in the log")
     gps = topics.frame(layout)
     if "latitude_1e7" in gps:
         gps["latitude_deg"] = gps["latitude_1e7"] * 1e-7
@@ -297,14 +310,14 @@ def _read_gps(topics: Topics) -> PositionTrack | Unavailable:
     if "fix_type" in gps:
         gps = gps[gps["fix_type"] >= GPS_3D_FIX]
     if gps.empty:
-        return _unavailable(GPS_SOURCE, "the receiver never had a 3D fix")
+        return _unavailable(GPS_POSITION, "the receiver never had a 3D fix")
     samples = _projected(topics, gps)
     if {"eph_m", "epv_m"} <= set(gps.columns):
         samples["north_m2"] = samples["east_m2"] = gps["eph_m"].to_numpy() ** 2 / 2.0
         samples["down_m2"] = gps["epv_m"].to_numpy() ** 2
     return _finished(
         PositionTrack(
-            GPS_SOURCE, 7, "GPS position", samples, "NED", AUTOPILOT_CLOCK, False, (layout.topic,)
+            GPS_POSITION, GNSS, "GPS position", samples, "NED", AUTOPILOT_CLOCK, (layout.topic,)
         ),
         POSITION_COLUMNS,
     )
@@ -352,5 +365,5 @@ def captured_truth(track: PositionTrack) -> Truth:
 
 def motion_capture(positions: tuple[PositionTrack, ...], *topics: str) -> PositionTrack | None:
     """Motion capture by its topics, where another track feeds EKF2: then it is the truth."""
-    fed = any(track.rung in EXTERNAL_VISION_RUNGS for track in positions)
+    fed = any(track.origin.is_vision for track in positions)
     return next((track for track in positions if fed and track.topics[0] in topics), None)

@@ -20,6 +20,7 @@ from px4fuse.flight import (
     SPECIFIC_FORCE_COLUMNS,
     VELOCITY_COLUMNS,
 )
+from px4fuse.origin import ALIGNED, GNSS, KEPT, MOTION_CAPTURE, REBUILT, RECEIVED, Origin
 
 
 @dataclass(frozen=True)
@@ -242,7 +243,7 @@ class TrackSource:
     """A logged position track: its name for ``--position-source``, and its layouts."""
 
     name: str
-    rung: int
+    origin: Origin
     description: str
     layouts: tuple[Layout, ...]
 
@@ -277,19 +278,19 @@ def _odometry(topic: str) -> tuple[Layout, ...]:
 TRACKS = (
     TrackSource(
         "vehicle_visual_odometry",
-        2,
+        RECEIVED,
         "external vision position as PX4 received it",
         (*_odometry("vehicle_visual_odometry"), Layout("vehicle_vision_position", _XYZ, "v1.8")),
     ),
     TrackSource(
         "vehicle_mocap_odometry",
-        3,
+        MOTION_CAPTURE,
         "motion capture, which EKF2 never fuses",
         (*_odometry("vehicle_mocap_odometry"), Layout("att_pos_mocap", _XYZ, "v1.8")),
     ),
     TrackSource(
         "estimator_visual_odometry_aligned",
-        4,
+        ALIGNED,
         "external vision rotated into EKF2's frame",
         (
             _odometry_until_v1_13("estimator_visual_odometry_aligned", "v1.12"),
@@ -297,6 +298,14 @@ TRACKS = (
         ),
     ),
 )
+
+# Names for ``--position-source`` of what EKF2 kept of external vision, and of GNSS
+KEPT_OBSERVATION = "estimator_aid_src_ev_pos"
+RECONSTRUCTION = "ekf2_state_plus_innovation"
+GPS_POSITION = "vehicle_gps_position"
+TOPIC_ORIGINS = {track.name: track.origin for track in TRACKS} | {
+    KEPT_OBSERVATION: KEPT, RECONSTRUCTION: REBUILT, GPS_POSITION: GNSS,
+}  # fmt: skip
 
 AID_OBSERVATION_HORIZONTAL = (
     Layout(
@@ -322,14 +331,6 @@ UNUSED: Mapping[str, str] = {
     "uwb_distance": "ranges to the anchors, and the landing target seen from the vehicle",
     "uwb_grid": "positions of the UWB anchors and of the landing target, not the vehicle's",
 }
-
-# Parameters that bear on fusion and on what is logged, and the airframe; only these enter the
-# results
-PARAMETERS = (
-    "EKF2_AID_MASK", "EKF2_EN", "EKF2_EVP_GATE", "EKF2_EVP_NOISE", "EKF2_EV_CTRL", "EKF2_EV_DELAY",
-    "EKF2_EV_NOISE_MD", "EKF2_HGT_MODE", "EKF2_HGT_REF", "EKF2_ACC_NOISE", "EKF2_PREDICT_US",
-    "EKF2_GPS_CTRL", "SDLOG_PROFILE", "SYS_AUTOSTART", "SYS_MC_EST_GROUP",
-)  # fmt: skip
 
 
 def topics() -> list[str]:

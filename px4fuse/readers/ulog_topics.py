@@ -24,8 +24,9 @@ from pyulog import ULog
 from pyulog.exceptions import ULogException
 
 from px4fuse.arrays import Array, IntArray
+from px4fuse.ekf2_parameters import REPORTED
 from px4fuse.errors import LogError
-from px4fuse.readers.px4_topics import IMU, PARAMETERS, Layout, topics
+from px4fuse.readers.px4_topics import IMU, Layout, topics
 from px4fuse.reading import read_log_bytes, shown
 from px4fuse.recording import Dropout, LogInfo
 
@@ -271,7 +272,7 @@ def read_topics(path: Path) -> Topics:
         parameters=MappingProxyType(
             {
                 name: float(ulog.initial_parameters[name])
-                for name in PARAMETERS
+                for name in REPORTED
                 if _is_finite(ulog.initial_parameters.get(name))
             }
         ),

@@ -67,7 +67,8 @@ def draw(document: Document) -> Iterator[Page]:
                 ("time zero", f"{log.boot_time_s:.6f} s after boot, the first sample of data"),
                 (
                     "position source",
-                    f"{source.name} (rung {source.rung} of 7) from {', '.join(source.topics)}; "
+                    f"{source.name} ({source.origin.kind}, {source.origin.passage}) from "
+                    f"{', '.join(source.topics)}; "
                     f"clock: {source.clock}",
                 ),
                 (

@@ -10,9 +10,9 @@ from matplotlib.ticker import LogLocator, NullLocator
 
 from px4fuse.analysis import Counterfactual
 from px4fuse.ekf2.agreement import REJECTING_SHARE
-from px4fuse.ekf2.parameters import PARAMETERS
 from px4fuse.ekf2.replay import HORIZONTAL
 from px4fuse.ekf2.whatif import Summary
+from px4fuse.ekf2_parameters import PARAMETERS
 from px4fuse.flight import Unavailable
 from px4fuse.plain import capital, number_words
 from px4fuse.report.document import WhatIfDocument

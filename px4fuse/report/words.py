@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from px4fuse.comparison.drift import may_drift
 from px4fuse.comparison.model import AgainstTruth, Comparison, Difference
 from px4fuse.filter.clock import CHANGE_P, ClockOffset
 from px4fuse.filter.consistency import Consistency
@@ -98,7 +97,7 @@ def verdict_notes(comparison: Comparison) -> list[str]:
         if isinstance(statement, Consistency)
     ]
     notes = []
-    if may_drift(comparison.flight, comparison.source):
+    if comparison.source.origin.may_drift:
         notes.append(
             "Consistent with a source that may drift is not correct: these verdicts say how well "
             "each filter follows it. Truth or a loop judges the error."
@@ -220,7 +219,7 @@ def tuning_advice(
     found = tuned[name]
     assert isinstance(found, AxisTuning)
     lines = []
-    drifts = may_drift(comparison.flight, comparison.source)
+    drifts = comparison.source.origin.may_drift
     if drifts:
         noise = found.sigma_z.value or found.sigma_z.high
         lines.append(

@@ -116,13 +116,25 @@ def whatif_results(request: WhatIfRequest, made_of: Counterfactual, command: str
 
 
 def _source(comparison: Comparison) -> PositionSource:
+    track = comparison.source
+    origin, parameters = track.origin, comparison.flight.log.parameters
     return copied(
         PositionSource,
-        comparison.source,
+        track,
+        kind=origin.kind,
+        passage=origin.passage,
+        reconstructed=origin.reconstructed,
+        ekf2_parameters={} if origin.aid is None else origin.aid.in_log(parameters),
         reason=comparison.source_reason,
         available=tuple(
-            copied(AvailableTrack, track, samples=len(track.samples))
-            for track in comparison.flight.positions
+            copied(
+                AvailableTrack,
+                known,
+                kind=known.origin.kind,
+                passage=known.origin.passage,
+                samples=len(known.samples),
+            )
+            for known in comparison.flight.positions
         ),
         not_in_log=tuple(part for part in comparison.missing if part.source),
     )

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
-
-from msgspec import Meta
+from collections.abc import Mapping
+from typing import Literal
 
 from px4fuse.flight import Alignment
+from px4fuse.origin import Passage, PositionKind
 from px4fuse.record import Count, Positive, Record, Unavailable
 from px4fuse.recording import ClockMap, InputFile, LogInfo
 from px4fuse.request import InputName
@@ -23,7 +23,8 @@ class AvailableTrack(Record, frozen=True):
     """A position track of the flight."""
 
     name: str
-    rung: Count
+    kind: PositionKind
+    passage: Passage
     samples: Count
     rate_hz: Positive | None = None
 
@@ -31,12 +32,15 @@ class AvailableTrack(Record, frozen=True):
 class PositionSource(Record, frozen=True, kw_only=True):
     """The position that both filters are judged by.
 
-    ``rung`` is its place in the ladder of sources, 1 is best; ``log`` the file that it was read
-    from.
+    ``kind`` and ``passage`` say where it comes from and how it got into the flight,
+    ``ekf2_parameters`` what the log has of EKF2's parameters for it, by PX4 name and in PX4's
+    units; ``log`` is the file that it was read from.
     """
 
     name: str
-    rung: Annotated[int, Meta(ge=1, le=7)]
+    kind: PositionKind
+    passage: Passage
+    ekf2_parameters: Mapping[str, float]
     description: str
     reason: str
     rate_hz: Positive

@@ -29,11 +29,11 @@ from px4fuse.ekf2.legs import (
 )
 from px4fuse.ekf2.model import StretchRun, delayed_states, run_variants
 from px4fuse.ekf2.output_predictor import follow_attitude, publish
-from px4fuse.ekf2.parameters import PARAMETERS as MODEL_PARAMETERS
-from px4fuse.ekf2.parameters import settings_in_force
 from px4fuse.ekf2.recursion import EAST, HEADING, NORTH, Variant
 from px4fuse.ekf2.stretches import Stretch, down_sampled, step_ends
 from px4fuse.ekf2.vision import Vision
+from px4fuse.ekf2_parameters import PARAMETERS as MODEL_PARAMETERS
+from px4fuse.ekf2_parameters import settings_in_force
 from px4fuse.simulation import sensors
 from px4fuse.simulation.ekf2_topics import Track, ekf2_topics
 from px4fuse.simulation.mistakes import Mistakes

@@ -10,11 +10,12 @@ from typing import Any
 import numpy as np
 
 from px4fuse.ekf2.model import MODEL_NOTE
+from px4fuse.ekf2_parameters import REPORTED
 from px4fuse.errors import SettingsError
 from px4fuse.flight import Flight
 from px4fuse.plain import plain
 from px4fuse.readers import ulog
-from px4fuse.readers.px4_topics import IMU, PARAMETERS
+from px4fuse.readers.px4_topics import IMU
 from px4fuse.readers.ulog_topics import NOTE_KEY, Topics
 from px4fuse.recording import LogInfo
 from px4fuse.simulation import ekf2, sensors
@@ -135,7 +136,7 @@ def to_flight(simulation: Simulation, name: str = "simulation.ulg") -> Flight:
             duration_s=int(stamps[-1] - stamps[0]) * 1e-6,
             parameters={
                 key: float(np.float32(simulation.parameters[key]))
-                for key in PARAMETERS
+                for key in REPORTED
                 if key in simulation.parameters
             },
             notes=(MODEL_NOTE,) if simulation.scenario.ekf2 else (),

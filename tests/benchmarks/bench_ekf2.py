@@ -50,11 +50,12 @@ def agreement_table(paths: list[Path]) -> dict[str, Model]:
         a, (north, east) = model.agreement, model.agreement.axes.values()
         print(
             f"{path.stem} | {a.samples} | {north.innovation_correlation:.4f}, "
-            f"{east.innovation_correlation:.4f} | {north.innovation_rms_difference_m:.4f}, "
-            f"{east.innovation_rms_difference_m:.4f} | {north.s_ratio_median:.3f} "
+            f"{east.innovation_correlation:.4f} | {north.innovation_rms_difference:.4f}, "
+            f"{east.innovation_rms_difference:.4f} | {north.s_ratio_median:.3f} "
             f"({min(north.s_ratio_p5, east.s_ratio_p5):.3f} to "
             f"{max(north.s_ratio_p95, east.s_ratio_p95):.3f}) | "
-            f"{a.rejected_share_replayed:.1%} / {a.rejected_share_logged:.1%} | {a.same_share:.1%}"
+            f"{a.rejected_share_replayed:.1%} / {a.rejected_share_logged:.1%} | "
+            f"{a.decisions_same:.1%}"
         )
         judge_agreement(path.stem, model)
     print("\npublished, model - log, rms: position m, velocity m/s (north, east)")
@@ -82,7 +83,7 @@ def judge_agreement(name: str, model: Model) -> None:
         assert abs(axis.s_ratio_median - 1.0) < 0.01, name
         assert axis.s_ratio_p5 > 0.96, name
         assert axis.s_ratio_p95 < 1.04, name
-        assert agreement.same_share >= 0.99, name
+        assert agreement.decisions_same >= 0.99, name
         if OUTLIERS not in name:
             old = name.startswith(("v1.13", "v1.14"))
             assert axis.position_rms_difference_m < (0.02 if old else 0.012), name

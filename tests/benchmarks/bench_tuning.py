@@ -43,7 +43,7 @@ def main() -> None:
     from px4fuse.filter.tuning import HORIZONTAL, tune
     from px4fuse.readers import read_log
 
-    axis = compare(read_log(LOG), axes=("north",)).axes[0].axis
+    axis = compare(read_log(LOG), axes=("north",)).lines[0]
     single = seconds(lambda: replay(axis, Settings()))
     legs = preintegrate(axis, Settings())
     weight = np.ones(len(legs.measurement_m))
@@ -55,7 +55,7 @@ def main() -> None:
     )
     test_clock.IMU_HZ = 250.0
     flight, _ = test_clock.made_flight(1, duration_s=600.0, offset_s=-0.1)
-    axes = tuple(each.axis for each in compare(flight, test_clock.SETTINGS).axes)
+    axes = tuple(each.axis for each in compare(flight, test_clock.SETTINGS).axes.values())
     for names in (None, (HORIZONTAL,)):
         took = seconds(lambda names=names: tune(axes, test_clock.SETTINGS, names, flight=flight), 1)
         print(f"tune, {names[0] if names else 'all axes'}, 600 s: {took:.1f} s (aim 5 s)")
