@@ -8,16 +8,20 @@ from dataclasses import fields, is_dataclass
 from decimal import Decimal
 from typing import Any
 
+import msgspec
+
 
 def plain(value: object) -> Any:
-    """Dataclasses, mappings and tuples as dicts and lists.
+    """Records, mappings and tuples as dicts and lists.
 
     What is None or not a finite number is left out of a dict, never written as zero or NaN.
 
     >>> plain({"rate_hz": float("nan"), "topics": ("a", "b")})
     {'topics': ['a', 'b']}
     """
-    if is_dataclass(value):
+    if isinstance(value, msgspec.Struct):
+        value = msgspec.structs.asdict(value)
+    elif is_dataclass(value):
         value = {field.name: getattr(value, field.name) for field in fields(value)}
     if isinstance(value, Mapping):
         made = {str(name): plain(part) for name, part in value.items()}

@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from conftest import REPOSITORY
+from forgery import forged, with_results
 from pypdf import PdfReader, PdfWriter
 
 from px4fuse.grading import grade as grading
@@ -28,23 +29,19 @@ class Reports:
 
     def __init__(self) -> None:
         pdf = REPORT.read_bytes()
-        reader = PdfReader(io.BytesIO(pdf))
-        (self._name,) = reader.attachments
-        self._results = json.loads(reader.attachments[self._name][0])
+        self._results = json.loads(PdfReader(io.BytesIO(pdf)).attachments["results.json"][0])
         self._pdf = pdf
 
     def of(self, name: str, student_id: str, log: str = "", notes: str = "") -> bytes:
         results = {**self._results, "student": {"name": name, "id": student_id, "notes": notes}}
         if log:
             results["log"] = {**results["log"], "sha256": log}
-        writer = PdfWriter(clone_from=io.BytesIO(self._pdf))
-        writer._root_object.pop("/Names", None)
-        writer.add_attachment(self._name, json.dumps(results).encode())
-        for _ in range(len(writer.pages) - 1):  # pages are drawn, which takes time
-            writer.remove_page(1)
-        out = io.BytesIO()
-        writer.write(out)
-        return out.getvalue()
+
+        def first_page_alone(writer: PdfWriter) -> None:  # pages are drawn, which takes time
+            for _ in range(len(writer.pages) - 1):
+                writer.remove_page(1)
+
+        return forged(self._pdf, with_results(json.dumps(results)), first_page_alone)
 
 
 def at_once(monkeypatch) -> list[str]:

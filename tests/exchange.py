@@ -10,7 +10,7 @@ import msgspec
 T = TypeVar("T")
 
 
-def replace(record: T, **changes: Any) -> T:
+def replace(record: T, /, **changes: Any) -> T:
     """The same record with these values."""
     if isinstance(record, msgspec.Struct):
         return msgspec.structs.replace(record, **changes)

@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 import msgspec
 import numpy as np
 import pandas as pd
+from exchange import replace
 
 from px4fuse.analysis import Analysis
 from px4fuse.filter.causes import Explained, Jump
@@ -31,6 +32,7 @@ T = TypeVar("T")
 
 NONE = Unavailable("it", "no topic for it", "Log it.")
 SEGMENT = Segment(10.0, 110.0, "")
+DRIFTING = replace(RECEIVED, kind="vio")
 # A setting that nobody comes with
 CHOSEN = Settings(sigma_a_m_s2=1.0, sigma_z_m=1.0)
 

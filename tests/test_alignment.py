@@ -16,6 +16,7 @@ from exchange import replace
 from flights import Estimator, Imu, Span, Uwb, aisle_flight, table, unavailable
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from msgspec import structs
 
 from px4fuse.arrays import Array
 from px4fuse.errors import MissingDataError, SettingsError
@@ -28,6 +29,7 @@ from px4fuse.flight import (
     PositionTrack,
     Reset,
 )
+from px4fuse.origin import GIVEN_FILE
 from px4fuse.placing.placement import EKF2_POSITION, IMU, place
 from px4fuse.readers import read_log
 from px4fuse.readers.position_csv import SAMPLE_COLUMNS, PositionFile, read_position_csv
@@ -343,7 +345,7 @@ def test_the_flight_gets_the_track_the_file_and_what_its_reader_said(flight: Fli
     track, *others = result.positions
     assert (track.name, track.origin, track.log, track.topics) == (
         "uwb.csv",
-        1,
+        GIVEN_FILE,
         "uwb.csv",
         ("uwb.csv",),
     )
@@ -352,11 +354,11 @@ def test_the_flight_gets_the_track_the_file_and_what_its_reader_said(flight: Fli
     assert track.clock.startswith("the file's own UNIX clock, -1795251250.")
     assert track.clock.endswith(" s to the boot clock, matched with EKF2 position")
     assert tuple(others) == flight.positions
-    assert [vars(given) for given in result.inputs] == [
-        {"name": "uwb.csv", "sha256": "f" * 64, "size_bytes": 1234, "role": "position"}
+    assert [structs.asdict(given) for given in result.inputs] == [
+        {"name": "uwb.csv", "sha256": "f" * 64, "bytes": 1234, "role": "position"}
     ]
     assert result.log.notes == ("uwb.csv: time: column 1", "uwb.csv: two rows dropped")
-    assert result.filters["ekf2"] is flight.ekf2
+    assert result.ekf2 is flight.ekf2
     assert flight.inputs == ()
 
 

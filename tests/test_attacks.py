@@ -18,6 +18,7 @@ import pytest
 from click.testing import CliRunner
 from conftest import page_of
 from exchange import replace
+from forgery import forged, on_page, with_results
 from notes_samples import FILLER
 from results_tools import LOOP, changed, decoded
 from test_verify import Base, base, read_again, report_of
@@ -29,6 +30,7 @@ from px4fuse.grading.model import Graded, Rubric
 from px4fuse.grading.rubric import read_rubric
 from px4fuse.grading.scoring import assess, refused
 from px4fuse.report import pdf as pdf_module
+from px4fuse.report.seal import sealed
 from px4fuse.simulation import flights
 from px4fuse.simulation.mistakes import parse
 from px4fuse.simulation.scenario import Scenario
@@ -334,7 +336,7 @@ def position(results: dict[str, Any]) -> None:
 def joined(results: dict[str, Any]) -> None:
     position(results)
     results["log"]["joined"] = [
-        {"name": "uwb.csv", "sha256": "a" * 64, "size_bytes": 9, "role": "position"}
+        {"name": "uwb.csv", "sha256": "a" * 64, "bytes": 9, "role": "position"}
     ]
 
 
@@ -358,7 +360,7 @@ FILES: dict[str, tuple[Change, str, str]] = {
     "libraries left out": (put({}, "provenance", "libraries"), "cannot verify", "Ask how"),
     "an unknown log": (put("c" * 64, "log", "sha256"), "other log", "add s01.ulg to --logs."),
     "the log of another": (put("b" * 64, "log", "sha256"), "other log", "given to s02"),
-    "a better NIS": (put(1.0, "axes", "north", "kf", "nis_mean"), "numbers differ", ""),
+    "a better NIS": (put(1.0, "axes", "north", "filters", "kf", "nis_mean"), "numbers differ", ""),
     "no finding": (put([], "findings"), "numbers differ", ""),
     "other settings": (put(0.3, "request", "sigma_a_m_s2"), "numbers differ", ""),
     "another part of the flight": (put(20.0, "request", "start_s"), "numbers differ", ""),
@@ -383,7 +385,7 @@ def test_files(
         monkeypatch.setattr(pdf_module, "render", page_of)
     results = copy.deepcopy(flight.honest.results)
     change(results)
-    pdf = flight.honest.with_results(results).sealed()
+    pdf = flight.honest.with_results(results)
     report = read_report(pdf, "a.pdf")
     if isinstance(report, Refused):
         verdict = Verdict("cannot verify", (report.reason,), with_log=False)
@@ -400,10 +402,8 @@ def test_files(
 
 def test_pages_that_were_painted_over(flight: Flight, honest: Graded, rubric: Rubric) -> None:
     """The numbers are verified, the page is not, and what is scored is the redrawn report."""
-    numbers = flight.honest.numbers
-    pdf = flight.honest.anatomy.streamed(
-        numbers.contents[0], lambda stream: stream + b"\n0 0 0 rg 100 300 200 200 re f\n"
-    ).sealed()
+    painted = on_page(1, lambda stream: stream + b"\n0 0 0 rg 100 300 200 200 re f\n")
+    pdf = sealed(forged(flight.honest.pdf, painted))
     verdict = flight.honest.verified(pdf)
     graded = flight.graded(report_of(pdf), verdict, rubric)
     assert graded.status == "page differs"
@@ -415,8 +415,7 @@ def test_pages_that_were_painted_over(flight: Flight, honest: Graded, rubric: Ru
 
 @pytest.mark.parametrize("results", [b"{}", b"", b"[1]", b"not JSON"])
 def test_no_results_are_no_report(flight: Flight, rubric: Rubric, results: bytes) -> None:
-    anatomy = flight.honest.anatomy
-    pdf = anatomy.streamed(flight.honest.numbers.results, lambda _: results).sealed()
+    pdf = sealed(forged(flight.honest.pdf, with_results(results.decode())))
     report = read_report(pdf, "a.pdf")
     assert isinstance(report, Refused)
     graded = flight.graded(report, Verdict("cannot verify", (report.reason,), False), rubric)
@@ -448,7 +447,7 @@ PERFECT = {"closures": [{**LOOP["loop"]["closures"][0], "p": 0.9999, "d2": 1e-4}
 NO_END: dict[str, Any] = {
     "closures": [],
     "closure_error_m": ...,
-    "known_end": {"unavailable": {"what": "m", "reason": "r", "remedy": ""}},
+    "known_end": {"what": "m", "reason": "r", "remedy": ""},
 }
 
 

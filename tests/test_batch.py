@@ -391,7 +391,7 @@ def test_logs_are_found_in_folders_globs_and_urls(tmp_path, monkeypatch):
     # each once, however it is given; a file that is named may be called anything
     again = find_logs(["logs/*.ulg", str(tmp_path / "logs/b.ulg"), "logs/d[1].ulg", "named"])
     assert [log.name for log in again] == ["b.ulg", "d[1].ulg", "named"]
-    assert {log.bytes for log in again} == {5}
+    assert {log.size_bytes for log in again} == {5}
     memory = fsspec.filesystem("memory")
     memory.pipe("/fleet/x.ulg", tiny_log(3))
     (log,) = find_logs(["memory://fleet"])

@@ -140,5 +140,5 @@ def test_what_is_consistent_and_white_needs_no_words(comparison: Comparison) -> 
 
 
 def test_a_source_that_may_drift_is_said_to(comparison: Comparison) -> None:
-    turning = replace(comparison.source, orientation=comparison.flight.attitude)
+    turning = replace(comparison.source, origin=replace(comparison.source.origin, kind="vio"))
     assert "is not correct" in verdict_notes(replace(comparison, source=turning))[0]

@@ -47,7 +47,7 @@ def made(tmp_path_factory, sample_log) -> tuple[Path, Result]:
     notes.write_text(
         "# What I saw\n\nCosts $5 and $x^2$ or \\frac{1}{2}; **bold**, _under_, <b>tag</b>.\n"
         "- a bullet\n1. numbered\n" + "word" * 300 + "\n\nสวัสดี 你好 \N{GRINNING FACE}\n"
-        "line " * 1500,
+        "line " * 4000,
         encoding="utf-8",
     )
     result = run(
@@ -79,7 +79,7 @@ def test_awkward_text_reaches_the_pages_as_it_is(made):
     assert "Ana $x$ Müller" in pages[0]
     whole = "\n".join(pages)
     assert "Costs $5 and x² or \\frac{1}{2}; bold, under, tag." in whole
-    assert "continued" in whole, "long notes must run over several pages"
+    assert sum("line line line" in page for page in pages) > 1  # long notes run on
 
 
 def test_command_line_in_the_report_names_no_folder_and_no_person(made):

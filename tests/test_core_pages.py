@@ -116,7 +116,7 @@ def test_all_time_axes_of_the_core_are_one(eventful: Document) -> None:
 
 
 def test_rejected_innovations_are_hollow_and_fused_ones_filled(eventful: Document) -> None:
-    result = eventful.main
+    result = eventful.analysis.main
     axes = Figure().add_axes((0.1, 0.1, 0.8, 0.8))
     innovations.draw_innovations(axes, result, 10_000)
     hollow = [
@@ -140,7 +140,7 @@ def test_the_zoom_is_where_the_filter_is_updated() -> None:
 
 
 def test_sentences_are_made_of_the_numbers(eventful: Document) -> None:
-    result = eventful.main
+    result = eventful.analysis.main
     (page,) = drawn(flight.draw, eventful)
     assert f"{flight.inside_share(result):.0%} of our error lies in our own ±2σ" in words(page)
     steps = result.replay.steps

@@ -194,12 +194,12 @@ def test_what_px4_cannot_set_is_not_proposed(sample: Analysis, offset_s: float, 
 
 def rejecting(comparison: Comparison) -> Comparison:
     """The same, had EKF2's gate rejected every other sample."""
-    axes = []
-    for axis in comparison.axes.values():
+    axes = {}
+    for name, axis in comparison.axes.items():
         frame = axis.ekf2_innovations.copy()
         frame.iloc[::2, frame.columns.get_loc("rejected")] = 1.0
-        axes.append(replace(axis, ekf2_innovations=frame))
-    return replace(comparison, axes=tuple(axes))
+        axes[name] = replace(axis, ekf2_innovations=frame)
+    return replace(comparison, axes=axes)
 
 
 def test_rejections_are_ended_by_the_noise_that_the_data_ask_for(sample: Analysis) -> None:
@@ -211,7 +211,7 @@ def test_rejections_are_ended_by_the_noise_that_the_data_ask_for(sample: Analysi
     assert right.startswith("With what the data ask for (EKF2_EVP_NOISE to 0.098 m) the rejections")
     assert "Remove the outliers" in right
     assert "A wider EKF2_EVP_GATE is no remedy; at 10:" in right
-    silent = replace(sample, comparison=north, tuning={})
+    silent = replace(sample, axes=north.axes, tuning={})
     assert "does not tell its noise" in only(ekf2_rejecting, silent).remedy
 
 

@@ -355,7 +355,7 @@ def test_a_summary_joins_north_and_east() -> None:
     one = Summary({}, axis(1.0, 0.3), axis(3.0, 0.4), 9, 0.0, 0.1, 0)
     assert one.nis_mean == 2.0
     assert one.position_rmse_to_truth_m == pytest.approx(0.5)
-    lacking = replace(one, axes={"north": axis(1.0, 0.3), "east": axis(3.0, NONE)})
+    lacking = replace(one, east=axis(3.0, NONE))
     assert lacking.position_rmse_to_truth_m is NONE
 
 

@@ -17,7 +17,7 @@ from browser import Browser, Elements
 from click.testing import CliRunner, Result
 from exchange import replace
 from explore_tools import ask, show
-from flights import Imu, aisle_flight
+from flights import Imu, aisle_flight, unexplained
 
 from px4fuse.analysis import Analysis, run, run_comparison
 from px4fuse.cli import cli
@@ -38,7 +38,6 @@ from px4fuse.request import ComparisonRequest
 pytestmark = pytest.mark.usefixtures("analysed_once")
 
 MARKUP = '<img src=x onerror="window.alive=1"></script><script>window.alive=2</script>\u202e'
-NOTHING = Unavailable("it", "not asked for", "")
 TABLE = """Object.fromEntries([...document.querySelectorAll('#tables tbody tr')].map((row) =>
   [row.cells[0].textContent, [row.cells[1].textContent, row.cells[2].textContent]]))"""
 
@@ -64,7 +63,7 @@ def page(browser: Browser, made: tuple[Path, Analysis]) -> Iterator[Browser]:
 
 def bare(flight: Flight) -> Analysis:
     """Without what takes long and the page can do without."""
-    return Analysis(compare(flight), {}, NOTHING, NOTHING, {}, NOTHING, NOTHING)
+    return unexplained(compare(flight))
 
 
 def page_of(analysis: Analysis, file: Path) -> Path:

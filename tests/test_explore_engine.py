@@ -77,7 +77,7 @@ def in_browser(
 def in_python(comparison: Comparison, at: int, settings: Settings) -> Replay:
     """As ``compare`` would with the segment and the aisle held."""
     track = shift_clock(raw_source(comparison), settings.clock_offset_s)
-    held = comparison.axes[at].axis
+    held = list(comparison.axes.values())[at].axis
     axis = make_axes(
         comparison.flight, track, comparison.segment, names=(held.name,),
         heading_deg=held.heading_deg if held.name == "aisle" else None,

@@ -13,6 +13,7 @@ import pytest
 from click.testing import CliRunner, Result
 from exchange import replace
 from flights import Estimator, aisle_flight
+from msgspec import structs
 from test_cli import run_main
 from ulog_tools import Log, make_log, stamps, topic
 
@@ -66,7 +67,9 @@ def rich_flight() -> Flight:
 
 def assert_same_clock(table: pd.DataFrame, clock: ClockMap) -> None:
     row = {name: value for name, value in table.iloc[0].to_dict().items() if not pd.isna(value)}
-    assert row == {name: value for name, value in vars(clock).items() if value is not None}
+    assert row == {
+        name: value for name, value in structs.asdict(clock).items() if value is not None
+    }
 
 
 # ---- what was read is what is written ---------------------------------------------------------
@@ -329,7 +332,7 @@ def test_the_lesson_by_hand_is_what_compare_does(
         ]
     )
     time, position, velocity, gain = printed.T
-    (north,) = compare(sample_flight, Settings(), axes=("north",), start_s=0.0).axes
+    north = compare(sample_flight, Settings(), axes=("north",), start_s=0.0)["north"]
     # both settled, and off the ground
     inside = (time > 5.0) & (time < 125.0)
     ours = state_at(north.replay, time[inside])

@@ -13,6 +13,7 @@ import pandas as pd
 import pytest
 from exchange import replace
 from findings_tools import (
+    DRIFTING,
     NONE,
     analysis,
     at_rate,
@@ -353,7 +354,7 @@ def test_hidden_errors_are_told_of_the_worst_axis_first() -> None:
     alone = only(errors_larger_than_claimed, analysis(axes=(just,)))
     assert alone.message.startswith("Innovations consistent, errors not: ")
     assert alone.remedy == errors_larger_than_claimed.REMEDIES["ekf2"]
-    drifts = analysis(axes=(hiding(),), source=source(orientation=object()))
+    drifts = analysis(axes=(hiding(),), source=source(origin=DRIFTING))
     assert (
         only(errors_larger_than_claimed, drifts).remedy
         == (errors_larger_than_claimed.REMEDIES["drift"])
@@ -378,7 +379,7 @@ def test_what_a_turn_and_shift_of_the_frame_leaves(left: float, frame: bool, dri
              ekf2_state=pd.DataFrame({"position_m": own[:, at]}, index=time_own))
         for at, name in enumerate(("north", "east"))
     ]  # fmt: skip
-    moves = source(orientation=object() if drifts else None)
+    moves = source(origin=DRIFTING if drifts else RECEIVED)
     finding = only(errors_larger_than_claimed, analysis(axes=tuple(axes), source=moves))
     assert finding.evidence["position_rmse_horizontal_m"] == pytest.approx(1.0, rel=0.01)
     assert finding.evidence["position_rmse_aligned_m"] == pytest.approx(left, rel=0.01)

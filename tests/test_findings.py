@@ -127,7 +127,7 @@ def as_odometry(flight: Flight) -> Flight:
     turn = np.linspace(0.0, 0.5, len(track.samples))
     quaternions = np.column_stack([np.cos(turn), 0.0 * turn, 0.0 * turn, np.sin(turn)])
     orientation = pd.DataFrame(quaternions, index=track.samples.index, columns=QUATERNION_COLUMNS)
-    return with_source(orientation=orientation)(flight)
+    return with_source(orientation=orientation, origin=replace(track.origin, kind="vio"))(flight)
 
 
 def apart(flight: Flight, *, grows: bool) -> Flight:

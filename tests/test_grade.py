@@ -14,6 +14,7 @@ import pytest
 from class_tools import in_this_process
 from click.testing import CliRunner
 from conftest import REPOSITORY
+from forgery import forged, with_results
 from pypdf import PdfReader, PdfWriter
 
 from px4fuse.assignment.key import Answer, AnswerKey
@@ -91,18 +92,11 @@ def test_a_report_with_its_log_is_verified_and_a_changed_one_is_not(tmp_path) ->
     folder = tmp_path / "in"
     folder.mkdir()
     shutil.copy(REPORT, folder / "a.pdf")
-    changed = PdfWriter(clone_from=io.BytesIO(REPORT.read_bytes()))
-    (name,) = PdfReader(io.BytesIO(REPORT.read_bytes())).attachments
-    results = json.loads(PdfReader(io.BytesIO(REPORT.read_bytes())).attachments[name][0])
+    pdf = REPORT.read_bytes()
+    results = json.loads(PdfReader(io.BytesIO(pdf)).attachments["results.json"][0])
     results["axes"]["north"]["filters"]["kf"]["nis_mean"] = 1.0
-    changed._root_object.pop("/Names", None)
-    changed.add_attachment(name, json.dumps(results).encode())
-    with (folder / "b.pdf").open("wb") as file:
-        changed.write(file)
-    shorter = PdfWriter(clone_from=io.BytesIO(REPORT.read_bytes()))
-    shorter.remove_page(7)
-    with (folder / "c.pdf").open("wb") as file:
-        shorter.write(file)
+    (folder / "b.pdf").write_bytes(forged(pdf, with_results(json.dumps(results))))
+    (folder / "c.pdf").write_bytes(forged(pdf, lambda writer: writer.remove_page(7)))
     output = tmp_path / "class"
     outcome = grade([folder], [LOG.parent], read_rubric(None), output, processes=2)
     first, second, third = outcome.graded
@@ -216,11 +210,8 @@ def test_results_of_another_version_are_refused_whatever_they_hold(tmp_path) -> 
                "axes": 3, "findings": {"a": 1}}  # fmt: skip
     (tmp_path / "in").mkdir()
     for name, more in (("a", {}), ("b", {"student": {"name": {"x": 1}, "id": ["y"], "notes": 7}})):
-        made = PdfWriter(clone_from=io.BytesIO(pdf))
-        made._root_object.pop("/Names", None)
-        made.add_attachment("results.json", json.dumps(results | more).encode())
-        with (tmp_path / "in" / f"{name}.pdf").open("wb") as file:
-            made.write(file)
+        made = forged(pdf, with_results(json.dumps(results | more)))
+        (tmp_path / "in" / f"{name}.pdf").write_bytes(made)
     outcome = grade([tmp_path / "in"], [], read_rubric(None), tmp_path / "out", processes=1)
     for one in outcome.graded:
         assert (one.student, one.student_id, one.notes, one.version) == ("", "", "", "")

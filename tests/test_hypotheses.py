@@ -60,10 +60,7 @@ NAMED_HERE = {name for detector in DETECTORS for name in detector.phrases}
 def analysed(flight: Flight, **span: float) -> Analysis:
     """A flight with its noises, all that the detectors here need."""
     comparison = compare(flight, RIGHT, axes=("north", "east"), **span)
-    return Analysis(
-        comparison, tuned_horizontally(comparison), unavailable("clock offset"),
-        unavailable("EKF2 replay"), {}, unavailable("loop closure"), unavailable("heading error"),
-    )  # fmt: skip
+    return replace(unexplained(comparison), tuning=tuned_horizontally(comparison))
 
 
 @cache
@@ -85,7 +82,7 @@ def found(analysis: Analysis) -> dict[str, Finding]:
 
 def test_a_response_is_what_the_filter_itself_makes_of_a_signal() -> None:
     """Of a step of the measurements, against two replays with filterpy."""
-    (north, *_) = compare(aisle_flight(duration_s=30.0), RIGHT, axes=("north",)).axes
+    north = compare(aisle_flight(duration_s=30.0), RIGHT, axes=("north",))["north"]
     time = north.axis.measurement_time_s
     step = np.where(time >= 12.0, 0.7, 0.0)
     moved = replace(north.axis, measurement_m=north.axis.measurement_m + step)
@@ -242,7 +239,7 @@ def test_intervals_of_a_thinned_source_are_whole_multiples(intervals, named) -> 
     (track,) = flight().positions
     samples = track.samples.iloc[: len(time)].set_axis(pd.Index(time + 5.0, name="time_s"))
     other = replace(flown(), source=replace(track, samples=samples))
-    finding = list(source_thinned.DETECTOR.detect(replace(flown(), comparison=other)))
+    finding = list(source_thinned.DETECTOR.detect(other))
     assert bool(finding) is named
 
 
@@ -298,7 +295,12 @@ def without_variances(flight: Flight) -> Flight:
 
 def as_odometry(flight: Flight) -> Flight:
     (track,) = flight.positions
-    return replace(flight, positions=(replace(track, orientation=flight.attitude),))
+    return replace(
+        flight,
+        positions=(
+            replace(track, origin=replace(track.origin, kind="vio"), orientation=flight.attitude),
+        ),
+    )
 
 
 @pytest.mark.parametrize(

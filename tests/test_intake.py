@@ -461,7 +461,7 @@ def test_too_many_objects():
 
 GRAPH = json.dumps(
     {
-        "schema": {"name": "px4fuse-graph", "version": "2.0"},
+        "schema": {"name": "px4fuse-graph", "version": "3.0"},
         "graph": {
             "name": "g.g2o", "dimension": 2, "poses": 3, "edges": 2, "initialised": "from the file",
             "gates": [], "solutions": {},

@@ -631,7 +631,7 @@ def kalman_rmse(tlog: Flight, ulog: Flight, ulog_settings: Settings) -> list[flo
     ]  # fmt: skip
     times = np.arange(low + 1.0, high - 1.0, 0.05)
     found = []
-    for one, other in zip(runs[0].axes, runs[1].axes, strict=True):
+    for one, other in zip(runs[0].axes.values(), runs[1].axes.values(), strict=True):
         first, _ = state_at(one.replay, times - tlog.log.boot_time_s)
         second, _ = state_at(other.replay, times - ulog.log.boot_time_s)
         assert np.isfinite(first - second).mean() > 0.99

@@ -14,6 +14,7 @@ import pytest
 from exchange import replace
 from findings_tools import (
     CHOSEN,
+    DRIFTING,
     NONE,
     analysis,
     log,
@@ -47,7 +48,7 @@ from px4fuse.plain import factor_words
 
 MOVING = source(samples=positions(np.arange(0.0, 120.0), np.arange(120.0)))
 HOVERING = source(samples=positions(np.arange(0.0, 120.0)))
-ODOMETRY = source(samples=MOVING.samples, orientation=object())
+ODOMETRY = source(samples=MOVING.samples, origin=DRIFTING)
 RIGHT = Noise(1.0, 0.9, 1.1)
 SLOW = {"verdict": "variance understated", "lag1_autocorrelation": 0.31}
 

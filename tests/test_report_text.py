@@ -228,13 +228,13 @@ def offset(**changes: Any) -> ClockOffset:
 
 
 def with_clock(found: ClockOffset | Unavailable, applied_s: float, delay_ms: float) -> Document:
-    comparison = SimpleNamespace(
+    analysis = SimpleNamespace(
+        clock=found,
         settings=SimpleNamespace(clock_offset_s=applied_s),
         flight=SimpleNamespace(
             log=SimpleNamespace(name="x.ulg", parameters={"EKF2_EV_DELAY": delay_ms})
         ),
     )
-    analysis = SimpleNamespace(clock=found, comparison=comparison)
     return Document(analysis, (), Student(), "")  # type: ignore[arg-type]
 
 

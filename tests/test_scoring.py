@@ -32,7 +32,7 @@ VERIFIED = Verdict("verified", ("all 900 numbers agree",), with_log=True)
 SHA = SHA256
 WORDS = read_rubric(None).words
 GAP = finding("source_gap")
-NONE = {"unavailable": {"what": "it", "reason": "too few of them", "remedy": ""}}
+NONE = {"what": "it", "reason": "too few of them", "remedy": ""}
 
 
 def report(results=EXAMPLE, pages=PAGES):
@@ -167,8 +167,7 @@ class TestTuning:
 
     def test_a_bound_and_nothing(self):
         where = "tuning__horizontal__sigma_z_m"
-        bound = {where: ..., f"{where}_interval": ..., f"{where}_upper_bound": 0.2}
-        results = changed(**bound)
+        results = changed(**{where: ..., f"{where}_interval": [0.0, 0.2]})
         assert checked("tuning", results, settings=["sigma_z_m"])[0] == 1.0
         points, comment = checked("tuning", changed(tuning__horizontal=NONE))
         assert points == 0.0
@@ -203,17 +202,16 @@ class TestNumber:
 
     @pytest.mark.parametrize("path", [PATH, "log", "log.name", "log.dropouts", "nothing"])
     def test_what_is_no_number_gives_nothing(self, path):
-        results = changed(axes__north__filters__kf__truth__position_rmse_m=...)
+        results = changed(axes__north__filters__kf__truth=NONE)
         points, comment = checked("number", results, path=path, at_most=1.0)
         assert points == 0.0
         assert "has no number for" in comment
 
     def test_why_there_is_no_number(self):
-        results = changed(axes__north__filters__kf=NONE)
-        comment = checked("number", results, path="axes.north.filters.kf.nis_mean", at_most=1.0)[1]
-        assert comment == (
-            "Your report has no number for axes.north.filters.kf.nis_mean (too few of them)."
-        )
+        path = "axes.north.filters.kf.truth.position_rmse_m"
+        results = changed(axes__north__filters__kf__truth=NONE)
+        comment = checked("number", results, path=path, at_most=1.0)[1]
+        assert comment == f"Your report has no number for {path} (too few of them)."
 
 
 class TestConsistent:

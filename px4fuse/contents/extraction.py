@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from msgspec import structs
 
 from px4fuse.filter.signals import ned_acceleration
 from px4fuse.flight import (
@@ -244,7 +245,7 @@ def _tables(flight: Flight) -> Iterator[_Table]:
         values = pd.DataFrame(list(flight.log.parameters.items()), columns=["name", "value"])
         yield _Table("parameters", _PARAMETERS, values)
     if flight.clocks:
-        mapped = pd.DataFrame([vars(clock) for clock in flight.clocks])
+        mapped = pd.DataFrame([structs.asdict(clock) for clock in flight.clocks])
         mapped = mapped.astype({"distinct_stamps": np.float64})  # NaN where they do tell it
         yield _Table("clocks", _CLOCKS, mapped)
 
