@@ -46,8 +46,10 @@ def made(tmp_path_factory, sample_log) -> tuple[Path, Result]:
     notes = folder / "notes.md"
     notes.write_text(
         "# What I saw\n\nCosts $5 and $x^2$ or \\frac{1}{2}; **bold**, _under_, <b>tag</b>.\n"
-        "- a bullet\n1. numbered\n" + "word" * 300 + "\n\nสวัสดี 你好 \N{GRINNING FACE}\n"
-        "line " * 4000,
+        "- a bullet\n1. numbered\n"
+        + "word" * 300
+        + "\n\nสวัสดี 你好 \N{GRINNING FACE}\n"
+        + "line " * 4000,
         encoding="utf-8",
     )
     result = run(
