@@ -55,7 +55,7 @@ def blank(width: float, height: float) -> bytes:
 def test_a_report_s_cover_is_small_and_readable() -> None:
     made = picture(REPORT.read_bytes(), 0)
     image = opened(made)
-    assert image.size == (700, 990)
+    assert image.size == (701, 991)
     colours = image.convert("RGB").getcolors(256)
     assert colours is not None
     assert max(colours)[1] == (255, 255, 255)
@@ -167,7 +167,7 @@ def test_every_page_of_a_report_is_drawn() -> None:
     made = page_pictures(REPORT.read_bytes())
     assert not isinstance(made, Unavailable)
     assert len(made) == len(PdfReader(REPORT).pages)
-    assert {opened(one).size for one in made} == {(700, 990)}
+    assert {opened(one).size for one in made} == {(701, 991)}
     assert made[0] == picture(REPORT.read_bytes(), 0)
 
 
