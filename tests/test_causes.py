@@ -5,18 +5,15 @@ from __future__ import annotations
 import pytest
 from exchange import replace
 from flights import Estimator, aisle_flight, unexplained
-from results_tools import changed, decoded, finding
-from test_scoring import checked
 
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.model import Comparison
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.tuning import Noise
-from px4fuse.findings import Finding, find, phrases
+from px4fuse.findings import Finding, find, names
 from px4fuse.findings.causes import CONSEQUENCES, NOISES, RECORDING, by_cause
 from px4fuse.findings.sigma import _off
 from px4fuse.flight import Flight
-from px4fuse.grading.flags import own_flags
 from px4fuse.report.words import verdict_notes
 
 
@@ -26,7 +23,7 @@ def one(name: str, severity: str = "warning", **evidence: str) -> Finding:
 
 def test_the_table_knows_only_findings_that_there_are() -> None:
     listed = {name.split(":")[0] for names in CONSEQUENCES.values() for name in names}
-    assert listed | set(CONSEQUENCES) | NOISES | RECORDING <= set(phrases())
+    assert listed | set(CONSEQUENCES) | NOISES | RECORDING <= set(names())
 
 
 def test_what_a_cause_brings_with_it_is_told_inside_it() -> None:
@@ -95,28 +92,6 @@ def test_ekf2s_untouched_noise_is_advice(noise_m: float, severity: str) -> None:
     (found,) = find(unexplained(compare(flight)))
     assert found.ids == ("ekf2_variance_overstated", "ekf2_variance_overstated")
     assert found.severity == severity
-
-
-def test_notes_that_name_a_consequence_take_up_its_cause() -> None:
-    cause = finding("sigma_z_large") | {"consequences": [finding("kf_variance_overstated")]}
-    results = changed(findings=[cause], student__notes="Our variance was overstated.")
-    assert checked("findings", results)[0] == 1.0
-    silent = changed(findings=[cause], student__notes="All is well.")
-    assert checked("findings", silent)[0] == 0.0
-
-
-def test_distrusting_a_source_that_may_drift_costs_no_points() -> None:
-    """The data of the example ask for 0.0966 m."""
-    above = {"settings__sigma_z_m": 0.3, "axes__north__filters__kf__verdict": "variance overstated"}
-    drift = changed(**above, findings=[finding("source_may_drift", "info")])
-    asked = {"settings": ["sigma_z_m"]}
-    assert checked("tuning", drift, **asked)[0] == 1.0
-    assert checked("tuning", changed(**above, findings=[]), **asked)[0] == 0.0
-    far = {"axes__north__filters__kf__nis_mean": 1.0 / 9.0}
-    for listed, share in (([finding("source_may_drift", "info")], 1.0), ([], 0.0)):
-        results = changed(**above, **far, findings=listed)
-        assert checked("consistent", results, axes=["north"])[0] == share
-    assert own_flags(decoded(drift)) == ()
 
 
 @pytest.fixture(scope="module")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import csv
 import hashlib
 import io
 import json
@@ -19,6 +20,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pypdf import PdfReader
 
+from px4fuse.answers import Answers, Claim
 from px4fuse.grading.anonymous import NAME
 from px4fuse.grading.class_page import STATUSES, html_text
 from px4fuse.grading.model import Entry, Graded, Item, Override
@@ -72,6 +74,9 @@ def row(name: str, points: float | None, **more: Any) -> Entry:
     return Entry(name, one.student_id, one, of=one.of, **own)
 
 
+FORM = Answers(
+    log_sha256="a" * 64, mistakes=(Claim(MARKUP, 1.0, BREAKOUT, panel=MARKUP, parameter=BREAKOUT),)
+)
 CLASS = (
     row("Zoë", 18.5, id="1007", numbers={"mean NIS": 1.02}, sheets=("pages/z 1.png", "pages/2.png"),
         mistakes={"positions that jump": True}),
@@ -82,9 +87,9 @@ CLASS = (
     row("", None, file="broken.pdf", status="cannot verify", reasons=("Not a PDF.",)),
     row(MARKUP, 5.0, id=FORMULA, file=BREAKOUT, flags=(MARKUP,), handed_in=b"<svg onload=x>",
         notes=BREAKOUT, reasons=(BREAKOUT,), numbers={MARKUP: 1.0}, pending=MARKUP,
-        to_read=((MARKUP, BREAKOUT),), mistakes={MARKUP: False}, remarks=(MARKUP,),
+        form=FORM, mistakes={MARKUP: False}, remarks=(MARKUP,),
         sheets=("//example.org/x.png",), redrawn_name="javascript:alert(1)", comment=BREAKOUT,
-        items=(Item(BREAKOUT, 5.0, 20.0, MARKUP),), handed_in_at=MARKUP,
+        items=(Item(BREAKOUT, 5.0, 20.0, MARKUP, by_hand=True, waits=True),), handed_in_at=MARKUP,
         overrides={BREAKOUT: Override(None, MARKUP)}),
     row(REVERSED, 8.0, id="5"),
     row(LONG, 7.0, id="6"),
@@ -131,7 +136,7 @@ def test_text_makes_no_elements(text: str) -> None:
             word, 5.0, id=word, file=f"{word}.pdf", flags=(word,), reasons=(word,),
             notes=f"So: {word}",
             numbers={word: 1.0}, items=(Item(word, 5.0, 20.0, word),), mistakes={word: False},
-            pending=word, to_read=((word, word),), comment=word, pseudonym="",
+            pending=word, form=FORM, comment=word, pseudonym="",
         )  # fmt: skip
         return html_text([one], word, word)
 
@@ -176,20 +181,16 @@ def test_pending_points_stand_apart_from_those_that_count() -> None:
 SHARED = " ".join(f"word{n}" for n in range(60))
 
 
-def test_notes_that_are_alike_stand_side_by_side() -> None:
+def test_texts_that_are_alike_stand_below_each_other() -> None:
     entries = [
         row("Ada", 9.0, id="1", notes=f"I begin here. {SHARED} and I end."),
         row("Bo", 9.0, id="2", notes=f"Another start: {SHARED.upper()}."),
         row("Cy", 9.0, id="3", notes=" ".join(f"own{n}" for n in range(60))),
     ]
     made = content(html_text(entries, "Class", "px4fuse 1"))["rows"]
-    (found,) = [part for part in made[0][2] if part[0] == "sides"]
-    assert re.fullmatch(r"Notes shared with Bo: \d\d%", found[1])
-    assert found[2][0] == [
-        ["Ada", False], ["I begin here. ", False], [SHARED, True], [" and I end.", False],
-    ]  # fmt: skip
-    assert found[2][1][2] == [SHARED.upper(), True]
-    assert not [part for part in made[2][2] if part[0] == "sides"]
+    shown = [[part[1] for part in one[2]] for one in made]
+    assert any(re.fullmatch(r"Text of Bo, which shares \d+%", title) for title in shown[0])
+    assert not any(title.startswith("Text of") for title in shown[2])
 
 
 def test_reading_time_is_of_words_and_pages() -> None:
@@ -216,7 +217,7 @@ def anonymous_class() -> list[Entry]:
         said = f"Your report names {name}, {student_id}. {SAYS}"
         entry = row(
             name, 9.0, id=student_id, file=file, flags=(flag,), reasons=(said,), pending=said,
-            notes=f"{name} ({student_id}): {SHARED} {SAYS} 王小明", to_read=((said, SAYS),),
+            notes=f"{name} ({student_id}): {SHARED} {SAYS} 王小明", form=FORM,
             numbers={f"NIS of {name}": 1.0}, items=(Item(f"For {name}", 9.0, 20.0, said),),
             mistakes={"positions that jump": False}, comment=said, remarks=(said,),
             overrides={f"For {name}": Override(10.0, said)},
@@ -515,3 +516,21 @@ def test_differences_are_listed(browser: Browser, tmp_path: Path) -> None:
     assert "axes.49" in text
     assert "and 10 more" in text
     assert "axes.50" not in text
+
+
+def test_points_and_words_of_the_instructor_are_downloaded_as_a_table(page: Browser) -> None:
+    page.ask("URL.createObjectURL = (one) => { window.table = one.text(); return '#'; }; 0")
+    assert not page.ask("document.querySelector('#save').checkVisibility()")
+    page.ask("document.querySelector('.list > tbody > tr .unfold').click()")
+    page.ask(
+        "(() => { const [points] = document.querySelectorAll('.boxes input');"
+        " const [words] = document.querySelectorAll('.boxes textarea');"
+        " points.value = '7.5'; words.value = '=1+1, \"well\"';"
+        " words.dispatchEvent(new Event('input')); })()"
+    )
+    page.click("#save")
+    made = str(page.ask_later("window.table"))
+    rows = list(csv.reader(io.StringIO(made.removeprefix("\ufeff"))))
+    assert rows[0] == ["id", "item", "points", "comment"]
+    assert ["1007", "total", "7.5", '\'=1+1, "well"'] in rows
+    assert ["'" + FORMULA, BREAKOUT, "", MARKUP] in rows  # what was said before stays

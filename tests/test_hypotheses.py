@@ -54,7 +54,7 @@ DETECTORS = [
         source_variance_wrong,
     )
 ]
-NAMED_HERE = {name for detector in DETECTORS for name in detector.phrases}
+NAMED_HERE = {name for detector in DETECTORS for name in detector.names}
 
 
 def analysed(flight: Flight, **span: float) -> Analysis:

@@ -32,7 +32,7 @@ DETECTORS = [
 ]
 RIGHT = Settings(sigma_a_m_s2=0.27, sigma_z_m=0.10)
 SEED = 3
-NAMED_HERE = {name for detector in DETECTORS for name in detector.phrases}
+NAMED_HERE = {name for detector in DETECTORS for name in detector.names}
 
 
 @cache

@@ -184,7 +184,7 @@ def test_long_notes_run_over_pages_and_lose_nothing() -> None:
     student = Student("", "", " ".join(words) + "\n\n" + table)
     sheets = set_by_typst(*notes.draw(document(student)))
     assert len(sheets) > 2
-    assert sheets[0].strip().startswith("Appendix: notes by the student")
+    assert sheets[0].strip().startswith("Appendix: what the student found")
     text = " ".join(sheets).split()
     assert [word for word in text if word.startswith("word")] == words
     assert sum(word == "cell" for word in text) == 1200

@@ -1,17 +1,15 @@
 """The rubric: the one that ships, and those that an instructor spoils."""
 
-import re
 import tomllib
 
 import pytest
 
 from px4fuse.errors import SettingsError
-from px4fuse.findings import names, phrases
 from px4fuse.grading.rubric import parse_rubric, read_rubric, rubric_text
-from px4fuse.grading.scoring import CHECKS
+from px4fuse.grading.scoring import CHECKS, NEED_KEY
 
 ITEM = '[[item]]\ntitle = "T"\npoints = 5\n'
-NOTES = ITEM + 'check = "notes"\n'
+NOTES = ITEM + 'check = "flight"\n'
 NUMBER = ITEM + 'check = "number"\npath = "a.b"\n'
 
 
@@ -25,10 +23,11 @@ def test_default_uses_and_explains_every_check_and_parameter():
 
 
 @pytest.mark.parametrize("kind", ["compare", "loop"])
-def test_items_of_the_default_add_up_to_100(kind):
-    items = read_rubric(None).items
-    points = [i.points for i in items if i.report in ("any", kind) and i.check != "mistakes"]
-    assert sum(points) == 100
+def test_items_of_the_default_add_up_to_65_and_120_with_a_key(kind):
+    items = [one for one in read_rubric(None).items if one.report in ("any", kind)]
+    with_key = {one.check: one.points for one in items if one.check in NEED_KEY}
+    assert with_key == {"answers": 100.0, "text": 20.0}
+    assert sum(one.points for one in items) == 65 + 120
 
 
 def test_copy_of_the_default_is_the_default(tmp_path):
@@ -37,27 +36,9 @@ def test_copy_of_the_default_is_the_default(tmp_path):
     assert read_rubric(path) == read_rubric(None)
 
 
-def test_every_finding_can_be_named_and_renamed():
-    """The rubric to copy lists the phrases of each finding, ready to be changed."""
-    listed = re.sub(r'(?m)^# (\w+ = \["?.*\])$', r"\1", rubric_text())
-    words = read_rubric(None).words
-    others = {"none", "negation", "doubt", "reassurance", "contrast", "closure_accepted", "topic"}
-    assert parse_rubric(listed, "x").words == words
-    assert words == phrases() | {name: words[name] for name in others}
-    assert set(names()) >= set(phrases())
-
-
-def test_words_of_the_default_stay_unless_replaced(tmp_path):
-    path = tmp_path / "rubric.toml"
-    path.write_text(NOTES + '[words]\nsource_gap = ["Lücke"]\n', encoding="utf-8")
-    words = read_rubric(path).words
-    assert words["source_gap"] == ("Lücke",)
-    assert words["source_outliers"] == read_rubric(None).words["source_outliers"]
-
-
 def test_parameters_left_out_have_their_defaults():
     (item,) = parse_rubric(NOTES, "x").items
-    assert item.parameters == {"min_words": 150, "min_different": 60}
+    assert item.parameters["min_measurements"] == 100
     assert item.report == "any"
 
 
@@ -79,10 +60,10 @@ BAD = {
     "unknown key": ("colour = 1\n" + NOTES, "unknown key 'colour'"),
     "unknown check": (ITEM + 'check = "beauty"', "check cannot be 'beauty'"),
     "no check": (ITEM, "no 'check'"),
-    "no title": ('[[item]]\npoints = 1\ncheck = "notes"', "no 'title'"),
+    "no title": ('[[item]]\npoints = 1\ncheck = "text"', "no 'title'"),
     "empty title": (NOTES.replace('"T"', '" "'), "title is empty"),
     "title of two lines": (NOTES.replace('"T"', '"a\\nb"'), "title cannot be"),
-    "no points": ('[[item]]\ntitle = "T"\ncheck = "notes"', "no 'points'"),
+    "no points": ('[[item]]\ntitle = "T"\ncheck = "text"', "no 'points'"),
     "negative points": (NOTES.replace("5", "-5"), "points cannot be -5"),
     "points are text": (NOTES.replace("5", '"5"'), "points cannot be '5'"),
     "points are true": (NOTES.replace("5", "true"), "points cannot be True"),
@@ -90,7 +71,10 @@ BAD = {
     "points are a date": (NOTES.replace("5", "2026-01-01"), "points cannot be what it is"),
     "huge points": (NOTES.replace("5", "9" * 400), "points cannot be"),
     "unknown parameter": (NOTES + "min_letters = 3", "unknown key 'min_letters'"),
-    "wrong type": (NOTES + "min_words = 1.5", "min_words cannot be 1.5; give a whole number"),
+    "wrong type": (
+        NOTES + "min_measurements = 1.5",
+        "min_measurements cannot be 1.5; give a whole number",
+    ),
     "unknown report": (NOTES + 'report = "tune"', "report cannot be 'tune'"),
     "unknown setting": (ITEM + 'check = "tuning"\nsettings = ["dt_s"]', "a list of sigma_z_m"),
     "number without bound": (NUMBER, "no bound"),
@@ -101,11 +85,8 @@ BAD = {
     "nothing required": (ITEM + 'check = "sections"', "nothing is required"),
     "two alike": (NOTES + NOTES, "items 1 and 2 have the same title"),
     "too many": (NOTES * 101, "at most 100"),
-    "words are text": ('words = "x"\n' + NOTES, "[words]"),
-    "words hold numbers": (NOTES + "[words]\nsource_gap = [1]", "[words]: source_gap"),
-    "notes is a number": ("notes = 1\n" + NOTES, "[notes] is not a table"),
-    "unknown rule for notes": (NOTES + "[notes]\nbeauty = 1", "[notes]: unknown key 'beauty'"),
-    "rule for notes is text": (NOTES + '[notes]\npacked = "x"', "packed cannot be 'x'"),
+    "words are text": ("common_words = [1]\n" + NOTES, "common_words cannot be"),
+    "words asked for": ('min_words = "x"\n' + NOTES, "min_words cannot be 'x'"),
     "others' log": ('others_log = "maybe"\n' + NOTES, "others_log cannot be 'maybe'"),
     "pages": ('pages = "maybe"\n' + NOTES, "pages cannot be 'maybe'"),
     "unverified": ('unverified = "maybe"\n' + NOTES, "unverified cannot be 'maybe'"),

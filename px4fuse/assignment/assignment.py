@@ -9,9 +9,11 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from px4fuse.answers import form_name, form_text
 from px4fuse.assignment.drawing import Drawn, Kinds, draw, most_mistakes
-from px4fuse.assignment.key import SCHEMA_VERSION, Answer, AnswerKey, folded, key_text, read_key
+from px4fuse.assignment.key import Answer, AnswerKey, folded, key_text, read_key
 from px4fuse.assignment.roster import Student
+from px4fuse.assignment.truth import truth_of
 from px4fuse.errors import OutputError, SettingsError
 from px4fuse.plain import plain
 from px4fuse.simulation import flights
@@ -48,6 +50,7 @@ def answer_to(
         findings=drawn.findings,
         truth={name: float(known[name]) for name in TRUTH},
         difficulty=drawn.difficulty,
+        form=truth_of(simulation, sha256),
     )
 
 
@@ -93,7 +96,7 @@ def assign(
     truth: bool = True,
     step: Callable[[int, int], None] = lambda done, of: None,
 ) -> Assigned:
-    """Write everyone's log into a folder, and the answer key.
+    """Write everyone's log and form into a folder, and the answer key.
 
     All logs are made before the first is put in its place, so that a run that fails leaves the
     folder as it was. What is there already is never replaced: a log must be the same to the byte,
@@ -134,10 +137,12 @@ def assign(
             for done, student in enumerate(students, start=1):
                 log, answer = fly(secret, student, kind, count, truth)
                 answers.append(answer)
-                target = folder / student.file
-                if not _there(target, log):
-                    staged[target] = Path(staging) / student.file
-                    staged[target].write_bytes(log)
+                form = form_text(student.file, answer.sha256).encode()
+                for name, content in ((student.file, log), (form_name(student.file), form)):
+                    target = folder / name
+                    if not _there(target, content):
+                        staged[target] = Path(staging) / name
+                        staged[target].write_bytes(content)
                 step(done, len(students))
             key = AnswerKey(kind, tuple(answers), made_up)
             _check_extends(key_file, before, key)
@@ -150,7 +155,8 @@ def assign(
     finally:
         if not known and folder.is_dir() and not any(folder.iterdir()):
             folder.rmdir()
-    return Assigned(key, len(staged), len(students) - len(staged))
+    written = sum(target.suffix == ".ulg" for target in staged)
+    return Assigned(key, written, len(students) - written)
 
 
 def preview(
@@ -191,13 +197,7 @@ def _check_count(kind: Kinds, count: int | None) -> None:
 
 def _key_before(key_file: Path) -> AnswerKey | None:
     """The key that is there already, to which students may be added."""
-    before = read_key(key_file) if key_file.exists() else None
-    if before is not None and before.version != SCHEMA_VERSION:
-        raise OutputError(
-            f"{key_file}: was made by an earlier px4fuse, which draws other flights. Grade with it "
-            "as it is, and give another folder with -o for new flights."
-        )
-    return before
+    return read_key(key_file) if key_file.exists() else None
 
 
 def _there(target: Path, log: bytes) -> bool:

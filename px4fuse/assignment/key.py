@@ -10,13 +10,12 @@ from typing import Annotated, NoReturn
 import msgspec
 from msgspec import Meta
 
+from px4fuse.assignment.truth import FormTruth
 from px4fuse.errors import SettingsError
 from px4fuse.reading import read_text
 
 SCHEMA_NAME = "px4fuse-assignment"
-SCHEMA_VERSION = 2
-# Version 1 had no difficulty, and its flights are drawn by earlier px4fuse only
-READ_VERSIONS = (1, SCHEMA_VERSION)
+SCHEMA_VERSION = 3
 # A thousand students take two million
 MAX_KEY_BYTES = 20_000_000
 MAX_STUDENTS = 1000
@@ -50,7 +49,9 @@ class Answer(msgspec.Struct, frozen=True, rename={"student_id": "id"}):
         Numbers that the log does not say: ``sigma_z_m``, ``sigma_a_m_s2`` and
         ``clock_offset_to_add_s`` among them.
     difficulty : float or None
-        See :class:`px4fuse.assignment.drawing.Drawn`; None in keys of version 1.
+        See :class:`px4fuse.assignment.drawing.Drawn`.
+    form : FormTruth or None
+        The right answers to the form.
     """
 
     student_id: Annotated[str, Meta(max_length=1000, pattern=r"\S")]
@@ -62,6 +63,7 @@ class Answer(msgspec.Struct, frozen=True, rename={"student_id": "id"}):
     findings: _Texts = ()
     truth: dict[str, _Number] = {}
     difficulty: _Number | None = None
+    form: FormTruth | None = None
 
 
 @dataclass(frozen=True)
@@ -74,14 +76,11 @@ class AnswerKey:
         Of the flights.
     secret : str
         From which the flights were drawn, where it was made up; else "".
-    version : int
-        Of the schema it was read from.
     """
 
     kind: str
     answers: tuple[Answer, ...]
     secret: str = field(default="", repr=False)
-    version: int = SCHEMA_VERSION
 
     def of_student(self, student_id: str) -> Answer | None:
         """The answer for an id, however it is capitalised.
@@ -146,7 +145,7 @@ def read_key(path: Path) -> AnswerKey:
         schema = msgspec.json.decode(text, type=_Headed).schema
         if schema.name != SCHEMA_NAME:
             _refuse(path, "not an answer key")
-        if schema.version not in READ_VERSIONS:
+        if schema.version != SCHEMA_VERSION:
             _refuse(path, "of a version that this px4fuse does not read")
         file = msgspec.json.decode(text, type=_File)
     except (msgspec.MsgspecError, RecursionError) as error:
@@ -156,7 +155,7 @@ def read_key(path: Path) -> AnswerKey:
         other = seen.setdefault(folded(answer.student_id), number)
         if other != number:
             _refuse(path, f"students {other} and {number} have the same id")
-    return AnswerKey(file.kind, file.students, file.secret, schema.version)
+    return AnswerKey(file.kind, file.students, file.secret)
 
 
 def _refuse(path: Path, why: str) -> NoReturn:

@@ -21,6 +21,7 @@ COMMANDS = {
     "compare": ("px4fuse.cli.compare", "Compare a flight's EKF2 with a two-state Kalman filter."),
     "batch": ("px4fuse.cli.batch", "Compare many logs, on this computer or a cluster."),
     "diff": ("px4fuse.cli.diff", "Say what changed between two flights or two settings."),
+    "answers": ("px4fuse.cli.answers", "Write the form about a flight, to be filled in."),
     "explore": ("px4fuse.cli.explore", "Turn the filter's knobs on a flight, in a web page."),
     "info": ("px4fuse.cli.info", "Say what is in a log and what can be done with it."),
     "extract": ("px4fuse.cli.extract", "Write a log's data as tidy tables, CSV or Parquet."),

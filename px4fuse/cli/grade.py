@@ -54,6 +54,11 @@ if TYPE_CHECKING:
     metavar="RULE",
     help="What being late costs: '10%/day' or '10%/day up to 50%' of all points, per started day.",
 )
+@click.option(
+    "--include-pending",
+    is_flag=True,
+    help="Enter points that still wait for you as they are proposed.",
+)
 @path_option(
     "--worksheet",
     multiple=True,
@@ -91,6 +96,7 @@ def grade(
     attempt: Literal["latest", "best", "first"],
     due: str | None,
     late: str | None,
+    include_pending: bool,
     worksheet: tuple[Path, ...],
     column: str | None,
     anonymous: bool,
@@ -154,7 +160,7 @@ def grade(
         None if roster is None else people_of_sheet(read_sheet(roster)),
         tuple(map(read_sheet, worksheet)),
         column or "",
-        Term(attempt, due_time(due) if due else None, rule),
+        Term(attempt, due_time(due) if due else None, rule, None, include_pending),
         anonymous,
     )
     try:

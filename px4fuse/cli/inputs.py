@@ -190,6 +190,11 @@ person_options = _together(
     click.option("--student", metavar="NAME", help="Name on the report."),
     click.option("--id", "student_id", metavar="ID", help="Student number on the report."),
     path_option("--notes", metavar="FILE.md", help="Your own words, printed in the report."),
+    path_option(
+        "--answers",
+        metavar="FILE.toml",
+        help="The form about the flight, filled in (see px4fuse answers), printed in the report.",
+    ),
 )
 #: Of commands whose results stand beside a report
 results_option = path_option(
@@ -258,12 +263,17 @@ def read_person(given: dict[str, Any]) -> Student:
     Raises
     ------
     SettingsError
-        The notes cannot be read.
+        The notes or the answers cannot be read.
     """
+    from msgspec import UNSET
+
+    from px4fuse.answers import read_answers
     from px4fuse.results.model import Student
 
     name, number = given.pop("student") or "", given.pop("student_id") or ""
-    person = Student(encodable(name), encodable(number), _read_notes(given.pop("notes")))
+    notes, form = _read_notes(given.pop("notes")), given.pop("answers")
+    answers = UNSET if form is None else read_answers(form)
+    person = Student(encodable(name), encodable(number), notes, answers)
     _tell_fonts(person.name + person.id + person.notes)
     return person
 

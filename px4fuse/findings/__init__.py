@@ -1,8 +1,7 @@
 """The mistakes that px4fuse names: a file each, with all that is said about it.
 
 A file declares ids, thresholds with unit and source, the detector (condition, words, remedy), what
-the finding is called and the phrases by which notes name it, and the flights on which its rate is
-measured. A detector never prints and never guesses: what it cannot see it does not mention.
+the finding is called, and the flights on which its rate is measured. A detector never prints and never guesses: what it cannot see it does not mention.
 
 To add a finding: its file, its name below, its place in ``causes.py`` if it follows from another or
 brings others with it, its rows of ``tests/studies/rates.csv``.
@@ -72,7 +71,6 @@ __all__ = [
     "find_loop",
     "named",
     "names",
-    "phrases",
 ]
 
 
@@ -90,15 +88,6 @@ def find(subject: Analysis | Comparison) -> tuple[Finding, ...]:
 def find_loop(loop: Loop) -> tuple[Finding, ...]:
     """All findings about a loop, most severe first."""
     return _find(LOOP_DETECTORS, loop)
-
-
-def phrases() -> dict[str, tuple[str, ...]]:
-    """By which phrases notes name each finding, besides its id: see :class:`Detector`."""
-    return {
-        name: tuple(listed.split(", ")) if listed else ()
-        for detector in DETECTORS
-        for name, listed in detector.phrases.items()
-    }
 
 
 @cache
@@ -127,7 +116,7 @@ def _in_flight(detector: Detector[Loop]) -> Detector[Analysis]:
         if isinstance(analysis.loop, Loop):
             yield from detector.detect(analysis.loop)
 
-    return Detector(detect, detector.phrases, detector.measured_on, names=detector.names)
+    return Detector(detect, detector.measured_on, names=detector.names)
 
 
 # Within one severity, in the order in which a report tells them (exceptions in causes.py)

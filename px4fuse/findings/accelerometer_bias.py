@@ -74,7 +74,6 @@ def _detect(analysis: Analysis) -> Found:
 
 DETECTOR = Detector(
     _detect,
-    {"accelerometer_bias": "acceler bias, imu bias, acceler offset, calibrate acceler"},
     {"accelerometer_bias": tuple(f"--mistake accel-bias={size}" for size in (0.25, 0.4, 0.5))},
     names={"accelerometer_bias": "a bias of the accelerometer"},
 )

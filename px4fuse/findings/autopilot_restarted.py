@@ -19,6 +19,5 @@ def _detect(analysis: Analysis) -> Found:
 
 DETECTOR = Detector(
     _detect,
-    {"autopilot_restarted": ""},
     names={"autopilot_restarted": "a restart of the autopilot"},
 )

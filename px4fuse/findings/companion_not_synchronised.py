@@ -33,6 +33,5 @@ def _detect(analysis: Analysis) -> Found:
 
 DETECTOR = Detector(
     _detect,
-    {"companion_not_synchronised": ""},
     names={"companion_not_synchronised": "a companion computer without time synchronisation"},
 )

@@ -64,10 +64,6 @@ def _detect(analysis: Analysis) -> Found:
 
 DETECTOR = Detector(
     _detect,
-    {
-        "ekf2_ev_delay_wrong": "ev_delay wrong, ev_delay should, delay wrong, ekf2_ev_delay, "
-        "ev_delay, delay",
-    },
     {"ekf2_ev_delay_wrong": tuple(f"--mistake ekf2-delay={ms}ms" for ms in (120, 150, 175))},
     names={"ekf2_ev_delay_wrong": "a delay set in EKF2 that is not that of the positions"},
 )

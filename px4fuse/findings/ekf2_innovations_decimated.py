@@ -36,6 +36,5 @@ def _detect(analysis: Analysis) -> Found:
 
 DETECTOR = Detector(
     _detect,
-    {"ekf2_innovations_decimated": ""},
     names={"ekf2_innovations_decimated": "EKF2's innovations logged too slowly"},
 )

@@ -26,6 +26,5 @@ def _detect(analysis: Analysis) -> Found:
 
 DETECTOR = Detector(
     _detect,
-    {"ekf2_instance_switch": "instance"},
     names={"ekf2_instance_switch": "a change of the EKF2 instance"},
 )

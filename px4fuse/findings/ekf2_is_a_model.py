@@ -20,6 +20,5 @@ def _detect(analysis: Analysis) -> Found:
 
 DETECTOR = Detector(
     _detect,
-    {"ekf2_is_a_model": ""},
     names={"ekf2_is_a_model": "EKF2 that is a model of it"},
 )

@@ -114,10 +114,6 @@ def _horizon_s(comparison: Comparison) -> float:
 
 DETECTOR = Detector(
     _detect,
-    {
-        "ekf2_not_fusing": "not fus, never fus, ekf2_ev_ctrl, ekf2_aid_mask",
-        "ekf2_fusion_interrupted": "fusion interrupt, stopped fusing, stops fusing",
-    },
     {"ekf2_not_fusing": ("--mistake ekf2-off",)},
     names={
         "ekf2_not_fusing": "EKF2 that never used the positions",

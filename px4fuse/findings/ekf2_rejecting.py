@@ -85,9 +85,6 @@ def _detect(analysis: Analysis) -> Found:
 
 DETECTOR = Detector(
     _detect,
-    {
-        "ekf2_rejecting": "reject, ekf2_evp_gate, reject good, gate narrow, gate tight, gate small",
-    },
     {"ekf2_rejecting": ("--mistake ekf2-gate=2",)},
     names={"ekf2_rejecting": "EKF2 that rejects good measurements"},
 )

@@ -41,6 +41,5 @@ def _detect(analysis: Analysis) -> Found:
 
 DETECTOR = Detector(
     _detect,
-    {"ekf2_resets": "reset"},
     names={"ekf2_resets": "resets of EKF2"},
 )

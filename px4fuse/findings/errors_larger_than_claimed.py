@@ -154,9 +154,5 @@ def _rms(errors: Array) -> float:
 
 DETECTOR = Detector(
     _detect,
-    {
-        "errors_larger_than_claimed": "nees, error larger, errors larger, error claim, "
-        "source drift, vio drift, odometry drift, truth overconfident",
-    },
     names={"errors_larger_than_claimed": "errors larger than the filter claims"},
 )

@@ -55,10 +55,6 @@ def _spans(time_s: Array, segment: Segment) -> tuple[tuple[float, float], ...]:
 
 DETECTOR = Detector(
     _detect,
-    {
-        "imu_gap": "gap, imu dropout, imu missing, imu lost, imu silent, imu stop, "
-        "acceler missing, acceler dropout, acceler lost, no imu for",
-    },
     {"imu_gap": ("--mistake imu-dropout=1s",)},
     names={"imu_gap": "a gap in the IMU's samples"},
 )

@@ -27,6 +27,5 @@ def _detect(analysis: Analysis) -> Found:
 
 DETECTOR = Detector(
     _detect,
-    {"innovations_need_ulog": ""},
     names={"innovations_need_ulog": "innovations that only a ULog holds"},
 )

@@ -39,10 +39,6 @@ def _first_of(notes: list[str]) -> str:
 
 DETECTOR = Detector(
     _detect,
-    {
-        "log_damaged": "damaged, corrupt, logger",
-        "samples_dropped": "stamp go back, stamp backward, samples dropped",
-    },
     names={
         "log_damaged": "a damaged log",
         "samples_dropped": "samples that were dropped because their stamps went back",

@@ -27,6 +27,5 @@ def _detect(analysis: Analysis) -> Found:
 
 DETECTOR = Detector(
     _detect,
-    {"logger_dropouts": "logger, sd card"},
     names={"logger_dropouts": "dropouts of the logger"},
 )

@@ -53,10 +53,6 @@ def _remedy(log: LogInfo, topic: str, rate_hz: float) -> str:
 
 DETECTOR = Detector(
     _detect,
-    {
-        "logging_rate_low": "logging rate, logged slow, imu rate, imu slow, sample rate, "
-        "sampling rate, sensor_combined",
-    },
     {"logging_rate_low": ("--mistake imu-rate=40", "--mistake imu-rate=20")},
     names={"logging_rate_low": "an IMU that was logged too slowly"},
 )

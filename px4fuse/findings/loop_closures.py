@@ -76,13 +76,6 @@ def _evidence(judged: Judged) -> dict[str, float | str]:
 DETECTOR = Detector(
     _detect,
     {
-        "false_loop_closure": "false closure, false loop, wrong closure, wrong loop, "
-        "closure rejected, closure gate, not closed, did not return, not land where, "
-        "landed elsewhere, loop open",
-        "loop_closure_doubtful": "closure doubt, closure contradict, closure dropped",
-        "loop_drift_understated": "drift understat, drift more, drift larger",
-    },
-    {
         "false_loop_closure": tuple(
             f"--kind loop --mistake open-end={metres}m" for metres in (3, 4, 5, 8)
         )

@@ -21,6 +21,5 @@ def _detect(loop: Loop) -> Found:
 
 DETECTOR = Detector(
     _detect,
-    {"loop_end_assumed": ""},
     names={"loop_end_assumed": "a landing place that was only assumed"},
 )

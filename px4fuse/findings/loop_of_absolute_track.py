@@ -20,6 +20,5 @@ def _detect(loop: Loop) -> Found:
 
 DETECTOR = Detector(
     _detect,
-    {"loop_of_absolute_track": "absolute, not drift, not odometry"},
     names={"loop_of_absolute_track": "a loop measured on a track that does not drift"},
 )

@@ -105,21 +105,16 @@ class Detector(Generic[Subject]):
     ----------
     detect : callable
         From an ``Analysis`` or a ``Loop`` to findings, with condition, words and remedy.
-    phrases : mapping
-        Every id that it may yield, to the phrases by which a student's notes name it besides that
-        id, with commas between them. All words of a phrase must stand in one sentence, in any
-        order; beginnings are enough ("stamp late" is in "the stamps come 0.2 s later").
     names : mapping
-        Every such id to what it is called within a sentence.
+        Every id that it may yield, to what it is called within a sentence.
     measured_on : mapping
         Id to the simulated flights on which its rate is measured (``rates.csv``): options of
         ``px4fuse simulate``, or a field of ``Settings`` with its value.
     """
 
     detect: Callable[[Subject], Found]
-    phrases: Mapping[str, str]
-    names: Mapping[str, str] = field(kw_only=True)
     measured_on: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    names: Mapping[str, str] = field(kw_only=True)
 
 
 def lowered(severity: Severity) -> Severity:

@@ -35,7 +35,6 @@ def _detect(analysis: Analysis) -> Found:
 
 DETECTOR = Detector(
     _detect,
-    {"no_motion": "hover, hardly moved, did not move, no movement, stood still"},
     {"no_motion": ("--mistake no-motion",)},
     names={"no_motion": "a vehicle that hardly moved"},
 )

@@ -24,6 +24,5 @@ def _detect(analysis: Analysis) -> Found:
 
 DETECTOR = Detector(
     _detect,
-    {"not_px4": ""},
     names={"not_px4": "a log that is not of PX4"},
 )

@@ -26,6 +26,5 @@ def _detect(analysis: Analysis) -> Found:
 
 DETECTOR = Detector(
     _detect,
-    {"position_file_placement": ""},
     names={"position_file_placement": "the placing of the position file"},
 )

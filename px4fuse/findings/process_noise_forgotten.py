@@ -59,7 +59,6 @@ def _detect(analysis: Analysis) -> Found:
 
 DETECTOR = Detector(
     _detect,
-    {"process_noise_forgotten": "process noise, forgot q, q forgot, sigma_a, sigma a"},
     {"process_noise_forgotten": ("sigma_a_m_s2=0.001",)},
     names={"process_noise_forgotten": "process noise that is nearly zero"},
 )

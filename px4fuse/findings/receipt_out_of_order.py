@@ -20,6 +20,5 @@ def _detect(analysis: Analysis) -> Found:
 
 DETECTOR = Detector(
     _detect,
-    {"receipt_out_of_order": ""},
     names={"receipt_out_of_order": "messages that came out of order"},
 )

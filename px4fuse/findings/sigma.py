@@ -177,13 +177,6 @@ def _reading(label: str, small: bool) -> str:
 DETECTOR = Detector(
     _detect,
     {
-        "sigma_z_small": "sigma_z, sigma z, measurement noise, measurement variance, trusts uwb, "
-        "trust uwb",
-        "sigma_z_large": "sigma_z, sigma z, measurement noise, measurement variance, distrust",
-        "sigma_a_small": "sigma_a, sigma a, process noise",
-        "sigma_a_large": "sigma_a, sigma a, process noise",
-    },
-    {
         "sigma_z_small": tuple(f"sigma_z_m={value:g}" for value in (0.07, 0.05, 0.03)),
         "sigma_z_large": tuple(f"sigma_z_m={value:g}" for value in (0.15, 0.2, 0.3)),
         "sigma_a_small": tuple(f"sigma_a_m_s2={value:g}" for value in (0.18, 0.1, 0.02)),

@@ -106,15 +106,6 @@ def typed_offset_s(comparison: Comparison, clock: ClockOffset) -> float:
 DETECTOR = Detector(
     _detect,
     {
-        "source_clock_offset": "clock offset, time offset, stamp offset, timestamp offset, "
-        "stamp late, stamp early, stamp delay, stamp lag, timestamp late, timestamp early, "
-        "timestamp delay, clock late, clock early, clock delay, clock behind, clock ahead, "
-        "clock shift, time shift, clock synchron, latency",
-        "source_clock_changes": "clock change, clock jump, clock step, clock drift, "
-        "clock converg, offset change, offset jump, offset step, offset differ, stamp change, "
-        "stamp jump, timestamp change, timestamp jump, timesync",
-    },
-    {
         "source_clock_offset": tuple(
             f"--mistake clock-offset={ms}ms" for ms in (40, 80, 120, 150, 200, 250)
         ),

@@ -39,6 +39,5 @@ def _detect(analysis: Analysis) -> Found:
 
 DETECTOR = Detector(
     _detect,
-    {"source_frame_not_north": "not north, frd, frame north"},
     names={"source_frame_not_north": "positions whose axes are not north and east"},
 )

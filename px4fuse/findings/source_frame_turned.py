@@ -84,14 +84,6 @@ def _drifting(source: str, heading: HeadingError, remedy: str) -> Finding:
 
 DETECTOR = Detector(
     _detect,
-    {
-        "source_frame_turned": "frame turn, frame rotat, frame align, frame misalign, frame yaw, "
-        "frame heading, positions turned, position rotat, uwb rotat, anchors rotat, yaw error, "
-        "yaw offset, yaw wrong, heading error, heading offset, heading wrong, not align north, "
-        "misalign",
-        "ekf2_heading_wrong": "heading drift, heading wander, heading change, yaw drift, "
-        "heading not constant, magnetometer, mag heading, compass",
-    },
     {"source_frame_turned": tuple(f"--mistake yaw={degrees}" for degrees in (10, 15, 20, 30))},
     names={
         "source_frame_turned": "positions that are turned against north",

@@ -31,11 +31,6 @@ def _detect(analysis: Analysis) -> Found:
 
 DETECTOR = Detector(
     _detect,
-    {
-        "source_gap": "gap, position dropout, source dropout, uwb dropout, measurement dropout, "
-        "uwb silent, source silent, position silent, uwb missing, position missing, "
-        "measurements missing, uwb lost, position lost, uwb stop, no position for, no uwb for",
-    },
     {"source_gap": ("--mistake dropout=2s", "--mistake dropout=8s")},
     names={"source_gap": "a time without positions"},
 )

@@ -44,10 +44,6 @@ def _detect(analysis: Analysis) -> Found:
 
 DETECTOR = Detector(
     _detect,
-    {
-        "source_jumps": "position jump, source jump, uwb jump, jumps, position step, false match, "
-        "relocali, shifted, teleport",
-    },
     {"source_jumps": tuple(f"--mistake jump={size}" for size in ("0.5m", "1m", "2m"))},
     names={"source_jumps": "positions that jump"},
 )

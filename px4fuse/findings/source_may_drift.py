@@ -46,6 +46,5 @@ def _detect(analysis: Analysis) -> Found:
 
 DETECTOR = Detector(
     _detect,
-    {"source_may_drift": "source drift, vio drift, odometry drift, not correct"},
     names={"source_may_drift": "a position source that may drift"},
 )

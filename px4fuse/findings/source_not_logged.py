@@ -54,10 +54,6 @@ def _detect(analysis: Analysis) -> Found:
 
 DETECTOR = Detector(
     _detect,
-    {
-        "source_not_logged": "sdlog_profile, not logged",
-        "source_decimated": "sdlog_profile, decimat, logged at",
-    },
     names={
         "source_not_logged": "a position source that was not logged",
         "source_decimated": "positions logged too slowly",

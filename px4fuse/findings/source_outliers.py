@@ -45,10 +45,6 @@ def _detect(analysis: Analysis) -> Found:
 
 DETECTOR = Detector(
     _detect,
-    {
-        "source_outliers": "outlier, nlos, without line of sight, no line of sight, line of sight, "
-        "reflection, multipath, spike",
-    },
     {"source_outliers": tuple(f"--mistake nlos={share}%" for share in (1, 2, 5))},
     names={"source_outliers": "outliers among the positions"},
 )

@@ -41,6 +41,5 @@ def _detect(analysis: Analysis) -> Found:
 
 DETECTOR = Detector(
     _detect,
-    {"source_samples_lost": ""},
     names={"source_samples_lost": "positions lost on the way"},
 )

@@ -54,10 +54,6 @@ def _detect(analysis: Analysis) -> Found:
 DETECTOR = Detector(
     _detect,
     {
-        "source_scale_wrong": "scale, distance too long, distance too short, anchors survey, "
-        "tape measure",
-    },
-    {
         "source_scale_wrong": (
             *(f"--mistake scale={percent}%" for percent in (5, 15, 20, 25)),
             "--uwb-rate 10 --sigma-uwb 0.05 --yaw follow --mistake scale=15%",

@@ -50,10 +50,6 @@ def _detect(analysis: Analysis) -> Found:
 
 DETECTOR = Detector(
     _detect,
-    {
-        "source_smoothed": "smooth, low pass, lowpass, moving average, averag, "
-        "position filtered, uwb filtered, innovations correlat, coloured noise, colored noise",
-    },
     {"source_smoothed": tuple(f"--mistake smoothed={size}" for size in ("0.1s", "0.2s", "0.5s"))},
     names={"source_smoothed": "positions that were smoothed before they were sent"},
 )

@@ -36,7 +36,6 @@ def _detect(analysis: Analysis) -> Found:
 
 DETECTOR = Detector(
     _detect,
-    {"source_stamps_constant": "", "source_receipt_jitter": ""},
     names={
         "source_stamps_constant": "position stamps that never change",
         "source_receipt_jitter": "stamps of receipt instead of measurement",

@@ -79,11 +79,6 @@ def stamps_of_arrival_end_s(analysis: Analysis) -> float | None:
 
 DETECTOR = Detector(
     _detect,
-    {
-        "source_stamps_of_arrival": "timesync, time of arrival, arrival time, clock change, "
-        "clock jump, clock step, clock converg, not synchron, stamp change, stamp jump, "
-        "offset change, offset jump",
-    },
     {"source_stamps_of_arrival": tuple(f"--mistake clock-jump={ms}ms" for ms in (50, 150, 300))},
     names={
         "source_stamps_of_arrival": "position stamps that are times of arrival until the clocks "

@@ -80,10 +80,6 @@ def _detect(analysis: Analysis) -> Found:
 
 DETECTOR = Detector(
     _detect,
-    {
-        "source_thinned": "thinned, decimat, position rate, uwb rate, source rate, rate too low, "
-        "samples missing, positions missing",
-    },
     {"source_thinned": tuple(f"--mistake decimate={rate}" for rate in ("2Hz", "3Hz", "2.5Hz"))},
     names={"source_thinned": "positions that were thinned before they were sent"},
 )

@@ -59,11 +59,6 @@ def _detect(analysis: Analysis) -> Found:
 DETECTOR = Detector(
     _detect,
     {
-        "source_variance_wrong": "reported variance, reports variance, reported standard, "
-        "reported noise, reported sigma, sender variance, sends variance, covariance, "
-        "measurement variance, ekf2_evp_noise",
-    },
-    {
         "source_variance_wrong": tuple(
             f"--mistake r-scale={factor:g}" for factor in (0.1, 0.25, 0.5, 4.0)
         )

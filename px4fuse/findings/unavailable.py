@@ -41,11 +41,6 @@ def _detect(analysis: Analysis) -> Found:
 
 DETECTOR = Detector(
     _detect,
-    {
-        "ekf2_unavailable": "",
-        "input_unavailable": "no acceler, no imu, constant velocity",
-        "too_few_innovations": "too few, few innovations",
-    },
     names={
         "ekf2_unavailable": "a log without EKF2",
         "input_unavailable": "a log without acceleration",

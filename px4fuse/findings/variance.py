@@ -294,15 +294,6 @@ def _ekf2_noise(result: AxisComparison) -> float:
 DETECTOR = Detector(
     _detect,
     {
-        "kf_variance_overstated": "overstat, variance too large, variance large, nis below, "
-        "nis low, conservative",
-        "kf_variance_understated": "understat, variance too small, variance small, nis above, "
-        "nis high, overconfident",
-        "ekf2_variance_overstated": "ekf2 overstat, ekf2 variance, ekf2_evp_noise, ekf2 nis",
-        "ekf2_variance_understated": "ekf2 understat, ekf2 variance, ekf2_evp_noise, ekf2 nis, "
-        "ekf2 overconfident",
-    },
-    {
         "ekf2_variance_understated": tuple(f"--mistake ekf2-noise={cm}cm" for cm in (4, 3)),
     },
     names={

@@ -6,13 +6,14 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from px4fuse.comparison.model import FilterName, FilterSummary
+from px4fuse.comparison.model import AgainstTruth, FilterName, FilterSummary
 from px4fuse.filter.clock import Clock
 from px4fuse.filter.consistency import HorizontalNis
 from px4fuse.filter.tuning import HORIZONTAL, Tuned
 from px4fuse.grading.evidence import Evidence, absence, drifts, text_of, why_not_horizontal
 from px4fuse.plain import factor_words
 from px4fuse.results.comparison import ASKED
+from px4fuse.results.trajectories import LoopPart
 
 # Findings about stamps for which no single offset is right
 CHANGING = ("source_clock_changes", "source_stamps_of_arrival")
@@ -47,13 +48,13 @@ def _tuned(evidence: Evidence, axis: str, name: str, factor: float) -> tuple[flo
         why = absence(tuned) or (why_not_horizontal(evidence) if axis == HORIZONTAL else "")
         return 0.0, f"Your report has no interval for {label}{why}"
     low, high = interval
+    if name == "sigma_z_m" and drifts(evidence):
+        # small innovations do not make a drifting source trustworthy: up to its error is right
+        high = max(high, _error_m(evidence))
     above = chosen / high if high > 0.0 else math.inf
-    # small innovations do not make a drifting source trustworthy
-    off = max(1.0 if chosen > high and drifts(evidence) else above, low / chosen, 1.0)
+    off = max(above, low / chosen, 1.0)
     said = f"your {label} {chosen:.3g} {unit} is"
     wanted = f"what the data ask for ({low:.3g} to {high:.3g} {unit})"
-    if off == 1.0 and chosen > high:
-        return 1.0, f"{said} above {wanted}, as it should be for a source that may drift"
     if off == 1.0:
         return 1.0, f"{said} within {wanted}"
     share = 1.0 - math.log(off) / math.log(factor) if factor > max(off, 1.0) else 0.0
@@ -78,31 +79,17 @@ def consistent(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float, str
         verdict, factor = judged.verdict, judged.variance_factor
         off = max(factor, 1.0 / factor)
         good = verdict == "consistent"
-        # small innovations do not make a drifting source trustworthy
-        excused = "overstated" in verdict and drifts(evidence)
         gone = given["factor"] <= off or given["factor"] <= 1.0
-        # no noise explains outliers, and none should be made to
-        outliers = "understated" in verdict and evidence.has("source_outliers")
-        explained = outliers and evidence.claims_that("source_outliers")
-        handed = not explained and _nothing_more(evidence)
-        if good or explained or excused or handed:
+        right = not good and _settings_are_right(evidence)
+        if good or right:
             shares.append(1.0)
         else:
             shares.append(0.0 if gone else 1.0 - math.log(off) / math.log(given["factor"]))
-        causes = (
-            (explained, ", because of outliers that no setting fixes, as your notes say"),
-            (outliers, ", because of outliers that no setting fixes; your notes should say so"),
-            (excused, ", as it may be against a source that may drift"),
-            (
-                handed,
-                ", because of what is wrong with the log that you were given, as your notes say",
-            ),
-            (
-                True,
-                ": look at what the tuning page asks for, and for what the model does not explain",
-            ),
+        because = (
+            ", with the noises that the data ask for: what is left no setting fixes"
+            if right
+            else ": look at what the tuning page asks for, and for what the model does not explain"
         )
-        because = next(text for holds, text in causes if holds)
         said.append(
             f"{owner} is consistent ({axis})"
             if good
@@ -112,17 +99,25 @@ def consistent(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float, str
     return sum(shares) / max(len(shares), 1), f"{comment[:1].upper() + comment[1:]}."
 
 
-def _handed_out(evidence: Evidence) -> tuple[str, ...]:
-    """What is wrong with the log that the student was given."""
-    return () if evidence.answer is None else evidence.answer.findings
+def _settings_are_right(evidence: Evidence) -> bool:
+    """Whether both noises are what the data ask for, so that nothing more can be set."""
+    return all(_tuned(evidence, HORIZONTAL, name, 2.0)[0] == 1.0 for name in SIGMAS)
 
 
-def _nothing_more(evidence: Evidence) -> bool:
-    """Whether a student has found all that is wrong with the log, and set what the data ask for."""
-    named = set(_handed_out(evidence))
-    return bool(named) and named <= evidence.claims.earned and not evidence.notes.problem and all(
-        _tuned(evidence, HORIZONTAL, name, 2.0)[0] == 1.0 for name in SIGMAS
-    )  # fmt: skip
+def _error_m(evidence: Evidence) -> float:
+    """How wrong a source that drifts is, as far as a loop or the truth tells; 0 where neither."""
+    comparison = evidence.comparison
+    if comparison is None:
+        return 0.0
+    found = [
+        truth.position_rmse_m
+        for axis in comparison.axes.values()
+        if isinstance(truth := axis.filters["kf"].truth, AgainstTruth)
+    ]
+    loop = comparison.loop
+    if isinstance(loop, LoopPart):
+        found.append(loop.closure_error_m or 0.0)
+    return max(found, default=0.0)
 
 
 def _judged(
@@ -161,7 +156,7 @@ def clock(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float, str]:
     said = f"You applied a clock offset of {applied:.3f} s"
     if low - given["margin_s"] <= applied <= high + given["margin_s"]:
         return 1.0, f"{said}, which is what the data ask for ({low:.3f} to {high:.3f} s)."
-    if any(evidence.has(name) or name in _handed_out(evidence) for name in CHANGING):
+    if any(map(evidence.has, CHANGING)):
         return _changing(evidence, given["undeterminable"])
     return 0.0, (
         f"{said} where the data ask for {low:.3f} to {high:.3f} s; set it with --clock-offset, or "
@@ -172,6 +167,6 @@ def clock(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float, str]:
 def _changing(evidence: Evidence, unnoticed: float) -> tuple[float, str]:
     """Stamps for which no single offset is right."""
     said = "The offset of the position stamps changes in your flight: no single one is right"
-    if any(map(evidence.claims_that, CHANGING)):
-        return 1.0, f"{said}, as your notes say."
-    return unnoticed, f"{said}; say in your notes from when on it holds, and why."
+    if evidence.claims("clock-jump", "clock-drift"):
+        return 1.0, f"{said}, as your form says."
+    return unnoticed, f"{said}; say in your form from when on it holds."

@@ -16,9 +16,7 @@ from px4fuse.results.contract import LoopResults
 from px4fuse.results.trajectories import Correction, Corrections, LoopPart, Score
 from px4fuse.trajectory.graph.analysis import GATE_ALPHA
 
-OPEN = "false_loop_closure"
-# In the words of the rubric: what says that a closure is true
-ACCEPTED = "closure_accepted"
+OPEN = "open-end"
 # A tape and a pilot's feet are not better, and an open end is not smaller
 TAPE_M = 0.5
 # A drift stated so many times larger or smaller than it is
@@ -85,21 +83,14 @@ def _landed_m(evidence: Evidence) -> float | None:
     return None if evidence.answer is None else evidence.answer.truth.get("closure_error_m")
 
 
-def unjudged(evidence: Evidence) -> bool:
-    """Whether the end was left open and nobody knows where it landed."""
-    results = evidence.results
-    opened = isinstance(results, LoopResults) and not results.request.came_back
-    return opened and _landed_m(evidence) is None
-
-
 def _open_end(evidence: Evidence) -> tuple[float, str]:
     """What the words "it did not come back" are worth, and why."""
     landed = _landed_m(evidence)
     if landed is not None and landed <= TAPE_M:
         return 0.0, "but your vehicle landed where it took off"
-    if evidence.claims_that(OPEN):
-        return 1.0, "as your notes say"
-    return 0.5, "but your notes do not say where it landed and how you know"
+    if evidence.claims(OPEN):
+        return 1.0, "as your form says"
+    return 0.5, "but your form does not say that it landed elsewhere"
 
 
 def loop(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float, str]:
@@ -140,13 +131,6 @@ def loop(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float, str]:
 
 def _rejected(evidence: Evidence, measured: str) -> tuple[float, str]:
     """A closure that the gate rejected, and what the notes make of it."""
-    if evidence.notes.claims(evidence.words.get(ACCEPTED, ())):
-        both = evidence.claims_that(OPEN)
-        return 1 / 3 if both else 0.0, (
-            f"{measured}, which is more than drift explains, and your notes "
-            f"{'also call' if both else 'call'} the closure true. Say where it landed "
-            "(--landed-at) or leave the end open (--open), and which of the two holds."
-        )
     share, why = _open_end(evidence)
     said = f"{measured}; the closure was rejected as false, which leaves the path as it is"
     return (1.0 + 2.0 * share) / 3.0, f"{said}, {why}."
@@ -165,7 +149,7 @@ def closure(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float, str]:
         known = _landed_m(evidence) is not None
         share, why = _open_end(evidence)
         share = share if known or landing else min(share, given["open_unknown"])
-        return share if evidence.claims_that(OPEN) else 0.0, (
+        return share if evidence.claims(OPEN) else 0.0, (
             f"Your loop is not closed, {why}. A closure error that drift cannot explain is no "
             "error of the odometry."
         )

@@ -5,22 +5,20 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from px4fuse.grading.claims import in_words
 from px4fuse.grading.evidence import (
     Evidence,
-    also_named,
     list_words,
     reason_of,
     text_of,
     values_at,
     why_absent,
 )
+from px4fuse.plain import capital
 from px4fuse.results.contract import LoopResults
 from px4fuse.verification.model import Verdict
+from px4fuse.verification.rerun import log_sha256
 from px4fuse.verification.verification import NO_LOG, is_number
 
-# Findings about a recording, for which a student who was given the log cannot be asked
-NOT_ASKED = frozenset(("log_damaged", "samples_dropped", "source_samples_lost"))
 # What places in the results are called that the default rubric asks for
 PARTS: Mapping[str, str] = {
     "axes.*.filters.kf": "the consistency of the filter",
@@ -100,69 +98,37 @@ def sections(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float, str]:
     )
 
 
-def notes(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float, str]:
-    """The student has written enough."""
-    read = evidence.notes
-    words, different = read.words, read.different
+def text(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float, str]:
+    """The student's own text, which nobody but the instructor scores."""
+    del given
     if not evidence.results.student.notes.strip():
-        return 0.0, "Your report has no notes of your own; write them and add them with --notes."
-    if read.problem:
+        return 0.0, "Your report has no text of your own; write one and add it with --notes."
+    return 0.0, "Your instructor reads your text and gives points for it."
+
+
+def answers(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float, str]:
+    """The form about the flight, by the answer key."""
+    del given
+    results = evidence.results
+    theirs = None if evidence.key is None else evidence.key.of_student(results.student.id)
+    if theirs is not None and theirs.sha256 != log_sha256(results):
+        return 0.0, f"This report is not about the log that you were given, {text_of(theirs.file)}."
+    if evidence.answer is None:
         return 0.0, (
-            f"Your notes {read.problem}: that earns nothing. Say in sentences of your own what "
-            "you see in this flight, how large it is, and what you did about it."
+            f"Neither your id ({text_of(results.student.id) or 'none is given'}) nor your log is "
+            "in the answer key; make the report of the log that you were given, with your --id."
         )
-    wrong = evidence.answer is not None and (evidence.answer.findings or evidence.charged)
-    if wrong and not evidence.claims.earned:
-        return 0.0, (
-            "Your notes name nothing that is wrong with this flight: that earns nothing. Look at "
-            "the report's findings first, and say what you see in this flight."
-        )
-    share = min(words / given["min_words"], different / given["min_different"], 1.0)
-    if share == 1.0:
-        return 1.0, f"Your notes have {words} words."
-    if words < given["min_words"]:
-        return share, (
-            f"Your notes have {words} words in sentences of your own; {given['min_words']} were "
-            "asked for."
-        )
-    return share, (
-        f"Your notes have {words} words, but only {different} different ones; "
-        f"{given['min_different']} were asked for."
+    if evidence.form_problem:
+        return 0.0, f"Your form {evidence.form_problem}."
+    found = evidence.form_points
+    if found is None:
+        return 0.0, "The answer key does not say what the right answers are."
+    parts = ", ".join(
+        f"{name} {points:.3g} of {found.of[name]:g}"
+        for name, points in found.parts.items()
+        if found.of[name]
     )
-
-
-def findings(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float, str]:
-    """The notes take up what the report finds, and nothing that the log does not have."""
-    ignored = {*given["ignore"]}
-    if evidence.answer is not None:
-        ignored |= NOT_ASKED  # which nobody who was handed a log can help
-    if evidence.has("ekf2_unavailable"):
-        ignored |= {one for one in evidence.words if one.startswith("ekf2_")}
-    asked = {
-        one.id: one
-        for one in evidence.results.findings
-        if one.severity in given["severities"] and one.id not in ignored
-    }
-    left = f"no {' or '.join(given['severities'])} left to explain"
-    if evidence.notes.problem or not evidence.notes.words:
-        named = in_words(asked)
-        return 0.0, (
-            f"Your notes do not take up what your report finds: {list_words(named)}."
-            if named
-            else f"Your report has {left}; say in your notes what you looked at to be sure."
-        )
-    # a student who names the effect of a cause has seen it too
-    missing = [name for name, one in asked.items() if not any(map(evidence.names, one.ids))]
-    wrong = evidence.charged
-    share = 1.0 - (len(missing) + len(wrong)) / max(len(asked), 1)
-    if not asked:
-        return share, f"Your report has {left}{also_named(wrong)}."
-    if not missing and not wrong:
-        return 1.0, f"Your notes take up all {len(asked)} findings of your report."
-    said = f"Your notes take up {len(asked) - len(missing)} of {len(asked)} findings"
-    if missing:
-        said += f"; say what causes {list_words(in_words(missing))} and what you did about it"
-    return share, f"{said}{also_named(wrong)}."
+    return found.share, f"Of 100: {parts}. {capital('; '.join(found.said))}."
 
 
 def number_between(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float, str]:

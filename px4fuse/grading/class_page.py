@@ -13,17 +13,19 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from px4fuse.answers import Answers, form_rows
 from px4fuse.grading.anonymous import Veil
 from px4fuse.grading.class_questions import Copied, above
 from px4fuse.grading.class_table import item_points, number, settled_report
 from px4fuse.grading.flags import copied_notes
 from px4fuse.grading.model import Entry, Graded, Override
-from px4fuse.grading.passages import shared_passages
+from px4fuse.grading.overrides import TOTAL
 from px4fuse.webpage.frame import (
     Cell,
     Column,
     Part,
     Row,
+    boxes,
     figure,
     links,
     listed,
@@ -31,7 +33,6 @@ from px4fuse.webpage.frame import (
     pairs,
     pictures,
     prose,
-    sides,
     tabled,
     words,
 )
@@ -105,7 +106,7 @@ def html_text(entries: Sequence[Entry], title: str, made_with: str) -> str:
             *(Column(veil.hide(name), "number", "numbers") for name in numbers),
         ),
         rows=[
-            _row(entry, layout, veil, minutes[at], _alike(at, entries, copied.get(at, ()), veil))
+            _row(entry, layout, veil, minutes[at], _alike(entries, copied.get(at, ()), veil))
             for at, entry in enumerate(entries)
         ],
         filters=_filters(entries),
@@ -141,7 +142,7 @@ def _tags(entry: Entry) -> list[str]:
     one = entry.counting
     tags = [status_of(entry)]
     if one:
-        tags += ["pending"] * bool(one.pending) + ["to read"] * bool(one.to_read)
+        tags += ["pending"] * bool(one.pending) + ["to read"] * one.waits
         tags += ["flagged"] * bool(one.flags or entry.remarks)
         tags += [f"missed:{mistake}" for mistake, named in one.mistakes.items() if not named]
     tags += ["late"] * bool(entry.late_s)
@@ -201,7 +202,7 @@ def _points(entry: Entry) -> Cell:
     one = entry.counting
     of = entry.of or (one.of if one else 0.0)
     if entry.total is None:
-        proposed = f"{number(one.points)} proposed" if one and one.pending else ""
+        proposed = f"{number(one.points)} proposed" if one and one.counted is None else ""
         return Cell("pending" if proposed else "–", None, proposed)
     share = (min(max(entry.total / of, 0.0), 1.0),) if of > 0.0 else ()
     said = [f"{number(entry.deduction)} off for being late"] * bool(entry.deduction)
@@ -234,13 +235,6 @@ def _details(entry: Entry, veil: Veil, alike: tuple[Part, ...]) -> tuple[Part, .
     return (
         listed("Flags", [veil.hide(text) for text in (*entry.remarks, *one.flags)], warn=True),
         listed("Pending: what you can do", [veil.hide(one.pending)] if one.pending else [], True),
-        listed(
-            "For you to judge",
-            [
-                f"{veil.hide(why).rstrip('.')}: “{veil.hide(said, own_words=True)}”"
-                for why, said in one.to_read
-            ],
-        ),
         listed("Verification", [veil.hide(reason) for reason in verdict.reasons]),
         tabled(
             "Numbers that differ",
@@ -260,7 +254,9 @@ def _details(entry: Entry, veil: Veil, alike: tuple[Part, ...]) -> tuple[Part, .
                 for mistake, named in one.mistakes.items()
             ],
         ),
-        prose("The student's notes", veil.hide(one.notes, own_words=True)),
+        _form(one.form, veil),
+        *([] if entry.pseudonym else [_boxes(entry, one)]),
+        prose("The student's own words", veil.hide(one.notes, own_words=True)),
         *alike,
         tabled(
             "Other attempts",
@@ -314,25 +310,45 @@ def _item_table(entry: Entry, one: Graded, veil: Veil) -> Part:
     return tabled("Points (proposed)" if one.pending else "Points", heads, rows, (1, 2))
 
 
-def _alike(
-    at: int, entries: Sequence[Entry], copied: Sequence[Copied], veil: Veil
-) -> tuple[Part, ...]:
+def _alike(entries: Sequence[Entry], copied: Sequence[Copied], veil: Veil) -> tuple[Part, ...]:
+    """The texts that share passages with a student's own, to be read beside it."""
     return tuple(
-        _side_by_side(entries[at], entries[to], share, veil) for share, to in copied[:MAX_COPIES]
-    )
+        prose(f"Text of {entries[to].called}, which shares {share:.0%}",
+              veil.hide(other.notes, own_words=True))
+        for share, to in copied[:MAX_COPIES]
+        if (other := entries[to].counting)
+    )  # fmt: skip
 
 
-def _side_by_side(entry: Entry, other: Entry, share: float, veil: Veil) -> Part:
-    assert entry.counting is not None
-    assert other.counting is not None
-    texts = shared_passages(
-        *(veil.hide(one.notes, own_words=True) for one in (entry.counting, other.counting))
-    )
-    return sides(
-        f"Notes shared with {other.called}: {share:.0%}",
-        ((entry.called, False), *texts[0]),
-        ((other.called, False), *texts[1]),
-    )
+def _boxes(entry: Entry, one: Graded) -> Part:
+    """Points and a comment for what only the instructor scores, and for the whole."""
+    by_hand = [
+        (title, item.of)
+        for title, item in zip(item_points(one), one.items, strict=True)
+        if item.by_hand
+    ]
+    rows = []
+    for title, of in (*by_hand, (TOTAL, entry.of or one.of)):
+        said = entry.overrides.get(title, Override())
+        rows.append((title, of, said.points, said.comment))
+    shown = {title for title, *_ in rows}
+    kept = [
+        (title, said.points, said.comment)
+        for title, said in entry.overrides.items()
+        if title not in shown
+    ]
+    kept += [("", None, entry.comment)] if entry.comment else []
+    owner = entry.student_id or one.submission
+    return boxes("Your points and words", owner, rows, kept)
+
+
+def _form(answers: Answers | None, veil: Veil) -> Part:
+    """What the form says, in its own words."""
+    rows = [
+        (veil.hide(name), veil.hide(value))
+        for name, value in (form_rows(answers) if answers else ())
+    ]
+    return pairs("The form", rows)
 
 
 def _beside(entry: Entry, one: Graded, veil: Veil) -> tuple[Part, ...]:

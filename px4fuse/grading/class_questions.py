@@ -135,9 +135,7 @@ def _to_judge(entries: Sequence[Entry]) -> str:
             continue
         # what to do stands in the row, where names are hidden
         waiting = ["points that are pending"] * bool(one.pending)
-        if one.to_read:
-            passages = "a passage" if len(one.to_read) == 1 else f"{len(one.to_read)} passages"
-            waiting.append(f"{passages} of the notes")
+        waiting += ["a text to read"] * one.waits
         if waiting:
             said = f"<span class='right'>{escaped(' and '.join(waiting))}</span>"
             lines.append(f"<li>{opens(at, entry.called)}{said}</li>")
@@ -163,5 +161,5 @@ def _pairs(entries: Sequence[Entry], copied: Mapping[int, Sequence[Copied]]) -> 
         f"<span class='right'>{-share:.0%} of both</span></li>"
         for share, at, other in found
     ]
-    said = "Open one of the two to read them side by side. Alike does not mean copied."
-    return ranking("Notes that share passages", said, lines, MOST_PAIRS, " pairs")
+    said = "Open one of the two to read them one after the other. Alike does not mean copied."
+    return ranking("Texts that share passages", said, lines, MOST_PAIRS, " pairs")

@@ -41,7 +41,7 @@ def csv_text(entries: Sequence[Entry]) -> str:
         points = item_points(one) if one else {}
         row: list[str | float | None] = [
             one.submission if one else "", entry.student, None, one.status if one else "missing",
-            one.counted if one else None, one.points if one and one.pending else None,
+            one.counted if one else None, one.points if one and one.counted is None else None,
             entry.of, entry.deduction or None, entry.total,
             *(points.get(title) for title in items),
             *((one.numbers if one else {}).get(title) for title in numbers),
@@ -71,7 +71,8 @@ def settled_report(entry: Entry) -> Graded | None:
         )
         if said.points is not None and said.points != item.points:
             comment = f"{comment} (Your instructor gave {number(points)} points.)"
-        items.append(replace(item, points=points, comment=comment))
+        waits = item.waits and said.points is None
+        items.append(replace(item, points=points, comment=comment, waits=waits))
     return replace(graded, items=tuple(items))
 
 

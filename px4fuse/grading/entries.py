@@ -33,12 +33,15 @@ class Term:
         With a time zone.
     times : mapping
         Index of a person in the register to when Moodle says that the work was handed in.
+    include_pending : bool
+        Whether points that wait for the instructor are entered as they are proposed.
     """
 
     attempt: Attempt = "latest"
     due: datetime | None = None
     late: LateRule | None = None
     times: Mapping[int, datetime] | None = None
+    include_pending: bool = False
 
 
 @dataclass(frozen=True)
@@ -147,7 +150,10 @@ def class_entries(
     titles = [tuple(item_points(one.counting)) if one.counting else () for one in made]
     said, notes = matched(overrides, made, titles)
     most = max((one.of for one in graded), default=0.0)
-    settled = (_settled(one, words, most) for one, words in zip(made, said, strict=True))
+    settled = (
+        _settled(one, words, most, term.include_pending)
+        for one, words in zip(made, said, strict=True)
+    )
     return tuple(settled), notes
 
 
@@ -245,7 +251,9 @@ def _entry(person: Person, tries: Sequence[_Try], term: Term) -> Entry:
     )
 
 
-def _settled(entry: Entry, said: Mapping[str, Override], most: float) -> Entry:
+def _settled(
+    entry: Entry, said: Mapping[str, Override], most: float, include_pending: bool
+) -> Entry:
     """With the instructor's word, and the total that follows."""
     comment = "\n".join(
         said[name].comment for name in ("", TOTAL) if name in said and said[name].comment
@@ -255,6 +263,6 @@ def _settled(entry: Entry, said: Mapping[str, Override], most: float) -> Entry:
     total = None
     if TOTAL in said and said[TOTAL].points is not None:
         total = said[TOTAL].points
-    elif settled is not None and not settled.pending:
-        total = round(max(sum(one.points for one in settled.items) - entry.deduction, 0.0), 2)
+    elif settled is not None and (settled.counted is not None or include_pending):
+        total = round(max(settled.points - entry.deduction, 0.0), 2)
     return replace(entry, comment=comment, total=total, of=settled.of if settled else most)

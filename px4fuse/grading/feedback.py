@@ -29,7 +29,7 @@ def feedback(graded: Graded, class_name: str = "") -> str:
     lines = [*([class_name] if class_name else []), f"Report   {text_of(graded.submission)}"]
     lines += [f"Student  {who}"] if who else []
     points = f"{_points(graded.points)} of {_points(graded.of)}"
-    if graded.pending:
+    if graded.counted is None:
         points = f"pending: they do not count yet (as it is: {points})"
     lines += [f"Points   {points}"] if graded.items else []
     lines += ["", *_wrapped(verdict_text(graded.verdict))]

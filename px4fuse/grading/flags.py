@@ -11,46 +11,27 @@ import re
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from decimal import Decimal
-from itertools import combinations
 from pathlib import PurePosixPath
 
-import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
-
+from px4fuse.answers import Answers
 from px4fuse.assignment.key import AnswerKey
 from px4fuse.assignment.key import folded as folded_id
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.tuning import HORIZONTAL, HeldOut, Tuned
-from px4fuse.grading.folding import folded
 from px4fuse.grading.model import Graded
+from px4fuse.grading.text import copies
 from px4fuse.plain import few_words
 from px4fuse.results.comparison import ASKED
 from px4fuse.results.contract import ComparisonResults, LoopResults, Reported
 from px4fuse.results.reading import one_line
 
-# Letters and digits in a row by which two texts are compared, so that spaces do not count: of
-# five words, hardly ever the same by chance, and a changed word costs as many of thousands
-SHINGLE_LETTERS = 25
-# One in so many shingles is kept, by its own value, so that a class takes seconds
-KEPT = 8
-# Knuth's, for hashes: 2^64 over the golden ratio, odd
-MULTIPLIER = 0x9E3779B97F4A7C15
-# Share of the shingles of two notes that are in both. Notes written apart on one lab share a few
-# per cent; at a quarter, two in five sentences are the same.
-COPIED = 0.25
-# Shorter notes are the same by chance
-MIN_SHINGLES = 25
-# What more than half of the class has is the instructor's template, from a class of this size on;
-# in a smaller one the copy itself would be taken for it
-TEMPLATE_SHARE = 0.5
-TEMPLATE_CLASS = 5
-# Of notes longer than this only the beginning is compared
-MAX_LETTERS = 30_000
 # Chosen noises have so many digits together before they are the same by chance only once in a
 # thousand pairs: 0.3 and 0.1 are what many would type
 MIN_DIGITS = 4
 # Digits to which px4fuse prints the settings that it advises
 PRINTED_DIGITS = 3
+# Numbers of a form that two students do not have in common by chance
+SAME_NUMBERS = 3
 # A hand-picked part of the flight below this share leaves most of it out
 HAND_PICKED = 0.5
 # Beyond this factor px4fuse itself names a wrong noise (findings/sigma.py, NOISE_OFF is 1.5);
@@ -176,6 +157,7 @@ def class_flags(
         _other_assignment(graded, key),
         _other_version(graded),
         _copied_notes(graded),
+        _same_form(graded),
         _other_name(graded, key),
     )
     for look in looks:
@@ -250,28 +232,8 @@ def _other_version(graded: Sequence[Graded]) -> Flags:
 
 
 def copied_notes(graded: Sequence[Graded]) -> list[tuple[float, int, int]]:
-    """Pairs whose notes share passages: which share of both, and their places."""
-    shingles = [_shingles(one.notes) for one in graded]
-    counted = Counter(part for parts in shingles for part in parts)
-    # a student who hands in twice does not make a template
-    if len(graded) >= TEMPLATE_CLASS:
-        common = {p for p, count in counted.items() if count > TEMPLATE_SHARE * len(graded)}
-        shingles = [parts - common for parts in shingles]
-    long = [index for index, parts in enumerate(shingles) if len(parts) >= MIN_SHINGLES]
-    # most of what anyone writes nobody else does: what is compared pair by pair is short
-    shared = {i: {part for part in shingles[i] if counted[part] > 1} for i in long}
-    pairs = []
-    for first, second in combinations(long, 2):
-        # no smaller than this share, whatever the rest
-        most = min(len(shared[first]), len(shared[second]))
-        least = COPIED * max(len(shingles[first]), len(shingles[second]))
-        if most < least or _who(graded[first]) == _who(graded[second]):
-            continue
-        both = len(shared[first] & shared[second])
-        share = both / (len(shingles[first]) + len(shingles[second]) - both)
-        if share >= COPIED:
-            pairs.append((share, first, second))
-    return pairs
+    """Pairs whose texts share passages: which share of the shorter one, and their places."""
+    return copies([one.notes for one in graded], [_who(one) for one in graded])
 
 
 def _copied_notes(graded: Sequence[Graded]) -> Flags:
@@ -281,24 +243,27 @@ def _copied_notes(graded: Sequence[Graded]) -> Flags:
         alike[second].append((share, first))
     for index, others in sorted(alike.items()):
         others.sort(reverse=True)
-        named = [f"{_name(graded[other])} ({share:.0%} of both)" for share, other in others]
-        yield index, f"The notes share whole passages with those of {few_words(named, SHOWN)}."
+        named = [f"{_name(graded[other])} ({share:.0%} of the shorter)" for share, other in others]
+        yield index, f"The text shares whole passages with those of {few_words(named, SHOWN)}."
 
 
-def _shingles(text: str) -> frozenset[int]:
-    """Hashes of runs of letters, what looks alike taken for the same, spaces and signs aside.
+def _same_form(graded: Sequence[Graded]) -> Flags:
+    """Wrong numbers that two students have in common, to the last digit."""
+    where: dict[tuple[float, ...], list[int]] = defaultdict(list)
+    for index, one in enumerate(graded):
+        if one.form is not None and len(numbers := _numbers_of(one.form)) >= SAME_NUMBERS:
+            where[numbers].append(index)
+    for members in where.values():
+        if len({_who(graded[index]) for index in members}) > 1:
+            for index in members:
+                yield index, f"The form has the numbers of {_others(graded, members, index)}."
 
-    Of all runs those that are 0 modulo :data:`KEPT` stand for the others (Manber 1994): the same in
-    every text that holds them.
-    """
-    letters = "".join(filter(str.isalnum, folded(text[: 2 * MAX_LETTERS])))[:MAX_LETTERS]
-    if len(letters) < SHINGLE_LETTERS:
-        return frozenset()
-    codes = np.frombuffer(letters.encode("utf-32-le"), np.uint32).astype(np.uint64)
-    # 64-bit arithmetic wraps around, as a hash may
-    powers = np.cumprod(np.full(SHINGLE_LETTERS, MULTIPLIER, np.uint64))
-    hashes = sliding_window_view(codes, SHINGLE_LETTERS) @ powers >> np.uint64(20)
-    return frozenset(hashes[hashes % KEPT == 0].tolist())
+
+def _numbers_of(form: Answers) -> tuple[float, ...]:
+    """Sizes, values and quantities with digits that nobody types by chance."""
+    given = [number for one in form.mistakes for number in (one.size, one.value)]
+    given += [number for number in form.quantities if isinstance(number, float)]
+    return tuple(number for number in given if number is not None and _digits(number) > 1)
 
 
 def _other_name(graded: Sequence[Graded], key: AnswerKey | None) -> Flags:

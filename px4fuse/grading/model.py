@@ -8,6 +8,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any, Literal
 
+from px4fuse.answers import Answers
 from px4fuse.verification.model import Verdict
 
 Kind = Literal["number", "whole", "flag", "text", "texts"]
@@ -62,24 +63,6 @@ class RubricItem:
 
 
 @dataclass(frozen=True)
-class Reading:
-    """From when on notes are a text of one's own: [notes] in rubric.toml explains each."""
-
-    judged_from: float = 20
-    shortest: float = 3
-    longest: float = 60
-    in_sentences: float = 0.5
-    ids: float = 0.25
-    quoted: float = 0.5
-    packed: float = 0.2
-    common: float = 0.06
-    commonest: float = 0.2
-    terms: float = 0.4
-    about: float = 0.35
-    most_named: float = 4
-
-
-@dataclass(frozen=True)
 class Rubric:
     """What a report is worth.
 
@@ -91,18 +74,19 @@ class Rubric:
         What becomes of those of a report on a log that was not given to the student.
     pages : {"count", "pending", "zero"}
         What becomes of those of a verified report whose pages look otherwise.
-    words : dict
-        Finding id to words by which notes may name it, and what says or changes something about
-        them: see rubric.toml.
+    min_words : int
+        Of a student's text, below which the instructor is told.
+    common_words : tuple of str
+        The commonest words of the course's language; empty for any language.
     """
 
     title: str
     unverified: Doubtful
     items: tuple[RubricItem, ...]
-    words: dict[str, tuple[str, ...]] = field(default_factory=dict)
     others_log: Doubtful = "pending"
     pages: Doubtful = "count"
-    notes: Reading = field(default_factory=Reading)
+    min_words: int = 100
+    common_words: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -131,12 +115,17 @@ class Submission:
 
 @dataclass(frozen=True)
 class Item:
-    """Points for one part of the rubric, and why."""
+    """Points for one part of the rubric, and why.
+
+    ``by_hand``: only the instructor gives them; ``waits``: has not yet.
+    """
 
     title: str
     points: float
     of: float
     comment: str
+    by_hand: bool = False
+    waits: bool = False
 
 
 @dataclass(frozen=True)
@@ -157,8 +146,8 @@ class Graded:
         What an instructor should look at: sentences.
     pending : str
         One sentence: what the instructor can do so that the points count.
-    to_read : tuple of (str, str)
-        What no rule can judge: why, and the passage of the notes.
+    form : Answers or None
+        The form as it was filled in.
     numbers : mapping
         A few for the class table, by column title.
     sha256, log_sha256, version : str
@@ -168,8 +157,7 @@ class Graded:
     notes : str
         The student's own words.
     mistakes : mapping
-        What the answer key says is wrong in the student's flight, in words, and whether the notes
-        name it.
+        What the answer key says is wrong in the student's flight, and whether the form names it.
     handed_in : bytes
         PNG of a page as it was handed in: the cover where nothing could be redrawn, else the one
         that differs most.
@@ -187,7 +175,7 @@ class Graded:
     items: tuple[Item, ...] = ()
     flags: tuple[str, ...] = ()
     pending: str = ""
-    to_read: tuple[tuple[str, str], ...] = ()
+    form: Answers | None = None
     numbers: Mapping[str, float] = field(default_factory=dict)
     sha256: str = ""
     log_sha256: str = ""
@@ -209,16 +197,18 @@ class Graded:
 
     @property
     def points(self) -> float:
-        """Sum over the items; while :attr:`pending` a proposal, never to be added to anything.
-
-        Wrong claims can cost more than their item gives, but never more than there is.
-        """
-        return max(sum(item.points for item in self.items), 0.0)
+        """Sum over the items; while :attr:`pending` a proposal, never to be added to anything."""
+        return sum(item.points for item in self.items)
 
     @property
     def counted(self) -> float | None:
-        """The points that count, never below zero; None while they are pending."""
-        return None if self.pending else max(self.points, 0.0)
+        """The points that count; None while they, or some of them, are the instructor's to say."""
+        return None if self.pending or self.waits else self.points
+
+    @property
+    def waits(self) -> bool:
+        """Whether the instructor has not yet given the points of an item."""
+        return any(item.waits for item in self.items)
 
     @property
     def of(self) -> float:

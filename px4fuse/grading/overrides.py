@@ -47,6 +47,7 @@ def read_overrides(path: Path) -> Overrides:
     found: dict[str, dict[str, Override]] = defaultdict(dict)
     for number, row in zip(sheet.numbers, sheet.rows, strict=True):
         student, item, points = (sheet.cell(row, (title,)) for title in TITLES[:3])
+        student, item = (cell.removeprefix("'") for cell in (student, item))
         comment = cleaned(sheet.cell(row, ("comment",))[:MAX_COMMENT])
         if item in found[student]:
             raise SettingsError(

@@ -6,18 +6,15 @@ check does and which parameters it has is in :data:`px4fuse.grading.scoring.CHEC
 
 from __future__ import annotations
 
-import json
 import math
 import tomllib
 from collections.abc import Mapping
-from dataclasses import fields, replace
 from importlib.resources import files
 from pathlib import Path
 from typing import Any, NoReturn, cast
 
 from px4fuse.errors import SettingsError
-from px4fuse.findings import phrases
-from px4fuse.grading.model import Applies, Doubtful, Parameter, Reading, Rubric, RubricItem
+from px4fuse.grading.model import Applies, Doubtful, Parameter, Rubric, RubricItem
 from px4fuse.grading.scoring import CHECKS
 from px4fuse.reading import read_text
 
@@ -38,17 +35,12 @@ DOUBTFUL = {
 }
 
 ITEM_KEYS = ("title", "points", "check", "report")
-RUBRIC_KEYS = ("title", *DOUBTFUL, "notes", "item", "words")
+RUBRIC_KEYS = ("title", *DOUBTFUL, "min_words", "common_words", "item")
 
 
 def rubric_text() -> str:
     """The default rubric, comments and all, for an instructor to copy and edit."""
-    text = files("px4fuse.grading").joinpath(DEFAULT).read_text(encoding="utf-8")
-    own = (
-        f"# {name} = {json.dumps(listed, ensure_ascii=False)}\n"
-        for name, listed in phrases().items()
-    )
-    return text + "".join(own)
+    return files("px4fuse.grading").joinpath(DEFAULT).read_text(encoding="utf-8")
 
 
 def read_rubric(path: Path | None) -> Rubric:
@@ -65,12 +57,8 @@ def read_rubric(path: Path | None) -> Rubric:
         It cannot be read, or something in it is not what it should be: the text says which item.
     """
     if path is None:
-        rubric = parse_rubric(rubric_text(), DEFAULT)
-        return replace(rubric, words={**phrases(), **rubric.words})
-    default = read_rubric(None)
-    text = read_text(path, SettingsError, MAX_RUBRIC_BYTES, name=str(path))
-    rubric = parse_rubric(text, str(path))
-    return replace(rubric, words={**default.words, **rubric.words})
+        return parse_rubric(rubric_text(), DEFAULT)
+    return parse_rubric(read_text(path, SettingsError, MAX_RUBRIC_BYTES, name=str(path)), str(path))
 
 
 def parse_rubric(text: str, where: str) -> Rubric:
@@ -103,8 +91,8 @@ def parse_rubric(text: str, where: str) -> Rubric:
     return Rubric(
         title=_value(where, "title", given, Parameter("text", "")),
         items=read,
-        words=_words(where, given.get("words", {})),
-        notes=_reading(where, given.get("notes", {})),
+        min_words=_value(where, "min_words", given, Parameter("whole", 100, 0, 100_000)),
+        common_words=_value(where, "common_words", given, Parameter("texts", ())),
         **fates,
     )
 
@@ -148,29 +136,6 @@ def _check_bounds(here: str, given: Mapping[str, Any]) -> None:
         _refuse(here, "zero_at goes with one bound; give at_least or at_most alone")
     if (high is not None and zero <= high) or (low is not None and zero >= low):
         _refuse(here, "zero_at is on the good side of the bound; put it beyond")
-
-
-def _words(where: str, given: object) -> dict[str, tuple[str, ...]]:
-    if not isinstance(given, dict) or len(given) > MAX_ITEMS:
-        _refuse(where, '[words] is not a table of finding ids; give ID = ["word", ...]')
-    here = f"{where}: [words]"
-    return {name: _value(here, name, given, Parameter("texts")) for name in given}
-
-
-def _reading(where: str, given: object) -> Reading:
-    if not isinstance(given, dict):
-        _refuse(where, "[notes] is not a table; give NAME = NUMBER")
-    here = f"{where}: [notes]"
-    known = {one.name: one.default for one in fields(Reading)}
-    for name in given:
-        if name not in known:
-            _refuse(here, f"unknown key {name!r}; it may have {', '.join(known)}")
-    return Reading(
-        **{
-            name: _value(here, name, given, Parameter("number", default, 0.0, 1e5))
-            for name, default in known.items()
-        }
-    )
 
 
 def _value(here: str, name: str, given: Mapping[str, Any], parameter: Parameter) -> Any:

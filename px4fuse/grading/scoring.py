@@ -6,22 +6,20 @@ no points and a comment, never an exception.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from px4fuse.assignment.key import AnswerKey
-from px4fuse.findings import SEVERITIES, named
-from px4fuse.grading import checks_filter, checks_loop, checks_mistakes, checks_report
+from px4fuse.grading import checks_filter, checks_loop, checks_report
 from px4fuse.grading.checks_filter import SIGMAS
 from px4fuse.grading.evidence import Evidence, Scorer, reason_of, text_of
 from px4fuse.grading.model import Doubtful, Graded, Item, Parameter, Rubric, RubricItem
-from px4fuse.grading.notes import MANY_DISGUISED
+from px4fuse.grading.text import text_flags
+from px4fuse.plain import capital
 from px4fuse.verification.model import Refused, Report, Verdict
 
-# Checks in which a wrong claim costs what a right one earns, so that guessing does not pay
-COSTLY = frozenset(("findings", "mistakes"))
-# Passages for the instructor to read, of one report
-MOST_TO_READ = 6
+# Items for which there has to be an answer key, and which only the instructor can score
+NEED_KEY, BY_HAND = frozenset(("answers", "text")), frozenset(("text",))
 
 
 @dataclass(frozen=True)
@@ -48,16 +46,6 @@ CHECKS: Mapping[str, Check] = {
     ),
     "sections": _check(
         checks_report.sections, results=Parameter("texts", ()), pages=Parameter("texts", ())
-    ),
-    "notes": _check(
-        checks_report.notes,
-        min_words=Parameter("whole", 150, 1, 100_000),
-        min_different=Parameter("whole", 60, 1, 100_000),
-    ),
-    "findings": _check(
-        checks_report.findings,
-        severities=Parameter("texts", ("error", "warning"), choices=SEVERITIES),
-        ignore=Parameter("texts", ("ekf2_unavailable",)),
     ),
     "tuning": _check(
         checks_filter.tuning,
@@ -99,7 +87,8 @@ CHECKS: Mapping[str, Check] = {
         min_path_m=Parameter("number", 20.0, 0.0, 1e6),
         handed_out=_share(0.4),
     ),
-    "mistakes": _check(checks_mistakes.mistakes, in_report=_share(0.0)),
+    "answers": _check(checks_report.answers),
+    "text": _check(checks_report.text),
 }
 
 
@@ -112,7 +101,7 @@ def assess(
 ) -> Graded:
     """Points for one report, whether they count, and what is left for the instructor.
 
-    Items for another kind of report are left out, and without an answer key those on mistakes. The
+    Items for another kind of report are left out, and without an answer key those on the form. The
     names of the file, and what :mod:`px4fuse.grading.grade` knows of it, are for the caller to add.
     ``owner_id`` is that of who handed it in, where a platform says so, whatever the report says.
     """
@@ -125,27 +114,26 @@ def assess(
         share, comment = 0.0, f"No points, since {why}."
         if fate != "zero":
             share, comment = CHECKS[item.check].score(evidence, item.parameters)
-        least = -1.0 if item.check in COSTLY else 0.0
-        points = round(item.points * min(max(share, least), 1.0), 2)
-        made.append(Item(item.title, points, item.points, comment[:1].upper() + comment[1:]))
+        written = bool(report.results.student.notes.strip())
+        by_hand = item.check in BY_HAND
+        waits = by_hand and written and fate != "zero"
+        points = round(item.points * min(max(share, 0.0), 1.0), 2)
+        made.append(Item(item.title, points, item.points, capital(comment), by_hand, waits))
+    found = evidence.form_points
     return Graded(
         "",
         report.results.student.name,
         report.results.student.id,
         verdict,
         tuple(made),
-        flags=(*_notes_flags(evidence), *checks_loop.contradictions(evidence)),
+        flags=(
+            *text_flags(report.results, rubric.min_words, rubric.common_words),
+            *checks_loop.contradictions(evidence),
+        ),
         pending=why if fate == "pending" else "",
-        to_read=tuple(_to_read(evidence)),
-        mistakes=_mistakes(evidence),
+        mistakes={} if found is None or not evidence.own else found.named,
+        form=evidence.form,
     )
-
-
-def _mistakes(evidence: Evidence) -> dict[str, bool]:
-    if evidence.answer is None or not evidence.own:
-        return {}
-    earned = frozenset() if evidence.notes.problem else evidence.claims.earned
-    return {named(finding): finding in earned for finding in evidence.answer.findings}
 
 
 def score(
@@ -189,39 +177,6 @@ def _whose(evidence: Evidence) -> str:
     return f"Find out whose report it is: the log was given to {whose}, {said}."
 
 
-def _notes_flags(evidence: Evidence) -> Iterator[str]:
-    notes = evidence.notes
-    if notes.problem:
-        yield f"The notes {notes.problem}; they were not scored."
-    if notes.disguised >= MANY_DISGUISED:
-        yield (
-            f"The notes hold {notes.disguised} words with letters that only look like those of the "
-            "alphabet, or that nobody sees: such words hide from a search."
-        )
-
-
-def _to_read(evidence: Evidence) -> Iterator[tuple[str, str]]:
-    """Passages for the instructor, the first few."""
-    if evidence.notes.problem:
-        return
-    claims = evidence.claims
-    known = "the log has" if evidence.answer is not None else "the report finds"
-    earned = claims.earned
-    lines = [
-        (f"May name {named(one)}, which {known}", said)
-        for one, said in {**claims.open, **claims.unsure}.items() if one not in earned
-    ]  # fmt: skip
-    lacks = "the log does not have" if evidence.answer is not None else "the report does not find"
-    cost = "; it cost points" if evidence.charged else ""
-    lines += [
-        (f"Was read as naming {named(one)}, which {lacks}{cost}", said)
-        for one, said in claims.wrong.items()
-    ]
-    if checks_loop.unjudged(evidence):
-        lines.append(("Says that it did not come back (--open), which the log cannot tell", ""))
-    yield from ((f"{why}.", text_of(said)) for why, said in lines[:MOST_TO_READ])
-
-
 def refused(rubric: Rubric, key: AnswerKey | None, why: Refused) -> Graded:
     """No points for what is not a report, so that it stands in the table with the others."""
     comment = f"No points, since the file could not be read as a report: {text_of(why.reason)}"
@@ -235,4 +190,4 @@ def refused(rubric: Rubric, key: AnswerKey | None, why: Refused) -> Graded:
 
 
 def _applies(item: RubricItem, key: AnswerKey | None, kind: str) -> bool:
-    return item.report in ("any", kind) and (item.check != "mistakes" or key is not None)
+    return item.report in ("any", kind) and (item.check not in NEED_KEY or key is not None)

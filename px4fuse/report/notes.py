@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from px4fuse.answers import Answers, form_rows
 from px4fuse.report.document import Document, LoopDocument
 from px4fuse.report.page import Page, appendix
 from px4fuse.report.style import MUTED
@@ -69,14 +70,19 @@ class Table:
 
 
 def draw(document: Document | LoopDocument) -> Iterator[Page]:
-    """Draw as many pages as the notes need; none without notes."""
-    title = "Notes by the student"
+    """Draw as many pages as the form and the notes need; none without both."""
+    title = "What the student found"
     if isinstance(document, Document):
         title = appendix(title)
-    blocks = list(read(document.student.notes))
-    if not blocks:
+    blocks, answers = list(read(document.student.notes)), document.student.answers
+    if not blocks and not isinstance(answers, Answers):
         return
     page = Page(title)
+    if isinstance(answers, Answers):
+        page.heading("The form, as it was filled in")
+        page.table(("Asked", "Answer"), [list(row) for row in form_rows(answers)],
+                   shares=[3.0, 4.0], size=TABLE_SIZE)  # fmt: skip
+        page.skip(8.0)
     for block in blocks:
         if isinstance(block, Line):
             page.note(

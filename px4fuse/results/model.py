@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
+from px4fuse.answers import Answers
 from px4fuse.record import Record
 
 MAX_NOTES_BYTES = 200_000
@@ -30,11 +31,14 @@ class Student(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     name, id : str
     notes : str
         The student's own words, Markdown.
+    answers : Answers or UNSET
+        The form about the flight, as filled in.
     """
 
     name: Annotated[str, Meta(max_length=MAX_PERSON)] = ""
     id: Annotated[str, Meta(max_length=MAX_PERSON)] = ""
     notes: Annotated[str, Meta(max_length=MAX_NOTES_BYTES)] = ""
+    answers: Answers | msgspec.UnsetType = msgspec.UNSET
 
 
 class Provenance(Record, frozen=True):

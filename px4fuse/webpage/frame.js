@@ -6,7 +6,7 @@
   const fold = (text) => text.normalize("NFD").replace(/\p{M}/gu, "").toLowerCase();
   const frame = document.querySelector(".frame");
   const selects = [...document.querySelectorAll(".controls select")];
-  const boxes = [...document.querySelectorAll("[data-group]")];
+  const shownGroups = [...document.querySelectorAll("[data-group]")];
   const tagged = [...document.querySelectorAll("button[data-tag]")];
 
   // Text from data only ever becomes a text node
@@ -106,18 +106,53 @@
     }
     return made;
   };
-  const sides = (both) => {
-    const made = make("div", "", "sides");
-    for (const [heading, ...pieces] of both) {
-      const side = make("section");
-      const text = isolated("p", "", "notes");
-      text.append(...pieces.map(([words, marked]) => make(marked ? "mark" : "span", words)));
-      side.append(isolated("h3", heading[0]), text);
-      made.append(side);
+  // What is typed in boxes, by whom it is about and its name; it leaves the page as a download only
+  const typed = new Map();
+  const boxes = (owner, lines, kept) => {
+    const made = make("div", "", "boxes");
+    for (const [name, most, points, words] of lines) {
+      const number = make("input");
+      const text = make("textarea");
+      Object.assign(number, { type: "number", min: 0, max: most, step: "any", value: points ?? "" });
+      Object.assign(text, { rows: 2, value: words, dir: "auto" });
+      for (const [title, field] of [["Points of " + most + " for " + name, number],
+        ["Comment", text]]) {
+        const label = isolated("label", title);
+        label.append(field);
+        made.append(label);
+        field.addEventListener("input", () => {
+          typed.set(owner + "\u0000" + name, [owner, name, number.value, text.value]);
+          at("save").hidden = false;
+        });
+      }
     }
+    made.append(make("small", kept.length ? kept.length + " more in overrides.csv, kept" : ""));
     return made;
   };
-  const makers = { list, prose, pairs, table, links, pictures, sides };
+  const tableOfBoxes = () => {
+    const lines = new Map();
+    for (const { details } of entries) {
+      for (const [kind, , owner, rows, kept] of details) {
+        if (kind !== "boxes") continue;
+        for (const [name, , points, words] of rows) {
+          if (points === null && !words) continue;
+          lines.set(owner + "\u0000" + name, [owner, name, points ?? "", words]);
+        }
+        for (const [name, points, words] of kept) {
+          lines.set(owner + "\u0000" + name, [owner, name, points ?? "", words]);
+        }
+      }
+    }
+    for (const [key, line] of typed) lines.set(key, line);
+    const quoted = (cell) => {
+      const text = String(cell);
+      // No cell begins a formula
+      return '"' + (/^[=+\-@\t\r]/.test(text) ? "'" : "") + text.replaceAll('"', '""') + '"';
+    };
+    const all = [["id", "item", "points", "comment"], ...lines.values()];
+    return "\ufeff" + all.map((line) => line.map(quoted).join(",") + "\r\n").join("");
+  };
+  const makers = { list, prose, pairs, table, links, pictures, boxes };
 
   const section = (parts, name) => {
     const made = make("section", "", name);
@@ -281,7 +316,7 @@
   };
 
   const groups = () => {
-    for (const box of boxes) whole.classList.toggle("with-" + box.dataset.group, box.checked);
+    for (const box of shownGroups) whole.classList.toggle("with-" + box.dataset.group, box.checked);
     fit();
   };
 
@@ -329,10 +364,17 @@
   document.querySelector(".controls").addEventListener("submit", (event) => event.preventDefault());
   at("text").addEventListener("input", filter);
   at("all").addEventListener("click", clear);
+  at("save").addEventListener("click", () => {
+    const link = make("a");
+    link.href = URL.createObjectURL(new Blob([tableOfBoxes()], { type: "text/csv" }));
+    link.download = "overrides.csv";
+    link.click();
+    URL.revokeObjectURL(link.href);
+  });
   at("back").addEventListener("click", () => turn(Math.max(first - size, 0)));
   at("on").addEventListener("click", () => turn(first + size));
   for (const select of selects) select.addEventListener("change", filter);
-  for (const box of boxes) {
+  for (const box of shownGroups) {
     box.checked = false;
     box.addEventListener("change", groups);
   }

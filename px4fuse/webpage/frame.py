@@ -147,13 +147,27 @@ def pictures(title: str, rows: Sequence[tuple[str, str, str]]) -> Part:
     ]
 
 
-def sides(title: str, left: Sequence[tuple[str, bool]], right: Sequence[tuple[str, bool]]) -> Part:
-    """Two texts beside each other, in pieces that are marked or not; the first is the heading."""
+def boxes(
+    title: str,
+    owner: str,
+    rows: Sequence[tuple[str, float, float | None, str]],
+    kept: Sequence[tuple[str, float | None, str]] = (),
+) -> Part:
+    """Boxes for points and words, which the page gives as a table to download.
+
+    Parameters
+    ----------
+    owner : str
+        Whose they are, as the table says it.
+    rows : sequence of (name, most, points, words)
+    kept : sequence of (name, points, words)
+        What the table holds besides.
+    """
     return [
-        "sides",
-        clean(title),
-        [[[clean(text), marked] for text, marked in side] for side in (left, right)],
-    ]
+        "boxes", clean(title), clean(owner),
+        [[clean(name), most, points, clean(words)] for name, most, points, words in rows],
+        [[clean(name), points, clean(words)] for name, points, words in kept],
+    ]  # fmt: skip
 
 
 # ------------------------------------------------------------------ above the table

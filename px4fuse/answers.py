@@ -1,0 +1,445 @@
+"""The form that a student fills in about a flight: ``answers.toml``.
+
+What it asks stands in tables here: the mistakes a flight can have, with the units of their sizes;
+what EKF2 can have done; the panels that show something; what can be done about it. Reading checks
+the form's grammar, never whether it is right.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import tomllib
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import msgspec
+from msgspec import Meta
+
+from px4fuse.errors import SettingsError
+from px4fuse.reading import read_text
+from px4fuse.record import Record, Sha256
+
+# tomllib takes seconds and gigabytes for one dotted key of 64 kB
+MAX_BYTES, MAX_LINE = 20_000, 500
+MOST_MISTAKES = 20
+NONE = "none"
+WHOLE_FLIGHT = "whole flight"
+BLANK = "\u2013"
+
+_S, _M = {"s": 1.0, "ms": 1e-3}, {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
+_PERCENT = {"%": 1.0, "factor": 100.0}
+_DEG = {"deg": 1.0, "rad": 57.29577951308232}
+_HZ, _A = {"Hz": 1.0}, {"m/s2": 1.0, "m/s²": 1.0}
+_FACTOR, _SD = {"factor": 1.0}, {"sd": 1.0}
+# What may be wrong: in words, and the units of its size (none: it has no size). The first unit is
+# the one that sizes are compared in; a factor of 1.05 on a length is 5 %
+MISTAKES: Mapping[str, tuple[str, Mapping[str, float]]] = {
+    NONE: ("nothing is wrong with the flight", {}),
+    "clock-offset": ("position stamps are late by this (negative: early), the whole flight", _S),
+    "clock-drift": ("the clock of the positions runs fast", {"ppm": 1.0}),
+    "clock-jump": ("stamps are late by this until the clocks are synchronised", _S),
+    "nlos": ("this share of the positions are outliers: no line of sight", {"%": 1.0}),
+    "dropout": ("the positions are silent that long", _S),
+    "imu-dropout": ("the IMU is missing that long", _S),
+    "decimate": ("positions come at this rate only", _HZ),
+    "r-scale": ("the variance that the source reports is this factor times the truth", _FACTOR),
+    "yaw": ("the position frame is turned against north (positive: clockwise)", _DEG),
+    "scale": ("distances of the positions are too long by this (negative: short)", _PERCENT),
+    "jump": ("the positions jump by this and stay there", _M),
+    "smoothed": ("the positions are low-pass filtered with this time constant", _S),
+    "accel-bias": ("the accelerometer's forward axis reads too much by this", _A),
+    "vibration": ("the accelerometer is this much noisier", _A),
+    "imu-rate": ("the IMU is logged at this rate only", _HZ),
+    "no-motion": ("the vehicle hovered where it took off", {}),
+    "open-end": ("the loop ends this far from its start: the closure is false", _M),
+    "vio-drift": ("the odometry drifts by this share of the path, more than usual", {"%": 1.0}),
+    "no-vvo": ("the positions that EKF2 was sent are not logged", {}),
+    "ekf2-noise": ("EKF2_EVP_NOISE is this, and the data ask for another", _M),
+    "ekf2-delay": ("EKF2_EV_DELAY is this, and the stamps are right", _S),
+    "ekf2-gate": ("EKF2_EVP_GATE is this, too small", _SD),
+    "ekf2-off": ("EKF2 was told not to fuse the positions", {}),
+}
+EKF2_DID = (
+    "nothing unusual", "followed the positions", "followed the wrong positions",
+    "fused at the wrong time", "rejected the bad samples", "rejected good samples",
+    "coasted, then reset", "trusted the positions too little", "never fused",
+)  # fmt: skip
+PANELS = (
+    "cover", "map", "position along the aisle", "velocity", "error to truth", "innovations",
+    "sigma", "why EKF2 differs", "parameters", "clock", "loop",
+)  # fmt: skip
+# What can be done about a mistake, with the units of its value (none: it takes no number)
+CURES: Mapping[str, Mapping[str, float]] = {
+    "--clock-offset": _S,
+    "--start": _S,
+    "--end": _S,
+    "--position-yaw": _DEG,
+    "--sigma-a": _A,
+    "--sigma-z": _M,
+    "--open": {},
+    "--landed-at": _M,
+    "--drift": _M,
+    "EKF2_EVP_NOISE": _M,
+    "EKF2_EVP_GATE": _SD,
+    "EKF2_EV_DELAY": {"ms": 1.0, "s": 1e3},
+    "EKF2_EV_CTRL": {"": 1.0},
+    "SDLOG_PROFILE": {"": 1.0},
+    "correct the stamps at the sender": _S,
+    "synchronise the clocks before take-off": {},
+    "multiply the positions at the sender": _FACTOR,
+    "turn the positions at the sender": _DEG,
+    "survey the anchors": {},
+    "one set of anchors": {},
+    "line of sight and link": {},
+    "switch the smoothing off": {},
+    "send positions more often": _HZ,
+    "report the true variance": _M,
+    "calibrate the accelerometer": {},
+    "balance the propellers": {},
+    "log at a higher rate": _HZ,
+    "fly several passes": {},
+}
+VERDICTS = ("consistent", "overstated", "understated")
+
+Number = Annotated[float, Meta(gt=-1e9, lt=1e9)]
+
+
+class Claim(Record, frozen=True):
+    """One mistake that a student names.
+
+    Attributes
+    ----------
+    kind : str
+        One of :data:`MISTAKES`.
+    size : float or None
+        In ``unit``, one of those of the kind; with its sign.
+    when : str
+        "whole flight", or empty where ``from_s`` and ``until_s`` (since the first data) say it.
+    parameter : str
+        One of :data:`CURES`, with its ``value`` in ``value_unit``.
+    panel : str
+        One of :data:`PANELS`: where it was seen.
+    """
+
+    kind: str
+    size: Number | None = None
+    unit: Annotated[str, Meta(max_length=10)] = ""
+    when: Literal["", "whole flight"] = ""
+    from_s: Number | None = None
+    until_s: Number | None = None
+    parameter: str = ""
+    value: Number | None = None
+    value_unit: Annotated[str, Meta(max_length=10)] = ""
+    panel: str = ""
+
+    def size_in_first_unit(self) -> float | None:
+        """The size in the kind's first unit; a length's factor as what it is beyond 1."""
+        units = MISTAKES[self.kind][1]
+        if self.size is None or not units:
+            return None
+        if self.unit == "factor" and self.kind == "scale":
+            return (self.size - 1.0) * 100.0
+        return self.size * (units[self.unit] if self.unit else next(iter(units.values())))
+
+    def value_in_first_unit(self) -> float | None:
+        """The value in the parameter's first unit."""
+        units = CURES.get(self.parameter, {})
+        if self.value is None or not units:
+            return self.value
+        return self.value * units.get(self.value_unit, 1.0)
+
+
+class Answers(Record, frozen=True, kw_only=True):
+    """A form as it was filled in; what was left blank is not there.
+
+    Attributes
+    ----------
+    log_sha256 : str
+        Of the log that the form was made for.
+    verdict_ours, verdict_ekf2 : str
+        On the innovation variance, one of :data:`VERDICTS`.
+    quantities : tuple of (float, tuple of float, or None)
+        In the order of :func:`asked`; a tuple where a list of updates was asked for.
+    """
+
+    log_sha256: Sha256
+    mistakes: Annotated[tuple[Claim, ...], Meta(max_length=MOST_MISTAKES)] = ()
+    verdict_ours: Literal["", "consistent", "overstated", "understated"] = ""
+    verdict_ekf2: Literal["", "consistent", "overstated", "understated"] = ""
+    ekf2_did: Annotated[tuple[str, ...], Meta(max_length=len(EKF2_DID))] = ()
+    quantities: Annotated[
+        tuple[Number | Annotated[tuple[Number, ...], Meta(max_length=200)] | None, ...],
+        Meta(max_length=10),
+    ] = ()
+
+    @property
+    def says_none(self) -> bool:
+        """Whether it says that nothing is wrong."""
+        return [claim.kind for claim in self.mistakes] == [NONE]
+
+
+QuantityKind = Literal["gain", "variance", "innovation", "nis", "silence", "gate"]
+# One of each pair is asked
+_DRAWN: tuple[tuple[QuantityKind, QuantityKind], ...] = (
+    ("gain", "variance"), ("innovation", "nis"), ("silence", "gate"),
+)  # fmt: skip
+
+
+class Quantity(Record, frozen=True):
+    """A number that no report prints, asked at settings of each log's own.
+
+    Attributes
+    ----------
+    kind : str
+        What is asked, along the aisle.
+    update : int
+        Counted from 1, as rows of ``replay(...).updates``: the first measurement is no update.
+    sigma_a_m_s2, sigma_z_m : float
+        Settings of our filter.
+    extra : float
+        Seconds of silence, or the gate in standard deviations.
+    """
+
+    kind: QuantityKind
+    update: int
+    sigma_a_m_s2: float
+    sigma_z_m: float
+    extra: float = 0.0
+
+    @property
+    def words(self) -> str:
+        """The question."""
+        what = {
+            "gain": f"position gain of update {self.update}",
+            "variance": f"position variance after update {self.update} (m²)",
+            "innovation": f"innovation of update {self.update} (m)",
+            "nis": f"NIS of update {self.update}",
+            "silence": f"sigma of the position {self.extra:g} s after update {self.update}, "
+            "without a further measurement (m)",
+            "gate": f"which of the updates {self.update} to {self.update + GATED} lie outside "
+            f"{self.extra:g} sqrt(S), as a list; the filter takes them all the same",
+        }[self.kind]
+        return f"{what}; with SIGMA_A {self.sigma_a_m_s2:g} and SIGMA_Z {self.sigma_z_m:g}"
+
+
+# Updates that a question about the gate goes over
+GATED = 20
+
+
+def asked(log_sha256: str) -> tuple[Quantity, ...]:
+    """Three quantities, which follow from the log and differ between logs."""
+    drawn = iter(hashlib.sha256(f"px4fuse answers {log_sha256}".encode()).digest())
+
+    def between(low: float, high: float, decimals: int) -> float:
+        return round(low + (high - low) * next(drawn) / 255.0, decimals)
+
+    settings = (between(0.2, 0.45, 2), between(0.06, 0.14, 3))
+    early, late, last = (pair[next(drawn) % 2] for pair in _DRAWN)
+    extra = between(1.0, 4.0, 1) if last == "silence" else between(1.3, 2.0, 1)
+    return (
+        Quantity(early, 2 + next(drawn) % 7, *settings),
+        Quantity(late, 20 + next(drawn) % 130, *settings),
+        Quantity(last, 20 + next(drawn) % 100, *settings, extra),
+    )
+
+
+def read_answers(path: Path) -> Answers:
+    """Read a form and check its grammar.
+
+    Raises
+    ------
+    SettingsError
+        It is not a form, or a field does not say what can be said there: which, and what can.
+    """
+    text = read_text(path, SettingsError, MAX_BYTES, name=str(path))
+    if any(len(line) > MAX_LINE for line in text.splitlines()):
+        raise SettingsError(f"{path}: has a line of more than {MAX_LINE} characters.")
+    try:
+        filled = msgspec.convert(_without_blanks(tomllib.loads(text)), _Filled)
+        answers = _answers(filled)
+        check(answers)
+    except (tomllib.TOMLDecodeError, RecursionError, msgspec.ValidationError, ValueError) as error:
+        raise SettingsError(f"{path}: {error}. Correct it there.") from error
+    return answers
+
+
+class _Filled(Record, frozen=True, kw_only=True):
+    """The file's own shape: claims under "mistake", numbers under the names of their questions."""
+
+    log_sha256: Sha256
+    mistake: tuple[Claim, ...] = ()
+    verdict_ours: Literal["", "consistent", "overstated", "understated"] = ""
+    verdict_ekf2: Literal["", "consistent", "overstated", "understated"] = ""
+    ekf2_did: tuple[str, ...] = ()
+    quantities: dict[str, Number | tuple[Number, ...]] = msgspec.field(default_factory=dict)
+
+
+def _without_blanks(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _without_blanks(part) for key, part in value.items() if part != ""}
+    if isinstance(value, list):
+        return [part for part in map(_without_blanks, value) if part not in ("", {})]
+    return value
+
+
+def _answers(filled: _Filled) -> Answers:
+    given = msgspec.structs.asdict(filled)
+    numbers = given.pop("quantities")
+    names = [f"q{number}" for number in range(1, len(asked("")) + 1)]
+    if unknown := sorted(numbers.keys() - set(names)):
+        raise ValueError(f"{unknown[0]} is not one of {', '.join(names)}")
+    return Answers(
+        mistakes=given.pop("mistake"),
+        quantities=tuple(numbers.get(name) for name in names),
+        **given,
+    )
+
+
+def check(answers: Answers) -> None:
+    """Check the grammar beyond types, as far as tables say it.
+
+    Raises
+    ------
+    ValueError
+        A word that cannot stand there, a number out of range, a claim twice.
+    """
+    kinds = [claim.kind for claim in answers.mistakes]
+    for name in kinds:
+        _one_of("kind", name, MISTAKES)
+        if kinds.count(name) > 1:
+            raise ValueError(f"kind {name!r} stands there twice: give each mistake once")
+    if NONE in kinds and len(kinds) > 1:
+        raise ValueError('kind "none" stands beside a mistake: give one or the other')
+    for said in answers.ekf2_did:
+        _one_of("ekf2_did", said, EKF2_DID)
+    for claim in answers.mistakes:
+        where = f"of {claim.kind}: "
+        if claim.parameter:
+            _one_of(f"{where}parameter", claim.parameter, CURES)
+        if claim.panel:
+            _one_of(f"{where}panel", claim.panel, PANELS)
+        if claim.unit:
+            _one_of(f"{where}unit", claim.unit, MISTAKES[claim.kind][1])
+        if claim.value_unit and claim.parameter:
+            _one_of(f"{where}value_unit", claim.value_unit, CURES[claim.parameter])
+        low, high = RANGES.get(claim.kind, (-1e6, 1e6))
+        size = claim.size_in_first_unit()
+        if size is not None and not low <= size <= high:
+            unit = next(iter(MISTAKES[claim.kind][1]))
+            raise ValueError(f"{where}size {size:g} {unit} is none that it can have: {low:g} to "
+                             f"{high:g} {unit}")  # fmt: skip
+
+
+# Sizes beyond which a number is a slip or nonsense, in the kind's first unit
+RANGES: Mapping[str, tuple[float, float]] = {
+    "clock-offset": (-5.0, 5.0), "clock-jump": (-5.0, 5.0), "nlos": (0.0, 100.0),
+    "dropout": (0.0, 600.0), "imu-dropout": (0.0, 600.0), "yaw": (-180.0, 180.0),
+    "scale": (-90.0, 400.0), "jump": (-100.0, 100.0), "smoothed": (0.0, 10.0),
+    "accel-bias": (-20.0, 20.0), "vibration": (0.0, 50.0), "imu-rate": (0.0, 8000.0),
+    "decimate": (0.0, 1000.0), "r-scale": (0.0, 1e6), "open-end": (0.0, 1000.0),
+    "vio-drift": (0.0, 100.0), "ekf2-noise": (0.0, 100.0), "ekf2-delay": (-5.0, 5.0),
+    "ekf2-gate": (0.0, 1000.0), "clock-drift": (-1e5, 1e5),
+}  # fmt: skip
+
+
+def _one_of(field: str, value: str, known: Any) -> None:
+    if value not in known:
+        allowed = ", ".join(f'"{name}"' for name in known) or "none: leave it empty"
+        raise ValueError(f"{field} {value!r} is not one of {allowed}")
+
+
+def form_name(log_name: str) -> str:
+    """What the form of a log is called.
+
+    >>> form_name("s07.ulg")
+    's07.answers.toml'
+    """
+    return f"{Path(log_name).stem}.answers.toml"
+
+
+def form_text(log_name: str, log_sha256: str) -> str:
+    """An empty form for a log, with everything that can be said in it explained."""
+    return "".join(f"{line}\n" for line in _form_lines(log_name, log_sha256))
+
+
+def _form_lines(log_name: str, log_sha256: str) -> Iterator[str]:
+    yield f"# What you found in {log_name}. Fill in between the quotes; numbers stand without"
+    yield '# them: size = 0.2. Leave "" where you do not know. Then make your report with'
+    yield f"#     px4fuse compare {log_name} --answers {form_name(log_name)} --notes notes.md"
+    yield "# which checks that the form can be read, not whether it is right."
+    yield ""
+    yield f'log_sha256 = "{log_sha256}"    # leave it as it is'
+    yield ""
+    yield "# Innovation variance of each filter in the report with SIGMA_A 0.5 and SIGMA_Z 0.1:"
+    yield f"# {_quoted(VERDICTS)}"
+    yield 'verdict_ours = ""'
+    yield 'verdict_ekf2 = ""'
+    yield ""
+    yield "# What EKF2 did, one or more of"
+    yield from (f"#     {name}" for name in _wrapped(EKF2_DID))
+    yield "ekf2_did = []"
+    yield ""
+    yield "# What is wrong with the flight. Copy the block below for each further mistake: a claim"
+    yield '# that is not true costs points. If nothing is wrong give kind = "none" and no more.'
+    yield "# kinds, and the units of their sizes:"
+    for name, (words, units) in MISTAKES.items():
+        unit = f" [{', '.join(filter(None, units))}]" if any(units) else ""
+        yield f"#     {name:13} {words}{unit}"
+    yield "# parameters (what cures it), and the units of their values:"
+    for name, units in CURES.items():
+        yield f"#     {name}" + (f" [{', '.join(filter(None, units))}]" if any(units) else "")
+    yield "# panels (where you saw it best):"
+    yield from (f"#     {line}" for line in _wrapped(PANELS))
+    yield "[[mistake]]"
+    yield 'kind = ""'
+    yield 'size = ""         # a number, with its sign'
+    yield 'unit = ""'
+    yield f'when = ""         # "{WHOLE_FLIGHT}", or give seconds since the first data:'
+    yield 'from_s = ""'
+    yield 'until_s = ""'
+    yield 'parameter = ""    # what cures it'
+    yield 'value = ""        # to which value'
+    yield 'value_unit = ""'
+    yield 'panel = ""'
+    yield ""
+    yield "# Numbers along the aisle that the report does not print, from a replay of your own with"
+    yield "# DT 0.1 s. Update 1 is the filter's first: the first measurement only sets its state."
+    yield "[quantities]"
+    for number, quantity in enumerate(asked(log_sha256), start=1):
+        yield f"# {quantity.words}"
+        yield f'q{number} = ""{"    # such as [61, 64]" if quantity.kind == "gate" else ""}'
+
+
+def form_rows(answers: Answers) -> Iterator[tuple[str, str]]:
+    """A filled form as names and values, for pages."""
+    yield "Variance of our filter", answers.verdict_ours or BLANK
+    yield "Variance of EKF2", answers.verdict_ekf2 or BLANK
+    yield "What EKF2 did", ", ".join(answers.ekf2_did) or BLANK
+    for claim in answers.mistakes:
+        ends = (("from", claim.from_s), ("until", claim.until_s))
+        span = (f"{name} {at:g} s" for name, at in ends if at is not None)
+        said = (
+            _number_words(claim.size, claim.unit, MISTAKES.get(claim.kind, ("", {}))[1]),
+            claim.when or " ".join(span),
+            claim.panel and f"seen in {claim.panel}",
+            f"{claim.parameter} "
+            + _number_words(claim.value, claim.value_unit, CURES.get(claim.parameter, {})),
+        )
+        yield claim.kind, "; ".join(part.strip() for part in said if part.strip()) or BLANK
+    for quantity, given in zip(asked(answers.log_sha256), answers.quantities, strict=False):
+        numbers = given if isinstance(given, tuple) else [] if given is None else [given]
+        yield quantity.words, ", ".join(f"{number:g}" for number in numbers) or BLANK
+
+
+def _number_words(number: float | None, unit: str, units: Mapping[str, float]) -> str:
+    return "" if number is None else f"{number:g} {unit or next(iter(units), '')}".rstrip()
+
+
+def _quoted(names: Any) -> str:
+    return ", ".join(f'"{name}"' for name in names)
+
+
+def _wrapped(names: tuple[str, ...]) -> Iterator[str]:
+    for start in range(0, len(names), 3):
+        yield _quoted(names[start : start + 3])

@@ -1,0 +1,222 @@
+"""What the right answers to a simulated flight are: the key to its form."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from px4fuse.answers import GATED, Quantity, asked
+from px4fuse.comparison.comparison import compare
+from px4fuse.comparison.estimates import clock_offset, tuned_horizontally
+from px4fuse.comparison.model import AxisComparison, Comparison, FilterName, FilterSummary
+from px4fuse.filter.clock import ClockOffset
+from px4fuse.filter.kalman import replay
+from px4fuse.filter.model import COVARIANCES, matrix, noise, transition
+from px4fuse.filter.settings import Settings
+from px4fuse.flight import Ekf2, Unavailable
+from px4fuse.record import Record
+from px4fuse.simulation import flights
+from px4fuse.simulation.mistakes import MISTAKES as SIMULATED
+from px4fuse.simulation.sensors import TIMESYNC_CONVERGED_S
+
+# A size may be off by this share and is right
+TOLERANCE = 0.15
+# From this factor in variance on a verdict cannot be mistaken
+CLEAR = 1.5
+# EKF2 has rejected samples from this share on
+REJECTED = 0.005
+# A reset of position that is seen, after EKF2 has found its first position
+RESET_M, SETTLED_S = 0.2, 5.0
+# What EKF2 does with a source that has this; after the semicolon what may be said as well
+DID: Mapping[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
+    "clock-offset": (("followed the wrong positions",), ("fused at the wrong time",)),
+    "clock-drift": (("followed the wrong positions",), ("fused at the wrong time",)),
+    "clock-jump": ((), ("fused at the wrong time", "followed the wrong positions")),
+    "yaw": (("followed the wrong positions",), ()),
+    "scale": (("followed the wrong positions",), ()),
+    "jump": ((), ("followed the wrong positions",)),
+    "smoothed": (("followed the wrong positions",), ("fused at the wrong time",)),
+    "ekf2-delay": (("fused at the wrong time",), ()),
+    "ekf2-off": (("never fused",), ()),
+    "dropout": ((), ("coasted, then reset",)),
+    "nlos": ((), ("followed the wrong positions",)),
+    "decimate": ((), ("never fused",)),
+}
+UNUSUAL_NOTHING = (("nothing unusual",), ("followed the positions",))
+
+
+class Wrong(Record, frozen=True):
+    """One mistake of a flight.
+
+    Attributes
+    ----------
+    size : float or None
+        In the first unit of :data:`px4fuse.answers.MISTAKES`; from ``low`` to ``high`` is right.
+    from_s, until_s : float or None
+        Since the first data; both None for the whole flight.
+    """
+
+    kind: str
+    size: float | None = None
+    low: float | None = None
+    high: float | None = None
+    from_s: float | None = None
+    until_s: float | None = None
+
+
+class VerdictTruth(Record, frozen=True):
+    """What the report says of a filter's innovation variance, with the factor; "" for nothing."""
+
+    verdict: str
+    factor: float | None = None
+
+    @property
+    def clear(self) -> bool:
+        """Whether nobody can take it for another."""
+        return self.factor is None or self.factor >= CLEAR
+
+
+class FormTruth(Record, frozen=True):
+    """The right answers to the form of one flight.
+
+    Attributes
+    ----------
+    sigma_z_m : float
+        Of the source as it is.
+    ekf2_did, ekf2_did_also : tuple of str
+        What has to be said, and what may be.
+    quantities : tuple
+        As :func:`px4fuse.answers.asked` asks them; None where the flight is too short.
+    """
+
+    mistakes: tuple[Wrong, ...]
+    sigma_z_m: float
+    ours: VerdictTruth
+    ekf2: VerdictTruth
+    ekf2_did: tuple[str, ...]
+    ekf2_did_also: tuple[str, ...]
+    quantities: tuple[float | tuple[float, ...] | None, ...]
+
+
+def truth_of(simulation: flights.Simulation, log_sha256: str) -> FormTruth:
+    """The right answers, from what was simulated and from the report as it comes."""
+    known = flights.answer(simulation)
+    comparison = compare(flights.to_flight(simulation), Settings())
+    mistakes = tuple(
+        _wrong(name, given, known["truth"], comparison) for name, given in known["mistakes"].items()
+    )
+    did, also = _ekf2_did(comparison, mistakes, known["truth"]["sigma_z_m"])
+    return FormTruth(
+        mistakes,
+        known["truth"]["sigma_z_m"],
+        _verdict(comparison, "kf"),
+        _verdict(comparison, "ekf2"),
+        did,
+        also,
+        tuple(quantity_truth(comparison.main, each) for each in asked(log_sha256)),
+    )
+
+
+def _wrong(
+    name: str, given: Mapping[str, Any], truth: Mapping[str, Any], comparison: Comparison
+) -> Wrong:
+    arguments = SIMULATED[name].arguments
+    if not arguments:
+        return Wrong(name)
+    size = given[arguments[0].field]
+    low, high = sorted((size * (1.0 - TOLERANCE), size * (1.0 + TOLERANCE)))
+    if name == "clock-offset":  # what an ideal analysis of the log can tell
+        found = clock_offset(comparison, tuned_horizontally(comparison))
+        if isinstance(found, ClockOffset) and found.determinable:
+            low, high = min(low, -found.interval_s[1]), max(high, -found.interval_s[0])
+    start_s, end_s = truth["airborne_s"]
+    spans: dict[str, tuple[float | None, float | None]] = {
+        "clock-jump": (None, TIMESYNC_CONVERGED_S),
+        "open-end": (end_s, None),
+    }
+    if name == "nlos" and truth["outlier_time_s"]:
+        spans[name] = truth["outlier_time_s"][0], truth["outlier_time_s"][-1]
+    if name in ("dropout", "imu-dropout", "jump"):
+        at_s = given[arguments[1].field]
+        share = 2.0 / 3.0 if name == "jump" else 0.5
+        at_s = start_s + share * (end_s - start_s) if at_s is None else at_s
+        spans[name] = at_s, None if name == "jump" else at_s + abs(size)
+    from_s, until_s = spans.get(name, (None, None))
+    return Wrong(name, size, low, high, from_s, until_s)
+
+
+def _verdict(comparison: Comparison, which: FilterName) -> VerdictTruth:
+    judged = comparison.main.filters[which]
+    if not isinstance(judged, FilterSummary):
+        return VerdictTruth("")
+    for word in ("overstated", "understated"):
+        if word in judged.verdict:
+            factor = judged.variance_factor
+            return VerdictTruth(word, max(factor, 1.0 / factor))
+    return VerdictTruth("consistent")
+
+
+def _ekf2_did(
+    comparison: Comparison, mistakes: tuple[Wrong, ...], sigma_z_m: float
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """What EKF2 did in this flight: by what is wrong with it, and by what the log shows."""
+    must: list[str] = []
+    also: list[str] = []
+    by_kind = {wrong.kind: wrong for wrong in mistakes}
+    for kind in by_kind:
+        said, allowed = DID.get(kind, ((), ()))
+        must += said
+        also += allowed
+    noise = by_kind.get("ekf2-noise")
+    if noise is not None and (noise.size or 0.0) > sigma_z_m:
+        must.append("trusted the positions too little")
+    ekf2 = comparison.flight.ekf2
+    innovations = comparison.main.ekf2_innovations
+    if not isinstance(innovations, Unavailable):
+        rejected = float((innovations["rejected"] > 0).mean())
+        if rejected > REJECTED:
+            bad = "nlos" in by_kind or "jump" in by_kind
+            must.append("rejected the bad samples" if bad else "rejected good samples")
+    if isinstance(ekf2, Ekf2) and any(
+        reset.quantity == "position" and math.hypot(*reset.delta[:2]) > RESET_M
+        for reset in ekf2.resets
+        if comparison.segment.start_s + SETTLED_S < reset.time_s
+    ):
+        must.append("coasted, then reset")
+    if not must:
+        must, also = list(UNUSUAL_NOTHING[0]), [*UNUSUAL_NOTHING[1], *also]
+    return tuple(dict.fromkeys(must)), tuple(one for one in dict.fromkeys(also) if one not in must)
+
+
+def quantity_truth(result: AxisComparison, quantity: Quantity) -> float | tuple[float, ...] | None:
+    """The answer to a question, from a replay with its settings; None where it never comes so far.
+
+    "silence" is the variance after the update, taken on by F and Q for so long (DT steps).
+    """
+    settings = Settings(quantity.sigma_a_m_s2, quantity.sigma_z_m)
+    run = replay(result.axis, settings)
+    updates = run.updates
+    at = quantity.update - 1
+    if at >= len(updates):
+        return None
+    row, covariance = updates.iloc[at], run.steps.loc[updates.index[at], COVARIANCES]
+    match quantity.kind:
+        case "gate":
+            part = updates.iloc[at : at + GATED + 1]
+            nis = part["innovation_m"] ** 2 / part["innovation_variance_m2"]
+            outside = np.flatnonzero(nis > quantity.extra**2) + quantity.update
+            return tuple(outside.astype(float).tolist())
+        case "silence":
+            p, f = matrix(tuple(covariance)), transition(settings.dt_s)
+            q = settings.sigma_a_m_s2**2 * settings.dt_s * matrix(noise(settings.dt_s))
+            for _ in range(round(quantity.extra / settings.dt_s)):
+                p = f @ p @ f.T + q
+            return math.sqrt(p[0, 0])
+        case "nis":
+            return float(row["innovation_m"] ** 2 / row["innovation_variance_m2"])
+        case "variance":
+            return float(covariance.iloc[0])
+    return float(row["gain_position" if quantity.kind == "gain" else "innovation_m"])

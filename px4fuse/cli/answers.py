@@ -1,0 +1,34 @@
+"""``px4fuse answers``: the form about a flight, to fill in."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+import click
+
+from px4fuse.cli.inputs import path_option
+from px4fuse.cli.outputs import write_outputs
+from px4fuse.errors import OutputError
+
+
+@click.command()
+@click.argument("log", type=click.Path(path_type=Path))
+@path_option(
+    "-o", "--output", metavar="FILE.toml", help="The form.  [default: LOG.answers.toml beside LOG]"
+)
+def answers(log: Path, output: Path | None) -> None:
+    """Write the form about a flight: what is wrong with it, what EKF2 did, three numbers.
+
+    Fill it in and give it to px4fuse compare --answers.
+    """
+    from px4fuse.answers import form_name, form_text
+    from px4fuse.reading import read_log_bytes
+
+    target = output or log.with_name(form_name(log.name))
+    if target.exists():
+        raise OutputError(f"{target}: exists already; it was not overwritten. Give another -o.")
+    write_outputs(
+        {target: form_text(log.name, hashlib.sha256(read_log_bytes(log)).hexdigest()).encode()}
+    )
+    click.echo(f"Wrote    {target}")

@@ -1,0 +1,357 @@
+"""Points for a form, by the answer key: of 100.
+
+The weights and shares are those by which forms were judged by hand. A guess does not pay: each
+claim that is not true costs, and what needs no measurement counts only with the size.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+
+from px4fuse.answers import MISTAKES, Answers, Claim
+from px4fuse.assignment.truth import FormTruth, VerdictTruth, Wrong
+
+PARTS = ("kinds", "sizes", "when", "cure", "verdicts", "quantities")
+WEIGHTS = dict(zip(PARTS, (30.0, 15.0, 10.0, 15.0, 15.0, 15.0), strict=True))
+# Of a clean flight that is called clean: there is nothing to size, date or cure
+WEIGHTS_CLEAN = dict(zip(PARTS, (40.0, 0.0, 0.0, 0.0, 30.0, 30.0), strict=True))
+FALSE_CLAIM, MOST_FALSE = 10.0, 3
+# What is the same thing from the other side earns part of the kind
+NEIGHBOURS = (
+    frozenset(("clock-offset", "ekf2-delay", "clock-jump", "clock-drift")),
+    frozenset(("ekf2-noise", "r-scale", "ekf2-gate")),
+    frozenset(("dropout", "decimate")),
+)
+NEIGHBOUR, SAME_NUMBER, EFFECT = 0.4, 2.0 / 3.0, 0.15
+# What only follows from a mistake, named in its place
+EFFECTS: Mapping[str, frozenset[str]] = {
+    "nlos": frozenset(("ekf2-noise", "r-scale", "ekf2-gate")),
+    "dropout": frozenset(("jump", "ekf2-gate")),
+    "open-end": frozenset(("vio-drift",)),
+    "clock-offset": frozenset(("smoothed", "scale")),
+    "jump": frozenset(("nlos",)),
+    "ekf2-noise": frozenset(("nlos", "jump")),
+    "ekf2-gate": frozenset(("nlos", "jump", "dropout")),
+    "ekf2-delay": frozenset(("smoothed",)),
+}
+# Where each is seen
+_TRACK = ("map", "error to truth", "cover")
+SEEN: Mapping[str, tuple[str, ...]] = {
+    "clock-offset": ("clock", "error to truth", "cover"),
+    "clock-drift": ("clock", "cover"),
+    "clock-jump": ("clock", "cover"),
+    "nlos": ("innovations", "cover"),
+    "dropout": ("innovations", "sigma", "position along the aisle", "cover"),
+    "imu-dropout": ("sigma", "velocity", "cover"),
+    "decimate": ("innovations", "sigma", "parameters", "cover"),
+    "r-scale": ("innovations", "parameters", "cover"),
+    "yaw": _TRACK,
+    "scale": _TRACK,
+    "jump": (*_TRACK, "innovations", "position along the aisle", "loop"),
+    "smoothed": ("clock", "innovations", "error to truth", "cover"),
+    "accel-bias": ("innovations", "velocity", "error to truth", "cover"),
+    "vibration": ("innovations", "velocity", "sigma", "cover"),
+    "imu-rate": ("parameters", "velocity", "cover"),
+    "no-motion": ("map", "position along the aisle", "velocity", "cover"),
+    "open-end": ("loop", "map", "cover"),
+    "no-vvo": ("parameters", "cover"),
+    "ekf2-noise": ("innovations", "parameters", "sigma", "cover"),
+    "ekf2-delay": ("why EKF2 differs", "parameters", "error to truth", "cover"),
+    "ekf2-gate": ("innovations", "parameters", "why EKF2 differs", "cover"),
+    "ekf2-off": ("innovations", "parameters", "why EKF2 differs", "cover"),
+}
+# What needs no measurement, so that it counts only as far as the size is right
+GUESSABLE = frozenset(("open-end",))
+ANY = (-math.inf, math.inf)
+CLOSE_S, CLOSE_SHARE = 2.0, 0.05
+FULL_WITHIN, HALF_WITHIN = 0.02, 0.10
+HALF_SIZE = 0.4
+
+
+@dataclass(frozen=True)
+class FormPoints:
+    """What a form is worth.
+
+    Attributes
+    ----------
+    parts : mapping
+        Points by the name of the part, of :attr:`of`.
+    said : tuple of str
+        What was right and what was not, for the student.
+    named : mapping
+        The flight's mistakes, and whether the form names each.
+    """
+
+    parts: Mapping[str, float]
+    of: Mapping[str, float]
+    said: tuple[str, ...] = ()
+    named: Mapping[str, bool] = field(default_factory=dict)
+
+    @property
+    def share(self) -> float:
+        """Of all points."""
+        return sum(self.parts.values()) / sum(self.of.values())
+
+
+def form_points(answers: Answers, truth: FormTruth) -> FormPoints:
+    """Points for a form about a flight whose truth is known."""
+    called_clean = not truth.mistakes and answers.says_none
+    weights = WEIGHTS_CLEAN if called_clean else WEIGHTS
+    parts = dict.fromkeys(PARTS, 0.0)
+    matched, false = _matched(answers, truth)
+    if called_clean:
+        parts["kinds"] = weights["kinds"]
+    elif truth.mistakes and len(false) < MOST_FALSE:
+        parts |= _of_mistakes(matched, truth, weights)
+        parts["kinds"] = max(parts["kinds"] - FALSE_CLAIM * len(false), 0.0)
+    parts["verdicts"] = weights["verdicts"] * _verdicts(answers, truth)
+    parts["quantities"] = weights["quantities"] * _quantities(answers, truth)
+    named = {
+        wrong.kind: claim is not None and claim.kind == wrong.kind for wrong, claim, _ in matched
+    }
+    return FormPoints(parts, weights, tuple(_said(matched, false, called_clean)), named)
+
+
+Match = tuple[Wrong, Claim | None, float]
+
+
+def _said(matched: list[Match], false: list[Claim], called_clean: bool) -> Iterator[str]:
+    """What of the mistakes was found, in words."""
+    if called_clean:
+        yield "your flight has no mistake, as you say"
+    elif not matched:
+        yield "your flight has no mistake"
+    found = [wrong.kind for wrong, claim, _ in matched if claim and claim.kind == wrong.kind]
+    if found:
+        yield f"you found {' and '.join(found)}"
+    for wrong, claim, _ in matched:
+        if claim is None:
+            yield f"you missed {wrong.kind} ({MISTAKES[wrong.kind][0]})"
+        elif claim.kind != wrong.kind:
+            yield f"you named {claim.kind} where it is {wrong.kind} ({MISTAKES[wrong.kind][0]})"
+    if false:
+        yield f"not in your flight: {', '.join(claim.kind for claim in false)}"
+
+
+def _matched(answers: Answers, truth: FormTruth) -> tuple[list[Match], list[Claim]]:
+    """Each mistake with the claim that stands for it and its share of the kind; false claims."""
+    left = [claim for claim in answers.mistakes if claim.kind != "none"]
+    found: dict[str, tuple[Claim, float]] = {}
+
+    for share_of in (_same, _neighbour, _effect):
+        for wrong in truth.mistakes:
+            if wrong.kind in found:
+                continue
+            for claim in left:
+                if share := share_of(wrong.kind, claim.kind):
+                    found[wrong.kind] = claim, share
+                    left.remove(claim)
+                    break
+    return [(wrong, *found.get(wrong.kind, (None, 0.0))) for wrong in truth.mistakes], left
+
+
+def _same(kind: str, claimed: str) -> float:
+    return float(kind == claimed)
+
+
+def _neighbour(kind: str, claimed: str) -> float:
+    if (kind, claimed) == ("r-scale", "ekf2-noise"):
+        return SAME_NUMBER
+    return NEIGHBOUR if any({kind, claimed} <= group for group in NEIGHBOURS) else 0.0
+
+
+def _effect(kind: str, claimed: str) -> float:
+    return EFFECT if claimed in EFFECTS.get(kind, ()) else 0.0
+
+
+def _of_mistakes(
+    matched: list[Match], truth: FormTruth, weights: Mapping[str, float]
+) -> dict[str, float]:
+    """Kinds, sizes, when and cure, each shared out evenly among the mistakes."""
+    count = len(matched)
+    sized = [match for match in matched if match[0].size is not None]
+    kinds = weights["kinds"] + (0.0 if sized else weights["sizes"])
+    points = dict.fromkeys(("kinds", "sizes", "when", "cure"), 0.0)
+    for wrong, claim, share in matched:
+        if claim is None:
+            continue
+        exact = claim.kind == wrong.kind
+        size = size_share(wrong, claim)
+        seen = when_share(wrong, claim) * (1.0 if exact else 0.5)
+        cured = cure_share(wrong, claim, truth)
+        if wrong.kind in GUESSABLE:
+            seen, cured = seen * size, cured * size
+        points["kinds"] += kinds * share / count
+        points["when"] += weights["when"] * seen / count
+        points["cure"] += weights["cure"] * cured / count
+        if sized:
+            points["sizes"] += weights["sizes"] * size / len(sized)
+    return points
+
+
+def size_share(wrong: Wrong, claim: Claim) -> float:
+    """What a size is worth: in full, half, or a third with the wrong sign or for a neighbour."""
+    size = claim.size_in_first_unit()
+    if wrong.size is None or wrong.low is None or wrong.high is None or size is None:
+        return 0.0
+    same_unit = [*MISTAKES[claim.kind][1]][:1] == [*MISTAKES[wrong.kind][1]][:1]
+    if wrong.low <= size <= wrong.high and same_unit:
+        return 1.0 if claim.kind == wrong.kind else 1.0 / 3.0
+    if claim.kind != wrong.kind:
+        return 0.0
+    if wrong.low <= -size <= wrong.high:
+        return 1.0 / 3.0
+    return 0.5 if abs(size - wrong.size) <= HALF_SIZE * abs(wrong.size) else 0.0
+
+
+def when_share(wrong: Wrong, claim: Claim) -> float:
+    """Half for the time, half for a panel that can show it."""
+    whole = wrong.from_s is None and wrong.until_s is None
+    if whole:
+        timed = claim.when == "whole flight"
+    else:
+        asked = (wrong.from_s, claim.from_s), (wrong.until_s, claim.until_s)
+        timed = not claim.when and all(
+            known is None or (given is not None and _near(given, known)) for known, given in asked
+        )
+    return 0.5 * timed + 0.5 * (claim.panel in SEEN.get(wrong.kind, ()))
+
+
+def _near(given_s: float, known_s: float) -> bool:
+    return abs(given_s - known_s) <= max(CLOSE_S, CLOSE_SHARE * known_s)
+
+
+def cure_share(wrong: Wrong, claim: Claim, truth: FormTruth) -> float:
+    """What the parameter and its value are worth, by what they do to this flight."""
+    value = claim.value_in_first_unit()
+    worth = [
+        share * _value_share(value, low, high)
+        for parameter, (low, high), share in cures(wrong, truth)
+        if parameter == claim.parameter
+    ]
+    return max(worth, default=0.0)
+
+
+def _value_share(value: float | None, low: float, high: float) -> float:
+    if (low, high) == ANY:
+        return 1.0
+    if value is None:
+        return 0.5
+    if low <= value <= high:
+        return 1.0
+    # what follows from a wrong sign doubles the error
+    return 1.0 / 3.0 if low <= -value <= high else 0.5
+
+
+Cure = tuple[str, tuple[float, float], float]
+
+
+def cures(wrong: Wrong, truth: FormTruth) -> tuple[Cure, ...]:
+    """Parameters that act on a mistake, from which value to which they cure it, and their share.
+
+    A half acts on the right thing without effect, a third hides the mistake.
+    """
+    size, low, high = (0.0 if one is None else one for one in (wrong.size, wrong.low, wrong.high))
+    from_s = 0.0 if wrong.from_s is None else wrong.from_s
+    until_s = from_s if wrong.until_s is None else wrong.until_s
+    noise = 0.8 * truth.sigma_z_m, 1.25 * truth.sigma_z_m
+    back = -high, -low
+    delay = (1e3 * low, 1e3 * high), 1.0 if size > 0.0 else 0.0
+    factors = 100.0 / (100.0 + high), 100.0 / (100.0 + low)
+    after = "--start", (until_s - 1.0, until_s + 15.0), 1.0
+    before = "--end", (from_s - 15.0, from_s + 1.0), 1.0
+    survey = "survey the anchors", ANY, 1.0
+    synchronise = "synchronise the clocks before take-off", ANY, 1.0
+    all_of: Mapping[str, tuple[Cure, ...]] = {
+        "clock-offset": (
+            ("--clock-offset", back, 1.0),
+            ("correct the stamps at the sender", back, 1.0),
+            ("EKF2_EV_DELAY", *delay),
+        ),
+        "clock-drift": (synchronise, ("--clock-offset", ANY, 0.5)),
+        "clock-jump": (synchronise, after),
+        "nlos": (("line of sight and link", ANY, 1.0), ("EKF2_EVP_GATE", ANY, 0.5)),
+        "dropout": (("line of sight and link", ANY, 1.0), after, before),
+        "imu-dropout": (("log at a higher rate", ANY, 0.5), after, before),
+        "decimate": (
+            ("send positions more often", (5.0, math.inf), 1.0),
+            ("line of sight and link", ANY, 0.5),
+        ),
+        "r-scale": (("EKF2_EVP_NOISE", noise, 1.0), ("report the true variance", noise, 1.0)),
+        "yaw": (
+            ("--position-yaw", back, 1.0), ("turn the positions at the sender", back, 1.0), survey,
+        ),
+        "scale": (("multiply the positions at the sender", factors, 1.0), survey),
+        "jump": (("one set of anchors", ANY, 1.0), after, before),
+        "smoothed": (
+            ("switch the smoothing off", ANY, 1.0), ("--clock-offset", back, 1.0 / 3.0),
+        ),
+        "accel-bias": (("calibrate the accelerometer", ANY, 1.0),),
+        "vibration": (("balance the propellers", ANY, 1.0), ("--sigma-a", ANY, 0.5)),
+        "imu-rate": (
+            ("log at a higher rate", (2.0 * size, math.inf), 1.0), ("SDLOG_PROFILE", ANY, 0.5),
+        ),
+        "no-motion": (("fly several passes", ANY, 1.0),),
+        "open-end": (("--open", ANY, 1.0), ("--landed-at", (low, high), 1.0)),
+        "no-vvo": (("SDLOG_PROFILE", (129.0, 255.0), 1.0),),
+        "ekf2-noise": (("EKF2_EVP_NOISE", noise, 1.0),),
+        "ekf2-delay": (("EKF2_EV_DELAY", (0.0, 20.0), 1.0),),
+        "ekf2-gate": (("EKF2_EVP_GATE", (3.0, 10.0), 1.0), ("EKF2_EVP_NOISE", ANY, 1.0 / 3.0)),
+        "ekf2-off": (("EKF2_EV_CTRL", (1.0, 15.0), 1.0),),
+    }  # fmt: skip
+    return all_of.get(wrong.kind, ())
+
+
+def _verdicts(answers: Answers, truth: FormTruth) -> float:
+    shares = (
+        _verdict(answers.verdict_ours, truth.ours),
+        _verdict(answers.verdict_ekf2, truth.ekf2),
+        _did(answers, truth),
+    )
+    return sum(shares) / len(shares)
+
+
+def _verdict(given: str, truth: VerdictTruth) -> float:
+    if not given or not truth.verdict:
+        return 0.0
+    if given == truth.verdict:
+        return 1.0
+    return 0.5 if given == "consistent" and not truth.clear else 0.0
+
+
+def _did(answers: Answers, truth: FormTruth) -> float:
+    """What EKF2 did: full for all of it and nothing false, half for some."""
+    given, must = set(answers.ekf2_did), set(truth.ekf2_did)
+    allowed = must | set(truth.ekf2_did_also)
+    false, right = len(given - allowed), len(given & allowed)
+    if not right or false > 1:
+        return 0.0
+    whole = must <= given or (len(must) == 1 and bool(given & set(truth.ekf2_did_also)))
+    return 1.0 if whole and not false else 0.5
+
+
+def _quantities(answers: Answers, truth: FormTruth) -> float:
+    pairs = [
+        (given, known)
+        for given, known in zip(answers.quantities, truth.quantities, strict=False)
+        if known is not None
+    ]
+    known = sum(one is not None for one in truth.quantities)
+    return sum(_quantity(*pair) for pair in pairs) / known if known else 0.0
+
+
+def _quantity(given: float | tuple[float, ...] | None, known: float | tuple[float, ...]) -> float:
+    if given is None or isinstance(given, tuple) != isinstance(known, tuple):
+        return 0.0
+    if isinstance(given, tuple) and isinstance(known, tuple):
+        off = len(set(given) ^ set(known))
+        return (1.0, 0.5)[off] if off < 2 and (known or not off) else 0.0
+    assert isinstance(given, float | int)
+    assert isinstance(known, float | int)
+    off_by = abs(given - known)
+    for within, share in ((FULL_WITHIN, 1.0), (HALF_WITHIN, 0.5)):
+        if off_by <= within * abs(known):
+            return share
+    return 0.0

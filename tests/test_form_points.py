@@ -1,0 +1,273 @@
+"""Points for forms: against those given by hand, and what a guess is worth."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.stats import spearmanr
+
+from px4fuse.answers import CURES, EKF2_DID, MISTAKES, PANELS, VERDICTS, Answers, Claim
+from px4fuse.assignment.truth import FormTruth, VerdictTruth, Wrong, truth_of
+from px4fuse.grading.form_points import PARTS, SEEN, cures, form_points
+from px4fuse.simulation import flights
+from px4fuse.simulation.mistakes import MISTAKES as SIMULATED
+from px4fuse.simulation.mistakes import parse
+from px4fuse.simulation.scenario import Scenario
+
+SHA256 = "a" * 64
+OPTIONS = {
+    "--kind": "kind", "--seed": "seed", "--sigma-a": "sigma_a_m_s2", "--speed": "speed_m_s",
+    "--heading": "heading_deg", "--sigma-uwb": "sigma_uwb_m", "--vio-drift": "vio_drift",
+}  # fmt: skip
+LATE = Wrong("clock-offset", 0.2, 0.17, 0.23)
+GAP = Wrong("dropout", 3.0, 2.55, 3.45, 50.0, 53.0)
+TRUTH = FormTruth(
+    (LATE, GAP),
+    0.1,
+    VerdictTruth("understated", 2.0),
+    VerdictTruth("overstated", 1.2),
+    ("followed the wrong positions", "coasted, then reset"),
+    ("fused at the wrong time",),
+    (0.5, (3.0, 7.0), -0.2),
+)
+RIGHT = Answers(
+    log_sha256=SHA256,
+    mistakes=(
+        Claim("clock-offset", 190.0, "ms", "whole flight", None, None, "--clock-offset", -0.2, "s",
+              "clock"),
+        Claim("dropout", 3.1, "s", "", 50.5, 53.0, "--start", 54.0, "s", "innovations"),
+    ),
+    verdict_ours="understated",
+    verdict_ekf2="overstated",
+    ekf2_did=("followed the wrong positions", "coasted, then reset"),
+    quantities=(0.505, (3.0, 7.0), -0.2),
+)  # fmt: skip
+CLEAN = FormTruth(
+    (), 0.1, VerdictTruth("consistent"), VerdictTruth("consistent"), ("nothing unusual",),
+    ("followed the positions",), (0.5, 0.1, 0.2),
+)  # fmt: skip
+
+
+def changed(answers: Answers, **values: Any) -> Answers:
+    given = {name: getattr(answers, name) for name in answers.__struct_fields__}
+    return Answers(**{**given, **values})
+
+
+def with_claim(**values: Any) -> Answers:
+    """The right form with another first claim."""
+    first = RIGHT.mistakes[0]
+    given = {name: getattr(first, name) for name in first.__struct_fields__}
+    return changed(RIGHT, mistakes=(Claim(**{**given, **values}), *RIGHT.mistakes[1:]))
+
+
+def parts(answers: Answers, truth: FormTruth = TRUTH) -> list[float]:
+    found = form_points(answers, truth).parts
+    return [round(found[name], 2) for name in PARTS]
+
+
+def test_every_mistake_that_a_flight_can_have_can_be_named_seen_and_cured() -> None:
+    assert set(SIMULATED) == set(SEEN) == set(MISTAKES) - {"none", "vio-drift"}
+    for name in SIMULATED:
+        offered = cures(Wrong(name, 1.0, 0.85, 1.15, 10.0, 20.0), TRUTH)
+        assert {cure for cure, _, _ in offered} <= set(CURES)
+        assert max(share for _, _, share in offered) == 1.0
+        assert set(SEEN[name]) <= set(PANELS)
+
+
+def test_all_right_is_everything_and_a_blank_form_nothing() -> None:
+    assert parts(RIGHT) == [30.0, 15.0, 10.0, 15.0, 15.0, 15.0]
+    assert form_points(RIGHT, TRUTH).share == 1.0
+    assert parts(Answers(log_sha256=SHA256)) == [0.0] * 6
+    assert form_points(RIGHT, TRUTH).named == {"clock-offset": True, "dropout": True}
+
+
+@pytest.mark.parametrize(
+    ("answers", "expected"),
+    [
+        # wrong sign: a third of its size and of its cure
+        (with_claim(size=-190.0, value=0.2), [30.0, 10.0, 10.0, 10.0, 15.0, 15.0]),
+        (with_claim(size=140.0), [30.0, 11.25, 10.0, 15.0, 15.0, 15.0]),
+        (with_claim(size=900.0, value=-0.9), [30.0, 7.5, 10.0, 11.25, 15.0, 15.0]),
+        (with_claim(panel="map"), [30.0, 15.0, 7.5, 15.0, 15.0, 15.0]),
+        (with_claim(when=""), [30.0, 15.0, 7.5, 15.0, 15.0, 15.0]),
+        (
+            with_claim(parameter="EKF2_EV_DELAY", value=200.0, value_unit="ms"),
+            [30.0, 15.0, 10.0, 15.0, 15.0, 15.0],
+        ),
+        (
+            with_claim(parameter="EKF2_EVP_GATE", value=3.0, value_unit="sd"),
+            [30.0, 15.0, 10.0, 7.5, 15.0, 15.0],
+        ),
+        # a neighbour earns 0.4 of the kind, a third of the size, half of when
+        (with_claim(kind="ekf2-delay"), [21.0, 10.0, 7.5, 15.0, 15.0, 15.0]),
+        # each false claim costs ten; three take all
+        (
+            changed(RIGHT, mistakes=(*RIGHT.mistakes, Claim("yaw"))),
+            [20.0, 15.0, 10.0, 15.0, 15.0, 15.0],
+        ),
+        (
+            changed(RIGHT, mistakes=(*RIGHT.mistakes, Claim("yaw"), Claim("nlos"), Claim("scale"))),
+            [0.0, 0.0, 0.0, 0.0, 15.0, 15.0],
+        ),
+        (changed(RIGHT, mistakes=(Claim("none"),)), [0.0, 0.0, 0.0, 0.0, 15.0, 15.0]),
+        (changed(RIGHT, verdict_ours="consistent"), [30.0, 15.0, 10.0, 15.0, 10.0, 15.0]),
+        (changed(RIGHT, verdict_ekf2="consistent"), [30.0, 15.0, 10.0, 15.0, 12.5, 15.0]),
+        (changed(RIGHT, ekf2_did=("coasted, then reset",)), [30.0, 15.0, 10.0, 15.0, 12.5, 15.0]),
+        (changed(RIGHT, quantities=(0.53, (3.0,), None)), [30.0, 15.0, 10.0, 15.0, 15.0, 5.0]),
+    ],
+)
+def test_what_is_half_right(answers: Answers, expected: list[float]) -> None:
+    assert parts(answers) == pytest.approx(expected, abs=0.01)
+
+
+def test_a_clean_flight() -> None:
+    none = Answers(log_sha256=SHA256, mistakes=(Claim("none"),))
+    assert parts(none, CLEAN) == [40.0, 0.0, 0.0, 0.0, 0.0, 0.0]
+    assert form_points(none, CLEAN).share == 0.4
+    whole = changed(
+        none, verdict_ours="consistent", verdict_ekf2="consistent", quantities=(0.5, 0.1, 0.2),
+        ekf2_did=("followed the positions",),
+    )  # fmt: skip
+    assert form_points(whole, CLEAN).share == 1.0
+    assert parts(RIGHT, CLEAN)[:4] == [0.0] * 4
+
+
+def test_a_cure_that_needs_no_measurement_counts_with_the_size_alone() -> None:
+    landed = Wrong("open-end", 5.0, 4.25, 5.75, 60.0, None)
+    truth = FormTruth(
+        (landed,), 0.01, CLEAN.ours, CLEAN.ekf2, CLEAN.ekf2_did, CLEAN.ekf2_did_also, ()
+    )
+    claim = Claim("open-end", None, "", "", 60.0, None, "--open", None, "", "loop")
+    guess = Answers(log_sha256=SHA256, mistakes=(claim,))
+    assert parts(guess, truth) == [30.0, 0.0, 0.0, 0.0, 0.0, 0.0]
+    measured = Answers(
+        log_sha256=SHA256,
+        mistakes=(Claim("open-end", 5.1, "m", "", 60.0, None, "--open", None, "", "loop"),),
+    )
+    assert parts(measured, truth)[:4] == [30.0, 15.0, 10.0, 15.0]
+
+
+# ------------------------------------------------------------------ forms with points by hand
+
+
+def simulation_of(typed: str) -> flights.Simulation:
+    """The flight that a px4fuse simulate line makes."""
+    words = shlex.split(typed)[2:]
+    values: dict[str, Any] = {}
+    mistakes = []
+    for option, value in zip(words, [*words[1:], ""], strict=True):
+        if option in OPTIONS:
+            kind = {"kind": str, "seed": int}.get(OPTIONS[option], float)
+            values[OPTIONS[option]] = kind(value)
+        elif option == "--mistake":
+            mistakes.append(value)
+        elif option == "--no-truth":
+            values["truth"] = False
+    passes = 1 if values["kind"] == "loop" else 6
+    return flights.simulate(Scenario(passes=passes, **values), parse(mistakes))
+
+
+def in_our_units(kind: str, unit: str) -> str:
+    return "" if unit in ("", next(iter(MISTAKES[kind][1]), "")) else unit
+
+
+def answers_of(form: dict[str, Any]) -> Answers:
+    claims = []
+    for one in form["mistakes"] or []:
+        when = one["when"]
+        parameter = one["parameter"] if one["parameter"] in CURES else ""
+        unit = one["value_unit"] if one["value_unit"] in CURES.get(parameter, {}) else ""
+        claims.append(
+            Claim(
+                one["kind"],
+                one["size"],
+                in_our_units(one["kind"], one["unit"]),
+                "whole flight" if when["text"] == "whole flight" else "",
+                when["from_s"],
+                when["until_s"],
+                parameter,
+                distance(one["value"]),
+                unit,
+                one["where"]["panel"],
+            )
+        )
+    return Answers(
+        log_sha256=SHA256,
+        mistakes=tuple(claims),
+        verdict_ours=form["verdict_ours"],
+        verdict_ekf2=form["verdict_ekf2"],
+        ekf2_did=tuple(form["ekf2_did"]),
+        quantities=tuple(given(one["given"]) for one in form["quantities"]),
+    )
+
+
+def distance(value: Any) -> Any:
+    """Forward and right as one number."""
+    if isinstance(value, str):
+        value = [float(part) for part in value.split(",")]
+    return float(np.linalg.norm(value)) if isinstance(value, list) else value
+
+
+def given(value: Any) -> Any:
+    return tuple(map(float, value)) if isinstance(value, list) else value
+
+
+@pytest.mark.reallogs
+def test_points_are_those_given_by_hand(shared_logs: Path) -> None:
+    bank = json.loads((shared_logs.parent / "grading" / "bank.json").read_text(encoding="utf-8"))
+    truths = {
+        flight["flight"]: truth_of(simulation_of(flight["simulate"]), SHA256)
+        for flight in bank["flights"]
+    }
+    ours, theirs = [], []
+    for form in bank["forms"]:
+        known = tuple(given(one["truth"]) for one in form["quantities"])
+        truth = truths[form["flight"]]
+        values = {name: getattr(truth, name) for name in truth.__struct_fields__}
+        made = form_points(answers_of(form), FormTruth(**{**values, "quantities": known}))
+        ours.append(sum(made.parts.values()))
+        theirs.append(form["judgement"]["points"])
+        print(
+            form["id"],
+            form["judgement"]["points"],
+            round(ours[-1], 1),
+            [round(v, 1) for v in made.parts.values()],
+            form["judgement"]["parts"],
+        )
+    assert len(ours) >= 30
+    assert np.abs(np.subtract(ours, theirs)).mean() <= 3.0
+    assert spearmanr(ours, theirs).statistic >= 0.95
+
+
+def test_random_forms_earn_little() -> None:
+    """Of 500 forms filled in at random, on flights with two mistakes, one and none."""
+    rng = np.random.default_rng(5)
+    earned = []
+    for _ in range(500):
+        kinds = rng.choice([name for name in MISTAKES if name != "none"],
+                           int(rng.integers(1, 4)), replace=False)  # fmt: skip
+        claims = tuple(
+            Claim(
+                str(kind), float(rng.uniform(0.0, 10.0)), "", "whole flight", None, None,
+                str(rng.choice(list(CURES))), float(rng.uniform(0.0, 10.0)), "",
+                str(rng.choice(PANELS)),
+            )
+            for kind in kinds
+        )  # fmt: skip
+        answers = Answers(
+            log_sha256=SHA256,
+            mistakes=(Claim("none"),) if rng.random() < 0.2 else claims,
+            verdict_ours=str(rng.choice(VERDICTS)),  # type: ignore[arg-type]
+            verdict_ekf2=str(rng.choice(VERDICTS)),  # type: ignore[arg-type]
+            ekf2_did=(str(rng.choice(EKF2_DID)),),
+            quantities=tuple(rng.uniform(-1.0, 1.0, 3).tolist()),
+        )
+        truth = (TRUTH, FormTruth((LATE,), 0.1, TRUTH.ours, TRUTH.ekf2, TRUTH.ekf2_did,
+                                  TRUTH.ekf2_did_also, TRUTH.quantities), CLEAN)  # fmt: skip
+        earned.append(form_points(answers, truth[int(rng.integers(3))]).share)
+    assert np.mean(earned) <= 0.2
