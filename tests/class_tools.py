@@ -14,8 +14,9 @@ from forgery import forged, with_results
 from pypdf import PdfReader, PdfWriter
 
 from px4fuse.grading import grade as grading
-from px4fuse.grading import records, sheets, workers
+from px4fuse.grading import records, sheets
 from px4fuse.grading.model import Entry, Graded, Item
+from px4fuse.verification import workers
 from px4fuse.verification.model import Verdict
 from px4fuse.verification.rerun import log_sha256
 from px4fuse.verification.verification import verify

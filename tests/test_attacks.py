@@ -33,10 +33,11 @@ from px4fuse.report.seal import sealed
 from px4fuse.simulation import flights
 from px4fuse.simulation.mistakes import parse
 from px4fuse.simulation.scenario import Scenario
+from px4fuse.verification import pages
 from px4fuse.verification.intake import read_report
 from px4fuse.verification.model import Refused, Report, Verdict
 
-pytestmark = pytest.mark.usefixtures("analysed_once")
+pytestmark = pytest.mark.usefixtures("analysed_once", "_pages_here")
 
 MISTAKES = ("nlos=3%", "dropout=5s,30s")
 GAP = '[[mistake]]\nkind = "dropout"\nsize = 5\nfrom_s = 30\nuntil_s = 35\npanel = "innovations"\n'
@@ -78,6 +79,12 @@ class Flight:
         results["student"]["notes"] = text
         report = replace(report_of(self.honest.pdf), results=read_again(results))
         return self.graded(report, Verdict("verified", (), True, page_status="same"), rubric)
+
+
+@pytest.fixture
+def _pages_here(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The process that bounds the drawing of pages takes seconds; test_pages.py has one."""
+    monkeypatch.setattr(pages, "bounded", lambda function, job, *_: function(job))
 
 
 @pytest.fixture(scope="module")

@@ -511,9 +511,9 @@ def test_the_faults_below_cover_every_finding() -> None:
 def test_every_file_is_listed() -> None:
     """One that nobody lists would never find anything."""
     modules = {module.name for module in pkgutil.iter_modules(package.__path__)}
-    names = modules - {"causes", "model", "story"}
-    ids = [
-        name for file in names for name in import_module(f"px4fuse.findings.{file}").DETECTOR.names
+    files = modules - {"causes", "model", "story"}
+    declared = [
+        name for file in files for name in import_module(f"px4fuse.findings.{file}").DETECTOR.names
     ]
     assert len(files) == len(DETECTORS)
     assert sorted(declared) == sorted(names())

@@ -227,6 +227,12 @@ TEXT = TextStringObject("x")
 @pytest.mark.parametrize(
     ("edit", "said"),
     [
+        (
+            on_root(
+                "/OpenAction", dictionary(S=NameObject("/URI"), URI=TextStringObject("http://x"))
+            ),
+            "an action that opens an address",
+        ),
         (on_root("/Names", dictionary(JavaScript=dictionary(Names=ArrayObject()))), "JavaScript"),
         (on_root("/Outlines", dictionary(A=action("JavaScript", JS=TEXT))), "JavaScript"),
         (on_root("/OpenAction", action("Launch", F=TEXT)), "an action that starts a program"),
@@ -241,7 +247,7 @@ TEXT = TextStringObject("x")
         (annotation(Subtype=NameObject("/Link"), A=action("Launch")), "starts a program"),
         (annotation(FS=dictionary(Type=NameObject("/Filespec"))), "a reference to another file"),
     ],
-    ids=range(13),
+    ids=range(14),
 )
 def test_what_acts_is_named(edit, said):
     assert said in reason(small(edit=edit))

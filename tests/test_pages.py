@@ -13,9 +13,17 @@ from hypothesis import strategies as st
 from matplotlib.backends.backend_pdf import PdfPages
 from matplotlib.figure import Figure
 from pypdf import PdfReader, PdfWriter
+from pypdf.generic import (
+    ArrayObject,
+    DecodedStreamObject,
+    DictionaryObject,
+    NameObject,
+    NumberObject,
+)
 
 from px4fuse.flight import Unavailable
 from px4fuse.report.style import report_style
+from px4fuse.verification import pages
 from px4fuse.verification.model import PageDifference
 from px4fuse.verification.pages import DISTANCE, compare_pages, looks, page_texts
 
@@ -47,6 +55,48 @@ def compared(one: bytes, other: bytes) -> tuple[PageDifference, ...]:
     found = compare_pages(one, other, exactly)
     assert not isinstance(found, Unavailable)
     return found
+
+
+@pytest.fixture(autouse=True)
+def _in_this_process(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    if "bounds" not in request.node.name:
+        monkeypatch.setattr(pages, "bounded", lambda function, job, *_: function(job))
+
+
+def test_pages_that_never_end_are_not_compared_within_bounds(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Forms in forms: each draws the next one ten times, which no reader ends."""
+    monkeypatch.setattr(pages, "TIMEOUT_S", 3.0)
+    found = compare_pages(nested_forms(12), BASE, exactly)
+    assert isinstance(found, Unavailable)
+    assert "within bounds" in found.reason
+    assert found.remedy.startswith("Do not open it")
+    assert compare_pages(BASE, BASE, exactly) == ()
+
+
+def nested_forms(depth: int) -> bytes:
+    """A page that draws a form, which draws another one ten times, and so on."""
+    writer = PdfWriter()
+    page = writer.add_blank_page(595, 842)
+    content, inner = b"0 0 1 1 re f\n", DictionaryObject()
+    for _ in range(depth):
+        form = DecodedStreamObject()
+        form.update({NameObject("/Subtype"): NameObject("/Form"), NameObject("/BBox"): BOX,
+                     NameObject("/Resources"): inner})  # fmt: skip
+        form.set_data(content)
+        named = DictionaryObject({NameObject("/X"): writer._add_object(form)})
+        content, inner = b"/X Do\n" * 10, DictionaryObject({NameObject("/XObject"): named})
+    whole = DecodedStreamObject()
+    whole.set_data(content)
+    page[NameObject("/Resources")] = inner
+    page[NameObject("/Contents")] = writer._add_object(whole)
+    out = io.BytesIO()
+    writer.write(out)
+    return out.getvalue()
+
+
+BOX = ArrayObject([NumberObject(0), NumberObject(0), NumberObject(595), NumberObject(842)])
 
 
 def test_the_same_and_the_same_saved_again() -> None:

@@ -14,8 +14,8 @@ from test_bad_logs import patience
 from test_cli import run_main
 
 from px4fuse.errors import LogError, Px4FuseError
-from px4fuse.grading import workers
 from px4fuse.reading import max_log_bytes, read_text, read_whole, shown
+from px4fuse.verification import workers
 from px4fuse.verification.model import Verdict
 from px4fuse.verification.rerun import log_sha256
 

@@ -17,7 +17,7 @@ import pytest
 from px4fuse.errors import SettingsError
 from px4fuse.grading import submissions
 from px4fuse.grading.model import Submission
-from px4fuse.grading.platforms import Origin, origin_of
+from px4fuse.grading.platforms import Origin, origin_of, origins_of
 from px4fuse.grading.submissions import collect, gradescope_people, read
 from px4fuse.verification.intake import MAX_BYTES
 from px4fuse.verification.model import Refused
@@ -140,6 +140,20 @@ submission_31:
 """
 
 
+def test_a_name_that_a_student_chose_does_not_change_platform_or_time():
+    """Blackboard's export, with a second time and with Moodle's way in the student's own part."""
+    usual = [f"Lab_user{n}_attempt_2026-11-20-11-00-0{n}_r.pdf" for n in range(3)]
+    forged = [
+        "Lab_eve_attempt_2026-11-23-10-00-00_x_attempt_2026-11-19-10-00-00_r.pdf",
+        "Lab_mal_attempt_2026-11-23-10-00-00_Doe Jane_4711_assignsubmission_file_r.pdf",
+    ]
+    found = [Submission(Path("export.zip"), name, name) for name in (*usual, *forged)]
+    origins = origins_of(found, {})
+    assert {one.platform for one in origins} == {"blackboard"}
+    assert [one.login for one in origins[3:]] == ["eve", "mal"]
+    assert {one.time.day for one in origins[3:]} == {23}
+
+
 def test_gradescope_says_who_and_when_beside_its_submissions(tmp_path):
     forged = METADATA.replace("Doe, Jane", "Mallory")
     content = zipped(
@@ -236,6 +250,16 @@ def test_links_do_not_lead_out_of_the_folder(tmp_path):
 
 
 # ------------------------------------------------------------------ names
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="links need rights there")
+def test_a_link_that_leads_to_itself_is_not_followed(tmp_path):
+    (tmp_path / "a.pdf").symlink_to(tmp_path / "b.pdf")
+    (tmp_path / "b.pdf").symlink_to(tmp_path / "a.pdf")
+    (tmp_path / "c.pdf").write_bytes(b"%PDF-")
+    found, notes = collect([tmp_path])
+    assert [one.name for one in found] == ["c.pdf"]
+    assert "2 links" in notes[0]
 
 
 def test_hostile_names_are_shown_and_never_used(tmp_path):

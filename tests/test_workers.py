@@ -13,8 +13,8 @@ import bad_jobs
 import pytest
 
 from px4fuse.errors import LogError
-from px4fuse.grading import workers
-from px4fuse.grading.workers import Failed, run_bounded
+from px4fuse.verification import workers
+from px4fuse.verification.workers import Failed, run_bounded
 
 MEMORY = 1_500_000_000
 
@@ -135,7 +135,7 @@ def test_who_stops_listening_ends_all():
 INTERRUPTED = """
 import os, sys, time
 sys.path.insert(0, {tests!r})
-from px4fuse.grading.workers import run_bounded
+from px4fuse.verification.workers import run_bounded
 from test_workers import act
 
 if __name__ == "__main__":

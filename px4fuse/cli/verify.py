@@ -51,10 +51,10 @@ def verify(
     input.
     """
     from px4fuse.grading.grade import MEMORY_BYTES
-    from px4fuse.grading.workers import Failed, run_bounded
     from px4fuse.verification.intake import MAX_BYTES, read_report
     from px4fuse.verification.model import Refused
     from px4fuse.verification.verification import verify as verify_report
+    from px4fuse.verification.workers import Failed, run_bounded
 
     content = read_whole(report, LogError, MAX_BYTES, smaller="Reports are below 2 MB")
     read = read_report(content, shown(report))

@@ -1,7 +1,8 @@
 """The mistakes that px4fuse names: a file each, with all that is said about it.
 
 A file declares ids, thresholds with unit and source, the detector (condition, words, remedy), what
-the finding is called, and the flights on which its rate is measured. A detector never prints and never guesses: what it cannot see it does not mention.
+the finding is called, and the flights on which its rate is measured. A detector never prints and
+never guesses: what it cannot see it does not mention.
 
 To add a finding: its file, its name below, its place in ``causes.py`` if it follows from another or
 brings others with it, its rows of ``tests/studies/rates.csv``.

@@ -203,7 +203,7 @@ def _try(
             f"{origin.platform.capitalize()} marks it as late and does not say by how much: nothing"
             " was taken off; say in overrides.csv what is."
         )
-    elif term.due is not None and packed is not None and packed.timestamp() > term.due.timestamp():
+    elif term.late and term.due and packed and packed.timestamp() > term.due.timestamp():
         remarks.append(
             f"The zip file dates it {packed.strftime(SHOWN)}, after the due time; that may be when "
             "it was downloaded, so nothing was taken off."
@@ -233,6 +233,10 @@ def _entry(person: Person, tries: Sequence[_Try], term: Term) -> Entry:
         "best": max(able, key=lambda one: (one.worth, one.order)),
     }[term.attempt]
     remarks = list(chosen.remarks)
+    beside = sum(one is not chosen and one.order[:2] == chosen.order[:2] != (0.0, 0.0)
+                 for one in able)  # fmt: skip
+    if beside:
+        remarks.append(f"{beside + 1} reports came at the same time; the best of them counts.")
     if able is not ordered and ordered[-1] is not chosen and not ordered[-1].read:
         remarks.append(
             f"{one_line(ordered[-1].graded.submission, 80)} cannot be read as a report, so that "

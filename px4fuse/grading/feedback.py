@@ -20,10 +20,11 @@ NEXT = (
 )
 
 
-def feedback(graded: Graded, class_name: str = "") -> str:
+def feedback(graded: Graded, class_name: str = "", final: bool = False) -> str:
     """Plain text for the student: the points, why, and where most can still be gained.
 
-    Flags are for the instructor and are not in it.
+    Flags are for the instructor and are not in it. ``final``: the instructor has said the total,
+    so that no proposal is told beside it.
     """
     who = ", ".join(part for part in (text_of(graded.student), text_of(graded.student_id)) if part)
     lines = [*([class_name] if class_name else []), f"Report   {text_of(graded.submission)}"]
@@ -31,7 +32,7 @@ def feedback(graded: Graded, class_name: str = "") -> str:
     points = f"{_points(graded.points)} of {_points(graded.of)}"
     if graded.counted is None:
         points = f"pending: they do not count yet (as it is: {points})"
-    lines += [f"Points   {points}"] if graded.items else []
+    lines += [f"Points   {points}"] if graded.items and not final else []
     lines += ["", *_wrapped(verdict_text(graded.verdict))]
     lines += [""] if graded.items else []
     for item in graded.items:
@@ -46,7 +47,7 @@ def feedback(graded: Graded, class_name: str = "") -> str:
         lines += [f"  - {text_of(i.title)} ({_points(i.of - i.points)})" for i in lost[:3]]
     elif graded.items and not lost:
         lines += ["", "Nothing is missing. Well done."]
-    lines += ["", *_wrapped(NEXT)] if graded.items else []
+    lines += ["", *_wrapped(NEXT)] if graded.items and not final else []
     return "\n".join(lines) + "\n"
 
 
@@ -60,7 +61,8 @@ def returned_text(entry: Entry, class_name: str = "") -> str:
     if graded is None:
         lines += [*([class_name] if class_name else []), "Nothing was handed in.", ""]
     else:
-        lines += [feedback(graded, class_name)]
+        final = TOTAL in entry.overrides and entry.total is not None
+        lines += [feedback(graded, class_name, final)]
     if entry.deduction:
         hours = (entry.late_s or 0.0) / 3600.0
         off = number(entry.deduction)

@@ -24,6 +24,7 @@ from px4fuse.plain import few_words
 from px4fuse.results.comparison import ASKED
 from px4fuse.results.contract import ComparisonResults, LoopResults, Reported
 from px4fuse.results.reading import one_line
+from px4fuse.simulation import flights
 
 # Chosen noises have so many digits together before they are the same by chance only once in a
 # thousand pairs: 0.3 and 0.1 are what many would type
@@ -42,13 +43,22 @@ CHOSEN = ("sigma_a_m_s2", "sigma_z_m", "dt_s", "input", "clock_offset_s")
 SHOWN = 4
 
 
-def own_flags(results: Reported) -> tuple[str, ...]:
-    """What stands out in one report by itself; nothing in one of a loop alone."""
+def own_flags(results: Reported, handed_out: bool = False) -> tuple[str, ...]:
+    """What stands out in one report by itself; nothing in one of a loop alone.
+
+    ``handed_out``: there is an answer key, so that logs are simulated for a reason.
+    """
     if isinstance(results, LoopResults):
         return ()
     return tuple(
         flag
-        for look in (_tuned_here, _hand_picked, _nothing_found, _left_out)
+        for look in (
+            _tuned_here,
+            _hand_picked,
+            _nothing_found,
+            _left_out,
+            *([] if handed_out else [_simulated]),
+        )
         for flag in look(results)
     )
 
@@ -136,6 +146,11 @@ def _left_out(results: ComparisonResults) -> Iterator[str]:
         yield "The IMU was not used (--input zero)."
 
 
+def _simulated(results: ComparisonResults) -> Iterator[str]:
+    if results.log.hardware == flights.HARDWARE:
+        yield "The log was made by px4fuse simulate: no vehicle flew."
+
+
 def class_flags(
     graded: Sequence[Graded], key: AnswerKey | None = None
 ) -> Mapping[int, tuple[str, ...]]:
@@ -158,6 +173,7 @@ def class_flags(
         _other_version(graded),
         _copied_notes(graded),
         _same_form(graded),
+        _same_numbers(graded),
         _other_name(graded, key),
     )
     for look in looks:
@@ -257,6 +273,19 @@ def _same_form(graded: Sequence[Graded]) -> Flags:
         if len({_who(graded[index]) for index in members}) > 1:
             for index in members:
                 yield index, f"The form has the numbers of {_others(graded, members, index)}."
+
+
+def _same_numbers(graded: Sequence[Graded]) -> Flags:
+    """The same flight under another hash: a byte of the log was changed."""
+    where: dict[tuple[float, ...], list[int]] = defaultdict(list)
+    for index, one in enumerate(graded):
+        if len(one.numbers) >= SAME_NUMBERS and one.verdict.status == "verified":
+            where[tuple(one.numbers.values())].append(index)
+    for members in where.values():
+        if len({graded[index].log_sha256 for index in members}) > 1:
+            for index in members:
+                said = "The same numbers to the last digit, from a log of another hash, as"
+                yield index, f"{said} {_others(graded, members, index)}: a copy of the log."
 
 
 def _numbers_of(form: Answers) -> tuple[float, ...]:

@@ -21,19 +21,19 @@ from px4fuse.grading.lateness import moodle_time
 from px4fuse.grading.model import Entry, Graded, Rubric, Submission
 from px4fuse.grading.outputs import Class, write_class
 from px4fuse.grading.overrides import NAME, read_overrides
-from px4fuse.grading.platforms import Origin, with_metadata
+from px4fuse.grading.platforms import Origin, origins_of
 from px4fuse.grading.records import verified
 from px4fuse.grading.roster import Register, people_of_key, people_of_sheet, person_of_row
 from px4fuse.grading.scoring import assess, refused
-from px4fuse.grading.workers import Failed, run_bounded
 from px4fuse.reading import files_by_sha256, max_log_bytes
 from px4fuse.results.contract import Reported, to_plain
 from px4fuse.verification.model import Refused, Verdict
 from px4fuse.verification.rerun import log_sha256
+from px4fuse.verification.workers import Failed, run_bounded
 
 RECORDS = "records"
 # Of one report: a flight of ten minutes takes about one; what takes longer is not a report
-TIMEOUT_S = 300.0
+TIMEOUT_S = 120.0
 MEMORY_BYTES = 4_000_000_000
 # For the class table: column title, and where in the results
 NUMBERS = (
@@ -117,7 +117,7 @@ def grade(
         grade_column(sheet, course.column)
     found, notes = submissions.collect(paths)
     people, unread = submissions.gradescope_people(paths)
-    origins = [with_metadata(one.name, people) for one in found]
+    origins = origins_of(found, people)
     register = register_of(course, key)
     graded, reused = grade_all(
         found, origins, logs, rubric, output / RECORDS, key, register, processes, progress
@@ -222,7 +222,10 @@ def grade_all(
     with closing(work):
         for index, result in work:
             if isinstance(result, Failed):
-                why = Refused(f"Grading it failed: {result.reason}", "Read it yourself.")
+                why = Refused(
+                    f"Grading it failed: {result.reason}",
+                    "Do not open it: ask for the report as px4fuse wrote it.",
+                )
                 graded[index] = replace(refused(rubric, key, why), submission=found[index].name)
             else:
                 graded[index], recalled = result
@@ -262,7 +265,7 @@ def grade_one(
     whole = replace(
         made,
         submission=submission.name,
-        flags=(*_page_flags(verdict), *own_flags(results), *made.flags),
+        flags=(*_page_flags(verdict), *own_flags(results, key is not None), *made.flags),
         numbers=_numbers(results),
         sha256=sha256,
         log_sha256=log_sha256(results),

@@ -21,9 +21,13 @@ Sources of the names:
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from pathlib import Path
+
+from px4fuse.grading.model import Submission
 
 METADATA = "submission_metadata.yml"
 # By platform: how its exports name files
@@ -35,7 +39,7 @@ PLATFORMS = {
         r"(?P<name>[^\W\d_][^/_]*)(?P<late>_LATE)?_(?P<number>\d+)_\d+_[^/]+(?:/|$)"
     ),
     "blackboard": re.compile(
-        r"[^/]*_(?P<login>[^/_]+)_attempt_(?P<time>\d{4}-\d\d-\d\d-\d\d-\d\d-\d\d)(?:_[^/]*|\.[^/.]+)$"
+        r"[^/]*?_(?P<login>[^/_]+)_attempt_(?P<time>\d{4}-\d\d-\d\d-\d\d-\d\d-\d\d)(?:_[^/]*|\.[^/.]+)$"
     ),
     "gradescope": re.compile(r"submission_(?P<number>\d+)(?:/|\.pdf$)"),
     # a login has a letter, and a number is not a year: "flight_lab_reports_2026/" is a folder
@@ -77,7 +81,7 @@ class Origin:
     late: bool = False
 
 
-def origin_of(name: str) -> Origin:
+def origin_of(name: str, platforms: Iterable[str] = tuple(PLATFORMS)) -> Origin:
     """Who handed a file in, by its path in the export.
 
     >>> origin_of("Doe Jane_4711_assignsubmission_file_/report.pdf").name
@@ -86,18 +90,43 @@ def origin_of(name: str) -> Origin:
     '12345'
     >>> origin_of("Lab 3_jdoe_attempt_2026-11-20-12-34-56_report.pdf").time
     datetime.datetime(2026, 11, 20, 12, 34, 56)
+    >>> origin_of("Lab_jdoe_attempt_2026-11-20-12-34-56_x_attempt_2026-11-19-01-02-03.pdf").login
+    'jdoe'
     >>> origin_of("report.pdf") == Origin()
     True
     """
     parts = name.split("/")
     for index in range(len(parts)):
         tail = "/".join(parts[index:])
-        for platform, pattern in PLATFORMS.items():
-            match = pattern.match(tail)
+        for platform in platforms:
+            match = PLATFORMS[platform].match(tail)
             found = match and _origin(platform, match.groupdict())
             if found:
                 return found
     return Origin()
+
+
+def origins_of(found: Sequence[Submission], people: Mapping[str, Origin]) -> list[Origin]:
+    """Who handed in each file, and by which platform.
+
+    An export is of one platform: that of most of its files. What a student called a file, in the
+    way of another platform, says nothing.
+    """
+    first = [origin_of(one.name) for one in found]
+    exports = [one.file if one.entry else Path(one.name).parts[0] for one in found]
+    counted: dict[object, Counter[str]] = defaultdict(Counter)
+    for export, origin in zip(exports, first, strict=True):
+        counted[export][origin.platform] += bool(origin.platform)
+    made = []
+    for one, export in zip(found, exports, strict=True):
+        platform, count = counted[export].most_common(1)[0]
+        origin = origin_of(one.name, (platform,)) if count else Origin()
+        if origin.platform in ("gradescope", ""):
+            # PDF assignments are exported as 123456.pdf
+            stem = one.name.rpartition("/")[2].casefold().removesuffix(".pdf")
+            origin = people.get(origin.number or stem, origin)
+        made.append(origin)
+    return made
 
 
 def _origin(platform: str, said: Mapping[str, str | None]) -> Origin | None:
@@ -116,16 +145,6 @@ def _origin(platform: str, said: Mapping[str, str | None]) -> Origin | None:
         time=time,
         late=bool(said.get("late")),
     )
-
-
-def with_metadata(name: str, people: Mapping[str, Origin]) -> Origin:
-    """Who handed a file in, also by what :func:`gradescope_metadata` says of its number."""
-    origin = origin_of(name)
-    if origin.platform == "gradescope":
-        return people.get(origin.number, origin)
-    # PDF assignments are exported as 123456.pdf
-    stem = name.rpartition("/")[2].casefold().removesuffix(".pdf")
-    return people.get(stem, origin) if not origin.platform else origin
 
 
 def gradescope_metadata(text: str) -> dict[str, Origin]:

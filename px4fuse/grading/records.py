@@ -23,10 +23,11 @@ from px4fuse.results.contract import ComparisonResults, LoopResults, Reported, t
 from px4fuse.results.reading import read_results
 from px4fuse.verification.intake import read_report
 from px4fuse.verification.model import Refused, Report, Seal, Verdict
-from px4fuse.verification.pages import page_texts
+from px4fuse.verification.pages import MEMORY_BYTES, TIMEOUT_S, page_texts
 from px4fuse.verification.pictures import key_page, picture
 from px4fuse.verification.rerun import log_sha256
 from px4fuse.verification.verification import verify
+from px4fuse.verification.workers import Failed, bounded
 from px4fuse.writing import write_all
 
 HANDED_IN, REDRAWN, RESULTS = ".handed-in.png", ".pdf", ".results.json"
@@ -90,20 +91,30 @@ def verified(
     gap = _is_gap(report.results, logs, handed_out)
     verdict = verify(report, {} if gap else logs)
     # what is shown and scored is the redrawn report, as far as there is one
-    seen = replace(report, pages=page_texts(verdict.redrawn or pdf))
+    if verdict.redrawn:
+        seen = replace(report, pages=page_texts(verdict.redrawn))
+    else:
+        texts = bounded(page_texts, pdf, TIMEOUT_S, MEMORY_BYTES)
+        seen = replace(report, pages=() if isinstance(texts, Failed) else texts)
     page = _page_to_show(verdict, seen)
-    handed_in = picture(pdf, page - 1) if verdict.pages or not verdict.redrawn else b""
+    handed_in: bytes | Unavailable | Failed = b""
+    if verdict.pages or not verdict.redrawn:
+        handed_in = bounded(_picture, (pdf, page - 1), TIMEOUT_S, MEMORY_BYTES)
     results = to_json(report.results).encode()
     unread = replace(verdict, redrawn=b"")
     files = {name: name in logs for name in _named(results)}
     kept = _Kept(_versions(), "", files, gap, unread, report.seal, seen.pages, page)
     parts = {
         RESULTS: results,
-        HANDED_IN: b"" if isinstance(handed_in, Unavailable) else handed_in,
+        HANDED_IN: handed_in if isinstance(handed_in, bytes) else b"",
         REDRAWN: verdict.redrawn,
     }
     _keep(records, sha256, kept, parts)
     return (replace(seen, pdf=b""), unread, page), False
+
+
+def _picture(job: tuple[bytes, int]) -> bytes | Unavailable:
+    return picture(*job)
 
 
 def _is_gap(results: Reported, logs: Mapping[str, Path], handed_out: frozenset[str]) -> bool:

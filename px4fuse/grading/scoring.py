@@ -162,6 +162,8 @@ def _fate(evidence: Evidence) -> tuple[Doubtful, str]:
         if rubric.others_log == "zero":
             return "zero", "your report is not about the log that you were given"
         todo.append(_whose(evidence))
+    if evidence.key is not None and getattr(evidence.results.request, "position", None):
+        todo.append("Ask where its position file comes from: none was handed out.")
     return ("pending", " ".join(todo)) if todo else ("count", "")
 
 

@@ -16,8 +16,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from px4fuse.flight import Unavailable
-from px4fuse.grading.workers import run_bounded
 from px4fuse.verification.pictures import page_pictures
+from px4fuse.verification.workers import run_bounded
 from px4fuse.writing import write_all
 
 TIMEOUT_S = 120.0

@@ -227,7 +227,11 @@ def _files(path: Path, notes: list[str]) -> Iterator[tuple[Path, str]]:
             whole = Path(folder) / file
             if _hidden(file):
                 continue
-            resolved = whole.resolve()
+            try:
+                resolved = whole.resolve(strict=True)
+            except (OSError, RuntimeError):  # it leads nowhere, or in a circle
+                outside += 1
+                continue
             # a named pipe would keep us waiting forever
             if not resolved.is_relative_to(root) or not resolved.is_file():
                 outside += 1

@@ -2,7 +2,7 @@
 
 Nothing in the file is executed, followed or written anywhere. Sizes are bounded here before pypdf
 sees the file, and by pypdf's own limits while it reads; what is left (a file made to be slow
-within every limit) is for the time and memory limits of :mod:`px4fuse.grading.workers`.
+within every limit) is for the time and memory limits of :mod:`px4fuse.verification.workers`.
 
 Of the file only the attached results are read; its pages are only counted, since the report is
 drawn again. A file that another program saved again is therefore as good as the original, as long
@@ -285,6 +285,10 @@ def _is_listed(reader: pypdf.PdfReader, number: int, generation: int) -> bool:
 def _look_at(value: DictionaryObject, contents: _Contents) -> None:
     """Note what a dictionary has that a report has not."""
     contents.found.update(text for key, text in _KEYS.items() if key in value)
+    for key in ("/OpenAction", "/AA"):
+        opened = _resolved(value.get(key))
+        if isinstance(opened, DictionaryObject) and "/URI" in str(opened):
+            contents.found.add("an action that opens an address")
     action = _name(value.get("/S"))
     if action in _ACTIONS:
         contents.found.add(_ACTIONS[action])

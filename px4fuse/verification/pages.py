@@ -40,6 +40,7 @@ from px4fuse.flight import Unavailable
 from px4fuse.results.reading import cleaned, one_line
 from px4fuse.verification.model import PageDifference
 from px4fuse.verification.pictures import FAILURES, opened, rendered, undrawn
+from px4fuse.verification.workers import Failed, bounded
 
 # Side of the square over which differences are averaged: about two digits, at a pixel per point
 SQUARE_PX = 8
@@ -49,6 +50,8 @@ DISTANCE = 0.07
 # A page that another program wrote may be rounded to whole points
 SIZE_PX = 2
 MAX_PAGES, MAX_PAGE_TEXT = 100, 1_000_000
+# For the pages of a PDF that was handed in; libraries take 0.6 GB of the address space
+TIMEOUT_S, MEMORY_BYTES = 10.0, 1_100_000_000
 
 NumbersAlike = Callable[[str, str], bool]
 
@@ -69,7 +72,7 @@ def compare_pages(
     Parameters
     ----------
     submitted : bytes
-        May be anything: call it in a process that has limits.
+        May be anything: its pages are drawn in a process of their own, within bounds.
     redrawn : bytes
         The report as px4fuse draws it.
     words_alike : callable
@@ -85,10 +88,12 @@ def compare_pages(
     except FAILURES as error:
         return undrawn(error)
     # of a thousand pages that are handed in, not all are drawn
-    try:
-        theirs = looks(submitted, len(ours) + 1)
-    except FAILURES as error:
-        return (PageDifference(1, undrawn(error).reason, 0, 1.0),)
+    theirs = bounded(_looks_or_why, (submitted, len(ours) + 1), TIMEOUT_S, MEMORY_BYTES)
+    if isinstance(theirs, Failed):
+        why = f"they cannot be drawn within bounds ({theirs.reason.rstrip('.')})"
+        return Unavailable("pages of the PDF", why, "Do not open it; read the redrawn report.")
+    if isinstance(theirs, Unavailable):
+        return (PageDifference(1, theirs.reason, 0, 1.0),)
     return tuple(_differences(theirs, ours, words_alike))
 
 
@@ -102,6 +107,13 @@ def looks(pdf: bytes, most: int = 1000) -> tuple[Look | Unavailable, ...]:
     """
     with opened(pdf) as document:
         return tuple(_look(document, page) for page in range(min(len(document), most)))
+
+
+def _looks_or_why(job: tuple[bytes, int]) -> tuple[Look | Unavailable, ...] | Unavailable:
+    try:
+        return looks(*job)
+    except FAILURES as error:
+        return undrawn(error)
 
 
 def page_texts(pdf: bytes) -> tuple[str, ...]:

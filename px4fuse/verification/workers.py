@@ -13,7 +13,7 @@ import pickle
 import signal
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from typing import Any, TypeVar
@@ -53,9 +53,7 @@ class _Worker:
         # spawn: the same on Windows and macOS, and no copy of the parent's memory
         context = multiprocessing.get_context("spawn")
         self.pipe, theirs = context.Pipe()
-        self.process = context.Process(
-            target=_serve, args=(theirs, function, memory_bytes), daemon=True
-        )
+        self.process = context.Process(target=_serve, args=(theirs, function, memory_bytes))
         with _environment():
             self.process.start()
         theirs.close()  # so that the pipe ends when the process does
@@ -139,6 +137,15 @@ def run_bounded(
     finally:
         for worker in workers:
             worker.end()
+
+
+def bounded(
+    function: Callable[[Job], Result], job: Job, timeout_s: float, memory_bytes: int
+) -> Result | Failed:
+    """One call in a process of its own, within bounds: see :func:`run_bounded`."""
+    work = run_bounded(function, [job], processes=1, timeout_s=timeout_s, memory_bytes=memory_bytes)
+    with closing(work):
+        return next(work)[1]
 
 
 def _wait_for_any(workers: list[_Worker]) -> list[Any]:

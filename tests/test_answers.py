@@ -1,0 +1,142 @@
+"""The form: what is filled in is what is read, and nonsense is refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from flights import aisle_flight
+from pypdf import PdfReader
+
+from px4fuse.answers import MISTAKES, Claim, asked, form_text, read_answers
+from px4fuse.assignment.truth import quantity_truth
+from px4fuse.cli import cli
+from px4fuse.comparison.comparison import compare
+from px4fuse.errors import SettingsError
+from px4fuse.filter.kalman import replay
+from px4fuse.filter.settings import Settings
+from px4fuse.results.contract import ComparisonResults
+from px4fuse.results.reading import read_results
+from px4fuse.simulation.mistakes import MISTAKES as SIMULATED
+
+SHA256 = "b" * 64
+EMPTY = form_text("s07.ulg", SHA256)
+CLAIM = '[[mistake]]\nkind = "{}"\n{}\n'
+
+
+def read(tmp_path: Path, text: str):
+    path = tmp_path / "a.toml"
+    path.write_text(text, encoding="utf-8")
+    return read_answers(path)
+
+
+def test_an_empty_form_says_nothing_and_explains_every_mistake(tmp_path: Path) -> None:
+    found = read(tmp_path, EMPTY)
+    assert found.log_sha256 == SHA256
+    assert (found.mistakes, found.quantities) == ((), (None, None, None))
+    assert set(SIMULATED) < set(MISTAKES)
+    for name in MISTAKES:
+        assert f"#     {name} " in EMPTY
+
+
+def test_what_is_filled_in_is_what_is_read(tmp_path: Path) -> None:
+    text = EMPTY.replace('kind = ""', 'kind = "yaw"').replace('size = ""', "size = -0.367")
+    text = text.replace('unit = ""', 'unit = "rad"', 1).replace('q2 = ""', "q2 = [3, 7]")
+    found = read(tmp_path, text.replace('verdict_ours = ""', 'verdict_ours = "overstated"'))
+    (claim,) = found.mistakes
+    assert claim.size_in_first_unit() == pytest.approx(-21.03, abs=0.01)
+    assert found.quantities[1] == (3.0, 7.0)
+    assert found.verdict_ours == "overstated"
+    assert Claim("scale", 1.14, "factor").size_in_first_unit() == pytest.approx(14.0)
+    assert Claim("clock-offset", 200.0, "ms").size_in_first_unit() == pytest.approx(0.2)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("a" * 30_000, "more than the limit"),
+        ("a." * 400 + "b = 1", "a line of more than 500"),
+        ("x = " + "[" * 450, "Correct it there"),
+        ("log_sha256 = 'x'", "Correct it there"),
+        (EMPTY.replace('kind = ""', 'kind = "gremlins"'), "'gremlins' is not one of"),
+        (EMPTY + CLAIM.format("yaw", "size = 900"), "none that it can have"),
+        (EMPTY.replace('kind = ""', 'kind = "yaw"').replace('size = ""', "size = nan"), "size"),
+        (EMPTY.replace('kind = ""', 'kind = "yaw"').replace('size = ""', "size = true"), "size"),
+        (EMPTY.replace('kind = ""', 'kind = "yaw"\ncolour = 1'), "colour"),
+        (EMPTY + CLAIM.format("yaw", "") * 2, "twice"),
+        (EMPTY + CLAIM.format("none", "") + CLAIM.format("yaw", ""), "one or the other"),
+        (EMPTY + CLAIM.format("yaw", 'unit = "kg"'), "'kg' is not one of"),
+        (EMPTY + CLAIM.format("yaw", 'panel = "sky"'), "'sky' is not one of"),
+        (EMPTY + CLAIM.format("yaw", 'parameter = "EKF3"'), "'EKF3' is not one of"),
+        (EMPTY.replace('q1 = ""', "q1 = inf"), "quantities"),
+        (EMPTY.replace('q1 = ""', 'q1 = ""\nq9 = 1'), "q9"),
+        (EMPTY.replace("ekf2_did = []", 'ekf2_did = ["slept"]'), "'slept' is not one of"),
+    ],
+)  # fmt: skip
+def test_nonsense_is_one_line_that_says_where(tmp_path: Path, text: str, said: str) -> None:
+    with pytest.raises(SettingsError) as error:
+        read(tmp_path, text)
+    assert said in str(error.value)
+    assert "\n" not in str(error.value).replace("\\n", "")
+
+
+def test_quantities_differ_between_logs_and_are_those_of_a_replay() -> None:
+    drawn = {asked(f"{n:064x}") for n in range(200)}
+    assert len(drawn) == 200
+    kinds = {quantity.kind for each in drawn for quantity in each}
+    assert kinds == {"gain", "variance", "innovation", "nis", "silence", "gate"}
+    main = compare(aisle_flight(duration_s=60.0)).main
+    for quantity in next(iter(drawn)):
+        run = replay(main.axis, Settings(quantity.sigma_a_m_s2, quantity.sigma_z_m))
+        row = run.updates.iloc[quantity.update - 1]
+        s, p = row["innovation_variance_m2"], row["prior_position_variance_m2"]
+        by_hand = {
+            "gain": p / s,
+            "variance": p * (1.0 - p / s),
+            "innovation": row["measurement_m"] - row["prior_position_m"],
+            "nis": row["innovation_m"] ** 2 / s,
+        }
+        found = quantity_truth(main, quantity)
+        if quantity.kind in by_hand:
+            assert found == pytest.approx(by_hand[quantity.kind], rel=1e-9)
+
+
+def test_silence_is_predicted_step_by_step() -> None:
+    """Against the closed form: P grows by F P Fᵀ + Q for each step of DT."""
+    main = compare(aisle_flight(duration_s=60.0)).main
+    quantity = next(q for n in range(99) for q in asked(f"{n:064x}") if q.kind == "silence")
+    settings = Settings(quantity.sigma_a_m_s2, quantity.sigma_z_m)
+    run = replay(main.axis, settings)
+    at = run.updates.index[quantity.update - 1]
+    p0, p1, p2 = run.steps.loc[at, ["position_variance_m2", "covariance_m2_s",
+                                    "velocity_variance_m2_s2"]]  # fmt: skip
+    dt, n = settings.dt_s, round(quantity.extra / settings.dt_s)
+    t = n * dt
+    # a step's acceleration moves the position by dt²/2 at once and by dt for each later step
+    lags = dt * (np.arange(n) + 0.5)
+    grown = settings.sigma_a_m_s2**2 * dt**2 * float((lags**2).sum())
+    expected = np.sqrt(p0 + 2.0 * t * p1 + t**2 * p2 + grown)
+    assert quantity_truth(main, quantity) == pytest.approx(expected, rel=1e-9)
+
+
+@pytest.mark.usefixtures("drawn_once")
+def test_the_way_of_a_form(tmp_path: Path, sample_log: Path) -> None:
+    """``answers`` writes it, ``compare`` reads it into page and results."""
+    form, report = tmp_path / "f.toml", tmp_path / "r.pdf"
+    made = CliRunner().invoke(cli, ["answers", str(sample_log), "-o", str(form)])
+    assert made.exit_code == 0, made.output
+    again = CliRunner().invoke(cli, ["answers", str(sample_log), "-o", str(form)],
+                               standalone_mode=False)  # fmt: skip
+    assert "exists already" in str(again.exception)
+    text = form.read_text(encoding="utf-8").replace('kind = ""', 'kind = "none"')
+    form.write_text(text, encoding="utf-8")
+    words = ["compare", str(sample_log), "--answers", str(form), "-o", str(report)]
+    done = CliRunner().invoke(cli, words, standalone_mode=False)
+    assert done.exception is None, done.output
+    reader = PdfReader(report)
+    results = read_results(reader.attachments["results.json"][0])
+    assert isinstance(results, ComparisonResults)
+    assert results.student.answers.says_none  # type: ignore[union-attr]
+    assert any("The form, as it was filled in" in page.extract_text() for page in reader.pages)
