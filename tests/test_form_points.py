@@ -119,6 +119,7 @@ def test_all_right_is_everything_and_a_blank_form_nothing() -> None:
         (changed(RIGHT, verdict_ekf2="consistent"), [30.0, 15.0, 10.0, 15.0, 12.5, 15.0]),
         (changed(RIGHT, ekf2_did=("coasted, then reset",)), [30.0, 15.0, 10.0, 15.0, 12.5, 15.0]),
         (changed(RIGHT, quantities=(0.53, (3.0,), None)), [30.0, 15.0, 10.0, 15.0, 15.0, 5.0]),
+        (changed(RIGHT, quantities=(9.0, (), None)), [30.0, 15.0, 10.0, 15.0, 7.5, 0.0]),
     ],
 )
 def test_what_is_half_right(answers: Answers, expected: list[float]) -> None:
@@ -232,7 +233,7 @@ def test_points_are_those_given_by_hand(shared_logs: Path) -> None:
         made = form_points(answers_of(form), FormTruth(**{**values, "quantities": known}))
         ours.append(sum(made.parts.values()))
         theirs.append(form["judgement"]["points"])
-        print(
+        print(  # shown where it fails
             form["id"],
             form["judgement"]["points"],
             round(ours[-1], 1),

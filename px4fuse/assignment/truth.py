@@ -24,6 +24,8 @@ from px4fuse.simulation.sensors import TIMESYNC_CONVERGED_S
 
 # A size may be off by this share and is right
 TOLERANCE = 0.15
+# What a closure error tells of where it landed
+LANDED_WITHIN_M = 0.3
 # From this factor in variance on a verdict cannot be mistaken
 CLEAR = 1.5
 # EKF2 has rejected samples from this share on
@@ -127,7 +129,8 @@ def _wrong(
     if not arguments:
         return Wrong(name)
     size = given[arguments[0].field]
-    low, high = sorted((size * (1.0 - TOLERANCE), size * (1.0 + TOLERANCE)))
+    off = LANDED_WITHIN_M if name == "open-end" else TOLERANCE * abs(size)
+    low, high = size - off, size + off
     if name == "clock-offset":  # what an ideal analysis of the log can tell
         found = clock_offset(comparison, tuned_horizontally(comparison))
         if isinstance(found, ClockOffset) and found.determinable:

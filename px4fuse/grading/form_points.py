@@ -106,8 +106,10 @@ def form_points(answers: Answers, truth: FormTruth) -> FormPoints:
     elif truth.mistakes and len(false) < MOST_FALSE:
         parts |= _of_mistakes(matched, truth, weights)
         parts["kinds"] = max(parts["kinds"] - FALSE_CLAIM * len(false), 0.0)
-    parts["verdicts"] = weights["verdicts"] * _verdicts(answers, truth)
-    parts["quantities"] = weights["quantities"] * _quantities(answers, truth)
+    computed = _quantities(answers, truth)
+    parts["quantities"] = weights["quantities"] * computed
+    # on many flights the verdicts are the same: who computed nothing may have guessed them
+    parts["verdicts"] = weights["verdicts"] * _verdicts(answers, truth) * (1.0 if computed else 0.5)
     named = {
         wrong.kind: claim is not None and claim.kind == wrong.kind for wrong, claim, _ in matched
     }

@@ -1,0 +1,143 @@
+"""What forms earn that nobody thought about, on assigned flights.
+
+``python tests/studies/form_guesses.py`` draws assignments as ``simulate --assignment`` does, takes
+the right answers of each, and prints the mean share of the points of: forms filled in at random,
+"none" everywhere, the constant form that earns most (the commonest mistake with the commonest
+answers), and forms filled in with the truth. ``--students`` gives another number of flights.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+from collections import Counter
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from statistics import fmean
+
+import numpy as np
+
+from px4fuse.answers import CURES, EKF2_DID, MISTAKES, PANELS, VERDICTS, Answers, Claim
+from px4fuse.assignment.assignment import fly
+from px4fuse.assignment.roster import Student
+from px4fuse.assignment.truth import FormTruth, Wrong
+from px4fuse.grading.form_points import SEEN, cures, form_points
+
+SECRET = b"form guesses"
+SHA256 = "0" * 64
+GUESSES = 20
+
+
+def truth(number: int) -> FormTruth:
+    """The right answers to the flight of one student of a mixed class."""
+    student = Student(f"s{number}", "", f"s{number}.ulg")
+    _, answer = fly(SECRET, student, "mixed")
+    assert answer.form is not None
+    return answer.form
+
+
+def at_random(rng: np.random.Generator) -> Answers:
+    """A form that knows what can be said and nothing else."""
+    named = [name for name in MISTAKES if name != "none"]
+    kinds = rng.choice(named, int(rng.integers(1, 4)), replace=False)
+    claims = tuple(
+        Claim(
+            str(kind), float(rng.lognormal(-1.0, 1.5)), when="whole flight",
+            parameter=str(rng.choice(list(CURES))), value=float(rng.lognormal(-1.0, 1.5)),
+            panel=str(rng.choice(PANELS)),
+        )
+        for kind in kinds
+    )  # fmt: skip
+    return Answers(
+        log_sha256=SHA256,
+        mistakes=(Claim("none"),) if rng.random() < 1.0 / 3.0 else claims,
+        verdict_ours=str(rng.choice(VERDICTS)),  # type: ignore[arg-type]
+        verdict_ekf2=str(rng.choice(VERDICTS)),  # type: ignore[arg-type]
+        ekf2_did=(str(rng.choice(EKF2_DID)),),
+        quantities=tuple(rng.normal(0.0, 0.3, 3).tolist()),
+    )
+
+
+def constant(truths: Sequence[FormTruth], kind: str) -> Answers:
+    """The same for everybody: a mistake, and the commonest of everything else."""
+
+    def common(values: list[str]) -> str:
+        return Counter(values).most_common(1)[0][0]
+
+    of_kind = [wrong for one in truths for wrong in one.mistakes if wrong.kind == kind]
+    size = float(np.median([wrong.size for wrong in of_kind if wrong.size is not None] or [0.0]))
+    cure = ""
+    if kind != "none":
+        cure = cures(Wrong(kind, size, size, size), truths[0])[0][0]
+    claim = Claim(
+        kind, size if kind != "none" else None, when="whole flight" if kind != "none" else "",
+        parameter=cure, panel=SEEN[kind][0] if kind != "none" else "",
+    )  # fmt: skip
+    return Answers(
+        log_sha256=SHA256,
+        mistakes=(claim,),
+        verdict_ours=common([one.ours.verdict for one in truths]),  # type: ignore[arg-type]
+        verdict_ekf2=common([one.ekf2.verdict for one in truths]),  # type: ignore[arg-type]
+        ekf2_did=(common([said for one in truths for said in one.ekf2_did]),),
+    )
+
+
+def right(one: FormTruth) -> Answers:
+    """The truth, as a student would write it."""
+    claims = []
+    for wrong in one.mistakes:
+        parameter, (low, high), _ = cures(wrong, one)[0]
+        value = 1.1 * low if np.isinf(high) else 0.5 * (low + high)
+        value = None if np.isinf(low) else value
+        whole = wrong.from_s is None and wrong.until_s is None
+        claims.append(
+            Claim(
+                wrong.kind,
+                wrong.size,
+                when="whole flight" if whole else "",
+                from_s=wrong.from_s,
+                until_s=wrong.until_s,
+                parameter=parameter,
+                value=value,
+                panel=SEEN[wrong.kind][0],
+            )
+        )
+    return Answers(
+        log_sha256=SHA256,
+        mistakes=tuple(claims) or (Claim("none"),),
+        verdict_ours=one.ours.verdict,  # type: ignore[arg-type]
+        verdict_ekf2=one.ekf2.verdict,  # type: ignore[arg-type]
+        ekf2_did=one.ekf2_did,
+        quantities=one.quantities,
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--students", type=int, default=300)
+    given = parser.parse_args()
+    with ProcessPoolExecutor(os.cpu_count()) as pool:
+        truths = list(pool.map(truth, range(given.students), chunksize=5))
+    rng = np.random.default_rng(1)
+    none = Answers(log_sha256=SHA256, mistakes=(Claim("none"),))
+    loops = [one for one in truths if one.sigma_z_m < 0.05]
+    aisles = [one for one in truths if one.sigma_z_m >= 0.05]
+    print(f"{len(aisles)} aisles, {len(loops)} loops")
+    for name, group in (("all", truths), ("aisles", aisles), ("loops", loops)):
+        kinds = {wrong.kind for one in group for wrong in one.mistakes} | {"none"}
+        best = {kind: fmean(form_points(constant(group, kind), one).share for one in group)
+                for kind in kinds}  # fmt: skip
+        kind = max(best, key=lambda each: best[each])
+        random = fmean(
+            form_points(at_random(rng), one).share for one in group for _ in range(GUESSES)
+        )
+        print(
+            f"{name:7} right {fmean(form_points(right(one), one).share for one in group):.3f}  "
+            f"random {random:.3f}  "
+            f"none {fmean(form_points(none, one).share for one in group):.3f}  "
+            f"best constant {best[kind]:.3f} ({kind})"
+        )
+
+
+if __name__ == "__main__":
+    main()
