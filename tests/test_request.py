@@ -82,7 +82,9 @@ def parsed(command: str) -> Request:
     assert program == "px4fuse"
     made = compare if name == "compare" else loop
     context = made.make_context(name, [*options, "--", file])
-    own = ("output", "json_path", "fail_on", "student", "student_id", "notes", "answers", "tum", "g2o")
+    own = (
+        "output", "json_path", "fail_on", "student", "student_id", "notes", "answers", "tum", "g2o",
+    )  # fmt: skip
     given_ = {key: value for key, value in context.params.items() if key not in own}
     if name == "compare":
         return comparison_request(given_.pop("log"), given_)
@@ -136,8 +138,8 @@ def test_what_px4fuse_cannot_have_recorded_is_refused(recorded: object, says: st
 @pytest.mark.parametrize("command", [compare, loop])
 def test_every_option_of_an_analysis_is_in_the_request(command: click.Command) -> None:
     """An option that the request forgets would be missing from every record."""
-    about_outputs = {"-o", "--json", "--student", "--id", "--notes", "--answers", "--fail-on", "--tum", "--g2o",
-                     "--closures", "--robust", "--max-size"}  # fmt: skip
+    about_outputs = {"-o", "--json", "--student", "--id", "--notes", "--answers", "--fail-on",
+                     "--tum", "--g2o", "--closures", "--robust", "--max-size"}  # fmt: skip
     request = ComparisonRequest(
         log="a", mavlink="b", system=1, sigma_a_m_s2=1.0, sigma_z_m=1.0, dt_s=0.2, input="zero",
         axes=("down",), heading_deg=1.0, start_s=1.0, end_s=2.0, clock_offset_s=0.1,
