@@ -143,7 +143,13 @@ class LogInfo(Record, frozen=True, omit_defaults=False):
     parameters : mapping
         Parameters that bear on fusion and logging, by PX4 name, as they were at the log's start.
     notes : tuple of str
-        What the reader had to do: corruption passed over, samples with impossible time stamps.
+        What the reader had to do: samples with impossible time stamps, clocks that were mapped.
+    damage : tuple of str
+        What of the file could not be read, and how much that is: sentences.
+    bytes_read : int
+        Of ``bytes``, those of whole messages.
+    ends_in_flight : bool
+        Whether the land detector still says "flying" at the end of the data.
     autopilot : str
         "PX4", "ArduPilot", or what the log says.
     start_unix_s : float or None
@@ -170,6 +176,9 @@ class LogInfo(Record, frozen=True, omit_defaults=False):
     start_unix_s: float | None = None
     senders: tuple[Sender, ...] = ()
     vehicle: str = ""
+    damage: tuple[str, ...] = ()
+    bytes_read: Count = 0
+    ends_in_flight: bool = False
 
     __repr__ = brief
 

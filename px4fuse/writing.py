@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import secrets
 import signal
 import stat
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import IO
 
 from px4fuse.errors import OutputError
 
 STANDARD_OUTPUT = Path("-")
+# How long a named pipe is waited for that nobody reads yet
+READER_S = 5.0
 #: What ends a run from outside: Ctrl-C, termination, and (not on Windows) a closed terminal
 STOPPING = (signal.SIGINT, signal.SIGTERM, *([signal.SIGHUP] if hasattr(signal, "SIGHUP") else []))
 
@@ -120,8 +125,23 @@ def _stream(path: Path, content: bytes) -> None:
         sys.stdout.buffer.write(content)
         sys.stdout.flush()
         return
-    with path.open("wb") as file:
+    with _opened_pipe(path) if path.is_fifo() else path.open("wb") as file:
         file.write(content)
+
+
+def _opened_pipe(path: Path) -> IO[bytes]:
+    """A named pipe that somebody reads; one that nobody reads would keep us waiting for ever."""
+    until = time.monotonic() + READER_S
+    while True:
+        try:
+            number = os.open(path, os.O_WRONLY | os.O_NONBLOCK)
+        except OSError as error:
+            if error.errno != errno.ENXIO or time.monotonic() > until:
+                raise
+            time.sleep(0.05)
+        else:
+            os.set_blocking(number, True)
+            return os.fdopen(number, "wb")
 
 
 def _rename(staged: Sequence[_Staged]) -> None:
@@ -167,8 +187,9 @@ def _explained(path: Path) -> Iterator[None]:
         raise
     except OSError as error:
         name = "standard output" if path == STANDARD_OUTPUT else path
+        why = "nobody reads this pipe" if error.errno == errno.ENXIO else error.strerror
         raise OutputError(
-            f"{name}: cannot be written ({error.strerror}). Choose another place for it."
+            f"{name}: cannot be written ({why}). Choose another place for it."
         ) from error
 
 

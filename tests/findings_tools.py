@@ -68,7 +68,8 @@ class StandIn:
 def log(**parts: Any) -> Any:
     usual = {
         "parameters": {}, "notes": (), "format": "ULog", "has_ulog": True, "autopilot": "PX4",
-        "dropouts": (),
+        "dropouts": (), "damage": (), "ends_in_flight": False, "duration_s": 60.0, "bytes": 0,
+        "bytes_read": 0,
     }  # fmt: skip
     return SimpleNamespace(**{**usual, **parts})
 

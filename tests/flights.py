@@ -115,6 +115,7 @@ def aisle_flight(
     parameters: Mapping[str, float] | None = None,
     dropouts: tuple[Dropout, ...] = (),
     notes: tuple[str, ...] = (),
+    damage: tuple[str, ...] = (),
 ) -> Flight:
     """Fly along the aisle; None leaves a part out of the log."""
     rng = np.random.default_rng(seed)
@@ -143,6 +144,7 @@ def aisle_flight(
             dropouts=dropouts,
             parameters=PARAMETERS if parameters is None else parameters,
             notes=notes,
+            damage=damage,
         ),
         imu=unavailable("IMU")
         if imu is None

@@ -441,12 +441,32 @@ def test_a_rate_that_is_just_enough_is_enough() -> None:
 
 def test_what_is_damaged_is_counted() -> None:
     for count, more in ((1, ""), (2, " (and 1 more such note)"), (3, " (and 2 more such notes)")):
-        notes = ("the file is damaged", "4 samples dropped: late")
-        one = analysis(log=log(notes=notes * count))
-        damaged, dropped = log_damaged.DETECTOR.detect(one)
-        assert damaged.message == f"The file is damaged{more}."
+        (dropped,) = log_damaged.DETECTOR.detect(
+            analysis(log=log(notes=("4 samples dropped: late",) * count))
+        )
         assert dropped.message == f"4 samples dropped: late{more}."
-        assert damaged.evidence == dropped.evidence == {"notes": float(count)}
+        assert dropped.evidence == {"notes": float(count)}
+
+
+@pytest.mark.parametrize(
+    ("damage", "flying", "severity", "said"),
+    [
+        (("it is cut", "9 bytes are lost"), True, "warning", "It is cut. 9 bytes are lost."),
+        ((), True, "info", "The log ends in flight, after 60.0 s: the landing is not in it."),
+        ((), False, None, ""),
+    ],
+)
+def test_what_is_not_in_a_log_is_said(
+    damage: tuple[str, ...], flying: bool, severity: str | None, said: str
+) -> None:
+    found = list(
+        log_damaged.DETECTOR.detect(
+            analysis(log=log(damage=damage, ends_in_flight=flying, bytes=100, bytes_read=91))
+        )
+    )
+    assert [(one.severity, one.message) for one in found] == ([(severity, said)] if said else [])
+    for one in found:
+        assert one.evidence == {"lost_bytes": 9.0, "ends_in_flight": float(flying)}
 
 
 def test_a_recording_says_what_it_holds() -> None:

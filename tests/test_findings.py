@@ -423,8 +423,8 @@ FAULTS = [
     Fault(
         "log_damaged",
         "warning",
-        {"notes": ("the file is damaged, what could be read was used",)},
-        evidence={"notes": 1.0},
+        {"damage": ("the file is damaged, what could be read was used",)},
+        evidence={"ends_in_flight": 0.0},
         remedy="SD card",
     ),
     Fault(

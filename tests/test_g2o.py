@@ -101,6 +101,14 @@ REFUSED = {
     "negative": (PLANE.replace(UNIT_2, "1 0 0 1 0 -1"), "line 3: the information matrix has a neg"),
     "indefinite": (PLANE.replace(UNIT_2, "1 2 0 1 0 1"), "line 3: the information matrix has a n"),
     "no rotation": (SPACE.replace("0 0 0 1\nE", "0 0 0 0\nE"), "line 2: a quaternion of length 0"),
+    "endless rotation": (
+        SPACE.replace("0 0 0 1\nE", "0 0 0 1.8e308\nE"),
+        "line 2",
+    ),
+    "long rotation": (
+        SPACE.replace("0 0 0 1\nE", "0 0 0 1.7e308\nE"),
+        "line 2: a quaternion of length",
+    ),
     "FIX of none": (PLANE + "FIX 8", "line 4: FIX of vertex 8, which the file does not have"),
     "two FIX": (PLANE + "FIX 0\nFIX 1", "line 5: FIX of a second vertex (1 beside 0)"),
     "parts": (f"{EDGE}\n{EDGE.replace('0 1', '5 6', 1)}", "falls into 2 parts: vertex 5 is not"),

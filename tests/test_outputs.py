@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import json
+import os
+import shlex
 import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 from test_cli import run_main
 from ulog_tools import ev_error, ev_stamps, make_log, position
 
 import px4fuse.report.pdf
 from px4fuse.analysis import run_comparison
+from px4fuse.cli import cli
 from px4fuse.errors import MissingDataError
 from px4fuse.report import fonts
 from px4fuse.request import ComparisonRequest
@@ -296,3 +300,64 @@ def test_stamps_of_arrival_are_said_to_be(tmp_path, monkeypatch, capsys, arrived
         odometry["timestamp_sample"] = odometry["timestamp"].copy()
     found = findings_of(monkeypatch, capsys, tmp_path / "r.pdf", log.write(tmp_path / "l.ulg"))
     assert ("companion_not_synchronised" in {each["id"] for each in found}) == arrived
+
+
+# ---- places that take no output ------------------------------------------------------------------
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full here")
+@pytest.mark.parametrize("words", [["--help"], ["--version"], ["lesson", "kalman"]])
+def test_a_full_place_is_one_line(words: list[str]) -> None:
+    with Path("/dev/full").open("wb") as full:
+        done = subprocess.run(
+            [sys.executable, "-m", "px4fuse", *words],
+            stdout=full,
+            stderr=subprocess.PIPE,
+            check=False,
+        )
+    assert done.returncode == 2
+    assert done.stderr.decode().startswith("px4fuse: standard output: cannot be written")
+    assert done.stderr.count(b"\n") == 1
+
+
+@pytest.mark.skipif(os.name != "posix", reason="closes a file descriptor")
+@pytest.mark.parametrize("words", ["--help", "lesson kalman"])
+def test_a_closed_standard_output_is_no_error(words: str) -> None:
+    done = subprocess.run(
+        ["sh", "-c", f"{sys.executable} -m px4fuse {words} >&-"],
+        stderr=subprocess.PIPE, check=False,
+    )  # fmt: skip
+    assert (done.returncode, done.stderr) == (0, b"")
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("info {log} --json {long}.json", "File name too long"),
+        ("extract {log} -o ''", "the name is empty"),
+        ("batch '' -o {folder}", "the name of a log is empty"),
+        ("tune {log} --start 126", "no noise could be determined"),
+        ("sync {log} --end 3", "no clock offset could be determined"),
+    ],
+)
+def test_what_is_not_done_is_one_line_and_no_success(
+    words: str, said: str, sample_log: Path, tmp_path: Path
+) -> None:
+    typed = words.format(log=sample_log, long="x" * 300, folder=tmp_path)
+    outcome = CliRunner().invoke(cli, shlex.split(typed), standalone_mode=False)
+    assert said in str(outcome.exception)
+    assert "\n" not in str(outcome.exception)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="named pipes are of POSIX")
+def test_a_pipe_that_nobody_reads_is_not_waited_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, sample_log: Path
+) -> None:
+    monkeypatch.setattr("px4fuse.writing.READER_S", 0.1)
+    os.mkfifo(tmp_path / "pipe")
+    words = ["info", str(sample_log), "--json", str(tmp_path / "pipe")]
+    outcome = CliRunner().invoke(cli, words, standalone_mode=False)
+    assert "nobody reads this pipe" in str(outcome.exception)
+    words = ["grade", str(tmp_path / "pipe"), "-o", str(tmp_path / "out")]
+    outcome = CliRunner().invoke(cli, words, standalone_mode=False)
+    assert "a device, pipe or socket" in str(outcome.exception)

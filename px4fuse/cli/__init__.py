@@ -114,6 +114,7 @@ def main() -> None:
     atexit.register(gc.freeze)  # and while everything is thrown away, as much again
     for name, one in ONE_THREAD.items():  # commands load the libraries later
         os.environ.setdefault(name, one)
+    _open_streams()
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):  # σ and ν on a Windows console with a legacy code page
             stream.reconfigure(errors="replace")
@@ -138,11 +139,33 @@ def main() -> None:
     except BrokenPipeError:  # the reader of a pipe has gone, as with | head; the files are written
         _abandon_output()
         code = 0
+    except OSError as error:  # of --help and --version, which click writes itself
+        _say(f"standard output: cannot be written ({error.strerror}), nothing was written.")
+        code = 2
+    sys.exit(_flushed(code if isinstance(code, int) else 0))
+
+
+def _flushed(code: int) -> int:
+    """The exit code once all that was said is out."""
     try:
         sys.stdout.flush()
-    except OSError:  # said before
+    except OSError as error:
         _abandon_output()
-    sys.exit(code if isinstance(code, int) else 0)
+        if code == 0:  # else said before
+            _say(f"standard output: cannot be written ({error.strerror}).")
+            return 2
+    return code
+
+
+def _open_streams() -> None:
+    """Give a stream that was closed (``>&-``) a place where what is written is lost."""
+    for number, name in ((1, "stdout"), (2, "stderr")):
+        if getattr(sys, name) is None:
+            lost = os.open(os.devnull, os.O_WRONLY)
+            if lost != number:
+                os.dup2(lost, number)
+                os.close(lost)
+            setattr(sys, name, open(number, "w", encoding="utf-8"))  # noqa: SIM115, PTH123 - for good
 
 
 def _in_options(text: str, command: str | None) -> str:

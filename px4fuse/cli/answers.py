@@ -7,13 +7,13 @@ from pathlib import Path
 
 import click
 
-from px4fuse.cli.inputs import path_option
+from px4fuse.cli.inputs import Named, path_option
 from px4fuse.cli.outputs import write_outputs
 from px4fuse.errors import OutputError
 
 
 @click.command()
-@click.argument("log", type=click.Path(path_type=Path))
+@click.argument("log", type=Named())
 @path_option(
     "-o", "--output", metavar="FILE.toml", help="The form.  [default: LOG.answers.toml beside LOG]"
 )

@@ -9,6 +9,7 @@ from typing import Any
 import click
 
 from px4fuse.cli.inputs import (
+    Named,
     analysis_options,
     comparison_request,
     person_options,
@@ -32,7 +33,7 @@ SEVERITIES = ("error", "warning", "info")
 
 
 @click.command()
-@click.argument("log", type=click.Path(path_type=Path))
+@click.argument("log", type=Named())
 @analysis_options
 @person_options
 @report_options

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from px4fuse.cli.inputs import max_size_option, path_option, results_option
+from px4fuse.cli.inputs import Named, max_size_option, path_option, results_option
 from px4fuse.cli.outputs import free_report, progress, report_paths, terminal, write_outputs
 from px4fuse.writing import STANDARD_OUTPUT
 
@@ -25,8 +25,8 @@ MAX_NAME_BYTES = 90
 
 
 @click.command()
-@click.argument("a", type=click.Path(path_type=Path))
-@click.argument("b", type=click.Path(path_type=Path))
+@click.argument("a", type=Named())
+@click.argument("b", type=Named())
 @max_size_option
 @path_option(
     "-o", "--output", metavar="FILE.pdf", help="The report.  [default: reports/A_to_B.pdf]"

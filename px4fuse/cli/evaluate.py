@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from px4fuse.cli.inputs import max_size_option, path_option, system_option
+from px4fuse.cli.inputs import Named, max_size_option, path_option, system_option
 from px4fuse.cli.outputs import finish, free_report, progress, report_paths
 from px4fuse.cli.quantity import Quantity
 from px4fuse.errors import OutputError, SettingsError
@@ -53,8 +53,8 @@ class DeltaType(click.ParamType["Delta"]):
 
 
 @click.command()
-@click.argument("estimate", type=click.Path(path_type=Path))
-@click.argument("reference", type=click.Path(path_type=Path))
+@click.argument("estimate", type=Named())
+@click.argument("reference", type=Named())
 @click.option(
     "--alignment",
     type=click.Choice(["none", "yaw", "se3", "sim3"]),

@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from px4fuse.cli.inputs import analysis_options, comparison_request, path_option
+from px4fuse.cli.inputs import Named, analysis_options, comparison_request, path_option
 from px4fuse.cli.outputs import progress, spare_inputs, terminal, write_outputs
 from px4fuse.errors import OutputError, SettingsError
 from px4fuse.request import settings_name
@@ -21,7 +21,7 @@ ENDINGS = (".html", ".htm")
 
 
 @click.command()
-@click.argument("logs", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.argument("logs", nargs=-1, required=True, type=Named())
 @analysis_options
 @path_option("-o", "--output", metavar="FILE.html", help="The page.  [default: reports/LOG.html]")
 @click.option("--open", "show", is_flag=True, help="Open it in the browser.")

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from px4fuse.cli.inputs import comparison_request, path_option, recording_options
+from px4fuse.cli.inputs import Named, comparison_request, path_option, recording_options
 from px4fuse.cli.outputs import write_outputs
 from px4fuse.errors import OutputError
 from px4fuse.reading import read_text
@@ -24,7 +24,7 @@ MAX_DESCRIPTION_BYTES = 50_000_000
 
 
 @click.command()
-@click.argument("log", type=click.Path(path_type=Path))
+@click.argument("log", type=Named())
 @path_option(
     "-o",
     "--output",

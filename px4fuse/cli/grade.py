@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Literal
 
 import click
 
-from px4fuse.cli.inputs import max_size_option, path_option
+from px4fuse.cli.inputs import Named, max_size_option, path_option
 from px4fuse.cli.outputs import Interrupted, progress, terminal, write_outputs
 from px4fuse.errors import OutputError, SettingsError
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 @click.command()
-@click.argument("submissions", nargs=-1, type=click.Path(path_type=Path))
+@click.argument("submissions", nargs=-1, type=Named())
 @path_option(
     "--logs",
     multiple=True,
@@ -140,16 +140,7 @@ def grade(
         raise SettingsError("nothing to grade: give PDFs, folders or zip files.")
     if output is None:
         raise SettingsError("say with -o where the class table goes.")
-    if output.exists() and not output.is_dir():
-        raise OutputError(f"-o {output}: is not a folder. Give another place.")
-    for path in (*submissions, *logs):
-        if not path.exists():
-            raise SettingsError(f"{path}: no such file or folder.")
-        if path.is_dir() and output.resolve().is_relative_to(path.resolve()):
-            raise OutputError(
-                f"-o {output}: lies inside {path}, which is read; its own output would be graded. "
-                "Choose another folder."
-            )
+    _check_places(output, (*submissions, *logs))
     answers = None
     if key is not None:
         from px4fuse.assignment.key import read_key
@@ -180,6 +171,21 @@ def grade(
         left = "but what is graded is kept. The same command goes on from there."
         raise Interrupted(stopped, left) from None
     _print(outcome)
+
+
+def _check_places(output: Path, given: tuple[Path, ...]) -> None:
+    if output.exists() and not output.is_dir():
+        raise OutputError(f"-o {output}: is not a folder. Give another place.")
+    for path in given:
+        if not path.exists():
+            raise SettingsError(f"{path}: no such file or folder.")
+        if not path.is_file() and not path.is_dir():
+            raise SettingsError(f"{path}: a device, pipe or socket. Give a file or folder.")
+        if path.is_dir() and output.resolve().is_relative_to(path.resolve()):
+            raise OutputError(
+                f"-o {output}: lies inside {path}, which is read; its own output would be graded. "
+                "Choose another folder."
+            )
 
 
 def _write_new(path: Path, content: bytes) -> None:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from px4fuse.cli.inputs import comparison_request, json_option, recording_options
+from px4fuse.cli.inputs import Named, comparison_request, json_option, recording_options
 from px4fuse.cli.outputs import progress, terminal, write_json
 from px4fuse.writing import STANDARD_OUTPUT
 
@@ -23,7 +23,7 @@ REPLAY_PPM = 10_000.0
 
 
 @click.command()
-@click.argument("log", type=click.Path(path_type=Path))
+@click.argument("log", type=Named())
 @json_option
 @recording_options
 def info(log: Path, json_path: Path | None, **given: Any) -> None:

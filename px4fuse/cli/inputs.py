@@ -45,8 +45,21 @@ def _together(*options: Option) -> Option:
     return add
 
 
+class Named(click.Path):
+    """A file or folder; an empty name, which would be the current folder, is a slip."""
+
+    def __init__(self) -> None:
+        super().__init__(path_type=Path)
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Convert what was typed."""
+        if value == "":
+            self.fail("the name is empty.", param, ctx)
+        return super().convert(value, param, ctx)
+
+
 # An option that names a file or folder
-path_option = partial(click.option, type=click.Path(path_type=Path))
+path_option = partial(click.option, type=Named())
 _ANALYSIS = _together(
     click.option(
         "--sigma-a",

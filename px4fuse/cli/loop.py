@@ -9,6 +9,7 @@ import click
 from click.core import ParameterSource
 
 from px4fuse.cli.inputs import (
+    Named,
     max_size_option,
     path_option,
     person_options,
@@ -65,7 +66,7 @@ class FrameType(click.Choice[str]):
 
 
 @click.command()
-@click.argument("source", type=click.Path(path_type=Path))
+@click.argument("source", type=Named())
 @click.option(
     "--from",
     "start_s",

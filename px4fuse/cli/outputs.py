@@ -224,8 +224,14 @@ def spare_inputs(targets: Iterable[Path]) -> None:
     paths = [Path(path) for some in several for path in some]  # URLs are texts
     read = [path if path.exists() else Path(str(path).rpartition(":")[0]) for path in paths]
     for target in targets:
+        try:
+            there = target.exists()
+        except OSError as error:  # a name that is too long
+            raise OutputError(
+                f"{target}: cannot be written ({error.strerror}). Choose another place for it."
+            ) from error
         for source in read:
-            if target.exists() and source.exists() and target.samefile(source):
+            if there and source.exists() and target.samefile(source):
                 raise OutputError(
                     f"{target}: is what this command reads; it was not overwritten. Give another "
                     "name for the output."

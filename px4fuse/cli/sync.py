@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from px4fuse.cli.inputs import analysis_options, comparison_request, json_option
+from px4fuse.cli.inputs import Named, analysis_options, comparison_request, json_option
 from px4fuse.cli.outputs import progress, terminal, write_json
 from px4fuse.writing import STANDARD_OUTPUT
 
@@ -15,7 +15,7 @@ STEPS = ("reading", "tuning", "clock offset", "changes of the clock")
 
 
 @click.command()
-@click.argument("log", type=click.Path(path_type=Path))
+@click.argument("log", type=Named())
 @analysis_options
 @json_option
 def sync(log: Path, json_path: Path | None, **given: Any) -> None:
@@ -26,7 +26,9 @@ def sync(log: Path, json_path: Path | None, **given: Any) -> None:
     """
     from px4fuse.analysis import run_preparation
     from px4fuse.comparison.estimates import clock_offset, tuned_horizontally
+    from px4fuse.errors import MissingDataError
     from px4fuse.filter.motion import Made
+    from px4fuse.flight import Unavailable
     from px4fuse.report.terminal import print_advice
     from px4fuse.report.words import clock_advice
     from px4fuse.request import command_line
@@ -38,6 +40,8 @@ def sync(log: Path, json_path: Path | None, **given: Any) -> None:
         step("tuning")
         made: Made = {}  # both need the same signals of the IMU
         found = clock_offset(compared, tuned_horizontally(compared, made), step, made)
-    if write_json(sync_results(request, compared, found, command_line(request, "sync")), json_path):
-        return
-    print_advice(terminal(), clock_advice(compared, found), request)
+    results = sync_results(request, compared, found, command_line(request, "sync"))
+    if not write_json(results, json_path):
+        print_advice(terminal(), clock_advice(compared, found), request)
+    if isinstance(found, Unavailable) or not found.determinable:
+        raise MissingDataError(f"{compared.flight.log.name}: no clock offset could be determined.")

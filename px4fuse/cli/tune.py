@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from px4fuse.cli.inputs import analysis_options, comparison_request, json_option
+from px4fuse.cli.inputs import Named, analysis_options, comparison_request, json_option
 from px4fuse.cli.outputs import progress, terminal, write_json
 from px4fuse.writing import STANDARD_OUTPUT
 
@@ -26,7 +26,7 @@ STEPS = (
 
 
 @click.command()
-@click.argument("log", type=click.Path(path_type=Path))
+@click.argument("log", type=Named())
 @analysis_options
 @json_option
 def tune(log: Path, json_path: Path | None, **given: Any) -> None:
@@ -37,6 +37,8 @@ def tune(log: Path, json_path: Path | None, **given: Any) -> None:
     """
     from px4fuse.analysis import run_preparation
     from px4fuse.comparison.estimates import tuned as tuned_noises
+    from px4fuse.errors import MissingDataError
+    from px4fuse.flight import Unavailable
     from px4fuse.request import command_line
     from px4fuse.results.build import tuning_results
 
@@ -44,11 +46,11 @@ def tune(log: Path, json_path: Path | None, **given: Any) -> None:
     with progress(json_path == STANDARD_OUTPUT, STEPS) as step:
         compared = run_preparation(request, step)
         tuned = tuned_noises(compared, progress=step)
-    if write_json(
-        tuning_results(request, compared, tuned, command_line(request, "tune")), json_path
-    ):
-        return
-    _print(terminal(), compared, tuned, request)
+    results = tuning_results(request, compared, tuned, command_line(request, "tune"))
+    if not write_json(results, json_path):
+        _print(terminal(), compared, tuned, request)
+    if all(isinstance(found, Unavailable) for found in tuned.values()):
+        raise MissingDataError(f"{compared.flight.log.name}: no noise could be determined.")
 
 
 def _print(

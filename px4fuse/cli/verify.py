@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from px4fuse.cli.inputs import json_option, max_size_option, path_option
+from px4fuse.cli.inputs import Named, json_option, max_size_option, path_option
 from px4fuse.cli.outputs import progress, spare_inputs, terminal, write_json, write_outputs
 from px4fuse.errors import LogError
 from px4fuse.reading import files_by_sha256, read_whole, shown
@@ -28,8 +28,8 @@ TIMEOUT_S = 1800.0
 
 
 @click.command()
-@click.argument("report", type=click.Path(path_type=Path), metavar="REPORT.pdf")
-@click.argument("logs", type=click.Path(path_type=Path), nargs=-1, metavar="[LOG ...]")
+@click.argument("report", type=Named(), metavar="REPORT.pdf")
+@click.argument("logs", type=Named(), nargs=-1, metavar="[LOG ...]")
 @max_size_option
 @path_option(
     "-o", "--output", metavar="FILE.pdf", help="Write the report, drawn again from the log."

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from px4fuse.cli.inputs import flight_options, json_option, path_option
+from px4fuse.cli.inputs import Named, flight_options, json_option, path_option
 from px4fuse.cli.outputs import progress, terminal, write_outputs
 from px4fuse.cli.quantity import NAMES, in_unit
 from px4fuse.errors import OutputError, SettingsError
@@ -23,7 +23,7 @@ STEPS = (
 
 
 @click.command()
-@click.argument("log", type=click.Path(path_type=Path))
+@click.argument("log", type=Named())
 @click.option(
     "--set",
     "changes",

@@ -105,7 +105,7 @@ def choose_source(flight: Flight, name: str | None = None) -> tuple[PositionTrac
 
 
 def _no_source(flight: Flight) -> str:
-    damaged = "the file is damaged, and " if any("damaged" in n for n in flight.log.notes) else ""
+    damaged = "the file is damaged, and " if flight.log.damage else ""
     if flight.log.format.startswith("MAVLink"):
         return (
             f"{flight.log.name}: {damaged}no external position was sent to the autopilot in this "

@@ -162,6 +162,8 @@ def take_inventory(flight: Flight) -> Inventory:
         unused=flight.unused,
         inputs=flight.inputs,
         notes=(
+            *flight.log.damage,
+            *_end(flight.log),
             *flight.log.notes,
             *(plan.track.notes if plan.track is not None else ()),
             *(flight.ekf2.notes if isinstance(flight.ekf2, Ekf2) else ()),
@@ -173,6 +175,11 @@ def to_plain(inventory: Inventory) -> dict[str, Any]:
     """The inventory for JSON: what is not known is absent."""
     data: dict[str, Any] = plain(inventory)
     return {"schema": {"name": SCHEMA_NAME, "version": SCHEMA_VERSION}, **data}
+
+
+def _end(log: LogInfo) -> tuple[str, ...]:
+    flying = log.ends_in_flight and not log.damage
+    return ("the log ends in flight: the landing is not in it",) if flying else ()
 
 
 def _utc(unix_s: float | None) -> str | None:

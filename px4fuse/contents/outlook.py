@@ -179,7 +179,7 @@ def advice(flight: Flight, plan: Plan) -> tuple[Advice, ...]:
 
 def _advice(flight: Flight, plan: Plan) -> Iterator[Advice]:
     log, track, ekf2 = flight.log, plan.track, flight.ekf2
-    if any("damaged" in note for note in log.notes):
+    if log.damage:
         remedy = (
             "Record where the link loses no bytes: by cable, or on the companion."
             if log.format.startswith("MAVLink")

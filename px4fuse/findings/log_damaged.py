@@ -8,17 +8,22 @@ from px4fuse.findings.model import Detector, Finding, Found, sentence
 
 def _detect(analysis: Analysis) -> Found:
     log = analysis.flight.log
-    damage = [note for note in log.notes if "damaged" in note]
     dropped = [note for note in log.notes if " dropped: " in note]
-    if damage:
+    ends = f"the log ends in flight, after {log.duration_s:.1f} s: the landing is not in it"
+    if log.damage or log.ends_in_flight:
         yield Finding(
             "log_damaged",
-            "warning",
-            _first_of(damage),
-            "Record where the link loses no bytes: by cable, or on the companion."
+            "warning" if log.damage else "info",
+            ". ".join(map(sentence, log.damage or (ends,))) + ".",
+            "Log until after the landing; if the log was cut short, copy it again."
+            if not log.damage
+            else "Record where the link loses no bytes: by cable, or on the companion."
             if log.format.startswith("MAVLink")
             else "Copy the log again; if that does not help, replace the SD card.",
-            {"notes": float(len(damage))},
+            {
+                "lost_bytes": float(log.bytes - log.bytes_read),
+                "ends_in_flight": float(log.ends_in_flight),
+            },
         )
     if dropped:
         yield Finding(

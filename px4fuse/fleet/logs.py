@@ -63,6 +63,8 @@ def find_logs(given: Iterable[str]) -> list[FoundLog]:
     """
     found: dict[str, FoundLog] = {}
     for one in given:
+        if not one:
+            raise SettingsError("the name of a log is empty. Give files, folders or URLs.")
         logs = _logs_in(one)
         if not logs:
             raise SettingsError(

@@ -96,6 +96,10 @@ def join(flight: Flight, other: Flight) -> Flight:
                 f"{agreement}",
             ),
             start_unix_s=unix_s,
+            damage=(
+                *flight.log.damage,
+                *(f"{other.log.name}: {said}" for said in other.log.damage),
+            ),
             senders=flight.log.senders or other.log.senders,
         ),
         positions=best_first((*flight.positions, *moved.positions)),

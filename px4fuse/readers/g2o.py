@@ -203,12 +203,13 @@ def _poses(name: str, lines: _Lines, numbers: Array, dimension: int) -> Array:
     if dimension == 2:
         return numbers
     poses = numbers.copy()
-    norm = np.linalg.norm(poses[:, 3:], axis=1)
-    bad = _first(norm < 1e-6)
+    with np.errstate(over="ignore"):
+        norm = np.linalg.norm(poses[:, 3:], axis=1)
+    bad = _first((norm < 1e-6) | ~(norm < 1e6))
     if bad is not None:
         raise TrajectoryError(
-            f"{name}, line {lines.line[bad]}: a quaternion of length 0 is not a rotation. Give "
-            "qx qy qz qw behind the position."
+            f"{name}, line {lines.line[bad]}: a quaternion of length {norm[bad]:.3g} is not a "
+            "rotation. Give qx qy qz qw, of length 1, behind the position."
         )
     # What is a unit quaternion already stays as it is, so that writing and reading changes nothing
     off = np.abs(norm - 1.0) > _UNIT

@@ -11,6 +11,7 @@ from types import MappingProxyType
 
 import numpy as np
 import pandas as pd
+from msgspec import structs
 
 from px4fuse.ekf2_parameters import REPORTED
 from px4fuse.flight import (
@@ -53,7 +54,12 @@ from px4fuse.readers.mavlink_senders import (
     describe_senders,
     map_senders,
 )
-from px4fuse.readers.parts import missing_parts, stretches_of_flight, stretches_of_modes
+from px4fuse.readers.parts import (
+    ends_in_flight,
+    missing_parts,
+    stretches_of_flight,
+    stretches_of_modes,
+)
 from px4fuse.readers.ulog_topics import dropped_note
 from px4fuse.recording import LogInfo, Unused
 
@@ -99,7 +105,10 @@ def read_mavlink(path: Path, system: int | None = None) -> Flight:
     airborne = _read_airborne(recording, remedies)
     modes = _read_modes(recording) if autopilot == "PX4" else NO_MODES
     return Flight(
-        log=_describe(recording, parameters, autopilot),
+        log=structs.replace(
+            _describe(recording, parameters, autopilot),
+            ends_in_flight=ends_in_flight(airborne, recording.duration_s),
+        ),
         imu=imu,
         attitude=attitude,
         positions=positions,
@@ -252,6 +261,8 @@ def _describe(
         start_unix_s=_start_unix_s(recording),
         senders=describe_senders(recording),
         vehicle=vehicle,
+        damage=recording.damage,
+        bytes_read=len(frames.content) - frames.bad_bytes,
     )
 
 

@@ -61,6 +61,8 @@ class Recording:
         From time of receipt to the boot clock, both s.
     zero_s, duration_s : float
         Boot time of the flight's time zero, and the span of the session.
+    damage : tuple of str
+        What could not be read: sentences.
     notes : list of str
     dropped : dict
         Samples dropped for an impossible time stamp, by message; :meth:`frame` fills it.
@@ -77,6 +79,7 @@ class Recording:
     zero_s: float
     duration_s: float
     notes: list[str]
+    damage: tuple[str, ...] = ()
     dropped: dict[str, int] = field(default_factory=dict)
     streams: dict[str, Stream] = field(default_factory=dict)
 
@@ -227,10 +230,13 @@ def settle_clocks(frames: Frames, address: Address) -> Recording:
     else:
         notes.append("no message in the stream carries a time: nothing in it can be placed in time")
     notes += _frame_notes(frames, received)
+    damage = _damage(frames)
     # without a boot clock the receipt must do
     span = stamps if len(stamps) else np.array([0.0, received.max()])
     zero_s, end_s = float(span[0]), float(span[-1])
-    return Recording(frames, *address, session, received, line, zero_s, end_s - zero_s, notes)
+    return Recording(
+        frames, *address, session, received, line, zero_s, end_s - zero_s, notes, damage
+    )
 
 
 def _without_strays(stamps: Array, rows: IntArray) -> IntArray:
@@ -241,17 +247,22 @@ def _without_strays(stamps: Array, rows: IntArray) -> IntArray:
     return np.concatenate(parts[many[0] : many[-1] + 1])
 
 
+def _damage(frames: Frames) -> tuple[str, ...]:
+    """What could not be read, where it is more than a first and a last frame that are cut."""
+    inside = frames.bad_bytes - 2 * LONGEST_FRAME
+    damaged = inside > DAMAGED_SHARE * len(frames.content)
+    return (f"the file is damaged: {_passed_over(frames)}",) if damaged else ()
+
+
+def _passed_over(frames: Frames) -> str:
+    share = frames.bad_bytes / len(frames.content)
+    return f"{frames.bad_bytes:,} bytes ({share:.2%}) belong to no whole MAVLink frame"
+
+
 def _frame_notes(frames: Frames, received: Array) -> list[str]:
     notes = []
-    if frames.bad_bytes:
-        share = frames.bad_bytes / len(frames.content)
-        # the first and the last frame may be cut
-        inside = frames.bad_bytes - 2 * LONGEST_FRAME
-        damaged = "damaged: " if inside > DAMAGED_SHARE * len(frames.content) else ""
-        notes.append(
-            f"{damaged}{frames.bad_bytes} bytes ({share:.2%}) belong to no whole MAVLink frame and "
-            "were passed over"
-        )
+    if frames.bad_bytes and not _damage(frames):
+        notes.append(_passed_over(frames))
     if frames.foreign:
         listed = ", ".join(
             f"{count} of {message_name(number)}" for number, count in sorted(frames.foreign.items())

@@ -43,6 +43,15 @@ def stretches_of_flight(landed: pd.Series, duration_s: float) -> tuple[tuple[flo
     )
 
 
+def ends_in_flight(
+    airborne: tuple[tuple[float, float], ...] | Unavailable, duration_s: float
+) -> bool:
+    """Whether the last stretch of flight has no end but that of the data."""
+    return not isinstance(airborne, Unavailable) and bool(
+        airborne and airborne[-1][1] >= duration_s
+    )
+
+
 def stretches_of_modes(names: pd.Series, end_s: float) -> tuple[FlightMode, ...]:
     """Stretches (s) of a step function of time whose values are names of flight modes."""
     changes = names[names.ne(names.shift())]

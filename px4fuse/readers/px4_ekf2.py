@@ -235,6 +235,7 @@ def _read_fusing(topics: Topics, instances: Instances) -> pd.DataFrame | Unavail
         )
     frame = of_primary(topics, layout, instances, step=True)
     if "flags" in frame:
+        frame = frame[np.isfinite(frame["flags"])]
         bits = frame["flags"].to_numpy().astype(np.int64)
         frame = pd.DataFrame(
             {name: (bits >> bit & 1).astype(float) for name, bit in CONTROL_MODE_BITS.items()},

@@ -20,6 +20,7 @@ from px4fuse.flight import (
     Unavailable,
 )
 from px4fuse.readers.parts import (
+    ends_in_flight,
     finite_rows,
     missing_parts,
     stretches_of_flight,
@@ -46,6 +47,8 @@ from px4fuse.readers.ulog_topics import (
 )
 from px4fuse.recording import Stream, Unused
 
+# A message that is cut off and no more is no loss besides; a silent IMU is one from here on
+LEAST_LOST, LOST_FROM_S = 65_538, 0.2
 # A receiver's UTC outside these is not valid: PX4's own GPS_EPOCH_SECS (gps_helper.h), and 2100
 UTC_RANGE_S = (1_234_567_890.0, 4_102_444_800.0)
 
@@ -69,6 +72,7 @@ def to_flight(topics: Topics) -> Flight:
     positions, missing_positions = read_positions(topics, ekf2)
     truth = read_truth(topics, positions)
     airborne = _read_airborne(topics)
+    in_flight = ends_in_flight(airborne, topics.log.duration_s)
     dropped = tuple(
         dropped_note(count, topic, "zero or go back")
         for (topic, _), count in sorted(topics.dropped.items())
@@ -82,7 +86,11 @@ def to_flight(topics: Topics) -> Flight:
     }
     return Flight(
         log=structs.replace(
-            topics.log, notes=topics.log.notes + dropped, start_unix_s=_start_unix(topics)
+            topics.log,
+            notes=topics.log.notes + dropped,
+            start_unix_s=_start_unix(topics),
+            damage=(*_lost(topics, imu, in_flight), *topics.log.damage),
+            ends_in_flight=in_flight,
         ),
         imu=imu,
         attitude=attitude,
@@ -99,6 +107,28 @@ def to_flight(topics: Topics) -> Flight:
             for number in topics.instances(name)[:1]
         ),
     )
+
+
+def _lost(topics: Topics, imu: pd.DataFrame | Unavailable, in_flight: bool) -> tuple[str, ...]:
+    """How much of the file is no whole message, in sentences."""
+    framing, log = topics.framing, topics.log
+    said = []
+    if framing.in_message:
+        flying = ", in flight" if in_flight else ""
+        said.append(
+            f"the file ends in mid-message after {log.duration_s:.1f} s{flying}: what came after "
+            "is not in it"
+        )
+    if framing.lost_bytes > LEAST_LOST * framing.in_message:
+        steps = np.array([]) if isinstance(imu, Unavailable) else np.diff(imu.index.to_numpy())
+        silent_s = float(steps[steps > LOST_FROM_S].sum())
+        where = "in one place" if framing.places == 1 else f"in {framing.places} places"
+        missing = f"; {silent_s:.1f} s of the IMU are missing" if silent_s else ""
+        said.append(
+            f"{framing.lost_bytes:,} of its {log.bytes:,} bytes "
+            f"({framing.lost_bytes / log.bytes:.2%}) could not be read, {where}{missing}"
+        )
+    return tuple(said)
 
 
 def _stream(topics: Topics, part: str, names: tuple[str, ...]) -> Stream:

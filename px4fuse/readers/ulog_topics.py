@@ -27,6 +27,7 @@ from px4fuse.arrays import Array, IntArray
 from px4fuse.ekf2_parameters import REPORTED
 from px4fuse.errors import LogError
 from px4fuse.readers.px4_topics import IMU, Layout, topics
+from px4fuse.readers.ulog_framing import Framing, whole_messages
 from px4fuse.reading import read_log_bytes, shown
 from px4fuse.recording import Dropout, LogInfo
 
@@ -72,6 +73,8 @@ class Topics:
         it.
     ekf2_parameters : mapping
         Every EKF2_ parameter, by PX4 name; ``log`` holds only those that enter the results.
+    framing : Framing
+        How much of the file is whole messages.
     """
 
     log: LogInfo
@@ -79,6 +82,7 @@ class Topics:
     zero_us: int
     dropped: dict[tuple[str, int], int]
     ekf2_parameters: Mapping[str, float] = field(default_factory=dict)
+    framing: Framing = field(default_factory=lambda: Framing(b""))
 
     def instances(self, topic: str) -> list[int]:
         """Instances of a topic that hold data, in order."""
@@ -232,18 +236,20 @@ def read_topics(path: Path) -> Topics:
     """
     name, content = shown(path), read_log_bytes(path)
     chatter = io.StringIO()
+    framing = whole_messages(content)
+    whole = framing.content
     try:
         with contextlib.redirect_stdout(chatter):  # pyulog prints its warnings
-            ulog = ULog(_handle(content), message_name_filter_list=topics())
+            ulog = ULog(_handle(whole), message_name_filter_list=topics())
             tables = _tables(ulog)
             # a log of other topics can still be placed in time, by all that it holds
-            placed = tables or _tables(ULog(_handle(content)))
+            placed = tables or _tables(ULog(_handle(whole)))
     except _PARSE_ERRORS as error:
         raise LogError(
             f"{name}: not a readable ULog ({str(error) or type(error).__name__}). "
             "Copy the .ulg from the vehicle again."
         ) from error
-    notes = _corruption_notes(ulog, chatter.getvalue())
+    notes: tuple[str, ...] = ()
     if not placed:
         raise LogError(
             f"{name}: a ULog without any data (no IMU, no position, no EKF2). If it is cut "
@@ -277,6 +283,8 @@ def read_topics(path: Path) -> Topics:
             }
         ),
         notes=notes,
+        damage=_corruption(ulog, chatter.getvalue()),
+        bytes_read=len(content) - framing.lost_bytes,
         autopilot=_text(ulog.msg_info_dict, "sys_name", "PX4"),
         vehicle=_text(ulog.msg_info_dict, "sys_uuid", ""),
     )
@@ -285,7 +293,7 @@ def read_topics(path: Path) -> Topics:
         for name, value in ulog.initial_parameters.items()
         if name.startswith("EKF2_") and _is_finite(value)
     }
-    return Topics(log, tables, zero_us, {}, MappingProxyType(parameters))
+    return Topics(log, tables, zero_us, {}, MappingProxyType(parameters), framing)
 
 
 def _tables(ulog: ULog) -> dict[tuple[str, int], dict[str, NDArray[Any]]]:
@@ -343,13 +351,13 @@ def _is_finite(value: object) -> bool:
     return isinstance(value, int | float) and bool(np.isfinite(value))
 
 
-def _corruption_notes(ulog: ULog, chatter: str) -> tuple[str, ...]:
+def _corruption(ulog: ULog, chatter: str) -> tuple[str, ...]:
+    """What pyulog says of whole messages that make no sense."""
     if not ulog.file_corruption:
         return ()
     said = "; ".join(dict.fromkeys(line.strip() for line in chatter.splitlines() if line.strip()))
-    return (
-        f"the file is damaged, what could be read was used ({said or 'pyulog gives no detail'})",
-    )
+    because = f" ({said})" if said else ""
+    return (f"the file is damaged: messages in it make no sense{because} and were passed over",)
 
 
 def _firmware(info: dict[str, Any]) -> str:

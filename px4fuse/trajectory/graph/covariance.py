@@ -111,12 +111,14 @@ def _tested(
         )
     seen = directions.T @ residual
     spread = directions.T @ covariance @ directions + np.diag(variance)
-    sigma = np.sqrt(np.diag(spread))
-    if np.linalg.eigvalsh(spread / np.outer(sigma, sigma))[0] <= _SINGULAR:
+    scale = np.diag(spread)
+    sound = bool(np.isfinite(spread).all()) and bool((scale > 0.0).all())
+    sigma = np.sqrt(scale, where=scale > 0.0, out=np.ones_like(scale))
+    if not sound or np.linalg.eigvalsh(spread / np.outer(sigma, sigma))[0] <= _SINGULAR:
         raise TrajectoryError(
             f"Odometry between vertices {graph.ids[graph.first[edge]]} and "
             f"{graph.ids[graph.second[edge]]} is too uncertain to test the closure with the digits "
-            "that numbers have. Give its edges more information."
+            "that numbers have. Give its edges information that is closer to the closure's."
         )
     d2 = float(seen @ np.linalg.solve(spread, seen))
     p = float(chdtrc(freedom, d2))
