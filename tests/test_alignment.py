@@ -32,7 +32,7 @@ from px4fuse.flight import (
 from px4fuse.origin import GIVEN_FILE
 from px4fuse.placing.placement import EKF2_POSITION, IMU, place
 from px4fuse.readers import read_log
-from px4fuse.readers.position_csv import SAMPLE_COLUMNS, PositionFile, read_position_csv
+from px4fuse.readers.position_csv import SAMPLE_COLUMNS, PositionRecording, read_position_csv
 
 BOOT_S = 2416.25
 OFFSET_S = -1795251250.2  # boot clock minus a UNIX clock
@@ -96,10 +96,10 @@ def flight_along(path: Any = passes, *, boot_s: float = BOOT_S, **parts: Any) ->
 
 def position_file(
     time_s: Array, xyz_m: Array, *, sigma_m: Any = np.nan, frame: str | None = None
-) -> PositionFile:
+) -> PositionRecording:
     values = np.full((len(time_s), len(SAMPLE_COLUMNS)), np.nan)
     values[:, :3], values[:, 3:6] = xyz_m, sigma_m
-    return PositionFile(
+    return PositionRecording(
         name="uwb.csv",
         sha256="f" * 64,
         size_bytes=1234,
@@ -120,7 +120,7 @@ def recorded(
     origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
     span_s: Span = (-np.inf, np.inf),
     **made: Any,
-) -> PositionFile:
+) -> PositionRecording:
     """Record the flight's UWB on another clock and in another frame."""
     samples = flight.positions[0].samples.loc[span_s[0] : span_s[1]]
     n, e, d = (samples[POSITION_COLUMNS].to_numpy() - origin_m).T
@@ -129,7 +129,9 @@ def recorded(
     return position_file(samples.index.to_numpy() + flight.log.boot_time_s - offset_s, xyz, **made)
 
 
-def placed(flight: Flight, file: PositionFile, **options: Any) -> tuple[Alignment, PositionTrack]:
+def placed(
+    flight: Flight, file: PositionRecording, **options: Any
+) -> tuple[Alignment, PositionTrack]:
     track = place(flight, file, **options).positions[0]
     assert track.alignment is not None
     return track.alignment, track
@@ -151,12 +153,12 @@ def flight() -> Flight:
 
 
 @pytest.fixture(scope="module")
-def external(sample_log: Path) -> PositionFile:
+def external(sample_log: Path) -> PositionRecording:
     return read_position_csv(sample_log.with_name("aisle_uwb_external.csv"))
 
 
 @pytest.fixture(scope="module")
-def true_offset_s(sample_flight: Flight, external: PositionFile) -> float:
+def true_offset_s(sample_flight: Flight, external: PositionRecording) -> float:
     """Boot clock minus the file's, from the positions that both hold."""
     logged = sample_flight.positions[0].samples
     time_of = {
@@ -179,7 +181,7 @@ def true_offset_s(sample_flight: Flight, external: PositionFile) -> float:
 
 
 def test_sample_file_is_placed_without_any_option(
-    sample_flight: Flight, external: PositionFile, true_offset_s: float
+    sample_flight: Flight, external: PositionRecording, true_offset_s: float
 ) -> None:
     alignment, track = placed(sample_flight, external)
     assert alignment.frame == "enu"
@@ -201,7 +203,7 @@ def test_sample_file_is_placed_without_any_option(
 
 
 def test_sample_file_with_the_true_offset_is_the_logged_track(
-    sample_flight: Flight, external: PositionFile, true_offset_s: float
+    sample_flight: Flight, external: PositionRecording, true_offset_s: float
 ) -> None:
     alignment, track = placed(
         sample_flight, external, frame="enu", clock_offset_s=true_offset_s
@@ -219,7 +221,7 @@ def test_sample_file_with_the_true_offset_is_the_logged_track(
 
 @pytest.mark.parametrize("yaw_deg", [-170.0, -90.0, 10.0, 75.0, 180.0])
 def test_turned_mirrored_and_shifted_sample_is_recovered(
-    sample_flight: Flight, external: PositionFile, true_offset_s: float, yaw_deg: float
+    sample_flight: Flight, external: PositionRecording, true_offset_s: float, yaw_deg: float
 ) -> None:
     origin = (3.0, -2.0, 0.5)
     position = external.samples[["y_m", "x_m", "z_m"]].to_numpy() * [1.0, 1.0, -1.0]
@@ -510,7 +512,7 @@ def test_an_ekf2_that_stands_still_leaves_it_to_the_imu() -> None:
 
 
 def test_the_sample_flight_without_ekf2(
-    sample_flight: Flight, external: PositionFile, true_offset_s: float
+    sample_flight: Flight, external: PositionRecording, true_offset_s: float
 ) -> None:
     flight = replace(sample_flight, ekf2=unavailable("EKF2"))
     alignment, _ = placed(flight, external)

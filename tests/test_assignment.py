@@ -19,24 +19,24 @@ from px4fuse.assignment import assignment
 from px4fuse.assignment.assignment import assign, fly, key_path
 from px4fuse.assignment.drawing import CHOICES, COUNTS, EASIEST, HARDEST, LOOPS, draw
 from px4fuse.assignment.key import AnswerKey, key_text, read_key
-from px4fuse.assignment.roster import Student, file_stem, read_roster
+from px4fuse.assignment.roster import RosterStudent, file_stem, read_roster
 from px4fuse.cli import cli, main
 from px4fuse.comparison.comparison import compare
 from px4fuse.errors import OutputError, SettingsError
 from px4fuse.findings import find, find_loop
 from px4fuse.loop.analysis import analyse
-from px4fuse.loop.sources import Source
+from px4fuse.loop.sources import LoopSource
 from px4fuse.loop.tracks import trajectory_of
 from px4fuse.simulation.mistakes import parse
 
 SECRET = b"a secret for tests"
 # What the secret gives student s1: seed, noise and heading, and the mistakes
 PINNED = ((759547191, 0.109, -14.4), ("clock-jump=53ms", "ekf2-off"))
-CLASS = tuple(Student(f"s{n:02d}", f"Name {n}", f"s{n:02d}.ulg") for n in range(3))
+CLASS = tuple(RosterStudent(f"s{n:02d}", f"Name {n}", f"s{n:02d}.ulg") for n in range(3))
 
 
 def student(name):
-    return Student(name, "", f"{name}.ulg")
+    return RosterStudent(name, "", f"{name}.ulg")
 
 
 def roster(tmp_path, content):
@@ -170,7 +170,7 @@ def test_what_the_key_expects_is_found_in_the_log(tmp_path, kind, number, count)
     flight = px4fuse.read_log(path)
     assert flight.log.sha256 == answer.sha256
     if kind == "loop":
-        found = find_loop(analyse(Source(trajectory_of(flight, "vio"), flight)))
+        found = find_loop(analyse(LoopSource(trajectory_of(flight, "vio"), flight)))
     else:
         found = find(explain(compare(flight, axes=("north", "east"))))
     assert len(answer.findings) == count
@@ -229,7 +229,7 @@ class TestRoster:
     def test_formulas_and_markup_stay_data(self, tmp_path):
         text = 'id,name\n=1+1|cmd,"<b onclick=\'x\'>&"\n@x,"=HYPERLINK(""http://x"")"\n'
         first, second = read_roster(roster(tmp_path, text))
-        assert first == Student("=1+1|cmd", "<b onclick='x'>&", "_1+1_cmd.ulg")
+        assert first == RosterStudent("=1+1|cmd", "<b onclick='x'>&", "_1+1_cmd.ulg")
         assert second.name == '=HYPERLINK("http://x")'
 
     @pytest.mark.parametrize(("content", "said"), BAD_ROSTERS.values(), ids=BAD_ROSTERS.keys())

@@ -10,7 +10,7 @@ from batch_tools import Clock, act
 import px4fuse
 from px4fuse.errors import SettingsError
 from px4fuse.fleet import engine
-from px4fuse.fleet.engine import Failed, connected, outcomes
+from px4fuse.fleet.engine import WorkerFailed, connected, outcomes
 
 
 def test_each_bad_job_is_lost_alone_and_its_worker_begins_again(subtests, monkeypatch):
@@ -43,7 +43,7 @@ def test_each_bad_job_is_lost_alone_and_its_worker_begins_again(subtests, monkey
     }.items():
         with subtests.test(work=work):
             result = found.pop(work)
-            if isinstance(result, Failed):
+            if isinstance(result, WorkerFailed):
                 assert expected in result.line
             else:
                 assert result == expected

@@ -24,7 +24,7 @@ from px4fuse.answers import Answers, Claim
 from px4fuse.grading.anonymous import NAME
 from px4fuse.grading.class_page import STATUSES, html_text
 from px4fuse.grading.model import Entry, Graded, Item, Override
-from px4fuse.verification.model import Difference, Verdict
+from px4fuse.verification.model import Mismatch, Verdict
 from px4fuse.webpage.safe import MAX_CHARACTERS
 
 MARKUP = '<img src=x onerror="window.alive=1"><b>bold</b>'
@@ -506,7 +506,7 @@ def test_three_hundred_are_one_page_of_a_megabyte(browser: Browser, tmp_path: Pa
 
 
 def test_differences_are_listed(browser: Browser, tmp_path: Path) -> None:
-    apart = tuple(Difference(f"axes.{n}", "1.0", "2.0") for n in range(60))
+    apart = tuple(Mismatch(f"axes.{n}", "1.0", "2.0") for n in range(60))
     one = Graded("a.pdf", "Ada", "1", Verdict("numbers differ", ("60.",), True, apart))
     file = tmp_path / "class.html"
     file.write_bytes(html_text([Entry("Ada", "1", one)], "Class", "px4fuse 1").encode())

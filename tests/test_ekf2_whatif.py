@@ -20,8 +20,8 @@ from px4fuse.ekf2.walk import (
     OUTPUT,
     SAMPLES,
     STEPS,
+    AxisLine,
     AxisWalk,
-    Line,
     OurFilter,
     Walk,
     _coast,
@@ -227,7 +227,7 @@ def test_a_track_of_ones_own_is_the_first_step(model: Model) -> None:
     # a track of one's own: 0.4 m off, so that 0.16 m² more are to be explained by the first step
     first = stages(model)[SAMPLES]
     track = pd.DataFrame({"position_m": first["north_m"] + 0.4, "velocity_m_s": first["north_m_s"]})
-    own = walked(walk(model, lines={"north": Line(1.0, 0.0, track)})).axes["north"]
+    own = walked(walk(model, lines={"north": AxisLine(1.0, 0.0, track)})).axes["north"]
     bias = np.mean(track["position_m"] - model.flown.published["north_m"])
     assert own.position_mean_square_m2 > 0.8 * bias**2
     assert own.position_mean_square_m2 == pytest.approx(
@@ -241,7 +241,9 @@ def test_a_track_of_ones_own_is_the_first_step(model: Model) -> None:
 
 def test_a_slanted_axis_is_the_projection(model: Model) -> None:
     half = np.sqrt(0.5)
-    made = walked(walk(model, lines={"aisle": Line(half, half), "across": Line(half, -half)})).axes
+    made = walked(
+        walk(model, lines={"aisle": AxisLine(half, half), "across": AxisLine(half, -half)})
+    ).axes
     plain = walked(walk(model)).axes
     for name in (
         "position_mean_square_m2",
@@ -260,7 +262,7 @@ def test_a_track_of_another_time_is_refused(model: Model) -> None:
         {"position_m": 0.0, "velocity_m_s": 0.0},
         index=pd.Index(model.flown.delayed.index.to_numpy() + 1e4, name="time_s"),
     )
-    result = walk(model, lines={"north": Line(1.0, 0.0, elsewhere)})
+    result = walk(model, lines={"north": AxisLine(1.0, 0.0, elsewhere)})
     assert isinstance(result, Unavailable)
     assert "no time in common" in result.reason
 
@@ -315,7 +317,7 @@ def test_errors_to_the_truth_are_of_its_own_span() -> None:
     times = np.array([9.0, 10.0, 15.0, 20.0, 21.0])
     off = np.array([9.0, 3.0, 4.0, 5.0, 9.0])
     flight = made(Flight, truth=truth_of({"north_m": 1.0, "east_m": 2.0}))
-    line = Line(0.6, 0.8)  # along which the truth is at 2.2 m
+    line = AxisLine(0.6, 0.8)  # along which the truth is at 2.2 m
     model = SimpleNamespace(flight=flight)
     found = walk_to_truth(model, 2.2 + off, line, times)  # type: ignore[arg-type]
     assert found == pytest.approx(math.sqrt(50.0 / 3.0))
@@ -382,5 +384,5 @@ def test_what_is_left_is_a_share_of_all() -> None:
         == 0.25
     )
     frame = pd.DataFrame({"north_m": [0.0, 2.0], "east_m": [4.0, 4.0]}, index=[0.0, 1.0])
-    along = Line(0.6, 0.8).along(frame, ["north_m", "east_m"], np.array([0.5]))
+    along = AxisLine(0.6, 0.8).along(frame, ["north_m", "east_m"], np.array([0.5]))
     assert along == pytest.approx([3.8])

@@ -14,7 +14,7 @@ from px4fuse.assignment.sheet import read_sheet
 from px4fuse.errors import SettingsError
 from px4fuse.grading.exports import as_html, filled, grade_column, moodle_feedback, plain_grades
 from px4fuse.grading.model import Entry
-from px4fuse.grading.platforms import Origin
+from px4fuse.grading.platforms import ExportOrigin
 from px4fuse.grading.roster import Person, Register, people_of_sheet
 
 # As mod/assign/gradingtable.php of Moodle writes it
@@ -148,9 +148,9 @@ def test_the_column_of_the_grade_is_named_or_the_only_one(tmp_path, text, column
 def test_moodles_feedback_zip_has_the_folders_that_it_reads_back() -> None:
     """The rule of importziplib.php: split at "_", the second part is the participant."""
     origins = {
-        "a.pdf": Origin("moodle", "4711", "Doe_Jane"),
-        "b.pdf": Origin("moodle", "4712", "../=Roe"),
-        "c.pdf": Origin("canvas", "5", "pat"),
+        "a.pdf": ExportOrigin("moodle", "4711", "Doe_Jane"),
+        "b.pdf": ExportOrigin("moodle", "4712", "../=Roe"),
+        "c.pdf": ExportOrigin("canvas", "5", "pat"),
     }
     entries = tuple(
         Entry(name, name, graded(f"{name}.pdf", 1.0), total=1.0) for name in ("a", "b", "c")
@@ -168,7 +168,8 @@ def test_moodles_feedback_zip_has_the_folders_that_it_reads_back() -> None:
 
 def test_blackboard_and_ilias_get_plain_tables_with_their_ids() -> None:
     origins = {
-        "0042.pdf": Origin("blackboard", login="jdoe"), "43.pdf": Origin("ilias", "77", "x", "mroe")
+        "0042.pdf": ExportOrigin("blackboard", login="jdoe"),
+        "43.pdf": ExportOrigin("ilias", "77", "x", "mroe"),
     }  # fmt: skip
     for platform, head, first in (
         ("blackboard", "Lab [Total Pts: 120 Score]", ["jdoe", "0042", "Jane Doe", "87.5"]),

@@ -19,7 +19,7 @@ from pypdf import PdfReader, PdfWriter
 
 from px4fuse.assignment.key import Answer, AnswerKey
 from px4fuse.cli import cli
-from px4fuse.grading.grade import Outcome, grade
+from px4fuse.grading.grade import GradeOutcome, grade
 from px4fuse.grading.model import Entry, Graded
 from px4fuse.grading.names import file_names
 from px4fuse.grading.rubric import read_rubric, rubric_text
@@ -238,7 +238,7 @@ def test_names_are_one_line_in_the_terminal(tmp_path, monkeypatch) -> None:
 
     one = Graded("a.pdf", "Ada\nPoints 120\n" + "A" * 100_000, "1", UNKNOWN)
     entry = Entry(one.student, one.student_id, one)
-    monkeypatch.setattr(module, "grade", lambda *_, **__: Outcome((entry,), (), 0, ()))
+    monkeypatch.setattr(module, "grade", lambda *_, **__: GradeOutcome((entry,), (), 0, ()))
     monkeypatch.chdir(tmp_path)
     shutil.copy(REPORT, "a.pdf")
     result = CliRunner().invoke(cli, ["grade", "a.pdf", "-o", "out"])
@@ -325,9 +325,9 @@ def test_the_options_of_a_term_reach_it(tmp_path, monkeypatch) -> None:
 
     given = {}
 
-    def noted(*_: object, **named: object) -> Outcome:
+    def noted(*_: object, **named: object) -> GradeOutcome:
         given.update(named)
-        return Outcome((), (), 0, ())
+        return GradeOutcome((), (), 0, ())
 
     monkeypatch.setattr(module, "grade", noted)
     monkeypatch.chdir(tmp_path)

@@ -19,7 +19,14 @@ from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.estimates import tuned_horizontally
 from px4fuse.filter import hypotheses
 from px4fuse.filter.causes import Explained, explained
-from px4fuse.filter.hypotheses import Fit, Signals, Whitened, fit, gains, respond
+from px4fuse.filter.hypotheses import (
+    HypothesisFit,
+    HypothesisSignals,
+    Whitened,
+    fit,
+    gains,
+    respond,
+)
 from px4fuse.filter.kalman import replay
 from px4fuse.filter.likelihood import preintegrate
 from px4fuse.filter.settings import Settings
@@ -91,7 +98,7 @@ def test_a_response_is_what_the_filter_itself_makes_of_a_signal() -> None:
     ) / np.sqrt(north.replay.updates["innovation_variance_m2"])
     legs = preintegrate(north.axis, RIGHT)
     still = np.zeros((len(legs.length_s), 1))
-    signals = Signals(still, still, step[1:, None], step[:1])
+    signals = HypothesisSignals(still, still, step[1:, None], step[:1])
     none = np.zeros(len(still), dtype=bool)
     s, gain = gains(legs, RIGHT.sigma_a_m_s2, RIGHT.sigma_z_m, none)
     response = respond(legs, signals, s, gain)
@@ -118,7 +125,7 @@ def test_a_fit_is_least_squares_with_the_prior_as_one_more_measurement() -> None
 
 
 def test_sigma_is_widened_where_more_remains_than_the_noises_say() -> None:
-    large = Fit(np.zeros(1), np.array([[0.04]]), 0.0, 0.0, 3.0)
+    large = HypothesisFit(np.zeros(1), np.array([[0.04]]), 0.0, 0.0, 3.0)
     assert large.estimate(0).sigma == pytest.approx(0.6)
     assert replace(large, spread=0.5).estimate(0).sigma == pytest.approx(0.2)
 

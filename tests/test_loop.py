@@ -20,7 +20,7 @@ from px4fuse.loop.analysis import analyse, loop_in
 from px4fuse.loop.corrections import BY_DISTANCE, PLAIN, SINGLE_LOOP, Correction
 from px4fuse.loop.loop import Loop, close_loop
 from px4fuse.loop.odometry import Closure, OdometryNoise, odometry_variances
-from px4fuse.loop.sources import Source, read_source, split_part
+from px4fuse.loop.sources import LoopSource, read_source, split_part
 from px4fuse.readers.closures import parse_closure, read_closures
 from px4fuse.request import GivenClosure
 from px4fuse.trajectory.evaluation import Evaluation
@@ -43,12 +43,12 @@ SIDE_M = 10.0
 
 
 @pytest.fixture(scope="module")
-def sample() -> Source:
+def sample() -> LoopSource:
     return read_source(str(SAMPLE))
 
 
 @pytest.fixture(scope="module")
-def sample_loop(sample: Source) -> Loop:
+def sample_loop(sample: LoopSource) -> Loop:
     return analyse(sample, reference=read_source(str(SLAM)).trajectory)
 
 
@@ -150,7 +150,7 @@ def test_headings_too_keep_the_shape_that_positions_alone_bend(sample_loop: Loop
 
 
 def test_without_a_known_heading_there_is_one_correction_by_distance(
-    sample: Source, sample_loop: Loop
+    sample: LoopSource, sample_loop: Loop
 ) -> None:
     assert [part.name for part in sample_loop.reported[1:3]] == [PLAIN, BY_DISTANCE]
     found = analyse(sample, landed_at=(0.0, 0.0, None))
@@ -185,7 +185,7 @@ def test_a_single_loop_says_that_it_has_no_redundancy(sample_loop: Loop) -> None
         assert robust.reason == SINGLE_LOOP
 
 
-def test_a_tape_gives_what_the_truth_gives(sample: Source, sample_loop: Loop) -> None:
+def test_a_tape_gives_what_the_truth_gives(sample: LoopSource, sample_loop: Loop) -> None:
     assert not isinstance(sample_loop.known_end, Unavailable)
     forward, right, _ = sample_loop.known_end.displacement_m  # its nose points along x
     heading = sample_loop.known_end.heading_change_deg
@@ -364,11 +364,11 @@ def test_dropping_most_closures_points_to_the_drift() -> None:
     assert "loop_drift_understated" in {finding.id for finding in find_loop(found)}
 
 
-def test_an_assumed_landing_is_said_to_be_assumed(sample: Source, sample_loop: Loop) -> None:
+def test_an_assumed_landing_is_said_to_be_assumed(sample: LoopSource, sample_loop: Loop) -> None:
     assert find_loop(sample_loop) == ()  # the log has the truth
     assert sample.flight is not None
     blind = Unavailable("ground truth", "left out", "")
-    found = analyse(Source(sample.trajectory, replace(sample.flight, truth=blind)))
+    found = analyse(LoopSource(sample.trajectory, replace(sample.flight, truth=blind)))
     (finding,) = find_loop(found)
     assert (finding.id, finding.severity) == ("loop_end_assumed", "info")
     assert "--landed-at" in finding.remedy
@@ -463,12 +463,14 @@ def test_a_file_of_closures(tmp_path: Path) -> None:
         (GivenClosure(20.0, 50.0, 0.0), "SIGMA 0 is outside"),
     ],
 )
-def test_impossible_closures_are_refused(sample: Source, closure: GivenClosure, says: str) -> None:
+def test_impossible_closures_are_refused(
+    sample: LoopSource, closure: GivenClosure, says: str
+) -> None:
     with pytest.raises(TrajectoryError, match=says):
         analyse(sample, closures=(closure,))
 
 
-def test_impossible_parts_are_refused(sample: Source) -> None:
+def test_impossible_parts_are_refused(sample: LoopSource) -> None:
     with pytest.raises(SettingsError, match="`start_s` or `end_s`"):
         analyse(sample, start_s=50.0, end_s=20.0)
     with pytest.raises(TrajectoryError, match="too few"):

@@ -23,7 +23,7 @@ from px4fuse.readers.position_csv import (
     LENGTH_UNITS,
     SAMPLE_COLUMNS,
     TIME_UNITS,
-    PositionFile,
+    PositionRecording,
     read_position_csv,
 )
 
@@ -87,10 +87,10 @@ def table(
 
 
 @pytest.fixture
-def read(tmp_path: Path) -> Callable[..., PositionFile]:
+def read(tmp_path: Path) -> Callable[..., PositionRecording]:
     """Write text or bytes to a file and read it."""
 
-    def read_(content: str | bytes, **options) -> PositionFile:
+    def read_(content: str | bytes, **options) -> PositionRecording:
         path = tmp_path / "uwb.csv"
         path.write_bytes(content if isinstance(content, bytes) else content.encode())
         return read_position_csv(path, **options)
@@ -98,7 +98,7 @@ def read(tmp_path: Path) -> Callable[..., PositionFile]:
     return read_
 
 
-def refused(read: Callable[..., PositionFile], content: str | bytes, **options) -> str:
+def refused(read: Callable[..., PositionRecording], content: str | bytes, **options) -> str:
     """The one line with which a file is refused."""
     with pytest.raises(Px4FuseError) as caught:
         read(content, **options)
@@ -112,7 +112,9 @@ def assert_one_line(error: Px4FuseError) -> None:
     assert str(error).endswith(".")
 
 
-def assert_track(file: PositionFile, *, start_us: int = UNIX_US, axes=(0, 1, 2), rows=slice(None)):
+def assert_track(
+    file: PositionRecording, *, start_us: int = UNIX_US, axes=(0, 1, 2), rows=slice(None)
+):
     """The samples are the track that was written."""
     assert list(file.samples.columns) == SAMPLE_COLUMNS
     assert file.samples.index.name == "time_s"
@@ -124,7 +126,7 @@ def assert_track(file: PositionFile, *, start_us: int = UNIX_US, axes=(0, 1, 2),
     np.testing.assert_allclose(file.samples[AXES].to_numpy(), track, rtol=0, atol=1e-9)
 
 
-def said(file: PositionFile, *words: str) -> None:
+def said(file: PositionRecording, *words: str) -> None:
     """One of the sentences has all of these words."""
     sentences = (*file.detected, *file.notes)
     assert any(all(word in sentence for word in words) for sentence in sentences), sentences

@@ -23,7 +23,7 @@ from px4fuse.filter.settings import Settings
 from px4fuse.flight import Unavailable
 from px4fuse.report import clock, fonts, notes
 from px4fuse.report.document import Document
-from px4fuse.report.notes import Line, Table, read
+from px4fuse.report.notes import NotesTable, Paragraph, read
 from px4fuse.report.page import Page, data, printable
 from px4fuse.report.pdf import compiled
 from px4fuse.report.sensitivity import PAIRS, SETTINGS, WINDOW_S, _settled, _window
@@ -33,7 +33,7 @@ THAI, HAN, ARABIC = "สมชาย", "王小明", "محمد"
 
 
 def lines(markdown: str) -> list[str]:
-    return [block.text for block in read(markdown) if isinstance(block, Line)]
+    return [block.text for block in read(markdown) if isinstance(block, Paragraph)]
 
 
 @pytest.fixture
@@ -108,7 +108,7 @@ def test_markdown_is_read() -> None:
 
 def test_lists_keep_their_marks_and_depth() -> None:
     blocks = list(read("- a\n  - b\n\n    c\n- d\n\n7. e\n8. f\n\n- - g\n"))
-    assert [(b.mark, b.text, b.indents) for b in blocks if isinstance(b, Line)] == [
+    assert [(b.mark, b.text, b.indents) for b in blocks if isinstance(b, Paragraph)] == [
         ("•", "a", 1), ("•", "b", 2), ("", "c", 2), ("•", "d", 1),
         ("7.", "e", 1), ("8.", "f", 1), ("•", "", 1), ("•", "g", 2),
     ]  # fmt: skip
@@ -123,7 +123,7 @@ def test_code_keeps_its_spaces_and_dollars() -> None:
 
 def test_a_table_is_a_table() -> None:
     (table,) = read("| a | *b* |\n|---|--:|\n| 1 | $x^2$ |\n")
-    assert table == Table((("a", "b"), ("1", "x²")))
+    assert table == NotesTable((("a", "b"), ("1", "x²")))
 
 
 @pytest.mark.parametrize(
@@ -161,7 +161,7 @@ def test_pictures_and_html_are_not_printed_raw(written: str, read_as: list[str])
 @given(st.text(st.sampled_from("#*-_`$|<>[]()!\\ \n1.ab{}^&;~="), max_size=80))
 def test_any_markdown_is_read(text: str) -> None:
     for block in read(text):
-        assert isinstance(block, Line | Table)
+        assert isinstance(block, Paragraph | NotesTable)
 
 
 def document(student: Student) -> Document:

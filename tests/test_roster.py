@@ -8,7 +8,7 @@ import pytest
 
 from px4fuse.assignment.sheet import read_sheet
 from px4fuse.errors import SettingsError
-from px4fuse.grading.platforms import Origin
+from px4fuse.grading.platforms import ExportOrigin
 from px4fuse.grading.roster import Person, Register, people_of_sheet
 
 MOODLE = (
@@ -79,20 +79,23 @@ CLASS = Register(
 @pytest.mark.parametrize(
     ("origin", "place"),
     [
-        (Origin("moodle", "4711", "Nobody"), 0),  # the participant, not the student of that id
-        (Origin("moodle", "42", "Nobody"), 1),
-        (Origin("moodle", "99", "doe JANE"), 0),
-        (Origin("canvas", "12345", "x"), 0),
-        (Origin("canvas", "99", "roemax"), 1),
-        (Origin("moodle", "99", "Zoe\u0308 Doe"), 2),  # the same letter, written as two
-        (Origin("blackboard", login="JDoe"), 0),
-        (Origin("ilias", "7", "Roe Max", "mroe"), 1),
-        (Origin("ilias", "7", "?", "45"), 4),
-        (Origin("gradescope", "7", student_id="42"), 0),
-        (Origin("gradescope", "7", email="Jane@X.edu"), 0),
-        (Origin("moodle", "99", "Kim Min"), None),  # two of that name
-        (Origin("moodle", "99", "Jane"), None),
-        (Origin(name="Jane Doe"), None),
+        (
+            ExportOrigin("moodle", "4711", "Nobody"),
+            0,
+        ),  # the participant, not the student of that id
+        (ExportOrigin("moodle", "42", "Nobody"), 1),
+        (ExportOrigin("moodle", "99", "doe JANE"), 0),
+        (ExportOrigin("canvas", "12345", "x"), 0),
+        (ExportOrigin("canvas", "99", "roemax"), 1),
+        (ExportOrigin("moodle", "99", "Zoe\u0308 Doe"), 2),  # the same letter, written as two
+        (ExportOrigin("blackboard", login="JDoe"), 0),
+        (ExportOrigin("ilias", "7", "Roe Max", "mroe"), 1),
+        (ExportOrigin("ilias", "7", "?", "45"), 4),
+        (ExportOrigin("gradescope", "7", student_id="42"), 0),
+        (ExportOrigin("gradescope", "7", email="Jane@X.edu"), 0),
+        (ExportOrigin("moodle", "99", "Kim Min"), None),  # two of that name
+        (ExportOrigin("moodle", "99", "Jane"), None),
+        (ExportOrigin(name="Jane Doe"), None),
     ],
 )
 def test_whose_a_file_is_by_what_the_platform_says(origin, place) -> None:

@@ -17,7 +17,7 @@ import pytest
 from px4fuse.errors import SettingsError
 from px4fuse.grading import submissions
 from px4fuse.grading.model import Submission
-from px4fuse.grading.platforms import Origin, origin_of, origins_of
+from px4fuse.grading.platforms import ExportOrigin, origin_of, origins_of
 from px4fuse.grading.submissions import collect, gradescope_people, read
 from px4fuse.verification.intake import MAX_BYTES
 from px4fuse.verification.model import Refused
@@ -116,7 +116,7 @@ def test_who_handed_in_is_what_the_platform_wrote_not_the_student():
     blackboard = origin_of("Lab 3_roe1_attempt_2026-11-20-12-34-56_Lab_doe1_attempt_x.pdf")
     assert (blackboard.login, blackboard.platform) == ("roe1", "blackboard")
     assert origin_of("Lab_roe1_attempt_2026-99-20-12-34-56_r.pdf").time is None
-    assert origin_of("flight_lab_reports_2026/r.pdf") == Origin()
+    assert origin_of("flight_lab_reports_2026/r.pdf") == ExportOrigin()
     ilias = origin_of("Lab 3/Roe_Max_roe1_77/Late Submission - r.pdf")
     assert (ilias.platform, ilias.login, ilias.late) == ("ilias", "roe1", True)
 

@@ -16,7 +16,7 @@ from class_tools import Reports, at_once, zipped
 from px4fuse.assignment.key import Answer, AnswerKey
 from px4fuse.assignment.sheet import read_sheet
 from px4fuse.grading.entries import Course, Term
-from px4fuse.grading.grade import Outcome, grade
+from px4fuse.grading.grade import GradeOutcome, grade
 from px4fuse.grading.lateness import due_time, late_rule
 from px4fuse.grading.model import Entry
 from px4fuse.grading.roster import people_of_sheet
@@ -135,7 +135,7 @@ class Lab:
         rows = [[last(n), first(n), f"user{n}", student_id(n), "", "", ""] for n in BLACKBOARD]
         return table(self.folder / "grades.csv", HEADS["blackboard"], rows, "\t")
 
-    def grade(self, rubric=None) -> Outcome:
+    def grade(self, rubric=None) -> GradeOutcome:
         due = due_time("2026-11-20 12:00:00 Europe/Berlin")
         course = Course(self.roster, tuple(map(read_sheet, self.sheets)), "",
                         Term("latest", due, late_rule("10%/day")), anonymous=True)  # fmt: skip
@@ -152,11 +152,11 @@ def lab(tmp_path: Path) -> Lab:
     return Lab(tmp_path)
 
 
-def of(outcome: Outcome, number: int) -> Entry:
+def of(outcome: GradeOutcome, number: int) -> Entry:
     return next(one for one in outcome.entries if one.student_id == student_id(number))
 
 
-def points(outcome: Outcome) -> dict[str, float | None]:
+def points(outcome: GradeOutcome) -> dict[str, float | None]:
     return {one.student_id: one.total for one in outcome.entries}
 
 
@@ -174,7 +174,7 @@ def test_a_term(lab, monkeypatch) -> None:
     anonymous(lab, last)
 
 
-def everyone_has_a_row(outcome: Outcome) -> None:
+def everyone_has_a_row(outcome: GradeOutcome) -> None:
     """Missing ones included, and nobody has two."""
     entries = outcome.entries
     assert [one.student_id for one in entries] == [student_id(n) for n in STUDENTS]
@@ -186,7 +186,7 @@ def everyone_has_a_row(outcome: Outcome) -> None:
     assert usual.remarks == ()
 
 
-def late_and_resubmitted(outcome: Outcome) -> None:
+def late_and_resubmitted(outcome: GradeOutcome) -> None:
     """Moodle's worksheet and Blackboard's names say when; Canvas says only that it was late."""
     usual, late = of(outcome, 1), of(outcome, LATE)
     assert (usual.handed_in, usual.late_s) == ("2026-11-20 10:58", 0.0)
@@ -200,7 +200,7 @@ def late_and_resubmitted(outcome: Outcome) -> None:
     assert len(again.others) == 1
 
 
-def copied_and_hostile(outcome: Outcome) -> None:
+def copied_and_hostile(outcome: GradeOutcome) -> None:
     """A copy is its owner's by the platform's word and earns less; what is no report, nothing."""
     copied = of(outcome, COPIED)
     assert "gives the id of 0003" in copied.remarks[0]
@@ -216,7 +216,7 @@ def copied_and_hostile(outcome: Outcome) -> None:
     assert len(intruder.others) == 1
 
 
-def another_rubric(lab: Lab, outcome: Outcome) -> None:
+def another_rubric(lab: Lab, outcome: GradeOutcome) -> None:
     doubled = re.sub(r"(?m)^points = (\d+)", lambda m: f"points = {2 * int(m[1])}", rubric_text())
     (lab.folder / "lab.toml").write_text(doubled, encoding="utf-8")
     second = lab.grade(read_rubric(lab.folder / "lab.toml"))
@@ -224,7 +224,7 @@ def another_rubric(lab: Lab, outcome: Outcome) -> None:
     assert of(second, 1).total == pytest.approx(2 * of(outcome, 1).total, abs=0.2)
 
 
-def the_instructors_word(lab: Lab, outcome: Outcome) -> Outcome:
+def the_instructors_word(lab: Lab, outcome: GradeOutcome) -> GradeOutcome:
     """Overrides are read, never written over, and kept by every regrade."""
     usual = of(outcome, 1)
     item = usual.counting.items[0].title
@@ -253,7 +253,7 @@ def the_instructors_word(lab: Lab, outcome: Outcome) -> Outcome:
     return third
 
 
-def imported(lab: Lab, outcome: Outcome) -> None:
+def imported(lab: Lab, outcome: GradeOutcome) -> None:
     """What each platform takes back, with the columns that it wrote."""
     for platform, file, column, separator in (
         ("moodle", "worksheet.csv", "Grade", ","),
@@ -286,7 +286,7 @@ def imported(lab: Lab, outcome: Outcome) -> None:
     assert not re.search(r"(?m)(^|,)\"?[=+@]", table_of)
 
 
-def anonymous(lab: Lab, outcome: Outcome) -> None:
+def anonymous(lab: Lab, outcome: GradeOutcome) -> None:
     """Who is who stands in a file of its own, and stays."""
     text = (lab.output / "names.csv").read_text(encoding="utf-8-sig")
     rows = list(csv.DictReader(io.StringIO(text, newline="")))

@@ -12,7 +12,7 @@ from pathlib import Path
 from px4fuse.answers import form_name, form_text
 from px4fuse.assignment.drawing import Drawn, Kinds, draw, most_mistakes
 from px4fuse.assignment.key import Answer, AnswerKey, folded, key_text, read_key
-from px4fuse.assignment.roster import Student
+from px4fuse.assignment.roster import RosterStudent
 from px4fuse.assignment.truth import truth_of
 from px4fuse.errors import OutputError, SettingsError
 from px4fuse.plain import plain
@@ -26,7 +26,7 @@ TRUTH = ("duration_s", "sigma_z_m", "sigma_a_m_s2", "reported_sigma_m", "clock_o
 
 
 def fly(
-    secret: bytes, student: Student, kind: Kinds, count: int | None = None, truth: bool = True
+    secret: bytes, student: RosterStudent, kind: Kinds, count: int | None = None, truth: bool = True
 ) -> tuple[bytes, Answer]:
     """One student's log, and the answer to it."""
     drawn = draw(secret, student.id, kind, count, truth)
@@ -36,7 +36,7 @@ def fly(
 
 
 def answer_to(
-    student: Student, drawn: Drawn, simulation: flights.Simulation, sha256: str
+    student: RosterStudent, drawn: Drawn, simulation: flights.Simulation, sha256: str
 ) -> Answer:
     """The answer to a flight as drawn, whose log has this SHA-256."""
     known = flights.answer(simulation)["truth"]
@@ -87,7 +87,7 @@ def key_path(folder: Path, given: Path | None) -> Path:
 
 
 def assign(
-    students: Sequence[Student],
+    students: Sequence[RosterStudent],
     folder: Path,
     key_file: Path,
     secret: bytes | None,
@@ -160,7 +160,7 @@ def assign(
 
 
 def preview(
-    students: Sequence[Student],
+    students: Sequence[RosterStudent],
     key_file: Path,
     secret: bytes | None,
     kind: Kinds,

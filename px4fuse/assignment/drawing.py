@@ -55,7 +55,7 @@ EASIEST, HARDEST = 0.6, 1.0
 
 
 @dataclass(frozen=True)
-class Choice:
+class AssignableMistake:
     """A mistake that may be drawn, at sizes at which it is found.
 
     Attributes
@@ -89,7 +89,7 @@ class Choice:
     at_s: tuple[float, float] | None = None
     hides: tuple[str, ...] = ()
 
-    def goes_with(self, other: Choice) -> bool:
+    def goes_with(self, other: AssignableMistake) -> bool:
         """Whether both are found in one flight."""
         return not (
             self.group == other.group or self.group in other.hides or other.group in self.hides
@@ -125,29 +125,31 @@ class Choice:
 # for a change of the clock in every second flight. Outliers make EKF2 reject and its NIS grow too,
 # and pull the heading; a delay is seen by what EKF2 does with good samples.
 NEED_IMU = ("clock", "frame")
-CHOICES: dict[Kind, tuple[Choice, ...]] = {
+CHOICES: dict[Kind, tuple[AssignableMistake, ...]] = {
     "aisle": (
-        Choice("clock-offset", "source_clock_offset", "clock", 150, "ms", either_sign=True),
-        Choice(
+        AssignableMistake(
+            "clock-offset", "source_clock_offset", "clock", 150, "ms", either_sign=True
+        ),
+        AssignableMistake(
             "clock-jump", "source_stamps_of_arrival", "clock", 50, "ms", hides=("frame", "gap")
         ),
-        Choice("yaw", "source_frame_turned", "frame", 15, "deg", either_sign=True),
-        Choice("nlos", "source_outliers", "outliers", 1, "%", hides=("frame",)),
-        Choice("dropout", "source_gap", "gap", 2, "s", at_s=(30, 70)),
-        Choice(
+        AssignableMistake("yaw", "source_frame_turned", "frame", 15, "deg", either_sign=True),
+        AssignableMistake("nlos", "source_outliers", "outliers", 1, "%", hides=("frame",)),
+        AssignableMistake("dropout", "source_gap", "gap", 2, "s", at_s=(30, 70)),
+        AssignableMistake(
             "imu-rate", "logging_rate_low", "rate", 40, "Hz", less_is_plainer=True, hides=NEED_IMU
         ),
-        Choice(
+        AssignableMistake(
             "ekf2-noise", "ekf2_variance_understated", "ekf2", 4, "cm", less_is_plainer=True,
             hides=("outliers",),
         ),
-        Choice(
+        AssignableMistake(
             "ekf2-gate", "ekf2_rejecting", "ekf2", 2, less_is_plainer=True, hides=("outliers",)
         ),
-        Choice("ekf2-delay", "ekf2_ev_delay_wrong", "clock", 150, "ms", hides=("ekf2",)),
-        Choice("ekf2-off", "ekf2_not_fusing", "ekf2"),
+        AssignableMistake("ekf2-delay", "ekf2_ev_delay_wrong", "clock", 150, "ms", hides=("ekf2",)),
+        AssignableMistake("ekf2-off", "ekf2_not_fusing", "ekf2"),
     ),
-    "loop": (Choice("open-end", "false_loop_closure", "end", 4, "m"),),
+    "loop": (AssignableMistake("open-end", "false_loop_closure", "end", 4, "m"),),
 }  # fmt: skip
 POSSIBLE_FINDINGS = frozenset(choice.finding for kind in CHOICES.values() for choice in kind)
 
@@ -163,7 +165,7 @@ class Drawn:
     """
 
     scenario: Scenario
-    chosen: tuple[Choice, ...]
+    chosen: tuple[AssignableMistake, ...]
     typed: tuple[str, ...]
 
     @property
@@ -208,7 +210,7 @@ def draw(
     one = partial(uniform, secret, student_id, kind)
     if count is None:
         count = bisect(list(accumulate(COUNTS[kind][:-1])), one("count"))
-    chosen: list[Choice] = []
+    chosen: list[AssignableMistake] = []
     for choice in sorted(CHOICES[kind], key=lambda c: one(f"order {c.mistake}")):
         if len(chosen) < count and all(map(choice.goes_with, chosen)):
             chosen.append(choice)

@@ -113,7 +113,7 @@ class _Headed(msgspec.Struct):
     schema: _Schema
 
 
-class _File(_Headed, omit_defaults=True):
+class _KeyFile(_Headed, omit_defaults=True):
     kind: _Text
     students: Annotated[tuple[Answer, ...], Meta(min_length=1, max_length=MAX_STUDENTS)]
     note: str = ""
@@ -128,7 +128,7 @@ def folded(text: str) -> str:
 def key_text(key: AnswerKey) -> str:
     """The key as JSON, for :func:`read_key`."""
     schema = _Schema(SCHEMA_NAME, SCHEMA_VERSION)
-    content = msgspec.json.encode(_File(schema, key.kind, key.answers, NOTE, key.secret))
+    content = msgspec.json.encode(_KeyFile(schema, key.kind, key.answers, NOTE, key.secret))
     return msgspec.json.format(content, indent=1).decode() + "\n"
 
 
@@ -147,7 +147,7 @@ def read_key(path: Path) -> AnswerKey:
             _refuse(path, "not an answer key")
         if schema.version != SCHEMA_VERSION:
             _refuse(path, "of a version that this px4fuse does not read")
-        file = msgspec.json.decode(text, type=_File)
+        file = msgspec.json.decode(text, type=_KeyFile)
     except (msgspec.MsgspecError, RecursionError) as error:
         _refuse(path, f"not an answer key ({error})")
     seen: dict[str, int] = {}

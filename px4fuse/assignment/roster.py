@@ -30,7 +30,7 @@ LAST_NAME_COLUMNS = ("lastname", "surname", "familyname", "nachname")
 
 
 @dataclass(frozen=True)
-class Student:
+class RosterStudent:
     """One row of the roster.
 
     Attributes
@@ -46,7 +46,7 @@ class Student:
     file: str
 
 
-def read_roster(path: Path) -> tuple[Student, ...]:
+def read_roster(path: Path) -> tuple[RosterStudent, ...]:
     """Read the class list that a learning platform exports: a CSV file with a header.
 
     Raises
@@ -65,7 +65,7 @@ def read_roster(path: Path) -> tuple[Student, ...]:
             "and, if you like, one 'name'."
         )
     column = (filled or listed)[:1]
-    students: list[Student] = []
+    students: list[RosterStudent] = []
     row_of: dict[str, int] = {}
     for number, row in zip(sheet.numbers, sheet.rows, strict=True):
         student_id = one_line(sheet.cell(row, column), MAX_NAME)
@@ -88,7 +88,7 @@ def read_roster(path: Path) -> tuple[Student, ...]:
                 f"{path}: rows {other} and {number} have the same id {shown}, or ids that give the "
                 "same file name. Give every student one of its own."
             )
-        students.append(Student(student_id, full_name(sheet, row), f"{stem}.ulg"))
+        students.append(RosterStudent(student_id, full_name(sheet, row), f"{stem}.ulg"))
     if not students:
         raise SettingsError(f"{path}: no students below the header. Give one row for each.")
     if len(students) > MAX_STUDENTS:

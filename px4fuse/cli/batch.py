@@ -13,7 +13,14 @@ import click
 
 from px4fuse.cli.compare import SEVERITIES
 from px4fuse.cli.inputs import path_option, settings_options
-from px4fuse.cli.outputs import Interrupted, Step, progress, spare_inputs, terminal, write_outputs
+from px4fuse.cli.outputs import (
+    Interrupted,
+    ShowStep,
+    progress,
+    spare_inputs,
+    terminal,
+    write_outputs,
+)
 from px4fuse.errors import OutputError, SettingsError
 from px4fuse.fleet import TIMEOUT_S
 
@@ -182,7 +189,7 @@ def batch(
         sys.exit(1)
 
 
-def _shown(step: Step, since_s: float, what: str, done: int, of: int) -> None:
+def _shown(step: ShowStep, since_s: float, what: str, done: int, of: int) -> None:
     """How far it is, with its rate."""
     per_minute = 60.0 * done / (time.monotonic() - since_s)
     step(f"{what}, {per_minute:.3g} per minute" if done else what, done, of)

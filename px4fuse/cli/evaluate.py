@@ -12,7 +12,7 @@ import click
 
 from px4fuse.cli.inputs import Named, max_size_option, path_option, system_option
 from px4fuse.cli.outputs import finish, free_report, progress, report_paths
-from px4fuse.cli.quantity import Quantity
+from px4fuse.cli.quantity import TypedQuantity
 from px4fuse.errors import OutputError, SettingsError
 from px4fuse.request import EVALUATION_OPTIONS, EvaluationRequest, command_line, settings_name
 from px4fuse.writing import STANDARD_OUTPUT
@@ -78,7 +78,7 @@ class DeltaType(click.ParamType["Delta"]):
 @click.option(
     "--time-offset",
     "time_offset_s",
-    type=Quantity("s", auto=True),
+    type=TypedQuantity("s", auto=True),
     help="Added to the estimate's stamps; auto finds it from the motion.  [default: auto where the "
     "two do not overlap]",
 )

@@ -13,7 +13,7 @@ from px4fuse.cli.outputs import Interrupted, progress, terminal, write_outputs
 from px4fuse.errors import OutputError, SettingsError
 
 if TYPE_CHECKING:
-    from px4fuse.grading.grade import Outcome
+    from px4fuse.grading.grade import GradeOutcome
 
 
 @click.command()
@@ -195,7 +195,7 @@ def _write_new(path: Path, content: bytes) -> None:
     click.echo(f"Wrote    {path}")
 
 
-def _print(outcome: Outcome) -> None:
+def _print(outcome: GradeOutcome) -> None:
     from collections import Counter
 
     from rich.text import Text

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, get_args
 
 import click
 
-from px4fuse.cli.quantity import Quantity
+from px4fuse.cli.quantity import TypedQuantity
 from px4fuse.errors import SettingsError
 from px4fuse.reading import max_log_bytes, read_text
 from px4fuse.request import AxisName, InputName
@@ -64,21 +64,21 @@ _ANALYSIS = _together(
     click.option(
         "--sigma-a",
         "sigma_a_m_s2",
-        type=Quantity("m/s²", 0.5),
+        type=TypedQuantity("m/s²", 0.5),
         default=0.5,
         help="Process noise SIGMA_A, 0.0001 to 100.",
     ),
     click.option(
         "--sigma-z",
         "sigma_z_m",
-        type=Quantity("m"),
+        type=TypedQuantity("m"),
         default=0.10,
         help="Measurement noise SIGMA_Z, 0.0001 to 100.",
     ),
     click.option(
         "--dt",
         "dt_s",
-        type=Quantity("s"),
+        type=TypedQuantity("s"),
         default=0.1,
         help="Prediction step DT, 0.001 to 1; Q is proportional to it.",
     ),
@@ -97,16 +97,18 @@ _ANALYSIS = _together(
     click.option(
         "--heading",
         "heading_deg",
-        type=Quantity("°", 30.0),
+        type=TypedQuantity("°", 30.0),
         help="Heading of the aisle, clockwise from north.  [default: from the track]",
     ),
     click.option(
         "--start",
         "start_s",
-        type=Quantity("s", 20.0),
+        type=TypedQuantity("s", 20.0),
         help="Start, seconds from the first data.  [default: take-off]",
     ),
-    click.option("--end", "end_s", type=Quantity("s", 60.0), help="End.  [default: touch-down]"),
+    click.option(
+        "--end", "end_s", type=TypedQuantity("s", 60.0), help="End.  [default: touch-down]"
+    ),
     click.option(
         "--position-source",
         metavar="NAME",
@@ -157,7 +159,7 @@ _POSITION = _together(
     ),
     click.option(
         "--position-yaw",
-        type=Quantity("°", 30.0, auto=True),
+        type=TypedQuantity("°", 30.0, auto=True),
         help="Turn it clockwise, seen from above; auto finds yaw and origin.  [default: 0]",
     ),
     click.option(
@@ -188,7 +190,7 @@ _POSITION_FIELDS = {
 clock_offset_option = click.option(
     "--clock-offset",
     "clock_offset_s",
-    type=Quantity("s", auto=True),
+    type=TypedQuantity("s", auto=True),
     help="Added to the position source's time stamps; auto estimates it.  [default: 0; auto with "
     "--position]",
 )

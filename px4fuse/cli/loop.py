@@ -17,7 +17,7 @@ from px4fuse.cli.inputs import (
     system_option,
 )
 from px4fuse.cli.outputs import finish, progress, report_paths, spare_inputs
-from px4fuse.cli.quantity import Quantity
+from px4fuse.cli.quantity import TypedQuantity
 from px4fuse.errors import SettingsError
 from px4fuse.reading import shown
 from px4fuse.request import FrameName, Landing
@@ -70,11 +70,11 @@ class FrameType(click.Choice[str]):
 @click.option(
     "--from",
     "start_s",
-    type=Quantity("s", 20.0),
+    type=TypedQuantity("s", 20.0),
     help="Start of the loop: seconds from the first data, or a trajectory's own stamps.  "
     "[default: take-off]",
 )
-@click.option("--to", "end_s", type=Quantity("s", 60.0), help="End.  [default: landing]")
+@click.option("--to", "end_s", type=TypedQuantity("s", 60.0), help="End.  [default: landing]")
 @click.option(
     "--landed-at",
     type=LandingType(),
@@ -98,21 +98,21 @@ class FrameType(click.Choice[str]):
 @click.option(
     "--drift",
     "position_drift_m",
-    type=Quantity("m", 1.0),
+    type=TypedQuantity("m", 1.0),
     default=1.0,
     help="Standard deviation of the odometry's position after 100 m.",
 )
 @click.option(
     "--heading-drift",
     "heading_drift_deg",
-    type=Quantity("°", 3.0),
+    type=TypedQuantity("°", 3.0),
     default=3.0,
     help="Standard deviation of its heading after 100 m.",
 )
 @click.option(
     "--key-frames",
     "key_frames_m",
-    type=Quantity("m", 0.2),
+    type=TypedQuantity("m", 0.2),
     help="Distance between key frames.  [default: a fiftieth of the extent, 0.02 to 0.5]",
 )
 @click.option(

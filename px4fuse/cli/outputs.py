@@ -56,7 +56,7 @@ class Interrupted(click.ClickException):
         click.echo(f"px4fuse: {self.message}", file=file, err=True)
 
 
-class Step(Protocol):
+class ShowStep(Protocol):
     """Says what is being done, and how much of it is done where that can be counted."""
 
     def __call__(self, what: str, done: int = 0, of: int | None = None) -> None:
@@ -64,7 +64,7 @@ class Step(Protocol):
 
 
 @contextmanager
-def progress(quiet: bool = False, steps: Sequence[str] = ()) -> Iterator[Step]:
+def progress(quiet: bool = False, steps: Sequence[str] = ()) -> Iterator[ShowStep]:
     """A bar on a terminal about what is being done and what remains; nothing in a pipe.
 
     Parameters

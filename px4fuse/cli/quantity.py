@@ -45,7 +45,7 @@ def in_unit(typed: str, unit: str) -> float | None:
         return None
 
 
-class Quantity(click.ParamType["float | str"]):
+class TypedQuantity(click.ParamType["float | str"]):
     """A number in a unit.
 
     Parameters

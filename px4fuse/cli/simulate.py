@@ -13,7 +13,7 @@ from click.core import ParameterSource
 
 from px4fuse.cli.inputs import path_option
 from px4fuse.cli.outputs import progress, terminal, write_outputs
-from px4fuse.cli.quantity import Quantity
+from px4fuse.cli.quantity import TypedQuantity
 from px4fuse.errors import OutputError, SettingsError
 from px4fuse.reading import read_text
 from px4fuse.simulation.mistakes import MISTAKES, as_typed, made, parse
@@ -21,7 +21,7 @@ from px4fuse.simulation.scenario import KINDS, YAWS, Scenario
 
 if TYPE_CHECKING:
     from px4fuse.assignment.drawing import Kinds
-    from px4fuse.assignment.roster import Student
+    from px4fuse.assignment.roster import RosterStudent
     from px4fuse.simulation.flights import Simulation
 
 _DEFAULT = Scenario()
@@ -41,7 +41,7 @@ def _scenario_option(
     """Option that sets one real number of the scenario, whose own value is the default."""
     default = getattr(_DEFAULT, field)
     between = (0.0, 360.0) if unit == "°" else None
-    kind = float if unit is None else Quantity(unit, default, between=between)
+    kind = float if unit is None else TypedQuantity(unit, default, between=between)
     return click.option(name, field, type=kind, default=default, **details)
 
 
@@ -264,7 +264,7 @@ def _read_secret(secret: str | None, file: Path | None) -> bytes | None:
 
 def _class(
     roster: Path, folder: Path, answer_path: Path | None
-) -> tuple[tuple[Student, ...], Path]:
+) -> tuple[tuple[RosterStudent, ...], Path]:
     """The students, and where their answer key goes."""
     from px4fuse.assignment.assignment import key_path
     from px4fuse.assignment.roster import read_roster

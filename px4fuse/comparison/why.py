@@ -18,7 +18,7 @@ from px4fuse.comparison.why_words import Facts, Outside, sentences
 from px4fuse.display import Shown
 from px4fuse.ekf2.agreement import judged_from, settled
 from px4fuse.ekf2.model import Model
-from px4fuse.ekf2.walk import WHAT, Coast, Line, OurFilter, Walked, walk
+from px4fuse.ekf2.walk import WHAT, AxisLine, Coast, OurFilter, Walked, walk
 from px4fuse.filter.clock import ClockOffset
 from px4fuse.filter.kalman import state_at
 from px4fuse.filter.tuning import AxisTuning
@@ -120,14 +120,14 @@ def why_ekf2_differs(
     return found
 
 
-def _line(result: AxisComparison, ekf2: Ekf2) -> Line:
+def _line(result: AxisComparison, ekf2: Ekf2) -> AxisLine:
     """The axis with our track at EKF2's own sample times, exact beside each update's jump."""
     north, east, _ = result.axis.direction
     steps, times = result.replay.steps.index, ekf2.state.index
     times = times[(times >= steps[0]) & (times <= steps[-1])]
     position, velocity = state_at(result.replay, times.to_numpy())
     track = pd.DataFrame({"position_m": position, "velocity_m_s": velocity}, index=times)
-    return Line(float(north), float(east), track)
+    return AxisLine(float(north), float(east), track)
 
 
 def _spans(model: Model, times: Array) -> tuple[tuple[float, float], ...]:

@@ -50,7 +50,7 @@ TURN, INPUT = 9, 10
 
 
 @dataclass(frozen=True)
-class Events:
+class FusionEvents:
     """The events of one stretch, E of them.
 
     Attributes
@@ -82,7 +82,7 @@ class Events:
 
 
 @dataclass(frozen=True)
-class Legs(Events):
+class Legs(FusionEvents):
     """Legs of one stretch, each ending in an event.
 
     Attributes
@@ -105,9 +105,9 @@ class Legs(Events):
     __repr__ = brief
 
     @property
-    def events(self) -> Events:
+    def events(self) -> FusionEvents:
         """Without the legs, which are large."""
-        return Events(*(getattr(self, each.name) for each in fields(Events)))
+        return FusionEvents(*(getattr(self, each.name) for each in fields(FusionEvents)))
 
 
 @dataclass(frozen=True)
@@ -155,7 +155,7 @@ def make_legs(inputs: Inputs, stretch: Stretch, timing: Timing) -> Legs:
     )
 
 
-def _events(inputs: Inputs, stretch: Stretch, timing: Timing) -> Events:
+def _events(inputs: Inputs, stretch: Stretch, timing: Timing) -> FusionEvents:
     vision = inputs.vision
     first = int(np.searchsorted(vision.stamp_s, stretch.time_s[0]))
     beyond = int(np.searchsorted(vision.stamp_s, stretch.time_s[-1]))
@@ -196,7 +196,7 @@ def _events(inputs: Inputs, stretch: Stretch, timing: Timing) -> Events:
         spread[place] = part
     time = stretch.time_s[ends].copy()
     time[place] = taken
-    return Events(ends, samples, actions, usables, startables, lates, losts, time)
+    return FusionEvents(ends, samples, actions, usables, startables, lates, losts, time)
 
 
 def _actions(

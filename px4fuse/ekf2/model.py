@@ -26,7 +26,7 @@ from px4fuse.ekf2.legs import (
     POSITION,
     THETA,
     VELOCITY,
-    Events,
+    FusionEvents,
     Legs,
     Timing,
     make_legs,
@@ -204,7 +204,7 @@ class StretchRun:
     """One stretch with its events by delay, and what the variants did in it."""
 
     stretch: Stretch
-    events: tuple[Events, ...]
+    events: tuple[FusionEvents, ...]
     which: NDArray[np.intp]
     run: Run
     variants: tuple[Variant, ...]

@@ -65,7 +65,7 @@ class OurFilter:
 
 
 @dataclass(frozen=True)
-class Line:
+class AxisLine:
     """A horizontal axis to walk along.
 
     Attributes
@@ -205,7 +205,7 @@ class _Stage:
 
 
 def walk(
-    model: Model, student: OurFilter | None = None, lines: Mapping[str, Line] | None = None
+    model: Model, student: OurFilter | None = None, lines: Mapping[str, AxisLine] | None = None
 ) -> Walk | Unavailable:
     """Walk from the student's filter to the logged EKF2.
 
@@ -214,7 +214,7 @@ def walk(
     model : Model
     student : OurFilter, optional
         By default the lesson's settings.
-    lines : mapping from axis name to Line, optional
+    lines : mapping from axis name to AxisLine, optional
         By default north and east, without tracks.
 
     Returns
@@ -230,7 +230,7 @@ def walk(
         )
     ekf2 = model.flight.ekf2
     assert isinstance(ekf2, Ekf2)
-    lines = lines or {"north": Line(1.0, 0.0), "east": Line(0.0, 1.0)}
+    lines = lines or {"north": AxisLine(1.0, 0.0), "east": AxisLine(0.0, 1.0)}
     variants = _variants(model, student or OurFilter())
     delayed, flown = delayed_variants(model, list(variants.values()))
     judged = judged_from(model.flown)
@@ -286,7 +286,7 @@ def _variants(model: Model, student: OurFilter) -> dict[str, Variant]:
     }
 
 
-def _axis(model: Model, stages: dict[str, _Stage], line: Line, times: Array) -> AxisWalk:
+def _axis(model: Model, stages: dict[str, _Stage], line: AxisLine, times: Array) -> AxisWalk:
     ekf2 = model.flight.ekf2
     assert isinstance(ekf2, Ekf2)
     own = line.track
@@ -334,7 +334,7 @@ def _axis(model: Model, stages: dict[str, _Stage], line: Line, times: Array) -> 
     )
 
 
-def _to_truth(model: Model, where: Array, line: Line, times: Array) -> float | Unavailable:
+def _to_truth(model: Model, where: Array, line: AxisLine, times: Array) -> float | Unavailable:
     truth = model.flight.truth
     if not isinstance(truth, Truth):
         return truth

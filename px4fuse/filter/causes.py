@@ -17,9 +17,9 @@ from px4fuse.filter.hypotheses import (
     RIGHT,
     TURN,
     Estimate,
-    Fit,
+    HypothesisFit,
+    HypothesisSignals,
     Lines,
-    Signals,
     fit,
     gains,
     lines_of,
@@ -147,7 +147,7 @@ def explained(
     )
 
 
-def _fit_noise(lines: Lines, levels: Array, skip: BoolArray) -> tuple[float, Fit]:
+def _fit_noise(lines: Lines, levels: Array, skip: BoolArray) -> tuple[float, HypothesisFit]:
     """The most likely of some SIGMA_A, and what is fitted with it."""
     fitted = cache(lambda at: lines.fit(float(levels[at]), skip))
     best = _lowest(lambda at: fitted(at).score, len(levels))
@@ -228,7 +228,7 @@ def _scan(lines: Lines, sigma_a: float, skip: BoolArray) -> list[float]:
         """χ² that a step at each of some times takes away."""
         candidates = steps(lines.time_s, block)
         still = np.broadcast_to(0.0, candidates.shape)
-        signals = Signals(still, still, candidates, np.zeros(len(block)))
+        signals = HypothesisSignals(still, still, candidates, np.zeros(len(block)))
         chi_square = np.zeros(len(block))
         for at, legs in enumerate(lines.legs):
             if at == 0 or not together:

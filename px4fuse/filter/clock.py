@@ -35,7 +35,7 @@ from px4fuse.filter.fitting import (
 from px4fuse.filter.lanes import gains, lanes_of_paths
 from px4fuse.filter.likelihood import PROFILE_DROP, parabola_vertex, profile_interval
 from px4fuse.filter.marginal import Fitted, Positions, centred, paired_products
-from px4fuse.filter.motion import CONSTANT_SIGMA, SEARCH_S, Made, Motion, motion
+from px4fuse.filter.motion import CONSTANT_SIGMA, SEARCH_S, Made, PreparedMotion, motion
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Segment, within
 from px4fuse.flight import POSITION_COLUMNS, Flight, PositionTrack, Unavailable
@@ -148,7 +148,7 @@ class ClockOffset(Shown, Clock, frozen=True, kw_only=True, eq=False):
 class _Problem:
     """Positions over the IMU's motion, with everything but the offset and the noises chosen."""
 
-    motion: Motion
+    motion: PreparedMotion
     positions_m: Array
     directions: Array
     dt_s: float

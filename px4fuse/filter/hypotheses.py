@@ -57,7 +57,7 @@ class Estimate:
 
 
 @dataclass(frozen=True)
-class Signals:
+class HypothesisSignals:
     """Signals of one axis, of which the first is what was measured, the others columns.
 
     Attributes
@@ -104,7 +104,7 @@ class Whitened:
 
 
 @dataclass(frozen=True)
-class Fit:
+class HypothesisFit:
     """Generalised least squares: coefficients, their covariance, and what remains.
 
     ``square`` is the sum of squares that remains, ``spread`` their root mean, 1 where the noises
@@ -146,14 +146,14 @@ def gains(
     return made[:, 0], np.where(skip[:, None], 0.0, made[:, 1:])
 
 
-def respond(legs: Preintegrated, signals: Signals, s: Array, gain: Array) -> Array:
+def respond(legs: Preintegrated, signals: HypothesisSignals, s: Array, gain: Array) -> Array:
     """Innovations over √S of many signals, all by the gains of one filter, shape (m, k).
 
     Parameters
     ----------
     legs : Preintegrated
         Of the axis: its lengths are used.
-    signals : Signals
+    signals : HypothesisSignals
         k of them.
     s, gain : ndarray
         As :func:`gains` returns them.
@@ -164,7 +164,7 @@ def respond(legs: Preintegrated, signals: Signals, s: Array, gain: Array) -> Arr
     return (signals.measured_m - prior) / np.sqrt(s)[:, None]
 
 
-def fit(white: Whitened, prior: Array) -> Fit:
+def fit(white: Whitened, prior: Array) -> HypothesisFit:
     """Regress whitened innovations on their columns.
 
     Parameters
@@ -184,7 +184,7 @@ def fit(white: Whitened, prior: Array) -> Fit:
     coefficients = covariance @ moment
     square = float(sum(y @ y for y in white.data) - coefficients @ moment)
     log_determinant = float(np.sum(np.log(np.diag(factor[0]))))
-    return Fit(
+    return HypothesisFit(
         coefficients,
         covariance,
         square,
@@ -201,9 +201,9 @@ class Lines:
     ----------
     time_s : ndarray, shape (m,)
         Of the measurements, as they were stamped.
-    legs, signals : tuple of Preintegrated and of Signals
+    legs, signals : tuple of Preintegrated and of HypothesisSignals
         Of each axis.
-    hats : Signals
+    hats : HypothesisSignals
         Slow accelerations, the same for each axis, but with coefficients for each.
     prior : ndarray, shape (k,)
         Standard deviations of the columns' coefficients before the data.
@@ -214,13 +214,13 @@ class Lines:
 
     time_s: Array
     legs: tuple[Preintegrated, ...]
-    signals: tuple[Signals, ...]
-    hats: Signals
+    signals: tuple[HypothesisSignals, ...]
+    hats: HypothesisSignals
     prior: Array
     sigma_z_m: float
     steps: Array
 
-    def fit(self, sigma_a: float, skip: BoolArray, scale: float = 1.0) -> Fit:
+    def fit(self, sigma_a: float, skip: BoolArray, scale: float = 1.0) -> HypothesisFit:
         """Fit all columns."""
         return fit(self.whiten(sigma_a, skip, scale), self.priors)
 
@@ -251,8 +251,8 @@ class Lines:
 
 def respond_each(
     legs: Sequence[Preintegrated],
-    signals: Sequence[Signals],
-    shared: Signals,
+    signals: Sequence[HypothesisSignals],
+    shared: HypothesisSignals,
     sigma_a: float,
     sigma_z: float,
     skip: BoolArray,
@@ -283,7 +283,7 @@ def same_gains(legs: Sequence[Preintegrated]) -> bool:
     )
 
 
-def _scaled(signals: Signals, scale: float) -> Signals:
+def _scaled(signals: HypothesisSignals, scale: float) -> HypothesisSignals:
     """Acceleration in the source's own length: of what was measured, and of a turn of it."""
     factor = np.ones(signals.position_m.shape[1])
     factor[[0, 1 + TURN]] = scale
@@ -294,8 +294,8 @@ def _scaled(signals: Signals, scale: float) -> Signals:
     )
 
 
-def _joined(signals: Sequence[Signals]) -> Signals:
-    return Signals(
+def _joined(signals: Sequence[HypothesisSignals]) -> HypothesisSignals:
+    return HypothesisSignals(
         np.hstack([each.position_m for each in signals]),
         np.hstack([each.velocity_m_s for each in signals]),
         np.hstack([each.measured_m for each in signals]),
@@ -303,10 +303,10 @@ def _joined(signals: Sequence[Signals]) -> Signals:
     )
 
 
-def _measured(added: Array) -> Signals:
+def _measured(added: Array) -> HypothesisSignals:
     """Signals that only the measurements have."""
     still = np.broadcast_to(0.0, added.shape)
-    return Signals(still, still, added, np.zeros(added.shape[1]))
+    return HypothesisSignals(still, still, added, np.zeros(added.shape[1]))
 
 
 def too_few(count: int) -> Unavailable:
@@ -373,12 +373,12 @@ def lines_of(
         position, velocity = (np.stack(part, axis=1) for part in zip(*columns, strict=True))
         measured, start = np.zeros_like(position), np.zeros(position.shape[1])
         measured[:, 0], start[0] = own.measurement_m, own.initial.position_m
-        signals.append(Signals(position, velocity, measured, start))
+        signals.append(HypothesisSignals(position, velocity, measured, start))
     return Lines(
         time_s,
         legs,
         tuple(signals),
-        Signals(slow[0], slow[1], np.zeros_like(slow[0]), np.zeros(len(hats))),
+        HypothesisSignals(slow[0], slow[1], np.zeros_like(slow[0]), np.zeros(len(hats))),
         prior,
         sigma_z,
         steps(time_s, []),

@@ -72,7 +72,7 @@ class Signals:
 
 
 @dataclass(frozen=True)
-class Motion:
+class PreparedMotion:
     """The IMU's signals under the measurements of one source, in stretches.
 
     Attributes
@@ -92,7 +92,7 @@ class Motion:
     edges: IntArray
     signals: tuple[Signals, ...]
 
-    def thinned(self, count: int) -> Motion | None:
+    def thinned(self, count: int) -> PreparedMotion | None:
         """About so many of the measurements, in the stretches that keep a few; None without one.
 
         Parameters
@@ -105,7 +105,7 @@ class Motion:
         if not enough.any():
             return None
         kept = kept & np.repeat(enough, np.diff(self.edges))
-        return Motion(
+        return PreparedMotion(
             self.time_s[kept],
             self.row[kept],
             np.cumsum([0, *counts[enough]]),
@@ -205,7 +205,7 @@ Made = dict[tuple[float, float], Signals]
 
 def motion(
     imu: pd.DataFrame, attitude: pd.DataFrame, time_s: Array, made: Made | None = None
-) -> Motion | None:
+) -> PreparedMotion | None:
     """Cut measurements into stretches that the IMU covers without a gap.
 
     Parameters
@@ -218,7 +218,7 @@ def motion(
 
     Returns
     -------
-    Motion, or None where no stretch has enough measurements or the IMU is too slow.
+    PreparedMotion, or None where no stretch has enough measurements or the IMU is too slow.
     """
     made = {} if made is None else made
     imu_time = imu.index.to_numpy()
@@ -249,7 +249,7 @@ def motion(
         return None
     row = np.concatenate(rows)
     edges = np.cumsum([0, *map(len, rows)])
-    return Motion(time_s[row], row, edges, tuple(signals))
+    return PreparedMotion(time_s[row], row, edges, tuple(signals))
 
 
 def _signals(imu: pd.DataFrame, attitude: pd.DataFrame, span: tuple[float, float]) -> Signals:

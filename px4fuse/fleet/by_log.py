@@ -17,7 +17,7 @@ MAIN = (("aisle",), ("north", "east"), ("down",))
 
 
 @dataclass(frozen=True)
-class Log:
+class LoggedFlight:
     """One log of a fleet.
 
     Attributes
@@ -69,14 +69,14 @@ class Log:
         return tags | {f"remedy:{remedy}": remedy or "no advice" for _, remedy in self.lacking}
 
 
-def short_names(logs: Sequence[Log]) -> dict[str, str]:
+def short_names(logs: Sequence[LoggedFlight]) -> dict[str, str]:
     """Long ids of flight controllers by their last digits, where these tell them apart."""
     long = {vehicle for log in logs if len(vehicle := log.texts["vehicle"]) > 20}
     short = {vehicle: f"…{vehicle[-8:]}" for vehicle in long}
     return short if len(set(short.values())) == len(short) else {}
 
 
-def logs_of(table: pd.DataFrame) -> list[Log]:
+def logs_of(table: pd.DataFrame) -> list[LoggedFlight]:
     """One per log, in the order of the table."""
     rows: dict[str, list[dict[str, Any]]] = {}
     present = table.notna().to_numpy()
@@ -89,7 +89,7 @@ def logs_of(table: pd.DataFrame) -> list[Log]:
     return [_log(axes) for axes in rows.values()]
 
 
-def _log(rows: Sequence[Mapping[str, Any]]) -> Log:
+def _log(rows: Sequence[Mapping[str, Any]]) -> LoggedFlight:
     axes = [row for row in rows if "axis" in row]
     main = next(
         (found for names in MAIN if (found := [axis for axis in axes if axis["axis"] in names])),
@@ -97,7 +97,7 @@ def _log(rows: Sequence[Mapping[str, Any]]) -> Log:
     )
     statuses = [str(row["status"]) for row in (*main, *rows)]
     lacking = [(str(row.get("reason", "")), str(row.get("remedy", ""))) for row in rows]
-    return Log(
+    return LoggedFlight(
         texts={name: str(_first(rows, name) or "") for name in COLUMNS if COLUMNS[name] == "str"},
         numbers={
             name: float(value) for name, kind in COLUMNS.items()

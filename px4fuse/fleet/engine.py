@@ -48,7 +48,7 @@ _START = "Start workers with: dask worker {} --nthreads 1"
 
 
 @dataclass(frozen=True)
-class Failed:
+class WorkerFailed:
     """Stands for the result of a job that gave none.
 
     Attributes
@@ -161,7 +161,7 @@ def _check(client: Client, address: str) -> None:
 
 
 @dataclass(frozen=True)
-class _Run:
+class _BatchRun:
     """A job that is handed out: to which worker, and how many have ended with it before."""
 
     job: Any
@@ -175,7 +175,7 @@ def outcomes(
     jobs: Iterable[Job],
     *,
     timeout_s: float,
-) -> Generator[tuple[Job, Result | Failed]]:
+) -> Generator[tuple[Job, Result | WorkerFailed]]:
     """Call a function on every job on a cluster, and give what comes of each as it comes.
 
     A worker has one job at a time, and no other before its result is here: none waits behind one
@@ -199,7 +199,7 @@ def outcomes(
 
     waiting = ((job, 0) for job in jobs)
     again: list[tuple[Job, int]] = []
-    running: dict[Future[Any], _Run] = {}
+    running: dict[Future[Any], _BatchRun] = {}
     begun: dict[str, tuple[str, float]] = {}
     alone: set[Future[Any]] = set()
     seen_s = looked_s = time.monotonic()
@@ -216,7 +216,7 @@ def outcomes(
                 future = client.submit(
                     function, job, pure=False, workers=address, allow_other_workers=bool(address)
                 )
-                running[future] = _Run(job, address, ends)
+                running[future] = _BatchRun(job, address, ends)
             if not running:
                 return
             try:
@@ -242,7 +242,7 @@ def outcomes(
                 for future in ended:
                     yield (
                         running.pop(future).job,
-                        Failed(
+                        WorkerFailed(
                             f"it took longer than {timeout_s:g} s and was ended. Allow more with "
                             "--timeout."
                         ),
@@ -255,7 +255,7 @@ def outcomes(
 
 
 def _free(
-    processing: Mapping[str, Collection[Any]], running: Mapping[Future[Any], _Run]
+    processing: Mapping[str, Collection[Any]], running: Mapping[Future[Any], _BatchRun]
 ) -> list[str | None]:
     """Workers without a job of ours, nor a result that is not here yet; the idlest first.
 
@@ -273,7 +273,7 @@ def _free(
 
 
 def _without_worker(
-    processing: Mapping[str, Collection[Any]], running: Mapping[Future[Any], _Run]
+    processing: Mapping[str, Collection[Any]], running: Mapping[Future[Any], _BatchRun]
 ) -> set[Future[Any]]:
     """Jobs that no worker has, since the one that they were given has ended.
 
@@ -291,7 +291,7 @@ def _without_worker(
 
 def _late(
     processing: Mapping[str, Collection[Any]],
-    running: Mapping[Future[Any], _Run],
+    running: Mapping[Future[Any], _BatchRun],
     begun: dict[str, tuple[str, float]],
     latest_s: float,
 ) -> list[str]:
@@ -327,7 +327,7 @@ def _fetched(done: Iterable[Future[Any]]) -> Iterator[tuple[Future[Any], Any]]:
 
 def _answers(
     found: Iterable[tuple[Future[Any], Any]],
-    running: dict[Future[Any], _Run],
+    running: dict[Future[Any], _BatchRun],
     again: list[tuple[Any, int]],
 ) -> Iterator[tuple[Any, Any]]:
     """Results of jobs; one whose worker ended is put among those to do again."""
@@ -340,7 +340,7 @@ def _answers(
         else:
             yield (
                 run.job,
-                Failed(
+                WorkerFailed(
                     f"the process that read it ended {ends} times: it crashed, or needed more "
                     "memory than it may take. Give each more with --memory, or look at this log "
                     "with px4fuse compare."
@@ -361,10 +361,10 @@ def _result(future: Future[Any]) -> Any:
     if isinstance(error, KilledWorker):
         return _Ended(error.allowed_failures + 1)
     if isinstance(error, MemoryError):
-        return Failed("it needs more memory than there is. Use fewer --workers.")
+        return WorkerFailed("it needs more memory than there is. Use fewer --workers.")
     if isinstance(error, Px4FuseError):
-        return Failed(str(error))
-    return Failed(
+        return WorkerFailed(str(error))
+    return WorkerFailed(
         f"{type(error).__name__}: {one_line(str(error), 300)}. Look at it with px4fuse compare."
     )
 

@@ -9,7 +9,7 @@ from typing import Literal
 import pandas as pd
 
 from px4fuse.findings import named
-from px4fuse.fleet.by_log import Log, logs_of, short_names
+from px4fuse.fleet.by_log import LoggedFlight, logs_of, short_names
 from px4fuse.fleet.questions import above, overstated_words
 from px4fuse.plain import few_words, number_words
 from px4fuse.webpage.charts import Scale, around_one, linear_scale, log_scale
@@ -132,7 +132,11 @@ def html_text(table: pd.DataFrame, title: str, made_with: str) -> str:
 
 
 def _row(
-    log: Log, names: Mapping[str, str], factor: Scale, sigma: Scale | None, clock: Scale | None
+    log: LoggedFlight,
+    names: Mapping[str, str],
+    factor: Scale,
+    sigma: Scale | None,
+    clock: Scale | None,
 ) -> Row:
     said = [named(finding) for finding in log.findings]
     folder = log.texts["log"].rpartition("/")[0]
@@ -162,7 +166,7 @@ def _factor(value: float | None, scale: Scale) -> Cell:
     return figure(value, overstated_words(value), (min(at, one), at, max(at, one)))
 
 
-def _interval(log: Log, name: str, unit: str, scale: Scale | None) -> Cell:
+def _interval(log: LoggedFlight, name: str, unit: str, scale: Scale | None) -> Cell:
     value, low, high = (log.numbers.get(f"{name}{end}_{unit}") for end in ("", "_low", "_high"))
     if value is None or scale is None:
         return figure(value)
@@ -170,7 +174,7 @@ def _interval(log: Log, name: str, unit: str, scale: Scale | None) -> Cell:
     return figure(value, f"{value:.3g}", tuple(scale.share(end) for end in ends))
 
 
-def _details(log: Log) -> tuple[Part, ...]:
+def _details(log: LoggedFlight) -> tuple[Part, ...]:
     return (
         listed("Not judged", [reason for reason, _ in log.lacking if reason], warn=True),
         listed("What to set", list(dict.fromkeys(remedy for _, remedy in log.lacking if remedy))),
@@ -181,7 +185,7 @@ def _details(log: Log) -> tuple[Part, ...]:
     )
 
 
-def _beside(log: Log) -> tuple[Part, ...]:
+def _beside(log: LoggedFlight) -> tuple[Part, ...]:
     return (
         links("Files", [(said, local_link(log.texts[name])) for said, name in FILES]),
         pairs("Tuned on this flight", [(said, _with_interval(log, *at)) for said, *at in TUNED]),
@@ -189,7 +193,7 @@ def _beside(log: Log) -> tuple[Part, ...]:
     )
 
 
-def _axes(log: Log) -> Part:
+def _axes(log: LoggedFlight) -> Part:
     """An axis per column, since there are few of them."""
     rows = [
         [said, *(_said(axis.get(name, "")) for axis in log.axes)]
@@ -204,7 +208,7 @@ def _said(value: object) -> str:
     return value if isinstance(value, str) else number_words(float(value))  # type: ignore[arg-type]
 
 
-def _with_interval(log: Log, name: str, unit: str) -> str:
+def _with_interval(log: LoggedFlight, name: str, unit: str) -> str:
     value, low, high = (log.numbers.get(f"{name}{end}_{unit}") for end in ("", "_low", "_high"))
     if value is None:
         return ""
@@ -214,7 +218,7 @@ def _with_interval(log: Log, name: str, unit: str) -> str:
     return f"{value:.3g} {spoken} (95 % from {low:.3g} to {high:.3g})"
 
 
-def _flight(log: Log) -> list[tuple[str, str]]:
+def _flight(log: LoggedFlight) -> list[tuple[str, str]]:
     numbers = [
         (said, f"{log.numbers[name]:.4g} {unit}")
         for said, name, unit in (
@@ -226,7 +230,7 @@ def _flight(log: Log) -> list[tuple[str, str]]:
     return [*((said, log.texts[name]) for said, name in FACTS), *numbers]
 
 
-def _filters(logs: Sequence[Log]) -> list[tuple[str, list[tuple[str, str]]]]:
+def _filters(logs: Sequence[LoggedFlight]) -> list[tuple[str, list[tuple[str, str]]]]:
     """What the logs have, most frequent first."""
     counts = Counter(tag for log in logs for tag in log.tags)
     words_of = {tag: said for log in logs for tag, said in log.tags.items()}

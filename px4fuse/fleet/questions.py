@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.findings import named
-from px4fuse.fleet.by_log import Log
+from px4fuse.fleet.by_log import LoggedFlight
 from px4fuse.plain import factor_words
 from px4fuse.webpage.charts import Scale, axis, bar, grid, over_time, plot, spread
 from px4fuse.webpage.frame import card, note, opens, picks, ranking, summary
@@ -26,7 +26,7 @@ FILTERS = (("kf", "ours"), ("ekf2", "ekf2"))
 
 
 def above(
-    logs: Sequence[Log],
+    logs: Sequence[LoggedFlight],
     names: Mapping[str, str],
     factor: Scale,
     sigma: Scale | None,
@@ -59,7 +59,7 @@ def overstated_words(factor: float) -> str:
     return f"{factor_words(off)} × too {'large' if factor > 1.0 else 'small'}"
 
 
-def _summary(logs: Sequence[Log]) -> str:
+def _summary(logs: Sequence[LoggedFlight]) -> str:
     statuses = Counter(log.status for log in logs)
     dates = sorted(log.texts["date"][:10] for log in logs if log.texts["date"])
     entries = [
@@ -77,10 +77,10 @@ def _summary(logs: Sequence[Log]) -> str:
     return summary([(name, escaped(value)) for name, value in entries if value])
 
 
-def _honesty(logs: Sequence[Log], by: str, names: Mapping[str, str], scale: Scale) -> str:
+def _honesty(logs: Sequence[LoggedFlight], by: str, names: Mapping[str, str], scale: Scale) -> str:
     """Distribution of over- and understatement in groups, those with most logs first."""
     title = f"Is the claimed uncertainty right? By {by}"
-    groups: dict[str, list[Log]] = defaultdict(list)
+    groups: dict[str, list[LoggedFlight]] = defaultdict(list)
     for log in logs:
         if log.factors:
             groups[log.texts[by]].append(log)
@@ -123,7 +123,7 @@ def _honesty(logs: Sequence[Log], by: str, names: Mapping[str, str], scale: Scal
 
 
 def _over_time(
-    logs: Sequence[Log], names: Mapping[str, str], name: str, unit: str, title: str,
+    logs: Sequence[LoggedFlight], names: Mapping[str, str], name: str, unit: str, title: str,
     scale: Scale | None, hint: str,
 ) -> str:  # fmt: skip
     """A number over the dates of the logs, a panel per vehicle, those with most logs first."""
@@ -188,7 +188,7 @@ def _dates(span: tuple[pd.Timestamp, pd.Timestamp]) -> str:
     )
 
 
-def _frequent(logs: Sequence[Log]) -> str:
+def _frequent(logs: Sequence[LoggedFlight]) -> str:
     title = "Findings, most frequent first"
     counts = Counter(finding for log in logs for finding in set(log.findings))
     if not counts:
@@ -205,7 +205,7 @@ def _frequent(logs: Sequence[Log]) -> str:
     return ranking(title, said, lines, MOST_FINDINGS, ", under Finding below")
 
 
-def _worst(logs: Sequence[Log]) -> str:
+def _worst(logs: Sequence[LoggedFlight]) -> str:
     """Those in which one of the filters is farthest from honest."""
     title = "The ten worst logs"
     off = [
@@ -229,17 +229,17 @@ def _worst(logs: Sequence[Log]) -> str:
     return ranking(title, said, lines, WORST)
 
 
-def _missing(logs: Sequence[Log]) -> str:
+def _missing(logs: Sequence[LoggedFlight]) -> str:
     """What could not be judged, by what to set so that the next can; whole logs first."""
     title = "Not judged, and what to set so that the next can"
-    groups: dict[str, list[tuple[Log, str]]] = defaultdict(list)
+    groups: dict[str, list[tuple[LoggedFlight, str]]] = defaultdict(list)
     for log in logs:
         for reason, remedy in log.lacking:
             groups[remedy].append((log, reason))
     if not groups:
         return card(title, note("Every log was judged."))
 
-    def rank(item: tuple[str, list[tuple[Log, str]]]) -> tuple[bool, int, str]:
+    def rank(item: tuple[str, list[tuple[LoggedFlight, str]]]) -> tuple[bool, int, str]:
         remedy, members = item
         return all(log.status == "done" for log, _ in members), -len(members), remedy
 

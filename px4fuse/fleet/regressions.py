@@ -36,7 +36,7 @@ BETWEEN_CHANGES = "; "
 
 
 @dataclass(frozen=True)
-class _Column:
+class _Measure:
     label: str
     unit: str
     aim: Aim
@@ -64,15 +64,15 @@ class _Column:
 _TRUTH = "ekf2_position_rmse_to_truth_m"
 _APART = "position_rmse_m"
 _COLUMNS = {
-    "ekf2_nis_mean": _Column("NIS of EKF2", "", "one"),
-    "kf_nis_mean": _Column("NIS of ours", "", "one"),
-    _TRUTH: _Column("error of EKF2", "m", "low"),
-    "kf_position_rmse_to_truth_m": _Column("error of ours", "m", "low"),
-    _APART: _Column("ours - EKF2", "m", "low"),
-    "sigma_z_m": _Column("SIGMA_Z found", "m", "low"),
-    "sigma_a_m_s2": _Column("SIGMA_A found", "m/s²", "low"),
-    "clock_offset_s": _Column("clock offset", "s", "zero", "difference"),
-    "rejected_share": _Column("share that EKF2 rejected", "", "low", "difference"),
+    "ekf2_nis_mean": _Measure("NIS of EKF2", "", "one"),
+    "kf_nis_mean": _Measure("NIS of ours", "", "one"),
+    _TRUTH: _Measure("error of EKF2", "m", "low"),
+    "kf_position_rmse_to_truth_m": _Measure("error of ours", "m", "low"),
+    _APART: _Measure("ours - EKF2", "m", "low"),
+    "sigma_z_m": _Measure("SIGMA_Z found", "m", "low"),
+    "sigma_a_m_s2": _Measure("SIGMA_A found", "m/s²", "low"),
+    "clock_offset_s": _Measure("clock offset", "s", "zero", "difference"),
+    "rejected_share": _Measure("share that EKF2 rejected", "", "low", "difference"),
 }
 # By what a flight is known, and the flights that it is held against
 _LOG, _VEHICLE = ["log_sha256", "axis"], ["vehicle", "settings", "axis"]
@@ -146,7 +146,7 @@ def marked(table: pd.DataFrame, baseline: pd.DataFrame) -> Marked:
     others = done & ~is_same & table["vehicle"].ne("").to_numpy()
     has_truth = table[_TRUTH].notna().to_numpy()
     worse: dict[int, list[str]] = defaultdict(list)
-    tests: list[tuple[int, _Column, float, float, float, float]] = []
+    tests: list[tuple[int, _Measure, float, float, float, float]] = []
     ps: list[float] = []
     held = np.zeros(len(table), dtype=bool)
     for at in np.flatnonzero(table["status"].eq(FAILED) & _was_done(table, known)):

@@ -17,7 +17,7 @@ import pandas as pd
 from px4fuse.errors import OutputError, Px4FuseError, SettingsError
 from px4fuse.filter.settings import Settings
 from px4fuse.fleet import TIMEOUT_S
-from px4fuse.fleet.engine import Failed, connected, outcomes
+from px4fuse.fleet.engine import WorkerFailed, connected, outcomes
 from px4fuse.fleet.job import Job, Outcome, analyse, file_stem, identify, refused
 from px4fuse.fleet.logs import FoundLog, find_logs
 from px4fuse.fleet.page import html_text
@@ -235,7 +235,7 @@ def _identify(
     ]
     with closing(outcomes(client, identify, asked, timeout_s=timeout_s)) as identified:
         for number, (one, sha256) in enumerate(identified, 1):
-            if isinstance(sha256, Failed):
+            if isinstance(sha256, WorkerFailed):
                 found.lost[one.address] = refused(sha256.line, FAILED)
             else:
                 found.hash_of[one.address] = sha256
@@ -284,7 +284,7 @@ def _compare(
     progress("comparing", 0, len(jobs))
     with closing(outcomes(client, analyse, jobs, timeout_s=timeout_s)) as compared:
         for number, (job, result) in enumerate(compared, 1):
-            if isinstance(result, Failed):
+            if isinstance(result, WorkerFailed):
                 found.lost[job.address] = refused(result.line, FAILED) | {"log_sha256": job.sha256}
             elif result.rows[0]["status"] == FAILED:
                 found.lost[job.address] = result.rows[0]

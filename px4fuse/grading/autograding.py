@@ -24,7 +24,7 @@ from px4fuse.grading.grade import grade_all
 from px4fuse.grading.gradescope import results, submission_metadata
 from px4fuse.grading.lateness import LateRule
 from px4fuse.grading.model import Entry
-from px4fuse.grading.platforms import Origin
+from px4fuse.grading.platforms import ExportOrigin
 from px4fuse.grading.roster import Register, people_of_key
 from px4fuse.grading.rubric import read_rubric, rubric_text
 from px4fuse.grading.submissions import collect
@@ -158,7 +158,9 @@ def run_autograder(folder: Path, late: LateRule | None) -> None:
     key = read_key(key_path) if key_path.exists() else None
     name, email, created, due = submission_metadata(folder)
     register = Register(people_of_key(key)) if key else None
-    origin = Origin("gradescope", name=name, email=email, time=created) if name else Origin()
+    origin = (
+        ExportOrigin("gradescope", name=name, email=email, time=created) if name else ExportOrigin()
+    )
     try:
         found, _ = collect([folder / "submission"])
     except SettingsError as error:  # an empty folder, or other files than PDFs

@@ -86,7 +86,7 @@ def html_text(entries: Sequence[Entry], title: str, made_with: str) -> str:
     common = posixpath.commonprefix([one.submission for one in graded]).rpartition("/")
     shared = len(common[0] + common[1])
     timed = any(entry.handed_in or entry.late_s for entry in entries)
-    layout = _Layout(items, numbers, shared, timed, named)
+    layout = _PageLayout(items, numbers, shared, timed, named)
     minutes = {at: reading_minutes(entry.counting) for at, entry in enumerate(entries)}
     return page(
         title=title,
@@ -162,7 +162,7 @@ def _filters(entries: Sequence[Entry]) -> list[tuple[str, list[tuple[str, str]]]
 
 
 @dataclass(frozen=True)
-class _Layout:
+class _PageLayout:
     """Columns that depend on the class."""
 
     items: tuple[str, ...]
@@ -173,7 +173,9 @@ class _Layout:
     named: bool
 
 
-def _row(entry: Entry, layout: _Layout, veil: Veil, minutes: float, alike: tuple[Part, ...]) -> Row:
+def _row(
+    entry: Entry, layout: _PageLayout, veil: Veil, minutes: float, alike: tuple[Part, ...]
+) -> Row:
     one = entry.counting
     status = status_of(entry)
     flags = [*entry.remarks, *(one.flags if one else ())]

@@ -13,7 +13,7 @@ from px4fuse.grading.class_table import item_points, settled_report
 from px4fuse.grading.lateness import LateRule, in_zone_of
 from px4fuse.grading.model import Entry, Graded, Override, Submission
 from px4fuse.grading.overrides import TOTAL, Overrides, matched
-from px4fuse.grading.platforms import Origin
+from px4fuse.grading.platforms import ExportOrigin
 from px4fuse.grading.roster import Person, Register
 from px4fuse.results.reading import one_line
 
@@ -74,7 +74,7 @@ class _Try:
     """One attempt: the file, when it came, and what that costs."""
 
     graded: Graded
-    origin: Origin
+    origin: ExportOrigin
     time: datetime | None
     packed: datetime | None
     late_s: float | None
@@ -101,7 +101,7 @@ class _Try:
 def class_entries(
     graded: Sequence[Graded],
     submissions: Sequence[Submission],
-    origins: Sequence[Origin],
+    origins: Sequence[ExportOrigin],
     register: Register | None,
     term: Term,
     overrides: Overrides,
@@ -157,7 +157,7 @@ def class_entries(
     return tuple(settled), notes
 
 
-def _named(graded: Sequence[Graded], origins: Sequence[Origin]) -> list[Person]:
+def _named(graded: Sequence[Graded], origins: Sequence[ExportOrigin]) -> list[Person]:
     """Without a roster: everyone whom a platform, else a report, names; each once."""
     register = Register([])
     for one, origin in zip(graded, origins, strict=True):
@@ -185,7 +185,7 @@ def _named(graded: Sequence[Graded], origins: Sequence[Origin]) -> list[Person]:
 def _try(
     graded: Graded,
     submission: Submission,
-    origin: Origin,
+    origin: ExportOrigin,
     term: Term,
     place: int | None,
     register: Register,

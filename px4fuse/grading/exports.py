@@ -35,7 +35,7 @@ from px4fuse.assignment.sheet import Sheet
 from px4fuse.errors import SettingsError
 from px4fuse.grading.class_table import number
 from px4fuse.grading.model import Entry
-from px4fuse.grading.platforms import Origin
+from px4fuse.grading.platforms import ExportOrigin
 from px4fuse.grading.roster import Register, person_of_row
 from px4fuse.grading.zipping import zipped
 from px4fuse.plain import few_words
@@ -195,7 +195,7 @@ def as_html(text: str) -> str:
 
 
 def moodle_feedback(
-    entries: Sequence[Entry], origins: Mapping[str, Origin], feedback: Mapping[int, str]
+    entries: Sequence[Entry], origins: Mapping[str, ExportOrigin], feedback: Mapping[int, str]
 ) -> bytes:
     """Feedback files as Moodle's "Upload multiple feedback files in a zip" takes them.
 
@@ -215,7 +215,9 @@ def moodle_feedback(
     return zipped(files)
 
 
-def _origin(entry: Entry, origins: Mapping[str, Origin], platform: str) -> Origin | None:
+def _origin(
+    entry: Entry, origins: Mapping[str, ExportOrigin], platform: str
+) -> ExportOrigin | None:
     """Where an entry's counting file came from, if from this platform."""
     origin = origins.get(entry.counting.submission) if entry.counting else None
     return origin if origin is not None and origin.platform == platform else None
@@ -225,7 +227,7 @@ def plain_grades(
     platform: str,
     title: str,
     entries: Sequence[Entry],
-    origins: Mapping[str, Origin],
+    origins: Mapping[str, ExportOrigin],
     register: Register,
     feedback: Mapping[int, str],
 ) -> str:

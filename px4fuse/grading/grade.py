@@ -21,7 +21,7 @@ from px4fuse.grading.lateness import moodle_time
 from px4fuse.grading.model import Entry, Graded, Rubric, Submission
 from px4fuse.grading.outputs import Class, write_class
 from px4fuse.grading.overrides import NAME, read_overrides
-from px4fuse.grading.platforms import Origin, origins_of
+from px4fuse.grading.platforms import ExportOrigin, origins_of
 from px4fuse.grading.records import verified
 from px4fuse.grading.roster import Register, people_of_key, people_of_sheet, person_of_row
 from px4fuse.grading.scoring import assess, refused
@@ -47,7 +47,7 @@ NUMBERS = (
 
 
 @dataclass(frozen=True)
-class Outcome:
+class GradeOutcome:
     """What grading a class gave.
 
     Attributes
@@ -82,7 +82,7 @@ def grade(
     title: str = "",
     processes: int | None = None,
     progress: Callable[[int, int], None] = lambda done, of: None,
-) -> Outcome:
+) -> GradeOutcome:
     """Grade everything that was handed in.
 
     Parameters
@@ -133,7 +133,7 @@ def grade(
         output / RECORDS,
         processes,
     )  # fmt: skip
-    return Outcome(entries, (*notes, *unread, *unknown, *more), reused, written)
+    return GradeOutcome(entries, (*notes, *unread, *unknown, *more), reused, written)
 
 
 def register_of(course: Course, key: AnswerKey | None) -> Register | None:
@@ -178,7 +178,7 @@ def _flagged(entries: Sequence[Entry], key: AnswerKey | None) -> tuple[Entry, ..
 
 
 @dataclass(frozen=True)
-class Job:
+class GradeJob:
     """One file, and whose it is where the platform says it."""
 
     submission: Submission
@@ -187,7 +187,7 @@ class Job:
 
 def grade_all(
     found: Sequence[Submission],
-    origins: Sequence[Origin],
+    origins: Sequence[ExportOrigin],
     logs: Sequence[Path],
     rubric: Rubric,
     records: Path,
@@ -201,7 +201,7 @@ def grade_all(
     for submission, origin in zip(found, origins, strict=True):
         place = register.by_platform(origin) if register else None
         owner = register.people[place].student_id if register and place is not None else ""
-        jobs.append(Job(submission, owner))
+        jobs.append(GradeJob(submission, owner))
     graded: dict[int, Graded] = {}
     reused = 0
     progress(0, len(found))
@@ -240,7 +240,7 @@ def grade_all(
 
 
 def grade_one(
-    job: Job,
+    job: GradeJob,
     logs: Mapping[str, Path],
     rubric: Rubric,
     key: AnswerKey | None,

@@ -18,7 +18,7 @@ Doubtful = Literal["pending", "zero", "count"]
 
 
 @dataclass(frozen=True)
-class Parameter:
+class RubricParameter:
     """What a check can be told.
 
     Attributes

@@ -24,7 +24,7 @@ from px4fuse.grading.gradescope import results
 from px4fuse.grading.model import Entry, Graded, Submission
 from px4fuse.grading.names import distinct, file_names
 from px4fuse.grading.overrides import NAME, TEMPLATE
-from px4fuse.grading.platforms import Origin, seen
+from px4fuse.grading.platforms import ExportOrigin, seen
 from px4fuse.grading.records import HANDED_IN, REDRAWN, file_of
 from px4fuse.grading.roster import Register
 from px4fuse.grading.sheets import delete_others, draw_sheets
@@ -62,7 +62,7 @@ class Class:
     register: Register
     title: str
     course: Course
-    origins: Mapping[str, Origin]
+    origins: Mapping[str, ExportOrigin]
     files: Mapping[str, Submission]
 
 

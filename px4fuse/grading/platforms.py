@@ -53,7 +53,7 @@ _MAX_METADATA = 20_000_000
 
 
 @dataclass(frozen=True)
-class Origin:
+class ExportOrigin:
     """What a platform says of a file that was handed in.
 
     Attributes
@@ -81,7 +81,7 @@ class Origin:
     late: bool = False
 
 
-def origin_of(name: str, platforms: Iterable[str] = tuple(PLATFORMS)) -> Origin:
+def origin_of(name: str, platforms: Iterable[str] = tuple(PLATFORMS)) -> ExportOrigin:
     """Who handed a file in, by its path in the export.
 
     >>> origin_of("Doe Jane_4711_assignsubmission_file_/report.pdf").name
@@ -92,7 +92,7 @@ def origin_of(name: str, platforms: Iterable[str] = tuple(PLATFORMS)) -> Origin:
     datetime.datetime(2026, 11, 20, 12, 34, 56)
     >>> origin_of("Lab_jdoe_attempt_2026-11-20-12-34-56_x_attempt_2026-11-19-01-02-03.pdf").login
     'jdoe'
-    >>> origin_of("report.pdf") == Origin()
+    >>> origin_of("report.pdf") == ExportOrigin()
     True
     """
     parts = name.split("/")
@@ -103,10 +103,12 @@ def origin_of(name: str, platforms: Iterable[str] = tuple(PLATFORMS)) -> Origin:
             found = match and _origin(platform, match.groupdict())
             if found:
                 return found
-    return Origin()
+    return ExportOrigin()
 
 
-def origins_of(found: Sequence[Submission], people: Mapping[str, Origin]) -> list[Origin]:
+def origins_of(
+    found: Sequence[Submission], people: Mapping[str, ExportOrigin]
+) -> list[ExportOrigin]:
     """Who handed in each file, and by which platform.
 
     An export is of one platform: that of most of its files. What a student called a file, in the
@@ -120,7 +122,7 @@ def origins_of(found: Sequence[Submission], people: Mapping[str, Origin]) -> lis
     made = []
     for one, export in zip(found, exports, strict=True):
         platform, count = counted[export].most_common(1)[0]
-        origin = origin_of(one.name, (platform,)) if count else Origin()
+        origin = origin_of(one.name, (platform,)) if count else ExportOrigin()
         if origin.platform in ("gradescope", ""):
             # PDF assignments are exported as 123456.pdf
             stem = one.name.rpartition("/")[2].casefold().removesuffix(".pdf")
@@ -129,7 +131,7 @@ def origins_of(found: Sequence[Submission], people: Mapping[str, Origin]) -> lis
     return made
 
 
-def _origin(platform: str, said: Mapping[str, str | None]) -> Origin | None:
+def _origin(platform: str, said: Mapping[str, str | None]) -> ExportOrigin | None:
     time = None
     if stamp := said.get("time"):
         try:
@@ -137,7 +139,7 @@ def _origin(platform: str, said: Mapping[str, str | None]) -> Origin | None:
         except ValueError:  # a 99th month: a student's own name
             return None
     whole = said.get("name") or " ".join(filter(None, (said.get("first"), said.get("last"))))
-    return Origin(
+    return ExportOrigin(
         platform,
         said.get("number") or "",
         whole,
@@ -147,7 +149,7 @@ def _origin(platform: str, said: Mapping[str, str | None]) -> Origin | None:
     )
 
 
-def gradescope_metadata(text: str) -> dict[str, Origin]:
+def gradescope_metadata(text: str) -> dict[str, ExportOrigin]:
     r"""People and times of Gradescope's ``submission_metadata.yml``, by number of submission.
 
     Read line by line, the few that are needed: outputs of autograders are in it as well, deeper.
@@ -157,12 +159,12 @@ def gradescope_metadata(text: str) -> dict[str, Origin]:
     >>> gradescope_metadata(text)["7"].student_id
     '12'
     """
-    found: dict[str, Origin] = {}
+    found: dict[str, ExportOrigin] = {}
     number, block = "", ""
     for line in text[:_MAX_METADATA].splitlines():
         if top := re.match(r"(?:submission_)?(\d+)(?:\.pdf)?:\s*$", line):
             number, block = top[1], ""
-            found[number] = Origin("gradescope", number)
+            found[number] = ExportOrigin("gradescope", number)
         elif line[:1].strip():
             number = ""
         elif number and (key := re.match(r"  :(\w+):\s*(.*)$", line)):
@@ -204,7 +206,7 @@ def _iso(value: str) -> datetime | None:
     return found if found.tzinfo else found.replace(tzinfo=UTC)
 
 
-def seen(origins: Iterable[Origin]) -> tuple[str, ...]:
+def seen(origins: Iterable[ExportOrigin]) -> tuple[str, ...]:
     """Platforms that files came from, in the order of :data:`PLATFORMS`."""
     there = {one.platform for one in origins}
     return tuple(name for name in PLATFORMS if name in there)

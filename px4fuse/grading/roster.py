@@ -18,7 +18,7 @@ from px4fuse.assignment.roster import (
 )
 from px4fuse.assignment.sheet import Sheet
 from px4fuse.errors import SettingsError
-from px4fuse.grading.platforms import Origin
+from px4fuse.grading.platforms import ExportOrigin
 from px4fuse.results.reading import one_line
 
 # Of Canvas, above the students
@@ -147,7 +147,7 @@ class Register:
                 return places[0]
         return None
 
-    def by_platform(self, origin: Origin) -> int | None:
+    def by_platform(self, origin: ExportOrigin) -> int | None:
         """Whose file it is by what the platform says, which no student can change."""
         if not origin.platform:
             return None

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, NoReturn, cast
 
 from px4fuse.errors import SettingsError
-from px4fuse.grading.model import Applies, Doubtful, Parameter, Rubric, RubricItem
+from px4fuse.grading.model import Applies, Doubtful, Rubric, RubricItem, RubricParameter
 from px4fuse.grading.scoring import CHECKS
 from px4fuse.reading import read_text
 
@@ -29,9 +29,9 @@ HELP = "px4fuse grade --write-rubric FILE.toml writes one that explains itself"
 APPLIES: tuple[Applies, ...] = ("any", "compare", "loop")
 # What becomes of points that nobody can vouch for
 DOUBTFUL = {
-    "unverified": Parameter("text", "pending", choices=("pending", "zero")),
-    "others_log": Parameter("text", "pending", choices=("pending", "zero", "count")),
-    "pages": Parameter("text", "count", choices=("count", "pending", "zero")),
+    "unverified": RubricParameter("text", "pending", choices=("pending", "zero")),
+    "others_log": RubricParameter("text", "pending", choices=("pending", "zero", "count")),
+    "pages": RubricParameter("text", "count", choices=("count", "pending", "zero")),
 }
 
 ITEM_KEYS = ("title", "points", "check", "report")
@@ -89,10 +89,10 @@ def parse_rubric(text: str, where: str) -> Rubric:
         name: cast(Doubtful, _value(where, name, given, one)) for name, one in DOUBTFUL.items()
     }
     return Rubric(
-        title=_value(where, "title", given, Parameter("text", "")),
+        title=_value(where, "title", given, RubricParameter("text", "")),
         items=read,
-        min_words=_value(where, "min_words", given, Parameter("whole", 100, 0, 100_000)),
-        common_words=_value(where, "common_words", given, Parameter("texts", ())),
+        min_words=_value(where, "min_words", given, RubricParameter("whole", 100, 0, 100_000)),
+        common_words=_value(where, "common_words", given, RubricParameter("texts", ())),
         **fates,
     )
 
@@ -100,14 +100,18 @@ def parse_rubric(text: str, where: str) -> Rubric:
 def _item(where: str, number: int, given: object) -> RubricItem:
     if not isinstance(given, dict):
         _refuse(where, f"item {number} is not a table; begin it with [[item]]")
-    title = _value(f"{where}: item {number}", "title", given, Parameter("text", required=True))
+    title = _value(
+        f"{where}: item {number}", "title", given, RubricParameter("text", required=True)
+    )
     here = f"{where}: item {number} ({title!r})"
     if not title.strip():
         _refuse(f"{where}: item {number}", "the title is empty; give it one")
     points = _value(
-        here, "points", given, Parameter("number", None, 0.0, MAX_POINTS, required=True)
+        here, "points", given, RubricParameter("number", None, 0.0, MAX_POINTS, required=True)
     )
-    check = _value(here, "check", given, Parameter("text", choices=tuple(CHECKS), required=True))
+    check = _value(
+        here, "check", given, RubricParameter("text", choices=tuple(CHECKS), required=True)
+    )
     known = CHECKS[check].parameters
     for name in given:
         if name not in ITEM_KEYS and name not in known:
@@ -120,7 +124,7 @@ def _item(where: str, number: int, given: object) -> RubricItem:
         _check_bounds(here, parameters)
     if check == "sections" and not parameters["results"] and not parameters["pages"]:
         _refuse(here, "nothing is required; give results = [...] or pages = [...]")
-    applies = _value(here, "report", given, Parameter("text", "any", choices=APPLIES))
+    applies = _value(here, "report", given, RubricParameter("text", "any", choices=APPLIES))
     return RubricItem(title, points, check, cast(Applies, applies), parameters)
 
 
@@ -138,7 +142,7 @@ def _check_bounds(here: str, given: Mapping[str, Any]) -> None:
         _refuse(here, "zero_at is on the good side of the bound; put it beyond")
 
 
-def _value(here: str, name: str, given: Mapping[str, Any], parameter: Parameter) -> Any:
+def _value(here: str, name: str, given: Mapping[str, Any], parameter: RubricParameter) -> Any:
     """One value, checked; a whole number counts as a number and one text as a list of it."""
     if name not in given:
         if parameter.required:
@@ -171,13 +175,13 @@ def _value(here: str, name: str, given: Mapping[str, Any], parameter: Parameter)
     return value
 
 
-def _is_text(value: object, parameter: Parameter) -> bool:
+def _is_text(value: object, parameter: RubricParameter) -> bool:
     if not isinstance(value, str) or len(value) > MAX_TEXT or not value.isprintable():
         return False
     return not parameter.choices or value in parameter.choices
 
 
-def _wanted(parameter: Parameter) -> str:
+def _wanted(parameter: RubricParameter) -> str:
     """What may be given, in words."""
     limits = f" from {parameter.low:g} to {parameter.high:g}" if parameter.high < 1e12 else ""
     choices = ", ".join(parameter.choices)

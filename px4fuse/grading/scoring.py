@@ -13,7 +13,7 @@ from px4fuse.assignment.key import AnswerKey
 from px4fuse.grading import checks_filter, checks_loop, checks_report
 from px4fuse.grading.checks_filter import SIGMAS
 from px4fuse.grading.evidence import Evidence, Scorer, reason_of, text_of
-from px4fuse.grading.model import Doubtful, Graded, Item, Parameter, Rubric, RubricItem
+from px4fuse.grading.model import Doubtful, Graded, Item, Rubric, RubricItem, RubricParameter
 from px4fuse.grading.text import text_flags
 from px4fuse.plain import capital
 from px4fuse.verification.model import Refused, Report, Verdict
@@ -27,64 +27,66 @@ class Check:
     """What a rubric may ask for: how it is scored, and what it can be told."""
 
     score: Scorer
-    parameters: Mapping[str, Parameter]
+    parameters: Mapping[str, RubricParameter]
 
 
-def _check(score: Scorer, **parameters: Parameter) -> Check:
+def _check(score: Scorer, **parameters: RubricParameter) -> Check:
     return Check(score, parameters)
 
 
-def _share(default: float) -> Parameter:
-    return Parameter("number", default, 0.0, 1.0)
+def _share(default: float) -> RubricParameter:
+    return RubricParameter("number", default, 0.0, 1.0)
 
 
 # A check is a function above, its line here, and an item of rubric.toml that explains it
 CHECKS: Mapping[str, Check] = {
     "verified": _check(checks_report.verified, without_log=_share(0.5)),
     "student": _check(
-        checks_report.student, name=Parameter("flag", True), id=Parameter("flag", True)
+        checks_report.student, name=RubricParameter("flag", True), id=RubricParameter("flag", True)
     ),
     "sections": _check(
-        checks_report.sections, results=Parameter("texts", ()), pages=Parameter("texts", ())
+        checks_report.sections,
+        results=RubricParameter("texts", ()),
+        pages=RubricParameter("texts", ()),
     ),
     "tuning": _check(
         checks_filter.tuning,
-        axis=Parameter("text", "horizontal"),
-        settings=Parameter("texts", SIGMAS, choices=SIGMAS),
-        factor=Parameter("number", 2.0, 1.0, 1000.0),
+        axis=RubricParameter("text", "horizontal"),
+        settings=RubricParameter("texts", SIGMAS, choices=SIGMAS),
+        factor=RubricParameter("number", 2.0, 1.0, 1000.0),
     ),
     "number": _check(
         checks_report.number_between,
-        path=Parameter("texts", required=True),
-        name=Parameter("text", ""),
-        unit=Parameter("text", ""),
-        at_least=Parameter("number"),
-        at_most=Parameter("number"),
-        zero_at=Parameter("number"),
-        advice=Parameter("text", ""),
+        path=RubricParameter("texts", required=True),
+        name=RubricParameter("text", ""),
+        unit=RubricParameter("text", ""),
+        at_least=RubricParameter("number"),
+        at_most=RubricParameter("number"),
+        zero_at=RubricParameter("number"),
+        advice=RubricParameter("text", ""),
     ),
     "consistent": _check(
         checks_filter.consistent,
-        filter=Parameter("text", "kf", choices=("kf", "ekf2")),
-        axes=Parameter("texts", ("horizontal",)),
-        factor=Parameter("number", 1.5, 1.0, 1000.0),
+        filter=RubricParameter("text", "kf", choices=("kf", "ekf2")),
+        axes=RubricParameter("texts", ("horizontal",)),
+        factor=RubricParameter("number", 1.5, 1.0, 1000.0),
     ),
     "clock": _check(
         checks_filter.clock,
-        margin_s=Parameter("number", 0.03, 0.0, 10.0),
+        margin_s=RubricParameter("number", 0.03, 0.0, 10.0),
         undeterminable=_share(0.5),
     ),
     "loop": _check(checks_loop.loop, without_reference=_share(0.5)),
     "closure": _check(
         checks_loop.closure,
-        enough_p=Parameter("number", 0.05, 0.002, 1.0),
+        enough_p=RubricParameter("number", 0.05, 0.002, 1.0),
         open_unknown=_share(0.5),
     ),
     "flight": _check(
         checks_report.flight,
-        min_duration_s=Parameter("number", 60.0, 0.0, 1e5),
-        min_measurements=Parameter("whole", 100, 0, 10_000_000),
-        min_path_m=Parameter("number", 20.0, 0.0, 1e6),
+        min_duration_s=RubricParameter("number", 60.0, 0.0, 1e5),
+        min_measurements=RubricParameter("whole", 100, 0, 10_000_000),
+        min_path_m=RubricParameter("number", 20.0, 0.0, 1e6),
         handed_out=_share(0.4),
     ),
     "answers": _check(checks_report.answers),

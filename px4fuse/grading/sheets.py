@@ -29,7 +29,7 @@ LIST = "drawn.txt"
 
 
 @dataclass(frozen=True)
-class Job:
+class SheetJob:
     """A redrawn report, the words that its pictures must not show, and where they go."""
 
     pdf: Path
@@ -66,7 +66,7 @@ def draw_sheets(
     OutputError
         The folder cannot be written.
     """
-    jobs = {key: Job(pdf, tuple(hide), folder) for key, (pdf, hide) in reports.items()}
+    jobs = {key: SheetJob(pdf, tuple(hide), folder) for key, (pdf, hide) in reports.items()}
     stems = {key: job.stem for key, job in jobs.items()}
     made = {key: found for key, stem in stems.items() if (found := _drawn(folder, stem))}
     missing = [key for key in jobs if key not in made]
@@ -87,7 +87,7 @@ def draw_sheets(
     return made
 
 
-def draw(job: Job) -> None:
+def draw(job: SheetJob) -> None:
     """Write the pictures of one report, if it can be drawn."""
     drawn = page_pictures(job.pdf.read_bytes(), job.hide)
     if isinstance(drawn, Unavailable):

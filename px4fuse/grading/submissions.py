@@ -23,7 +23,7 @@ from typing import IO
 from px4fuse.errors import SettingsError
 from px4fuse.grading.model import Submission
 from px4fuse.grading.names import distinct
-from px4fuse.grading.platforms import METADATA, Origin, gradescope_metadata
+from px4fuse.grading.platforms import METADATA, ExportOrigin, gradescope_metadata
 from px4fuse.results.reading import cleaned, one_line
 from px4fuse.verification.intake import MAX_BYTES
 from px4fuse.verification.model import Refused
@@ -136,7 +136,7 @@ def read(submission: Submission) -> bytes | Refused:
     return content
 
 
-def gradescope_people(paths: Sequence[Path]) -> tuple[dict[str, Origin], tuple[str, ...]]:
+def gradescope_people(paths: Sequence[Path]) -> tuple[dict[str, ExportOrigin], tuple[str, ...]]:
     """What Gradescope's export says of its submissions; empty where nothing came from there.
 
     Only the file beside the submissions is read, never one that a student handed in.
@@ -148,7 +148,7 @@ def gradescope_people(paths: Sequence[Path]) -> tuple[dict[str, Origin], tuple[s
     notes : tuple of str
         Why such a file was not read.
     """
-    found: dict[str, Origin] = {}
+    found: dict[str, ExportOrigin] = {}
     notes: list[str] = []
     for path in paths:
         for file, name in _files(path, []):

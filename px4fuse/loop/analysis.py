@@ -13,7 +13,7 @@ from px4fuse.flight import Flight, Truth, Unavailable
 from px4fuse.loop.loop import Loop, close_loop
 from px4fuse.loop.odometry import Closure, OdometryNoise
 from px4fuse.loop.part import KnownEnd, chosen_part, measured_end, part_of_flight, true_end
-from px4fuse.loop.sources import Source
+from px4fuse.loop.sources import LoopSource
 from px4fuse.loop.tracks import odometry_of, trajectory_of
 from px4fuse.request import GivenClosure
 from px4fuse.trajectory.model import Trajectory
@@ -26,7 +26,7 @@ LOOP_MAX_GAP_SHARE = 0.10
 
 
 def analyse(
-    source: Source,
+    source: LoopSource,
     *,
     start_s: float | None = None,
     end_s: float | None = None,
@@ -148,4 +148,4 @@ def loop_in(flight: Flight, progress: Callable[[str], None] = lambda _: None) ->
             f"the odometry ends {gap:.1f} m from where it began and spans {extent:.1f} m: no loop",
             "Fly back to the place of take-off, or use px4fuse loop with --closure.",
         )
-    return analyse(Source(trajectory, flight), progress=progress)
+    return analyse(LoopSource(trajectory, flight), progress=progress)

@@ -19,7 +19,7 @@ _G2O = (b"VERTEX_", b"EDGE_", b"FIX")
 
 
 @dataclass(frozen=True)
-class Source:
+class LoopSource:
     """A trajectory and, where it is part of one, the flight."""
 
     trajectory: Trajectory
@@ -80,7 +80,7 @@ def read_source(
     default: Part | None = None,
     frame: Frame | None = None,
     system: int | None = None,
-) -> Source:
+) -> LoopSource:
     """Read a trajectory from a file, or a part of a flight log.
 
     Parameters
@@ -116,7 +116,7 @@ def read_source(
                 f"{shown(path)}: a trajectory file has no part {part!r}. Leave it out."
             )
         trajectory = read_trajectory(path)
-        return Source(trajectory if frame is None else replace(trajectory, frame=frame), None)
+        return LoopSource(trajectory if frame is None else replace(trajectory, frame=frame), None)
     if frame is not None:
         raise SettingsError(
             f"`frame` {frame.lower()} is for trajectory files; {shown(path)} is a flight log, "
@@ -124,7 +124,7 @@ def read_source(
         )
     flight = read_log(path, system=system)
     chosen = part or default or _odometry_or_ekf2(flight)
-    return Source(trajectory_of(flight, chosen), flight)
+    return LoopSource(trajectory_of(flight, chosen), flight)
 
 
 def _odometry_or_ekf2(flight: Flight) -> Part:

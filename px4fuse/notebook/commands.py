@@ -16,7 +16,7 @@ from px4fuse.flight import Flight, Unavailable
 from px4fuse.loop.analysis import analyse
 from px4fuse.loop.loop import Loop
 from px4fuse.loop.odometry import OdometryNoise
-from px4fuse.loop.sources import Source, read_source
+from px4fuse.loop.sources import LoopSource, read_source
 from px4fuse.readers import read_log
 from px4fuse.request import (
     AUTO,
@@ -204,7 +204,7 @@ def close_loop(
     if reference is not None and not isinstance(reference, Trajectory):
         reference = read_source(str(reference), default="truth").trajectory
     return analyse(
-        Source(source, None)
+        LoopSource(source, None)
         if isinstance(source, Trajectory)
         else read_source(str(source), frame=frame),
         start_s=start_s,

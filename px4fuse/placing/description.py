@@ -22,7 +22,7 @@ from px4fuse.placing.tracks import (
 )
 
 if TYPE_CHECKING:
-    from px4fuse.readers.position_csv import PositionFile
+    from px4fuse.readers.position_csv import PositionRecording
 
 # Another lag whose residual is not larger by this factor can hardly be told apart
 NEAR_RESIDUAL = {EKF2_POSITION: 2.0, IMU: 1.4}  # the IMU's own noise leaves 1.4 to 1.7
@@ -34,7 +34,7 @@ MAX_UNIX_DIFFERENCE_S = 60.0  # computers in a lab keep time better than this
 
 def describe(
     flight: Flight,
-    file: PositionFile,
+    file: PositionRecording,
     samples: pd.DataFrame,
     match: Match | None,
     frame_option: str | None,
@@ -211,7 +211,9 @@ def _height_warnings(flight: Flight, placed: pd.DataFrame) -> list[str]:
     ]
 
 
-def _unix_warnings(flight: Flight, file: PositionFile, clock_offset_s: float | None) -> list[str]:
+def _unix_warnings(
+    flight: Flight, file: PositionRecording, clock_offset_s: float | None
+) -> list[str]:
     """Whether the file's UNIX clock is far from the log's: then it may be of another flight."""
     start_s = flight.log.start_unix_s
     if file.clock != "UNIX" or start_s is None or clock_offset_s is None:

@@ -14,7 +14,7 @@ from px4fuse.placing.tracks import (
     MIN_OVERLAP_S,
     MIN_SAMPLES,
     NoMatchError,
-    Track,
+    OwnTrack,
 )
 from px4fuse.trajectory.correlation import autocovariance, moments
 from px4fuse.trajectory.offset import STEP_S
@@ -84,7 +84,7 @@ class Fit:
     overlap_s: float
 
 
-def correlation_peak(file: Track, reference: Track, yaw_rad: float | None) -> Peak:
+def correlation_peak(file: OwnTrack, reference: OwnTrack, yaw_rad: float | None) -> Peak:
     """Lag of greatest likelihood gain over all lags on the grid, yaw free where None.
 
     With a free offset the residual sum of squares over an overlap of N grid points is
@@ -136,8 +136,8 @@ def correlation_peak(file: Track, reference: Track, yaw_rad: float | None) -> Pe
 
 
 def least_squares_fit(
-    file: Track,
-    reference: Track,
+    file: OwnTrack,
+    reference: OwnTrack,
     peak: Peak | None,
     lag_s: float,
     yaw_rad: float | None,

@@ -23,7 +23,7 @@ from px4fuse.placing.tracks import (
     MIN_MOTION_M,
     MIN_OVERLAP_S,
     NoMatchError,
-    Track,
+    OwnTrack,
     band_passed,
     continuous_track,
     despiked,
@@ -54,7 +54,7 @@ class Match:
 
     Attributes
     ----------
-    reference : Track
+    reference : OwnTrack
     frame : str
     misfits_m : dict from frame to float
         Residual in each frame that was tried, best first.
@@ -68,7 +68,7 @@ class Match:
         Frame in which the file fits without a turn, where that is not the one asked for.
     """
 
-    reference: Track
+    reference: OwnTrack
     frame: str
     misfits_m: dict[str, float]
     fit: Fit
@@ -120,7 +120,7 @@ def find_match(
 
 
 def _match(
-    references: list[Track],
+    references: list[OwnTrack],
     samples: pd.DataFrame,
     frame: str | None,
     yaw_rad: float | None,
@@ -224,7 +224,11 @@ def _fitted_across_resets(
 
 
 def _best_fit(
-    samples: pd.DataFrame, frame: str, reference: Track, yaw_rad: float | None, lag_s: float | None
+    samples: pd.DataFrame,
+    frame: str,
+    reference: OwnTrack,
+    yaw_rad: float | None,
+    lag_s: float | None,
 ) -> Fit:
     """Find the lag, unless it is given, then fit."""
     file = file_track(samples, frame)

@@ -28,14 +28,14 @@ from px4fuse.readers.parts import finite_rows
 from px4fuse.recording import InputFile
 
 if TYPE_CHECKING:
-    from px4fuse.readers.position_csv import PositionFile
+    from px4fuse.readers.position_csv import PositionRecording
 
 __all__ = ["EKF2_POSITION", "IMU", "place"]
 
 
 def place(
     flight: Flight,
-    file: PositionFile,
+    file: PositionRecording,
     *,
     frame: str | None = None,
     yaw_deg: float | Literal["auto"] | None = None,

@@ -54,7 +54,7 @@ class NoMatchError(Exception):
 
 
 @dataclass(frozen=True)
-class Track:
+class OwnTrack:
     """Positions over time, of the file or of its reference.
 
     Attributes
@@ -86,28 +86,28 @@ class Track:
         return np.stack(position, axis=1), valid
 
 
-def file_track(samples: pd.DataFrame, frame: str) -> Track:
+def file_track(samples: pd.DataFrame, frame: str) -> OwnTrack:
     """Read the file's axes as north, east, down; time from its first sample on."""
     order, sign = FRAMES[frame]
     time = samples.index.to_numpy()
-    return Track(
+    return OwnTrack(
         time - time[0],
         samples[["x_m", "y_m", "z_m"]].to_numpy()[:, order] * sign,
         np.ones(len(time), dtype=bool),
     )
 
 
-def on_grid(track: Track) -> Track:
+def on_grid(track: OwnTrack) -> OwnTrack:
     """Resample to the grid that begins with the track, gaps marked."""
     interval = np.diff(track.time_s)
     grid = np.arange(track.time_s[0], track.time_s[-1], STEP_S)
     before = np.searchsorted(track.time_s, grid, side="right") - 1
     longest = max(GAP_S, GAP_INTERVALS * float(np.median(interval)))
     within = interval[np.clip(before, 0, len(interval) - 1)] <= longest
-    return Track(grid, track.at(grid)[0], within)
+    return OwnTrack(grid, track.at(grid)[0], within)
 
 
-def despiked(track: Track, window: int = 3) -> Track:
+def despiked(track: OwnTrack, window: int = 3) -> OwnTrack:
     """Without single outliers, or more with a longer median."""
     return replace(track, position_m=median_filter(track.position_m, size=(window, 1)))
 
@@ -120,23 +120,23 @@ def band_passed(position_m: Array) -> Array:
     return filtered
 
 
-def without_edges(track: Track) -> Track:
+def without_edges(track: OwnTrack) -> OwnTrack:
     """Without what the filter's transients spoil, next to gaps too."""
     edge = round(BAND_EDGE_S / STEP_S)
     return replace(track, valid=binary_erosion(track.valid, np.ones(2 * edge + 1, dtype=bool)))
 
 
-def horizontal_range_m(track: Track) -> float:
+def horizontal_range_m(track: OwnTrack) -> float:
     """Larger horizontal range (m), noise and outliers left out."""
     return float(np.max(np.ptp(despiked(track, 5).position_m[:, :2], axis=0)))
 
 
-def _ekf2_track(state: pd.DataFrame) -> Track:
+def _ekf2_track(state: pd.DataFrame) -> OwnTrack:
     """EKF2's position on the grid, smoothed."""
     known = finite_rows(state, POSITION_COLUMNS[:2])
     if len(known) < MIN_SAMPLES:
         raise NoMatchError("EKF2 has no horizontal position in this log")
-    raw = Track(
+    raw = OwnTrack(
         known.index.to_numpy(), known[POSITION_COLUMNS].to_numpy(), np.ones(len(known), dtype=bool)
     )
     grid = on_grid(raw)
@@ -144,7 +144,7 @@ def _ekf2_track(state: pd.DataFrame) -> Track:
     return replace(grid, position_m=smooth, name=EKF2_POSITION)
 
 
-def ekf2_references(flight: Flight) -> list[Track]:
+def ekf2_references(flight: Flight) -> list[OwnTrack]:
     """EKF2's position as published and, where it was reset horizontally, without those resets.
 
     Height is always as published: most of its resets correct an error of before take-off.
@@ -168,14 +168,14 @@ def ekf2_references(flight: Flight) -> list[Track]:
     return references
 
 
-def imu_references(flight: Flight) -> list[Track]:
+def imu_references(flight: Flight) -> list[OwnTrack]:
     """Acceleration integrated twice, band-passed after each integration."""
     acceleration = ned_acceleration(flight)
     if isinstance(acceleration, Unavailable):
         raise NoMatchError("the log has no acceleration in NED")
     time = acceleration.index.to_numpy()
     velocity = cumulative_trapezoid(acceleration.to_numpy(), time, axis=0, initial=0)
-    grid = on_grid(Track(time, velocity, np.ones(len(time), dtype=bool)))
+    grid = on_grid(OwnTrack(time, velocity, np.ones(len(time), dtype=bool)))
     if len(grid.time_s) * STEP_S < MIN_OVERLAP_S:
         raise NoMatchError("the IMU's record is too short")
     position = cumulative_trapezoid(band_passed(grid.position_m), dx=STEP_S, axis=0, initial=0)
@@ -203,7 +203,7 @@ def placed_samples(
     )
 
 
-def continuous_track(ekf2: Ekf2, placed: pd.DataFrame) -> Track:
+def continuous_track(ekf2: Ekf2, placed: pd.DataFrame) -> OwnTrack:
     """EKF2's track with its resets treated as the placed file has it."""
     track = PositionTrack("", GIVEN_FILE, "", placed, "NED", "", ())
     whole = Segment(float(placed.index[0]), float(placed.index[-1]), "")

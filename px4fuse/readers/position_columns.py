@@ -22,7 +22,7 @@ from px4fuse.readers.text_table import quote
 
 
 @dataclass(frozen=True)
-class Choice:
+class ColumnChoice:
     """Columns to read, by index."""
 
     time: int
@@ -48,7 +48,7 @@ class Choice:
         return list(dict.fromkeys(index for index in every if index is not None))
 
 
-def choose(table: Table, columns: tuple[str, ...] | None) -> Choice:
+def choose(table: Table, columns: tuple[str, ...] | None) -> ColumnChoice:
     """Choose the columns: those that the option tells, else by name, else the first ones."""
     width = max(map(len, table.head), default=0)
     meanings = [*map(meaning, table.names), *[Meaning()] * (width - len(table.names))]
@@ -101,7 +101,9 @@ def choose(table: Table, columns: tuple[str, ...] | None) -> Choice:
         f"sigma: {table.labels(sigma) or 'none'}",
         f"quality: {quality_words}",
     ]
-    return Choice(time, iso, nanoseconds, position, sigma, quality, units, frame, words, notes)
+    return ColumnChoice(
+        time, iso, nanoseconds, position, sigma, quality, units, frame, words, notes
+    )
 
 
 def _resolve(columns: tuple[str, ...], table: Table, width: int) -> list[int]:

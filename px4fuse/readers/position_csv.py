@@ -19,7 +19,7 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.errors import LogError, SettingsError
-from px4fuse.readers.position_columns import Choice, choose
+from px4fuse.readers.position_columns import ColumnChoice, choose
 from px4fuse.readers.position_names import (
     LENGTH_UNITS,
     TIME_UNITS,
@@ -64,7 +64,7 @@ _CSV = {
 
 
 @dataclass(frozen=True)
-class PositionFile:
+class PositionRecording:
     """An external position log as its own system wrote it: its own clock, its own frame.
 
     Attributes
@@ -105,7 +105,7 @@ def read_position_csv(
     columns: tuple[str, ...] | None = None,
     time_unit: str | None = None,
     length_unit: str | None = None,
-) -> PositionFile:
+) -> PositionRecording:
     """Read an external position log.
 
     Parameters
@@ -171,7 +171,7 @@ def read_position_csv(
     clock: Literal["UNIX", "local"] = "UNIX" if is_unix else "local"
     time, position, *others = choice.detected
     time, position = f"{time}, {clock} clock, in {unit_words}", f"{position}, in {length_words}"
-    return PositionFile(
+    return PositionRecording(
         name=name,
         sha256=hashlib.sha256(content).hexdigest(),
         size_bytes=len(content),
@@ -213,7 +213,7 @@ def _convert(texts: Any, is_iso: bool, errors: Literal["raise", "coerce"]) -> An
     return pd.to_numeric(texts, errors=errors)
 
 
-def _read_rows(table: Table, choice: Choice) -> tuple[Any, pd.DataFrame, list[str]]:
+def _read_rows(table: Table, choice: ColumnChoice) -> tuple[Any, pd.DataFrame, list[str]]:
     """Times in their own unit (µs from ISO 8601 text), the other columns by index, and notes.
 
     Of rows with time and position.
@@ -252,7 +252,7 @@ def _read_rows(table: Table, choice: Choice) -> tuple[Any, pd.DataFrame, list[st
     return times[is_usable].to_numpy(dtype=exact), numbers[is_usable], notes
 
 
-def _name_text(table: Table, choice: Choice, texts: pd.DataFrame) -> str:
+def _name_text(table: Table, choice: ColumnChoice, texts: pd.DataFrame) -> str:
     """Name the first text where a number or a time belongs."""
     bad = []
     for column in (choice.time, *choice.numbers):
@@ -287,7 +287,7 @@ def _is_cut(fields: list[str], head: list[list[str]]) -> bool:
     return digits(fields[-1]) < min(map(digits, texts))
 
 
-def _time_unit(ticks: Any, choice: Choice, option: str | None) -> tuple[str, str]:
+def _time_unit(ticks: Any, choice: ColumnChoice, option: str | None) -> tuple[str, str]:
     """Unit of the time column, and the words on it."""
     if choice.iso:
         return "us", choice.iso
@@ -317,7 +317,7 @@ def _time_unit(ticks: Any, choice: Choice, option: str | None) -> tuple[str, str
 
 
 def _length_units(
-    numbers: pd.DataFrame, choice: Choice, option: str | None
+    numbers: pd.DataFrame, choice: ColumnChoice, option: str | None
 ) -> tuple[dict[int, str], str]:
     """Length unit of each column of numbers, and the words on those of position."""
     # outliers must not decide

@@ -54,7 +54,7 @@ MAP, PANEL, LEGEND = 160.0, 95.0, 14.0
 
 
 @dataclass(frozen=True)
-class Track:
+class SideTrack:
     """One of the two on an axis that both have; its times count from ``zero_s``."""
 
     name: str
@@ -128,7 +128,7 @@ def _cells(change: NumberChange) -> list[Cell]:
 # -- pictures --------------------------------------------------------------------------------------
 
 
-def _tracks(a: Analysis, b: Analysis, axis: str) -> tuple[tuple[Track, Track], str]:
+def _tracks(a: Analysis, b: Analysis, axis: str) -> tuple[tuple[SideTrack, SideTrack], str]:
     """Both on one axis, and what their times count from."""
     took_off = [happened(analysis).take_off_s for analysis in (a, b)]
     zeros = [times[0] for times in took_off if times]
@@ -137,13 +137,13 @@ def _tracks(a: Analysis, b: Analysis, axis: str) -> tuple[tuple[Track, Track], s
         zeros = [float(x[axis].axis.measurement_time_s[0]) for x in (a, b)]
         since = "the first measurement"
     first, second = (
-        Track(name, analysis, analysis[axis], zero)
+        SideTrack(name, analysis, analysis[axis], zero)
         for name, analysis, zero in zip("AB", (a, b), zeros, strict=True)
     )
     return (first, second), f"time since {since} (s)"
 
 
-def _drawn_tracks(tracks: tuple[Track, Track], since: str) -> Page:
+def _drawn_tracks(tracks: tuple[SideTrack, SideTrack], since: str) -> Page:
     along = the(tracks[0].result.axis.name)
     page = Page("Tracks of A and B", "A is dark and solid, B lighter and dashed, on common axes.")
     columns = halves()
@@ -175,7 +175,7 @@ def _drawn_tracks(tracks: tuple[Track, Track], since: str) -> Page:
     return page
 
 
-def _drawn_innovations(tracks: tuple[Track, Track], since: str) -> Page:
+def _drawn_innovations(tracks: tuple[SideTrack, SideTrack], since: str) -> Page:
     along = the(tracks[0].result.axis.name)
     page = Page(
         f"Innovations and variances along {along}",
@@ -198,11 +198,11 @@ def _drawn_innovations(tracks: tuple[Track, Track], since: str) -> Page:
 
 
 Series = tuple[Array, Array]
-Of = Callable[[Track], Series | None]
+Of = Callable[[SideTrack], Series | None]
 
 
 def _series(
-    page: Page, tracks: Sequence[Track], since: str, *panels: tuple[str, str, Of],
+    page: Page, tracks: Sequence[SideTrack], since: str, *panels: tuple[str, str, Of],
     log: bool = False,
 ) -> None:  # fmt: skip
     """One series of both per panel; what neither has is left out, the last says what times are."""
@@ -222,7 +222,7 @@ def _series(
 
 
 def _innovations(
-    page: Page, tracks: Sequence[Track], title: str, of: Callable[[Track], Any]
+    page: Page, tracks: Sequence[SideTrack], title: str, of: Callable[[SideTrack], Any]
 ) -> None:
     frames = [(track, frame) for track in tracks if isinstance(frame := of(track), pd.DataFrame)]
     sigmas = {t.name: 2.0 * np.sqrt(f["innovation_variance_m2"].to_numpy()) for t, f in frames}
@@ -251,7 +251,7 @@ def _innovations(
         legend_above(axes, markerscale=2.0)
 
 
-def _finish(axes: Axes, tracks: Sequence[Track], since: str) -> None:
+def _finish(axes: Axes, tracks: Sequence[SideTrack], since: str) -> None:
     """Common limits in time, whose numbers stand at the last panel alone."""
     segments = [(track.analysis.segment, track.zero_s) for track in tracks]
     axes.set_xlim(
@@ -264,26 +264,26 @@ def _finish(axes: Axes, tracks: Sequence[Track], since: str) -> None:
         bare_x(axes)
 
 
-def _ekf2_position(track: Track) -> Series | None:
+def _ekf2_position(track: SideTrack) -> Series | None:
     state = track.result.ekf2_state
     if not isinstance(state, pd.DataFrame):
         return None
     return track.since(state.index), state["position_m"].to_numpy()
 
 
-def _ekf2_sigma(track: Track) -> Series | None:
+def _ekf2_sigma(track: SideTrack) -> Series | None:
     variance = track.result.ekf2_variance
     if not isinstance(variance, pd.DataFrame):
         return None
     return track.since(variance.index), np.sqrt(variance["position_variance_m2"].to_numpy())
 
 
-def _our_sigma(track: Track) -> Series | None:
+def _our_sigma(track: SideTrack) -> Series | None:
     updates = track.result.replay.updates
     return track.since(updates.index), np.sqrt(updates["prior_position_variance_m2"].to_numpy())
 
 
-def _apart(track: Track) -> Series | None:
+def _apart(track: SideTrack) -> Series | None:
     """Ours minus EKF2, at EKF2's times."""
     state = track.result.ekf2_state
     if not isinstance(state, pd.DataFrame):
@@ -292,7 +292,7 @@ def _apart(track: Track) -> Series | None:
     return _known(track.since(state.index), ours - state["position_m"].to_numpy())
 
 
-def _error(track: Track) -> Series | None:
+def _error(track: SideTrack) -> Series | None:
     """EKF2 against the truth."""
     state, truth = track.result.ekf2_state, track.result.truth
     if not isinstance(state, pd.DataFrame) or not isinstance(truth, pd.DataFrame):
@@ -306,16 +306,16 @@ def _known(time: Array, values: Array) -> Series | None:
     return (time[finite], values[finite]) if finite.any() else None
 
 
-def _rms_words(tracks: Sequence[Track], of: Of) -> str:
+def _rms_words(tracks: Sequence[SideTrack], of: Of) -> str:
     return _said("Root mean square", tracks, of, lambda values: np.sqrt(np.mean(values**2)))
 
 
-def _median_words(tracks: Sequence[Track], of: Of) -> str:
+def _median_words(tracks: Sequence[SideTrack], of: Of) -> str:
     return _said("Median", tracks, of, np.median)
 
 
 def _said(
-    head: str, tracks: Sequence[Track], of: Of, statistic: Callable[[Array], np.floating[Any]]
+    head: str, tracks: Sequence[SideTrack], of: Of, statistic: Callable[[Array], np.floating[Any]]
 ) -> str:
     """One number (m) of each series; nothing where there is none."""
     said = [

@@ -49,7 +49,7 @@ SYMBOLS = {
 
 
 @dataclass(frozen=True)
-class Line:
+class Paragraph:
     """A paragraph, or a line of code: its words, how they look, and the mark of a list before."""
 
     text: str
@@ -62,7 +62,7 @@ class Line:
 
 
 @dataclass(frozen=True)
-class Table:
+class NotesTable:
     """Rows of cells, the first one the head."""
 
     rows: tuple[tuple[str, ...], ...]
@@ -84,7 +84,7 @@ def draw(document: Document | LoopDocument) -> Iterator[Page]:
                    shares=[3.0, 4.0], size=TABLE_SIZE)  # fmt: skip
         page.skip(8.0)
     for block in blocks:
-        if isinstance(block, Line):
+        if isinstance(block, Paragraph):
             page.note(
                 block.text, block.size, block.weight == "bold", block.colour,
                 indent=INDENT * min(block.indents, MOST_INDENTS), mark=block.mark,
@@ -97,7 +97,7 @@ def draw(document: Document | LoopDocument) -> Iterator[Page]:
     yield page
 
 
-def read(notes: str) -> Iterator[Line | Table]:
+def read(notes: str) -> Iterator[Paragraph | NotesTable]:
     r"""Markdown as lines and tables, in their order.
 
     >>> [line.text for line in read("# A *b*\n\n- $\\sigma_z^2$ is `R`\n\n![a map](m.png)")]
@@ -112,12 +112,12 @@ def read(notes: str) -> Iterator[Line | Table]:
     yield from _blocks(SyntaxTreeNode(markdown.parse(notes)), 0)
 
 
-def _blocks(node: SyntaxTreeNode, indents: int) -> Iterator[Line | Table]:
+def _blocks(node: SyntaxTreeNode, indents: int) -> Iterator[Paragraph | NotesTable]:
     for child in node.children:
         match child.type:
             case "heading":
                 size = HEADING_SIZES.get(child.tag, BODY_SIZE)
-                yield Line(_inline(child), size, "bold", indents=indents, above=8.0)
+                yield Paragraph(_inline(child), size, "bold", indents=indents, above=8.0)
             case "bullet_list" | "ordered_list":
                 yield from _items(child, indents)
             case "blockquote":
@@ -125,32 +125,34 @@ def _blocks(node: SyntaxTreeNode, indents: int) -> Iterator[Line | Table]:
             case "fence" | "code_block":
                 for number, text in enumerate(child.content.rstrip("\n").split("\n")):
                     code = text.expandtabs(4).replace(" ", "\N{NO-BREAK SPACE}")
-                    yield Line(code or " ", 7.5, colour=MUTED, indents=indents + 1,
+                    yield Paragraph(code or " ", 7.5, colour=MUTED, indents=indents + 1,
                                above=0.0 if number else 4.0)  # fmt: skip
             case "table":
                 rows = [row for part in child.children for row in part.children]
-                yield Table(tuple(tuple(_inline(c) for c in row.children) for row in rows), indents)
+                yield NotesTable(
+                    tuple(tuple(_inline(c) for c in row.children) for row in rows), indents
+                )
             case "html_block":
                 for text in _said(child.content).split("\n"):
                     if text.strip():
-                        yield Line(text.strip(), indents=indents)
+                        yield Paragraph(text.strip(), indents=indents)
             case "hr":
-                yield Line("")
+                yield Paragraph("")
             case _:
-                yield Line(_inline(child), indents=indents)
+                yield Paragraph(_inline(child), indents=indents)
 
 
-def _items(node: SyntaxTreeNode, indents: int) -> Iterator[Line | Table]:
+def _items(node: SyntaxTreeNode, indents: int) -> Iterator[Paragraph | NotesTable]:
     """Items of a list, the first line of each with its mark."""
     first = int(node.attrs.get("start", 1))
     for number, item in enumerate(node.children, start=first):
         mark = "•" if node.type == "bullet_list" else f"{number}."
         blocks = list(_blocks(item, indents + 1))
-        if not blocks or not isinstance(blocks[0], Line) or blocks[0].mark:
-            blocks.insert(0, Line("", indents=indents + 1))
+        if not blocks or not isinstance(blocks[0], Paragraph) or blocks[0].mark:
+            blocks.insert(0, Paragraph("", indents=indents + 1))
         head = blocks[0]
-        assert isinstance(head, Line)
-        yield Line(head.text, head.size, head.weight, head.colour, head.indents, mark, 2.0)
+        assert isinstance(head, Paragraph)
+        yield Paragraph(head.text, head.size, head.weight, head.colour, head.indents, mark, 2.0)
         yield from blocks[1:]
 
 

@@ -26,7 +26,7 @@ Pair = tuple[Array, Array]
 
 
 @dataclass(frozen=True)
-class View:
+class MapView:
     """How the map lies on the page: the heading (rad) of its x axis, and the names of both."""
 
     heading: float
@@ -63,7 +63,7 @@ def plan(document: Document, facts: Sequence[tuple[str, str]]) -> Page:
     return page
 
 
-def _height(view: View, tracks: Mapping[str, Pair]) -> float:
+def _height(view: MapView, tracks: Mapping[str, Pair]) -> float:
     """Of a map of the page's width, in points."""
     x, y = view(*tracks["measurement"])
     scale = WIDTH / (1.1 * float(np.ptp(x)) + 1e-6)
@@ -98,7 +98,7 @@ def _tracks(comparison: Comparison) -> dict[str, Pair]:
     return tracks
 
 
-def _view(comparison: Comparison, points: Array) -> tuple[View, float]:
+def _view(comparison: Comparison, points: Array) -> tuple[MapView, float]:
     """Along the track where it is long and narrow, else with north up; how long against wide."""
     aisle = next((line for line in comparison.lines if line.name == AISLE), None)
     centred = points - points.mean(axis=0)
@@ -110,15 +110,15 @@ def _view(comparison: Comparison, points: Array) -> tuple[View, float]:
     if np.sin(heading) < 0.0:  # north is up rather than down
         heading += np.pi
     degrees = np.rad2deg(heading) % 360.0
-    along = View(heading, (f"along {degrees:.0f}° from north (m)", "to its left (m)"))
+    along = MapView(heading, (f"along {degrees:.0f}° from north (m)", "to its left (m)"))
     x, y = along(points[:, 0], points[:, 1])
     ratio = float(np.ptp(x)) / max(float(np.ptp(y)), 1e-6)
     if ratio >= LONG:
         return along, ratio
-    return View(np.pi / 2.0, ("east (m)", "north (m)")), ratio
+    return MapView(np.pi / 2.0, ("east (m)", "north (m)")), ratio
 
 
-def _map(axes: Axes, document: Document, view: View, tracks: Mapping[str, Pair]) -> None:
+def _map(axes: Axes, document: Document, view: MapView, tracks: Mapping[str, Pair]) -> None:
     axes.plot(*view(*tracks["measurement"]), **{**MEASURED, "ms": 3.0}, label="measurement")
     for name, style in (("EKF2", EKF2_LINE), ("ours", OURS_LINE), ("truth", TRUTH_LINE)):
         if name in tracks:
@@ -149,7 +149,7 @@ def _thinned(track: Pair, most: int = 2000) -> Pair:
     return track[0][::every], track[1][::every]
 
 
-def _north(axes: Axes, view: View) -> None:
+def _north(axes: Axes, view: MapView) -> None:
     """An arrow to the north in the corner."""
     x, y = view(np.array([1.0]), np.array([0.0]))
     axes.annotate(

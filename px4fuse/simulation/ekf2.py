@@ -35,7 +35,7 @@ from px4fuse.ekf2.vision import Vision
 from px4fuse.ekf2_parameters import PARAMETERS as MODEL_PARAMETERS
 from px4fuse.ekf2_parameters import settings_in_force
 from px4fuse.simulation import sensors
-from px4fuse.simulation.ekf2_topics import Track, ekf2_topics
+from px4fuse.simulation.ekf2_topics import TopicTrack, ekf2_topics
 from px4fuse.simulation.mistakes import Mistakes
 from px4fuse.simulation.motion import Motion, Sines, attitude
 from px4fuse.simulation.scenario import Scenario
@@ -220,7 +220,7 @@ def _vision(source: Topic) -> Vision:
     )
 
 
-def _track(inputs: Inputs, done: StretchRun, time_us: IntArray, nominal: Array) -> Track:
+def _track(inputs: Inputs, done: StretchRun, time_us: IntArray, nominal: Array) -> TopicTrack:
     stretch, settings = done.stretch, inputs.settings
     lag = round(inputs.horizon_s / inputs.step_s)
     state, _ = delayed_states(done, 0)
@@ -246,7 +246,7 @@ def _track(inputs: Inputs, done: StretchRun, time_us: IntArray, nominal: Array) 
         tau_velocity_s=settings["EKF2_TAU_VEL"],
         tau_position_s=settings["EKF2_TAU_POS"],
     )
-    return Track(
+    return TopicTrack(
         time_us=time_us,
         lag=lag,
         delayed_attitude=multiply(from_vector(state[:, THETA]), nominal),

@@ -24,7 +24,7 @@ PUBLISHED_LATER_US = 100
 
 
 @dataclass(frozen=True)
-class Track:
+class TopicTrack:
     """What the model did, at the end of each prediction step, shape (n + 1, ...).
 
     Attributes
@@ -55,7 +55,7 @@ class Track:
 
 
 def ekf2_topics(
-    inputs: Inputs, done: StretchRun, track: Track, aid_source_hz: float
+    inputs: Inputs, done: StretchRun, track: TopicTrack, aid_source_hz: float
 ) -> tuple[Topic, ...]:
     """The topics that EKF2 had anything to say in.
 
@@ -75,7 +75,7 @@ def ekf2_topics(
     return tuple(topic for topic in topics if len(topic.fields["timestamp"]))
 
 
-def _local_position(track: Track) -> Topic:
+def _local_position(track: TopicTrack) -> Topic:
     rows = np.flatnonzero(sensors.thinned(sensors.seconds(track.time_us), LOCAL_POSITION_HZ))
     steps = np.array([step for step, _ in track.resets], dtype=np.intp)
     jumps = np.array([[0.0, 0.0], *(jump for _, jump in track.resets)])
@@ -103,7 +103,7 @@ def _local_position(track: Track) -> Topic:
     return Topic("vehicle_local_position", fields)
 
 
-def _states(done: StretchRun, track: Track) -> Topic:
+def _states(done: StretchRun, track: TopicTrack) -> Topic:
     """estimator_states of v1.16: 25 states with 24 covariances, positions as 0."""
     end = done.events[0].end
     events = np.flatnonzero(np.diff(end, prepend=0) > 0)
@@ -127,7 +127,7 @@ def _states(done: StretchRun, track: Track) -> Topic:
     )
 
 
-def _aid_source(inputs: Inputs, done: StretchRun, track: Track, rate_hz: float) -> Topic:
+def _aid_source(inputs: Inputs, done: StretchRun, track: TopicTrack, rate_hz: float) -> Topic:
     """estimator_aid_src_ev_pos: a message for every sample that came in time."""
     events, run = done.events[0], done.run
     seen = np.flatnonzero(events.usable & (events.end < len(track.time_us) - track.lag))
@@ -164,7 +164,7 @@ def _aid_source(inputs: Inputs, done: StretchRun, track: Track, rate_hz: float) 
     )
 
 
-def _flags(inputs: Inputs, done: StretchRun, track: Track) -> Topic:
+def _flags(inputs: Inputs, done: StretchRun, track: TopicTrack) -> Topic:
     """estimator_status_flags: once a second, and when fusion of vision starts or stops."""
     events, run, time = done.events[0], done.run, done.stretch.time_s
     tried = np.flatnonzero(run.fused[:, 0] | run.rejected[:, 0] | run.reset[:, 0])
@@ -196,7 +196,7 @@ def _flags(inputs: Inputs, done: StretchRun, track: Track) -> Topic:
     )
 
 
-def _horizon_us(track: Track, rows: IntArray) -> NDArray[np.int64]:
+def _horizon_us(track: TopicTrack, rows: IntArray) -> NDArray[np.int64]:
     """How much later what the filter did in a step is published."""
     later: NDArray[np.int64] = track.time_us[rows + track.lag] - track.time_us[rows]
     return later

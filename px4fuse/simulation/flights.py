@@ -52,7 +52,7 @@ class Simulation:
     scenario: Scenario
     mistakes: Mistakes
     motion: Motion
-    positions: sensors.Positions
+    positions: sensors.SensedPositions
     topics: tuple[Topic, ...]
     parameters: Mapping[str, int | float]
 

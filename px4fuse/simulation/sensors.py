@@ -47,7 +47,7 @@ def stream(scenario: Scenario, name: Stream) -> np.random.Generator:
 
 
 @dataclass(frozen=True)
-class Positions:
+class SensedPositions:
     """The position source.
 
     Attributes
@@ -214,7 +214,7 @@ def ground_truth(scenario: Scenario, motion: Motion) -> Topic:
     return Topic("vehicle_local_position_groundtruth", fields)
 
 
-def positions(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> Positions:
+def positions(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> SensedPositions:
     """vehicle_visual_odometry: UWB in the aisle, VIO around the loop."""
     timing = stream(scenario, Stream.TIMING)
     interval_s = 1.0 / scenario.source_rate_hz
@@ -251,7 +251,7 @@ def positions(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> Positio
     rotation = None
     if scenario.kind == "loop":
         rotation = attitude(state).body_to_ned[keep]
-    return Positions(
+    return SensedPositions(
         topic=_odometry(
             arrival_us[keep], stamp_us[keep], position[keep], reported_sigma_m(scenario, mistakes),
             rotation,

@@ -49,7 +49,7 @@ class Refused:
 
 
 @dataclass(frozen=True)
-class Difference:
+class Mismatch:
     """One number or text that a new run of the analysis does not confirm.
 
     Attributes
@@ -113,7 +113,7 @@ class Verdict:
     status: Status
     reasons: tuple[str, ...]
     with_log: bool
-    differences: tuple[Difference, ...] = ()
+    differences: tuple[Mismatch, ...] = ()
     page_status: PageStatus = "not compared"
     pages: tuple[PageDifference, ...] = ()
     redrawn: bytes = field(default=b"", repr=False)

@@ -24,7 +24,7 @@ from px4fuse.results.contract import LoopResults, Reported, to_plain
 from px4fuse.results.model import Provenance
 from px4fuse.results.reading import cleaned, one_line
 from px4fuse.verification import rerun
-from px4fuse.verification.model import Difference, PageStatus, Refused, Report, Status, Verdict
+from px4fuse.verification.model import Mismatch, PageStatus, Refused, Report, Status, Verdict
 from px4fuse.verification.pages import NumbersAlike, compare_pages
 from px4fuse.verification.rerun import Recomputed
 
@@ -66,7 +66,7 @@ class Numbers:
 
     Attributes
     ----------
-    differences : tuple of Difference
+    differences : tuple of Mismatch
         The first of those beyond the tolerances.
     differing : int
         How many there are.
@@ -76,7 +76,7 @@ class Numbers:
         How many values.
     """
 
-    differences: tuple[Difference, ...]
+    differences: tuple[Mismatch, ...]
     differing: int
     pairs: tuple[tuple[float, float], ...]
     compared: int
@@ -226,7 +226,7 @@ def compare_results(recorded: Mapping[str, Any], recomputed: Mapping[str, Any]) 
         if not (is_number(theirs) and is_number(ours)) and not _same(theirs, ours, rounded):
             wrong[path] = theirs, ours
     found = tuple(
-        Difference(one_line(path, SHOWN_TEXT), _shown(theirs), _shown(ours))
+        Mismatch(one_line(path, SHOWN_TEXT), _shown(theirs), _shown(ours))
         for path, (theirs, ours) in list(wrong.items())[:SHOWN]
     )
     return Numbers(found, len(wrong), tuple(pairs), len(leaves))

@@ -30,7 +30,7 @@ from px4fuse.filter.settings import Settings
 from px4fuse.findings import DETECTORS, find, find_loop
 from px4fuse.flight import Flight, Unavailable
 from px4fuse.loop.analysis import analyse, loop_in
-from px4fuse.loop.sources import Source
+from px4fuse.loop.sources import LoopSource
 from px4fuse.loop.tracks import trajectory_of
 from px4fuse.simulation.flights import simulate_flight
 from px4fuse.simulation.mistakes import parse
@@ -196,7 +196,7 @@ def _fly(job: Job) -> list[tuple[str, ...]]:
     if scenario.kind == "loop":
         # the loop without the truth, which would tell where it landed
         flight = simulate_flight(replace(scenario, truth=False), mistakes)
-        loop = analyse(Source(trajectory_of(flight, "vio"), flight))
+        loop = analyse(LoopSource(trajectory_of(flight, "vio"), flight))
         of_loop = tuple(i for f in find_loop(loop) for i in f.ids)
         if first.finding:
             return [_named(first, of_loop)]

@@ -19,7 +19,7 @@ import numpy as np
 
 from px4fuse.answers import CURES, EKF2_DID, MISTAKES, PANELS, VERDICTS, Answers, Claim
 from px4fuse.assignment.assignment import fly
-from px4fuse.assignment.roster import Student
+from px4fuse.assignment.roster import RosterStudent
 from px4fuse.assignment.truth import FormTruth, Wrong
 from px4fuse.grading.form_points import SEEN, cures, form_points
 
@@ -30,7 +30,7 @@ GUESSES = 20
 
 def truth(number: int) -> FormTruth:
     """The right answers to the flight of one student of a mixed class."""
-    student = Student(f"s{number}", "", f"s{number}.ulg")
+    student = RosterStudent(f"s{number}", "", f"s{number}.ulg")
     _, answer = fly(SECRET, student, "mixed")
     assert answer.form is not None
     return answer.form

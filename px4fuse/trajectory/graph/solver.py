@@ -81,7 +81,7 @@ class _State:
 
 
 @dataclass(frozen=True)
-class _Run:
+class _Descent:
     state: _State
     cost: float
     iterations: int
@@ -136,7 +136,7 @@ def solve(
     doubtful = ~graph.successive if loops is None else loops
     if doubtful.shape != graph.first.shape:
         raise ValueError(f"loops has shape {doubtful.shape}, not {graph.first.shape}")
-    problem = _Problem(graph)
+    problem = _GraphProblem(graph)
     start = problem.state(graph.poses)
     initial_cost = 0.5 * float(np.sum(start.chi2))
     if not np.isfinite(initial_cost):
@@ -152,7 +152,7 @@ def solve(
         if robust == "dcs":
             kernel = _dcs(doubtful)
             last = problem.minimise(run.state, kernel, max_iterations)
-            run = _Run(last.state, last.cost, run.iterations + last.iterations, last.converged)
+            run = _Descent(last.state, last.cost, run.iterations + last.iterations, last.converged)
             weights = kernel(run.state.chi2)[0]
     return Solution(
         poses=run.state.poses,
@@ -164,7 +164,7 @@ def solve(
     )
 
 
-class _Problem:
+class _GraphProblem:
     """A graph with the pattern of its normal equations."""
 
     def __init__(self, graph: PoseGraph) -> None:
@@ -180,7 +180,7 @@ class _Problem:
 
     def minimise(
         self, start: _State, kernel: Kernel, max_iterations: int, tolerance: float = _TOLERANCE
-    ) -> _Run:
+    ) -> _Descent:
         """Walk down from some poses, as GTSAM's LevenbergMarquardtOptimizer does."""
         state, damping, iterations = start, _FIRST_DAMPING, 0
         weights, costs = kernel(state.chi2)
@@ -201,13 +201,13 @@ class _Problem:
                     break
                 damping *= _DAMPING_FACTOR
             if tried is None or not accepted:
-                return _Run(state, cost, iterations, flat)
+                return _Descent(state, cost, iterations, flat)
             state, weights, before, cost = tried, tried_weights, cost, cost - drop
             iterations += 1
             damping /= _DAMPING_FACTOR
             if drop <= max(tolerance * before, _TOLERANCE):
-                return _Run(state, cost, iterations, True)
-        return _Run(state, cost, iterations, cost <= _TOLERANCE)
+                return _Descent(state, cost, iterations, True)
+        return _Descent(state, cost, iterations, cost <= _TOLERANCE)
 
     def _step(
         self, state: _State, matrix: sparse.csc_array[np.float64], gradient: Array, damping: float
@@ -252,8 +252,8 @@ def _dcs(doubtful: BoolArray) -> Kernel:
 
 
 def _gnc(
-    problem: _Problem, start: _State, plain: _Run, doubtful: BoolArray, max_iterations: int
-) -> tuple[_Run, Array]:
+    problem: _GraphProblem, start: _State, plain: _Descent, doubtful: BoolArray, max_iterations: int
+) -> tuple[_Descent, Array]:
     """Truncated least squares over the doubtful edges, from two starts."""
     freedom = ranks(problem.graph.information)
     bound = np.full(len(doubtful), np.inf)
@@ -280,12 +280,12 @@ def _gnc(
         if (cost := priced(trial.state, again)) < lowest:
             lowest, run, weights = cost, trial, again
     require_connected(problem.graph, weights > 0.0, "the edges that gnc did not set aside")
-    return _Run(run.state, run.cost, spent, run.converged), weights
+    return _Descent(run.state, run.cost, spent, run.converged), weights
 
 
 def _graduated(
-    problem: _Problem, start: _State, bound: Array, max_iterations: int
-) -> tuple[_Run, Array]:
+    problem: _GraphProblem, start: _State, bound: Array, max_iterations: int
+) -> tuple[_Descent, Array]:
     """One descent of graduated non-convexity (Yang 2020, algorithm 1, eq. 13 and 14)."""
     state, spent = start, 0
     # Infinite bounds are edges that are not doubted
@@ -311,4 +311,4 @@ def _graduated(
         if np.array_equal(again, weights):
             break
         weights = again
-    return _Run(state, run.cost, spent, run.converged), weights
+    return _Descent(state, run.cost, spent, run.converged), weights
