@@ -12,6 +12,9 @@ from px4fuse.results.contract import LoopResults, Results, to_plain
 from px4fuse.results.model import Student
 from px4fuse.results.parts import provenance, schema_of
 from px4fuse.results.reading import read_results
+from px4fuse.trajectory.evaluation import AbsoluteError
+from px4fuse.trajectory.offset import TimeOffset
+from px4fuse.trajectory.scores import Interval, RelativeError, Statistics
 
 SHIPPED = Path(__file__).parent.parent / "reports" / "aisle_uwb.json"
 EXAMPLE: dict[str, Any] = json.loads(SHIPPED.read_text(encoding="utf-8"))
@@ -21,15 +24,15 @@ NONE = Unavailable("it", "nobody asked", "Ask.")
 
 def correction(rmse: float, moved_m: float) -> made.Correction:
     """A correction with one score."""
-    statistics = made.Statistics(9, rmse, rmse, rmse, 0.0, rmse, rmse)
+    statistics = Statistics(9, rmse, rmse, rmse, 0.0, rmse, rmse)
     score = made.Score(
         alignment="se3",
         alignment_reason="asked",
         transform=made.Transform((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 1.0, 6),
         association=made.Association("interpolate", 9, 0.1, 0, 0, 1.0, 1.0),
-        time_offset=made.TimeOffset(offset_s=0.0, determinable=True, reason=""),
-        ate=made.AbsoluteError(statistics, made.RmseInterval(rmse, rmse, 1, 9.0), NONE),
-        rpe=(made.RelativeError(5.0, "m", True, "reference", statistics, NONE, NONE),),
+        time_offset=TimeOffset(offset_s=0.0, determinable=True, reason=""),
+        ate=AbsoluteError(statistics, Interval(rmse, rmse, 1, 9.0), NONE),
+        rpe=(RelativeError(5.0, "m", True, "reference", statistics, NONE, NONE),),
         notes=(),
         warnings=(),
     )

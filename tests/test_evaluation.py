@@ -141,10 +141,10 @@ def test_ate_is_that_of_evo(pair: tuple[str, str], kind: AlignmentKind) -> None:
     got = evaluate(*map(published, pair), alignment=kind, association="nearest", rpe_deltas=())
     np.testing.assert_array_equal(got.reference_m, true.positions_xyz)
     np.testing.assert_allclose(got.estimate_m, made.positions_xyz, rtol=0, atol=1e-9)
-    assert isinstance(got.ate.rotation, Statistics)
+    assert isinstance(got.ate.rotation_deg, Statistics)
     for relation, errors, ours in (
-        (PoseRelation.translation_part, got.position_error_m, got.ate.translation),
-        (PoseRelation.rotation_angle_deg, got.rotation_error_deg, got.ate.rotation),
+        (PoseRelation.translation_part, got.position_error_m, got.ate.translation_m),
+        (PoseRelation.rotation_angle_deg, got.rotation_error_deg, got.ate.rotation_deg),
     ):
         metric = APE(relation)
         metric.process_data((true, made))
@@ -183,13 +183,13 @@ def test_rpe_is_that_of_evo(pair: tuple[str, str], kind: AlignmentKind) -> None:
             pairs_from=pairs_from,  # type: ignore[arg-type]
         )
         for ours in got.rpe:
-            if kind != "se3" and ours.delta.unit == "frames":
+            if kind != "se3" and ours.unit == "frames":
                 continue  # scale and turn do not change these pairs; evo takes its time
-            unit = Unit.frames if ours.delta.unit == "frames" else Unit.meters
+            unit = Unit.frames if ours.unit == "frames" else Unit.meters
             is_reference = pairs_from == "reference"
             metric = RPE(
                 PoseRelation.translation_part,
-                ours.delta.value,
+                ours.delta,
                 unit,
                 all_pairs=all_pairs,
                 pairs_from_reference=is_reference,
@@ -197,7 +197,7 @@ def test_rpe_is_that_of_evo(pair: tuple[str, str], kind: AlignmentKind) -> None:
             try:
                 metric.process_data((true, made))
             except FilterException:
-                assert isinstance(ours.translation, Unavailable)
+                assert isinstance(ours.translation_m, Unavailable)
                 continue
             np.testing.assert_array_equal(ours.end, metric.delta_ids)
             np.testing.assert_allclose(ours.translation_error_m, metric.error, rtol=0, atol=1e-9)
@@ -357,7 +357,7 @@ def test_no_overlap_names_both_spans_and_the_remedy() -> None:
             associate(estimate, reference, method=method)  # type: ignore[arg-type]
     with pytest.raises(TrajectoryError, match=r"0.000 to 59.950 s.*`time_offset_s` auto"):
         evaluate(estimate, reference, time_offset_s=0.0)
-    assert evaluate(estimate, reference, time_offset_s=-500.0).ate.translation.rmse < 1e-9
+    assert evaluate(estimate, reference, time_offset_s=-500.0).ate.translation_m.rmse < 1e-9
 
 
 # -- scores ----------------------------------------------------------------------------------------
@@ -369,15 +369,15 @@ def test_a_transformed_copy_has_no_error(kind: AlignmentKind) -> None:
     turn = Rotation.from_euler("z", 2.0) if kind == "yaw" else TURN
     copied = moved(reference, turn, SHIFT, 0.3 if kind == "sim3" else 1.0, kind="vio")
     got = evaluate(copied, reference, alignment=kind)
-    assert got.ate.translation.max < 1e-9
-    assert isinstance(got.ate.rotation, Statistics)
-    assert got.ate.rotation.max < 1e-9
-    assert [str(one.delta) for one in got.rpe] == ["1 m", "5 m", "10 m", "1 s", "10 s"]
+    assert got.ate.translation_m.max < 1e-9
+    assert isinstance(got.ate.rotation_deg, Statistics)
+    assert got.ate.rotation_deg.max < 1e-9
+    assert [one.delta_words for one in got.rpe] == ["1 m", "5 m", "10 m", "1 s", "10 s"]
     for one in got.rpe:
-        assert isinstance(one.translation, Statistics)
-        assert isinstance(one.rotation, Statistics)
-        assert one.translation.max < 1e-9
-        assert one.rotation.max < 1e-9
+        assert isinstance(one.translation_m, Statistics)
+        assert isinstance(one.rotation_deg, Statistics)
+        assert one.translation_m.max < 1e-9
+        assert one.rotation_deg.max < 1e-9
     assert not got.warnings
 
 
@@ -386,10 +386,10 @@ def test_a_tilt_shows_after_yaw_and_hides_after_se3() -> None:
     tilted = moved(reference, Rotation.from_euler("x", 5.0, degrees=True), SHIFT, kind="vio")
     got = evaluate(tilted, reference)
     assert got.alignment == "yaw"
-    assert isinstance(got.ate.rotation, Statistics)
-    assert got.ate.rotation.rmse == pytest.approx(5.0, abs=0.1)
-    assert got.ate.translation.rmse > 0.1
-    assert evaluate(tilted, reference, alignment="se3").ate.translation.rmse < 1e-9
+    assert isinstance(got.ate.rotation_deg, Statistics)
+    assert got.ate.rotation_deg.rmse == pytest.approx(5.0, abs=0.1)
+    assert got.ate.translation_m.rmse > 0.1
+    assert evaluate(tilted, reference, alignment="se3").ate.translation_m.rmse < 1e-9
 
 
 def test_a_drift_in_scale_is_the_rpe_over_distance() -> None:
@@ -450,14 +450,14 @@ def test_deltas_that_mean_nothing_are_refused(delta: Delta) -> None:
 def test_what_cannot_be_had_is_absent_with_the_reason() -> None:
     reference = flight()
     got = evaluate(replace(reference, rotation=None, kind="vio"), reference)
-    assert isinstance(got.ate.rotation, Unavailable)
+    assert isinstance(got.ate.rotation_deg, Unavailable)
     assert got.rotation_error_deg is None
     for one in got.rpe:
-        assert isinstance(one.translation, Unavailable)
-        assert "the estimate has no orientation" in str(one.translation)
+        assert isinstance(one.translation_m, Unavailable)
+        assert "the estimate has no orientation" in str(one.translation_m)
     far = evaluate(reference, reference, rpe_deltas=[Delta(1e4, "m")]).rpe[0]
-    assert isinstance(far.translation, Unavailable)
-    assert "no two poses are 10000 m apart" in str(far.translation)
+    assert isinstance(far.translation_m, Unavailable)
+    assert "no two poses are 10000 m apart" in str(far.translation_m)
 
 
 # -- which alignment, and doubts -------------------------------------------------------------------
@@ -522,13 +522,13 @@ def test_a_camera_is_compared_around_its_constant_rotation_in_the_vehicle() -> N
     noise = Rotation.from_rotvec(np.random.default_rng(1).normal(0.0, 0.01, (len(camera), 3)))
     camera = replace(camera, rotation=camera.rotation * mounted * noise)
     got = evaluate(camera, reference)
-    assert isinstance(got.ate.rotation, Statistics)
-    assert got.ate.rotation.rmse == pytest.approx(np.degrees(0.01 * np.sqrt(3)), rel=0.05)
+    assert isinstance(got.ate.rotation_deg, Statistics)
+    assert got.ate.rotation_deg.rmse == pytest.approx(np.degrees(0.01 * np.sqrt(3)), rel=0.05)
     assert got.body_rotation is not None
     assert (got.body_rotation * mounted).magnitude() < 0.01
     assert "constant rotation of 120" in got.notes[0]
-    assert isinstance(got.rpe[0].translation, Statistics)
-    assert got.rpe[0].translation.rmse < 0.03
+    assert isinstance(got.rpe[0].translation_m, Statistics)
+    assert got.rpe[0].translation_m.rmse < 0.03
     for same in (replace(camera, frame="unknown", kind="unknown"), replace(camera, frame="NED")):
         assert evaluate(same, reference, alignment="se3").body_rotation is None
 
@@ -695,7 +695,7 @@ def test_the_sample_slam_against_itself_drifting() -> None:
     got = evaluate(replace(slam, position_m=drift, name="drifting.tum"), slam)
     assert got.alignment == "se3"
     assert got.body_rotation is None
-    assert 0.005 < got.ate.translation.rmse < 0.1
+    assert 0.005 < got.ate.translation_m.rmse < 0.1
     assert len(got.time_s) == len(got.distance_m) == len(got.position_error_m) == len(slam)
     assert got.association.coverage_reference == pytest.approx(1 - 3.1 / 86.0, abs=0.002)
 
@@ -710,14 +710,14 @@ def test_the_sample_slam_against_the_log_that_it_was_made_from() -> None:
     slam = read_trajectory(SAMPLE)
     odometry = evaluate(vio, truth)
     assert odometry.alignment == "yaw"
-    assert 0.3 < odometry.ate.translation.rmse < 0.6
+    assert 0.3 < odometry.ate.translation_m.rmse < 0.6
     # the log has no UNIX time: the offset is found from the motion
     got = evaluate(slam, truth)
     assert got.alignment == "se3"
     assert got.time_offset.determinable
-    assert got.ate.translation.rmse < 0.08
-    assert isinstance(got.ate.rotation, Statistics)
-    assert got.ate.rotation.rmse < 0.6
+    assert got.ate.translation_m.rmse < 0.08
+    assert isinstance(got.ate.rotation_deg, Statistics)
+    assert got.ate.rotation_deg.rmse < 0.6
     assert got.body_rotation is not None
     assert np.degrees(got.body_rotation.magnitude()) == pytest.approx(120.0, abs=1.0)
     other = evaluate(vio, slam)

@@ -184,14 +184,14 @@ def test_one_delta_tells_nothing_about_growth() -> None:
 def test_the_table_holds_the_statistics() -> None:
     score = sample()
     rows = {label: cells for label, *cells in score_rows(score)}
-    ate = score.ate.translation
+    ate = score.ate.translation_m
     numbers = (ate.rmse, ate.mean, ate.median, ate.std, ate.max)
     assert [rows["ATE (m)"][k] for k in (0, 2, 3, 4, 5)] == [f"{x:.4f}" for x in numbers]
     assert len(rows) == 1 + len(score.rpe)
     for error in score.rpe:
-        assert isinstance(error.translation, Statistics)
-        assert rows[f"RPE {error.delta} (m)"][0] == f"{error.translation.rmse:.4f}"
-        assert rows[f"RPE {error.delta} (m)"][6] == str(error.translation.count)
+        assert isinstance(error.translation_m, Statistics)
+        assert rows[f"RPE {error.delta_words} (m)"][0] == f"{error.translation_m.rmse:.4f}"
+        assert rows[f"RPE {error.delta_words} (m)"][6] == str(error.translation_m.count)
 
 
 def test_no_error_is_said_to_be_none() -> None:
@@ -235,7 +235,7 @@ def test_both_panels_have_the_ape_and_lines_of_its_statistics() -> None:
         assert np.nanmax(y) == pytest.approx(score.position_error_m.max())
         assert x[np.nanargmax(y)] == pytest.approx(along[np.argmax(score.position_error_m)])
         assert np.isnan(y).sum() == 1  # the gap
-        ate = score.ate.translation
+        ate = score.ate.translation_m
         levels = {str(line.get_label()).split()[0]: line.get_ydata()[0] for line in lines}
         assert levels == {
             "max": ate.max, "RMSE": ate.rmse, "mean": ate.mean, "median": ate.median,
@@ -248,8 +248,8 @@ def test_the_rpe_stands_at_the_end_of_each_motion_as_evo_draws_it() -> None:
     shown = {str(line.get_label()): line for line in axes.get_lines()}
     assert list(shown) == ["1 m", "5 m", "10 m"]
     for error in score.rpe:
-        if str(error.delta) in shown:
-            curve = shown[str(error.delta)]
+        if error.delta_words in shown:
+            curve = shown[error.delta_words]
             x, y = np.asarray(curve.get_xdata()), np.asarray(curve.get_ydata())
             worst = int(np.argmax(error.translation_error_m))
             assert np.nanmax(y) == pytest.approx(error.translation_error_m[worst])
@@ -259,9 +259,13 @@ def test_the_rpe_stands_at_the_end_of_each_motion_as_evo_draws_it() -> None:
 def test_each_delta_has_a_box_and_its_rmse() -> None:
     score = sample()
     axes = panel(score, "RPE per delta")
-    assert [text.get_text() for text in axes.get_xticklabels()] == [str(e.delta) for e in score.rpe]
+    assert [text.get_text() for text in axes.get_xticklabels()] == [
+        e.delta_words for e in score.rpe
+    ]
     drawn = [line.get_ydata()[0] for line in axes.get_lines() if line.get_marker() == "D"]
-    assert drawn == [e.translation.rmse for e in score.rpe if isinstance(e.translation, Statistics)]
+    assert drawn == [
+        e.translation_m.rmse for e in score.rpe if isinstance(e.translation_m, Statistics)
+    ]
 
 
 def test_many_deltas_fill_the_table_and_some_boxes() -> None:
@@ -350,4 +354,4 @@ def test_published_trajectories_are_drawn_on_one_page(pair: tuple[str, str]) -> 
     score = evaluate(estimate, reference)
     assert len(PdfReader(io.BytesIO(render(EvaluationDocument(score), "{}"))).pages) == 1
     text = said(score)
-    assert f"{score.ate.translation.rmse:.4f}" in text
+    assert f"{score.ate.translation_m.rmse:.4f}" in text

@@ -76,7 +76,7 @@ def results(sample_log, analysis) -> dict[str, Shown]:
         "Loop": loop,
         "Trajectory": loop.odometry.trajectory,
         "Evaluation": evaluation,
-        "RelativeError": evaluation.rpe[0],
+        "PairwiseError": evaluation.rpe[0],
         "WhatIf": px4fuse.what_if(analysis.ekf2_model, {"EKF2_EVP_NOISE": 0.3}),
         "Changes": changes(
             Side("aisle_uwb.json", "results", read_results(SHIPPED.read_bytes())),
@@ -92,7 +92,7 @@ def results_of(analysis: px4fuse.Analysis) -> ComparisonResults:
 
 NAMES = [
     "Flight", "Comparison", "Analysis", "AxisComparison", "Consistency", "Why", "AxisTuning",
-    "ClockOffset", "Loop", "Trajectory", "Evaluation", "RelativeError", "WhatIf", "Changes",
+    "ClockOffset", "Loop", "Trajectory", "Evaluation", "PairwiseError", "WhatIf", "Changes",
 ]  # fmt: skip
 
 
@@ -316,8 +316,8 @@ def test_tables_hold_the_results(results, analysis):
     assert positions.size()["EKF2"] == len(analysis.flight.ekf2.state)
     evaluation = results["Evaluation"]
     scores = evaluation.to_frame().set_index("score")["rmse_m"]
-    assert scores["ATE"] == evaluation.ate.translation.rmse
-    assert scores["RPE 5 m"] == evaluation.rpe[1].translation.rmse
+    assert scores["ATE"] == evaluation.ate.translation_m.rmse
+    assert scores["RPE 5 m"] == evaluation.rpe[1].translation_m.rmse
     changed = results["WhatIf"].to_frame().set_index("ekf2")["nis_mean"]
     assert changed["EKF2_EVP_NOISE=0.3"] < 0.3 * changed["logged"]
 

@@ -60,7 +60,7 @@ def score(correction: Correction | Unavailable, index: int = 0) -> Evaluation:
 
 
 def rmse(correction: Correction | Unavailable, index: int = 0) -> float:
-    return score(correction, index).ate.translation.rmse
+    return score(correction, index).ate.translation_m.rmse
 
 
 # ------------------------------------------------------------------ the sample flight
@@ -141,7 +141,7 @@ def test_the_plain_correction_moves_each_pose_by_its_share_and_turns_none(
 def test_headings_too_keep_the_shape_that_positions_alone_bend(sample_loop: Loop) -> None:
     """The sample's heading drifts: over 10 m only the one that turns is as good as the odometry."""
     over = [
-        next(e.translation for e in score(part).rpe if str(e.delta) == "10 m")
+        next(e.translation_m for e in score(part).rpe if e.delta_words == "10 m")
         for part in (sample_loop.odometry, sample_loop.by_distance, sample_loop.plain)
     ]
     before, turned, plain = (e.rmse for e in over if isinstance(e, Statistics))

@@ -360,4 +360,4 @@ def test_a_pipe_that_nobody_reads_is_not_waited_for(
     assert "nobody reads this pipe" in str(outcome.exception)
     words = ["grade", str(tmp_path / "pipe"), "-o", str(tmp_path / "out")]
     outcome = CliRunner().invoke(cli, words, standalone_mode=False)
-    assert "a device, pipe or socket" in str(outcome.exception)
+    assert "not a regular file (a device, pipe or socket)" in str(outcome.exception)

@@ -377,7 +377,7 @@ def test_a_file_with_a_colon_in_its_name_is_a_file(desk, tmp_path) -> None:
 REFUSED = {
     "missing": ("loop absent.ulg", "absent.ulg: cannot be read (No such file or directory)"),
     "missing part": ("loop absent.ulg:vio", "absent.ulg: cannot be read"),
-    "no name": ("loop ''", "is a folder"),
+    "no name": ("loop ''", "the name is empty"),
     "no name but a part": ("loop :vio", "is a folder"),
     "folder": ("loop folder", "folder: is a folder"),
     "folder with a part": ("loop folder:vio", "folder: is a folder"),

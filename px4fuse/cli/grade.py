@@ -180,7 +180,9 @@ def _check_places(output: Path, given: tuple[Path, ...]) -> None:
         if not path.exists():
             raise SettingsError(f"{path}: no such file or folder.")
         if not path.is_file() and not path.is_dir():
-            raise SettingsError(f"{path}: a device, pipe or socket. Give a file or folder.")
+            raise SettingsError(
+                f"{path}: not a regular file (a device, pipe or socket). Give a file or folder."
+            )
         if path.is_dir() and output.resolve().is_relative_to(path.resolve()):
             raise OutputError(
                 f"-o {output}: lies inside {path}, which is read; its own output would be graded. "

@@ -25,7 +25,7 @@ from px4fuse.report.style import EKF2_DOTS, EKF2_LINE, MEASUREMENT, OURS_BAND, O
 from px4fuse.report.style import OURS as OURS_COLOUR
 from px4fuse.trajectory.evaluation import Evaluation
 from px4fuse.trajectory.model import Trajectory
-from px4fuse.trajectory.scores import RelativeError
+from px4fuse.trajectory.scores import PairwiseError
 
 # Negative log-likelihood by which a pair of noises may lie above the best one, 95 %: χ²(2)/2
 REGION_DROP, SHOWN_DROP = 3.0, 12.0
@@ -174,7 +174,7 @@ def evaluation(result: Evaluation, ax: Any = None) -> Any:
     )  # fmt: skip
     left.figure.colorbar(dots, ax=left, label="error, m")
     _map(left, "right, m", "ahead, m")
-    rmse = result.ate.translation.rmse
+    rmse = result.ate.translation_m.rmse
     over_time.plot(result.time_s, result.position_error_m, **OURS_LINE)
     over_time.axhline(rmse, color=EKF2_COLOUR, label=f"ATE {rmse:.3g} m")
     over_time.set(xlabel="time, s", ylabel="error, m", ylim=(0.0, None))
@@ -182,11 +182,11 @@ def evaluation(result: Evaluation, ax: Any = None) -> Any:
     return ax
 
 
-def relative_error(result: RelativeError, ax: Axes | None = None) -> Axes:
+def relative_error(result: PairwiseError, ax: Axes | None = None) -> Axes:
     """Error of every pair, by the pose that it starts from."""
     ax = _one(ax)
     ax.plot(result.start, result.translation_error_m, **OURS_DOTS)
-    ax.set(xlabel="pose that the pair starts from", ylabel=f"error over {result.delta}, m")
+    ax.set(xlabel="pose that the pair starts from", ylabel=f"error over {result.delta_words}, m")
     return ax
 
 
@@ -216,6 +216,6 @@ PICTURES = {
     Loop: loop,
     Trajectory: trajectory,
     Evaluation: evaluation,
-    RelativeError: relative_error,
+    PairwiseError: relative_error,
     WhatIf: what_if,
 }

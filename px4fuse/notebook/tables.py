@@ -31,7 +31,7 @@ from px4fuse.loop.loop import Loop
 from px4fuse.report.words import settings_words, verdict_words
 from px4fuse.trajectory.evaluation import AbsoluteError, Evaluation
 from px4fuse.trajectory.model import AXES_OF_FRAME, Trajectory
-from px4fuse.trajectory.scores import RelativeError
+from px4fuse.trajectory.scores import PairwiseError, RelativeError
 
 EKF2 = "EKF2"
 OURS = "our filter"
@@ -343,7 +343,7 @@ def _(loop: Loop) -> str:
     for reference in loop.references:
         scores = ((path.name, path.scores.get(reference.name)) for path in loop.reported)
         found = ", ".join(
-            f"{name} {score.ate.translation.rmse:.3g} m"
+            f"{name} {score.ate.translation_m.rmse:.3g} m"
             for name, score in scores
             if isinstance(score, Evaluation)
         )
@@ -358,7 +358,7 @@ def _(loop: Loop) -> pd.DataFrame:
     for path in loop.reported:
         moved = {"path": path.name, "moved_max_m": float(path.moved_m.max())}
         for name, score in path.scores.items():
-            ate = np.nan if isinstance(score, Unavailable) else score.ate.translation.rmse
+            ate = np.nan if isinstance(score, Unavailable) else score.ate.translation_m.rmse
             rows.append(moved | {"reference": name, "ate_rmse_m": ate})
         if not path.scores:
             rows.append(moved | {"reference": None, "ate_rmse_m": np.nan})
@@ -369,11 +369,11 @@ def _(loop: Loop) -> pd.DataFrame:
 def _(found: Evaluation) -> str:
     ate = found.ate
     low_high = ""
-    if not isinstance(ate.interval, Unavailable):
-        low_high = f" (95 %: {ate.interval.low:.3g} to {ate.interval.high:.3g} m)"
+    if not isinstance(ate.interval_m, Unavailable):
+        low_high = f" (95 %: {ate.interval_m.low:.3g} to {ate.interval_m.high:.3g} m)"
     said = (
         f"{found.estimate.name} against {found.reference.name}, alignment {found.alignment}: "
-        f"ATE {ate.translation.rmse:.3g} m{low_high}"
+        f"ATE {ate.translation_m.rmse:.3g} m{low_high}"
     )
     return "\n".join([said, *map(words, found.rpe)])
 
@@ -381,32 +381,36 @@ def _(found: Evaluation) -> str:
 @frame.register
 def _(found: Evaluation) -> pd.DataFrame:
     """ATE, then the RPE over each delta; over poses, or pairs of them."""
-    rows = [_score("ATE", found.ate), *(_score(f"RPE {part.delta}", part) for part in found.rpe)]
+    rows = [
+        _score("ATE", found.ate),
+        *(_score(f"RPE {part.delta_words}", part) for part in found.rpe),
+    ]
     return pd.DataFrame(rows)
 
 
 def _score(name: str, part: AbsoluteError | RelativeError) -> dict[str, Any]:
     row: dict[str, Any] = {"score": name}
-    if not isinstance(part.translation, Unavailable):
-        row |= {"count": part.translation.count, "rmse_m": part.translation.rmse}
-        row |= {"mean_m": part.translation.mean, "median_m": part.translation.median}
-        row["max_m"] = part.translation.max
-    if not isinstance(part.interval, Unavailable):
-        row |= {"rmse_low_m": part.interval.low, "rmse_high_m": part.interval.high}
-    if not isinstance(part.rotation, Unavailable):
-        row["rotation_rmse_deg"] = part.rotation.rmse
+    if not isinstance(part.translation_m, Unavailable):
+        row |= {"count": part.translation_m.count, "rmse_m": part.translation_m.rmse}
+        row |= {"mean_m": part.translation_m.mean, "median_m": part.translation_m.median}
+        row["max_m"] = part.translation_m.max
+    if not isinstance(part.interval_m, Unavailable):
+        row |= {"rmse_low_m": part.interval_m.low, "rmse_high_m": part.interval_m.high}
+    if not isinstance(part.rotation_deg, Unavailable):
+        row["rotation_rmse_deg"] = part.rotation_deg.rmse
     return row
 
 
 @words.register
-def _(part: RelativeError) -> str:
-    if isinstance(part.translation, Unavailable):
-        return f"RPE over {part.delta}: {part.translation.reason}"
-    return f"RPE over {part.delta}: {part.translation.rmse:.3g} m, {part.translation.count} pairs"
+def _(part: PairwiseError) -> str:
+    if isinstance(part.translation_m, Unavailable):
+        return f"RPE over {part.delta_words}: {part.translation_m.reason}"
+    found = part.translation_m
+    return f"RPE over {part.delta_words}: {found.rmse:.3g} m, {found.count} pairs"
 
 
 @frame.register
-def _(part: RelativeError) -> pd.DataFrame:
+def _(part: PairwiseError) -> pd.DataFrame:
     """Every pair: its poses, as indices into the evaluation, and its errors."""
     return pd.DataFrame(
         {

@@ -48,7 +48,7 @@ from px4fuse.report.style import (
 )
 from px4fuse.trajectory.evaluation import Evaluation
 from px4fuse.trajectory.model import AXES_OF_FRAME, MIN_POSES, Frame
-from px4fuse.trajectory.scores import Interval, RelativeError, Statistics
+from px4fuse.trajectory.scores import Interval, PairwiseError, Statistics
 
 # Indices of the axes that are right, up the page and vertical; and whether the last points down
 _AXES: Mapping[Frame, tuple[int, int, int, bool]] = {
@@ -287,7 +287,7 @@ def _panels(page: Page, score: Evaluation) -> None:
         left.numbers(relative_words(shown, score.time_s, zero))
     axes = right.panel("RPE per delta (m)", "", HEIGHT, above=14.0)
     _boxes(axes, score)
-    if any(isinstance(error.translation, Statistics) for error in score.rpe):
+    if any(isinstance(error.translation_m, Statistics) for error in score.rpe):
         right.numbers(growth_words(score.rpe))
     page.beside(left, right)
 
@@ -296,23 +296,30 @@ def _absolute(axes: Axes, score: Evaluation, along: Array) -> None:
     """APE with its statistics as lines."""
     _line(axes, along, score.position_error_m, score.time_s, color=OURS, lw=0.8)
     for name, label, style in STATISTICS:
-        value = getattr(score.ate.translation, name)
+        value = getattr(score.ate.translation_m, name)
         axes.axhline(value, label=f"{label} {metres(value)}", zorder=3, **style)
     _from_zero(axes, along, float(score.position_error_m.max()))
 
 
-def _relative(axes: Axes, score: Evaluation) -> list[RelativeError]:
+def _relative(axes: Axes, score: Evaluation) -> list[PairwiseError]:
     """RPE over time, of the distances where there are any; returns what is shown."""
-    known = [e for e in score.rpe if isinstance(e.translation, Statistics)]
+    known = [e for e in score.rpe if isinstance(e.translation_m, Statistics)]
     if not known:
         _none(axes, score)
         return []
-    unit = "m" if any(e.delta.unit == "m" for e in known) else known[0].delta.unit
-    shown = [e for e in known if e.delta.unit == unit][-MOST_CURVES:]
+    unit = "m" if any(e.unit == "m" for e in known) else known[0].unit
+    shown = [e for e in known if e.unit == unit][-MOST_CURVES:]
     zero = zero_s(score)
     for error, style in zip(shown, CURVES[-len(shown) :], strict=True):
         ends = score.time_s[error.end]
-        _line(axes, ends - zero, error.translation_error_m, ends, label=f"{error.delta}", **style)
+        _line(
+            axes,
+            ends - zero,
+            error.translation_error_m,
+            ends,
+            label=f"{error.delta_words}",
+            **style,
+        )
     _from_zero(axes, score.time_s - zero, max(float(e.translation_error_m.max()) for e in shown))
     legend_above(axes, handlelength=1.8)
     axes.set_xlabel(_time_label(score))
@@ -321,8 +328,8 @@ def _relative(axes: Axes, score: Evaluation) -> list[RelativeError]:
 
 def _boxes(axes: Axes, score: Evaluation) -> None:
     """RPE of every delta as a box, with its RMSE and the interval of that."""
-    known: list[tuple[RelativeError, Statistics]] = [
-        (e, e.translation) for e in score.rpe if isinstance(e.translation, Statistics)
+    known: list[tuple[PairwiseError, Statistics]] = [
+        (e, e.translation_m) for e in score.rpe if isinstance(e.translation_m, Statistics)
     ]
     if not known:
         _none(axes, score)
@@ -330,14 +337,14 @@ def _boxes(axes: Axes, score: Evaluation) -> None:
     known = known[:: -(-len(known) // MOST_BOXES)]
     axes.boxplot(
         [error.translation_error_m for error, _ in known], whis=(0, 100), widths=0.5,
-        tick_labels=[f"{error.delta}" for error, _ in known], patch_artist=True,
+        tick_labels=[f"{error.delta_words}" for error, _ in known], patch_artist=True,
         boxprops={"facecolor": "#dbe5f1", "edgecolor": OURS, "lw": 0.8},
         medianprops={"color": "black", "lw": 1.0}, whiskerprops={"color": OURS, "lw": 0.8},
         capprops={"color": OURS, "lw": 0.8},
     )  # fmt: skip
     for place, (error, found) in enumerate(known, start=1):
-        if isinstance(error.interval, Interval):
-            ends = (error.interval.low, error.interval.high)
+        if isinstance(error.interval_m, Interval):
+            ends = (error.interval_m.low, error.interval_m.high)
             axes.plot([place + 0.36] * 2, ends, color=EKF2, lw=1.2, solid_capstyle="butt")
         axes.plot(place + 0.36, found.rmse, "D", color=EKF2, mec="black", mew=0.5, ms=3.6)
     axes.set_ylim(0.0, max(axes.get_ylim()[1], LEAST_SCALE_M))
@@ -346,8 +353,8 @@ def _boxes(axes: Axes, score: Evaluation) -> None:
 
 
 def _none(axes: Axes, score: Evaluation) -> None:
-    reason = next((e.translation.reason for e in score.rpe
-                   if isinstance(e.translation, Unavailable)),
+    reason = next((e.translation_m.reason for e in score.rpe
+                   if isinstance(e.translation_m, Unavailable)),
                   "the path is too short for a delta")  # fmt: skip
     empty(axes, f"No RPE: {reason}.")
 

@@ -11,7 +11,7 @@ from px4fuse.flight import Unavailable
 from px4fuse.loop.analysis import SMALLEST_STAMP_S
 from px4fuse.report.loop_words import interval_words
 from px4fuse.trajectory.evaluation import AbsoluteError, Evaluation
-from px4fuse.trajectory.scores import RelativeError, Statistics
+from px4fuse.trajectory.scores import PairwiseError, Statistics
 
 # Above this share of the squared error the worst tenth of the poses is what there is to look at
 FEW_DECIDE = 0.5
@@ -40,9 +40,10 @@ def summary(score: Evaluation) -> str:
     """The score in one sentence."""
     worst = int(np.argmax(score.position_error_m))
     return (
-        f"{score.estimate.name} is {metres(score.ate.translation.rmse)} (RMSE) from "
-        f"{score.reference.name} {_aligned(score)}; farthest, {metres(score.ate.translation.max)}, "
-        f"at {score.time_s[worst] - zero_s(score):.1f} s, {score.distance_m[worst]:.1f} m along."
+        f"{score.estimate.name} is {metres(score.ate.translation_m.rmse)} (RMSE) from "
+        f"{score.reference.name} {_aligned(score)}; farthest, "
+        f"{metres(score.ate.translation_m.max)}, at {score.time_s[worst] - zero_s(score):.1f} s, "
+        f"{score.distance_m[worst]:.1f} m along."
     )
 
 
@@ -52,10 +53,11 @@ def _aligned(score: Evaluation) -> str:
 
 def score_rows(score: Evaluation) -> list[list[str]]:
     """Of the ATE and every RPE: RMSE, interval, mean, median, std, max, n, and RMSE of rotation."""
-    named: list[tuple[str, AbsoluteError | RelativeError]]
-    named = [("ATE (m)", score.ate), *((f"RPE {e.delta} (m)", e) for e in score.rpe)]
+    named: list[tuple[str, AbsoluteError | PairwiseError]]
+    named = [("ATE (m)", score.ate), *((f"RPE {e.delta_words} (m)", e) for e in score.rpe)]
     return [
-        [name, *_cells(e.translation, interval_words(e.interval), e.rotation)] for name, e in named
+        [name, *_cells(e.translation_m, interval_words(e.interval_m), e.rotation_deg)]
+        for name, e in named
     ]
 
 
@@ -74,7 +76,7 @@ def _cells(
 
 def reasons(score: Evaluation) -> list[str]:
     """Why a number is missing, each reason once."""
-    parts = [score.ate.interval, score.ate.rotation, *(e.translation for e in score.rpe)]
+    parts = [score.ate.interval_m, score.ate.rotation_deg, *(e.translation_m for e in score.rpe)]
     missing = [part for part in parts if isinstance(part, Unavailable)]
     return list(dict.fromkeys(f"No {part.what}: {part.reason}." for part in missing))
 
@@ -97,8 +99,8 @@ def after_words(score: Evaluation) -> str:
     """What the map shows."""
     worst = int(np.argmax(score.position_error_m))
     return (
-        f"{metres(score.ate.translation.rmse)} (RMSE) {_aligned(score)}. The darker the path, the "
-        f"larger its error; × is the largest, {metres(score.ate.translation.max)} at "
+        f"{metres(score.ate.translation_m.rmse)} (RMSE) {_aligned(score)}. The darker the path, "
+        f"the larger its error; × is the largest, {metres(score.ate.translation_m.max)} at "
         f"{score.time_s[worst] - zero_s(score):.1f} s."
     )
 
@@ -107,7 +109,7 @@ def time_words(score: Evaluation) -> str:
     """Whether a few moments decide."""
     squares = np.sort(score.position_error_m**2)
     total = float(squares.sum())
-    if score.ate.translation.rmse < NEGLIGIBLE_M:
+    if score.ate.translation_m.rmse < NEGLIGIBLE_M:
         return "There is no error at any time."
     share = float(squares[-max(1, len(squares) // 10) :].sum()) / total
     said = (
@@ -132,7 +134,7 @@ def distance_words(score: Evaluation) -> str:
     said = f"RMSE by quarters of the path {', '.join(f'{q:.3f}' for q in found)} m: "
     if len(found) < 4:
         return f"{said}the poses do not cover all of it."
-    if score.ate.translation.rmse < NEGLIGIBLE_M:
+    if score.ate.translation_m.rmse < NEGLIGIBLE_M:
         return f"{said}there is no error."
     first, *middle, last = found
     if min(first, last) > DIFFERS * max(middle):
@@ -143,7 +145,7 @@ def distance_words(score: Evaluation) -> str:
     return f"{said}largest in the {where}, no steady growth as a drift from the start has."
 
 
-def relative_words(shown: list[RelativeError], times: Array, zero: float) -> str:
+def relative_words(shown: list[PairwiseError], times: Array, zero: float) -> str:
     """Where the motion itself is worst."""
     last = shown[-1]
     worst = int(np.argmax(last.translation_error_m))
@@ -155,15 +157,13 @@ def relative_words(shown: list[RelativeError], times: Array, zero: float) -> str
     )
 
 
-def growth_words(rpe: tuple[RelativeError, ...]) -> str:
+def growth_words(rpe: tuple[PairwiseError, ...]) -> str:
     """How the RPE grows with its delta, which tells noise from drift."""
     boxes = "Box: middle half; whiskers: all; diamond: RMSE with its 95 % interval."
     by_unit: dict[str, list[tuple[float, float]]] = {}
     for error in rpe:
-        if isinstance(error.translation, Statistics) and error.translation.rmse > NEGLIGIBLE_M:
-            by_unit.setdefault(error.delta.unit, []).append(
-                (error.delta.value, error.translation.rmse)
-            )
+        if isinstance(error.translation_m, Statistics) and error.translation_m.rmse > NEGLIGIBLE_M:
+            by_unit.setdefault(error.unit, []).append((error.delta, error.translation_m.rmse))
     several = max(by_unit.values(), key=len, default=[])
     (low, small), (high, large) = min(several, default=(0, 0)), max(several, default=(0, 0))
     if not low < high:

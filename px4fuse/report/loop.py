@@ -200,8 +200,8 @@ def _along(page: Page, loop: Loop) -> None:
             along = np.interp(score.time_s, part.trajectory.time_s, loop.distance_m)
             axes.plot(*thin(along, score.position_error_m), **STYLES[part.name])
             drawn.append(part)
-            said.append(f"{part.name}: RMSE {score.ate.translation.rmse:.3f} m, max "
-                        f"{score.ate.translation.max:.3f} m")  # fmt: skip
+            said.append(f"{part.name}: RMSE {score.ate.translation_m.rmse:.3f} m, max "
+                        f"{score.ate.translation_m.max:.3f} m")  # fmt: skip
         _fit(axes, drawn)
         page.numbers("; ".join(said))
     for axes in every[:-1]:
@@ -266,9 +266,9 @@ def _relative(page: Page, loop: Loop, name: str) -> None:
     rows: list[list[str]] = []
     for part, score in good:
         errors: list[tuple[str, AbsoluteError | RelativeError]]
-        errors = [("ATE", score.ate), *((f"RPE {e.delta}", e) for e in score.rpe)]
+        errors = [("ATE", score.ate), *((f"RPE {e.delta_words}", e) for e in score.rpe)]
         for index, (label, e) in enumerate(errors):
-            numbers = statistics_words(e.translation, e.interval, e.rotation)
+            numbers = statistics_words(e.translation_m, e.interval_m, e.rotation_deg)
             rows.append([part.name if index == 0 else "", label, *numbers])
     heads = ["path", "error over", "RMSE (m)", "95 % interval (m)", "rotation RMSE (°)", "n"]
     page.table(heads, rows)

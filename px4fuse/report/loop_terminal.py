@@ -27,7 +27,7 @@ from px4fuse.report.terminal import print_finding
 from px4fuse.request import LoopRequest
 from px4fuse.trajectory.evaluation import Evaluation
 from px4fuse.trajectory.graph.analysis import MANY_CLOSURES, SOLUTIONS, SolvedGraph
-from px4fuse.trajectory.scores import Delta, Statistics
+from px4fuse.trajectory.scores import Statistics
 
 MOST_ROWS = 10
 
@@ -72,22 +72,23 @@ def _print_paths(console: Console, loop: Loop) -> None:
         known = [score for score in scores.values() if isinstance(score, Evaluation)]
         if not known:
             continue
-        over = [e.delta for e in known[0].rpe if e.delta.unit == "m"][-2:]
+        over = [e.delta_words for e in known[0].rpe if e.unit == "m"][-2:]
         say(console, Text(f"Against {name}", "bold"))
-        table = _table("path", "ATE (m)", "95 %", *(f"RPE {delta} (m)" for delta in over))
+        table = _table("path", "ATE (m)", "95 %", *(f"RPE {distance} (m)" for distance in over))
         for path, score in scores.items():
             table.add_row(path, *_scores(score, over))
         console.print(table)
 
 
-def _scores(score: Evaluation | Unavailable, over: list[Delta]) -> list[str]:
+def _scores(score: Evaluation | Unavailable, over: list[str]) -> list[str]:
     """ATE, its interval, and RPE over some distances."""
     if isinstance(score, Unavailable):
         return ["–"]
-    rpe = [next(e.translation for e in score.rpe if e.delta == delta) for delta in over]
+    by_distance = {e.delta_words: e.translation_m for e in score.rpe}
+    rpe = [by_distance[distance] for distance in over]
     return [
-        f"{score.ate.translation.rmse:.3f}",
-        interval_words(score.ate.interval).strip(" ()"),
+        f"{score.ate.translation_m.rmse:.3f}",
+        interval_words(score.ate.interval_m).strip(" ()"),
         *(f"{e.rmse:.3f}" if isinstance(e, Statistics) else "–" for e in rpe),
     ]
 
@@ -99,15 +100,15 @@ def print_evaluation(console: Console, score: Evaluation) -> None:
     print_line(console, "How", score_words(score))
     ate = score.ate
     table = _table("error", "RMSE", "95 %", "mean", "median", "max", "n")
-    _statistics(table, "ATE (m)", ate.translation, interval_words(ate.interval).strip(" ()"))
-    if isinstance(ate.rotation, Statistics):
-        _statistics(table, "rotation (°)", ate.rotation)
+    _statistics(table, "ATE (m)", ate.translation_m, interval_words(ate.interval_m).strip(" ()"))
+    if isinstance(ate.rotation_deg, Statistics):
+        _statistics(table, "rotation (°)", ate.rotation_deg)
     for error in score.rpe:
-        if isinstance(error.translation, Statistics):
-            interval = interval_words(error.interval).strip(" ()")
-            _statistics(table, f"RPE {error.delta} (m)", error.translation, interval)
-        if isinstance(error.rotation, Statistics):
-            _statistics(table, f"RPE {error.delta} (°)", error.rotation)
+        if isinstance(error.translation_m, Statistics):
+            interval = interval_words(error.interval_m).strip(" ()")
+            _statistics(table, f"RPE {error.delta_words} (m)", error.translation_m, interval)
+        if isinstance(error.rotation_deg, Statistics):
+            _statistics(table, f"RPE {error.delta_words} (°)", error.rotation_deg)
     console.print(table)
     for text in (*reasons(score), *score.notes):
         say(console, Text(text, "dim"))

@@ -130,7 +130,7 @@ def ate_words(score: Evaluation | Unavailable) -> str:
     """RMSE of the ATE in m, with its interval where there is one."""
     if isinstance(score, Unavailable):
         return "–"
-    return f"{score.ate.translation.rmse:.3f}{interval_words(score.ate.interval)}"
+    return f"{score.ate.translation_m.rmse:.3f}{interval_words(score.ate.interval_m)}"
 
 
 def interval_words(interval: Interval | Unavailable) -> str:

@@ -13,12 +13,12 @@ from px4fuse.flight import Unavailable
 from px4fuse.loop.corrections import Correction, Judged
 from px4fuse.loop.loop import Loop
 from px4fuse.loop.part import KnownEnd
+from px4fuse.record import written
 from px4fuse.request import LoopRequest
 from px4fuse.results import trajectories as made
 from px4fuse.results.contract import LOOP, EvaluationResults, GraphResults, LoopResults
 from px4fuse.results.model import Student
 from px4fuse.results.parts import (
-    S,
     copied,
     provenance,
     schema_of,
@@ -26,7 +26,6 @@ from px4fuse.results.parts import (
 from px4fuse.trajectory.evaluation import Evaluation
 from px4fuse.trajectory.graph.analysis import SOLUTIONS, SolvedGraph
 from px4fuse.trajectory.model import AXES_OF_FRAME, Trajectory
-from px4fuse.trajectory.scores import RelativeError
 
 
 def loop_results(
@@ -154,25 +153,7 @@ def _score(score: Evaluation) -> made.Score:
             translation_m=tuple(transform.translation_m.tolist()),
         ),
         association=copied(made.Association, matched, poses=len(matched)),
-        time_offset=copied(made.TimeOffset, score.time_offset),
-        ate=made.AbsoluteError(
-            translation_m=copied(made.Statistics, score.ate.translation),
-            interval_m=_copied(made.RmseInterval, score.ate.interval),
-            rotation_deg=_copied(made.Statistics, score.ate.rotation),
-        ),
-        rpe=tuple(_relative(one) for one in score.rpe),
-    )
-
-
-def _relative(error: RelativeError) -> made.RelativeError:
-    return copied(
-        made.RelativeError,
-        error,
-        delta=error.delta.value,
-        unit=error.delta.unit,
-        translation_m=_copied(made.Statistics, error.translation),
-        interval_m=_copied(made.RmseInterval, error.interval),
-        rotation_deg=_copied(made.Statistics, error.rotation),
+        rpe=tuple(written(one) for one in score.rpe),
     )
 
 
@@ -214,7 +195,3 @@ def _correction(correction: Correction | Unavailable) -> made.Correction | Unava
             for name, one in correction.scores.items()
         },
     )
-
-
-def _copied(kind: type[S], part: object) -> S | Unavailable:
-    return part if isinstance(part, Unavailable) else copied(kind, part)

@@ -9,7 +9,10 @@ from typing import Annotated, Literal
 
 from msgspec import Meta
 
-from px4fuse.record import Count, Maybe, NotNegative, Record, Share, Span, Unavailable, Vector
+from px4fuse.record import Count, Maybe, NotNegative, Record, Share, Unavailable, Vector
+from px4fuse.trajectory.evaluation import AbsoluteError
+from px4fuse.trajectory.offset import TimeOffset
+from px4fuse.trajectory.scores import RelativeError
 
 Frame = Literal["NED", "FRD", "ENU", "camera", "unknown"]
 Kind = Literal["vio", "ekf2", "kf", "truth", "slam", "unknown"]
@@ -50,56 +53,6 @@ class Association(Record, frozen=True):
     in_gaps: Count
     coverage_estimate: float
     coverage_reference: float
-
-
-class TimeOffset(Record, frozen=True, kw_only=True):
-    """What was added to the estimate's stamps, with its interval where it was estimated."""
-
-    offset_s: float | None = None
-    interval_s: Span | None = None
-    determinable: bool
-    reason: str
-
-
-class Statistics(Record, frozen=True):
-    """Of errors, in the unit that the name of the field says."""
-
-    count: Count
-    rmse: NotNegative
-    mean: float
-    median: float
-    std: NotNegative
-    min: float
-    max: float
-
-
-class RmseInterval(Record, frozen=True):
-    """95 % interval of the RMSE, by block bootstrap."""
-
-    low: float
-    high: float
-    block_length: Count
-    blocks: float
-
-
-class AbsoluteError(Record, frozen=True):
-    """ATE: of position (m), with its interval, and of orientation (degrees)."""
-
-    translation_m: Statistics
-    interval_m: Maybe[RmseInterval]
-    rotation_deg: Maybe[Statistics]
-
-
-class RelativeError(Record, frozen=True):
-    """RPE over pairs that are ``delta`` apart."""
-
-    delta: float
-    unit: Literal["frames", "m", "s"]
-    all_pairs: bool
-    pairs_from: Literal["estimate", "reference"]
-    translation_m: Maybe[Statistics]
-    interval_m: Maybe[RmseInterval]
-    rotation_deg: Maybe[Statistics]
 
 
 class Score(Record, frozen=True, kw_only=True):

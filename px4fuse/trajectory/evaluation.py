@@ -18,6 +18,7 @@ from px4fuse.arrays import Array
 from px4fuse.display import Shown
 from px4fuse.errors import TrajectoryError
 from px4fuse.flight import Unavailable
+from px4fuse.record import Maybe, Record
 from px4fuse.trajectory.alignment import AlignmentKind, Transform, fit, umeyama
 from px4fuse.trajectory.association import Association, Method, associate
 from px4fuse.trajectory.model import Trajectory, cumulative_distance
@@ -25,7 +26,7 @@ from px4fuse.trajectory.offset import TimeOffset, clock_difference, estimate_tim
 from px4fuse.trajectory.scores import (
     Delta,
     Interval,
-    RelativeError,
+    PairwiseError,
     Side,
     Statistics,
     default_deltas,
@@ -44,13 +45,12 @@ _DOWN, _UP = ("NED", "FRD"), ("ENU",)
 _MONO = re.compile(r"(?<![a-z])mono(?![a-z])|monocular", re.IGNORECASE)
 
 
-@dataclass(frozen=True)
-class AbsoluteError:
-    """ATE: translation in m, its RMSE's interval, and rotation in degrees."""
+class AbsoluteError(Record, frozen=True):
+    """ATE: of position (m), with its RMSE's interval, and of orientation (degrees)."""
 
-    translation: Statistics
-    interval: Interval | Unavailable
-    rotation: Statistics | Unavailable
+    translation_m: Statistics
+    interval_m: Maybe[Interval]
+    rotation_deg: Maybe[Statistics]
 
 
 @dataclass(frozen=True, repr=False)
@@ -70,7 +70,7 @@ class Evaluation(Shown):
     time_offset : TimeOffset
         ``offset_s`` is what was added to the estimate's stamps.
     ate : AbsoluteError
-    rpe : tuple of RelativeError
+    rpe : tuple of PairwiseError
     time_s : ndarray, shape (n,)
         Of the poses used, on the estimate's clock.
     distance_m : ndarray, shape (n,)
@@ -94,7 +94,7 @@ class Evaluation(Shown):
     association: Association
     time_offset: TimeOffset
     ate: AbsoluteError
-    rpe: tuple[RelativeError, ...]
+    rpe: tuple[PairwiseError, ...]
     time_s: Array
     distance_m: Array
     estimate_m: Array
@@ -266,12 +266,12 @@ def _time_offset(
         found = estimate_time_offset(estimate, reference)
         if found.determinable:
             return found, []
-        used = TimeOffset(clocks or 0.0, None, False, found.reason)
+        used = TimeOffset(offset_s=clocks or 0.0, determinable=False, reason=found.reason)
         return used, [f"{found.reason} Used {by_clock} instead."]
     if given_s is None:
-        used = TimeOffset(clocks or 0.0, None, True, f"By {by_clock}.")
+        used = TimeOffset(offset_s=clocks or 0.0, determinable=True, reason=f"By {by_clock}.")
         return used, _clock_doubts(estimate, reference) if unrelated else []
-    return TimeOffset(given_s, None, True, "As asked for."), []
+    return TimeOffset(offset_s=given_s, determinable=True, reason="As asked for."), []
 
 
 def _clock_doubts(estimate: Trajectory, reference: Trajectory) -> list[str]:

@@ -11,15 +11,17 @@ robustly.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
+from msgspec import structs
 from scipy.ndimage import gaussian_filter1d, maximum_filter1d
 from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Slerp
 from scipy.special import stdtrit
 
 from px4fuse.arrays import Array, BoolArray
+from px4fuse.record import Record, Span
 from px4fuse.trajectory.alignment import Transform, umeyama
 from px4fuse.trajectory.association import bracketed, gap_limit, positions_at
 from px4fuse.trajectory.correlation import autocovariance, moments
@@ -49,8 +51,7 @@ MAX_HALF_INTERVAL_S = 0.5  # that of the search; beyond it an interval helps nob
 LEVEL = 0.95
 
 
-@dataclass(frozen=True)
-class TimeOffset:
+class TimeOffset(Record, frozen=True, kw_only=True):
     """Offset between two clocks.
 
     Attributes
@@ -65,8 +66,8 @@ class TimeOffset:
         How it was found, or why it was not.
     """
 
-    offset_s: float | None
-    interval_s: tuple[float, float] | None
+    offset_s: float | None = None
+    interval_s: Span | None = None
     determinable: bool
     reason: str
 
@@ -103,7 +104,7 @@ def estimate_time_offset(estimate: Trajectory, reference: Trajectory) -> TimeOff
     if found.offset_s is None or found.interval_s is None or not is_swapped:
         return found
     low, high = found.interval_s
-    return replace(found, offset_s=-found.offset_s, interval_s=(-high, -low))
+    return structs.replace(found, offset_s=-found.offset_s, interval_s=(-high, -low))
 
 
 def _median_step(trajectory: Trajectory) -> float:
@@ -149,11 +150,11 @@ def _search(sparse: Trajectory, dense: Trajectory, start_s: float | None) -> Tim
         f"Speeds correlated over all lags, then the least ATE ({best.rms_m:.3g} m after a free "
         f"similarity, {len(best.time_s)} poses)."
     )
-    return TimeOffset(best.offset_s, interval, True, reason)
+    return TimeOffset(offset_s=best.offset_s, interval_s=interval, determinable=True, reason=reason)
 
 
 def _unknown(why: str) -> TimeOffset:
-    return TimeOffset(None, None, False, f"The time offset is not determinable: {why}.")
+    return TimeOffset(determinable=False, reason=f"The time offset is not determinable: {why}.")
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ from px4fuse.arrays import Array, IntArray
 from px4fuse.display import Shown
 from px4fuse.errors import SettingsError
 from px4fuse.flight import Unavailable
+from px4fuse.record import Count, Maybe, NotNegative, Record
 from px4fuse.trajectory.correlation import autocovariance
 from px4fuse.trajectory.model import Trajectory, cumulative_distance
 
@@ -45,21 +46,19 @@ class Delta:
         return f"{self.value:g} {self.unit}"
 
 
-@dataclass(frozen=True)
-class Statistics:
+class Statistics(Record, frozen=True):
     """Of ``count`` errors, all in their unit; ``std`` without Bessel's correction, as evo's."""
 
-    count: int
-    rmse: float
+    count: Count
+    rmse: NotNegative
     mean: float
     median: float
-    std: float
+    std: NotNegative
     min: float
     max: float
 
 
-@dataclass(frozen=True)
-class Interval:
+class Interval(Record, frozen=True):
     """95 % interval of an RMSE, by block bootstrap.
 
     Attributes
@@ -73,39 +72,52 @@ class Interval:
 
     low: float
     high: float
-    block_length: int
+    block_length: Count
     blocks: float
 
 
-@dataclass(frozen=True, repr=False)
-class RelativeError(Shown):
-    """RPE over one delta.
+class RelativeError(Record, frozen=True):
+    """RPE over pairs that are ``delta`` apart.
 
     Attributes
     ----------
-    delta : Delta
+    delta : float
+        In ``unit``.
     all_pairs : bool
         Pairs start at every pose, else each where the one before ends.
     pairs_from : {"estimate", "reference"}
         Whose path a distance is measured along.
-    translation : Statistics or Unavailable
-        m.
-    interval : Interval or Unavailable
+    translation_m, rotation_deg : Statistics or Unavailable
+    interval_m : Interval or Unavailable
         Of the translation's RMSE.
-    rotation : Statistics or Unavailable
-        Degrees.
+    """
+
+    delta: float
+    unit: Unit
+    all_pairs: bool
+    pairs_from: Side
+    translation_m: Maybe[Statistics]
+    interval_m: Maybe[Interval]
+    rotation_deg: Maybe[Statistics]
+
+    @property
+    def delta_words(self) -> str:
+        """How far the poses of a pair are apart."""
+        return str(Delta(self.delta, self.unit))
+
+
+class PairwiseError(Shown, RelativeError, frozen=True, kw_only=True, eq=False):
+    """RPE over one delta, with its pairs.
+
+    Attributes
+    ----------
     start, end : ndarray of int, shape (k,)
         Poses of each pair, as indices into the evaluation's arrays.
     translation_error_m, rotation_error_deg : ndarray, shape (k,)
         Empty where unavailable.
     """
 
-    delta: Delta
-    all_pairs: bool
-    pairs_from: Side
-    translation: Statistics | Unavailable
-    interval: Interval | Unavailable
-    rotation: Statistics | Unavailable
+    written_as = RelativeError
     start: IntArray
     end: IntArray
     translation_error_m: Array
@@ -221,7 +233,7 @@ def relative_error(
     *,
     all_pairs: bool = True,
     pairs_from: Side = "reference",
-) -> RelativeError:
+) -> PairwiseError:
     """RPE over one delta: E = (Q_i⁻¹ Q_j)⁻¹ (P_i⁻¹ P_j), Sturm (2012), eq. 1.
 
     Parameters
@@ -243,9 +255,10 @@ def relative_error(
         both = Unavailable(what, reason, "Ask for another delta.")
     if isinstance(both, Unavailable):
         none, empty = np.empty(0, dtype=np.intp), np.empty(0)
-        return RelativeError(
-            delta, all_pairs, pairs_from, both, both, both, none, none, empty, empty
-        )
+        return PairwiseError(
+            delta.value, delta.unit, all_pairs, pairs_from, both, both, both,
+            start=none, end=none, translation_error_m=empty, rotation_error_deg=empty,
+        )  # fmt: skip
     p, q = (rotation[start].inv() for rotation in both)
     p_move = p.apply(aligned.position_m[end] - aligned.position_m[start])
     q_move = q.apply(reference.position_m[end] - reference.position_m[start])
@@ -254,13 +267,14 @@ def relative_error(
     p_turn, q_turn = p * both[0][end], q * both[1][end]
     rotation = np.degrees((q_turn.inv() * p_turn).magnitude())
     overlap = int(np.median(end - start)) if all_pairs else 1
-    return RelativeError(
-        delta=delta,
+    return PairwiseError(
+        delta=delta.value,
+        unit=delta.unit,
         all_pairs=all_pairs,
         pairs_from=pairs_from,
-        translation=statistics(translation),
-        interval=rmse_interval(translation, what, min_block=overlap),
-        rotation=statistics(rotation),
+        translation_m=statistics(translation),
+        interval_m=rmse_interval(translation, what, min_block=overlap),
+        rotation_deg=statistics(rotation),
         start=start,
         end=end,
         translation_error_m=translation,
