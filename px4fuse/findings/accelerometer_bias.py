@@ -12,13 +12,13 @@ import pandas as pd
 from px4fuse.analysis import Analysis
 from px4fuse.filter.causes import Explained
 from px4fuse.filter.signals import within
-from px4fuse.findings.model import Detector, Finding, Found, Threshold
+from px4fuse.findings.model import Found, finding, warning
 from px4fuse.flight import SPECIFIC_FORCE_COLUMNS, Ekf2
 
-ACCELEROMETER_BIAS = Threshold(0.2, "m/s²", "half of EKF2's own limit, EKF2_ABL_LIM")
-ACCELEROMETER_BIAS_ERROR = Threshold(0.3, "m/s²", "as SIGMA_A tripled; 0.15 m after one second")
-BIAS_SIGMAS = Threshold(4.0, "standard deviations", "6e-5 of clean flights lie beyond")
-TILT_DEG_PER_BIAS = float(np.degrees(1.0 / 9.80665))
+BIAS_M_S2 = 0.2  # half of EKF2's own limit, EKF2_ABL_LIM
+BIAS_ERROR_M_S2 = 0.3  # as SIGMA_A tripled; 0.15 m after one second
+BIAS_SIGMAS = 4.0  # 6e-5 of clean flights lie beyond
+TILT_DEG_PER_M_S2 = float(np.degrees(1.0 / 9.80665))
 
 
 def _ekf2_bias(analysis: Analysis) -> list[float] | None:
@@ -26,29 +26,29 @@ def _ekf2_bias(analysis: Analysis) -> list[float] | None:
     ekf2 = analysis.flight.ekf2
     if not isinstance(ekf2, Ekf2) or not isinstance(ekf2.accelerometer_bias, pd.DataFrame):
         return None
-    inside = within(ekf2.accelerometer_bias, analysis.segment)
-    if inside.empty:
-        return None
-    return [float(inside[column].median()) for column in SPECIFIC_FORCE_COLUMNS]
+    inside = within(ekf2.accelerometer_bias, analysis.segment)[SPECIFIC_FORCE_COLUMNS]
+    return None if inside.empty else [float(median) for median in inside.median()]
 
 
-def _detect(analysis: Analysis) -> Found:
+def detect(analysis: Analysis) -> Found:
+    """Our estimate where it is sure, else EKF2's."""
     found, of_ekf2 = analysis.explained, _ekf2_bias(analysis)
     if isinstance(found, Explained):
         forward, right = found.forward_bias, found.right_bias
         size = float(np.hypot(forward.value, right.value))
         sigma = float(np.hypot(forward.sigma, right.sigma))
-        if size >= max(ACCELEROMETER_BIAS.value, BIAS_SIGMAS.value * sigma):
+        if size >= max(BIAS_M_S2, BIAS_SIGMAS * sigma):
             in_ekf2 = ""
             if of_ekf2 is not None:
                 in_ekf2 = f" EKF2 subtracts {of_ekf2[0]:+.2f} forward, {of_ekf2[1]:+.2f} right."
-            yield Finding(
+            yield finding(
+                "error" if size >= BIAS_ERROR_M_S2 else "warning",
                 "accelerometer_bias",
-                "error" if size >= ACCELEROMETER_BIAS_ERROR.value else "warning",
                 f"The accelerometer reads {forward.value:+.2f} m/s² too much forward and "
-                f"{right.value:+.2f} right (± {1.96 * forward.sigma:.2f}), by what the positions "
-                "show of the motion: our filter integrates it as acceleration. An attitude that "
-                f"is off by {size * TILT_DEG_PER_BIAS:.1f}° does the same.{in_ekf2}",
+                f"{right.value:+.2f} right",
+                f" (± {1.96 * forward.sigma:.2f}), by what the positions show of the motion: our "
+                "filter integrates it as acceleration. An attitude that is off by "
+                f"{size * TILT_DEG_PER_M_S2:.1f}° does the same.{in_ekf2}",
                 "Calibrate the accelerometers and the level horizon, at the temperature of the "
                 "flight; a larger SIGMA_A only hides it.",
                 {"bias_m_s2": size, "sigma_m_s2": sigma},
@@ -59,21 +59,12 @@ def _detect(analysis: Analysis) -> Found:
     # horizontally ours is the better estimate, where there is one
     bias = [0.0, 0.0, of_ekf2[2]] if isinstance(found, Explained) else of_ekf2
     size = float(np.linalg.norm(bias))
-    if size < ACCELEROMETER_BIAS.value:
-        return
-    yield Finding(
-        "accelerometer_bias",
-        "warning",
-        f"EKF2 subtracts an accelerometer bias of {size:.2f} m/s² ({of_ekf2[0]:+.2f} forward, "
-        f"{of_ekf2[1]:+.2f} right, {of_ekf2[2]:+.2f} down). Our filter integrates it and needs a "
-        "larger SIGMA_A for that.",
-        "Calibrate the accelerometers, at the temperature of the flight.",
-        {"bias_m_s2": size},
-    )
-
-
-DETECTOR = Detector(
-    _detect,
-    {"accelerometer_bias": tuple(f"--mistake accel-bias={size}" for size in (0.25, 0.4, 0.5))},
-    names={"accelerometer_bias": "a bias of the accelerometer"},
-)
+    if size >= BIAS_M_S2:
+        yield warning(
+            "accelerometer_bias",
+            f"EKF2 subtracts an accelerometer bias of {size:.2f} m/s²",
+            f" ({of_ekf2[0]:+.2f} forward, {of_ekf2[1]:+.2f} right, {of_ekf2[2]:+.2f} down). Our "
+            "filter integrates it and needs a larger SIGMA_A for that.",
+            "Calibrate the accelerometers, at the temperature of the flight.",
+            {"bias_m_s2": size},
+        )

@@ -18,16 +18,16 @@ from px4fuse.comparison.model import AgainstTruth, AxisComparison, Comparison
 from px4fuse.errors import TrajectoryError
 from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.kalman import state_at
-from px4fuse.findings.model import Detector, Finding, Found, Threshold
+from px4fuse.findings.model import Found, finding
 from px4fuse.flight import Unavailable
 from px4fuse.plain import factor_words, number_words
 from px4fuse.trajectory.alignment import fit
 
-NEES_LARGE = Threshold(4.0, "times", "errors twice as large as σ; clean flights stay below 3")
-NEES_ERROR = Threshold(16.0, "times", "errors four times as large as σ")
-CONTENT = Threshold(1.5, "mean NIS", "above, the innovations themselves say so (variance.py)")
-SMALL = Threshold(0.5, "mean NIS", "innovations are 30 % smaller than claimed")
-FRAME_SHARE = Threshold(0.5, "of the error", "what is left is less than what turning took away")
+NEES_LARGE = 4.0  # errors twice as large as σ; clean flights stay below 3
+NEES_ERROR = 16.0  # errors four times as large as σ
+CONTENT_NIS = 1.5  # above, the innovations themselves say so (variance.py)
+SMALL_NIS = 0.5  # innovations are 30 % smaller than claimed
+FRAME_SHARE = 0.5  # of the error: what is left is less than what turning took away
 FILTERS = {"kf": "our filter", "ekf2": "EKF2"}
 REMEDIES = {
     "drift": "Take no noise from these innovations: correct the drift at a loop (px4fuse loop "
@@ -46,72 +46,72 @@ class Hidden:
     """One filter on one axis whose innovations hide its error."""
 
     owner: str
-    result: AxisComparison
+    axis: str
     statement: Consistency
-    truth: AgainstTruth
+    rmse_m: float
     nees: float
+
+    @property
+    def claimed_m(self) -> float:
+        """Standard deviation that the filter states."""
+        return self.rmse_m / float(np.sqrt(self.nees))
 
 
 def hidden_errors(comparison: Comparison) -> list[Hidden]:
     """Where the error is larger than claimed and no innovation says so, the worst first."""
     found = []
-    for result in comparison.axes.values():
+    for name, result in comparison.axes.items():
         for owner, statement in result.filters.items():
             truth = statement.truth
-            if isinstance(statement, Unavailable) or isinstance(truth, Unavailable):
+            if isinstance(statement, Unavailable) or not isinstance(truth, AgainstTruth):
                 continue
-            nees = truth.nees_position_mean
-            if nees is None or nees < NEES_LARGE.value:
-                continue
-            if statement.nis_mean < CONTENT.value:
-                found.append(Hidden(owner, result, statement, truth, nees))
+            nees = truth.nees_position_mean or 0.0
+            if nees >= NEES_LARGE and statement.nis_mean < CONTENT_NIS:
+                found.append(Hidden(owner, name, statement, truth.position_rmse_m, nees))
     return sorted(found, key=lambda hidden: -hidden.nees)
 
 
-def _detect(analysis: Analysis) -> Found:
-    comparison = analysis
-    hidden = hidden_errors(comparison)
+def detect(analysis: Analysis) -> Found:
+    """Told of each filter's worst axis."""
+    hidden = hidden_errors(analysis)
     if not hidden:
         return
-    worst = hidden[0]
-    drifts = comparison.source.origin.may_drift
-    evidence: dict[str, float | str] = {"axis": worst.result.axis.name, "filter": worst.owner}
+    worst, drifts = hidden[0], analysis.source.origin.may_drift
+    evidence: dict[str, float | str] = {"axis": worst.axis, "filter": worst.owner}
     said = []
     for owner, name in FILTERS.items():
-        one = next((h for h in hidden if h.owner == owner), None)
-        if one is None:
-            continue
-        claimed = one.truth.position_rmse_m / np.sqrt(one.nees)
-        evidence |= {
-            f"{owner}_nis_mean": one.statement.nis_mean,
-            f"{owner}_nees_position_mean": one.nees,
-            f"{owner}_position_rmse_m": one.truth.position_rmse_m,
-            f"{owner}_sigma_p_m": claimed,
-        }
-        said.append(
-            f"{name} claims σ {claimed:.2g} m along {one.result.axis.name} and errs by "
-            f"{one.truth.position_rmse_m:.2f} m RMS (mean NEES {factor_words(one.nees)}, mean NIS "
-            f"{number_words(one.statement.nis_mean, 2)}; 1 is consistent)"
-        )
-    small = worst.statement.nis_mean < SMALL.value
+        one = next((each for each in hidden if each.owner == owner), None)
+        if one is not None:
+            nis = one.statement.nis_mean
+            evidence |= {
+                f"{owner}_nis_mean": nis,
+                f"{owner}_nees_position_mean": one.nees,
+                f"{owner}_position_rmse_m": one.rmse_m,
+                f"{owner}_sigma_p_m": one.claimed_m,
+            }
+            said.append(
+                f"{name} claims σ {one.claimed_m:.2g} m along {one.axis} and errs by "
+                f"{one.rmse_m:.2f} m RMS (mean NEES {factor_words(one.nees)}, mean NIS "
+                f"{number_words(nis, 2)}; 1 is consistent)"
+            )
+    small = worst.statement.nis_mean < SMALL_NIS
     words = "; ".join(said) + "."
-    frame = _after_turning(comparison, worst.owner)
     alone = all(one.owner == "ekf2" for one in hidden)
     remedy = REMEDIES["drift" if drifts else "ekf2" if alone else "shared"]
-    if frame is not None:
+    if frame := _after_turning(analysis, worst.owner):
         before, left = frame
         evidence |= {"position_rmse_horizontal_m": before, "position_rmse_aligned_m": left}
         remain = f"of {before:.2f} m horizontally {left:.2f} m remain after the best shift and turn"
-        if left < FRAME_SHARE.value * before:
+        if left < FRAME_SHARE * before:
             words += f" Most of it is how the source's frame lies: {remain}."
             remedy = REMEDIES["frame"]
         elif drifts:
             words += f" The source drifts, and the filter follows it: {remain}."
-    yield Finding(
+    yield finding(
+        "error" if worst.nees >= NEES_ERROR else "warning",
         "errors_larger_than_claimed",
-        "error" if worst.nees >= NEES_ERROR.value else "warning",
-        f"Innovations {'small, errors large' if small else 'consistent, errors not'}: {words} "
-        "Innovations judge a filter against its source, truth judges both.",
+        f"Innovations {'small, errors large' if small else 'consistent, errors not'}",
+        f": {words} Innovations judge a filter against its source, truth judges both.",
         remedy,
         evidence,
     )
@@ -119,40 +119,33 @@ def _detect(analysis: Analysis) -> Found:
 
 def _after_turning(comparison: Comparison, owner: str) -> tuple[float, float] | None:
     """Horizontal RMSE (m) to the truth, and what of it the best shift and turn leave."""
-    axes = comparison.axes
-    if not {"north", "east"} <= axes.keys():
+    axes = [comparison.axes[name] for name in ("north", "east") if name in comparison.axes]
+    truths = [result.truth for result in axes if isinstance(result.truth, pd.DataFrame)]
+    if len(truths) < 2:
         return None
-    north, east = axes["north"], axes["east"]
-    if not isinstance(north.truth, pd.DataFrame) or not isinstance(east.truth, pd.DataFrame):
-        return None
-    times = north.truth.index.to_numpy()
-    columns = []
-    for result in (north, east):
-        if owner == "kf":
-            columns.append(state_at(result.replay, times)[0])
-        elif isinstance(result.ekf2_state, pd.DataFrame):
-            state = result.ekf2_state["position_m"]
-            columns.append(np.interp(times, state.index, state, left=np.nan, right=np.nan))
-    if len(columns) < 2:
-        return None
+    times = truths[0].index.to_numpy()
+    tracks = [_track(result, owner, times) for result in axes]
     level = np.zeros(len(times))
-    estimate = np.column_stack([*columns, level])
-    true = np.column_stack([north.truth["position_m"], east.truth["position_m"], level])
+    estimate = np.column_stack([*tracks, level])
+    true = np.column_stack([*(truth["position_m"] for truth in truths), level])
     known = np.isfinite(estimate).all(axis=1) & np.isfinite(true).all(axis=1)
     estimate, true = estimate[known], true[known]
     try:
         aligned = fit(estimate, true, "yaw").apply(estimate)
     except TrajectoryError:  # too little motion to turn by
         return None
-    return _rms(estimate - true), _rms(aligned - true)
+    root = np.sqrt(len(true))
+    return float(np.linalg.norm(estimate - true) / root), float(
+        np.linalg.norm(aligned - true) / root
+    )
 
 
-def _rms(errors: Array) -> float:
-    """Root mean square of the lengths of vectors, shape (n, 3)."""
-    return float(np.sqrt(np.mean(np.sum(errors**2, axis=1))))
-
-
-DETECTOR = Detector(
-    _detect,
-    names={"errors_larger_than_claimed": "errors larger than the filter claims"},
-)
+def _track(result: AxisComparison, owner: str, times: Array) -> Array:
+    """Position (m) of a filter along one axis; NaN where it is not known."""
+    if owner == "kf":
+        return state_at(result.replay, times)[0]
+    if isinstance(result.ekf2_state, Unavailable):
+        return np.full(len(times), np.nan)
+    state = result.ekf2_state["position_m"]
+    track: Array = np.interp(times, state.index, state, left=np.nan, right=np.nan)
+    return track

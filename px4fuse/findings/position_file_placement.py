@@ -3,28 +3,22 @@
 from __future__ import annotations
 
 from px4fuse.analysis import Analysis
-from px4fuse.findings.model import Detector, Finding, Found, sentence
+from px4fuse.findings.model import Found, finding
+from px4fuse.plain import capital
 
 
-def _detect(analysis: Analysis) -> Found:
+def detect(analysis: Analysis) -> Found:
+    """Every warning of the placing."""
     source = analysis.source
-    alignment = source.alignment
-    if alignment is None:
-        return
-    for warning in alignment.warnings:
+    for warning in source.alignment.warnings if source.alignment is not None else ():
         said, option, value = warning.rstrip(".").partition("ive --position-")
-        message = sentence(f"{said[:-1].rstrip(' :')}" if option else said)
-        yield Finding(
-            "position_file_placement",
+        message = capital(f"{said[:-1].rstrip(' :')}" if option else said).rstrip(".")
+        yield finding(
             "error" if option else "warning",
-            f"{source.name}: {message.rstrip('.')}.",
+            "position_file_placement",
+            f"{source.name}: {message}",
+            ".",
             f"Give --position-{value}."
             if option
             else "Give --clock-offset, --position-frame and --position-yaw where you know them.",
         )
-
-
-DETECTOR = Detector(
-    _detect,
-    names={"position_file_placement": "the placing of the position file"},
-)

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from px4fuse.analysis import Analysis
-from px4fuse.findings.model import Detector, Finding, Found, Threshold
+from px4fuse.findings.model import Found, warning
 from px4fuse.origin import RECEIVED
 
+WANTED = "vehicle_visual_odometry"
 VISION_PROFILE_BIT = 128  # SDLOG_PROFILE bit 7, logged_topics.cpp
-LOGGER_INTERVAL_TOLERANCE = Threshold(
-    0.25, "of the interval", "jitter of PX4's logger seen in flights"
-)
+LOGGER_TOLERANCE = 0.25  # of the interval: jitter of PX4's logger seen in flights
 # Intervals (s) at which PX4's default profile thins these topics, logged_topics.cpp
 LOGGER_INTERVALS_S = {
     "estimator_visual_odometry_aligned": (0.2,),
@@ -18,44 +17,31 @@ LOGGER_INTERVALS_S = {
 }
 
 
-def _detect(analysis: Analysis) -> Found:
-    comparison = analysis
-    source = comparison.source
-    logged = any(
-        track.origin.preference == RECEIVED.preference for track in comparison.flight.positions
-    )
+def detect(analysis: Analysis) -> Found:
+    """What stands in for it, and whether the logger thinned that."""
+    source, received = analysis.source, RECEIVED.preference
+    logged = any(track.origin.preference == received for track in analysis.flight.positions)
     if source.origin.as_sent or logged:
         return
-    profile = int(comparison.flight.log.parameters.get("SDLOG_PROFILE", 1))
-    wanted = "vehicle_visual_odometry"
-    reasons = (part.reason for part in comparison.missing if part.source == wanted)
-    why = next(reasons, "it is not in this log")
+    name, rate_hz = source.name, source.rate_hz
+    profile = int(analysis.flight.log.parameters.get("SDLOG_PROFILE", 1))
+    reasons = (part.reason for part in analysis.missing if part.source == WANTED)
     remedy = f"Set SDLOG_PROFILE to {profile | VISION_PROFILE_BIT} and fly again."
-    yield Finding(
+    yield warning(
         "source_not_logged",
-        "warning",
-        f"The log lacks vehicle_visual_odometry, the position as it arrived ({why}); "
-        f"{source.name} ({source.description}) stands in for it at {source.rate_hz:.1f} Hz.",
+        f"The log lacks {WANTED}, the position as it arrived",
+        f" ({next(reasons, 'it is not in this log')}); {name} ({source.description}) stands in "
+        f"for it at {rate_hz:.1f} Hz.",
         remedy,
-        {"rate_hz": source.rate_hz, "sdlog_profile": float(profile)},
+        {"rate_hz": rate_hz, "sdlog_profile": profile},
     )
-    for interval in LOGGER_INTERVALS_S.get(source.name, ()):
-        if abs(1.0 / source.rate_hz / interval - 1.0) < LOGGER_INTERVAL_TOLERANCE.value:
-            yield Finding(
+    for interval in LOGGER_INTERVALS_S.get(name, ()):
+        if abs(1.0 / rate_hz / interval - 1.0) < LOGGER_TOLERANCE:
+            yield warning(
                 "source_decimated",
-                "warning",
-                f"{source.name} is logged at {source.rate_hz:.1f} Hz, the logger's own limit for "
-                f"it ({1 / interval:g} Hz): the source may have run faster, the samples between "
-                "are lost.",
+                f"{name} is logged at {rate_hz:.1f} Hz, the logger's own limit for it",
+                f" ({1 / interval:g} Hz): the source may have run faster, the samples between are "
+                "lost.",
                 remedy,
-                {"rate_hz": source.rate_hz, "logger_limit_hz": 1.0 / interval},
+                {"rate_hz": rate_hz, "logger_limit_hz": 1.0 / interval},
             )
-
-
-DETECTOR = Detector(
-    _detect,
-    names={
-        "source_not_logged": "a position source that was not logged",
-        "source_decimated": "positions logged too slowly",
-    },
-)

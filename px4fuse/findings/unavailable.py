@@ -3,47 +3,35 @@
 from __future__ import annotations
 
 from px4fuse.analysis import Analysis
-from px4fuse.findings.model import Detector, Finding, Found
+from px4fuse.findings.model import Found, warning
 from px4fuse.flight import Unavailable
 
 
-def _detect(analysis: Analysis) -> Found:
-    comparison = analysis
-    ekf2 = comparison.flight.ekf2
+def detect(analysis: Analysis) -> Found:
+    """All that is missing, with the reason and the remedy that stand in its place."""
+    ekf2, acceleration = analysis.flight.ekf2, analysis.lines[0].acceleration
     if isinstance(ekf2, Unavailable):
-        yield Finding(
+        yield warning(
             "ekf2_unavailable",
-            "warning",
-            f"Nothing to compare with: {ekf2.reason}. The report holds our filter alone.",
+            "Nothing to compare with",
+            f": {ekf2.reason}. The report holds our filter alone.",
             ekf2.remedy,
         )
-    acceleration = comparison.lines[0].acceleration
     if isinstance(acceleration, Unavailable):
-        yield Finding(
+        yield warning(
             "input_unavailable",
-            "warning",
-            f"No acceleration input ({acceleration.what}: {acceleration.reason}); "
-            "our filter assumes constant velocity.",
+            "No acceleration input",
+            f" ({acceleration.what}: {acceleration.reason}); our filter assumes constant velocity.",
             acceleration.remedy,
         )
-    for result in comparison.axes.values():
+    for result in analysis.axes.values():
         ours = result.filters["kf"]
         if isinstance(ours, Unavailable):
-            yield Finding(
+            yield warning(
                 "too_few_innovations",
-                "warning",
-                f"No statement on consistency: {ours.reason}.",
+                "No statement on consistency",
+                f": {ours.reason}.",
                 ours.remedy,
-                {"count": float(len(result.replay.updates))},
+                {"count": len(result.replay.updates)},
             )
             return
-
-
-DETECTOR = Detector(
-    _detect,
-    names={
-        "ekf2_unavailable": "a log without EKF2",
-        "input_unavailable": "a log without acceleration",
-        "too_few_innovations": "too few measurements to judge a filter by",
-    },
-)

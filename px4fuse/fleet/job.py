@@ -151,7 +151,7 @@ def _compared(job: Job, path: Path, sha256: str) -> Outcome:
         status = NOT_JUDGED if isinstance(error, MissingDataError) else FAILED
         text = str(error).removeprefix(f"{path.name}: ")
         return Outcome((known | refused(text, status),))
-    severities = tuple(finding.severity for finding in findings)
+    severities = tuple(one.severity for one in findings if one.caused_by is None)
     return Outcome(tuple(rows_of(found)), severities, text.encode(), report)
 
 

@@ -63,7 +63,9 @@ def rows_of(found: ComparisonResults) -> list[Row]:
         "source": found.source.name,
         "source_rate_hz": found.source.rate_hz,
         "story": "\n".join(found.story),
-        "findings": BETWEEN_FINDINGS.join(finding.id for finding in found.findings),
+        "findings": BETWEEN_FINDINGS.join(
+            one.id for one in found.findings if one.caused_by is None
+        ),
     }
     if isinstance(found.clock, Clock) and found.clock.determinable:
         low, high = found.clock.interval_s

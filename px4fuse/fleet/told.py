@@ -99,11 +99,10 @@ def findings(a: ComparisonResults, b: ComparisonResults) -> Iterator[FindingChan
     sides: tuple[tuple[ComparisonResults, ComparisonResults, Which], ...]
     sides = ((b, a, "B"), (a, b, "A"))
     for mine, other, only_in in sides:
-        known = {name for finding in other.findings for name in finding.ids}
-        for finding in mine.findings:
-            for one in (finding, *finding.consequences):
-                if one.id not in known:
-                    yield FindingChange(one.id, one.severity, one.message, only_in)
+        known = {one.id for one in other.findings}
+        for one in mine.findings:
+            if one.id not in known:
+                yield FindingChange(one.id, one.severity, one.message, only_in)
 
 
 def summary(found: ChangeResults) -> tuple[str, ...]:

@@ -104,7 +104,7 @@ class Evidence:
 
     def has(self, finding: str) -> bool:
         """Whether the report lists a finding."""
-        return any(finding in one.ids for one in self.results.findings)
+        return any(one.id == finding for one in self.results.findings)
 
 
 def values_at(results: Mapping[str, Any], path: str) -> Iterator[tuple[str, Any]]:

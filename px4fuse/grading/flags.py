@@ -115,7 +115,7 @@ def _hand_picked(results: ComparisonResults) -> Iterator[str]:
 
 def _nothing_found(results: ComparisonResults) -> Iterator[str]:
     """A noise is far off and no finding says so: px4fuse would have."""
-    ids = {name for finding in results.findings for name in finding.ids}
+    ids = {one.id for one in results.findings}
     tuned = results.tuning.get(HORIZONTAL)
     if "no_motion" in ids or not isinstance(tuned, Tuned):
         return
