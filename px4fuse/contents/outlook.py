@@ -17,11 +17,14 @@ from px4fuse.comparison.projection import (
 )
 from px4fuse.filter.consistency import MIN_INNOVATIONS
 from px4fuse.filter.signals import Axis, Segment, ned_acceleration, within
-from px4fuse.findings.ekf2_innovations_decimated import MIN_INNOVATION_SHARE
 from px4fuse.findings.ekf2_not_fusing import EV_START_INTERVAL_S
-from px4fuse.findings.imu_gap import IMU_GAP_TOTAL_S
-from px4fuse.findings.logging_rate_low import MIN_ATTITUDE_RATE_HZ, MIN_IMU_RATE_HZ, too_slow
-from px4fuse.findings.source_not_logged import VISION_PROFILE_BIT
+from px4fuse.findings.imu import (
+    IMU_GAP_TOTAL_S,
+    MIN_ATTITUDE_RATE_HZ,
+    MIN_IMU_RATE_HZ,
+    too_slow,
+)
+from px4fuse.findings.missing import MIN_INNOVATION_SHARE, VISION_PROFILE_BIT
 from px4fuse.flight import VELOCITY_COLUMNS, Ekf2, Flight, PositionTrack, Unavailable, sample_rate
 from px4fuse.origin import MOTION_CAPTURE, RECEIVED
 

@@ -22,17 +22,7 @@ from px4fuse.findings.loops import find_in
 from px4fuse.findings.model import SEVERITIES, Finding, Found, Severity, by_root
 from px4fuse.loop.loop import Loop
 
-__all__ = [
-    "NAMES",
-    "SEVERITIES",
-    "Finding",
-    "Severity",
-    "by_root",
-    "detectors",
-    "find",
-    "find_loop",
-    "named",
-]
+__all__ = ["NAMES", "SEVERITIES", "Finding", "Severity", "by_root", "find", "find_loop", "named"]
 
 
 @cache

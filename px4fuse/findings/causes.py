@@ -132,8 +132,6 @@ NOISES = frozenset(
         "sigma_z_large", "sigma_z_small",
     }
 )  # fmt: skip
-# Judged by the setting that it follows from, whatever its own size
-_JUDGED_BY_CAUSE = frozenset({"kf_variance_overstated", "kf_variance_understated"})
 
 
 def by_cause(findings: Iterable[Finding]) -> tuple[Finding, ...]:
@@ -152,7 +150,9 @@ def by_cause(findings: Iterable[Finding]) -> tuple[Finding, ...]:
         groups = [group for group in groups if group not in taken]
         for first, *rest in taken:
             into += [replace(first, caused_by=cause), *rest]
-        weighed = [first.severity for first, *_ in taken if first.id not in _JUDGED_BY_CAUSE]
+        # the variance of our filter is judged by the setting that it follows from
+        own = ("kf_variance_overstated", "kf_variance_understated")
+        weighed = (first.severity for first, *_ in taken if first.id not in own)
         severity = min((into[0].severity, *weighed), key=SEVERITIES.index)
         into[0] = replace(into[0], severity=severity)
     return tuple(one for group in sorted(groups, key=_rank) for one in group)
@@ -164,9 +164,5 @@ def _follows(finding: Finding, listed: tuple[str, ...]) -> bool:
 
 def _rank(group: list[Finding]) -> int:
     """Place in a report."""
-    first = group[0]
-    if first.severity == "error":
-        return 2 if first.id in NOISES else 0
-    if first.severity == "warning":
-        return 1 if first.id in RECORDING else 3
-    return 4
+    error, warning = 2 if group[0].id in NOISES else 0, 1 if group[0].id in RECORDING else 3
+    return {"error": error, "warning": warning, "info": 4}[group[0].severity]

@@ -77,14 +77,9 @@ Found = Iterator[Finding]
 
 
 def finding(
-    severity: Severity,
-    name: str,
-    headline: str,
-    explanation: str,
-    remedy: str,
-    evidence: Mapping[str, int | float | str] | None = None,
-    spans_s: tuple[Span, ...] = (),
-) -> Finding:
+    severity: Severity, name: str, headline: str, explanation: str, remedy: str,
+    evidence: Mapping[str, int | float | str] | None = None, spans_s: tuple[Span, ...] = (),
+) -> Finding:  # fmt: skip
     """A finding whose message begins with its headline and goes on with the explanation."""
     message = f"{headline}{explanation}"
     return Finding(name, severity, message, remedy, evidence or {}, headline, spans_s=spans_s)

@@ -20,7 +20,7 @@ from px4fuse.comparison.model import Comparison
 from px4fuse.comparison.remedy import filter_words
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise
-from px4fuse.findings.errors_larger_than_claimed import hidden_errors
+from px4fuse.findings.hidden_errors import hidden_errors
 from px4fuse.findings.model import Found, Severity, finding, lowered
 from px4fuse.findings.no_motion import MOTION_RANGE_M, motion_range_m
 from px4fuse.flight import Unavailable

@@ -5,19 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 
 from px4fuse.analysis import Analysis
+from px4fuse.comparison import remedy
 from px4fuse.comparison.asked import delay_change
 from px4fuse.comparison.model import Comparison
-from px4fuse.comparison.remedy import (
-    COMMAND,
-    WORSE_FILTER_ERROR,
-    delay_helps,
-    filter_errors_m,
-    replayed,
-    settings_words,
-)
 from px4fuse.filter.clock import CHANGE_P, ClockOffset
 from px4fuse.findings.model import Found, error, finding
-from px4fuse.findings.source_smoothed import low_pass
+from px4fuse.findings.source_positions import low_pass
 from px4fuse.findings.source_stamps import until_synchronised
 from px4fuse.flight import Unavailable
 
@@ -52,12 +45,12 @@ def detect(analysis: Analysis) -> Found:
     # one offset cannot hold for stamps that are of arrival in a part of the flight only
     if size <= max(OFFSET_S, clock.chance_s) or until_synchronised(analysis) is not None:
         return
-    remedy = f"{COMMAND} --clock-offset {typed_offset_s(analysis, clock):.3f}"
+    typed = f"{remedy.COMMAND} --clock-offset {typed_offset_s(analysis, clock):.3f}"
     shifted = replace(analysis.settings, clock_offset_s=round(clock.offset_s, 3))
-    if errors := filter_errors_m(analysis, shifted):
-        if errors[1] > WORSE_FILTER_ERROR * errors[0]:
+    if errors := remedy.filter_errors_m(analysis, shifted):
+        if errors[1] > remedy.WORSE_FILTER_ERROR * errors[0]:
             return  # the truth knows better
-        remedy += f": position error {errors[0]:.3f} → {errors[1]:.3f} m (replayed)"
+        typed += f": position error {errors[0]:.3f} → {errors[1]:.3f} m (replayed)"
     side, ends = "early", (low - clock.applied_s, high - clock.applied_s)
     if clock.remaining_s < 0:
         side, ends = "late", (-ends[1], -ends[0])
@@ -67,7 +60,7 @@ def detect(analysis: Analysis) -> Found:
         f"The stamps of {source.name} are {side} by {size:.3f} s against the IMU",
         f" (95 % {ends[0]:.3f} to {ends[1]:.3f} s): at 1 m/s that is an error of {size:.2f} m, "
         "which neither filter's innovations show.",
-        f"{remedy}{_for_ekf2(analysis, clock)}.",
+        f"{typed}{_for_ekf2(analysis, clock)}.",
         evidence,
     )
 
@@ -78,10 +71,10 @@ def _for_ekf2(analysis: Analysis, clock: ClockOffset) -> str:
     if isinstance(model, Unavailable) or analysis.source.name != model.inputs.vision.source:
         return ""
     changes = delay_change(model, -1e3 * clock.offset_s)
-    found = replayed(model, changes) if changes else []
+    found = remedy.replayed(model, changes) if changes else []
     for effect in [] if isinstance(found, Unavailable) else found:
-        if delay_helps(effect.before, effect.after):
-            return f"; for EKF2 set {settings_words(changes)}: {effect.words()}"
+        if remedy.delay_helps(effect.before, effect.after):
+            return f"; for EKF2 set {remedy.settings_words(changes)}: {effect.words()}"
     return ""
 
 

@@ -7,6 +7,7 @@ from px4fuse.filter.heading import DRIFT_P, HeadingError
 from px4fuse.findings.ekf2_not_fusing import FUSING_SHARE_ERROR
 from px4fuse.findings.model import Finding, Found, Severity, finding, share_on
 from px4fuse.flight import Ekf2, Unavailable
+from px4fuse.plain import capital
 
 HEADING_SIGMAS = 4.0  # standard deviations; clean flights were seen up to 3.2
 HEADING_ERROR_DEG = 5.0  # EKF2's magnetic heading was off by 3 to 4° in flights seen
@@ -24,6 +25,7 @@ def detect(analysis: Analysis) -> Found:
     heading = analysis.heading
     if isinstance(heading, HeadingError) and not analysis.source.origin.reconstructed:
         yield from turned(analysis, heading)
+    yield from placement(analysis)
 
 
 def not_north(analysis: Analysis) -> Finding:
@@ -111,3 +113,20 @@ def _drifting(source: str, heading: HeadingError, remedy: str) -> Finding:
             "p_limit": DRIFT_P,
         },
     )
+
+
+def placement(analysis: Analysis) -> Found:
+    """What is poorly determined about where a position file lies in the flight."""
+    source = analysis.source
+    for warning in source.alignment.warnings if source.alignment is not None else ():
+        said, option, value = warning.rstrip(".").partition("ive --position-")
+        message = capital(f"{said[:-1].rstrip(' :')}" if option else said).rstrip(".")
+        yield finding(
+            "error" if option else "warning",
+            "position_file_placement",
+            f"{source.name}: {message}",
+            ".",
+            f"Give --position-{value}."
+            if option
+            else "Give --clock-offset, --position-frame and --position-yaw where you know them.",
+        )

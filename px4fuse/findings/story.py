@@ -17,7 +17,7 @@ from px4fuse.comparison.model import AgainstTruth, AxisComparison, Difference, F
 from px4fuse.comparison.why import Why
 from px4fuse.comparison.why_words import STAMPS_WRONG, the
 from px4fuse.filter.kalman import state_at
-from px4fuse.findings.errors_larger_than_claimed import hidden_errors
+from px4fuse.findings.hidden_errors import hidden_errors
 from px4fuse.findings.model import Finding
 from px4fuse.findings.sigma import tuned_for
 from px4fuse.flight import Unavailable

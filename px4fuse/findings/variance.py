@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TypeGuard
+
 import numpy as np
 from msgspec import structs
 
@@ -14,7 +16,7 @@ from px4fuse.filter.fitting import SIGMA_Z_SEARCH_M
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise
 from px4fuse.findings.causes import CAUSE, ELSEWHERE, NOISE, OUTLIERS
-from px4fuse.findings.errors_larger_than_claimed import hidden_errors
+from px4fuse.findings.hidden_errors import hidden_errors
 from px4fuse.findings.model import Finding, Found, Severity, finding, lowered
 from px4fuse.findings.sigma import LAG1_SLOW, SMALLEST_SIGMA_Z_M, try_out, tuned_for
 from px4fuse.flight import Unavailable
@@ -47,26 +49,24 @@ Member = tuple[AxisComparison, Consistency]
 def detect(analysis: Analysis) -> Found:
     """One finding for the horizontal axes, which the vertical one follows: they have one noise."""
     for owner in FILTERS:
-        off: list[Member] = []
-        for result in analysis.axes.values():
-            statement = result.filters[owner]
-            if isinstance(statement, Unavailable) or statement.verdict == "consistent":
-                continue
-            factor = statement.variance_factor
-            if max(factor, 1.0 / factor) >= VARIANCE_FACTOR:
-                off.append((result, statement))
         for over in (True, False):
             first = None
             for group, axes in GROUPS.items():
-                members = [
-                    (result, statement)
-                    for result, statement in off
-                    if result.axis.name in axes and (statement.variance_factor > 1.0) == over
-                ]
+                results = [analysis.axes[name] for name in axes if name in analysis.axes]
+                pairs = [(result, result.filters[owner]) for result in results]
+                members = [(result, each) for result, each in pairs if _is_off(each, over=over)]
                 if members:
                     found = _of_group(analysis, owner, group, members)
                     yield structs.replace(found, caused_by=first)
                     first = found.id
+
+
+def _is_off(statement: Consistency | Unavailable, *, over: bool) -> TypeGuard[Consistency]:
+    """Whether a variance is over-, or else understated."""
+    if isinstance(statement, Unavailable):
+        return False
+    factor = statement.variance_factor if over else 1.0 / statement.variance_factor
+    return statement.verdict != "consistent" and factor >= VARIANCE_FACTOR
 
 
 def _of_group(analysis: Analysis, owner: FilterName, group: str, members: list[Member]) -> Finding:
@@ -86,7 +86,7 @@ def _of_group(analysis: Analysis, owner: FilterName, group: str, members: list[M
     elif tuned is None:
         remedy, cause = "Which noise the data ask for could not be told: see tuning.", ELSEWHERE
     else:
-        remedy, cause = _remedy(analysis, owner, result, statement, tuned)
+        cause, remedy = _remedy(analysis, owner, result, statement, tuned)
     evidence: dict[str, float | str] = {
         "axis": result.axis.name,
         "variance_factor": statement.variance_factor,
@@ -129,7 +129,7 @@ def _remedy(
     analysis: Analysis, owner: FilterName, result: AxisComparison, statement: Consistency,
     tuned: AxisTuning,
 ) -> tuple[str, str]:  # fmt: skip
-    """The measurement noise that the data ask for, as what to type or to set, and the cause.
+    """The cause, and the measurement noise that the data ask for, as what to type or to set.
 
     It is a property of the source, so our estimate of it serves EKF2 as well.
     """
@@ -137,16 +137,14 @@ def _remedy(
     lag1, needed = statement.lag1_autocorrelation, tuned.filter_sigma_a.value or 0.0
     asked_m, bounded = _asked_m(tuned.sigma_z), tuned.sigma_z.value is None
     if owner == "kf" and not over and lag1 > LAG1_SLOW and needed > settings.sigma_a_m_s2:
-        return (
+        return ELSEWHERE, (
             f"The filter follows too slowly (lag-1 correlation {lag1:+.2f}): raise SIGMA_A first. "
-            f"{try_out(analysis, {'--sigma-a': needed})}",
-            ELSEWHERE,
+            f"{try_out(analysis, {'--sigma-a': needed})}"
         )
     if asked_m is None:
-        return (
+        return ELSEWHERE, (
             f"No SIGMA_Z up to {SIGMA_Z_SEARCH_M[1]:g} m explains it: look at the acceleration "
-            "input (IMU rate, gaps, vibration) and at the clocks.",
-            ELSEWHERE,
+            "input (IMU rate, gaps, vibration) and at the clocks."
         )
     used_m = settings.sigma_z_m if owner == "kf" else _ekf2_noise_m(result)
     if owner == "ekf2" and bounded:  # EKF2's own innovations bound it too, and less tightly
@@ -160,7 +158,7 @@ def _remedy(
     if bounded:
         why = f"The source's noise is at most {noise_m:.2g} m, below what this rate can show."
         noise_m, more = max(noise_m, SMALLEST_SIGMA_Z_M), ", and less SIGMA_A"
-    return f"{why} {try_out(analysis, {'--sigma-z': float(f'{noise_m:.2g}')}, more)}", NOISE
+    return NOISE, f"{why} {try_out(analysis, {'--sigma-z': float(f'{noise_m:.2g}')}, more)}"
 
 
 def _other_cause(
@@ -168,17 +166,16 @@ def _other_cause(
 ) -> tuple[str, str]:
     """Where to look when the noise is as large as the filter takes it to be."""
     if statement.variance_factor < 1.0 and _has_outliers(analysis, statement):
-        return (
+        return OUTLIERS, (
             f"{statement.outside_gate:.1%} lie outside the gate while the bulk fits "
             f"{noise_m:.2g} m: remove the outliers (line of sight, anchor survey) instead of "
-            "raising the noise.",
-            OUTLIERS,
+            "raising the noise."
         )
     name, where = "SIGMA_Z", "SIGMA_A (--sigma-a) and the clock (--clock-offset)"
     if owner == "ekf2":
         name = "EKF2_EVP_NOISE"
         where = "the clock (EKF2_EV_DELAY) and at EKF2's process noise (EKF2_ACC_NOISE)"
-    return f"It is not {name} (the source's noise is {noise_m:.2g} m): look at {where}.", ELSEWHERE
+    return ELSEWHERE, f"It is not {name} (the source's noise is {noise_m:.2g} m): look at {where}."
 
 
 def _ekf2_remedy(
@@ -196,11 +193,11 @@ def _ekf2_remedy(
             "EKF2_EVP_NOISE: correct it there, or "
         )
     if result.axis.name == "down":
-        return f"{why}set {settings_words(changes)}. {not_replayed(ONLY_HORIZONTAL)}", NOISE
+        return NOISE, f"{why}set {settings_words(changes)}. {not_replayed(ONLY_HORIZONTAL)}"
     words, helps = remedy_words(
         analysis.ekf2_model, changes, noise_helps, why=why, otherwise=LOOK_ELSEWHERE
     )
-    return words, NOISE if helps else ELSEWHERE
+    return NOISE if helps else ELSEWHERE, words
 
 
 def _noise_helps(noise_m: float, used_m: float, *, over: bool) -> bool:
@@ -209,17 +206,19 @@ def _noise_helps(noise_m: float, used_m: float, *, over: bool) -> bool:
     More noise fixes one that is understated, less one that is overstated; if the noise already
     fits, or the other way round, the cause lies elsewhere.
     """
-    if 1 / NOISE_FITS < noise_m / used_m < NOISE_FITS:
-        return False
-    return not (noise_m > used_m if over else noise_m < used_m)
+    ratio = noise_m / used_m
+    return not (ratio > 1.0 / NOISE_FITS if over else ratio < NOISE_FITS)
 
 
 def _has_outliers(analysis: Analysis, statement: Consistency) -> bool:
     """Whether gross outliers explain the innovations, which the source has as well."""
     tuned = analysis.tuning.get(HORIZONTAL)
-    if isinstance(tuned, AxisTuning) and (len(tuned.outlier_time_s) <= OUTLIER_SHARE * tuned.count):
-        return False  # it is the filter that is elsewhere
-    return statement.outside_gate > OUTLIER_SHARE
+    if statement.outside_gate <= OUTLIER_SHARE:
+        return False
+    # where the source has none, it is the filter that is elsewhere
+    return not isinstance(tuned, AxisTuning) or (
+        len(tuned.outlier_time_s) > OUTLIER_SHARE * tuned.count
+    )
 
 
 def _ekf2_noise_m(result: AxisComparison) -> float:

@@ -1,4 +1,4 @@
-"""Innovations that a filter is content with, and errors against the truth that it is not.
+"""What innovations cannot show: errors against the truth, and the drift of a source.
 
 Innovations judge a filter against its source, truth judges both: an error that filter and source
 share shows in no innovation. Normalised by the variance that the filter states, the squared error
@@ -18,8 +18,10 @@ from px4fuse.comparison.model import AgainstTruth, AxisComparison, Comparison
 from px4fuse.errors import TrajectoryError
 from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.kalman import state_at
-from px4fuse.findings.model import Found, finding
+from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
+from px4fuse.findings.model import Finding, Found, finding, info
 from px4fuse.flight import Unavailable
+from px4fuse.loop.loop import Loop
 from px4fuse.plain import factor_words, number_words
 from px4fuse.trajectory.alignment import fit
 
@@ -72,10 +74,15 @@ def hidden_errors(comparison: Comparison) -> list[Hidden]:
 
 
 def detect(analysis: Analysis) -> Found:
+    """Errors that innovations hide, or a drift that nothing shows."""
+    if hidden := hidden_errors(analysis):
+        yield larger(analysis, hidden)
+    elif analysis.source.origin.may_drift:
+        yield drift(analysis)
+
+
+def larger(analysis: Analysis, hidden: list[Hidden]) -> Finding:
     """Told of each filter's worst axis."""
-    hidden = hidden_errors(analysis)
-    if not hidden:
-        return
     worst, drifts = hidden[0], analysis.source.origin.may_drift
     evidence: dict[str, float | str] = {"axis": worst.axis, "filter": worst.owner}
     said = []
@@ -107,7 +114,7 @@ def detect(analysis: Analysis) -> Found:
             remedy = REMEDIES["frame"]
         elif drifts:
             words += f" The source drifts, and the filter follows it: {remain}."
-    yield finding(
+    return finding(
         "error" if worst.nees >= NEES_ERROR else "warning",
         "errors_larger_than_claimed",
         f"Innovations {'small, errors large' if small else 'consistent, errors not'}",
@@ -134,10 +141,9 @@ def _after_turning(comparison: Comparison, owner: str) -> tuple[float, float] | 
         aligned = fit(estimate, true, "yaw").apply(estimate)
     except TrajectoryError:  # too little motion to turn by
         return None
-    root = np.sqrt(len(true))
-    return float(np.linalg.norm(estimate - true) / root), float(
-        np.linalg.norm(aligned - true) / root
-    )
+    errors = (estimate - true, aligned - true)
+    before, left = (float(np.linalg.norm(error)) / len(true) ** 0.5 for error in errors)
+    return before, left
 
 
 def _track(result: AxisComparison, owner: str, times: Array) -> Array:
@@ -149,3 +155,27 @@ def _track(result: AxisComparison, owner: str, times: Array) -> Array:
     state = result.ekf2_state["position_m"]
     track: Array = np.interp(times, state.index, state, left=np.nan, right=np.nan)
     return track
+
+
+def drift(analysis: Analysis) -> Finding:
+    """Neither truth nor anything else judges it: what it scatters by, and what its loop shows."""
+    name, tuned, loop = analysis.source.name, analysis.tuning.get(HORIZONTAL), analysis.loop
+    evidence: dict[str, float | str] = {"source": name}
+    more = ""
+    if isinstance(tuned, AxisTuning) and (noise := tuned.sigma_z.value or tuned.sigma_z.high):
+        bound = "at most " if tuned.sigma_z.value is None else ""
+        evidence |= {"short_term_noise_m": noise}
+        more = f" Over a second or so it scatters by {bound}{noise:.2g} m, which is not its error."
+    if isinstance(loop, Loop) and (gap_m := loop.closure_error_m) is not None:
+        evidence |= {"closure_error_m": gap_m, "path_length_m": loop.path_length_m}
+        more += f" Its loop misses by {gap_m:.2f} m after {loop.path_length_m:.0f} m."
+    return info(
+        "source_may_drift",
+        f"Consistency with {name} is not correctness",
+        ": it comes with a heading of its own, as odometry (VIO, SLAM) does, and odometry drifts. "
+        "Innovations say how well a filter follows its source, not where the vehicle was."
+        f"{more}",
+        "Judge it by a loop (px4fuse loop LOG) or by a truth (ATT_POS_MOCAP). Only if it is motion "
+        "capture, which does not drift, do its innovations tell its noise.",
+        evidence,
+    )
