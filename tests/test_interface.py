@@ -291,7 +291,7 @@ def test_tables_are_tidy_with_units(results, name):
     without_unit = (
         "nis_mean|nis_band|nees_|outside_|autocorrelation|gain_nats|_share|sigma_factor|_p$|bias_t|_lags|count|"
         # a column has the unit
-        "^([wxyzabpq]|change|change_low|change_high|delta|interval_m_blocks)$"
+        "^([wxyzabpq]|change|change_low|change_high|delta)$|_block"
     )
     unit = r"_(m|s|m_s|m_s2|m2|m2_s2|deg)(_(interval|low|high|rmse|mean|median|std|min|max)|$)"
     for column in table.select_dtypes("floating"):
