@@ -29,10 +29,11 @@ from px4fuse.comparison.estimates import (
 )
 from px4fuse.comparison.model import Comparison
 from px4fuse.comparison.preparation import prepare
-from px4fuse.comparison.why import Why, why_ekf2_differs
+from px4fuse.comparison.why import why_ekf2_differs
 from px4fuse.display import brief
 from px4fuse.ekf2.model import Model, open_model
 from px4fuse.ekf2.replay import Ekf2Replay
+from px4fuse.ekf2.walk import Why
 from px4fuse.ekf2.whatif import WhatIf, sweep_values, what_if
 from px4fuse.ekf2_parameters import check
 from px4fuse.errors import LogError, MissingDataError, SettingsError

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from px4fuse.ekf2.inputs import Inputs, Rules
-from px4fuse.ekf2.legs import GRAVITY_M_S2
+from px4fuse.ekf2.intervals import GRAVITY_M_S2
 from px4fuse.ekf2.stretches import Stretch
 from px4fuse.trajectory.rotation import skew
 

@@ -112,7 +112,7 @@ def test_rules_of_the_releases(monkeypatch: pytest.MonkeyPatch) -> None:
     assert isinstance(new, Inputs)
     assert new.rules == Rules(0.2, 0.4, 1.0, 5, None, False)
     assert new.imu_offset_m.tolist() == [0.0, 0.25, 0.0]
-    assert (new.step_s, new.horizon_s, new.predict_s, new.max_leg_s) == (0.01, 0.1, 0.01, 0.25)
+    assert (new.step_s, new.horizon_s, new.predict_s, new.max_interval_s) == (0.01, 0.1, 0.01, 0.25)
     old = flown(monkeypatch, parameters={"EKF2_AID_MASK": 8.0}, per_step_biases=True)
     assert isinstance(old, Inputs)
     assert old.rules == Rules(math.inf, 7.0, 7.0, 1_000_000, pytest.approx(5e-4), True)

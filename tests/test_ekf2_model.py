@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from px4fuse.ekf2 import model as model_module
 from px4fuse.ekf2.inputs import Inputs, prepare
-from px4fuse.ekf2.legs import FUSE, START, Legs, Timing, make_legs
+from px4fuse.ekf2.intervals import FUSE, START, Legs, Timing, make_intervals
 from px4fuse.ekf2.model import (
     Model,
     delayed_states,
@@ -228,7 +228,7 @@ def test_vision_that_pauses_stops_fusion_until_two_samples_in_a_row(
     paused = samples[(samples.index < 60.0) | (samples.index > 61.0)]
     inputs = prepare(with_vision(sample_flight, paused))
     assert isinstance(inputs, Inputs)
-    legs = make_legs(inputs, inputs.stretches[0], Timing(0.0, inputs.horizon_s))
+    legs = make_intervals(inputs, inputs.stretches[0], Timing(0.0, inputs.horizon_s))
     sampled = legs.sample >= 0
     action, time = legs.action[sampled], legs.time_s[sampled]
     started = np.flatnonzero(action == START)
@@ -241,7 +241,7 @@ def test_vision_that_pauses_stops_fusion_until_two_samples_in_a_row(
     assert (action[time < 60.0][1:] == FUSE).all()
     # up to v1.13 there is no such rule
     patient = replace(inputs.rules, start_interval_s=np.inf, stop_s=7.0)
-    legs = make_legs(
+    legs = make_intervals(
         replace(inputs, rules=patient), inputs.stretches[0], Timing(0.0, inputs.horizon_s)
     )
     assert (legs.action[legs.sample >= 0][1:-3] == FUSE).all()

@@ -17,7 +17,7 @@ from findings_tools import log, made
 from scipy.spatial.transform import Rotation
 
 from px4fuse.ekf2.inputs import Inputs
-from px4fuse.ekf2.legs import FUSE, GRAVITY_M_S2, IDLE, START, Timing, make_legs
+from px4fuse.ekf2.intervals import FUSE, GRAVITY_M_S2, IDLE, START, Timing, make_intervals
 from px4fuse.ekf2.model import Model, replay_settings
 from px4fuse.ekf2.recursion import (
     Run,
@@ -196,7 +196,7 @@ def at_rest(
         settings_in_force(settings), (stretch,), vision, RULES, 0.01, 0.1, 0.01,
         vision_height=False, imu_offset_m=np.zeros(3),
     )  # fmt: skip
-    legs = make_legs(inputs, stretch, Timing(0.0, 0.1))
+    legs = make_intervals(inputs, stretch, Timing(0.0, 0.1))
     variant = Variant(inputs.settings, as_logged=True)
     return run(inputs, stretch, [legs], np.zeros(1, np.intp), [variant])
 

@@ -64,11 +64,8 @@ def asked_of_ekf2(
 
 def tuned_noise_m(tuning: Mapping[str, AxisTuning | Unavailable]) -> float | None:
     """Horizontal measurement noise (m) that the data ask for; None where they do not tell."""
-    for name in (HORIZONTAL, AISLE, "north", "east"):
-        tuned = tuning.get(name)
-        if isinstance(tuned, AxisTuning):
-            return tuned.sigma_z.value
-    return None
+    known = (tuning.get(name) for name in (HORIZONTAL, AISLE, "north", "east"))
+    return next((tuned.sigma_z.value for tuned in known if isinstance(tuned, AxisTuning)), None)
 
 
 def noise_change(model: Model, noise_m: float) -> dict[str, float]:
@@ -94,12 +91,10 @@ def delay_change(model: Model, delay_ms: float) -> dict[str, float]:
     if delay_ms > known.maximum:
         return {}
     changes = {"EKF2_EV_DELAY": max(float(round(delay_ms)), known.minimum)}
-    needed = changes["EKF2_EV_DELAY"] + ARRIVAL_MS
-    if not model.inputs.rules.horizon_by_delay and (
-        needed > model.inputs.settings["EKF2_DELAY_MAX"]
-    ):
+    needed, flown = changes["EKF2_EV_DELAY"] + ARRIVAL_MS, model.inputs.settings
+    if not model.inputs.rules.horizon_by_delay and needed > flown["EKF2_DELAY_MAX"]:
         changes["EKF2_DELAY_MAX"] = DELAY_STEP_MS * math.ceil(needed / DELAY_STEP_MS)
-    return {name: value for name, value in changes.items() if value != model.inputs.settings[name]}
+    return {name: value for name, value in changes.items() if value != flown[name]}
 
 
 def noise_used_m(model: Model) -> float:

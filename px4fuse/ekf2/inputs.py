@@ -6,22 +6,20 @@ from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
+from px4fuse.arrays import Array
 from px4fuse.display import brief
 from px4fuse.ekf2.stretches import MIN_STRETCH_S, Stretch, find_stretches, predict_s
 from px4fuse.ekf2.vision import WHAT, Vision, read_vision
 from px4fuse.ekf2_parameters import fuses_by_mask, settings_in_force
-from px4fuse.flight import Ekf2, Flight, Unavailable
-
-Array = NDArray[np.float64]
+from px4fuse.flight import Ekf2, Flight, FusionRecord, Unavailable
 
 # Predictions of more than this lose turns and vibration inside a step; EKF2's own are 8 to 13 ms
 MAX_IMU_INTERVAL_S = 0.012
 # The first release that stamps estimator_states with the time of the horizon
 STAMPED_AT_HORIZON = "PX4 v1.13"
 NO_LIMIT = 1_000_000
-MAX_LEG_S = 0.25
+MAX_INTERVAL_S = 0.25
 
 
 @dataclass(frozen=True)
@@ -73,7 +71,7 @@ class Inputs:
         Whether EKF2 took its height from vision.
     imu_offset_m : ndarray, shape (3,)
         EKF2_IMU_POS, body FRD.
-    max_leg_s : float
+    max_interval_s : float
         Height and heading are measured at least this often where vision is silent.
     """
 
@@ -86,7 +84,7 @@ class Inputs:
     predict_s: float
     vision_height: bool
     imu_offset_m: Array
-    max_leg_s: float = MAX_LEG_S
+    max_interval_s: float = MAX_INTERVAL_S
 
     __repr__ = brief
 
@@ -105,12 +103,11 @@ def prepare(flight: Flight) -> Inputs | Unavailable:  # noqa: PLR0911 (a reason 
     assert isinstance(imu, pd.DataFrame)
     assert isinstance(attitude, pd.DataFrame)
     assert isinstance(ekf2, Ekf2)
-    record = ekf2.record
-    if isinstance(record, Unavailable):
-        return Unavailable(WHAT, record.reason, record.remedy)
-    fused = ekf2.innovations["north"]
-    if isinstance(fused, Unavailable):
-        return Unavailable(WHAT, fused.reason, fused.remedy)
+    record, horizon_s = ekf2.record, ekf2.horizon_s
+    for each in (record, ekf2.innovations["north"]):
+        if isinstance(each, Unavailable):
+            return Unavailable(WHAT, each.reason, each.remedy)
+    assert isinstance(record, FusionRecord)
     if record.other_aiding:
         return Unavailable(
             WHAT,
@@ -127,7 +124,6 @@ def prepare(flight: Flight) -> Inputs | Unavailable:  # noqa: PLR0911 (a reason 
     vision = read_vision(flight, ekf2, record, attitude)
     if isinstance(vision, Unavailable):
         return vision
-    horizon_s = ekf2.horizon_s
     if isinstance(horizon_s, Unavailable):
         if not flight.log.firmware.startswith(STAMPED_AT_HORIZON):
             return Unavailable(WHAT, horizon_s.reason, horizon_s.remedy)
@@ -139,21 +135,17 @@ def prepare(flight: Flight) -> Inputs | Unavailable:  # noqa: PLR0911 (a reason 
             f"no {MIN_STRETCH_S:g} s of external vision fused without a gap in IMU or vision",
             "Record without dropouts (a faster SD card, fewer topics), and send vision steadily.",
         )
-    old = fuses_by_mask(record.parameters)
     floor = 5e-8 / ekf2.step_s**2 if record.per_step_biases else None
     # EV_MAX_INTERVAL, ev_control.cpp; no_aid_timeout_max and reset_timeout_max, common.h
-    by_delay = "EKF2_DELAY_MAX" not in record.parameters
-    rules = (
-        Rules(np.inf, 7.0, 7.0, NO_LIMIT, floor, by_delay)
-        if old
-        else Rules(0.2, 0.4, 1.0, 5, floor, by_delay)
+    limits = (
+        (np.inf, 7.0, 7.0, NO_LIMIT) if fuses_by_mask(record.parameters) else (0.2, 0.4, 1.0, 5)
     )
     fusing = ekf2.fusing
     return Inputs(
         settings=settings_in_force(record.parameters),
         stretches=stretches,
         vision=vision,
-        rules=rules,
+        rules=Rules(*limits, floor, "EKF2_DELAY_MAX" not in record.parameters),
         step_s=ekf2.step_s,
         horizon_s=horizon_s,
         predict_s=predict_s(record),

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
+from px4fuse.arrays import Array, BoolArray, IntArray
 from px4fuse.display import brief
 from px4fuse.ekf2_parameters import fuses_by_mask, settings_in_force
 from px4fuse.flight import (
@@ -26,8 +26,6 @@ from px4fuse.flight import (
 )
 from px4fuse.origin import GIVEN_FILE
 from px4fuse.trajectory.rotation import conjugate, interpolate, matrix, multiply
-
-Array = NDArray[np.float64]
 
 WHAT = "EKF2 replay"
 # Logger limits of the topics that hold a copy of the vision samples (logged_topics.cpp)
@@ -64,7 +62,7 @@ class Vision:
     position_m: Array
     variance_m2: Array
     rejected: Array
-    reset: NDArray[np.bool_]
+    reset: BoolArray
     source: str
 
     __repr__ = brief
@@ -101,49 +99,52 @@ def read_vision(
                 "EKF2 turned it north",
                 "Send the position in NED, or with an orientation.",
             )
-        published = interpolate(
-            stamp, attitude.index.to_numpy(), attitude[QUATERNION_COLUMNS].to_numpy()
-        )
-        sent = interpolate(
-            stamp,
-            track.orientation.index.to_numpy(),
-            track.orientation[QUATERNION_COLUMNS].to_numpy(),
+        published, sent = (
+            interpolate(stamp, frame.index.to_numpy(), frame[QUATERNION_COLUMNS].to_numpy())
+            for frame in (attitude, track.orientation)
         )
         turn = matrix(multiply(published, conjugate(sent)))
         position = np.einsum("nij,nj->ni", turn, position)
         variance = np.einsum("nij,nj->ni", turn**2, variance)
     age = record.vision_age_s
+    arrival = np.full(len(stamp), -np.inf)  # unknown: never taken to be late
     if len(age) and "vehicle_visual_odometry" in track.topics:
         arrival = stamp + np.interp(stamp, age.index.to_numpy(), age.to_numpy())
-    else:
-        arrival = np.full(len(stamp), -np.inf)  # unknown: never taken to be late
-    rejected, reset = _decisions(ekf2, record, stamp)
-    return Vision(stamp, arrival, position, variance, rejected, reset, track.name)
+    decisions = _decisions(ekf2, record, stamp)
+    return Vision(stamp, arrival, position, variance, *decisions, track.name)
 
 
-def _decisions(ekf2: Ekf2, record: FusionRecord, stamp: Array) -> tuple[Array, NDArray[np.bool_]]:
+def _decisions(ekf2: Ekf2, record: FusionRecord, stamp: Array) -> tuple[Array, BoolArray]:
     """What EKF2 rejected and reset to, where its aid-source topic tells, by time of measurement."""
     rejected, reset = np.full(len(stamp), np.nan), np.zeros(len(stamp), dtype=bool)
-    innovations = ekf2.innovations["north"]
-    if (
-        isinstance(innovations, Unavailable)
-        or isinstance(ekf2.horizon_s, Unavailable)
-        or AID_SOURCE not in ekf2.innovation_topics
-    ):
+    innovations, horizon_s = ekf2.innovations["north"], ekf2.horizon_s
+    known = AID_SOURCE in ekf2.innovation_topics
+    if isinstance(innovations, Unavailable) or isinstance(horizon_s, Unavailable) or not known:
         return rejected, reset
     delay_s = settings_in_force(record.parameters)["EKF2_EV_DELAY"] * 1e-3
-    taken, logged = stamp - delay_s - 0.5 * ekf2.step_s, innovations.index.to_numpy()
-    at = np.clip(np.searchsorted(logged, taken - SAME_SAMPLE_S), 0, len(logged) - 1)
-    same = np.abs(logged[at] - taken) <= SAME_SAMPLE_S
-    rejected[same] = innovations["rejected"].to_numpy()[at[same]]
+    taken = stamp - delay_s - 0.5 * ekf2.step_s
+    row = same_sample(innovations.index.to_numpy(), taken)
+    rejected[row >= 0] = innovations["rejected"].to_numpy()[row[row >= 0]]
     # a reset shows in the first published sample after it, the horizon after the measurement
-    published = taken + ekf2.horizon_s
-    for one in ekf2.resets:
-        before = np.flatnonzero((published <= one.time_s) & (rejected != 0.0))
-        moved = one.quantity == "position" and bool(one.delta[0] or one.delta[1])
-        if moved and len(before) and one.time_s - published[before[-1]] < RESET_SHOWS_S:
+    published = taken + horizon_s
+    for shown_s in horizontal_resets_s(ekf2):
+        before = np.flatnonzero((published <= shown_s) & (rejected != 0.0))
+        if len(before) and shown_s - published[before[-1]] < RESET_SHOWS_S:
             reset[before[-1]] = True
     return rejected, reset
+
+
+def same_sample(known_s: Array, wanted_s: Array) -> IntArray:
+    """Row of the sample of each time of measurement; -1 where there is none."""
+    at = np.clip(np.searchsorted(known_s, wanted_s - SAME_SAMPLE_S), 0, len(known_s) - 1)
+    return np.where(np.abs(known_s[at] - wanted_s) <= SAME_SAMPLE_S, at, -1)
+
+
+def horizontal_resets_s(ekf2: Ekf2) -> Array:
+    """When resets of EKF2's horizontal position show in what it publishes."""
+    return np.array(
+        [one.time_s for one in ekf2.resets if one.quantity == "position" and any(one.delta[:2])]
+    )
 
 
 def _source(flight: Flight) -> PositionTrack | Unavailable:
@@ -154,8 +155,7 @@ def _source(flight: Flight) -> PositionTrack | Unavailable:
             return track
         if track.name in COPY_INTERVAL_S:
             interval = float(np.median(np.diff(track.samples.index.to_numpy())))
-            limit = COPY_INTERVAL_S[track.name]
-            if interval < 0.9 * limit and interval <= 0.25:
+            if interval < 0.9 * COPY_INTERVAL_S[track.name] and interval <= 0.25:
                 return track
             why.append(
                 f"{track.name} holds one sample in {interval:.2g} s, fewer than EKF2 may have fused"
