@@ -15,9 +15,8 @@ from findings_tools import NONE, log, made
 from scipy.spatial.transform import Rotation
 
 from px4fuse.ekf2 import inputs as inputs_module
-from px4fuse.ekf2.inputs import Inputs, Rules, prepare
+from px4fuse.ekf2.inputs import Inputs, Rules, Vision, _decisions, _source, prepare, read_vision
 from px4fuse.ekf2.stretches import Stretch
-from px4fuse.ekf2.vision import Vision, _decisions, _source, read_vision
 from px4fuse.ekf2.whatif import sweep_values
 from px4fuse.ekf2_parameters import PARAMETERS, check, fuses_by_mask, settings_in_force
 from px4fuse.errors import SettingsError

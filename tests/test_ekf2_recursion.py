@@ -16,7 +16,7 @@ from exchange import replace
 from findings_tools import log, made
 from scipy.spatial.transform import Rotation
 
-from px4fuse.ekf2.inputs import Inputs
+from px4fuse.ekf2.inputs import Inputs, Vision
 from px4fuse.ekf2.intervals import FUSE, GRAVITY_M_S2, IDLE, START, Timing, make_intervals
 from px4fuse.ekf2.model import Model, replay_settings
 from px4fuse.ekf2.recursion import (
@@ -31,7 +31,6 @@ from px4fuse.ekf2.recursion import (
 )
 from px4fuse.ekf2.recursion import _measurements as measurements
 from px4fuse.ekf2.stretches import Stretch
-from px4fuse.ekf2.vision import Vision
 from px4fuse.ekf2_parameters import settings_in_force
 from px4fuse.errors import SettingsError
 

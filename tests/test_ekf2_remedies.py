@@ -9,13 +9,16 @@ from exchange import replace
 from flights import Estimator, aisle_flight
 
 from px4fuse.analysis import Analysis, explain
-from px4fuse.comparison.asked import asked_of_ekf2, delay_change, noise_change, noise_used_m
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.model import Comparison
 from px4fuse.comparison.remedy import (
     Effect,
+    asked_of_ekf2,
+    delay_change,
     delay_helps,
+    noise_change,
     noise_helps,
+    noise_used_m,
     rejects_less,
     remedy_words,
 )

@@ -12,9 +12,9 @@ import pandas as pd
 import pytest
 from findings_tools import NONE, made
 
+from px4fuse.ekf2.inputs import Vision
 from px4fuse.ekf2.stretches import _counted, _stretch, down_sampled, find_stretches, predict_s
 from px4fuse.ekf2.stretches import step_ends as ends_of
-from px4fuse.ekf2.vision import Vision
 from px4fuse.flight import (
     ACCELEROMETER_BIAS_COLUMNS,
     ANGULAR_RATE_COLUMNS,

@@ -11,8 +11,7 @@ from page_tools import axes_of, words
 from px4fuse.analysis import Analysis, explain
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.model import Comparison
-from px4fuse.comparison.why import Why, why_ekf2_differs
-from px4fuse.comparison.why_words import STAMPS_WRONG
+from px4fuse.comparison.why import STAMPS_WRONG, Why, why_ekf2_differs
 from px4fuse.ekf2.model import Model
 from px4fuse.ekf2.walk import SAMPLES, STEPS
 from px4fuse.filter.clock import ClockOffset

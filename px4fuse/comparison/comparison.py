@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import Unpack
+from typing import Any, Unpack
 
 import numpy as np
 import pandas as pd
@@ -137,7 +137,7 @@ def _summary(
     innovations: Frame, variance: Frame, truth: AgainstTruth | Unavailable, gate: float
 ) -> FilterSummary | UnjudgedFilter:
     """What a filter did, from its innovations, its variances, and those around each update."""
-    sigmas = {
+    sigmas: dict[str, Any] = {
         name: _median_sigma(frame, column)
         for name, frame, column in (
             ("sigma_p_median_m", variance, "position_variance_m2"),
@@ -236,8 +236,8 @@ def _nees(at_s: Array, error: Array, variance: pd.Series) -> float | None:
     known = np.isfinite(error)
     if not known.any():
         return None
-    error = np.interp(variance.index, at_s[known], error[known], np.nan, np.nan)
-    normalised = error**2 / variance.to_numpy()
+    there = np.interp(variance.index, at_s[known], error[known], np.nan, np.nan)
+    normalised = np.square(there) / variance.to_numpy()
     return float(np.nanmean(normalised)) if np.isfinite(normalised).any() else None
 
 

@@ -49,11 +49,6 @@ def size(noise: Noise, otherwise: float) -> float:
     return noise.value or noise.high or otherwise
 
 
-def tuned_horizontally(comparison: Comparison, made: Made | None = None) -> Tuning:
-    """The horizontal noises alone, which is what the clock estimate needs; ``made`` as there."""
-    return tuned(comparison, (HORIZONTAL,), made=made)
-
-
 def tuned(
     comparison: Comparison,
     names: tuple[str, ...] | None = None,
@@ -68,12 +63,11 @@ def tuned(
     names : tuple of str, optional
         Axis names and "horizontal"; by default all that there are.
     progress : callable
-        Told what is being done.
+        Is given what is being done.
     made : dict, optional
         As :func:`px4fuse.filter.motion.motion` has it.
     """
-    flight = comparison.flight
-    slow = imu_too_slow_for_clocks(flight)
+    flight, slow = comparison.flight, imu_too_slow_for_clocks(comparison.flight)
     return tune(
         comparison.lines, comparison.settings, names, lambda name: progress(f"tuning {name}"),
         flight if slow is None else replace(flight, imu=slow),
@@ -81,40 +75,32 @@ def tuned(
     )  # fmt: skip
 
 
-def clock_offset(
+def noises_and_clock(
     comparison: Comparison,
-    tuning: Tuning,
     progress: Progress = silent,
-    made: Made | None = None,
-) -> ClockOffset | Unavailable:
-    """What must still be added to the stamps of the source, beyond the offset that was set.
+    names: tuple[str, ...] | None = (HORIZONTAL,),
+) -> tuple[Tuning, ClockOffset | Unavailable]:
+    """Most likely noises, and what must still be added to the stamps of the source.
 
-    Parameters
-    ----------
-    comparison : Comparison
-    tuning : mapping
-        Its measurement noise and outliers are used where it has them.
-    progress : callable
-        Told what is being done.
-    made : dict, optional
-        As :func:`px4fuse.filter.motion.motion` has it.
+    Beyond the offset that was set. Parameters are those of :func:`tuned`.
     """
+    made: Made = {}  # both need the same signals of the IMU
+    tuning = tuned(comparison, names, progress, made)
     if slow := imu_too_slow_for_clocks(comparison.flight):
-        return slow
+        return tuning, slow
     settings = comparison.settings
     known = [
         found
         for found in (tuning.get(HORIZONTAL), *tuning.values())
         if isinstance(found, AxisTuning)
     ]
-    found = estimate_clock_offset(
+    clock = estimate_clock_offset(
         comparison.flight, comparison.source, comparison.segment, settings,
         known[0].noises if known else Noises(settings.sigma_a_m_s2, settings.sigma_z_m),
         known[0].outlier_time_s if known else None, progress, made,
     )  # fmt: skip
-    if isinstance(found, ClockOffset) and comparison.source.origin.may_drift:
-        return with_drift(found)
-    return found
+    drifts = comparison.source.origin.may_drift
+    return tuning, with_drift(clock) if drifts and isinstance(clock, ClockOffset) else clock
 
 
 def turned_frame(
@@ -128,10 +114,12 @@ def turned_frame(
     tuned, sigma_z_m = tuning.get(HORIZONTAL), comparison.settings.sigma_z_m
     if isinstance(tuned, AxisTuning):
         sigma_z_m = size(tuned.sigma_z, sigma_z_m)
-    certain = isinstance(clock, ClockOffset) and clock.determinable
+    offset_s = 0.0
+    if isinstance(clock, ClockOffset) and clock.determinable:
+        offset_s = clock.remaining_s
     return heading_error(
         comparison.flight, comparison.source, comparison.segment, comparison.settings, sigma_z_m,
-        clock.remaining_s if certain else 0.0,
+        offset_s,
     )  # fmt: skip
 
 
@@ -150,17 +138,17 @@ def imu_too_slow_for_clocks(flight: Flight) -> Unavailable | None:
     rate = 1.0 / float(np.median(np.diff(flight.imu.index.to_numpy())))
     if rate >= CLOCK_RATE_MARGIN * needed:
         return None
-    told = f"{rate:.{1 if rate < 10 else 0}f} Hz"
+    hertz = f"{rate:.{1 if rate < 10 else 0}f} Hz"
     if not telemetry:
         return Unavailable(
             "clock offset",
-            f"the IMU was logged at {told}, at least {needed:g} Hz are needed",
+            f"the IMU was logged at {hertz}, at least {needed:g} Hz are needed",
             'Put the line "sensor_combined 0" into etc/logging/logger_topics.txt on the SD card.',
         )
     remedy = "Give the ULog of the same flight as LOG, and this recording with --mavlink."
     return Unavailable(
         "clock offset",
-        f"the IMU came by telemetry at {told}, each sample picked out of several; at least "
+        f"the IMU came by telemetry at {hertz}, each sample picked out of several; at least "
         f"{needed:g} Hz are needed",
         remedy if flight.log.has_ulog else f"Have the IMU sent at {needed:g} Hz.",
     )

@@ -181,10 +181,7 @@ def shift_clock(track: PositionTrack, clock_offset_s: float) -> PositionTrack:
 
 
 def choose_segment(
-    flight: Flight,
-    track: PositionTrack,
-    start_s: float | None = None,
-    end_s: float | None = None,
+    flight: Flight, track: PositionTrack, start_s: float | None = None, end_s: float | None = None
 ) -> Segment:
     """Choose the part of the log to analyse: where the source runs and the vehicle flies.
 

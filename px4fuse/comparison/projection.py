@@ -50,7 +50,9 @@ def continuous_state(
         What was done, empty where there was no reset in the segment.
     """
     inside = [r for r in ekf2.resets if segment.start_s < r.time_s <= segment.end_s]
-    state, kept, undone = ekf2.state.copy() if inside else ekf2.state, [], []
+    state = ekf2.state.copy() if inside else ekf2.state
+    kept: list[str] = []
+    undone: list[str] = []
     for label, quantity, columns in (
         ("horizontal position", "position", POSITION_COLUMNS[:2]),
         ("height", "position", POSITION_COLUMNS[2:]),

@@ -8,17 +8,10 @@ from msgspec.structs import replace
 from numpy.typing import ArrayLike
 
 from px4fuse.arrays import Array, BoolArray, IntArray
+from px4fuse.ekf2.inputs import AID_SOURCE, same_sample
 from px4fuse.ekf2.replay import HORIZONTAL, Agreement, AxisAgreement, Ekf2Replay, Spans
 from px4fuse.ekf2.stretches import SETTLING_S
-from px4fuse.ekf2.vision import AID_SOURCE, same_sample
-from px4fuse.flight import (
-    POSITION_COLUMNS,
-    VELOCITY_COLUMNS,
-    Ekf2,
-    Flight,
-    Truth,
-    Unavailable,
-)
+from px4fuse.flight import POSITION_COLUMNS, VELOCITY_COLUMNS, Ekf2, Flight, Truth, Unavailable
 
 MIN_SAMPLES = 20
 # The older topics repeat a sample until the next fusion, with the time of a later step

@@ -228,19 +228,10 @@ def _updates(part: Run, at: int) -> pd.DataFrame:
     events = part.events[at]
     seen = np.flatnonzero(np.isfinite(part.innovation_m[:, at, 0]))
     after = part.variance[seen + 1, at]
-    values = np.column_stack(
-        [
-            part.innovation_m[seen, at],
-            part.variance_m2[seen, at],
-            part.rejected[seen, at],
-            part.fused[seen, at],
-            part.reset[seen, at],
-            after[:, POSITION][:, :2],
-            after[:, VELOCITY][:, :2],
-            part.noise_m2[seen, at],
-            part.stretch.time_s[events.end[seen]],
-        ]
-    )
+    flags = np.stack([part.rejected, part.fused, part.reset], axis=-1)[seen, at]
+    nu, s, r = (each[seen, at] for each in (part.innovation_m, part.variance_m2, part.noise_m2))
+    fused_at_s = part.stretch.time_s[events.end[seen], None]
+    values = np.hstack([nu, s, flags, after[:, 6:8], after[:, 3:5], r, fused_at_s])
     index = pd.Index(events.time_s[seen], name="time_s")
     return pd.DataFrame(values, index=index, columns=UPDATE_COLUMNS)
 

@@ -141,10 +141,17 @@ def run(  # noqa: PLR0915 (one recursion, read from top to bottom)
         np.array([getattr(variant, name) for variant in variants])
         for name in ("biases", "attitude", "gated", "as_logged")
     )
-    stacks = _Stacks(intervals)
-    end, action = stacks.of_events("end"), stacks.of_events("action")
-    action = np.where(gated, action, np.where(stacks.of_events("usable"), FUSE, IDLE))
-    startable, now_s = stacks.of_events("startable"), stretch.time_s[end]
+    distinct = list(dict.fromkeys(intervals))
+    pick = [distinct.index(each) for each in intervals] if len(distinct) > 1 else slice(None)
+
+    def stacked(name: str, some: slice = slice(None)) -> Any:
+        """A part of the intervals, shape (E, S, ...): what all variants share is there once."""
+        return np.stack([getattr(each, name)[some] for each in distinct], axis=1)[:, pick]
+
+    event = stacked("events")
+    end, startable = event["end"], event["startable"]
+    action = np.where(gated, event["action"], np.where(event["usable"], FUSE, IDLE))
+    now_s = stretch.time_s[end]
     sampled = np.any(action > IDLE, axis=1)
     sample = np.maximum(intervals[0].events.sample, 0)
     logged, logged_reset = inputs.vision.rejected[sample], inputs.vision.reset[sample]
@@ -176,10 +183,10 @@ def run(  # noqa: PLR0915 (one recursion, read from top to bottom)
         within = e % TOGETHER
         if not within:  # intervals are long: a few at a time
             some = slice(e, e + TOGETHER)
-            transition = stacks.of("transition", some)
-            pushed = stacks.of("drive", some) + attitude[:, None] * stacks.of("turn", some)
-            added = gyro2 * stacks.of("gyro_noise", some)
-            added = added + force2 * stacks.of("accelerometer_noise", some)
+            transition = stacked("transition", some)
+            pushed = stacked("drive", some) + attitude[:, None] * stacked("turn", some)
+            added = gyro2 * stacked("gyro_noise", some)
+            added = added + force2 * stacked("accelerometer_noise", some)
         phi = transition[within]
         # x = Φx + u, P = ΦPΦ' + Q
         x = (phi @ x[:, :, None])[:, :, 0] + pushed[within]
@@ -239,24 +246,6 @@ def run(  # noqa: PLR0915 (one recursion, read from top to bottom)
         stretch, tuple(variants), tuple(each.events for each in intervals), innovations, variances,
         noise[:, :, :2], rejected, fused, reset, states, spreads, P,
     )  # fmt: skip
-
-
-class _Stacks:
-    """Parts of the intervals of S variants, stacked; those that all share are there once."""
-
-    def __init__(self, intervals: Sequence[Intervals]) -> None:
-        self.distinct = list(dict.fromkeys(intervals))
-        shared = len(self.distinct) == 1
-        self.pick = slice(None) if shared else [self.distinct.index(each) for each in intervals]
-
-    def of(self, name: str, some: slice) -> Array:
-        """Of some events, shape (events, S or 1, ...)."""
-        parts = [getattr(each, name)[some] for each in self.distinct]
-        return np.stack(parts, axis=1)[:, self.pick]
-
-    def of_events(self, name: str) -> Any:
-        """A field of the events, shape (E, S or 1)."""
-        return np.stack([each.events[name] for each in self.distinct], axis=1)[:, self.pick]
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,6 @@ import pandas as pd
 
 from px4fuse.arrays import Array, IntArray
 from px4fuse.display import brief
-from px4fuse.ekf2.vision import Vision
 from px4fuse.flight import (
     ACCELEROMETER_BIAS_COLUMNS,
     ANGULAR_RATE_COLUMNS,
@@ -113,7 +112,7 @@ def find_stretches(
     attitude: pd.DataFrame,
     ekf2: Ekf2,
     record: FusionRecord,
-    vision: Vision,
+    vision_s: Array,
 ) -> tuple[Stretch, ...]:
     """Parts of a flight without gaps in IMU and vision, from when EKF2 has fused for a while.
 
@@ -124,7 +123,8 @@ def find_stretches(
     imu, attitude : DataFrame
     ekf2 : Ekf2
     record : FusionRecord
-    vision : Vision
+    vision_s : ndarray
+        Stamps of external vision.
     """
     innovations = ekf2.innovations["north"]
     if isinstance(innovations, Unavailable):
@@ -132,11 +132,11 @@ def find_stretches(
     fused, states = innovations.index.to_numpy(), record.delayed.index.to_numpy()
     time = imu.index.to_numpy()
     cuts = [time[0], time[-1]]
-    for stamps, limit in ((time, IMU_GAP_S), (vision.stamp_s, RESTART_GAP_S)):
+    for stamps, limit in ((time, IMU_GAP_S), (vision_s, RESTART_GAP_S)):
         gap = np.flatnonzero(np.diff(stamps) > limit)
         cuts += [*stamps[gap], *stamps[gap + 1]]
-    first = max(attitude.index[0], vision.stamp_s[0])
-    last = min(attitude.index[-1], vision.stamp_s[-1] + 1.0)
+    first = max(attitude.index[0], vision_s[0])
+    last = min(attitude.index[-1], vision_s[-1] + 1.0)
     airborne = () if isinstance(flight.airborne, Unavailable) else flight.airborne
     found = []
     for low, high in pairwise(np.unique(np.clip(cuts, first, last))):
@@ -170,7 +170,7 @@ def _stretch(
     known = np.flatnonzero(np.isin(np.rint(time * 1e6), np.rint(record.delayed.index * 1e6)))
     ends = step_ends(interval, known, predict_s(record))
     bias = np.asarray(start[ACCELEROMETER_BIAS_COLUMNS])
-    rate = imu[ANGULAR_RATE_COLUMNS].to_numpy()[1:] - start[GYRO_BIAS_COLUMNS].to_numpy()
+    rate = imu[ANGULAR_RATE_COLUMNS].to_numpy()[1:] - np.asarray(start[GYRO_BIAS_COLUMNS])
     force = imu[SPECIFIC_FORCE_COLUMNS].to_numpy()[1:] - bias
     turn, gain = down_sampled(rate * interval[:, None], force * interval[:, None], ends)
     times = time[np.concatenate([[0], ends])]

@@ -33,7 +33,7 @@ from px4fuse.flight import POSITION_COLUMNS, VELOCITY_COLUMNS, Ekf2, Truth, Unav
 from px4fuse.record import Count, NotNegative, Record
 
 WHAT = "why EKF2 differs"
-OURS, EKF2 = "ours", "EKF2 as logged"
+OTHER_TIME = Unavailable("RMSE to truth", "the truth is of another time", "Record both together.")
 # The filter of the lesson spreads its process noise over steps of DT (DESIGN: Q per second is
 # SIGMA_A² · DT); EKF2 adds EKF2_ACC_NOISE² · Δt² each step, EKF2_ACC_NOISE² · Δt per second
 SAMPLES = "samples and time steps"
@@ -45,6 +45,8 @@ ATTITUDE = "attitude and gyro bias as states"
 GATE = "gate, missed samples, resets"
 OUTPUT = "output predictor"
 STEPS = (SAMPLES, STAMPS, NOISE, BIASES, PROCESS, ATTITUDE, GATE, OUTPUT)
+
+COLUMNS = (POSITION_COLUMNS, VELOCITY_COLUMNS)
 
 
 class Step(Record, frozen=True, kw_only=True):
@@ -207,30 +209,29 @@ def walk(
             "the student's filter and the replay have no time in common",
             "Analyse the part of the flight in which EKF2 fused vision (--start, --end).",
         )
-    first, last = float(times[0]), float(times[-1])
-    spans = tuple(
-        (max(start, first), min(end, last)) for start, end in judged if start < last and end > first
-    )
+    span = float(times[0]), float(times[-1])
+    parts = ((max(start, span[0]), min(end, span[1])) for start, end in judged)
     directions = {name: run.axis.direction for name, run in (runs or {}).items()}
     directions = directions or {"north": np.eye(3)[0], "east": np.eye(3)[1]}
-    stages: dict[str, dict[str, tuple[Array, Array]]] = {name: {} for name in directions}
-    ungated = flown.delayed
+    ungated, stages = flown.delayed, []
     # one at a time: each is as long as the flight
     tracks = chain(delayed, (flown.delayed, flown.published, ekf2.state))
-    for stage, track in zip((*variants, OUTPUT, EKF2), tracks, strict=True):
-        for name, direction in directions.items():
-            position, velocity = (
-                along(track, columns, direction, times)
-                for columns in (POSITION_COLUMNS, VELOCITY_COLUMNS)
-            )
-            stages[name][stage] = position, velocity
+    for stage, track in zip((*STEPS, "EKF2 as logged"), tracks, strict=True):
+        stages.append(
+            [
+                [along(track, columns, direction, times) for columns in COLUMNS]
+                for direction in directions.values()
+            ]
+        )
         if stage == ATTITUDE:
             ungated = track
-    coast = _coast(flown, ungated, (first, last), judged)
+    spans = tuple((start, end) for start, end in parts if start < end)
+    coast = _coast(flown, ungated, span, judged)
     found = {}
-    for name, direction in directions.items():
-        stages[name][OURS] = state_at(runs[name], times) if runs else stages[name][SAMPLES]
-        found[name] = _axis(model, stages[name], direction, times, spans, coast)
+    for at, (name, direction) in enumerate(directions.items()):
+        ours = state_at(runs[name], times) if runs else stages[0][at]
+        path = np.array([ours, *(stage[at] for stage in stages)])
+        found[name] = _axis(model, direction, times, path, spans, coast)
     return found
 
 
@@ -253,20 +254,15 @@ def _variants(model: Model, ours: Settings) -> dict[str, Variant]:
 
 
 def _axis(
-    model: Model,
-    stages: Mapping[str, tuple[Array, Array]],
-    direction: Array,
-    times: Array,
-    spans: Spans,
-    coast: Coast | None,
+    model: Model, direction: Array, times: Array, path: Array, spans: Spans, coast: Coast | None
 ) -> Why:
-    tracks = np.array([stages[name] for name in (OURS, *STEPS, EKF2)])
-    apart = tracks - tracks[-1]
-    errors = [rms_to_truth(model.flight, track, direction, times) for track in tracks[:, 0]]
-    position, velocity = np.mean(apart**2, axis=2)[:-1].T.tolist()
-    moved = np.abs(np.diff(tracks[:-1, 0], axis=0))
+    """Why along one axis; ``path`` is ours, after each step, and the logged EKF2, (10, 2, n)."""
+    apart = path - path[-1]
+    errors = [rms_to_truth(model.flight, track, direction, times) for track in path[:, 0]]
+    position, velocity = np.mean(apart[:-1] ** 2, axis=2).T.tolist()
+    moved = np.abs(np.diff(path[:-1, 0], axis=0))
     most = np.argmax(moved, axis=1)
-    steps = (
+    steps = tuple(
         Step(
             name=name,
             position_mean_square_m2=position[at] - position[at + 1],
@@ -277,21 +273,17 @@ def _axis(
         )
         for at, name in enumerate(STEPS)
     )
-    lacking = model.flight.truth
-    if isinstance(lacking, Truth):
-        lacking = Unavailable(
-            "RMSE to truth", "the truth is of another time", "Record both together."
-        )
+    lacking = OTHER_TIME if isinstance(model.flight.truth, Truth) else model.flight.truth
+    ends = {"kf": errors[0], "ekf2": errors[-1]}
     return Why(
         count=len(times),
         position_mean_square_m2=position[0],
         velocity_mean_square_m2_s2=velocity[0],
-        steps=tuple(steps),
+        steps=steps,
         position_left_mean_square_m2=position[-1],
         velocity_left_mean_square_m2_s2=velocity[-1],
         position_rmse_to_truth_m={
-            name: lacking if error is None else error
-            for name, error in (("kf", errors[0]), ("ekf2", errors[-1]))
+            name: lacking if error is None else error for name, error in ends.items()
         },
         spans_s=spans,
         coast=coast,

@@ -14,16 +14,10 @@ import pandas as pd
 
 from px4fuse.arrays import Array
 from px4fuse.display import Shown
-from px4fuse.ekf2.agreement import (
-    at_times,
-    judged_from,
-    logged_innovations,
-    rms_to_truth,
-    settled,
-)
+from px4fuse.ekf2.agreement import at_times, judged_from, logged_innovations, rms_to_truth, settled
+from px4fuse.ekf2.inputs import horizontal_resets_s
 from px4fuse.ekf2.model import Model, replay_settings
 from px4fuse.ekf2.replay import HORIZONTAL, Agreement, Ekf2Replay, Spans
-from px4fuse.ekf2.vision import horizontal_resets_s
 from px4fuse.ekf2_parameters import check
 from px4fuse.errors import SettingsError
 from px4fuse.filter.consistency import nis_band

@@ -19,7 +19,7 @@ from px4fuse.comparison.model import (
     Difference,
     FilterName,
 )
-from px4fuse.comparison.why_words import the
+from px4fuse.comparison.why import the
 from px4fuse.ekf2.walk import Why
 from px4fuse.filter.kalman import state_at
 from px4fuse.filter.settings import Settings

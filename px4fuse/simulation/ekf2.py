@@ -17,7 +17,7 @@ from dataclasses import replace
 import numpy as np
 
 from px4fuse.arrays import Array, BoolArray, IntArray
-from px4fuse.ekf2.inputs import Inputs, Rules
+from px4fuse.ekf2.inputs import Inputs, Rules, Vision
 from px4fuse.ekf2.intervals import (
     ACCELEROMETER_BIAS,
     GRAVITY_M_S2,
@@ -31,7 +31,6 @@ from px4fuse.ekf2.model import delayed_states, run_variants
 from px4fuse.ekf2.output_predictor import follow_attitude, publish
 from px4fuse.ekf2.recursion import EAST, HEADING, NORTH, Run, Variant
 from px4fuse.ekf2.stretches import Stretch, down_sampled, step_ends
-from px4fuse.ekf2.vision import Vision
 from px4fuse.ekf2_parameters import PARAMETERS as MODEL_PARAMETERS
 from px4fuse.ekf2_parameters import settings_in_force
 from px4fuse.simulation import sensors

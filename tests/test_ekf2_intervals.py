@@ -14,10 +14,9 @@ from ekf2_tools import RULES
 from exchange import replace
 from findings_tools import made
 
-from px4fuse.ekf2.inputs import Inputs, Rules
+from px4fuse.ekf2.inputs import Inputs, Rules, Vision
 from px4fuse.ekf2.intervals import FUSE, IDLE, START, Timing, _actions, _events, _noises
 from px4fuse.ekf2.stretches import Stretch
-from px4fuse.ekf2.vision import Vision
 
 
 @pytest.mark.parametrize("n", [4, 200])
