@@ -91,7 +91,7 @@ def flown(
     monkeypatch: pytest.MonkeyPatch, *, interval_s: float = 0.008, **record: Any
 ) -> Inputs | Unavailable:
     """What is prepared of a flight of which only the parameters matter."""
-    monkeypatch.setattr(inputs_module, "read_vision", lambda *_: made(Vision))
+    monkeypatch.setattr(inputs_module, "read_vision", lambda *_: made(Vision, stamp_s=None))
     monkeypatch.setattr(inputs_module, "find_stretches", lambda *_: (made(Stretch),))
     parts = {"parameters": {}, "other_aiding": (), "per_step_biases": False, **record}
     fusing = parts.pop("fusing", pd.DataFrame({"vertical": [1.0, 0.0]}))

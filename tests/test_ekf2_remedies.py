@@ -64,7 +64,10 @@ def summary(
     nis: float, rejected: float = 0.0, error: float | Unavailable = 0.1, std: float = 0.1
 ) -> Summary:
     axis = AxisSummary(nis, (0.9, 1.1), std, 0.05, error)
-    return Summary({}, axis, axis, 600, rejected, 0.2, 0)
+    return Summary(
+        changed={}, north=axis, east=axis, samples=600, rejected_share=rejected,
+        longest_without_fusion_s=0.2, resets=0,
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize(

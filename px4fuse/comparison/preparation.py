@@ -136,12 +136,9 @@ def _no_source(flight: Flight) -> str:
             "positioning system's own file with `position`"
             f"{', or the ULog' if flight.log.has_ulog else ''}."
         )
-    gps = any(not track.origin.automatic for track in flight.positions)
-    hint = (
-        "Only GPS is in it: give `position_source` vehicle_gps_position to use that, or s"
-        if gps
-        else "S"
-    )
+    hint = "S"
+    if any(not track.origin.automatic for track in flight.positions):
+        hint = "Only GPS is in it: give `position_source` vehicle_gps_position to use that, or s"
     return (
         f"{name}no external position in this log (no "
         "vehicle_visual_odometry, motion capture or EKF2 innovations of external vision). "
@@ -197,19 +194,17 @@ def choose_segment(
     SettingsError
         The chosen part is empty or holds fewer than three measurements.
     """
-    source_start, source_end = float(track.samples.index[0]), float(track.samples.index[-1])
+    source_start, source_end = track.samples.index[[0, -1]].tolist()
     low, high = max(source_start, 0.0), min(source_end, flight.log.duration_s)
     if isinstance(flight.airborne, Unavailable):
         reason = "the whole span of the source: the log has no land detector"
     elif not flight.airborne:
         reason = "the whole span of the source: the vehicle never took off"
     else:
-        take_off, touch_down = flight.airborne[0][0], flight.airborne[-1][1]
-        if max(low, take_off) < min(high, touch_down):
-            low, high = max(low, take_off), min(high, touch_down)
-            reason = "where the source runs and the vehicle flies"
-        else:
-            reason = "the whole span of the source: it does not run in flight"
+        reason = "the whole span of the source: it does not run in flight"
+        flying = max(low, flight.airborne[0][0]), min(high, flight.airborne[-1][1])
+        if flying[0] < flying[1]:
+            (low, high), reason = flying, "where the source runs and the vehicle flies"
     if start_s is not None or end_s is not None:
         low, high = low if start_s is None else start_s, high if end_s is None else end_s
         ends = {"--start": start_s, "--end": end_s}

@@ -69,34 +69,6 @@ class Model:
     __repr__ = brief
 
 
-def replay_ekf2(
-    flight: Flight, parameters: Mapping[str, float] | None = None
-) -> Ekf2Replay | Unavailable:
-    """Replay EKF2 from a flight's log.
-
-    Parameters
-    ----------
-    flight : Flight
-    parameters : mapping, optional
-        What to change, by PX4 name and in PX4's units; by default nothing.
-
-    Returns
-    -------
-    Ekf2Replay or Unavailable
-        Its ``agreement`` is that of the replay as flown, whatever was changed.
-
-    Raises
-    ------
-    SettingsError
-        A parameter that the model does not have, or a value outside PX4's range.
-    """
-    changed = check(parameters or {})
-    model = open_model(flight)
-    if isinstance(model, Unavailable):
-        return model
-    return replay_settings(model, [changed])[0] if changed else model.flown
-
-
 def open_model(flight: Flight) -> Model | Unavailable:
     """Make a flight ready for replays and replay it as flown, or say why the log cannot carry it.
 

@@ -232,7 +232,7 @@ def _of_log(flight: Flight, replay: Ekf2Replay, judged: Spans) -> Summary:
         fused = used.index[used["rejected"] == 0].to_numpy()
         longest = _longest(np.concatenate([fused, resets]), judged)
     return _summary(
-        flight, judged, used, ekf2.state, ekf2.variance,
+        flight, judged, used, ekf2.state, None,
         changed={}, longest_without_fusion_s=longest, resets=len(resets),
     )  # fmt: skip
 
@@ -242,43 +242,39 @@ def _summary(
     judged: Spans,
     used: pd.DataFrame,
     published: pd.DataFrame,
-    variance: pd.DataFrame | Unavailable,
+    variance: pd.DataFrame | None,
     **more: Any,
 ) -> Summary:
-    """What innovations, the published position and its stated variance show, and ``more``."""
+    """What innovations, the published position and its stated variance show, and ``more``.
+
+    None is the variance that EKF2 logs; any other is taken at its times too.
+    """
     ekf2 = flight.ekf2
     assert isinstance(ekf2, Ekf2)
+    logged, axes = ekf2.variance, {}
     times = ekf2.state.index[settled(ekf2.state.index, judged)].to_numpy()
-    axes: dict[str, Any] = {}
     for axis, direction in zip(HORIZONTAL, np.eye(3), strict=False):
         nu = used[f"innovation_{axis}_m"].to_numpy()
         s = used[f"innovation_variance_{axis}_m2"].to_numpy()
+        sigma: float | Unavailable
+        if isinstance(logged, Unavailable):
+            sigma = logged
+        else:
+            at = logged.index[settled(logged.index, judged)].to_numpy()
+            stated = at_times(logged if variance is None else variance, f"{axis}_m2", at)
+            sigma = float(np.sqrt(np.median(stated)))
         position = at_times(published, f"{axis}_m", times)
         error = rms_to_truth(flight, position, direction, times)
         axes[axis] = AxisSummary(
             nis_mean=float(np.mean(nu**2 / s)),
             nis_band=nis_band(len(nu)),
             innovation_std_m=float(np.std(nu)),
-            sigma_p_median_m=_sigma(ekf2.variance, variance, f"{axis}_m2", judged),
+            sigma_p_median_m=sigma,
             position_rmse_to_truth_m=NO_TRUTH if error is None else error,
         )
+    north, east = (axes[axis] for axis in HORIZONTAL)
     share = float(used["rejected"].mean())
-    return Summary(**axes, samples=len(used), rejected_share=share, **more)
-
-
-def _sigma(
-    logged: pd.DataFrame | Unavailable,
-    variance: pd.DataFrame | Unavailable,
-    column: str,
-    judged: Spans,
-) -> float | Unavailable:
-    """Median of what is stated, at the times at which EKF2 logs it."""
-    if isinstance(logged, Unavailable):
-        return logged
-    if isinstance(variance, Unavailable):
-        return variance
-    times = logged.index[settled(logged.index, judged)].to_numpy()
-    return float(np.sqrt(np.median(at_times(variance, column, times))))
+    return Summary(north=north, east=east, samples=len(used), rejected_share=share, **more)
 
 
 def _longest(fused_s: Array, judged: Spans) -> float:
