@@ -24,7 +24,7 @@ from px4fuse.comparison.model import Comparison, UnjudgedFilter
 from px4fuse.display import Shown
 from px4fuse.filter.consistency import Consistency
 from px4fuse.fleet.changes import changes
-from px4fuse.fleet.sides import Side
+from px4fuse.fleet.inputs import DiffInput
 from px4fuse.request import with_options
 from px4fuse.results.build import results as build
 from px4fuse.results.contract import ComparisonResults
@@ -79,8 +79,8 @@ def results(sample_log, analysis) -> dict[str, Shown]:
         "PairwiseError": evaluation.rpe[0],
         "WhatIf": px4fuse.what_if(analysis.ekf2_model, {"EKF2_EVP_NOISE": 0.3}),
         "Changes": changes(
-            Side("aisle_uwb.json", "results", read_results(SHIPPED.read_bytes())),
-            Side("small.ulg", "log", results_of(analysis), analysis),
+            DiffInput("aisle_uwb.json", "results", read_results(SHIPPED.read_bytes())),
+            DiffInput("small.ulg", "log", results_of(analysis), analysis),
         ),
     }
 
@@ -290,7 +290,7 @@ def test_tables_are_tidy_with_units(results, name):
     without_unit = {
         "nis_mean", "nis_low", "nis_high", "outside_two_sigma", "lag1_autocorrelation", "gain_nats",
         "rejected_share", "w", "x", "y", "z",
-        "a", "b", "change", "change_low", "change_high", "p", "q",  # a column has the unit
+        "a", "b", "change", "q", "a_low", "a_high", "b_low", "b_high", "change_low", "change_high",
     }  # fmt: skip
     units = ("_m", "_s", "_m_s", "_m_s2", "_m2", "_m2_s2", "_deg")
     for column in table.select_dtypes("floating"):
