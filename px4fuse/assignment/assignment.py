@@ -12,7 +12,7 @@ from pathlib import Path
 from px4fuse.answers import form_name, form_text
 from px4fuse.assignment.drawing import Drawn, Kinds, draw, most_mistakes
 from px4fuse.assignment.key import Answer, AnswerKey, folded, key_text, read_key
-from px4fuse.assignment.roster import RosterStudent
+from px4fuse.assignment.roster import Person
 from px4fuse.assignment.truth import truth_of
 from px4fuse.errors import OutputError, SettingsError
 from px4fuse.plain import plain
@@ -26,22 +26,16 @@ TRUTH = ("duration_s", "sigma_z_m", "sigma_a_m_s2", "reported_sigma_m", "clock_o
 
 
 def fly(
-    secret: bytes, student: RosterStudent, kind: Kinds, count: int | None = None, truth: bool = True
+    secret: bytes, student: Person, kind: Kinds, count: int | None = None, truth: bool = True
 ) -> tuple[bytes, Answer]:
     """One student's log, and the answer to it."""
-    drawn = draw(secret, student.id, kind, count, truth)
+    drawn = draw(secret, student.student_id, kind, count, truth)
     simulation = flights.simulate(drawn.scenario, parse(drawn.typed))
     log = flights.to_ulog(simulation)
-    return log, answer_to(student, drawn, simulation, hashlib.sha256(log).hexdigest())
-
-
-def answer_to(
-    student: RosterStudent, drawn: Drawn, simulation: flights.Simulation, sha256: str
-) -> Answer:
-    """The answer to a flight as drawn, whose log has this SHA-256."""
+    sha256 = hashlib.sha256(log).hexdigest()
     known = flights.answer(simulation)["truth"]
-    return Answer(
-        student_id=student.id,
+    return log, Answer(
+        student_id=student.student_id,
         name=student.name,
         file=student.file,
         sha256=sha256,
@@ -87,7 +81,7 @@ def key_path(folder: Path, given: Path | None) -> Path:
 
 
 def assign(
-    students: Sequence[RosterStudent],
+    students: Sequence[Person],
     folder: Path,
     key_file: Path,
     secret: bytes | None,
@@ -121,7 +115,7 @@ def assign(
         A file is there already with other content, or cannot be written.
     """
     _check_count(kind, count)
-    before = _key_before(key_file)
+    before = read_key(key_file) if key_file.exists() else None
     made_up = before.secret if before is not None else ""
     if secret is None:
         made_up = made_up or secrets.token_urlsafe(24)
@@ -139,10 +133,9 @@ def assign(
                 answers.append(answer)
                 form = form_text(student.file, answer.sha256).encode()
                 for name, content in ((student.file, log), (form_name(student.file), form)):
-                    target = folder / name
-                    if not _there(target, content):
-                        staged[target] = Path(staging) / name
-                        staged[target].write_bytes(content)
+                    if not _there(folder / name, content):
+                        staged[folder / name] = Path(staging) / name
+                        staged[folder / name].write_bytes(content)
                 step(done, len(students))
             key = AnswerKey(kind, tuple(answers), made_up)
             _check_extends(key_file, before, key)
@@ -160,7 +153,7 @@ def assign(
 
 
 def preview(
-    students: Sequence[RosterStudent],
+    students: Sequence[Person],
     key_file: Path,
     secret: bytes | None,
     kind: Kinds,
@@ -176,15 +169,15 @@ def preview(
         The key that is there was made by an earlier px4fuse.
     """
     _check_count(kind, count)
-    before = _key_before(key_file)
     if secret is None:
+        before = read_key(key_file) if key_file.exists() else None
         if before is None or not before.secret:
             raise SettingsError(
                 "--preview requires --secret-file or --secret: one that is made up is not kept, "
                 "and would give others each time."
             )
         secret = before.secret.encode()
-    return [draw(secret, student.id, kind, count) for student in students]
+    return [draw(secret, student.student_id, kind, count) for student in students]
 
 
 def _check_count(kind: Kinds, count: int | None) -> None:
@@ -193,11 +186,6 @@ def _check_count(kind: Kinds, count: int | None) -> None:
             f"--mistakes {count}: a flight of kind {kind} can have 0 to {most_mistakes(kind)}, of "
             "which each is still found beside the others."
         )
-
-
-def _key_before(key_file: Path) -> AnswerKey | None:
-    """The key that is there already, to which students may be added."""
-    return read_key(key_file) if key_file.exists() else None
 
 
 def _there(target: Path, log: bytes) -> bool:

@@ -165,7 +165,6 @@ def _read(pdf: bytes) -> Report:
         sha256=hashlib.sha256(pdf).hexdigest(),
         seal=seal_of(pdf),
         results=results,
-        pages=(),
         pdf=pdf,
     )
 
