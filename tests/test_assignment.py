@@ -314,7 +314,7 @@ class TestAssign:
             assign(CLASS[:2], folder, key_file, SECRET, "aisle")
         assert files(folder) == {k: v for k, v in before.items() if k != "key"}
 
-    def test_failed_runs_leave_nothing(self, tmp_path, monkeypatch):
+    def test_an_interrupted_run_can_go_on(self, tmp_path, monkeypatch):
         folder, key_file = tmp_path / "flights", tmp_path / "key.json"
 
         def stop_at_last(*given):
@@ -324,9 +324,15 @@ class TestAssign:
 
         monkeypatch.setattr(assignment, "fly", stop_at_last)
         with pytest.raises(KeyboardInterrupt):
-            assign(CLASS, folder, key_file, SECRET, "aisle")
+            assign(CLASS, folder, key_file, None, "aisle")
         monkeypatch.undo()
-        assert list(tmp_path.iterdir()) == []
+        assert len(read_key(key_file).answers) == 2
+        made = assign(CLASS, folder, key_file, None, "aisle")
+        assert (made.written, made.kept) == (1, 2)
+        assert read_key(key_file) == made.key
+
+    def test_what_cannot_be_written_leaves_nothing(self, tmp_path):
+        folder, key_file = tmp_path / "flights", tmp_path / "key.json"
         key_file.mkdir()
         with pytest.raises(SettingsError):
             assign(CLASS[:1], folder, key_file, SECRET, "aisle")
@@ -335,7 +341,8 @@ class TestAssign:
         for where, key in ((folder, blocked / "key.json"), (blocked, tmp_path / "k.json")):
             with pytest.raises(OutputError, match="cannot be written"):
                 assign(CLASS[:1], where, key, SECRET, "aisle")
-        assert {path.name for path in tmp_path.iterdir()} == {"key.json", "file"}
+        assert not any(path.is_file() for path in folder.rglob("*"))
+        assert not (tmp_path / "k.json").exists()
 
     def test_number_of_mistakes(self, tmp_path):
         for kind, count in (("aisle", 3), ("aisle", -1), ("loop", 2), ("mixed", 2)):

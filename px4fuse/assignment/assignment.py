@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import secrets
-import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -92,9 +91,9 @@ def assign(
 ) -> Assigned:
     """Write everyone's log and form into a folder, and the answer key.
 
-    All logs are made before the first is put in its place, so that a run that fails leaves the
-    folder as it was. What is there already is never replaced: a log must be the same to the byte,
-    and a key may only gain students.
+    Each student's log, form and answer are put in their places together, so that a run that is
+    interrupted can go on. What is there already is never replaced: a log must be the same to the
+    byte, and a key may only gain students.
 
     Parameters
     ----------
@@ -115,40 +114,31 @@ def assign(
         A file is there already with other content, or cannot be written.
     """
     _check_count(kind, count)
-    before = read_key(key_file) if key_file.exists() else None
-    made_up = before.secret if before is not None else ""
+    key = read_key(key_file) if key_file.exists() else AnswerKey(kind, ())
+    answers = {folded(answer.student_id): answer for answer in key.answers}
+    _check_extends(
+        key_file, key.kind == kind and answers.keys() <= {folded(s.student_id) for s in students}
+    )
+    made_up = key.secret
     if secret is None:
         made_up = made_up or secrets.token_urlsafe(24)
         secret = made_up.encode()
     elif made_up.encode() != secret:
         made_up = ""
-    known = folder.exists()
-    staged: dict[Path, Path] = {}
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix=".px4fuse-", dir=folder) as staging:
-            answers = []
-            for done, student in enumerate(students, start=1):
-                log, answer = fly(secret, student, kind, count, truth)
-                answers.append(answer)
-                form = form_text(student.file, answer.sha256).encode()
-                for name, content in ((student.file, log), (form_name(student.file), form)):
-                    if not _there(folder / name, content):
-                        staged[folder / name] = Path(staging) / name
-                        staged[folder / name].write_bytes(content)
-                step(done, len(students))
-            key = AnswerKey(kind, tuple(answers), made_up)
-            _check_extends(key_file, before, key)
-            _place(staged, key_file, key_text(key).encode())
-    except OSError as error:
-        raise OutputError(
-            f"{error.filename or folder}: cannot be written ({error.strerror}). Choose another "
-            "place with -o."
-        ) from error
-    finally:
-        if not known and folder.is_dir() and not any(folder.iterdir()):
-            folder.rmdir()
-    written = sum(target.suffix == ".ulg" for target in staged)
+    written = 0
+    for done, student in enumerate(students, start=1):
+        log, answer = fly(secret, student, kind, count, truth)
+        known = answers.setdefault(folded(student.student_id), answer)
+        _check_extends(key_file, known.sha256 == answer.sha256)
+        form = form_text(student.file, answer.sha256).encode()
+        contents = {folder / student.file: log, folder / form_name(student.file): form}
+        new = {path: content for path, content in contents.items() if not _there(path, content)}
+        key = AnswerKey(kind, tuple(answers.values()), made_up)
+        write_all({**new, key_file: key_text(key).encode()})
+        # of no use to anyone but the instructor
+        key_file.chmod(0o600)
+        written += folder / student.file in new
+        step(done, len(students))
     return Assigned(key, written, len(students) - written)
 
 
@@ -200,31 +190,11 @@ def _there(target: Path, log: bytes) -> bool:
     )
 
 
-def _check_extends(key_file: Path, before: AnswerKey | None, key: AnswerKey) -> None:
+def _check_extends(key_file: Path, same: bool) -> None:
     """A key that is there already must be part of the new one."""
-    if before is None:
-        return
-    new = {folded(answer.student_id): answer.sha256 for answer in key.answers}
-    lost = [a.student_id for a in before.answers if new.get(folded(a.student_id)) != a.sha256]
-    if before.kind != key.kind or lost:
+    if not same:
         raise OutputError(
             f"{key_file}: is the answer key of other flights; it was not overwritten. Give the "
             "same secret, options and students as before (more are welcome), or another place with "
             "--answer."
         )
-
-
-def _place(staged: Mapping[Path, Path], key_file: Path, key: bytes) -> None:
-    """Move logs to their places and write the key; no log stays where one of these fails."""
-    placed: list[Path] = []
-    try:
-        for target, path in staged.items():
-            path.replace(target)
-            placed.append(target)
-        write_all({key_file: key})
-    except BaseException:
-        for target in placed:
-            target.unlink(missing_ok=True)
-        raise
-    # of no use to anyone but the instructor
-    key_file.chmod(0o600)

@@ -8,17 +8,17 @@ from typing import Annotated, ClassVar
 from msgspec import Meta
 
 from px4fuse.grading.evidence import (
+    NAMED,
     Bound,
     Evidence,
     RubricItem,
     Scored,
     Text,
-    list_words,
     reason_of,
     text_of,
     values_at,
 )
-from px4fuse.plain import capital
+from px4fuse.plain import capital, few_words
 from px4fuse.record import Share
 from px4fuse.results.contract import LoopResults
 from px4fuse.verification.rerun import log_sha256
@@ -64,21 +64,14 @@ class StudentItem(RubricItem, frozen=True, kw_only=True, tag="student"):
     def score(self, evidence: Evidence) -> Scored:
         """Share of what is asked for."""
         student = evidence.results.student
-        asked = [
-            row
-            for row, wanted in (
-                (("name", "--student", text_of(student.name)), self.name),
-                (("student id", "--id", text_of(student.id)), self.id),
-            )
-            if wanted
-        ]
-        missing = [(what, option) for what, option, value in asked if not value]
+        asked = {"name (--student)": student.name} if self.name else {}
+        asked |= {"student id (--id)": student.id} if self.id else {}
+        missing = [what for what, value in asked.items() if not text_of(value)]
         if not missing:
-            return 1.0, f"Your report names {', '.join(row[2] for row in asked) or 'nobody'}."
-        names, options = (" and ".join(words) for words in zip(*missing, strict=True))
-        return 1.0 - len(missing) / len(asked), (
-            f"Your report does not give your {names}; make it with {options}."
-        )
+            named = ", ".join(map(text_of, asked.values()))
+            return 1.0, f"Your report names {named or 'nobody'}."
+        said = " and ".join(missing)
+        return 1.0 - len(missing) / len(asked), f"Your report does not give your {said}."
 
 
 class SectionsItem(RubricItem, frozen=True, kw_only=True, tag="sections"):
@@ -88,18 +81,16 @@ class SectionsItem(RubricItem, frozen=True, kw_only=True, tag="sections"):
 
     def score(self, evidence: Evidence) -> Scored:
         """Share of the parts."""
+        asked = len(self.results)
         missing = [
             f"{PARTS.get(path, path)}{evidence.why_absent(path)}"
             for path in self.results
             if not any(map(_is_there, values_at(evidence.plain, path)))
         ]
-        asked = len(self.results)
-        if not missing:
-            return 1.0, f"Your report has all {asked} parts that were asked for."
-        return 1.0 - len(missing) / asked, (
-            f"Your report has {asked - len(missing)} of {asked} parts; missing: "
-            f"{list_words(missing)}. Make the report with px4fuse as it comes, on a whole flight."
-        )
+        said = f"Your report has {asked - len(missing)} of {asked} parts that were asked for"
+        if missing:
+            said = f"{said}; missing: {few_words(missing, NAMED)}"
+        return 1.0 - len(missing) / asked, f"{said}."
 
 
 def _is_there(found: tuple[str, object]) -> bool:
@@ -215,28 +206,29 @@ class AnswersItem(RubricItem, frozen=True, kw_only=True, tag="answers"):
 
     def score(self, evidence: Evidence) -> Scored:
         """Share of the points of :mod:`px4fuse.grading.form_points`."""
-        results = evidence.results
-        theirs = None if evidence.key is None else evidence.key.of_student(results.student.id)
-        if theirs is not None and theirs.sha256 != log_sha256(results):
+        student_id, form = evidence.results.student.id, evidence.form
+        theirs = None if evidence.key is None else evidence.key.of_student(student_id)
+        if theirs is not None and theirs.sha256 != log_sha256(evidence.results):
             file = text_of(theirs.file)
             return 0.0, f"This report is not about the log that you were given, {file}."
         if evidence.answer is None:
+            said = text_of(student_id) or "none is given"
             return 0.0, (
-                f"Neither your id ({text_of(results.student.id) or 'none is given'}) nor your log "
-                "is in the answer key; make the report of the log that you were given, with your "
-                "--id."
+                f"Neither your id ({said}) nor your log is in the answer key; make the report of "
+                "the log that you were given, with your --id."
             )
-        if isinstance(evidence.form, str):
-            return 0.0, f"Your form {evidence.form}."
         found = evidence.form_points
-        if found is None:
-            return 0.0, "The answer key does not say what the right answers are."
-        parts = ", ".join(
+        if isinstance(form, str) or found is None:
+            known = (
+                f"Your form {form}" if isinstance(form, str) else "The answer key has no answers"
+            )
+            return 0.0, f"{known}."
+        parts = [
             f"{name} {points:.3g} of {found.of[name]:g}"
             for name, points in found.parts.items()
             if found.of[name]
-        )
-        return found.share, f"Of 100: {parts}. {capital('; '.join(found.said))}."
+        ]
+        return found.share, f"Of 100: {', '.join(parts)}. {capital('; '.join(found.said))}."
 
 
 class TextItem(RubricItem, frozen=True, kw_only=True, tag="text"):

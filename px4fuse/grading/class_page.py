@@ -14,7 +14,7 @@ from collections.abc import Sequence
 
 from px4fuse.answers import form_rows
 from px4fuse.grading.anonymous import Veil
-from px4fuse.grading.class_questions import Copied, above
+from px4fuse.grading.class_questions import above
 from px4fuse.grading.class_table import number
 from px4fuse.grading.flags import copied_notes
 from px4fuse.grading.model import Entry, Graded, Override
@@ -78,7 +78,7 @@ def html_text(entries: Sequence[Entry], title: str, made_with: str) -> str:
         title=title,
         subtitle=f"{len(entries)} {'student' if len(entries) == 1 else 'students'}, graded with "
         f"{made_with}",
-        above=above(entries, veil, made.copied),
+        above=above(entries, veil),
         noun=("student", "students"),
         columns=(
             Column("Student"),
@@ -137,7 +137,7 @@ class _Page:
         graded = [one for entry in entries if (one := entry.counting)]
         self.items = tuple(dict.fromkeys(name for one in graded for name in one.by_title))
         self.numbers = tuple(dict.fromkeys(name for one in graded for name in one.numbers))
-        self.copied: dict[int, list[Copied]] = {
+        self.copied = {
             places[at]: [(share, places[to]) for share, to in others]
             for at, others in copied_notes(graded).items()
         }
@@ -185,11 +185,7 @@ class _Page:
             for title, item in one.by_title.items()
         ]
         attempts = [
-            [
-                f"attempt {place}" if entry.pseudonym else other.submission,
-                other.status,
-                "pending" if other.pending else f"{number(other.points)} / {number(other.of)}",
-            ]
+            f"{f'attempt {place}' if entry.pseudonym else other.submission}: {other.status}"
             for place, other in enumerate(entry.others, start=1)
         ]
         return (
@@ -223,10 +219,7 @@ class _Page:
             *([] if entry.pseudonym else [_boxes(entry, one)]),
             prose("The student's own words", hide(one.notes, own_words=True)),
             *self._alike(at),
-            tabled(
-                "Other attempts", ("File", "Status", "Points") if attempts else (), attempts, (2,)
-            ),
-            pairs("Submission", _facts(entry, one)),
+            listed("Other attempts", attempts),
         )
 
     def _alike(self, at: int) -> list[Part]:
@@ -265,19 +258,6 @@ def late_words(entry: Entry) -> str:
         if entry.late_s >= least * size:
             return f"{entry.late_s / size:.0f} {unit} late"
     return f"{math.ceil(entry.late_s / 60.0)} min late"
-
-
-def _facts(entry: Entry, one: Graded) -> list[tuple[str, str]]:
-    who = (
-        ("Name", entry.student),
-        ("Id", entry.student_id),
-        ("File", one.submission),
-        ("SHA-256 of the PDF", one.sha256),
-        ("SHA-256 of the log", one.log_sha256),
-    )
-    version = f"px4fuse {one.version}" if one.version else ""
-    facts = (("Handed in", entry.handed_in), ("Late", late_words(entry)), ("Version", version))
-    return [*(() if entry.pseudonym else who), *facts]
 
 
 def _boxes(entry: Entry, one: Graded) -> Part:

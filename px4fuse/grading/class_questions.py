@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import statistics
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 from px4fuse.grading.anonymous import Veil
 from px4fuse.grading.class_table import number
@@ -14,16 +14,12 @@ from px4fuse.webpage.charts import bar, bins, histogram
 from px4fuse.webpage.frame import card, note, opens, picks, ranking, summary
 from px4fuse.webpage.safe import escaped
 
-# How alike the notes are, and the place of the other entry
-Copied = tuple[float, int]
 MOST_NAMES = 40
-MOST_PAIRS = 20
 
 
-def above(entries: Sequence[Entry], veil: Veil, copied: Mapping[int, Sequence[Copied]]) -> str:
+def above(entries: Sequence[Entry], veil: Veil) -> str:
     """HTML of all that stands above the table."""
-    cards = (_items(entries, veil), _mistakes(entries), _to_judge(entries), _pairs(entries, copied))
-    shown = "".join(cards)
+    shown = _items(entries, veil) + _mistakes(entries)
     return _summary(entries) + (f'<div class="cards">{shown}</div>' if shown else "")
 
 
@@ -99,30 +95,3 @@ def _mistakes(entries: Sequence[Entry]) -> str:
         lines.append(f"<li>{bar(shares[mistake])}{said}<span class='right'>{named}</span>{by}</li>")
     said = "Of the students whose flight has it, by the answer key; hardest first."
     return ranking("Who missed which mistake", said, lines, len(lines)) if lines else ""
-
-
-def _to_judge(entries: Sequence[Entry]) -> str:
-    """Points that wait for the instructor."""
-    lines = []
-    for at, entry in enumerate(entries):
-        one = entry.counting
-        # what to do stands in the row, where names are hidden
-        waiting = ["points that are pending"] * bool(one and one.pending)
-        waiting += ["a text to read"] * bool(one and one.waits)
-        if waiting:
-            said = f"<span class='right'>{escaped(' and '.join(waiting))}</span>"
-            lines.append(f"<li>{opens(at, entry.called)}{said}</li>")
-    rest = ": choose “pending” or “to read” under Status"
-    return ranking("For you to judge", "", lines, MOST_NAMES, rest) if lines else ""
-
-
-def _pairs(entries: Sequence[Entry], copied: Mapping[int, Sequence[Copied]]) -> str:
-    """Pairs of students whose notes share passages, most alike first."""
-    found = [(-share, at, to) for at, others in copied.items() for share, to in others if at < to]
-    lines = [
-        f"<li><span>{opens(at, entries[at].called)} and {opens(to, entries[to].called)}</span>"
-        f"<span class='right'>{-share:.0%} of both</span></li>"
-        for share, at, to in sorted(found)
-    ]
-    said = "Open one of the two to read them one after the other. Alike does not mean copied."
-    return ranking("Texts that share passages", said, lines, MOST_PAIRS, " pairs") if lines else ""

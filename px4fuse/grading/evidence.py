@@ -16,7 +16,6 @@ from px4fuse.answers import Answers, check
 from px4fuse.assignment.key import Answer, AnswerKey
 from px4fuse.filter.tuning import HORIZONTAL
 from px4fuse.grading.form_points import FormPoints, form_points
-from px4fuse.plain import few_words
 from px4fuse.record import Unavailable
 from px4fuse.results.contract import ComparisonResults, LoopResults, Reported, to_plain
 from px4fuse.results.reading import one_line
@@ -198,11 +197,6 @@ def text_of(value: str) -> str:
 def absence(part: object) -> str:
     """Why a part is not there, in brackets; "" where it is, or nobody says."""
     return f" ({text_of(part.reason).rstrip('.')})" if isinstance(part, Unavailable) else ""
-
-
-def list_words(names: Sequence[str]) -> str:
-    """Names with commas between them, the first few."""
-    return few_words(names, NAMED)
 
 
 def joined(reasons: Sequence[str]) -> str:

@@ -11,7 +11,6 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from decimal import Decimal
 from operator import attrgetter
-from pathlib import PurePosixPath
 
 from px4fuse.assignment.key import AnswerKey, folded
 from px4fuse.filter.settings import Settings
@@ -191,13 +190,9 @@ def _other_name(graded: Sequence[Graded], key: AnswerKey | None) -> Flags:
             if student_id not in own
             and (student_id in words or (len(_words(name)) > 1 and _words(name) <= words))
         ]
-        stem = PurePosixPath(one.submission.replace("\\", "/")).stem
         if others:
             other = _line(sorted(others)[0])
             yield index, f"The file's name is that of {other}, the report says {_name(one)}."
-        elif stem.isdecimal() and any(len(stem) == len(each) and each.isdecimal() for each in own):
-            said = f"the report gives the id {_line(one.student_id)}"
-            yield index, f"The file is named {_line(stem)}, {said}."
 
 
 def _words(text: str) -> frozenset[str]:
