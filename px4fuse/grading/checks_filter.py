@@ -11,9 +11,9 @@ from px4fuse.filter.clock import Clock
 from px4fuse.filter.consistency import HorizontalNis
 from px4fuse.filter.tuning import HORIZONTAL, Tuned
 from px4fuse.grading.evidence import Evidence, absence, drifts, text_of, why_not_horizontal
+from px4fuse.loop.model import LoopPart
 from px4fuse.plain import factor_words
 from px4fuse.results.comparison import ASKED
-from px4fuse.results.trajectories import LoopPart
 
 # Findings about stamps for which no single offset is right
 CHANGING = ("source_clock_changes", "source_stamps_of_arrival")

@@ -9,11 +9,12 @@ from typing import Any
 from scipy.stats import chi2
 
 from px4fuse.grading.evidence import Evidence, absence
+from px4fuse.loop.model import Correction, LoopPart, Way
 from px4fuse.plain import length_words, p_words
-from px4fuse.record import Unavailable
+from px4fuse.record import Maybe, Unavailable
 from px4fuse.request import LoopRequest
 from px4fuse.results.contract import LoopResults
-from px4fuse.results.trajectories import Correction, Corrections, LoopPart, Score
+from px4fuse.trajectory.evaluation import Score
 from px4fuse.trajectory.graph.analysis import GATE_ALPHA
 
 OPEN = "open-end"
@@ -169,15 +170,16 @@ def closure(evidence: Evidence, given: Mapping[str, Any]) -> tuple[float, str]:
     )
 
 
-def _corrected(corrections: Corrections, without_reference: float) -> tuple[float, str]:
+def _corrected(
+    corrections: Mapping[Way, Maybe[Correction]], without_reference: float
+) -> tuple[float, str]:
     """One for a corrected path and one for an ATE below the uncorrected one."""
-    tried = (
-        corrections.by_distance_plain, corrections.by_distance, corrections.pose_graph_gated,
-    )  # fmt: skip
+    ways: tuple[Way, ...] = ("by_distance_plain", "by_distance", "pose_graph_gated")
+    tried = [corrections.get(way) for way in ways]
     done = [one for one in tried if isinstance(one, Correction)]
     if not done:
         return 0.0, ", but the path is not corrected."
-    before = _ates(corrections.uncorrected)
+    before = _ates(corrections.get("uncorrected"))
     pairs = [
         (before[name], ate) for one in done for name, ate in _ates(one).items() if before.get(name)
     ]
@@ -195,7 +197,7 @@ def _corrected(corrections: Corrections, without_reference: float) -> tuple[floa
     )
 
 
-def _ates(correction: Correction | Unavailable) -> dict[str, float]:
+def _ates(correction: Correction | Unavailable | None) -> dict[str, float]:
     """ATE (m) of a correction by the reference that it was scored against."""
     scores = correction.scores if isinstance(correction, Correction) else {}
     return {
