@@ -1,6 +1,6 @@
 """Request → Analysis: the one way to run a comparison or a loop.
 
-Readers, placing, filter, comparison and what explains it are called from here, in that order.
+Readers, alignment, filter, comparison and what explains it are called from here, in that order.
 """
 
 from __future__ import annotations
@@ -186,14 +186,14 @@ def read_flight(request: ComparisonRequest, progress: Progress = silent) -> Flig
                 f"`mavlink` {other.log.name}: this is a {other.log.format}, not a MAVLink "
                 "recording. Give the ULog as LOG, and the recording (.tlog) with `mavlink`."
             )
-        from px4fuse.placing import join  # noqa: PLC0415
+        from px4fuse.alignment import join  # noqa: PLC0415
 
         flight = join(flight, other)
     position, offset = request.position, request.clock_offset_s
     if position is None:
         return flight
     # scipy.signal and scipy.ndimage cost a fifth of a second: only where a file is placed
-    from px4fuse.placing import place  # noqa: PLC0415
+    from px4fuse.alignment import place  # noqa: PLC0415
     from px4fuse.readers.position_csv import read_position_csv  # noqa: PLC0415
 
     file = read_position_csv(

@@ -30,7 +30,7 @@ from px4fuse.flight import (
     Reset,
 )
 from px4fuse.origin import GIVEN_FILE
-from px4fuse.placing.placement import EKF2_POSITION, IMU, place
+from px4fuse.alignment.placement import EKF2_POSITION, IMU, place
 from px4fuse.readers import read_log
 from px4fuse.readers.position_csv import SAMPLE_COLUMNS, PositionRecording, read_position_csv
 

@@ -38,7 +38,7 @@ from px4fuse.flight import (
     Unavailable,
 )
 from px4fuse.origin import RECEIVED
-from px4fuse.placing.joining import join
+from px4fuse.alignment.joining import join
 from px4fuse.readers import read_log
 
 

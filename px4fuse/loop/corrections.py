@@ -79,22 +79,13 @@ def judge(graph: PoseGraph | Unavailable, told: Sequence[Told]) -> tuple[Closure
         return ()
     edges = np.arange(len(graph.first) - len(told), len(graph.first))
     judged = []
-    for edge, result, (given, end) in zip(
-        edges, gate(graph, edges, alpha=GATE_ALPHA), told, strict=True
-    ):
-        missed = graph.poses[graph.second[edge], :3] - graph.poses[graph.first[edge], :3]
-        closure = Closure(
-            time_1_s=given.time_1_s,
-            time_2_s=given.time_2_s,
-            sigma_m=given.sigma_m,
-            source="given" if end is None else LANDING,
-            distance_m=float(np.linalg.norm(missed if end is None else missed - end.displacement)),
-            d2=result.d2,
-            degrees_of_freedom=result.degrees_of_freedom,
-            p=result.p,
-            accepted=result.accepted,
-        )
-        judged.append(closure)
+    for result, (given, end) in zip(gate(graph, edges, alpha=GATE_ALPHA), told, strict=True):
+        missed = graph.poses[result.second, :3] - graph.poses[result.first, :3]
+        facts = structs.asdict(given) | structs.asdict(result)
+        del facts["first"], facts["second"]
+        facts["source"] = "given" if end is None else LANDING
+        there = np.zeros(3) if end is None else end.displacement
+        judged.append(Closure(distance_m=float(np.linalg.norm(missed - there)), **facts))
     return tuple(judged)
 
 
@@ -165,7 +156,29 @@ def _carried(path: Trajectory, nodes: IntArray, before: Array, after: Array) -> 
     return path.moved(position, None if path.rotation is None else turned * path.rotation)
 
 
-def scored(
+def score_all(
+    odometry: Trajectory, made: Mapping[Way, Made], references: tuple[Trajectory, ...]
+) -> tuple[CorrectedPath, dict[Way, CorrectedPath | Unavailable]]:
+    """The odometry, and every path, scored; the clocks are matched once, on the odometry."""
+    raw = _scored("uncorrected", odometry, odometry, None, references, {})
+    offsets = {
+        name: score.time_offset.offset_s
+        for name, score in raw.scores.items()
+        if isinstance(score, Evaluation) and score.time_offset.offset_s is not None
+    }
+    found: dict[Way, CorrectedPath | Unavailable] = {"uncorrected": raw}
+    for way, one in made.items():
+        same = found.get("pose_graph_all")
+        if isinstance(one, Unavailable):
+            found[way] = one
+        elif isinstance(same, CorrectedPath) and one[1] is same.solution:
+            found[way] = structs.replace(same, name=NAMES[way])
+        else:
+            found[way] = _scored(way, odometry, *one, references, offsets)
+    return raw, found
+
+
+def _scored(
     way: Way,
     odometry: Trajectory,
     corrected: Trajectory,
@@ -173,7 +186,7 @@ def scored(
     references: tuple[Trajectory, ...],
     offsets: Mapping[str, float],
 ) -> CorrectedPath:
-    """A path scored against every reference; the clocks are matched once, on the odometry."""
+    """A path, how far it moved, and its score against every reference."""
     scores: dict[str, Evaluation | Unavailable] = {}
     for reference in references:
         same_clock = 0.0 if reference.sha256 == corrected.sha256 else None
@@ -197,12 +210,3 @@ def scored(
         solution=solution,
         **costs,
     )
-
-
-def offsets_of(odometry: CorrectedPath) -> dict[str, float]:
-    """Clock offsets to each reference, as found on the odometry."""
-    return {
-        name: score.time_offset.offset_s
-        for name, score in odometry.scores.items()
-        if isinstance(score, Evaluation) and score.time_offset.offset_s is not None
-    }

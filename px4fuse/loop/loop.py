@@ -6,7 +6,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 import numpy as np
-from msgspec import structs
 
 from px4fuse.arrays import Array, IntArray
 from px4fuse.display import Shown
@@ -14,7 +13,7 @@ from px4fuse.errors import MissingDataError, SettingsError, TrajectoryError
 from px4fuse.filter.signals import Segment
 from px4fuse.flight import Unavailable
 from px4fuse.loop.closure import heading_change_rad, key_frame_spacing_m, key_frames, upright
-from px4fuse.loop.corrections import NAMES, by_distance, judge, offsets_of, scored, solve_all
+from px4fuse.loop.corrections import by_distance, judge, score_all, solve_all
 from px4fuse.loop.model import (
     CorrectedPath,
     KnownEnd,
@@ -151,10 +150,7 @@ def close_loop(
         A number is out of range.
     """
     noise = noise or OdometryNoise()
-    drifts = {"position_drift_m": noise.position_m, "heading_drift_deg": noise.heading_deg}
-    for name, drift in drifts.items():
-        if not 1e-4 <= drift <= 100.0:
-            raise SettingsError(f"`{name}` {drift:g} is outside 0.0001 to 100.")
+    _check_drift(noise)
     whole = upright(trajectory)
     low, high = whole.time_s[[0, -1]].tolist()
     segment = segment or Segment(low, high, "the whole trajectory")
@@ -192,22 +188,12 @@ def close_loop(
         misclosure = heading_error = end
     else:
         misclosure, heading_error = end_m - end.displacement, _heading_error(end, heading)
-    raw = scored("uncorrected", path, path, None, references, {})
-    offsets = offsets_of(raw)
     graph, nodes, statement = pose_graph(path, frames, told, noise)
     judged = judge(graph, told)
     solved, judged = solve_all(path, nodes, graph, judged, progress)
     landing = judged[0] if came_back and judged else None
-    corrections: dict[Way, CorrectedPath | Unavailable] = {"uncorrected": raw}
     spread = by_distance(path, distance, misclosure, heading_error, landing)
-    for way, made in (spread | solved).items():
-        same = corrections.get("pose_graph_all")
-        if isinstance(made, Unavailable):
-            corrections[way] = made
-        elif isinstance(same, CorrectedPath) and made[1] is same.solution:
-            corrections[way] = structs.replace(same, name=NAMES[way])
-        else:
-            corrections[way] = scored(way, path, *made, references, offsets)
+    raw, corrections = score_all(path, spread | solved, references)
     missed = None if isinstance(misclosure, Unavailable) else float(np.linalg.norm(misclosure))
     return Loop(
         track=path.name,
@@ -241,6 +227,13 @@ def close_loop(
         references=references,
         given_frame=trajectory.frame,
     )
+
+
+def _check_drift(noise: OdometryNoise) -> None:
+    drifts = {"position_drift_m": noise.position_m, "heading_drift_deg": noise.heading_deg}
+    for name, drift in drifts.items():
+        if not 1e-4 <= drift <= 100.0:
+            raise SettingsError(f"`{name}` {drift:g} is outside 0.0001 to 100.")
 
 
 def _check(closure: GivenClosure, path: Trajectory, *, is_landing: bool) -> None:

@@ -119,10 +119,10 @@ def pose_graph(
     information = np.zeros((len(first), 6, 6))
     diagonal = np.column_stack([np.repeat(1.0 / translation[:, None], 3, axis=1), 1.0 / turn])
     information[steps[:, None], range(6), range(6)] = diagonal
-    moved = position[second] - position[first]
-    there = rotation[second]
+    back, there = rotation[first].inv(), rotation[second]
+    moved = back.apply(position[second] - position[first])
     for row, (closure, end) in enumerate(told, start=len(steps)):
-        moved[row] = 0.0 if end is None else end.displacement
+        moved[row] = 0.0 if end is None else back[row].apply(end.displacement)
         information[row, range(3), range(3)] = closure.sigma_m**-2
         if end is not None and end.heading_change_deg is not None:
             by_odometry = heading_change_rad(there[row] * rotation[first[row]].inv())
@@ -131,14 +131,13 @@ def pose_graph(
             vertical = there[row].inv().apply(DOWN)
             sigma = np.radians(end.sigma_heading_deg or 0.0)
             information[row, 3:, 3:] = np.outer(vertical, vertical) / sigma**2
-    back = rotation[first].inv()
     graph = PoseGraph(
         dimension=3,
         ids=np.arange(len(nodes)),
         poses=np.column_stack([position, rotation.as_quat()]),
         first=first,
         second=second,
-        measurements=np.column_stack([back.apply(moved), (back * there).as_quat()]),
+        measurements=np.column_stack([moved, (back * there).as_quat()]),
         information=information,
         initialised="odometry",
     )

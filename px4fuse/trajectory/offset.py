@@ -1,7 +1,7 @@
 """Offset between the clocks of two recordings of one motion: every lag, then least squares.
 
 One search serves trajectories here, and a position file against EKF2 or the IMU in
-:mod:`px4fuse.placing.fitting`: both series are correlated over all lags (:mod:`correlation`), the
+:mod:`px4fuse.alignment.fitting`: both series are correlated over all lags (:mod:`correlation`), the
 best is refined by least squares, and is refused where another lag's residual is within
 :data:`RIVAL_RATIO` of it. What differs is what is known. Trajectories may have any frame and scale,
 so their speeds are correlated and a free similarity is refined; a position file is in metres with z
