@@ -42,7 +42,8 @@ from px4fuse.findings import story as telling
 from px4fuse.findings.model import Finding
 from px4fuse.findings.story import story
 from px4fuse.findings.variance import _is_default, _kf_remedy, _noise_helps, _outliers
-from px4fuse.loop.loop import Judged, Loop
+from px4fuse.loop.loop import Loop
+from px4fuse.loop.model import Closure
 from px4fuse.plain import factor_words
 
 MOVING = source(samples=positions(np.arange(0.0, 120.0), np.arange(120.0)))
@@ -399,22 +400,15 @@ def test_of_a_bound_the_noise_is_never_less_than_a_millimetre() -> None:
 
 def closure(
     gnc: float | None = 1.0, *, accepted: bool = True, where: str = "landing", p: float = 0.5
-) -> Judged:
-    class At:
-        source, time_1_s, time_2_s = where, 10.0, 90.0
-
-        def __str__(self) -> str:
-            return "the closure"
-
-    gate = SimpleNamespace(accepted=accepted, p=p, d2=25.0, degrees_of_freedom=2)
-    return Judged(At(), 3.0, gate, {} if gnc is None else {"gnc": gnc})  # type: ignore[arg-type]
+) -> Closure:
+    return Closure(
+        time_1_s=10.0, time_2_s=90.0, sigma_m=0.1, source=where, distance_m=3.0, d2=25.0,
+        degrees_of_freedom=2, p=p, accepted=accepted, weight_gnc=gnc,
+    )  # fmt: skip
 
 
-def loop(*closures: Judged, assumed: bool = False) -> Loop:
-    class Made(Loop):
-        end_assumed = assumed
-
-    return made(Made, closures=closures)
+def loop(*closures: Closure, assumed: bool = False) -> Loop:
+    return made(Loop, closures=closures, end_assumed=assumed)
 
 
 @pytest.mark.parametrize(
@@ -428,19 +422,24 @@ def loop(*closures: Judged, assumed: bool = False) -> Loop:
         ((closure(0.0, accepted=False),), ["loop_drift_understated", "false_loop_closure"]),
     ],
 )  # fmt: skip
-def test_closures(closures: tuple[Judged, ...], expected: list[str]) -> None:
+def test_closures(closures: tuple[Closure, ...], expected: list[str]) -> None:
     found = list(loop_closures.DETECTOR.detect(loop(*closures)))
     assert [finding.id for finding in found] == expected
     if expected == ["loop_drift_understated"]:
-        dropped = sum(judged.weights["gnc"] < 0.5 for judged in closures)
+        dropped = sum((each.weight_gnc or 0.0) < 0.5 for each in closures)
         assert found[0].evidence == {"dropped": dropped, "closures": float(len(closures))}
 
 
 def test_a_false_closure_is_told_with_what_to_do() -> None:
     for where, assumed, says, remedy in (
         ("landing", True, "cannot have landed where it took off, as was assumed", "--open"),
-        ("landing", False, "the closure cannot be true", "--open"),
-        ("given", True, "the closure cannot be true", "Leave it out; it is not used."),
+        ("landing", False, "the closure of take-off and landing cannot be true", "--open"),
+        (
+            "given",
+            True,
+            "the closure of 10 s and 90 s cannot be true",
+            "Leave it out; it is not used.",
+        ),
     ):
         false = loop(closure(accepted=False, where=where), assumed=assumed)
         finding = only(loop_closures, false)
@@ -454,11 +453,7 @@ def test_a_false_closure_is_told_with_what_to_do() -> None:
 
 
 def closing(gap_m: float | None, length_m: float = 50.0) -> Loop:
-    class Made(Loop):
-        closure_error_m = gap_m
-        path_length_m = length_m
-
-    return made(Made)
+    return made(Loop, closure_error_m=gap_m, path_length_m=length_m)
 
 
 def test_what_may_drift_is_told_with_its_scatter_and_its_loop() -> None:

@@ -269,7 +269,7 @@ def _class(roster: Path, folder: Path, answer_path: Path | None) -> tuple[tuple[
 
 
 def _assign(
-    students: tuple[RosterStudent, ...],
+    students: tuple[Person, ...],
     folder: Path,
     key_file: Path,
     secret: bytes | None,
@@ -301,7 +301,7 @@ def _assign(
 
 
 def _preview(
-    students: tuple[RosterStudent, ...],
+    students: tuple[Person, ...],
     key_file: Path,
     secret: bytes | None,
     kind: Kinds,

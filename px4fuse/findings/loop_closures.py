@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from px4fuse.findings.model import Detector, Finding, Found, Threshold
-from px4fuse.loop.corrections import Judged
 from px4fuse.loop.loop import Loop
+from px4fuse.loop.model import LANDING, Closure
 from px4fuse.trajectory.graph.analysis import GATE_ALPHA
 
 MOST = Threshold(0.5, "share", "of several closures, more are true than false")
@@ -12,7 +12,8 @@ DOUBTFUL_WEIGHT = Threshold(0.5, "weight", "GNC ends at 0 or 1 (Yang et al. 2020
 
 
 def _detect(loop: Loop) -> Found:
-    dropped = [j for j in loop.closures if j.weights.get("gnc", 1.0) < DOUBTFUL_WEIGHT.value]
+    weighed = [c for c in loop.closures if c.weight_gnc is not None]
+    dropped = [c for c in weighed if (c.weight_gnc or 0.0) < DOUBTFUL_WEIGHT.value]
     most = len(dropped) > MOST.value * len(loop.closures)
     if most:
         yield Finding(
@@ -23,52 +24,52 @@ def _detect(loop: Loop) -> Found:
             "Give a larger --drift or --heading-drift.",
             {"dropped": float(len(dropped)), "closures": float(len(loop.closures))},
         )
-    for judged in loop.closures:
-        if not judged.gate.accepted:
-            yield _false(judged, loop.end_assumed)
-        elif judged in dropped and not most:
+    for closure in loop.closures:
+        if not closure.accepted:
+            yield _false(closure, loop.end_assumed)
+        elif closure in dropped and not most:
             yield Finding(
                 "loop_closure_doubtful",
                 "warning",
-                f"The other closures contradict {judged.closure}: robust solving drops it, "
+                f"The other closures contradict {closure}: robust solving drops it, "
                 "although the drift alone could explain it.",
                 "Leave it out, or take the robust solution (GNC).",
-                _evidence(judged) | {"gnc_weight": judged.weights["gnc"]},
+                _evidence(closure) | {"gnc_weight": closure.weight_gnc or 0.0},
             )
 
 
-def _false(judged: Judged, assumed: bool) -> Finding:
-    gate = judged.gate
-    landing = judged.closure.source == "landing"
+def _false(closure: Closure, assumed: bool) -> Finding:
+    landing = closure.source == LANDING
     remedy = "Leave it out; it is not used."
     if landing:
         remedy = (
             "If it landed elsewhere, measure where (--landed-at FORWARD,RIGHT) or leave the "
             "landing out (--open)."
         )
-    what = f"{judged.closure} cannot be true"
+    what = f"{closure} cannot be true"
     if landing and assumed:
         what = "the vehicle cannot have landed where it took off, as was assumed"
     return Finding(
         "false_loop_closure",
         "error",
-        f"False loop closure: {what}. The odometry misses it by {judged.distance_m:.2f} m, and "
-        f"drift explains that with a chance of {gate.p:.1g} (d² {gate.d2:.0f}, "
-        f"{gate.degrees_of_freedom} degrees of freedom). Trusting it would warp the entire path.",
+        f"False loop closure: {what}. The odometry misses it by {closure.distance_m:.2f} m, and "
+        f"drift explains that with a chance of {closure.p:.1g} (d² {closure.d2:.0f}, "
+        f"{closure.degrees_of_freedom} degrees of freedom). Trusting it would warp the entire "
+        "path.",
         f"{remedy} If the odometry really drifts that much, say so with --drift and "
         "--heading-drift.",
-        _evidence(judged),
+        _evidence(closure),
     )
 
 
-def _evidence(judged: Judged) -> dict[str, float | str]:
+def _evidence(closure: Closure) -> dict[str, float | str]:
     return {
-        "time_1_s": judged.closure.time_1_s,
-        "time_2_s": judged.closure.time_2_s,
-        "distance_m": judged.distance_m,
-        "d2": judged.gate.d2,
-        "degrees_of_freedom": float(judged.gate.degrees_of_freedom),
-        "p": judged.gate.p,
+        "time_1_s": closure.time_1_s,
+        "time_2_s": closure.time_2_s,
+        "distance_m": closure.distance_m,
+        "d2": closure.d2,
+        "degrees_of_freedom": float(closure.degrees_of_freedom),
+        "p": closure.p,
         "alpha": GATE_ALPHA,
     }
 

@@ -21,11 +21,11 @@ from px4fuse.grading.evidence import (
     falling,
     text_of,
 )
+from px4fuse.loop.model import LoopPart
 from px4fuse.plain import capital, factor_words
 from px4fuse.record import Share
 from px4fuse.results.comparison import ASKED
 from px4fuse.results.contract import ComparisonResults
-from px4fuse.results.trajectories import LoopPart
 
 # Findings about stamps for which no single offset is right
 CHANGING = ("source_clock_changes", "source_stamps_of_arrival")
