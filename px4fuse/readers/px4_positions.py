@@ -47,6 +47,7 @@ from px4fuse.recording import ClockMap
 MIN_TRACK_SAMPLES = 3
 EARTH_RADIUS_M = 6_371_000.0  # PX4's CONSTANTS_RADIUS_OF_EARTH, src/lib/geo/geo.h
 GPS_3D_FIX = 3
+GLOBAL_COLUMNS = ["latitude_deg", "longitude_deg", "altitude_m"]
 # Samples that are published within this of their measurement have no measured time of their own
 SAME_TIME_US = 100
 ARRIVAL_SHARE = 0.9
@@ -284,14 +285,13 @@ def _local_origin(topics: Topics) -> tuple[float, float, float] | None:
     return float(latitude), float(longitude), float(altitude)
 
 
-def _projected(topics: Topics, geo: pd.DataFrame) -> pd.DataFrame:
+def projected(geo: pd.DataFrame, origin: tuple[float, float, float] | None) -> pd.DataFrame:
     """Latitude, longitude and altitude as north, east, down (m).
 
-    About EKF2's origin, or where it had none about their own first sample.
+    About an origin, or where there is none about their own first sample.
     """
-    columns = ["latitude_deg", "longitude_deg", "altitude_m"]
-    latitude, longitude, altitude = geo[columns].to_numpy().T
-    origin = _local_origin(topics) or (latitude[0], longitude[0], altitude[0])
+    latitude, longitude, altitude = geo[GLOBAL_COLUMNS].to_numpy().T
+    origin = origin or (latitude[0], longitude[0], altitude[0])
     north, east = project(latitude, longitude, origin[:2])
     return pd.DataFrame(
         {"north_m": north, "east_m": east, "down_m": origin[2] - altitude}, index=geo.index
@@ -311,7 +311,7 @@ def _read_gps(topics: Topics) -> PositionTrack | Unavailable:
         gps = gps[gps["fix_type"] >= GPS_3D_FIX]
     if gps.empty:
         return _unavailable(GPS_POSITION, "the receiver never had a 3D fix")
-    samples = _projected(topics, gps)
+    samples = projected(gps, _local_origin(topics))
     if {"eph_m", "epv_m"} <= set(gps.columns):
         samples["north_m2"] = samples["east_m2"] = gps["eph_m"].to_numpy() ** 2 / 2.0
         samples["down_m2"] = gps["epv_m"].to_numpy() ** 2
@@ -339,7 +339,7 @@ def read_truth(topics: Topics, positions: tuple[PositionTrack, ...]) -> Truth | 
         geo = finite_rows(topics.frame(layout), ["latitude_deg", "longitude_deg"])
         if len(geo):
             velocity = geo.reindex(columns=VELOCITY_COLUMNS)
-            samples = _projected(topics, geo).join(velocity)
+            samples = projected(geo, _local_origin(topics)).join(velocity)
             return Truth(layout.topic, samples, _true_attitude(topics))
     captured = motion_capture(positions, "vehicle_mocap_odometry", "att_pos_mocap")
     if captured is None:
