@@ -50,8 +50,7 @@ from px4fuse.readers.parts import (
     stretches_of_modes,
     with_attitude,
 )
-from px4fuse.readers.px4_instances import NO_SELECTOR
-from px4fuse.readers.ulog_topics import dropped_note
+from px4fuse.readers.ulog_topics import NO_SELECTOR, dropped_note
 from px4fuse.recording import LogInfo, Unused
 
 VARIANCE_COLUMNS = POSITION_VARIANCE_COLUMNS + VELOCITY_VARIANCE_COLUMNS
