@@ -6,7 +6,6 @@ import csv
 import hashlib
 import io
 from collections.abc import Callable
-from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import numpy as np
@@ -139,15 +138,12 @@ DIALECTS: dict[str, str | bytes] = {
     "comma": table(PLAIN),
     "comma and blank": table(PLAIN, separator=", "),
     "semicolon": table(PLAIN, separator=";"),
-    "semicolon, decimal comma": table(PLAIN, separator=";", decimal=","),
     "tab": table(PLAIN, separator="\t"),
-    "tab, decimal comma": table(PLAIN, separator="\t", decimal=","),
     "space": table(PLAIN, separator=" "),
     "several spaces": table(PLAIN, separator="   "),
     "leading spaces": "".join(
         "  " + line for line in table(PLAIN, separator="  ").splitlines(True)
     ),
-    "space, decimal comma": table(PLAIN, separator=" ", decimal=","),
     "quotes": table(PLAIN, quote='"'),
     "byte order mark": b"\xef\xbb\xbf" + table(PLAIN).encode(),
     "Latin-1": table({"t [µs]": exact(UNIX_US + TIME_US, 0), "x": X, "y": Y, "z": Z}).encode(
@@ -157,7 +153,7 @@ DIALECTS: dict[str, str | bytes] = {
     "UTF-16": table(PLAIN).encode("utf-16"),
     "CR": table(PLAIN, end="\r"),
     "trailing separators": table(PLAIN, trailing=",,"),
-    "trailing semicolon": table(PLAIN, separator=";", decimal=",", trailing=";"),
+    "trailing semicolon": table(PLAIN, separator=";", trailing=";"),
     "blank lines": "\n\n" + table(PLAIN, end="\n\n") + "\n  \n",
     "lines of separators": table(PLAIN) + ",,,\n,,,\n",
     "comments": "# made by uwbd\n% v2\n" + table(PLAIN).replace("\n", "\n# note, 1, 2, 3\n", 5),
@@ -180,15 +176,8 @@ def test_every_dialect_gives_the_same_samples(read, dialect):
     assert file.samples[SAMPLE_COLUMNS[3:]].isna().all(axis=None)
 
 
-@pytest.mark.parametrize(
-    ("dialect", "words"),
-    [
-        ("tab, decimal comma", ("tab", "decimal comma", "header in line 1")),
-        ("preamble", ("comma between", "decimal point", "header in line 5")),
-    ],
-)
-def test_says_what_the_text_is(read, dialect, words):
-    said(read(DIALECTS[dialect]), *words)
+def test_says_what_the_text_is(read):
+    said(read(DIALECTS["preamble"]), "table: comma between columns, header in line 5")
 
 
 def test_plain_format_needs_no_note(read):
@@ -260,31 +249,6 @@ def test_units_and_clocks_of_time(read, case):
 def test_says_why_the_unit_of_time(read, case, words):
     name, texts, _, _ = TIMES[case]
     said(read(table({name: texts, "x": X, "y": Y, "z": Z})), "time: ", *words)
-
-
-def iso(zone: str = "Z", separator: str = "T", date: str = "-", shift_h: int = 0) -> list[str]:
-    start = datetime(1970, 1, 1, tzinfo=UTC) + timedelta(hours=shift_h)
-    moments = [start + timedelta(microseconds=UNIX_US + int(us)) for us in TIME_US]
-    return [
-        moment.strftime(f"%Y{date}%m{date}%d{separator}%H:%M:%S.%f{zone}") for moment in moments
-    ]
-
-
-@pytest.mark.parametrize(
-    ("texts", "words"),
-    [
-        (iso(), "ISO 8601 text"),
-        (iso(zone="+01:00", shift_h=1), "ISO 8601 text"),
-        (iso(zone=""), "no zone, taken as UTC"),
-        (iso(zone="", separator=" "), "no zone, taken as UTC"),
-        (iso(zone="", separator=" ", date="/"), "no zone, taken as UTC"),
-    ],
-)
-def test_iso_time(read, texts, words):
-    file = read(table({"Timestamp": texts, "x": X, "y": Y, "z": Z}))
-    assert_track(file)
-    assert file.clock == "UNIX"
-    said(file, words)
 
 
 def test_nineteen_digits_keep_their_microseconds(read):
@@ -580,12 +544,6 @@ def test_text_in_a_column_of_numbers_is_named(read, column, text):
     assert f"uwb.csv, line 35: '{column}': '{text}' is no" in line
 
 
-@pytest.mark.parametrize("text", ["2026-11-21T25:00:00Z", "1795253650.9", "later"])
-def test_text_among_iso_times_is_named(read, text):
-    line = refused(read, table({**PLAIN, "time": [*iso()[:29], text, *iso()[30:]]}))
-    assert f"line 31: 'time': '{text}' is not a time" in line
-
-
 def test_several_tags_are_pointed_out(read):
     file = read(table({"tag_id": ["A1", "B2"] * (ROWS // 2), **PLAIN}))
     said(file, "several tags ('A1', 'B2')")
@@ -597,17 +555,15 @@ ODD = {"clock": UNIX_S, "a": Y, "b": X, "c": Z, "d_": SIGMA}
 
 
 @pytest.mark.parametrize(
-    ("columns", "header", "has_sigma"),
+    ("columns", "has_sigma"),
     [
-        (("clock", "b", "a", "c"), True, False),
-        (("CLOCK", "B ", "a", "c", "d_"), True, True),
-        (("1", "3", "2", "4"), True, False),
-        (("1", "3", "2", "4", "5"), False, True),
-        (("clock", "3", "a", "4"), True, False),
+        (("clock", "b", "a", "c"), False),
+        (("CLOCK", "B ", "a", "c", "d_"), True),
+        (("clock", "3", "a", "4"), False),
     ],
 )
-def test_columns_option(read, columns, header, has_sigma):
-    file = read(PREAMBLE + table(ODD, header=header), columns=columns)
+def test_columns_option(read, columns, has_sigma):
+    file = read(PREAMBLE + table(ODD), columns=columns)
     assert_track(file)
     assert file.samples["sigma_x_m"].notna().all() == has_sigma
     if has_sigma:
@@ -633,11 +589,6 @@ def test_columns_option_without_height(read):
     assert file.samples["x_m"].to_numpy() == pytest.approx(TRACK_M[:, 0])
 
 
-def test_columns_option_by_number_where_the_header_is_short(read):
-    text = "time,x,y,z\n" + table({"row": JUNK, **PLAIN}, header=False)
-    assert_track(read(text, columns=("2", "3", "4", "5")))
-
-
 def test_header_with_unnamed_columns_at_its_end(read):
     rows = table({**PLAIN, "more": JUNK}, header=False)
     assert_track(read("time,x,y,z,\n" + rows))
@@ -645,8 +596,8 @@ def test_header_with_unnamed_columns_at_its_end(read):
 
 def test_columns_option_takes_any_column(read):
     # names whose own meaning is another: a length as time, a time as a length
-    file = read(table({"x_m": UNIX_S, "time_ms": X, "b": Y, "c": Z}), columns=("1", "2", "3", "4"))
-    assert_track(file)
+    columns = {"x_m": UNIX_S, "time_ms": X, "b": Y, "c": Z, "x": JUNK, "y": JUNK}
+    assert_track(read(table(columns), columns=("1", "2", "3", "4")))
 
 
 @pytest.mark.parametrize(
@@ -693,13 +644,16 @@ def test_a_column_that_is_not_there(read):
         ((REPOSITORY / "sample_logs" / "aisle_uwb.ulg").read_bytes(), "binary"),
         (b"Dear all,\nplease find attached\nthe log.\n", "of which the first is 'Dear all,'"),
         (b"time,x,y,z\n", "usable rows: 0"),
-        (table(PLAIN, header=False), "Give a CSV file with a header, or say where"),
+        (table(PLAIN, header=False), "Give a CSV file with a header, or name its"),
         (table({"when": UNIX_S, "x": X, "y": Y}), "the first is 'when,x,y'"),
         (table({"time": UNIX_S, "a": X, "b": Y}), "no header"),
         (table({"time": UNIX_S, "x": X, "b": Y}), "no header"),
         (table({"time": UNIX_S, "x [ft]": X, "y [ft]": Y}), "no header"),
         (table({"t": UNIX_S, "lat": X, "lon": Y}), "no header"),
-        (table(PLAIN, decimal=","), "names 4 columns, but rows have 8. Export it with semicolons"),
+        (
+            table(PLAIN, decimal=","),
+            "names 4 columns, but rows have 8. Export it with",
+        ),
         ("time,x,y,z\n" + table({"n": JUNK, **PLAIN}, header=False), "4 columns, but rows have 5"),
         (table({**PLAIN, "x": ["nan"] * ROWS}), "usable rows: 0, at least 3 are needed; 60 rows"),
         (table({**PLAIN, "time": [""] * ROWS}), "usable rows: 0"),

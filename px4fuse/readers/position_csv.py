@@ -31,7 +31,6 @@ from px4fuse.readers.position_names import (
     meaning,
 )
 from px4fuse.readers.text_table import (
-    NUMBER,
     UNIX_END_S,
     UNIX_START_S,
     at_line,
@@ -60,8 +59,6 @@ HEAD_LINES, HEAD_CHARS = 1000, 200_000
 MAX_COLUMNS = 200
 _COLUMNS = "`columns` TIME,X,Y,Z"
 _SEPARATORS = {";": "semicolon", "\t": "tab", ",": "comma", " ": "space"}
-_ISO_TIME = re.compile(r"[0-9]{4}[-/][0-9]{2}[-/][0-9]{2}[T ][0-9]{2}:[0-9]{2}.*")
-_ZONE = re.compile(r"(?:[zZ]|[+-]\d\d(?::?\d\d)?)$")
 _MISSING = ["", "-", "--", "nan", "-nan", "nan(ind)", "-nan(ind)", "inf", "+inf", "-inf"]
 _MISSING += ["na", "n/a", "null", "none"]
 
@@ -108,25 +105,18 @@ class _Table:
 
     file: str
     separator: str
-    names: list[str]  # of the columns; empty without a header
+    names: list[str]  # of the columns
     body: str  # whole lines after the header
     first_line: int  # number of the body's first line
-    words: str
-    notes: tuple[str, ...]
 
     def label(self, *columns: int | None) -> str:
         """Names of some columns for a person, each once."""
         some = dict.fromkeys(
-            quote(self.names[at]) if self.names[at:] and self.names[at] else f"column {at + 1}"
+            quote(self.names[at]) if self.names[at] else f"column {at + 1}"
             for at in columns
             if at is not None
         )
         return ", ".join([*some][:12]) + (", ..." if len(some) > 12 else "")
-
-    def not_found(self, what: str) -> str:
-        """Say that a column is not there, and which are."""
-        names = self.label(*range(len(self.names))) or "unnamed"
-        return f"{self.file}: no {what} found (the columns are {names}). Name them with {_COLUMNS}."
 
     def texts(self, columns: Iterable[int], rows: int | None = None) -> pd.DataFrame:
         """Texts of some columns; None where a value is missing."""
@@ -171,7 +161,7 @@ class _Choice:
 
     def unit(self, column: int, units: Iterable[str]) -> str | None:
         """Unit that a column's name gives."""
-        said = self.meanings[column].unit if column < len(self.meanings) else ""
+        said = self.meanings[column].unit
         return said if said in units else None
 
 
@@ -190,9 +180,9 @@ def read_position_csv(
         A text table; see the module's description.
     columns : tuple of str, optional
         TIME, X, Y, Z and optionally SIGMA, each a column's name or its number from 1. Z may be
-        left out together with SIGMA. A file without a header needs their numbers.
+        left out together with SIGMA.
     time_unit : {"s", "ms", "us", "ns"}, optional
-        Unit of the time column, whatever its name and its values say; ISO 8601 text has none.
+        Unit of the time column, whatever its name and its values say.
     length_unit : {"m", "cm", "mm"}, optional
         Unit of positions and sigmas, whatever their names say.
 
@@ -207,14 +197,10 @@ def read_position_csv(
     _check_options(columns, time_unit, length_unit)
     path = Path(path)
     content = read_whole(path, LogError, MAX_FILE_BYTES, again="Copy it again")
-    table = _find_table(shown(path), content, columns)
+    table, notes = _find_table(shown(path), content, columns)
     choice = _choose(table, columns)
-    ticks, numbers, iso, notes = _read_rows(table, choice)
-    if choice.tag is not None:
-        tags = sorted({*table.texts([choice.tag], HEAD_LINES)[choice.tag].dropna()})
-        if tags[1:]:
-            notes.append(f"several tags ({', '.join(map(quote, tags[:2]))}): keep those of one")
-    unit, unit_words = ("us", iso) if iso else _time_unit(ticks, choice, time_unit)
+    ticks, numbers = _read_rows(table, choice, notes)
+    unit, unit_words = _time_unit(ticks, choice, time_unit)
     seconds = seconds_of(ticks, round(1.0 / TIME_UNITS[unit]))
     usable = np.flatnonzero(np.abs(seconds) < UNIX_END_S)
     # by rank: stamps that are apart as integers can be one float
@@ -257,13 +243,14 @@ def read_position_csv(
         clock=clock,
         frame=choice.frame,
         detected=(
-            table.words,
+            f"table: {_SEPARATORS[table.separator]} between columns, header in line "
+            f"{table.first_line - 1}",
             f"time: {choice.time_words}, {clock} clock, in {unit_words}",
             f"position: {table.label(*choice.position)} as {axes}{height}, in {length_words}",
             f"sigma: {table.label(*choice.sigma) or 'none'}",
             f"quality: {quality}",
         ),
-        notes=(*table.notes, *notes),
+        notes=tuple(notes),
     )
 
 
@@ -296,41 +283,48 @@ def _split(line: str, separator: str) -> list[str]:
     return [field.strip() for field in line.split(separator)]
 
 
-def _find_table(file: str, content: bytes, columns: tuple[str, ...] | None) -> _Table:
-    """Find separator, header and first row: by the columns' names, or else by their numbers."""
+def _find_table(
+    file: str, content: bytes, columns: tuple[str, ...] | None
+) -> tuple[_Table, list[str]]:
+    """Find separator, header and first row, and say whether a last line was left out."""
     text = text_of(content)
     if text is None:
         raise LogError(
             f"{file}: a binary file, not a text table. Give the CSV file of the UWB system; a "
             "flight log is read without `position`."
         )
-    text, notes = text.replace('"', ""), ()
-    whole, _, last = text.rpartition("\n")
+    notes = []
+    whole, _, last = text.replace('"', "").rpartition("\n")
+    text = f"{whole}\n"
     if last.strip():
-        text = f"{whole}\n"
         number = text.count("\n") + 1
-        notes = (f"line {number}, the last one, was dropped: it may be cut, as it has no end",)
+        notes.append(f"line {number}, the last one, was dropped: it may be cut, as it has no end")
     lines = text[: text.rfind("\n", 0, HEAD_CHARS) + 1].split("\n")[:HEAD_LINES]
     wanted = {column.strip().casefold() for column in columns or () if not column.isdecimal()}
-    by_number = bool(columns) and not wanted
-    for is_first, skipped in ((_is_header, 1), (_is_row, 0)) if by_number else ((_is_header, 1),):
-        for at, line in enumerate(lines):
-            for separator, word in _SEPARATORS.items():
-                fields = _split(line.strip("#% "), separator)
-                if len(fields) > MAX_COLUMNS or not is_first(fields, wanted):
-                    continue
-                names, start = fields if skipped else [], at + skipped
-                width = MAX_COLUMNS if by_number else len(names)
-                body, decimal = _plain(file, text.split("\n", start)[start], separator, width)
-                header = f"header in line {start}" if names else "no header"
-                words = f"table: {word} between columns, decimal {decimal}, {header}"
-                return _Table(file, separator, names, body, start + 1, words, notes)
-    told = ", ".join(map(quote, sorted(wanted))) or "time, x, y, z"
-    raise LogError(
-        f"{file}: no header with the columns {told} in its first {len(lines)} lines, of which the "
-        f"first is {quote(lines[0])}. Give a CSV file with a header, or say where time and "
-        f"position are with {_COLUMNS}."
+    headers = (
+        (at + 1, separator, names)
+        for at, line in enumerate(lines)
+        for separator in _SEPARATORS
+        for names in [_split(line.strip("#% "), separator)]
+        if len(names) <= MAX_COLUMNS and _is_header(names, wanted)
     )
+    start, separator, names = next(headers, (0, "", []))
+    if not names:
+        told = ", ".join(map(quote, sorted(wanted))) or "time, x, y, z"
+        raise LogError(
+            f"{file}: no header with the columns {told} in its first {len(lines)} lines, of which "
+            f"the first is {quote(lines[0])}. Give a CSV file with a header, or name its columns "
+            f"with {_COLUMNS}."
+        )
+    body = re.sub(r"(?m)^[ \t]*[#%].*", "", text.split("\n", start)[start])
+    head = body[:HEAD_CHARS].lstrip("\n").partition("\n")[0].rstrip(f"{separator} ")
+    width = len(_split(head, separator))
+    if width > len(names):
+        raise LogError(
+            f"{file}: the header names {len(names)} columns, but rows have {width}. Export it with "
+            "decimal points, and with a name for every column."
+        )
+    return _Table(file, separator, names, body, start + 1), notes
 
 
 def _is_header(fields: list[str], wanted: set[str]) -> bool:
@@ -340,26 +334,6 @@ def _is_header(fields: list[str], wanted: set[str]) -> bool:
     meanings = [meaning(name) for name in fields]
     has_time = any(column.kind == "time" for column in meanings)
     return has_time and find_position(meanings) is not None
-
-
-def _is_row(fields: list[str], _: set[str]) -> bool:
-    """Whether these are numbers or a time and numbers, enough for a position."""
-    return sum(bool(NUMBER.fullmatch(f) or _ISO_TIME.fullmatch(f)) for f in fields) >= MIN_ROWS
-
-
-def _plain(file: str, body: str, separator: str, width: int) -> tuple[str, str]:
-    """The table without comments and with decimal points, and which decimal mark it has."""
-    if "#" in body or "%" in body:
-        body = re.sub(r"(?m)^[ \t]*[#%].*", "", body)
-    head = body[:HEAD_CHARS].lstrip("\n").partition("\n")[0]
-    row = _split(head.rstrip(f"{separator} "), separator)
-    if len(row) > width:
-        raise LogError(
-            f"{file}: the header names {width} columns, but rows have {len(row)}. Export it with "
-            f"semicolons and decimal points, or give the columns' numbers with {_COLUMNS}."
-        )
-    has_comma = separator != "," and any("," in f and NUMBER.fullmatch(f) for f in row)
-    return (body.replace(",", "."), "comma") if has_comma else (body, "point")
 
 
 def _choose(table: _Table, columns: tuple[str, ...] | None) -> _Choice:
@@ -375,29 +349,28 @@ def _choose(table: _Table, columns: tuple[str, ...] | None) -> _Choice:
         frame, position = found if found and {*found[1]} == {*position} else (None, position)
     else:
         time, words = _choose_time(table, meanings)
-        assert found is not None, "a header names a position"
-        frame, position = found
+        frame, position = found or (None, ())
     if position[2] is not None and table.texts([position[2]], HEAD_LINES).isna().all(axis=None):
         position = (*position[:2], None)
     backwards = [*enumerate(meanings)][::-1]  # of several with one meaning the first is kept
     sigmas = {m.key: i for i, m in backwards if m.kind == "sigma"}
     sigma = (told[4],) * 3 if len(told) > 4 else find_sigma(sigmas, frame)
     kinds = {m.kind: i for i, m in backwards}
-    return _Choice(
-        time, position, sigma, kinds.get("quality"), kinds.get("tag"), frame, meanings, words
-    )
+    quality, tag = kinds.get("quality"), kinds.get("tag")
+    return _Choice(time, position, sigma, quality, tag, frame, meanings, words)
 
 
 def _resolve(table: _Table, columns: tuple[str, ...]) -> list[int]:
     """Columns that the option names, by index."""
     names = [name.casefold() for name in table.names]
-    first = _split(table.body.lstrip("\n").partition("\n")[0], table.separator)
     found = []
     for column in columns:
         wanted = column.strip().casefold()
-        is_number = wanted.isdecimal() and 1 <= float(wanted) <= max(len(first), len(names))
-        if wanted not in names and not is_number:
-            raise SettingsError(table.not_found(f"column {quote(column)}"))
+        if wanted not in names and not (wanted.isdecimal() and 1 <= float(wanted) <= len(names)):
+            raise SettingsError(
+                f"{table.file}: no column {quote(column)} found (the columns are "
+                f"{table.label(*range(len(names)))}). Name them with {_COLUMNS}."
+            )
         found.append(names.index(wanted) if wanted in names else int(wanted) - 1)
     if len({*found}) < len(found):
         raise SettingsError(f"{_COLUMNS}: {quote(','.join(columns))} names one column twice.")
@@ -418,53 +391,39 @@ def _choose_time(table: _Table, meanings: list[Meaning]) -> tuple[int, str]:
     return first, table.label(first) + words
 
 
-def _read_rows(table: _Table, choice: _Choice) -> tuple[Any, pd.DataFrame, str, list[str]]:
-    """Times in their own unit (µs from ISO 8601 text), other columns by index, and words.
-
-    The words are on ISO 8601 text, where times are such, and on rows without time or position.
-    """
+def _read_rows(table: _Table, choice: _Choice, notes: list[str]) -> tuple[Any, pd.DataFrame]:
+    """Times in their own unit, and the other columns by index, of rows with time and position."""
     used = dict.fromkeys(index for index in (choice.time, *choice.sources) if index is not None)
     texts = table.texts(used)
-    first = next(iter(texts[choice.time].dropna()), "")
-    iso = "ISO 8601 text" if _ISO_TIME.fullmatch(first) else ""
-    if iso and not _ZONE.search(first[10:]):
-        iso += ", no zone, taken as UTC"
-    numbers, bad = {}, []
-    for index in used:
-        if iso and index == choice.time:
-            dates = texts[index].str.replace("/", "-")
-            values = pd.to_datetime(dates, format="ISO8601", utc=True, errors="coerce")
-        else:
-            # integers stay exact where some are missing
-            values = pd.to_numeric(texts[index], errors="coerce", dtype_backend="numpy_nullable")  # type: ignore[call-overload]
-        if index != choice.quality:
-            is_text = texts[index].notna() & values.isna()
-            bad += [(int(row), index) for row in np.flatnonzero(is_text)[:1]]
-        numbers[index] = values
+    # integers stay exact where some are missing
+    exact: dict[str, Any] = {"errors": "coerce", "dtype_backend": "numpy_nullable"}
+    numbers = {index: pd.to_numeric(texts[index], **exact) for index in used}
+    bad = [
+        (int(row), index)
+        for index, values in numbers.items()
+        if index != choice.quality
+        for row in np.flatnonzero(texts[index].notna() & values.isna())[:1]
+    ]
     if bad:
         row, column = min(bad)
-        kind = "time" if column == choice.time else "number"
-        raise LogError(
-            at_line(
-                table.file,
-                table.first_line + row,
-                f"{table.label(column)}: {quote(str(texts[column].iloc[row]))} is not a {kind}",
-                f"Correct or remove that line, or say where time and position are with {_COLUMNS}.",
-            )
-        )
+        text, kind = str(texts[column].iloc[row]), "time" if column == choice.time else "number"
+        what = f"{table.label(column)}: {quote(text)} is not a {kind}"
+        remedy = f"Correct or remove that line, or say where time and position are with {_COLUMNS}."
+        raise LogError(at_line(table.file, table.first_line + row, what, remedy))
     times = numbers.pop(choice.time)
     others = pd.DataFrame({at: values.astype("float64") for at, values in numbers.items()})
     axes = [index for index in choice.position if index is not None]
-    is_usable = times.notna() & (others[axes].abs() < MAX_COORDINATE).all(axis=1)
-    if iso:
-        times = times.where(is_usable, pd.Timestamp(0, tz="UTC")).dt.as_unit("us").astype("int64")
-    is_usable &= times.between(-MAX_TICKS, MAX_TICKS).fillna(False)
-    notes = []
+    is_usable = times.between(-MAX_TICKS, MAX_TICKS).fillna(False)
+    is_usable &= (others[axes].abs() < MAX_COORDINATE).all(axis=1)
     filled = texts.notna().any(axis=1)  # others are blank lines
     if missing := int(filled.sum() - is_usable.sum()):
-        notes.append(f"{_count(missing)} dropped: without a usable time or position")
-    exact = "int64" if times.dtype.kind == "i" else "float64"
-    return times[is_usable].to_numpy(dtype=exact), others[is_usable], iso, notes
+        notes.insert(0, f"{_count(missing)} dropped: without a usable time or position")
+    if choice.tag is not None:
+        tags = sorted({*table.texts([choice.tag], HEAD_LINES)[choice.tag].dropna()})
+        if tags[1:]:
+            notes.append(f"several tags ({', '.join(map(quote, tags[:2]))}): keep those of one")
+    dtype = "int64" if times.dtype.kind == "i" else "float64"
+    return times[is_usable].to_numpy(dtype=dtype), others[is_usable]
 
 
 def _time_unit(ticks: Any, choice: _Choice, option: str | None) -> tuple[str, str]:
