@@ -31,8 +31,7 @@ from findings_tools import (
 )
 
 from px4fuse.comparison.model import Difference
-from px4fuse.comparison.why import Why
-from px4fuse.comparison.why_words import STAMPS_WRONG
+from px4fuse.ekf2.walk import Why
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.tuning import HeldOut, Noise
 from px4fuse.findings import Finding, hidden_errors, loops, process_noise_forgotten, sigma, variance
@@ -40,7 +39,8 @@ from px4fuse.findings import story as telling
 from px4fuse.findings.causes import by_cause
 from px4fuse.findings.story import story
 from px4fuse.findings.variance import _has_outliers, _is_default, _noise_helps
-from px4fuse.loop.loop import Judged, Loop
+from px4fuse.loop.loop import Loop
+from px4fuse.loop.model import Closure
 
 MOVING = source(samples=positions(np.arange(0.0, 120.0), np.arange(120.0)))
 HOVERING = source(samples=positions(np.arange(0.0, 120.0)))
@@ -362,20 +362,16 @@ def test_what_ekf2s_variance_asks_for(
 
 def closure(
     gnc: float | None = 1.0, *, accepted: bool = True, where: str = "landing", p: float = 0.5
-) -> Judged:
-    class At:
-        source, time_1_s, time_2_s = where, 10.0, 90.0
-
-        def __str__(self) -> str:
-            return "the closure"
-
-    gate = SimpleNamespace(accepted=accepted, p=p, d2=25.0, degrees_of_freedom=2)
-    return Judged(At(), 3.0, gate, {} if gnc is None else {"gnc": gnc})  # type: ignore[arg-type]
+) -> Closure:
+    return Closure(
+        time_1_s=10.0, time_2_s=90.0, sigma_m=0.1, source=where, distance_m=3.0, d2=25.0,
+        degrees_of_freedom=2, p=p, accepted=accepted, weight_gnc=gnc,
+    )  # fmt: skip
 
 
-def loop(*closures: Judged, **parts: Any) -> Loop:
+def loop(*closures: Closure, **parts: Any) -> Loop:
     """A loop with these properties, which are computed of others in a real one."""
-    return made(type("Made", (Loop,), parts), closures=closures)
+    return made(Loop, closures=closures, **parts)
 
 
 @pytest.mark.parametrize(
@@ -389,11 +385,11 @@ def loop(*closures: Judged, **parts: Any) -> Loop:
         ((closure(0.0, accepted=False),), ["loop_drift_understated", "false_loop_closure"]),
     ],
 )  # fmt: skip
-def test_closures(closures: tuple[Judged, ...], expected: list[str]) -> None:
+def test_closures(closures: tuple[Closure, ...], expected: list[str]) -> None:
     found = list(loops.closures(loop(*closures, end_assumed=False)))
     assert [finding.id for finding in found] == expected
     if expected == ["loop_drift_understated"]:
-        dropped = sum(judged.weights["gnc"] < 0.5 for judged in closures)
+        dropped = sum((each.weight_gnc or 0.0) < 0.5 for each in closures)
         assert found[0].evidence == {"dropped": dropped, "closures": len(closures)}
 
 
@@ -401,8 +397,8 @@ def test_closures(closures: tuple[Judged, ...], expected: list[str]) -> None:
     ("where", "assumed", "says", "remedy"),
     [
         ("landing", True, "cannot have landed where it took off, as was assumed", "--open"),
-        ("landing", False, "the closure cannot be true", "--open"),
-        ("given", True, "the closure cannot be true", "Leave it out; it is not used."),
+        ("landing", False, "the closure of take-off and landing cannot be true", "--open"),
+        ("given", True, "the closure of 10 s and 90 s cannot be true", "it is not used."),
     ],
 )
 def test_a_false_closure_is_told_with_what_to_do(
@@ -503,7 +499,7 @@ def test_what_weighs_most_is_told_in_order() -> None:
     def found(name: str, level: Any = "error", **parts: Any) -> Finding:
         return Finding(name, level, "So.", "Do.", headline=f"It is {name}", **parts)
 
-    why = made(Why, sentences=(f"{STAMPS_WRONG} late.", "The rest is the noise; most at 4 s."))
+    why = made(Why, cause="The rest is the noise.")
     one = flight_of(along(1.0, 1.0), why={"aisle": why})
     told = story(one, (found("ekf2_resets"), found("no_motion", "info"), found("imu_gap")))
     assert told[1:] == ("It is imu_gap.", "The rest is the noise.")

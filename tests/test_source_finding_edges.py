@@ -357,7 +357,7 @@ def test_what_a_clock_offset_asks_of_ekf2(monkeypatch: pytest.MonkeyPatch) -> No
     """The delay is what the stamps are late by, with what was applied: 150 ms."""
     effect = SimpleNamespace(before=1.0, after=2.0, words=lambda: "it helps")
     monkeypatch.setattr(
-        source_clock, "delay_change", lambda _, late_ms: {"EKF2_EV_DELAY": round(late_ms)}
+        remedies, "delay_change", lambda _, late_ms: {"EKF2_EV_DELAY": round(late_ms)}
     )
     monkeypatch.setattr(remedies, "replayed", lambda *_: [effect])
     for fed, helps, there in (("uwb", True, True), ("another", True, False), ("uwb", False, False)):

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from px4fuse.analysis import Analysis
 from px4fuse.findings.model import Finding, Found, error, info, warning
-from px4fuse.loop.corrections import Judged
 from px4fuse.loop.loop import Loop
+from px4fuse.loop.model import LANDING, Closure
 from px4fuse.trajectory.graph.analysis import GATE_ALPHA
 
 MOST = 0.5  # of several closures more are true than false
@@ -26,26 +26,27 @@ def find_in(loop: Loop) -> Found:
 
 def closures(loop: Loop) -> Found:
     """Closures that the drift cannot explain, or that the others contradict."""
-    dropped = [j for j in loop.closures if j.weights.get("gnc", 1.0) < DOUBTFUL_WEIGHT]
-    most = len(dropped) > MOST * len(loop.closures)
+    weights = [1.0 if c.weight_gnc is None else c.weight_gnc for c in loop.closures]
+    dropped = sum(weight < DOUBTFUL_WEIGHT for weight in weights)
+    most = dropped > MOST * len(weights)
     if most:
         yield warning(
             "loop_drift_understated",
-            f"Robust solving drops {len(dropped)} of {len(loop.closures)} closures",
+            f"Robust solving drops {dropped} of {len(weights)} closures",
             ": more likely the odometry drifts more than stated than that most closures are false.",
             "Give a larger --drift or --heading-drift.",
-            {"dropped": len(dropped), "closures": len(loop.closures)},
+            {"dropped": dropped, "closures": len(weights)},
         )
-    for judged in loop.closures:
-        if not judged.gate.accepted:
-            yield _false(judged, loop.end_assumed)
-        elif judged in dropped and not most:
+    for closure, weight in zip(loop.closures, weights, strict=True):
+        if not closure.accepted:
+            yield _false(closure, loop.end_assumed)
+        elif weight < DOUBTFUL_WEIGHT and not most:
             yield warning(
                 "loop_closure_doubtful",
-                f"The other closures contradict {judged.closure}",
+                f"The other closures contradict {closure}",
                 ": robust solving drops it, although the drift alone could explain it.",
                 "Leave it out, or take the robust solution (GNC).",
-                _evidence(judged) | {"gnc_weight": judged.weights["gnc"]},
+                _evidence(closure) | {"gnc_weight": weight},
             )
 
 
@@ -73,10 +74,9 @@ def assumptions(loop: Loop) -> Found:
         )
 
 
-def _false(judged: Judged, assumed: bool) -> Finding:
-    gate = judged.gate
-    what, remedy = f"{judged.closure} cannot be true", "Leave it out; it is not used."
-    if judged.closure.source == "landing":
+def _false(closure: Closure, assumed: bool) -> Finding:
+    what, remedy = f"{closure} cannot be true", "Leave it out; it is not used."
+    if closure.source == LANDING:
         remedy = (
             "If it landed elsewhere, measure where (--landed-at FORWARD,RIGHT) or leave the "
             "landing out (--open)."
@@ -86,23 +86,22 @@ def _false(judged: Judged, assumed: bool) -> Finding:
     return error(
         "false_loop_closure",
         "False loop closure",
-        f": {what}. The odometry misses it by {judged.distance_m:.2f} m, and drift explains that "
-        f"with a chance of {gate.p:.1g} (d² {gate.d2:.0f}, {gate.degrees_of_freedom} degrees of "
-        "freedom). Trusting it would warp the entire path.",
+        f": {what}. The odometry misses it by {closure.distance_m:.2f} m, and drift explains that "
+        f"with a chance of {closure.p:.1g} (d² {closure.d2:.0f}, {closure.degrees_of_freedom} "
+        "degrees of freedom). Trusting it would warp the entire path.",
         f"{remedy} If the odometry really drifts that much, say so with --drift and "
         "--heading-drift.",
-        _evidence(judged),
+        _evidence(closure),
     )
 
 
-def _evidence(judged: Judged) -> dict[str, float]:
-    closure, gate = judged.closure, judged.gate
+def _evidence(closure: Closure) -> dict[str, float]:
     return {
         "time_1_s": closure.time_1_s,
         "time_2_s": closure.time_2_s,
-        "distance_m": judged.distance_m,
-        "d2": gate.d2,
-        "degrees_of_freedom": gate.degrees_of_freedom,
-        "p": gate.p,
+        "distance_m": closure.distance_m,
+        "d2": closure.d2,
+        "degrees_of_freedom": closure.degrees_of_freedom,
+        "p": closure.p,
         "alpha": GATE_ALPHA,
     }

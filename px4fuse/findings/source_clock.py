@@ -6,7 +6,6 @@ from dataclasses import replace
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison import remedy
-from px4fuse.comparison.asked import delay_change
 from px4fuse.comparison.model import Comparison
 from px4fuse.ekf2_parameters import PARAMETERS
 from px4fuse.filter.clock import CHANGE_P, ClockOffset
@@ -77,7 +76,7 @@ def _for_ekf2(analysis: Analysis, clock: ClockOffset) -> str:
     model = analysis.ekf2_model
     if isinstance(model, Unavailable) or analysis.source.name != model.inputs.vision.source:
         return ""
-    changes = delay_change(model, -1e3 * clock.offset_s)
+    changes = remedy.delay_change(model, -1e3 * clock.offset_s)
     found = remedy.replayed(model, changes) if changes else []
     for effect in [] if isinstance(found, Unavailable) else found:
         if remedy.delay_helps(effect.before, effect.after):
@@ -126,6 +125,6 @@ def delay_remedy(analysis: Analysis, delay_ms: float, flown_ms: float) -> str:
         return f"{AT_THE_SENDER} EKF2 has no parameter for stamps that are early."
     changes = {"EKF2_EV_DELAY": max(float(round(delay_ms)), 0.0)}
     if not isinstance(model, Unavailable):
-        changes = delay_change(model, delay_ms) or changes
+        changes = remedy.delay_change(model, delay_ms) or changes
     words, _ = remedy.remedy_words(model, changes, remedy.delay_helps, otherwise=AT_THE_SENDER)
     return words

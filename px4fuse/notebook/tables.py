@@ -12,8 +12,8 @@ from msgspec import structs
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import FILTERS, AxisComparison, Comparison
-from px4fuse.comparison.why import Why
 from px4fuse.display import frame, words
+from px4fuse.ekf2.walk import Why
 from px4fuse.ekf2.whatif import Summary, WhatIf
 from px4fuse.filter.clock import ClockOffset
 from px4fuse.filter.consistency import Consistency
