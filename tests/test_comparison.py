@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from exchange import replace
-from flights import Estimator, Imu, Uwb, aisle_flight
+from flights import Estimator, Imu, Uwb, aisle_flight, unavailable
 from msgspec.structs import asdict
 
 from px4fuse.arrays import Array
@@ -21,7 +21,7 @@ from px4fuse.comparison.model import (
     UnjudgedFilter,
 )
 from px4fuse.comparison.preparation import prepare
-from px4fuse.errors import SettingsError
+from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.kalman import variance_at
 from px4fuse.filter.settings import Settings
@@ -179,7 +179,7 @@ class TestMadeFlight:
     def test_our_filter_is_consistent_where_its_noise_is_the_flights(
         self, made: Comparison
     ) -> None:
-        assert made.horizontal.get("kf").verdict == "consistent"
+        assert made.horizontal["kf"].verdict == "consistent"
         for result in made.axes.values():
             assert result.filters["kf"].truth.nees_position_mean == pytest.approx(1.0, abs=0.3)
             assert result.filters["kf"].truth.nees_velocity_mean == pytest.approx(1.0, abs=0.3)
@@ -412,6 +412,24 @@ class TestRobustness:
         comparison = compare(aisle_flight(imu=Imu(gap_s=(40.0, 42.0))))
         for result in comparison.axes.values():
             assert result.replay.input_gap_s == pytest.approx(2.0, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("choices", "says"),
+    [
+        ({"axes": ("up",)}, "up"),
+        ({"position_source": "vehicle_mocap_odometry"}, "This log has: vehicle_visual_odometry"),
+        ({"settings": Settings(clock_offset_s=9.9), "end_s": 5.0}, "vehicle_visual_odometry|empty"),
+    ],
+)
+def test_what_is_not_there_is_refused(made: Comparison, choices: dict, says: str) -> None:
+    with pytest.raises((SettingsError, MissingDataError), match=says):
+        compare(made.flight, **choices)
+
+
+def test_a_flight_without_a_source_is_refused(made: Comparison) -> None:
+    with pytest.raises(MissingDataError, match="no external position"):
+        compare(replace(made.flight, positions=(), missing=(unavailable("UWB"),)))
 
 
 def test_variance_in_an_imu_gap_is_that_of_the_next_step() -> None:
