@@ -9,6 +9,7 @@ from px4fuse.loop.model import LANDING, Closure
 from px4fuse.trajectory.graph.analysis import GATE_ALPHA
 
 MOST = 0.5  # of several closures more are true than false
+EVIDENCE = ("time_1_s", "time_2_s", "distance_m", "d2", "degrees_of_freedom", "p")
 DOUBTFUL_WEIGHT = 0.5  # GNC ends at 0 or 1 (Yang et al. 2020)
 
 
@@ -96,12 +97,4 @@ def _false(closure: Closure, assumed: bool) -> Finding:
 
 
 def _evidence(closure: Closure) -> dict[str, float]:
-    return {
-        "time_1_s": closure.time_1_s,
-        "time_2_s": closure.time_2_s,
-        "distance_m": closure.distance_m,
-        "d2": closure.d2,
-        "degrees_of_freedom": closure.degrees_of_freedom,
-        "p": closure.p,
-        "alpha": GATE_ALPHA,
-    }
+    return {**{name: getattr(closure, name) for name in EVIDENCE}, "alpha": GATE_ALPHA}
