@@ -3,30 +3,32 @@
 from __future__ import annotations
 
 import copy
-import hashlib
 import io
 import json
 import re
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import pytest
 from class_tools import in_this_process
 from click.testing import CliRunner
 from forgery import (
+    Base,
     Edit,
     Forge,
+    base,
     edited,
     entry,
     font,
     forged,
     glyphs,
     on_page,
+    plain,
+    read_again,
     replaced,
+    report_of,
     seal,
     text,
     with_results,
@@ -46,14 +48,11 @@ from pypdf.generic import (
 
 from px4fuse.cli import cli
 from px4fuse.cli.verify import verify as verify_command
-from px4fuse.errors import ResultsError
-from px4fuse.reading import files_by_sha256
-from px4fuse.report.seal import seal_of, sealed
-from px4fuse.results.contract import ComparisonResults, LoopResults, Reported, to_json, to_plain
-from px4fuse.results.reading import read_results
+from px4fuse.report.seal import sealed
+from px4fuse.results.contract import to_json, to_plain
 from px4fuse.verification import pages, rerun, verification
 from px4fuse.verification.intake import read_report
-from px4fuse.verification.model import Refused, Report, Verdict
+from px4fuse.verification.model import Refused, Report
 from px4fuse.verification.rerun import Recomputed
 from px4fuse.verification.verification import (
     ESTIMATE_RELATIVE,
@@ -73,13 +72,6 @@ LOOP_LOG = REPOSITORY / "sample_logs" / "loop_vio.ulg"
 SHIPPED = REPOSITORY / "reports" / "aisle_uwb.pdf"
 
 
-def report_of(pdf: bytes) -> Report:
-    """A report, read without care: tests of reading are elsewhere."""
-    results = read_results(PdfReader(io.BytesIO(pdf)).attachments["results.json"][0])
-    assert isinstance(results, ComparisonResults | LoopResults)
-    return Report(hashlib.sha256(pdf).hexdigest(), seal_of(pdf), results, pdf)
-
-
 @pytest.fixture(autouse=True, scope="module")
 def _looked_at_once() -> Iterator[None]:
     """The redrawn report is the same in most tests: it is rasterised once, in this process."""
@@ -88,61 +80,6 @@ def _looked_at_once() -> Iterator[None]:
         patch.setattr(pages, "looks", lru_cache(8)(pages.looks))
         patch.setattr(pages, "bounded", lambda function, job, *_: function(job))
         yield
-
-
-def plain(report: Report) -> dict[str, Any]:
-    """The results of a report, to be changed."""
-    made: dict[str, Any] = json.loads(to_json(report.results))
-    return made
-
-
-def read_again(results: dict[str, Any]) -> Reported:
-    """Changed results, as they are read from a report."""
-    made = read_results(to_json(results).encode())
-    assert isinstance(made, ComparisonResults | LoopResults)
-    return made
-
-
-@dataclass(frozen=True)
-class Base:
-    """A report that is verified, and its analysis, computed once."""
-
-    pdf: bytes
-    results: dict[str, Any]
-    again: Recomputed
-    files: Mapping[str, Path]
-
-    def recompute(self, results: Reported, logs: Mapping[str, Path]) -> Recomputed | Refused:
-        """What a new run gives; from memory where everything that it rests on is recorded so."""
-        ours, theirs = (
-            # the recorded command is made anew from the request
-            (held.request, held.student, rerun.log_sha256(held),
-             msgspec.structs.replace(held.provenance, command=""))
-            for held in (self.again.results, results)
-        )  # fmt: skip
-        return self.again if ours == theirs else rerun.recompute(results, logs)
-
-    def verified(self, pdf: bytes) -> Verdict:
-        """The verdict on a forged report, with the log."""
-        try:
-            report = report_of(pdf)
-        except ResultsError as error:  # refused before there is anything to verify
-            return Verdict("cannot verify", (str(error),), with_log=False)
-        return verify(report, self.files, recompute=self.recompute)
-
-    def with_results(self, results: dict[str, Any]) -> bytes:
-        """The report with other results attached, and a seal that fits."""
-        return sealed(forged(self.pdf, with_results(to_json(results))))
-
-
-def base(pdf: bytes, log: Path) -> Base:
-    files = files_by_sha256([log])
-    report = report_of(pdf)
-    again = rerun.recompute(report.results, files)
-    assert isinstance(again, Recomputed), again
-    drawn = again.draw()
-    kept = Recomputed(again.results, lambda: drawn)
-    return Base(drawn, plain(report_of(drawn)), kept, files)
 
 
 @pytest.fixture(scope="module")
