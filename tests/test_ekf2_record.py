@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from ulog_tools import GENERATIONS, covariances, make_log, stamps, topic
 
+from px4fuse.alignment.joining import later
 from px4fuse.flight import (
     ACCELEROMETER_BIAS_COLUMNS,
     DELAYED_STATE_COLUMNS,
@@ -17,7 +18,6 @@ from px4fuse.flight import (
     FusionRecord,
     Unavailable,
 )
-from px4fuse.alignment.joining import later
 from px4fuse.readers import read_log
 
 QUATERNION = Rotation.from_euler("ZYX", [40.0, 10.0, -5.0], degrees=True).as_quat(scalar_first=True)
