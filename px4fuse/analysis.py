@@ -39,7 +39,7 @@ from px4fuse.errors import LogError, MissingDataError, SettingsError
 from px4fuse.filter.causes import AFTER_STEP_S, Explained, explained
 from px4fuse.filter.clock import ClockOffset
 from px4fuse.filter.heading import HeadingError
-from px4fuse.filter.motion import Made
+from px4fuse.filter.motion import SignalCache
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import AISLE, Axis
 from px4fuse.filter.smoothing import Smoothing, smoothing
@@ -256,7 +256,7 @@ def run_preparation(
     first = prepared(settings)
     if asked != AUTO or request.position is not None:
         return first
-    made: Made = {}
+    made: SignalCache = {}
     found = clock_offset(first, tuned_horizontally(first, made), progress, made)
     if isinstance(found, Unavailable) or not found.determinable:
         raise MissingDataError(
@@ -366,7 +366,7 @@ def run_what_if(
             if asked:
                 raise
         else:
-            made: Made = {}
+            made: SignalCache = {}
             tuning = tuned_horizontally(compared, made)
             clock = clock_offset(compared, tuning, progress, made)
             why = why_ekf2_differs(compared, model, tuning, clock)
@@ -405,7 +405,7 @@ def explain(comparison: Comparison, progress: Progress = silent) -> Analysis:
         Told what is being done.
     """
     names = REPORTED if {"north", "east"} <= {line.name for line in comparison.lines} else None
-    made: Made = {}  # tuning and clock need the same signals of the IMU
+    made: SignalCache = {}  # tuning and clock need the same signals of the IMU
     tuning = tuned(comparison, names, progress, made)
     clock = clock_offset(comparison, tuning, progress, made)
     del made

@@ -9,17 +9,17 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from filter_tools import any_axis, any_settings, sample_axes
 from filterpy.kalman import KalmanFilter
 from flights import line
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from px4fuse.comparison.preparation import choose_segment, choose_source
 from px4fuse.errors import SettingsError
 from px4fuse.filter.kalman import Replay, replay, state_at, variance_at
 from px4fuse.filter.model import H, matrix, noise
 from px4fuse.filter.settings import InitialState, Settings
-from px4fuse.filter.signals import Axis, make_axes
+from px4fuse.filter.signals import Axis
 from px4fuse.flight import Flight
 
 SAME_TIME_S = 5e-7
@@ -103,31 +103,6 @@ def assert_equals_plain_recursion(axis: Axis, chosen: Settings) -> None:
     states, updates = plain_replay(axis, chosen)
     np.testing.assert_allclose(run.steps[STATE], states, rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(run.updates[UPDATE], updates, rtol=1e-9, atol=1e-9)
-
-
-def sample_axes(flight: Flight) -> tuple[Axis, ...]:
-    track, _ = choose_source(flight)
-    return make_axes(flight, track, choose_segment(flight, track))
-
-
-log_uniform = st.floats(-2.0, 1.0).map(lambda exponent: 10.0**exponent)
-any_settings = st.builds(
-    Settings,
-    sigma_a_m_s2=log_uniform,
-    sigma_z_m=log_uniform,
-    dt_s=st.floats(0.02, 1.0),
-    input=st.sampled_from(["imu", "zero"]),
-)
-
-
-@st.composite
-def any_axis(draw: st.DrawFn) -> Axis:
-    """Measurements at irregular times, under an acceleration sampled at 50 Hz."""
-    intervals = draw(st.lists(st.floats(0.005, 0.7), min_size=3, max_size=20))
-    rng = np.random.default_rng(draw(st.integers(0, 2**32)))
-    measured = draw(st.floats(0.0, 500.0)) + np.cumsum(intervals)
-    imu = np.arange(measured[0] - 0.05, measured[-1] + 0.05, 0.02)
-    return line(measured, rng.normal(0.0, 5.0, len(measured)), (imu, rng.normal(0, 3, len(imu))))
 
 
 @pytest.fixture

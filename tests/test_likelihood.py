@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from exchange import replace
+from filter_tools import any_axis, any_settings, sample_axes
 from flights import line, random_walk
 from hypothesis import given, settings
 from numpy.typing import NDArray
 from scipy.stats import norm
-from test_kalman import any_axis, any_settings, sample_axes
 
 from px4fuse.filter.kalman import replay
 from px4fuse.filter.likelihood import (

@@ -27,7 +27,7 @@ def sync(log: Path, json_path: Path | None, **given: Any) -> None:
     from px4fuse.analysis import run_preparation
     from px4fuse.comparison.estimates import clock_offset, tuned_horizontally
     from px4fuse.errors import MissingDataError
-    from px4fuse.filter.motion import Made
+    from px4fuse.filter.motion import SignalCache
     from px4fuse.flight import Unavailable
     from px4fuse.report.terminal import print_advice
     from px4fuse.report.words import clock_advice
@@ -38,7 +38,7 @@ def sync(log: Path, json_path: Path | None, **given: Any) -> None:
     with progress(json_path == STANDARD_OUTPUT, STEPS) as step:
         compared = run_preparation(request, step)
         step("tuning")
-        made: Made = {}  # both need the same signals of the IMU
+        made: SignalCache = {}  # both need the same signals of the IMU
         found = clock_offset(compared, tuned_horizontally(compared, made), step, made)
     results = sync_results(request, compared, found, command_line(request, "sync"))
     if not write_json(results, json_path):

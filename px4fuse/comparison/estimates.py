@@ -12,7 +12,7 @@ from px4fuse.comparison.model import Comparison
 from px4fuse.filter.clock import ClockOffset, estimate_clock_offset
 from px4fuse.filter.fitting import Noises
 from px4fuse.filter.heading import HeadingError, heading_error
-from px4fuse.filter.motion import MAX_IMU_INTERVAL_S, Made
+from px4fuse.filter.motion import MAX_IMU_INTERVAL_S, SignalCache
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise, tune
 from px4fuse.flight import Flight, Unavailable
 
@@ -35,7 +35,7 @@ def size(noise: Noise, otherwise: float) -> float:
     return noise.value or noise.high or otherwise
 
 
-def tuned_horizontally(comparison: Comparison, made: Made | None = None) -> Tuning:
+def tuned_horizontally(comparison: Comparison, made: SignalCache | None = None) -> Tuning:
     """The horizontal noises alone, which is what the clock estimate needs; ``made`` as there."""
     return tuned(comparison, (HORIZONTAL,), made=made)
 
@@ -44,7 +44,7 @@ def tuned(
     comparison: Comparison,
     names: tuple[str, ...] | None = None,
     progress: Progress = silent,
-    made: Made | None = None,
+    made: SignalCache | None = None,
 ) -> dict[str, AxisTuning | Unavailable]:
     """Most likely noises of a comparison's axes; an IMU too slow to tell biases is left out.
 
@@ -75,7 +75,7 @@ def clock_offset(
     comparison: Comparison,
     tuning: Tuning,
     progress: Progress = silent,
-    made: Made | None = None,
+    made: SignalCache | None = None,
 ) -> ClockOffset | Unavailable:
     """What must still be added to the stamps of the source, beyond the offset that was set.
 
