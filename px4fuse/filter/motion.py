@@ -205,7 +205,12 @@ class PreparedMotion:
         return self.of_ratios(offset_s, [ratio], walk, sigma)[0].scaled(sigma)
 
     def search(
-        self, count: int, noises: Noises, factors: Sequence[float] = (1.0,)
+        self,
+        count: int,
+        noises: Noises,
+        factors: Sequence[float] = (1.0,),
+        *,
+        scaled: bool = True,
     ) -> tuple[float, Noises]:
         """The most likely offset over the whole search, and SIGMA_A of some.
 
@@ -216,12 +221,14 @@ class PreparedMotion:
         noises : Noises
         factors : sequence of float
             Of SIGMA_A.
+        scaled : bool
+            Whether the scale of the positions is one of the constants.
         """
         offsets = np.linspace(-SEARCH_S, SEARCH_S, COARSE_POINTS)
         sigma = noises.sigma_z_m
         ratios = [factor * noises.sigma_a_m_s2 / sigma for factor in factors]
         fits = self.thinned(count).of_ratios(
-            offsets, ratios, noises.walk_m / sigma, sigma, scaled=False
+            offsets, ratios, noises.walk_m / sigma, sigma, scaled=scaled
         )
         scores = np.stack([fitted.scaled(sigma).totals()[0] for fitted in fits])
         level, at = np.unravel_index(np.argmin(scores), scores.shape)

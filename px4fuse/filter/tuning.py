@@ -337,7 +337,7 @@ def _with_biases(
     if isinstance(moved, Unavailable):
         return None
     start = replace(alone.noises, walk_m=FIRST_WALK_M if drifts else 0.0)
-    offset, start = moved.search(COARSE_MEASUREMENTS, start, SIGMA_A_FACTORS)
+    offset, start = moved.search(COARSE_MEASUREMENTS, start, SIGMA_A_FACTORS, scaled=False)
     return most_likely([moved.at(np.array([offset]))], start, moved.weight)
 
 

@@ -11,7 +11,7 @@ from px4fuse.comparison.model import (
     FilterSummary,
     UnjudgedFilter,
 )
-from px4fuse.comparison.why_words import the
+from px4fuse.comparison.why import the
 from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.signals import AISLE
 from px4fuse.findings import Finding

@@ -9,7 +9,7 @@ from rich.table import Table
 from rich.text import Text
 
 from px4fuse.comparison.model import Difference
-from px4fuse.comparison.why import Why
+from px4fuse.ekf2.walk import Why
 from px4fuse.filter.consistency import Consistency
 from px4fuse.findings import Finding, Severity
 from px4fuse.flight import Unavailable
