@@ -30,6 +30,7 @@ from scipy.stats import binom, chi2
 from px4fuse.arrays import Array
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.estimates import noises_and_clock
+from px4fuse.filter import clock
 from px4fuse.filter.clock import (
     CHANGE_P,
     ClockOffset,
@@ -321,15 +322,20 @@ def test_drift_is_weighted_least_squares_of_the_parts() -> None:
 
 @pytest.mark.parametrize("offset_s", [0.0, -0.2, -0.21, 0.333])
 @pytest.mark.parametrize("factor", [1.0, 2.5])
-def test_parts_and_change_are_those_of_their_profiles(offset_s: float, factor: float) -> None:
+def test_parts_and_change_are_those_of_their_profiles(
+    monkeypatch: pytest.MonkeyPatch, offset_s: float, factor: float
+) -> None:
     """Profiles that are parabolas, about multiples of the grid's step from the whole's offset."""
     shift, sigma = np.array([-0.05, 0.025, 0.0, 0.0]), np.array([0.03, 0.02, 0.03, 0.5])
 
-    def fitted(grid: Array, _: Noises) -> SimpleNamespace:
+    def fitted(grid: Array, *_: object) -> SimpleNamespace:
         square = (grid - offset_s - shift[:, None]) ** 2 / sigma[:, None] ** 2
         return SimpleNamespace(by_stretch=lambda: 0.5 * square[None])
 
-    moved = SimpleNamespace(edges=np.arange(5) * 2, time_s=np.arange(8.0), fitted=fitted)
+    monkeypatch.setattr(clock, "fitted", fitted)
+    moved = SimpleNamespace(
+        edges=np.arange(5) * 2, time_s=np.arange(8.0), blocks=lambda grid: grid, weight=None
+    )
     parts, p = _parts(moved, offset_s, Noises(0.1, 0.1), factor)
     # the last one says too little
     assert [(part.start_s, part.end_s) for part in parts] == [(0.0, 1.0), (2.0, 3.0), (4.0, 5.0)]

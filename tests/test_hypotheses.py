@@ -124,8 +124,9 @@ def test_a_fit_is_least_squares_with_the_prior_as_one_more_measurement() -> None
 
 
 def test_hats_make_up_every_slow_signal() -> None:
-    hats = hypotheses._hats(10.0, 100.0)
-    np.testing.assert_allclose(sum(hat.value_m_s2 for hat in hats), 1.0)
+    time, hats = hypotheses._hats(10.0, 100.0)
+    assert time[[0, -1]].tolist() == [10.0, 100.0]
+    np.testing.assert_allclose(np.sum(hats, axis=0), 1.0)
 
 
 # ------------------------------------------------------------------ the causes
@@ -170,7 +171,6 @@ def test_a_scale_is_not_drawn_to_zero_by_the_noise_of_the_acceleration() -> None
         found = explained(
             comparison.flight,
             tuple(result.axis for result in comparison.axes.values()),
-            comparison.segment,
             RIGHT,
             sigma_a_m_s2=0.2,
             sigma_z_m=0.1,

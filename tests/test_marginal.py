@@ -218,7 +218,7 @@ def test_marginal_constants_are_a_covariance() -> None:
     ours = np.array([fit(*arguments(part, noises, WEIGHT)).totals()[0] for noises in SOME_NOISES])
     np.testing.assert_allclose(ours - ours[0, 0], expected - expected[0, 0], rtol=1e-5, atol=1e-3)
     # over SIGMA_Z, which only changes what is as good as unknown
-    scaled = np.array([fitted(part, noises, WEIGHT).totals()[0] for noises in SOME_NOISES])
+    scaled = np.array([fitted([part], noises, WEIGHT).totals()[0] for noises in SOME_NOISES])
     np.testing.assert_allclose(scaled - scaled[0, 0], ours - ours[0, 0], rtol=1e-5, atol=1e-3)
 
 

@@ -25,7 +25,7 @@ from px4fuse.filter.hypotheses import (
 )
 from px4fuse.filter.likelihood import parabola_vertex
 from px4fuse.filter.settings import Settings
-from px4fuse.filter.signals import Axis, Segment
+from px4fuse.filter.signals import Axis
 from px4fuse.flight import Flight, Unavailable
 
 # With biases and tilt taken out, less noise of the acceleration is left than the filter needs
@@ -90,7 +90,6 @@ class Explained:
 def explained(
     flight: Flight,
     axes: tuple[Axis, ...],
-    segment: Segment,
     settings: Settings,
     *,
     sigma_a_m_s2: float,
@@ -105,7 +104,6 @@ def explained(
     flight : Flight
     axes : tuple of Axis
         Horizontal, with the same measurement times.
-    segment : Segment
     settings : Settings
         ``dt_s`` gives SIGMA_A its meaning.
     sigma_a_m_s2, sigma_z_m : float
@@ -119,7 +117,7 @@ def explained(
     -------
     Explained, or Unavailable where there is no acceleration or too few measurements.
     """
-    lines = hypotheses_of(flight, axes, segment, settings, sigma_z_m, clock_offset_s)
+    lines = hypotheses_of(flight, axes, settings, sigma_z_m, clock_offset_s)
     if isinstance(lines, Unavailable):
         return lines
     skip = np.isin(axes[0].measurement_time_s[-len(lines.time_s) :], outlier_time_s)
@@ -134,11 +132,7 @@ def explained(
         lines = replace(lines, steps=steps(lines.time_s, [jump.time_s for jump in jumps]))
         sigma_a, found = _fit_noise(lines, levels, skip)
     return Explained(
-        found.estimate(FORWARD),
-        found.estimate(RIGHT),
-        _scale(lines, sigma_a, skip),
-        jumps,
-        sigma_a,
+        found.estimate(FORWARD), found.estimate(RIGHT), _scale(lines, sigma_a, skip), jumps, sigma_a
     )
 
 

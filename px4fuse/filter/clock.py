@@ -14,7 +14,7 @@ interval is as much wider (a sandwich estimate: White 1982).
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache as cached
+from functools import cache
 
 import numpy as np
 from msgspec import structs
@@ -23,7 +23,7 @@ from scipy.special import chdtrc
 
 from px4fuse.arrays import Array
 from px4fuse.display import Shown
-from px4fuse.filter.fitting import Noises, most_likely
+from px4fuse.filter.fitting import Noises, fitted, most_likely, of_ratios
 from px4fuse.filter.likelihood import PROFILE_DROP, parabola_vertex, profile_interval
 from px4fuse.filter.marginal import Fitted, paired_products
 from px4fuse.filter.motion import COARSE_POINTS, SEARCH_S, PreparedMotion, SignalCache, motion
@@ -140,7 +140,7 @@ def estimate_clock_offset(
     noises: Noises,
     outlier_time_s: Array | None = None,
     progress: Callable[[str], None] = lambda _: None,
-    cache: SignalCache | None = None,
+    signals: SignalCache | None = None,
 ) -> ClockOffset | Unavailable:
     """Estimate what must be added to the stamps of a position track.
 
@@ -158,7 +158,7 @@ def estimate_clock_offset(
     outlier_time_s : ndarray, optional
         Measurements to leave out.
     progress : callable
-    cache : dict, optional
+    signals : dict, optional
         As :func:`px4fuse.filter.motion.motion` has it.
 
     Returns
@@ -174,7 +174,7 @@ def estimate_clock_offset(
         samples.to_numpy(),
         directions=np.eye(3),
         dt_s=settings.dt_s,
-        cache=cache,
+        signals=signals,
     )
     if isinstance(moved, Unavailable):
         return moved
@@ -182,10 +182,11 @@ def estimate_clock_offset(
     offset, _ = moved.search(COARSE_MEASUREMENTS, noises)
     sigma, width = 0.0, 0.1
     for _ in range(2):
-        here = [moved.at(np.array([offset]))]
-        noises = most_likely(here, noises, moved.weight, outliers=False).noises
+        noises = most_likely([moved.at(offset)], noises, moved.weight, outliers=False).noises
         curve = _around(offset, width, FINE_POINTS)
-        offset, sigma = _vertex(curve, moved.fitted(curve, noises).totals()[0])
+        offset, sigma = _vertex(
+            curve, fitted(moved.blocks(curve), noises, moved.weight).totals()[0]
+        )
         width = float(np.clip(3.5 * sigma, 0.01, SEARCH_S))
     factor = _scatter(moved, offset, noises, sigma**-2.0)
     while True:
@@ -249,11 +250,14 @@ def _profiled(moved: PreparedMotion, curve: Array, noises: Noises, offset: float
     sigma_z, sigma_a = noises.sigma_z_m, noises.sigma_a_m_s2
     offsets = np.append(curve, offset)
     ratios = sigma_a / sigma_z * np.exp(NOISE_STEP * np.array([-1.0, 0.0, 1.0]))
-    fits = cached(lambda walk: moved.of_ratios(offsets, ratios.tolist(), walk, sigma_z))
+
+    @cache
+    def fits(walk: float) -> list[Fitted]:
+        return of_ratios(moved.blocks(offsets), ratios.tolist(), walk, moved.weight, sigma_z)
 
     def at(shift_a: int, shift_z: int) -> Array:
         scale = sigma_z * float(np.exp(NOISE_STEP * shift_z))
-        found: Fitted = fits(noises.walk_m / scale)[1 + shift_a - shift_z]
+        found = fits(noises.walk_m / scale)[1 + shift_a - shift_z]
         return np.asarray(found.totals(np.array([scale]))[0])
 
     middle = at(0, 0)
@@ -276,7 +280,7 @@ def _scatter(moved: PreparedMotion, offset: float, noises: Noises, information: 
     the IMU measures, M the inverse covariance with the constants taken out. Its part eᵀMn is
     random even where nothing moves, and e holds the same noise.
     """
-    here = moved.at(np.array([offset]))
+    here = moved.at(offset)
     joined, count, axes = here.joined, len(moved.time_s), len(moved.directions)
     legs, rng = int(np.count_nonzero(joined)), np.random.default_rng(count)
 
@@ -325,7 +329,7 @@ def _parts(
     """Offset of each stretch by itself, and the p-value of no change, by the likelihood ratio."""
     grid = offset + np.linspace(-SEARCH_S, SEARCH_S, 2 * COARSE_POINTS - 1)
     grid = grid[np.abs(grid) <= SEARCH_S]  # at equal steps, as the parabolas need them
-    profiles = moved.fitted(grid, noises).by_stretch()[0]
+    profiles = fitted(moved.blocks(grid), noises, moved.weight).by_stretch()[0]
     found, used = [], []
     for begin, end, profile in zip(moved.edges, moved.edges[1:], profiles, strict=False):
         middle, sigma = _vertex(grid, profile)
@@ -344,10 +348,7 @@ def _drift(parts: tuple[PartOffset, ...]) -> tuple[float | None, float | None]:
     """Drift of the source's clock (ppm) with its standard deviation."""
     if len(parts) < 3:
         return None, None
-    offset = np.array([part.offset_s for part in parts])
-    weight = np.array([part.sigma_s for part in parts]) ** -2.0
-    time = np.array([(part.start_s + part.end_s) / 2.0 for part in parts])
-    centred = time - np.sum(weight * time) / np.sum(weight)
-    spread = np.sum(weight * centred**2)
-    drift = float(np.sum(weight * centred * offset) / spread)
-    return drift * 1e6, float(spread**-0.5) * 1e6
+    rows = [((part.start_s + part.end_s) / 2.0, part.offset_s, part.sigma_s) for part in parts]
+    time, offset, sigma = np.transpose(rows)
+    line, covariance = np.polyfit(time - time.mean(), offset, 1, w=1.0 / sigma, cov="unscaled")
+    return float(line[0]) * 1e6, float(np.sqrt(covariance[0, 0])) * 1e6

@@ -13,15 +13,7 @@ from scipy.special import chdtrc, gammaincinv, stdtr
 
 from px4fuse.arrays import Array
 from px4fuse.display import Shown
-from px4fuse.record import (
-    Correlation,
-    Count,
-    NotNegative,
-    Positive,
-    Record,
-    Share,
-    Unavailable,
-)
+from px4fuse.record import Correlation, Count, NotNegative, Positive, Record, Share, Unavailable
 
 Verdict = Literal["consistent", "variance overstated", "variance understated"]
 

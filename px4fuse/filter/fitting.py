@@ -8,14 +8,14 @@ and maximisation, one decision for all axes of a sample, with what *all* data sa
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from math import floor, log
 
 import numpy as np
 from scipy.optimize import minimize
-from scipy.special import comb, expit, gammaincinv
+from scipy.special import chdtri, comb, expit
 
 from px4fuse.arrays import Array
 from px4fuse.filter.likelihood import Preintegrated
@@ -109,12 +109,12 @@ class Likelihood:
         rows = range(of_ratio, of_ratio + self.nodes)
         new = [row for row in rows if row not in self._fits]
         ratios = np.exp(self.step * np.array(new)).tolist()
-        fits = [of_ratios(part, ratios, 0.0, self.weight, self.sigma_z_m) for part in self.parts]
+        fits = [of_ratios([part], ratios, 0.0, self.weight, self.sigma_z_m) for part in self.parts]
         self._fits |= dict(zip(new, zip(*fits, strict=True), strict=True))
         scales = np.exp(self.step * (of_z + np.arange(self.nodes)))
         for row in rows:
             if (row, of_z) not in self._rows:
-                totals = [fitted.totals(scales)[:, 0] for fitted in self._fits[row]]
+                totals = [each.totals(scales)[:, 0] for each in self._fits[row]]
                 self._rows[row, of_z] = np.sum(totals, axis=0)
         return np.array([self._rows[row, of_z] for row in rows])
 
@@ -135,13 +135,18 @@ def _between(at: float, count: int) -> Array:
 
 
 def of_ratios(
-    positions: Positions, ratios: Sequence[float], walk: float, weight: Array, sigma_z_m: float
+    blocks: Iterable[Positions],
+    ratios: Sequence[float],
+    walk: float,
+    weight: Array,
+    sigma_z_m: float,
 ) -> list[Fitted]:
     """Fit with noises over SIGMA_Z; what is fixed is taken at a SIGMA_Z.
 
     Parameters
     ----------
-    positions : Positions
+    blocks : iterable of Positions
+        The same ones at other clock offsets.
     ratios : sequence of float
         SIGMA_A / SIGMA_Z, 1/s².
     walk : float
@@ -149,20 +154,24 @@ def of_ratios(
     weight : ndarray, shape (m,)
     sigma_z_m : float
     """
-    scaled, variance = positions.over(sigma_z_m, walk, weight)
-    return [fit(scaled, ratio, variance) for ratio in ratios]
+    scaled = (positions.over(sigma_z_m, walk, weight) for positions in blocks)
+    fits = [[fit(few, ratio, variance) for ratio in ratios] for few, variance in scaled]
+    return [
+        replace(of_one[0], gram=np.concatenate([each.gram for each in of_one], axis=1))
+        for of_one in zip(*fits, strict=True)
+    ]
 
 
-def fitted(positions: Positions, noises: Noises, weight: Array) -> Fitted:
+def fitted(blocks: Iterable[Positions], noises: Noises, weight: Array) -> Fitted:
     """Fit with some noises and weights."""
     sigma = noises.sigma_z_m
     ratio, walk = noises.sigma_a_m_s2 / sigma, noises.walk_m / sigma
-    return of_ratios(positions, [ratio], walk, weight, sigma)[0].scaled(sigma)
+    return of_ratios(blocks, [ratio], walk, weight, sigma)[0].scaled(sigma)
 
 
 def negative_log_likelihood(parts: Sequence[Positions], noises: Noises, weight: Array) -> float:
     """-ln p of the measurements of all parts but for a constant."""
-    return float(sum(fitted(part, noises, weight).totals()[0, 0] for part in parts))
+    return float(sum(fitted([part], noises, weight).totals()[0, 0] for part in parts))
 
 
 @dataclass(frozen=True)
@@ -238,7 +247,7 @@ def most_likely(
         noises = _maximise(likelihood, noises, ROUGH_STEPS if again else MAX_STEPS)
         square, count = _squares(parts, noises, weight)
         # outliers raise the noise that hides them: the median does not follow them
-        bulk = float(np.median(square / count) / (chi_square_median(count[0]) / count[0]))
+        bulk = float(np.median(square / count) / (chdtri(count[0], 0.5) / count[0]))
         if bulk > SIGMA_Z_SEARCH_M[1] ** 2:  # noise beyond the search is not outliers
             break
         variance = min(noises.sigma_z_m**2, BULK**2 * bulk)
@@ -267,16 +276,11 @@ def _squares(parts: Sequence[Positions], noises: Noises, weight: Array) -> tuple
     """:func:`squares` of all parts together, at the most likely constants."""
     found = []
     for part in parts:
-        constants = fitted(part, noises, weight).constants()[:, 0]
+        constants = fitted([part], noises, weight).constants()[:, 0]
         own, variance = part.over(1.0, noises.walk_m, weight / noises.sigma_z_m**2)
         found.append(squares(own, noises.sigma_a_m_s2, variance, constants))
     square, count = np.sum(found, axis=0)[:, -len(weight) :]
     return square, count
-
-
-def chi_square_median(freedom: float) -> float:
-    """Median of chi-square."""
-    return 2.0 * float(gammaincinv(freedom / 2.0, 0.5))
 
 
 def _outlier_probability(square: Array, count: Array, share: float, width: float) -> Array:

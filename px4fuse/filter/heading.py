@@ -25,13 +25,7 @@ from px4fuse.filter.model import INITIAL_SIGMA_P_M, INITIAL_SIGMA_V_M_S, noise_o
 from px4fuse.filter.motion import MAX_IMU_INTERVAL_S
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import IMU_GAP_S, Segment, ned_acceleration, within
-from px4fuse.flight import (
-    POSITION_COLUMNS,
-    QUATERNION_COLUMNS,
-    Flight,
-    PositionTrack,
-    Unavailable,
-)
+from px4fuse.flight import POSITION_COLUMNS, QUATERNION_COLUMNS, Flight, PositionTrack, Unavailable
 from px4fuse.record import NotNegative, Record, Share
 
 PART_S = 2.0

@@ -20,21 +20,15 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from numpy.typing import ArrayLike
 from scipy import constants
 from scipy.linalg import cho_factor, cho_solve
 from scipy.spatial.transform import Rotation
 
-from px4fuse.arrays import Array, BoolArray, IntArray
+from px4fuse.arrays import Array, BoolArray, IntArray, cumulative_integral
 from px4fuse.filter.likelihood import Preintegrated, innovations_of_signals, moved, preintegrate
 from px4fuse.filter.settings import Settings
-from px4fuse.filter.signals import (
-    Acceleration,
-    Axis,
-    Segment,
-    ned_acceleration,
-    project_acceleration,
-    step_means,
-)
+from px4fuse.filter.signals import Axis, ned_acceleration
 from px4fuse.filter.steps import Timeline, timeline
 from px4fuse.flight import AXIS_NAMES, QUATERNION_COLUMNS, Flight, Unavailable
 
@@ -213,7 +207,6 @@ def too_few(count: int) -> Unavailable:
 def hypotheses_of(
     flight: Flight,
     axes: tuple[Axis, ...],
-    segment: Segment,
     settings: Settings,
     sigma_z: float,
     clock_offset_s: float,
@@ -225,7 +218,6 @@ def hypotheses_of(
     flight : Flight
     axes : tuple of Axis
         Horizontal, with the same measurement times.
-    segment : Segment
     settings : Settings
         ``dt_s`` gives SIGMA_A its meaning.
     sigma_z : float
@@ -251,9 +243,9 @@ def hypotheses_of(
     for axis in shifted:
         own = preintegrate(axis, settings)
         columns = [(own.delta_position_m, own.delta_velocity_m_s)]
-        for frame in common:
-            pushed = project_acceleration(frame, axis.direction, segment)
-            columns.append(moved(line, _step_means(pushed, line)))
+        columns += [
+            _added(frame.to_numpy() @ axis.direction, frame.index, line) for frame in common
+        ]
         dp, dv = (np.stack(part, axis=1) for part in zip(*columns, strict=True))
         measured = np.zeros_like(dp)
         # the filter starts at the first one
@@ -261,21 +253,22 @@ def hypotheses_of(
         start = replace(own.initial, position_m=0.0)
         legs.append(replace(_with_signals(own, dp, dv, measured), initial=start))
     time_s = axes[0].measurement_time_s[-len(measured) :]
-    hats = _hats(time_s[0] + clock_offset_s, time_s[-1] + clock_offset_s)
-    ramps = [moved(line, _step_means(hat, line)) for hat in hats]
-    slow_position, slow_velocity = (np.stack(part, axis=1) for part in zip(*ramps, strict=True))
+    fine, hats = _hats(time_s[0] + clock_offset_s, time_s[-1] + clock_offset_s)
+    slow = [_added(hat, fine, line) for hat in hats]
+    slow_position, slow_velocity = (np.stack(part, axis=1) for part in zip(*slow, strict=True))
     prior = np.append(
         np.full(CONSTANTS, np.inf), np.full(len(axes) * len(hats), TILT_SIGMA_RAD * constants.g)
     )
-    hats_of = slow_position, slow_velocity
-    return Hypotheses(time_s, tuple(legs), hats_of, prior, sigma_z, steps(time_s, []))
+    return Hypotheses(
+        time_s, tuple(legs), (slow_position, slow_velocity), prior, sigma_z, steps(time_s, [])
+    )
 
 
-def _step_means(acceleration: Acceleration | Unavailable, line: Timeline) -> Array:
-    """Over each step; zero where there is none."""
-    if isinstance(acceleration, Unavailable):
-        return np.zeros(len(line.time_s) - 1)
-    return step_means(acceleration, line.time_s)[0]
+def _added(acceleration_m_s2: Array, time_s: ArrayLike, line: Timeline) -> tuple[Array, Array]:
+    """Position and velocity that an acceleration adds between the measurements."""
+    time = np.asarray(time_s, dtype=np.float64)
+    velocity = np.interp(line.time_s, time, cumulative_integral(acceleration_m_s2, time))
+    return moved(line, np.diff(velocity) / np.diff(line.time_s))
 
 
 def _common_columns(attitude: pd.DataFrame, acceleration: pd.DataFrame) -> list[pd.DataFrame]:
@@ -293,15 +286,12 @@ def _common_columns(attitude: pd.DataFrame, acceleration: pd.DataFrame) -> list[
     return [*biases, pd.DataFrame(turned, index=acceleration.index, columns=names)]
 
 
-def _hats(start_s: float, end_s: float) -> list[Acceleration | Unavailable]:
-    """Hat functions between knots, of which any slow signal is made."""
+def _hats(start_s: float, end_s: float) -> tuple[Array, Array]:
+    """Hat functions between knots, of which any slow signal is made, at times so fine (n, h)."""
     count = int(np.clip(np.ceil((end_s - start_s) / KNOT_S), 1, MAX_KNOTS)) + 1
-    knots = np.linspace(start_s, end_s, count)
-    # so fine that no interval passes for a gap
     time = np.linspace(start_s, end_s, 20 * (count - 1) + 1)
-    between = Segment(start_s, end_s, "between the knots")
-    hats = (pd.DataFrame(np.interp(time, knots, hat), time) for hat in np.eye(count))
-    return [project_acceleration(hat, np.ones(1), between) for hat in hats]
+    knots = np.linspace(start_s, end_s, count)
+    return time, np.array([np.interp(time, knots, hat) for hat in np.eye(count)])
 
 
 def steps(time_s: Array, starts_s: Iterable[float]) -> Array:

@@ -12,7 +12,7 @@ sought, and would pass much of it off as scale (errors in variables, Fuller 1987
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from px4fuse.arrays import Array, IntArray, cumulative_integral
 from px4fuse.filter.fitting import Noises, of_ratios
-from px4fuse.filter.marginal import Fitted, Positions, centred
+from px4fuse.filter.marginal import Positions, centred
 from px4fuse.filter.model import noise_of_many_steps
 from px4fuse.filter.signals import imu_gaps
 from px4fuse.flight import (
@@ -174,43 +174,20 @@ class PreparedMotion:
             delta_velocity_m_s=dv,
         )
 
-    def at(self, offset_s: Array) -> Positions:
-        """The same about a smooth path through them, whose scale is the last constant."""
-        return centred(self.positions(offset_s), scaled=True)
+    def at(self, offset_s: float) -> Positions:
+        """The same at one offset, about a smooth path whose scale is the last constant."""
+        return next(self.blocks(np.array([offset_s])))
 
-    def of_ratios(
-        self,
-        offset_s: Array,
-        ratios: Sequence[float],
-        walk: float,
-        sigma_z_m: float,
-        *,
-        scaled: bool = True,
-    ) -> list[Fitted]:
-        """As :func:`px4fuse.filter.fitting.of_ratios`, at some offsets, with a scale or without."""
+    def blocks(self, offset_s: Array, *, scaled: bool = True) -> Iterator[Positions]:
+        """The same at some offsets, a few at a time, with the scale as a constant or without."""
         signals = len(self.time_s) * len(self.directions) * (1 + len(CONSTANT_SIGMA))
         at_once = max(1, BLOCK // signals)
-        blocks = np.split(offset_s, range(at_once, len(offset_s), at_once))
-        positions = self.at if scaled else self.positions
-        made = [of_ratios(positions(few), ratios, walk, self.weight, sigma_z_m) for few in blocks]
-        return [
-            replace(of_one[0], gram=np.concatenate([part.gram for part in of_one], axis=1))
-            for of_one in zip(*made, strict=True)
-        ]
-
-    def fitted(self, offset_s: Array, noises: Noises) -> Fitted:
-        """Fit with some noises, at some offsets."""
-        sigma = noises.sigma_z_m
-        ratio, walk = noises.sigma_a_m_s2 / sigma, noises.walk_m / sigma
-        return self.of_ratios(offset_s, [ratio], walk, sigma)[0].scaled(sigma)
+        for few in np.split(offset_s, range(at_once, len(offset_s), at_once)):
+            positions = self.positions(few)
+            yield centred(positions, scaled=True) if scaled else positions
 
     def search(
-        self,
-        count: int,
-        noises: Noises,
-        factors: Sequence[float] = (1.0,),
-        *,
-        scaled: bool = True,
+        self, count: int, noises: Noises, factors: Sequence[float] = (1.0,), *, scaled: bool = True
     ) -> tuple[float, Noises]:
         """The most likely offset over the whole search, and SIGMA_A of some.
 
@@ -227,9 +204,9 @@ class PreparedMotion:
         offsets = np.linspace(-SEARCH_S, SEARCH_S, COARSE_POINTS)
         sigma = noises.sigma_z_m
         ratios = [factor * noises.sigma_a_m_s2 / sigma for factor in factors]
-        fits = self.thinned(count).of_ratios(
-            offsets, ratios, noises.walk_m / sigma, sigma, scaled=scaled
-        )
+        some = self.thinned(count)
+        blocks = some.blocks(offsets, scaled=scaled)
+        fits = of_ratios(blocks, ratios, noises.walk_m / sigma, some.weight, sigma)
         scores = np.stack([fitted.scaled(sigma).totals()[0] for fitted in fits])
         level, at = np.unravel_index(np.argmin(scores), scores.shape)
         sigma_a = noises.sigma_a_m_s2 * factors[int(level)]
@@ -244,7 +221,7 @@ def motion(
     directions: Array,
     dt_s: float,
     weight: Array | None = None,
-    cache: SignalCache | None = None,
+    signals: SignalCache | None = None,
 ) -> PreparedMotion | Unavailable:
     """Cut measurements into stretches that the IMU covers without a gap.
 
@@ -255,7 +232,7 @@ def motion(
     measurement_m : ndarray, shape (m, a)
     directions, dt_s, weight
         As :class:`PreparedMotion` has them; by default all count the same.
-    cache : dict, optional
+    signals : dict, optional
         Signals of this flight, to which new ones are added.
 
     Returns
@@ -267,10 +244,10 @@ def motion(
         return imu
     if isinstance(attitude, Unavailable):
         return attitude
-    cache = {} if cache is None else cache
+    signals = {} if signals is None else signals
+    of_stretch: list[Signals] = []
     imu_time, known = imu.index.to_numpy(), attitude.index.to_numpy()
     rows: list[IntArray] = []
-    signals = []
     for begin, end in _covered(imu_time, known):
         inside = np.flatnonzero((time_s >= begin + SEARCH_S) & (time_s <= end - SEARCH_S))
         if not len(inside):
@@ -282,9 +259,9 @@ def motion(
             if len(part) >= MIN_STRETCH_MEASUREMENTS:
                 rows.append(part)
                 around = time_s[part[0]] - SEARCH_S, time_s[part[-1]] + SEARCH_S
-                if around not in cache:
-                    cache[around] = signals_of(imu, attitude, around)
-                signals.append(cache[around])
+                if around not in signals:
+                    signals[around] = signals_of(imu, attitude, around)
+                of_stretch.append(signals[around])
     row = np.concatenate([np.zeros(0, dtype=np.intp), *rows])
     if len(row) < MIN_MEASUREMENTS:
         return Unavailable(
@@ -298,7 +275,7 @@ def motion(
         measurement_m[row],
         np.ones(len(row)) if weight is None else weight[row],
         np.cumsum([0, *map(len, rows)]),
-        tuple(signals),
+        tuple(of_stretch),
         directions,
         dt_s,
         float(np.median(np.diff(imu_time))),

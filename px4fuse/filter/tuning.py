@@ -204,7 +204,7 @@ def tune(
     progress: Callable[[str], None] = lambda _: None,
     flight: Flight | None = None,
     drifts: bool = False,
-    cache: SignalCache | None = None,
+    signals: SignalCache | None = None,
 ) -> dict[str, AxisTuning | Unavailable]:
     """Most likely SIGMA_A and SIGMA_Z of each axis, and of north and east together.
 
@@ -221,7 +221,7 @@ def tune(
         Whose IMU tells biases and tilt from noise.
     drifts : bool
         Whether the source may wander by itself, as odometry does.
-    cache : dict, optional
+    signals : dict, optional
         As :func:`px4fuse.filter.motion.motion` has it.
 
     Returns
@@ -234,11 +234,11 @@ def tune(
         if np.array_equal(pair[0].measurement_time_s, pair[1].measurement_time_s):
             groups[HORIZONTAL] = pair
     tuned = {}
-    cache = {} if cache is None else cache
+    signals = {} if signals is None else signals
     for name, group in groups.items():
         if names is None or name in names:
             progress(name)
-            tuned[name] = tune_axes(name, group, settings, flight, drifts, cache)
+            tuned[name] = tune_axes(name, group, settings, flight, drifts, signals)
     return tuned
 
 
@@ -248,7 +248,7 @@ def tune_axes(
     settings: Settings,
     flight: Flight | None = None,
     drifts: bool = False,
-    cache: SignalCache | None = None,
+    signals: SignalCache | None = None,
 ) -> AxisTuning | Unavailable:
     """Most likely noises that several axes share.
 
@@ -263,7 +263,7 @@ def tune_axes(
         Whose IMU tells biases and tilt from noise.
     drifts : bool
         Whether the source may wander by itself, as odometry does.
-    cache : dict, optional
+    signals : dict, optional
         As :func:`px4fuse.filter.motion.motion` has it.
     """
     legs = [preintegrate(axis, settings) for axis in axes]
@@ -277,7 +277,7 @@ def tune_axes(
     parts = [filter_part(leg) for leg in legs]
     chosen = Noises(settings.sigma_a_m_s2, settings.sigma_z_m)
     alone = most_likely(parts, chosen, np.ones(count))
-    found = _with_biases(axes, settings, flight, alone, drifts, cache)
+    found = _with_biases(axes, settings, flight, alone, drifts, signals)
     best = alone if found is None else found
     skip = alone.outlier > 0.5
     if np.mean(skip) > MAX_OUTLIER_SHARE:
@@ -318,7 +318,7 @@ def _with_biases(
     flight: Flight | None,
     alone: NoiseFit,
     drifts: bool,
-    cache: SignalCache | None,
+    signals: SignalCache | None,
 ) -> NoiseFit | None:
     """Noises with the IMU's constants and the clock offset taken out, None without an IMU."""
     if flight is None or settings.input == "zero":
@@ -332,13 +332,13 @@ def _with_biases(
         dt_s=settings.dt_s,
         # the filter starts at the first measurement, which it does not weigh
         weight=np.concatenate([np.ones(len(measured) - len(alone.weight)), alone.weight]),
-        cache=cache,
+        signals=signals,
     )
     if isinstance(moved, Unavailable):
         return None
     start = replace(alone.noises, walk_m=FIRST_WALK_M if drifts else 0.0)
     offset, start = moved.search(COARSE_MEASUREMENTS, start, SIGMA_A_FACTORS, scaled=False)
-    return most_likely([moved.at(np.array([offset]))], start, moved.weight)
+    return most_likely([moved.at(offset)], start, moved.weight)
 
 
 def _noise(best: NoiseFit, which: int) -> Noise:
