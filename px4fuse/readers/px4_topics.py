@@ -56,6 +56,9 @@ LOCAL_POSITION = (
     ),
 )
 
+# What records all that EKF2 and the loggers publish by default
+DEFAULT_PROFILE = "Record with SDLOG_PROFILE bit 0 (default)."
+
 # Topics with EKF2's state vector and its variances, best first
 ESTIMATOR_STATES = ("estimator_states", "estimator_status")  # since v1.12, v1.8 to v1.11
 # (number of states, number of variances) -> how many variances attitude has; velocity and position
