@@ -116,14 +116,13 @@ def print_evaluation(console: Console, score: Evaluation) -> None:
         say(console, Text(text, "yellow"))
 
 
-def print_graph(console: Console, name: str, solved: SolvedGraph) -> None:
+def print_graph(console: Console, solved: SolvedGraph) -> None:
     """Print how a pose graph was solved, and the closures that the gate rejects."""
-    graph = solved.graph
     print_line(
         console,
         "Graph",
-        f"{name}: {graph.dimension}-D, {len(graph)} poses, {len(graph.first)} edges; poses from "
-        f"{graph.initialised}",
+        f"{solved.name}: {solved.dimension}-D, {solved.poses} poses, {solved.edges} edges; poses "
+        f"from {solved.initialised}",
     )
     gates = solved.gates
     if isinstance(gates, Unavailable):
@@ -138,7 +137,7 @@ def print_graph(console: Console, name: str, solved: SolvedGraph) -> None:
             console.print(f"         {ends}: d² {gate.d2:.1f}, p {gate.p:.2g}", markup=False)
         if len(rejected) > MOST_ROWS:
             console.print(f"         and {len(rejected) - MOST_ROWS} more", markup=False)
-    if len(solved.solutions) == 1 and (~graph.successive).sum() > MANY_CLOSURES:
+    if len(solved.solutions) == 1 and (~solved.graph.successive).sum() > MANY_CLOSURES:
         print_line(console, "Robust", "left out for so many closures: --robust takes minutes")
     table = _table("path", "cost before", "cost", "iterations", "closures dropped")
     for key, solution in solved.solutions.items():
