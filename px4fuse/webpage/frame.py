@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from string import Template
 from typing import Any, Literal
 
-from px4fuse.webpage.safe import clean, escaped, inert_json, part, policy_hash
+from px4fuse.webpage.safe import cleaned, escaped, inert_json, part, policy_hash
 
 # Rows that the script draws at once, and that are there without it
 PAGE_ROWS = 100
@@ -108,17 +108,17 @@ class Row:
 
 def listed(title: str, texts: Sequence[str], warn: bool = False) -> Part:
     """A list of sentences."""
-    return ["list", clean(title), [clean(text) for text in texts], warn]
+    return ["list", title, texts, warn]
 
 
 def prose(title: str, text: str) -> Part:
     """Text with its own lines."""
-    return ["prose", clean(title), clean(text)]
+    return ["prose", title, text]
 
 
 def pairs(title: str, rows: Sequence[tuple[str, str]]) -> Part:
     """Names and what they are; those without a value are left out."""
-    return ["pairs", clean(title), [[clean(name), clean(value)] for name, value in rows if value]]
+    return ["pairs", title, [row for row in rows if row[1]]]
 
 
 def tabled(
@@ -129,22 +129,17 @@ def tabled(
     after: str = "",
 ) -> Part:
     """A small table; ``numeric`` are the columns that end flush."""
-    lines = [[clean(text) for text in row] for row in rows]
-    return ["table", clean(title), [clean(head) for head in heads], lines, list(numeric), after]
+    return ["table", title, heads, rows, list(numeric), after]
 
 
 def links(title: str, rows: Sequence[tuple[str, str]]) -> Part:
     """Words and where they lead: addresses of :func:`px4fuse.webpage.safe.local_link` only."""
-    return ["links", clean(title), [[clean(text), to] for text, to in rows if to]]
+    return ["links", title, [row for row in rows if row[1]]]
 
 
 def pictures(title: str, rows: Sequence[tuple[str, str, str]]) -> Part:
     """Caption, words for who does not see it, and address (local, or data:image/png)."""
-    return [
-        "pictures",
-        clean(title),
-        [[clean(said), clean(alt), source] for said, alt, source in rows],
-    ]
+    return ["pictures", title, rows]
 
 
 def boxes(
@@ -163,11 +158,7 @@ def boxes(
     kept : sequence of (name, points, words)
         What the table holds besides.
     """
-    return [
-        "boxes", clean(title), clean(owner),
-        [[clean(name), most, points, clean(words)] for name, most, points, words in rows],
-        [[clean(name), points, clean(words)] for name, points, words in kept],
-    ]  # fmt: skip
+    return ["boxes", title, owner, rows, kept]
 
 
 # ------------------------------------------------------------------ above the table
@@ -259,20 +250,18 @@ def page(
     style = part("base.css") + part("frame.css")
     script = part("frame.js")
     content = {
-        "columns": [
-            [clean(c.title), c.kind, c.group, c.narrow, c.mark] for c in columns
-        ],
+        "columns": [(c.title, c.kind, c.group, c.narrow, c.mark) for c in columns],
         "rows": [
-            [
+            (
                 [_compact(cell) for cell in row.cells],
-                [clean(tag) for tag in row.tags],
+                row.tags,
                 *([part for part in side if part[2]] for side in (row.details, row.beside)),
-            ]
+            )
             for row in rows
         ],
         "size": PAGE_ROWS,
         "nouns": noun,
-    }  # fmt: skip
+    }
     return Template(part("frame.html")).substitute(
         style_hash=policy_hash(style),
         script_hash=policy_hash(script),
@@ -282,12 +271,16 @@ def page(
         subtitle=escaped(subtitle),
         above=above,
         placeholder=escaped(placeholder),
-        filters="\n".join(_select(number, *each) for number, each in enumerate(filters)),
-        groups="\n".join(_box(*group) for group in groups),
+        filters="".join(_select(number, *each) for number, each in enumerate(filters)),
+        groups="".join(
+            f'<label><input type="checkbox" data-group="{escaped(group)}" autocomplete="off"> '
+            f"{escaped(label)}</label>"
+            for group, label in groups
+        ),
         label=escaped(noun[1].capitalize()),
         one=escaped(noun[0]),
         plain=_plain(columns, rows, noun, otherwise),
-        content=inert_json(content),
+        content=inert_json(cleaned(content)),
     )
 
 
@@ -295,23 +288,14 @@ def _select(number: int, label: str, options: Sequence[tuple[str, str]]) -> str:
     made = "".join(
         f'<option value="{escaped(tag)}">{escaped(said)}</option>' for tag, said in options
     )
-    return (
-        f'<label>{escaped(label)} <select id="filter-{number}" autocomplete="off">{made}'
-        "</select></label>"
-    )
-
-
-def _box(group: str, label: str) -> str:
-    box = f'<input type="checkbox" data-group="{escaped(group)}" autocomplete="off">'
-    return f"<label>{box} {escaped(label)}</label>"
+    select = f'<select id="filter-{number}" autocomplete="off">{made}</select>'
+    return f"<label>{escaped(label)} {select}</label>"
 
 
 def _compact(cell: Cell) -> list[Any]:
     """Its fields without those at the end that are empty; true stands for a value like its text."""
-    value = True if cell.value == cell.text else cell.value
-    text = clean(cell.text)
-    fields = [text, value if value is not None else "", clean(cell.below), cell.look,
-              [round(number, 3) for number in cell.picture]]  # fmt: skip
+    value = True if cell.value == cell.text else "" if cell.value is None else cell.value
+    fields = [cell.text, value, cell.below, cell.look, [round(part, 3) for part in cell.picture]]
     while fields and fields[-1] in ("", []):
         fields.pop()
     return fields
@@ -320,27 +304,17 @@ def _compact(cell: Cell) -> list[Any]:
 def _plain(
     columns: Sequence[Column], rows: Sequence[Row], noun: tuple[str, str], otherwise: str
 ) -> str:
-    """The first rows for who allows no scripts."""
-    heads = "".join(f'<th scope="col"{_class(c)}>{escaped(c.title)}</th>' for c in columns)
-    lines = []
-    for row in rows[:PLAIN_ROWS]:
-        first, *others = zip(columns, row.cells, strict=True)
-        cells = "".join(_plain_cell("td", *other) for other in others)
-        lines.append(f"<tr>{_plain_cell('th', *first)}{cells}</tr>")
+    """The first rows as a plain table, for browsers that run no scripts."""
+    heads = "".join(f'<th scope="col">{escaped(column.title)}</th>' for column in columns)
+    lines = [
+        "".join(f'<td dir="auto">{escaped(f"{c.text} {c.below}".strip())}</td>' for c in row.cells)
+        for row in rows[:PLAIN_ROWS]
+    ]
     said = f"The first {PLAIN_ROWS} of {len(rows)} {noun[1]}. " if len(rows) > PLAIN_ROWS else ""
-    return (
-        f'<p class="note">{escaped(said)}Sorting, searching and unfolding need scripts, which are '
-        f'part of this page. {escaped(otherwise)}</p><table class="list"><thead><tr>{heads}</tr>'
-        f"</thead><tbody>{''.join(lines)}</tbody></table>"
+    return note(
+        f"{said}Sorting, searching and unfolding need scripts, which are part of this page. "
+        f"{otherwise}"
+    ) + (
+        f'<table class="list"><thead><tr>{heads}</tr></thead>'
+        f"<tbody>{''.join(f'<tr>{line}</tr>' for line in lines)}</tbody></table>"
     )
-
-
-def _class(column: Column) -> str:
-    return ' class="n"' if column.kind == "number" else ""
-
-
-def _plain_cell(tag: str, column: Column, cell: Cell) -> str:
-    below = f'<span class="file" dir="auto">{escaped(cell.below)}</span>' if cell.below else ""
-    text = escaped(cell.text)
-    name = ' class="name"' if tag == "th" else ""
-    return f'<{tag}{_class(column)}><span{name} dir="auto">{text}</span>{below}</{tag}>'

@@ -9,9 +9,11 @@ import re
 from html import escape
 from importlib.resources import files
 from pathlib import PurePosixPath
+from typing import Any
 from urllib.parse import quote
 
 MAX_CHARACTERS = 20_000
+PICTURE = "data:image/png;base64,"
 # Controls but for tab and line end, surrogates, and what turns the direction of all that follows
 HARMFUL = re.compile("[\0-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff\u202a-\u202e\u2066-\u2069]")
 
@@ -24,6 +26,15 @@ def clean(text: str, most: int = MAX_CHARACTERS) -> str:
     """
     text = text if len(text) <= most else text[:most] + "…"
     return HARMFUL.sub("\N{REPLACEMENT CHARACTER}", text)
+
+
+def cleaned(value: Any) -> Any:
+    """The same with every text in it clean; a picture in an address is not cut."""
+    if isinstance(value, str):
+        return clean(value, len(value) if value.startswith(PICTURE) else MAX_CHARACTERS)
+    if isinstance(value, dict):
+        return {name: cleaned(part) for name, part in value.items()}
+    return [cleaned(part) for part in value] if isinstance(value, list | tuple) else value
 
 
 def escaped(text: str) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from px4fuse.placing.joining import join
-from px4fuse.placing.placement import place
+from px4fuse.alignment.joining import join
+from px4fuse.alignment.placement import place
 
 __all__ = ["join", "place"]

@@ -7,8 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import least_squares
 
-from px4fuse.arrays import Array, Complex
-from px4fuse.placing.tracks import (
+from px4fuse.alignment.tracks import (
     EKF2_POSITION,
     IMU,
     MIN_OVERLAP_S,
@@ -16,6 +15,7 @@ from px4fuse.placing.tracks import (
     NoMatchError,
     OwnTrack,
 )
+from px4fuse.arrays import Array, Complex
 from px4fuse.trajectory.correlation import autocovariance, moments
 from px4fuse.trajectory.offset import STEP_S
 
@@ -38,7 +38,8 @@ class Peak:
         Time of the flight at the file's first sample.
     concordance : float
         2·Re(e^{-iψ}cov) / (var + var): a correlation that also falls where one of the two moves
-        further than the other; 1 only where they are equal but for an offset.
+        further than the other; 1 only where they are equal but for an offset. NaN where the lag
+        was given.
     rival_s : float
         The best lag elsewhere, relative to this one; NaN where there is none.
     rival_ratio : float
@@ -46,20 +47,20 @@ class Peak:
     """
 
     lag_s: float
-    concordance: float
+    concordance: float = float("nan")
     rival_s: float = float("nan")
     rival_ratio: float = float("inf")
 
 
-@dataclass(frozen=True)
-class Fit:
-    """Least-squares fit of e^{iψ}·file(t) + origin to reference(t + lag).
+@dataclass(frozen=True, kw_only=True)
+class Fit(Peak):
+    """Least-squares fit of e^{iψ}·file(t) + origin to reference(t + lag), near a peak.
 
     Attributes
     ----------
-    peak : Peak
-        Where it started; where the clock was given, with the fit's own concordance.
-    lag_s, yaw_rad : float
+    concordance : float
+        That of the peak; where the clock was given, the fit's own.
+    yaw_rad : float
     lag_sigma_s, yaw_sigma_rad : float or None
         None where it was not free.
     origin_m : ndarray, shape (3,)
@@ -72,8 +73,6 @@ class Fit:
         From the first to the last sample that was used.
     """
 
-    peak: Peak
-    lag_s: float
     lag_sigma_s: float | None
     yaw_rad: float
     yaw_sigma_rad: float | None
@@ -136,13 +135,7 @@ def correlation_peak(file: OwnTrack, reference: OwnTrack, yaw_rad: float | None)
 
 
 def least_squares_fit(
-    file: OwnTrack,
-    reference: OwnTrack,
-    peak: Peak | None,
-    lag_s: float,
-    yaw_rad: float | None,
-    *,
-    clock_free: bool,
+    file: OwnTrack, reference: OwnTrack, peak: Peak, yaw_rad: float | None, *, clock_free: bool
 ) -> Fit:
     """Robust least squares (soft L1) over origin and, where free, lag and yaw.
 
@@ -156,13 +149,13 @@ def least_squares_fit(
     NoMatchError
         Too few samples lie within the reference.
     """
-    start, known = reference.at(file.time_s + lag_s)
+    start, known = reference.at(file.time_s + peak.lag_s)
     used = known & file.valid
     if np.count_nonzero(used) < MIN_SAMPLES:
         raise NoMatchError(
             f"{np.count_nonzero(used)} of the file's positions fall on the reference"
         )
-    time = file.time_s[used] + lag_s
+    time = file.time_s[used] + peak.lag_s
     z, target = file.horizontal_m[used], (start[:, 0] + 1j * start[:, 1])[used]
     centre = np.mean(z)
     z = z - centre  # decorrelates yaw and origin
@@ -170,7 +163,6 @@ def least_squares_fit(
     coherence = complex(np.vdot(z, target) / len(z) / power) if power > 0 else 0j
     mean_square = float(np.var(z) + np.var(target)) / 2.0
     horizontal = reference.horizontal_m
-    yaw_free = yaw_rad is None
 
     def unpack(x: Array) -> tuple[complex, float, float]:
         """Origin, lag beyond the start, yaw."""
@@ -183,12 +175,10 @@ def least_squares_fit(
         return np.concatenate([r.real, r.imag])
 
     start_at = complex(np.mean(target))
-    first = [start_at.real, start_at.imag] + [0.0] * clock_free
-    first += [float(np.angle(coherence))] * yaw_free
-    limit = np.full(len(first), np.inf)
-    if clock_free:
-        limit[2] = WINDOW_S
-    x0 = np.array(first)
+    # origin, and where they are free lag and yaw
+    free = [True, True, clock_free, yaw_rad is None]
+    x0 = np.array([start_at.real, start_at.imag, 0.0, float(np.angle(coherence))])[free]
+    limit = np.array([np.inf, np.inf, WINDOW_S, np.inf])[free]
     solution = least_squares(
         residual, x0, bounds=(-limit, limit), loss="soft_l1", f_scale=_scale(residual(x0))
     )
@@ -206,14 +196,19 @@ def least_squares_fit(
     origin_down = float(np.median(down)) if len(down) else 0.0
     horizontal_rms = capped_rms(np.abs(r_complex)) / np.sqrt(2.0)
     vertical_rms = capped_rms(down - origin_down) if len(down) else 0.0
-    concordance = (np.exp(-1j * yaw) * coherence).real * power / mean_square if power > 0 else 0.0
+    concordance = peak.concordance
+    if np.isnan(concordance):
+        agreed = float((np.exp(-1j * yaw) * coherence).real)
+        concordance = agreed * power / mean_square if power > 0 else 0.0
     origin -= np.exp(1j * yaw) * centre
     return Fit(
-        peak=peak or Peak(lag_s, float(concordance)),
-        lag_s=lag_s + shift,
+        lag_s=peak.lag_s + shift,
         lag_sigma_s=(np.inf if at_limit else float(sigma[2])) if clock_free else None,
+        concordance=concordance,
+        rival_s=peak.rival_s,
+        rival_ratio=peak.rival_ratio,
         yaw_rad=yaw,
-        yaw_sigma_rad=float(sigma[-1]) if yaw_free else None,
+        yaw_sigma_rad=float(sigma[-1]) if yaw_rad is None else None,
         origin_m=np.array([origin.real, origin.imag, origin_down]),
         coherence=coherence,
         horizontal_rms_m=float(horizontal_rms),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,10 +13,10 @@ from px4fuse.analysis import Analysis, run
 from px4fuse.display import brief
 from px4fuse.errors import LogError, ResultsError
 from px4fuse.findings import find
-from px4fuse.reading import read_head, read_whole, shown
+from px4fuse.reading import files_by_sha256, read_head, read_whole, shown
 from px4fuse.request import ComparisonRequest, command_line
 from px4fuse.results.build import results
-from px4fuse.results.contract import ComparisonResults
+from px4fuse.results.contract import ComparisonResults, Results
 from px4fuse.results.model import Student
 from px4fuse.results.reading import MAX_BYTES as MAX_RESULTS_BYTES
 from px4fuse.results.reading import read_results
@@ -27,14 +26,14 @@ from px4fuse.verification.model import Refused
 
 Kind = Literal["log", "report", "results"]
 Progress = Callable[[str], None]
-# What a log is analysed with is what the other side's results were made with; more of it where
+# A log is analysed with these settings of the other one's results, and with more of them where
 # they are of the same log
 _FILTER = ("sigma_a_m_s2", "sigma_z_m", "dt_s", "input", "axes", "clock_offset_s")
 _PART = ("heading_deg", "start_s", "end_s", "position_source")
 
 
 @dataclass(frozen=True, repr=False)
-class Side:
+class DiffInput:
     """One of two comparisons.
 
     Attributes
@@ -53,8 +52,10 @@ class Side:
     __repr__ = brief
 
 
-def read_sides(a: Path, b: Path, progress: Progress = lambda _: None) -> tuple[Side, Side]:
-    """Read both; a log is analysed with the settings of the other side's results, if it has some.
+def read_inputs(
+    a: Path, b: Path, progress: Progress = lambda _: None
+) -> tuple[DiffInput, DiffInput]:
+    """Read both; a log is analysed with the settings of the other one's results, if it has some.
 
     Raises
     ------
@@ -63,57 +64,53 @@ def read_sides(a: Path, b: Path, progress: Progress = lambda _: None) -> tuple[S
     ResultsError
         A report or results cannot be read, are not of ``px4fuse compare``, or both are one file.
     """
-    paths = (a, b)
-    kinds = [_kind(path) for path in paths]
+    first, second = (_read(path) for path in (a, b))
     if a.samefile(b):
         raise ResultsError(f"{shown(a)}: A and B are the same file. Give two.")
-    read = [
-        None if kind == "log" else Side(shown(path), kind, _read(path, kind))
-        for path, kind in zip(paths, kinds, strict=True)
-    ]
-    made = [
-        side or _analysed(path, read[1 - at], progress)
-        for at, (path, side) in enumerate(zip(paths, read, strict=True))
-    ]
-    return made[0], made[1]
+    return (
+        first or _analysed(a, second, progress),
+        second or _analysed(b, first, progress),
+    )
 
 
-def _kind(path: Path) -> Kind:
-    head = read_head(path, 64, LogError)
+def _read(path: Path) -> DiffInput | None:
+    """The results in a file; None of a log."""
+    name, head = shown(path), read_head(path, 64, LogError)
+    kind: Kind
+    found: Results
     if head.startswith(b"%PDF-"):
-        return "report"
-    return "results" if head.removeprefix(b"\xef\xbb\xbf").lstrip().startswith(b"{") else "log"
-
-
-def _read(path: Path, kind: Kind) -> ComparisonResults:
-    name = shown(path)
-    if kind == "report":
+        kind = "report"
         content = read_whole(path, ResultsError, MAX_REPORT_BYTES, smaller="Reports are below 2 MB")
         report = read_report(content, name)
         if isinstance(report, Refused):
             raise ResultsError(report.reason)
-        found: object = report.results
+        found = report.results
+    elif head.removeprefix(b"\xef\xbb\xbf").lstrip().startswith(b"{"):
+        kind = "results"
+        found = read_results(
+            read_whole(
+                path, ResultsError, MAX_RESULTS_BYTES, smaller="Give results of px4fuse compare"
+            ),
+            name,
+        )
     else:
-        content = read_whole(
-            path, ResultsError, MAX_RESULTS_BYTES, smaller="Give results of px4fuse compare"
-        )
-        found = read_results(content, name)
+        return None
     if not isinstance(found, ComparisonResults):
-        made_by = getattr(found, "schema").name  # noqa: B009 - every kind of results has one
         raise ResultsError(
-            f"{name}: holds {made_by}; px4fuse diff takes what px4fuse compare writes, or a log."
+            f"{name}: holds {found.schema.name}; px4fuse diff takes what px4fuse compare writes, "
+            "or a log."
         )
-    return found
+    return DiffInput(name, kind, found)
 
 
-def _analysed(path: Path, other: Side | None, progress: Progress) -> Side:
+def _analysed(path: Path, other: DiffInput | None, progress: Progress) -> DiffInput:
     request = ComparisonRequest(log=str(path))
     if other is not None:
-        with path.open("rb") as file:
-            is_same = hashlib.file_digest(file, "sha256").hexdigest() == other.results.log.sha256
-        asked = other.results.request
+        is_same = other.results.log.sha256 in files_by_sha256([path])
         fields = (*_FILTER, *_PART) if is_same else _FILTER
-        request = replace(request, **{name: getattr(asked, name) for name in fields})
+        request = replace(
+            request, **{name: getattr(other.results.request, name) for name in fields}
+        )
     analysis = run(request, progress)
     found = results(request, analysis, find(analysis), Student(), command_line(request))
-    return Side(shown(path), "log", found, analysis)
+    return DiffInput(shown(path), "log", found, analysis)

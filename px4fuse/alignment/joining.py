@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import TypeVar
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass, replace
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -16,18 +17,14 @@ from px4fuse.flight import (
     QUATERNION_COLUMNS,
     Ekf2,
     Flight,
-    FlightMode,
-    FusionRecord,
-    PositionTrack,
-    Reset,
-    Truth,
     Unavailable,
     best_first,
 )
 from px4fuse.readers.parts import missing_parts
 from px4fuse.recording import InputFile
 
-Table = TypeVar("Table", pd.DataFrame, pd.Series)
+# Fields of records that are times
+TIMES = ("time_s", "start_s", "end_s")
 # Both recordings must hold this much of the same time
 MIN_OVERLAP_S = 2.0
 # EKF2's position is sent as it is logged: what is left is interpolation between samples
@@ -63,54 +60,44 @@ def join(flight: Flight, other: Flight) -> Flight:
             f"{_span(other)} on the autopilot's boot clock. Give the recordings of one flight."
         )
     moved = _shifted(other, shift_s)
-    unix_s = flight.log.start_unix_s
-    if unix_s is None and other.log.start_unix_s is not None:
-        unix_s = other.log.start_unix_s - shift_s
     agreement = _agreement(flight, moved)
-    taken: dict[str, object] = {}
+    taken: dict[str, Any] = {}
     streams = dict(flight.streams)
     for part in ("imu", "attitude", "ekf2", "truth", "airborne", "modes"):
         mine, theirs = getattr(flight, part), getattr(moved, part)
         if isinstance(mine, Unavailable) and not isinstance(theirs, Unavailable):
             taken[part] = theirs
             streams |= {k: v for k, v in moved.streams.items() if k.startswith(part)}
-    ekf2 = flight.ekf2
     if (
-        isinstance(ekf2, Ekf2)
-        and isinstance(ekf2.variance, Unavailable)
+        isinstance(flight.ekf2, Ekf2)
+        and isinstance(flight.ekf2.variance, Unavailable)
         and isinstance(moved.ekf2, Ekf2)
         and isinstance(moved.ekf2.variance, pd.DataFrame)
     ):
-        taken["ekf2"] = replace(ekf2, variance=moved.ekf2.variance)
+        taken["ekf2"] = replace(flight.ekf2, variance=moved.ekf2.variance)
         streams["ekf2_variance"] = moved.streams["ekf2_variance"]
-    joined = replace(flight, **taken)  # type: ignore[arg-type]
+    joined = replace(flight, **taken)
     lacking = missing_parts(joined.imu, joined.attitude, joined.ekf2, joined.truth)
+    log, given = flight.log, other.log
+    unix_s = log.start_unix_s
+    if unix_s is None and given.start_unix_s is not None:
+        unix_s = given.start_unix_s - shift_s
+    how = f"joined with {given.name} on the boot clock, {high - low:.1f} s in common; {agreement}"
     return replace(
         joined,
         log=structs.replace(
-            flight.log,
-            notes=(
-                *flight.log.notes,
-                *(f"{other.log.name}: {note}" for note in other.log.notes),
-                f"joined with {other.log.name} on the boot clock, {high - low:.1f} s in common; "
-                f"{agreement}",
-            ),
+            log,
+            notes=(*log.notes, *(f"{given.name}: {note}" for note in given.notes), how),
             start_unix_s=unix_s,
-            damage=(
-                *flight.log.damage,
-                *(f"{other.log.name}: {said}" for said in other.log.damage),
-            ),
-            senders=flight.log.senders or other.log.senders,
+            damage=(*log.damage, *(f"{given.name}: {said}" for said in given.damage)),
+            senders=log.senders or given.senders,
         ),
         positions=best_first((*flight.positions, *moved.positions)),
         missing=(*lacking, *(part for part in flight.missing if part.source)),
         streams=streams,
         clocks=(*flight.clocks, *other.clocks),
         unused=(*flight.unused, *other.unused),
-        inputs=(
-            *flight.inputs,
-            InputFile(other.log.name, other.log.sha256, other.log.bytes, "mavlink"),
-        ),
+        inputs=(*flight.inputs, InputFile(given.name, given.sha256, given.bytes, "mavlink")),
     )
 
 
@@ -119,67 +106,39 @@ def _span(flight: Flight) -> str:
     return f"{start:.1f} s to {start + flight.log.duration_s:.1f} s"
 
 
-def _later(frame: Table, shift_s: float) -> Table:
-    return frame.set_axis(pd.Index(frame.index.to_numpy() + shift_s, name="time_s"))
+def later(part: Any, shift_s: float) -> Any:
+    """A part of a flight counted from another time zero: its tables, and the times in its records.
+
+    Parameters
+    ----------
+    part : DataFrame, Series, record of such, or a tuple or mapping of records
+        Anything else stays as it is.
+    """
+    if isinstance(part, pd.DataFrame | pd.Series):
+        return part.set_axis(pd.Index(part.index.to_numpy() + shift_s, name="time_s"))
+    if isinstance(part, tuple):
+        return tuple(later(one, shift_s) for one in part)
+    if isinstance(part, Mapping):
+        return {key: later(one, shift_s) for key, one in part.items()}
+    if not is_dataclass(part) or isinstance(part, type):
+        return part
+    moved = {}
+    for name in (each.name for each in fields(part)):
+        value = getattr(part, name)
+        moved[name] = value + shift_s if name in TIMES else later(value, shift_s)
+    if isinstance(part, Ekf2):
+        moved["instances"] = tuple((time + shift_s, number) for time, number in part.instances)
+    return replace(part, **moved)
 
 
 def _shifted(flight: Flight, shift_s: float) -> Flight:
     """The same flight counted from another time zero."""
-
-    def moved(part: pd.DataFrame | Unavailable) -> pd.DataFrame | Unavailable:
-        return part if isinstance(part, Unavailable) else _later(part, shift_s)
-
-    ekf2, truth, airborne, modes = flight.ekf2, flight.truth, flight.airborne, flight.modes
-    if isinstance(ekf2, Ekf2):
-        ekf2 = replace(
-            ekf2,
-            state=_later(ekf2.state, shift_s),
-            variance=moved(ekf2.variance),
-            innovations={axis: moved(part) for axis, part in ekf2.innovations.items()},
-            fusing=moved(ekf2.fusing),
-            accelerometer_bias=moved(ekf2.accelerometer_bias),
-            resets=tuple(Reset(r.time_s + shift_s, r.quantity, r.delta) for r in ekf2.resets),
-            instances=tuple((time + shift_s, number) for time, number in ekf2.instances),
-            record=_later_record(ekf2.record, shift_s),
-        )
-    if isinstance(truth, Truth):
-        truth = replace(
-            truth,
-            samples=_later(truth.samples, shift_s),
-            attitude=None if truth.attitude is None else _later(truth.attitude, shift_s),
-        )
+    parts = ("imu", "attitude", "positions", "ekf2", "truth", "modes")
+    airborne = flight.airborne
     if not isinstance(airborne, Unavailable):
         airborne = tuple((start + shift_s, end + shift_s) for start, end in airborne)
-    if not isinstance(modes, Unavailable):
-        modes = tuple(FlightMode(m.start_s + shift_s, m.end_s + shift_s, m.name) for m in modes)
-    tracks: list[PositionTrack] = [
-        replace(
-            track,
-            samples=_later(track.samples, shift_s),
-            orientation=None if track.orientation is None else _later(track.orientation, shift_s),
-        )
-        for track in flight.positions
-    ]
-    return replace(
-        flight,
-        imu=moved(flight.imu),
-        attitude=moved(flight.attitude),
-        positions=tuple(tracks),
-        ekf2=ekf2,
-        truth=truth,
-        airborne=airborne,
-        modes=modes,
-    )
-
-
-def _later_record(record: FusionRecord | Unavailable, shift_s: float) -> FusionRecord | Unavailable:
-    if isinstance(record, Unavailable):
-        return record
-    return replace(
-        record,
-        delayed=_later(record.delayed, shift_s),
-        vision_age_s=_later(record.vision_age_s, shift_s),
-    )
+    moved = {name: later(getattr(flight, name), shift_s) for name in parts}
+    return replace(flight, airborne=airborne, **moved)
 
 
 def _agreement(flight: Flight, other: Flight) -> str:
@@ -191,16 +150,11 @@ def _agreement(flight: Flight, other: Flight) -> str:
         mine, theirs = flight.ekf2.state, other.ekf2.state
         at = theirs.index[(theirs.index >= mine.index[0]) & (theirs.index <= mine.index[-1])]
         if len(at) >= MIN_COMMON_SAMPLES:
-            difference = np.column_stack(
-                [np.interp(at, mine.index, mine[c]) - theirs.loc[at, c] for c in POSITION_COLUMNS]
-            )
-            median = float(np.median(np.linalg.norm(difference, axis=1)))
+            ours = np.column_stack([np.interp(at, mine.index, mine[c]) for c in POSITION_COLUMNS])
+            apart = np.linalg.norm(ours - theirs.loc[at, POSITION_COLUMNS].to_numpy(), axis=1)
+            median = float(np.median(apart))
             if median > MAX_POSITION_DIFFERENCE_M:
-                raise MissingDataError(
-                    f"{flight.log.name} and {other.log.name} are not of the same flight: EKF2's "
-                    f"positions differ by {median:.2f} m (median). Give the recordings of one "
-                    "flight."
-                )
+                raise _not_one(flight, other, f"EKF2's positions differ by {median:.2f} m")
             return f"their EKF2 positions differ by {median:.3f} m (median)"
     if isinstance(flight.attitude, pd.DataFrame) and isinstance(other.attitude, pd.DataFrame):
         nearest = pd.merge_asof(
@@ -209,17 +163,18 @@ def _agreement(flight: Flight, other: Flight) -> str:
         ).dropna()  # fmt: skip
         if len(nearest) >= MIN_COMMON_SAMPLES:
             first, second = (
-                Rotation.from_quat(
-                    nearest[[c + suffix for c in QUATERNION_COLUMNS]].to_numpy(copy=True),
-                    scalar_first=True,
-                )
-                for suffix in ("_x", "_y")
+                Rotation.from_quat(nearest[columns].to_numpy(copy=True), scalar_first=True)
+                for columns in ([c + suffix for c in QUATERNION_COLUMNS] for suffix in ("_x", "_y"))
             )
             angle = float(np.degrees(np.median((first.inv() * second).magnitude())))
             if angle > MAX_ATTITUDE_DIFFERENCE_DEG:
-                raise MissingDataError(
-                    f"{flight.log.name} and {other.log.name} are not of the same flight: their "
-                    f"attitudes differ by {angle:.0f}° (median). Give the recordings of one flight."
-                )
+                raise _not_one(flight, other, f"their attitudes differ by {angle:.0f}°")
             return f"their attitudes differ by {angle:.1f}° (median)"
     return "that they are of the same flight could not be checked: nothing is in both"
+
+
+def _not_one(flight: Flight, other: Flight, why: str) -> MissingDataError:
+    return MissingDataError(
+        f"{flight.log.name} and {other.log.name} are not of the same flight: {why} (median). Give "
+        "the recordings of one flight."
+    )

@@ -8,15 +8,15 @@ from functools import partial
 import numpy as np
 import pandas as pd
 
-from px4fuse.flight import Flight, Unavailable
-from px4fuse.placing.fitting import (
+from px4fuse.alignment.fitting import (
     MIN_CONCORDANCE,
     RESIDUAL_FLOOR_M,
     Fit,
+    Peak,
     correlation_peak,
     least_squares_fit,
 )
-from px4fuse.placing.tracks import (
+from px4fuse.alignment.tracks import (
     EKF2_POSITION,
     FRAMES,
     IMU,
@@ -35,6 +35,7 @@ from px4fuse.placing.tracks import (
     placed_samples,
     without_edges,
 )
+from px4fuse.flight import Flight, Unavailable
 from px4fuse.trajectory.offset import RIVAL_RATIO, STEP_S
 
 # nwu is enu turned by 90°
@@ -81,6 +82,11 @@ class Match:
         """The fit that the clock is taken from."""
         return self.free if self.turned else self.fit
 
+    @property
+    def misfits(self) -> str:
+        """Residual in each frame, in words."""
+        return ", ".join(f"{name} {misfit:.2f} m" for name, misfit in self.misfits_m.items())
+
 
 def find_match(
     flight: Flight,
@@ -96,11 +102,8 @@ def find_match(
     NoMatchError
         With its remedy.
     """
-    sought = [
-        f"`{name}`"
-        for name, known in (("clock_offset_s", lag_s), ("frame", frame), ("yaw_deg", yaw_rad))
-        if known is None
-    ]
+    asked = {"`clock_offset_s`": lag_s, "`frame`": frame, "`yaw_deg`": yaw_rad}
+    sought = [name for name, known in asked.items() if known is None]
     reasons = []
     # what is all given is at most compared, for which the IMU's band says too little
     for references in (ekf2_references, imu_references) if sought else (ekf2_references,):
@@ -134,26 +137,22 @@ def _match(
     frames = (frame,) if frame else TURNABLE_FRAMES if yaw_rad is None else tuple(FRAMES)
     matches = []
     for reference in references:
-        fits = {name: _best_fit(samples, name, reference, yaw_rad, lag_s) for name in frames}
-        fits = dict(sorted(fits.items(), key=lambda item: item[1].rms_m))
-        best, fit = next(iter(fits.items()))
-        free = fit if yaw_rad is None else _best_fit(samples, best, reference, None, lag_s)
-        turned = fit.peak.concordance < MIN_CONCORDANCE[reference.name] or is_turned(
-            fit.horizontal_rms_m, free, reference.name
+        name = reference.name
+        fitted = partial(_best_fit, samples, reference, lag_s)
+        fits = {tried: fitted(tried, yaw_rad) for tried in frames}
+        misfits = {tried: fits[tried].rms_m for tried in sorted(fits, key=lambda f: fits[f].rms_m)}
+        best = next(iter(misfits))
+        fit = fits[best]
+        free = fit if yaw_rad is None else fitted(best, None)
+        turned = is_sound(free, name) and (
+            fit.concordance < MIN_CONCORDANCE[name] or is_turned(fit.horizontal_rms_m, free, name)
         )
-        turned &= is_sound(free, reference.name)
-        misfits = {name: tried.rms_m for name, tried in fits.items()}
         better = ""
         if turned and frame and yaw_rad is not None:
-            others = {
-                name: _best_fit(samples, name, reference, yaw_rad, lag_s)
-                for name in FRAMES
-                if name != frame
-            }
-            name, other = min(others.items(), key=lambda item: item[1].rms_m)
-            fits_well = other.peak.concordance >= GOOD_CONCORDANCE[reference.name]
-            if fits_well and TURNED_RATIO * other.rms_m < fit.rms_m:
-                better = name
+            others = {tried: fitted(tried, yaw_rad) for tried in FRAMES if tried != frame}
+            other, there = min(others.items(), key=lambda item: item[1].rms_m)
+            fits_well = there.concordance >= GOOD_CONCORDANCE[name]
+            better = other if fits_well and TURNED_RATIO * there.rms_m < fit.rms_m else ""
         matches.append(Match(reference, best, misfits, fit, free, turned, better))
     return min(matches, key=lambda match: match.clock.rms_m)
 
@@ -167,8 +166,7 @@ def is_turned(horizontal_rms_m: float, free: Fit, reference: str) -> bool:
 
 def is_sound(fit: Fit, reference: str) -> bool:
     """Whether a fit is good enough to overrule what was asked for."""
-    good = fit.peak.concordance >= GOOD_CONCORDANCE[reference]
-    return good and fit.peak.rival_ratio >= RIVAL_RATIO
+    return fit.concordance >= GOOD_CONCORDANCE[reference] and fit.rival_ratio >= RIVAL_RATIO
 
 
 def _check_match(match: Match) -> None:
@@ -179,29 +177,25 @@ def _check_match(match: Match) -> None:
     NoMatchError
     """
     name, fit = match.reference.name, match.clock
-    peak = fit.peak
-    if peak.concordance < MIN_CONCORDANCE[name]:
+    if fit.concordance < MIN_CONCORDANCE[name]:
         raise NoMatchError(
-            f"the file does not follow the {name} (concordance {peak.concordance:.2f}, at least "
+            f"the file does not follow the {name} (concordance {fit.concordance:.2f}, at least "
             f"{MIN_CONCORDANCE[name]:g} is needed)"
         )
-    if peak.rival_ratio < RIVAL_RATIO:
+    clock_open = ""
+    if fit.rival_ratio < RIVAL_RATIO:
+        clock_open = f": offsets {abs(fit.rival_s):.1f} s apart fit the {name} equally well"
+    elif fit.lag_sigma_s is not None and fit.lag_sigma_s > MAX_CLOCK_SIGMA_S:
+        clock_open = f" (standard deviation of the offset above {MAX_CLOCK_SIGMA_S:g} s)"
+    if clock_open:
         raise NoMatchError(
-            f"the flight's path leaves the clock open: offsets {abs(peak.rival_s):.1f} s apart fit "
-            f"the {name} equally well",
-            "Give `clock_offset_s`",
-        )
-    if fit.lag_sigma_s is not None and fit.lag_sigma_s > MAX_CLOCK_SIGMA_S:
-        raise NoMatchError(
-            "the flight's path leaves the clock open (standard deviation of the offset above "
-            f"{MAX_CLOCK_SIGMA_S:g} s)",
-            "Give `clock_offset_s`",
+            f"the flight's path leaves the clock open{clock_open}", "Give `clock_offset_s`"
         )
     if len(match.misfits_m) > 1:
         best, second = (np.hypot(m, RESIDUAL_FLOOR_M) for m in [*match.misfits_m.values()][:2])
         if second < FRAME_RATIO * best:
             raise NoMatchError(
-                f"no frame fits the {name} clearly best ({residual_words(match.misfits_m)})",
+                f"no frame fits the {name} clearly best ({match.misfits})",
                 f"Give `frame`{' or `yaw_deg` auto' if match.turned else ''}",
             )
 
@@ -215,20 +209,19 @@ def _fitted_across_resets(
     clock = match.clock
     placed = placed_samples(samples, match.frame, clock.yaw_rad, clock.origin_m, clock.lag_s)
     track = continuous_track(flight.ekf2, placed)
-    again = partial(
-        least_squares_fit, file_track(samples, match.frame), track, clock_free=lag_s is None
-    )
-    free = again(match.free.peak, match.free.lag_s, None)
-    fit = free if yaw_rad is None else again(match.fit.peak, match.fit.lag_s, yaw_rad)
+    file = file_track(samples, match.frame)
+    again = partial(least_squares_fit, file, track, clock_free=lag_s is None)
+    free = again(match.free, None)
+    fit = free if yaw_rad is None else again(match.fit, yaw_rad)
     return replace(match, reference=track, fit=fit, free=free)
 
 
 def _best_fit(
     samples: pd.DataFrame,
-    frame: str,
     reference: OwnTrack,
-    yaw_rad: float | None,
     lag_s: float | None,
+    frame: str,
+    yaw_rad: float | None,
 ) -> Fit:
     """Find the lag, unless it is given, then fit."""
     file = file_track(samples, frame)
@@ -238,12 +231,5 @@ def _best_fit(
             raise NoMatchError("the file is too short for a match with the IMU")
         coarse = replace(coarse, position_m=band_passed(band_passed(coarse.position_m)))
         file = coarse = without_edges(coarse)
-    if lag_s is not None:
-        return least_squares_fit(file, reference, None, lag_s, yaw_rad, clock_free=False)
-    peak = correlation_peak(coarse, reference, yaw_rad)
-    return least_squares_fit(file, reference, peak, peak.lag_s, yaw_rad, clock_free=True)
-
-
-def residual_words(misfits_m: dict[str, float]) -> str:
-    """Residual in each frame, in words."""
-    return ", ".join(f"{name} {misfit:.2f} m" for name, misfit in misfits_m.items())
+    peak = correlation_peak(coarse, reference, yaw_rad) if lag_s is None else Peak(lag_s)
+    return least_squares_fit(file, reference, peak, yaw_rad, clock_free=lag_s is None)

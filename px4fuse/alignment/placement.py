@@ -18,12 +18,12 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from msgspec import structs
 
+from px4fuse.alignment.description import describe
+from px4fuse.alignment.matching import find_match
+from px4fuse.alignment.tracks import EKF2_POSITION, FRAMES, IMU, MIN_SAMPLES, NoMatchError
 from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.flight import Flight, PositionTrack
 from px4fuse.origin import GIVEN_FILE
-from px4fuse.placing.description import describe
-from px4fuse.placing.matching import find_match
-from px4fuse.placing.tracks import EKF2_POSITION, FRAMES, IMU, MIN_SAMPLES, NoMatchError
 from px4fuse.readers.parts import finite_rows
 from px4fuse.recording import InputFile
 
