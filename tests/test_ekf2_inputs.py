@@ -6,6 +6,7 @@ The limits are written out here, so that one that is changed must be changed her
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -87,57 +88,49 @@ def test_a_sweep_has_2_to_200_values() -> None:
 # ---------------------------------------------------------------- inputs and vision
 
 
-def flown(
-    monkeypatch: pytest.MonkeyPatch, *, interval_s: float = 0.008, **record: Any
-) -> Inputs | Unavailable:
+@pytest.fixture
+def flown(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
     """What is prepared of a flight of which only the parameters matter."""
     monkeypatch.setattr(inputs_module, "read_vision", lambda *_: made(Vision, stamp_s=None))
     monkeypatch.setattr(inputs_module, "find_stretches", lambda *_: (made(Stretch),))
-    parts = {"parameters": {}, "other_aiding": (), "per_step_biases": False, **record}
-    fusing = parts.pop("fusing", pd.DataFrame({"vertical": [1.0, 0.0]}))
-    horizon = parts.pop("horizon_s", 0.1)
-    firmware = parts.pop("firmware", "PX4 v1.16.1")
-    ekf2 = made(
-        Ekf2, record=made(FusionRecord, **parts), innovations={"north": pd.DataFrame()},
-        horizon_s=horizon, step_s=0.01, fusing=fusing,
-    )  # fmt: skip
-    imu = pd.DataFrame(index=interval_s * np.arange(2))
-    return prepare(made(Flight, imu=imu, attitude=imu, ekf2=ekf2, log=log(firmware=firmware)))
+
+    def prepared(
+        interval_s: float = 0.008, horizon_s: Any = 0.1, firmware: str = "PX4 v1.16.1",
+        fusing: Any = NONE, per_step_biases: bool = False, **parameters: float,
+    ) -> Any:  # fmt: skip
+        record = made(
+            FusionRecord, parameters=parameters, other_aiding=(), per_step_biases=per_step_biases
+        )
+        ekf2 = made(
+            Ekf2, record=record, innovations={"north": pd.DataFrame()}, horizon_s=horizon_s,
+            step_s=0.01, fusing=fusing,
+        )  # fmt: skip
+        imu = pd.DataFrame(index=interval_s * np.arange(2))
+        return prepare(made(Flight, imu=imu, attitude=imu, ekf2=ekf2, log=log(firmware=firmware)))
+
+    return prepared
 
 
-def test_rules_of_the_releases(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rules_of_the_releases(flown: Callable[..., Any]) -> None:
     """EV_MAX_INTERVAL, ev_control.cpp; no_aid_timeout_max and reset_timeout_max, common.h."""
-    new = flown(monkeypatch, parameters={"EKF2_DELAY_MAX": 200.0, "EKF2_IMU_POS_Y": 0.25})
-    assert isinstance(new, Inputs)
+    new = flown(EKF2_DELAY_MAX=200.0, EKF2_IMU_POS_Y=0.25)
     assert new.rules == Rules(0.2, 0.4, 1.0, 5, None, False)
     assert new.imu_offset_m.tolist() == [0.0, 0.25, 0.0]
     assert (new.step_s, new.horizon_s, new.predict_s, new.max_interval_s) == (0.01, 0.1, 0.01, 0.25)
-    old = flown(monkeypatch, parameters={"EKF2_AID_MASK": 8.0}, per_step_biases=True)
-    assert isinstance(old, Inputs)
+    old = flown(EKF2_AID_MASK=8.0, per_step_biases=True)
     assert old.rules == Rules(math.inf, 7.0, 7.0, 1_000_000, pytest.approx(5e-4), True)
     assert old.settings["EKF2_EV_DELAY"] == 175.0
-    predict = flown(monkeypatch, parameters={"EKF2_PREDICT_US": 8000.0})
-    assert isinstance(predict, Inputs)
-    assert predict.predict_s == pytest.approx(0.008)
+    assert flown(EKF2_PREDICT_US=8000.0).predict_s == pytest.approx(0.008)
 
 
-def test_what_a_log_must_hold(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert isinstance(flown(monkeypatch, interval_s=0.012), Inputs)
-    slow = flown(monkeypatch, interval_s=0.0125)
-    assert isinstance(slow, Unavailable)
-    assert "logged at 80 Hz" in slow.reason
-    assert isinstance(flown(monkeypatch, horizon_s=NONE), Unavailable)
-    oldest = flown(monkeypatch, horizon_s=NONE, firmware="PX4 v1.13.3")
-    assert isinstance(oldest, Inputs)
-    assert oldest.horizon_s == 0.0
+def test_what_a_log_must_hold(flown: Callable[..., Any]) -> None:
+    assert isinstance(flown(0.012), Inputs)
+    assert "logged at 80 Hz" in flown(0.0125).reason
+    assert isinstance(flown(horizon_s=NONE), Unavailable)
+    assert flown(horizon_s=NONE, firmware="PX4 v1.13.3").horizon_s == 0.0
     for vertical, there in (([1.0, 0.0], False), ([1.0, 1.0, 0.0], True)):
-        fusing = pd.DataFrame({"vertical": vertical})
-        one = flown(monkeypatch, fusing=fusing)
-        assert isinstance(one, Inputs)
-        assert one.vision_height is there
-    none = flown(monkeypatch, fusing=NONE)
-    assert isinstance(none, Inputs)
-    assert none.vision_height is False
+        assert flown(fusing=pd.DataFrame({"vertical": vertical})).vision_height is there
+    assert flown(fusing=NONE).vision_height is False
 
 
 def track(name: str, origin: Origin, interval_s: float = 0.1, **parts: Any) -> PositionTrack:
