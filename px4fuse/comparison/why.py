@@ -243,9 +243,7 @@ def _reasons(
             f"{settings.sigma_a_m_s2:.2g}, so EKF2 trusts {trusted}"
         ),
         ATTITUDE: "EKF2 lets the positions correct its attitude, ours takes it as it is",
-        GATE: (
-            f"EKF2's gate rejects {rejected:.1%} of the samples, ours takes all{_coasted(why)}"
-        ),
+        GATE: (f"EKF2's gate rejects {rejected:.1%} of the samples, ours takes all{_coasted(why)}"),
         OUTPUT: (
             f"EKF2 filters {inputs.horizon_s * 1e3:.0f} ms behind the present, carries that to now "
             f"by the IMU and smooths it (EKF2_TAU_POS {flown['EKF2_TAU_POS']:g} s)"
