@@ -266,9 +266,11 @@ def test_the_effect_in_words() -> None:
 
 
 def words(analysis: Analysis, **changes: float) -> str:
-    return remedy_words(
+    said, helps = remedy_words(
         analysis.ekf2_model, changes, noise_helps, why="Because: ", otherwise="Look elsewhere:"
     )
+    assert helps is said.startswith("Because")
+    return said
 
 
 def test_confirmed_refused_and_not_replayed(sample: Analysis) -> None:
