@@ -218,8 +218,8 @@ def _of_innovations(judged: FilterSummary, field: str, value: float) -> Bounds |
     if field not in ("nis_mean", "innovation_std_m") or not _is_normal(judged, count):
         return None
     ends = count / chi2.ppf((0.5 + LEVEL / 2, 0.5 - LEVEL / 2), count)
-    interval = value * (ends if field == "nis_mean" else np.sqrt(ends))
-    return float(interval[0]), float(interval[1])
+    low, high = (ends if field == "nis_mean" else np.sqrt(ends)).tolist()
+    return value * low, value * high
 
 
 def bootstrapped(errors: Array, field: str) -> Bounds | None:
