@@ -46,7 +46,7 @@ from px4fuse.simulation.scenario import Scenario
 
 
 def number(value: float, interval=None, *, aim="low", scale="ratio", kind="x") -> Number:
-    return Number(Measure(kind, "it", "m", aim, scale), "it", value, interval)
+    return Number(Measure(kind, "it", "m", aim, scale), value, interval)
 
 
 def around(value: float, factor: float, **kinds) -> Number:
