@@ -125,6 +125,9 @@ def test_means_of_nis_are_compared_as_the_f_test_would(n, m, ratio):
         number(value, interval_of(white(value, count), "nis_mean", value))
         for value, count in ((1.0, n), (ratio, m))
     ]
+    assert interval_of(white(1.0, n), "innovation_std_m", 3.0) == pytest.approx(
+        tuple(3.0 * np.sqrt(both[0].interval))
+    )
     exact = 2.0 * min(fisher.cdf(ratio, m, n), fisher.sf(ratio, m, n))
     assert contrast(*both).p == pytest.approx(exact, rel=0.25, abs=0.02)
 
