@@ -82,9 +82,6 @@ def test_everything_that_was_handed_in_stands_in_the_table(handed_in, tmp_path) 
     assert "<img src=x" not in page
     assert "<title>Lab: fusion and loop closure</title>" in page  # the rubric's
     assert len(list((output / "feedback").glob("*.txt"))) == 6
-    for results in (output / "gradescope").rglob("results.json"):
-        found = json.loads(results.read_text(encoding="utf-8"))
-        assert found["score"] >= 0.0
 
 
 @pytest.mark.usefixtures("at_once", "drawn_once")
@@ -343,9 +340,9 @@ def test_the_options_of_a_term_reach_it(tmp_path, monkeypatch) -> None:
     course = given["course"]
     assert [person.student_id for person in course.roster] == ["0042"]
     assert course.worksheets[0].head == ("id", "Grade")
-    assert (course.column, course.anonymous, course.term.attempt) == ("Grade", True, "best")
-    assert course.term.due.isoformat() == "2026-11-20T23:59:59+01:00"
-    assert course.term.late.text == "5%/hour"
+    assert (course.column, course.anonymous, course.attempt) == ("Grade", True, "best")
+    assert course.due.isoformat() == "2026-11-20T23:59:59+01:00"
+    assert course.late.text == "5%/hour"
 
 
 def test_the_default_rubric_is_written_to_be_edited(tmp_path, monkeypatch) -> None:

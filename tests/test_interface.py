@@ -259,18 +259,17 @@ def test_nothing_prints_a_whole_table(results):
     seen: set[int] = set()
 
     def walk(value: object, path: str) -> None:
-        if (
-            dataclasses.is_dataclass(value)
-            and not isinstance(value, type)
-            and id(value) not in seen
-        ):
+        names = getattr(value, "__struct_fields__", ())
+        if dataclasses.is_dataclass(value):
+            names = [field.name for field in dataclasses.fields(value)]
+        if names and not isinstance(value, type) and id(value) not in seen:
             seen.add(id(value))
-            whole = [getattr(value, field.name) for field in dataclasses.fields(value)]
+            whole = [getattr(value, name) for name in names]
             if any(isinstance(part, pd.DataFrame | np.ndarray) for part in whole):
                 assert len(repr(value)) < 1000, path
                 assert "\n0 " not in repr(value), path
-            for field, part in zip(dataclasses.fields(value), whole, strict=True):
-                walk(part, f"{path}.{field.name}")
+            for name, part in zip(names, whole, strict=True):
+                walk(part, f"{path}.{name}")
         elif isinstance(value, tuple):
             for part in value:
                 walk(part, f"{path}[]")

@@ -73,10 +73,11 @@ def rows_of(found: ComparisonResults) -> list[Row]:
     ``variance_factor`` in the results. SIGMA_Z and SIGMA_A are what the data ask for, north and
     east together. The clock offset is there where it is determinable.
     """
+    causes = [one for one in found.findings if one.caused_by is None]
     common = log_columns(found.log) | {
         "story": "\n".join(found.story),
-        "findings": BETWEEN_FINDINGS.join(finding.id for finding in found.findings),
-        "severities": sorted({finding.severity for finding in found.findings}),
+        "findings": BETWEEN_FINDINGS.join(one.id for one in causes),
+        "severities": sorted({one.severity for one in causes}),
     }
     clock = bool(at(found, "clock.determinable"))
     rows = []

@@ -66,11 +66,10 @@ def findings(a: ComparisonResults, b: ComparisonResults) -> Iterator[FindingChan
     both: tuple[tuple[ComparisonResults, ComparisonResults, Which], ...]
     both = ((b, a, "B"), (a, b, "A"))
     for mine, other, only_in in both:
-        known = {name for finding in other.findings for name in finding.ids}
-        for finding in mine.findings:
-            for one in (finding, *finding.consequences):
-                if one.id not in known:
-                    yield FindingChange(one.id, one.severity, one.message, only_in)
+        known = {one.id for one in other.findings}
+        for one in mine.findings:
+            if one.id not in known:
+                yield FindingChange(one.id, one.severity, one.message, only_in)
 
 
 def sentences(found: ChangeResults) -> Iterator[str]:

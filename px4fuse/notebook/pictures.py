@@ -12,8 +12,8 @@ from matplotlib.axes import Axes
 from px4fuse.analysis import Analysis
 from px4fuse.arrays import Array
 from px4fuse.comparison.model import AxisComparison, Comparison
-from px4fuse.comparison.why import Why
 from px4fuse.display import frame
+from px4fuse.ekf2.walk import Why
 from px4fuse.ekf2.whatif import WhatIf
 from px4fuse.filter.clock import ClockOffset
 from px4fuse.filter.tuning import AxisTuning

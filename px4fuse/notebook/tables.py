@@ -12,8 +12,8 @@ from msgspec import structs
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import FILTERS, AxisComparison, Comparison
-from px4fuse.comparison.why import Why
 from px4fuse.display import frame, words
+from px4fuse.ekf2.walk import Why
 from px4fuse.ekf2.whatif import Summary, WhatIf
 from px4fuse.filter.clock import ClockOffset
 from px4fuse.filter.consistency import Consistency
@@ -159,7 +159,8 @@ def _(analysis: Analysis) -> str:
     for sentence in story(analysis, found):
         lines += wrap(sentence, WIDTH)
     for severity in SEVERITIES:
-        if names := ", ".join(finding.id for finding in found if finding.severity == severity):
+        named = (one.id for one in found if one.severity == severity and one.caused_by is None)
+        if names := ", ".join(named):
             lines += wrap(f"{severity}: {names}", WIDTH)
     return "\n".join(lines)
 

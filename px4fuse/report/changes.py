@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 import pandas as pd
 
 from px4fuse.comparison.model import AxisComparison
-from px4fuse.comparison.why_words import the
+from px4fuse.comparison.why import the
 from px4fuse.report import flight, innovations
 from px4fuse.report.changes_words import cells, folded_words, other_lines, printed
 from px4fuse.report.document import ChangesDocument

@@ -33,7 +33,7 @@ def seconds(work: Callable[[], object]) -> float:
 
 def main() -> None:
     import numpy as np
-    import test_evaluation
+    from trajectory_tools import flight
 
     from px4fuse.readers.trajectory import read_trajectory, tum_text
     from px4fuse.trajectory.association import associate
@@ -41,8 +41,8 @@ def main() -> None:
     from px4fuse.trajectory.offset import estimate_time_offset
     from px4fuse.trajectory.scores import rmse_interval
 
-    reference = test_evaluation.flight(600.0, 200.0)
-    estimate = test_evaluation.flight(600.0, 30.0, "vio")
+    reference = flight(600.0, 200.0)
+    estimate = flight(600.0, 30.0, "vio")
     noise = np.random.default_rng(1).normal(0.0, 0.05, estimate.position_m.shape)
     estimate = replace(estimate, position_m=estimate.position_m + noise)
     with tempfile.TemporaryDirectory() as folder:
@@ -51,8 +51,8 @@ def main() -> None:
         size = path.stat().st_size / 1e6
         took = seconds(lambda: read_trajectory(path))
         print(f"read 20,000 poses, {size:.1f} MB       {took:7.3f} s")
-    matched = associate(estimate, reference)
-    error = np.linalg.norm(matched.estimate.position_m - matched.reference.position_m, axis=1)
+    x, y, _ = associate(estimate, reference)
+    error = np.linalg.norm(x.position_m - y.position_m, axis=1)
     for words, work in (
         ("write 120,000 poses", lambda: tum_text(reference)),
         ("associate 18,000 with 120,000", lambda: associate(estimate, reference)),
