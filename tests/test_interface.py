@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import re
 import subprocess
 import sys
 from html.parser import HTMLParser
@@ -24,7 +25,7 @@ from px4fuse.comparison.model import Comparison, UnjudgedFilter
 from px4fuse.display import Shown
 from px4fuse.filter.consistency import Consistency
 from px4fuse.fleet.changes import changes
-from px4fuse.fleet.sides import Side
+from px4fuse.fleet.inputs import DiffInput
 from px4fuse.request import with_options
 from px4fuse.results.build import results as build
 from px4fuse.results.contract import ComparisonResults
@@ -79,8 +80,8 @@ def results(sample_log, analysis) -> dict[str, Shown]:
         "PairwiseError": evaluation.rpe[0],
         "WhatIf": px4fuse.what_if(analysis.ekf2_model, {"EKF2_EVP_NOISE": 0.3}),
         "Changes": changes(
-            Side("aisle_uwb.json", "results", read_results(SHIPPED.read_bytes())),
-            Side("small.ulg", "log", results_of(analysis), analysis),
+            DiffInput("aisle_uwb.json", "results", read_results(SHIPPED.read_bytes())),
+            DiffInput("small.ulg", "log", results_of(analysis), analysis),
         ),
     }
 
@@ -258,18 +259,17 @@ def test_nothing_prints_a_whole_table(results):
     seen: set[int] = set()
 
     def walk(value: object, path: str) -> None:
-        if (
-            dataclasses.is_dataclass(value)
-            and not isinstance(value, type)
-            and id(value) not in seen
-        ):
+        names = getattr(value, "__struct_fields__", ())
+        if dataclasses.is_dataclass(value):
+            names = [field.name for field in dataclasses.fields(value)]
+        if names and not isinstance(value, type) and id(value) not in seen:
             seen.add(id(value))
-            whole = [getattr(value, field.name) for field in dataclasses.fields(value)]
+            whole = [getattr(value, name) for name in names]
             if any(isinstance(part, pd.DataFrame | np.ndarray) for part in whole):
                 assert len(repr(value)) < 1000, path
                 assert "\n0 " not in repr(value), path
-            for field, part in zip(dataclasses.fields(value), whole, strict=True):
-                walk(part, f"{path}.{field.name}")
+            for name, part in zip(names, whole, strict=True):
+                walk(part, f"{path}.{name}")
         elif isinstance(value, tuple):
             for part in value:
                 walk(part, f"{path}[]")
@@ -287,14 +287,14 @@ def test_tables_are_tidy_with_units(results, name):
     table = results[name].to_frame()
     assert len(table) >= 1
     assert table.columns.is_unique
-    without_unit = {
-        "nis_mean", "nis_low", "nis_high", "outside_two_sigma", "lag1_autocorrelation", "gain_nats",
-        "rejected_share", "w", "x", "y", "z",
-        "a", "b", "change", "change_low", "change_high", "p", "q",  # a column has the unit
-    }  # fmt: skip
-    units = ("_m", "_s", "_m_s", "_m_s2", "_m2", "_m2_s2", "_deg")
+    without_unit = (
+        "nis_mean|nis_band|nees_|outside_|autocorrelation|gain_nats|_share|sigma_factor|_p$|bias_t|_lags|count|"
+        # a column has the unit
+        "^([wxyzq]|(a|b|change)(_low|_high)?|delta)$|_block"
+    )
+    unit = r"_(m|s|m_s|m_s2|m2|m2_s2|deg)(_(interval|low|high|rmse|mean|median|std|min|max)|$)"
     for column in table.select_dtypes("floating"):
-        assert column in without_unit or column.endswith(units), column
+        assert re.search(f"{unit}|{without_unit}", column), column
 
 
 def test_tables_hold_the_results(results, analysis):
@@ -315,10 +315,10 @@ def test_tables_hold_the_results(results, analysis):
     positions = results["Flight"].to_frame().groupby("track")
     assert positions.size()["EKF2"] == len(analysis.flight.ekf2.state)
     evaluation = results["Evaluation"]
-    scores = evaluation.to_frame().set_index("score")["rmse_m"]
+    scores = evaluation.to_frame().set_index("score")["translation_m_rmse"]
     assert scores["ATE"] == evaluation.ate.translation_m.rmse
     assert scores["RPE 5 m"] == evaluation.rpe[1].translation_m.rmse
-    changed = results["WhatIf"].to_frame().set_index("ekf2")["nis_mean"]
+    changed = results["WhatIf"].to_frame().set_index("ekf2")["north_nis_mean"]
     assert changed["EKF2_EVP_NOISE=0.3"] < 0.3 * changed["logged"]
 
 

@@ -14,7 +14,7 @@ from px4fuse.answers import Answers, Claim
 from px4fuse.assignment.key import Answer, AnswerKey
 from px4fuse.assignment.truth import FormTruth, VerdictTruth, Wrong
 from px4fuse.errors import ResultsError
-from px4fuse.findings import names
+from px4fuse.findings import NAMES
 from px4fuse.grading.feedback import returned_text
 from px4fuse.grading.flags import chosen_settings, class_flags, own_flags
 from px4fuse.grading.model import Entry, Graded, Item
@@ -387,7 +387,7 @@ class TestWhatStudentsRead:
 
     def test_words_never_ids(self):
         """Whatever is missing is told in words; paths and ids are the program's own."""
-        wrong = [finding(name, "error") for name in names()]
+        wrong = [finding(name, "error") for name in NAMES]
         spoilt = [
             changed(findings=wrong, student__notes="It is a flight of 5 s.", tuning={}, clock=NONE),
             changed(LOOP, findings=wrong, loop__closure_error_m=..., loop__known_end=NONE,

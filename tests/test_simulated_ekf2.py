@@ -14,14 +14,13 @@ from flights import unexplained
 from px4fuse.analysis import explain
 from px4fuse.cli import cli
 from px4fuse.comparison.comparison import compare
-from px4fuse.ekf2.model import MODEL_NOTE, open_model, replay_ekf2
-from px4fuse.ekf2.replay import Agreement, Ekf2Replay
+from px4fuse.ekf2.model import MODEL_NOTE, Model, open_model
+from px4fuse.ekf2.replay import Agreement
 from px4fuse.ekf2.whatif import WhatIf, what_if
 from px4fuse.errors import SettingsError
 from px4fuse.filter.consistency import nis_band
 from px4fuse.filter.settings import Settings
-from px4fuse.findings import find
-from px4fuse.findings.ekf2_ev_delay_wrong import DETECTOR as DELAY
+from px4fuse.findings import find, source_clock
 from px4fuse.flight import Ekf2, Flight, FusionRecord, Truth, Unavailable
 from px4fuse.readers import read_log
 from px4fuse.readers.px4_ekf2 import samples_per_step
@@ -53,10 +52,9 @@ def fused(flight: Flight, axis: str = "north") -> pd.DataFrame:
 
 
 def agreement(flight: Flight) -> Agreement:
-    replay = replay_ekf2(flight)
-    assert isinstance(replay, Ekf2Replay), replay
-    assert replay.agreement is not None
-    return replay.agreement
+    model = open_model(flight)
+    assert isinstance(model, Model), model
+    return model.agreement
 
 
 def rmse(flight: Flight, start_s: float, end_s: float, column: str = "north_m") -> float:
@@ -68,7 +66,7 @@ def rmse(flight: Flight, start_s: float, end_s: float, column: str = "north_m") 
 
 def named(flight: Flight) -> set[str]:
     compared = compare(flight, RIGHT, axes=("north", "east"))
-    return {name for finding in find(unexplained(compared)) for name in finding.ids}
+    return {finding.id for finding in find(unexplained(compared))}
 
 
 @pytest.fixture(scope="module")
@@ -138,8 +136,6 @@ def test_clean_flights_are_consistent_and_near_the_truth() -> None:
 
 def test_the_horizon_state_is_as_good_as_it_says(clean: Flight) -> None:
     """Position and velocity at the horizon, their variances, and the biases that it learns."""
-    replay = replay_ekf2(clean)
-    assert isinstance(replay, Ekf2Replay)
     assert isinstance(clean.truth, Truth)
     record, truth = of(clean).record, clean.truth.samples
     assert isinstance(record, FusionRecord)
@@ -250,7 +246,7 @@ def test_a_delay_in_force_is_asked_away() -> None:
     ahead = rmse(flight, 10.0, 110.0)
     assert ahead > 1.3 * rmse(flown(scenario=Scenario(seed=100)), 10.0, 110.0)
     analysis = explain(compare(flight, RIGHT, axes=("north", "east")))
-    (finding,) = DELAY.detect(analysis)
+    (finding,) = [f for f in source_clock.detect(analysis) if f.id == "ekf2_ev_delay_wrong"]
     assert finding.evidence["ekf2_ev_delay_ms"] == 175.0
     assert finding.evidence["asked_ms"] == pytest.approx(0.0, abs=60.0)
     assert "EKF2_EV_DELAY" in finding.remedy

@@ -31,12 +31,13 @@ from px4fuse.grading.evidence import (
     text_of,
     values_at,
 )
+from px4fuse.loop.model import Correction, LoopPart, Way
 from px4fuse.plain import capital, factor_words, few_words, length_words, p_words
-from px4fuse.record import Share
+from px4fuse.record import Maybe, Share
 from px4fuse.request import LoopRequest
 from px4fuse.results.comparison import ASKED
 from px4fuse.results.contract import ComparisonResults, LoopResults
-from px4fuse.results.trajectories import Correction, Corrections, LoopPart, Score
+from px4fuse.trajectory.evaluation import Score
 from px4fuse.trajectory.graph.analysis import GATE_ALPHA
 from px4fuse.verification.rerun import log_sha256
 from px4fuse.verification.verification import is_number
@@ -519,13 +520,14 @@ class LoopItem(RubricItem, frozen=True, kw_only=True, tag="loop"):
         share, comment = self._corrected(loop.corrections)
         return (1.0 + share) / 3.0, f"{measured}{comment}"
 
-    def _corrected(self, made: Corrections) -> Scored:
+    def _corrected(self, corrections: Mapping[Way, Maybe[Correction]]) -> Scored:
         """One for a corrected path and one for an ATE below the uncorrected one."""
-        tried = (made.by_distance_plain, made.by_distance, made.pose_graph_gated)
+        ways: tuple[Way, ...] = ("by_distance_plain", "by_distance", "pose_graph_gated")
+        tried = [corrections.get(way) for way in ways]
         done = [one for one in tried if isinstance(one, Correction)]
         if not done:
             return 0.0, ", but the path is not corrected."
-        before = _ates(made.uncorrected)
+        before = _ates(corrections.get("uncorrected"))
         pairs = [
             (was, now) for one in done for name, now in _ates(one).items()
             if (was := before.get(name))

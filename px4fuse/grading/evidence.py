@@ -139,7 +139,7 @@ class Evidence:
 
     def has(self, finding: str) -> bool:
         """Whether the report lists a finding."""
-        return any(finding in one.ids for one in self.results.findings)
+        return any(one.id == finding for one in self.results.findings)
 
     def why_absent(self, path: str) -> str:
         """Why there is nothing at a path, in brackets, as far as the results say it."""

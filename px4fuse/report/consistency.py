@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 
 from px4fuse.arrays import Array
 from px4fuse.comparison.model import AxisComparison
-from px4fuse.comparison.why_words import the
+from px4fuse.comparison.why import the
 from px4fuse.filter.consistency import MIN_INNOVATIONS, Consistency, autocorrelation, nis_band
 from px4fuse.flight import Unavailable
 from px4fuse.plain import capital, number_words, p_words

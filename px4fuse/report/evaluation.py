@@ -219,12 +219,11 @@ def _side_words(score: Evaluation, side: View) -> str:
 
 
 def _before(axes: Axes, score: Evaluation, view: View) -> None:
-    matched = score.association
-    for track, style, label in (
-        (matched.reference, REFERENCE, "reference"),
-        (matched.estimate, {"color": OURS, "lw": 1.2}, "estimate before alignment"),
+    for position, style, label in (
+        (score.reference_m, REFERENCE, "reference"),
+        (score.unaligned_m, {"color": OURS, "lw": 1.2}, "estimate before alignment"),
     ):
-        way(axes, view.of(track.position_m), score.time_s, label=label, **style)
+        way(axes, view.of(position), score.time_s, label=label, **style)
     _framed(axes, score, view)
 
 

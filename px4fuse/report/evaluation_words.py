@@ -83,7 +83,7 @@ def reasons(score: Evaluation) -> list[str]:
 
 def before_words(score: Evaluation) -> str:
     """How far the two are apart as their numbers stand, and what the alignment took away."""
-    x, y = score.association.estimate.position_m, score.association.reference.position_m
+    x, y = score.unaligned_m, score.reference_m
     apart = float(np.sqrt(((x - y) ** 2).sum(axis=1).mean()))
     fitted = score.transform
     scaled = f", scaled {fitted.scale:.3g} times" if fitted.degrees_of_freedom == 7 else ""

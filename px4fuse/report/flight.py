@@ -13,7 +13,7 @@ from matplotlib.patches import Patch
 
 from px4fuse.arrays import Array
 from px4fuse.comparison.model import FILTERS, AgainstTruth, AxisComparison, Difference
-from px4fuse.comparison.why_words import the
+from px4fuse.comparison.why import the
 from px4fuse.flight import Unavailable
 from px4fuse.report import marks
 from px4fuse.report.document import Document

@@ -13,7 +13,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 from px4fuse.arrays import Array
 from px4fuse.comparison.events import Span
 from px4fuse.comparison.model import AxisComparison, FilterSummary, UnjudgedFilter
-from px4fuse.comparison.why_words import the
+from px4fuse.comparison.why import the
 from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.signals import Segment
 from px4fuse.flight import Unavailable

@@ -9,10 +9,11 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
-from px4fuse.findings import Finding
+from px4fuse.findings import Finding, by_root
 from px4fuse.flight import Unavailable
-from px4fuse.loop.corrections import BY_DISTANCE, PLAIN, UNCORRECTED, Correction
+from px4fuse.loop.corrections import BY_DISTANCE, PLAIN, UNCORRECTED
 from px4fuse.loop.loop import Loop
+from px4fuse.loop.model import CorrectedPath
 from px4fuse.plain import capital, p_words
 from px4fuse.report.cover import write_finding
 from px4fuse.report.document import Document, LoopDocument
@@ -77,8 +78,8 @@ def draw_loop(
         page.labelled(label, text)
     for text in (by_distance_words(loop), redundancy_words(loop), *refusals(loop)):
         page.write(text, colour=MUTED, above=2.0)
-    for finding in findings:
-        write_finding(page, finding)
+    for group in by_root(findings):
+        write_finding(page, group)
     page.skip(6.0)
     _table(page, loop)
     _map(page, loop)
@@ -113,7 +114,7 @@ def _table(page: Page, loop: Loop) -> None:
     )
 
 
-def shown(loop: Loop) -> list[Correction]:
+def shown(loop: Loop) -> list[CorrectedPath]:
     """The paths that are drawn: each kind of correction once."""
     return [part for part in loop.reported if part.name in STYLES]
 
@@ -131,8 +132,8 @@ def _map(page: Page, loop: Loop) -> None:
     axes.plot(start[1], start[0], "o", color="black", ms=5, label="start", zorder=5)
     axes.plot(end[1], end[0], "s", color=EKF2, mec="black", mew=0.6, ms=5,
               label="end by odometry", zorder=5)  # fmt: skip
-    if not isinstance(loop.misclosure_m, Unavailable):
-        true = end - loop.misclosure_m
+    if loop.closure_error_axes_m is not None:
+        true = end - np.array(list(loop.closure_error_axes_m.values()))
         axes.annotate(
             "", xy=(true[1], true[0]), xytext=(end[1], end[0]), zorder=6,
             arrowprops={"arrowstyle": "->", "color": "#a61b1b", "lw": 1.2, "shrinkA": 3,
@@ -158,9 +159,7 @@ def _reference(axes: Axes, loop: Loop) -> None:
             score = part.scores.get(name)
             if not isinstance(score, Evaluation):
                 continue
-            transform = score.transform
-            back = transform.rotation.inv().apply(score.reference_m - transform.translation_m)
-            position = back / transform.scale
+            position = score.transform.undo(score.reference_m)
             way(axes, position[:, (1, 0)], score.time_s, label=name, **TRUTH_LINE, zorder=4)
             return
 
@@ -209,7 +208,7 @@ def _along(page: Page, loop: Loop) -> None:
     every[-1].set_xlabel("distance along the path (m)")
 
 
-def _fit(axes: Axes, drawn: list[Correction]) -> None:
+def _fit(axes: Axes, drawn: list[CorrectedPath]) -> None:
     """Scale to the paths that might be used: one that a false closure warps runs out of sight."""
     highest = [
         float(np.nanmax(line.get_ydata()))
@@ -231,18 +230,17 @@ def _scores(loop: Loop, name: Callable[[str], str]) -> Page:
     )
     page.heading("Closures", 10.5)
     rows: list[list[Cell]] = []
-    for judged in loop.closures:
-        gate = judged.gate
+    for closure in loop.closures:
         weights = [
-            f"{judged.weights[name]:.2f}" if name in judged.weights else "–"
-            for name in ("dcs", "gnc")
+            "–" if weight is None else f"{weight:.2f}"
+            for weight in (closure.weight_dcs, closure.weight_gnc)
         ]
         cells = [
-            closure_name(judged, loop), f"{judged.distance_m:.2f}", f"{gate.d2:.1f}",
-            f"{gate.degrees_of_freedom}", p_words(gate.p).removeprefix("p "),
-            "accepted" if gate.accepted else "REJECTED", *weights,
+            closure_name(closure, loop), f"{closure.distance_m:.2f}", f"{closure.d2:.1f}",
+            f"{closure.degrees_of_freedom}", p_words(closure.p).removeprefix("p "),
+            "accepted" if closure.accepted else "REJECTED", *weights,
         ]  # fmt: skip
-        colour = "black" if gate.accepted else SEVERITY_COLOURS["error"]
+        colour = "black" if closure.accepted else SEVERITY_COLOURS["error"]
         rows.append([(cell, colour) for cell in cells])
     if rows:
         heads = ["same place at", "missed by (m)", "d²", "dof", "p", "gate", "DCS weight",

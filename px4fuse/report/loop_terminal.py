@@ -6,7 +6,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from px4fuse.findings import Finding
+from px4fuse.findings import Finding, by_root
 from px4fuse.flight import Unavailable
 from px4fuse.loop.loop import Loop
 from px4fuse.report.evaluation_words import reasons
@@ -41,15 +41,15 @@ def print_loop(
     _print_paths(console, loop)
     if len(loop.closures) > 1:
         closures = _table("closure", "missed by (m)", "d²", "p", "gate", "DCS", "GNC")
-        for judged in loop.closures:
-            gate = judged.gate
+        for closure in loop.closures:
+            weights = closure.weight_dcs, closure.weight_gnc
             closures.add_row(
-                closure_name(judged, loop),
-                f"{judged.distance_m:.2f}",
-                f"{gate.d2:.1f}",
-                f"{gate.p:.2g}",
-                Text("accepted", "green") if gate.accepted else Text("REJECTED", "bold red"),
-                *(f"{judged.weights.get(name, float('nan')):.2f}" for name in ("dcs", "gnc")),
+                closure_name(closure, loop),
+                f"{closure.distance_m:.2f}",
+                f"{closure.d2:.1f}",
+                f"{closure.p:.2g}",
+                Text("accepted", "green") if closure.accepted else Text("REJECTED", "bold red"),
+                *("nan" if weight is None else f"{weight:.2f}" for weight in weights),
             )
         console.print(closures)
     for text in (
@@ -57,8 +57,8 @@ def print_loop(
     ):  # fmt: skip
         if text:
             say(console, Text(text, "dim"))
-    for finding in findings:
-        print_finding(console, finding, request)
+    for group in by_root(findings):
+        print_finding(console, group, request)
 
 
 def _print_paths(console: Console, loop: Loop) -> None:
@@ -134,7 +134,7 @@ def print_graph(console: Console, name: str, solved: SolvedGraph) -> None:
         rejected = [gate for gate in gates if not gate.accepted]
         print_line(console, "Gate", f"rejects {len(rejected)} of {len(gates)} closures")
         for gate in rejected[:MOST_ROWS]:
-            ends = f"{graph.ids[graph.first[gate.edge]]} – {graph.ids[graph.second[gate.edge]]}"
+            ends = f"{gate.first} – {gate.second}"
             console.print(f"         {ends}: d² {gate.d2:.1f}, p {gate.p:.2g}", markup=False)
         if len(rejected) > MOST_ROWS:
             console.print(f"         and {len(rejected) - MOST_ROWS} more", markup=False)
@@ -144,10 +144,10 @@ def print_graph(console: Console, name: str, solved: SolvedGraph) -> None:
     for key, solution in solved.solutions.items():
         table.add_row(
             SOLUTIONS[key],
-            f"{solution.initial_cost:.6g}",
+            f"{solution.cost_initial:.6g}",
             f"{solution.cost:.6g}",
             f"{solution.iterations}" + ("" if solution.converged else " (not converged)"),
-            "" if key == "all" else f"{(solution.weights < 0.5).sum()}",
+            "" if key == "all" else f"{solution.dropped}",
         )
     console.print(table)
 

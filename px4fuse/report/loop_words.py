@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import numpy as np
-
-from px4fuse.filter.signals import Segment
 from px4fuse.flight import Unavailable
 from px4fuse.loop.analysis import SMALLEST_STAMP_S
-from px4fuse.loop.corrections import SINGLE_LOOP, Correction, Judged
+from px4fuse.loop.corrections import SINGLE_LOOP
 from px4fuse.loop.loop import Loop
+from px4fuse.loop.model import LANDING, Closure, CorrectedPath
 from px4fuse.trajectory.evaluation import Evaluation
 from px4fuse.trajectory.graph.analysis import GATE_ALPHA
-from px4fuse.trajectory.model import AXES_OF_FRAME, Trajectory
+from px4fuse.trajectory.model import Trajectory
 from px4fuse.trajectory.scores import Interval, Statistics
 
 KINDS = {
@@ -27,22 +25,21 @@ KINDS = {
 def loop_lines(loop: Loop) -> list[tuple[str, str]]:
     """Label and sentence, in the order of interest."""
     path = loop.odometry.trajectory
-    part = loop.segment
     lines = [
         (
             "Track",
-            f"{path.name}: {KINDS[path.kind]}, {len(path)} poses, {len(loop.nodes)} key frames "
-            f"{loop.spacing_m:.2g} m apart",
+            f"{path.name}: {KINDS[path.kind]}, {len(path)} poses, {loop.key_frames} key frames "
+            f"{loop.key_frame_spacing_m:.2g} m apart",
         ),
-        ("Part", f"{_span(part)}, {part.reason}"),
+        ("Part", f"{_span(loop)}, {loop.part_reason}"),
         ("Closure", closure_words(loop)),
         ("End", "not used" if isinstance(loop.known_end, Unavailable) else loop.known_end.source),
     ]
-    lines += [("Gate", gate_words(judged)) for judged in loop.closures[:1]]
+    lines += [("Gate", gate_words(closure)) for closure in loop.closures[:1]]
     return lines
 
 
-def _span(part: Segment) -> str:
+def _span(part: Loop) -> str:
     if part.start_s > SMALLEST_STAMP_S:
         return f"{part.end_s - part.start_s:.1f} s from stamp {part.start_s:.2f} s"
     return f"{part.start_s:.1f} s to {part.end_s:.1f} s"
@@ -50,51 +47,50 @@ def _span(part: Segment) -> str:
 
 def closure_words(loop: Loop) -> str:
     """The closure error in m, in percent, per axis and in heading."""
-    error, misclosure = loop.closure_error_m, loop.misclosure_m
-    if error is None or isinstance(misclosure, Unavailable):
+    error, misclosure = loop.closure_error_m, loop.closure_error_axes_m
+    if error is None or misclosure is None:
         return f"path {loop.path_length_m:.1f} m; no closure error is stated: it did not come back"
-    named = zip(AXES_OF_FRAME[loop.odometry.trajectory.frame], misclosure, strict=True)
     text = (
         f"{error:.2f} m after {loop.path_length_m:.1f} m = {error / loop.path_length_m:.2%} "
-        f"({', '.join(f'{name} {part:+.2f} m' for name, part in named)})"
+        f"({', '.join(f'{name} {part:+.2f} m' for name, part in misclosure.items())})"
     )
-    turned = loop.misclosure_heading_deg
+    turned = loop.heading_error_deg
     if isinstance(turned, Unavailable):
         return f"{text}; heading: not known, {turned.reason}"
     return f"{text}; heading {turned:+.1f}°"
 
 
-def gate_words(judged: Judged) -> str:
+def gate_words(closure: Closure) -> str:
     """What the gate says about one closure."""
-    gate = judged.gate
     verdict = (
-        "as the stated drift allows" if gate.accepted else "REJECTED: the drift cannot explain it"
+        "as the stated drift allows"
+        if closure.accepted
+        else "REJECTED: the drift cannot explain it"
     )
     return (
-        f"d² {gate.d2:.1f} with {gate.degrees_of_freedom} degrees of freedom, p {gate.p:.2g} "
-        f"(rejected below {GATE_ALPHA:g}): {verdict}"
+        f"d² {closure.d2:.1f} with {closure.degrees_of_freedom} degrees of freedom, p "
+        f"{closure.p:.2g} (rejected below {GATE_ALPHA:g}): {verdict}"
     )
 
 
-def closure_name(judged: Judged, loop: Loop) -> str:
+def closure_name(closure: Closure, loop: Loop) -> str:
     """Which closure; long stamps count from the first pose."""
-    closure = judged.closure
-    if closure.source == "landing":
+    if closure.source == LANDING:
         return "take-off and landing"
-    start = loop.segment.start_s
+    start = loop.start_s
     zero = start if start > SMALLEST_STAMP_S else 0.0
     return f"{closure.time_1_s - zero:.2f} s and {closure.time_2_s - zero:.2f} s"
 
 
 def by_distance_words(loop: Loop) -> str:
     """What the corrections by distance are; nothing where there is none."""
-    if isinstance(loop.plain, Unavailable):
+    if "by_distance_plain" not in loop.paths:
         return ""
     example = (
         "By distance, positions only, is the lesson's Example 2: each position moves by its share "
         "of the gap, and the path keeps the bend of its headings."
     )
-    turned = loop.misclosure_heading_deg
+    turned = loop.heading_error_deg
     if isinstance(turned, Unavailable):
         return f"{example} Headings are not turned: {turned.reason}."
     return (
@@ -110,7 +106,7 @@ def redundancy_words(loop: Loop) -> str:
 
 def refusals(loop: Loop) -> list[str]:
     """Why a correction is missing, each reason once."""
-    parts = (loop.by_distance, *loop.solved.values())
+    parts = loop.corrections.values()
     reasons = [f"{p.what}: {p.reason}" for p in parts if isinstance(p, Unavailable)]
     return [r for r in dict.fromkeys(reasons) if SINGLE_LOOP not in r]
 
@@ -152,11 +148,11 @@ def statistics_words(
     ]
 
 
-def moved_words(correction: Correction) -> str:
+def moved_words(correction: CorrectedPath) -> str:
     """How far the poses moved."""
-    if not correction.moved_m.any():
+    if not correction.moved_max_m:
         return "–"
-    return f"{np.sqrt(np.mean(correction.moved_m**2)):.2f} / {correction.moved_m.max():.2f}"
+    return f"{correction.moved_rms_m:.2f} / {correction.moved_max_m:.2f}"
 
 
 def track_words(path: Trajectory) -> str:
@@ -174,7 +170,7 @@ def score_words(score: Evaluation) -> str:
     clock = "" if not offset else f"; clocks matched by {offset:+.3f} s"
     return (
         f"alignment {score.alignment} ({score.alignment_reason.rstrip('.')}); "
-        f"{len(matched)} poses, "
+        f"{matched.poses} poses, "
         f"{matched.coverage_estimate:.0%} of the estimate, {matched.coverage_reference:.0%} of the "
         f"reference's time{clock}"
     )

@@ -9,8 +9,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from px4fuse.comparison.why import Why
 from px4fuse.ekf2.replay import Agreement, Ekf2Replay
+from px4fuse.ekf2.walk import Why
 from px4fuse.filter.signals import AISLE
 from px4fuse.flight import Unavailable
 from px4fuse.plain import capital
