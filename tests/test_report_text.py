@@ -8,6 +8,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 import typst
 from exchange import replace
@@ -170,7 +171,7 @@ def document(student: Student) -> Document:
 
 def set_by_typst(*pages: Page) -> list[str]:
     """Text of each sheet of a PDF of these pages."""
-    blocks = [block for page in pages for block in data(page.blocks)]
+    blocks = data([block for page in pages for block in page.blocks])
     report = {
         "title": "t", "author": "a", "head": "", "student": "", "foot": "", "results": None,
         "fonts": [fonts.FONT], "blocks": blocks,
@@ -290,15 +291,13 @@ def test_only_the_ratio_moves_the_gain_and_the_track() -> None:
 
 def test_the_window_lies_where_nothing_is_missing_and_something_moves() -> None:
     time = np.arange(0.0, 100.0, 0.2)
-    result = SimpleNamespace(axis=SimpleNamespace(measurement_time_s=time))
-    velocity = np.where(time < 50.0, 3.0 * np.sin(time), 0.5 * np.sin(time))
-    start, end = _window(result, velocity, [])  # type: ignore[arg-type]
+    velocity = pd.Series(np.where(time < 50.0, 3.0 * np.sin(time), 0.5 * np.sin(time)), time)
+    start, end = _window(velocity, [])
     assert end <= 50.0
-    start, end = _window(result, velocity, [(10.0, 12.0), (30.0, 45.0)])  # type: ignore[arg-type]
+    start, end = _window(velocity, [(10.0, 12.0), (30.0, 45.0)])
     assert end - start == WINDOW_S
     assert start >= 45.0
     # where every window holds a gap, the one that holds the least of them
-    start, end = _window(result, velocity, [(5.0 * i, 5.0 * i + 4.0) for i in range(16)])  # type: ignore[arg-type]
+    start, end = _window(velocity, [(5.0 * i, 5.0 * i + 4.0) for i in range(16)])
     assert start >= 78.0
-    short = SimpleNamespace(axis=SimpleNamespace(measurement_time_s=time[:20]))
-    assert _window(short, velocity[:20], []) == (0.0, pytest.approx(3.8))  # type: ignore[arg-type]
+    assert _window(velocity[:20], []) == (0.0, pytest.approx(3.8))

@@ -28,9 +28,8 @@ from px4fuse.report.changes_words import (
     value_words,
 )
 from px4fuse.report.document import ChangesDocument
-from px4fuse.report.innovations import log_ticks
 from px4fuse.report.page import Cell, Page, halves, legend_above
-from px4fuse.report.style import MAX_POINTS, MUTED, SEVERITY_COLOURS, bare_x, thin
+from px4fuse.report.style import MAX_POINTS, MUTED, SEVERITY_COLOURS, bare_x, log_ticks, thin
 from px4fuse.results.changes import NumberChange
 from px4fuse.results.contract import ChangeResults
 
@@ -215,7 +214,6 @@ def _series(
         for track, made in drawn:
             axes.plot(*thin(*made), **STYLES[track.name], label=track.name)
         if log:
-            axes.set_yscale("log")
             log_ticks(axes)
         _finish(axes, tracks, since if at == len(found) - 1 else "")
         legend_above(axes)

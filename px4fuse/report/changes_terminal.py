@@ -12,8 +12,8 @@ from px4fuse.report.changes_words import (
     told,
     value_words,
 )
-from px4fuse.report.screen import plain_table, print_file, print_line, say
-from px4fuse.report.terminal import STYLES
+from px4fuse.report.screen import STYLES, plain_table, print_file, print_line, say
+from px4fuse.report.style import SEVERITY_COLOURS
 from px4fuse.results.contract import ChangeResults
 
 MOST = 15
@@ -58,7 +58,8 @@ def print_changes(console: Console, results: ChangeResults, report: object = Non
         print_line(console, HEADS[text.kind], f"{text.what}: {text.a} → {text.b}")
     for one in results.findings:
         head = "New" if one.only_in == "B" else "Gone"
-        print_line(console, head, Text(f"{one.severity}: {one.message}", STYLES[one.severity]))
+        style = STYLES[SEVERITY_COLOURS[one.severity]]
+        print_line(console, head, Text(f"{one.severity}: {one.message}", style))
     for note in (*results.notes, *results.methods[:1]):
         say(console, Text(note, "dim"))
     if report is not None:

@@ -42,16 +42,11 @@ def line(document: Document) -> str:
 
 def has_page(document: Document) -> bool:
     """Whether the flight says more about the clock than that it is right."""
-    clock, comparison = document.analysis.clock, document.comparison
+    clock, analysis = document.analysis.clock, document.analysis
     if isinstance(clock, Unavailable):
         return False
-    return (
-        not clock.determinable
-        or stamps_wrong(comparison, clock)
-        or delay_wrong(comparison, clock)
-        or _changes(clock)
-        or _drifts(clock)
-    )
+    wrong = stamps_wrong(analysis, clock) or delay_wrong(analysis, clock)
+    return not clock.determinable or wrong or _changes(clock) or _drifts(clock)
 
 
 def _changes(clock: ClockOffset) -> bool:
@@ -59,9 +54,8 @@ def _changes(clock: ClockOffset) -> bool:
 
 
 def _drifts(clock: ClockOffset) -> bool:
-    if clock.drift_ppm is None or clock.drift_sigma_ppm is None:
-        return False
-    return abs(clock.drift_ppm) > DRIFT_SIGMAS * clock.drift_sigma_ppm
+    drift, sigma = clock.drift_ppm, clock.drift_sigma_ppm
+    return drift is not None and sigma is not None and abs(drift) > DRIFT_SIGMAS * sigma
 
 
 def draw(document: Document) -> Iterator[Page]:
@@ -76,8 +70,8 @@ def draw(document: Document) -> Iterator[Page]:
         "maximised over the offset, jointly with sensor biases, attitude errors and noises; the "
         "attitude is from the gyros alone, because EKF2's was corrected by these very positions.",
     )
-    for text in clock_advice(document.comparison, clock):
-        page.labelled(text[:9].strip(), text[9:], size=8.5)
+    for label, text in clock_advice(document.analysis, clock).items():
+        page.labelled(label, text, size=8.5)
     _curve(page, clock)
     if len(clock.parts) > 1:
         _parts(page, clock, document)
@@ -87,13 +81,12 @@ def draw(document: Document) -> Iterator[Page]:
 def _curve(page: Page, clock: ClockOffset) -> None:
     """Likelihood over the offset."""
     (low, high), best, applied = clock.interval_s, clock.offset_s, clock.applied_s
-    axes = page.panel(
-        "ln of how much less likely each offset is than the best",
+    say = (
         f"Best at {best:+.3f} s; 95 % from {low:+.3f} to {high:+.3f} s, wider than the curve alone "
-        f"would say because the IMU's noise moves it too. From {clock.count} measurements.",
-        CURVE,
-        above=14.0,
+        f"would say because the IMU's noise moves it too. From {clock.count} measurements."
     )
+    title = "ln of how much less likely each offset is than the best"
+    axes = page.panel(title, say, CURVE, above=14.0)
     axes.axvspan(low, high, color=OURS_BAND, lw=0, label="95 % interval")
     axes.plot(clock.curve_s, clock.curve_drop, **OURS_LINE)
     axes.axvline(applied, color="black", lw=0.8, ls="--", label="as analysed")

@@ -8,7 +8,7 @@ from typing import ClassVar
 
 from px4fuse.analysis import Analysis, Counterfactual
 from px4fuse.comparison.events import Events, happened
-from px4fuse.comparison.model import Comparison
+from px4fuse.comparison.model import AxisComparison
 from px4fuse.findings import Finding
 from px4fuse.findings.story import story
 from px4fuse.flight import Unavailable
@@ -50,9 +50,9 @@ class Document:
     made: Provenance | None = None
 
     @property
-    def comparison(self) -> Comparison:
-        """The comparison itself, without what explains it."""
-        return self.analysis
+    def other_axes(self) -> list[AxisComparison]:
+        """The axes beside the main one."""
+        return [axis for axis in self.analysis.axes.values() if axis is not self.analysis.main]
 
     @cached_property
     def story(self) -> tuple[str, ...]:
@@ -62,17 +62,17 @@ class Document:
     @property
     def truth_known(self) -> bool:
         """Whether the log has a truth to compare with."""
-        return not isinstance(self.comparison.flight.truth, Unavailable)
+        return not isinstance(self.analysis.flight.truth, Unavailable)
 
     @cached_property
     def events(self) -> Events:
         """What is marked on every time axis."""
-        return happened(self.comparison)
+        return happened(self.analysis)
 
     @property
     def log(self) -> tuple[str, str]:
         """Name and SHA-256 of the log."""
-        return self.comparison.flight.log.name, self.comparison.flight.log.sha256
+        return self.analysis.flight.log.name, self.analysis.flight.log.sha256
 
     @property
     def title(self) -> str:
@@ -194,9 +194,3 @@ class LoopDocument:
     def title(self) -> str:
         """Of the PDF."""
         return f"px4fuse loop {self.log[0]}"
-
-    @property
-    def facts(self) -> tuple[tuple[str, str], ...]:
-        """Whose report it is, and which file it is about."""
-        student = who(self.student, ", ")
-        return (*((("Student", student),) if student else ()), ("SHA-256", self.log[1]))

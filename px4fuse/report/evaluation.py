@@ -4,18 +4,12 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from functools import cache
 from importlib import metadata
 from textwrap import fill
-from typing import Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-import matplotlib as mpl
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection
-from matplotlib.colors import Colormap, LinearSegmentedColormap, Normalize
-from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
 
 from px4fuse.arrays import Array, IntArray
 from px4fuse.flight import Unavailable
@@ -26,21 +20,18 @@ from px4fuse.report.evaluation_words import (
     distance_words,
     growth_words,
     metres,
-    reasons,
     relative_words,
-    score_rows,
     summary,
     time_words,
+    write_evaluation,
     zero_s,
 )
-from px4fuse.report.loop_words import score_words, track_words
 from px4fuse.report.page import WIDTH, Page, halves, legend_above
 from px4fuse.report.style import (
     EKF2,
     MAX_POINTS_NARROW,
     MUTED,
     OURS,
-    SEVERITY_COLOURS,
     TRUTH,
     empty,
     report_style,
@@ -49,6 +40,10 @@ from px4fuse.report.style import (
 from px4fuse.trajectory.evaluation import Evaluation
 from px4fuse.trajectory.model import AXES_OF_FRAME, MIN_POSES, Frame
 from px4fuse.trajectory.scores import Interval, PairwiseError, Statistics
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.colors import Colormap
 
 # Indices of the axes that are right, up the page and vertical; and whether the last points down
 _AXES: Mapping[Frame, tuple[int, int, int, bool]] = {
@@ -68,11 +63,8 @@ PIECES = 1200
 # Axes of errors reach at least this far: rounding is no error to look at
 LEAST_SCALE_M = 1e-3
 # In points: heights of a panel, of the maps and of a legend, and between the maps
-HEIGHT, MAPS, GAP = 78.0, 150.0, 16.0
+HEIGHT, MAPS, GAP = 76.0, 128.0, 16.0
 MOST_CURVES, MOST_BOXES = 3, 12
-TABLE_HEADS = (
-    "error", "RMSE", "95 % interval", "mean", "median", "std", "max", "n", "rotation RMSE (°)",
-)  # fmt: skip
 REFERENCE: dict[str, Any] = {"color": TRUTH, "lw": 0.8, "ls": (0, (4, 2))}
 STATISTICS: tuple[tuple[str, str, dict[str, Any]], ...] = (
     ("max", "max", {"color": MUTED, "lw": 0.8, "ls": (0, (1, 1.5))}),
@@ -88,18 +80,18 @@ CURVES: tuple[dict[str, Any], ...] = (
 PICTURE_INCHES, PICTURE_DPI, PICTURE_LETTERS = (10.0, 5.4), 150, 115
 
 
-def _darkening() -> Colormap:
+@cache
+def colours() -> Colormap:
     """Colours from light to dark, so that grey shows them in order; none is as light as paper."""
-    colours = mpl.colormaps["YlOrRd"](np.linspace(0.3, 1.0, 128)) * (1.0, 1.0, 1.0, 1.0)
-    colours[:, :3] *= np.linspace(1.0, 0.55, 128)[:, np.newaxis]
-    return LinearSegmentedColormap.from_list("error", colours)
+    import matplotlib as mpl  # noqa: PLC0415
+    from matplotlib.colors import LinearSegmentedColormap  # noqa: PLC0415
+
+    made = mpl.colormaps["YlOrRd"](np.linspace(0.3, 1.0, 128)) * (1.0, 1.0, 1.0, 1.0)
+    made[:, :3] *= np.linspace(1.0, 0.55, 128)[:, np.newaxis]
+    return LinearSegmentedColormap.from_list("error", made)
 
 
-COLOURS = _darkening()
-
-
-@dataclass(frozen=True)
-class View:
+class View(NamedTuple):
     """From where a path is seen: the axes across and up the page."""
 
     title: str
@@ -137,15 +129,7 @@ def draw(document: EvaluationDocument) -> Iterator[Page]:
         "motion over a delta is.",
     )
     page.write(summary(score), size=9.0, bold=True)
-    for text in (
-        f"Estimate {track_words(score.estimate)}. Reference {track_words(score.reference)}.",
-        f"{score_words(score)}.".replace("alignment", "Alignment", 1),
-    ):
-        page.write(text, size=7.2, colour=MUTED, above=-1.0)
-    for text in score.warnings:
-        page.write(text, bold=True, colour=SEVERITY_COLOURS["warning"])
-    page.table(TABLE_HEADS, score_rows(score))
-    page.numbers(" ".join([*reasons(score), *score.notes]))
+    write_evaluation(page, score)
     _maps(page, score)
     _panels(page, score)
     yield page
@@ -153,22 +137,22 @@ def draw(document: EvaluationDocument) -> Iterator[Page]:
 
 def picture(score: Evaluation) -> bytes:
     """The path by error, APE over time and RPE per delta, as PNG for a slide or a notebook."""
+    from matplotlib.figure import Figure  # noqa: PLC0415
+
     with report_style():
         figure = Figure(figsize=PICTURE_INCHES)
         title = fill(summary(score), PICTURE_LETTERS)
         figure.text(0.015, 0.985, title, size=9.5, weight="bold", va="top")
         axes = figure.add_axes((0.06, 0.14, 0.40, 0.74), title="the path, by its error (APE)")
-        scale = figure.add_axes((0.475, 0.14, 0.012, 0.74))
-        _path(axes, score, views(score)[0], scale)
+        _path(axes, score, views(score)[0], figure.add_axes((0.475, 0.14, 0.012, 0.74)))
         handles, labels = axes.get_legend_handles_labels()
         figure.legend(handles, labels, loc="lower left", ncols=4, bbox_to_anchor=(0.02, 0.01))
-        over_time = figure.add_axes((0.58, 0.60, 0.40, 0.28), title="APE over time (m)")
-        _absolute(over_time, score, score.time_s - zero_s(score))
-        over_time.set_xlabel(_time_label(score))
-        over_time.legend(loc="upper right", bbox_to_anchor=(1.01, -0.19), ncols=4,
-                         columnspacing=1.0, handlelength=1.9, borderaxespad=0.0)  # fmt: skip
-        _boxes(figure.add_axes((0.58, 0.14, 0.40, 0.28), title="RPE per delta (m); diamond: RMSE"),
-               score)  # fmt: skip
+        axes = figure.add_axes((0.58, 0.60, 0.40, 0.28), title="APE over time (m)")
+        _absolute(axes, score, score.time_s - zero_s(score), _time_label(score))
+        axes.legend(loc="upper right", bbox_to_anchor=(1.01, -0.19), ncols=4, columnspacing=1.0,
+                    handlelength=1.9, borderaxespad=0.0)  # fmt: skip
+        title = "RPE per delta (m); diamond: RMSE"
+        _boxes(figure.add_axes((0.58, 0.14, 0.40, 0.28), title=title), score)
         out = io.BytesIO()
         software = f"px4fuse {metadata.version('px4fuse')}"
         figure.savefig(out, format="png", dpi=PICTURE_DPI, metadata={"Software": software})
@@ -177,30 +161,30 @@ def picture(score: Evaluation) -> bytes:
 
 def _maps(page: Page, score: Evaluation) -> None:
     """The two as they stand, and the aligned path by its error, from one or two sides."""
-    seen = views(score)
-    is_aligned = score.alignment != "none"
+    seen, is_aligned = views(score), score.alignment != "none"
     title = "After alignment, by error" if is_aligned else "By error"
-    parts = [(f"{title}, {view.title}", _side_words(score, view)) for view in seen]
-    parts[0] = (parts[0][0], after_words(score))
+    parts = {f"{title}, {view.title}": _side_words(score, view) for view in seen}
+    parts[f"{title}, {seen[0].title}"] = after_words(score)
     if is_aligned:
-        parts.insert(0, ("Before alignment", before_words(score)))
+        parts = {"Before alignment": before_words(score), **parts}
     width = (WIDTH - GAP * (len(parts) - 1)) / len(parts)
     columns = [Page(width=width) for _ in parts]
     panels = [
         column.panel(head, "", MAPS, left=34.0, right=34.0 if column is columns[-1] else 4.0)
-        for column, (head, _) in zip(columns, parts, strict=True)
+        for column, head in zip(columns, parts, strict=True)
     ]
-    after = panels[int(is_aligned) :]
-    for axes, view in zip(after, seen, strict=True):
-        scale = axes.inset_axes((1.02, 0.0, 0.03, 1.0)) if axes is after[-1] else None
+    for axes, view in zip(panels[int(is_aligned) :], seen, strict=True):
+        scale = axes.inset_axes((1.02, 0.0, 0.03, 1.0)) if axes is panels[-1] else None
         _path(axes, score, view, scale)
     if is_aligned:
         _before(panels[0], score, seen[0])
-    entries = dict(zip(*after[0].get_legend_handles_labels()[::-1], strict=True))
-    if is_aligned:
-        entries = dict(zip(*panels[0].get_legend_handles_labels()[::-1], strict=True)) | entries
+    entries = {
+        label: handle
+        for axes in panels[: 1 + is_aligned]
+        for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)
+    }
     page.legend(list(entries.values()))
-    for column, (_, text) in zip(columns, parts, strict=True):
+    for column, text in zip(columns, parts.values(), strict=True):
         column.numbers(text)
     page.beside(*columns, gap=GAP)
 
@@ -230,16 +214,17 @@ def _before(axes: Axes, score: Evaluation, view: View) -> None:
 
 def _path(axes: Axes, score: Evaluation, view: View, scale: Axes | None) -> None:
     """The aligned path by its error, the reference dashed upon it."""
+    from matplotlib.collections import LineCollection  # noqa: PLC0415
+
     error, gaps = score.position_error_m, _gaps(score.time_s)
     at = np.unique(np.linspace(0, len(error) - 1, min(len(error), PIECES)).astype(np.intp))
     corners = view.of(score.estimate_m)[at]
     before_gap = np.searchsorted(gaps, at, side="right")  # how many gaps come before each corner
     unbroken = np.diff(before_gap) == 0
-    largest = np.maximum.reduceat(error, at[:-1])
     pieces = np.stack([corners[:-1], corners[1:]], axis=1)[unbroken]
-    norm = Normalize(0.0, max(float(error.max()), LEAST_SCALE_M))
-    drawn = LineCollection(list(pieces), cmap=COLOURS, norm=norm, lw=3.0, capstyle="round")
-    drawn.set_array(largest[unbroken])
+    drawn = LineCollection(list(pieces), cmap=colours(), lw=3.0, capstyle="round")
+    drawn.set_array(np.maximum.reduceat(error, at[:-1])[unbroken])
+    drawn.set_clim(0.0, max(float(error.max()), LEAST_SCALE_M))
     axes.add_collection(drawn)
     way(axes, view.of(score.reference_m), score.time_s, label="reference", **REFERENCE)
     start, worst = view.of(score.estimate_m)[[0, int(np.argmax(error))]]
@@ -247,9 +232,7 @@ def _path(axes: Axes, score: Evaluation, view: View, scale: Axes | None) -> None
     axes.plot(*worst, "x", color="black", ms=7, mew=1.6, label="largest error", zorder=5)
     _framed(axes, score, view)
     if scale is not None:
-        figure = axes.get_figure()
-        assert isinstance(figure, Figure)
-        bar = figure.colorbar(drawn, cax=scale)
+        bar = scale.figure.colorbar(drawn, cax=scale)
         bar.set_label("APE (m)", labelpad=1)
         bar.outline.set_linewidth(0.5)
 
@@ -259,88 +242,71 @@ def _framed(axes: Axes, score: Evaluation, view: View) -> None:
     axes.autoscale_view()
     axes.set_aspect("equal", adjustable="datalim")
     axes.grid(True, axis="both")
-    axes.xaxis.set_major_locator(MaxNLocator(4))
-    axes.yaxis.set_major_locator(MaxNLocator(6))
-    axes.set_xlabel(f"{names[view.across]} (m)")
-    axes.set_ylabel(f"{names[view.up]} (m)")
+    axes.locator_params(axis="x", nbins=4)
+    axes.locator_params(axis="y", nbins=6)
+    axes.set(xlabel=f"{names[view.across]} (m)", ylabel=f"{names[view.up]} (m)")
     if view.down:
         axes.invert_yaxis()
 
 
 def _panels(page: Page, score: Evaluation) -> None:
     """APE over time and over distance; RPE over time and per delta."""
-    zero = zero_s(score)
     left, right = halves()
     axes = left.panel("APE over time (m)", "", HEIGHT)
-    _absolute(axes, score, score.time_s - zero)
-    axes.set_xlabel(_time_label(score))
+    _absolute(axes, score, score.time_s - zero_s(score), _time_label(score))
     page.legend(axes.get_legend_handles_labels()[0])
     left.numbers(time_words(score))
     axes = right.panel("APE over distance (m)", "", HEIGHT)
-    _absolute(axes, score, score.distance_m)
-    axes.set_xlabel("distance along the reference (m)")
+    _absolute(axes, score, score.distance_m, "distance along the reference (m)")
     right.numbers(distance_words(score))
     page.beside(left, right)
     left, right = halves()
     axes = left.panel("RPE over time (m)", "", HEIGHT, above=14.0)
-    if shown := _relative(axes, score):
-        left.numbers(relative_words(shown, score.time_s, zero))
-    axes = right.panel("RPE per delta (m)", "", HEIGHT, above=14.0)
-    _boxes(axes, score)
-    if any(isinstance(error.translation_m, Statistics) for error in score.rpe):
+    if known := [e for e in score.rpe if isinstance(e.translation_m, Statistics)]:
+        left.numbers(relative_words(_relative(axes, score, known), score.time_s, zero_s(score)))
+        _boxes(right.panel("RPE per delta (m)", "", HEIGHT, above=14.0), score)
         right.numbers(growth_words(score.rpe))
+    else:
+        _none(axes, score)
     page.beside(left, right)
 
 
-def _absolute(axes: Axes, score: Evaluation, along: Array) -> None:
+def _absolute(axes: Axes, score: Evaluation, along: Array, label: str) -> None:
     """APE with its statistics as lines."""
     _line(axes, along, score.position_error_m, score.time_s, color=OURS, lw=0.8)
-    for name, label, style in STATISTICS:
+    for name, title, style in STATISTICS:
         value = getattr(score.ate.translation_m, name)
-        axes.axhline(value, label=f"{label} {metres(value)}", zorder=3, **style)
-    _from_zero(axes, along, float(score.position_error_m.max()))
+        axes.axhline(value, label=f"{title} {metres(value)}", zorder=3, **style)
+    _from_zero(axes, along, float(score.position_error_m.max()), label)
 
 
-def _relative(axes: Axes, score: Evaluation) -> list[PairwiseError]:
+def _relative(axes: Axes, score: Evaluation, known: list[PairwiseError]) -> list[PairwiseError]:
     """RPE over time, of the distances where there are any; returns what is shown."""
-    known = [e for e in score.rpe if isinstance(e.translation_m, Statistics)]
-    if not known:
-        _none(axes, score)
-        return []
     unit = "m" if any(e.unit == "m" for e in known) else known[0].unit
     shown = [e for e in known if e.unit == unit][-MOST_CURVES:]
     zero = zero_s(score)
     for error, style in zip(shown, CURVES[-len(shown) :], strict=True):
         ends = score.time_s[error.end]
-        _line(
-            axes,
-            ends - zero,
-            error.translation_error_m,
-            ends,
-            label=f"{error.delta_words}",
-            **style,
-        )
-    _from_zero(axes, score.time_s - zero, max(float(e.translation_error_m.max()) for e in shown))
+        _line(axes, ends - zero, error.translation_error_m, ends, label=error.delta_words, **style)
+    highest = max(float(error.translation_error_m.max()) for error in shown)
+    _from_zero(axes, score.time_s - zero, highest, _time_label(score))
     legend_above(axes, handlelength=1.8)
-    axes.set_xlabel(_time_label(score))
     return shown
 
 
 def _boxes(axes: Axes, score: Evaluation) -> None:
     """RPE of every delta as a box, with its RMSE and the interval of that."""
-    known: list[tuple[PairwiseError, Statistics]] = [
-        (e, e.translation_m) for e in score.rpe if isinstance(e.translation_m, Statistics)
-    ]
+    known = [(e, e.translation_m) for e in score.rpe if isinstance(e.translation_m, Statistics)]
     if not known:
         _none(axes, score)
         return
     known = known[:: -(-len(known) // MOST_BOXES)]
+    edge, middle = {"color": OURS, "lw": 0.8}, {"color": "black", "lw": 1.0}
     axes.boxplot(
         [error.translation_error_m for error, _ in known], whis=(0, 100), widths=0.5,
-        tick_labels=[f"{error.delta_words}" for error, _ in known], patch_artist=True,
-        boxprops={"facecolor": "#dbe5f1", "edgecolor": OURS, "lw": 0.8},
-        medianprops={"color": "black", "lw": 1.0}, whiskerprops={"color": OURS, "lw": 0.8},
-        capprops={"color": OURS, "lw": 0.8},
+        tick_labels=[error.delta_words for error, _ in known], patch_artist=True,
+        boxprops={"facecolor": "#dbe5f1", "edgecolor": OURS, "lw": 0.8}, medianprops=middle,
+        whiskerprops=edge, capprops=edge,
     )  # fmt: skip
     for place, (error, found) in enumerate(known, start=1):
         if isinstance(error.interval_m, Interval):
@@ -363,11 +329,12 @@ def _time_label(score: Evaluation) -> str:
     return "time from the first pose (s)" if zero_s(score) else "time (s)"
 
 
-def _from_zero(axes: Axes, along: Array, highest: float) -> None:
+def _from_zero(axes: Axes, along: Array, highest: float, label: str) -> None:
     axes.set_ylim(0.0, 1.08 * max(highest, LEAST_SCALE_M))
     axes.set_xlim(float(along[0]), max(float(along[-1]), float(along[0]) + 1e-6))
-    axes.xaxis.set_major_locator(MaxNLocator(6))
-    axes.yaxis.set_major_locator(MaxNLocator(4))
+    axes.locator_params(axis="x", nbins=6)
+    axes.locator_params(axis="y", nbins=4)
+    axes.set_xlabel(label)
 
 
 def _gaps(time_s: Array, least_s: float = 0.0) -> IntArray:

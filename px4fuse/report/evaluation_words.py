@@ -9,7 +9,9 @@ import numpy as np
 from px4fuse.arrays import Array
 from px4fuse.flight import Unavailable
 from px4fuse.loop.analysis import SMALLEST_STAMP_S
-from px4fuse.report.loop_words import interval_words
+from px4fuse.report.loop_words import interval_words, score_words, track_words
+from px4fuse.report.page import Page
+from px4fuse.report.style import SEVERITY_COLOURS
 from px4fuse.trajectory.evaluation import AbsoluteError, Evaluation
 from px4fuse.trajectory.scores import PairwiseError, Statistics
 
@@ -19,6 +21,9 @@ FEW_DECIDE = 0.5
 DIFFERS = 1.3
 # Rounding: no error to say anything about
 NEGLIGIBLE_M = 1e-6
+SCORE_HEAD = (
+    "error", "RMSE", "95 %", "mean", "median", "std", "max", "n", "rotation\nRMSE (°)",
+)  # fmt: skip
 
 
 def metres(value: float) -> str:
@@ -51,27 +56,31 @@ def _aligned(score: Evaluation) -> str:
     return "without alignment" if score.alignment == "none" else "after alignment"
 
 
+def write_evaluation(page: Page, score: Evaluation) -> None:
+    """Write what was scored and how, and the statistics of all errors."""
+    page.labelled("Estimate", track_words(score.estimate))
+    page.labelled("Against", track_words(score.reference))
+    page.labelled("How", score_words(score))
+    for text in score.warnings:
+        page.write(text, bold=True, colour=SEVERITY_COLOURS["warning"])
+    page.table(SCORE_HEAD, score_rows(score), right=range(1, len(SCORE_HEAD)))
+    page.numbers(" ".join([*reasons(score), *score.notes]))
+
+
 def score_rows(score: Evaluation) -> list[list[str]]:
-    """Of the ATE and every RPE: RMSE, interval, mean, median, std, max, n, and RMSE of rotation."""
-    named: list[tuple[str, AbsoluteError | PairwiseError]]
-    named = [("ATE (m)", score.ate), *((f"RPE {e.delta_words} (m)", e) for e in score.rpe)]
-    return [
-        [name, *_cells(e.translation_m, interval_words(e.interval_m), e.rotation_deg)]
-        for name, e in named
-    ]
-
-
-def _cells(
-    moved: Statistics | Unavailable, interval: str, turned: Statistics | Unavailable
-) -> list[str]:
-    rotation = f"{turned.rmse:.2f}" if isinstance(turned, Statistics) else "–"
-    if isinstance(moved, Unavailable):
-        return ["–", "", "", "", "", "", "", rotation]
-    numbers = (moved.mean, moved.median, moved.std, moved.max)
-    return [
-        f"{moved.rmse:.4f}", interval.strip(" ()"), *(f"{n:.4f}" for n in numbers),
-        f"{moved.count}", rotation,
-    ]  # fmt: skip
+    """Of the ATE and every RPE: what :data:`SCORE_HEAD` says."""
+    errors: dict[str, AbsoluteError | PairwiseError] = {"ATE (m)": score.ate}
+    errors |= {f"RPE {error.delta_words} (m)": error for error in score.rpe}
+    rows = []
+    for name, error in errors.items():
+        moved, turned = error.translation_m, error.rotation_deg
+        cells = ["–", *[""] * 6]
+        if isinstance(moved, Statistics):
+            numbers = (moved.mean, moved.median, moved.std, moved.max)
+            cells = [f"{moved.rmse:.4f}", interval_words(error.interval_m)]
+            cells += [*(f"{number:.4f}" for number in numbers), f"{moved.count}"]
+        rows.append([name, *cells, f"{turned.rmse:.2f}" if isinstance(turned, Statistics) else "–"])
+    return rows
 
 
 def reasons(score: Evaluation) -> list[str]:

@@ -1,14 +1,19 @@
-"""What there is to say about a loop, for the terminal and the PDF."""
+"""What there is to say about a loop, in words and tables, for the terminal and the PDF."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from px4fuse.filter.signals import Segment
+from px4fuse.findings import Finding
 from px4fuse.flight import Unavailable
 from px4fuse.loop.analysis import SMALLEST_STAMP_S
 from px4fuse.loop.corrections import SINGLE_LOOP, Correction, Judged
 from px4fuse.loop.loop import Loop
+from px4fuse.plain import capital, p_words
+from px4fuse.report.cover import write_finding
+from px4fuse.report.page import Cell, Page
+from px4fuse.report.style import MUTED, SEVERITY_COLOURS
 from px4fuse.trajectory.evaluation import Evaluation
 from px4fuse.trajectory.graph.analysis import GATE_ALPHA
 from px4fuse.trajectory.model import AXES_OF_FRAME, Trajectory
@@ -22,24 +27,80 @@ KINDS = {
     "slam": "a SLAM system's trajectory",
     "unknown": "a trajectory",
 }
+CLOSURE_HEAD = (
+    "same place at", "missed\nby (m)", "d²", "dof", "p", "gate", "DCS\nweight", "GNC\nweight",
+)  # fmt: skip
 
 
-def loop_lines(loop: Loop) -> list[tuple[str, str]]:
-    """Label and sentence, in the order of interest."""
+def write_loop(page: Page, loop: Loop, findings: tuple[Finding, ...] = ()) -> None:
+    """Write what was found, with every path, how far it moved, and its ATE to each reference."""
     path = loop.odometry.trajectory
-    part = loop.segment
-    lines = [
-        (
-            "Track",
-            f"{path.name}: {KINDS[path.kind]}, {len(path)} poses, {len(loop.nodes)} key frames "
-            f"{loop.spacing_m:.2g} m apart",
-        ),
-        ("Part", f"{_span(part)}, {part.reason}"),
-        ("Closure", closure_words(loop)),
-        ("End", "not used" if isinstance(loop.known_end, Unavailable) else loop.known_end.source),
-    ]
-    lines += [("Gate", gate_words(judged)) for judged in loop.closures[:1]]
-    return lines
+    page.labelled(
+        "Track",
+        f"{path.name}: {KINDS[path.kind]}, {len(path)} poses, {len(loop.nodes)} key frames "
+        f"{loop.spacing_m:.2g} m apart",
+    )
+    page.labelled("Part", f"{_span(loop.segment)}, {loop.segment.reason}")
+    page.labelled("Closure", closure_words(loop))
+    end = loop.known_end
+    page.labelled("End", "not used" if isinstance(end, Unavailable) else end.source)
+    for judged in loop.closures[:1]:
+        page.labelled("Gate", gate_words(judged))
+    for text in (by_distance_words(loop), *redundancy_words(loop), *refusals(loop)):
+        page.write(text, colour=MUTED, above=2.0)
+    for finding in findings:
+        write_finding(page, finding)
+    names = [reference.name for reference in loop.references]
+    page.table(
+        ["path", "moved RMS\n/ max (m)", *(f"ATE to\n{name} (m)" for name in names)],
+        [
+            [part.name, moved_words(part), *(_ate(part.scores[name]) for name in names)]
+            for part in loop.reported
+        ],
+    )
+    page.numbers(
+        "ATE is the RMSE of position after alignment, in brackets its 95 % interval by block "
+        "bootstrap where the flight is long enough for one."
+        if names
+        else "Neither ground truth nor a SLAM trajectory is given, so that no error of the path "
+        "can be stated; --reference FILE scores it."
+    )
+
+
+def write_scores(page: Page, loop: Loop) -> None:
+    """Write every closure with its gate and weights, RPE, and how scores were made."""
+    rows: list[list[Cell]] = []
+    for judged in loop.closures:
+        gate = judged.gate
+        cells = [
+            closure_name(judged, loop), f"{judged.distance_m:.2f}", f"{gate.d2:.1f}",
+            f"{gate.degrees_of_freedom}", p_words(gate.p).removeprefix("p "),
+            "accepted" if gate.accepted else "REJECTED",
+        ]  # fmt: skip
+        weights = (judged.weights.get(name) for name in ("dcs", "gnc"))
+        cells += ["–" if weight is None else f"{weight:.2f}" for weight in weights]
+        colour = "black" if gate.accepted else SEVERITY_COLOURS["error"]
+        rows.append([(cell, colour) for cell in cells])
+    if rows:
+        page.table(CLOSURE_HEAD, rows, right=(1, 2, 3, 4, 6, 7))
+    for reference in loop.references:
+        scores = {part.name: part.scores[reference.name] for part in loop.reported}
+        known = {name: score for name, score in scores.items() if isinstance(score, Evaluation)}
+        page.heading(f"RPE against {reference.name}", 10.5, above=14.0)
+        missing = (score.reason for score in scores.values() if isinstance(score, Unavailable))
+        for reason in dict.fromkeys(missing):
+            page.write(reason, size=7.5)
+        if not known:
+            continue
+        first = next(iter(known.values()))
+        head = ["path", *(f"{e.delta_words} (m)" for e in first.rpe), "rotation (°)"]
+        page.table(head, [
+            [name, *(_error(e.translation_m, e.interval_m) for e in score.rpe),
+             _rmse(score.ate.rotation_deg, 2)]
+            for name, score in known.items()
+        ])  # fmt: skip
+        for text in (score_words(first), *first.notes, *first.warnings):
+            page.numbers(capital(text))
 
 
 def _span(part: Segment) -> str:
@@ -103,9 +164,9 @@ def by_distance_words(loop: Loop) -> str:
     )
 
 
-def redundancy_words(loop: Loop) -> str:
+def redundancy_words(loop: Loop) -> list[str]:
     """That one loop has no redundancy, or nothing."""
-    return SINGLE_LOOP if len(loop.closures) == 1 else ""
+    return [SINGLE_LOOP] if len(loop.closures) == 1 else []
 
 
 def refusals(loop: Loop) -> list[str]:
@@ -115,41 +176,25 @@ def refusals(loop: Loop) -> list[str]:
     return [r for r in dict.fromkeys(reasons) if SINGLE_LOOP not in r]
 
 
-def unscored(loop: Loop) -> list[str]:
-    """Why a reference scores nothing, each reason once."""
-    reasons = [
-        f"{name}: {score.reason}"
-        for part in loop.reported
-        for name, score in part.scores.items()
-        if isinstance(score, Unavailable)
-    ]
-    return list(dict.fromkeys(reasons))
-
-
-def ate_words(score: Evaluation | Unavailable) -> str:
-    """RMSE of the ATE in m, with its interval where there is one."""
+def _ate(score: Evaluation | Unavailable) -> str:
     if isinstance(score, Unavailable):
         return "–"
-    return f"{score.ate.translation_m.rmse:.3f}{interval_words(score.ate.interval_m)}"
+    return _error(score.ate.translation_m, score.ate.interval_m)
+
+
+def _error(moved: Statistics | Unavailable, interval: Interval | Unavailable) -> str:
+    """RMSE of an error, in brackets its interval where there is one."""
+    within = interval_words(interval)
+    return _rmse(moved) + (f" ({within})" if within else "")
+
+
+def _rmse(found: Statistics | Unavailable, digits: int = 3) -> str:
+    return f"{found.rmse:.{digits}f}" if isinstance(found, Statistics) else "–"
 
 
 def interval_words(interval: Interval | Unavailable) -> str:
-    """An interval in brackets; nothing where there is none."""
-    return f" ({interval.low:.3f}–{interval.high:.3f})" if isinstance(interval, Interval) else ""
-
-
-def statistics_words(
-    moved: Statistics | Unavailable,
-    interval: Interval | Unavailable,
-    turned: Statistics | Unavailable,
-) -> list[str]:
-    """RMSE, its interval, RMSE of rotation, and how many errors: cells of a table."""
-    return [
-        f"{moved.rmse:.3f}" if isinstance(moved, Statistics) else "–",
-        f"{interval.low:.3f} – {interval.high:.3f}" if isinstance(interval, Interval) else "–",
-        f"{turned.rmse:.2f}" if isinstance(turned, Statistics) else "–",
-        f"{moved.count}" if isinstance(moved, Statistics) else "",
-    ]
+    """An interval; nothing where there is none."""
+    return f"{interval.low:.3f}–{interval.high:.3f}" if isinstance(interval, Interval) else ""
 
 
 def moved_words(correction: Correction) -> str:

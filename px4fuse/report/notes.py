@@ -82,13 +82,12 @@ def draw(document: Document | LoopDocument) -> Iterator[Page]:
         page.heading("The form, as it was filled in")
         page.table(("Asked", "Answer"), [list(row) for row in form_rows(answers)],
                    shares=[3.0, 4.0], size=TABLE_SIZE)  # fmt: skip
-        page.skip(8.0)
     for block in blocks:
         if isinstance(block, Paragraph):
-            page.note(
-                block.text, block.size, block.weight == "bold", block.colour,
+            page.write(
+                block.text, size=block.size, bold=block.weight == "bold", colour=block.colour,
                 indent=INDENT * min(block.indents, MOST_INDENTS), mark=block.mark,
-                above=block.above,
+                above=block.above - 2.0,
             )  # fmt: skip
         else:
             columns = max(map(len, block.rows))

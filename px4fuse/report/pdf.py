@@ -27,7 +27,6 @@ from px4fuse.report import (
     innovations,
     loop,
     notes,
-    other_axes,
     provenance,
     sensitivity,
     whatif,
@@ -54,7 +53,7 @@ PAGES: Mapping[type, tuple[Callable[[Any], Iterator[Page]], ...]] = {
         flight.draw,
         innovations.draw,
         why.draw,
-        other_axes.draw,
+        flight.draw_other_axes,
         consistency.draw,
         sensitivity.draw,
         clock.draw,
@@ -85,28 +84,24 @@ def render(document: Report, results_json: str) -> bytes:
     """
     with report_style():
         pages = [page for draw in PAGES[type(document)] for page in draw(document)]
-        blocks = [block for page in pages for block in data(page.blocks)]
-    name, sha256 = document.log
-    made_by = f"px4fuse {metadata.version('px4fuse')}"
-    student = document.student
-    families = fonts.families(
-        "".join((document.title, student.name, student.id, student.notes, document.command))
-    )
+        blocks = data([block for page in pages for block in page.blocks])
+    made_by, student = f"px4fuse {metadata.version('px4fuse')}", document.student
+    from_outside = document.title, student.name, student.id, student.notes, document.command
     return compiled(
         {
             "title": document.title,
             "author": made_by,
-            "head": _shortened(f"px4fuse · {name} · SHA-256 {sha256[:12]}", 90),
-            "student": _shortened(who(student, " · "), 40),
+            "head": _line("px4fuse · {} · SHA-256 {:.12}".format(*document.log), 90),
+            "student": _line(who(student, " · "), 40),
             "foot": made_by,
-            "fonts": families,
+            "fonts": fonts.families("".join(from_outside)),
             "blocks": blocks,
             "results": results_json,
         }
     )
 
 
-def _shortened(text: str, most: int) -> str:
+def _line(text: str, most: int) -> str:
     """One line of so many letters at most."""
     line = " ".join(printable(text).split())
     return line if len(line) <= most else f"{line[: most - 1]}…"

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
-from matplotlib.axes import Axes
-from matplotlib.ticker import MaxNLocator
 
 from px4fuse.arrays import Array
 from px4fuse.comparison.model import Comparison
@@ -19,9 +18,13 @@ from px4fuse.report.marks import LANDING, TAKE_OFF
 from px4fuse.report.page import WIDTH, Page, legend_above
 from px4fuse.report.style import EKF2_LINE, MEASURED, MUTED, OURS_LINE, TRUTH_LINE
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
 # A track so many times longer than wide lies along the page, else north is up
 LONG = 2.2
 TALLEST, LOWEST, BESIDE, WIDE = 120.0, 56.0, 150.0, 256.0  # points
+MOST_POINTS = 2000
 Pair = tuple[Array, Array]
 
 
@@ -38,7 +41,7 @@ class MapView:
         return c * north + s * east, s * north - c * east
 
 
-def plan(document: Document, facts: Sequence[tuple[str, str]]) -> Page:
+def plan(document: Document, facts: Mapping[str, str]) -> Page:
     """The map of a document's flight, with labelled sentences below or beside it.
 
     A long track lies along the page and takes its width, with the facts below it.
@@ -46,17 +49,16 @@ def plan(document: Document, facts: Sequence[tuple[str, str]]) -> Page:
     Parameters
     ----------
     document : Document
-    facts : sequence of (str, str)
+    facts : mapping from labels to sentences
     """
-    tracks = _tracks(document.comparison)
-    view, ratio = _view(document.comparison, np.column_stack(tracks["measurement"]))
+    tracks = _tracks(document.analysis)
+    view, ratio = _view(document.analysis, np.column_stack(tracks["measurement"]))
     page = Page()
-    page.heading("From above", 10.5)
     drawn = page if ratio >= LONG else Page(width=WIDE)
     height = _height(view, tracks) if ratio >= LONG else BESIDE
-    _map(drawn.panel("", "", height, above=16.0, left=36.0), document, view, tracks)
+    _map(drawn.panel("From above", "", height, above=16.0, left=36.0), document, view, tracks)
     beside = page if ratio >= LONG else Page(width=WIDTH - WIDE - 14.0)
-    for label, text in facts:
+    for label, text in facts.items():
         beside.labelled(label, text, size=7.0, above=-0.5)
     if drawn is not page:
         page.beside(drawn, beside)
@@ -81,18 +83,13 @@ def _tracks(comparison: Comparison) -> dict[str, Pair]:
     tracks = {"measurement": cut(comparison.source.samples)}
     if isinstance(flight.truth, Truth):
         tracks["truth"] = cut(flight.truth.samples)
-    both = {result.axis.name: result for result in comparison.axes.values()}
-    if {"north", "east"} <= both.keys():
-        north, east = both["north"], both["east"]
-        if isinstance(north.ekf2_state, pd.DataFrame) and isinstance(east.ekf2_state, pd.DataFrame):
-            tracks["EKF2"] = (
-                north.ekf2_state["position_m"].to_numpy(),
-                east.ekf2_state["position_m"].to_numpy(),
-            )
-        tracks["ours"] = (
-            north.replay.steps["position_m"].to_numpy(),
-            east.replay.steps["position_m"].to_numpy(),
-        )
+    if {"north", "east"} <= comparison.axes.keys():
+        both = [comparison.axes[name] for name in ("north", "east")]
+        theirs, ours = [one.ekf2_state for one in both], [one.replay.steps for one in both]
+        for name, frames in (("EKF2", theirs), ("ours", ours)):
+            known = [f["position_m"].to_numpy() for f in frames if isinstance(f, pd.DataFrame)]
+            if len(known) == len(both):
+                tracks[name] = known[0], known[1]
     elif isinstance(flight.ekf2, Ekf2):
         tracks["EKF2"] = cut(flight.ekf2.state)
     return tracks
@@ -122,8 +119,10 @@ def _map(axes: Axes, document: Document, view: MapView, tracks: Mapping[str, Pai
     axes.plot(*view(*tracks["measurement"]), **{**MEASURED, "ms": 3.0}, label="measurement")
     for name, style in (("EKF2", EKF2_LINE), ("ours", OURS_LINE), ("truth", TRUTH_LINE)):
         if name in tracks:
-            axes.plot(*_thinned(view(*tracks[name])), **style, label=name)
-    samples = document.comparison.source.samples
+            north, east = tracks[name]
+            every = max(1, len(north) // MOST_POINTS)
+            axes.plot(*view(north[::every], east[::every]), **style, label=name)
+    samples = document.analysis.source.samples
     for times, style, label in (
         (document.events.take_off_s, TAKE_OFF, "take-off"),
         (document.events.landing_s, LANDING, "landing"),
@@ -133,20 +132,11 @@ def _map(axes: Axes, document: Document, view: MapView, tracks: Mapping[str, Pai
             x, y = view(samples["north_m"].to_numpy()[near], samples["east_m"].to_numpy()[near])
             axes.plot(x, y, **{**style, "ms": 7.0, "mec": "white", "mew": 0.6}, label=label)
     axes.set_aspect("equal", adjustable="datalim", anchor="W")
-    axes.xaxis.set_major_locator(MaxNLocator(8))
-    axes.yaxis.set_major_locator(MaxNLocator(4))
     axes.grid(visible=True, axis="both")
-    axes.set_xlabel(view.labels[0])
-    axes.set_ylabel(view.labels[1])
+    axes.set(xlabel=view.labels[0], ylabel=view.labels[1])
     if view.heading != np.pi / 2.0:
         _north(axes, view)
     legend_above(axes, handlelength=1.8)
-
-
-def _thinned(track: Pair, most: int = 2000) -> Pair:
-    """Every so many points of a path."""
-    every = max(1, len(track[0]) // most)
-    return track[0][::every], track[1][::every]
 
 
 def _north(axes: Axes, view: MapView) -> None:

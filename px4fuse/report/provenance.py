@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 from px4fuse.report import clock, fonts
 from px4fuse.report.document import Document, LoopDocument
@@ -44,19 +44,22 @@ LOOP_METHOD = (
     "alignment by Umeyama 1991, or about the vertical where both know gravity (Zhang and "
     "Scaramuzza 2018); 95 % intervals by block bootstrap.",
 )
-Section = tuple[str, list[tuple[str, str]]]
+# Labels and sentences below a heading
+Sections = dict[str, list[tuple[str, str]]]
 
 
 def draw(document: Document) -> Iterator[Page]:
     """Draw one page or more."""
-    comparison = document.comparison
-    flight, source = comparison.flight, comparison.source
-    log = flight.log
-    sections: list[Section] = [
-        _made_with(document),
-        (
-            "The log",
-            [
+    analysis, flight, source = document.analysis, document.analysis.flight, document.analysis.source
+    log, placed = flight.log, document.analysis.source.alignment
+    others = (f"{t.name} ({t.rate_hz:.1f} Hz)" for t in flight.positions if t is not source)
+    parameters = ", ".join(f"{name} {value:g}" for name, value in log.parameters.items())
+    missing = [(p.source or p.what, f"{p.reason}. {p.remedy}") for p in analysis.missing]
+    yield from _layout(
+        "Appendix: provenance",
+        document,
+        {
+            "The log": [
                 ("file", f"{log.name}, {log.bytes} bytes, {log.format}"),
                 ("SHA-256", log.sha256),
                 *(
@@ -68,42 +71,19 @@ def draw(document: Document) -> Iterator[Page]:
                 (
                     "position source",
                     f"{source.name} ({source.origin.kind}, {source.origin.passage}) from "
-                    f"{', '.join(source.topics)}; "
-                    f"clock: {source.clock}",
+                    f"{', '.join(source.topics)}; clock: {source.clock}",
                 ),
-                (
-                    "also in the log",
-                    ", ".join(
-                        f"{t.name} ({t.rate_hz:.1f} Hz)"
-                        for t in flight.positions
-                        if t is not source
-                    )
-                    or "no other position",
-                ),
-                (
-                    "parameters",
-                    ", ".join(f"{k} {v:g}" for k, v in log.parameters.items()) or "none",
-                ),
+                ("also in the log", ", ".join(others) or "no other position"),
+                ("parameters", parameters or "none"),
             ],
-        ),
-        ("Clocks, to the autopilot's boot clock", [("", clock_words(c)) for c in flight.clocks]),
-        (f"Stamps of {source.name}, by the IMU", [("", clock.line(document))]),
-        (
-            f"Placement of {source.name}",
-            [] if source.alignment is None else alignment_words(source.alignment),
-        ),
-        ("Choices made on the way", [("", note) for note in comparison.notes] or [("", "none")]),
-        (
-            "Looked for and not found",
-            [
-                (part.source or part.what, f"{part.reason}. {part.remedy}")
-                for part in comparison.missing
-            ]
-            or [("", "nothing is missing")],
-        ),
-        ("How the numbers are made", [("", text) for text in METHOD]),
-    ]
-    yield from _layout("Appendix: provenance", sections)
+            "Clocks, to the autopilot's boot clock": _plain(map(clock_words, flight.clocks)),
+            f"Stamps of {source.name}, by the IMU": _plain([clock.line(document)]),
+            f"Placement of {source.name}": [*alignment_words(placed).items()] if placed else [],
+            "Choices made on the way": _plain(analysis.notes or ["none"]),
+            "Looked for and not found": missing or _plain(["nothing is missing"]),
+            "How the numbers are made": _plain(METHOD),
+        },
+    )
 
 
 def draw_loop(document: LoopDocument) -> Iterator[Page]:
@@ -111,62 +91,50 @@ def draw_loop(document: LoopDocument) -> Iterator[Page]:
     loop = document.loop
     files = [("track", loop.odometry.trajectory)]
     files += [("reference", reference) for reference in loop.references]
+    read = [
+        (label, f"{track.name}, {track.size_bytes} bytes, SHA-256 {track.sha256}. "
+         f"{' '.join(track.notes)}")
+        for label, track in files
+    ]  # fmt: skip
     yield from _layout(
         "Provenance",
-        [
-            _made_with(document),
-            (
-                "The files",
-                [
-                    (
-                        label,
-                        f"{track.name}, {track.size_bytes} bytes, SHA-256 {track.sha256}. "
-                        f"{' '.join(track.notes)}",
-                    )
-                    for label, track in files
-                ],
-            ),
-            ("Choices made on the way", [("", note) for note in loop.notes] or [("", "none")]),
-            ("How the numbers are made", [("", text) for text in LOOP_METHOD]),
-        ],
+        document,
+        {
+            "The files": read,
+            "Choices made on the way": _plain(loop.notes or ["none"]),
+            "How the numbers are made": _plain(LOOP_METHOD),
+        },
     )
 
 
-def _made_with(document: Document | LoopDocument) -> Section:
+def _plain(texts: Iterable[str]) -> list[tuple[str, str]]:
+    """Sentences without a label."""
+    return [("", text) for text in texts]
+
+
+def _layout(heading: str, document: Document | LoopDocument, sections: Sections) -> Iterator[Page]:
+    """Write what the report was made with, and then all else, in small letters."""
+    page, student = Page(heading), document.student
     made = provenance(document.command) if document.made is None else document.made
-    return (
-        "Made with",
-        [
-            ("command", made.command),
-            ("px4fuse", f"{made.px4fuse} on Python {made.python}"),
-            ("libraries", ", ".join(f"{k} {v}" for k, v in made.libraries.items())),
-            ("results", "attached inside this PDF as results.json"),
-            *_fonts(document),
-        ],
-    )
-
-
-def _layout(heading: str, sections: list[Section]) -> Iterator[Page]:
-    page = Page(heading)
-    for title, entries in sections:
+    made_with = [
+        ("command", made.command),
+        ("px4fuse", f"{made.px4fuse} on Python {made.python}"),
+        ("libraries", ", ".join(f"{name} {of}" for name, of in made.libraries.items())),
+        ("results", "attached inside this PDF as results.json"),
+    ]
+    if fonts.missing(student.name + student.id + student.notes):
+        text = (
+            f"{fonts.NO_GLYPH} stands for characters that no font on this machine has; "
+            "results.json holds the text as given"
+        )
+        made_with.append(("fonts", text))
+    for title, entries in {"Made with": made_with, **sections}.items():
         if entries:
             page.heading(title, 9.5, above=9.0)
         for label, text in entries:
             if label:
-                page.labelled(
-                    label, text, size=SIZE, width=INDENT, above=-1.0, colour=MUTED, bold=False
-                )
+                page.labelled(label, text, size=SIZE, width=INDENT, above=-1.0, colour=MUTED,
+                              bold=False)  # fmt: skip
             else:
-                page.write(text, size=SIZE, above=0.0)
+                page.write(text, size=SIZE)
     yield page
-
-
-def _fonts(document: Document | LoopDocument) -> list[tuple[str, str]]:
-    student = document.student
-    if not fonts.missing(student.name + student.id + student.notes):
-        return []
-    text = (
-        f"{fonts.NO_GLYPH} stands for characters that no font on this machine has; results.json "
-        "holds the text as given"
-    )
-    return [("fonts", text)]

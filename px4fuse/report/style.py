@@ -9,13 +9,16 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import matplotlib as mpl
 import numpy as np
-from matplotlib.axes import Axes
 
 from px4fuse.arrays import Array
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.axes import Axes
+    from matplotlib.axis import Axis
 
 FONT = "DejaVu Sans"
 TIME_LABEL = "time since first data (s)"
@@ -27,7 +30,7 @@ EKF2_BAND = "#f6c99f"
 TRUTH = "#111111"
 MEASUREMENT = "#9a9a9a"
 MUTED = "#555555"
-RULE = "#bbbbbb"
+GOOD = "#1f6b3a"
 SEVERITY_COLOURS = {"error": "#a61b1b", "warning": "#8a5a00", "info": "#33556b"}
 
 OURS_LINE: dict[str, Any] = {"color": OURS, "lw": 1.0, "ls": "-"}
@@ -52,6 +55,8 @@ MAX_POINTS_NARROW = 500
 @contextmanager
 def report_style() -> Iterator[None]:
     """Matplotlib settings of the panels, for the duration of a block."""
+    import matplotlib as mpl  # noqa: PLC0415 - not where words alone are shown
+
     with mpl.rc_context(
         {
             "font.family": [FONT],
@@ -65,7 +70,6 @@ def report_style() -> Iterator[None]:
             "axes.linewidth": 0.6,
             "axes.spines.top": False,
             "axes.spines.right": False,
-            "axes.unicode_minus": True,
             "axes.grid": True,
             "axes.grid.axis": "y",
             "grid.color": "#e3e3e3",
@@ -83,11 +87,34 @@ def report_style() -> Iterator[None]:
             "text.parse_math": False,
             "svg.fonttype": "none",  # text stays text: it can be selected and searched
             "svg.hashsalt": "px4fuse",  # the same bytes each time
-            "path.simplify": True,
             "path.simplify_threshold": 0.5,
         }
     ):
         yield
+
+
+def curve(axes: Axes, values: pd.Series[float], limit: int = MAX_POINTS, **style: Any) -> None:
+    """Draw a series over its index, thinned."""
+    axes.plot(*thin(values.index.to_numpy(), values.to_numpy(), limit), **style)
+
+
+def log_ticks(axes: Axes) -> None:
+    """Log scale of y with some room, and with plain numbers."""
+    axes.set_yscale("log")
+    low, high = axes.get_ylim()
+    axes.set_ylim(low / 1.15, high * 1.25)
+    plain_ticks(axes.yaxis)
+
+
+def plain_ticks(axis: Axis) -> None:
+    """Plain numbers on a log axis, at 1, 2 and 5 in each decade; of many decades at 1."""
+    from matplotlib.ticker import LogLocator, NullLocator  # noqa: PLC0415
+
+    low, high = axis.get_view_interval()
+    subs = (1.0, 2.0, 5.0) if high / low < 30.0 else (1.0, 3.0) if high / low < 300.0 else (1.0,)
+    axis.set_major_locator(LogLocator(base=10.0, subs=subs))
+    axis.set_major_formatter(lambda value, _: f"{value:g}")
+    axis.set_minor_locator(NullLocator())
 
 
 def bare_x(axes: Axes) -> None:
