@@ -21,16 +21,19 @@ from test_evaluation import PUBLISHED, flight, moved, published
 
 from px4fuse.loop.sources import read_source
 from px4fuse.report.document import EvaluationDocument
-from px4fuse.report.evaluation import colours, draw, picture, views
-from px4fuse.report.evaluation_words import (
+from px4fuse.report.evaluation import (
     after_words,
     before_words,
+    colours,
     distance_words,
+    draw,
     growth_words,
+    picture,
     quarters,
     score_rows,
     summary,
     time_words,
+    views,
 )
 from px4fuse.report.page import Page
 from px4fuse.report.pdf import render

@@ -139,7 +139,7 @@ def test_loop_writes_report_results_path_and_graph(made) -> None:
     assert "1.42 m" in result.output
     assert "REJECTED" in result.output  # 10,60 is no closure
     for name in (PLAIN, BY_DISTANCE):  # with the score of each against the truth and against SLAM
-        row = rf"^{name} .* 0\.[23]\d+ \(.* 0\.[23]\d+ \("
+        row = rf"^{name} +\d\S* / \S+ +0\.[23]\d+ .* 0\.[23]\d+"
         assert len(re.findall(row, result.output, re.MULTILINE)) == 1
     assert "Example 2" in result.output
     for name in ("r.g2o", "r.json", "r.pdf", "r.tum"):

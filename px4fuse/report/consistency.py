@@ -16,15 +16,7 @@ from px4fuse.plain import capital, number_words, p_words
 from px4fuse.report import marks
 from px4fuse.report.document import Document
 from px4fuse.report.page import Page, halves, legend_above
-from px4fuse.report.style import (
-    EKF2_DOTS,
-    EKF2_LINE,
-    OURS_BAND,
-    OURS_DOTS,
-    OURS_LINE,
-    TIME_LABEL,
-    curve,
-)
+from px4fuse.report.style import DOTS, LINES, OURS_BAND, TIME_LABEL, curve
 from px4fuse.report.words import VERDICT_HEAD, filters, verdict_rows, verdict_words
 
 if TYPE_CHECKING:
@@ -48,7 +40,6 @@ class Series(NamedTuple):
     name: str
     values: pd.Series[float]
     line: dict[str, Any]
-    dots: dict[str, Any]
     statement: Consistency
 
 
@@ -89,18 +80,15 @@ def draw(document: Document) -> Iterator[Page]:
 
 def _series(result: AxisComparison) -> list[Series]:
     """Of each filter that has enough innovations."""
-    looks = {
-        "ours": (result.replay.updates, OURS_LINE, OURS_DOTS | {"ms": 3.0}),
-        "EKF2": (result.ekf2_innovations, EKF2_LINE, EKF2_DOTS | {"ms": 3.0, "mfc": "white"}),
-    }
+    frames = {"ours": result.replay.updates, "EKF2": result.ekf2_innovations}
     series = []
     for name, one in filters(result).items():
-        frame, line, dots = looks[name]
+        frame = frames[name]
         if isinstance(frame, pd.DataFrame) and isinstance(one, Consistency):
             values = frame["innovation_m"] / np.sqrt(frame["innovation_variance_m2"])
             known = values[np.isfinite(values)]
             if len(known) >= MIN_INNOVATIONS:
-                series.append(Series(name, known, line, dots, one))
+                series.append(Series(name, known, LINES[name], one))
     return series
 
 
@@ -156,7 +144,8 @@ def _autocorrelation(axes: Axes, series: list[Series]) -> None:
         r = autocorrelation(one.values.to_numpy(), lags)
         at = np.arange(1, lags + 1) + shift
         axes.vlines(at, 0.0, r, color=one.line["color"], lw=1.2)
-        axes.plot(at, r, **one.dots | {"mew": 0.6}, label=one.name)
+        filled = {"mfc": one.line["color"] if one.name == "ours" else "white"}
+        axes.plot(at, r, **DOTS[one.name] | filled | {"ms": 3.0, "mew": 0.6}, label=one.name)
         bound = _bound(one)
         if one.name == "ours":
             axes.axhspan(-bound, bound, color=OURS_BAND, lw=0, zorder=0.5, label="95 % of white")

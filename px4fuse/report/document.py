@@ -69,16 +69,6 @@ class Document:
         """What is marked on every time axis."""
         return happened(self.analysis)
 
-    @property
-    def log(self) -> tuple[str, str]:
-        """Name and SHA-256 of the log."""
-        return self.analysis.flight.log.name, self.analysis.flight.log.sha256
-
-    @property
-    def title(self) -> str:
-        """Of the PDF."""
-        return f"px4fuse compare {self.log[0]}"
-
 
 @dataclass(frozen=True)
 class WhatIfDocument:
@@ -95,16 +85,6 @@ class WhatIfDocument:
     command: str
     student: ClassVar[Student] = NOBODY
 
-    @property
-    def log(self) -> tuple[str, str]:
-        """Name and SHA-256 of the log."""
-        return self.made_of.flight.log.name, self.made_of.flight.log.sha256
-
-    @property
-    def title(self) -> str:
-        """Of the PDF."""
-        return f"px4fuse whatif {self.log[0]}"
-
 
 @dataclass(frozen=True)
 class EvaluationDocument:
@@ -118,16 +98,6 @@ class EvaluationDocument:
     score: Evaluation
     command: ClassVar[str] = ""
     student: ClassVar[Student] = NOBODY
-
-    @property
-    def log(self) -> tuple[str, str]:
-        """Name and SHA-256 of what the estimate was read from."""
-        return self.score.estimate.name, self.score.estimate.sha256
-
-    @property
-    def title(self) -> str:
-        """Of the PDF."""
-        return f"px4fuse evaluate {self.log[0]} {self.score.reference.name}"
 
 
 @dataclass(frozen=True)
@@ -151,17 +121,6 @@ class ChangesDocument:
         """The command line that makes it again, without folders."""
         return self.results.provenance.command
 
-    @property
-    def log(self) -> tuple[str, str]:
-        """Names of both logs with the SHA-256 of A, and the SHA-256 of B."""
-        a, b = self.results.a, self.results.b
-        return f"A {a.log}, SHA-256 {a.log_sha256[:12]} · B {b.log}", b.log_sha256
-
-    @property
-    def title(self) -> str:
-        """Of the PDF."""
-        return f"px4fuse diff {self.results.a.given} {self.results.b.given}"
-
 
 @dataclass(frozen=True)
 class LoopDocument:
@@ -183,14 +142,3 @@ class LoopDocument:
     student: Student
     command: str
     made: Provenance | None = None
-
-    @property
-    def log(self) -> tuple[str, str]:
-        """Name and SHA-256 of what the trajectory was read from."""
-        track = self.loop.odometry.trajectory
-        return track.name, track.sha256
-
-    @property
-    def title(self) -> str:
-        """Of the PDF."""
-        return f"px4fuse loop {self.log[0]}"

@@ -6,39 +6,23 @@ import io
 from collections.abc import Iterator, Mapping
 from functools import cache
 from importlib import metadata
+from itertools import pairwise
 from textwrap import fill
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from rich.console import Console
 
 from px4fuse.arrays import Array, IntArray
 from px4fuse.flight import Unavailable
+from px4fuse.loop.analysis import SMALLEST_STAMP_S
+from px4fuse.report import style
 from px4fuse.report.document import EvaluationDocument
-from px4fuse.report.evaluation_words import (
-    after_words,
-    before_words,
-    distance_words,
-    growth_words,
-    metres,
-    relative_words,
-    summary,
-    time_words,
-    write_evaluation,
-    zero_s,
-)
 from px4fuse.report.page import WIDTH, Page, halves, legend_above
-from px4fuse.report.style import (
-    EKF2,
-    MAX_POINTS_NARROW,
-    MUTED,
-    OURS,
-    TRUTH,
-    empty,
-    report_style,
-    thin,
-)
-from px4fuse.trajectory.evaluation import Evaluation
-from px4fuse.trajectory.model import AXES_OF_FRAME, MIN_POSES, Frame
+from px4fuse.report.screen import show
+from px4fuse.report.style import EKF2, MUTED, OURS, TRUTH, report_style
+from px4fuse.trajectory.evaluation import AbsoluteError, Evaluation
+from px4fuse.trajectory.model import AXES_OF_FRAME, Frame, Trajectory
 from px4fuse.trajectory.scores import Interval, PairwiseError, Statistics
 
 if TYPE_CHECKING:
@@ -47,12 +31,9 @@ if TYPE_CHECKING:
 
 # Indices of the axes that are right, up the page and vertical; and whether the last points down
 _AXES: Mapping[Frame, tuple[int, int, int, bool]] = {
-    "NED": (1, 0, 2, True),
-    "FRD": (1, 0, 2, True),
-    "ENU": (0, 1, 2, False),
-    "camera": (0, 2, 1, True),
-    "unknown": (0, 1, 2, False),
-}
+    "NED": (1, 0, 2, True), "FRD": (1, 0, 2, True), "ENU": (0, 1, 2, False),
+    "camera": (0, 2, 1, True), "unknown": (0, 1, 2, False),
+}  # fmt: skip
 # A path whose height is less than this share of its length is seen from above alone
 FLAT = 0.1
 # Steps of so many median ones are gaps: no line crosses them
@@ -78,6 +59,15 @@ CURVES: tuple[dict[str, Any], ...] = (
     {"color": OURS, "lw": 1.1},
 )
 PICTURE_INCHES, PICTURE_DPI, PICTURE_LETTERS = (10.0, 5.4), 150, 115
+# Above this share of the squared error the worst tenth of the poses is what there is to look at
+FEW_DECIDE = 0.5
+# Quarters of a path differ if one is so many times the other
+DIFFERS = 1.3
+# Rounding: no error to say anything about
+NEGLIGIBLE_M = 1e-6
+SCORE_HEAD = (
+    "error", "RMSE", "95 %", "mean", "median", "std", "max", "n", "rotation\nRMSE (°)",
+)  # fmt: skip
 
 
 @cache
@@ -101,23 +91,20 @@ class View(NamedTuple):
 
     def of(self, position_m: Array) -> Array:
         """Coordinates on the page, shape (n, 3) to (n, 2)."""
-        seen: Array = position_m[:, (self.across, self.up)]
-        return seen
+        return np.asarray(position_m[:, (self.across, self.up)])
 
 
 def views(score: Evaluation) -> list[View]:
     """From above; and from the side where the path is not flat."""
     across, up, vertical, down = _AXES[score.reference.frame]
-    names = AXES_OF_FRAME[score.reference.frame]
-    known = score.reference.frame != "unknown"
     extent = np.maximum(np.ptp(score.reference_m, axis=0), np.ptp(score.estimate_m, axis=0))
     level = across if extent[across] >= extent[up] else up
-    title = "from above" if known else f"{names[across]} and {names[up]}"
-    side = "from the side" if known else f"{names[level]} and {names[vertical]}"
-    seen = [View(title, across, up)]
-    if extent[vertical] > FLAT * extent[level]:
-        seen.append(View(side, level, vertical, down))
-    return seen
+    titles = ["from above", "from the side"]
+    if score.reference.frame == "unknown":
+        names = AXES_OF_FRAME["unknown"]
+        titles = [f"{names[across]} and {names[up]}", f"{names[level]} and {names[vertical]}"]
+    seen = [View(titles[0], across, up), View(titles[1], level, vertical, down)]
+    return seen if extent[vertical] > FLAT * extent[level] else seen[:1]
 
 
 def draw(document: EvaluationDocument) -> Iterator[Page]:
@@ -163,7 +150,7 @@ def _maps(page: Page, score: Evaluation) -> None:
     """The two as they stand, and the aligned path by its error, from one or two sides."""
     seen, is_aligned = views(score), score.alignment != "none"
     title = "After alignment, by error" if is_aligned else "By error"
-    parts = {f"{title}, {view.title}": _side_words(score, view) for view in seen}
+    parts = {f"{title}, {view.title}": side_words(score, view.up) for view in seen}
     parts[f"{title}, {seen[0].title}"] = after_words(score)
     if is_aligned:
         parts = {"Before alignment": before_words(score), **parts}
@@ -189,26 +176,13 @@ def _maps(page: Page, score: Evaluation) -> None:
     page.beside(*columns, gap=GAP)
 
 
-def _side_words(score: Evaluation, side: View) -> str:
-    """How much of the squared error is vertical."""
-    squares = ((score.estimate_m - score.reference_m) ** 2).mean(axis=0)
-    total = float(squares.sum())
-    name = AXES_OF_FRAME[score.reference.frame][side.up]
-    if total == 0.0:
-        return f"There is no error along {name}."
-    return (
-        f"Along {name} the RMSE is {metres(float(np.sqrt(squares[side.up])))}: "
-        f"{squares[side.up] / total:.0%} of the squared error."
-    )
-
-
 def _before(axes: Axes, score: Evaluation, view: View) -> None:
     matched = score.association
-    for track, style, label in (
+    for track, looks, label in (
         (matched.reference, REFERENCE, "reference"),
         (matched.estimate, {"color": OURS, "lw": 1.2}, "estimate before alignment"),
     ):
-        way(axes, view.of(track.position_m), score.time_s, label=label, **style)
+        way(axes, view.of(track.position_m), score.time_s, label=label, **looks)
     _framed(axes, score, view)
 
 
@@ -274,9 +248,9 @@ def _panels(page: Page, score: Evaluation) -> None:
 def _absolute(axes: Axes, score: Evaluation, along: Array, label: str) -> None:
     """APE with its statistics as lines."""
     _line(axes, along, score.position_error_m, score.time_s, color=OURS, lw=0.8)
-    for name, title, style in STATISTICS:
+    for name, title, looks in STATISTICS:
         value = getattr(score.ate.translation_m, name)
-        axes.axhline(value, label=f"{title} {metres(value)}", zorder=3, **style)
+        axes.axhline(value, label=f"{title} {metres(value)}", zorder=3, **looks)
     _from_zero(axes, along, float(score.position_error_m.max()), label)
 
 
@@ -285,9 +259,9 @@ def _relative(axes: Axes, score: Evaluation, known: list[PairwiseError]) -> list
     unit = "m" if any(e.unit == "m" for e in known) else known[0].unit
     shown = [e for e in known if e.unit == unit][-MOST_CURVES:]
     zero = zero_s(score)
-    for error, style in zip(shown, CURVES[-len(shown) :], strict=True):
+    for error, looks in zip(shown, CURVES[-len(shown) :], strict=True):
         ends = score.time_s[error.end]
-        _line(axes, ends - zero, error.translation_error_m, ends, label=error.delta_words, **style)
+        _line(axes, ends - zero, error.translation_error_m, ends, label=error.delta_words, **looks)
     highest = max(float(error.translation_error_m.max()) for error in shown)
     _from_zero(axes, score.time_s - zero, highest, _time_label(score))
     legend_above(axes, handlelength=1.8)
@@ -319,10 +293,9 @@ def _boxes(axes: Axes, score: Evaluation) -> None:
 
 
 def _none(axes: Axes, score: Evaluation) -> None:
-    reason = next((e.translation_m.reason for e in score.rpe
-                   if isinstance(e.translation_m, Unavailable)),
-                  "the path is too short for a delta")  # fmt: skip
-    empty(axes, f"No RPE: {reason}.")
+    missing = [e.translation_m for e in score.rpe if isinstance(e.translation_m, Unavailable)]
+    reason = missing[0].reason if missing else "the path is too short for a delta"
+    style.empty(axes, f"No RPE: {reason}.")
 
 
 def _time_label(score: Evaluation) -> str:
@@ -339,19 +312,16 @@ def _from_zero(axes: Axes, along: Array, highest: float, label: str) -> None:
 
 def _gaps(time_s: Array, least_s: float = 0.0) -> IntArray:
     """Indices of the poses after a gap in time."""
-    if len(time_s) < MIN_POSES:
-        return np.empty(0, dtype=np.intp)
     steps = np.diff(time_s)
-    found: IntArray = np.flatnonzero(steps > max(GAP_STEPS * np.median(steps), least_s)) + 1
-    return found
+    longest = max(GAP_STEPS * float(np.median(steps)), least_s) if len(steps) else least_s
+    return np.asarray(np.flatnonzero(steps > longest) + 1)
 
 
-def _line(axes: Axes, x: Array, y: Array, time_s: Array, **style: Any) -> None:
+def _line(axes: Axes, x: Array, y: Array, time_s: Array, **looks: Any) -> None:
     """A line over time or distance, thinned to its extremes; no gap that shows is crossed."""
-    gaps = _gaps(time_s, GAP_SHARE * float(time_s[-1] - time_s[0]))
-    kept, values = thin(x, y, MAX_POINTS_NARROW)
-    after = np.searchsorted(kept, x[gaps])
-    axes.plot(np.insert(kept, after, np.nan), np.insert(values, after, np.nan), **style)
+    kept, values = style.thin(x, y, style.MAX_POINTS_NARROW)
+    after = np.searchsorted(kept, x[_gaps(time_s, GAP_SHARE * float(time_s[-1] - time_s[0]))])
+    axes.plot(np.insert(kept, after, np.nan), np.insert(values, after, np.nan), **looks)
 
 
 def way(axes: Axes, seen: Array, time_s: Array, **style: Any) -> None:
@@ -360,3 +330,210 @@ def way(axes: Axes, seen: Array, time_s: Array, **style: Any) -> None:
     even = np.linspace(0, len(seen) - 1, min(len(seen), PIECES)).astype(np.intp)
     kept = np.unique(np.concatenate([even, gaps]))
     axes.plot(*np.insert(seen[kept], np.searchsorted(kept, gaps), np.nan, axis=0).T, **style)
+
+
+# ---------------------------------------------------------------------------------------- words
+
+
+def print_evaluation(console: Console, score: Evaluation) -> None:
+    """Print the scores of one trajectory against another."""
+    page = Page()
+    write_evaluation(page, score)
+    show(console, page.blocks)
+
+
+def metres(value: float) -> str:
+    """A length with the digits that matter.
+
+    >>> metres(0.0512), metres(31.26)
+    ('0.051 m', '31.3 m')
+    """
+    return f"{value:.3f} m" if abs(value) < 10.0 else f"{value:.1f} m"
+
+
+def zero_s(score: Evaluation) -> float:
+    """Where times on the page count from: the first pose where stamps are UNIX time, else zero."""
+    start = float(score.time_s[0])
+    return start if start > SMALLEST_STAMP_S else 0.0
+
+
+def summary(score: Evaluation) -> str:
+    """The score in one sentence."""
+    worst = int(np.argmax(score.position_error_m))
+    return (
+        f"{score.estimate.name} is {metres(score.ate.translation_m.rmse)} (RMSE) from "
+        f"{score.reference.name} {_aligned(score)}; farthest, "
+        f"{metres(score.ate.translation_m.max)}, at {score.time_s[worst] - zero_s(score):.1f} s, "
+        f"{score.distance_m[worst]:.1f} m along."
+    )
+
+
+def _aligned(score: Evaluation) -> str:
+    return "without alignment" if score.alignment == "none" else "after alignment"
+
+
+def write_evaluation(page: Page, score: Evaluation) -> None:
+    """Write what was scored and how, and the statistics of all errors."""
+    page.labelled("Estimate", track_words(score.estimate))
+    page.labelled("Against", track_words(score.reference))
+    page.labelled("How", score_words(score))
+    for text in score.warnings:
+        page.write(text, bold=True, colour=style.SEVERITY_COLOURS["warning"])
+    page.table(SCORE_HEAD, score_rows(score), right=range(1, len(SCORE_HEAD)))
+    page.numbers(" ".join([*reasons(score), *score.notes]))
+
+
+def score_rows(score: Evaluation) -> list[list[str]]:
+    """Of the ATE and every RPE: what :data:`SCORE_HEAD` says."""
+    errors: dict[str, AbsoluteError | PairwiseError] = {"ATE (m)": score.ate}
+    errors |= {f"RPE {error.delta_words} (m)": error for error in score.rpe}
+    rows = []
+    for name, error in errors.items():
+        moved, turned = error.translation_m, error.rotation_deg
+        cells = ["–", *[""] * 6]
+        if isinstance(moved, Statistics):
+            numbers = (moved.mean, moved.median, moved.std, moved.max)
+            cells = [f"{moved.rmse:.4f}", interval_words(error.interval_m)]
+            cells += [*(f"{number:.4f}" for number in numbers), f"{moved.count}"]
+        rows.append([name, *cells, f"{turned.rmse:.2f}" if isinstance(turned, Statistics) else "–"])
+    return rows
+
+
+def reasons(score: Evaluation) -> list[str]:
+    """Why a number is missing, each reason once."""
+    parts = [score.ate.interval_m, score.ate.rotation_deg, *(e.translation_m for e in score.rpe)]
+    missing = [part for part in parts if isinstance(part, Unavailable)]
+    return list(dict.fromkeys(f"No {part.what}: {part.reason}." for part in missing))
+
+
+def before_words(score: Evaluation) -> str:
+    """How far the two are apart as their numbers stand, and what the alignment took away."""
+    x, y = score.association.estimate.position_m, score.association.reference.position_m
+    apart = float(np.sqrt(((x - y) ** 2).sum(axis=1).mean()))
+    fitted = score.transform
+    scaled = f", scaled {fitted.scale:.3g} times" if fitted.degrees_of_freedom == 7 else ""
+    moved = float(np.linalg.norm(fitted.apply(x.mean(axis=0)) - x.mean(axis=0)))
+    return (
+        f"As they stand {metres(apart)} apart (RMSE). Turned by "
+        f"{np.degrees(fitted.rotation.magnitude()):.1f}°, moved {metres(moved)}{scaled}: a choice "
+        "of frame, no error."
+    )
+
+
+def after_words(score: Evaluation) -> str:
+    """What the map shows."""
+    worst = int(np.argmax(score.position_error_m))
+    return (
+        f"{metres(score.ate.translation_m.rmse)} (RMSE) {_aligned(score)}. The darker the path, "
+        f"the larger its error; × is the largest, {metres(score.ate.translation_m.max)} at "
+        f"{score.time_s[worst] - zero_s(score):.1f} s."
+    )
+
+
+def side_words(score: Evaluation, axis: int) -> str:
+    """How much of the squared error is vertical."""
+    squares = ((score.estimate_m - score.reference_m) ** 2).mean(axis=0)
+    name = AXES_OF_FRAME[score.reference.frame][axis]
+    if not squares.any():
+        return f"There is no error along {name}."
+    return (
+        f"Along {name} the RMSE is {metres(float(np.sqrt(squares[axis])))}: "
+        f"{squares[axis] / squares.sum():.0%} of the squared error."
+    )
+
+
+def time_words(score: Evaluation) -> str:
+    """Whether a few moments decide."""
+    squares = np.sort(score.position_error_m**2)
+    total = float(squares.sum())
+    if score.ate.translation_m.rmse < NEGLIGIBLE_M:
+        return "There is no error at any time."
+    share = float(squares[-max(1, len(squares) // 10) :].sum()) / total
+    said = "it is spread over time, and no matter of a few moments"
+    if share > FEW_DECIDE:
+        said = "a few moments decide, look at these"
+    return f"The worst tenth of the poses makes {share:.0%} of the squared error: {said}."
+
+
+def quarters(score: Evaluation) -> list[float]:
+    """RMSE over each quarter of the reference's path (m); fewer where one has no pose."""
+    along = score.distance_m
+    edges = np.linspace(0.0, along[-1], 5)
+    parts = np.clip(np.searchsorted(edges, along, side="right") - 1, 0, 3)
+    errors = [score.position_error_m[parts == part] for part in range(4)]
+    return [float(np.sqrt(np.mean(e**2))) for e in errors if len(e)]
+
+
+def distance_words(score: Evaluation) -> str:
+    """Whether the error grows along the path."""
+    found = quarters(score)
+    said = f"RMSE by quarters of the path {', '.join(f'{q:.3f}' for q in found)} m: "
+    if len(found) < 4:
+        return f"{said}the poses do not cover all of it."
+    if score.ate.translation_m.rmse < NEGLIGIBLE_M:
+        return f"{said}there is no error."
+    first, *middle, last = found
+    if min(first, last) > DIFFERS * max(middle):
+        return f"{said}high at both ends, as drift looks after an alignment."
+    if all(a <= b for a, b in pairwise(found)) and last > DIFFERS * first:
+        return f"{said}it grows along the path, as drift does."
+    where = ("first", "second", "third", "last")[int(np.argmax(found))]
+    return f"{said}largest in the {where}, no steady growth as a drift from the start has."
+
+
+def relative_words(shown: list[PairwiseError], times: Array, zero: float) -> str:
+    """Where the motion itself is worst."""
+    last = shown[-1]
+    worst = int(np.argmax(last.translation_error_m))
+    return (
+        "What a motion over the delta is wrong by, wherever the path was before, drawn at its end: "
+        f"a peak is where it went wrong. Largest over {last.delta}: "
+        f"{metres(float(last.translation_error_m[worst]))}, from "
+        f"{times[last.start[worst]] - zero:.1f} to {times[last.end[worst]] - zero:.1f} s."
+    )
+
+
+def growth_words(rpe: tuple[PairwiseError, ...]) -> str:
+    """How the RPE grows with its delta, which tells noise from drift."""
+    boxes = "Box: middle half; whiskers: all; diamond: RMSE with its 95 % interval."
+    by_unit: dict[str, list[tuple[float, float]]] = {}
+    for error in rpe:
+        if isinstance(error.translation_m, Statistics) and error.translation_m.rmse > NEGLIGIBLE_M:
+            by_unit.setdefault(error.unit, []).append((error.delta, error.translation_m.rmse))
+    several = max(by_unit.values(), key=len, default=[])
+    (low, small), (high, large) = min(several, default=(0, 0)), max(several, default=(0, 0))
+    if not low < high:
+        return f"{boxes} A second distance would tell noise from drift."
+    ratio = high / low
+    unit = next(unit for unit, found in by_unit.items() if found is several)
+    return (
+        f"{boxes} From {low:g} to {high:g} {unit}, {ratio:.3g} times, the RMSE is "
+        f"{large / small:.2g} times as large: 1 is noise of each pose, {np.sqrt(ratio):.2g} a "
+        f"random walk, {ratio:.3g} a wrong scale or heading."
+    )
+
+
+def interval_words(interval: Interval | Unavailable) -> str:
+    """An interval; nothing where there is none."""
+    return f"{interval.low:.3f}–{interval.high:.3f}" if isinstance(interval, Interval) else ""
+
+
+def track_words(path: Trajectory) -> str:
+    """A trajectory by its name, what it is, its length in time and its frame."""
+    return (
+        f"{path.name}: {path.kind}, {len(path)} poses over "
+        f"{path.time_s[-1] - path.time_s[0]:.1f} s, frame {path.frame}"
+    )
+
+
+def score_words(score: Evaluation) -> str:
+    """How a score was made, in one sentence."""
+    matched = score.association
+    offset = score.time_offset.offset_s
+    clock = "" if not offset else f"; clocks matched by {offset:+.3f} s"
+    return (
+        f"alignment {score.alignment} ({score.alignment_reason.rstrip('.')}); "
+        f"{len(matched)} poses, "
+        f"{matched.coverage_estimate:.0%} of the estimate, {matched.coverage_reference:.0%} of the "
+        f"reference's time{clock}"
+    )

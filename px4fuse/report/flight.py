@@ -13,7 +13,7 @@ from px4fuse.flight import Unavailable
 from px4fuse.report import marks, panels
 from px4fuse.report.document import Document
 from px4fuse.report.page import WIDTH, Page
-from px4fuse.report.style import EKF2_LINE, MEASURED, OURS_BAND, OURS_LINE, TRUTH_LINE
+from px4fuse.report.style import LINES, MEASURED, OURS_BAND
 from px4fuse.report.why import nothing_concluded
 from px4fuse.report.words import filters, verdict_words
 
@@ -48,13 +48,12 @@ def _legend(page: Page, document: Document) -> None:
     result = document.analysis.main
     lines: list[Artist] = [
         Line2D([], [], **{**MEASURED, "ms": 5.0}, label="measurement"),
-        Line2D([], [], **OURS_LINE, label="ours"),
+        Line2D([], [], **LINES["ours"], label="ours"),
         Patch(facecolor=OURS_BAND, lw=0, label="ours ±2σ"),
     ]
-    if isinstance(result.ekf2_state, pd.DataFrame):
-        lines.append(Line2D([], [], **EKF2_LINE, label="EKF2"))
-    if isinstance(result.truth, pd.DataFrame):
-        lines.append(Line2D([], [], **TRUTH_LINE, label="truth"))
+    for name, frame in (("EKF2", result.ekf2_state), ("truth", result.truth)):
+        if isinstance(frame, pd.DataFrame):
+            lines.append(Line2D([], [], **LINES[name], label=name))
     page.legend(lines, marks.handles(document))
 
 

@@ -6,25 +6,40 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pandas as pd
+from rich.console import Console
 
 from px4fuse.arrays import Array
+from px4fuse.filter.signals import Segment
 from px4fuse.findings import Finding
 from px4fuse.flight import Unavailable
-from px4fuse.loop.corrections import BY_DISTANCE, PLAIN, UNCORRECTED, Correction
+from px4fuse.loop.analysis import SMALLEST_STAMP_S
+from px4fuse.loop.corrections import (
+    BY_DISTANCE,
+    PLAIN,
+    SINGLE_LOOP,
+    UNCORRECTED,
+    Correction,
+    Judged,
+)
 from px4fuse.loop.loop import Loop
-from px4fuse.plain import capital
+from px4fuse.plain import capital, p_words
+from px4fuse.report.cover import write_finding
 from px4fuse.report.document import Document, LoopDocument, who
-from px4fuse.report.evaluation import way
-from px4fuse.report.loop_words import write_loop, write_scores
-from px4fuse.report.page import AXIS_LABEL, TICKS, Page, appendix, legend_above
-from px4fuse.report.style import EKF2, OURS, SEVERITY_COLOURS, TRUTH_LINE, bare_x, thin
+from px4fuse.report.evaluation import interval_words, score_words, way
+from px4fuse.report.page import AXIS_LABEL, TICKS, Cell, Page, appendix, legend_above
+from px4fuse.report.screen import show
+from px4fuse.report.style import EKF2, MUTED, OURS, SEVERITY_COLOURS, TRUTH_LINE, bare_x, curve
+from px4fuse.request import LoopRequest
 from px4fuse.trajectory.evaluation import Evaluation
-from px4fuse.trajectory.graph.analysis import SOLUTIONS
+from px4fuse.trajectory.graph.analysis import GATE_ALPHA, MANY_CLOSURES, SOLUTIONS, SolvedGraph
 from px4fuse.trajectory.model import AXES_OF_FRAME
+from px4fuse.trajectory.scores import Interval, Statistics
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+MOST_ROWS = 10  # of rejected closures
 GREEN, RED = "#3a7d5c", SEVERITY_COLOURS["error"]
 STYLES: Mapping[str, dict[str, Any]] = {
     UNCORRECTED: {"color": EKF2, "lw": 1.1, "ls": (0, (4, 1.6))},
@@ -33,6 +48,17 @@ STYLES: Mapping[str, dict[str, Any]] = {
     SOLUTIONS["gated"]: {"color": OURS, "lw": 1.2, "ls": "-"},
     SOLUTIONS["all"]: {"color": "#8d6a9f", "lw": 0.9, "ls": (0, (2, 1))},
 }
+KINDS = {
+    "vio": "odometry (external vision)",
+    "ekf2": "EKF2's track",
+    "kf": "our filter's track",
+    "truth": "ground truth",
+    "slam": "a SLAM system's trajectory",
+    "unknown": "a trajectory",
+}
+CLOSURE_HEAD = (
+    "same place at", "missed\nby (m)", "d²", "dof", "p", "gate", "DCS\nweight", "GNC\nweight",
+)  # fmt: skip
 TITLE, LEAD = (
     "Loop closure",
     "A path that truly returns must close; the gap is what the odometry drifted. Each correction "
@@ -56,7 +82,7 @@ def draw_report(document: LoopDocument) -> Iterator[Page]:
     page = Page(TITLE, LEAD)
     if student := who(document.student, ", "):
         page.labelled("Student", student)
-    page.labelled("SHA-256", document.log[1])
+    page.labelled("SHA-256", document.loop.odometry.trajectory.sha256)
     yield from _draw(document.loop, page, str, document.findings)
 
 
@@ -157,7 +183,7 @@ def _along(page: Page, loop: Loop) -> None:
     for place, (title, curves) in enumerate(drawn.items(), start=1):
         axes = page.panel(title, "", HEIGHT, above=14.0 if title == height else 4.0)
         for name, (x, y, _) in curves.items():
-            axes.plot(*thin(x, y), label=name, **STYLES[name])
+            curve(axes, pd.Series(y, x), label=name, **STYLES[name])
         axes.set_xlim(0.0, loop.path_length_m)
         if place == len(drawn):
             axes.set_xlabel("distance along the path (m)")
@@ -171,3 +197,222 @@ def _along(page: Page, loop: Loop) -> None:
         if used:
             axes.set_ylim(0.0, 1.15 * max(*used, 1e-3))
         page.numbers("; ".join(f"{name}: {said}" for name, (*_, said) in curves.items()))
+
+
+# ---------------------------------------------------------------------------------------- words
+
+
+def print_loop(
+    console: Console, loop: Loop, findings: tuple[Finding, ...], request: LoopRequest
+) -> None:
+    """Print what was found about a loop."""
+    page = Page()
+    write_loop(page, loop)
+    write_scores(page, loop)
+    for finding in findings:
+        write_finding(page, finding)
+    show(console, page.blocks, request)
+
+
+def write_loop(page: Page, loop: Loop, findings: tuple[Finding, ...] = ()) -> None:
+    """Write what was found, with every path, how far it moved, and its ATE to each reference."""
+    path = loop.odometry.trajectory
+    page.labelled(
+        "Track",
+        f"{path.name}: {KINDS[path.kind]}, {len(path)} poses, {len(loop.nodes)} key frames "
+        f"{loop.spacing_m:.2g} m apart",
+    )
+    page.labelled("Part", f"{_span(loop.segment)}, {loop.segment.reason}")
+    page.labelled("Closure", closure_words(loop))
+    end = loop.known_end
+    page.labelled("End", "not used" if isinstance(end, Unavailable) else end.source)
+    for judged in loop.closures[:1]:
+        page.labelled("Gate", gate_words(judged))
+    for text in (by_distance_words(loop), *redundancy_words(loop), *refusals(loop)):
+        page.write(text, colour=MUTED, above=2.0)
+    for finding in findings:
+        write_finding(page, finding)
+    names = [reference.name for reference in loop.references]
+    page.table(
+        ["path", "moved RMS\n/ max (m)", *(f"ATE to\n{name} (m)" for name in names)],
+        [
+            [part.name, moved_words(part), *(_ate(part.scores[name]) for name in names)]
+            for part in loop.reported
+        ],
+    )
+    page.numbers(
+        "ATE is the RMSE of position after alignment, in brackets its 95 % interval by block "
+        "bootstrap where the flight is long enough for one."
+        if names
+        else "Neither ground truth nor a SLAM trajectory is given, so that no error of the path "
+        "can be stated; --reference FILE scores it."
+    )
+
+
+def write_scores(page: Page, loop: Loop) -> None:
+    """Write every closure with its gate and weights, RPE, and how scores were made."""
+    rows: list[list[Cell]] = []
+    for judged in loop.closures:
+        gate = judged.gate
+        cells = [
+            closure_name(judged, loop), f"{judged.distance_m:.2f}", f"{gate.d2:.1f}",
+            f"{gate.degrees_of_freedom}", p_words(gate.p).removeprefix("p "),
+            "accepted" if gate.accepted else "REJECTED",
+        ]  # fmt: skip
+        weights = (judged.weights.get(name) for name in ("dcs", "gnc"))
+        cells += ["–" if weight is None else f"{weight:.2f}" for weight in weights]
+        colour = "black" if gate.accepted else SEVERITY_COLOURS["error"]
+        rows.append([(cell, colour) for cell in cells])
+    if rows:
+        page.table(CLOSURE_HEAD, rows, right=(1, 2, 3, 4, 6, 7))
+    for reference in loop.references:
+        scores = {part.name: part.scores[reference.name] for part in loop.reported}
+        known = {name: score for name, score in scores.items() if isinstance(score, Evaluation)}
+        page.heading(f"RPE against {reference.name}", 10.5, above=14.0)
+        missing = (score.reason for score in scores.values() if isinstance(score, Unavailable))
+        for reason in dict.fromkeys(missing):
+            page.write(reason, size=7.5)
+        if not known:
+            continue
+        first = next(iter(known.values()))
+        head = ["path", *(f"{e.delta_words} (m)" for e in first.rpe), "rotation (°)"]
+        page.table(head, [
+            [name, *(_error(e.translation_m, e.interval_m) for e in score.rpe),
+             _rmse(score.ate.rotation_deg, 2)]
+            for name, score in known.items()
+        ])  # fmt: skip
+        for text in (score_words(first), *first.notes, *first.warnings):
+            page.numbers(capital(text))
+
+
+def _span(part: Segment) -> str:
+    if part.start_s > SMALLEST_STAMP_S:
+        return f"{part.end_s - part.start_s:.1f} s from stamp {part.start_s:.2f} s"
+    return f"{part.start_s:.1f} s to {part.end_s:.1f} s"
+
+
+def closure_words(loop: Loop) -> str:
+    """The closure error in m, in percent, per axis and in heading."""
+    error, misclosure = loop.closure_error_m, loop.misclosure_m
+    if error is None or isinstance(misclosure, Unavailable):
+        return f"path {loop.path_length_m:.1f} m; no closure error is stated: it did not come back"
+    named = zip(AXES_OF_FRAME[loop.odometry.trajectory.frame], misclosure, strict=True)
+    text = (
+        f"{error:.2f} m after {loop.path_length_m:.1f} m = {error / loop.path_length_m:.2%} "
+        f"({', '.join(f'{name} {part:+.2f} m' for name, part in named)})"
+    )
+    turned = loop.misclosure_heading_deg
+    if isinstance(turned, Unavailable):
+        return f"{text}; heading: not known, {turned.reason}"
+    return f"{text}; heading {turned:+.1f}°"
+
+
+def gate_words(judged: Judged) -> str:
+    """What the gate says about one closure."""
+    gate = judged.gate
+    verdict = (
+        "as the stated drift allows" if gate.accepted else "REJECTED: the drift cannot explain it"
+    )
+    return (
+        f"d² {gate.d2:.1f} with {gate.degrees_of_freedom} degrees of freedom, p {gate.p:.2g} "
+        f"(rejected below {GATE_ALPHA:g}): {verdict}"
+    )
+
+
+def closure_name(judged: Judged, loop: Loop) -> str:
+    """Which closure; long stamps count from the first pose."""
+    closure = judged.closure
+    if closure.source == "landing":
+        return "take-off and landing"
+    start = loop.segment.start_s
+    zero = start if start > SMALLEST_STAMP_S else 0.0
+    return f"{closure.time_1_s - zero:.2f} s and {closure.time_2_s - zero:.2f} s"
+
+
+def by_distance_words(loop: Loop) -> str:
+    """What the corrections by distance are; nothing where there is none."""
+    if isinstance(loop.plain, Unavailable):
+        return ""
+    example = (
+        "By distance, positions only, is the lesson's Example 2: each position moves by its share "
+        "of the gap, and the path keeps the bend of its headings."
+    )
+    turned = loop.misclosure_heading_deg
+    if isinstance(turned, Unavailable):
+        return f"{example} Headings are not turned: {turned.reason}."
+    return (
+        f"{example} Headings too: each step is first turned back by its share of the {turned:+.1f}°"
+        " that the heading is off at the end, and what is left of the gap is spread as before."
+    )
+
+
+def redundancy_words(loop: Loop) -> list[str]:
+    """That one loop has no redundancy, or nothing."""
+    return [SINGLE_LOOP] if len(loop.closures) == 1 else []
+
+
+def refusals(loop: Loop) -> list[str]:
+    """Why a correction is missing, each reason once."""
+    parts = (loop.by_distance, *loop.solved.values())
+    reasons = [f"{p.what}: {p.reason}" for p in parts if isinstance(p, Unavailable)]
+    return [r for r in dict.fromkeys(reasons) if SINGLE_LOOP not in r]
+
+
+def _ate(score: Evaluation | Unavailable) -> str:
+    if isinstance(score, Unavailable):
+        return "–"
+    return _error(score.ate.translation_m, score.ate.interval_m)
+
+
+def _error(moved: Statistics | Unavailable, interval: Interval | Unavailable) -> str:
+    """RMSE of an error, in brackets its interval where there is one."""
+    within = interval_words(interval)
+    return _rmse(moved) + (f" ({within})" if within else "")
+
+
+def _rmse(found: Statistics | Unavailable, digits: int = 3) -> str:
+    return f"{found.rmse:.{digits}f}" if isinstance(found, Statistics) else "–"
+
+
+def moved_words(correction: Correction) -> str:
+    """How far the poses moved."""
+    if not correction.moved_m.any():
+        return "–"
+    return f"{np.sqrt(np.mean(correction.moved_m**2)):.2f} / {correction.moved_m.max():.2f}"
+
+
+def print_graph(console: Console, name: str, solved: SolvedGraph) -> None:
+    """Print how a pose graph was solved, and the closures that the gate rejects."""
+    graph, page = solved.graph, Page()
+    page.labelled(
+        "Graph",
+        f"{name}: {graph.dimension}-D, {len(graph)} poses, {len(graph.first)} edges; poses from "
+        f"{graph.initialised}",
+    )
+    gates = solved.gates
+    if isinstance(gates, Unavailable):
+        page.labelled("Gate", f"none: {gates.reason}")
+    elif not gates:
+        page.labelled("Gate", "no closures to judge: every edge is odometry")
+    else:
+        rejected = [gate for gate in gates if not gate.accepted]
+        said = [
+            f"{graph.ids[graph.first[gate.edge]]} – {graph.ids[graph.second[gate.edge]]}: "
+            f"d² {gate.d2:.1f}, p {gate.p:.2g}"
+            for gate in rejected[:MOST_ROWS]
+        ]
+        said += [f"and {len(rejected) - MOST_ROWS} more"] if len(rejected) > MOST_ROWS else []
+        page.labelled("Gate", f"rejects {len(rejected)} of {len(gates)} closures", *said)
+    if len(solved.solutions) == 1 and (~graph.successive).sum() > MANY_CLOSURES:
+        page.labelled("Robust", "left out for so many closures: --robust takes minutes")
+    rows = [
+        [
+            SOLUTIONS[key], f"{solution.initial_cost:.6g}", f"{solution.cost:.6g}",
+            f"{solution.iterations}" + ("" if solution.converged else " (not converged)"),
+            "" if key == "all" else f"{(solution.weights < 0.5).sum()}",
+        ]
+        for key, solution in solved.solutions.items()
+    ]  # fmt: skip
+    head = ("path", "cost before", "cost", "iterations", "closures dropped")
+    page.table(head, rows, right=(1, 2, 3, 4))
+    show(console, page.blocks)

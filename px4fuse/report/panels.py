@@ -3,35 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 
-from px4fuse.comparison.model import AgainstTruth, AxisComparison, Difference
+from px4fuse.comparison.model import AxisComparison, Difference
 from px4fuse.filter.consistency import Consistency
 from px4fuse.flight import Unavailable
 from px4fuse.plain import capital
-from px4fuse.report import marks
+from px4fuse.report import marks, style
 from px4fuse.report.document import Document
 from px4fuse.report.page import Page
-from px4fuse.report.style import (
-    EKF2_DOTS,
-    EKF2_LINE,
-    EKF2_REJECTED,
-    MAX_POINTS,
-    MAX_POINTS_NARROW,
-    MEASURED,
-    OURS_BAND,
-    OURS_DOTS,
-    OURS_LINE,
-    TIME_LABEL,
-    TRUTH_LINE,
-    bare_x,
-    curve,
-    log_ticks,
-    thin,
-)
+from px4fuse.report.style import DOTS, LINES, band, bare_x, curve, log_ticks
 from px4fuse.report.words import filters, verdict_words
 
 if TYPE_CHECKING:
@@ -42,15 +27,32 @@ NARROW, STRIP = 72.0, 12.0
 # The axes of innovations reach this much beyond 2√S, or beyond 99 % of the innovations if that is
 # further, but not beyond so many √S; what lies outside is drawn at the edge and counted
 EDGE, LARGEST_SIGMA = 1.3, 5.0
-UNITS = {"position": "m", "velocity": "m/s"}
+
+
+class Quantity(NamedTuple):
+    """What both filters estimate: its unit, and where it and its errors stand."""
+
+    unit: str
+    column: str
+    variance: str
+    rmse: str
+    sigma: str
+
+
+POSITIONS = Quantity(
+    "m", "position_m", "position_variance_m2", "position_rmse_m", "sigma_p_median_m"
+)  # fmt: skip
+VELOCITIES = Quantity(
+    "m/s", "velocity_m_s", "velocity_variance_m2_s2", "velocity_rmse_m_s", "sigma_v_median_m_s"
+)
 
 
 class Panel(NamedTuple):
     """A panel over time: how it is drawn, and what is said above and below it."""
 
-    title: Callable[[AxisComparison], str]
+    title: str
     height: float
-    draw: Callable[[Axes, AxisComparison, int], None]
+    draw: Callable[[Axes, AxisComparison], None]
     say: Callable[[Document, AxisComparison], str]
     numbers: Callable[[AxisComparison], str]
 
@@ -68,63 +70,43 @@ class Panel(NamedTuple):
             In a column of its own, without its sentence.
         """
         strip = strip and bool(document.events.modes)
-        say = "" if narrow else self.say(document, result)
-        axes = page.panel(
-            self.title(result), say, NARROW if narrow else self.height,
-            above=STRIP if strip else 4.0,
-        )  # fmt: skip
-        self.draw(axes, result, MAX_POINTS_NARROW if narrow else MAX_POINTS)
+        of = "truth" if isinstance(result.truth, pd.DataFrame) else "EKF2"
+        say, height = ("", NARROW) if narrow else (self.say(document, result), self.height)
+        axes = page.panel(self.title.format(of), say, height, above=STRIP if strip else 4.0)
+        self.draw(axes, result)
         # rejected innovations are there themselves
         rejected = "" if self is INNOVATIONS else result.axis.name
         marks.draw(axes, document, axis=rejected, strip=strip)
         if narrow:
             axes.locator_params(axis="x", nbins=4)
         if last:
-            axes.set_xlabel(TIME_LABEL)
+            axes.set_xlabel(style.TIME_LABEL)
         else:
             bare_x(axes)
         page.numbers(self.numbers(result))
         return axes
 
 
-def _band(axes: Axes, middle: pd.Series[float], sigma: pd.Series[float], limit: int) -> None:
-    """Ours ±2σ."""
-    time = middle.index.to_numpy()
-    shown, upper = thin(time, (middle + 2.0 * sigma).to_numpy(), limit)
-    lower = np.interp(shown, time, (middle - 2.0 * sigma).to_numpy())
-    axes.fill_between(shown, lower, upper, color=OURS_BAND, lw=0)
-
-
 # ------------------------------------------------------------------------------ position, velocity
 
 
-def _tracks(axes: Axes, result: AxisComparison, quantity: str, limit: int) -> None:
-    column, power = {"position": ("position_m", "m2"), "velocity": ("velocity_m_s", "m2_s2")}[
-        quantity
-    ]
-    ours = result.replay.steps[column]
-    _band(axes, ours, np.sqrt(result.replay.steps[f"{quantity}_variance_{power}"]), limit)
+def draw_tracks(axes: Axes, result: AxisComparison, of: Quantity) -> None:
+    """Draw what was measured, both filters with our band, and the truth."""
+    if of is POSITIONS:
+        measured = pd.Series(result.axis.measurement_m, result.axis.measurement_time_s)
+        curve(axes, measured, **style.MEASURED)
+    ours = result.replay.steps[of.column]
+    band(axes, ours, np.sqrt(result.replay.steps[of.variance]))
     shown = [ours]
-    for frame, style in ((result.ekf2_state, EKF2_LINE), (result.truth, TRUTH_LINE)):
-        if isinstance(frame, pd.DataFrame) and frame[column].notna().any():
-            curve(axes, frame[column], limit, **style, zorder=2.5)
-            shown.append(frame[column])
-    curve(axes, ours, limit, **OURS_LINE)
+    for frame, name in ((result.ekf2_state, "EKF2"), (result.truth, "truth")):
+        if isinstance(frame, pd.DataFrame) and frame[of.column].notna().any():
+            curve(axes, frame[of.column], **LINES[name], zorder=2.5)
+            shown.append(frame[of.column])
+    curve(axes, ours, **LINES["ours"])
     # scaled to the tracks, not to the wide band of the first second
     every = pd.concat(shown)
     pad = 0.08 * (every.max() - every.min()) + 1e-3
     axes.set_ylim(every.min() - pad, every.max() + pad)
-
-
-def draw_position(axes: Axes, result: AxisComparison, limit: int) -> None:
-    """Draw the measurements, both filters with our band, and the truth."""
-    axes.plot(*thin(result.axis.measurement_time_s, result.axis.measurement_m, limit), **MEASURED)
-    _tracks(axes, result, "position", limit)
-
-
-def draw_velocity(axes: Axes, result: AxisComparison, limit: int) -> None:
-    """Draw the velocity of both filters with our band, and the truth."""
-    _tracks(axes, result, "velocity", limit)
 
 
 def error_reference(result: AxisComparison) -> pd.DataFrame | Unavailable:
@@ -139,29 +121,27 @@ def apart(frame: pd.DataFrame, reference: pd.DataFrame) -> pd.Series[float]:
     return (frame["position_m"] - at).dropna()
 
 
-def draw_error(axes: Axes, result: AxisComparison, limit: int) -> None:
+def draw_error(axes: Axes, result: AxisComparison) -> None:
     """Draw position errors against truth, or the difference to EKF2 where there is no truth."""
     reference, steps = error_reference(result), result.replay.steps
     assert isinstance(reference, pd.DataFrame)
     sigma = np.sqrt(steps["position_variance_m2"])
-    _band(axes, 0.0 * sigma, sigma, limit)
+    band(axes, 0.0 * sigma, sigma)
     axes.axhline(0.0, color="black", lw=0.5)
     error = apart(steps, reference)
     highest = [error.abs().max(), 2.2 * sigma.median()]
     if reference is result.truth and isinstance(result.ekf2_state, pd.DataFrame):
         theirs = apart(result.ekf2_state, reference)
-        curve(axes, theirs, limit, **EKF2_LINE, zorder=2.5)
+        curve(axes, theirs, **LINES["EKF2"], zorder=2.5)
         highest.append(theirs.abs().max())
-    curve(axes, error, limit, **OURS_LINE)
+    curve(axes, error, **LINES["ours"])
     axes.set_ylim(-1.1 * max(highest), 1.1 * max(highest))
 
 
 def _position_words(_: Document, result: AxisComparison) -> str:
     travelled = float(np.ptp(result.axis.measurement_m))
     words = f"{len(result.replay.updates)} measurements over {travelled:.3g} m"
-    if not isinstance(result.ekf2_state, pd.DataFrame) or not isinstance(
-        result.difference, Difference
-    ):
+    if isinstance(result.ekf2_state, Unavailable) or isinstance(result.difference, Unavailable):
         return f"{words}; our filter follows them."
     distance = apart(result.ekf2_state, result.replay.steps).abs()
     return (
@@ -172,23 +152,23 @@ def _position_words(_: Document, result: AxisComparison) -> str:
 
 def _velocity_words(_: Document, result: AxisComparison) -> str:
     words = "Never measured: each filter infers it from positions and IMU."
-    return f"{words} {nearer(result, 'velocity')}".rstrip()
+    return f"{words} {nearer(result, VELOCITIES)}".rstrip()
 
 
 def _error_words(_: Document, result: AxisComparison) -> str:
     share = inside_share(result)
     if isinstance(result.truth, pd.DataFrame):
         said = f"{share:.0%} of our error lies in our own ±2σ (blue), where 95% should."
-        return f"{nearer(result, 'position')} {said}".lstrip()
+        return f"{nearer(result, POSITIONS)} {said}".lstrip()
     return (
         f"The log has no truth: this says how far both are apart, not who is right. {share:.0%} "
         "of it lies in our ±2σ (blue)."
     )
 
 
-def nearer(result: AxisComparison, quantity: str) -> str:
+def nearer(result: AxisComparison, of: Quantity) -> str:
     """Which filter is nearer to the truth, by root mean square; empty where one is not known."""
-    errors = _errors(result, quantity)
+    errors = _errors(result, of)
     if len(errors) < 2:
         return ""
     (low, first), (high, second) = sorted((error, name) for name, error in errors.items())
@@ -205,20 +185,15 @@ def inside_share(result: AxisComparison) -> float:
     return float((error.abs() <= 2.0 * np.sqrt(steps["position_variance_m2"])[error.index]).mean())
 
 
-def _errors(result: AxisComparison, quantity: str) -> dict[str, float]:
+def _errors(result: AxisComparison, of: Quantity) -> dict[str, float]:
     """RMSE to the truth of each filter that has one."""
-    field = "position_rmse_m" if quantity == "position" else "velocity_rmse_m_s"
-    found = {
-        name: getattr(one.truth, field)
-        for name, one in filters(result).items()
-        if isinstance(one.truth, AgainstTruth)
-    }
+    found = {name: getattr(one.truth, of.rmse, None) for name, one in filters(result).items()}
     return {name: error for name, error in found.items() if error is not None}
 
 
-def _error_numbers(result: AxisComparison, quantity: str = "position") -> str:
-    errors = ", ".join(f"{name} {error:.3f}" for name, error in _errors(result, quantity).items())
-    return f"RMS to truth ({UNITS[quantity]}): {errors}" if errors else ""
+def _error_numbers(result: AxisComparison, of: Quantity = POSITIONS) -> str:
+    errors = ", ".join(f"{name} {error:.3f}" for name, error in _errors(result, of).items())
+    return f"RMS to truth ({of.unit}): {errors}" if errors else ""
 
 
 def _position_numbers(result: AxisComparison) -> str:
@@ -232,7 +207,7 @@ def _position_numbers(result: AxisComparison) -> str:
 
 
 def _velocity_numbers(result: AxisComparison) -> str:
-    said = [_error_numbers(result, "velocity")]
+    said = [_error_numbers(result, VELOCITIES)]
     if isinstance(result.difference, Difference):
         said.append(f"ours - EKF2: RMS {result.difference.velocity_rmse_m_s:.3f} m/s")
     return "; ".join(filter(None, said))
@@ -252,25 +227,25 @@ def _limit(result: AxisComparison) -> float:
     return EDGE * max(limits)
 
 
-def draw_innovations(axes: Axes, result: AxisComparison, limit: int) -> None:
+def draw_innovations(axes: Axes, result: AxisComparison) -> None:
     """Draw innovations of both filters with ±2√S; what EKF2 rejected is hollow."""
     edge, updates, frame = _limit(result), result.replay.updates, result.ekf2_innovations
     ours = updates["innovation_m"]
-    _band(axes, 0.0 * ours, np.sqrt(updates["innovation_variance_m2"]), limit)
+    band(axes, 0.0 * ours, np.sqrt(updates["innovation_variance_m2"]))
     axes.axhline(0.0, color="black", lw=0.5)
-    dots = [(ours, OURS_DOTS)]
+    dots = [(ours, DOTS["ours"])]
     if isinstance(frame, pd.DataFrame):
         two_sigma = 2.0 * np.sqrt(frame["innovation_variance_m2"])
         for side in (two_sigma, -two_sigma):
-            curve(axes, side, limit, **EKF2_LINE)
+            curve(axes, side, **LINES["EKF2"])
         rejected = frame["rejected"] > 0
         theirs = frame["innovation_m"]
-        dots = [(theirs[~rejected], EKF2_DOTS), (theirs[rejected], EKF2_REJECTED), *dots]
-    for values, style in dots:
-        curve(axes, values[values.abs() <= edge], limit, **style)
+        dots = [(theirs[~rejected], DOTS["EKF2"]), (theirs[rejected], style.EKF2_REJECTED), *dots]
+    for values, look in dots:
+        curve(axes, values[values.abs() <= edge], **look)
         for sign, marker in ((1.0, "^"), (-1.0, "v")):
             beyond = values.index[sign * values > edge]  # shown at the edge
-            there: dict[str, Any] = {**style, "marker": marker, "ms": 3.2, "clip_on": False}
+            there: dict[str, Any] = {**look, "marker": marker, "ms": 3.2, "clip_on": False}
             if len(beyond):
                 axes.plot(beyond, np.full(len(beyond), sign * 0.96 * edge), **there)
     axes.set_ylim(-edge, edge)
@@ -310,10 +285,10 @@ def _innovation_numbers(result: AxisComparison) -> str:
     return "; ".join(said)
 
 
-def _draw_sigma(axes: Axes, result: AxisComparison, limit: int, column: str) -> None:
-    for frame, style in ((result.replay.steps, OURS_LINE), (result.ekf2_variance, EKF2_LINE)):
+def _draw_sigma(axes: Axes, result: AxisComparison, of: Quantity) -> None:
+    for frame, name in ((result.replay.steps, "ours"), (result.ekf2_variance, "EKF2")):
         if isinstance(frame, pd.DataFrame):
-            curve(axes, np.sqrt(frame[column]), limit, **style)
+            curve(axes, np.sqrt(frame[of.variance]), **LINES[name])
     log_ticks(axes)
 
 
@@ -331,46 +306,34 @@ def sigma_words(document: Document, result: AxisComparison) -> str:
     return f"In the {end - start:.1f} s without measurements from {start:.0f} s on σ grew: {grown}."
 
 
-def _medians(result: AxisComparison, field: str, unit: str) -> str:
-    values = {name: getattr(one, field) for name, one in filters(result).items()}
-    return "median: " + ", ".join(
-        f"{name} not logged" if value is None else f"{name} {value:.3f} {unit}"
-        for name, value in values.items()
-    )
+def _medians(result: AxisComparison, of: Quantity) -> str:
+    medians = {name: getattr(one, of.sigma) for name, one in filters(result).items()}
+    said = [
+        f"{name} not logged" if median is None else f"{name} {median:.3f} {of.unit}"
+        for name, median in medians.items()
+    ]
+    return f"median: {', '.join(said)}"
 
 
 POSITION = Panel(
-    lambda _: "Position (m)", 150.0, draw_position, _position_words, _position_numbers
-)  # fmt: skip
+    "Position (m)", 150.0, partial(draw_tracks, of=POSITIONS), _position_words, _position_numbers
+)
 VELOCITY = Panel(
-    lambda _: "Velocity (m/s)", 150.0, draw_velocity, _velocity_words, _velocity_numbers
+    "Velocity (m/s)", 150.0, partial(draw_tracks, of=VELOCITIES), _velocity_words, _velocity_numbers
 )
 ERROR = Panel(
-    lambda result: (
-        "Error: position - truth (m)"
-        if isinstance(result.truth, pd.DataFrame)
-        else "Difference: ours - EKF2 (m)"
-    ),
-    150.0,
-    draw_error,
-    _error_words,
+    "Position - {} (m)", 150.0, draw_error, _error_words,
     lambda result: _error_numbers(result) or _position_numbers(result),
-)
+)  # fmt: skip
 INNOVATIONS = Panel(
-    lambda _: "Innovation: measurement - prediction (m)", 140.0, draw_innovations,
-    innovation_words, _innovation_numbers,
+    "Innovation: measurement - prediction (m)", 140.0, draw_innovations, innovation_words,
+    _innovation_numbers,
 )  # fmt: skip
 SIGMA_P = Panel(
-    lambda _: "σ of position (m), log scale",
-    80.0,
-    lambda axes, result, limit: _draw_sigma(axes, result, limit, "position_variance_m2"),
-    sigma_words,
-    lambda result: _medians(result, "sigma_p_median_m", "m"),
-)
+    "σ of position (m), log scale", 80.0, partial(_draw_sigma, of=POSITIONS), sigma_words,
+    partial(_medians, of=POSITIONS),
+)  # fmt: skip
 SIGMA_V = Panel(
-    lambda _: "σ of velocity (m/s), log scale",
-    60.0,
-    lambda axes, result, limit: _draw_sigma(axes, result, limit, "velocity_variance_m2_s2"),
-    lambda *_: "",
-    lambda result: _medians(result, "sigma_v_median_m_s", "m/s"),
-)
+    "σ of velocity (m/s), log scale", 60.0, partial(_draw_sigma, of=VELOCITIES), lambda *_: "",
+    partial(_medians, of=VELOCITIES),
+)  # fmt: skip

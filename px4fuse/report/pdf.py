@@ -49,23 +49,35 @@ RESULTS_NAME = "results.json"
 STANDARDS: list[Any] = ["a-3a", "ua-1"]
 PAGES: Mapping[type, tuple[Callable[[Any], Iterator[Page]], ...]] = {
     Document: (
-        cover.draw,
-        flight.draw,
-        innovations.draw,
-        why.draw,
-        flight.draw_other_axes,
-        consistency.draw,
-        sensitivity.draw,
-        clock.draw,
-        loop.draw,
-        notes.draw,
-        provenance.draw,
+        cover.draw, flight.draw, innovations.draw, why.draw, flight.draw_other_axes,
+        consistency.draw, sensitivity.draw, clock.draw, loop.draw, notes.draw, provenance.draw,
     ),
     LoopDocument: (loop.draw_report, notes.draw, provenance.draw_loop),
     WhatIfDocument: (whatif.draw,),
     EvaluationDocument: (evaluation.draw,),
     ChangesDocument: (changes.draw,),
-}
+}  # fmt: skip
+
+
+def _named(document: Report) -> tuple[str, str, str]:
+    """Title of the PDF, and name and SHA-256 of the file that it is about."""
+    match document:
+        case Document(analysis):
+            log = analysis.flight.log
+            return f"px4fuse compare {log.name}", log.name, log.sha256
+        case WhatIfDocument(made_of):
+            log = made_of.flight.log
+            return f"px4fuse whatif {log.name}", log.name, log.sha256
+        case LoopDocument(loop=found):
+            track = found.odometry.trajectory
+            return f"px4fuse loop {track.name}", track.name, track.sha256
+        case EvaluationDocument(score):
+            one, other = score.estimate, score.reference
+            return f"px4fuse evaluate {one.name} {other.name}", one.name, one.sha256
+        case ChangesDocument(results):
+            a, b = results.a, results.b
+            name = f"A {a.log}, SHA-256 {a.log_sha256[:12]} · B {b.log}"
+            return f"px4fuse diff {a.given} {b.given}", name, b.log_sha256
 
 
 def render(document: Report, results_json: str) -> bytes:
@@ -85,13 +97,14 @@ def render(document: Report, results_json: str) -> bytes:
     with report_style():
         pages = [page for draw in PAGES[type(document)] for page in draw(document)]
         blocks = data([block for page in pages for block in page.blocks])
+    title, name, sha256 = _named(document)
     made_by, student = f"px4fuse {metadata.version('px4fuse')}", document.student
-    from_outside = document.title, student.name, student.id, student.notes, document.command
+    from_outside = title, student.name, student.id, student.notes, document.command
     return compiled(
         {
-            "title": document.title,
+            "title": title,
             "author": made_by,
-            "head": _line("px4fuse · {} · SHA-256 {:.12}".format(*document.log), 90),
+            "head": _line(f"px4fuse · {name} · SHA-256 {sha256[:12]}", 90),
             "student": _line(who(student, " · "), 40),
             "foot": made_by,
             "fonts": fonts.families("".join(from_outside)),

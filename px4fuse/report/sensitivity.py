@@ -17,20 +17,10 @@ from px4fuse.filter.likelihood import States, preintegrate, states, total_over_g
 from px4fuse.filter.tuning import HORIZONTAL, MIN_MEASUREMENTS, AxisTuning, Noise
 from px4fuse.flight import Unavailable
 from px4fuse.plain import factor_words, number_words
-from px4fuse.report import marks
+from px4fuse.report import marks, style
 from px4fuse.report.document import Document
 from px4fuse.report.page import Page, halves, legend_above
-from px4fuse.report.style import (
-    MUTED,
-    OURS,
-    OURS_BAND,
-    TIME_LABEL,
-    TRUTH_LINE,
-    bare_x,
-    curve,
-    empty,
-    plain_ticks,
-)
+from px4fuse.report.style import LINES, MUTED, OURS, OURS_BAND, bare_x, curve, plain_ticks
 
 if TYPE_CHECKING:
     pass
@@ -100,16 +90,16 @@ def draw(document: Document) -> Iterator[Page]:
         last = pair is PAIRS[-1][1]
         axes = page.panel(title, _apart_words(run, pair), TRACK, above=14.0)
         marks.draw(axes, document)
-        for column, style in zip(pair, (THICK, THIN), strict=True):
+        for column, look in zip(pair, (THICK, THIN), strict=True):
             label = SETTINGS[column][0]
-            curve(axes, velocity[column].loc[slice(*window)], **style, label=label)
+            curve(axes, velocity[column].loc[slice(*window)], **look, label=label)
         if isinstance(result.truth, pd.DataFrame):
             true = result.truth["velocity_m_s"].loc[slice(*window)].dropna()
-            curve(axes, true, **TRUTH_LINE, label="truth")
+            curve(axes, true, **LINES["truth"], label="truth")
         axes.set_xlim(*window)
         legend_above(axes)
         if last:
-            axes.set_xlabel(TIME_LABEL)
+            axes.set_xlabel(style.TIME_LABEL)
         else:
             bare_x(axes)
     page.numbers(
@@ -130,7 +120,7 @@ def _map(page: Page, document: Document) -> None:
     found = tuning[name]
     title = f"How likely the innovations are ({name})"
     if isinstance(found, Unavailable):
-        empty(page.panel(title, "", MAP), f"No map: {found.reason}.")
+        style.empty(page.panel(title, "", MAP), f"No map: {found.reason}.")
         return
     axes = page.panel(title, _map_words(found), MAP, left=BESIDE, below=BELOW)
     chosen = settings.sigma_a_m_s2, settings.sigma_z_m
@@ -141,8 +131,8 @@ def _map(page: Page, document: Document) -> None:
     for factor in (1.0 / FACTOR, 1.0, FACTOR):
         same_gain = factor * chosen[0] / chosen[1] * z[[0, -1]]
         axes.plot(z[[0, -1]], same_gain, color="black", lw=0.7, ls=(0, (1, 1.5)))
-    for (_, of_a, of_z), style in zip(SETTINGS[1:], (OF_A, OF_Z, OF_A, OF_Z), strict=True):
-        axes.plot(chosen[1] * of_z, chosen[0] * of_a, **style | {"ms": 4.0})
+    for (_, of_a, of_z), look in zip(SETTINGS[1:], (OF_A, OF_Z, OF_A, OF_Z), strict=True):
+        axes.plot(chosen[1] * of_z, chosen[0] * of_a, **look | {"ms": 4.0})
     best = [_point(noise) for noise in noises]
     axes.plot(best[1], best[0], "o", color="white", mec="black", ms=6.0, label="asked for")
     axes.plot(chosen[1], chosen[0], **CHOSEN, label="chosen")
@@ -225,11 +215,11 @@ def _gains(page: Page, ratio: float, gains: Array) -> None:
         say = f"{say[:-1]}: each square holds its circle."
     axes = page.panel("Gain of position, settled, over the ratio", say, MAP, below=BELOW)
     axes.plot(ratio * CURVE, gains[len(SETTINGS) :], color=MUTED, lw=1.0)
-    for columns, style, label in (
+    for columns, look, label in (
         ([1, 3], OF_A, "SIGMA_A × or / 4"), ([2, 4], OF_Z, "SIGMA_Z / or × 4"),
         ([0], CHOSEN, "chosen"),
     ):  # fmt: skip
-        axes.plot(at[columns], gains[columns], **style, label=label)
+        axes.plot(at[columns], gains[columns], **look, label=label)
     axes.set(xscale="log", xlim=ratio * CURVE[[0, -1]], ylim=(0.0, 1.0),
              xlabel="SIGMA_A / SIGMA_Z (1/s²)")  # fmt: skip
     ticks = ratio * CURVE[::4]

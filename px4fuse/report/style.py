@@ -9,6 +9,7 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib.resources import files
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -45,11 +46,13 @@ EKF2_REJECTED: dict[str, Any] = {
 MEASURED: dict[str, Any] = {
     "color": MEASUREMENT, "marker": ".", "ms": 1.8, "mew": 0, "ls": "none",
 }  # fmt: skip
+# By the names that a reader sees
+LINES = {"ours": OURS_LINE, "EKF2": EKF2_LINE, "truth": TRUTH_LINE}
+DOTS = {"ours": OURS_DOTS, "EKF2": EKF2_DOTS}
 
 # What the eye can see across a page, and across a third of it: longer series are thinned to their
 # extremes per bucket.
-MAX_POINTS = 1500
-MAX_POINTS_NARROW = 500
+MAX_POINTS, MAX_POINTS_NARROW, WIDE_INCHES = 1500, 500, 3.0
 
 
 @contextmanager
@@ -57,45 +60,25 @@ def report_style() -> Iterator[None]:
     """Matplotlib settings of the panels, for the duration of a block."""
     import matplotlib as mpl  # noqa: PLC0415 - not where words alone are shown
 
-    with mpl.rc_context(
-        {
-            "font.family": [FONT],
-            "font.size": 7.5,
-            "axes.titlesize": 8.5,
-            "axes.titlelocation": "left",
-            "axes.titlepad": 4,
-            "axes.titley": 1.0,  # fixed: placing titles automatically lays every axis out twice
-            "axes.labelsize": 7.5,
-            "axes.labelpad": 2,
-            "axes.linewidth": 0.6,
-            "axes.spines.top": False,
-            "axes.spines.right": False,
-            "axes.grid": True,
-            "axes.grid.axis": "y",
-            "grid.color": "#e3e3e3",
-            "grid.linewidth": 0.5,
-            "axes.axisbelow": True,
-            "xtick.labelsize": 7,
-            "ytick.labelsize": 7,
-            "xtick.major.width": 0.6,
-            "ytick.major.width": 0.6,
-            "xtick.major.size": 2.5,
-            "ytick.major.size": 2.5,
-            "legend.fontsize": 7,
-            "legend.frameon": False,
-            "legend.handlelength": 2.4,
-            "text.parse_math": False,
-            "svg.fonttype": "none",  # text stays text: it can be selected and searched
-            "svg.hashsalt": "px4fuse",  # the same bytes each time
-            "path.simplify_threshold": 0.5,
-        }
-    ):
+    with mpl.rc_context({"font.family": [FONT]}, files("px4fuse.report") / "report.mplstyle"):
         yield
 
 
-def curve(axes: Axes, values: pd.Series[float], limit: int = MAX_POINTS, **style: Any) -> None:
-    """Draw a series over its index, thinned."""
-    axes.plot(*thin(values.index.to_numpy(), values.to_numpy(), limit), **style)
+def curve(axes: Axes, values: pd.Series[float], **style: Any) -> None:
+    """Draw a series over its index, with as many points as the eye can see in these axes."""
+    axes.plot(*thin(values.index.to_numpy(), values.to_numpy(), _seen(axes)), **style)
+
+
+def band(axes: Axes, middle: pd.Series[float], sigma: pd.Series[float]) -> None:
+    """Draw our ±2σ about a series."""
+    time = middle.index.to_numpy()
+    shown, upper = thin(time, (middle + 2.0 * sigma).to_numpy(), _seen(axes))
+    lower = np.interp(shown, time, (middle - 2.0 * sigma).to_numpy())
+    axes.fill_between(shown, lower, upper, color=OURS_BAND, lw=0)
+
+
+def _seen(axes: Axes) -> int:
+    return MAX_POINTS if axes.bbox.width / axes.figure.dpi > WIDE_INCHES else MAX_POINTS_NARROW
 
 
 def log_ticks(axes: Axes) -> None:

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pandas as pd
 
 from px4fuse.arrays import Array
 from px4fuse.comparison.why import Why
@@ -16,16 +17,7 @@ from px4fuse.plain import capital
 from px4fuse.report import marks
 from px4fuse.report.document import Document
 from px4fuse.report.page import Page
-from px4fuse.report.style import (
-    EKF2,
-    EKF2_BAND,
-    MUTED,
-    OURS,
-    OURS_BAND,
-    OURS_LINE,
-    TIME_LABEL,
-    thin,
-)
+from px4fuse.report.style import EKF2, EKF2_BAND, LINES, MUTED, OURS, OURS_BAND, TIME_LABEL, curve
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -137,10 +129,10 @@ def _axis(page: Page, name: str, why: Why, document: Document) -> None:
         "Position apart (m): ours - EKF2 (dark), and what the model leaves of it (light)",
         _time_words(why), TIME_POINTS, above=12.0 if strip else 4.0,
     )  # fmt: skip
+    apart, left_over = (pd.Series(v, why.times_s) for v in (why.apart_m, why.left_m))
     for start, end in why.spans_s:
-        inside = (why.times_s > start) & (why.times_s < end)
-        for values, style in ((why.apart_m, OURS_LINE), (why.left_m, {"color": EKF2, "lw": 0.8})):
-            axes.plot(*thin(why.times_s[inside], values[inside]), **style)
+        curve(axes, apart.loc[start:end], **LINES["ours"])
+        curve(axes, left_over.loc[start:end], color=EKF2, lw=0.8)
     if why.coast is not None:
         end = why.coast.start_s + why.coast.duration_s
         axes.axvspan(why.coast.start_s, end, color=EKF2_BAND, lw=0, zorder=0.5)
