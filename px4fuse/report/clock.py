@@ -12,7 +12,7 @@ from px4fuse.plain import p_words
 from px4fuse.report import marks
 from px4fuse.report.document import Document
 from px4fuse.report.page import Page, legend_above
-from px4fuse.report.style import OURS, OURS_BAND, OURS_LINE, TIME_LABEL
+from px4fuse.report.style import OURS, OURS_BAND, OURS_LINE
 from px4fuse.report.words import clock_advice, delay_wrong, stamps_wrong
 
 # Heights of the axes in points
@@ -113,7 +113,8 @@ def _parts(page: Page, clock: ClockOffset, document: Document) -> None:
             f"Drift {clock.drift_ppm:+,.0f} ± {1.96 * clock.drift_sigma_ppm:,.0f} ppm{sure}."
         )
     said.append("Band: 95 % interval of the whole flight.")
-    axes = page.panel("Offset of each part of the flight by itself (s)", " ".join(said), PARTS)
+    title = "Offset of each part of the flight by itself (s)"
+    axes = marks.panel(page, document, title, " ".join(said), PARTS)
     axes.axhspan(*clock.interval_s, color=OURS_BAND, lw=0)
     ends = np.array([(part.start_s, part.end_s) for part in clock.parts])
     axes.errorbar(
@@ -121,5 +122,3 @@ def _parts(page: Page, clock: ClockOffset, document: Document) -> None:
         xerr=np.diff(ends, axis=1)[:, 0] / 2.0, yerr=[1.96 * part.sigma_s for part in clock.parts],
         fmt="o", color=OURS, ms=4, lw=1.0, capsize=2,
     )  # fmt: skip
-    marks.draw(axes, document)
-    axes.set_xlabel(TIME_LABEL)

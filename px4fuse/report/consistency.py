@@ -16,7 +16,7 @@ from px4fuse.plain import capital, number_words, p_words
 from px4fuse.report import marks
 from px4fuse.report.document import Document
 from px4fuse.report.page import Page, halves, legend_above
-from px4fuse.report.style import DOTS, LINES, OURS_BAND, TIME_LABEL, curve
+from px4fuse.report.style import DOTS, LINES, OURS_BAND, curve
 from px4fuse.report.words import VERDICT_HEAD, filters, verdict_rows, verdict_words
 
 if TYPE_CHECKING:
@@ -55,10 +55,9 @@ def draw(document: Document) -> Iterator[Page]:
     )
     series = _series(result)
     if series:
-        axes = page.panel("Mean NIS so far, log scale", _nis_words(series), RUNNING, above=LEGEND)
+        axes = marks.panel(page, document, "Mean NIS so far, log scale", _nis_words(series),
+                           RUNNING, above=LEGEND)  # fmt: skip
         _running(axes, series)
-        marks.draw(axes, document)
-        axes.set_xlabel(TIME_LABEL)
         legend_above(axes)
         first, second = halves()
         left = first.panel("Size: ν / √S", _shape_words(series), BELOW, above=LEGEND, left=4.0)

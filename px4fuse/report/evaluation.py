@@ -214,11 +214,9 @@ def _path(axes: Axes, score: Evaluation, view: View, scale: Axes | None) -> None
 def _framed(axes: Axes, score: Evaluation, view: View) -> None:
     names = AXES_OF_FRAME[score.reference.frame]
     axes.autoscale_view()
-    axes.set_aspect("equal", adjustable="datalim")
-    axes.grid(True, axis="both")
+    style.as_map(axes, names[view.across], names[view.up])
     axes.locator_params(axis="x", nbins=4)
     axes.locator_params(axis="y", nbins=6)
-    axes.set(xlabel=f"{names[view.across]} (m)", ylabel=f"{names[view.up]} (m)")
     if view.down:
         axes.invert_yaxis()
 

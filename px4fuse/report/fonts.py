@@ -28,11 +28,6 @@ NO_GLYPH = "\N{WHITE SQUARE}"
 MOST_SHOWN = 12
 # First word of Unicode's name of a character, for scripts that people call otherwise
 SCRIPTS = {"CJK": "Chinese", "HIRAGANA": "Japanese", "KATAKANA": "Japanese", "HANGUL": "Korean"}
-# Where it is not "Noto Sans" and the script
-NOTO = {
-    "Chinese": "Noto Sans SC", "Japanese": "Noto Sans JP", "Korean": "Noto Sans KR",
-    "symbol": "Noto Emoji",
-}  # fmt: skip
 
 
 @cache
@@ -63,12 +58,11 @@ def missing(text: str) -> str:
 
 def advice(characters: str) -> str:
     """What to install for :func:`missing` characters, as one sentence or two."""
-    scripts = list(dict.fromkeys(map(_script, characters)))
-    noto = " and ".join(dict.fromkeys(NOTO.get(s, f"Noto Sans {s}") for s in scripts))
+    scripts = " and ".join(dict.fromkeys(map(_script, characters)))
     shown = characters[:MOST_SHOWN] + ("…" if len(characters) > MOST_SHOWN else "")
     return (
-        f"No font of this machine has the {' and '.join(scripts)} characters {shown}: the report "
-        f"shows {NO_GLYPH} for each. Install a font that has them: {noto}, from "
+        f"No font of this machine has the {scripts} characters {shown}: the report shows "
+        f"{NO_GLYPH} for each. Install a font that has them: Noto Sans for {scripts}, from "
         "fonts.google.com/noto."
     )
 

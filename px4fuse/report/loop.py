@@ -13,23 +13,18 @@ from px4fuse.arrays import Array
 from px4fuse.filter.signals import Segment
 from px4fuse.findings import Finding
 from px4fuse.flight import Unavailable
+from px4fuse.loop import corrections
 from px4fuse.loop.analysis import SMALLEST_STAMP_S
-from px4fuse.loop.corrections import (
-    BY_DISTANCE,
-    PLAIN,
-    SINGLE_LOOP,
-    UNCORRECTED,
-    Correction,
-    Judged,
-)
+from px4fuse.loop.corrections import SINGLE_LOOP, Correction, Judged
 from px4fuse.loop.loop import Loop
 from px4fuse.plain import capital, p_words
+from px4fuse.report import style
 from px4fuse.report.cover import write_finding
 from px4fuse.report.document import Document, LoopDocument, who
 from px4fuse.report.evaluation import interval_words, score_words, way
 from px4fuse.report.page import AXIS_LABEL, TICKS, Cell, Page, appendix, legend_above
 from px4fuse.report.screen import show
-from px4fuse.report.style import EKF2, MUTED, OURS, SEVERITY_COLOURS, TRUTH_LINE, bare_x, curve
+from px4fuse.report.style import EKF2, LINES, MUTED, OURS, as_map, bare_x, curve
 from px4fuse.request import LoopRequest
 from px4fuse.trajectory.evaluation import Evaluation
 from px4fuse.trajectory.graph.analysis import GATE_ALPHA, MANY_CLOSURES, SOLUTIONS, SolvedGraph
@@ -40,22 +35,18 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 MOST_ROWS = 10  # of rejected closures
-GREEN, RED = "#3a7d5c", SEVERITY_COLOURS["error"]
+GREEN, RED = "#3a7d5c", style.SEVERITY_COLOURS["error"]
 STYLES: Mapping[str, dict[str, Any]] = {
-    UNCORRECTED: {"color": EKF2, "lw": 1.1, "ls": (0, (4, 1.6))},
-    PLAIN: {"color": "#79b294", "lw": 1.3, "ls": (0, (1.2, 1.2))},
-    BY_DISTANCE: {"color": GREEN, "lw": 1.0, "ls": (0, (6, 1.2, 1, 1.2))},
+    corrections.UNCORRECTED: {"color": EKF2, "lw": 1.1, "ls": (0, (4, 1.6))},
+    corrections.PLAIN: {"color": "#79b294", "lw": 1.3, "ls": (0, (1.2, 1.2))},
+    corrections.BY_DISTANCE: {"color": GREEN, "lw": 1.0, "ls": (0, (6, 1.2, 1, 1.2))},
     SOLUTIONS["gated"]: {"color": OURS, "lw": 1.2, "ls": "-"},
     SOLUTIONS["all"]: {"color": "#8d6a9f", "lw": 0.9, "ls": (0, (2, 1))},
 }
 KINDS = {
-    "vio": "odometry (external vision)",
-    "ekf2": "EKF2's track",
-    "kf": "our filter's track",
-    "truth": "ground truth",
-    "slam": "a SLAM system's trajectory",
-    "unknown": "a trajectory",
-}
+    "vio": "odometry (external vision)", "ekf2": "EKF2's track", "kf": "our filter's track",
+    "truth": "ground truth", "slam": "a SLAM system's trajectory", "unknown": "a trajectory",
+}  # fmt: skip
 CLOSURE_HEAD = (
     "same place at", "missed\nby (m)", "d²", "dof", "p", "gate", "DCS\nweight", "GNC\nweight",
 )  # fmt: skip
@@ -134,9 +125,7 @@ def _map(page: Page, loop: Loop) -> None:
         axes.annotate("", xy=true, xytext=end, zorder=6, arrowprops=arrow)
         axes.plot([], [], color=RED, lw=1.2, label=f"gap {loop.closure_error_m:.2f} m")
         axes.plot(*true, "x", color=RED, ms=5, mew=1.2, zorder=6, label="where it really ended")
-    axes.set_aspect("equal", adjustable="datalim", anchor="W")
-    axes.grid(True, axis="both")
-    axes.set(xlabel=f"{names[1]} (m)", ylabel=f"{names[0]} (m)")
+    as_map(axes, names[1], names[0])
     below = -(TICKS + AXIS_LABEL + 2.0) / MAP
     axes.legend(loc="upper left", ncols=4, borderaxespad=0.0, bbox_to_anchor=(0.0, below))
 
@@ -151,7 +140,7 @@ def _reference(axes: Axes, loop: Loop) -> None:
             transform = score.transform
             back = transform.rotation.inv().apply(score.reference_m - transform.translation_m)
             position = back / transform.scale
-            way(axes, position[:, (1, 0)], score.time_s, label=name, **TRUTH_LINE, zorder=4)
+            way(axes, position[:, (1, 0)], score.time_s, label=name, **LINES["truth"], zorder=4)
             return
 
 
@@ -261,7 +250,7 @@ def write_scores(page: Page, loop: Loop) -> None:
         ]  # fmt: skip
         weights = (judged.weights.get(name) for name in ("dcs", "gnc"))
         cells += ["–" if weight is None else f"{weight:.2f}" for weight in weights]
-        colour = "black" if gate.accepted else SEVERITY_COLOURS["error"]
+        colour = "black" if gate.accepted else style.SEVERITY_COLOURS["error"]
         rows.append([(cell, colour) for cell in cells])
     if rows:
         page.table(CLOSURE_HEAD, rows, right=(1, 2, 3, 4, 6, 7))
@@ -310,9 +299,9 @@ def closure_words(loop: Loop) -> str:
 def gate_words(judged: Judged) -> str:
     """What the gate says about one closure."""
     gate = judged.gate
-    verdict = (
-        "as the stated drift allows" if gate.accepted else "REJECTED: the drift cannot explain it"
-    )
+    verdict = "as the stated drift allows"
+    if not gate.accepted:
+        verdict = "REJECTED: the drift cannot explain it"
     return (
         f"d² {gate.d2:.1f} with {gate.degrees_of_freedom} degrees of freedom, p {gate.p:.2g} "
         f"(rejected below {GATE_ALPHA:g}): {verdict}"

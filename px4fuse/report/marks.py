@@ -11,7 +11,8 @@ from px4fuse.arrays import Array
 from px4fuse.comparison.events import Span
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.report.document import Document
-from px4fuse.report.style import EKF2_REJECTED, MUTED
+from px4fuse.report.page import Page
+from px4fuse.report.style import EKF2_REJECTED, MUTED, TIME_LABEL, bare_x
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
@@ -28,6 +29,7 @@ OUTLIER: dict[str, Any] = {"color": "black", "marker": "x", "ms": 3.0, "mew": 0.
 TAKE_OFF: dict[str, Any] = {"color": "black", "marker": "^", "ms": 4.5, "mew": 0, "ls": "none"}
 LANDING: dict[str, Any] = {"color": "black", "marker": "v", "ms": 4.5, "mew": 0, "ls": "none"}
 REJECTED_LINE, OUTLIER_LINE, RESET_LINE = 0.025, 0.075, 0.92
+STRIP = 12.0  # points for the names of flight modes
 # Marks closer than this share of the segment fall on one another
 CLOSEST = 1.0 / 300.0
 STRIP_SIZE, STRIP_WIDTH = 6.5, 4.0  # of the letters, and of one of them, in points
@@ -94,6 +96,27 @@ def draw(axes: Axes, document: Document, *, axis: str | None = None, strip: bool
             axes.add_artist(signs)  # which leaves the limits alone
     if strip:
         _strip(axes, document)
+
+
+def panel(
+    page: Page, document: Document, title: str, say: str, height: float, *, above: float = 4.0,
+    axis: str | None = None, strip: bool = False, last: bool = True,
+) -> Axes:  # fmt: skip
+    """A panel over the time of the flight, marked as by :func:`draw`.
+
+    Parameters
+    ----------
+    last : bool
+        Whether it says what its x axis is; else another one below it does.
+    """
+    strip = strip and bool(document.events.modes)
+    axes = page.panel(title, say, height, above=max(above, STRIP if strip else 0.0))
+    draw(axes, document, axis=axis, strip=strip)
+    if last:
+        axes.set_xlabel(TIME_LABEL)
+    else:
+        bare_x(axes)
+    return axes
 
 
 def outliers(document: Document) -> Array:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import html
 import re
-import unicodedata
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
@@ -39,7 +38,11 @@ IMAGE = re.compile(r"""<img\b(?:[^>]*?\balt\s*=\s*(["'])(.*?)\1)?[^>]*>""", re.I
 BREAK = re.compile(r"<(br|/p|/div|/tr|/li|/h\d)\b[^>]*>", re.IGNORECASE)
 TAG = re.compile(r"<[^>]*>")
 SUPERSCRIPTS = str.maketrans("0123456789+-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁺⁻")
-SYMBOLS = {
+GREEK = (
+    "alpha beta gamma delta epsilon zeta eta theta iota kappa lambda mu nu xi omicron pi rho sigma "
+    "tau upsilon phi chi psi omega"
+)
+SYMBOLS = dict(zip(GREEK.split(), "αβγδεζηθικλμνξοπρστυφχψω", strict=True)) | {
     "cdot": "·", "times": "×", "pm": "±", "le": "≤", "leq": "≤", "ge": "≥", "geq": "≥",
     "approx": "≈", "neq": "≠", "sim": "~", "infty": "∞", "sum": "Σ", "int": "∫", "partial": "∂",
     "to": "→", "rightarrow": "→", "degree": "°", "circ": "°", "sqrt": "√", "ldots": "…",
@@ -175,11 +178,4 @@ def _symbol(found: re.Match[str]) -> str:
     name = found[1]
     if name in SYMBOLS:
         return SYMBOLS[name]
-    if not name.isalpha():
-        return name
-    size = "CAPITAL" if name[0].isupper() else "SMALL"
-    greek = "LAMDA" if name.lower() == "lambda" else name.upper()
-    try:
-        return unicodedata.lookup(f"GREEK {size} LETTER {greek}")
-    except KeyError:
-        return name
+    return SYMBOLS[name.lower()].upper() if name.lower() in SYMBOLS else name

@@ -16,14 +16,13 @@ from px4fuse.plain import capital
 from px4fuse.report import marks, style
 from px4fuse.report.document import Document
 from px4fuse.report.page import Page
-from px4fuse.report.style import DOTS, LINES, band, bare_x, curve, log_ticks
+from px4fuse.report.style import DOTS, LINES, band, curve, log_ticks
 from px4fuse.report.words import filters, verdict_words
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-# Points: height of the axes in a column of three, and room for the names of flight modes
-NARROW, STRIP = 72.0, 12.0
+NARROW = 72.0  # points: height of the axes in a column of three
 # The axes of innovations reach this much beyond 2√S, or beyond 99 % of the innovations if that is
 # further, but not beyond so many √S; what lies outside is drawn at the edge and counted
 EDGE, LARGEST_SIGMA = 1.3, 5.0
@@ -59,7 +58,7 @@ class Panel(NamedTuple):
     def put(
         self, page: Page, document: Document, result: AxisComparison, *, last: bool,
         strip: bool = False, narrow: bool = False,
-    ) -> Axes:  # fmt: skip
+    ) -> None:  # fmt: skip
         """Draw it on a page, above others on the same time axis unless it is the last.
 
         Parameters
@@ -69,22 +68,16 @@ class Panel(NamedTuple):
         narrow : bool
             In a column of its own, without its sentence.
         """
-        strip = strip and bool(document.events.modes)
         of = "truth" if isinstance(result.truth, pd.DataFrame) else "EKF2"
         say, height = ("", NARROW) if narrow else (self.say(document, result), self.height)
-        axes = page.panel(self.title.format(of), say, height, above=STRIP if strip else 4.0)
-        self.draw(axes, result)
         # rejected innovations are there themselves
         rejected = "" if self is INNOVATIONS else result.axis.name
-        marks.draw(axes, document, axis=rejected, strip=strip)
+        axes = marks.panel(page, document, self.title.format(of), say, height, axis=rejected,
+                           strip=strip, last=last)  # fmt: skip
         if narrow:
             axes.locator_params(axis="x", nbins=4)
-        if last:
-            axes.set_xlabel(style.TIME_LABEL)
-        else:
-            bare_x(axes)
+        self.draw(axes, result)
         page.numbers(self.numbers(result))
-        return axes
 
 
 # ------------------------------------------------------------------------------ position, velocity

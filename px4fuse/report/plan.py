@@ -15,7 +15,7 @@ from px4fuse.flight import Ekf2, Truth
 from px4fuse.report.document import Document
 from px4fuse.report.marks import LANDING, TAKE_OFF
 from px4fuse.report.page import WIDTH, Page, legend_above
-from px4fuse.report.style import LINES, MEASURED, MUTED
+from px4fuse.report.style import LINES, MEASURED, MUTED, as_map
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -39,7 +39,7 @@ class MapView(NamedTuple):
         return c * north + s * east, s * north - c * east
 
 
-NORTH_UP = MapView(np.pi / 2.0, ("east (m)", "north (m)"))
+NORTH_UP = MapView(np.pi / 2.0, ("east", "north"))
 
 
 def plan(document: Document, facts: Mapping[str, str]) -> Page:
@@ -103,7 +103,7 @@ def _along(comparison: Comparison, points: Array) -> MapView:
     if np.sin(heading) < 0.0:
         heading += np.pi
     degrees = np.rad2deg(heading) % 360.0
-    return MapView(heading, (f"along {degrees:.0f}° from north (m)", "to its left (m)"))
+    return MapView(heading, (f"along {degrees:.0f}° from north", "to its left"))
 
 
 def _map(axes: Axes, document: Document, view: MapView, tracks: Mapping[str, Pair]) -> None:
@@ -122,9 +122,7 @@ def _map(axes: Axes, document: Document, view: MapView, tracks: Mapping[str, Pai
             near = samples.iloc[samples.index.get_indexer(list(times), method="nearest")]
             signs = view.of(near["north_m"], near["east_m"])
             axes.plot(*signs, **{**looks, "ms": 7.0, "mec": "white", "mew": 0.6}, label=label)
-    axes.set_aspect("equal", adjustable="datalim", anchor="W")
-    axes.grid(visible=True, axis="both")
-    axes.set(xlabel=view.labels[0], ylabel=view.labels[1])
+    as_map(axes, *view.labels)
     if view is not NORTH_UP:
         x, y = view.of(20.0, 0.0)
         arrow = {"arrowstyle": "<-", "color": MUTED, "lw": 0.8, "shrinkA": 1, "shrinkB": 0}

@@ -20,7 +20,7 @@ from px4fuse.plain import factor_words, number_words
 from px4fuse.report import marks, style
 from px4fuse.report.document import Document
 from px4fuse.report.page import Page, halves, legend_above
-from px4fuse.report.style import LINES, MUTED, OURS, OURS_BAND, bare_x, curve, plain_ticks
+from px4fuse.report.style import LINES, MUTED, OURS, OURS_BAND, curve, plain_ticks
 
 if TYPE_CHECKING:
     pass
@@ -87,9 +87,8 @@ def draw(document: Document) -> Iterator[Page]:
     missing = [*document.events.gaps, *document.events.dropouts]
     window = _window(velocity[0], missing)
     for title, pair in PAIRS:
-        last = pair is PAIRS[-1][1]
-        axes = page.panel(title, _apart_words(run, pair), TRACK, above=14.0)
-        marks.draw(axes, document)
+        axes = marks.panel(page, document, title, _apart_words(run, pair), TRACK, above=14.0,
+                           last=pair is PAIRS[-1][1])  # fmt: skip
         for column, look in zip(pair, (THICK, THIN), strict=True):
             label = SETTINGS[column][0]
             curve(axes, velocity[column].loc[slice(*window)], **look, label=label)
@@ -98,10 +97,6 @@ def draw(document: Document) -> Iterator[Page]:
             curve(axes, true, **LINES["truth"], label="truth")
         axes.set_xlim(*window)
         legend_above(axes)
-        if last:
-            axes.set_xlabel(style.TIME_LABEL)
-        else:
-            bare_x(axes)
     page.numbers(
         f"Velocity along {the(result.axis.name)} (m/s) over the {window[1] - window[0]:.0f} s with "
         "the most motion in which nothing is missing."

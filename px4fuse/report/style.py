@@ -105,6 +105,13 @@ def bare_x(axes: Axes) -> None:
     axes.tick_params(axis="x", labelbottom=False)
 
 
+def as_map(axes: Axes, right: str, up: str) -> None:
+    """Make both directions of the same scale, with a grid and their names (m)."""
+    axes.set_aspect("equal", adjustable="datalim", anchor="W")
+    axes.grid(True, axis="both")
+    axes.set(xlabel=f"{right} (m)", ylabel=f"{up} (m)")
+
+
 def empty(axes: Axes, reason: str) -> None:
     """Say in an axes why there is nothing to draw."""
     axes.set_axis_off()

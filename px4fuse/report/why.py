@@ -17,7 +17,7 @@ from px4fuse.plain import capital
 from px4fuse.report import marks
 from px4fuse.report.document import Document
 from px4fuse.report.page import Page
-from px4fuse.report.style import EKF2, EKF2_BAND, LINES, MUTED, OURS, OURS_BAND, TIME_LABEL, curve
+from px4fuse.report.style import EKF2, EKF2_BAND, LINES, MUTED, OURS, OURS_BAND, curve
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -124,11 +124,8 @@ def _axis(page: Page, name: str, why: Why, document: Document) -> None:
         if column:
             axes.set_yticklabels([])
     page.drawing(figure, f"What each step brings, in per cent: {', '.join(names)}")
-    strip = bool(document.events.modes)
-    axes = page.panel(
-        "Position apart (m): ours - EKF2 (dark), and what the model leaves of it (light)",
-        _time_words(why), TIME_POINTS, above=12.0 if strip else 4.0,
-    )  # fmt: skip
+    title = "Position apart (m): ours - EKF2 (dark), and what the model leaves of it (light)"
+    axes = marks.panel(page, document, title, _time_words(why), TIME_POINTS, axis=name, strip=True)
     apart, left_over = (pd.Series(v, why.times_s) for v in (why.apart_m, why.left_m))
     for start, end in why.spans_s:
         curve(axes, apart.loc[start:end], **LINES["ours"])
@@ -136,8 +133,6 @@ def _axis(page: Page, name: str, why: Why, document: Document) -> None:
     if why.coast is not None:
         end = why.coast.start_s + why.coast.duration_s
         axes.axvspan(why.coast.start_s, end, color=EKF2_BAND, lw=0, zorder=0.5)
-    marks.draw(axes, document, axis=name, strip=strip)
-    axes.set_xlabel(TIME_LABEL)
 
 
 def _waterfall(axes: Axes, names: list[str], shares: Array, left: float) -> None:

@@ -3,19 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from itertools import permutations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from px4fuse.comparison.model import (
-    AxisComparison,
-    Comparison,
-    Difference,
-    FilterSummary,
-    UnjudgedFilter,
-)
+from px4fuse.comparison.model import AxisComparison, Comparison, Difference, FilterSummary
+from px4fuse.comparison.model import UnjudgedFilter as Unjudged
 from px4fuse.filter.clock import CHANGE_P, ClockOffset
-from px4fuse.filter.consistency import Consistency
+from px4fuse.filter.consistency import Consistency, verdict_of
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.findings import Finding
@@ -55,7 +51,7 @@ def verdict_words(statement: Consistency | Unavailable) -> str:
     return f"{_side(statement)} {factor_words(_factor(statement))}×"
 
 
-def filters(result: AxisComparison) -> dict[str, FilterSummary | UnjudgedFilter]:
+def filters(result: AxisComparison) -> dict[str, FilterSummary | Unjudged]:
     """Both filters of an axis by the names that a reader sees; ours alone where EKF2 is missing."""
     known = {"ours": result.filters["kf"]}
     if not isinstance(result.ekf2_state, Unavailable):
@@ -74,7 +70,7 @@ VERDICT_HEAD = ("axis", "filter", "mean\nNIS", "95 %\nband", "innovation\nvarian
 
 def verdict_rows(
     axes: Iterable[AxisComparison],
-    more: Callable[[AxisComparison, str, FilterSummary | UnjudgedFilter], Sequence[str]],
+    more: Callable[[AxisComparison, str, FilterSummary | Unjudged], Sequence[str]],
 ) -> list[list[Cell]]:
     """A row for each axis and filter: what :data:`VERDICT_HEAD` says, and more cells."""
     rows: list[list[Cell]] = []
@@ -99,7 +95,7 @@ def error_rows(
     every = document.analysis.axes.values()
     has_ekf2 = any(isinstance(result.difference, Difference) for result in every)
 
-    def more(result: AxisComparison, name: str, one: FilterSummary | UnjudgedFilter) -> list[str]:
+    def more(result: AxisComparison, name: str, one: FilterSummary | Unjudged) -> list[str]:
         found: list[Any] = [result.difference if name == "ours" else None] if has_ekf2 else []
         found += [one.truth] if document.truth_known else []
         return [_metres(part, field) for part in found for field in RMSE]
@@ -169,22 +165,19 @@ def verdict_notes(comparison: Comparison) -> list[str]:
 
 def _same_nis(stated: Sequence[tuple[str, str, Consistency]]) -> Iterator[str]:
     """Two filters on one axis of which only the one with more samples is called wrong."""
-    for axis, owner, wrong in stated:
-        for other, fine in ((o, s) for a, o, s in stated if a == axis):
-            low, high = wrong.nis_band
-            if wrong.verdict == "consistent" or fine.verdict != "consistent":
-                continue
-            same_side = max(wrong.nis_mean, fine.nis_mean) < low or (
-                min(wrong.nis_mean, fine.nis_mean) > high
+    for (axis, owner, wrong), (on, other, fine) in permutations(stated, 2):
+        if on != axis or wrong.verdict == "consistent" or fine.verdict != "consistent":
+            continue
+        # the same mean in the wider band of the other
+        outside = verdict_of(fine.nis_mean, wrong.nis_band) == wrong.verdict
+        inside = verdict_of(wrong.nis_mean, fine.nis_band) == "consistent"
+        if outside and inside and fine.count < wrong.count:
+            bands = " and ".join("{:.2f}-{:.2f}".format(*one.nis_band) for one in (wrong, fine))
+            yield (
+                f"Along {axis} only {owner} is called {_side(wrong)} although {other} has "
+                f"nearly the same mean NIS ({wrong.nis_mean:.2f}, {fine.nis_mean:.2f}): with "
+                f"{wrong.count} samples against {fine.count} the band is narrower ({bands})."
             )
-            wide_low, wide_high = fine.nis_band
-            if same_side and fine.count < wrong.count and wide_low < wrong.nis_mean < wide_high:
-                bands = " and ".join("{:.2f}-{:.2f}".format(*s.nis_band) for s in (wrong, fine))
-                yield (
-                    f"Along {axis} only {owner} is called {_side(wrong)} although {other} has "
-                    f"nearly the same mean NIS ({wrong.nis_mean:.2f}, {fine.nis_mean:.2f}): with "
-                    f"{wrong.count} samples against {fine.count} the band is narrower ({bands})."
-                )
 
 
 def consequences_words(finding: Finding) -> str:
