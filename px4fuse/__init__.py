@@ -16,7 +16,6 @@ if _typing.TYPE_CHECKING:
     from px4fuse.comparison.model import Comparison as Comparison
     from px4fuse.ekf2.model import Model as Model
     from px4fuse.ekf2.model import open_model as open_model
-    from px4fuse.ekf2.model import replay_ekf2 as replay_ekf2
     from px4fuse.ekf2.whatif import WhatIf as WhatIf
     from px4fuse.errors import Px4FuseError as Px4FuseError
     from px4fuse.filter.clock import ClockOffset as ClockOffset
@@ -79,7 +78,6 @@ _HOMES = {
     "read_log": "readers",
     "read_trajectory": "readers.trajectory",
     "replay": "filter.kalman",
-    "replay_ekf2": "ekf2.model",
     "run": "analysis",
     "tune": "filter.tuning",
     "what_if": "notebook.commands",

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,31 +15,29 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from px4fuse.arrays import Array
-from px4fuse.comparison.asked import asked_of_ekf2
 from px4fuse.comparison.comparison import compare, compare_prepared
 from px4fuse.comparison.estimates import (
     Progress,
     Tuning,
-    clock_offset,
+    noises_and_clock,
     silent,
     size,
-    tuned,
-    tuned_horizontally,
     turned_frame,
 )
 from px4fuse.comparison.model import Comparison
-from px4fuse.comparison.preparation import prepare
-from px4fuse.comparison.why import Why, why_ekf2_differs
+from px4fuse.comparison.preparation import Choices, prepare
+from px4fuse.comparison.remedy import asked_of_ekf2
+from px4fuse.comparison.why import why_ekf2_differs
 from px4fuse.display import brief
 from px4fuse.ekf2.model import Model, open_model
 from px4fuse.ekf2.replay import Ekf2Replay
+from px4fuse.ekf2.walk import Why
 from px4fuse.ekf2.whatif import WhatIf, sweep_values, what_if
 from px4fuse.ekf2_parameters import check
 from px4fuse.errors import LogError, MissingDataError, SettingsError
 from px4fuse.filter.causes import AFTER_STEP_S, Explained, explained
 from px4fuse.filter.clock import ClockOffset
 from px4fuse.filter.heading import HeadingError
-from px4fuse.filter.motion import Made
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import AISLE, Axis
 from px4fuse.filter.smoothing import Smoothing, smoothing
@@ -96,14 +94,9 @@ class Analysis(Comparison):
         found = self._horizontally()
         if isinstance(found, Unavailable):
             return found
-        axes, outlier_time_s, used = found
+        axes, left_out, noises = found
         return explained(
-            self.flight,
-            axes,
-            self.segment,
-            self.settings,
-            outlier_time_s=outlier_time_s,
-            **used,
+            self.flight, axes, self.segment, self.settings, outlier_time_s=left_out, **noises
         )
 
     @cached_property
@@ -112,32 +105,28 @@ class Analysis(Comparison):
         found = self._horizontally()
         if isinstance(found, Unavailable):
             return found
-        axes, left_out, used = found
+        axes, left_out, noises = found
         # the filter comes to a jump as slowly as a low pass would
         time_s = axes[0].measurement_time_s
-        causes = self.explained
-        for jump in causes.jumps if isinstance(causes, Explained) else ():
+        for jump in self.explained.jumps if isinstance(self.explained, Explained) else ():
             near = (time_s >= jump.time_s) & (time_s < jump.time_s + AFTER_STEP_S)
             left_out = np.union1d(left_out, time_s[near])
-        return smoothing(axes, self.settings, outlier_time_s=left_out, **used)
+        return smoothing(axes, self.settings, outlier_time_s=left_out, **noises)
 
     def _horizontally(self) -> tuple[tuple[Axis, ...], Array, dict[str, float]] | Unavailable:
         """The horizontal axes, times of outliers, noises and a clock offset beyond doubt."""
-        axes = {name: result.axis for name, result in self.axes.items()}
-        settings = self.settings
+        clock, offset_s, settings = self.clock, 0.0, self.settings
+        if isinstance(clock, ClockOffset) and clock.determinable:
+            offset_s = clock.remaining_s if abs(clock.remaining_s) > clock.chance_s else 0.0
         for name, group in ((HORIZONTAL, ("north", "east")), (AISLE, (AISLE,))):
             tuned = self.tuning.get(name)
-            if isinstance(tuned, AxisTuning) and axes.keys() >= set(group):
-                clock, offset_s = self.clock, 0.0
-                if isinstance(clock, ClockOffset) and clock.determinable:
-                    remaining_s = clock.remaining_s
-                    offset_s = remaining_s if abs(remaining_s) > clock.chance_s else 0.0
-                used = {
+            if isinstance(tuned, AxisTuning) and self.axes.keys() >= set(group):
+                noises = {
                     "sigma_a_m_s2": size(tuned.filter_sigma_a, settings.sigma_a_m_s2),
                     "sigma_z_m": size(tuned.sigma_z, settings.sigma_z_m),
                     "clock_offset_s": offset_s,
                 }
-                return tuple(axes[each] for each in group), tuned.outlier_time_s, used
+                return tuple(self.axes[each].axis for each in group), tuned.outlier_time_s, noises
         return Unavailable(
             "causes beyond noise",
             "the noises of the horizontal axes are not known",
@@ -176,38 +165,29 @@ def read_flight(request: ComparisonRequest, progress: Progress = silent) -> Flig
     """
     log = Path(request.log)
     progress(f"reading {shown(log)}")
-    if request.mavlink is None:
-        flight = read_log(log, system=request.system)
-    else:
-        flight = read_log(log)
+    flight = read_log(log, system=request.system if request.mavlink is None else None)
+    # scipy.signal and scipy.ndimage cost a fifth of a second: only where something is placed
+    if request.mavlink is not None:
+        from px4fuse.placing import join  # noqa: PLC0415
+
         other = read_log(Path(request.mavlink), system=request.system)
         if not other.log.format.startswith("MAVLink"):
             raise LogError(
                 f"`mavlink` {other.log.name}: this is a {other.log.format}, not a MAVLink "
                 "recording. Give the ULog as LOG, and the recording (.tlog) with `mavlink`."
             )
-        from px4fuse.placing import join  # noqa: PLC0415
-
         flight = join(flight, other)
     position, offset = request.position, request.clock_offset_s
     if position is None:
         return flight
-    # scipy.signal and scipy.ndimage cost a fifth of a second: only where a file is placed
     from px4fuse.placing import place  # noqa: PLC0415
     from px4fuse.readers.position_csv import read_position_csv  # noqa: PLC0415
 
-    file = read_position_csv(
-        Path(position.path),
-        columns=position.columns,
-        time_unit=position.time_unit,
-        length_unit=position.length_unit,
-    )
+    units = {"time_unit": position.time_unit, "length_unit": position.length_unit}
+    file = read_position_csv(Path(position.path), columns=position.columns, **units)
+    clock_offset_s = None if isinstance(offset, str) else offset
     return place(
-        flight,
-        file,
-        frame=position.frame,
-        yaw_deg=position.yaw_deg,
-        clock_offset_s=None if isinstance(offset, str) else offset,
+        flight, file, frame=position.frame, yaw_deg=position.yaw_deg, clock_offset_s=clock_offset_s
     )
 
 
@@ -239,31 +219,26 @@ def run_preparation(
         clock_offset_s=asked if isinstance(asked, float) and request.position is None else 0.0,
     )
     _check_finite(start_s=request.start_s, end_s=request.end_s, clock_offset_s=asked)
-    read = flight or read_flight(request, progress)
-
-    def prepared(settings: Settings) -> Comparison:
-        return prepare(
-            read,
-            settings,
-            axes=request.axes or None,
-            heading_deg=request.heading_deg,
-            position_source=request.position_source,
-            start_s=request.start_s,
-            end_s=request.end_s,
-            input_required=request.input == "imu",
-        )
-
-    first = prepared(settings)
+    flight = flight or read_flight(request, progress)
+    required = request.input == "imu"
+    choices = Choices(
+        axes=request.axes or None,
+        heading_deg=request.heading_deg,
+        position_source=request.position_source,
+        start_s=request.start_s,
+        end_s=request.end_s,
+    )
+    prepared = prepare(flight, settings, input_required=required, **choices)
     if asked != AUTO or request.position is not None:
-        return first
-    made: Made = {}
-    found = clock_offset(first, tuned_horizontally(first, made), progress, made)
-    if isinstance(found, Unavailable) or not found.determinable:
+        return prepared
+    _, clock = noises_and_clock(prepared, progress)
+    if isinstance(clock, Unavailable) or not clock.determinable:
         raise MissingDataError(
-            f"{read.log.name}: `clock_offset_s` auto: not determinable: {found.reason}. "
+            f"{flight.log.name}: `clock_offset_s` auto: not determinable: {clock.reason}. "
             "Give the seconds to add, or leave it out."
         )
-    return prepared(replace(settings, clock_offset_s=found.offset_s))
+    settings = replace(settings, clock_offset_s=clock.offset_s)
+    return prepare(flight, settings, input_required=required, **choices)
 
 
 def _check_finite(**values: float | str | None) -> None:
@@ -286,13 +261,10 @@ def run_loop(request: LoopRequest, progress: Progress = silent) -> Loop:
 
     _check_finite(start_s=request.start_s, end_s=request.end_s)
     progress(f"reading {shown(Path(request.source))}")
-    source = read_source(request.source, frame=request.frame, system=request.system)
-    reference = None
+    system, landed, reference = request.system, request.landed_at, None
+    source = read_source(request.source, frame=request.frame, system=system)
     if request.reference is not None:
-        reference = read_source(
-            request.reference, default="truth", system=request.system
-        ).trajectory
-    landed = request.landed_at
+        reference = read_source(request.reference, default="truth", system=system).trajectory
     return analyse(
         source,
         start_s=request.start_s,
@@ -359,24 +331,22 @@ def run_what_if(
         raise MissingDataError(f"{flight.log.name}: {model}")
     asked = not changes and swept is None
     why: Mapping[str, Why | Unavailable] = {}
-    if model.agreement.good:
-        try:
+    compared = None
+    try:
+        if model.agreement.good:
             compared = compare(flight, axes=("north", "east", AISLE))
-        except MissingDataError:  # EKF2 can be replayed all the same
-            if asked:
-                raise
-        else:
-            made: Made = {}
-            tuning = tuned_horizontally(compared, made)
-            clock = clock_offset(compared, tuning, progress, made)
-            why = why_ekf2_differs(compared, model, tuning, clock)
-            if asked:
-                changes = asked_of_ekf2(compared, model, tuning, clock)
-                if not changes:
-                    raise MissingDataError(_not_told(compared))
+    except MissingDataError:  # EKF2 can be replayed all the same
+        if asked:
+            raise
+    if compared is not None:
+        tuning, clock = noises_and_clock(compared, progress)
+        why = why_ekf2_differs(compared, model, tuning, clock)
+        if asked:
+            changes = asked_of_ekf2(compared, model, tuning, clock)
+            if not changes:
+                raise MissingDataError(_nothing_asked(compared))
     settings = [changes] if changes else []
-    if swept is not None:
-        settings += [{**changes, swept.parameter: value} for value in values]
+    settings += [{**changes, swept.parameter: value} for value in values] if swept else []
     progress("replaying with other parameters")
     found = what_if(model, settings)
     if isinstance(found, Unavailable):
@@ -384,7 +354,7 @@ def run_what_if(
     return Counterfactual(flight, found, changes, asked, why)
 
 
-def _not_told(compared: Comparison) -> str:
+def _nothing_asked(compared: Comparison) -> str:
     name, source = compared.flight.log.name, compared.source
     why = "the data do not tell the noise and the delay of what EKF2 fused"
     if source.origin.may_drift:
@@ -405,10 +375,7 @@ def explain(comparison: Comparison, progress: Progress = silent) -> Analysis:
         Told what is being done.
     """
     names = REPORTED if {"north", "east"} <= {line.name for line in comparison.lines} else None
-    made: Made = {}  # tuning and clock need the same signals of the IMU
-    tuning = tuned(comparison, names, progress, made)
-    clock = clock_offset(comparison, tuning, progress, made)
-    del made
+    tuning, clock = noises_and_clock(comparison, progress, names)
     progress("replaying EKF2")
     model = open_model(comparison.flight)
     why = why_ekf2_differs(comparison, model, tuning, clock)
@@ -418,11 +385,6 @@ def explain(comparison: Comparison, progress: Progress = silent) -> Analysis:
 
     loop = loop_in(comparison.flight, progress)
     return Analysis(
-        **{each.name: getattr(comparison, each.name) for each in fields(Comparison)},
-        tuning=tuning,
-        clock=clock,
-        ekf2_model=model,
-        why=why,
-        loop=loop,
+        **vars(comparison), tuning=tuning, clock=clock, ekf2_model=model, why=why, loop=loop,
         heading=heading,
-    )
+    )  # fmt: skip

@@ -103,13 +103,10 @@ PARAMETERS: Mapping[str, Parameter] = {
     EV_POS.gate: Parameter("SD", 5.0, 1.0, 1e3, "gate of the vision position innovation"),
     EV_POS.delay: Parameter("ms", 0.0, 0.0, 300.0, "age of vision at its stamp"),
     "EKF2_DELAY_MAX": Parameter("ms", 200.0, 0.0, 1e3, "how far fusion may run behind (v1.15)"),
-    EV_POS.lever_arm[0]: Parameter(
-        "m", 0.0, -math.inf, math.inf, "vision sensor forward of the body"
-    ),
-    EV_POS.lever_arm[1]: Parameter(
-        "m", 0.0, -math.inf, math.inf, "vision sensor right of the body"
-    ),
-    EV_POS.lever_arm[2]: Parameter("m", 0.0, -math.inf, math.inf, "vision sensor below the body"),
+    **{
+        name: Parameter("m", 0.0, -math.inf, math.inf, f"vision sensor {place} the body")
+        for name, place in zip(EV_POS.lever_arm, ("forward of", "right of", "below"), strict=True)
+    },
     "EKF2_ACC_NOISE": Parameter("m/s^2", 0.35, 0.01, 1.0, "noise of the accelerometer"),
     "EKF2_GYR_NOISE": Parameter("rad/s", 0.015, 0.0001, 0.1, "noise of the gyro"),
     "EKF2_ACC_B_NOISE": Parameter("m/s^3", 0.003, 0.0, 0.01, "drift of the accelerometer's bias"),
@@ -161,12 +158,12 @@ def check(chosen: Mapping[str, float]) -> dict[str, float]:
     {'EKF2_EVP_NOISE': 0.2}
     """
     for name, value in chosen.items():
-        if name not in PARAMETERS:
+        known = PARAMETERS.get(name)
+        if known is None:
             raise SettingsError(
                 f"{name}: the model of EKF2 does not have this parameter. It knows "
                 f"{', '.join(PARAMETERS)}."
             )
-        known = PARAMETERS[name]
         if not known.minimum <= value <= known.maximum or not math.isfinite(value):
             unit = f" {known.unit}" if known.unit else ""
             raise SettingsError(

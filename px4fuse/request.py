@@ -12,7 +12,7 @@ import shlex
 import subprocess
 from collections.abc import Iterator, Mapping
 from pathlib import PurePath
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, NamedTuple, Self
 
 import msgspec
 
@@ -223,10 +223,10 @@ class EvaluationRequest(_Asked, frozen=True, kw_only=True):
 
     estimate: str
     reference: str
-    alignment: str | None = None
-    association: str = "interpolate"
+    alignment: Literal["none", "yaw", "se3", "sim3"] | None = None
+    association: Literal["interpolate", "nearest"] = "interpolate"
     max_gap_s: float | None = None
-    time_offset_s: float | str | None = None
+    time_offset_s: float | Literal["auto"] | None = None
     rpe: tuple[str, ...] = ()
     consecutive: bool = False
     system: System | None = None
@@ -234,52 +234,152 @@ class EvaluationRequest(_Asked, frozen=True, kw_only=True):
 
 Request = ComparisonRequest | LoopRequest | WhatIfRequest
 
-# The option that gives each field, in the order in which a command line is written
-OPTIONS = {
-    "mavlink": "--mavlink",
-    "system": "--system",
-    "path": "--position",
-    "frame": "--position-frame",
-    "yaw_deg": "--position-yaw",
-    "columns": "--position-columns",
-    "time_unit": "--position-time-unit",
-    "length_unit": "--position-unit",
-    "position_source": "--position-source",
-    "sigma_a_m_s2": "--sigma-a",
-    "sigma_z_m": "--sigma-z",
-    "dt_s": "--dt",
-    "input": "--input",
-    "axes": "--axis",
-    "heading_deg": "--heading",
-    "start_s": "--start",
-    "end_s": "--end",
-    "clock_offset_s": "--clock-offset",
-}
+
+class Option(NamedTuple):
+    """How a field of a request is typed on the command line; what it takes is the field's type.
+
+    Attributes
+    ----------
+    name : str
+    meaning : str
+        Its help; empty where the command declares the option itself.
+    unit : str
+        Of a number, as :data:`px4fuse.cli.quantity.NAMES` has it.
+    example : float
+        Shown where what was typed cannot be understood.
+    metavar : str or None
+    """
+
+    name: str
+    meaning: str = ""
+    unit: str = ""
+    example: float = 0.1
+    metavar: str | None = None
+
+
+_SYSTEM = Option(
+    "--system", "MAVLink system id of the vehicle.  [default: the one with the most data]",
+    metavar="ID",
+)  # fmt: skip
+# Which recordings of one flight are read
+RECORDINGS = {
+    "mavlink": Option(
+        "--mavlink", "MAVLink recording of the same flight: gives what LOG lacks.",
+        metavar="FILE.tlog",
+    ),
+    "system": _SYSTEM,
+}  # fmt: skip
+POSITION_OPTIONS = {
+    "path": Option(
+        "--position", "The positioning system's own recording: time, x, y, z.", metavar="FILE.csv"
+    ),
+    "frame": Option(
+        "--position-frame",
+        "What its x, y, z are.  [default: from its column names, or what fits EKF2]",
+    ),
+    "yaw_deg": Option(
+        "--position-yaw",
+        "Turn it clockwise, seen from above; auto finds yaw and origin.  [default: 0]", "°", 30.0,
+    ),
+    "columns": Option(
+        "--position-columns", "Names or numbers of its columns.  [default: by their names]",
+        metavar="TIME,X,Y,Z[,SIGMA]",
+    ),
+    "time_unit": Option("--position-time-unit", "Unit of its time.  [default: detected]"),
+    "length_unit": Option("--position-unit", "Unit of its x, y, z.  [default: detected]"),
+}  # fmt: skip
+# Of what the filter does, for one flight or many
+FILTER_OPTIONS = {
+    "sigma_a_m_s2": Option(
+        "--sigma-a", "Process noise SIGMA_A, 0.0001 to 100.", "m/s²", 0.5
+    ),
+    "sigma_z_m": Option("--sigma-z", "Measurement noise SIGMA_Z, 0.0001 to 100.", "m"),
+    "dt_s": Option("--dt", "Prediction step DT, 0.001 to 1; Q is proportional to it.", "s"),
+    "input": Option(
+        "--input",
+        "Acceleration from the IMU, or constant velocity.  [default: imu where logged]",
+    ),
+    "axes": Option(
+        "--axis",
+        "Axis to analyse; may be repeated.  [default: all that the source supports]",
+    ),
+    "heading_deg": Option(
+        "--heading",
+        "Heading of the aisle, clockwise from north.  [default: from the track]", "°", 30.0,
+    ),
+    "start_s": Option(
+        "--start", "Start, seconds from the first data.  [default: take-off]", "s", 20.0
+    ),
+    "end_s": Option("--end", "End.  [default: touch-down]", "s", 60.0),
+    "position_source": Option(
+        "--position-source",
+        "Position source, for example vehicle_gps_position.  [default: the best logged]",
+        metavar="NAME",
+    ),
+}  # fmt: skip
+CLOCK_OPTION = {
+    "clock_offset_s": Option(
+        "--clock-offset", "Added to the position source's time stamps; auto estimates it.  "
+        "[default: 0; auto with --position]", "s",
+    )
+}  # fmt: skip
 LOOP_OPTIONS = {
-    "frame": "--frame",
-    "system": "--system",
-    "reference": "--reference",
-    "start_s": "--from",
-    "end_s": "--to",
-    "landed_at": "--landed-at",
-    "closures": "--closure",
-    "position_drift_m": "--drift",
-    "heading_drift_deg": "--heading-drift",
-    "key_frames_m": "--key-frames",
-    "came_back": "--open",
-}
+    "start_s": Option(
+        "--from", "Start of the loop: seconds from the first data, or a trajectory's own stamps.  "
+        "[default: take-off]", "s", 20.0,
+    ),
+    "end_s": Option("--to", "End.  [default: landing]", "s", 60.0),
+    "landed_at": Option("--landed-at"),
+    "came_back": Option("--open"),
+    "closures": Option("--closure"),
+    "reference": Option(
+        "--reference", "What the paths are scored against, besides the log's ground truth: a SLAM "
+        "trajectory.", metavar="FILE|LOG:PART",
+    ),
+    "position_drift_m": Option(
+        "--drift", "Standard deviation of the odometry's position after 100 m.", "m", 1.0
+    ),
+    "heading_drift_deg": Option(
+        "--heading-drift", "Standard deviation of its heading after 100 m.", "°", 3.0
+    ),
+    "key_frames_m": Option(
+        "--key-frames",
+        "Distance between key frames.  [default: a fiftieth of the extent, 0.02 to 0.5]", "m", 0.2,
+    ),
+    "frame": Option("--frame", "Axes of a trajectory file.  [default: recognised]"),
+    "system": _SYSTEM,
+}  # fmt: skip
 EVALUATION_OPTIONS = {
-    "alignment": "--alignment",
-    "association": "--association",
-    "max_gap_s": "--max-gap",
-    "time_offset_s": "--time-offset",
-    "rpe": "--rpe",
-    "consecutive": "--consecutive",
-    "system": "--system",
+    "alignment": Option(
+        "--alignment", "What is fitted before comparing.  [default: yaw for VIO, EKF2 and our "
+        "filter; se3 for SLAM; sim3 for monocular SLAM]",
+    ),
+    "association": Option(
+        "--association", "Interpolate the reference, or take its nearest pose (as evo does)."
+    ),
+    "max_gap_s": Option("--max-gap"),
+    "time_offset_s": Option(
+        "--time-offset", "Added to the estimate's stamps; auto finds it from the motion.  "
+        "[default: auto where the two do not overlap]", "s",
+    ),
+    "rpe": Option("--rpe"),
+    "consecutive": Option(
+        "--consecutive", "RPE over pairs end to end, instead of from every pose."
+    ),
+    "system": _SYSTEM,
+}  # fmt: skip
+RECORDING_OPTIONS = RECORDINGS | POSITION_OPTIONS | CLOCK_OPTION
+OPTIONS = RECORDING_OPTIONS | FILTER_OPTIONS
+_OF_REQUESTS: dict[type[msgspec.Struct], Mapping[str, Option]] = {
+    ComparisonRequest: OPTIONS,
+    PositionFile: POSITION_OPTIONS,
+    LoopRequest: LOOP_OPTIONS,
+    WhatIfRequest: RECORDINGS,
+    EvaluationRequest: EVALUATION_OPTIONS,
 }
 
-# What the errors of a command may name: its arguments in Python, to its options
-ARGUMENTS = OPTIONS | {
+# What the errors of a command may name, besides fields: arguments in Python, to its options
+_ARGUMENTS = {
     "position": "--position",
     "changes": "--set",
     "scheduler": "--scheduler",
@@ -287,13 +387,14 @@ ARGUMENTS = OPTIONS | {
 }
 
 
-def with_options(text: str, options: Mapping[str, str] = ARGUMENTS) -> str:
+def with_options(text: str, options: Mapping[str, Option] = OPTIONS) -> str:
     """The text of an error with options in the place of the arguments that it names.
 
     >>> with_options("`sigma_z_m` 0 is out of range: give 0.0001 to 100 m.")
     '--sigma-z 0 is out of range: give 0.0001 to 100 m.'
     """
-    return re.sub(r"`(\w+)`", lambda name: options.get(name[1], name[0]), text)
+    names = _ARGUMENTS | {field: option.name for field, option in options.items()}
+    return re.sub(r"`(\w+)`", lambda name: names.get(name[1], name[0]), text)
 
 
 def command_line(
@@ -349,27 +450,19 @@ def _file(path: str) -> str:
     return f"./{path}" if path.startswith("-") else path
 
 
-def _all_options(request: Request | EvaluationRequest) -> Iterator[tuple[str, str | None]]:
-    """Options with their values, None for a flag."""
-    if isinstance(request, EvaluationRequest):
-        yield from _options(request, EVALUATION_OPTIONS)
-    elif isinstance(request, LoopRequest):
-        yield from _options(request, LOOP_OPTIONS)
-    else:
-        yield from _options(request, OPTIONS)
-        if isinstance(request, ComparisonRequest) and request.position is not None:
-            yield from _options(request.position, OPTIONS)
-
-
-def _options(struct: msgspec.Struct, options: dict[str, str]) -> Iterator[tuple[str, str | None]]:
-    """Options with their values, for the fields that are not at their defaults."""
-    for field in msgspec.structs.fields(struct):
-        value = getattr(struct, field.name)
+def _all_options(request: msgspec.Struct) -> Iterator[tuple[str, str | None]]:
+    """Options with their values, None for a flag, of the fields that are not at their defaults."""
+    options = _OF_REQUESTS[type(request)]
+    for field in msgspec.structs.fields(request):
+        value = getattr(request, field.name)
         if field.name not in options or value == field.default:
             continue
         several = value if field.name in ("axes", "closures", "rpe") else (value,)
         for single in several:
-            yield options[field.name], None if isinstance(single, bool) else _typed(single)
+            name = options[field.name].name
+            yield name, None if isinstance(single, bool) else _typed(single)
+    if (position := getattr(request, "position", None)) is not None:
+        yield from _all_options(position)
 
 
 def _typed(value: Any) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from px4fuse.ekf2.inputs import Inputs, Rules
-from px4fuse.ekf2.legs import GRAVITY_M_S2
+from px4fuse.ekf2.intervals import GRAVITY_M_S2, Events
 from px4fuse.ekf2.stretches import Stretch
 from px4fuse.trajectory.rotation import skew
 
@@ -43,9 +43,7 @@ def step_state(stretch: Stretch, k: int, x: np.ndarray) -> np.ndarray:
     return x
 
 
-def plain_replay(
-    inputs: Inputs, stretch: Stretch, ends: np.ndarray, samples: np.ndarray, actions: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def plain_replay(inputs: Inputs, stretch: Stretch, events: Events) -> tuple[np.ndarray, np.ndarray]:
     """Innovations and variances of the flight as flown, for a flight without rejections.
 
     Covariance and state go on at each prediction; every measurement is fused alone.
@@ -67,7 +65,7 @@ def plain_replay(
         x = x + K * nu
         P = P - np.outer(K, P[i])
 
-    for end, sample, action in zip(ends, samples, actions, strict=True):
+    for end, sample, action in zip(events.end, events.sample, events.action, strict=True):
         while k < end:
             F = step_matrix(stretch, k, trapezoid=False)
             x = step_state(stretch, k, x)

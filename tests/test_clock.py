@@ -18,7 +18,7 @@ from scipy.stats import binom, chi2
 
 from px4fuse.arrays import Array
 from px4fuse.comparison.comparison import compare
-from px4fuse.comparison.estimates import clock_offset, tuned_horizontally
+from px4fuse.comparison.estimates import noises_and_clock
 from px4fuse.filter.clock import (
     CHANGE_P,
     MIN_MEASUREMENTS,
@@ -539,8 +539,7 @@ def test_outliers_that_were_found_are_left_out() -> None:
 def test_outliers_are_those_that_tuning_found() -> None:
     flight, outlier = made_flight(8, offset_s=-0.2, outliers=12)
     compared = compare(flight, SETTINGS)
-    tuning = tuned_horizontally(compared)
-    found = clock_offset(compared, tuning)
+    tuning, found = noises_and_clock(compared)
     tuned = tuning["horizontal"]
     at = flight.positions[0].samples.index.to_numpy()
     inside = at[outlier]
@@ -553,7 +552,7 @@ def test_outliers_are_those_that_tuning_found() -> None:
 def test_an_offset_that_was_set_is_not_found_again() -> None:
     flight, _ = made_flight(9, offset_s=-0.2)
     compared = compare(flight, replace(SETTINGS, clock_offset_s=-0.2))
-    found = clock_offset(compared, tuned_horizontally(compared))
+    _, found = noises_and_clock(compared)
     assert covers(found, -0.2)
     assert found.applied_s == -0.2
     assert clock_advice(compared, found)["Offset"].startswith("-0.")
@@ -607,7 +606,7 @@ def test_an_offset_beyond_the_search_is_not_called_determined() -> None:
 )
 def test_the_offset_of_simulated_flights(shared_logs, name: str, true_s: float) -> None:
     compared = compare(read_log(shared_logs / "simulated" / f"{name}.ulg"))
-    found = clock_offset(compared, tuned_horizontally(compared))
+    _, found = noises_and_clock(compared)
     assert found.determinable
     assert found.offset_s == pytest.approx(true_s, abs=0.05)
     assert covers(found, true_s)

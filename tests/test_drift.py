@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from exchange import replace
 
-from px4fuse.comparison.drift import with_drift
+from px4fuse.comparison.estimates import with_drift
 from px4fuse.filter.clock import ClockOffset, PartOffset
 from px4fuse.origin import (
     ALIGNED,

@@ -15,9 +15,8 @@ from findings_tools import NONE, log, made
 from scipy.spatial.transform import Rotation
 
 from px4fuse.ekf2 import inputs as inputs_module
-from px4fuse.ekf2.inputs import Inputs, Rules, prepare
+from px4fuse.ekf2.inputs import Inputs, Rules, Vision, _decisions, _source, prepare, read_vision
 from px4fuse.ekf2.stretches import Stretch
-from px4fuse.ekf2.vision import Vision, _decisions, _source, read_vision
 from px4fuse.ekf2.whatif import sweep_values
 from px4fuse.ekf2_parameters import PARAMETERS, check, fuses_by_mask, settings_in_force
 from px4fuse.errors import SettingsError
@@ -92,7 +91,7 @@ def flown(
     monkeypatch: pytest.MonkeyPatch, *, interval_s: float = 0.008, **record: Any
 ) -> Inputs | Unavailable:
     """What is prepared of a flight of which only the parameters matter."""
-    monkeypatch.setattr(inputs_module, "read_vision", lambda *_: made(Vision))
+    monkeypatch.setattr(inputs_module, "read_vision", lambda *_: made(Vision, stamp_s=None))
     monkeypatch.setattr(inputs_module, "find_stretches", lambda *_: (made(Stretch),))
     parts = {"parameters": {}, "other_aiding": (), "per_step_biases": False, **record}
     fusing = parts.pop("fusing", pd.DataFrame({"vertical": [1.0, 0.0]}))
@@ -112,7 +111,7 @@ def test_rules_of_the_releases(monkeypatch: pytest.MonkeyPatch) -> None:
     assert isinstance(new, Inputs)
     assert new.rules == Rules(0.2, 0.4, 1.0, 5, None, False)
     assert new.imu_offset_m.tolist() == [0.0, 0.25, 0.0]
-    assert (new.step_s, new.horizon_s, new.predict_s, new.max_leg_s) == (0.01, 0.1, 0.01, 0.25)
+    assert (new.step_s, new.horizon_s, new.predict_s, new.max_interval_s) == (0.01, 0.1, 0.01, 0.25)
     old = flown(monkeypatch, parameters={"EKF2_AID_MASK": 8.0}, per_step_biases=True)
     assert isinstance(old, Inputs)
     assert old.rules == Rules(math.inf, 7.0, 7.0, 1_000_000, pytest.approx(5e-4), True)

@@ -16,8 +16,8 @@ from exchange import replace
 from findings_tools import log, made
 from scipy.spatial.transform import Rotation
 
-from px4fuse.ekf2.inputs import Inputs
-from px4fuse.ekf2.legs import FUSE, GRAVITY_M_S2, IDLE, START, Timing, make_legs
+from px4fuse.ekf2.inputs import Inputs, Vision
+from px4fuse.ekf2.intervals import FUSE, GRAVITY_M_S2, IDLE, START, Timing, make_intervals
 from px4fuse.ekf2.model import Model, replay_settings
 from px4fuse.ekf2.recursion import (
     Run,
@@ -27,11 +27,11 @@ from px4fuse.ekf2.recursion import (
     _drift,
     _Fusion,
     _limit_bias,
+    _Sample,
     run,
 )
 from px4fuse.ekf2.recursion import _measurements as measurements
 from px4fuse.ekf2.stretches import Stretch
-from px4fuse.ekf2.vision import Vision
 from px4fuse.ekf2_parameters import settings_in_force
 from px4fuse.errors import SettingsError
 
@@ -75,15 +75,13 @@ def test_what_counts_as_measurement_and_noise() -> None:
     )
     turned = Rotation.from_euler("z", 90.0, degrees=True).as_matrix()
     stretch = made(Stretch, rotation=np.array([np.eye(3), turned]))
-    legs = [SimpleNamespace(sample=np.array([0]), end=np.array([1]))]
     knob = {
         "EKF2_EVP_NOISE": np.array([0.1, 0.001]), "EKF2_EV_NOISE_MD": np.array([0.0, 1.0]),
         "EKF2_EV_POS_X": np.array([0.0, 0.3]), "EKF2_EV_POS_Y": np.zeros(2),
         "EKF2_EV_POS_Z": np.zeros(2),
     }  # fmt: skip
     inputs = made(Inputs, vision=vision, imu_offset_m=np.zeros(3))
-    which = np.zeros(2, np.intp)
-    position, noise = measurements(inputs, stretch, legs, which, knob)  # type: ignore[arg-type]
+    position, noise = measurements(inputs, stretch, np.array([0]), np.array([[1]]), knob)
     # 0.3 m ahead of a body that faces east: the body is west of the sensor
     np.testing.assert_allclose(position[0], [[1.0, 2.0, 3.0], [1.0, 1.7, 3.0]], atol=1e-12)
     # what is reported, EKF2_EVP_NOISE at least; or that alone, 1 cm at least
@@ -92,17 +90,17 @@ def test_what_counts_as_measurement_and_noise() -> None:
 
 def deciding(
     *, action: int = FUSE, startable: bool = False, gated: bool = True, obeys: bool = False,
-    told: float = np.nan, told_reset: bool = False, outside: bool = True, silent_s: float = 0.5,
+    logged: float = np.nan, logged_reset: bool = False, outside: bool = True, silent_s: float = 0.5,
     stopped: bool = False, left: int = 5,
 ) -> tuple[bool, bool, bool, float, bool, int]:  # fmt: skip
     """What is rejected, taken and reset at 10 s; then last fusion, whether stopped, resets left."""
-    schedule = SimpleNamespace(
-        action=np.array([[action]]), startable=np.array([[startable]]), time_s=np.array([[10.0]]),
-        gated=np.array([gated]), obeys=np.array([obeys]), told=np.array([told]),
-        told_reset=np.array([told_reset]),
+    sample = _Sample(
+        action=np.array([action]), startable=np.array([startable]), time_s=np.array([10.0]),
+        gated=np.array([gated]), as_logged=np.array([obeys]), rejected=logged,
+        reset=logged_reset,
     )  # fmt: skip
     before = _Fusion(np.array([10.0 - silent_s]), np.array([stopped]), np.array([left]))
-    rejected, taken, reset, after = _decide(RULES, schedule, 0, np.array([outside]), before)  # type: ignore[arg-type]
+    rejected, taken, reset, after = _decide(RULES, sample, np.array([outside]), before)
     last, stop, rest = after.last_s[0], after.stopped[0], after.left[0]
     return bool(rejected[0]), bool(taken[0]), bool(reset[0]), float(last), bool(stop), int(rest)
 
@@ -122,13 +120,13 @@ def deciding(
         ({"stopped": True, "startable": True, "left": 0}, (True, False, True, 10.0, False, 5)),
         ({"action": IDLE}, (False, False, False, 9.5, False, 5)),
         # as the log tells
-        ({"obeys": True, "told": 0.0}, (False, True, False, 10.0, False, 5)),
-        ({"obeys": True, "told": 1.0, "outside": False}, (True, False, False, 9.5, False, 5)),
-        ({"obeys": True, "told": 1.0, "silent_s": 9.0, "left": 0},
+        ({"obeys": True, "logged": 0.0}, (False, True, False, 10.0, False, 5)),
+        ({"obeys": True, "logged": 1.0, "outside": False}, (True, False, False, 9.5, False, 5)),
+        ({"obeys": True, "logged": 1.0, "silent_s": 9.0, "left": 0},
          (True, False, False, 1.0, False, 0)),
-        ({"obeys": True, "told": 1.0, "told_reset": True}, (True, False, True, 10.0, False, 5)),
+        ({"obeys": True, "logged": 1.0, "logged_reset": True}, (True, False, True, 10.0, False, 5)),
         ({"obeys": True}, (True, False, False, 9.5, False, 5)),
-        ({"told": 0.0}, (True, False, False, 9.5, False, 5)),
+        ({"logged": 0.0}, (True, False, False, 9.5, False, 5)),
     ],
 )  # fmt: skip
 def test_what_is_decided_of_a_sample(case: dict[str, Any], expected: tuple[Any, ...]) -> None:
@@ -168,11 +166,11 @@ def test_a_release_without_delay_max_has_none() -> None:
 
 
 def at_rest(
-    measured_m: list[float], told: float = np.nan, down_m: float = 0.0, **settings: float
+    measured_m: list[float], logged: float = np.nan, down_m: float = 0.0, **settings: float
 ) -> Run:
     """A level vehicle that stands still at the origin, seen at 10 Hz at these places north.
 
-    EKF2 itself rejected the fourth sample where that is told.
+    EKF2 itself rejected the fourth sample where that is logged.
     """
     count = 10 * (len(measured_m) + 1)
     flat = np.zeros((count, 3))
@@ -191,14 +189,14 @@ def at_rest(
         stamp, np.full(len(stamp), -np.inf), np.column_stack([north, 0.0 * north, 0.0 * north]),
         np.zeros((len(stamp), 3)), np.full(len(stamp), np.nan), np.zeros(len(stamp), bool), "uwb",
     )  # fmt: skip
-    vision.rejected[3] = told
+    vision.rejected[3] = logged
     inputs = Inputs(
         settings_in_force(settings), (stretch,), vision, RULES, 0.01, 0.1, 0.01,
         vision_height=False, imu_offset_m=np.zeros(3),
     )  # fmt: skip
-    legs = make_legs(inputs, stretch, Timing(0.0, 0.1))
+    intervals = make_intervals(inputs, stretch, Timing(0.0, 0.1))
     variant = Variant(inputs.settings, as_logged=True)
-    return run(inputs, stretch, [legs], np.zeros(1, np.intp), [variant])
+    return run(inputs, stretch, [variant], [intervals])
 
 
 def test_a_vehicle_at_rest_stays_and_its_variance_is_the_kalman_filters() -> None:
@@ -236,10 +234,10 @@ def test_a_step_of_the_source_is_rejected_for_a_second_and_then_reset_to() -> No
 
 
 def test_what_the_log_tells_of_a_rejection_is_obeyed() -> None:
-    done = at_rest([0.0] * 6, told=1.0)
+    done = at_rest([0.0] * 6, logged=1.0)
     assert done.rejected[:, 0].tolist() == [False, False, False, True, False, False]
     assert done.fused[:, 0].tolist() == [True, True, True, False, True, True]
-    assert at_rest([0.0] * 6, told=0.0).fused.all()
+    assert at_rest([0.0] * 6, logged=0.0).fused.all()
 
 
 def test_height_follows_ekf2s_own() -> None:

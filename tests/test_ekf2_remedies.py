@@ -9,13 +9,16 @@ from exchange import replace
 from flights import Estimator, aisle_flight
 
 from px4fuse.analysis import Analysis, explain
-from px4fuse.comparison.asked import asked_of_ekf2, delay_change, noise_change, noise_used_m
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.model import Comparison
 from px4fuse.comparison.remedy import (
     Effect,
+    asked_of_ekf2,
+    delay_change,
     delay_helps,
+    noise_change,
     noise_helps,
+    noise_used_m,
     rejects_less,
     remedy_words,
 )
@@ -61,7 +64,10 @@ def summary(
     nis: float, rejected: float = 0.0, error: float | Unavailable = 0.1, std: float = 0.1
 ) -> Summary:
     axis = AxisSummary(nis, (0.9, 1.1), std, 0.05, error)
-    return Summary({}, axis, axis, 600, rejected, 0.2, 0)
+    return Summary(
+        changed={}, north=axis, east=axis, samples=600, rejected_share=rejected,
+        longest_without_fusion_s=0.2, resets=0,
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,6 @@ from findings_tools import NONE, made
 
 from px4fuse.ekf2.stretches import _counted, _stretch, down_sampled, find_stretches, predict_s
 from px4fuse.ekf2.stretches import step_ends as ends_of
-from px4fuse.ekf2.vision import Vision
 from px4fuse.flight import (
     ACCELEROMETER_BIAS_COLUMNS,
     ANGULAR_RATE_COLUMNS,
@@ -136,7 +135,7 @@ def stretches(monkeypatch: pytest.MonkeyPatch, **parts: Any) -> list[tuple[float
         pd.DataFrame(index=given["imu"]),
         made(Ekf2, innovations={"north": pd.DataFrame(index=given["fused"])}),
         made(FusionRecord, delayed=pd.DataFrame(index=given["delayed"])),
-        made(Vision, stamp_s=given["vision"]),
+        given["vision"],
     )
     return found
 

@@ -13,36 +13,23 @@ from ekf2_tools import RULES
 from exchange import replace
 from findings_tools import NONE, made
 
+from px4fuse.ekf2.agreement import along, rms_to_truth
 from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.model import Model, delayed_variants, open_model
 from px4fuse.ekf2.replay import Ekf2Replay
-from px4fuse.ekf2.walk import (
-    OUTPUT,
-    SAMPLES,
-    STEPS,
-    AxisLine,
-    AxisWalk,
-    OurFilter,
-    Walk,
-    _coast,
-    _variants,
-    walk,
-)
-from px4fuse.ekf2.walk import _to_truth as walk_to_truth
+from px4fuse.ekf2.walk import OUTPUT, SAMPLES, STEPS, Why, _coast, _variants, walk
 from px4fuse.ekf2.whatif import (
     AxisSummary,
     Summary,
     WhatIf,
     _longest,
     _notes,
-    _sigma,
-    _to_truth,
-    sweep,
-    sweep_values,
+    _of_replay,
     what_if,
 )
-from px4fuse.ekf2_parameters import PARAMETERS, check, settings_in_force
-from px4fuse.errors import SettingsError
+from px4fuse.filter.kalman import Replay
+from px4fuse.filter.settings import Settings
+from px4fuse.filter.signals import Axis
 from px4fuse.flight import STATE_COLUMNS, Ekf2, Flight, Truth, Unavailable
 
 
@@ -63,17 +50,13 @@ def test_side_by_side(model: Model) -> None:
     wide, narrow = made.whatif
     for axis in ("north", "east"):
         logged, replayed = made.logged.axes[axis], made.replayed.axes[axis]
-        assert isinstance(logged.position_rmse_to_truth_m, float)
-        assert isinstance(logged.sigma_p_median_m, float)
-        assert replayed.position_rmse_to_truth_m == pytest.approx(
-            logged.position_rmse_to_truth_m, abs=0.003
-        )
+        error_m = logged.position_rmse_to_truth_m
+        assert replayed.position_rmse_to_truth_m == pytest.approx(error_m, abs=0.003)
         assert replayed.sigma_p_median_m == pytest.approx(logged.sigma_p_median_m, rel=0.02)
         assert replayed.nis_mean == pytest.approx(logged.nis_mean, rel=0.3)
         assert wide.axes[axis].nis_mean < 0.1
         assert narrow.axes[axis].nis_mean > 5.0
-        low, high = replayed.nis_band
-        assert low < 1.0 < high
+        assert replayed.nis_band[0] < 1.0 < replayed.nis_band[1]
         # the truth knows which is best: UWB noise is 0.10 m
         assert narrow.axes[axis].position_rmse_to_truth_m > replayed.position_rmse_to_truth_m
     assert made.replayed.samples > 2 * made.logged.samples  # the log holds 2 Hz of 5 Hz
@@ -82,7 +65,6 @@ def test_side_by_side(model: Model) -> None:
     assert made.replayed.rejected_share == made.logged.rejected_share == 0.0
     assert narrow.rejected_share > 0.2
     assert narrow.resets > 0
-    assert isinstance(narrow.longest_without_fusion_s, float)
     assert narrow.longest_without_fusion_s > 1.0
     assert not made.notes
 
@@ -101,80 +83,38 @@ def test_a_flight_without_truth_has_no_rmse(model: Model) -> None:
         assert isinstance(summary.axes["north"].position_rmse_to_truth_m, Unavailable)
 
 
-def test_sweeps(model: Model) -> None:
-    values = sweep_values("EKF2_EVP_NOISE", 0.02, 0.5, 5)
-    assert values == pytest.approx(np.geomspace(0.02, 0.5, 5))
-    made = found(sweep(model, "EKF2_EVP_NOISE", values))
-    nis = [summary.axes["north"].nis_mean for summary in made.whatif]
-    assert nis == sorted(nis, reverse=True)
-    assert [summary.changed["EKF2_EVP_NOISE"] for summary in made.whatif] == values
-    assert sweep_values("EKF2_EV_DELAY", 0.0, 200.0, 5) == [0.0, 50.0, 100.0, 150.0, 200.0]
-
-
-@pytest.mark.parametrize(
-    ("name", "low", "high", "count", "said"),
-    [
-        ("EKF2_EVP_NOISE", 0.5, 0.02, 5, "smaller"),
-        ("EKF2_EVP_NOISE", 0.02, 0.5, 1, "between 2 and 200"),
-        ("EKF2_EVP_NOISE", 0.0, 0.5, 5, "outside PX4's range"),
-        ("EKF2_BARO_NOISE", 1.0, 2.0, 5, "does not have this parameter"),
-    ],
-)
-def test_senseless_sweeps_are_refused(
-    name: str, low: float, high: float, count: int, said: str
-) -> None:
-    with pytest.raises(SettingsError, match=said):
-        sweep_values(name, low, high, count)
-
-
-def test_parameters_are_checked_by_name_and_range() -> None:
-    with pytest.raises(SettingsError) as error:
-        check({"EKF2_HEAD_NOISE": 0.3})
-    assert all(name in str(error.value) for name in PARAMETERS)
-    assert "\n" not in str(error.value)
-    for name, value in (
-        ("EKF2_EVP_NOISE", 0.0), ("EKF2_EV_DELAY", -1.0), ("EKF2_EV_DELAY", float("nan")),
-        ("EKF2_EVP_GATE", 0.5), ("EKF2_EV_NOISE_MD", 0.5), ("EKF2_EV_POS_X", float("inf")),
-    ):  # fmt: skip
-        with pytest.raises(SettingsError, match=name):
-            check({name: value})
-    for name, parameter in PARAMETERS.items():
-        assert check({name: parameter.default}) == {name: parameter.default}
-
-
-def test_defaults_are_the_releases() -> None:
-    assert settings_in_force({})["EKF2_EV_DELAY"] == 0.0
-    assert settings_in_force({"EKF2_AID_MASK": 8.0})["EKF2_EV_DELAY"] == 175.0
-    assert settings_in_force({"EKF2_AID_MASK": 0.0, "EKF2_EV_CTRL": 1.0})["EKF2_EV_DELAY"] == 0.0
-    assert settings_in_force({"EKF2_EVP_NOISE": 0.2})["EKF2_EVP_NOISE"] == 0.2
-
-
 def stages(model: Model) -> dict[str, pd.DataFrame]:
     """Track of the filter after each step."""
-    variants = _variants(model, OurFilter())
-    delayed, flown = delayed_variants(model, list(variants.values()))
-    tracks = (*delayed, flown.delayed, flown.published)
-    return dict(zip((*variants, OUTPUT), tracks, strict=True))
+    delayed, flown = delayed_variants(model, list(_variants(model, Settings()).values()))
+    return dict(zip(STEPS, (*delayed, flown.delayed, flown.published), strict=True))
 
 
-def walked(result: Walk | Unavailable) -> Walk:
-    assert isinstance(result, Walk)
+def walked(model: Model, *given: Any) -> dict[str, Why]:
+    result = walk(model, *given)
+    assert isinstance(result, dict)
     return result
 
 
+def on_track(track: pd.DataFrame, off_m: float = 0.0, direction: Any = (1.0, 0.0, 0.0)) -> Replay:
+    """A run of ours that is where a track is along a direction, at the track's times."""
+    weights = np.array(direction)
+    state = {
+        "position_m": track[STATE_COLUMNS[:3]].to_numpy() @ weights + off_m,
+        "velocity_m_s": track[STATE_COLUMNS[3:]].to_numpy() @ weights,
+        "acceleration_m_s2": 0.0,
+    }
+    axis = made(Axis, direction=weights)
+    return made(Replay, axis=axis, steps=pd.DataFrame(state, index=track.index))
+
+
 def test_the_bars_add_up_and_little_is_left(model: Model) -> None:
-    made = walked(walk(model))
-    assert made.coast is None
-    for axis in made.axes.values():
+    for axis in walked(model).values():
+        assert axis.coast is None
         assert tuple(step.name for step in axis.steps) == STEPS
-        position = sum(step.position_mean_square_m2 for step in axis.steps)
-        velocity = sum(step.velocity_mean_square_m2_s2 for step in axis.steps)
-        assert position + axis.position_left_mean_square_m2 == pytest.approx(
-            axis.position_mean_square_m2, abs=1e-12
-        )
-        assert velocity + axis.velocity_left_mean_square_m2_s2 == pytest.approx(
-            axis.velocity_mean_square_m2_s2, abs=1e-12
-        )
+        for quantity in ("position_mean_square_m2", "velocity_mean_square_m2_s2"):
+            left = getattr(axis, quantity.replace("_mean", "_left_mean"))
+            total = sum(getattr(step, quantity) for step in axis.steps) + left
+            assert total == pytest.approx(getattr(axis, quantity), abs=1e-12)
         assert axis.position_left_share < 0.03
         by_name = {step.name: step for step in axis.steps}
         # what is the same in both filters moves nothing
@@ -186,85 +126,66 @@ def test_the_bars_add_up_and_little_is_left(model: Model) -> None:
         assert last == pytest.approx(axis.position_rmse_to_truth_m["ekf2"], abs=0.003)
 
 
-def test_the_ends_of_the_walk_are_student_and_model_against_log(model: Model) -> None:
-    made = walked(walk(model))
+def test_the_ends_of_the_walk_are_ours_and_model_against_log(model: Model) -> None:
+    axes, tracks = walked(model), stages(model)
     assert isinstance(model.flight.ekf2, Ekf2)
-    logged = model.flight.ekf2.state
-    tracks = stages(model)
-    inside = (logged.index > model.flown.stretches_s[0][0] + 5.0) & (
-        logged.index < model.flown.stretches_s[0][1]
-    )
-    times = logged.index[inside]
-    assert len(made.times_s) == pytest.approx(len(times), abs=2)
-    for axis in ("north", "east"):
-        for ours, name in (
-            (tracks[SAMPLES], "position_mean_square_m2"),
-            (tracks[OUTPUT], "position_left_mean_square_m2"),
+    logged, (start, end) = model.flight.ekf2.state, model.flown.stretches_s[0]
+    times = logged.index[(logged.index > start + 5.0) & (logged.index < end)]
+    for name, axis in axes.items():
+        assert len(axis.times_s) == pytest.approx(len(times), abs=2)
+        for ours, square in (
+            (tracks[SAMPLES], axis.position_mean_square_m2),
+            (tracks[OUTPUT], axis.position_left_mean_square_m2),
         ):
-            there = np.interp(times, ours.index, ours[f"{axis}_m"])
-            square = np.mean((there - logged.loc[times, f"{axis}_m"]) ** 2)
-            assert getattr(made.axes[axis], name) == pytest.approx(square, rel=0.02)
+            there = np.interp(times, ours.index, ours[f"{name}_m"])
+            apart = there - logged.loc[times, f"{name}_m"]
+            assert square == pytest.approx(np.mean(apart**2), rel=0.02)
 
 
-def test_the_walk_starts_where_the_student_is(model: Model) -> None:
-    plain = walked(walk(model))
-    noisy = walked(walk(model, OurFilter(sigma_z_m=0.5)))
-    north = plain.axes["north"], noisy.axes["north"]
-    assert north[1].position_mean_square_m2 != pytest.approx(
-        north[0].position_mean_square_m2, rel=0.05
+def test_the_walk_starts_with_our_settings(model: Model) -> None:
+    plain, noisy, late = (
+        walked(model, settings)["north"]
+        for settings in (Settings(), Settings(sigma_z_m=0.5), Settings(clock_offset_s=-0.3))
     )
-    assert north[1].position_left_mean_square_m2 == pytest.approx(
-        north[0].position_left_mean_square_m2, rel=1e-9
-    )
-    assert abs(noisy.axes["north"].steps[2].position_mean_square_m2) > 1e-5
-    late = walked(walk(model, OurFilter(clock_offset_s=-0.3)))
-    assert late.axes["north"].steps[0].position_moved_m == 0.0
-    assert late.axes["north"].steps[1].position_moved_m > 0.2
+    square = plain.position_mean_square_m2
+    assert noisy.position_mean_square_m2 != pytest.approx(square, rel=0.05)
+    left = plain.position_left_mean_square_m2
+    assert noisy.position_left_mean_square_m2 == pytest.approx(left, rel=1e-9)
+    assert abs(noisy.steps[2].position_mean_square_m2) > 1e-5
+    assert late.steps[0].position_moved_m == 0.0
+    assert late.steps[1].position_moved_m > 0.2
 
 
-def test_a_track_of_ones_own_is_the_first_step(model: Model) -> None:
-    plain = walked(walk(model))
-    # a track of one's own: 0.4 m off, so that 0.16 m² more are to be explained by the first step
-    first = stages(model)[SAMPLES]
-    track = pd.DataFrame({"position_m": first["north_m"] + 0.4, "velocity_m_s": first["north_m_s"]})
-    own = walked(walk(model, lines={"north": AxisLine(1.0, 0.0, track)})).axes["north"]
-    bias = np.mean(track["position_m"] - model.flown.published["north_m"])
-    assert own.position_mean_square_m2 > 0.8 * bias**2
-    assert own.position_mean_square_m2 == pytest.approx(
-        own.position_left_mean_square_m2 + sum(step.position_mean_square_m2 for step in own.steps),
-        abs=1e-12,
-    )
-    assert own.steps[0].position_moved_m == pytest.approx(0.4, abs=1e-6)
-    for ours, theirs in zip(own.steps[1:], plain.axes["north"].steps[1:], strict=True):
+def test_a_run_of_ones_own_is_the_first_step(model: Model) -> None:
+    plain, first = walked(model)["north"], stages(model)[SAMPLES]
+    # 0.4 m off, so that 0.16 m² more are to be explained by the first step
+    own = walked(model, Settings(), {"north": on_track(first, 0.4)})["north"]
+    assert own.position_mean_square_m2 > 0.8 * 0.4**2
+    parts = [own.position_left_mean_square_m2, *(s.position_mean_square_m2 for s in own.steps)]
+    assert own.position_mean_square_m2 == pytest.approx(sum(parts), abs=1e-12)
+    assert own.steps[0].position_moved_m == pytest.approx(0.4, abs=0.01)
+    for ours, theirs in zip(own.steps[1:], plain.steps[1:], strict=True):
         assert ours.position_mean_square_m2 == pytest.approx(theirs.position_mean_square_m2)
+    elsewhere = first.set_axis(first.index + 1e4)
+    result = walk(model, Settings(), {"north": on_track(elsewhere)})
+    assert isinstance(result, Unavailable)
+    assert "no time in common" in result.reason
 
 
 def test_a_slanted_axis_is_the_projection(model: Model) -> None:
-    half = np.sqrt(0.5)
-    made = walked(
-        walk(model, lines={"aisle": AxisLine(half, half), "across": AxisLine(half, -half)})
-    ).axes
-    plain = walked(walk(model)).axes
+    half, first = np.sqrt(0.5), stages(model)[SAMPLES]
+    ways = {"aisle": (half, half, 0.0), "across": (half, -half, 0.0)}
+    turned, plain = (
+        walked(model, Settings(), {n: on_track(first, direction=way) for n, way in some.items()})
+        for some in (ways, {"north": (1.0, 0.0, 0.0), "east": (0.0, 1.0, 0.0)})
+    )
     for name in (
-        "position_mean_square_m2",
-        "position_left_mean_square_m2",
-        "velocity_mean_square_m2_s2",
-    ):
-        sums = [sum(getattr(axis, name) for axis in axes.values()) for axes in (made, plain)]
+        "position_mean_square_m2", "position_left_mean_square_m2", "velocity_mean_square_m2_s2",
+    ):  # fmt: skip
+        sums = [sum(getattr(axis, name) for axis in axes.values()) for axes in (turned, plain)]
         assert sums[0] == pytest.approx(sums[1], rel=1e-9)  # turning keeps the squares
-    assert made["aisle"].position_mean_square_m2 != pytest.approx(
-        plain["north"].position_mean_square_m2
-    )
-
-
-def test_a_track_of_another_time_is_refused(model: Model) -> None:
-    elsewhere = pd.DataFrame(
-        {"position_m": 0.0, "velocity_m_s": 0.0},
-        index=pd.Index(model.flown.delayed.index.to_numpy() + 1e4, name="time_s"),
-    )
-    result = walk(model, lines={"north": AxisLine(1.0, 0.0, elsewhere)})
-    assert isinstance(result, Unavailable)
-    assert "no time in common" in result.reason
+    north = plain["north"].position_mean_square_m2
+    assert turned["aisle"].position_mean_square_m2 != pytest.approx(north)
 
 
 # ---------------------------------------------------------------- on numbers whose answer is known
@@ -273,12 +194,13 @@ def test_a_track_of_another_time_is_refused(model: Model) -> None:
 def test_the_walk_changes_one_thing_after_the_other() -> None:
     flown = {"EKF2_EVP_NOISE": 0.3, "EKF2_EV_NOISE_MD": 0.0, "EKF2_ACC_NOISE": 0.35}
     model = made(Model, inputs=made(Inputs, settings=flown, step_s=0.01))
-    found = list(_variants(model, OurFilter(0.5, 0.2, 0.16, -0.05)).values())
-    assert [one.settings["EKF2_ACC_NOISE"] for one in found] == pytest.approx(
-        [2.0] * 4 + [0.35] * 3
-    )
-    assert [one.settings["EKF2_EVP_NOISE"] for one in found] == [0.2] * 2 + [0.3] * 5
-    assert [one.settings["EKF2_EV_NOISE_MD"] for one in found] == [1.0] * 2 + [0.0] * 5
+    ours = Settings(0.5, 0.2, 0.16, clock_offset_s=-0.05)
+    found = list(_variants(model, ours).values())
+    settings = [one.settings for one in found]
+    assert [s["EKF2_ACC_NOISE"] for s in settings] == pytest.approx([2.0] * 4 + [0.35] * 3)
+    assert [s["EKF2_EVP_NOISE"] for s in settings] == [0.2] * 2 + [0.3] * 5
+    assert [s["EKF2_EV_NOISE_MD"] for s in settings] == [1.0] * 2 + [0.0] * 5
+    assert settings[0]["EKF2_EV_POS_X"] == 0.0
     assert [one.biases for one in found] == [False] * 3 + [True] * 4
     assert [one.attitude for one in found] == [False] * 5 + [True] * 2
     assert [one.gated for one in found] == [False] * 6 + [True]
@@ -286,7 +208,7 @@ def test_the_walk_changes_one_thing_after_the_other() -> None:
     assert [one.stamp_offset_s for one in found] == [-0.05] + [None] * 6
 
 
-def test_the_longest_run_of_rejections_is_told_with_how_far_it_led() -> None:
+def test_the_longest_run_of_rejections_is_said_with_how_far_it_led() -> None:
     taken = 20.0 + np.arange(10.0)
     updates = pd.DataFrame(
         {"rejected": [0, 1, 0, 0, 1, 1, 1, 0, 1, 1], "fused_at_s": taken + 0.5}, index=taken
@@ -308,25 +230,17 @@ def test_the_longest_run_of_rejections_is_told_with_how_far_it_led() -> None:
     assert _coast(one, still, (22.4, 24.4), ((0.0, 99.0),)) is None
 
 
-def truth_of(where: dict[str, float]) -> Truth:
-    frame = pd.DataFrame(0.0, index=[10.0, 20.0], columns=STATE_COLUMNS)
-    return made(Truth, samples=frame.assign(**where))
-
-
 def test_errors_to_the_truth_are_of_its_own_span() -> None:
-    times = np.array([9.0, 10.0, 15.0, 20.0, 21.0])
-    off = np.array([9.0, 3.0, 4.0, 5.0, 9.0])
-    flight = made(Flight, truth=truth_of({"north_m": 1.0, "east_m": 2.0}))
-    line = AxisLine(0.6, 0.8)  # along which the truth is at 2.2 m
-    model = SimpleNamespace(flight=flight)
-    found = walk_to_truth(model, 2.2 + off, line, times)  # type: ignore[arg-type]
-    assert found == pytest.approx(math.sqrt(50.0 / 3.0))
-    later = walk_to_truth(model, off[:1], line, times[:1])  # type: ignore[arg-type]
-    assert isinstance(later, Unavailable)
-    published = pd.DataFrame({"east_m": 2.0 + off}, index=times)
-    assert _to_truth(flight, published, "east", times) == pytest.approx(math.sqrt(50.0 / 3.0))
-    assert isinstance(_to_truth(flight, published, "east", times[:1]), Unavailable)
-    assert isinstance(_to_truth(made(Flight, truth=NONE), published, "east", times), Unavailable)
+    times, direction = np.array([9.0, 10.0, 15.0, 20.0, 21.0]), np.array([0.6, 0.8, 0.0])
+    frame = pd.DataFrame(0.0, index=[10.0, 20.0], columns=STATE_COLUMNS)
+    truth = made(Truth, samples=frame.assign(north_m=[0.0, 2.0], east_m=2.0))
+    there = along(truth.samples, ["north_m", "east_m"], direction, times)
+    assert there == pytest.approx([1.6, 1.6, 2.2, 2.8, 2.8])
+    off, flight = np.array([9.0, 3.0, 4.0, 5.0, 9.0]), made(Flight, truth=truth)
+    error = rms_to_truth(flight, there + off, direction, times)
+    assert error == pytest.approx(math.sqrt(50.0 / 3.0))
+    assert rms_to_truth(flight, there[:1], direction, times[:1]) is None
+    assert rms_to_truth(made(Flight, truth=NONE), there, direction, times) is None
 
 
 def test_the_longest_time_without_fusion_counts_both_ends() -> None:
@@ -336,29 +250,48 @@ def test_the_longest_time_without_fusion_counts_both_ends() -> None:
     assert _longest(np.array([16.0]), judged) == 44.0
 
 
-def test_the_stated_sigma_goes_from_after_one_sample_to_before_the_next() -> None:
+@pytest.mark.parametrize("stated", [True, False])
+def test_the_stated_sigma_goes_from_after_one_sample_to_before_the_next(stated: bool) -> None:
     """At the middle between them the variance is the mean of 0.01 after and 0.09 before."""
+    both = {
+        f"{part}_{axis}_{unit}": values
+        for axis in ("north", "east")
+        for part, unit, values in (
+            ("innovation", "m", [0.1, 0.3]), ("innovation_variance", "m2", [0.05, 0.13]),
+            ("observation_variance", "m2", [0.04, 0.04]),
+            ("position_variance", "m2", [0.01, 0.02]),
+        )
+    }  # fmt: skip
     updates = pd.DataFrame(
-        {
-            "innovation_variance_east_m2": [0.05, 0.13], "observation_variance_east_m2": 0.04,
-            "position_variance_east_m2": [0.01, 0.02], "fused_at_s": [20.0, 22.0],
-        }
-    )  # fmt: skip
-    ekf2 = made(Ekf2, variance=pd.DataFrame(index=[21.0]))
-    one = made(Ekf2Replay, updates=updates)
-    assert _sigma(ekf2, one, "east", ((10.0, 30.0),)) == pytest.approx(math.sqrt(0.05))
-    assert _sigma(made(Ekf2, variance=NONE), one, "east", ((10.0, 30.0),)) is NONE
+        {**both, "fused_at_s": [20.0, 22.0], "fused": 1.0, "rejected": [0.0, 1.0], "reset": 0.0},
+        index=[20.0, 22.0],
+    )
+    state = pd.DataFrame(0.0, index=[20.0, 21.0], columns=STATE_COLUMNS)
+    variance = pd.DataFrame({"north_m2": 9.0, "east_m2": 9.0}, index=[21.0]) if stated else NONE
+    flight = made(Flight, ekf2=made(Ekf2, state=state, variance=variance), truth=NONE)
+    replay = made(Ekf2Replay, updates=updates, published=state, changed={}, late=1, lost=2)
+    found = _of_replay(flight, replay, ((10.0, 30.0),))
+    for axis in found.axes.values():
+        assert axis.nis_mean == pytest.approx((0.01 / 0.05 + 0.09 / 0.13) / 2.0)
+        assert axis.innovation_std_m == pytest.approx(0.1)
+        expected = pytest.approx(math.sqrt(0.05)) if stated else NONE
+        assert axis.sigma_p_median_m == expected
+    assert (found.samples, found.rejected_share, found.late, found.lost) == (2, 0.5, 1, 2)
 
 
 def test_a_summary_joins_north_and_east() -> None:
     def axis(nis: float, error: Any) -> AxisSummary:
         return AxisSummary(nis, (0.9, 1.1), 0.1, 0.1, error)
 
-    one = Summary({}, axis(1.0, 0.3), axis(3.0, 0.4), 9, 0.0, 0.1, 0)
+    one = Summary(
+        changed={}, north=axis(1.0, 0.3), east=axis(3.0, 0.4), samples=9, rejected_share=0.0,
+        longest_without_fusion_s=0.1, resets=0,
+    )  # fmt: skip
     assert one.nis_mean == 2.0
     assert one.position_rmse_to_truth_m == pytest.approx(0.5)
-    lacking = replace(one, east=axis(3.0, NONE))
-    assert lacking.position_rmse_to_truth_m is NONE
+    assert replace(one, east=axis(3.0, NONE)).position_rmse_to_truth_m is NONE
+    why = made(Why, position_left_mean_square_m2=1.0, position_mean_square_m2=4.0)
+    assert why.position_left_share == 0.25
 
 
 def test_samples_that_come_too_late_are_a_note() -> None:
@@ -374,15 +307,3 @@ def test_samples_that_come_too_late_are_a_note() -> None:
         assert _notes(model, SimpleNamespace(late=0, lost=0)) == []  # type: ignore[arg-type]
         one.late, one.changed = 0, {}
         assert _notes(model, one)[0].startswith("as flown: 2 of 10 samples")  # type: ignore[arg-type]
-
-
-def test_what_is_left_is_a_share_of_all() -> None:
-    assert (
-        made(
-            AxisWalk, position_left_mean_square_m2=1.0, position_mean_square_m2=4.0
-        ).position_left_share
-        == 0.25
-    )
-    frame = pd.DataFrame({"north_m": [0.0, 2.0], "east_m": [4.0, 4.0]}, index=[0.0, 1.0])
-    along = AxisLine(0.6, 0.8).along(frame, ["north_m", "east_m"], np.array([0.5]))
-    assert along == pytest.approx([3.8])

@@ -19,11 +19,11 @@ from ulog_tools import Log, make_log, stamps, topic
 
 from px4fuse.cli import cli
 from px4fuse.comparison.comparison import compare
-from px4fuse.contents import extraction
 from px4fuse.filter.kalman import state_at
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import ned_acceleration
 from px4fuse.flight import QUATERNION_COLUMNS, Flight, Reset, Unavailable
+from px4fuse.inspect import tables as extraction
 from px4fuse.readers import read_log
 from px4fuse.recording import ClockMap, Dropout, InputFile
 

@@ -16,7 +16,7 @@ from flights import aisle_flight, unavailable, unexplained
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.comparison import compare
-from px4fuse.comparison.estimates import tuned_horizontally
+from px4fuse.comparison.estimates import noises_and_clock
 from px4fuse.filter import hypotheses
 from px4fuse.filter.causes import Explained, explained
 from px4fuse.filter.hypotheses import (
@@ -67,7 +67,7 @@ NAMED_HERE = {name for detector in DETECTORS for name in detector.names}
 def analysed(flight: Flight, **span: float) -> Analysis:
     """A flight with its noises, all that the detectors here need."""
     comparison = compare(flight, RIGHT, axes=("north", "east"), **span)
-    return replace(unexplained(comparison), tuning=tuned_horizontally(comparison))
+    return replace(unexplained(comparison), tuning=noises_and_clock(comparison)[0])
 
 
 @cache

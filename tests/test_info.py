@@ -19,11 +19,11 @@ from px4fuse.cli.info import _print
 from px4fuse.cli.outputs import terminal
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.preparation import choose_source
-from px4fuse.contents.inventory import Inventory, Source, take_inventory, to_plain
-from px4fuse.contents.outlook import Ability
 from px4fuse.errors import Px4FuseError
 from px4fuse.findings import find
 from px4fuse.flight import Flight, Unavailable
+from px4fuse.inspect.inventory import Inventory, Source, take_inventory, to_plain
+from px4fuse.inspect.outlook import Ability
 from px4fuse.origin import GNSS
 from px4fuse.readers import read_log
 from px4fuse.recording import ClockMap, Dropout, Sender

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import re
 import subprocess
 import sys
 from html.parser import HTMLParser
@@ -287,14 +288,14 @@ def test_tables_are_tidy_with_units(results, name):
     table = results[name].to_frame()
     assert len(table) >= 1
     assert table.columns.is_unique
-    without_unit = {
-        "nis_mean", "nis_low", "nis_high", "outside_two_sigma", "lag1_autocorrelation", "gain_nats",
-        "rejected_share", "w", "x", "y", "z",
-        "a", "b", "change", "change_low", "change_high", "p", "q",  # a column has the unit
-    }  # fmt: skip
-    units = ("_m", "_s", "_m_s", "_m_s2", "_m2", "_m2_s2", "_deg")
+    without_unit = (
+        "nis_mean|nis_band|nees_|outside_|autocorrelation|gain_nats|_share|sigma_factor|_p$|bias_t|_lags|count|"
+        # a column has the unit
+        "^([wxyzabpq]|change|change_low|change_high|delta)$|_block"
+    )
+    unit = r"_(m|s|m_s|m_s2|m2|m2_s2|deg)(_(interval|low|high|rmse|mean|median|std|min|max)|$)"
     for column in table.select_dtypes("floating"):
-        assert column in without_unit or column.endswith(units), column
+        assert re.search(f"{unit}|{without_unit}", column), column
 
 
 def test_tables_hold_the_results(results, analysis):
@@ -315,10 +316,10 @@ def test_tables_hold_the_results(results, analysis):
     positions = results["Flight"].to_frame().groupby("track")
     assert positions.size()["EKF2"] == len(analysis.flight.ekf2.state)
     evaluation = results["Evaluation"]
-    scores = evaluation.to_frame().set_index("score")["rmse_m"]
+    scores = evaluation.to_frame().set_index("score")["translation_m_rmse"]
     assert scores["ATE"] == evaluation.ate.translation_m.rmse
     assert scores["RPE 5 m"] == evaluation.rpe[1].translation_m.rmse
-    changed = results["WhatIf"].to_frame().set_index("ekf2")["nis_mean"]
+    changed = results["WhatIf"].to_frame().set_index("ekf2")["north_nis_mean"]
     assert changed["EKF2_EVP_NOISE=0.3"] < 0.3 * changed["logged"]
 
 

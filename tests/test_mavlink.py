@@ -48,7 +48,6 @@ from scipy.spatial.transform import Rotation
 from test_bad_logs import patience
 
 from px4fuse.comparison.comparison import compare
-from px4fuse.contents.inventory import take_inventory
 from px4fuse.errors import LogError, MissingDataError, Px4FuseError, SettingsError
 from px4fuse.filter.kalman import state_at
 from px4fuse.filter.settings import Settings
@@ -67,6 +66,7 @@ from px4fuse.flight import (
     Truth,
     Unavailable,
 )
+from px4fuse.inspect.inventory import take_inventory
 from px4fuse.origin import MOTION_CAPTURE, RECEIVED
 from px4fuse.readers import read_log
 from px4fuse.readers.mavlink_frames import read_frames

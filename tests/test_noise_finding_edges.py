@@ -28,8 +28,7 @@ from findings_tools import (
 from test_finding_edges import against_truth, axis, hiding, severity, statement
 
 from px4fuse.comparison.model import Difference
-from px4fuse.comparison.why import Why
-from px4fuse.comparison.why_words import STAMPS_WRONG
+from px4fuse.ekf2.walk import Why
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.tuning import HeldOut, Noise
 from px4fuse.findings import (
@@ -541,7 +540,7 @@ def test_what_weighs_most_is_told_in_order() -> None:
     def found(name: str, level: Any = "error", **parts: Any) -> Finding:
         return Finding(name, level, f"It is {name}: so.", "Do.", **parts)
 
-    why = made(Why, sentences=(f"{STAMPS_WRONG} late.", "The rest is the noise; most at 4 s."))
+    why = made(Why, cause="The rest is the noise.")
     one = flight_of(along(1.0, 1.0, difference=NONE), why={"aisle": why})
     told = story(one, (found("ekf2_resets"), found("no_motion", "info"), found("imu_gap")))
     assert told[1:] == ("It is imu_gap.", "The rest is the noise.")

@@ -12,7 +12,7 @@ from flights import Imu, aisle_flight
 
 from px4fuse.analysis import Analysis, explain
 from px4fuse.comparison.comparison import compare
-from px4fuse.comparison.estimates import clock_offset
+from px4fuse.comparison.estimates import noises_and_clock
 from px4fuse.filter.clock import ClockOffset
 from px4fuse.filter.tuning import AxisTuning
 from px4fuse.findings import find
@@ -91,7 +91,7 @@ def recorded(flight: Flight, topic: str) -> Flight:
 def test_a_clock_offset_needs_the_whole_imu(topic, imu_hz, needed) -> None:
     """A sample that telemetry picks out of many is no mean over its interval."""
     flight = recorded(aisle_flight(duration_s=40.0, imu=Imu(rate_hz=imu_hz)), topic)
-    found = clock_offset(compare(flight, axes=("north", "east")), {})
+    _, found = noises_and_clock(compare(flight, axes=("north", "east")))
     if needed is None:
         assert isinstance(found, ClockOffset)
         return

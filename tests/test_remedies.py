@@ -10,10 +10,9 @@ import pytest
 from exchange import replace
 
 from px4fuse.analysis import Analysis, explain
-from px4fuse.comparison.asked import asked_of_ekf2
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.model import AgainstTruth, Comparison
-from px4fuse.comparison.remedy import filter_words
+from px4fuse.comparison.remedy import asked_of_ekf2, filter_words
 from px4fuse.ekf2.model import Model
 from px4fuse.ekf2.whatif import what_if
 from px4fuse.filter.settings import Settings

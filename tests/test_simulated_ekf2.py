@@ -14,8 +14,8 @@ from flights import unexplained
 from px4fuse.analysis import explain
 from px4fuse.cli import cli
 from px4fuse.comparison.comparison import compare
-from px4fuse.ekf2.model import MODEL_NOTE, open_model, replay_ekf2
-from px4fuse.ekf2.replay import Agreement, Ekf2Replay
+from px4fuse.ekf2.model import MODEL_NOTE, Model, open_model
+from px4fuse.ekf2.replay import Agreement
 from px4fuse.ekf2.whatif import WhatIf, what_if
 from px4fuse.errors import SettingsError
 from px4fuse.filter.consistency import nis_band
@@ -53,10 +53,9 @@ def fused(flight: Flight, axis: str = "north") -> pd.DataFrame:
 
 
 def agreement(flight: Flight) -> Agreement:
-    replay = replay_ekf2(flight)
-    assert isinstance(replay, Ekf2Replay), replay
-    assert replay.agreement is not None
-    return replay.agreement
+    model = open_model(flight)
+    assert isinstance(model, Model), model
+    return model.agreement
 
 
 def rmse(flight: Flight, start_s: float, end_s: float, column: str = "north_m") -> float:
@@ -138,8 +137,6 @@ def test_clean_flights_are_consistent_and_near_the_truth() -> None:
 
 def test_the_horizon_state_is_as_good_as_it_says(clean: Flight) -> None:
     """Position and velocity at the horizon, their variances, and the biases that it learns."""
-    replay = replay_ekf2(clean)
-    assert isinstance(replay, Ekf2Replay)
     assert isinstance(clean.truth, Truth)
     record, truth = of(clean).record, clean.truth.samples
     assert isinstance(record, FusionRecord)

@@ -11,10 +11,9 @@ from page_tools import axes_of, words
 from px4fuse.analysis import Analysis, explain
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.model import Comparison
-from px4fuse.comparison.why import Why, why_ekf2_differs
-from px4fuse.comparison.why_words import STAMPS_WRONG
+from px4fuse.comparison.why import why_ekf2_differs
 from px4fuse.ekf2.model import Model
-from px4fuse.ekf2.walk import SAMPLES, STEPS
+from px4fuse.ekf2.walk import SAMPLES, STEPS, Why
 from px4fuse.filter.clock import ClockOffset
 from px4fuse.filter.kalman import state_at
 from px4fuse.filter.settings import Settings
@@ -275,10 +274,8 @@ class TestFlownFlights:
 
 
 def test_the_story_leaves_wrong_stamps_to_their_finding(sample: Analysis) -> None:
-    sentences = (
-        f"{STAMPS_WRONG} late by 0.30 s for both filters alike.",
-        "Most of it is the noise (60% of the mean square): 0.1 m; most at 3.0 s, where it moves.",
-    )
-    why = {"aisle": replace(of(sample), sentences=sentences)}
-    told = story(replace(sample, why=why), ())
-    assert told[1:] == ("Most of it is the noise (60% of the mean square): 0.1 m.",)
+    late = again(sample, sample, clock=offset(sample.clock, -0.25))
+    told = story(replace(sample, why={"aisle": late}), ())
+    assert told[1:] == (late.cause,)
+    assert late.sentences[1].startswith(late.cause.removesuffix("."))
+    assert "; most at" not in late.cause

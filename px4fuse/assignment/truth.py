@@ -10,7 +10,7 @@ import numpy as np
 
 from px4fuse.answers import GATED, Quantity, asked
 from px4fuse.comparison.comparison import compare
-from px4fuse.comparison.estimates import clock_offset, tuned_horizontally
+from px4fuse.comparison.estimates import noises_and_clock
 from px4fuse.comparison.model import AxisComparison, Comparison, FilterName, FilterSummary
 from px4fuse.filter.clock import ClockOffset
 from px4fuse.filter.kalman import replay
@@ -132,7 +132,7 @@ def _wrong(
     off = LANDED_WITHIN_M if name == "open-end" else TOLERANCE * abs(size)
     low, high = size - off, size + off
     if name == "clock-offset":  # what an ideal analysis of the log can tell
-        found = clock_offset(comparison, tuned_horizontally(comparison))
+        _, found = noises_and_clock(comparison)
         if isinstance(found, ClockOffset) and found.determinable:
             low, high = min(low, -found.interval_s[1]), max(high, -found.interval_s[0])
     start_s, end_s = truth["airborne_s"]

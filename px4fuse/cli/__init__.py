@@ -170,10 +170,10 @@ def _open_streams() -> None:
 
 def _in_options(text: str, command: str | None) -> str:
     """The text of an error as somebody who typed a command reads it."""
-    from px4fuse.request import ARGUMENTS, EVALUATION_OPTIONS, LOOP_OPTIONS, with_options
+    from px4fuse.request import EVALUATION_OPTIONS, LOOP_OPTIONS, OPTIONS, with_options
 
     tables = {"loop": LOOP_OPTIONS, "evaluate": EVALUATION_OPTIONS}
-    return with_options(text, tables.get(command or "", ARGUMENTS))
+    return with_options(text, tables.get(command or "", OPTIONS))
 
 
 def _say(text: str) -> None:

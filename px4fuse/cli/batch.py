@@ -6,6 +6,7 @@ import gc
 import sys
 import time
 from functools import partial
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -25,49 +26,8 @@ from px4fuse.errors import OutputError, SettingsError
 from px4fuse.fleet import TIMEOUT_S
 
 FAILED, WORSE = "failed", "worse"
-# How a cluster of each kind is started, for people who have one
-CLUSTERS = {
-    "slurm": """\
-px4fuse uses a Dask cluster that runs. On Slurm, Dask starts one with dask-jobqueue. On a login
-node, with px4fuse[batch] installed where the jobs run:
-
-    pip install dask-jobqueue
-    python - <<'END'
-    from dask_jobqueue import SLURMCluster
-    cluster = SLURMCluster(cores=1, processes=1, memory="4GB", walltime="04:00:00")
-    cluster.scale(jobs=50)  # each is a worker with one thread, as px4fuse requires
-    print(cluster.scheduler_address, flush=True)
-    input("Press Enter to end the cluster. ")
-    END
-
-Then, in another shell, with the address that it printed:
-
-    px4fuse batch LOGS -o DIR --scheduler tcp://ADDRESS:PORT
-
-LOGS must lie on a disk that all nodes see at the same path, or be URLs.
-""",
-    "kubernetes": """\
-px4fuse uses a Dask cluster that runs. On Kubernetes, Dask starts one with dask-kubernetes. Build
-an image of Python with px4fuse[batch], then, where kubectl works:
-
-    pip install dask-kubernetes
-    helm install --repo https://helm.dask.org --create-namespace -n dask-operator \\
-        --generate-name dask-kubernetes-operator
-    python - <<'END'
-    from dask_kubernetes.operator import KubeCluster
-    cluster = KubeCluster(name="px4fuse", image="YOUR/IMAGE", n_workers=50,
-        worker_command="dask worker --nthreads 1")
-    input("Press Enter to end the cluster. ")
-    END
-
-Then, in another shell:
-
-    kubectl port-forward service/px4fuse-scheduler 8786
-    px4fuse batch LOGS -o DIR --scheduler tcp://localhost:8786
-
-LOGS should be URLs (s3://, gs://), whose package (s3fs, gcsfs) is in the image too.
-""",
-}
+# How a cluster of each kind is started, for people who have one: beside this file, as NAME.txt
+CLUSTERS = ("slurm", "kubernetes")
 
 
 @click.command()
@@ -137,7 +97,7 @@ def batch(
     what is new, and tries again what has failed; Ctrl-C keeps what is done.
     """
     if scheduler in CLUSTERS:
-        click.echo(CLUSTERS[scheduler], nl=False)
+        click.echo(files("px4fuse.cli").joinpath(f"{scheduler}.txt").read_text("utf-8"), nl=False)
         return
     if output is None:
         raise SettingsError("say with -o which folder the table goes to.")

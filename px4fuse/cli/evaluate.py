@@ -10,9 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from px4fuse.cli.inputs import Named, max_size_option, path_option, system_option
+from px4fuse.cli.inputs import Named, max_size_option, path_option, request_options
 from px4fuse.cli.outputs import finish, free_report, progress, report_paths
-from px4fuse.cli.quantity import TypedQuantity
 from px4fuse.errors import OutputError, SettingsError
 from px4fuse.request import EVALUATION_OPTIONS, EvaluationRequest, command_line, settings_name
 from px4fuse.writing import STANDARD_OUTPUT
@@ -56,31 +55,12 @@ class DeltaType(click.ParamType["Delta"]):
 @click.argument("estimate", type=Named())
 @click.argument("reference", type=Named())
 @click.option(
-    "--alignment",
-    type=click.Choice(["none", "yaw", "se3", "sim3"]),
-    help="What is fitted before comparing.  [default: yaw for VIO, EKF2 and our filter; se3 for "
-    "SLAM; sim3 for monocular SLAM]",
-)
-@click.option(
-    "--association",
-    type=click.Choice(["interpolate", "nearest"]),
-    default="interpolate",
-    help="Interpolate the reference, or take its nearest pose (as evo does).",
-)
-@click.option(
     "--max-gap",
     "max_gap_s",
     type=click.FloatRange(min=0.0, min_open=True),
     metavar="S",
     help="Longest gap of the reference to interpolate across; for nearest the largest difference "
     "in time.  [default: from its rate; 0.01 for nearest]",
-)
-@click.option(
-    "--time-offset",
-    "time_offset_s",
-    type=TypedQuantity("s", auto=True),
-    help="Added to the estimate's stamps; auto finds it from the motion.  [default: auto where the "
-    "two do not overlap]",
 )
 @click.option(
     "--rpe",
@@ -90,10 +70,7 @@ class DeltaType(click.ParamType["Delta"]):
     help="RPE over a distance (5m), a time (10s) or frames (1f); may be repeated.  [default: some "
     "that suit the path]",
 )
-@click.option(
-    "--consecutive", is_flag=True, help="RPE over pairs end to end, instead of from every pose."
-)
-@system_option
+@request_options(EvaluationRequest, EVALUATION_OPTIONS)
 @max_size_option
 @path_option(
     "-o",
@@ -136,7 +113,7 @@ def evaluate(
 
     for name in ("max_gap_s", "time_offset_s"):
         if isinstance(given[name], float) and not math.isfinite(given[name]):
-            option = EVALUATION_OPTIONS[name]
+            option = EVALUATION_OPTIONS[name].name
             raise SettingsError(f"{option} {given[name]:g} is not a finite number.")
     request = EvaluationRequest(
         estimate=str(estimate), reference=str(reference), rpe=tuple(map(str, rpe)), **given

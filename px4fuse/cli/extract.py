@@ -54,7 +54,7 @@ def extract(log: Path, folder: Path, kind: str, **given: Any) -> None:
             '--format parquet needs pyarrow: pip install "px4fuse[parquet]", or take --format csv.'
         )
     from px4fuse.analysis import read_flight
-    from px4fuse.contents import extraction
+    from px4fuse.inspect import tables as extraction
     from px4fuse.results.contract import to_json
 
     flight = read_flight(comparison_request(log, given))

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
-    from px4fuse.contents.inventory import Inventory, Source
+    from px4fuse.inspect.inventory import Inventory, Source
     from px4fuse.request import ComparisonRequest
 
 # No clock drifts by more: the recording was replayed at another speed
@@ -29,7 +29,7 @@ REPLAY_PPM = 10_000.0
 def info(log: Path, json_path: Path | None, **given: Any) -> None:
     """Say what is in a log, what px4fuse can do with it, and what to log next time."""
     from px4fuse.analysis import read_flight
-    from px4fuse.contents.inventory import take_inventory, to_plain
+    from px4fuse.inspect.inventory import take_inventory, to_plain
 
     request = comparison_request(log, given)
     with progress(json_path == STANDARD_OUTPUT, ("reading", "looking")) as step:

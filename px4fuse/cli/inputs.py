@@ -2,20 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_args
+from types import NoneType, UnionType
+from typing import TYPE_CHECKING, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import click
+from msgspec import NODEFAULT, Struct
+from msgspec.structs import fields
 
 from px4fuse.cli.quantity import TypedQuantity
 from px4fuse.errors import SettingsError
 from px4fuse.reading import max_log_bytes, read_text
-from px4fuse.request import AxisName, InputName
+from px4fuse.request import (
+    CLOCK_OPTION,
+    FILTER_OPTIONS,
+    OPTIONS,
+    POSITION_OPTIONS,
+    RECORDINGS,
+    ComparisonRequest,
+    EvaluationRequest,
+    PositionFile,
+)
+from px4fuse.request import Option as Declared
 
 if TYPE_CHECKING:
-    from px4fuse.request import ComparisonRequest, PositionFile
     from px4fuse.results.model import Student
 
 
@@ -45,6 +57,14 @@ def _together(*options: Option) -> Option:
     return add
 
 
+class AnyCase(click.Choice[str]):
+    """One of some words, in any case, given as the field writes it."""
+
+    def normalize_choice(self, choice: Any, ctx: click.Context | None) -> str:
+        """Compare in small letters."""
+        return str(choice).lower()
+
+
 class Named(click.Path):
     """A file or folder; an empty name, which would be the current folder, is a slip."""
 
@@ -60,67 +80,44 @@ class Named(click.Path):
 
 # An option that names a file or folder
 path_option = partial(click.option, type=Named())
-_ANALYSIS = _together(
-    click.option(
-        "--sigma-a",
-        "sigma_a_m_s2",
-        type=TypedQuantity("m/s²", 0.5),
-        default=0.5,
-        help="Process noise SIGMA_A, 0.0001 to 100.",
-    ),
-    click.option(
-        "--sigma-z",
-        "sigma_z_m",
-        type=TypedQuantity("m"),
-        default=0.10,
-        help="Measurement noise SIGMA_Z, 0.0001 to 100.",
-    ),
-    click.option(
-        "--dt",
-        "dt_s",
-        type=TypedQuantity("s"),
-        default=0.1,
-        help="Prediction step DT, 0.001 to 1; Q is proportional to it.",
-    ),
-    click.option(
-        "--input",
-        type=click.Choice(get_args(InputName)),
-        help="Acceleration from the IMU, or constant velocity.  [default: imu where logged]",
-    ),
-    click.option(
-        "--axis",
-        "axes",
-        type=click.Choice(get_args(AxisName)),
-        multiple=True,
-        help="Axis to analyse; may be repeated.  [default: all that the source supports]",
-    ),
-    click.option(
-        "--heading",
-        "heading_deg",
-        type=TypedQuantity("°", 30.0),
-        help="Heading of the aisle, clockwise from north.  [default: from the track]",
-    ),
-    click.option(
-        "--start",
-        "start_s",
-        type=TypedQuantity("s", 20.0),
-        help="Start, seconds from the first data.  [default: take-off]",
-    ),
-    click.option(
-        "--end", "end_s", type=TypedQuantity("s", 60.0), help="End.  [default: touch-down]"
-    ),
-    click.option(
-        "--position-source",
-        metavar="NAME",
-        help="Position source, for example vehicle_gps_position.  [default: the best logged]",
-    ),
-)
-system_option = click.option(
-    "--system",
-    type=click.IntRange(0, 255),
-    metavar="ID",
-    help="MAVLink system id of the vehicle.  [default: the one with the most data]",
-)
+
+
+def request_options(kind: type[Struct], options: Mapping[str, Declared]) -> Option:
+    """The options of some fields of a request: what each takes and its default are the field's."""
+    hints, defaults = get_type_hints(kind), {field.name: field for field in fields(kind)}
+    return _together(
+        *(
+            _option(name, declared, hints[name], defaults[name].default)
+            for name, declared in options.items()
+            if declared.meaning
+        )
+    )
+
+
+def _option(field: str, declared: Declared, hint: Any, default: Any) -> Option:
+    """One of them; the parameters of a position file begin with what file they are about."""
+    # Literal["a"] | None, tuple[Literal["a"], ...] and Annotated say inside what may be typed
+    parts = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
+    inner = next(part for part in parts if part is not NoneType)
+    name = declared.name[2:].replace("-", "_") if declared.name.startswith("--position") else field
+    details: dict[str, Any] = {"help": declared.meaning, "metavar": declared.metavar}
+    if default is not NODEFAULT:
+        details["default"] = default or None
+    if field in ("path", "mavlink", "reference"):
+        details["type"] = Named()
+    elif declared.unit:
+        details["type"] = TypedQuantity(declared.unit, declared.example, auto=len(parts) > 2)
+    elif inner is bool:
+        details |= {"is_flag": True, "default": False}
+    elif inner is int:
+        details["type"] = click.IntRange(0, 255)
+    elif get_origin(inner) is tuple:
+        choices = get_args(get_args(inner)[0])
+        details["type"] = click.Choice(choices) if choices else ColumnNames()
+        details["multiple"] = bool(choices)
+    elif get_origin(inner) is Literal:
+        details["type"] = AnyCase(get_args(inner))
+    return click.option(declared.name, name, **details)
 
 
 def _allow_size(ctx: click.Context, _: click.Parameter, megabytes: int | None) -> None:
@@ -137,62 +134,6 @@ max_size_option = click.option(
     callback=_allow_size,
     metavar="MB",
     help=f"Largest log that is read.  [default: {max_log_bytes.get() // 1_000_000}]",
-)
-_RECORDINGS = _together(
-    path_option(
-        "--mavlink",
-        metavar="FILE.tlog",
-        help="MAVLink recording of the same flight: gives what LOG lacks.",
-    ),
-    system_option,
-)
-_POSITION = _together(
-    path_option(
-        "--position",
-        metavar="FILE.csv",
-        help="The positioning system's own recording: time, x, y, z.",
-    ),
-    click.option(
-        "--position-frame",
-        type=click.Choice(["ned", "enu", "nwu"]),
-        help="What its x, y, z are.  [default: from its column names, or what fits EKF2]",
-    ),
-    click.option(
-        "--position-yaw",
-        type=TypedQuantity("°", 30.0, auto=True),
-        help="Turn it clockwise, seen from above; auto finds yaw and origin.  [default: 0]",
-    ),
-    click.option(
-        "--position-columns",
-        type=ColumnNames(),
-        metavar="TIME,X,Y,Z[,SIGMA]",
-        help="Names or numbers of its columns.  [default: by their names]",
-    ),
-    click.option(
-        "--position-time-unit",
-        type=click.Choice(["s", "ms", "us", "ns"]),
-        help="Unit of its time.  [default: detected]",
-    ),
-    click.option(
-        "--position-unit",
-        type=click.Choice(["m", "cm", "mm"]),
-        help="Unit of its x, y, z.  [default: detected]",
-    ),
-)
-# Fields of a request's PositionFile by the option that gives them
-_POSITION_FIELDS = {
-    "position_frame": "frame",
-    "position_yaw": "yaw_deg",
-    "position_columns": "columns",
-    "position_time_unit": "time_unit",
-    "position_unit": "length_unit",
-}
-clock_offset_option = click.option(
-    "--clock-offset",
-    "clock_offset_s",
-    type=TypedQuantity("s", auto=True),
-    help="Added to the position source's time stamps; auto estimates it.  [default: 0; auto with "
-    "--position]",
 )
 json_option = path_option(
     "--json",
@@ -232,14 +173,22 @@ report_options = _together(
 )
 
 
-#: Which recordings of the flight are read, and how
-recording_options = _together(_RECORDINGS, _POSITION, clock_offset_option, max_size_option)
+system_option = request_options(EvaluationRequest, {"system": OPTIONS["system"]})
+_FILTER = request_options(ComparisonRequest, FILTER_OPTIONS)
+_CLOCK = request_options(ComparisonRequest, CLOCK_OPTION)
 #: Of commands that read a flight as it was recorded
-flight_options = _together(_RECORDINGS, max_size_option)
+flight_options = _together(request_options(ComparisonRequest, RECORDINGS), max_size_option)
+#: Which recordings of the flight are read, and how
+recording_options = _together(
+    request_options(ComparisonRequest, RECORDINGS),
+    request_options(PositionFile, POSITION_OPTIONS),
+    _CLOCK,
+    max_size_option,
+)
 #: Of every command that runs the filter: settings, segment and recordings
-analysis_options = _together(_ANALYSIS, recording_options)
+analysis_options = _together(_FILTER, recording_options)
 #: Of an analysis that hold for many logs: no other files of one flight
-settings_options = _together(_ANALYSIS, system_option, clock_offset_option, max_size_option)
+settings_options = _together(_FILTER, system_option, _CLOCK, max_size_option)
 
 
 def comparison_request(log: Path, given: dict[str, Any]) -> ComparisonRequest:
@@ -250,26 +199,25 @@ def comparison_request(log: Path, given: dict[str, Any]) -> ComparisonRequest:
     SettingsError
         An option is about a position file, and none is given.
     """
-    from px4fuse.request import ComparisonRequest
-
-    position = _position_file(given)
-    mavlink = given.pop("mavlink")
     return ComparisonRequest(
-        log=str(log), mavlink=None if mavlink is None else str(mavlink), position=position, **given
+        log=str(log), mavlink=text_of(given.pop("mavlink")), position=_position(given), **given
     )
 
 
-def _position_file(given: dict[str, Any]) -> PositionFile | None:
-    from px4fuse.request import PositionFile
-
-    path = given.pop("position")
-    how = {field: given.pop(option) for option, field in _POSITION_FIELDS.items()}
-    if path is not None:
-        return PositionFile(path=str(path), **how)
-    for option, field in _POSITION_FIELDS.items():
-        if how[field] is not None:
-            raise SettingsError(f"--{option.replace('_', '-')} requires --position.")
+def _position(given: dict[str, Any]) -> PositionFile | None:
+    typed = {field: option.name for field, option in POSITION_OPTIONS.items()}
+    how = {field: given.pop(name[2:].replace("-", "_")) for field, name in typed.items()}
+    if how["path"] is not None:
+        return PositionFile(**how | {"path": str(how["path"])})
+    for field, value in how.items():
+        if value is not None:
+            raise SettingsError(f"{typed[field]} requires --position.")
     return None
+
+
+def text_of(path: Path | None) -> str | None:
+    """A path as a request has it."""
+    return None if path is None else str(path)
 
 
 def read_person(given: dict[str, Any]) -> Student:

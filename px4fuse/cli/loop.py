@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_args
+from typing import TYPE_CHECKING, Any
 
 import click
 from click.core import ParameterSource
@@ -14,18 +14,17 @@ from px4fuse.cli.inputs import (
     path_option,
     person_options,
     read_person,
-    system_option,
+    request_options,
+    text_of,
 )
 from px4fuse.cli.outputs import finish, progress, report_paths, spare_inputs
-from px4fuse.cli.quantity import TypedQuantity
 from px4fuse.errors import SettingsError
 from px4fuse.reading import shown
-from px4fuse.request import FrameName, Landing
+from px4fuse.request import LOOP_OPTIONS, Landing, LoopRequest, command_line
 from px4fuse.writing import STANDARD_OUTPUT
 
 if TYPE_CHECKING:
     from px4fuse.loop.loop import Loop
-    from px4fuse.request import LoopRequest
 
 STEPS = (
     "reading", *(f"solving: pose graph, {name}" for name in ("all", "gated", "DCS", "GNC")),
@@ -57,24 +56,8 @@ class LandingType(click.ParamType[Landing]):
         return Landing(*numbers)
 
 
-class FrameType(click.Choice[str]):
-    """Axes by their names in small letters, given as the field writes them."""
-
-    def normalize_choice(self, choice: Any, ctx: click.Context | None) -> str:
-        """Compare in small letters."""
-        return str(choice).lower()
-
-
 @click.command()
 @click.argument("source", type=Named())
-@click.option(
-    "--from",
-    "start_s",
-    type=TypedQuantity("s", 20.0),
-    help="Start of the loop: seconds from the first data, or a trajectory's own stamps.  "
-    "[default: take-off]",
-)
-@click.option("--to", "end_s", type=TypedQuantity("s", 60.0), help="End.  [default: landing]")
 @click.option(
     "--landed-at",
     type=LandingType(),
@@ -90,40 +73,10 @@ class FrameType(click.Choice[str]):
     help="It was at the same place at two times, within SIGMA m (0.10); may be repeated.",
 )
 @path_option("--closures", metavar="FILE", help="Such closures, one a line.")
-@path_option(
-    "--reference",
-    metavar="FILE|LOG:PART",
-    help="What the paths are scored against, besides the log's ground truth: a SLAM trajectory.",
-)
-@click.option(
-    "--drift",
-    "position_drift_m",
-    type=TypedQuantity("m", 1.0),
-    default=1.0,
-    help="Standard deviation of the odometry's position after 100 m.",
-)
-@click.option(
-    "--heading-drift",
-    "heading_drift_deg",
-    type=TypedQuantity("°", 3.0),
-    default=3.0,
-    help="Standard deviation of its heading after 100 m.",
-)
-@click.option(
-    "--key-frames",
-    "key_frames_m",
-    type=TypedQuantity("m", 0.2),
-    help="Distance between key frames.  [default: a fiftieth of the extent, 0.02 to 0.5]",
-)
-@click.option(
-    "--frame",
-    type=FrameType(get_args(FrameName)),
-    help="Axes of a trajectory file.  [default: recognised]",
-)
 @click.option(
     "--robust", is_flag=True, help="Solve a pose graph of over 1000 closures robustly too: minutes."
 )
-@system_option
+@request_options(LoopRequest, LOOP_OPTIONS)
 @max_size_option
 @person_options
 @path_option("-o", "--output", metavar="FILE.pdf", help="A report, and its results beside it.")
@@ -150,7 +103,6 @@ def loop(
     from px4fuse.loop.sources import is_g2o, split_part
     from px4fuse.report.document import LoopDocument
     from px4fuse.report.loop import print_loop
-    from px4fuse.request import command_line
     from px4fuse.results.build_trajectories import loop_results
     from px4fuse.results.contract import to_json
 
@@ -186,14 +138,13 @@ def loop(
 def loop_request(source: Path, given: dict[str, Any]) -> LoopRequest:
     """What the command's options gave, as a request."""
     from px4fuse.readers.closures import parse_closure, read_closures
-    from px4fuse.request import LoopRequest
 
     closures = tuple(parse_closure(text) for text in given.pop("closure"))
-    file, reference = given.pop("closures"), given.pop("reference")
+    file = given.pop("closures")
     del given["robust"]
     return LoopRequest(
         source=str(source),
-        reference=None if reference is None else str(reference),
+        reference=text_of(given.pop("reference")),
         closures=closures if file is None else closures + read_closures(file),
         came_back=not given.pop("opened"),
         **given,
@@ -233,7 +184,6 @@ def _solve(source: Path, json_path: Path | None, g2o: Path | None, robust: bool 
     from px4fuse.loop.sources import split_part
     from px4fuse.readers.g2o import g2o_text, read_g2o
     from px4fuse.report.loop import print_graph
-    from px4fuse.request import LoopRequest, command_line
     from px4fuse.results.build_trajectories import graph_results
     from px4fuse.results.contract import to_json
     from px4fuse.trajectory.graph.analysis import analyse_graph

@@ -35,14 +35,27 @@ MAX_SECRET_BYTES = 10_000
 Command = TypeVar("Command", bound=Callable[..., None])
 
 
-def _scenario_option(
-    name: str, field: str, unit: str | None, **details: Any
-) -> Callable[[Command], Command]:
-    """Option that sets one real number of the scenario, whose own value is the default."""
-    default = getattr(_DEFAULT, field)
-    between = (0.0, 360.0) if unit == "°" else None
-    kind = float if unit is None else TypedQuantity(unit, default, between=between)
-    return click.option(name, field, type=kind, default=default, **details)
+# Option, field of the scenario, whose own value is the default, unit and help
+_SCENARIO = (
+    ("--length", "length_m", "m", "Of the aisle, or of a side of the square."),
+    ("--speed", "speed_m_s", "m/s", None),
+    ("--heading", "heading_deg", "°", "Of the aisle or of the first side, clockwise from north."),
+    ("--sigma-uwb", "sigma_uwb_m", "m", "White noise of the UWB, per axis: the true SIGMA_Z."),
+    ("--uwb-rate", "uwb_rate_hz", "Hz", None),
+    ("--sigma-a", "sigma_a_m_s2", "m/s²",
+     "White noise of the accelerometer's mean over 0.1 s: the true SIGMA_A."),
+    ("--accel-bias-sigma", "accel_bias_sigma_m_s2", "m/s²",
+     "Width from which the accelerometer's constant bias is drawn."),
+)  # fmt: skip
+
+
+def _scenario_options(command: Command) -> Command:
+    """The real numbers of the scenario."""
+    for name, field, unit, meaning in reversed(_SCENARIO):
+        default = getattr(_DEFAULT, field)
+        kind = TypedQuantity(unit, default, between=(0.0, 360.0) if unit == "°" else None)
+        command = click.option(name, field, type=kind, default=default, help=meaning)(command)
+    return command
 
 
 class WithMistakes(click.Command):
@@ -133,36 +146,16 @@ class WithMistakes(click.Command):
 @click.option(
     "--passes", type=int, metavar="N", help="Passes of the aisle [6], or laps of the loop [1]."
 )
-@_scenario_option("--length", "length_m", "m", help="Of the aisle, or of a side of the square.")
-@_scenario_option("--speed", "speed_m_s", "m/s")
-@_scenario_option(
-    "--heading", "heading_deg", "°", help="Of the aisle or of the first side, clockwise from north."
-)
 @click.option(
     "--yaw",
     type=click.Choice(YAWS),
     help="Whether the nose stays or follows the flight.  [default: fixed; follow in a loop]",
 )
-@_scenario_option(
-    "--sigma-uwb", "sigma_uwb_m", "m", help="White noise of the UWB, per axis: the true SIGMA_Z."
-)
-@_scenario_option("--uwb-rate", "uwb_rate_hz", "Hz")
-@_scenario_option(
-    "--sigma-a",
-    "sigma_a_m_s2",
-    "m/s²",
-    help="White noise of the accelerometer's mean over 0.1 s: the true SIGMA_A.",
-)
-@_scenario_option(
-    "--accel-bias-sigma",
-    "accel_bias_sigma_m_s2",
-    "m/s²",
-    help="Width from which the accelerometer's constant bias is drawn.",
-)
-@_scenario_option(
+@_scenario_options
+@click.option(
     "--vio-drift",
-    "vio_drift",
-    None,
+    type=float,
+    default=_DEFAULT.vio_drift,
     metavar="SHARE",
     help="Drift of the VIO, as a share of the distance.",
 )
@@ -194,10 +187,11 @@ def simulate(
     _check_options(assignment)
     if assignment is not None:
         drawn_from = _read_secret(secret, secret_file), scenario["kind"], count
+        students, key_file = _class(assignment, output, answer_path)
         if preview:
-            _preview(assignment, output, answer_path, *drawn_from)
+            _preview(students, key_file, *drawn_from)
         else:
-            _assign(assignment, output, answer_path, *drawn_from, not no_truth)
+            _assign(students, output, key_file, *drawn_from, not no_truth)
         return
     if scenario["kind"] == MIXED:
         raise SettingsError(f"--kind {MIXED} requires --assignment ROSTER.csv.")
@@ -277,9 +271,9 @@ def _class(
 
 
 def _assign(
-    roster: Path,
+    students: tuple[RosterStudent, ...],
     folder: Path,
-    answer_path: Path | None,
+    key_file: Path,
     secret: bytes | None,
     kind: Kinds,
     count: int | None,
@@ -288,7 +282,6 @@ def _assign(
     """Write a flight for everyone, and the answer key."""
     from px4fuse.assignment.assignment import assign
 
-    students, key_file = _class(roster, folder, answer_path)
     with progress() as step:
         made = assign(
             students, folder, key_file, secret, kind, count, truth, partial(step, "simulating")
@@ -310,9 +303,8 @@ def _assign(
 
 
 def _preview(
-    roster: Path,
-    folder: Path,
-    answer_path: Path | None,
+    students: tuple[RosterStudent, ...],
+    key_file: Path,
     secret: bytes | None,
     kind: Kinds,
     count: int | None,
@@ -323,7 +315,6 @@ def _preview(
     from px4fuse.assignment.assignment import preview
     from px4fuse.report.screen import plain_table
 
-    students, key_file = _class(roster, folder, answer_path)
     drawn = preview(students, key_file, secret, kind, count)
     table = plain_table(
         ("student", "left"), ("name", "left"), ("flight", "left"), ("mistakes", "left"),

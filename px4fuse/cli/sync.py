@@ -25,9 +25,8 @@ def sync(log: Path, json_path: Path | None, **given: Any) -> None:
     or a MAVLink recording.
     """
     from px4fuse.analysis import run_preparation
-    from px4fuse.comparison.estimates import clock_offset, tuned_horizontally
+    from px4fuse.comparison.estimates import noises_and_clock
     from px4fuse.errors import MissingDataError
-    from px4fuse.filter.motion import Made
     from px4fuse.flight import Unavailable
     from px4fuse.report.terminal import print_advice
     from px4fuse.report.words import clock_advice
@@ -37,9 +36,7 @@ def sync(log: Path, json_path: Path | None, **given: Any) -> None:
     request = comparison_request(log, given)
     with progress(json_path == STANDARD_OUTPUT, STEPS) as step:
         compared = run_preparation(request, step)
-        step("tuning")
-        made: Made = {}  # both need the same signals of the IMU
-        found = clock_offset(compared, tuned_horizontally(compared, made), step, made)
+        _, found = noises_and_clock(compared, step)
     results = sync_results(request, compared, found, command_line(request, "sync"))
     if not write_json(results, json_path):
         print_advice(terminal(), clock_advice(compared, found), request)

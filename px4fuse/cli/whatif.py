@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from px4fuse.cli.inputs import Named, flight_options, json_option, path_option
+from px4fuse.cli.inputs import Named, flight_options, json_option, path_option, text_of
 from px4fuse.cli.outputs import progress, terminal, write_outputs
 from px4fuse.cli.quantity import NAMES, in_unit
 from px4fuse.errors import OutputError, SettingsError
@@ -61,7 +61,7 @@ def whatif(
         raise OutputError(f"{output}: the page is a PDF. Give a name that ends in .pdf with -o.")
     request = WhatIfRequest(
         log=str(log),
-        mavlink=None if mavlink is None else str(mavlink),
+        mavlink=text_of(mavlink),
         system=system,
         changes=_changes(changes),
         sweep=None if sweep is None else _sweep(sweep),

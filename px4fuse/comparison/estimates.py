@@ -1,4 +1,11 @@
-"""What the data say of noises, clock and heading, of a comparison or of what it begins with."""
+"""What the data say of noises, clock and heading, of a comparison or of what it begins with.
+
+Innovations judge a filter against its source. An odometry is smooth over seconds and metres wrong
+after minutes: a filter that follows it closely has small innovations and a large error, so that no
+measurement noise follows from them, and the errors of scale and heading look like a clock that
+wanders. Which sources those are says ``Origin.may_drift``; :func:`with_drift` says what is left of
+their clock estimate.
+"""
 
 from __future__ import annotations
 
@@ -6,10 +13,12 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 import numpy as np
+from msgspec import structs
+from scipy.special import stdtr
 
-from px4fuse.comparison.drift import with_drift
+from px4fuse.arrays import Array
 from px4fuse.comparison.model import Comparison
-from px4fuse.filter.clock import ClockOffset, estimate_clock_offset
+from px4fuse.filter.clock import MAX_HALF_INTERVAL_S, ClockOffset, estimate_clock_offset
 from px4fuse.filter.fitting import Noises
 from px4fuse.filter.heading import HeadingError, heading_error
 from px4fuse.filter.motion import MAX_IMU_INTERVAL_S, Made
@@ -22,22 +31,22 @@ MIN_TELEMETRY_IMU_HZ = 200.0
 CLOCK_RATE_MARGIN = 0.98
 TELEMETRY_IMU = ("HIGHRES_IMU", "SCALED_IMU", "SCALED_IMU2", "SCALED_IMU3")
 
+# A step of the clock that drift cannot imitate: at 1 m/s a good UWB's noise
+CHANGE_S = 0.10
+# On either side of a step, so that each shows its own scatter
+MIN_PARTS = 2
+
 Progress = Callable[[str], None]
 Tuning = Mapping[str, AxisTuning | Unavailable]
 
 
 def silent(_: str) -> None:
-    """Progress that nobody watches."""
+    """Progress that is shown to nobody."""
 
 
 def size(noise: Noise, otherwise: float) -> float:
     """Most likely value of a noise, or its bound, or what was set."""
     return noise.value or noise.high or otherwise
-
-
-def tuned_horizontally(comparison: Comparison, made: Made | None = None) -> Tuning:
-    """The horizontal noises alone, which is what the clock estimate needs; ``made`` as there."""
-    return tuned(comparison, (HORIZONTAL,), made=made)
 
 
 def tuned(
@@ -54,66 +63,44 @@ def tuned(
     names : tuple of str, optional
         Axis names and "horizontal"; by default all that there are.
     progress : callable
-        Told what is being done.
+        Is given what is being done.
     made : dict, optional
         As :func:`px4fuse.filter.motion.motion` has it.
     """
-    flight = comparison.flight
-    slow = imu_too_slow_for_clocks(flight)
+    flight, slow = comparison.flight, imu_too_slow_for_clocks(comparison.flight)
     return tune(
-        comparison.lines,
-        comparison.settings,
-        names,
-        lambda name: progress(f"tuning {name}"),
+        comparison.lines, comparison.settings, names, lambda name: progress(f"tuning {name}"),
         flight if slow is None else replace(flight, imu=slow),
-        comparison.source.origin.may_drift,
-        made,
-    )
+        comparison.source.origin.may_drift, made,
+    )  # fmt: skip
 
 
-def clock_offset(
+def noises_and_clock(
     comparison: Comparison,
-    tuning: Tuning,
     progress: Progress = silent,
-    made: Made | None = None,
-) -> ClockOffset | Unavailable:
-    """What must still be added to the stamps of the source, beyond the offset that was set.
+    names: tuple[str, ...] | None = (HORIZONTAL,),
+) -> tuple[Tuning, ClockOffset | Unavailable]:
+    """Most likely noises, and what must still be added to the stamps of the source.
 
-    Parameters
-    ----------
-    comparison : Comparison
-    tuning : mapping
-        Its measurement noise and outliers are used where it has them.
-    progress : callable
-        Told what is being done.
-    made : dict, optional
-        As :func:`px4fuse.filter.motion.motion` has it.
+    Beyond the offset that was set. Parameters are those of :func:`tuned`.
     """
+    made: Made = {}  # both need the same signals of the IMU
+    tuning = tuned(comparison, names, progress, made)
     if slow := imu_too_slow_for_clocks(comparison.flight):
-        return slow
-    tuned = next(
-        (
-            found
-            for found in (tuning.get(HORIZONTAL), *tuning.values())
-            if isinstance(found, AxisTuning)
-        ),
-        None,
-    )
+        return tuning, slow
     settings = comparison.settings
-    noises = Noises(settings.sigma_a_m_s2, settings.sigma_z_m)
-    found = estimate_clock_offset(
-        comparison.flight,
-        comparison.source,
-        comparison.segment,
-        settings,
-        noises if tuned is None else tuned.noises,
-        None if tuned is None else tuned.outlier_time_s,
-        progress,
-        made,
-    )
-    if isinstance(found, ClockOffset) and comparison.source.origin.may_drift:
-        return with_drift(found)
-    return found
+    known = [
+        found
+        for found in (tuning.get(HORIZONTAL), *tuning.values())
+        if isinstance(found, AxisTuning)
+    ]
+    clock = estimate_clock_offset(
+        comparison.flight, comparison.source, comparison.segment, settings,
+        known[0].noises if known else Noises(settings.sigma_a_m_s2, settings.sigma_z_m),
+        known[0].outlier_time_s if known else None, progress, made,
+    )  # fmt: skip
+    drifts = comparison.source.origin.may_drift
+    return tuning, with_drift(clock) if drifts and isinstance(clock, ClockOffset) else clock
 
 
 def turned_frame(
@@ -124,18 +111,16 @@ def turned_frame(
 ) -> HeadingError | Unavailable:
     """Turn of the source's frame, with the noise and the clock offset that were found."""
     progress("heading")
-    tuned = tuning.get(HORIZONTAL)
-    sigma_z_m = comparison.settings.sigma_z_m
+    tuned, sigma_z_m = tuning.get(HORIZONTAL), comparison.settings.sigma_z_m
     if isinstance(tuned, AxisTuning):
         sigma_z_m = size(tuned.sigma_z, sigma_z_m)
+    offset_s = 0.0
+    if isinstance(clock, ClockOffset) and clock.determinable:
+        offset_s = clock.remaining_s
     return heading_error(
-        comparison.flight,
-        comparison.source,
-        comparison.segment,
-        comparison.settings,
-        sigma_z_m,
-        clock.remaining_s if isinstance(clock, ClockOffset) and clock.determinable else 0.0,
-    )
+        comparison.flight, comparison.source, comparison.segment, comparison.settings, sigma_z_m,
+        offset_s,
+    )  # fmt: skip
 
 
 def imu_too_slow_for_clocks(flight: Flight) -> Unavailable | None:
@@ -153,17 +138,74 @@ def imu_too_slow_for_clocks(flight: Flight) -> Unavailable | None:
     rate = 1.0 / float(np.median(np.diff(flight.imu.index.to_numpy())))
     if rate >= CLOCK_RATE_MARGIN * needed:
         return None
-    told = f"{rate:.{1 if rate < 10 else 0}f} Hz"
+    hertz = f"{rate:.{1 if rate < 10 else 0}f} Hz"
     if not telemetry:
         return Unavailable(
             "clock offset",
-            f"the IMU was logged at {told}, at least {needed:g} Hz are needed",
+            f"the IMU was logged at {hertz}, at least {needed:g} Hz are needed",
             'Put the line "sensor_combined 0" into etc/logging/logger_topics.txt on the SD card.',
         )
     remedy = "Give the ULog of the same flight as LOG, and this recording with --mavlink."
     return Unavailable(
         "clock offset",
-        f"the IMU came by telemetry at {told}, each sample picked out of several; at least "
+        f"the IMU came by telemetry at {hertz}, each sample picked out of several; at least "
         f"{needed:g} Hz are needed",
         remedy if flight.log.has_ulog else f"Have the IMU sent at {needed:g} Hz.",
     )
+
+
+def with_drift(clock: ClockOffset) -> ClockOffset:
+    """The clock estimate of a source that may drift: no surer than its parts agree.
+
+    Errors of scale and heading, and the walk of an odometry, move the offset of each part by more
+    than the noise does. The scatter of the parts about their steps is what they amount to: it
+    widens the interval, and only a step beyond it, of 0.1 s or more, is a change of the clock.
+    """
+    offset = np.array([part.offset_s for part in clock.parts])
+    weight = np.array([part.sigma_s**-2.0 for part in clock.parts])
+    if len(offset) <= MIN_PARTS:
+        return structs.replace(clock, change_p=None, drift_ppm=None, drift_sigma_ppm=None)
+    scatter = np.sqrt(max(1.0, _square(offset, weight) / (len(offset) - 1)))
+    low, high = (clock.offset_s + scatter * (end - clock.offset_s) for end in clock.interval_s)
+    reason = clock.reason
+    if not reason and (high - low) / 2.0 > MAX_HALF_INTERVAL_S:
+        reason = (
+            "the parts of the flight differ by more than noise explains, as they do for a source "
+            f"that drifts: offsets from {low:+.2f} s to {high:+.2f} s are possible"
+        )
+    return structs.replace(
+        clock,
+        interval_s=(float(low), float(high)),
+        sigma_s=float(clock.sigma_s * scatter),
+        determinable=not reason,
+        reason=reason,
+        drift_ppm=None,
+        drift_sigma_ppm=None,
+        change_p=_step_p(offset, weight),
+    )
+
+
+def _square(offset: Array, weight: Array) -> float:
+    """Σ w (x - weighted mean)²."""
+    return float(np.sum(weight * (offset - np.average(offset, weights=weight)) ** 2))
+
+
+def _step_p(offset: Array, weight: Array) -> float | None:
+    """p-value of the largest step between parts against their own scatter, both sides estimated.
+
+    Student's t of two weighted means whose common scatter comes from within the sides, times the
+    number of places looked at (Bonferroni); 1 where the step is below ``CHANGE_S``.
+    """
+    count = len(offset)
+    places = range(MIN_PARTS, count - MIN_PARTS + 1)
+    smallest = 1.0
+    for at in places:
+        sides = [(offset[rows], weight[rows]) for rows in (slice(None, at), slice(at, None))]
+        step = float(np.diff([np.average(x, weights=w) for x, w in sides])[0])
+        if abs(step) < CHANGE_S:
+            continue
+        scatter = max(1.0, sum(_square(x, w) for x, w in sides) / (count - 2))
+        sigma = np.sqrt(scatter * sum(1.0 / np.sum(w) for _, w in sides))
+        p = 2.0 * float(stdtr(count - 2, -abs(step) / sigma))
+        smallest = min(smallest, p * len(places))
+    return smallest if places else None

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import TypedDict, Unpack
 
-import numpy as np
 import pandas as pd
 
 from px4fuse.comparison.model import Comparison
 from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.filter.settings import Settings
-from px4fuse.filter.signals import MIN_MEASUREMENTS, Segment, make_axes
+from px4fuse.filter.signals import MIN_MEASUREMENTS, Segment, make_axes, within
 from px4fuse.flight import Flight, PositionTrack, Truth, Unavailable
 from px4fuse.origin import GIVEN_FILE
 from px4fuse.readers.mavlink_messages import POSITION_INPUTS
@@ -25,47 +25,70 @@ NOT_ITS_OWN_TRUTH = Unavailable(
 )
 
 
+class Choices(TypedDict, total=False):
+    """What of a flight is compared.
+
+    Attributes
+    ----------
+    axes : tuple of str
+        From "north", "east", "down", "aisle"; by default all that the source supports.
+    heading_deg : float
+        Of the aisle.
+    position_source : str
+        Name of a track of the flight.
+    start_s, end_s : float
+        Segment, seconds from the first data.
+    """
+
+    axes: tuple[str, ...] | None
+    heading_deg: float | None
+    position_source: str | None
+    start_s: float | None
+    end_s: float | None
+
+
 def prepare(
     flight: Flight,
     settings: Settings | None = None,
     *,
-    axes: tuple[str, ...] | None = None,
-    heading_deg: float | None = None,
-    position_source: str | None = None,
-    start_s: float | None = None,
-    end_s: float | None = None,
     input_required: bool = False,
+    **choices: Unpack[Choices],
 ) -> Comparison:
-    """Choose the source, the segment and the axes, with the arguments of :func:`compare`.
+    """Choose the source, the segment and the axes.
 
     Parameters
     ----------
+    flight : Flight
+    settings : Settings, optional
     input_required : bool
         Raise instead of falling back to ``input="zero"`` where the log has no acceleration.
+    **choices
+        As :class:`Choices` has them.
 
     Raises
     ------
-    MissingDataError, SettingsError
-        As :func:`compare`; no acceleration while ``input_required``.
+    MissingDataError
+        No position source, or no such axis.
+    SettingsError
+        An empty segment; no acceleration while ``input_required``.
     """
     settings = settings or Settings()
-    track, reason = choose_source(flight, position_source)
+    track, reason = choose_source(flight, choices.get("position_source"))
     track = shift_clock(track, settings.clock_offset_s)
-    segment = choose_segment(flight, track, start_s, end_s)
-    lines = make_axes(flight, track, segment, names=axes, heading_deg=heading_deg)
+    segment = choose_segment(flight, track, choices.get("start_s"), choices.get("end_s"))
+    names, heading_deg = choices.get("axes"), choices.get("heading_deg")
+    lines = make_axes(flight, track, segment, names=names, heading_deg=heading_deg)
     if isinstance(flight.truth, Truth) and flight.truth.name == track.name:
         flight = replace(flight, truth=NOT_ITS_OWN_TRUTH)
-    missing = list(flight.missing)
-    notes = [*flight.log.notes, *track.notes]
+    notes, missing = (*flight.log.notes, *track.notes), flight.missing
     acceleration = lines[0].acceleration
     if settings.input == "imu" and isinstance(acceleration, Unavailable):
         if input_required:
             raise SettingsError(f"{flight.log.name}: `input` imu: {acceleration}")
         settings = replace(settings, input="zero")
-        notes.append(f"no acceleration input ({acceleration.reason}): constant velocity was used")
-        if acceleration not in missing:
-            missing.append(acceleration)
-    return Comparison(flight, track, reason, segment, settings, lines, tuple(notes), tuple(missing))
+        notes += (f"no acceleration input ({acceleration.reason}): constant velocity was used",)
+        missing += () if acceleration in missing else (acceleration,)
+    return Comparison(flight, track, reason, segment, settings, lines, notes, missing)
 
 
 def choose_source(flight: Flight, name: str | None = None) -> tuple[PositionTrack, str]:
@@ -88,39 +111,36 @@ def choose_source(flight: Flight, name: str | None = None) -> tuple[PositionTrac
     MissingDataError
         The log holds no (such) track; the text says what was looked for and what would log it.
     """
-    have = ", ".join(track.name for track in flight.positions) or "none"
-    if name is not None:
+    if name is None:
         for track in flight.positions:
-            if track.name == name:
-                return track, "chosen with --position-source"
-        looked = {missing.source: missing for missing in flight.missing}
-        reason = looked[name].reason if name in looked else "no such source"
-        raise MissingDataError(
-            f"{flight.log.name}: position source {name}: {reason}. This log has: {have}."
-        )
+            if track.origin.automatic:
+                return track, _why_best(flight, track)
+        raise MissingDataError(_no_source(flight))
     for track in flight.positions:
-        if track.origin.automatic:
-            return track, _why_best(flight, track)
-    raise MissingDataError(_no_source(flight))
+        if track.name == name:
+            return track, "chosen with --position-source"
+    have = ", ".join(track.name for track in flight.positions) or "none"
+    reasons = {missing.source: missing.reason for missing in flight.missing}
+    raise MissingDataError(
+        f"{flight.log.name}: position source {name}: {reasons.get(name, 'no such source')}. "
+        f"This log has: {have}."
+    )
 
 
 def _no_source(flight: Flight) -> str:
-    damaged = "the file is damaged, and " if flight.log.damage else ""
+    name = f"{flight.log.name}: {'the file is damaged, and ' if flight.log.damage else ''}"
     if flight.log.format.startswith("MAVLink"):
         return (
-            f"{flight.log.name}: {damaged}no external position was sent to the autopilot in this "
+            f"{name}no external position was sent to the autopilot in this "
             "recording (no VISION_POSITION_ESTIMATE, ODOMETRY or ATT_POS_MOCAP). Give the "
             "positioning system's own file with `position`"
             f"{', or the ULog' if flight.log.has_ulog else ''}."
         )
-    gps = any(not track.origin.automatic for track in flight.positions)
-    hint = (
-        "Only GPS is in it: give `position_source` vehicle_gps_position to use that, or s"
-        if gps
-        else "S"
-    )
+    hint = "S"
+    if any(not track.origin.automatic for track in flight.positions):
+        hint = "Only GPS is in it: give `position_source` vehicle_gps_position to use that, or s"
     return (
-        f"{flight.log.name}: {damaged}no external position in this log (no "
+        f"{name}no external position in this log (no "
         "vehicle_visual_odometry, motion capture or EKF2 innovations of external vision). "
         f"{hint}et SDLOG_PROFILE to 129 and send the UWB position to PX4 as "
         "VISION_POSITION_ESTIMATE, or give the UWB's own file with `position`."
@@ -158,10 +178,7 @@ def shift_clock(track: PositionTrack, clock_offset_s: float) -> PositionTrack:
 
 
 def choose_segment(
-    flight: Flight,
-    track: PositionTrack,
-    start_s: float | None = None,
-    end_s: float | None = None,
+    flight: Flight, track: PositionTrack, start_s: float | None = None, end_s: float | None = None
 ) -> Segment:
     """Choose the part of the log to analyse: where the source runs and the vehicle flies.
 
@@ -177,25 +194,21 @@ def choose_segment(
     SettingsError
         The chosen part is empty or holds fewer than three measurements.
     """
-    source_start, source_end = float(track.samples.index[0]), float(track.samples.index[-1])
+    source_start, source_end = track.samples.index[[0, -1]].tolist()
     low, high = max(source_start, 0.0), min(source_end, flight.log.duration_s)
     if isinstance(flight.airborne, Unavailable):
         reason = "the whole span of the source: the log has no land detector"
     elif not flight.airborne:
         reason = "the whole span of the source: the vehicle never took off"
     else:
-        take_off, touch_down = flight.airborne[0][0], flight.airborne[-1][1]
-        if max(low, take_off) < min(high, touch_down):
-            low, high = max(low, take_off), min(high, touch_down)
-            reason = "where the source runs and the vehicle flies"
-        else:
-            reason = "the whole span of the source: it does not run in flight"
+        reason = "the whole span of the source: it does not run in flight"
+        flying = max(low, flight.airborne[0][0]), min(high, flight.airborne[-1][1])
+        if flying[0] < flying[1]:
+            (low, high), reason = flying, "where the source runs and the vehicle flies"
     if start_s is not None or end_s is not None:
-        low = low if start_s is None else start_s
-        high = high if end_s is None else end_s
-        given = [
-            text for text, value in (("--start", start_s), ("--end", end_s)) if value is not None
-        ]
+        low, high = low if start_s is None else start_s, high if end_s is None else end_s
+        ends = {"--start": start_s, "--end": end_s}
+        given = [text for text, value in ends.items() if value is not None]
         reason = f"chosen with {' and '.join(given)}"
         inside = max(low, 0.0), min(high, flight.log.duration_s)
         if inside != (low, high) and inside[0] < inside[1]:
@@ -206,10 +219,11 @@ def choose_segment(
             f"{flight.log.name}: the segment from {low:.6g} s to {high:.6g} s is empty; the "
             f"position source runs from {source_start:.2f} s to {source_end:.2f} s."
         )
-    count = np.count_nonzero((track.samples.index >= low) & (track.samples.index <= high))
+    segment = Segment(low, high, reason)
+    count = len(within(track.samples, segment))
     if count < MIN_MEASUREMENTS:
         raise SettingsError(
             f"{flight.log.name}: {count} measurements of {track.name} between {low:.2f} s and "
             f"{high:.2f} s are too few (at least {MIN_MEASUREMENTS} are needed)."
         )
-    return Segment(low, high, reason)
+    return segment

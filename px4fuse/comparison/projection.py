@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
+from functools import partial
+
 import numpy as np
 import pandas as pd
 
@@ -10,11 +13,13 @@ from px4fuse.filter.signals import AISLE, Axis, Segment, along, within
 from px4fuse.flight import (
     POSITION_COLUMNS,
     POSITION_VARIANCE_COLUMNS,
+    STATE_COLUMNS,
     VELOCITY_COLUMNS,
     VELOCITY_VARIANCE_COLUMNS,
     Ekf2,
     Flight,
     PositionTrack,
+    Reset,
     Truth,
     Unavailable,
 )
@@ -45,96 +50,78 @@ def continuous_state(
         What was done, empty where there was no reset in the segment.
     """
     inside = [r for r in ekf2.resets if segment.start_s < r.time_s <= segment.end_s]
-    if not inside:
-        return ekf2.state, ""
-    state = ekf2.state.copy()
+    state = ekf2.state.copy() if inside else ekf2.state
     kept: list[str] = []
     undone: list[str] = []
-    groups = (
-        ("horizontal position", "position", POSITION_COLUMNS[:2], [0, 1]),
-        ("height", "position", POSITION_COLUMNS[2:], [2]),
-        ("velocity", "velocity", VELOCITY_COLUMNS, [0, 1, 2]),
-    )
-    for label, quantity, columns, axes in groups:
-        deltas = np.array(
-            [[r.delta[axis] if r.quantity == quantity else 0.0 for axis in axes] for r in inside]
-        )
-        times = np.array([r.time_s for r in inside])
-        real = np.any(deltas != 0, axis=1)
-        if not real.any():
+    for label, quantity, columns in (
+        ("horizontal position", "position", POSITION_COLUMNS[:2]),
+        ("height", "position", POSITION_COLUMNS[2:]),
+        ("velocity", "velocity", VELOCITY_COLUMNS),
+    ):
+        axes = [STATE_COLUMNS.index(column) % 3 for column in columns]
+        resets = [
+            r for r in inside if r.quantity == quantity and any(r.delta[axis] for axis in axes)
+        ]
+        if not resets:
             continue
-        done = kept
+        said = kept
         if quantity == "position":  # a velocity has no frame origin to lose
-            published = ekf2.state[columns]
-            candidate = _undo(published, times[real], deltas[real], track, segment, columns)
-            distance = _distance(published, track, segment, columns)
-            if _distance(candidate, track, segment, columns) < CLEARLY_CLOSER * distance:
-                state[columns] = candidate
-                done = undone
-        done.append(f"{np.count_nonzero(real)} of {label}")
-    said = []
+            samples = within(track.samples, segment)[columns].dropna()
+            best = min(_undone(ekf2.state[columns], resets, axes), key=partial(_distance, samples))
+            if _distance(samples, best) < CLEARLY_CLOSER * _distance(samples, ekf2.state):
+                state[columns], said = best, undone
+        said.append(f"{len(resets)} of {label}")
+    statements = []
     if undone:
-        said.append(f"resets undone: {', '.join(undone)} (they change the frame)")
+        statements.append(f"resets undone: {', '.join(undone)} (they change the frame)")
     if kept:
-        said.append(f"resets kept: {', '.join(kept)} (they correct an error)")
-    return state, "; ".join(said)
+        statements.append(f"resets kept: {', '.join(kept)} (they correct an error)")
+    return state, "; ".join(statements)
 
 
-def _undo(
-    published: pd.DataFrame,
-    times: Array,
-    deltas: Array,
-    track: PositionTrack,
-    segment: Segment,
-    columns: list[str],
-) -> pd.DataFrame:
-    """Continuous position, in the frame of that stretch between resets that fits the track best."""
-    after = published.index.to_numpy()[:, None] >= times[None, :]
-    candidates = []
-    for stretch in range(len(times) + 1):
+def _undone(
+    published: pd.DataFrame, resets: list[Reset], axes: list[int]
+) -> Iterator[pd.DataFrame]:
+    """Continuous position, in the frame of each stretch between resets."""
+    deltas = np.array([reset.delta for reset in resets])[:, axes]
+    after = np.array([published.index >= reset.time_s for reset in resets]).T
+    for stretch in range(len(resets) + 1):
         # relative to this stretch: resets before it still to come are added, later ones taken away
         shift = (~after[:, :stretch]) @ deltas[:stretch] - after[:, stretch:] @ deltas[stretch:]
-        candidates.append(published + shift)
-    return min(candidates, key=lambda frame: _distance(frame, track, segment, columns))
+        yield published + shift
 
 
-def _distance(
-    state: pd.DataFrame, track: PositionTrack, segment: Segment, columns: list[str]
-) -> float:
-    samples = within(track.samples, segment)[columns].dropna()
+def _distance(samples: pd.DataFrame, state: pd.DataFrame) -> float:
+    """Median squared distance of the state from samples."""
     squared = np.zeros(len(samples))
-    for column in columns:
+    for column in samples:
         squared += (np.interp(samples.index, state.index, state[column]) - samples[column]) ** 2
     return float(np.median(squared)) if len(squared) else float("inf")
 
 
 def project_state(state: pd.DataFrame, axis: Axis, segment: Segment) -> pd.DataFrame:
     """Position (m) and velocity (m/s) along the axis, within the segment."""
-    cut = within(state, segment)
-    return pd.DataFrame(
-        {
-            "position_m": along(cut, POSITION_COLUMNS, axis.direction),
-            "velocity_m_s": along(cut, VELOCITY_COLUMNS, axis.direction),
-        },
-        index=cut.index,
-    )
+    columns = {"position_m": POSITION_COLUMNS, "velocity_m_s": VELOCITY_COLUMNS}
+    return _project(within(state, segment), columns, axis.direction)
+
+
+def _project(frame: pd.DataFrame, columns: Mapping[str, list[str]], weights: Array) -> pd.DataFrame:
+    made = {name: along(frame, parts, weights) for name, parts in columns.items()}
+    return pd.DataFrame(made, index=frame.index)
 
 
 def project_variance(ekf2: Ekf2, axis: Axis, segment: Segment) -> pd.DataFrame | Unavailable:
     """Variances along the axis; EKF2 logs no covariance between axes, so none is added."""
     if isinstance(ekf2.variance, Unavailable):
         return ekf2.variance
-    cut = within(ekf2.variance, segment)
-    if cut.empty:
+    columns = {
+        "position_variance_m2": POSITION_VARIANCE_COLUMNS,
+        "velocity_variance_m2_s2": VELOCITY_VARIANCE_COLUMNS,
+    }
+    projected = _project(within(ekf2.variance, segment), columns, axis.direction**2)
+    if projected.empty:
         return Unavailable("EKF2 variances", "no sample in the segment", "Analyse more of the log.")
-    weights = axis.direction**2
-    return pd.DataFrame(
-        {
-            "position_variance_m2": along(cut, POSITION_VARIANCE_COLUMNS, weights),
-            "velocity_variance_m2_s2": along(cut, VELOCITY_VARIANCE_COLUMNS, weights),
-        },
-        index=cut.index,
-    )
+    return projected
 
 
 def project_innovations(
@@ -151,18 +138,15 @@ def project_innovations(
             f"those in the log belong to external vision, not to {track.name}",
             "Choose the source that EKF2 fused (--position-source).",
         )
-    if axis.name == AISLE:
-        north, east = ekf2.innovations["north"], ekf2.innovations["east"]
-        if isinstance(north, Unavailable):
-            return north
-        if isinstance(east, Unavailable):
-            return east
-        cut = _innovations_along(within(north, segment), east, axis.direction)
-    else:
-        frame = next(frame for name, frame in ekf2.innovations.items() if name == axis.name)
+    frames = []
+    for name in ("north", "east") if axis.name == AISLE else (axis.name,):
+        frame = next(frame for key, frame in ekf2.innovations.items() if key == name)
         if isinstance(frame, Unavailable):
             return frame
-        cut = within(frame, segment).copy()
+        frames.append(frame)
+    cut = within(frames[0], segment).copy()
+    if axis.name == AISLE:
+        cut = _innovations_along(cut, frames[1], axis.direction)
     if cut.empty:
         return Unavailable(
             "EKF2 innovations", "no sample in the segment", "Analyse more of the log."

@@ -1,4 +1,4 @@
-"""What a replay says of a remedy, of EKF2 or of our filter: what the findings share.
+"""What the data ask of EKF2's parameters, and what a replay says of a remedy, EKF2's or ours.
 
 A change is proposed with its effect, and only where the replay confirms it. Where EKF2 cannot be
 replayed, the words say so.
@@ -10,17 +10,25 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from px4fuse.comparison.comparison import compare, kf_against_truth
+import numpy as np
+
+from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.model import AgainstTruth, Comparison
 from px4fuse.ekf2.model import Model
 from px4fuse.ekf2.whatif import Summary, what_if
 from px4fuse.ekf2_parameters import PARAMETERS
-from px4fuse.filter.kalman import replay
+from px4fuse.filter.clock import ClockOffset
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import AISLE
+from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.flight import Unavailable
 from px4fuse.plain import capital
 
+# EKF2 takes R from the sender where that is more than this many times EKF2_EVP_NOISE
+REPORTED_TIMES = 1.25
+# One prediction of EKF2 (EKF2_PREDICT_US), and what a message takes to arrive
+UPDATE_MS, ARRIVAL_MS = 10.0, 30.0
+DELAY_STEP_MS = 50.0
 # How a remedy to type is written; who prints it knows the log (px4fuse.report.commands)
 COMMAND = "px4fuse compare LOG"
 # A noise must bring |log mean NIS| below this share of itself: what does less is not its cause
@@ -33,6 +41,88 @@ WORSE_ERROR = 1.05
 WORSE_FILTER_ERROR = 1.005
 # Shares of rejected samples below this are not worth a word
 REJECTED_SHOWN = 0.005
+
+
+def asked_of_ekf2(
+    comparison: Comparison,
+    model: Model,
+    tuning: Mapping[str, AxisTuning | Unavailable],
+    clock: ClockOffset | Unavailable,
+) -> dict[str, float]:
+    """EKF2's parameters as the data ask for them, by PX4 name and in PX4's units.
+
+    Parameters
+    ----------
+    comparison : Comparison
+    model : Model
+        Of its flight.
+    tuning : mapping from axis name, or "horizontal", to AxisTuning or Unavailable
+    clock : ClockOffset or Unavailable
+
+    Returns
+    -------
+    dict
+        Empty where the data tell nothing, or the source that was analysed is not the one that EKF2
+        fused. The delay only where what was flown is outside its interval. The noise of a source
+        that may drift only where EKF2 trusts it even more than its short-term noise allows: small
+        innovations against such a source say nothing about its error.
+    """
+    source = comparison.source
+    if source.name != model.inputs.vision.source or source.alignment is not None:
+        return {}
+    changes: dict[str, float] = {}
+    noise_m = tuned_noise_m(tuning)
+    trusted = noise_m is not None and noise_m <= noise_used_m(model)
+    if noise_m is not None and not (trusted and source.origin.may_drift):
+        changes |= noise_change(model, noise_m)
+    if isinstance(clock, ClockOffset) and clock.determinable:
+        flown = model.inputs.settings["EKF2_EV_DELAY"]
+        high, low = (-1e3 * end for end in clock.interval_s)
+        if not low - UPDATE_MS <= flown <= high + UPDATE_MS:
+            changes |= delay_change(model, -1e3 * clock.offset_s)
+    return changes
+
+
+def tuned_noise_m(tuning: Mapping[str, AxisTuning | Unavailable]) -> float | None:
+    """Horizontal measurement noise (m) that the data ask for; None where they do not tell."""
+    known = (tuning.get(name) for name in (HORIZONTAL, AISLE, "north", "east"))
+    return next((tuned.sigma_z.value for tuned in known if isinstance(tuned, AxisTuning)), None)
+
+
+def noise_change(model: Model, noise_m: float) -> dict[str, float]:
+    """What to set so that EKF2 takes a position's standard deviation (m) to be this.
+
+    Two digits, within PX4's range.
+    """
+    settings = model.inputs.settings
+    least = PARAMETERS["EKF2_EVP_NOISE"].minimum
+    changes = {"EKF2_EVP_NOISE": max(float(f"{noise_m:.2g}"), least)}
+    reported = noise_used_m(model) > REPORTED_TIMES * settings["EKF2_EVP_NOISE"]
+    if reported and noise_m < noise_used_m(model) and settings["EKF2_EV_NOISE_MD"] == 0.0:
+        changes["EKF2_EV_NOISE_MD"] = 1.0
+    return changes
+
+
+def delay_change(model: Model, delay_ms: float) -> dict[str, float]:
+    """What to set so that EKF2 takes positions to be this older than their stamps.
+
+    Nothing where PX4's range ends before; 0 for stamps that are early.
+    """
+    known = PARAMETERS["EKF2_EV_DELAY"]
+    if delay_ms > known.maximum:
+        return {}
+    changes = {"EKF2_EV_DELAY": max(float(round(delay_ms)), known.minimum)}
+    needed, flown = changes["EKF2_EV_DELAY"] + ARRIVAL_MS, model.inputs.settings
+    if not model.inputs.rules.horizon_by_delay and needed > flown["EKF2_DELAY_MAX"]:
+        changes["EKF2_DELAY_MAX"] = DELAY_STEP_MS * math.ceil(needed / DELAY_STEP_MS)
+    return {name: value for name, value in changes.items() if value != flown[name]}
+
+
+def noise_used_m(model: Model) -> float:
+    """Median √R (m) of EKF2 as flown."""
+    updates = model.flown.updates
+    columns = ["observation_variance_north_m2", "observation_variance_east_m2"]
+    return float(np.sqrt(np.median(updates[columns].to_numpy())))
 
 
 @dataclass(frozen=True)
@@ -57,11 +147,11 @@ class Effect:
         if max(before.rejected_share, after.rejected_share) >= REJECTED_SHOWN:
             parts.append(f"rejected {before.rejected_share:.0%} → {after.rejected_share:.0%}")
         parts.append(f"mean NIS {_short(before.nis_mean)} → {_short(after.nis_mean)}")
-        errors = before.position_rmse_to_truth_m, after.position_rmse_to_truth_m
-        if any(isinstance(error, Unavailable) for error in errors):
+        flown, changed = before.position_rmse_to_truth_m, after.position_rmse_to_truth_m
+        if isinstance(flown, Unavailable):
             parts.append(f"innovations {_std(before):.3f} → {_std(after):.3f} m rms, no truth")
         else:
-            parts.append(f"position error {errors[0]:.2f} → {errors[1]:.2f} m")
+            parts.append(f"position error {flown:.2f} → {changed:.2f} m")
         return f"{', '.join(parts)} (replayed)"
 
 
@@ -130,34 +220,26 @@ def filter_errors_m(comparison: Comparison, changed: Settings) -> tuple[float, f
     Root of the sum of the mean squares of all axes but the aisle, which is made of the others.
     None without a truth.
     """
-    names = set(comparison.axes)
-    results = [r for r in comparison.axes.values() if r.axis.name != AISLE or names == {AISLE}]
-    before = [result.filters["kf"].truth for result in results]
-    if changed.clock_offset_s == comparison.settings.clock_offset_s:
-        runs = [replay(result.axis, changed) for result in results]
-        after = []
-        for result, run in zip(results, runs, strict=True):
-            state = result.ekf2_state
-            timed = result.replay.steps if isinstance(state, Unavailable) else state
-            after.append(kf_against_truth(run, result.truth, timed.index.to_numpy()))
-    else:  # the measurements themselves are at other times
-        again = compare(
-            comparison.flight,
-            changed,
-            axes=tuple(result.axis.name for result in results),
-            heading_deg=results[0].axis.heading_deg if names == {AISLE} else None,
-            position_source=comparison.source.name,
-            start_s=comparison.segment.start_s,
-            end_s=comparison.segment.end_s,
-        )
-        after = [result.filters["kf"].truth for result in again.axes.values()]
-    first, second = (
-        [error.position_rmse_m for error in errors if isinstance(error, AgainstTruth)]
-        for errors in (before, after)
-    )
-    if min(len(first), len(second)) < len(results):
+    names = [name for name in comparison.axes if name != AISLE] or [AISLE]
+
+    def errors_m(of: Comparison) -> list[float]:
+        truths = (of.axes[name].filters["kf"].truth for name in names)
+        return [truth.position_rmse_m for truth in truths if isinstance(truth, AgainstTruth)]
+
+    segment, before = comparison.segment, errors_m(comparison)
+    if len(before) < len(names):
         return None
-    return math.hypot(*first), math.hypot(*second)
+    again = compare(
+        comparison.flight,
+        changed,
+        axes=tuple(names),
+        heading_deg=comparison.axes[names[0]].heading_deg,
+        position_source=comparison.source.name,
+        start_s=segment.start_s,
+        end_s=segment.end_s,
+    )
+    after = errors_m(again)
+    return (math.hypot(*before), math.hypot(*after)) if len(after) == len(names) else None
 
 
 def filter_words(
@@ -206,35 +288,31 @@ def settings_words(changes: Mapping[str, float]) -> str:
 def noise_helps(before: Summary, after: Summary) -> bool:
     """Whether another noise brings the mean NIS nearer to 1, and neither rejects nor errs more."""
     nearer = abs(math.log(after.nis_mean)) < NIS_NEARER * abs(math.log(before.nis_mean))
-    more = after.rejected_share > before.rejected_share or _errs_more(before, after)
+    more = after.rejected_share > before.rejected_share or _errs_more(before, after, WORSE_ERROR)
     return nearer and not more
 
 
 def rejects_less(before: Summary, after: Summary) -> bool:
     """Whether far fewer samples are rejected, and the position is not worse."""
     fewer = after.rejected_share < REJECTED_FEWER * before.rejected_share
-    return fewer and not _errs_more(before, after)
+    return fewer and not _errs_more(before, after, WORSE_ERROR)
 
 
 def delay_helps(before: Summary, after: Summary) -> bool:
     """Whether the innovations become smaller, and the error to the truth where there is one."""
-    errors = before.position_rmse_to_truth_m, after.position_rmse_to_truth_m
-    if isinstance(errors[0], float) and isinstance(errors[1], float) and errors[1] >= errors[0]:
-        return False
-    return _std(after) < _std(before) and after.rejected_share <= before.rejected_share
+    smaller = _std(after) < _std(before) and after.rejected_share <= before.rejected_share
+    return smaller and not _errs_more(before, after, 1.0)
 
 
-def _errs_more(before: Summary, after: Summary) -> bool:
-    errors = before.position_rmse_to_truth_m, after.position_rmse_to_truth_m
-    if isinstance(errors[0], Unavailable) or isinstance(errors[1], Unavailable):
-        return False
-    return errors[1] > WORSE_ERROR * errors[0]
+def _errs_more(before: Summary, after: Summary, times: float) -> bool:
+    """Whether the error to the truth becomes so many times what it was; not where none is known."""
+    error, flown = after.position_rmse_to_truth_m, before.position_rmse_to_truth_m
+    return isinstance(error, float) and isinstance(flown, float) and error > times * flown
 
 
 def _std(summary: Summary) -> float:
     """Standard deviation of the innovations per axis (m)."""
-    squares = [axis.innovation_std_m**2 for axis in summary.axes.values()]
-    return math.sqrt(sum(squares) / len(squares))
+    return math.sqrt(np.mean([axis.innovation_std_m**2 for axis in summary.axes.values()]))
 
 
 def _short(nis: float) -> str:

@@ -5,14 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 from msgspec.structs import replace
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike
 
-from px4fuse.ekf2.replay import HORIZONTAL, Agreement, AxisAgreement, Ekf2Replay
+from px4fuse.arrays import Array, BoolArray, IntArray
+from px4fuse.ekf2.inputs import AID_SOURCE, same_sample
+from px4fuse.ekf2.replay import HORIZONTAL, Agreement, AxisAgreement, Ekf2Replay, Spans
 from px4fuse.ekf2.stretches import SETTLING_S
-from px4fuse.ekf2.vision import AID_SOURCE, SAME_SAMPLE_S
-from px4fuse.flight import POSITION_COLUMNS, VELOCITY_COLUMNS, Ekf2, Flight, Unavailable
-
-Array = NDArray[np.float64]
+from px4fuse.flight import POSITION_COLUMNS, VELOCITY_COLUMNS, Ekf2, Flight, Truth, Unavailable
 
 MIN_SAMPLES = 20
 # The older topics repeat a sample until the next fusion, with the time of a later step
@@ -41,11 +40,9 @@ def agreement_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavai
     ekf2 = flight.ekf2
     assert isinstance(ekf2, Ekf2)
     logged = logged_innovations(ekf2)
-    updates = replay.updates
-    judged = judged_from(replay)
-    matched = match(replay, ekf2, logged.index.to_numpy()) if len(logged) else np.empty(0, int)
-    use = (matched >= 0) & settled(logged.index.to_numpy(), judged)
-    log, model = logged[use], updates.iloc[matched[use]]
+    matched = match(replay, ekf2, logged.index.to_numpy())
+    use = (matched >= 0) & settled(logged.index, judged_from(replay))
+    log, model = logged[use], replay.updates.iloc[matched[use]]
     if len(log) < MIN_SAMPLES:
         return Unavailable(
             "EKF2 replay",
@@ -59,19 +56,15 @@ def agreement_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavai
             "the innovations do not vary, so that nothing tells whether they agree",
             "Record a flight with motion and measured positions.",
         )
-    axes: dict[str, AxisAgreement] = {
-        axis: _axis(axis, log, model, ekf2, replay) for axis in HORIZONTAL
-    }
-    by_log = log["rejected"].to_numpy() > 0
-    by_model = model["rejected"].to_numpy() > 0
+    north, east = (_axis(axis, log, model, ekf2, replay) for axis in HORIZONTAL)
+    by_log, by_model = (frame["rejected"].to_numpy() > 0 for frame in (log, model))
     shares = float(by_log.mean()), float(by_model.mean())
-    good, reason = _verdict(axes, *shares)
-    north, east = (axes[axis] for axis in HORIZONTAL)
+    good, reason = _verdict({"north": north, "east": east}, *shares)
     apart_m = np.hypot(north.position_rms_difference_m, east.position_rms_difference_m)
     return Agreement(
         north=north,
         east=east,
-        ev_pos=dict(axes),
+        ev_pos={"north": north, "east": east},
         samples=len(log),
         rejected_share_logged=shares[0],
         rejected_share_replayed=shares[1],
@@ -95,31 +88,25 @@ def logged_innovations(ekf2: Ekf2) -> pd.DataFrame:
     return pd.DataFrame(parts).dropna()
 
 
-def judged_from(replay: Ekf2Replay) -> tuple[tuple[float, float], ...]:
+def judged_from(replay: Ekf2Replay) -> Spans:
     """Parts of the replay that are judged: each stretch without its beginning."""
     return tuple((start + SETTLING_S, end) for start, end in replay.stretches_s)
 
 
-def settled(times: Array, judged: tuple[tuple[float, float], ...]) -> NDArray[np.bool_]:
+def settled(times_s: ArrayLike, judged: Spans) -> BoolArray:
     """Which times lie in one of some spans."""
-    inside = np.zeros(len(times), dtype=bool)
-    for start, end in judged:
-        inside |= (times > start) & (times < end)
-    return inside
+    times = np.asarray(times_s)
+    return np.asarray(np.any([(times > a) & (times < b) for a, b in judged], axis=0))
 
 
-def match(replay: Ekf2Replay, ekf2: Ekf2, times: Array) -> NDArray[np.intp]:
+def match(replay: Ekf2Replay, ekf2: Ekf2, times: Array) -> IntArray:
     """Row of the replay's updates of each logged innovation; -1 where there is none."""
-    updates = replay.updates
     if AID_SOURCE in ekf2.innovation_topics:
-        taken = updates.index.to_numpy()
-        at = np.clip(np.searchsorted(taken, times - SAME_SAMPLE_S), 0, len(taken) - 1)
-        return np.where(np.abs(taken[at] - times) <= SAME_SAMPLE_S, at, -1)
-    fused_at = updates["fused_at_s"].to_numpy()
+        return same_sample(replay.updates.index.to_numpy(), times)
+    fused_at = replay.updates["fused_at_s"].to_numpy()
     at = np.searchsorted(fused_at, times + 1e-4, side="right") - 1
     age = times - fused_at[np.maximum(at, 0)]
-    rows: NDArray[np.intp] = np.where((at >= 0) & (age <= MAX_REPEAT_S), at, -1)
-    return rows
+    return np.where((at >= 0) & (age <= MAX_REPEAT_S), at, -1)
 
 
 def _axis(
@@ -128,36 +115,51 @@ def _axis(
     nu, nu_log = (f[f"innovation_{axis}_m"].to_numpy() for f in (model, log))
     s, s_log = (f[f"innovation_variance_{axis}_m2"].to_numpy() for f in (model, log))
     low, middle, high = np.percentile(s / s_log, [5, 50, 95])
+    times = ekf2.state.index[settled(ekf2.state.index, judged_from(replay))].to_numpy()
     at = HORIZONTAL.index(axis)
+    position, velocity = (
+        at_times(replay.published, column, times) - at_times(ekf2.state, column, times)
+        for column in (POSITION_COLUMNS[at], VELOCITY_COLUMNS[at])
+    )
     return AxisAgreement(
         innovation_correlation=float(np.corrcoef(nu, nu_log)[0, 1]),
-        innovation_rms_difference=_rms(nu - nu_log),
+        innovation_rms_difference=rms(nu - nu_log),
         s_ratio_median=float(middle),
         s_ratio_p5=float(low),
         s_ratio_p95=float(high),
         nis_mean_logged=float(np.mean(nu_log**2 / s_log)),
         nis_mean_replayed=float(np.mean(nu**2 / s)),
-        position_rms_difference_m=_rms(published_difference(ekf2, replay, POSITION_COLUMNS[at])),
-        velocity_rms_difference_m_s=_rms(published_difference(ekf2, replay, VELOCITY_COLUMNS[at])),
+        position_rms_difference_m=rms(position),
+        velocity_rms_difference_m_s=rms(velocity),
     )
-
-
-def published_difference(ekf2: Ekf2, replay: Ekf2Replay, column: str) -> Array:
-    """Published state, replay minus log, at EKF2's own sample times."""
-    times = ekf2.state.index.to_numpy()
-    times = times[settled(times, judged_from(replay))]
-    logged = at_times(ekf2.state, column, times)
-    found: Array = at_times(replay.published, column, times) - logged
-    return found
 
 
 def at_times(frame: pd.DataFrame, column: str, times: Array) -> Array:
     """One column of a time-indexed frame, interpolated."""
-    value: Array = np.interp(times, frame.index.to_numpy(), frame[column].to_numpy())
-    return value
+    return np.asarray(np.interp(times, frame.index, frame[column]))
 
 
-def _rms(values: Array) -> float:
+def along(frame: pd.DataFrame, columns: list[str], direction: Array, times: Array) -> Array:
+    """North and east columns of a time-indexed frame, interpolated, along a direction."""
+    north, east = (
+        weight * at_times(frame, column, times) if weight else np.zeros(len(times))
+        for weight, column in zip(direction[:2], columns[:2], strict=True)
+    )
+    return np.asarray(north + east)
+
+
+def rms_to_truth(flight: Flight, position: Array, direction: Array, times: Array) -> float | None:
+    """Error of a horizontal position (m, RMS) in the truth's span; None where there is no truth."""
+    if not isinstance(flight.truth, Truth):
+        return None
+    truth = flight.truth.samples
+    inside = (times >= truth.index[0]) & (times <= truth.index[-1])
+    error = (position - along(truth, POSITION_COLUMNS, direction, times))[inside]
+    return rms(error) if len(error) else None
+
+
+def rms(values: Array) -> float:
+    """Root of the mean square."""
     return float(np.sqrt(np.mean(values**2)))
 
 

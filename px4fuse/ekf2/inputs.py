@@ -1,4 +1,8 @@
-"""Flight → what the model of EKF2 runs on, or why its log cannot carry the model."""
+"""Flight → what the model of EKF2 runs on, or why its log cannot carry the model.
+
+Sources: PX4-Autopilot ``EKF/aid_sources/external_vision/ev_pos_control.cpp`` and, before v1.15,
+``EKF/ev_pos_control.cpp`` (frames), ``logged_topics.cpp`` (logging rates).
+"""
 
 from __future__ import annotations
 
@@ -6,22 +10,69 @@ from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
+from px4fuse.arrays import Array, BoolArray, IntArray
 from px4fuse.display import brief
 from px4fuse.ekf2.stretches import MIN_STRETCH_S, Stretch, find_stretches, predict_s
-from px4fuse.ekf2.vision import WHAT, Vision, read_vision
 from px4fuse.ekf2_parameters import fuses_by_mask, settings_in_force
-from px4fuse.flight import Ekf2, Flight, Unavailable
+from px4fuse.flight import (
+    POSITION_COLUMNS,
+    POSITION_VARIANCE_COLUMNS,
+    QUATERNION_COLUMNS,
+    Ekf2,
+    Flight,
+    FusionRecord,
+    PositionTrack,
+    Unavailable,
+)
+from px4fuse.origin import GIVEN_FILE
+from px4fuse.trajectory.rotation import conjugate, interpolate, matrix, multiply
 
-Array = NDArray[np.float64]
-
+WHAT = "EKF2 replay"
+# Logger limits of the topics that hold a copy of the vision samples (logged_topics.cpp)
+COPY_INTERVAL_S = {"estimator_visual_odometry_aligned": 0.2, "estimator_aid_src_ev_pos": 0.5}
+ROTATE_VISION_BIT = 64  # EKF2_AID_MASK, up to v1.13
+# The aid-source topics carry the time of measurement, as EKF2 takes it, to about a millisecond
+AID_SOURCE = "estimator_aid_src_ev_pos"
+SAME_SAMPLE_S = 0.006
+# vehicle_local_position is logged every 0.1 s
+RESET_SHOWS_S = 0.2
 # Predictions of more than this lose turns and vibration inside a step; EKF2's own are 8 to 13 ms
 MAX_IMU_INTERVAL_S = 0.012
 # The first release that stamps estimator_states with the time of the horizon
 STAMPED_AT_HORIZON = "PX4 v1.13"
 NO_LIMIT = 1_000_000
-MAX_LEG_S = 0.25
+MAX_INTERVAL_S = 0.25
+
+
+@dataclass(frozen=True)
+class Vision:
+    """External vision samples as EKF2 received them, shape (m,) or (m, ...), in time order.
+
+    Attributes
+    ----------
+    stamp_s, arrival_s : ndarray, shape (m,)
+    position_m : ndarray, shape (m, 3)
+        NED.
+    variance_m2 : ndarray, shape (m, 3)
+        As reported; 0 where the sender gave none.
+    rejected : ndarray, shape (m,)
+        Whether EKF2's gate rejected it, 1 or 0; NaN where the log does not tell.
+    reset : ndarray of bool, shape (m,)
+        Whether EKF2 reset its position to it, where the log tells what it rejected.
+    source : str
+        Name of the track.
+    """
+
+    stamp_s: Array
+    arrival_s: Array
+    position_m: Array
+    variance_m2: Array
+    rejected: Array
+    reset: BoolArray
+    source: str
+
+    __repr__ = brief
 
 
 @dataclass(frozen=True)
@@ -73,7 +124,7 @@ class Inputs:
         Whether EKF2 took its height from vision.
     imu_offset_m : ndarray, shape (3,)
         EKF2_IMU_POS, body FRD.
-    max_leg_s : float
+    max_interval_s : float
         Height and heading are measured at least this often where vision is silent.
     """
 
@@ -86,7 +137,7 @@ class Inputs:
     predict_s: float
     vision_height: bool
     imu_offset_m: Array
-    max_leg_s: float = MAX_LEG_S
+    max_interval_s: float = MAX_INTERVAL_S
 
     __repr__ = brief
 
@@ -105,12 +156,11 @@ def prepare(flight: Flight) -> Inputs | Unavailable:  # noqa: PLR0911 (a reason 
     assert isinstance(imu, pd.DataFrame)
     assert isinstance(attitude, pd.DataFrame)
     assert isinstance(ekf2, Ekf2)
-    record = ekf2.record
-    if isinstance(record, Unavailable):
-        return Unavailable(WHAT, record.reason, record.remedy)
-    fused = ekf2.innovations["north"]
-    if isinstance(fused, Unavailable):
-        return Unavailable(WHAT, fused.reason, fused.remedy)
+    record, horizon_s = ekf2.record, ekf2.horizon_s
+    for each in (record, ekf2.innovations["north"]):
+        if isinstance(each, Unavailable):
+            return Unavailable(WHAT, each.reason, each.remedy)
+    assert isinstance(record, FusionRecord)
     if record.other_aiding:
         return Unavailable(
             WHAT,
@@ -127,36 +177,130 @@ def prepare(flight: Flight) -> Inputs | Unavailable:  # noqa: PLR0911 (a reason 
     vision = read_vision(flight, ekf2, record, attitude)
     if isinstance(vision, Unavailable):
         return vision
-    horizon_s = ekf2.horizon_s
     if isinstance(horizon_s, Unavailable):
         if not flight.log.firmware.startswith(STAMPED_AT_HORIZON):
             return Unavailable(WHAT, horizon_s.reason, horizon_s.remedy)
         horizon_s = 0.0  # a buffer of one step: EKF2_EV_DELAY is at most EKF2_PREDICT_US
-    stretches = find_stretches(flight, imu, attitude, ekf2, record, vision)
+    stretches = find_stretches(flight, imu, attitude, ekf2, record, vision.stamp_s)
     if not stretches:
         return Unavailable(
             WHAT,
             f"no {MIN_STRETCH_S:g} s of external vision fused without a gap in IMU or vision",
             "Record without dropouts (a faster SD card, fewer topics), and send vision steadily.",
         )
-    old = fuses_by_mask(record.parameters)
     floor = 5e-8 / ekf2.step_s**2 if record.per_step_biases else None
     # EV_MAX_INTERVAL, ev_control.cpp; no_aid_timeout_max and reset_timeout_max, common.h
-    by_delay = "EKF2_DELAY_MAX" not in record.parameters
-    rules = (
-        Rules(np.inf, 7.0, 7.0, NO_LIMIT, floor, by_delay)
-        if old
-        else Rules(0.2, 0.4, 1.0, 5, floor, by_delay)
+    limits = (
+        (np.inf, 7.0, 7.0, NO_LIMIT) if fuses_by_mask(record.parameters) else (0.2, 0.4, 1.0, 5)
     )
     fusing = ekf2.fusing
     return Inputs(
         settings=settings_in_force(record.parameters),
         stretches=stretches,
         vision=vision,
-        rules=rules,
+        rules=Rules(*limits, floor, "EKF2_DELAY_MAX" not in record.parameters),
         step_s=ekf2.step_s,
         horizon_s=horizon_s,
         predict_s=predict_s(record),
         vision_height=isinstance(fusing, pd.DataFrame) and bool(fusing["vertical"].mean() > 0.5),
         imu_offset_m=np.array([record.parameters.get(f"EKF2_IMU_POS_{x}", 0.0) for x in "XYZ"]),
+    )
+
+
+def read_vision(
+    flight: Flight, ekf2: Ekf2, record: FusionRecord, attitude: pd.DataFrame
+) -> Vision | Unavailable:
+    """The samples that EKF2 received, in NED, or why the log does not hold them all.
+
+    Parameters
+    ----------
+    flight : Flight
+    ekf2 : Ekf2
+    record : FusionRecord
+    attitude : DataFrame
+        As published, to turn samples of a frame of their own.
+    """
+    track = _source(flight)
+    if isinstance(track, Unavailable):
+        return track
+    samples = track.samples.dropna(subset=POSITION_COLUMNS[:2])
+    stamp = samples.index.to_numpy()
+    position = samples[POSITION_COLUMNS].to_numpy(copy=True)
+    variance = samples[POSITION_VARIANCE_COLUMNS].fillna(0.0).to_numpy(copy=True)
+    rotated = not isinstance(ekf2.fusing, pd.DataFrame) or not ekf2.fusing["yaw"].any()
+    if fuses_by_mask(record.parameters):
+        rotated = bool(int(record.parameters["EKF2_AID_MASK"]) & ROTATE_VISION_BIT)
+    if track.frame == "FRD" and rotated:
+        if track.orientation is None:
+            return Unavailable(
+                WHAT,
+                f"{track.name} is in a frame of its own (FRD) and gives no orientation by which "
+                "EKF2 turned it north",
+                "Send the position in NED, or with an orientation.",
+            )
+        published, sent = (
+            interpolate(stamp, frame.index.to_numpy(), frame[QUATERNION_COLUMNS].to_numpy())
+            for frame in (attitude, track.orientation)
+        )
+        turn = matrix(multiply(published, conjugate(sent)))
+        position = np.einsum("nij,nj->ni", turn, position)
+        variance = np.einsum("nij,nj->ni", turn**2, variance)
+    age = record.vision_age_s
+    arrival = np.full(len(stamp), -np.inf)  # unknown: never taken to be late
+    if len(age) and "vehicle_visual_odometry" in track.topics:
+        arrival = stamp + np.interp(stamp, age.index.to_numpy(), age.to_numpy())
+    decisions = _decisions(ekf2, record, stamp)
+    return Vision(stamp, arrival, position, variance, *decisions, track.name)
+
+
+def _decisions(ekf2: Ekf2, record: FusionRecord, stamp: Array) -> tuple[Array, BoolArray]:
+    """What EKF2 rejected and reset to, where its aid-source topic tells, by time of measurement."""
+    rejected, reset = np.full(len(stamp), np.nan), np.zeros(len(stamp), dtype=bool)
+    innovations, horizon_s = ekf2.innovations["north"], ekf2.horizon_s
+    known = AID_SOURCE in ekf2.innovation_topics
+    if isinstance(innovations, Unavailable) or isinstance(horizon_s, Unavailable) or not known:
+        return rejected, reset
+    delay_s = settings_in_force(record.parameters)["EKF2_EV_DELAY"] * 1e-3
+    taken = stamp - delay_s - 0.5 * ekf2.step_s
+    row = same_sample(innovations.index.to_numpy(), taken)
+    rejected[row >= 0] = innovations["rejected"].to_numpy()[row[row >= 0]]
+    # a reset shows in the first published sample after it, the horizon after the measurement
+    published = taken + horizon_s
+    for shown_s in horizontal_resets_s(ekf2):
+        before = np.flatnonzero((published <= shown_s) & (rejected != 0.0))
+        if len(before) and shown_s - published[before[-1]] < RESET_SHOWS_S:
+            reset[before[-1]] = True
+    return rejected, reset
+
+
+def same_sample(known_s: Array, wanted_s: Array) -> IntArray:
+    """Row of the sample of each time of measurement; -1 where there is none."""
+    at = np.clip(np.searchsorted(known_s, wanted_s - SAME_SAMPLE_S), 0, len(known_s) - 1)
+    return np.where(np.abs(known_s[at] - wanted_s) <= SAME_SAMPLE_S, at, -1)
+
+
+def horizontal_resets_s(ekf2: Ekf2) -> Array:
+    """When resets of EKF2's horizontal position show in what it publishes."""
+    return np.array(
+        [one.time_s for one in ekf2.resets if one.quantity == "position" and any(one.delta[:2])]
+    )
+
+
+def _source(flight: Flight) -> PositionTrack | Unavailable:
+    """The track that EKF2 received, complete."""
+    why = ["no vehicle_visual_odometry"]
+    for track in sorted(flight.positions, key=lambda t: t.origin == GIVEN_FILE):
+        if track.origin.is_vision and track.origin.as_sent:
+            return track
+        if track.name in COPY_INTERVAL_S:
+            interval = float(np.median(np.diff(track.samples.index.to_numpy())))
+            if interval < 0.9 * COPY_INTERVAL_S[track.name] and interval <= 0.25:
+                return track
+            why.append(
+                f"{track.name} holds one sample in {interval:.2g} s, fewer than EKF2 may have fused"
+            )
+    return Unavailable(
+        WHAT,
+        "; ".join(why),
+        "Set SDLOG_PROFILE to 129 (default and vision), or give the MAVLink recording too.",
     )

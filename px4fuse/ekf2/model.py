@@ -14,39 +14,34 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pandas as pd
 from msgspec import structs
-from numpy.typing import NDArray
 
+from px4fuse.arrays import Array
 from px4fuse.display import brief
 from px4fuse.ekf2.agreement import REJECTING_SHARE, agreement_with_log, with_obedient
 from px4fuse.ekf2.inputs import Inputs, prepare
-from px4fuse.ekf2.legs import (
+from px4fuse.ekf2.intervals import (
     ACCELEROMETER_BIAS,
     GRAVITY_M_S2,
     GYRO_BIAS,
     POSITION,
     THETA,
     VELOCITY,
-    FusionEvents,
-    Legs,
+    Intervals,
     Timing,
-    make_legs,
+    make_intervals,
 )
 from px4fuse.ekf2.output_predictor import follow_attitude, later, publish
 from px4fuse.ekf2.recursion import Run, Variant, run, with_correlation
 from px4fuse.ekf2.replay import UPDATE_COLUMNS, Agreement, Ekf2Replay
-from px4fuse.ekf2.stretches import Stretch
 from px4fuse.ekf2_parameters import check
 from px4fuse.errors import SettingsError
-from px4fuse.flight import STATE_COLUMNS, Flight, Unavailable
-
-Array = NDArray[np.float64]
+from px4fuse.flight import POSITION_COLUMNS, STATE_COLUMNS, VELOCITY_COLUMNS, Flight, Unavailable
 
 # Where a log's EKF2 is this model (simulated flights), the log says so in these words
 MODEL_NOTE = (
     "EKF2 in this log is px4fuse's model of EKF2, run on the simulated sensors, not PX4's EKF2"
 )
 MAX_HORIZON_S = 1.0  # EKF2_DELAY_MAX
-HORIZONTAL_POSITION, HORIZONTAL_VELOCITY = slice(6, 8), slice(3, 5)
 
 
 @dataclass(frozen=True)
@@ -57,7 +52,7 @@ class Model:
     ----------
     flight : Flight
     inputs : Inputs
-    legs : tuple of Legs
+    intervals : tuple of Intervals
         Of each stretch, for the delay as flown.
     flown : Ekf2Replay
         With the parameters of the log.
@@ -67,39 +62,11 @@ class Model:
 
     flight: Flight
     inputs: Inputs
-    legs: tuple[Legs, ...]
+    intervals: tuple[Intervals, ...]
     flown: Ekf2Replay
     agreement: Agreement
 
     __repr__ = brief
-
-
-def replay_ekf2(
-    flight: Flight, parameters: Mapping[str, float] | None = None
-) -> Ekf2Replay | Unavailable:
-    """Replay EKF2 from a flight's log.
-
-    Parameters
-    ----------
-    flight : Flight
-    parameters : mapping, optional
-        What to change, by PX4 name and in PX4's units; by default nothing.
-
-    Returns
-    -------
-    Ekf2Replay or Unavailable
-        Its ``agreement`` is that of the replay as flown, whatever was changed.
-
-    Raises
-    ------
-    SettingsError
-        A parameter that the model does not have, or a value outside PX4's range.
-    """
-    changed = check(parameters or {})
-    model = open_model(flight)
-    if isinstance(model, Unavailable):
-        return model
-    return replay_settings(model, [changed])[0] if changed else model.flown
 
 
 def open_model(flight: Flight) -> Model | Unavailable:
@@ -112,27 +79,30 @@ def open_model(flight: Flight) -> Model | Unavailable:
     inputs = prepare(flight)
     if isinstance(inputs, Unavailable):
         return inputs
-    variant = Variant(inputs.settings)
-    timing = variant.timing(inputs)
-    legs = tuple(make_legs(inputs, stretch, timing) for stretch in inputs.stretches)
+    flown = Variant(inputs.settings)
+    timing = flown.timing(inputs)
+    intervals = tuple(make_intervals(inputs, stretch, timing) for stretch in inputs.stretches)
     stretches = tuple(
-        with_correlation(inputs, stretch, leg)
-        for stretch, leg in zip(inputs.stretches, legs, strict=True)
+        with_correlation(inputs, stretch, each)
+        for stretch, each in zip(inputs.stretches, intervals, strict=True)
     )
     inputs = replace(inputs, stretches=stretches)
-    runs = run_variants(inputs, [variant], {timing: legs})
-    flown = _assemble(inputs, runs, 0, {})
-    agreement = agreement_with_log(flight, flown)
+
+    def replayed(variant: Variant) -> tuple[Ekf2Replay, Agreement | Unavailable]:
+        runs = run_variants(inputs, [variant], {timing: intervals})
+        replay = _assemble(inputs, runs, 0, {})
+        return replay, agreement_with_log(flight, replay)
+
+    replay, agreement = replayed(flown)
     if isinstance(agreement, Unavailable):
         return agreement
     share = max(agreement.rejected_share_logged, agreement.rejected_share_replayed)
     if agreement.good and share > REJECTING_SHARE and np.isfinite(inputs.vision.rejected).any():
-        variant = Variant(inputs.settings, as_logged=True)
-        obedient = _assemble(inputs, run_variants(inputs, [variant], {timing: legs}), 0, {})
-        obeyed = agreement_with_log(flight, obedient)
+        _, obeyed = replayed(replace(flown, as_logged=True))
         if isinstance(obeyed, Agreement):
             agreement = with_obedient(agreement, obeyed)
-    return Model(flight, inputs, legs, structs.replace(flown, agreement=agreement), agreement)
+    replay = structs.replace(replay, agreement=agreement)
+    return Model(flight, inputs, intervals, replay, agreement)
 
 
 def replay_settings(
@@ -159,22 +129,10 @@ def replay_settings(
         )
     if not changes:
         return ()
-    flown = model.inputs.settings
-    variants = [Variant({**flown, **change}) for change in changes]
-    return tuple(
-        structs.replace(replay, agreement=model.agreement)
-        for replay in replay_variants(model, variants, changes)
-    )
-
-
-def replay_variants(
-    model: Model, variants: Sequence[Variant], changes: Sequence[Mapping[str, float]]
-) -> list[Ekf2Replay]:
-    """Replay filters of any kind; ``changes`` are what each is said to have changed."""
     inputs = model.inputs
-    made = {Variant(inputs.settings).timing(inputs): model.legs}
-    runs = run_variants(inputs, variants, made)
-    return [_assemble(inputs, runs, at, change) for at, change in enumerate(changes)]
+    runs = _run_model(model, [Variant({**inputs.settings, **change}) for change in changes])
+    replays = (_assemble(inputs, runs, at, change) for at, change in enumerate(changes))
+    return tuple(structs.replace(replay, agreement=model.agreement) for replay in replays)
 
 
 def delayed_variants(
@@ -184,97 +142,73 @@ def delayed_variants(
 
     What a filter publishes is as long again, and takes as long to make.
     """
-    made = {Variant(model.inputs.settings).timing(model.inputs): model.legs}
-    runs = run_variants(model.inputs, variants, made)
-    last = _assemble(model.inputs, runs, len(variants) - 1, {})
+    runs, last = _run_model(model, variants), len(variants) - 1
     tracks = (
-        pd.concat([_delayed(part, delayed_states(part, at)[0]) for part in runs])
-        for at in range(len(variants) - 1)
+        pd.concat([_track(part, delayed_states(part, at)[0][:, 3:9]) for part in runs])
+        for at in range(last)
     )
-    return tracks, last
+    return tracks, _assemble(model.inputs, runs, last, {})
 
 
-def _delayed(part: StretchRun, state: Array) -> pd.DataFrame:
-    index = pd.Index(part.stretch.time_s, name="time_s")
-    return pd.DataFrame(np.hstack([state[:, 6:9], state[:, 3:6]]), index, STATE_COLUMNS)
-
-
-@dataclass(frozen=True)
-class StretchRun:
-    """One stretch with its events by delay, and what the variants did in it."""
-
-    stretch: Stretch
-    events: tuple[FusionEvents, ...]
-    which: NDArray[np.intp]
-    run: Run
-    variants: tuple[Variant, ...]
+def _run_model(model: Model, variants: Sequence[Variant]) -> list[Run]:
+    timing = Variant(model.inputs.settings).timing(model.inputs)
+    return run_variants(model.inputs, variants, {timing: model.intervals})
 
 
 def run_variants(
-    inputs: Inputs, variants: Sequence[Variant], made: Mapping[Timing, Sequence[Legs]]
-) -> list[StretchRun]:
-    """Run variants through every stretch; ``made`` are the legs that there are."""
+    inputs: Inputs, variants: Sequence[Variant], known: Mapping[Timing, Sequence[Intervals]]
+) -> list[Run]:
+    """Run variants through every stretch; ``known`` are the intervals that there are."""
     timings = [variant.timing(inputs) for variant in variants]
-    distinct = list(dict.fromkeys(timings))
-    which = np.array([distinct.index(timing) for timing in timings])
     runs = []
     for at, stretch in enumerate(inputs.stretches):
-        legs = tuple(
-            made[timing][at] if timing in made else make_legs(inputs, stretch, timing)
-            for timing in distinct
-        )
-        done = run(inputs, stretch, legs, which, variants)
-        events = tuple(each.events for each in legs)
-        runs.append(StretchRun(stretch, events, which, done, tuple(variants)))
+        intervals = {
+            timing: known[timing][at]
+            if timing in known
+            else make_intervals(inputs, stretch, timing)
+            for timing in set(timings)
+        }
+        runs.append(run(inputs, stretch, variants, [intervals[timing] for timing in timings]))
     return runs
 
 
+def _track(part: Run, velocity_position: Array) -> pd.DataFrame:
+    index = pd.Index(part.stretch.time_s, name="time_s")
+    return pd.DataFrame(velocity_position, index, VELOCITY_COLUMNS + POSITION_COLUMNS)[
+        STATE_COLUMNS
+    ]
+
+
 def _assemble(
-    inputs: Inputs, runs: Sequence[StretchRun], at: int, changed: Mapping[str, float]
+    inputs: Inputs, runs: Sequence[Run], at: int, changed: Mapping[str, float]
 ) -> Ekf2Replay:
-    updates, delayed, published = [], [], []
-    for part in runs:
-        updates.append(_updates(part, at))
-        state, output = _tracks(inputs, part, at)
-        delayed.append(state)
-        published.append(output)
+    tracks = [_tracks(inputs, part, at) for part in runs]
     return Ekf2Replay(
         settings=runs[0].variants[at].settings,
         changed=dict(changed),
-        updates=pd.concat(updates),
-        delayed=pd.concat(delayed),
-        published=pd.concat(published),
-        stretches_s=tuple(
-            (float(part.stretch.time_s[0]), float(part.stretch.time_s[-1])) for part in runs
-        ),
+        updates=pd.concat([_updates(part, at) for part in runs]),
+        delayed=pd.concat([delayed for delayed, _ in tracks]),
+        published=pd.concat([published for _, published in tracks]),
+        stretches_s=tuple(tuple(part.stretch.time_s[[0, -1]].tolist()) for part in runs),
         source=inputs.vision.source,
-        late=sum(int(part.events[part.which[at]].late.sum()) for part in runs),
-        lost=sum(int(part.events[part.which[at]].lost.sum()) for part in runs),
+        late=sum(int(part.events[at].late.sum()) for part in runs),
+        lost=sum(int(part.events[at].lost.sum()) for part in runs),
     )
 
 
-def _updates(part: StretchRun, at: int) -> pd.DataFrame:
-    events, done = part.events[part.which[at]], part.run
-    seen = np.flatnonzero(np.isfinite(done.innovation_m[:, at, 0]))
-    after = done.variance[seen + 1, at]
-    values = np.column_stack(
-        [
-            done.innovation_m[seen, at],
-            done.variance_m2[seen, at],
-            done.rejected[seen, at],
-            done.fused[seen, at],
-            done.reset[seen, at],
-            after[:, HORIZONTAL_POSITION],
-            after[:, HORIZONTAL_VELOCITY],
-            done.noise_m2[seen, at],
-            part.stretch.time_s[events.end[seen]],
-        ]
-    )
+def _updates(part: Run, at: int) -> pd.DataFrame:
+    events = part.events[at]
+    seen = np.flatnonzero(np.isfinite(part.innovation_m[:, at, 0]))
+    after = part.variance[seen + 1, at]
+    flags = np.stack([part.rejected, part.fused, part.reset], axis=-1)[seen, at]
+    nu, s, r = (each[seen, at] for each in (part.innovation_m, part.variance_m2, part.noise_m2))
+    fused_at_s = part.stretch.time_s[events.end[seen], None]
+    values = np.hstack([nu, s, flags, after[:, 6:8], after[:, 3:5], r, fused_at_s])
     index = pd.Index(events.time_s[seen], name="time_s")
     return pd.DataFrame(values, index=index, columns=UPDATE_COLUMNS)
 
 
-def _tracks(inputs: Inputs, part: StretchRun, at: int) -> tuple[pd.DataFrame, pd.DataFrame]:
+def _tracks(inputs: Inputs, part: Run, at: int) -> tuple[pd.DataFrame, pd.DataFrame]:
     """The filter's state and what it publishes, at each step."""
     stretch, variant = part.stretch, part.variants[at]
     state, reset = delayed_states(part, at)
@@ -284,28 +218,22 @@ def _tracks(inputs: Inputs, part: StretchRun, at: int) -> tuple[pd.DataFrame, pd
     force = stretch.force_m_s2 - later(state[:, ACCELEROMETER_BIAS], lag)[1:]
     force = np.einsum("nij,nj->ni", stretch.rotation[1:], force)
     if variant.attitude:  # the published attitude followed that of EKF2 itself
-        turned = follow_attitude(
-            state[:, :3] - stretch.attitude_error_rad, lag, inputs.step_s, horizon_s
-        )
-        force = force + np.cross(turned[1:], force)
-    velocity, position = publish(
+        apart = state[:, THETA] - stretch.attitude_error_rad
+        force += np.cross(follow_attitude(apart, lag, inputs.step_s, horizon_s)[1:], force)
+    published = publish(
         gain_m_s=(force + GRAVITY_M_S2) * stretch.step_s[:, None],
         step_s=stretch.step_s,
-        velocity_m_s=state[:, 3:6],
-        position_m=state[:, 6:9],
+        velocity_m_s=state[:, VELOCITY],
+        position_m=state[:, POSITION],
         reset_m=reset,
         lag=lag,
         tau_velocity_s=variant.settings["EKF2_TAU_VEL"],
         tau_position_s=variant.settings["EKF2_TAU_POS"],
     )
-    index = pd.Index(stretch.time_s, name="time_s")
-    return (
-        _delayed(part, state),
-        pd.DataFrame(np.hstack([position, velocity]), index, STATE_COLUMNS),
-    )
+    return _track(part, state[:, 3:9]), _track(part, np.hstack(published))
 
 
-def delayed_states(part: StretchRun, at: int) -> tuple[Array, Array]:
+def delayed_states(part: Run, at: int) -> tuple[Array, Array]:
     """State of one variant at each step's end, and the position's resets up to then.
 
     Returns
@@ -313,24 +241,24 @@ def delayed_states(part: StretchRun, at: int) -> tuple[Array, Array]:
     state : ndarray, shape (n + 1, 15)
     reset_m : ndarray, shape (n + 1, 3)
     """
-    events, variant = part.events[part.which[at]], part.variants[at]
-    stretch, kept = part.stretch, part.run.state[:, at]
+    end, variant = part.events[at].end, part.variants[at]
+    stretch, kept = part.stretch, part.state[:, at]
     count, rotation, dt = len(stretch.step_s), stretch.rotation[1:], stretch.step_s[:, None]
-    leg = np.searchsorted(events.end, np.arange(count), side="right")
-    first = np.searchsorted(leg, leg)
-    state = kept[np.concatenate([[0], leg])]
+    interval = np.searchsorted(end, np.arange(count), side="right")
+    first = np.searchsorted(interval, interval)
+    state = kept[np.concatenate([[0], interval])]
 
     def grown(each: Array) -> Array:
-        """Sum of what each step adds, from the beginning of its leg on."""
+        """Sum of what each step adds, from the beginning of its interval on."""
         total = np.cumsum(each, axis=0)
         return np.asarray(total - (total - each)[first])
 
     def before(after: Array, rows: slice) -> Array:
         """What there was before each step."""
         shifted = np.concatenate([after[:1], after[:-1]])
-        return np.where((first == np.arange(count))[:, None], kept[leg, rows], shifted)
+        return np.where((first == np.arange(count))[:, None], kept[interval, rows], shifted)
 
-    # the equations of the legs, for this state alone
+    # the equations of the intervals, for this state alone
     turned = -np.einsum("nij,nj->ni", rotation, state[1:, GYRO_BIAS]) * dt
     if variant.attitude:
         turned -= stretch.correction_rad
@@ -341,9 +269,9 @@ def delayed_states(part: StretchRun, at: int) -> tuple[Array, Array]:
     state[1:, VELOCITY] += grown(gained * dt)
     speed = state[1:, VELOCITY]
     state[1:, POSITION] += grown(0.5 * dt * (before(speed, VELOCITY) + speed))
-    state[events.end] = kept[1:]
+    state[end] = kept[1:]
     reset = np.zeros((count + 1, 3))
-    for e in np.flatnonzero(part.run.reset[:, at]):
+    for e in np.flatnonzero(part.reset[:, at]):
         # measured position minus the state before: the innovation itself
-        reset[events.end[e] :, :2] += part.run.innovation_m[e, at]
+        reset[end[e] :, :2] += part.innovation_m[e, at]
     return state, reset

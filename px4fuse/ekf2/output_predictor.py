@@ -12,10 +12,9 @@ Source: PX4-Autopilot ``EKF/output_predictor/output_predictor.cpp`` (``EKF/ekf.c
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import lapack
 
-Array = NDArray[np.float64]
+from px4fuse.arrays import Array
 
 INTEGRAL_SHARE = 0.1
 ATTITUDE_SHARE = 0.5
@@ -54,13 +53,12 @@ def publish(
         Before the first comparison, at step ``lag``, dead reckoning from the first state.
     """
     mean_step = float(np.mean(step_s))
-    zero = np.zeros((1, gain_m_s.shape[1]))
-    free = velocity_m_s[0] + np.concatenate([zero, np.cumsum(gain_m_s, axis=0)])
+    free = np.cumsum(np.concatenate([velocity_m_s[:1], gain_m_s]), axis=0)
     velocity = free + _followed(velocity_m_s - free, lag, mean_step, tau_velocity_s)
     # within a step the velocity grows by what the IMU gives; corrections come at its end
     moved = (velocity[:-1] + 0.5 * gain_m_s) * step_s[:, None]
     steady = position_m - reset_m  # the buffer is moved along with a reset
-    free = steady[0] + np.concatenate([zero, np.cumsum(moved, axis=0)])
+    free = np.cumsum(np.concatenate([steady[:1], moved]), axis=0)
     position = free + _followed(steady - free, lag, mean_step, tau_position_s)
     return velocity, position + later(reset_m, lag)
 
@@ -72,18 +70,14 @@ def _followed(offset: Array, lag: int, step_s: float, tau_s: float) -> Array:
     """
     g = step_s / np.clip(tau_s, step_s, 10.0)
     h = INTEGRAL_SHARE * g**2
-    start = offset[0]
-    late = later(offset - start, lag)
+    late = later(offset - offset[0], lag)
     corrected = _recursive(np.array([g + h, -g]), np.array([1.0, g + h - 2.0, 1.0 - g]), late)
-    total: Array = corrected + start
-    return total
+    return np.asarray(corrected + offset[0])
 
 
 def later(values: Array, lag: int) -> Array:
     """The same values ``lag`` steps later, the first one before them."""
-    if lag == 0:
-        return values
-    return np.concatenate([np.repeat(values[:1], lag, axis=0), values[:-lag]])[: len(values)]
+    return values[np.maximum(np.arange(len(values)) - lag, 0)]
 
 
 def follow_attitude(error_rad: Array, lag: int, step_s: float, horizon_s: float) -> Array:
@@ -99,10 +93,8 @@ def follow_attitude(error_rad: Array, lag: int, step_s: float, horizon_s: float)
     step_s, horizon_s : float
     """
     share = ATTITUDE_SHARE * step_s / max(horizon_s, step_s)
-    numerator = np.zeros(lag + 2)
-    numerator[-1] = share
-    denominator = np.zeros(lag + 2)
-    denominator[:2] = 1.0, -1.0
+    numerator, denominator = np.zeros((2, lag + 2))
+    numerator[-1], denominator[:2] = share, (1.0, -1.0)
     denominator[-1] += share
     return _recursive(numerator, denominator, error_rad)
 

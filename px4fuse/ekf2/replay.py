@@ -10,6 +10,7 @@ from px4fuse.display import brief
 from px4fuse.flight import AxisName
 from px4fuse.record import Correlation, Count, NotNegative, Positive, Record, Share, Span
 
+Spans = tuple[Span, ...]
 HORIZONTAL: tuple[AxisName, AxisName] = ("north", "east")
 UPDATE_COLUMNS = [
     "innovation_north_m", "innovation_east_m", "innovation_variance_north_m2",
@@ -104,7 +105,7 @@ class Replayed(Record, frozen=True, kw_only=True, omit_defaults=False):
     """
 
     source: str
-    stretches_s: tuple[Span, ...]
+    stretches_s: Spans
     settings: Mapping[str, float]
     late: Count = 0
     lost: Count = 0

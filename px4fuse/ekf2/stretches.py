@@ -10,10 +10,9 @@ from itertools import pairwise
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
+from px4fuse.arrays import Array, IntArray
 from px4fuse.display import brief
-from px4fuse.ekf2.vision import Vision
 from px4fuse.flight import (
     ACCELEROMETER_BIAS_COLUMNS,
     ANGULAR_RATE_COLUMNS,
@@ -38,9 +37,6 @@ from px4fuse.trajectory.rotation import (
     running_product,
     to_vector,
 )
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.intp]
 
 # Without vision or IMU for longer than this the model starts again from the log: other things than
 # vision then move EKF2 (gravity, fake position, zero velocity), which the model does not have
@@ -116,7 +112,7 @@ def find_stretches(
     attitude: pd.DataFrame,
     ekf2: Ekf2,
     record: FusionRecord,
-    vision: Vision,
+    vision_s: Array,
 ) -> tuple[Stretch, ...]:
     """Parts of a flight without gaps in IMU and vision, from when EKF2 has fused for a while.
 
@@ -127,37 +123,33 @@ def find_stretches(
     imu, attitude : DataFrame
     ekf2 : Ekf2
     record : FusionRecord
-    vision : Vision
+    vision_s : ndarray
+        Stamps of external vision.
     """
     innovations = ekf2.innovations["north"]
     if isinstance(innovations, Unavailable):
         return ()
-    fused = innovations.index.to_numpy()
-    delayed_time = record.delayed.index.to_numpy()
+    fused, states = innovations.index.to_numpy(), record.delayed.index.to_numpy()
     time = imu.index.to_numpy()
-    interval = np.diff(time)
     cuts = [time[0], time[-1]]
-    for stamps, limit in ((time, IMU_GAP_S), (vision.stamp_s, RESTART_GAP_S)):
+    for stamps, limit in ((time, IMU_GAP_S), (vision_s, RESTART_GAP_S)):
         gap = np.flatnonzero(np.diff(stamps) > limit)
         cuts += [*stamps[gap], *stamps[gap + 1]]
-    first = max(attitude.index[0], vision.stamp_s[0])
-    last = min(attitude.index[-1], vision.stamp_s[-1] + 1.0)
+    first = max(attitude.index[0], vision_s[0])
+    last = min(attitude.index[-1], vision_s[-1] + 1.0)
+    airborne = () if isinstance(flight.airborne, Unavailable) else flight.airborne
     found = []
-    edges = np.unique(np.clip(cuts, first, last))
-    for low, high in pairwise(edges):
+    for low, high in pairwise(np.unique(np.clip(cuts, first, last))):
         inside = fused[(fused >= low) & (fused <= high)]
         if not len(inside):
             continue
-        begin = inside[0] + START_AFTER_S
-        if not isinstance(flight.airborne, Unavailable):
-            offs = [off + AIRBORNE_S for off, _ in flight.airborne if off < high]
-            begin = max([begin, *offs[:1]])
-        at = int(np.searchsorted(delayed_time, begin))
-        if at == len(delayed_time) or high - delayed_time[at] < MIN_STRETCH_S:
+        offs = [off + AIRBORNE_S for off, _ in airborne if off < high]
+        at = int(np.searchsorted(states, max([inside[0] + START_AFTER_S, *offs[:1]])))
+        if at == len(states) or high - states[at] < MIN_STRETCH_S:
             continue
-        if np.any(interval[(time[1:] > delayed_time[at]) & (time[:-1] < high)] > IMU_GAP_S):
-            continue
-        found.append(_stretch(imu, attitude, ekf2, record, at, high))
+        covered = (time[1:] > states[at]) & (time[:-1] < high)
+        if np.all(np.diff(time)[covered] <= IMU_GAP_S):
+            found.append(_stretch(imu, attitude, ekf2, record, at, high))
     return tuple(found)
 
 
@@ -169,60 +161,50 @@ def _stretch(
     at: int,
     end_s: float,
 ) -> Stretch:
-    start = record.delayed.iloc[at]
+    start = record.delayed.iloc[at].astype(np.float64)
     time = imu.index.to_numpy()
-    from_row = int(np.argmin(np.abs(time - record.delayed.index[at])))
-    to_row = int(np.searchsorted(time, end_s, side="right"))
-    time = time[from_row:to_row]
+    first_row = int(np.argmin(np.abs(time - record.delayed.index[at])))
+    rows = slice(first_row, int(np.searchsorted(time, end_s, side="right")))
+    time, imu = time[rows], imu.iloc[rows]
     interval = np.diff(time)
     known = np.flatnonzero(np.isin(np.rint(time * 1e6), np.rint(record.delayed.index * 1e6)))
     ends = step_ends(interval, known, predict_s(record))
-    gyro_bias = start[GYRO_BIAS_COLUMNS].to_numpy(dtype=np.float64)
-    accelerometer_bias = start[ACCELEROMETER_BIAS_COLUMNS].to_numpy(dtype=np.float64)
-    rate = imu[ANGULAR_RATE_COLUMNS].to_numpy()[from_row + 1 : to_row] - gyro_bias
-    force = imu[SPECIFIC_FORCE_COLUMNS].to_numpy()[from_row + 1 : to_row] - accelerometer_bias
+    bias = np.asarray(start[ACCELEROMETER_BIAS_COLUMNS])
+    rate = imu[ANGULAR_RATE_COLUMNS].to_numpy()[1:] - np.asarray(start[GYRO_BIAS_COLUMNS])
+    force = imu[SPECIFIC_FORCE_COLUMNS].to_numpy()[1:] - bias
     turn, gain = down_sampled(rate * interval[:, None], force * interval[:, None], ends)
-    step_time = time[np.concatenate([[0], ends])]
-    step = np.diff(step_time)
+    times = time[np.concatenate([[0], ends])]
+    step = np.diff(times)
     gyro = running_product(np.concatenate([[[1.0, 0.0, 0.0, 0.0]], from_vector(turn)]))
-    logged = attitude[QUATERNION_COLUMNS].to_numpy()
-    logged_time = attitude.index.to_numpy()
-    inside = (logged_time >= step_time[0]) & (logged_time <= step_time[-1])
-    logged, logged_time = logged[inside], logged_time[inside]
+
+    def beyond(frame: pd.DataFrame, early_s: float, known: Array) -> tuple[Array, Array]:
+        """Times of a frame's attitudes, and what they have beyond the known ones at the steps."""
+        inside = (frame.index >= times[0] - early_s) & (frame.index <= times[-1])
+        at_s, own = frame.index[inside].to_numpy(), frame.loc[inside, QUATERNION_COLUMNS].to_numpy()
+        return at_s, multiply(own, conjugate(interpolate(at_s, times, known)))
+
     # what the published attitude has beyond the gyro's, in the earth frame
-    beyond = multiply(logged, conjugate(interpolate(logged_time, step_time, gyro)))
-    extra = interpolate(step_time, logged_time, beyond)
+    extra = interpolate(times, *beyond(attitude, 0.0, gyro))
     nominal = multiply(extra, gyro)
-    delayed_time = record.delayed.index.to_numpy()
-    inside = (delayed_time >= step_time[0] - 1e-4) & (delayed_time <= step_time[-1])
-    own = record.delayed.loc[inside, QUATERNION_COLUMNS].to_numpy(copy=True)
-    error = to_vector(
-        multiply(own, conjugate(interpolate(delayed_time[inside], step_time, nominal)))
-    )
-    state = np.zeros(15)
-    state[:3] = error[0]
-    state[3:6] = start[VELOCITY_COLUMNS]
-    position = start[POSITION_COLUMNS].to_numpy(dtype=np.float64)
-    published = [
-        np.interp(step_time[0], ekf2.state.index, ekf2.state[name]) for name in POSITION_COLUMNS
-    ]
-    state[6:9] = np.where(np.isfinite(position), position, published)
-    state[8] = published[2]  # altitude and height have different origins since v1.16
+    states, turned = beyond(record.delayed, 1e-4, nominal)
+    error = to_vector(turned)
+    published = [np.interp(times[0], ekf2.state.index, ekf2.state[c]) for c in POSITION_COLUMNS]
+    position = start[POSITION_COLUMNS].to_numpy()
+    position = np.where(np.isfinite(position), position, published)
+    position[2] = published[2]  # altitude and height have different origins since v1.16
     return Stretch(
-        time_s=step_time,
+        time_s=times,
         step_s=step,
         rotation=matrix(nominal),
         correction_rad=to_vector(multiply(extra[1:], conjugate(extra[:-1]))),
         force_m_s2=gain / step[:, None],
-        accelerometer_bias_m_s2=accelerometer_bias,
-        state=state,
-        variance=start[DELAYED_VARIANCE_COLUMNS].to_numpy(dtype=np.float64),
-        down_m=np.interp(step_time, ekf2.state.index, ekf2.state["down_m"]),
-        heading_variance_rad2=_at(record.delayed["attitude_down_rad2"], step_time),
-        down_variance_m2=_at(record.delayed["down_m2"], step_time),
-        attitude_error_rad=np.column_stack(
-            [np.interp(step_time, delayed_time[inside], part) for part in error.T]
-        ),
+        accelerometer_bias_m_s2=bias,
+        state=np.concatenate([error[0], start[VELOCITY_COLUMNS], position, np.zeros(6)]),
+        variance=np.asarray(start[DELAYED_VARIANCE_COLUMNS]),
+        down_m=_at(ekf2.state["down_m"], times),
+        heading_variance_rad2=_at(record.delayed["attitude_down_rad2"], times),
+        down_variance_m2=_at(record.delayed["down_m2"], times),
+        attitude_error_rad=np.column_stack([np.interp(times, states, part) for part in error.T]),
         correlation=np.eye(15),
     )
 
@@ -233,11 +215,10 @@ def predict_s(record: FusionRecord) -> float:
 
 
 def _at(series: pd.Series, times: Array) -> Array:
-    values: Array = np.interp(times, series.index.to_numpy(), series.to_numpy())
-    return values
+    return np.asarray(np.interp(times, series.index, series))
 
 
-def step_ends(interval_s: Array, known: Indices, target_s: float) -> Indices:
+def step_ends(interval_s: Array, known: IntArray, target_s: float) -> IntArray:
     """Where EKF2's prediction steps end: after how many IMU intervals from the start.
 
     A step is complete after :func:`samples_per_step`, or as soon as it is longer than the target.
@@ -259,32 +240,28 @@ def step_ends(interval_s: Array, known: Indices, target_s: float) -> Indices:
     """
     needed = samples_per_step(target_s, float(np.median(interval_s)))
     early = np.flatnonzero(np.convolve(interval_s, np.ones(max(needed - 1, 1)), "valid") > target_s)
-    ends: list[NDArray[np.intp]] = []
+    ends: list[int] = []
     shown = set(known.tolist())
-    marks = sorted({0, len(interval_s), *shown})
-    for low, high in pairwise(marks):
+    for low, high in pairwise(sorted({0, len(interval_s), *shown})):
         if needed == 1 or np.searchsorted(early, low) == np.searchsorted(early, high):
-            block = np.arange(low + needed, high + 1, needed, dtype=np.intp)
+            block = list(range(low + needed, high + 1, needed))
         else:
-            block = np.array(_counted(interval_s[low:high], needed, target_s), dtype=np.intp) + low
-        if high in shown and (not len(block) or block[-1] != high):
-            block = np.append(block, high)
-        ends.append(block)
-    return np.concatenate(ends)
+            block = [low + end for end in _counted(interval_s[low:high], needed, target_s)]
+        ends += [*block, high] if high in shown and block[-1:] != [high] else block
+    return np.array(ends, dtype=np.intp)
 
 
 def _counted(interval_s: Array, needed: int, target_s: float) -> list[int]:
     ends, count, total = [], 0, 0.0
     for at, interval in enumerate(interval_s.tolist(), start=1):
-        count += 1
-        total += interval
+        count, total = count + 1, total + interval
         if (count >= needed and total > 0.5 * target_s) or total > target_s:
             ends.append(at)
             count, total = 0, 0.0
     return ends
 
 
-def down_sampled(turn: Array, gain: Array, ends: Indices) -> tuple[Array, Array]:
+def down_sampled(turn: Array, gain: Array, ends: IntArray) -> tuple[Array, Array]:
     """Turn and velocity gained in each step, the gain in the body's frame at the step's end."""
     starts = np.concatenate([[0], ends[:-1]])
     turned = np.concatenate([np.zeros((1, 3)), np.cumsum(turn, axis=0)])

@@ -7,29 +7,22 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
+from px4fuse.arrays import Array
 from px4fuse.display import Shown
-from px4fuse.ekf2.agreement import at_times, judged_from, logged_innovations, settled
+from px4fuse.ekf2.agreement import at_times, judged_from, logged_innovations, rms_to_truth, settled
+from px4fuse.ekf2.inputs import horizontal_resets_s
 from px4fuse.ekf2.model import Model, replay_settings
-from px4fuse.ekf2.replay import HORIZONTAL, Agreement, Ekf2Replay
+from px4fuse.ekf2.replay import HORIZONTAL, Agreement, Ekf2Replay, Spans
 from px4fuse.ekf2_parameters import check
 from px4fuse.errors import SettingsError
 from px4fuse.filter.consistency import nis_band
-from px4fuse.flight import (
-    POSITION_COLUMNS,
-    POSITION_VARIANCE_COLUMNS,
-    Ekf2,
-    Flight,
-    Truth,
-    Unavailable,
-)
+from px4fuse.flight import Ekf2, Flight, Unavailable
 from px4fuse.record import Count, NotNegative, Record, Share
-
-Array = NDArray[np.float64]
 
 WHAT = "EKF2 what-if"
 # Below this share of EKF2's samples in the log, gaps between fusions cannot be told from it
@@ -66,7 +59,7 @@ class AxisSummary(Record, frozen=True):
     position_rmse_to_truth_m: NotNegative | Unavailable
 
 
-class Summary(Record, frozen=True, omit_defaults=False):
+class Summary(Record, frozen=True, kw_only=True, omit_defaults=False):
     """One EKF2: as logged, as replayed, or with other parameters.
 
     Attributes
@@ -136,7 +129,7 @@ class WhatIf(Shown):
     logged: Summary
     replayed: Summary
     whatif: tuple[Summary, ...]
-    judged: tuple[tuple[float, float], ...]
+    judged: Spans
     notes: tuple[str, ...]
 
 
@@ -204,55 +197,32 @@ def sweep_values(name: str, low: float, high: float, count: int = SWEEP_VALUES) 
     return [float(value) for value in values]
 
 
-def sweep(model: Model, name: str, values: Sequence[float]) -> WhatIf | Unavailable:
-    """What EKF2 would have done with each value of one parameter; see :func:`what_if`."""
-    return what_if(model, [{name: value} for value in values])
-
-
-def _of_replay(
-    flight: Flight, replay: Ekf2Replay, judged: tuple[tuple[float, float], ...]
-) -> Summary:
-    assert isinstance(flight.ekf2, Ekf2)
-    every = replay.updates
-    used = every[settled(every.index.to_numpy(), judged)]
-    times = _judged_times(flight.ekf2.state, judged)
+def _of_replay(flight: Flight, replay: Ekf2Replay, judged: Spans) -> Summary:
+    updates = replay.updates
+    used, at = updates[settled(updates.index, judged)], updates["fused_at_s"].to_numpy()
+    # between the samples the variance grows from after one to before the next
+    variance = pd.DataFrame(index=np.column_stack([at - 1e-6, at]).ravel())
+    for axis in HORIZONTAL:
+        s, r = (updates[f"{of}_variance_{axis}_m2"] for of in ("innovation", "observation"))
+        after = updates[f"position_variance_{axis}_m2"]
+        variance[f"{axis}_m2"] = np.column_stack([s - r, after]).ravel()
     fused = used["fused_at_s"][(used["fused"] > 0) | (used["reset"] > 0)]
-    axes = {
-        axis: _axis(
-            used[f"innovation_{axis}_m"].to_numpy(),
-            used[f"innovation_variance_{axis}_m2"].to_numpy(),
-            _sigma(flight.ekf2, replay, axis, judged),
-            _to_truth(flight, replay.published, axis, times),
-        )
-        for axis in HORIZONTAL
-    }
-    return Summary(
-        changed=replay.changed,
-        north=axes["north"],
-        east=axes["east"],
-        samples=len(used),
-        rejected_share=float(used["rejected"].mean()),
-        longest_without_fusion_s=_longest(fused.to_numpy(), judged),
-        resets=int(used["reset"].sum()),
-        late=replay.late,
-        lost=replay.lost,
-    )
+    return _summary(
+        flight, judged, used, replay.published, variance,
+        changed=replay.changed, longest_without_fusion_s=_longest(fused.to_numpy(), judged),
+        resets=int(used["reset"].sum()), late=replay.late, lost=replay.lost,
+    )  # fmt: skip
 
 
-def _of_log(flight: Flight, replay: Ekf2Replay, judged: tuple[tuple[float, float], ...]) -> Summary:
+def _of_log(flight: Flight, replay: Ekf2Replay, judged: Spans) -> Summary:
     ekf2 = flight.ekf2
     assert isinstance(ekf2, Ekf2)
     logged = logged_innovations(ekf2)
-    used = logged[settled(logged.index.to_numpy(), judged)]
-    times = _judged_times(ekf2.state, judged)
-    resets = [
-        reset
-        for reset in ekf2.resets
-        if reset.quantity == "position" and (reset.delta[0] or reset.delta[1])
-    ]
-    horizon_s = 0.0 if isinstance(ekf2.horizon_s, Unavailable) else ekf2.horizon_s
-    at = np.array([reset.time_s - horizon_s for reset in resets])
-    replayed = int(settled(replay.updates.index.to_numpy(), judged).sum())
+    used = logged[settled(logged.index, judged)]
+    behind_s = 0.0 if isinstance(ekf2.horizon_s, Unavailable) else ekf2.horizon_s
+    resets = horizontal_resets_s(ekf2) - behind_s
+    resets = resets[settled(resets, judged)]
+    replayed = int(settled(replay.updates.index, judged).sum())
     longest: float | Unavailable = Unavailable(
         "longest time without fusion",
         f"the log holds {len(used)} of about {replayed} innovations",
@@ -260,86 +230,56 @@ def _of_log(flight: Flight, replay: Ekf2Replay, judged: tuple[tuple[float, float
     )
     if len(used) > COMPLETE_SHARE * replayed:
         fused = used.index[used["rejected"] == 0].to_numpy()
-        longest = _longest(np.concatenate([fused, at[settled(at, judged)]]), judged)
-    axes = {
-        axis: _axis(
-            used[f"innovation_{axis}_m"].to_numpy(),
-            used[f"innovation_variance_{axis}_m2"].to_numpy(),
-            _logged_sigma(ekf2, axis, judged),
-            _to_truth(flight, ekf2.state, axis, times),
+        longest = _longest(np.concatenate([fused, resets]), judged)
+    return _summary(
+        flight, judged, used, ekf2.state, None,
+        changed={}, longest_without_fusion_s=longest, resets=len(resets),
+    )  # fmt: skip
+
+
+def _summary(
+    flight: Flight,
+    judged: Spans,
+    used: pd.DataFrame,
+    published: pd.DataFrame,
+    variance: pd.DataFrame | None,
+    **more: Any,
+) -> Summary:
+    """What innovations, the published position and its stated variance show, and ``more``.
+
+    None is the variance that EKF2 logs; any other is taken at its times too.
+    """
+    ekf2 = flight.ekf2
+    assert isinstance(ekf2, Ekf2)
+    logged, axes = ekf2.variance, {}
+    times = ekf2.state.index[settled(ekf2.state.index, judged)].to_numpy()
+    for axis, direction in zip(HORIZONTAL, np.eye(3), strict=False):
+        nu = used[f"innovation_{axis}_m"].to_numpy()
+        s = used[f"innovation_variance_{axis}_m2"].to_numpy()
+        sigma: float | Unavailable
+        if isinstance(logged, Unavailable):
+            sigma = logged
+        else:
+            at = logged.index[settled(logged.index, judged)].to_numpy()
+            stated = at_times(logged if variance is None else variance, f"{axis}_m2", at)
+            sigma = float(np.sqrt(np.median(stated)))
+        position = at_times(published, f"{axis}_m", times)
+        error = rms_to_truth(flight, position, direction, times)
+        axes[axis] = AxisSummary(
+            nis_mean=float(np.mean(nu**2 / s)),
+            nis_band=nis_band(len(nu)),
+            innovation_std_m=float(np.std(nu)),
+            sigma_p_median_m=sigma,
+            position_rmse_to_truth_m=NO_TRUTH if error is None else error,
         )
-        for axis in HORIZONTAL
-    }
-    return Summary(
-        changed={},
-        north=axes["north"],
-        east=axes["east"],
-        samples=len(used),
-        rejected_share=float(used["rejected"].mean()),
-        longest_without_fusion_s=longest,
-        resets=int(settled(at, judged).sum()),
-    )
+    north, east = (axes[axis] for axis in HORIZONTAL)
+    share = float(used["rejected"].mean())
+    return Summary(north=north, east=east, samples=len(used), rejected_share=share, **more)
 
 
-def _axis(
-    innovation: Array, variance: Array, sigma: float | Unavailable, rmse: float | Unavailable
-) -> AxisSummary:
-    return AxisSummary(
-        nis_mean=float(np.mean(innovation**2 / variance)),
-        nis_band=nis_band(len(innovation)),
-        innovation_std_m=float(np.std(innovation)),
-        sigma_p_median_m=sigma,
-        position_rmse_to_truth_m=rmse,
-    )
-
-
-def _judged_times(frame: pd.DataFrame, judged: tuple[tuple[float, float], ...]) -> Array:
-    times: Array = frame.index.to_numpy()
-    return times[settled(times, judged)]
-
-
-def _logged_sigma(
-    ekf2: Ekf2, axis: str, judged: tuple[tuple[float, float], ...]
-) -> float | Unavailable:
-    if isinstance(ekf2.variance, Unavailable):
-        return ekf2.variance
-    times = _judged_times(ekf2.variance, judged)
-    column = POSITION_VARIANCE_COLUMNS[HORIZONTAL.index(axis)]
-    return float(np.sqrt(np.median(at_times(ekf2.variance, column, times))))
-
-
-def _sigma(
-    ekf2: Ekf2, replay: Ekf2Replay, axis: str, judged: tuple[tuple[float, float], ...]
-) -> float | Unavailable:
-    """Between the samples the variance grows from after one to before the next."""
-    if isinstance(ekf2.variance, Unavailable):
-        return ekf2.variance
-    updates = replay.updates
-    before = updates[f"innovation_variance_{axis}_m2"] - updates[f"observation_variance_{axis}_m2"]
-    after = updates[f"position_variance_{axis}_m2"]
-    at = updates["fused_at_s"].to_numpy()
-    times = np.column_stack([at - 1e-6, at]).ravel()
-    values = np.column_stack([before, after]).ravel()
-    variance = np.interp(_judged_times(ekf2.variance, judged), times, values)
-    return float(np.sqrt(np.median(variance)))
-
-
-def _to_truth(flight: Flight, track: pd.DataFrame, axis: str, times: Array) -> float | Unavailable:
-    """RMSE of a published position, at EKF2's own sample times within the truth's span."""
-    if not isinstance(flight.truth, Truth):
-        return NO_TRUTH
-    truth = flight.truth.samples
-    times = times[(times >= truth.index[0]) & (times <= truth.index[-1])]
-    if not len(times):
-        return NO_TRUTH
-    column = POSITION_COLUMNS[HORIZONTAL.index(axis)]
-    error = at_times(track, column, times) - at_times(truth, column, times)
-    return float(np.sqrt(np.mean(error**2)))
-
-
-def _longest(fused_s: Array, judged: tuple[tuple[float, float], ...]) -> float:
+def _longest(fused_s: Array, judged: Spans) -> float:
     """Longest time between two fusions, the ends of what is judged included."""
-    ends = [time for span in judged[:1] for time in span[:1]] + [judged[-1][1]]
+    ends = [judged[0][0], judged[-1][1]]
     return float(np.max(np.diff(np.sort(np.concatenate([fused_s, ends])))))
 
 
@@ -347,9 +287,9 @@ def _notes(model: Model, replay: Ekf2Replay) -> list[str]:
     if not replay.late and not replay.lost:
         return []
     remedy = "" if model.inputs.rules.horizon_by_delay else ": raise EKF2_DELAY_MAX"
-    said = ", ".join(f"{name}={value:g}" for name, value in replay.changed.items()) or "as flown"
+    change = ", ".join(f"{name}={value:g}" for name, value in replay.changed.items())
     return [
-        f"{said}: {replay.late + replay.lost} of {len(replay.updates) + replay.lost} samples would "
-        f"reach EKF2 after its fusion horizon has passed them ({replay.lost} would never be "
-        f"fused){remedy}"
+        f"{change or 'as flown'}: {replay.late + replay.lost} of "
+        f"{len(replay.updates) + replay.lost} samples would reach EKF2 after its fusion horizon "
+        f"has passed them ({replay.lost} would never be fused){remedy}"
     ]

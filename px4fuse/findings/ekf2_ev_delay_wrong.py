@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.asked import delay_change
-from px4fuse.comparison.remedy import delay_helps, remedy_words
+from px4fuse.comparison.remedy import delay_change, delay_helps, remedy_words
 from px4fuse.ekf2_parameters import PARAMETERS
 from px4fuse.filter.clock import ClockOffset
 from px4fuse.findings.model import Detector, Finding, Found, Threshold

@@ -3,8 +3,13 @@
 from __future__ import annotations
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.asked import asked_of_ekf2
-from px4fuse.comparison.remedy import not_replayed, rejects_less, replayed, settings_words
+from px4fuse.comparison.remedy import (
+    asked_of_ekf2,
+    not_replayed,
+    rejects_less,
+    replayed,
+    settings_words,
+)
 from px4fuse.ekf2_parameters import PARAMETERS
 from px4fuse.findings.model import Detector, Finding, Found, Threshold, moments
 from px4fuse.flight import Ekf2, Unavailable

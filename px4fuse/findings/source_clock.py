@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.asked import delay_change
 from px4fuse.comparison.model import Comparison
 from px4fuse.comparison.remedy import (
     COMMAND,
     WORSE_FILTER_ERROR,
+    delay_change,
     delay_helps,
     filter_errors_m,
     replayed,

@@ -6,7 +6,6 @@ why EKF2 differs.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator
 
 import numpy as np
@@ -20,8 +19,8 @@ from px4fuse.comparison.model import (
     Difference,
     FilterName,
 )
-from px4fuse.comparison.why import Why
-from px4fuse.comparison.why_words import STAMPS_WRONG, the
+from px4fuse.comparison.why import the
+from px4fuse.ekf2.walk import Why
 from px4fuse.filter.kalman import state_at
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise
@@ -210,7 +209,4 @@ def _differences(analysis: Analysis) -> Iterator[str]:
         )
     why = analysis.why.get(analysis.main.axis.name)
     if isinstance(why, Why):
-        # wrong stamps are a finding of their own
-        first = next(each for each in why.sentences if not each.startswith(STAMPS_WRONG))
-        # without its moment
-        yield re.split(r"; most at|(?<=\D)\. ", first)[0].removesuffix(".") + "."
+        yield why.cause  # wrong stamps are a finding of their own

@@ -12,8 +12,8 @@ from matplotlib.axes import Axes
 from px4fuse.analysis import Analysis
 from px4fuse.arrays import Array
 from px4fuse.comparison.model import AxisComparison, Comparison
-from px4fuse.comparison.why import Why
 from px4fuse.display import frame
+from px4fuse.ekf2.walk import Why
 from px4fuse.ekf2.whatif import WhatIf
 from px4fuse.filter.clock import ClockOffset
 from px4fuse.filter.tuning import AxisTuning
@@ -194,13 +194,13 @@ def what_if(result: WhatIf, ax: Any = None) -> Any:
     """Mean NIS, and error to the truth or share of rejections, of each EKF2: two axes."""
     if ax is None:
         _, ax = plt.subplots(1, 2, sharey=True, figsize=(10, 3.5), layout="constrained")
-    table = frame(result).iloc[::-1]
+    labels = {"rejected_share": "share rejected", "nis_mean": "mean NIS (1 is consistent)"}
     known = not isinstance(result.logged.position_rmse_to_truth_m, Unavailable)
     second = "position_rmse_to_truth_m" if known else "rejected_share"
-    labels = {"rejected_share": "share rejected", "nis_mean": "mean NIS (1 is consistent)"}
-    for panel, column in zip(ax, ("nis_mean", second), strict=True):
-        panel.barh([name for name, _ in variants(result)][::-1], table[column], color=EKF2_COLOUR)
-        panel.set_xlabel(labels.get(column, "position, m RMS from the truth"))
+    names, parts = zip(*reversed(variants(result)), strict=True)
+    for panel, field in zip(ax, ("nis_mean", second), strict=True):
+        panel.barh(names, [getattr(part, field) for part in parts], color=EKF2_COLOUR)
+        panel.set_xlabel(labels.get(field, "position, m RMS from the truth"))
     ax[0].axvline(1.0, color=OURS_COLOUR, lw=0.8)
     return ax
 

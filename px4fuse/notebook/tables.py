@@ -8,11 +8,12 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from msgspec import structs
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import FILTERS, AxisComparison, Comparison
-from px4fuse.comparison.why import Why
 from px4fuse.display import frame, words
+from px4fuse.ekf2.walk import Why
 from px4fuse.ekf2.whatif import Summary, WhatIf
 from px4fuse.filter.clock import ClockOffset
 from px4fuse.filter.consistency import Consistency
@@ -28,14 +29,32 @@ from px4fuse.flight import (
     Unavailable,
 )
 from px4fuse.loop.loop import Loop
+from px4fuse.record import Record, written
 from px4fuse.report.words import settings_words, verdict_words
-from px4fuse.trajectory.evaluation import AbsoluteError, Evaluation
+from px4fuse.trajectory.evaluation import Evaluation
 from px4fuse.trajectory.model import AXES_OF_FRAME, Trajectory
-from px4fuse.trajectory.scores import PairwiseError, RelativeError
+from px4fuse.trajectory.scores import PairwiseError
 
 EKF2 = "EKF2"
 OURS = "our filter"
 WIDTH = 100
+
+
+def row(record: Any) -> dict[str, Any]:
+    """A record's numbers and words by the names of its fields, parts by their field's name too.
+
+    The ends of an interval are ``_low`` and ``_high``; what is not available is missing.
+    """
+    cells: dict[str, Any] = {}
+    fields = {} if isinstance(record, Unavailable) else structs.asdict(written(record))
+    for name, value in fields.items():
+        if isinstance(value, Record):
+            cells |= {f"{name}_{below}": cell for below, cell in row(value).items()}
+        elif isinstance(value, tuple) and len(value) == 2:
+            cells |= {f"{name}_low": number(value[0]), f"{name}_high": number(value[1])}
+        elif value is None or isinstance(value, int | float | str):
+            cells[name] = np.nan if value is None else value
+    return cells
 
 
 def number(value: Any) -> float:
@@ -145,51 +164,20 @@ def _(analysis: Analysis) -> str:
     return "\n".join(lines)
 
 
-def _consistency_row(statement: Consistency | Unavailable) -> dict[str, Any]:
-    if isinstance(statement, Unavailable):
-        return {}
-    low, high = statement.nis_band
-    return {
-        "innovations": statement.count,
-        "nis_mean": statement.nis_mean,
-        "nis_low": low,
-        "nis_high": high,
-        "verdict": statement.verdict,
-        "innovation_mean_m": statement.innovation_mean_m,
-        "innovation_std_m": statement.innovation_std_m,
-        "sqrt_s_median_m": statement.sqrt_s_median_m,
-        "outside_two_sigma": statement.outside_two_sigma,
-        "lag1_autocorrelation": statement.lag1_autocorrelation,
-    }
-
-
 @frame.register
 def _(statement: Consistency) -> pd.DataFrame:
-    return pd.DataFrame([_consistency_row(statement)])
+    return pd.DataFrame([row(statement)])
 
 
 @frame.register
 def _(comparison: Comparison) -> pd.DataFrame:
     """A row per axis and filter."""
-    rows = []
-    for result in comparison.axes.values():
-        for name, summary in _filters(result):
-            truth = summary.truth
-            row: dict[str, Any] = {"axis": result.axis.name, "filter": name}
-            if name == OURS or not isinstance(result.ekf2_state, Unavailable):
-                row |= _consistency_row(summary)
-                row |= {
-                    "sigma_p_median_m": number(summary.sigma_p_median_m),
-                    "sigma_v_median_m_s": number(summary.sigma_v_median_m_s),
-                }
-            if not isinstance(truth, Unavailable):
-                row |= {
-                    "position_rmse_to_truth_m": truth.position_rmse_m,
-                    "velocity_rmse_to_truth_m_s": number(truth.velocity_rmse_m_s),
-                }
-            rows.append(row)
-    table = pd.DataFrame(rows)
-    return table.astype({"innovations": "Int64"}) if "innovations" in table else table
+    table = pd.DataFrame(
+        {"axis": result.axis.name, "filter": name} | row(summary)
+        for result in comparison.axes.values()
+        for name, summary in _filters(result)
+    )
+    return table.astype({"count": "Int64"}) if "count" in table else table
 
 
 @frame.register
@@ -275,17 +263,7 @@ def _noise(noise: Noise, unit: str) -> str:
 
 @frame.register
 def _(tuning: AxisTuning) -> pd.DataFrame:
-    row: dict[str, Any] = {"axis": tuning.name}
-    for name, unit, noise in (
-        ("filter_sigma_a", "m_s2", tuning.filter_sigma_a),
-        ("sigma_a", "m_s2", tuning.sigma_a),
-        ("sigma_z", "m", tuning.sigma_z),
-    ):
-        row[f"{name}_{unit}"] = number(noise.value)
-        row[f"{name}_low_{unit}"] = number(noise.low)
-        row[f"{name}_high_{unit}"] = number(noise.high)
-    counts = {"measurements": tuning.count, "outliers": len(tuning.outlier_time_s)}
-    return pd.DataFrame([row | counts | {"gain_nats": tuning.gain_nats}])
+    return pd.DataFrame([{"axis": tuning.name} | row(tuning)])
 
 
 @words.register
@@ -381,24 +359,10 @@ def _(found: Evaluation) -> str:
 @frame.register
 def _(found: Evaluation) -> pd.DataFrame:
     """ATE, then the RPE over each delta; over poses, or pairs of them."""
-    rows = [
-        _score("ATE", found.ate),
-        *(_score(f"RPE {part.delta_words}", part) for part in found.rpe),
-    ]
-    return pd.DataFrame(rows)
-
-
-def _score(name: str, part: AbsoluteError | RelativeError) -> dict[str, Any]:
-    row: dict[str, Any] = {"score": name}
-    if not isinstance(part.translation_m, Unavailable):
-        row |= {"count": part.translation_m.count, "rmse_m": part.translation_m.rmse}
-        row |= {"mean_m": part.translation_m.mean, "median_m": part.translation_m.median}
-        row["max_m"] = part.translation_m.max
-    if not isinstance(part.interval_m, Unavailable):
-        row |= {"rmse_low_m": part.interval_m.low, "rmse_high_m": part.interval_m.high}
-    if not isinstance(part.rotation_deg, Unavailable):
-        row["rotation_rmse_deg"] = part.rotation_deg.rmse
-    return row
+    return pd.DataFrame(
+        [{"score": "ATE"} | row(found.ate)]
+        + [{"score": f"RPE {part.delta_words}"} | row(part) for part in found.rpe]
+    )
 
 
 @words.register
@@ -448,16 +412,4 @@ def _(found: WhatIf) -> str:
 
 @frame.register
 def _(found: WhatIf) -> pd.DataFrame:
-    return pd.DataFrame(
-        [
-            {
-                "ekf2": name,
-                "nis_mean": part.nis_mean,
-                "rejected_share": part.rejected_share,
-                "longest_without_fusion_s": number(part.longest_without_fusion_s),
-                "resets": part.resets,
-                "position_rmse_to_truth_m": number(part.position_rmse_to_truth_m),
-            }
-            for name, part in variants(found)
-        ]
-    )
+    return pd.DataFrame({"ekf2": name} | row(part) for name, part in variants(found))

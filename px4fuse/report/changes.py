@@ -15,7 +15,7 @@ from px4fuse.analysis import Analysis
 from px4fuse.arrays import Array
 from px4fuse.comparison.events import happened
 from px4fuse.comparison.model import AxisComparison
-from px4fuse.comparison.why_words import the
+from px4fuse.comparison.why import the
 from px4fuse.filter.kalman import state_at
 from px4fuse.filter.signals import AISLE
 from px4fuse.plain import number_words

@@ -22,7 +22,7 @@ from px4fuse.request import (
 
 # A value ends before the full stop of its sentence
 _WRITTEN = re.compile(r"px4fuse (\w+) LOG(?![\w.])((?: --[a-z-]+ [-\w]+(?:\.\d+)?)*)")
-_FIELDS = {option: field for field, option in OPTIONS.items()}
+_FIELDS = {option.name: field for field, option in OPTIONS.items()}
 
 
 def runnable(text: str, request: Request) -> tuple[str, list[str]]:

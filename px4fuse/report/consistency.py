@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.comparison.model import AxisComparison, FilterSummary, UnjudgedFilter
-from px4fuse.comparison.why_words import the
+from px4fuse.comparison.why import the
 from px4fuse.filter.consistency import MIN_INNOVATIONS, Consistency, autocorrelation, nis_band
 from px4fuse.flight import Unavailable
 from px4fuse.plain import capital, number_words, p_words

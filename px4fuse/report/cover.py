@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from px4fuse.comparison.model import AgainstTruth, Difference
-from px4fuse.comparison.why_words import the
+from px4fuse.comparison.why import the
 from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.signals import AISLE
 from px4fuse.findings import Finding

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import pandas as pd
 
 from px4fuse.comparison.model import Difference
-from px4fuse.comparison.why_words import the
+from px4fuse.comparison.why import the
 from px4fuse.flight import Unavailable
 from px4fuse.report import marks, panels
 from px4fuse.report.document import Document

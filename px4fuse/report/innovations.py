@@ -10,7 +10,7 @@ import pandas as pd
 
 from px4fuse.comparison.events import Span
 from px4fuse.comparison.model import AxisComparison
-from px4fuse.comparison.why_words import the
+from px4fuse.comparison.why import the
 from px4fuse.filter.signals import Segment
 from px4fuse.report import panels
 from px4fuse.report.document import Document

@@ -11,7 +11,7 @@ import pandas as pd
 from px4fuse.arrays import Array
 from px4fuse.comparison.events import Span
 from px4fuse.comparison.model import AxisComparison
-from px4fuse.comparison.why_words import the
+from px4fuse.comparison.why import the
 from px4fuse.filter.fitting import FIRST_WIDTH
 from px4fuse.filter.likelihood import States, preintegrate, states, total_over_grid
 from px4fuse.filter.tuning import HORIZONTAL, MIN_MEASUREMENTS, AxisTuning, Noise

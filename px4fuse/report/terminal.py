@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 from rich.console import Console
 
-from px4fuse.comparison.why import Why
+from px4fuse.ekf2.walk import Why
 from px4fuse.flight import Unavailable
 from px4fuse.report.cover import facts, write_finding
 from px4fuse.report.document import Document

@@ -9,8 +9,8 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.arrays import Array
-from px4fuse.comparison.why import Why
 from px4fuse.ekf2.replay import Agreement, Ekf2Replay
+from px4fuse.ekf2.walk import Why
 from px4fuse.filter.signals import AISLE
 from px4fuse.flight import Unavailable
 from px4fuse.plain import capital

@@ -14,8 +14,8 @@ import msgspec
 from msgspec import Meta
 
 from px4fuse.comparison.model import AxisResult, FilterName
-from px4fuse.comparison.why import WhySteps
 from px4fuse.ekf2.replay import Agreement, Replayed
+from px4fuse.ekf2.walk import WhySteps
 from px4fuse.ekf2.whatif import Summary
 from px4fuse.filter.clock import Clock
 from px4fuse.filter.consistency import HorizontalNis

@@ -17,8 +17,8 @@ from dataclasses import replace
 import numpy as np
 
 from px4fuse.arrays import Array, BoolArray, IntArray
-from px4fuse.ekf2.inputs import Inputs, Rules
-from px4fuse.ekf2.legs import (
+from px4fuse.ekf2.inputs import Inputs, Rules, Vision
+from px4fuse.ekf2.intervals import (
     ACCELEROMETER_BIAS,
     GRAVITY_M_S2,
     GYRO_BIAS,
@@ -27,11 +27,10 @@ from px4fuse.ekf2.legs import (
     THETA,
     VELOCITY,
 )
-from px4fuse.ekf2.model import StretchRun, delayed_states, run_variants
+from px4fuse.ekf2.model import delayed_states, run_variants
 from px4fuse.ekf2.output_predictor import follow_attitude, publish
-from px4fuse.ekf2.recursion import EAST, HEADING, NORTH, Variant
+from px4fuse.ekf2.recursion import EAST, HEADING, NORTH, Run, Variant
 from px4fuse.ekf2.stretches import Stretch, down_sampled, step_ends
-from px4fuse.ekf2.vision import Vision
 from px4fuse.ekf2_parameters import PARAMETERS as MODEL_PARAMETERS
 from px4fuse.ekf2_parameters import settings_in_force
 from px4fuse.simulation import sensors
@@ -64,7 +63,7 @@ REST_SD = np.repeat([0.05, 0.0005, 0.06], 3)
 HEADING_SD_RAD, HEIGHT_SD_M = 0.03, 0.15
 HEIGHT_ERROR_M = 0.03
 # Fine enough that variances are logged between the samples of a UWB too
-MAX_LEG_S = 0.1
+MAX_INTERVAL_S = 0.1
 
 
 def parameters(source_sigma_m: float, mistakes: Mistakes) -> dict[str, int | float]:
@@ -118,7 +117,7 @@ def fly(
         predict_s=PREDICT_US * 1e-6,
         vision_height=False,
         imu_offset_m=np.zeros(3),
-        max_leg_s=MAX_LEG_S,
+        max_interval_s=MAX_INTERVAL_S,
     )
     done = run_variants(inputs, [Variant(settings)], {})[0]
     track = _track(inputs, done, time_us, nominal)
@@ -220,7 +219,7 @@ def _vision(source: Topic) -> Vision:
     )
 
 
-def _track(inputs: Inputs, done: StretchRun, time_us: IntArray, nominal: Array) -> TopicTrack:
+def _track(inputs: Inputs, done: Run, time_us: IntArray, nominal: Array) -> TopicTrack:
     stretch, settings = done.stretch, inputs.settings
     lag = round(inputs.horizon_s / inputs.step_s)
     state, _ = delayed_states(done, 0)
@@ -258,12 +257,12 @@ def _track(inputs: Inputs, done: StretchRun, time_us: IntArray, nominal: Array) 
     )
 
 
-def _held(done: StretchRun, state: Array) -> tuple[list[tuple[int, Array]], BoolArray]:
+def _held(done: Run, state: Array) -> tuple[list[tuple[int, Array]], BoolArray]:
     """Resets by step, and where there is aiding; without it for long the position stays.
 
     EKF2 then fuses a position of its own making. The model has none: ``state`` is held in place.
     """
-    events, run, time = done.events[0], done.run, done.stretch.time_s
+    events, run, time = done.events[0], done, done.stretch.time_s
     horizontal = slice(NORTH, EAST + 1)
     used = np.flatnonzero(run.fused[:, 0] | run.reset[:, 0])
     last = np.zeros(len(time))

@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 
 from px4fuse.arrays import Array, BoolArray, IntArray
 from px4fuse.ekf2.inputs import Inputs
-from px4fuse.ekf2.legs import POSITION, STATES
-from px4fuse.ekf2.model import StretchRun
-from px4fuse.ekf2.recursion import EAST, NORTH
+from px4fuse.ekf2.intervals import POSITION, STATES
+from px4fuse.ekf2.recursion import EAST, NORTH, Run
 from px4fuse.simulation import sensors
 from px4fuse.simulation.ulog_writer import Topic
 
@@ -55,13 +54,13 @@ class TopicTrack:
 
 
 def ekf2_topics(
-    inputs: Inputs, done: StretchRun, track: TopicTrack, aid_source_hz: float
+    inputs: Inputs, done: Run, track: TopicTrack, aid_source_hz: float
 ) -> tuple[Topic, ...]:
     """The topics that EKF2 had anything to say in.
 
     Parameters
     ----------
-    done : StretchRun
+    done : Run
         The model's run, of one variant in one stretch.
     aid_source_hz : float
         To what estimator_aid_src_ev_pos is thinned; 0 leaves it.
@@ -103,7 +102,7 @@ def _local_position(track: TopicTrack) -> Topic:
     return Topic("vehicle_local_position", fields)
 
 
-def _states(done: StretchRun, track: TopicTrack) -> Topic:
+def _states(done: Run, track: TopicTrack) -> Topic:
     """estimator_states of v1.16: 25 states with 24 covariances, positions as 0."""
     end = done.events[0].end
     events = np.flatnonzero(np.diff(end, prepend=0) > 0)
@@ -115,7 +114,7 @@ def _states(done: StretchRun, track: TopicTrack) -> Topic:
     states[:, 4:16] = track.delayed[rows]
     states[:, 7:9] = 0.0  # horizontally kept as latitude and longitude
     covariances = np.zeros((len(rows), 24), np.float32)
-    covariances[:, :STATES] = done.run.variance[events + 1, 0]
+    covariances[:, :STATES] = done.variance[events + 1, 0]
     return Topic(
         "estimator_states",
         {
@@ -127,9 +126,9 @@ def _states(done: StretchRun, track: TopicTrack) -> Topic:
     )
 
 
-def _aid_source(inputs: Inputs, done: StretchRun, track: TopicTrack, rate_hz: float) -> Topic:
+def _aid_source(inputs: Inputs, done: Run, track: TopicTrack, rate_hz: float) -> Topic:
     """estimator_aid_src_ev_pos: a message for every sample that came in time."""
-    events, run = done.events[0], done.run
+    events, run = done.events[0], done
     seen = np.flatnonzero(events.usable & (events.end < len(track.time_us) - track.lag))
     seen = seen[sensors.thinned(sensors.seconds(track.time_us[events.end[seen]]), rate_hz)]
     rows = events.end[seen]
@@ -164,9 +163,9 @@ def _aid_source(inputs: Inputs, done: StretchRun, track: TopicTrack, rate_hz: fl
     )
 
 
-def _flags(inputs: Inputs, done: StretchRun, track: TopicTrack) -> Topic:
+def _flags(inputs: Inputs, done: Run, track: TopicTrack) -> Topic:
     """estimator_status_flags: once a second, and when fusion of vision starts or stops."""
-    events, run, time = done.events[0], done.run, done.stretch.time_s
+    events, run, time = done.events[0], done, done.stretch.time_s
     tried = np.flatnonzero(run.fused[:, 0] | run.rejected[:, 0] | run.reset[:, 0])
     on = np.zeros(len(time), np.bool_)
     stops = np.append(time[events.end[tried]], np.inf)[1:]

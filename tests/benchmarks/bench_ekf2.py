@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from px4fuse.ekf2.model import Model, open_model, replay_settings
-from px4fuse.ekf2.walk import STEPS, Walk, walk
+from px4fuse.ekf2.walk import STEPS, walk
 from px4fuse.ekf2.whatif import Summary, WhatIf, what_if
 from px4fuse.flight import Flight, Unavailable
 from px4fuse.readers import read_log
@@ -99,8 +99,8 @@ def waterfalls(models: dict[str, Model]) -> dict[str, float]:
     print("\nwhy EKF2 differs | total rms m | " + " | ".join(STEPS) + " | left")
     for name, model in models.items():
         found = walk(model)
-        assert isinstance(found, Walk), found
-        axes = found.axes.values()
+        assert isinstance(found, dict), found
+        axes = found.values()
         total = sum(axis.position_mean_square_m2 for axis in axes)
         bars = [
             sum(axis.steps[at].position_mean_square_m2 for axis in axes) / total

@@ -24,7 +24,7 @@ from scipy.stats import binomtest
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.comparison import compare
-from px4fuse.comparison.estimates import clock_offset, tuned_horizontally, turned_frame
+from px4fuse.comparison.estimates import noises_and_clock, turned_frame
 from px4fuse.ekf2.model import open_model
 from px4fuse.filter.settings import Settings
 from px4fuse.findings import DETECTORS, find, find_loop
@@ -216,8 +216,7 @@ def _fly(job: Job) -> list[tuple[str, ...]]:
 def _explain(flight: Flight, condition: Condition) -> Analysis:
     """What the detectors look at, without why EKF2 differs, for speed."""
     comparison = compare(flight, condition.settings, axes=("north", "east"))
-    tuning = tuned_horizontally(comparison)
-    clock = clock_offset(comparison, tuning)
+    tuning, clock = noises_and_clock(comparison)
     model = open_model(flight) if condition.ekf2 else NOT_ASKED
     heading = turned_frame(comparison, tuning, clock)
     return Analysis(

@@ -18,7 +18,7 @@ import numpy as np
 from detector_rates import DEFAULT, SCENARIOS, clean
 
 from px4fuse.comparison.comparison import compare
-from px4fuse.comparison.estimates import clock_offset, tuned_horizontally
+from px4fuse.comparison.estimates import noises_and_clock
 from px4fuse.filter.clock import CHANGE_P, ClockOffset
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise
 from px4fuse.findings.source_clock import CLOCK_OFFSET
@@ -41,8 +41,8 @@ def measured(job: Job) -> tuple[float, ...] | None:
     flown = replace(clean(scenario).flight(seed), ekf2=False, truth=False)
     flight = simulate_flight(flown, parse((mistake,) if mistake else ()))
     comparison = compare(flight, axes=("north", "east"))
-    tuning = tuned_horizontally(comparison)
-    tuned, clock = tuning[HORIZONTAL], clock_offset(comparison, tuning)
+    tuning, clock = noises_and_clock(comparison)
+    tuned = tuning[HORIZONTAL]
     if not isinstance(tuned, AxisTuning) or not isinstance(clock, ClockOffset):
         return None
     low, high = clock.interval_s

@@ -14,10 +14,9 @@ from ekf2_tools import RULES
 from exchange import replace
 from findings_tools import made
 
-from px4fuse.ekf2.inputs import Inputs, Rules
-from px4fuse.ekf2.legs import FUSE, IDLE, START, Timing, _actions, _events, _noises
+from px4fuse.ekf2.inputs import Inputs, Rules, Vision
+from px4fuse.ekf2.intervals import FUSE, IDLE, START, Timing, _actions, _events, _noises
 from px4fuse.ekf2.stretches import Stretch
-from px4fuse.ekf2.vision import Vision
 
 
 @pytest.mark.parametrize("n", [4, 200])
@@ -81,7 +80,9 @@ def test_fusion_starts_on_the_second_of_two_samples_and_stops_in_silence() -> No
 def events(
     stamps: list[float], *, delay_s: float = 0.0, age_s: float = -9.0, horizon_s: float = 0.0
 ) -> Any:
-    inputs = made(Inputs, vision=vision_of(stamps, age_s), step_s=0.01, rules=RULES, max_leg_s=0.25)
+    inputs = made(
+        Inputs, vision=vision_of(stamps, age_s), step_s=0.01, rules=RULES, max_interval_s=0.25
+    )
     return _events(inputs, stretch_of(100), Timing(delay_s, horizon_s))
 
 

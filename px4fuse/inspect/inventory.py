@@ -11,7 +11,11 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.comparison.preparation import choose_segment, choose_source
-from px4fuse.contents.outlook import (
+from px4fuse.errors import MissingDataError, Px4FuseError
+from px4fuse.filter.signals import IMU_GAP_INTERVALS, IMU_GAP_S, Segment, make_axes
+from px4fuse.findings.source_gap import GAP, GAP_INTERVALS
+from px4fuse.flight import Ekf2, Flight, Unavailable, sample_rate
+from px4fuse.inspect.outlook import (
     PART_NAMES,
     Ability,
     Advice,
@@ -20,10 +24,6 @@ from px4fuse.contents.outlook import (
     advice,
     most_innovations,
 )
-from px4fuse.errors import MissingDataError, Px4FuseError
-from px4fuse.filter.signals import IMU_GAP_INTERVALS, IMU_GAP_S, Segment, make_axes
-from px4fuse.findings.source_gap import GAP, GAP_INTERVALS
-from px4fuse.flight import Ekf2, Flight, Unavailable, sample_rate
 from px4fuse.plain import plain
 from px4fuse.recording import ClockMap, InputFile, LogInfo, Unused
 from px4fuse.request import with_options

@@ -1,0 +1,231 @@
+"""A flight as tidy tables, each column described in a data dictionary."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import cache
+from importlib.resources import files
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from msgspec import structs
+
+from px4fuse.filter.signals import ned_acceleration
+from px4fuse.flight import Ekf2, Flight, PositionTrack, Truth, Unavailable
+from px4fuse.plain import plain
+
+SCHEMA_NAME = "px4fuse-flight"
+SCHEMA_VERSION = "1.0"
+DICTIONARY_COLUMNS = ["table", "column", "unit", "frame", "meaning", "source_topic", "clock"]
+# What a file name may not hold on some system, or what is awkward in a shell
+_UNSAFE = re.compile(r"[^A-Za-z0-9_-]+")
+MAX_NAME = 80
+NO_POSITION = Unavailable(
+    "external position", "the log holds no track", "px4fuse info says what would log one."
+)
+
+
+@dataclass(frozen=True)
+class _Table:
+    """One table, and its rows of the data dictionary."""
+
+    name: str
+    data: pd.DataFrame
+    columns: pd.DataFrame
+
+
+def tables(flight: Flight) -> Mapping[str, pd.DataFrame]:
+    """Everything in a flight as tidy tables: one row per sample, one documented unit per column.
+
+    Returns
+    -------
+    mapping from table name to DataFrame
+        The first column of a time series is ``time_s``. Names are safe as file names. Parts that
+        are unavailable have no table; see :func:`absent`.
+    """
+    return {table.name: table.data for table in _tables(flight)}
+
+
+def data_dictionary(flight: Flight) -> pd.DataFrame:
+    """One row per column of every table, in order.
+
+    Returns
+    -------
+    DataFrame
+        Columns table, column, unit (ASCII, so that every spreadsheet reads it), frame, meaning,
+        source_topic, clock.
+    """
+    parts = [table.columns for table in _tables(flight)]
+    if not parts:
+        return pd.DataFrame(columns=DICTIONARY_COLUMNS)
+    return pd.concat(parts, ignore_index=True)[DICTIONARY_COLUMNS]
+
+
+def absent(flight: Flight) -> tuple[Unavailable, ...]:
+    """Parts of the flight that have no table, and why."""
+    ekf2 = flight.ekf2
+    parts: list[object] = [flight.imu, flight.attitude, ekf2, flight.truth, flight.airborne]
+    if isinstance(ekf2, Ekf2):
+        parts += [ekf2.variance, *ekf2.innovations.values(), ekf2.fusing]
+    if not any(isinstance(part, Unavailable) for part in (flight.imu, flight.attitude)):
+        parts.append(ned_acceleration(flight))
+    found = [part for part in parts if isinstance(part, Unavailable)]
+    if not flight.positions:
+        found.append(NO_POSITION)
+    return tuple(dict.fromkeys(found))
+
+
+def description(flight: Flight) -> dict[str, Any]:
+    """What the log is and what is missing from it, for JSON: what is not known is absent."""
+    ekf2 = flight.ekf2
+    about: dict[str, Any] = {
+        "schema": {"name": SCHEMA_NAME, "version": SCHEMA_VERSION},
+        "log": flight.log,
+        "streams": flight.streams,
+        "positions": [
+            {
+                "table": table,
+                "name": track.name,
+                "kind": track.origin.kind,
+                "passage": track.origin.passage,
+                "description": track.description,
+                "frame": track.frame,
+                "clock": track.clock,
+                "reconstructed": track.origin.reconstructed,
+                "topics": track.topics,
+                "log": track.log,
+                "alignment": track.alignment,
+            }
+            for table, track in _named_tracks(flight)
+        ],
+        "ekf2": {"gate": ekf2.gate, "notes": ekf2.notes} if isinstance(ekf2, Ekf2) else None,
+        "clocks": flight.clocks,
+        "missing": tuple(dict.fromkeys((*absent(flight), *flight.missing))),
+        "unused": flight.unused,
+        "inputs": flight.inputs,
+    }
+    data: dict[str, Any] = plain(about)
+    return data
+
+
+@cache
+def _described() -> pd.DataFrame:
+    """Unit, frame and meaning of every column, by table."""
+    with files("px4fuse.inspect").joinpath("columns.csv").open(encoding="utf-8") as file:
+        return pd.read_csv(file, index_col="table", keep_default_na=False)
+
+
+def _table(
+    name: str,
+    data: pd.DataFrame,
+    origin: tuple[tuple[str, ...], str] = ((), ""),
+    of: str = "",
+    **words: str,
+) -> _Table:
+    """A table with the columns that are described for it, or for ``of``.
+
+    Parameters
+    ----------
+    origin : (tuple of str, str)
+        Topics and clock that it was read from.
+    **words
+        What stands in braces in the descriptions.
+    """
+    columns = _described().loc[of or name].map(lambda cell: cell.format(**words))
+    topics, clock = origin
+    columns = columns.assign(table=name, source_topic=" ".join(topics), clock=clock)
+    return _Table(name, data.reindex(columns=columns["column"].tolist()), columns)
+
+
+def _series(flight: Flight, name: str, data: pd.DataFrame | Unavailable) -> Iterator[_Table]:
+    """A time series that is named as its stream; nothing where it is unavailable."""
+    if isinstance(data, pd.DataFrame):
+        yield _table(name, _timed(data), _origin(flight, name))
+
+
+def _timed(data: pd.DataFrame) -> pd.DataFrame:
+    return data.rename_axis("time_s").reset_index()
+
+
+def _tables(flight: Flight) -> Iterator[_Table]:
+    yield from _series(flight, "imu", flight.imu)
+    yield from _series(flight, "attitude", flight.attitude)
+    acceleration = ned_acceleration(flight)
+    if isinstance(acceleration, pd.DataFrame):
+        data = acceleration.set_axis(["north_m_s2", "east_m_s2", "down_m_s2"], axis=1)
+        (imu, clock), (attitude, _) = _origin(flight, "imu"), _origin(flight, "attitude")
+        yield _table("acceleration_ned", _timed(data), ((*imu, *attitude), clock))
+    for name, track in _named_tracks(flight):
+        words = {"frame": track.frame, "description": track.description}
+        origin = (track.topics, track.clock)
+        yield _table(name, _timed(track.samples), origin, "position", **words)
+    if isinstance(flight.ekf2, Ekf2):
+        yield from _ekf2(flight, flight.ekf2)
+    if isinstance(flight.truth, Truth):
+        yield from _series(flight, "truth", flight.truth.samples)
+    log = flight.log
+    if not isinstance(flight.airborne, Unavailable):
+        spans = _listed(["time_s", "end_s"], flight.airborne)
+        yield _table("airborne", spans, _origin(flight, "airborne"))
+    if log.dropouts:
+        rows = [(dropout.start_s, dropout.duration_s) for dropout in log.dropouts]
+        yield _table("dropouts", _listed(["time_s", "duration_s"], rows))
+    if log.parameters:
+        values = pd.DataFrame(list(log.parameters.items()), columns=["name", "value"])
+        yield _table("parameters", values)
+    if flight.clocks:
+        mapped = pd.DataFrame([structs.asdict(clock) for clock in flight.clocks])
+        # NaN where they do tell the time
+        yield _table("clocks", mapped.astype({"distinct_stamps": np.float64}))
+
+
+def _listed(columns: list[str], rows: Iterable[tuple[float, ...]]) -> pd.DataFrame:
+    return pd.DataFrame(list(rows), columns=columns, dtype=np.float64)
+
+
+def _ekf2(flight: Flight, ekf2: Ekf2) -> Iterator[_Table]:
+    yield from _series(flight, "ekf2_state", ekf2.state)
+    yield from _series(flight, "ekf2_variance", ekf2.variance)
+    frames = [
+        frame.assign(axis=axis)
+        for axis, frame in ekf2.innovations.items()
+        if isinstance(frame, pd.DataFrame)
+    ]
+    if frames:
+        tidy = pd.concat(frames).sort_index(kind="stable")
+        yield from _series(flight, "ekf2_innovations", tidy)
+    yield from _series(flight, "ekf2_fusing", ekf2.fusing)
+    origin = _origin(flight, "ekf2_state")
+    jumps = [reset.delta for reset in ekf2.resets]
+    resets = _listed(["delta_north", "delta_east", "delta_down"], jumps)
+    resets["time_s"] = np.array([reset.time_s for reset in ekf2.resets], np.float64)
+    resets["quantity"] = np.array([reset.quantity for reset in ekf2.resets], object)
+    yield _table("resets", resets, origin)
+    # the first instance holds from the beginning, which a reader stamps minus infinity
+    begin = min(float(ekf2.state.index[0]), 0.0)
+    rows = [(max(time, begin), number) for time, number in ekf2.instances]
+    instances = _listed(["time_s", "instance"], rows).astype({"instance": np.int64})
+    yield _table("instances", instances, origin)
+
+
+def _named_tracks(flight: Flight) -> Iterator[tuple[str, PositionTrack]]:
+    """Every position track with the name of its table, each name once whatever its case."""
+    taken: set[str] = set()
+    for track in flight.positions:
+        # the first word is ours, so that none of the names that Windows reserves can result
+        stem = _UNSAFE.sub("_", f"position_{track.name}")[:MAX_NAME].rstrip("_")
+        name, number = stem, 1
+        while name.lower() in taken:
+            number += 1
+            name = f"{stem}_{number}"
+        taken.add(name.lower())
+        yield name, track
+
+
+def _origin(flight: Flight, part: str) -> tuple[tuple[str, ...], str]:
+    """Topics and clock that a part was read from."""
+    stream = flight.streams.get(part)
+    return ((), "") if stream is None else (stream.topics, stream.clock)
