@@ -117,7 +117,7 @@ def test_all_time_axes_of_the_core_are_one(eventful: Document) -> None:
 def test_rejected_innovations_are_hollow_and_fused_ones_filled(eventful: Document) -> None:
     result = eventful.analysis.main
     axes = Figure().add_axes((0.1, 0.1, 0.8, 0.8))
-    panels.draw_innovations(axes, result, 10_000)
+    panels.draw_innovations(axes, result)
     hollow = [
         line
         for line in axes.lines
@@ -162,7 +162,7 @@ def test_who_is_nearer_is_said(eventful: Document, ours: float, ekf2: float, sai
         name: replace(one, truth=replace(one.truth, position_rmse_m=error))
         for (name, one), error in zip(result.filters.items(), (ours, ekf2), strict=True)
     }
-    assert panels.nearer(replace(result, filters=made), "position") == said
+    assert panels.nearer(replace(result, filters=made), panels.POSITIONS) == said
 
 
 @pytest.mark.parametrize("count", [0, 3, 40])

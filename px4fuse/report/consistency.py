@@ -140,7 +140,7 @@ def _histogram(axes: Axes, series: list[Series]) -> None:
 def _autocorrelation(axes: Axes, series: list[Series]) -> None:
     for shift, one in zip((-0.18, 0.18), series, strict=False):
         lags = min(LAGS, len(one.values) // 3)
-        r = autocorrelation(one.values.to_numpy(), lags)
+        r = autocorrelation(np.asarray(one.values, np.float64), lags)
         at = np.arange(1, lags + 1) + shift
         axes.vlines(at, 0.0, r, color=one.line["color"], lw=1.2)
         filled = {"mfc": one.line["color"] if one.name == "ours" else "white"}

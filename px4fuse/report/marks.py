@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from px4fuse.arrays import Array
-from px4fuse.comparison.events import Span
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.report.document import Document
 from px4fuse.report.page import Page
@@ -39,7 +38,7 @@ class Mark(NamedTuple):
     """What happened: bands of the whole height, or signs at a height of the axes."""
 
     label: str
-    where: Sequence[Span] | Sequence[float] | Array
+    where: Sequence[Any] | Array
     style: dict[str, Any]
     height: float | None = None
 

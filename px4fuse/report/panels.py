@@ -111,7 +111,8 @@ def apart(frame: pd.DataFrame, reference: pd.DataFrame) -> pd.Series[float]:
     """Position of one track minus another's (m), where both are known."""
     times, known = frame.index, reference["position_m"]
     at = np.interp(times, known.index, known, left=np.nan, right=np.nan)
-    return (frame["position_m"] - at).dropna()
+    distance: pd.Series[float] = (frame["position_m"] - at).dropna()
+    return distance
 
 
 def draw_error(axes: Axes, result: AxisComparison) -> None:

@@ -10,7 +10,7 @@ import json
 from collections.abc import Callable, Iterator, Mapping
 from functools import cache
 from importlib import metadata
-from importlib.resources import files
+from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
@@ -148,4 +148,4 @@ def compiled(report: Mapping[str, Any], template: str | None = None) -> bytes:
 
 @cache
 def _template() -> str:
-    return files("px4fuse.report").joinpath("report.typ").read_text(encoding="utf-8")
+    return Path(__file__).with_name("report.typ").read_text(encoding="utf-8")

@@ -119,7 +119,7 @@ def _map(axes: Axes, document: Document, view: MapView, tracks: Mapping[str, Pai
         (document.events.landing_s, LANDING, "landing"),
     ):
         if times:
-            near = samples.iloc[samples.index.get_indexer(list(times), method="nearest")]
+            near = samples.iloc[samples.index.get_indexer(pd.Index(times), method="nearest")]
             signs = view.of(near["north_m"], near["east_m"])
             axes.plot(*signs, **{**looks, "ms": 7.0, "mec": "white", "mew": 0.6}, label=label)
     as_map(axes, *view.labels)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from importlib.resources import files
+from pathlib import Path
 
 from px4fuse.report import clock, fonts
 from px4fuse.report.document import Document, LoopDocument
@@ -22,7 +22,7 @@ def draw(document: Document) -> Iterator[Page]:
     others = (f"{t.name} ({t.rate_hz:.1f} Hz)" for t in flight.positions if t is not source)
     parameters = (f"{name} {value:g}" for name, value in log.parameters.items())
     page = _begin("Appendix: provenance", document)
-    facts = {
+    facts: dict[str, str] = {
         "file": f"{log.name}, {log.bytes} bytes, {log.format}",
         "SHA-256": log.sha256,
         **{f.role: f"{f.name}, {f.bytes} bytes, SHA-256 {f.sha256}" for f in flight.inputs},
@@ -95,5 +95,5 @@ def _section(
 
 
 def _methods(page: Page, name: str) -> None:
-    text = files("px4fuse.report").joinpath(name).read_text(encoding="utf-8")
+    text = Path(__file__).with_name(name).read_text(encoding="utf-8")
     _section(page, "How the numbers are made", plain=text.split("\n\n"))

@@ -60,12 +60,12 @@ def _show_labelled(console: Console, block: Block, request: Request | None) -> N
     lines = block["label"]["text"].split("\n")
     labels = [line for line in lines if len(line) < INDENT]
     aside = "".join(f" ({line})" for line in lines if len(line) >= INDENT)
-    for place, (label, part) in enumerate(zip_longest(labels, block["texts"], fillvalue="")):
-        words, commands = _styled(part) if part else Text(), list[str]()
+    for place, (label, part) in enumerate(zip_longest(labels, block["texts"])):
+        words, commands = Text() if part is None else _styled(part), list[str]()
         if request is not None:
             words.plain, commands = runnable(words.plain, request)
         words.append("" if place else aside)
-        say(console, words, _styled({**block["label"], "text": label}), INDENT)
+        say(console, words, _styled({**block["label"], "text": label or ""}), INDENT)
         for command in commands:
             print_command(console, command)
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Iterator
 from contextlib import contextmanager
-from importlib.resources import files
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from matplotlib.axis import Axis
 
 FONT = "DejaVu Sans"
+SHEET = Path(__file__).with_name("report.mplstyle")
 TIME_LABEL = "time since first data (s)"
 
 OURS = "#123f7a"
@@ -60,19 +61,19 @@ def report_style() -> Iterator[None]:
     """Matplotlib settings of the panels, for the duration of a block."""
     import matplotlib as mpl  # noqa: PLC0415 - not where words alone are shown
 
-    with mpl.rc_context({"font.family": [FONT]}, files("px4fuse.report") / "report.mplstyle"):
+    with mpl.rc_context({"font.family": [FONT]}, SHEET):
         yield
 
 
 def curve(axes: Axes, values: pd.Series[float], **style: Any) -> None:
     """Draw a series over its index, with as many points as the eye can see in these axes."""
-    axes.plot(*thin(values.index.to_numpy(), values.to_numpy(), _seen(axes)), **style)
+    axes.plot(*thin(values.index.to_numpy(), np.asarray(values, np.float64), _seen(axes)), **style)
 
 
 def band(axes: Axes, middle: pd.Series[float], sigma: pd.Series[float]) -> None:
     """Draw our ±2σ about a series."""
     time = middle.index.to_numpy()
-    shown, upper = thin(time, (middle + 2.0 * sigma).to_numpy(), _seen(axes))
+    shown, upper = thin(time, np.asarray(middle + 2.0 * sigma, np.float64), _seen(axes))
     lower = np.interp(shown, time, (middle - 2.0 * sigma).to_numpy())
     axes.fill_between(shown, lower, upper, color=OURS_BAND, lw=0)
 

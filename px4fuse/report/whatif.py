@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 SIZE = 8.0
-PANEL_POINTS = 80.0
+PANEL_POINTS = 60.0
 MAX_TICKS = 10
 WIDE = 5.0  # values that span more are drawn on a logarithmic scale
 Of = Callable[[Summary, str], float | Unavailable]
@@ -86,14 +86,12 @@ def sweep_heads(made_of: Counterfactual) -> list[str]:
 def sweep_rows(made_of: Counterfactual) -> list[list[str]]:
     """One row per value of the sweep."""
     name = swept(made_of)
-    (nis, _, _, sigma, rmse), (_, *rest) = (
-        [cell for _, cell in table] for table in (AXIS_ROWS, ROWS)
-    )
+    nis, _, _, sigma, rmse = (cell for _, cell in AXIS_ROWS)
     return [
         [
             number_words(summary.changed[name]),
             "/".join(nis(summary, axis) for axis in HORIZONTAL),
-            *(cell(summary) for cell in rest),
+            *(cell(summary) for _, cell in ROWS[1:]),
             *("/".join(cell(summary, axis) for axis in HORIZONTAL) for cell in (sigma, rmse)),
         ]
         for summary in sweep_of(made_of)
@@ -169,6 +167,8 @@ def print_what_if(console: Console, made_of: Counterfactual) -> None:
     made_of : Counterfactual
     """
     page = Page()
+    if AISLE in made_of.why:
+        write_why(page, made_of.why[AISLE])
     _tables(page, made_of)
     page.write("Replays are of px4fuse's model of EKF2, not of PX4's own code.")
     show(console, page.blocks)
@@ -181,8 +181,6 @@ def _tables(page: Page, made_of: Counterfactual) -> None:
     spans = ", ".join(f"{start:.1f} to {end:.1f} s" for start, end in found.judged)
     page.labelled("Judged", spans)
     page.labelled("Replay", agreement_words(found.agreement))
-    if AISLE in made_of.why:
-        write_why(page, made_of.why[AISLE])
     head = ["", *heads(made_of)]
     page.table(head, rows(made_of), right=range(1, len(head)), size=SIZE)
     if sweep_of(made_of):
@@ -226,5 +224,5 @@ def _curves(axes: Axes, values: list[float], lines: list[list[float | Unavailabl
         axes.set_xscale("log")
     ticks = values[:: math.ceil(len(values) / MAX_TICKS)]
     axes.set_xticks(ticks, [number_words(value) for value in ticks])
-    axes.tick_params(axis="x", which="minor", bottom=False)
+    axes.minorticks_off()
     axes.margins(x=0.02)

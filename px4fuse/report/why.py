@@ -32,6 +32,7 @@ ROW_POINTS = 12.0
 AROUND = 42.0  # points above and below the bars
 LABELS, GAP = 0.25, 0.04  # of the width: names of the steps, and between both
 TIME_POINTS = 105.0
+AWAY = {"color": "white", "hatch": "////"}  # bars of steps that lead away from EKF2
 
 
 def draw(document: Document) -> Iterator[Page]:
@@ -139,13 +140,14 @@ def _waterfall(axes: Axes, names: list[str], shares: Array, left: float) -> None
     """Bars from the whole difference down to what is left, in per cent of the whole."""
     before = 100.0 - np.concatenate([[0.0], np.cumsum(shares)])
     rows, farthest = len(names) + 2, max(100.0, float(before.max()))
-    style: dict[str, Any] = {"height": 0.7, "edgecolor": OURS, "lw": 0.6}
-    axes.barh(0, 100.0, color=OURS, **style)
+    style: dict[str, Any] = {"height": 0.7, "edgecolor": OURS, "lw": 0.6, "color": OURS}
+    axes.barh(0, 100.0, **style)
     for row, (share, start) in enumerate(zip(shares, before, strict=False), start=1):
-        nearer = {"color": OURS_BAND} if share >= 0.0 else {"color": "white", "hatch": "////"}
-        axes.barh(row, -share, left=start, **style, **nearer)
+        style |= {"color": OURS_BAND, "hatch": ""} if share >= 0.0 else AWAY
+        axes.barh(row, -share, left=start, **style)
         axes.plot([start] * 2, [row - 1.35, row + 0.35], color=MUTED, lw=0.5)
-    axes.barh(rows - 1, left, color=EKF2_BAND, **style | {"edgecolor": EKF2})
+    style |= {"color": EKF2_BAND, "edgecolor": EKF2, "hatch": ""}
+    axes.barh(rows - 1, left, **style)
     for row, number in enumerate((100.0, *shares, left)):
         digits = 1 if 0.05 <= abs(number) < 9.95 else 0
         axes.text(1.03 * farthest, row, f"{number:z.{digits}f} %", va="center", size=6.5)
