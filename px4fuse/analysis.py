@@ -1,6 +1,6 @@
 """Request → Analysis: the one way to run a comparison or a loop.
 
-Readers, placing, filter, comparison and what explains it are called from here, in that order.
+Readers, alignment, filter, comparison and what explains it are called from here, in that order.
 """
 
 from __future__ import annotations
@@ -168,7 +168,7 @@ def read_flight(request: ComparisonRequest, progress: Progress = silent) -> Flig
     flight = read_log(log, system=request.system if request.mavlink is None else None)
     # scipy.signal and scipy.ndimage cost a fifth of a second: only where something is placed
     if request.mavlink is not None:
-        from px4fuse.placing import join  # noqa: PLC0415
+        from px4fuse.alignment import join  # noqa: PLC0415
 
         other = read_log(Path(request.mavlink), system=request.system)
         if not other.log.format.startswith("MAVLink"):
@@ -180,7 +180,7 @@ def read_flight(request: ComparisonRequest, progress: Progress = silent) -> Flig
     position, offset = request.position, request.clock_offset_s
     if position is None:
         return flight
-    from px4fuse.placing import place  # noqa: PLC0415
+    from px4fuse.alignment import place  # noqa: PLC0415
     from px4fuse.readers.position_csv import read_position_csv  # noqa: PLC0415
 
     units = {"time_unit": position.time_unit, "length_unit": position.length_unit}
@@ -256,7 +256,7 @@ def run_loop(request: LoopRequest, progress: Progress = silent) -> Loop:
         A file cannot be read or lacks what was asked for, or a setting is out of range.
     """
     from px4fuse.loop.analysis import analyse  # noqa: PLC0415 (tune and sync have none)
-    from px4fuse.loop.odometry import OdometryNoise  # noqa: PLC0415
+    from px4fuse.loop.model import OdometryNoise  # noqa: PLC0415
     from px4fuse.loop.sources import read_source  # noqa: PLC0415
 
     _check_finite(start_s=request.start_s, end_s=request.end_s)

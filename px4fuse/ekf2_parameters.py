@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from px4fuse.errors import SettingsError
 
@@ -24,32 +24,20 @@ class Aid:
     ----------
     name : str
         PX4's own, as in ``estimator_aid_src_<name>``.
-    switch, switch_bit : str, int
-        The bit that has EKF2 fuse it, from v1.14 on.
-    old_switch : str
-        The same in words, up to v1.13.
+    switch : str
+        What has EKF2 fuse it, from v1.14 on; EKF2_AID_MASK before.
     noise, gate, delay : str
         Standard deviation of the measurement, its gate in standard deviations, its age in ms.
     noise_mode : str
         1: variances of the sender are not used; empty where there is no such choice.
-    lever_arm : tuple of str
-        Place of the sensor in the body: forward, right and down of its origin.
     """
 
     name: str
     switch: str
-    switch_bit: int
-    old_switch: str
     noise: str
     gate: str
     delay: str
     noise_mode: str = ""
-    lever_arm: tuple[str, ...] = ()
-
-    @property
-    def switched_on(self) -> str:
-        """What has EKF2 fuse it, in words."""
-        return f"bit {self.switch_bit} of {self.switch} ({self.old_switch} before v1.14)"
 
     def in_log(self, logged: Mapping[str, float]) -> dict[str, float]:
         """Its parameters among those of a log, and what switches it."""
@@ -59,21 +47,9 @@ class Aid:
 
 AID_MASK = "EKF2_AID_MASK"
 EV_POS = Aid(
-    name="ev_pos", switch="EKF2_EV_CTRL", switch_bit=0, old_switch=f"bit 3 of {AID_MASK}",
-    noise="EKF2_EVP_NOISE", gate="EKF2_EVP_GATE", delay="EKF2_EV_DELAY",
-    noise_mode="EKF2_EV_NOISE_MD",
-    lever_arm=("EKF2_EV_POS_X", "EKF2_EV_POS_Y", "EKF2_EV_POS_Z"),
-)  # fmt: skip
-EV_HGT = replace(EV_POS, name="ev_hgt", switch_bit=1, old_switch="EKF2_HGT_MODE 3")
-EV_YAW = replace(
-    EV_POS, name="ev_yaw", switch_bit=3, old_switch=f"bit 4 of {AID_MASK}",
-    noise="EKF2_EVA_NOISE", gate="EKF2_HDG_GATE",
-)  # fmt: skip
-GNSS_POS = Aid(
-    name="gnss_pos", switch="EKF2_GPS_CTRL", switch_bit=0, old_switch=f"bit 0 of {AID_MASK}",
-    noise="EKF2_GPS_P_NOISE", gate="EKF2_GPS_P_GATE", delay="EKF2_GPS_DELAY",
-    lever_arm=("EKF2_GPS_POS_X", "EKF2_GPS_POS_Y", "EKF2_GPS_POS_Z"),
-)  # fmt: skip
+    "ev_pos", "EKF2_EV_CTRL", "EKF2_EVP_NOISE", "EKF2_EVP_GATE", "EKF2_EV_DELAY", "EKF2_EV_NOISE_MD"
+)
+GNSS_POS = Aid("gnss_pos", "EKF2_GPS_CTRL", "EKF2_GPS_P_NOISE", "EKF2_GPS_P_GATE", "EKF2_GPS_DELAY")
 
 
 @dataclass(frozen=True)
@@ -103,10 +79,9 @@ PARAMETERS: Mapping[str, Parameter] = {
     EV_POS.gate: Parameter("SD", 5.0, 1.0, 1e3, "gate of the vision position innovation"),
     EV_POS.delay: Parameter("ms", 0.0, 0.0, 300.0, "age of vision at its stamp"),
     "EKF2_DELAY_MAX": Parameter("ms", 200.0, 0.0, 1e3, "how far fusion may run behind (v1.15)"),
-    **{
-        name: Parameter("m", 0.0, -math.inf, math.inf, f"vision sensor {place} the body")
-        for name, place in zip(EV_POS.lever_arm, ("forward of", "right of", "below"), strict=True)
-    },
+    "EKF2_EV_POS_X": Parameter("m", 0.0, -math.inf, math.inf, "vision sensor forward of the body"),
+    "EKF2_EV_POS_Y": Parameter("m", 0.0, -math.inf, math.inf, "vision sensor right of the body"),
+    "EKF2_EV_POS_Z": Parameter("m", 0.0, -math.inf, math.inf, "vision sensor below the body"),
     "EKF2_ACC_NOISE": Parameter("m/s^2", 0.35, 0.01, 1.0, "noise of the accelerometer"),
     "EKF2_GYR_NOISE": Parameter("rad/s", 0.015, 0.0001, 0.1, "noise of the gyro"),
     "EKF2_ACC_B_NOISE": Parameter("m/s^3", 0.003, 0.0, 0.01, "drift of the accelerometer's bias"),

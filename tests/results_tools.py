@@ -5,14 +5,17 @@ import json
 from pathlib import Path
 from typing import Any
 
+from px4fuse.loop.model import Closure, Correction, KnownEnd, LoopPart, OdometryNoise
 from px4fuse.record import Unavailable
 from px4fuse.request import LoopRequest
-from px4fuse.results import trajectories as made
 from px4fuse.results.contract import LoopResults, Results, to_plain
 from px4fuse.results.model import Student
 from px4fuse.results.parts import provenance, schema_of
 from px4fuse.results.reading import read_results
-from px4fuse.trajectory.evaluation import AbsoluteError
+from px4fuse.trajectory.alignment import Transform
+from px4fuse.trajectory.association import Association
+from px4fuse.trajectory.evaluation import AbsoluteError, Score
+from px4fuse.trajectory.model import Track
 from px4fuse.trajectory.offset import TimeOffset
 from px4fuse.trajectory.scores import Interval, RelativeError, Statistics
 
@@ -22,21 +25,21 @@ SHA256 = EXAMPLE["log"]["sha256"]
 NONE = Unavailable("it", "nobody asked", "Ask.")
 
 
-def correction(rmse: float, moved_m: float) -> made.Correction:
+def correction(rmse: float, moved_m: float) -> Correction:
     """A correction with one score."""
     statistics = Statistics(9, rmse, rmse, rmse, 0.0, rmse, rmse)
-    score = made.Score(
+    score = Score(
         alignment="se3",
         alignment_reason="asked",
-        transform=made.Transform((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 1.0, 6),
-        association=made.Association("interpolate", 9, 0.1, 0, 0, 1.0, 1.0),
+        transform=Transform((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 1.0, 6),
+        association=Association("interpolate", 9, 0.1, 0, 0, 1.0, 1.0),
         time_offset=TimeOffset(offset_s=0.0, determinable=True, reason=""),
         ate=AbsoluteError(statistics, Interval(rmse, rmse, 1, 9.0), NONE),
         rpe=(RelativeError(5.0, "m", True, "reference", statistics, NONE, NONE),),
         notes=(),
         warnings=(),
     )
-    return made.Correction(
+    return Correction(
         moved_max_m=moved_m, moved_rms_m=moved_m, scores={"slam.tum": score, "ekf2": NONE}
     )
 
@@ -45,9 +48,9 @@ LOOP = to_plain(
     LoopResults(
         schema=schema_of("px4fuse-loop"),
         request=LoopRequest(source="loop.ulg:vio"),
-        track=made.Track("loop.ulg:vio", SHA256, 9, "vio", "NED", 9, 1.0, 95.0, True, ()),
+        track=Track("loop.ulg:vio", SHA256, 9, "vio", "NED", 9, 1.0, 95.0, True, ()),
         references=(),
-        loop=made.LoopPart(
+        loop=LoopPart(
             track="loop.ulg:vio",
             kind="vio",
             frame="NED",
@@ -59,7 +62,7 @@ LOOP = to_plain(
             key_frame_spacing_m=0.5,
             path_length_m=87.7,
             end_from_start_m={"north": 1.42, "east": 0.0, "down": 0.0},
-            known_end=made.KnownEnd(
+            known_end=KnownEnd(
                 displacement_m={"north": 0.0, "east": 0.0, "down": 0.0},
                 sigma_m=0.1,
                 source="landing",
@@ -69,11 +72,26 @@ LOOP = to_plain(
             closure_percent=1.62,
             heading_error_deg=NONE,
             absolute=False,
-            odometry_noise=made.OdometryNoise(1.0, 3.0, 0.01, 0.03, 0.1),
-            closures=(made.Closure(1.0, 95.0, 0.1, "landing", 1.4, 2.0, 3, 0.5, True),),
-            corrections=made.Corrections(
-                correction(0.41, 0.0), NONE, correction(0.26, 1.4), NONE, NONE, NONE, NONE
+            odometry_noise=OdometryNoise(),
+            closures=(
+                Closure(
+                    time_1_s=1.0,
+                    time_2_s=95.0,
+                    sigma_m=0.1,
+                    source="landing",
+                    distance_m=1.4,
+                    d2=2.0,
+                    degrees_of_freedom=3,
+                    p=0.5,
+                    accepted=True,
+                ),
             ),
+            corrections={
+                "uncorrected": correction(0.41, 0.0),
+                "by_distance_plain": NONE,
+                "by_distance": correction(0.26, 1.4),
+                **{f"pose_graph_{name}": NONE for name in ("all", "gated", "dcs", "gnc")},
+            },
             notes=(),
         ),
         findings=(),

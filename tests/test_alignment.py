@@ -18,6 +18,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from msgspec import structs
 
+from px4fuse.alignment.placement import EKF2_POSITION, IMU, place
 from px4fuse.arrays import Array
 from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.flight import (
@@ -30,7 +31,6 @@ from px4fuse.flight import (
     Reset,
 )
 from px4fuse.origin import GIVEN_FILE
-from px4fuse.placing.placement import EKF2_POSITION, IMU, place
 from px4fuse.readers import read_log
 from px4fuse.readers.position_csv import SAMPLE_COLUMNS, PositionRecording, read_position_csv
 

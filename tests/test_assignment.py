@@ -19,7 +19,7 @@ from px4fuse.assignment import assignment
 from px4fuse.assignment.assignment import assign, fly, key_path
 from px4fuse.assignment.drawing import CHOICES, COUNTS, EASIEST, HARDEST, LOOPS, draw
 from px4fuse.assignment.key import AnswerKey, key_text, read_key
-from px4fuse.assignment.roster import RosterStudent, file_stem, read_roster
+from px4fuse.assignment.roster import Person, file_stem, read_roster
 from px4fuse.cli import cli, main
 from px4fuse.comparison.comparison import compare
 from px4fuse.errors import OutputError, SettingsError
@@ -32,11 +32,11 @@ from px4fuse.simulation.mistakes import parse
 SECRET = b"a secret for tests"
 # What the secret gives student s1: seed, noise and heading, and the mistakes
 PINNED = ((759547191, 0.109, -14.4), ("clock-jump=53ms", "ekf2-off"))
-CLASS = tuple(RosterStudent(f"s{n:02d}", f"Name {n}", f"s{n:02d}.ulg") for n in range(3))
+CLASS = tuple(Person(f"s{n:02d}", f"Name {n}") for n in range(3))
 
 
 def student(name):
-    return RosterStudent(name, "", f"{name}.ulg")
+    return Person(name)
 
 
 def roster(tmp_path, content):
@@ -174,7 +174,7 @@ def test_what_the_key_expects_is_found_in_the_log(tmp_path, kind, number, count)
     else:
         found = find(explain(compare(flight, axes=("north", "east"))))
     assert len(answer.findings) == count
-    assert set(answer.findings) <= {name for finding in found for name in finding.ids}
+    assert set(answer.findings) <= {finding.id for finding in found}
 
 
 # ------------------------------------------------------------------ roster
@@ -195,18 +195,17 @@ ROSTERS = {
 
 
 BAD_ROSTERS = {
-    "no id column": ("a,b\n1,2\n", "no column of ids"),
+    "no id column": ("a,b\n1,2\n", "no column tells who"),
     "empty": ("", "empty"),
-    "no header": ("1001,Ann\n", "no column of ids"),
-    "header alone": ("id,name\n", "no students"),
-    "empty id": ("id,name\n1,A\n,B\n", "row 3 has no id in the column 'id'"),
+    "header alone": ("id,name\n", "0 students"),
+    "empty id": ("id,name\n1,A\n,B\n", "'B' has no id"),
     "same id": ("id\n1\n2\n1\n", "rows 2 and 4 have the same id '1'"),
     "same but for case": ("id\nab\nAB\n", "rows 2 and 3"),
-    "same file": ("id\na/b\na:b\n", "rows 2 and 3"),
-    "nothing left": ("id\n///\n", "neither letters nor digits"),
+    "same file": ("id\na/b\na:b\n", "'a/b' and 'a:b' give the same file name"),
+    "nothing left": ("id\n///\n", "letters or digits"),
     "binary": (b"\x00\x01\x02id", "not text"),
     "spreadsheet": (b"PK\x03\x04....", "Save it as CSV"),
-    "too many": ("id\n" + "\n".join(map(str, range(1001))), "1001 students are too many"),
+    "too many": ("id\n" + "\n".join(map(str, range(1001))), "1001 students"),
     "too long": (b"id\n" + b"1" * 20_000_001, "more than the limit"),
     "huge cell": ('id,name\n1,"' + "x" * 200_000 + '"\n', "not a CSV file"),
 }
@@ -216,7 +215,7 @@ class TestRoster:
     @pytest.mark.parametrize("content", ROSTERS.values(), ids=ROSTERS.keys())
     def test_spellings(self, tmp_path, content):
         students = read_roster(roster(tmp_path, content))
-        assert [one.id for one in students] == ["1001", "1002"]
+        assert [one.student_id for one in students] == ["1001", "1002"]
         assert [one.file for one in students] == ["1001.ulg", "1002.ulg"]
         if "whole" not in content:
             assert [one.name for one in students] == ["Ann Lee", "Bob Ray"]
@@ -224,12 +223,13 @@ class TestRoster:
     @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "cp1252"])
     def test_encodings(self, tmp_path, encoding):
         (one,) = read_roster(roster(tmp_path, "id,name\nä1,Jürgen\n".encode(encoding)))
-        assert (one.id, one.name) == ("ä1", "Jürgen")
+        assert (one.student_id, one.name) == ("ä1", "Jürgen")
 
     def test_formulas_and_markup_stay_data(self, tmp_path):
         text = 'id,name\n=1+1|cmd,"<b onclick=\'x\'>&"\n@x,"=HYPERLINK(""http://x"")"\n'
         first, second = read_roster(roster(tmp_path, text))
-        assert first == RosterStudent("=1+1|cmd", "<b onclick='x'>&", "_1+1_cmd.ulg")
+        assert first == Person("=1+1|cmd", "<b onclick='x'>&")
+        assert first.file == "_1+1_cmd.ulg"
         assert second.name == '=HYPERLINK("http://x")'
 
     @pytest.mark.parametrize(("content", "said"), BAD_ROSTERS.values(), ids=BAD_ROSTERS.keys())
@@ -314,7 +314,7 @@ class TestAssign:
             assign(CLASS[:2], folder, key_file, SECRET, "aisle")
         assert files(folder) == {k: v for k, v in before.items() if k != "key"}
 
-    def test_failed_runs_leave_nothing(self, tmp_path, monkeypatch):
+    def test_an_interrupted_run_can_go_on(self, tmp_path, monkeypatch):
         folder, key_file = tmp_path / "flights", tmp_path / "key.json"
 
         def stop_at_last(*given):
@@ -324,9 +324,15 @@ class TestAssign:
 
         monkeypatch.setattr(assignment, "fly", stop_at_last)
         with pytest.raises(KeyboardInterrupt):
-            assign(CLASS, folder, key_file, SECRET, "aisle")
+            assign(CLASS, folder, key_file, None, "aisle")
         monkeypatch.undo()
-        assert list(tmp_path.iterdir()) == []
+        assert len(read_key(key_file).answers) == 2
+        made = assign(CLASS, folder, key_file, None, "aisle")
+        assert (made.written, made.kept) == (1, 2)
+        assert read_key(key_file) == made.key
+
+    def test_what_cannot_be_written_leaves_nothing(self, tmp_path):
+        folder, key_file = tmp_path / "flights", tmp_path / "key.json"
         key_file.mkdir()
         with pytest.raises(SettingsError):
             assign(CLASS[:1], folder, key_file, SECRET, "aisle")
@@ -335,7 +341,8 @@ class TestAssign:
         for where, key in ((folder, blocked / "key.json"), (blocked, tmp_path / "k.json")):
             with pytest.raises(OutputError, match="cannot be written"):
                 assign(CLASS[:1], where, key, SECRET, "aisle")
-        assert {path.name for path in tmp_path.iterdir()} == {"key.json", "file"}
+        assert not any(path.is_file() for path in folder.rglob("*"))
+        assert not (tmp_path / "k.json").exists()
 
     def test_number_of_mistakes(self, tmp_path):
         for kind, count in (("aisle", 3), ("aisle", -1), ("loop", 2), ("mixed", 2)):

@@ -70,7 +70,7 @@ class Flight:
         if isinstance(report, Refused):
             made = refused(rubric, self.key, report)
             return Graded("a.pdf", "", "", verdict, made.items, pending=made.pending)
-        made = assess(report, verdict, rubric, self.key)
+        made = assess(report.results, verdict, rubric, self.key)
         return Graded("a.pdf", "", "", verdict, made.items, made.flags, made.pending)
 
     def with_notes(self, text: str, rubric: Rubric) -> Graded:
@@ -309,10 +309,9 @@ def looped(truth: Any, notes: str, request: dict[str, Any], loop: dict[str, Any]
     values |= {f"loop__{name}": value for name, value in loop.items()}
     form = {"log_sha256": SHA256, "mistakes": [{"kind": "open-end"}] if notes else []}
     results = decoded(changed(LOOP, student__answers=form, student__id="s01", **values))
-    report = Report("0" * 64, "intact", results, (), b"")
     key = truth and AnswerKey("loop", (Answer("s01", "", "", LOOP["track"]["sha256"], *truth),))
     verdict = Verdict("verified", (), True, page_status="same")
-    made = assess(report, verdict, read_rubric(None), key)
+    made = assess(results, verdict, read_rubric(None), key)
     items = tuple(item for item in made.items if "losure" in item.title or "Loop" in item.title)
     return Graded("a.pdf", "", "", verdict, items, made.flags, made.pending)
 

@@ -13,6 +13,7 @@ from ekf2_tools import plain_replay, step_matrix, step_noise, step_state
 from exchange import replace
 from findings_tools import made
 
+from px4fuse.alignment.joining import join
 from px4fuse.ekf2 import model as model_module
 from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.intervals import Timing
@@ -33,7 +34,6 @@ from px4fuse.flight import (
     Unavailable,
 )
 from px4fuse.origin import RECEIVED
-from px4fuse.placing.joining import join
 from px4fuse.readers import read_log
 
 

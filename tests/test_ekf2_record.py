@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from ulog_tools import GENERATIONS, covariances, make_log, stamps, topic
 
+from px4fuse.alignment.joining import later
 from px4fuse.flight import (
     ACCELEROMETER_BIAS_COLUMNS,
     DELAYED_STATE_COLUMNS,
@@ -17,7 +18,6 @@ from px4fuse.flight import (
     FusionRecord,
     Unavailable,
 )
-from px4fuse.placing.joining import _later_record
 from px4fuse.readers import read_log
 
 QUATERNION = Rotation.from_euler("ZYX", [40.0, 10.0, -5.0], degrees=True).as_quat(scalar_first=True)
@@ -115,7 +115,7 @@ def test_the_age_of_vision_is_publication_minus_measurement(record_of):
     age = record_of(log).record.vision_age_s
     expected = (fields["timestamp"].astype(float) - fields["timestamp_sample"]) * 1e-6
     assert age.to_numpy() == pytest.approx(expected)
-    moved = _later_record(record_of(log).record, 2.5)
+    moved = later(record_of(log).record, 2.5)
     assert isinstance(moved, FusionRecord)
     assert moved.vision_age_s.index[0] == pytest.approx(age.index[0] + 2.5)
     assert moved.delayed.index[0] == pytest.approx(record_of(log).record.delayed.index[0] + 2.5)

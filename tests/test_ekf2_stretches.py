@@ -12,8 +12,13 @@ import pandas as pd
 import pytest
 from findings_tools import NONE, made
 
-from px4fuse.ekf2.stretches import _counted, _stretch, down_sampled, find_stretches, predict_s
-from px4fuse.ekf2.stretches import step_ends as ends_of
+from px4fuse.ekf2.stretches import (
+    _stretch,
+    down_sampled,
+    find_stretches,
+    predict_s,
+    step_ends,
+)
 from px4fuse.flight import (
     ACCELEROMETER_BIAS_COLUMNS,
     ANGULAR_RATE_COLUMNS,
@@ -31,18 +36,24 @@ from px4fuse.flight import (
 from px4fuse.trajectory.rotation import matrix
 
 
-def test_a_step_ends_after_its_samples_or_when_it_is_long() -> None:
-    assert _counted(np.array([0.004] * 5), 2, 0.008) == [2, 4]
-    assert _counted(np.array([0.004, 0.009, 0.004, 0.004]), 2, 0.008) == [2, 4]
-    assert _counted(np.array([0.009, 0.004, 0.004]), 2, 0.008) == [1, 3]
-    assert _counted(np.array([0.005] * 6), 3, 0.0155) == [3, 6]
-    # by count only when more than half of the step has passed
-    assert _counted(np.array([0.002, 0.002, 0.0021]), 2, 0.008) == [3]
-    assert ends_of(np.full(9, 0.004), np.array([3]), 0.008).tolist() == [2, 3, 5, 7, 9]
-    assert ends_of(np.full(6, 0.004), np.array([], int), 0.008).tolist() == [2, 4, 6]
-    assert ends_of(np.full(3, 0.01), np.array([], int), 0.008).tolist() == [1, 2, 3]
-    late = np.array([0.004, 0.004, 0.009, 0.004, 0.004])
-    assert ends_of(late, np.array([], int), 0.008).tolist() == [2, 3, 5]
+@pytest.mark.parametrize(
+    ("interval_ms", "known", "ends"),
+    [
+        ([4] * 5, [], [2, 4]),
+        ([4, 9, 4, 4], [], [2, 4]),  # longer than the target before its samples are there
+        ([9, 4, 4], [], [1, 3]),
+        ([4, 4, 9, 4, 4], [], [2, 3, 5]),
+        ([4, 4, 1, 1.5, 4, 4, 4], [], [2, 5, 7]),  # by count when half of the target has passed
+        ([4] * 9, [3], [2, 3, 5, 7, 9]),  # a known end sets the count again
+        ([10] * 3, [], [1, 2, 3]),
+        ([2.75] * 7, [0, 6], [3, 6]),
+    ],
+)
+def test_a_step_ends_after_its_samples_or_when_it_is_long(
+    interval_ms: list[float], known: list[int], ends: list[int]
+) -> None:
+    found = step_ends(np.array(interval_ms) * 1e-3, np.array(known, int), 0.008)
+    assert found.tolist() == ends
 
 
 def test_a_gain_is_seen_from_the_end_of_its_step() -> None:

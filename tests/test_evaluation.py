@@ -125,9 +125,9 @@ def test_association_by_the_nearest_is_that_of_evo(pair: tuple[str, str], offset
             theirs = expected(y.time_s, x.time_s, 0.01, offset_s)[::-1]
         else:
             theirs = expected(x.time_s, y.time_s, 0.01, -offset_s)
-        got = associate(x, y, method="nearest", time_offset_s=offset_s)
-        np.testing.assert_array_equal(got.estimate.time_s, x.time_s[theirs[0]])
-        np.testing.assert_array_equal(got.reference.time_s, y.time_s[theirs[1]])
+        used, matched, _ = associate(x, y, method="nearest", time_offset_s=offset_s)
+        np.testing.assert_array_equal(used.time_s, x.time_s[theirs[0]])
+        np.testing.assert_array_equal(matched.time_s, y.time_s[theirs[1]])
 
 
 @pytest.mark.reallogs
@@ -294,13 +294,13 @@ def test_interpolation_is_exact_where_the_motion_is_uniform() -> None:
     reference = Trajectory("r", "truth", time, time[:, None] * [1.0, 2.0, 3.0], turns)
     at = np.sort(np.random.default_rng(1).uniform(-1.0, 11.0, 300))
     estimate = Trajectory("e", "vio", at - 5.0, np.zeros((300, 3)), None)
-    got = associate(estimate, reference, time_offset_s=5.0)
+    _, matched, got = associate(estimate, reference, time_offset_s=5.0)
     inside = (at >= 0.0) & (at <= time[-1])
-    assert (len(got), got.outside, got.in_gaps) == (inside.sum(), (~inside).sum(), 0)
-    np.testing.assert_allclose(got.reference.position_m, at[inside, None] * [1, 2, 3], atol=1e-12)
-    assert got.reference.rotation is not None
+    assert (got.poses, got.outside, got.in_gaps) == (inside.sum(), (~inside).sum(), 0)
+    np.testing.assert_allclose(matched.position_m, at[inside, None] * [1, 2, 3], atol=1e-12)
+    assert matched.rotation is not None
     expected = Rotation.from_rotvec(at[inside, None] * [0.1, 0.5, 0.2])
-    assert (got.reference.rotation.inv() * expected).magnitude().max() < 1e-12
+    assert (matched.rotation.inv() * expected).magnitude().max() < 1e-12
     assert got.coverage_estimate == pytest.approx(inside.mean())
     assert got.coverage_reference == pytest.approx(np.ptp(at[inside]) / time[-1])
 
@@ -308,11 +308,12 @@ def test_interpolation_is_exact_where_the_motion_is_uniform() -> None:
 def test_nothing_is_interpolated_across_a_gap() -> None:
     whole = flight(20.0)
     reference = whole[(whole.time_s < 5.0) | (whole.time_s >= 10.0)]
-    got = associate(whole, reference)
+    got = associate(whole, reference)[2]
     assert got.max_gap_s == pytest.approx(0.15)
-    assert (len(got), got.in_gaps, got.outside) == (300, 100, 0)
-    assert len(associate(whole, reference, max_gap_s=6.0)) == 400
-    lost = associate(reference, whole)  # the other way round: the reference's time is not covered
+    assert (got.poses, got.in_gaps, got.outside) == (300, 100, 0)
+    assert associate(whole, reference, max_gap_s=6.0)[2].poses == 400
+    # the other way round: the reference's time is not covered
+    lost = associate(reference, whole)[2]
     assert lost.coverage_estimate == 1.0
     assert lost.coverage_reference == pytest.approx(0.75, abs=0.01)
 
@@ -329,7 +330,9 @@ def test_nearest_pairs_and_what_is_left_out_are_those_of_the_definition(denser: 
     edges = reference.time_s[[0, 0, -1, -1]] + np.array([-1.1, -0.9, 0.9, 1.1]) * limit
     time = np.union1d(time, edges)
     estimate = Trajectory("e", "vio", time - offset_s, np.zeros((len(time), 3)), None)
-    got = associate(estimate, reference, method="nearest", max_gap_s=limit, time_offset_s=offset_s)
+    x, y, got = associate(
+        estimate, reference, method="nearest", max_gap_s=limit, time_offset_s=offset_s
+    )
     apart = np.abs(time[:, None] - reference.time_s)
     if denser:
         kept = np.flatnonzero(apart.min(axis=0) <= limit)
@@ -337,14 +340,14 @@ def test_nearest_pairs_and_what_is_left_out_are_those_of_the_definition(denser: 
     else:
         used = np.flatnonzero(apart.min(axis=1) <= limit)
         matched = apart.argmin(axis=1)[used]
-    np.testing.assert_array_equal(got.estimate.time_s, estimate.time_s[used])
-    np.testing.assert_array_equal(got.reference.time_s, reference.time_s[matched])
+    np.testing.assert_array_equal(x.time_s, estimate.time_s[used])
+    np.testing.assert_array_equal(y.time_s, reference.time_s[matched])
     first, last = reference.time_s[[0, -1]]
     outside = np.count_nonzero((time < first - limit) | (time > last + limit))
     poses = len(np.unique(used))
     assert (got.outside, got.in_gaps) == (outside, len(time) - outside - poses)
     assert got.coverage_estimate == pytest.approx(poses / len(time))
-    assert (got.max_gap_s, got.time_offset_s, len(got)) == (limit, offset_s, len(used))
+    assert (got.max_gap_s, got.poses) == (limit, len(used))
 
 
 def test_no_overlap_names_both_spans_and_the_remedy() -> None:

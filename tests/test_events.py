@@ -10,10 +10,10 @@ import pytest
 from exchange import replace
 from flights import Estimator, Uwb, aisle_flight
 
+from px4fuse.alignment.joining import join
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.events import happened, source_gaps
 from px4fuse.flight import Flight, FlightMode, Reset, Unavailable
-from px4fuse.placing.joining import join
 from px4fuse.readers import read_log
 from px4fuse.readers.parts import stretches_of_modes
 from px4fuse.readers.px4_topics import NAV_STATES

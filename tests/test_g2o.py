@@ -229,7 +229,7 @@ def test_information_that_overflows_is_refused_with_its_line(
     path.write_text(square(f"{entry} 0 0 1 0 1", edge))
     code, out, err = run_main(monkeypatch, capsys, "loop", path)
     assert (code, out) == (2, "")
-    assert f"g.g2o: line {edge + 1}: the information matrix has the entry {entry}" in err.replace(
+    assert f"g.g2o, line {edge + 1}: the information matrix has the entry {entry}" in err.replace(
         "e+", "e"
     ).replace("4.94e-324", "5e-324").replace("9.99989e-321", "1e-320")
     assert len(err.splitlines()) == 1

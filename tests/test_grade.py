@@ -343,9 +343,9 @@ def test_the_options_of_a_term_reach_it(tmp_path, monkeypatch) -> None:
     course = given["course"]
     assert [person.student_id for person in course.roster] == ["0042"]
     assert course.worksheets[0].head == ("id", "Grade")
-    assert (course.column, course.anonymous, course.term.attempt) == ("Grade", True, "best")
-    assert course.term.due.isoformat() == "2026-11-20T23:59:59+01:00"
-    assert course.term.late.text == "5%/hour"
+    assert (course.column, course.anonymous, course.attempt) == ("Grade", True, "best")
+    assert course.due.isoformat() == "2026-11-20T23:59:59+01:00"
+    assert course.late.text == "5%/hour"
 
 
 def test_the_default_rubric_is_written_to_be_edited(tmp_path, monkeypatch) -> None:

@@ -16,7 +16,7 @@ from px4fuse.comparison.preparation import choose_segment, choose_source
 from px4fuse.filter import heading
 from px4fuse.filter.heading import DRIFT_P, HeadingError, HeadingPart, heading_error
 from px4fuse.filter.settings import Settings
-from px4fuse.findings import Finding, source_frame_turned
+from px4fuse.findings import Finding, source_frame
 from px4fuse.flight import QUATERNION_COLUMNS, ROTATION_VARIANCE_COLUMNS, Flight, Unavailable
 from px4fuse.origin import KEPT
 from px4fuse.readers import read_log
@@ -148,7 +148,7 @@ def named(heading: HeadingError, **track: object) -> dict[str, Finding]:
     (source,) = flight.positions
     comparison = compare(replace(flight, positions=(replace(source, **track),)), axes=("north",))
     analysis = replace(unexplained(comparison), heading=heading)
-    return {finding.id: finding for finding in source_frame_turned.DETECTOR.detect(analysis)}
+    return {finding.id: finding for finding in source_frame.detect(analysis)}
 
 
 def made(*turns_deg: float, drift_p: float) -> HeadingError:

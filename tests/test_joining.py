@@ -10,9 +10,9 @@ from flights import aisle_flight
 from mavlink_tools import BOOT_S, Aisle, unix
 from ulog_tools import load
 
+from px4fuse.alignment.joining import join
 from px4fuse.errors import MissingDataError
 from px4fuse.flight import AXIS_NAMES, POSITION_COLUMNS, Ekf2, Flight, Unavailable
-from px4fuse.placing.joining import join
 from px4fuse.readers import read_log
 
 POSITION_TOPICS = ("vehicle_visual_odometry", "estimator_aid_src_ev_pos")

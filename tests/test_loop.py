@@ -17,9 +17,10 @@ from px4fuse.findings import find_loop
 from px4fuse.flight import Unavailable
 from px4fuse.lesson import ODOMETRY_M
 from px4fuse.loop.analysis import analyse, loop_in
-from px4fuse.loop.corrections import BY_DISTANCE, PLAIN, SINGLE_LOOP, Correction
+from px4fuse.loop.corrections import BY_DISTANCE, PLAIN, SINGLE_LOOP
 from px4fuse.loop.loop import Loop, close_loop
-from px4fuse.loop.odometry import Closure, OdometryNoise, odometry_variances
+from px4fuse.loop.model import CorrectedPath, OdometryNoise
+from px4fuse.loop.odometry import odometry_variances
 from px4fuse.loop.sources import LoopSource, read_source, split_part
 from px4fuse.readers.closures import parse_closure, read_closures
 from px4fuse.request import GivenClosure
@@ -29,14 +30,6 @@ from px4fuse.trajectory.scores import Statistics
 
 SAMPLE = REPOSITORY / "sample_logs" / "loop_vio.ulg"
 SLAM = REPOSITORY / "sample_logs" / "loop_slam.tum"
-# Findings that this file makes, see test_findings
-NAMED_HERE = {
-    "false_loop_closure",
-    "loop_closure_doubtful",
-    "loop_drift_understated",
-    "loop_end_assumed",
-    "loop_of_absolute_track",
-}
 RATE_HZ = 10.0
 SPEED_M_S = 1.0
 SIDE_M = 10.0
@@ -52,14 +45,14 @@ def sample_loop(sample: LoopSource) -> Loop:
     return analyse(sample, reference=read_source(str(SLAM)).trajectory)
 
 
-def score(correction: Correction | Unavailable, index: int = 0) -> Evaluation:
-    assert isinstance(correction, Correction)
+def score(correction: CorrectedPath | Unavailable, index: int = 0) -> Evaluation:
+    assert isinstance(correction, CorrectedPath)
     found = list(correction.scores.values())[index]
     assert isinstance(found, Evaluation)
     return found
 
 
-def rmse(correction: Correction | Unavailable, index: int = 0) -> float:
+def rmse(correction: CorrectedPath | Unavailable, index: int = 0) -> float:
     return score(correction, index).ate.translation_m.rmse
 
 
@@ -98,30 +91,33 @@ def test_the_samples_closure_error_is_the_true_one(sample_loop: Loop) -> None:
     assert sample_loop.closure_error_m == pytest.approx(true_closure_error_m(), abs=0.02)
     assert sample_loop.closure_error_m == pytest.approx(1.42, abs=0.05)  # sample_logs/README.md
     assert sample_loop.path_length_m == pytest.approx(87.7, abs=1.5)
-    assert sample_loop.misclosure_heading_deg == pytest.approx(5.09, abs=0.3)
-    assert sample_loop.segment.reason == "from take-off to landing, by the land detector"
+    assert sample_loop.heading_error_deg == pytest.approx(5.09, abs=0.3)
+    assert sample_loop.part_reason == "from take-off to landing, by the land detector"
 
 
 @pytest.mark.parametrize("reference", [0, 1], ids=["truth", "SLAM"])
 def test_both_corrections_bring_the_sample_closer(sample_loop: Loop, reference: int) -> None:
     before = rmse(sample_loop.odometry, reference)
-    assert rmse(sample_loop.by_distance, reference) < 0.8 * before
-    assert rmse(sample_loop.solved["gated"], reference) < 0.8 * before
+    assert rmse(sample_loop.corrections["by_distance"], reference) < 0.8 * before
+    assert rmse(sample_loop.corrections["pose_graph_gated"], reference) < 0.8 * before
 
 
 def test_example_2_through_the_loop_is_the_lessons_digit_for_digit() -> None:
     corners = np.column_stack([np.array(ODOMETRY_M), np.zeros(len(ODOMETRY_M))])
     path = Trajectory("corners", "vio", np.arange(5.0), corners, None, "FRD")
     found = close_loop(path)
-    assert isinstance(found.plain, Correction)
-    error, total = found.misclosure_m, found.path_length_m
-    assert isinstance(error, np.ndarray)
+    assert isinstance(found.corrections["by_distance_plain"], CorrectedPath)
+    error, total = list((found.closure_error_axes_m or {}).values()), found.path_length_m
     lines = [
         f"loop closure error ({error[0]:.1f}, {error[1]:.1f}) m over {total:.1f} m = "
         f"{found.closure_error_m / total:.1%}",
         *(
             f"({x:5.1f}, {y:5.1f}) -> ({a:5.2f}, {b:5.2f})"
-            for (x, y), (a, b, _) in zip(ODOMETRY_M, found.plain.trajectory.position_m, strict=True)
+            for (x, y), (a, b, _) in zip(
+                ODOMETRY_M,
+                found.corrections["by_distance_plain"].trajectory.position_m,
+                strict=True,
+            )
         ),
     ]
     assert lines == EXAMPLE_2.splitlines()
@@ -130,11 +126,13 @@ def test_example_2_through_the_loop_is_the_lessons_digit_for_digit() -> None:
 def test_the_plain_correction_moves_each_pose_by_its_share_and_turns_none(
     sample_loop: Loop,
 ) -> None:
-    plain, path = sample_loop.plain, sample_loop.odometry.trajectory
-    assert isinstance(plain, Correction)
+    plain, path = sample_loop.corrections["by_distance_plain"], sample_loop.odometry.trajectory
+    assert isinstance(plain, CorrectedPath)
     share = sample_loop.distance_m / sample_loop.distance_m[-1]
     moved = path.position_m - plain.trajectory.position_m
-    np.testing.assert_allclose(moved, np.outer(share, sample_loop.misclosure_m), atol=1e-12)
+    np.testing.assert_allclose(
+        moved, np.outer(share, list((sample_loop.closure_error_axes_m or {}).values())), atol=1e-12
+    )
     assert plain.trajectory.rotation is path.rotation
 
 
@@ -142,7 +140,11 @@ def test_headings_too_keep_the_shape_that_positions_alone_bend(sample_loop: Loop
     """The sample's heading drifts: over 10 m only the one that turns is as good as the odometry."""
     over = [
         next(e.translation_m for e in score(part).rpe if e.delta_words == "10 m")
-        for part in (sample_loop.odometry, sample_loop.by_distance, sample_loop.plain)
+        for part in (
+            sample_loop.odometry,
+            sample_loop.corrections["by_distance"],
+            sample_loop.corrections["by_distance_plain"],
+        )
     ]
     before, turned, plain = (e.rmse for e in over if isinstance(e, Statistics))
     assert turned < 1.05 * before
@@ -154,47 +156,47 @@ def test_without_a_known_heading_there_is_one_correction_by_distance(
 ) -> None:
     assert [part.name for part in sample_loop.reported[1:3]] == [PLAIN, BY_DISTANCE]
     found = analyse(sample, landed_at=(0.0, 0.0, None))
-    assert isinstance(found.misclosure_heading_deg, Unavailable)
+    assert isinstance(found.heading_error_deg, Unavailable)
     names = [part.name for part in found.reported]
     assert PLAIN in names
     assert BY_DISTANCE not in names
-    assert isinstance(found.plain, Correction)
-    assert isinstance(found.by_distance, Correction)
+    assert isinstance(found.corrections["by_distance_plain"], CorrectedPath)
+    assert isinstance(found.corrections["by_distance"], CorrectedPath)
     np.testing.assert_allclose(
-        found.plain.trajectory.position_m, found.by_distance.trajectory.position_m, atol=1e-9
+        found.corrections["by_distance_plain"].trajectory.position_m,
+        found.corrections["by_distance"].trajectory.position_m,
+        atol=1e-9,
     )
 
 
 def test_a_corrected_path_ends_where_the_vehicle_did(sample_loop: Loop) -> None:
     assert not isinstance(sample_loop.known_end, Unavailable)
-    end = np.array(sample_loop.known_end.displacement_m)
+    end = np.array(sample_loop.known_end.displacement)
     for part, within in (
-        (sample_loop.plain, 1e-9),
-        (sample_loop.by_distance, 1e-9),
-        (sample_loop.solved["gated"], 0.02),
+        (sample_loop.corrections["by_distance_plain"], 1e-9),
+        (sample_loop.corrections["by_distance"], 1e-9),
+        (sample_loop.corrections["pose_graph_gated"], 0.02),
     ):
-        assert isinstance(part, Correction)
+        assert isinstance(part, CorrectedPath)
         moved = part.trajectory.position_m[-1] - part.trajectory.position_m[0]
         assert np.linalg.norm(moved - end) < within
 
 
 def test_a_single_loop_says_that_it_has_no_redundancy(sample_loop: Loop) -> None:
     for name in ("dcs", "gnc"):
-        robust = sample_loop.solved[name]
+        robust = sample_loop.corrections[f"pose_graph_{name}"]
         assert isinstance(robust, Unavailable)
         assert robust.reason == SINGLE_LOOP
 
 
 def test_a_tape_gives_what_the_truth_gives(sample: LoopSource, sample_loop: Loop) -> None:
     assert not isinstance(sample_loop.known_end, Unavailable)
-    forward, right, _ = sample_loop.known_end.displacement_m  # its nose points along x
+    forward, right, _ = sample_loop.known_end.displacement  # its nose points along x
     heading = sample_loop.known_end.heading_change_deg
     taped = analyse(sample, landed_at=(forward, right, heading))
     # a tape does not see the height, which the truth has 0.16 m lower
     assert taped.closure_error_m == pytest.approx(sample_loop.closure_error_m, abs=0.03)
-    assert taped.misclosure_heading_deg == pytest.approx(
-        sample_loop.misclosure_heading_deg, abs=1e-6
-    )
+    assert taped.heading_error_deg == pytest.approx(sample_loop.heading_error_deg, abs=1e-6)
 
 
 def test_the_tlog_of_the_flight_gives_the_same_loop(shared_logs: Path) -> None:
@@ -260,9 +262,11 @@ def laps(count: int, seed: int, noise: OdometryNoise) -> tuple[Trajectory, Traje
 
 LAP_S = 4 * SIDE_M / SPEED_M_S
 # on the second and third laps the vehicle passes where it was on the first
-TRUE = tuple(Closure(t, t + lap * LAP_S, 0.05) for lap in (1, 2) for t in (5.0, 14.0, 23.0, 32.0))
+TRUE = tuple(
+    GivenClosure(t, t + lap * LAP_S, 0.05) for lap in (1, 2) for t in (5.0, 14.0, 23.0, 32.0)
+)
 # opposite sides of the square
-FALSE = Closure(12.0, 2 * LAP_S + 35.0, 0.05)
+FALSE = GivenClosure(12.0, 2 * LAP_S + 35.0, 0.05)
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -271,20 +275,22 @@ def test_one_false_closure_among_true_ones(seed: int) -> None:
     truth, odometry = laps(3, seed, noise)
     clean = close_loop(odometry, closures=TRUE, noise=noise, references=(truth,))
     fooled = close_loop(odometry, closures=(*TRUE, FALSE), noise=noise, references=(truth,))
-    assert all(judged.gate.accepted for judged in clean.closures)
+    assert all(judged.accepted for judged in clean.closures)
     *true, false = fooled.closures
-    assert false.gate.p < 0.001
-    assert not false.gate.accepted
-    assert all(judged.gate.accepted for judged in true)
-    without = rmse(clean.solved["all"])
+    assert false.p < 0.001
+    assert not false.accepted
+    assert all(judged.accepted for judged in true)
+    without = rmse(clean.corrections["pose_graph_all"])
     assert without < 0.6 * rmse(clean.odometry)
     # trusting it warps the path; the gate and both ways of robust solving do not
-    assert rmse(fooled.solved["all"]) > 3.0 * without
+    assert rmse(fooled.corrections["pose_graph_all"]) > 3.0 * without
     for name in ("gated", "dcs", "gnc"):
-        assert rmse(fooled.solved[name]) == pytest.approx(without, rel=0.05), name
+        assert rmse(fooled.corrections[f"pose_graph_{name}"]) == pytest.approx(without, rel=0.05), (
+            name
+        )
     for name in ("dcs", "gnc"):
-        assert false.weights[name] < 0.05
-        assert min(judged.weights[name] for judged in true) > 0.5
+        assert getattr(false, f"weight_{name}") < 0.05
+        assert min(getattr(judged, f"weight_{name}") for judged in true) > 0.5
     named = [finding.id for finding in find_loop(fooled)]
     assert named[0] == "false_loop_closure"
     assert "loop_closure_doubtful" not in named
@@ -296,7 +302,7 @@ def test_the_gate_accepts_true_landings_as_often_as_stated() -> None:
     p = []
     for seed in range(60):
         _, odometry = laps(1, 100 + seed, noise)
-        p.append(close_loop(odometry, noise=noise).closures[0].gate.p)
+        p.append(close_loop(odometry, noise=noise).closures[0].p)
     assert min(p) > 0.001
     for share in (0.25, 0.5, 0.75):
         assert np.mean(np.array(p) < share) == pytest.approx(share, abs=0.2)
@@ -307,9 +313,9 @@ def test_a_landing_elsewhere_is_rejected_and_nothing_is_corrected() -> None:
     half = odometry[: len(odometry) // 2]
     found = close_loop(half)
     judged = found.closures[0]
-    assert not judged.gate.accepted
+    assert not judged.accepted
     assert judged.distance_m == pytest.approx(SIDE_M * np.sqrt(2.0), rel=0.2)
-    for part in (found.by_distance, found.solved["gated"]):
+    for part in (found.corrections["by_distance"], found.corrections["pose_graph_gated"]):
         assert isinstance(part, Unavailable)
         assert "warp" in part.reason
     finding = find_loop(found)[0]
@@ -317,7 +323,7 @@ def test_a_landing_elsewhere_is_rejected_and_nothing_is_corrected() -> None:
     assert finding.evidence["p"] < 0.001
     opened = close_loop(half, came_back=False)
     assert opened.closure_error_m is None
-    assert isinstance(opened.misclosure_m, Unavailable)
+    assert opened.closure_error_axes_m is None
     assert opened.closures == ()
     assert find_loop(opened) == ()
 
@@ -326,24 +332,24 @@ def test_the_heading_at_landing_counts_only_where_it_may_be_the_same() -> None:
     noise = OdometryNoise()
     _, odometry = laps(1, 4, noise)
     turned = close_loop(odometry, noise=noise)  # it ends facing west
-    assert isinstance(turned.misclosure_heading_deg, Unavailable)
-    assert turned.closures[0].gate.degrees_of_freedom == 3
+    assert isinstance(turned.heading_error_deg, Unavailable)
+    assert turned.closures[0].degrees_of_freedom == 3
     assert odometry.rotation is not None
     quaternions = odometry.rotation.as_quat()
     quaternions[-1] = odometry.rotation[0].as_quat()
     same = replace(odometry, rotation=Rotation.from_quat(quaternions))
     found = close_loop(same, noise=noise)
-    assert found.misclosure_heading_deg == pytest.approx(0.0, abs=1e-9)
-    assert found.closures[0].gate.degrees_of_freedom == 4
+    assert found.heading_error_deg == pytest.approx(0.0, abs=1e-9)
+    assert found.closures[0].degrees_of_freedom == 4
 
 
 def test_a_doubtful_closure_is_named() -> None:
     """Off by less than the drift could explain, but the others know better."""
     noise = OdometryNoise()
     _, odometry = laps(3, 5, noise)
-    wrong = Closure(20.0, 21.5 + LAP_S, 0.05)  # 1.5 m further along the side
+    wrong = GivenClosure(20.0, 21.5 + LAP_S, 0.05)  # 1.5 m further along the side
     found = close_loop(odometry, closures=(*TRUE, wrong), noise=noise)
-    assert found.closures[-1].gate.accepted
+    assert found.closures[-1].accepted
     doubtful = [f for f in find_loop(found) if f.id == "loop_closure_doubtful"]
     assert len(doubtful) == 1
     assert doubtful[0].evidence["time_1_s"] == 20.0
@@ -392,8 +398,8 @@ def test_reported_variances_count_where_they_grow() -> None:
 
 
 def test_poses_between_key_frames_move_with_them(sample_loop: Loop) -> None:
-    solved = sample_loop.solved["gated"]
-    assert isinstance(solved, Correction)
+    solved = sample_loop.corrections["pose_graph_gated"]
+    assert isinstance(solved, CorrectedPath)
     assert solved.solution is not None
     at_nodes = solved.trajectory.position_m[sample_loop.nodes]
     np.testing.assert_allclose(at_nodes, solved.solution.poses[:, :3], atol=1e-9)
@@ -411,7 +417,7 @@ def test_times_of_a_file_in_unix_time_may_count_from_its_first_pose() -> None:
     relative = analyse(source, closures=(GivenClosure(3.0, 80.0, 0.3),))
     start = float(source.trajectory.time_s[0])
     stamped = analyse(source, closures=(GivenClosure(start + 3.0, start + 80.0, 0.3),))
-    assert relative.closures[1].gate == stamped.closures[1].gate
+    assert relative.closures[1] == stamped.closures[1]
 
 
 def test_the_slam_file_is_levelled_and_closes_better_than_the_odometry() -> None:
@@ -493,8 +499,8 @@ def test_a_part_of_a_log_is_named_after_a_colon(tmp_path: Path) -> None:
 
 def test_slerp_is_what_the_turn_between_nodes_is(sample_loop: Loop) -> None:
     """Orientation corrections between nodes are on the geodesic of their neighbours'."""
-    solved = sample_loop.solved["gated"]
-    assert isinstance(solved, Correction)
+    solved = sample_loop.corrections["pose_graph_gated"]
+    assert isinstance(solved, CorrectedPath)
     after, before = solved.trajectory, sample_loop.odometry.trajectory
     assert after.rotation is not None
     assert before.rotation is not None

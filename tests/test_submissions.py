@@ -18,7 +18,7 @@ from px4fuse.errors import SettingsError
 from px4fuse.grading import submissions
 from px4fuse.grading.model import Submission
 from px4fuse.grading.platforms import ExportOrigin, origin_of, origins_of
-from px4fuse.grading.submissions import collect, gradescope_people, read
+from px4fuse.grading.submissions import collect, read
 from px4fuse.verification.intake import MAX_BYTES
 from px4fuse.verification.model import Refused
 
@@ -147,8 +147,7 @@ def test_a_name_that_a_student_chose_does_not_change_platform_or_time():
         "Lab_eve_attempt_2026-11-23-10-00-00_x_attempt_2026-11-19-10-00-00_r.pdf",
         "Lab_mal_attempt_2026-11-23-10-00-00_Doe Jane_4711_assignsubmission_file_r.pdf",
     ]
-    found = [Submission(Path("export.zip"), name, name) for name in (*usual, *forged)]
-    origins = origins_of(found, {})
+    origins = origins_of([(Path("export.zip"), name) for name in (*usual, *forged)], {})
     assert {one.platform for one in origins} == {"blackboard"}
     assert [one.login for one in origins[3:]] == ["eve", "mal"]
     assert {one.time.day for one in origins[3:]} == {23}
@@ -166,19 +165,20 @@ def test_gradescope_says_who_and_when_beside_its_submissions(tmp_path):
     path = write(tmp_path / "export.zip", content)
     write(tmp_path / "unpacked" / "submission_metadata.yml", METADATA.encode())
     write(tmp_path / "unpacked" / "submission_31" / "submission_metadata.yml", forged.encode())
+    write(tmp_path / "unpacked" / "submission_31" / "report.pdf", PDF)
     for place in (path, tmp_path / "unpacked"):
-        people, notes = gradescope_people([place])
-        (one,) = people.values()
-        assert notes == ()
+        (found,), notes = collect([place])
+        one = found.origin
+        assert notes == ("Passed over, since they are not PDFs: 1 .yml.",)
         assert (one.name, one.student_id, one.email) == ("Doe, Jane", "0042", "jane@example.edu")
         assert one.time.isoformat() == "2026-11-20T22:59:01.123456+00:00"
 
 
 def test_metadata_that_cannot_be_read_is_said(tmp_path):
-    bomb = zipped({"submission_metadata.yml": b" " * 5_000_000})
-    people, (note,) = gradescope_people([write(tmp_path / "export.zip", bomb)])
-    assert people == {}
-    assert note.startswith("export.zip: who handed in is not known: it shrinks more than 100 times")
+    bomb = zipped({"submission_metadata.yml": b" " * 5_000_000, "submission_3.pdf": PDF})
+    (found,), (note,) = collect([write(tmp_path / "export.zip", bomb)])
+    assert (found.origin.number, found.origin.name) == ("3", "")
+    assert note.startswith("submission_metadata.yml: passed over: it shrinks more than 100 times")
 
 
 def test_times_of_entries_are_kept(tmp_path):
@@ -359,7 +359,7 @@ def test_too_many_zip_files_in_a_zip(tmp_path, monkeypatch):
     path = write(tmp_path / "x.zip", zipped({"a.zip": inner, "b.zip": inner}))
     found, notes = collect([path])
     assert [each.name for each in found] == ["a.zip/r.pdf"]
-    assert notes == ("x.zip: it holds too many zip files; the rest of it was passed over.",)
+    assert notes == ("x.zip: passed over: it holds too many zip files.",)
 
 
 def test_too_many_entries(tmp_path, monkeypatch):

@@ -77,7 +77,7 @@ def report_of(pdf: bytes) -> Report:
     """A report, read without care: tests of reading are elsewhere."""
     results = read_results(PdfReader(io.BytesIO(pdf)).attachments["results.json"][0])
     assert isinstance(results, ComparisonResults | LoopResults)
-    return Report(hashlib.sha256(pdf).hexdigest(), seal_of(pdf), results, (), pdf)
+    return Report(hashlib.sha256(pdf).hexdigest(), seal_of(pdf), results, pdf)
 
 
 @pytest.fixture(autouse=True, scope="module")

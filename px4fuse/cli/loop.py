@@ -173,7 +173,7 @@ def _files(found: Loop, tum: Path | None, g2o: Path | None) -> dict[Path, bytes]
             raise MissingDataError(
                 f"--tum {shown(tum)}: there is no corrected path: no closure could be used."
             )
-        contents[tum] = tum_text(in_frame(best.trajectory, found.frame)).encode()
+        contents[tum] = tum_text(in_frame(best.trajectory, found.given_frame)).encode()
     if g2o is not None:
         contents[g2o] = g2o_text(found.solved_graph()).encode()
     return contents

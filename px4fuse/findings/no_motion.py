@@ -7,10 +7,10 @@ import numpy as np
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import Comparison
 from px4fuse.filter.signals import within
-from px4fuse.findings.model import Detector, Finding, Found, Threshold
+from px4fuse.findings.model import Found, warning
 from px4fuse.flight import POSITION_COLUMNS
 
-MOTION_RANGE = Threshold(0.5, "m", "5 to 95 % range; a hovering drone with 0.1 m UWB stays below")
+MOTION_RANGE_M = 0.5  # 5 to 95 %; a hovering drone with 0.1 m UWB stays below
 
 
 def motion_range_m(comparison: Comparison) -> float:
@@ -20,21 +20,14 @@ def motion_range_m(comparison: Comparison) -> float:
     return float(np.max(high - low))
 
 
-def _detect(analysis: Analysis) -> Found:
+def detect(analysis: Analysis) -> Found:
+    """A smaller range than noise makes."""
     extent = motion_range_m(analysis)
-    if extent < MOTION_RANGE.value:
-        yield Finding(
+    if extent < MOTION_RANGE_M:
+        yield warning(
             "no_motion",
-            "warning",
-            f"The vehicle moved only {extent:.2f} m horizontally (5 to 95 %): velocity, heading "
-            "and clock offset cannot be judged from this flight.",
+            f"The vehicle moved only {extent:.2f} m horizontally",
+            " (5 to 95 %): velocity, heading and clock offset cannot be judged from this flight.",
             "Fly several passes of 5 m or more, with clear starts and stops.",
             {"range_m": extent},
         )
-
-
-DETECTOR = Detector(
-    _detect,
-    {"no_motion": ("--mistake no-motion",)},
-    names={"no_motion": "a vehicle that hardly moved"},
-)

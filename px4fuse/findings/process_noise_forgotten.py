@@ -5,60 +5,40 @@ A slow filter is no mistake where nothing happens: its innovations must say that
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.remedy import filter_words
-from px4fuse.findings.model import Detector, Finding, Found, Threshold
-from px4fuse.findings.variance import LAG1_SLOW, tuned_for
+from px4fuse.findings.model import Found, error
+from px4fuse.findings.sigma import LAG1_SLOW, try_out, tuned_for
 from px4fuse.flight import Unavailable, sample_rate
 
-RESPONSE_TIME = Threshold(2.5, "s", "five times the lesson's; a vehicle turns around in less")
+RESPONSE_TIME_S = 2.5  # five times the lesson's; a vehicle turns around in less
 
 
-def _detect(analysis: Analysis) -> Found:
-    comparison = analysis
-    for result in comparison.axes.values():
+def detect(analysis: Analysis) -> Found:
+    """The first axis on which the filter lags, needing too long to follow."""
+    for name, result in analysis.axes.items():
         updates, statement = result.replay.updates, result.filters["kf"]
         if isinstance(statement, Unavailable) or statement.verdict != "variance understated":
             continue
-        if statement.lag1_autocorrelation < LAG1_SLOW.value:
+        if statement.lag1_autocorrelation < LAG1_SLOW:
             continue
         gain = float(updates["gain_position"].iloc[len(updates) // 2 :].median())
         response_s = 1.0 / (sample_rate(updates) * gain)
-        if response_s < RESPONSE_TIME.value:
+        if response_s < RESPONSE_TIME_S:
             continue
         after = result.replay.steps["position_variance_m2"].reindex(updates.index).to_numpy()
         before = updates["prior_position_variance_m2"].to_numpy()
         growth = float(np.median((before[1:] / after[:-1] - 1.0)[len(after) // 2 :]))
-        tuned = tuned_for(analysis, result.axis.name)
+        tuned = tuned_for(analysis, name)
         needed = None if tuned is None else tuned.filter_sigma_a.value
-        remedy = "Raise SIGMA_A."
-        if needed is not None:
-            asked = float(f"{needed:.3g}")
-            changed = replace(comparison.settings, sigma_a_m_s2=asked)
-            remedy += f" {filter_words(comparison, changed, f'--sigma-a {asked:g}')}"
-        yield Finding(
+        more = "" if needed is None else f" {try_out(analysis, {'--sigma-a': needed})}"
+        yield error(
             "process_noise_forgotten",
-            "error",
-            f"With SIGMA_A {comparison.settings.sigma_a_m_s2:g} m/s² Q is forgotten: σ_p hardly "
-            f"grows between updates ({growth:.1%} in variance), the gain is {gain:.3f}, and the "
-            f"filter needs {response_s:.0f} s to follow (along {result.axis.name}).",
-            remedy,
-            {
-                "relative_growth": growth,
-                "gain": gain,
-                "response_s": response_s,
-                "axis": result.axis.name,
-            },
+            f"With SIGMA_A {analysis.settings.sigma_a_m_s2:g} m/s² Q is forgotten",
+            f": σ_p hardly grows between updates ({growth:.1%} in variance), the gain is "
+            f"{gain:.3f}, and the filter needs {response_s:.0f} s to follow (along {name}).",
+            f"Raise SIGMA_A.{more}",
+            {"relative_growth": growth, "gain": gain, "response_s": response_s, "axis": name},
         )
         return
-
-
-DETECTOR = Detector(
-    _detect,
-    {"process_noise_forgotten": ("sigma_a_m_s2=0.001",)},
-    names={"process_noise_forgotten": "process noise that is nearly zero"},
-)

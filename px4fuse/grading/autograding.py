@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import base64
-import hashlib
 import json
 import platform
 import re
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from importlib import metadata
 from importlib.resources import files
@@ -18,13 +17,12 @@ from pathlib import Path
 
 from px4fuse.assignment.key import key_text, read_key
 from px4fuse.errors import SettingsError
-from px4fuse.grading.entries import Term, class_entries
+from px4fuse.grading.entries import Course, class_entries
 from px4fuse.grading.feedback import returned_text
 from px4fuse.grading.grade import grade_all
 from px4fuse.grading.gradescope import results, submission_metadata
 from px4fuse.grading.lateness import LateRule
 from px4fuse.grading.model import Entry
-from px4fuse.grading.platforms import ExportOrigin
 from px4fuse.grading.roster import Register, people_of_key
 from px4fuse.grading.rubric import read_rubric, rubric_text
 from px4fuse.grading.submissions import collect
@@ -42,11 +40,12 @@ python3 -m venv /opt/uv
 /opt/uv/bin/pip install uv
 /opt/uv/bin/uv venv --python {python} /opt/px4fuse
 /opt/uv/bin/uv pip install --python /opt/px4fuse/bin/python \\
-    --constraint /autograder/source/constraints.txt "/autograder/source/{wheel}[grade]"
+    --requirement /autograder/source/requirements.txt
 """
 RUN = """#!/usr/bin/env bash
 # Run for every submission: its PDF is read within bounds, and nothing in it is executed.
-exec /opt/px4fuse/bin/px4fuse grade --gradescope /autograder{options}
+export PYTHONPATH=/autograder/source
+exec /opt/px4fuse/bin/python -P -m px4fuse grade --gradescope /autograder{options}
 """
 EXECUTABLE = ("setup.sh", "run_autograder")
 
@@ -72,13 +71,15 @@ def autograder_zip(
     read_rubric(rubric)
     text = rubric_text() if rubric is None else rubric.read_text(encoding="utf-8-sig")
     python = ".".join(platform.python_version_tuple()[:2])
-    name, wheel = _wheel()
     options = f' --late "{late.text}"' if late else ""
+    about = metadata.distribution("px4fuse")
+    described = about.read_text("METADATA") or about.read_text("PKG-INFO") or ""
     contents = {
-        "setup.sh": SETUP.format(wheel=name, python=python).encode(),
+        "setup.sh": SETUP.format(python=python).encode(),
         "run_autograder": RUN.format(options=options).encode(),
-        name: wheel,
-        "constraints.txt": _constraints().encode(),
+        "requirements.txt": "".join(f"{one}\n" for one in sorted(set(_requirements()))).encode(),
+        f"px4fuse-{about.version}.dist-info/METADATA": described.encode(),
+        **dict(_package("px4fuse", files("px4fuse"))),
         "rubric.toml": text.encode(),
         **({} if key is None else {"key.json": key_text(read_key(key)).encode()}),
     }
@@ -87,55 +88,22 @@ def autograder_zip(
     return zipped(contents, EXECUTABLE)
 
 
-def _constraints() -> str:
+def _requirements() -> Iterator[str]:
     """The versions of what px4fuse needs, as they are here: the last digits depend on them."""
-    lines = set()
     for text in metadata.requires("px4fuse") or ():
         name = re.match(r"[\w.-]+", text)
-        if name is None or "extra == 'test'" in text:
-            continue
-        try:
-            lines.add(f"{name[0]}=={metadata.version(name[0])}")
-        except metadata.PackageNotFoundError:  # an extra that is not installed here
-            continue
-    return "\n".join(sorted(lines)) + "\n"
+        if name is not None and "extra == 'test'" not in text:
+            with suppress(metadata.PackageNotFoundError):  # an extra that is not installed here
+                yield f"{name[0]}=={metadata.version(name[0])}"
 
 
-def _wheel() -> tuple[str, bytes]:
-    """px4fuse as it is installed here, as a wheel (PEP 427)."""
-    version = metadata.version("px4fuse")
-    info = f"px4fuse-{version}.dist-info"
-    contents = dict(_package("px4fuse", files("px4fuse")))
-    about = metadata.distribution("px4fuse").read_text("METADATA") or (
-        metadata.distribution("px4fuse").read_text("PKG-INFO") or ""
-    )
-    contents |= {
-        f"{info}/METADATA": about.encode(),
-        f"{info}/WHEEL": b"Wheel-Version: 1.0\nGenerator: px4fuse\nRoot-Is-Purelib: true\n"
-        b"Tag: py3-none-any\n",
-        f"{info}/entry_points.txt": b"[console_scripts]\npx4fuse = px4fuse.cli:main\n",
-    }
-    lines = [
-        f"{name},sha256={_digest(content)},{len(content)}" for name, content in contents.items()
-    ]
-    record = "\n".join([*lines, f"{info}/RECORD,,"]) + "\n"
-    return f"px4fuse-{version}-py3-none-any.whl", zipped(
-        contents | {f"{info}/RECORD": record.encode()}
-    )
-
-
-def _digest(content: bytes) -> str:
-    return base64.urlsafe_b64encode(hashlib.sha256(content).digest()).rstrip(b"=").decode()
-
-
-def _package(name: str, folder: Traversable) -> list[tuple[str, bytes]]:
-    found = []
+def _package(name: str, folder: Traversable) -> Iterator[tuple[str, bytes]]:
+    """The files of a package, without what Python compiled."""
     for one in sorted(folder.iterdir(), key=lambda each: each.name):
         if one.is_dir() and one.name != "__pycache__":
-            found += _package(f"{name}/{one.name}", one)
-        elif one.is_file() and not one.name.endswith(".pyc"):
-            found.append((f"{name}/{one.name}", one.read_bytes()))
-    return found
+            yield from _package(f"{name}/{one.name}", one)
+        elif one.is_file():
+            yield f"{name}/{one.name}", one.read_bytes()
 
 
 def run_autograder(folder: Path, late: LateRule | None) -> None:
@@ -156,33 +124,27 @@ def run_autograder(folder: Path, late: LateRule | None) -> None:
     rubric = read_rubric(source / "rubric.toml")
     key_path = source / "key.json"
     key = read_key(key_path) if key_path.exists() else None
-    name, email, created, due = submission_metadata(folder)
+    origin, due = submission_metadata(folder)
     register = Register(people_of_key(key)) if key else None
-    origin = (
-        ExportOrigin("gradescope", name=name, email=email, time=created) if name else ExportOrigin()
-    )
     try:
         found, _ = collect([folder / "submission"])
     except SettingsError as error:  # an empty folder, or other files than PDFs
-        entry = Entry(name, "", None, email=email, of=sum(item.points for item in rubric.items))
+        of = sum(item.points for item in rubric.items)
+        entry = Entry(origin.name, "", None, email=origin.email, of=of)
         text = str(error)
     else:
+        found = tuple(replace(one, origin=origin) for one in found)
         with tempfile.TemporaryDirectory(prefix="px4fuse-") as records:
-            origins = [origin] * len(found)
-            graded, _ = grade_all(
-                found, origins, [source / "logs"], rubric, Path(records), key, register, 1
-            )
-        term = Term("latest", due, late)
-        entries, _ = class_entries(graded, found, origins, register, term, {})
+            graded, _ = grade_all(found, [source / "logs"], rubric, Path(records), key, register, 1)
+        entries, _ = class_entries(graded, found, register, Course(due=due, late=late), {}, {})
         entry = max(
             (one for one in entries if one.counting),
             key=lambda one: -1.0 if one.total is None else one.total,
         )
         text = returned_text(entry)
         if register and register.by_platform(origin) is None:
-            unknown = (
-                f"The answer key has nobody of the name {name or '(none)'}: compare the report's."
-            )
+            name = origin.name or "(none)"
+            unknown = f"The answer key has nobody of the name {name}: compare the report's."
             entry = replace(entry, remarks=(unknown, *entry.remarks))
     made = results(entry, text, time.perf_counter() - start)
     content = json.dumps(made, ensure_ascii=False, indent=2)

@@ -9,13 +9,15 @@ to build the container, ``run_autograder`` for every submission; the zip file's 
 
 from __future__ import annotations
 
-import json
 from datetime import datetime
 from pathlib import Path
 from typing import Any
 
+import msgspec
+
 from px4fuse.errors import SettingsError
 from px4fuse.grading.model import Entry
+from px4fuse.grading.platforms import NOBODY, ExportOrigin
 from px4fuse.reading import read_text
 from px4fuse.results.reading import cleaned, one_line
 
@@ -34,30 +36,27 @@ def results(entry: Entry, text: str, seconds: float | None = None) -> dict[str, 
         That grading took.
     """
     graded = entry.counting
-    tests: list[dict[str, Any]] = []
-
-    def add(name: str, score: float, of: float, output: str, **more: object) -> None:
-        texts = {"name": name, "name_format": "text", "output": output, "output_format": "text"}
-        numbers = {"number": str(len(tests) + 1), "score": score, "max_score": of}
-        tests.append({**texts, **numbers, **more})
-
-    for item in graded.items if graded else ():
-        add(
+    tests = [
+        _test(
+            number,
             one_line(item.title, 200),
-            item.points,
-            item.of,
             item.comment,
+            VISIBLE,
+            score=item.points,
+            max_score=item.of,
             status="passed" if item.points >= item.of else "failed",
             tags=["px4fuse", graded.status if graded else "missing"],
-            visibility=VISIBLE,
         )
-    said = (*entry.remarks, *(graded.flags if graded else ()))
-    if graded and graded.pending:
-        said = (f"Pending: {graded.pending}", *said)
-    if said:
-        text_for = "\n".join(map(cleaned, said))
+        for number, item in enumerate(graded.items if graded else (), start=1)
+    ]
+    said = [f"Pending: {graded.pending}"] if graded and graded.pending else []
+    if said := [*said, *entry.flags]:
+        output = "\n".join(map(cleaned, said))
         tags = ["px4fuse", "instructor"]
-        add("For the instructor", 0.0, 0.0, text_for, tags=tags, visibility="hidden")
+        last = len(tests) + 1
+        tests.append(
+            _test(last, "For the instructor", output, "hidden", score=0.0, max_score=0.0, tags=tags)
+        )
     made: dict[str, Any] = {
         "score": entry.total or 0.0,
         "output": text,
@@ -71,14 +70,39 @@ def results(entry: Entry, text: str, seconds: float | None = None) -> dict[str, 
     return made if seconds is None else {**made, "execution_time": round(seconds, 2)}
 
 
-def submission_metadata(folder: Path) -> tuple[str, str, datetime | None, datetime | None]:
-    """Who handed in what ``submission_metadata.json`` is about, when, and when it was due.
+def _test(number: int, name: str, output: str, visibility: str, **more: object) -> dict[str, Any]:
+    return {
+        "name": name,
+        "name_format": "text",
+        "output": output,
+        "output_format": "text",
+        "number": str(number),
+        "visibility": visibility,
+        **more,
+    }
 
-    Returns
-    -------
-    name, email : str
-        Of the first of a group.
-    created, due : datetime or None
+
+class _User(msgspec.Struct):
+    name: str | None = None
+    email: str | None = None
+
+
+class _Assignment(msgspec.Struct):
+    due_date: datetime | None = None
+
+
+class _Metadata(msgspec.Struct):
+    """What is read of ``submission_metadata.json``."""
+
+    users: list[_User] = []
+    assignment: _Assignment | None = None
+    created_at: datetime | None = None
+
+
+def submission_metadata(folder: Path) -> tuple[ExportOrigin, datetime | None]:
+    """Who handed in what ``submission_metadata.json`` is about, and when it was due.
+
+    Of a group the first is named; without a name nobody is known.
 
     Raises
     ------
@@ -87,18 +111,13 @@ def submission_metadata(folder: Path) -> tuple[str, str, datetime | None, dateti
     """
     path = folder / "submission_metadata.json"
     if not path.exists():
-        return "", "", None, None
+        return NOBODY, None
     text = read_text(path, SettingsError, MAX_METADATA, name=path.name)
     try:
-        said = json.loads(text)
-        users = said.get("users") or [{}]
-        due = (said.get("assignment") or {}).get("due_date")
-        created = said.get("created_at")
-        return (
-            one_line(str(users[0].get("name") or ""), 200),
-            one_line(str(users[0].get("email") or ""), 200),
-            datetime.fromisoformat(created) if created else None,
-            datetime.fromisoformat(due) if due else None,
-        )
-    except (ValueError, TypeError, AttributeError, RecursionError) as error:
+        said = msgspec.json.decode(text, type=_Metadata)
+    except (msgspec.MsgspecError, RecursionError) as error:
         raise SettingsError(f"{path.name}: not what Gradescope writes.") from error
+    user = said.users[0] if said.users else _User()
+    name, email = (one_line(one or "", 200) for one in (user.name, user.email))
+    origin = ExportOrigin("gradescope", name=name, email=email, time=said.created_at)
+    return origin if name else NOBODY, getattr(said.assignment, "due_date", None)

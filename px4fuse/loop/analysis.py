@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 
@@ -11,8 +10,8 @@ from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.filter.signals import Segment
 from px4fuse.flight import Flight, Truth, Unavailable
 from px4fuse.loop.loop import Loop, close_loop
-from px4fuse.loop.odometry import Closure, OdometryNoise
-from px4fuse.loop.part import KnownEnd, chosen_part, measured_end, part_of_flight, true_end
+from px4fuse.loop.model import KnownEnd, OdometryNoise
+from px4fuse.loop.part import chosen_part, measured_end, part_of_flight, true_end
 from px4fuse.loop.sources import LoopSource
 from px4fuse.loop.tracks import odometry_of, trajectory_of
 from px4fuse.request import GivenClosure
@@ -71,13 +70,17 @@ def analyse(
 
     start = None if start_s is None else stamp(start_s)
     end = None if end_s is None else stamp(end_s)
+    truth, absolute, at_rest = None, False, False
     if flight is None:
         span = float(trajectory.time_s[0]), float(trajectory.time_s[-1])
-        whole = Segment(*span, "the whole trajectory")
-        segment, at_rest = chosen_part(whole, start, end, span), False
+        segment = chosen_part(Segment(*span, "the whole trajectory"), start, end, span)
     else:
         segment, at_rest = part_of_flight(flight, trajectory, start, end)
-    truth = None if flight is None or trajectory.kind == "truth" else truth_of(flight)
+        truth = None if trajectory.kind == "truth" else truth_of(flight)
+        # it was told its position, and no odometry
+        told = any(track.origin.is_vision for track in flight.positions)
+        no_odometry = isinstance(odometry_of(flight), Unavailable)
+        absolute = trajectory.kind in ("ekf2", "kf") and told and no_odometry
     known: KnownEnd | None = None
     notes: tuple[str, ...] = ()
     if landed_at is not None:
@@ -86,31 +89,26 @@ def analyse(
         known = measured_end(trajectory, segment, at_rest, *landed_at)
     elif truth is not None and came_back:
         found = true_end(trajectory, truth, segment, at_rest)
-        if isinstance(found, Unavailable):
-            notes = (f"the truth does not tell where it ended: {found.reason}",)
-        else:
+        if isinstance(found, KnownEnd):
             known = found
-    references = tuple(part for part in (truth, reference) if part is not None)
-    loop = close_loop(
+        else:
+            notes = (f"the truth does not tell where it ended: {found}",)
+    return close_loop(
         trajectory,
         segment,
         known_end=known,
         came_back=came_back,
-        closures=tuple(Closure(stamp(c.time_1_s), stamp(c.time_2_s), c.sigma_m) for c in closures),
+        closures=tuple(
+            GivenClosure(stamp(c.time_1_s), stamp(c.time_2_s), c.sigma_m) for c in closures
+        ),
         noise=noise,
-        references=references,
+        references=tuple(part for part in (truth, reference) if part is not None),
         spacing_m=spacing_m,
         at_rest=at_rest,
+        absolute=absolute,
+        notes=notes,
         progress=progress,
     )
-    absolute = flight is not None and trajectory.kind in ("ekf2", "kf") and _positioned(flight)
-    return replace(loop, notes=(*loop.notes, *notes), absolute=absolute)
-
-
-def _positioned(flight: Flight) -> bool:
-    """Whether the flight was told its position, and no odometry."""
-    told = any(track.origin.is_vision for track in flight.positions)
-    return told and isinstance(odometry_of(flight), Unavailable)
 
 
 def truth_of(flight: Flight) -> Trajectory | None:
@@ -128,20 +126,20 @@ def loop_in(flight: Flight, progress: Callable[[str], None] = lambda _: None) ->
 
     Unavailable where there is no odometry, or where it does not come back near its start.
     """
+    odometry = odometry_of(flight)
     try:
         trajectory = trajectory_of(flight, "vio")
-    except MissingDataError as error:
-        return Unavailable(
-            "loop closure",
-            str(error).split(": ", 1)[-1].split(". ", 1)[0],
-            "A loop is measured on visual-inertial odometry, sent as ODOMETRY.",
-        )
+    except MissingDataError as error:  # too few poses, or none
+        reason = odometry.reason if isinstance(odometry, Unavailable) else str(error).rstrip(".")
+        remedy = "A loop is measured on visual-inertial odometry, sent as ODOMETRY."
+        return Unavailable("loop closure", reason, remedy)
     segment, _ = part_of_flight(flight, trajectory, None, None)
-    inside = trajectory.position_m[
-        (trajectory.time_s >= segment.start_s) & (trajectory.time_s <= segment.end_s)
-    ]
-    extent = float(np.linalg.norm(np.ptp(inside, axis=0))) if len(inside) else 0.0
-    gap = float(np.linalg.norm(inside[-1] - inside[0])) if len(inside) else 0.0
+    time = trajectory.time_s
+    inside = trajectory.position_m[(time >= segment.start_s) & (time <= segment.end_s)]
+    extent = gap = 0.0
+    if len(inside):
+        extent = float(np.linalg.norm(np.ptp(inside, axis=0)))
+        gap = float(np.linalg.norm(inside[-1] - inside[0]))
     if 2.0 * extent < LOOP_MIN_PATH_M or gap > LOOP_MAX_GAP_SHARE * 2.0 * extent:
         return Unavailable(
             "loop closure",

@@ -2,49 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from px4fuse.arrays import Array
 from px4fuse.errors import SettingsError, TrajectoryError
 from px4fuse.filter.signals import Segment
 from px4fuse.flight import Flight, Unavailable
 from px4fuse.loop.closure import DOWN, heading_change_rad, upright
-from px4fuse.trajectory.model import MIN_POSES, Trajectory
+from px4fuse.loop.model import KnownEnd
+from px4fuse.trajectory.model import MIN_POSES, Frame, Trajectory, by_axis
 
 # Poses on the ground are averaged over this long, if they stay within this far of each other
 REST_S = 1.0
 REST_RANGE_M = 0.15
 # A vehicle that ends within this of its first heading was set down as it stood
 SAME_HEADING_DEG = 15.0
-
-
-@dataclass(frozen=True)
-class KnownEnd:
-    """Where the vehicle really ended, seen from where it began.
-
-    Attributes
-    ----------
-    displacement_m : tuple of float
-        In the frame of the trajectory.
-    heading_change_deg : float or None
-        From the first heading to the last, clockwise; None where it is not known.
-    sigma_m, sigma_heading_deg : float
-        Standard deviations.
-    source : str
-        Who says so.
-    assumed : bool
-        Whether nobody knows.
-    """
-
-    displacement_m: tuple[float, float, float]
-    heading_change_deg: float | None
-    sigma_m: float
-    sigma_heading_deg: float
-    source: str
-    assumed: bool = False
 
 
 def part_of(trajectory: Trajectory, segment: Segment, at_rest: bool = False) -> Trajectory:
@@ -68,32 +42,16 @@ def part_of(trajectory: Trajectory, segment: Segment, at_rest: bool = False) -> 
         return part
     position = part.position_m.copy()
     quaternions = None if part.rotation is None else part.rotation.as_quat()
-    for index, (low, high) in (
-        (0, (segment.start_s - REST_S, segment.start_s)),
-        (-1, (segment.end_s, segment.end_s + REST_S)),
-    ):
-        pose = _rest(trajectory, low, high)
-        if pose is None:
+    for index, low in ((0, segment.start_s - REST_S), (-1, segment.end_s)):
+        resting = trajectory[(time >= low) & (time <= low + REST_S)]
+        # not where it moves
+        if not len(resting) or np.linalg.norm(np.ptp(resting.position_m, axis=0)) > REST_RANGE_M:
             continue
-        position[index] = pose[0]
-        if quaternions is not None and pose[1] is not None:
-            quaternions[index] = pose[1].as_quat()
+        position[index] = resting.position_m.mean(axis=0)
+        if quaternions is not None and resting.rotation is not None:
+            quaternions[index] = resting.rotation.mean().as_quat()
     rotation = None if quaternions is None else Rotation.from_quat(quaternions)
     return replace(part, position_m=position, rotation=rotation)
-
-
-def _rest(
-    trajectory: Trajectory, low_s: float, high_s: float
-) -> tuple[Array, Rotation | None] | None:
-    """Mean pose over a time at rest; None where it moves, or where there is no pose."""
-    chosen = (trajectory.time_s >= low_s) & (trajectory.time_s <= high_s)
-    if not chosen.any():
-        return None
-    position = trajectory.position_m[chosen]
-    if np.linalg.norm(np.ptp(position, axis=0)) > REST_RANGE_M:
-        return None
-    rotation = None if trajectory.rotation is None else trajectory.rotation[chosen].mean()
-    return position.mean(axis=0), rotation
 
 
 def part_of_flight(
@@ -115,16 +73,13 @@ def part_of_flight(
     elif not flight.airborne:
         reason = "the whole track: the land detector never says that it flies"
     else:
-        low = max(low, flight.airborne[0][0])
-        high = min(high, flight.airborne[-1][1])
+        low, high = max(low, flight.airborne[0][0]), min(high, flight.airborne[-1][1])
         count = len(flight.airborne)
         reason = "from take-off to landing, by the land detector"
         if count > 1:
             reason = f"from the first take-off to the last of {count} landings"
-        at_rest = True
-    return chosen_part(Segment(low, high, reason), start_s, end_s, span), (
-        at_rest and start_s is None and end_s is None
-    )
+        at_rest = start_s is None and end_s is None
+    return chosen_part(Segment(low, high, reason), start_s, end_s, span), at_rest
 
 
 def chosen_part(
@@ -152,16 +107,16 @@ def chosen_part(
     return Segment(low, high, reason)
 
 
-def assumed_end(heading_change_deg: float | None) -> KnownEnd:
+def assumed_end(frame: Frame, heading_change_deg: float | None) -> KnownEnd:
     """The vehicle ends where it began; with the same heading if the odometry nearly says so."""
     same = heading_change_deg is not None and abs(heading_change_deg) <= SAME_HEADING_DEG
+    heading = "with the same heading" if same else "its heading there is not known"
     return KnownEnd(
-        (0.0, 0.0, 0.0),
-        0.0 if same else None,
-        0.10,
-        5.0,
-        "assumed: it landed where it took off"
-        + (", with the same heading" if same else "; its heading there is not known"),
+        displacement_m=by_axis(frame, np.zeros(3)),
+        heading_change_deg=0.0 if same else None,
+        sigma_m=0.10,
+        sigma_heading_deg=5.0 if same else None,
+        source=f"assumed: it landed where it took off{', ' if same else '; '}{heading}",
         assumed=True,
     )
 
@@ -188,21 +143,22 @@ def measured_end(
     if path.rotation is not None:
         nose = path.rotation[0].apply([1.0, 0.0, 0.0])
         heading = float(np.arctan2(nose[1], nose[0]))
-    north, east, _ = Rotation.from_rotvec(heading * DOWN).apply([forward_m, right_m, 0.0])
+    moved = Rotation.from_rotvec(heading * DOWN).apply([forward_m, right_m, 0.0])
     return KnownEnd(
-        (float(north), float(east), 0.0),
-        heading_change_deg,
-        0.05,
-        2.0,
-        f"measured: it landed {forward_m:g} m ahead and {right_m:g} m to the right of where it "
-        "took off (--landed-at)",
+        displacement_m=by_axis(path.frame, moved),
+        heading_change_deg=heading_change_deg,
+        sigma_m=0.05,
+        sigma_heading_deg=None if heading_change_deg is None else 2.0,
+        source=f"measured: it landed {forward_m:g} m ahead and {right_m:g} m to the right of where "
+        "it took off (--landed-at)",
+        assumed=False,
     )
 
 
 def true_end(
     trajectory: Trajectory, truth: Trajectory, segment: Segment, at_rest: bool
-) -> KnownEnd | Unavailable:
-    """Where the vehicle really ended, by the ground truth in the same log.
+) -> KnownEnd | str:
+    """Where the vehicle really ended, by the ground truth in the same log, or why not.
 
     The truth is turned into the odometry's frame by their headings at the start.
     """
@@ -210,26 +166,22 @@ def true_end(
     try:
         real = part_of(truth, segment, at_rest)
     except TrajectoryError as error:
-        return Unavailable("true end of the loop", str(error), "None needed.")
-    moved = real.position_m[-1] - real.position_m[0]
+        return str(error)
+    moved, change = real.position_m[-1] - real.position_m[0], None
+    landed_m = np.linalg.norm(moved)
     if path.rotation is not None and real.rotation is not None:
         turn = heading_change_rad(path.rotation[0] * real.rotation[0].inv())
         moved = Rotation.from_rotvec(turn * DOWN).apply(moved)
         heading = heading_change_rad(real.rotation[-1] * real.rotation[0].inv())
-        change: float | None = float(np.degrees(heading))
-    elif path.frame == real.frame:
-        change = None
-    else:
-        return Unavailable(
-            "true end of the loop",
-            "the truth has no orientation by which to turn it into the odometry's frame",
-            "None needed.",
-        )
+        change = float(np.degrees(heading))
+    elif path.frame != real.frame:
+        return "the truth has no orientation by which to turn it into the odometry's frame"
     return KnownEnd(
-        (float(moved[0]), float(moved[1]), float(moved[2])),
-        change,
-        0.02,
-        0.5,
-        f"the ground truth in the log ({truth.name}): it landed {np.linalg.norm(moved):.2f} m from "
-        "where it took off",
+        displacement_m=by_axis(path.frame, moved),
+        heading_change_deg=change,
+        sigma_m=0.02,
+        sigma_heading_deg=None if change is None else 0.5,
+        source=f"the ground truth in the log ({truth.name}): it landed {landed_m:.2f} m from where "
+        "it took off",
+        assumed=False,
     )

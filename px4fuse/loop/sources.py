@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import cast
 
 from px4fuse.errors import MissingDataError, SettingsError, TrajectoryError
 from px4fuse.flight import Flight, Unavailable
@@ -35,15 +36,14 @@ def split_part(argument: str) -> tuple[Path, Part | None]:
         What follows the colon is no part.
     """
     whole = Path(argument)
-    if whole.exists():
+    path, colon, part = argument.rpartition(":")
+    if whole.exists() or not colon:
         return whole, None
-    path, colon, tail = argument.rpartition(":")
-    for part in PARTS:
-        if colon and tail == part:
-            return Path(path), part
-    if colon and Path(path).is_file():
+    if part in PARTS:
+        return Path(path), cast(Part, part)
+    if Path(path).is_file():
         raise TrajectoryError(
-            f"{shown(Path(path))}:{tail}: {tail!r} is not a part of a flight. Choose from "
+            f"{shown(Path(path))}:{part}: {part!r} is not a part of a flight. Choose from "
             f"{', '.join(PARTS)}."
         )
     return whole, None
@@ -63,15 +63,14 @@ def head_of(path: Path) -> bytes:
 def is_text(path: Path) -> bool:
     """Whether a file is text, and so no flight log."""
     head = head_of(path)
-    if head.startswith(_UTF16):
-        return True
-    return bool(head) and not any(byte < 9 or 13 < byte < 32 for byte in head)
+    binary = any(byte < 9 or 13 < byte < 32 for byte in head)
+    return head.startswith(_UTF16) or (bool(head) and not binary)
 
 
 def is_g2o(path: Path) -> bool:
     """Whether a file is a pose graph in g2o's format."""
-    lines = (line.strip() for line in head_of(path).splitlines())
-    return is_text(path) and any(line.startswith(_G2O) for line in lines)
+    lines = head_of(path).splitlines()
+    return is_text(path) and any(line.strip().startswith(_G2O) for line in lines)
 
 
 def read_source(
@@ -123,14 +122,11 @@ def read_source(
             "which states its frame. Leave `frame` out."
         )
     flight = read_log(path, system=system)
-    chosen = part or default or _odometry_or_ekf2(flight)
+    chosen = part or default
+    if chosen is None:
+        odometry, chosen = odometry_of(flight), "vio"
+        if isinstance(odometry, Unavailable):
+            chosen = "ekf2"
+            if isinstance(flight.ekf2, Unavailable):
+                raise MissingDataError(f"{flight.log.name}: {odometry.reason}. {odometry.remedy}")
     return LoopSource(trajectory_of(flight, chosen), flight)
-
-
-def _odometry_or_ekf2(flight: Flight) -> Part:
-    odometry = odometry_of(flight)
-    if not isinstance(odometry, Unavailable):
-        return "vio"
-    if isinstance(flight.ekf2, Unavailable):
-        raise MissingDataError(f"{flight.log.name}: {odometry.reason}. {odometry.remedy}")
-    return "ekf2"

@@ -66,39 +66,21 @@ def trajectory_of(flight: Flight, part: Part) -> Trajectory:
         return _ours(flight)
     found = {"vio": odometry_of(flight), "truth": flight.truth, "ekf2": flight.ekf2}[part]
     if isinstance(found, PositionTrack):
-        return _odometry(flight, found)
-    if isinstance(found, Ekf2):
-        return _ekf2(flight, found)
+        # where the log does not say, x is taken to be forward at the start
+        frame: Frame = "NED" if found.frame == "NED" else "FRD"
+        note = f"{found.name}: {found.description}"
+        return _trajectory(flight, part, found.samples, found.orientation, (note,), frame)
     if isinstance(found, Truth):
-        samples = finite_rows(found.samples, POSITION_COLUMNS)[POSITION_COLUMNS]
-        return _trajectory(flight, part, samples, found.attitude, "NED", None, (found.name,))
-    raise MissingDataError(f"{flight.log.name}:{part}: {found.reason}. {found.remedy}")
-
-
-def _odometry(flight: Flight, track: PositionTrack) -> Trajectory:
-    # where the log does not say, x is taken to be forward at the start
-    frame: Frame = "NED" if track.frame == "NED" else "FRD"
-    samples = finite_rows(track.samples, POSITION_COLUMNS)
-    return _trajectory(
-        flight,
-        "vio",
-        samples[POSITION_COLUMNS],
-        track.orientation,
-        frame,
-        samples[POSITION_VARIANCE_COLUMNS],
-        (f"{track.name}: {track.description}",),
-    )
-
-
-def _ekf2(flight: Flight, ekf2: Ekf2) -> Trajectory:
-    state, resets = ekf2.state, ""
+        return _trajectory(flight, part, found.samples, found.attitude, (found.name,))
+    if not isinstance(found, Ekf2):
+        raise MissingDataError(f"{flight.log.name}:{part}: {found.reason}. {found.remedy}")
+    state, notes = found.state, ["EKF2's position as published"]
     source = next((t for t in flight.positions if t.origin.is_vision), None)
     if source is not None:
         whole = Segment(0.0, flight.log.duration_s, "the whole log")
-        state, resets = continuous_state(ekf2, source, whole)
-    attitude = None if isinstance(flight.attitude, Unavailable) else flight.attitude
-    notes = tuple(note for note in ("EKF2's position as published", resets) if note)
-    return _trajectory(flight, "ekf2", state[POSITION_COLUMNS], attitude, "NED", None, notes)
+        state, resets = continuous_state(found, source, whole)
+        notes += [resets] if resets else []
+    return _trajectory(flight, part, state, flight.attitude, tuple(notes))
 
 
 def _ours(flight: Flight) -> Trajectory:
@@ -108,54 +90,51 @@ def _ours(flight: Flight) -> Trajectory:
             column: result.replay.steps["position_m"]
             for column, result in zip(POSITION_COLUMNS, compared.axes.values(), strict=True)
         }
-    ).dropna()
-    attitude = None if isinstance(flight.attitude, Unavailable) else flight.attitude
+    )
     used = compared.settings
     note = (
         f"our filter over {compared.source.name}, SIGMA_A {used.sigma_a_m_s2:g} m/s², SIGMA_Z "
         f"{used.sigma_z_m:g} m"
     )
-    return _trajectory(flight, "kf", position, attitude, "NED", None, (note,))
+    return _trajectory(flight, "kf", position, flight.attitude, (note,))
 
 
 def _trajectory(
     flight: Flight,
     part: Kind,
-    position: pd.DataFrame,
-    orientation: pd.DataFrame | None,
-    frame: Frame,
-    variance: pd.DataFrame | None,
+    samples: pd.DataFrame,
+    orientation: pd.DataFrame | Unavailable | None,
     notes: tuple[str, ...],
+    frame: Frame = "NED",
 ) -> Trajectory:
     """Poses at the times of the positions, the orientation interpolated to them (slerp)."""
+    samples = finite_rows(samples, POSITION_COLUMNS)
     rotation, rotation_variance = None, None
-    if orientation is not None:
-        inside = (position.index >= orientation.index[0]) & (
-            position.index <= orientation.index[-1]
-        )
-        if inside.sum() >= MIN_POSES:
-            position = position[inside]
-            variance = None if variance is None else variance[inside]
-            times = position.index.to_numpy()
+    if isinstance(orientation, pd.DataFrame):
+        known = orientation.index.to_numpy()
+        inside = samples[(samples.index >= known[0]) & (samples.index <= known[-1])]
+        if len(inside) >= MIN_POSES:
+            samples = inside
             quaternions = orientation[QUATERNION_COLUMNS].to_numpy(copy=True)
-            known = Rotation.from_quat(quaternions, scalar_first=True)
-            rotation = Slerp(orientation.index.to_numpy(), known)(times)
-            rotation_variance = _at(orientation, times)
-    if len(position) < MIN_POSES:
+            turns = Rotation.from_quat(quaternions, scalar_first=True)
+            rotation = Slerp(known, turns)(samples.index.to_numpy())
+            reported = _whole(orientation, ROTATION_VARIANCE_COLUMNS)
+            if reported is not None:
+                columns = [np.interp(samples.index, known, column) for column in reported.T]
+                rotation_variance = np.column_stack(columns)
+    if len(samples) < MIN_POSES:
         raise MissingDataError(
-            f"{flight.log.name}:{part}: {len(position)} poses are too few (at least {MIN_POSES})."
+            f"{flight.log.name}:{part}: {len(samples)} poses are too few (at least {MIN_POSES})."
         )
-    if variance is not None and variance.isna().to_numpy().any():
-        variance = None
     return Trajectory(
         name=f"{flight.log.name}:{part}",
         kind=part,
-        time_s=position.index.to_numpy(np.float64),
-        position_m=position.to_numpy(np.float64),
+        time_s=samples.index.to_numpy(np.float64),
+        position_m=samples[POSITION_COLUMNS].to_numpy(np.float64),
         rotation=rotation,
         frame=frame,
         unix_offset_s=flight.log.start_unix_s,
-        position_variance_m2=None if variance is None else variance.to_numpy(np.float64),
+        position_variance_m2=_whole(samples, POSITION_VARIANCE_COLUMNS),
         rotation_variance_rad2=rotation_variance,
         sha256=flight.log.sha256,
         size_bytes=flight.log.bytes,
@@ -163,11 +142,8 @@ def _trajectory(
     )
 
 
-def _at(orientation: pd.DataFrame, times: Array) -> Array | None:
-    """Reported rotation variances at some times, shape (n, 3); None where there are none."""
-    if not set(ROTATION_VARIANCE_COLUMNS) <= set(orientation.columns):
+def _whole(samples: pd.DataFrame, columns: list[str]) -> Array | None:
+    """Reported variances, shape (n, 3); None where there are none, or some are missing."""
+    if not set(columns) <= set(samples.columns) or samples[columns].isna().to_numpy().any():
         return None
-    values = orientation[ROTATION_VARIANCE_COLUMNS].to_numpy()
-    if np.isnan(values).any():
-        return None
-    return np.column_stack([np.interp(times, orientation.index, column) for column in values.T])
+    return samples[columns].to_numpy(np.float64)

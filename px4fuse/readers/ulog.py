@@ -8,35 +8,26 @@ import numpy as np
 import pandas as pd
 from msgspec import structs
 
-from px4fuse.arrays import Array
 from px4fuse.flight import (
     ANGULAR_RATE_COLUMNS,
     MODES_NOT_LOGGED,
-    QUATERNION_COLUMNS,
     SPECIFIC_FORCE_COLUMNS,
     Flight,
     FlightMode,
     Truth,
     Unavailable,
 )
+from px4fuse.readers import px4_topics as px4
 from px4fuse.readers.parts import (
     ends_in_flight,
     finite_rows,
     missing_parts,
     stretches_of_flight,
     stretches_of_modes,
+    with_attitude,
 )
 from px4fuse.readers.px4_ekf2 import ekf2_topics, read_ekf2
 from px4fuse.readers.px4_positions import GPS_3D_FIX, read_positions, read_truth
-from px4fuse.readers.px4_topics import (
-    ATTITUDE,
-    FLIGHT_MODE,
-    GPS,
-    IMU,
-    LAND_DETECTED,
-    NAV_STATES,
-    UNUSED,
-)
 from px4fuse.readers.ulog_topics import (
     ACCELEROMETER_OFFSET_INVALID_US,
     AT_MEASUREMENT,
@@ -78,11 +69,11 @@ def to_flight(topics: Topics) -> Flight:
         for (topic, _), count in sorted(topics.dropped.items())
     )
     used = {
-        "imu": () if isinstance(imu, Unavailable) else (IMU[0].topic,),
-        "attitude": () if isinstance(attitude, Unavailable) else (ATTITUDE[0].topic,),
+        "imu": () if isinstance(imu, Unavailable) else (px4.IMU[0].topic,),
+        "attitude": () if isinstance(attitude, Unavailable) else (px4.ATTITUDE[0].topic,),
         **ekf2_topics(topics, ekf2),
         "truth": (truth.name,) if isinstance(truth, Truth) else (),
-        "airborne": () if isinstance(airborne, Unavailable) else (LAND_DETECTED[0].topic,),
+        "airborne": () if isinstance(airborne, Unavailable) else (px4.LAND_DETECTED[0].topic,),
     }
     return Flight(
         log=structs.replace(
@@ -102,9 +93,9 @@ def to_flight(topics: Topics) -> Flight:
         missing=(*missing_parts(imu, attitude, ekf2, truth), *missing_positions),
         streams={part: _stream(topics, part, names) for part, names in used.items() if names},
         unused=tuple(
-            Unused(name, len(topics.tables[name, number]["timestamp"]), reason)
-            for name, reason in UNUSED.items()
-            for number in topics.instances(name)[:1]
+            Unused(name, len(table["timestamp"]), reason)
+            for name, reason in px4.UNUSED.items()
+            for table in topics.of(name)[:1]
         ),
     )
 
@@ -140,7 +131,7 @@ def _stream(topics: Topics, part: str, names: tuple[str, ...]) -> Stream:
 
 def _start_unix(topics: Topics) -> float | None:
     """UNIX time (s) of time zero by the GPS receiver, the median over its fixes."""
-    gps = topics.read(GPS)
+    gps = topics.read(px4.GPS)
     if gps is None or "utc_us" not in gps:
         return None
     utc_s = gps["utc_us"] * 1e-6
@@ -151,7 +142,7 @@ def _start_unix(topics: Topics) -> float | None:
 
 
 def _read_imu(topics: Topics) -> pd.DataFrame | Unavailable:
-    imu = topics.read(IMU)
+    imu = topics.read(px4.IMU)
     if imu is None:
         return Unavailable(
             "IMU", "no topic sensor_combined", "Record with SDLOG_PROFILE bit 0 (default)."
@@ -174,14 +165,12 @@ def _read_imu(topics: Topics) -> pd.DataFrame | Unavailable:
 
 
 def _read_attitude(topics: Topics) -> pd.DataFrame | Unavailable:
-    attitude = topics.read(ATTITUDE)
+    attitude = topics.read(px4.ATTITUDE)
     if attitude is None:
         return Unavailable(
             "attitude", "no topic vehicle_attitude", "Record with SDLOG_PROFILE bit 0 (default)."
         )
-    attitude = attitude[QUATERNION_COLUMNS]
-    norm: Array = np.linalg.norm(attitude.to_numpy(), axis=1)
-    attitude = attitude[np.isfinite(norm) & (norm > 0.5)]  # a zero quaternion is no attitude
+    attitude = with_attitude(attitude)
     if len(attitude) < 2:
         return Unavailable(
             "attitude",
@@ -193,7 +182,7 @@ def _read_attitude(topics: Topics) -> pd.DataFrame | Unavailable:
 
 def _read_airborne(topics: Topics) -> tuple[tuple[float, float], ...] | Unavailable:
     """Stretches of flight by the land detector, each from take-off to touch-down."""
-    detected = topics.read(LAND_DETECTED, step=True)
+    detected = topics.read(px4.LAND_DETECTED, step=True)
     if detected is None or detected.empty:
         return Unavailable(
             "land detector",
@@ -204,9 +193,9 @@ def _read_airborne(topics: Topics) -> tuple[tuple[float, float], ...] | Unavaila
 
 
 def _read_modes(topics: Topics) -> tuple[FlightMode, ...] | Unavailable:
-    status = topics.read(FLIGHT_MODE, step=True)
+    status = topics.read(px4.FLIGHT_MODE, step=True)
     if status is None or status["nav_state"].isna().all():
         return MODES_NOT_LOGGED
     states = status["nav_state"].dropna()
-    names = states.map(lambda state: NAV_STATES.get(int(state), f"mode {state:.0f}"))
+    names = states.map(lambda state: px4.NAV_STATES.get(int(state), f"mode {state:.0f}"))
     return stretches_of_modes(names, topics.log.duration_s)

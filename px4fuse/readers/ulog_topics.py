@@ -11,8 +11,9 @@ import hashlib
 import io
 import struct
 from bisect import bisect_left
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -26,7 +27,8 @@ from pyulog.exceptions import ULogException
 from px4fuse.arrays import Array, IntArray
 from px4fuse.ekf2_parameters import REPORTED
 from px4fuse.errors import LogError
-from px4fuse.readers.px4_topics import IMU, Layout, topics
+from px4fuse.readers.layouts import Layout
+from px4fuse.readers.px4_topics import IMU, SELECTOR, topics
 from px4fuse.readers.ulog_framing import Framing, whole_messages
 from px4fuse.reading import read_log_bytes, shown
 from px4fuse.recording import Dropout, LogInfo
@@ -55,6 +57,12 @@ _PARSE_ERRORS = (
     ULogException, struct.error, IndexError, KeyError, ValueError, TypeError, AttributeError,
     OverflowError, UnicodeError, EOFError, MemoryError, AssertionError, RecursionError,
 )  # fmt: skip
+
+
+# Primary EKF2 instance from each time on
+Instances = tuple[tuple[float, int], ...]
+# One EKF2 instance alone publishes no selector
+NO_SELECTOR: Instances = ((-np.inf, 0),)
 
 
 @dataclass(frozen=True)
@@ -88,14 +96,31 @@ class Topics:
         """Instances of a topic that hold data, in order."""
         return sorted(instance for name, instance in self.tables if name == topic)
 
+    def of(self, topic: str) -> list[dict[str, NDArray[Any]]]:
+        """Tables of a topic's instances, in order."""
+        return [self.tables[topic, number] for number in self.instances(topic)]
+
+    @cached_property
+    def primary(self) -> Instances:
+        """Primary EKF2 instance from each time on (``EKF2Selector.cpp``)."""
+        status = self.read(SELECTOR, step=True)
+        selected = pd.Series(dtype=float) if status is None else status["instance"]
+        selected = selected[selected < 255]  # 255: none selected yet
+        if selected.empty:
+            return NO_SELECTOR
+        changes = selected[selected.ne(selected.shift())]
+        times = [-np.inf, *changes.index[1:]]
+        return tuple((float(at), int(number)) for at, number in zip(times, changes, strict=True))
+
     def find(self, layouts: tuple[Layout, ...]) -> Layout | None:
         """First layout that this log holds, or None."""
-        for layout in layouts:
-            for (name, _), table in self.tables.items():
-                wanted = layout.columns.values()
-                if name == layout.topic and all(column in table for column in wanted):
-                    return layout
-        return None
+        held = (
+            layout
+            for layout in layouts
+            for table in self.of(layout.topic)
+            if all(column in table for column in layout.columns.values())
+        )
+        return next(held, None)
 
     def frame(self, layout: Layout, instance: int = 0, *, step: bool = False) -> pd.DataFrame:
         """Read one layout as a frame of float64 columns, indexed by measurement time in s.
@@ -124,7 +149,10 @@ class Topics:
             self.dropped[layout.topic, instance] = len(time_us) - len(keep)
         with np.errstate(invalid="ignore"):  # damaged bytes can be signalling NaNs
             frame = pd.DataFrame(
-                {ours: _usable(table[px4][keep]) for ours, px4 in columns.items()},
+                {
+                    ours: _usable(table[px4][keep]) * layout.scale.get(ours, 1.0)
+                    for ours, px4 in columns.items()
+                },
                 index=pd.Index((time_us[keep] - self.zero_us) * _MICROSECOND, name="time_s"),
             )
         return frame if step else self.window(frame)
@@ -134,12 +162,39 @@ class Topics:
         layout = self.find(layouts)
         return None if layout is None else self.frame(layout, step=step)
 
+    def of_primary(
+        self,
+        layout: Layout,
+        *,
+        step: bool = False,
+        select: Callable[[pd.DataFrame], pd.DataFrame] | None = None,
+    ) -> pd.DataFrame:
+        """Rows of each instance of a topic of EKF2 from when that instance was the primary one.
+
+        Parameters
+        ----------
+        layout, step
+            As :meth:`frame` takes them.
+        select : callable, optional
+            Which rows of an instance count; all by default.
+        """
+        available = self.instances(layout.topic)
+        alone = self.primary == NO_SELECTOR
+        starts, numbers = (np.array(part) for part in zip(*self.primary, strict=True))
+        parts: list[pd.DataFrame] = []
+        for number in available[:1] if alone else available:
+            frame = self.frame(layout, number, step=step)
+            frame = frame if select is None else select(frame)
+            at = np.searchsorted(starts, frame.index.to_numpy(), side="right") - 1
+            parts.append(frame if alone else frame[numbers[at] == number])
+        joined = pd.concat(parts).sort_index()
+        return joined[~joined.index.duplicated()]
+
     def clock(self, topic: str) -> str:
         """Which moment the times of a topic's samples are."""
         measured = any(
             np.any(measurement_time_us(table) != table["timestamp"].astype(np.int64))
-            for (name, _), table in self.tables.items()
-            if name == topic
+            for table in self.of(topic)
         )
         return AT_MEASUREMENT if measured else AT_PUBLICATION
 
@@ -173,14 +228,6 @@ def _usable(values: NDArray[Any]) -> Array:
     usable: Array = values.astype(np.float64)
     usable[np.isinf(usable)] = np.nan
     return usable
-
-
-def states_and_covariances(table: Mapping[str, NDArray[Any]]) -> tuple[int, int]:
-    """How many of either a topic with EKF2's state vector has."""
-    states, covariances = (
-        sum(column.startswith(f"{name}[") for column in table) for name in ("states", "covariances")
-    )
-    return states, covariances
 
 
 def increasing(time_us: NDArray[np.int64]) -> IntArray:

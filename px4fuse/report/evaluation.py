@@ -177,12 +177,11 @@ def _maps(page: Page, score: Evaluation) -> None:
 
 
 def _before(axes: Axes, score: Evaluation, view: View) -> None:
-    matched = score.association
-    for track, looks, label in (
-        (matched.reference, REFERENCE, "reference"),
-        (matched.estimate, {"color": OURS, "lw": 1.2}, "estimate before alignment"),
+    for position, looks, label in (
+        (score.reference_m, REFERENCE, "reference"),
+        (score.unaligned_m, {"color": OURS, "lw": 1.2}, "estimate before alignment"),
     ):
-        way(axes, view.of(track.position_m), score.time_s, label=label, **looks)
+        way(axes, view.of(position), score.time_s, label=label, **looks)
     _framed(axes, score, view)
 
 
@@ -406,7 +405,7 @@ def reasons(score: Evaluation) -> list[str]:
 
 def before_words(score: Evaluation) -> str:
     """How far the two are apart as their numbers stand, and what the alignment took away."""
-    x, y = score.association.estimate.position_m, score.association.reference.position_m
+    x, y = score.unaligned_m, score.reference_m
     apart = float(np.sqrt(((x - y) ** 2).sum(axis=1).mean()))
     fitted = score.transform
     scaled = f", scaled {fitted.scale:.3g} times" if fitted.degrees_of_freedom == 7 else ""
@@ -531,7 +530,7 @@ def score_words(score: Evaluation) -> str:
     clock = "" if not offset else f"; clocks matched by {offset:+.3f} s"
     return (
         f"alignment {score.alignment} ({score.alignment_reason.rstrip('.')}); "
-        f"{len(matched)} poses, "
+        f"{matched.poses} poses, "
         f"{matched.coverage_estimate:.0%} of the estimate, {matched.coverage_reference:.0%} of the "
         f"reference's time{clock}"
     )

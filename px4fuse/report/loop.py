@@ -10,13 +10,13 @@ import pandas as pd
 from rich.console import Console
 
 from px4fuse.arrays import Array
-from px4fuse.filter.signals import Segment
-from px4fuse.findings import Finding
+from px4fuse.findings import Finding, by_root
 from px4fuse.flight import Unavailable
 from px4fuse.loop import corrections
 from px4fuse.loop.analysis import SMALLEST_STAMP_S
-from px4fuse.loop.corrections import SINGLE_LOOP, Correction, Judged
+from px4fuse.loop.corrections import SINGLE_LOOP
 from px4fuse.loop.loop import Loop
+from px4fuse.loop.model import LANDING, Closure, CorrectedPath
 from px4fuse.plain import capital, p_words
 from px4fuse.report import style
 from px4fuse.report.cover import write_finding
@@ -103,7 +103,7 @@ def _draw(
     yield page
 
 
-def shown(loop: Loop) -> list[Correction]:
+def shown(loop: Loop) -> list[CorrectedPath]:
     """The paths that are drawn: each kind of correction once."""
     return [part for part in loop.reported if part.name in STYLES]
 
@@ -119,8 +119,8 @@ def _map(page: Page, loop: Loop) -> None:
     start, end = path.position_m[[0, -1]][:, (1, 0)]
     axes.plot(*start, "o", color="black", ms=5, label="start", zorder=5)
     axes.plot(*end, "s", color=EKF2, mec="black", mew=0.6, ms=5, label="end by odometry", zorder=5)
-    if not isinstance(loop.misclosure_m, Unavailable):
-        true = end - loop.misclosure_m[[1, 0]]
+    if loop.closure_error_axes_m is not None:
+        true = end - np.array(list(loop.closure_error_axes_m.values()))[[1, 0]]
         arrow = {"arrowstyle": "->", "color": RED, "lw": 1.2, "shrinkA": 3, "shrinkB": 0}
         axes.annotate("", xy=true, xytext=end, zorder=6, arrowprops=arrow)
         axes.plot([], [], color=RED, lw=1.2, label=f"gap {loop.closure_error_m:.2f} m")
@@ -137,9 +137,7 @@ def _reference(axes: Axes, loop: Loop) -> None:
             score = part.scores.get(name)
             if not isinstance(score, Evaluation):
                 continue
-            transform = score.transform
-            back = transform.rotation.inv().apply(score.reference_m - transform.translation_m)
-            position = back / transform.scale
+            position = score.transform.undo(score.reference_m)
             way(axes, position[:, (1, 0)], score.time_s, label=name, **LINES["truth"], zorder=4)
             return
 
@@ -198,8 +196,8 @@ def print_loop(
     page = Page()
     write_loop(page, loop)
     write_scores(page, loop)
-    for finding in findings:
-        write_finding(page, finding)
+    for group in by_root(findings):
+        write_finding(page, group)
     show(console, page.blocks, request)
 
 
@@ -208,19 +206,19 @@ def write_loop(page: Page, loop: Loop, findings: tuple[Finding, ...] = ()) -> No
     path = loop.odometry.trajectory
     page.labelled(
         "Track",
-        f"{path.name}: {KINDS[path.kind]}, {len(path)} poses, {len(loop.nodes)} key frames "
-        f"{loop.spacing_m:.2g} m apart",
+        f"{path.name}: {KINDS[path.kind]}, {len(path)} poses, {loop.key_frames} key frames "
+        f"{loop.key_frame_spacing_m:.2g} m apart",
     )
-    page.labelled("Part", f"{_span(loop.segment)}, {loop.segment.reason}")
+    page.labelled("Part", f"{_span(loop)}, {loop.part_reason}")
     page.labelled("Closure", closure_words(loop))
     end = loop.known_end
     page.labelled("End", "not used" if isinstance(end, Unavailable) else end.source)
-    for judged in loop.closures[:1]:
-        page.labelled("Gate", gate_words(judged))
+    for closure in loop.closures[:1]:
+        page.labelled("Gate", gate_words(closure))
     for text in (by_distance_words(loop), *redundancy_words(loop), *refusals(loop)):
         page.write(text, colour=MUTED, above=2.0)
-    for finding in findings:
-        write_finding(page, finding)
+    for group in by_root(findings):
+        write_finding(page, group)
     names = [reference.name for reference in loop.references]
     page.table(
         ["path", "moved RMS\n/ max (m)", *(f"ATE to\n{name} (m)" for name in names)],
@@ -241,16 +239,15 @@ def write_loop(page: Page, loop: Loop, findings: tuple[Finding, ...] = ()) -> No
 def write_scores(page: Page, loop: Loop) -> None:
     """Write every closure with its gate and weights, RPE, and how scores were made."""
     rows: list[list[Cell]] = []
-    for judged in loop.closures:
-        gate = judged.gate
+    for closure in loop.closures:
         cells = [
-            closure_name(judged, loop), f"{judged.distance_m:.2f}", f"{gate.d2:.1f}",
-            f"{gate.degrees_of_freedom}", p_words(gate.p).removeprefix("p "),
-            "accepted" if gate.accepted else "REJECTED",
+            closure_name(closure, loop), f"{closure.distance_m:.2f}", f"{closure.d2:.1f}",
+            f"{closure.degrees_of_freedom}", p_words(closure.p).removeprefix("p "),
+            "accepted" if closure.accepted else "REJECTED",
         ]  # fmt: skip
-        weights = (judged.weights.get(name) for name in ("dcs", "gnc"))
+        weights = closure.weight_dcs, closure.weight_gnc
         cells += ["–" if weight is None else f"{weight:.2f}" for weight in weights]
-        colour = "black" if gate.accepted else style.SEVERITY_COLOURS["error"]
+        colour = "black" if closure.accepted else style.SEVERITY_COLOURS["error"]
         rows.append([(cell, colour) for cell in cells])
     if rows:
         page.table(CLOSURE_HEAD, rows, right=(1, 2, 3, 4, 6, 7))
@@ -274,7 +271,7 @@ def write_scores(page: Page, loop: Loop) -> None:
             page.numbers(capital(text))
 
 
-def _span(part: Segment) -> str:
+def _span(part: Loop) -> str:
     if part.start_s > SMALLEST_STAMP_S:
         return f"{part.end_s - part.start_s:.1f} s from stamp {part.start_s:.2f} s"
     return f"{part.start_s:.1f} s to {part.end_s:.1f} s"
@@ -282,51 +279,47 @@ def _span(part: Segment) -> str:
 
 def closure_words(loop: Loop) -> str:
     """The closure error in m, in percent, per axis and in heading."""
-    error, misclosure = loop.closure_error_m, loop.misclosure_m
-    if error is None or isinstance(misclosure, Unavailable):
+    error, misclosure = loop.closure_error_m, loop.closure_error_axes_m
+    if error is None or misclosure is None:
         return f"path {loop.path_length_m:.1f} m; no closure error is stated: it did not come back"
-    named = zip(AXES_OF_FRAME[loop.odometry.trajectory.frame], misclosure, strict=True)
     text = (
         f"{error:.2f} m after {loop.path_length_m:.1f} m = {error / loop.path_length_m:.2%} "
-        f"({', '.join(f'{name} {part:+.2f} m' for name, part in named)})"
+        f"({', '.join(f'{name} {part:+.2f} m' for name, part in misclosure.items())})"
     )
-    turned = loop.misclosure_heading_deg
+    turned = loop.heading_error_deg
     if isinstance(turned, Unavailable):
         return f"{text}; heading: not known, {turned.reason}"
     return f"{text}; heading {turned:+.1f}°"
 
 
-def gate_words(judged: Judged) -> str:
+def gate_words(closure: Closure) -> str:
     """What the gate says about one closure."""
-    gate = judged.gate
     verdict = "as the stated drift allows"
-    if not gate.accepted:
+    if not closure.accepted:
         verdict = "REJECTED: the drift cannot explain it"
     return (
-        f"d² {gate.d2:.1f} with {gate.degrees_of_freedom} degrees of freedom, p {gate.p:.2g} "
-        f"(rejected below {GATE_ALPHA:g}): {verdict}"
+        f"d² {closure.d2:.1f} with {closure.degrees_of_freedom} degrees of freedom, p "
+        f"{closure.p:.2g} (rejected below {GATE_ALPHA:g}): {verdict}"
     )
 
 
-def closure_name(judged: Judged, loop: Loop) -> str:
+def closure_name(closure: Closure, loop: Loop) -> str:
     """Which closure; long stamps count from the first pose."""
-    closure = judged.closure
-    if closure.source == "landing":
+    if closure.source == LANDING:
         return "take-off and landing"
-    start = loop.segment.start_s
-    zero = start if start > SMALLEST_STAMP_S else 0.0
+    zero = loop.start_s if loop.start_s > SMALLEST_STAMP_S else 0.0
     return f"{closure.time_1_s - zero:.2f} s and {closure.time_2_s - zero:.2f} s"
 
 
 def by_distance_words(loop: Loop) -> str:
     """What the corrections by distance are; nothing where there is none."""
-    if isinstance(loop.plain, Unavailable):
+    if "by_distance_plain" not in loop.paths:
         return ""
     example = (
         "By distance, positions only, is the lesson's Example 2: each position moves by its share "
         "of the gap, and the path keeps the bend of its headings."
     )
-    turned = loop.misclosure_heading_deg
+    turned = loop.heading_error_deg
     if isinstance(turned, Unavailable):
         return f"{example} Headings are not turned: {turned.reason}."
     return (
@@ -342,8 +335,8 @@ def redundancy_words(loop: Loop) -> list[str]:
 
 def refusals(loop: Loop) -> list[str]:
     """Why a correction is missing, each reason once."""
-    parts = (loop.by_distance, *loop.solved.values())
-    reasons = [f"{p.what}: {p.reason}" for p in parts if isinstance(p, Unavailable)]
+    parts = [p for p in loop.corrections.values() if isinstance(p, Unavailable)]
+    reasons = [f"{p.what}: {p.reason}" for p in parts]
     return [r for r in dict.fromkeys(reasons) if SINGLE_LOOP not in r]
 
 
@@ -363,11 +356,11 @@ def _rmse(found: Statistics | Unavailable, digits: int = 3) -> str:
     return f"{found.rmse:.{digits}f}" if isinstance(found, Statistics) else "–"
 
 
-def moved_words(correction: Correction) -> str:
+def moved_words(correction: CorrectedPath) -> str:
     """How far the poses moved."""
-    if not correction.moved_m.any():
+    if not correction.moved_max_m:
         return "–"
-    return f"{np.sqrt(np.mean(correction.moved_m**2)):.2f} / {correction.moved_m.max():.2f}"
+    return f"{correction.moved_rms_m:.2f} / {correction.moved_max_m:.2f}"
 
 
 def print_graph(console: Console, name: str, solved: SolvedGraph) -> None:
@@ -386,8 +379,7 @@ def print_graph(console: Console, name: str, solved: SolvedGraph) -> None:
     else:
         rejected = [gate for gate in gates if not gate.accepted]
         said = [
-            f"{graph.ids[graph.first[gate.edge]]} – {graph.ids[graph.second[gate.edge]]}: "
-            f"d² {gate.d2:.1f}, p {gate.p:.2g}"
+            f"{gate.first} – {gate.second}: d² {gate.d2:.1f}, p {gate.p:.2g}"
             for gate in rejected[:MOST_ROWS]
         ]
         said += [f"and {len(rejected) - MOST_ROWS} more"] if len(rejected) > MOST_ROWS else []
@@ -396,9 +388,9 @@ def print_graph(console: Console, name: str, solved: SolvedGraph) -> None:
         page.labelled("Robust", "left out for so many closures: --robust takes minutes")
     rows = [
         [
-            SOLUTIONS[key], f"{solution.initial_cost:.6g}", f"{solution.cost:.6g}",
+            SOLUTIONS[key], f"{solution.cost_initial:.6g}", f"{solution.cost:.6g}",
             f"{solution.iterations}" + ("" if solution.converged else " (not converged)"),
-            "" if key == "all" else f"{(solution.weights < 0.5).sum()}",
+            "" if key == "all" else f"{solution.dropped}",
         ]
         for key, solution in solved.solutions.items()
     ]  # fmt: skip

@@ -55,6 +55,10 @@ class Panel(NamedTuple):
     say: Callable[[Document, AxisComparison], str]
     numbers: Callable[[AxisComparison], str]
 
+    def named(self, result: AxisComparison) -> str:
+        """Its title, with what errors are counted from."""
+        return self.title.format("truth" if isinstance(result.truth, pd.DataFrame) else "EKF2")
+
     def put(
         self, page: Page, document: Document, result: AxisComparison, *, last: bool,
         strip: bool = False, narrow: bool = False,
@@ -68,11 +72,10 @@ class Panel(NamedTuple):
         narrow : bool
             In a column of its own, without its sentence.
         """
-        of = "truth" if isinstance(result.truth, pd.DataFrame) else "EKF2"
         say, height = ("", NARROW) if narrow else (self.say(document, result), self.height)
         # rejected innovations are there themselves
         rejected = "" if self is INNOVATIONS else result.axis.name
-        axes = marks.panel(page, document, self.title.format(of), say, height, axis=rejected,
+        axes = marks.panel(page, document, self.named(result), say, height, axis=rejected,
                            strip=strip, last=last)  # fmt: skip
         if narrow:
             axes.locator_params(axis="x", nbins=4)

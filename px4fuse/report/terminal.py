@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from rich.console import Console
 
 from px4fuse.ekf2.walk import Why
+from px4fuse.findings import by_root
 from px4fuse.flight import Unavailable
 from px4fuse.report.cover import facts, write_finding
 from px4fuse.report.document import Document
@@ -58,9 +59,10 @@ def print_summary(
         write_why(page, why)
     if not document.findings:
         page.write("No findings.")
-    for finding in document.findings[:MOST_FINDINGS]:
-        write_finding(page, finding)
-    if (more := len(document.findings) - MOST_FINDINGS) > 0:
+    groups = by_root(document.findings)
+    for group in groups[:MOST_FINDINGS]:
+        write_finding(page, group)
+    if (more := len(groups) - MOST_FINDINGS) > 0:
         page.write(f"and {more} more in the report" if report else f"and {more} more")
     show(console, page.blocks, request)
     if report is not None:

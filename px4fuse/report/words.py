@@ -140,12 +140,12 @@ def verdict_notes(comparison: Comparison) -> list[str]:
     small = [
         f"{owner} {axis} {verdict_words(statement)}"
         for axis, owner, statement in stated
-        if statement.verdict != "consistent" and _factor(statement) < VARIANCE_FACTOR.value
+        if statement.verdict != "consistent" and _factor(statement) < VARIANCE_FACTOR
     ]
     if small:
         notes.append(
-            f"{', '.join(small)}: more than chance, but less than {VARIANCE_FACTOR.value:g}× "
-            f"({np.sqrt(VARIANCE_FACTOR.value) - 1.0:.0%} in σ), from where it is a finding."
+            f"{', '.join(small)}: more than chance, but less than {VARIANCE_FACTOR:g}× "
+            f"({np.sqrt(VARIANCE_FACTOR) - 1.0:.0%} in σ), from where it is a finding."
         )
     notes += _same_nis(stated)
     coloured = [
@@ -180,9 +180,9 @@ def _same_nis(stated: Sequence[tuple[str, str, Consistency]]) -> Iterator[str]:
             )
 
 
-def consequences_words(finding: Finding) -> str:
+def consequences_words(followers: Sequence[Finding]) -> str:
     """What the same cause brings with it, each in one sentence."""
-    return "With it: " + " ".join(f"{one.headline}." for one in finding.consequences)
+    return "With it: " + " ".join(f"{one.headline}." for one in followers)
 
 
 def clock_words(clock: ClockMap) -> str:

@@ -14,7 +14,6 @@ from px4fuse.findings.story import story
 from px4fuse.flight import Unavailable
 from px4fuse.record import written
 from px4fuse.request import AxisName, ComparisonRequest, WhatIfRequest
-from px4fuse.results.build_trajectories import loop_part
 from px4fuse.results.comparison import AvailableTrack, ChosenSettings, PositionSource
 from px4fuse.results.contract import (
     COMPARISON,
@@ -49,7 +48,7 @@ def results(
         heading=analysis.heading,
         ekf2_replay=written(analysis.ekf2_replay),
         why=written(analysis.why),
-        loop=loop_part(analysis.loop),
+        loop=written(analysis.loop),
         story=story(analysis, findings),
         findings=findings,
         notes=analysis.notes,

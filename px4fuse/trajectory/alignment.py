@@ -8,7 +8,6 @@ scale (seven).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -16,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from px4fuse.arrays import Array
 from px4fuse.errors import TrajectoryError
+from px4fuse.record import Count, Record, Vector
 from px4fuse.trajectory.model import MIN_POSES
 
 AlignmentKind = Literal["none", "yaw", "se3", "sim3"]
@@ -27,31 +27,40 @@ MIN_SHARE, MIN_SPREAD_M = 1e-6, 1e-6
 MAX_PLANE_RATIO, MAX_LINE_RATIO = 1.0, 2.0
 
 
-@dataclass(frozen=True)
-class Transform:
-    """A similarity, from the estimate's world to the reference's: s·R·p + t.
+class Transform(Record, frozen=True):
+    """A similarity, from the estimate's world to the reference's: x ↦ scale · R x + t.
 
     Attributes
     ----------
-    rotation : Rotation
-        R, a single one.
-    translation_m : ndarray, shape (3,)
+    quaternion_wxyz : tuple of float
+        R.
+    translation_m : tuple of float
         t, in the reference's frame.
     scale : float
-        s; exactly 1 except for Sim(3).
+        Exactly 1 except for Sim(3).
     degrees_of_freedom : int
         How many of its numbers were fitted: 0, 4, 6 or 7.
     """
 
-    rotation: Rotation
-    translation_m: Array
+    quaternion_wxyz: tuple[float, float, float, float]
+    translation_m: Vector
     scale: float
-    degrees_of_freedom: int
+    degrees_of_freedom: Count
+
+    @property
+    def rotation(self) -> Rotation:
+        """R, a single one."""
+        return Rotation.from_quat(self.quaternion_wxyz, scalar_first=True)
 
     def apply(self, position_m: Array) -> Array:
         """Positions in the reference's frame, shape (n, 3) or (3,)."""
         turned: Array = self.rotation.apply(self.scale * position_m)
         return turned + self.translation_m
+
+    def undo(self, position_m: Array) -> Array:
+        """Positions in the estimate's world, shape (n, 3) or (3,)."""
+        back: Array = self.rotation.inv().apply(position_m - np.array(self.translation_m))
+        return back / self.scale
 
 
 def fit(estimate_m: Array, reference_m: Array, kind: AlignmentKind) -> Transform:
@@ -79,11 +88,12 @@ def fit(estimate_m: Array, reference_m: Array, kind: AlignmentKind) -> Transform
             "that both are of the same flight, and their clocks (`time_offset_s` auto)."
         )
     if kind == "none":
-        return Transform(Rotation.identity(), np.zeros(3), 1.0, 0)
+        return Transform((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 1.0, 0)
     if kind == "yaw":
-        transform = _yaw(estimate_m, reference_m)
-        level = (True, True, False)
-        _check_yaw(transform, estimate_m[:, level], reference_m[:, level], reference_m)
+        x, y = (m[:, 0] + 1j * m[:, 1] for m in (estimate_m, reference_m))
+        heading = float(np.angle(np.vdot(x - x.mean(), y - y.mean())))
+        transform = _transform(Rotation.from_euler("z", heading), estimate_m, reference_m, 1.0, 4)
+        _check_yaw(transform, estimate_m, reference_m)
         return transform
     # the scale is left out of the question: a wrong one is no reason to doubt the turn
     free = umeyama(estimate_m, reference_m, with_scale=True)
@@ -102,25 +112,23 @@ def umeyama(estimate_m: Array, reference_m: Array, *, with_scale: bool) -> Trans
     with_scale : bool
         Sim(3); scale 1 where the estimate does not move.
     """
-    x_mean, y_mean = estimate_m.mean(axis=0), reference_m.mean(axis=0)
-    x, y = estimate_m - x_mean, reference_m - y_mean
+    x, y = estimate_m - estimate_m.mean(axis=0), reference_m - reference_m.mean(axis=0)
     u, d, vt = np.linalg.svd(y.T @ x / len(x))  # eq. 38
     s = np.array([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])  # eq. 43
-    turn = (u * s) @ vt  # eq. 40
     variance = float((x * x).sum() / len(x))  # eq. 36
     # eq. 42; the smallest double would give an infinite scale
     scale = float(d @ s / variance) if with_scale and variance > MIN_SPREAD_M**2 else 1.0
-    translation: Array = y_mean - scale * (turn @ x_mean)  # eq. 41
-    return Transform(Rotation.from_matrix(turn), translation, scale, 7 if with_scale else 6)
+    turn = Rotation.from_matrix((u * s) @ vt)  # eq. 40
+    return _transform(turn, estimate_m, reference_m, scale, 7 if with_scale else 6)
 
 
-def _yaw(estimate_m: Array, reference_m: Array) -> Transform:
-    """Four degrees of freedom: horizontal positions as complex numbers, a turn as a factor."""
-    x_mean, y_mean = estimate_m.mean(axis=0), reference_m.mean(axis=0)
-    x, y = estimate_m - x_mean, reference_m - y_mean
-    cross = np.vdot(x[:, 0] + 1j * x[:, 1], y[:, 0] + 1j * y[:, 1])
-    turn = Rotation.from_euler("z", float(np.angle(cross)))
-    return Transform(turn, y_mean - turn.apply(x_mean), 1.0, 4)
+def _transform(
+    turn: Rotation, estimate_m: Array, reference_m: Array, scale: float, freedom: int
+) -> Transform:
+    """The similarity of a turn and a scale, which brings the means together (eq. 41)."""
+    shift = reference_m.mean(axis=0) - scale * turn.apply(estimate_m.mean(axis=0))
+    w, x, y, z = turn.as_quat(scalar_first=True).tolist()
+    return Transform((w, x, y, z), tuple(shift.tolist()), scale, freedom)
 
 
 def _spread(position_m: Array) -> Array:
@@ -130,11 +138,15 @@ def _spread(position_m: Array) -> Array:
     return rms
 
 
-def _check_yaw(transform: Transform, x: Array, y: Array, reference_m: Array) -> None:
+def rms_m(difference_m: Array) -> float:
+    """Root mean square length of vectors, shape (n, d)."""
+    return float(np.sqrt((difference_m * difference_m).sum(axis=1).mean()))
+
+
+def _check_yaw(transform: Transform, estimate_m: Array, reference_m: Array) -> None:
     """Refuse a yaw that the horizontal motion does not determine."""
-    moved = min(float(np.hypot(*_spread(x))), float(np.hypot(*_spread(y))))
-    turned = (x - x.mean(axis=0)) @ transform.rotation.as_matrix()[:2, :2].T
-    left = float(np.sqrt(((y - y.mean(axis=0) - turned) ** 2).sum(axis=1).mean()))
+    moved = min(float(np.hypot(*_spread(m[:, :2]))) for m in (estimate_m, reference_m))
+    left = rms_m((reference_m - transform.apply(estimate_m))[:, :2])
     extent = float(np.linalg.norm(_spread(reference_m)))
     if moved < max(MIN_SPREAD_M, MIN_SHARE * extent) or left > MAX_PLANE_RATIO * moved:
         raise TrajectoryError(
@@ -151,18 +163,17 @@ def _check_turn(
 
     The second singular value is the extent of the motion away from a line.
     """
-    x, y = transform.scale * _spread(estimate_m), _spread(reference_m)
-    length, width = min(x[0], y[0]), min(x[1], y[1])
-    left = reference_m - transform.apply(estimate_m)
-    rms = float(np.sqrt((left * left).sum(axis=1).mean()))
-    if length < MIN_SPREAD_M or _spread(estimate_m)[0] < MIN_SPREAD_M:
+    spread, target = _spread(estimate_m), _spread(reference_m)
+    length, width, _ = np.minimum(transform.scale * spread, target)
+    left = rms_m(reference_m - transform.apply(estimate_m))
+    if min(length, spread[0]) < MIN_SPREAD_M:
         raise TrajectoryError(
             f"One of the two does not move, so {kind} cannot be found from it. `alignment` none "
             "compares without turning."
         )
-    if width < MIN_SHARE * length or rms > MAX_LINE_RATIO * width:
+    if width < MIN_SHARE * length or left > MAX_LINE_RATIO * width:
         raise TrajectoryError(
             f"The motion is along a line: {length:.2g} m (RMS) by {width:.2g} m across it, where "
-            f"an alignment leaves {rms:.2g} m, so the turn about that line and with it {kind} "
+            f"an alignment leaves {left:.2g} m, so the turn about that line and with it {kind} "
             f"cannot be found. Use `alignment` yaw if z is vertical in both, or `alignment` none."
         )

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
 from scipy.spatial.transform import Slerp
 
 from px4fuse.arrays import Array, BoolArray, IntArray
-from px4fuse.display import brief
 from px4fuse.errors import TrajectoryError
+from px4fuse.record import Count, NotNegative, Record
 from px4fuse.trajectory.model import MIN_POSES, Trajectory
 
 Method = Literal["interpolate", "nearest"]
@@ -20,22 +20,17 @@ GAP_INTERVALS, GAP_S = 3.0, 0.1
 NEAREST_S = 0.01  # the evo package's default too
 
 
-@dataclass(frozen=True)
-class Association:
-    """Poses of both at the same times.
+class Association(Record, frozen=True):
+    """How poses were paired by time, and how many were left out.
 
     Attributes
     ----------
-    estimate : Trajectory
-        The poses used, on its own clock.
-    reference : Trajectory
-        As many, on the reference's clock: interpolated, or the nearest ones.
     method : {"interpolate", "nearest"}
+    poses : int
+        Of each of the two, at the same times.
     max_gap_s : float
         Longest interval of the reference that is interpolated across; for "nearest" the largest
         difference in time.
-    time_offset_s : float
-        What was added to the estimate's stamps.
     outside, in_gaps : int
         Poses of the estimate dropped as the reference has none at their time: before its start
         or after its end, and in its gaps.
@@ -46,20 +41,13 @@ class Association:
         longer than five median ones and 0.5 s do not.
     """
 
-    estimate: Trajectory
-    reference: Trajectory
     method: Method
-    max_gap_s: float
-    time_offset_s: float
-    outside: int
-    in_gaps: int
+    poses: Count
+    max_gap_s: NotNegative
+    outside: Count
+    in_gaps: Count
     coverage_estimate: float
     coverage_reference: float
-
-    __repr__ = brief
-
-    def __len__(self) -> int:
-        return len(self.estimate)
 
 
 def associate(
@@ -69,8 +57,8 @@ def associate(
     method: Method = "interpolate",
     max_gap_s: float | None = None,
     time_offset_s: float = 0.0,
-) -> Association:
-    """Poses of both at the same times.
+) -> tuple[Trajectory, Trajectory, Association]:
+    """Poses of both at the same times: the estimate's on its own clock, and as many references.
 
     Parameters
     ----------
@@ -89,36 +77,38 @@ def associate(
     TrajectoryError
         Fewer than three poses match; the text gives both spans.
     """
+    time, (first, last) = estimate.time_s + time_offset_s, reference.time_s[[0, -1]]
     if method == "nearest":
-        limit = NEAREST_S if max_gap_s is None else max_gap_s
+        limit = slack = NEAREST_S if max_gap_s is None else max_gap_s
         chosen, other = _nearest(estimate.time_s, reference.time_s, limit, time_offset_s)
-        matched = None if len(chosen) < MIN_POSES else reference[other]
+        matched = reference[other]
     else:
-        limit = gap_limit(reference.time_s) if max_gap_s is None else max_gap_s
-        time = estimate.time_s + time_offset_s
+        limit, slack = gap_limit(reference.time_s) if max_gap_s is None else max_gap_s, 0.0
         chosen = np.flatnonzero(bracketed(time, reference.time_s, limit))
-        matched = None if len(chosen) < MIN_POSES else _at(reference, time[chosen])
-    time = estimate.time_s + time_offset_s
-    if matched is None:
-        raise TrajectoryError(_no_overlap(estimate, reference, time, len(chosen), time_offset_s))
-    slack = limit if method == "nearest" else 0.0
-    inside = (time >= reference.time_s[0] - slack) & (time <= reference.time_s[-1] + slack)
+        matched = _at(reference, time[chosen])
+    if len(chosen) < MIN_POSES:
+        what = f"only {len(chosen)} of its poses match" if len(chosen) else "no poses match"
+        added = f" (with the offset of {time_offset_s:.12g} s)" if time_offset_s else ""
+        raise TrajectoryError(
+            f"{estimate.name}: {what} in time: it spans {time[0]:.3f} to {time[-1]:.3f} s{added}, "
+            f"the reference {reference.name} {first:.3f} to {last:.3f} s. Check that both are of "
+            "the same flight; if their clocks differ, give `time_offset_s` auto."
+        )
+    outside = int(((time < first - slack) | (time > last + slack)).sum())
     steps = np.diff(time[chosen])
     longest = max(5.0 * float(np.median(np.diff(estimate.time_s))), 0.5)
-    span = float(reference.time_s[-1] - reference.time_s[0])
-    covered = float(steps[steps <= longest].sum()) / span
-    outside = int(len(estimate) - inside.sum())
-    return Association(
-        estimate=estimate[chosen],
-        reference=matched,
+    covered = float(steps[steps <= longest].sum() / (last - first))
+    used, all_poses = len(np.unique(chosen)), len(estimate)
+    found = Association(
         method=method,
+        poses=len(chosen),
         max_gap_s=limit,
-        time_offset_s=time_offset_s,
         outside=outside,
-        in_gaps=len(estimate) - outside - len(np.unique(chosen)),
-        coverage_estimate=len(np.unique(chosen)) / len(estimate),
+        in_gaps=all_poses - outside - used,
+        coverage_estimate=used / all_poses,
         coverage_reference=min(covered, 1.0),
     )
+    return estimate[chosen], matched, found
 
 
 def gap_limit(time_s: Array) -> float:
@@ -129,17 +119,16 @@ def gap_limit(time_s: Array) -> float:
 def bracketed(time_s: Array, reference_s: Array, limit: float) -> BoolArray:
     """Whether each time is a reference's, or between two that are near enough to each other."""
     right = np.clip(np.searchsorted(reference_s, time_s), 1, len(reference_s) - 1)
-    exact = (reference_s[right] == time_s) | (reference_s[right - 1] == time_s)
-    between = (reference_s[right - 1] <= time_s) & (time_s <= reference_s[right])
-    near = reference_s[right] - reference_s[right - 1] <= limit
-    bracketed: BoolArray = exact | (between & near)
+    before, after = reference_s[right - 1], reference_s[right]
+    between = (before <= time_s) & (time_s <= after) & (after - before <= limit)
+    bracketed: BoolArray = between | (before == time_s) | (after == time_s)
     return bracketed
 
 
 def _at(trajectory: Trajectory, time_s: Array) -> Trajectory:
     """Poses at times within its span."""
     rotation = trajectory.rotation
-    if rotation is not None:
+    if rotation is not None and len(time_s):
         rotation = Slerp(trajectory.time_s, rotation)(time_s)
     return replace(trajectory.moved(positions_at(trajectory, time_s), rotation), time_s=time_s)
 
@@ -164,21 +153,6 @@ def _nearest(
     long = estimate_s + offset_s if is_longer else reference_s - offset_s
     right = np.minimum(np.searchsorted(long, short, side="right"), len(long) - 1)
     left = np.maximum(right - 1, 0)
-    after, before = long[right] - short, np.where(right > 0, short - long[left], np.inf)
-    nearest = np.where(after < before, right, left)
-    inside = (short >= long[0] - limit) & (short <= long[-1] + limit)
-    kept = np.flatnonzero(inside & (np.minimum(after, before) <= limit))
+    nearest = np.where(np.abs(long[right] - short) < np.abs(short - long[left]), right, left)
+    kept = np.flatnonzero(np.abs(long[nearest] - short) <= limit)
     return (nearest[kept], kept) if is_longer else (kept, nearest[kept])
-
-
-def _no_overlap(
-    estimate: Trajectory, reference: Trajectory, time_s: Array, count: int, offset_s: float
-) -> str:
-    what = "no poses match" if not count else f"only {count} of its poses match"
-    added = f" (with the offset of {offset_s:.12g} s)" if offset_s else ""
-    return (
-        f"{estimate.name}: {what} in time: it spans {time_s[0]:.3f} to {time_s[-1]:.3f} s{added}, "
-        f"the reference {reference.name} {reference.time_s[0]:.3f} to {reference.time_s[-1]:.3f} "
-        "s. Check that both are of the same flight; if their clocks differ, give "
-        "`time_offset_s` auto."
-    )

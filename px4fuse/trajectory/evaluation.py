@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
+from msgspec import structs
 from scipy.spatial.transform import Rotation
 
 from px4fuse.arrays import Array
@@ -27,6 +28,7 @@ from px4fuse.trajectory.scores import (
     Delta,
     Interval,
     PairwiseError,
+    RelativeError,
     Side,
     Statistics,
     default_deltas,
@@ -42,6 +44,7 @@ MIN_CLOCK_DOUBT_S = 0.1  # less than this may be the filter's own lag
 MAX_SPARSER = 5.0  # a reference with so much longer intervals is hardly one
 
 _DOWN, _UP = ("NED", "FRD"), ("ENU",)
+_FREE = ("slam", "unknown")  # whose world may be turned in any way
 _MONO = re.compile(r"(?<![a-z])mono(?![a-z])|monocular", re.IGNORECASE)
 
 
@@ -53,14 +56,11 @@ class AbsoluteError(Record, frozen=True):
     rotation_deg: Maybe[Statistics]
 
 
-@dataclass(frozen=True, repr=False)
-class Evaluation(Shown):
-    """An estimate's scores against a reference.
+class Score(Record, frozen=True, kw_only=True):
+    """ATE and RPE of an estimate against a reference, and how the two were made comparable.
 
     Attributes
     ----------
-    estimate, reference : Trajectory
-        As given.
     alignment : {"none", "yaw", "se3", "sim3"}
     alignment_reason : str
         Why this one, a sentence.
@@ -70,40 +70,55 @@ class Evaluation(Shown):
     time_offset : TimeOffset
         ``offset_s`` is what was added to the estimate's stamps.
     ate : AbsoluteError
-    rpe : tuple of PairwiseError
-    time_s : ndarray, shape (n,)
-        Of the poses used, on the estimate's clock.
-    distance_m : ndarray, shape (n,)
-        Along the reference, from its first pose used.
-    estimate_m, reference_m : ndarray, shape (n, 3)
-        Positions of the aligned estimate, and of the reference.
-    position_error_m : ndarray, shape (n,)
-    rotation_error_deg : ndarray, shape (n,), or None
-    body_rotation : Rotation or None
-        Constant rotation from the reference's body to the estimate's that the rotations were
-        freed of; None where both are of the same body.
+    rpe : tuple of RelativeError
     notes, warnings : tuple of str
         Sentences.
     """
 
-    estimate: Trajectory
-    reference: Trajectory
     alignment: AlignmentKind
     alignment_reason: str
     transform: Transform
     association: Association
     time_offset: TimeOffset
     ate: AbsoluteError
+    rpe: tuple[RelativeError, ...]
+    notes: tuple[str, ...]
+    warnings: tuple[str, ...]
+
+
+class Evaluation(Shown, Score, frozen=True, kw_only=True, eq=False):
+    """An estimate's scores against a reference, with the error of each pose.
+
+    Attributes
+    ----------
+    estimate, reference : Trajectory
+        As given.
+    rpe : tuple of PairwiseError
+    time_s : ndarray, shape (n,)
+        Of the poses used, on the estimate's clock.
+    distance_m : ndarray, shape (n,)
+        Along the reference, from its first pose used.
+    unaligned_m, estimate_m, reference_m : ndarray, shape (n, 3)
+        Positions of the estimate before and after alignment, and of the reference.
+    position_error_m : ndarray, shape (n,)
+    rotation_error_deg : ndarray, shape (n,), or None
+    body_rotation : Rotation or None
+        Constant rotation from the reference's body to the estimate's that the rotations were
+        freed of; None where both are of the same body.
+    """
+
+    written_as = Score
     rpe: tuple[PairwiseError, ...]
+    estimate: Trajectory
+    reference: Trajectory
     time_s: Array
     distance_m: Array
+    unaligned_m: Array
     estimate_m: Array
     reference_m: Array
     position_error_m: Array
     rotation_error_deg: Array | None
     body_rotation: Rotation | None
-    notes: tuple[str, ...]
-    warnings: tuple[str, ...]
 
 
 def evaluate(
@@ -142,26 +157,20 @@ def evaluate(
     SettingsError
         A delta is not above zero, or not whole for frames.
     """
-    warnings = _swapped(estimate, reference)
     offset, offset_warnings = _time_offset(estimate, reference, time_offset_s)
-    matched = associate(
+    x, y, matched = associate(
         estimate,
         reference,
         method=association,
         max_gap_s=max_gap_s,
         time_offset_s=offset.offset_s or 0.0,
     )
-    x, y = matched.estimate, matched.reference
+    reason = "As asked for."
     if alignment is None:
         alignment, reason = choose_alignment(x, y)
-    else:
-        reason = "As asked for."
     transform = fit(x.position_m, y.position_m, alignment)
-    aligned = replace(
-        x,
-        position_m=transform.apply(x.position_m),
-        rotation=None if x.rotation is None else transform.rotation * x.rotation,
-    )
+    turned = None if x.rotation is None else transform.rotation * x.rotation
+    aligned = replace(x, position_m=transform.apply(x.position_m), rotation=turned)
     body, notes = _body_rotation(aligned, y)
     if body is not None and aligned.rotation is not None:
         aligned = replace(aligned, rotation=aligned.rotation * body)
@@ -169,19 +178,14 @@ def evaluate(
     error = np.linalg.norm(aligned.position_m - y.position_m, axis=1)
     both = rotations_of(aligned, y, "ATE of the rotation")
     rotation_error: Array | None = None
-    rotation_statistics: Statistics | Unavailable
+    rotation: Statistics | Unavailable
     if isinstance(both, Unavailable):
-        rotation_statistics = both
+        rotation = both
     else:
         rotation_error = np.degrees((both[0].inv() * both[1]).magnitude())
-        rotation_statistics = statistics(rotation_error)
-    ate = AbsoluteError(statistics(error), rmse_interval(error, "ATE"), rotation_statistics)
+        rotation = statistics(rotation_error)
     if rpe_deltas is None:
         rpe_deltas = default_deltas(distance, x.time_s)
-    rpe = tuple(
-        relative_error(aligned, y, delta, all_pairs=all_pairs, pairs_from=pairs_from)
-        for delta in rpe_deltas
-    )
     return Evaluation(
         estimate=estimate,
         reference=reference,
@@ -190,17 +194,25 @@ def evaluate(
         transform=transform,
         association=matched,
         time_offset=offset,
-        ate=ate,
-        rpe=rpe,
+        ate=AbsoluteError(statistics(error), rmse_interval(error, "ATE"), rotation),
+        rpe=tuple(
+            relative_error(aligned, y, delta, all_pairs=all_pairs, pairs_from=pairs_from)
+            for delta in rpe_deltas
+        ),
         time_s=x.time_s,
         distance_m=distance,
+        unaligned_m=x.position_m,
         estimate_m=aligned.position_m,
         reference_m=y.position_m,
         position_error_m=error,
         rotation_error_deg=rotation_error,
         body_rotation=body,
         notes=notes,
-        warnings=(*warnings, *offset_warnings, *_doubts(matched, alignment)),
+        warnings=(
+            *_swapped(estimate, reference),
+            *offset_warnings,
+            *_doubts(x, y, matched, alignment),
+        ),
     )
 
 
@@ -215,40 +227,36 @@ def choose_alignment(estimate: Trajectory, reference: Trajectory) -> tuple[Align
     estimate, reference : Trajectory
         Associated: as many poses, at the same times.
     """
-    both = (estimate.kind, reference.kind)
-    is_same = estimate.frame == reference.frame != "unknown" or reference.kind == "truth"
-    if estimate.kind == "truth" and is_same:
+    same_frame = estimate.frame == reference.frame != "unknown"
+    if estimate.kind == "truth" and (same_frame or reference.kind == "truth"):
         return "none", "No alignment, as ground truth is compared as it is."
     frames = f"{estimate.frame} and {reference.frame}"
     is_upright = any({estimate.frame, reference.frame} <= set(same) for same in (_DOWN, _UP))
-    if is_upright and not {"slam", "unknown"} & {estimate.kind}:
+    free = [one for one in (estimate, reference) if one.kind in _FREE]
+    if is_upright and estimate.kind not in _FREE:
         return "yaw", (
             f"Yaw and position (4 DoF), as z is vertical in both frames ({frames}): a tilt of the "
             "estimate is an error."
         )
-    is_metric = not {"slam", "unknown"} & set(both)
-    name = next((one.name for one in (estimate, reference) if _MONO.search(one.name)), "")
-    why = f"as the frames are {frames}, which do not share a vertical"
-    if not is_metric:
-        who = estimate if estimate.kind in ("slam", "unknown") else reference
-        what = "comes from SLAM, whose world is its first key frame"
-        why = f"as {who.name} {what if who.kind == 'slam' else 'does not say what made it'}"
     try:
         scale = fit(estimate.position_m, reference.position_m, "sim3").scale
     except TrajectoryError:
-        if is_upright:
-            return "yaw", (
-                f"Yaw and position (4 DoF), as the motion is along a line and z is vertical in "
-                f"both frames ({frames})."
-            )
-        raise
-    if is_metric or (not name and abs(scale - 1.0) <= MAX_SCALE_ERROR):
+        if not is_upright:
+            raise
+        return "yaw", (
+            f"Yaw and position (4 DoF), as the motion is along a line and z is vertical in "
+            f"both frames ({frames})."
+        )
+    why = f"as the frames are {frames}, which do not share a vertical"
+    if free:
+        made = "comes from SLAM, whose world is its first key frame"
+        why = f"as {free[0].name} {made if free[0].kind == 'slam' else 'does not say what made it'}"
+    name = next((one.name for one in (estimate, reference) if _MONO.search(one.name)), "")
+    if not free or (not name and abs(scale - 1.0) <= MAX_SCALE_ERROR):
         return "se3", f"Rotation and position (6 DoF), {why}."
-    because = (
-        f"{name} says that it is monocular"
-        if name
-        else f"the scale is {scale:.3g}, more than {MAX_SCALE_ERROR:.0%} off"
-    )
+    because = f"the scale is {scale:.3g}, more than {MAX_SCALE_ERROR:.0%} off"
+    if name:
+        because = f"{name} says that it is monocular"
     return "sim3", f"Rotation, position and scale (7 DoF), {why}, and {because}."
 
 
@@ -256,84 +264,75 @@ def _time_offset(
     estimate: Trajectory, reference: Trajectory, given_s: float | Literal["auto"] | None
 ) -> tuple[TimeOffset, list[str]]:
     """What to add to the estimate's stamps."""
+    if isinstance(given_s, float | int):
+        return TimeOffset(offset_s=given_s, determinable=True, reason="As asked for."), []
     clocks = clock_difference(estimate, reference)
-    by_clock = "the stamps as they are" if clocks in (None, 0.0) else "UNIX time of both clocks"
+    by_clock = "UNIX time of both clocks" if clocks else "the stamps as they are"
+    clocked = TimeOffset(offset_s=clocks or 0.0, determinable=True, reason=f"By {by_clock}.")
     start, end = estimate.time_s[[0, -1]] + (clocks or 0.0)
     apart = start > reference.time_s[-1] or end < reference.time_s[0]
     # a flight's boot clock and the clock of a file have nothing to do with each other
     unrelated = clocks is None and estimate.of_log != reference.of_log
-    if given_s == "auto" or (given_s is None and apart):
-        found = estimate_time_offset(estimate, reference)
+    sought = given_s == "auto" or apart
+    if not (sought or unrelated):
+        return clocked, []
+    found = estimate_time_offset(estimate, reference)
+    if sought:
         if found.determinable:
             return found, []
-        used = TimeOffset(offset_s=clocks or 0.0, determinable=False, reason=found.reason)
+        used = structs.replace(clocked, determinable=False, reason=found.reason)
         return used, [f"{found.reason} Used {by_clock} instead."]
-    if given_s is None:
-        used = TimeOffset(offset_s=clocks or 0.0, determinable=True, reason=f"By {by_clock}.")
-        return used, _clock_doubts(estimate, reference) if unrelated else []
-    return TimeOffset(offset_s=given_s, determinable=True, reason="As asked for."), []
-
-
-def _clock_doubts(estimate: Trajectory, reference: Trajectory) -> list[str]:
-    """A warning where two clocks that may be unrelated agree with other stamps than given."""
-    found = estimate_time_offset(estimate, reference)
-    if found.interval_s is None or found.offset_s is None:
-        return []
-    low, high = found.interval_s
-    if low <= 0.0 <= high or abs(found.offset_s) < MIN_CLOCK_DOUBT_S:
-        return []
-    return [
-        f"The stamps are used as they are, but the motions fit best with {found.offset_s:+.3f} s "
-        "added to the estimate's: are the two clocks unrelated? Then give --time-offset auto."
-    ]
+    offset, (low, high) = found.offset_s or 0.0, found.interval_s or (0.0, 0.0)
+    doubtful = not low <= 0.0 <= high and abs(offset) >= MIN_CLOCK_DOUBT_S
+    doubt = (
+        f"The stamps are used as they are, but the motions fit best with {offset:+.3f} s added to "
+        "the estimate's: are the two clocks unrelated? Then give --time-offset auto."
+    )
+    return clocked, [doubt] if doubtful else []
 
 
 def _swapped(estimate: Trajectory, reference: Trajectory) -> list[str]:
     """Warnings where the two look interchanged."""
+    if reference.kind == "truth" != estimate.kind:
+        return []
+    step, other_step = (float(np.median(np.diff(one.time_s))) for one in (estimate, reference))
+    span, other_span = (float(np.ptp(one.time_s)) for one in (estimate, reference))
+    signs = {
+        f"{estimate.name} is ground truth and {reference.name} is not": (
+            estimate.kind == "truth" != reference.kind
+        ),
+        f"The reference has one pose in {other_step:.3g} s, the estimate one in {step:.3g} s": (
+            other_step > MAX_SPARSER * step
+        ),
+        f"The reference lasts {other_span:.1f} s, the estimate {span:.1f} s": (
+            other_span < MIN_COVERAGE * span
+        ),
+    }
     swap = "Are the two interchanged? The estimate comes first."
-    warnings: list[str] = []
-    if reference.kind == "truth" and estimate.kind != "truth":
-        return warnings
-    if estimate.kind == "truth" and reference.kind != "truth":
-        warnings.append(f"{estimate.name} is ground truth and {reference.name} is not. {swap}")
-    steps = [float(np.median(np.diff(one.time_s))) for one in (estimate, reference)]
-    spans = [float(one.time_s[-1] - one.time_s[0]) for one in (estimate, reference)]
-    if steps[1] > MAX_SPARSER * steps[0]:
-        warnings.append(
-            f"The reference has one pose in {steps[1]:.3g} s, the estimate one in {steps[0]:.3g} "
-            f"s. {swap}"
-        )
-    if spans[1] < MIN_COVERAGE * spans[0]:
-        warnings.append(
-            f"The reference lasts {spans[1]:.1f} s, the estimate {spans[0]:.1f} s. {swap}"
-        )
-    return warnings
+    return [f"{sign}. {swap}" for sign, holds in signs.items() if holds]
 
 
-def _doubts(matched: Association, alignment: AlignmentKind) -> list[str]:
+def _doubts(
+    estimate: Trajectory, reference: Trajectory, matched: Association, alignment: AlignmentKind
+) -> list[str]:
     """Warnings on what was compared."""
-    warnings = []
-    if matched.coverage_estimate < MIN_COVERAGE:
-        warnings.append(
-            f"Only {matched.coverage_estimate:.0%} of the estimate's poses have a reference "
-            f"({matched.outside} lie outside its span, {matched.in_gaps} in its gaps)."
-        )
-    if matched.coverage_reference < MIN_COVERAGE:
-        warnings.append(
-            f"The estimate covers only {matched.coverage_reference:.0%} of the reference's time: "
-            "errors where it has no poses do not count."
-        )
-    x, y = matched.estimate.position_m, matched.reference.position_m
-    if alignment != "sim3":
-        # of the spreads: it needs no turn that the motion would have to determine
-        spreads = [float(np.sqrt(one.var(axis=0).sum())) for one in (x, y)]
-        scale = umeyama(x, y, with_scale=True).scale
-        if min(spreads) > 0.0 and abs(scale - 1.0) > MAX_SCALE_ERROR:
-            warnings.append(
-                f"The estimate's scale is off: {scale:.3g} times it would fit best, and the "
-                f"alignment ({alignment}) leaves that in the errors."
-            )
-    return warnings
+    x, y = estimate.position_m, reference.position_m
+    # of the spreads: it needs no turn that the motion would have to determine
+    scale = umeyama(x, y, with_scale=True).scale
+    moves = min(float(np.ptp(one, axis=0).max()) for one in (x, y)) > 0.0
+    doubts = {
+        f"Only {matched.coverage_estimate:.0%} of the estimate's poses have a reference "
+        f"({matched.outside} lie outside its span, {matched.in_gaps} in its gaps).": (
+            matched.coverage_estimate < MIN_COVERAGE
+        ),
+        f"The estimate covers only {matched.coverage_reference:.0%} of the reference's time: "
+        "errors where it has no poses do not count.": matched.coverage_reference < MIN_COVERAGE,
+        f"The estimate's scale is off: {scale:.3g} times it would fit best, and the alignment "
+        f"({alignment}) leaves that in the errors.": (
+            alignment != "sim3" and moves and abs(scale - 1.0) > MAX_SCALE_ERROR
+        ),
+    }
+    return [doubt for doubt, holds in doubts.items() if holds]
 
 
 def _body_rotation(
@@ -342,11 +341,10 @@ def _body_rotation(
     """Constant rotation between two bodies whose axes differ, as a camera's and a vehicle's do."""
     if aligned.rotation is None or reference.rotation is None:
         return None, ()
-    is_camera = [one.frame == "camera" for one in (aligned, reference)]
-    is_vehicle = [one.frame in (*_DOWN, *_UP) for one in (aligned, reference)]
-    is_slam = [one.kind == "slam" for one in (aligned, reference)]
-    differ = is_camera[0] != is_camera[1] or any(
-        is_slam[i] and is_vehicle[1 - i] and not is_vehicle[i] for i in (0, 1)
+    vehicles = (*_DOWN, *_UP)
+    differ = (aligned.frame == "camera") != (reference.frame == "camera") or any(
+        one.kind == "slam" and other.frame in vehicles and one.frame not in vehicles
+        for one, other in ((aligned, reference), (reference, aligned))
     )
     if not differ:
         return None, ()

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from msgspec import Meta
 from scipy.spatial.transform import Rotation
 
 from px4fuse.arrays import Array, BoolArray, IntArray
 from px4fuse.display import Shown
+from px4fuse.record import Count, Record
 
 # What made it; "slam" is a system whose world is its first key frame (ORB-SLAM3 and the like)
 Kind = Literal["vio", "ekf2", "kf", "truth", "slam", "unknown"]
@@ -24,6 +26,30 @@ AXES_OF_FRAME: Mapping[Frame, tuple[str, str, str]] = {
     "camera": ("right", "down", "forward"),
     "unknown": ("x", "y", "z"),
 }
+
+
+# A vector by the names of a frame's axes
+AxisLengths = Annotated[dict[str, float], Meta(min_length=3, max_length=3)]
+
+
+def by_axis(frame: Frame, vector_m: Array) -> dict[str, float]:
+    """A vector by the names of the axes."""
+    return dict(zip(AXES_OF_FRAME[frame], vector_m.tolist(), strict=True))
+
+
+class Track(Record, frozen=True):
+    """A trajectory as results name it, and the file that it was read from."""
+
+    name: str
+    sha256: Annotated[str, Meta(pattern="^([0-9a-f]{64})?$")]
+    size_bytes: Count
+    kind: Kind
+    frame: Frame
+    poses: Count
+    start_s: float
+    end_s: float
+    orientations: bool
+    notes: tuple[str, ...]
 
 
 @dataclass(frozen=True, repr=False)
@@ -83,14 +109,11 @@ class Trajectory(Shown):
         ----------
         chosen : slice, boolean array of shape (n,), or integer array
         """
-        return replace(
-            self,
-            time_s=self.time_s[chosen],
-            position_m=self.position_m[chosen],
-            rotation=None if self.rotation is None else self.rotation[chosen],
-            position_variance_m2=_some(self.position_variance_m2, chosen),
-            rotation_variance_rad2=_some(self.rotation_variance_rad2, chosen),
-        )
+        every = ("time_s", "position_m", "rotation", "position_variance_m2",
+                 "rotation_variance_rad2")  # fmt: skip
+        known: dict[str, Any] = {name: getattr(self, name) for name in every}
+        some = {name: values[chosen] for name, values in known.items() if values is not None}
+        return replace(self, **some)
 
     def moved(self, position_m: Array, rotation: Rotation | None) -> Trajectory:
         """The same poses elsewhere, of which no reported variance holds any longer."""
@@ -102,9 +125,20 @@ class Trajectory(Shown):
             rotation_variance_rad2=None,
         )
 
-
-def _some(values: Array | None, chosen: slice | BoolArray | IntArray) -> Array | None:
-    return None if values is None else values[chosen]
+    def track(self) -> Track:
+        """What results say about it."""
+        return Track(
+            name=self.name,
+            sha256=self.sha256,
+            size_bytes=self.size_bytes,
+            kind=self.kind,
+            frame=self.frame,
+            poses=len(self),
+            start_s=float(self.time_s[0]),
+            end_s=float(self.time_s[-1]),
+            orientations=self.rotation is not None,
+            notes=self.notes,
+        )
 
 
 def cumulative_distance(position_m: Array) -> Array:

@@ -1,7 +1,7 @@
 """Offset between the clocks of two recordings of one motion: every lag, then least squares.
 
 One search serves trajectories here, and a position file against EKF2 or the IMU in
-:mod:`px4fuse.placing.fitting`: both series are correlated over all lags (:mod:`correlation`), the
+:mod:`px4fuse.alignment.fitting`: both series are correlated over all lags (:mod:`correlation`), the
 best is refined by least squares, and is refused where another lag's residual is within
 :data:`RIVAL_RATIO` of it. What differs is what is known. Trajectories may have any frame and scale,
 so their speeds are correlated and a free similarity is refined; a position file is in metres with z
@@ -22,7 +22,7 @@ from scipy.special import stdtrit
 
 from px4fuse.arrays import Array, BoolArray
 from px4fuse.record import Record, Span
-from px4fuse.trajectory.alignment import Transform, umeyama
+from px4fuse.trajectory.alignment import Transform, rms_m, umeyama
 from px4fuse.trajectory.association import bracketed, gap_limit, positions_at
 from px4fuse.trajectory.correlation import autocovariance, moments
 from px4fuse.trajectory.model import MIN_POSES, Trajectory
@@ -94,14 +94,11 @@ def estimate_time_offset(estimate: Trajectory, reference: Trajectory) -> TimeOff
         Not determinable where nothing moves, where the speed is constant along a line or a circle
         (a shift in time is then one in space), or where other offsets fit as well.
     """
-    start = clock_difference(estimate, reference)
     # what is interpolated should be the denser of the two
-    is_swapped = _median_step(estimate) < _median_step(reference)
-    sparse, dense = (reference, estimate) if is_swapped else (estimate, reference)
-    if start is not None and is_swapped:
-        start = -start
-    found = _search(sparse, dense, start)
-    if found.offset_s is None or found.interval_s is None or not is_swapped:
+    if _median_step(estimate) >= _median_step(reference):
+        return _search(estimate, reference)
+    found = _search(reference, estimate)
+    if found.offset_s is None or found.interval_s is None:
         return found
     low, high = found.interval_s
     return structs.replace(found, offset_s=-found.offset_s, interval_s=(-high, -low))
@@ -111,9 +108,10 @@ def _median_step(trajectory: Trajectory) -> float:
     return float(np.median(np.diff(trajectory.time_s)))
 
 
-def _search(sparse: Trajectory, dense: Trajectory, start_s: float | None) -> TimeOffset:
+def _search(sparse: Trajectory, dense: Trajectory) -> TimeOffset:
     """Offset that must be added to the sparse one's stamps."""
-    candidates = _candidates(sparse, dense, start_s)
+    start_s = clock_difference(sparse, dense)
+    candidates = ([] if start_s is None else [start_s]) + _candidates(sparse, dense)
     if not candidates:
         return _unknown(
             "the speeds of the two do not resemble each other at any offset (nothing moves, the "
@@ -125,45 +123,35 @@ def _search(sparse: Trajectory, dense: Trajectory, start_s: float | None) -> Tim
     if not fits:
         return _unknown("where speeds resemble each other, positions do not, or too few overlap")
     best = fits[0]
+    alike = [fit for fit in fits if fit.misfit <= RIVAL_RATIO * best.misfit]
+    apart = [fit for fit in alike if abs(fit.offset_s - best.offset_s) > APART_S]
     if start_s is not None:
         # clocks that are set decide between offsets that fit alike
-        alike = [fit for fit in fits if fit.misfit <= RIVAL_RATIO * best.misfit]
         best = min(alike, key=lambda fit: abs(fit.offset_s - start_s))
-    else:
-        rivals = [fit for fit in fits if abs(fit.offset_s - best.offset_s) > APART_S]
-        if rivals and rivals[0].misfit <= RIVAL_RATIO * best.misfit:
-            apart = rivals[0].offset_s - best.offset_s
-            return _unknown(
-                f"the motion repeats itself: {abs(apart):.1f} s further the ATE is "
-                f"{rivals[0].rms_m:.3g} m instead of {best.rms_m:.3g} m"
-            )
+    elif apart:
+        return _unknown(
+            f"the motion repeats itself: {abs(apart[0].offset_s - best.offset_s):.1f} s further "
+            f"the ATE is {apart[0].rms_m:.3g} m instead of {best.rms_m:.3g} m"
+        )
     # again with the poses that are known around the offset, not around the candidate
     best = _refine(sparse, dense, best.offset_s, FINE_WINDOW_S) or best
-    half = best.half_interval()
+    half = _half_interval(sparse, dense, best)
     if not half <= MAX_HALF_INTERVAL_S:
         return _unknown(
             "the speed hardly changes: a shift in time is as good as one in space"
             + (f" (95 %: ±{half:.2g} s)" if np.isfinite(half) else "")
         )
-    interval = (best.offset_s - half, best.offset_s + half)
-    reason = (
-        f"Speeds correlated over all lags, then the least ATE ({best.rms_m:.3g} m after a free "
-        f"similarity, {len(best.time_s)} poses)."
+    return TimeOffset(
+        offset_s=best.offset_s,
+        interval_s=(best.offset_s - half, best.offset_s + half),
+        determinable=True,
+        reason=f"Speeds correlated over all lags, then the least ATE ({best.rms_m:.3g} m after a "
+        f"free similarity, {len(best.time_s)} poses).",
     )
-    return TimeOffset(offset_s=best.offset_s, interval_s=interval, determinable=True, reason=reason)
 
 
 def _unknown(why: str) -> TimeOffset:
     return TimeOffset(determinable=False, reason=f"The time offset is not determinable: {why}.")
-
-
-@dataclass(frozen=True)
-class _Speeds:
-    """Speeds on a regular grid, each scaled to variance 1, and where they are known."""
-
-    start_s: float
-    values: tuple[Array, ...]
-    known: BoolArray
 
 
 def _grid_velocity(trajectory: Trajectory, step_s: float) -> tuple[Array, Array]:
@@ -183,62 +171,48 @@ def _velocity(trajectory: Trajectory, time_s: Array) -> Array:
     return np.stack(columns, axis=1)
 
 
-def _speeds(trajectory: Trajectory, step_s: float, with_rotation: bool) -> _Speeds:
-    """Speed (and angular speed) on a grid from its first stamp on."""
+def _speeds(trajectory: Trajectory, step_s: float) -> tuple[list[Array], BoolArray]:
+    """Speed, and angular speed where there is one, on a grid, and where they are known."""
     time = trajectory.time_s
     grid, velocity = _grid_velocity(trajectory, step_s)
     # key frames are interpolated too, tracking that is lost is not
     known = bracketed(grid, time, max(10.0 * _median_step(trajectory), 0.5))
-    values = [np.linalg.norm(velocity, axis=1)]
-    if with_rotation and trajectory.rotation is not None:
+    speeds = [np.linalg.norm(velocity, axis=1)]
+    if trajectory.rotation is not None:
         turned = Slerp(time, trajectory.rotation)(grid)
         rates = (turned[:-1].inv() * turned[1:]).as_rotvec() / step_s
         rates = np.concatenate((rates, rates[-1:]))
         sigma = max(SMOOTHING_S, _median_step(trajectory)) / step_s
-        values.append(np.linalg.norm(gaussian_filter1d(rates, sigma, axis=0), axis=1))
-    return _Speeds(float(time[0]), tuple(values), known)
+        speeds.append(np.linalg.norm(gaussian_filter1d(rates, sigma, axis=0), axis=1))
+    return speeds, known
 
 
-def _candidates(sparse: Trajectory, dense: Trajectory, start_s: float | None) -> list[float]:
-    """Offsets at which speeds correlate, best first, and the start where there is one."""
+def _candidates(sparse: Trajectory, dense: Trajectory) -> list[float]:
+    """Offsets at which speeds correlate, best first (Padfield 2012, eqs. 3 to 9)."""
     spans = [float(one.time_s[-1] - one.time_s[0]) for one in (sparse, dense)]
     step = max(STEP_S, max(spans) / MAX_SAMPLES)
     if min(spans) < 10 * step:
-        return [] if start_s is None else [start_s]
-    with_rotation = sparse.rotation is not None and dense.rotation is not None
-    x, y = (_speeds(one, step, with_rotation) for one in (sparse, dense))
+        return []
+    (x, x_known), (y, y_known) = (_speeds(one, step) for one in (sparse, dense))
     needed = max(MIN_OVERLAP_S, MIN_OVERLAP_SHARE * min(spans)) / step
     needed = min(needed, 0.5 * min(spans) / step)
-    each = [
-        _correlation(a, b, x.known, y.known, needed)
-        for a, b in zip(x.values, y.values, strict=True)
-    ]
+    each = []
+    for a, b in zip(x, y, strict=False):  # angular speeds where both have them
+        found = moments(a, b, x_known, y_known)
+        # a stretch at rest correlates with anything once its variance is rounding
+        usable = found.count >= needed
+        for values, known, power in ((a, x_known, found.power_a), (b, y_known, found.power_b)):
+            whole = float(np.var(values[known])) * np.count_nonzero(known)
+            usable &= power > 1e-3 * whole / len(values) * found.count
+        scale = np.sqrt(np.where(usable, found.power_a * found.power_b, 1.0))
+        each.append(np.where(usable, found.covariance.real / scale, 0.0))
     total = np.mean(each, axis=0)
-    peaks = (total == maximum_filter1d(total, round(2 * APART_S / step) + 1)) & (
-        total > MIN_CORRELATION
-    )
-    order = np.flatnonzero(peaks)
+    highest = maximum_filter1d(total, round(2 * APART_S / step) + 1)
+    order = np.flatnonzero((total == highest) & (total > MIN_CORRELATION))
     order = order[np.argsort(-total[order])][:CANDIDATES]
     # index k: the sparse one's first sample is at the dense one's sample k - (n - 1)
-    lags = (order - (len(x.known) - 1)) * step + y.start_s - x.start_s
-    return [*([] if start_s is None else [start_s]), *lags.tolist()]
-
-
-def _correlation(
-    a: Array, b: Array, a_known: BoolArray, b_known: BoolArray, needed: float
-) -> Array:
-    """Correlation coefficient at every lag over the samples known in both; 0 where too few are.
-
-    Padfield (2012), eqs. 3 to 9.
-    """
-    found = moments(a, b, a_known, b_known)
-    # a stretch at rest correlates with anything once its variance is rounding
-    usable = found.count >= needed
-    for values, known, power in ((a, a_known, found.power_a), (b, b_known, found.power_b)):
-        whole = float(np.var(values[known])) * np.count_nonzero(known)
-        usable &= power > 1e-3 * whole / len(values) * found.count
-    scale = np.sqrt(np.where(usable, found.power_a * found.power_b, 1.0))
-    return np.where(usable, found.covariance.real / scale, 0.0)
+    lags = (order - (len(x_known) - 1)) * step + float(dense.time_s[0]) - float(sparse.time_s[0])
+    return list(lags.tolist())
 
 
 @dataclass(frozen=True)
@@ -247,64 +221,65 @@ class _OffsetFit:
 
     Attributes
     ----------
-    offset_s, rms_m : float
+    offset_s : float
+    transform : Transform
+        From the sparse one to the dense one.
     time_s : ndarray, shape (n,)
-        Of the sparse one.
-    position_m, left_m : ndarray, shape (n, 3)
-        Aligned position of the sparse one, and what is left to the dense one.
-    velocity_m_s, other_m_s : ndarray, shape (n, 3)
-        Of the dense one, and of the sparse one as aligned.
+        Of the sparse one's poses that were used.
+    aligned_m, target_m : ndarray, shape (n, 3)
+        Positions of the sparse one as aligned, and of the dense one.
     """
 
     offset_s: float
-    rms_m: float
+    transform: Transform
     time_s: Array
-    position_m: Array
-    left_m: Array
-    velocity_m_s: Array
-    other_m_s: Array
+    aligned_m: Array
+    target_m: Array
+
+    @property
+    def rms_m(self) -> float:
+        """RMS of what is left."""
+        return rms_m(self.target_m - self.aligned_m)
 
     @property
     def misfit(self) -> float:
         """RMS of what is left over that of the motion: fits of a part do not win by moving less."""
         # of the target: an estimate that does not follow is scaled to a point
-        extent = float(np.sqrt((self.position_m + self.left_m).var(axis=0).sum()))
+        extent = float(np.sqrt(self.target_m.var(axis=0).sum()))
         return max(self.rms_m / extent, MIN_MISFIT) if extent > 0.0 else float("inf")
 
-    def half_interval(self) -> float:
-        """Half of the 95 % interval (s); infinite where a shift in space does as well."""
-        n = len(self.time_s)
-        # what the similarity cannot take over of a shift in time: shifts, small turns, scale
-        centred = self.position_m - self.position_m.mean(axis=0)
-        columns = [np.tile(axis, (n, 1)) for axis in np.eye(3)]
-        columns += [np.cross(axis, centred) for axis in np.eye(3)]
-        absorbed = np.stack([*columns, centred], axis=-1).reshape(3 * n, 7)
-        both = np.stack((self.velocity_m_s, self.other_m_s), axis=-1).reshape(3 * n, 2)
-        both = both - absorbed @ np.linalg.lstsq(absorbed, both, rcond=None)[0]
-        information, other = (float(power) for power in (both * both).sum(axis=0))
-        agreed = float(both[:, 0] @ both[:, 1])
-        moved = float((self.velocity_m_s**2).sum())
-        if information <= MIN_FREE_SHARE**2 * moved or agreed <= MIN_FREE_CORRELATION * np.sqrt(
-            information * other
-        ):
-            return float("inf")
-        free = both[:, 0].reshape(n, 3)
-        score = (free * self.left_m).sum(axis=1)
-        # weights that fall to zero must not do so within the correlation
-        lags = min(max(1, WINDOW_LENGTHS * _correlation_length(score)), n // 4)
-        weights = 1.0 - np.arange(1, lags + 1) / (lags + 1.0)
-        products = [float(score[k:] @ score[:-k]) for k in range(1, lags + 1)]
-        variance = max(float(score @ score) + 2.0 * float(weights @ products), 0.0)
-        variance = max(variance, float(score @ score))
-        runs = max(n / lags - 1.0, 1.0)
-        quantile = float(stdtrit(runs, 0.5 + LEVEL / 2.0))
-        return quantile * float(np.sqrt(variance)) / information
+
+def _half_interval(sparse: Trajectory, dense: Trajectory, fit: _OffsetFit) -> float:
+    """Half of the 95 % interval (s); infinite where a shift in space does as well."""
+    n, centred = len(fit.time_s), fit.aligned_m - fit.aligned_m.mean(axis=0)
+    velocity = _velocity(dense, fit.time_s + fit.offset_s)
+    other = fit.transform.rotation.apply(fit.transform.scale * _velocity(sparse, fit.time_s))
+    # what the similarity cannot take over of a shift in time: shifts, small turns, scale
+    columns = [np.tile(axis, (n, 1)) for axis in np.eye(3)]
+    columns += [np.cross(axis, centred) for axis in np.eye(3)]
+    absorbed = np.stack([*columns, centred], axis=-1).reshape(3 * n, 7)
+    both = np.stack((velocity, other), axis=-1).reshape(3 * n, 2)
+    both = both - absorbed @ np.linalg.lstsq(absorbed, both, rcond=None)[0]
+    (information, agreed), (_, other_information) = (both.T @ both).tolist()
+    if (
+        information <= MIN_FREE_SHARE**2 * float((velocity**2).sum())
+        or agreed <= MIN_FREE_CORRELATION * (information * other_information) ** 0.5
+    ):
+        return float("inf")
+    score = (both[:, 0].reshape(n, 3) * (fit.target_m - fit.aligned_m)).sum(axis=1)
+    # weights that fall to zero must not do so within the correlation
+    lags = min(max(1, WINDOW_LENGTHS * _correlation_length(score)), n // 4)
+    weights = 1.0 - np.arange(1, lags + 1) / (lags + 1.0)
+    products = [float(score[k:] @ score[:-k]) for k in range(1, lags + 1)]
+    alone = float(score @ score)
+    variance = max(alone + 2.0 * float(weights @ products), alone)
+    quantile = float(stdtrit(max(n / lags - 1.0, 1.0), 0.5 + LEVEL / 2.0))
+    return float(quantile * np.sqrt(variance) / information)
 
 
 def _correlation_length(values: Array) -> int:
     """First lag at which the autocorrelation is below 1/e, at most a quarter of them."""
-    centred = values - values.mean()
-    full = autocovariance(centred)
+    full = autocovariance(values - values.mean())
     below = np.flatnonzero(full < full[0] / np.e)
     return int(below[0]) if len(below) else len(values) // 4
 
@@ -325,30 +300,18 @@ def _refine(
     chosen = chosen[:: -(-len(chosen) // MAX_POSES)]
     time, position = time[chosen], sparse.position_m[chosen]
 
-    def aligned(shift_s: float) -> tuple[Transform, Array]:
+    def at(shift_s: float) -> _OffsetFit:
         target = positions_at(dense, time + (lag_s + shift_s))
         # the similarity acts on the sparse one: acting on the target, its scale could fall to zero
-        return umeyama(position, target, with_scale=True), target
+        transform = umeyama(position, target, with_scale=True)
+        return _OffsetFit(lag_s + shift_s, transform, time, transform.apply(position), target)
 
     def cost(shift_s: float) -> float:
-        transform, target = aligned(shift_s)
-        left = target - transform.apply(position)
-        return float((left * left).sum())
+        fit = at(shift_s)
+        return float(((fit.target_m - fit.aligned_m) ** 2).sum())
 
     # over the shift, not the offset: beside a difference of 50 years tolerances are seconds
     grid = window_s * np.linspace(-1.0, 1.0, 21)
     best = int(np.argmin([cost(shift) for shift in grid]))
     bracket = (grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)])
-    shift = float(minimize_scalar(cost, bounds=bracket, method="bounded").x)
-    offset = lag_s + shift
-    transform, target = aligned(shift)
-    left = target - transform.apply(position)
-    return _OffsetFit(
-        offset_s=offset,
-        rms_m=float(np.sqrt((left * left).sum(axis=1).mean())),
-        time_s=time,
-        position_m=transform.apply(position),
-        left_m=left,
-        velocity_m_s=_velocity(dense, time + offset),
-        other_m_s=transform.rotation.apply(transform.scale * _velocity(sparse, time)),
-    )
+    return at(float(minimize_scalar(cost, bounds=bracket, method="bounded").x))

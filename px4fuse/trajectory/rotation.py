@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from px4fuse.arrays import Array
 
 
 def multiply(a: Array, b: Array) -> Array:

@@ -251,35 +251,27 @@ def relative_error(
     what = f"RPE over {delta}"
     both = rotations_of(aligned, reference, what)
     if not isinstance(both, Unavailable) and not len(start):
-        reason = f"no two poses are {delta} apart"
-        both = Unavailable(what, reason, "Ask for another delta.")
+        both = Unavailable(what, f"no two poses are {delta} apart", "Ask for another delta.")
+    scores: tuple[Maybe[Statistics], Maybe[Interval], Maybe[Statistics]]
     if isinstance(both, Unavailable):
-        none, empty = np.empty(0, dtype=np.intp), np.empty(0)
-        return PairwiseError(
-            delta.value, delta.unit, all_pairs, pairs_from, both, both, both,
-            start=none, end=none, translation_error_m=empty, rotation_error_deg=empty,
-        )  # fmt: skip
-    p, q = (rotation[start].inv() for rotation in both)
-    p_move = p.apply(aligned.position_m[end] - aligned.position_m[start])
-    q_move = q.apply(reference.position_m[end] - reference.position_m[start])
-    # the outer rotation of E turns its translation but does not change its length
-    translation = np.linalg.norm(p_move - q_move, axis=1)
-    p_turn, q_turn = p * both[0][end], q * both[1][end]
-    rotation = np.degrees((q_turn.inv() * p_turn).magnitude())
-    overlap = int(np.median(end - start)) if all_pairs else 1
+        start = end = np.empty(0, dtype=np.intp)
+        translation = rotation = np.empty(0)
+        scores = both, both, both
+    else:
+        p, q = (one[start].inv() for one in both)
+        p_move = p.apply(aligned.position_m[end] - aligned.position_m[start])
+        q_move = q.apply(reference.position_m[end] - reference.position_m[start])
+        # the outer rotation of E turns its translation but does not change its length
+        translation = np.linalg.norm(p_move - q_move, axis=1)
+        p_turn, q_turn = p * both[0][end], q * both[1][end]
+        rotation = np.degrees((q_turn.inv() * p_turn).magnitude())
+        overlap = int(np.median(end - start)) if all_pairs else 1
+        interval = rmse_interval(translation, what, min_block=overlap)
+        scores = statistics(translation), interval, statistics(rotation)
     return PairwiseError(
-        delta=delta.value,
-        unit=delta.unit,
-        all_pairs=all_pairs,
-        pairs_from=pairs_from,
-        translation_m=statistics(translation),
-        interval_m=rmse_interval(translation, what, min_block=overlap),
-        rotation_deg=statistics(rotation),
-        start=start,
-        end=end,
-        translation_error_m=translation,
-        rotation_error_deg=rotation,
-    )
+        delta.value, delta.unit, all_pairs, pairs_from, *scores,
+        start=start, end=end, translation_error_m=translation, rotation_error_deg=rotation,
+    )  # fmt: skip
 
 
 def rotations_of(

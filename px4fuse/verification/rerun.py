@@ -35,6 +35,14 @@ _Place = Callable[[str, str | None, str], Path]
 _WINDOWS = re.compile(r'[<>:"|?*]|^(?:con|prn|aux|nul|com\d|lpt\d)(?:\.|$)|[. ]$', re.IGNORECASE)
 
 
+class FileMissingError(ResultsError):
+    """A file that a report rests on is not among those given; ``missing`` is what it is called."""
+
+    def __init__(self, text: str, missing: str) -> None:
+        super().__init__(text)
+        self.missing = missing
+
+
 @dataclass(frozen=True)
 class Recomputed:
     """What the analysis gives now.
@@ -54,6 +62,12 @@ class Recomputed:
 def log_sha256(results: Reported) -> str:
     """SHA-256 of the log that a report is about."""
     return results.track.sha256 if isinstance(results, LoopResults) else results.log.sha256
+
+
+def log_name(results: Reported) -> str:
+    """Name of the log that a report is about, as the report gives it."""
+    loop = isinstance(results, LoopResults)
+    return split_part(results.track.name)[0] if loop else results.log.name  # type: ignore[union-attr]
 
 
 def recompute(results: Reported, logs: Mapping[str, Path]) -> Recomputed | Refused:
@@ -85,7 +99,7 @@ def recompute(results: Reported, logs: Mapping[str, Path]) -> Recomputed | Refus
     except SettingsError as error:  # no run with these settings can have made a report
         return Refused(f"{NOT_OURS}: {error}", ASK)
     except ResultsError as error:
-        return Refused(str(error), error.remedy)
+        return Refused(str(error), error.remedy, getattr(error, "missing", ""))
     except Px4FuseError as error:
         return Refused(str(error), ASK)
     except Exception as error:  # noqa: BLE001 - settings made to fail may fail anywhere
@@ -102,10 +116,8 @@ def _place(
     """
     path = None if sha256 is None else logs.get(sha256)
     if path is None:
-        raise ResultsError(
-            f"none of the files given has the SHA-256 of {what}",
-            f"Add {one_line(recorded, 80)} to --logs.",
-        )
+        asked = f"none of the files given has the SHA-256 of {what}"
+        raise FileMissingError(asked, one_line(recorded, 80) or "its file")
     name = recorded
     plain = name == Path(name).name and "\\" not in name and name.isprintable()
     if not plain or len(name.encode(errors="replace")) > MAX_NAME_BYTES:

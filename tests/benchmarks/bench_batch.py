@@ -55,12 +55,12 @@ def main(count: int, workers: int) -> None:
             if what.startswith("comparing") and done % max(1, of // 10) == 0:
                 memory.append(here.memory_info().rss / 1e6)
 
-        with connected(workers=workers) as client:
-            run(logs[:WARM], Path(scratch, "warm"), request, client)
+        with connected(workers=workers):  # of the session, which every run takes
+            run([log.address for log in logs[:WARM]], Path(scratch, "warm"))
             everyone = [here, *here.children(recursive=True)]
             cpu = sum(sum(process.cpu_times()[:2]) for process in everyone)
             begun = time.perf_counter()
-            run(logs, Path(scratch, "out"), request, client, progress=look)
+            run([str(folder)], Path(scratch, "out"), progress=look)
             many_s = time.perf_counter() - begun
             many_cpu_s = sum(sum(process.cpu_times()[:2]) for process in everyone) - cpu
     print(f"one process: {one_s:.1f} s, {one_cpu_s / count:.2f} s of CPU per log")

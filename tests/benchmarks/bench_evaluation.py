@@ -51,8 +51,8 @@ def main() -> None:
         size = path.stat().st_size / 1e6
         took = seconds(lambda: read_trajectory(path))
         print(f"read 20,000 poses, {size:.1f} MB       {took:7.3f} s")
-    matched = associate(estimate, reference)
-    error = np.linalg.norm(matched.estimate.position_m - matched.reference.position_m, axis=1)
+    x, y, _ = associate(estimate, reference)
+    error = np.linalg.norm(x.position_m - y.position_m, axis=1)
     for words, work in (
         ("write 120,000 poses", lambda: tum_text(reference)),
         ("associate 18,000 with 120,000", lambda: associate(estimate, reference)),

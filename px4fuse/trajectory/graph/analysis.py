@@ -9,9 +9,10 @@ import numpy as np
 
 from px4fuse.errors import TrajectoryError
 from px4fuse.flight import Unavailable
+from px4fuse.record import Count, Record
 from px4fuse.trajectory.graph.covariance import GateResult, gate
 from px4fuse.trajectory.graph.model import PoseGraph
-from px4fuse.trajectory.graph.solver import Solution, solve
+from px4fuse.trajectory.graph.solver import GraphSolution, Solution, solve
 
 MANY_CLOSURES = 1000
 # Chance that the gate rejects a closure that is true
@@ -23,6 +24,18 @@ SOLUTIONS: Mapping[str, str] = {
     "dcs": "pose graph, DCS",
     "gnc": "pose graph, GNC",
 }
+
+
+class Graph(Record, frozen=True):
+    """A pose graph from a file, its closures and its solutions, as results have them."""
+
+    name: str
+    dimension: Count
+    poses: Count
+    edges: Count
+    initialised: str
+    gates: tuple[GateResult, ...] | Unavailable
+    solutions: dict[str, GraphSolution]
 
 
 @dataclass(frozen=True)

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from scipy.special import chdtrc
 
 from px4fuse.arrays import Array, IntArray
 from px4fuse.errors import TrajectoryError
+from px4fuse.record import Count, NotNegative, Record, Share
 from px4fuse.trajectory.graph import lie
 from px4fuse.trajectory.graph.model import (
     PoseGraph,
@@ -22,14 +22,13 @@ from px4fuse.trajectory.graph.model import (
 _SINGULAR = 1e-13
 
 
-@dataclass(frozen=True)
-class GateResult:
+class GateResult(Record, frozen=True):
     """What odometry alone says to a closure.
 
     Attributes
     ----------
-    edge : int
-        Its place in the graph.
+    first, second : int
+        Its ends, by the vertex numbers of the file.
     d2 : float
         Squared Mahalanobis distance of the closure from the relative pose by odometry.
     degrees_of_freedom : int
@@ -40,10 +39,11 @@ class GateResult:
         Whether p is at least alpha.
     """
 
-    edge: int
-    d2: float
-    degrees_of_freedom: int
-    p: float
+    first: int
+    second: int
+    d2: NotNegative
+    degrees_of_freedom: Count
+    p: Share
     accepted: bool
 
 
@@ -102,12 +102,13 @@ def gate(
 def _tested(
     graph: PoseGraph, edge: int, residual: Array, covariance: Array, alpha: float
 ) -> GateResult:
+    ends = int(graph.ids[graph.first[edge]]), int(graph.ids[graph.second[edge]])
     directions, variance = observed_directions(graph.information[edge])
     freedom = len(variance)
     if not freedom:
         raise TrajectoryError(
-            f"The closure from vertex {graph.ids[graph.first[edge]]} to "
-            f"{graph.ids[graph.second[edge]]} has no information. Give its inverse covariance."
+            f"The closure from vertex {ends[0]} to {ends[1]} has no information. Give its inverse "
+            "covariance."
         )
     seen = directions.T @ residual
     spread = directions.T @ covariance @ directions + np.diag(variance)
@@ -116,13 +117,13 @@ def _tested(
     sigma = np.sqrt(scale, where=scale > 0.0, out=np.ones_like(scale))
     if not sound or np.linalg.eigvalsh(spread / np.outer(sigma, sigma))[0] <= _SINGULAR:
         raise TrajectoryError(
-            f"Odometry between vertices {graph.ids[graph.first[edge]]} and "
-            f"{graph.ids[graph.second[edge]]} is too uncertain to test the closure with the digits "
-            "that numbers have. Give its edges information that is closer to the closure's."
+            f"Odometry between vertices {ends[0]} and {ends[1]} is too uncertain to test the "
+            "closure with the digits that numbers have. Give its edges information that is closer "
+            "to the closure's."
         )
     d2 = float(seen @ np.linalg.solve(spread, seen))
     p = float(chdtrc(freedom, d2))
-    return GateResult(edge, d2, freedom, p, p >= alpha)
+    return GateResult(*ends, d2, freedom, p, p >= alpha)
 
 
 def _dead_reckoning(graph: PoseGraph, low: int, high: int, chain: IntArray) -> tuple[Array, Array]:

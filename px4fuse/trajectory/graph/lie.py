@@ -14,7 +14,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.polynomial.polynomial import polyval
 
-from px4fuse.arrays import Array, BoolArray
+from px4fuse.arrays import Array
+from px4fuse.trajectory.rotation import matrix, skew
 
 # Below this angle (rad) series replace quotients that cancel; five terms then reach 1e-14
 SMALL = 0.3
@@ -22,24 +23,6 @@ _B = (1 / 6, -1 / 120, 1 / 5040, -1 / 362880, 1 / 39916800)
 
 _C = (1 / 12, 1 / 720, 1 / 30240, 1 / 1209600, 1 / 47900160)
 _C_SLOPE = (1 / 360, 1 / 7560, 1 / 201600, 1 / 5987520, 691 / 130767436800)
-
-
-def skew(vector: Array) -> Array:
-    """Matrix of the cross product with a vector.
-
-    Parameters
-    ----------
-    vector : ndarray, shape (..., 3)
-
-    Returns
-    -------
-    ndarray, shape (..., 3, 3)
-    """
-    made = np.zeros((*vector.shape, 3))
-    x, y, z = vector[..., 0], vector[..., 1], vector[..., 2]
-    made[..., 0, 1], made[..., 0, 2], made[..., 1, 2] = -z, y, -x
-    made[..., 1, 0], made[..., 2, 0], made[..., 2, 1] = z, -y, x
-    return made
 
 
 def wrap(angle: Array) -> Array:
@@ -72,12 +55,7 @@ def rotation_matrix(pose: Array) -> Array:
     if pose.shape[-1] == 3:
         c, s = np.cos(pose[..., 2]), np.sin(pose[..., 2])
         return _matrix((c, -s), (s, c))
-    x, y, z, w = (pose[..., k] for k in range(3, 7))
-    return _matrix(
-        (1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)),
-        (2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)),
-        (2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)),
-    )
+    return matrix(pose[..., (6, 3, 4, 5)])
 
 
 def identity(width: int) -> Array:
@@ -213,9 +191,11 @@ def right_jacobian_inverse(tangent: Array) -> Array:
     """
     if tangent.shape[-1] == 3:
         theta = tangent[..., 2]
-        half, column = 0.5 * theta, _plane_column(tangent)
-        a = 1.0 - theta * theta * _c(np.abs(theta))
-        x, y = column[..., 0], column[..., 1]
+        half, a = 0.5 * theta, 1.0 - theta * theta * _c(np.abs(theta))
+        # how the position that exp(xi) reaches, in its own axes, moves with the rotation
+        even, odd = theta * _b(np.abs(theta)), _a(np.abs(theta))
+        x = even * tangent[..., 0] - odd * tangent[..., 1]
+        y = odd * tangent[..., 0] + even * tangent[..., 1]
         return _matrix((a, -half, half * y - a * x), (half, a, -half * x - a * y), (0.0, 0.0, 1.0))
     rho, phi = tangent[..., :3], tangent[..., 3:]
     theta = np.linalg.norm(phi, axis=-1)[..., None, None]
@@ -223,11 +203,11 @@ def right_jacobian_inverse(tangent: Array) -> Array:
     hat = skew(phi)
     square = _outer(phi, phi) - theta * theta * np.eye(3)
     c = _c(theta)
+    product = _outer(rho, phi)
+    both = product + np.swapaxes(product, -1, -2) - 2.0 * dot * np.eye(3)  # phi^ rho^ + rho^ phi^
     made = np.zeros((*tangent.shape, 6))
     made[..., :3, :3] = made[..., 3:, 3:] = np.eye(3) + 0.5 * hat + c * square
-    made[..., :3, 3:] = (
-        0.5 * skew(rho) + c * _both(rho, phi, dot) + (dot * _c_slope(theta)) * square
-    )
+    made[..., :3, 3:] = 0.5 * skew(rho) + c * both + (dot * _c_slope(theta)) * square
     return made
 
 
@@ -267,20 +247,6 @@ def _outer(a: Array, b: Array) -> Array:
     return made
 
 
-def _both(rho: Array, phi: Array, dot: Array) -> Array:
-    """Cross-product matrices: phi^ rho^ + rho^ phi^."""
-    product = _outer(rho, phi)
-    return product + np.swapaxes(product, -1, -2) - 2.0 * dot * np.eye(3)
-
-
-def _plane_column(tangent: Array) -> Array:
-    """How the position that exp(xi) reaches, in its own axes, moves with the rotation."""
-    x, y, theta = tangent[..., 0], tangent[..., 1], tangent[..., 2]
-    even = theta * _b(np.abs(theta))
-    odd = _a(np.abs(theta))
-    return np.stack([even * x - odd * y, odd * x + even * y], axis=-1)
-
-
 def _rotate(quaternion: Array, vector: Array) -> Array:
     axis = quaternion[..., :3]
     twice = 2.0 * cross(axis, vector)
@@ -304,25 +270,21 @@ def _a(theta: Array) -> Array:
 
 def _b(theta: Array) -> Array:
     """(theta - sin theta) / theta^3."""
-    small, t = _split(theta)
-    return np.where(small, polyval(theta * theta, _B), (t - np.sin(t)) / t**3)
+    t = np.where(theta < SMALL, 1.0, theta)
+    return np.where(theta < SMALL, polyval(theta * theta, _B), (t - np.sin(t)) / t**3)
 
 
 def _c(theta: Array) -> Array:
     """(1 - theta/2 cot(theta/2)) / theta^2."""
-    small, t = _split(theta)
-    return np.where(small, polyval(theta * theta, _C), (1.0 - 0.5 * t / np.tan(0.5 * t)) / t**2)
+    t = np.where(theta < SMALL, 1.0, theta)
+    exact = (1.0 - 0.5 * t / np.tan(0.5 * t)) / t**2
+    return np.where(theta < SMALL, polyval(theta * theta, _C), exact)
 
 
 def _c_slope(theta: Array) -> Array:
     """Derivative of c by theta, over theta."""
-    small, t = _split(theta)
+    t = np.where(theta < SMALL, 1.0, theta)
     g_slope = 0.5 / np.tan(0.5 * t) - 0.25 * t / np.sin(0.5 * t) ** 2
     exact = -(g_slope + 2.0 * (1.0 - 0.5 * t / np.tan(0.5 * t)) / t) / t**3
-    made: Array = np.where(small, polyval(theta * theta, _C_SLOPE), exact)
+    made: Array = np.where(theta < SMALL, polyval(theta * theta, _C_SLOPE), exact)
     return made
-
-
-def _split(theta: Array) -> tuple[BoolArray, Array]:
-    small = theta < SMALL
-    return small, np.where(small, 1.0, theta)

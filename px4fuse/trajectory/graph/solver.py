@@ -13,6 +13,7 @@ from scipy.special import gammaincinv
 from px4fuse.arrays import Array, BoolArray
 from px4fuse.display import brief
 from px4fuse.errors import TrajectoryError
+from px4fuse.record import Count, NotNegative, Record
 from px4fuse.trajectory.graph import lie
 from px4fuse.trajectory.graph.model import PoseGraph, ranks, require_connected
 from px4fuse.trajectory.graph.system import BlockSystem
@@ -39,31 +40,43 @@ _SECOND_LOOKS = 20  # dropped closures, those that fit best first; each costs on
 _TLS_ROUNDS = 20
 
 
-@dataclass(frozen=True)
-class Solution:
+class GraphSolution(Record, frozen=True, kw_only=True):
+    """One solution of a pose graph.
+
+    Attributes
+    ----------
+    cost_initial : float
+        Half the sum of the squared residuals at the graph's own poses, with all weights 1.
+    cost : float
+        Half the sum of the squared residuals times the weights.
+    iterations : int
+        Accepted steps, over all starts and stages.
+    converged : bool
+        False where the iterations ran out, or no step could lower the cost before it was flat.
+    dropped : int
+        Edges of weight below a half.
+    """
+
+    cost_initial: NotNegative
+    cost: NotNegative
+    iterations: Count
+    converged: bool
+    dropped: Count
+
+
+class Solution(GraphSolution, frozen=True, kw_only=True, eq=False):
     """Result of an optimisation.
 
     Attributes
     ----------
     poses : ndarray, shape (n, 3) or (n, 7)
         As in the graph; the first one as it was.
-    cost : float
-        Half the sum of the squared residuals times the weights.
-    initial_cost : float
-        At the graph's own poses, with all weights 1.
-    iterations : int
-        Accepted steps, over all starts and stages.
-    converged : bool
-        False where the iterations ran out, or no step could lower the cost before it was flat.
     weights : ndarray, shape (m,)
         Factors on each edge's information, from 0 (set aside) to 1.
     """
 
+    written_as = GraphSolution
     poses: Array
-    cost: float
-    initial_cost: float
-    iterations: int
-    converged: bool
     weights: Array
 
     __repr__ = brief
@@ -138,8 +151,8 @@ def solve(
         raise ValueError(f"loops has shape {doubtful.shape}, not {graph.first.shape}")
     problem = _GraphProblem(graph)
     start = problem.state(graph.poses)
-    initial_cost = 0.5 * float(np.sum(start.chi2))
-    if not np.isfinite(initial_cost):
+    cost_initial = 0.5 * float(np.sum(start.chi2))
+    if not np.isfinite(cost_initial):
         raise TrajectoryError(
             "The pose graph has a pose or measurement that is not a finite number, or one too "
             "large to square. Correct it, or take the edge out."
@@ -157,9 +170,10 @@ def solve(
     return Solution(
         poses=run.state.poses,
         cost=0.5 * float(np.sum(weights * run.state.chi2)),
-        initial_cost=initial_cost,
+        cost_initial=cost_initial,
         iterations=run.iterations,
         converged=run.converged,
+        dropped=int(np.count_nonzero(weights < 0.5)),
         weights=weights,
     )
 

@@ -35,55 +35,21 @@ class BlockSystem:
     """
 
     def __init__(self, first: IntArray, second: IntArray, poses: int, size: int) -> None:
-        self._size, self._count = size, poses - 1
-        self._slot = np.full(poses, -1, dtype=np.intp)
-        self._slot[1:] = _order(first, second, poses)
-        a, b = self._slot[first], self._slot[second]
-        edges = np.arange(len(a))
-        free_a, free_b = a >= 0, b >= 0
-        free = free_a & free_b & (a != b)
-        # Contributions in the order H_ii, H_jj, H_ij, H_ji of all edges, then empty diagonals
-        m = len(a)
-        row = np.concatenate([a[free_a], b[free_b], a[free], b[free], np.arange(self._count)])
-        column = np.concatenate([a[free_a], b[free_b], b[free], a[free], np.arange(self._count)])
-        source = np.concatenate(
-            [edges[free_a], m + edges[free_b], 2 * m + edges[free], 3 * m + edges[free]]
-        )
-        key, block = np.unique(column * self._count + row, return_inverse=True)
+        self._first, self._second, self._size = first, second, size
+        slot = np.full(poses, -1, dtype=np.intp)
+        slot[1:] = self._slot = _order(first, second, poses)
+        a, b = slot[first], slot[second]
+        # blocks H_ii, H_jj, H_ij, H_ji of all edges, then empty ones on the diagonal
+        row, column = np.concatenate([a, b, a, b]), np.concatenate([a, b, b, a])
+        source = np.flatnonzero((row >= 0) & (column >= 0))  # the pose that is held has none
+        every = np.arange(poses - 1)
+        place = np.append(column[source], every) * (poses - 1) + np.append(row[source], every)
+        key, block = np.unique(place, return_inverse=True)
         self._gather = sparse.csr_array(
-            (np.ones(len(source)), (block[: len(source)], source)), shape=(len(key), 4 * m)
+            (np.ones(len(source)), (block[: len(source)], source)), shape=(len(key), len(row))
         )
-        self._incidence = sparse.csr_array(
-            (
-                np.ones(free_a.sum() + free_b.sum()),
-                (
-                    np.concatenate([a[free_a], b[free_b]]),
-                    np.concatenate([edges[free_a], m + edges[free_b]]),
-                ),
-            ),
-            shape=(self._count, 2 * m),
-        )
-        self._place(key)
-
-    def _place(self, key: IntArray) -> None:
-        """Where each number of each block stands in the compressed columns."""
-        d = self._size
-        column, row = np.divmod(key, self._count)
-        blocks = np.bincount(column, minlength=self._count)
-        start = np.concatenate([[0], np.cumsum(blocks)])
-        within = np.arange(len(key)) - start[column]
-        p, q = np.arange(d)[None, :, None], np.arange(d)[None, None, :]
-        height = (blocks[column] * d)[:, None, None]
-        position = (start[column] * d * d + within * d)[:, None, None] + q * height + p
-        self._order = np.empty(position.size, dtype=np.intp)
-        self._order[position.ravel()] = np.arange(position.size)
-        rows = np.broadcast_to(row[:, None, None] * d + p, position.shape).reshape(-1)
-        self._rows = rows[self._order].astype(np.int32)
-        columns = np.repeat(blocks * d, d)
-        self._starts = np.concatenate([[0], np.cumsum(columns)]).astype(np.int32)
-        diagonal = np.flatnonzero(column == row)
-        here = np.arange(d)
-        self._diagonal = position[diagonal][:, here, here].ravel()
+        columns, self._rows = np.divmod(key, poses - 1)
+        self._starts = np.searchsorted(columns, np.arange(poses))
 
     def matrix(self, ii: Array, jj: Array, ij: Array) -> sparse.csc_array[np.float64]:
         """Sum the blocks of all edges.
@@ -95,9 +61,9 @@ class BlockSystem:
         """
         d = self._size
         blocks = np.concatenate([ii, jj, ij, ij.transpose(0, 2, 1)]).reshape(-1, d * d)
-        data = (self._gather @ blocks).ravel()[self._order]
-        shape = (self._count * d, self._count * d)
-        return sparse.csc_array((data, self._rows, self._starts), shape=shape)
+        summed = (self._gather @ blocks).reshape(-1, d, d).transpose(0, 2, 1)
+        # by columns, which are the rows of the transposed matrix
+        return sparse.bsr_array((summed, self._rows, self._starts)).tocsr().T
 
     def vector(self, i: Array, j: Array) -> Array:
         """Sum the gradients of all edges.
@@ -112,14 +78,10 @@ class BlockSystem:
         ndarray, shape (n, d, ...)
             Zero for the pose that is held.
         """
-        both = np.concatenate([i, j])
-        made: Array = self._incidence @ both.reshape(len(both), -1)
-        return self._unordered(made.reshape(self._count, *i.shape[1:]))
-
-    def _unordered(self, blocks: Array) -> Array:
-        """From the order of elimination to the order of the poses."""
-        made = np.zeros((self._count + 1, *blocks.shape[1:]))
-        made[1:] = blocks[self._slot[1:]]
+        made = np.zeros((len(self._slot) + 1, *i.shape[1:]))
+        np.add.at(made, self._first, i)
+        np.add.at(made, self._second, j)
+        made[0] = 0.0
         return made
 
     def solve(
@@ -141,16 +103,16 @@ class BlockSystem:
         ndarray, shape (n, d, ...), or None
             None where the matrix is singular.
         """
-        data = matrix.data.copy()
-        data[self._diagonal] += damping
-        damped = sparse.csc_array((data, self._rows, self._starts), shape=matrix.shape)
-        ordered = np.empty((self._count, *right.shape[1:]))
-        ordered[self._slot[1:]] = right[1:]
+        damped = matrix.copy()
+        damped.setdiag(matrix.diagonal() + damping)
+        ordered = np.empty(right[1:].shape)
+        ordered[self._slot] = right[1:]
         try:
             solved = factorise(damped, "NATURAL").solve(ordered.reshape(-1, *right.shape[2:]))
         except RuntimeError:
             return None
-        made = self._unordered(solved.reshape(ordered.shape))
+        made = np.zeros(right.shape)
+        made[1:] = solved.reshape(ordered.shape)[self._slot]
         return made if np.all(np.isfinite(made)) else None
 
 

@@ -1,0 +1,243 @@
+"""What was found of a position file's clock and frame, with reasons and warnings."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+import pandas as pd
+
+from px4fuse.alignment.fitting import MIN_CONCORDANCE, capped_rms
+from px4fuse.alignment.matching import GOOD_CONCORDANCE, Match, is_sound, is_turned
+from px4fuse.alignment.tracks import (
+    EKF2_POSITION,
+    IMU,
+    MIN_MOTION_M,
+    MIN_SAMPLES,
+    NoMatchError,
+    continuous_track,
+    placed_samples,
+)
+from px4fuse.flight import Alignment, Flight, Unavailable
+
+if TYPE_CHECKING:
+    from px4fuse.readers.position_csv import PositionRecording
+
+# Another lag whose residual is not larger by this factor can hardly be told apart
+NEAR_RESIDUAL = {EKF2_POSITION: 2.0, IMU: 1.4}  # the IMU's own noise leaves 1.4 to 1.7
+LARGE_CLOCK_SIGMA_S = 0.1
+LARGE_YAW_SIGMA_DEG = 2.0
+MIN_MIRRORED = 0.8  # correlation of the heights below minus which they run against each other
+MAX_UNIX_DIFFERENCE_S = 60.0  # computers in a lab keep time better than this
+
+
+def describe(
+    flight: Flight,
+    file: PositionRecording,
+    samples: pd.DataFrame,
+    match: Match | None,
+    frame_option: str | None,
+    yaw_deg: float | Literal["auto"] | None,
+    clock_offset_s: float | None,
+) -> tuple[Alignment, pd.DataFrame]:
+    """Alignment, with the reason for each of its parts, and the placed samples."""
+    start_to_boot_s = flight.log.boot_time_s - float(samples.index[0])
+    frame, auto = frame_option or file.frame or "", yaw_deg == "auto"
+    yaw_rad = 0.0 if yaw_deg is None or yaw_deg == "auto" else float(np.radians(yaw_deg))
+    yaw_sigma_deg = clock_sigma_s = correlation = None
+    lag_s = 0.0 if clock_offset_s is None else clock_offset_s - start_to_boot_s
+    origin_m, reference = np.zeros(3), ""
+    yaw_reason, clock_reason = "given with --position-yaw", "given with --clock-offset"
+    if yaw_deg is None:
+        yaw_reason = "the file's frame is taken to be EKF2's"
+    frame_reason = "from the names of the file's columns"
+    if frame_option:
+        frame_reason = "given with --position-frame"
+    if match:
+        frame, reference = match.frame, match.reference.name
+        if not (frame_option or file.frame):
+            frame_reason = f"fits {reference} best; residuals: {match.misfits}"
+            if auto and frame == "enu":
+                frame_reason += "; nwu differs from enu only by the yaw, which was found"
+        if auto:
+            yaw_rad = match.fit.yaw_rad
+            yaw_sigma_deg = float(np.degrees(match.fit.yaw_sigma_rad or 0.0))
+            yaw_reason = f"matched with {reference}"
+            origin_m = match.fit.origin_m if reference == EKF2_POSITION else origin_m
+        if clock_offset_s is None:
+            lag_s, clock_sigma_s = match.clock.lag_s, match.clock.lag_sigma_s
+            clock_offset_s = lag_s + start_to_boot_s
+            clock_reason = f"matched with {reference}, so that a delay of that is part of it"
+        correlation = float((np.exp(-1j * yaw_rad) * match.clock.coherence).real)
+    placed = placed_samples(samples, frame, yaw_rad, origin_m, lag_s)
+    compared = None if reference == IMU else _compare(flight, placed)
+    if compared:
+        reference, correlation = EKF2_POSITION, compared.correlation
+    warnings = [
+        *(_match_warnings(match, samples, yaw_sigma_deg) if match else ()),
+        *_frame_warnings(match, compared, yaw_rad, auto),
+        *([] if match and match.better_frame else _height_warnings(flight, placed)),
+        *_unix_warnings(flight, file, clock_offset_s),
+    ]
+    alignment = Alignment(
+        frame=frame,
+        frame_reason=frame_reason,
+        yaw_deg=float(np.degrees(yaw_rad)),
+        yaw_sigma_deg=yaw_sigma_deg,
+        yaw_reason=yaw_reason,
+        origin_m=(float(origin_m[0]), float(origin_m[1]), float(origin_m[2])),
+        clock_offset_s=float(clock_offset_s or 0.0),
+        clock_offset_sigma_s=clock_sigma_s,
+        clock_reason=clock_reason,
+        reference=reference,
+        correlation=correlation,
+        residual_rms_m=compared.rms_m if compared else None,
+        warnings=tuple(warnings),
+    )
+    return alignment, placed
+
+
+@dataclass(frozen=True)
+class _Comparison:
+    """The placed file against EKF2, horizontally.
+
+    Attributes
+    ----------
+    rms_m, capped_rms_m : float
+        Per axis.
+    correlation : float or None
+        None where EKF2 hardly moves.
+    """
+
+    rms_m: float
+    capped_rms_m: float
+    correlation: float | None
+
+
+def _compare(flight: Flight, placed: pd.DataFrame) -> _Comparison | None:
+    """Compare at the file's times; None where EKF2 has no position there."""
+    if isinstance(flight.ekf2, Unavailable):
+        return None
+    try:
+        ekf2, known = continuous_track(flight.ekf2, placed).at(placed.index.to_numpy())
+    except NoMatchError:
+        return None
+    if np.count_nonzero(known) < MIN_SAMPLES:
+        return None
+    ours = (placed["north_m"].to_numpy() + 1j * placed["east_m"].to_numpy())[known]
+    theirs = (ekf2[:, 0] + 1j * ekf2[:, 1])[known]
+    distance = np.abs(ours - theirs)
+    ours, theirs = ours - np.mean(ours), theirs - np.mean(theirs)
+    moves = max(np.ptp(theirs.real), np.ptp(theirs.imag)) >= MIN_MOTION_M
+    power = float(np.linalg.norm(ours) * np.linalg.norm(theirs))
+    return _Comparison(
+        rms_m=float(np.sqrt(np.mean(distance**2) / 2.0)),
+        capped_rms_m=capped_rms(distance) / np.sqrt(2.0),
+        correlation=float(np.vdot(ours, theirs).real) / power if moves and power > 0.0 else None,
+    )
+
+
+def _match_warnings(
+    match: Match, samples: pd.DataFrame, yaw_sigma_deg: float | None
+) -> Iterator[str]:
+    """What is poorly determined."""
+    name, fit = match.reference.name, match.clock
+    if fit.concordance < GOOD_CONCORDANCE[name]:
+        yield f"The file follows the {name} only roughly (concordance {fit.concordance:.2f})."
+    if fit.rival_ratio < NEAR_RESIDUAL[name]:
+        yield (
+            f"A clock offset {fit.rival_s:+.1f} s from this one fits nearly as well, with a "
+            f"residual only {fit.rival_ratio:.1f} times as large: if this one is wrong, give "
+            "--clock-offset SECONDS."
+        )
+    if fit.lag_sigma_s is not None:
+        if fit.lag_sigma_s > LARGE_CLOCK_SIGMA_S:
+            yield (
+                "The clock offset is poorly determined (standard deviation "
+                f"{fit.lag_sigma_s:.2f} s)."
+            )
+        spans = [float(np.ptp(times)) for times in (samples.index, match.reference.time_s)]
+        if fit.overlap_s < 0.5 * min(spans):
+            yield (
+                f"Only {fit.overlap_s:.0f} s of the file overlap the {name}: if more should, "
+                "give --clock-offset SECONDS."
+            )
+    if yaw_sigma_deg is not None and yaw_sigma_deg > LARGE_YAW_SIGMA_DEG:
+        yield (
+            f"The yaw is poorly determined (standard deviation {yaw_sigma_deg:.1f}°): the flight "
+            "is short, or nearly a point."
+        )
+
+
+def _height_warnings(flight: Flight, placed: pd.DataFrame) -> Iterator[str]:
+    """Whether the file's height runs against EKF2's: then its frame is another one."""
+    if isinstance(flight.ekf2, Unavailable):
+        return
+    down = flight.ekf2.state["down_m"]
+    ours = placed["down_m"].loc[down.index[0] : down.index[-1]].dropna()
+    if len(ours) < MIN_SAMPLES:
+        return
+    theirs = np.interp(ours.index, down.index, down)
+    moved = min(np.ptp(np.percentile(ours, [2, 98])), np.ptp(theirs))
+    if moved >= MIN_MOTION_M and np.corrcoef(ours, theirs)[0, 1] <= -MIN_MIRRORED:
+        yield (
+            "The file's height runs against EKF2's (one rises where the other sinks): its z points "
+            "the other way. Give another --position-frame."
+        )
+
+
+def _unix_warnings(
+    flight: Flight, file: PositionRecording, clock_offset_s: float | None
+) -> Iterator[str]:
+    """Whether the file's UNIX clock is far from the log's: then it may be of another flight."""
+    start_s = flight.log.start_unix_s
+    if file.clock != "UNIX" or start_s is None or clock_offset_s is None:
+        return
+    apart_s = abs(flight.log.boot_time_s - clock_offset_s - start_s)
+    if apart_s >= MAX_UNIX_DIFFERENCE_S:
+        yield (
+            f"By their UNIX times file and log are {apart_s:.0f} s apart: is it the same flight? "
+            "Flights along one path match each other well."
+        )
+
+
+def _frame_warnings(
+    match: Match | None, compared: _Comparison | None, yaw_rad: float, auto: bool
+) -> Iterator[str]:
+    """Whether the file's frame is EKF2's, where it was not fitted to be, and where it cannot be."""
+    name = match.reference.name if match else EKF2_POSITION
+    if auto:
+        if name == IMU:
+            yield (
+                "The IMU tells the yaw to a few degrees only (1° to 6° off on simulated flights), "
+                "and not the origin of the file's frame, which was left at 0."
+            )
+        return
+    followed = 1.0
+    if compared and compared.correlation is not None:
+        followed = compared.correlation
+    turned = match is not None and match.turned
+    if match and compared:
+        turned = is_sound(match.free, EKF2_POSITION) and is_turned(
+            compared.capped_rms_m, match.free, EKF2_POSITION
+        )
+    if match and turned and match.better_frame:
+        yield (
+            f"The file does not fit the {name} as {match.frame}, but it does as "
+            f"{match.better_frame}: give --position-frame {match.better_frame}."
+        )
+    elif match and turned:
+        yaw = np.degrees(np.angle(np.exp(1j * (match.free.yaw_rad - yaw_rad))))
+        shift = np.hypot(*match.free.origin_m[:2])
+        how = f" and shifted by {shift:.1f} m" if compared else ""
+        yield (
+            f"The file's frame seems turned by {yaw:.1f}°{how} against the {name}: give "
+            "--position-yaw auto."
+        )
+    elif followed < MIN_CONCORDANCE[EKF2_POSITION]:
+        yield (
+            f"The file hardly follows the EKF2 position (correlation {followed:.2f}): check clock "
+            "offset, frame and yaw."
+        )

@@ -1,0 +1,239 @@
+"""One track fitted to another: lag by cross-correlation, then lag, yaw and origin."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from px4fuse.alignment.tracks import (
+    EKF2_POSITION,
+    IMU,
+    MIN_OVERLAP_S,
+    MIN_SAMPLES,
+    NoMatchError,
+    OwnTrack,
+)
+from px4fuse.arrays import Array, Complex
+from px4fuse.trajectory.correlation import autocovariance, moments
+from px4fuse.trajectory.offset import STEP_S
+
+WINDOW_S = 1.0  # by which the least squares may leave the correlation's peak
+# Concordance below which nothing was matched
+MIN_CONCORDANCE = {EKF2_POSITION: 0.7, IMU: 0.5}
+MIN_MISFIT = 1e-4  # better matches are as good as this one, so that the longer of them counts
+FAR_S = 3.0  # at this distance a lag is another one, even on a plateau
+RESIDUAL_FLOOR_M = 0.05  # what the grid's steps leave of a perfect match
+MAX_DISTANCE_M = 1.0  # a larger one counts as this where fits are compared: it may be NLOS
+
+
+@dataclass(frozen=True)
+class Peak:
+    """Peak of the cross-correlation.
+
+    Attributes
+    ----------
+    lag_s : float
+        Time of the flight at the file's first sample.
+    concordance : float
+        2·Re(e^{-iψ}cov) / (var + var): a correlation that also falls where one of the two moves
+        further than the other; 1 only where they are equal but for an offset. NaN where the lag
+        was given.
+    rival_s : float
+        The best lag elsewhere, relative to this one; NaN where there is none.
+    rival_ratio : float
+        Its residual (RMS) over that of the peak.
+    """
+
+    lag_s: float
+    concordance: float = float("nan")
+    rival_s: float = float("nan")
+    rival_ratio: float = float("inf")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fit(Peak):
+    """Least-squares fit of e^{iψ}·file(t) + origin to reference(t + lag), near a peak.
+
+    Attributes
+    ----------
+    concordance : float
+        That of the peak; where the clock was given, the fit's own.
+    yaw_rad : float
+    lag_sigma_s, yaw_sigma_rad : float or None
+        None where it was not free.
+    origin_m : ndarray, shape (3,)
+        North, east, down.
+    coherence : complex
+        Normalised covariance of reference and file before the yaw: its angle is the best yaw.
+    horizontal_rms_m, rms_m : float
+        Capped residual: per horizontal axis; and of the vector, with height where both have it.
+    overlap_s : float
+        From the first to the last sample that was used.
+    """
+
+    lag_sigma_s: float | None
+    yaw_rad: float
+    yaw_sigma_rad: float | None
+    origin_m: Array
+    coherence: complex
+    horizontal_rms_m: float
+    rms_m: float
+    overlap_s: float
+
+
+def correlation_peak(file: OwnTrack, reference: OwnTrack, yaw_rad: float | None) -> Peak:
+    """Lag of greatest likelihood gain over all lags on the grid, yaw free where None.
+
+    With a free offset the residual sum of squares over an overlap of N grid points is
+    Σ|f - f̄|² + Σ|g - ḡ|² - 2·Re(e^{-iψ}cov); against two tracks that have nothing in common the
+    log-likelihood grows by -N·ln(1 - concordance), which is maximised: a long overlap with an
+    excellent match beats a short one in which two straight lines match as well.
+
+    Raises
+    ------
+    NoMatchError
+        No lag has enough overlap.
+    """
+    if not file.valid.any() or not reference.valid.any():
+        raise NoMatchError("too little is left between gaps to be matched")
+    found = moments(file.horizontal_m, reference.horizontal_m, file.valid, reference.valid)
+    count, covariance, power = found.count, found.covariance, found.power_a + found.power_b
+    shorter = min(np.count_nonzero(file.valid), np.count_nonzero(reference.valid))
+    enough = count >= max(MIN_SAMPLES, min(MIN_OVERLAP_S / STEP_S, shorter / 2.0))
+    if not enough.any():
+        raise NoMatchError("too little is left between gaps to be matched")
+    enough &= power > 1e-9 * np.max(power)  # else rounding errors correlate
+    agreed = np.abs(covariance) if yaw_rad is None else (np.exp(-1j * yaw_rad) * covariance).real
+    concordance = np.zeros_like(power)
+    concordance[enough] = 2.0 * agreed[enough] / power[enough]
+    gain = -count * np.log(np.maximum(1.0 - concordance, MIN_MISFIT))
+    best = int(np.argmax(np.where(enough, gain, -np.inf)))
+
+    def lag(index: int) -> float:
+        return float(reference.time_s[0]) + (index - len(file.valid) + 1) * STEP_S
+
+    # a rival lies where the concordance has fallen to half in between, or far away
+    outside = np.flatnonzero(concordance < 0.5 * concordance[best])
+    low = np.max(outside[outside < best], initial=-1)
+    high = np.min(outside[outside > best], initial=len(count))
+    rivals = (count >= 0.5 * count[best]) & (power >= 0.25 * power[best]) & enough
+    rivals &= concordance >= MIN_CONCORDANCE[reference.name]
+    far = round(FAR_S / STEP_S)
+    rivals[max(low + 1, best - far) : min(high, best + far + 1)] = False
+    peak = Peak(lag(best), float(concordance[best]))
+    if not rivals.any():
+        return peak
+    # per axis; the floor keeps two perfect matches equal
+    square = np.maximum(power - 2.0 * agreed, 0.0) / (2.0 * np.maximum(count, 1.0))
+    residual = np.sqrt(square + RESIDUAL_FLOOR_M**2)
+    rival = int(np.argmin(np.where(rivals, residual, np.inf)))
+    return replace(
+        peak, rival_s=lag(rival) - lag(best), rival_ratio=float(residual[rival] / residual[best])
+    )
+
+
+def least_squares_fit(
+    file: OwnTrack, reference: OwnTrack, peak: Peak, yaw_rad: float | None, *, clock_free: bool
+) -> Fit:
+    """Robust least squares (soft L1) over origin and, where free, lag and yaw.
+
+    The origin is always free, even where it is not used: an offset of the file would otherwise
+    pass for a lag wherever the vehicle flies more one way than the other. Covariance:
+    σ²(JᵀJ)⁻¹ at the optimum with σ from the median residual, times 1 + 2Σρ, the factor by which
+    autocorrelated residuals count for fewer (ρ summed up to its first zero).
+
+    Raises
+    ------
+    NoMatchError
+        Too few samples lie within the reference.
+    """
+    start, known = reference.at(file.time_s + peak.lag_s)
+    used = known & file.valid
+    if np.count_nonzero(used) < MIN_SAMPLES:
+        raise NoMatchError(
+            f"{np.count_nonzero(used)} of the file's positions fall on the reference"
+        )
+    time = file.time_s[used] + peak.lag_s
+    z, target = file.horizontal_m[used], (start[:, 0] + 1j * start[:, 1])[used]
+    centre = np.mean(z)
+    z = z - centre  # decorrelates yaw and origin
+    power = float(np.sqrt(np.var(z) * np.var(target)))
+    coherence = complex(np.vdot(z, target) / len(z) / power) if power > 0 else 0j
+    mean_square = float(np.var(z) + np.var(target)) / 2.0
+    horizontal = reference.horizontal_m
+
+    def unpack(x: Array) -> tuple[complex, float, float]:
+        """Origin, lag beyond the start, yaw."""
+        shift = float(x[2]) if clock_free else 0.0
+        return complex(x[0], x[1]), shift, float(x[-1]) if yaw_rad is None else yaw_rad
+
+    def residual(x: Array) -> Array:
+        origin, shift, yaw = unpack(x)
+        r = np.exp(1j * yaw) * z + origin - np.interp(time + shift, reference.time_s, horizontal)
+        return np.concatenate([r.real, r.imag])
+
+    start_at = complex(np.mean(target))
+    # origin, and where they are free lag and yaw
+    free = [True, True, clock_free, yaw_rad is None]
+    x0 = np.array([start_at.real, start_at.imag, 0.0, float(np.angle(coherence))])[free]
+    limit = np.array([np.inf, np.inf, WINDOW_S, np.inf])[free]
+    solution = least_squares(
+        residual, x0, bounds=(-limit, limit), loss="soft_l1", f_scale=_scale(residual(x0))
+    )
+    (origin, shift, yaw), r = unpack(solution.x), residual(solution.x)
+    r_complex = r[: len(z)] + 1j * r[len(z) :]
+    jacobian = np.asarray(solution.jac)
+    information = jacobian.T @ jacobian
+    information += 1e-9 * np.diag(np.diag(information) + 1e-12)  # singular: a huge variance
+    variance = np.diag(np.linalg.inv(information)) * _scale(r) ** 2 * _inflation(r_complex)
+    sigma = np.sqrt(np.maximum(variance, 0.0))
+    at_limit = clock_free and abs(shift) > 0.99 * WINDOW_S
+    ned, _ = reference.at(time + shift)
+    down = ned[:, 2] - file.position_m[used, 2]
+    down = down[np.isfinite(down)]
+    origin_down = float(np.median(down)) if len(down) else 0.0
+    horizontal_rms = capped_rms(np.abs(r_complex)) / np.sqrt(2.0)
+    vertical_rms = capped_rms(down - origin_down) if len(down) else 0.0
+    concordance = peak.concordance
+    if np.isnan(concordance):
+        agreed = float((np.exp(-1j * yaw) * coherence).real)
+        concordance = agreed * power / mean_square if power > 0 else 0.0
+    origin -= np.exp(1j * yaw) * centre
+    return Fit(
+        lag_s=peak.lag_s + shift,
+        lag_sigma_s=(np.inf if at_limit else float(sigma[2])) if clock_free else None,
+        concordance=concordance,
+        rival_s=peak.rival_s,
+        rival_ratio=peak.rival_ratio,
+        yaw_rad=yaw,
+        yaw_sigma_rad=float(sigma[-1]) if yaw_rad is None else None,
+        origin_m=np.array([origin.real, origin.imag, origin_down]),
+        coherence=coherence,
+        horizontal_rms_m=float(horizontal_rms),
+        rms_m=float(np.sqrt(2.0 * horizontal_rms**2 + vertical_rms**2)),
+        overlap_s=float(time[-1] - time[0]),
+    )
+
+
+def _scale(residual: Array) -> float:
+    """Standard deviation by the median; never 0, for a perfect fit too."""
+    return max(1.4826 * float(np.median(np.abs(residual))), 1e-3)
+
+
+def _inflation(residual: Complex) -> float:
+    """1 + 2Σρ: how many autocorrelated residuals say as much as one independent one."""
+    limit = 3.0 * _scale(np.abs(residual))
+    clipped = residual * np.minimum(1.0, limit / np.maximum(np.abs(residual), 1e-12))
+    rho = autocovariance(clipped)
+    if rho[0] <= 0.0:
+        return 1.0
+    crossed = np.flatnonzero(rho <= 0.0)
+    until = crossed[0] if len(crossed) else len(rho)
+    return float(1.0 + 2.0 * np.sum(rho[1:until]) / rho[0])
+
+
+def capped_rms(values_m: Array) -> float:
+    """Root mean square with large values counted as the largest that counts."""
+    return float(np.sqrt(np.mean(np.minimum(np.abs(values_m), MAX_DISTANCE_M) ** 2)))

@@ -1,0 +1,235 @@
+"""The position file matched with EKF2 or the IMU, in the frame that fits, or refused."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+import pandas as pd
+
+from px4fuse.alignment.fitting import (
+    MIN_CONCORDANCE,
+    RESIDUAL_FLOOR_M,
+    Fit,
+    Peak,
+    correlation_peak,
+    least_squares_fit,
+)
+from px4fuse.alignment.tracks import (
+    EKF2_POSITION,
+    FRAMES,
+    IMU,
+    MIN_MOTION_M,
+    MIN_OVERLAP_S,
+    NoMatchError,
+    OwnTrack,
+    band_passed,
+    continuous_track,
+    despiked,
+    ekf2_references,
+    file_track,
+    horizontal_range_m,
+    imu_references,
+    on_grid,
+    placed_samples,
+    without_edges,
+)
+from px4fuse.flight import Flight, Unavailable
+from px4fuse.trajectory.offset import RIVAL_RATIO, STEP_S
+
+# nwu is enu turned by 90°
+TURNABLE_FRAMES = ("ned", "enu")
+MAX_SPAN_S = 86400.0  # a day takes five seconds on the tracks' grid
+# Concordance below which a match is rough: a warning says so, and it overrules nothing
+GOOD_CONCORDANCE = {EKF2_POSITION: 0.9, IMU: 0.7}
+MAX_CLOCK_SIGMA_S = 0.5
+FRAME_RATIO = 1.3  # by which one frame must fit better than the next
+# A free yaw and origin that reduce the residual so much say that the file's frame is not EKF2's
+TURNED_RATIO, TURNED_RMS_M = 2.0, 0.3
+
+
+@dataclass(frozen=True)
+class Match:
+    """The file in one frame, matched with one reference.
+
+    Attributes
+    ----------
+    reference : OwnTrack
+    frame : str
+    misfits_m : dict from frame to float
+        Residual in each frame that was tried, best first.
+    fit : Fit
+        With the yaw that was asked for, found where none was.
+    free : Fit
+        With the yaw found in any case.
+    turned : bool
+        Whether the file's frame is clearly not EKF2's, so that the clock is taken from ``free``.
+    better_frame : str
+        Frame in which the file fits without a turn, where that is not the one asked for.
+    """
+
+    reference: OwnTrack
+    frame: str
+    misfits_m: dict[str, float]
+    fit: Fit
+    free: Fit
+    turned: bool
+    better_frame: str = ""
+
+    @property
+    def clock(self) -> Fit:
+        """The fit that the clock is taken from."""
+        return self.free if self.turned else self.fit
+
+    @property
+    def misfits(self) -> str:
+        """Residual in each frame, in words."""
+        return ", ".join(f"{name} {misfit:.2f} m" for name, misfit in self.misfits_m.items())
+
+
+def find_match(
+    flight: Flight,
+    samples: pd.DataFrame,
+    frame: str | None,
+    yaw_rad: float | None,
+    lag_s: float | None,
+) -> Match | None:
+    """Match with the first reference that serves; None where none does and nothing is sought.
+
+    Raises
+    ------
+    NoMatchError
+        With its remedy.
+    """
+    asked = {"`clock_offset_s`": lag_s, "`frame`": frame, "`yaw_deg`": yaw_rad}
+    sought = [name for name, known in asked.items() if known is None]
+    reasons = []
+    # what is all given is at most compared, for which the IMU's band says too little
+    for references in (ekf2_references, imu_references) if sought else (ekf2_references,):
+        try:
+            match = _match(references(flight), samples, frame, yaw_rad, lag_s)
+            _check_match(match)
+            if match.reference.name == IMU:
+                return match
+            return _fitted_across_resets(flight, samples, match, yaw_rad, lag_s)
+        except NoMatchError as error:
+            if error.remedy and sought:
+                raise
+            reasons.append(str(error))
+    if sought:
+        raise NoMatchError("; ".join(dict.fromkeys(reasons)), f"Give {' and '.join(sought)}")
+    return None
+
+
+def _match(
+    references: list[OwnTrack],
+    samples: pd.DataFrame,
+    frame: str | None,
+    yaw_rad: float | None,
+    lag_s: float | None,
+) -> Match:
+    """Match with the best of the references, in the best of the frames."""
+    if samples.index[-1] - samples.index[0] > MAX_SPAN_S:
+        raise NoMatchError("the file spans more than a day: cut it to the day of the flight")
+    if horizontal_range_m(file_track(samples, "ned")) < MIN_MOTION_M:
+        raise NoMatchError("the file hardly moves")
+    frames = (frame,) if frame else TURNABLE_FRAMES if yaw_rad is None else tuple(FRAMES)
+    matches = []
+    for reference in references:
+        name = reference.name
+        fitted = partial(_best_fit, samples, reference, lag_s)
+        fits = {tried: fitted(tried, yaw_rad) for tried in frames}
+        misfits = {tried: fits[tried].rms_m for tried in sorted(fits, key=lambda f: fits[f].rms_m)}
+        best = next(iter(misfits))
+        fit = fits[best]
+        free = fit if yaw_rad is None else fitted(best, None)
+        turned = is_sound(free, name) and (
+            fit.concordance < MIN_CONCORDANCE[name] or is_turned(fit.horizontal_rms_m, free, name)
+        )
+        better = ""
+        if turned and frame and yaw_rad is not None:
+            others = {tried: fitted(tried, yaw_rad) for tried in FRAMES if tried != frame}
+            other, there = min(others.items(), key=lambda item: item[1].rms_m)
+            fits_well = there.concordance >= GOOD_CONCORDANCE[name]
+            better = other if fits_well and TURNED_RATIO * there.rms_m < fit.rms_m else ""
+        matches.append(Match(reference, best, misfits, fit, free, turned, better))
+    return min(matches, key=lambda match: match.clock.rms_m)
+
+
+def is_turned(horizontal_rms_m: float, free: Fit, reference: str) -> bool:
+    """Whether the file fits clearly better with a yaw and origin of its own."""
+    return horizontal_rms_m > TURNED_RATIO * free.horizontal_rms_m and (
+        horizontal_rms_m > TURNED_RMS_M or reference == IMU
+    )
+
+
+def is_sound(fit: Fit, reference: str) -> bool:
+    """Whether a fit is good enough to overrule what was asked for."""
+    return fit.concordance >= GOOD_CONCORDANCE[reference] and fit.rival_ratio >= RIVAL_RATIO
+
+
+def _check_match(match: Match) -> None:
+    """Refuse a match that is poor, or is not the only one.
+
+    Raises
+    ------
+    NoMatchError
+    """
+    name, fit = match.reference.name, match.clock
+    if fit.concordance < MIN_CONCORDANCE[name]:
+        raise NoMatchError(
+            f"the file does not follow the {name} (concordance {fit.concordance:.2f}, at least "
+            f"{MIN_CONCORDANCE[name]:g} is needed)"
+        )
+    clock_open = ""
+    if fit.rival_ratio < RIVAL_RATIO:
+        clock_open = f": offsets {abs(fit.rival_s):.1f} s apart fit the {name} equally well"
+    elif fit.lag_sigma_s is not None and fit.lag_sigma_s > MAX_CLOCK_SIGMA_S:
+        clock_open = f" (standard deviation of the offset above {MAX_CLOCK_SIGMA_S:g} s)"
+    if clock_open:
+        raise NoMatchError(
+            f"the flight's path leaves the clock open{clock_open}", "Give `clock_offset_s`"
+        )
+    if len(match.misfits_m) > 1:
+        best, second = (np.hypot(m, RESIDUAL_FLOOR_M) for m in [*match.misfits_m.values()][:2])
+        if second < FRAME_RATIO * best:
+            raise NoMatchError(
+                f"no frame fits the {name} clearly best ({match.misfits})",
+                f"Give `frame`{' or `yaw_deg` auto' if match.turned else ''}",
+            )
+
+
+def _fitted_across_resets(
+    flight: Flight, samples: pd.DataFrame, match: Match, yaw_rad: float | None, lag_s: float | None
+) -> Match:
+    """Fit again to EKF2 with its resets treated as everything else in px4fuse treats them."""
+    if isinstance(flight.ekf2, Unavailable) or not flight.ekf2.resets:
+        return match
+    clock = match.clock
+    placed = placed_samples(samples, match.frame, clock.yaw_rad, clock.origin_m, clock.lag_s)
+    track = continuous_track(flight.ekf2, placed)
+    file = file_track(samples, match.frame)
+    again = partial(least_squares_fit, file, track, clock_free=lag_s is None)
+    free = again(match.free, None)
+    fit = free if yaw_rad is None else again(match.fit, yaw_rad)
+    return replace(match, reference=track, fit=fit, free=free)
+
+
+def _best_fit(
+    samples: pd.DataFrame,
+    reference: OwnTrack,
+    lag_s: float | None,
+    frame: str,
+    yaw_rad: float | None,
+) -> Fit:
+    """Find the lag, unless it is given, then fit."""
+    file = file_track(samples, frame)
+    coarse = on_grid(despiked(file))
+    if reference.name == IMU:
+        if len(coarse.time_s) * STEP_S < MIN_OVERLAP_S:
+            raise NoMatchError("the file is too short for a match with the IMU")
+        coarse = replace(coarse, position_m=band_passed(band_passed(coarse.position_m)))
+        file = coarse = without_edges(coarse)
+    peak = correlation_peak(coarse, reference, yaw_rad) if lag_s is None else Peak(lag_s)
+    return least_squares_fit(file, reference, peak, yaw_rad, clock_free=lag_s is None)

@@ -1,8 +1,0 @@
-"""Two recordings of one flight made one, and a position file placed into a flight."""
-
-from __future__ import annotations
-
-from px4fuse.placing.joining import join
-from px4fuse.placing.placement import place
-
-__all__ = ["join", "place"]
