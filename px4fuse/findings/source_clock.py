@@ -125,6 +125,6 @@ def delay_remedy(analysis: Analysis, delay_ms: float, flown_ms: float) -> str:
         return f"{AT_THE_SENDER} EKF2 has no parameter for stamps that are early."
     changes = {"EKF2_EV_DELAY": max(float(round(delay_ms)), 0.0)}
     if not isinstance(model, Unavailable):
-        changes = delay_change(model, delay_ms) or changes
+        changes = remedy.delay_change(model, delay_ms) or changes
     words, _ = remedy.remedy_words(model, changes, remedy.delay_helps, otherwise=AT_THE_SENDER)
     return words
