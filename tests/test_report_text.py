@@ -38,10 +38,6 @@ def written(markdown: str) -> list[Block]:
     return page.blocks
 
 
-def lines(markdown: str) -> list[str]:
-    return [block["text"] for block in written(markdown) if block["kind"] == "text"]
-
-
 @pytest.fixture
 def _fresh(monkeypatch: pytest.MonkeyPatch) -> Any:
     """Fonts are looked up anew, before and after."""
@@ -68,14 +64,10 @@ def with_font(monkeypatch: pytest.MonkeyPatch, name: str, characters: str) -> No
 
 
 @pytest.mark.usefixtures("_fresh")
-def test_letters_of_latin_greek_cyrillic_and_arabic_are_always_there() -> None:
+def test_a_font_of_the_machine_is_taken_for_what_dejavu_lacks(monkeypatch) -> None:
+    with_font(monkeypatch, "Some Thai", THAI)
     assert fonts.missing(f"Ångström σ Жанна {ARABIC} 5 ≤ 6") == ""
     assert fonts.families(f"Ångström {ARABIC}") == [fonts.FONT]
-
-
-@pytest.mark.usefixtures("_fresh")
-def test_a_font_of_the_machine_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
-    with_font(monkeypatch, "Some Thai", THAI)
     assert fonts.families(f"{THAI} and me") == [fonts.FONT, "Some Thai"]
     assert fonts.missing(f"{THAI} {HAN}") == HAN
 
@@ -103,13 +95,6 @@ def test_a_font_that_has_a_box_for_everything_is_none(monkeypatch: pytest.Monkey
     assert [name for name, _ in fonts._others()] == ["Noto Sans Thai", "An Alphabet Sans", "Zebra"]
 
 
-def test_markdown_is_read() -> None:
-    assert lines("# A *b* **c**\n\nd `e` ~~f~~ g\nh\n\n> i") == ["A b c", "d e f g h", "i"]
-    assert lines("a  \nb") == ["a\nb"]
-    assert lines("[x](https://y.z) <https://y.z>") == ["x (https://y.z) https://y.z"]
-    assert lines("SIGMA_A and SIGMA_Z, 2 * 3 * 4") == ["SIGMA_A and SIGMA_Z, 2 * 3 * 4"]
-
-
 def test_lists_keep_their_marks_and_depth() -> None:
     blocks = written("- a\n  - b\n\n    c\n- d\n\n7. e\n8. f\n\n- - g\n")
     assert [(b["mark"], b["text"], b["indent"] / notes.INDENT) for b in blocks] == [
@@ -119,8 +104,8 @@ def test_lists_keep_their_marks_and_depth() -> None:
 
 
 def test_code_keeps_its_spaces_and_dollars() -> None:
-    (code,) = lines("```\nif x:\n    $y$ <b>\n```")
-    assert code.replace("\N{NO-BREAK SPACE}", " ") == "if x:\n    $y$ <b>"
+    (code,) = written("```\nif x:\n    $y$ <b>\n```")
+    assert code["text"].replace("\N{NO-BREAK SPACE}", " ") == "if x:\n    $y$ <b>"
 
 
 def test_a_table_is_a_table() -> None:
@@ -131,23 +116,20 @@ def test_a_table_is_a_table() -> None:
 @pytest.mark.parametrize(
     ("markdown", "read_as"),
     [
-        (r"$\sigma_z^2$", "σ_z²"),
-        (r"$\hat{x}_{k|k-1}$", "x_(k|k-1)"),
-        (r"$$\frac{a}{b+1}$$", "a/(b+1)"),
-        (r"$\sqrt{S} \le 5 \times 10^{-3}$", "√(S) ≤ 5 × 10⁻³"),
-        (r"$\Delta t$ and $\lambda$", "Δ t and λ"),
-        (r"$\unknown{x}$", "unknownx"),
-        ("costs $5 and $10", "costs $5 and $10"),
-        (r"\$5 and `$x$`", "$5 and $x$"),
-    ],
-)
-def test_mathematics_becomes_letters_and_prices_stay(markdown: str, read_as: str) -> None:
-    assert lines(markdown) == [read_as]
-
-
-@pytest.mark.parametrize(
-    ("markdown", "read_as"),
-    [
+        ("# A *b* **c**\n\nd `e` ~~f~~ g\nh\n\n> i", ["A b c", "d e f g h", "i"]),
+        ("a  \nb", ["a\nb"]),
+        ("[x](https://y.z) <https://y.z>", ["x (https://y.z) https://y.z"]),
+        ("SIGMA_A and SIGMA_Z, 2 * 3 * 4", ["SIGMA_A and SIGMA_Z, 2 * 3 * 4"]),
+        # mathematics becomes letters, and prices stay
+        (r"$\sigma_z^2$", ["σ_z²"]),
+        (r"$\hat{x}_{k|k-1}$", ["x_(k|k-1)"]),
+        (r"$$\frac{a}{b+1}$$", ["a/(b+1)"]),
+        (r"$\sqrt{S} \le 5 \times 10^{-3}$", ["√(S) ≤ 5 × 10⁻³"]),
+        (r"$\Delta t$ and $\lambda$", ["Δ t and λ"]),
+        (r"$\unknown{x}$", ["unknownx"]),
+        ("costs $5 and $10", ["costs $5 and $10"]),
+        (r"\$5 and `$x$`", ["$5 and $x$"]),
+        # pictures and HTML are not printed raw
         ("![a map](m.png)", ["[picture: a map]"]),
         ("![](m.png)", ["[picture]"]),
         ('a <b>c</b><br>d &amp; e <img src="x" alt="f">', ["a c\nd & e [picture: f]"]),
@@ -156,8 +138,8 @@ def test_mathematics_becomes_letters_and_prices_stay(markdown: str, read_as: str
         ("<style>a{}", []),
     ],
 )
-def test_pictures_and_html_are_not_printed_raw(markdown: str, read_as: list[str]) -> None:
-    assert lines(markdown) == read_as
+def test_markdown_is_read_as_text(markdown: str, read_as: list[str]) -> None:
+    assert [block["text"] for block in written(markdown) if block["text"]] == read_as
 
 
 @given(st.text(st.sampled_from("#*-_`$|<>[]()!\\ \n1.ab{}^&;~="), max_size=80))

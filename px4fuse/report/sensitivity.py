@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -21,10 +21,6 @@ from px4fuse.report import marks, style
 from px4fuse.report.document import Document
 from px4fuse.report.page import Page, halves, legend_above
 from px4fuse.report.style import LINES, MUTED, OURS, OURS_BAND, curve, plain_ticks
-
-if TYPE_CHECKING:
-    pass
-
 
 FACTOR = 4.0
 # The chosen pair, and what is done to SIGMA_A and SIGMA_Z: two of them share each other gain
