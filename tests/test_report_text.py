@@ -104,6 +104,7 @@ def test_lists_keep_their_marks_and_depth() -> None:
 
 
 def test_code_keeps_its_spaces_and_dollars() -> None:
+    assert printable("\N{NO-BREAK SPACE}x\n") == "\N{NO-BREAK SPACE}x\n"
     (code,) = written("```\nif x:\n    $y$ <b>\n```")
     assert code["text"].replace("\N{NO-BREAK SPACE}", " ") == "if x:\n    $y$ <b>"
 

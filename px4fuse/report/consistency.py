@@ -16,7 +16,7 @@ from px4fuse.plain import capital, number_words, p_words
 from px4fuse.report import marks
 from px4fuse.report.document import Document
 from px4fuse.report.page import Page, halves, legend_above
-from px4fuse.report.style import DOTS, LINES, OURS_BAND, curve
+from px4fuse.report.style import DOTS, LINES, OURS_BAND, curve, plain_ticks
 from px4fuse.report.words import VERDICT_HEAD, filters, verdict_rows, verdict_words
 
 if TYPE_CHECKING:
@@ -112,14 +112,8 @@ def _running(axes: Axes, series: list[Series]) -> None:
         settled = running[len(running) // 4 :]
         lowest, highest = min(lowest, 0.7 * settled.min()), max(highest, 1.4 * settled.max())
     axes.axhline(1.0, color="black", lw=0.5)
-    axes.set_yscale("log")
-    axes.set_ylim(lowest, highest)
-    axes.yaxis.set_major_formatter(lambda value, _: number_words(value, 1))
-    few = highest / lowest < 30.0
-    axes.yaxis.set_minor_formatter(
-        lambda value, _: number_words(value, 1) if few and f"{value:.0e}"[0] in "25" else ""
-    )
-    axes.tick_params(axis="y", which="minor", labelsize=7, size=1.5)
+    axes.set(yscale="log", ylim=(lowest, highest))
+    plain_ticks(axes.yaxis)
 
 
 def _histogram(axes: Axes, series: list[Series]) -> None:

@@ -4,19 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from px4fuse.comparison.model import AgainstTruth, Difference
 from px4fuse.comparison.why import the
 from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.signals import AISLE
 from px4fuse.findings import Finding, by_root
 from px4fuse.flight import Unavailable
-from px4fuse.plain import number_words
 from px4fuse.report.document import Document, who
 from px4fuse.report.page import Page, halves, words
 from px4fuse.report.plan import plan
 from px4fuse.report.style import EKF2, MUTED, OURS, SEVERITY_COLOURS
 from px4fuse.report.words import (
-    band_words,
     clock_words,
     consequences_words,
     error_rows,
@@ -42,8 +39,7 @@ def draw(document: Document) -> Iterator[Page]:
     for sentence in document.story:
         page.write(sentence, size=10.5, above=2.0)
     _verdict(page, document)
-    if document.other_axes:
-        page.table(*error_rows(document, document.other_axes), right=(2, 3, 5, 6, 7, 8))
+    write_axes(page, document)
     page.heading("Findings", 10.5, above=12.0)
     if not document.findings:
         page.write("None: no detector has anything to say about this flight.")
@@ -54,9 +50,8 @@ def draw(document: Document) -> Iterator[Page]:
 
 def _verdict(page: Page, document: Document) -> None:
     """The main axis, large: each filter on its half of the page."""
-    result = document.analysis.main
+    result, columns = document.analysis.main, []
     along = the(result.axis.name)
-    columns = []
     for (name, one), colour in zip(filters(result).items(), (OURS, EKF2), strict=False):
         judged = isinstance(one, Consistency)
         column, _ = halves()
@@ -64,29 +59,21 @@ def _verdict(page: Page, document: Document) -> None:
         column.write(f"Along {along} {owner}'s variance is")
         column.write(verdict_words(one), size=16.0, bold=True, colour=colour if judged else MUTED,
                      above=1.0)  # fmt: skip
-        said = f"{one.reason}." if isinstance(one, Unavailable) else (
-            f"Mean NIS {number_words(one.nis_mean)}, band {band_words(one)}, from {one.count} "
-            "innovations."
-        )  # fmt: skip
-        if isinstance(one.truth, AgainstTruth):
-            velocity = one.truth.velocity_rmse_m_s
-            said += f" {one.truth.position_rmse_m:.3f} m"
-            said += "" if velocity is None else f" and {velocity:.3f} m/s"
-            said += " RMS from the truth."
-        column.write(said, above=1.0)
+        if isinstance(one, Unavailable):
+            column.write(f"{one.reason}.", above=1.0)
         columns.append(column)
     page.beside(*columns, above=14.0)
-    part = result.difference
-    if isinstance(part, Difference):
-        page.write(
-            f"Ours - EKF2: {part.position_rmse_m:.3f} m and {part.velocity_rmse_m_s:.3f} m/s RMS, "
-            f"at most {part.position_maximum_m:.2f} m."
-            + ("" if document.truth_known else " The log has no truth to say who is right."),
-            above=2.0,
-        )
-    elif isinstance(result.ekf2_state, Unavailable):
-        page.write(f"There is no EKF2 to compare with: {result.ekf2_state.reason}.", above=2.0)
-    page.write(EXPLANATION, size=7.0, colour=MUTED)
+    said = [EXPLANATION]
+    if isinstance(result.ekf2_state, Unavailable):
+        said.append(f"There is no EKF2 to compare with: {result.ekf2_state.reason}.")
+    if not document.truth_known:
+        said.append("The log has no truth to say who is right.")
+    page.write(" ".join(said), size=7.0, colour=MUTED)
+
+
+def write_axes(page: Page, document: Document) -> None:
+    """Write a row for each axis and filter: verdict, distance from one another, errors."""
+    page.table(*error_rows(document), right=(2, 3, 5, 6, 7, 8))
 
 
 def facts(document: Document) -> dict[str, str]:
@@ -118,7 +105,7 @@ def facts(document: Document) -> dict[str, str]:
         "Segment": f"{segment.start_s:.2f} s to {segment.end_s:.2f} s, {segment.reason}",
         "Aisle": "" if aisle is None else f"{aisle.heading_deg:.1f}° from north ({aisle.note})",
         "With": ", ".join(f"{file.name}, SHA-256 {file.sha256[:12]}…" for file in flight.inputs),
-        "SHA-256": f"{log.sha256}, {log.bytes / 1e6:.2f} MB",
+        "SHA-256": f"{log.sha256[:32]}…, {log.bytes / 1e6:.2f} MB",
     }
     return {label: text for label, text in listed.items() if text}
 

@@ -118,27 +118,23 @@ def _blocks(page: Page, node: SyntaxTreeNode, indents: int, mark: str = "") -> N
 
 def _inline(node: SyntaxTreeNode) -> str:
     """Words of a block without their marks."""
-    said = []
-    for child in node.children:
-        match child.type:
-            case "text" | "code_inline":
-                said.append(child.content)
-            case "maths":
-                said.append(_letters(child.content))
-            case "softbreak":
-                said.append(" ")
-            case "hardbreak":
-                said.append("\n")
-            case "image":
-                said.append(_picture(child.content))
-            case "html_inline":
-                said.append(_said(child.content))
-            case "link":
-                words, address = _inline(child), str(child.attrs.get("href", ""))
-                said.append(words if words in (address, "") else f"{words} ({address})")
-            case _:
-                said.append(_inline(child))
-    return "".join(said)
+    return "".join(map(_words, node.children))
+
+
+def _words(node: SyntaxTreeNode) -> str:
+    match node.type:
+        case "text" | "code_inline":
+            return node.content
+        case "softbreak" | "hardbreak":
+            return " " if node.type == "softbreak" else "\n"
+        case "maths" | "image" | "html_inline":
+            of = {"maths": _letters, "image": _picture, "html_inline": _said}
+            return of[node.type](node.content)
+        case "link":
+            words, address = _inline(node), str(node.attrs.get("href", ""))
+            return words if words in (address, "") else f"{words} ({address})"
+        case _:
+            return _inline(node)
 
 
 def _picture(description: str) -> str:

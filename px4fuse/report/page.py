@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 WIDTH, AXIS_LEFT, LABEL = 512.0, 26.0, 52.0
 # Points below an axes for its numbers, and for its label
 TICKS, AXIS_LABEL, BARE = 12.0, 11.0, 3.0
+KEPT = "\n\N{NO-BREAK SPACE}"  # though not printable by themselves
 Block = dict[str, Any]
 Cell = str | tuple[str, str]
 
@@ -175,9 +176,9 @@ def legend_above(axes: Axes, **options: Any) -> None:
 def printable(text: str) -> str:
     """Text without control characters, and a white square for what no font here can draw."""
     return "".join(
-        character if character == "\n" or fonts.font_of(character) else fonts.NO_GLYPH
+        character if character in KEPT or fonts.font_of(character) else fonts.NO_GLYPH
         for character in text.expandtabs(4)
-        if character == "\n" or character.isprintable()
+        if character in KEPT or character.isprintable()
     )
 
 

@@ -9,13 +9,13 @@ from rich.console import Console
 from px4fuse.ekf2.walk import Why
 from px4fuse.findings import by_root
 from px4fuse.flight import Unavailable
-from px4fuse.report.cover import facts, write_finding
+from px4fuse.report.cover import facts, write_axes, write_finding
 from px4fuse.report.document import Document
 from px4fuse.report.page import Page
 from px4fuse.report.screen import print_file, show
 from px4fuse.report.style import MUTED
 from px4fuse.report.why import write_why
-from px4fuse.report.words import error_rows, verdict_notes
+from px4fuse.report.words import verdict_notes
 from px4fuse.request import Request
 
 MOST_FINDINGS = 4
@@ -50,8 +50,7 @@ def print_summary(
     for label, text in facts(document).items():
         if label in FACTS:
             page.labelled(label, text)
-    head, rows = error_rows(document, (analysis.main, *document.other_axes))
-    page.table(head, rows, right=(2, 3, 5, 6, 7, 8))
+    write_axes(page, document)
     for note in (LEGEND, *verdict_notes(analysis)):
         page.write(note, colour=MUTED)
     why = analysis.why.get(analysis.main.axis.name)

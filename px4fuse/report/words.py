@@ -85,15 +85,13 @@ def verdict_rows(
     return rows
 
 
-def error_rows(
-    document: Document, axes: Iterable[AxisComparison]
-) -> tuple[list[str], list[list[Cell]]]:
-    """Head and rows of verdicts and errors.
+def error_rows(document: Document) -> tuple[list[str], list[list[Cell]]]:
+    """Head and rows of verdicts and errors, the main axis first.
 
     Between both filters, and between each and the truth, where the flight has these.
     """
-    every = document.analysis.axes.values()
-    has_ekf2 = any(isinstance(result.difference, Difference) for result in every)
+    axes = (document.analysis.main, *document.other_axes)
+    has_ekf2 = any(isinstance(result.difference, Difference) for result in axes)
 
     def more(result: AxisComparison, name: str, one: FilterSummary | Unjudged) -> list[str]:
         found: list[Any] = [result.difference if name == "ours" else None] if has_ekf2 else []
