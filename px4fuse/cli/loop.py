@@ -102,7 +102,7 @@ def loop(
     from px4fuse.findings import find_loop
     from px4fuse.loop.sources import is_g2o, split_part
     from px4fuse.report.document import LoopDocument
-    from px4fuse.report.loop_terminal import print_loop
+    from px4fuse.report.loop import print_loop
     from px4fuse.results.build_trajectories import loop_results
     from px4fuse.results.contract import to_json
 
@@ -183,7 +183,7 @@ def _solve(source: Path, json_path: Path | None, g2o: Path | None, robust: bool 
     """Solve a pose graph from a file."""
     from px4fuse.loop.sources import split_part
     from px4fuse.readers.g2o import g2o_text, read_g2o
-    from px4fuse.report.loop_terminal import print_graph
+    from px4fuse.report.loop import print_graph
     from px4fuse.results.build_trajectories import graph_results
     from px4fuse.results.contract import to_json
     from px4fuse.trajectory.graph.analysis import analyse_graph
