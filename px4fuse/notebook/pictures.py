@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from textwrap import fill
 from typing import Any
 
 import numpy as np
@@ -29,6 +30,8 @@ from px4fuse.trajectory.scores import PairwiseError
 
 # Negative log-likelihood by which a pair of noises may lie above the best one, 95 %: χ²(2)/2
 REGION_DROP, SHOWN_DROP = 3.0, 12.0
+# Characters in a line of what stands beside an axis
+LABEL_WIDTH = 26
 # Of a frame, which coordinates a map shows to the right and upwards
 ACROSS = {"NED": (1, 0), "FRD": (1, 0), "ENU": (0, 1), "camera": (0, 2), "unknown": (0, 1)}
 
@@ -63,7 +66,7 @@ def axis_comparison(result: AxisComparison, ax: Any = None) -> Any:
     first = POSITION if isinstance(error_reference(result), Unavailable) else ERROR
     for axes, panel in zip(ax, (first, INNOVATIONS, SIGMA_P), strict=True):
         panel.draw(axes, result)
-        axes.set_ylabel(panel.named(result))
+        axes.set_ylabel(fill(panel.named(result), LABEL_WIDTH))
     ax[0].set_title(result.axis.name)
     ax[-1].set_xlabel("time (s)")
     return ax
