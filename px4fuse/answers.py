@@ -9,8 +9,10 @@ from __future__ import annotations
 
 import hashlib
 import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from importlib.resources import files
 from pathlib import Path
+from string import Template
 from typing import Annotated, Any, Literal
 
 import msgspec
@@ -24,7 +26,6 @@ from px4fuse.record import Record, Sha256
 MAX_BYTES, MAX_LINE = 20_000, 500
 MOST_MISTAKES = 20
 NONE = "none"
-WHOLE_FLIGHT = "whole flight"
 BLANK = "\u2013"
 
 _S, _M = {"s": 1.0, "ms": 1e-3}, {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
@@ -103,6 +104,10 @@ CURES: Mapping[str, Mapping[str, float]] = {
 VERDICTS = ("consistent", "overstated", "understated")
 
 Number = Annotated[float, Meta(gt=-1e9, lt=1e9)]
+Unit = Annotated[str, Meta(max_length=10)]
+VerdictWord = Literal["", "consistent", "overstated", "understated"]
+# A number, or the updates of a list, as they are asked for; None is left blank
+Quantified = Number | Annotated[tuple[Number, ...], Meta(max_length=200)] | None
 
 
 class Claim(Record, frozen=True):
@@ -124,13 +129,13 @@ class Claim(Record, frozen=True):
 
     kind: str
     size: Number | None = None
-    unit: Annotated[str, Meta(max_length=10)] = ""
+    unit: Unit = ""
     when: Literal["", "whole flight"] = ""
     from_s: Number | None = None
     until_s: Number | None = None
     parameter: str = ""
     value: Number | None = None
-    value_unit: Annotated[str, Meta(max_length=10)] = ""
+    value_unit: Unit = ""
     panel: str = ""
 
     def size_in_first_unit(self) -> float | None:
@@ -165,13 +170,10 @@ class Answers(Record, frozen=True, kw_only=True):
 
     log_sha256: Sha256
     mistakes: Annotated[tuple[Claim, ...], Meta(max_length=MOST_MISTAKES)] = ()
-    verdict_ours: Literal["", "consistent", "overstated", "understated"] = ""
-    verdict_ekf2: Literal["", "consistent", "overstated", "understated"] = ""
+    verdict_ours: VerdictWord = ""
+    verdict_ekf2: VerdictWord = ""
     ekf2_did: Annotated[tuple[str, ...], Meta(max_length=len(EKF2_DID))] = ()
-    quantities: Annotated[
-        tuple[Number | Annotated[tuple[Number, ...], Meta(max_length=200)] | None, ...],
-        Meta(max_length=10),
-    ] = ()
+    quantities: Annotated[tuple[Quantified, ...], Meta(max_length=10)] = ()
 
     @property
     def says_none(self) -> bool:
@@ -256,23 +258,29 @@ def read_answers(path: Path) -> Answers:
     if any(len(line) > MAX_LINE for line in text.splitlines()):
         raise SettingsError(f"{path}: has a line of more than {MAX_LINE} characters.")
     try:
-        filled = msgspec.convert(_without_blanks(tomllib.loads(text)), _Filled)
-        answers = _answers(filled)
+        answers = msgspec.convert(_as_record(tomllib.loads(text)), Answers)
         check(answers)
     except (tomllib.TOMLDecodeError, RecursionError, msgspec.ValidationError, ValueError) as error:
         raise SettingsError(f"{path}: {error}. Correct it there.") from error
     return answers
 
 
-class _Filled(Record, frozen=True, kw_only=True):
-    """The file's own shape: claims under "mistake", numbers under the names of their questions."""
+def _as_record(given: dict[str, Any]) -> dict[str, Any]:
+    """The file's own shape as that of :class:`Answers`: what is blank is left out.
 
-    log_sha256: Sha256
-    mistake: tuple[Claim, ...] = ()
-    verdict_ours: Literal["", "consistent", "overstated", "understated"] = ""
-    verdict_ekf2: Literal["", "consistent", "overstated", "understated"] = ""
-    ekf2_did: tuple[str, ...] = ()
-    quantities: dict[str, Number | tuple[Number, ...]] = msgspec.field(default_factory=dict)
+    Claims stand under "mistake", and numbers under the names of their questions.
+    """
+    filled = _without_blanks(given)
+    claims = filled.pop("mistake", ())
+    numbers = msgspec.convert(filled.pop("quantities", {}), dict[str, Any])
+    names = [f"q{number}" for number in range(1, len(asked("")) + 1)]
+    if unknown := sorted({*numbers, *({"mistakes"} & filled.keys())} - set(names)):
+        raise ValueError(f"{unknown[0]} is not one of mistake, {', '.join(names)}")
+    return {
+        **filled,
+        "mistakes": claims,
+        "quantities": tuple(numbers.get(name) for name in names),
+    }
 
 
 def _without_blanks(value: Any) -> Any:
@@ -281,19 +289,6 @@ def _without_blanks(value: Any) -> Any:
     if isinstance(value, list):
         return [part for part in map(_without_blanks, value) if part not in ("", {})]
     return value
-
-
-def _answers(filled: _Filled) -> Answers:
-    given = msgspec.structs.asdict(filled)
-    numbers = given.pop("quantities")
-    names = [f"q{number}" for number in range(1, len(asked("")) + 1)]
-    if unknown := sorted(numbers.keys() - set(names)):
-        raise ValueError(f"{unknown[0]} is not one of {', '.join(names)}")
-    return Answers(
-        mistakes=given.pop("mistake"),
-        quantities=tuple(numbers.get(name) for name in names),
-        **given,
-    )
 
 
 def check(answers: Answers) -> None:
@@ -314,21 +309,22 @@ def check(answers: Answers) -> None:
     for said in answers.ekf2_did:
         _one_of("ekf2_did", said, EKF2_DID)
     for claim in answers.mistakes:
-        where = f"of {claim.kind}: "
-        if claim.parameter:
-            _one_of(f"{where}parameter", claim.parameter, CURES)
-        if claim.panel:
-            _one_of(f"{where}panel", claim.panel, PANELS)
-        if claim.unit:
-            _one_of(f"{where}unit", claim.unit, MISTAKES[claim.kind][1])
-        if claim.value_unit and claim.parameter:
-            _one_of(f"{where}value_unit", claim.value_unit, CURES[claim.parameter])
+        units = MISTAKES[claim.kind][1]
+        for field, known in (
+            ("parameter", CURES),
+            ("panel", PANELS),
+            ("unit", units),
+            ("value_unit", CURES.get(claim.parameter)),
+        ):
+            value = getattr(claim, field)
+            if value and known is not None:
+                _one_of(f"of {claim.kind}: {field}", value, known)
         low, high = RANGES.get(claim.kind, (-1e6, 1e6))
         size = claim.size_in_first_unit()
         if size is not None and not low <= size <= high:
-            unit = next(iter(MISTAKES[claim.kind][1]))
-            raise ValueError(f"{where}size {size:g} {unit} is none that it can have: {low:g} to "
-                             f"{high:g} {unit}")  # fmt: skip
+            unit = next(iter(units))
+            raise ValueError(f"of {claim.kind}: size {size:g} {unit} is none that it can have: "
+                             f"{low:g} to {high:g} {unit}")  # fmt: skip
 
 
 # Sizes beyond which a number is a slip or nonsense, in the kind's first unit
@@ -360,55 +356,23 @@ def form_name(log_name: str) -> str:
 
 def form_text(log_name: str, log_sha256: str) -> str:
     """An empty form for a log, with everything that can be said in it explained."""
-    return "".join(f"{line}\n" for line in _form_lines(log_name, log_sha256))
-
-
-def _form_lines(log_name: str, log_sha256: str) -> Iterator[str]:
-    yield f"# What you found in {log_name}. Fill in between the quotes; numbers stand without"
-    yield '# them: size = 0.2. Leave "" where you do not know. Then make your report with'
-    yield f"#     px4fuse compare {log_name} --answers {form_name(log_name)} --notes notes.md"
-    yield "# which checks that the form can be read, not whether it is right."
-    yield ""
-    yield f'log_sha256 = "{log_sha256}"    # leave it as it is'
-    yield ""
-    yield "# Innovation variance of each filter in the report with SIGMA_A 0.5 and SIGMA_Z 0.1:"
-    yield f"# {_quoted(VERDICTS)}"
-    yield 'verdict_ours = ""'
-    yield 'verdict_ekf2 = ""'
-    yield ""
-    yield "# What EKF2 did, one or more of"
-    yield from (f"#     {name}" for name in _wrapped(EKF2_DID))
-    yield "ekf2_did = []"
-    yield ""
-    yield "# What is wrong with the flight. Copy the block below for each further mistake: a claim"
-    yield '# that is not true costs points. If nothing is wrong give kind = "none" and no more.'
-    yield "# kinds, and the units of their sizes:"
-    for name, (words, units) in MISTAKES.items():
-        unit = f" [{', '.join(filter(None, units))}]" if any(units) else ""
-        yield f"#     {name:13} {words}{unit}"
-    yield "# parameters (what cures it), and the units of their values:"
-    for name, units in CURES.items():
-        yield f"#     {name}" + (f" [{', '.join(filter(None, units))}]" if any(units) else "")
-    yield "# panels (where you saw it best):"
-    yield from (f"#     {line}" for line in _wrapped(PANELS))
-    yield "[[mistake]]"
-    yield 'kind = ""'
-    yield 'size = ""         # a number, with its sign'
-    yield 'unit = ""'
-    yield f'when = ""         # "{WHOLE_FLIGHT}", or give seconds since the first data:'
-    yield 'from_s = ""'
-    yield 'until_s = ""'
-    yield 'parameter = ""    # what cures it'
-    yield 'value = ""        # to which value'
-    yield 'value_unit = ""'
-    yield 'panel = ""'
-    yield ""
-    yield "# Numbers along the aisle that the report does not print, from a replay of your own with"
-    yield "# DT 0.1 s. Update 1 is the filter's first: the first measurement only sets its state."
-    yield "[quantities]"
-    for number, quantity in enumerate(asked(log_sha256), start=1):
-        yield f"# {quantity.words}"
-        yield f'q{number} = ""{"    # such as [61, 64]" if quantity.kind == "gate" else ""}'
+    template = Template(files("px4fuse").joinpath("answers.toml").read_text(encoding="utf-8"))
+    questions = [
+        f'# {one.words}\nq{number} = ""{"    # such as [61, 64]" * (one.kind == "gate")}'
+        for number, one in enumerate(asked(log_sha256), start=1)
+    ]
+    kinds = (f"{name:13} {words}{_units(units)}" for name, (words, units) in MISTAKES.items())
+    return template.substitute(
+        log=log_name,
+        form=form_name(log_name),
+        sha256=log_sha256,
+        verdicts=_quoted(VERDICTS),
+        did=_block(_in_threes(EKF2_DID)),
+        kinds=_block(kinds),
+        cures=_block(f"{name}{_units(units)}" for name, units in CURES.items()),
+        panels=_block(_in_threes(PANELS)),
+        questions="\n".join(questions),
+    )
 
 
 def form_rows(answers: Answers) -> Iterator[tuple[str, str]]:
@@ -418,15 +382,14 @@ def form_rows(answers: Answers) -> Iterator[tuple[str, str]]:
     yield "What EKF2 did", ", ".join(answers.ekf2_did) or BLANK
     for claim in answers.mistakes:
         ends = (("from", claim.from_s), ("until", claim.until_s))
-        span = (f"{name} {at:g} s" for name, at in ends if at is not None)
+        value = _number_words(claim.value, claim.value_unit, CURES.get(claim.parameter, {}))
         said = (
             _number_words(claim.size, claim.unit, MISTAKES.get(claim.kind, ("", {}))[1]),
-            claim.when or " ".join(span),
-            claim.panel and f"seen in {claim.panel}",
-            f"{claim.parameter} "
-            + _number_words(claim.value, claim.value_unit, CURES.get(claim.parameter, {})),
+            claim.when or " ".join(f"{name} {at:g} s" for name, at in ends if at is not None),
+            f"seen in {claim.panel}" if claim.panel else "",
+            f"{claim.parameter} {value}".strip(),
         )
-        yield claim.kind, "; ".join(part.strip() for part in said if part.strip()) or BLANK
+        yield claim.kind, "; ".join(filter(None, said)) or BLANK
     for quantity, given in zip(asked(answers.log_sha256), answers.quantities, strict=False):
         numbers = given if isinstance(given, tuple) else [] if given is None else [given]
         yield quantity.words, ", ".join(f"{number:g}" for number in numbers) or BLANK
@@ -436,10 +399,19 @@ def _number_words(number: float | None, unit: str, units: Mapping[str, float]) -
     return "" if number is None else f"{number:g} {unit or next(iter(units), '')}".rstrip()
 
 
-def _quoted(names: Any) -> str:
+def _units(units: Mapping[str, float]) -> str:
+    named = ", ".join(filter(None, units))
+    return f" [{named}]" if named else ""
+
+
+def _block(lines: Iterable[str]) -> str:
+    """Lines of a comment."""
+    return "\n".join(f"#     {line}" for line in lines)
+
+
+def _quoted(names: Iterable[str]) -> str:
     return ", ".join(f'"{name}"' for name in names)
 
 
-def _wrapped(names: tuple[str, ...]) -> Iterator[str]:
-    for start in range(0, len(names), 3):
-        yield _quoted(names[start : start + 3])
+def _in_threes(names: tuple[str, ...]) -> Iterator[str]:
+    return (_quoted(names[start : start + 3]) for start in range(0, len(names), 3))

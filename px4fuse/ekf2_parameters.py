@@ -32,8 +32,6 @@ class Aid:
         Standard deviation of the measurement, its gate in standard deviations, its age in ms.
     noise_mode : str
         1: variances of the sender are not used; empty where there is no such choice.
-    lever_arm : tuple of str
-        Place of the sensor in the body: forward, right and down of its origin.
     """
 
     name: str
@@ -44,7 +42,6 @@ class Aid:
     gate: str
     delay: str
     noise_mode: str = ""
-    lever_arm: tuple[str, ...] = ()
 
     @property
     def switched_on(self) -> str:
@@ -59,20 +56,13 @@ class Aid:
 
 AID_MASK = "EKF2_AID_MASK"
 EV_POS = Aid(
-    name="ev_pos", switch="EKF2_EV_CTRL", switch_bit=0, old_switch=f"bit 3 of {AID_MASK}",
-    noise="EKF2_EVP_NOISE", gate="EKF2_EVP_GATE", delay="EKF2_EV_DELAY",
-    noise_mode="EKF2_EV_NOISE_MD",
-    lever_arm=("EKF2_EV_POS_X", "EKF2_EV_POS_Y", "EKF2_EV_POS_Z"),
+    "ev_pos", "EKF2_EV_CTRL", 0, f"bit 3 of {AID_MASK}",
+    "EKF2_EVP_NOISE", "EKF2_EVP_GATE", "EKF2_EV_DELAY", "EKF2_EV_NOISE_MD",
 )  # fmt: skip
 EV_HGT = replace(EV_POS, name="ev_hgt", switch_bit=1, old_switch="EKF2_HGT_MODE 3")
-EV_YAW = replace(
-    EV_POS, name="ev_yaw", switch_bit=3, old_switch=f"bit 4 of {AID_MASK}",
-    noise="EKF2_EVA_NOISE", gate="EKF2_HDG_GATE",
-)  # fmt: skip
 GNSS_POS = Aid(
-    name="gnss_pos", switch="EKF2_GPS_CTRL", switch_bit=0, old_switch=f"bit 0 of {AID_MASK}",
-    noise="EKF2_GPS_P_NOISE", gate="EKF2_GPS_P_GATE", delay="EKF2_GPS_DELAY",
-    lever_arm=("EKF2_GPS_POS_X", "EKF2_GPS_POS_Y", "EKF2_GPS_POS_Z"),
+    "gnss_pos", "EKF2_GPS_CTRL", 0, f"bit 0 of {AID_MASK}",
+    "EKF2_GPS_P_NOISE", "EKF2_GPS_P_GATE", "EKF2_GPS_DELAY",
 )  # fmt: skip
 
 
@@ -103,10 +93,9 @@ PARAMETERS: Mapping[str, Parameter] = {
     EV_POS.gate: Parameter("SD", 5.0, 1.0, 1e3, "gate of the vision position innovation"),
     EV_POS.delay: Parameter("ms", 0.0, 0.0, 300.0, "age of vision at its stamp"),
     "EKF2_DELAY_MAX": Parameter("ms", 200.0, 0.0, 1e3, "how far fusion may run behind (v1.15)"),
-    **{
-        name: Parameter("m", 0.0, -math.inf, math.inf, f"vision sensor {place} the body")
-        for name, place in zip(EV_POS.lever_arm, ("forward of", "right of", "below"), strict=True)
-    },
+    "EKF2_EV_POS_X": Parameter("m", 0.0, -math.inf, math.inf, "vision sensor forward of the body"),
+    "EKF2_EV_POS_Y": Parameter("m", 0.0, -math.inf, math.inf, "vision sensor right of the body"),
+    "EKF2_EV_POS_Z": Parameter("m", 0.0, -math.inf, math.inf, "vision sensor below the body"),
     "EKF2_ACC_NOISE": Parameter("m/s^2", 0.35, 0.01, 1.0, "noise of the accelerometer"),
     "EKF2_GYR_NOISE": Parameter("rad/s", 0.015, 0.0001, 0.1, "noise of the gyro"),
     "EKF2_ACC_B_NOISE": Parameter("m/s^3", 0.003, 0.0, 0.01, "drift of the accelerometer's bias"),

@@ -42,6 +42,8 @@ class Clock:
     def __init__(self) -> None:
         self.ahead_s = 0.0
 
+    sleep = staticmethod(time.sleep)
+
     def monotonic(self) -> float:
         return time.monotonic() + self.ahead_s
 

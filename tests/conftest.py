@@ -26,7 +26,7 @@ from pypdf import PdfWriter
 
 import px4fuse
 from px4fuse import analysis
-from px4fuse.fleet import sides
+from px4fuse.fleet import inputs
 from px4fuse.flight import Flight
 from px4fuse.notebook import commands
 from px4fuse.readers import read_log
@@ -180,7 +180,7 @@ def _remembered(
 def analysed_once() -> Iterator[None]:
     """The same request on the same files is analysed once; for tests that patch nothing of it."""
     with pytest.MonkeyPatch.context() as patch:
-        for place in (analysis, commands, sides):
+        for place in (analysis, commands, inputs):
             patch.setattr(place, "run", _remembered)
         yield
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import inspect
-from types import ModuleType, SimpleNamespace
+from collections.abc import Callable, Iterable
+from types import SimpleNamespace
 from typing import Any, TypeVar
 
 import msgspec
@@ -12,8 +13,10 @@ import pandas as pd
 from exchange import replace
 
 from px4fuse.analysis import Analysis
+from px4fuse.comparison.model import FILTERS, AgainstTruth, FilterSummary, UnjudgedFilter
 from px4fuse.filter.causes import Explained, Jump
 from px4fuse.filter.clock import ClockOffset, PartOffset
+from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.hypotheses import Estimate
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Segment
@@ -69,7 +72,7 @@ def log(**parts: Any) -> Any:
     usual = {
         "parameters": {}, "notes": (), "format": "ULog", "has_ulog": True, "autopilot": "PX4",
         "dropouts": (), "damage": (), "ends_in_flight": False, "duration_s": 60.0, "bytes": 0,
-        "bytes_read": 0,
+        "bytes_read": 0, "restarts": None, "receipt_went_back": None, "dropped": {},
     }  # fmt: skip
     return SimpleNamespace(**{**usual, **parts})
 
@@ -109,19 +112,58 @@ def analysis(
     )  # fmt: skip
 
 
-def named(module: ModuleType, subject: Any) -> dict[str, str]:
-    return {finding.id: finding.severity for finding in module.DETECTOR.detect(subject)}
+def axis(name: str = "north", **parts: Any) -> Any:
+    """One axis; a filter that is not given is not judged."""
+    usual = {"ekf2_innovations": NONE, "truth": NONE, "ekf2_state": NONE}
+    filters = {
+        key: _with_truth(parts.pop(key, NONE), parts.pop(f"{key}_truth", NONE)) for key in FILTERS
+    }
+    return SimpleNamespace(axis=SimpleNamespace(name=name), filters=filters, **usual | parts)
 
 
-def severity(module: ModuleType, subject: Any) -> str | None:
+def _with_truth(one: Any, truth: Any) -> Any:
+    if one is NONE:
+        return UnjudgedFilter("it", "no topic for it", "Log it.", truth=truth)
+    known = {
+        name: getattr(one, name) for name in Consistency.__struct_fields__ if hasattr(one, name)
+    }
+    return made(FilterSummary, **known, truth=truth)
+
+
+def statement(nis: float = 1.0, verdict: str = "consistent", **parts: Any) -> Any:
+    """A filter with this mean NIS."""
+    usual = {"lag1_autocorrelation": 0.0, "outside_gate": 0.0, "innovation_std_m": 0.3,
+             "innovation_mean_m": 0.4}  # fmt: skip
+    return made(
+        Consistency, nis_mean=nis, nis_band=(0.8, 1.2), verdict=verdict, **{**usual, **parts}
+    )
+
+
+def against_truth(nees: float, rmse_m: float = 0.4) -> AgainstTruth:
+    return AgainstTruth(count=100, position_rmse_m=rmse_m, nees_position_mean=nees)
+
+
+def hiding(nis: float = 1.0, nees: float = 4.0, name: str = "north", **parts: Any) -> Any:
+    """Our filter, content with its innovations."""
+    return axis(name, kf=statement(nis), kf_truth=against_truth(nees), **parts)
+
+
+Detect = Callable[[Any], Iterable[Finding]]
+
+
+def named(detect: Detect, subject: Any) -> dict[str, str]:
+    return {finding.id: finding.severity for finding in detect(subject)}
+
+
+def severity(detect: Detect, subject: Any) -> str | None:
     """Of the one finding; None where there is none."""
-    found = named(module, subject)
+    found = named(detect, subject)
     assert len(found) <= 1
     return next(iter(found.values()), None)
 
 
-def only(module: ModuleType, subject: Any) -> Finding:
-    (finding,) = module.DETECTOR.detect(subject)
+def only(detect: Detect, subject: Any) -> Finding:
+    (finding,) = detect(subject)
     return finding
 
 

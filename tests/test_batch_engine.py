@@ -22,7 +22,6 @@ def test_each_bad_job_is_lost_alone_and_its_worker_begins_again(subtests, monkey
     ]  # fmt: skip
     clock = Clock()
     monkeypatch.setattr(engine, "time", clock)
-    monkeypatch.setattr(engine, "ENDS", 2)
     found = {}
     with connected(workers=2, memory="1GB") as client:
         for work, result in outcomes(client, act, jobs, timeout_s=60.0):
@@ -38,7 +37,7 @@ def test_each_bad_job_is_lost_alone_and_its_worker_begins_again(subtests, monkey
         ("square", 6): 36,
         ("variable", "OMP_NUM_THREADS"): "1",
         ("hold the interpreter", 0): "longer than 60 s",
-        ("hog", 4_000): "ended 2 times: it crashed, or needed more memory",
+        ("hog", 4_000): "ended 3 times: it crashed, or needed more memory",
         ("raise", "no number"): "ValueError: no number",
     }.items():
         with subtests.test(work=work):
@@ -69,10 +68,10 @@ def test_a_result_that_does_not_come_is_asked_for_again(monkeypatch):
 
 def test_a_job_that_was_given_to_a_worker_that_had_ended_is_given_to_another(monkeypatch):
     """Its end was not known yet."""
-    free, gone = engine._free, ["tcp://127.0.0.1:9"]
     monkeypatch.setattr(engine, "TICK_S", 0.1)
-    monkeypatch.setattr(engine, "_free", lambda *known: [gone.pop()] if gone else free(*known))
     with connected(workers=1, memory="1GB") as client:
+        known, gone = client.processing, [{"tcp://127.0.0.1:9": ()}]
+        monkeypatch.setattr(client, "processing", lambda: gone.pop() if gone else known())
         found = dict(outcomes(client, act, [("square", 3), ("square", 4)], timeout_s=60.0))
     assert found == {("square", 3): 9, ("square", 4): 16}
 
@@ -91,7 +90,7 @@ def test_a_result_that_is_lost_before_it_comes_counts_as_an_ended_worker():
         def exception(self):
             return KilledWorker("job", None, 0)
 
-    assert engine._result(Lost()) == engine._Ended(1)
+    assert engine._result(Lost()) is engine._ENDED
 
 
 def test_workers_that_cannot_be_ended_are_refused():

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from px4fuse.grading.class_table import FIRST, LAST, csv_text
-from px4fuse.grading.model import Entry, Graded, Item, Override
+from px4fuse.grading.model import Entry, Graded, Item
 from px4fuse.spreadsheet import MAX_CHARACTERS, neutral, neutral_id
 from px4fuse.verification.model import Verdict
 
@@ -143,8 +143,8 @@ def test_items_of_one_title_keep_a_column_each() -> None:
 def test_late_overridden_pending_and_missing_ones_say_so() -> None:
     items = (Item("notes", 1.0, 2.0, ""), Item("cover", 2.0, 2.0, ""))
     one = Graded("a.pdf", "A", "0042", Verdict("verified", (), True), items)
-    said = {"cover": Override(0.5, "why")}
-    late = entry(one, late_s=5400.0, deduction=0.4, total=1.1, overrides=said, comment="see me")
+    less = replace(one, items=(items[0], replace(items[1], points=0.5)))
+    late = entry(less, late_s=5400.0, deduction=0.4, total=1.1, comment="see me")
     pending = entry(replace(one, pending="Run 0.1.1."), total=None)
     missing = Entry("C", "-17", None, of=4.0)
     head, *rest = cells(csv_text([late, pending, missing]))

@@ -25,7 +25,7 @@ from px4fuse.comparison.model import Comparison, UnjudgedFilter
 from px4fuse.display import Shown
 from px4fuse.filter.consistency import Consistency
 from px4fuse.fleet.changes import changes
-from px4fuse.fleet.sides import Side
+from px4fuse.fleet.inputs import DiffInput
 from px4fuse.request import with_options
 from px4fuse.results.build import results as build
 from px4fuse.results.contract import ComparisonResults
@@ -80,8 +80,8 @@ def results(sample_log, analysis) -> dict[str, Shown]:
         "PairwiseError": evaluation.rpe[0],
         "WhatIf": px4fuse.what_if(analysis.ekf2_model, {"EKF2_EVP_NOISE": 0.3}),
         "Changes": changes(
-            Side("aisle_uwb.json", "results", read_results(SHIPPED.read_bytes())),
-            Side("small.ulg", "log", results_of(analysis), analysis),
+            DiffInput("aisle_uwb.json", "results", read_results(SHIPPED.read_bytes())),
+            DiffInput("small.ulg", "log", results_of(analysis), analysis),
         ),
     }
 
@@ -290,7 +290,7 @@ def test_tables_are_tidy_with_units(results, name):
     without_unit = (
         "nis_mean|nis_band|nees_|outside_|autocorrelation|gain_nats|_share|sigma_factor|_p$|bias_t|_lags|count|"
         # a column has the unit
-        "^([wxyzabpq]|change|change_low|change_high|delta)$|_block"
+        "^([wxyzq]|(a|b|change)(_low|_high)?|delta)$|_block"
     )
     unit = r"_(m|s|m_s|m_s2|m2|m2_s2|deg)(_(interval|low|high|rmse|mean|median|std|min|max)|$)"
     for column in table.select_dtypes("floating"):

@@ -30,14 +30,6 @@ from px4fuse.trajectory.scores import Statistics
 
 SAMPLE = REPOSITORY / "sample_logs" / "loop_vio.ulg"
 SLAM = REPOSITORY / "sample_logs" / "loop_slam.tum"
-# Findings that this file makes, see test_findings
-NAMED_HERE = {
-    "false_loop_closure",
-    "loop_closure_doubtful",
-    "loop_drift_understated",
-    "loop_end_assumed",
-    "loop_of_absolute_track",
-}
 RATE_HZ = 10.0
 SPEED_M_S = 1.0
 SIDE_M = 10.0

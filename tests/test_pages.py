@@ -25,7 +25,7 @@ from px4fuse.flight import Unavailable
 from px4fuse.report.style import report_style
 from px4fuse.verification import pages
 from px4fuse.verification.model import PageDifference
-from px4fuse.verification.pages import DISTANCE, compare_pages, looks, page_texts
+from px4fuse.verification.pages import DISTANCE, compare_pages, looks
 
 
 @pytest.fixture(autouse=True)
@@ -104,7 +104,6 @@ def test_the_same_and_the_same_saved_again() -> None:
     again = io.BytesIO()
     PdfWriter(clone_from=io.BytesIO(pdf)).write(again)
     assert compared(pdf, pdf) == compared(again.getvalue(), pdf) == ()
-    assert page_texts(pdf) == ("one 1.25", "two")
 
 
 def test_another_word_is_found_on_its_page() -> None:
@@ -192,14 +191,12 @@ def test_damaged_files_never_raise(seed: int, count: int) -> None:
     for _ in range(count):
         content[dice.randrange(len(content))] = dice.randrange(256)
     assert isinstance(compared(bytes(content), BASE), tuple)
-    assert isinstance(page_texts(bytes(content)), tuple)
 
 
 @pytest.mark.parametrize("content", [b"", b"%PDF-1.7", b"\0" * 1000])
 def test_what_is_no_pdf_differs(content: bytes) -> None:
     (found,) = compared(content, BASE)
     assert "cannot be drawn" in found.what
-    assert page_texts(content) == ()
 
 
 def test_without_pypdfium2_nothing_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -207,4 +204,3 @@ def test_without_pypdfium2_nothing_is_said(monkeypatch: pytest.MonkeyPatch) -> N
     found = compare_pages(BASE, BASE, exactly)
     assert isinstance(found, Unavailable)
     assert 'pip install "px4fuse[grade]"' in str(found)
-    assert page_texts(BASE) == ()

@@ -17,12 +17,11 @@ from PIL import Image
 from pypdf import PdfReader, PdfWriter
 
 from px4fuse.flight import Unavailable
-from px4fuse.grading.sheets import delete_others, draw_sheets
+from px4fuse.grading.sheets import draw_sheets
 from px4fuse.verification.pictures import (
     COVER,
     MAX_BYTES,
     MAX_PIXELS,
-    key_page,
     page_pictures,
     picture,
 )
@@ -67,13 +66,6 @@ def test_a_report_s_cover_is_small_and_readable() -> None:
 
 def test_the_same_page_gives_the_same_bytes() -> None:
     assert picture(REPORT.read_bytes(), 1) == picture(REPORT.read_bytes(), 1)
-
-
-def test_the_key_page_is_the_cover() -> None:
-    pages = [page.extract_text() for page in PdfReader(REPORT).pages]
-    assert key_page(pages) == 0
-    assert key_page(["my own title page", *pages]) == 1
-    assert key_page([]) == key_page(["", "no verdict here"]) == 0
 
 
 @pytest.mark.parametrize("page", [-1, 9, 10**9, 2**70])
@@ -202,7 +194,7 @@ def test_pages_are_drawn_once_and_named_by_what_they_show(tmp_path: Path) -> Non
     folder = tmp_path / "pages"
     made = draw_sheets(reports, folder, processes=1)
     assert {name: len(files) for name, files in made.items()} == {
-        "a": len(PdfReader(REPORT).pages), "b": 1,
+        "a": len(PdfReader(REPORT).pages), "b": 1, "c": 0,
     }  # fmt: skip
     first = {path: path.stat().st_mtime_ns for path in folder.glob("*.png")}
     assert {path.name for path in first} == {file for files in made.values() for file in files}
@@ -226,11 +218,10 @@ def test_only_what_was_drawn_here_is_deleted(tmp_path: Path) -> None:
     # as an instructor, or an earlier version without a list, may have put it there
     strange = folder / f"{'0' * 16}-001-of-001.png"
     strange.write_bytes(b"mine")
-    delete_others(folder, [new])
+    assert draw_sheets({"b": both["b"]}, folder, processes=1) == {"b": (new,)}
     assert {path.name for path in folder.glob("*.png")} == {new, strange.name}
-    draw_sheets(both, folder, processes=1)
-    delete_others(folder, [old, new])
-    delete_others(folder, ())
+    assert draw_sheets(both, folder, processes=1) == {"a": (old,), "b": (new,)}
+    assert draw_sheets({}, folder) == {}
     assert [path.name for path in folder.glob("*.png")] == [strange.name]
-    delete_others(tmp_path / "none", ())
+    draw_sheets({}, tmp_path / "none")
     assert not (tmp_path / "none").exists()

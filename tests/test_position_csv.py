@@ -6,14 +6,13 @@ import csv
 import hashlib
 import io
 from collections.abc import Callable
-from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 from conftest import REPOSITORY
-from hypothesis import HealthCheck, Phase, example, given, settings
+from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from patience import patience
 
@@ -61,7 +60,8 @@ def exact(ticks: np.ndarray, decimals: int) -> list[str]:
 
 UNIX_S = exact(UNIX_US + TIME_US, 6)
 X, Y, Z = (fixed(axis, 4) for axis in TRACK_M.T)
-PLAIN = {"time": UNIX_S, "x": X, "y": Y, "z": Z}
+PLAIN_XYZ = {"x": X, "y": Y, "z": Z}
+PLAIN = {"time": UNIX_S, **PLAIN_XYZ}
 
 
 def table(
@@ -139,17 +139,13 @@ DIALECTS: dict[str, str | bytes] = {
     "comma": table(PLAIN),
     "comma and blank": table(PLAIN, separator=", "),
     "semicolon": table(PLAIN, separator=";"),
-    "semicolon, decimal comma": table(PLAIN, separator=";", decimal=","),
     "tab": table(PLAIN, separator="\t"),
-    "tab, decimal comma": table(PLAIN, separator="\t", decimal=","),
     "space": table(PLAIN, separator=" "),
     "several spaces": table(PLAIN, separator="   "),
     "leading spaces": "".join(
         "  " + line for line in table(PLAIN, separator="  ").splitlines(True)
     ),
-    "space, decimal comma": table(PLAIN, separator=" ", decimal=","),
     "quotes": table(PLAIN, quote='"'),
-    "quotes, decimal comma": table(PLAIN, quote='"', decimal=","),
     "byte order mark": b"\xef\xbb\xbf" + table(PLAIN).encode(),
     "Latin-1": table({"t [µs]": exact(UNIX_US + TIME_US, 0), "x": X, "y": Y, "z": Z}).encode(
         "latin-1"
@@ -158,18 +154,13 @@ DIALECTS: dict[str, str | bytes] = {
     "UTF-16": table(PLAIN).encode("utf-16"),
     "CR": table(PLAIN, end="\r"),
     "trailing separators": table(PLAIN, trailing=",,"),
-    "trailing semicolon": table(PLAIN, separator=";", decimal=",", trailing=";"),
+    "trailing semicolon": table(PLAIN, separator=";", trailing=";"),
     "blank lines": "\n\n" + table(PLAIN, end="\n\n") + "\n  \n",
     "lines of separators": table(PLAIN) + ",,,\n,,,\n",
     "comments": "# made by uwbd\n% v2\n" + table(PLAIN).replace("\n", "\n# note, 1, 2, 3\n", 5),
     "preamble": PREAMBLE + table(PLAIN),
     "anchors before the header": "A0,0.0,0.0,2.5\nA1,9.0,0.0,2.5\n" + table(PLAIN),
-    "no header": table(PLAIN, header=False),
-    "no header, decimal comma": table(PLAIN, header=False, separator=";", decimal=","),
-    "preamble, no header": PREAMBLE + table(PLAIN, header=False),
     "comment header": "# " + table(PLAIN),
-    "numpy.savetxt": "# time, x, y, z\n" + table(PLAIN, header=False, separator=" "),
-    "no line feed at the end": table(PLAIN).rstrip("\n"),
     "NULs after a power cut": table(PLAIN).encode() + bytes(300),
     "DOS end of file": table(PLAIN).encode() + b"\x1a",
     "header only names what is used": table({"id": ["7"] * ROWS, **PLAIN, "note": ["ok"] * ROWS}),
@@ -186,18 +177,8 @@ def test_every_dialect_gives_the_same_samples(read, dialect):
     assert file.samples[SAMPLE_COLUMNS[3:]].isna().all(axis=None)
 
 
-@pytest.mark.parametrize(
-    ("dialect", "words"),
-    [
-        ("tab, decimal comma", ("tab", "decimal comma", "header in line 1")),
-        ("preamble", ("comma between", "decimal point", "header in line 5")),
-        ("preamble", ("3 lines before the table",)),
-        ("no header", ("no header",)),
-        ("no header", ("position: column 2, column 3, column 4 as x, y, z",)),
-    ],
-)
-def test_says_what_the_text_is(read, dialect, words):
-    said(read(DIALECTS[dialect]), *words)
+def test_says_what_the_text_is(read):
+    said(read(DIALECTS["preamble"]), "table: comma between columns, header in line 5")
 
 
 def test_plain_format_needs_no_note(read):
@@ -267,34 +248,7 @@ def test_units_and_clocks_of_time(read, case):
     ],
 )
 def test_says_why_the_unit_of_time(read, case, words):
-    name, texts, _, _ = TIMES[case]
-    said(read(table({name: texts, "x": X, "y": Y, "z": Z})), "time: ", *words)
-
-
-def iso(zone: str = "Z", separator: str = "T", date: str = "-", shift_h: int = 0) -> list[str]:
-    start = datetime(1970, 1, 1, tzinfo=UTC) + timedelta(hours=shift_h)
-    moments = [start + timedelta(microseconds=UNIX_US + int(us)) for us in TIME_US]
-    return [
-        moment.strftime(f"%Y{date}%m{date}%d{separator}%H:%M:%S.%f{zone}") for moment in moments
-    ]
-
-
-@pytest.mark.parametrize(
-    ("texts", "words"),
-    [
-        (iso(), "ISO 8601 text"),
-        (iso(zone="+01:00", shift_h=1), "ISO 8601 text"),
-        (iso(zone=""), "no zone, taken as UTC"),
-        (iso(zone="", separator=" "), "no zone, taken as UTC"),
-        (iso(zone="", separator=" ", date="/"), "no zone, taken as UTC"),
-    ],
-)
-@pytest.mark.parametrize("header", [True, False])
-def test_iso_time(read, texts, words, header):
-    file = read(table({"Timestamp": texts, "x": X, "y": Y, "z": Z}, header=header))
-    assert_track(file)
-    assert file.clock == "UNIX"
-    said(file, words)
+    said(read(table({TIMES[case][0]: TIMES[case][1], **PLAIN_XYZ})), "time: ", *words)
 
 
 def test_nineteen_digits_keep_their_microseconds(read):
@@ -336,10 +290,6 @@ def test_time_unit_option_wins(read, unit):
 
 
 LATER_S = exact(UNIX_US + TIME_US + 30_000, 6)
-SPLIT = {
-    "secs": [text[:10] for text in UNIX_S],
-    "nsecs": [str(int(text[11:]) * 1000) for text in UNIX_S],
-}
 
 
 @pytest.mark.parametrize(
@@ -356,11 +306,6 @@ SPLIT = {
              "field.header.stamp": exact(1000 * (UNIX_US + TIME_US), 0),
              "field.header.frame_id": ["map"] * ROWS},
             ("'field.header.stamp', the time of measurement",),
-        ),
-        (
-            {"Time": LATER_S, "header.stamp.secs": SPLIT["secs"],
-             "header.stamp.nsecs": SPLIT["nsecs"]},
-            ("'header.stamp.secs', 'header.stamp.nsecs' together",),
         ),
     ],
 )  # fmt: skip
@@ -443,19 +388,18 @@ def test_length_unit_option_wins(read, unit):
     assert samples["sigma_z_m"].to_numpy() == pytest.approx(SIGMA_M * LENGTH_UNITS[unit])
 
 
-def test_an_outlier_does_not_decide_the_unit(read):
-    x = [*X]
-    x[7] = "4000.0"
+@pytest.mark.parametrize(
+    ("x", "words"),
+    [
+        ([*X[:7], "4000.0", *X[8:]], "in m (no unit in the names)"),
+        (fixed(np.linspace(0.0, 5e6, ROWS), 1), "assumed, as no unit gives an indoor flight"),
+    ],
+)
+def test_an_outlier_does_not_decide_the_unit_and_no_spread_is_believed(read, x, words):
     file = read(table({**PLAIN, "x": x}))
-    assert file.samples["x_m"].iloc[7] == 4000.0
+    assert file.samples["x_m"].tolist() == list(map(float, x))
     assert file.samples["y_m"].to_numpy() == pytest.approx(TRACK_M[:, 1])
-
-
-def test_a_spread_that_no_unit_explains_is_doubted(read):
-    x = fixed(np.linspace(0.0, 5e6, ROWS), 1)
-    file = read(table({**PLAIN, "x": x}))
-    assert file.samples["x_m"].iloc[-1] == 5e6
-    said(file, "position: ", "assumed, as no unit gives an indoor flight")
+    said(file, "position: ", words)
 
 
 @pytest.mark.parametrize("extra", [{}, {"z": [""] * ROWS}, {"z": ["nan"] * ROWS}])
@@ -494,12 +438,10 @@ def test_sigma(read, columns, factors):
     said(file, "sigma: ", repr(next(iter(columns))) if "sigma_z" not in columns else "'sigma_x'")
 
 
-def test_sigma_has_the_unit_of_position(read):
-    file = read(table({"t": UNIX_S, "x": MM[0], "y": MM[1], "sigma": fixed(1000 * SIGMA_M, 0)}))
+def test_sigma_has_the_unit_and_the_frame_of_position(read):
+    mm = fixed(1000 * SIGMA_M, 0)
+    file = read(table({"t": UNIX_S, "x": MM[0], "y": MM[1], "sigma": mm}))
     assert file.samples["sigma_y_m"].to_numpy() == pytest.approx(SIGMA_M)
-
-
-def test_sigma_of_a_named_frame(read):
     columns = {"n": X, "e": Y, "d": Z, "sd": SIGMA, "sigma_e": fixed(2 * SIGMA_M, 3)}
     samples = read(table({"t": UNIX_S, **columns})).samples
     assert samples["sigma_x_m"].to_numpy() == pytest.approx(SIGMA_M)
@@ -519,7 +461,6 @@ def test_quality_in_words_is_left_out(read):
     file = read(table({**PLAIN, "quality": ["good"] * ROWS}))
     assert_track(file)
     assert file.samples["quality"].isna().all()
-    said(file, "'quality' holds no numbers")
 
 
 def test_sigma_must_be_above_zero(read):
@@ -529,14 +470,6 @@ def test_sigma_must_be_above_zero(read):
     assert_track(file)
     assert np.flatnonzero(file.samples["sigma_x_m"].isna()).tolist() == [3, 4]
     said(file, "sigma is not above zero in 2 rows")
-
-
-@pytest.mark.parametrize(("more", "is_sigma"), [([SIGMA], True), ([JUNK] * 4, False)])
-def test_without_header_a_fifth_and_last_column_is_sigma(read, more, is_sigma):
-    columns = {**PLAIN, **{f"c{i}": values for i, values in enumerate(more)}}
-    file = read(table(columns, header=False))
-    assert_track(file)
-    assert file.samples["sigma_z_m"].notna().all() == is_sigma
 
 
 # -- rows ------------------------------------------------------------------------------------------
@@ -553,13 +486,6 @@ def test_rows_without_position_are_dropped(read, missing):
     said(file, "3 rows were dropped", "without a usable time or position")
 
 
-def test_without_header_first_rows_may_lack_a_position(read):
-    text = table(PLAIN, header=False)
-    file = read(f"{UNIX_S[0][:9]}0.5,nan,nan,nan\n" + text)
-    assert_track(file)
-    said(file, "1 row was dropped")
-
-
 def test_cut_rows_between_others_are_dropped(read):
     lines = table(PLAIN).splitlines(keepends=True)
     lines[30] = UNIX_S[29] + ",1.0\n"
@@ -568,27 +494,15 @@ def test_cut_rows_between_others_are_dropped(read):
     said(file, "1 row was dropped")
 
 
-@pytest.mark.parametrize("keep", range(1, len(table(PLAIN).splitlines()[-1])))
-def test_a_cut_last_line_is_dropped(read, keep):
+@pytest.mark.parametrize("left", [1, 20, len(table(PLAIN).splitlines()[-1])])
+def test_a_last_line_without_an_end_is_dropped(read, left):
+    """It may be cut anywhere, in its last digits too."""
     lines = table(PLAIN).splitlines(keepends=True)
-    file = read("".join(lines[:-1]) + lines[-1][:keep])
+    file = read("".join(lines[:-1]) + lines[-1][:left])
     assert_track(file, rows=slice(-1))
-    assert file.notes == (f"line {ROWS + 1}, the last one, was dropped: it is cut",)
-
-
-@pytest.mark.parametrize(
-    ("columns", "last", "is_cut"),
-    [
-        (PLAIN, "1795253690.0,1.0,2.0,nu", True),
-        ({**PLAIN, "state": ["valid"] * ROWS}, "1795253690.0,1.0,2.0,3.0,valid", False),
-        ({**PLAIN, "qf": [str(q) for q in QUALITY]}, "1795253690.0,1.0,2.0,3.0,8", True),
-        ({**PLAIN, "qf": [str(q) for q in QUALITY]}, "1795253690.0,1.0,2.0,3.0,80", False),
-    ],
-)
-def test_which_last_line_is_cut(read, columns, last, is_cut):
-    file = read(table(columns) + last)
-    assert len(file.samples) == ROWS + (not is_cut)
-    assert (f"line {ROWS + 2}, the last one, was dropped: it is cut" in file.notes) == is_cut
+    assert file.notes == (
+        f"line {ROWS + 1}, the last one, was dropped: it may be cut, as it has no end",
+    )
 
 
 @pytest.mark.parametrize(
@@ -627,25 +541,6 @@ def test_text_in_a_column_of_numbers_is_named(read, column, text):
     assert f"uwb.csv, line 35: '{column}': '{text}' is no" in line
 
 
-@pytest.mark.parametrize("text", ["2026-11-21T25:00:00Z", "1795253650.9", "later"])
-def test_text_among_iso_times_is_named(read, text):
-    line = refused(read, table({**PLAIN, "time": [*iso()[:29], text, *iso()[30:]]}))
-    assert f"line 31: 'time': '{text}' is not a time" in line
-
-
-def test_text_in_split_times_is_named(read):
-    nsecs = [*SPLIT["nsecs"][:-1], "oops"]
-    columns = {"secs": SPLIT["secs"], "nsecs": nsecs, "x": X, "y": Y}
-    assert f"line {ROWS + 1}: 'nsecs': 'oops' is not a number" in refused(read, table(columns))
-
-
-def test_text_in_a_file_without_header_is_named(read):
-    y = [*Y]
-    y[29] = "oops"
-    line = refused(read, table({**PLAIN, "y": y}, header=False))
-    assert "line 30: column 3: 'oops' is not a number" in line
-
-
 def test_several_tags_are_pointed_out(read):
     file = read(table({"tag_id": ["A1", "B2"] * (ROWS // 2), **PLAIN}))
     said(file, "several tags ('A1', 'B2')")
@@ -657,17 +552,15 @@ ODD = {"clock": UNIX_S, "a": Y, "b": X, "c": Z, "d_": SIGMA}
 
 
 @pytest.mark.parametrize(
-    ("columns", "header", "has_sigma"),
+    ("columns", "has_sigma"),
     [
-        (("clock", "b", "a", "c"), True, False),
-        (("CLOCK", "B ", "a", "c", "d_"), True, True),
-        (("1", "3", "2", "4"), True, False),
-        (("1", "3", "2", "4", "5"), False, True),
-        (("clock", "3", "a", "4"), True, False),
+        (("clock", "b", "a", "c"), False),
+        (("CLOCK", "B ", "a", "c", "d_"), True),
+        (("clock", "3", "a", "4"), False),
     ],
 )
-def test_columns_option(read, columns, header, has_sigma):
-    file = read(PREAMBLE + table(ODD, header=header), columns=columns)
+def test_columns_option(read, columns, has_sigma):
+    file = read(PREAMBLE + table(ODD), columns=columns)
     assert_track(file)
     assert file.samples["sigma_x_m"].notna().all() == has_sigma
     if has_sigma:
@@ -693,11 +586,6 @@ def test_columns_option_without_height(read):
     assert file.samples["x_m"].to_numpy() == pytest.approx(TRACK_M[:, 0])
 
 
-def test_columns_option_by_number_where_the_header_is_short(read):
-    text = "time,x,y,z\n" + table({"row": JUNK, **PLAIN}, header=False)
-    assert_track(read(text, columns=("2", "3", "4", "5")))
-
-
 def test_header_with_unnamed_columns_at_its_end(read):
     rows = table({**PLAIN, "more": JUNK}, header=False)
     assert_track(read("time,x,y,z,\n" + rows))
@@ -705,8 +593,8 @@ def test_header_with_unnamed_columns_at_its_end(read):
 
 def test_columns_option_takes_any_column(read):
     # names whose own meaning is another: a length as time, a time as a length
-    file = read(table({"x_m": UNIX_S, "time_ms": X, "b": Y, "c": Z}), columns=("1", "2", "3", "4"))
-    assert_track(file)
+    columns = {"x_m": UNIX_S, "time_ms": X, "b": Y, "c": Z, "x": JUNK, "y": JUNK}
+    assert_track(read(table(columns), columns=("1", "2", "3", "4")))
 
 
 @pytest.mark.parametrize(
@@ -719,10 +607,9 @@ def test_columns_option_takes_any_column(read):
         ({"columns": ("time", "x", "y", "")}, "does not name four or five different columns"),
         ({"columns": ("1", "2", "y", "z", "5", "6")}, "does not name four or five"),
         (
-            {"columns": ("time", "x", "y", "w")},
-            "no column 'w' found (the columns are 'time', 'x', 'y'",
+            {"columns": ("1", "2", "3", "9")},
+            "no column '9' found (the columns are 'time', 'x', 'y', 'z'). Name them with",
         ),
-        ({"columns": ("1", "2", "3", "9")}, "no column '9'"),
         ({"columns": ("0", "2", "3", "4")}, "no column '0'"),
         ({"columns": ("1", "2", "3", "9" * 5000)}, "no column '9999"),
         ({"columns": ("time", "2", "x", "y")}, "names one column twice"),
@@ -735,6 +622,11 @@ def test_bad_options(read, options, words):
     assert_one_line(caught.value)
 
 
+def test_a_column_that_is_not_there(read):
+    line = refused(read, table(PLAIN), columns=("time", "x", "y", "w"))
+    assert "no header with the columns 'time', 'w', 'x', 'y' in its first" in line
+
+
 # -- what cannot be read ---------------------------------------------------------------------------
 
 
@@ -742,25 +634,24 @@ def test_bad_options(read, options, words):
     ("content", "words"),
     [
         (b"", "empty"),
-        (b"\n\n \n", "no row of numbers"),
+        (b"\n\n \n", "no header with the columns time, x, y, z"),
         (table(PLAIN).replace("\n", "\ns,m,m,m\n", 1), "line 2: 'time': 's' is not a time"),
-        ("time,x,y,z,sigma\n1,2\n3,4\n", "no rows with time and position found"),
+        ("time,x,y,z,sigma\n1,2\n3,4\n", "no table of numbers"),
         (b"\x00\x01time,x,y,z\n1,2,3,4\n", "binary"),
         ((REPOSITORY / "sample_logs" / "aisle_uwb.ulg").read_bytes(), "binary"),
-        (b"Dear all,\nplease find attached\nthe log.\n", "no row of numbers"),
-        (b"time,x,y,z\n", "no row of numbers"),
-        (table({"when": UNIX_S, "x": X, "y": Y}), "no time column found (the columns are 'when'"),
-        (table({"time": UNIX_S, "a": X, "b": Y}), "no position columns found (the columns are 't"),
-        (table({"time": UNIX_S, "x": X, "b": Y}), "no position columns found"),
-        (table({"time": UNIX_S, "x [ft]": X, "y [ft]": Y}), "no position columns found"),
-        (table({"t": UNIX_S, "lat": X, "lon": Y}), "'lat', 'lon'). Name them with `columns`"),
-        (table(PLAIN, decimal=","), "names 4 columns, but rows have 8, as with a decimal comma"),
-        ("time,x,y,z\n" + table({"n": JUNK, **PLAIN}, header=False), "4 columns, but rows have 5"),
+        (b"Dear all,\nplease find attached\nthe log.\n", "of which the first is 'Dear all,'"),
+        (b"time,x,y,z\n", "usable rows: 0"),
+        (table(PLAIN, header=False), "Give a CSV file with a header, or name its"),
+        (table({"when": UNIX_S, "x": X, "y": Y}), "the first is 'when,x,y'"),
+        (table({"time": UNIX_S, "a": X, "b": Y}), "no header"),
+        (table({"time": UNIX_S, "x": X, "b": Y}), "no header"),
+        (table({"time": UNIX_S, "x [ft]": X, "y [ft]": Y}), "no header"),
+        (table({"t": UNIX_S, "lat": X, "lon": Y}), "no header"),
         (
-            table({"t": UNIX_S, "x": X}, header=False),
-            "no time column found (the columns are unnamed)",
+            table(PLAIN, decimal=","),
+            "names 4 columns, but rows have 8. Export it with",
         ),
-        (table(PLAIN, header=False)[:60], "usable rows: 1, at least 3"),
+        ("time,x,y,z\n" + table({"n": JUNK, **PLAIN}, header=False), "4 columns, but rows have 5"),
         (table({**PLAIN, "x": ["nan"] * ROWS}), "usable rows: 0, at least 3 are needed; 60 rows"),
         (table({**PLAIN, "time": [""] * ROWS}), "usable rows: 0"),
         (table({**PLAIN, "time": ["12.5"] * ROWS}), "usable rows: 1"),
@@ -833,25 +724,6 @@ def check_any(read, content: bytes, given_options: dict) -> None:
     assert all(len(line.splitlines()) == 1 for line in (*file.detected, *file.notes))
 
 
-@fuzzed
-@given(st.binary(max_size=400), options)
-@example(b"\xff\xfe" + bytes(range(255)), {})
-def test_any_bytes(read, content, given_options):
-    check_any(read, content, given_options)
-
-
-@fuzzed
-@given(st.text(max_size=300), options)
-def test_any_text(read, content, given_options):
-    check_any(read, content.encode(errors="replace"), given_options)
-
-
-@fuzzed
-@given(st.lists(words_of_tables, max_size=80).map("".join), options)
-def test_any_table(read, content, given_options):
-    check_any(read, content.encode(), given_options)
-
-
 @st.composite
 def rows_of_values(draw: st.DrawFn) -> bytes:
     values = st.one_of(
@@ -866,21 +738,30 @@ def rows_of_values(draw: st.DrawFn) -> bytes:
     return "\n".join([header, *map(",".join, rows), ""]).encode()
 
 
-@fuzzed
-@given(rows_of_values(), options)
-def test_any_values(read, content, given_options):
-    check_any(read, content, given_options)
+@st.composite
+def damaged_files(draw: st.DrawFn) -> bytes:
+    content = bytearray(draw(st.sampled_from(SEEDS)))
+    for _ in range(draw(st.integers(1, 4))):
+        at = draw(st.integers(0, len(content)))
+        end = min(len(content), at + draw(st.integers(0, 60)))
+        content[at:end] = draw(st.binary(max_size=20))
+    return bytes(content)
 
 
+CONTENTS = {
+    "bytes": st.binary(max_size=400) | st.just(b"\xff\xfe" + bytes(range(255))),
+    "text": st.text(max_size=300).map(lambda text: text.encode(errors="replace")),
+    "table": st.lists(words_of_tables, max_size=80).map("".join).map(str.encode),
+    "values": rows_of_values(),
+    "damaged": damaged_files(),
+}
+
+
+@pytest.mark.parametrize("kind", CONTENTS)
 @fuzzed
-@given(st.sampled_from(SEEDS), st.data(), options)
-def test_damaged_files(read, seed, data, given_options):
-    content = bytearray(seed)
-    for _ in range(data.draw(st.integers(1, 4))):
-        at = data.draw(st.integers(0, len(content)))
-        end = min(len(content), at + data.draw(st.integers(0, 60)))
-        content[at:end] = data.draw(st.binary(max_size=20))
-    check_any(read, bytes(content), given_options)
+@given(data=st.data(), given_options=options)
+def test_any_content_is_read_or_refused(read, kind, data, given_options):
+    check_any(read, data.draw(CONTENTS[kind]), given_options)
 
 
 @pytest.mark.parametrize(

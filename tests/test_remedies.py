@@ -1,4 +1,4 @@
-"""What a remedy does to the error against the truth, and what is said of sources that drift."""
+"""What remedies propose, with their effect: confirmed by a replay or by the truth, or not."""
 
 from __future__ import annotations
 
@@ -8,16 +8,29 @@ from pathlib import Path
 
 import pytest
 from exchange import replace
+from flights import Estimator, aisle_flight
 
 from px4fuse.analysis import Analysis, explain
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.model import AgainstTruth, Comparison
-from px4fuse.comparison.remedy import asked_of_ekf2, filter_words
-from px4fuse.ekf2.model import Model
-from px4fuse.ekf2.whatif import what_if
+from px4fuse.comparison.remedy import (
+    Effect,
+    asked_of_ekf2,
+    delay_change,
+    delay_helps,
+    filter_words,
+    noise_change,
+    noise_helps,
+    noise_used_m,
+    rejects_less,
+    remedy_words,
+)
+from px4fuse.ekf2.model import Model, replay_settings
+from px4fuse.ekf2.whatif import AxisSummary, Summary, what_if
+from px4fuse.filter.clock import ClockOffset
 from px4fuse.filter.settings import Settings
-from px4fuse.findings import Finding, find
-from px4fuse.flight import Unavailable
+from px4fuse.findings import Finding, ekf2_rejecting, find, source_clock
+from px4fuse.flight import Flight, Unavailable
 from px4fuse.readers import read_log
 from px4fuse.simulation.flights import simulate_flight
 from px4fuse.simulation.mistakes import parse
@@ -47,8 +60,8 @@ def errors_m(comparison: Comparison) -> float:
 
 
 def given(findings: tuple[Finding, ...]) -> list[str]:
-    """Remedies that are one, those of consequences too."""
-    remedies = [one.remedy for finding in findings for one in (finding, *finding.consequences)]
+    """Remedies that are one."""
+    remedies = [finding.remedy for finding in findings]
     return [each for each in remedies if "Leave it" not in each and "no remedy" not in each]
 
 
@@ -121,9 +134,8 @@ def test_on_a_loop_of_vio_the_truth_is_told_first_and_no_noise_is_lowered(seed, 
     assert first.id == "errors_larger_than_claimed"
     assert first.evidence["kf_nees_position_mean"] > 100.0 * first.evidence["kf_nis_mean"]
     for finding in findings:
-        for one in (finding, *finding.consequences):
-            assert "set EKF2_EVP_NOISE" not in one.remedy
-            assert "--sigma-z" not in one.remedy
+        assert "set EKF2_EVP_NOISE" not in finding.remedy
+        assert "--sigma-z" not in finding.remedy
     assert isinstance(analysis.ekf2_model, Model)
     asked = asked_of_ekf2(analysis, analysis.ekf2_model, analysis.tuning, analysis.clock)
     flown_with = analysis.ekf2_model.inputs.settings["EKF2_EVP_NOISE"]
@@ -136,7 +148,7 @@ def test_without_truth_the_report_says_that_consistency_is_not_correctness() -> 
     drift = next(finding for finding in findings if finding.id == "source_may_drift")
     assert "is not correctness" in drift.message
     assert drift.evidence["short_term_noise_m"] == pytest.approx(0.01, rel=0.1)
-    assert {one.id for one in drift.consequences} == {"kf_variance_overstated"}
+    assert {one.id for one in findings if one.caused_by} == {"kf_variance_overstated"}
 
 
 def test_the_sample_loop_has_no_clock_change_and_no_smaller_noise(sample_log: Path) -> None:
@@ -145,7 +157,7 @@ def test_the_sample_loop_has_no_clock_change_and_no_smaller_noise(sample_log: Pa
         compare(read_log(sample_log.with_name("loop_vio.ulg")), axes=("north", "east"))
     )
     findings = find(analysis)
-    ids = {name for finding in findings for name in finding.ids}
+    ids = {finding.id for finding in findings}
     assert findings[0].id == "errors_larger_than_claimed"
     assert "source_clock_changes" not in ids
     assert not any("EKF2_EVP_NOISE" in remedy for remedy in given(findings))
@@ -170,3 +182,228 @@ def test_a_remedy_of_our_filter_that_the_truth_contradicts_is_not_given() -> Non
     typed = "px4fuse compare LOG --sigma-z 0.2."
     assert filter_words(blind, Settings(sigma_z_m=0.2), "--sigma-z 0.2", 0.1) == typed
     assert filter_words(blind, Settings(sigma_z_m=0.2), "--sigma-z 0.2", -0.1).startswith("Leave")
+
+
+# ---------------------------------------------------------------- of EKF2
+
+NO_TRUTH = Unavailable("truth", "none", "None.")
+
+
+@pytest.fixture(scope="module")
+def sample(sample_flight: Flight) -> Analysis:
+    return explain(compare(sample_flight))
+
+
+def model_of(analysis: Analysis) -> Model:
+    assert isinstance(analysis.ekf2_model, Model)
+    return analysis.ekf2_model
+
+
+def flown_with(analysis: Analysis, **changes: float) -> Analysis:
+    """The same, had EKF2 been flown with other parameters."""
+    model = model_of(analysis)
+    (flown,) = replay_settings(model, [changes])
+    inputs = replace(model.inputs, settings={**model.inputs.settings, **changes})
+    return replace(analysis, ekf2_model=replace(model, inputs=inputs, flown=flown))
+
+
+def offset(analysis: Analysis, offset_s: float) -> Analysis:
+    """The same with stamps that are said to be off."""
+    assert isinstance(analysis.clock, ClockOffset)
+    clock = replace(
+        analysis.clock, offset_s=offset_s, interval_s=(offset_s - 0.01, offset_s + 0.01),
+        sigma_s=0.005, determinable=True, change_p=None,
+    )  # fmt: skip
+    return replace(analysis, clock=clock)
+
+
+def summary(
+    nis: float, rejected: float = 0.0, error: float | Unavailable = 0.1, std: float = 0.1
+) -> Summary:
+    axis = AxisSummary(nis, (0.9, 1.1), std, 0.05, error)
+    return Summary(
+        changed={}, north=axis, east=axis, samples=600, rejected_share=rejected,
+        longest_without_fusion_s=0.2, resets=0,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("after", "noise", "fewer", "delay"),
+    [
+        (summary(1.0, 0.0, 0.08, 0.09), True, True, True),
+        (summary(1.0, 0.0, NO_TRUTH, 0.09), True, True, True),
+        (summary(1.0, 0.0, 0.12, 0.09), False, False, False),  # no small error
+        (summary(9.0, 0.0, 0.08, 0.09), False, True, True),  # the NIS stays
+        (summary(0.05, 0.0, 0.08, 0.09), False, True, True),  # as far off on the other side
+        (summary(1.0, 0.2, 0.08, 0.09), True, False, True),
+        (summary(1.0, 0.3, 0.08, 0.09), False, False, False),
+        (summary(1.0, 0.0, 0.08, 0.11), True, True, False),
+    ],
+)  # fmt: skip
+def test_a_remedy_must_help_and_not_harm(
+    after: Summary, noise: bool, fewer: bool, delay: bool
+) -> None:
+    before = summary(10.0, 0.25, 0.1 if isinstance(axis_error(after), float) else NO_TRUTH, 0.1)
+    assert noise_helps(before, after) is noise
+    assert rejects_less(before, after) is fewer
+    assert delay_helps(before, after) is delay
+
+
+def axis_error(of: Summary) -> float | Unavailable:
+    return of.axes["north"].position_rmse_to_truth_m
+
+
+def test_the_effect_in_words() -> None:
+    before, after = summary(11.0, 0.27, 0.0707), summary(1.0, 0.0, 0.0424)
+    effect = Effect({"EKF2_EVP_NOISE": 0.1}, before, after)
+    assert effect.words() == (
+        "rejected 27% → 0%, mean NIS 11 → 1.0, position error 0.10 → 0.06 m (replayed)"
+    )
+    blind = Effect({}, summary(0.04, 0.0, NO_TRUTH, 0.2), summary(1.0, 0.0, NO_TRUTH))
+    assert (
+        blind.words() == "mean NIS 0.04 → 1.0, innovations 0.200 → 0.100 m rms, no truth (replayed)"
+    )
+
+
+def words(analysis: Analysis, **changes: float) -> str:
+    said, helps = remedy_words(
+        analysis.ekf2_model, changes, noise_helps, why="Because: ", otherwise="Look elsewhere:"
+    )
+    assert helps is said.startswith("Because")
+    return said
+
+
+def test_confirmed_refused_and_not_replayed(sample: Analysis) -> None:
+    sure = flown_with(sample, EKF2_EVP_NOISE=0.03)
+    said = words(sure, EKF2_EVP_NOISE=0.1)
+    assert said.startswith("Because: set EKF2_EVP_NOISE to 0.1 m: rejected ")
+    assert "→ 0%, mean NIS" in said
+    assert said.endswith("m (replayed).")
+    said = words(sample, EKF2_EVP_NOISE=0.5)  # what was flown is right
+    assert said.startswith("Look elsewhere: EKF2_EVP_NOISE 0.5 is no remedy: mean NIS 0.9 → 0.041")
+    blind = replace(sample, ekf2_model=Unavailable("EKF2 replay", "no IMU", "Record it."))
+    said = words(blind, EKF2_EVP_NOISE=0.2)
+    assert said == "Because: set EKF2_EVP_NOISE to 0.2 m. Not replayed: no IMU."
+    model = model_of(sample)
+    agreement = replace(model.agreement, good=False, reason="they part")
+    doubtful = replace(sample, ekf2_model=replace(model, agreement=agreement))
+    assert "Not replayed: the model does not reproduce what EKF2 logged: they part." in words(
+        doubtful, EKF2_EVP_NOISE=0.2
+    )
+
+
+def test_what_the_data_ask_for(sample: Analysis) -> None:
+    model, comparison = model_of(sample), sample
+
+    def asked(analysis: Analysis) -> dict[str, float]:
+        return asked_of_ekf2(comparison, model, analysis.tuning, analysis.clock)
+
+    assert asked(sample) == {"EKF2_EVP_NOISE": 0.098}
+    assert asked(replace(sample, tuning={})) == {}
+    aisle = {"aisle": sample.tuning["horizontal"]}  # --axis aisle
+    assert asked(replace(sample, tuning=aisle))["EKF2_EVP_NOISE"] == pytest.approx(0.1, abs=0.01)
+    late = asked(offset(sample, -0.25))
+    assert late == {"EKF2_EVP_NOISE": 0.098, "EKF2_EV_DELAY": 250.0, "EKF2_DELAY_MAX": 300.0}
+    assert asked(offset(sample, -0.14))["EKF2_EV_DELAY"] == 140.0
+    assert "EKF2_EV_DELAY" not in asked(offset(sample, -0.019))  # 0 may be right
+    assert "EKF2_DELAY_MAX" not in asked(offset(sample, -0.14))
+    assert "EKF2_EV_DELAY" not in asked(offset(sample, -0.4))  # beyond PX4's range
+    assert "EKF2_EV_DELAY" not in asked(offset(sample, 0.2))  # early: it is 0 already
+    other = replace(comparison, source=replace(comparison.source, name="another"))
+    assert asked_of_ekf2(other, model, sample.tuning, sample.clock) == {}
+
+
+def test_a_noise_that_the_sender_reports_is_overruled(sample: Analysis) -> None:
+    model = model_of(sample)
+    assert noise_used_m(model) == pytest.approx(0.1)
+    assert noise_change(model, 0.0012345) == {"EKF2_EVP_NOISE": 0.01}
+    settings = {**model.inputs.settings, "EKF2_EVP_NOISE": 0.02, "EKF2_EV_NOISE_MD": 0.0}
+    reported = replace(model, inputs=replace(model.inputs, settings=settings))
+    assert noise_change(reported, 0.05) == {"EKF2_EVP_NOISE": 0.05, "EKF2_EV_NOISE_MD": 1.0}
+    assert noise_change(reported, 0.2) == {"EKF2_EVP_NOISE": 0.2}
+    assert delay_change(model, -40.0) == {}
+    assert delay_change(model, 400.0) == {}
+
+
+def only(name: str, analysis: Analysis) -> Finding:
+    found = (*ekf2_rejecting.detect(analysis), *source_clock.detect(analysis))
+    (finding,) = [each for each in found if each.id == name]
+    return finding
+
+
+def test_a_delay_that_the_replay_refutes_is_not_proposed(sample: Analysis) -> None:
+    """The stamps of the sample are right; a clock estimate that says otherwise is refuted."""
+    finding = only("ekf2_ev_delay_wrong", offset(sample, -0.15))
+    assert finding.remedy.startswith("Correct the stamps at the sender: EKF2_EV_DELAY 150 is no")
+    # neither is ours, which the truth refutes as well
+    found = [finding.id for finding in source_clock.detect(offset(sample, -0.15))]
+    assert found == ["ekf2_ev_delay_wrong"]
+
+
+def test_a_delay_that_the_replay_confirms_is(sample: Analysis) -> None:
+    flight = sample.flight
+    parameters = {**flight.log.parameters, "EKF2_EV_DELAY": 150.0}
+    wrong = replace(flight, log=replace(flight.log, parameters=parameters))
+    late = flown_with(offset(sample, 0.0), EKF2_EV_DELAY=150.0)
+    late = replace(late, flight=wrong)
+    remedy = only("ekf2_ev_delay_wrong", late).remedy
+    assert remedy.startswith("Set EKF2_EV_DELAY to 0 ms: mean NIS")
+    assert remedy.endswith("(replayed).")
+
+
+@pytest.mark.parametrize(
+    ("offset_s", "said"),
+    [(0.2, "no parameter for stamps that are early"), (-0.4, "PX4 allows 300")],
+)
+def test_what_px4_cannot_set_is_not_proposed(sample: Analysis, offset_s: float, said: str) -> None:
+    assert said in only("ekf2_ev_delay_wrong", offset(sample, offset_s)).remedy
+
+
+def rejecting(comparison: Comparison) -> Comparison:
+    """The same, had EKF2's gate rejected every other sample."""
+    axes = {}
+    for name, axis in comparison.axes.items():
+        frame = axis.ekf2_innovations.copy()
+        frame.iloc[::2, frame.columns.get_loc("rejected")] = 1.0
+        axes[name] = replace(axis, ekf2_innovations=frame)
+    return replace(comparison, axes=axes)
+
+
+def test_rejections_are_ended_by_the_noise_that_the_data_ask_for(sample: Analysis) -> None:
+    north = rejecting(replace(sample, axes={"north": sample.axes["north"]}))
+    sure = flown_with(replace(sample, axes=north.axes), EKF2_EVP_NOISE=0.03)
+    remedy = only("ekf2_rejecting", sure).remedy
+    assert remedy.startswith("Set EKF2_EVP_NOISE to 0.098 m: rejected")
+    right = only("ekf2_rejecting", replace(sample, axes=north.axes)).remedy
+    assert right.startswith("With what the data ask for (EKF2_EVP_NOISE to 0.098 m) the rejections")
+    assert "Remove the outliers" in right
+    assert "A wider EKF2_EVP_GATE is no remedy; at 10:" in right
+    silent = replace(sample, axes=north.axes, tuning={})
+    assert "does not tell its noise" in only("ekf2_rejecting", silent).remedy
+
+
+def test_without_a_replay_the_order_of_doing_is_given() -> None:
+    analysis = explain(compare(aisle_flight(ekf2=Estimator(rejected_share=0.5))))
+    remedy = next(one.remedy for one in find(analysis) if one.id == "ekf2_rejecting")
+    assert remedy.startswith("First make EKF2_EVP_NOISE the source's own noise")
+    assert "Not replayed: " in remedy
+
+
+@pytest.mark.reallogs
+@pytest.mark.parametrize(
+    ("log", "name", "said"),
+    [
+        ("v1.16.1_aisle_overconfident", "ekf2_variance_understated",
+         "set EKF2_EVP_NOISE to 0.098 m: rejected 53% → 0%, mean NIS 22 → 1.0, position error 0.31 "
+         "→ 0.11 m (replayed)"),
+        ("v1.16.1_aisle_overconfident", "ekf2_rejecting", "Set EKF2_EVP_NOISE to 0.098 m"),
+        ("v1.16.1_aisle_nlos", "ekf2_variance_understated", "remove the outliers"),
+        ("v1.16.1_aisle_nlos", "ekf2_rejecting", "A wider EKF2_EVP_GATE is no remedy; at 10"),
+        ("v1.16.1_aisle_clock_late", "ekf2_ev_delay_wrong", "position error 0.34 → 0.11 m"),
+        ("v1.16.1_aisle_clock_late", "source_clock_offset", "for EKF2 set EKF2_EV_DELAY to 264 ms"),
+        ("v1.13.3_aisle_evdelay175", "ekf2_ev_delay_wrong", "position error 0.15 → 0.10 m"),
+    ],
+)  # fmt: skip
+def test_flown_flights(shared_logs: Path, log: str, name: str, said: str) -> None:
+    found = find(explain(compare(read_log(shared_logs / "simulated" / f"{log}.ulg"))))
+    assert any(said in finding.remedy for finding in found if finding.id == name)

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from px4fuse.assignment.sheet import read_sheet
+from px4fuse.assignment.roster import Person, read_people
 from px4fuse.errors import SettingsError
 from px4fuse.grading.platforms import ExportOrigin
-from px4fuse.grading.roster import Person, Register, people_of_sheet
+from px4fuse.grading.roster import Register
 
 MOODLE = (
     'Identifier,"Full name","ID number","Email address",Status,Grade,"Maximum Grade"\r\n'
@@ -27,7 +27,7 @@ ILIAS = "Nachname;Vorname;Benutzername;Matrikelnummer\nDoe;Jane;jdoe;0042\n"
 def people(tmp_path: Path, content: bytes) -> tuple[Person, ...]:
     path = tmp_path / "roster.csv"
     path.write_bytes(content)
-    return people_of_sheet(read_sheet(path))
+    return read_people(path)
 
 
 @pytest.mark.parametrize(
@@ -52,7 +52,7 @@ def test_columns_are_found_by_the_titles_that_platforms_write(tmp_path, text, is
     ("text", "says"),
     [
         ("a,b\n1,2\n", "no column tells who"),
-        ("id\n1\n1\n", "stands there twice"),
+        ("id\n1\n1\n", "rows 2 and 3 have the same id"),
         ("", "empty"),
         ("PK\x03\x04", "a spreadsheet"),
         ("id\n\0\n", "not text"),
@@ -113,13 +113,13 @@ def test_whose_a_file_is_by_what_the_platform_says(origin, place) -> None:
     ],
 )
 def test_whose_a_report_is_by_id_then_by_name(student_id, name, place) -> None:
-    assert CLASS.by_report(student_id, name) == place
+    assert CLASS.place(Person(student_id, name)) == place
 
 
 def test_of_two_ids_that_differ_by_zeros_the_exact_one_is_meant() -> None:
     register = Register([Person("042"), Person("42")])
-    assert register.by_report("42", "") == 1
-    assert register.by_report("0042", "") is None
+    assert register.place(Person("42")) == 1
+    assert register.place(Person("0042")) is None
 
 
 def test_a_worksheet_adds_what_it_knows() -> None:

@@ -5,8 +5,7 @@ import tomllib
 import pytest
 
 from px4fuse.errors import SettingsError
-from px4fuse.grading.rubric import parse_rubric, read_rubric, rubric_text
-from px4fuse.grading.scoring import CHECKS, NEED_KEY
+from px4fuse.grading.rubric import AnyItem, parse_rubric, read_rubric, rubric_text
 
 ITEM = '[[item]]\ntitle = "T"\npoints = 5\n'
 NOTES = ITEM + 'check = "flight"\n'
@@ -16,17 +15,18 @@ NUMBER = ITEM + 'check = "number"\npath = "a.b"\n'
 def test_default_uses_and_explains_every_check_and_parameter():
     text = rubric_text()
     used = {item["check"] for item in tomllib.loads(text)["item"]}
-    assert used == set(CHECKS)
-    for check in CHECKS.values():
-        for name in check.parameters:
-            assert f"{name} = " in text or name in text, name
+    checks = AnyItem.__args__
+    assert used == {check.__struct_config__.tag for check in checks}
+    for check in checks:
+        for name in check.__struct_fields__:
+            assert name in text, name
 
 
 @pytest.mark.parametrize("kind", ["compare", "loop"])
 def test_items_of_the_default_add_up_to_65_and_120_with_a_key(kind):
     items = [one for one in read_rubric(None).items if one.report in ("any", kind)]
-    with_key = {one.check: one.points for one in items if one.check in NEED_KEY}
-    assert with_key == {"answers": 100.0, "text": 20.0}
+    assert {one.points for one in items if one.needs_key} == {100.0, 20.0}
+    assert [one.by_hand for one in items if one.needs_key] == [False, True]
     assert sum(one.points for one in items) == 65 + 120
 
 
@@ -38,58 +38,47 @@ def test_copy_of_the_default_is_the_default(tmp_path):
 
 def test_parameters_left_out_have_their_defaults():
     (item,) = parse_rubric(NOTES, "x").items
-    assert item.parameters["min_measurements"] == 100
-    assert item.report == "any"
-
-
-def test_one_text_is_a_list_of_it_and_a_whole_number_a_number():
+    assert (item.min_measurements, item.report) == (100, "any")
     (item,) = parse_rubric(NUMBER + "at_most = 1\n", "x").items
-    assert item.parameters["path"] == ("a.b",)
-    assert isinstance(item.parameters["at_most"], float)
+    assert isinstance(item.at_most, float)
 
 
 DEEP = "a = " + "[" * 100_000
 BAD = {
-    "not toml": ("[[item", "not TOML"),
-    "deep": (DEEP, "not TOML"),
-    "integer of ten thousand digits": (NOTES.replace("5", "9" * 10_000), "not TOML"),
-    "empty": ("", "no items"),
-    "no items": ('title = "x"', "no items"),
-    "items are one table": ('[item]\ntitle = "x"', "no items"),
-    "item is a number": ("item = [1]", "item 1 is not a table"),
-    "unknown key": ("colour = 1\n" + NOTES, "unknown key 'colour'"),
-    "unknown check": (ITEM + 'check = "beauty"', "check cannot be 'beauty'"),
-    "no check": (ITEM, "no 'check'"),
-    "no title": ('[[item]]\npoints = 1\ncheck = "text"', "no 'title'"),
-    "empty title": (NOTES.replace('"T"', '" "'), "title is empty"),
-    "title of two lines": (NOTES.replace('"T"', '"a\\nb"'), "title cannot be"),
-    "no points": ('[[item]]\ntitle = "T"\ncheck = "text"', "no 'points'"),
-    "negative points": (NOTES.replace("5", "-5"), "points cannot be -5"),
-    "points are text": (NOTES.replace("5", '"5"'), "points cannot be '5'"),
-    "points are true": (NOTES.replace("5", "true"), "points cannot be True"),
-    "points are nan": (NOTES.replace("5", "nan"), "points cannot be nan"),
-    "points are a date": (NOTES.replace("5", "2026-01-01"), "points cannot be what it is"),
-    "huge points": (NOTES.replace("5", "9" * 400), "points cannot be"),
-    "unknown parameter": (NOTES + "min_letters = 3", "unknown key 'min_letters'"),
-    "wrong type": (
-        NOTES + "min_measurements = 1.5",
-        "min_measurements cannot be 1.5; give a whole number",
-    ),
-    "unknown report": (NOTES + 'report = "tune"', "report cannot be 'tune'"),
-    "unknown setting": (ITEM + 'check = "tuning"\nsettings = ["dt_s"]', "a list of sigma_z_m"),
+    "not toml": ("[[item", "Expected"),
+    "deep": (DEEP, "recursion"),
+    "integer of ten thousand digits": (NOTES.replace("5", "9" * 10_000), "Exceeds the limit"),
+    "empty": ("", "missing required field `item`"),
+    "items are one table": ('[item]\ntitle = "x"', "Expected `array`"),
+    "item is a number": ("item = [1]", "item 1: Expected `object`"),
+    "unknown key": ("colour = 1\n" + NOTES, "unknown field `colour`"),
+    "unknown check": (ITEM + 'check = "beauty"', "item 1: Invalid value 'beauty'"),
+    "no check": (ITEM, "item 1: Object missing required field `check`"),
+    "no title": ('[[item]]\npoints = 1\ncheck = "text"', "missing required field `title`"),
+    "empty title": (NOTES.replace('"T"', '" "'), "`$.title`"),
+    "title of two lines": (NOTES.replace('"T"', '"a\\nb"'), "`$.title`"),
+    "negative points": (NOTES.replace("5", "-5"), "Expected `float` >= 0.0 - at `$.points`"),
+    "points are text": (NOTES.replace("5", '"5"'), "`$.points`"),
+    "points are true": (NOTES.replace("5", "true"), "`$.points`"),
+    "points are nan": (NOTES.replace("5", "nan"), "`$.points`"),
+    "huge points": (NOTES.replace("5", "9" * 400), "`$.points`"),
+    "unknown parameter": (NOTES + "min_letters = 3", "unknown field `min_letters`"),
+    "wrong type": (NOTES + "min_measurements = 1.5", "Expected `int`"),
+    "unknown report": (NOTES + 'report = "tune"', "Invalid enum value 'tune'"),
+    "unknown setting": (ITEM + 'check = "tuning"\nsettings = ["dt_s"]', "'dt_s'"),
     "number without bound": (NUMBER, "no bound"),
-    "number without path": (ITEM + 'check = "number"\nat_most = 1', "no 'path'"),
-    "bounds exchanged": (NUMBER + "at_least = 2\nat_most = 1", "exchange them"),
+    "number without path": (ITEM + 'check = "number"\nat_most = 1', "field `path`"),
+    "bounds exchanged": (NUMBER + "at_least = 2\nat_most = 1", "at_least below at_most"),
     "zero on the good side": (NUMBER + "at_most = 2\nzero_at = 1", "put it beyond"),
-    "zero with two bounds": (NUMBER + "at_least = 0\nat_most = 2\nzero_at = 9", "one bound"),
-    "nothing required": (ITEM + 'check = "sections"', "nothing is required"),
-    "two alike": (NOTES + NOTES, "items 1 and 2 have the same title"),
-    "too many": (NOTES * 101, "at most 100"),
-    "words are text": ("common_words = [1]\n" + NOTES, "common_words cannot be"),
-    "words asked for": ('min_words = "x"\n' + NOTES, "min_words cannot be 'x'"),
-    "others' log": ('others_log = "maybe"\n' + NOTES, "others_log cannot be 'maybe'"),
-    "pages": ('pages = "maybe"\n' + NOTES, "pages cannot be 'maybe'"),
-    "unverified": ('unverified = "maybe"\n' + NOTES, "unverified cannot be 'maybe'"),
+    "zero on the other good side": (NUMBER + "at_least = 0\nzero_at = 1", "put it beyond"),
+    "zero with two bounds": (NUMBER + "at_least = 0\nat_most = 2\nzero_at = 9", "one of them"),
+    "nothing required": (ITEM + 'check = "sections"\nresults = []', "length >= 1"),
+    "two alike": (NOTES + NOTES, "two items have the title 'T'"),
+    "too many": (NOTES * 101, "length <= 100"),
+    "words are text": ("common_words = [1]\n" + NOTES, "`$.common_words[0]`"),
+    "words asked for": ('min_words = "x"\n' + NOTES, "`$.min_words`"),
+    "others' log": ('others_log = "maybe"\n' + NOTES, "`$.others_log`"),
+    "unverified": ('unverified = "count"\n' + NOTES, "`$.unverified`"),
 }
 
 

@@ -6,16 +6,14 @@ import re
 
 import numpy as np
 import pytest
-from exchange import replace
 from flights import Estimator, Uwb, aisle_flight, motion, unexplained, with_noises
 
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.model import Comparison
 from px4fuse.filter.settings import Settings
 from px4fuse.findings import find
-from px4fuse.findings.model import Finding, moments, off_spans
 from px4fuse.findings.story import MOST_SENTENCES, story
-from px4fuse.flight import Reset, Unavailable
+from px4fuse.flight import Reset
 from px4fuse.recording import Dropout
 
 ALONG_DEG = 30.0
@@ -119,30 +117,8 @@ def test_findings_say_when_they_show() -> None:
         ekf2=Estimator(resets=resets, fusing=((0.0, 1.0), (51.0, 0.0), (58.5, 1.0))),
         dropouts=(Dropout(20.0, 0.3),),
     )
-    analysis = unexplained(compare(flight))
-    when = {
-        one.id: one.when for top in find(analysis) for one in (top, *top.consequences)
-    }  # fmt: skip
-    assert when["source_gap"] == "50.0 s to 58.0 s"
-    assert when["ekf2_resets"] == "31.0 s, 72.5 s"
-    assert when["logger_dropouts"] == "20.0 s to 20.3 s"
-    assert when["ekf2_fusion_interrupted"] == "51.0 s to 58.5 s"
-
-
-def test_a_step_function_is_off_from_its_change_to_the_next() -> None:
-    flight = aisle_flight(ekf2=Estimator(fusing=((0.0, 0.0), (5.0, 1.0), (9.0, 0.0), (9.5, 1.0))))
-    assert not isinstance(flight.ekf2, Unavailable)
-    assert not isinstance(flight.ekf2.fusing, Unavailable)
-    steps = flight.ekf2.fusing["horizontal"]
-    assert off_spans(steps, 2.0, 100.0) == ((2.0, 5.0), (9.0, 9.5))
-    assert off_spans(steps, 5.0, 9.2) == ((9.0, 9.2),)
-
-
-def test_words_of_a_finding() -> None:
-    finding = Finding("x", "info", "The noise (0.1 m) is large: look at 1.5 s. Then go on.", "Go.")
-    assert finding.headline == "The noise is large"
-    assert finding.when == ""
-    at = replace(finding, spans_s=moments([3.0, 4.0]))
-    assert at.when == "3.0 s, 4.0 s"
-    assert replace(finding, spans_s=((3.0, 4.25),)).when == "3.0 s to 4.2 s"
-    assert replace(finding, spans_s=moments(range(9))).when == "from 0.0 s to 8.0 s"
+    when = {found.id: (found.when, found.says_when) for found in find(unexplained(compare(flight)))}
+    assert when["source_gap"] == ("50.0 s to 58.0 s", True)
+    assert when["ekf2_resets"] == ("31.0 s, 72.5 s", True)
+    assert when["logger_dropouts"] == ("20.0 s to 20.3 s", False)
+    assert when["ekf2_fusion_interrupted"] == ("51.0 s to 58.5 s", False)

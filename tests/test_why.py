@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from exchange import replace
@@ -51,22 +53,6 @@ def again(analysis: Analysis, comparison: Comparison, **changes: object) -> Why:
     found = why_ekf2_differs(comparison, **{**given, **changes})["aisle"]
     assert isinstance(found, Why)
     return found
-
-
-def test_all_horizontal_axes_are_walked_and_add_up(sample: Analysis) -> None:
-    assert set(sample.why) == {"north", "east", "aisle"}
-    for name in sample.why:
-        axis = of(sample, name)
-        assert tuple(step.name for step in axis.steps) == STEPS
-        position = sum(step.position_mean_square_m2 for step in axis.steps)
-        velocity = sum(step.velocity_mean_square_m2_s2 for step in axis.steps)
-        assert position + axis.position_left_mean_square_m2 == pytest.approx(
-            axis.position_mean_square_m2, abs=1e-12
-        )
-        assert velocity + axis.velocity_left_mean_square_m2_s2 == pytest.approx(
-            axis.velocity_mean_square_m2_s2
-        )
-        assert axis.position_left_share < 0.03
 
 
 def test_the_whole_is_our_filter_against_what_ekf2_published(sample: Analysis) -> None:
@@ -215,62 +201,51 @@ def test_every_axis_that_is_explained_has_its_panels(sample: Analysis) -> None:
 
 
 def test_results_hold_the_steps_and_the_agreement(sample: Analysis) -> None:
-    made = results(ComparisonRequest(log="aisle_uwb.ulg"), sample, (), Student(), "")
-    said = to_plain(made)
-    aisle = said["why"]["aisle"]
+    said = to_plain(results(ComparisonRequest(log="x.ulg"), sample, (), Student(), ""))
+    assert set(said["why"]) == {"north", "east", "aisle"}
+    aisle, agreement = said["why"]["aisle"], said["ekf2_replay"]["agreement"]
     assert [step["name"] for step in aisle["steps"]] == list(STEPS)
-    position = sum(step["position_mean_square_m2"] for step in aisle["steps"])
-    assert position + aisle["position_left_mean_square_m2"] == pytest.approx(
-        aisle["position_mean_square_m2"], abs=1e-12
-    )
-    assert "velocity_mean_square_m2_s2" in aisle["steps"][0]
-    agreement = said["ekf2_replay"]["agreement"]
+    assert not {"apart_m", "left_m", "times_s", "cause"} & aisle.keys()
     north = agreement["north"]
-    assert north["innovation_correlation"] > 0.995
     assert north["s_ratio_p5"] < north["s_ratio_median"] < north["s_ratio_p95"]
-    assert north["innovation_rms_difference"] < 0.01
-    assert agreement["rejected_share_logged"] == agreement["rejected_share_replayed"] == 0.0
+    assert agreement["ev_pos"]["north"] == north
     none = to_plain(results(ComparisonRequest(log="x"), unexplained(sample), (), Student(), ""))
     assert none["ekf2_replay"]["reason"]
 
 
 @pytest.mark.reallogs
-class TestFlownFlights:
-    def of(self, shared_logs, name: str) -> tuple[Analysis, Why]:
-        analysis = explain(compare(read_log(shared_logs / "simulated" / f"{name}.ulg")))
-        return analysis, of(analysis)
-
-    def test_an_overconfident_ekf2_is_named_by_its_parameter(self, shared_logs) -> None:
-        _, why = self.of(shared_logs, "v1.16.1_aisle_overconfident")
-        assert why.sentences[0].startswith("EKF2_EVP_NOISE is too small")
-        assert "55% of the samples" in why.sentences[0]
-        assert why.coast is not None
-        assert f"{why.coast.samples} samples in a row and coasted" in why.sentences[0]
-        assert "the rejections that follow from it are" in why.sentences[0]
-        assert any("through its too small noise and the rejections" in s for s in why.sentences)
-        assert why.position_left_share < 0.03
-
-    def test_outliers_are_of_the_gate_and_no_noise_is_blamed(self, shared_logs) -> None:
-        _, why = self.of(shared_logs, "v1.16.1_aisle_nlos")
-        said = " ".join(why.sentences)
-        assert "EKF2_EVP_NOISE" not in said
-        assert "the gate, missed samples, resets" in said
-        assert "EKF2 is closer to the truth" in said
-        assert "up to 4.0 m apart (at 64 s)" in said  # it did not fuse for 15 s
-
-    def test_on_a_late_clock_no_delay_is_blamed(self, shared_logs) -> None:
-        _, why = self.of(shared_logs, "v1.16.1_aisle_clock_late")
-        assert why.sentences[0].startswith("The source's stamps are late by 0.26 s for both")
+@pytest.mark.parametrize(
+    ("log", "first", "elsewhere", "never"),
+    [
+        ("v1.16.1_aisle_overconfident",
+         ("EKF2_EVP_NOISE is too small", "55% of the samples", "samples in a row and coasted",
+          "the rejections that follow from it are"),
+         ("through its too small noise and the rejections",), ()),
+        # outliers are of the gate, and no noise is blamed; it did not fuse for 15 s
+        ("v1.16.1_aisle_nlos", (),
+         ("the gate, missed samples, resets", "EKF2 is closer to the truth",
+          "up to 4.0 m apart (at 64 s)"), ("EKF2_EVP_NOISE",)),
+        ("v1.16.1_aisle_clock_late", ("The source's stamps are late by 0.26 s for both",), (), ()),
+        ("v1.13.3_aisle_evdelay175",
+         ("is the stamps and delay",
+          "175 ms older than its stamp (EKF2_EV_DELAY), ours 0 ms"),
+         ("mostly through the stamps and delay",), ()),
+    ],
+)  # fmt: skip
+def test_flown_flights(
+    shared_logs: Path, log: str, first: tuple[str, ...], elsewhere: tuple[str, ...],
+    never: tuple[str, ...],
+) -> None:  # fmt: skip
+    why = of(explain(compare(read_log(shared_logs / "simulated" / f"{log}.ulg"))))
+    assert all(words in why.sentences[0] for words in first)
+    assert all(words in " ".join(why.sentences) for words in elsewhere)
+    assert not any(words in " ".join(why.sentences) for words in never)
+    assert why.position_left_share < 0.03
+    if log.endswith("clock_late"):  # on a late clock no delay is blamed
         by_name = {step.name: step for step in why.steps}
-        stamps = by_name["stamps and delay"]
-        assert abs(stamps.position_mean_square_m2) < 0.05 * why.position_mean_square_m2
+        stamps = by_name["stamps and delay"].position_mean_square_m2
+        assert abs(stamps) < 0.05 * why.position_mean_square_m2
         assert by_name["measurement noise"].position_moved_m < 1e-6
-
-    def test_a_delay_at_its_old_default_is_the_largest_step(self, shared_logs) -> None:
-        _, why = self.of(shared_logs, "v1.13.3_aisle_evdelay175")
-        assert "is the stamps and delay" in why.sentences[0]
-        assert "175 ms older than its stamp (EKF2_EV_DELAY), ours 0 ms" in why.sentences[0]
-        assert any("mostly through the stamps and delay" in s for s in why.sentences)
 
 
 def test_the_story_leaves_wrong_stamps_to_their_finding(sample: Analysis) -> None:

@@ -107,9 +107,14 @@ def place(
         alignment=alignment,
     )
     said = tuple(f"{file.name}: {text}" for text in (*file.detected, *file.notes))
+    dropped = {file.name: file.dropped} if file.dropped else {}
     return replace(
         flight,
-        log=structs.replace(flight.log, notes=(*flight.log.notes, *said)),
+        log=structs.replace(
+            flight.log,
+            notes=(*flight.log.notes, *said),
+            dropped={**flight.log.dropped, **dropped},
+        ),
         positions=(track, *flight.positions),
         inputs=(*flight.inputs, InputFile(file.name, file.sha256, file.size_bytes, "position")),
     )

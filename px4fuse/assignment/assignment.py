@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import hashlib
 import secrets
-import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from px4fuse.answers import form_name, form_text
 from px4fuse.assignment.drawing import Drawn, Kinds, draw, most_mistakes
 from px4fuse.assignment.key import Answer, AnswerKey, folded, key_text, read_key
-from px4fuse.assignment.roster import RosterStudent
+from px4fuse.assignment.roster import Person
 from px4fuse.assignment.truth import truth_of
 from px4fuse.errors import OutputError, SettingsError
 from px4fuse.plain import plain
@@ -26,22 +25,16 @@ TRUTH = ("duration_s", "sigma_z_m", "sigma_a_m_s2", "reported_sigma_m", "clock_o
 
 
 def fly(
-    secret: bytes, student: RosterStudent, kind: Kinds, count: int | None = None, truth: bool = True
+    secret: bytes, student: Person, kind: Kinds, count: int | None = None, truth: bool = True
 ) -> tuple[bytes, Answer]:
     """One student's log, and the answer to it."""
-    drawn = draw(secret, student.id, kind, count, truth)
+    drawn = draw(secret, student.student_id, kind, count, truth)
     simulation = flights.simulate(drawn.scenario, parse(drawn.typed))
     log = flights.to_ulog(simulation)
-    return log, answer_to(student, drawn, simulation, hashlib.sha256(log).hexdigest())
-
-
-def answer_to(
-    student: RosterStudent, drawn: Drawn, simulation: flights.Simulation, sha256: str
-) -> Answer:
-    """The answer to a flight as drawn, whose log has this SHA-256."""
+    sha256 = hashlib.sha256(log).hexdigest()
     known = flights.answer(simulation)["truth"]
-    return Answer(
-        student_id=student.id,
+    return log, Answer(
+        student_id=student.student_id,
         name=student.name,
         file=student.file,
         sha256=sha256,
@@ -87,7 +80,7 @@ def key_path(folder: Path, given: Path | None) -> Path:
 
 
 def assign(
-    students: Sequence[RosterStudent],
+    students: Sequence[Person],
     folder: Path,
     key_file: Path,
     secret: bytes | None,
@@ -98,9 +91,9 @@ def assign(
 ) -> Assigned:
     """Write everyone's log and form into a folder, and the answer key.
 
-    All logs are made before the first is put in its place, so that a run that fails leaves the
-    folder as it was. What is there already is never replaced: a log must be the same to the byte,
-    and a key may only gain students.
+    Each student's log, form and answer are put in their places together, so that a run that is
+    interrupted can go on. What is there already is never replaced: a log must be the same to the
+    byte, and a key may only gain students.
 
     Parameters
     ----------
@@ -121,46 +114,36 @@ def assign(
         A file is there already with other content, or cannot be written.
     """
     _check_count(kind, count)
-    before = _key_before(key_file)
-    made_up = before.secret if before is not None else ""
+    key = read_key(key_file) if key_file.exists() else AnswerKey(kind, ())
+    answers = {folded(answer.student_id): answer for answer in key.answers}
+    _check_extends(
+        key_file, key.kind == kind and answers.keys() <= {folded(s.student_id) for s in students}
+    )
+    made_up = key.secret
     if secret is None:
         made_up = made_up or secrets.token_urlsafe(24)
         secret = made_up.encode()
     elif made_up.encode() != secret:
         made_up = ""
-    known = folder.exists()
-    staged: dict[Path, Path] = {}
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix=".px4fuse-", dir=folder) as staging:
-            answers = []
-            for done, student in enumerate(students, start=1):
-                log, answer = fly(secret, student, kind, count, truth)
-                answers.append(answer)
-                form = form_text(student.file, answer.sha256).encode()
-                for name, content in ((student.file, log), (form_name(student.file), form)):
-                    target = folder / name
-                    if not _there(target, content):
-                        staged[target] = Path(staging) / name
-                        staged[target].write_bytes(content)
-                step(done, len(students))
-            key = AnswerKey(kind, tuple(answers), made_up)
-            _check_extends(key_file, before, key)
-            _place(staged, key_file, key_text(key).encode())
-    except OSError as error:
-        raise OutputError(
-            f"{error.filename or folder}: cannot be written ({error.strerror}). Choose another "
-            "place with -o."
-        ) from error
-    finally:
-        if not known and folder.is_dir() and not any(folder.iterdir()):
-            folder.rmdir()
-    written = sum(target.suffix == ".ulg" for target in staged)
+    written = 0
+    for done, student in enumerate(students, start=1):
+        log, answer = fly(secret, student, kind, count, truth)
+        known = answers.setdefault(folded(student.student_id), answer)
+        _check_extends(key_file, known.sha256 == answer.sha256)
+        form = form_text(student.file, answer.sha256).encode()
+        contents = {folder / student.file: log, folder / form_name(student.file): form}
+        new = {path: content for path, content in contents.items() if not _there(path, content)}
+        key = AnswerKey(kind, tuple(answers.values()), made_up)
+        write_all({**new, key_file: key_text(key).encode()})
+        # of no use to anyone but the instructor
+        key_file.chmod(0o600)
+        written += folder / student.file in new
+        step(done, len(students))
     return Assigned(key, written, len(students) - written)
 
 
 def preview(
-    students: Sequence[RosterStudent],
+    students: Sequence[Person],
     key_file: Path,
     secret: bytes | None,
     kind: Kinds,
@@ -176,15 +159,15 @@ def preview(
         The key that is there was made by an earlier px4fuse.
     """
     _check_count(kind, count)
-    before = _key_before(key_file)
     if secret is None:
+        before = read_key(key_file) if key_file.exists() else None
         if before is None or not before.secret:
             raise SettingsError(
                 "--preview requires --secret-file or --secret: one that is made up is not kept, "
                 "and would give others each time."
             )
         secret = before.secret.encode()
-    return [draw(secret, student.id, kind, count) for student in students]
+    return [draw(secret, student.student_id, kind, count) for student in students]
 
 
 def _check_count(kind: Kinds, count: int | None) -> None:
@@ -193,11 +176,6 @@ def _check_count(kind: Kinds, count: int | None) -> None:
             f"--mistakes {count}: a flight of kind {kind} can have 0 to {most_mistakes(kind)}, of "
             "which each is still found beside the others."
         )
-
-
-def _key_before(key_file: Path) -> AnswerKey | None:
-    """The key that is there already, to which students may be added."""
-    return read_key(key_file) if key_file.exists() else None
 
 
 def _there(target: Path, log: bytes) -> bool:
@@ -212,31 +190,11 @@ def _there(target: Path, log: bytes) -> bool:
     )
 
 
-def _check_extends(key_file: Path, before: AnswerKey | None, key: AnswerKey) -> None:
+def _check_extends(key_file: Path, same: bool) -> None:
     """A key that is there already must be part of the new one."""
-    if before is None:
-        return
-    new = {folded(answer.student_id): answer.sha256 for answer in key.answers}
-    lost = [a.student_id for a in before.answers if new.get(folded(a.student_id)) != a.sha256]
-    if before.kind != key.kind or lost:
+    if not same:
         raise OutputError(
             f"{key_file}: is the answer key of other flights; it was not overwritten. Give the "
             "same secret, options and students as before (more are welcome), or another place with "
             "--answer."
         )
-
-
-def _place(staged: Mapping[Path, Path], key_file: Path, key: bytes) -> None:
-    """Move logs to their places and write the key; no log stays where one of these fails."""
-    placed: list[Path] = []
-    try:
-        for target, path in staged.items():
-            path.replace(target)
-            placed.append(target)
-        write_all({key_file: key})
-    except BaseException:
-        for target in placed:
-            target.unlink(missing_ok=True)
-        raise
-    # of no use to anyone but the instructor
-    key_file.chmod(0o600)

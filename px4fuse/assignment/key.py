@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import unicodedata
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, NoReturn
+from typing import Annotated, Literal
 
 import msgspec
 from msgspec import Meta
@@ -14,8 +13,6 @@ from px4fuse.assignment.truth import FormTruth
 from px4fuse.errors import SettingsError
 from px4fuse.reading import read_text
 
-SCHEMA_NAME = "px4fuse-assignment"
-SCHEMA_VERSION = 3
 # A thousand students take two million
 MAX_KEY_BYTES = 20_000_000
 MAX_STUDENTS = 1000
@@ -66,9 +63,13 @@ class Answer(msgspec.Struct, frozen=True, rename={"student_id": "id"}):
     form: FormTruth | None = None
 
 
-@dataclass(frozen=True)
-class AnswerKey:
-    """The answers of a class.
+class _Schema(msgspec.Struct, frozen=True):
+    name: Literal["px4fuse-assignment"] = "px4fuse-assignment"
+    version: Literal[3] = 3
+
+
+class AnswerKey(msgspec.Struct, frozen=True):
+    """The answers of a class, as they are written.
 
     Attributes
     ----------
@@ -78,9 +79,16 @@ class AnswerKey:
         From which the flights were drawn, where it was made up; else "".
     """
 
-    kind: str
-    answers: tuple[Answer, ...]
-    secret: str = field(default="", repr=False)
+    kind: _Text
+    answers: Annotated[tuple[Answer, ...], Meta(min_length=1, max_length=MAX_STUDENTS)] = (
+        msgspec.field(name="students")
+    )
+    secret: _Text = ""
+    schema: _Schema = _Schema()
+    note: str = NOTE
+
+    def __repr__(self) -> str:  # without the secret
+        return f"AnswerKey({self.kind!r}, {len(self.answers)} students)"
 
     def of_student(self, student_id: str) -> Answer | None:
         """The answer for an id, however it is capitalised.
@@ -102,24 +110,6 @@ class AnswerKey:
         return next((a for a in self.answers if sha256 and a.sha256 == sha256), None)
 
 
-class _Schema(msgspec.Struct):
-    name: str
-    version: int
-
-
-class _Headed(msgspec.Struct):
-    """What every version of the file has."""
-
-    schema: _Schema
-
-
-class _KeyFile(_Headed, omit_defaults=True):
-    kind: _Text
-    students: Annotated[tuple[Answer, ...], Meta(min_length=1, max_length=MAX_STUDENTS)]
-    note: str = ""
-    secret: _Text = ""
-
-
 def folded(text: str) -> str:
     """Id or name for comparison: one spelling per character, case and outer spaces ignored."""
     return unicodedata.normalize("NFKC", text).strip().casefold()
@@ -127,9 +117,7 @@ def folded(text: str) -> str:
 
 def key_text(key: AnswerKey) -> str:
     """The key as JSON, for :func:`read_key`."""
-    schema = _Schema(SCHEMA_NAME, SCHEMA_VERSION)
-    content = msgspec.json.encode(_KeyFile(schema, key.kind, key.answers, NOTE, key.secret))
-    return msgspec.json.format(content, indent=1).decode() + "\n"
+    return msgspec.json.format(msgspec.json.encode(key), indent=1).decode() + "\n"
 
 
 def read_key(path: Path) -> AnswerKey:
@@ -142,23 +130,12 @@ def read_key(path: Path) -> AnswerKey:
     """
     text = read_text(path, SettingsError, MAX_KEY_BYTES, name=str(path))
     try:
-        schema = msgspec.json.decode(text, type=_Headed).schema
-        if schema.name != SCHEMA_NAME:
-            _refuse(path, "not an answer key")
-        if schema.version != SCHEMA_VERSION:
-            _refuse(path, "of a version that this px4fuse does not read")
-        file = msgspec.json.decode(text, type=_KeyFile)
-    except (msgspec.MsgspecError, RecursionError) as error:
-        _refuse(path, f"not an answer key ({error})")
-    seen: dict[str, int] = {}
-    for number, answer in enumerate(file.students, start=1):
-        other = seen.setdefault(folded(answer.student_id), number)
-        if other != number:
-            _refuse(path, f"students {other} and {number} have the same id")
-    return AnswerKey(file.kind, file.students, file.secret)
-
-
-def _refuse(path: Path, why: str) -> NoReturn:
-    raise SettingsError(
-        f"{path}: {why}. Give the answer key as px4fuse simulate --assignment wrote it."
-    )
+        key = msgspec.json.decode(text, type=AnswerKey)
+        if len({folded(answer.student_id) for answer in key.answers}) < len(key.answers):
+            raise ValueError("two students have the same id")
+    except (msgspec.MsgspecError, RecursionError, ValueError) as error:
+        raise SettingsError(
+            f"{path}: not an answer key that this px4fuse reads ({error}). Give it as px4fuse "
+            "simulate --assignment wrote it."
+        ) from error
+    return key

@@ -1,13 +1,14 @@
-"""The class list that a learning platform exports."""
+"""The class list that a learning platform exports: who is in the class."""
 
 from __future__ import annotations
 
+import re
 import unicodedata
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
-from px4fuse.assignment.key import MAX_STUDENTS
+from px4fuse.assignment.key import MAX_STUDENTS, folded
 from px4fuse.assignment.sheet import Sheet, read_sheet
 from px4fuse.errors import SettingsError
 from px4fuse.results.reading import one_line
@@ -17,7 +18,7 @@ MAX_NAME = 200
 MAX_STEM = 48
 RESERVED = {"con", "prn", "aux", "nul"} | {f"{n}{i}" for n in ("com", "lpt") for i in range(10)}
 # Column titles, letters and digits only, best first. The university's own id; Canvas's "ID",
-# Moodle's "Identifier" and ILIAS's "User ID" are the platform's and stand below
+# Moodle's "Identifier" and ILIAS's "User ID" are the platform's
 ID_COLUMNS = (
     "studentid", "studentnumber", "studentno", "idnumber", "matriculationnumber", "matriculation",
     "matrikelnummer", "matrikelnr", "orgdefinedid", "sisuserid", "sid", "id", "number",
@@ -27,83 +28,140 @@ EMAIL_COLUMNS = ("emailaddress", "email", "mail", "emailadresse")
 NAME_COLUMNS = ("name", "fullname", "studentname", "displayname", "student")
 FIRST_NAME_COLUMNS = ("firstname", "givenname", "forename", "vorname")
 LAST_NAME_COLUMNS = ("lastname", "surname", "familyname", "nachname")
+# Of Canvas, above the students
+NOT_STUDENTS = ("pointspossible", "studenttest")
 
 
 @dataclass(frozen=True)
-class RosterStudent:
-    """One row of the roster.
+class Person:
+    """One of the class.
 
     Attributes
     ----------
-    id, name : str
-        As they stand there.
-    file : str
-        Name of the student's log: the id, as far as a file system takes it.
+    student_id, name, email : str
+        As the roster says.
+    login : str
+        By which Blackboard and ILIAS know the student.
+    numbers : mapping
+        Platform to the number that it gave the student.
     """
 
-    id: str
-    name: str
-    file: str
+    student_id: str
+    name: str = ""
+    email: str = ""
+    login: str = ""
+    numbers: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def file(self) -> str:
+        """Name of the student's log: the id, as far as a file system takes it."""
+        return f"{file_stem(self.student_id)}.ulg"
 
 
-def read_roster(path: Path) -> tuple[RosterStudent, ...]:
-    """Read the class list that a learning platform exports: a CSV file with a header.
+def read_people(path: Path) -> tuple[Person, ...]:
+    """The class list that a learning platform exports, or any table with a column of ids or names.
 
     Raises
     ------
     SettingsError
-        It cannot be read, has no column of ids, or an id is missing or stands there twice.
+        It cannot be read, no column tells who somebody is, or two rows have the same id.
     """
-    sheet = read_sheet(path)
-    # platforms export columns that nobody filled in
-    every = (*ID_COLUMNS, "userid", *LOGIN_COLUMNS, *EMAIL_COLUMNS)
-    listed = [title for title in every if sheet.column((title,)) is not None]
-    filled = [one for one in listed if any(sheet.cell(row, (one,)) for row in sheet.rows)]
-    if not listed:
+    return people_of_sheet(read_sheet(path))
+
+
+def people_of_sheet(sheet: Sheet) -> tuple[Person, ...]:
+    """The people of a table, as :func:`read_people` does it.
+
+    Columns are found by their titles: id (Student ID, ID number, Matrikelnummer, SIS User ID),
+    login (Username, SIS Login ID), email, name (or first and last name). Worksheets of Moodle and
+    gradebooks of Canvas are class lists too.
+
+    Raises
+    ------
+    SettingsError
+        No column tells who somebody is, or two rows have the same id.
+    """
+    known = (_ids(sheet), LOGIN_COLUMNS, EMAIL_COLUMNS, NAME_COLUMNS, LAST_NAME_COLUMNS)
+    if not any(sheet.column(titles) is not None for titles in known):
         raise SettingsError(
-            f"{path}: no column of ids. The first row must name the columns; call one 'student id' "
-            "and, if you like, one 'name'."
+            f"{sheet.path}: no column tells who a student is. Give one a title such as id, email "
+            "or name."
         )
-    column = (filled or listed)[:1]
-    students: list[RosterStudent] = []
-    row_of: dict[str, int] = {}
+    rows: dict[str, int] = {}
+    people = []
     for number, row in zip(sheet.numbers, sheet.rows, strict=True):
-        student_id = one_line(sheet.cell(row, column), MAX_NAME)
-        if not student_id:
-            title = sheet.head[sheet.column(column) or 0].strip()
+        person = person_of_row(sheet, row)
+        if person is None:
+            continue
+        wanted = folded(person.student_id)
+        if wanted and rows.setdefault(wanted, number) != number:
             raise SettingsError(
-                f"{path}: row {number} has no id in the column {title!r}. Give every "
-                "student one, or delete the row."
+                f"{sheet.path}: rows {rows[wanted]} and {number} have the same id "
+                f"{one_line(person.student_id, 40)!r}. Give every student one of its own."
             )
-        stem = file_stem(student_id)
-        shown = repr(one_line(student_id, 40))
+        people.append(person)
+    return tuple(people)
+
+
+def read_roster(path: Path) -> tuple[Person, ...]:
+    """The class list from which an assignment is made: everyone has an id of its own.
+
+    Raises
+    ------
+    SettingsError
+        From :func:`read_people`, or no file can be named after an id.
+    """
+    people = read_people(path)
+    if not people or len(people) > MAX_STUDENTS:
+        raise SettingsError(f"{path}: {len(people)} students. Give 1 to {MAX_STUDENTS}.")
+    stems: dict[str, Person] = {}
+    for person in people:
+        who = one_line(person.student_id or person.name, 40)
+        stem = file_stem(person.student_id)
         if stem is None:
             raise SettingsError(
-                f"{path}: row {number}: the id {shown} has neither letters nor digits, so that no "
-                "file can be named after it."
+                f"{path}: {who!r} has no id with letters or digits, after which a file can be "
+                "named. Give every student one."
             )
-        other = row_of.setdefault(stem.casefold(), number)
-        if other != number:
+        if stems.setdefault(stem.casefold(), person) is not person:
             raise SettingsError(
-                f"{path}: rows {other} and {number} have the same id {shown}, or ids that give the "
-                "same file name. Give every student one of its own."
+                f"{path}: {one_line(stems[stem.casefold()].student_id, 40)!r} and {who!r} give the "
+                "same file name. Give every student an id of its own."
             )
-        students.append(RosterStudent(student_id, full_name(sheet, row), f"{stem}.ulg"))
-    if not students:
-        raise SettingsError(f"{path}: no students below the header. Give one row for each.")
-    if len(students) > MAX_STUDENTS:
-        raise SettingsError(
-            f"{path}: {len(students)} students are too many (at most {MAX_STUDENTS}). Split the "
-            "roster."
-        )
-    return tuple(students)
+    return people
 
 
-def full_name(sheet: Sheet, row: Sequence[str]) -> str:
-    """A student's name, from one column or from two."""
+def person_of_row(sheet: Sheet, row: Sequence[str]) -> Person | None:
+    """The student in a row of a table; None for a row without one."""
     parts = (sheet.cell(row, titles) for titles in (FIRST_NAME_COLUMNS, LAST_NAME_COLUMNS))
     whole = sheet.cell(row, NAME_COLUMNS) or " ".join(filter(None, parts))
-    return one_line(whole, MAX_NAME)
+    if re.sub(r"\W", "", whole.casefold()) in NOT_STUDENTS:
+        return None
+    name, email, login, student_id = (
+        one_line(text, MAX_NAME)
+        for text in (
+            whole,
+            sheet.cell(row, EMAIL_COLUMNS),
+            sheet.cell(row, LOGIN_COLUMNS),
+            sheet.cell(row, _ids(sheet)),
+        )
+    )
+    numbers = {}
+    if participant := re.search(r"\d+$", sheet.cell(row, ("identifier",))):
+        numbers["moodle"] = participant[0]
+    if _is_canvas(sheet) and (user := sheet.cell(row, ("id",))):
+        numbers["canvas"] = user
+    found = Person(student_id or login or email, name, email, login, numbers)
+    return found if found.student_id or name or numbers else None
+
+
+def _is_canvas(sheet: Sheet) -> bool:
+    return sheet.column(("sisuserid", "sisloginid")) is not None
+
+
+def _ids(sheet: Sheet) -> list[str]:
+    """Titles of the university's ids."""
+    return [name for name in ID_COLUMNS if name != "id" or not _is_canvas(sheet)]
 
 
 def file_stem(student_id: str) -> str | None:

@@ -11,7 +11,6 @@ import codecs
 import csv
 import io
 import re
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -114,8 +113,7 @@ def read_sheet(path: Path) -> Sheet:
         raise SettingsError(f"{path}: not text. Give a CSV file with a header.")
     header = next((line for line in text.splitlines() if line.strip()), "")
     # quoted cells may hold any of them
-    bare_marks = Counter(re.sub(r'"[^"]*"', "", header))
-    separator = max(SEPARATORS, key=lambda sign: bare_marks[sign])
+    separator = max(SEPARATORS, key=re.sub(r'"[^"]*"', "", header).count)
     try:
         reader = csv.reader(io.StringIO(text, newline=""), delimiter=separator)
         lines = [(reader.line_num, cells) for cells in reader]

@@ -111,31 +111,28 @@ def batch(
     spare_inputs([] if junit_path is None else [junit_path])  # before the work, not after it
     if fail_on == WORSE and baseline is None:
         raise SettingsError("--fail-on worse requires --baseline: worse than what?")
-    from px4fuse.fleet.engine import connected
     from px4fuse.fleet.junit import junit
-    from px4fuse.fleet.logs import find_logs
     from px4fuse.fleet.regressions import read_baseline
-    from px4fuse.fleet.run import fleet_request, run
+    from px4fuse.fleet.run import run
     from px4fuse.fleet.terminal import print_fleet
 
     gc.enable()  # a long run, of a library that leaves circles
-    found = find_logs(logs)
-    request = fleet_request(given)
     before = None if baseline is None else read_baseline(baseline)
     try:
         with progress() as step:
             step("starting the workers")
-            with connected(scheduler, workers, memory or "auto") as client:
-                fleet = run(
-                    found,
-                    output,
-                    request,
-                    client,
-                    reports=reports,
-                    timeout_s=timeout_s,
-                    baseline=before,
-                    progress=partial(_shown, step, time.monotonic()),
-                )
+            fleet = run(
+                logs,
+                output,
+                reports=reports,
+                timeout_s=timeout_s,
+                baseline=before,
+                scheduler=scheduler,
+                workers=workers,
+                memory=memory or "auto",
+                progress=partial(_shown, step, time.monotonic()),
+                **given,
+            )
     except KeyboardInterrupt as stopped:
         left = f"what is done is kept in {output}. The same command goes on from there."
         raise Interrupted(stopped, left) from None

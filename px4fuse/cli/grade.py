@@ -63,7 +63,7 @@ if TYPE_CHECKING:
     "--worksheet",
     multiple=True,
     metavar="FILE.csv",
-    help="Moodle's grading worksheet, Canvas's gradebook or Blackboard's grades as exported: a "
+    help="Moodle's grading worksheet, Canvas's gradebook, or another table with ids or names: a "
     "copy with the grades filled in is written. May be repeated.",
 )
 @click.option("--column", metavar="TITLE", help="Of the worksheets, for the grade.")
@@ -113,11 +113,11 @@ def grade(
     a new rubric takes seconds. What students hand in is read within bounds of time and memory, and
     nothing in it is executed.
     """
+    from px4fuse.assignment.roster import read_people
     from px4fuse.assignment.sheet import read_sheet
-    from px4fuse.grading.entries import Course, Term
+    from px4fuse.grading.entries import Course
     from px4fuse.grading.grade import grade as grade_all
     from px4fuse.grading.lateness import due_time, late_rule
-    from px4fuse.grading.roster import people_of_sheet
     from px4fuse.grading.rubric import read_rubric, rubric_text
 
     if write_rubric is not None:
@@ -125,12 +125,12 @@ def grade(
         return
     rule = late_rule(late) if late else None
     if gradescope is not None:
-        from px4fuse.grading.autograding import run_autograder
+        from px4fuse.grading.gradescope import run_autograder
 
         run_autograder(gradescope, rule)
         return
     if write_autograder is not None:
-        from px4fuse.grading.autograding import autograder_zip
+        from px4fuse.grading.gradescope import autograder_zip
 
         _write_new(write_autograder, autograder_zip(logs, rubric, key, rule))
         return
@@ -148,10 +148,13 @@ def grade(
         answers = read_key(key)
     chosen = read_rubric(rubric)
     course = Course(
-        None if roster is None else people_of_sheet(read_sheet(roster)),
+        None if roster is None else read_people(roster),
         tuple(map(read_sheet, worksheet)),
         column or "",
-        Term(attempt, due_time(due) if due else None, rule, None, include_pending),
+        attempt,
+        due_time(due) if due else None,
+        rule,
+        include_pending,
         anonymous,
     )
     try:
@@ -217,7 +220,7 @@ def _print(outcome: GradeOutcome) -> None:
             status += ", pending"
         style = "green" if status == "verified" else "yellow"
         total = "–" if entry.total is None else f"{entry.total:g}"
-        flags = len(entry.remarks) + (len(one.flags) if one else 0)
+        flags = len(entry.flags)
         table.add_row(
             Text(one_line(entry.student or entry.student_id, 60)),
             Text(one.submission if one else ""),

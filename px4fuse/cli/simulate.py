@@ -21,7 +21,7 @@ from px4fuse.simulation.scenario import KINDS, YAWS, Scenario
 
 if TYPE_CHECKING:
     from px4fuse.assignment.drawing import Kinds
-    from px4fuse.assignment.roster import RosterStudent
+    from px4fuse.assignment.roster import Person
     from px4fuse.simulation.flights import Simulation
 
 _DEFAULT = Scenario()
@@ -256,9 +256,7 @@ def _read_secret(secret: str | None, file: Path | None) -> bytes | None:
     return secret_of(text, name)
 
 
-def _class(
-    roster: Path, folder: Path, answer_path: Path | None
-) -> tuple[tuple[RosterStudent, ...], Path]:
+def _class(roster: Path, folder: Path, answer_path: Path | None) -> tuple[tuple[Person, ...], Path]:
     """The students, and where their answer key goes."""
     from px4fuse.assignment.assignment import key_path
     from px4fuse.assignment.roster import read_roster
@@ -271,7 +269,7 @@ def _class(
 
 
 def _assign(
-    students: tuple[RosterStudent, ...],
+    students: tuple[Person, ...],
     folder: Path,
     key_file: Path,
     secret: bytes | None,
@@ -303,7 +301,7 @@ def _assign(
 
 
 def _preview(
-    students: tuple[RosterStudent, ...],
+    students: tuple[Person, ...],
     key_file: Path,
     secret: bytes | None,
     kind: Kinds,
@@ -321,7 +319,7 @@ def _preview(
         ("difficulty", "right"),
     )  # fmt: skip
     for student, one in zip(students, drawn, strict=True):
-        cells = (student.id, student.name, one.scenario.kind, " ".join(one.typed) or "none")
+        cells = (student.student_id, student.name, one.scenario.kind, " ".join(one.typed) or "none")
         table.add_row(*map(Text, cells), f"{one.difficulty:.2f}")
     terminal().print(table)
     for line in _class_summary(

@@ -188,8 +188,8 @@ def remedy_words(
     *,
     why: str = "",
     otherwise: str,
-) -> str:
-    """A change of EKF2's parameters as a remedy, as far as a replay confirms it.
+) -> tuple[str, bool]:
+    """A change of EKF2's parameters in words, and whether it is a remedy: no replay denies it.
 
     Parameters
     ----------
@@ -206,12 +206,12 @@ def remedy_words(
     setting = f"{why}set {settings_words(changes)}"
     found = replayed(model, changes)
     if isinstance(found, Unavailable):
-        return f"{capital(setting)}. {not_replayed(found)}"
+        return f"{capital(setting)}. {not_replayed(found)}", True
     (effect,) = found
     if helps(effect.before, effect.after):
-        return f"{capital(setting)}: {effect.words()}."
+        return f"{capital(setting)}: {effect.words()}.", True
     said = ", ".join(f"{name} {value:.3g}" for name, value in changes.items())
-    return f"{otherwise} {said} is no remedy: {effect.words()}."
+    return f"{otherwise} {said} is no remedy: {effect.words()}.", False
 
 
 def filter_errors_m(comparison: Comparison, changed: Settings) -> tuple[float, float] | None:

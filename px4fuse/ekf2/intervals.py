@@ -169,8 +169,7 @@ def _effects(stretch: Stretch, start: IntArray, end: IntArray) -> Array:
     # the first steps of all intervals, then their second ones and so on, longer before shorter
     longest_first = np.argsort(-length, kind="stable")
     first = start[longest_first]
-    effects = np.zeros((len(end), MOVED, CAUSES))
-    attitude, velocity, position = (effects[:, rows] for rows in (THETA, VELOCITY, POSITION))
+    attitude, velocity, position = effects = np.zeros((3, len(end), 3, CAUSES))
     attitude[:, :, 0:3] = np.eye(3)
     force_m_s2 = np.einsum("nij,nj->ni", stretch.rotation[1:], stretch.force_m_s2)
     steps = np.arange(int(length.max(initial=0)))
@@ -185,8 +184,8 @@ def _effects(stretch: Stretch, start: IntArray, end: IntArray) -> Array:
         position[some] += 0.5 * dt * velocity[some]
         attitude[some, :, 3:6] += turned
         attitude[some, :, TURN] -= stretch.correction_rad[step]
-    effects[longest_first] = effects.copy()
-    return effects
+    effects[:, longest_first] = effects.copy()
+    return np.concatenate(effects, axis=1)
 
 
 def _noises(steps: Array, duration_s: Array, tilt: Array) -> tuple[Array, Array]:

@@ -35,7 +35,7 @@ from px4fuse.ekf2.recursion import Run, Variant, run, with_correlation
 from px4fuse.ekf2.replay import UPDATE_COLUMNS, Agreement, Ekf2Replay
 from px4fuse.ekf2_parameters import check
 from px4fuse.errors import SettingsError
-from px4fuse.flight import POSITION_COLUMNS, STATE_COLUMNS, VELOCITY_COLUMNS, Flight, Unavailable
+from px4fuse.flight import STATE_COLUMNS, Flight, Unavailable
 
 # Where a log's EKF2 is this model (simulated flights), the log says so in these words
 MODEL_NOTE = (
@@ -144,7 +144,7 @@ def delayed_variants(
     """
     runs, last = _run_model(model, variants), len(variants) - 1
     tracks = (
-        pd.concat([_track(part, delayed_states(part, at)[0][:, 3:9]) for part in runs])
+        pd.concat([_track(part, delayed_states(part, at)[0]) for part in runs])
         for at in range(last)
     )
     return tracks, _assemble(model.inputs, runs, last, {})
@@ -162,21 +162,17 @@ def run_variants(
     timings = [variant.timing(inputs) for variant in variants]
     runs = []
     for at, stretch in enumerate(inputs.stretches):
-        intervals = {
-            timing: known[timing][at]
-            if timing in known
-            else make_intervals(inputs, stretch, timing)
-            for timing in set(timings)
-        }
+        intervals = {timing: parts[at] for timing, parts in known.items()}
+        for timing in set(timings) - known.keys():
+            intervals[timing] = make_intervals(inputs, stretch, timing)
         runs.append(run(inputs, stretch, variants, [intervals[timing] for timing in timings]))
     return runs
 
 
-def _track(part: Run, velocity_position: Array) -> pd.DataFrame:
+def _track(part: Run, state: Array) -> pd.DataFrame:
+    """Position and velocity of a state at each step's end."""
     index = pd.Index(part.stretch.time_s, name="time_s")
-    return pd.DataFrame(velocity_position, index, VELOCITY_COLUMNS + POSITION_COLUMNS)[
-        STATE_COLUMNS
-    ]
+    return pd.DataFrame(np.hstack([state[:, POSITION], state[:, VELOCITY]]), index, STATE_COLUMNS)
 
 
 def _assemble(
@@ -230,7 +226,7 @@ def _tracks(inputs: Inputs, part: Run, at: int) -> tuple[pd.DataFrame, pd.DataFr
         tau_velocity_s=variant.settings["EKF2_TAU_VEL"],
         tau_position_s=variant.settings["EKF2_TAU_POS"],
     )
-    return _track(part, state[:, 3:9]), _track(part, np.hstack(published))
+    return _track(part, state), _track(part, np.hstack([state[:, THETA], *published]))
 
 
 def delayed_states(part: Run, at: int) -> tuple[Array, Array]:

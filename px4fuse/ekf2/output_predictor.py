@@ -77,7 +77,7 @@ def _followed(offset: Array, lag: int, step_s: float, tau_s: float) -> Array:
 
 def later(values: Array, lag: int) -> Array:
     """The same values ``lag`` steps later, the first one before them."""
-    return values[np.maximum(np.arange(len(values)) - lag, 0)]
+    return np.concatenate([np.repeat(values[:1], lag, axis=0), values])[: len(values)]
 
 
 def follow_attitude(error_rad: Array, lag: int, step_s: float, horizon_s: float) -> Array:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -168,7 +168,7 @@ def run(  # noqa: PLR0915 (one recursion, read from top to bottom)
     gyro2 = np.where(attitude, knob["EKF2_GYR_NOISE"] ** 2, 0.0)[:, None, None]
     force2 = (knob["EKF2_ACC_NOISE"] ** 2)[:, None, None]
     drift, drift_limit = _drift(inputs, knob, biases, attitude)
-    drifted = np.diff(end, axis=0, prepend=0)[:, :, None]
+    steps = np.diff(end, axis=0, prepend=0)[:, :, None]
     floor = inputs.rules.bias_floor
     x, P = _start(stretch, biases, attitude)
     fusion = _Fusion(
@@ -179,6 +179,7 @@ def run(  # noqa: PLR0915 (one recursion, read from top to bottom)
     states, spreads = np.empty((2, events + 1, size, STATES))
     states[0], spreads[0] = x, _diagonal(P)
     innovation, R = np.empty((2, size, 4))
+    stopped = False  # the fusion of any
     for e in range(events):
         within = e % TOGETHER
         if not within:  # intervals are long: a few at a time
@@ -187,6 +188,7 @@ def run(  # noqa: PLR0915 (one recursion, read from top to bottom)
             pushed = stacked("drive", some) + attitude[:, None] * stacked("turn", some)
             added = gyro2 * stacked("gyro_noise", some)
             added = added + force2 * stacked("accelerometer_noise", some)
+            drifted = drift * steps[some]
         phi = transition[within]
         # x = Φx + u, P = ΦPΦ' + Q
         x = (phi @ x[:, :, None])[:, :, 0] + pushed[within]
@@ -194,7 +196,7 @@ def run(  # noqa: PLR0915 (one recursion, read from top to bottom)
         P[:, :MOVED, :MOVED] += added[within]
         spread = _diagonal(P)
         biased = spread[:, BIASES]
-        biased += (biased < drift_limit) * (drift * drifted[e])
+        biased += (biased < drift_limit) * drifted[within]
         if floor is not None:
             _limit_bias(P, floor, biases)
         np.subtract(own[e], x[:, OWN], out=innovation[:, :2])
@@ -211,7 +213,7 @@ def run(  # noqa: PLR0915 (one recursion, read from top to bottom)
             innovations[e] = np.where(active[:, None], nu, np.nan)
             variances[e] = np.where(active[:, None], S, np.nan)
             innovation[:, 2:] = nu
-            if quiet[e] and not (fusion.stopped.any() or outside.any()):
+            if quiet[e] and not (stopped or outside.any()):
                 fusion = _Fusion(now_s[e], fusion.stopped, fusion.left)
                 fused[e], R[:, 2:] = True, noise[e, :, :2]
             else:
@@ -221,7 +223,7 @@ def run(  # noqa: PLR0915 (one recursion, read from top to bottom)
                 rejected[e], fused[e], reset[e], fusion = _decide(
                     inputs.rules, known, outside, fusion
                 )
-                restart = reset[e]
+                restart, stopped = reset[e], bool(fusion.stopped.any())
                 R[fused[e], 2:] = noise[e, fused[e], :2]
             if inputs.vision_height:
                 innovation[:, 1] = measured[e, :, 2] - x[:, DOWN]
@@ -261,8 +263,7 @@ class _Sample:
     reset: bool
 
 
-@dataclass(frozen=True)
-class _Fusion:
+class _Fusion(NamedTuple):
     """Of each variant: time of the last fusion, whether fusion has stopped, resets left."""
 
     last_s: Array

@@ -127,8 +127,7 @@ def find_stretches(
         Stamps of external vision.
     """
     innovations = ekf2.innovations["north"]
-    if isinstance(innovations, Unavailable):
-        return ()
+    assert isinstance(innovations, pd.DataFrame)
     fused, states = innovations.index.to_numpy(), record.delayed.index.to_numpy()
     time = imu.index.to_numpy()
     cuts = [time[0], time[-1]]
@@ -239,26 +238,15 @@ def step_ends(interval_s: Array, known: IntArray, target_s: float) -> IntArray:
         The last is at most n.
     """
     needed = samples_per_step(target_s, float(np.median(interval_s)))
-    early = np.flatnonzero(np.convolve(interval_s, np.ones(max(needed - 1, 1)), "valid") > target_s)
-    ends: list[int] = []
     shown = set(known.tolist())
-    for low, high in pairwise(sorted({0, len(interval_s), *shown})):
-        if needed == 1 or np.searchsorted(early, low) == np.searchsorted(early, high):
-            block = list(range(low + needed, high + 1, needed))
-        else:
-            block = [low + end for end in _counted(interval_s[low:high], needed, target_s)]
-        ends += [*block, high] if high in shown and block[-1:] != [high] else block
-    return np.array(ends, dtype=np.intp)
-
-
-def _counted(interval_s: Array, needed: int, target_s: float) -> list[int]:
     ends, count, total = [], 0, 0.0
     for at, interval in enumerate(interval_s.tolist(), start=1):
         count, total = count + 1, total + interval
-        if (count >= needed and total > 0.5 * target_s) or total > target_s:
+        complete = count >= needed and total > 0.5 * target_s
+        if complete or total > target_s or at in shown:
             ends.append(at)
             count, total = 0, 0.0
-    return ends
+    return np.array(ends, dtype=np.intp)
 
 
 def down_sampled(turn: Array, gain: Array, ends: IntArray) -> tuple[Array, Array]:

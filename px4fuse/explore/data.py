@@ -30,7 +30,7 @@ from px4fuse.filter.settings import (
 )
 from px4fuse.filter.signals import AISLE, Acceleration, Axis, along, imu_gaps, within
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
-from px4fuse.findings.model import Finding
+from px4fuse.findings.model import Finding, by_root
 from px4fuse.findings.story import story
 from px4fuse.flight import POSITION_COLUMNS, PositionTrack, Unavailable
 from px4fuse.request import ComparisonRequest, command_line
@@ -89,7 +89,10 @@ def flight_data(
             "modes": [[mode.start_s, mode.end_s, mode.name] for mode in events.modes],
             "reset": list(events.resets_s),
         },
-        "findings": [_finding(one) for one in findings],
+        "findings": [
+            {**_finding(first), "more": [_finding(one) for one in followers]}
+            for first, *followers in by_root(findings)
+        ],
         "command": _command(request, comparison),
         "offset": _offset(request, settings),
     }
@@ -305,7 +308,7 @@ def _finding(finding: Finding) -> dict[str, Any]:
         "message": finding.message,
         "remedy": finding.remedy,
         "spans": [list(span) for span in finding.spans_s[:20]],
-        "more": [_finding(one) for one in finding.consequences],
+        "more": [],
     }
 
 

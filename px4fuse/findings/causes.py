@@ -1,8 +1,7 @@
-"""Which findings have one cause, and in which order causes are told.
+"""What findings are called, which of them have one cause, and in which order they are told.
 
-What a cause brings with it is told inside it, with its evidence, so that a report has one finding
-per thing to put right. The table is read from above: a finding goes to the first cause that is
-there.
+What a cause brings with it stands behind it, with its evidence, so that a report has one finding
+per thing to put right.
 """
 
 from __future__ import annotations
@@ -11,15 +10,78 @@ from collections.abc import Iterable, Mapping
 
 from msgspec.structs import replace
 
-from px4fuse.findings.model import SEVERITIES, Finding
+from px4fuse.findings.model import SEVERITIES, Finding, by_root
 
+# What each finding is called within a sentence (a student reads words, never ids), in the order
+# in which those of one rank are told
+NAMES: Mapping[str, str] = {
+    "source_stamps_constant": "position stamps that never change",
+    "source_receipt_jitter": "stamps of receipt instead of measurement",
+    "source_stamps_of_arrival": "position stamps that are times of arrival until the clocks agree",
+    "source_thinned": "positions that were thinned before they were sent",
+    "source_smoothed": "positions that were smoothed before they were sent",
+    "source_jumps": "positions that jump",
+    "accelerometer_bias": "a bias of the accelerometer",
+    "source_scale_wrong": "positions whose scale is wrong",
+    "source_clock_changes": "position stamps whose offset changes in flight",
+    "source_clock_offset": "position stamps that are early or late",
+    "errors_larger_than_claimed": "errors larger than the filter claims",
+    "source_frame_turned": "positions that are turned against north",
+    "ekf2_heading_wrong": "a heading of EKF2 that is wrong or drifts",
+    "source_outliers": "outliers among the positions",
+    "source_variance_wrong": "a variance that the position source states wrongly",
+    "sigma_z_small": "a SIGMA_Z that is too small",
+    "sigma_z_large": "a SIGMA_Z that is too large",
+    "sigma_a_small": "a SIGMA_A that is too small",
+    "sigma_a_large": "a SIGMA_A that is too large",
+    "loop_drift_understated": "odometry that drifts more than was stated",
+    "false_loop_closure": "a loop that does not end where it began",
+    "loop_closure_doubtful": "a closure that the others contradict",
+    "loop_of_absolute_track": "a loop measured on a track that does not drift",
+    "loop_end_assumed": "a landing place that was only assumed",
+    "ekf2_not_fusing": "EKF2 that never used the positions",
+    "ekf2_fusion_interrupted": "EKF2 that stopped fusing for a time",
+    "process_noise_forgotten": "process noise that is nearly zero",
+    "kf_variance_overstated": "a filter variance that is too large",
+    "kf_variance_understated": "a filter variance that is too small",
+    "ekf2_variance_overstated": "EKF2 that is too cautious about its variance",
+    "ekf2_variance_understated": "EKF2 that is too sure: its variance is too small",
+    "ekf2_rejecting": "EKF2 that rejects good measurements",
+    "ekf2_ev_delay_wrong": "a delay set in EKF2 that is not that of the positions",
+    "companion_not_synchronised": "a companion computer without time synchronisation",
+    "position_file_placement": "the placing of the position file",
+    "source_not_logged": "a position source that was not logged",
+    "source_decimated": "positions logged too slowly",
+    "source_gap": "a time without positions",
+    "logger_dropouts": "dropouts of the logger",
+    "imu_gap": "a gap in the IMU's samples",
+    "autopilot_restarted": "a restart of the autopilot",
+    "ekf2_resets": "resets of EKF2",
+    "ekf2_instance_switch": "a change of the EKF2 instance",
+    "no_motion": "a vehicle that hardly moved",
+    "source_may_drift": "a position source that may drift",
+    "logging_rate_low": "an IMU that was logged too slowly",
+    "ekf2_innovations_decimated": "EKF2's innovations logged too slowly",
+    "source_frame_not_north": "positions whose axes are not north and east",
+    "ekf2_unavailable": "a log without EKF2",
+    "input_unavailable": "a log without acceleration",
+    "too_few_innovations": "too few measurements to judge a filter by",
+    "log_damaged": "a damaged log",
+    "samples_dropped": "samples that were dropped because their stamps went back",
+    "source_samples_lost": "positions lost on the way",
+    "not_px4": "a log that is not of PX4",
+    "receipt_out_of_order": "messages that came out of order",
+    "innovations_need_ulog": "innovations that only a ULog holds",
+    "ekf2_is_a_model": "EKF2 that is a model of it",
+}
 # In the evidence of a finding about a variance: what the detector holds it to be the effect of
 CAUSE = "cause"
 NOISE, OUTLIERS, ELSEWHERE = "measurement noise", "outliers", "elsewhere"
 
 _OVERSTATED = ("kf_variance_overstated", "ekf2_variance_overstated")
-# Cause to what it brings with it, read from above: what brings others with it stands before what
-# brings it; "id:cause" only where the evidence names that cause
+# Cause to what it brings with it, read from above, so that a finding goes to the first cause that
+# is there; what brings others with it stands before what brings it; "id:cause" only where the
+# evidence names that cause
 CONSEQUENCES: Mapping[str, tuple[str, ...]] = {
     "source_stamps_constant": ("source_receipt_jitter",),
     "sigma_a_small": ("kf_variance_understated",),
@@ -30,107 +92,71 @@ CONSEQUENCES: Mapping[str, tuple[str, ...]] = {
     # the gate is as wide as S says
     "ekf2_variance_understated": ("ekf2_rejecting",),
     "source_outliers": (
-        f"kf_variance_understated:{OUTLIERS}",
-        f"ekf2_variance_understated:{OUTLIERS}",
+        f"kf_variance_understated:{OUTLIERS}", f"ekf2_variance_understated:{OUTLIERS}",
         "ekf2_rejecting",
     ),
     "errors_larger_than_claimed": _OVERSTATED,
     "source_may_drift": _OVERSTATED,
     "ekf2_ev_delay_wrong": ("errors_larger_than_claimed",),
     "source_smoothed": (
-        "sigma_z_large",
-        "sigma_z_small",
-        "sigma_a_large",
-        "sigma_a_small",
-        *_OVERSTATED,
-        "kf_variance_understated",
-        "ekf2_variance_understated",
-        "errors_larger_than_claimed",
+        "sigma_z_large", "sigma_z_small", "sigma_a_large", "sigma_a_small", *_OVERSTATED,
+        "kf_variance_understated", "ekf2_variance_understated", "errors_larger_than_claimed",
     ),
     "source_jumps": ("errors_larger_than_claimed",),
     "source_scale_wrong": ("errors_larger_than_claimed",),
     "accelerometer_bias": ("errors_larger_than_claimed",),
     # a step of the stamps moves positions of a vehicle that moves
-    "source_clock_changes": (
-        "source_jumps",
-        "ekf2_ev_delay_wrong",
-        "errors_larger_than_claimed",
-    ),
+    "source_clock_changes": ("source_jumps", "ekf2_ev_delay_wrong", "errors_larger_than_claimed"),
     "source_stamps_of_arrival": ("source_clock_changes",),
     "source_clock_offset": (
-        "source_stamps_of_arrival",
-        "ekf2_ev_delay_wrong",
-        "errors_larger_than_claimed",
-        f"kf_variance_understated:{ELSEWHERE}",
-        f"ekf2_variance_understated:{ELSEWHERE}",
+        "source_stamps_of_arrival", "ekf2_ev_delay_wrong", "errors_larger_than_claimed",
+        f"kf_variance_understated:{ELSEWHERE}", f"ekf2_variance_understated:{ELSEWHERE}",
     ),
     "source_frame_turned": ("errors_larger_than_claimed",),
     "source_not_logged": ("source_decimated",),
     "source_gap": ("ekf2_fusion_interrupted",),
     "logger_dropouts": ("imu_gap",),
-}
+}  # fmt: skip
 # What the recording lacks: put right first, since noises are judged by what was recorded
-RECORDING = frozenset(
-    {
-        "autopilot_restarted", "imu_gap", "input_unavailable", "log_damaged", "logger_dropouts",
-        "logging_rate_low", "source_decimated", "source_gap", "source_not_logged",
-        "source_samples_lost", "too_few_innovations",
-    }
-)  # fmt: skip
-NOISES = frozenset(
-    {
-        "kf_variance_overstated", "kf_variance_understated", "ekf2_variance_overstated",
-        "ekf2_variance_understated", "process_noise_forgotten", "sigma_a_large", "sigma_a_small",
-        "sigma_z_large", "sigma_z_small",
-    }
-)  # fmt: skip
-# Judged by the setting that it follows from, whatever its own size
-_JUDGED_BY_CAUSE = frozenset({"kf_variance_overstated", "kf_variance_understated"})
+RECORDING = frozenset({
+    "autopilot_restarted", "imu_gap", "input_unavailable", "log_damaged", "logger_dropouts",
+    "logging_rate_low", "source_decimated", "source_gap", "source_not_logged",
+    "source_samples_lost", "too_few_innovations",
+})  # fmt: skip
+SETTINGS = frozenset({"sigma_a_large", "sigma_a_small", "sigma_z_large", "sigma_z_small"})
+VARIANCES = frozenset({*_OVERSTATED, "kf_variance_understated", "ekf2_variance_understated"})
+NOISES = SETTINGS | VARIANCES | {"process_noise_forgotten"}
 
 
 def by_cause(findings: Iterable[Finding]) -> tuple[Finding, ...]:
-    """One finding per cause, in the order in which to put them right.
+    """Findings in the order in which to put them right, each behind what it follows from.
 
-    By severity and then in the given order, except that what the recording lacks comes before
-    errors of noises.
+    By severity and then in the order of :data:`NAMES`, except that what the recording lacks comes
+    before errors of noises. A cause is as severe as what it brings with it.
     """
-    return tuple(sorted(_joined(list(findings)), key=_rank))
-
-
-def _joined(findings: list[Finding]) -> list[Finding]:
+    places = {name: place for place, name in enumerate(NAMES)}
+    groups = sorted(by_root(findings), key=lambda group: places[group[0].id])
     for cause, listed in CONSEQUENCES.items():
-        at = next((i for i, finding in enumerate(findings) if finding.id == cause), None)
-        if at is None:
+        into = next((group for group in groups if group[0].id == cause), None)
+        if into is None:
             continue
-        taken = [i for i, finding in enumerate(findings) if i != at and _follows(finding, listed)]
-        if taken:
-            joined = _join(findings[at], [findings[i] for i in taken])
-            findings = [
-                joined if i == at else finding
-                for i, finding in enumerate(findings)
-                if i not in taken
-            ]
-    return findings
+        taken = [group for group in groups if group is not into and _follows(group[0], listed)]
+        groups = [group for group in groups if group not in taken]
+        for first, *rest in taken:
+            into += [replace(first, caused_by=cause), *rest]
+        # the variance of our filter is judged by the setting that it follows from
+        own = ("kf_variance_overstated", "kf_variance_understated")
+        weighed = (first.severity for first, *_ in taken if first.id not in own)
+        severity = min((into[0].severity, *weighed), key=SEVERITIES.index)
+        into[0] = replace(into[0], severity=severity)
+    return tuple(one for group in sorted(groups, key=_rank) for one in group)
 
 
 def _follows(finding: Finding, listed: tuple[str, ...]) -> bool:
     return finding.id in listed or f"{finding.id}:{finding.evidence.get(CAUSE)}" in listed
 
 
-def _join(cause: Finding, taken: list[Finding]) -> Finding:
-    weighed = [f.severity for f in taken if f.id not in _JUDGED_BY_CAUSE]
-    inner = tuple(one for f in taken for one in (replace(f, consequences=()), *f.consequences))
-    return replace(
-        cause,
-        severity=min((cause.severity, *weighed), key=SEVERITIES.index),
-        consequences=(*cause.consequences, *inner),
-    )
-
-
-def _rank(finding: Finding) -> int:
+def _rank(group: list[Finding]) -> int:
     """Place in a report."""
-    if finding.severity == "error":
-        return 2 if finding.id in NOISES else 0
-    if finding.severity == "warning":
-        return 1 if finding.id in RECORDING else 3
-    return 4
+    error, warning = 2 if group[0].id in NOISES else 0, 1 if group[0].id in RECORDING else 3
+    return {"error": error, "warning": warning, "info": 4}[group[0].severity]

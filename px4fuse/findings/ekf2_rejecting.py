@@ -3,19 +3,13 @@
 from __future__ import annotations
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.remedy import (
-    asked_of_ekf2,
-    not_replayed,
-    rejects_less,
-    replayed,
-    settings_words,
-)
+from px4fuse.comparison import remedy
 from px4fuse.ekf2_parameters import PARAMETERS
-from px4fuse.findings.model import Detector, Finding, Found, Threshold, moments
+from px4fuse.findings.model import Found, finding, moments
 from px4fuse.flight import Ekf2, Unavailable
 
-REJECTED_SHARE_WARNING = Threshold(0.01, "of the innovations", "5 σ rejects 6e-7 when consistent")
-REJECTED_SHARE_ERROR = Threshold(0.20, "of the innovations", "one in five: R or the clock is wrong")
+REJECTED_SHARE_WARNING = 0.01  # of the innovations; 5 σ rejects 6e-7 when consistent
+REJECTED_SHARE_ERROR = 0.20  # of the innovations: one in five, R or the clock is wrong
 IN_ORDER = (
     "First make EKF2_EVP_NOISE the source's own noise, then remove outliers (line of sight) and "
     "check the clock; widen EKF2_EVP_GATE last."
@@ -23,73 +17,59 @@ IN_ORDER = (
 OUTLIERS = "Remove the outliers (line of sight, anchor survey)."
 
 
+def detect(analysis: Analysis) -> Found:
+    """A rejection is of the horizontal vector, so one horizontal axis speaks for all."""
+    ekf2, axes = analysis.flight.ekf2, analysis.axes.values()
+    horizontal = [result for result in axes if result.axis.name != "down"][:1]
+    for result in (*horizontal, *(result for result in axes if result.axis.name == "down")):
+        name, frame = result.axis.name, result.ekf2_innovations
+        if isinstance(frame, Unavailable) or not isinstance(ekf2, Ekf2):
+            continue
+        known = frame["rejected"].dropna()
+        share = float(known.mean())  # NaN where it is not known
+        if share >= REJECTED_SHARE_WARNING:
+            what = "height" if name == "down" else "horizontal position"
+            yield finding(
+                "error" if share >= REJECTED_SHARE_ERROR else "warning",
+                "ekf2_rejecting",
+                f"EKF2 rejected {share:.1%} of the source's samples for {what}",
+                f" (outside {ekf2.gate:g} √S): outliers, a noise set too small, or a late clock.",
+                IN_ORDER if name == "down" else _remedy(analysis),
+                {"rejected_share": share, "count": len(frame), "axis": name},
+                moments(known.index[known > 0.0]),
+            )
+
+
 def _remedy(analysis: Analysis) -> str:
     """The noise or the delay that the data ask for, where that ends the rejections."""
     model = analysis.ekf2_model
     if isinstance(model, Unavailable):
-        return f"{IN_ORDER} {not_replayed(model)}"
-    wanted = asked_of_ekf2(analysis, model, analysis.tuning, analysis.clock)
+        return f"{IN_ORDER} {remedy.not_replayed(model)}"
+    wanted = remedy.asked_of_ekf2(analysis, model, analysis.tuning, analysis.clock)
     flown = model.inputs.settings
     asked = {name: value for name, value in wanted.items() if value != flown[name]}
     delay = {name: value for name, value in asked.items() if "DELAY" in name}
     noise = {name: value for name, value in asked.items() if name not in delay}
     both = asked if noise and delay else {}
     candidates = [changes for changes in (noise, delay, both) if changes]
-    gate = min(2.0 * model.inputs.settings["EKF2_EVP_GATE"], PARAMETERS["EKF2_EVP_GATE"].maximum)
-    found = replayed(model, *candidates, {"EKF2_EVP_GATE": gate})
+    gate = min(2.0 * flown["EKF2_EVP_GATE"], PARAMETERS["EKF2_EVP_GATE"].maximum)
+    found = remedy.replayed(model, *candidates, {"EKF2_EVP_GATE": gate})
     if isinstance(found, Unavailable):
-        return f"{IN_ORDER} {not_replayed(found)}"
+        return f"{IN_ORDER} {remedy.not_replayed(found)}"
     *effects, wider = found
     for effect in effects:
-        if rejects_less(effect.before, effect.after):
-            return f"Set {settings_words(effect.changes)}: {effect.words()}."
-    said = (
-        f"{OUTLIERS} EKF2's parameters are what the data ask for."
-        if wanted
-        else f"{OUTLIERS} What EKF2 fused does not tell its noise here."
-    )
+        if remedy.rejects_less(effect.before, effect.after):
+            return f"Set {remedy.settings_words(effect.changes)}: {effect.words()}."
+    said = f"{OUTLIERS} What EKF2 fused does not tell its noise here."
     if effects:
+        asked_for, remain = remedy.settings_words(effects[-1].changes), effects[-1].words()
         said = (
-            f"With what the data ask for ({settings_words(effects[-1].changes)}) the rejections "
-            f"remain: {effects[-1].words()}. {OUTLIERS}"
+            f"With what the data ask for ({asked_for}) the rejections remain: {remain}. {OUTLIERS}"
         )
+    elif wanted:
+        said = f"{OUTLIERS} EKF2's parameters are what the data ask for."
     if isinstance(wider.after.position_rmse_to_truth_m, Unavailable):
         return said
-    helps = rejects_less(wider.before, wider.after)
+    helps = remedy.rejects_less(wider.before, wider.after)
     verdict = "Widen EKF2_EVP_GATE" if helps else "A wider EKF2_EVP_GATE is no remedy"
     return f"{said} {verdict}; at {gate:g}: {wider.words()}."
-
-
-def _detect(analysis: Analysis) -> Found:
-    comparison = analysis
-    ekf2 = comparison.flight.ekf2
-    gate = ekf2.gate if isinstance(ekf2, Ekf2) else float("nan")
-    # a rejection is of the horizontal vector, so one horizontal axis speaks for all
-    horizontal = [r for r in comparison.axes.values() if r.axis.name != "down"][:1]
-    for result in (*horizontal, *(r for r in comparison.axes.values() if r.axis.name == "down")):
-        frame = result.ekf2_innovations
-        if isinstance(frame, Unavailable):
-            continue
-        known = frame["rejected"].dropna()
-        if known.empty:
-            continue
-        share = float(known.mean())
-        if share < REJECTED_SHARE_WARNING.value:
-            continue
-        what = "height" if result.axis.name == "down" else "horizontal position"
-        yield Finding(
-            "ekf2_rejecting",
-            "error" if share >= REJECTED_SHARE_ERROR.value else "warning",
-            f"EKF2 rejected {share:.1%} of the source's samples for {what} (outside {gate:g} √S): "
-            "outliers, a noise set too small, or a late clock.",
-            IN_ORDER if what == "height" else _remedy(analysis),
-            {"rejected_share": share, "count": float(len(frame)), "axis": result.axis.name},
-            spans_s=moments(known.index[known > 0.0]),
-        )
-
-
-DETECTOR = Detector(
-    _detect,
-    {"ekf2_rejecting": ("--mistake ekf2-gate=2",)},
-    names={"ekf2_rejecting": "EKF2 that rejects good measurements"},
-)

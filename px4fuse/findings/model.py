@@ -1,22 +1,24 @@
-"""What a finding is, and what its file declares of it."""
+"""What a finding is, and the words that several of them share."""
 
 from __future__ import annotations
 
-import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
-from typing import Annotated, Generic, Literal, TypeVar
+from collections.abc import Iterable, Iterator, Mapping
+from functools import partial
+from typing import Annotated, Literal
 
-import msgspec
 import numpy as np
 import pandas as pd
 from msgspec import Meta
 
+from px4fuse.filter.signals import Segment
 from px4fuse.record import Record, Span
 
-Subject = TypeVar("Subject")
 Severity = Literal["error", "warning", "info"]
 SEVERITIES: tuple[Severity, Severity, Severity] = ("error", "warning", "info")
+# More times are not listed one by one
+MOST_SPANS = 3
+# Shorter is told as one moment
+MOMENT_S = 0.05
 
 
 class Finding(Record, frozen=True, omit_defaults=False):
@@ -30,13 +32,15 @@ class Finding(Record, frozen=True, omit_defaults=False):
         error: the comparison or the flight is misleading as it stands; warning: a number is
         wrong or blind; info: know it when you read the report.
     message : str
-        One sentence.
-    evidence : dict
-        Numbers, with units in their names.
+        What is wrong, and what that means.
     remedy : str
         What to type or to set.
-    consequences : tuple of Finding
-        What the same cause brings with it, each with its own evidence.
+    evidence : dict
+        Numbers, with units in their names.
+    headline : str
+        The first part of the message: what is wrong, without full stop.
+    caused_by : str or None
+        Id of the finding that it follows from: the nearest one before it with that id.
     spans_s : tuple of (float, float)
         From when to when it shows, seconds from the first data; empty where that is throughout.
     """
@@ -45,8 +49,9 @@ class Finding(Record, frozen=True, omit_defaults=False):
     severity: Severity
     message: str
     remedy: str
-    evidence: Mapping[str, int | float | str] = msgspec.field(default_factory=dict)
-    consequences: tuple[Finding, ...] = ()
+    evidence: Mapping[str, int | float | str] = {}
+    headline: str = ""
+    caused_by: str | None = None
     spans_s: tuple[Span, ...] = ()
 
     @property
@@ -54,72 +59,53 @@ class Finding(Record, frozen=True, omit_defaults=False):
         """When it shows, in words; empty where that is throughout."""
         if len(self.spans_s) > MOST_SPANS:
             return f"from {self.spans_s[0][0]:.1f} s to {self.spans_s[-1][1]:.1f} s"
-        told = [
+        return ", ".join(
             f"{start:.1f} s to {end:.1f} s" if end - start > MOMENT_S else f"{start:.1f} s"
             for start, end in self.spans_s
-        ]
-        return ", ".join(told)
+        )
 
     @property
-    def headline(self) -> str:
-        """What the message says before it explains: no brackets, no full stop."""
-        told = re.sub(r" \([^()]*\)", "", self.message)
-        return re.split(r"[:;.] |\.$", told, maxsplit=1)[0]
+    def says_when(self) -> bool:
+        """Whether the message names the moment, as the evidence does."""
+        return not {"at_s", "first_s", "until_s"}.isdisjoint(self.evidence)
 
     def __repr__(self) -> str:
         return f"<{self.severity} {self.id}: {self.message} {self.remedy}>"
 
-    @property
-    def ids(self) -> tuple[str, ...]:
-        """Its own id and those of its consequences."""
-        return (self.id, *(finding.id for finding in self.consequences))
-
-
-@dataclass(frozen=True)
-class Threshold:
-    """A number that a detector compares with."""
-
-    value: float
-    unit: str
-    source: str
-
 
 Found = Iterator[Finding]
 
-# More are not listed one by one
-MOST_SPANS = 3
-# Shorter is told as one moment
-MOMENT_S = 0.05
+
+def finding(
+    severity: Severity, name: str, headline: str, explanation: str, remedy: str,
+    evidence: Mapping[str, int | float | str] | None = None, spans_s: tuple[Span, ...] = (),
+) -> Finding:  # fmt: skip
+    """A finding whose message begins with its headline and goes on with the explanation."""
+    message = f"{headline}{explanation}"
+    return Finding(name, severity, message, remedy, evidence or {}, headline, spans_s=spans_s)
 
 
-def moments(times_s: Iterable[float]) -> tuple[tuple[float, float], ...]:
+error, warning, info = (partial(finding, severity) for severity in SEVERITIES)
+
+
+def by_root(findings: Iterable[Finding]) -> list[list[Finding]]:
+    """Findings that follow from no other, each with those behind it that follow from it."""
+    groups: list[list[Finding]] = []
+    for one in findings:
+        if one.caused_by is None:
+            groups.append([])
+        groups[-1].append(one)
+    return groups
+
+
+def moments(times_s: Iterable[float]) -> tuple[Span, ...]:
     """Spans of no length, for what happens at a moment."""
     return tuple((float(time), float(time)) for time in times_s)
 
 
-@dataclass(frozen=True)
-class Detector(Generic[Subject]):
-    """What one file of this package declares: one finding, or those that share a condition.
-
-    Attributes
-    ----------
-    detect : callable
-        From an ``Analysis`` or a ``Loop`` to findings, with condition, words and remedy.
-    names : mapping
-        Every id that it may yield, to what it is called within a sentence.
-    measured_on : mapping
-        Id to the simulated flights on which its rate is measured (``rates.csv``): options of
-        ``px4fuse simulate``, or a field of ``Settings`` with its value.
-    """
-
-    detect: Callable[[Subject], Found]
-    measured_on: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    names: Mapping[str, str] = field(kw_only=True)
-
-
 def lowered(severity: Severity) -> Severity:
     """One step less severe: what nobody chose is advice."""
-    return SEVERITIES[min(SEVERITIES.index(severity) + 1, len(SEVERITIES) - 1)]
+    return "warning" if severity == "error" else "info"
 
 
 def times(count: int) -> str:
@@ -127,23 +113,15 @@ def times(count: int) -> str:
     return "once" if count == 1 else f"{count} times"
 
 
-def sentence(note: str) -> str:
-    """A note with a capital letter, unless it begins with a file's name."""
-    first = note.split(" ", 1)[0]
-    return note if "." in first else note[:1].upper() + note[1:]
+def spans_at(value: float, steps: pd.Series, segment: Segment) -> tuple[Span, ...]:
+    """Parts of a segment in which a step function has a value; its first one holds before too."""
+    edges = np.clip(np.append(steps.index.to_numpy(), np.inf), segment.start_s, segment.end_s)
+    edges[0] = segment.start_s
+    there = (steps.to_numpy() == value) & (np.diff(edges) > 0.0)
+    return tuple(zip(edges[:-1][there].tolist(), edges[1:][there].tolist(), strict=True))
 
 
-def off_spans(steps: pd.Series, start_s: float, end_s: float) -> tuple[tuple[float, float], ...]:
-    """Parts of a span in which a 0/1 step function is 0."""
-    begins = np.clip(steps.index.to_numpy(), start_s, end_s)
-    begins[0] = start_s  # its first value also holds before
-    ends = np.append(begins[1:], end_s)
-    off = (steps.to_numpy() == 0.0) & (ends > begins)
-    return tuple(zip(begins[off].tolist(), ends[off].tolist(), strict=True))
-
-
-def step_share(steps: pd.Series, start_s: float, end_s: float) -> float:
-    """Share of a span in which a 0/1 step function is 1."""
-    edges = np.clip(np.append(steps.index.to_numpy(), np.inf), start_s, end_s)
-    edges[0] = start_s  # its first value also holds before
-    return float(np.sum(np.diff(edges) * steps.to_numpy()) / (end_s - start_s))
+def share_on(steps: pd.Series, segment: Segment) -> float:
+    """Share of a segment in which a 0/1 step function is 1."""
+    on_s = sum(end - start for start, end in spans_at(1.0, steps, segment))
+    return on_s / (segment.end_s - segment.start_s)

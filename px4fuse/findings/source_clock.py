@@ -1,97 +1,87 @@
-"""The source's stamps are late or early against the IMU, or their error changed in flight."""
+"""The source's stamps are late or early against the IMU, and EKF2_EV_DELAY is not that delay."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
 from px4fuse.analysis import Analysis
+from px4fuse.comparison import remedy
 from px4fuse.comparison.model import Comparison
-from px4fuse.comparison.remedy import (
-    COMMAND,
-    WORSE_FILTER_ERROR,
-    delay_change,
-    delay_helps,
-    filter_errors_m,
-    replayed,
-    settings_words,
-)
+from px4fuse.ekf2_parameters import PARAMETERS
 from px4fuse.filter.clock import CHANGE_P, ClockOffset
-from px4fuse.findings.model import Detector, Finding, Found, Threshold
-from px4fuse.findings.source_smoothed import low_pass
-from px4fuse.findings.source_stamps_of_arrival import stamps_of_arrival_end_s
+from px4fuse.findings.model import Found, error, finding, warning
+from px4fuse.findings.source_positions import low_pass
+from px4fuse.findings.source_stamps import until_synchronised
 from px4fuse.flight import Unavailable
 
-CLOCK_OFFSET = Threshold(0.03, "s", "at 1 m/s a third of a good UWB's noise")
-CLOCK_OFFSET_ERROR = Threshold(0.10, "s", "at 1 m/s a good UWB's noise")
+OFFSET_S = 0.03  # at 1 m/s a third of a good UWB's noise
+OFFSET_ERROR_S = 0.10  # at 1 m/s a good UWB's noise
+EKF2_UPDATE_S = 0.010  # EKF2_PREDICT_US, EKF2's own step
+AT_THE_SENDER = "Correct the stamps at the sender:"
+
+
+def detect(analysis: Analysis) -> Found:
+    """An offset that is known, of stamps that are the source's own and not EKF2's."""
+    clock, made = analysis.clock, analysis.source.origin.reconstructed
+    if isinstance(clock, ClockOffset) and clock.determinable and not made:
+        yield from offset(analysis, clock)
+        yield from delay(analysis, clock)
+
+
+def offset(analysis: Analysis, clock: ClockOffset) -> Found:
+    """The stamps contradict the IMU, or their error changed in flight."""
+    source = analysis.source
+    if low_pass(analysis) is not None:  # which lags behind the motion by itself
+        return
+    low, high = clock.interval_s
+    evidence = {"offset_s": clock.offset_s, "interval_low_s": low, "interval_high_s": high}
+    if clock.change_p is not None and clock.change_p < CHANGE_P:
+        yield error(
+            "source_clock_changes",
+            f"The clock offset of {source.name} is not the same throughout",
+            f" (p {clock.change_p:.1g}): {clock.parts[0].offset_s:+.2f} s at the beginning, "
+            f"{clock.parts[-1].offset_s:+.2f} s at the end. PX4 takes the time of arrival until "
+            "500 TIMESYNC answers have come.",
+            "Let the clocks synchronise for a minute before take-off; analyse one side of the "
+            "change with --start, --end.",
+            {**evidence, "change_p": clock.change_p},
+        )
+        return
+    size = abs(clock.remaining_s)
+    # one offset cannot hold for stamps that are of arrival in a part of the flight only
+    if size <= max(OFFSET_S, clock.chance_s) or until_synchronised(analysis) is not None:
+        return
+    typed = f"{remedy.COMMAND} --clock-offset {typed_offset_s(analysis, clock):.3f}"
+    shifted = replace(analysis.settings, clock_offset_s=round(clock.offset_s, 3))
+    if errors := remedy.filter_errors_m(analysis, shifted):
+        if errors[1] > remedy.WORSE_FILTER_ERROR * errors[0]:
+            return  # the truth knows better
+        typed += f": position error {errors[0]:.3f} → {errors[1]:.3f} m (replayed)"
+    side, ends = "early", (low - clock.applied_s, high - clock.applied_s)
+    if clock.remaining_s < 0:
+        side, ends = "late", (-ends[1], -ends[0])
+    yield finding(
+        "error" if size > OFFSET_ERROR_S else "warning",
+        "source_clock_offset",
+        f"The stamps of {source.name} are {side} by {size:.3f} s against the IMU",
+        f" (95 % {ends[0]:.3f} to {ends[1]:.3f} s): at 1 m/s that is an error of {size:.2f} m, "
+        "which neither filter's innovations show.",
+        f"{typed}{_for_ekf2(analysis, clock)}.",
+        evidence,
+    )
 
 
 def _for_ekf2(analysis: Analysis, clock: ClockOffset) -> str:
     """What putting EKF2's delay right would do, where a replay confirms it."""
-    model, comparison = analysis.ekf2_model, analysis
-    if isinstance(model, Unavailable) or comparison.source.name != model.inputs.vision.source:
+    model = analysis.ekf2_model
+    if isinstance(model, Unavailable) or analysis.source.name != model.inputs.vision.source:
         return ""
-    late_ms = -1e3 * clock.offset_s
-    changes = delay_change(model, late_ms)
-    found = replayed(model, changes) if changes else None
-    if found is None or isinstance(found, Unavailable):
-        return ""
-    (effect,) = found
-    if not delay_helps(effect.before, effect.after):
-        return ""
-    return f"; for EKF2 set {settings_words(changes)}: {effect.words()}"
-
-
-def _detect(analysis: Analysis) -> Found:
-    comparison = analysis
-    clock = analysis.clock
-    # what was derived from EKF2's own output has EKF2's stamps, not the source's
-    reconstructed = comparison.source.origin.reconstructed
-    if not isinstance(clock, ClockOffset) or not clock.determinable or reconstructed:
-        return
-    if low_pass(analysis) is not None:  # which lags behind the motion by itself
-        return
-    low, high = clock.interval_s
-    evidence: dict[str, float | str] = {
-        "offset_s": clock.offset_s,
-        "interval_low_s": low,
-        "interval_high_s": high,
-    }
-    changes = clock.change_p is not None and clock.change_p < CHANGE_P
-    if changes:
-        first, last = clock.parts[0], clock.parts[-1]
-        yield Finding(
-            "source_clock_changes",
-            "error",
-            f"The clock offset of {comparison.source.name} is not the same throughout (p "
-            f"{clock.change_p:.1g}): {first.offset_s:+.2f} s at the beginning, "
-            f"{last.offset_s:+.2f} s at the end. PX4 takes the time of arrival until "
-            "500 TIMESYNC answers have come.",
-            "Let the clocks synchronise for a minute before take-off; analyse one side of the "
-            "change with --start, --end.",
-            {**evidence, "change_p": clock.change_p or 0.0},
-        )
-    # one offset cannot hold for stamps that are of arrival in a part of the flight only
-    changes = changes or stamps_of_arrival_end_s(analysis) is not None
-    if abs(clock.remaining_s) > max(CLOCK_OFFSET.value, clock.chance_s) and not changes:
-        remedy = f"{COMMAND} --clock-offset {typed_offset_s(comparison, clock):.3f}"
-        shifted = replace(comparison.settings, clock_offset_s=round(clock.offset_s, 3))
-        errors = filter_errors_m(comparison, shifted)
-        if errors is not None:
-            if errors[1] > WORSE_FILTER_ERROR * errors[0]:
-                return  # the truth knows better
-            remedy += f": position error {errors[0]:.3f} → {errors[1]:.3f} m (replayed)"
-        low, high = low - clock.applied_s, high - clock.applied_s
-        ends = (-high, -low) if clock.remaining_s < 0 else (low, high)
-        yield Finding(
-            "source_clock_offset",
-            "error" if abs(clock.remaining_s) > CLOCK_OFFSET_ERROR.value else "warning",
-            f"The stamps of {comparison.source.name} are "
-            f"{'late' if clock.remaining_s < 0 else 'early'} by {abs(clock.remaining_s):.3f} s "
-            f"against the IMU (95 % {ends[0]:.3f} to {ends[1]:.3f} s): at 1 m/s that is an error "
-            f"of {abs(clock.remaining_s):.2f} m, which neither filter's innovations show.",
-            f"{remedy}{_for_ekf2(analysis, clock)}.",
-            evidence,
-        )
+    changes = remedy.delay_change(model, -1e3 * clock.offset_s)
+    found = remedy.replayed(model, changes) if changes else []
+    for effect in [] if isinstance(found, Unavailable) else found:
+        if remedy.delay_helps(effect.before, effect.after):
+            return f"; for EKF2 set {remedy.settings_words(changes)}: {effect.words()}"
+    return ""
 
 
 def typed_offset_s(comparison: Comparison, clock: ClockOffset) -> float:
@@ -103,16 +93,38 @@ def typed_offset_s(comparison: Comparison, clock: ClockOffset) -> float:
     return clock.offset_s if placed is None else placed.clock_offset_s + clock.remaining_s
 
 
-DETECTOR = Detector(
-    _detect,
-    {
-        "source_clock_offset": tuple(
-            f"--mistake clock-offset={ms}ms" for ms in (40, 80, 120, 150, 200, 250)
-        ),
-        "source_clock_changes": tuple(f"--mistake clock-jump={ms}ms" for ms in (150, 250, 400)),
-    },
-    names={
-        "source_clock_offset": "position stamps that are early or late",
-        "source_clock_changes": "position stamps whose offset changes in flight",
-    },
-)
+def delay(analysis: Analysis, clock: ClockOffset) -> Found:
+    """EKF2_EV_DELAY lies outside what the clock offset and EKF2's step leave open."""
+    delay_ms = analysis.flight.log.parameters.get("EKF2_EV_DELAY")
+    asked_ms = -1e3 * clock.offset_s
+    known_ms = 1e3 * max(clock.chance_s + EKF2_UPDATE_S, OFFSET_S)
+    if delay_ms is None or abs(delay_ms - asked_ms) < known_ms:
+        return
+    low_ms, high_ms = (-1e3 * end for end in reversed(clock.interval_s))
+    asked, more = f"the data ask for {round(asked_ms)} ms", ""
+    ends = f"{round(low_ms)} to {round(high_ms)}"
+    if asked_ms < 0.0:
+        asked = f"the stamps are early by {round(-asked_ms)} ms"
+        ends, more = f"{round(-high_ms)} to {round(-low_ms)}", ", for which there is no delay"
+    yield warning(
+        "ekf2_ev_delay_wrong",
+        f"EKF2_EV_DELAY is {delay_ms:g} ms, while {asked}",
+        f" (95 % {ends}){more}: EKF2 fuses each position at the wrong time, and its track lags or "
+        "leads by the difference.",
+        delay_remedy(analysis, 0.0 if low_ms <= 0.0 else asked_ms, delay_ms),
+        {"ekf2_ev_delay_ms": delay_ms, "asked_ms": asked_ms},
+    )
+
+
+def delay_remedy(analysis: Analysis, delay_ms: float, flown_ms: float) -> str:
+    """EKF2_EV_DELAY as the data ask for it, as far as PX4's range and a replay allow."""
+    model, most_ms = analysis.ekf2_model, PARAMETERS["EKF2_EV_DELAY"].maximum
+    if delay_ms > most_ms:
+        return f"{AT_THE_SENDER} PX4 allows {most_ms:g} ms (EKF2_EV_DELAY)."
+    if round(delay_ms) <= 0.0 and flown_ms == 0.0:
+        return f"{AT_THE_SENDER} EKF2 has no parameter for stamps that are early."
+    changes = {"EKF2_EV_DELAY": max(float(round(delay_ms)), 0.0)}
+    if not isinstance(model, Unavailable):
+        changes = remedy.delay_change(model, delay_ms) or changes
+    words, _ = remedy.remedy_words(model, changes, remedy.delay_helps, otherwise=AT_THE_SENDER)
+    return words

@@ -2,42 +2,35 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from typing import TypeGuard
 
 import numpy as np
 from msgspec import structs
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.model import FILTERS, AxisComparison, Comparison
-from px4fuse.comparison.remedy import (
-    filter_words,
-    noise_helps,
-    not_replayed,
-    remedy_words,
-    settings_words,
-)
+from px4fuse.comparison.model import FILTERS, AxisComparison, FilterName
+from px4fuse.comparison.remedy import noise_helps, not_replayed, remedy_words, settings_words
 from px4fuse.ekf2_parameters import PARAMETERS
 from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.fitting import SIGMA_Z_SEARCH_M
 from px4fuse.filter.settings import Settings
-from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
+from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise
 from px4fuse.findings.causes import CAUSE, ELSEWHERE, NOISE, OUTLIERS
-from px4fuse.findings.errors_larger_than_claimed import hidden_errors
-from px4fuse.findings.model import Detector, Finding, Found, Severity, Threshold, lowered
-from px4fuse.findings.sigma import SMALLEST_SIGMA_Z
+from px4fuse.findings.hidden_errors import hidden_errors
+from px4fuse.findings.model import Finding, Found, Severity, finding, lowered
+from px4fuse.findings.sigma import LAG1_SLOW, SMALLEST_SIGMA_Z_M, try_out, tuned_for
 from px4fuse.flight import Unavailable
 from px4fuse.plain import factor_words, number_words
 
-VARIANCE_FACTOR = Threshold(
-    1.5, "times", "22 % in standard deviation; chance moves it less at n > 100"
-)
-VARIANCE_FACTOR_ERROR = Threshold(4.0, "times", "a factor of two in standard deviation")
-EKF2_NOISE_FLOOR = Threshold(0.01, "m", "EKF2 never trusts external vision better, EKF2.cpp")
-NOISE_FITS = Threshold(1.25, "times", "the median's own scatter below n = 100 (1.17/√n, two σ)")
-LAG1_SLOW = Threshold(0.3, "correlation", "white innovations stay below 2/√n, 0.2 at n = 100")
-SMALLEST_NOISE = Threshold(0.001, "m", "below what any positioning system resolves")
-OUTLIER_SHARE = Threshold(0.005, "outside 5√S", "6e-7 is expected")
+VARIANCE_FACTOR = 1.5  # times: 22 % in standard deviation; chance moves it less at n > 100
+VARIANCE_FACTOR_ERROR = 4.0  # times: a factor of two in standard deviation
+EKF2_NOISE_FLOOR_M = 0.01  # EKF2 never trusts external vision better, EKF2.cpp
+NOISE_FITS = 1.25  # times: the median's own scatter below n = 100 (1.17/√n, two σ)
+SMALLEST_NOISE_M = 0.001  # below what any positioning system resolves
+OUTLIER_SHARE = 0.005  # outside 5√S, where 6e-7 is expected
 
+OWNERS = {"kf": "Our", "ekf2": "EKF2's"}
+GROUPS = {"horizontal": ("north", "east", "aisle"), "vertical": ("down",)}
 ONLY_HORIZONTAL = Unavailable("EKF2 replay", "the model of EKF2 is of horizontal position", "None.")
 LOOK_ELSEWHERE = (
     "Look at the clock (EKF2_EV_DELAY), the outliers and EKF2's process noise (EKF2_ACC_NOISE):"
@@ -46,7 +39,6 @@ AGAINST_DRIFT = (
     "Nothing follows from innovations alone: against a source that may drift they show how well "
     "the filter follows it, not how wrong both are."
 )
-
 AGAINST_TRUTH = (
     "Lower no noise for these innovations: the errors against the truth are larger than claimed."
 )
@@ -54,52 +46,47 @@ AGAINST_TRUTH = (
 Member = tuple[AxisComparison, Consistency]
 
 
-def _detect(analysis: Analysis) -> Found:
+def detect(analysis: Analysis) -> Found:
+    """One finding for the horizontal axes, which the vertical one follows: they have one noise."""
     for owner in FILTERS:
-        named: list[Member] = []
-        for result in analysis.axes.values():
-            statement = result.filters[owner]
-            if isinstance(statement, Unavailable):
-                continue
-            factor = max(statement.variance_factor, 1.0 / statement.variance_factor)
-            if statement.verdict != "consistent" and factor >= VARIANCE_FACTOR.value:
-                named.append((result, statement))
         for over in (True, False):
-            groups = [
-                _variance_finding(analysis, owner, group, members)
-                for group, axes in (
-                    ("horizontal", ("north", "east", "aisle")),
-                    ("vertical", ("down",)),
-                )
-                if (
-                    members := [
-                        (r, s)
-                        for r, s in named
-                        if r.axis.name in axes and (s.variance_factor > 1.0) == over
-                    ]
-                )
-            ]
-            if groups:  # one noise for all axes: the vertical axis tells no other cause
-                yield structs.replace(groups[0], consequences=tuple(groups[1:]))
+            first = None
+            for group, axes in GROUPS.items():
+                results = [analysis.axes[name] for name in axes if name in analysis.axes]
+                pairs = [(result, result.filters[owner]) for result in results]
+                members = [(result, each) for result, each in pairs if _is_off(each, over=over)]
+                if members:
+                    found = _of_group(analysis, owner, group, members)
+                    yield structs.replace(found, caused_by=first)
+                    first = found.id
 
 
-def _variance_finding(analysis: Analysis, owner: str, group: str, members: list[Member]) -> Finding:
+def _is_off(statement: Consistency | Unavailable, *, over: bool) -> TypeGuard[Consistency]:
+    """Whether a variance is over-, or else understated."""
+    if isinstance(statement, Unavailable):
+        return False
+    factor = statement.variance_factor if over else 1.0 / statement.variance_factor
+    return statement.verdict != "consistent" and factor >= VARIANCE_FACTOR
+
+
+def _of_group(analysis: Analysis, owner: FilterName, group: str, members: list[Member]) -> Finding:
     """One finding for a group of axes, on the axis whose NIS is furthest from 1."""
     result, statement = max(members, key=lambda pair: abs(np.log(pair[1].nis_mean)))
     over = statement.variance_factor > 1.0
     factor = statement.variance_factor if over else 1.0 / statement.variance_factor
-    name = "Our" if owner == "kf" else "EKF2's"
     low, high = statement.nis_band
-    comparison = analysis
-    severity: Severity = "error" if factor >= VARIANCE_FACTOR_ERROR.value else "warning"
-    if _is_default(comparison, owner, result):
+    severity: Severity = "error" if factor >= VARIANCE_FACTOR_ERROR else "warning"
+    if _is_default(analysis, owner, result):
         severity = lowered(severity)
-    if over and comparison.source.origin.may_drift:
+    tuned, stated = tuned_for(analysis, result.axis.name), "overstated" if over else "understated"
+    if over and analysis.source.origin.may_drift:
         severity, remedy, cause = "info", AGAINST_DRIFT, ELSEWHERE
-    elif over and any(hidden.owner == owner for hidden in hidden_errors(comparison)):
+    elif over and any(hidden.owner == owner for hidden in hidden_errors(analysis)):
         remedy, cause = AGAINST_TRUTH, ELSEWHERE
+    elif tuned is None:
+        remedy, cause = "Which noise the data ask for could not be told: see tuning.", ELSEWHERE
     else:
-        remedy, cause = _noise_remedy(analysis, owner, result, statement)
+        cause, remedy = _remedy(analysis, owner, result, statement, tuned)
     evidence: dict[str, float | str] = {
         "axis": result.axis.name,
         "variance_factor": statement.variance_factor,
@@ -107,199 +94,136 @@ def _variance_finding(analysis: Analysis, owner: str, group: str, members: list[
         "outside_gate": statement.outside_gate,
         CAUSE: cause,
     }
-    asked = _asked(analysis, result)
-    if asked is not None:
-        evidence["sigma_z_asked_m"] = asked.sigma_z_m
-        evidence["sigma_z_asked_is_upper_bound"] = float(asked.upper_bound)
-    return Finding(
-        f"{owner}_variance_{'overstated' if over else 'understated'}",
+    if tuned is not None and (asked := _asked_m(tuned.sigma_z)) is not None:
+        evidence["sigma_z_asked_m"] = asked
+        evidence["sigma_z_asked_is_upper_bound"] = float(tuned.sigma_z.value is None)
+    return finding(
         severity,
-        f"{name} innovation variance is {'overstated' if over else 'understated'} "
-        f"{factor_words(factor)} times along {result.axis.name} (mean NIS "
-        f"{number_words(statement.nis_mean)}, consistent is {low:.2f} to {high:.2f}; {group}).",
+        f"{owner}_variance_{stated}",
+        f"{OWNERS[owner]} innovation variance is {stated} "
+        f"{factor_words(factor)} times along {result.axis.name}",
+        f" (mean NIS {number_words(statement.nis_mean)}, consistent is {low:.2f} to {high:.2f}; "
+        f"{group}).",
         remedy,
         evidence,
     )
 
 
-def _is_default(comparison: Comparison, owner: str, result: AxisComparison) -> bool:
+def _is_default(analysis: Analysis, owner: FilterName, result: AxisComparison) -> bool:
     """Whether the measurement noise in force is the one that comes with the program."""
     if owner == "kf":
-        chosen, defaults = comparison.settings, Settings()
-        return (chosen.sigma_z_m, chosen.sigma_a_m_s2) == (
-            defaults.sigma_z_m,
-            defaults.sigma_a_m_s2,
-        )
+        chosen, own = analysis.settings, Settings()
+        return (chosen.sigma_z_m, chosen.sigma_a_m_s2) == (own.sigma_z_m, own.sigma_a_m_s2)
     default = PARAMETERS["EKF2_EVP_NOISE"].default
-    used = _ekf2_noise(result)
-    untouched = comparison.flight.log.parameters.get("EKF2_EVP_NOISE", default) == default
+    untouched = analysis.flight.log.parameters.get("EKF2_EVP_NOISE", default) == default
     # a sender that reports a larger variance has chosen it
-    return untouched and not abs(np.log(used / default)) > np.log(NOISE_FITS.value)
+    return untouched and not abs(np.log(_ekf2_noise_m(result) / default)) > np.log(NOISE_FITS)
 
 
-@dataclass(frozen=True)
-class SourceNoise:
-    """The source's noise by tuning, the same in all findings: a value or an upper bound."""
-
-    sigma_z_m: float
-    upper_bound: bool
+def _asked_m(noise: Noise) -> float | None:
+    """The source's noise by tuning, the same in all findings: a value, else an upper bound."""
+    return noise.high if noise.value is None else noise.value
 
 
-def tuned_for(analysis: Analysis, axis: str) -> AxisTuning | None:
-    """What was tuned for an axis: both horizontal ones together, where there are both."""
-    names = (axis,) if axis == "down" else (HORIZONTAL, axis)
-    found = (analysis.tuning.get(name) for name in names)
-    return next((tuned for tuned in found if isinstance(tuned, AxisTuning)), None)
-
-
-def _asked(analysis: Analysis, result: AxisComparison) -> SourceNoise | None:
-    tuned = tuned_for(analysis, result.axis.name)
-    if tuned is None:
-        return None
-    noise = tuned.sigma_z
-    if noise.value is not None:
-        return SourceNoise(noise.value, upper_bound=False)
-    return None if noise.high is None else SourceNoise(noise.high, upper_bound=True)
-
-
-def _noise_remedy(
-    analysis: Analysis, owner: str, result: AxisComparison, statement: Consistency
-) -> tuple[str, str]:
-    """The measurement noise that the data ask for, as what to type or to set, and the cause.
+def _remedy(
+    analysis: Analysis, owner: FilterName, result: AxisComparison, statement: Consistency,
+    tuned: AxisTuning,
+) -> tuple[str, str]:  # fmt: skip
+    """The cause, and the measurement noise that the data ask for, as what to type or to set.
 
     It is a property of the source, so our estimate of it serves EKF2 as well.
     """
-    comparison = analysis
-    asked, settings = _asked(analysis, result), comparison.settings
-    lag1 = statement.lag1_autocorrelation
-    tuned = tuned_for(analysis, result.axis.name)
-    needed = None if tuned is None else tuned.filter_sigma_a.value
-    slow = statement.variance_factor < 1.0 and lag1 > LAG1_SLOW.value
-    if owner == "kf" and slow and needed and needed > settings.sigma_a_m_s2:
-        sigma_a = float(f"{needed:.3g}")
-        typed = f"--sigma-a {sigma_a:g}"
-        words = filter_words(comparison, replace(settings, sigma_a_m_s2=sigma_a), typed)
-        return (
+    settings, over = analysis.settings, statement.variance_factor > 1.0
+    lag1, needed = statement.lag1_autocorrelation, tuned.filter_sigma_a.value or 0.0
+    asked_m, bounded = _asked_m(tuned.sigma_z), tuned.sigma_z.value is None
+    if owner == "kf" and not over and lag1 > LAG1_SLOW and needed > settings.sigma_a_m_s2:
+        return ELSEWHERE, (
             f"The filter follows too slowly (lag-1 correlation {lag1:+.2f}): raise SIGMA_A first. "
-            f"{words}",
-            ELSEWHERE,
+            f"{try_out(analysis, {'--sigma-a': needed})}"
         )
-    if tuned is None:
-        return "Which noise the data ask for could not be told: see tuning.", ELSEWHERE
-    if asked is None:
-        return (
+    if asked_m is None:
+        return ELSEWHERE, (
             f"No SIGMA_Z up to {SIGMA_Z_SEARCH_M[1]:g} m explains it: look at the acceleration "
-            "input (IMU rate, gaps, vibration) and at the clocks.",
-            ELSEWHERE,
+            "input (IMU rate, gaps, vibration) and at the clocks."
         )
-    if owner == "kf":
-        return _kf_remedy(analysis, asked, statement)
-    return _ekf2_remedy(analysis, result, asked, statement)
+    used_m = settings.sigma_z_m if owner == "kf" else _ekf2_noise_m(result)
+    if owner == "ekf2" and bounded:  # EKF2's own innovations bound it too, and less tightly
+        asked_m = float(np.hypot(statement.innovation_std_m, statement.innovation_mean_m))
+    noise_m = max(asked_m, SMALLEST_NOISE_M)
+    if not (owner == "kf" and bounded) and not _noise_helps(noise_m, used_m, over=over):
+        return _other_cause(analysis, owner, statement, noise_m)
+    if owner == "ekf2":
+        return _ekf2_remedy(analysis, result, noise_m, bounded=bounded, over=over)
+    why, more = f"The data ask for SIGMA_Z {noise_m:.2g} m.", ""
+    if bounded:
+        why = f"The source's noise is at most {noise_m:.2g} m, below what this rate can show."
+        noise_m, more = max(noise_m, SMALLEST_SIGMA_Z_M), ", and less SIGMA_A"
+    return NOISE, f"{why} {try_out(analysis, {'--sigma-z': float(f'{noise_m:.2g}')}, more)}"
 
 
-def _kf_remedy(analysis: Analysis, asked: SourceNoise, statement: Consistency) -> tuple[str, str]:
-    comparison = analysis
-    settings = comparison.settings
-    noise = max(asked.sigma_z_m, SMALLEST_NOISE.value)
-    if asked.upper_bound:
-        typed = float(f"{max(noise, SMALLEST_SIGMA_Z.value):.2g}")
-        words = filter_words(
-            comparison, replace(settings, sigma_z_m=typed), f"--sigma-z {typed:g}, and less SIGMA_A"
+def _other_cause(
+    analysis: Analysis, owner: FilterName, statement: Consistency, noise_m: float
+) -> tuple[str, str]:
+    """Where to look when the noise is as large as the filter takes it to be."""
+    if statement.variance_factor < 1.0 and _has_outliers(analysis, statement):
+        return OUTLIERS, (
+            f"{statement.outside_gate:.1%} lie outside the gate while the bulk fits "
+            f"{noise_m:.2g} m: remove the outliers (line of sight, anchor survey) instead of "
+            "raising the noise."
         )
-        return (
-            f"The source's noise is at most {noise:.2g} m, below what this rate can show. {words}",
-            NOISE,
-        )
-    if not _noise_helps(noise, settings.sigma_z_m, statement):
-        outliers = _outliers(analysis, noise, statement)
-        return (outliers, OUTLIERS) if outliers else (
-            f"It is not SIGMA_Z (the source's noise is {noise:.2g} m): look at SIGMA_A (--sigma-a) "
-            "and the clock (--clock-offset).",
-            ELSEWHERE,
-        )  # fmt: skip
-    typed = float(f"{noise:.2g}")
-    words = filter_words(comparison, replace(settings, sigma_z_m=typed), f"--sigma-z {typed:g}")
-    return f"The data ask for SIGMA_Z {noise:.2g} m. {words}", NOISE
+    name, where = "SIGMA_Z", "SIGMA_A (--sigma-a) and the clock (--clock-offset)"
+    if owner == "ekf2":
+        name = "EKF2_EVP_NOISE"
+        where = "the clock (EKF2_EV_DELAY) and at EKF2's process noise (EKF2_ACC_NOISE)"
+    return ELSEWHERE, f"It is not {name} (the source's noise is {noise_m:.2g} m): look at {where}."
 
 
 def _ekf2_remedy(
-    analysis: Analysis, result: AxisComparison, asked: SourceNoise, statement: Consistency
+    analysis: Analysis, result: AxisComparison, noise_m: float, *, bounded: bool, over: bool
 ) -> tuple[str, str]:
-    parameters = analysis.flight.log.parameters
-    used, set_noise = _ekf2_noise(result), parameters.get("EKF2_EVP_NOISE", np.nan)
-    noise = asked.sigma_z_m
-    if asked.upper_bound:  # EKF2's own innovations bound it too, and less tightly
-        noise = float(np.hypot(statement.innovation_std_m, statement.innovation_mean_m))
-    noise = max(noise, SMALLEST_NOISE.value)
-    if not _noise_helps(noise, used, statement):
-        outliers = _outliers(analysis, noise, statement)
-        return (outliers, OUTLIERS) if outliers else (
-            f"It is not EKF2_EVP_NOISE (the source's noise is {noise:.2g} m): look at the clock "
-            "(EKF2_EV_DELAY) and at EKF2's process noise (EKF2_ACC_NOISE).",
-            ELSEWHERE,
-        )  # fmt: skip
-    changes = {"EKF2_EVP_NOISE": max(float(f"{noise:.2g}"), EKF2_NOISE_FLOOR.value)}
-    reported = used > NOISE_FITS.value * set_noise and parameters.get("EKF2_EV_NOISE_MD") != 1.0
-    bound = "at most " if asked.upper_bound else ""
-    was = "" if np.isnan(used) else f" (√R was {used:.2g} m)"
-    why = f"The source's noise is {bound}{noise:.2g} m{was}: "
-    if reported and statement.variance_factor > 1.0:
+    parameters, used_m = analysis.flight.log.parameters, _ekf2_noise_m(result)
+    changes = {"EKF2_EVP_NOISE": max(float(f"{noise_m:.2g}"), EKF2_NOISE_FLOOR_M)}
+    was = "" if np.isnan(used_m) else f" (√R was {used_m:.2g} m)"
+    why = f"The source's noise is {'at most ' if bounded else ''}{noise_m:.2g} m{was}: "
+    reported = used_m > NOISE_FITS * parameters.get("EKF2_EVP_NOISE", np.nan)
+    if over and reported and parameters.get("EKF2_EV_NOISE_MD") != 1.0:
         changes = {"EKF2_EV_NOISE_MD": 1.0, **changes}
         why = (
-            f"R is what the sender reports ({used:.2g} m), since that is more than EKF2_EVP_NOISE: "
-            "correct it there, or "
+            f"R is what the sender reports ({used_m:.2g} m), since that is more than "
+            "EKF2_EVP_NOISE: correct it there, or "
         )
     if result.axis.name == "down":
-        return f"{why}set {settings_words(changes)}. {not_replayed(ONLY_HORIZONTAL)}", NOISE
-    words = remedy_words(
+        return NOISE, f"{why}set {settings_words(changes)}. {not_replayed(ONLY_HORIZONTAL)}"
+    words, helps = remedy_words(
         analysis.ekf2_model, changes, noise_helps, why=why, otherwise=LOOK_ELSEWHERE
     )
-    return words, ELSEWHERE if words.startswith(LOOK_ELSEWHERE) else NOISE
+    return NOISE if helps else ELSEWHERE, words
 
 
-def _noise_helps(noise: float, used: float, statement: Consistency) -> bool:
-    """Whether another measurement noise fixes the variance.
+def _noise_helps(noise_m: float, used_m: float, *, over: bool) -> bool:
+    """Whether another measurement noise fixes a variance that is over- or understated.
 
     More noise fixes one that is understated, less one that is overstated; if the noise already
     fits, or the other way round, the cause lies elsewhere.
     """
-    if 1 / NOISE_FITS.value < noise / used < NOISE_FITS.value:
-        return False
-    return not (noise < used if statement.variance_factor < 1.0 else noise > used)
+    ratio = noise_m / used_m
+    return not (ratio > 1.0 / NOISE_FITS if over else ratio < NOISE_FITS)
 
 
-def _outliers(analysis: Analysis, noise: float, statement: Consistency) -> str:
-    """What to do about gross outliers, empty where there are none."""
-    if statement.variance_factor > 1.0 or statement.outside_gate <= OUTLIER_SHARE.value:
-        return ""
+def _has_outliers(analysis: Analysis, statement: Consistency) -> bool:
+    """Whether gross outliers explain the innovations, which the source has as well."""
     tuned = analysis.tuning.get(HORIZONTAL)
-    if isinstance(tuned, AxisTuning) and (
-        len(tuned.outlier_time_s) <= OUTLIER_SHARE.value * tuned.count
-    ):
-        return ""  # the source has none: it is the filter that is elsewhere
-    return (
-        f"{statement.outside_gate:.1%} lie outside the gate while the bulk fits {noise:.2g} m: "
-        "remove the outliers (line of sight, anchor survey) instead of raising the noise."
+    if statement.outside_gate <= OUTLIER_SHARE:
+        return False
+    # where the source has none, it is the filter that is elsewhere
+    return not isinstance(tuned, AxisTuning) or (
+        len(tuned.outlier_time_s) > OUTLIER_SHARE * tuned.count
     )
 
 
-def _ekf2_noise(result: AxisComparison) -> float:
-    """Median √R (m) that EKF2 used; NaN where unknown."""
+def _ekf2_noise_m(result: AxisComparison) -> float:
+    """Median √R that EKF2 used; NaN where unknown."""
     frame = result.ekf2_innovations
     if isinstance(frame, Unavailable):
         return float("nan")
     return float(np.sqrt(frame["observation_variance_m2"].median()))
-
-
-DETECTOR = Detector(
-    _detect,
-    {
-        "ekf2_variance_understated": tuple(f"--mistake ekf2-noise={cm}cm" for cm in (4, 3)),
-    },
-    names={
-        "kf_variance_overstated": "a filter variance that is too large",
-        "kf_variance_understated": "a filter variance that is too small",
-        "ekf2_variance_overstated": "EKF2 that is too cautious about its variance",
-        "ekf2_variance_understated": "EKF2 that is too sure: its variance is too small",
-    },
-)

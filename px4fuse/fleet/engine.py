@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Mapping
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, replace
 from importlib import metadata
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -60,11 +61,11 @@ class WorkerFailed:
     line: str
 
 
-@dataclass(frozen=True)
-class _Ended:
-    """Stands for the result of a job whose worker ended so often."""
-
-    times: int
+# What stands for a job whose worker ended each time
+_ENDED = WorkerFailed(
+    f"the process that read it ended {ENDS} times: it crashed, or needed more memory than it may "
+    "take. Give each more with --memory, or look at this log with px4fuse compare."
+)
 
 
 @contextmanager
@@ -162,11 +163,12 @@ def _check(client: Client, address: str) -> None:
 
 @dataclass(frozen=True)
 class _BatchRun:
-    """A job that is handed out: to which worker, and how many have ended with it before."""
+    """A job, how many workers have ended with it, and which has it until when at the latest."""
 
     job: Any
-    address: str | None
-    ends: int
+    ends: int = 0
+    address: str = ""
+    deadline_s: float = 0.0
 
 
 def outcomes(
@@ -178,8 +180,8 @@ def outcomes(
 ) -> Generator[tuple[Job, Result | WorkerFailed]]:
     """Call a function on every job on a cluster, and give what comes of each as it comes.
 
-    A worker has one job at a time, and no other before its result is here: none waits behind one
-    that hangs, or is ended with it. Nothing of a finished job is kept.
+    A worker gets a job when it has nothing to do, and no other before its result is here: none
+    waits behind one that hangs, or is ended with it. Nothing of a finished job is kept.
 
     Parameters
     ----------
@@ -188,7 +190,7 @@ def outcomes(
     function : callable
         At the top level of a module.
     timeout_s : float
-        For one job, once it runs.
+        For one job.
 
     Raises
     ------
@@ -197,56 +199,26 @@ def outcomes(
     """
     from distributed import CancelledError, wait  # noqa: PLC0415
 
-    waiting = ((job, 0) for job in jobs)
-    again: list[tuple[Job, int]] = []
+    waiting = deque(_BatchRun(job) for job in jobs)
     running: dict[Future[Any], _BatchRun] = {}
-    begun: dict[str, tuple[str, float]] = {}
-    alone: set[Future[Any]] = set()
-    seen_s = looked_s = time.monotonic()
+    seen_s = time.monotonic()
     try:
-        while True:
-            processing = client.processing()
-            seen_s = time.monotonic() if processing else seen_s
-            if time.monotonic() - seen_s > WORKERS_S:
+        while waiting or running:
+            workers, now_s = client.processing(), time.monotonic()
+            seen_s = now_s if workers else seen_s
+            if now_s - seen_s > WORKERS_S:
                 raise Px4FuseError("the cluster has lost all its workers.")
-            for address in _free(processing, running):
-                if (work := again.pop() if again else next(waiting, None)) is None:
-                    break
-                job, ends = work
-                future = client.submit(
-                    function, job, pure=False, workers=address, allow_other_workers=bool(address)
-                )
-                running[future] = _BatchRun(job, address, ends)
+            given = {run.address for run in running.values()}
+            for address, tasks in workers.items():
+                if waiting and not tasks and address not in given:
+                    run = waiting.popleft()
+                    future = client.submit(function, run.job, pure=False, workers=address)
+                    running[future] = replace(run, address=address, deadline_s=now_s + timeout_s)
+            with suppress(TimeoutError):
+                wait(list(running), timeout=TICK_S, return_when="FIRST_COMPLETED")
             if not running:
-                return
-            try:
-                done = wait(list(running), timeout=TICK_S, return_when="FIRST_COMPLETED").done
-            except TimeoutError:
-                done = set()
-            yield from _answers(_fetched(done), running, again)
-            done.clear()
-            if time.monotonic() - looked_s >= TICK_S:
-                looked_s = time.monotonic()
-                processing = client.processing()
-                # what is said of a job may still be on its way: it is looked for twice
-                before, alone = alone, _without_worker(processing, running)
-                lost = alone & before
-                client.cancel(list(lost))
-                yield from _answers(((future, _Ended(1)) for future in lost), running, again)
-                late = _late(processing, running, begun, looked_s - timeout_s)
-                keys = {begun.pop(address)[0] for address in late}
-                ended = [future for future in running if str(future.key) in keys]
-                if ended:
-                    client.cancel(ended)
-                    client.restart_workers(late, timeout=RESTART_S, raise_for_error=False)
-                for future in ended:
-                    yield (
-                        running.pop(future).job,
-                        WorkerFailed(
-                            f"it took longer than {timeout_s:g} s and was ended. Allow more with "
-                            "--timeout."
-                        ),
-                    )
+                time.sleep(TICK_S)
+            yield from _finished(client, running, waiting, timeout_s)
     except (CancelledError, OSError) as error:
         raise Px4FuseError(f"the scheduler is gone ({one_line(str(error), 120)}).") from error
     finally:
@@ -254,112 +226,50 @@ def outcomes(
             client.cancel(list(running))
 
 
-def _free(
-    processing: Mapping[str, Collection[Any]], running: Mapping[Future[Any], _BatchRun]
-) -> list[str | None]:
-    """Workers without a job of ours, nor a result that is not here yet; the idlest first.
-
-    Where nothing runs and there is no worker, none: one job is handed out that waits for one.
-    """
-    known = {str(future.key) for future in running}
-    given = {run.address for run in running.values()}
-    free = [
-        address
-        for address, keys in processing.items()
-        if address not in given and known.isdisjoint(map(str, keys))
-    ]
-    free.sort(key=lambda address: len(processing[address]))
-    return [*free] if free or running else [None]
-
-
-def _without_worker(
-    processing: Mapping[str, Collection[Any]], running: Mapping[Future[Any], _BatchRun]
-) -> set[Future[Any]]:
-    """Jobs that no worker has, since the one that they were given has ended.
-
-    Dask leaves one that was handed out just when no worker was there without one for ever.
-    """
-    held = {str(key) for keys in processing.values() for key in keys}
-    return {
-        future
-        for future, run in running.items()
-        if run.address not in (None, *processing)
-        and str(future.key) not in held
-        and future.status not in ("finished", "error")
-    }
-
-
-def _late(
-    processing: Mapping[str, Collection[Any]],
-    running: Mapping[Future[Any], _BatchRun],
-    begun: dict[str, tuple[str, float]],
-    latest_s: float,
-) -> list[str]:
-    """Workers whose job began before a time; keeps account of what each began, and when."""
-    given = {str(future.key): run.address for future, run in running.items()}
-    late = []
-    for address, keys in processing.items():
-        ours = [key for key in map(str, keys) if key in given]
-        if not ours:
-            begun.pop(address, None)
-            continue
-        if begun.get(address, ("", 0.0))[0] not in ours:
-            # Dask may put one whose result was lost behind that which was given here
-            first = max(ours, key=lambda key: given[key] == address)
-            begun[address] = (first, time.monotonic())
-        if begun[address][1] < latest_s:
-            late.append(address)
-    return late
-
-
-def _fetched(done: Iterable[Future[Any]]) -> Iterator[tuple[Future[Any], Any]]:
-    """What comes of finished jobs.
-
-    A worker that does not answer has begun work of others that does not let it: it is asked again.
-    """
-    for future in done:
-        try:
-            found = _result(future)
-        except TimeoutError:
-            continue
-        yield future, found
-
-
-def _answers(
-    found: Iterable[tuple[Future[Any], Any]],
-    running: dict[Future[Any], _BatchRun],
-    again: list[tuple[Any, int]],
-) -> Iterator[tuple[Any, Any]]:
-    """Results of jobs; one whose worker ended is put among those to do again."""
-    for future, result in found:
-        run = running.pop(future)
-        if not isinstance(result, _Ended):
-            yield run.job, result
-        elif (ends := run.ends + result.times) < ENDS:
-            again.append((run.job, ends))
-        else:
-            yield (
-                run.job,
-                WorkerFailed(
-                    f"the process that read it ended {ends} times: it crashed, or needed more "
-                    "memory than it may take. Give each more with --memory, or look at this log "
-                    "with px4fuse compare."
-                ),
+def _finished(
+    client: Client, running: dict[Future[Any], _BatchRun], waiting: deque[_BatchRun],
+    timeout_s: float,
+) -> Iterator[tuple[Any, Any]]:  # fmt: skip
+    """Take what is over from the running jobs: done, with their worker, or out of time."""
+    workers, now_s = client.processing(), time.monotonic()
+    for future, run in list(running.items()):
+        result: Any
+        if future.done():
+            try:
+                result = _result(future)
+            except TimeoutError:  # its worker has begun work of others that does not let it answer
+                continue
+        elif run.address not in workers:
+            result = _ENDED
+        elif now_s > run.deadline_s:
+            result = WorkerFailed(
+                f"it took longer than {timeout_s:g} s and was ended. Allow more with --timeout."
             )
+            client.restart_workers([run.address], timeout=RESTART_S, raise_for_error=False)
+        else:
+            continue
+        if not future.done():
+            client.cancel([future])
+        del running[future]
+        if result is _ENDED and run.ends + 1 < ENDS:
+            waiting.appendleft(_BatchRun(run.job, run.ends + 1))
+        else:
+            yield run.job, result
 
 
 def _result(future: Future[Any]) -> Any:
+    """What a function gave, or why there is nothing."""
     from distributed import KilledWorker  # noqa: PLC0415
 
     if not _failed(future):
         try:
             return future.result(timeout=FETCH_S)
         except Exception:
-            if not _failed(future):  # else its worker ended, and it was done again
+            if not _failed(future):  # else its worker ended before its result was here
                 raise
     error = future.exception()
     if isinstance(error, KilledWorker):
-        return _Ended(error.allowed_failures + 1)
+        return _ENDED
     if isinstance(error, MemoryError):
         return WorkerFailed("it needs more memory than there is. Use fewer --workers.")
     if isinstance(error, Px4FuseError):

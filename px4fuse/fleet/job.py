@@ -55,14 +55,11 @@ class Outcome:
     ----------
     rows : tuple of Row
         An axis each; one where the log could not be compared.
-    severities : tuple of str
-        Of its findings.
     results, report : bytes
         JSON and PDF; empty where there is none.
     """
 
     rows: tuple[Row, ...]
-    severities: tuple[str, ...] = ()
     results: bytes = b""
     report: bytes = b""
 
@@ -75,7 +72,7 @@ def identify(job: Job) -> str:
     LogError
         It cannot be read.
     """
-    with _limited(job), local_file(job.address) as path:
+    with _opened(job) as path:
         return _sha256(path)
 
 
@@ -97,7 +94,7 @@ def analyse(job: Job) -> Outcome:
         raise SettingsError(f"a worker has px4fuse {version}, not {job.px4fuse}.")
     sha256 = job.sha256
     try:
-        with _limited(job), local_file(job.address) as path:
+        with _opened(job) as path:
             sha256 = _sha256(path)
             if job.sha256 not in ("", sha256):
                 raise LogError(CHANGED)
@@ -110,10 +107,12 @@ def analyse(job: Job) -> Outcome:
 
 
 @contextmanager
-def _limited(job: Job) -> Iterator[None]:
+def _opened(job: Job) -> Iterator[Path]:
+    """The log as a file of this computer, within its limit."""
     before = max_log_bytes.set(job.max_bytes)
     try:
-        yield
+        with local_file(job.address) as path:
+            yield path
     finally:
         max_log_bytes.reset(before)
 
@@ -151,8 +150,7 @@ def _compared(job: Job, path: Path, sha256: str) -> Outcome:
         status = NOT_JUDGED if isinstance(error, MissingDataError) else FAILED
         text = str(error).removeprefix(f"{path.name}: ")
         return Outcome((known | refused(text, status),))
-    severities = tuple(finding.severity for finding in findings)
-    return Outcome(tuple(rows_of(found)), severities, text.encode(), report)
+    return Outcome(tuple(rows_of(found)), text.encode(), report)
 
 
 def _sha256(path: Path) -> str:

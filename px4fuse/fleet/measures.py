@@ -1,4 +1,4 @@
-"""The numbers of a comparison that are held against another's, each with its 95 % interval.
+"""The numbers that flights are compared by, each with its 95 % interval.
 
 An interval says how well one flight tells its number. Noises and the clock have theirs from their
 likelihood. Innovations and errors are correlated in time: with the log at hand theirs comes from a
@@ -9,29 +9,30 @@ known.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from functools import reduce
 from typing import Any, Literal
 
 import numpy as np
+import numpy.typing as npt
 import pandas as pd
 from scipy.special import ndtr
 from scipy.stats import binomtest, chi2
 
 from px4fuse.analysis import Analysis
 from px4fuse.arrays import Array
-from px4fuse.comparison.model import FILTERS, AxisComparison, FilterSummary
+from px4fuse.comparison.model import AxisComparison, AxisResult, FilterSummary
 from px4fuse.filter.clock import Clock
 from px4fuse.filter.heading import HeadingError
 from px4fuse.filter.kalman import state_at
 from px4fuse.filter.signals import AISLE
+from px4fuse.filter.tuning import Tuned
 from px4fuse.flight import Unavailable
 from px4fuse.results.contract import ComparisonResults
 from px4fuse.trajectory.scores import rmse_interval
 
-Aim = Literal["low", "one", "zero", ""]
-Scale = Literal["ratio", "difference"]
 Bounds = tuple[float, float]
 
 Z95 = 1.959964
@@ -39,77 +40,110 @@ LEVEL = 0.95
 # Innovations are not normal where their share outside ±2√S is so many standard deviations from
 # that of normal ones with the same mean square
 NOT_NORMAL_SIGMAS = 4.0
-
-LIKELIHOOD = "likelihood"
-BOOTSTRAP = "block bootstrap"
-CHI_SQUARE = "chi-square"
-WILSON = "Wilson"
+# Two settings of one flight that differ by less are the same: of a ratio, and by unit
+LEAST_RATIO = 0.01
+LEAST_DIFFERENCE = {"": 0.001, "m": 0.001, "s": 0.001, "°": 0.1}
 
 
 @dataclass(frozen=True)
-class Number:
-    """One number of a comparison.
+class Measure:
+    """A kind of number that flights are compared by.
 
     Attributes
     ----------
-    interval : (float, float) or None
-        95 %; None where there is none.
+    path : str
+        Where it stands in the results; ``*`` is the name of an axis.
     aim : {"low", "one", "zero", ""}
         What is better: lower, nearer to 1, nearer to 0; "" where nothing is.
     scale : {"ratio", "difference"}
         Whether two of them are compared by their ratio or their difference.
-    method : str
-        How the interval was found.
-    kind : str
-        What it shares with the same number of other axes: ``axes.*.filters.kf.nis_mean``.
     """
-
-    label: str
-    unit: str
-    value: float
-    interval: Bounds | None
-    aim: Aim
-    scale: Scale
-    method: str
-    kind: str
-
-
-@dataclass(frozen=True)
-class _Row:
-    """A number that every axis has: where it stands below the axis, and what it is."""
 
     path: str
     label: str
-    unit: str
-    aim: Aim
-    scale: Scale = "ratio"
+    unit: str = ""
+    aim: Literal["low", "one", "zero", ""] = "low"
+    scale: Literal["ratio", "difference"] = "ratio"
+
+    def scaled(self, values: npt.ArrayLike) -> Array:
+        """Values on the scale on which they are compared; NaN where they have no logarithm."""
+        found = np.asarray(values, dtype=np.float64)
+        if self.scale == "difference":
+            return found
+        logs: Array = np.log(found, out=np.full(found.shape, np.nan), where=found > 0.0)
+        return logs
+
+    def unscaled(self, value: float) -> float:
+        """A value of that scale as a ratio or difference."""
+        return math.exp(value) if self.scale == "ratio" else value
+
+    @property
+    def least(self) -> float:
+        """Two numbers of one flight that differ by less are the same, on their scale."""
+        return math.log1p(LEAST_RATIO) if self.scale == "ratio" else LEAST_DIFFERENCE[self.unit]
+
+    def farther(self, now: float, before: float) -> float:
+        """By how much a number is farther from what is best, on its scale; 0 where nothing is."""
+        if self.aim == "":
+            return 0.0
+        return now - before if self.aim == "low" else abs(now) - abs(before)
 
 
-def _of_filter(key: str, name: str) -> tuple[_Row, ...]:
+def _of_filter(key: str, name: str) -> tuple[Measure, ...]:
+    path = f"axes.*.filters.{key}"
     return (
-        _Row(f"{key}.nis_mean", f"NIS of {name}", "", "one"),
-        _Row(f"{key}.innovation_std_m", f"innovation std of {name}", "m", "low"),
-        _Row(f"{key}.outside_gate", f"beyond the gate of {name}", "", "low",
-             "difference"),
-        _Row(f"{key}.truth.position_rmse_m", f"error of {name}", "m", "low"),
-        _Row(f"{key}.truth.velocity_rmse_m_s", f"velocity error of {name}", "m/s", "low"),
-        _Row(f"{key}.truth.nees_position_mean", f"NEES of {name}", "", "one"),
-        _Row(f"{key}.innovation_mean_m", f"innovation mean of {name}", "m", "zero",
-             "difference"),
-        _Row(f"{key}.sigma_p_median_m", f"σ_p of {name}", "m", ""),
-        _Row(f"{key}.sigma_v_median_m_s", f"σ_v of {name}", "m/s", ""),
+        Measure(f"{path}.nis_mean", f"NIS of {name}", aim="one"),
+        Measure(f"{path}.innovation_std_m", f"innovation std of {name}", "m"),
+        Measure(f"{path}.outside_gate", f"beyond the gate of {name}", scale="difference"),
+        Measure(f"{path}.truth.position_rmse_m", f"error of {name}", "m"),
+        Measure(f"{path}.truth.velocity_rmse_m_s", f"velocity error of {name}", "m/s"),
+        Measure(f"{path}.truth.nees_position_mean", f"NEES of {name}", aim="one"),
+        Measure(f"{path}.innovation_mean_m", f"innovation mean of {name}", "m", "zero",
+                "difference"),
+        Measure(f"{path}.sigma_p_median_m", f"σ_p of {name}", "m", ""),
+        Measure(f"{path}.sigma_v_median_m_s", f"σ_v of {name}", "m/s", ""),
     )  # fmt: skip
 
 
-_ROWS = (
-    *_of_filter("filters.ekf2", "EKF2"),
-    *_of_filter("filters.kf", "ours"),
-    _Row("difference.position_rmse_m", "ours - EKF2", "m", "low"),
-    _Row("difference.velocity_rmse_m_s", "ours - EKF2, velocity", "m/s", "low"),
-)
-# Errors of the state by what they are of
-_ERRORS = {"position_m": "position_rmse_m", "velocity_m_s": "velocity_rmse_m_s"}
-_NOISES = (("sigma_z_m", "SIGMA_Z", "m"), ("filter_sigma_a_m_s2", "SIGMA_A", "m/s²"))
+APART = "axes.*.difference."
+REJECTED = "axes.*.rejected_share"
+MEASURES = {
+    measure.path: measure
+    for measure in (
+        Measure("tuning.*.sigma_z_m", "SIGMA_Z found", "m"),
+        Measure("tuning.*.filter_sigma_a_m_s2", "SIGMA_A found", "m/s²"),
+        Measure("clock.offset_s", "clock offset", "s", "zero", "difference"),
+        Measure("heading.turn_deg", "turn of the source's frame", "°", "zero", "difference"),
+        Measure(REJECTED, "share that EKF2 rejected", scale="difference"),
+        Measure("loop.closure_error_m", "closure error of the loop", "m"),
+        Measure("source.rate_hz", "rate of the source", "Hz", ""),
+        Measure("log.duration_s", "duration of the log", "s", ""),
+        *_of_filter("ekf2", "EKF2"),
+        *_of_filter("kf", "ours"),
+        Measure(f"{APART}position_rmse_m", "ours - EKF2", "m"),
+        Measure(f"{APART}velocity_rmse_m_s", "ours - EKF2, velocity", "m/s"),
+    )
+}
+
+
+@dataclass(frozen=True)
+class Number:
+    """One number of a comparison, with its 95 % interval; None where there is none."""
+
+    measure: Measure
+    value: float
+    interval: Bounds | None = None
+
+
+def at(found: object, path: str) -> Any:
+    """What stands at a place in the results; None where there is nothing."""
+
+    def below(part: Any, name: str) -> Any:
+        if isinstance(part, tuple):
+            return part[int(name)]
+        return part.get(name) if isinstance(part, Mapping) else getattr(part, name, None)
+
+    return reduce(below, path.split("."), found)
 
 
 def numbers(results: ComparisonResults, analysis: Analysis | None = None) -> dict[str, Number]:
@@ -120,122 +154,88 @@ def numbers(results: ComparisonResults, analysis: Analysis | None = None) -> dic
     analysis : Analysis, optional
         What they were made from, for the intervals that only the log can give.
     """
-    return dict(_of_flight(results)) | dict(_of_axes(results, analysis))
-
-
-def _of_flight(results: ComparisonResults) -> Iterator[tuple[str, Number]]:
-    for name, tuned in results.tuning.items():
-        for field, label, unit in _NOISES:
-            value = getattr(tuned, field, None)
-            if value:
-                found = getattr(tuned, f"{field}_interval")
-                yield f"tuning.{name}.{field}", Number(
-                    f"{label} found, {name}", unit, value, found, "low", "ratio",
-                    LIKELIHOOD, f"tuning.*.{field}",
-                )  # fmt: skip
-    clock, heading = results.clock, results.heading
-    if isinstance(clock, Clock) and clock.determinable:
-        yield "clock.offset_s", Number(
-            "clock offset", "s", clock.offset_s, clock.interval_s, "zero",
-            "difference", LIKELIHOOD, "clock.offset_s",
-        )  # fmt: skip
-    if isinstance(heading, HeadingError) and not heading.drifts:
-        half = Z95 * heading.sigma_deg
-        yield "heading.turn_deg", Number(
-            "turn of the source's frame", "°", heading.turn_deg,
-            (heading.turn_deg - half, heading.turn_deg + half), "zero", "difference", LIKELIHOOD,
-            "heading.turn_deg",
-        )  # fmt: skip
+    every = [summary for axis in results.axes.values() for summary in axis.filters.values()]
+    has_truth = not all(isinstance(summary.truth, Unavailable) for summary in every)
     # EKF2 rejects a horizontal position as a whole
     level = next((name for name in ("north", "east", AISLE) if name in results.axes), "")
-    for at, label in ((level, "horizontal"), ("down", "down")):
-        axis = next((axis for name, axis in results.axes.items() if name == at), None)
-        ekf2 = None if axis is None else axis.filters["ekf2"]
-        if axis is None or axis.rejected_share is None or not isinstance(ekf2, FilterSummary):
-            continue
-        interval = share_interval(axis.rejected_share, ekf2.count * independent_share(ekf2))
-        yield f"axes.{at}.rejected_share", Number(
-            f"rejected by EKF2, {label}", "", axis.rejected_share, interval, "low", "difference",
-            WILSON, "axes.*.rejected_share",
-        )  # fmt: skip
-    plain: tuple[tuple[str, str, str, Aim], ...] = (
-        ("loop.closure_error_m", "closure error of the loop", "m", "low"),
-        ("source.rate_hz", "rate of the source", "Hz", ""),
-        ("log.duration_s", "duration of the log", "s", ""),
-    )
-    for path, label, unit, aim in plain:
-        value = _at(results, path)
-        if value is not None:
-            yield path, Number(label, unit, value, None, aim, "ratio", "", path)
-
-
-def _of_axes(results: ComparisonResults, analysis: Analysis | None) -> Iterator[tuple[str, Number]]:
-    known_truth = any(
-        not isinstance(axis.filters[name].truth, Unavailable)
-        for axis in results.axes.values()
-        for name in FILTERS
-    )
-    for name, axis in results.axes.items():
-        series = {} if analysis is None else _series(analysis[name])
-        for row in _ROWS:
-            value = _at(axis, row.path)
-            if value is None:
+    errors = {
+        f"axes.{name}.{path}": values
+        for name, axis in ({} if analysis is None else analysis.axes).items()
+        for path, values in errors_of(axis).items()
+    }
+    found: dict[str, Number] = {}
+    for kind, measure in MEASURES.items():
+        head, several, _ = kind.partition(".*")
+        for name in (at(results, head) or ()) if several else ("",):
+            path = kind.replace("*", name)
+            value = at(results, path)
+            parent, _, field = path.rpartition(".")
+            part = at(results, parent)
+            unclear = isinstance(part, Clock) and not part.determinable
+            unclear |= isinstance(part, HeadingError) and part.drifts
+            if unclear or not isinstance(value, int | float):
                 continue
+            if kind == REJECTED and name not in (level, "down"):
+                continue
+            label = f"{measure.label}, {name}" if name else measure.label
             # where a truth judges both, their distance from each other is neither good nor bad
-            aim = "" if known_truth and row.path.startswith("difference.") else row.aim
-            interval, method = interval_of(row.path, value, _at_filter(axis, row.path), series)
-            yield f"axes.{name}.{row.path}", Number(
-                f"{row.label}, {name}", row.unit, value, interval, aim, row.scale, method,
-                f"axes.*.{row.path}",
-            )  # fmt: skip
+            aim = "" if has_truth and kind.startswith(APART) else measure.aim
+            found[path] = Number(
+                replace(measure, label=label, aim=aim),
+                float(value),
+                bootstrapped(errors[path], field)
+                if path in errors
+                else interval_of(part, field, value),
+            )
+    return found
 
 
-def _at(found: object, path: str) -> float | None:
-    """A number below a part of the results, None where there is none."""
-    value = reduce(_below, path.split("."), found)
-    return float(value) if isinstance(value, int | float) else None
+def interval_of(part: object, field: str, value: float) -> Bounds | None:
+    """95 % interval of a number in a part of the results, from the results alone."""
+    match part:
+        case Tuned():
+            interval: Bounds | None = getattr(part, f"{field}_interval")
+            return None if interval is None or None in interval else interval
+        case Clock():
+            return part.interval_s
+        case HeadingError():
+            return value - Z95 * part.sigma_deg, value + Z95 * part.sigma_deg
+        case AxisResult():
+            judged = part.filters["ekf2"]
+            return (
+                None if isinstance(judged, Unavailable) else _of_innovations(judged, field, value)
+            )
+        case FilterSummary():
+            return _of_innovations(part, field, value)
+    return None
 
 
-def _below(found: object, name: str) -> Any:
-    return found.get(name) if isinstance(found, Mapping) else getattr(found, name, None)
+def _of_innovations(judged: FilterSummary, field: str, value: float) -> Bounds | None:
+    count = independent_count(judged)
+    if field in ("outside_gate", "rejected_share"):
+        return share_interval(value, count)
+    if field not in ("nis_mean", "innovation_std_m") or not _is_normal(judged, count):
+        return None
+    ends = count / chi2.ppf((0.5 + LEVEL / 2, 0.5 - LEVEL / 2), count)
+    low, high = (ends if field == "nis_mean" else np.sqrt(ends)).tolist()
+    return value * low, value * high
 
 
-def _at_filter(axis: object, path: str) -> FilterSummary | None:
-    judged = reduce(_below, path.split(".")[:2], axis)
-    return judged if isinstance(judged, FilterSummary) else None
+def bootstrapped(errors: Array, field: str) -> Bounds | None:
+    """95 % interval of a (root) mean square of correlated errors."""
+    found = rmse_interval(errors, field)
+    power = 2.0 if field == "nis_mean" else 1.0
+    return None if isinstance(found, Unavailable) else (found.low**power, found.high**power)
 
 
-def interval_of(
-    path: str, value: float, judged: FilterSummary | None, series: Mapping[str, Array]
-) -> tuple[Bounds | None, str]:
-    """95 % interval of a number of an axis, and how it was found."""
-    field = path.rsplit(".", maxsplit=1)[-1]
-    if path in series:
-        found = rmse_interval(series[path], path)
-        if isinstance(found, Unavailable):
-            return None, ""
-        power = 2.0 if field == "nis_mean" else 1.0
-        return (found.low**power, found.high**power), BOOTSTRAP
-    if judged is None:
-        return None, ""
-    count = judged.count * independent_share(judged)
-    if field == "outside_gate":
-        return share_interval(value, count), WILSON
-    if field in ("nis_mean", "innovation_std_m") and _is_normal(judged, count):
-        power = 1.0 if field == "nis_mean" else 0.5
-        low, high = (count / chi2.ppf(p, count) for p in (0.5 + LEVEL / 2, 0.5 - LEVEL / 2))
-        return (value * low**power, value * high**power), CHI_SQUARE
-    return None, ""
+def independent_count(judged: FilterSummary) -> float:
+    """How many of the innovations' squares are as good as independent.
 
-
-def independent_share(judged: FilterSummary) -> float:
-    """Share of the innovations' squares that are as good as independent.
-
-    With the autocorrelation r^k of a first-order process squares have r^2k, hence
+    With the autocorrelation r^k of a first-order process squares have r^2k, hence a share of
     1/(1 + 2 Σ r^2k) (Bayley and Hammersley 1946).
     """
     squared = judged.lag1_autocorrelation**2
-    return (1.0 - squared) / (1.0 + squared)
+    return judged.count * (1.0 - squared) / (1.0 + squared)
 
 
 def _is_normal(judged: FilterSummary, count: float) -> bool:
@@ -253,27 +253,27 @@ def share_interval(share: float, count: float) -> Bounds:
     return float(found.low), float(found.high)
 
 
-def _series(result: AxisComparison) -> dict[str, Array]:
-    """What the root mean squares of an axis are over, by where they stand in the results."""
+def errors_of(axis: AxisComparison) -> dict[str, Array]:
+    """What the root mean squares of an axis are over, by where they stand in its results."""
     found: dict[str, Array] = {}
-    for name, frame in (("kf", result.replay.updates), ("ekf2", result.ekf2_innovations)):
+    for name, frame in (("kf", axis.replay.updates), ("ekf2", axis.ekf2_innovations)):
         if isinstance(frame, pd.DataFrame):
             innovation = frame["innovation_m"].to_numpy()
-            found[f"filters.{name}.nis_mean"] = innovation / np.sqrt(
-                frame["innovation_variance_m2"].to_numpy()
-            )
+            sigma = np.sqrt(frame["innovation_variance_m2"].to_numpy())
+            found[f"filters.{name}.nis_mean"] = innovation / sigma
             found[f"filters.{name}.innovation_std_m"] = innovation - np.nanmean(innovation)
-    state = result.ekf2_state
-    times = result.replay.steps.index if isinstance(state, Unavailable) else state.index
-    ours = dict(zip(_ERRORS, state_at(result.replay, times.to_numpy()), strict=True))
-    for column, field in _ERRORS.items():
-        theirs = None if isinstance(state, Unavailable) else state[column].to_numpy()
-        if theirs is not None:
-            found[f"difference.{field}"] = ours[column] - theirs
-        if isinstance(truth := result.truth, Unavailable):
-            continue
-        true = np.interp(times, truth.index, truth[column], left=np.nan, right=np.nan)
-        found[f"filters.kf.truth.{field}"] = ours[column] - true
-        if theirs is not None:
-            found[f"filters.ekf2.truth.{field}"] = theirs - true
+    ekf2 = axis.ekf2_state if isinstance(axis.ekf2_state, pd.DataFrame) else None
+    times = (axis.replay.steps if ekf2 is None else ekf2).index.to_numpy()
+    position, velocity = state_at(axis.replay, times)
+    for column, field, ours in (
+        ("position_m", "position_rmse_m", position),
+        ("velocity_m_s", "velocity_rmse_m_s", velocity),
+    ):
+        states = {"kf": ours} | ({} if ekf2 is None else {"ekf2": ekf2[column].to_numpy()})
+        if ekf2 is not None:
+            found[f"difference.{field}"] = ours - states["ekf2"]
+        if isinstance(truth := axis.truth, pd.DataFrame):
+            true = np.interp(times, truth.index, truth[column], left=np.nan, right=np.nan)
+            for name, state in states.items():
+                found[f"filters.{name}.truth.{field}"] = state - true
     return {path: values[np.isfinite(values)] for path, values in found.items()}

@@ -8,45 +8,60 @@ from typing import Any
 
 import pandas as pd
 
-from px4fuse.comparison.model import AgainstTruth, AxisResult, Difference, FilterSummary
-from px4fuse.ekf2.replay import AxisAgreement, Replayed
-from px4fuse.filter.clock import Clock
-from px4fuse.filter.tuning import Tuned
+from px4fuse.fleet.measures import at
 from px4fuse.record import Unavailable
-from px4fuse.results.comparison import ASKED, Log
+from px4fuse.results.comparison import Log
 from px4fuse.results.contract import ComparisonResults
 from px4fuse.spreadsheet import neutral
 
 DONE, NOT_JUDGED, FAILED = "done", "not judged", "failed"
+BETWEEN_FINDINGS = ";"
 # Which tuning speaks for an axis
 _TUNED_AS = {"north": "horizontal", "east": "horizontal"}
-#: Columns of the fleet's table and their types; absent numbers are NA, absent texts are empty
-COLUMNS: dict[str, str] = dict.fromkeys(
-    (
-        "log", "name", "log_sha256", "px4fuse", "settings", "status", "reason", "remedy", "vehicle",
-        "firmware", "firmware_hash", "airframe", "hardware", "date",
-    ), "str",
-) | {
-    "duration_s": "float64",
-    "source": "str",
-    "source_rate_hz": "float64",
-    "axis": "str",
-    "updates": "Int64",
-    "kf_nis_mean": "float64",
-    "kf_factor": "float64",
-    "kf_verdict": "str",
-    "ekf2_nis_mean": "float64",
-    "ekf2_factor": "float64",
-    "ekf2_verdict": "str",
-} | dict.fromkeys(
-    (
-        "position_rmse_m", "velocity_rmse_m_s", "kf_position_rmse_to_truth_m",
-        "ekf2_position_rmse_to_truth_m", "sigma_z_m", "sigma_z_low_m", "sigma_z_high_m",
-        "sigma_a_m_s2", "sigma_a_low_m_s2", "sigma_a_high_m_s2", "clock_offset_s",
-        "clock_offset_low_s", "clock_offset_high_s", "rejected_share", "model_correlation",
-    ), "float64",
-) | dict.fromkeys(("story", "findings", "results", "report", "change"), "str")  # fmt: skip
-BETWEEN_FINDINGS = ";"
+#: Columns of the table and where each stands in the results; empty where it is put together
+PLACES = {
+    **dict.fromkeys(("log", "name"), "log.name"),
+    "log_sha256": "log.sha256",
+    "px4fuse": "provenance.px4fuse",
+    **dict.fromkeys(("settings", "status", "reason", "remedy"), ""),
+    "vehicle": "log.vehicle",
+    "firmware": "log.firmware",
+    "firmware_hash": "log.firmware_hash",
+    "airframe": "",
+    "hardware": "log.hardware",
+    "date": "",
+    "duration_s": "log.duration_s",
+    "source": "source.name",
+    "source_rate_hz": "source.rate_hz",
+    "axis": "",
+    "updates": "axes.{axis}.updates.count",
+    "kf_nis_mean": "axes.{axis}.filters.kf.nis_mean",
+    "kf_factor": "axes.{axis}.filters.kf.variance_factor",
+    "kf_verdict": "axes.{axis}.filters.kf.verdict",
+    "ekf2_nis_mean": "axes.{axis}.filters.ekf2.nis_mean",
+    "ekf2_factor": "axes.{axis}.filters.ekf2.variance_factor",
+    "ekf2_verdict": "axes.{axis}.filters.ekf2.verdict",
+    "position_rmse_m": "axes.{axis}.difference.position_rmse_m",
+    "velocity_rmse_m_s": "axes.{axis}.difference.velocity_rmse_m_s",
+    "kf_position_rmse_to_truth_m": "axes.{axis}.filters.kf.truth.position_rmse_m",
+    "ekf2_position_rmse_to_truth_m": "axes.{axis}.filters.ekf2.truth.position_rmse_m",
+    "sigma_z_m": "tuning.{tuned}.sigma_z_m",
+    "sigma_z_low_m": "tuning.{tuned}.sigma_z_m_interval.0",
+    "sigma_z_high_m": "tuning.{tuned}.sigma_z_m_interval.1",
+    "sigma_a_m_s2": "tuning.{tuned}.filter_sigma_a_m_s2",
+    "sigma_a_low_m_s2": "tuning.{tuned}.filter_sigma_a_m_s2_interval.0",
+    "sigma_a_high_m_s2": "tuning.{tuned}.filter_sigma_a_m_s2_interval.1",
+    "clock_offset_s": "clock.offset_s",
+    "clock_offset_low_s": "clock.interval_s.0",
+    "clock_offset_high_s": "clock.interval_s.1",
+    "rejected_share": "axes.{axis}.rejected_share",
+    "model_correlation": "ekf2_replay.agreement.{axis}.innovation_correlation",
+    **dict.fromkeys(("story", "findings", "results", "report", "change"), ""),
+}
+_NUMBERS = ("_m", "_s", "_s2", "_hz", "_mean", "_factor", "_share", "_correlation")
+#: Types of the columns; absent numbers are NA, absent texts are empty
+COLUMNS = {name: "float64" if name.endswith(_NUMBERS) else "str" for name in PLACES}
+COLUMNS["updates"] = "Int64"
 
 Row = dict[str, Any]
 
@@ -58,94 +73,39 @@ def rows_of(found: ComparisonResults) -> list[Row]:
     ``variance_factor`` in the results. SIGMA_Z and SIGMA_A are what the data ask for, north and
     east together. The clock offset is there where it is determinable.
     """
+    causes = [one for one in found.findings if one.caused_by is None]
     common = log_columns(found.log) | {
-        "px4fuse": found.provenance.px4fuse,
-        "source": found.source.name,
-        "source_rate_hz": found.source.rate_hz,
         "story": "\n".join(found.story),
-        "findings": BETWEEN_FINDINGS.join(finding.id for finding in found.findings),
+        "findings": BETWEEN_FINDINGS.join(one.id for one in causes),
+        "severities": sorted({one.severity for one in causes}),
     }
-    if isinstance(found.clock, Clock) and found.clock.determinable:
-        low, high = found.clock.interval_s
-        common |= {
-            "clock_offset_s": found.clock.offset_s,
-            "clock_offset_low_s": low,
-            "clock_offset_high_s": high,
+    clock = bool(at(found, "clock.determinable"))
+    rows = []
+    for name, axis in found.axes.items():
+        lacking = next((f for f in axis.filters.values() if isinstance(f, Unavailable)), None)
+        row = common | {
+            "axis": name,
+            "status": NOT_JUDGED if isinstance(axis.filters["kf"], Unavailable) else DONE,
+            "reason": f"{lacking.what}: {lacking.reason}" if lacking else "",
+            "remedy": lacking.remedy if lacking else "",
         }
-    return [
-        common
-        | {"axis": name}
-        | _axis(axis)
-        | _tuned(found.tuning.get(_TUNED_AS.get(name, name)))
-        | _agreement(found, name)
-        for name, axis in found.axes.items()
-    ]
+        for column, place in PLACES.items():
+            if column not in row and place and (clock or not place.startswith("clock.")):
+                tuned = _TUNED_AS.get(name, name)
+                row[column] = at(found, place.format(axis=name, tuned=tuned))
+        rows.append(row)
+    return rows
 
 
 def log_columns(log: Log) -> Row:
     """What is known of a log once it is read."""
     start = log.start_unix_s
-    return {
-        "name": log.name,
-        "log_sha256": log.sha256,
-        "vehicle": log.vehicle,
-        "firmware": log.firmware,
-        "firmware_hash": log.firmware_hash,
+    found = {"log": log}
+    places = {name: place for name, place in PLACES.items() if place.startswith("log.")}
+    return {name: at(found, place) for name, place in places.items()} | {
         "airframe": f"{airframe:g}" if (airframe := log.parameters.get("SYS_AUTOSTART")) else "",
-        "hardware": log.hardware,
         "date": "" if start is None else f"{datetime.fromtimestamp(start, UTC):%Y-%m-%dT%H:%M:%SZ}",
-        "duration_s": log.duration_s,
     }
-
-
-def _axis(axis: AxisResult) -> Row:
-    lacking = [one for one in axis.filters.values() if isinstance(one, Unavailable)]
-    row: Row = {
-        "status": DONE if isinstance(axis.filters["kf"], FilterSummary) else NOT_JUDGED,
-        "reason": f"{lacking[0].what}: {lacking[0].reason}" if lacking else "",
-        "remedy": lacking[0].remedy if lacking else "",
-        "updates": axis.updates.count,
-        "rejected_share": axis.rejected_share,
-    }
-    for name, judged in axis.filters.items():
-        if isinstance(judged.truth, AgainstTruth):
-            row[f"{name}_position_rmse_to_truth_m"] = judged.truth.position_rmse_m
-        if isinstance(judged, FilterSummary):
-            row |= {
-                f"{name}_nis_mean": judged.nis_mean,
-                f"{name}_factor": judged.variance_factor,
-                f"{name}_verdict": judged.verdict,
-            }
-    if isinstance(axis.difference, Difference):
-        row |= {
-            "position_rmse_m": axis.difference.position_rmse_m,
-            "velocity_rmse_m_s": axis.difference.velocity_rmse_m_s,
-        }
-    return row
-
-
-def _tuned(tuned: Tuned | Unavailable | None) -> Row:
-    """What the filter's two settings should be; of a bound, the one end that is known."""
-    row: Row = {}
-    if isinstance(tuned, Tuned):
-        for column, unit in (("sigma_z", "m"), ("sigma_a", "m_s2")):
-            asked = ASKED[f"{column}_{unit}"]
-            low, high = getattr(tuned, f"{asked}_interval") or (None, None)
-            row |= {
-                f"{column}_{unit}": getattr(tuned, asked),
-                f"{column}_low_{unit}": low,
-                f"{column}_high_{unit}": high,
-            }
-    return row
-
-
-def _agreement(found: ComparisonResults, axis: str) -> Row:
-    if not isinstance(found.ekf2_replay, Replayed):
-        return {}
-    agreement = getattr(found.ekf2_replay.agreement, axis, None)  # of north and east
-    if not isinstance(agreement, AxisAgreement):
-        return {}
-    return {"model_correlation": agreement.innovation_correlation}
 
 
 def table_of(rows: Iterable[Mapping[str, Any]]) -> pd.DataFrame:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import io
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
+from functools import partial
 from importlib import metadata
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -31,8 +32,8 @@ from px4fuse.writing import write_all
 if TYPE_CHECKING:
     from distributed import Client
 
-RESULTS = "results"
-ROWS = "rows.sqlite"
+# Columns of the files of a log, relative to the folder
+FILES = ("results", "report")
 _GOES_ON = "What is done is kept: the same command goes on from there."
 
 Progress = Callable[[str, int, int], None]
@@ -65,11 +66,10 @@ class Fleet:
 class _Found:
     """What is known of the logs so far."""
 
-    logs: Sequence[FoundLog]
+    logs: Mapping[str, FoundLog]  # by address, as all of it
     output: Path
     store: Store
-    baseline: pd.DataFrame | None = None
-    hash_of: dict[str, str] = field(default_factory=dict)  # by address
+    hash_of: dict[str, str] = field(default_factory=dict)
     lost: dict[str, Row] = field(default_factory=dict)  # rows of those that give none
     reused: set[str] = field(default_factory=set)
 
@@ -128,94 +128,71 @@ def batch(
     OutputError
         A result cannot be written.
     """
-    single = isinstance(paths, str | Path)
-    logs = find_logs(map(str, (paths,) if single else paths))  # type: ignore[arg-type]
-    request = fleet_request(settings)
-    with (
-        TemporaryDirectory(prefix="px4fuse-") as scratch,
-        connected(scheduler, workers, memory) as client,
-    ):
+    given = (paths,) if isinstance(paths, str | Path) else paths
+    with TemporaryDirectory(prefix="px4fuse-") as scratch:
         fleet = run(
-            logs,
+            map(str, given),
             Path(scratch if output is None else output),
-            request,
-            client,
             reports=reports and output is not None,
             timeout_s=timeout_s,
             baseline=baseline,
+            scheduler=scheduler,
+            workers=workers,
+            memory=memory,
             progress=progress,
+            **settings,
         )
-    files = {} if output is not None else {"results": "", "report": ""}
-    return fleet.table.assign(**files)
+    return fleet.table if output is not None else fleet.table.assign(results="", report="")
 
 
-def fleet_request(settings: dict[str, Any]) -> ComparisonRequest:
-    """The request of every log, without its log.
+def run(
+    paths: Iterable[str],
+    output: Path,
+    *,
+    reports: bool = False,
+    timeout_s: float = TIMEOUT_S,
+    baseline: pd.DataFrame | None = None,
+    scheduler: str | None = None,
+    workers: int | None = None,
+    memory: str = "auto",
+    progress: Progress = lambda what, done, of: None,
+    **settings: Any,
+) -> Fleet:
+    """As :func:`batch`, with what else there is to say of a run.
+
+    What ends the run early (Ctrl-C, a full disk, a cluster that is gone) costs what was not done
+    by then; what was done is in the folder, and in the table as far as it can be written.
 
     Raises
     ------
     SettingsError
-        A setting is unknown or out of range.
+        As :func:`batch`.
+    OutputError
+        A result cannot be written.
+    Px4FuseError
+        The cluster is gone.
     """
+    logs = {log.address: log for log in find_logs(paths)}
     try:
         request = ComparisonRequest(log="LOG", **settings)
     except TypeError as error:
         raise SettingsError(f"no such setting ({error}).") from error
     if request.mavlink is not None or request.position is not None:
         raise SettingsError("`mavlink` and `position` belong to one flight, not to many.")
-    Settings(request.sigma_a_m_s2, request.sigma_z_m, request.dt_s)
-    return request
-
-
-def run(
-    logs: Sequence[FoundLog],
-    output: Path,
-    request: ComparisonRequest,
-    client: Client,
-    *,
-    reports: bool = False,
-    timeout_s: float = TIMEOUT_S,
-    baseline: pd.DataFrame | None = None,
-    progress: Progress = lambda what, done, of: None,
-) -> Fleet:
-    """Compare logs on a cluster, and write rows, results and the table into a folder.
-
-    What ends the run early (Ctrl-C, a full disk, a cluster that is gone) costs what was not done
-    by then; what was done is in the folder, and in the table as far as it can be written.
-
-    Parameters
-    ----------
-    output : Path
-        Folder.
-    request : ComparisonRequest
-        Its settings count for every log.
-    timeout_s : float
-        For one log.
-    progress : callable
-        As :func:`batch`.
-
-    Raises
-    ------
-    OutputError
-        A result cannot be written.
-    Px4FuseError
-        The cluster is gone.
-    """
-    try:
-        output.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"{output}: cannot be made ({error.strerror}). Give another.") from error
-    version, settings = metadata.version("px4fuse"), command_line(request)
+    Settings(request.sigma_a_m_s2, request.sigma_z_m, request.dt_s)  # refuses what is out of range
+    version, used = metadata.version("px4fuse"), command_line(request)
     job = Job("", request, reports, max_log_bytes.get(), version)
-    with opened(output / ROWS, version, settings) as store:
-        found = _Found(logs, output, store, baseline)
+    with connected(scheduler, workers, memory) as client, opened(output, version, used) as store:
+        work = partial(_worked, client, timeout_s, progress)
+        found = _Found(logs, output, store)
         try:
-            _identify(found, client, job, timeout_s, progress)
+            _identify(found, work, job)
             todo = list(_todo(found, job))
             try:
-                _compare(found, client, todo, timeout_s, progress)
+                for one, outcome in work(analyse, todo, "comparing"):
+                    _keep(found, one.address, outcome)
             finally:
-                fleet = _written(found)
+                fleet = _written(found, baseline)
         except OutputError as error:
             raise OutputError(f"{error} {_GOES_ON}") from error
         except Px4FuseError as error:
@@ -223,117 +200,100 @@ def run(
     return fleet
 
 
-def _identify(
-    found: _Found, client: Client, job: Job, timeout_s: float, progress: Progress
-) -> None:
+def _worked(
+    client: Client, timeout_s: float, progress: Progress, function: Callable[[Job], Any],
+    jobs: Sequence[Job], what: str,
+) -> Iterator[tuple[Job, Any]]:  # fmt: skip
+    """What comes of every job; of one that a worker was lost with the row that says why."""
+    failed = 0
+    progress(what, 0, len(jobs))
+    with closing(outcomes(client, function, jobs, timeout_s=timeout_s)) as found:
+        for number, (job, outcome) in enumerate(found, 1):
+            if isinstance(outcome, WorkerFailed):
+                row = refused(outcome.line, FAILED) | {"log_sha256": job.sha256}
+                outcome = Outcome((row,))  # noqa: PLW2901
+            failed += isinstance(outcome, Outcome) and outcome.rows[0]["status"] == FAILED
+            yield job, outcome
+            progress(f"{what}, {failed} failed", number, len(jobs))
+
+
+def _identify(found: _Found, work: Callable[..., Iterator[tuple[Job, Any]]], job: Job) -> None:
     """Hash the logs that may be known, or be the same as another: those of a size that is."""
-    sizes, known = Counter(log.size_bytes for log in found.logs), found.store.sizes()
+    sizes, known = Counter(log.size_bytes for log in found.logs.values()), found.store.sizes()
     asked = [
         replace(job, address=log.address)
-        for log in found.logs
+        for log in found.logs.values()
         if log.size_bytes is None or sizes[log.size_bytes] > 1 or log.size_bytes in known
     ]
-    with closing(outcomes(client, identify, asked, timeout_s=timeout_s)) as identified:
-        for number, (one, sha256) in enumerate(identified, 1):
-            if isinstance(sha256, WorkerFailed):
-                found.lost[one.address] = refused(sha256.line, FAILED)
-            else:
-                found.hash_of[one.address] = sha256
-            progress("looking for what is new", number, len(asked))
+    for one, sha256 in work(identify, asked, "looking for what is new"):
+        if isinstance(sha256, Outcome):
+            found.lost[one.address] = sha256.rows[0]
+        else:
+            found.hash_of[one.address] = sha256
     first_of: dict[str, FoundLog] = {}
-    for log in found.logs:
-        if log.address not in found.hash_of:
+    for log in found.logs.values():
+        if (sha256 := found.hash_of.get(log.address)) is None:
             continue
-        first = first_of.setdefault(found.hash_of[log.address], log)
-        if first is not log:
+        if (first := first_of.setdefault(sha256, log)) is not log:
             found.lost[log.address] = {
                 "status": NOT_JUDGED,
-                "log_sha256": found.hash_of[log.address],
+                "log_sha256": sha256,
                 "reason": f"the same file as {first.log}, whose rows stand for both",
             }
 
 
 def _todo(found: _Found, job: Job) -> Iterator[Job]:
     """Jobs of the logs of which not everything is there."""
-    for log in found.logs:
+    for log in found.logs.values():
         if log.address in found.lost:
             continue
         sha256 = found.hash_of.get(log.address, "")
-        rows, _ = found.store.rows(sha256)
-        if rows and ("axis" not in rows[0] or all(_files(found, rows[0])[: 1 + job.reports])):
+        rows = found.store.rows(sha256)
+        files = [rows[0][kind] for kind in FILES[: 1 + job.reports]] if rows else [""]
+        if rows and ("axis" not in rows[0] or all((found.output / f).is_file() for f in files)):
             found.reused.add(sha256)
         else:
             yield replace(job, address=log.address, sha256=sha256)
 
 
-def _files(found: _Found, row: Row) -> tuple[str, str]:
-    """Results and report of a log, relative to the folder; empty where there is none."""
-    stem = f"{RESULTS}/{file_stem(row['name'], row['log_sha256'])}"
-    results, report = f"{stem}.json", f"{stem}.pdf"
-    return (
-        results if (found.output / results).is_file() else "",
-        report if (found.output / report).is_file() else "",
-    )
-
-
-def _compare(
-    found: _Found, client: Client, jobs: Sequence[Job], timeout_s: float, progress: Progress
-) -> None:
-    sizes = {log.address: log.size_bytes for log in found.logs}
-    failed = 0
-    progress("comparing", 0, len(jobs))
-    with closing(outcomes(client, analyse, jobs, timeout_s=timeout_s)) as compared:
-        for number, (job, result) in enumerate(compared, 1):
-            if isinstance(result, WorkerFailed):
-                found.lost[job.address] = refused(result.line, FAILED) | {"log_sha256": job.sha256}
-            elif result.rows[0]["status"] == FAILED:
-                found.lost[job.address] = result.rows[0]
-            else:
-                found.hash_of[job.address] = _keep(found, result, sizes[job.address])
-            failed += job.address in found.lost
-            progress(f"comparing, {failed} failed", number, len(jobs))
-
-
-def _keep(found: _Found, outcome: Outcome, size_bytes: int | None) -> str:
+def _keep(found: _Found, address: str, outcome: Outcome) -> None:
     """Write a log's files, then its rows: rows without files are never there."""
     row = outcome.rows[0]
-    sha256: str = row["log_sha256"]
-    stem = found.output / RESULTS / file_stem(row["name"], sha256)
-    files = {".json": outcome.results, ".pdf": outcome.report}
-    write_all(
-        {stem.with_name(stem.name + end): content for end, content in files.items() if content}
-    )
-    found.store.keep(sha256, size_bytes, outcome.severities, outcome.rows)
-    return sha256
+    if row["status"] == FAILED:
+        found.lost[address] = row
+        return
+    sha256 = found.hash_of[address] = row["log_sha256"]
+    stem = f"results/{file_stem(row['name'], sha256)}"
+    contents = {
+        f"{stem}{end}": content
+        for end, content in ((".json", outcome.results), (".pdf", outcome.report))
+    }
+    write_all({found.output / name: content for name, content in contents.items() if content})
+    files = dict(zip(FILES, (name if contents[name] else "" for name in contents), strict=True))
+    rows = [each | files for each in outcome.rows]
+    found.store.keep(sha256, found.logs[address].size_bytes, rows)
 
 
-def _written(found: _Found) -> Fleet:
+def _written(found: _Found, baseline: pd.DataFrame | None) -> Fleet:
     """Make the table of all that is known by now, and write it."""
     severities: set[str] = set()
 
     def rows() -> Iterator[Row]:
-        for log in found.logs:
-            if (lost := found.lost.get(log.address)) is not None:
-                kept, severe = [lost], set[str]()
-            else:
-                kept, severe = found.store.rows(found.hash_of.get(log.address, ""))
-            severities.update(severe)
-            judged = bool(kept) and "axis" in kept[0]
-            results, report = _files(found, kept[0]) if judged else ("", "")
+        for log in found.logs.values():
+            lost = found.lost.get(log.address)
+            kept = [lost] if lost else found.store.rows(found.hash_of.get(log.address, ""))
             for row in kept:
+                severities.update(row.get("severities", ()))
                 yield row | {
                     "log": log.log,
                     "name": log.name,
                     "px4fuse": found.store.px4fuse,
                     "settings": found.store.settings,
-                    "results": results,
-                    "report": report,
                 }
 
     table, against = table_of(rows()), ""
-    if found.baseline is not None:
-        held = marked(table, found.baseline)
-        table, against = held.table, held.words
+    if baseline is not None:
+        table, against = marked(table, baseline)
     page = html_text(table, found.output.resolve().name, f"px4fuse {found.store.px4fuse}")
     parquet = io.BytesIO()
     table.to_parquet(parquet, index=False)

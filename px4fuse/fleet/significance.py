@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -13,14 +12,11 @@ import pandas as pd
 from scipy.special import ndtr
 from scipy.stats import false_discovery_control
 
-from px4fuse.fleet.measures import Z95, Aim, Bounds, Number, Scale
+from px4fuse.fleet.measures import Z95, Bounds, Number
 
 #: Of what is called significant, this share is expected to be chance
 FALSE_DISCOVERY_RATE = 0.05
 SPREAD_TABLE = "spread.csv"
-# Two settings of one flight that differ by less are the same: of a ratio, and by unit
-LEAST_RATIO = 0.01
-LEAST_DIFFERENCE = {"": 0.001, "m": 0.001, "s": 0.001, "°": 0.1}
 
 
 @dataclass(frozen=True)
@@ -31,26 +27,28 @@ class Contrast:
     ----------
     delta : float
         ln(b/a) or b - a.
-    half : float or None
-        By how much ``delta`` must differ from 0 to lie outside its 95 % interval; None without
-        intervals.
+    farther : float
+        By how much b is farther than a from what is best; 0 where nothing is.
     interval : (float, float) or None
-        Of ``delta``.
-    nearer : float
-        By how much b is farther than a from what is best, on the same scale; 0 where nothing is.
+        Of ``delta``, 95 %; None where one of the two has none.
     """
 
     delta: float
-    half: float | None
-    interval: Bounds | None
-    nearer: float
+    farther: float
+    interval: Bounds | None = None
+
+    @property
+    def half(self) -> float:
+        """From ``delta`` to the end of its interval that faces "no change"; 0 without one."""
+        if self.interval is None:
+            return 0.0
+        low, high = self.interval
+        return self.delta - low if self.delta > 0.0 else high - self.delta
 
     @property
     def z(self) -> float:
         """Standard deviations from "no change"."""
-        if not self.half or self.delta == 0.0:
-            return 0.0
-        return Z95 * abs(self.delta) / self.half
+        return Z95 * abs(self.delta) / self.half if self.half and self.delta else 0.0
 
     @property
     def p(self) -> float:
@@ -75,32 +73,24 @@ def contrast(a: Number, b: Number, spread: float = 0.0) -> Contrast | None:
     Contrast or None
         None where a ratio to zero would be needed.
     """
-    ratio = a.scale == "ratio"
-    if ratio and min(a.value, b.value) <= 0.0:
+    x, y = a.measure.scaled((a.value, b.value)).tolist()
+    if not np.isfinite(y - x):
         return None
-    x, y = (float(np.log(n.value)) if ratio else n.value for n in (a, b))
-    delta = y - x
-    nearer = farther(a.aim, y, x)
-    reach_a, reach_b = (_reach(n, at, spread) for n, at in ((a, x), (b, y)))
-    if reach_a is None or reach_b is None:
-        return Contrast(delta, None, None, nearer)
-    below = float(np.hypot(reach_b[0], reach_a[1]))
-    above = float(np.hypot(reach_b[1], reach_a[0]))
-    half = below if delta > 0.0 else above
-    return Contrast(delta, half, (delta - below, delta + above), nearer)
+    farther = a.measure.farther(y, x)
+    if a.interval is None or b.interval is None:
+        return Contrast(y - x, farther)
+    a_below, a_above = _reach(a, a.interval, spread)
+    b_below, b_above = _reach(b, b.interval, spread)
+    below, above = np.hypot(b_below, a_above), np.hypot(b_above, a_below)
+    return Contrast(y - x, farther, (float(y - x - below), float(y - x + above)))
 
 
-def _reach(number: Number, at: float, spread: float) -> Bounds | None:
+def _reach(number: Number, interval: Bounds, spread: float) -> Bounds:
     """How far the interval of a number reaches below and above it, on its scale."""
-    if number.interval is None:
-        return None
-    low, high = number.interval
-    if number.scale == "ratio":
-        above = float(np.log(high)) - at
-        # an interval that is open below has no logarithm there
-        below = at - float(np.log(low)) if low > 0.0 else above
-    else:
-        below, above = at - low, high - at
+    low, value, high = number.measure.scaled((interval[0], number.value, interval[1])).tolist()
+    above = high - value
+    # an interval that is open below has no logarithm there
+    below = value - low if np.isfinite(low) else above
     wide = Z95 * spread
     return float(np.hypot(max(below, 0.0), wide)), float(np.hypot(max(above, 0.0), wide))
 
@@ -114,24 +104,11 @@ def corrected(p: Sequence[float]) -> list[float]:
     return [float(q) for q in false_discovery_control(p)] if p else []
 
 
-def least_difference(scale: Scale, unit: str) -> float:
-    """Two numbers of one flight that differ by less are the same, on their scale."""
-    return math.log1p(LEAST_RATIO) if scale == "ratio" else LEAST_DIFFERENCE[unit]
-
-
-def farther(aim: Aim, now: float, before: float) -> float:
-    """By how much a number is farther from what is best, on its scale; 0 where nothing is."""
-    if aim == "":
-        return 0.0
-    return now - before if aim == "low" else abs(now) - abs(before)
-
-
 @cache
 def spreads() -> Mapping[str, float]:
     """By which standard deviation a number varies between flights beyond its interval, by kind.
 
-    Measured by :mod:`px4fuse.fleet.spread`; of a kind that is not in the table 0.
+    Measured by ``tests/studies/spread.py``.
     """
     with files("px4fuse.fleet").joinpath(SPREAD_TABLE).open(encoding="utf-8") as file:
-        table = pd.read_csv(file)
-    return dict(zip(table["kind"], table["spread"], strict=True))
+        return dict(pd.read_csv(file).set_index("kind")["spread"])

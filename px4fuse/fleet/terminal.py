@@ -18,30 +18,22 @@ SHOWN = 8
 def print_fleet(console: Console, fleet: Fleet) -> None:
     """Print what could not be compared, both filters by axis, findings and what is worse."""
     logs = fleet.table.drop_duplicates("log")
-    alone = logs[logs["axis"] == ""]
-    causes = alone.groupby(["status", "reason", "remedy"], sort=False, as_index=False).agg(
-        logs=("log", "count"), one=("log", "first")
-    )
-    most = causes.sort_values("logs", ascending=False, kind="stable")
-    for cause in most.head(SHOWN).itertuples():
-        which = cause.one if cause.logs == 1 else f"{cause.logs} logs, one is {cause.one}"
-        text = f"{which!s}: {cause.status}: {cause.reason}. {cause.remedy}".rstrip()
-        say(console, Text(text, "red" if cause.status == FAILED else "yellow"))
+    alone = logs[logs["axis"] == ""].groupby(["status", "reason", "remedy"], sort=False)["log"]
+    causes = alone.agg(["count", "first"]).reset_index()
+    most = causes.sort_values("count", ascending=False, kind="stable")
+    for cause in most.head(SHOWN).to_dict("records"):
+        one = "" if cause["count"] == 1 else f"{cause['count']} logs, one is "
+        style = "red" if cause["status"] == FAILED else "yellow"
+        text = "{first}: {status}: {reason}. {remedy}".format_map(cause).rstrip()
+        say(console, Text(one + text, style))
     if len(most) > SHOWN:
         say(console, f"{len(most) - SHOWN} more reasons are in fleet.html.")
-    table = plain_table(
-        ("axis", "left"),
-        *(
-            (f"{whose}\n{what}", "right")
-            for whose in ("ours", "EKF2")
-            for what in ("logs", "factor")
-        ),
-    )
+    heads = [f"{whose}\n{what}" for whose in ("ours", "EKF2") for what in ("logs", "factor")]
+    table = plain_table(("axis", "left"), *((head, "right") for head in heads))
     for axis, rows in fleet.table[fleet.table["axis"] != ""].groupby("axis", sort=False):
         cells = []
         for factors in (rows["kf_factor"].dropna(), rows["ekf2_factor"].dropna()):
-            median = factor_words(float(factors.median())) if len(factors) else "–"
-            cells += [f"{len(factors)}", median]
+            cells += [f"{len(factors)}", factor_words(factors.median()) if len(factors) else "–"]
         table.add_row(str(axis), *cells)
     if table.row_count:
         console.print(table)

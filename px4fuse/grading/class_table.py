@@ -6,10 +6,8 @@ import csv
 import io
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 
-from px4fuse.grading.model import Entry, Graded, Override
-from px4fuse.grading.names import distinct
+from px4fuse.grading.model import Entry
 from px4fuse.spreadsheet import neutral, neutral_id
 
 FIRST = ("file", "student", "id", "status", "points", "pending points", "of", "deducted", "total")
@@ -31,20 +29,21 @@ def csv_text(entries: Sequence[Entry]) -> str:
         Begins with the byte order mark by which Excel knows UTF-8; lines end with CRLF. Write it
         without translating line ends.
     """
-    settled = [settled_report(entry) for entry in entries]
-    items = tuple(dict.fromkeys(title for one in settled if one for title in item_points(one)))
-    numbers = tuple(dict.fromkeys(title for one in settled if one for title in one.numbers))
+    handed_in = [one for entry in entries if (one := entry.counting)]
+    items = tuple(dict.fromkeys(title for one in handed_in for title in one.by_title))
+    numbers = tuple(dict.fromkeys(title for one in handed_in for title in one.numbers))
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\r\n")
     writer.writerow(neutral(title) for title in (*FIRST, *items, *numbers, *LAST))
-    for entry, one in zip(entries, settled, strict=True):
-        points = item_points(one) if one else {}
+    for entry in entries:
+        one = entry.counting
+        points = {title: item.points for title, item in one.by_title.items()} if one else {}
         row: list[str | float | None] = [
             one.submission if one else "", entry.student, None, one.status if one else "missing",
             one.counted if one else None, one.points if one and one.counted is None else None,
             entry.of, entry.deduction or None, entry.total,
-            *(points.get(title) for title in items),
-            *((one.numbers if one else {}).get(title) for title in numbers),
+            *map(points.get, items),
+            *(one.numbers.get(title) if one else None for title in numbers),
             entry.handed_in, None if entry.late_s is None else entry.late_s / 3600.0,
             one.pending if one else "", entry.comment, BETWEEN.join(entry.remarks),
             BETWEEN.join(one.flags) if one else "",
@@ -55,31 +54,6 @@ def csv_text(entries: Sequence[Entry]) -> str:
         cells[FIRST.index("id")] = neutral_id(entry.student_id)
         writer.writerow(cells)
     return "\ufeff" + out.getvalue()
-
-
-def settled_report(entry: Entry) -> Graded | None:
-    """The report that counts, with the instructor's points and comments on its items."""
-    graded = entry.counting
-    if graded is None or not entry.overrides:
-        return graded
-    items = []
-    for title, item in zip(item_points(graded), graded.items, strict=True):
-        said = entry.overrides.get(title, Override())
-        points = item.points if said.points is None else said.points
-        comment = (
-            f"{item.comment} Your instructor: {said.comment}" if said.comment else item.comment
-        )
-        if said.points is not None and said.points != item.points:
-            comment = f"{comment} (Your instructor gave {number(points)} points.)"
-        waits = item.waits and said.points is None
-        items.append(replace(item, points=points, comment=comment, waits=waits))
-    return replace(graded, items=tuple(items))
-
-
-def item_points(one: Graded) -> dict[str, float]:
-    """Points by the title of the rubric's item; titles that come twice are numbered."""
-    titles = distinct(item.title for item in one.items)
-    return dict(zip(titles, (item.points for item in one.items), strict=True))
 
 
 def number(value: float | None) -> str:

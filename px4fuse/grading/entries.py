@@ -4,49 +4,25 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from datetime import datetime
 from typing import Literal
 
+from px4fuse.assignment.roster import Person
 from px4fuse.assignment.sheet import Sheet
-from px4fuse.grading.class_table import item_points, settled_report
+from px4fuse.grading.class_table import number
 from px4fuse.grading.lateness import LateRule, in_zone_of
-from px4fuse.grading.model import Entry, Graded, Override, Submission
+from px4fuse.grading.model import Entry, Graded, Item, Override, Submission
 from px4fuse.grading.overrides import TOTAL, Overrides, matched
-from px4fuse.grading.platforms import ExportOrigin
-from px4fuse.grading.roster import Person, Register
+from px4fuse.grading.roster import Register
 from px4fuse.results.reading import one_line
 
-Attempt = Literal["latest", "best", "first"]
 SHOWN = "%Y-%m-%d %H:%M"
 
 
 @dataclass(frozen=True)
-class Term:
-    """The rules of a class.
-
-    Attributes
-    ----------
-    attempt : {"latest", "best", "first"}
-        Which one counts of several.
-    due : datetime or None
-        With a time zone.
-    times : mapping
-        Index of a person in the register to when Moodle says that the work was handed in.
-    include_pending : bool
-        Whether points that wait for the instructor are entered as they are proposed.
-    """
-
-    attempt: Attempt = "latest"
-    due: datetime | None = None
-    late: LateRule | None = None
-    times: Mapping[int, datetime] | None = None
-    include_pending: bool = False
-
-
-@dataclass(frozen=True)
 class Course:
-    """What is known of a class besides what it handed in.
+    """What is known of a class besides what it handed in, and its rules.
 
     Attributes
     ----------
@@ -56,8 +32,12 @@ class Course:
         Tables of learning platforms, to be filled in.
     column : str
         Of the worksheets, for the grade; "" where there is only one.
-    term : Term
-        Which attempt counts, and what being late costs.
+    attempt : {"latest", "best", "first"}
+        Which one counts of several.
+    due : datetime or None
+        With a time zone.
+    include_pending : bool
+        Whether points that wait for the instructor are entered as they are proposed.
     anonymous : bool
         Whether the class page shows pseudonyms.
     """
@@ -65,45 +45,24 @@ class Course:
     roster: tuple[Person, ...] | None = None
     worksheets: tuple[Sheet, ...] = ()
     column: str = ""
-    term: Term = field(default_factory=Term)
+    attempt: Literal["latest", "best", "first"] = "latest"
+    due: datetime | None = None
+    late: LateRule | None = None
+    include_pending: bool = False
     anonymous: bool = False
 
 
-@dataclass(frozen=True)
-class _Try:
-    """One attempt: the file, when it came, and what that costs."""
-
-    graded: Graded
-    origin: ExportOrigin
-    time: datetime | None
-    packed: datetime | None
-    late_s: float | None
-    deduction: float
-    remarks: tuple[str, ...]
-
-    @property
-    def read(self) -> bool:
-        return bool(self.graded.version)
-
-    @property
-    def worth(self) -> float:
-        """For the best of several: what counts, pending ones last."""
-        points = self.graded.counted
-        return -1.0 if points is None else max(points - self.deduction, 0.0)
-
-    @property
-    def order(self) -> tuple[float, float, float, str]:
-        """By time, of one submission the better file later."""
-        times = (0.0 if one is None else one.timestamp() for one in (self.time, self.packed))
-        return (*times, self.worth, self.graded.submission)  # type: ignore[return-value]
+# When it came and when it was packed, by which attempts are ordered; the file; and the row that it
+# would make alone
+Attempt = tuple[tuple[float, float], Graded, Entry]
 
 
 def class_entries(
     graded: Sequence[Graded],
     submissions: Sequence[Submission],
-    origins: Sequence[ExportOrigin],
     register: Register | None,
-    term: Term,
+    course: Course,
+    times: Mapping[int, datetime],
     overrides: Overrides,
 ) -> tuple[tuple[Entry, ...], tuple[str, ...]]:
     """Lay out a class: everyone in the register, then what belongs to nobody in it.
@@ -114,8 +73,10 @@ def class_entries(
 
     Parameters
     ----------
-    graded, submissions, origins : sequences
+    graded, submissions : sequences
         Of every file, in one order.
+    times : mapping
+        Index of a person in the register to when Moodle says that the work was handed in.
 
     Returns
     -------
@@ -123,150 +84,175 @@ def class_entries(
     notes : tuple of str
         On overrides that fit nobody.
     """
-    everyone = register or Register(_named(graded, origins))
-    owners: dict[int, list[int]] = defaultdict(list)
-    nobody: list[int] = []
-    for index, (one, origin) in enumerate(zip(graded, origins, strict=True)):
-        place = everyone.by_platform(origin)
-        if place is None:
-            place = everyone.by_report(one.student_id, one.student)
-        (nobody if place is None else owners[place]).append(index)
-
-    def tries(members: Sequence[int], place: int | None = None) -> list[_Try]:
-        return [
-            _try(graded[at], submissions[at], origins[at], term, place, everyone) for at in members
-        ]
-
-    made = [
-        _entry(person, tries(owners[place], place), term)
-        for place, person in enumerate(everyone.people)
-    ]
+    everyone = register or Register(_named(graded, submissions))
+    attempts: dict[int, list[Attempt]] = defaultdict(list)
+    strangers = []
     note = "Not in the roster." if register else "Neither the report nor the platform names anyone."
-    for index in nobody:
-        one = graded[index]
-        person = Person(one.student_id, one_line(one.student or origins[index].name, 200))
-        entry = _entry(person, tries([index]), term)
-        made.append(replace(entry, remarks=(note, *entry.remarks)))
-    titles = [tuple(item_points(one.counting)) if one.counting else () for one in made]
-    said, notes = matched(overrides, made, titles)
+    for one, submission in zip(graded, submissions, strict=True):
+        place = everyone.by_platform(submission.origin)
+        if place is None:
+            place = everyone.place(Person(one.student_id, one.student))
+        said = submission.origin.time or times.get(-1 if place is None else place)
+        attempt = _attempt(one, submission, said, course, place, everyone)
+        if place is not None:
+            attempts[place].append(attempt)
+        else:
+            strangers.append(replace(attempt[2], remarks=(note, *attempt[2].remarks)))
+    made = [
+        _chosen(attempts[at], course) if attempts[at]
+        else Entry(person.name, person.student_id, None, email=person.email)
+        for at, person in enumerate(everyone.people)
+    ]  # fmt: skip
+    made += strangers
+    told, notes = matched(overrides, made)
     most = max((one.of for one in graded), default=0.0)
     settled = (
-        _settled(one, words, most, term.include_pending)
-        for one, words in zip(made, said, strict=True)
+        _settled(one, words, most, course.include_pending)
+        for one, words in zip(made, told, strict=True)
     )
     return tuple(settled), notes
 
 
-def _named(graded: Sequence[Graded], origins: Sequence[ExportOrigin]) -> list[Person]:
+def _named(graded: Sequence[Graded], submissions: Sequence[Submission]) -> list[Person]:
     """Without a roster: everyone whom a platform, else a report, names; each once."""
     register = Register([])
-    for one, origin in zip(graded, origins, strict=True):
+    for one, submission in zip(graded, submissions, strict=True):
+        origin = submission.origin
+        claimed = register.place(Person(one.student_id)) if one.student_id else None
         if origin.platform and (origin.number or origin.login):
             if register.by_platform(origin) is not None:
                 continue
-            numbers = {origin.platform: origin.number} if origin.number else {}
-            same = register.by_report(one.student_id, "")
             # two students may not hand in under one id: the second is known by the platform alone
-            student_id = origin.student_id or ("" if same is not None else one.student_id)
+            student_id = origin.student_id or ("" if claimed is not None else one.student_id)
             register.people.append(
                 Person(
                     student_id or origin.login or origin.number,
                     one_line(one.student if student_id else origin.name, 200) or origin.name,
                     origin.email,
                     origin.login,
-                    numbers,
+                    {origin.platform: origin.number} if origin.number else {},
                 )
             )
-        elif one.student_id and register.by_report(one.student_id, "") is None:
+        elif one.student_id and claimed is None:
             register.people.append(Person(one.student_id, one_line(one.student, 200)))
     return register.people
 
 
-def _try(
+def _attempt(
     graded: Graded,
     submission: Submission,
-    origin: ExportOrigin,
-    term: Term,
+    said: datetime | None,
+    course: Course,
     place: int | None,
     register: Register,
-) -> _Try:
-    said = origin.time or (term.times or {}).get(-1 if place is None else place)
-    time = None if said is None else in_zone_of(said, term.due)
-    packed = None if submission.time is None else in_zone_of(submission.time, term.due)
+) -> Attempt:
+    """One file as if it were the only one of its student, ``said`` when it came."""
+    origin, due = submission.origin, course.due
+    time, packed = (
+        None if one is None else in_zone_of(one, due) for one in (said, submission.time)
+    )
     late_s = None
     remarks = []
-    if term.due is not None and time is not None:
+    if due is not None and time is not None:
         # not their difference: in one zone Python takes the clock's, also over a change of it
-        late_s = max(time.timestamp() - term.due.timestamp(), 0.0)
+        late_s = max(time.timestamp() - due.timestamp(), 0.0)
     elif origin.late:
         remarks.append(
             f"{origin.platform.capitalize()} marks it as late and does not say by how much: nothing"
             " was taken off; say in overrides.csv what is."
         )
-    elif term.late and term.due and packed and packed.timestamp() > term.due.timestamp():
+    elif course.late and due and packed and packed.timestamp() > due.timestamp():
         remarks.append(
             f"The zip file dates it {packed.strftime(SHOWN)}, after the due time; that may be when "
             "it was downloaded, so nothing was taken off."
         )
-    claimed = register.by_report(graded.student_id, "") if origin.platform else None
+    claimed = register.place(Person(graded.student_id)) if origin.platform else None
     if claimed is not None and place is not None and claimed != place:
         other = register.people[claimed]
         remarks.append(
             f"The report gives the id of {other.student_id} ({other.name or 'no name'}), but "
             f"{origin.platform.capitalize()} says who handed it in."
         )
-    deduction = term.late.deduction(late_s, graded.of) if term.late and late_s else 0.0
-    return _Try(graded, origin, time, packed, late_s, deduction, tuple(remarks))
-
-
-def _entry(person: Person, tries: Sequence[_Try], term: Term) -> Entry:
-    if not tries:
-        return Entry(person.name, person.student_id, None, email=person.email)
-    ordered = sorted(tries, key=lambda one: one.order)
-    # what is not a report counts only where there is nothing else
-    able = [one for one in ordered if one.read] or ordered
-    # several files of one submission: the best
-    of_first = [one for one in able if one.order[:2] == able[0].order[:2]]
-    chosen = {
-        "latest": able[-1],
-        "first": of_first[-1],
-        "best": max(able, key=lambda one: (one.worth, one.order)),
-    }[term.attempt]
-    remarks = list(chosen.remarks)
-    beside = sum(one is not chosen and one.order[:2] == chosen.order[:2] != (0.0, 0.0)
-                 for one in able)  # fmt: skip
-    if beside:
-        remarks.append(f"{beside + 1} reports came at the same time; the best of them counts.")
-    if able is not ordered and ordered[-1] is not chosen and not ordered[-1].read:
-        remarks.append(
-            f"{one_line(ordered[-1].graded.submission, 80)} cannot be read as a report, so that "
-            "another file counts."
-        )
-    return Entry(
-        person.name or one_line(chosen.graded.student or chosen.origin.name, 200),
+    person = Person(graded.student_id) if place is None else register.people[place]
+    entry = Entry(
+        person.name or one_line(graded.student or origin.name, 200),
         person.student_id,
-        chosen.graded,
-        tuple(one.graded for one in ordered if one is not chosen),
-        "" if chosen.time is None else chosen.time.strftime(SHOWN),
-        chosen.late_s,
-        chosen.deduction,
+        graded,
+        (),
+        "" if time is None else time.strftime(SHOWN),
+        late_s,
+        course.late.deduction(late_s, graded.of) if course.late and late_s else 0.0,
         email=person.email,
         remarks=tuple(remarks),
     )
+    times = (time.timestamp() if time else 0.0, packed.timestamp() if packed else 0.0)
+    return times, graded, entry
+
+
+def _worth(attempt: Attempt) -> float:
+    """For the best of several: what counts, pending ones last."""
+    _, one, entry = attempt
+    return -1.0 if one.counted is None else max(one.counted - entry.deduction, 0.0)
+
+
+def _order(attempt: Attempt) -> tuple[object, ...]:
+    """By time, of one submission the better file later."""
+    return attempt[0], _worth(attempt), attempt[1].submission
+
+
+def _chosen(attempts: Sequence[Attempt], course: Course) -> Entry:
+    """The attempt that counts, with the others and what that needs said."""
+    ordered = sorted(attempts, key=_order)
+    # what is not a report counts only where there is nothing else
+    able = [one for one in ordered if one[1].version] or ordered
+    found = {
+        "latest": able[-1],
+        # several files of one submission: the best
+        "first": [one for one in able if one[0] == able[0][0]][-1],
+        "best": max(able, key=lambda one: (_worth(one), _order(one))),
+    }[course.attempt]
+    times, graded, entry = found
+    remarks = list(entry.remarks)
+    beside = sum(one[0] == times for one in able) if any(times) else 1
+    if beside > 1:
+        remarks.append(f"{beside} reports came at the same time; the best of them counts.")
+    last = ordered[-1][1]
+    if not last.version and last is not graded:
+        name = one_line(last.submission, 80)
+        remarks.append(f"{name} cannot be read as a report, so that another file counts.")
+    others = tuple(one for _, one, _ in ordered if one is not graded)
+    return replace(entry, others=others, remarks=tuple(remarks))
 
 
 def _settled(
     entry: Entry, said: Mapping[str, Override], most: float, include_pending: bool
 ) -> Entry:
-    """With the instructor's word, and the total that follows."""
-    comment = "\n".join(
-        said[name].comment for name in ("", TOTAL) if name in said and said[name].comment
+    """With the instructor's word on items and on all of it, and the total that follows."""
+    words = [said[name].comment for name in ("", TOTAL) if name in said]
+    one, total = entry.counting, None
+    if one is not None:
+        items = (_overruled(item, said.get(title)) for title, item in one.by_title.items())
+        one = replace(one, items=tuple(items))
+        if one.counted is not None or include_pending:
+            total = round(max(one.points - entry.deduction, 0.0), 2)
+    final = said[TOTAL].points if TOTAL in said else None
+    return replace(
+        entry,
+        counting=one,
+        overrides={title: each for title, each in said.items() if title},
+        comment="\n".join(filter(None, words)),
+        total=total if final is None else final,
+        of=one.of if one else most,
     )
-    entry = replace(entry, overrides={title: one for title, one in said.items() if title})
-    settled = settled_report(entry)
-    total = None
-    if TOTAL in said and said[TOTAL].points is not None:
-        total = said[TOTAL].points
-    elif settled is not None and (settled.counted is not None or include_pending):
-        total = round(max(settled.points - entry.deduction, 0.0), 2)
-    return replace(entry, comment=comment, total=total, of=settled.of if settled else most)
+
+
+def _overruled(item: Item, said: Override | None) -> Item:
+    """An item with the instructor's points and comment in place of, or behind, the rules'."""
+    if said is None:
+        return item
+    comment = f"{item.comment} Your instructor: {said.comment}" if said.comment else item.comment
+    if said.points is None:
+        return replace(item, comment=comment)
+    if said.points != item.points:
+        comment = f"{comment} (Your instructor gave {number(said.points)} points.)"
+    return replace(item, points=said.points, comment=comment, waits=False)

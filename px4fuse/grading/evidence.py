@@ -1,51 +1,90 @@
-"""What a check may look at, and how it speaks of it."""
+"""What a check may look at, how a rubric asks for it, and how it speaks of what it found."""
 
 from __future__ import annotations
 
+import math
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
+
+import msgspec
+from msgspec import Meta
 
 from px4fuse.answers import Answers, check
 from px4fuse.assignment.key import Answer, AnswerKey
 from px4fuse.filter.tuning import HORIZONTAL
 from px4fuse.grading.form_points import FormPoints, form_points
-from px4fuse.grading.model import Rubric
-from px4fuse.plain import few_words
 from px4fuse.record import Unavailable
 from px4fuse.results.contract import ComparisonResults, LoopResults, Reported, to_plain
 from px4fuse.results.reading import one_line
-from px4fuse.verification.model import Report, Verdict
+from px4fuse.verification.model import Verdict
 from px4fuse.verification.rerun import log_sha256
 
 MAX_QUOTE = 160
 # Lists are cut where a comment would become longer than a sentence
 NAMED = 4
+NOT_BOTH = " (it needs the axes north and east, which were not both analysed: leave --axis out)"
+# A step of a path: in quotes where it has dots
 STEP = re.compile(r'"([^"]*)"|([^."]+)')
 
-Scorer = Callable[["Evidence", Mapping[str, Any]], tuple[float, str]]
+# What stands on one line
+_PLAIN = r"[^\x00-\x1f\x7f]"
+Text = Annotated[str, Meta(max_length=200, pattern=rf"^{_PLAIN}*$")]
+Title = Annotated[str, Meta(max_length=200, pattern=rf"^{_PLAIN}*[^\s\x00-\x1f\x7f]{_PLAIN}*$")]
+Bound = Annotated[float, Meta(ge=-1e12, le=1e12)]
+Factor = Annotated[float, Meta(ge=1.0, le=1000.0)]
+# Share of the points, and why
+Scored = tuple[float, str]
+
+
+class RubricItem(
+    msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="check"
+):
+    """One part of the grade; each check is a kind of item, whose fields are its parameters.
+
+    Attributes
+    ----------
+    points : float
+        The most that it gives.
+    report : {"any", "compare", "loop"}
+        The reports that it is for; in others it is left out.
+    needs_key, by_hand : bool
+        Whether it takes an answer key, and whether only the instructor can score it.
+    """
+
+    needs_key: ClassVar[bool] = False
+    by_hand: ClassVar[bool] = False
+
+    title: Title
+    points: Annotated[float, Meta(ge=0.0, le=1000.0)]
+    report: Literal["any", "compare", "loop"] = "any"
+
+    def score(self, evidence: Evidence) -> Scored:
+        """Share of the points from 0 to 1, and a sentence that says why."""
+        raise NotImplementedError
+
+    def applies(self, kind: str, key: AnswerKey | None) -> bool:
+        """Whether reports of this kind have it."""
+        return self.report in ("any", kind) and (key is not None or not self.needs_key)
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """What a check may look at."""
+    """What a check may look at: a report's results, the verdict on them, and the answer key.
 
-    report: Report
+    ``owner_id`` is who handed it in by what a platform says, whatever the report says.
+    """
+
+    results: Reported
     verdict: Verdict
-    rubric: Rubric
     key: AnswerKey | None
     owner_id: str = ""
 
     @property
-    def results(self) -> Reported:
-        """The attached results."""
-        return self.report.results
-
-    @property
     def comparison(self) -> ComparisonResults | None:
-        """The attached results where they compare filters."""
+        """The results where they compare filters."""
         return None if isinstance(self.results, LoopResults) else self.results
 
     @property
@@ -55,7 +94,7 @@ class Evidence:
 
     @cached_property
     def plain(self) -> dict[str, Any]:
-        """The attached results, for paths that a rubric names."""
+        """The results, for paths that a rubric names."""
         return to_plain(self.results)
 
     @cached_property
@@ -73,14 +112,8 @@ class Evidence:
         return given is not None and given.sha256 == log_sha256(self.results)
 
     @cached_property
-    def form(self) -> Answers | None:
-        """The form of the report, where it can be read and is about this log."""
-        answers = self.results.student.answers
-        return answers if isinstance(answers, Answers) and not self.form_problem else None
-
-    @cached_property
-    def form_problem(self) -> str:
-        """Why there is no form to score, as the end of "your form ..."."""
+    def form(self) -> Answers | str:
+        """The form about this log, or why there is none: the end of "your form ..."."""
         answers = self.results.student.answers
         if not isinstance(answers, Answers):
             return "is not in your report: make it with --answers answers.toml"
@@ -90,46 +123,70 @@ class Evidence:
             return f"cannot be read ({text_of(str(error))})"
         if answers.log_sha256 != log_sha256(self.results):
             return "was made for another log"
-        return ""
+        return answers
 
-    def claims(self, *kinds: str) -> bool:
-        """Whether the form names one of these mistakes."""
-        return self.form is not None and any(one.kind in kinds for one in self.form.mistakes)
-
-    @property
+    @cached_property
     def form_points(self) -> FormPoints | None:
         """What the form is worth; None without an answer key for this log, or without a form."""
         truth = None if self.answer is None else self.answer.form
-        return None if truth is None or self.form is None else form_points(self.form, truth)
+        known = truth is not None and isinstance(self.form, Answers)
+        return form_points(self.form, truth) if known else None  # type: ignore[arg-type]
+
+    def claims(self, *kinds: str) -> bool:
+        """Whether the form names one of these mistakes."""
+        form = self.form
+        return isinstance(form, Answers) and any(one.kind in kinds for one in form.mistakes)
 
     def has(self, finding: str) -> bool:
         """Whether the report lists a finding."""
-        return any(finding in one.ids for one in self.results.findings)
+        return any(one.id == finding for one in self.results.findings)
+
+    def why_absent(self, path: str) -> str:
+        """Why there is nothing at a path, in brackets, as far as the results say it."""
+        steps = [match[0] for match in STEP.finditer(path)]
+        for end in range(len(steps), 0, -1):
+            for _, reason in values_at(self.plain, ".".join((*steps[:end], "reason"))):
+                return f" ({text_of(reason).rstrip('.')})"
+        axes = self.comparison and self.comparison.axes
+        if HORIZONTAL in path and axes and not {"north", "east"} <= set(axes):
+            return NOT_BOTH
+        return ""
 
 
-def values_at(results: Mapping[str, Any], path: str) -> Iterator[tuple[str, Any]]:
+def values_at(results: Mapping[str, Any], path: str) -> list[tuple[str, Any]]:
     """Paths and values where a path leads; ``*`` is every key, quotes hold names with dots.
 
-    >>> list(values_at({"a": {"b.c": [1, 2]}}, 'a."b.c".1'))
+    >>> values_at({"a": {"b.c": [1, 2]}}, 'a."b.c".1')
     [('a.b.c.1', 2)]
     """
     found: list[tuple[str, Any]] = [("", results)]
     for match in STEP.finditer(path):
         step = match[1] if match[1] is not None else match[2]
-        every = match[2] == "*"
-        following = []
-        for name, value in found:
-            if isinstance(value, dict):
-                keys = list(value) if every else [step] * (step in value)
-                following += [(f"{name}.{key}", value[key]) for key in keys]
-            elif isinstance(value, list | tuple):
-                following += [
-                    (f"{name}.{place}", value[place])
-                    for place in range(len(value))
-                    if every or step == str(place)
-                ]
-        found = following
-    yield from ((name.removeprefix("."), value) for name, value in found)
+        found = [
+            (f"{name}.{key}", part)
+            for name, value in found
+            for key, part in _parts(value)
+            if step in ("*", key)
+        ]
+    return [(name.removeprefix("."), value) for name, value in found]
+
+
+def _parts(value: Any) -> Iterator[tuple[str, Any]]:
+    if isinstance(value, Mapping):
+        yield from value.items()
+    elif isinstance(value, list | tuple):
+        yield from ((str(place), part) for place, part in enumerate(value))
+
+
+def falling(off: float, factor: float) -> float:
+    """Share for what is off by a factor: 1 where it is not, 0 from ``factor`` on, by logarithms.
+
+    >>> [round(falling(off, 4.0), 2) for off in (1.0, 2.0, 4.0, 9.0)]
+    [1.0, 0.5, 0.0, 0.0]
+    """
+    if off <= 1.0:
+        return 1.0
+    return max(1.0 - math.log(off) / math.log(factor), 0.0) if factor > 1.0 else 0.0
 
 
 def text_of(value: str) -> str:
@@ -139,37 +196,7 @@ def text_of(value: str) -> str:
 
 def absence(part: object) -> str:
     """Why a part is not there, in brackets; "" where it is, or nobody says."""
-    if isinstance(part, Unavailable):
-        return f" ({text_of(part.reason).rstrip('.')})"
-    return ""
-
-
-def why_absent(evidence: Evidence, path: str) -> str:
-    """Why there is nothing at a path of the rubric: what the results themselves say of it."""
-    steps = [match[0] for match in STEP.finditer(path)]
-    for end in range(len(steps), 0, -1):
-        above = ".".join(steps[:end])
-        for _, reason in values_at(evidence.plain, f"{above}.reason"):
-            return f" ({text_of(reason).rstrip('.')})"
-    return why_not_horizontal(evidence) if HORIZONTAL in path else ""
-
-
-def why_not_horizontal(evidence: Evidence) -> str:
-    """Why there is nothing about north and east together."""
-    if evidence.comparison is None or {"north", "east"} <= set(evidence.comparison.axes):
-        return ""
-    return " (it needs the axes north and east, which were not both analysed: leave --axis out)"
-
-
-def list_words(names: Sequence[str]) -> str:
-    """Names with commas between them, the first few."""
-    return few_words(names, NAMED)
-
-
-def reason_of(verdict: Verdict) -> str:
-    """The first reason of a verdict, in brackets."""
-    said = joined(verdict.reasons[:1])
-    return f" ({said})" if said else ""
+    return f" ({text_of(part.reason).rstrip('.')})" if isinstance(part, Unavailable) else ""
 
 
 def joined(reasons: Sequence[str]) -> str:
@@ -177,6 +204,7 @@ def joined(reasons: Sequence[str]) -> str:
     return "; ".join(text for reason in reasons if (text := text_of(reason).rstrip(".")))
 
 
-def drifts(evidence: Evidence) -> bool:
-    """Whether the report says that its innovations do not measure the error."""
-    return evidence.has("source_may_drift")
+def reason_of(verdict: Verdict) -> str:
+    """The first reason of a verdict, in brackets."""
+    said = joined(verdict.reasons[:1])
+    return f" ({said})" if said else ""

@@ -10,8 +10,8 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
-from px4fuse.answers import MISTAKES, Answers, Claim
-from px4fuse.assignment.truth import FormTruth, VerdictTruth, Wrong
+from px4fuse.answers import MISTAKES, Answers, Claim, Quantified
+from px4fuse.assignment.truth import FormTruth, Wrong
 
 PARTS = ("kinds", "sizes", "when", "cure", "verdicts", "quantities")
 WEIGHTS = dict(zip(PARTS, (30.0, 15.0, 10.0, 15.0, 15.0, 15.0), strict=True))
@@ -36,32 +36,22 @@ EFFECTS: Mapping[str, frozenset[str]] = {
     "ekf2-gate": frozenset(("nlos", "jump", "dropout")),
     "ekf2-delay": frozenset(("smoothed",)),
 }
-# Where each is seen
-_TRACK = ("map", "error to truth", "cover")
-SEEN: Mapping[str, tuple[str, ...]] = {
-    "clock-offset": ("clock", "error to truth", "cover"),
-    "clock-drift": ("clock", "cover"),
-    "clock-jump": ("clock", "cover"),
-    "nlos": ("innovations", "cover"),
-    "dropout": ("innovations", "sigma", "position along the aisle", "cover"),
-    "imu-dropout": ("sigma", "velocity", "cover"),
-    "decimate": ("innovations", "sigma", "parameters", "cover"),
-    "r-scale": ("innovations", "parameters", "cover"),
-    "yaw": _TRACK,
-    "scale": _TRACK,
-    "jump": (*_TRACK, "innovations", "position along the aisle", "loop"),
-    "smoothed": ("clock", "innovations", "error to truth", "cover"),
-    "accel-bias": ("innovations", "velocity", "error to truth", "cover"),
-    "vibration": ("innovations", "velocity", "sigma", "cover"),
-    "imu-rate": ("parameters", "velocity", "cover"),
-    "no-motion": ("map", "position along the aisle", "velocity", "cover"),
-    "open-end": ("loop", "map", "cover"),
-    "no-vvo": ("parameters", "cover"),
-    "ekf2-noise": ("innovations", "parameters", "sigma", "cover"),
-    "ekf2-delay": ("why EKF2 differs", "parameters", "error to truth", "cover"),
-    "ekf2-gate": ("innovations", "parameters", "why EKF2 differs", "cover"),
-    "ekf2-off": ("innovations", "parameters", "why EKF2 differs", "cover"),
-}
+# What each panel shows; the cover shows that there is something
+SHOWS: Mapping[str, tuple[str, ...]] = {
+    "clock": ("clock-offset", "clock-drift", "clock-jump", "smoothed"),
+    "innovations": ("nlos", "dropout", "decimate", "r-scale", "jump", "smoothed", "accel-bias",
+                    "vibration", "ekf2-noise", "ekf2-gate", "ekf2-off"),
+    "map": ("yaw", "scale", "jump", "no-motion", "open-end"),
+    "parameters": ("decimate", "r-scale", "imu-rate", "no-vvo", "ekf2-noise", "ekf2-delay",
+                   "ekf2-gate", "ekf2-off"),
+    "sigma": ("dropout", "imu-dropout", "decimate", "vibration", "ekf2-noise"),
+    "position along the aisle": ("dropout", "jump", "no-motion"),
+    "velocity": ("imu-dropout", "accel-bias", "vibration", "imu-rate", "no-motion"),
+    "why EKF2 differs": ("ekf2-delay", "ekf2-gate", "ekf2-off"),
+    "error to truth": ("clock-offset", "yaw", "scale", "jump", "smoothed", "accel-bias",
+                       "ekf2-delay"),
+    "loop": ("jump", "open-end"),
+}  # fmt: skip
 # What needs no measurement, so that it counts only as far as the size is right
 GUESSABLE = frozenset(("open-end",))
 ANY = (-math.inf, math.inf)
@@ -99,17 +89,19 @@ def form_points(answers: Answers, truth: FormTruth) -> FormPoints:
     """Points for a form about a flight whose truth is known."""
     called_clean = not truth.mistakes and answers.says_none
     weights = WEIGHTS_CLEAN if called_clean else WEIGHTS
-    parts = dict.fromkeys(PARTS, 0.0)
+    shares = dict.fromkeys(PARTS, 0.0)
     matched, false = _matched(answers, truth)
+    if truth.mistakes and len(false) < MOST_FALSE:
+        shares |= _of_mistakes(matched, truth)
+    shares["quantities"] = computed = _quantities(answers, truth)
+    # on many flights the verdicts are the same: who computed nothing may have guessed them
+    shares["verdicts"] = _verdicts(answers, truth) * (1.0 if computed else 0.5)
+    parts = {name: weights[name] * share for name, share in shares.items()}
     if called_clean:
         parts["kinds"] = weights["kinds"]
-    elif truth.mistakes and len(false) < MOST_FALSE:
-        parts |= _of_mistakes(matched, truth, weights)
-        parts["kinds"] = max(parts["kinds"] - FALSE_CLAIM * len(false), 0.0)
-    computed = _quantities(answers, truth)
-    parts["quantities"] = weights["quantities"] * computed
-    # on many flights the verdicts are the same: who computed nothing may have guessed them
-    parts["verdicts"] = weights["verdicts"] * _verdicts(answers, truth) * (1.0 if computed else 0.5)
+    elif truth.mistakes and all(wrong.size is None for wrong in truth.mistakes):
+        parts["kinds"] += weights["sizes"] * shares["kinds"]  # there is nothing to size
+    parts["kinds"] = max(parts["kinds"] - FALSE_CLAIM * len(false), 0.0)
     named = {
         wrong.kind: claim is not None and claim.kind == wrong.kind for wrong, claim, _ in matched
     }
@@ -121,76 +113,67 @@ Match = tuple[Wrong, Claim | None, float]
 
 def _said(matched: list[Match], false: list[Claim], called_clean: bool) -> Iterator[str]:
     """What of the mistakes was found, in words."""
-    if called_clean:
-        yield "your flight has no mistake, as you say"
-    elif not matched:
-        yield "your flight has no mistake"
+    if not matched:
+        yield f"your flight has no mistake{', as you say' * called_clean}"
     found = [wrong.kind for wrong, claim, _ in matched if claim and claim.kind == wrong.kind]
     if found:
         yield f"you found {' and '.join(found)}"
     for wrong, claim, _ in matched:
+        what = f"{wrong.kind} ({MISTAKES[wrong.kind][0]})"
         if claim is None:
-            yield f"you missed {wrong.kind} ({MISTAKES[wrong.kind][0]})"
+            yield f"you missed {what}"
         elif claim.kind != wrong.kind:
-            yield f"you named {claim.kind} where it is {wrong.kind} ({MISTAKES[wrong.kind][0]})"
+            yield f"you named {claim.kind} where it is {what}"
     if false:
         yield f"not in your flight: {', '.join(claim.kind for claim in false)}"
 
 
 def _matched(answers: Answers, truth: FormTruth) -> tuple[list[Match], list[Claim]]:
-    """Each mistake with the claim that stands for it and its share of the kind; false claims."""
+    """Each mistake with the claim that stands for it and its share of the kind; false claims.
+
+    The best match is taken first: the kind itself, then its neighbours, then what it causes.
+    """
     left = [claim for claim in answers.mistakes if claim.kind != "none"]
     found: dict[str, tuple[Claim, float]] = {}
-
-    for share_of in (_same, _neighbour, _effect):
-        for wrong in truth.mistakes:
-            if wrong.kind in found:
-                continue
-            for claim in left:
-                if share := share_of(wrong.kind, claim.kind):
-                    found[wrong.kind] = claim, share
-                    left.remove(claim)
-                    break
+    tried = [
+        (kind_share(wrong.kind, claim.kind), wrong.kind, claim)
+        for wrong in truth.mistakes
+        for claim in left
+    ]
+    for share, kind, claim in sorted(tried, key=lambda one: -one[0]):
+        if share and kind not in found and claim in left:
+            found[kind] = claim, share
+            left.remove(claim)
     return [(wrong, *found.get(wrong.kind, (None, 0.0))) for wrong in truth.mistakes], left
 
 
-def _same(kind: str, claimed: str) -> float:
-    return float(kind == claimed)
-
-
-def _neighbour(kind: str, claimed: str) -> float:
+def kind_share(kind: str, claimed: str) -> float:
+    """What naming one kind is worth where it is another."""
+    if kind == claimed:
+        return 1.0
     if (kind, claimed) == ("r-scale", "ekf2-noise"):
         return SAME_NUMBER
-    return NEIGHBOUR if any({kind, claimed} <= group for group in NEIGHBOURS) else 0.0
-
-
-def _effect(kind: str, claimed: str) -> float:
+    if any({kind, claimed} <= group for group in NEIGHBOURS):
+        return NEIGHBOUR
     return EFFECT if claimed in EFFECTS.get(kind, ()) else 0.0
 
 
-def _of_mistakes(
-    matched: list[Match], truth: FormTruth, weights: Mapping[str, float]
-) -> dict[str, float]:
-    """Kinds, sizes, when and cure, each shared out evenly among the mistakes."""
-    count = len(matched)
-    sized = [match for match in matched if match[0].size is not None]
-    kinds = weights["kinds"] + (0.0 if sized else weights["sizes"])
-    points = dict.fromkeys(("kinds", "sizes", "when", "cure"), 0.0)
+def _of_mistakes(matched: list[Match], truth: FormTruth) -> dict[str, float]:
+    """Shares of kinds, sizes, when and cure, each the mean over the mistakes."""
+    sized = sum(wrong.size is not None for wrong, _, _ in matched)
+    shares = dict.fromkeys(("kinds", "sizes", "when", "cure"), 0.0)
     for wrong, claim, share in matched:
         if claim is None:
             continue
-        exact = claim.kind == wrong.kind
         size = size_share(wrong, claim)
-        seen = when_share(wrong, claim) * (1.0 if exact else 0.5)
+        seen = when_share(wrong, claim) * (1.0 if claim.kind == wrong.kind else 0.5)
         cured = cure_share(wrong, claim, truth)
-        if wrong.kind in GUESSABLE:
-            seen, cured = seen * size, cured * size
-        points["kinds"] += kinds * share / count
-        points["when"] += weights["when"] * seen / count
-        points["cure"] += weights["cure"] * cured / count
-        if sized:
-            points["sizes"] += weights["sizes"] * size / len(sized)
-    return points
+        counts = size if wrong.kind in GUESSABLE else 1.0
+        shares["kinds"] += share / len(matched)
+        shares["when"] += seen * counts / len(matched)
+        shares["cure"] += cured * counts / len(matched)
+        shares["sizes"] += size / max(sized, 1)
+    return shares
 
 
 def size_share(wrong: Wrong, claim: Claim) -> float:
@@ -198,53 +181,49 @@ def size_share(wrong: Wrong, claim: Claim) -> float:
     size = claim.size_in_first_unit()
     if wrong.size is None or wrong.low is None or wrong.high is None or size is None:
         return 0.0
-    same_unit = [*MISTAKES[claim.kind][1]][:1] == [*MISTAKES[wrong.kind][1]][:1]
-    if wrong.low <= size <= wrong.high and same_unit:
-        return 1.0 if claim.kind == wrong.kind else 1.0 / 3.0
     if claim.kind != wrong.kind:
-        return 0.0
-    if wrong.low <= -size <= wrong.high:
-        return 1.0 / 3.0
-    return 0.5 if abs(size - wrong.size) <= HALF_SIZE * abs(wrong.size) else 0.0
+        same_unit = [*MISTAKES[claim.kind][1]][:1] == [*MISTAKES[wrong.kind][1]][:1]
+        return 1.0 / 3.0 if wrong.low <= size <= wrong.high and same_unit else 0.0
+    close = abs(size - wrong.size) <= HALF_SIZE * abs(wrong.size)
+    return _value_share(size, wrong.low, wrong.high, 0.5 if close else 0.0)
 
 
 def when_share(wrong: Wrong, claim: Claim) -> float:
     """Half for the time, half for a panel that can show it."""
-    whole = wrong.from_s is None and wrong.until_s is None
-    if whole:
+    if wrong.from_s is None and wrong.until_s is None:
         timed = claim.when == "whole flight"
     else:
         asked = (wrong.from_s, claim.from_s), (wrong.until_s, claim.until_s)
         timed = not claim.when and all(
-            known is None or (given is not None and _near(given, known)) for known, given in asked
+            known is None
+            or (given is not None and abs(given - known) <= max(CLOSE_S, CLOSE_SHARE * known))
+            for known, given in asked
         )
-    return 0.5 * timed + 0.5 * (claim.panel in SEEN.get(wrong.kind, ()))
+    return 0.5 * timed + 0.5 * (claim.panel in panels(wrong.kind))
 
 
-def _near(given_s: float, known_s: float) -> bool:
-    return abs(given_s - known_s) <= max(CLOSE_S, CLOSE_SHARE * known_s)
+def panels(kind: str) -> list[str]:
+    """The panels that can show a kind of mistake."""
+    return [*(panel for panel, kinds in SHOWS.items() if kind in kinds), "cover"]
 
 
 def cure_share(wrong: Wrong, claim: Claim, truth: FormTruth) -> float:
     """What the parameter and its value are worth, by what they do to this flight."""
     value = claim.value_in_first_unit()
     worth = [
-        share * _value_share(value, low, high)
+        share if (low, high) == ANY
+        else share * (0.5 if value is None else _value_share(value, low, high, 0.5))
         for parameter, (low, high), share in cures(wrong, truth)
         if parameter == claim.parameter
-    ]
+    ]  # fmt: skip
     return max(worth, default=0.0)
 
 
-def _value_share(value: float | None, low: float, high: float) -> float:
-    if (low, high) == ANY:
-        return 1.0
-    if value is None:
-        return 0.5
+def _value_share(value: float, low: float, high: float, otherwise: float) -> float:
+    """All for what is right, a third for the wrong sign."""
     if low <= value <= high:
         return 1.0
-    # what follows from a wrong sign doubles the error
-    return 1.0 / 3.0 if low <= -value <= high else 0.5
+    return 1.0 / 3.0 if low <= -value <= high else otherwise
 
 
 Cure = tuple[str, tuple[float, float], float]
@@ -307,20 +286,13 @@ def cures(wrong: Wrong, truth: FormTruth) -> tuple[Cure, ...]:
 
 
 def _verdicts(answers: Answers, truth: FormTruth) -> float:
-    shares = (
-        _verdict(answers.verdict_ours, truth.ours),
-        _verdict(answers.verdict_ekf2, truth.ekf2),
-        _did(answers, truth),
-    )
+    """Mean share of the verdicts on both filters and of what EKF2 did."""
+    shares = [_did(answers, truth)]
+    for given, known in ((answers.verdict_ours, truth.ours), (answers.verdict_ekf2, truth.ekf2)):
+        nearly = given == "consistent" and known.verdict and not known.clear
+        right = given and given == known.verdict
+        shares.append(1.0 if right else 0.5 if nearly else 0.0)
     return sum(shares) / len(shares)
-
-
-def _verdict(given: str, truth: VerdictTruth) -> float:
-    if not given or not truth.verdict:
-        return 0.0
-    if given == truth.verdict:
-        return 1.0
-    return 0.5 if given == "consistent" and not truth.clear else 0.0
 
 
 def _did(answers: Answers, truth: FormTruth) -> float:
@@ -335,25 +307,18 @@ def _did(answers: Answers, truth: FormTruth) -> float:
 
 
 def _quantities(answers: Answers, truth: FormTruth) -> float:
-    pairs = [
-        (given, known)
-        for given, known in zip(answers.quantities, truth.quantities, strict=False)
-        if known is not None
-    ]
+    """Mean share of the numbers that can be known."""
     known = sum(one is not None for one in truth.quantities)
-    return sum(_quantity(*pair) for pair in pairs) / known if known else 0.0
+    pairs = zip(answers.quantities, truth.quantities, strict=False)
+    return sum(_quantity(*pair) for pair in pairs) / max(known, 1)
 
 
-def _quantity(given: float | tuple[float, ...] | None, known: float | tuple[float, ...]) -> float:
-    if given is None or isinstance(given, tuple) != isinstance(known, tuple):
-        return 0.0
+def _quantity(given: Quantified, known: Quantified) -> float:
     if isinstance(given, tuple) and isinstance(known, tuple):
         off = len(set(given) ^ set(known))
         return (1.0, 0.5)[off] if off < 2 and (known or not off) else 0.0
-    assert isinstance(given, float | int)
-    assert isinstance(known, float | int)
-    off_by = abs(given - known)
-    for within, share in ((FULL_WITHIN, 1.0), (HALF_WITHIN, 0.5)):
-        if off_by <= within * abs(known):
-            return share
+    if isinstance(given, float | int) and isinstance(known, float | int):
+        for within, share in ((FULL_WITHIN, 1.0), (HALF_WITHIN, 0.5)):
+            if abs(given - known) <= within * abs(known):
+                return share
     return 0.0

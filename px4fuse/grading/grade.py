@@ -12,29 +12,30 @@ from functools import partial
 from pathlib import Path
 
 from px4fuse.assignment.key import AnswerKey
+from px4fuse.assignment.roster import people_of_sheet, person_of_row
 from px4fuse.grading import submissions
 from px4fuse.grading.entries import Course, class_entries
 from px4fuse.grading.evidence import values_at
 from px4fuse.grading.exports import grade_column, kind_of
 from px4fuse.grading.flags import chosen_settings, class_flags, own_flags
 from px4fuse.grading.lateness import moodle_time
-from px4fuse.grading.model import Entry, Graded, Rubric, Submission
-from px4fuse.grading.outputs import Class, write_class
+from px4fuse.grading.model import Entry, Graded, Submission
+from px4fuse.grading.outputs import write_class
 from px4fuse.grading.overrides import NAME, read_overrides
-from px4fuse.grading.platforms import ExportOrigin, origins_of
 from px4fuse.grading.records import verified
-from px4fuse.grading.roster import Register, people_of_key, people_of_sheet, person_of_row
+from px4fuse.grading.roster import Register, people_of_key
+from px4fuse.grading.rubric import Rubric
 from px4fuse.grading.scoring import assess, refused
 from px4fuse.reading import files_by_sha256, max_log_bytes
-from px4fuse.results.contract import Reported, to_plain
+from px4fuse.results.contract import to_plain
 from px4fuse.verification.model import Refused, Verdict
-from px4fuse.verification.rerun import log_sha256
 from px4fuse.verification.workers import Failed, run_bounded
 
 RECORDS = "records"
 # Of one report: a flight of ten minutes takes about one; what takes longer is not a report
 TIMEOUT_S = 120.0
 MEMORY_BYTES = 4_000_000_000
+FAILED = "Do not open it: ask for the report as px4fuse wrote it."
 # For the class table: column title, and where in the results
 NUMBERS = (
     ("SIGMA_A (m/s²)", "settings.sigma_a_m_s2"),
@@ -93,7 +94,7 @@ def grade(
         Flight logs and folders of them; a report names its log by SHA-256.
     output : Path
         Folder for the class table (``class.csv``, ``class.html``), the redrawn ``reports/``,
-        ``feedback/``, ``gradescope/``, ``grades/`` for learning platforms, and the records that
+        ``feedback/``, ``grades/`` for learning platforms, and the records that
         make a second run quick. Its ``overrides.csv`` is read.
     key : AnswerKey, optional
         Which mistakes each student's flight has.
@@ -116,32 +117,29 @@ def grade(
     for sheet in course.worksheets:
         grade_column(sheet, course.column)
     found, notes = submissions.collect(paths)
-    people, unread = submissions.gradescope_people(paths)
-    origins = origins_of(found, people)
     register = register_of(course, key)
-    graded, reused = grade_all(
-        found, origins, logs, rubric, output / RECORDS, key, register, processes, progress
-    )
-    term = replace(course.term, times=_moodle_times(course, register))
-    entries, unknown = class_entries(graded, found, origins, register, term, overrides)
+    records = output / RECORDS
+    graded, reused = grade_all(found, logs, rubric, records, key, register, processes, progress)
+    times = _moodle_times(course, register)
+    entries, unknown = class_entries(graded, found, register, course, times, overrides)
     entries = _flagged(entries, key)
     written, more = write_class(
-        Class(entries, register or Register([]), title or rubric.title or "Class", course,
-              {one.name: of for one, of in zip(found, origins, strict=True)},
-              {one.name: one for one in found}),
+        entries,
+        {one.name: one for one in found},
+        register or Register([]),
+        course,
+        title or rubric.title or "Class",
         output,
-        output / RECORDS,
+        records,
         processes,
-    )  # fmt: skip
-    return GradeOutcome(entries, (*notes, *unread, *unknown, *more), reused, written)
+    )
+    return GradeOutcome(entries, (*notes, *unknown, *more), reused, written)
 
 
 def register_of(course: Course, key: AnswerKey | None) -> Register | None:
     """Who is in the class, with what the worksheets know of them; None where nothing says it."""
     listed = [people_of_sheet(sheet) for sheet in course.worksheets]
-    people = course.roster or (people_of_key(key) if key else None)
-    if people is None and listed:
-        people = listed[0]
+    people = course.roster or (people_of_key(key) if key else next(iter(listed), None))
     if people is None:
         return None
     register = Register(people)
@@ -154,12 +152,10 @@ def _moodle_times(course: Course, register: Register | None) -> dict[int, dateti
     """When Moodle's worksheets say that people of the class handed in."""
     times = {}
     for sheet in course.worksheets:
-        if kind_of(sheet) != "moodle" or register is None:
-            continue
-        for row in sheet.rows:
+        for row in sheet.rows if kind_of(sheet) == "moodle" and register else ():
             time = moodle_time(sheet.cell(row, ("lastmodifiedsubmission",)))
             person = person_of_row(sheet, row)
-            place = register.place(person) if person else None
+            place = register.place(person) if person and register else None
             if time is not None and place is not None:
                 times[place] = time
     return times
@@ -167,27 +163,19 @@ def _moodle_times(course: Course, register: Register | None) -> dict[int, dateti
 
 def _flagged(entries: Sequence[Entry], key: AnswerKey | None) -> tuple[Entry, ...]:
     """With what stands out between the reports that count."""
-    places = [at for at, entry in enumerate(entries) if entry.counting]
-    counting = [one for entry in entries if (one := entry.counting)]
-    flags = class_flags(counting, key)
-    made = list(entries)
-    for index, (at, one) in enumerate(zip(places, counting, strict=True)):
-        whole = replace(one, flags=(*one.flags, *flags.get(index, ())))
-        made[at] = replace(entries[at], counting=whole)
+    flags = class_flags([one for entry in entries if (one := entry.counting)], key)
+    made, index = [], 0
+    for entry in entries:
+        one = entry.counting
+        if one is not None:
+            one = replace(one, flags=(*one.flags, *flags.get(index, ())))
+            index += 1
+        made.append(replace(entry, counting=one))
     return tuple(made)
-
-
-@dataclass(frozen=True)
-class GradeJob:
-    """One file, and whose it is where the platform says it."""
-
-    submission: Submission
-    owner_id: str
 
 
 def grade_all(
     found: Sequence[Submission],
-    origins: Sequence[ExportOrigin],
     logs: Sequence[Path],
     rubric: Rubric,
     records: Path,
@@ -198,10 +186,10 @@ def grade_all(
 ) -> tuple[tuple[Graded, ...], int]:
     """Verify, or recall, and score every file, each within bounds; and how many were recalled."""
     jobs = []
-    for submission, origin in zip(found, origins, strict=True):
-        place = register.by_platform(origin) if register else None
+    for submission in found:
+        place = register.by_platform(submission.origin) if register else None
         owner = register.people[place].student_id if register and place is not None else ""
-        jobs.append(GradeJob(submission, owner))
+        jobs.append((submission, owner))
     graded: dict[int, Graded] = {}
     reused = 0
     progress(0, len(found))
@@ -221,57 +209,54 @@ def grade_all(
     )
     with closing(work):
         for index, result in work:
-            if isinstance(result, Failed):
-                why = Refused(
-                    f"Grading it failed: {result.reason}",
-                    "Do not open it: ask for the report as px4fuse wrote it.",
+            one, recalled = (
+                (
+                    refused(rubric, key, Refused(f"Grading it failed: {result.reason}", FAILED)),
+                    False,
                 )
-                graded[index] = replace(refused(rubric, key, why), submission=found[index].name)
-            else:
-                graded[index], recalled = result
-                reused += recalled
+                if isinstance(result, Failed)
+                else result
+            )
+            submission = found[index]
+            nameless = not one.student and not one.student_id
+            graded[index] = replace(
+                one,
+                submission=submission.name,
+                student=submission.origin.name if nameless else one.student,
+            )
+            reused += recalled
             progress(len(graded), len(found))
-    named = [
-        one if one.student or one.student_id or not origin.platform
-        else replace(one, student=origin.name)
-        for one, origin in zip((graded[at] for at in range(len(found))), origins, strict=True)
-    ]  # fmt: skip
-    return tuple(named), reused
+    return tuple(graded[index] for index in range(len(found))), reused
 
 
 def grade_one(
-    job: GradeJob,
+    job: tuple[Submission, str],
     logs: Mapping[str, Path],
     rubric: Rubric,
     key: AnswerKey | None,
     records: Path,
     largest_log_bytes: int,
 ) -> tuple[Graded, bool]:
-    """Read, verify or recall, and score one submission; runs in a process of its own."""
+    """Read, verify or recall, and score a file, whoever it is from; in a process of its own."""
     max_log_bytes.set(largest_log_bytes)
-    submission = job.submission
+    submission, owner_id = job
     content = submissions.read(submission)
     if isinstance(content, Refused):
-        return replace(refused(rubric, key, content), submission=submission.name), False
+        return refused(rubric, key, content), False
     sha256 = hashlib.sha256(content).hexdigest()
     handed_out = frozenset(answer.sha256 for answer in key.answers) if key else frozenset()
     found, recalled = verified(records, content, logs, handed_out)
     if isinstance(found, Refused):
-        made = refused(rubric, key, found)
-        return replace(made, submission=submission.name, sha256=sha256), recalled
-    report, verdict, page = found
-    results = report.results
-    made = assess(report, verdict, rubric, key, job.owner_id)
+        return replace(refused(rubric, key, found), sha256=sha256), recalled
+    results, verdict, page = found
+    plain = to_plain(results)
+    made = assess(results, verdict, rubric, key, owner_id)
     whole = replace(
         made,
-        submission=submission.name,
         flags=(*_page_flags(verdict), *own_flags(results, key is not None), *made.flags),
-        numbers=_numbers(results),
+        numbers={title: float(n) for title, path in NUMBERS for _, n in values_at(plain, path)},
         sha256=sha256,
-        log_sha256=log_sha256(results),
-        version=results.provenance.px4fuse,
         settings=chosen_settings(results),
-        notes=results.student.notes,
         page=page,
     )
     return whole, recalled
@@ -286,8 +271,3 @@ def _page_flags(verdict: Verdict) -> tuple[str, ...]:
         f"Page {first.page} of the PDF that was handed in is not what px4fuse draws from the log: "
         f"{first.what}.{more} Read the redrawn report.",
     )
-
-
-def _numbers(results: Reported) -> dict[str, float]:
-    plain = to_plain(results)
-    return {title: float(value) for title, path in NUMBERS for _, value in values_at(plain, path)}

@@ -1,4 +1,4 @@
-"""The rubric, what is handed in, and what it is worth."""
+"""What is handed in, and what it is worth: a submission, what it earns, and a student's row."""
 
 from __future__ import annotations
 
@@ -6,87 +6,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
-from typing import Any, Literal
 
 from px4fuse.answers import Answers
+from px4fuse.grading.names import distinct
+from px4fuse.grading.platforms import NOBODY, ExportOrigin
 from px4fuse.verification.model import Verdict
-
-Kind = Literal["number", "whole", "flag", "text", "texts"]
-Applies = Literal["any", "compare", "loop"]
-# What is done with points that nobody can vouch for: left for the instructor, taken, or counted
-Doubtful = Literal["pending", "zero", "count"]
-
-
-@dataclass(frozen=True)
-class RubricParameter:
-    """What a check can be told.
-
-    Attributes
-    ----------
-    default : object
-        Where it is left out; None says that there is none, which leaves that part out.
-    low, high : float
-        Limits of a number, or of each.
-    choices : tuple of str
-        What a text may be; empty for anything.
-    """
-
-    kind: Kind
-    default: Any = None
-    low: float = -1e12
-    high: float = 1e12
-    choices: tuple[str, ...] = ()
-    required: bool = False
-
-
-@dataclass(frozen=True)
-class RubricItem:
-    """One part of the grade.
-
-    Attributes
-    ----------
-    points : float
-        The most that it gives.
-    check : str
-        One of :data:`px4fuse.grading.scoring.CHECKS`.
-    report : {"any", "compare", "loop"}
-        The reports that it is for; in others it is left out.
-    parameters : dict
-        Of the check, all of them.
-    """
-
-    title: str
-    points: float
-    check: str
-    report: Applies = "any"
-    parameters: dict[str, Any] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class Rubric:
-    """What a report is worth.
-
-    Attributes
-    ----------
-    unverified : {"pending", "zero"}
-        What becomes of the points of a report that cannot be verified.
-    others_log : {"pending", "zero", "count"}
-        What becomes of those of a report on a log that was not given to the student.
-    pages : {"count", "pending", "zero"}
-        What becomes of those of a verified report whose pages look otherwise.
-    min_words : int
-        Of a student's text, below which the instructor is told.
-    common_words : tuple of str
-        The commonest words of the course's language; empty for any language.
-    """
-
-    title: str
-    unverified: Doubtful
-    items: tuple[RubricItem, ...]
-    others_log: Doubtful = "pending"
-    pages: Doubtful = "count"
-    min_words: int = 100
-    common_words: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -105,12 +29,15 @@ class Submission:
     time : datetime or None
         Of the entry in the zip file, in an unknown time zone: when the platform took it, or when
         it packed the zip file.
+    origin : ExportOrigin
+        Who handed it in, as a platform says.
     """
 
     file: Path
     entry: str
     name: str
     time: datetime | None = None
+    origin: ExportOrigin = NOBODY
 
 
 @dataclass(frozen=True)
@@ -215,6 +142,11 @@ class Graded:
         """The most that there is to have."""
         return sum(item.of for item in self.items)
 
+    @property
+    def by_title(self) -> dict[str, Item]:
+        """The items by their titles; titles that come twice are numbered."""
+        return dict(zip(distinct(item.title for item in self.items), self.items, strict=True))
+
 
 @dataclass(frozen=True)
 class Override:
@@ -233,7 +165,8 @@ class Entry:
     student, student_id : str
         As the roster says; of somebody who is not in it, as the report or the platform says.
     counting : Graded or None
-        The attempt that counts; None where nothing was handed in.
+        The attempt that counts, with the instructor's points and comments on its items; None where
+        nothing was handed in.
     others : tuple of Graded
         Further attempts, earliest first.
     handed_in : str
@@ -283,3 +216,8 @@ class Entry:
     def called(self) -> str:
         """What the class page calls the student."""
         return self.pseudonym or self.student or self.student_id or "no name"
+
+    @property
+    def flags(self) -> tuple[str, ...]:
+        """All that an instructor should look at."""
+        return (*self.remarks, *(self.counting.flags if self.counting else ()))

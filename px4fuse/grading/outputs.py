@@ -6,10 +6,9 @@ import csv
 import hashlib
 import io
 import itertools
-import json
 import random
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from importlib import metadata
 from pathlib import Path
 
@@ -20,17 +19,14 @@ from px4fuse.grading.class_page import html_text
 from px4fuse.grading.class_table import csv_text
 from px4fuse.grading.entries import Course
 from px4fuse.grading.feedback import returned_text
-from px4fuse.grading.gradescope import results
 from px4fuse.grading.model import Entry, Graded, Submission
 from px4fuse.grading.names import distinct, file_names
 from px4fuse.grading.overrides import NAME, TEMPLATE
-from px4fuse.grading.platforms import ExportOrigin, seen
 from px4fuse.grading.records import HANDED_IN, REDRAWN, file_of
 from px4fuse.grading.roster import Register
-from px4fuse.grading.sheets import delete_others, draw_sheets
+from px4fuse.grading.sheets import draw_sheets
 from px4fuse.plain import few_words
 from px4fuse.spreadsheet import neutral, neutral_id
-from px4fuse.verification.model import Refused
 from px4fuse.writing import write_all
 
 # Reports drawn again from their logs: what to read instead of what was handed in
@@ -44,110 +40,109 @@ NAMES = "names.csv"
 NAMES_HEAD = ("pseudonym", "id", "name")
 
 
-@dataclass(frozen=True)
-class Class:
-    """All that is written of a class.
-
-    Attributes
-    ----------
-    register : Register
-        Its people are those of the first entries.
-    origins : mapping
-        Name of a submission to where it came from.
-    files : mapping
-        Name of a submission to where it is read.
-    """
-
-    entries: tuple[Entry, ...]
-    register: Register
-    title: str
-    course: Course
-    origins: Mapping[str, ExportOrigin]
-    files: Mapping[str, Submission]
-
-
 def write_class(
-    made: Class, output: Path, records: Path, processes: int | None = None
+    entries: Sequence[Entry],
+    files: Mapping[str, Submission],
+    register: Register,
+    course: Course,
+    title: str,
+    output: Path,
+    records: Path,
+    processes: int | None = None,
 ) -> tuple[tuple[Path, ...], tuple[str, ...]]:
     """Write everything, and say what could not be entered.
 
     ``overrides.csv`` is made where it is not there, and never written over.
+
+    Parameters
+    ----------
+    files : mapping
+        Name of a submission to where it is read.
+    register : Register
+        Its people are those of the first entries.
+
+    Returns
+    -------
+    written : tuple of Path
+    notes : tuple of str
 
     Raises
     ------
     OutputError
         The folder cannot be written.
     """
-    names = file_names([_stem(entry) for entry in made.entries])
-    written_out = [
-        _with_files(entry, name, made, output, records)
-        for entry, name in zip(made.entries, names, strict=True)
+    names = file_names([_identity(entry, stem=True) for entry in entries])
+    shown = [
+        _with_files(entry, name, files, output, records)
+        for entry, name in zip(entries, names, strict=True)
     ]
-    pictured = _with_sheets(written_out, output, made.course.anonymous, processes)
-    texts = {at: returned_text(entry, made.title) for at, entry in enumerate(made.entries)}
-    table, page, said = output / "class.csv", output / "class.html", output / NAME
-    contents = {table: csv_text(made.entries).encode()}
-    if made.course.anonymous:
-        pictured, listed = _pseudonyms(pictured, output / NAMES)
-        contents[output / NAMES] = listed.encode()
+    shown = _with_sheets(shown, output, course.anonymous, processes)
+    drawn = any(one.redrawn_name for entry in shown for one in entry.files)
+    texts = [returned_text(entry, title) for entry in entries]
+    contents = {"class.csv": csv_text(entries).encode()}
+    if course.anonymous:
+        shown, listed = _pseudonyms(shown, output / NAMES)
+        contents[NAMES] = listed.encode()
     made_with = f"px4fuse {metadata.version('px4fuse')}"
-    contents[page] = html_text(pictured, made.title, made_with).encode()
-    if not said.exists():
-        contents[said] = TEMPLATE.encode()
-    for at, (entry, name) in enumerate(zip(made.entries, names, strict=True)):
-        contents[output / FEEDBACK / f"{name}.txt"] = texts[at].encode()
-        if entry.counting:
-            found = json.dumps(results(entry, texts[at]), ensure_ascii=False, indent=2)
-            contents[output / "gradescope" / name / "results.json"] = found.encode()
-    grades, notes = _grades(made, texts)
-    contents |= {output / GRADES / name: content for name, content in grades.items()}
-    write_all(contents)
-    drawn = {Path(name).name for entry in pictured for one in entry.files for name in one.sheets}
-    delete_others(output / SHEETS, drawn)
-    folders = [output / FEEDBACK, output / "gradescope"]
-    if any(one.redrawn_name for entry in pictured for one in entry.files):
-        folders = [output / REPORTS, output / SHEETS, *folders]
-    written = (table, page, *folders, *([output / GRADES] if grades else []), said)
+    contents["class.html"] = html_text(shown, title, made_with).encode()
+    if not (output / NAME).exists():
+        contents[NAME] = TEMPLATE.encode()
+    for name, text in zip(names, texts, strict=True):
+        contents[f"{FEEDBACK}/{name}.txt"] = text.encode()
+    notes: list[str] = []
+    stems = distinct((sheet.path.stem for sheet in course.worksheets), "{}-{}")
+    for sheet, stem in zip(course.worksheets, stems, strict=True):
+        made, said = exports.filled(sheet, entries, register, course.column, texts)
+        contents[f"{GRADES}/{stem}{sheet.path.suffix}"] = made.content()
+        notes += said
+    if moodle := exports.moodle_feedback(entries, files, texts):
+        contents[f"{GRADES}/moodle_feedback.zip"] = moodle
+    write_all({output / name: content for name, content in contents.items()})
+    folders = [REPORTS, SHEETS] * drawn + [FEEDBACK]
+    folders += [GRADES] * any(name.startswith(GRADES) for name in contents)
+    written = tuple(output / name for name in ("class.csv", "class.html", *folders, NAME))
     return written, (*notes, *_left_over(output, names))
 
 
-def _with_files(entry: Entry, name: str, made: Class, output: Path, records: Path) -> Entry:
+def _identity(entry: Entry, stem: bool = False) -> str:
+    """Id, or name, or the file: what stays the same over several runs."""
+    file = entry.counting.submission if entry.counting else ""
+    return entry.student_id or (Path(file).stem if stem else entry.student or file)
+
+
+def _with_files(
+    entry: Entry, name: str, files: Mapping[str, Submission], output: Path, records: Path
+) -> Entry:
     """With the redrawn reports, and what was handed in, in folders to read them."""
 
     def whole(one: Graded, stem: str) -> Graded:
+        if not one.sha256:
+            return one
         handed_in, redrawn = (
-            _content(file_of(records, one.sha256, end)) if one.sha256 else b""
-            for end in (HANDED_IN, REDRAWN)
+            _content(file_of(records, one.sha256, end)) for end in (HANDED_IN, REDRAWN)
         )
-        where = f"{REPORTS}/{stem}.pdf" if redrawn else ""
+        where, original = f"{REPORTS}/{stem}.pdf", f"{ORIGINALS}/{stem}.pdf"
         if redrawn:
             write_all({output / where: redrawn})
-        original = f"{ORIGINALS}/{stem}.pdf"
-        there = _copied(one, made.files.get(one.submission), output / original)
+        there = _copied(one, files[one.submission], output / original)
         return replace(
             one,
             handed_in=handed_in,
-            redrawn_name=where,
+            redrawn_name=where if redrawn else "",
             handed_in_name=original if there else "",
         )
 
-    return replace(
-        entry,
-        counting=whole(entry.counting, name) if entry.counting else None,
-        others=tuple(
-            whole(one, f"{name}_other_{at}") for at, one in enumerate(entry.others, start=1)
-        ),
-    )
+    others = (whole(one, f"{name}_other_{at}") for at, one in enumerate(entry.others, start=1))
+    counting = whole(entry.counting, name) if entry.counting else None
+    return replace(entry, counting=counting, others=tuple(others))
 
 
-def _copied(one: Graded, submission: Submission | None, to: Path) -> bool:
+def _copied(one: Graded, submission: Submission, to: Path) -> bool:
     """Whether the student's own PDF stands where the class page leads to it."""
-    if submission is None or not one.sha256:
-        return False
     if hashlib.sha256(_content(to)).hexdigest() == one.sha256:
         return True
     content = submissions.read(submission)
-    if isinstance(content, Refused) or not content.startswith(b"%PDF"):
+    if not isinstance(content, bytes) or not content.startswith(b"%PDF"):
         return False
     write_all({to: content})
     return True
@@ -168,10 +163,10 @@ def _with_sheets(
     drawn = draw_sheets(reports, output / SHEETS, processes)
     made = []
     for entry in entries:
-        one = entry.counting
-        names = drawn.get(one.redrawn_name, ()) if one else ()
-        sheets = tuple(f"{SHEETS}/{name}" for name in names)
-        made.append(replace(entry, counting=replace(one, sheets=sheets)) if one else entry)
+        if one := entry.counting:
+            sheets = tuple(f"{SHEETS}/{name}" for name in drawn.get(one.redrawn_name, ()))
+            entry = replace(entry, counting=replace(one, sheets=sheets))  # noqa: PLW2901
+        made.append(entry)
     return made
 
 
@@ -185,57 +180,23 @@ def _pseudonyms(entries: Sequence[Entry], path: Path) -> tuple[list[Entry], str]
     A second run keeps the pseudonyms of the first; their order says nothing of the names.
     """
     kept: dict[str, tuple[str, str]] = {}
-    if path.exists():
-        sheet = read_sheet(path)
-        for row in sheet.rows:
-            name, who, student = (
-                sheet.cell(row, (title,)).removeprefix("'") for title in NAMES_HEAD
-            )
-            kept[who] = name, student
-    identities = [one.student_id or one.student or _submission(one) for one in entries]
+    sheet = read_sheet(path) if path.exists() else None
+    for row in sheet.rows if sheet else ():
+        name, who, student = (sheet.cell(row, (title,)).removeprefix("'") for title in NAMES_HEAD)  # type: ignore[union-attr]
+        kept[who] = name, student
     taken = {name for name, _ in kept.values()}
     numbered = (f"Student {number:03}" for number in itertools.count(1))
     free = (name for name in numbered if name not in taken)
-    new = [at for at, who in enumerate(identities) if who not in kept]
-    random.SystemRandom().shuffle(new)
-    kept |= {
-        identities[at]: (name, entries[at].student) for at, name in zip(new, free, strict=False)
-    }
+    new = {who: entry.student for entry in entries if (who := _identity(entry)) not in kept}
+    for who in random.SystemRandom().sample(list(new), len(new)):
+        kept[who] = next(free), new[who]
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\r\n")
     writer.writerow(NAMES_HEAD)
     for who, (name, student) in sorted(kept.items(), key=lambda pair: pair[1]):
         writer.writerow((name, neutral_id(who), neutral(student)))
-    made = [
-        replace(entry, pseudonym=kept[who][0])
-        for entry, who in zip(entries, identities, strict=True)
-    ]
+    made = [replace(entry, pseudonym=kept[_identity(entry)][0]) for entry in entries]
     return sorted(made, key=lambda entry: entry.pseudonym), "\ufeff" + out.getvalue()
-
-
-def _submission(entry: Entry) -> str:
-    return entry.counting.submission if entry.counting else ""
-
-
-def _grades(made: Class, texts: Mapping[int, str]) -> tuple[dict[str, bytes], tuple[str, ...]]:
-    """Files that a learning platform imports, by name, and what could not be entered."""
-    contents: dict[str, bytes] = {}
-    notes: list[str] = []
-    names = distinct((sheet.path.stem for sheet in made.course.worksheets), "{}-{}")
-    for sheet, name in zip(made.course.worksheets, names, strict=True):
-        filled = exports.filled(sheet, made.entries, made.register, made.course.column, texts)
-        contents[f"{name}{sheet.path.suffix}"] = filled.sheet.content()
-        notes += filled.notes
-    platforms = seen(made.origins.values())
-    if "moodle" in platforms:
-        contents["moodle_feedback.zip"] = exports.moodle_feedback(made.entries, made.origins, texts)
-    for platform in ("blackboard", "ilias"):
-        if platform in platforms:
-            text = exports.plain_grades(
-                platform, made.title, made.entries, made.origins, made.register, texts
-            )
-            contents[f"plain_{platform}.csv"] = text.encode()
-    return contents, tuple(notes)
 
 
 def _left_over(output: Path, names: Sequence[str]) -> tuple[str, ...]:
@@ -244,10 +205,6 @@ def _left_over(output: Path, names: Sequence[str]) -> tuple[str, ...]:
     if not others:
         return ()
     return (
-        f"feedback and gradescope also hold {len(others)} of an earlier run, which are not among "
+        f"feedback also holds {len(others)} of an earlier run, which are not among "
         f"these submissions: {few_words(others, 4)}. Delete them if they are out of date.",
     )
-
-
-def _stem(entry: Entry) -> str:
-    return entry.student_id or (Path(entry.counting.submission).stem if entry.counting else "")

@@ -11,7 +11,7 @@ from px4fuse.assignment.key import folded
 from px4fuse.assignment.sheet import read_sheet
 from px4fuse.errors import SettingsError
 from px4fuse.grading.model import Entry, Override
-from px4fuse.grading.roster import same_id
+from px4fuse.grading.roster import only_place, same_id
 from px4fuse.results.reading import cleaned, one_line
 
 NAME = "overrides.csv"
@@ -74,14 +74,9 @@ def _points(text: str) -> float | None:
 
 
 def matched(
-    overrides: Overrides, entries: Sequence[Entry], items: Sequence[Sequence[str]]
+    overrides: Overrides, entries: Sequence[Entry]
 ) -> tuple[list[dict[str, Override]], tuple[str, ...]]:
     """What is said of whom, and a sentence for every row that fits nobody, or no item.
-
-    Parameters
-    ----------
-    items : sequence of sequence of str
-        Titles of the items of each entry.
 
     Returns
     -------
@@ -96,14 +91,14 @@ def matched(
         if place is None:
             notes.append(f"{NAME}: nobody has the id {one_line(student, 40) or '(empty)'}.")
             continue
-        titles = {folded(one): one for one in (*items[place], TOTAL, "")}
+        one = entries[place].counting
+        titles = {folded(title): title for title in (*(one.by_title if one else ()), TOTAL, "")}
         for item, override in rows.items():
-            title = titles.get(folded(item))
-            if title is None:
+            if folded(item) in titles:
+                said[place][titles[folded(item)]] = override
+            else:
                 name = one_line(item, 60)
                 notes.append(f"{NAME}: {one_line(student, 40)} has no item {name!r}.")
-            else:
-                said[place][title] = override
     return said, tuple(notes)
 
 
@@ -114,8 +109,4 @@ def _place(entries: Sequence[Entry], student: str) -> int | None:
         lambda entry: same_id(entry.student_id, student),
         lambda entry: entry.counting is not None and entry.counting.submission == student,
     )
-    for look in looks:
-        places = [place for place, entry in enumerate(entries) if look(entry)]
-        if len(places) == 1:
-            return places[0]
-    return None
+    return only_place(entries, looks)

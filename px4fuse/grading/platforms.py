@@ -23,11 +23,9 @@ from __future__ import annotations
 import re
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-
-from px4fuse.grading.model import Submission
 
 METADATA = "submission_metadata.yml"
 # By platform: how its exports name files
@@ -48,7 +46,9 @@ PLATFORMS = {
         r"_(?P<number>(?!(?:19|20)\d\d/)\d+)/(?P<late>Late Submission - )?"
     ),
 }
-_BLACKBOARD_TIME = "%Y-%m-%d-%H-%M-%S"
+TIME_IN_NAMES = "%Y-%m-%d-%H-%M-%S"
+_SUBMISSION = re.compile(r"^(?:submission_)?(\d+)(?:\.pdf)?:\s*\n((?:[ -].*\n?)*)", re.MULTILINE)
+_SUBMITTERS = re.compile(r"^  :submitters:\s*\n((?:  - .*\n?|    .*\n?)*)", re.MULTILINE)
 _MAX_METADATA = 20_000_000
 
 
@@ -81,6 +81,9 @@ class ExportOrigin:
     late: bool = False
 
 
+NOBODY = ExportOrigin()
+
+
 def origin_of(name: str, platforms: Iterable[str] = tuple(PLATFORMS)) -> ExportOrigin:
     """Who handed a file in, by its path in the export.
 
@@ -100,113 +103,90 @@ def origin_of(name: str, platforms: Iterable[str] = tuple(PLATFORMS)) -> ExportO
         tail = "/".join(parts[index:])
         for platform in platforms:
             match = PLATFORMS[platform].match(tail)
-            found = match and _origin(platform, match.groupdict())
-            if found:
-                return found
-    return ExportOrigin()
+            if match is None:
+                continue
+            said = {key: value or "" for key, value in match.groupdict().items()}
+            stamp = said.get("time", "")
+            try:
+                time = datetime.strptime(stamp, TIME_IN_NAMES) if stamp else None
+            except ValueError:  # a 99th month: a student's own name
+                continue
+            whole = f"{said.get('first', '')} {said.get('last', '')}".strip()
+            return ExportOrigin(
+                platform, said.get("number", ""), said.get("name") or whole, said.get("login", ""),
+                time=time, late=bool(said.get("late")),
+            )  # fmt: skip
+    return NOBODY
 
 
 def origins_of(
-    found: Sequence[Submission], people: Mapping[str, ExportOrigin]
+    names: Sequence[tuple[Path | None, str]], people: Mapping[str, ExportOrigin]
 ) -> list[ExportOrigin]:
     """Who handed in each file, and by which platform.
 
     An export is of one platform: that of most of its files. What a student called a file, in the
     way of another platform, says nothing.
+
+    Parameters
+    ----------
+    names : sequence of (Path or None, str)
+        Zip file (None for a file of its own) and name of each.
+    people : mapping
+        Of Gradescope's metadata, by number of a submission.
     """
-    first = [origin_of(one.name) for one in found]
-    exports = [one.file if one.entry else Path(one.name).parts[0] for one in found]
+    exports = [zipped or name.partition("/")[0] for zipped, name in names]
     counted: dict[object, Counter[str]] = defaultdict(Counter)
-    for export, origin in zip(exports, first, strict=True):
-        counted[export][origin.platform] += bool(origin.platform)
+    for export, (_, name) in zip(exports, names, strict=True):
+        counted[export].update(filter(None, [origin_of(name).platform]))
     made = []
-    for one, export in zip(found, exports, strict=True):
-        platform, count = counted[export].most_common(1)[0]
-        origin = origin_of(one.name, (platform,)) if count else ExportOrigin()
+    for export, (_, name) in zip(exports, names, strict=True):
+        origin = origin_of(name, [one for one, _ in counted[export].most_common(1)])
         if origin.platform in ("gradescope", ""):
             # PDF assignments are exported as 123456.pdf
-            stem = one.name.rpartition("/")[2].casefold().removesuffix(".pdf")
+            stem = name.rpartition("/")[2].casefold().removesuffix(".pdf")
             origin = people.get(origin.number or stem, origin)
         made.append(origin)
     return made
 
 
-def _origin(platform: str, said: Mapping[str, str | None]) -> ExportOrigin | None:
-    time = None
-    if stamp := said.get("time"):
-        try:
-            time = datetime.strptime(stamp, _BLACKBOARD_TIME)
-        except ValueError:  # a 99th month: a student's own name
-            return None
-    whole = said.get("name") or " ".join(filter(None, (said.get("first"), said.get("last"))))
-    return ExportOrigin(
-        platform,
-        said.get("number") or "",
-        whole,
-        said.get("login") or "",
-        time=time,
-        late=bool(said.get("late")),
-    )
-
-
 def gradescope_metadata(text: str) -> dict[str, ExportOrigin]:
     r"""People and times of Gradescope's ``submission_metadata.yml``, by number of submission.
 
-    Read line by line, the few that are needed: outputs of autograders are in it as well, deeper.
+    Only what stands where Gradescope writes it: outputs of autograders are in it as well, deeper.
     Of a group the first member is named.
 
     >>> text = "submission_7:\n  :submitters:\n  - :name: Ada\n    :sid: '12'\n"
     >>> gradescope_metadata(text)["7"].student_id
     '12'
     """
-    found: dict[str, ExportOrigin] = {}
-    number, block = "", ""
-    for line in text[:_MAX_METADATA].splitlines():
-        if top := re.match(r"(?:submission_)?(\d+)(?:\.pdf)?:\s*$", line):
-            number, block = top[1], ""
-            found[number] = ExportOrigin("gradescope", number)
-        elif line[:1].strip():
-            number = ""
-        elif number and (key := re.match(r"  :(\w+):\s*(.*)$", line)):
-            block = key[1]
-            if block == "created_at":
-                found[number] = replace(found[number], time=_iso(_unquoted(key[2])))
-        elif number and block == "submitters":
-            field = re.match(r"  (?:- |  ):(name|sid|email):\s*(.*)$", line)
-            if field:
-                said = _unquoted(field[2])
-                known = found[number]
-                found[number] = replace(
-                    known,
-                    name=known.name or said * (field[1] == "name"),
-                    student_id=known.student_id or said * (field[1] == "sid"),
-                    email=known.email or said * (field[1] == "email"),
-                )
+    found = {}
+    for number, block in _SUBMISSION.findall(text[:_MAX_METADATA].replace("\r\n", "\n")):
+        people = _SUBMITTERS.search(block)
+        name, student_id, email = (
+            _value(people[1] if people else "", rf"  (?:- |  ):{key}") for key in _KEYS
+        )
+        time = _time(_value(block, "  :created_at"))
+        found[number] = ExportOrigin("gradescope", number, name, "", student_id, email, time)
     return found
 
 
-def _unquoted(value: str) -> str:
-    value = value.strip()
-    quoted = len(value) > 1 and value[0] == value[-1] and value[0] in "'\""
-    return value[1:-1] if quoted else value
+_KEYS = ("name", "sid", "email")
 
 
-def _iso(value: str) -> datetime | None:
-    """A time as YAML and JSON of Gradescope have it, with its zone.
+def _value(block: str, key: str) -> str:
+    """The first value of a key, without quotes."""
+    match = re.search(rf"^{key}: *(['\"]?)(.*)\1 *$", block, re.MULTILINE)
+    return match[2] if match else ""
 
-    >>> _iso("2026-11-20 12:34:56.123456000 Z").isoformat()
+
+def _time(value: str) -> datetime | None:
+    """A time as YAML of Gradescope has it, with its zone.
+
+    >>> _time("2026-11-20 12:34:56.123456000 Z").isoformat()
     '2026-11-20T12:34:56.123456+00:00'
     """
-    plain = re.sub(r"(\.\d{6})\d*", r"\1", value.strip()).replace(" Z", "+00:00")
-    plain = re.sub(r" (?=[+-]\d\d:?\d\d$)", "", plain)
     try:
-        found = datetime.fromisoformat(plain)
+        found = datetime.fromisoformat(re.sub(r" (?=Z|[+-]\d)", "", value))
     except ValueError:
         return None
     return found if found.tzinfo else found.replace(tzinfo=UTC)
-
-
-def seen(origins: Iterable[ExportOrigin]) -> tuple[str, ...]:
-    """Platforms that files came from, in the order of :data:`PLATFORMS`."""
-    there = {one.platform for one in origins}
-    return tuple(name for name in PLATFORMS if name in there)

@@ -10,48 +10,52 @@ from __future__ import annotations
 import hashlib
 import re
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from functools import cache
+from functools import cache, partial
 from importlib import metadata
 from pathlib import Path
 
 import msgspec
 
 from px4fuse.errors import ResultsError
-from px4fuse.flight import Unavailable
 from px4fuse.results.contract import ComparisonResults, LoopResults, Reported, to_json
 from px4fuse.results.reading import read_results
 from px4fuse.verification.intake import read_report
-from px4fuse.verification.model import Refused, Report, Seal, Verdict
-from px4fuse.verification.pages import MEMORY_BYTES, TIMEOUT_S, page_texts
-from px4fuse.verification.pictures import key_page, picture
+from px4fuse.verification.model import Refused, Verdict
+from px4fuse.verification.pages import MEMORY_BYTES, TIMEOUT_S
+from px4fuse.verification.pictures import picture
 from px4fuse.verification.rerun import log_sha256
 from px4fuse.verification.verification import verify
-from px4fuse.verification.workers import Failed, bounded
+from px4fuse.verification.workers import bounded
 from px4fuse.writing import write_all
 
 HANDED_IN, REDRAWN, RESULTS = ".handed-in.png", ".pdf", ".results.json"
 MADE_WITH = ("px4fuse", "numpy", "scipy", "matplotlib", "pypdfium2", "pillow")
-THE_FILE = "The file"
 _SHA256 = re.compile(rb'"([0-9a-f]{64})"')
 
 
-# A report without its bytes, with the pages of the redrawn one as far as there is one; what was
-# found; and which page the pictures show, counted from 1
-Verified = tuple[Report, Verdict, int]
-
-
 @dataclass(frozen=True)
-class _Kept:
-    """What a record says besides its other files; of a refused file only why."""
+class Record:
+    """What was found of one PDF; of what is no report only why.
+
+    Attributes
+    ----------
+    made_with : dict
+        Versions that it holds for.
+    files : dict
+        SHA-256 of every file that the report rests on, and whether it was at hand.
+    gap : bool
+        Whether the log is of the answer key and was not at hand: the instructor's gap.
+    page : int
+        Which page the picture of what was handed in shows, counted from 1.
+    """
 
     made_with: dict[str, str]
-    refused: str = ""
+    refused: Refused | None = None
     files: dict[str, bool] = field(default_factory=dict)
     gap: bool = False
     verdict: Verdict | None = None
-    seal: Seal = "missing"
-    pages: tuple[str, ...] = ()
     page: int = 1
 
 
@@ -62,7 +66,7 @@ def file_of(records: Path, sha256: str, end: str = ".json") -> Path:
 
 def verified(
     records: Path, pdf: bytes, logs: Mapping[str, Path], handed_out: frozenset[str]
-) -> tuple[Verified | Refused, bool]:
+) -> tuple[tuple[Reported, Verdict, int] | Refused, bool]:
     """Read and verify a report, or recall what an earlier run found.
 
     Parameters
@@ -77,44 +81,33 @@ def verified(
 
     Returns
     -------
-    Verified or Refused
+    (results, verdict, page to show), or Refused
     recalled : bool
     """
     sha256 = hashlib.sha256(pdf).hexdigest()
     found = _recalled(records, sha256, logs, handed_out)
     if found is not None:
         return found, True
-    report = read_report(pdf, THE_FILE)
+    report = read_report(pdf, "The file")
     if isinstance(report, Refused):
-        _keep(records, sha256, _Kept(_versions(), report.reason), {})
+        _keep(records, sha256, Record(_versions(), report), {})
         return report, False
     gap = _is_gap(report.results, logs, handed_out)
     verdict = verify(report, {} if gap else logs)
-    # what is shown and scored is the redrawn report, as far as there is one
-    if verdict.redrawn:
-        seen = replace(report, pages=page_texts(verdict.redrawn))
-    else:
-        texts = bounded(page_texts, pdf, TIMEOUT_S, MEMORY_BYTES)
-        seen = replace(report, pages=() if isinstance(texts, Failed) else texts)
-    page = _page_to_show(verdict, seen)
-    handed_in: bytes | Unavailable | Failed = b""
+    page = max(verdict.pages, key=lambda one: (one.picture, one.words)).page if verdict.pages else 1
+    handed_in: object = b""
     if verdict.pages or not verdict.redrawn:
-        handed_in = bounded(_picture, (pdf, page - 1), TIMEOUT_S, MEMORY_BYTES)
+        handed_in = bounded(partial(picture, page=page - 1), pdf, TIMEOUT_S, MEMORY_BYTES)
     results = to_json(report.results).encode()
     unread = replace(verdict, redrawn=b"")
-    files = {name: name in logs for name in _named(results)}
-    kept = _Kept(_versions(), "", files, gap, unread, report.seal, seen.pages, page)
+    kept = Record(_versions(), None, _files(results, logs), gap, unread, page)
     parts = {
         RESULTS: results,
         HANDED_IN: handed_in if isinstance(handed_in, bytes) else b"",
         REDRAWN: verdict.redrawn,
     }
     _keep(records, sha256, kept, parts)
-    return (replace(seen, pdf=b""), unread, page), False
-
-
-def _picture(job: tuple[bytes, int]) -> bytes | Unavailable:
-    return picture(*job)
+    return (report.results, unread, page), False
 
 
 def _is_gap(results: Reported, logs: Mapping[str, Path], handed_out: frozenset[str]) -> bool:
@@ -122,44 +115,33 @@ def _is_gap(results: Reported, logs: Mapping[str, Path], handed_out: frozenset[s
     return log in handed_out and log not in logs
 
 
-def _named(results: bytes) -> list[str]:
-    """The SHA-256 of every file that a report rests on."""
-    return sorted({match[1].decode() for match in _SHA256.finditer(results)})
-
-
-def _page_to_show(verdict: Verdict, report: Report) -> int:
-    """The page that differs most, else the cover; counted from 1."""
-    if verdict.pages:
-        return max(verdict.pages, key=lambda one: (one.picture, one.words)).page
-    return 1 + (0 if verdict.redrawn else key_page(report.pages))
+def _files(results: bytes, logs: Mapping[str, Path]) -> dict[str, bool]:
+    """Of every file that a report rests on, whether it is at hand."""
+    return {name: name in logs for name in sorted({n.decode() for n in _SHA256.findall(results)})}
 
 
 @cache
 def _versions() -> dict[str, str]:
-    found = {}
+    found = dict.fromkeys(MADE_WITH, "")
     for name in MADE_WITH:
-        try:
+        with suppress(metadata.PackageNotFoundError):  # pictures are an extra
             found[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:  # pictures are an extra
-            found[name] = ""
     return found
 
 
-def _keep(records: Path, sha256: str, kept: _Kept, parts: Mapping[str, bytes]) -> None:
+def _keep(records: Path, sha256: str, kept: Record, parts: Mapping[str, bytes]) -> None:
     files = {file_of(records, sha256, end): content for end, content in parts.items()}
     write_all({**files, file_of(records, sha256): msgspec.json.encode(kept)})
 
 
 def _recalled(
     records: Path, sha256: str, logs: Mapping[str, Path], handed_out: frozenset[str]
-) -> Verified | Refused | None:
+) -> tuple[Reported, Verdict, int] | Refused | None:
     """What an earlier run found, if nothing that it rests on has changed."""
     try:
-        kept = msgspec.json.decode(file_of(records, sha256).read_bytes(), type=_Kept)
-        if kept.made_with != _versions():
-            return None
-        if kept.verdict is None:
-            return Refused(kept.refused)
+        kept = msgspec.json.decode(file_of(records, sha256).read_bytes(), type=Record)
+        if kept.made_with != _versions() or kept.verdict is None:
+            return kept.refused if kept.made_with == _versions() else None
         data = file_of(records, sha256, RESULTS).read_bytes()
         results = read_results(data)
     # none, or not one of ours: done again
@@ -167,7 +149,5 @@ def _recalled(
         return None
     if not isinstance(results, ComparisonResults | LoopResults):
         return None
-    files = {name: name in logs for name in _named(data)}
-    if kept.files != files or kept.gap != _is_gap(results, logs, handed_out):
-        return None
-    return Report(sha256, kept.seal, results, kept.pages, b""), kept.verdict, kept.page
+    same = kept.files == _files(data, logs) and kept.gap == _is_gap(results, logs, handed_out)
+    return (results, kept.verdict, kept.page) if same else None

@@ -11,7 +11,6 @@ import hashlib
 import os
 import re
 from collections.abc import Collection, Mapping, Sequence
-from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -49,6 +48,8 @@ def draw_sheets(
 ) -> dict[str, tuple[str, ...]]:
     """Draw the pages of reports that are not drawn yet, in processes of their own.
 
+    Pictures that it drew before of reports that are no longer among these are deleted.
+
     Parameters
     ----------
     reports : mapping
@@ -59,7 +60,7 @@ def draw_sheets(
     Returns
     -------
     dict
-        Key to names of files in the folder, page by page; those that cannot be drawn are left out.
+        Key to names of files in the folder, page by page; empty for what cannot be drawn.
 
     Raises
     ------
@@ -68,54 +69,34 @@ def draw_sheets(
     """
     jobs = {key: SheetJob(pdf, tuple(hide), folder) for key, (pdf, hide) in reports.items()}
     stems = {key: job.stem for key, job in jobs.items()}
-    made = {key: found for key, stem in stems.items() if (found := _drawn(folder, stem))}
-    missing = [key for key in jobs if key not in made]
-    if jobs:
-        _list(folder, _listed(folder).union(stems.values()))
-    work = run_bounded(
+    listed = _listed(folder)
+    if listed | set(stems.values()):
+        _list(folder, listed | set(stems.values()))
+    missing = [jobs[key] for key, stem in stems.items() if not _drawn(folder, stem)]
+    for _ in run_bounded(
         draw,
-        [jobs[key] for key in missing],
+        missing,
         processes=min(processes or os.cpu_count() or 1, len(missing)),
         timeout_s=TIMEOUT_S,
         memory_bytes=MEMORY_BYTES,
-    )
-    with closing(work):
-        for index, _ in work:
-            key = missing[index]
-            if found := _drawn(folder, stems[key]):
-                made[key] = found
-    return made
+    ):
+        pass
+    gone = listed - set(stems.values())
+    for stem in gone:
+        for path in folder.glob(f"{stem}-*-of-*.png"):
+            path.unlink(missing_ok=True)
+    if gone:
+        _list(folder, stems.values())
+    return {key: _drawn(folder, stem) for key, stem in stems.items()}
 
 
 def draw(job: SheetJob) -> None:
     """Write the pictures of one report, if it can be drawn."""
     drawn = page_pictures(job.pdf.read_bytes(), job.hide)
-    if isinstance(drawn, Unavailable):
-        return
-    stem = job.stem
-    write_all(
-        {
-            job.folder / f"{stem}-{number:03}-of-{len(drawn):03}.png": picture
-            for number, picture in enumerate(drawn, start=1)
-        }
-    )
-
-
-def delete_others(folder: Path, names: Collection[str]) -> None:
-    """Delete what :func:`draw_sheets` drew into a folder, but for the files of these names.
-
-    Raises
-    ------
-    OutputError
-        The folder cannot be written.
-    """
-    kept = {name.partition("-")[0] for name in names}
-    listed = _listed(folder)
-    for stem in listed - kept:
-        for path in folder.glob(f"{stem}-*-of-*.png"):
-            path.unlink(missing_ok=True)
-    if not listed <= kept:
-        _list(folder, listed & kept)
+    if not isinstance(drawn, Unavailable):
+        ends = (f"-{number:03}-of-{len(drawn):03}.png" for number in range(1, len(drawn) + 1))
+        named = zip((job.folder / f"{job.stem}{end}" for end in ends), drawn, strict=True)
+        write_all(dict(named))
 
 
 def _listed(folder: Path) -> set[str]:
@@ -125,7 +106,7 @@ def _listed(folder: Path) -> set[str]:
 
 
 def _list(folder: Path, stems: Collection[str]) -> None:
-    write_all({folder / LIST: "".join(f"{stem}\n" for stem in sorted(stems)).encode()})
+    write_all({folder / LIST: "".join(f"{stem}\n" for stem in sorted(set(stems))).encode()})
 
 
 def _drawn(folder: Path, stem: str) -> tuple[str, ...]:

@@ -13,17 +13,17 @@ import struct
 import zipfile
 import zlib
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from datetime import datetime
-from functools import partial
 from pathlib import Path
 from typing import IO
 
 from px4fuse.errors import SettingsError
 from px4fuse.grading.model import Submission
 from px4fuse.grading.names import distinct
-from px4fuse.grading.platforms import METADATA, ExportOrigin, gradescope_metadata
+from px4fuse.grading.platforms import METADATA, ExportOrigin, gradescope_metadata, origins_of
 from px4fuse.results.reading import cleaned, one_line
 from px4fuse.verification.intake import MAX_BYTES
 from px4fuse.verification.model import Refused
@@ -40,9 +40,6 @@ MAX_NAME = 200
 # The year that stands where a program knew no time
 ZIP_EPOCH = 1980
 
-# Entry as Submission keeps it, its name for people, and when it was changed
-Found = tuple[str, str, datetime | None]
-
 _TOO_LARGE = f"larger than {MAX_BYTES // 1_000_000} MB; reports are below 2 MB."
 # Between a zip file's entry and the entry of the zip file in it; no name can hold it
 _INSIDE = "\0"
@@ -56,19 +53,31 @@ _DAMAGED = (
     EOFError,
     ValueError,
     RuntimeError,  # also NotImplementedError: what zipfile does not know
-    KeyError,
+    LookupError,
     OverflowError,
+    MemoryError,
 )
 
 
+@dataclass
+class _Search:
+    """What a search has met: PDFs by where they are, people of Gradescope, and what it says."""
+
+    found: dict[tuple[Path, str], tuple[str, datetime | None]] = field(default_factory=dict)
+    people: dict[str, ExportOrigin] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+    others: Counter[str] = field(default_factory=Counter)
+
+
 def collect(paths: Sequence[Path]) -> tuple[tuple[Submission, ...], tuple[str, ...]]:
-    """Find the PDFs in files, folders and zip files.
+    """Find the PDFs in files, folders and zip files, and who handed them in by their names.
 
     Parameters
     ----------
     paths : sequence of Path
         PDFs, zip files, and folders, which are searched with their subfolders. Zip files may hold
-        zip files, which may not hold more.
+        zip files, which may not hold more. Gradescope's ``submission_metadata.yml`` is read where
+        it stands beside the submissions, never inside one.
 
     Returns
     -------
@@ -82,104 +91,77 @@ def collect(paths: Sequence[Path]) -> tuple[tuple[Submission, ...], tuple[str, .
     SettingsError
         A path does not exist, or there is no PDF in any of them.
     """
-    notes: list[str] = []
-    others: Counter[str] = Counter()
-    found: dict[tuple[Path, str], tuple[str, datetime | None]] = {}
+    search = _Search()
     for path in paths:
-        for file, name in _files(path, notes):
+        for file, name in _files(path, search.notes):
             if name.lower().endswith(".pdf"):
-                found.setdefault((file, ""), (name, None))
+                search.found.setdefault((file, ""), (name, None))
             elif name.lower().endswith(".zip"):
-                prefix = f"{name}/" if path.is_dir() else ""
-                for entry, inner, time in _entries(partial(_outer, file), name, notes, others):
-                    found.setdefault((file, entry), (prefix + inner, time))
+                with file.open("rb") as stream:
+                    prefix = f"{name}/" if path.is_dir() else ""
+                    _search_zip(stream, name, prefix, file, search)
+            elif _is_metadata(name):
+                with file.open("rb") as stream:
+                    search.people |= _people(stream.read(MAX_BYTES))
             else:
-                others[_kind(name)] += 1
-    if others:
-        kinds = ", ".join(f"{count} {kind}" for kind, count in others.most_common(5))
-        more = ", ..." if len(others) > 5 else ""
+                search.others[_kind(name)] += 1
+    notes = search.notes
+    if search.others:
+        kinds = ", ".join(f"{count} {kind}" for kind, count in search.others.most_common(5))
+        more = ", ..." if len(search.others) > 5 else ""
         notes.append(f"Passed over, since they are not PDFs: {kinds}{more}.")
-    if not found:
-        why = f" {' '.join(notes)}" if notes else ""
-        raise SettingsError(one_line(f"No PDF was found in what was given.{why}", 500))
-    order = sorted(found.items(), key=lambda item: (item[1][0].casefold(), item[1][0], item[0]))
+    if not search.found:
+        raise SettingsError(
+            one_line(" ".join(["No PDF was found in what was given.", *notes]), 500)
+        )
+    order = sorted(
+        search.found.items(), key=lambda item: (item[1][0].casefold(), item[1][0], item[0])
+    )
     names = distinct(_shown(name) for _, (name, _) in order)
+    exports = [(file if entry else None, name)
+               for ((file, entry), _), name in zip(order, names, strict=True)]  # fmt: skip
     made = (
-        Submission(*where, name, time)
-        for (where, (_, time)), name in zip(order, names, strict=True)
+        Submission(*where, name, time, origin)
+        for (where, (_, time)), name, origin in zip(
+            order, names, origins_of(exports, search.people), strict=True
+        )
     )
     return tuple(made), tuple(notes)
 
 
 def read(submission: Submission) -> bytes | Refused:
     """Bytes of a submission, at most :data:`~px4fuse.verification.intake.MAX_BYTES` of them."""
+    reason = "no file any more."
     try:
-        if not submission.file.is_file():
-            return _refused(submission, "no file any more.")
-        if not submission.entry:
+        if submission.file.is_file():
             with submission.file.open("rb") as file:
-                content = file.read(MAX_BYTES + 1)
-            return content if len(content) <= MAX_BYTES else _refused(submission, _TOO_LARGE)
-        outer, _, inner = submission.entry.partition(_INSIDE)
-        with submission.file.open("rb") as file, _archive(file) as archive:
-            content = _unpacked(archive, outer)
-        if inner:
-            with _archive(io.BytesIO(content)) as archive:
-                content = _unpacked(archive, inner)
+                if not submission.entry:
+                    content = file.read(MAX_BYTES + 1)
+                    if len(content) > MAX_BYTES:
+                        raise _EntryError(_TOO_LARGE)
+                    return content
+                outer, _, inner = submission.entry.partition(_INSIDE)
+                with _archive(file) as archive:
+                    content = _unpacked(archive, outer)
+            if inner:
+                with _archive(io.BytesIO(content)) as archive:
+                    content = _unpacked(archive, inner)
+            return content
     except _EntryError as error:
-        return _refused(submission, str(error))
-    except MemoryError:
-        return _refused(submission, "it takes more memory to unpack than there is.")
+        reason = str(error)
     except _DAMAGED as error:
-        reason = error.strerror if isinstance(error, OSError) and error.strerror else "damaged"
-        return _refused(submission, f"it cannot be read ({reason}).")
-    return content
-
-
-def gradescope_people(paths: Sequence[Path]) -> tuple[dict[str, ExportOrigin], tuple[str, ...]]:
-    """What Gradescope's export says of its submissions; empty where nothing came from there.
-
-    Only the file beside the submissions is read, never one that a student handed in.
-
-    Returns
-    -------
-    people : dict
-        Number of a submission to who handed it in.
-    notes : tuple of str
-        Why such a file was not read.
-    """
-    found: dict[str, ExportOrigin] = {}
-    notes: list[str] = []
-    for path in paths:
-        for file, name in _files(path, []):
-            texts: list[bytes] = []
-            if _is_metadata(name):
-                with file.open("rb") as stream:
-                    texts.append(stream.read(MAX_BYTES))
-            elif name.lower().endswith(".zip"):
-                try:
-                    texts += _metadata_inside(file)
-                except _EntryError as error:
-                    notes.append(f"{_shown(name)}: who handed in is not known: {error}")
-                except (MemoryError, *_DAMAGED):  # collect says so of the whole zip file
-                    continue
-            for text in texts:
-                found |= gradescope_metadata(text.decode("utf-8", errors="replace"))
-    return found, tuple(notes)
-
-
-def _metadata_inside(file: Path) -> list[bytes]:
-    with file.open("rb") as stream, _archive(stream) as archive:
-        return [
-            _unpacked(archive, entry.filename)
-            for entry in archive.infolist()
-            if _is_metadata(_label(entry))
-        ]
+        why = error.strerror if isinstance(error, OSError) and error.strerror else "damaged"
+        reason = f"it cannot be read ({why})."
+    return Refused(f"{one_line(submission.name, MAX_NAME)}: {reason}")
 
 
 def _is_metadata(name: str) -> bool:
     *folders, last = name.split("/")
     return last == METADATA and not any(one.startswith("submission_") for one in folders)
+
+
+def _people(content: bytes) -> dict[str, ExportOrigin]:
+    return gradescope_metadata(content.decode("utf-8", errors="replace"))
 
 
 class _EntryError(Exception):
@@ -192,15 +174,13 @@ class _Limited:
     def __init__(self, file: IO[bytes]) -> None:
         self._file = file
         self.seek, self.tell, self.seekable = file.seek, file.tell, file.seekable
+        self.close = file.close
 
     def read(self, size: int = -1) -> bytes:
         if size > MAX_DIRECTORY_BYTES:
             raise zipfile.BadZipFile("table of contents too large")
         # zipfile asks for "the rest" only where it looks for the end of the archive
         return self._file.read(size if size >= 0 else MAX_DIRECTORY_BYTES)
-
-    def close(self) -> None:
-        self._file.close()
 
 
 @contextmanager
@@ -223,20 +203,17 @@ def _files(path: Path, notes: list[str]) -> Iterator[tuple[Path, str]]:
     for folder, folders, files in os.walk(root):  # symbolic links to folders are not entered
         folders[:] = sorted(each for each in folders if not _hidden(each))
         outside += sum((Path(folder) / each).is_symlink() for each in folders)
-        for file in sorted(files):
+        for file in sorted(each for each in files if not _hidden(each)):
             whole = Path(folder) / file
-            if _hidden(file):
-                continue
             try:
                 resolved = whole.resolve(strict=True)
+                # a named pipe would keep us waiting forever
+                inside = resolved.is_relative_to(root) and resolved.is_file()
             except (OSError, RuntimeError):  # it leads nowhere, or in a circle
-                outside += 1
-                continue
-            # a named pipe would keep us waiting forever
-            if not resolved.is_relative_to(root) or not resolved.is_file():
-                outside += 1
-                continue
-            yield resolved, whole.relative_to(root).as_posix()
+                inside = False
+            if inside:
+                yield resolved, whole.relative_to(root).as_posix()
+            outside += not inside
     if outside:
         notes.append(
             f"{one_line(path.name, MAX_NAME)}: {outside} links out of the folder or special files "
@@ -254,48 +231,70 @@ def _kind(name: str) -> str:
     return suffix if re.fullmatch(r"\.[a-z0-9]{1,8}", suffix) else "without a known suffix"
 
 
-def _entries(
-    opened: Callable[[], IO[bytes]],
+def _search_zip(
+    stream: IO[bytes],
     name: str,
-    notes: list[str],
-    others: Counter[str],
-    is_inner: bool = False,
-) -> Iterator[Found]:
-    """PDFs in a zip file, and in the zip files in it, with the time of the outer entry."""
-    shown = _shown(name)
+    prefix: str,
+    file: Path,
+    search: _Search,
+    outer: tuple[str, datetime | None] | None = None,
+) -> None:
+    """Look for PDFs in a zip file, and in the zip files in it.
+
+    Parameters
+    ----------
+    prefix : str
+        What names of its files begin with.
+    outer : (str, datetime or None), optional
+        Of a zip file in another one: its entry there, and its time. The student set the clock of
+        what is in it.
+    """
+    shown, left = _shown(name), MAX_INNER_BYTES
     try:
-        with opened() as stream, _archive(stream) as archive:
-            inner_left = MAX_INNER_BYTES
-            for entry, label in _listed(archive, shown, notes):
-                # the student set the clock of what is in an inner zip file
-                time = _time(entry)
-                if label.lower().endswith(".pdf"):
-                    yield entry.filename, label, time
-                elif not label.lower().endswith(".zip"):
-                    others[_kind(label)] += 1
-                elif is_inner:
-                    notes.append(f"{shown}: a zip file in it was passed over: too deep.")
+        with _archive(stream) as archive:
+            for entry, label in _listed(archive, shown, search.notes):
+                where = entry.filename if outer is None else f"{outer[0]}{_INSIDE}{entry.filename}"
+                time = _time(entry) if outer is None else outer[1]
+                end = label.lower()[-4:]
+                about = outer is None and _is_metadata(label)
+                if end == ".pdf":
+                    search.found.setdefault((file, where), (prefix + label, time))
+                elif not about and end != ".zip":
+                    search.others[_kind(label)] += 1
+                elif outer is not None:
+                    search.notes.append(f"{shown}: a zip file in it was passed over: too deep.")
+                elif (left := left - entry.file_size) < 0:
+                    raise _EntryError("it holds too many zip files.")
                 else:
-                    inner_left -= entry.file_size
-                    if inner_left < 0:
-                        notes.append(
-                            f"{shown}: it holds too many zip files; the rest of it was passed over."
-                        )
-                        return
-                    content = partial(_inner, archive, entry.filename)
-                    for inside, inner_label, _ in _entries(content, label, notes, others, True):
-                        yield f"{entry.filename}{_INSIDE}{inside}", f"{label}/{inner_label}", time
-    except (_EntryError, MemoryError, *_DAMAGED) as error:
-        why = str(error) if isinstance(error, _EntryError) else "not a zip file, or damaged."
-        notes.append(f"{shown}: passed over: {why}")
+                    _search_inside(archive, entry, about, prefix + label, file, search, time)
+    except (_EntryError, *_DAMAGED) as error:
+        search.notes.append(f"{shown}: passed over: {_why(error)}")
 
 
-def _outer(file: Path) -> IO[bytes]:
-    return file.open("rb")
+def _search_inside(
+    archive: zipfile.ZipFile,
+    entry: zipfile.ZipInfo,
+    about: bool,
+    name: str,
+    file: Path,
+    search: _Search,
+    time: datetime | None,
+) -> None:
+    """Look into a zip file in a zip file, or into what is written ``about`` the submissions."""
+    try:
+        content = _unpacked(archive, entry.filename)
+    except (_EntryError, *_DAMAGED) as error:
+        search.notes.append(f"{_shown(name)}: passed over: {_why(error)}")
+        return
+    if about:
+        search.people |= _people(content)
+    else:
+        outer = (entry.filename, time)
+        _search_zip(io.BytesIO(content), name, f"{name}/", file, search, outer)
 
 
-def _inner(archive: zipfile.ZipFile, name: str) -> IO[bytes]:
-    return io.BytesIO(_unpacked(archive, name))
+def _why(error: BaseException) -> str:
+    return str(error) if isinstance(error, _EntryError) else "not a zip file, or damaged."
 
 
 def _listed(
@@ -343,25 +342,20 @@ def _label(entry: zipfile.ZipInfo) -> str:
 def _unpacked(archive: zipfile.ZipFile, name: str) -> bytes:
     """Content of an entry, if it is one that a learning platform would write."""
     entry = archive.getinfo(name)
-    if entry.flag_bits & _ENCRYPTED:
-        raise _EntryError("encrypted in its zip file.")
-    if stat.S_ISLNK(entry.external_attr >> 16):
-        raise _EntryError("a symbolic link in its zip file, which is not followed.")
-    if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-        raise _EntryError("packed in its zip file by a method that is not read.")
-    if entry.file_size > MAX_BYTES:
-        raise _EntryError(_TOO_LARGE)
-    if entry.file_size > 1_000_000 and entry.file_size > MAX_RATIO * entry.compress_size:
-        raise _EntryError(f"it shrinks more than {MAX_RATIO} times in its zip file: no report.")
-    with archive.open(entry) as stream:
-        content = stream.read(MAX_BYTES + 1)
-    if len(content) > MAX_BYTES:
-        raise _EntryError(_TOO_LARGE)
-    return content
-
-
-def _refused(submission: Submission, reason: str) -> Refused:
-    return Refused(f"{one_line(submission.name, MAX_NAME)}: {reason}")
+    small = entry.file_size <= max(1_000_000, MAX_RATIO * entry.compress_size)
+    known = entry.compress_type in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+    for wrong, why in (
+        (entry.flag_bits & _ENCRYPTED, "encrypted in its zip file."),
+        (stat.S_ISLNK(entry.external_attr >> 16),
+         "a symbolic link in its zip file, which is not followed."),
+        (not known, "packed in its zip file by a method that is not read."),
+        (entry.file_size > MAX_BYTES, _TOO_LARGE),
+        (not small, f"it shrinks more than {MAX_RATIO} times in its zip file: no report."),
+    ):  # fmt: skip
+        if wrong:
+            raise _EntryError(why)
+    # zipfile gives no more than the declared size
+    return archive.read(entry)
 
 
 def _shown(name: str) -> str:

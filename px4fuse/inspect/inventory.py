@@ -13,7 +13,7 @@ import pandas as pd
 from px4fuse.comparison.preparation import choose_segment, choose_source
 from px4fuse.errors import MissingDataError, Px4FuseError
 from px4fuse.filter.signals import IMU_GAP_INTERVALS, IMU_GAP_S, Segment, make_axes
-from px4fuse.findings.source_gap import GAP, GAP_INTERVALS
+from px4fuse.findings.source_intervals import longest_s
 from px4fuse.flight import Ekf2, Flight, Unavailable, sample_rate
 from px4fuse.inspect.outlook import (
     PART_NAMES,
@@ -277,4 +277,4 @@ def _gap_limit(frame: pd.DataFrame, *, of_imu: bool = False) -> float | None:
         return None
     if of_imu:
         return max(IMU_GAP_S, IMU_GAP_INTERVALS * float(np.median(np.diff(frame.index.to_numpy()))))
-    return max(GAP.value, GAP_INTERVALS.value / sample_rate(frame))
+    return longest_s(1.0 / sample_rate(frame))

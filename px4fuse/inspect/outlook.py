@@ -17,11 +17,14 @@ from px4fuse.comparison.projection import (
 )
 from px4fuse.filter.consistency import MIN_INNOVATIONS
 from px4fuse.filter.signals import Axis, Segment, ned_acceleration, within
-from px4fuse.findings.ekf2_innovations_decimated import MIN_INNOVATION_SHARE
-from px4fuse.findings.ekf2_not_fusing import EV_START_INTERVAL
-from px4fuse.findings.imu_gap import IMU_GAP_TOTAL
-from px4fuse.findings.logging_rate_low import MIN_ATTITUDE_RATE, MIN_IMU_RATE, too_slow
-from px4fuse.findings.source_not_logged import VISION_PROFILE_BIT
+from px4fuse.findings.ekf2_not_fusing import EV_START_INTERVAL_S
+from px4fuse.findings.imu import (
+    IMU_GAP_TOTAL_S,
+    MIN_ATTITUDE_RATE_HZ,
+    MIN_IMU_RATE_HZ,
+    too_slow,
+)
+from px4fuse.findings.missing import MIN_INNOVATION_SHARE, VISION_PROFILE_BIT
 from px4fuse.flight import VELOCITY_COLUMNS, Ekf2, Flight, PositionTrack, Unavailable, sample_rate
 from px4fuse.origin import MOTION_CAPTURE, RECEIVED
 
@@ -38,8 +41,8 @@ PART_NAMES = {
 }
 # The position as PX4 received it
 AS_RECEIVED = "vehicle_visual_odometry"
-# EKF2 starts on external vision only where samples are closer than EV_START_INTERVAL; with jitter a
-# source needs this much more than that rate to be fused without luck
+# EKF2 starts on external vision only where samples are closer than EV_START_INTERVAL_S; with jitter
+# a source needs this much more than that rate to be fused without luck
 EV_RATE_MARGIN = 1.25
 
 
@@ -103,11 +106,11 @@ def abilities(flight: Flight, plan: Plan) -> Iterator[Ability]:
 def _too_slow(flight: Flight) -> Iterator[tuple[str, float, float]]:
     """Part, its rate and the rate that the acceleration needs, where it falls short of that."""
     for key, part, needed in (
-        ("imu", flight.imu, MIN_IMU_RATE),
-        ("attitude", flight.attitude, MIN_ATTITUDE_RATE),
+        ("imu", flight.imu, MIN_IMU_RATE_HZ),
+        ("attitude", flight.attitude, MIN_ATTITUDE_RATE_HZ),
     ):
         if isinstance(part, pd.DataFrame) and too_slow(part, needed):
-            yield key, sample_rate(part), needed.value
+            yield key, sample_rate(part), needed
 
 
 def _hertz(rate: float) -> str:
@@ -200,7 +203,7 @@ def _advice(flight: Flight, plan: Plan) -> Iterator[Advice]:
             if isinstance(part, Unavailable):
                 yield Advice(part.remedy, (PART_NAMES[key],))
     lost_s = sum(dropout.duration_s for dropout in log.dropouts)
-    if lost_s > IMU_GAP_TOTAL.value:
+    if lost_s > IMU_GAP_TOTAL_S:
         yield Advice("Use a faster SD card, or log less (SDLOG_PROFILE).", ("dropouts",))
     for key, last in (("airborne", flight.airborne), ("truth", flight.truth)):
         if isinstance(last, Unavailable) and (key == "airborne" or log.has_ulog):
@@ -220,11 +223,11 @@ def _position_advice(flight: Flight, track: PositionTrack) -> Iterator[Advice]:
         yield Advice(remedy, ("position",))
     ekf2 = flight.ekf2
     fused = isinstance(ekf2, Ekf2) and isinstance(ekf2.innovations["north"], pd.DataFrame)
-    slow = track.rate_hz < EV_RATE_MARGIN / EV_START_INTERVAL.value
+    slow = track.rate_hz < EV_RATE_MARGIN / EV_START_INTERVAL_S
     if fused and slow and track.origin.preference == RECEIVED.preference:
         yield Advice(
             "Send the position at 10 Hz: EKF2 (v1.14 and later) starts to fuse only samples less "
-            f"than {EV_START_INTERVAL.value:g} s apart.",
+            f"than {EV_START_INTERVAL_S:g} s apart.",
             ("EKF2",),
         )
 
@@ -253,7 +256,7 @@ def _innovation_advice(ekf2: Ekf2, track: PositionTrack) -> Iterator[Advice]:
         yield Advice(innovations.remedy, (PART_NAMES["ekf2_innovations"],))
         return
     measured = track.samples.loc[innovations.index[0] : innovations.index[-1]]
-    decimated = len(innovations) < MIN_INNOVATION_SHARE.value * len(measured)
+    decimated = len(innovations) < MIN_INNOVATION_SHARE * len(measured)
     if decimated and not track.origin.reconstructed and ekf2.innovation_topics:
         yield Advice(
             f'Put the line "{ekf2.innovation_topics[0]} 0" into etc/logging/logger_topics.txt on '

@@ -29,7 +29,7 @@ NO_POSITION = Unavailable(
 
 
 @dataclass(frozen=True)
-class _Table:
+class DescribedTable:
     """One table, and its rows of the data dictionary."""
 
     name: str
@@ -124,7 +124,7 @@ def _table(
     origin: tuple[tuple[str, ...], str] = ((), ""),
     of: str = "",
     **words: str,
-) -> _Table:
+) -> DescribedTable:
     """A table with the columns that are described for it, or for ``of``.
 
     Parameters
@@ -137,10 +137,12 @@ def _table(
     columns = _described().loc[of or name].map(lambda cell: cell.format(**words))
     topics, clock = origin
     columns = columns.assign(table=name, source_topic=" ".join(topics), clock=clock)
-    return _Table(name, data.reindex(columns=columns["column"].tolist()), columns)
+    return DescribedTable(name, data.reindex(columns=columns["column"].tolist()), columns)
 
 
-def _series(flight: Flight, name: str, data: pd.DataFrame | Unavailable) -> Iterator[_Table]:
+def _series(
+    flight: Flight, name: str, data: pd.DataFrame | Unavailable
+) -> Iterator[DescribedTable]:
     """A time series that is named as its stream; nothing where it is unavailable."""
     if isinstance(data, pd.DataFrame):
         yield _table(name, _timed(data), _origin(flight, name))
@@ -150,7 +152,7 @@ def _timed(data: pd.DataFrame) -> pd.DataFrame:
     return data.rename_axis("time_s").reset_index()
 
 
-def _tables(flight: Flight) -> Iterator[_Table]:
+def _tables(flight: Flight) -> Iterator[DescribedTable]:
     yield from _series(flight, "imu", flight.imu)
     yield from _series(flight, "attitude", flight.attitude)
     acceleration = ned_acceleration(flight)
@@ -186,7 +188,7 @@ def _listed(columns: list[str], rows: Iterable[tuple[float, ...]]) -> pd.DataFra
     return pd.DataFrame(list(rows), columns=columns, dtype=np.float64)
 
 
-def _ekf2(flight: Flight, ekf2: Ekf2) -> Iterator[_Table]:
+def _ekf2(flight: Flight, ekf2: Ekf2) -> Iterator[DescribedTable]:
     yield from _series(flight, "ekf2_state", ekf2.state)
     yield from _series(flight, "ekf2_variance", ekf2.variance)
     frames = [

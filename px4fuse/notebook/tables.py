@@ -159,7 +159,8 @@ def _(analysis: Analysis) -> str:
     for sentence in story(analysis, found):
         lines += wrap(sentence, WIDTH)
     for severity in SEVERITIES:
-        if names := ", ".join(finding.id for finding in found if finding.severity == severity):
+        named = (one.id for one in found if one.severity == severity and one.caused_by is None)
+        if names := ", ".join(named):
             lines += wrap(f"{severity}: {names}", WIDTH)
     return "\n".join(lines)
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from px4fuse.arrays import Array, IntArray
 from px4fuse.errors import TrajectoryError
-from px4fuse.readers.text_table import is_number, quote, text_of
+from px4fuse.readers.text_table import at_line, is_number, quote, text_of
 from px4fuse.reading import read_whole, shown
 from px4fuse.trajectory.graph.initialisation import initialise
 from px4fuse.trajectory.graph.model import FROM_FILE, PoseGraph
@@ -36,11 +36,16 @@ _LEAST_INFORMATION, _MOST_INFORMATION = 1e-50, 1e50
 
 @dataclass
 class _Lines:
-    """Lines of one tag: which ones, the vertices that they name, their numbers."""
+    """Lines of one tag of a file: which ones, the vertices that they name, their numbers."""
 
+    file: str
     line: list[int] = field(default_factory=list)
     ids: list[list[int]] = field(default_factory=list)
     numbers: list[list[float]] = field(default_factory=list)
+
+    def refuse(self, row: int, what: str, remedy: str) -> TrajectoryError:
+        """Error that names the line of a row."""
+        return TrajectoryError(at_line(self.file, self.line[row], what, remedy))
 
 
 def read_g2o(path: str | Path) -> PoseGraph:
@@ -80,22 +85,53 @@ def parse_g2o(text: str, name: str) -> PoseGraph:
     TrajectoryError
         As :func:`read_g2o`.
     """
-    found, fixed = _split(text, name)
-    tags = [tag for tag in _TAGS if found[tag].line]
-    dimensions = {_TAGS[tag][0] for tag in tags}
-    if len(dimensions) > 1:
-        line = min(found[tag].line[0] for tag in tags if _TAGS[tag][0] == 3)
-        raise TrajectoryError(
-            f"{name}, line {line}: poses in space (SE3) beside poses in the plane (SE2). Give one "
-            "kind per file."
+    found = _split(text, name)
+    in_space = [found[tag] for tag in _TAGS if _TAGS[tag][0] == 3 and found[tag].line]
+    is_plane = bool(found["VERTEX_SE2"].line or found["EDGE_SE2"].line)
+    if in_space and is_plane:
+        first = min(in_space, key=lambda lines: lines.line[0])
+        raise first.refuse(
+            0, "poses in space (SE3) beside poses in the plane (SE2)", "Give one kind per file."
         )
-    kind = "SE2" if dimensions == {2} else "SE3:QUAT"
+    kind, dimension = ("SE2", 2) if is_plane else ("SE3:QUAT", 3)
     vertices, edges = found[f"VERTEX_{kind}"], found[f"EDGE_{kind}"]
     if not edges.line:
         raise TrajectoryError(
             f"{name}: no edges. Give a g2o file with EDGE_SE2 or EDGE_SE3:QUAT lines."
         )
-    return _graph(name, 2 if kind == "SE2" else 3, vertices, edges, fixed)
+    width = 3 if is_plane else 7
+    numbers, ends = _finite(edges), np.array(edges.ids, dtype=np.intp)
+    if vertices.line:
+        poses = _poses(vertices, _finite(vertices))
+        numbered = np.array(vertices.ids, dtype=np.intp)[:, 0]
+        order = np.argsort(numbered, kind="stable")
+        ids, poses = numbered[order], poses[order]
+        twice = np.flatnonzero(ids[1:] == ids[:-1])
+        if len(twice):
+            before, again = order[twice[0]], order[twice[0] + 1]
+            first_line = vertices.line[before]
+            what = f"vertex {ids[twice[0]]} for the second time (first on line {first_line})"
+            raise vertices.refuse(again, what, "Take one of them out.")
+    else:
+        ids = np.unique(ends)
+        poses = np.zeros((len(ids), width))
+        poses[:, -1] = 0.0 if is_plane else 1.0
+    index = _indices(edges, ids, ends)
+    _require_fixed(found["FIX"], ids)
+    graph = PoseGraph(
+        dimension=dimension,
+        ids=ids,
+        poses=poses,
+        first=index[:, 0],
+        second=index[:, 1],
+        measurements=_poses(edges, numbers[:, :width]),
+        information=_information(edges, numbers[:, width:], 3 if is_plane else 6),
+        initialised=FROM_FILE,
+    )
+    try:
+        return graph if vertices.line else initialise(graph)
+    except TrajectoryError as error:
+        raise TrajectoryError(f"{name}: {error}") from None
 
 
 def g2o_text(graph: PoseGraph) -> str:
@@ -122,94 +158,62 @@ def g2o_text(graph: PoseGraph) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _split(text: str, name: str) -> tuple[dict[str, _Lines], list[tuple[int, int]]]:
-    """Lines by tag, and the vertices of FIX lines with their line."""
-    found = {tag: _Lines() for tag in _TAGS}
-    fixed: list[tuple[int, int]] = []
+def _split(text: str, name: str) -> dict[str, _Lines]:
+    """Lines by tag; of FIX each vertex stands on a line of its own."""
+    found = {tag: _Lines(name) for tag in (*_TAGS, "FIX")}
     for number, raw in enumerate(text.split("\n"), start=1):
         line = raw.partition("#")[0] if "#" in raw else raw
         parts = line.split()
         if not parts:
             continue
         tag = parts[0]
-        expected = _TAGS.get(tag)
-        if expected is None:
-            if tag == "FIX":
-                fixed += [(number, _id(each, name, number)) for each in parts[1:]]
-            elif not tag.startswith(_IGNORED):
-                raise TrajectoryError(f"{name}, line {number}: {_unknown(tag)}")
-            continue
-        _, named, numbers = expected
-        if len(parts) != 1 + named + numbers:
-            raise TrajectoryError(
-                f"{name}, line {number}: {tag} has {len(parts) - 1} numbers, not "
-                f"{named + numbers}. Write the file again; it may be cut off."
-            )
+        if tag not in found:
+            if tag.startswith(_IGNORED):
+                continue
+            raise TrajectoryError(f"{name}, line {number}: {_unknown(tag)}")
         into = found[tag]
+        if tag == "FIX":
+            into.line += [number] * len(parts[1:])
+            into.ids += [[_id(each, name, number)] for each in parts[1:]]
+            continue
+        _, named, numbers = _TAGS[tag]
+        if len(parts) != 1 + named + numbers:
+            what = f"{tag} has {len(parts) - 1} numbers, not {named + numbers}"
+            remedy = "Write the file again; it may be cut off."
+            raise TrajectoryError(at_line(name, number, what, remedy))
         try:
             values = list(map(float, parts[1 + named :]))
         except ValueError:
             bad = next(each for each in parts[1 + named :] if not is_number(each))
-            raise TrajectoryError(
-                f"{name}, line {number}: {quote(bad)} is not a number. Correct it."
-            ) from None
+            what = f"{quote(bad)} is not a number"
+            raise TrajectoryError(at_line(name, number, what, "Correct it.")) from None
         into.line.append(number)
         into.ids.append([_id(each, name, number) for each in parts[1 : 1 + named]])
         into.numbers.append(values)
-    return found, fixed
+    return found
 
 
-def _graph(
-    name: str, dimension: int, vertices: _Lines, edges: _Lines, fixed: list[tuple[int, int]]
-) -> PoseGraph:
-    width = 3 if dimension == 2 else 7
-    numbers = np.array(edges.numbers)
-    _require_finite(name, edges, numbers)
-    ends = np.array(edges.ids, dtype=np.intp)
-    if vertices.line:
-        given = np.array(vertices.numbers)
-        _require_finite(name, vertices, given)
-        poses = _poses(name, vertices, given, dimension)
-        numbered = np.array(vertices.ids, dtype=np.intp)[:, 0]
-        order = np.argsort(numbered, kind="stable")
-        ids, poses = numbered[order], poses[order]
-        _require_once(name, vertices, ids, order)
-    else:
-        ids = np.unique(ends)
-        poses = np.zeros((len(ids), width))
-        poses[:, -1] = 0.0 if dimension == 2 else 1.0
-    index = _indices(name, edges, ids, ends)
-    _require_fixed(name, fixed, ids)
-    graph = PoseGraph(
-        dimension=dimension,
-        ids=ids,
-        poses=poses,
-        first=index[:, 0],
-        second=index[:, 1],
-        measurements=_poses(name, edges, numbers[:, :width], dimension),
-        information=_information(name, edges, numbers[:, width:], 3 if dimension == 2 else 6),
-        initialised=FROM_FILE,
-    )
-    if vertices.line:
-        return graph
-    try:
-        return initialise(graph)
-    except TrajectoryError as error:
-        raise TrajectoryError(f"{name}: {error}") from None
+def _finite(lines: _Lines) -> Array:
+    numbers = np.array(lines.numbers)
+    bad = _first(~np.all(np.isfinite(numbers), axis=1))
+    if bad is not None:
+        raise lines.refuse(bad, "a number that is not finite", "Correct it, or take the line out.")
+    return numbers
 
 
-def _poses(name: str, lines: _Lines, numbers: Array, dimension: int) -> Array:
+def _poses(lines: _Lines, numbers: Array) -> Array:
     """Poses with unit quaternions."""
-    if dimension == 2:
+    if numbers.shape[1] == 3:
         return numbers
     poses = numbers.copy()
     with np.errstate(over="ignore"):
         norm = np.linalg.norm(poses[:, 3:], axis=1)
     bad = _first((norm < 1e-6) | ~(norm < 1e6))
     if bad is not None:
-        raise TrajectoryError(
-            f"{name}, line {lines.line[bad]}: a quaternion of length {norm[bad]:.3g} is not a "
-            "rotation. Give qx qy qz qw, of length 1, behind the position."
+        raise lines.refuse(
+            bad,
+            f"a quaternion of length {norm[bad]:.3g} is not a rotation",
+            "Give qx qy qz qw, of length 1, behind the position.",
         )
     # What is a unit quaternion already stays as it is, so that writing and reading changes nothing
     off = np.abs(norm - 1.0) > _UNIT
@@ -217,21 +221,22 @@ def _poses(name: str, lines: _Lines, numbers: Array, dimension: int) -> Array:
     return poses
 
 
-def _information(name: str, lines: _Lines, numbers: Array, size: int) -> Array:
+def _information(lines: _Lines, numbers: Array, size: int) -> Array:
     """Symmetric matrices from their upper triangles, row by row."""
     row, column = np.triu_indices(size)
     made = np.empty((len(numbers), size, size))
     made[:, row, column] = made[:, column, row] = numbers
-    size_of_entry = np.abs(numbers)
-    beyond = (size_of_entry > _MOST_INFORMATION) | (
-        (row == column) & (size_of_entry > 0.0) & (size_of_entry < _LEAST_INFORMATION)
-    )
+    entry = np.abs(numbers)
+    tiny = (row == column) & (entry > 0.0) & (entry < _LEAST_INFORMATION)
+    beyond = tiny | (entry > _MOST_INFORMATION)
     bad = _first(np.any(beyond, axis=1))
     if bad is not None:
-        raise TrajectoryError(
-            f"{name}: line {lines.line[bad]}: the information matrix has the entry "
-            f"{numbers[bad][beyond[bad]][0]:.3g}, which cannot be computed with. Give 0 for what "
-            f"the edge does not tell, else {_LEAST_INFORMATION:g} to {_MOST_INFORMATION:g}."
+        raise lines.refuse(
+            bad,
+            f"the information matrix has the entry {numbers[bad][beyond[bad]][0]:.3g}, which "
+            "cannot be computed with",
+            f"Give 0 for what the edge does not tell, else {_LEAST_INFORMATION:g} to "
+            f"{_MOST_INFORMATION:g}.",
         )
     try:
         np.linalg.cholesky(made)
@@ -239,64 +244,42 @@ def _information(name: str, lines: _Lines, numbers: Array, size: int) -> Array:
         values = np.linalg.eigvalsh(made)
         bad = _first(values[:, 0] < -_ROUNDING * np.maximum(values[:, -1], 0.0))
         if bad is not None:
-            raise TrajectoryError(
-                f"{name}, line {lines.line[bad]}: the information matrix has a negative "
-                f"eigenvalue ({values[bad, 0]:.3g}). Give the upper triangle of an inverse "
-                "covariance, row by row."
+            raise lines.refuse(
+                bad,
+                f"the information matrix has a negative eigenvalue ({values[bad, 0]:.3g})",
+                "Give the upper triangle of an inverse covariance, row by row.",
             ) from None
     return made
 
 
-def _indices(name: str, edges: _Lines, ids: IntArray, ends: IntArray) -> IntArray:
+def _indices(edges: _Lines, ids: IntArray, ends: IntArray) -> IntArray:
     """Places of the edges' vertices."""
     index = np.minimum(np.searchsorted(ids, ends), len(ids) - 1)
     missing = _first(np.any(ids[index] != ends, axis=1))
     if missing is not None:
-        vertex = next(each for each in ends[missing].tolist() if each not in set(ids.tolist()))
-        raise TrajectoryError(
-            f"{name}, line {edges.line[missing]}: an edge to vertex {vertex}, which the file does "
-            "not have. Add its VERTEX line, or take all of them out."
+        vertex = ends[missing][ids[index[missing]] != ends[missing]][0]
+        raise edges.refuse(
+            missing,
+            f"an edge to vertex {vertex}, which the file does not have",
+            "Add its VERTEX line, or take all of them out.",
         )
     same = _first(ends[:, 0] == ends[:, 1])
     if same is not None:
-        raise TrajectoryError(
-            f"{name}, line {edges.line[same]}: an edge from vertex {ends[same, 0]} to itself. "
-            "Take it out."
-        )
+        raise edges.refuse(same, f"an edge from vertex {ends[same, 0]} to itself", "Take it out.")
     return index
 
 
-def _require_finite(name: str, lines: _Lines, numbers: Array) -> None:
-    bad = _first(~np.all(np.isfinite(numbers), axis=1))
-    if bad is not None:
-        raise TrajectoryError(
-            f"{name}, line {lines.line[bad]}: a number that is not finite. Correct it, or take the "
-            "line out."
-        )
-
-
-def _require_once(name: str, vertices: _Lines, ids: IntArray, order: IntArray) -> None:
-    twice = np.flatnonzero(ids[1:] == ids[:-1])
-    if len(twice):
-        before, again = vertices.line[order[twice[0]]], vertices.line[order[twice[0] + 1]]
-        raise TrajectoryError(
-            f"{name}, line {again}: vertex {ids[twice[0]]} for the second time (first on line "
-            f"{before}). Take one of them out."
-        )
-
-
-def _require_fixed(name: str, fixed: list[tuple[int, int]], ids: IntArray) -> None:
-    known = set(ids.tolist())
-    for line, vertex in fixed:
+def _require_fixed(fixed: _Lines, ids: IntArray) -> None:
+    known = {*ids.tolist()}
+    for row, (vertex,) in enumerate(fixed.ids):
         if vertex not in known:
-            raise TrajectoryError(
-                f"{name}, line {line}: FIX of vertex {vertex}, which the file does not have. Take "
-                "the line out."
-            )
-        if vertex != fixed[0][1]:
-            raise TrajectoryError(
-                f"{name}, line {line}: FIX of a second vertex ({vertex} beside {fixed[0][1]}). "
-                "One pose is held here: take the line out, or join the two by an edge."
+            what = f"FIX of vertex {vertex}, which the file does not have"
+            raise fixed.refuse(row, what, "Take the line out.")
+        if [vertex] != fixed.ids[0]:
+            raise fixed.refuse(
+                row,
+                f"FIX of a second vertex ({vertex} beside {fixed.ids[0][0]})",
+                "One pose is held here: take the line out, or join the two by an edge.",
             )
 
 
@@ -311,9 +294,8 @@ def _id(text: str, name: str, line: int) -> int:
     except ValueError:
         number = _BIGGEST_ID
     if not -_BIGGEST_ID <= number < _BIGGEST_ID or "_" in text:
-        raise TrajectoryError(
-            f"{name}, line {line}: {quote(text)} is not the number of a vertex. Give an integer."
-        )
+        what = f"{quote(text)} is not the number of a vertex"
+        raise TrajectoryError(at_line(name, line, what, "Give an integer."))
     return number
 
 

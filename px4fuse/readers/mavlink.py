@@ -6,6 +6,7 @@ v1.16) and MAVLink's ``common.xml``; ``mavlink_messages`` holds them as tables.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
 
@@ -13,40 +14,28 @@ import numpy as np
 import pandas as pd
 from msgspec import structs
 
-from px4fuse.ekf2_parameters import REPORTED
+from px4fuse.ekf2_parameters import EV_POS, REPORTED, settings_in_force
 from px4fuse.flight import (
-    ANGULAR_RATE_COLUMNS,
+    AXIS_NAMES,
+    POSITION_VARIANCE_COLUMNS,
     QUATERNION_COLUMNS,
-    SPECIFIC_FORCE_COLUMNS,
+    STATE_COLUMNS,
+    VELOCITY_VARIANCE_COLUMNS,
+    Ekf2,
     Flight,
     FlightMode,
     Unavailable,
 )
+from px4fuse.readers import mavlink_messages as messages
 from px4fuse.readers.mavlink_clocks import UNIX_FROM_S
-from px4fuse.readers.mavlink_ekf2 import MIN_NORM, read_ekf2
-from px4fuse.readers.mavlink_frames import Frames, message_ids, read_frames
-from px4fuse.readers.mavlink_messages import (
-    ATTITUDE,
-    AUTO_MODE,
-    AUTO_MODES,
-    IMU,
-    LANDED,
-    MAIN_MODES,
-    NO_MODES,
-    UNUSED,
-    VEHICLE_TYPES,
-    Remedies,
-    remedies_of,
-)
+from px4fuse.readers.mavlink_frames import message_ids, read_frames
 from px4fuse.readers.mavlink_positions import read_positions, read_truth
 from px4fuse.readers.mavlink_recording import (
     BOOT_CLOCK,
     RECEIPT_CLOCK,
     Recording,
-    quaternions_of_angles,
     settle_clocks,
     unix_of_boot,
-    vector,
 )
 from px4fuse.readers.mavlink_senders import (
     choose_autopilot,
@@ -59,10 +48,12 @@ from px4fuse.readers.parts import (
     missing_parts,
     stretches_of_flight,
     stretches_of_modes,
+    with_attitude,
 )
-from px4fuse.readers.ulog_topics import dropped_note
+from px4fuse.readers.ulog_topics import NO_SELECTOR, dropped_note
 from px4fuse.recording import LogInfo, Unused
 
+VARIANCE_COLUMNS = POSITION_VARIANCE_COLUMNS + VELOCITY_VARIANCE_COLUMNS
 # MAV_PARAM_TYPE: below, an integer
 PARAMETER_REAL = 9
 
@@ -96,14 +87,13 @@ def read_mavlink(path: Path, system: int | None = None) -> Flight:
     recording = settle_clocks(frames, address)
     mapped = map_senders(recording)
     parameters = _read_parameters(recording, autopilot)
-    remedies = remedies_of(autopilot)
-    imu = _read_imu(recording, remedies)
-    attitude = _read_attitude(recording, remedies)
-    ekf2 = read_ekf2(recording, parameters, autopilot)
-    positions, missing_positions = read_positions(recording, mapped, remedies)
+    remedies, replay = messages.remedies_of(autopilot)
+    imu = _read_imu(recording, remedies["imu"])
+    attitude = _read_attitude(recording, remedies["attitude"])
+    ekf2 = _read_ekf2(recording, parameters, autopilot, remedies, replay)
+    positions, missing_positions = read_positions(recording, mapped, remedies["position"])
     truth = read_truth(recording, positions, remedies)
-    airborne = _read_airborne(recording, remedies)
-    modes = _read_modes(recording) if autopilot == "PX4" else NO_MODES
+    airborne = _read_airborne(recording, remedies["landed"])
     return Flight(
         log=structs.replace(
             _describe(recording, parameters, autopilot),
@@ -115,94 +105,156 @@ def read_mavlink(path: Path, system: int | None = None) -> Flight:
         ekf2=ekf2,
         truth=truth,
         airborne=airborne,
-        modes=modes,
+        modes=_read_modes(recording) if autopilot == "PX4" else messages.NO_MODES,
         missing=(*missing_parts(imu, attitude, ekf2, truth), *missing_positions),
         streams=MappingProxyType(recording.streams),
         clocks=clock_maps(recording, mapped),
-        unused=_unused(frames),
+        unused=tuple(
+            Unused(name, count, reason)
+            for name, reason in messages.UNUSED.items()
+            if (count := int(np.count_nonzero(frames.message_id == message_ids()[name])))
+        ),
     )
 
 
-def _read_imu(recording: Recording, remedies: Remedies) -> pd.DataFrame | Unavailable:
-    found = [(source, recording.rows(source.message)) for source in IMU]
+def _read_imu(recording: Recording, remedy: str) -> pd.DataFrame | Unavailable:
+    found = [(layout, recording.rows(layout.topic)) for layout in messages.IMU]
     # HIGHRES_IMU has units and µs; of the others the densest
-    source, rows = found[0] if len(found[0][1]) > 1 else max(found, key=lambda pair: len(pair[1]))
+    layout, rows = found[0] if len(found[0][1]) > 1 else max(found, key=lambda pair: len(pair[1]))
     if len(rows) < 2:
         raw = len(recording.rows("RAW_IMU"))
         refused = f"; {raw} RAW_IMU were refused, since raw counts have no unit" if raw else ""
-        return Unavailable("IMU", f"no HIGHRES_IMU or SCALED_IMU{refused}", remedies.imu)
-    table = recording.frames.table(source.message, rows)
+        return Unavailable("IMU", f"no HIGHRES_IMU or SCALED_IMU{refused}", remedy)
+    table = recording.frames.table(layout.topic, rows)
     if "id" in (table.dtype.names or ()):
-        busiest = table["id"] == np.bincount(table["id"]).argmax()
-        if not np.all(busiest):
-            rows, table = rows[busiest], table[busiest]
-    boot_s = recording.boot_s(table, rows)
-    # an hour of it is hundreds of megabytes, so that nothing is kept twice
-    values = np.empty((len(rows), 6))
-    values[:, :3] = vector(table, "xacc", "yacc", "zacc", scale=source.acceleration_unit)
-    values[:, 3:] = vector(table, "xgyro", "ygyro", "zgyro", scale=source.angular_rate_unit)
+        rows = rows[table["id"] == np.bincount(table["id"]).argmax()]
     del table
-    columns = SPECIFIC_FORCE_COLUMNS + ANGULAR_RATE_COLUMNS
-    usable = np.isfinite(values).all(axis=1)
-    if not np.all(usable):
-        boot_s, values = boot_s[usable], values[usable]
-    imu = recording.frame(source.message, boot_s, columns, values)
+    imu = recording.read(layout, rows)
+    if imu.isna().any(axis=None):
+        imu = imu.dropna()
     if len(imu) < 2:
         return Unavailable(
             "IMU",
-            f"{source.message} holds {len(imu)} usable samples",
+            f"{layout.topic} holds {len(imu)} usable samples",
             "Check that the sensors ran while the link was recorded.",
         )
-    recording.came_from("imu", BOOT_CLOCK, source.message)
+    recording.came_from("imu", BOOT_CLOCK, layout.topic)
     return imu
 
 
-def _read_attitude(recording: Recording, remedies: Remedies) -> pd.DataFrame | Unavailable:
-    found = [(message, recording.rows(message)) for message in ATTITUDE]
-    message, rows = max(found, key=lambda pair: len(pair[1]))
-    table = recording.frames.table(message, rows)
-    if message == "ATTITUDE":
-        quaternion = quaternions_of_angles(table)
-    elif message == "ODOMETRY":
-        quaternion = table["q"].astype(np.float64)
-    else:
-        quaternion = vector(table, "q1", "q2", "q3", "q4")
-    norm = np.linalg.norm(quaternion, axis=1)
-    good = np.isfinite(norm) & (norm > MIN_NORM)
-    boot_s = recording.boot_s(table, rows)[good]
-    attitude = recording.frame(message, boot_s, QUATERNION_COLUMNS, quaternion[good])
+def _read_attitude(recording: Recording, remedy: str) -> pd.DataFrame | Unavailable:
+    layout = max(messages.ATTITUDE, key=lambda layout: len(recording.rows(layout.topic)))
+    attitude = with_attitude(recording.read(layout))[QUATERNION_COLUMNS]
     if len(attitude) < 2:
-        return Unavailable(
-            "attitude", f"no usable {', '.join(ATTITUDE[:-1])} or {ATTITUDE[-1]}", remedies.attitude
-        )
-    recording.came_from("attitude", BOOT_CLOCK, message)
+        *some, last = (layout.topic for layout in messages.ATTITUDE)
+        return Unavailable("attitude", f"no usable {', '.join(some)} or {last}", remedy)
+    recording.came_from("attitude", BOOT_CLOCK, layout.topic)
     return attitude
 
 
+def _read_ekf2(
+    recording: Recording,
+    parameters: Mapping[str, float],
+    autopilot: str,
+    remedies: Mapping[str, str],
+    replay: Unavailable,
+) -> Ekf2 | Unavailable:
+    """EKF2's output as the autopilot sent it, or why there is none."""
+    counts = {layout.topic: len(recording.rows(layout.topic)) for layout in messages.STATES}
+    # the one with variances as long as it is not much sparser than the one without
+    dense = (one for one in messages.STATES if 2 * counts[one.topic] >= max(counts.values()))
+    layout = next(dense)
+    message = layout.topic
+    if counts[message] < 2:
+        return Unavailable(
+            "EKF2", "no ODOMETRY or LOCAL_POSITION_NED of the autopilot", remedies["state"]
+        )
+    samples = recording.read(layout)
+    state = samples[STATE_COLUMNS].dropna()
+    if len(state) < 2:
+        return Unavailable("EKF2", f"{message} holds no finite state", "Wait for EKF2 to start.")
+    recording.came_from("ekf2_state", BOOT_CLOCK, message)
+    notes = [f"EKF2's state is {message} as the autopilot sent it"]
+    if autopilot != "PX4":
+        notes.append(f"this is {autopilot}: what is called EKF2 here is its own estimator")
+    if "reset_counter" in samples and (
+        count := np.count_nonzero(samples["reset_counter"].diff()[1:])
+    ):
+        notes.append(
+            f"EKF2 reset its state {count} times in the recording; ODOMETRY does not say by "
+            "how much, so nothing was undone"
+        )
+    found = samples.reindex(columns=VARIANCE_COLUMNS)
+    found = found[(found > 0.0).all(axis=1)]
+    if found.empty:
+        message, found = messages.ACCURACY.topic, _variance_by_accuracy(recording)
+        if len(found):
+            notes.append(
+                "EKF2's position variances are from ESTIMATOR_STATUS: its horizontal accuracy "
+                "squared, half to each axis; velocity variances are not sent"
+            )
+    lacking = "no ODOMETRY with covariance and no ESTIMATOR_STATUS of the autopilot"
+    variance: pd.DataFrame | Unavailable = found
+    if found.empty:
+        variance = Unavailable("EKF2 variances", lacking, remedies["variance"])
+    else:
+        recording.came_from("ekf2_variance", BOOT_CLOCK, message)
+    inside = "MAVLink does not carry EKF2's"
+    return Ekf2(
+        state=state,
+        variance=variance,
+        innovations={
+            axis: Unavailable(
+                f"EKF2 innovations, {axis}", f"{inside} innovations", remedies["inside"]
+            )
+            for axis in AXIS_NAMES
+        },
+        innovation_topics=(),
+        fusing=Unavailable("EKF2 fusion flags", f"{inside} fusion flags", remedies["inside"]),
+        resets=(),
+        instances=NO_SELECTOR,
+        gate=settings_in_force(parameters)[EV_POS.gate],
+        notes=tuple(notes),
+        record=replay,
+    )
+
+
+def _variance_by_accuracy(recording: Recording) -> pd.DataFrame:
+    """Position variances from the accuracies of ESTIMATOR_STATUS, which are one σ.
+
+    PX4's horizontal accuracy is the root of the sum over both axes (``get_ekf_lpos_accuracy``).
+    """
+    accuracy = recording.read(messages.ACCURACY)
+    variance = pd.DataFrame(np.nan, index=accuracy.index, columns=VARIANCE_COLUMNS)
+    variance["north_m2"] = variance["east_m2"] = accuracy["horizontal_m"] ** 2 / 2.0
+    variance["down_m2"] = accuracy["vertical_m"] ** 2
+    return variance[(variance[POSITION_VARIANCE_COLUMNS] > 0.0).all(axis=1)]
+
+
 def _read_airborne(
-    recording: Recording, remedies: Remedies
+    recording: Recording, remedy: str
 ) -> tuple[tuple[float, float], ...] | Unavailable:
     """Stretches of flight by the land detector, each from take-off to touch-down."""
     rows = recording.rows("EXTENDED_SYS_STATE")
     table = recording.frames.table("EXTENDED_SYS_STATE", rows)
     known = table["landed_state"] > 0
     if not np.any(known):
-        return Unavailable("land detector", "no usable EXTENDED_SYS_STATE", remedies.landed)
+        return Unavailable("land detector", "no usable EXTENDED_SYS_STATE", remedy)
     recording.came_from("airborne", RECEIPT_CLOCK, "EXTENDED_SYS_STATE")
     time_s = recording.receipt_boot_s(rows[known]) - recording.zero_s
-    landed = pd.Series(table["landed_state"][known] == LANDED, index=time_s)
+    landed = pd.Series(table["landed_state"][known] == messages.LANDED, index=time_s)
     return stretches_of_flight(landed, recording.duration_s)
 
 
 def _read_modes(recording: Recording) -> tuple[FlightMode, ...] | Unavailable:
     rows = recording.rows("HEARTBEAT")
     if not len(rows):
-        return NO_MODES
+        return messages.NO_MODES
     modes = recording.frames.table("HEARTBEAT", rows)["custom_mode"].astype(np.int64)
     names = [
-        AUTO_MODES.get(mode >> 24 & 0xFF, "Auto")
-        if (main := mode >> 16 & 0xFF) == AUTO_MODE
-        else MAIN_MODES.get(main, f"mode {main}")
+        messages.AUTO_MODES.get(mode >> 24 & 0xFF, "Auto")
+        if (main := mode >> 16 & 0xFF) == messages.AUTO_MODE
+        else messages.MAIN_MODES.get(main, f"mode {main}")
         for mode in modes.tolist()
     ]
     time_s = recording.receipt_boot_s(rows) - recording.zero_s
@@ -240,7 +292,7 @@ def _describe(
         uid = bytes(version["uid2"]).hex()
         vehicle = uid if uid.strip("0") else ""
     beats = frames.table("HEARTBEAT", recording.rows("HEARTBEAT"))
-    kind = VEHICLE_TYPES.get(int(beats["type"][0]), "vehicle") if len(beats) else "vehicle"
+    kind = messages.VEHICLE_TYPES.get(int(beats["type"][0]), "vehicle") if len(beats) else "vehicle"
     dropped = [
         dropped_note(count, message, "zero, go back, or lie outside the recording")
         for message, count in sorted(recording.dropped.items())
@@ -257,6 +309,9 @@ def _describe(
         duration_s=recording.duration_s,
         parameters=parameters,
         notes=(*recording.notes, *dropped),
+        restarts=recording.restarts,
+        receipt_went_back=recording.receipt_went_back,
+        dropped=dict(sorted(recording.dropped.items())),
         autopilot=autopilot,
         start_unix_s=_start_unix_s(recording),
         senders=describe_senders(recording),
@@ -278,12 +333,3 @@ def _start_unix_s(recording: Recording) -> float | None:
     if received_us is None or not recording.boot_of_receipt.pairs:
         return None
     return float(received_us[0] * 1e-6 + recording.boot_of_receipt.inverse().at(zero)[0])
-
-
-def _unused(frames: Frames) -> tuple[Unused, ...]:
-    found = []
-    for name, reason in UNUSED.items():
-        count = int(np.count_nonzero(frames.message_id == message_ids()[name]))
-        if count:
-            found.append(Unused(name, count, reason))
-    return tuple(found)

@@ -2,7 +2,7 @@
 
 A recording is scanned for frames instead of being parsed byte by byte: every position that could
 begin a frame of a known message is checked by its checksum, so that junk, cut frames and bad
-checksums cost themselves and nothing else. A message type is then decoded for all its frames at
+checksums cost themselves; they are counted. A message type is then decoded for all its frames at
 once with the field tables of pymavlink's dialect.
 
 Sources: MAVLink developer guide, "Packet Serialization"; pymavlink's generated dialects.
@@ -12,18 +12,18 @@ from __future__ import annotations
 
 import hashlib
 from collections import Counter, defaultdict
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from fastcrc.crc16 import mcrf4xx  # CRC-16/MCRF4XX is MAVLink's X.25 checksum
 from numpy.typing import NDArray
 from pymavlink.dialects.v20 import all as dialect
 
-from px4fuse.arrays import BoolArray, IntArray
+from px4fuse.arrays import IntArray
 from px4fuse.errors import LogError
 from px4fuse.reading import read_log_bytes, shown
 
@@ -73,11 +73,9 @@ class Frames:
     payload_length : ndarray of uint8, shape (n,)
     received_us : ndarray of int64, shape (n,), or None
         Time of receipt, µs UNIX, of a recording with stamps (damaged ones interpolated).
-    unknown : mapping from message id to count
-        Whole frames of messages that the dialect does not know; their checksum cannot be checked.
-    foreign : mapping from message id to count
-        Whole frames of messages that the dialect defines otherwise: of those that a sender sent of
-        one message most have another checksum than its definition gives.
+    passed_over : mapping from message id to count
+        Whole frames of messages that the dialect does not know, or defines otherwise: of those that
+        a sender sent of one message most have another checksum than its definition gives.
     bad_bytes : int
         Bytes that belong to no frame.
     bad_stamps : int
@@ -95,8 +93,7 @@ class Frames:
     payload_start: Integers
     payload_length: NDArray[np.uint8]
     received_us: Integers | None
-    unknown: Mapping[int, int]
-    foreign: Mapping[int, int]
+    passed_over: Mapping[int, int]
     bad_bytes: int
     bad_stamps: int
 
@@ -197,9 +194,8 @@ def read_frames(path: Path) -> Frames:
     """
     name, content = shown(path), read_log_bytes(path)
     start, end = _scan(content)
-    stamped = bool(len(start)) and _is_stamped(start, end)
-    start, end = _without_overlap(start, end, STAMP if stamped else 0)
-    start, end = _without_chance(content, start, end, STAMP if stamped else 0)
+    start, end = _without_overlap(start, end)
+    stamp = STAMP if len(start) and _is_stamped(start, end) else 0
     good = int(np.sum(end - start))
     if good < MIN_GOOD_SHARE * len(content) or not len(start):
         raise LogError(
@@ -210,17 +206,16 @@ def read_frames(path: Path) -> Frames:
     source = np.frombuffer(content, dtype=np.uint8)
     second = source[start] == MAGIC_2
     # sequence, system, component and the lowest byte of the message id follow one another
-    sequence = start + np.where(second, 4, 2)
-    number = source[sequence + 3].astype(np.int32)
-    at = start[second]
-    number[second] |= (source[at + 8].astype(np.int32) << 8) | (
-        source[at + 9].astype(np.int32) << 16
+    at = start + np.where(second, 4, 2)
+    number = source[at + 3].astype(np.int32)
+    for byte in (1, 2):
+        number[second] |= source[at[second] + 3 + byte].astype(np.int32) << 8 * byte
+    system, component = source[at + 1], source[at + 2]
+    passed_over, bad_bytes = _between(
+        content, start - stamp, end, stamp, (system, component, number)
     )
-    system, component = source[sequence + 1], source[sequence + 2]
-    known = Counter(zip(system.tolist(), component.tolist(), number.tolist(), strict=True))
-    unknown, foreign, bad_bytes = _gaps(content, start, end, STAMP if stamped else 0, known)
     received, link, bad_stamps = None, np.zeros(len(start), dtype=np.uint8), 0
-    if stamped:
+    if stamp:
         received, link, bad_stamps = _stamps(source, start, end)
     return Frames(
         name=name,
@@ -230,13 +225,12 @@ def read_frames(path: Path) -> Frames:
         message_id=number,
         system=system,
         component=component,
-        sequence=source[sequence],
+        sequence=source[at],
         link=link,
         payload_start=start + np.where(second, HEADER_2, HEADER_1),
         payload_length=source[start + 1],
         received_us=received,
-        unknown=unknown,
-        foreign=foreign,
+        passed_over=passed_over,
         bad_bytes=bad_bytes,
         bad_stamps=bad_stamps,
     )
@@ -259,38 +253,27 @@ def _scan(content: bytes) -> tuple[Integers, Integers]:
     return np.concatenate([nothing, *starts]), np.concatenate([nothing, *ends])
 
 
-def _without_overlap(start: Integers, end: Integers, stamp: int) -> tuple[Integers, Integers]:
-    """Frames that do not overlap; those that touch a neighbour go before those that do not.
+def _without_overlap(start: Integers, end: Integers) -> tuple[Integers, Integers]:
+    """Frames in file order, without those that begin inside the one before.
 
-    One frame may lie in another one's payload (a tunnel), and by chance a few other bytes look
-    like frames, which must not hide the true ones below them.
+    One frame may lie in another one's payload (a tunnel). By chance a stamp looks like the
+    beginning of a frame, which must not hide the true one that follows the one before.
     """
     if not np.any(start[1:] < end[:-1]):
         return start, end
-    touches = _among(start - stamp, np.sort(end)) | _among(end + stamp, start)
-    keep = _greedy(start, end, np.flatnonzero(touches))
-    kept_start, kept_end = start[keep], end[keep]
-    rest = np.flatnonzero(~touches)
-    after = np.searchsorted(kept_start, start[rest])
-    if len(keep):
-        next_start = np.append(kept_start, np.iinfo(np.int64).max)[after]
-        last_end = np.append(0, kept_end)[after]
-        rest = rest[(end[rest] <= next_start) & (start[rest] >= last_end)]
-    keep = np.sort(np.concatenate([keep, _greedy(start, end, rest)]))
+    keep, reached = [], 0
+    for row, begin in enumerate(start):
+        follows = begin in (reached, reached + STAMP)
+        if begin >= reached and (follows or not _any_of((reached, reached + STAMP), start)):
+            keep.append(row)
+            reached = int(end[row])
     return start[keep], end[keep]
 
 
-def _greedy(start: Integers, end: Integers, rows: Integers) -> Integers:
-    """Rows in order, without those that begin before the last one kept ends."""
-    free = np.ones(len(rows), dtype=np.bool_)
-    free[1:] = start[rows[1:]] >= np.maximum.accumulate(end[rows])[:-1]
-    alone = free & np.append(free[1:], True)
-    keep, reached = [], 0
-    for row in rows[~alone].tolist():
-        if start[row] >= reached:
-            keep.append(row)
-            reached = end[row]
-    return np.sort(np.concatenate([rows[alone], np.array(keep, dtype=np.int64)]))
+def _any_of(values: tuple[int, ...], increasing: Integers) -> bool:
+    """Whether one of some values is among increasing ones."""
+    at = np.searchsorted(increasing[:-1], values)
+    return bool(np.any(increasing[at] == values))
 
 
 def _candidates(
@@ -315,98 +298,65 @@ def _candidates(
     return (start[known], end[known], crc_end[known], _crc_extra()[number[known]].astype(np.uint16))
 
 
-def _among(values: Integers, increasing: Integers) -> BoolArray:
-    """Whether each value is among increasing ones; np.isin takes many times the memory."""
-    at = np.searchsorted(increasing[:-1], values)
-    return np.asarray(increasing[at] == values)
-
-
 def _is_stamped(start: Integers, end: Integers) -> bool:
     """Whether a stamp stands before each frame: eight bytes between neighbours instead of none."""
-    stamped = np.count_nonzero(_among(end + STAMP, start))
-    bare = np.count_nonzero(_among(end, start))
+    apart = start[1:] - end[:-1]
+    stamped, bare = np.count_nonzero(apart == STAMP), np.count_nonzero(apart == 0)
     return bool(stamped > bare) if stamped + bare else bool(start[0] == STAMP)
 
 
-def _without_chance(
-    content: bytes, start: Integers, end: Integers, stamp: int
-) -> tuple[Integers, Integers]:
-    """Drop frames that chance made inside a message that the dialect does not know.
+def _whole_frames(
+    content: bytes, at: int, high: int, stamp: int
+) -> Iterator[tuple[tuple[int, int, int], int]]:
+    """Frames that follow one another between two places, by their headers alone.
 
-    Such a frame touches no neighbour, and without it the bytes between the neighbours are whole
-    frames of unknown messages.
+    Yields
+    ------
+    tuple of int
+        System, component and message.
+    int
+        Size in bytes, with the stamp.
     """
-    highs = np.concatenate([start[1:] - stamp, [len(content)]])
-    lows = np.concatenate([[0], end[:-1]])
-    alone = np.flatnonzero((lows != start - stamp) & (highs != end))
-    chance = []
-    for at in alone.tolist():
-        inside, reached = _whole_frames(content, int(lows[at]), int(highs[at]), stamp)
-        unknown = all(one.message not in dialect.mavlink_map for one in inside)
-        if inside and unknown and reached == highs[at]:
-            chance.append(at)
-    return np.delete(start, chance), np.delete(end, chance)
-
-
-class _Whole(NamedTuple):
-    """A frame by its header alone."""
-
-    system: int
-    component: int
-    message: int
-    size: int
-
-
-def _whole_frames(content: bytes, at: int, high: int, stamp: int) -> tuple[list[_Whole], int]:
-    """Frames that follow one another from one offset on, by their headers, and where they end."""
-    found: list[_Whole] = []
     while at + stamp + HEADER_1 + CHECKSUM <= high:
         head = content[at + stamp : at + stamp + HEADER_2]
-        size = head[1] + HEADER_1 + CHECKSUM
-        system, component, number = head[3], head[4], head[5]
         if head[0] == MAGIC_2 and len(head) == HEADER_2:
             size = head[1] + HEADER_2 + CHECKSUM + SIGNATURE * (head[2] & SIGNED)
-            system, component, number = head[5], head[6], int.from_bytes(head[7:10], "little")
-        elif head[0] != MAGIC_1:
-            break
-        if at + stamp + size > high:
-            break
-        found.append(_Whole(system, component, number, stamp + size))
+            kind = head[5], head[6], int.from_bytes(head[7:10], "little")
+        elif head[0] == MAGIC_1:
+            size, kind = head[1] + HEADER_1 + CHECKSUM, (head[3], head[4], head[5])
+        else:
+            return
         at += stamp + size
-    return found, at
+        if at > high:
+            return
+        yield kind, stamp + size
 
 
-def _gaps(
+def _between(
     content: bytes,
     start: Integers,
     end: Integers,
     stamp: int,
-    known: Mapping[tuple[int, int, int], int],
-) -> tuple[dict[int, int], dict[int, int], int]:
-    """Unknown and foreign frames between the good ones, and the bytes that belong to no frame.
+    kinds: tuple[NDArray[Any], NDArray[Any], NDArray[Any]],
+) -> tuple[dict[int, int], int]:
+    """Whole frames between the good ones by message, and how many bytes belong to no frame.
 
-    ``known`` counts the good frames by system, component and message.
+    ``start`` is with the stamp; ``kinds`` are system, component and message of the good ones.
     """
-    unknown: Counter[int] = Counter()
-    wrong: defaultdict[tuple[int, int, int], list[int]] = defaultdict(list)
-    bad = 0
-    lows = np.concatenate([[0], end])
-    highs = np.concatenate([start - stamp, [len(content)]])
+    lows, highs = np.append(0, end), np.append(start, len(content))
+    bad = int(np.sum(np.maximum(highs - lows, 0)))
+    found: defaultdict[tuple[int, int, int], list[int]] = defaultdict(list)
     for gap in np.flatnonzero(highs > lows).tolist():
-        found, at = _whole_frames(content, int(lows[gap]), int(highs[gap]), stamp)
-        bad += int(highs[gap]) - at
-        for one in found:
-            if one.message in dialect.mavlink_map:
-                wrong[one[:3]].append(one.size)
-            else:
-                unknown[one.message] += 1
-    foreign: Counter[int] = Counter()
-    for sender, sizes in wrong.items():
-        if len(sizes) > max(known.get(sender, 0), 1):
-            foreign[sender[2]] += len(sizes)
-        else:
-            bad += sum(sizes)
-    return dict(unknown), dict(foreign), bad
+        for kind, size in _whole_frames(content, int(lows[gap]), int(highs[gap]), stamp):
+            found[kind].append(size)
+    passed_over: Counter[int] = Counter()
+    for kind, sizes in found.items():
+        known = kind[2] in dialect.mavlink_map
+        good = np.logical_and.reduce([part == one for part, one in zip(kinds, kind, strict=True)])
+        if not known or len(sizes) > max(int(np.count_nonzero(good)), 1):
+            passed_over[kind[2]] += len(sizes)
+            bad -= sum(sizes)
+    return dict(passed_over), bad
 
 
 def _stamps(

@@ -1,5 +1,7 @@
 """The table of MAVLink messages: names, units, frames and directions as data.
 
+A new message with a position is a row of :data:`POSITION_INPUTS`, and nothing else.
+
 Sources: MAVLink ``common.xml``; PX4 ``src/modules/mavlink/mavlink_receiver.cpp`` and
 ``streams/*.hpp`` (v1.13 to v1.16).
 """
@@ -9,12 +11,29 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-import numpy as np
 from scipy import constants
 
 from px4fuse.arrays import Array
-from px4fuse.flight import RECORD_NOT_LOGGED, Unavailable
+from px4fuse.flight import (
+    ANGULAR_RATE_COLUMNS,
+    POSITION_VARIANCE_COLUMNS,
+    QUATERNION_COLUMNS,
+    RECORD_NOT_LOGGED,
+    ROTATION_VARIANCE_COLUMNS,
+    SPECIFIC_FORCE_COLUMNS,
+    VELOCITY_COLUMNS,
+    VELOCITY_VARIANCE_COLUMNS,
+    Unavailable,
+)
 from px4fuse.origin import MOTION_CAPTURE, RECEIVED, Origin
+from px4fuse.readers.layouts import (
+    POSE_DIAGONAL,
+    POSITION_AND_VELOCITY,
+    ROTATION_DIAGONAL,
+    XYZ,
+    Layout,
+    elements,
+)
 
 AUTOPILOT_COMPONENT = 1  # MAV_COMP_ID_AUTOPILOT1
 NO_AUTOPILOT = 8  # MAV_AUTOPILOT_INVALID: a ground station, a camera, a companion computer
@@ -42,89 +61,60 @@ NO_MODES = Unavailable(
     "flight modes", "no HEARTBEAT of a PX4 autopilot", "Record the link of a PX4 vehicle."
 )
 
-
-@dataclass(frozen=True)
-class Remedies:
-    """What would have put each part of a flight into a recording, by the autopilot's own means."""
-
-    imu: str
-    attitude: str
-    state: str
-    variance: str
-    innovations: str
-    fusing: str
-    landed: str
-    position: str
-    truth: str
-    replay: Unavailable
-
-
+# What would have put each part of a flight into a recording, by the autopilot's own means
 _JOIN = "Give the ULog of the same flight as LOG, and this recording with --mavlink."
 _FILE = "give the positioning system's own file with --position."
-PX4_REMEDIES = Remedies(
-    imu="Set the stream rate of HIGHRES_IMU to 50 Hz or more (in PX4's console: mavlink stream "
+_PX4_STATE = "Set the stream rate of ODOMETRY to 30 Hz or more, or join the ULog."
+PX4_REMEDIES: Mapping[str, str] = {
+    "imu": "Set the stream rate of HIGHRES_IMU to 50 Hz or more (in PX4's console: mavlink stream "
     "-d DEVICE -s HIGHRES_IMU -r 100), or join the ULog.",
-    attitude="Set the stream rate of ATTITUDE_QUATERNION to 20 Hz or more, or join the ULog.",
-    state="Set the stream rate of ODOMETRY to 30 Hz or more, or join the ULog.",
-    variance="Set the stream rate of ODOMETRY to 30 Hz or more, or join the ULog.",
-    innovations=_JOIN,
-    fusing=_JOIN,
-    landed="Set the stream rate of EXTENDED_SYS_STATE to 1 Hz, or give --start and --end.",
-    position="Record where the companion's link passes (a MAVLink router), or join the ULog of the "
-    f"flight, or {_FILE}",
-    truth="Real flights have truth only from motion capture (send ATT_POS_MOCAP).",
-    replay=RECORD_NOT_LOGGED,
-)
+    "attitude": "Set the stream rate of ATTITUDE_QUATERNION to 20 Hz or more, or join the ULog.",
+    "state": _PX4_STATE,
+    "variance": _PX4_STATE,
+    "inside": _JOIN,
+    "landed": "Set the stream rate of EXTENDED_SYS_STATE to 1 Hz, or give --start and --end.",
+    "position": "Record where the companion's link passes (a MAVLink router), or join the ULog of "
+    f"the flight, or {_FILE}",
+    "truth": "Real flights have truth only from motion capture (send ATT_POS_MOCAP).",
+}
 # Its own log is DataFlash (.BIN), and SRn_ parameters set the streams of its serial port n
-ARDUPILOT_REMEDIES = Remedies(
-    imu="Ask the autopilot for SCALED_IMU2 at 50 Hz (MAV_CMD_SET_MESSAGE_INTERVAL, or SRn_RAW_SENS "
-    "of the recorded link).",
-    attitude="Ask the autopilot for ATTITUDE at 20 Hz (MAV_CMD_SET_MESSAGE_INTERVAL, or SRn_EXTRA1 "
-    "of the recorded link).",
-    state="Ask the autopilot for LOCAL_POSITION_NED at 10 Hz (MAV_CMD_SET_MESSAGE_INTERVAL, or "
+ARDUPILOT_REMEDIES: Mapping[str, str] = {
+    "imu": "Ask the autopilot for SCALED_IMU2 at 50 Hz (MAV_CMD_SET_MESSAGE_INTERVAL, or "
+    "SRn_RAW_SENS of the recorded link).",
+    "attitude": "Ask the autopilot for ATTITUDE at 20 Hz (MAV_CMD_SET_MESSAGE_INTERVAL, or "
+    "SRn_EXTRA1 of the recorded link).",
+    "state": "Ask the autopilot for LOCAL_POSITION_NED at 10 Hz (MAV_CMD_SET_MESSAGE_INTERVAL, or "
     "SRn_POSITION of the recorded link).",
-    variance="ArduPilot sends no variances; px4fuse does not read its DataFlash log (.BIN).",
-    innovations="ArduPilot keeps them in its DataFlash log (.BIN), which px4fuse does not read.",
-    fusing="ArduPilot keeps them in its DataFlash log (.BIN), which px4fuse does not read.",
-    landed="Ask for EXTENDED_SYS_STATE at 1 Hz, or give --start and --end.",
-    position=f"Record where the companion's link passes (a MAVLink router), or {_FILE}",
-    truth="ArduPilot fuses motion capture itself, so that a real flight's recording has no truth.",
-    replay=Unavailable(
-        "replay of the estimator",
-        "ArduPilot's estimator is another one than the one that px4fuse has a model of",
-        "Read its state as it is.",
-    ),
+    "variance": "ArduPilot sends no variances; px4fuse does not read its DataFlash log (.BIN).",
+    "inside": "ArduPilot keeps them in its DataFlash log (.BIN), which px4fuse does not read.",
+    "landed": "Ask for EXTENDED_SYS_STATE at 1 Hz, or give --start and --end.",
+    "position": f"Record where the companion's link passes (a MAVLink router), or {_FILE}",
+    "truth": "ArduPilot fuses motion capture itself, so that a real flight's recording has no "
+    "truth.",
+}
+ARDUPILOT_REPLAY = Unavailable(
+    "replay of the estimator",
+    "ArduPilot's estimator is another one than the one that px4fuse has a model of",
+    "Read its state as it is.",
 )
 
 
-def remedies_of(autopilot: str) -> Remedies:
-    """Remedies for the autopilot of that name; PX4's for all but ArduPilot."""
-    return ARDUPILOT_REMEDIES if autopilot == "ArduPilot" else PX4_REMEDIES
+def remedies_of(autopilot: str) -> tuple[Mapping[str, str], Unavailable]:
+    """Remedies by part, and why EKF2 is not replayed; PX4's for all but ArduPilot."""
+    if autopilot == "ArduPilot":
+        return ARDUPILOT_REMEDIES, ARDUPILOT_REPLAY
+    return PX4_REMEDIES, RECORD_NOT_LOGGED
 
 
-# Row-major upper triangle of a 6×6 matrix: x, y, z
-POSE_DIAGONAL = np.array([0, 6, 11])
-# The same triangle's rotations about x, y, z
-ROTATION_DIAGONAL = np.array([15, 18, 20])
-# Row-major upper triangle of a 9×9 matrix: x, y, z, vx, vy, vz
-EXTENDED_COVARIANCE_DIAGONAL = np.array([0, 9, 17, 24, 30, 35])
-
-
-@dataclass(frozen=True)
-class ImuSource:
-    """An IMU message and what its units are in m/s² and rad/s; axes are body FRD."""
-
-    message: str
-    acceleration_unit: float
-    angular_rate_unit: float
-
-
+_IMU_COLUMNS = SPECIFIC_FORCE_COLUMNS + ANGULAR_RATE_COLUMNS
+_IMU_FIELDS = dict(
+    zip(_IMU_COLUMNS, ("xacc", "yacc", "zacc", "xgyro", "ygyro", "zgyro"), strict=True)
+)
+# milli-g and mrad/s
+_MILLI = dict(zip(_IMU_COLUMNS, [constants.g * 1e-3] * 3 + [1e-3] * 3, strict=True))
 IMU = (
-    ImuSource("HIGHRES_IMU", 1.0, 1.0),
-    # milli-g and mrad/s
-    ImuSource("SCALED_IMU", constants.g * 1e-3, 1e-3),
-    ImuSource("SCALED_IMU2", constants.g * 1e-3, 1e-3),
-    ImuSource("SCALED_IMU3", constants.g * 1e-3, 1e-3),
+    Layout("HIGHRES_IMU", _IMU_FIELDS),
+    *(Layout(f"SCALED_IMU{n}", _IMU_FIELDS, scale=_MILLI) for n in ("", "2", "3")),
 )
 # Messages whose time_usec is the autopilot's boot clock; GPS_RAW_INT's, say, is the receiver's
 STAMPED_BY_BOOT_CLOCK = ("HIGHRES_IMU", "ODOMETRY", "ESTIMATOR_STATUS")
@@ -133,8 +123,71 @@ OWN_MESSAGES = (
     "HIGHRES_IMU", "SCALED_IMU", "SCALED_IMU2", "SCALED_IMU3", "RAW_IMU", "ATTITUDE_QUATERNION",
     "LOCAL_POSITION_NED", "GLOBAL_POSITION_INT", "SYS_STATUS", "ESTIMATOR_STATUS",
 )  # fmt: skip
+_ANGLES = {"roll": "roll", "pitch": "pitch", "yaw": "yaw"}
 # Equally dense ones are taken in this order
-ATTITUDE = ("ATTITUDE_QUATERNION", "ATTITUDE", "ODOMETRY")
+ATTITUDE = (
+    Layout("ATTITUDE_QUATERNION", {name: f"q{i}" for i, name in enumerate(QUATERNION_COLUMNS, 1)}),
+    Layout("ATTITUDE", _ANGLES),
+    Layout("ODOMETRY", elements(QUATERNION_COLUMNS, "q")),
+)
+
+
+def _pose(covariance: str) -> dict[str, str]:
+    """Variances of position and orientation, which stand on the diagonal of a covariance."""
+    return elements(POSITION_VARIANCE_COLUMNS, covariance, POSE_DIAGONAL) | elements(
+        ROTATION_VARIANCE_COLUMNS, covariance, ROTATION_DIAGONAL
+    )
+
+
+ODOMETRY = Layout(
+    "ODOMETRY",
+    POSITION_AND_VELOCITY
+    | elements(QUATERNION_COLUMNS, "q")
+    | _pose("pose_covariance")
+    | elements(VELOCITY_VARIANCE_COLUMNS, "velocity_covariance", POSE_DIAGONAL)
+    | {name: name for name in ("frame_id", "child_frame_id", "reset_counter")},
+)
+# EKF2's state, those with variances first: of row-major upper triangles of 9×9 matrices
+STATES = (
+    ODOMETRY,
+    Layout(
+        "LOCAL_POSITION_NED_COV",
+        POSITION_AND_VELOCITY
+        | elements(
+            POSITION_VARIANCE_COLUMNS + VELOCITY_VARIANCE_COLUMNS,
+            "covariance",
+            (0, 9, 17, 24, 30, 35),
+        ),
+    ),
+    Layout("LOCAL_POSITION_NED", POSITION_AND_VELOCITY),
+)
+ACCURACY = Layout(
+    "ESTIMATOR_STATUS", {"horizontal_m": "pos_horiz_accuracy", "vertical_m": "pos_vert_accuracy"}
+)
+
+_DEGREES = {"latitude_deg": 1e-7, "longitude_deg": 1e-7}
+_SPEED = dict(zip(VELOCITY_COLUMNS, ("vn", "ve", "vd"), strict=True))
+# Simulation truth; ArduPilot's SIMSTATE has no height and no velocity
+TRUTH = (
+    Layout(
+        "HIL_STATE_QUATERNION",
+        {"latitude_deg": "lat", "longitude_deg": "lon", "altitude_m": "alt"}
+        | dict(zip(VELOCITY_COLUMNS, ("vx", "vy", "vz"), strict=True))
+        | elements(QUATERNION_COLUMNS, "attitude_quaternion"),
+        scale={**_DEGREES, "altitude_m": 1e-3, **dict.fromkeys(VELOCITY_COLUMNS, 1e-2)},
+    ),
+    *(
+        Layout(
+            "SIM_STATE",
+            {"latitude_deg": f"lat{fine}", "longitude_deg": f"lon{fine}", "altitude_m": "alt"}
+            | _SPEED
+            | {name: f"q{i}" for i, name in enumerate(QUATERNION_COLUMNS, 1)},
+            scale=scale,
+        )
+        for fine, scale in (("_int", _DEGREES), ("", {}))
+    ),
+    Layout("SIMSTATE", {"latitude_deg": "lat", "longitude_deg": "lng"}, scale=_DEGREES),
+)
 
 
 @dataclass(frozen=True)
@@ -142,41 +195,54 @@ class PositionInput:
     """An external position on its way to the autopilot.
 
     ``name`` is the track's name for ``--position-source``, ``stamp`` the field with the sender's
-    time in µs. PX4 drops the covariance of a naive estimator (``mavlink_receiver.cpp``).
+    time in µs, ``estimator`` the MAV_ESTIMATOR_TYPE of which it is, where the message has that.
+    PX4 drops the covariance of a naive estimator (``mavlink_receiver.cpp``).
     """
 
     name: str
-    message: str
+    layout: Layout
     stamp: str
     origin: Origin
     description: str
+    estimator: int | None = None
     drops_covariance: bool = False
 
+    @property
+    def message(self) -> str:
+        """Its MAVLink name."""
+        return self.layout.topic
 
-def _odometry(
-    name: str, description: str, drops: bool = False, origin: Origin = RECEIVED
-) -> PositionInput:
-    return PositionInput(name, "ODOMETRY", "time_usec", origin, description, drops)
 
-
+_SENT = "as it was sent to the autopilot"
 _MOCAP = "motion capture, which EKF2 never fuses"
+# ODOMETRY from outside the autopilot is by MAV_ESTIMATOR_TYPE. The others are no measurement: PX4
+# refuses GPS, GPS_INS, LIDAR and AUTOPILOT as input; from the autopilot itself it is EKF2's output.
 POSITION_INPUTS = (
     PositionInput(
-        "VISION_POSITION_ESTIMATE", "VISION_POSITION_ESTIMATE", "usec", RECEIVED,
-        "external vision position as it was sent to the autopilot",
+        "VISION_POSITION_ESTIMATE",
+        Layout("VISION_POSITION_ESTIMATE", XYZ | _ANGLES | _pose("covariance")),
+        "usec", RECEIVED, f"external vision position {_SENT}",
     ),
-    _odometry("ODOMETRY", "external odometry as it was sent to the autopilot"),
-    PositionInput("ATT_POS_MOCAP", "ATT_POS_MOCAP", "time_usec", MOTION_CAPTURE, _MOCAP),
+    PositionInput(
+        "ODOMETRY", ODOMETRY, "time_usec", RECEIVED, f"external odometry {_SENT}", 0,
+    ),
+    PositionInput(
+        "ODOMETRY_NAIVE", ODOMETRY, "time_usec", RECEIVED, "external odometry, without covariance",
+        1, drops_covariance=True,
+    ),
+    PositionInput(
+        "ODOMETRY_VISION", ODOMETRY, "time_usec", RECEIVED, f"visual odometry {_SENT}", 2,
+    ),
+    PositionInput(
+        "ODOMETRY_VIO", ODOMETRY, "time_usec", RECEIVED, f"visual-inertial odometry {_SENT}", 3,
+    ),
+    PositionInput("ODOMETRY_MOCAP", ODOMETRY, "time_usec", MOTION_CAPTURE, _MOCAP, 6),
+    PositionInput(
+        "ATT_POS_MOCAP",
+        Layout("ATT_POS_MOCAP", XYZ | elements(QUATERNION_COLUMNS, "q") | _pose("covariance")),
+        "time_usec", MOTION_CAPTURE, _MOCAP,
+    ),
 )  # fmt: skip
-# ODOMETRY from outside the autopilot by MAV_ESTIMATOR_TYPE. The others are no measurement: PX4
-# refuses GPS, GPS_INS, LIDAR and AUTOPILOT as input; from the autopilot itself it is EKF2's output.
-ODOMETRY_INPUTS: Mapping[int, PositionInput] = {
-    0: _odometry("ODOMETRY", "external odometry as it was sent to the autopilot"),
-    1: _odometry("ODOMETRY_NAIVE", "external odometry, without covariance", True),
-    2: _odometry("ODOMETRY_VISION", "visual odometry as it was sent to the autopilot"),
-    3: _odometry("ODOMETRY_VIO", "visual-inertial odometry as it was sent to the autopilot"),
-    6: _odometry("ODOMETRY_MOCAP", _MOCAP, origin=MOTION_CAPTURE),
-}
 
 
 @dataclass(frozen=True)
@@ -187,14 +253,14 @@ class FrameOfReference:
     """
 
     name: str
-    order: tuple[int, int, int]
-    signs: tuple[float, float, float]
+    order: tuple[int, int, int] = (0, 1, 2)
+    signs: tuple[float, float, float] = (1.0, 1.0, 1.0)
     body: bool = False
 
     @property
     def as_is(self) -> bool:
         """Whether it is NED (or FRD) already, and does not turn with the vehicle."""
-        return not self.body and self.order == _AS_IS and self.signs == _NOTHING
+        return self == FrameOfReference(self.name)
 
     def turn(self, vectors: Array) -> Array:
         """Vectors of this frame in NED (or FRD), shape (n, 3)."""
@@ -205,14 +271,13 @@ class FrameOfReference:
         return variances[:, self.order]
 
 
-_AS_IS, _NOTHING = (0, 1, 2), (1.0, 1.0, 1.0)
 FRAMES_OF_REFERENCE: Mapping[int, FrameOfReference] = {
-    1: FrameOfReference("NED", _AS_IS, _NOTHING),
+    1: FrameOfReference("NED"),
     4: FrameOfReference("NED", (1, 0, 2), (1.0, 1.0, -1.0)),  # ENU: x_N = y, y_E = x, z_D = -z
-    8: FrameOfReference("FRD", _AS_IS, _NOTHING, body=True),  # MAV_FRAME_BODY_NED, in fact FRD
-    12: FrameOfReference("FRD", _AS_IS, _NOTHING, body=True),
-    20: FrameOfReference("FRD", _AS_IS, _NOTHING),
-    21: FrameOfReference("FRD", _AS_IS, (1.0, -1.0, -1.0)),
+    8: FrameOfReference("FRD", body=True),  # MAV_FRAME_BODY_NED, in fact FRD
+    12: FrameOfReference("FRD", body=True),
+    20: FrameOfReference("FRD"),
+    21: FrameOfReference("FRD", signs=(1.0, -1.0, -1.0)),
 }
 
 UNUSED: Mapping[str, str] = {

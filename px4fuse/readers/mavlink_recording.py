@@ -11,16 +11,20 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from px4fuse.arrays import Array, IntArray
-from px4fuse.readers.mavlink_clocks import (
-    UNIX_FROM_S,
-    Line,
-    least_delay,
-    tells_time,
+from px4fuse.flight import (
+    POSITION_COLUMNS,
+    POSITION_VARIANCE_COLUMNS,
+    QUATERNION_COLUMNS,
+    ROTATION_VARIANCE_COLUMNS,
+    STATE_COLUMNS,
+    VELOCITY_COLUMNS,
+    VELOCITY_VARIANCE_COLUMNS,
 )
+from px4fuse.readers.layouts import Layout
+from px4fuse.readers.mavlink_clocks import UNIX_FROM_S, Line, least_delay, tells_time
 from px4fuse.readers.mavlink_frames import LONGEST_FRAME, Frames, message_name, wire_layout
-from px4fuse.readers.mavlink_messages import (
-    STAMPED_BY_BOOT_CLOCK,
-)
+from px4fuse.readers.mavlink_messages import FRAMES_OF_REFERENCE, STAMPED_BY_BOOT_CLOCK
+from px4fuse.readers.parts import MIN_NORM
 from px4fuse.readers.ulog_topics import increasing
 from px4fuse.recording import Stream
 
@@ -64,6 +68,8 @@ class Recording:
     damage : tuple of str
         What could not be read: sentences.
     notes : list of str
+    restarts, receipt_went_back : int or None
+        As :class:`~px4fuse.recording.LogInfo` has them.
     dropped : dict
         Samples dropped for an impossible time stamp, by message; :meth:`frame` fills it.
     streams : dict
@@ -80,6 +86,8 @@ class Recording:
     duration_s: float
     notes: list[str]
     damage: tuple[str, ...] = ()
+    restarts: int | None = None
+    receipt_went_back: int | None = None
     dropped: dict[str, int] = field(default_factory=dict)
     streams: dict[str, Stream] = field(default_factory=dict)
 
@@ -88,31 +96,53 @@ class Recording:
         system, component = address or (self.system, self.component)
         rows = self.frames.rows(message)
         rows = rows[(rows >= self.session.start) & (rows < self.session.stop)]
-        rows = rows[self.frames.system[rows] == system]
-        chosen: IntArray = rows[self.frames.component[rows] == component]
+        own = (self.frames.system[rows] == system) & (self.frames.component[rows] == component)
+        chosen: IntArray = rows[own]
         return chosen
 
-    def frame(self, name: str, boot_s: Array, columns: list[str], values: Array) -> pd.DataFrame:
-        """Samples indexed by seconds of the flight, strictly increasing.
+    def read(
+        self,
+        layout: Layout,
+        rows: IntArray | None = None,
+        boot_s: Array | None = None,
+        name: str = "",
+    ) -> pd.DataFrame:
+        """Samples of one message by seconds of the flight, strictly increasing.
 
         Parameters
         ----------
-        name : str
-            Under which dropped samples are counted.
-        boot_s : ndarray, shape (n,)
-            Boot clock; NaN drops the sample.
-        columns : list of str, length m
-        values : ndarray, shape (n, m)
+        layout : Layout
+            Angles become quaternions, and what is in a frame of its own comes in NED (or FRD).
+        rows : ndarray, shape (n,), optional
+            Of :meth:`rows`; by default all of the autopilot.
+        boot_s : ndarray, shape (n,), optional
+            Boot clock; NaN drops the sample. By default the message's own stamp.
+        name : str, optional
+            Under which dropped samples are counted, by default the message's.
         """
-        keep = self._keep(name, boot_s)
-        kept = values[keep]
-        kept[~np.isfinite(kept)] = np.nan
-        return pd.DataFrame(
-            kept,
+        rows = self.rows(layout.topic) if rows is None else rows
+        table = self.frames.table(layout.topic, rows)
+        boot_s = self.boot_s(table, rows) if boot_s is None else boot_s
+        keep = self._keep(name or layout.topic, boot_s)
+        if len(keep) < len(table):
+            table = table[keep]
+        # an hour of the IMU is hundreds of megabytes, so that nothing is kept twice
+        values = np.empty((len(keep), len(layout.columns)))
+        for at, (column, field_name) in enumerate(layout.columns.items()):
+            base, _, index = field_name.removesuffix("]").partition("[")
+            field_values = table[base][:, int(index)] if index else table[base]
+            values[:, at] = field_values.astype(np.float64) * layout.scale.get(column, 1.0)
+        del table
+        values[~np.isfinite(values)] = np.nan
+        samples = pd.DataFrame(
+            values,
             index=pd.Index(boot_s[keep] - self.zero_s, name="time_s"),
-            columns=columns,
-            copy=False,  # it is a copy already
+            columns=list(layout.columns),
+            copy=False,
         )
+        if "roll" in samples:
+            samples[QUATERNION_COLUMNS] = _quaternions_of_angles(samples)
+        return _in_ned(samples) if "frame_id" in samples else samples
 
     def _keep(self, name: str, boot_s: Array) -> IntArray:
         """Samples with a possible time stamp, strictly increasing; the others are counted."""
@@ -148,19 +178,49 @@ class Recording:
         self.streams[part] = Stream(messages, clock, self.frames.name)
 
 
-def vector(table: NDArray[Any], *fields: str, scale: float = 1.0) -> Array:
-    """Fields of a table as columns of float64, shape (n, number of fields)."""
-    return np.column_stack([table[name].astype(np.float64) * scale for name in fields])
-
-
-def quaternions_of_angles(table: NDArray[Any]) -> Array:
-    """Fields roll, pitch and yaw (rad) as w, x, y, z, shape (n, 4); NaN where not finite."""
-    angles = vector(table, "yaw", "pitch", "roll")
+def _quaternions_of_angles(samples: pd.DataFrame) -> Array:
+    """Roll, pitch and yaw (rad) as w, x, y, z, shape (n, 4); NaN where not finite."""
+    angles = samples[["yaw", "pitch", "roll"]].to_numpy()
     known = np.isfinite(angles).all(axis=1)
-    quaternion = np.full((len(table), 4), np.nan)
+    quaternion = np.full((len(angles), 4), np.nan)
     if known.any():
         quaternion[known] = Rotation.from_euler("ZYX", angles[known]).as_quat(scalar_first=True)
     return quaternion
+
+
+def _in_ned(samples: pd.DataFrame) -> pd.DataFrame:
+    """ODOMETRY in NED (or FRD); NaN where a frame is not one of those that PX4 knows.
+
+    The velocity is in the child frame, which PX4 sets to the body up to v1.13 and to NED later
+    (``streams/ODOMETRY.hpp``). Orientations are given up where the frame is not NED or FRD: what
+    such a sender calls its body is not known.
+    """
+    turned = np.linalg.norm(samples[QUATERNION_COLUMNS].to_numpy(), axis=1) > MIN_NORM
+    orientation = QUATERNION_COLUMNS + ROTATION_VARIANCE_COLUMNS
+    made = samples.copy()
+    made[STATE_COLUMNS + POSITION_VARIANCE_COLUMNS] = np.nan
+    made[VELOCITY_VARIANCE_COLUMNS + orientation] = np.nan
+    used = {*samples["frame_id"].unique(), *samples["child_frame_id"].unique()}
+    for number in used & FRAMES_OF_REFERENCE.keys():
+        frame = FRAMES_OF_REFERENCE[number]
+        own = samples[(samples["frame_id"] == number) & (not frame.body)]
+        made.loc[own.index, POSITION_COLUMNS] = frame.turn(own[POSITION_COLUMNS].to_numpy())
+        variance = frame.permute(own[POSITION_VARIANCE_COLUMNS].to_numpy())
+        made.loc[own.index, POSITION_VARIANCE_COLUMNS] = variance
+        if frame.as_is:
+            made.loc[own.index, orientation] = own[orientation]
+        moving = samples[(samples["child_frame_id"] == number) & (turned | (not frame.body))]
+        speed = frame.turn(moving[VELOCITY_COLUMNS].to_numpy())
+        spread = frame.permute(moving[VELOCITY_VARIANCE_COLUMNS].to_numpy())
+        if frame.body and len(moving):
+            quaternion = moving[QUATERNION_COLUMNS].to_numpy(copy=True)
+            rotation = Rotation.from_quat(quaternion, scalar_first=True).as_matrix()
+            speed = np.einsum("nij,nj->ni", rotation, speed)
+            # diagonal of R diag(s) Rᵀ
+            spread = np.einsum("nij,nj->ni", rotation**2, spread)
+        made.loc[moving.index, VELOCITY_COLUMNS] = speed
+        made.loc[moving.index, VELOCITY_VARIANCE_COLUMNS] = spread
+    return made
 
 
 def _boot_stamps(frames: Frames, address: Address) -> tuple[IntArray, Array]:
@@ -229,14 +289,23 @@ def settle_clocks(frames: Frames, address: Address) -> Recording:
         received = stamps[at]
     else:
         notes.append("no message in the stream carries a time: nothing in it can be placed in time")
-    notes += _frame_notes(frames, received)
-    damage = _damage(frames)
+    back = int(np.count_nonzero(np.diff(received) < 0.0)) if frames.received_us is not None else 0
+    notes += _frame_notes(frames, back)
+    share = frames.bad_bytes / len(frames.content)
+    lost = f"{frames.bad_bytes:,} bytes ({share:.2%}) belong to no whole MAVLink frame"
+    # a first and a last frame that are cut are no damage
+    inside = frames.bad_bytes - 2 * LONGEST_FRAME
+    is_damaged = inside > DAMAGED_SHARE * len(frames.content)
+    damage = (f"the file is damaged: {lost}",) if is_damaged else ()
+    if frames.bad_bytes and not is_damaged:
+        notes.append(lost)
     # without a boot clock the receipt must do
     span = stamps if len(stamps) else np.array([0.0, received.max()])
     zero_s, end_s = float(span[0]), float(span[-1])
     return Recording(
-        frames, *address, session, received, line, zero_s, end_s - zero_s, notes, damage
-    )
+        frames, *address, session, received, line, zero_s, end_s - zero_s, notes, damage,
+        len(restarts) or None, back or None,
+    )  # fmt: skip
 
 
 def _without_strays(stamps: Array, rows: IntArray) -> IntArray:
@@ -247,38 +316,21 @@ def _without_strays(stamps: Array, rows: IntArray) -> IntArray:
     return np.concatenate(parts[many[0] : many[-1] + 1])
 
 
-def _damage(frames: Frames) -> tuple[str, ...]:
-    """What could not be read, where it is more than a first and a last frame that are cut."""
-    inside = frames.bad_bytes - 2 * LONGEST_FRAME
-    damaged = inside > DAMAGED_SHARE * len(frames.content)
-    return (f"the file is damaged: {_passed_over(frames)}",) if damaged else ()
-
-
-def _passed_over(frames: Frames) -> str:
-    share = frames.bad_bytes / len(frames.content)
-    return f"{frames.bad_bytes:,} bytes ({share:.2%}) belong to no whole MAVLink frame"
-
-
-def _frame_notes(frames: Frames, received: Array) -> list[str]:
+def _frame_notes(frames: Frames, back: int) -> list[str]:
     notes = []
-    if frames.bad_bytes and not _damage(frames):
-        notes.append(_passed_over(frames))
-    if frames.foreign:
+    if frames.passed_over:
         listed = ", ".join(
-            f"{count} of {message_name(number)}" for number, count in sorted(frames.foreign.items())
+            f"{count} of {message_name(number)}"
+            for number, count in sorted(frames.passed_over.items())
         )
         notes.append(
-            "whole frames of a dialect that px4fuse does not know (it defines these messages "
-            f"otherwise, so that their checksums do not match) were passed over: {listed}"
+            "whole frames of messages that px4fuse does not know, or knows with other checksums, "
+            f"were passed over: {listed}"
         )
     if frames.bad_stamps:
         notes.append(f"{frames.bad_stamps} times of receipt are damaged and were interpolated")
-    back = int(np.count_nonzero(np.diff(received) < 0.0))
-    if back and frames.received_us is not None:
+    if back:
         notes.append(f"the time of receipt went back {back} {'times' if back > 1 else 'time'}")
-    if frames.unknown:
-        listed = ", ".join(f"{count} of {name}" for name, count in sorted(frames.unknown.items()))
-        notes.append(f"messages with ids that this version does not know: {listed}")
     return notes
 
 

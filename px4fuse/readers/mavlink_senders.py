@@ -106,7 +106,8 @@ def senders_of(recording: Recording, message: str) -> list[Address]:
 
 def map_senders(recording: Recording) -> dict[Address, Mapped]:
     """Clock of every sender of an external position."""
-    found = {s for source in POSITION_INPUTS for s in senders_of(recording, source.message)}
+    messages = {source.message for source in POSITION_INPUTS}
+    found = {s for message in messages for s in senders_of(recording, message)}
     unix = unix_of_boot(recording)
     return {sender: _map_sender(recording, sender, unix) for sender in sorted(found)}
 

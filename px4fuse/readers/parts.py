@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 
-from px4fuse.arrays import BoolArray
+from px4fuse.arrays import Array, BoolArray
 from px4fuse.flight import (
     QUATERNION_COLUMNS,
     ROTATION_VARIANCE_COLUMNS,
@@ -17,6 +17,7 @@ from px4fuse.flight import (
 
 # No position, velocity, acceleration or angle of a flight in SI units comes near it
 DAMAGED = 1e9
+MIN_NORM = 0.5  # a zero quaternion is no attitude
 
 
 def missing_parts(
@@ -72,6 +73,12 @@ def finite_rows(samples: pd.DataFrame, columns: list[str]) -> pd.DataFrame:
     return samples[possible]
 
 
+def with_attitude(samples: pd.DataFrame) -> pd.DataFrame:
+    """Rows of a frame with a quaternion ``w, x, y, z``; one of norm 0 means "not given"."""
+    norm: Array = np.linalg.norm(samples[QUATERNION_COLUMNS].to_numpy(), axis=1)
+    return samples[(norm > MIN_NORM) & (norm < DAMAGED)]
+
+
 def orientation_of(samples: pd.DataFrame) -> pd.DataFrame | None:
     """Orientations in a frame of samples; None where there are none, or all are the same.
 
@@ -79,19 +86,18 @@ def orientation_of(samples: pd.DataFrame) -> pd.DataFrame | None:
     ----------
     samples : DataFrame
         With the columns ``w, x, y, z`` where the sender gave quaternions, and perhaps
-        ``forward_rad2, right_rad2, down_rad2``. A quaternion of norm 0 and a variance of 0
-        mean "not given" (``EKF2.cpp``).
+        ``forward_rad2, right_rad2, down_rad2``, of which 0 means "not given" (``EKF2.cpp``).
     """
-    if not set(QUATERNION_COLUMNS) <= set(samples.columns):
-        return None
-    found = finite_rows(
-        samples.reindex(columns=QUATERNION_COLUMNS + ROTATION_VARIANCE_COLUMNS), QUATERNION_COLUMNS
-    )
-    norm = np.linalg.norm(found[QUATERNION_COLUMNS].to_numpy(), axis=1)
-    found = found[norm > 0.5]
+    found = with_attitude(samples.reindex(columns=QUATERNION_COLUMNS + ROTATION_VARIANCE_COLUMNS))
     quaternions = found[QUATERNION_COLUMNS]
     if len(found) < 2 or (quaternions == quaternions.iloc[0]).to_numpy().all():
         return None
     variances = found[ROTATION_VARIANCE_COLUMNS]
     oriented: pd.DataFrame = found.assign(**variances.where(variances > 0))
     return oriented
+
+
+def attitude_of(samples: pd.DataFrame | None) -> pd.DataFrame | None:
+    """Quaternions of :func:`orientation_of` alone."""
+    found = None if samples is None else orientation_of(samples)
+    return None if found is None else found[QUATERNION_COLUMNS]

@@ -1,9 +1,9 @@
 """An external UWB positioning log (CSV) to samples on its own clock and in its own frame.
 
 The documented format is a header and ``time, x, y, z`` in seconds and metres, with ``sigma`` or
-``sigma_x, sigma_y, sigma_z`` or ``quality`` where the system gives them. Vendors write many others,
-so separator, header, columns and units are detected. Every decision is stated, and every decision
-that a person might have to correct has an option.
+``sigma_x, sigma_y, sigma_z`` or ``quality`` where the system gives them. Vendors write others, so
+separator, names and units are detected. Every decision is stated, and every decision that a person
+might have to correct has an option.
 """
 
 from __future__ import annotations
@@ -11,6 +11,8 @@ from __future__ import annotations
 import csv
 import hashlib
 import io
+import re
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -19,20 +21,23 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.errors import LogError, SettingsError
-from px4fuse.readers.position_columns import ColumnChoice, choose
 from px4fuse.readers.position_names import (
     LENGTH_UNITS,
+    TIME_KINDS,
     TIME_UNITS,
+    Meaning,
+    find_position,
+    find_sigma,
+    meaning,
 )
-from px4fuse.readers.position_table import (
-    COLUMNS,
-    MISSING,
-    Table,
-    find_table,
-    plain_text,
-    split,
+from px4fuse.readers.text_table import (
+    UNIX_END_S,
+    UNIX_START_S,
+    at_line,
+    quote,
+    seconds_of,
+    text_of,
 )
-from px4fuse.readers.text_table import UNIX_END_S, UNIX_START_S, at_line, quote, seconds_of
 from px4fuse.readers.ulog_topics import increasing
 from px4fuse.reading import read_whole, shown
 
@@ -49,18 +54,13 @@ MAX_UNIX_INTERVAL_S = 60.0
 MIN_SPREAD_M, MAX_SPREAD_M = 0.2, 200.0
 MAX_COORDINATE = 1e9  # in any unit; beyond it stands a time stamp, or damage
 MAX_TICKS = 2**61  # of a time stamp in its own unit; differences must fit into int64
-
-_CSV = {
-    "header": None,
-    "index_col": False,
-    "dtype_backend": "numpy_nullable",  # integers stay exact where some are missing
-    "na_values": MISSING,
-    "keep_default_na": False,
-    "skip_blank_lines": False,  # so that rows are lines
-    "skipinitialspace": True,
-    "quoting": csv.QUOTE_NONE,
-    "low_memory": False,
-}
+# The header is looked for in so much of the file
+HEAD_LINES, HEAD_CHARS = 1000, 200_000
+MAX_COLUMNS = 200
+_COLUMNS = "`columns` TIME,X,Y,Z"
+_SEPARATORS = {";": "semicolon", "\t": "tab", ",": "comma", " ": "space"}
+_MISSING = ["", "-", "--", "nan", "-nan", "nan(ind)", "-nan(ind)", "inf", "+inf", "-inf"]
+_MISSING += ["na", "n/a", "null", "none"]
 
 
 @dataclass(frozen=True)
@@ -87,6 +87,8 @@ class PositionRecording:
         One sentence per decision.
     notes : tuple of str
         What was dropped and why, and what looks doubtful.
+    dropped : int
+        Rows without a time that can be.
     """
 
     name: str
@@ -97,6 +99,76 @@ class PositionRecording:
     frame: str | None
     detected: tuple[str, ...]
     notes: tuple[str, ...]
+    dropped: int = 0
+
+
+@dataclass(frozen=True)
+class _Table:
+    """Where the table is in a file."""
+
+    file: str
+    separator: str
+    names: list[str]  # of the columns
+    body: str  # whole lines after the header
+    first_line: int  # number of the body's first line
+
+    def label(self, *columns: int | None) -> str:
+        """Names of some columns for a person, each once."""
+        some = dict.fromkeys(
+            quote(self.names[at]) if self.names[at] else f"column {at + 1}"
+            for at in columns
+            if at is not None
+        )
+        return ", ".join([*some][:12]) + (", ..." if len(some) > 12 else "")
+
+    def texts(self, columns: Iterable[int], rows: int | None = None) -> pd.DataFrame:
+        """Texts of some columns; None where a value is missing."""
+        used = sorted(set(columns))
+        try:
+            texts = pd.read_csv(
+                io.StringIO(self.body),
+                sep=r"\s+" if self.separator == " " else self.separator,
+                header=None,
+                index_col=False,
+                names=range(used[-1] + 1),
+                usecols=used,
+                dtype=str,
+                nrows=rows,
+                keep_default_na=False,
+                skip_blank_lines=False,  # so that rows are lines
+                quoting=csv.QUOTE_NONE,
+            )
+        except ValueError as error:
+            raise LogError(f"{self.file}: no table of numbers. Export it as CSV again.") from error
+        texts = texts.apply(lambda column: column.str.strip())
+        made: pd.DataFrame = texts.mask(
+            texts.apply(lambda column: column.str.lower().isin(_MISSING)), None
+        )
+        return made
+
+
+@dataclass(frozen=True)
+class _Choice:
+    """Which columns are read, by index."""
+
+    time: int
+    position: tuple[int | None, ...]
+    sigma: tuple[int | None, ...]
+    quality: int | None
+    tag: int | None
+    frame: str | None
+    meanings: list[Meaning]
+    time_words: str
+
+    @property
+    def sources(self) -> tuple[int | None, ...]:
+        """Columns in the order of SAMPLE_COLUMNS."""
+        return (*self.position, *self.sigma, self.quality)
+
+    def unit(self, column: int, units: Iterable[str]) -> str | None:
+        """Unit that a column's name gives."""
+        said = self.meanings[column].unit
+        return said if said in units else None
 
 
 def read_position_csv(
@@ -116,7 +188,7 @@ def read_position_csv(
         TIME, X, Y, Z and optionally SIGMA, each a column's name or its number from 1. Z may be
         left out together with SIGMA.
     time_unit : {"s", "ms", "us", "ns"}, optional
-        Unit of the time column, whatever its name and its values say; ISO 8601 text has none.
+        Unit of the time column, whatever its name and its values say.
     length_unit : {"m", "cm", "mm"}, optional
         Unit of positions and sigmas, whatever their names say.
 
@@ -130,11 +202,10 @@ def read_position_csv(
     """
     _check_options(columns, time_unit, length_unit)
     path = Path(path)
-    name = shown(path)
     content = read_whole(path, LogError, MAX_FILE_BYTES, again="Copy it again")
-    table = find_table(name, plain_text(name, content), columns)
-    choice = choose(table, columns)
-    ticks, numbers, notes = _read_rows(table, choice)
+    table, notes = _find_table(shown(path), content, columns)
+    choice = _choose(table, columns)
+    ticks, numbers = _read_rows(table, choice, notes)
     unit, unit_words = _time_unit(ticks, choice, time_unit)
     seconds = seconds_of(ticks, round(1.0 / TIME_UNITS[unit]))
     usable = np.flatnonzero(np.abs(seconds) < UNIX_END_S)
@@ -145,9 +216,9 @@ def read_position_csv(
         notes.append(f"{_count(dropped)} dropped: their time stamps repeat, go back or are absurd")
     if len(keep) < MIN_ROWS:
         raise LogError(
-            f"{name}: usable rows: {len(keep)}, at least {MIN_ROWS} are needed"
+            f"{table.file}: usable rows: {len(keep)}, at least {MIN_ROWS} are needed"
             f"{''.join('; ' + note for note in notes)}. Copy the file again, or say where time and "
-            f"position are with {COLUMNS}."
+            f"position are with {_COLUMNS}."
         )
     numbers = numbers.iloc[keep].set_index(pd.Index(seconds[keep], name="time_s"))
     step = float(np.median(np.diff(numbers.index)))
@@ -156,30 +227,37 @@ def read_position_csv(
             f"one sample in {step:.3g} s (median) is not a rate of a UWB: check "
             "--position-time-unit"
         )
-    units, length_words = _length_units(numbers, choice, length_unit)
+    scales, length_words = _length_units(numbers, choice, length_unit)
     samples = pd.DataFrame(np.nan, index=numbers.index, columns=SAMPLE_COLUMNS)
-    sources = (*choice.position, *choice.sigma, choice.quality)
-    for column, index in zip(SAMPLE_COLUMNS, sources, strict=True):
+    for column, index in zip(SAMPLE_COLUMNS, choice.sources, strict=True):
         if index is not None:
-            scale = 1.0 if column == "quality" else LENGTH_UNITS[units[index]]
-            samples[column] = numbers[index] * scale
+            samples[column] = numbers[index] * (1.0 if column == "quality" else scales[index])
     wrong = samples[SIGMA_COLUMNS] <= 0.0
     if rows := int(wrong.any(axis=1).sum()):
         notes.append(f"sigma is not above zero in {rows} rows and was left out there")
         samples[SIGMA_COLUMNS] = samples[SIGMA_COLUMNS].mask(wrong)
     is_unix = UNIX_START_S <= float(np.median(numbers.index)) < UNIX_END_S
     clock: Literal["UNIX", "local"] = "UNIX" if is_unix else "local"
-    time, position, *others = choice.detected
-    time, position = f"{time}, {clock} clock, in {unit_words}", f"{position}, in {length_words}"
+    axes = choice.frame.upper() if choice.frame else "x, y, z"
+    height = "" if choice.position[2] is not None else " without height"
+    quality = f"{table.label(choice.quality)}, as given" if choice.quality is not None else "none"
     return PositionRecording(
-        name=name,
+        name=table.file,
         sha256=hashlib.sha256(content).hexdigest(),
         size_bytes=len(content),
         samples=samples.where(np.isfinite(samples)),  # 1e999 reads as infinity
         clock=clock,
         frame=choice.frame,
-        detected=(table.detected, time, position, *others),
-        notes=(*choice.notes, *notes),
+        dropped=dropped,
+        detected=(
+            f"table: {_SEPARATORS[table.separator]} between columns, header in line "
+            f"{table.first_line - 1}",
+            f"time: {choice.time_words}, {clock} clock, in {unit_words}",
+            f"position: {table.label(*choice.position)} as {axes}{height}, in {length_words}",
+            f"sigma: {table.label(*choice.sigma) or 'none'}",
+            f"quality: {quality}",
+        ),
+        notes=tuple(notes),
     )
 
 
@@ -196,7 +274,7 @@ def _check_options(
     given = [column.strip().casefold() for column in columns or ("1", "2", "3")]
     if not 3 <= len(given) <= 5 or "" in given or len(set(given)) < len(given):
         raise SettingsError(
-            f"{COLUMNS}[,SIGMA]: {','.join(given)!r} does not name four or five different "
+            f"{_COLUMNS}[,SIGMA]: {','.join(given)!r} does not name four or five different "
             "columns (three where there is no height)."
         )
 
@@ -205,109 +283,175 @@ def _count(rows: int) -> str:
     return "1 row was" if rows == 1 else f"{rows} rows were"
 
 
-def _convert(texts: Any, is_iso: bool, errors: Literal["raise", "coerce"]) -> Any:
-    """Times, or numbers, of texts."""
-    if is_iso:
-        plain = texts.str.replace("/", "-")
-        return pd.to_datetime(plain, format="ISO8601", utc=True, errors=errors)
-    return pd.to_numeric(texts, errors=errors)
+def _split(line: str, separator: str) -> list[str]:
+    """Fields of one line."""
+    if separator == " ":  # "x [mm]" is one name
+        return re.sub(r" +(?=[\[(])", "", line.strip()).split()
+    return [field.strip() for field in line.split(separator)]
 
 
-def _read_rows(table: Table, choice: ColumnChoice) -> tuple[Any, pd.DataFrame, list[str]]:
-    """Times in their own unit (µs from ISO 8601 text), the other columns by index, and notes.
+def _find_table(
+    file: str, content: bytes, columns: tuple[str, ...] | None
+) -> tuple[_Table, list[str]]:
+    """Find separator, header and first row, and say whether a last line was left out."""
+    text = text_of(content)
+    if text is None:
+        raise LogError(
+            f"{file}: a binary file, not a text table. Give the CSV file of the UWB system; a "
+            "flight log is read without `position`."
+        )
+    notes = []
+    whole, _, last = text.replace('"', "").rpartition("\n")
+    text = f"{whole}\n"
+    if last.strip():
+        number = text.count("\n") + 1
+        notes.append(f"line {number}, the last one, was dropped: it may be cut, as it has no end")
+    lines = text[: text.rfind("\n", 0, HEAD_CHARS) + 1].split("\n")[:HEAD_LINES]
+    wanted = {column.strip().casefold() for column in columns or () if not column.isdecimal()}
+    headers = (
+        (at + 1, separator, names)
+        for at, line in enumerate(lines)
+        for separator in _SEPARATORS
+        for names in [_split(line.strip("#% "), separator)]
+        if len(names) <= MAX_COLUMNS and _is_header(names, wanted)
+    )
+    start, separator, names = next(headers, (0, "", []))
+    if not names:
+        told = ", ".join(map(quote, sorted(wanted))) or "time, x, y, z"
+        raise LogError(
+            f"{file}: no header with the columns {told} in its first {len(lines)} lines, of which "
+            f"the first is {quote(lines[0])}. Give a CSV file with a header, or name its columns "
+            f"with {_COLUMNS}."
+        )
+    body = re.sub(r"(?m)^[ \t]*[#%].*", "", text.split("\n", start)[start])
+    head = body[:HEAD_CHARS].lstrip("\n").partition("\n")[0].rstrip(f"{separator} ")
+    width = len(_split(head, separator))
+    if width > len(names):
+        raise LogError(
+            f"{file}: the header names {len(names)} columns, but rows have {width}. Export it with "
+            "decimal points, and with a name for every column."
+        )
+    return _Table(file, separator, names, body, start + 1), notes
 
-    Of rows with time and position.
-    """
-    body, notes = table.body, []
-    last = body[body.rfind("\n") + 1 :]
-    if last and _is_cut(split(last, table.separator), table.head):
-        body = body[: -len(last)]
-        number = table.first_line + body.count("\n")
-        notes.append(f"line {number}, the last one, was dropped: it is cut")
-    used = [choice.time, *choice.numbers]
-    options: dict[str, Any] = _CSV | {
-        "sep": r"\s+" if table.separator == " " else table.separator,
-        "names": list(range(max(used) + 1)),
-        "usecols": used,
-    }
-    kinds = {choice.time: "str"} if choice.iso else {}
-    kinds |= dict.fromkeys(choice.numbers, "float64")
-    try:
-        rows = pd.read_csv(io.StringIO(body), dtype=kinds, **options)
-        times = _convert(rows[choice.time], bool(choice.iso), "raise")
-    except ValueError as error:
-        texts = pd.read_csv(io.StringIO(body), dtype=str, **options)
-        raise LogError(_name_text(table, choice, texts)) from error
-    numbers = rows[choice.numbers]
-    filled = times.notna() | numbers.notna().any(axis=1)  # others are blank lines
-    is_usable = times.notna() & (numbers[choice.axes].abs() < MAX_COORDINATE).all(axis=1)
-    if choice.iso:
-        times = times.dt.as_unit("us").astype("int64")
-    elif choice.nanoseconds is not None:
-        times = times + numbers[choice.nanoseconds] * 1e-9
-    is_usable &= times.between(-MAX_TICKS, MAX_TICKS).fillna(False)
+
+def _is_header(fields: list[str], wanted: set[str]) -> bool:
+    """Whether these are names of columns: those that were asked for, or of time and position."""
+    if wanted:
+        return wanted <= {name.casefold() for name in fields}
+    meanings = [meaning(name) for name in fields]
+    has_time = any(column.kind == "time" for column in meanings)
+    return has_time and find_position(meanings) is not None
+
+
+def _choose(table: _Table, columns: tuple[str, ...] | None) -> _Choice:
+    """Choose the columns: those that the option tells, else by name."""
+    meanings = [meaning(name) for name in table.names]
+    told = _resolve(table, columns) if columns else []
+    shown = [m if not told or i in told[1:4] else Meaning() for i, m in enumerate(meanings)]
+    found = find_position(shown)
+    if told:
+        time, words = told[0], table.label(told[0])
+        position: tuple[int | None, ...] = (*told[1:4], None)[:3]
+        # the order of the names is that of their frame, as far as they are of one
+        frame, position = found if found and {*found[1]} == {*position} else (None, position)
+    else:
+        time, words = _choose_time(table, meanings)
+        frame, position = found or (None, ())
+    if position[2] is not None and table.texts([position[2]], HEAD_LINES).isna().all(axis=None):
+        position = (*position[:2], None)
+    backwards = [*enumerate(meanings)][::-1]  # of several with one meaning the first is kept
+    sigmas = {m.key: i for i, m in backwards if m.kind == "sigma"}
+    sigma = (told[4],) * 3 if len(told) > 4 else find_sigma(sigmas, frame)
+    kinds = {m.kind: i for i, m in backwards}
+    quality, tag = kinds.get("quality"), kinds.get("tag")
+    return _Choice(time, position, sigma, quality, tag, frame, meanings, words)
+
+
+def _resolve(table: _Table, columns: tuple[str, ...]) -> list[int]:
+    """Columns that the option names, by index."""
+    names = [name.casefold() for name in table.names]
+    found = []
+    for column in columns:
+        wanted = column.strip().casefold()
+        if wanted not in names and not (wanted.isdecimal() and 1 <= float(wanted) <= len(names)):
+            raise SettingsError(
+                f"{table.file}: no column {quote(column)} found (the columns are "
+                f"{table.label(*range(len(names)))}). Name them with {_COLUMNS}."
+            )
+        found.append(names.index(wanted) if wanted in names else int(wanted) - 1)
+    if len({*found}) < len(found):
+        raise SettingsError(f"{_COLUMNS}: {quote(','.join(columns))} names one column twice.")
+    return found
+
+
+def _choose_time(table: _Table, meanings: list[Meaning]) -> tuple[int, str]:
+    """Column of time, and the words on it: of measurement before that of recording, if filled."""
+    times = [index for index, column in enumerate(meanings) if column.kind == "time"]
+    texts = table.texts(times, HEAD_LINES)
+
+    def rank(index: int) -> tuple[bool, int]:
+        is_filled = texts[index].str.strip("+-0.").fillna("").ne("")
+        return bool(is_filled.mean() <= 0.5), TIME_KINDS.index(meanings[index].key)
+
+    first, *others = sorted(times, key=rank)
+    words = f", the {meanings[first].key} (not used: {table.label(*others)})" if others else ""
+    return first, table.label(first) + words
+
+
+def _read_rows(table: _Table, choice: _Choice, notes: list[str]) -> tuple[Any, pd.DataFrame]:
+    """Times in their own unit, and the other columns by index, of rows with time and position."""
+    used = dict.fromkeys(index for index in (choice.time, *choice.sources) if index is not None)
+    texts = table.texts(used)
+    # integers stay exact where some are missing
+    exact: dict[str, Any] = {"errors": "coerce", "dtype_backend": "numpy_nullable"}
+    numbers = {index: pd.to_numeric(texts[index], **exact) for index in used}
+    bad = [
+        (int(row), index)
+        for index, values in numbers.items()
+        if index != choice.quality
+        for row in np.flatnonzero(texts[index].notna() & values.isna())[:1]
+    ]
+    if bad:
+        row, column = min(bad)
+        text, kind = str(texts[column].iloc[row]), "time" if column == choice.time else "number"
+        what = f"{table.label(column)}: {quote(text)} is not a {kind}"
+        remedy = f"Correct or remove that line, or say where time and position are with {_COLUMNS}."
+        raise LogError(at_line(table.file, table.first_line + row, what, remedy))
+    times = numbers.pop(choice.time)
+    others = pd.DataFrame({at: values.astype("float64") for at, values in numbers.items()})
+    axes = [index for index in choice.position if index is not None]
+    is_usable = times.between(-MAX_TICKS, MAX_TICKS).fillna(False)
+    is_usable &= (others[axes].abs() < MAX_COORDINATE).all(axis=1)
+    filled = texts.notna().any(axis=1)  # others are blank lines
     if missing := int(filled.sum() - is_usable.sum()):
         notes.insert(0, f"{_count(missing)} dropped: without a usable time or position")
-    exact = "int64" if times.dtype.kind == "i" else "float64"
-    return times[is_usable].to_numpy(dtype=exact), numbers[is_usable], notes
+    if choice.tag is not None:
+        tags = sorted({*table.texts([choice.tag], HEAD_LINES)[choice.tag].dropna()})
+        if tags[1:]:
+            notes.append(f"several tags ({', '.join(map(quote, tags[:2]))}): keep those of one")
+    dtype = "int64" if times.dtype.kind == "i" else "float64"
+    return times[is_usable].to_numpy(dtype=dtype), others[is_usable]
 
 
-def _name_text(table: Table, choice: ColumnChoice, texts: pd.DataFrame) -> str:
-    """Name the first text where a number or a time belongs."""
-    bad = []
-    for column in (choice.time, *choice.numbers):
-        is_iso = bool(choice.iso) and column == choice.time
-        is_text = texts[column].notna() & _convert(texts[column], is_iso, "coerce").isna()
-        bad += [(int(row), column) for row in np.flatnonzero(is_text)[:1]]
-    if not bad:
-        return f"{table.file}: no table of numbers. Export it as CSV again."
-    row, column = min(bad)
-    kind = "time" if column == choice.time else "number"
-    return at_line(
-        table.file,
-        table.first_line + row,
-        f"{table.label(column)}: {quote(str(texts[column].iloc[row]))} is not a {kind}",
-        f"Correct or remove that line, or say where time and position are with {COLUMNS}.",
-    )
-
-
-def _is_cut(fields: list[str], head: list[list[str]]) -> bool:
-    """Whether a last line without line feed ends early.
-
-    It does where it has fewer fields or fewer digits in its last one than every row before it.
-    """
-    texts = [row[-1] for row in head]
-    if not head or len(fields) < min(map(len, head)):
-        return True
-    has_point = any("." in text for text in texts)
-
-    def digits(text: str) -> int:
-        return len(text.partition(".")[2] if has_point else text)
-
-    return digits(fields[-1]) < min(map(digits, texts))
-
-
-def _time_unit(ticks: Any, choice: ColumnChoice, option: str | None) -> tuple[str, str]:
+def _time_unit(ticks: Any, choice: _Choice, option: str | None) -> tuple[str, str]:
     """Unit of the time column, and the words on it."""
-    if choice.iso:
-        return "us", choice.iso
     if option is not None:
         return option, f"{option} as --position-time-unit says"
     middle = float(np.median(ticks)) if len(ticks) else 0.0
-    named = choice.units.get(choice.time)
+    named = choice.unit(choice.time, TIME_UNITS)
     if named and abs(middle) * TIME_UNITS[named] < UNIX_END_S:
         return named, f"{named} from its name"
     contradiction = f"; its name says {named}, which cannot be" if named else ""
     steps = np.diff(ticks)
     steps = steps[steps > 0]
     step = float(np.median(steps)) if len(steps) else 0.0
+    fits = []
     for unit, scale in TIME_UNITS.items():
         is_unix = UNIX_START_S <= middle * scale < UNIX_END_S
         if is_unix and step * scale <= MAX_UNIX_INTERVAL_S:
             return unit, f"{unit} from its magnitude{contradiction}"
-    fits = [
-        u for u, scale in TIME_UNITS.items() if MIN_INTERVAL_S <= step * scale <= MAX_INTERVAL_S
-    ]
+        if MIN_INTERVAL_S <= step * scale <= MAX_INTERVAL_S:
+            fits.append(unit)
     if not fits:
         return "s", "s assumed, as no unit gives the rate of a UWB: else give --position-time-unit"
     words = f"{fits[0]} from its interval of {step * TIME_UNITS[fits[0]]:.3g} s"
@@ -317,13 +461,14 @@ def _time_unit(ticks: Any, choice: ColumnChoice, option: str | None) -> tuple[st
 
 
 def _length_units(
-    numbers: pd.DataFrame, choice: ColumnChoice, option: str | None
-) -> tuple[dict[int, str], str]:
-    """Length unit of each column of numbers, and the words on those of position."""
+    numbers: pd.DataFrame, choice: _Choice, option: str | None
+) -> tuple[dict[int, float], str]:
+    """Metres per unit of each column of numbers, and the words on those of position."""
+    axes = [index for index in choice.position if index is not None]
     # outliers must not decide
-    spreads = numbers[choice.axes].quantile(0.95) - numbers[choice.axes].quantile(0.05)
+    spreads = numbers[axes].quantile(0.95) - numbers[axes].quantile(0.05)
     spread = float(spreads.max())
-    named = [choice.units[index] for index in choice.axes if index in choice.units]
+    named = [unit for index in axes if (unit := choice.unit(index, LENGTH_UNITS))]
     if option is not None:
         unit, reason = option, "as --position-unit says"
     elif named:
@@ -331,13 +476,14 @@ def _length_units(
     elif spread <= MAX_SPREAD_M:
         unit, reason = "m", "no unit in the names"
     elif MIN_SPREAD_M <= spread * LENGTH_UNITS["mm"] <= MAX_SPREAD_M:
-        unit, reason = (
-            "mm",
-            f"as {spread:.0f} m is not an indoor flight; if cm, give --position-unit",
-        )
+        unit = "mm"
+        reason = f"as {spread:.0f} m is not an indoor flight; if cm, give --position-unit"
     else:
         unit, reason = "m", "assumed, as no unit gives an indoor flight: else give --position-unit"
-    units = {index: option or choice.units.get(index, unit) for index in choice.numbers}
-    used = ", ".join(dict.fromkeys(units[index] for index in choice.axes))
-    span = max(float(spreads[index]) * LENGTH_UNITS[units[index]] for index in choice.axes)
-    return units, f"{used} ({reason}), nine tenths of it within {span:.3g} m"
+    units = {
+        at: option or choice.unit(at, LENGTH_UNITS) or unit for at in map(int, numbers.columns)
+    }
+    scales = {at: LENGTH_UNITS[name] for at, name in units.items()}
+    span = max(float(spreads[index]) * scales[index] for index in axes)
+    used = ", ".join(dict.fromkeys(units[index] for index in axes))
+    return scales, f"{used} ({reason}), nine tenths of it within {span:.3g} m"

@@ -1,6 +1,7 @@
-"""EKF2's part of a ULog: state, variances, innovations, resets, of the primary instance.
+"""EKF2's part of a ULog: state, variances, innovations, resets, and the inside of its filter.
 
-Source: PX4-Autopilot ``EKF2.cpp`` (PublishStates).
+Sources: PX4-Autopilot ``EKF2.cpp`` (PublishStates), ``EKF/common.h`` (order of the states),
+``msg/EstimatorStatusFlags.msg`` and ``msg/EstimatorStatus.msg`` (horizontal aiding).
 """
 
 from __future__ import annotations
@@ -11,44 +12,37 @@ from typing import Literal
 import numpy as np
 import pandas as pd
 
+from px4fuse.arrays import Array
 from px4fuse.ekf2_parameters import EV_POS, settings_in_force
 from px4fuse.flight import (
     BIAS_NOT_LOGGED,
+    DELAYED_STATE_COLUMNS,
+    DELAYED_VARIANCE_COLUMNS,
     EKF2_STEP_S,
     HORIZON_NOT_LOGGED,
+    POSITION_COLUMNS,
     POSITION_VARIANCE_COLUMNS,
+    RECORD_NOT_LOGGED,
     SPECIFIC_FORCE_COLUMNS,
     STATE_COLUMNS,
     VELOCITY_VARIANCE_COLUMNS,
     Ekf2,
+    FusionRecord,
     Reset,
     Unavailable,
 )
-from px4fuse.readers.px4_fusion_record import read_record
+from px4fuse.readers import px4_topics as px4
+from px4fuse.readers.layouts import Layout, elements
 from px4fuse.readers.px4_innovations import read_innovations
-from px4fuse.readers.px4_instances import Instances, of_primary, primary_instances
-from px4fuse.readers.px4_topics import (
-    ACCELEROMETER_BIAS_STATE,
-    BIAS_PER_STEP,
-    CONTROL_MODE_BITS,
-    COVARIANCE_OFFSETS,
-    ESTIMATOR_STATES,
-    FUSING,
-    IMU,
-    INNOVATIONS,
-    LOCAL_POSITION,
-    SENSOR_BIAS,
-    Layout,
-)
-from px4fuse.readers.ulog_topics import Topics, measurement_time_us, states_and_covariances
+from px4fuse.readers.ulog_topics import Topics, measurement_time_us
 
-_RESET_COUNTERS: tuple[
-    tuple[Literal["position", "velocity"], str, tuple[str | None, str | None, str | None]], ...
-] = (
-    ("position", "xy_reset_counter", ("delta_north_m", "delta_east_m", None)),
-    ("position", "z_reset_counter", (None, None, "delta_down_m")),
-    ("velocity", "vxy_reset_counter", ("delta_north_m_s", "delta_east_m_s", None)),
-    ("velocity", "vz_reset_counter", (None, None, "delta_down_m_s")),
+VISION = "vehicle_visual_odometry"
+STATES = 16  # attitude, velocity, position and both biases; the rest does not concern position
+_RESETS: tuple[tuple[Literal["position", "velocity"], str, tuple[str, str, str]], ...] = (
+    ("position", "xy_reset_counter", ("delta_north_m", "delta_east_m", "")),
+    ("position", "z_reset_counter", ("", "", "delta_down_m")),
+    ("velocity", "vxy_reset_counter", ("delta_north_m_s", "delta_east_m_s", "")),
+    ("velocity", "vz_reset_counter", ("", "", "delta_down_m_s")),
 )
 
 
@@ -57,42 +51,38 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
     parameters = topics.log.parameters
     if parameters.get("EKF2_EN") == 0.0:
         return Unavailable("EKF2", "EKF2_EN is 0: EKF2 did not run", "Set EKF2_EN to 1.")
-    if parameters.get("SYS_MC_EST_GROUP", 2.0) != 2.0:
+    if (group := parameters.get("SYS_MC_EST_GROUP", 2.0)) != 2.0:
         return Unavailable(
             "EKF2",
-            f"SYS_MC_EST_GROUP is {parameters['SYS_MC_EST_GROUP']:.0f}: another estimator ran",
+            f"SYS_MC_EST_GROUP is {group:.0f}: another estimator ran",
             "Set SYS_MC_EST_GROUP to 2.",
         )
-    local = topics.read(LOCAL_POSITION)
+    local = topics.read(px4.LOCAL_POSITION)
     if local is None:
-        return Unavailable(
-            "EKF2", "no topic vehicle_local_position", "Record with SDLOG_PROFILE bit 0 (default)."
-        )
+        return Unavailable("EKF2", "no topic vehicle_local_position", px4.DEFAULT_PROFILE)
     state = local[STATE_COLUMNS].dropna()
     if state.empty:
         return Unavailable(
             "EKF2", "vehicle_local_position holds no finite sample", "Wait until EKF2 has started."
         )
-    instances = primary_instances(topics)
-    notes: list[str] = []
-    fusing = _read_fusing(topics, instances)
+    fusing = _read_fusing(topics)
     gate = settings_in_force(parameters)[EV_POS.gate]
-    innovations, innovation_topics = read_innovations(topics, instances, fusing, gate, notes)
+    innovations, innovation_topics, notes = read_innovations(topics, fusing, gate)
     step_s = _step_s(topics)
     return Ekf2(
         state=state,
-        variance=_read_variance(topics, instances),
+        variance=_read_variance(topics),
         innovations=innovations,
         innovation_topics=innovation_topics,
         fusing=fusing,
         resets=read_resets(local),
-        instances=instances,
+        instances=topics.primary,
         gate=gate,
-        notes=tuple(notes),
-        accelerometer_bias=_read_accelerometer_bias(topics, instances, step_s),
+        notes=notes,
+        accelerometer_bias=_read_accelerometer_bias(topics, step_s),
         step_s=step_s,
         horizon_s=_horizon_s(topics, step_s),
-        record=read_record(topics, step_s, instances),
+        record=_read_record(topics, step_s),
     )
 
 
@@ -100,54 +90,55 @@ def ekf2_topics(topics: Topics, ekf2: Ekf2 | Unavailable) -> Mapping[str, tuple[
     """Topics behind each part that is there, by the part's name in ``Flight.streams``."""
     if isinstance(ekf2, Unavailable):
         return {}
-    used = {"ekf2_state": tuple(layout.topic for layout in LOCAL_POSITION)}
-    if isinstance(ekf2.variance, pd.DataFrame):
-        used["ekf2_variance"] = tuple(_lengths(topics))[:1]
-    if ekf2.innovation_topics:
-        joined = [
-            (layout.variance_topic, layout.ratio_topic)
-            for layout in INNOVATIONS
-            if layout.topic in ekf2.innovation_topics
-        ]
-        names = [*ekf2.innovation_topics, *(name for pair in joined for name in pair)]
-        used["ekf2_innovations"] = tuple(n for n in dict.fromkeys(names) if topics.instances(n))
-    layout = topics.find(FUSING)
-    if isinstance(ekf2.fusing, pd.DataFrame) and layout is not None:
-        used["ekf2_fusing"] = (layout.topic,)
-    return used
+    joined = (
+        layout.topic
+        for axis in px4.INNOVATIONS.values()
+        for layouts in axis
+        if layouts[0].topic in ekf2.innovation_topics
+        for layout in layouts
+    )
+    used = dict.fromkeys((*ekf2.innovation_topics, *joined))
+    fusing = topics.find(px4.FUSING)
+    return {
+        "ekf2_state": tuple(layout.topic for layout in px4.LOCAL_POSITION),
+        "ekf2_variance": ()
+        if isinstance(ekf2.variance, Unavailable)
+        else tuple(_state_vectors(topics))[:1],
+        "ekf2_innovations": tuple(name for name in used if topics.instances(name)),
+        "ekf2_fusing": ()
+        if isinstance(ekf2.fusing, Unavailable) or fusing is None
+        else (fusing.topic,),
+    }
 
 
-def _lengths(topics: Topics) -> Mapping[str, tuple[int, int]]:
-    """Numbers of states and of covariances of each topic that has both, best first."""
-    lengths = {}
-    for candidate in ESTIMATOR_STATES:
-        for (name, _), table in topics.tables.items():
-            if name == candidate.topic and "covariances[0]" in table:
-                lengths[candidate.topic] = states_and_covariances(table)
-    return lengths
+def _state_vectors(topics: Topics) -> Mapping[str, tuple[int, int]]:
+    """Numbers of states and of variances of each topic that has both, best first."""
+    return {
+        topic: (
+            sum(name.startswith("states[") for name in table),
+            sum(name.startswith("covariances[") for name in table),
+        )
+        for topic in px4.ESTIMATOR_STATES
+        for table in topics.of(topic)[:1]
+        if "covariances[0]" in table
+    }
 
 
-def _read_variance(topics: Topics, instances: Instances) -> pd.DataFrame | Unavailable:
+def _read_variance(topics: Topics) -> pd.DataFrame | Unavailable:
     """Velocity and position variances, their place decided by the lengths of the arrays."""
-    for topic, length in _lengths(topics).items():
-        offsets = COVARIANCE_OFFSETS.get(length)
-        if offsets is None:
+    for topic, length in _state_vectors(topics).items():
+        first = px4.ATTITUDE_VARIANCES.get(length)
+        if first is None:
             return Unavailable(
                 "EKF2 variances",
                 f"{topic} has {length[0]} states and {length[1]} covariances, a layout unknown "
                 "here",
                 "Report the PX4 version to the authors of px4fuse.",
             )
-        velocity, position = offsets
-        columns = {
-            name: f"covariances[{first + i}]"
-            for first, names in (
-                (position, POSITION_VARIANCE_COLUMNS),
-                (velocity, VELOCITY_VARIANCE_COLUMNS),
-            )
-            for i, name in enumerate(names)
-        }
-        frame = of_primary(topics, Layout(topic, columns, ""), instances)
+        columns = elements(
+            POSITION_VARIANCE_COLUMNS, "covariances", range(first + 3, first + 6)
+        ) | elements(VELOCITY_VARIANCE_COLUMNS, "covariances", range(first, first + 3))
+        frame = topics.of_primary(Layout(topic, columns))
         frame = frame[(frame > 0.0).all(axis=1)]
         if len(frame):
             return frame
@@ -166,11 +157,10 @@ def target_step_s(topics: Topics) -> float:
 def _step_s(topics: Topics) -> float:
     """Time between two predictions: EKF2 gathers whole IMU samples (ImuDownSampler.cpp)."""
     target = target_step_s(topics)
-    imu = topics.read(IMU)
+    imu = topics.read(px4.IMU)
     if imu is None or len(imu) < 2:
         return target
-    intervals = np.diff(imu.index.to_numpy())
-    interval = float(np.median(intervals))
+    interval = float(np.median(np.diff(imu.index.to_numpy())))
     return samples_per_step(target, interval) * interval if interval < target else target
 
 
@@ -184,28 +174,25 @@ def samples_per_step(target_s: float, interval_s: float) -> int:
     return max(int(target_s / interval_s + 0.5 + 1e-6), 1)
 
 
-def _read_accelerometer_bias(
-    topics: Topics, instances: Instances, step_s: float
-) -> pd.DataFrame | Unavailable:
+def _read_accelerometer_bias(topics: Topics, step_s: float) -> pd.DataFrame | Unavailable:
     """Accelerometer bias from its own topic, or else from the state vector.
 
-    A state vector of 24 with 24 covariances holds it per prediction step: divided by that step.
+    The quaternion filter's state vector holds it per prediction step: divided by that step.
     """
-    layout = topics.find(SENSOR_BIAS)
+    layout = topics.find(px4.SENSOR_BIAS)
     if layout is not None:
-        own = of_primary(topics, layout, instances).dropna()
+        own = topics.of_primary(layout).dropna()
         if len(own):
             return own
-    for topic, length in _lengths(topics).items():
-        if length not in COVARIANCE_OFFSETS:
+    first = px4.ACCELEROMETER_BIAS_STATE
+    columns = elements(SPECIFIC_FORCE_COLUMNS, "states", range(first, first + 3))
+    for topic, length in _state_vectors(topics).items():
+        attitude = px4.ATTITUDE_VARIANCES.get(length)
+        if attitude is None:
             continue
-        columns = {
-            name: f"states[{ACCELEROMETER_BIAS_STATE + i}]"
-            for i, name in enumerate(SPECIFIC_FORCE_COLUMNS)
-        }
-        frame = of_primary(topics, Layout(topic, columns, ""), instances).dropna()
+        frame = topics.of_primary(Layout(topic, columns)).dropna()
         if len(frame):
-            return frame / (step_s if length in BIAS_PER_STEP else 1.0)
+            return frame / (step_s if attitude == px4.QUATERNION_FILTER else 1.0)
     return BIAS_NOT_LOGGED
 
 
@@ -215,31 +202,39 @@ def _horizon_s(topics: Topics, step_s: float) -> float | Unavailable:
     Releases before v1.13 stamp it with the newest IMU sample instead, so that what is left is less
     than a prediction step.
     """
-    for topic in _lengths(topics):
-        table = topics.tables[topic, topics.instances(topic)[0]]
-        if "timestamp_sample" in table:
-            measured = measurement_time_us(table).astype(np.float64)
-            lag = float(np.median(table["timestamp"] - measured)) * 1e-6
-            if lag > step_s:
-                return lag
+    for topic in _state_vectors(topics):
+        age = _age_s(topics, topic)
+        if len(age) and (lag := float(age.median())) > step_s:
+            return lag
     return HORIZON_NOT_LOGGED
 
 
-def _read_fusing(topics: Topics, instances: Instances) -> pd.DataFrame | Unavailable:
-    layout = topics.find(FUSING)
+def _age_s(topics: Topics, topic: str) -> pd.Series:
+    """How long after its measurement each message of a topic was published, by that stamp (s)."""
+    for table in topics.of(topic)[:1]:
+        if "timestamp_sample" in table:
+            stamp_us = measurement_time_us(table)
+            times = pd.Index((stamp_us - topics.zero_us) * 1e-6, name="time_s")
+            age_us = table["timestamp"].astype(np.int64) - stamp_us
+            return pd.Series(age_us * 1e-6, index=times)
+    return pd.Series(dtype=np.float64)
+
+
+def _read_fusing(topics: Topics) -> pd.DataFrame | Unavailable:
+    layout = topics.find(px4.FUSING)
     if layout is None:
         return Unavailable(
             "EKF2 fusion flags",
             "neither estimator_status_flags nor estimator_status is in the log",
-            "Record with SDLOG_PROFILE bit 0 (default).",
+            px4.DEFAULT_PROFILE,
         )
-    frame = of_primary(topics, layout, instances, step=True)
+    frame = topics.of_primary(layout, step=True)
     if "flags" in frame:
-        frame = frame[np.isfinite(frame["flags"])]
-        bits = frame["flags"].to_numpy().astype(np.int64)
+        flags = frame["flags"].dropna()
+        bits = flags.to_numpy().astype(np.int64)
         frame = pd.DataFrame(
-            {name: (bits >> bit & 1).astype(float) for name, bit in CONTROL_MODE_BITS.items()},
-            index=frame.index,
+            {name: (bits >> bit & 1).astype(float) for name, bit in px4.CONTROL_MODE_BITS.items()},
+            index=flags.index,
         )
     frame = frame[["horizontal", "vertical", "yaw"]].dropna()
     if frame.empty:
@@ -252,7 +247,7 @@ def _read_fusing(topics: Topics, instances: Instances) -> pd.DataFrame | Unavail
 def read_resets(local: pd.DataFrame) -> tuple[Reset, ...]:
     """Resets of the published state, from the counters (uint8, they wrap) and their deltas."""
     resets = []
-    for quantity, counter, deltas in _RESET_COUNTERS:
+    for quantity, counter, deltas in _RESETS:
         if counter not in local:
             continue
         for row in (np.flatnonzero(np.diff(local[counter].to_numpy()) != 0) + 1).tolist():
@@ -262,3 +257,72 @@ def read_resets(local: pd.DataFrame) -> tuple[Reset, ...]:
             if all(np.isfinite([north, east, down])):
                 resets.append(Reset(float(local.index[row]), quantity, (north, east, down)))
     return tuple(sorted(resets, key=lambda reset: reset.time_s))
+
+
+def _read_record(topics: Topics, step_s: float) -> FusionRecord | Unavailable:
+    """What the log tells of the inside of EKF2's filter, in one layout and unit for all releases.
+
+    ``step_s`` is the time between two predictions, for releases that keep biases per prediction.
+    """
+    topic = px4.ESTIMATOR_STATES[0]
+    attitude = px4.ATTITUDE_VARIANCES.get(_state_vectors(topics).get(topic, (0, 0)))
+    if attitude is None:
+        return RECORD_NOT_LOGGED
+    states = [f"states[{i}]" for i in range(STATES)]
+    variances = [f"covariances[{i}]" for i in range(STATES - 4 + attitude)]
+    layout = Layout(topic, {name: name for name in states + variances})
+    raw = topics.of_primary(layout).dropna()
+    raw = raw[np.abs(np.linalg.norm(raw[states[:4]], axis=1) - 1.0) < 0.01]
+    if raw.empty:
+        return RECORD_NOT_LOGGED
+    state, variance = raw[states].to_numpy(copy=True), raw[variances].to_numpy(copy=True)
+    per_step = attitude == px4.QUATERNION_FILTER
+    if per_step:
+        state[:, 10:16] /= step_s
+        variance = np.hstack([_attitude_variance(state[:, :4], variance[:, :4]), variance[:, 4:]])
+        variance[:, 9:15] /= step_s**2
+    delayed = pd.DataFrame(
+        np.hstack([state, variance]),
+        index=raw.index,
+        columns=DELAYED_STATE_COLUMNS + DELAYED_VARIANCE_COLUMNS,
+    )
+    horizontal = POSITION_COLUMNS[:2]
+    if not delayed[horizontal].to_numpy().any():  # from v1.16 kept as latitude and longitude
+        delayed[horizontal] = np.nan
+    age = _age_s(topics, VISION).sort_index()
+    return FusionRecord(
+        parameters=topics.ekf2_parameters,
+        delayed=delayed,
+        per_step_biases=per_step,
+        other_aiding=_other_aiding(topics),
+        vision_age_s=age[~age.index.duplicated()],
+    )
+
+
+def _attitude_variance(quaternion: Array, variance: Array) -> Array:
+    """Variances of the attitude error about NED's axes, from those of the quaternion.
+
+    δθ = 2 Im(δq ⊗ q*); the log holds no correlations.
+    """
+    w, x, y, z = quaternion.T
+    turns = np.array([[-x, w, -z, y], [-y, z, w, -x], [-z, -y, x, w]])
+    squared: Array = 4.0 * np.einsum("ijn,nj->ni", turns**2, variance)
+    return squared
+
+
+def _other_aiding(topics: Topics) -> tuple[str, ...]:
+    """Horizontal aiding besides vision position that was used at any time."""
+    flags = topics.of("estimator_status_flags")
+    found = [
+        name
+        for table in flags
+        for flag, name in px4.AIDING_FLAGS.items()
+        if flag in table and np.any(table[flag])
+    ]
+    found += [
+        name
+        for table in ([] if flags else topics.of("estimator_status"))
+        for name, bit in px4.AIDING_BITS.items()
+        if np.any(table["control_mode_flags"].astype(np.int64) >> bit & 1)
+    ]
+    return tuple(dict.fromkeys(found))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -13,7 +13,6 @@ from px4fuse.flight import (
     AXIS_NAMES,
     POSITION_COLUMNS,
     POSITION_VARIANCE_COLUMNS,
-    QUATERNION_COLUMNS,
     STATE_COLUMNS,
     VELOCITY_COLUMNS,
     Ekf2,
@@ -22,31 +21,18 @@ from px4fuse.flight import (
     Unavailable,
     best_first,
 )
-from px4fuse.origin import GNSS, KEPT, REBUILT, Origin, with_orientation
-from px4fuse.readers.parts import finite_rows, orientation_of
+from px4fuse.origin import with_orientation
+from px4fuse.readers import px4_topics as px4
+from px4fuse.readers.parts import attitude_of, finite_rows, orientation_of
 from px4fuse.readers.px4_ekf2 import target_step_s
-from px4fuse.readers.px4_instances import NO_SELECTOR, Instances, of_primary
-from px4fuse.readers.px4_topics import (
-    AID_OBSERVATION_HORIZONTAL,
-    AID_OBSERVATION_VERTICAL,
-    FRAMES,
-    GPS,
-    GPS_POSITION,
-    KEPT_OBSERVATION,
-    LOCAL_POSITION,
-    RECONSTRUCTION,
-    TRACKS,
-    TRUTH_ATTITUDE,
-    TRUTH_GLOBAL,
-    TRUTH_LOCAL,
-    TrackSource,
-)
+from px4fuse.readers.px4_topics import GPS_POSITION, KEPT_OBSERVATION, RECONSTRUCTION
 from px4fuse.readers.ulog_topics import Topics
 from px4fuse.recording import ClockMap
 
 MIN_TRACK_SAMPLES = 3
 EARTH_RADIUS_M = 6_371_000.0  # PX4's CONSTANTS_RADIUS_OF_EARTH, src/lib/geo/geo.h
 GPS_3D_FIX = 3
+GLOBAL_COLUMNS = ["latitude_deg", "longitude_deg", "altitude_m"]
 # Samples that are published within this of their measurement have no measured time of their own
 SAME_TIME_US = 100
 ARRIVAL_SHARE = 0.9
@@ -59,31 +45,21 @@ def read_positions(
     topics: Topics, ekf2: Ekf2 | Unavailable
 ) -> tuple[tuple[PositionTrack, ...], tuple[Unavailable, ...]]:
     """Every external position track, the best first, and what was looked for and not found."""
-    instances = NO_SELECTOR if isinstance(ekf2, Unavailable) else ekf2.instances
-    candidates = [_read_logged(topics, source, instances) for source in TRACKS]
-    candidates.append(_read_aid_observation(topics, instances, ekf2))
-    candidates.append(_reconstruct(topics, ekf2))
-    candidates.append(_read_gps(topics))
-    tracks = tuple(
-        replace(track, log=topics.log.name)
-        for track in candidates
-        if isinstance(track, PositionTrack)
-    )
-    missing = tuple(track for track in candidates if isinstance(track, Unavailable))
-    return best_first(tracks), missing
+    fusing = ekf2.fusing if isinstance(ekf2, Ekf2) else ekf2
+    # of what EKF2 kept, a source that EKF2 took a heading from counts as an odometry
+    turns = isinstance(fusing, pd.DataFrame) and bool((fusing["yaw"] > 0).any())
+    found = [
+        *(_read_logged(topics, source) for source in px4.TRACKS),
+        _read_kept(topics, turns),
+        _rebuild(topics, ekf2, turns),
+        _read_gps(topics),
+    ]
+    missing = tuple(track for track in found if isinstance(track, Unavailable))
+    return best_first(track for track in found if isinstance(track, PositionTrack)), missing
 
 
 def _unavailable(name: str, reason: str) -> Unavailable:
-    remedy = {
-        "vehicle_visual_odometry": (
-            "Set SDLOG_PROFILE to 129 (default and vision) to log it as it arrives."
-        ),
-        "vehicle_mocap_odometry": "Logged when ATT_POS_MOCAP is sent to PX4.",
-        KEPT_OBSERVATION: "Logged by default since v1.16 when EKF2 runs on external vision.",
-        RECONSTRUCTION: "Needs EKF2 innovations of external vision.",
-        GPS_POSITION: "Logged when a GPS receiver is connected.",
-    }.get(name, "Logged by PX4 v1.10 to v1.13 when external vision is fused.")
-    return Unavailable(f"position source {name}", reason, remedy, source=name)
+    return Unavailable(f"position source {name}", reason, px4.TRACK_REMEDIES[name], source=name)
 
 
 def clean_positions(samples: pd.DataFrame, axes: list[str]) -> pd.DataFrame:
@@ -96,38 +72,55 @@ def clean_positions(samples: pd.DataFrame, axes: list[str]) -> pd.DataFrame:
     return found.assign(**given.where(given > 0))
 
 
-def _finished(track: PositionTrack, axes: list[str]) -> PositionTrack | Unavailable:
-    """Drop samples without a position, and the track where it is then too short."""
-    samples = clean_positions(track.samples, axes)
-    if len(samples) < MIN_TRACK_SAMPLES:
-        return _unavailable(track.name, f"{len(samples)} finite samples are too few")
-    return replace(track, samples=samples)
-
-
-def _read_logged(
-    topics: Topics, source: TrackSource, instances: Instances
+def _track(
+    topics: Topics,
+    name: str,
+    description: str,
+    samples: pd.DataFrame,
+    used: tuple[str, ...],
+    *,
+    turns: bool = False,
+    needed: list[str] = POSITION_COLUMNS,
+    frame: str = "NED",
+    clock: str = AUTOPILOT_CLOCK,
+    **more: Any,
 ) -> PositionTrack | Unavailable:
+    """A track of the samples that have a position; unavailable where they are too few.
+
+    ``turns`` says whether it has an orientation that turns, ``needed`` what a sample must have.
+    """
+    samples = clean_positions(samples, needed)
+    if len(samples) < MIN_TRACK_SAMPLES:
+        return _unavailable(name, f"{len(samples)} finite samples are too few")
+    origin = with_orientation(px4.TOPIC_ORIGINS[name], turns=turns)
+    log = topics.log.name
+    return PositionTrack(name, origin, description, samples, frame, clock, used, log, **more)
+
+
+def _read_logged(topics: Topics, source: px4.TrackSource) -> PositionTrack | Unavailable:
     layout = topics.find(source.layouts)
     if layout is None:
         return _unavailable(source.name, f"no topic {source.name} in the log")
-    if not layout.topic.startswith("estimator_"):  # only EKF2's own topics have its instances
-        instances = NO_SELECTOR
-    samples = of_primary(topics, layout, instances)
+    is_ekf2 = layout.topic.startswith("estimator_")  # only EKF2's own topics have its instances
+    samples = topics.of_primary(layout) if is_ekf2 else topics.frame(layout)
     frame = "unknown"
-    for field, names in FRAMES.items():
+    for field, names in px4.FRAMES.items():
         if field in samples and len(samples):
             frame = names.get(int(samples[field].iloc[-1]), "unknown")
     if source.name == "estimator_visual_odometry_aligned":
         frame = "NED"  # rotated by EKF2 itself, whatever the field still says
     orientation = orientation_of(samples)
-    return _finished(
-        PositionTrack(
-            source.name, with_orientation(source.origin, turns=orientation is not None),
-            source.description, samples, frame, AUTOPILOT_CLOCK, (layout.topic,),
-            clock_map=_arrival(topics, layout.topic), orientation=orientation,
-        ),
-        POSITION_COLUMNS,
-    )  # fmt: skip
+    return _track(
+        topics,
+        source.name,
+        source.description,
+        samples,
+        (layout.topic,),
+        turns=orientation is not None,
+        frame=frame,
+        clock_map=_arrival(topics, layout.topic),
+        orientation=orientation,
+    )
 
 
 def _arrival(topics: Topics, topic: str) -> ClockMap | None:
@@ -135,7 +128,7 @@ def _arrival(topics: Topics, topic: str) -> ClockMap | None:
 
     PX4 takes the time of arrival until 500 answers to TIMESYNC have come (``Timesync.cpp``).
     """
-    table = topics.tables[topic, topics.instances(topic)[0]]
+    table = topics.of(topic)[0]
     if "timestamp_sample" not in table:
         return None
     age_us = table["timestamp"].astype(np.int64) - table["timestamp_sample"].astype(np.int64)
@@ -147,39 +140,28 @@ def _arrival(topics: Topics, topic: str) -> ClockMap | None:
     )  # fmt: skip
 
 
-def _read_aid_observation(
-    topics: Topics, instances: Instances, ekf2: Ekf2 | Unavailable
-) -> PositionTrack | Unavailable:
-    layout = topics.find(AID_OBSERVATION_HORIZONTAL)
+def _read_kept(topics: Topics, turns: bool) -> PositionTrack | Unavailable:
+    layout = topics.find(px4.AID_OBSERVATION_HORIZONTAL)
     if layout is None:
         return _unavailable(KEPT_OBSERVATION, f"no topic {KEPT_OBSERVATION} in the log")
-    samples = of_primary(topics, layout, instances)
-    used = [layout.topic]
+    samples, used = topics.of_primary(layout), [layout.topic]
     notes: tuple[str, ...] = ()
-    vertical = topics.find(AID_OBSERVATION_VERTICAL)
+    vertical = topics.find(px4.AID_OBSERVATION_VERTICAL)
     if vertical is not None:
-        height = of_primary(topics, vertical, instances)
-        samples, notes = _with_height(samples, height)
+        samples, notes = _with_height(samples, topics.of_primary(vertical))
         used.append(vertical.topic)
     # EKF2 stamps its buffer entries earlier than the sender did: by its delay and by half its
     # update period (estimator_interface.cpp)
-    lead_s = _delay_s(topics) + 0.5 * target_step_s(topics)
-    samples.index = pd.Index(samples.index.to_numpy() + lead_s, name="time_s")
-    return _finished(
-        PositionTrack(
-            KEPT_OBSERVATION, _kept(KEPT, ekf2),
-            "the observations that EKF2 kept of external vision", samples, "NED",
-            AUTOPILOT_CLOCK, tuple(used), notes=notes,
-        ),
-        POSITION_COLUMNS[:2],
+    samples = _later(samples, _delay_s(topics) + 0.5 * target_step_s(topics))
+    description = "the observations that EKF2 kept of external vision"
+    return _track(
+        topics, KEPT_OBSERVATION, description, samples, tuple(used),
+        turns=turns, needed=POSITION_COLUMNS[:2], notes=notes,
     )  # fmt: skip
 
 
-def _kept(origin: Origin, ekf2: Ekf2 | Unavailable) -> Origin:
-    """Of what EKF2 kept, a source that EKF2 took a heading from counts as an odometry."""
-    fusing = ekf2.fusing if isinstance(ekf2, Ekf2) else ekf2
-    turns = isinstance(fusing, pd.DataFrame) and bool((fusing["yaw"] > 0).any())
-    return with_orientation(origin, turns=turns)
+def _later(samples: pd.DataFrame, by_s: float) -> pd.DataFrame:
+    return samples.set_axis(pd.Index(samples.index.to_numpy() + by_s, name="time_s"))
 
 
 def _with_height(
@@ -215,7 +197,7 @@ def _delay_s(topics: Topics) -> float:
     return topics.log.parameters.get(EV_POS.delay, 0.0) * 1e-3
 
 
-def _reconstruct(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack | Unavailable:
+def _rebuild(topics: Topics, ekf2: Ekf2 | Unavailable, turns: bool) -> PositionTrack | Unavailable:
     """Position = EKF2's state + innovation (measurement - state), at the innovation's time.
 
     The innovation may be as old as one interval of the source, so the times are late by up to
@@ -232,18 +214,15 @@ def _reconstruct(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack | Un
             )
     if not {"north_m", "east_m"} <= tracks.keys():
         return _unavailable(RECONSTRUCTION, "EKF2 fused no horizontal external vision position")
-    samples = pd.DataFrame({"north_m": tracks["north_m"], "east_m": tracks["east_m"]})
+    samples = pd.DataFrame({name: tracks[name] for name in POSITION_COLUMNS[:2]})
     notes: tuple[str, ...] = ()
     if "down_m" in tracks:
         samples, notes = _with_height(samples, tracks["down_m"].to_frame("down_m"))
-    samples.index = pd.Index(samples.index.to_numpy() + _delay_s(topics), name="time_s")
-    return _finished(
-        PositionTrack(
-            RECONSTRUCTION, _kept(REBUILT, ekf2), "EKF2's position plus its innovation", samples,
-            "NED", f"EKF2's time plus {EV_POS.delay}; late by up to one interval of the source",
-            ("vehicle_local_position", *ekf2.innovation_topics), notes=notes,
-        ),
-        POSITION_COLUMNS[:2],
+    return _track(
+        topics, RECONSTRUCTION, "EKF2's position plus its innovation",
+        _later(samples, _delay_s(topics)), ("vehicle_local_position", *ekf2.innovation_topics),
+        turns=turns, needed=POSITION_COLUMNS[:2], notes=notes,
+        clock=f"EKF2's time plus {EV_POS.delay}; late by up to one interval of the source",
     )  # fmt: skip
 
 
@@ -272,7 +251,7 @@ def project(
 
 def _local_origin(topics: Topics) -> tuple[float, float, float] | None:
     """EKF2's geographic origin (degrees, degrees, m), where it had one."""
-    local = topics.read(LOCAL_POSITION)
+    local = topics.read(px4.LOCAL_POSITION)
     columns = ["ref_lat", "ref_lon", "ref_alt"]
     if local is None or not set(columns) <= set(local.columns):
         return None
@@ -284,14 +263,13 @@ def _local_origin(topics: Topics) -> tuple[float, float, float] | None:
     return float(latitude), float(longitude), float(altitude)
 
 
-def _projected(topics: Topics, geo: pd.DataFrame) -> pd.DataFrame:
+def projected(geo: pd.DataFrame, origin: tuple[float, float, float] | None) -> pd.DataFrame:
     """Latitude, longitude and altitude as north, east, down (m).
 
-    About EKF2's origin, or where it had none about their own first sample.
+    About an origin, or where there is none about their own first sample.
     """
-    columns = ["latitude_deg", "longitude_deg", "altitude_m"]
-    latitude, longitude, altitude = geo[columns].to_numpy().T
-    origin = _local_origin(topics) or (latitude[0], longitude[0], altitude[0])
+    latitude, longitude, altitude = geo[GLOBAL_COLUMNS].to_numpy().T
+    origin = origin or (latitude[0], longitude[0], altitude[0])
     north, east = project(latitude, longitude, origin[:2])
     return pd.DataFrame(
         {"north_m": north, "east_m": east, "down_m": origin[2] - altitude}, index=geo.index
@@ -299,28 +277,19 @@ def _projected(topics: Topics, geo: pd.DataFrame) -> pd.DataFrame:
 
 
 def _read_gps(topics: Topics) -> PositionTrack | Unavailable:
-    layout = topics.find(GPS)
+    layout = topics.find(px4.GPS)
     if layout is None:
         return _unavailable(GPS_POSITION, f"no topic {GPS_POSITION} in the log")
     gps = topics.frame(layout)
-    if "latitude_1e7" in gps:
-        gps["latitude_deg"] = gps["latitude_1e7"] * 1e-7
-        gps["longitude_deg"] = gps["longitude_1e7"] * 1e-7
-        gps["altitude_m"] = gps["altitude_mm"] * 1e-3
     if "fix_type" in gps:
         gps = gps[gps["fix_type"] >= GPS_3D_FIX]
     if gps.empty:
         return _unavailable(GPS_POSITION, "the receiver never had a 3D fix")
-    samples = _projected(topics, gps)
+    samples = projected(gps, _local_origin(topics))
     if {"eph_m", "epv_m"} <= set(gps.columns):
         samples["north_m2"] = samples["east_m2"] = gps["eph_m"].to_numpy() ** 2 / 2.0
         samples["down_m2"] = gps["epv_m"].to_numpy() ** 2
-    return _finished(
-        PositionTrack(
-            GPS_POSITION, GNSS, "GPS position", samples, "NED", AUTOPILOT_CLOCK, (layout.topic,)
-        ),
-        POSITION_COLUMNS,
-    )
+    return _track(topics, GPS_POSITION, "GPS position", samples, (layout.topic,))
 
 
 def read_truth(topics: Topics, positions: tuple[PositionTrack, ...]) -> Truth | Unavailable:
@@ -329,18 +298,15 @@ def read_truth(topics: Topics, positions: tuple[PositionTrack, ...]) -> Truth | 
     Some has only latitude and longitude (v1.13 and older); its own first sample is the simulation's
     home.
     """
-    layout = topics.find(TRUTH_LOCAL)
-    if layout is not None:
-        samples = topics.frame(layout).dropna()
-        if len(samples):
-            return Truth(layout.topic, samples, _true_attitude(topics))
-    layout = topics.find(TRUTH_GLOBAL)
-    if layout is not None:
-        geo = finite_rows(topics.frame(layout), ["latitude_deg", "longitude_deg"])
-        if len(geo):
-            velocity = geo.reindex(columns=VELOCITY_COLUMNS)
-            samples = _projected(topics, geo).join(velocity)
-            return Truth(layout.topic, samples, _true_attitude(topics))
+    attitude = attitude_of(topics.read(px4.TRUTH_ATTITUDE))
+    local = topics.read(px4.TRUTH_LOCAL)
+    if local is not None and len(local := local.dropna()):
+        return Truth(px4.TRUTH_LOCAL[0].topic, local, attitude)
+    geo = topics.read(px4.TRUTH_GLOBAL)
+    if geo is not None and len(geo := finite_rows(geo, GLOBAL_COLUMNS[:2])):
+        velocity = geo.reindex(columns=VELOCITY_COLUMNS)
+        samples = projected(geo, _local_origin(topics)).join(velocity)
+        return Truth(px4.TRUTH_GLOBAL[0].topic, samples, attitude)
     captured = motion_capture(positions, "vehicle_mocap_odometry", "att_pos_mocap")
     if captured is None:
         return Unavailable(
@@ -351,16 +317,10 @@ def read_truth(topics: Topics, positions: tuple[PositionTrack, ...]) -> Truth | 
     return captured_truth(captured)
 
 
-def _true_attitude(topics: Topics) -> pd.DataFrame | None:
-    logged = topics.read(TRUTH_ATTITUDE)
-    attitude = None if logged is None else orientation_of(logged)
-    return None if attitude is None else attitude[QUATERNION_COLUMNS]
-
-
 def captured_truth(track: PositionTrack) -> Truth:
     """Motion capture as the truth."""
-    attitude = None if track.orientation is None else track.orientation[QUATERNION_COLUMNS]
-    return Truth(track.name, track.samples.reindex(columns=STATE_COLUMNS), attitude)
+    state = track.samples.reindex(columns=STATE_COLUMNS)
+    return Truth(track.name, state, attitude_of(track.orientation))
 
 
 def motion_capture(positions: tuple[PositionTrack, ...], *topics: str) -> PositionTrack | None:

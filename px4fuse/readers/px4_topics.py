@@ -8,8 +8,9 @@ from PX4-Autopilot's ``msg/*.msg`` at the release tags named in ``since``.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
+from px4fuse.ekf2_parameters import AID_MASK, EV_POS
 from px4fuse.flight import (
     ANGULAR_RATE_COLUMNS,
     AXIS_NAMES,
@@ -18,104 +19,64 @@ from px4fuse.flight import (
     QUATERNION_COLUMNS,
     ROTATION_VARIANCE_COLUMNS,
     SPECIFIC_FORCE_COLUMNS,
-    VELOCITY_COLUMNS,
+    AxisName,
 )
 from px4fuse.origin import ALIGNED, GNSS, KEPT, MOTION_CAPTURE, REBUILT, RECEIVED, Origin
-
-
-@dataclass(frozen=True)
-class Layout:
-    """One way in which PX4 has logged a quantity.
-
-    Attributes
-    ----------
-    topic : str
-    columns : mapping
-        Our column name to PX4's field name; all must be present.
-    since : str
-        The PX4 releases that log it so.
-    optional : mapping
-        Further columns, read where the topic has them.
-    """
-
-    topic: str
-    columns: Mapping[str, str]
-    since: str
-    optional: Mapping[str, str] = field(default_factory=dict)
-
-
-def _vector(names: list[str], px4_field: str) -> dict[str, str]:
-    return {name: f"{px4_field}[{i}]" for i, name in enumerate(names)}
-
-
-_XYZ = dict(zip(POSITION_COLUMNS, "xyz", strict=True))
-_POSITION_AND_VELOCITY = _XYZ | dict(zip(VELOCITY_COLUMNS, ("vx", "vy", "vz"), strict=True))
-# pose_covariance is the row-major upper triangle of a 6×6 matrix, rotations last
-_POSE_DIAGONAL = {
-    name: f"pose_covariance[{at}]"
-    for name, at in zip(POSITION_VARIANCE_COLUMNS, (0, 6, 11), strict=True)
-}
-_ROTATION_DIAGONAL = {
-    name: f"pose_covariance[{at}]"
-    for name, at in zip(ROTATION_VARIANCE_COLUMNS, (15, 18, 20), strict=True)
-}
+from px4fuse.readers.layouts import (
+    POSE_DIAGONAL,
+    POSITION_AND_VELOCITY,
+    ROTATION_DIAGONAL,
+    XYZ,
+    Layout,
+    elements,
+)
 
 IMU = (
     Layout(
         "sensor_combined",
-        _vector(SPECIFIC_FORCE_COLUMNS, "accelerometer_m_s2")
-        | _vector(ANGULAR_RATE_COLUMNS, "gyro_rad"),
+        elements(SPECIFIC_FORCE_COLUMNS, "accelerometer_m_s2")
+        | elements(ANGULAR_RATE_COLUMNS, "gyro_rad"),
         "v1.8",
         {"accelerometer_offset_us": "accelerometer_timestamp_relative"},
     ),
 )
 
-ATTITUDE = (Layout("vehicle_attitude", _vector(QUATERNION_COLUMNS, "q"), "v1.8"),)
+ATTITUDE = (Layout("vehicle_attitude", elements(QUATERNION_COLUMNS, "q"), "v1.8"),)
 
+_RESETS = ("xy_reset_counter", "z_reset_counter", "vxy_reset_counter", "vz_reset_counter")
 LOCAL_POSITION = (
     Layout(
         "vehicle_local_position",
-        _POSITION_AND_VELOCITY,
+        POSITION_AND_VELOCITY,
         "v1.8",
-        {
-            **{
-                f"{moved}_reset_counter": f"{moved}_reset_counter"
-                for moved in ("xy", "z", "vxy", "vz")
-            },
-            "delta_north_m": "delta_xy[0]",
-            "delta_east_m": "delta_xy[1]",
-            "delta_down_m": "delta_z",
-            "delta_north_m_s": "delta_vxy[0]",
-            "delta_east_m_s": "delta_vxy[1]",
-            "delta_down_m_s": "delta_vz",
-            **{name: name for name in ("ref_lat", "ref_lon", "ref_alt")},
-        },
+        {name: name for name in (*_RESETS, "ref_lat", "ref_lon", "ref_alt")}
+        | {"delta_down_m": "delta_z", "delta_down_m_s": "delta_vz"}
+        | elements(["delta_north_m", "delta_east_m"], "delta_xy")
+        | elements(["delta_north_m_s", "delta_east_m_s"], "delta_vxy"),
     ),
 )
 
-# EKF2's state vector with its variances; the offsets of the variances follow from the lengths
-ESTIMATOR_STATES = (
-    Layout("estimator_states", {}, "v1.12"),
-    Layout("estimator_status", {}, "v1.8 to v1.11"),
-)
+# What records all that EKF2 and the loggers publish by default
+DEFAULT_PROFILE = "Record with SDLOG_PROFILE bit 0 (default)."
 
-# (number of states, number of covariances) -> index of the first velocity and position variance.
-# 24/24: quaternion filter; 24/23 and 25/24: error-state filter with three attitude errors
-# (src/modules/ekf2/EKF/python/ekf_derivation/generated/state.h at v1.15.4 and v1.16).
-COVARIANCE_OFFSETS: Mapping[tuple[int, int], tuple[int, int]] = {
-    (24, 24): (4, 7),
-    (24, 23): (3, 6),
-    (25, 24): (3, 6),
-    (32, 28): (4, 7),  # before v1.9: arrays padded beyond the 24 states of EKF2
+# Topics with EKF2's state vector and its variances, best first
+ESTIMATOR_STATES = ("estimator_states", "estimator_status")  # since v1.12, v1.8 to v1.11
+# (number of states, number of variances) -> how many variances attitude has; velocity and position
+# follow it. 4: of the quaternion filter, whose biases are increments per prediction; 3: of the
+# error-state filter (EKF/python/ekf_derivation/generated/state.h at v1.15.4 and v1.16)
+ATTITUDE_VARIANCES: Mapping[tuple[int, int], int] = {
+    (24, 24): 4,
+    (24, 23): 3,
+    (25, 24): 3,
+    (32, 28): 4,  # before v1.9: arrays padded beyond the 24 states of EKF2
 }
+QUATERNION_FILTER = 4
 
 # EKF2's accelerometer bias in m/s², whatever the generation of the state vector
 SENSOR_BIAS = (
-    Layout("estimator_sensor_bias", _vector(SPECIFIC_FORCE_COLUMNS, "accel_bias"), "v1.11"),
+    Layout("estimator_sensor_bias", elements(SPECIFIC_FORCE_COLUMNS, "accel_bias"), "v1.11"),
 )
 ACCELEROMETER_BIAS_STATE = 13
-# States of the quaternion filter (24 covariances or 28) are velocity increments per prediction
-BIAS_PER_STEP: frozenset[tuple[int, int]] = frozenset({(24, 24), (32, 28)})
 
 SELECTOR = (Layout("estimator_selector_status", {"instance": "primary_instance"}, "v1.12"),)
 
@@ -130,64 +91,63 @@ FUSING = (
 # estimator_status.control_mode_flags, msg/EstimatorStatus.msg
 CONTROL_MODE_BITS: Mapping[str, int] = {"horizontal": 12, "yaw": 13, "vertical": 14}
 
-_AID_OPTIONAL = {"fused": "fused", "rejected": "innovation_rejected"}
-
-
-def _aid(index: str) -> dict[str, str]:
-    return {
-        "innovation_m": f"innovation{index}",
-        "innovation_variance_m2": f"innovation_variance{index}",
-        "observation_variance_m2": f"observation_variance{index}",
-        "test_ratio": f"test_ratio{index}",
-    }
-
-
-# The per-source record of every fusion attempt, with exact times, since v1.14
-AID_SOURCE: Mapping[str, tuple[Layout, ...]] = {
-    "north": (Layout("estimator_aid_src_ev_pos", _aid("[0]"), "v1.14", _AID_OPTIONAL),),
-    "east": (Layout("estimator_aid_src_ev_pos", _aid("[1]"), "v1.14", _AID_OPTIONAL),),
-    "down": (Layout("estimator_aid_src_ev_hgt", _aid(""), "v1.14", _AID_OPTIONAL),),
+# Horizontal aiding besides vision position, by the flags of all releases from v1.12, and before by
+# the bits of estimator_status.control_mode_flags
+AIDING_FLAGS: Mapping[str, str] = {
+    "cs_gps": "GPS",
+    "cs_gnss_pos": "GPS position",
+    "cs_gnss_vel": "GPS velocity",
+    "cs_opt_flow": "optical flow",
+    "cs_ev_vel": "vision velocity",
+    "cs_aux_gpos": "auxiliary global position",
+    "cs_fuse_aspd": "airspeed",
+    "cs_rngbcn_fusion": "ranging beacons",
 }
+AIDING_BITS: Mapping[str, int] = {"GPS": 2, "optical flow": 3, "vision velocity": 24}
 
 
-@dataclass(frozen=True)
-class InnovationLayout:
-    """Innovations, their variances and test ratios, which are separate topics before v1.14.
+def _innovations(axis: AxisName) -> tuple[tuple[Layout, ...], ...]:
+    """Topics of an axis' innovations, joined by time: the aid source's, then the older ones.
 
-    ``fields`` gives the field per axis, ``ratio_fields`` that of the test ratio: v1.11 to v1.13
-    store the larger of the two horizontal ratios in element 0.
+    The aid source records every fusion attempt with its exact time. v1.11 to v1.13 store the larger
+    of the two horizontal test ratios in element 0.
     """
+    number = AXIS_NAMES.index(axis)
+    topic, at = ("ev_hgt", "") if axis == "down" else ("ev_pos", f"[{number}]")
+    field = "ev_vpos" if axis == "down" else f"ev_hpos[{number}]"
+    return (
+        (
+            Layout(
+                f"estimator_aid_src_{topic}",
+                {
+                    "innovation_m": f"innovation{at}",
+                    "innovation_variance_m2": f"innovation_variance{at}",
+                    "observation_variance_m2": f"observation_variance{at}",
+                    "test_ratio": f"test_ratio{at}",
+                },
+                "v1.14",
+                {"fused": "fused", "rejected": "innovation_rejected"},
+            ),
+        ),
+        (
+            Layout("estimator_innovations", {"innovation_m": field}, "v1.11"),
+            Layout("estimator_innovation_variances", {"innovation_variance_m2": field}, "v1.11"),
+            Layout("estimator_innovation_test_ratios", {"test_ratio": field}, "v1.11"),
+        ),
+        (
+            Layout(
+                "ekf2_innovations",
+                {
+                    "innovation_m": f"vel_pos_innov[{3 + number}]",
+                    "innovation_variance_m2": f"vel_pos_innov_var[{3 + number}]",
+                },
+                "v1.8 to v1.10",
+            ),
+        ),
+    )
 
-    topic: str
-    variance_topic: str
-    ratio_topic: str
-    fields: Mapping[str, str]
-    variance_fields: Mapping[str, str]
-    ratio_fields: Mapping[str, str]
-    since: str
 
-
-_EV_FIELDS = {"north": "ev_hpos[0]", "east": "ev_hpos[1]", "down": "ev_vpos"}
-INNOVATIONS = (
-    InnovationLayout(
-        "estimator_innovations",
-        "estimator_innovation_variances",
-        "estimator_innovation_test_ratios",
-        _EV_FIELDS,
-        _EV_FIELDS,
-        _EV_FIELDS,
-        "v1.11",
-    ),
-    InnovationLayout(
-        "ekf2_innovations",
-        "ekf2_innovations",
-        "",
-        {axis: f"vel_pos_innov[{3 + i}]" for i, axis in enumerate(AXIS_NAMES)},
-        {axis: f"vel_pos_innov_var[{3 + i}]" for i, axis in enumerate(AXIS_NAMES)},
-        {},
-        "v1.8 to v1.10",
-    ),
-)
+INNOVATIONS = {axis: _innovations(axis) for axis in AXIS_NAMES}
 
 LAND_DETECTED = (Layout("vehicle_land_detected", {"landed": "landed"}, "v1.8"),)
 
@@ -202,7 +162,7 @@ NAV_STATES: Mapping[int, str] = {
     **{22 + number: f"External {number}" for number in range(1, 9)},
 }  # fmt: skip
 
-TRUTH_LOCAL = (Layout("vehicle_local_position_groundtruth", _POSITION_AND_VELOCITY, "simulation"),)
+TRUTH_LOCAL = (Layout("vehicle_local_position_groundtruth", POSITION_AND_VELOCITY, "simulation"),)
 TRUTH_GLOBAL = (
     Layout(
         "vehicle_global_position_groundtruth",
@@ -212,7 +172,7 @@ TRUTH_GLOBAL = (
     ),
 )
 TRUTH_ATTITUDE = (
-    Layout("vehicle_attitude_groundtruth", _vector(QUATERNION_COLUMNS, "q"), "simulation"),
+    Layout("vehicle_attitude_groundtruth", elements(QUATERNION_COLUMNS, "q"), "simulation"),
 )
 
 _GPS_OPTIONAL = {
@@ -231,9 +191,10 @@ GPS = (
     ),
     Layout(
         "vehicle_gps_position",
-        {"latitude_1e7": "lat", "longitude_1e7": "lon", "altitude_mm": "alt"},
+        {"latitude_deg": "lat", "longitude_deg": "lon", "altitude_m": "alt"},
         "v1.8 to v1.13",
         _GPS_OPTIONAL,
+        {"latitude_deg": 1e-7, "longitude_deg": 1e-7, "altitude_m": 1e-3},
     ),
 )
 
@@ -255,23 +216,28 @@ FRAMES: Mapping[str, Mapping[int, str]] = {
 }
 
 
-def _odometry_until_v1_13(topic: str, since: str) -> Layout:
-    optional = _POSE_DIAGONAL | _vector(QUATERNION_COLUMNS, "q") | _ROTATION_DIAGONAL
-    return Layout(topic, _XYZ, f"{since} to v1.13", optional | {"local_frame": "local_frame"})
+_OLD_POSE = elements(POSITION_VARIANCE_COLUMNS, "pose_covariance", POSE_DIAGONAL)
+_OLD_ODOMETRY = (
+    _OLD_POSE
+    | elements(QUATERNION_COLUMNS, "q")
+    | elements(ROTATION_VARIANCE_COLUMNS, "pose_covariance", ROTATION_DIAGONAL)
+    | {"local_frame": "local_frame"}
+)
 
 
-def _odometry(topic: str) -> tuple[Layout, ...]:
+def _odometry(topic: str, before: str) -> tuple[Layout, ...]:
     return (
         Layout(
             topic,
-            _vector(POSITION_COLUMNS, "position"),
+            elements(POSITION_COLUMNS, "position"),
             "v1.14",
-            _vector(POSITION_VARIANCE_COLUMNS, "position_variance")
+            elements(POSITION_VARIANCE_COLUMNS, "position_variance")
             | {"pose_frame": "pose_frame"}
-            | _vector(QUATERNION_COLUMNS, "q")
-            | _vector(ROTATION_VARIANCE_COLUMNS, "orientation_variance"),
+            | elements(QUATERNION_COLUMNS, "q")
+            | elements(ROTATION_VARIANCE_COLUMNS, "orientation_variance"),
         ),
-        _odometry_until_v1_13(topic, "v1.9"),
+        Layout(topic, XYZ, "v1.9 to v1.13", _OLD_ODOMETRY),
+        Layout(before, XYZ, "v1.8"),
     )
 
 
@@ -280,21 +246,21 @@ TRACKS = (
         "vehicle_visual_odometry",
         RECEIVED,
         "external vision position as PX4 received it",
-        (*_odometry("vehicle_visual_odometry"), Layout("vehicle_vision_position", _XYZ, "v1.8")),
+        _odometry("vehicle_visual_odometry", "vehicle_vision_position"),
     ),
     TrackSource(
         "vehicle_mocap_odometry",
         MOTION_CAPTURE,
         "motion capture, which EKF2 never fuses",
-        (*_odometry("vehicle_mocap_odometry"), Layout("att_pos_mocap", _XYZ, "v1.8")),
+        _odometry("vehicle_mocap_odometry", "att_pos_mocap"),
     ),
     TrackSource(
         "estimator_visual_odometry_aligned",
         ALIGNED,
         "external vision rotated into EKF2's frame",
         (
-            _odometry_until_v1_13("estimator_visual_odometry_aligned", "v1.12"),
-            Layout("vehicle_visual_odometry_aligned", _XYZ, "v1.10 to v1.11", _POSE_DIAGONAL),
+            Layout("estimator_visual_odometry_aligned", XYZ, "v1.12 to v1.13", _OLD_ODOMETRY),
+            Layout("vehicle_visual_odometry_aligned", XYZ, "v1.10 to v1.11", _OLD_POSE),
         ),
     ),
 )
@@ -306,13 +272,31 @@ GPS_POSITION = "vehicle_gps_position"
 TOPIC_ORIGINS = {track.name: track.origin for track in TRACKS} | {
     KEPT_OBSERVATION: KEPT, RECONSTRUCTION: REBUILT, GPS_POSITION: GNSS,
 }  # fmt: skip
+# What would have logged a track
+TRACK_REMEDIES: Mapping[str, str] = {
+    "vehicle_visual_odometry": "Set SDLOG_PROFILE to 129 (default and vision) to log it as it "
+    "arrives.",
+    "vehicle_mocap_odometry": "Logged when ATT_POS_MOCAP is sent to PX4.",
+    "estimator_visual_odometry_aligned": "Logged by PX4 v1.10 to v1.13 when external vision is "
+    "fused.",
+    KEPT_OBSERVATION: "Logged by default since v1.16 when EKF2 runs on external vision.",
+    RECONSTRUCTION: "Needs EKF2 innovations of external vision.",
+    GPS_POSITION: "Logged when a GPS receiver is connected.",
+}
+# What has EKF2 fuse external vision; it starts on samples less than 0.2 s apart (ev_control.cpp)
+HOW_TO_FUSE: Mapping[str, str] = {
+    "horizontal": "Send the position at 10 Hz (EKF2 starts on samples less than 0.2 s apart) and "
+    f"set bit 0 of {EV_POS.switch} (bit 3 of {AID_MASK} before v1.14).",
+    "vertical": f"Set bit 1 of {EV_POS.switch} (EKF2_HGT_MODE 3 before v1.14) if EKF2 is to fuse "
+    "the source's height.",
+}
 
 AID_OBSERVATION_HORIZONTAL = (
     Layout(
-        "estimator_aid_src_ev_pos",
-        {"north_m": "observation[0]", "east_m": "observation[1]"},
+        KEPT_OBSERVATION,
+        elements(POSITION_COLUMNS[:2], "observation"),
         "v1.14",
-        {"north_m2": "observation_variance[0]", "east_m2": "observation_variance[1]"},
+        elements(POSITION_VARIANCE_COLUMNS[:2], "observation_variance"),
     ),
 )
 AID_OBSERVATION_VERTICAL = (
@@ -336,12 +320,10 @@ UNUSED: Mapping[str, str] = {
 def topics() -> list[str]:
     """Every topic named in this table, sorted: all that a reader needs to decode."""
     groups = (
-        IMU, ATTITUDE, LOCAL_POSITION, ESTIMATOR_STATES, SENSOR_BIAS, SELECTOR, FUSING,
-        LAND_DETECTED, FLIGHT_MODE, TRUTH_LOCAL, TRUTH_GLOBAL, TRUTH_ATTITUDE, GPS,
-        AID_OBSERVATION_HORIZONTAL, AID_OBSERVATION_VERTICAL, *AID_SOURCE.values(),
-        *(track.layouts for track in TRACKS),
+        IMU, ATTITUDE, LOCAL_POSITION, SENSOR_BIAS, SELECTOR, FUSING, LAND_DETECTED, FLIGHT_MODE,
+        TRUTH_LOCAL, TRUTH_GLOBAL, TRUTH_ATTITUDE, GPS, AID_OBSERVATION_HORIZONTAL,
+        AID_OBSERVATION_VERTICAL, *(track.layouts for track in TRACKS),
+        *(layouts for axis in INNOVATIONS.values() for layouts in axis),
     )  # fmt: skip
-    names = {layout.topic for group in groups for layout in group} | UNUSED.keys()
-    for layout in INNOVATIONS:
-        names |= {layout.topic, layout.variance_topic, layout.ratio_topic}
-    return sorted(names - {""})
+    named = {layout.topic for group in groups for layout in group}
+    return sorted(named | UNUSED.keys() | {*ESTIMATOR_STATES})

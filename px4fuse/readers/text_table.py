@@ -16,9 +16,9 @@ UNIX_START_S, UNIX_END_S = 946_684_800.0, 4_102_444_800.0
 _SNIFFED_CHARS = 100_000
 _UTF_16 = (b"\xff\xfe", b"\xfe\xff")  # a Windows shell's redirection
 _CONTROL = re.compile("[\x00-\x08\x0e-\x1b]")
-# With a decimal point or comma
-NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?|[0-9]*[.,][0-9]+)(?:[eE][+-]?[0-9]+)?")
-_NOT_FINITE = re.compile(r"[+-]?(?:nan|inf)", re.IGNORECASE)
+_NUMBER = re.compile(
+    r"[+-]?(?:(?:[0-9]+\.?|[0-9]*\.[0-9]+)(?:e[+-]?[0-9]+)?|nan|inf)", re.IGNORECASE
+)
 
 
 def text_of(content: bytes) -> str | None:
@@ -42,7 +42,7 @@ def text_of(content: bytes) -> str | None:
 
 def is_number(text: str) -> bool:
     """Whether this is a number with a decimal point, NaN or infinite."""
-    return bool(NUMBER.fullmatch(text) or _NOT_FINITE.fullmatch(text)) and "," not in text
+    return _NUMBER.fullmatch(text) is not None
 
 
 def seconds_of(ticks: Any, per_second: int) -> Array:

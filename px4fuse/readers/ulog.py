@@ -8,35 +8,26 @@ import numpy as np
 import pandas as pd
 from msgspec import structs
 
-from px4fuse.arrays import Array
 from px4fuse.flight import (
     ANGULAR_RATE_COLUMNS,
     MODES_NOT_LOGGED,
-    QUATERNION_COLUMNS,
     SPECIFIC_FORCE_COLUMNS,
     Flight,
     FlightMode,
     Truth,
     Unavailable,
 )
+from px4fuse.readers import px4_topics as px4
 from px4fuse.readers.parts import (
     ends_in_flight,
     finite_rows,
     missing_parts,
     stretches_of_flight,
     stretches_of_modes,
+    with_attitude,
 )
 from px4fuse.readers.px4_ekf2 import ekf2_topics, read_ekf2
 from px4fuse.readers.px4_positions import GPS_3D_FIX, read_positions, read_truth
-from px4fuse.readers.px4_topics import (
-    ATTITUDE,
-    FLIGHT_MODE,
-    GPS,
-    IMU,
-    LAND_DETECTED,
-    NAV_STATES,
-    UNUSED,
-)
 from px4fuse.readers.ulog_topics import (
     ACCELEROMETER_OFFSET_INVALID_US,
     AT_MEASUREMENT,
@@ -66,8 +57,15 @@ def read_ulog(path: Path) -> Flight:
 
 def to_flight(topics: Topics) -> Flight:
     """Make a flight of the topics of a log."""
-    imu = _read_imu(topics)
-    attitude = _read_attitude(topics)
+    running = "Check that the logger ran while the sensors did."
+    imu = _enough(_read_imu(topics), "IMU", px4.IMU[0].topic, running)
+    logged = topics.read(px4.ATTITUDE)
+    attitude = _enough(
+        None if logged is None else with_attitude(logged),
+        "attitude",
+        px4.ATTITUDE[0].topic,
+        "Check that the estimator ran while the logger did.",
+    )
     ekf2 = read_ekf2(topics)
     positions, missing_positions = read_positions(topics, ekf2)
     truth = read_truth(topics, positions)
@@ -78,16 +76,17 @@ def to_flight(topics: Topics) -> Flight:
         for (topic, _), count in sorted(topics.dropped.items())
     )
     used = {
-        "imu": () if isinstance(imu, Unavailable) else (IMU[0].topic,),
-        "attitude": () if isinstance(attitude, Unavailable) else (ATTITUDE[0].topic,),
+        "imu": () if isinstance(imu, Unavailable) else (px4.IMU[0].topic,),
+        "attitude": () if isinstance(attitude, Unavailable) else (px4.ATTITUDE[0].topic,),
         **ekf2_topics(topics, ekf2),
         "truth": (truth.name,) if isinstance(truth, Truth) else (),
-        "airborne": () if isinstance(airborne, Unavailable) else (LAND_DETECTED[0].topic,),
+        "airborne": () if isinstance(airborne, Unavailable) else (px4.LAND_DETECTED[0].topic,),
     }
     return Flight(
         log=structs.replace(
             topics.log,
             notes=topics.log.notes + dropped,
+            dropped={topic: count for (topic, _), count in sorted(topics.dropped.items())},
             start_unix_s=_start_unix(topics),
             damage=(*_lost(topics, imu, in_flight), *topics.log.damage),
             ends_in_flight=in_flight,
@@ -102,9 +101,9 @@ def to_flight(topics: Topics) -> Flight:
         missing=(*missing_parts(imu, attitude, ekf2, truth), *missing_positions),
         streams={part: _stream(topics, part, names) for part, names in used.items() if names},
         unused=tuple(
-            Unused(name, len(topics.tables[name, number]["timestamp"]), reason)
-            for name, reason in UNUSED.items()
-            for number in topics.instances(name)[:1]
+            Unused(name, len(table["timestamp"]), reason)
+            for name, reason in px4.UNUSED.items()
+            for table in topics.of(name)[:1]
         ),
     )
 
@@ -140,7 +139,7 @@ def _stream(topics: Topics, part: str, names: tuple[str, ...]) -> Stream:
 
 def _start_unix(topics: Topics) -> float | None:
     """UNIX time (s) of time zero by the GPS receiver, the median over its fixes."""
-    gps = topics.read(GPS)
+    gps = topics.read(px4.GPS)
     if gps is None or "utc_us" not in gps:
         return None
     utc_s = gps["utc_us"] * 1e-6
@@ -150,12 +149,21 @@ def _start_unix(topics: Topics) -> float | None:
     return float((utc_s - gps.index)[known].median()) if known.any() else None
 
 
-def _read_imu(topics: Topics) -> pd.DataFrame | Unavailable:
-    imu = topics.read(IMU)
+def _enough(
+    samples: pd.DataFrame | None, what: str, topic: str, remedy: str
+) -> pd.DataFrame | Unavailable:
+    """The usable samples of a topic, or why there are none."""
+    if samples is None:
+        return Unavailable(what, f"no topic {topic}", px4.DEFAULT_PROFILE)
+    if len(samples) < 2:
+        return Unavailable(what, f"{topic} holds {len(samples)} usable samples", remedy)
+    return samples
+
+
+def _read_imu(topics: Topics) -> pd.DataFrame | None:
+    imu = topics.read(px4.IMU)
     if imu is None:
-        return Unavailable(
-            "IMU", "no topic sensor_combined", "Record with SDLOG_PROFILE bit 0 (default)."
-        )
+        return None
     if "accelerometer_offset_us" in imu:
         offset_us = imu.pop("accelerometer_offset_us")
         imu = imu[offset_us != ACCELEROMETER_OFFSET_INVALID_US]
@@ -163,37 +171,12 @@ def _read_imu(topics: Topics) -> pd.DataFrame | Unavailable:
         keep = increasing(time_us.astype(np.int64) + topics.zero_us)
         imu = imu.iloc[keep].set_axis(pd.Index(time_us[keep] * 1e-6, name="time_s"))
     columns = SPECIFIC_FORCE_COLUMNS + ANGULAR_RATE_COLUMNS
-    imu = finite_rows(imu[columns], columns)
-    if len(imu) < 2:
-        return Unavailable(
-            "IMU",
-            f"sensor_combined holds {len(imu)} usable samples",
-            "Check that the logger ran while the sensors did.",
-        )
-    return imu
-
-
-def _read_attitude(topics: Topics) -> pd.DataFrame | Unavailable:
-    attitude = topics.read(ATTITUDE)
-    if attitude is None:
-        return Unavailable(
-            "attitude", "no topic vehicle_attitude", "Record with SDLOG_PROFILE bit 0 (default)."
-        )
-    attitude = attitude[QUATERNION_COLUMNS]
-    norm: Array = np.linalg.norm(attitude.to_numpy(), axis=1)
-    attitude = attitude[np.isfinite(norm) & (norm > 0.5)]  # a zero quaternion is no attitude
-    if len(attitude) < 2:
-        return Unavailable(
-            "attitude",
-            f"vehicle_attitude holds {len(attitude)} usable samples",
-            "Check that the estimator ran while the logger did.",
-        )
-    return attitude
+    return finite_rows(imu[columns], columns)
 
 
 def _read_airborne(topics: Topics) -> tuple[tuple[float, float], ...] | Unavailable:
     """Stretches of flight by the land detector, each from take-off to touch-down."""
-    detected = topics.read(LAND_DETECTED, step=True)
+    detected = topics.read(px4.LAND_DETECTED, step=True)
     if detected is None or detected.empty:
         return Unavailable(
             "land detector",
@@ -204,9 +187,9 @@ def _read_airborne(topics: Topics) -> tuple[tuple[float, float], ...] | Unavaila
 
 
 def _read_modes(topics: Topics) -> tuple[FlightMode, ...] | Unavailable:
-    status = topics.read(FLIGHT_MODE, step=True)
+    status = topics.read(px4.FLIGHT_MODE, step=True)
     if status is None or status["nav_state"].isna().all():
         return MODES_NOT_LOGGED
     states = status["nav_state"].dropna()
-    names = states.map(lambda state: NAV_STATES.get(int(state), f"mode {state:.0f}"))
+    names = states.map(lambda state: px4.NAV_STATES.get(int(state), f"mode {state:.0f}"))
     return stretches_of_modes(names, topics.log.duration_s)

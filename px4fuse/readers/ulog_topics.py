@@ -11,8 +11,9 @@ import hashlib
 import io
 import struct
 from bisect import bisect_left
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -26,7 +27,8 @@ from pyulog.exceptions import ULogException
 from px4fuse.arrays import Array, IntArray
 from px4fuse.ekf2_parameters import REPORTED
 from px4fuse.errors import LogError
-from px4fuse.readers.px4_topics import IMU, Layout, topics
+from px4fuse.readers.layouts import Layout
+from px4fuse.readers.px4_topics import IMU, SELECTOR, topics
 from px4fuse.readers.ulog_framing import Framing, whole_messages
 from px4fuse.reading import read_log_bytes, shown
 from px4fuse.recording import Dropout, LogInfo
@@ -37,13 +39,9 @@ _MICROSECOND = 1e-6
 MAX_PUBLICATION_LAG_S = 10.0
 # Samples outside the data window by more than this are stale leftovers of an earlier boot phase.
 WINDOW_MARGIN_S = 2.0
-# ULog file format, docs.px4.io: header, then definitions up to the first of these messages
-HEADER_BYTES = 16
-DATA_MESSAGES = "ALC"
 # What a time stamp of a topic says, see measurement_time_us
 AT_MEASUREMENT = "autopilot boot clock, at measurement"
 AT_PUBLICATION = "autopilot boot clock, at publication"
-MAX_READS = 2_000_000
 RELEASE = 255
 # An info message in which a log says of itself what whoever reads it must know
 NOTE_KEY = "px4fuse_note"
@@ -55,6 +53,12 @@ _PARSE_ERRORS = (
     ULogException, struct.error, IndexError, KeyError, ValueError, TypeError, AttributeError,
     OverflowError, UnicodeError, EOFError, MemoryError, AssertionError, RecursionError,
 )  # fmt: skip
+
+
+# Primary EKF2 instance from each time on
+Instances = tuple[tuple[float, int], ...]
+# One EKF2 instance alone publishes no selector
+NO_SELECTOR: Instances = ((-np.inf, 0),)
 
 
 @dataclass(frozen=True)
@@ -88,14 +92,31 @@ class Topics:
         """Instances of a topic that hold data, in order."""
         return sorted(instance for name, instance in self.tables if name == topic)
 
+    def of(self, topic: str) -> list[dict[str, NDArray[Any]]]:
+        """Tables of a topic's instances, in order."""
+        return [self.tables[topic, number] for number in self.instances(topic)]
+
+    @cached_property
+    def primary(self) -> Instances:
+        """Primary EKF2 instance from each time on (``EKF2Selector.cpp``)."""
+        status = self.read(SELECTOR, step=True)
+        selected = pd.Series(dtype=float) if status is None else status["instance"]
+        selected = selected[selected < 255]  # 255: none selected yet
+        if selected.empty:
+            return NO_SELECTOR
+        changes = selected[selected.ne(selected.shift())]
+        times = [-np.inf, *changes.index[1:]]
+        return tuple((float(at), int(number)) for at, number in zip(times, changes, strict=True))
+
     def find(self, layouts: tuple[Layout, ...]) -> Layout | None:
         """First layout that this log holds, or None."""
-        for layout in layouts:
-            for (name, _), table in self.tables.items():
-                wanted = layout.columns.values()
-                if name == layout.topic and all(column in table for column in wanted):
-                    return layout
-        return None
+        held = (
+            layout
+            for layout in layouts
+            for table in self.of(layout.topic)
+            if all(column in table for column in layout.columns.values())
+        )
+        return next(held, None)
 
     def frame(self, layout: Layout, instance: int = 0, *, step: bool = False) -> pd.DataFrame:
         """Read one layout as a frame of float64 columns, indexed by measurement time in s.
@@ -124,7 +145,10 @@ class Topics:
             self.dropped[layout.topic, instance] = len(time_us) - len(keep)
         with np.errstate(invalid="ignore"):  # damaged bytes can be signalling NaNs
             frame = pd.DataFrame(
-                {ours: _usable(table[px4][keep]) for ours, px4 in columns.items()},
+                {
+                    ours: _usable(table[px4][keep]) * layout.scale.get(ours, 1.0)
+                    for ours, px4 in columns.items()
+                },
                 index=pd.Index((time_us[keep] - self.zero_us) * _MICROSECOND, name="time_s"),
             )
         return frame if step else self.window(frame)
@@ -134,12 +158,39 @@ class Topics:
         layout = self.find(layouts)
         return None if layout is None else self.frame(layout, step=step)
 
+    def of_primary(
+        self,
+        layout: Layout,
+        *,
+        step: bool = False,
+        select: Callable[[pd.DataFrame], pd.DataFrame] | None = None,
+    ) -> pd.DataFrame:
+        """Rows of each instance of a topic of EKF2 from when that instance was the primary one.
+
+        Parameters
+        ----------
+        layout, step
+            As :meth:`frame` takes them.
+        select : callable, optional
+            Which rows of an instance count; all by default.
+        """
+        available = self.instances(layout.topic)
+        alone = self.primary == NO_SELECTOR
+        starts, numbers = (np.array(part) for part in zip(*self.primary, strict=True))
+        parts: list[pd.DataFrame] = []
+        for number in available[:1] if alone else available:
+            frame = self.frame(layout, number, step=step)
+            frame = frame if select is None else select(frame)
+            at = np.searchsorted(starts, frame.index.to_numpy(), side="right") - 1
+            parts.append(frame if alone else frame[numbers[at] == number])
+        joined = pd.concat(parts).sort_index()
+        return joined[~joined.index.duplicated()]
+
     def clock(self, topic: str) -> str:
         """Which moment the times of a topic's samples are."""
         measured = any(
             np.any(measurement_time_us(table) != table["timestamp"].astype(np.int64))
-            for (name, _), table in self.tables.items()
-            if name == topic
+            for table in self.of(topic)
         )
         return AT_MEASUREMENT if measured else AT_PUBLICATION
 
@@ -175,14 +226,6 @@ def _usable(values: NDArray[Any]) -> Array:
     return usable
 
 
-def states_and_covariances(table: Mapping[str, NDArray[Any]]) -> tuple[int, int]:
-    """How many of either a topic with EKF2's state vector has."""
-    states, covariances = (
-        sum(column.startswith(f"{name}[") for column in table) for name in ("states", "covariances")
-    )
-    return states, covariances
-
-
 def increasing(time_us: NDArray[np.int64]) -> IntArray:
     """Indices of the longest strictly increasing run of positive time stamps.
 
@@ -195,17 +238,12 @@ def increasing(time_us: NDArray[np.int64]) -> IntArray:
         return indices
     tails: list[int] = []  # smallest last stamp of an increasing run of each length
     tail_at: list[int] = []  # where that stamp stands
-    previous = np.full(len(stamps), -1, dtype=np.intp)
+    previous = np.empty(len(stamps), dtype=np.intp)
     for at, stamp in enumerate(stamps.tolist()):
         length = bisect_left(tails, stamp)
-        if length:
-            previous[at] = tail_at[length - 1]
-        if length == len(tails):
-            tails.append(stamp)
-            tail_at.append(at)
-        else:
-            tails[length] = stamp
-            tail_at[length] = at
+        previous[at] = tail_at[length - 1] if length else -1
+        tails[length : length + 1] = [stamp]
+        tail_at[length : length + 1] = [at]
     run = []
     at = tail_at[-1]
     while at >= 0:
@@ -240,10 +278,10 @@ def read_topics(path: Path) -> Topics:
     whole = framing.content
     try:
         with contextlib.redirect_stdout(chatter):  # pyulog prints its warnings
-            ulog = ULog(_handle(whole), message_name_filter_list=topics())
+            ulog = ULog(io.BytesIO(whole), message_name_filter_list=topics())
             tables = _tables(ulog)
             # a log of other topics can still be placed in time, by all that it holds
-            placed = tables or _tables(ULog(_handle(whole)))
+            placed = tables or _tables(ULog(io.BytesIO(whole)))
     except _PARSE_ERRORS as error:
         raise LogError(
             f"{name}: not a readable ULog ({str(error) or type(error).__name__}). "
@@ -261,6 +299,11 @@ def read_topics(path: Path) -> Topics:
     if NOTE_KEY in ulog.msg_info_dict:
         notes += (_text(ulog.msg_info_dict, NOTE_KEY, ""),)
     zero_us, end_us = _data_span(placed, name)
+    given = {
+        name: float(value)
+        for name, value in ulog.initial_parameters.items()
+        if isinstance(value, int | float) and np.isfinite(value)
+    }
     log = LogInfo(
         name=name,
         sha256=hashlib.sha256(content).hexdigest(),
@@ -275,24 +318,14 @@ def read_topics(path: Path) -> Topics:
             Dropout((d.timestamp - zero_us) * _MICROSECOND, d.duration * 1e-3)
             for d in ulog.dropouts
         ),
-        parameters=MappingProxyType(
-            {
-                name: float(ulog.initial_parameters[name])
-                for name in REPORTED
-                if _is_finite(ulog.initial_parameters.get(name))
-            }
-        ),
+        parameters=MappingProxyType({name: given[name] for name in REPORTED if name in given}),
         notes=notes,
         damage=_corruption(ulog, chatter.getvalue()),
         bytes_read=len(content) - framing.lost_bytes,
         autopilot=_text(ulog.msg_info_dict, "sys_name", "PX4"),
         vehicle=_text(ulog.msg_info_dict, "sys_uuid", ""),
     )
-    parameters = {
-        name: float(value)
-        for name, value in ulog.initial_parameters.items()
-        if name.startswith("EKF2_") and _is_finite(value)
-    }
+    parameters = {name: value for name, value in given.items() if name.startswith("EKF2_")}
     return Topics(log, tables, zero_us, {}, MappingProxyType(parameters), framing)
 
 
@@ -347,10 +380,6 @@ def _text(info: dict[str, Any], key: str, otherwise: str) -> str:
     return "".join(c for c in text if c.isprintable()) or otherwise
 
 
-def _is_finite(value: object) -> bool:
-    return isinstance(value, int | float) and bool(np.isfinite(value))
-
-
 def _corruption(ulog: ULog, chatter: str) -> tuple[str, ...]:
     """What pyulog says of whole messages that make no sense."""
     if not ulog.file_corruption:
@@ -370,34 +399,3 @@ def _firmware(info: dict[str, Any]) -> str:
     # last byte: 0 development, 64 alpha, 128 beta, 192 release candidate, 255 release
     suffix = "" if kind == RELEASE else ("-dev", "-alpha", "-beta", "-rc")[kind // 64]
     return f"{_text(info, 'sys_name', 'PX4')} v{major}.{minor}.{patch}{suffix}"
-
-
-class _PatientBytes(io.BytesIO):
-    """A file that ends a reader that no longer gets anywhere.
-
-    pyulog steps back by more than it read when the definitions are cut off, and would do so for
-    ever.
-    """
-
-    def __init__(self, content: bytes) -> None:
-        super().__init__(content)
-        self._left = min(1000 + 4 * len(content), MAX_READS)
-
-    def read(self, size: int | None = -1) -> bytes:
-        self._left -= 1
-        if self._left < 0:
-            raise EOFError("its definitions are damaged")
-        return super().read(size)
-
-
-def _handle(content: bytes) -> io.BytesIO:
-    """The file for pyulog; a patient one, which costs time, only for damaged definitions."""
-    at = HEADER_BYTES
-    while at + 3 <= len(content):
-        size, kind = struct.unpack_from("<HB", content, at)
-        if chr(kind) in DATA_MESSAGES:
-            return io.BytesIO(content)
-        at += 3 + size
-        if kind == 0 or size == 0 or at > len(content):
-            break
-    return _PatientBytes(content)

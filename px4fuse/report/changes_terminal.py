@@ -5,20 +5,13 @@ from __future__ import annotations
 from rich.console import Console
 from rich.text import Text
 
-from px4fuse.report.changes_words import (
-    change_words,
-    folded_words,
-    judgement_words,
-    told,
-    value_words,
-)
+from px4fuse.report.changes_words import cells, folded_words, other_lines, printed
 from px4fuse.report.screen import plain_table, print_file, print_line, say
 from px4fuse.report.terminal import STYLES
 from px4fuse.results.contract import ChangeResults
 
 MOST = 15
 JUDGED = {"worse": "bold red", "better": "green", "changed": "bold", "no test": "dim"}
-HEADS = {"setting": "Setting", "parameter": "PX4", "flight": "Flight"}
 
 
 def print_changes(console: Console, results: ChangeResults, report: object = None) -> None:
@@ -37,29 +30,22 @@ def print_changes(console: Console, results: ChangeResults, report: object = Non
     for name, side in (("A", results.a), ("B", results.b)):
         of = "" if side.given == side.log else f", of {side.log}"
         print_line(console, name, f"{side.given}{of}")
-    shown = told(results)
+    shown = printed(results)
+    table = plain_table(
+        ("", "left"), ("number", "left"), ("A", "right"), ("B", "right"), ("change (95 %)", "left")
+    )
+    for change in shown[:MOST]:
+        judged, *others, _ = cells(change)
+        table.add_row(Text(judged, JUDGED[judged]), *others)
     if shown:
-        table = plain_table(
-            ("", "left"), ("number", "left"), ("A", "right"), ("B", "right"),
-            ("change (95 %)", "left"),
-        )  # fmt: skip
-        for change in shown[:MOST]:
-            judged = judgement_words(change)
-            table.add_row(
-                Text(judged, JUDGED[judged]), change.label, value_words(change, change.a),
-                value_words(change, change.b, unit=True), change_words(change),
-            )  # fmt: skip
         console.print(table)
     if (more := len(shown) - MOST) > 0:
         say(console, f"and {more} more in the report" if report else f"and {more} more (--json)")
     if folded := folded_words(results):
         say(console, Text(folded, "dim"))
-    for text in results.texts:
-        print_line(console, HEADS[text.kind], f"{text.what}: {text.a} → {text.b}")
-    for one in results.findings:
-        head = "New" if one.only_in == "B" else "Gone"
-        print_line(console, head, Text(f"{one.severity}: {one.message}", STYLES[one.severity]))
-    for note in (*results.notes, *results.methods[:1]):
+    for head, text, severity in other_lines(results):
+        print_line(console, head, Text(text, STYLES[severity] if severity else ""))
+    for note in results.notes[:2]:
         say(console, Text(note, "dim"))
     if report is not None:
         print_file(console, "Report", report)

@@ -14,7 +14,7 @@ from px4fuse.comparison.model import (
 from px4fuse.comparison.why import the
 from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.signals import AISLE
-from px4fuse.findings import Finding
+from px4fuse.findings import Finding, by_root
 from px4fuse.flight import Unavailable
 from px4fuse.report.document import Document, who
 from px4fuse.report.page import Cell, Page, halves, words
@@ -49,8 +49,8 @@ def draw(document: Document) -> Iterator[Page]:
     page.heading("Findings", 10.5, above=12.0)
     if not document.findings:
         page.write("None: no detector has anything to say about this flight.")
-    for finding in document.findings:
-        write_finding(page, finding)
+    for group in by_root(document.findings):
+        write_finding(page, group)
     yield page
 
 
@@ -152,11 +152,12 @@ def facts(document: Document) -> list[tuple[str, str]]:
     return [(label, text) for label, text in listed if text]
 
 
-def write_finding(page: Page, finding: Finding) -> None:
-    """Write severity, when it shows, sentence and remedy."""
+def write_finding(page: Page, group: list[Finding]) -> None:
+    """Write severity, when it shows, sentence and remedy, and what follows from it."""
+    finding, *followers = group
     said = [words(finding.message, 8.0), words(finding.remedy, 7.5, MUTED)]
-    if finding.consequences:
-        said.append(words(consequences_words(finding), 7.5, MUTED))
+    if followers:
+        said.append(words(consequences_words(followers), 7.5, MUTED))
     page.labelled(
         f"{finding.severity}\n{finding.when}", size=7.0, beside=said, above=2.0,
         colour=SEVERITY_COLOURS[finding.severity],

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
-from px4fuse.findings import Finding
+from px4fuse.findings import Finding, by_root
 from px4fuse.flight import Unavailable
 from px4fuse.loop.corrections import BY_DISTANCE, PLAIN, UNCORRECTED
 from px4fuse.loop.loop import Loop
@@ -78,8 +78,8 @@ def draw_loop(
         page.labelled(label, text)
     for text in (by_distance_words(loop), redundancy_words(loop), *refusals(loop)):
         page.write(text, colour=MUTED, above=2.0)
-    for finding in findings:
-        write_finding(page, finding)
+    for group in by_root(findings):
+        write_finding(page, group)
     page.skip(6.0)
     _table(page, loop)
     _map(page, loop)

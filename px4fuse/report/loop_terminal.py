@@ -6,7 +6,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from px4fuse.findings import Finding
+from px4fuse.findings import Finding, by_root
 from px4fuse.flight import Unavailable
 from px4fuse.loop.loop import Loop
 from px4fuse.report.evaluation_words import reasons
@@ -57,8 +57,8 @@ def print_loop(
     ):  # fmt: skip
         if text:
             say(console, Text(text, "dim"))
-    for finding in findings:
-        print_finding(console, finding, request)
+    for group in by_root(findings):
+        print_finding(console, group, request)
 
 
 def _print_paths(console: Console, loop: Loop) -> None:

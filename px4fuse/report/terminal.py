@@ -11,7 +11,7 @@ from rich.text import Text
 from px4fuse.comparison.model import Difference
 from px4fuse.ekf2.walk import Why
 from px4fuse.filter.consistency import Consistency
-from px4fuse.findings import Finding, Severity
+from px4fuse.findings import Finding, Severity, by_root
 from px4fuse.flight import Unavailable
 from px4fuse.report.commands import runnable
 from px4fuse.report.document import Document
@@ -88,9 +88,10 @@ def print_summary(
         print_why(console, why)
     if not document.findings:
         say(console, "No findings.")
-    for finding in document.findings[:MOST_FINDINGS]:
-        print_finding(console, finding, request)
-    if (more := len(document.findings) - MOST_FINDINGS) > 0:
+    groups = by_root(document.findings)
+    for group in groups[:MOST_FINDINGS]:
+        print_finding(console, group, request)
+    if (more := len(groups) - MOST_FINDINGS) > 0:
         say(console, f"and {more} more in the report" if report else f"and {more} more")
     if report is not None:
         print_file(console, "Report", report)
@@ -120,14 +121,15 @@ def print_advice(console: Console, lines: Iterable[str], request: Request) -> No
             print_command(console, command)
 
 
-def print_finding(console: Console, finding: Finding, request: Request) -> None:
-    """Print severity, sentence, remedy and the commands that the remedy names."""
+def print_finding(console: Console, group: list[Finding], request: Request) -> None:
+    """Print severity, sentence, remedy and the commands that it names, and what follows."""
+    finding, *followers = group
     head = Text(finding.severity.ljust(INDENT), STYLES[finding.severity])
     say(console, finding_words(finding), head, INDENT)
     remedy, commands = runnable(finding.remedy, request)
     print_line(console, "", remedy, "dim")
-    if finding.consequences:
-        print_line(console, "", consequences_words(finding), "dim")
+    if followers:
+        print_line(console, "", consequences_words(followers), "dim")
     for command in commands:
         print_command(console, command)
 

@@ -105,12 +105,12 @@ def verdict_notes(comparison: Comparison) -> list[str]:
     small = [
         f"{owner} {axis} {verdict_words(statement)}"
         for axis, owner, statement in stated
-        if statement.verdict != "consistent" and _factor(statement) < VARIANCE_FACTOR.value
+        if statement.verdict != "consistent" and _factor(statement) < VARIANCE_FACTOR
     ]
     if small:
         notes.append(
-            f"{', '.join(small)}: more than chance, but less than {VARIANCE_FACTOR.value:g}× "
-            f"({np.sqrt(VARIANCE_FACTOR.value) - 1.0:.0%} in σ), from where it is a finding."
+            f"{', '.join(small)}: more than chance, but less than {VARIANCE_FACTOR:g}× "
+            f"({np.sqrt(VARIANCE_FACTOR) - 1.0:.0%} in σ), from where it is a finding."
         )
     notes += _same_nis(stated)
     coloured = [
@@ -150,13 +150,13 @@ def _same_nis(stated: Sequence[tuple[str, str, Consistency]]) -> Iterator[str]:
 
 def finding_words(finding: Finding) -> str:
     """What a finding says, with when it shows where the message does not say that."""
-    told = any(f"{time:.1f} s" in finding.message for span in finding.spans_s for time in span)
-    return finding.message if told or not finding.when else f"{finding.message} At {finding.when}."
+    said = finding.says_when or not finding.when
+    return finding.message if said else f"{finding.message} At {finding.when}."
 
 
-def consequences_words(finding: Finding) -> str:
+def consequences_words(followers: Sequence[Finding]) -> str:
     """What the same cause brings with it, each in one sentence."""
-    return "With it: " + " ".join(f"{one.headline}." for one in finding.consequences)
+    return "With it: " + " ".join(f"{one.headline}." for one in followers)
 
 
 def clock_words(clock: ClockMap) -> str:

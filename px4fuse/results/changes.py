@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from typing import Literal
 
-from px4fuse.record import Count, Record, Sha256, Share, Span
+from px4fuse.record import Record, Sha256, Share, Span
 from px4fuse.results.model import Version
 
-Status = Literal["significant", "within chance", "not tested", "differs", "same"]
 Which = Literal["A", "B"]
+Status = Literal[
+    "significant", "within chance", "not tested", "differs", "same", "only in A", "only in B"
+]
 Judgement = Literal["better", "worse", "changed", ""]
 
 
@@ -31,6 +33,7 @@ class NumberChange(Record, frozen=True, kw_only=True):
         Where it stands in the results of both: ``axes.aisle.filters.ekf2.nis_mean``.
     label, unit : str
     a, b : float
+        Absent where only the other one has it.
     a_interval, b_interval : (float, float)
         95 %; absent where there is none.
     scale : {"ratio", "difference"}
@@ -39,32 +42,28 @@ class NumberChange(Record, frozen=True, kw_only=True):
         Absent where it is a ratio to zero.
     change_interval : (float, float)
         95 %, with what two flights with the same equipment are apart by.
-    p, q : float
-        p-value of "no change", and the same corrected for the number of tests.
+    q : float
+        p-value of "no change", corrected for the number of tests.
     status : str
         "significant", "within chance" or "not tested" between two flights; "differs" or "same"
         between two settings of one flight, where nothing is left to chance.
     judgement : {"better", "worse", "changed", ""}
         "changed" where B is neither; "" where the change is not significant.
-    why : str
-        What the status rests on, in words.
     """
 
     path: str
     label: str
     unit: str
-    a: float
-    b: float
+    a: float | None = None
+    b: float | None = None
     a_interval: Span | None = None
     b_interval: Span | None = None
     scale: Literal["ratio", "difference"]
     change: float | None = None
     change_interval: Span | None = None
-    p: Share | None = None
     q: Share | None = None
     status: Status
-    judgement: Judgement
-    why: str
+    judgement: Judgement = ""
 
 
 class TextChange(Record, frozen=True):
@@ -83,21 +82,3 @@ class FindingChange(Record, frozen=True):
     severity: Literal["error", "warning", "info"]
     message: str
     only_in: Which
-
-
-class OneSided(Record, frozen=True):
-    """A number that only one of the two has."""
-
-    path: str
-    label: str
-    only_in: Which
-
-
-class Counts(Record, frozen=True):
-    """How many numbers are compared, tested, changed (significantly, or at all) and judged."""
-
-    compared: Count
-    tested: Count
-    changed: Count
-    better: Count
-    worse: Count

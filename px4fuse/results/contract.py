@@ -27,10 +27,8 @@ from px4fuse.record import Maybe, Record, Span, Unavailable
 from px4fuse.request import AxisName, ComparisonRequest, LoopRequest, WhatIfRequest
 from px4fuse.results.changes import (
     Compared,
-    Counts,
     FindingChange,
     NumberChange,
-    OneSided,
     TextChange,
 )
 from px4fuse.results.comparison import ChosenSettings, Log, PositionSource
@@ -180,13 +178,11 @@ class ChangeResults(Record, frozen=True, kw_only=True):
         Both are of one flight, so that nothing is left to chance.
     summary : tuple of str
         Sentences.
-    counts : Counts
     numbers : tuple of NumberChange
         Significant ones first, worse before better.
     texts : tuple of TextChange
     findings : tuple of FindingChange
-    one_sided : tuple of OneSided
-    methods, notes : tuple of str
+    notes : tuple of str
         How significance was decided, and what to mind, a sentence each.
     provenance : Provenance
     """
@@ -196,12 +192,9 @@ class ChangeResults(Record, frozen=True, kw_only=True):
     b: Compared
     paired: bool
     summary: tuple[str, ...]
-    counts: Counts
     numbers: tuple[NumberChange, ...]
     texts: tuple[TextChange, ...]
     findings: tuple[FindingChange, ...]
-    one_sided: tuple[OneSided, ...]
-    methods: tuple[str, ...]
     notes: tuple[str, ...]
     provenance: Provenance
 

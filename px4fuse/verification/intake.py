@@ -16,8 +16,7 @@ import io
 import logging
 import re
 import zlib
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import suppress
 from dataclasses import dataclass, field, fields
 from typing import Any
 
@@ -45,6 +44,7 @@ MAX_MISSING = 100
 
 _INSTALL = 'reading reports needs more packages: pip install "px4fuse[grade]".'
 _DAMAGED = "damaged: it cannot be read as a PDF. Hand in the file that px4fuse wrote."
+_LOCKED = "encrypted, or damaged. Hand in the file px4fuse wrote."
 _COSTLY = "it takes more memory or work to open than a report can need."
 
 # What acts, by key of a dictionary ... Links, comments, forms without scripts and the view to open
@@ -97,6 +97,10 @@ _FILTERS = frozenset(("/FlateDecode", "/DCTDecode"))
 _STREAM = re.compile(rb"(?<!end)stream *\r?\n?")
 
 
+# What pypdf thinks of a broken file is not for the instructor's terminal
+logging.getLogger("pypdf").setLevel(logging.CRITICAL + 1)
+
+
 @dataclass
 class _Contents:
     """What the walk over a document met."""
@@ -123,66 +127,56 @@ def read_report(pdf: bytes, name: str) -> Report | Refused:
     """
     remedy = ""
     try:
-        with _quiet_pypdf():
-            return _read(pdf)
+        _check_file(pdf)
+        known = {setting.name for setting in fields(pypdf.Configuration)}
+        limits = {name: value for name, value in _PYPDF_LIMITS.items() if name in known}
+        with pypdf.apply_configuration(**limits):
+            results = _results(pdf)
+        return Report(hashlib.sha256(pdf).hexdigest(), seal_of(pdf), results, pdf)
     except ResultsError as refusal:
         reason, remedy = str(refusal), refusal.remedy
     except (LimitReachedError, RecursionError, MemoryError):
         reason = _COSTLY
     # pypdf names no closed set of exceptions for what is broken in a file
     except Exception:  # noqa: BLE001
-        reason = _DAMAGED
+        old = not hasattr(pypdf, "apply_configuration")
+        reason = _INSTALL if old else _LOCKED if b"/Encrypt" in pdf else _DAMAGED
     return Refused(f"{one_line(name, 200)}: {reason}", remedy)
 
 
-@contextmanager
-def _quiet_pypdf() -> Iterator[None]:
-    """What pypdf thinks of a broken file is not for the instructor's terminal."""
-    logger = logging.getLogger("pypdf")
-    before = logger.level
-    logger.setLevel(logging.CRITICAL + 1)
-    try:
-        yield
-    finally:
-        logger.setLevel(before)
-
-
-def _read(pdf: bytes) -> Report:
-    if not hasattr(pypdf, "apply_configuration"):
-        raise ResultsError(_INSTALL)
-    _check_file(pdf)
-    _check_streams(pdf)
-    known = {setting.name for setting in fields(pypdf.Configuration)}
-    limits = {name: value for name, value in _PYPDF_LIMITS.items() if name in known}
-    with pypdf.apply_configuration(**limits):
-        reader = _open(pdf)
-        _check_page_count(reader)
-        contents = _walk(reader)
-        if contents.found:
-            raise ResultsError(f"it contains {', '.join(sorted(contents.found))}; no report does.")
-        results = _results(_attachment(contents))
-    return Report(
-        sha256=hashlib.sha256(pdf).hexdigest(),
-        seal=seal_of(pdf),
-        results=results,
-        pages=(),
-        pdf=pdf,
+def _results(pdf: bytes) -> Reported:
+    # strict: a file that needs repair is read differently by every program
+    reader = pypdf.PdfReader(
+        io.BytesIO(pdf), strict=True, xref_stream_maximum_entries=10 * MAX_OBJECTS
     )
+    if reader.is_encrypted:
+        raise ResultsError("encrypted. Hand in the file that px4fuse wrote.")
+    try:
+        count = len(reader.pages)
+    except LimitReachedError:
+        count = MAX_PAGES + 1
+    if not 0 < count <= MAX_PAGES:
+        raise ResultsError(f"more than {MAX_PAGES} pages." if count else "a PDF without pages.")
+    contents = _walk(reader)
+    if contents.found:
+        raise ResultsError(f"it contains {', '.join(sorted(contents.found))}; no report does.")
+    where = f"{RESULTS_NAME} in it"
+    results = read_results(_attachment(contents), where)
+    if not isinstance(results, ComparisonResults | LoopResults):
+        raise ResultsError(f"{where} holds no results of a report.")
+    return results
 
 
 def _check_file(pdf: bytes) -> None:
-    if len(pdf) > MAX_BYTES:
-        raise ResultsError(f"larger than {MAX_BYTES // 1_000_000} MB; reports are below 2 MB.")
-    if not pdf:
-        raise ResultsError("an empty file.")
-    if not pdf.startswith(b"%PDF-"):
-        raise ResultsError("not a PDF.")
-    if b"%%EOF" not in pdf[-2048:]:
-        raise ResultsError("cut off: the end of the PDF is missing. Hand it in again.")
-
-
-def _check_streams(pdf: bytes) -> None:
-    """Inflate every stream into nothing, so that no bomb reaches pypdf."""
+    for wrong, why in (
+        (len(pdf) > MAX_BYTES, f"larger than {MAX_BYTES // 1_000_000} MB; reports are below 2 MB."),
+        (not pdf, "an empty file."),
+        (not pdf.startswith(b"%PDF-"), "not a PDF."),
+        (b"%%EOF" not in pdf[-2048:], "cut off: the end of the PDF is missing. Hand it in again."),
+    ):
+        if wrong:
+            raise ResultsError(why)
+    # every stream is inflated into nothing, so that no bomb reaches pypdf
     left = MAX_DOCUMENT_BYTES
     for match in _STREAM.finditer(pdf):
         # `stream` may stand anywhere, also inside a stream; each try counts towards the same limit
@@ -214,35 +208,6 @@ def _inflated_bytes(pdf: bytes, start: int, limit: int) -> int:
     taken -= len(inflate.unused_data)
     # the least is what a try costs, however little is there
     return min(max(taken, given, 1000), limit + 1)
-
-
-def _open(pdf: bytes) -> pypdf.PdfReader:
-    try:
-        # strict: a file that needs repair is read differently by every program
-        reader = pypdf.PdfReader(
-            io.BytesIO(pdf), strict=True, xref_stream_maximum_entries=10 * MAX_OBJECTS
-        )
-        encrypted = reader.is_encrypted
-    except (LimitReachedError, RecursionError, MemoryError):
-        raise
-    except Exception as error:
-        if b"/Encrypt" in pdf:
-            raise ResultsError("encrypted, or damaged. Hand in the file px4fuse wrote.") from error
-        raise
-    if encrypted:
-        raise ResultsError("encrypted. Hand in the file that px4fuse wrote.")
-    return reader
-
-
-def _check_page_count(reader: pypdf.PdfReader) -> None:
-    try:
-        count = len(reader.pages)
-    except LimitReachedError:
-        count = MAX_PAGES + 1
-    if count > MAX_PAGES:
-        raise ResultsError(f"more than {MAX_PAGES} pages.")
-    if count == 0:
-        raise ResultsError("a PDF without pages.")
 
 
 def _walk(reader: pypdf.PdfReader) -> _Contents:
@@ -332,23 +297,20 @@ def _attachment(contents: _Contents) -> bytes:
         raise ResultsError(
             "more than one file is attached, or none that can be read: hand in one report per PDF."
         )
-    names = {
-        str(_resolved(contents.files[0].get(key)))
-        for key in ("/UF", "/F", "/DOS", "/Mac", "/Unix")
-        if key in contents.files[0]
-    }
+    file = contents.files[0]
+    names = {str(_resolved(file.get(key))) for key in ("/UF", "/F", "/DOS", "/Mac", "/Unix")
+             if key in file}  # fmt: skip
     if names != {RESULTS_NAME}:
         shown = one_line(" / ".join(sorted(names)), 80)
         raise ResultsError(f"the attached file is called {shown!r}, not {RESULTS_NAME!r}.")
+    data = None
     (stream,) = streams.values()
-    too_large = f"{RESULTS_NAME} in it is larger than {MAX_ATTACHMENT_BYTES // 1_000_000} MB."
-    try:
-        with pypdf.apply_configuration(zlib_maximum_output_length=MAX_ATTACHMENT_BYTES):
-            data = bytes(stream.get_data())
-    except LimitReachedError as error:
-        raise ResultsError(too_large) from error
-    if len(data) > MAX_ATTACHMENT_BYTES:
-        raise ResultsError(too_large)
+    most = pypdf.apply_configuration(zlib_maximum_output_length=MAX_ATTACHMENT_BYTES)
+    with suppress(LimitReachedError), most:
+        data = bytes(stream.get_data())
+    if data is None or len(data) > MAX_ATTACHMENT_BYTES:
+        limit = MAX_ATTACHMENT_BYTES // 1_000_000
+        raise ResultsError(f"{RESULTS_NAME} in it is larger than {limit} MB.")
     return data
 
 
@@ -356,11 +318,3 @@ def _streams_of(file: DictionaryObject) -> list[StreamObject]:
     versions = _resolved(file.get("/EF"))
     parts = versions.values() if isinstance(versions, DictionaryObject) else ()
     return [part for each in parts if isinstance(part := _resolved(each), StreamObject)]
-
-
-def _results(data: bytes) -> Reported:
-    where = f"{RESULTS_NAME} in it"
-    results = read_results(data, where)
-    if not isinstance(results, ComparisonResults | LoopResults):
-        raise ResultsError(f"{where} holds no results of a report.")
-    return results

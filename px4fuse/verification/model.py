@@ -24,8 +24,6 @@ class Report:
         Of the PDF.
     results : ComparisonResults or LoopResults
         The attached results.
-    pages : tuple of str
-        Text of each page; empty as it is read. Nothing that verifies a report looks at them.
     pdf : bytes
         The file itself.
     """
@@ -33,7 +31,6 @@ class Report:
     sha256: str
     seal: Seal
     results: Reported
-    pages: tuple[str, ...]
     pdf: bytes = field(repr=False)
 
 
@@ -41,11 +38,13 @@ class Report:
 class Refused:
     """A submission that cannot be read as a report, and why: one sentence for a person.
 
-    ``remedy`` is what whoever verifies it can do; "" where nothing helps but another file.
+    ``remedy`` is what whoever verifies it can do; "" where nothing helps but another file, and
+    ``missing`` the name of a file that would help.
     """
 
     reason: str
     remedy: str = ""
+    missing: str = ""
 
 
 @dataclass(frozen=True)
@@ -108,6 +107,8 @@ class Verdict:
         what was handed in. Empty where the analysis was not run again.
     remedy : str
         What whoever verifies it can do where nothing could be said: one sentence.
+    missing : str
+        Name of the log, or of another file, without which nothing could be said.
     """
 
     status: Status
@@ -118,6 +119,20 @@ class Verdict:
     pages: tuple[PageDifference, ...] = ()
     redrawn: bytes = field(default=b"", repr=False)
     remedy: str = ""
+    missing: str = ""
+
+    @property
+    def waits_for_file(self) -> bool:
+        """Whether nothing is wrong with the report, but a file of it is not at hand."""
+        return self.status == "cannot verify" and bool(self.missing)
+
+    @property
+    def what_to_do(self) -> str:
+        """What whoever verifies it can do; "" for nothing."""
+        if not self.missing:
+            return self.remedy
+        other = "If it is a log of yours, add" if self.status == "other log" else "Add"
+        return f"{other} {self.missing} to --logs."
 
     @property
     def outcome(self) -> str:

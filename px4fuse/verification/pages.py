@@ -29,6 +29,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from difflib import SequenceMatcher
+from functools import partial
 from itertools import zip_longest
 from typing import Any
 
@@ -49,7 +50,7 @@ SQUARE_PX = 8
 DISTANCE = 0.07
 # A page that another program wrote may be rounded to whole points
 SIZE_PX = 2
-MAX_PAGES, MAX_PAGE_TEXT = 100, 1_000_000
+MAX_PAGE_TEXT = 1_000_000
 # For the pages of a PDF that was handed in; libraries take 0.6 GB of the address space
 TIMEOUT_S, MEMORY_BYTES = 10.0, 1_100_000_000
 
@@ -88,7 +89,7 @@ def compare_pages(
     except FAILURES as error:
         return undrawn(error)
     # of a thousand pages that are handed in, not all are drawn
-    theirs = bounded(_looks_or_why, (submitted, len(ours) + 1), TIMEOUT_S, MEMORY_BYTES)
+    theirs = bounded(partial(_looks_or_why, most=len(ours) + 1), submitted, TIMEOUT_S, MEMORY_BYTES)
     if isinstance(theirs, Failed):
         why = f"they cannot be drawn within bounds ({theirs.reason.rstrip('.')})"
         return Unavailable("pages of the PDF", why, "Do not open it; read the redrawn report.")
@@ -109,20 +110,11 @@ def looks(pdf: bytes, most: int = 1000) -> tuple[Look | Unavailable, ...]:
         return tuple(_look(document, page) for page in range(min(len(document), most)))
 
 
-def _looks_or_why(job: tuple[bytes, int]) -> tuple[Look | Unavailable, ...] | Unavailable:
+def _looks_or_why(pdf: bytes, most: int) -> tuple[Look | Unavailable, ...] | Unavailable:
     try:
-        return looks(*job)
+        return looks(pdf, most)
     except FAILURES as error:
         return undrawn(error)
-
-
-def page_texts(pdf: bytes) -> tuple[str, ...]:
-    """Text of each page; none without pypdfium2 or where the file cannot be read."""
-    try:
-        with opened(pdf) as document:
-            return tuple(_text(document[page]) for page in range(min(len(document), MAX_PAGES)))
-    except FAILURES:
-        return ()
 
 
 def _look(document: Any, page: int) -> Look | Unavailable:

@@ -24,8 +24,6 @@ MAX_PIXELS = 2_000_000
 MAX_DRAWN_COLOURS = 20_000
 # PDF's own limit is 14,400 points, or 200 inches
 MAX_POINTS = 14_400.0
-# Headings of the first page of either kind of report
-COVERS = ("Two-state Kalman filter against EKF2", "Loop closure")
 WHAT = "picture of the page"
 # Where a report's pages name log and student, and what names are covered with
 HEAD = 0.045
@@ -35,17 +33,6 @@ FAILURES = (
     RuntimeError, ValueError, TypeError, ArithmeticError, LookupError, AssertionError, OSError,
     MemoryError, ImportError,
 )  # fmt: skip
-
-
-def key_page(pages: Sequence[str]) -> int:
-    """Which page to show of a report, counted from 0, by the text of each.
-
-    That is its cover, also where a student put pages before it.
-    """
-    for page, text in enumerate(pages):
-        if any(line.strip() in COVERS for line in text.splitlines()):
-            return page
-    return 0
 
 
 def picture(pdf: bytes, page: int) -> bytes | Unavailable:

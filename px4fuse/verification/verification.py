@@ -20,11 +20,18 @@ from typing import Any
 
 from px4fuse.flight import Unavailable
 from px4fuse.reading import files_by_sha256
-from px4fuse.results.contract import LoopResults, Reported, to_plain
+from px4fuse.results.contract import Reported, to_plain
 from px4fuse.results.model import Provenance
 from px4fuse.results.reading import cleaned, one_line
 from px4fuse.verification import rerun
-from px4fuse.verification.model import Mismatch, PageStatus, Refused, Report, Status, Verdict
+from px4fuse.verification.model import (
+    Mismatch,
+    PageDifference,
+    PageStatus,
+    Refused,
+    Report,
+    Verdict,
+)
 from px4fuse.verification.pages import NumbersAlike, compare_pages
 from px4fuse.verification.rerun import Recomputed
 
@@ -81,6 +88,20 @@ class Numbers:
     pairs: tuple[tuple[float, float], ...]
     compared: int
 
+    @property
+    def reason(self) -> str:
+        """What was found, as a sentence."""
+        if not self.differing:
+            return (
+                f"the log gives all {self.compared} values again (within {RELATIVE:g}, estimates "
+                f"within {ESTIMATE_RELATIVE:g})"
+            )
+        first = ", ".join(one.path for one in self.differences[:3])
+        more = ", …" * (self.differing > 3)
+        return (
+            f"{self.differing} of {self.compared} values are not what the log gives: {first}{more}"
+        )
+
 
 def verify(
     report: Report,
@@ -113,37 +134,27 @@ def verify(
     theirs, ours = report.results.provenance.px4fuse, metadata.version("px4fuse")
     if theirs != ours:
         named = one_line(theirs, 40)
-        reason = f"made with px4fuse {named}, this is {ours}"
-        return _unknown(reason, f"Run it with px4fuse {named}.")
+        why = f"made with px4fuse {named}, this is {ours}"
+        return _unknown(Refused(why, f"Run it with px4fuse {named}."))
+    name = one_line(rerun.log_name(report.results), 80) or "its log"
     if not logs:
-        return _unknown(NO_LOG, f"Add {_log_name(report.results)} to --logs.")
+        return _unknown(Refused(NO_LOG, missing=name))
     files = logs if isinstance(logs, Mapping) else files_by_sha256(logs)
     sha256 = rerun.log_sha256(report.results)
     if sha256 not in files:
         asked = one_line(sha256, 64) or "none"
         reason = f"none of the {len(files)} files given is the log, whose SHA-256 is {asked}"
-        remedy = f"If it is a log of yours, add {_log_name(report.results)} to --logs."
-        return Verdict("other log", (reason,), with_log=False, remedy=remedy)
+        return Verdict("other log", (reason,), with_log=False, missing=name)
     if report.results.student.notes.count("\n") > MAX_NOTES_LINES:
         reason = f"its notes have more than {MAX_NOTES_LINES} lines, which is no report"
-        return _unknown(reason, rerun.ASK)
+        return _unknown(Refused(reason, rerun.ASK))
     again = recompute(report.results, files)
-    if isinstance(again, Refused):
-        return _unknown(one_line(again.reason, 400), again.remedy)
-    return _with_log(report, again)
+    return _unknown(again) if isinstance(again, Refused) else _with_log(report, again)
 
 
-def _unknown(reason: str, remedy: str) -> Verdict:
-    return Verdict("cannot verify", (reason,), with_log=False, remedy=remedy)
-
-
-def _log_name(results: Reported) -> str:
-    """Name of the log, as the report gives it."""
-    if isinstance(results, LoopResults):
-        name, _ = rerun.split_part(results.track.name)
-    else:
-        name = results.log.name
-    return one_line(name, 80) or "its log"
+def _unknown(why: Refused) -> Verdict:
+    reasons = (one_line(why.reason, 400),)
+    return Verdict("cannot verify", reasons, False, remedy=why.remedy, missing=why.missing)
 
 
 def _with_log(report: Report, again: Recomputed) -> Verdict:
@@ -152,36 +163,30 @@ def _with_log(report: Report, again: Recomputed) -> Verdict:
         reason = "the log gives the same file again, byte for byte"
         return Verdict("verified", (reason, LIMIT), True, page_status="same", redrawn=redrawn)
     numbers = compare_results(to_plain(report.results), to_plain(again.results))
-    rounded = _rounding(numbers.pairs)
-    pages = compare_pages(report.pdf, redrawn, lambda one, other: same_words(one, other, rounded))
-    status: Status = "numbers differ" if numbers.differences else "verified"
-    reasons = [_number_reason(numbers)]
-    page_status: PageStatus = "same"
+    alike = _rounding(numbers.pairs)
+    pages = compare_pages(report.pdf, redrawn, lambda one, other: same_words(one, other, alike))
+    reasons = [numbers.reason]
+    page_status: PageStatus = "not compared"
+    differing: tuple[PageDifference, ...] = ()
     if isinstance(pages, Unavailable):
         reasons.append(f"the pages were not compared: {pages.reason}. {pages.remedy}")
-        pages, page_status = (), "not compared"
-    elif pages:
-        page_status = "differ"
+    else:
+        differing, page_status = pages, "differ" if pages else "same"
         reasons += [f"page {one.page} differs: {one.what}" for one in pages]
+    if differing:
         reasons += _other_machine(report.results.provenance, again.results.provenance)
     if report.seal != "intact":
         reasons.append(SAVED_AGAIN)
-    if status == "verified":
+    if not numbers.differing:
         reasons.append(LIMIT)
-    found = numbers.differences
-    return Verdict(status, tuple(reasons), True, found, page_status, pages, redrawn)
-
-
-def _number_reason(numbers: Numbers) -> str:
-    if not numbers.differences:
-        return (
-            f"the log gives all {numbers.compared} values again (within {RELATIVE:g}, estimates "
-            f"within {ESTIMATE_RELATIVE:g})"
-        )
-    first = ", ".join(one.path for one in numbers.differences[:3])
-    return (
-        f"{numbers.differing} of {numbers.compared} values are not what the log gives: {first}"
-        + ("" if numbers.differing <= 3 else ", …")
+    return Verdict(
+        "numbers differ" if numbers.differing else "verified",
+        tuple(reasons),
+        True,
+        numbers.differences,
+        page_status,
+        differing,
+        redrawn,
     )
 
 
@@ -207,29 +212,27 @@ def compare_results(recorded: Mapping[str, Any], recomputed: Mapping[str, Any]) 
     command = str(recomputed["provenance"]["command"])
     # everything rests on an offset or placement that was estimated
     everywhere = "auto" in command.split() or "--position" in command.split()
-    leaves = [
-        (path, theirs, ours)
-        for path, theirs, ours in _leaves("", recorded, recomputed)
-        if not path.startswith(MACHINE)
-    ]
     wrong: dict[str, tuple[Any, Any]] = {}
     pairs: list[tuple[float, float]] = []
-    for path, theirs, ours in leaves:
-        if is_number(theirs) and is_number(ours):
-            wide = everywhere or path.startswith(ESTIMATES)
-            if not _near(path, theirs, ours, wide):
-                wrong[path] = theirs, ours
-            elif theirs != ours:
-                pairs.append((float(theirs), float(ours)))
-    rounded = _rounding(pairs)
-    for path, theirs, ours in leaves:
-        if not (is_number(theirs) and is_number(ours)) and not _same(theirs, ours, rounded):
+    others: list[tuple[str, Any, Any]] = []
+    compared = 0
+    for path, theirs, ours in _leaves("", recorded, recomputed):
+        if path.startswith(MACHINE):
+            continue
+        compared += 1
+        if not (is_number(theirs) and is_number(ours)):
+            others.append((path, theirs, ours))
+        elif not _near(path, theirs, ours, everywhere or path.startswith(ESTIMATES)):
             wrong[path] = theirs, ours
+        elif theirs != ours:
+            pairs.append((float(theirs), float(ours)))
+    rounded = _rounding(pairs)
+    wrong |= {path: (a, b) for path, a, b in others if not _same(a, b, rounded)}
     found = tuple(
         Mismatch(one_line(path, SHOWN_TEXT), _shown(theirs), _shown(ours))
         for path, (theirs, ours) in list(wrong.items())[:SHOWN]
     )
-    return Numbers(found, len(wrong), tuple(pairs), len(leaves))
+    return Numbers(found, len(wrong), tuple(pairs), compared)
 
 
 # Stands where there is nothing
@@ -238,19 +241,14 @@ _ABSENT = object()
 
 def _leaves(path: str, theirs: Any, ours: Any) -> Iterator[tuple[str, Any, Any]]:
     """Values side by side; a branch that one of them lacks, or that is a value there, is one."""
-    if isinstance(ours, Mapping) and isinstance(theirs, Mapping):
-        for name in (*ours, *(name for name in theirs if name not in ours)):
-            below = f"{path}.{name}" if path else str(name)
-            yield from _leaves(below, theirs.get(name, _ABSENT), ours.get(name, _ABSENT))
-    elif isinstance(ours, list | tuple) and isinstance(theirs, list | tuple):
-        for i in range(max(len(ours), len(theirs))):
-            yield from _leaves(
-                f"{path}[{i}]",
-                theirs[i] if i < len(theirs) else _ABSENT,
-                ours[i] if i < len(ours) else _ABSENT,
-            )
-    else:
+    if isinstance(ours, list | tuple) and isinstance(theirs, list | tuple):
+        theirs, ours = ({f"[{i}]": v for i, v in enumerate(one)} for one in (theirs, ours))
+    if not (isinstance(ours, Mapping) and isinstance(theirs, Mapping)):
         yield path, theirs, ours
+        return
+    for name in {**ours, **theirs}:
+        below = f"{path}.{name}" if path and not name.startswith("[") else f"{path}{name}"
+        yield from _leaves(below, theirs.get(name, _ABSENT), ours.get(name, _ABSENT))
 
 
 def is_number(value: object) -> bool:

@@ -393,6 +393,10 @@
       show(entries[Number(button.dataset.open)]);
     });
   }
+  for (const box of document.querySelectorAll("[data-parts]")) {
+    const { parts, mark } = box.dataset;
+    box.append(sketch(parts.split(" ").map(Number), mark ? Number(mark) : null));
+  }
   window.addEventListener("resize", fit);
   window.addEventListener("beforeprint", () => {
     first = 0;

@@ -7,12 +7,11 @@ Without scripts the page shows its first rows as a plain table.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from string import Template
 from typing import Any, Literal
 
-from px4fuse.webpage.safe import clean, escaped, inert_json, part, policy_hash
+from px4fuse.webpage.safe import cleaned, inert_json, part, policy_hash, template
 
 # Rows that the script draws at once, and that are there without it
 PAGE_ROWS = 100
@@ -108,17 +107,17 @@ class Row:
 
 def listed(title: str, texts: Sequence[str], warn: bool = False) -> Part:
     """A list of sentences."""
-    return ["list", clean(title), [clean(text) for text in texts], warn]
+    return ["list", title, texts, warn]
 
 
 def prose(title: str, text: str) -> Part:
     """Text with its own lines."""
-    return ["prose", clean(title), clean(text)]
+    return ["prose", title, text]
 
 
 def pairs(title: str, rows: Sequence[tuple[str, str]]) -> Part:
     """Names and what they are; those without a value are left out."""
-    return ["pairs", clean(title), [[clean(name), clean(value)] for name, value in rows if value]]
+    return ["pairs", title, [row for row in rows if row[1]]]
 
 
 def tabled(
@@ -129,22 +128,17 @@ def tabled(
     after: str = "",
 ) -> Part:
     """A small table; ``numeric`` are the columns that end flush."""
-    lines = [[clean(text) for text in row] for row in rows]
-    return ["table", clean(title), [clean(head) for head in heads], lines, list(numeric), after]
+    return ["table", title, heads, rows, list(numeric), after]
 
 
 def links(title: str, rows: Sequence[tuple[str, str]]) -> Part:
     """Words and where they lead: addresses of :func:`px4fuse.webpage.safe.local_link` only."""
-    return ["links", clean(title), [[clean(text), to] for text, to in rows if to]]
+    return ["links", title, [row for row in rows if row[1]]]
 
 
 def pictures(title: str, rows: Sequence[tuple[str, str, str]]) -> Part:
     """Caption, words for who does not see it, and address (local, or data:image/png)."""
-    return [
-        "pictures",
-        clean(title),
-        [[clean(said), clean(alt), source] for said, alt, source in rows],
-    ]
+    return ["pictures", title, rows]
 
 
 def boxes(
@@ -163,59 +157,32 @@ def boxes(
     kept : sequence of (name, points, words)
         What the table holds besides.
     """
-    return [
-        "boxes", clean(title), clean(owner),
-        [[clean(name), most, points, clean(words)] for name, most, points, words in rows],
-        [[clean(name), points, clean(words)] for name, points, words in kept],
-    ]  # fmt: skip
+    return ["boxes", title, owner, rows, kept]
 
 
 # ------------------------------------------------------------------ above the table
 
 
-def card(title: str, *content: str) -> str:
-    """A box with a heading; the content is HTML."""
-    return f'<section class="card"><h2>{escaped(title)}</h2>{"".join(content)}</section>'
+def _macro(name: str) -> Callable[..., str]:
+    """A macro of ``parts.html``, which gives HTML."""
+    parts: Any = template("webpage/parts.html").module
+    macro = getattr(parts, name)
+    # as a plain text: what is put together of these is not escaped once more
+    return lambda *given: str(macro(*given))
 
 
-def ranking(title: str, said: str, lines: Sequence[str], most: int, rest: str = "") -> str:
-    """A box with a list, its first lines; ``said`` and ``rest`` stand before and behind it."""
-    more = len(lines) - most
-    return card(
-        title,
-        note(said) if said else "",
-        f'<ol class="ranks">{"".join(lines[:most])}</ol>',
-        note(f"And {more} more{rest}.") if more > 0 else "",
-    )
-
-
-def summary(entries: Sequence[tuple[str, str]], *content: str) -> str:
-    """The box on top: names with their values, which are HTML, and what else stands in it."""
-    listed = "".join(f"<div><dt>{name}</dt><dd>{value}</dd></div>" for name, value in entries)
-    inside = f"<dl>{listed}</dl>{''.join(content)}"
-    return f'<section class="card summary" aria-label="Summary">{inside}</section>'
-
-
-def note(text: str) -> str:
-    """A small grey paragraph."""
-    return f'<p class="note">{escaped(text)}</p>'
-
-
-def picks(tag: str, text: str) -> str:
-    """A button that chooses a filter's tag."""
-    return _button("tag", tag, text)
-
-
-def opens(index: int, text: str) -> str:
-    """A button that shows and unfolds a row, counted from 0."""
-    return _button("open", str(index), text)
-
-
-def _button(does: str, value: str, text: str) -> str:
-    return (
-        f'<button type="button" class="link" data-{does}="{escaped(value)}" dir="auto">'
-        f"{escaped(text)}</button>"
-    )
+#: A box: ``card(title, *content)``, where content is HTML
+card = _macro("card")
+#: A box with a list, its first lines: ``ranking(title, said, lines, most, rest)``
+ranking = _macro("ranking")
+#: The box on top: ``summary(entries, *content)``, names with their values, which are HTML
+summary = _macro("summary")
+#: A small grey paragraph: ``note(text)``
+note = _macro("note")
+#: A button that chooses a filter's tag: ``picks(tag, text)``
+picks = _macro("picks")
+#: A button that shows and unfolds a row, counted from 0: ``opens(index, text)``
+opens = _macro("opens")
 
 
 # ------------------------------------------------------------------ the page
@@ -259,88 +226,42 @@ def page(
     style = part("base.css") + part("frame.css")
     script = part("frame.js")
     content = {
-        "columns": [
-            [clean(c.title), c.kind, c.group, c.narrow, c.mark] for c in columns
-        ],
+        "columns": [(c.title, c.kind, c.group, c.narrow, c.mark) for c in columns],
         "rows": [
-            [
+            (
                 [_compact(cell) for cell in row.cells],
-                [clean(tag) for tag in row.tags],
+                row.tags,
                 *([part for part in side if part[2]] for side in (row.details, row.beside)),
-            ]
+            )
             for row in rows
         ],
         "size": PAGE_ROWS,
         "nouns": noun,
-    }  # fmt: skip
-    return Template(part("frame.html")).substitute(
+    }
+    return template("webpage/frame.html").render(
         style_hash=policy_hash(style),
         script_hash=policy_hash(script),
         style=style,
         script=script,
-        title=escaped(title),
-        subtitle=escaped(subtitle),
+        title=title,
+        subtitle=subtitle,
         above=above,
-        placeholder=escaped(placeholder),
-        filters="\n".join(_select(number, *each) for number, each in enumerate(filters)),
-        groups="\n".join(_box(*group) for group in groups),
-        label=escaped(noun[1].capitalize()),
-        one=escaped(noun[0]),
-        plain=_plain(columns, rows, noun, otherwise),
-        content=inert_json(content),
+        placeholder=placeholder,
+        filters=filters,
+        groups=groups,
+        noun=noun,
+        columns=columns,
+        rows=rows,
+        plain_rows=PLAIN_ROWS,
+        otherwise=otherwise,
+        content=inert_json(cleaned(content)),
     )
-
-
-def _select(number: int, label: str, options: Sequence[tuple[str, str]]) -> str:
-    made = "".join(
-        f'<option value="{escaped(tag)}">{escaped(said)}</option>' for tag, said in options
-    )
-    return (
-        f'<label>{escaped(label)} <select id="filter-{number}" autocomplete="off">{made}'
-        "</select></label>"
-    )
-
-
-def _box(group: str, label: str) -> str:
-    box = f'<input type="checkbox" data-group="{escaped(group)}" autocomplete="off">'
-    return f"<label>{box} {escaped(label)}</label>"
 
 
 def _compact(cell: Cell) -> list[Any]:
     """Its fields without those at the end that are empty; true stands for a value like its text."""
-    value = True if cell.value == cell.text else cell.value
-    text = clean(cell.text)
-    fields = [text, value if value is not None else "", clean(cell.below), cell.look,
-              [round(number, 3) for number in cell.picture]]  # fmt: skip
+    value = True if cell.value == cell.text else "" if cell.value is None else cell.value
+    fields = [cell.text, value, cell.below, cell.look, [round(part, 3) for part in cell.picture]]
     while fields and fields[-1] in ("", []):
         fields.pop()
     return fields
-
-
-def _plain(
-    columns: Sequence[Column], rows: Sequence[Row], noun: tuple[str, str], otherwise: str
-) -> str:
-    """The first rows for who allows no scripts."""
-    heads = "".join(f'<th scope="col"{_class(c)}>{escaped(c.title)}</th>' for c in columns)
-    lines = []
-    for row in rows[:PLAIN_ROWS]:
-        first, *others = zip(columns, row.cells, strict=True)
-        cells = "".join(_plain_cell("td", *other) for other in others)
-        lines.append(f"<tr>{_plain_cell('th', *first)}{cells}</tr>")
-    said = f"The first {PLAIN_ROWS} of {len(rows)} {noun[1]}. " if len(rows) > PLAIN_ROWS else ""
-    return (
-        f'<p class="note">{escaped(said)}Sorting, searching and unfolding need scripts, which are '
-        f'part of this page. {escaped(otherwise)}</p><table class="list"><thead><tr>{heads}</tr>'
-        f"</thead><tbody>{''.join(lines)}</tbody></table>"
-    )
-
-
-def _class(column: Column) -> str:
-    return ' class="n"' if column.kind == "number" else ""
-
-
-def _plain_cell(tag: str, column: Column, cell: Cell) -> str:
-    below = f'<span class="file" dir="auto">{escaped(cell.below)}</span>' if cell.below else ""
-    text = escaped(cell.text)
-    name = ' class="name"' if tag == "th" else ""
-    return f'<{tag}{_class(column)}><span{name} dir="auto">{text}</span>{below}</{tag}>'

@@ -6,12 +6,17 @@ import base64
 import hashlib
 import json
 import re
+from functools import cache
 from html import escape
 from importlib.resources import files
 from pathlib import PurePosixPath
+from typing import Any
 from urllib.parse import quote
 
+from jinja2 import Environment, PackageLoader, StrictUndefined, Template
+
 MAX_CHARACTERS = 20_000
+PICTURE = "data:image/png;base64,"
 # Controls but for tab and line end, surrogates, and what turns the direction of all that follows
 HARMFUL = re.compile("[\0-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff\u202a-\u202e\u2066-\u2069]")
 
@@ -24,6 +29,15 @@ def clean(text: str, most: int = MAX_CHARACTERS) -> str:
     """
     text = text if len(text) <= most else text[:most] + "…"
     return HARMFUL.sub("\N{REPLACEMENT CHARACTER}", text)
+
+
+def cleaned(value: Any) -> Any:
+    """The same with every text in it clean; a picture in an address is not cut."""
+    if isinstance(value, str):
+        return clean(value, len(value) if value.startswith(PICTURE) else MAX_CHARACTERS)
+    if isinstance(value, dict):
+        return {name: cleaned(part) for name, part in value.items()}
+    return [cleaned(part) for part in value] if isinstance(value, list | tuple) else value
 
 
 def escaped(text: str) -> str:
@@ -53,6 +67,17 @@ def local_link(path: str) -> str:
     if PurePosixPath(path).is_absolute():
         return ""
     return quote(path.encode("utf-8", "replace"))
+
+
+@cache
+def template(name: str) -> Template:
+    """A template of the package: text from data is clean and escaped in it, whatever it is."""
+    environment = Environment(
+        loader=PackageLoader("px4fuse", ""), autoescape=True, trim_blocks=True,
+        finalize=lambda value: clean(value) if type(value) is str else value,
+        undefined=StrictUndefined,
+    )  # fmt: skip
+    return environment.get_template(name)
 
 
 def part(name: str) -> str:

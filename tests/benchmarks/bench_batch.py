@@ -22,7 +22,8 @@ import psutil
 from px4fuse.fleet.engine import connected
 from px4fuse.fleet.job import Job, analyse
 from px4fuse.fleet.logs import find_logs
-from px4fuse.fleet.run import fleet_request, run
+from px4fuse.fleet.run import run
+from px4fuse.request import ComparisonRequest
 from px4fuse.simulation.flights import simulate, to_ulog
 from px4fuse.simulation.scenario import Scenario
 
@@ -38,7 +39,7 @@ def main(count: int, workers: int) -> None:
         for seed in range(count):
             flight = simulate(Scenario(passes=2, length_m=8.0, seed=seed))
             (folder / f"{seed:04d}.ulg").write_bytes(to_ulog(flight))
-        logs, request = find_logs([str(folder)]), fleet_request({})
+        logs, request = find_logs([str(folder)]), ComparisonRequest(log="LOG")
         version = metadata.version("px4fuse")
         jobs = [Job(log.address, request, False, 2 * 10**9, version) for log in logs]
         for job in jobs[:WARM]:
@@ -55,12 +56,12 @@ def main(count: int, workers: int) -> None:
             if what.startswith("comparing") and done % max(1, of // 10) == 0:
                 memory.append(here.memory_info().rss / 1e6)
 
-        with connected(workers=workers) as client:
-            run(logs[:WARM], Path(scratch, "warm"), request, client)
+        with connected(workers=workers):  # of the session, which every run takes
+            run([log.address for log in logs[:WARM]], Path(scratch, "warm"))
             everyone = [here, *here.children(recursive=True)]
             cpu = sum(sum(process.cpu_times()[:2]) for process in everyone)
             begun = time.perf_counter()
-            run(logs, Path(scratch, "out"), request, client, progress=look)
+            run([str(folder)], Path(scratch, "out"), progress=look)
             many_s = time.perf_counter() - begun
             many_cpu_s = sum(sum(process.cpu_times()[:2]) for process in everyone) - cpu
     print(f"one process: {one_s:.1f} s, {one_cpu_s / count:.2f} s of CPU per log")

@@ -27,7 +27,7 @@ from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.estimates import noises_and_clock, turned_frame
 from px4fuse.ekf2.model import open_model
 from px4fuse.filter.settings import Settings
-from px4fuse.findings import DETECTORS, find, find_loop
+from px4fuse.findings import find, find_loop
 from px4fuse.flight import Flight, Unavailable
 from px4fuse.loop.analysis import analyse, loop_in
 from px4fuse.loop.sources import LoopSource
@@ -99,9 +99,8 @@ RIGHT = SCENARIOS[DEFAULT].settings
 class Condition:
     """A mistake of a stated size, and the finding that must name it.
 
-    ``typed`` is as the finding's file declares it (``measured_on``): options of ``px4fuse
-    simulate``, first those of the scenario where it is not the usual one, or a field of
-    ``Settings`` with its value.
+    ``typed`` is the ``condition`` of the table: options of ``px4fuse simulate``, first those of
+    the scenario where it is not the usual one, or a field of ``Settings`` with its value.
     """
 
     finding: str
@@ -152,11 +151,14 @@ class Condition:
         return Scenario(**given, ekf2=self.ekf2, seed=seed)
 
 
+def rates() -> pd.DataFrame:
+    """The table as it was measured last."""
+    return pd.read_csv(TABLE, keep_default_na=False)
+
+
+# A new one is a row of the table without numbers
 CONDITIONS = tuple(
-    Condition(finding, typed)
-    for detector in DETECTORS
-    for finding, conditions in detector.measured_on.items()
-    for typed in conditions
+    Condition(row.finding, row.condition) for row in rates().itertuples() if row.condition != CLEAN
 )
 
 
@@ -197,7 +199,7 @@ def _fly(job: Job) -> list[tuple[str, ...]]:
         # the loop without the truth, which would tell where it landed
         flight = simulate_flight(replace(scenario, truth=False), mistakes)
         loop = analyse(LoopSource(trajectory_of(flight, "vio"), flight))
-        of_loop = tuple(i for f in find_loop(loop) for i in f.ids)
+        of_loop = tuple(found.id for found in find_loop(loop))
         if first.finding:
             return [_named(first, of_loop)]
     flight = simulate_flight(scenario, mistakes)
@@ -208,7 +210,7 @@ def _fly(job: Job) -> list[tuple[str, ...]]:
             # the most likely noises and the clock's offset do not depend on the chosen ones
             again = compare(flight, condition.settings, axes=("north", "east"))
             compared = replace(explained, **vars(again))
-        ids = tuple(i for f in find(compared) for i in f.ids)
+        ids = tuple(found.id for found in find(compared))
         named.append(_named(condition, (*ids, *(name for name in of_loop if name not in ids))))
     return named
 
@@ -317,11 +319,6 @@ def _row(name: str, scenario: str, condition: str, own: list[tuple[str, ...]]) -
         "high": round(float(interval.high), 4),
         "first": round(first / len(own), 4),
     }
-
-
-def rates() -> pd.DataFrame:
-    """The table as it was measured last."""
-    return pd.read_csv(TABLE, keep_default_na=False)
 
 
 def _main() -> None:

@@ -19,9 +19,9 @@ import numpy as np
 
 from px4fuse.answers import CURES, EKF2_DID, MISTAKES, PANELS, VERDICTS, Answers, Claim
 from px4fuse.assignment.assignment import fly
-from px4fuse.assignment.roster import RosterStudent
+from px4fuse.assignment.roster import Person
 from px4fuse.assignment.truth import FormTruth, Wrong
-from px4fuse.grading.form_points import SEEN, cures, form_points
+from px4fuse.grading.form_points import cures, form_points, panels
 
 SECRET = b"form guesses"
 SHA256 = "0" * 64
@@ -30,7 +30,7 @@ GUESSES = 20
 
 def truth(number: int) -> FormTruth:
     """The right answers to the flight of one student of a mixed class."""
-    student = RosterStudent(f"s{number}", "", f"s{number}.ulg")
+    student = Person(f"s{number}")
     _, answer = fly(SECRET, student, "mixed")
     assert answer.form is not None
     return answer.form
@@ -71,7 +71,7 @@ def constant(truths: Sequence[FormTruth], kind: str) -> Answers:
         cure = cures(Wrong(kind, size, size, size), truths[0])[0][0]
     claim = Claim(
         kind, size if kind != "none" else None, when="whole flight" if kind != "none" else "",
-        parameter=cure, panel=SEEN[kind][0] if kind != "none" else "",
+        parameter=cure, panel=panels(kind)[0] if kind != "none" else "",
     )  # fmt: skip
     return Answers(
         log_sha256=SHA256,
@@ -99,7 +99,7 @@ def right(one: FormTruth) -> Answers:
                 until_s=wrong.until_s,
                 parameter=parameter,
                 value=value,
-                panel=SEEN[wrong.kind][0],
+                panel=panels(wrong.kind)[0],
             )
         )
     return Answers(

@@ -44,7 +44,7 @@ SETTINGS = Settings(0.27, 0.10)
 # Seeds of the flights that the spread is measured on, that pairs are of, and that are changed
 SPREAD_SEED, PAIR_SEED, CHANGED_SEED = 0, 20_000, 30_000
 
-Told = dict[str, Number]
+Numbers = dict[str, Number]
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ CHANGES = (
 )
 
 
-def fly(change: Change, seed: int) -> tuple[Told, Told]:
+def fly(change: Change, seed: int) -> tuple[Numbers, Numbers]:
     """Numbers of one simulated flight: with the log at hand, and from its results alone."""
     scenario = Scenario(passes=change.passes, sigma_uwb_m=change.sigma_uwb_m, seed=seed)
     flight = simulate_flight(scenario, parse(change.mistakes))
@@ -80,7 +80,7 @@ def fly(change: Change, seed: int) -> tuple[Told, Told]:
     return numbers(found, analysis), numbers(found)
 
 
-def spread(flown: Iterable[Told]) -> pd.DataFrame:
+def spread(flown: Iterable[Numbers]) -> pd.DataFrame:
     """By how much each kind of number varies between flights beyond its interval.
 
     Returns
@@ -91,8 +91,8 @@ def spread(flown: Iterable[Told]) -> pd.DataFrame:
     values: Mapping[tuple[str, str], list[tuple[float, float]]] = defaultdict(list)
     for one in flown:
         for path, number in one.items():
-            if number.interval is not None and (number.scale == "difference" or number.value > 0.0):
-                values[number.kind, path].append(_value_and_sigma(number))
+            if number.interval is not None and np.isfinite(number.measure.scaled(number.value)):
+                values[number.measure.path, path].append(_value_and_sigma(number))
     beyond: Mapping[str, list[float]] = defaultdict(list)
     count: Mapping[str, list[int]] = defaultdict(list)
     for (kind, _), pairs in values.items():
@@ -113,15 +113,13 @@ def spread(flown: Iterable[Told]) -> pd.DataFrame:
 def _value_and_sigma(number: Number) -> tuple[float, float]:
     assert number.interval is not None
     low, high = number.interval
-    if number.scale == "difference":
-        return number.value, (high - low) / (2.0 * Z95)
-    value = float(np.log(number.value))
-    below = value - float(np.log(low)) if low > 0.0 else float(np.log(high)) - value
-    return value, (float(np.log(high)) - value + below) / (2.0 * Z95)
+    low, value, high = number.measure.scaled((low, number.value, high)).tolist()
+    below = value - low if np.isfinite(low) else high - value
+    return value, (high - value + below) / (2.0 * Z95)
 
 
 def rates(
-    first: list[tuple[Told, Told]], other: list[tuple[Told, Told]]
+    first: list[tuple[Numbers, Numbers]], other: list[tuple[Numbers, Numbers]]
 ) -> list[dict[str, object]]:
     """How often pairs of flights show a significant change, with their logs and without.
 
@@ -136,8 +134,7 @@ def rates(
     for at, given in enumerate(("logs", "results")):
         shown: list[list[str]] = []
         for a, b in zip(first, other, strict=True):
-            both = {path: (a[at][path], b[at][path]) for path in a[at] if path in b[at]}
-            made = number_changes(both, paired=False)
+            made = number_changes(a[at], b[at], paired=False)
             shown.append([change.path for change in made if change.status == "significant"])
         hits = sum(map(bool, shown))
         interval = binomtest(hits, len(shown)).proportion_ci()

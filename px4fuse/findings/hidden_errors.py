@@ -1,0 +1,180 @@
+"""What innovations cannot show: errors against the truth, and the drift of a source.
+
+Innovations judge a filter against its source, truth judges both: an error that filter and source
+share shows in no innovation. Normalised by the variance that the filter states, the squared error
+is the NEES (1 is consistent).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+
+from px4fuse.analysis import Analysis
+from px4fuse.arrays import Array
+from px4fuse.comparison.model import AgainstTruth, AxisComparison, Comparison
+from px4fuse.errors import TrajectoryError
+from px4fuse.filter.consistency import Consistency
+from px4fuse.filter.kalman import state_at
+from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
+from px4fuse.findings.model import Finding, Found, finding, info
+from px4fuse.flight import Unavailable
+from px4fuse.loop.loop import Loop
+from px4fuse.plain import factor_words, number_words
+from px4fuse.trajectory.alignment import fit
+
+NEES_LARGE = 4.0  # errors twice as large as σ; clean flights stay below 3
+NEES_ERROR = 16.0  # errors four times as large as σ
+CONTENT_NIS = 1.5  # above, the innovations themselves say so (variance.py)
+SMALL_NIS = 0.5  # innovations are 30 % smaller than claimed
+FRAME_SHARE = 0.5  # of the error: what is left is less than what turning took away
+FILTERS = {"kf": "our filter", "ekf2": "EKF2"}
+REMEDIES = {
+    "drift": "Take no noise from these innovations: correct the drift at a loop (px4fuse loop "
+    "LOG), or give the filter a second, absolute source.",
+    "frame": "Turn and shift the source's frame into that of the truth before you judge a filter "
+    "by it, and take no noise from these innovations.",
+    "ekf2": "Our filter errs less with the same source, so the error is EKF2's own: look at "
+    "EKF2_EV_DELAY, at its heading, and at what else it fuses.",
+    "shared": "Look for an error that source and filter share: the clock (px4fuse sync LOG), a "
+    "source that smooths its positions, its scale, the survey of the anchors.",
+}
+
+
+@dataclass(frozen=True)
+class Hidden:
+    """One filter on one axis whose innovations hide its error."""
+
+    owner: str
+    axis: str
+    statement: Consistency
+    rmse_m: float
+    nees: float
+
+    @property
+    def claimed_m(self) -> float:
+        """Standard deviation that the filter states."""
+        return self.rmse_m / float(np.sqrt(self.nees))
+
+
+def hidden_errors(comparison: Comparison) -> list[Hidden]:
+    """Where the error is larger than claimed and no innovation says so, the worst first."""
+    found = []
+    for name, result in comparison.axes.items():
+        for owner, statement in result.filters.items():
+            truth = statement.truth
+            if isinstance(statement, Unavailable) or not isinstance(truth, AgainstTruth):
+                continue
+            nees = truth.nees_position_mean or 0.0
+            if nees >= NEES_LARGE and statement.nis_mean < CONTENT_NIS:
+                found.append(Hidden(owner, name, statement, truth.position_rmse_m, nees))
+    return sorted(found, key=lambda hidden: -hidden.nees)
+
+
+def detect(analysis: Analysis) -> Found:
+    """Errors that innovations hide, or a drift that nothing shows."""
+    if hidden := hidden_errors(analysis):
+        yield larger(analysis, hidden)
+    elif analysis.source.origin.may_drift:
+        yield drift(analysis)
+
+
+def larger(analysis: Analysis, hidden: list[Hidden]) -> Finding:
+    """Told of each filter's worst axis."""
+    worst, drifts = hidden[0], analysis.source.origin.may_drift
+    evidence: dict[str, float | str] = {"axis": worst.axis, "filter": worst.owner}
+    said = []
+    for owner, name in FILTERS.items():
+        for one in [each for each in hidden if each.owner == owner][:1]:
+            nis = one.statement.nis_mean
+            evidence |= {
+                f"{owner}_nis_mean": nis,
+                f"{owner}_nees_position_mean": one.nees,
+                f"{owner}_position_rmse_m": one.rmse_m,
+                f"{owner}_sigma_p_m": one.claimed_m,
+            }
+            said.append(
+                f"{name} claims σ {one.claimed_m:.2g} m along {one.axis} and errs by "
+                f"{one.rmse_m:.2f} m RMS (mean NEES {factor_words(one.nees)}, mean NIS "
+                f"{number_words(nis, 2)}; 1 is consistent)"
+            )
+    small = worst.statement.nis_mean < SMALL_NIS
+    words = "; ".join(said) + "."
+    alone = all(one.owner == "ekf2" for one in hidden)
+    remedy = REMEDIES["drift" if drifts else "ekf2" if alone else "shared"]
+    if frame := _after_turning(analysis, worst.owner):
+        before, left = frame
+        evidence |= {"position_rmse_horizontal_m": before, "position_rmse_aligned_m": left}
+        remain = f"of {before:.2f} m horizontally {left:.2f} m remain after the best shift and turn"
+        if left < FRAME_SHARE * before:
+            words += f" Most of it is how the source's frame lies: {remain}."
+            remedy = REMEDIES["frame"]
+        elif drifts:
+            words += f" The source drifts, and the filter follows it: {remain}."
+    return finding(
+        "error" if worst.nees >= NEES_ERROR else "warning",
+        "errors_larger_than_claimed",
+        f"Innovations {'small, errors large' if small else 'consistent, errors not'}",
+        f": {words} Innovations judge a filter against its source, truth judges both.",
+        remedy,
+        evidence,
+    )
+
+
+def _after_turning(comparison: Comparison, owner: str) -> tuple[float, float] | None:
+    """Horizontal RMSE (m) to the truth, and what of it the best shift and turn leave."""
+    axes = [comparison.axes[name] for name in ("north", "east") if name in comparison.axes]
+    truths = [result.truth for result in axes if isinstance(result.truth, pd.DataFrame)]
+    if len(truths) < 2:
+        return None
+    times = truths[0].index.to_numpy()
+    tracks = [_track(result, owner, times) for result in axes]
+    level = np.zeros(len(times))
+    estimate = np.column_stack([*tracks, level])
+    true = np.column_stack([*(truth["position_m"] for truth in truths), level])
+    known = np.isfinite(estimate).all(axis=1) & np.isfinite(true).all(axis=1)
+    estimate, true = estimate[known], true[known]
+    try:
+        aligned = fit(estimate, true, "yaw").apply(estimate)
+    except TrajectoryError:  # too little motion to turn by
+        return None
+    errors = (estimate - true, aligned - true)
+    before, left = (float(np.linalg.norm(error)) / len(true) ** 0.5 for error in errors)
+    return before, left
+
+
+def _track(result: AxisComparison, owner: str, times: Array) -> Array:
+    """Position (m) of a filter along one axis; NaN where it is not known."""
+    if owner == "kf":
+        return state_at(result.replay, times)[0]
+    if isinstance(result.ekf2_state, Unavailable):
+        return np.full(len(times), np.nan)
+    state = result.ekf2_state["position_m"]
+    track: Array = np.interp(times, state.index, state, left=np.nan, right=np.nan)
+    return track
+
+
+def drift(analysis: Analysis) -> Finding:
+    """Neither truth nor anything else judges it: what it scatters by, and what its loop shows."""
+    name, tuned, loop = analysis.source.name, analysis.tuning.get(HORIZONTAL), analysis.loop
+    evidence: dict[str, float | str] = {"source": name}
+    more = ""
+    if isinstance(tuned, AxisTuning) and (noise := tuned.sigma_z.value or tuned.sigma_z.high):
+        bound = "at most " if tuned.sigma_z.value is None else ""
+        evidence |= {"short_term_noise_m": noise}
+        more = f" Over a second or so it scatters by {bound}{noise:.2g} m, which is not its error."
+    if isinstance(loop, Loop) and (gap_m := loop.closure_error_m) is not None:
+        evidence |= {"closure_error_m": gap_m, "path_length_m": loop.path_length_m}
+        more += f" Its loop misses by {gap_m:.2f} m after {loop.path_length_m:.0f} m."
+    return info(
+        "source_may_drift",
+        f"Consistency with {name} is not correctness",
+        ": it comes with a heading of its own, as odometry (VIO, SLAM) does, and odometry drifts. "
+        "Innovations say how well a filter follows its source, not where the vehicle was."
+        f"{more}",
+        "Judge it by a loop (px4fuse loop LOG) or by a truth (ATT_POS_MOCAP). Only if it is motion "
+        "capture, which does not drift, do its innovations tell its noise.",
+        evidence,
+    )

@@ -1,0 +1,148 @@
+"""What is wrong with the IMU: a bias of the accelerometer, gaps, too low a rate."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+
+from px4fuse.analysis import Analysis
+from px4fuse.filter.causes import Explained
+from px4fuse.filter.signals import Segment, imu_gaps, within
+from px4fuse.findings.model import MOMENT_S, Found, finding, warning
+from px4fuse.flight import SPECIFIC_FORCE_COLUMNS, Ekf2, sample_rate
+from px4fuse.record import Span
+from px4fuse.recording import LogInfo
+
+BIAS_M_S2 = 0.2  # half of EKF2's own limit, EKF2_ABL_LIM
+BIAS_ERROR_M_S2 = 0.3  # as SIGMA_A tripled; 0.15 m after one second
+BIAS_SIGMAS = 4.0  # 6e-5 of clean flights lie beyond
+TILT_DEG_PER_M_S2 = float(np.degrees(1.0 / 9.80665))
+IMU_GAP_TOTAL_S = 0.2  # two prediction steps
+MIN_IMU_RATE_HZ = 50.0  # 5 IMU samples per DT of 0.1 s, and 10 with margin for aliasing
+MIN_ATTITUDE_RATE_HZ = 10.0  # PX4's default is 20 Hz; slerp bridges 0.1 s of a tilt
+RATE_MARGIN = 0.98  # a stream set to a rate runs a little below it
+
+
+def detect(analysis: Analysis) -> Found:
+    """All of them."""
+    yield from bias(analysis)
+    yield from gaps(analysis)
+    yield from rates(analysis)
+
+
+def bias(analysis: Analysis) -> Found:
+    """The accelerometer reads too much or too little all the time.
+
+    Our own estimate is from the positions: a bias that is taken for acceleration moves the
+    innovations in a way that nothing else does. EKF2's stands in where there is none, and for the
+    down axis.
+    """
+    found, of_ekf2, in_ekf2 = analysis.explained, _ekf2_bias(analysis), ""
+    if of_ekf2 is not None:
+        in_ekf2 = f"{of_ekf2[0]:+.2f} forward, {of_ekf2[1]:+.2f} right"
+    if isinstance(found, Explained):
+        forward, right = found.forward_bias, found.right_bias
+        size = float(np.hypot(forward.value, right.value))
+        sigma = float(np.hypot(forward.sigma, right.sigma))
+        if size >= max(BIAS_M_S2, BIAS_SIGMAS * sigma):
+            yield finding(
+                "error" if size >= BIAS_ERROR_M_S2 else "warning",
+                "accelerometer_bias",
+                f"The accelerometer reads {forward.value:+.2f} m/s² too much forward and "
+                f"{right.value:+.2f} right",
+                f" (± {1.96 * forward.sigma:.2f}), by what the positions show of the motion: our "
+                "filter integrates it as acceleration. An attitude that is off by "
+                f"{size * TILT_DEG_PER_M_S2:.1f}° does the same."
+                + (f" EKF2 subtracts {in_ekf2}." if in_ekf2 else ""),
+                "Calibrate the accelerometers and the level horizon, at the temperature of the "
+                "flight; a larger SIGMA_A only hides it.",
+                {"bias_m_s2": size, "sigma_m_s2": sigma},
+            )
+            return
+    if of_ekf2 is None:
+        return
+    # horizontally ours is the better estimate, where there is one
+    size = float(np.linalg.norm(of_ekf2[2:] if isinstance(found, Explained) else of_ekf2))
+    if size >= BIAS_M_S2:
+        yield warning(
+            "accelerometer_bias",
+            f"EKF2 subtracts an accelerometer bias of {size:.2f} m/s²",
+            f" ({in_ekf2}, {of_ekf2[2]:+.2f} down). Our filter integrates it and needs a larger "
+            "SIGMA_A for that.",
+            "Calibrate the accelerometers, at the temperature of the flight.",
+            {"bias_m_s2": size},
+        )
+
+
+def _ekf2_bias(analysis: Analysis) -> list[float] | None:
+    """Median of what EKF2 subtracts, forward, right and down (m/s²)."""
+    ekf2 = analysis.flight.ekf2
+    if not isinstance(ekf2, Ekf2) or not isinstance(ekf2.accelerometer_bias, pd.DataFrame):
+        return None
+    inside = within(ekf2.accelerometer_bias, analysis.segment)[SPECIFIC_FORCE_COLUMNS]
+    return None if inside.empty else [float(median) for median in inside.median()]
+
+
+def gaps(analysis: Analysis) -> Found:
+    """Missing for longer than two steps of prediction and of the IMU."""
+    gap_s, imu = next(iter(analysis.axes.values())).replay.input_gap_s, analysis.flight.imu
+    interval_s = 1.0 / sample_rate(imu) if isinstance(imu, pd.DataFrame) else 0.0
+    recorded = analysis.flight.log.format.startswith("MAVLink")
+    remedy = "Record where the link loses no messages" if recorded else "Use a faster SD card"
+    if gap_s > max(IMU_GAP_TOTAL_S, 2.0 * interval_s):
+        yield warning(
+            "imu_gap",
+            f"The IMU is missing for {gap_s:.2f} s of the segment",
+            "; the process noise was raised there to the size of the motion.",
+            f"{remedy}, or choose a segment without the gap (--start, --end).",
+            {"total_s": gap_s},
+            _spans(imu, analysis.segment) if isinstance(imu, pd.DataFrame) else (),
+        )
+
+
+def _spans(imu: pd.DataFrame, segment: Segment) -> tuple[Span, ...]:
+    """From when to when the IMU is missing, at the ends of the segment too."""
+    time_s = imu.index.to_numpy()
+    gap = imu_gaps(time_s)
+    missing = list(zip(time_s[:-1][gap].tolist(), time_s[1:][gap].tolist(), strict=True))
+    outside = ((segment.start_s, float(time_s[0])), (float(time_s[-1]), segment.end_s))
+    missing += [(start, end) for start, end in outside if end - start > MOMENT_S]
+    inside = (span for span in missing if span[1] > segment.start_s and span[0] < segment.end_s)
+    return tuple(sorted(inside))
+
+
+def too_slow(samples: pd.DataFrame, needed_hz: float) -> bool:
+    """Whether samples come at a lower rate than is needed."""
+    return sample_rate(samples) < RATE_MARGIN * needed_hz
+
+
+def rates(analysis: Analysis) -> Found:
+    """IMU or attitude, below the rate that the acceleration needs."""
+    flight = analysis.flight
+    for part, name, default, needed_hz in (
+        (flight.imu, "imu", "sensor_combined", MIN_IMU_RATE_HZ),
+        (flight.attitude, "attitude", "vehicle_attitude", MIN_ATTITUDE_RATE_HZ),
+    ):
+        topic = flight.streams[name].topics[0] if name in flight.streams else default
+        if isinstance(part, pd.DataFrame) and too_slow(part, needed_hz):
+            rate_hz = sample_rate(part)
+            yield warning(
+                "logging_rate_low",
+                f"{topic} was logged at {rate_hz:.1f} Hz, below the {needed_hz:g} Hz that the "
+                "acceleration needs",
+                ": motion between samples is lost.",
+                _faster(flight.log, topic, 2.0 * needed_hz),
+                {"rate_hz": rate_hz, "needed_hz": needed_hz, "topic": topic},
+            )
+
+
+def _faster(log: LogInfo, topic: str, rate_hz: float) -> str:
+    """How to log a topic at a rate."""
+    if not log.format.startswith("MAVLink"):
+        return f'Put the line "{topic} 0" into etc/logging/logger_topics.txt on the SD card.'
+    if not log.has_ulog:
+        return f"Ask for {topic} at {rate_hz:g} Hz (MAV_CMD_SET_MESSAGE_INTERVAL)."
+    return (
+        f"Raise its stream rate (mavlink stream -d DEVICE -s {topic} -r {rate_hz:g} in PX4's "
+        "console), or join the ULog (--mavlink)."
+    )

@@ -1,0 +1,95 @@
+"""What the log lacks: EKF2, an acceleration, innovations, the position as it arrived."""
+
+from __future__ import annotations
+
+import pandas as pd
+
+from px4fuse.analysis import Analysis
+from px4fuse.findings.model import Found, info, warning
+from px4fuse.flight import Ekf2, Unavailable
+from px4fuse.origin import RECEIVED
+
+WANTED = "vehicle_visual_odometry"
+VISION_PROFILE_BIT = 128  # SDLOG_PROFILE bit 7, logged_topics.cpp
+LOGGER_TOLERANCE = 0.25  # of the interval: jitter of PX4's logger seen in flights
+# Intervals (s) at which PX4's default profile thins these topics, logged_topics.cpp
+LOGGER_INTERVALS_S = {
+    "estimator_visual_odometry_aligned": (0.2,),
+    "estimator_aid_src_ev_pos": (0.5,),
+    "ekf2_state_plus_innovation": (0.5, 0.2),  # 0.2 in v1.11
+}
+MIN_INNOVATION_SHARE = 0.75  # of the source's samples: a quarter lost biases nothing yet
+
+
+def detect(analysis: Analysis) -> Found:
+    """All of them."""
+    yield from unavailable(analysis)
+    yield from source_as_sent(analysis)
+    yield from innovations(analysis)
+
+
+def unavailable(analysis: Analysis) -> Found:
+    """The report has to do without, with the reason and the remedy that stand in its place."""
+    ekf2, acceleration = analysis.flight.ekf2, analysis.lines[0].acceleration
+    if isinstance(ekf2, Unavailable):
+        more = f": {ekf2.reason}. The report holds our filter alone."
+        yield warning("ekf2_unavailable", "Nothing to compare with", more, ekf2.remedy)
+    if isinstance(acceleration, Unavailable):
+        more = f" ({acceleration.what}: {acceleration.reason}); our filter assumes constant "
+        remedy = acceleration.remedy
+        yield warning("input_unavailable", "No acceleration input", f"{more}velocity.", remedy)
+    for result in analysis.axes.values():
+        ours = result.filters["kf"]
+        if isinstance(ours, Unavailable):
+            said, count = "No statement on consistency", {"count": len(result.replay.updates)}
+            yield warning("too_few_innovations", said, f": {ours.reason}.", ours.remedy, count)
+            return
+
+
+def source_as_sent(analysis: Analysis) -> Found:
+    """The position as it arrived is not in the log: what stands in, and whether that is thinned."""
+    source, received = analysis.source, RECEIVED.preference
+    logged = any(track.origin.preference == received for track in analysis.flight.positions)
+    if source.origin.as_sent or logged:
+        return
+    name, rate_hz = source.name, source.rate_hz
+    profile = int(analysis.flight.log.parameters.get("SDLOG_PROFILE", 1))
+    reasons = (part.reason for part in analysis.missing if part.source == WANTED)
+    remedy = f"Set SDLOG_PROFILE to {profile | VISION_PROFILE_BIT} and fly again."
+    yield warning(
+        "source_not_logged",
+        f"The log lacks {WANTED}, the position as it arrived",
+        f" ({next(reasons, 'it is not in this log')}); {name} ({source.description}) stands in "
+        f"for it at {rate_hz:.1f} Hz.",
+        remedy,
+        {"rate_hz": rate_hz, "sdlog_profile": profile},
+    )
+    for interval in LOGGER_INTERVALS_S.get(name, ()):
+        if abs(1.0 / rate_hz / interval - 1.0) < LOGGER_TOLERANCE:
+            yield warning(
+                "source_decimated",
+                f"{name} is logged at {rate_hz:.1f} Hz, the logger's own limit for it",
+                f" ({1 / interval:g} Hz): the source may have run faster, the samples between are "
+                "lost.",
+                remedy,
+                {"rate_hz": rate_hz, "logger_limit_hz": 1.0 / interval},
+            )
+
+
+def innovations(analysis: Analysis) -> Found:
+    """Too few innovations of EKF2 for the measurements, which are not made of them."""
+    ekf2, axes = analysis.flight.ekf2, analysis.axes.values()
+    frames = (result.ekf2_innovations for result in axes)
+    logged = next((len(frame) for frame in frames if isinstance(frame, pd.DataFrame)), None)
+    if logged is None or analysis.source.origin.reconstructed or not isinstance(ekf2, Ekf2):
+        return
+    count = len(next(iter(axes)).replay.updates)
+    if logged / count < MIN_INNOVATION_SHARE:
+        yield info(
+            "ekf2_innovations_decimated",
+            f"The log holds {logged} EKF2 innovations for {count} measurements",
+            f": {1 - logged / count:.0%} of what EKF2 did with the source is not in it.",
+            f'Put the line "{ekf2.innovation_topics[0]} 0" into etc/logging/logger_topics.txt on '
+            "the SD card.",
+            {"logged": logged, "measurements": count},
+        )

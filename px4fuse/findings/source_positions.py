@@ -1,0 +1,207 @@
+"""What is wrong with the positions themselves: still, smoothed, stepping, scattered, scaled.
+
+How well a log can show a scale: six passes at 5 Hz and 0.10 m give it to 3.5 % (one σ), so that
+5 % is invisible, whatever is computed; 15 % is seen at 10 Hz and 0.05 m. Small errors need a tape
+measure or the truth.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+
+import numpy as np
+import pandas as pd
+
+from px4fuse.analysis import Analysis
+from px4fuse.comparison.model import Comparison
+from px4fuse.filter.causes import AFTER_STEP_S, Explained
+from px4fuse.filter.signals import within
+from px4fuse.filter.smoothing import Smoothing
+from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
+from px4fuse.findings.imu import MIN_IMU_RATE_HZ, too_slow
+from px4fuse.findings.model import Found, finding, moments, times, warning
+from px4fuse.findings.source_stamps import arrivals
+from px4fuse.flight import POSITION_COLUMNS, POSITION_VARIANCE_COLUMNS, Unavailable
+from px4fuse.plain import factor_words
+
+MOTION_RANGE_M = 0.5  # 5 to 95 %; a hovering drone with 0.1 m UWB stays below
+GAIN_NATS = 12.0  # a likelihood ratio of 160,000; clean flights have 0 to 2
+LAG_S = 0.05  # at 1 m/s half of a good UWB's noise
+LAG_ERROR_S = 0.10  # at 1 m/s a good UWB's noise
+JUMP_M = 0.2  # twice a good UWB's noise
+JUMP_ERROR_M = 0.5  # no longer the same place
+SCALE = 0.12  # of the distance; flights of PX4's simulation are within 0.11
+SCALE_ERROR = 0.15  # of the distance: a metre in seven
+SCALE_SIGMAS = 3.0  # standard deviations; 0.3 % of clean flights lie beyond
+OUTLIERS = 0.005  # of the measurements; a normal source has 0.02 % beyond 3.7 σ
+OUTLIERS_ERROR = 0.02  # of the measurements: every tenth second at 5 Hz
+MIN_OUTLIERS = 3
+REPORTED = 2.0  # times in variance: EKF2's own NIS is off by about that
+REPORTED_ERROR = 3.0  # times in variance: beyond what EKF2's NIS bears
+
+
+def detect(analysis: Analysis) -> Found:
+    """All of them; odometry, and what was made of EKF2's output, only where that says something."""
+    yield from motion(analysis)
+    yield from jumps(analysis)
+    yield from outliers(analysis)
+    if analysis.source.orientation is None and not analysis.source.origin.reconstructed:
+        yield from smoothing(analysis)
+        yield from scale(analysis)
+        yield from stated_variance(analysis)
+
+
+def low_pass(analysis: Analysis) -> Smoothing | None:
+    """The low pass in the source, None where there is none or it cannot be told."""
+    source, found = analysis.source, analysis.smoothing
+    # the error of odometry drifts, which makes that of successive positions agree as well; what
+    # was made of EKF2's own output has EKF2's filter in it
+    if source.orientation is not None or source.origin.reconstructed:
+        return None
+    if not isinstance(found, Smoothing) or found.gain_nats < GAIN_NATS or found.lag_s < LAG_S:
+        return None
+    return found
+
+
+def smoothing(analysis: Analysis) -> Found:
+    """A low pass makes errors agree and positions late."""
+    found, name = low_pass(analysis), analysis.source.name
+    if found is not None:
+        yield finding(
+            "error" if found.lag_s >= LAG_ERROR_S else "warning",
+            "source_smoothed",
+            f"{name} is smoothed before it is sent",
+            ": the errors of successive positions agree (correlation about "
+            f"{found.correlation:.1f}), and they come about {found.lag_s:.2f} s behind the motion. "
+            f"Behind that is a noise of {found.sigma_z_m:.2g} m. Both filters take the noise of "
+            "each position for new, trust them too much, and lag.",
+            "Switch the smoothing (averaging, filter) of the positioning system off and send raw "
+            "positions; it is no clock error, so leave the stamps as they are.",
+            asdict(found),
+        )
+
+
+def jumps(analysis: Analysis) -> Found:
+    """Steps to another place that the IMU does not measure: a false match, a moved anchor."""
+    found = analysis.explained
+    # a moving vehicle's positions jump where the stamps do
+    if not isinstance(found, Explained) or any(arrivals(analysis)):
+        return
+    large = [jump for jump in found.jumps if jump.size_m >= JUMP_M]
+    if large:
+        largest = max(large, key=lambda jump: jump.size_m)
+        size, at_s, sigma = largest.size_m, largest.time_s, max(s.sigma for s in largest.step_m)
+        yield finding(
+            "error" if size >= JUMP_ERROR_M else "warning",
+            "source_jumps",
+            f"{analysis.source.name} jumps {times(len(large))} and stays there, by {size:.2f} m "
+            f"(± {1.96 * sigma:.2f}) at {at_s:.1f} s, while the IMU measures no such motion",
+            ": a false match, another set of anchors or an origin that was set again. After it "
+            "both filters are wrong by that, and consistent.",
+            "Analyse one side of the jump with --start, --end; let the source keep one origin and "
+            "one set of anchors in flight.",
+            {"count": len(large), "size_m": size, "at_s": at_s, "sigma_m": sigma},
+            moments(jump.time_s for jump in large),
+        )
+
+
+def scale(analysis: Analysis) -> Found:
+    """Distances are too long or too short, by an IMU that misses no motion."""
+    imu, found = analysis.flight.imu, analysis.explained
+    if not isinstance(imu, pd.DataFrame) or too_slow(imu, MIN_IMU_RATE_HZ):
+        return
+    # a low pass takes from the motion as well
+    if not isinstance(found, Explained) or low_pass(analysis) is not None:
+        return
+    off, sigma = found.scale.value, found.scale.sigma
+    if abs(off) >= max(SCALE, SCALE_SIGMAS * sigma):
+        yield finding(
+            "error" if abs(off) >= SCALE_ERROR else "warning",
+            "source_scale_wrong",
+            f"Distances of {analysis.source.name} are {abs(off):.0%} too "
+            f"{'long' if off > 0 else 'short'} (± {1.96 * sigma:.0%}) against the motion that the "
+            "IMU measures",
+            ": neither filter's innovations show it, since both follow the positions.",
+            "Measure a known distance with the source; survey the anchors again, and check its "
+            "unit and its calibration.",
+            {"scale": 1.0 + off, "sigma": sigma},
+        )
+
+
+def outliers(analysis: Analysis) -> Found:
+    """More than a normal source has, without what begins a step that stays."""
+    tuned = analysis.tuning.get(HORIZONTAL) or next(iter(analysis.tuning.values()), None)
+    if not isinstance(tuned, AxisTuning):
+        return
+    found = analysis.explained
+    steps = [jump.time_s for jump in found.jumps] if isinstance(found, Explained) else []
+    times_s = [
+        time
+        for time in tuned.outlier_time_s.tolist()
+        if not any(at <= time < at + AFTER_STEP_S for at in steps)
+    ]
+    count, share = len(times_s), len(times_s) / tuned.count
+    if share < OUTLIERS or count < MIN_OUTLIERS:
+        return
+    first = ", ".join(f"{time:.1f}" for time in times_s[:3])
+    yield finding(
+        "error" if share >= OUTLIERS_ERROR else "warning",
+        "source_outliers",
+        f"{count} of {tuned.count} measurements ({share:.1%}) are outliers that no noise explains",
+        f" ({tuned.name}; at {first} s{' and more' if count > 3 else ''}): for UWB most likely "
+        "reflections without line of sight. They pull both filters, and look like noise unless "
+        "they are left out.",
+        "Give the tag line of sight to the anchors there, or reject them before they are sent; do "
+        "not raise SIGMA_Z or EKF2_EVP_NOISE for them.",
+        {"count": count, "share": share, "first_s": times_s[0]},
+        moments(times_s),
+    )
+
+
+def stated_variance(analysis: Analysis) -> Found:
+    """The variance that the source reports is outside the interval of its noise."""
+    source, tuned = analysis.source, analysis.tuning.get(HORIZONTAL)
+    # where the source smooths, the noise from one position to the next is not all
+    smooths = isinstance(analysis.smoothing, Unavailable) or low_pass(analysis) is not None
+    if smooths or not isinstance(tuned, AxisTuning):
+        return
+    reported = within(source.samples, analysis.segment)[POSITION_VARIANCE_COLUMNS[:2]].dropna()
+    noise, low, high = tuned.sigma_z.value, tuned.sigma_z.low, tuned.sigma_z.high
+    if reported.empty or noise is None or low is None or high is None:
+        return
+    sigma = float(np.sqrt(reported.to_numpy().mean(axis=1)).mean())
+    factor = (sigma / noise) ** 2
+    size = max(factor, 1.0 / factor)
+    if size >= REPORTED and not low <= sigma <= high:
+        yield finding(
+            "error" if size >= REPORTED_ERROR else "warning",
+            "source_variance_wrong",
+            f"{source.name} reports a standard deviation of {sigma:.3g} m, and its noise is "
+            f"{noise:.3g} m",
+            f" (95 % {low:.3g} to {high:.3g}): the variance that it sends is {factor_words(size)} "
+            f"times too {'small' if factor < 1.0 else 'large'}. EKF2 takes R from it "
+            "(EKF2_EV_NOISE_MD 0), though never less than EKF2_EVP_NOISE.",
+            f"Correct it at the sender: a variance of {noise**2:.2g} m², or set EKF2_EV_NOISE_MD "
+            f"to 1 and EKF2_EVP_NOISE to {noise:.2g}.",
+            {"reported_sigma_m": sigma, "sigma_z_m": noise, "variance_factor": factor},
+        )
+
+
+def motion_range_m(comparison: Comparison) -> float:
+    """Larger horizontal extent of the source in the segment, 5 to 95 %."""
+    inside = within(comparison.source.samples, comparison.segment)
+    low, high = inside[POSITION_COLUMNS[:2]].quantile([0.05, 0.95]).to_numpy()
+    return float(np.max(high - low))
+
+
+def motion(analysis: Analysis) -> Found:
+    """The vehicle hardly moved: nothing about dynamics can be identified."""
+    extent = motion_range_m(analysis)
+    if extent < MOTION_RANGE_M:
+        yield warning(
+            "no_motion",
+            f"The vehicle moved only {extent:.2f} m horizontally",
+            " (5 to 95 %): velocity, heading and clock offset cannot be judged from this flight.",
+            "Fly several passes of 5 m or more, with clear starts and stops.",
+            {"range_m": extent},
+        )

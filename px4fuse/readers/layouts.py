@@ -1,0 +1,48 @@
+"""How a topic or message holds a quantity: the rows of which the tables of both formats consist."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+
+from px4fuse.flight import POSITION_COLUMNS, VELOCITY_COLUMNS
+
+
+@dataclass(frozen=True)
+class Layout:
+    """One way in which a quantity is written.
+
+    Attributes
+    ----------
+    topic : str
+        A PX4 topic or a MAVLink message.
+    columns : mapping
+        Our column name to the field's name, ``name[i]`` for an element; all must be present.
+    since : str
+        The PX4 releases that log it so.
+    optional : mapping
+        Further columns, read where the topic has them.
+    scale : mapping
+        Our unit per unit of the field, by our column name; 1 where there is none.
+    """
+
+    topic: str
+    columns: Mapping[str, str]
+    since: str = ""
+    optional: Mapping[str, str] = field(default_factory=dict)
+    scale: Mapping[str, float] = field(default_factory=dict)
+
+
+def elements(names: list[str], of: str, at: Iterable[int] = range(100)) -> dict[str, str]:
+    """Columns that are elements of one field; all from the first on by default.
+
+    >>> elements(["north_m", "east_m"], "position")
+    {'north_m': 'position[0]', 'east_m': 'position[1]'}
+    """
+    return {name: f"{of}[{index}]" for name, index in zip(names, at, strict=False)}
+
+
+XYZ = dict(zip(POSITION_COLUMNS, "xyz", strict=True))
+POSITION_AND_VELOCITY = XYZ | dict(zip(VELOCITY_COLUMNS, ("vx", "vy", "vz"), strict=True))
+# Where the diagonal stands in the row-major upper triangle of a 6×6 matrix: x, y, z, and rotations
+POSE_DIAGONAL, ROTATION_DIAGONAL = (0, 6, 11), (15, 18, 20)
